@@ -1,0 +1,41 @@
+# Two commands for a reader: `make demo` and `make test`. The rest is for those who build beamfit.
+PYTHON ?= python3
+BIN := .venv/bin
+# The matrices are tiny: a second BLAS thread costs more than it brings.
+export OPENBLAS_NUM_THREADS := 1
+export OMP_NUM_THREADS := 1
+export PIP_DISABLE_PIP_VERSION_CHECK := 1
+
+.PHONY: demo test bench lint clean
+.DEFAULT_GOAL := demo
+
+.venv/runtime: pyproject.toml constraints.txt
+	test -x $(BIN)/python || $(PYTHON) -m venv .venv
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable .
+	touch $@
+
+.venv/test: .venv/runtime
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[test]'
+	touch $@
+
+.venv/bench: .venv/test
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[bench]'
+	touch $@
+
+demo: .venv/runtime
+	mkdir -p demo
+	$(BIN)/beamfit emittance measurements/lcls_otr2.csv --lattice lattices/lcls_otr2.toml --report demo/lcls_otr2.html
+
+test: .venv/test lint
+	$(BIN)/python -m pytest --quiet --numprocesses 2
+
+lint: .venv/test
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/lint-imports
+
+bench: .venv/bench
+	$(BIN)/python benchmarks/emittance.py
+
+clean:
+	rm -rf .venv demo dist build
