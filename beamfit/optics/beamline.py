@@ -1,0 +1,188 @@
+"""A sequence of elements and its transfer matrix as a function of the settings."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import partial, reduce
+
+import jax
+from jax.typing import ArrayLike
+
+from beamfit.errors import InputError, nearest
+from beamfit.optics.elements import Element, Marker, Screen, TransferMatrix
+from beamfit.optics.particle import ELECTRON_MASS
+
+__all__ = ["Beamline"]
+
+
+@partial(
+    jax.tree_util.register_dataclass,
+    data_fields=["elements", "energy", "energy_spread"],
+    meta_fields=["name", "mass"],
+)
+@dataclass(frozen=True)
+class Beamline:
+    """Elements in the order the beam meets them.
+
+    Parameters
+    ----------
+    elements : tuple of Element
+        The elements; names are unique among magnets and screens.
+    energy : float
+        Total energy in MeV.
+    name : str
+        What to call the line.
+    mass : float
+        Rest energy of the particle in MeV.
+    energy_spread : float
+        Relative momentum spread σ_δ, which widens the beam where there is dispersion.
+
+    Raises
+    ------
+    InputError
+        If two magnets or screens share a name.
+
+    Examples
+    --------
+    >>> from beamfit.optics.elements import Drift, Quadrupole
+    >>> line = Beamline((Quadrupole("Q", 0.1), Drift("D", 2.0), Screen("S")), energy=135.0)
+    >>> round(float(line.matrix({"Q": 4.0}).x[0, 1]), 4)
+    1.2408
+    """
+
+    elements: tuple[Element, ...]
+    energy: ArrayLike
+    name: str = "line"
+    mass: float = ELECTRON_MASS
+    energy_spread: ArrayLike = 0.0
+
+    def __post_init__(self) -> None:
+        named = [e.name for e in self.elements if e.setting is not None or isinstance(e, Screen)]
+        twice = sorted({n for n in named if named.count(n) > 1})
+        if twice:
+            raise InputError(
+                f"the name '{twice[0]}' used twice in line '{self.name}'",
+                "a name of its own for each magnet and screen",
+            )
+
+    def __getitem__(self, name: str) -> Element:
+        return self.elements[self._index(name)]
+
+    def __len__(self) -> int:
+        return len(self.elements)
+
+    def _index(self, name: str) -> int:
+        names = [e.name for e in self.elements]
+        if name not in names:
+            raise InputError(f"no element '{name}' in line '{self.name}'", nearest(name, names))
+        return names.index(name)
+
+    @property
+    def magnets(self) -> tuple[str, ...]:
+        """Names of the elements that have a setting."""
+        return tuple(e.name for e in self.elements if e.setting is not None)
+
+    @property
+    def screens(self) -> tuple[str, ...]:
+        """Names of the screens."""
+        return tuple(e.name for e in self.elements if isinstance(e, Screen))
+
+    @property
+    def length(self) -> ArrayLike:
+        """Length along the reference orbit, m."""
+        return sum(e.length for e in self.elements)
+
+    def between(self, first: str, last: str) -> Beamline:
+        """Cut out the line from the exit of ``first`` to the exit of ``last``.
+
+        Parameters
+        ----------
+        first, last : str
+            Element names, ``first`` upstream of ``last``.
+
+        Returns
+        -------
+        Beamline
+            The part, so that ``line.between(a, c)`` is ``a..b`` followed by ``b..c``.
+
+        Raises
+        ------
+        InputError
+            If a name is unknown or the order is reversed.
+
+        Examples
+        --------
+        >>> line = Beamline((Marker("A"), Marker("B"), Marker("C")), energy=100.0)
+        >>> [e.name for e in line.between("A", "C").elements]
+        ['B', 'C']
+        """
+        i, j = self._index(first), self._index(last)
+        if i > j:
+            raise InputError(f"'{first}' lies downstream of '{last}'", "the upstream name first")
+        return replace(self, elements=self.elements[i + 1 : j + 1])
+
+    def upto(self, last: str) -> Beamline:
+        """Cut the line after ``last``; the part keeps the start.
+
+        Examples
+        --------
+        >>> line = Beamline((Marker("A"), Marker("B"), Marker("C")), energy=100.0)
+        >>> [e.name for e in line.upto("B").elements]
+        ['A', 'B']
+        """
+        return replace(self, elements=self.elements[: self._index(last) + 1])
+
+    def with_element(self, element: Element) -> Beamline:
+        """Return the line with the element of the same name replaced.
+
+        Examples
+        --------
+        >>> line = Beamline((Screen("S"),), energy=100.0)
+        >>> line.with_element(Screen("S", resolution=1e-5))["S"].resolution
+        1e-05
+        """
+        i = self._index(element.name)
+        return replace(self, elements=(*self.elements[:i], element, *self.elements[i + 1 :]))
+
+    def matrix(
+        self,
+        settings: Mapping[str, ArrayLike] | None = None,
+        energy: ArrayLike | None = None,
+    ) -> TransferMatrix:
+        """Transfer matrix from the start of the line to its end.
+
+        A JAX function of the settings, the energy and every number of the line: jit, vmap,
+        and differentiate it at will.
+
+        Parameters
+        ----------
+        settings : mapping of str to float, optional
+            Magnet name to setting, in the unit of that magnet's calibration; a magnet not
+            named keeps its own setting.
+        energy : float, optional
+            Total energy in MeV; the line's own if None.
+
+        Returns
+        -------
+        TransferMatrix
+            Both planes, each of shape (3, 3).
+
+        Raises
+        ------
+        InputError
+            If a setting names no magnet of the line.
+
+        Notes
+        -----
+        R = R_n … R_2 R_1, report eqs 30-31.
+        """
+        settings = dict(settings or {})
+        unknown = sorted(set(settings) - set(self.magnets))
+        if unknown:
+            raise InputError(
+                f"a setting for '{unknown[0]}'", nearest(unknown[0], list(self.magnets))
+            )
+        energy = self.energy if energy is None else energy
+        parts = (e.matrix(settings.get(e.name), energy) for e in self.elements)
+        return reduce(lambda total, part: part @ total, parts, Marker("start").matrix())

@@ -1,0 +1,173 @@
+"""What a magnet's setting means: from amperes, kilogauss or 1/m² to focusing strength.
+
+Each calibration is a frozen value with ``unit`` (the word a scan's column header ends in) and
+``k1l(setting, length, energy)``, the integrated strength in 1/m.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+from typing import ClassVar
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+from jax.typing import ArrayLike
+
+from beamfit.optics.particle import ELECTRON_MASS, rigidity
+
+__all__ = [
+    "Calibration",
+    "CurrentPolynomial",
+    "FocusingStrength",
+    "IntegratedGradient",
+    "IntegratedStrength",
+    "SlopeIntercept",
+]
+
+
+@partial(jax.tree_util.register_dataclass, data_fields=["slope", "intercept"], meta_fields=[])
+@dataclass(frozen=True)
+class SlopeIntercept:
+    """Focusing strength linear in the current: k1 = (slope · I + intercept)/E.
+
+    Report eq. 40 and the text after eq. 22; its α, β are ``slope``, ``intercept``.
+
+    Parameters
+    ----------
+    slope : float
+        MeV/(m² A).
+    intercept : float
+        MeV/m², the focusing that remains at zero current.
+
+    Examples
+    --------
+    >>> q = SlopeIntercept(slope=167.23, intercept=43.17)
+    >>> round(float(q.k1l(1.0, length=0.07677, energy=30.5)) / 0.07677, 4)
+    6.8984
+    """
+
+    slope: ArrayLike
+    intercept: ArrayLike
+    unit: ClassVar[str] = "A"
+
+    def k1l(self, setting: ArrayLike, length: ArrayLike, energy: ArrayLike) -> Array:
+        """Integrated strength in 1/m at a current in A, a length in m, an energy in MeV."""
+        return jnp.asarray((self.slope * setting + self.intercept) / energy * length)
+
+
+@partial(
+    jax.tree_util.register_dataclass,
+    data_fields=["coefficients"],
+    meta_fields=["signed_intercept", "mass"],
+)
+@dataclass(frozen=True)
+class CurrentPolynomial:
+    """Gradient as a polynomial of the current, from a magnetic measurement.
+
+    G(I) = c0 + c1 I + c2 I² + … in T/m, and k1 = G/(Bρ).
+
+    Parameters
+    ----------
+    coefficients : tuple of float
+        c0, c1, … in T/m, T/(m A), …; any order.
+    signed_intercept : bool
+        The remanent field c0 takes the sign of the current, as it does in a magnet that is
+        cycled to the same polarity before each use.
+    mass : float
+        Rest energy of the particle, MeV.
+
+    Examples
+    --------
+    >>> q = CurrentPolynomial((0.1, 2.0, -0.01), signed_intercept=True)
+    >>> [round(float(q.gradient(i)), 3) for i in (-1.0, 1.0)]
+    [-2.11, 2.09]
+    """
+
+    coefficients: tuple[ArrayLike, ...]
+    signed_intercept: bool = False
+    mass: float = ELECTRON_MASS
+    unit: ClassVar[str] = "A"
+
+    def gradient(self, current: ArrayLike) -> Array:
+        """Gradient in T/m at a current in A."""
+        remanent, *rest = self.coefficients
+        if self.signed_intercept:
+            remanent = remanent * jnp.sign(current)
+        rising = sum(c * current ** (n + 1) for n, c in enumerate(rest))
+        return jnp.asarray(remanent + rising, float)
+
+    def k1l(self, setting: ArrayLike, length: ArrayLike, energy: ArrayLike) -> Array:
+        """Integrated strength in 1/m at a current in A, a length in m, an energy in MeV."""
+        return self.gradient(setting) * length / rigidity(energy, self.mass)
+
+
+@partial(jax.tree_util.register_dataclass, data_fields=["scale"], meta_fields=["mass"])
+@dataclass(frozen=True)
+class IntegratedGradient:
+    """The setting is the integrated gradient in kG; positive focuses x.
+
+    Parameters
+    ----------
+    scale : float
+        Factor on the setting; 1 trusts the control system.
+    mass : float
+        Rest energy of the particle, MeV.
+
+    Examples
+    --------
+    >>> round(float(IntegratedGradient().k1l(-4.219084, length=0.108, energy=135.0)), 6)
+    -0.936932
+    """
+
+    scale: ArrayLike = 1.0
+    mass: float = ELECTRON_MASS
+    unit: ClassVar[str] = "kG"
+
+    def k1l(self, setting: ArrayLike, length: ArrayLike, energy: ArrayLike) -> Array:
+        """Integrated strength in 1/m at an integrated gradient in kG and an energy in MeV."""
+        return jnp.asarray(0.1 * self.scale * setting / rigidity(energy, self.mass))
+
+
+@partial(jax.tree_util.register_dataclass, data_fields=["scale"], meta_fields=[])
+@dataclass(frozen=True)
+class FocusingStrength:
+    """The setting is k1 itself, in 1/m²; positive focuses x.
+
+    Examples
+    --------
+    >>> float(FocusingStrength().k1l(6.0, length=0.5, energy=100.0))
+    3.0
+    """
+
+    scale: ArrayLike = 1.0
+    unit: ClassVar[str] = "k1"
+
+    def k1l(self, setting: ArrayLike, length: ArrayLike, energy: ArrayLike) -> Array:
+        """Integrated strength in 1/m at a k1 in 1/m² and a length in m."""
+        return jnp.asarray(self.scale * setting * length)
+
+
+@partial(jax.tree_util.register_dataclass, data_fields=["scale"], meta_fields=[])
+@dataclass(frozen=True)
+class IntegratedStrength:
+    """The setting is the inverse focal length k1·L of a thin lens, in 1/m.
+
+    Examples
+    --------
+    >>> float(IntegratedStrength().k1l(0.25, length=0.0, energy=100.0))
+    0.25
+    """
+
+    scale: ArrayLike = 1.0
+    unit: ClassVar[str] = "k1l"
+
+    def k1l(self, setting: ArrayLike, length: ArrayLike, energy: ArrayLike) -> Array:
+        """Integrated strength in 1/m, which is the setting."""
+        return jnp.asarray(self.scale * setting)
+
+
+Calibration = (
+    SlopeIntercept | CurrentPolynomial | IntegratedGradient | FocusingStrength | IntegratedStrength
+)

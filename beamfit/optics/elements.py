@@ -1,0 +1,345 @@
+"""The elements of a beam line. Each is a frozen value with ``matrix(setting, energy)``.
+
+The mathematics is in focusing.py; here each element only says which strength, length and
+edges it has in each plane. Positive k1 focuses x.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+from typing import ClassVar, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+from jax.typing import ArrayLike
+
+from beamfit.optics.calibration import Calibration, FocusingStrength, IntegratedStrength
+from beamfit.optics.focusing import focusing
+
+__all__ = [
+    "Drift",
+    "Element",
+    "Marker",
+    "Quadrupole",
+    "Screen",
+    "SectorDipole",
+    "ThinLens",
+    "TransferMatrix",
+    "hard_edge_slice",
+]
+
+_BY_K1, _BY_K1L = FocusingStrength(), IntegratedStrength()
+
+
+class TransferMatrix(NamedTuple):
+    """Linear map of both planes, uncoupled, with dispersion.
+
+    Attributes
+    ----------
+    x, y : Array
+        Shape (..., 3, 3), acting on (u in m, u' in rad, δ = Δp/p). ``x[..., 0, 1]`` is R12,
+        ``y[..., 0, 1]`` is R34, ``x[..., 0, 2]`` is R16.
+
+    Examples
+    --------
+    >>> drift = Drift("D", 2.0).matrix()
+    >>> float((drift @ drift).x[0, 1])
+    4.0
+    """
+
+    x: Array
+    y: Array
+
+    def __matmul__(self, earlier: object) -> TransferMatrix:
+        """Compose with the map the beam meets first: (B @ A) is A, then B."""
+        if not isinstance(earlier, TransferMatrix):
+            return NotImplemented
+        return TransferMatrix(self.x @ earlier.x, self.y @ earlier.y)
+
+
+def _matrix(
+    r11: ArrayLike, r12: ArrayLike, r21: ArrayLike, r22: ArrayLike, r16: ArrayLike, r26: ArrayLike
+) -> Array:
+    rows = [[r11, r12, r16], [r21, r22, r26], [0.0, 0.0, 1.0]]
+    return jnp.stack([jnp.stack([jnp.asarray(e, float) for e in row]) for row in rows])
+
+
+def _thick(k: ArrayLike, length: ArrayLike, curvature: ArrayLike = 0.0) -> Array:
+    """One plane of constant focusing k (1/m²) and curvature h (1/m): u'' + k u = h δ."""
+    c, s, d = focusing(k, length)
+    return _matrix(c, s, -k * s, c, curvature * d, curvature * s)
+
+
+def _kick(strength: ArrayLike) -> Array:
+    """One plane of a thin lens: u' changes by -strength · u, strength in 1/m."""
+    return _matrix(1.0, 0.0, -strength, 1.0, 0.0, 0.0)
+
+
+@partial(jax.tree_util.register_dataclass, data_fields=["length"], meta_fields=["name"])
+@dataclass(frozen=True)
+class Drift:
+    """A field-free length in m (report eq. 21).
+
+    Examples
+    --------
+    >>> float(Drift("D1", 1.5).matrix().y[0, 1])
+    1.5
+    """
+
+    name: str
+    length: ArrayLike
+    setting: ClassVar[None] = None
+
+    def matrix(self, setting: ArrayLike | None = None, energy: ArrayLike = 1.0) -> TransferMatrix:
+        """Transfer matrix of the drift, the same in both planes."""
+        r = _thick(0.0, self.length)
+        return TransferMatrix(r, r)
+
+
+@partial(
+    jax.tree_util.register_dataclass,
+    data_fields=["length", "setting", "calibration"],
+    meta_fields=["name"],
+)
+@dataclass(frozen=True)
+class Quadrupole:
+    """A quadrupole of constant gradient (report eqs 20 and 22).
+
+    Parameters
+    ----------
+    name : str
+        Its name in the lattice and in the scan's column headers.
+    length : float
+        Effective length in m.
+    setting : float
+        What it is set to when a scan does not say, in the calibration's unit.
+    calibration : Calibration
+        From setting to strength; k1 in 1/m² unless given.
+
+    Examples
+    --------
+    >>> q = Quadrupole("Q", 0.1, setting=0.0)
+    >>> bool((q.matrix().x == Drift("D", 0.1).matrix().x).all())
+    True
+    """
+
+    name: str
+    length: ArrayLike
+    setting: ArrayLike = 0.0
+    calibration: Calibration = _BY_K1
+
+    def k1(self, setting: ArrayLike | None = None, energy: ArrayLike = 1.0) -> Array:
+        """Focusing strength in 1/m², positive in x, at a setting and an energy in MeV."""
+        setting = self.setting if setting is None else setting
+        return self.calibration.k1l(setting, self.length, energy) / self.length
+
+    def matrix(self, setting: ArrayLike | None = None, energy: ArrayLike = 1.0) -> TransferMatrix:
+        """Transfer matrix at a setting (the element's own if None) and an energy in MeV."""
+        k1 = self.k1(setting, energy)
+        return TransferMatrix(_thick(k1, self.length), _thick(-k1, self.length))
+
+
+@partial(
+    jax.tree_util.register_dataclass,
+    data_fields=["setting", "calibration"],
+    meta_fields=["name"],
+)
+@dataclass(frozen=True)
+class ThinLens:
+    """A quadrupole of no length: u' changes by -k1l · u in x, +k1l · u in y.
+
+    Parameters
+    ----------
+    name : str
+        Its name.
+    setting : float
+        Inverse focal length in 1/m, or an integrated gradient, as the calibration says.
+    calibration : Calibration
+        `IntegratedStrength` or `IntegratedGradient`.
+
+    Examples
+    --------
+    >>> ThinLens("L", 0.5).matrix().x[1, 0].item()
+    -0.5
+    """
+
+    name: str
+    setting: ArrayLike = 0.0
+    calibration: Calibration = _BY_K1L
+    length: ClassVar[float] = 0.0
+
+    def matrix(self, setting: ArrayLike | None = None, energy: ArrayLike = 1.0) -> TransferMatrix:
+        """Transfer matrix at a setting (the element's own if None) and an energy in MeV."""
+        setting = self.setting if setting is None else setting
+        k1l = self.calibration.k1l(setting, 0.0, energy)
+        return TransferMatrix(_kick(k1l), _kick(-k1l))
+
+
+def hard_edge_slice(
+    angle: ArrayLike, exit_edge: ArrayLike, energy_ratio: ArrayLike
+) -> tuple[Array, Array]:
+    """Bend angle and exit edge angle of a slice of another energy in the same fixed magnet.
+
+    The slice enters on the reference axis, follows a circle of radius ρ·r through the uniform
+    field and leaves where that circle meets the exit pole face, which stays where it is. With
+    the pole face at ν = α - ψ_exit to the entrance, the exit angle α' solves
+    sin(α' - ν) = (sin ψ_exit + sin ν)/r - sin ν, exactly.
+
+    Parameters
+    ----------
+    angle : float
+        Reference bend angle α, rad.
+    exit_edge : float
+        Exit pole-face angle ψ_exit, rad; positive defocuses the bend plane.
+    energy_ratio : float
+        r = momentum of the slice over the reference momentum.
+
+    Returns
+    -------
+    tuple of Array
+        α' and ψ_exit' = ψ_exit + (α' - α), rad.
+
+    Notes
+    -----
+    The report prints Δα = α(r - 1) (text after eq. 28). A stiffer slice is bent less, so the
+    sign there is wrong: to first order Δα = -(r - 1)(sin ψ_exit + sin ν)/cos ψ_exit, which is
+    -α(r - 1) only for a thin wedge. tests/optics/test_dipole_tracking.py tracks particles
+    through the field and settles it. The report's tan ψ_exit + Δα is tan(ψ_exit + Δα) to
+    first order.
+
+    Examples
+    --------
+    >>> bend, _ = hard_edge_slice(angle=1.0, exit_edge=0.0, energy_ratio=1.01)
+    >>> bool(bend < 1.0)
+    True
+    """
+    face = angle - exit_edge
+    sine = (jnp.sin(exit_edge) + jnp.sin(face)) / energy_ratio - jnp.sin(face)
+    at_exit = jnp.arcsin(sine)
+    return face + at_exit, at_exit
+
+
+@partial(
+    jax.tree_util.register_dataclass,
+    data_fields=["radius", "angle", "entrance_edge", "exit_edge", "energy_offset", "k1"],
+    meta_fields=["name", "bend_plane"],
+)
+@dataclass(frozen=True)
+class SectorDipole:
+    """A hard-edged sector dipole with pole-face rotations, in both planes.
+
+    The bend plane is edge · sector · edge with dispersion; the other plane is edge · drift ·
+    edge, which is the matrix of report eqs 24-28 (eq. 27 with 1/ρ before the whole bracket;
+    as printed its determinant is 0.82).
+
+    Parameters
+    ----------
+    name : str
+        Its name.
+    radius : float
+        Bending radius ρ in m.
+    angle : float
+        Bend angle α in rad.
+    entrance_edge, exit_edge : float
+        Pole-face rotations ψ in rad; positive focuses the plane across the bend.
+    bend_plane : {"x", "y"}
+        The plane that is bent.
+    energy_offset : float
+        E_slice/E_proj - 1 of the slice that is transported.
+    k1 : float
+        Gradient in the magnet, 1/m², positive focuses x.
+
+    Notes
+    -----
+    The body solves u'' + (h² + k) u = h δ in the bend plane, u'' - k u = 0 across it; a
+    rotated edge is a thin lens of strength ∓tan ψ/ρ (K. L. Brown, SLAC-75, wedge magnets).
+    Both are held against another program and against particles tracked through the field.
+
+    Examples
+    --------
+    >>> spec = SectorDipole("SPEC", 0.4, 1.0471975512, 0.0441568, 0.2354449, bend_plane="y")
+    >>> [round(float(spec.matrix().x[0, j]), 6) for j in (0, 1)]
+    [0.953729, 0.418879]
+    """
+
+    name: str
+    radius: ArrayLike
+    angle: ArrayLike
+    entrance_edge: ArrayLike = 0.0
+    exit_edge: ArrayLike = 0.0
+    bend_plane: str = "x"
+    energy_offset: ArrayLike = 0.0
+    k1: ArrayLike = 0.0
+    setting: ClassVar[None] = None
+
+    @property
+    def length(self) -> ArrayLike:
+        """Length of the reference orbit in the magnet, m."""
+        return self.radius * self.angle
+
+    def matrix(self, setting: ArrayLike | None = None, energy: ArrayLike = 1.0) -> TransferMatrix:
+        """Transfer matrix about the slice's own orbit; setting and energy do not enter."""
+        ratio = 1.0 + jnp.asarray(self.energy_offset, float)
+        angle, exit_edge = hard_edge_slice(self.angle, self.exit_edge, ratio)
+        radius = self.radius * ratio
+        h, length = 1.0 / radius, radius * angle
+        k_bend = (self.k1 if self.bend_plane == "x" else -self.k1) / ratio
+        entry, leave = h * jnp.tan(self.entrance_edge), h * jnp.tan(exit_edge)
+        bent = _kick(-leave) @ _thick(h**2 + k_bend, length, h) @ _kick(-entry)
+        across = _kick(leave) @ _thick(-k_bend, length) @ _kick(entry)
+        return (
+            TransferMatrix(bent, across) if self.bend_plane == "x" else TransferMatrix(across, bent)
+        )
+
+
+@partial(jax.tree_util.register_dataclass, data_fields=[], meta_fields=["name"])
+@dataclass(frozen=True)
+class Marker:
+    """A named place of no length.
+
+    Examples
+    --------
+    >>> Marker("M").matrix().x.tolist() == jnp.eye(3).tolist()
+    True
+    """
+
+    name: str
+    length: ClassVar[float] = 0.0
+    setting: ClassVar[None] = None
+
+    def matrix(self, setting: ArrayLike | None = None, energy: ArrayLike = 1.0) -> TransferMatrix:
+        """Return the identity in both planes."""
+        return TransferMatrix(jnp.eye(3), jnp.eye(3))
+
+
+@partial(jax.tree_util.register_dataclass, data_fields=["resolution"], meta_fields=["name"])
+@dataclass(frozen=True)
+class Screen:
+    """A place where the beam size is measured.
+
+    Parameters
+    ----------
+    name : str
+        Its name, as in a scan's ``screen`` column.
+    resolution : float
+        Point-spread rms in m, which adds to every measured size in quadrature.
+
+    Examples
+    --------
+    >>> Screen("OTR2", resolution=5e-6).resolution
+    5e-06
+    """
+
+    name: str
+    resolution: ArrayLike = 0.0
+    length: ClassVar[float] = 0.0
+    setting: ClassVar[None] = None
+
+    def matrix(self, setting: ArrayLike | None = None, energy: ArrayLike = 1.0) -> TransferMatrix:
+        """Return the identity in both planes."""
+        return TransferMatrix(jnp.eye(3), jnp.eye(3))
+
+
+Element = Drift | Quadrupole | ThinLens | SectorDipole | Marker | Screen
