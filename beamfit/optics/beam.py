@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 from jax.typing import ArrayLike
 
@@ -76,7 +77,7 @@ class BeamMatrix:
         """
         determinant = s11 * s22 - s12 * s12
         known = not isinstance(determinant, jax.core.Tracer)
-        if known and not (jnp.all(jnp.asarray(s11) > 0) and jnp.all(determinant > 0)):
+        if known and not (np.all(np.asarray(s11) > 0) and np.all(np.asarray(determinant) > 0)):
             raise InputError(
                 f"sigma11 = {s11}, sigma12 = {s12}, sigma22 = {s22}",
                 "sigma11 > 0 and sigma11*sigma22 > sigma12**2: a positive definite matrix",
@@ -94,7 +95,7 @@ class BeamMatrix:
             If ε or β is known and not positive.
         """
         for name, value in (("emittance", emittance), ("beta", beta)):
-            if not isinstance(value, jax.core.Tracer) and not jnp.all(jnp.asarray(value) > 0):
+            if not isinstance(value, jax.core.Tracer) and not np.all(np.asarray(value) > 0):
                 raise InputError(f"{name} = {value}", "a positive number")
         root = jnp.sqrt(emittance / beta)
         return cls(beta * root, -alpha * root, root)

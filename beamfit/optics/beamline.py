@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import partial, reduce
+from typing import NamedTuple
 
 import jax
 from jax.typing import ArrayLike
@@ -13,13 +14,29 @@ from beamfit.errors import InputError, nearest
 from beamfit.optics.elements import Element, Marker, Screen, TransferMatrix
 from beamfit.optics.particle import ELECTRON_MASS
 
-__all__ = ["Beamline"]
+__all__ = ["Beamline", "Design"]
+
+
+class Design(NamedTuple):
+    """Twiss parameters a line was designed for.
+
+    Attributes
+    ----------
+    at : str
+        The element at whose exit they hold.
+    x, y : tuple of float, optional
+        (β in m, α) of each plane.
+    """
+
+    at: str
+    x: tuple[float, float] | None = None
+    y: tuple[float, float] | None = None
 
 
 @partial(
     jax.tree_util.register_dataclass,
     data_fields=["elements", "energy", "energy_spread"],
-    meta_fields=["name", "mass"],
+    meta_fields=["name", "mass", "design"],
 )
 @dataclass(frozen=True)
 class Beamline:
@@ -37,18 +54,19 @@ class Beamline:
         Rest energy of the particle in MeV.
     energy_spread : float
         Relative momentum spread σ_δ, which widens the beam where there is dispersion.
+    design : Design, optional
+        The Twiss parameters the line was designed for, at one of its elements.
 
-    Raises
-    ------
-    InputError
-        If two magnets or screens share a name.
+    Notes
+    -----
+    Magnets of one name are in series on one supply: a setting of that name sets them all.
 
     Examples
     --------
     >>> from beamfit.optics.elements import Drift, Quadrupole
     >>> line = Beamline((Quadrupole("Q", 0.1), Drift("D", 2.0), Screen("S")), energy=135.0)
     >>> round(float(line.matrix({"Q": 4.0}).x[0, 1]), 4)
-    1.2408
+    2.0595
     """
 
     elements: tuple[Element, ...]
@@ -56,15 +74,7 @@ class Beamline:
     name: str = "line"
     mass: float = ELECTRON_MASS
     energy_spread: ArrayLike = 0.0
-
-    def __post_init__(self) -> None:
-        named = [e.name for e in self.elements if e.setting is not None or isinstance(e, Screen)]
-        twice = sorted({n for n in named if named.count(n) > 1})
-        if twice:
-            raise InputError(
-                f"the name '{twice[0]}' used twice in line '{self.name}'",
-                "a name of its own for each magnet and screen",
-            )
+    design: Design | None = None
 
     def __getitem__(self, name: str) -> Element:
         return self.elements[self._index(name)]
@@ -81,7 +91,7 @@ class Beamline:
     @property
     def magnets(self) -> tuple[str, ...]:
         """Names of the elements that have a setting."""
-        return tuple(e.name for e in self.elements if e.setting is not None)
+        return tuple(dict.fromkeys(e.name for e in self.elements if e.setting is not None))
 
     @property
     def screens(self) -> tuple[str, ...]:
@@ -134,7 +144,7 @@ class Beamline:
         return replace(self, elements=self.elements[: self._index(last) + 1])
 
     def with_element(self, element: Element) -> Beamline:
-        """Return the line with the element of the same name replaced.
+        """Return the line with every element of the same name replaced.
 
         Examples
         --------
@@ -142,8 +152,10 @@ class Beamline:
         >>> line.with_element(Screen("S", resolution=1e-5))["S"].resolution
         1e-05
         """
-        i = self._index(element.name)
-        return replace(self, elements=(*self.elements[:i], element, *self.elements[i + 1 :]))
+        self._index(element.name)  # says so if there is none
+        return replace(
+            self, elements=tuple(element if e.name == element.name else e for e in self.elements)
+        )
 
     def matrix(
         self,

@@ -194,9 +194,12 @@ def test_unknown_magnet_offers_the_nearest(gtf):
         gtf.matrix({"QZ2": 1.0})
 
 
-def test_same_name_twice_is_refused():
-    with pytest.raises(InputError, match="'Q' used twice"):
-        Beamline((Quadrupole("Q", 0.1), Quadrupole("Q", 0.1)), energy=100.0)
+def test_magnets_of_one_name_share_a_setting():
+    line = Beamline((Quadrupole("Q", 0.1), Drift("D", 1.0), Quadrupole("Q", 0.1)), energy=100.0)
+    single = Quadrupole("Q", 0.1).matrix(3.0)
+    expected = single @ Drift("D", 1.0).matrix() @ single
+    np.testing.assert_allclose(line.matrix({"Q": 3.0}).x, expected.x, rtol=1e-14)
+    assert line.magnets == ("Q",)
 
 
 def test_calibrations_agree_where_they_mean_the_same_field():

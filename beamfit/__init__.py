@@ -1,0 +1,44 @@
+"""Beam emittance and lifetime from quadrupole scans and current records.
+
+>>> import beamfit
+>>> beam = beamfit.BeamMatrix.from_twiss(emittance=2.67e-9, beta=1.28, alpha=-0.08)
+>>> f"{beam.normalized_emittance(135.0) * 1e6:.3f} um"
+'0.705 um'
+"""
+
+from importlib import import_module
+
+__version__ = "0.1.0"
+
+# Public name -> module. Loaded on first use, so that `beamfit --help` and a bad file are
+# answered before JAX has been imported.
+_HOME = {
+    "BeamMatrix": "beamfit.optics.beam",
+    "Beamline": "beamfit.optics.beamline",
+    "Drift": "beamfit.optics.elements",
+    "EmittanceFit": "beamfit.studies.results",
+    "InputError": "beamfit.errors",
+    "QuadScan": "beamfit.studies.scans",
+    "Quadrupole": "beamfit.optics.elements",
+    "Screen": "beamfit.optics.elements",
+    "SectorDipole": "beamfit.optics.elements",
+    "ThinLens": "beamfit.optics.elements",
+    "fit_emittance": "beamfit.studies.emittance",
+    "fit_sizes": "beamfit.studies.sigma",
+    "load_lattice": "beamfit.io.lattice",
+    "read_quad_scan": "beamfit.io.measurement",
+    "systematics": "beamfit.studies.sensitivity",
+    "write_report": "beamfit.report.page",
+}
+
+__all__ = ["__version__", *_HOME]
+
+
+def __getattr__(name: str) -> object:
+    if name not in _HOME:
+        raise AttributeError(f"module 'beamfit' has no attribute '{name}'")
+    return getattr(import_module(_HOME[name]), name)
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

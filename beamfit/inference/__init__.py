@@ -1,0 +1,1 @@
+"""Statistics that know nothing about beams: what data determine, and quantities with errors."""

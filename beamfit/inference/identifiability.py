@@ -1,0 +1,120 @@
+"""What a set of data determines about a set of parameters, by singular values."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy.special import chdtrc, ndtr, stdtr
+
+__all__ = ["Directions", "chi2_probability", "one_sided_probability", "scaled_directions"]
+
+
+class Directions(NamedTuple):
+    """Singular values of a scaled Jacobian and the directions the data leave open.
+
+    Attributes
+    ----------
+    singular_values : ndarray
+        Descending; each is one over the relative error along its direction.
+    condition : float
+        Largest over smallest; infinite if the smallest is zero.
+    undetermined : tuple of str
+        The directions whose relative error exceeds the limit, in words.
+    """
+
+    singular_values: np.ndarray
+    condition: float
+    undetermined: tuple[str, ...]
+
+
+def scaled_directions(
+    jacobian: np.ndarray, scale: np.ndarray, names: list[str], limit: float = 1 / 3
+) -> Directions:
+    """Decompose J · diag(scale): which combinations of parameters the residuals see.
+
+    Parameters
+    ----------
+    jacobian : ndarray
+        Shape (points, parameters): derivative of (model/error) by the parameters.
+    scale : ndarray
+        Shape (parameters,): the size of each parameter, so that a unit step means 100 %.
+    names : list of str
+        Parameter names, for the words.
+    limit : float
+        A direction with a larger relative error counts as undetermined.
+
+    Returns
+    -------
+    Directions
+        Singular values and open directions.
+
+    Notes
+    -----
+    With unit errors the covariance is (JᵀJ)⁻¹ = V S⁻² Vᵀ (the linear theory of least
+    squares), so the relative error along column k of V is 1/S_k.
+
+    Examples
+    --------
+    >>> found = scaled_directions(np.array([[10.0, 10.0], [10.0, 10.0]]), np.ones(2), ["a", "b"])
+    >>> found.undetermined
+    ('a - b',)
+    """
+    scaled = np.asarray(jacobian) * scale
+    if not np.isfinite(scaled).all():
+        return Directions(np.zeros(len(names)), np.inf, tuple(names))
+    _, values, rows = np.linalg.svd(scaled, full_matrices=True)
+    values = np.concatenate([values, np.zeros(len(names) - len(values))])
+    smallest = values[-1] if values[-1] > 1e-13 * values[0] else 0.0
+    open_rows = [row for value, row in zip(values, rows, strict=True) if value * limit < 1.0]
+    return Directions(
+        singular_values=values,
+        condition=float(values[0] / smallest) if smallest else np.inf,
+        undetermined=tuple(_in_words(row, names) for row in open_rows),
+    )
+
+
+def _in_words(row: np.ndarray, names: list[str]) -> str:
+    """Write a direction as a sum of its larger components."""
+    row = row / row[np.argmax(np.abs(row))]
+    terms = [(c, n) for c, n in zip(row, names, strict=True) if abs(c) >= 0.1]
+    words = ""
+    for coefficient, name in terms:
+        sign = " - " if coefficient < 0 else " + "
+        size = "" if round(abs(coefficient), 1) == 1.0 else f"{abs(coefficient):.1f} "
+        words += f"{sign}{size}{name}"
+    return words.removeprefix(" + ").strip() if not words.startswith(" - ") else words.strip()
+
+
+def chi2_probability(chi2: float, dof: int) -> float | None:
+    """Probability of a χ² at least this large if the errors are right; None without freedom.
+
+    Examples
+    --------
+    >>> round(chi2_probability(18.3, 2), 7)
+    0.0001063
+    """
+    return float(chdtrc(dof, chi2)) if dof > 0 else None
+
+
+def one_sided_probability(deviations: float, dof: int | None) -> float:
+    """Chance that noise alone lifts a quantity this many standard errors above zero.
+
+    Parameters
+    ----------
+    deviations : float
+        Value over its standard error.
+    dof : int or None
+        Degrees of freedom from which the error was taken, for Student's distribution; None
+        where the errors were known beforehand, for the normal one.
+
+    Examples
+    --------
+    >>> round(one_sided_probability(3.0, None), 5)
+    0.00135
+    >>> round(one_sided_probability(3.0, 2), 3)
+    0.048
+    """
+    if dof is None:
+        return float(ndtr(-deviations))
+    return float(stdtr(dof, -deviations)) if dof > 0 else 1.0

@@ -1,0 +1,86 @@
+"""A number with its error and unit, and the statuses a fit may end in."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from enum import StrEnum
+
+__all__ = ["Quantity", "Status"]
+
+_PREFIXES = ((1.0, ""), (1e-3, "m"), (1e-6, "µ"), (1e-9, "n"), (1e-12, "p"))
+
+
+class Status(StrEnum):
+    """How a fit ended. Anything but ``converged`` is a warning with a sentence beside it."""
+
+    converged = "converged"
+    poor_fit = "poor_fit"
+    unidentified = "unidentified"
+    at_limit = "at_limit"
+    infeasible = "infeasible"
+    not_finite = "not_finite"
+    not_converged = "not_converged"
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """A value, its standard error and its unit.
+
+    Parameters
+    ----------
+    value : float
+        In SI.
+    error : float or None
+        One standard deviation, scaled by sqrt(χ²/dof) where that exceeds 1; None where the
+        data do not determine the value.
+    unit : str
+        SI unit, "1" for a pure number.
+    error_raw : float or None
+        The error before that scaling.
+
+    Examples
+    --------
+    >>> print(Quantity(0.70468e-6, 0.0156e-6, "m"))
+    0.705 ± 0.016 µm
+    >>> print(Quantity(4.1e-8, None, "m"))
+    41 nm (not determined)
+    """
+
+    value: float
+    error: float | None
+    unit: str
+    error_raw: float | None = None
+
+    @property
+    def relative(self) -> float | None:
+        """Error over value, or None."""
+        return None if self.error is None or self.value == 0 else self.error / abs(self.value)
+
+    def to_json(self) -> dict[str, float | str | None]:
+        """Give the object of the JSON contract; numbers that are not finite are null."""
+        fields = {"value": self.value, "error": self.error, "error_raw": self.error_raw}
+        finite = {k: v if v is not None and math.isfinite(v) else None for k, v in fields.items()}
+        return {**finite, "unit": self.unit}
+
+    def __str__(self) -> str:
+        factor, unit = self._prefix()
+        end = f" {unit}" if unit else ""
+        value = self.value / factor
+        if self.error is None or not math.isfinite(self.error):
+            return f"{value:.3g}{end} (not determined)"
+        error = self.error / factor
+        places = 3 if error == 0 else 1 - math.floor(math.log10(error))
+        if abs(value) < 1e-3 or max(abs(value), error) >= 1e5:
+            power = math.floor(math.log10(max(abs(value), error)))
+            value, error, places = value / 10**power, error / 10**power, places + power
+            return f"({value:.{max(places, 0)}f} ± {error:.{max(places, 0)}f})e{power:+03d}{end}"
+        return f"{value:.{max(places, 0)}f} ± {error:.{max(places, 0)}f}{end}"
+
+    def _prefix(self) -> tuple[float, str]:
+        """Choose nm, µm, mm for lengths; leave other units alone."""
+        if self.unit != "m" or self.value == 0:
+            return 1.0, "" if self.unit == "1" else self.unit
+        size = max(abs(self.value), self.error or 0.0)
+        factor, prefix = next((p for p in _PREFIXES if size >= 0.1 * p[0]), _PREFIXES[-1])
+        return factor, prefix + self.unit

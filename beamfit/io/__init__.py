@@ -1,0 +1,1 @@
+"""Files in and out. The only package that opens files."""

@@ -1,0 +1,142 @@
+"""Reading text safely, digests, and writing so that no file is ever half there."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import tempfile
+from collections.abc import Iterator
+from os import PathLike
+from pathlib import Path
+
+from beamfit.errors import InputError
+
+__all__ = ["digest", "read_text", "text_lines", "write_atomically"]
+
+# A text line of a scan or a lattice is short; a longer one is another kind of file.
+LONGEST_LINE = 100_000
+LARGEST_TEXT = 4_000_000
+
+
+def _opened(path: str | PathLike[str]):
+    try:
+        return open(path, "rb")
+    except FileNotFoundError:
+        raise InputError("no such file", "an existing file", path=path) from None
+    except IsADirectoryError:
+        raise InputError("a directory", "a file", path=path) from None
+    except OSError as error:
+        raise InputError(
+            f"a file that cannot be read ({error.strerror})", "a readable file", path=path
+        ) from None
+
+
+def text_lines(path: str | PathLike[str]) -> Iterator[str]:
+    """Read a text file line by line in bounded memory.
+
+    Parameters
+    ----------
+    path : str or path
+        The file.
+
+    Yields
+    ------
+    str
+        A line, without its end.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be opened, is empty, is binary, is not UTF-8, or has a line longer
+        than any text table has.
+    """
+    number = 0
+    with _opened(path) as stream:
+        while raw := stream.readline(LONGEST_LINE + 1):
+            number += 1
+            if b"\0" in raw or raw.startswith(b"\x89HDF"):
+                raise InputError("a binary file", "a text file", path=path, line=number)
+            if len(raw) > LONGEST_LINE:
+                raise InputError(
+                    f"a line of more than {LONGEST_LINE} characters",
+                    "a text table",
+                    path=path,
+                    line=number,
+                )
+            try:
+                line = raw.decode("utf-8-sig" if number == 1 else "utf-8")
+            except UnicodeDecodeError:
+                raise InputError(
+                    "bytes that are not text", "UTF-8 text", path=path, line=number
+                ) from None
+            yield line.rstrip("\r\n")
+    if number == 0:
+        raise InputError("an empty file", "a file with content", path=path)
+
+
+def read_text(path: str | PathLike[str]) -> str:
+    """Read a whole text file of modest size, such as a lattice.
+
+    Raises
+    ------
+    InputError
+        As `text_lines`, and if the file is larger than any lattice.
+    """
+    lines, size = [], 0
+    for line in text_lines(path):
+        lines.append(line)
+        size += len(line) + 1
+        if size > LARGEST_TEXT:
+            raise InputError(
+                f"more than {LARGEST_TEXT // 1_000_000} MB of text", "a lattice file", path=path
+            )
+    return "\n".join(lines) + "\n"
+
+
+def digest(path: str | PathLike[str]) -> str:
+    """SHA-256 of a file, as hexadecimal digits."""
+    with _opened(path) as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
+
+
+def write_atomically(path: str | PathLike[str], content: bytes) -> None:
+    """Write a file so that a reader sees the old one or the whole new one, never a part.
+
+    Parameters
+    ----------
+    path : str or path
+        Where to.
+    content : bytes
+        What.
+
+    Raises
+    ------
+    InputError
+        If the place cannot be written.
+
+    Examples
+    --------
+    >>> import tempfile, pathlib
+    >>> target = pathlib.Path(tempfile.mkdtemp()) / "note.txt"
+    >>> write_atomically(target, b"whole")
+    >>> target.read_bytes()
+    b'whole'
+    """
+    target = Path(path)
+    temporary = None
+    try:
+        handle, temporary = tempfile.mkstemp(dir=target.parent, prefix=f".{target.name}.")
+        with os.fdopen(handle, "wb") as stream:
+            stream.write(content)
+            stream.flush()
+            os.fsync(stream.fileno())
+        umask = os.umask(0)
+        os.umask(umask)
+        os.chmod(temporary, 0o666 & ~umask)
+        os.replace(temporary, target)
+    except OSError as error:
+        if temporary is not None and os.path.exists(temporary):
+            os.unlink(temporary)
+        raise InputError(
+            f"a place that cannot be written ({error.strerror})", "a writable path", path=path
+        ) from None

@@ -1,0 +1,365 @@
+"""Lattice files: versioned TOML, checked line by line before any optics is built."""
+
+from __future__ import annotations
+
+import math
+import re
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from os import PathLike
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from beamfit.errors import InputError, nearest
+from beamfit.io.files import digest, read_text
+
+if TYPE_CHECKING:
+    from beamfit.optics.beamline import Beamline
+
+__all__ = ["LatticeFile", "load_lattice", "read_lattice"]
+
+FORMAT = "beamfit-lattice-1"
+FOREIGN = {".madx", ".seq", ".mad8", ".mad", ".lte", ".ele", ".elegant"}
+# Settings a magnet may be given, one of them; the key says the unit.
+STRENGTHS = {
+    "current_A": "A",
+    "integrated_gradient_kG": "kG",
+    "k1_per_m2": "k1",
+    "k1l_per_m": "k1l",
+}
+NUMBER, TEXT, LIST, FLAG = (int, float), str, list, bool
+POSITIVE = {"length_m", "radius_m", "beta_m"}
+ELEMENTS: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
+    # type: (required keys, optional keys)
+    "drift": ({"length_m": NUMBER}, {"name": TEXT}),
+    "quadrupole": (
+        {"name": TEXT, "length_m": NUMBER},
+        {
+            "current_A": NUMBER,
+            "slope": NUMBER,
+            "intercept": NUMBER,
+            "gradient_polynomial_T_per_m": LIST,
+            "signed_intercept": FLAG,
+            "integrated_gradient_kG": NUMBER,
+            "k1_per_m2": NUMBER,
+        },
+    ),
+    "thin_lens": ({"name": TEXT}, {"k1l_per_m": NUMBER, "integrated_gradient_kG": NUMBER}),
+    "sector_dipole": (
+        {"name": TEXT, "radius_m": NUMBER, "angle_deg": NUMBER, "bend_plane": TEXT},
+        {
+            "entrance_edge_deg": NUMBER,
+            "exit_edge_deg": NUMBER,
+            "energy_offset": NUMBER,
+            "k1_per_m2": NUMBER,
+        },
+    ),
+    "marker": ({"name": TEXT}, {}),
+    "screen": ({"name": TEXT}, {"resolution_um": NUMBER}),
+}
+TOP = (
+    {"format": TEXT, "energy_MeV": NUMBER, "element": LIST},
+    {"name": TEXT, "source": TEXT, "particle": TEXT, "energy_spread": NUMBER, "design": dict},
+)
+
+
+@dataclass(frozen=True)
+class LatticeFile:
+    """A checked lattice, as plain tables: no JAX needed to know what is in it.
+
+    Attributes
+    ----------
+    elements : tuple of dict
+        The element tables of the file, in order.
+    calibrations : dict of str to str
+        Magnet name to the unit of its setting.
+    """
+
+    path: str | PathLike[str]
+    sha256: str
+    name: str
+    energy: float
+    particle: str
+    energy_spread: float
+    elements: tuple[Mapping[str, Any], ...]
+    calibrations: Mapping[str, str]
+    design: Mapping[str, Any] | None = None
+    source: str = ""
+    foreign: Beamline | None = field(default=None, repr=False)
+
+    @property
+    def places(self) -> list[str]:
+        """Names at which a size may have been measured: screens and markers."""
+        return [e["name"] for e in self.elements if e["type"] in ("screen", "marker")]
+
+    @property
+    def default_screen(self) -> str | None:
+        """The last screen, used where a scan names none."""
+        screens = [e["name"] for e in self.elements if e["type"] == "screen"]
+        return screens[-1] if screens else None
+
+    def build(self) -> Beamline:
+        """Make the beam line (this loads JAX)."""
+        from beamfit.io.build import beamline_of
+
+        return self.foreign if self.foreign is not None else beamline_of(self)
+
+
+def load_lattice(
+    path: str | PathLike[str], *, use: str | None = None, energy: float | None = None
+) -> Beamline:
+    """Read a beam line from a file.
+
+    Parameters
+    ----------
+    path : str or path
+        A TOML lattice (docs/files.md), or a MAD-X (``.madx``, ``.seq``), MAD-8 (``.mad8``)
+        or elegant (``.lte``) file.
+    use : str, optional
+        Which line or sequence of a MAD-X or elegant file.
+    energy : float, optional
+        Total energy in MeV of an elegant file, which carries none; overrides a MAD-X beam.
+
+    Returns
+    -------
+    Beamline
+        The line.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be used, naming file, line and key.
+
+    Examples
+    --------
+    >>> import tempfile, pathlib
+    >>> file = pathlib.Path(tempfile.mkdtemp()) / "line.toml"
+    >>> _ = file.write_text('''format = "beamfit-lattice-1"
+    ... energy_MeV = 135.0
+    ... [[element]]
+    ... type = "quadrupole"
+    ... name = "Q"
+    ... length_m = 0.108
+    ... integrated_gradient_kG = -3.0
+    ... [[element]]
+    ... type = "screen"
+    ... name = "OTR"
+    ... ''')
+    >>> load_lattice(file).magnets
+    ('Q',)
+    """
+    return read_lattice(path, use=use, energy=energy).build()
+
+
+def read_lattice(
+    path: str | PathLike[str], *, use: str | None = None, energy: float | None = None
+) -> LatticeFile:
+    """Read and check a lattice file without building it; see `load_lattice`."""
+    if Path(path).suffix.lower() in FOREIGN:
+        from beamfit.io.sequence import read_sequence
+
+        return read_sequence(path, use=use, energy=energy)
+    return _Reader(path).lattice()
+
+
+class _Reader:
+    """One lattice file being checked; knows where in the text each key stands."""
+
+    def __init__(self, path: str | PathLike[str]) -> None:
+        self.path = path
+        self.text = read_text(path)
+        self.heads = [
+            n
+            for n, t in enumerate(self.text.splitlines(), 1)
+            if re.match(r"\s*\[\[\s*element\s*\]\]", t)
+        ]
+        try:
+            self.document = tomllib.loads(self.text)
+        except tomllib.TOMLDecodeError as error:
+            line = re.search(r"at line (\d+)", str(error))
+            what = re.sub(r"\s*\(at .*\)", "", str(error))
+            raise InputError(
+                f"TOML that does not parse ({what})",
+                "valid TOML",
+                path=path,
+                line=int(line[1]) if line else len(self.text.splitlines()),
+            ) from None
+
+    def error(
+        self, found: str, expected: str, key: str | None = None, element: int | None = None
+    ) -> InputError:
+        """Make the error that names the line on which the key (or its element) stands."""
+        return InputError(
+            found, expected, path=self.path, line=self._line(key, element), column=key
+        )
+
+    def _line(self, key: str | None, element: int | None) -> int:
+        lines = self.text.splitlines()
+        start = 0 if element is None or element >= len(self.heads) else self.heads[element] - 1
+        if key is not None:
+            # An element ends at the next table; the top level is searched to its first table.
+            for n in range(start, len(lines)):
+                if n > start and lines[n].lstrip().startswith("["):
+                    break
+                if re.match(rf"\s*['\"]?{re.escape(key)}['\"]?\s*=", lines[n]):
+                    return n + 1
+        return start + 1
+
+    def lattice(self) -> LatticeFile:
+        document = self.document
+        found = document.get("format")
+        if found != FORMAT:
+            raise self.error(f"format {found!r}", f'format = "{FORMAT}"', "format")
+        self.check_keys(document, *TOP, element=None)
+        energy, particle = document["energy_MeV"], document.get("particle", "electron")
+        if particle not in ("electron", "positron", "proton"):
+            raise self.error(f"particle '{particle}'", "electron, positron or proton", "particle")
+        rest = 938.272 if particle == "proton" else 0.511
+        if not rest < energy <= 1e7:
+            raise self.error(
+                f"{energy:g} MeV",
+                f"a total energy between {rest:g} MeV and 10 TeV; is it in GeV or eV?",
+                "energy_MeV",
+            )
+        elements = [self.element(e, i) for i, e in enumerate(document["element"])]
+        self.check_unique(elements)
+        return LatticeFile(
+            path=self.path,
+            sha256=digest(self.path),
+            name=document.get("name", Path(self.path).stem),
+            energy=float(energy),
+            particle=particle,
+            energy_spread=float(document.get("energy_spread", 0.0)),
+            elements=tuple(elements),
+            calibrations={
+                e["name"]: unit
+                for e in elements
+                for key, unit in STRENGTHS.items()
+                if key in e and e["type"] in ("quadrupole", "thin_lens")
+            },
+            design=self.design(elements),
+            source=document.get("source", ""),
+        )
+
+    def element(self, table: object, index: int) -> Mapping[str, Any]:
+        """Check one element table and return it with a name."""
+        if not isinstance(table, dict):
+            raise self.error(f"element {table!r}", "a table [[element]]", "element")
+        kind = table.get("type")
+        if kind not in ELEMENTS:
+            word = str(kind) if kind is not None else "no type"
+            raise self.error(
+                f"element {index + 1} of type '{word}'",
+                nearest(word, list(ELEMENTS)),
+                "type",
+                index,
+            )
+        required, optional = ELEMENTS[kind]
+        self.check_keys(table, required | {"type": TEXT}, optional, index)
+        if kind in ("quadrupole", "thin_lens"):
+            self.check_strength(table, index)
+        if kind == "sector_dipole" and table["bend_plane"] not in ("x", "y"):
+            raise self.error(f"bend_plane '{table['bend_plane']}'", "x or y", "bend_plane", index)
+        return {"name": f"{kind}{index + 1}"} | table
+
+    def check_keys(
+        self, table: Mapping, required: Mapping, optional: Mapping, element: int | None
+    ) -> None:
+        """Every required key, no unknown key, the right type, finite numbers."""
+        where = "at the top level" if element is None else f"in element {element + 1}"
+        for key in required:
+            if key not in table:
+                raise self.error(f"no '{key}' {where}", f"a line {key} = ...", None, element)
+        kinds = {**required, **optional}
+        for key, value in table.items():
+            if key not in kinds:
+                raise self.error(f"unknown key '{key}'", nearest(key, list(kinds)), key, element)
+            wrong = not isinstance(value, kinds[key]) or (
+                isinstance(value, bool) and kinds[key] is not FLAG
+            )
+            if wrong or (isinstance(value, float) and not math.isfinite(value)):
+                names = {
+                    NUMBER: "a number",
+                    TEXT: "text in quotes",
+                    LIST: "a list",
+                    FLAG: "true or false",
+                    dict: "a table",
+                }
+                raise self.error(f"{value!r}", names[kinds[key]], key, element)
+            if key in POSITIVE and not value > 0:
+                raise self.error(f"{value!r}", "a positive number", key, element)
+
+    def check_strength(self, table: Mapping, index: int) -> None:
+        """One setting, and with a current exactly one calibration."""
+        given = [k for k in STRENGTHS if k in table]
+        if len(given) != 1:
+            allowed = [k for k in STRENGTHS if k in ELEMENTS[table["type"]][1]]
+            raise self.error(
+                f"{table['name']} with " + (" and ".join(given) or "no setting"),
+                "one of " + ", ".join(allowed),
+                given[1] if len(given) > 1 else None,
+                index,
+            )
+        line = {"slope", "intercept"} & set(table)
+        polynomial = "gradient_polynomial_T_per_m" in table
+        if given[0] != "current_A":
+            if line or polynomial:
+                raise self.error(
+                    f"{table['name']} with {given[0]} and a current calibration",
+                    "current_A = ... for its setting, or no calibration",
+                    given[0],
+                    index,
+                )
+            return
+        if (len(line) == 2) == polynomial or len(line) == 1:
+            raise self.error(
+                f"{table['name']} set by current_A without one calibration",
+                "both slope and intercept, or gradient_polynomial_T_per_m",
+                "current_A",
+                index,
+            )
+        numbers = table.get("gradient_polynomial_T_per_m", [0.0, 1.0])
+        good = all(isinstance(c, NUMBER) and not isinstance(c, bool) for c in numbers)
+        if len(numbers) < 2 or not good:
+            raise self.error(
+                f"{numbers!r}",
+                "at least two numbers c0, c1, ... in T/m, T/(m A), ...",
+                "gradient_polynomial_T_per_m",
+                index,
+            )
+
+    def check_unique(self, elements: list[Mapping[str, Any]]) -> None:
+        seen: dict[str, int] = {}
+        for index, element in enumerate(elements):
+            if element["name"] in seen:
+                raise self.error(
+                    f"the name '{element['name']}' used again",
+                    f"another name: element {seen[element['name']] + 1} has it",
+                    "name",
+                    index,
+                )
+            seen[element["name"]] = index
+
+    def design(self, elements: list[Mapping[str, Any]]) -> Mapping[str, Any] | None:
+        """Check the design Twiss, if there is one."""
+        table = self.document.get("design")
+        if table is None:
+            return None
+        names = [e["name"] for e in elements]
+        if table.get("at") not in names:
+            raise self.error(
+                f"design Twiss at '{table.get('at')}'", nearest(str(table.get("at")), names)
+            )
+        for plane in [k for k in table if k != "at"]:
+            twiss = table[plane]
+            good = (
+                plane in ("x", "y")
+                and isinstance(twiss, dict)
+                and (set(twiss) == {"beta_m", "alpha"})
+            )
+            if not good or not twiss["beta_m"] > 0:
+                raise self.error(
+                    f"design {plane} = {twiss!r}", "x = { beta_m = ..., alpha = ... }, beta_m > 0"
+                )
+        return table

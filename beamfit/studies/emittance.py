@@ -1,0 +1,177 @@
+"""The emittance fit with known transport: a scan and a line in, a judged result out."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from beamfit.errors import InputError
+from beamfit.inference.identifiability import scaled_directions
+from beamfit.inference.quantity import Quantity
+from beamfit.optics.beamline import Beamline
+from beamfit.optics.particle import beta_gamma
+from beamfit.studies.plane import PlaneWork, next_measurement, work_on
+from beamfit.studies.results import EmittanceFit, Identifiability, PlaneFit, ScreenTwiss
+from beamfit.studies.scans import QuadScan, check_names
+from beamfit.studies.transport import names_of, plane_input, scanned_line
+from beamfit.studies.verdict import LOST, Verdict, judge, phase_coverage
+
+__all__ = ["fit_emittance"]
+
+METHODS = ("size_squared", "size")
+
+
+def fit_emittance(
+    scan: QuadScan,
+    line: Beamline,
+    *,
+    planes: tuple[str, ...] | None = None,
+    method: str = "size_squared",
+    robust: bool = False,
+) -> EmittanceFit:
+    """Fit the beam matrix at the start of a line to a scan, and judge the result.
+
+    Parameters
+    ----------
+    scan : QuadScan
+        The measured sizes.
+    line : Beamline
+        The line, from where the beam matrix is wanted to the screens.
+    planes : tuple of str, optional
+        ("x",), ("y",) or both; all planes of the scan if None.
+    method : {"size_squared", "size"}
+        The residual: the report's ``error_linear`` or ``error_nonlinear``.
+    robust : bool
+        Give each point a probability of being an outlier (with "size_squared").
+
+    Returns
+    -------
+    EmittanceFit
+        Values, errors, statuses and sentences; `print` it.
+
+    Raises
+    ------
+    InputError
+        If the line lacks a magnet or screen of the scan, or an option is unknown.
+
+    Notes
+    -----
+    One geometric beam matrix at the start is common to all rows, also where their energies
+    differ. Errors are those of the linear theory of least squares, propagated to ε, β, α by
+    their gradients; see docs/emittance.md.
+
+    Examples
+    --------
+    >>> from beamfit.optics.beam import BeamMatrix
+    >>> from beamfit.optics.elements import Drift, Quadrupole, Screen
+    >>> line = Beamline((Quadrupole("Q", 0.1), Drift("D", 2.0), Screen("S")), energy=135.0)
+    >>> k1 = np.linspace(-2.0, 12.0, 8)
+    >>> sizes = [float(BeamMatrix.from_twiss(2e-9, 5.0, 0.0).transport(
+    ...     line.matrix({"Q": k}).x).l11) for k in k1]
+    >>> scan = QuadScan({"Q": k1}, {"Q": "k1"}, {"x": sizes}, {"x": 0.02 * np.array(sizes)})
+    >>> fit = fit_emittance(scan, line)
+    >>> fit.x.status.value, f"{fit.x.emittance.value * 1e9:.4f} nm"
+    ('converged', '2.0000 nm')
+    """
+    _check_options(method, robust)
+    check_names(scan, *names_of(line))
+    scanned = scanned_line(scan, line)
+    asked = planes or scan.planes
+    # A plane that is not asked for still testifies to the settings and the optics.
+    works = {
+        plane: work_on(plane, plane_input(scan, line, plane), scanned, line, method, robust)
+        for plane in dict.fromkeys((*asked, *scan.planes))
+    }
+    clear = {plane: judge(w.evidence, None).cause is None for plane, w in works.items()}
+    fits = []
+    for plane in asked:
+        work, beside = works[plane], any(c for p, c in clear.items() if p != plane)
+        verdict, advice = judge(work.evidence, None, beside), None
+        if verdict.cause is not None:
+            advice = next_measurement(work, scanned)
+            verdict = judge(work.evidence, advice, beside)
+        fits.append(_plane_fit(work, line, verdict, advice))
+    return EmittanceFit(tuple(fits), scan, line)
+
+
+def _check_options(method: str, robust: bool) -> None:
+    if method not in METHODS:
+        raise InputError(f"method '{method}'", "size_squared or size")
+    if robust and method != "size_squared":
+        raise InputError("a robust fit of size", 'method "size_squared" with robust')
+
+
+def _plane_fit(w: PlaneWork, line: Beamline, verdict: Verdict, advice: str | None) -> PlaneFit:
+    """Assemble the result: errors only for what the data determine."""
+    sigma, e, d = w.fit.sigma, w.evidence, w.derived
+    determined = verdict.cause is None
+    # The three numbers of size² can be known although the emittance is not.
+    linear = determined or (e.full_rank and e.positive and e.misfit <= LOST and e.dof > 0)
+
+    def quantity(value: float, raw: float, unit: str, known: bool = determined) -> Quantity:
+        if not known or not math.isfinite(raw):
+            return Quantity(float(value), None, unit)
+        return Quantity(float(value), float(raw) * w.scale, unit, float(raw))
+
+    emittance, error = (float(d.start[0]) if e.positive else 0.0), d.start_error[0]
+    factor = float(beta_gamma(w.given.energy.mean(), line.mass))
+    raw = np.sqrt(np.diagonal(w.covariance))
+    residual = float(np.sqrt(np.mean((w.points.size - w.points.model) ** 2)))
+    return PlaneFit(
+        plane=w.plane,
+        status=verdict.status,
+        message=verdict.message,
+        emittance=quantity(emittance, error, "m"),
+        normalized_emittance=quantity(factor * emittance, factor * error, "m"),
+        beta=quantity(d.start[1], d.start_error[1], "m"),
+        alpha=quantity(d.start[2], d.start_error[2], "1"),
+        sigma=tuple(
+            quantity(sigma[i], raw[i], unit, linear) for i, unit in enumerate(("m^2", "m", "1"))
+        ),
+        screen=ScreenTwiss(
+            name=w.given.screens[-1],
+            settings=_own_settings(line, w.given.screens[-1]),
+            beta=quantity(d.screen[0], d.screen_error[0], "m"),
+            alpha=quantity(d.screen[1], d.screen_error[1], "1"),
+            size=quantity(d.screen[2], d.screen_error[2], "m", linear),
+        ),
+        mismatch=None
+        if line.design is None or getattr(line.design, w.plane) is None
+        else quantity(d.mismatch[0], d.mismatch_error[0], "1"),
+        chi2=e.chi2 if e.noise_known else None,
+        dof=e.dof,
+        rms_residual=Quantity(residual, None, "m"),
+        covariance=w.covariance if linear else np.full((3, 3), np.nan),
+        error_scale=w.scale,
+        noise="given" if e.noise_known else "inferred from the residuals",
+        method=w.method,
+        identifiability=_identifiability(w, determined, advice),
+        points=w.points,
+    )
+
+
+def _own_settings(line: Beamline, screen: str) -> dict[str, float]:
+    part = line.upto(screen)
+    return {name: float(line[name].setting) for name in part.magnets}
+
+
+def _identifiability(w: PlaneWork, determined: bool, advice: str | None) -> Identifiability:
+    p, sigma, e = w.points, w.fit.sigma, w.evidence
+    unit = np.array([sigma[0], math.sqrt(max(sigma[0] * sigma[2], 0.0)), sigma[2]])
+    design = np.stack([p.r11**2, 2 * p.r11 * p.r12, p.r12**2], -1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        jacobian = design / (2.0 * p.size * p.error * w.scale)[:, None]
+    found = scaled_directions(jacobian, unit, ["sigma11", "sigma12", "sigma22"])
+    open_ones = found.undetermined if determined else (*found.undetermined, "emittance")
+    beta, alpha = float(w.derived.start[1]), float(w.derived.start[2])
+    return Identifiability(
+        determined=determined,
+        singular_values=tuple(float(v) for v in found.singular_values),
+        condition=found.condition if math.isfinite(found.condition) else None,
+        waist_bracketed=e.bracketed,
+        phase_coverage=phase_coverage(p.r11, p.r12, beta, alpha),
+        zero_distance=min(e.determinant_distance, e.zero_distance),
+        undetermined=open_ones,
+        next_measurement=advice,
+    )

@@ -1,0 +1,281 @@
+"""A quadrupole scan as a value: settings, sizes and errors in SI, checked once.
+
+Plain numpy, so that a bad file is reported before JAX is ever loaded.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from os import PathLike
+from typing import NamedTuple
+
+import numpy as np
+
+from beamfit.errors import InputError, nearest
+
+__all__ = ["PlaneRows", "QuadScan", "check_names", "first_unusable"]
+
+PLANES = ("x", "y")
+
+
+class PlaneRows(NamedTuple):
+    """The rows of a scan in which one plane was measured.
+
+    Attributes
+    ----------
+    settings : dict of str to ndarray
+        Magnet name to settings, each of shape (n,).
+    size : ndarray
+        Rms beam size in m, shape (n,).
+    error : ndarray or None
+        Its standard error in m, shape (n,); None where the file has none.
+    energy : ndarray or None
+        Total energy in MeV, shape (n,).
+    screen : tuple of str or None
+        The screen of each row.
+    resolution : ndarray or None
+        Point-spread rms in m, shape (n,).
+    energy_spread : ndarray or None
+        Relative momentum spread, shape (n,).
+    """
+
+    settings: dict[str, np.ndarray]
+    size: np.ndarray
+    error: np.ndarray | None
+    energy: np.ndarray | None
+    screen: tuple[str, ...] | None
+    resolution: np.ndarray | None
+    energy_spread: np.ndarray | None
+
+
+def first_unusable(values: np.ndarray, *, blank: bool = False) -> tuple[int, str] | None:
+    """Find the first value that is not a positive finite number.
+
+    Parameters
+    ----------
+    values : ndarray
+        Sizes, errors or energies.
+    blank : bool
+        Whether NaN stands for a cell left blank, and is passed over.
+
+    Returns
+    -------
+    tuple of int and str, or None
+        Index and what was found there; None if all are usable.
+
+    Examples
+    --------
+    >>> first_unusable(np.array([1.0, -2.0]))
+    (1, 'the value -2')
+    """
+    wrong = ~(np.isfinite(values) & (values > 0))
+    if blank:
+        wrong &= ~np.isnan(values)
+    if not wrong.any():
+        return None
+    index = int(np.argmax(wrong))
+    return index, f"the value {values[index]:g}"
+
+
+@dataclass(frozen=True, eq=False)
+class QuadScan:
+    """Beam sizes against magnet settings, in one or both planes.
+
+    Parameters
+    ----------
+    settings : mapping of str to array
+        Magnet name to settings, each of shape (n,), in the unit ``units`` names.
+    units : mapping of str to str
+        Magnet name to ``"A"``, ``"kG"`` (integrated gradient), ``"k1"`` (1/m²) or ``"k1l"`` (1/m).
+    size : mapping of str to array
+        Plane ("x", "y") to rms sizes in m, shape (n,); NaN where a row has none.
+    error : mapping of str to array, optional
+        Plane to standard errors in m. A plane left out has no errors: the fit infers them.
+    energy : array, optional
+        Total energy of each row in MeV; the lattice's if None.
+    screen : sequence of str, optional
+        Screen of each row; the lattice's only one if None.
+    resolution, energy_spread : array, optional
+        Point-spread rms in m and relative momentum spread of each row.
+    shots : array, optional
+        How many shots each row is the mean of.
+    error_source : str
+        Where the errors come from, in words, for the report.
+    name, path, sha256 : str
+        What to call the scan, and the file it came from.
+    provenance : tuple of str
+        Comment lines of the file.
+    columns : mapping of str to str
+        What the file called each thing, for error messages.
+
+    Raises
+    ------
+    InputError
+        If sizes, errors or energies are not positive numbers, shapes differ, or fewer than
+        three distinct settings remain in a plane.
+
+    Examples
+    --------
+    >>> scan = QuadScan({"Q": [0.0, 1.0, 2.0]}, {"Q": "A"}, {"x": [2e-4, 1e-4, 3e-4]})
+    >>> scan.planes, len(scan)
+    (('x',), 3)
+    """
+
+    settings: Mapping[str, np.ndarray]
+    units: Mapping[str, str]
+    size: Mapping[str, np.ndarray]
+    error: Mapping[str, np.ndarray] = field(default_factory=dict)
+    energy: np.ndarray | None = None
+    screen: tuple[str, ...] | None = None
+    resolution: np.ndarray | None = None
+    energy_spread: np.ndarray | None = None
+    shots: np.ndarray | None = None
+    error_source: str = "given"
+    name: str = "scan"
+    path: str | PathLike[str] | None = None
+    sha256: str | None = None
+    provenance: tuple[str, ...] = ()
+    columns: Mapping[str, str] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        for key in ("settings", "size", "error"):
+            arrays = {k: np.asarray(v, float) for k, v in getattr(self, key).items()}
+            object.__setattr__(self, key, arrays)
+        for key in ("energy", "resolution", "energy_spread"):
+            if getattr(self, key) is not None:
+                object.__setattr__(self, key, np.asarray(getattr(self, key), float))
+        self._check_shapes()
+        self._check_values()
+        for plane in self.planes:
+            self._check_three_settings(plane)
+
+    def __len__(self) -> int:
+        return len(next(iter(self.settings.values())))
+
+    @property
+    def planes(self) -> tuple[str, ...]:
+        """The planes that were measured."""
+        return tuple(p for p in PLANES if p in self.size)
+
+    def rows(self, plane: str) -> PlaneRows:
+        """Select the rows in which one plane was measured.
+
+        Raises
+        ------
+        InputError
+            If the scan has no sizes of that plane.
+        """
+        if plane not in self.size:
+            raise self.unusable(f"no sizes in plane {plane}", f"a column size_{plane}_um")
+        keep = ~np.isnan(self.size[plane])
+        optional = (self.energy, self.resolution, self.energy_spread)
+        energy, resolution, spread = (None if v is None else v[keep] for v in optional)
+        return PlaneRows(
+            settings={name: values[keep] for name, values in self.settings.items()},
+            size=self.size[plane][keep],
+            error=self.error[plane][keep] if plane in self.error else None,
+            energy=energy,
+            screen=None
+            if self.screen is None
+            else tuple(s for s, k in zip(self.screen, keep, strict=True) if k),
+            resolution=resolution,
+            energy_spread=spread,
+        )
+
+    def unusable(self, found: str, expected: str, key: str | None = None) -> InputError:
+        """Make the error that names this scan's file and the column of ``key``."""
+        column = None if key is None else self.columns.get(key, key)
+        return InputError(found, expected, path=self.path, column=column)
+
+    def _check_shapes(self) -> None:
+        if not self.settings:
+            raise self.unusable("no magnet settings", "a column such as Q2_A, Q2_kG or Q2_k1")
+        if not self.planes:
+            raise self.unusable("no beam sizes", "a column such as size_x_um")
+        lengths = {k: len(v) for k, v in self.settings.items()}
+        lengths |= {f"size_{p}": len(v) for p, v in self.size.items()}
+        lengths |= {f"size_{p}_error": len(v) for p, v in self.error.items()}
+        if len(set(lengths.values())) != 1:
+            raise self.unusable(f"lengths {lengths}", "one length for all columns")
+
+    def _check_values(self) -> None:
+        for name, values in self.settings.items():
+            if not np.isfinite(values).all():
+                raise self.unusable("a setting that is not a number", "finite settings", name)
+        checks = [(f"size_{p}", v, True) for p, v in self.size.items()]
+        checks += [(f"size_{p}_error", v, True) for p, v in self.error.items()]
+        checks += [("energy", self.energy, False)] if self.energy is not None else []
+        for key, values, blank in checks:
+            wrong = first_unusable(values, blank=blank)
+            if wrong:
+                raise self.unusable(f"{wrong[1]} at point {wrong[0] + 1}", "a positive number", key)
+
+    def _check_three_settings(self, plane: str) -> None:
+        rows = self.rows(plane)
+        keys = set(_row_keys(rows.settings, rows.energy, rows.screen))
+        if len(keys) < 3:
+            raise self.unusable(
+                f"{len(keys)} distinct settings in plane {plane}",
+                "at least three: the beam matrix has three numbers",
+            )
+
+
+def _row_keys(
+    settings: Mapping[str, np.ndarray], energy: np.ndarray | None, screen: tuple[str, ...] | None
+) -> list[tuple]:
+    """What makes two rows the same measurement: all settings, the energy and the screen."""
+    n = len(next(iter(settings.values())))
+    columns = [list(v) for v in settings.values()]
+    columns.append([None] * n if energy is None else list(energy))
+    columns.append([None] * n if screen is None else list(screen))
+    return list(zip(*columns, strict=True))
+
+
+def check_names(
+    scan: QuadScan, calibrations: Mapping[str, str], places: list[str], default: str | None
+) -> None:
+    """Check that a lattice has what a scan names, before anything is computed.
+
+    Parameters
+    ----------
+    scan : QuadScan
+        The scan.
+    calibrations : mapping of str to str
+        Magnet name to the unit of its calibration in the lattice.
+    places : list of str
+        Names a screen may have.
+    default : str or None
+        The screen used where the scan names none.
+
+    Raises
+    ------
+    InputError
+        If a magnet or screen is missing (the nearest is offered), or a current is given for
+        a magnet whose lattice entry has no current calibration.
+
+    Examples
+    --------
+    >>> scan = QuadScan({"Q": [0.0, 1.0, 2.0]}, {"Q": "A"}, {"x": [2e-4, 1e-4, 3e-4]})
+    >>> check_names(scan, {"Q": "A"}, ["OTR"], "OTR")
+    """
+    for name, unit in scan.units.items():
+        if name not in calibrations:
+            raise scan.unusable(
+                f"no magnet '{name}' in the lattice", nearest(name, list(calibrations)), name
+            )
+        if unit == "A" and calibrations[name] != "A":
+            raise scan.unusable(
+                f"currents for '{name}', which the lattice gives no current calibration",
+                f"slope and intercept for {name} in the lattice, or a column {name}_kG",
+                name,
+            )
+    for screen in sorted(set(scan.screen or ())):
+        if screen not in places:
+            raise scan.unusable(
+                f"no screen '{screen}' in the lattice", nearest(screen, places), "screen"
+            )
+    if scan.screen is None and default is None:
+        raise scan.unusable(
+            "a lattice without a screen", 'an element of type "screen" where sizes were measured'
+        )
