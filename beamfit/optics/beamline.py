@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from functools import partial, reduce
+from functools import partial
 from typing import NamedTuple
 
 import jax
 from jax.typing import ArrayLike
 
 from beamfit.errors import InputError, nearest
-from beamfit.optics.elements import Element, Marker, Screen, TransferMatrix
+from beamfit.optics.elements import IDENTITY, Element, Marker, Screen, TransferMatrix
 from beamfit.optics.particle import ELECTRON_MASS
 
 __all__ = ["Beamline", "Design"]
@@ -178,7 +178,7 @@ class Beamline:
         Returns
         -------
         TransferMatrix
-            Both planes, each of shape (3, 3).
+            Both planes, ``x`` and ``y`` of shape (3, 3).
 
         Raises
         ------
@@ -189,12 +189,55 @@ class Beamline:
         -----
         R = R_n … R_2 R_1, report eqs 30-31.
         """
+        last = self.elements[-1].name if self.elements else None
+        return self.matrices((last,), settings, energy)[last] if last else IDENTITY
+
+    def matrices(
+        self,
+        places: tuple[str, ...],
+        settings: Mapping[str, ArrayLike] | None = None,
+        energy: ArrayLike | None = None,
+    ) -> dict[str, TransferMatrix]:
+        """Transfer matrices from the start to the exits of several elements, in one pass.
+
+        Parameters
+        ----------
+        places : tuple of str
+            Element names; of elements that share a name, the last counts.
+        settings, energy
+            As in `matrix`.
+
+        Returns
+        -------
+        dict of str to TransferMatrix
+            One a place.
+
+        Raises
+        ------
+        InputError
+            If a setting names no magnet of the line, or a place no element.
+
+        Examples
+        --------
+        >>> from beamfit.optics.elements import Drift
+        >>> line = Beamline((Drift("A", 1.0), Screen("S"), Drift("B", 2.0)), energy=100.0)
+        >>> [float(r.x[0, 1]) for r in line.matrices(("S", "B")).values()]
+        [1.0, 3.0]
+        """
         settings = dict(settings or {})
         unknown = sorted(set(settings) - set(self.magnets))
         if unknown:
             raise InputError(
                 f"a setting for '{unknown[0]}'", nearest(unknown[0], list(self.magnets))
             )
+        for place in places:
+            self._index(place)
         energy = self.energy if energy is None else energy
-        parts = (e.matrix(settings.get(e.name), energy) for e in self.elements)
-        return reduce(lambda total, part: part @ total, parts, Marker("start").matrix())
+        total, found = IDENTITY, {}
+        for element in self.elements:
+            if not isinstance(element, Marker | Screen):
+                part = element.matrix(settings.get(element.name), energy)
+                total = part if total is IDENTITY else part @ total
+            if element.name in places:
+                found[element.name] = total
+        return {place: found[place] for place in places}

@@ -8,10 +8,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import partial
-from typing import ClassVar, NamedTuple
+from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 from jax.typing import ArrayLike
 
@@ -19,6 +20,7 @@ from beamfit.optics.calibration import Calibration, FocusingStrength, Integrated
 from beamfit.optics.focusing import focusing
 
 __all__ = [
+    "IDENTITY",
     "Drift",
     "Element",
     "Marker",
@@ -33,14 +35,16 @@ __all__ = [
 _BY_K1, _BY_K1L = FocusingStrength(), IntegratedStrength()
 
 
-class TransferMatrix(NamedTuple):
+@partial(jax.tree_util.register_dataclass, data_fields=["planes"], meta_fields=[])
+@dataclass(frozen=True)
+class TransferMatrix:
     """Linear map of both planes, uncoupled, with dispersion.
 
-    Attributes
+    Parameters
     ----------
-    x, y : Array
-        Shape (..., 3, 3), acting on (u in m, u' in rad, δ = Δp/p). ``x[..., 0, 1]`` is R12,
-        ``y[..., 0, 1]`` is R34, ``x[..., 0, 2]`` is R16.
+    planes : Array
+        Shape (..., 2, 3, 3), the x plane and the y plane, each acting on (u in m, u' in rad,
+        δ = Δp/p).
 
     Examples
     --------
@@ -49,32 +53,46 @@ class TransferMatrix(NamedTuple):
     4.0
     """
 
-    x: Array
-    y: Array
+    planes: Array
+
+    @property
+    def x(self) -> Array:
+        """Shape (..., 3, 3): ``x[..., 0, 1]`` is R12, ``x[..., 0, 2]`` is R16."""
+        return self.planes[..., 0, :, :]
+
+    @property
+    def y(self) -> Array:
+        """Shape (..., 3, 3): ``y[..., 0, 1]`` is R34, ``y[..., 0, 2]`` is R36."""
+        return self.planes[..., 1, :, :]
 
     def __matmul__(self, earlier: object) -> TransferMatrix:
         """Compose with the map the beam meets first: (B @ A) is A, then B."""
         if not isinstance(earlier, TransferMatrix):
             return NotImplemented
-        return TransferMatrix(self.x @ earlier.x, self.y @ earlier.y)
+        return TransferMatrix(self.planes @ earlier.planes)
 
 
-def _matrix(
-    r11: ArrayLike, r12: ArrayLike, r21: ArrayLike, r22: ArrayLike, r16: ArrayLike, r26: ArrayLike
-) -> Array:
-    rows = [[r11, r12, r16], [r21, r22, r26], [0.0, 0.0, 1.0]]
-    return jnp.stack([jnp.stack([jnp.asarray(e, float) for e in row]) for row in rows])
+# Where the focusing functions stand in a plane's matrix.
+_COSINE = np.diag([1.0, 1.0, 0.0])
+_SINE = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
+_SLOPE = _SINE.T
+_LAST = np.diag([0.0, 0.0, 1.0])
+_DISPERSION = np.array([[0.0, 0.0, 1.0], [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
+_ANGLE = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, 0.0, 0.0]])
+IDENTITY = TransferMatrix(np.stack([np.eye(3)] * 2))
 
 
 def _thick(k: ArrayLike, length: ArrayLike, curvature: ArrayLike = 0.0) -> Array:
-    """One plane of constant focusing k (1/m²) and curvature h (1/m): u'' + k u = h δ."""
-    c, s, d = focusing(k, length)
-    return _matrix(c, s, -k * s, c, curvature * d, curvature * s)
+    """Constant focusing k (1/m²) and curvature h (1/m): u'' + k u = h δ, for any shape of k."""
+    c, s, d = (f[..., None, None] for f in focusing(k, length))
+    k, h = (jnp.asarray(v, float)[..., None, None] for v in (k, curvature))
+    straight = c * _COSINE + s * _SINE - k * s * _SLOPE + _LAST
+    return straight + h * (d * _DISPERSION + s * _ANGLE)
 
 
 def _kick(strength: ArrayLike) -> Array:
-    """One plane of a thin lens: u' changes by -strength · u, strength in 1/m."""
-    return _matrix(1.0, 0.0, -strength, 1.0, 0.0, 0.0)
+    """A thin lens: u' changes by -strength · u, strength in 1/m, for any shape."""
+    return np.eye(3) - jnp.asarray(strength, float)[..., None, None] * _SLOPE
 
 
 @partial(jax.tree_util.register_dataclass, data_fields=["length"], meta_fields=["name"])
@@ -94,8 +112,7 @@ class Drift:
 
     def matrix(self, setting: ArrayLike | None = None, energy: ArrayLike = 1.0) -> TransferMatrix:
         """Transfer matrix of the drift, the same in both planes."""
-        r = _thick(0.0, self.length)
-        return TransferMatrix(r, r)
+        return TransferMatrix(IDENTITY.planes + jnp.asarray(self.length, float) * _SINE)
 
 
 @partial(
@@ -138,7 +155,7 @@ class Quadrupole:
     def matrix(self, setting: ArrayLike | None = None, energy: ArrayLike = 1.0) -> TransferMatrix:
         """Transfer matrix at a setting (the element's own if None) and an energy in MeV."""
         k1 = self.k1(setting, energy)
-        return TransferMatrix(_thick(k1, self.length), _thick(-k1, self.length))
+        return TransferMatrix(_thick(jnp.stack([k1, -k1]), self.length))
 
 
 @partial(
@@ -174,7 +191,7 @@ class ThinLens:
         """Transfer matrix at a setting (the element's own if None) and an energy in MeV."""
         setting = self.setting if setting is None else setting
         k1l = self.calibration.k1l(setting, 0.0, energy)
-        return TransferMatrix(_kick(k1l), _kick(-k1l))
+        return TransferMatrix(_kick(jnp.stack([k1l, -k1l])))
 
 
 def hard_edge_slice(
@@ -285,13 +302,16 @@ class SectorDipole:
         angle, exit_edge = hard_edge_slice(self.angle, self.exit_edge, ratio)
         radius = self.radius * ratio
         h, length = 1.0 / radius, radius * angle
-        k_bend = (self.k1 if self.bend_plane == "x" else -self.k1) / ratio
         entry, leave = h * jnp.tan(self.entrance_edge), h * jnp.tan(exit_edge)
-        bent = _kick(-leave) @ _thick(h**2 + k_bend, length, h) @ _kick(-entry)
-        across = _kick(leave) @ _thick(-k_bend, length) @ _kick(entry)
-        return (
-            TransferMatrix(bent, across) if self.bend_plane == "x" else TransferMatrix(across, bent)
+        # +1 in the plane that is bent: there the body focuses by h² and an edge defocuses.
+        sign = np.array([1.0, -1.0] if self.bend_plane == "x" else [-1.0, 1.0])
+        bent = sign > 0
+        body = _thick(
+            jnp.where(bent, h**2, 0.0) + np.array([1.0, -1.0]) * self.k1 / ratio,
+            length,
+            jnp.where(bent, h, 0.0),
         )
+        return TransferMatrix(_kick(-sign * leave) @ body @ _kick(-sign * entry))
 
 
 @partial(jax.tree_util.register_dataclass, data_fields=[], meta_fields=["name"])
@@ -311,7 +331,7 @@ class Marker:
 
     def matrix(self, setting: ArrayLike | None = None, energy: ArrayLike = 1.0) -> TransferMatrix:
         """Return the identity in both planes."""
-        return TransferMatrix(jnp.eye(3), jnp.eye(3))
+        return IDENTITY
 
 
 @partial(jax.tree_util.register_dataclass, data_fields=["resolution"], meta_fields=["name"])
@@ -339,7 +359,7 @@ class Screen:
 
     def matrix(self, setting: ArrayLike | None = None, energy: ArrayLike = 1.0) -> TransferMatrix:
         """Return the identity in both planes."""
-        return TransferMatrix(jnp.eye(3), jnp.eye(3))
+        return IDENTITY
 
 
 Element = Drift | Quadrupole | ThinLens | SectorDipole | Marker | Screen

@@ -14,7 +14,13 @@ from beamfit.optics.particle import beta_gamma
 from beamfit.studies.plane import PlaneWork, next_measurement, work_on
 from beamfit.studies.results import EmittanceFit, Identifiability, PlaneFit, ScreenTwiss
 from beamfit.studies.scans import QuadScan, check_names
-from beamfit.studies.transport import names_of, plane_input, scanned_line
+from beamfit.studies.transport import (
+    names_of,
+    plane_input,
+    scan_rows,
+    scanned_line,
+    transfer_rows,
+)
 from beamfit.studies.verdict import LOST, Verdict, judge, phase_coverage
 
 __all__ = ["fit_emittance"]
@@ -79,8 +85,16 @@ def fit_emittance(
     scanned = scanned_line(scan, line)
     asked = planes or scan.planes
     # A plane that is not asked for still testifies to the settings and the optics.
+    rows = scan_rows(scan, scanned)
+    matrices = transfer_rows(scanned, rows.settings, rows.energy, places=rows.places)
     works = {
-        plane: work_on(plane, plane_input(scan, line, plane), scanned, line, method, robust)
+        plane: work_on(
+            plane,
+            plane_input(scan, scanned, rows, matrices, plane),
+            getattr(line.design, plane, None),
+            method,
+            robust,
+        )
         for plane in dict.fromkeys((*asked, *scan.planes))
     }
     clear = {plane: judge(w.evidence, None).cause is None for plane, w in works.items()}
@@ -130,15 +144,15 @@ def _plane_fit(w: PlaneWork, line: Beamline, verdict: Verdict, advice: str | Non
             quantity(sigma[i], raw[i], unit, linear) for i, unit in enumerate(("m^2", "m", "1"))
         ),
         screen=ScreenTwiss(
-            name=w.given.screens[-1],
-            settings=_own_settings(line, w.given.screens[-1]),
+            name=w.given.screen[-1],
+            settings=_own_settings(line, w.given.screen[-1]),
             beta=quantity(d.screen[0], d.screen_error[0], "m"),
             alpha=quantity(d.screen[1], d.screen_error[1], "1"),
             size=quantity(d.screen[2], d.screen_error[2], "m", linear),
         ),
         mismatch=None
-        if line.design is None or getattr(line.design, w.plane) is None
-        else quantity(d.mismatch[0], d.mismatch_error[0], "1"),
+        if getattr(line.design, w.plane, None) is None
+        else quantity(d.mismatch, d.mismatch_error, "1"),
         chi2=e.chi2 if e.noise_known else None,
         dof=e.dof,
         rms_residual=Quantity(residual, None, "m"),

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-import jax
 import numpy as np
 
 from beamfit.optics.beamline import Beamline
@@ -15,10 +14,11 @@ from beamfit.studies.next_point import (
     candidate_settings,
     plausible_sigma,
 )
+from beamfit.studies.propagation import Derived, derive
 from beamfit.studies.results import Points
 from beamfit.studies.robust import fit_robust
-from beamfit.studies.sigma import SigmaFit
-from beamfit.studies.transport import Derived, PlaneInput, plane_numbers, transfer_rows
+from beamfit.studies.sigma import SigmaFit, fit_sizes
+from beamfit.studies.transport import PlaneInput, transfer_rows
 from beamfit.studies.verdict import LOST, Evidence, waist_bracketed
 
 __all__ = ["PlaneWork", "next_measurement", "work_on"]
@@ -59,8 +59,7 @@ class PlaneWork(NamedTuple):
 def work_on(
     plane: str,
     given: PlaneInput,
-    scanned: Beamline,
-    line: Beamline,
+    design: tuple[float, float] | None,
     method: str = "size_squared",
     robust: bool = False,
 ) -> PlaneWork:
@@ -71,65 +70,49 @@ def work_on(
     """
     known_noise = given.error is not None
     error = given.error if known_noise else given.size
-    numbers = _numbers(given, scanned, line, plane, error, method)
-    probability = None
+    probability, lost = None, 0
     if robust:
-        found = fit_robust(numbers.r11, numbers.r12, given.size, error, numbers.known)
-        probability, error = found.outlier_probability, found.error
-        numbers = _numbers(given, scanned, line, plane, error, method)
-        numbers = numbers._replace(fit=numbers.fit._replace(converged=found.fit.converged))
-    fit, dof = numbers.fit, len(given.size) - 3
+        found = fit_robust(given.r11, given.r12, given.size, error, given.known)
+        fit, probability, error = found.fit, found.outlier_probability, found.error
+        lost = round(float(probability.sum()))
+    else:
+        fit = fit_sizes(given.r11, given.r12, given.size, error, given.known, method=method)
+    fit = SigmaFit(*(np.asarray(v) for v in fit))
+    dof = max(len(given.size) - lost - 3, 0)
     unit = 1.0
     if not known_noise:
         unit = math.sqrt(float(fit.chi2) / dof) if dof > 0 else math.nan
     chi2 = float(fit.chi2) if known_noise else float(dof)
     scale = math.sqrt(max(1.0, chi2 / dof)) if dof > 0 else 1.0
+    r11, r12 = given.r11, given.r12
+    model = fit.sigma @ np.stack([r11**2, 2.0 * r11 * r12, r12**2]) + given.known
     points = Points(
         settings=given.settings,
-        screen=tuple(given.screens[i] for i in given.which),
+        screen=given.screen,
         size=given.size,
         error=error * unit,
-        model=numbers.model,
-        pull=_pull(given.size, numbers.model, error * unit, method),
+        model=np.sqrt(np.maximum(model, 0.0)),
+        pull=_pull(given.size, np.sqrt(np.maximum(model, 0.0)), error * unit, method),
         outlier_probability=probability,
-        r11=numbers.r11,
-        r12=numbers.r12,
-        known=numbers.known,
+        r11=r11,
+        r12=r12,
+        known=given.known,
     )
-    errors = {
-        k: getattr(numbers.derived, k) * unit
-        for k in ("start_error", "screen_error", "mismatch_error")
-    }
+    covariance = fit.covariance * unit**2
+    derived = derive(
+        fit.sigma, covariance, given.to_screen, given.to_design, np.array(design or (1.0, 0.0))
+    )
     return PlaneWork(
         plane=plane,
         method=method,
         given=given,
         points=points,
         fit=fit,
-        derived=numbers.derived._replace(**errors),
-        covariance=fit.covariance * unit**2,
+        derived=Derived(*(np.asarray(v) for v in derived)),
+        covariance=covariance,
         scale=scale,
         evidence=_evidence(fit, points, chi2, dof, known_noise, scale * unit),
     )
-
-
-def _numbers(given, scanned, line, plane, error, method):
-    """Call the compiled function and bring its arrays to numpy."""
-    numbers = plane_numbers(
-        scanned,
-        line,
-        given.settings,
-        given.energy,
-        given.which,
-        given.size,
-        error,
-        given.energy_spread,
-        given.resolution,
-        plane=plane,
-        screens=given.screens,
-        method=method,
-    )
-    return jax.tree.map(np.asarray, numbers)
 
 
 def _pull(size: np.ndarray, model: np.ndarray, error: np.ndarray, method: str) -> np.ndarray:
@@ -177,9 +160,9 @@ def next_measurement(work: PlaneWork, scanned: Beamline) -> str | None:
         return None
     rows = []
     for name, table in candidate_settings(work.given.settings):
-        n = len(table[name])
-        energy, which = np.full(n, work.given.energy.mean()), np.full(n, work.given.which[0])
-        r = np.asarray(transfer_rows(scanned, table, energy, which, work.plane, work.given.screens))
+        energy = np.full(len(table[name]), work.given.energy.mean())
+        matrices = transfer_rows(scanned, table, energy, places=work.given.screen[-1:])
+        r = np.asarray(matrices.planes)[:, "xy".index(work.plane), 0]
         a, b = r[:, 0, 0], r[:, 0, 1]
         rows.append((name, table[name], np.stack([a**2, 2 * a * b, b**2], -1)))
     relative = max(float(np.median(p.error / p.size)) * work.scale, 1e-3)

@@ -32,8 +32,8 @@ __all__ = [
 
 # A direction of σ is lost when its diagonal of R is this far below the largest.
 _RANK = 1e-10
-# Directions tried for a beam of zero emittance, then the zooms around the best one.
-_COARSE, _FINE, _ZOOMS = 64, 17, 4
+# Directions tried for a beam of zero emittance, and zooms around the best one.
+_DIRECTIONS, _ZOOMS = 48, 5
 
 
 class SizeData(NamedTuple):
@@ -235,20 +235,23 @@ def zero_emittance(r11: Array, r12: Array, target: Array, scale: Array) -> tuple
     parts = parts * scale
     projection, gram = parts @ target, parts @ parts.T
 
-    def gain_of(angle: Array) -> Array:
+    def length_and_gain(angle: Array) -> tuple[Array, Array]:
         basis = jnp.stack([jnp.ones_like(angle), jnp.cos(2.0 * angle), jnp.sin(2.0 * angle)])
-        norm = jnp.einsum("ia,ij,ja->a", basis, gram, basis)
-        return jnp.maximum(projection @ basis, 0.0) ** 2 / jnp.where(norm > 0, norm, 1.0)
+        norm = jnp.sum((gram @ basis) * basis, axis=0)
+        overlap = jnp.maximum(projection @ basis, 0.0)
+        length = overlap / jnp.where(norm > 0.0, norm, 1.0)
+        return length, length * overlap
 
-    angle, width = jnp.asarray(0.0), jnp.pi
-    for count in (_COARSE, *[_FINE] * _ZOOMS):
-        tried = angle + width * (jnp.arange(count) / count - 0.5 + 0.5 / count)
-        angle = tried[jnp.argmax(gain_of(tried))]
-        width = 2.0 * width / count
-    row = scale * (along * jnp.cos(angle) + across * jnp.sin(angle)) ** 2
-    norm = jnp.sum(row**2)
-    length = jnp.maximum(jnp.sum(row * target) / jnp.where(norm > 0, norm, 1.0), 0.0)
-    chi2 = jnp.sum((target - length * row) ** 2)
+    steps = (jnp.arange(_DIRECTIONS) + 0.5) / _DIRECTIONS - 0.5
+
+    def zoom(_: int, state: tuple[Array, Array]) -> tuple[Array, Array]:
+        angle, width = state
+        tried = angle + width * steps
+        return tried[jnp.argmax(length_and_gain(tried)[1])], 2.0 * width / _DIRECTIONS
+
+    angle, _ = jax.lax.fori_loop(0, _ZOOMS, zoom, (jnp.asarray(0.0), jnp.asarray(jnp.pi)))
+    length, gain = length_and_gain(angle)
+    chi2 = jnp.sum(target**2) - gain
     w = jnp.sin(angle) / rest
     v1, v2 = jnp.cos(angle) / jnp.sqrt(g11) - w * g12 / g11, w
     return length * jnp.stack([v1**2, v1 * v2, v2**2]), chi2

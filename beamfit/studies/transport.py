@@ -12,27 +12,45 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from beamfit.optics.beam import BeamMatrix
 from beamfit.optics.beamline import Beamline
 from beamfit.optics.calibration import FocusingStrength, IntegratedGradient, IntegratedStrength
-from beamfit.optics.elements import Marker, Screen
+from beamfit.optics.elements import Marker, Screen, TransferMatrix
 from beamfit.studies.scans import QuadScan
-from beamfit.studies.sigma import SigmaFit, emittance_parts, fit_sizes
 
 __all__ = [
-    "Derived",
     "PlaneInput",
-    "PlaneNumbers",
+    "ScanRows",
     "names_of",
     "plane_input",
-    "plane_numbers",
+    "scan_rows",
     "scanned_line",
     "transfer_rows",
 ]
 
 
+class ScanRows(NamedTuple):
+    """The rows of a scan as the line sees them, and one more: the line's own settings.
+
+    Attributes
+    ----------
+    settings : dict of str to ndarray
+        Magnet name to setting, shape (n + 1,), in the scan's units.
+    energy : ndarray
+        Total energy in MeV, shape (n + 1,).
+    places : tuple of str
+        Screens of the scan, each once, then the element of the design Twiss.
+    which : ndarray
+        Index into ``places``, shape (n + 1,).
+    """
+
+    settings: dict[str, np.ndarray]
+    energy: np.ndarray
+    places: tuple[str, ...]
+    which: np.ndarray
+
+
 class PlaneInput(NamedTuple):
-    """One plane of a scan with everything the transport needs; arrays of shape (n,).
+    """One plane of a scan, carried to its screens; arrays of shape (n,).
 
     Attributes
     ----------
@@ -40,72 +58,35 @@ class PlaneInput(NamedTuple):
         Magnet name to setting.
     energy : ndarray
         Total energy, MeV.
-    screens : tuple of str
-        The screens, each once.
-    which : ndarray
-        Index into ``screens``.
+    screen : tuple of str
+        Where each size was measured.
     size : ndarray
         Rms size, m.
     error : ndarray or None
         Standard error, m.
-    energy_spread, resolution : ndarray
-        Relative, and m.
+    r11, r12, r16 : ndarray
+        Transfer-matrix elements from the start (R12, R16 in m).
+    energy_spread : ndarray
+        Relative momentum spread.
+    known : ndarray
+        Size² in m² due to dispersion and resolution.
+    to_screen, to_design : ndarray
+        Shape (3, 3): start to the last screen and to the design's place, magnets as the
+        lattice sets them.
     """
 
     settings: dict[str, np.ndarray]
     energy: np.ndarray
-    screens: tuple[str, ...]
-    which: np.ndarray
+    screen: tuple[str, ...]
     size: np.ndarray
     error: np.ndarray | None
+    r11: np.ndarray
+    r12: np.ndarray
+    r16: np.ndarray
     energy_spread: np.ndarray
-    resolution: np.ndarray
-
-
-class Derived(NamedTuple):
-    """What people quote, with raw errors from the exact gradients.
-
-    Attributes
-    ----------
-    start, start_error : Array
-        Shape (3,): ε (m), β (m), α at the start.
-    screen, screen_error : Array
-        Shape (3,): β (m), α, rms size (m) at the last screen, magnets at their own settings.
-    mismatch, mismatch_error : Array
-        Shape (1,): BMAG to the design.
-    """
-
-    start: Array
-    start_error: Array
-    screen: Array
-    screen_error: Array
-    mismatch: Array
-    mismatch_error: Array
-
-
-class PlaneNumbers(NamedTuple):
-    """All numbers of one plane, computed in one compiled call.
-
-    Attributes
-    ----------
-    r11, r12 : Array
-        Shape (n,), start to screen (R12 in m).
-    known : Array
-        Shape (n,), size² in m² due to dispersion and resolution.
-    fit : SigmaFit
-        The fitted beam matrix.
-    model : Array
-        Shape (n,), fitted sizes in m.
-    derived : Derived
-        Twiss and mismatch.
-    """
-
-    r11: Array
-    r12: Array
-    known: Array
-    fit: SigmaFit
-    model: Array
-    derived: Derived
+    known: np.ndarray
+    to_screen: np.ndarray
+    to_design: np.ndarray
 
 
 def names_of(line: Beamline) -> tuple[dict[str, str], list[str], str | None]:
@@ -122,15 +103,16 @@ def names_of(line: Beamline) -> tuple[dict[str, str], list[str], str | None]:
 
 
 def scanned_line(scan: QuadScan, line: Beamline) -> Beamline:
-    """Give each scanned magnet the meaning its column's unit has.
+    """Give each scanned magnet the meaning its column's unit has, at the same strength.
 
     Examples
     --------
     >>> from beamfit.optics.elements import Quadrupole
-    >>> line = Beamline((Quadrupole("Q", 0.1), Screen("S")), energy=100.0)
+    >>> line = Beamline((Quadrupole("Q", 0.1, setting=3.0), Screen("S")), energy=100.0)
     >>> scan = QuadScan({"Q": [0.0, 1.0, 2.0]}, {"Q": "kG"}, {"x": [2e-4, 1e-4, 3e-4]})
-    >>> scanned_line(scan, line)["Q"].calibration.unit
-    'kG'
+    >>> magnet = scanned_line(scan, line)["Q"]
+    >>> magnet.calibration.unit, round(float(magnet.k1(energy=100.0)), 9)
+    ('kG', 3.0)
     """
     meanings = {
         "kG": IntegratedGradient(mass=line.mass),
@@ -140,126 +122,88 @@ def scanned_line(scan: QuadScan, line: Beamline) -> Beamline:
     for name, unit in scan.units.items():
         magnet = line[name]
         if unit != magnet.calibration.unit:
-            line = line.with_element(replace(magnet, calibration=meanings[unit]))
+            meaning = meanings[unit]
+            strength = magnet.calibration.k1l(magnet.setting, magnet.length, line.energy)
+            # Every other meaning is proportional to its setting.
+            setting = float(strength / meaning.k1l(1.0, magnet.length, line.energy))
+            line = line.with_element(replace(magnet, calibration=meaning, setting=setting))
     return line
 
 
-def plane_input(scan: QuadScan, line: Beamline, plane: str) -> PlaneInput:
-    """Collect what the fit of one plane needs, filling in what the line knows."""
-    rows = scan.rows(plane)
-    n = len(rows.size)
-    named = rows.screen or (line.screens[-1],) * n
+def scan_rows(scan: QuadScan, scanned: Beamline) -> ScanRows:
+    """Collect the rows of a scan for `transfer_rows`."""
+    n = len(scan)
+    named = scan.screen or (scanned.screens[-1],) * n
     screens = tuple(dict.fromkeys(named))
-    which = np.array([screens.index(s) for s in named])
-    own = np.array([float(getattr(line[s], "resolution", 0.0)) for s in screens])
-    spread = np.full(n, float(line.energy_spread))
-    return PlaneInput(
-        settings=rows.settings,
-        energy=np.full(n, float(line.energy)) if rows.energy is None else rows.energy,
-        screens=screens,
-        which=which,
-        size=rows.size,
-        error=rows.error,
-        energy_spread=spread if rows.energy_spread is None else rows.energy_spread,
-        resolution=own[which] if rows.resolution is None else rows.resolution,
+    design = (scanned.design.at,) if scanned.design else ()
+    own = float(scanned.energy)
+    return ScanRows(
+        settings={k: np.append(v, float(scanned[k].setting)) for k, v in scan.settings.items()},
+        energy=np.append(np.full(n, own) if scan.energy is None else scan.energy, own),
+        places=tuple(dict.fromkeys((*screens, *design))),
+        which=np.array([screens.index(s) for s in named] + [len(screens) - 1]),
     )
 
 
-@partial(jax.jit, static_argnames=("plane", "screens"))
+@partial(jax.jit, static_argnames="places")
 def transfer_rows(
-    line: Beamline,
-    settings: Mapping[str, Array],
-    energy: Array,
-    which: Array,
-    plane: str,
-    screens: tuple[str, ...],
-) -> Array:
-    """Transfer matrices of one plane from the start to the screen of each row.
+    line: Beamline, settings: Mapping[str, Array], energy: Array, places: tuple[str, ...]
+) -> TransferMatrix:
+    """Transfer matrices from the start to several places, for many settings.
 
     Parameters
     ----------
     line : Beamline
-        The line.
+        The line, with the calibrations of the scan's columns.
     settings : mapping of str to Array
         Magnet name to settings, shape (n,).
     energy : Array
         MeV, shape (n,).
-    which : Array
-        Index into ``screens``, shape (n,).
-    plane : str
-        "x" or "y".
-    screens : tuple of str
-        The screens.
+    places : tuple of str
+        Element names.
 
     Returns
     -------
-    Array
-        Shape (n, 3, 3).
+    TransferMatrix
+        ``planes`` of shape (n, 2, places, 3, 3).
     """
 
-    def to(screen: str) -> Array:
-        part = line.upto(screen)
-        own = {n: v for n, v in settings.items() if n in part.magnets}
-        return jax.vmap(lambda s, e: getattr(part.matrix(s, e), plane))(own, energy)
+    def one(setting: Mapping[str, Array], at: Array) -> TransferMatrix:
+        found = line.matrices(places, setting, at)
+        return TransferMatrix(jnp.stack([jnp.asarray(found[p].planes) for p in places], axis=-4))
 
-    every = jnp.stack([to(screen) for screen in screens])
-    return every[which, jnp.arange(len(which))]
+    every = jax.vmap(one)(dict(settings), energy)
+    return TransferMatrix(jnp.swapaxes(every.planes, 1, 2))
 
 
-@partial(jax.jit, static_argnames=("plane", "screens", "method"))
-def plane_numbers(
-    scanned: Beamline,
-    line: Beamline,
-    settings: Mapping[str, Array],
-    energy: Array,
-    which: Array,
-    size: Array,
-    error: Array,
-    energy_spread: Array,
-    resolution: Array,
-    plane: str,
-    screens: tuple[str, ...],
-    method: str,
-) -> PlaneNumbers:
-    """Transport, fit and propagation of one plane; arguments as in `PlaneInput`.
-
-    ``scanned`` has the calibrations of the scan's columns, ``line`` its own: the beam at the
-    screen is given for the latter's settings. Pure, so that it can be differentiated by every
-    number of the line.
-    """
-    r = transfer_rows(scanned, settings, energy, which, plane, screens)
-    r11, r12 = r[:, 0, 0], r[:, 0, 1]
-    known = (r[:, 0, 2] * energy_spread) ** 2 + resolution**2
-    fit = fit_sizes(r11, r12, size, error, known, method)
-    design = jnp.stack([r11**2, 2.0 * r11 * r12, r12**2], axis=-1)
-    return PlaneNumbers(
-        r11=r11,
-        r12=r12,
-        known=known,
-        fit=fit,
-        model=jnp.sqrt(jnp.maximum(design @ fit.sigma + known, 0.0)),
-        derived=_derive(fit.sigma, fit.covariance, line, plane, screens[-1]),
+def plane_input(
+    scan: QuadScan, scanned: Beamline, rows: ScanRows, matrices: TransferMatrix, plane: str
+) -> PlaneInput:
+    """Select what the fit of one plane needs from the matrices of a scan's rows."""
+    measured = scan.rows(plane)
+    keep = np.flatnonzero(~np.isnan(scan.size[plane]))
+    every = np.asarray(matrices.planes)[:, "xy".index(plane)]
+    r = every[keep, rows.which[keep]]
+    spread = measured.energy_spread
+    if spread is None:
+        spread = np.full(len(keep), float(scanned.energy_spread))
+    resolution = measured.resolution
+    screen = tuple(rows.places[i] for i in rows.which[keep])
+    if resolution is None:
+        own = {s: float(getattr(scanned[s], "resolution", 0.0)) for s in set(screen)}
+        resolution = np.array([own[s] for s in screen])
+    design = rows.places.index(scanned.design.at) if scanned.design else 0
+    return PlaneInput(
+        settings=measured.settings,
+        energy=rows.energy[keep],
+        screen=screen,
+        size=measured.size,
+        error=measured.error,
+        r11=r[:, 0, 0],
+        r12=r[:, 0, 1],
+        r16=r[:, 0, 2],
+        energy_spread=spread,
+        known=(r[:, 0, 2] * spread) ** 2 + resolution**2,
+        to_screen=every[-1, rows.which[-1]],
+        to_design=every[-1, design],
     )
-
-
-def _derive(sigma: Array, covariance: Array, line: Beamline, plane: str, screen: str) -> Derived:
-    """Propagate σ and its covariance to what people quote, by exact gradients."""
-    to_screen = getattr(line.upto(screen).matrix(), plane)
-    twiss = getattr(line.design, plane) if line.design else None
-
-    def at_screen(s: Array) -> Array:
-        beam = BeamMatrix.from_sigma(*s).transport(to_screen)
-        return jnp.stack([beam.twiss.beta, beam.twiss.alpha, beam.l11])
-
-    def mismatch(s: Array) -> Array:
-        if twiss is None:
-            return jnp.full(1, jnp.nan)
-        there = getattr(line.upto(line.design.at).matrix(), plane)
-        beam = BeamMatrix.from_sigma(*s).transport(there)
-        return beam.mismatch(BeamMatrix.from_twiss(1.0, *twiss))[None]
-
-    def with_error(function):
-        gradient = jax.jacfwd(function)(sigma)
-        return function(sigma), jnp.sqrt(jnp.diagonal(gradient @ covariance @ gradient.T))
-
-    return Derived(*with_error(emittance_parts), *with_error(at_screen), *with_error(mismatch))

@@ -1,0 +1,167 @@
+"""`beamfit emittance`: a scan and a lattice in, a judged emittance out."""
+
+from __future__ import annotations
+
+import json
+import math
+import shlex
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from beamfit import __version__
+from beamfit.errors import InputError
+from beamfit.io.lattice import LatticeFile, read_lattice
+from beamfit.io.measurement import read_quad_scan
+from beamfit.studies.scans import QuadScan, check_names
+
+if TYPE_CHECKING:
+    from beamfit.studies.results import EmittanceFit
+
+__all__ = ["emittance"]
+
+EXAMPLE = """\b
+Examples:
+  beamfit emittance measurements/lcls_otr2.csv --lattice lattices/lcls_otr2.toml
+  beamfit emittance scan.csv --lattice line.toml --plane x --report scan.pdf
+  beamfit emittance scan.csv --lattice line.madx --use LINE --json
+"""
+
+
+@click.command(epilog=EXAMPLE)
+@click.argument("scan", type=click.Path())
+@click.option(
+    "--lattice",
+    required=True,
+    type=click.Path(),
+    metavar="FILE",
+    help="Lattice: TOML, MAD-X (.madx, .seq), MAD-8 (.mad8) or elegant (.lte).",
+)
+@click.option(
+    "--plane",
+    type=click.Choice(["x", "y", "both"]),
+    default=None,
+    help="Which plane to fit; all that were measured by default.",
+)
+@click.option(
+    "--method",
+    type=click.Choice(["size-squared", "size"]),
+    default="size-squared",
+    show_default=True,
+    help="What the fit compares: size² (linear) or size.",
+)
+@click.option("--robust", is_flag=True, help="Give each point a probability of being an outlier.")
+@click.option(
+    "--report",
+    type=click.Path(),
+    metavar="FILE.html|FILE.pdf",
+    default=None,
+    help="Write a report page.",
+)
+@click.option("--json", "as_json", is_flag=True, help="Print one JSON object and nothing else.")
+@click.option(
+    "--use", metavar="NAME", default=None, help="Line or sequence of a MAD-X or elegant file."
+)
+@click.option(
+    "--energy",
+    type=float,
+    metavar="MEV",
+    default=None,
+    help="Total energy of the lattice, for files that have none.",
+)
+def emittance(
+    scan: str,
+    lattice: str,
+    plane: str | None,
+    method: str,
+    robust: bool,
+    report: str | None,
+    as_json: bool,
+    use: str | None,
+    energy: float | None,
+) -> None:
+    """Fit the emittance to a quadrupole scan and say whether to believe it.
+
+    SCAN is a CSV or HDF5 file with columns such as Q2_A (or Q2_kG, Q2_k1), size_x_um,
+    size_x_error_um, size_y_um, and optionally energy_MeV, screen, shot.
+    """
+    if report is not None and Path(report).suffix.lower() not in (".html", ".pdf"):
+        raise InputError(f"report '{report}'", "a name ending in .html or .pdf")
+    measured = read_quad_scan(scan)
+    described = read_lattice(lattice, use=use, energy=energy)
+    check_names(measured, described.calibrations, described.places, described.default_screen)
+    planes = _planes(plane, measured)
+
+    from beamfit.studies.emittance import fit_emittance  # JAX from here on
+
+    fit = fit_emittance(
+        measured,
+        described.build(),
+        planes=planes,
+        method=method.replace("-", "_"),
+        robust=robust,
+    )
+    inputs = {str(scan): measured.sha256, str(lattice): described.sha256}
+    command = shlex.join(["beamfit", *sys.argv[1:]])
+    if report is not None:
+        from beamfit.report.page import write_report
+
+        write_report(report, fit, command=command, inputs=inputs)
+    if as_json:
+        click.echo(_json(fit, command, inputs))
+    else:
+        _print(fit, described, report)
+
+
+def _planes(plane: str | None, scan: QuadScan) -> tuple[str, ...]:
+    if plane in (None, "both"):
+        if plane == "both" and scan.planes != ("x", "y"):
+            missing = next(p for p in "xy" if p not in scan.planes)
+            raise scan.unusable(f"no sizes in plane {missing}", f"a column size_{missing}_um")
+        return scan.planes
+    scan.rows(plane)  # says so if it was not measured
+    return (plane,)
+
+
+def _json(fit: EmittanceFit, command: str, inputs: dict[str, str | None]) -> str:
+    from beamfit.studies.sensitivity import range_sensitivity, systematics
+
+    results = [
+        p.to_json()
+        | {
+            "systematics": [c._asdict() for c in systematics(fit, p.plane)],
+            "range": [r._asdict() for r in range_sensitivity(p)],
+        }
+        for p in fit.planes
+    ]
+    document = {"beamfit": __version__, "command": command, "inputs": inputs, "results": results}
+    return json.dumps(_finite(document), indent=2, ensure_ascii=False, allow_nan=False)
+
+
+def _finite(value: Any) -> Any:
+    """Replace numbers JSON cannot hold by null."""
+    if isinstance(value, dict):
+        return {k: _finite(v) for k, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(v) for v in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _print(fit: EmittanceFit, lattice: LatticeFile, report: str | None) -> None:
+    """Show tables, the verdict and what the budget is."""
+    from rich.console import Console
+
+    from beamfit.cli.terminal import budget_table, range_table, result_table, verdict_lines
+
+    console = Console(highlight=False)
+    console.print(result_table(fit))
+    for p in fit.planes:
+        console.print(verdict_lines(p))
+    console.print(budget_table(fit))
+    console.print(range_table(fit))
+    errors = fit.scan.error_source if fit.scan.error else "inferred from the residuals"
+    console.print(f"Errors of the sizes: {errors}.", style="dim")
+    if report is not None:
+        console.print(f"Report written to {report}", style="bold")
