@@ -23,7 +23,14 @@ from beamfit.studies.results import EmittanceFit, PlaneFit
 from beamfit.studies.sigma import emittance_parts, fit_sizes
 from beamfit.studies.transport import plane_input, scan_rows, scanned_line, transfer_rows
 
-__all__ = ["Change", "RangeRow", "range_sensitivity", "systematics"]
+__all__ = [
+    "Change",
+    "RangeRow",
+    "budget_rows",
+    "range_rows",
+    "range_sensitivity",
+    "systematics",
+]
 
 
 class Change(NamedTuple):
@@ -241,3 +248,33 @@ def range_sensitivity(plane: PlaneFit) -> list[RangeRow]:
         )
         for name, e in zip(names, emittance, strict=True)
     ]
+
+
+def budget_rows(fit: EmittanceFit) -> list[tuple[str, list[str]]]:
+    """Cause and one cell per plane: the change of the normalised emittance."""
+    columns = [{c.cause: c for c in systematics(fit, p.plane)} for p in fit.planes]
+    causes = dict.fromkeys(cause for column in columns for cause in column)
+    return [
+        (
+            cause,
+            [
+                f"{100 * column[cause].normalized_emittance:+.2f} %" if cause in column else "-"
+                for column in columns
+            ],
+        )
+        for cause in causes
+    ]
+
+
+def range_rows(fit: EmittanceFit) -> list[tuple[str, list[str]]]:
+    """What was left out and one cell per plane: the normalised emittance and its shift."""
+    columns = [{r.left_out: r for r in range_sensitivity(p)} for p in fit.planes]
+    names = dict.fromkeys(name for column in columns for name in column)
+    return [(name, [_range_cell(column.get(name)) for column in columns]) for name in names]
+
+
+def _range_cell(row: RangeRow | None) -> str:
+    if row is None or math.isnan(row.normalized_emittance):
+        return "-" if row is None else "none"
+    shift = "" if math.isnan(row.shift) else f" ({row.shift:+.1f})"
+    return f"{row.normalized_emittance * 1e6:.3f} µm{shift}"

@@ -8,7 +8,7 @@ from html import escape
 from beamfit.inference.quantity import Quantity
 from beamfit.studies.results import EmittanceFit, PlaneFit
 
-__all__ = ["as_html", "as_text", "point_rows", "result_rows"]
+__all__ = ["as_html", "as_text", "identifiability_rows", "point_rows", "result_rows"]
 
 
 def result_rows(fit: EmittanceFit) -> list[tuple[str, list[str]]]:
@@ -76,6 +76,27 @@ def _yes(value: bool | None) -> str:
 
 def _degrees(value: float | None) -> str:
     return "-" if value is None else f"{value:.0f}° of 180°"
+
+
+def identifiability_rows(fit: EmittanceFit) -> list[tuple[str, list[str]]]:
+    """Label and one cell per plane for what the data determine."""
+    rows: list[tuple[str, Callable[[PlaneFit], str]]] = [
+        ("emittance", lambda p: "determined" if p.identifiability.determined else "not determined"),
+        ("left open", lambda p: ", ".join(p.identifiability.undetermined) or "nothing"),
+        (
+            "singular values",
+            lambda p: ", ".join(f"{v:.3g}" for v in p.identifiability.singular_values),
+        ),
+        ("condition", lambda p: _condition(p.identifiability.condition)),
+        ("zero emittance at", lambda p: f"{p.identifiability.zero_distance:.1f} standard errors"),
+        ("waist bracketed", lambda p: _yes(p.identifiability.waist_bracketed)),
+        ("betatron phase seen", lambda p: _degrees(p.identifiability.phase_coverage)),
+    ]
+    return [(label, [cell(p) for p in fit.planes]) for label, cell in rows]
+
+
+def _condition(value: float | None) -> str:
+    return "infinite" if value is None else f"{value:.3g}"
 
 
 def point_rows(plane: PlaneFit) -> tuple[list[str], list[list[str]]]:
