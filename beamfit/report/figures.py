@@ -1,20 +1,22 @@
-"""The pictures of an emittance fit: the scan with its residuals, and the phase ellipses."""
+"""The pictures of an emittance fit: the scan with its residuals, and the phase ellipses.
+
+Each is drawn into a figure or a part of one, so that the HTML page and the PDF share them.
+"""
 
 from __future__ import annotations
 
-import matplotlib
-
-matplotlib.use("Agg", force=False)
+from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
+from matplotlib.figure import FigureBase
 
 from beamfit.inference.quantity import Status
 from beamfit.studies.results import EmittanceFit, PlaneFit
 from beamfit.studies.transport import scanned_line, transfer_rows
 
-__all__ = ["ellipse_figure", "scan_figure"]
+__all__ = ["STYLE", "draw_ellipses", "draw_scan", "pictures"]
 
 COLOUR = {"x": "#1f5fa8", "y": "#b5421f"}
 STYLE = {
@@ -29,46 +31,42 @@ STYLE = {
 UNITS = {"A": "A", "kG": "kG", "k1": "1/m²", "k1l": "1/m"}
 
 
-def scan_figure(fit: EmittanceFit, plane: str) -> Figure:
+def draw_scan(figure: FigureBase, fit: EmittanceFit, plane: str) -> None:
     """Draw one plane's sizes with the fit, and the residuals in standard errors below.
+
+    One varied magnet gives a curve against its setting; several give the points in order.
 
     Parameters
     ----------
+    figure : Figure or SubFigure
+        Where to.
     fit : EmittanceFit
         The fit.
     plane : str
         "x" or "y".
-
-    Returns
-    -------
-    Figure
-        One varied magnet gives a curve against its setting; several give the points in order.
     """
     p = fit[plane]
-    with matplotlib.rc_context(STYLE):
-        figure = Figure(figsize=(6.4, 4.6), layout="constrained")
-        above, below = figure.subplots(2, 1, sharex=True, height_ratios=(3, 1))
-        varied = [n for n, v in p.points.settings.items() if np.ptp(v) > 0]
-        single = len(varied) == 1
-        at = p.points.settings[varied[0]] if single else np.arange(1, len(p.points.size) + 1)
-        if single:
-            _curves(above, fit, p, varied[0])
-            label = f"{varied[0]}, {UNITS[fit.scan.units[varied[0]]]}"
-        else:
-            above.plot(at, 1e6 * p.points.model, "_", ms=14, mew=2, color=COLOUR[plane], alpha=0.6)
-            label = "measurement"
-        _points(above, p, at)
-        above.set_ylabel("rms size, µm")
-        above.set_ylim(bottom=0.0)
-        above.set_title(f"{plane} plane: {_headline(p)}")
-        below.axhspan(-1, 1, color="0.93")
-        below.axhline(0, color="0.6", lw=0.8)
-        below.plot(at, p.points.pull, "o", color=COLOUR[plane], ms=5)
-        reach = max(3.0, 1.15 * float(np.nanmax(np.abs(p.points.pull), initial=0.0)))
-        below.set_ylim(-reach, reach)
-        below.set_ylabel("residual,\nstd. errors")
-        below.set_xlabel(label)
-    return figure
+    above, below = figure.subplots(2, 1, sharex=True, height_ratios=(3, 1))
+    varied = [n for n, v in p.points.settings.items() if np.ptp(v) > 0]
+    if len(varied) == 1:
+        at = p.points.settings[varied[0]]
+        _curves(above, fit, p, varied[0])
+        below.set_xlabel(f"{varied[0]}, {UNITS[fit.scan.units[varied[0]]]}")
+    else:
+        at = np.arange(1, len(p.points.size) + 1)
+        above.plot(at, 1e6 * p.points.model, "_", ms=14, mew=2, color=COLOUR[plane], alpha=0.6)
+        below.set_xlabel("measurement")
+    _points(above, p, at)
+    above.set_ylabel("rms size, µm")
+    above.set_ylim(bottom=0.0)
+    above.set_title(f"{plane} plane: {_headline(p)}")
+    below.axhspan(-1, 1, color="0.93")
+    below.axhline(0, color="0.6", lw=0.8)
+    below.plot(at, p.points.pull, "o", color=COLOUR[plane], ms=5)
+    finite = np.abs(p.points.pull[np.isfinite(p.points.pull)])
+    reach = max(3.0, 1.15 * float(finite.max(initial=0.0)))
+    below.set_ylim(-reach, reach)
+    below.set_ylabel("residual,\nstd. errors")
 
 
 def _headline(p: PlaneFit) -> str:
@@ -131,8 +129,34 @@ def _points(axes: Axes, p: PlaneFit, at: np.ndarray) -> None:
             )
 
 
-def ellipse_figure(fit: EmittanceFit) -> Figure | None:
+def draw_ellipses(figure: FigureBase, fit: EmittanceFit) -> None:
     """Draw the one-sigma phase ellipses at the start of the line and at the screen.
+
+    Parameters
+    ----------
+    figure : Figure or SubFigure
+        Where to.
+    fit : EmittanceFit
+        A fit with a positive emittance in at least one plane.
+    """
+    drawn = [p for p in fit.planes if p.emittance.value > 0]
+    start, screen = figure.subplots(1, 2)
+    for p in drawn:
+        _ellipse(start, p, p.beta.value, p.alpha.value)
+        _ellipse(screen, p, p.screen.beta.value, p.screen.alpha.value)
+    start.set_title("phase ellipse at the start")
+    screen.set_title(f"at {drawn[0].screen.name}")
+    for axes in (start, screen):
+        axes.set_xlabel("position, µm")
+        axes.set_ylabel("angle, µrad")
+        axes.axhline(0, color="0.85", lw=0.8, zorder=0)
+        axes.axvline(0, color="0.85", lw=0.8, zorder=0)
+    handles, labels = start.get_legend_handles_labels()
+    figure.legend(handles, labels, frameon=False, loc="outside lower center", ncols=2)
+
+
+def pictures(fit: EmittanceFit) -> list[tuple[str, float, Callable[[FigureBase], None]]]:
+    """List the pictures of a fit: what each shows, its height in inches, and how to draw it.
 
     Parameters
     ----------
@@ -141,27 +165,16 @@ def ellipse_figure(fit: EmittanceFit) -> Figure | None:
 
     Returns
     -------
-    Figure or None
-        None where no plane has a positive emittance.
+    list of (str, float, callable)
+        To be drawn within `matplotlib.rc_context(STYLE)`.
     """
-    drawn = [p for p in fit.planes if p.emittance.value > 0]
-    if not drawn:
-        return None
-    with matplotlib.rc_context(STYLE):
-        figure = Figure(figsize=(6.4, 3.1), layout="constrained")
-        start, screen = figure.subplots(1, 2)
-        for p in drawn:
-            _ellipse(start, p, p.beta.value, p.alpha.value)
-            _ellipse(screen, p, p.screen.beta.value, p.screen.alpha.value)
-        start.set_title("at the start")
-        screen.set_title(f"at {drawn[0].screen.name}")
-        for axes in (start, screen):
-            axes.set_xlabel("position, µm")
-            axes.set_ylabel("angle, µrad")
-            axes.axhline(0, color="0.85", lw=0.8, zorder=0)
-            axes.axvline(0, color="0.85", lw=0.8, zorder=0)
-            axes.legend(frameon=False, loc="upper right")
-    return figure
+    listed = [
+        (f"scan of the {p.plane} plane", 4.6, partial(draw_scan, fit=fit, plane=p.plane))
+        for p in fit.planes
+    ]
+    if any(p.emittance.value > 0 for p in fit.planes):
+        listed.append(("phase ellipses", 3.4, partial(draw_ellipses, fit=fit)))
+    return listed
 
 
 def _ellipse(axes: Axes, p: PlaneFit, beta: float, alpha: float) -> None:

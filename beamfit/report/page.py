@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import io
 import platform
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from datetime import UTC, datetime
 from importlib.metadata import version
 from os import PathLike
@@ -13,13 +13,14 @@ from pathlib import Path
 from typing import Any
 
 import jinja2
-from matplotlib.figure import Figure
+from matplotlib import rc_context
+from matplotlib.figure import Figure, FigureBase
 
 import beamfit
 from beamfit.errors import InputError
 from beamfit.inference.quantity import Status
 from beamfit.io.files import write_atomically
-from beamfit.report.figures import ellipse_figure, scan_figure
+from beamfit.report.figures import STYLE, pictures
 from beamfit.report.pdf import pdf_of
 from beamfit.studies.results import EmittanceFit, PlaneFit
 from beamfit.studies.sensitivity import budget_rows, range_rows
@@ -61,14 +62,12 @@ def write_report(
     if suffix not in (".html", ".pdf"):
         raise InputError(f"report '{path}'", "a name ending in .html or .pdf", path=path)
     content = _content(fit, command, inputs)
-    pictures = [(f"scan of the {p.plane} plane", scan_figure(fit, p.plane)) for p in fit.planes]
-    ellipses = ellipse_figure(fit)
-    if ellipses is not None:
-        pictures.append(("phase ellipses", ellipses))
-    if suffix == ".html":
-        write_atomically(path, _html(content, pictures).encode())
-    else:
-        write_atomically(path, pdf_of(content, [figure for _, figure in pictures]))
+    with rc_context(STYLE):
+        if suffix == ".html":
+            page = _html(content, pictures(fit)).encode()
+        else:
+            page = pdf_of(content, pictures(fit))
+    write_atomically(path, page)
 
 
 def _content(
@@ -116,18 +115,19 @@ def _plane(p: PlaneFit) -> dict[str, Any]:
     }
 
 
-def _html(content: Mapping[str, Any], pictures: list[tuple[str, Figure]]) -> str:
+def _html(content: Mapping[str, Any], drawings: list) -> str:
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("beamfit.report", ""),
         autoescape=True,
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,
     )
-    shown = [{"alt": alt, "data": _svg(figure)} for alt, figure in pictures]
+    shown = [{"alt": alt, "data": _svg(height, draw)} for alt, height, draw in drawings]
     return environment.get_template("page.html.j2").render(**content, pictures=shown)
 
 
-def _svg(figure: Figure) -> str:
-    buffer = io.BytesIO()
+def _svg(height: float, draw: Callable[[FigureBase], None]) -> str:
+    figure, buffer = Figure(figsize=(6.4, height), layout="constrained"), io.BytesIO()
+    draw(figure)
     figure.savefig(buffer, format="svg")
     return base64.b64encode(buffer.getvalue()).decode()

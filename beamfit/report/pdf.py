@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import io
 import textwrap
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from matplotlib.backends.backend_pdf import PdfPages
-from matplotlib.figure import Figure
+from matplotlib.figure import Figure, FigureBase
 
 __all__ = ["pdf_of"]
 
@@ -67,15 +67,30 @@ class _Pages:
         self.y -= 0.3 * LINE
 
 
-def pdf_of(content: Mapping[str, Any], figures: list[Figure]) -> bytes:
+def _picture_page(drawings: list[tuple[str, float, Callable[[FigureBase], None]]]) -> Figure:
+    """Put the pictures below one another on one page."""
+    page = Figure(figsize=(WIDTH, HEIGHT), layout="constrained")
+    page.get_layout_engine().set(rect=(0.06, 0.05, 0.88, 0.9), hspace=0.06)
+    heights = [height for _, height, _ in drawings]
+    empty = max(HEIGHT - 2 * MARGIN - sum(heights), 0.01)
+    parts = page.subfigures(len(drawings) + 1, 1, height_ratios=[*heights, empty])
+    for part, (_, _, draw) in zip(parts, drawings, strict=False):
+        draw(part)
+    return page
+
+
+def pdf_of(
+    content: Mapping[str, Any],
+    drawings: list[tuple[str, float, Callable[[FigureBase], None]]],
+) -> bytes:
     """Make the PDF of a report.
 
     Parameters
     ----------
     content : mapping
         The report's tables, as the HTML template takes them.
-    figures : list of Figure
-        The pictures, each of which gets a page of its own size.
+    drawings : list of (str, float, callable)
+        The pictures, as `beamfit.report.figures.pictures` lists them.
 
     Returns
     -------
@@ -115,6 +130,6 @@ def pdf_of(content: Mapping[str, Any], figures: list[Figure]) -> bytes:
         pages.paragraph(note, size=8.5, color="0.35")
     buffer = io.BytesIO()
     with PdfPages(buffer) as document:
-        for page in [pages.pages[0], *figures, *pages.pages[1:]]:
+        for page in [pages.pages[0], _picture_page(drawings), *pages.pages[1:]]:
             document.savefig(page)
     return buffer.getvalue()

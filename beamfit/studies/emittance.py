@@ -141,7 +141,8 @@ def _plane_fit(w: PlaneWork, line: Beamline, verdict: Verdict, advice: str | Non
         beta=quantity(d.start[1], d.start_error[1], "m"),
         alpha=quantity(d.start[2], d.start_error[2], "1"),
         sigma=tuple(
-            quantity(sigma[i], raw[i], unit, linear) for i, unit in enumerate(("m^2", "m", "1"))
+            quantity(sigma[i], raw[i], unit, linear)
+            for i, unit in enumerate(("m^2", "m rad", "rad^2"))
         ),
         screen=ScreenTwiss(
             name=w.given.screen[-1],

@@ -82,7 +82,7 @@ def systematics(fit: EmittanceFit, plane: str) -> list[Change]:
     Returns
     -------
     list of Change
-        Empty where the plane has no positive emittance to change. First order: exact
+        Empty where the emittance is not determined. First order: exact
         derivatives (through transport, and through the minimum by the implicit function
         theorem) times the step.
 
@@ -101,7 +101,7 @@ def systematics(fit: EmittanceFit, plane: str) -> list[Change]:
     ['Q strength +1 %', 'drift D +1 cm', 'energy +1 %']
     """
     result = fit[plane]
-    if not result.emittance.value > 0.0:
+    if result.emittance.error is None:
         return []
     scanned = scanned_line(fit.scan, fit.line)
     rows = scan_rows(fit.scan, scanned)

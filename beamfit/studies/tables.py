@@ -53,9 +53,7 @@ def result_rows(fit: EmittanceFit) -> list[tuple[str, list[str]]]:
 
 def _cell(value: object) -> str:
     text = str(value)
-    if isinstance(value, Quantity) and value.unit in ("m^2",):
-        return text.replace("m^2", "m²")
-    return text
+    return text.replace("^2", "²") if isinstance(value, Quantity) else text
 
 
 def _chi2(p: PlaneFit) -> str:

@@ -121,6 +121,8 @@ def judge(e: Evidence, next_measurement: str | None, other_plane_clear: bool = F
             f"errors, and the lattice. {clear}.",
             None,
         )
+    if e.noise_known and e.chi2 > e.dof > 0:
+        clear += f"; errors are scaled by sqrt(chi2/dof) = {math.sqrt(e.chi2 / e.dof):.2f}"
     return Verdict(Status.converged, clear + ".", None)
 
 
