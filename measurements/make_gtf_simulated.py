@@ -17,7 +17,8 @@ CURRENTS = np.linspace(0.0, 3.9, 14)
 RELATIVE, SEED = 0.02, 11
 HEADER = f"""\
 # SIMULATED, not measured: quadrupole scan of the SLAC Gun Test Facility line (lattices/gtf.toml)
-# sizes from the beam matrix of the PUNDA report, Table 2, first row, in 1e-8 SI: 2.62035, 1.55237, 1.40828
+# sizes from the beam matrix of the PUNDA report, Table 2, first row
+# sigma11, sigma12, sigma22 = 2.62035, 1.55237, 1.40828 in 1e-8 m2, m rad, rad2
 # each size times a normal error of {100 * RELATIVE:g} %, numpy default_rng seed {SEED}
 # made by measurements/make_gtf_simulated.py
 Q2_A,size_x_um,size_x_error_um

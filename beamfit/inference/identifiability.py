@@ -92,7 +92,7 @@ def chi2_probability(chi2: float, dof: int) -> float | None:
     Examples
     --------
     >>> round(chi2_probability(18.3, 2), 7)
-    0.0001063
+    0.0001062
     """
     return float(chdtrc(dof, chi2)) if dof > 0 else None
 

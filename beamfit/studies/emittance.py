@@ -105,8 +105,25 @@ def fit_emittance(
         if verdict.cause is not None:
             advice = next_measurement(work, scanned)
             verdict = judge(work.evidence, advice, beside)
+        verdict = verdict._replace(message=verdict.message + _outlier_words(work))
         fits.append(_plane_fit(work, line, verdict, advice))
     return EmittanceFit(tuple(fits), scan, line)
+
+
+def _outlier_words(work: PlaneWork) -> str:
+    """Name the points the robust fit doubts."""
+    probability = work.points.outlier_probability
+    doubted = [] if probability is None else np.flatnonzero(probability > 0.5)
+    if not len(doubted):
+        return ""
+    places = [
+        ", ".join(f"{n} = {v[i]:.4g}" for n, v in work.points.settings.items()) for i in doubted
+    ]
+    return (
+        f" {len(doubted)} of {len(probability)} points more likely outliers than not: "
+        + "; ".join(places)
+        + "."
+    )
 
 
 def _check_options(method: str, robust: bool) -> None:
