@@ -62,6 +62,12 @@ def peer(kg: np.ndarray, sizes: np.ndarray, errors: np.ndarray):
     return fit
 
 
+def row(name: str, *cells: float | str) -> None:
+    """Print one line of the table."""
+    shown = [c if isinstance(c, str) else f"{c:.1f}" for c in cells]
+    print(f"{name:44s}" + "".join(f"{c:>14s}" for c in shown))
+
+
 def main() -> None:
     """Print the table."""
     scan, line = beamfit.read_quad_scan(SCAN), beamfit.load_lattice(LATTICE)
@@ -91,14 +97,10 @@ def main() -> None:
     check = theirs()["norm_emit_x"] * 1e6
     mine = beamfit.fit_emittance(x_only, line).x.normalized_emittance.value * 1e6
     print(f"same answer: beamfit {mine:.5f} um, pyemittance {check:.5f} um")
-    print(f"{'':44s}{'beamfit':>12s}{'pyemittance':>14s}{'ratio':>8s}")
-    print(
-        f"{'one fit with covariance, us':44s}{one * 1e6:12.0f}{their_one * 1e6:14.0f}{their_one / one:8.1f}"
-    )
-    print(f"{'one fit with verdict, Twiss and errors, us':44s}{judged * 1e6:12.0f}{'-':>14s}")
-    print(
-        f"{'10 000 scans, us each':44s}{each * 1e6:12.1f}{their_each * 1e6:14.0f}{their_each / each:8.1f}"
-    )
+    row("", "beamfit", "pyemittance", "ratio")
+    row("one fit with covariance, us", 1e6 * one, 1e6 * their_one, their_one / one)
+    row("one fit with verdict, Twiss and errors, us", 1e6 * judged, "-", "-")
+    row("10 000 scans, us each", 1e6 * each, 1e6 * their_each, their_each / each)
     cold()
 
 

@@ -6,7 +6,8 @@ from rich.table import Table
 from rich.text import Text
 
 from beamfit.inference.quantity import Status
-from beamfit.studies.results import EmittanceFit, PlaneFit
+from beamfit.studies.fit import EmittanceFit
+from beamfit.studies.results import PlaneFit
 from beamfit.studies.sensitivity import budget_rows, range_rows
 from beamfit.studies.tables import result_rows
 
@@ -32,7 +33,7 @@ def result_table(fit: EmittanceFit) -> Table:
     table.add_column("")
     for p in fit.planes:
         table.add_column(p.plane, no_wrap=True)
-    for label, cells in result_rows(fit):
+    for label, cells in result_rows(fit.planes):
         shown = [
             Text(c, style=f"bold {COLOUR.get(p.status, 'red')}") if label == "status" else Text(c)
             for c, p in zip(cells, fit.planes, strict=True)

@@ -17,10 +17,9 @@ from beamfit.io.files import digest, read_text
 if TYPE_CHECKING:
     from beamfit.optics.beamline import Beamline
 
-__all__ = ["LatticeFile", "load_lattice", "read_lattice"]
+__all__ = ["LatticeFile", "read_toml_lattice"]
 
 FORMAT = "beamfit-lattice-1"
-FOREIGN = {".madx", ".seq", ".mad8", ".mad", ".lte", ".ele", ".elegant"}
 # Settings a magnet may be given, one of them; the key says the unit.
 STRENGTHS = {
     "current_A": "A",
@@ -99,67 +98,15 @@ class LatticeFile:
         screens = [e["name"] for e in self.elements if e["type"] == "screen"]
         return screens[-1] if screens else None
 
-    def build(self) -> Beamline:
-        """Make the beam line (this loads JAX)."""
-        from beamfit.io.build import beamline_of
 
-        return self.foreign if self.foreign is not None else beamline_of(self)
-
-
-def load_lattice(
-    path: str | PathLike[str], *, use: str | None = None, energy: float | None = None
-) -> Beamline:
-    """Read a beam line from a file.
-
-    Parameters
-    ----------
-    path : str or path
-        A TOML lattice (docs/files.md), or a MAD-X (``.madx``, ``.seq``), MAD-8 (``.mad8``)
-        or elegant (``.lte``) file.
-    use : str, optional
-        Which line or sequence of a MAD-X or elegant file.
-    energy : float, optional
-        Total energy in MeV of an elegant file, which carries none; overrides a MAD-X beam.
-
-    Returns
-    -------
-    Beamline
-        The line.
+def read_toml_lattice(path: str | PathLike[str]) -> LatticeFile:
+    """Read and check a TOML lattice without building it.
 
     Raises
     ------
     InputError
-        If the file cannot be used, naming file, line and key.
-
-    Examples
-    --------
-    >>> import tempfile, pathlib
-    >>> file = pathlib.Path(tempfile.mkdtemp()) / "line.toml"
-    >>> _ = file.write_text('''format = "beamfit-lattice-1"
-    ... energy_MeV = 135.0
-    ... [[element]]
-    ... type = "quadrupole"
-    ... name = "Q"
-    ... length_m = 0.108
-    ... integrated_gradient_kG = -3.0
-    ... [[element]]
-    ... type = "screen"
-    ... name = "OTR"
-    ... ''')
-    >>> load_lattice(file).magnets
-    ('Q',)
+        If it cannot be used, naming the line of the key.
     """
-    return read_lattice(path, use=use, energy=energy).build()
-
-
-def read_lattice(
-    path: str | PathLike[str], *, use: str | None = None, energy: float | None = None
-) -> LatticeFile:
-    """Read and check a lattice file without building it; see `load_lattice`."""
-    if Path(path).suffix.lower() in FOREIGN:
-        from beamfit.io.sequence import read_sequence
-
-        return read_sequence(path, use=use, energy=energy)
     return _Reader(path).lattice()
 
 

@@ -22,7 +22,8 @@ from beamfit.inference.quantity import Status
 from beamfit.io.files import write_atomically
 from beamfit.report.figures import STYLE, pictures
 from beamfit.report.pdf import pdf_of
-from beamfit.studies.results import EmittanceFit, PlaneFit
+from beamfit.studies.fit import EmittanceFit
+from beamfit.studies.results import PlaneFit
 from beamfit.studies.sensitivity import budget_rows, range_rows
 from beamfit.studies.tables import identifiability_rows, point_rows, result_rows
 
@@ -91,10 +92,10 @@ def _content(
         "title": f"Emittance of {scan.name}",
         "subtitle": f"{len(scan)} settings on line {line.name}, {energy}; written {when}",
         "planes": [_plane(p) for p in fit.planes],
-        "results": result_rows(fit),
+        "results": result_rows(fit.planes),
         "budget": budget_rows(fit),
         "ranges": range_rows(fit),
-        "identifiability": identifiability_rows(fit),
+        "identifiability": identifiability_rows(fit.planes),
         "provenance": provenance,
         "notes": scan.provenance,
     }

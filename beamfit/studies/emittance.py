@@ -11,8 +11,9 @@ from beamfit.inference.identifiability import scaled_directions
 from beamfit.inference.quantity import Quantity
 from beamfit.optics.beamline import Beamline
 from beamfit.optics.particle import beta_gamma
+from beamfit.studies.fit import EmittanceFit
 from beamfit.studies.plane import PlaneWork, next_measurement, work_on
-from beamfit.studies.results import EmittanceFit, Identifiability, PlaneFit, ScreenTwiss
+from beamfit.studies.results import Identifiability, PlaneFit, ScreenTwiss
 from beamfit.studies.scans import QuadScan, check_names
 from beamfit.studies.transport import (
     names_of,

@@ -19,7 +19,8 @@ from jax import Array
 from beamfit.optics.beamline import Beamline
 from beamfit.optics.calibration import CurrentPolynomial, SlopeIntercept
 from beamfit.optics.elements import Drift, TransferMatrix
-from beamfit.studies.results import EmittanceFit, PlaneFit
+from beamfit.studies.fit import EmittanceFit
+from beamfit.studies.results import PlaneFit
 from beamfit.studies.sigma import emittance_parts, fit_sizes
 from beamfit.studies.transport import plane_input, scan_rows, scanned_line, transfer_rows
 
