@@ -173,7 +173,6 @@ def next_measurement(work: PlaneWork, scanned: Beamline) -> str | None:
     inside = values.min() <= found.setting <= values.max()
     return (
         f"Measure next near {found.magnet} = {found.setting:.3g}, "
-        f"{'inside' if inside else 'beyond'} the scanned range: with a size to "
-        f"{100 * relative:.2g} % there the emittance error would be about "
-        f"{100 * found.relative_error:.0f} %."
+        f"{'inside' if inside else 'beyond'} the scanned range: of all single points it would "
+        "sharpen the emittance most; then judge again."
     )
