@@ -29,6 +29,8 @@ STYLE = {
     "axes.titlelocation": "left",
     "figure.dpi": 110,
 }
+# More points than this are drawn as an image: as curves they would fill the page with bytes.
+MANY = 500
 UNITS = {"A": "A", "kG": "kG", "k1": "1/m²", "k1l": "1/m"}
 
 
@@ -63,7 +65,7 @@ def draw_scan(figure: FigureBase, fit: EmittanceFit, plane: str) -> None:
     above.set_title(f"{plane} plane: {_headline(p)}")
     below.axhspan(-1, 1, color="0.93")
     below.axhline(0, color="0.6", lw=0.8)
-    below.plot(at, p.points.pull, "o", color=COLOUR[plane], ms=5)
+    below.plot(at, p.points.pull, "o", color=COLOUR[plane], ms=5, rasterized=len(at) > MANY)
     finite = np.abs(p.points.pull[np.isfinite(p.points.pull)])
     reach = max(3.0, 1.15 * float(finite.max(initial=0.0)))
     below.set_ylim(-reach, reach)
@@ -127,6 +129,7 @@ def _points(axes: Axes, p: PlaneFit, at: np.ndarray) -> None:
                 capsize=3,
                 color=COLOUR[p.plane],
                 mfc=face,
+                rasterized=len(at) > MANY,
             )
 
 

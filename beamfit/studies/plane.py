@@ -72,7 +72,7 @@ def work_on(
     error = given.error if known_noise else given.size
     probability, lost = None, 0
     if robust:
-        found = fit_robust(given.r11, given.r12, given.size, error, given.known)
+        found = fit_robust(given.r11, given.r12, given.size, error, given.known, known_noise)
         fit, probability, error = found.fit, found.outlier_probability, found.error
         lost = round(float(probability.sum()))
     else:

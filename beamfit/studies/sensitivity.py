@@ -20,7 +20,7 @@ from beamfit.optics.beamline import Beamline
 from beamfit.optics.calibration import CurrentPolynomial, SlopeIntercept
 from beamfit.optics.elements import Drift, TransferMatrix
 from beamfit.studies.fit import EmittanceFit
-from beamfit.studies.results import PlaneFit
+from beamfit.studies.results import PlaneFit, Points
 from beamfit.studies.sigma import emittance_parts, fit_sizes
 from beamfit.studies.transport import plane_input, scan_rows, scanned_line, transfer_rows
 
@@ -32,6 +32,10 @@ __all__ = [
     "range_sensitivity",
     "systematics",
 ]
+
+
+# Leaving out one of more points than this tells nothing.
+MOST_POINTS = 50
 
 
 class Change(NamedTuple):
@@ -211,30 +215,22 @@ def range_sensitivity(plane: PlaneFit) -> list[RangeRow]:
     Returns
     -------
     list of RangeRow
-        One a point left out, and one for sizes within twice the smallest if that leaves
-        enough. A shift of more than about one standard error, again and again in one
-        direction, says that the fit range decides the answer.
+        One a point left out (of at most 50: of more, one says nothing), and one for sizes
+        within twice the smallest if that leaves enough. A shift of more than about one
+        standard error, again and again in one direction, says that the fit range decides the
+        answer.
     """
     p = plane.points
     n = len(p.size)
-    keep = ~np.eye(n, dtype=bool)
-    screens = len(set(p.screen)) > 1
-    varied = [m for m, v in p.settings.items() if np.ptp(v) > 0]
-    names = [
-        "without "
-        + (f"{p.screen[i]}, " if screens else "")
-        + ", ".join(f"{m} = {p.settings[m][i]:.4g}" for m in varied)
-        for i in range(n)
-    ]
+    few = 4 <= n <= MOST_POINTS
+    rows = [(f"without {_place(p, i)}", np.arange(n) != i) for i in range(n if few else 0)]
     near = p.size <= 2.0 * p.size.min()
     if 4 <= near.sum() < n:
-        keep, names = np.vstack([keep, near]), [*names, "only sizes within 2 x the smallest"]
-    if n - 1 < 3:
-        return []
+        rows.append(("only sizes within 2 x the smallest", near))
     # One at a time: a batch of another shape would be compiled for this table alone.
     fits = [
         fit_sizes(p.r11, p.r12, p.size, np.where(k, p.error, np.inf), p.known, method=plane.method)
-        for k in keep
+        for _, k in rows
     ]
     emittance = [math.sqrt(f.determinant) if f.positive else math.nan for f in fits]
     factor = (
@@ -247,8 +243,15 @@ def range_sensitivity(plane: PlaneFit) -> list[RangeRow]:
             float(e * factor),
             float((e - plane.emittance.value) / error) if error else float("nan"),
         )
-        for name, e in zip(names, emittance, strict=True)
+        for (name, _), e in zip(rows, emittance, strict=True)
     ]
+
+
+def _place(points: Points, i: int) -> str:
+    """Name a point by its screen, where there are several, and the settings that vary."""
+    varied = [f"{n} = {v[i]:.4g}" for n, v in points.settings.items() if np.ptp(v) > 0]
+    screen = [points.screen[i]] if len(set(points.screen)) > 1 else []
+    return ", ".join(screen + varied)
 
 
 def budget_rows(fit: EmittanceFit) -> list[tuple[str, list[str]]]:

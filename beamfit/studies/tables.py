@@ -8,6 +8,9 @@ from html import escape
 from beamfit.inference.quantity import Quantity
 from beamfit.studies.results import PlaneFit
 
+# A longer table of points is cut, and says so.
+MOST_ROWS = 500
+
 __all__ = ["as_html", "as_text", "identifiability_rows", "point_rows", "result_rows"]
 
 
@@ -119,7 +122,7 @@ def point_rows(plane: PlaneFit) -> tuple[list[str], list[list[str]]]:
     if p.outlier_probability is not None:
         header.append("P(outlier)")
     rows = []
-    for i in range(len(p.size)):
+    for i in range(min(len(p.size), MOST_ROWS)):
         cells = [p.screen[i]] if screens else []
         cells += [f"{values[i]:.5g}" for values in p.settings.values()]
         cells += [f"{1e6 * v[i]:.2f}" for v in (p.size, p.error, p.model)]
@@ -127,6 +130,9 @@ def point_rows(plane: PlaneFit) -> tuple[list[str], list[list[str]]]:
         if p.outlier_probability is not None:
             cells.append(f"{p.outlier_probability[i]:.2f}")
         rows.append(cells)
+    left = len(p.size) - len(rows)
+    if left > 0:
+        rows.append([f"{left} more"] + [""] * (len(header) - 1))
     return header, rows
 
 

@@ -106,6 +106,19 @@ def test_an_outlier_gets_a_probability_not_a_cut(gtf, gtf_sizes):
     assert "1 of 14 points" in robust.message
 
 
+def test_an_outlier_is_found_without_errors_too(gtf, gtf_sizes):
+    currents, _, sizes = gtf_sizes
+    scan = scan_of("Q2", "A", currents, sizes, seed=8, errors=False)
+    spoilt = scan.size["x"].copy()
+    spoilt[3] *= 1.4
+    bad = beamfit.QuadScan({"Q2": currents}, {"Q2": "A"}, {"x": spoilt})
+    truth = beamfit.fit_emittance(scan, gtf).x.emittance
+    robust = beamfit.fit_emittance(bad, gtf, robust=True).x
+    assert robust.points.outlier_probability[3] > 0.99
+    assert abs(robust.emittance.value - truth.value) < truth.error
+    assert robust.emittance.error < 2 * truth.error
+
+
 def test_robust_fit_of_clean_data_is_the_plain_fit(gtf, gtf_sizes):
     currents, _, sizes = gtf_sizes
     scan = scan_of("Q2", "A", currents, sizes, relative=0.01)
