@@ -209,7 +209,9 @@ def _gas(fractions: dict[str, float], path: Path) -> Gas:
     try:
         return gas_mixture(**fractions)
     except (TypeError, ValueError) as error:
-        raise InputError(str(error), "partial pressures by molecule", path=path, column="gas") from error
+        raise InputError(
+            str(error), "partial pressures by molecule", path=path, column="gas"
+        ) from error
 
 
 def ring_from_pyat(
@@ -249,7 +251,9 @@ def ring_from_pyat(
     """
     loss, voltage = lattice.get_energy_loss(), lattice.get_rf_voltage()
     if voltage <= loss:
-        raise InputError(f"RF voltage {voltage:.6g} V", f"more than the loss of {loss:.6g} V a turn")
+        raise InputError(
+            f"RF voltage {voltage:.6g} V", f"more than the loss of {loss:.6g} V a turn"
+        )
     beam = lattice.enable_6d(copy=True).envelope_parameters()
     flat = lattice.disable_6d(copy=True)
     lengths = np.array([element.Length for element in flat])

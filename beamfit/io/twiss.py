@@ -46,9 +46,7 @@ def _rows(path: Path) -> tuple[dict[str, int], list[tuple[int, list[str]]], bool
     return {name: k for k, name in enumerate(header)}, cells[1:], False
 
 
-def _column(
-    name: str, position: int, rows: list[tuple[int, list[str]]], path: Path
-) -> np.ndarray:
+def _column(name: str, position: int, rows: list[tuple[int, list[str]]], path: Path) -> np.ndarray:
     values = np.empty(len(rows))
     for row, (line, cells) in enumerate(rows):
         try:
@@ -120,7 +118,9 @@ def read_twiss(path: str | Path, circumference: float) -> Optics:
         else:
             known = nearest(sought, list(header))
             raise InputError(f"no column '{sought}', but {known}", f"'{sought}'", path=path)
-        bad = np.flatnonzero(~np.isfinite(columns[name]) | (name[:4] == "beta") & (columns[name] <= 0))
+        bad = np.flatnonzero(
+            ~np.isfinite(columns[name]) | (name[:4] == "beta") & (columns[name] <= 0)
+        )
         if bad.size:
             line = rows[bad[0]][0]
             raise InputError(

@@ -161,7 +161,9 @@ def _bruck_shape(xi: Array, nodes: int = 64) -> Array:
     upper = jnp.log1p(45 / xi)
     log_w = upper * (roots + 1) / 2
     w = jnp.exp(log_w)
-    return jnp.sqrt(xi) * upper / 2 * jnp.sum(weights * (1 - (1 + log_w / 2) / w) * jnp.exp(-xi * w))
+    return (
+        jnp.sqrt(xi) * upper / 2 * jnp.sum(weights * (1 - (1 + log_w / 2) / w) * jnp.exp(-xi * w))
+    )
 
 
 @jax.jit
