@@ -6,11 +6,12 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 from beamfit.lifetime.decay import current
 
-__all__ = ["Physical", "Solution", "physical_values", "solve_decay"]
+__all__ = ["Physical", "Solution", "physical_values", "solve_decay", "solve_decays"]
 
 MAX_ITERATIONS = 60
 # A step that would lower the sum of squares by less than this share of it ends the search.
@@ -36,13 +37,13 @@ class Physical(NamedTuple):
         Share of a in the loss at the mean current: 1 all Touschek-like, 0 all gas-like.
     """
 
-    i0: jax.Array
-    a: jax.Array
-    b: jax.Array
-    rate_start: jax.Array
-    rate_end: jax.Array
-    rate_mean: jax.Array
-    share: jax.Array
+    i0: Array
+    a: Array
+    b: Array
+    rate_start: Array
+    rate_end: Array
+    rate_mean: Array
+    share: Array
 
 
 class Solution(NamedTuple):
@@ -64,10 +65,10 @@ class Solution(NamedTuple):
 
     values: Physical
     errors: Physical
-    correlation: jax.Array
-    residuals: jax.Array
-    sum_squares: jax.Array
-    converged: jax.Array
+    correlation: Array
+    residuals: Array
+    sum_squares: Array
+    converged: Array
 
 
 def physical_values(theta: Array, span: Array, reference: Array) -> Physical:
@@ -109,44 +110,55 @@ def physical_values(theta: Array, span: Array, reference: Array) -> Physical:
 
 
 def _linear_guess(
-    time: Array, measured: Array, weight: Array, free: Array
-) -> tuple[Array, Array]:
-    """Start and standard deviation of a weak prior on the quadratic part.
+    time: np.ndarray, measured: np.ndarray, weight: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Start, and standard deviation of a weak prior on the quadratic part; shapes (..., n).
 
     Integrated once, the law is linear in the solver's parameters: I(t) = p0 - p1 ∫I dt -
     p2 ∫I(I - 1) dt in scaled units. The integrals of the readings average their noise, so this
-    start is good for a decay of any length.
+    start is good for a decay of any length. In numpy: compiling it costs more than it saves.
     """
-    steps = jnp.diff(time, prepend=0.0)
 
-    def integral(values: Array) -> Array:
-        return jnp.cumsum(steps * (values + jnp.roll(values, 1)) / 2)
+    def integral(values: np.ndarray) -> np.ndarray:
+        area = np.diff(time) * (values[..., 1:] + values[..., :-1]) / 2
+        return np.concatenate([np.zeros_like(time[..., :1]), np.cumsum(area, axis=-1)], axis=-1)
 
-    columns = jnp.stack(
-        [jnp.ones_like(time), -integral(measured), -integral(measured * (measured - 1))]
-    )
-    rows = weight * columns
-    target = weight * measured
+    columns = (np.ones_like(time), -integral(measured), -integral(measured * (measured - 1)))
+    rows = weight[..., None, :] * np.stack(columns, axis=-2)
+    target = (weight * measured)[..., None]
+    normal, moment = rows @ rows.swapaxes(-1, -2), rows @ target
+    count = np.maximum(np.sum(weight > 0, axis=-1) - 3, 1)
 
-    def solve(rows: Array, ridge: Array) -> tuple[Array, Array, Array]:
-        scale = jnp.sqrt(jnp.sum(rows**2, axis=1) + ridge) + 1e-300
-        normal = (rows @ rows.T + jnp.diag(ridge)) / scale / scale[:, None]
-        normal = normal + 1e-15 * jnp.eye(scale.size)
-        theta = jnp.linalg.solve(normal, rows @ target / scale) / scale
-        squares = jnp.sum((theta @ rows - target) ** 2)
-        return theta, squares, jnp.sqrt(jnp.linalg.inv(normal)[1, 1]) / scale[1]
+    def solve(size: int, ridge: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """First parameters, noise of unit weight, error of the loss."""
+        part = normal[..., :size, :size] + ridge
+        scale = np.sqrt(np.diagonal(part, axis1=-2, axis2=-1))[..., None] + 1e-300
+        scaled = part / scale / scale.swapaxes(-1, -2)
+        inverse = np.linalg.inv(scaled + 1e-15 * np.eye(size))
+        theta = inverse @ (moment[..., :size, :] / scale) / scale
+        left = rows[..., :size, :].swapaxes(-1, -2) @ theta - target
+        noise = np.sqrt(np.sum(left**2, axis=(-2, -1)) / count)
+        return theta[..., 0], noise, np.sqrt(inverse[..., 1, 1]) / scale[..., 1, 0]
 
-    count = jnp.maximum(jnp.sum(weight > 0) - 3, 1)
-    straight, squares, error = solve(rows[:2], jnp.zeros(2))
-    noise = jnp.sqrt(squares / count)
-    width = PRIOR_WIDTH * (jnp.abs(straight[1]) + 3 * noise * error) + 1e-300
-    bent, squares, _ = solve(rows, jnp.array([0.0, 0.0, 1.0]) * (noise / width) ** 2)
-    noise = jnp.minimum(noise, jnp.sqrt(squares / count))
-    return jnp.where(free[2] > 0, bent, jnp.append(straight, 0.0)), width / noise
+    straight, noise, error = solve(2, np.zeros(()))
+    width = PRIOR_WIDTH * (np.abs(straight[..., 1]) + 3 * noise * error) + 1e-300
+    ridge = (noise / width)[..., None, None] ** 2 * np.diag([0.0, 0.0, 1.0])
+    bent, less, _ = solve(3, ridge)
+    return bent, width / np.maximum(np.minimum(noise, less), 1e-300)
 
 
-def _search(time: Array, measured: Array, weight: Array, free: Array) -> tuple[Array, Array]:
+def _inverse(matrix: Array) -> Array:
+    """Inverse of a 3 by 3 matrix by cross products: no library call inside the loop."""
+    first, second, third = matrix
+    columns = [jnp.cross(second, third), jnp.cross(third, first), jnp.cross(first, second)]
+    return jnp.stack(columns, axis=1) / (first @ columns[0])
+
+
+def _search(
+    time: Array, measured: Array, weight: Array, free: Array, start: Array, width: Array
+) -> tuple[Array, Array, Array]:
     """Levenberg-Marquardt in scaled time (0 to 1) and current (about 1)."""
+    prior = jnp.diag(jnp.array([0.0, 0.0, width**-2]))
 
     def residual(theta: Array) -> Array:
         values = physical_values(theta, 1.0, 1.0)
@@ -159,21 +171,19 @@ def _search(time: Array, measured: Array, weight: Array, free: Array) -> tuple[A
         normal = jacobian @ jacobian.T + jnp.diag(1 - free) + prior
         return normal, jacobian @ value + pull, value @ value + (theta[2] / width) ** 2
 
-    theta, width = _linear_guess(time, measured, weight, free)
-    prior = jnp.diag(jnp.array([0.0, 0.0, width**-2]))
     floor = 1e-30 * jnp.sum((weight * measured) ** 2)
 
     def body(state):
         theta, normal, gradient, squares, damping, _, count = state
         scale = jnp.sqrt(jnp.diag(normal)) + 1e-300
         scaled = normal / scale / scale[:, None]
-        step = -jnp.linalg.solve(scaled + damping * jnp.eye(3), gradient / scale) / scale
+        step = -_inverse(scaled + damping * jnp.eye(3)) @ (gradient / scale) / scale
         gain = -(gradient @ step)
         trial_theta = theta + step
         trial = normal_equations(trial_theta)
         better = trial[2] <= squares
         # Judged on a nearly undamped step only, or strong damping would look like convergence.
-        done = (gain <= ENOUGH * squares + floor) & (damping <= 1e-3)
+        done = (gain <= ENOUGH * squares + floor) & (damping <= 1e-3) & (count > 0)
         kept = jax.tree.map(
             lambda new, old: jnp.where(better, new, old),
             (trial_theta, *trial),
@@ -181,7 +191,7 @@ def _search(time: Array, measured: Array, weight: Array, free: Array) -> tuple[A
         )
         damping = jnp.where(better, damping / 30, jnp.maximum(damping, 1e-7) * 10)
         # A step refused although the model promised no gain is rounding, not failure.
-        stuck = (gain <= 1e3 * (ENOUGH * squares + floor)) & ~better
+        stuck = (gain <= 1e3 * (ENOUGH * squares + floor)) & ~better & (count > 0)
         return *kept, damping, done | stuck, count + 1
 
     def unfinished(state):
@@ -189,15 +199,73 @@ def _search(time: Array, measured: Array, weight: Array, free: Array) -> tuple[A
 
     # A start taken from noise can lie where the law has no value; a plain decay never does.
     plain = jnp.array([1.0, 0.1, 0.05]) * free
-    theta = jnp.where(jnp.isfinite(residual(theta)).all(), theta, plain)
-    state = (theta, *normal_equations(theta), 1e-6, False, 0)
+    theta = jnp.where(jnp.isfinite(residual(start * free)).all(), start * free, plain)
+    # The first step is none: it brings the first normal equations, compiled once this way.
+    state = (theta, jnp.eye(3), jnp.zeros(3), jnp.inf, 1e-6, False, 0)
     theta, normal, _, _, _, done, _ = jax.lax.while_loop(unfinished, body, state)
     return theta, normal, done
 
 
-@jax.jit
-def solve_decay(time: Array, measured: Array, weight: Array, free: Array) -> Solution:
-    """Fit the decay law to one record; `jax.vmap` it for many of one padded length.
+def _solve(readings: Array, settings: Array) -> tuple[Array, Array]:
+    """Scale, search, and turn the solver's parameters into physical ones.
+
+    Few arrays in and out: each costs more than an iteration of the search.
+    """
+    time, measured, weight = readings
+    free, start, (width, span, reference) = settings[:3], settings[3:6], settings[6:]
+    unit = weight * reference
+    theta, normal, done = _search(time / span, measured / reference, unit, free, start, width)
+    scale = jnp.sqrt(jnp.diag(normal)) + 1e-300
+    covariance = _inverse(normal / scale / scale[:, None]) / scale / scale[:, None]
+    covariance = covariance * free * free[:, None]
+
+    values = physical_values(theta, span, reference)
+    slopes = jnp.stack(jax.jacfwd(lambda p: physical_values(p, span, reference))(theta))
+    spread = slopes @ covariance @ slopes.T
+    errors = jnp.sqrt(jnp.diag(spread))
+    correlation = spread[1, 2] / (errors[1] * errors[2])
+    model = current(time, values.i0, values.a, values.b)
+    residuals = jnp.where(weight > 0, model - measured, 0.0)
+    rest = jnp.array([correlation, jnp.sum((weight * residuals) ** 2), done])
+    return jnp.concatenate([jnp.stack(values), errors, rest]), residuals
+
+
+_solve_one = jax.jit(_solve)
+_solve_many = jax.jit(jax.vmap(_solve))
+
+
+def _prepared(
+    time: np.ndarray, measured: np.ndarray, weight: np.ndarray, free: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Readings and settings as `_solve` takes them, for one record or rows of them."""
+    used = weight > 0
+    span = np.max(time * used, axis=-1, keepdims=True)
+    reference = np.sum(measured * used, axis=-1, keepdims=True) / used.sum(axis=-1, keepdims=True)
+    start, width = _linear_guess(time / span, measured / reference, weight * reference)
+    free = np.broadcast_to(free, start.shape)
+    settings = np.concatenate([free, start, width[..., None], span, reference], axis=-1)
+    return np.stack([time, measured, weight], axis=-2), settings
+
+
+def _unpacked(summary: Array, residuals: Array) -> Solution:
+    leaves = np.moveaxis(np.asarray(summary), -1, 0)
+    size = len(Physical._fields)
+    correlation, squares, done = leaves[2 * size :]
+    finite = np.isfinite(leaves[:size]).all(axis=0)
+    return Solution(
+        values=Physical(*leaves[:size]),
+        errors=Physical(*leaves[size : 2 * size]),
+        correlation=correlation,
+        residuals=np.asarray(residuals),
+        sum_squares=squares,
+        converged=(done > 0) & finite,
+    )
+
+
+def solve_decay(
+    time: np.ndarray, measured: np.ndarray, weight: np.ndarray, free: np.ndarray | None = None
+) -> Solution:
+    """Fit the decay law to one record.
 
     Parameters
     ----------
@@ -207,8 +275,8 @@ def solve_decay(time: Array, measured: Array, weight: Array, free: Array) -> Sol
         Currents, mA.
     weight : array, shape (n,)
         1/error, 1/mA; zero for padding.
-    free : array, shape (3,)
-        Ones; (1, 1, 0) holds a at zero and so fits a single exponential.
+    free : array, shape (3,), optional
+        Ones where a parameter is fitted; (1, 1, 0) holds a at zero: a single exponential.
 
     Returns
     -------
@@ -223,32 +291,33 @@ def solve_decay(time: Array, measured: Array, weight: Array, free: Array) -> Sol
 
     Examples
     --------
-    >>> import jax.numpy as jnp
-    >>> time = jnp.linspace(0.0, 36000.0, 100)
-    >>> fit = solve_decay(time, current(time, 500.0, 2e-8, 1e-6), jnp.ones(100), jnp.ones(3))
+    >>> time = np.linspace(0.0, 36000.0, 100)
+    >>> fit = solve_decay(time, np.array(current(time, 500.0, 2e-8, 1e-6)), np.ones(100))
     >>> print(f"{fit.values.a:.6e} {fit.values.b:.6e} {fit.converged}")
     2.000000e-08 1.000000e-06 True
     """
-    used = weight > 0
-    span = jnp.max(jnp.where(used, time, 0.0))
-    reference = jnp.sum(jnp.where(used, measured, 0.0)) / jnp.sum(used)
-    unit = weight * reference
-    theta, normal, done = _search(time / span, measured / reference, unit, free)
-    scale = jnp.sqrt(jnp.diag(normal)) + 1e-300
-    covariance = jnp.linalg.inv(normal / scale / scale[:, None]) / scale / scale[:, None]
-    covariance = covariance * free * free[:, None]
+    free = np.ones(3) if free is None else free
+    return _unpacked(*_solve_one(*_prepared(time, measured, weight, free)))
 
-    values = physical_values(theta, span, reference)
-    slopes = jnp.stack(jax.jacfwd(lambda p: physical_values(p, span, reference))(theta))
-    spread = slopes @ covariance @ slopes.T
-    errors = jnp.sqrt(jnp.diag(spread))
-    model = current(time, values.i0, values.a, values.b)
-    residuals = jnp.where(used, model - measured, 0.0)
-    return Solution(
-        values=values,
-        errors=Physical(*errors),
-        correlation=spread[1, 2] / (errors[1] * errors[2]),
-        residuals=residuals,
-        sum_squares=jnp.sum((weight * residuals) ** 2),
-        converged=done & jnp.isfinite(theta).all(),
-    )
+
+def solve_decays(time: np.ndarray, measured: np.ndarray, weight: np.ndarray) -> Solution:
+    """Fit the decay law to many records of one padded length at once.
+
+    Parameters
+    ----------
+    time, measured, weight : array, shape (m, n)
+        As for `solve_decay`, one row a record.
+
+    Returns
+    -------
+    Solution
+        Each leaf with a first axis of length m.
+
+    Examples
+    --------
+    >>> time = np.linspace(0.0, 36000.0, 100) * np.ones((2, 1))
+    >>> measured = np.array(current(time, np.array([[500.0], [100.0]]), 2e-8, 1e-6))
+    >>> print(solve_decays(time, measured, np.ones((2, 100))).values.i0)
+    [500. 100.]
+    """
+    return _unpacked(*_solve_many(*_prepared(time, measured, weight, np.ones(3))))
