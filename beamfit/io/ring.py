@@ -198,7 +198,7 @@ def read_operation(path: str | Path) -> Operation:
     if values["rf_voltage"] <= loss:
         raise InputError(
             f"{values['rf_voltage'] / 1e3:.6g} kV",
-            f"more than the energy loss per turn of {loss / 1e3:.6g} kV, or no beam is stored",
+            f"more than the loss of {loss / 1e3:.6g} kV a turn, or no beam is stored",
             path=path,
             column="rf_voltage_kV",
         )

@@ -118,13 +118,12 @@ def read_twiss(path: str | Path, circumference: float) -> Optics:
         else:
             known = nearest(sought, list(header))
             raise InputError(f"no column '{sought}', but {known}", f"'{sought}'", path=path)
-        bad = np.flatnonzero(
-            ~np.isfinite(columns[name]) | (name[:4] == "beta") & (columns[name] <= 0)
-        )
-        if bad.size:
+        values = columns[name]
+        usable = np.isfinite(values) & ((values > 0) | (not name.startswith("beta")))
+        if (bad := np.flatnonzero(~usable)).size:
             line = rows[bad[0]][0]
             raise InputError(
-                f"{columns[name][bad[0]]}", "a usable value", path=path, line=line, column=sought
+                f"{values[bad[0]]}", "a usable value", path=path, line=line, column=sought
             )
     weight = _weights(columns.pop("s_m"), circumference, rows, path)
     return Optics(weight, *columns.values())

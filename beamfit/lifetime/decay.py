@@ -69,7 +69,7 @@ def current(time: Array, i0: Array, a: Array, b: Array) -> Array:
     Examples
     --------
     >>> print(f"{current(3600.0, 500.0, 2e-8, 1e-6):.3f} {current(3600.0, 500.0, 2e-8, 0.0):.3f}")
-    480.907 482.625
+    480.921 482.625
     """
     return i0 * jnp.exp(-b * time) / (1 + a * i0 * time * mean_exponential(b * time))
 
@@ -131,23 +131,22 @@ def current_by_rate(
     >>> import numpy as np
     >>> t = np.linspace(0, 36000, 11)
     >>> by_rate = current_by_rate(t, 500.0, lambda i: 2e-8 * i + 1e-6)
-    >>> print(f"{abs(by_rate / current(t, 500.0, 2e-8, 1e-6) - 1).max():.0e}")
-    0e+00
+    >>> print(bool(abs(by_rate / current(t, 500.0, 2e-8, 1e-6) - 1).max() < 1e-10))
+    True
     """
 
     def slope(log_current: Array) -> Array:
         return -rate(jnp.exp(log_current))
 
-    def advance(log_current: Array, interval: Array) -> tuple[Array, Array]:
-        step = interval / steps
-        for _ in range(steps):
-            k1 = slope(log_current)
-            k2 = slope(log_current + step / 2 * k1)
-            k3 = slope(log_current + step / 2 * k2)
-            k4 = slope(log_current + step * k3)
-            log_current = log_current + step / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+    def advance(log_current: Array, step: Array) -> tuple[Array, Array]:
+        k1 = slope(log_current)
+        k2 = slope(log_current + step / 2 * k1)
+        k3 = slope(log_current + step / 2 * k2)
+        k4 = slope(log_current + step * k3)
+        log_current = log_current + step / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
         return log_current, log_current
 
     start = jnp.log(jnp.asarray(i0, float))
-    _, logs = jax.lax.scan(advance, start, jnp.diff(jnp.asarray(time, float)))
-    return jnp.exp(jnp.concatenate([start[None], logs]))
+    intervals = jnp.repeat(jnp.diff(jnp.asarray(time, float)) / steps, steps)
+    _, logs = jax.lax.scan(advance, start, intervals)
+    return jnp.exp(jnp.concatenate([start[None], logs[steps - 1 :: steps]]))

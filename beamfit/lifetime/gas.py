@@ -36,8 +36,8 @@ def vertical_acceptance(chamber: Array, scraper: Array, scraper_beta_y: Array) -
 
     Examples
     --------
-    >>> print(vertical_acceptance(4e-6, 3e-3, 10.0))
-    9e-07
+    >>> print(f"{vertical_acceptance(4e-6, 3e-3, 10.0):.1e}")
+    9.0e-07
     """
     return jnp.minimum(chamber, scraper**2 / scraper_beta_y)
 
@@ -72,7 +72,7 @@ def elastic_cross_section(
     Examples
     --------
     >>> print(f"{elastic_cross_section(7, 5870.85, 8.7845, 9e-7):.4e}")
-    6.9232e-28
+    6.9233e-28
     """
     return 2 * jnp.pi * (ELECTRON_RADIUS * charge / lorentz) ** 2 * mean_beta_y / acceptance
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -26,7 +27,14 @@ from beamfit.lifetime.gas import (
 from beamfit.lifetime.ring import Operation, Ring
 from beamfit.lifetime.touschek import piwinski_rate
 
-__all__ = ["Bunch", "Losses", "bunch_in_bucket", "loss_coefficients", "population"]
+__all__ = [
+    "Bunch",
+    "Losses",
+    "bunch_in_bucket",
+    "loss_coefficients",
+    "population",
+    "touschek_shape",
+]
 
 
 class Losses(NamedTuple):
@@ -206,7 +214,39 @@ def loss_coefficients(ring: Ring, operation: Operation, current: float | Array) 
     if known and bool(jnp.any(jnp.asarray(voltage) <= loss)):
         raise InputError(
             f"RF voltage {float(jnp.min(voltage)) / 1e3:.6g} kV",
-            f"more than the energy loss per turn of {float(loss) / 1e3:.6g} kV, or no beam is stored",
+            f"more than the loss of {float(loss) / 1e3:.6g} kV a turn, or no beam is stored",
             column="rf_voltage_kV",
         )
     return _coefficients(ring, operation, jnp.asarray(current, float))
+
+
+def touschek_shape(ring: Ring, operation: Operation) -> Callable[[Array], Array]:
+    """How the Touschek part of a depends on the beam current through bunch lengthening.
+
+    Parameters
+    ----------
+    ring : Ring
+        The ring, with its impedance.
+    operation : Operation
+        RF voltage and number of bunches.
+
+    Returns
+    -------
+    callable
+        Current in mA to a_T relative to that at zero current; for `fit_decay`'s `shape`.
+
+    Examples
+    --------
+    >>> from beamfit.io.ring import read_operation, read_ring
+    >>> ring = read_ring("lattices/spear3_2003.toml")._replace(impedance=0.4)
+    >>> shape = touschek_shape(ring, read_operation("lattices/spear3_2003.toml"))
+    >>> print(f"{shape(500.0):.4f}")
+    0.9085
+    """
+
+    def shape(current: Array) -> Array:
+        bunch_current = current / operation.bunches
+        natural = bunch_in_bucket(ring, operation.rf_voltage, 0.0).length
+        return natural / bunch_in_bucket(ring, operation.rf_voltage, bunch_current).length
+
+    return shape

@@ -13,9 +13,9 @@ from beamfit.lifetime.decay import current
 
 __all__ = ["Physical", "Solution", "physical_values", "solve_decay", "solve_decays"]
 
-MAX_ITERATIONS = 60
+MAX_ITERATIONS = 200
 # A step that would lower the sum of squares by less than this share of it ends the search.
-ENOUGH = 1e-13
+ENOUGH = 1e-11
 # Width of a prior on the quadratic part, in units of the whole loss (whose own error counts in).
 # Physics allows 0 to 1, so 30 moves no value that the record determines (by 4e-5 of it where the
 # verdict turns, nothing beyond); it keeps records too short for their noise from running away.

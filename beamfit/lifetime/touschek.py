@@ -140,7 +140,7 @@ def piwinski_rate(
     >>> ring = Ring(3e9, 234.144, 372, 1.187e-3, 8.78e5, 9.54e-4, 1.8e-8, 3.6e-11, 0.03,
     ...             1e-5, 10.0, 5.3e-3, 3e-3, 0.0, point)
     >>> f"{1 / piwinski_rate(ring, 8.7e9, 4.97e-3, 0.03) / 3600:.1f} h"
-    '0 h'
+    '35.1 h'
     """
     lorentz = ring.relativistic_gamma
     acceptance = jnp.broadcast_to(acceptance, ring.optics.weight.shape)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -14,7 +15,9 @@ from scipy.optimize import least_squares
 from beamfit.lifetime.decay import current_by_rate
 from beamfit.lifetime.solve import Physical, Solution, solve_decay
 
-__all__ = ["PowerFit", "solve_power", "solve_shaped"]
+__all__ = ["PowerFit", "constant_shape", "solve_power", "solve_shaped"]
+
+Shape = Callable[[Array], Array]
 
 
 class PowerFit(NamedTuple):
@@ -39,74 +42,112 @@ class PowerFit(NamedTuple):
     converged: bool
 
 
-def _model(
-    theta: Array, time: Array, shape: Callable[[Array, Array], Array]
+def constant_shape(beam_current: Array) -> Array:
+    """The shape of a constant a.
+
+    Parameters
+    ----------
+    beam_current : float or array
+        Current, mA.
+
+    Returns
+    -------
+    float or array
+        Ones.
+
+    Examples
+    --------
+    >>> print(constant_shape(500.0))
+    1.0
+    """
+    return jnp.ones_like(beam_current, dtype=float)
+
+
+# theta: current at the start over the mean, loss in one span at the mean current, the part of it
+# that is proportional to a, and the power of the current by which a departs from its shape.
+def _rate(theta: Array, reference: Array, shape: Shape) -> Shape:
+    """Loss in one span as a function of the current over the mean."""
+    _, loss, quadratic, exponent = theta
+
+    def rate(scaled: Array) -> Array:
+        relative = shape(scaled * reference) / shape(reference) * scaled**exponent
+        return loss + quadratic * (relative * scaled - 1)
+
+    return rate
+
+
+@partial(jax.jit, static_argnames="shape")
+def _residual(
+    theta: Array, time: Array, scaled: Array, weight: Array, reference: Array, shape: Shape
 ) -> Array:
-    """Scaled current for the solver's parameters; `shape` is 1 at the mean current, 1 here."""
-    start, loss, quadratic = theta[:3]
+    model = current_by_rate(time, theta[0], _rate(theta, reference, shape))
+    return weight * (model - scaled)
 
-    def rate(beam_current: Array) -> Array:
-        return loss + quadratic * (shape(beam_current, theta) * beam_current - 1)
 
-    return current_by_rate(time, start, rate)
+_jacobian = jax.jit(jax.jacfwd(_residual), static_argnames="shape")
+
+
+class _Minimum(NamedTuple):
+    theta: np.ndarray
+    covariance: np.ndarray
+    residuals: np.ndarray
+    success: bool
 
 
 def _minimise(
-    time: np.ndarray,
-    measured: np.ndarray,
-    weight: np.ndarray,
-    shape: Callable[[Array, Array], Array],
-    extra: tuple[float, ...],
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, bool]:
-    """Parameters, their covariance, scaled residuals, and success; started from constant a."""
+    time: np.ndarray, measured: np.ndarray, weight: np.ndarray, shape: Shape, free: int
+) -> _Minimum:
+    """Fit the first `free` parameters, starting from a constant a."""
     span, reference = float(time[-1]), float(measured.mean())
-    start = solve_decay(time, measured, weight)
-    values = start.values
-    loss = float(values.rate_mean) * span
-    first = np.array([float(values.i0) / reference, loss, float(values.a) * reference * span, *extra])
-    # Weights of their own size keep the optimiser's tolerances meaningful.
-    unit = weight * reference
-    size = np.sqrt(np.mean(unit**2))
+    values = solve_decay(time, measured, weight).values
+    quadratic = float(values.a) * reference * span
+    start = np.array([values.i0 / reference, values.rate_mean * span, quadratic, 0.0])
+    # Weights of order one keep the optimiser's tolerances meaningful.
+    size = np.sqrt(np.mean(weight**2))
+    data = (time / span, measured / reference, weight / size, reference)
 
-    @jax.jit
-    def residual(theta: Array) -> Array:
-        return unit / size * (_model(theta, time / span, shape) - measured / reference)
+    def full(parameters: np.ndarray) -> np.ndarray:
+        return np.concatenate([parameters, start[free:]])
 
-    slopes = jax.jit(jax.jacfwd(residual))
     found = least_squares(
-        residual, first, slopes, method="lm", xtol=1e-13, ftol=1e-13, gtol=1e-15, x_scale="jac"
+        lambda p: np.asarray(_residual(full(p), *data, shape=shape)),
+        start[:free],
+        lambda p: np.asarray(_jacobian(full(p), *data, shape=shape))[:, :free],
+        method="lm",
+        x_scale="jac",
+        xtol=1e-12,
+        ftol=1e-12,
+        gtol=1e-15,
     )
-    triangle = np.linalg.qr(found.jac * size, mode="r")
-    inverse = np.linalg.pinv(triangle)
-    residuals = found.fun * size / unit * reference
-    finite = bool(np.isfinite(found.x).all())
-    return found.x, inverse @ inverse.T, residuals, found.success and finite
+    inverse = np.linalg.pinv(np.linalg.qr(found.jac * size * reference, mode="r"))
+    residuals = found.fun * size / weight * reference
+    success = bool(found.success and np.isfinite(found.x).all())
+    return _Minimum(full(found.x), inverse @ inverse.T, residuals, success)
 
 
-def _physical(theta: Array, time: Array, reference: float, shape) -> Physical:
+@partial(jax.jit, static_argnames="shape")
+def _physical(theta: Array, time: Array, reference: Array, shape: Shape) -> Array:
     span = time[-1]
-    start, loss, quadratic = theta[:3]
-    end = _model(theta, time / span, shape)[-1]
-
-    def rate(beam_current: Array) -> Array:
-        return (loss + quadratic * (shape(beam_current, theta) * beam_current - 1)) / span
-
-    return Physical(
+    start, loss, quadratic, _ = theta
+    rate = _rate(theta, reference, shape)
+    end = current_by_rate(time / span, start, rate)[-1]
+    values = Physical(
         i0=start * reference,
         a=quadratic / (reference * span),
         b=(loss - quadratic) / span,
-        rate_start=rate(start),
-        rate_end=rate(end),
+        rate_start=rate(start) / span,
+        rate_end=rate(end) / span,
         rate_mean=loss / span,
         share=quadratic / loss,
     )
+    return jnp.stack(values)
 
 
 def solve_shaped(
     time: np.ndarray,
     measured: np.ndarray,
     weight: np.ndarray,
-    shape: Callable[[Array], Array],
+    shape: Shape,
 ) -> Solution:
     """Fit I0, a and b where a has a known dependence on the current.
 
@@ -135,24 +176,18 @@ def solve_shaped(
     >>> print(f"{fit.values.b:.4e}")
     1.0000e-06
     """
-    reference = float(measured.mean())
-    level = shape(jnp.asarray(reference))
-
-    def relative(beam_current: Array, theta: Array) -> Array:
-        return shape(beam_current * reference) / level
-
-    theta, covariance, residuals, success = _minimise(time, measured, weight, relative, ())
-    values = _physical(theta, time, reference, relative)
-    slopes = jax.jacfwd(lambda p: jnp.stack(_physical(p, time, reference, relative)))(theta)
-    spread = np.asarray(slopes @ covariance @ slopes.T)
+    found = _minimise(time, measured, weight, shape, free=3)
+    point = (jnp.asarray(found.theta), time, float(measured.mean()))
+    slopes = np.asarray(jax.jacfwd(_physical)(*point, shape=shape))[:, :3]
+    spread = slopes @ found.covariance @ slopes.T
     errors = np.sqrt(np.diag(spread))
     return Solution(
-        values=values,
+        values=Physical(*np.asarray(_physical(*point, shape=shape))),
         errors=Physical(*errors),
         correlation=spread[1, 2] / (errors[1] * errors[2]),
-        residuals=residuals,
-        sum_squares=np.sum((weight * residuals) ** 2),
-        converged=success,
+        residuals=found.residuals,
+        sum_squares=np.sum((weight * found.residuals) ** 2),
+        converged=found.success,
     )
 
 
@@ -179,10 +214,7 @@ def solve_power(time: np.ndarray, measured: np.ndarray, weight: np.ndarray) -> P
     -0.200
     """
 
-    def power(beam_current: Array, theta: Array) -> Array:
-        return beam_current ** theta[3]
-
-    theta, covariance, residuals, success = _minimise(time, measured, weight, power, (0.0,))
-    squares = float(np.sum((weight * residuals) ** 2))
-    error = float(np.sqrt(covariance[3, 3]))
-    return PowerFit(float(theta[3]), error, residuals, squares, success)
+    found = _minimise(time, measured, weight, constant_shape, free=4)
+    squares = float(np.sum((weight * found.residuals) ** 2))
+    error = float(np.sqrt(found.covariance[3, 3]))
+    return PowerFit(float(found.theta[3]), error, found.residuals, squares, found.success)

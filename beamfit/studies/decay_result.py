@@ -49,7 +49,7 @@ class Quantity:
         if self.error == 0:
             return f"{self.value:.6g} ± 0 {self.unit}"
         power = math.floor(math.log10(self.error)) - 1
-        shift = 0 if -6 < power < 3 else math.floor(math.log10(abs(self.value) or 1.0))
+        shift = 0 if -9 < power < 3 else math.floor(math.log10(abs(self.value) or 1.0))
         digits = max(0, shift - power)
         tail = f"e{shift}" if shift else ""
         body = f"{self.value / 10**shift:.{digits}f} ± {self.error / 10**shift:.{digits}f}"
@@ -151,7 +151,9 @@ class DecayFit:
     def __str__(self) -> str:
         rows = [f"{self.record}: {self.status}. {self.message}"]
         rows += [f"  {name:15s} {getattr(self, name)}" for name in QUANTITIES]
-        rows.append(f"  chi²/dof {self.chi2:.4g}/{self.dof}, residual {self.rms_residual:.3g} mA rms")
+        rows.append(
+            f"  chi²/dof {self.chi2:.4g}/{self.dof}, residual {self.rms_residual:.3g} mA rms"
+        )
         return "\n".join(rows)
 
     def to_json(self) -> dict[str, Any]:

@@ -82,8 +82,8 @@ def _unidentified(solution: Solution, scale: float, verdict: Separability) -> st
         )
     if verdict.share_error is None:
         return "a and b are not separable on this record: record longer"
-    # The bend grows with the square of the span, its error falls with the root of the readings.
-    longer = (verdict.share_error / SEPARABLE) ** 0.4
+    # The bend of the decay grows with the square of the span.
+    longer = (verdict.share_error / SEPARABLE) ** 0.5
     return (
         f"a and b are not separable on this record (correlation {verdict.correlation:.6f}; share "
         f"of a in the loss {verdict.share:.2g} ± {verdict.share_error:.2g}); the lifetime at the "
@@ -125,7 +125,9 @@ def _status(
             f"true errors are about {verdict.error_inflation:.1f} times those given"
         )
     step = record.resolution
-    if step is not None and step > 2 * scale * (1 if record.error is None else np.min(record.error)):
+    if step is not None and step > 2 * scale * (
+        1 if record.error is None else np.min(record.error)
+    ):
         remarks.append(f"The readings are quantised in steps of {step:.3g} mA")
     if not verdict.separable:
         status, cause = "unidentified", _unidentified(solution, scale, verdict)
@@ -134,8 +136,8 @@ def _status(
     elif gammaincc(dof / 2, chi2 / 2) < POOR_FIT:
         status = "poor_fit"
         cause = (
-            f"chi²/dof is {chi2 / dof:.3g}, improbable for this law and the stated errors, which are "
-            "enlarged to match: look for steps with split_record, or test constant_a_test"
+            f"chi²/dof is {chi2 / dof:.3g}, improbable for this law and the stated errors, which "
+            "are enlarged to match: look for steps with split_record, or test constant_a_test"
         )
     else:
         status, cause = "converged", "a and b are determined"
@@ -146,14 +148,13 @@ def judge_constant(record: DecayRecord) -> DecayFit:
     """The result for readings that are all equal: no decay is seen, and no noise either."""
     level = float(record.current[0])
     unknown = {
-        name: Quantity(None, None, None, unit)
-        for name, unit in (("a", "1/(mA s)"), ("b", "1/s"))
+        name: Quantity(None, None, None, unit) for name, unit in (("a", "1/(mA s)"), ("b", "1/s"))
     }
     lifetimes = ("lifetime_start", "lifetime_end", "lifetime_mean")
     unknown |= {name: Quantity(None, None, None, "h") for name in lifetimes}
     message = (
-        f"All {len(record)} readings are {level:.6g} mA, so neither decay nor noise is seen: record "
-        "longer, or read the monitor with more digits."
+        f"All {len(record)} readings are {level:.6g} mA, so neither decay nor noise is seen: "
+        "record longer, or read the monitor with more digits."
     )
     return DecayFit(
         record=record.name,

@@ -126,6 +126,38 @@ def _runs(flags: np.ndarray) -> list[tuple[int, int]]:
     return list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))
 
 
+def _event(record: DecayRecord, kind: str, first: int, last: int, change_from: int) -> Event:
+    """An event from reading `first` to `last`, its change counted from another reading."""
+    time, current = record.time, record.current
+    change = current[last if change_from == first else first] - current[change_from]
+    return Event(kind, float(time[first]), float(time[last] - time[first]), float(change))
+
+
+def _noise(record: DecayRecord, kept: np.ndarray) -> float:
+    scatter = noise_of(record.time[kept], record.current[kept])
+    return max(scatter, (record.resolution or 0.0) / 2)
+
+
+def _beam_readings(record: DecayRecord) -> tuple[np.ndarray, list[Event]]:
+    """Indices of the readings that show the beam, and what the others are."""
+    dropped, end_of_beam = _dropouts(record.current)
+    found = {"dropout": dropped, "saturated": _saturated(record.current)}
+    kept = np.flatnonzero(~dropped & ~found["saturated"] & (np.arange(len(record)) < end_of_beam))
+    if kept.size >= FEWEST:
+        found["spike"] = np.zeros(len(record), bool)
+        spikes = _spikes(record.current[kept], _noise(record, kept))
+        found["spike"][kept[spikes]] = True
+        kept = kept[~spikes]
+    events = [
+        _event(record, kind, first, end - 1, max(first - 1, 0))
+        for kind, flags in found.items()
+        for first, end in _runs(flags)
+    ]
+    if end_of_beam < len(record):
+        events.append(_event(record, "loss", end_of_beam, len(record) - 1, end_of_beam - 1))
+    return kept, events
+
+
 def _steps(time: np.ndarray, current: np.ndarray, noise: float) -> np.ndarray:
     """Change from each reading to the next beyond what the decay around it explains, or zero."""
     interval = np.diff(time)
@@ -162,44 +194,25 @@ def split_record(record: DecayRecord) -> Split:
     >>> saw = 100 * np.exp(-(t % 2000) / 36000)
     >>> split = split_record(DecayRecord(t, saw))
     >>> len(split.segments), str(split.events[0])
-    (2, 'refill at 2000 s (+5.377 mA)')
+    (2, 'refill at 2000 s (+5.378 mA)')
     """
-    time, current = record.time, record.current
-    events: list[Event] = []
-
-    def note(kind: str, first: int, last: int, change: float) -> None:
-        events.append(Event(kind, float(time[first]), float(time[last] - time[first]), change))
-
-    dropped, end_of_beam = _dropouts(current)
-    if end_of_beam < len(record):
-        note("loss", end_of_beam, len(record) - 1, -float(current[end_of_beam - 1]))
-    saturated = _saturated(current)
-    for kind, flags in (("dropout", dropped), ("saturated", saturated)):
-        for first, end in _runs(flags):
-            note(kind, first, end - 1, float(current[first] - current[max(first - 1, 0)]))
-    kept = np.flatnonzero(~dropped[:end_of_beam] & ~saturated[:end_of_beam])
+    kept, events = _beam_readings(record)
     if kept.size < FEWEST:
         return Split((), tuple(events))
-    noise = max(noise_of(time[kept], current[kept]), (record.resolution or 0.0) / 2)
-    spikes = _spikes(current[kept], noise)
-    for first, end in _runs(spikes):
-        change = float(current[kept[first]] - current[kept[max(first - 1, 0)]])
-        note("spike", kept[first], kept[end - 1], change)
-    kept = kept[~spikes]
-
-    steps = _steps(time[kept], current[kept], noise)
+    steps = _steps(record.time[kept], record.current[kept], _noise(record, kept))
     for before in np.flatnonzero(steps):
         kind = "refill" if steps[before] > 0 else "loss"
-        note(kind, kept[before + 1], kept[before + 1], float(steps[before]))
-    interval = np.diff(time)
+        at = float(record.time[kept[before + 1]])
+        events.append(Event(kind, at, 0.0, float(steps[before])))
+    interval = np.diff(record.time)
     for before in np.flatnonzero(interval > GAP * np.median(interval)):
-        note("gap", before, before + 1, float(current[before + 1] - current[before]))
+        events.append(_event(record, "gap", before, before + 1, before))
 
     pieces = np.split(kept, np.flatnonzero(steps) + 1)
     long = [piece for piece in pieces if piece.size >= FEWEST]
     for piece in pieces:
         if piece.size < FEWEST:
-            note("short", piece[0], piece[-1], float(current[piece[-1]] - current[piece[0]]))
-    names = [record.name if len(long) == 1 else f"{record.name}#{k}" for k in range(1, len(long) + 1)]
+            events.append(_event(record, "short", piece[0], piece[-1], piece[0]))
+    names = [record.name if len(long) == 1 else f"{record.name}#{k + 1}" for k in range(len(long))]
     segments = tuple(record.select(rows, name) for rows, name in zip(long, names, strict=True))
     return Split(segments, tuple(sorted(events, key=lambda event: event.time)))
