@@ -251,9 +251,8 @@ def ring_from_pyat(
     """
     loss, voltage = lattice.get_energy_loss(), lattice.get_rf_voltage()
     if voltage <= loss:
-        raise InputError(
-            f"RF voltage {voltage:.6g} V", f"more than the loss of {loss:.6g} V a turn"
-        )
+        expected = f"more than the loss of {loss:.6g} V a turn, or no beam is stored"
+        raise InputError(f"RF voltage {voltage:.6g} V", expected, column="rf_voltage")
     beam = lattice.enable_6d(copy=True).envelope_parameters()
     flat = lattice.disable_6d(copy=True)
     lengths = np.array([element.Length for element in flat])

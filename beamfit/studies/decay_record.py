@@ -62,7 +62,7 @@ def _unit_change(current: np.ndarray) -> int | None:
         decades = np.abs(np.log10(current[1:] / current[:-1]))
     for row in np.flatnonzero(np.abs(decades - 3) < 0.01) + 1:
         before, after = np.median(current[max(row - 3, 0) : row]), np.median(current[row : row + 3])
-        if before > 0 and after > 0 and abs(abs(np.log10(after / before)) - 3) < 0.01:
+        if before > 0 and after > 0 and abs(abs(np.log10(after / before)) - 3) < 0.05:
             return int(row)
     return None
 

@@ -115,9 +115,17 @@ def _saturated(current: np.ndarray) -> np.ndarray:
     return flagged
 
 
-def _spikes(current: np.ndarray, noise: float) -> np.ndarray:
-    """Up to three readings off the running median, which follows decays and steps exactly."""
-    return np.abs(current - median_filter(current, 7, mode="nearest")) > THRESHOLD * noise
+def _flattened(time: np.ndarray, current: np.ndarray) -> np.ndarray:
+    """The readings without their decay: level, but for noise, steps and spikes."""
+    interval = np.diff(time)
+    slope = median_filter(np.diff(current) / interval, WINDOW, mode="nearest")
+    return current - np.concatenate([[0.0], np.cumsum(slope * interval)])
+
+
+def _spikes(time: np.ndarray, current: np.ndarray, noise: float) -> np.ndarray:
+    """Up to three readings off the running median, which follows steps exactly."""
+    level = _flattened(time, current)
+    return np.abs(level - median_filter(level, 7, mode="nearest")) > THRESHOLD * noise
 
 
 def _runs(flags: np.ndarray) -> list[tuple[int, int]]:
@@ -145,7 +153,7 @@ def _beam_readings(record: DecayRecord) -> tuple[np.ndarray, list[Event]]:
     kept = np.flatnonzero(~dropped & ~found["saturated"] & (np.arange(len(record)) < end_of_beam))
     if kept.size >= FEWEST:
         found["spike"] = np.zeros(len(record), bool)
-        spikes = _spikes(record.current[kept], _noise(record, kept))
+        spikes = _spikes(record.time[kept], record.current[kept], _noise(record, kept))
         found["spike"][kept[spikes]] = True
         kept = kept[~spikes]
     events = [
@@ -160,12 +168,10 @@ def _beam_readings(record: DecayRecord) -> tuple[np.ndarray, list[Event]]:
 
 def _steps(time: np.ndarray, current: np.ndarray, noise: float) -> np.ndarray:
     """Change from each reading to the next beyond what the decay around it explains, or zero."""
-    interval = np.diff(time)
     change = np.diff(current)
-    slope = median_filter(change / interval, min(WINDOW, change.size), mode="nearest")
-    excess = change - slope * interval
+    excess = np.diff(_flattened(time, current))
     usual = 1.4826 * np.median(np.abs(excess))
-    allowed = THRESHOLD * max(usual, np.sqrt(2) * noise) + 0.5 * np.abs(slope) * interval
+    allowed = THRESHOLD * max(usual, np.sqrt(2) * noise) + 0.5 * np.abs(change - excess)
     return np.where(np.abs(excess) > allowed, change, 0.0)
 
 

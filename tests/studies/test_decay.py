@@ -7,7 +7,7 @@ import pytest
 
 from beamfit.errors import InputError
 from beamfit.io.decay_record import read_decay_record
-from beamfit.lifetime.decay import current, current_by_rate
+from beamfit.lifetime.decay import current_by_rate
 from beamfit.studies.decay import fit_decay, fit_decays
 from beamfit.studies.decay_checks import (
     constant_a_test,
@@ -25,10 +25,13 @@ CONTRACT = (
 HOUR = 3600.0
 
 
+def law(time, i0, a, b):
+    return i0 * np.exp(-b * time) / (1 + a / b * i0 * -np.expm1(-b * time))
+
+
 def simulated(span, noise=1e-3, i0=500.0, a=4e-8, b=2e-6, rows=500, seed=1, stated=None):
     time = np.linspace(0, span, rows)
-    exact = np.asarray(current(time, i0, a, b))
-    measured = exact + noise * np.random.default_rng(seed).normal(size=rows)
+    measured = law(time, i0, a, b) + noise * np.random.default_rng(seed).normal(size=rows)
     error = np.full(rows, stated) if stated else None
     return DecayRecord(time, measured, error, name="simulated")
 
@@ -98,12 +101,14 @@ def test_the_length_it_asks_for_is_enough():
 
 
 def test_a_record_shorter_than_its_noise_allows():
-    fit = fit_decay(simulated(60, noise=5.0, stated=5.0))
-    assert fit.status == "unidentified"
-    assert "within its noise" in fit.message
-    assert fit.lifetime_mean.error is None
-    limit = float(fit.message.split("above ")[1].split(" h")[0])
-    assert limit < 1 / (4e-8 * 500 + 2e-6) / HOUR
+    fits = fit_decays([simulated(60, noise=5.0, seed=k, stated=5.0) for k in range(64)])
+    lost = [fit for fit in fits if "within its noise" in fit.message]
+    assert len(lost) > 50
+    assert {fit.status for fit in lost} == {"unidentified"}
+    assert {fit.lifetime_mean.error for fit in lost} == {None}
+    limits = [float(fit.message.split("above ")[1].split(" h")[0]) for fit in lost]
+    true = 1 / (4e-8 * 500 + 2e-6) / HOUR
+    assert np.mean(np.array(limits) < true) > 0.85  # stated to hold in 95 of 100
 
 
 def test_errors_in_the_file_are_tested_by_chi2_and_enlarged():
@@ -127,22 +132,21 @@ def test_errors_missing_from_the_file_are_inferred_and_said_so():
     assert fit.a.error == pytest.approx(stated.a.error_raw, rel=0.1)
 
 
-@pytest.mark.parametrize(
-    "name", ["a", "b", "i0", "lifetime_start", "lifetime_end", "lifetime_mean"]
-)
-def test_the_stated_errors_cover_the_truth(name):
-    records = [simulated(4 * HOUR, noise=0.02, seed=seed) for seed in range(200)]
+def test_the_stated_errors_cover_the_truth():
+    records = [simulated(4 * HOUR, noise=0.02, seed=seed) for seed in range(256)]
     fits = fit_decays(records)
-    end = float(current(4 * HOUR, 500.0, 4e-8, 2e-6))
-    mean = float(np.mean(current(records[0].time, 500.0, 4e-8, 2e-6)))
+    beams = law(np.array([0, 4 * HOUR]), 500.0, 4e-8, 2e-6)
+    mean = np.mean(law(records[0].time, 500.0, 4e-8, 2e-6))
     true = {"a": 4e-8, "b": 2e-6, "i0": 500.0} | {
         f"lifetime_{where}": 1 / (4e-8 * beam + 2e-6) / HOUR
-        for where, beam in (("start", 500.0), ("end", end), ("mean", mean))
+        for where, beam in zip(("start", "end", "mean"), (*beams, mean), strict=True)
     }
-    pulls = [(getattr(fit, name).value - true[name]) / getattr(fit, name).error for fit in fits]
-    # 200 records know the width of the pulls to 5 %.
-    assert np.std(pulls) == pytest.approx(1, abs=0.2)
-    assert abs(np.mean(pulls)) < 0.3
+    for name, value in true.items():
+        found = [getattr(fit, name) for fit in fits]
+        pulls = [(quantity.value - value) / quantity.error for quantity in found]
+        # 256 records know the width of the pulls to 4 %, their mean to 6 %.
+        assert np.std(pulls) == pytest.approx(1, abs=0.15)
+        assert abs(np.mean(pulls)) < 0.25
 
 
 def test_many_at_once_equal_one_by_one():
@@ -164,7 +168,7 @@ def test_a_constant_record_is_no_decay():
 
 def test_quantised_readings_are_noted():
     time = np.linspace(0, 8 * HOUR, 2000)
-    record = DecayRecord(time, np.round(np.asarray(current(time, 200.0, 4e-8, 2e-6)), 0))
+    record = DecayRecord(time, np.round(law(time, 200.0, 4e-8, 2e-6)))
     fit = fit_decay(record)
     assert "quantised in steps of 1 mA" in fit.message
     assert abs(fit.lifetime_mean.value / (1 / (4e-8 * fit.mean_current + 2e-6) / HOUR) - 1) < 0.01
@@ -259,7 +263,7 @@ def test_a_thousand_random_records_leave_no_failure():
         i0, noise = 10 ** rng.uniform(0, 2.8), 10 ** rng.uniform(-4, -1)
         span = 60.0 if k % 4 == 0 else 10 ** rng.uniform(1.7, np.log10(2 * lifetime))
         time = np.linspace(0, span, 100)
-        exact = np.asarray(current(time, i0, share / lifetime / i0, (1 - share) / lifetime))
+        exact = law(time, i0, share / lifetime / i0, (1 - share) / lifetime)
         measured = np.abs(exact + noise * rng.normal(size=100))
         records.append(DecayRecord(time, measured, np.full(100, noise) if k % 2 else None))
     fits = fit_decays(records)
