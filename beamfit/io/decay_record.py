@@ -10,6 +10,7 @@ import h5py
 import numpy as np
 
 from beamfit.errors import InputError, nearest
+from beamfit.io.files import text_lines
 from beamfit.studies.decay_record import Conditions, DecayRecord, first_fault
 
 __all__ = ["read_decay_record"]
@@ -94,10 +95,7 @@ def _number(cell: str, name: str) -> float:
 
 
 def _read_csv(path: Path) -> DecayRecord:
-    try:
-        text = path.read_text(encoding="utf-8-sig").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(str(error), "a CSV file in UTF-8", path=path) from error
+    text = list(text_lines(path))
     comments = tuple(line.lstrip("# ").rstrip() for line in text if line.startswith("#"))
     numbered = [(i, line) for i, line in enumerate(text, 1) if line.strip() and line[0] != "#"]
     if not numbered:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from beamfit.errors import InputError, nearest
+from beamfit.io.files import read_text
 from beamfit.io.twiss import read_twiss
 from beamfit.lifetime.ring import Gas, Operation, Optics, Ring, gas_mixture
 
@@ -63,10 +64,8 @@ ANY_SIGN = {name for name in OPTICS_KEYS if not name.startswith("beta")} | {"mom
 
 def _document(path: Path) -> dict[str, Any]:
     try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise InputError(error.strerror or "unreadable", "a ring file", path=path) from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        return tomllib.loads(read_text(path))
+    except tomllib.TOMLDecodeError as error:
         raise InputError(str(error), "a ring file in TOML", path=path) from error
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from beamfit.errors import InputError, nearest
+from beamfit.io.files import text_lines
 from beamfit.lifetime.ring import Optics
 
 __all__ = ["read_twiss"]
@@ -29,11 +30,7 @@ MAY_BE_MISSING = {"dispersion_y_m", "dispersion_slope_y"}
 
 def _rows(path: Path) -> tuple[dict[str, int], list[tuple[int, list[str]]], bool]:
     """Column positions, numbered rows, and whether the file is TFS."""
-    try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(str(error), "a Twiss table, CSV or TFS", path=path) from error
-    numbered = [(i, line.strip()) for i, line in enumerate(lines, 1) if line.strip()]
+    numbered = [(i, line.strip()) for i, line in enumerate(text_lines(path), 1) if line.strip()]
     if any(line.startswith("*") for _, line in numbered):
         header = next(line.split()[1:] for _, line in numbered if line.startswith("*"))
         rows = [(i, line.split()) for i, line in numbered if line[0] not in "@*$#"]

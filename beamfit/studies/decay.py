@@ -18,6 +18,8 @@ from beamfit.studies.decay_verdict import judge, judge_constant
 __all__ = ["fit_decay", "fit_decays"]
 
 FEWEST = 5
+# Records solved in one call; fewer are filled up, so that one number is compiled.
+TOGETHER = 64
 
 
 def fit_decay(record: DecayRecord, shape: Callable[[Any], Any] | None = None) -> DecayFit:
@@ -102,13 +104,15 @@ def fit_decays(records: Sequence[DecayRecord]) -> tuple[DecayFit, ...]:
         else:
             groups.setdefault(_padded_size(len(record)), []).append(k)
     for members in groups.values():
-        padded = [_padded(records[k], _weight(records[k])) for k in members]
-        # The number of records is padded too, or each new number would compile anew.
-        padded += [padded[0]] * (_padded_size(len(members), 1) - len(members))
-        stacked = [np.stack(arrays) for arrays in zip(*padded, strict=True)]
-        solutions = solve_decays(*stacked)
-        for row, k in enumerate(members):
-            fits[k] = judge(records[k], jax.tree.map(lambda leaf, r=row: leaf[r], solutions))
+        for first in range(0, len(members), TOGETHER):
+            chosen = members[first : first + TOGETHER]
+            padded = [_padded(records[k], _weight(records[k])) for k in chosen]
+            padded += padded[:1] * (TOGETHER - len(chosen))
+            stacked = [np.stack(arrays) for arrays in zip(*padded, strict=True)]
+            solutions = solve_decays(*stacked)
+            for row, k in enumerate(chosen):
+                one = jax.tree.map(lambda leaf, r=row: leaf[r], solutions)
+                fits[k] = judge(records[k], one)
     return tuple(fits[k] for k in range(len(records)))
 
 
@@ -124,9 +128,9 @@ def _weight(record: DecayRecord) -> np.ndarray:
     return np.ones(len(record)) if record.error is None else 1 / record.error
 
 
-def _padded_size(rows: int, least: int = 64) -> int:
+def _padded_size(rows: int) -> int:
     """64, 256, 1024, ...: every length is compiled once, for a second or two, so keep few."""
-    size = least
+    size = 64
     while size < rows:
         size *= 4
     return size

@@ -9,11 +9,12 @@ import numpy as np
 from scipy.special import fdtrc
 
 from beamfit.errors import InputError
+from beamfit.inference.quantity import Quantity, Status
 from beamfit.lifetime.solve import solve_decay
 from beamfit.lifetime.varying import solve_power
 from beamfit.studies.decay import fit_decay
 from beamfit.studies.decay_record import DecayRecord
-from beamfit.studies.decay_result import DecayFit, Quantity
+from beamfit.studies.decay_result import DecayFit
 
 __all__ = [
     "ConstantA",
@@ -59,11 +60,10 @@ class OneLifetime:
 
 def _one_lifetime(rate: float, error: float, residuals: np.ndarray, fit: DecayFit) -> OneLifetime:
     bias = [
-        math.nan if quantity.value is None else 1 / rate / HOUR / quantity.value - 1
-        for quantity in (fit.lifetime_start, fit.lifetime_mean)
+        1 / rate / HOUR / quantity.value - 1 for quantity in (fit.lifetime_start, fit.lifetime_mean)
     ]
     spread = error / rate**2 / HOUR
-    lifetime = Quantity(1 / rate / HOUR, spread, spread, "h")
+    lifetime = Quantity(1 / rate / HOUR, spread, "h", spread)
     return OneLifetime(lifetime, float(np.sqrt(np.mean(residuals**2))), *bias)
 
 
@@ -205,7 +205,7 @@ class ConstantA:
 
     Parameters
     ----------
-    status : str
+    status : Status
         `converged` if a constant a describes the record, `poor_fit` if it is rejected,
         `unidentified` if the record cannot tell.
     message : str
@@ -216,7 +216,7 @@ class ConstantA:
         Probability of a worse contradiction if a is constant.
     """
 
-    status: str
+    status: Status
     message: str
     exponent: Quantity
     p_value: float
@@ -251,8 +251,8 @@ def constant_a_test(record: DecayRecord) -> ConstantA:
     >>> t = np.linspace(0, 8 * 3600, 500)
     >>> noise = 1e-3 * np.random.default_rng(1).normal(size=t.size)
     >>> record = DecayRecord(t, np.array(current(t, 500.0, 2e-8, 1e-6)) + noise)
-    >>> constant_a_test(record).status
-    'converged'
+    >>> print(constant_a_test(record).status)
+    converged
     """
     weight = np.ones(len(record)) if record.error is None else 1 / record.error
     constant = solve_decay(record.time, record.current, weight)
@@ -268,16 +268,16 @@ def constant_a_test(record: DecayRecord) -> ConstantA:
     chance = float(fdtrc(1.0, dof, excess))
     raw = power.error * math.sqrt(unit)
     error = raw / math.sqrt(independent)
-    exponent = Quantity(power.exponent, error, raw, "1")
+    exponent = Quantity(power.exponent, error, "1", raw)
     if not power.converged or not error < 1 / 3:
         message = "The record cannot tell a constant a from one that depends on the current"
-        unknown = Quantity(power.exponent, None, None, "1")
-        return ConstantA("unidentified", f"{message}: record longer.", unknown, chance)
+        unknown = Quantity(power.exponent, None, "1")
+        return ConstantA(Status.unidentified, f"{message}: record longer.", unknown, chance)
     if chance < REJECTED:
         message = (
             f"A constant a is rejected (p = {chance:.2g}): a goes as I^{power.exponent:.3f}, "
             "so b of the constant-a fit is not a gas loss; fit with the shape of a."
         )
-        return ConstantA("poor_fit", message, exponent, chance)
+        return ConstantA(Status.poor_fit, message, exponent, chance)
     message = f"A constant a describes the record (p = {chance:.2g}, exponent {exponent})."
-    return ConstantA("converged", message, exponent, chance)
+    return ConstantA(Status.converged, message, exponent, chance)

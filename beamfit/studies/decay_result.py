@@ -2,67 +2,16 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
 
-__all__ = ["DecayFit", "Quantity", "Separability"]
+from beamfit.inference.quantity import Quantity, Status
+
+__all__ = ["DecayFit", "Separability"]
 
 QUANTITIES = ("a", "b", "i0", "lifetime_start", "lifetime_end", "lifetime_mean")
-
-
-@dataclass(frozen=True)
-class Quantity:
-    """A value with its standard deviation and unit; None where the data do not determine it.
-
-    Parameters
-    ----------
-    value : float or None
-        The value.
-    error : float or None
-        One standard deviation, enlarged by sqrt(chi²/dof) where that exceeds 1.
-    error_raw : float or None
-        The same without the enlargement.
-    unit : str
-        Unit of all three.
-
-    Examples
-    --------
-    >>> print(Quantity(35.37, 0.02, 0.02, "h"))
-    35.370 ± 0.020 h
-    >>> print(Quantity(7e-8, None, None, "1/(mA s)"))
-    7e-08 1/(mA s), not determined
-    """
-
-    value: float | None
-    error: float | None
-    error_raw: float | None
-    unit: str
-
-    def __str__(self) -> str:
-        if self.value is None:
-            return "not determined"
-        if self.error is None:
-            return f"{self.value:.4g} {self.unit}, not determined"
-        if self.error == 0:
-            return f"{self.value:.6g} ± 0 {self.unit}"
-        power = math.floor(math.log10(self.error)) - 1
-        shift = 0 if -9 < power < 3 else math.floor(math.log10(abs(self.value) or 1.0))
-        digits = max(0, shift - power)
-        tail = f"e{shift}" if shift else ""
-        body = f"{self.value / 10**shift:.{digits}f} ± {self.error / 10**shift:.{digits}f}"
-        return f"({body}){tail} {self.unit}" if shift else f"{body} {self.unit}"
-
-    def to_json(self) -> dict[str, float | str | None]:
-        """Return the fields as JSON's types."""
-        return {
-            "value": self.value,
-            "error": self.error,
-            "error_raw": self.error_raw,
-            "unit": self.unit,
-        }
 
 
 @dataclass(frozen=True)
@@ -104,7 +53,7 @@ class DecayFit:
     ----------
     record : str
         Name of the record.
-    status : str
+    status : Status
         `converged`; `poor_fit` if chi² is improbable (below 1e-3); `infeasible` if a or b is
         negative by more than its error allows; `unidentified` if a and b, or the lifetime
         itself, are not determined; `not_finite` if the search failed.
@@ -132,7 +81,7 @@ class DecayFit:
     """
 
     record: str
-    status: str
+    status: Status
     message: str
     i0: Quantity
     a: Quantity
@@ -160,7 +109,7 @@ class DecayFit:
         """Return the result as one JSON object, as `beamfit lifetime --json` prints it."""
         return {
             "record": self.record,
-            "status": self.status,
+            "status": self.status.value,
             "message": self.message,
             **{name: getattr(self, name).to_json() for name in QUANTITIES},
             "mean_current": {"value": self.mean_current, "error": None, "unit": "mA"},

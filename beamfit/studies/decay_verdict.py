@@ -5,12 +5,13 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from scipy.special import gammaincc
 
 from beamfit.errors import InputError
+from beamfit.inference.identifiability import chi2_probability
+from beamfit.inference.quantity import Quantity, Status
 from beamfit.lifetime.solve import Physical, Solution
 from beamfit.studies.decay_record import DecayRecord
-from beamfit.studies.decay_result import DecayFit, Quantity, Separability
+from beamfit.studies.decay_result import DecayFit, Separability
 
 __all__ = ["judge", "judge_constant"]
 
@@ -30,16 +31,16 @@ def _quantity(
 ) -> Quantity:
     value, error = float(value), float(error)
     if not math.isfinite(value):
-        return Quantity(None, None, None, unit)
+        return Quantity(math.nan, None, unit)
     if not known or not math.isfinite(error):
-        return Quantity(value, None, None, unit)
-    return Quantity(value, error * scale, error * raw, unit)
+        return Quantity(value, None, unit)
+    return Quantity(value, error * scale, unit, error * raw)
 
 
 def _lifetime(rate: float, error: float, raw: float, scale: float, known: bool) -> Quantity:
     """Lifetime in hours from a loss rate; no error where the rate is not clear of zero."""
     if not rate > 0:
-        return Quantity(None, None, None, "h")
+        return Quantity(math.nan, None, "h")
     known = known and error * scale < DETERMINED * rate
     return _quantity(1 / rate / HOUR, error / rate**2 / HOUR, raw, scale, "h", known)
 
@@ -111,10 +112,13 @@ def _status(
     dof: int,
     scale: float,
     verdict: Separability,
-) -> tuple[str, str]:
+) -> tuple[Status, str]:
     """Status and message, the gravest first."""
     if not bool(solution.converged):
-        return "not_finite", "The search found no finite minimum: look at the record for steps."
+        return (
+            Status.not_finite,
+            "The search found no finite minimum: look at the record for steps.",
+        )
     remarks = []
     if record.error is None:
         noise = f"{scale:.3g} mA rms is inferred from the residuals"
@@ -130,17 +134,17 @@ def _status(
     ):
         remarks.append(f"The readings are quantised in steps of {step:.3g} mA")
     if not verdict.separable:
-        status, cause = "unidentified", _unidentified(solution, scale, verdict)
+        status, cause = Status.unidentified, _unidentified(solution, scale, verdict)
     elif negative := _negative(solution.values, solution.errors, scale, verdict.error_inflation):
-        status, cause = "infeasible", negative
-    elif gammaincc(dof / 2, chi2 / 2) < POOR_FIT:
-        status = "poor_fit"
+        status, cause = Status.infeasible, negative
+    elif chi2_probability(chi2, dof) < POOR_FIT:
+        status = Status.poor_fit
         cause = (
             f"chi²/dof is {chi2 / dof:.3g}, improbable for this law and the stated errors, which "
             "are enlarged to match: look for steps with split_record, or test constant_a_test"
         )
     else:
-        status, cause = "converged", "a and b are determined"
+        status, cause = Status.converged, "a and b are determined"
     return status, ". ".join([cause, *remarks]) + "."
 
 
@@ -148,19 +152,19 @@ def judge_constant(record: DecayRecord) -> DecayFit:
     """The result for readings that are all equal: no decay is seen, and no noise either."""
     level = float(record.current[0])
     unknown = {
-        name: Quantity(None, None, None, unit) for name, unit in (("a", "1/(mA s)"), ("b", "1/s"))
+        name: Quantity(math.nan, None, unit) for name, unit in (("a", "1/(mA s)"), ("b", "1/s"))
     }
     lifetimes = ("lifetime_start", "lifetime_end", "lifetime_mean")
-    unknown |= {name: Quantity(None, None, None, "h") for name in lifetimes}
+    unknown |= {name: Quantity(math.nan, None, "h") for name in lifetimes}
     message = (
         f"All {len(record)} readings are {level:.6g} mA, so neither decay nor noise is seen: "
         "record longer, or read the monitor with more digits."
     )
     return DecayFit(
         record=record.name,
-        status="unidentified",
+        status=Status.unidentified,
         message=message,
-        i0=Quantity(level, None, None, "mA"),
+        i0=Quantity(level, None, "mA"),
         **unknown,
         mean_current=level,
         chi2=0.0,

@@ -74,7 +74,7 @@ def test_bad_rings_are_named_by_key(tmp_path, old, new, column, words):
 
 
 def test_a_missing_ring_file(tmp_path):
-    with pytest.raises(InputError, match="No such file"):
+    with pytest.raises(InputError, match="no such file"):
         read_ring(tmp_path / "none.toml")
 
 

@@ -150,8 +150,8 @@ def test_the_stated_errors_cover_the_truth():
 
 
 def test_many_at_once_equal_one_by_one():
-    records = [simulated(HOUR * k, rows=65 + 30 * k, seed=k) for k in (1, 2, 3, 4, 5)]
-    records.append(DecayRecord([0, 1, 2, 3, 4], [5.0] * 5))
+    records = [simulated(HOUR * k, rows=300 + 30 * k, seed=k) for k in (1, 2, 3, 4, 5)]
+    records.append(DecayRecord(np.arange(9.0), np.full(9, 5.0)))
     for record, fit in zip(records, fit_decays(records), strict=True):
         alone = fit_decay(record)
         assert fit.status == alone.status
@@ -162,12 +162,12 @@ def test_a_constant_record_is_no_decay():
     fit = fit_decay(DecayRecord(np.arange(20.0), np.full(20, 100.0)))
     assert fit.status == "unidentified"
     assert "All 20 readings are 100 mA" in fit.message
-    assert fit.lifetime_mean.value is None
+    assert np.isnan(fit.lifetime_mean.value)
     assert fit.to_json()["a"]["value"] is None
 
 
 def test_quantised_readings_are_noted():
-    time = np.linspace(0, 8 * HOUR, 2000)
+    time = np.linspace(0, 8 * HOUR, 1000)
     record = DecayRecord(time, np.round(law(time, 200.0, 4e-8, 2e-6)))
     fit = fit_decay(record)
     assert "quantised in steps of 1 mA" in fit.message
@@ -194,10 +194,10 @@ def test_a_gap_does_no_harm():
 
 
 def lengthening_record():
-    time = np.linspace(0, 10 * HOUR, 600)
+    time = np.linspace(0, 10 * HOUR, 500)
     exact = current_by_rate(time, 500.0, lambda i: 4e-8 * (i / 500) ** -0.25 * i + 2e-7)
-    noise = 2e-3 * np.random.default_rng(2).normal(size=600)
-    return DecayRecord(time, np.asarray(exact) + noise, np.full(600, 2e-3))
+    noise = 2e-3 * np.random.default_rng(2).normal(size=500)
+    return DecayRecord(time, np.asarray(exact) + noise, np.full(500, 2e-3))
 
 
 def test_a_varying_a_is_found_and_its_false_gas_term_undone():
@@ -262,14 +262,14 @@ def test_a_thousand_random_records_leave_no_failure():
         lifetime, share = 10 ** rng.uniform(0, 2.3) * HOUR, rng.uniform()
         i0, noise = 10 ** rng.uniform(0, 2.8), 10 ** rng.uniform(-4, -1)
         span = 60.0 if k % 4 == 0 else 10 ** rng.uniform(1.7, np.log10(2 * lifetime))
-        time = np.linspace(0, span, 100)
+        time = np.linspace(0, span, 300)
         exact = law(time, i0, share / lifetime / i0, (1 - share) / lifetime)
-        measured = np.abs(exact + noise * rng.normal(size=100))
-        records.append(DecayRecord(time, measured, np.full(100, noise) if k % 2 else None))
+        measured = np.abs(exact + noise * rng.normal(size=300))
+        records.append(DecayRecord(time, measured, np.full(300, noise) if k % 2 else None))
     fits = fit_decays(records)
     statuses = Counter(fit.status for fit in fits)
     assert set(statuses) <= {"converged", "unidentified", "poor_fit"}
     # One in a thousand good fits has a chi² this improbable.
     assert statuses["poor_fit"] <= 3
     assert statuses["converged"] > 200
-    assert all(fit.lifetime_mean.value is None or fit.lifetime_mean.value > 0 for fit in fits)
+    assert all(not fit.lifetime_mean.value <= 0 for fit in fits)
