@@ -175,9 +175,9 @@ def test_quantised_readings_are_noted():
 
 
 def test_a_rising_record_is_refused_with_a_remedy():
-    time = np.linspace(0, 600, 100)
+    time = np.linspace(0, 600, 400)
     with pytest.raises(InputError, match=r"rises, 80 to 102 mA.*split_record"):
-        fit_decay(DecayRecord(time, np.linspace(80, 102, 100)))
+        fit_decay(DecayRecord(time, np.linspace(80, 102, 400)))
 
 
 def test_too_few_readings():
