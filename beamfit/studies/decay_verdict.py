@@ -22,6 +22,8 @@ SEPARABLE = 0.2
 # A loss rate less than three errors from zero leaves the lifetime without an upper limit.
 DETERMINED = 1 / 3
 POOR_FIT = 1e-3
+# A change between neighbouring residuals of so many times their usual one is a step, not noise.
+STEP = 12.0
 # How many errors below zero an unphysical a or b, or a rising current, is believed.
 BELIEVED = 5.0
 
@@ -52,6 +54,21 @@ def _neighbours(residuals: np.ndarray) -> float:
         return 0.0
     correlation = float(residuals[1:] @ residuals[:-1]) / squares
     return correlation if abs(correlation) > 4 / math.sqrt(residuals.size) else 0.0
+
+
+def _step(record: DecayRecord, residuals: np.ndarray) -> str | None:
+    """The sentence for a step or spike in the record, whether or not its errors are known."""
+    change = np.diff(residuals)
+    usual = 1.4826 * float(np.median(np.abs(change)))
+    floor = max(record.resolution or 0.0, 1e-12 * float(record.current.max()))
+    largest = int(np.argmax(np.abs(change)))
+    if abs(change[largest]) <= STEP * max(usual, floor):
+        return None
+    # Residuals are model minus reading, so a refill lowers them.
+    return (
+        f"The record has a step of {-change[largest]:+.4g} mA at {record.time[largest + 1]:.6g} s: "
+        "cut it with split_record and fit the pieces"
+    )
 
 
 def _separability(
@@ -105,6 +122,15 @@ def _negative(values: Physical, errors: Physical, scale: float, inflation: float
     return None
 
 
+def _quantised(record: DecayRecord, scale: float) -> list[str]:
+    step, noise = record.resolution, scale
+    if record.error is not None:
+        noise *= float(np.min(record.error))
+    if step is None or step <= 2 * noise:
+        return []
+    return [f"The readings are quantised in steps of {step:.3g} mA"]
+
+
 def _status(
     record: DecayRecord,
     solution: Solution,
@@ -128,13 +154,13 @@ def _status(
             f"Neighbouring residuals are correlated ({verdict.residual_correlation:.2f}), so the "
             f"true errors are about {verdict.error_inflation:.1f} times those given"
         )
-    step = record.resolution
-    if step is not None and step > 2 * scale * (
-        1 if record.error is None else np.min(record.error)
-    ):
-        remarks.append(f"The readings are quantised in steps of {step:.3g} mA")
+    remarks += _quantised(record, scale)
+    step = _step(record, solution.residuals[: len(record)])
     if not verdict.separable:
         status, cause = Status.unidentified, _unidentified(solution, scale, verdict)
+        remarks += [step] if step else []
+    elif step:
+        status, cause = Status.poor_fit, step
     elif negative := _negative(solution.values, solution.errors, scale, verdict.error_inflation):
         status, cause = Status.infeasible, negative
     elif chi2_probability(chi2, dof) < POOR_FIT:

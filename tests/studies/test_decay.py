@@ -273,3 +273,14 @@ def test_a_thousand_random_records_leave_no_failure():
     assert statuses["poor_fit"] <= 3
     assert statuses["converged"] > 200
     assert all(not fit.lifetime_mean.value <= 0 for fit in fits)
+
+
+@pytest.mark.parametrize("stated", [None, 1e-3])
+def test_a_record_with_a_refill_is_not_passed_off_as_a_decay(stated):
+    record = simulated(8 * HOUR, stated=stated)
+    refilled = record.current + np.where(record.time > 5 * HOUR, 20.0, 0.0)
+    fit = fit_decay(DecayRecord(record.time, refilled, record.error))
+    assert fit.status in ("poor_fit", "unidentified")
+    assert "a step of +" in fit.message
+    assert "split_record" in fit.message
+    assert "step" not in fit_decay(record).message
