@@ -119,7 +119,7 @@ def random_records(table: Table) -> None:
         records.append(DecayRecord(t, measured, np.full(1000, noise)))
         starts.append((measured[0], 5e7 / lifetime / i0, 5e5 / lifetime))
     together, _ = seconds(lambda: fit_decays(records), 1)
-    statuses = Counter(result.status for result in fit_decays(records))
+    statuses = Counter(result.status.value for result in fit_decays(records))
     begin, failed = time.perf_counter(), 0
     for record, start in zip(records, starts, strict=True):
         try:

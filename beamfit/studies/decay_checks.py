@@ -162,8 +162,8 @@ def moving_lifetime(record: DecayRecord, window: float) -> LifetimeTrace:
     -------
     LifetimeTrace
         One value for each reading whose window lies within the record and holds five readings.
-        Neighbouring values share readings. The line's slope over the window's mean current is
-        biased by about (window/lifetime)²/12 of the lifetime, no more.
+        Neighbouring values share readings. The lifetime is that at the window's mean current,
+        too long by a share of (window/lifetime)²/60, for a decay by gas and by Touschek alike.
 
     Raises
     ------

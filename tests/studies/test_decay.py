@@ -284,3 +284,12 @@ def test_a_record_with_a_refill_is_not_passed_off_as_a_decay(stated):
     assert "a step of +" in fit.message
     assert "split_record" in fit.message
     assert "step" not in fit_decay(record).message
+
+
+@pytest.mark.parametrize(("a", "b"), [(1e-30, 1 / 36000), (1 / 36000 / 500, 1e-30)])
+def test_the_bias_of_the_moving_lifetime_is_as_stated(a, b):
+    time = np.linspace(0, 2 * HOUR, 401)
+    trace = moving_lifetime(DecayRecord(time, law(time, 500.0, a, b)), 7199.0)
+    lifetime = 1 / (a * trace.current[0] + b) / HOUR
+    stated = (2 / lifetime) ** 2 / 60
+    assert trace.lifetime[0] / lifetime - 1 == pytest.approx(stated, rel=0.1)
