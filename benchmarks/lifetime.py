@@ -1,7 +1,7 @@
 """Lifetime against its peers, side by side in one run: python benchmarks/lifetime.py [--whole]
 
 Touschek lifetime against pyAT on the SPEAR3 2003 ring (on every 40th slice, the time scaled to the
-ring; --whole runs pyAT on all, about a minute and a half), the (I0, a, b) fit against
+ring; --whole runs pyAT on all, for minutes), the (I0, a, b) fit against
 scipy.optimize.curve_fit, and a thousand random records.
 """
 
