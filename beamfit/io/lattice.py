@@ -6,7 +6,7 @@ import math
 import re
 import tomllib
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -86,7 +86,6 @@ class LatticeFile:
     calibrations: Mapping[str, str]
     design: Mapping[str, Any] | None = None
     source: str = ""
-    foreign: Beamline | None = field(default=None, repr=False)
 
     @property
     def places(self) -> list[str]:
@@ -103,7 +102,7 @@ class LatticeFile:
         """Make the beam line (this loads JAX)."""
         from beamfit.io.build import beamline_of
 
-        return self.foreign if self.foreign is not None else beamline_of(self)
+        return beamline_of(self)
 
 
 def load_lattice(
