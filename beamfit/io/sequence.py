@@ -170,6 +170,8 @@ def _parse(parser: Any, source: Source) -> None:
     def checked(text: str) -> bool:
         if HARMFUL.search(unicodedata.normalize("NFKC", text)):
             raise ValueError("a name that no lattice needs and that could run code")
+        if not _balanced(text):  # on which the parser would never end
+            raise ValueError("parentheses that do not match")
         if source.dialect == ELEGANT:
             parser.rpn.stack.clear()  # a "% 3.7 sto k" leaves its number there
             text = ALONE.sub(r"\1,)", text)
@@ -182,6 +184,15 @@ def _parse(parser: Any, source: Source) -> None:
         parser.parse_lines(source.text.splitlines(keepends=True), final=False)
     except Exception as error:  # whatever evaluating an expression may raise
         raise _unparsed(source, error) from None
+
+
+def _balanced(text: str) -> bool:
+    depth = 0
+    for bracket in re.findall(r"[(){}]", re.sub(r'"[^"]*"', "", text)):
+        depth += 1 if bracket in "({" else -1
+        if depth < 0:
+            return False
+    return depth == 0
 
 
 def _unparsed(source: Source, error: Exception) -> InputError:
@@ -282,11 +293,15 @@ def _beam(parser: Any, source: Source, name: str, energy: float | None) -> tuple
                 total = 1e-6 * float(beam.resolve()["energy"])
             except Exception as error:
                 cause = _short(str(error))
-                raise source.error(f"a BEAM that cannot be read ({cause})", "energy = ...") from None
+                raise source.error(
+                    f"a BEAM that cannot be read ({cause})", "energy = ..."
+                ) from None
     if particle not in ("electron", "positron", "proton"):
         raise source.error(f"particle '{particle}'", "electron, positron or proton")
     if total is None:
-        where = "--energy in MeV" if source.dialect == ELEGANT else "BEAM, ENERGY = or --energy in MeV"
+        where = (
+            "--energy in MeV" if source.dialect == ELEGANT else "BEAM, ENERGY = or --energy in MeV"
+        )
         raise source.error("no beam energy in the file", f"{where} (energy= from Python)")
     rest = 938.272 if particle == "proton" else 0.511
     if not rest < total <= 1e7:
@@ -324,7 +339,5 @@ def _expanded(parser: Any, source: Source, name: str, key: str) -> list[Any]:
         raise source.error(f"'{name}' cannot be expanded ({cause})", _valid(source), name) from None
     for warning in warned:
         if "overlapping" in str(warning.message):
-            raise source.error(
-                _short(str(warning.message)), "elements that do not overlap", name
-            )
+            raise source.error(_short(str(warning.message)), "elements that do not overlap", name)
     return elements

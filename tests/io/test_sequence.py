@@ -97,8 +97,10 @@ def test_matrix_is_that_of_pyat(name, written):
 
 
 def test_the_three_dialects_say_the_same(written):
-    r = [load_lattice(written(n, t), energy=135.0).upto(last).matrix().planes
-         for (n, t), last in zip(FILES.items(), ("OTR", "OTR", "BPM.drift"), strict=True)]
+    r = [
+        load_lattice(written(n, t), energy=135.0).upto(last).matrix().planes
+        for (n, t), last in zip(FILES.items(), ("OTR", "OTR", "BPM.drift"), strict=True)
+    ]
     np.testing.assert_allclose(r[0], r[1], atol=1e-12)
     np.testing.assert_allclose(r[0], r[2], atol=1e-12)
 
