@@ -159,6 +159,11 @@ def read_lattice(
         from beamfit.io.sequence import read_sequence
 
         return read_sequence(path, use=use, energy=energy)
+    for option, value, instead in (("use", use, "one line"), ("energy", energy, "energy_MeV")):
+        if value is not None:
+            raise InputError(
+                f"--{option} for a TOML lattice", f"none: the file has {instead}", path=path
+            )
     return _Reader(path).lattice()
 
 
@@ -176,6 +181,12 @@ class _Reader:
         try:
             self.document = tomllib.loads(self.text)
         except tomllib.TOMLDecodeError as error:
+            if re.search(r"^[^#=\n]*\bsize_[xy]_", self.text, re.MULTILINE):
+                raise InputError(
+                    "a scan where the lattice should be",
+                    "the scan first and the lattice after --lattice; are they swapped?",
+                    path=path,
+                ) from None
             line = re.search(r"at line (\d+)", str(error))
             what = re.sub(r"\s*\(at .*\)", "", str(error))
             raise InputError(

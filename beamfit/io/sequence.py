@@ -307,7 +307,7 @@ def _beam(parser: Any, source: Source, name: str, energy: float | None) -> tuple
     if not rest < total <= 1e7:
         raise source.error(
             f"an energy of {total:g} MeV",
-            f"a total energy between {rest:g} MeV and 10 TeV (MAD's BEAM is in GeV, --energy in MeV)",
+            f"a total energy between {rest:g} MeV and 10 TeV; BEAM is in GeV, --energy in MeV",
         )
     return particle, float(total)
 

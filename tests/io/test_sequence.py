@@ -10,7 +10,8 @@ from beamfit.io.lattice import load_lattice, read_lattice
 
 at = pytest.importorskip("at", reason="accelerator-toolbox is not installed")
 
-# A quadrupole, a corrector (at zero: pyAT's matrix is about the kicked orbit), a bend with edges and gradient, and a monitor with a length.
+# A quadrupole, a corrector (at zero: pyAT's matrix is about the kicked orbit), a bend with
+# edges and gradient, and a monitor with a length.
 MADX = """! a comment: with a colon
 beam, particle=electron, energy=0.135;
 kq := 3.7;
