@@ -185,7 +185,7 @@ class _Translation:
         return {
             "type": "sector_dipole",
             "name": self.name,
-            "radius_m": self.length / angle,
+            "radius_m": self.length / abs(angle),
             "angle_deg": math.degrees(angle),
             "entrance_edge_deg": math.degrees(edges[0]),
             "exit_edge_deg": math.degrees(edges[1]),

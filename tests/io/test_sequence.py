@@ -4,6 +4,8 @@ import sys
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from beamfit.errors import InputError
 from beamfit.io.lattice import load_lattice, read_lattice
@@ -320,3 +322,23 @@ def test_without_pyat(written, monkeypatch):
     monkeypatch.setitem(sys.modules, "at", None)
     path = written("line.madx", MADX)
     assert "pip install 'beamfit[lattice]'" in refused(path)
+
+
+@given(
+    st.sampled_from(sorted(FILES)),
+    st.integers(0, 500),
+    st.integers(0, 20),
+    st.text(alphabet="(){}[],;:=!\"'&*/%+- \n.qLéé", max_size=6),
+)
+def test_any_damage_is_read_or_refused(tmp_path_factory, name, start, length, damage):
+    text = FILES[name]
+    path = tmp_path_factory.getbasetemp() / f"damaged_{name}"
+    path.write_text(text[:start] + damage + text[start + length :])
+    try:
+        read_lattice(path, energy=135.0)
+    except InputError as error:
+        said = str(error)
+    else:
+        return
+    assert str(path) in said
+    assert "\n" not in said
