@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import shlex
 import sys
 from pathlib import Path
@@ -88,8 +89,7 @@ def emittance(
     SCAN is a CSV or HDF5 file with columns such as Q2_A (or Q2_kG, Q2_k1), size_x_um,
     size_x_error_um, size_y_um, and optionally energy_MeV, screen, shot.
     """
-    if report is not None and Path(report).suffix.lower() not in (".html", ".pdf"):
-        raise InputError(f"report '{report}'", "a name ending in .html or .pdf")
+    _check_report(report)
     measured = read_quad_scan(scan)
     described = read_lattice(lattice, use=use, energy=energy)
     check_names(measured, described.calibrations, described.places, described.default_screen)
@@ -114,6 +114,21 @@ def emittance(
         click.echo(_json(fit, command, inputs))
     else:
         _print(fit, described, report)
+
+
+def _check_report(report: str | None) -> None:
+    """Find out before the fit whether its report could be written."""
+    if report is None:
+        return
+    if Path(report).suffix.lower() not in (".html", ".pdf"):
+        raise InputError(f"report '{report}'", "a name ending in .html or .pdf")
+    folder = Path(report).parent
+    if Path(report).is_dir():
+        raise InputError(f"report '{report}', which is a folder", "the name of a file")
+    if not folder.is_dir():
+        raise InputError(f"report '{report}'", f"a folder that exists; '{folder}' is none")
+    if not os.access(folder, os.W_OK):
+        raise InputError(f"report '{report}'", f"a folder one may write to; '{folder}' is not")
 
 
 def _planes(plane: str | None, scan: QuadScan) -> tuple[str, ...]:
