@@ -9,7 +9,6 @@ constraint.
 
 from __future__ import annotations
 
-from itertools import product
 from typing import TYPE_CHECKING, NamedTuple
 
 import jax
@@ -28,71 +27,100 @@ _ROUNDING = 2.0**-53
 _TINY = 1e-300  # covers underflow, which a relative error does not
 
 
+class _Ball(NamedTuple):
+    """An enclosure of finite numbers: within `radius` of `middle`.
+
+    Cheaper than two ends, and for narrow ranges as tight; products never compare signs.
+    """
+
+    middle: jax.Array
+    radius: jax.Array
+
+    def __getitem__(self, at) -> _Ball:
+        """Index both parts alike."""
+        return _Ball(self.middle[at], self.radius[at])
+
+    @property
+    def largest(self) -> jax.Array:
+        """The largest magnitude inside."""
+        return jnp.abs(self.middle) + self.radius
+
+
 class _Nodes(NamedTuple):
     """Enclosures for the n nodes of a layer; each derivative adds one axis of inputs."""
 
     value: Range
-    first: Range
-    second: Range
-    third: Range
+    first: _Ball
+    second: _Ball
+    third: _Ball
 
 
-def _largest(a: Range) -> jax.Array:
-    """The largest magnitude in a range."""
-    return jnp.maximum(jnp.abs(a.lower), jnp.abs(a.upper))
+def _rounded(found: _Ball, size: jax.Array, operations: int) -> _Ball:
+    """Widen a ball by the rounding of some operations on numbers of a size."""
+    error = 2 * operations * _ROUNDING * jax.lax.stop_gradient(size) + _TINY
+    return _Ball(found.middle, found.radius + error)
 
 
-def _shaped(a: Range, *at) -> Range:
-    """Index both ends alike."""
-    return Range(a.lower[at], a.upper[at])
+def _times(a: _Ball, b: _Ball) -> _Ball:
+    """Enclose a product."""
+    radius = jnp.abs(a.middle) * b.radius + a.radius * b.largest
+    return _rounded(_Ball(a.middle * b.middle, radius), a.largest * b.largest, 4)
 
 
-def _times(a: Range, b: Range) -> Range:
-    """Enclose the product of two ranges; zero times anything is zero, also infinity."""
-    ends = jnp.stack(
-        [jnp.where((p == 0) | (q == 0), 0.0, p * q) for p, q in product(a, b)]
-    )
-    found = Range(jnp.min(ends, axis=0), jnp.max(ends, axis=0))
-    return found.widened(2 * _ROUNDING * _largest(found) + _TINY)
+def _plus(*parts: _Ball) -> _Ball:
+    """Enclose a sum."""
+    found = _Ball(sum(p.middle for p in parts), sum(p.radius for p in parts))
+    return _rounded(found, sum(p.largest for p in parts), 2 * len(parts))
 
 
-def _plus(*parts: Range) -> Range:
-    """Enclose the sum of ranges."""
-    found = Range(sum(p.lower for p in parts), sum(p.upper for p in parts))
-    size = sum(_largest(p) for p in parts)
-    return found.widened(2 * len(parts) * _ROUNDING * size + _TINY)
-
-
-def _weighted(a: Range, weight: jax.Array) -> Range:
+def _weighted(a: _Ball, weight: jax.Array) -> _Ball:
     """Enclose the sum over nodes of weight * a, for a of shape (nodes, ...)."""
-    w = jnp.reshape(weight, weight.shape + (1,) * (a.lower.ndim - 1))
-    low, high = (jnp.where(w == 0, 0.0, w * end[:, None]) for end in a)
+    size = jnp.abs(weight)
+    found = _Ball(*(jnp.tensordot(w, p, (0, 0)) for w, p in zip((weight, size), a, strict=True)))
+    return _rounded(found, jnp.tensordot(size, a.largest, (0, 0)), 2 * weight.shape[0] + 4)
+
+
+def _weighted_values(a: Range, weight: jax.Array) -> Range:
+    """Enclose the sum over nodes of weight * a by its ends, which may be infinite."""
+    low, high = (jnp.where(weight == 0, 0.0, weight * end[:, None]) for end in a)
     found = Range(jnp.sum(jnp.minimum(low, high), axis=0), jnp.sum(jnp.maximum(low, high), axis=0))
-    size = jnp.sum(_largest(Range(low, high)), axis=0)
+    size = jnp.sum(jnp.maximum(jnp.abs(low), jnp.abs(high)), axis=0)
     return found.widened(2 * (weight.shape[0] + 2) * _ROUNDING * size + _TINY)
 
 
+def _joined(a: Range, b: Range) -> Range:
+    """Enclose the sum of two ranges."""
+    found = Range(a.lower + b.lower, a.upper + b.upper)
+    return found.widened(4 * _ROUNDING * (jnp.abs(found.lower) + jnp.abs(found.upper)) + _TINY)
+
+
+def _ball(a: Range) -> _Ball:
+    """The ball around a range."""
+    middle = 0.5 * (a.lower + a.upper)
+    radius = 0.5 * (a.upper - a.lower)
+    return _rounded(_Ball(middle, radius), jnp.abs(a.lower) + jnp.abs(a.upper), 2)
+
+
 def _activated(s: _Nodes, kind: str) -> _Nodes:
-    """Enclose a layer's nodes from its arguments: the chain rule, to third order, for ranges."""
+    """Enclose a layer's nodes from its arguments: the chain rule, to third order, for balls."""
+    if kind in ("identity", "linear"):
+        return s
     new, n = np.newaxis, slice(None)
-    value, d1, d2, d3 = (range_of(kind, order, s.value) for order in range(4))
-    one, two, three = (n, new), (n, new, new), (n, new, new, new)
-    i, j = _shaped(s.first, n, n, new), _shaped(s.first, n, new, n)
-    pairs = _times(i, j)
-    triples = _times(_shaped(pairs, n, n, n, new), _shaped(s.first, n, new, new, n))
+    d1, d2, d3 = (_ball(range_of(kind, order, s.value)) for order in (1, 2, 3))
+    i, j, k = s.first[n, n, new, new], s.first[n, new, n, new], s.first[n, new, new, n]
+    pairs = _times(s.first[n, n, new], s.first[n, new, n])
     mixed = _plus(
-        _times(_shaped(s.second, n, n, n, new), _shaped(s.first, n, new, new, n)),
-        _times(_shaped(s.second, n, n, new, n), _shaped(s.first, n, new, n, new)),
-        _times(_shaped(s.second, n, new, n, n), _shaped(s.first, n, n, new, new)),
+        _times(s.second[n, n, n, new], k),
+        _times(s.second[n, n, new, n], j),
+        _times(s.second[n, new, n, n], i),
     )
-    first = _times(_shaped(d1, *one), s.first)
-    second = _plus(_times(_shaped(d2, *two), pairs), _times(_shaped(d1, *two), s.second))
+    second = _plus(_times(d2[n, new, new], pairs), _times(d1[n, new, new], s.second))
     third = _plus(
-        _times(_shaped(d3, *three), triples),
-        _times(_shaped(d2, *three), mixed),
-        _times(_shaped(d1, *three), s.third),
+        _times(d3[n, new, new, new], _times(pairs[n, n, n, new], k)),
+        _times(d2[n, new, new, new], mixed),
+        _times(d1[n, new, new, new], s.third),
     )
-    return _Nodes(value, first, second, third)
+    return _Nodes(range_of(kind, 0, s.value), _times(d1[n, new], s.first), second, third)
 
 
 def _entered(s: _Nodes, net: MLP, layer: str, box: Range) -> _Nodes:
@@ -101,43 +129,45 @@ def _entered(s: _Nodes, net: MLP, layer: str, box: Range) -> _Nodes:
     for i, port in enumerate(net.input_ports):
         if port.layer != layer:
             continue
-        side = _shaped(box, i)
+        side = Range(box.lower[i], box.upper[i])
         ends = [(end - port.bias) / port.scale for end in side]
-        error = 4 * _ROUNDING * (_largest(side) + abs(port.bias)) / abs(port.scale) + _TINY
-        x = Range(jnp.minimum(*ends), jnp.maximum(*ends)).widened(error)
-        joined = _plus(_shaped(value, port.node), x)
+        size = jnp.maximum(*(jnp.abs(end) for end in side)) + abs(port.bias)
+        x = Range(jnp.minimum(*ends), jnp.maximum(*ends))
+        x = x.widened(4 * _ROUNDING * size / abs(port.scale) + _TINY)
+        joined = _joined(Range(*(v[port.node] for v in value)), x)
         value = Range(*(v.at[port.node].set(e) for v, e in zip(value, joined, strict=True)))
-        unit = Range(*[jnp.asarray(1 / port.scale)] * 2).widened(2 * _ROUNDING / abs(port.scale))
-        joined = _plus(_shaped(first, port.node, i), unit)
-        first = Range(*(f.at[port.node, i].set(e) for f, e in zip(first, joined, strict=True)))
+        unit = _rounded(_Ball(jnp.asarray(1 / port.scale), 0.0), 1 / abs(port.scale), 1)
+        joined = _plus(first[port.node, i], unit)
+        first = _Ball(*(f.at[port.node, i].set(e) for f, e in zip(first, joined, strict=True)))
     return s._replace(value=value, first=first)
 
 
 def _enclose(net: MLP, box: Range) -> _Nodes:
-    """Enclose the derivatives of every output over a box."""
+    """Enclose the derivatives of every output over a box (values keep their node's scale)."""
     inputs = len(net.input_ports)
     done: dict[str, _Nodes] = {}
     for layer in net.order:
         bias = net.biases.get(layer.name, jnp.zeros(layer.size))
         zeros = [jnp.zeros((layer.size, *(inputs,) * order)) for order in (1, 2, 3)]
-        s = _Nodes(Range(bias, bias), *(Range(zero, zero) for zero in zeros))
+        s = _Nodes(Range(bias, bias), *(_Ball(zero, zero) for zero in zeros))
         for source, target in net.connections:
             if target == layer.name:
-                weight = net.weights[f"{source}->{target}"]
-                s = _Nodes(
-                    *(_plus(a, _weighted(b, weight)) for a, b in zip(s, done[source], strict=True))
+                weight, before = net.weights[f"{source}->{target}"], done[source]
+                value = _joined(s.value, _weighted_values(before.value, weight))
+                rest = (
+                    _plus(a, _weighted(b, weight)) for a, b in zip(s[1:], before[1:], strict=True)
                 )
+                s = _Nodes(value, *rest)
         done[layer.name] = _activated(_entered(s, net, layer.name, box), layer.kind)
-    return _Nodes(*(_read_out(net, done, order) for order in range(4)))
-
-
-def _read_out(net: MLP, done: dict[str, _Nodes], order: int) -> Range:
-    """Gather one derivative of the output nodes and scale it (values keep their node's scale)."""
-    rows = [_shaped(done[port.layer][order], port.node) for port in net.output_ports]
-    stacked = Range(*(jnp.stack(ends) for ends in zip(*rows, strict=True)))
+    rows = [
+        jax.tree_util.tree_map(lambda part, p=port: part[p.node], done[port.layer])
+        for port in net.output_ports
+    ]
+    stacked = jax.tree_util.tree_map(lambda *parts: jnp.stack(parts), *rows)
     scale = jnp.array([port.scale for port in net.output_ports])
-    scale = jnp.reshape(scale, (-1,) + (1,) * order)
-    return stacked if order == 0 else _times(stacked, Range(scale, scale))
+    scales = (jnp.reshape(scale, (-1, *(1,) * order)) for order in (1, 2, 3))
+    rest = (_times(b, _Ball(c, 0.0)) for b, c in zip(stacked[1:], scales, strict=True))
+    return _Nodes(stacked.value, *rest)
 
 
 def _highest(slope: jax.Array, bend: jax.Array, radius: jax.Array) -> jax.Array:
@@ -149,24 +179,20 @@ def _highest(slope: jax.Array, bend: jax.Array, radius: jax.Array) -> jax.Array:
     return jnp.where(inside, peak, at_edge) + jax.lax.stop_gradient(error)
 
 
-def _taylor(net: MLP, box: Range, whole: _Nodes) -> Range:
+def _taylor(middle: _Nodes, whole: _Nodes, radius: jax.Array) -> Range:
     """Enclose the gains over a finite box by Taylor's theorem about its centre."""
-    centre = 0.5 * (box.lower + box.upper)
-    middle = _enclose(net, Range(centre, centre))
-    # Rounded up, so that centre +- radius covers the box.
-    radius = jnp.maximum(box.upper - centre, centre - box.lower)
-    radius = radius + 4 * _ROUNDING * (jnp.abs(box.lower) + jnp.abs(box.upper))
-    slope = _largest(middle.second)
-    bend_up = jnp.diagonal(whole.third.upper, axis1=-2, axis2=-1)
-    bend_down = jnp.diagonal(whole.third.lower, axis1=-2, axis2=-1)
-    cross = _largest(whole.third) * (1 - jnp.eye(len(centre)))
+    n = len(radius)
+    bend = _Ball(*(jnp.diagonal(part, axis1=-2, axis2=-1) for part in whole.third))
+    cross = whole.third.largest * (1 - jnp.eye(n))
     mixed = 0.5 * jnp.einsum("oijk,j,k->oi", cross, radius, radius)
-    terms = 8 * _ROUNDING * (len(centre) ** 2 + 2)
+    slope = middle.second.largest
     up, down = (
-        (jnp.sum(_highest(slope, bend, radius), axis=-1) + mixed) * (1 + terms)
-        for bend in (bend_up, -bend_down)
+        (jnp.sum(_highest(slope, sign * bend.middle + bend.radius, radius), axis=-1) + mixed)
+        for sign in (1, -1)
     )
-    return _plus(middle.first, Range(-down, up))
+    size = jnp.abs(up) + jnp.abs(down) + mixed + middle.first.largest
+    reach = middle.first.radius + 8 * (n**2 + 2) * _ROUNDING * jax.lax.stop_gradient(size)
+    return Range(middle.first.middle - down - reach, middle.first.middle + up + reach)
 
 
 def gain_bounds(net: MLP, lower: jax.Array, upper: jax.Array) -> Range:
@@ -192,13 +218,29 @@ def gain_bounds(net: MLP, lower: jax.Array, upper: jax.Array) -> Range:
     >>> bool(found.lower[0, 0] < found.upper[0, 0])
     True
     """
-    box = Range(jnp.asarray(lower, float), jnp.asarray(upper, float))
-    whole = _enclose(net, box)
-    finite = jnp.all(jnp.isfinite(box.upper - box.lower))
-    tight = _taylor(net, Range(*(jnp.where(finite, end, 0.0) for end in box)), whole)
+    return _bounds(net, jnp.asarray(lower, float), jnp.asarray(upper, float))
+
+
+@jax.jit
+def _bounds(net: MLP, lower: jax.Array, upper: jax.Array) -> Range:
+    """The bounds of `gain_bounds`, compiled once for each structure of network."""
+    finite = jnp.all(jnp.isfinite(upper - lower))
+    low, high = (jnp.where(finite, end, 0.0) for end in (lower, upper))
+    centre = 0.5 * (low + high)
+    # Rounded up, so that centre +- radius covers the box.
+    radius = jnp.maximum(high - centre, centre - low)
+    radius = radius + 4 * _ROUNDING * (jnp.abs(low) + jnp.abs(high))
+    boxes = Range(jnp.stack([lower, centre]), jnp.stack([upper, centre]))
+    both = jax.vmap(lambda box: _enclose(net, box))(boxes)
+    whole, middle = (jax.tree_util.tree_map(lambda part, i=i: part[i], both) for i in (0, 1))
+    tight = _taylor(middle, whole, radius)
+    # An infinite slope has no ball: its middle is not a number, and nothing is known of the gain.
+    known = jnp.isfinite(whole.first.radius)
+    reach = jnp.where(known, whole.first.radius, jnp.inf)
+    around = jnp.where(known, whole.first.middle, 0.0)
     return Range(
-        jnp.where(finite, jnp.maximum(whole.first.lower, tight.lower), whole.first.lower),
-        jnp.where(finite, jnp.minimum(whole.first.upper, tight.upper), whole.first.upper),
+        jnp.where(finite, jnp.maximum(around - reach, tight.lower), around - reach),
+        jnp.where(finite, jnp.minimum(around + reach, tight.upper), around + reach),
     )
 
 

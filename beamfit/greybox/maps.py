@@ -8,6 +8,7 @@ constants) can be free in a fit and are differentiated by JAX like the inputs.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any, Protocol
 
 import jax
@@ -332,12 +333,10 @@ def _foreign_jvp(door, order, primals, tangents):
     return _foreign(door, order, x), _foreign(door, order + 1, x) @ direction
 
 
-def _restricted(m: Map, x: jax.Array, variables: Sequence[str] | None):
+def _restricted(m: Map, x: jax.Array, variables: tuple[str, ...]):
     """The map as a function of chosen inputs and leaves: the function and where it stands."""
-    x = jnp.asarray(x, float)
-    chosen = m.inputs if variables is None else tuple(variables)
-    at = positions([v for v in chosen if v in m.inputs], m.inputs, "input")
-    found = [leaf for v in chosen if v not in m.inputs for leaf in tree.find_leaves(m, v)]
+    at = positions([v for v in variables if v in m.inputs], m.inputs, "input")
+    found = [leaf for v in variables if v not in m.inputs for leaf in tree.find_leaves(m, v)]
     start = jnp.concatenate([x[jnp.array(at, int)], tree.read(m, found)])
 
     def function(v):
@@ -377,6 +376,13 @@ def sensitivities(
     >>> sensitivities(m, jnp.array([5.0, 7.0]), ["v", "matrix"]).tolist()
     [[3.0, 5.0, 7.0]]
     """
+    chosen = m.inputs if variables is None else tuple(variables)
+    return _forward(m, jnp.asarray(x, float), chosen)
+
+
+@partial(jax.jit, static_argnums=2)
+def _forward(m: Map, x: jax.Array, variables: tuple[str, ...]) -> jax.Array:
+    """Forward sweeps, compiled once for each structure of map."""
     function, start = _restricted(m, x, variables)
     return jax.jacfwd(function)(start)
 
@@ -415,10 +421,17 @@ def adjoints(
     >>> adjoints(m, jnp.array([5.0]), ["z"]).tolist()
     [[3.0]]
     """
-    chosen = positions(m.outputs if functions is None else functions, m.outputs, "output")
+    rows = positions(m.outputs if functions is None else functions, m.outputs, "output")
+    chosen = m.inputs if variables is None else tuple(variables)
+    return _backward(m, jnp.asarray(x, float), tuple(rows), chosen)
+
+
+@partial(jax.jit, static_argnums=(2, 3))
+def _backward(m: Map, x: jax.Array, rows: tuple[int, ...], variables: tuple[str, ...]):
+    """Backward sweeps, compiled once for each structure of map."""
     function, start = _restricted(m, x, variables)
     _, pull = jax.vjp(function, start)
-    return jax.vmap(lambda w: pull(w)[0])(jnp.eye(len(m.outputs))[jnp.array(chosen)])
+    return jax.vmap(lambda w: pull(w)[0])(jnp.eye(len(m.outputs))[jnp.array(rows)])
 
 
 def gain(m: Map, x: jax.Array, output: str, by: Sequence[str]) -> jax.Array:

@@ -263,9 +263,9 @@ def _ports(elements: list[Plain.Element]) -> list[Port]:
 def _gain(e: Plain.Element) -> Gain:
     """A gain; its order says how many of da, db, dc are read."""
     order = _number(e, "order", 1, int)
-    by = tuple(_need(e, key) for key in ("da", "db", "dc")[: max(order, 0)])
     if not 1 <= order <= 3:
         raise InputError(f"order {order} of the gain '{e.attrib.get('name', '')}'", "1, 2 or 3")
+    by = tuple(_need(e, key) for key in ("da", "db", "dc")[:order])
     kind = e.attrib.get("type", "local")
     return Gain(_need(e, "name"), _need(e, "dy"), by, kind, _number(e, "cells", 64, int))
 
