@@ -55,7 +55,7 @@ def descend(
     --------
     >>> found = descend(lambda x: np.array([x[0] - 3.0, 2.0 * x[1]]), lambda x: np.diag([1.0, 2.0]),
     ...                 np.array([0.0, 1.0]), np.array([-1.0, 0.5]), np.array([9.0, 9.0]))
-    >>> found.x.tolist()
+    >>> np.round(found.x, 12).tolist()
     [3.0, 0.5]
     """
     x = np.clip(x, lower, upper)
