@@ -15,7 +15,7 @@ from beamfit.greybox.fit import Attempt, Fit, Limited, Status, Variable
 from beamfit.greybox.implicit import Implicit
 from beamfit.greybox.problem import Problem
 
-__all__ = ["Slopes", "State", "conclude", "refused", "slopes", "state"]
+__all__ = ["Slopes", "State", "conclude", "first_order", "refused", "slopes", "state"]
 
 _TOLERANCE = 1e-6  # within which a limit counts as reached and a point as an optimum
 
@@ -41,7 +41,8 @@ class State(NamedTuple):
 
 
 @jax.jit
-def _slopes(core, theta):
+def first_order(core, theta):
+    """The parts of `Slopes`, compiled once for each structure of problem."""
     r, r_jacobian = problem.residual(core, theta), jax.jacfwd(problem.residual, 1)(core, theta)
     cost, gradient = jax.value_and_grad(problem.cost, 1)(core, theta)
     c, c_jacobian = problem.constraints(core, theta), jax.jacrev(problem.constraints, 1)(core, theta)
@@ -50,7 +51,7 @@ def _slopes(core, theta):
 
 def slopes(p: Problem, theta: np.ndarray) -> Slopes:
     """Evaluate values and first derivatives at a point."""
-    return Slopes(*(np.asarray(part) for part in _slopes(p.core, jnp.asarray(theta, float))))
+    return Slopes(*(np.asarray(part) for part in first_order(p.core, jnp.asarray(theta, float))))
 
 
 def _gradient_scale(p: Problem, theta: np.ndarray, at: Slopes) -> np.ndarray:

@@ -36,6 +36,11 @@ class Limits(NamedTuple):
         high = self.upper - self.value <= tolerance * (1 + np.abs(_finite(self.upper)))
         return low, high
 
+    def distance(self, multiplier: np.ndarray) -> np.ndarray:
+        """Distance from the limit a multiplier belongs to; zero where there is none."""
+        low, high = self.value - self.lower, self.upper - self.value
+        return np.where(multiplier > 0, low, np.where(multiplier < 0, high, 0.0))
+
 
 class Multipliers(NamedTuple):
     """Multipliers of the bounds (reduced gradients) and of the constraints."""
@@ -152,14 +157,8 @@ def residual(
     pull = np.reshape(jacobian, (-1, len(gradient)))
     left = gradient - found.bounds - pull.T @ found.constraints
     size = scale + np.abs(found.constraints) @ np.abs(pull)
-    slack = [
-        np.minimum(np.abs(part.value - part.lower), np.abs(part.upper - part.value))
-        for part in (bounds, limits)
-    ]
-    products = [
-        np.abs(y) * s for y, s in zip((found.bounds, found.constraints), slack, strict=True)
-    ]
-    products = [np.where(y == 0, 0.0, p) for y, p in zip(found, products, strict=True)]
+    parts = ((found.bounds, bounds), (found.constraints, limits))
+    products = [np.abs(y * part.distance(y)) for y, part in parts]
     crossed = np.concatenate([bounds.violation, limits.violation, [0.0]])
     return KKT(
         float(np.max(np.abs(left) / size, initial=0.0)),

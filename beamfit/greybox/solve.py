@@ -156,7 +156,7 @@ def _from(p: Problem, start: np.ndarray, iterations: int, hessian: str):
 
     end = descend(
         lambda x: np.asarray(problem.residual(p.core, full(x))),
-        lambda x: np.asarray(_residual_jacobian(p.core, full(x)))[:, moving],
+        lambda x: np.asarray(assess.first_order(p.core, full(x))[1])[:, moving],
         start[moving],
         p.lower[moving],
         p.upper[moving],
@@ -165,11 +165,6 @@ def _from(p: Problem, start: np.ndarray, iterations: int, hessian: str):
     s = assess.state(p, full(end.x))
     said = "came to rest" if end.rested else "ran out of iterations"
     return s, Attempt("Gauss-Newton", s.theta, float(s.at.cost), s.kkt, end.iterations, said)
-
-
-@jax.jit
-def _residual_jacobian(core, theta):
-    return jax.jacfwd(problem.residual, 1)(core, theta)
 
 
 @jax.jit
