@@ -15,7 +15,7 @@ from beamfit.greybox.fit import Attempt, Fit, Limited, Status, Variable
 from beamfit.greybox.implicit import Implicit
 from beamfit.greybox.problem import Problem
 
-__all__ = ["Slopes", "State", "conclude", "first_order", "refused", "slopes", "state"]
+__all__ = ["Slopes", "State", "conclude", "constraint_slopes", "first_order", "refused", "slopes", "state"]
 
 _TOLERANCE = 1e-6  # within which a limit counts as reached and a point as an optimum
 
@@ -45,8 +45,14 @@ def first_order(core, theta):
     """The parts of `Slopes`, compiled once for each structure of problem."""
     r, r_jacobian = problem.residual(core, theta), jax.jacfwd(problem.residual, 1)(core, theta)
     cost, gradient = jax.value_and_grad(problem.cost, 1)(core, theta)
-    c, c_jacobian = problem.constraints(core, theta), jax.jacrev(problem.constraints, 1)(core, theta)
-    return r, r_jacobian, cost, gradient, c, c_jacobian
+    c = problem.constraints(core, theta)
+    return r, r_jacobian, cost, gradient, c, constraint_slopes(core, theta)
+
+
+def constraint_slopes(core, theta):
+    """Jacobian of the constraints, by as few sweeps as there are variables or constraints."""
+    few = jax.eval_shape(problem.constraints, core, theta).shape < theta.shape
+    return (jax.jacrev if few else jax.jacfwd)(problem.constraints, 1)(core, theta)
 
 
 def slopes(p: Problem, theta: np.ndarray) -> Slopes:

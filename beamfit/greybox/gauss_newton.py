@@ -31,6 +31,7 @@ def descend(
     lower: np.ndarray,
     upper: np.ndarray,
     iterations: int = 1000,
+    tolerance: float = 1e-13,
 ) -> Descent:
     """Minimise half the sum of squares within bounds.
 
@@ -46,6 +47,8 @@ def descend(
         Bounds, lower < upper.
     iterations : int
         Most accepted and refused steps together.
+    tolerance : float
+        On the length of a step relative to x, both in units of the columns of the Jacobian.
 
     Returns
     -------
@@ -75,11 +78,12 @@ def descend(
         new = np.clip(x + step, lower, upper)
         step = new - x
         promised = -(slope @ step) - 0.5 * np.sum((triangle @ step) ** 2)
-        if np.linalg.norm(scale * step) <= 1e-13 * np.linalg.norm(scale * x) or promised <= 0:
+        if np.linalg.norm(scale * step) <= tolerance * np.linalg.norm(scale * x):
             return Descent(x, count, True)
         r_new = residual(new)
         gained = 0.5 * (r - r_new) @ (r + r_new)
-        ratio = gained / promised if np.isfinite(gained) else -1.0
+        # Pinning can spoil a long step; a short one always promises something.
+        ratio = gained / promised if np.isfinite(gained) and promised > 0 else -1.0
         fresh = ratio > 1e-4
         if fresh:
             x, r = new, r_new

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy import optimize
 
-__all__ = ["SOLVERS", "Program", "Proposal"]
+__all__ = ["SOLVERS", "Program", "Proposal", "Stage"]
 
 
 class Program(NamedTuple):
@@ -137,9 +137,19 @@ def _slsqp(program: Program, x: np.ndarray, iterations: int) -> Proposal:
     return Proposal(found.x, int(found.nit), found.message)
 
 
-SOLVERS: dict[str, Callable[[Program, np.ndarray, int], Proposal]] = {
-    "Uno filtersqp": _uno("filtersqp"),
-    "Uno ipopt": _uno("ipopt"),
-    "scipy SLSQP": _slsqp,
-}
+class Stage(NamedTuple):
+    """A solver, the Hessian it wants (gauss_newton, exact or none), and its steps in one go."""
+
+    name: str
+    hessian: str
+    steps: int
+    solve: Callable[[Program, np.ndarray, int], Proposal]
+
+
+SOLVERS: tuple[Stage, ...] = (
+    Stage("Uno filtersqp with Gauss-Newton", "gauss_newton", 3000, _uno("filtersqp")),
+    Stage("Uno filtersqp", "exact", 300, _uno("filtersqp")),
+    Stage("Uno ipopt", "exact", 1000, _uno("ipopt")),
+    Stage("scipy SLSQP", "none", 300, _slsqp),
+)
 """In the order of trying."""

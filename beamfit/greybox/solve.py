@@ -17,7 +17,7 @@ from beamfit.greybox.gauss_newton import descend
 from beamfit.greybox.problem import Problem
 from beamfit.greybox.programs import SOLVERS, Program
 
-__all__ = ["solve", "starting_points"]
+__all__ = ["search", "solve", "starting_points"]
 
 _OPTIMUM = 1e-6
 
@@ -26,15 +26,17 @@ def solve(
     p: Problem,
     starts: int = 1,
     seed: int = 0,
-    iterations: int = 1000,
+    iterations: int = 3000,
     hessian: str = "exact",
     progress: bool = False,
 ) -> Fit:
     """Minimise the cost of a problem within its bounds and constraints.
 
-    Least squares with bounds alone go to trust-region Gauss-Newton; problems with constraints or
-    further objectives to Uno, and to scipy where Uno ends without an optimum. Whether a point is an
-    optimum is decided by our own KKT residual. Of several starts the cheapest optimum is the answer.
+    Least squares with bounds alone go to trust-region Gauss-Newton. Problems with constraints go to
+    Uno's sequential quadratic programming, with the Gauss-Newton Hessian first (networks fitted to
+    few data have flat valleys in which the exact one crawls), then with the exact Hessian, then to
+    scipy where Uno ends without an optimum. Whether a point is an optimum is decided by our own KKT
+    residual. Of several starts the cheapest optimum is the answer.
 
     Parameters
     ----------
@@ -47,8 +49,8 @@ def solve(
     iterations : int
         Most iterations of a solver from one start.
     hessian : str
-        ``"exact"``, or ``"gauss_newton"`` for problems with constraints whose model brings no
-        second derivatives (foreign code): squares of first derivatives, constraints as straight.
+        ``"exact"``, or ``"gauss_newton"`` to keep to first derivatives, for models that bring no
+        second ones (foreign code).
     progress : bool
         Show a progress bar over the starts on standard error.
 
@@ -91,7 +93,7 @@ def solve(
         points, "fitting", console=Console(stderr=True), transient=True, disable=not progress
     )
     found = [
-        _from(p, point, iterations, hessian)
+        search(p, point, iterations, hessian)
         for point in bar
         if np.isfinite(float(p.cost(point))) and np.all(np.isfinite(p.constraint_values(point)))
     ]
@@ -143,8 +145,23 @@ def _rank(s: assess.State) -> tuple:
     return (not good, not feasible, s.at.cost if feasible else s.kkt.feasibility)
 
 
-def _from(p: Problem, start: np.ndarray, iterations: int, hessian: str):
-    """Search from one start: the end point and the account of it."""
+def search(
+    p: Problem, start: np.ndarray, iterations: int = 3000, hessian: str = "exact"
+) -> tuple[assess.State, Attempt]:
+    """Search from one start.
+
+    Parameters
+    ----------
+    p, iterations, hessian
+        As for `solve`.
+    start : array, shape (n,)
+        Where to start; cost and constraints are finite there.
+
+    Returns
+    -------
+    tuple of State and Attempt
+        The end point, judged, and the account of it.
+    """
     moving = np.flatnonzero(p.lower < p.upper)
     if p.constraints or p.objectives:
         return _program(p, start, moving, iterations, hessian)
@@ -174,8 +191,7 @@ def _values(core, theta):
 
 @jax.jit
 def _first(core, theta):
-    gradient = jax.grad(problem.cost, 1)(core, theta)
-    return gradient, jax.jacrev(problem.constraints, 1)(core, theta)
+    return jax.grad(problem.cost, 1)(core, theta), assess.constraint_slopes(core, theta)
 
 
 @jax.jit
@@ -203,20 +219,24 @@ def _program(p: Problem, start: np.ndarray, moving: np.ndarray, iterations: int,
     size = np.maximum(np.abs(start), np.where(np.isfinite(span), 0.1 * span, 0.0))
     unit = np.where((size > 1e2) | ((size < 1e-2) & (size > 0)), size, 1.0)
     flat = min(1.0, 100.0 / max(np.max(np.abs(first * unit)), 1e-300))
-    program = _scaled(p, start, moving, unit, flat, _exact if hessian == "exact" else _squares)
+    # Squares say nothing of further objectives; foreign code may have first derivatives only.
+    usable = {"none", hessian} if p.objectives else {"none", "gauss_newton", hessian}
     best, tried, steps, said = None, [], 0, ""
-    for name, solver in SOLVERS.items():
-        end = solver(program, (start / unit)[moving], iterations)
+    for stage in (stage for stage in SOLVERS if stage.hessian in usable):
+        second = _squares if stage.hessian == "gauss_newton" else _exact
+        program = _scaled(p, start, moving, unit, flat, second)
+        near = best is not None and best.kkt.feasibility <= _OPTIMUM
+        begin = best.theta if near else start
+        end = stage.solve(program, (begin / unit)[moving], min(stage.steps, iterations))
         theta = start.copy()
         theta[moving] = np.clip(end.x * unit[moving], p.lower[moving], p.upper[moving])
         s = assess.state(p, theta)
-        tried, steps, said = [*tried, name], steps + end.iterations, end.said
+        tried, steps, said = [*tried, stage.name], steps + end.iterations, end.said
         if best is None or _rank(s) < _rank(best):
             best = s
         if best.kkt.worst <= _OPTIMUM:
             break
-    account = Attempt(", ".join(tried), best.theta, float(best.at.cost), best.kkt, steps, said)
-    return best, account
+    return best, Attempt(", ".join(tried), best.theta, float(best.at.cost), best.kkt, steps, said)
 
 
 def _scaled(p: Problem, start, moving, unit, flat, second) -> Program:
