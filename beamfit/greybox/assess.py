@@ -15,7 +15,16 @@ from beamfit.greybox.fit import Attempt, Fit, Limited, Status, Variable
 from beamfit.greybox.implicit import Implicit
 from beamfit.greybox.problem import Problem
 
-__all__ = ["Slopes", "State", "conclude", "constraint_slopes", "first_order", "refused", "slopes", "state"]
+__all__ = [
+    "Slopes",
+    "State",
+    "conclude",
+    "constraint_slopes",
+    "first_order",
+    "refused",
+    "slopes",
+    "state",
+]
 
 _TOLERANCE = 1e-6  # within which a limit counts as reached and a point as an optimum
 
@@ -74,7 +83,7 @@ def _gradient_scale(p: Problem, theta: np.ndarray, at: Slopes) -> np.ndarray:
     scale = np.linalg.norm(at.residual_jacobian, axis=0) * size
     if p.objectives:
         scale = scale + max(1.0, abs(at.cost)) / np.maximum(1.0, np.abs(theta))
-    return np.maximum(scale, 1e-300)
+    return np.maximum(scale, max(1e-12 * np.max(scale), 1e-100))
 
 
 def state(p: Problem, theta: np.ndarray) -> State:
@@ -168,6 +177,19 @@ def conclude(p: Problem, s: State, attempts: tuple[Attempt, ...], seconds: float
     -------
     Fit
     """
+    failure = _inner_failure(p, s.theta)
+    if not np.isfinite(s.kkt.worst) and not failure:
+        said = (
+            "the cost or a derivative is not finite at the end of the search; bound the free "
+            "numbers away from there, or use a parametrisation that stays defined."
+        )
+        return refused(p, Status.NOT_FINITE, said, seconds, s.theta, attempts)
+    if failure:
+        said = (
+            f"{failure} at the end of the search; start it nearer to its root, or bound the free "
+            "numbers to where a root exists."
+        )
+        return refused(p, Status.NOT_CONVERGED, said, seconds, s.theta, attempts)
     spread = _spread(p, s)
     chi2 = float(s.at.residual @ s.at.residual)
     dof = len(s.at.residual) - spread.rank
@@ -217,36 +239,27 @@ def _list(names) -> str:
 
 def _verdict(p, s, attempts, variables, constraints, blind, chi2, dof, judged):
     """Status and sentence, the gravest first."""
-    if not np.isfinite(s.kkt.worst):
-        return Status.NOT_FINITE, (
-            "the cost or a derivative is not finite at the end of the search; bound the free "
-            "numbers away from there, or use a parametrisation that stays defined."
-        )
     if s.kkt.feasibility > _TOLERANCE:
         crossed = kkt.Limits(s.at.constraints, p.constraint_lower, p.constraint_upper).violation
         worst = constraints[int(np.argmax(crossed))] if constraints else None
-        place = f" '{worst.name}' ends at {worst.value:.4g}, outside" if worst else " bounds: outside"
+        place = (
+            f" '{worst.name}' ends at {worst.value:.4g}, outside" if worst else " bounds: outside"
+        )
         limits = f" [{worst.lower:.4g}, {worst.upper:.4g}]" if worst else ""
         return Status.INFEASIBLE, (
             f"no point within all constraints was found from {_starts(attempts)}:{place}{limits}; "
             "relax it, free more numbers, or start elsewhere."
         )
-    if _ran_away(p, s, attempts):
+    if p.objectives and s.at.cost < -1e15:
         return Status.UNBOUNDED, (
             f"the cost falls without end (down to {s.at.cost:.3g}); bound the free numbers, or "
             "check the sign of the objective."
         )
-    failure = _inner_failure(p, s.theta)
-    if failure:
-        return Status.NOT_CONVERGED, (
-            f"{failure} at the end of the search; start it nearer to its root, or bound the free "
-            "numbers to where a root exists."
-        )
     if s.kkt.worst > _TOLERANCE:
         return Status.NOT_CONVERGED, (
-            f"no optimum was reached from {_starts(attempts)} (KKT residual {s.kkt.worst:.1e} after "
-            f"{sum(a.iterations for a in attempts)} iterations); give more starts or iterations, "
-            "or a better start."
+            f"no optimum was reached from {_starts(attempts)} (KKT residual {s.kkt.worst:.1e} "
+            f"after {sum(a.iterations for a in attempts)} iterations); give more starts "
+            "or iterations, or a better start."
         )
     asked = ~p.nuisance
     if (blind & asked).any():
@@ -273,30 +286,30 @@ def _verdict(p, s, attempts, variables, constraints, blind, chi2, dof, judged):
     )
 
 
-def _ran_away(p: Problem, s: State, attempts: tuple[Attempt, ...]) -> bool:
-    """Whether the search found the cost to fall without end."""
-    return bool(p.objectives) and s.at.cost < -1e15
-
-
 def _starts(attempts: tuple[Attempt, ...]) -> str:
     return f"{len(attempts)} start{'s' if len(attempts) != 1 else ''}"
 
 
-def refused(p: Problem, status: Status, message: str, seconds: float) -> Fit:
-    """A fit that could not begin: the model's own values, nothing determined."""
-    n, m = len(p.start), len(p.constraint_names)
-    nan = np.nan
+def refused(
+    p: Problem,
+    status: Status,
+    message: str,
+    seconds: float,
+    theta: np.ndarray | None = None,
+    attempts: tuple[Attempt, ...] = (),
+) -> Fit:
+    """A fit without an answer: where it stopped, and nothing determined."""
+    theta = p.start if theta is None else theta
+    n, nan, inf = len(theta), np.nan, np.inf
     variables = tuple(
         Variable(name, float(v), nan, nan, float(a), float(b), "free", nan)
-        for name, v, a, b in zip(p.names, p.start, p.lower, p.upper, strict=True)
+        for name, v, a, b in zip(p.names, theta, p.lower, p.upper, strict=True)
     )
+    limits = zip(p.constraint_names, p.constraint_lower, p.constraint_upper, strict=True)
     constraints = tuple(
-        Limited(name, nan, float(a), float(b), "free", nan)
-        for name, a, b in zip(
-            p.constraint_names, p.constraint_lower, p.constraint_upper, strict=True
-        )
+        Limited(name, nan, float(a), float(b), "free", nan) for name, a, b in limits
     )
     return Fit(
-        p, p.start, status, message, nan, nan, 0, kkt.KKT(np.inf, np.inf, np.inf if m else 0.0),
-        variables, constraints, np.full((n, n), nan), np.eye(n), nan, (), seconds,
+        p, theta, status, message, nan, nan, 0, kkt.KKT(inf, inf, inf), variables, constraints,
+        np.full((n, n), nan), np.eye(n), nan, attempts, seconds,
     )  # fmt: skip

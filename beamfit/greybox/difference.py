@@ -1,8 +1,8 @@
 """The default parametric model where no physics is known: a Taylor-type difference equation.
 
-Report eqs 2-4: the next output is a polynomial in the deviations of past outputs and inputs from an
-operating point, and the polynomial's coefficients are the parameters p that a map gives as functions
-of the process inputs.
+Report eqs 2-4: the next output is a polynomial in the deviations of past outputs and inputs from
+an operating point, and the polynomial's coefficients are the parameters p that a map gives as
+functions of the process inputs.
 """
 
 from __future__ import annotations

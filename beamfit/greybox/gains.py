@@ -12,8 +12,9 @@ import numpy as np
 
 from beamfit.errors import InputError
 from beamfit.greybox.bounds import cells, gain_bounds
-from beamfit.greybox.maps import gain, positions
-from beamfit.greybox.problem import Constraint
+from beamfit.greybox.maps import positions
+from beamfit.greybox.sensitivity import gain
+from beamfit.greybox.terms import Constraint
 
 __all__ = ["certified_gain", "gain_at", "part"]
 

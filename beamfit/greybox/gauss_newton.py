@@ -91,6 +91,8 @@ def descend(
             growth = 2.0
         elif promised <= 1e-16 * (r @ r):
             return Descent(x, count, True)  # what is promised is below rounding
+        elif damping > 1e30:
+            return Descent(x, count, False)  # no step however short lowers the cost
         else:
             damping, growth = damping * growth, 2 * growth
     return Descent(x, iterations, False)
@@ -103,7 +105,9 @@ def _step(triangle, reduced, weight, low, high, blocked) -> np.ndarray:
     while not pinned.all():
         loose = ~pinned
         left = np.vstack([triangle[:, loose], np.diag(weight[loose])])
-        right = np.concatenate([-reduced - triangle[:, pinned] @ step[pinned], np.zeros(loose.sum())])
+        right = np.concatenate(
+            [-reduced - triangle[:, pinned] @ step[pinned], np.zeros(loose.sum())]
+        )
         step[loose] = np.linalg.lstsq(left, right, rcond=None)[0]
         leaving = loose & ((step < low) | (step > high))
         if not leaving.any():

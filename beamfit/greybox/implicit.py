@@ -111,7 +111,7 @@ class Implicit:
         return Root(y, defect, steps, jax.lax.stop_gradient(converged))
 
     def _newton(self, f, start):
-        """Damped Newton: halve the step until the defect falls; a scan, so that checkify sees it."""
+        """Damped Newton: halve the step until the defect falls (a scan: checkify enters it)."""
         halvings = 0.5 ** jnp.arange(8)
 
         def norm(y):

@@ -1,9 +1,9 @@
 """Is a point an optimum, and what does it cost to hold its limits? Our own answer, not a solver's.
 
-At an optimum of cost f within limits on c(theta) and bounds on theta there are multipliers y, z with
-grad f = J_c^T y + z (stationarity), y and z zero where a limit is not reached, not negative at a
-lower and not positive at an upper limit (Nocedal & Wright, Numerical Optimization, 2nd ed., 12.1).
-So a multiplier is d(cost)/d(limit), with cost = chi-square/2.
+At an optimum of cost f within limits on c(theta) and bounds on theta there are multipliers y, z
+with grad f = J_c^T y + z (stationarity), y and z zero where a limit is not reached, not negative at
+a lower and not positive at an upper limit (Nocedal & Wright, Numerical Optimization, 2nd ed.,
+section 12.1). So a multiplier is d(cost)/d(limit), with cost = chi-square/2.
 """
 
 from __future__ import annotations

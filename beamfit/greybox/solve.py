@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from rich.console import Console
 from rich.progress import track
@@ -99,8 +98,9 @@ def solve(
     ]
     seconds = time.perf_counter() - began
     if not found:
+        place = "the start" if starts == 1 else "any start"
         said = (
-            f"the cost or a constraint is not finite at {'the start' if starts == 1 else 'any start'}; "
+            f"the cost or a constraint is not finite at {place}; "
             "start elsewhere, or use a parametrisation that is defined there."
         )
         return assess.refused(p, Status.NOT_FINITE, said, seconds)
@@ -214,7 +214,7 @@ def _squares(core, theta, sigma, y):
 def _program(p: Problem, start: np.ndarray, moving: np.ndarray, iterations: int, hessian: str):
     """Search with the solvers for constraints, until one ends on an optimum."""
     first = np.asarray(_first(p.core, start)[0])
-    # Numbers far from 1 are measured in their own size, and a steep cost is flattened, as IPOPT does.
+    # Numbers far from 1 are measured in their own size; a steep cost is flattened, as IPOPT does.
     span = p.upper - p.lower
     size = np.maximum(np.abs(start), np.where(np.isfinite(span), 0.1 * span, 0.0))
     unit = np.where((size > 1e2) | ((size < 1e-2) & (size > 0)), size, 1.0)

@@ -68,9 +68,9 @@ def parse_network(text: str, path: str | os.PathLike[str] | None = None) -> MLP:
 def network_from(element: Plain.Element) -> MLP:
     """Read a network from its ``<mapping>`` element, as when it stands inside another document.
 
-    A layer without a ``bias`` attribute has biases unless it is an identity: Appendix B's 22 weights
-    for 1-5-2 need them, and its layers do not say. Inputs and outputs without ``node`` take the
-    nodes of their layer in turn.
+    A layer without a ``bias`` attribute has biases unless it is an identity: Appendix B's 22
+    weights for 1-5-2 need them, and its layers do not say. Inputs and outputs without ``node`` take
+    the nodes of their layer in turn.
 
     Parameters
     ----------
@@ -140,9 +140,7 @@ def format_network(net: MLP, name: str = "mlp") -> str:
     root = Plain.Element("mapping", classname=_CLASS, name=name)
     for tag, ports in (("input", net.input_ports), ("output", net.output_ports)):
         for port in ports:
-            e = Plain.SubElement(
-                root, tag, name=port.name, layer=port.layer, node=str(port.node)
-            )
+            e = Plain.SubElement(root, tag, name=port.name, layer=port.layer, node=str(port.node))
             for field, default in Port._field_defaults.items():
                 value = getattr(port, field)
                 if field != "node" and value != default:
@@ -222,7 +220,9 @@ def _number(e: Plain.Element, key: str, default: float, kind: type = float):
     try:
         return kind(e.attrib.get(key, default))
     except ValueError:
-        raise InputError(f"{key}='{e.attrib[key]}' in <{e.tag}>", f"a number ({kind.__name__})") from None
+        raise InputError(
+            f"{key}='{e.attrib[key]}' in <{e.tag}>", f"a number ({kind.__name__})"
+        ) from None
 
 
 def _numbers(e: Plain.Element) -> np.ndarray | None:

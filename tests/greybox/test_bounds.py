@@ -105,7 +105,7 @@ def test_the_excess_falls_with_the_cube_of_the_cell():
     def excess(half):
         box = gain_bounds(net, [0.3 - half, -0.2 - half], [0.3 + half, -0.2 + half])
         grid = np.stack(np.meshgrid(*[np.linspace(-half, half, 41)] * 2), -1).reshape(-1, 2)
-        gains = sampled_gains(net, grid + [0.3, -0.2])
+        gains = sampled_gains(net, grid + np.array([0.3, -0.2]))
         return float((box.upper - box.lower - np.ptp(gains, axis=0)).max())
 
     # Off-diagonal second-order terms are bounded by their magnitude, which leaves a square here.
@@ -150,7 +150,9 @@ def test_bounds_are_differentiable_by_the_weights():
     slope = jax.jit(jax.grad(worst))(w)
     step = jnp.zeros_like(w).at[0, 1].set(1e-6)
     value = jax.jit(worst)
-    assert float(slope[0, 1]) == pytest.approx(float(value(w + step) - value(w - step)) / 2e-6, rel=1e-6)
+    assert float(slope[0, 1]) == pytest.approx(
+        float(value(w + step) - value(w - step)) / 2e-6, rel=1e-6
+    )
 
 
 @pytest.mark.parametrize("box", [([0.0], [np.inf]), ([1.0], [0.0])])

@@ -21,11 +21,9 @@ from beamfit.greybox.maps import (
     Map,
     Parallel,
     Series,
-    adjoints,
-    gain,
-    sensitivities,
 )
 from beamfit.greybox.mlp import MLP, Gain, dense
+from beamfit.greybox.sensitivity import adjoints, gain, sensitivities
 
 AFFINE = Affine(["a", "b"], ["p", "q"], [[1.0, -2.0], [0.5, 3.0]], [0.1, 0.2])
 FORMULA = Formula(
@@ -76,9 +74,8 @@ def map_classes():
         module = importlib.import_module(f"beamfit.greybox.{info.name}")
         for _, cls in inspect.getmembers(module, inspect.isclass):
             named = {"inputs", "outputs"} <= {*dir(cls), *getattr(cls, "__annotations__", {})}
-            if named and callable(getattr(cls, "__call__", None)) and cls is not Map:
-                if "__call__" in vars(cls):
-                    found.add(cls)
+            if named and "__call__" in vars(cls) and cls is not Map:
+                found.add(cls)
     return found
 
 

@@ -8,7 +8,8 @@ import pytest
 
 from beamfit.errors import InputError
 from beamfit.greybox.activations import KINDS, Range, range_of
-from beamfit.greybox.mlp import MLP, Gain, Layer, Port, dense, monotone_signs
+from beamfit.greybox.mlp import MLP, Gain, Layer, Port, dense
+from beamfit.greybox.monotone import monotone_signs
 from beamfit.io.network import format_network, parse_network, read_network, write_network
 
 # The report's own example (3.1.3), put together from its fragments; weights are its numbers
@@ -55,7 +56,7 @@ def test_the_reports_network_reads_and_computes():
     np.testing.assert_allclose(found[:2], report_network_by_hand(x), rtol=1e-14)
 
     def shifted(a=0.0, b=0.0):
-        return report_network_by_hand(x + [a, b, 0.0])[0]
+        return report_network_by_hand(x + np.array([a, b, 0.0]))[0]
 
     h, k = 1e-3, 0.3
     np.testing.assert_allclose(found[2], (shifted(h) - shifted(-h)) / (2 * h), rtol=1e-6)
@@ -205,9 +206,7 @@ def test_signed_weights_make_every_output_monotonic():
     weights = {
         k: jnp.where(signs[k] == 0, w, signs[k] * jnp.abs(w)) for k, w in net.weights.items()
     }
-    bound = MLP(
-        net.layers, net.connections, net.input_ports, net.output_ports, weights, net.biases
-    )
+    bound = MLP(net.layers, net.connections, net.input_ports, net.output_ports, weights, net.biases)
     points = np.random.default_rng(0).uniform(-3, 3, (2000, 2))
     gains = jax.vmap(jax.jacfwd(bound.values))(points)
     assert gains[:, :, 0].max() <= 0
