@@ -36,6 +36,7 @@ lint: .venv/test
 
 bench: .venv/bench
 	$(BIN)/python benchmarks/emittance.py
+	$(BIN)/python benchmarks/lifetime.py
 
 clean:
 	rm -rf .venv demo dist build

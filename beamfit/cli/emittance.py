@@ -14,12 +14,13 @@ import click
 
 from beamfit import __version__
 from beamfit.errors import InputError
-from beamfit.io.lattice import LatticeFile, read_lattice
+from beamfit.io.lattice import LatticeFile
+from beamfit.io.line import build_line, read_lattice
 from beamfit.io.measurement import read_quad_scan
 from beamfit.studies.scans import QuadScan, check_names
 
 if TYPE_CHECKING:
-    from beamfit.studies.results import EmittanceFit
+    from beamfit.studies.fit import EmittanceFit
 
 __all__ = ["emittance"]
 
@@ -70,7 +71,7 @@ Examples:
     type=float,
     metavar="MEV",
     default=None,
-    help="Total energy of the lattice, for files that have none.",
+    help="Total energy, instead of the lattice's own; elegant files have none.",
 )
 def emittance(
     scan: str,
@@ -98,7 +99,7 @@ def emittance(
 
     fit = fit_emittance(
         measured,
-        described.build(),
+        build_line(described),
         planes=planes,
         method=method.replace("-", "_"),
         robust=robust,

@@ -63,7 +63,8 @@ def scaled_directions(
     scaled = np.asarray(jacobian) * scale
     if not np.isfinite(scaled).all():
         return Directions(np.zeros(len(names)), np.inf, tuple(names))
-    _, values, rows = np.linalg.svd(scaled, full_matrices=True)
+    # All right-hand directions, also those that fewer points than parameters leave out.
+    _, values, rows = np.linalg.svd(scaled, full_matrices=scaled.shape[0] < scaled.shape[1])
     values = np.concatenate([values, np.zeros(len(names) - len(values))])
     smallest = values[-1] if values[-1] > 1e-13 * values[0] else 0.0
     open_rows = [row for value, row in zip(values, rows, strict=True) if value * limit < 1.0]
@@ -92,7 +93,7 @@ def chi2_probability(chi2: float, dof: int) -> float | None:
     Examples
     --------
     >>> round(chi2_probability(18.3, 2), 7)
-    0.0001063
+    0.0001062
     """
     return float(chdtrc(dof, chi2)) if dof > 0 else None
 

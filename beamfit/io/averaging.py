@@ -12,6 +12,8 @@ __all__ = ["average_shots"]
 
 # Below this many shots a setting's own scatter is too uncertain to weight it by.
 ENOUGH_SHOTS = 5
+# With fewer repeats in all (two or three accidental ones) the scatter says nothing.
+ENOUGH_DEGREES = 3
 
 
 def average_shots(scan: QuadScan, *, marked: bool) -> QuadScan:
@@ -30,7 +32,8 @@ def average_shots(scan: QuadScan, *, marked: bool) -> QuadScan:
     QuadScan
         One row a setting. The error is the standard error of the mean, s/√n with n - 1 in s;
         where a setting has fewer than five shots, s is the relative scatter pooled over all
-        settings, because two or three shots can agree by chance.
+        settings, because two or three shots can agree by chance. With fewer than three
+        repeats in all there are no errors, and the fit infers them.
 
     Examples
     --------
@@ -85,10 +88,10 @@ def _mean(values: np.ndarray) -> float:
 
 
 def _standard_error(sizes: np.ndarray, groups: list[np.ndarray]) -> np.ndarray | None:
-    """Standard error of each mean in m, or None where no setting was repeated or all agree."""
+    """Standard error of each mean in m, or None where too few repeat or all agree."""
     shots = [sizes[g][~np.isnan(sizes[g])] for g in groups]
     degrees = sum(max(len(s) - 1, 0) for s in shots)
-    if degrees == 0:
+    if degrees < ENOUGH_DEGREES:
         return None
     relative = sum(((s - s.mean()) ** 2).sum() / s.mean() ** 2 for s in shots if len(s) > 1)
     pooled = np.sqrt(relative / degrees)

@@ -8,18 +8,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from beamfit.errors import InputError, nearest
 from beamfit.io.files import digest, read_text
 from beamfit.io.lattice_keys import ELEMENTS, FORMAT, NUMBER, STRENGTHS, TEXT, TOP, amiss
 
-if TYPE_CHECKING:
-    from beamfit.optics.beamline import Beamline
-
-__all__ = ["LatticeFile", "load_lattice", "read_lattice"]
-
-FOREIGN = {".madx", ".seq", ".mad8", ".mad", ".lte", ".ele", ".elegant"}
+__all__ = ["LatticeFile", "read_toml_lattice"]
 
 
 @dataclass(frozen=True)
@@ -56,72 +51,15 @@ class LatticeFile:
         screens = [e["name"] for e in self.elements if e["type"] == "screen"]
         return screens[-1] if screens else None
 
-    def build(self) -> Beamline:
-        """Make the beam line (this loads JAX)."""
-        from beamfit.io.build import beamline_of
 
-        return beamline_of(self)
-
-
-def load_lattice(
-    path: str | PathLike[str], *, use: str | None = None, energy: float | None = None
-) -> Beamline:
-    """Read a beam line from a file.
-
-    Parameters
-    ----------
-    path : str or path
-        A TOML lattice (docs/files.md), or a MAD-X (``.madx``, ``.seq``), MAD-8 (``.mad8``)
-        or elegant (``.lte``) file.
-    use : str, optional
-        Which line or sequence of a MAD-X or elegant file.
-    energy : float, optional
-        Total energy in MeV of an elegant file, which carries none; overrides a MAD-X beam.
-
-    Returns
-    -------
-    Beamline
-        The line.
+def read_toml_lattice(path: str | PathLike[str]) -> LatticeFile:
+    """Read and check a TOML lattice without building it.
 
     Raises
     ------
     InputError
-        If the file cannot be used, naming file, line and key.
-
-    Examples
-    --------
-    >>> import tempfile, pathlib
-    >>> file = pathlib.Path(tempfile.mkdtemp()) / "line.toml"
-    >>> _ = file.write_text('''format = "beamfit-lattice-1"
-    ... energy_MeV = 135.0
-    ... [[element]]
-    ... type = "quadrupole"
-    ... name = "Q"
-    ... length_m = 0.108
-    ... integrated_gradient_kG = -3.0
-    ... [[element]]
-    ... type = "screen"
-    ... name = "OTR"
-    ... ''')
-    >>> load_lattice(file).magnets
-    ('Q',)
+        If it cannot be used, naming the line of the key.
     """
-    return read_lattice(path, use=use, energy=energy).build()
-
-
-def read_lattice(
-    path: str | PathLike[str], *, use: str | None = None, energy: float | None = None
-) -> LatticeFile:
-    """Read and check a lattice file without building it; see `load_lattice`."""
-    if Path(path).suffix.lower() in FOREIGN:
-        from beamfit.io.sequence import read_sequence
-
-        return read_sequence(path, use=use, energy=energy)
-    for option, value, instead in (("use", use, "one line"), ("energy", energy, "energy_MeV")):
-        if value is not None:
-            raise InputError(
-                f"--{option} for a TOML lattice", f"none: the file has {instead}", path=path
-            )
     return _Reader(path).lattice()
 
 

@@ -11,8 +11,9 @@ from beamfit.inference.identifiability import scaled_directions
 from beamfit.inference.quantity import Quantity
 from beamfit.optics.beamline import Beamline
 from beamfit.optics.particle import beta_gamma
+from beamfit.studies.fit import EmittanceFit
 from beamfit.studies.plane import PlaneWork, next_measurement, work_on
-from beamfit.studies.results import EmittanceFit, Identifiability, PlaneFit, ScreenTwiss
+from beamfit.studies.results import Identifiability, PlaneFit, ScreenTwiss
 from beamfit.studies.scans import QuadScan, check_names
 from beamfit.studies.transport import (
     names_of,
@@ -105,8 +106,25 @@ def fit_emittance(
         if verdict.cause is not None:
             advice = next_measurement(work, scanned)
             verdict = judge(work.evidence, advice, beside)
+        verdict = verdict._replace(message=verdict.message + _outlier_words(work))
         fits.append(_plane_fit(work, line, verdict, advice))
     return EmittanceFit(tuple(fits), scan, line)
+
+
+def _outlier_words(work: PlaneWork) -> str:
+    """Name the points the robust fit doubts."""
+    probability = work.points.outlier_probability
+    doubted = [] if probability is None else np.flatnonzero(probability > 0.5)
+    if not len(doubted):
+        return ""
+    places = [
+        ", ".join(f"{n} = {v[i]:.4g}" for n, v in work.points.settings.items()) for i in doubted
+    ]
+    return (
+        f" {len(doubted)} of {len(probability)} points more likely outliers than not: "
+        + "; ".join(places)
+        + "."
+    )
 
 
 def _check_options(method: str, robust: bool) -> None:
@@ -141,7 +159,8 @@ def _plane_fit(w: PlaneWork, line: Beamline, verdict: Verdict, advice: str | Non
         beta=quantity(d.start[1], d.start_error[1], "m"),
         alpha=quantity(d.start[2], d.start_error[2], "1"),
         sigma=tuple(
-            quantity(sigma[i], raw[i], unit, linear) for i, unit in enumerate(("m^2", "m", "1"))
+            quantity(sigma[i], raw[i], unit, linear)
+            for i, unit in enumerate(("m^2", "m rad", "rad^2"))
         ),
         screen=ScreenTwiss(
             name=w.given.screen[-1],

@@ -39,8 +39,8 @@ def candidate_settings(settings: dict[str, np.ndarray]) -> list[tuple[str, dict[
     Examples
     --------
     >>> [(name, table)] = candidate_settings({"Q": np.array([0.0, 2.0])})
-    >>> name, table["Q"].min(), table["Q"].max()
-    ('Q', -1.0, 3.0)
+    >>> name, table["Q"][[0, -1]].tolist()
+    ('Q', [-1.0, 3.0])
     """
     found = []
     for name, values in settings.items():

@@ -72,7 +72,7 @@ def work_on(
     error = given.error if known_noise else given.size
     probability, lost = None, 0
     if robust:
-        found = fit_robust(given.r11, given.r12, given.size, error, given.known)
+        found = fit_robust(given.r11, given.r12, given.size, error, given.known, known_noise)
         fit, probability, error = found.fit, found.outlier_probability, found.error
         lost = round(float(probability.sum()))
     else:
@@ -173,7 +173,6 @@ def next_measurement(work: PlaneWork, scanned: Beamline) -> str | None:
     inside = values.min() <= found.setting <= values.max()
     return (
         f"Measure next near {found.magnet} = {found.setting:.3g}, "
-        f"{'inside' if inside else 'beyond'} the scanned range: with a size to "
-        f"{100 * relative:.2g} % there the emittance error would be about "
-        f"{100 * found.relative_error:.0f} %."
+        f"{'inside' if inside else 'beyond'} the scanned range: of all single points it would "
+        "sharpen the emittance most; then judge again."
     )

@@ -1,4 +1,4 @@
-"""What a fit returns: frozen values that answer whether to believe them."""
+"""What a fit says of one plane: frozen values that answer whether to believe them."""
 
 from __future__ import annotations
 
@@ -8,13 +8,11 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from beamfit.inference.quantity import Quantity, Status
-from beamfit.studies.scans import QuadScan
 
 if TYPE_CHECKING:
     from beamfit.optics.beam import BeamMatrix
-    from beamfit.optics.beamline import Beamline
 
-__all__ = ["EmittanceFit", "Identifiability", "PlaneFit", "Points", "ScreenTwiss"]
+__all__ = ["Identifiability", "PlaneFit", "Points", "ScreenTwiss"]
 
 
 class Points(NamedTuple):
@@ -230,42 +228,3 @@ class PlaneFit:
                 "outlier_probability": None if probability is None else probability.tolist(),
             },
         }
-
-
-@dataclass(frozen=True, eq=False)
-class EmittanceFit:
-    """A fitted scan: one `PlaneFit` a plane, with the scan and the line it came from.
-
-    Prints as a table; in a notebook it shows as one.
-    """
-
-    planes: tuple[PlaneFit, ...]
-    scan: QuadScan
-    line: Beamline
-
-    def __getitem__(self, plane: str) -> PlaneFit:
-        return {p.plane: p for p in self.planes}[plane]
-
-    @property
-    def x(self) -> PlaneFit:
-        """The fit of the x plane."""
-        return self["x"]
-
-    @property
-    def y(self) -> PlaneFit:
-        """The fit of the y plane."""
-        return self["y"]
-
-    def to_json(self) -> list[dict[str, Any]]:
-        """Give the ``results`` list of the JSON contract."""
-        return [p.to_json() for p in self.planes]
-
-    def __str__(self) -> str:
-        from beamfit.studies.tables import as_text
-
-        return as_text(self)
-
-    def _repr_html_(self) -> str:
-        from beamfit.studies.tables import as_html
-
-        return as_html(self)

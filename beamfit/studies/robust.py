@@ -13,6 +13,8 @@ __all__ = ["RobustFit", "fit_robust"]
 # A point is an outlier with this probability before it is seen, and its error is then this
 # many times larger.
 FRACTION, WIDTH = 0.05, 10.0
+# At most this many points are left out in turn for a start.
+STARTS = 50
 
 
 class RobustFit(NamedTuple):
@@ -34,7 +36,12 @@ class RobustFit(NamedTuple):
 
 
 def fit_robust(
-    r11: np.ndarray, r12: np.ndarray, size: np.ndarray, error: np.ndarray, known: np.ndarray
+    r11: np.ndarray,
+    r12: np.ndarray,
+    size: np.ndarray,
+    error: np.ndarray,
+    known: np.ndarray,
+    noise_known: bool = True,
 ) -> RobustFit:
     """Fit size² with a mixture of good points and outliers.
 
@@ -42,6 +49,9 @@ def fit_robust(
     ----------
     r11, r12, size, error, known : ndarray
         As `fit_sizes`, each of shape (n,).
+    noise_known : bool
+        If not, the errors are right up to a factor, which the median residual of the start
+        gives (1.4826 times it is one standard deviation of a normal distribution).
 
     Returns
     -------
@@ -65,25 +75,30 @@ def fit_robust(
     [0.01, 0.01, 1.0, 0.01, 0.01, 0.01, 0.01, 0.01, 0.01]
     """
 
-    def pulls(sigma: np.ndarray) -> np.ndarray:
+    def pulls(sigma: np.ndarray, error: np.ndarray) -> np.ndarray:
         model = sigma[0] * r11**2 + 2 * sigma[1] * r11 * r12 + sigma[2] * r12**2 + known
         return (model - size**2) / (2.0 * size * error)
 
-    without = np.where(np.eye(len(size), dtype=bool), np.inf, error)
+    n = len(size)
+    left_out = np.unique(np.linspace(0, n - 1, min(n, STARTS)).round().astype(int))
+    without = np.where(np.arange(n) == left_out[:, None], np.inf, error)
     starts = np.vstack(
         [
             fit_sizes(r11, r12, size, error, known).sigma[None],
             fit_sizes(r11, r12, size, without, known).sigma,
         ]
     )
-    pull = pulls(min(starts, key=lambda s: np.median(np.abs(pulls(s)))))
+    pull = pulls(min(starts, key=lambda s: np.median(np.abs(pulls(s, error)))), error)
+    if not noise_known:
+        factor = 1.4826 * np.median(np.abs(pull)) * np.sqrt(n / max(n - 3, 1))
+        pull, error = pull / factor, error * factor
     for _ in range(200):
         bad = FRACTION / WIDTH * np.exp(-0.5 * (pull / WIDTH) ** 2)
         good = (1.0 - FRACTION) * np.exp(-0.5 * pull**2)
         probability = bad / (bad + good)
         widened = error / np.sqrt((1.0 - probability) + probability / WIDTH**2)
         fit = fit_sizes(r11, r12, size, widened, known)
-        moved = pulls(np.asarray(fit.sigma))
+        moved = pulls(np.asarray(fit.sigma), error)
         settled = np.max(np.abs(moved - pull)) < 1e-9
         pull = moved
         if settled:

@@ -19,11 +19,23 @@ from jax import Array
 from beamfit.optics.beamline import Beamline
 from beamfit.optics.calibration import CurrentPolynomial, SlopeIntercept
 from beamfit.optics.elements import Drift, TransferMatrix
-from beamfit.studies.results import EmittanceFit, PlaneFit
+from beamfit.studies.fit import EmittanceFit
+from beamfit.studies.results import PlaneFit, Points
 from beamfit.studies.sigma import emittance_parts, fit_sizes
 from beamfit.studies.transport import plane_input, scan_rows, scanned_line, transfer_rows
 
-__all__ = ["Change", "RangeRow", "range_sensitivity", "systematics"]
+__all__ = [
+    "Change",
+    "RangeRow",
+    "budget_rows",
+    "range_rows",
+    "range_sensitivity",
+    "systematics",
+]
+
+
+# Leaving out one of more points than this tells nothing.
+MOST_POINTS = 50
 
 
 class Change(NamedTuple):
@@ -75,7 +87,7 @@ def systematics(fit: EmittanceFit, plane: str) -> list[Change]:
     Returns
     -------
     list of Change
-        Empty where the plane has no positive emittance to change. First order: exact
+        Empty where the emittance is not determined. First order: exact
         derivatives (through transport, and through the minimum by the implicit function
         theorem) times the step.
 
@@ -94,14 +106,15 @@ def systematics(fit: EmittanceFit, plane: str) -> list[Change]:
     ['Q strength +1 %', 'drift D +1 cm', 'energy +1 %']
     """
     result = fit[plane]
-    if not result.emittance.value > 0.0:
+    if result.emittance.error is None:
         return []
     scanned = scanned_line(fit.scan, fit.line)
     rows = scan_rows(fit.scan, scanned)
     magnets = tuple(n for n, v in fit.scan.settings.items() if np.ptp(v) > 0)
     upstream = fit.line.upto(result.screen.name).elements
     drifts = tuple(e.name for e in upstream if isinstance(e, Drift))
-    matrices, changed = _rows_and_slopes(
+    matrices = transfer_rows(scanned, rows.settings, rows.energy, places=rows.places)
+    changed = _slopes(
         scanned, rows.settings, rows.energy, places=rows.places, magnets=magnets, drifts=drifts
     )
     given = plane_input(fit.scan, scanned, rows, matrices, plane)
@@ -109,7 +122,7 @@ def systematics(fit: EmittanceFit, plane: str) -> list[Change]:
     changed = np.asarray(changed.planes)[:, "xy".index(plane)]
     slope = changed[keep, rows.which[keep], 0]  # (n, 3, changes)
     known_slope = 2.0 * (given.r16 * given.energy_spread**2)[:, None] * slope[:, 2]
-    by_r11, by_r12, by_known = _log_emittance_gradient(
+    gradient = _log_emittance_gradient(
         np.array([q.value for q in result.sigma]),
         given.r11,
         given.r12,
@@ -118,7 +131,8 @@ def systematics(fit: EmittanceFit, plane: str) -> list[Change]:
         result.points.error,
         method=result.method,
     )
-    relative = np.asarray(by_r11 @ slope[:, 0] + by_r12 @ slope[:, 1] + by_known @ known_slope)
+    by_r11, by_r12, by_known = (np.asarray(g) for g in gradient)
+    relative = by_r11 @ slope[:, 0] + by_r12 @ slope[:, 1] + by_known @ known_slope
     # ln βγ rises by E²/(E² - m²) for each relative step of the energy.
     energy = given.energy.mean()
     stiffer = energy**2 / (energy**2 - fit.line.mass**2)
@@ -152,8 +166,8 @@ def _scaled(line: Beamline, magnet: str, factor: Array) -> Beamline:
 
 
 @partial(jax.jit, static_argnames=("places", "magnets", "drifts"))
-def _rows_and_slopes(line, settings, energy, *, places, magnets, drifts):
-    """Transfer matrices of all rows, and their derivatives by each change in the last axis."""
+def _slopes(line, settings, energy, *, places, magnets, drifts):
+    """Derivatives of the transfer matrices of all rows, by each change in the last axis."""
 
     def rows(change: Array) -> TransferMatrix:
         moved = line
@@ -164,7 +178,7 @@ def _rows_and_slopes(line, settings, energy, *, places, magnets, drifts):
         return transfer_rows(moved, settings, energy * (1.0 + change[-1]), places)
 
     none = jnp.zeros(len(magnets) + len(drifts) + 1)
-    return rows(none), jax.jacfwd(rows)(none)
+    return jax.jacfwd(rows)(none)
 
 
 @partial(jax.jit, static_argnames="method")
@@ -203,30 +217,22 @@ def range_sensitivity(plane: PlaneFit) -> list[RangeRow]:
     Returns
     -------
     list of RangeRow
-        One a point left out, and one for sizes within twice the smallest if that leaves
-        enough. A shift of more than about one standard error, again and again in one
-        direction, says that the fit range decides the answer.
+        One a point left out (of at most 50: of more, one says nothing), and one for sizes
+        within twice the smallest if that leaves enough. A shift of more than about one
+        standard error, again and again in one direction, says that the fit range decides the
+        answer.
     """
     p = plane.points
     n = len(p.size)
-    keep = ~np.eye(n, dtype=bool)
-    screens = len(set(p.screen)) > 1
-    varied = [m for m, v in p.settings.items() if np.ptp(v) > 0]
-    names = [
-        "without "
-        + (f"{p.screen[i]}, " if screens else "")
-        + ", ".join(f"{m} = {p.settings[m][i]:.4g}" for m in varied)
-        for i in range(n)
-    ]
+    few = 4 <= n <= MOST_POINTS
+    rows = [(f"without {_place(p, i)}", np.arange(n) != i) for i in range(n if few else 0)]
     near = p.size <= 2.0 * p.size.min()
     if 4 <= near.sum() < n:
-        keep, names = np.vstack([keep, near]), [*names, "only sizes within 2 x the smallest"]
-    if n - 1 < 3:
-        return []
+        rows.append(("only sizes within 2 x the smallest", near))
     # One at a time: a batch of another shape would be compiled for this table alone.
     fits = [
         fit_sizes(p.r11, p.r12, p.size, np.where(k, p.error, np.inf), p.known, method=plane.method)
-        for k in keep
+        for _, k in rows
     ]
     emittance = [math.sqrt(f.determinant) if f.positive else math.nan for f in fits]
     factor = (
@@ -239,5 +245,42 @@ def range_sensitivity(plane: PlaneFit) -> list[RangeRow]:
             float(e * factor),
             float((e - plane.emittance.value) / error) if error else float("nan"),
         )
-        for name, e in zip(names, emittance, strict=True)
+        for (name, _), e in zip(rows, emittance, strict=True)
     ]
+
+
+def _place(points: Points, i: int) -> str:
+    """Name a point by its screen, where there are several, and the settings that vary."""
+    varied = [f"{n} = {v[i]:.4g}" for n, v in points.settings.items() if np.ptp(v) > 0]
+    screen = [points.screen[i]] if len(set(points.screen)) > 1 else []
+    return ", ".join(screen + varied)
+
+
+def budget_rows(fit: EmittanceFit) -> list[tuple[str, list[str]]]:
+    """Cause and one cell per plane: the change of the normalised emittance."""
+    columns = [{c.cause: c for c in systematics(fit, p.plane)} for p in fit.planes]
+    causes = dict.fromkeys(cause for column in columns for cause in column)
+    return [
+        (
+            cause,
+            [
+                f"{100 * column[cause].normalized_emittance:+.2f} %" if cause in column else "-"
+                for column in columns
+            ],
+        )
+        for cause in causes
+    ]
+
+
+def range_rows(fit: EmittanceFit) -> list[tuple[str, list[str]]]:
+    """What was left out and one cell per plane: the normalised emittance and its shift."""
+    columns = [{r.left_out: r for r in range_sensitivity(p)} for p in fit.planes]
+    names = dict.fromkeys(name for column in columns for name in column)
+    return [(name, [_range_cell(column.get(name)) for column in columns]) for name in names]
+
+
+def _range_cell(row: RangeRow | None) -> str:
+    if row is None or math.isnan(row.normalized_emittance):
+        return "-" if row is None else "none"
+    shift = "" if math.isnan(row.shift) else f" ({row.shift:+.1f})"
+    return f"{row.normalized_emittance * 1e6:.3f} µm{shift}"

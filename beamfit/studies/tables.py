@@ -6,25 +6,28 @@ from collections.abc import Callable
 from html import escape
 
 from beamfit.inference.quantity import Quantity
-from beamfit.studies.results import EmittanceFit, PlaneFit
+from beamfit.studies.results import PlaneFit
 
-__all__ = ["as_html", "as_text", "point_rows", "result_rows"]
+# A longer table of points is cut, and says so.
+MOST_ROWS = 500
+
+__all__ = ["as_html", "as_text", "identifiability_rows", "point_rows", "result_rows"]
 
 
-def result_rows(fit: EmittanceFit) -> list[tuple[str, list[str]]]:
+def result_rows(planes: tuple[PlaneFit, ...]) -> list[tuple[str, list[str]]]:
     """Label and one cell per plane, for every number a result has.
 
     Parameters
     ----------
-    fit : EmittanceFit
-        The result.
+    planes : tuple of PlaneFit
+        The planes of a fit.
 
     Returns
     -------
     list of (str, list of str)
         Rows in the order they are read.
     """
-    at = f"at {fit.planes[0].screen.name}"
+    at = f"at {planes[0].screen.name}"
     rows: list[tuple[str, Callable[[PlaneFit], object]]] = [
         ("status", lambda p: p.status.value.replace("_", " ")),
         ("normalised emittance", lambda p: p.normalized_emittance),
@@ -38,7 +41,7 @@ def result_rows(fit: EmittanceFit) -> list[tuple[str, list[str]]]:
         (f"alpha {at}", lambda p: p.screen.alpha),
         (f"size {at}", lambda p: p.screen.size),
     ]
-    if any(p.mismatch is not None for p in fit.planes):
+    if any(p.mismatch is not None for p in planes):
         rows.append(("mismatch BMAG", lambda p: p.mismatch if p.mismatch else "-"))
     rows += [
         ("chi2/dof", _chi2),
@@ -48,14 +51,12 @@ def result_rows(fit: EmittanceFit) -> list[tuple[str, list[str]]]:
         ("phase seen", lambda p: _degrees(p.identifiability.phase_coverage)),
         ("zero emittance at", lambda p: f"{p.identifiability.zero_distance:.1f} sigma"),
     ]
-    return [(label, [_cell(cell(p)) for p in fit.planes]) for label, cell in rows]
+    return [(label, [_cell(cell(p)) for p in planes]) for label, cell in rows]
 
 
 def _cell(value: object) -> str:
     text = str(value)
-    if isinstance(value, Quantity) and value.unit in ("m^2",):
-        return text.replace("m^2", "m²")
-    return text
+    return text.replace("^2", "²") if isinstance(value, Quantity) else text
 
 
 def _chi2(p: PlaneFit) -> str:
@@ -78,6 +79,29 @@ def _degrees(value: float | None) -> str:
     return "-" if value is None else f"{value:.0f}° of 180°"
 
 
+def identifiability_rows(
+    planes: tuple[PlaneFit, ...],
+) -> list[tuple[str, list[str]]]:
+    """Label and one cell per plane for what the data determine."""
+    rows: list[tuple[str, Callable[[PlaneFit], str]]] = [
+        ("emittance", lambda p: "determined" if p.identifiability.determined else "not determined"),
+        ("left open", lambda p: ", ".join(p.identifiability.undetermined) or "nothing"),
+        (
+            "singular values",
+            lambda p: ", ".join(f"{v:.3g}" for v in p.identifiability.singular_values),
+        ),
+        ("condition", lambda p: _condition(p.identifiability.condition)),
+        ("zero emittance at", lambda p: f"{p.identifiability.zero_distance:.1f} standard errors"),
+        ("waist bracketed", lambda p: _yes(p.identifiability.waist_bracketed)),
+        ("betatron phase seen", lambda p: _degrees(p.identifiability.phase_coverage)),
+    ]
+    return [(label, [cell(p) for p in planes]) for label, cell in rows]
+
+
+def _condition(value: float | None) -> str:
+    return "infinite" if value is None else f"{value:.3g}"
+
+
 def point_rows(plane: PlaneFit) -> tuple[list[str], list[list[str]]]:
     """Header and rows of the point-by-point table of one plane.
 
@@ -98,7 +122,7 @@ def point_rows(plane: PlaneFit) -> tuple[list[str], list[list[str]]]:
     if p.outlier_probability is not None:
         header.append("P(outlier)")
     rows = []
-    for i in range(len(p.size)):
+    for i in range(min(len(p.size), MOST_ROWS)):
         cells = [p.screen[i]] if screens else []
         cells += [f"{values[i]:.5g}" for values in p.settings.values()]
         cells += [f"{1e6 * v[i]:.2f}" for v in (p.size, p.error, p.model)]
@@ -106,36 +130,34 @@ def point_rows(plane: PlaneFit) -> tuple[list[str], list[list[str]]]:
         if p.outlier_probability is not None:
             cells.append(f"{p.outlier_probability[i]:.2f}")
         rows.append(cells)
+    left = len(p.size) - len(rows)
+    if left > 0:
+        rows.append([f"{left} more"] + [""] * (len(header) - 1))
     return header, rows
 
 
-def as_text(fit: EmittanceFit) -> str:
+def as_text(heading: str, planes: tuple[PlaneFit, ...]) -> str:
     """Lay the result out for a terminal, verdicts below the numbers."""
-    rows = result_rows(fit)
+    rows = result_rows(planes)
     width = max(len(label) for label, _ in rows)
-    columns = [max(len(r[1][i]) for r in rows) for i in range(len(fit.planes))]
-    lines = [f"{fit.scan.name} on {fit.line.name}, fit of {_method(fit)}", ""]
-    head = [p.plane.ljust(w) for p, w in zip(fit.planes, columns, strict=True)]
-    lines.append(" " * (width + 2) + "  ".join(head).rstrip())
+    columns = [max(len(r[1][i]) for r in rows) for i in range(len(planes))]
+    head = [p.plane.ljust(w) for p, w in zip(planes, columns, strict=True)]
+    lines = [heading, "", " " * (width + 2) + "  ".join(head).rstrip()]
     for label, cells in rows:
         padded = [c.ljust(w) for c, w in zip(cells, columns, strict=True)]
         lines.append(f"{label.ljust(width)}  " + "  ".join(padded).rstrip())
-    lines += ["", *(f"{p.plane}: {p.message}" for p in fit.planes)]
+    lines += ["", *(f"{p.plane}: {p.message}" for p in planes)]
     return "\n".join(lines)
 
 
-def _method(fit: EmittanceFit) -> str:
-    return {"size_squared": "size squared", "size": "size"}[fit.planes[0].method]
-
-
-def as_html(fit: EmittanceFit) -> str:
+def as_html(planes: tuple[PlaneFit, ...]) -> str:
     """Lay the result out for a notebook."""
-    head = "".join(f"<th>{p.plane}</th>" for p in fit.planes)
+    head = "".join(f"<th>{p.plane}</th>" for p in planes)
     body = "".join(
         f"<tr><th style='text-align:left'>{escape(label)}</th>"
         + "".join(f"<td style='text-align:left'>{escape(c)}</td>" for c in cells)
         + "</tr>"
-        for label, cells in result_rows(fit)
+        for label, cells in result_rows(planes)
     )
-    notes = "".join(f"<p><b>{p.plane}</b>: {escape(p.message)}</p>" for p in fit.planes)
+    notes = "".join(f"<p><b>{p.plane}</b>: {escape(p.message)}</p>" for p in planes)
     return f"<table><thead><tr><th></th>{head}</tr></thead><tbody>{body}</tbody></table>{notes}"

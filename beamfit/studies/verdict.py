@@ -17,9 +17,9 @@ POOR_FIT = 1e-3
 # The emittance is determined if zero is this many standard errors away ...
 CLEAR, CLEAR_BESIDE_ANOTHER = 4.0, 3.0
 # ... and noise would lift it so far less often than this, counting the degrees of freedom.
-CHANCE = 5e-3
+CHANCE = 2e-3
 # Sizes that miss every beam by this much, rms and relative, follow no beam.
-LOST = 0.2
+LOST = 0.15
 
 
 class Evidence(NamedTuple):
@@ -88,7 +88,7 @@ def judge(e: Evidence, next_measurement: str | None, other_plane_clear: bool = F
     -----
     The two distances from zero emittance must both exceed four standard errors, and the
     probability of that by chance (Student's t where the errors rest on these residuals,
-    normal where they were known and fit) must be under 0.5 %. On simulated noise and
+    normal where they were known and fit) must be under 0.2 %. On simulated noise and
     one-sided scans this rule is measured in docs/verdict.md.
 
     Examples
@@ -121,6 +121,8 @@ def judge(e: Evidence, next_measurement: str | None, other_plane_clear: bool = F
             f"errors, and the lattice. {clear}.",
             None,
         )
+    if e.noise_known and e.chi2 > e.dof > 0:
+        clear += f"; errors are scaled by sqrt(chi2/dof) = {math.sqrt(e.chi2 / e.dof):.2f}"
     return Verdict(Status.converged, clear + ".", None)
 
 

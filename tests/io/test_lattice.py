@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from beamfit.errors import InputError
-from beamfit.io.lattice import load_lattice, read_lattice
+from beamfit.io.line import build_line, load_lattice, read_lattice
 from beamfit.optics.calibration import CurrentPolynomial, IntegratedGradient, SlopeIntercept
 from beamfit.optics.elements import Drift, Marker, Quadrupole, Screen, SectorDipole, ThinLens
 from beamfit.optics.particle import PROTON_MASS
@@ -93,7 +93,7 @@ def test_every_key_is_understood(write):
     assert file.places == ["M", "S"]
     assert file.default_screen == "S"
     assert file.calibrations == {"QL": "A", "QP": "A", "L": "k1l", "QG": "kG"}
-    line = file.build()
+    line = build_line(file)
     assert (line.name, line.energy, line.energy_spread) == ("all of it", 1200.0, 1e-3)
     assert line.mass == PROTON_MASS
     assert line.design.at == "S"
@@ -266,7 +266,7 @@ def test_options_of_other_files_are_refused(write):
 
 def read_or_refuse(path):
     try:
-        return read_lattice(path).build()
+        return load_lattice(path)
     except InputError as error:
         said = str(error)
     assert str(path) in said

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from beamfit.errors import InputError
-from beamfit.io.lattice import load_lattice, read_lattice
+from beamfit.io.line import build_line, load_lattice, read_lattice
 
 at = pytest.importorskip("at", reason="accelerator-toolbox is not installed")
 
@@ -153,10 +153,10 @@ def test_what_a_scan_needs_is_told_without_building(written):
     assert (file.energy, file.particle) == (pytest.approx(135.0), "electron")
     assert next(e for e in file.elements if e["name"] == "Q1")["k1_per_m2"] == 3.7
     # halves of the monitor before and after its centre, where the size is measured
-    assert file.build().upto("BPM").length == pytest.approx(2.0)
+    assert build_line(file).upto("BPM").length == pytest.approx(2.0)
     line = read_lattice(written("line.lte", ELEGANT), energy=135.0)
     assert line.places == ["W1", "BPM"]
-    assert line.build().upto("BPM").length == pytest.approx(0.12 + 0.68 + 0.4 + 1.77 + 0.03)
+    assert build_line(line).upto("BPM").length == pytest.approx(0.12 + 0.68 + 0.4 + 1.77 + 0.03)
 
 
 def test_a_marker_can_be_the_screen(written):
@@ -261,7 +261,7 @@ def test_elements_without_strength_are_drifts(written):
     """
     file = read_lattice(written("a.madx", text))
     assert {e["type"] for e in file.elements} == {"drift", "marker"}
-    assert file.build().length == pytest.approx(1.3)
+    assert build_line(file).length == pytest.approx(1.3)
 
 
 def test_which_line(written):

@@ -1,0 +1,87 @@
+"""Beam lines from files of any kind: read and check first, build (which loads JAX) after."""
+
+from __future__ import annotations
+
+from os import PathLike
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from beamfit.errors import InputError
+from beamfit.io.lattice import LatticeFile, read_toml_lattice
+
+if TYPE_CHECKING:
+    from beamfit.optics.beamline import Beamline
+
+__all__ = ["build_line", "load_lattice", "read_lattice"]
+
+FOREIGN = {".madx", ".seq", ".mad8", ".mad", ".lte", ".ele", ".elegant"}
+
+
+def load_lattice(
+    path: str | PathLike[str], *, use: str | None = None, energy: float | None = None
+) -> Beamline:
+    """Read a beam line from a file.
+
+    Parameters
+    ----------
+    path : str or path
+        A TOML lattice (docs/files.md), or a MAD-X (``.madx``, ``.seq``), MAD-8 (``.mad8``)
+        or elegant (``.lte``) file.
+    use : str, optional
+        Which line or sequence of a MAD-X or elegant file.
+    energy : float, optional
+        Total energy in MeV of an elegant file, which carries none; overrides a MAD-X beam.
+
+    Returns
+    -------
+    Beamline
+        The line.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be used, naming file, line and key.
+
+    Examples
+    --------
+    >>> import tempfile, pathlib
+    >>> file = pathlib.Path(tempfile.mkdtemp()) / "line.toml"
+    >>> _ = file.write_text('''format = "beamfit-lattice-1"
+    ... energy_MeV = 135.0
+    ... [[element]]
+    ... type = "quadrupole"
+    ... name = "Q"
+    ... length_m = 0.108
+    ... integrated_gradient_kG = -3.0
+    ... [[element]]
+    ... type = "screen"
+    ... name = "OTR"
+    ... ''')
+    >>> load_lattice(file).magnets
+    ('Q',)
+    """
+    file = read_lattice(path, use=use, energy=energy)
+    return build_line(file)
+
+
+def read_lattice(
+    path: str | PathLike[str], *, use: str | None = None, energy: float | None = None
+) -> LatticeFile:
+    """Read and check a lattice file of any kind without building it; see `load_lattice`."""
+    if Path(path).suffix.lower() in FOREIGN:
+        from beamfit.io.sequence import read_sequence
+
+        return read_sequence(path, use=use, energy=energy)
+    for option, value, instead in (("use", use, "one line"), ("energy", energy, "energy_MeV")):
+        if value is not None:
+            raise InputError(
+                f"--{option} for a TOML lattice", f"none: the file has {instead}", path=path
+            )
+    return read_toml_lattice(path)
+
+
+def build_line(file: LatticeFile) -> Beamline:
+    """Build the line a checked lattice file describes."""
+    from beamfit.io.build import beamline_of
+
+    return beamline_of(file)

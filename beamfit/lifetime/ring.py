@@ -1,0 +1,200 @@
+"""What the loss mechanisms must know of a storage ring: plain values, pytrees for JAX."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from scipy import constants
+
+__all__ = ["ELECTRON_MASS_EV", "Gas", "Operation", "Optics", "Ring", "gas_mixture"]
+
+ELECTRON_MASS_EV = constants.m_e * constants.c**2 / constants.e
+
+# Atoms in a molecule: the gases of an electron ring's residual-gas spectra.
+MOLECULES = {
+    "H2": {1: 2},
+    "He": {2: 1},
+    "CH4": {6: 1, 1: 4},
+    "H2O": {8: 1, 1: 2},
+    "Ne": {10: 1},
+    "N2": {7: 2},
+    "CO": {6: 1, 8: 1},
+    "O2": {8: 2},
+    "Ar": {18: 1},
+    "CO2": {6: 1, 8: 2},
+}
+
+
+class Optics(NamedTuple):
+    """Optical functions at points along the ring, and the share of the ring each stands for.
+
+    One point with ring averages is as good a value as thousands of slices.
+
+    Attributes
+    ----------
+    weight : array, shape (n,)
+        Share of the circumference; the weights sum to 1.
+    beta_x, beta_y : array, shape (n,)
+        Twiss beta, m.
+    alpha_x, alpha_y : array, shape (n,)
+        Twiss alpha.
+    dispersion_x, dispersion_y : array, shape (n,)
+        Dispersion, m.
+    slope_x, slope_y : array, shape (n,)
+        Derivative of the dispersion along the ring.
+    """
+
+    weight: jax.Array
+    beta_x: jax.Array
+    beta_y: jax.Array
+    alpha_x: jax.Array
+    alpha_y: jax.Array
+    dispersion_x: jax.Array
+    dispersion_y: jax.Array
+    slope_x: jax.Array
+    slope_y: jax.Array
+
+    def average(self, values: jax.Array) -> jax.Array:
+        """Average over the ring of a quantity given at each point."""
+        return jnp.sum(self.weight * values)
+
+
+class Ring(NamedTuple):
+    """A storage ring as the loss mechanisms see it.
+
+    Attributes
+    ----------
+    energy : float
+        Beam energy, eV.
+    circumference : float
+        Circumference, m.
+    harmonic : float
+        Harmonic number.
+    momentum_compaction : float
+        Momentum compaction factor.
+    energy_loss : float
+        Energy radiated in one turn, eV.
+    energy_spread : float
+        Relative rms energy spread.
+    emittance_x, emittance_y : float
+        Emittances, m rad.
+    momentum_acceptance : float or array, shape (n,)
+        Momentum acceptance of the lattice without RF, relative; infinite if the RF alone limits.
+    acceptance_y : float
+        Vertical acceptance of the chamber, m rad; infinite if the scraper alone limits.
+    scraper_beta_y : float
+        Vertical Twiss beta at the scraper, m.
+    damping_time_y, damping_time_z : float
+        Amplitude damping times of the vertical plane and of energy, s; infinite to leave the
+        quantum lifetime out.
+    impedance : float
+        Longitudinal broad-band impedance abs(Z/n), ohm; 0 for a bunch that does not lengthen.
+    optics : Optics
+        Optical functions along the ring.
+    """
+
+    energy: jax.Array
+    circumference: jax.Array
+    harmonic: jax.Array
+    momentum_compaction: jax.Array
+    energy_loss: jax.Array
+    energy_spread: jax.Array
+    emittance_x: jax.Array
+    emittance_y: jax.Array
+    momentum_acceptance: jax.Array
+    acceptance_y: jax.Array
+    scraper_beta_y: jax.Array
+    damping_time_y: jax.Array
+    damping_time_z: jax.Array
+    impedance: jax.Array
+    optics: Optics
+
+    @property
+    def relativistic_gamma(self) -> jax.Array:
+        """Energy over rest energy."""
+        return self.energy / ELECTRON_MASS_EV
+
+
+class Gas(NamedTuple):
+    """Atoms of the residual gas, element by element.
+
+    Attributes
+    ----------
+    charge : array, shape (k,)
+        Atomic number.
+    atoms : array, shape (k,)
+        Atoms of the element for each molecule of the mixture.
+    """
+
+    charge: jax.Array
+    atoms: jax.Array
+
+
+class Operation(NamedTuple):
+    """The settings an operator can change, and the vacuum that results.
+
+    Attributes
+    ----------
+    rf_voltage : float
+        Sum of the peak RF voltages, V.
+    scraper_y : float
+        Distance from the beam to the nearer vertical scraper jaw, m; infinite if there is none.
+    bunches : float
+        Number of equally filled bunches.
+    pressure_base : float
+        Pressure without beam, Pa.
+    pressure_slope : float
+        Rise of the pressure with beam current, Pa/mA.
+    temperature : float
+        Temperature of the gas, K.
+    gas : Gas
+        Composition of the residual gas.
+    """
+
+    rf_voltage: jax.Array
+    scraper_y: jax.Array
+    bunches: jax.Array
+    pressure_base: jax.Array
+    pressure_slope: jax.Array
+    temperature: jax.Array
+    gas: Gas
+
+
+def gas_mixture(**fractions: float) -> Gas:
+    """Residual gas from the share of each molecule in the pressure.
+
+    Parameters
+    ----------
+    **fractions : float
+        Partial pressures of H2, He, CH4, H2O, Ne, N2, CO, O2, Ar, CO2 in any common unit.
+
+    Returns
+    -------
+    Gas
+        Elements with their atoms for each molecule of the mixture.
+
+    Raises
+    ------
+    ValueError
+        If a molecule is unknown, a fraction is negative, or all are zero.
+
+    Examples
+    --------
+    >>> gas = gas_mixture(H2=3, CO=1)
+    >>> gas.charge.tolist(), gas.atoms.tolist()
+    ([1.0, 6.0, 8.0], [1.5, 0.25, 0.25])
+    """
+    unknown = set(fractions) - set(MOLECULES)
+    if unknown:
+        raise ValueError(f"unknown gas {sorted(unknown)[0]}; known are {', '.join(MOLECULES)}")
+    total = sum(fractions.values())
+    if min(fractions.values(), default=0.0) < 0 or not total > 0:
+        raise ValueError("partial pressures must not be negative and not all zero")
+    atoms: dict[int, float] = {}
+    for molecule, fraction in fractions.items():
+        for charge, number in MOLECULES[molecule].items():
+            atoms[charge] = atoms.get(charge, 0.0) + number * fraction / total
+    charges = sorted(atoms)
+    return Gas(jnp.array(charges, float), jnp.array([atoms[charge] for charge in charges]))

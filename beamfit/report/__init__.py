@@ -1,0 +1,1 @@
+"""Report pages: the only package that draws."""

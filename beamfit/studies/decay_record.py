@@ -1,0 +1,250 @@
+"""A record of beam current against time: what is measured, checked on construction."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import NamedTuple
+
+import numpy as np
+
+from beamfit.errors import InputError
+
+__all__ = ["Conditions", "DecayRecord", "Fault", "first_fault"]
+
+
+class Conditions(NamedTuple):
+    """Operating conditions along a record, in SI; None where the file does not give them.
+
+    Attributes
+    ----------
+    rf_voltage : array, shape (n,), or None
+        Sum of the peak RF voltages, V.
+    scraper_y : array, shape (n,), or None
+        Distance from the beam to the vertical scraper jaw, m.
+    pressure : array, shape (n,), or None
+        Average pressure, Pa.
+    bunches : array, shape (n,), or None
+        Number of filled bunches.
+    """
+
+    rf_voltage: np.ndarray | None = None
+    scraper_y: np.ndarray | None = None
+    pressure: np.ndarray | None = None
+    bunches: np.ndarray | None = None
+
+
+class Fault(NamedTuple):
+    """The first thing wrong with a record's numbers.
+
+    Attributes
+    ----------
+    row : int
+        Index of the reading.
+    quantity : str
+        Which of `time`, `current`, `error`, or a name in `Conditions`.
+    found, expected : str
+        For the error message.
+    """
+
+    row: int
+    quantity: str
+    found: str
+    expected: str
+
+
+def _first(bad: np.ndarray) -> int | None:
+    return int(np.argmax(bad)) if bad.any() else None
+
+
+def _unit_change(current: np.ndarray) -> int | None:
+    """Where A follow mA or the other way round: by 1000, and the decay goes on from there."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        decades = np.abs(np.log10(current[1:] / current[:-1]))
+    for row in np.flatnonzero(np.abs(decades - 3) < 0.01) + 1:
+        before, after = np.median(current[max(row - 3, 0) : row]), np.median(current[row : row + 3])
+        if before > 0 and after > 0 and abs(abs(np.log10(after / before)) - 3) < 0.05:
+            return int(row)
+    return None
+
+
+def first_fault(
+    time: np.ndarray, current: np.ndarray, error: np.ndarray | None, conditions: Conditions
+) -> Fault | None:
+    """Find the first number that no record of a stored beam can hold.
+
+    Parameters
+    ----------
+    time, current : array, shape (n,)
+        In s and mA.
+    error : array, shape (n,), or None
+        Standard deviations of the current, mA.
+    conditions : Conditions
+        Operating conditions.
+
+    Returns
+    -------
+    Fault or None
+        None if all is usable.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> first_fault(np.array([0.0, 1.0, 1.0]), np.ones(3), None, Conditions()).found
+    'time 1 s after 1 s'
+    """
+    named = {"time": time, "current": current, "error": error, **conditions._asdict()}
+    for name, values in named.items():
+        if values is not None and (row := _first(~np.isfinite(values))) is not None:
+            return Fault(row, name, f"{values[row]}", "a finite number")
+    row = _first(np.diff(time, prepend=-np.inf) <= 0)
+    if row is not None:
+        found = f"time {time[row]:.10g} s after {time[row - 1]:.10g} s"
+        return Fault(row, "time", found, "times that increase")
+    if (row := _first(current < 0)) is not None:
+        found = f"a negative current, {current[row]:.6g} mA"
+        return Fault(row, "current", found, "a current of zero or more; subtract the DCCT's offset")
+    if error is not None and (row := _first(error <= 0)) is not None:
+        return Fault(row, "error", f"an error of {error[row]:.6g} mA", "a positive one")
+    for name, values in conditions._asdict().items():
+        if values is not None and (row := _first(values < 0)) is not None:
+            return Fault(row, name, f"a negative {name}, {values[row]:.6g}", "zero or more")
+    if (row := _unit_change(current)) is not None:
+        found = f"{current[row]:.6g} mA after {current[row - 1]:.6g} mA, a factor of 1000"
+        return Fault(row, "current", found, "one unit throughout, A or mA")
+    return None
+
+
+def _frozen(values: object, rows: int, quantity: str) -> np.ndarray:
+    array = np.array(values, float)
+    if array.shape != (rows,):
+        found = f"{quantity} of shape {array.shape}"
+        raise InputError(found, f"{rows} readings", column=quantity)
+    array.flags.writeable = False
+    return array
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class DecayRecord:
+    """Beam current against time, validated and immutable.
+
+    Parameters
+    ----------
+    time : array, shape (n,)
+        Times, s, increasing; kept relative to the first.
+    current : array, shape (n,)
+        Beam current, mA; zero where the monitor dropped out.
+    error : array, shape (n,), optional
+        Standard deviation of each reading, mA. Without it the noise is inferred from the fit.
+    name : str, optional
+        What to call the record in results: the file's name.
+    start : float, optional
+        Unix time of the first reading, s.
+    conditions : Conditions, optional
+        Operating conditions in SI, each of shape (n,).
+    comments : tuple of str, optional
+        Provenance, as written in the file.
+
+    Raises
+    ------
+    InputError
+        If there are fewer than two readings, shapes differ, times do not increase, a current or
+        condition is negative or not finite, an error is not positive, or units are mixed.
+
+    Examples
+    --------
+    >>> record = DecayRecord([0, 60, 120], [100.0, 99.9, 99.8])
+    >>> print(record)
+    record: 3 readings over 0.0333 h, 100 to 99.8 mA
+    """
+
+    time: np.ndarray
+    current: np.ndarray
+    error: np.ndarray | None = None
+    name: str = "record"
+    start: float | None = None
+    conditions: Conditions = field(default_factory=Conditions)
+    comments: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        rows = np.size(self.time)
+        if rows < 2:
+            raise InputError(f"{rows} readings", "two or more", path=self.name)
+        time = np.array(self.time, float)
+        for quantity in ("current", "error"):
+            if getattr(self, quantity) is not None:
+                values = _frozen(getattr(self, quantity), rows, quantity)
+                object.__setattr__(self, quantity, values)
+        conditions = Conditions(
+            *(
+                None if values is None else _frozen(values, rows, name)
+                for name, values in self.conditions._asdict().items()
+            )
+        )
+        fault = first_fault(time, self.current, self.error, conditions)
+        if fault is not None:
+            found = f"reading {fault.row + 1}: {fault.found}"
+            raise InputError(found, fault.expected, path=self.name, column=fault.quantity)
+        object.__setattr__(self, "time", _frozen(time - time[0], rows, "time"))
+        object.__setattr__(self, "conditions", conditions)
+
+    def __len__(self) -> int:
+        return self.time.size
+
+    def __str__(self) -> str:
+        return (
+            f"{self.name}: {len(self)} readings over {self.span / 3600:.3g} h, "
+            f"{self.current[0]:.6g} to {self.current[-1]:.6g} mA"
+        )
+
+    def __repr__(self) -> str:
+        return f"<DecayRecord {self}>"
+
+    @property
+    def span(self) -> float:
+        """Time from the first to the last reading, s."""
+        return float(self.time[-1])
+
+    @property
+    def resolution(self) -> float | None:
+        """Step of a coarsely quantised reading, mA; None where readings seldom repeat."""
+        levels = np.unique(self.current)
+        if levels.size < 2 or levels.size > len(self) / 2:
+            return None
+        return float(np.diff(levels).min())
+
+    def select(self, rows: np.ndarray | slice, name: str | None = None) -> DecayRecord:
+        """Take some of the readings.
+
+        Parameters
+        ----------
+        rows : slice, or array of bool or int
+            Which readings; at least two.
+        name : str, optional
+            Name of the new record.
+
+        Returns
+        -------
+        DecayRecord
+            With time counted from its own first reading, and `start` moved with it.
+
+        Raises
+        ------
+        InputError
+            If fewer than two readings are left.
+
+        Examples
+        --------
+        >>> DecayRecord([0, 60, 120], [100.0, 99.9, 99.8], start=1e9).select(slice(1, 3)).start
+        1000000060.0
+        """
+        time = self.time[rows]
+        moved = None if self.start is None or not time.size else self.start + float(time[0])
+        return replace(
+            self,
+            time=time,
+            current=self.current[rows],
+            error=None if self.error is None else self.error[rows],
+            name=self.name if name is None else name,
+            start=moved,
+            conditions=Conditions(*(None if v is None else v[rows] for v in self.conditions)),
+        )

@@ -1,0 +1,51 @@
+"""A fitted scan: its planes, and the scan and line they came from."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from beamfit.studies.results import PlaneFit
+from beamfit.studies.scans import QuadScan
+from beamfit.studies.tables import as_html, as_text
+
+if TYPE_CHECKING:
+    from beamfit.optics.beamline import Beamline
+
+__all__ = ["EmittanceFit"]
+
+
+@dataclass(frozen=True, eq=False)
+class EmittanceFit:
+    """A fitted scan: one `PlaneFit` a plane, with the scan and the line it came from.
+
+    Prints as a table; in a notebook it shows as one.
+    """
+
+    planes: tuple[PlaneFit, ...]
+    scan: QuadScan
+    line: Beamline
+
+    def __getitem__(self, plane: str) -> PlaneFit:
+        return {p.plane: p for p in self.planes}[plane]
+
+    @property
+    def x(self) -> PlaneFit:
+        """The fit of the x plane."""
+        return self["x"]
+
+    @property
+    def y(self) -> PlaneFit:
+        """The fit of the y plane."""
+        return self["y"]
+
+    def to_json(self) -> list[dict[str, Any]]:
+        """Give the ``results`` list of the JSON contract."""
+        return [p.to_json() for p in self.planes]
+
+    def __str__(self) -> str:
+        heading = f"{self.scan.name} on {self.line.name}, fit of {self.planes[0].method}"
+        return as_text(heading.replace("_", " "), self.planes)
+
+    def _repr_html_(self) -> str:
+        return as_html(self.planes)

@@ -1,0 +1,109 @@
+"""The command as a person and as a script use it."""
+
+import hashlib
+import json
+import sys
+
+import pytest
+
+import beamfit
+from beamfit.cli import main
+
+
+@pytest.fixture
+def run(monkeypatch, capsys, root):
+    """Run `beamfit ...` in this process from the top of the checkout; status, out, err."""
+    monkeypatch.chdir(root)
+
+    def call(*arguments):
+        monkeypatch.setattr(sys, "argv", ["beamfit", *map(str, arguments)])
+        with pytest.raises(SystemExit) as stop:
+            main()
+        captured = capsys.readouterr()
+        return stop.value.code, captured.out, captured.err
+
+    return call
+
+
+REAL = ("emittance", "measurements/lcls_otr2.csv", "--lattice", "lattices/lcls_otr2.toml")
+
+
+def test_json_is_one_object_and_nothing_else(run, root):
+    status, out, err = run(*REAL, "--json")
+    assert (status, err) == (0, "")
+    document = json.loads(out)
+    assert list(document) == ["beamfit", "command", "inputs", "results"]
+    assert document["beamfit"] == beamfit.__version__
+    assert document["command"].startswith("beamfit emittance measurements/lcls_otr2.csv")
+    for path, digest in document["inputs"].items():
+        assert digest == hashlib.sha256((root / path).read_bytes()).hexdigest()
+    x, y = document["results"]
+    assert (x["plane"], x["status"]) == ("x", "poor_fit")
+    assert (y["plane"], y["status"]) == ("y", "converged")
+    quantity = x["normalized_emittance"]
+    assert quantity["unit"] == "m"
+    assert quantity["value"] == pytest.approx(0.7050e-6, abs=5e-10)
+    assert quantity["error"] == pytest.approx(0.0155e-6, abs=3e-10)
+    assert quantity["error_raw"] < quantity["error"]
+    assert x["identifiability"]["verdict"] == "determined"
+    assert [c["cause"] for c in x["systematics"]][-1] == "energy +1 %"
+    assert len(x["range"]) == 6
+
+
+@pytest.mark.parametrize(("option", "planes"), [("x", ["x"]), ("y", ["y"]), ("both", ["x", "y"])])
+def test_plane(run, option, planes):
+    status, out, _ = run(*REAL, "--json", "--plane", option)
+    assert status == 0
+    assert [r["plane"] for r in json.loads(out)["results"]] == planes
+
+
+def test_both_planes_of_a_scan_that_has_one(run):
+    status, out, err = run(
+        "emittance",
+        "measurements/gtf_simulated.csv",
+        "--lattice",
+        "lattices/gtf.toml",
+        "--plane",
+        "both",
+    )
+    assert (status, out) == (2, "")
+    assert err == (
+        "beamfit: measurements/gtf_simulated.csv: no sizes in plane y; "
+        "expected a column size_y_um\n"
+    )
+
+
+def test_the_tables_and_the_verdict(run):
+    status, out, err = run(*REAL)
+    assert (status, err) == (0, "")
+    for words in ("0.705 ± 0.016 µm", "chi2/dof = 9.2", "drift D1 +1 cm", "without Q525 = -4.219"):
+        assert words in out
+
+
+def test_an_undetermined_scan_is_answered_with_status_0_and_null(run, tmp_path):
+    scan = tmp_path / "noise.csv"
+    rows = [(0.0, 90), (0.5, 160), (1.0, 70), (1.5, 150), (2.0, 60), (2.5, 170), (3.0, 80)]
+    scan.write_text("Q2_A,size_x_um\n" + "".join(f"{a},{s}\n" for a, s in rows))
+    status, out, _ = run("emittance", scan, "--lattice", "lattices/gtf.toml", "--json")
+    assert status == 0
+    [result] = json.loads(out)["results"]
+    assert result["status"] == "unidentified"
+    assert result["emittance"]["error"] is None
+    assert result["normalized_emittance"]["error"] is None
+    assert result["systematics"] == []
+
+
+def test_robust_and_size(run):
+    status, out, _ = run(*REAL, "--json", "--plane", "x", "--robust")
+    assert status == 0
+    assert max(json.loads(out)["results"][0]["points"]["outlier_probability"]) > 0.9
+    status, out, _ = run(*REAL, "--json", "--plane", "x", "--method", "size")
+    assert json.loads(out)["results"][0]["method"] == "size"
+
+
+def test_help_has_an_example(run):
+    for arguments in (("--help",), ("emittance", "--help")):
+        status, out, _ = run(*arguments)
+        assert status == 0
+        assert "xample" in out
+        assert "beamfit emittance" in out

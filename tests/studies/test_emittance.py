@@ -1,0 +1,244 @@
+"""The fit with known transport against truth, other programs' routines and limits."""
+
+import numpy as np
+import pytest
+from scipy.optimize import least_squares
+
+import beamfit
+from beamfit.errors import InputError
+from beamfit.inference.quantity import Status
+from beamfit.optics.beam import BeamMatrix
+from beamfit.optics.beamline import Beamline
+from beamfit.optics.elements import Drift, Quadrupole, Screen, SectorDipole
+from tests.studies.conftest import TABLE_2, design, scan_of
+
+TRUE_EMITTANCE = float(np.sqrt(TABLE_2[0] * TABLE_2[2] - TABLE_2[1] ** 2))
+
+
+@pytest.mark.parametrize("method", ["size_squared", "size"])
+def test_exact_sizes_give_the_beam_back(gtf, gtf_sizes, method):
+    currents, _, sizes = gtf_sizes
+    fit = beamfit.fit_emittance(scan_of("Q2", "A", currents, sizes), gtf, method=method).x
+    np.testing.assert_allclose([q.value for q in fit.sigma], TABLE_2, rtol=1e-9)
+    assert fit.emittance.value == pytest.approx(TRUE_EMITTANCE, rel=1e-9)
+    assert fit.status is Status.converged
+
+
+def test_errors_of_the_report_line_at_two_percent(gtf, gtf_sizes):
+    """physics.md: σ11, σ12, σ22 to 2.0, 2.2, 1.6 % from 14 sizes at 2 %."""
+    currents, _, sizes = gtf_sizes
+    fit = beamfit.fit_emittance(scan_of("Q2", "A", currents, sizes), gtf).x
+    assert [round(100 * q.relative, 1) for q in fit.sigma] == [2.0, 2.2, 1.6]
+
+
+def test_covariance_is_the_textbook_inverse_and_propagates(gtf, gtf_sizes):
+    currents, rows, sizes = gtf_sizes
+    fit = beamfit.fit_emittance(scan_of("Q2", "A", currents, sizes, seed=3), gtf).x
+    p = fit.points
+    weighted = rows / (2 * p.size * p.error)[:, None]
+    covariance = np.linalg.inv(weighted.T @ weighted)
+    np.testing.assert_allclose(fit.covariance, covariance, rtol=1e-6)
+    s11, s12, s22 = (q.value for q in fit.sigma)
+    e = fit.emittance.value
+
+    def numbers(s):
+        emittance = np.sqrt(s[0] * s[2] - s[1] ** 2)
+        return np.array([emittance, s[0] / emittance, -s[1] / emittance])
+
+    step = 1e-6 * np.diag([s11, abs(s12), s22])
+    centre = np.array([s11, s12, s22])
+    gradient = np.array([(numbers(centre + h) - numbers(centre - h)) / (2 * h.sum()) for h in step])
+    errors = np.sqrt(np.diag(gradient.T @ covariance @ gradient))
+    got = [q.error_raw for q in (fit.emittance, fit.beta, fit.alpha)]
+    np.testing.assert_allclose(got, errors, rtol=1e-5)
+    assert fit.normalized_emittance.value / e == pytest.approx(59.678, abs=1e-3)  # βγ at 30.5 MeV
+
+
+def test_errors_cover_the_truth_as_often_as_they_say():
+    """2000 simulated scans: 68.3 % and 95.4 % within 1 and 2 standard errors (binomial, 4 σ)."""
+    r11, r12 = np.linspace(0.7, -2.5, 14), np.linspace(2.1, 1.37, 14)
+    true = np.sqrt(np.stack([r11**2, 2 * r11 * r12, r12**2], 1) @ TABLE_2)
+    noise = np.random.default_rng(2).normal(size=(2000, 14))
+    fits = beamfit.fit_sizes(
+        r11, r12, true * (1 + 0.01 * noise), np.broadcast_to(0.01 * true, noise.shape)
+    )
+    determinant = np.asarray(fits.determinant)
+    off = np.abs(determinant - TRUE_EMITTANCE**2) / np.asarray(fits.determinant_error)
+    for within, expected in ((1.0, 0.6827), (2.0, 0.9545)):
+        spread = 4 * np.sqrt(expected * (1 - expected) / 2000)
+        assert np.mean(off < within) == pytest.approx(expected, abs=spread)
+
+
+def test_size_fit_is_what_scipy_finds(gtf, gtf_sizes):
+    currents, rows, sizes = gtf_sizes
+    fit = beamfit.fit_emittance(scan_of("Q2", "A", currents, sizes, seed=7), gtf, method="size").x
+    p = fit.points
+    found = least_squares(
+        lambda s: (np.sqrt(rows @ (s * 1e-8)) - p.size) / p.error,
+        TABLE_2 * 1e8,
+        xtol=1e-15,
+        ftol=1e-15,
+        gtol=1e-15,
+    )
+    np.testing.assert_allclose([q.value for q in fit.sigma], found.x * 1e-8, rtol=1e-6)
+    assert fit.chi2 == pytest.approx(2 * found.cost, rel=1e-9)
+    covariance = np.linalg.inv(found.jac.T @ found.jac) * 1e-16
+    np.testing.assert_allclose(fit.covariance, covariance, rtol=1e-4)
+
+
+def test_many_scans_in_one_call_are_the_same_as_one_by_one(gtf_sizes):
+    _, rows, sizes = gtf_sizes
+    r11 = np.sqrt(rows[:, 0]) * np.where(np.arange(14) < 3, 1, -1)
+    r12 = np.sqrt(rows[:, 2])
+    many = sizes * (1 + 0.02 * np.random.default_rng(0).normal(size=(5, 14)))
+    for method in ("size_squared", "size"):
+        batch = beamfit.fit_sizes(r11, r12, many, 0.02 * many, method=method)
+        for i in range(5):
+            one = beamfit.fit_sizes(r11, r12, many[i], 0.02 * many[i], method=method)
+            np.testing.assert_allclose(batch.sigma[i], one.sigma, rtol=1e-9)
+            np.testing.assert_allclose(batch.chi2_zero[i], one.chi2_zero, rtol=1e-6)
+
+
+def test_without_errors_the_noise_is_inferred_and_said(gtf, gtf_sizes):
+    currents, _, sizes = gtf_sizes
+    scan = scan_of("Q2", "A", currents, sizes, seed=5, errors=False)
+    fit = beamfit.fit_emittance(scan, gtf).x
+    assert fit.status is Status.converged
+    assert fit.chi2 is None
+    assert "inferred" in fit.noise
+    # With errors that make χ² equal to its degrees of freedom the two fits are one.
+    relative = fit.points.error[0] / fit.points.size[0]
+    given = beamfit.QuadScan(
+        {"Q2": currents}, {"Q2": "A"}, scan.size, {"x": relative * scan.size["x"]}
+    )
+    same = beamfit.fit_emittance(given, gtf).x
+    assert same.chi2 == pytest.approx(same.dof, rel=1e-9)
+    assert fit.emittance.error == pytest.approx(same.emittance.error_raw, rel=1e-9)
+    assert relative == pytest.approx(0.02, rel=0.5)
+
+
+def test_several_magnets_screens_planes_and_resolution(three_quads):
+    rng = np.random.default_rng(1)
+    beams = {
+        "x": BeamMatrix.from_twiss(3e-9, 8.0, 1.0),
+        "y": BeamMatrix.from_twiss(2e-9, 5.0, -0.5),
+    }
+    settings = {"QA": [], "QC": []}
+    screens, sizes = [], {"x": [], "y": []}
+    for qa in np.linspace(-8, 8, 5):
+        for qc in (-3.0, 0.0, 3.0):
+            for screen in ("YAG1", "YAG2"):
+                matrix = three_quads.upto(screen).matrix({"QA": qa, "QC": qc})
+                settings["QA"].append(qa)
+                settings["QC"].append(qc)
+                screens.append(screen)
+                for plane, beam in beams.items():
+                    clean = float(beam.transport(getattr(matrix, plane)).l11)
+                    seen = np.hypot(clean, 8e-6)  # the lattice's screen resolution
+                    sizes[plane].append(seen * (1 + 1e-4 * rng.normal()))
+    scan = beamfit.QuadScan(
+        settings,
+        {"QA": "kG", "QC": "k1"},
+        sizes,
+        {p: 1e-4 * np.array(v) for p, v in sizes.items()},
+        screen=tuple(screens),
+    )
+    fit = beamfit.fit_emittance(scan, three_quads)
+    for plane, beam in beams.items():
+        got = fit[plane].emittance
+        assert abs(got.value - float(beam.emittance)) < 5 * got.error
+        assert got.relative < 1e-3
+        assert fit[plane].identifiability.waist_bracketed is None
+
+
+def test_a_current_calibrated_magnet_may_be_scanned_by_gradient(three_quads):
+    """QB has a polynomial in A; a scan of it in kG must use the gradient as it is."""
+    kg = np.linspace(-6, 6, 9)
+    length = float(three_quads["QB"].length)
+    strength = 0.1 * kg / (np.sqrt(250.0**2 - 0.51099895069**2) / 299.792458) / length
+    by_k1 = three_quads.with_element(Quadrupole("QB", length))
+    sizes = np.sqrt(design(by_k1, {"QB": strength}) @ [4e-8, 1e-9, 1e-9])
+    bare = three_quads.with_element(Screen("YAG1")).with_element(Screen("YAG2"))
+    fit = beamfit.fit_emittance(scan_of("QB", "kG", kg, sizes), bare).x
+    np.testing.assert_allclose([q.value for q in fit.sigma], [4e-8, 1e-9, 1e-9], rtol=1e-8)
+
+
+def test_energies_row_by_row(gtf):
+    """The same geometric beam seen at two energies, each row with its own transport."""
+    currents, energies = np.tile(np.linspace(0, 3.9, 6), 2), np.repeat([28.0, 33.0], 6)
+    sizes = []
+    for current, energy in zip(currents, energies, strict=True):
+        r = np.asarray(gtf.matrix({"Q2": current}, energy=energy).x)[0]
+        sizes.append(np.sqrt(TABLE_2 @ [r[0] ** 2, 2 * r[0] * r[1], r[1] ** 2]))
+    scan = beamfit.QuadScan(
+        {"Q2": currents}, {"Q2": "A"}, {"x": sizes}, {"x": 0.02 * np.array(sizes)}, energy=energies
+    )
+    fit = beamfit.fit_emittance(scan, gtf).x
+    np.testing.assert_allclose([q.value for q in fit.sigma], TABLE_2, rtol=1e-9)
+    gamma = 30.5 / 0.51099895069
+    assert fit.normalized_emittance.value / fit.emittance.value == pytest.approx(
+        np.sqrt(gamma**2 - 1), rel=1e-12
+    )
+
+
+def test_dispersion_and_energy_spread_are_taken_out():
+    line = Beamline(
+        (
+            Quadrupole("Q", 0.2),
+            Drift("D", 1.0),
+            SectorDipole("B", 2.0, 0.4),
+            Drift("E", 1.0),
+            Screen("S", 2e-5),
+        ),
+        energy=200.0,
+        energy_spread=5e-3,
+    )
+    k1 = np.linspace(-4, 8, 9)
+    sigma = np.array([4e-8, -5e-9, 2e-9])
+    r16 = float(line.matrix().x[0, 2])
+    clean = design(line, {"Q": k1}) @ sigma
+    assert (r16 * 5e-3) ** 2 > 10 * clean.max()  # it would swamp the fit
+    sizes = np.sqrt(clean + (r16 * 5e-3) ** 2 + 2e-5**2)
+    fit = beamfit.fit_emittance(scan_of("Q", "k1", k1, sizes, relative=1e-3), line).x
+    np.testing.assert_allclose([q.value for q in fit.sigma], sigma, rtol=1e-6)
+
+
+def test_three_points_fit_exactly_and_cannot_be_tested(gtf, gtf_sizes):
+    currents, _, sizes = gtf_sizes
+    pick = [2, 7, 12]
+    scan = scan_of("Q2", "A", currents[pick], sizes[pick])
+    fit = beamfit.fit_emittance(scan, gtf).x
+    assert (fit.dof, fit.error_scale) == (0, 1.0)
+    assert fit.status is Status.converged
+    assert fit.emittance.value == pytest.approx(TRUE_EMITTANCE, rel=1e-8)
+    bare = scan_of("Q2", "A", currents[pick], sizes[pick], errors=False)
+    nothing = beamfit.fit_emittance(bare, gtf).x
+    assert nothing.status is Status.unidentified
+    assert nothing.emittance.error is None
+    assert "leave nothing to judge" in nothing.message
+
+
+@pytest.mark.parametrize(
+    ("option", "words"),
+    [
+        ({"method": "cubic"}, "method 'cubic'; expected size_squared or size"),
+        ({"method": "size", "robust": True}, "robust fit of size"),
+        ({"planes": ("y",)}, "no sizes in plane y"),
+    ],
+)
+def test_options_that_do_not_exist(gtf, gtf_sizes, option, words):
+    currents, _, sizes = gtf_sizes
+    with pytest.raises(InputError, match=words):
+        beamfit.fit_emittance(scan_of("Q2", "A", currents, sizes), gtf, **option)
+
+
+def test_json_has_the_contract(gtf, gtf_sizes):
+    currents, _, sizes = gtf_sizes
+    [result] = beamfit.fit_emittance(scan_of("Q2", "A", currents, sizes), gtf).to_json()
+    contract = {"plane", "status", "message", "emittance", "normalized_emittance", "beta", "alpha"}
+    contract |= {"sigma11", "sigma12", "sigma22", "chi2", "dof", "rms_residual", "identifiability"}
+    assert contract <= set(result)
+    for name in ("emittance", "normalized_emittance", "beta", "alpha", "sigma11", "sigma22"):
+        assert {"value", "error", "unit", "error_raw"} == set(result[name])
+    assert result["emittance"]["unit"] == "m"
+    assert result["status"] == "converged"

@@ -1,0 +1,164 @@
+import numpy as np
+import pytest
+
+from beamfit.errors import InputError
+from beamfit.studies.decay import fit_decays
+from beamfit.studies.decay_record import Conditions, DecayRecord
+from beamfit.studies.segments import noise_of, split_record
+
+
+def decay(time, i0=100.0, lifetime=36000.0, noise=1e-3, seed=1):
+    exact = i0 * np.exp(-time / lifetime)
+    return exact + noise * np.random.default_rng(seed).normal(size=time.size)
+
+
+TIME = np.arange(0.0, 6000.0, 10.0)
+
+
+def kinds(split):
+    return [event.kind for event in split.events]
+
+
+def test_a_clean_decay_is_left_alone():
+    split = split_record(DecayRecord(TIME, decay(TIME), name="clean"))
+    assert kinds(split) == []
+    assert [len(part) for part in split.segments] == [600]
+    assert split.segments[0].name == "clean"
+
+
+def test_no_false_alarm_in_noise_of_any_size():
+    for seed in range(40):
+        noise = 10.0 ** (seed % 5 - 4)
+        split = split_record(DecayRecord(TIME, decay(TIME, noise=noise, seed=seed)))
+        assert kinds(split) == []
+
+
+def test_top_up_is_cut_at_every_refill():
+    saw = decay(TIME % 500, noise=1e-3)
+    split = split_record(DecayRecord(TIME, saw, name="top-up"))
+    assert kinds(split) == ["refill"] * 11
+    assert [event.time for event in split.events] == [500.0 * k for k in range(1, 12)]
+    assert [len(part) for part in split.segments] == [50] * 12
+    assert split.segments[3].name == "top-up#4"
+    fits = fit_decays(split.segments)
+    assert all(
+        fit.lifetime_mean.value == pytest.approx(10, abs=4 * fit.lifetime_mean.error)
+        for fit in fits
+    )
+
+
+def test_a_loss_step_ends_a_decay():
+    current = decay(TIME)
+    current[300:] -= 0.5
+    split = split_record(DecayRecord(TIME, current))
+    assert kinds(split) == ["loss"]
+    assert split.events[0].time == 3000.0
+    assert split.events[0].change == pytest.approx(-0.53, abs=0.02)
+    assert [len(part) for part in split.segments] == [300, 300]
+    assert split.segments[1].time[0] == 0
+
+
+def test_dropouts_and_spikes_are_dropped_and_the_decay_goes_on():
+    current = decay(TIME)
+    current[100:140] = 0.0
+    current[400] += 3.0
+    split = split_record(DecayRecord(TIME, current))
+    assert kinds(split) == ["dropout", "spike"]
+    assert split.events[0].duration == pytest.approx(390.0)
+    assert [len(part) for part in split.segments] == [559]
+
+
+def test_a_beam_that_is_lost_does_not_come_back():
+    current = decay(TIME)
+    current[500:] = 0.0
+    split = split_record(DecayRecord(TIME, current))
+    assert kinds(split) == ["loss"]
+    assert split.events[0].change == pytest.approx(-87, abs=1)
+    assert [len(part) for part in split.segments] == [500]
+
+
+def test_a_decay_over_many_lifetimes_is_no_dropout():
+    time = np.arange(0.0, 6000.0, 10.0)
+    split = split_record(DecayRecord(time, np.abs(decay(time, lifetime=600.0, noise=1e-4))))
+    assert [len(part) for part in split.segments] == [600]
+
+
+def test_saturated_readings_are_dropped():
+    current = np.minimum(decay(TIME), 98.0)
+    split = split_record(DecayRecord(TIME, current))
+    assert kinds(split) == ["saturated"]
+    assert split.segments[0].current.max() < 98.0
+    assert len(split.segments[0]) == pytest.approx(527, abs=2)
+
+
+def test_quantised_readings_are_not_steps():
+    record = DecayRecord(TIME, np.round(decay(TIME), 1))
+    assert record.resolution == pytest.approx(0.1)
+    split = split_record(record)
+    assert kinds(split) == []
+    assert [len(part) for part in split.segments] == [600]
+
+
+def test_a_gap_is_noted_and_a_refill_in_it_found():
+    kept = (TIME < 2000) | (TIME > 4000)
+    smooth = split_record(DecayRecord(TIME[kept], decay(TIME)[kept]))
+    assert kinds(smooth) == ["gap"]
+    assert [len(part) for part in smooth.segments] == [int(kept.sum())]
+    refilled = decay(TIME)[kept]
+    refilled[200:] += 10
+    cut = split_record(DecayRecord(TIME[kept], refilled))
+    assert sorted(kinds(cut)) == ["gap", "refill"]
+    assert [len(part) for part in cut.segments] == [200, int(kept.sum()) - 200]
+
+
+def test_pieces_too_short_to_fit_are_named():
+    current = decay(TIME)
+    current[590:] += 5
+    current[595:] += 5
+    split = split_record(DecayRecord(TIME, current))
+    assert kinds(split).count("short") == 2
+    assert [len(part) for part in split.segments] == [590]
+
+
+def test_the_noise_of_uneven_readings():
+    rng = np.random.default_rng(3)
+    time = np.sort(rng.uniform(0, 6000, 2000))
+    current = 100 * np.exp(-time / 36000) + 0.02 * rng.normal(size=2000)
+    assert noise_of(time, current) == pytest.approx(0.02, rel=0.1)
+
+
+@pytest.mark.parametrize(
+    ("time", "current", "column", "words"),
+    [
+        ([0, 1, 1, 2], [4, 3, 2, 1], "time", "reading 3: time 1 s after 1 s"),
+        ([0, 1, 2, 3], [4, 3, -2, 1], "current", "reading 3: a negative current, -2 mA"),
+        ([0, 1, 2, 3], [4, np.nan, 2, 1], "current", "reading 2: nan"),
+        ([0, 1, 2, 3, 4], [99, 98, 0.097, 0.096, 0.095], "current", "a factor of 1000"),
+    ],
+)
+def test_what_no_beam_can_do(time, current, column, words):
+    with pytest.raises(InputError, match=words) as caught:
+        DecayRecord(time, current)
+    assert caught.value.column == column
+
+
+def test_errors_and_conditions_are_checked():
+    with pytest.raises(InputError, match="reading 2: an error of 0 mA"):
+        DecayRecord([0, 1], [2, 1], [0.1, 0.0])
+    with pytest.raises(InputError, match="a negative pressure"):
+        DecayRecord([0, 1], [2, 1], conditions=Conditions(pressure=[1e-8, -1e-8]))
+    with pytest.raises(InputError, match=r"current of shape \(3,\); expected 2 readings"):
+        DecayRecord([0, 1], [3, 2, 1])
+    with pytest.raises(InputError, match="1 readings; expected two or more"):
+        DecayRecord([0], [3])
+
+
+def test_a_record_cannot_be_changed():
+    source = np.array([3.0, 2.0, 1.0])
+    record = DecayRecord([5, 6, 7], source, conditions=Conditions(bunches=[280, 280, 280]))
+    source[0] = 9.0
+    assert record.current[0] == 3.0
+    assert record.time.tolist() == [0.0, 1.0, 2.0]
+    with pytest.raises(ValueError, match="read-only"):
+        record.current[0] = 4.0
+    assert record.select([0, 2]).conditions.bunches.tolist() == [280.0, 280.0]

@@ -1,0 +1,128 @@
+"""Systematics against refits, range table against refits, outliers."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import beamfit
+from beamfit.optics.elements import Drift
+from beamfit.studies.sensitivity import range_sensitivity, systematics
+from tests.studies.conftest import scan_of
+
+
+@pytest.mark.parametrize("method", ["size_squared", "size"])
+def test_budget_is_the_slope_of_a_refit(gtf, gtf_sizes, method):
+    """Each exact derivative against a central difference of the whole fit."""
+    currents, _, sizes = gtf_sizes
+    scan = scan_of("Q2", "A", currents, sizes, seed=4)
+    fit = beamfit.fit_emittance(scan, gtf, method=method)
+    changes = {c.cause: c for c in systematics(fit, "x")}
+    assert list(changes) == [
+        "Q2 slope +1 %",
+        "drift D_QQ +1 cm",
+        "drift D1 +1 cm",
+        "drift D2 +1 cm",
+        "energy +1 %",
+    ]
+    h = 1e-4
+
+    def moved(cause, step):
+        if cause == "energy":
+            return replace(gtf, energy=gtf.energy * (1 + step))
+        if cause == "slope":
+            c = gtf["Q2"].calibration
+            magnet = replace(gtf["Q2"], calibration=replace(c, slope=c.slope * (1 + step)))
+            return gtf.with_element(magnet)
+        return gtf.with_element(Drift(cause, gtf[cause].length + step))
+
+    for cause, name in (
+        ("slope", "Q2 slope +1 %"),
+        ("D1", "drift D1 +1 cm"),
+        ("energy", "energy +1 %"),
+    ):
+        up, down = (beamfit.fit_emittance(scan, moved(cause, s), method=method).x for s in (h, -h))
+        for got, attribute in (
+            (changes[name].emittance, "emittance"),
+            (changes[name].normalized_emittance, "normalized_emittance"),
+        ):
+            ends = [getattr(f, attribute).value for f in (up, down)]
+            slope = np.log(ends[0] / ends[1]) / (2 * h)
+            assert got == pytest.approx(0.01 * slope, rel=1e-5), (cause, attribute)
+
+
+def test_emittance_is_one_over_the_slope(gtf, gtf_sizes):
+    """physics.md: from one scan the emittance goes as 1/slope, so +1 % gives about -1 %."""
+    currents, _, sizes = gtf_sizes
+    fit = beamfit.fit_emittance(scan_of("Q2", "A", currents, sizes), gtf)
+    assert systematics(fit, "x")[0].emittance == pytest.approx(-0.01, abs=5e-4)
+
+
+def test_an_undetermined_emittance_has_no_budget(gtf):
+    scan = scan_of("Q2", "A", np.linspace(3, 3.9, 8), np.full(8, 1e-4), seed=1)
+    fit = beamfit.fit_emittance(scan, gtf)
+    assert systematics(fit, "x") == []
+
+
+def test_range_rows_are_refits_without_the_point(gtf, gtf_sizes):
+    currents, _, sizes = gtf_sizes
+    scan = scan_of("Q2", "A", currents, sizes, seed=6)
+    fit = beamfit.fit_emittance(scan, gtf)
+    rows = range_sensitivity(fit.x)
+    assert len(rows) == 15  # each of 14 left out, and the near half
+    keep = np.arange(14) != 4
+    less = beamfit.QuadScan(
+        {"Q2": currents[keep]},
+        {"Q2": "A"},
+        {"x": scan.size["x"][keep]},
+        {"x": scan.error["x"][keep]},
+    )
+    expected = beamfit.fit_emittance(less, gtf).x
+    assert rows[4].left_out == "without Q2 = 1.2"
+    assert rows[4].normalized_emittance == pytest.approx(
+        expected.normalized_emittance.value, rel=1e-9
+    )
+    assert rows[4].shift == pytest.approx(
+        (expected.emittance.value - fit.x.emittance.value) / fit.x.emittance.error, rel=1e-6
+    )
+
+
+def test_an_outlier_gets_a_probability_not_a_cut(gtf, gtf_sizes):
+    currents, _, sizes = gtf_sizes
+    scan = scan_of("Q2", "A", currents, sizes, seed=8)
+    spoilt = scan.size["x"].copy()
+    spoilt[3] *= 1.4
+    bad = beamfit.QuadScan({"Q2": currents}, {"Q2": "A"}, {"x": spoilt}, scan.error)
+    truth = beamfit.fit_emittance(scan, gtf).x.emittance
+    plain = beamfit.fit_emittance(bad, gtf).x
+    robust = beamfit.fit_emittance(bad, gtf, robust=True).x
+    probability = robust.points.outlier_probability
+    assert probability[3] > 0.99
+    assert np.delete(probability, 3).max() < 0.2
+    assert abs(robust.emittance.value - truth.value) < truth.error
+    assert abs(plain.emittance.value - truth.value) > 2 * truth.error
+    assert plain.emittance.error > 3 * robust.emittance.error
+    assert robust.dof == 10
+    assert "1 of 14 points" in robust.message
+
+
+def test_an_outlier_is_found_without_errors_too(gtf, gtf_sizes):
+    currents, _, sizes = gtf_sizes
+    scan = scan_of("Q2", "A", currents, sizes, seed=8, errors=False)
+    spoilt = scan.size["x"].copy()
+    spoilt[3] *= 1.4
+    bad = beamfit.QuadScan({"Q2": currents}, {"Q2": "A"}, {"x": spoilt})
+    truth = beamfit.fit_emittance(scan, gtf).x.emittance
+    robust = beamfit.fit_emittance(bad, gtf, robust=True).x
+    assert robust.points.outlier_probability[3] > 0.99
+    assert abs(robust.emittance.value - truth.value) < truth.error
+    assert robust.emittance.error < 2 * truth.error
+
+
+def test_robust_fit_of_clean_data_is_the_plain_fit(gtf, gtf_sizes):
+    currents, _, sizes = gtf_sizes
+    scan = scan_of("Q2", "A", currents, sizes, relative=0.01)
+    plain, robust = (beamfit.fit_emittance(scan, gtf, robust=r).x for r in (False, True))
+    assert robust.emittance.value == pytest.approx(plain.emittance.value, rel=1e-9)
+    assert robust.points.outlier_probability.max() < 0.01
+    assert robust.emittance.error == pytest.approx(plain.emittance.error, rel=0.01)
