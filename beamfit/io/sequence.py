@@ -94,7 +94,7 @@ def read_sequence(
     >>> import tempfile, pathlib
     >>> file = pathlib.Path(tempfile.mkdtemp()) / "line.lte"
     >>> _ = file.write_text('Q1: QUAD, L=0.1, K1=3\\nS: MONI\\nLC: LINE=(Q1,S)\\n')
-    >>> read_sequence(file, energy=135.0).calibrations["Q1"]  # doctest: +SKIP
+    >>> read_sequence(file, energy=135.0).calibrations["Q1"]
     'k1'
     """
     suffix = Path(path).suffix.lower()
@@ -106,13 +106,18 @@ def read_sequence(
         )
     source = Source(path, read_text(path), DIALECTS[suffix])
     with _silence() as said:
-        parser = _parser(source)
-        _parse(parser, source)
-        _check_ignored(said.getvalue(), source)
-        name, key = _chosen(parser, source, use)
-        particle, total = _beam(parser, source, name, energy)
-        expanded = _expanded(parser, source, name, key)
-        elements = element_tables(expanded, _descriptions(parser), source)
+        try:
+            parser = _parser(source)
+            _parse(parser, source)
+            _check_ignored(said.getvalue(), source)
+            name, key = _chosen(parser, source, use)
+            particle, total = _beam(parser, source, name, energy)
+            expanded = _expanded(parser, source, name, key)
+            elements = element_tables(expanded, _descriptions(parser), source)
+        except InputError:
+            raise
+        except Exception as error:  # expressions are evaluated late, wherever they are used
+            raise _unparsed(source, error) from None
     if not elements:
         raise source.error(f"'{name}' without elements", "a line with magnets and a screen", name)
     units = {"quadrupole": "k1", "thin_lens": "k1l"}
@@ -187,12 +192,13 @@ def _parse(parser: Any, source: Source) -> None:
 
 
 def _balanced(text: str) -> bool:
-    depth = 0
+    opened = []
     for bracket in re.findall(r"[(){}]", re.sub(r'"[^"]*"', "", text)):
-        depth += 1 if bracket in "({" else -1
-        if depth < 0:
+        if bracket in "({":
+            opened.append(bracket)
+        elif not opened or opened.pop() + bracket not in ("()", "{}"):
             return False
-    return depth == 0
+    return not opened
 
 
 def _unparsed(source: Source, error: Exception) -> InputError:
@@ -319,7 +325,8 @@ def _check_members(parser: Any, source: Source, members: Any, name: str) -> None
         if isinstance(member, tuple | list):
             _check_members(parser, source, member, name)
         elif not hasattr(member, "expand"):
-            raise source.error(f"'{name}' with {member!r} in it", "elements and lines", name)
+            found = getattr(member, "expr", member)
+            raise source.error(f"'{name}' with {found!r} in it", "elements and lines", name)
 
 
 def _expanded(parser: Any, source: Source, name: str, key: str) -> list[Any]:

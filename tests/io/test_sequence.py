@@ -285,6 +285,8 @@ def test_which_line(written):
         ("a.madx", "beam, energy=1; lc: line=(lc);", "lc"),
         ("a.lte", "C: CHARGE, TOTAL=1e-9\nLC: LINE=(C)", "without elements"),
         ("a.madx", "beam, energy=1; d: drift, l=1; lc: line=(d, pi);", "3.14159"),
+        ("a.madx", "beam, energy=1; k := 3**; lc: line=(k);", "'3**'"),
+        ("a.madx", "beam, energy=k; k := 3**; d: drift, l=1; lc: line=(d);", "BEAM"),
         ("a.madx", MADX.replace("at=0.5", "at=0.1"), "overlap"),
         ("a.madx", "call, file='nowhere.madx';\n", "nowhere.madx"),
         ("a.ele", "&run_setup\n lattice = line.lte\n&end\n", "command file"),
@@ -306,6 +308,7 @@ def test_files_that_cannot_be_used(name, text, said, written):
         ("line.madx", "l=0.12,", "l=0.12*,", 4),
         ("line.mad8", "L=0.68", "L=0.68)(", 7),
         ("line.lte", "L=0.68", "L=0.68+", 4),
+        ("line.lte", "W1,BPM)", "W1,BPM}", 10),
     ],
 )
 def test_a_statement_that_does_not_parse_is_located(name, old, new, line, written):
