@@ -8,7 +8,6 @@ import unicodedata
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
-from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
 from types import MappingProxyType
@@ -18,6 +17,7 @@ from beamfit.errors import InputError, nearest
 from beamfit.io.files import digest, read_text
 from beamfit.io.lattice import LatticeFile
 from beamfit.io.sequence_elements import element_tables
+from beamfit.io.sequence_source import Source
 
 __all__ = ["read_sequence"]
 
@@ -42,26 +42,6 @@ HARMFUL = re.compile(r"__|_frame|f_back|f_globals|f_builtins")
 # pyAT takes the parameters of an element that is alone in an elegant LINE for its members.
 ALONE = re.compile(r"(LINE\s*=\s*\([^,()]*)\)", re.IGNORECASE)
 ENERGIES = ("energy", "pc", "gamma", "beta", "brho")
-
-
-@dataclass(frozen=True)
-class Source:
-    """The file being read, to say where something stands."""
-
-    path: str | PathLike[str]
-    text: str
-    dialect: str
-
-    def line_of(self, name: str) -> int | None:
-        """Line on which a name is defined, if it is in this file."""
-        pattern = re.compile(rf'\s*"?{re.escape(name)}"?\s*(:|=)', re.IGNORECASE)
-        lines = enumerate(self.text.splitlines(), start=1)
-        return next((n for n, t in lines if pattern.match(t)), None)
-
-    def error(self, found: str, expected: str, name: str | None = None) -> InputError:
-        """Make the error that names the file, and the line that defines ``name``."""
-        line = None if name is None else self.line_of(name)
-        return InputError(found, expected, path=self.path, line=line)
 
 
 def read_sequence(

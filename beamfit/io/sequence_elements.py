@@ -14,7 +14,7 @@ import numpy as np
 
 if TYPE_CHECKING:
     from beamfit.errors import InputError
-    from beamfit.io.sequence import Source
+    from beamfit.io.sequence_source import Source
 
 __all__ = ["element_tables"]
 
