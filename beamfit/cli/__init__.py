@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 import sys
 from pathlib import Path
@@ -30,8 +31,13 @@ cli.add_command(emittance)
 def main() -> None:
     """Run the command line: exit 0 when answered, 2 with one line on unusable input."""
     _compile_quickly()
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):  # a terminal without µ shows a mark instead
+            stream.reconfigure(errors="replace")
     try:
-        sys.exit(cli.main(prog_name="beamfit", standalone_mode=False) or 0)
+        status = cli.main(prog_name="beamfit", standalone_mode=False) or 0
+        sys.stdout.flush()
+        sys.exit(status)
     except click.exceptions.NoArgsIsHelpError as error:
         click.echo(error.format_message())
         sys.exit(0)
@@ -41,6 +47,12 @@ def main() -> None:
         sys.exit(130)
     except InputError as error:
         _fail(str(error))
+    except BrokenPipeError:  # the reader, `head` say, has seen enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(0)
+    except OSError as error:
+        sys.stdout = None  # what is left in its buffer has nowhere to go
+        _fail(f"output that cannot be written ({error.strerror}); expected room for it")
 
 
 def _compile_quickly() -> None:
@@ -50,7 +62,13 @@ def _compile_quickly() -> None:
     do not optimise code that runs for microseconds. Both only where the user has not chosen.
     """
     cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "beamfit"
-    os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(cache))
+    try:
+        cache.mkdir(parents=True, exist_ok=True)
+        usable = os.access(cache, os.W_OK)
+    except OSError:
+        usable = False
+    if usable:
+        os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(cache))
     os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
     os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "-1")
     os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0")

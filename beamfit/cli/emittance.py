@@ -92,7 +92,13 @@ def emittance(
     _check_report(report)
     measured = read_quad_scan(scan)
     described = read_lattice(lattice, use=use, energy=energy)
-    check_names(measured, described.calibrations, described.places, described.default_screen)
+    check_names(
+        measured,
+        described.calibrations,
+        described.places,
+        described.default_screen,
+        described.rest_energy,
+    )
     planes = _planes(plane, measured)
 
     from beamfit.studies.emittance import fit_emittance  # JAX from here on
@@ -153,7 +159,7 @@ def _json(fit: EmittanceFit, command: str, inputs: dict[str, str | None]) -> str
         for p in fit.planes
     ]
     document = {"beamfit": __version__, "command": command, "inputs": inputs, "results": results}
-    return json.dumps(_finite(document), indent=2, ensure_ascii=False, allow_nan=False)
+    return json.dumps(_finite(document), indent=2, allow_nan=False)
 
 
 def _finite(value: Any) -> Any:
@@ -171,7 +177,8 @@ def _print(fit: EmittanceFit, lattice: LatticeFile, report: str | None) -> None:
 
     from beamfit.cli.terminal import budget_table, range_table, result_table, verdict_lines
 
-    console = Console(highlight=False)
+    # Names are shown as they are: a bracket in one is not a style.
+    console = Console(highlight=False, markup=False)
     console.print(result_table(fit))
     for p in fit.planes:
         console.print(verdict_lines(p))

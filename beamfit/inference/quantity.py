@@ -55,6 +55,8 @@ class Quantity:
     def __str__(self) -> str:
         factor, unit = self._prefix()
         end = f" {unit}" if unit else ""
+        if not math.isfinite(self.value):
+            return "not determined"
         value = self.value / factor
         if self.error is None or not math.isfinite(self.error):
             return f"{value:.3g}{end} (not determined)"

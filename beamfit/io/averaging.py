@@ -33,7 +33,7 @@ def average_shots(scan: QuadScan, *, marked: bool) -> QuadScan:
         One row a setting. The error is the standard error of the mean, s/√n with n - 1 in s;
         where a setting has fewer than five shots, s is the relative scatter pooled over all
         settings, because two or three shots can agree by chance. With fewer than three
-        repeats in all there are no errors, and the fit infers them.
+        repeats in all the errors of the file stand, or there are none and the fit infers them.
 
     Examples
     --------
@@ -50,6 +50,8 @@ def average_shots(scan: QuadScan, *, marked: bool) -> QuadScan:
     size = {p: np.array([_mean(v[g]) for g in groups]) for p, v in scan.size.items()}
     scatter = {p: _standard_error(scan.size[p], groups) for p in scan.size}
     known = {p: e for p, e in scatter.items() if e is not None}
+    # Too few repeats for a scatter: what the file says of its shots is kept.
+    given = {p: _of_the_mean(e, groups) for p, e in scan.error.items() if p not in known}
 
     def pick(values: np.ndarray | None) -> np.ndarray | None:
         return None if values is None else values[first]
@@ -58,7 +60,7 @@ def average_shots(scan: QuadScan, *, marked: bool) -> QuadScan:
         scan,
         settings={n: v[first] for n, v in scan.settings.items()},
         size=size,
-        error=known,
+        error=known | given,
         energy=pick(scan.energy),
         resolution=pick(scan.resolution),
         energy_spread=pick(scan.energy_spread),
@@ -66,7 +68,7 @@ def average_shots(scan: QuadScan, *, marked: bool) -> QuadScan:
         shots=np.array([len(g) for g in groups]),
         error_source="the scatter of the shots (standard error of the mean)"
         if known
-        else "none given",
+        else ("the file" if given else "none given"),
     )
 
 
@@ -85,6 +87,18 @@ def _mean(values: np.ndarray) -> float:
     """Mean of the shots that were measured; NaN where none was."""
     measured = values[~np.isnan(values)]
     return float(measured.mean()) if len(measured) else np.nan
+
+
+def _of_the_mean(error: np.ndarray, groups: list[np.ndarray]) -> np.ndarray:
+    """Errors of the means of shots that bring errors of their own."""
+    return np.array(
+        [
+            np.sqrt(np.nanmean(error[g] ** 2) / np.sum(~np.isnan(error[g])))
+            if (~np.isnan(error[g])).any()
+            else np.nan
+            for g in groups
+        ]
+    )
 
 
 def _standard_error(sizes: np.ndarray, groups: list[np.ndarray]) -> np.ndarray | None:

@@ -41,6 +41,11 @@ class LatticeFile:
     source: str = ""
 
     @property
+    def rest_energy(self) -> float:
+        """Rest energy of the particle, MeV."""
+        return 938.27208943 if self.particle == "proton" else 0.51099895069
+
+    @property
     def places(self) -> list[str]:
         """Names at which a size may have been measured: screens and markers."""
         return [e["name"] for e in self.elements if e["type"] in ("screen", "marker")]

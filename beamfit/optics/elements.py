@@ -260,7 +260,8 @@ class SectorDipole:
     angle : float
         Bend angle α in rad.
     entrance_edge, exit_edge : float
-        Pole-face rotations ψ in rad; positive focuses the plane across the bend.
+        Pole-face rotations ψ in rad; positive focuses the plane across the bend. A bend the
+        other way has a negative radius and angle, and the edges that focus are negative too.
     bend_plane : {"x", "y"}
         The plane that is bent.
     energy_offset : float

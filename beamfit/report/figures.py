@@ -28,6 +28,7 @@ STYLE = {
     "axes.titlesize": 11,
     "axes.titlelocation": "left",
     "figure.dpi": 110,
+    "text.parse_math": False,  # a $ in a name is a $
 }
 # More points than this are drawn as an image: as curves they would fill the page with bytes.
 MANY = 500

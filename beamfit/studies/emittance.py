@@ -163,8 +163,8 @@ def _plane_fit(w: PlaneWork, line: Beamline, verdict: Verdict, advice: str | Non
             for i, unit in enumerate(("m^2", "m rad", "rad^2"))
         ),
         screen=ScreenTwiss(
-            name=w.given.screen[-1],
-            settings=_own_settings(line, w.given.screen[-1]),
+            name=w.given.last_screen,
+            settings=_own_settings(line, w.given.last_screen),
             beta=quantity(d.screen[0], d.screen_error[0], "m"),
             alpha=quantity(d.screen[1], d.screen_error[1], "1"),
             size=quantity(d.screen[2], d.screen_error[2], "m", linear),

@@ -74,7 +74,7 @@ def work_on(
     if robust:
         found = fit_robust(given.r11, given.r12, given.size, error, given.known, known_noise)
         fit, probability, error = found.fit, found.outlier_probability, found.error
-        lost = round(float(probability.sum()))
+        lost = int(np.sum(probability > 0.5))
     else:
         fit = fit_sizes(given.r11, given.r12, given.size, error, given.known, method=method)
     fit = SigmaFit(*(np.asarray(v) for v in fit))
@@ -129,7 +129,8 @@ def _evidence(
     with np.errstate(invalid="ignore", divide="ignore"):
         determinant = float(fit.determinant / fit.determinant_error / unit)
         zero = math.sqrt(max(float(fit.chi2_zero - fit.chi2), 0.0)) / unit if unit else math.inf
-    weight = 1.0 if points.outlier_probability is None else 1.0 - points.outlier_probability
+    doubt = points.outlier_probability
+    weight = 1.0 if doubt is None else 1.0 - doubt
     relative = (points.model - points.size) / points.size
     return Evidence(
         full_rank=bool(fit.full_rank),
@@ -144,14 +145,26 @@ def _evidence(
         bracketed=waist_bracketed(
             points.settings, points.screen, points.size, np.nan_to_num(points.error)
         ),
+        smallest_at_end=_smallest_at_end(points),
+        swamped=bool((points.known > points.size**2).any()),
+        outliers=0.0 if doubt is None else float(np.mean(doubt > 0.5)),
+        robust=doubt is not None,
     )
+
+
+def _smallest_at_end(points: Points) -> bool:
+    """Whether one magnet was scanned and its first or last setting gave the smallest size."""
+    varied = [v for v in points.settings.values() if np.ptp(v) > 0]
+    if len(varied) != 1 or len(set(points.screen)) > 1:
+        return False
+    return bool(varied[0][np.argmin(points.size)] in (varied[0].min(), varied[0].max()))
 
 
 def next_measurement(work: PlaneWork, scanned: Beamline) -> str | None:
     """Say which further setting would help most, if one can be named."""
     e, p = work.evidence, work.points
-    nothing_to_build_on = e.misfit > LOST and e.chi2 > e.dof
-    if not e.full_rank or not np.isfinite(work.covariance).all() or nothing_to_build_on:
+    nothing_to_build_on = e.misfit > LOST or e.swamped or not e.full_rank
+    if nothing_to_build_on or not np.isfinite(work.covariance).all():
         return None
     covariance = work.covariance * work.scale**2
     start = work.fit.sigma if e.positive else best_symmetric(p)
@@ -161,7 +174,7 @@ def next_measurement(work: PlaneWork, scanned: Beamline) -> str | None:
     rows = []
     for name, table in candidate_settings(work.given.settings):
         energy = np.full(len(table[name]), work.given.energy.mean())
-        matrices = transfer_rows(scanned, table, energy, places=work.given.screen[-1:])
+        matrices = transfer_rows(scanned, table, energy, places=(work.given.last_screen,))
         r = np.asarray(matrices.planes)[:, "xy".index(work.plane), 0]
         a, b = r[:, 0, 0], r[:, 0, 1]
         rows.append((name, table[name], np.stack([a**2, 2 * a * b, b**2], -1)))
@@ -171,8 +184,12 @@ def next_measurement(work: PlaneWork, scanned: Beamline) -> str | None:
         return None
     values = work.given.settings[found.magnet]
     inside = values.min() <= found.setting <= values.max()
+    held = [
+        f"{n} = {np.median(v):.3g}" for n, v in work.given.settings.items() if n != found.magnet
+    ]
+    others = f", with {', '.join(held)} at {work.given.last_screen}" if held else ""
     return (
         f"Measure next near {found.magnet} = {found.setting:.3g}, "
-        f"{'inside' if inside else 'beyond'} the scanned range: of all single points it would "
+        f"{'inside' if inside else 'beyond'} the scanned range{others}: of single points it would "
         "sharpen the emittance most; then judge again."
     )

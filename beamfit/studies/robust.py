@@ -5,13 +5,14 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from scipy.special import expit
 
 from beamfit.studies.sigma import SigmaFit, fit_sizes
 
 __all__ = ["RobustFit", "fit_robust"]
 
-# A point is an outlier with this probability before it is seen, and its error is then this
-# many times larger.
+# A point is an outlier with this probability before it is seen, and its error is then at least
+# this many times larger.
 FRACTION, WIDTH = 0.05, 10.0
 # At most this many points are left out in turn for a start.
 STARTS = 50
@@ -72,7 +73,7 @@ def fit_robust(
     >>> true = np.sqrt(r11**2 * 4e-8 + r12**2 * 1e-8)
     >>> size = true * np.where(np.arange(9) == 2, 1.5, 1.0)
     >>> fit_robust(r11, r12, size, 0.02 * true, np.zeros(9)).outlier_probability.round(2).tolist()
-    [0.01, 0.01, 1.0, 0.01, 0.01, 0.01, 0.01, 0.01, 0.01]
+    [0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]
     """
 
     def pulls(sigma: np.ndarray, error: np.ndarray) -> np.ndarray:
@@ -91,12 +92,16 @@ def fit_robust(
     pull = pulls(min(starts, key=lambda s: np.median(np.abs(pulls(s, error)))), error)
     if not noise_known:
         factor = 1.4826 * np.median(np.abs(pull)) * np.sqrt(n / max(n - 3, 1))
+        factor = max(factor, 1e-9)  # points that fit exactly have no noise to scale by
         pull, error = pull / factor, error * factor
+    width = WIDTH
     for _ in range(200):
-        bad = FRACTION / WIDTH * np.exp(-0.5 * (pull / WIDTH) ** 2)
-        good = (1.0 - FRACTION) * np.exp(-0.5 * pull**2)
-        probability = bad / (bad + good)
-        widened = error / np.sqrt((1.0 - probability) + probability / WIDTH**2)
+        # Odds by their logarithm: far out both densities are zero, their ratio is not.
+        odds = np.log(FRACTION / width / (1 - FRACTION)) + 0.5 * pull**2 * (1 - width**-2)
+        probability = expit(odds)
+        # The outliers' own width: a point off by 300 errors must not pull by 30.
+        width = max(WIDTH, float(np.sqrt(probability @ pull**2 / probability.sum())))
+        widened = error / np.sqrt((1.0 - probability) + probability / width**2)
         fit = fit_sizes(r11, r12, size, widened, known)
         moved = pulls(np.asarray(fit.sigma), error)
         settled = np.max(np.abs(moved - pull)) < 1e-9

@@ -233,7 +233,11 @@ def _row_keys(
 
 
 def check_names(
-    scan: QuadScan, calibrations: Mapping[str, str], places: list[str], default: str | None
+    scan: QuadScan,
+    calibrations: Mapping[str, str],
+    places: list[str],
+    default: str | None,
+    rest_energy: float = 0.0,
 ) -> None:
     """Check that a lattice has what a scan names, before anything is computed.
 
@@ -247,6 +251,8 @@ def check_names(
         Names a screen may have.
     default : str or None
         The screen used where the scan names none.
+    rest_energy : float
+        Of the lattice's particle, MeV.
 
     Raises
     ------
@@ -270,6 +276,12 @@ def check_names(
                 f"slope and intercept for {name} in the lattice, or a column {name}_kG",
                 name,
             )
+    if scan.energy is not None and scan.energy.min() <= rest_energy:
+        raise scan.unusable(
+            f"{scan.energy.min():g} MeV",
+            f"total energies above the particle's rest energy of {rest_energy:g} MeV",
+            "energy_MeV",
+        )
     for screen in sorted(set(scan.screen or ())):
         if screen not in places:
             raise scan.unusable(

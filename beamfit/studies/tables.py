@@ -28,6 +28,7 @@ def result_rows(planes: tuple[PlaneFit, ...]) -> list[tuple[str, list[str]]]:
         Rows in the order they are read.
     """
     at = f"at {planes[0].screen.name}"
+    own = ", ".join(f"{n} = {v:.4g}" for n, v in planes[0].screen.settings.items()) or "-"
     rows: list[tuple[str, Callable[[PlaneFit], object]]] = [
         ("status", lambda p: p.status.value.replace("_", " ")),
         ("normalised emittance", lambda p: p.normalized_emittance),
@@ -40,6 +41,7 @@ def result_rows(planes: tuple[PlaneFit, ...]) -> list[tuple[str, list[str]]]:
         (f"beta {at}", lambda p: p.screen.beta),
         (f"alpha {at}", lambda p: p.screen.alpha),
         (f"size {at}", lambda p: p.screen.size),
+        (f"{at}, for", lambda p: own),
     ]
     if any(p.mismatch is not None for p in planes):
         rows.append(("mismatch BMAG", lambda p: p.mismatch if p.mismatch else "-"))

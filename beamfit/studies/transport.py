@@ -14,7 +14,7 @@ from jax import Array
 
 from beamfit.optics.beamline import Beamline
 from beamfit.optics.calibration import FocusingStrength, IntegratedGradient, IntegratedStrength
-from beamfit.optics.elements import Marker, Screen, TransferMatrix
+from beamfit.optics.elements import Marker, Screen, ThinLens, TransferMatrix
 from beamfit.studies.scans import QuadScan
 
 __all__ = [
@@ -38,9 +38,9 @@ class ScanRows(NamedTuple):
     energy : ndarray
         Total energy in MeV, shape (n + 1,).
     places : tuple of str
-        Screens of the scan, each once, then the element of the design Twiss.
+        Screens of the scan in the order of the line, then the element of the design Twiss.
     which : ndarray
-        Index into ``places``, shape (n + 1,).
+        Index into ``places``, shape (n + 1,); the last row's is the last screen of the line.
     """
 
     settings: dict[str, np.ndarray]
@@ -70,6 +70,8 @@ class PlaneInput(NamedTuple):
         Relative momentum spread.
     known : ndarray
         Size² in m² due to dispersion and resolution.
+    last_screen : str
+        The scan's last screen along the line.
     to_screen, to_design : ndarray
         Shape (3, 3): start to the last screen and to the design's place, magnets as the
         lattice sets them.
@@ -85,21 +87,22 @@ class PlaneInput(NamedTuple):
     r16: np.ndarray
     energy_spread: np.ndarray
     known: np.ndarray
+    last_screen: str
     to_screen: np.ndarray
     to_design: np.ndarray
 
 
-def names_of(line: Beamline) -> tuple[dict[str, str], list[str], str | None]:
-    """Calibration units by magnet, places a screen may be, and the default screen.
+def names_of(line: Beamline) -> tuple[dict[str, str], list[str], str | None, float]:
+    """Calibration units by magnet, places a screen may be, the default screen, rest energy.
 
     Examples
     --------
     >>> names_of(Beamline((Screen("S"),), energy=100.0))
-    ({}, ['S'], 'S')
+    ({}, ['S'], 'S', 0.51099895069)
     """
     units = {n: line[n].calibration.unit for n in line.magnets}
     places = [e.name for e in line.elements if isinstance(e, Screen | Marker)]
-    return units, places, line.screens[-1] if line.screens else None
+    return units, places, line.screens[-1] if line.screens else None, line.mass
 
 
 def scanned_line(scan: QuadScan, line: Beamline) -> Beamline:
@@ -121,6 +124,12 @@ def scanned_line(scan: QuadScan, line: Beamline) -> Beamline:
     }
     for name, unit in scan.units.items():
         magnet = line[name]
+        if isinstance(magnet, ThinLens) and unit == "k1":
+            raise scan.unusable(
+                f"k1 for '{name}', which has no length",
+                f"a column {name}_k1l (inverse focal length, 1/m) or {name}_kG",
+                name,
+            )
         if unit != magnet.calibration.unit:
             meaning = meanings[unit]
             strength = magnet.calibration.k1l(magnet.setting, magnet.length, line.energy)
@@ -134,7 +143,8 @@ def scan_rows(scan: QuadScan, scanned: Beamline) -> ScanRows:
     """Collect the rows of a scan for `transfer_rows`."""
     n = len(scan)
     named = scan.screen or (scanned.screens[-1],) * n
-    screens = tuple(dict.fromkeys(named))
+    order = [e.name for e in scanned.elements]
+    screens = tuple(sorted(set(named), key=order.index))
     design = (scanned.design.at,) if scanned.design else ()
     own = float(scanned.energy)
     return ScanRows(
@@ -204,6 +214,7 @@ def plane_input(
         r16=r[:, 0, 2],
         energy_spread=spread,
         known=(r[:, 0, 2] * spread) ** 2 + resolution**2,
+        last_screen=rows.places[rows.which[-1]],
         to_screen=every[-1, rows.which[-1]],
         to_design=every[-1, design],
     )

@@ -6,6 +6,7 @@ import math
 from typing import NamedTuple
 
 import numpy as np
+from scipy.special import stdtrit
 
 from beamfit.inference.identifiability import chi2_probability, one_sided_probability
 from beamfit.inference.quantity import Status
@@ -16,10 +17,14 @@ __all__ = ["Evidence", "Verdict", "judge", "phase_coverage", "waist_bracketed"]
 POOR_FIT = 1e-3
 # The emittance is determined if zero is this many standard errors away ...
 CLEAR, CLEAR_BESIDE_ANOTHER = 4.0, 3.0
+# (sizes of such a scan may miss the beam by this much, relative and rms)
+VOUCHED = 0.2
 # ... and noise would lift it so far less often than this, counting the degrees of freedom.
 CHANCE = 2e-3
 # Sizes that miss every beam by this much, rms and relative, follow no beam.
 LOST = 0.15
+# A robust fit must keep this many degrees of freedom, and may doubt this share of the points.
+ROBUST_DOF, DOUBTED = 4, 0.2
 
 
 class Evidence(NamedTuple):
@@ -43,6 +48,14 @@ class Evidence(NamedTuple):
         Rms relative miss of the sizes, corrected for the three fitted numbers.
     bracketed : bool or None
         Whether the waist is.
+    smallest_at_end : bool
+        Whether the smallest size is the first or last setting of the scan.
+    swamped : bool
+        Whether dispersion and resolution alone exceed a measured size.
+    outliers : float
+        Share of the points the robust fit thinks bad; 0 for a plain fit.
+    robust : bool
+        Whether the fit was robust: its noise then rests on its own judgement.
     """
 
     full_rank: bool
@@ -55,6 +68,10 @@ class Evidence(NamedTuple):
     zero_distance: float
     misfit: float
     bracketed: bool | None
+    smallest_at_end: bool = False
+    swamped: bool = False
+    outliers: float = 0.0
+    robust: bool = False
 
 
 class Verdict(NamedTuple):
@@ -97,18 +114,21 @@ def judge(e: Evidence, next_measurement: str | None, other_plane_clear: bool = F
     >>> judge(good, None).status.value
     'converged'
     """
-    cause = _cause(e, other_plane_clear)
+    # A neighbour vouches for a scan that has errors and a waist, and misses by no more than 20 %.
+    vouched = other_plane_clear and e.noise_known and bool(e.bracketed) and e.misfit <= VOUCHED
+    cause = _cause(e, vouched)
     if cause is not None:
         remedy = f" {next_measurement}" if next_measurement else ""
         return Verdict(Status.unidentified, f"Not determined: {cause}.{remedy}", cause)
     if not e.converged:
         return Verdict(
             Status.not_converged,
-            "The iteration did not settle; use the fit of size squared, which needs none.",
+            "The iteration did not settle; use the plain fit of size squared, which needs none.",
             None,
         )
     clear = (
-        f"The scan determines the emittance: zero is {_number(e.determinant_distance)} standard "
+        "The scan determines the emittance: zero is "
+        f"{_number(min(e.determinant_distance, e.zero_distance))} standard "
         f"errors away" + _waist_words(e.bracketed)
     )
     probability = chi2_probability(e.chi2, e.dof)
@@ -120,6 +140,12 @@ def judge(e: Evidence, next_measurement: str | None, other_plane_clear: bool = F
             "errors are scaled by that. Check how the sizes are taken from the profile, their "
             f"errors, and the lattice. {clear}.",
             None,
+        )
+    if not e.noise_known and e.dof < 8:
+        reach = float(stdtrit(e.dof, 0.975))
+        clear += (
+            f"; noise inferred on {e.dof} degrees of freedom: 95 % of answers lie within "
+            f"{reach:.1f} errors"
         )
     if e.noise_known and e.chi2 > e.dof > 0:
         clear += f"; errors are scaled by sqrt(chi2/dof) = {math.sqrt(e.chi2 / e.dof):.2f}"
@@ -133,8 +159,16 @@ def _cause(e: Evidence, other_plane_clear: bool) -> str | None:
             "the settings do not separate the three numbers of the beam matrix, as if the "
             "scanned magnet were downstream of the screen or hardly moved"
         )
-    if e.dof == 0 and not e.noise_known:
-        return "three points without errors fit exactly and leave nothing to judge them by"
+    if e.robust and (e.dof < ROBUST_DOF or e.outliers > DOUBTED):
+        return (
+            f"the robust fit doubts {100 * e.outliers:.0f} % of the points and keeps {e.dof} "
+            "degrees of freedom, too few to tell outliers from noise; measure more settings"
+        )
+    if e.dof == 0:
+        return (
+            "three points fit any three numbers exactly and leave nothing to judge them by; "
+            "measure a fourth setting"
+        )
     probability = chi2_probability(e.chi2, e.dof)
     poor = e.noise_known and probability is not None and probability < POOR_FIT
     if e.misfit > LOST and (poor or not e.noise_known) and not other_plane_clear:
@@ -142,22 +176,31 @@ def _cause(e: Evidence, other_plane_clear: bool) -> str | None:
             f"the sizes follow no beam through this line, the best one misses them by "
             f"{100 * e.misfit:.0f} % rms; check settings, units, energy and screen"
         )
+    if e.swamped:
+        return (
+            "resolution and dispersion alone are larger than a measured size; check "
+            "resolution_um and energy_spread"
+        )
     if not e.positive:
-        return "no beam fits better than one of zero emittance" + _one_sided(e.bracketed)
+        return "no beam fits better than one of zero emittance" + _one_sided(e)
     distance = min(e.determinant_distance, e.zero_distance)
-    estimated = e.dof if (not e.noise_known or e.chi2 > e.dof > 0) else None
+    rests_on_residuals = not e.noise_known or e.robust or e.chi2 > e.dof
+    estimated = e.dof if rests_on_residuals else None
     needed = CLEAR_BESIDE_ANOTHER if other_plane_clear else CLEAR
     chance = one_sided_probability(distance, estimated)
     if distance < needed or (chance > CHANCE and not other_plane_clear):
-        few = f" on {e.dof} degrees of freedom" if distance >= needed else ""
-        return f"zero emittance lies only {distance:.1f} standard errors away{few}" + _one_sided(
-            e.bracketed
-        )
+        if distance >= needed:
+            return (
+                f"zero emittance lies {distance:.1f} standard errors away, but with {e.dof} "
+                f"degrees of freedom noise does that in {100 * chance:.2g} % of scans; measure "
+                "more settings"
+            )
+        return f"zero emittance lies only {distance:.1f} standard errors away" + _one_sided(e)
     return None
 
 
-def _one_sided(bracketed: bool | None) -> str:
-    return "; the smallest size is at the end of the scan" if bracketed is False else ""
+def _one_sided(e: Evidence) -> str:
+    return "; the smallest size is at the end of the scan" if e.smallest_at_end else ""
 
 
 def _waist_words(bracketed: bool | None) -> str:

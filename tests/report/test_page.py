@@ -2,6 +2,7 @@
 
 import base64
 import re
+from dataclasses import replace
 from html.parser import HTMLParser
 
 import numpy as np
@@ -102,6 +103,16 @@ def three_lines(root):
     ]
     scan = beamfit.QuadScan({"QA": kg}, {"QA": "kG"}, {"x": sizes}, screen=screens)
     return beamfit.fit_emittance(scan, line)
+
+
+def test_names_are_shown_as_they_are(root, tmp_path):
+    line = beamfit.load_lattice(root / "lattices/lcls_otr2.toml")
+    scan = beamfit.read_quad_scan(root / "measurements/lcls_otr2.csv")
+    odd = replace(scan, name="a $x_$ [red] & b")
+    for suffix in ("html", "pdf"):
+        fit = beamfit.fit_emittance(odd, replace(line, name="$L_$ [/b]"))
+        beamfit.write_report(tmp_path / f"odd.{suffix}", fit)
+    assert "a $x_$ [red] &amp; b" in (tmp_path / "odd.html").read_text()
 
 
 def test_other_suffixes_and_places_are_refused(fit, tmp_path):

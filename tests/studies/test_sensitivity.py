@@ -119,6 +119,19 @@ def test_an_outlier_is_found_without_errors_too(gtf, gtf_sizes):
     assert robust.emittance.error < 2 * truth.error
 
 
+def test_a_wild_point_with_a_tiny_error_is_set_aside(gtf, gtf_sizes):
+    """One size and its error ten times too small: off by hundreds of its errors."""
+    currents, _, sizes = gtf_sizes
+    scan = scan_of("Q2", "A", currents, sizes, seed=8)
+    size, error = scan.size["x"].copy(), scan.error["x"].copy()
+    size[4], error[4] = size[4] / 10, error[4] / 10
+    bad = beamfit.QuadScan({"Q2": currents}, {"Q2": "A"}, {"x": size}, {"x": error})
+    truth = beamfit.fit_emittance(scan, gtf).x.emittance
+    robust = beamfit.fit_emittance(bad, gtf, robust=True).x
+    assert robust.points.outlier_probability[4] > 0.999
+    assert abs(robust.emittance.value - truth.value) < truth.error
+
+
 def test_robust_fit_of_clean_data_is_the_plain_fit(gtf, gtf_sizes):
     currents, _, sizes = gtf_sizes
     scan = scan_of("Q2", "A", currents, sizes, relative=0.01)
