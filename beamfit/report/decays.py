@@ -1,0 +1,84 @@
+"""The report of decay records."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+from beamfit.report.decay_figures import decay_pictures
+from beamfit.report.document import Page, Table, Verdict, by_name, provenance, written
+from beamfit.studies.decay_tables import budget_rows, decay_rows, event_rows, separability_rows
+from beamfit.studies.decays import Decay, RecordStudy
+
+__all__ = ["decay_page"]
+
+ERRORS = (
+    "dI/dt = -a I² - b I. Errors are one standard deviation, scaled by sqrt(χ²/dof) where that "
+    "exceeds 1. “Not determined” means the record puts no error on the value; it is not to be "
+    "quoted."
+)
+BUDGET = (
+    "Computed for the ring file and the record's own settings, nothing fitted. The percentages are "
+    "shares of the computed loss at the mean current."
+)
+# Decays beside one another in one table.
+ABREAST = 2
+
+
+def decay_page(
+    studies: Sequence[RecordStudy], command: str | None, inputs: Mapping[str, str | None] | None
+) -> Page:
+    """Lay out decay records.
+
+    Parameters
+    ----------
+    studies : sequence of RecordStudy
+        At least one record.
+    command : str or None
+        The command that made it.
+    inputs : mapping of str to str, or None
+        Input files and their SHA-256.
+
+    Returns
+    -------
+    Page
+    """
+    decays = [decay for study in studies for decay in study.decays]
+    groups = [decays[k : k + ABREAST] for k in range(0, len(decays), ABREAST)]
+    tables = [_table("Result", group, decay_rows, ERRORS) for group in groups[:1]]
+    tables += [_table("Result, continued", group, decay_rows) for group in groups[1:]]
+    tables += [_table("What the records determine", group, separability_rows) for group in groups]
+    tables += [
+        _table("Losses from first principles", group, budget_rows, BUDGET)
+        for group in groups
+        if budget_rows(group)
+    ]
+    header = ["what", "at", "for", "change"]
+    tables += [
+        Table(f"Cut at or left out of {study.record.name}", header, event_rows(study))
+        for study in studies
+        if study.events
+    ]
+    names = [study.record.name for study in studies]
+    title = names[0] if len(names) == 1 else f"{len(names)} records"
+    hours = sum(study.record.span for study in studies) / 3600
+    return Page(
+        title=f"Beam lifetime of {title}",
+        subtitle=f"{len(decays)} decays in {hours:.3g} h of record; {written()}",
+        verdicts=[_verdict(decay) for decay in decays],
+        tables=tables,
+        pictures=decay_pictures(studies),
+        pictures_title="Records and fits",
+        provenance=provenance(inputs or {}, [], command),
+        notes=tuple(note for study in studies for note in study.record.comments),
+    )
+
+
+def _table(title: str, decays: Sequence[Decay], rows, note: str = "") -> Table:
+    return by_name(title, [decay.fit.record for decay in decays], rows(decays), note)
+
+
+def _verdict(decay: Decay) -> Verdict:
+    fit = decay.fit
+    value = f"lifetime {fit.lifetime_mean} at {fit.mean_current:.4g} mA"
+    headline = value if fit.lifetime_mean.error is not None else "lifetime not determined"
+    return Verdict(fit.status.value, f"{fit.record}: {headline}", fit.message)
