@@ -60,7 +60,7 @@ def lifetime(record: tuple[str, ...], ring: str | None, report: str | None, as_j
         from beamfit.io.ring import read_operation, read_ring
 
         inputs[ring] = digest(ring)
-        operation, described = read_operation(ring), read_ring(ring)
+        described, operation = read_ring(ring), read_operation(ring)
 
         from beamfit.studies.loss_budget import Machine  # JAX from here on
 

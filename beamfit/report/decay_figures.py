@@ -102,7 +102,7 @@ def draw_lifetime(figure: FigureBase, study: RecordStudy) -> None:
     axes.plot([], [], color=RED, label="fit, 1/(a I + b)")
     known = [top for top in tops if np.isfinite(top)]
     if known:
-        axes.set_ylim(0, 1.5 * max(known))
+        axes.set_ylim(0.6 * min(known), 1.4 * max(known))
     axes.set_ylabel("lifetime, h")
     axes.set_xlabel(f"time, {unit}")
     axes.set_title("momentary lifetime")

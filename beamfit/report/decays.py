@@ -61,9 +61,10 @@ def decay_page(
     names = [study.record.name for study in studies]
     title = names[0] if len(names) == 1 else f"{len(names)} records"
     hours = sum(study.record.span for study in studies) / 3600
+    count = f"{len(decays)} decay" + ("s" if len(decays) > 1 else "")
     return Page(
         title=f"Beam lifetime of {title}",
-        subtitle=f"{len(decays)} decays in {hours:.3g} h of record; {written()}",
+        subtitle=f"{count} in {hours:.3g} h of record; {written()}",
         verdicts=[_verdict(decay) for decay in decays],
         tables=tables,
         pictures=decay_pictures(studies),

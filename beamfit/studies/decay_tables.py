@@ -11,6 +11,8 @@ __all__ = ["budget_rows", "decay_rows", "event_rows", "separability_rows"]
 
 Rows = list[tuple[str, list[str]]]
 MOST_EVENTS = 100
+# Percent of the loss below which a mechanism's digits say nothing.
+NEGLIGIBLE = 1e-6
 
 
 def _laid_out(decays: Sequence[Decay], rows: list[tuple[str, Callable[[Decay], object]]]) -> Rows:
@@ -139,6 +141,8 @@ def _with_share(decay: Decay, name: str) -> str:
     value = float(getattr(decay.budget.losses, name))
     rate = value * decay.budget.current if name[0] == "a" else value
     share = 100 * rate * 3600 * decay.budget.lifetime
+    if share < NEGLIGIBLE:
+        return "negligible"
     return f"{value:.4g} {'1/(mA s)' if name[0] == 'a' else '1/s'} ({share:.3g} % of the loss)"
 
 

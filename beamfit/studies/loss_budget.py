@@ -160,7 +160,7 @@ def budget(record: DecayRecord, machine: Machine) -> Budget:
     >>> machine = Machine(read_ring(path), read_operation(path))
     >>> found = budget(DecayRecord([0, 60], [500.0, 499.9]), machine)
     >>> print(f"{found.lifetime:.1f} h, Touschek alone {1 / found.rates['Touschek']:.1f} h")
-    13.3 h, Touschek alone 30.4 h
+    18.4 h, Touschek alone 30.4 h
     """
     operation = operation_during(record, machine)
     current = float(record.current.mean())
