@@ -1,0 +1,9 @@
+"""The grey-box core: maps with sensitivities, networks with gains, constrained fits that explain.
+
+It knows nothing about beams. The parts are imported from their modules:
+`maps`, `mlp`, `bounds`, `difference`, `problem`, `solve`, `fit`.
+"""
+
+import jax
+
+jax.config.update("jax_enable_x64", True)

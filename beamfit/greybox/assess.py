@@ -1,0 +1,315 @@
+"""From a point to a verdict: optimum or not, what the data determine, what holds the answer."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.experimental import checkify
+from scipy import linalg, stats
+
+from beamfit.greybox import kkt, problem
+from beamfit.greybox.fit import Attempt, Fit, Limited, Status, Variable
+from beamfit.greybox.implicit import Implicit
+from beamfit.greybox.problem import Problem
+
+__all__ = [
+    "Slopes",
+    "State",
+    "conclude",
+    "constraint_slopes",
+    "first_order",
+    "refused",
+    "slopes",
+    "state",
+]
+
+_TOLERANCE = 1e-6  # within which a limit counts as reached and a point as an optimum
+
+
+class Slopes(NamedTuple):
+    """Everything of first order at a point."""
+
+    residual: np.ndarray
+    residual_jacobian: np.ndarray
+    cost: float
+    gradient: np.ndarray
+    constraints: np.ndarray
+    jacobian: np.ndarray
+
+
+class State(NamedTuple):
+    """A point with its multipliers and its distance from an optimum."""
+
+    theta: np.ndarray
+    at: Slopes
+    found: kkt.Multipliers
+    kkt: kkt.KKT
+
+
+@jax.jit
+def first_order(core, theta):
+    """The parts of `Slopes`, compiled once for each structure of problem."""
+    r, r_jacobian = problem.residual(core, theta), jax.jacfwd(problem.residual, 1)(core, theta)
+    cost, gradient = jax.value_and_grad(problem.cost, 1)(core, theta)
+    c = problem.constraints(core, theta)
+    return r, r_jacobian, cost, gradient, c, constraint_slopes(core, theta)
+
+
+def constraint_slopes(core, theta):
+    """Jacobian of the constraints, by as few sweeps as there are variables or constraints."""
+    few = jax.eval_shape(problem.constraints, core, theta).shape < theta.shape
+    return (jax.jacrev if few else jax.jacfwd)(problem.constraints, 1)(core, theta)
+
+
+def slopes(p: Problem, theta: np.ndarray) -> Slopes:
+    """Evaluate values and first derivatives at a point."""
+    return Slopes(*(np.asarray(part) for part in first_order(p.core, jnp.asarray(theta, float))))
+
+
+def _gradient_scale(p: Problem, theta: np.ndarray, at: Slopes) -> np.ndarray:
+    """Size of a gradient component that matters.
+
+    A residual vector moved by one standard deviation, or by 1e-6 of the measured values where the
+    errors are unknown, is the least that counts; for further objectives, the cost over the value.
+    """
+    if p.errors_known or not p.records:
+        least = 1.0
+    else:
+        least = 1e-6 * np.sqrt(sum(float(jnp.sum(rec.measured**2)) for rec in p.records))
+    size = max(np.linalg.norm(at.residual), least)
+    scale = np.linalg.norm(at.residual_jacobian, axis=0) * size
+    if p.objectives:
+        scale = scale + max(1.0, abs(at.cost)) / np.maximum(1.0, np.abs(theta))
+    return np.maximum(scale, max(1e-12 * np.max(scale), 1e-100))
+
+
+def state(p: Problem, theta: np.ndarray) -> State:
+    """Find the multipliers at a point and measure how far it is from an optimum.
+
+    Parameters
+    ----------
+    p : Problem
+        The problem.
+    theta : array, shape (n,)
+        The point.
+
+    Returns
+    -------
+    State
+        With an infinite residual where something is not finite.
+    """
+    at = slopes(p, theta)
+    if not all(np.all(np.isfinite(part)) for part in at):
+        none = kkt.Multipliers(np.zeros(len(theta)), np.zeros(len(at.constraints)))
+        return State(theta, at, none, kkt.KKT(np.inf, np.inf, np.inf))
+    scale = _gradient_scale(p, theta, at)
+    bounds = kkt.Limits(theta, p.lower, p.upper)
+    limits = kkt.Limits(at.constraints, p.constraint_lower, p.constraint_upper)
+    found = kkt.multipliers(at.gradient, at.jacobian, bounds, limits, scale, _TOLERANCE)
+    size = at.cost if p.objectives else 0.5 * scale.size
+    distance = kkt.residual(at.gradient, at.jacobian, bounds, limits, scale, found, size)
+    return State(theta, at, found, distance)
+
+
+class _Spread(NamedTuple):
+    """Covariance along the active limits, its rank, unseen directions, and what is held."""
+
+    covariance: np.ndarray
+    rank: int
+    unseen: np.ndarray
+    held: np.ndarray
+
+
+def _spread(p: Problem, s: State) -> _Spread:
+    """Covariance in the tangent of what is held; singular values tell what is not determined."""
+    fixed = p.lower == p.upper
+    scale = _gradient_scale(p, s.theta, s.at)
+    held = fixed | (np.abs(s.found.bounds) > 1e-9 * scale)
+    equal = p.constraint_lower == p.constraint_upper
+    pulls = np.abs(s.found.constraints) * np.linalg.norm(s.at.jacobian / scale, axis=1)
+    rows = np.vstack([np.eye(len(s.theta))[held], s.at.jacobian[equal | (pulls > 1e-9)]])
+    length = np.linalg.norm(s.at.residual_jacobian, axis=0)
+    unit = np.where(length > 0, 1 / np.where(length > 0, length, 1.0), 1.0)
+    tangent = linalg.null_space(rows * unit) if len(rows) else np.eye(len(s.theta))
+    if tangent.shape[1] == 0:
+        return _Spread(np.zeros((len(s.theta),) * 2), 0, np.zeros((len(s.theta), 0)), held)
+    seen = s.at.residual_jacobian * unit @ tangent
+    _, sizes, directions = linalg.svd(seen, full_matrices=True)
+    rank = int(np.sum(sizes > 1e-10 * max(sizes[0], 1e-300))) if sizes.size else 0
+    along = unit[:, None] * (tangent @ directions.T)
+    spread = along[:, :rank] / sizes[:rank]
+    unseen = along[:, rank:]
+    unseen = unseen / np.where((n := np.linalg.norm(unseen, axis=0)) > 0, n, 1.0)
+    return _Spread(spread @ spread.T, rank, unseen, held)
+
+
+def _inner_failure(p: Problem, theta: np.ndarray) -> str | None:
+    """What an implicit map inside the model says of its own convergence at the answer."""
+    parts = jax.tree_util.tree_leaves(p.core, is_leaf=lambda part: isinstance(part, Implicit))
+    if not any(isinstance(part, Implicit) for part in parts):
+        return None
+    look = checkify.checkify(
+        jax.jit(lambda core, t: (problem.cost(core, t), problem.constraints(core, t))),
+        errors=checkify.user_checks,
+    )
+    said = look(p.core, jnp.asarray(theta, float))[0].get()
+    return None if said is None else said.removesuffix(" (`check` failed)")
+
+
+def conclude(p: Problem, s: State, attempts: tuple[Attempt, ...], seconds: float) -> Fit:
+    """Judge the best point of a search.
+
+    Parameters
+    ----------
+    p : Problem
+        The problem.
+    s : State
+        The best point.
+    attempts : tuple of Attempt
+        Every start.
+    seconds : float
+        Time taken.
+
+    Returns
+    -------
+    Fit
+    """
+    failure = _inner_failure(p, s.theta)
+    if not np.isfinite(s.kkt.worst) and not failure:
+        said = (
+            "the cost or a derivative is not finite at the end of the search; bound the free "
+            "numbers away from there, or use a parametrisation that stays defined."
+        )
+        return refused(p, Status.NOT_FINITE, said, seconds, s.theta, attempts)
+    if failure:
+        said = (
+            f"{failure} at the end of the search; start it nearer to its root, or bound the free "
+            "numbers to where a root exists."
+        )
+        return refused(p, Status.NOT_CONVERGED, said, seconds, s.theta, attempts)
+    spread = _spread(p, s)
+    chi2 = float(s.at.residual @ s.at.residual)
+    dof = len(s.at.residual) - spread.rank
+    ratio = chi2 / dof if dof > 0 else np.nan
+    judged = p.errors_known or not p.records
+    scale = (np.sqrt(max(1.0, ratio)) if dof > 0 else 1.0) if judged else np.sqrt(ratio)
+    raw = np.sqrt(np.diag(spread.covariance))
+    blind = np.any(np.abs(spread.unseen) > 1e-6, axis=1) | (scale * raw > p.upper - p.lower)
+    raw = np.where(blind | spread.held, np.nan, raw)
+    fixed = p.lower == p.upper
+    blind &= ~fixed & ~spread.held
+    edge = _states(s.found.bounds, kkt.Limits(s.theta, p.lower, p.upper))
+    variables = tuple(
+        Variable(name, *map(float, numbers), state, float(gradient))
+        for name, *numbers, state, gradient in zip(
+            p.names, s.theta, scale * raw, raw, p.lower, p.upper, edge, s.found.bounds, strict=True
+        )
+    )
+    limits = kkt.Limits(s.at.constraints, p.constraint_lower, p.constraint_upper)
+    constraints = tuple(
+        Limited(name, *map(float, numbers), state, float(y))
+        for name, *numbers, state, y in zip(
+            p.constraint_names, *limits, _states(s.found.constraints, limits), s.found.constraints,
+            strict=True,
+        )
+    )  # fmt: skip
+    status, message = _verdict(p, s, attempts, variables, constraints, blind, chi2, dof, judged)
+    return Fit(
+        p, s.theta, status, message, float(s.at.cost), chi2, dof, s.kkt, variables, constraints,
+        spread.covariance, spread.unseen, float(scale), attempts, seconds,
+    )  # fmt: skip
+
+
+def _states(multiplier: np.ndarray, limits: kkt.Limits) -> list[str]:
+    """Whether each value is free, at its lower or upper limit, or fixed."""
+    low, high = limits.reached(_TOLERANCE)
+    fixed = limits.lower == limits.upper
+    cases = [fixed, low & ((multiplier > 0) | ~high), high]
+    return np.select(cases, ["fixed", "lower", "upper"], "free").tolist()
+
+
+def _list(names) -> str:
+    """A few names for a sentence."""
+    names = list(names)
+    return ", ".join(names[:4]) + (f" and {len(names) - 4} more" if len(names) > 4 else "")
+
+
+def _verdict(p, s, attempts, variables, constraints, blind, chi2, dof, judged):
+    """Status and sentence, the gravest first."""
+    if s.kkt.feasibility > _TOLERANCE:
+        crossed = kkt.Limits(s.at.constraints, p.constraint_lower, p.constraint_upper).violation
+        worst = constraints[int(np.argmax(crossed))] if constraints else None
+        place = (
+            f" '{worst.name}' ends at {worst.value:.4g}, outside" if worst else " bounds: outside"
+        )
+        limits = f" [{worst.lower:.4g}, {worst.upper:.4g}]" if worst else ""
+        return Status.INFEASIBLE, (
+            f"no point within all constraints was found from {_starts(attempts)}:{place}{limits}; "
+            "relax it, free more numbers, or start elsewhere."
+        )
+    if p.objectives and s.at.cost < -1e15:
+        return Status.UNBOUNDED, (
+            f"the cost falls without end (down to {s.at.cost:.3g}); bound the free numbers, or "
+            "check the sign of the objective."
+        )
+    if s.kkt.worst > _TOLERANCE:
+        return Status.NOT_CONVERGED, (
+            f"no optimum was reached from {_starts(attempts)} (KKT residual {s.kkt.worst:.1e} "
+            f"after {sum(a.iterations for a in attempts)} iterations); give more starts "
+            "or iterations, or a better start."
+        )
+    asked = ~p.nuisance
+    if (blind & asked).any():
+        names = _list(np.array(p.names)[blind & asked])
+        return Status.UNIDENTIFIED, (
+            f"the data do not determine {names}; add data of another kind, a prior, or fix it."
+        )
+    chance = stats.chi2.sf(chi2, dof) if dof > 0 else 1.0
+    if judged and p.records and chance < 1e-3:
+        return Status.POOR_FIT, (
+            f"chi2 = {chi2:.4g} for {dof} degrees of freedom happens by chance in {chance:.1e} of "
+            "cases; the model misses something or the errors are too small."
+        )
+    held = [v for v, ask in zip(variables, asked, strict=True) if ask]
+    held = [v for v in held if v.state in ("lower", "upper")]
+    if held:
+        names = _list(f"{v.name} ({v.state})" for v in held)
+        return Status.AT_LIMIT, (
+            f"the best value lies at a bound: {names}; the bound decides it, not the data, so "
+            "justify or widen it."
+        )
+    return Status.CONVERGED, (
+        f"an optimum was reached from {_starts(attempts)} (KKT residual {s.kkt.worst:.1e})."
+    )
+
+
+def _starts(attempts: tuple[Attempt, ...]) -> str:
+    return f"{len(attempts)} start{'s' if len(attempts) != 1 else ''}"
+
+
+def refused(
+    p: Problem,
+    status: Status,
+    message: str,
+    seconds: float,
+    theta: np.ndarray | None = None,
+    attempts: tuple[Attempt, ...] = (),
+) -> Fit:
+    """A fit without an answer: where it stopped, and nothing determined."""
+    theta = p.start if theta is None else theta
+    n, nan, inf = len(theta), np.nan, np.inf
+    variables = tuple(
+        Variable(name, float(v), nan, nan, float(a), float(b), "free", nan)
+        for name, v, a, b in zip(p.names, theta, p.lower, p.upper, strict=True)
+    )
+    limits = zip(p.constraint_names, p.constraint_lower, p.constraint_upper, strict=True)
+    constraints = tuple(
+        Limited(name, nan, float(a), float(b), "free", nan) for name, a, b in limits
+    )
+    return Fit(
+        p, theta, status, message, nan, nan, 0, kkt.KKT(inf, inf, inf), variables, constraints,
+        np.full((n, n), nan), np.eye(n), nan, attempts, seconds,
+    )  # fmt: skip

@@ -1,0 +1,315 @@
+"""Certified bounds of a network's first-order gains over boxes (report 3.1.3; physics.md 5).
+
+The derivatives of order 1 to 3 are enclosed over the box by interval arithmetic with outward
+rounding. The gains are then tightened by Taylor's theorem about the box's centre c,
+g(c + d) = g(c) + H(c) d + d T(box) d / 2, whose excess falls with the cube of the box's size; so a
+range is split into cells. Everything is JAX: a bound is differentiable by the weights and can be a
+constraint.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from beamfit.errors import InputError
+from beamfit.greybox.activations import Range, range_of
+
+if TYPE_CHECKING:
+    from beamfit.greybox.mlp import MLP
+
+__all__ = ["cells", "gain_bounds", "over_cells"]
+
+_ROUNDING = 2.0**-53
+_TINY = 1e-300  # covers underflow, which a relative error does not
+
+
+class _Ball(NamedTuple):
+    """An enclosure of finite numbers: within `radius` of `middle`.
+
+    Cheaper than two ends, and for narrow ranges as tight; products never compare signs.
+    """
+
+    middle: jax.Array
+    radius: jax.Array
+
+    def __getitem__(self, at) -> _Ball:
+        """Index both parts alike."""
+        return _Ball(self.middle[at], self.radius[at])
+
+    @property
+    def largest(self) -> jax.Array:
+        """The largest magnitude inside."""
+        return jnp.abs(self.middle) + self.radius
+
+
+class _Nodes(NamedTuple):
+    """Enclosures for the n nodes of a layer; each derivative adds one axis of inputs."""
+
+    value: Range
+    first: _Ball
+    second: _Ball
+    third: _Ball
+
+
+def _rounded(found: _Ball, size: jax.Array, operations: int) -> _Ball:
+    """Widen a ball by the rounding of some operations on numbers of a size."""
+    error = 2 * operations * _ROUNDING * jax.lax.stop_gradient(size) + _TINY
+    return _Ball(found.middle, found.radius + error)
+
+
+def _times(a: _Ball, b: _Ball) -> _Ball:
+    """Enclose a product."""
+    radius = jnp.abs(a.middle) * b.radius + a.radius * b.largest
+    return _rounded(_Ball(a.middle * b.middle, radius), a.largest * b.largest, 4)
+
+
+def _plus(*parts: _Ball) -> _Ball:
+    """Enclose a sum."""
+    found = _Ball(sum(p.middle for p in parts), sum(p.radius for p in parts))
+    return _rounded(found, sum(p.largest for p in parts), 2 * len(parts))
+
+
+def _weighted(a: _Ball, weight: jax.Array) -> _Ball:
+    """Enclose the sum over nodes of weight * a, for a of shape (nodes, ...)."""
+    size = jnp.abs(weight)
+    found = _Ball(*(jnp.tensordot(w, p, (0, 0)) for w, p in zip((weight, size), a, strict=True)))
+    return _rounded(found, jnp.tensordot(size, a.largest, (0, 0)), 2 * weight.shape[0] + 4)
+
+
+def _weighted_values(a: Range, weight: jax.Array) -> Range:
+    """Enclose the sum over nodes of weight * a by its ends, which may be infinite."""
+    low, high = (jnp.where(weight == 0, 0.0, weight * end[:, None]) for end in a)
+    found = Range(jnp.sum(jnp.minimum(low, high), axis=0), jnp.sum(jnp.maximum(low, high), axis=0))
+    size = jnp.sum(jnp.maximum(jnp.abs(low), jnp.abs(high)), axis=0)
+    return found.widened(2 * (weight.shape[0] + 2) * _ROUNDING * size + _TINY)
+
+
+def _joined(a: Range, b: Range) -> Range:
+    """Enclose the sum of two ranges."""
+    found = Range(a.lower + b.lower, a.upper + b.upper)
+    return found.widened(4 * _ROUNDING * (jnp.abs(found.lower) + jnp.abs(found.upper)) + _TINY)
+
+
+def _ball(a: Range) -> _Ball:
+    """The ball around a range."""
+    middle = 0.5 * (a.lower + a.upper)
+    radius = 0.5 * (a.upper - a.lower)
+    return _rounded(_Ball(middle, radius), jnp.abs(a.lower) + jnp.abs(a.upper), 2)
+
+
+def _activated(s: _Nodes, kind: str) -> _Nodes:
+    """Enclose a layer's nodes from its arguments: the chain rule, to third order, for balls."""
+    if kind in ("identity", "linear"):
+        return s
+    new, n = np.newaxis, slice(None)
+    d1, d2, d3 = (_ball(range_of(kind, order, s.value)) for order in (1, 2, 3))
+    i, j, k = s.first[n, n, new, new], s.first[n, new, n, new], s.first[n, new, new, n]
+    pairs = _times(s.first[n, n, new], s.first[n, new, n])
+    mixed = _plus(
+        _times(s.second[n, n, n, new], k),
+        _times(s.second[n, n, new, n], j),
+        _times(s.second[n, new, n, n], i),
+    )
+    second = _plus(_times(d2[n, new, new], pairs), _times(d1[n, new, new], s.second))
+    third = _plus(
+        _times(d3[n, new, new, new], _times(pairs[n, n, n, new], k)),
+        _times(d2[n, new, new, new], mixed),
+        _times(d1[n, new, new, new], s.third),
+    )
+    return _Nodes(range_of(kind, 0, s.value), _times(d1[n, new], s.first), second, third)
+
+
+def _entered(s: _Nodes, net: MLP, layer: str, box: Range) -> _Nodes:
+    """Add the inputs that enter a layer."""
+    value, first = s.value, s.first
+    for i, port in enumerate(net.input_ports):
+        if port.layer != layer:
+            continue
+        side = Range(box.lower[i], box.upper[i])
+        ends = [(end - port.bias) / port.scale for end in side]
+        size = jnp.maximum(*(jnp.abs(end) for end in side)) + abs(port.bias)
+        x = Range(jnp.minimum(*ends), jnp.maximum(*ends))
+        x = x.widened(4 * _ROUNDING * size / abs(port.scale) + _TINY)
+        joined = _joined(Range(*(v[port.node] for v in value)), x)
+        value = Range(*(v.at[port.node].set(e) for v, e in zip(value, joined, strict=True)))
+        unit = _rounded(_Ball(jnp.asarray(1 / port.scale), 0.0), 1 / abs(port.scale), 1)
+        joined = _plus(first[port.node, i], unit)
+        first = _Ball(*(f.at[port.node, i].set(e) for f, e in zip(first, joined, strict=True)))
+    return s._replace(value=value, first=first)
+
+
+def _enclose(net: MLP, box: Range) -> _Nodes:
+    """Enclose the derivatives of every output over a box (values keep their node's scale)."""
+    inputs = len(net.input_ports)
+    done: dict[str, _Nodes] = {}
+    for layer in net.order:
+        bias = net.biases.get(layer.name, jnp.zeros(layer.size))
+        zeros = [jnp.zeros((layer.size, *(inputs,) * order)) for order in (1, 2, 3)]
+        s = _Nodes(Range(bias, bias), *(_Ball(zero, zero) for zero in zeros))
+        for source, target in net.connections:
+            if target == layer.name:
+                weight, before = net.weights[f"{source}->{target}"], done[source]
+                value = _joined(s.value, _weighted_values(before.value, weight))
+                rest = (
+                    _plus(a, _weighted(b, weight)) for a, b in zip(s[1:], before[1:], strict=True)
+                )
+                s = _Nodes(value, *rest)
+        done[layer.name] = _activated(_entered(s, net, layer.name, box), layer.kind)
+    rows = [
+        jax.tree_util.tree_map(lambda part, p=port: part[p.node], done[port.layer])
+        for port in net.output_ports
+    ]
+    stacked = jax.tree_util.tree_map(lambda *parts: jnp.stack(parts), *rows)
+    scale = jnp.array([port.scale for port in net.output_ports])
+    scales = (jnp.reshape(scale, (-1, *(1,) * order)) for order in (1, 2, 3))
+    rest = (_times(b, _Ball(c, 0.0)) for b, c in zip(stacked[1:], scales, strict=True))
+    return _Nodes(stacked.value, *rest)
+
+
+def _highest(slope: jax.Array, bend: jax.Array, radius: jax.Array) -> jax.Array:
+    """Largest value of slope*d + bend*d^2/2 over |d| <= radius, for slope >= 0, rounded up."""
+    inside = (bend < 0) & (slope < -bend * radius)
+    at_edge = slope * radius + 0.5 * bend * radius**2
+    peak = 0.5 * slope**2 / jnp.where(inside, -bend, 1.0)
+    error = 16 * _ROUNDING * (slope * radius + jnp.abs(bend) * radius**2) + _TINY
+    return jnp.where(inside, peak, at_edge) + jax.lax.stop_gradient(error)
+
+
+def _taylor(middle: _Nodes, whole: _Nodes, radius: jax.Array) -> Range:
+    """Enclose the gains over a finite box by Taylor's theorem about its centre."""
+    n = len(radius)
+    bend = _Ball(*(jnp.diagonal(part, axis1=-2, axis2=-1) for part in whole.third))
+    cross = whole.third.largest * (1 - jnp.eye(n))
+    mixed = 0.5 * jnp.einsum("oijk,j,k->oi", cross, radius, radius)
+    slope = middle.second.largest
+    up, down = (
+        (jnp.sum(_highest(slope, sign * bend.middle + bend.radius, radius), axis=-1) + mixed)
+        for sign in (1, -1)
+    )
+    size = jnp.abs(up) + jnp.abs(down) + mixed + middle.first.largest
+    reach = middle.first.radius + 8 * (n**2 + 2) * _ROUNDING * jax.lax.stop_gradient(size)
+    return Range(middle.first.middle - down - reach, middle.first.middle + up + reach)
+
+
+def gain_bounds(net: MLP, lower: jax.Array, upper: jax.Array) -> Range:
+    """Enclose every first-order gain of a network over one box.
+
+    Parameters
+    ----------
+    net : MLP
+        The network; its own gain outputs play no part.
+    lower, upper : array, shape (inputs,)
+        Corners of the box; infinite sides are allowed.
+
+    Returns
+    -------
+    Range
+        `lower` and `upper`, each of shape (output ports, inputs): no input in the box has a gain
+        outside, rounding included.
+
+    Examples
+    --------
+    >>> from beamfit.greybox.mlp import dense
+    >>> found = gain_bounds(dense(["u"], ["y"]), jnp.array([0.0]), jnp.array([0.1]))
+    >>> bool(found.lower[0, 0] < found.upper[0, 0])
+    True
+    """
+    return _bounds(net, jnp.asarray(lower, float), jnp.asarray(upper, float))
+
+
+@jax.jit
+def _bounds(net: MLP, lower: jax.Array, upper: jax.Array) -> Range:
+    """The bounds of `gain_bounds`, compiled once for each structure of network."""
+    finite = jnp.all(jnp.isfinite(upper - lower))
+    low, high = (jnp.where(finite, end, 0.0) for end in (lower, upper))
+    centre = 0.5 * (low + high)
+    # Rounded up, so that centre +- radius covers the box.
+    radius = jnp.maximum(high - centre, centre - low)
+    radius = radius + 4 * _ROUNDING * (jnp.abs(low) + jnp.abs(high))
+    boxes = Range(jnp.stack([lower, centre]), jnp.stack([upper, centre]))
+    both = jax.vmap(lambda box: _enclose(net, box))(boxes)
+    whole, middle = (jax.tree_util.tree_map(lambda part, i=i: part[i], both) for i in (0, 1))
+    tight = _taylor(middle, whole, radius)
+    # An infinite slope has no ball: its middle is not a number, and nothing is known of the gain.
+    known = jnp.isfinite(whole.first.radius)
+    reach = jnp.where(known, whole.first.radius, jnp.inf)
+    around = jnp.where(known, whole.first.middle, 0.0)
+    return Range(
+        jnp.where(finite, jnp.maximum(around - reach, tight.lower), around - reach),
+        jnp.where(finite, jnp.minimum(around + reach, tight.upper), around + reach),
+    )
+
+
+def cells(lower, upper, number: int) -> tuple[np.ndarray, np.ndarray]:
+    """Split a box into a grid of cells that leave no gap.
+
+    Parameters
+    ----------
+    lower, upper : array, shape (inputs,)
+        Corners of the box, finite.
+    number : int
+        Cells along each input.
+
+    Returns
+    -------
+    tuple of numpy.ndarray, shape (cells, inputs)
+        Lower and upper corners; neighbours share their faces exactly.
+
+    Raises
+    ------
+    InputError
+        If the box is empty or infinite, or there is no cell.
+
+    Examples
+    --------
+    >>> low, high = cells([0.0], [1.0], 2)
+    >>> low.tolist(), high.tolist()
+    ([[0.0], [0.5]], [[0.5], [1.0]])
+    """
+    lower, upper = np.asarray(lower, float), np.asarray(upper, float)
+    if number < 1 or not np.all(np.isfinite(upper - lower)) or np.any(lower > upper):
+        raise InputError(
+            f"{number} cells from {lower.tolist()} to {upper.tolist()}",
+            "at least one cell of a finite box with lower <= upper",
+        )
+    edges = [np.linspace(a, b, number + 1) for a, b in zip(lower, upper, strict=True)]
+    low = np.stack(np.meshgrid(*[e[:-1] for e in edges], indexing="ij"), -1)
+    high = np.stack(np.meshgrid(*[e[1:] for e in edges], indexing="ij"), -1)
+    return low.reshape(-1, lower.size), high.reshape(-1, lower.size)
+
+
+def over_cells(net: MLP, lower, upper, number: int) -> Range:
+    """Enclose every first-order gain over each cell of a box.
+
+    Parameters
+    ----------
+    net : MLP
+        The network.
+    lower, upper : array, shape (inputs,)
+        Corners of the box, finite.
+    number : int
+        Cells along each input.
+
+    Returns
+    -------
+    Range
+        `lower` and `upper`, each of shape (cells, output ports, inputs). A constraint on all of
+        them holds everywhere in the box.
+
+    Raises
+    ------
+    InputError
+        As for `cells`.
+
+    Examples
+    --------
+    >>> from beamfit.greybox.mlp import dense
+    >>> over_cells(dense(["u"], ["y", "z"]), [0.0], [1.0], 4).lower.shape
+    (4, 2, 1)
+    """
+    low, high = cells(lower, upper, number)
+    return jax.vmap(lambda a, b: gain_bounds(net, a, b))(low, high)

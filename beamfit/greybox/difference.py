@@ -1,0 +1,174 @@
+"""The default parametric model where no physics is known: a Taylor-type difference equation.
+
+Report eqs 2-4: the next output is a polynomial in the deviations of past outputs and inputs from
+an operating point, and the polynomial's coefficients are the parameters p that a map gives as
+functions of the process inputs.
+"""
+
+from __future__ import annotations
+
+from itertools import combinations_with_replacement, product
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from beamfit.errors import InputError
+from beamfit.greybox import tree
+
+__all__ = ["TaylorDifference"]
+
+
+@tree.node("process_inputs", "process_outputs", "y_past", "u_past", "degree")
+class TaylorDifference:
+    """Next output y_k = init + sum A_i y_(k-i) + sum B_i u_(k-i) (+ all products), eqs 2 and 4.
+
+    All y and u are deviations from the operating point. As a map, its inputs are the coefficients
+    followed by the past (``y[k-1]``, ..., ``u[k]``, ``u[k-1]``, ...), so that it is the second map
+    of a `Series` whose first map gives the coefficients.
+
+    Parameters
+    ----------
+    process_inputs, process_outputs : tuple of str
+        Names of u and y.
+    y_past : int
+        Number of past outputs, i = 1 ... y_past.
+    u_past : int
+        Number of past inputs besides the present one, i = 0 ... u_past.
+    degree : int
+        1 for eq 4; 2 adds every product of two deviations (the second-order terms of eq 2).
+
+    Raises
+    ------
+    InputError
+        If a number is out of range.
+
+    Examples
+    --------
+    >>> lag = TaylorDifference(("u",), ("y",), y_past=1, u_past=0)
+    >>> lag.coefficients
+    ('y:init', 'y:y[k-1]', 'y:u[k]')
+    >>> lag.simulate(jnp.array([0.0, 0.5, 1.0]), jnp.ones((3, 1)), jnp.zeros((1, 1)))[:, 0].tolist()
+    [1.0, 1.5, 1.75]
+    """
+
+    process_inputs: tuple[str, ...]
+    process_outputs: tuple[str, ...]
+    y_past: int = 1
+    u_past: int = 0
+    degree: int = 1
+
+    def __post_init__(self):
+        object.__setattr__(self, "process_inputs", tuple(self.process_inputs))
+        object.__setattr__(self, "process_outputs", tuple(self.process_outputs))
+        if self.y_past < 0 or self.u_past < 0 or self.degree not in (1, 2):
+            raise InputError(
+                f"y_past {self.y_past}, u_past {self.u_past}, degree {self.degree}",
+                "numbers of past samples from 0 and degree 1 or 2",
+            )
+
+    @property
+    def past(self) -> tuple[str, ...]:
+        """Names of the deviations the next output depends on."""
+        steps = ["k", *(f"k-{i}" for i in range(1, 1 + max(self.y_past, self.u_past)))]
+        outputs = product(steps[1 : 1 + self.y_past], self.process_outputs)
+        inputs = product(steps[: 1 + self.u_past], self.process_inputs)
+        return tuple(f"{name}[{step}]" for step, name in (*outputs, *inputs))
+
+    @property
+    def terms(self) -> tuple[tuple[int, ...], ...]:
+        """The monomials, as positions in `past`; the empty one is the constant."""
+        every = range(len(self.past))
+        return tuple(
+            term for n in range(self.degree + 1) for term in combinations_with_replacement(every, n)
+        )
+
+    @property
+    def coefficients(self) -> tuple[str, ...]:
+        """Names of the parameters p, output by output."""
+        words = ["*".join(self.past[i] for i in term) or "init" for term in self.terms]
+        return tuple(f"{y}:{word}" for y, word in product(self.process_outputs, words))
+
+    @property
+    def inputs(self) -> tuple[str, ...]:
+        """The coefficients, then the past."""
+        return self.coefficients + self.past
+
+    @property
+    def outputs(self) -> tuple[str, ...]:
+        """The next outputs."""
+        return self.process_outputs
+
+    def __call__(self, x: jax.Array) -> jax.Array:
+        """Next outputs at one point: coefficients and past in one vector."""
+        return self.step(x[: len(self.coefficients)], x[len(self.coefficients) :])
+
+    def step(self, p: jax.Array, past: jax.Array) -> jax.Array:
+        """Next outputs from coefficients and past deviations.
+
+        Parameters
+        ----------
+        p : array, shape (coefficients,)
+            The parameters.
+        past : array, shape (past,)
+            The deviations in the order of `past`.
+
+        Returns
+        -------
+        jax.Array, shape (process outputs,)
+        """
+        monomials = jnp.stack([jnp.prod(past[np.array(t, int)]) for t in self.terms])
+        return jnp.reshape(p, (len(self.process_outputs), -1)) @ monomials
+
+    def one_step(self, p: jax.Array, u: jax.Array, y: jax.Array) -> jax.Array:
+        """Predict each sample from the measured past (equation error).
+
+        Parameters
+        ----------
+        p : array, shape (coefficients,) or (samples, coefficients)
+            Constant parameters, or those of each sample.
+        u : array, shape (samples, process inputs)
+            Input deviations.
+        y : array, shape (samples, process outputs)
+            Measured output deviations.
+
+        Returns
+        -------
+        jax.Array, shape (samples - start, process outputs)
+            Predictions from sample max(y_past, u_past) on.
+        """
+        start = max(self.y_past, self.u_past)
+        k = np.arange(start, len(u))
+        lags = [y[k - i] for i in range(1, 1 + self.y_past)]
+        lags += [u[k - i] for i in range(1 + self.u_past)]
+        p = jnp.broadcast_to(p, (len(u), len(self.coefficients)))
+        return jax.vmap(self.step)(p[start:], jnp.concatenate(lags, axis=1))
+
+    def simulate(self, p: jax.Array, u: jax.Array, y0: jax.Array) -> jax.Array:
+        """Run the equation on its own outputs (output error).
+
+        Parameters
+        ----------
+        p : array, shape (coefficients,) or (samples, coefficients)
+            Constant parameters, or those of each sample.
+        u : array, shape (samples, process inputs)
+            Input deviations; before the first sample the input is taken as its first value.
+        y0 : array, shape (y_past, process outputs)
+            Output deviations before the first sample, the latest first.
+
+        Returns
+        -------
+        jax.Array, shape (samples, process outputs)
+        """
+        u = jnp.asarray(u, float)
+        before = jnp.broadcast_to(u[0], (1 + self.u_past, u.shape[1]))
+
+        def advance(state, now):
+            ys, us = state
+            coefficients, present = now
+            us = jnp.concatenate([present[None], us])[: 1 + self.u_past]
+            new = self.step(coefficients, jnp.concatenate([ys.ravel(), us.ravel()]))
+            return (jnp.concatenate([new[None], ys])[: self.y_past], us), new
+
+        p = jnp.broadcast_to(p, (len(u), len(self.coefficients)))
+        return jax.lax.scan(advance, (jnp.asarray(y0, float), before), (p, u))[1]

@@ -1,0 +1,204 @@
+"""The answer of a fit: values, what they are worth, and what held them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from enum import StrEnum
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from beamfit.errors import InputError, nearest
+from beamfit.greybox.kkt import KKT
+from beamfit.greybox.problem import Problem
+
+__all__ = ["Attempt", "Fit", "Limited", "Quantity", "Status", "Variable"]
+
+
+class Status(StrEnum):
+    """The verdict on a fit; `Fit.message` gives cause and remedy."""
+
+    CONVERGED = "converged"
+    AT_LIMIT = "at_limit"
+    POOR_FIT = "poor_fit"
+    UNIDENTIFIED = "unidentified"
+    NOT_CONVERGED = "not_converged"
+    UNBOUNDED = "unbounded"
+    INFEASIBLE = "infeasible"
+    NOT_FINITE = "not_finite"
+    CONTRADICTORY_BOUNDS = "contradictory_bounds"
+
+
+class Variable(NamedTuple):
+    """A free number: value, error, bounds, state and reduced gradient d(cost)/d(bound).
+
+    `error` is one standard deviation, enlarged by sqrt(chi2/dof) where that exceeds 1, and NaN
+    where the data do not determine the value; `error_raw` is not enlarged. `state` is ``free``,
+    ``lower``, ``upper`` or ``fixed``.
+    """
+
+    name: str
+    value: float
+    error: float
+    error_raw: float
+    lower: float
+    upper: float
+    state: str
+    reduced_gradient: float
+
+
+class Limited(NamedTuple):
+    """A constraint element: value, limits, state and multiplier d(cost)/d(limit)."""
+
+    name: str
+    value: float
+    lower: float
+    upper: float
+    state: str
+    multiplier: float
+
+
+class Quantity(NamedTuple):
+    """A derived number with its error; NaN where the data do not determine it."""
+
+    value: np.ndarray
+    error: np.ndarray
+
+
+class Attempt(NamedTuple):
+    """One start of a search: which solver ended where, at what cost, how near to an optimum."""
+
+    solver: str
+    theta: np.ndarray
+    cost: float
+    kkt: KKT
+    iterations: int
+    said: str
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """What a fit found and how far to believe it.
+
+    Parameters
+    ----------
+    problem : Problem
+        What was fitted.
+    theta : array, shape (n,)
+        The free numbers.
+    status : Status
+        The verdict.
+    message : str
+        One sentence: cause and remedy.
+    cost, chi2 : float
+        Cost, and sum of squared residuals, priors included.
+    dof : int
+        Residuals less the directions they determine.
+    kkt : KKT
+        How far from an optimum, computed here and not by a solver.
+    variables, constraints : tuple
+        The free numbers and the constraint elements, with bounds, states and multipliers.
+    covariance : array, shape (n, n)
+        Of the determined directions along the active limits, not enlarged; in linear approximation.
+    undetermined : array, shape (n, k)
+        Directions in theta that the residuals do not see.
+    scale : float
+        Factor on errors: sqrt(chi2/dof) where above 1, or wherever the noise is inferred.
+    attempts : tuple of Attempt
+        Every start; the best one is the answer.
+    seconds : float
+        Time taken, compilation included.
+    """
+
+    problem: Problem
+    theta: np.ndarray
+    status: Status
+    message: str
+    cost: float
+    chi2: float
+    dof: int
+    kkt: KKT
+    variables: tuple[Variable, ...]
+    constraints: tuple[Limited, ...]
+    covariance: np.ndarray
+    undetermined: np.ndarray
+    scale: float
+    attempts: tuple[Attempt, ...]
+    seconds: float
+
+    @property
+    def model(self) -> Any:
+        """The model with the fitted numbers."""
+        return self.problem.model_at(self.theta)
+
+    @property
+    def iterations(self) -> int:
+        """Iterations over all starts."""
+        return sum(attempt.iterations for attempt in self.attempts)
+
+    @property
+    def active(self) -> tuple[str, ...]:
+        """Names of the bounds and constraints that hold the answer."""
+        rows = (*self.variables, *self.constraints)
+        return tuple(row.name for row in rows if row.state in ("lower", "upper"))
+
+    @cached_property
+    def _rows(self) -> dict[str, Variable | Limited]:
+        return {row.name: row for row in (*self.constraints, *self.variables)}
+
+    def __getitem__(self, name: str) -> Variable | Limited:
+        """The free number or constraint element of a name."""
+        if name not in self._rows:
+            raise InputError(f"no result '{name}'", nearest(name, list(self._rows)))
+        return self._rows[name]
+
+    def derive(self, function: Callable[[Any], Any]) -> Quantity:
+        """Compute a quantity from the fitted model with its error, in linear approximation.
+
+        Parameters
+        ----------
+        function : callable
+            ``function(model)``, an array of any shape, in JAX.
+
+        Returns
+        -------
+        Quantity
+            Value and error of that shape; the error is NaN where the quantity moves along a
+            direction the data do not determine.
+        """
+
+        def of_theta(theta):
+            return function(self.problem.model_at(theta))
+
+        value = np.asarray(of_theta(self.theta))
+        slope = np.asarray(jax.jacfwd(of_theta)(self.theta)).reshape(value.size, -1)
+        variance = np.einsum("ij,jk,ik->i", slope, self.covariance, slope)
+        error = self.scale * np.sqrt(np.maximum(variance, 0.0))
+        unseen = np.abs(slope @ self.undetermined)
+        size = np.abs(slope) @ np.abs(self.undetermined)
+        error = np.where(np.any(unseen > 1e-6 * size + 1e-300, axis=1), np.nan, error)
+        return Quantity(value, error.reshape(value.shape))
+
+    def __str__(self) -> str:
+        """A table of the verdict, the numbers and the active constraints."""
+        per = f", chi2/dof = {self.chi2 / self.dof:.3g}" if self.dof > 0 else ""
+        lines = [f"{self.status}: {self.message}"]
+        lines += [f"chi2 = {self.chi2:.6g}, dof = {self.dof}{per}, KKT = {self.kkt.worst:.1e}"]
+        shown = [v for v, n in zip(self.variables, self.problem.nuisance, strict=True) if not n]
+        width = max((len(row.name) for row in (*shown, *self.constraints)), default=4)
+        for v in shown:
+            error = "undetermined" if np.isnan(v.error) else f"{v.error:.2g}"
+            held = "" if v.state == "free" else f"  {v.state}, gradient {v.reduced_gradient:.3g}"
+            lines.append(f"{v.name:<{width}}  {v.value:>13.6g} ± {error:<12}{held}".rstrip())
+        hidden = len(self.variables) - len(shown)
+        lines += [f"and {hidden} nuisance numbers"] if hidden else []
+        for c in self.constraints:
+            if c.state in ("lower", "upper"):
+                lines.append(
+                    f"{c.name:<{width}}  {c.value:>13.6g} at its {c.state} limit, "
+                    f"multiplier {c.multiplier:.3g}"
+                )
+        return "\n".join(lines)

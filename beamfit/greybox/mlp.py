@@ -1,0 +1,353 @@
+"""Multi-layer perceptrons with gains as outputs (report 3.1.3)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from graphlib import CycleError, TopologicalSorter
+from itertools import pairwise
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from beamfit.errors import InputError, nearest
+from beamfit.greybox import tree
+from beamfit.greybox.activations import KINDS
+from beamfit.greybox.bounds import gain_bounds, over_cells
+from beamfit.greybox.maps import positions
+from beamfit.greybox.sensitivity import gain
+
+__all__ = ["MLP", "Gain", "Layer", "Port", "connection", "dense"]
+
+
+class Layer(NamedTuple):
+    """A layer: its name, one of the seven node functions, its size, and whether it has a bias."""
+
+    name: str
+    kind: str
+    size: int
+    bias: bool = False
+
+
+class Port(NamedTuple):
+    """Where the outside world meets a node: outside value = scale * node value + bias.
+
+    The report does not say which way its scale and bias work; this reading makes both ends alike,
+    and its example values look like standard deviations and means. `lower` and `upper` tell the
+    range over which certified gains hold.
+    """
+
+    name: str
+    layer: str
+    node: int = 0
+    scale: float = 1.0
+    bias: float = 0.0
+    lower: float = -np.inf
+    upper: float = np.inf
+
+
+class Gain(NamedTuple):
+    """A gain as a further output: d(output)/d(by[0])..., of order len(by), 1 to 3.
+
+    `kind` is ``local`` (at the point), ``lower`` or ``upper`` (a certified bound over the whole
+    input range, split into `cells` along each input; first order only).
+    """
+
+    name: str
+    output: str
+    by: tuple[str, ...]
+    kind: str = "local"
+    cells: int = 64
+
+
+def connection(source: str, target: str) -> str:
+    """Name the weights between two layers.
+
+    Examples
+    --------
+    >>> connection("layer0", "layer1")
+    'layer0->layer1'
+    """
+    return f"{source}->{target}"
+
+
+@tree.node("layers", "connections", "input_ports", "output_ports", "gains")
+class MLP:
+    """A network of layers with any connections between them, skips included.
+
+    A node's argument is its bias plus the weighted nodes of all layers connected to it plus, at an
+    input's node, (x - port.bias) / port.scale.
+
+    Parameters
+    ----------
+    layers : sequence of Layer
+        In any order.
+    connections : sequence of (str, str)
+        Source and target layer; no loops.
+    input_ports, output_ports : sequence of Port
+        Named inputs and outputs.
+    weights : mapping of str to array, optional
+        ``"source->target"`` to an array of shape (source size, target size); zero if absent.
+    biases : mapping of str to array, optional
+        Layer name to shape (size,); zero if absent.
+    gains : sequence of Gain, optional
+        Gains that follow the outputs.
+
+    Raises
+    ------
+    InputError
+        If names, shapes or orders do not fit, or the connections form a loop.
+
+    Examples
+    --------
+    >>> net = MLP([Layer("in", "identity", 1), Layer("out", "tanh", 1, bias=True)],
+    ...           [("in", "out")], [Port("u", "in")], [Port("y", "out")],
+    ...           {"in->out": [[2.0]]}, gains=[Gain("dy/du", "y", ("u",))])
+    >>> net.outputs, net(jnp.array([0.0])).tolist()
+    (('y', 'dy/du'), [0.0, 2.0])
+    """
+
+    layers: tuple[Layer, ...]
+    connections: tuple[tuple[str, str], ...]
+    input_ports: tuple[Port, ...]
+    output_ports: tuple[Port, ...]
+    weights: Mapping[str, jax.Array] | None = None
+    biases: Mapping[str, jax.Array] | None = None
+    gains: tuple[Gain, ...] = ()
+
+    def __post_init__(self):
+        for name in ("layers", "input_ports", "output_ports", "gains"):
+            object.__setattr__(self, name, tuple(getattr(self, name)))
+        object.__setattr__(self, "connections", tuple(tuple(c) for c in self.connections))
+        _check_layers(self)
+        _check_ports(self)
+        _check_gains(self)
+        size = {layer.name: layer.size for layer in self.layers}
+        shapes = {connection(a, b): (size[a], size[b]) for a, b in self.connections}
+        object.__setattr__(self, "weights", _arrays(self.weights, shapes, "connection"))
+        shapes = {layer.name: (layer.size,) for layer in self.layers if layer.bias}
+        object.__setattr__(self, "biases", _arrays(self.biases, shapes, "layer with a bias"))
+
+    @property
+    def inputs(self) -> tuple[str, ...]:
+        """Names of the inputs."""
+        return tuple(port.name for port in self.input_ports)
+
+    @property
+    def outputs(self) -> tuple[str, ...]:
+        """Names of the outputs, then of the gains."""
+        return tuple(port.name for port in (*self.output_ports, *self.gains))
+
+    @property
+    def order(self) -> tuple[Layer, ...]:
+        """The layers in an order of computation."""
+        return tuple(self.layers[i] for i in _order(self.layers, self.connections))
+
+    def __call__(self, x: jax.Array) -> jax.Array:
+        """Outputs and gains at one point."""
+        return jnp.concatenate([self.values(x), *(g[None] for g in self._gains(x))])
+
+    def values(self, x: jax.Array) -> jax.Array:
+        """Outputs without the gains.
+
+        Parameters
+        ----------
+        x : array, shape (inputs,)
+            The point.
+
+        Returns
+        -------
+        jax.Array, shape (output ports,)
+        """
+        nodes: dict[str, jax.Array] = {}
+        for layer in self.order:
+            s = self.biases.get(layer.name, jnp.zeros(layer.size))
+            for source, target in self.connections:
+                if target == layer.name:
+                    s = s + nodes[source] @ self.weights[connection(source, target)]
+            for i, port in enumerate(self.input_ports):
+                if port.layer == layer.name:
+                    s = s.at[port.node].add((x[i] - port.bias) / port.scale)
+            nodes[layer.name] = KINDS[layer.kind].function(s)
+        return jnp.stack([p.scale * nodes[p.layer][p.node] + p.bias for p in self.output_ports])
+
+    def _gains(self, x: jax.Array) -> list[jax.Array]:
+        """Values of the gains asked for."""
+        plain = MLP(
+            self.layers,
+            self.connections,
+            self.input_ports,
+            self.output_ports,
+            self.weights,
+            self.biases,
+        )
+        return [
+            gain(plain, x, g.output, g.by) if g.kind == "local" else _certified(plain, g)
+            for g in self.gains
+        ]
+
+
+def _certified(net: MLP, asked: Gain) -> jax.Array:
+    """The certified bound of a gain over the range of the input ports."""
+    (row,) = positions([asked.output], net.outputs)
+    (column,) = positions(asked.by, net.inputs)
+    low = np.array([port.lower for port in net.input_ports])
+    high = np.array([port.upper for port in net.input_ports])
+    if not np.all(np.isfinite(high - low)):
+        bound = gain_bounds(net, low, high)
+        return (bound.lower if asked.kind == "lower" else bound.upper)[row, column]
+    bound = over_cells(net, low, high, asked.cells)
+    if asked.kind == "lower":
+        return jnp.min(bound.lower[:, row, column])
+    return jnp.max(bound.upper[:, row, column])
+
+
+def _order(layers, connections) -> list[int]:
+    """Positions of the layers, sources before targets."""
+    names = [layer.name for layer in layers]
+    before = {name: {a for a, b in connections if b == name} for name in names}
+    try:
+        return [names.index(name) for name in TopologicalSorter(before).static_order()]
+    except CycleError as error:
+        raise InputError(
+            f"a loop of connections {' -> '.join(error.args[1])}", "connections without loops"
+        ) from None
+
+
+def _check_layers(net: MLP) -> None:
+    """Refuse unknown node functions, doubled names and connections that lead nowhere."""
+    names = [layer.name for layer in net.layers]
+    for layer in net.layers:
+        if names.count(layer.name) > 1:
+            raise InputError(f"two layers named '{layer.name}'", "each name once")
+        if layer.kind not in KINDS:
+            raise InputError(f"layer type '{layer.kind}'", nearest(layer.kind, list(KINDS)))
+        if layer.kind == "identity" and layer.bias:
+            raise InputError(f"a bias on the identity layer '{layer.name}'", "type linear for it")
+        if layer.size < 1:
+            raise InputError(f"layer '{layer.name}' of size {layer.size}", "at least one node")
+    for pair in net.connections:
+        positions(pair, names, "layer")
+        if net.connections.count(pair) > 1:
+            raise InputError(f"two connections {connection(*pair)}", "each connection once")
+    _order(net.layers, net.connections)
+
+
+def _check_ports(net: MLP) -> None:
+    """Refuse ports on nodes that do not exist and scales that lose the value."""
+    sizes = {layer.name: layer.size for layer in net.layers}
+    for port in (*net.input_ports, *net.output_ports):
+        positions([port.layer], list(sizes), "layer")
+        if not 0 <= port.node < sizes[port.layer]:
+            raise InputError(
+                f"'{port.name}' at node {port.node} of layer '{port.layer}'",
+                f"a node from 0 to {sizes[port.layer] - 1}",
+            )
+        if port.scale == 0 or not np.isfinite(port.scale):
+            raise InputError(f"scale {port.scale} at '{port.name}'", "a finite number, not zero")
+    if not net.input_ports or not net.output_ports:
+        raise InputError("a network without inputs or outputs", "at least one of each")
+    for names in (net.inputs, net.outputs):
+        if len(set(names)) < len(names):
+            raise InputError(f"names {', '.join(names)}", "each name once")
+
+
+def _check_gains(net: MLP) -> None:
+    """Refuse gains of orders or kinds that do not exist."""
+    for asked in net.gains:
+        positions([asked.output], [port.name for port in net.output_ports], "output")
+        positions(asked.by, net.inputs, "input")
+        if not 1 <= len(asked.by) <= 3:
+            raise InputError(f"gain '{asked.name}' of order {len(asked.by)}", "order 1, 2 or 3")
+        if asked.kind not in ("local", "lower", "upper"):
+            raise InputError(
+                f"gain type '{asked.kind}'", nearest(asked.kind, ["local", "lower", "upper"])
+            )
+        if asked.kind != "local" and len(asked.by) > 1:
+            raise InputError(
+                f"a {asked.kind} bound on the gain '{asked.name}' of order {len(asked.by)}",
+                "order 1: bounds are certified for first-order gains",
+            )
+
+
+def _arrays(given, shapes: Mapping[str, tuple[int, ...]], what: str) -> dict[str, jax.Array]:
+    """Arrays by name, zero where none is given."""
+    given = dict(given or {})
+    positions(list(given), list(shapes), what)
+    found = {}
+    for name, shape in shapes.items():
+        found[name] = jnp.asarray(given.get(name, np.zeros(shape)), float)
+        if found[name].shape != shape:
+            raise InputError(
+                f"values of shape {found[name].shape} for {what} '{name}'", f"shape {shape}"
+            )
+    return found
+
+
+def dense(
+    inputs: Sequence[str | Port],
+    outputs: Sequence[str | Port],
+    hidden: Sequence[int] = (5,),
+    kind: str = "tanh",
+    seed: int = 0,
+    spread: float = 1.0,
+    gains: Sequence[Gain] = (),
+) -> MLP:
+    """Build a network of fully connected layers with random weights.
+
+    Parameters
+    ----------
+    inputs, outputs : sequence of str or Port
+        Names, or ports that carry scale, bias and range (their layer and node are set here).
+    hidden : sequence of int
+        Sizes of the hidden layers.
+    kind : str
+        Node function of the hidden layers; the last layer is linear with a bias.
+    seed : int
+        Of the random weights.
+    spread : float
+        Weights are normal with standard deviation spread / sqrt(source size), biases with spread.
+    gains : sequence of Gain
+        Gains to append to the outputs.
+
+    Returns
+    -------
+    MLP
+
+    Raises
+    ------
+    InputError
+        If the parts do not fit.
+
+    Examples
+    --------
+    >>> net = dense(["c"], ["A", "B"], hidden=[5])
+    >>> [leaf.size for leaf in tree.leaves(net)]
+    [5, 10, 5, 2]
+    """
+    sizes = [len(inputs), *hidden, len(outputs)]
+    kinds = ["identity", *[kind] * len(hidden), "linear"]
+    names = [f"layer{i}" for i in range(len(sizes))]
+    layers = [
+        Layer(name, kind, size, i > 0)
+        for i, (name, kind, size) in enumerate(zip(names, kinds, sizes, strict=True))
+    ]
+    random = np.random.default_rng(seed)
+    pairs = list(pairwise(names))
+    weights = {
+        connection(*pair): random.normal(0, spread / np.sqrt(shape[0]), shape)
+        for pair, shape in zip(pairs, pairwise(sizes), strict=True)
+    }
+    biases = {
+        name: random.normal(0, spread, n) for name, n in zip(names[1:], sizes[1:], strict=True)
+    }
+    return MLP(
+        layers, pairs, _ports(inputs, names[0]), _ports(outputs, names[-1]), weights, biases, gains
+    )
+
+
+def _ports(given: Sequence[str | Port], layer: str) -> list[Port]:
+    """Ports on the nodes of one layer, in order."""
+    ports = [p if isinstance(p, Port) else Port(p, layer) for p in given]
+    return [port._replace(layer=layer, node=i) for i, port in enumerate(ports)]

@@ -1,0 +1,272 @@
+"""What is to be fitted: a model, its free numbers, and everything that is known about them.
+
+A problem is stated with functions of ``(model, data)``, where the model is any JAX tree and its
+numbers are addressed by path. It offers them as functions of one flat vector ``theta`` of the free
+numbers, pure and in JAX: residuals, cost, constraints, log-probability. Fits, samplers and studies
+stand on these.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from beamfit.errors import InputError
+from beamfit.greybox import tree
+from beamfit.greybox.terms import Constraint, Free, Objective, Prior, Record
+
+__all__ = ["Constraint", "Free", "Objective", "Prior", "Problem", "Record"]
+
+
+@tree.node("chosen")
+class Core:
+    """The part of a problem JAX sees: arrays to trace, structure to compile for."""
+
+    chosen: tuple[tree.Leaf, ...]
+    model: Any
+    records: tuple[Record, ...]
+    priors: tuple[Prior, ...]
+    constraints: tuple[Constraint, ...]
+    objectives: tuple[Objective, ...]
+
+
+def _model_at(core: Core, theta: jax.Array) -> Any:
+    return tree.replace(core.model, core.chosen, theta)
+
+
+@jax.jit
+def residual(core: Core, theta: jax.Array) -> jax.Array:
+    """Residuals of every record, then of every prior, as one vector."""
+    model = _model_at(core, theta)
+    parts = [part.residual(model) for part in (*core.records, *core.priors)]
+    return jnp.concatenate(parts) if parts else jnp.zeros(0)
+
+
+@jax.jit
+def cost(core: Core, theta: jax.Array) -> jax.Array:
+    """Half the sum of squared residuals plus the further objectives."""
+    r = residual(core, theta)
+    model = _model_at(core, theta)
+    extra = [jnp.sum(o.weight * o.function(model, o.data)) for o in core.objectives]
+    return 0.5 * r @ r + sum(extra)
+
+
+@jax.jit
+def constraints(core: Core, theta: jax.Array) -> jax.Array:
+    """Values of every constraint as one vector."""
+    model = _model_at(core, theta)
+    parts = [jnp.ravel(c.function(model, c.data)) for c in core.constraints]
+    return jnp.concatenate(parts) if parts else jnp.zeros(0)
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """A fit to be done.
+
+    Parameters
+    ----------
+    model : pytree
+        Holds every number, free or not; free numbers start from its values.
+    free : sequence of Free
+        Which are free, within which bounds. Each number at most once.
+    records : sequence of Record
+        Measured data. Several records share the model's numbers.
+    priors : sequence of Prior
+    constraints : sequence of Constraint
+    objectives : sequence of Objective
+
+    Raises
+    ------
+    InputError
+        If a path is unknown, a number free twice, bounds do not fit a leaf's shape, a prediction
+        does not fit its measured values, or nothing is free or asked.
+
+    Examples
+    --------
+    >>> def line(model, x):
+    ...     return model["slope"] * x + model["offset"]
+    >>> x = np.array([0.0, 1.0, 2.0])
+    >>> problem = Problem({"slope": 1.0, "offset": 0.0}, [Free("slope"), Free("offset", 0, 1)],
+    ...                   [Record("scan", line, x, measured=2 * x, error=0.1)])
+    >>> problem.names
+    ('slope', 'offset')
+    >>> [round(float(v), 3) for v in problem.residual(np.array([1.0, 0.0]))]
+    [0.0, -10.0, -20.0]
+    """
+
+    model: Any
+    free: Sequence[Free]
+    records: Sequence[Record] = ()
+    priors: Sequence[Prior] = ()
+    constraints: Sequence[Constraint] = ()
+    objectives: Sequence[Objective] = ()
+    core: Core = field(init=False, repr=False)
+
+    def __post_init__(self):
+        model = jax.tree_util.tree_map(lambda v: jnp.asarray(v, float), self.model)
+        spread = [(leaf, f) for f in self.free for leaf in tree.find_leaves(model, f.path)]
+        paths = [leaf.path for leaf, _ in spread]
+        twice = sorted({path for path in paths if paths.count(path) > 1})
+        if twice:
+            raise InputError(f"'{twice[0]}' free twice", "each number free at most once")
+        if not paths:
+            raise InputError("no free number", "at least one")
+        if not (self.records or self.priors or self.objectives):
+            raise InputError("nothing to fit", "a record, a prior or an objective")
+        groups = [
+            tuple(group) for group in (self.records, self.priors, self.constraints, self.objectives)
+        ]
+        for name, group in zip(_GROUPS, groups, strict=True):
+            object.__setattr__(self, name, group)
+        object.__setattr__(self, "free", tuple(self.free))
+        object.__setattr__(self, "core", Core(tuple(leaf for leaf, _ in spread), model, *groups))
+        object.__setattr__(self, "_spread", tuple(spread))
+        _check_shapes(self)
+
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        """Name of each free number."""
+        return tuple(name for leaf in self.core.chosen for name in tree.element_names(leaf))
+
+    @cached_property
+    def start(self) -> np.ndarray:
+        """The model's own values of the free numbers."""
+        return np.asarray(tree.read(self.core.model, self.core.chosen))
+
+    @cached_property
+    def lower(self) -> np.ndarray:
+        """Lower bound of each free number."""
+        return self._column("lower")
+
+    @cached_property
+    def upper(self) -> np.ndarray:
+        """Upper bound of each free number."""
+        return self._column("upper")
+
+    @cached_property
+    def nuisance(self) -> np.ndarray:
+        """Whether each free number is one nobody asks for."""
+        return self._column("nuisance").astype(bool)
+
+    @cached_property
+    def start_range(self) -> np.ndarray:
+        """Range of random starts, shape (2, free); NaN where none was given."""
+        ends = [
+            np.tile((np.nan, np.nan) if f.start is None else f.start, (leaf.size, 1))
+            for leaf, f in self._spread
+        ]
+        return np.concatenate(ends).T
+
+    @cached_property
+    def constraint_names(self) -> tuple[str, ...]:
+        """Name of each constraint element."""
+        leaves = (tree.Leaf(0, c.name, shape) for c, shape in self._constraint_shapes)
+        return tuple(name for leaf in leaves for name in tree.element_names(leaf))
+
+    @cached_property
+    def constraint_lower(self) -> np.ndarray:
+        """Lower limit of each constraint element."""
+        return self._limits("lower")
+
+    @cached_property
+    def constraint_upper(self) -> np.ndarray:
+        """Upper limit of each constraint element."""
+        return self._limits("upper")
+
+    @property
+    def errors_known(self) -> bool:
+        """Whether any record brings measurement errors."""
+        return any(record.error is not None for record in self.records)
+
+    def model_at(self, theta) -> Any:
+        """The model with the free numbers set to theta."""
+        return _model_at(self.core, jnp.asarray(theta, float))
+
+    def residual(self, theta) -> jax.Array:
+        """Residuals in units of their errors, priors last, shape (values,)."""
+        return residual(self.core, jnp.asarray(theta, float))
+
+    def cost(self, theta) -> jax.Array:
+        """Half of chi-square (priors included) plus the weighted objectives."""
+        return cost(self.core, jnp.asarray(theta, float))
+
+    def constraint_values(self, theta) -> jax.Array:
+        """Values of the constraint elements."""
+        return constraints(self.core, jnp.asarray(theta, float))
+
+    def log_probability(self, theta) -> jax.Array:
+        """Log of the posterior density up to a constant: -cost, and -inf outside bounds and limits.
+
+        A record without errors counts with errors of 1; set its noise before sampling.
+        """
+        theta = jnp.asarray(theta, float)
+        inside = jnp.all((theta >= self.lower) & (theta <= self.upper))
+        if self.constraints:
+            c = self.constraint_values(theta)
+            inside &= jnp.all((c >= self.constraint_lower) & (c <= self.constraint_upper))
+        value = -self.cost(theta)
+        return jnp.where(inside & jnp.isfinite(value), value, -jnp.inf)
+
+    def _column(self, what: str) -> np.ndarray:
+        """One property of `Free`, spread over the elements."""
+        parts = []
+        for leaf, f in self._spread:
+            value = np.asarray(getattr(f, what), float)
+            if value.shape not in ((), leaf.shape):
+                raise InputError(
+                    f"{what} of shape {value.shape} for '{leaf.path}'",
+                    f"a number or an array of shape {leaf.shape}",
+                )
+            parts.append(np.broadcast_to(value, leaf.shape).ravel())
+        return np.concatenate(parts)
+
+    @cached_property
+    def _constraint_shapes(self) -> list[tuple[Constraint, tuple[int, ...]]]:
+        """Each constraint with the shape of its values."""
+        return [
+            (c, jax.eval_shape(c.function, self.core.model, c.data).shape) for c in self.constraints
+        ]
+
+    def _limits(self, what: str) -> np.ndarray:
+        """One limit of every constraint, spread over its elements."""
+        parts = [np.zeros(0)]
+        for c, shape in self._constraint_shapes:
+            try:
+                parts.append(np.broadcast_to(np.asarray(getattr(c, what), float), shape).ravel())
+            except ValueError:
+                raise InputError(
+                    f"{what} limit of shape {np.shape(getattr(c, what))} for '{c.name}'",
+                    f"a number or an array that spreads to shape {shape}",
+                ) from None
+        return np.concatenate(parts)
+
+
+_GROUPS = ("records", "priors", "constraints", "objectives")
+
+
+def _check_shapes(problem: Problem) -> None:
+    """Refuse predictions, priors and limits whose shapes do not fit, before anything runs."""
+    for record in problem.records:
+        found = jax.eval_shape(record.predict, problem.core.model, record.data).shape
+        if found != record.measured.shape:
+            raise InputError(
+                f"a prediction of shape {found} for record '{record.name}'",
+                f"the shape of its measured values, {record.measured.shape}",
+            )
+        if record.error is not None and record.error.shape not in ((), record.measured.shape):
+            raise InputError(
+                f"errors of shape {record.error.shape} in record '{record.name}'",
+                f"a number or the shape of the measured values, {record.measured.shape}",
+            )
+    for prior in problem.priors:
+        jax.eval_shape(prior.residual, problem.core.model)
+    known = [record.error is not None for record in problem.records]
+    if any(known) and not all(known):
+        raise InputError("records with and without errors", "errors for all records or for none")
+    _ = (problem.lower, problem.upper, problem.constraint_lower, problem.constraint_upper)

@@ -1,0 +1,227 @@
+"""Models as trees of numbers: dataclasses JAX can walk, and leaves addressed by path."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any, NamedTuple, TypeVar, dataclass_transform
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from beamfit.errors import InputError, nearest
+
+__all__ = ["Leaf", "element_names", "find_leaves", "leaves", "node", "read", "replace"]
+
+C = TypeVar("C", bound=type)
+
+
+@dataclass_transform(frozen_default=True)
+def node(*static: str):
+    """Make a class a frozen dataclass that JAX walks: `static` fields are structure, the rest data.
+
+    Unlike `jax.tree_util.register_dataclass`, rebuilding does not run ``__post_init__``, so a
+    class can check its input on construction and still hold traced arrays inside JAX.
+
+    Parameters
+    ----------
+    *static : str
+        Names of the fields that are structure (hashable, compared by value).
+
+    Returns
+    -------
+    decorator
+        Turns a class with annotated fields into the registered dataclass.
+
+    Examples
+    --------
+    >>> @node("name")
+    ... class Scaled:
+    ...     name: str
+    ...     factor: float
+    >>> jax.tree_util.tree_leaves(Scaled("a", 2.0))
+    [2.0]
+    """
+
+    def decorate(cls: C) -> C:
+        cls = dataclasses.dataclass(frozen=True, eq=False)(cls)
+        names = [f.name for f in dataclasses.fields(cls)]
+        data = [name for name in names if name not in static]
+
+        def flatten(value):
+            return [getattr(value, name) for name in data], tuple(
+                getattr(value, name) for name in static
+            )
+
+        def flatten_with_keys(value):
+            children, structure = flatten(value)
+            keys = (jax.tree_util.GetAttrKey(name) for name in data)
+            return list(zip(keys, children, strict=True)), structure
+
+        def unflatten(structure, children):
+            value = object.__new__(cls)
+            for name, part in zip([*static, *data], [*structure, *children], strict=True):
+                object.__setattr__(value, name, part)
+            return value
+
+        jax.tree_util.register_pytree_with_keys(cls, flatten_with_keys, unflatten, flatten)
+        return cls
+
+    return decorate
+
+
+class Leaf(NamedTuple):
+    """One array of a tree: its place among the leaves, its path and its shape."""
+
+    index: int
+    path: str
+    shape: tuple[int, ...]
+
+    @property
+    def size(self) -> int:
+        """Number of elements."""
+        return int(np.prod(self.shape, dtype=int))
+
+
+def leaves(tree: Any) -> tuple[Leaf, ...]:
+    """List the leaves of a tree with their paths.
+
+    Parameters
+    ----------
+    tree : pytree
+        Any JAX tree.
+
+    Returns
+    -------
+    tuple of Leaf
+        In JAX's order; a path reads ``sigma.s11`` or ``map.layers.1.bias``.
+
+    Examples
+    --------
+    >>> [leaf.path for leaf in leaves({"a": 1.0, "b": (2.0, 3.0)})]
+    ['a', 'b.0', 'b.1']
+    """
+    found = jax.tree_util.tree_leaves_with_path(tree)
+    return tuple(
+        Leaf(i, jax.tree_util.keystr(path, simple=True, separator="."), jnp.shape(value))
+        for i, (path, value) in enumerate(found)
+    )
+
+
+def find_leaves(tree: Any, path: str) -> tuple[Leaf, ...]:
+    """Find the leaf at a path, or every leaf below it.
+
+    Parameters
+    ----------
+    tree : pytree
+        The model.
+    path : str
+        A leaf's path, or the path of a part that contains leaves; ``""`` is the whole.
+
+    Returns
+    -------
+    tuple of Leaf
+        At least one.
+
+    Raises
+    ------
+    InputError
+        If nothing lies at that path.
+
+    Examples
+    --------
+    >>> [leaf.path for leaf in find_leaves({"a": 1.0, "b": (2.0, 3.0)}, "b")]
+    ['b.0', 'b.1']
+    """
+    every = leaves(tree)
+    found = tuple(
+        leaf
+        for leaf in every
+        if path == "" or leaf.path == path or leaf.path.startswith(path + ".")
+    )
+    if not found:
+        known = nearest(path, [leaf.path for leaf in every])
+        raise InputError(f"no leaf at '{path}'", f"a path in the model: {known}")
+    return found
+
+
+def element_names(leaf: Leaf) -> tuple[str, ...]:
+    """Name each number of a leaf.
+
+    Parameters
+    ----------
+    leaf : Leaf
+        A leaf of any shape.
+
+    Returns
+    -------
+    tuple of str
+        ``path`` for a scalar, ``path[i,j]`` in C order otherwise.
+
+    Examples
+    --------
+    >>> element_names(Leaf(0, "w", (2, 1)))
+    ('w[0,0]', 'w[1,0]')
+    """
+    if leaf.shape == ():
+        return (leaf.path,)
+    return tuple(f"{leaf.path}[{','.join(map(str, i))}]" for i in np.ndindex(*leaf.shape))
+
+
+def read(tree: Any, chosen: Sequence[Leaf]) -> jax.Array:
+    """Gather leaves into one flat vector.
+
+    Parameters
+    ----------
+    tree : pytree
+        The model.
+    chosen : sequence of Leaf
+        Which leaves, in this order.
+
+    Returns
+    -------
+    jax.Array, shape (n,)
+        Their elements.
+
+    Examples
+    --------
+    >>> model = {"a": 1.0, "b": (2.0, 3.0)}
+    >>> read(model, find_leaves(model, "b")).tolist()
+    [2.0, 3.0]
+    """
+    values = jax.tree_util.tree_leaves(tree)
+    parts = [jnp.ravel(jnp.asarray(values[leaf.index], float)) for leaf in chosen]
+    return jnp.concatenate(parts) if parts else jnp.zeros(0)
+
+
+def replace(tree: Any, chosen: Sequence[Leaf], vector: jax.Array) -> Any:
+    """Return the tree with the chosen leaves taken from a flat vector.
+
+    Parameters
+    ----------
+    tree : pytree
+        The model.
+    chosen : sequence of Leaf
+        Which leaves, in the order of the vector.
+    vector : array, shape (n,)
+        Their new elements.
+
+    Returns
+    -------
+    pytree
+        Of the same structure.
+
+    Examples
+    --------
+    >>> model = {"a": 1.0, "b": (2.0, 3.0)}
+    >>> new = replace(model, find_leaves(model, "b"), jnp.array([5.0, 6.0]))
+    >>> float(new["b"][1])
+    6.0
+    """
+    values, structure = jax.tree_util.tree_flatten(tree)
+    start = 0
+    for leaf in chosen:
+        values[leaf.index] = jnp.reshape(vector[start : start + leaf.size], leaf.shape)
+        start += leaf.size
+    return jax.tree_util.tree_unflatten(structure, values)
