@@ -195,7 +195,7 @@ def test_a_voltage_at_its_limit_has_no_error(fit, sample):
 def test_the_next_decay_closes_the_gap(machine, decays):
     """Without scraper scan the proposal is to move the scraper, and recording it does help."""
     still = [d for d in decays[:15] if d.segment.conditions.scraper_y[0] > 5.9e-3]
-    fit = fit_scales(still, machine)
+    fit = fit_scales(still, machine, priors={"elastic": (1.0, 0.3)})
     candidates = [
         Candidate(machine.operation._replace(scraper_y=y, rf_voltage=v), 500.0, 5760.0, 2e-3)
         for y in (6e-3, 2e-3)
@@ -205,7 +205,7 @@ def test_the_next_decay_closes_the_gap(machine, decays):
     assert first.candidate.operation.scraper_y == 2e-3
     assert first.information > 0
     [scraped] = [d for d in decays[5:10] if d.segment.conditions.scraper_y[0] == 2e-3]
-    better = fit_scales([*still, scraped], machine)
+    better = fit_scales([*still, scraped], machine, priors={"elastic": (1.0, 0.3)})
     assert better.covariance[2, 2] < 0.5 * fit.covariance[2, 2]
     # The expected error is that of a like decay, within what its other settings change.
     assert better.covariance[2, 2] ** 0.5 == pytest.approx(first.errors[2], rel=0.5)
