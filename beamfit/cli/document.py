@@ -34,7 +34,10 @@ def command_line() -> str:
 
 
 def json_text(
-    command: str, inputs: Mapping[str, str | None], results: Sequence[Mapping[str, Any]]
+    command: str,
+    inputs: Mapping[str, str | None],
+    results: Sequence[Mapping[str, Any]],
+    further: Mapping[str, Any] | None = None,
 ) -> str:
     """Write the one JSON object of a command.
 
@@ -46,6 +49,8 @@ def json_text(
         Input files and their SHA-256.
     results : sequence of mapping
         One entry a result.
+    further : mapping, optional
+        What concerns all results together, after them.
 
     Returns
     -------
@@ -58,6 +63,7 @@ def json_text(
     [{'a': None}]
     """
     document = {"beamfit": __version__, "command": command, "inputs": inputs, "results": results}
+    document |= further or {}
     return json.dumps(_finite(document), indent=2, ensure_ascii=False, allow_nan=False)
 
 

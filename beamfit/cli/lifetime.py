@@ -13,6 +13,7 @@ from beamfit.io.files import digest
 
 if TYPE_CHECKING:
     from beamfit.studies.decays import RecordStudy
+    from beamfit.studies.shift import Shift
 
 __all__ = ["lifetime"]
 
@@ -21,6 +22,7 @@ Examples:
   beamfit lifetime measurements/aps_1999_decay.csv
   beamfit lifetime fill1.csv fill2.h5 --ring lattices/spear3_2003.toml
   beamfit lifetime fill1.csv --ring ring.toml --report fill1.html --json
+  beamfit lifetime measurements/spear3_shift_simulated.csv --ring lattices/spear3_2003.toml --study
 """
 
 
@@ -40,8 +42,16 @@ Examples:
     default=None,
     help="Write a report page.",
 )
+@click.option(
+    "--study",
+    is_flag=True,
+    help="Fit the ring's loss mechanisms to all decays together: scales, loss budget with credible "
+    "intervals, best operating point, next decay, anomaly. Needs --ring.",
+)
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object and nothing else.")
-def lifetime(record: tuple[str, ...], ring: str | None, report: str | None, as_json: bool) -> None:
+def lifetime(
+    record: tuple[str, ...], ring: str | None, report: str | None, study: bool, as_json: bool
+) -> None:
     """Fit the lifetime to decay records and say what they cannot tell.
 
     RECORD is a CSV or HDF5 file with columns such as time_s (or ISO time), beam_current_mA,
@@ -50,6 +60,8 @@ def lifetime(record: tuple[str, ...], ring: str | None, report: str | None, as_j
     dI/dt = -a I² - b I, the lifetime at its start, mean current and end, and a verdict.
     """
     check_report_name(report)
+    if study and ring is None:
+        raise InputError("--study without a ring", "--ring FILE.toml")
     inputs = {path: digest(path) for path in record}
     if len(inputs) < len(record):
         twice = next(path for path in record if record.count(path) > 1)
@@ -69,26 +81,35 @@ def lifetime(record: tuple[str, ...], ring: str | None, report: str | None, as_j
     from beamfit.studies.decays import study_record
 
     studies = tuple(study_record(each, machine) for each in records)
+    shift = None
+    if study:
+        from beamfit.studies.shift import study_shift
+
+        shift = study_shift([decay for each in studies for decay in each.decays], machine)
     command = command_line()
     if report is not None:
         from beamfit.report.page import write_report
 
-        write_report(report, studies, command=command, inputs=inputs)
+        write_report(report, studies, command=command, inputs=inputs, shift=shift)
     if as_json:
         results = [decay.to_json() for study in studies for decay in study.decays]
-        click.echo(json_text(command, inputs, results))
+        further = {} if shift is None else {"study": shift.to_json()}
+        click.echo(json_text(command, inputs, results, further))
     else:
-        _print(studies, report)
+        _print(studies, shift, report)
 
 
-def _print(studies: tuple[RecordStudy, ...], report: str | None) -> None:
+def _print(studies: tuple[RecordStudy, ...], shift: Shift | None, report: str | None) -> None:
     from rich.console import Console
 
-    from beamfit.cli.terminal import decay_tables
+    from beamfit.cli.terminal import decay_tables, shift_lines
 
     console = Console(highlight=False)
     for study in studies:
         for shown in decay_tables(study):
             console.print(shown)
+    if shift is not None:
+        for line in shift_lines(shift):
+            console.print(line)
     if report is not None:
         console.print(f"Report written to {report}", style="bold")

@@ -9,14 +9,22 @@ from rich.text import Text
 
 from beamfit.inference.quantity import Status
 from beamfit.studies.decay_tables import budget_rows as loss_rows
-from beamfit.studies.decay_tables import decay_rows, separability_rows
+from beamfit.studies.decay_tables import decay_rows, separability_rows, shift_rows
 from beamfit.studies.decays import RecordStudy
 from beamfit.studies.fit import EmittanceFit
 from beamfit.studies.results import PlaneFit
 from beamfit.studies.sensitivity import budget_rows, range_rows
+from beamfit.studies.shift import Shift
 from beamfit.studies.tables import result_rows
 
-__all__ = ["budget_table", "decay_tables", "range_table", "result_table", "verdict_lines"]
+__all__ = [
+    "budget_table",
+    "decay_tables",
+    "range_table",
+    "result_table",
+    "shift_lines",
+    "verdict_lines",
+]
 
 COLOUR = {Status.converged: "green", Status.poor_fit: "yellow"}
 # Decays beside one another in one table.
@@ -79,6 +87,17 @@ def decay_tables(study: RecordStudy) -> Iterator[Table | Text]:
         if losses:
             yield _result_table("\nLosses from first principles", names, statuses, losses)
         yield Text("")
+
+
+def shift_lines(shift: Shift) -> Iterator[Table | Text]:
+    """Lay out a study of many decays and its verdicts."""
+    fit = shift.fit
+    names = [f"{len(fit.names)} decays"]
+    yield _result_table("First principles fitted to", names, [fit.status], shift_rows(shift))
+    yield _verdict("all decays", fit.status, fit.message)
+    yield _verdict("operating point", Status.converged, shift.best.message)
+    if shift.anomaly is not None:
+        yield _verdict("second half", shift.anomaly.status, shift.anomaly.message)
 
 
 def _verdict(name: str, status: Status, message: str) -> Text:

@@ -6,8 +6,15 @@ from collections.abc import Mapping, Sequence
 
 from beamfit.report.decay_figures import decay_pictures
 from beamfit.report.document import Page, Table, Verdict, by_name, provenance, written
-from beamfit.studies.decay_tables import budget_rows, decay_rows, event_rows, separability_rows
+from beamfit.studies.decay_tables import (
+    budget_rows,
+    decay_rows,
+    event_rows,
+    separability_rows,
+    shift_rows,
+)
 from beamfit.studies.decays import Decay, RecordStudy
+from beamfit.studies.shift import Shift
 
 __all__ = ["decay_page"]
 
@@ -20,12 +27,19 @@ BUDGET = (
     "Computed for the ring file and the record's own settings, nothing fitted. The percentages are "
     "shares of the computed loss at the mean current."
 )
+SHIFT = (
+    "Scales multiply the ring file's first principles. Brackets are 68 % credible intervals. The "
+    "best point is sought within the range of settings seen."
+)
 # Decays beside one another in one table.
 ABREAST = 2
 
 
 def decay_page(
-    studies: Sequence[RecordStudy], command: str | None, inputs: Mapping[str, str | None] | None
+    studies: Sequence[RecordStudy],
+    command: str | None,
+    inputs: Mapping[str, str | None] | None,
+    shift: Shift | None = None,
 ) -> Page:
     """Lay out decay records.
 
@@ -37,6 +51,8 @@ def decay_page(
         The command that made it.
     inputs : mapping of str to str, or None
         Input files and their SHA-256.
+    shift : Shift, optional
+        The study of all decays together.
 
     Returns
     -------
@@ -44,7 +60,8 @@ def decay_page(
     """
     decays = [decay for study in studies for decay in study.decays]
     groups = [decays[k : k + ABREAST] for k in range(0, len(decays), ABREAST)]
-    tables = [_table("Result", group, decay_rows, ERRORS) for group in groups[:1]]
+    tables = [] if shift is None else [by_name("All decays", ["value"], shift_rows(shift), SHIFT)]
+    tables += [_table("Result", group, decay_rows, ERRORS) for group in groups[:1]]
     tables += [_table("Result, continued", group, decay_rows) for group in groups[1:]]
     tables += [_table("What the records determine", group, separability_rows) for group in groups]
     tables += [
@@ -65,7 +82,7 @@ def decay_page(
     return Page(
         title=f"Beam lifetime of {title}",
         subtitle=f"{count} in {hours:.3g} h of record; {written()}",
-        verdicts=[_verdict(decay) for decay in decays],
+        verdicts=_shift_verdicts(shift) + [_verdict(decay) for decay in decays],
         tables=tables,
         pictures=decay_pictures(studies),
         pictures_title="Records and fits",
@@ -83,3 +100,17 @@ def _verdict(decay: Decay) -> Verdict:
     value = f"lifetime {fit.lifetime_mean} at {fit.mean_current:.4g} mA"
     headline = value if fit.lifetime_mean.error is not None else "lifetime not determined"
     return Verdict(fit.status.value, f"{fit.record}: {headline}", fit.message)
+
+
+def _shift_verdicts(shift: Shift | None) -> list[Verdict]:
+    if shift is None:
+        return []
+    fit, best = shift.fit, shift.best
+    said = [
+        Verdict(fit.status.value, f"{len(fit.names)} decays together", fit.message),
+        Verdict("converged", f"best lifetime {best.lifetime}", best.message),
+    ]
+    found = shift.anomaly
+    if found is not None:
+        said.append(Verdict(found.status.value, "second half against the first", found.message))
+    return said

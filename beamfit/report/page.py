@@ -17,6 +17,7 @@ from beamfit.report.figures import STYLE
 from beamfit.report.pdf import pdf_of
 from beamfit.studies.decays import RecordStudy
 from beamfit.studies.fit import EmittanceFit
+from beamfit.studies.shift import Shift
 
 __all__ = ["write_report"]
 
@@ -27,6 +28,7 @@ def write_report(
     *,
     command: str | None = None,
     inputs: Mapping[str, str | None] | None = None,
+    shift: Shift | None = None,
 ) -> None:
     """Write a report page of a fit.
 
@@ -40,6 +42,8 @@ def write_report(
         The command that made it.
     inputs : mapping of str to str, optional
         Input files and their SHA-256; a scan's own if None.
+    shift : Shift, optional
+        The study of all decays together, to go before them.
 
     Raises
     ------
@@ -53,8 +57,10 @@ def write_report(
     suffix = Path(path).suffix.lower()
     if suffix not in (".html", ".pdf"):
         raise InputError(f"report '{path}'", "a name ending in .html or .pdf", path=path)
-    lay_out = emittance_page if isinstance(result, EmittanceFit) else decay_page
     with rc_context(STYLE):
-        page = lay_out(result, command, inputs)
+        if isinstance(result, EmittanceFit):
+            page = emittance_page(result, command, inputs)
+        else:
+            page = decay_page(result, command, inputs, shift)
         content = html_of(page) if suffix == ".html" else pdf_of(page)
     write_atomically(path, content)

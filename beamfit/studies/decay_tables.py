@@ -5,9 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 from beamfit.inference.quantity import Quantity
+from beamfit.lifetime.scaled import MECHANISMS
 from beamfit.studies.decays import Decay, RecordStudy
+from beamfit.studies.shift import Shift
 
-__all__ = ["budget_rows", "decay_rows", "event_rows", "separability_rows"]
+__all__ = ["budget_rows", "decay_rows", "event_rows", "separability_rows", "shift_rows"]
 
 Rows = list[tuple[str, list[str]]]
 MOST_EVENTS = 100
@@ -159,3 +161,50 @@ def event_rows(study: RecordStudy) -> list[list[str]]:
     ]
     left = len(study.events) - len(rows)
     return rows + ([[f"{left} more", "", "", ""]] if left else [])
+
+
+def shift_rows(shift: Shift) -> Rows:
+    """Label and one cell for each answer of a study of many decays.
+
+    Parameters
+    ----------
+    shift : Shift
+        The study.
+
+    Returns
+    -------
+    list of (str, list of str)
+        Scales, loss budget, best point, next decay, anomaly.
+    """
+    fit, best = shift.fit, shift.best
+    rows = [("status", fit.status.value.replace("_", " "))]
+    for name in MECHANISMS:
+        scale = getattr(fit, name)
+        said = "not separable" if scale.error is None else str(scale)
+        rows.append((f"{name}, scale on the ring file", said))
+    rows.append(("chi2/dof", f"{fit.chi2:.4g}/{fit.dof}"))
+    for row in shift.budget:
+        shown = f"{row.median:.4g} ({row.lower:.4g} to {row.upper:.4g}) {row.unit}"
+        label = f"{row.name} at {shift.current:.4g} mA"
+        rows.append((label, shown if row.separable else f"{shown}, not separable"))
+    voltage = Quantity(best.rf_voltage.value / 1e3, _over(best.rf_voltage.error, 1e3), "kV")
+    shown = str(voltage) if voltage.error is not None else f"{voltage.value:.6g} kV, at its limit"
+    rows += [
+        ("best RF voltage", shown),
+        ("best scraper and bunches", f"{1e3 * best.scraper_y:.4g} mm, {best.bunches:.6g}"),
+        ("lifetime there", str(best.lifetime)),
+        ("lifetime at the usual settings", str(best.usual)),
+    ]
+    for number, proposal in enumerate(shift.proposals, 1):
+        operation = proposal.candidate.operation
+        said = (
+            f"{float(operation.rf_voltage) / 1e3:.6g} kV, {1e3 * float(operation.scraper_y):.4g} "
+            f"mm, {float(operation.bunches):.6g} bunches, {proposal.candidate.current:.4g} mA "
+            f"(information {proposal.information:.3g})"
+        )
+        rows.append((f"next decay, choice {number}", said))
+    return [(label, [cell]) for label, cell in rows]
+
+
+def _over(value: float | None, unit: float) -> float | None:
+    return None if value is None else value / unit

@@ -1,4 +1,4 @@
-"""Networks of a and b: they obey physics everywhere, follow the truth, and correct a wrong model."""
+"""Networks of a and b: they obey physics everywhere, follow the truth, correct a wrong model."""
 
 import jax
 import numpy as np
