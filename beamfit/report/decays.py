@@ -31,8 +31,19 @@ SHIFT = (
     "Scales multiply the ring file's first principles. Brackets are 68 % credible intervals. The "
     "best point is sought within the range of settings seen."
 )
-# Decays beside one another in one table.
-ABREAST = 2
+# Decays beside one another in one table, and how many have every number shown.
+ABREAST, FEW = 2, 4
+SHORT = {
+    "Result": ("status", "current at the start", "lifetime at the mean current"),
+    "a and b": ("a", "b", "chi2/dof"),
+    "Losses from first principles": (
+        "RF voltage",
+        "scraper",
+        "bunches",
+        "lifetime at the mean, computed",
+        "lifetime at the mean, measured",
+    ),
+}
 
 
 def decay_page(
@@ -59,16 +70,8 @@ def decay_page(
     Page
     """
     decays = [decay for study in studies for decay in study.decays]
-    groups = [decays[k : k + ABREAST] for k in range(0, len(decays), ABREAST)]
     tables = [] if shift is None else [by_name("All decays", ["value"], shift_rows(shift), SHIFT)]
-    tables += [_table("Result", group, decay_rows, ERRORS) for group in groups[:1]]
-    tables += [_table("Result, continued", group, decay_rows) for group in groups[1:]]
-    tables += [_table("What the records determine", group, separability_rows) for group in groups]
-    tables += [
-        _table("Losses from first principles", group, budget_rows, BUDGET)
-        for group in groups
-        if budget_rows(group)
-    ]
+    tables += _side_by_side(decays) if len(decays) <= FEW else _one_below_another(decays)
     header = ["what", "at", "for", "change"]
     tables += [
         Table(f"Cut at or left out of {study.record.name}", header, event_rows(study))
@@ -82,7 +85,7 @@ def decay_page(
     return Page(
         title=f"Beam lifetime of {title}",
         subtitle=f"{count} in {hours:.3g} h of record; {written()}",
-        verdicts=_shift_verdicts(shift) + [_verdict(decay) for decay in decays],
+        verdicts=_shift_verdicts(shift) + _verdicts(decays),
         tables=tables,
         pictures=decay_pictures(studies),
         pictures_title="Records and fits",
@@ -91,8 +94,59 @@ def decay_page(
     )
 
 
-def _table(title: str, decays: Sequence[Decay], rows, note: str = "") -> Table:
-    return by_name(title, [decay.fit.record for decay in decays], rows(decays), note)
+def _side_by_side(decays: Sequence[Decay]) -> list[Table]:
+    """Every number of a few decays, one column each."""
+    groups = [decays[k : k + ABREAST] for k in range(0, len(decays), ABREAST)]
+    parts = [
+        ("Result", ERRORS, decay_rows),
+        ("What the records determine", "", separability_rows),
+        ("Losses from first principles", BUDGET, budget_rows),
+    ]
+    return [
+        by_name(
+            title, [decay.fit.record for decay in group], rows, note if group is groups[0] else ""
+        )
+        for title, note, rows_of in parts
+        for group in groups
+        if (rows := rows_of(group))
+    ]
+
+
+def _one_below_another(decays: Sequence[Decay]) -> list[Table]:
+    """The main numbers of many decays, one row each."""
+    every = dict(decay_rows(decays)) | dict(budget_rows(decays))
+    names = [decay.fit.record for decay in decays]
+    shown = {
+        title: [label for label in labels if label in every] for title, labels in SHORT.items()
+    }
+    return [
+        Table(
+            title,
+            ["decay", *(label.removeprefix("lifetime at the mean, ") for label in labels)],
+            [list(row) for row in zip(names, *(every[label] for label in labels), strict=True)],
+            {"Result": ERRORS}.get(title, ""),
+        )
+        for title, labels in shown.items()
+        if labels
+    ]
+
+
+def _verdicts(decays: Sequence[Decay]) -> list[Verdict]:
+    """One for each decay; of many decays one for each thing said."""
+    if len(decays) <= FEW:
+        return [_verdict(decay) for decay in decays]
+    alike: dict[tuple[str, str], list[str]] = {}
+    for decay in decays:
+        said = (decay.fit.status.value, decay.fit.message)
+        alike.setdefault(said, []).append(decay.fit.record)
+    return [
+        Verdict(
+            status,
+            names[0] if len(names) == 1 else f"{len(names)} decays, {names[0]} to {names[-1]}",
+            message,
+        )
+        for (status, message), names in alike.items()
+    ]
 
 
 def _verdict(decay: Decay) -> Verdict:

@@ -319,9 +319,15 @@ def _verdict(vector, covariance, scale, chi2, dof, success, decays):
             "desorption": "the current at constant settings",
         }
         advice = ", ".join(dict.fromkeys(cures[name] for name in blind))
+        missed = dof > 0 and chi2_probability(chi2, dof) < POOR_FIT
+        more = (
+            f" First principles miss something besides: chi²/dof is {chi2 / dof:.3g}."
+            if missed
+            else ""
+        )
         return Status.unidentified, (
             f"{' and '.join(blind)} not separable by {len(decays)} decays: vary {advice}, or give "
-            "a prior."
+            f"a prior.{more}"
         )
     if dof > 0 and chi2_probability(chi2, dof) < POOR_FIT:
         return Status.poor_fit, (

@@ -66,3 +66,16 @@ def test_refills_are_listed(tmp_path):
     page = (tmp_path / "saw.html").read_text()
     assert page.count("<td>refill</td>") == 3
     assert "record#4" in page
+
+
+def test_many_decays_have_a_row_each_and_alike_verdicts_are_said_once(tmp_path):
+    time = np.arange(0.0, 12000.0, 10.0)
+    saw = 100 * np.exp(-(time % 2000) / 36000) + 1e-3 * np.sin(time)
+    errors = np.full(time.size, 1e-3)
+    study = study_record(DecayRecord(time, saw, errors))
+    assert len(study.decays) == 6
+    for suffix in ("html", "pdf"):
+        beamfit.write_report(tmp_path / f"many.{suffix}", (study,))
+    page = (tmp_path / "many.html").read_text()
+    assert "<td>record#6</td>" in page
+    assert page.count('<div class="verdict') < 6

@@ -116,7 +116,9 @@ def test_a_correction_finds_what_first_principles_miss(machine):
     decays = wrong_ring_decays(machine)
     known = {"bremsstrahlung": (1.0, 0.05), "elastic": (1.0, 0.05), "desorption": (1.0, 0.05)}
     scales = fit_scales(decays, machine, priors=known, pressure_error=0.01)
-    assert scales.status is Status.poor_fit
+    assert scales.status is not Status.converged
+    assert "chi²/dof" in scales.message
+    assert scales.chi2 / scales.dof > 10
     network = fit_loss_network(decays, machine, scales, starts=1, floor=0.005)
     operation = machine.operation._replace(rf_voltage=2.3e6)
     losses = loss_coefficients(machine.ring, operation, 477.0)
