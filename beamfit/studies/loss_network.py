@@ -49,9 +49,11 @@ class Certificate(NamedTuple):
     lower, upper : array, shape (4,)
         Corners of the box: RF voltage MV, logarithms of scraper mm, pressure nPa, bunches.
     gains : array, shape (2, 4, 2)
-        Enclosures of the slopes of ln a and ln b by the four inputs over the box, rounded outward.
+        Enclosures of the slopes of the network's ln a and ln b by the four inputs over the box,
+        rounded outward; of a correction, those of its factor.
     convex : bool
-        Whether the lifetime has a single maximum in the RF voltage, by construction.
+        Whether the lifetime has a single maximum in the RF voltage, by construction: of a network
+        alone it has, of a correction it is not known.
     """
 
     lower: np.ndarray
@@ -277,7 +279,7 @@ def fit_loss_network(
     low, high = inputs.min(0), inputs.max(0)
     enclosed = over_cells(fit.model["map"], low, high, 2)
     gains = np.stack([np.min(enclosed.lower, axis=0), np.max(enclosed.upper, axis=0)], axis=-1)
-    return NetworkFit(fit, Certificate(low, high, gains, True), machine, scales)
+    return NetworkFit(fit, Certificate(low, high, gains, corrected is None), machine, scales)
 
 
 def _typical(measured: Summaries) -> np.ndarray:

@@ -204,3 +204,26 @@ def test_bad_files_are_answered_without_jax(root, tmp_path):
         )
         assert done.stdout == "2 False\n"
         assert done.stderr.count("\n") == 1
+
+
+def test_a_study_of_a_shift(run):
+    path = "measurements/spear3_shift_simulated.csv"
+    status, out, err = run("lifetime", path, "--ring", RING, "--study", "--json")
+    assert (status, err) == (0, "")
+    document = json.loads(out)
+    assert len(document["results"]) == 30
+    study = document["study"]
+    assert study["scales"]["status"] == "converged"
+    true = {"touschek": 1.12, "bremsstrahlung": 1.30, "elastic": 0.85, "desorption": 1.25}
+    for name, value in true.items():
+        scale = study["scales"][name]
+        assert scale["value"] == pytest.approx(value, abs=3 * scale["error"])
+    assert study["anomaly"]["moved"] == []
+    assert study["best"]["lifetime"]["value"] >= study["best"]["usual"]["value"]
+    assert study["next"][0]["information"] >= study["next"][-1]["information"] > 0
+
+
+def test_a_study_needs_a_ring(run):
+    status, out, err = run("lifetime", APS, "--study")
+    assert (status, out) == (2, "")
+    assert "--ring" in err
