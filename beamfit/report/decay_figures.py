@@ -106,7 +106,8 @@ def draw_lifetime(figure: FigureBase, study: RecordStudy) -> None:
     axes.set_ylabel("lifetime, h")
     axes.set_xlabel(f"time, {unit}")
     axes.set_title("momentary lifetime")
-    axes.legend(frameon=False, loc="lower right")
+    handles, labels = axes.get_legend_handles_labels()
+    figure.legend(handles, labels, frameon=False, loc="outside lower center", ncols=2)
 
 
 def _momentary(axes: Axes, decay: Decay, scale: float) -> float:
@@ -164,8 +165,8 @@ def draw_budget(figure: FigureBase, decays: Sequence[Decay]) -> None:
     axes.set_ylim(-0.6, len(shown) - 0.4)
     axes.set_xlim(left=0)
     axes.set_xlabel("loss rate at the mean current, 1/h")
-    more = f" (the first {MOST_BARS} of {len(decays)} decays)" if len(decays) > MOST_BARS else ""
-    axes.set_title(f"losses from first principles{more}")
+    more = f", {MOST_BARS} of {len(decays)} decays" if len(decays) > MOST_BARS else ""
+    axes.set_title(f"computed losses{more}")
     handles, labels = axes.get_legend_handles_labels()
     figure.legend(handles, labels, frameon=False, loc="outside lower center", ncols=5)
 

@@ -53,8 +53,8 @@ def loss_parts(a: Array, b: Array, mean_current: Array) -> Array:
 
     Examples
     --------
-    >>> loss_parts(2e-8, 1e-6, 500.0).tolist()
-    [1e-05, 1.1e-05]
+    >>> [f"{part:.2e}" for part in loss_parts(2e-8, 1e-6, 500.0)]
+    ['1.00e-05', '1.10e-05']
     """
     quadratic = a * mean_current
     return jnp.stack([quadratic, quadratic + b], axis=-1)
@@ -140,7 +140,7 @@ def summarise(decays: tuple[Decay, ...]) -> Summaries:
     >>> fit = study.decays[0].fit
     >>> error = 1 / abs(found.root[0, 1, 1])  # of the loss rate, a I being free
     >>> print(f"{error / found.parts[0, 1]:.1e}, by the fit {fit.lifetime_mean.relative:.1e}")
-    2.8e-06, by the fit 2.8e-06
+    2.1e-06, by the fit 2.1e-06
     """
     rows = []
     for decay in decays:
