@@ -37,6 +37,7 @@ lint: .venv/test
 bench: .venv/bench
 	$(BIN)/python benchmarks/emittance.py
 	$(BIN)/python benchmarks/lifetime.py
+	$(BIN)/python benchmarks/greybox.py 20 0
 
 clean:
 	rm -rf .venv demo dist build

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import shlex
 import sys
 from collections.abc import Mapping, Sequence
@@ -17,15 +18,25 @@ __all__ = ["check_report_name", "command_line", "json_text"]
 
 
 def check_report_name(report: str | None) -> None:
-    """Refuse a report that is neither page nor PDF before anything is computed.
+    """Find out before anything is computed whether the report could be written.
 
     Raises
     ------
     InputError
-        If the name ends in anything but .html or .pdf.
+        If the name ends in anything but .html or .pdf, is a folder's, or its folder does not
+        exist or may not be written to.
     """
-    if report is not None and Path(report).suffix.lower() not in (".html", ".pdf"):
+    if report is None:
+        return
+    if Path(report).suffix.lower() not in (".html", ".pdf"):
         raise InputError(f"report '{report}'", "a name ending in .html or .pdf")
+    folder = Path(report).parent
+    if Path(report).is_dir():
+        raise InputError(f"report '{report}', which is a folder", "the name of a file")
+    if not folder.is_dir():
+        raise InputError(f"report '{report}'", f"a folder that exists; '{folder}' is none")
+    if not os.access(folder, os.W_OK):
+        raise InputError(f"report '{report}'", f"a folder one may write to; '{folder}' is not")
 
 
 def command_line() -> str:

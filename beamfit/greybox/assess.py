@@ -183,13 +183,13 @@ def conclude(p: Problem, s: State, attempts: tuple[Attempt, ...], seconds: float
             "the cost or a derivative is not finite at the end of the search; bound the free "
             "numbers away from there, or use a parametrisation that stays defined."
         )
-        return refused(p, Status.NOT_FINITE, said, seconds, s.theta, attempts)
+        return refused(p, Status.not_finite, said, seconds, s.theta, attempts)
     if failure:
         said = (
             f"{failure} at the end of the search; start it nearer to its root, or bound the free "
             "numbers to where a root exists."
         )
-        return refused(p, Status.NOT_CONVERGED, said, seconds, s.theta, attempts)
+        return refused(p, Status.not_converged, said, seconds, s.theta, attempts)
     spread = _spread(p, s)
     chi2 = float(s.at.residual @ s.at.residual)
     dof = len(s.at.residual) - spread.rank
@@ -246,17 +246,17 @@ def _verdict(p, s, attempts, variables, constraints, blind, chi2, dof, judged):
             f" '{worst.name}' ends at {worst.value:.4g}, outside" if worst else " bounds: outside"
         )
         limits = f" [{worst.lower:.4g}, {worst.upper:.4g}]" if worst else ""
-        return Status.INFEASIBLE, (
+        return Status.infeasible, (
             f"no point within all constraints was found from {_starts(attempts)}:{place}{limits}; "
             "relax it, free more numbers, or start elsewhere."
         )
     if p.objectives and s.at.cost < -1e15:
-        return Status.UNBOUNDED, (
+        return Status.unbounded, (
             f"the cost falls without end (down to {s.at.cost:.3g}); bound the free numbers, or "
             "check the sign of the objective."
         )
     if s.kkt.worst > _TOLERANCE:
-        return Status.NOT_CONVERGED, (
+        return Status.not_converged, (
             f"no optimum was reached from {_starts(attempts)} (KKT residual {s.kkt.worst:.1e} "
             f"after {sum(a.iterations for a in attempts)} iterations); give more starts "
             "or iterations, or a better start."
@@ -264,12 +264,12 @@ def _verdict(p, s, attempts, variables, constraints, blind, chi2, dof, judged):
     asked = ~p.nuisance
     if (blind & asked).any():
         names = _list(np.array(p.names)[blind & asked])
-        return Status.UNIDENTIFIED, (
+        return Status.unidentified, (
             f"the data do not determine {names}; add data of another kind, a prior, or fix it."
         )
     chance = stats.chi2.sf(chi2, dof) if dof > 0 else 1.0
     if judged and p.records and chance < 1e-3:
-        return Status.POOR_FIT, (
+        return Status.poor_fit, (
             f"chi2 = {chi2:.4g} for {dof} degrees of freedom happens by chance in {chance:.1e} of "
             "cases; the model misses something or the errors are too small."
         )
@@ -277,11 +277,11 @@ def _verdict(p, s, attempts, variables, constraints, blind, chi2, dof, judged):
     held = [v for v in held if v.state in ("lower", "upper")]
     if held:
         names = _list(f"{v.name} ({v.state})" for v in held)
-        return Status.AT_LIMIT, (
+        return Status.at_limit, (
             f"the best value lies at a bound: {names}; the bound decides it, not the data, so "
             "justify or widen it."
         )
-    return Status.CONVERGED, (
+    return Status.converged, (
         f"an optimum was reached from {_starts(attempts)} (KKT residual {s.kkt.worst:.1e})."
     )
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from enum import StrEnum
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -14,22 +13,9 @@ import numpy as np
 from beamfit.errors import InputError, nearest
 from beamfit.greybox.kkt import KKT
 from beamfit.greybox.problem import Problem
+from beamfit.status import Status
 
 __all__ = ["Attempt", "Fit", "Limited", "Quantity", "Status", "Variable"]
-
-
-class Status(StrEnum):
-    """The verdict on a fit; `Fit.message` gives cause and remedy."""
-
-    CONVERGED = "converged"
-    AT_LIMIT = "at_limit"
-    POOR_FIT = "poor_fit"
-    UNIDENTIFIED = "unidentified"
-    NOT_CONVERGED = "not_converged"
-    UNBOUNDED = "unbounded"
-    INFEASIBLE = "infeasible"
-    NOT_FINITE = "not_finite"
-    CONTRADICTORY_BOUNDS = "contradictory_bounds"
 
 
 class Variable(NamedTuple):

@@ -71,7 +71,7 @@ def solve(
     >>> data = Record("scan", line, np.arange(4.0), [0.0, 2.1, 3.9, 6.0], error=0.1)
     >>> fit = solve(Problem({"slope": 1.0}, [Free("slope", 0, 10)], [data]))
     >>> fit.status, round(fit["slope"].value, 4), round(fit["slope"].error, 4)
-    (<Status.CONVERGED: 'converged'>, 1.9929, 0.0267)
+    (<Status.converged: 'converged'>, 1.9929, 0.0267)
     """
     began = time.perf_counter()
     if hessian not in ("exact", "gauss_newton"):
@@ -86,7 +86,7 @@ def solve(
     ]
     if wrong:
         said = f"the lower bound of {wrong[0]} lies above its upper bound; correct the bounds."
-        return assess.refused(p, Status.CONTRADICTORY_BOUNDS, said, time.perf_counter() - began)
+        return assess.refused(p, Status.contradictory_bounds, said, time.perf_counter() - began)
     points = starting_points(p, starts, seed)
     bar = track(
         points, "fitting", console=Console(stderr=True), transient=True, disable=not progress
@@ -103,7 +103,7 @@ def solve(
             f"the cost or a constraint is not finite at {place}; "
             "start elsewhere, or use a parametrisation that is defined there."
         )
-        return assess.refused(p, Status.NOT_FINITE, said, seconds)
+        return assess.refused(p, Status.not_finite, said, seconds)
     best, _ = min(found, key=lambda pair: _rank(pair[0]))
     return assess.conclude(p, best, tuple(attempt for _, attempt in found), seconds)
 

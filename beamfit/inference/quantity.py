@@ -1,26 +1,15 @@
-"""A number with its error and unit, and the statuses a fit may end in."""
+"""A number with its error and unit."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from enum import StrEnum
+
+from beamfit.status import Status
 
 __all__ = ["Quantity", "Status"]
 
 _PREFIXES = ((1.0, ""), (1e-3, "m"), (1e-6, "µ"), (1e-9, "n"), (1e-12, "p"))
-
-
-class Status(StrEnum):
-    """How a fit ended. Anything but ``converged`` is a warning with a sentence beside it."""
-
-    converged = "converged"
-    poor_fit = "poor_fit"
-    unidentified = "unidentified"
-    at_limit = "at_limit"
-    infeasible = "infeasible"
-    not_finite = "not_finite"
-    not_converged = "not_converged"
 
 
 @dataclass(frozen=True)

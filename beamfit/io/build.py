@@ -67,7 +67,7 @@ def _element(table: Mapping[str, Any], mass: float) -> Element:
     if kind == "sector_dipole":
         return SectorDipole(
             name,
-            float(table["radius_m"]),
+            float(np.copysign(table["radius_m"], table["angle_deg"])),
             float(np.radians(table["angle_deg"])),
             float(np.radians(table.get("entrance_edge_deg", 0.0))),
             float(np.radians(table.get("exit_edge_deg", 0.0))),

@@ -15,6 +15,15 @@ __all__ = ["digest", "read_text", "text_lines", "write_atomically"]
 
 # A text line of a scan or a lattice is short; a longer one is another kind of file.
 LONGEST_LINE = 100_000
+# How files begin that are given for text, what they are, and what to do.
+SIGNATURES = {
+    b"\x89HDF": ("an HDF5 file", "a text file; an HDF5 scan is named .h5"),
+    b"PK\x03\x04": ("a spreadsheet or an archive", "a text file; save it as CSV (UTF-8)"),
+    b"\xd0\xcf\x11\xe0": ("a spreadsheet", "a text file; save it as CSV (UTF-8)"),
+    b"\x1f\x8b": ("a compressed file", "a text file; unpack it first"),
+    b"\xff\xfe": ("UTF-16 text", "UTF-8 text; save it as CSV (UTF-8)"),
+    b"\xfe\xff": ("UTF-16 text", "UTF-8 text; save it as CSV (UTF-8)"),
+}
 LARGEST_TEXT = 4_000_000
 
 
@@ -25,9 +34,10 @@ def _opened(path: str | PathLike[str]):
         raise InputError("no such file", "an existing file", path=path) from None
     except IsADirectoryError:
         raise InputError("a directory", "a file", path=path) from None
-    except OSError as error:
+    except (OSError, ValueError) as error:  # a name with a zero byte is a ValueError
+        cause = getattr(error, "strerror", None) or error
         raise InputError(
-            f"a file that cannot be read ({error.strerror})", "a readable file", path=path
+            f"a file that cannot be read ({cause})", "a readable file", path=path
         ) from None
 
 
@@ -54,7 +64,9 @@ def text_lines(path: str | PathLike[str]) -> Iterator[str]:
     with _opened(path) as stream:
         while raw := stream.readline(LONGEST_LINE + 1):
             number += 1
-            if b"\0" in raw or raw.startswith(b"\x89HDF"):
+            if number == 1:
+                _check_signature(raw, path)
+            if b"\0" in raw:
                 raise InputError("a binary file", "a text file", path=path, line=number)
             if len(raw) > LONGEST_LINE:
                 raise InputError(
@@ -72,6 +84,12 @@ def text_lines(path: str | PathLike[str]) -> Iterator[str]:
             yield line.rstrip("\r\n")
     if number == 0:
         raise InputError("an empty file", "a file with content", path=path)
+
+
+def _check_signature(start: bytes, path: str | PathLike[str]) -> None:
+    for signature, (found, expected) in SIGNATURES.items():
+        if start.startswith(signature):
+            raise InputError(found, expected, path=path, line=1)
 
 
 def read_text(path: str | PathLike[str]) -> str:

@@ -2,65 +2,19 @@
 
 from __future__ import annotations
 
-import math
 import re
 import tomllib
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from beamfit.errors import InputError, nearest
 from beamfit.io.files import digest, read_text
-
-if TYPE_CHECKING:
-    from beamfit.optics.beamline import Beamline
+from beamfit.io.lattice_keys import ELEMENTS, FORMAT, NUMBER, STRENGTHS, TEXT, TOP, amiss
 
 __all__ = ["LatticeFile", "read_toml_lattice"]
-
-FORMAT = "beamfit-lattice-1"
-# Settings a magnet may be given, one of them; the key says the unit.
-STRENGTHS = {
-    "current_A": "A",
-    "integrated_gradient_kG": "kG",
-    "k1_per_m2": "k1",
-    "k1l_per_m": "k1l",
-}
-NUMBER, TEXT, LIST, FLAG = (int, float), str, list, bool
-POSITIVE = {"length_m", "radius_m", "beta_m"}
-ELEMENTS: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
-    # type: (required keys, optional keys)
-    "drift": ({"length_m": NUMBER}, {"name": TEXT}),
-    "quadrupole": (
-        {"name": TEXT, "length_m": NUMBER},
-        {
-            "current_A": NUMBER,
-            "slope": NUMBER,
-            "intercept": NUMBER,
-            "gradient_polynomial_T_per_m": LIST,
-            "signed_intercept": FLAG,
-            "integrated_gradient_kG": NUMBER,
-            "k1_per_m2": NUMBER,
-        },
-    ),
-    "thin_lens": ({"name": TEXT}, {"k1l_per_m": NUMBER, "integrated_gradient_kG": NUMBER}),
-    "sector_dipole": (
-        {"name": TEXT, "radius_m": NUMBER, "angle_deg": NUMBER, "bend_plane": TEXT},
-        {
-            "entrance_edge_deg": NUMBER,
-            "exit_edge_deg": NUMBER,
-            "energy_offset": NUMBER,
-            "k1_per_m2": NUMBER,
-        },
-    ),
-    "marker": ({"name": TEXT}, {}),
-    "screen": ({"name": TEXT}, {"resolution_um": NUMBER}),
-}
-TOP = (
-    {"format": TEXT, "energy_MeV": NUMBER, "element": LIST},
-    {"name": TEXT, "source": TEXT, "particle": TEXT, "energy_spread": NUMBER, "design": dict},
-)
 
 
 @dataclass(frozen=True)
@@ -85,7 +39,6 @@ class LatticeFile:
     calibrations: Mapping[str, str]
     design: Mapping[str, Any] | None = None
     source: str = ""
-    foreign: Beamline | None = field(default=None, repr=False)
 
     @property
     def places(self) -> list[str]:
@@ -123,7 +76,13 @@ class _Reader:
         ]
         try:
             self.document = tomllib.loads(self.text)
-        except tomllib.TOMLDecodeError as error:
+        except (ValueError, RecursionError) as error:  # integers too long, nesting too deep
+            if re.search(r"^[^#=\n]*\bsize_[xy]_", self.text, re.MULTILINE):
+                raise InputError(
+                    "a scan where the lattice should be",
+                    "the scan first and the lattice after --lattice; are they swapped?",
+                    path=path,
+                ) from None
             line = re.search(r"at line (\d+)", str(error))
             what = re.sub(r"\s*\(at .*\)", "", str(error))
             raise InputError(
@@ -134,16 +93,23 @@ class _Reader:
             ) from None
 
     def error(
-        self, found: str, expected: str, key: str | None = None, element: int | None = None
+        self,
+        found: str,
+        expected: str,
+        key: str | None = None,
+        element: int | None = None,
+        table: str | None = None,
     ) -> InputError:
-        """Make the error that names the line on which the key (or its element) stands."""
-        return InputError(
-            found, expected, path=self.path, line=self._line(key, element), column=key
-        )
+        """Make the error that names the line on which the key (or its table) stands."""
+        line = self._line(key, element, table)
+        return InputError(found, expected, path=self.path, line=line, column=key)
 
-    def _line(self, key: str | None, element: int | None) -> int:
+    def _line(self, key: str | None, element: int | None, table: str | None = None) -> int:
         lines = self.text.splitlines()
         start = 0 if element is None or element >= len(self.heads) else self.heads[element] - 1
+        if table is not None:
+            head = re.compile(rf"\s*\[?\s*{table}\b")
+            start = next((n for n, t in enumerate(lines) if head.match(t)), 0)
         if key is not None:
             # An element ends at the next table; the top level is searched to its first table.
             for n in range(start, len(lines)):
@@ -168,6 +134,10 @@ class _Reader:
                 f"{energy:g} MeV",
                 f"a total energy between {rest:g} MeV and 10 TeV; is it in GeV or eV?",
                 "energy_MeV",
+            )
+        if not document["element"]:
+            raise self.error(
+                "no elements", "tables [[element]] in the order of the beam", "element"
             )
         elements = [self.element(e, i) for i, e in enumerate(document["element"])]
         self.check_unique(elements)
@@ -194,11 +164,11 @@ class _Reader:
         if not isinstance(table, dict):
             raise self.error(f"element {table!r}", "a table [[element]]", "element")
         kind = table.get("type")
-        if kind not in ELEMENTS:
-            word = str(kind) if kind is not None else "no type"
+        if not isinstance(kind, str) or kind not in ELEMENTS:
+            word = f"type {kind!r}" if kind is not None else "no type"
             raise self.error(
-                f"element {index + 1} of type '{word}'",
-                nearest(word, list(ELEMENTS)),
+                f"element {index + 1} of {word}",
+                nearest(str(kind), list(ELEMENTS)),
                 "type",
                 index,
             )
@@ -208,6 +178,8 @@ class _Reader:
             self.check_strength(table, index)
         if kind == "sector_dipole" and table["bend_plane"] not in ("x", "y"):
             raise self.error(f"bend_plane '{table['bend_plane']}'", "x or y", "bend_plane", index)
+        if kind == "sector_dipole" and table["angle_deg"] == 0:
+            raise self.error("a dipole that does not bend", "a drift", "angle_deg", index)
         return {"name": f"{kind}{index + 1}"} | table
 
     def check_keys(
@@ -222,20 +194,9 @@ class _Reader:
         for key, value in table.items():
             if key not in kinds:
                 raise self.error(f"unknown key '{key}'", nearest(key, list(kinds)), key, element)
-            wrong = not isinstance(value, kinds[key]) or (
-                isinstance(value, bool) and kinds[key] is not FLAG
-            )
-            if wrong or (isinstance(value, float) and not math.isfinite(value)):
-                names = {
-                    NUMBER: "a number",
-                    TEXT: "text in quotes",
-                    LIST: "a list",
-                    FLAG: "true or false",
-                    dict: "a table",
-                }
-                raise self.error(f"{value!r}", names[kinds[key]], key, element)
-            if key in POSITIVE and not value > 0:
-                raise self.error(f"{value!r}", "a positive number", key, element)
+            expected = amiss(key, value, kinds[key])
+            if expected:
+                raise self.error(f"{value!r}"[:80], expected, key, element)
 
     def check_strength(self, table: Mapping, index: int) -> None:
         """One setting, and with a current exactly one calibration."""
@@ -250,6 +211,13 @@ class _Reader:
             )
         line = {"slope", "intercept"} & set(table)
         polynomial = "gradient_polynomial_T_per_m" in table
+        if "signed_intercept" in table and not polynomial:
+            raise self.error(
+                f"{table['name']} with signed_intercept",
+                "gradient_polynomial_T_per_m beside it, whose first number it signs",
+                "signed_intercept",
+                index,
+            )
         if given[0] != "current_A":
             if line or polynomial:
                 raise self.error(
@@ -267,7 +235,7 @@ class _Reader:
                 index,
             )
         numbers = table.get("gradient_polynomial_T_per_m", [0.0, 1.0])
-        good = all(isinstance(c, NUMBER) and not isinstance(c, bool) for c in numbers)
+        good = all(amiss("", c, NUMBER) is None for c in numbers)
         if len(numbers) < 2 or not good:
             raise self.error(
                 f"{numbers!r}",
@@ -294,19 +262,21 @@ class _Reader:
         if table is None:
             return None
         names = [e["name"] for e in elements]
-        if table.get("at") not in names:
+        at = table.get("at")
+        if at not in names:
             raise self.error(
-                f"design Twiss at '{table.get('at')}'", nearest(str(table.get("at")), names)
+                f"design Twiss at {at!r}", nearest(str(at), names), "at", table="design"
             )
         for plane in [k for k in table if k != "at"]:
             twiss = table[plane]
-            good = (
-                plane in ("x", "y")
-                and isinstance(twiss, dict)
-                and (set(twiss) == {"beta_m", "alpha"})
-            )
+            good = plane in ("x", "y") and isinstance(twiss, dict)
+            good = good and set(twiss) == {"beta_m", "alpha"}
+            good = good and not any(amiss(k, v, NUMBER) for k, v in twiss.items())
             if not good or not twiss["beta_m"] > 0:
                 raise self.error(
-                    f"design {plane} = {twiss!r}", "x = { beta_m = ..., alpha = ... }, beta_m > 0"
+                    f"design {plane} = {twiss!r}",
+                    "x = { beta_m = ..., alpha = ... }, beta_m > 0",
+                    plane,
+                    table="design",
                 )
         return table

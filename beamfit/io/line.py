@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -31,7 +30,7 @@ def load_lattice(
     use : str, optional
         Which line or sequence of a MAD-X or elegant file.
     energy : float, optional
-        Total energy in MeV: overrides the file's; an elegant file carries none.
+        Total energy in MeV of an elegant file, which carries none; overrides a MAD-X beam.
 
     Returns
     -------
@@ -73,14 +72,16 @@ def read_lattice(
         from beamfit.io.sequence import read_sequence
 
         return read_sequence(path, use=use, energy=energy)
-    if use is not None:
-        raise InputError(f"use '{use}'", "no such option for a TOML lattice: it is one line")
-    file = read_toml_lattice(path)
-    return file if energy is None else replace(file, energy=energy)
+    for option, value, instead in (("use", use, "one line"), ("energy", energy, "energy_MeV")):
+        if value is not None:
+            raise InputError(
+                f"--{option} for a TOML lattice", f"none: the file has {instead}", path=path
+            )
+    return read_toml_lattice(path)
 
 
 def build_line(file: LatticeFile) -> Beamline:
     """Build the line a checked lattice file describes."""
     from beamfit.io.build import beamline_of
 
-    return file.foreign if file.foreign is not None else beamline_of(file)
+    return beamline_of(file)

@@ -3,55 +3,32 @@
 from __future__ import annotations
 
 import csv
-import re
 from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from os import PathLike
 from pathlib import Path
 
 import numpy as np
 
-from beamfit.errors import InputError, nearest
+from beamfit.errors import InputError
 from beamfit.io.averaging import average_shots
+from beamfit.io.columns import (
+    CARRIED,
+    LENGTHS,
+    MOST_ROWS,
+    Column,
+    Table,
+    check_header,
+    column_of,
+)
 from beamfit.io.files import digest, text_lines
+from beamfit.io.hdf5_table import read_hdf5
 from beamfit.studies.scans import QuadScan, first_unusable
 
 __all__ = ["read_quad_scan"]
 
-# More rows than any scan: such a file is a log, and is refused before it fills the memory.
-MOST_ROWS = 100_000
-LENGTHS = {"m": 1.0, "mm": 1e-3, "um": 1e-6, "µm": 1e-6, "μm": 1e-6}
-SETTINGS = ("A", "kG", "k1", "k1l")
-CARRIED = re.compile(r"note_.*|time|timestamp|charge_[np]C")
-SIZE = re.compile(r"(size_[xy](?:_error)?|resolution)_([^_]*)")
 # Rms sizes on a screen; outside this a header's unit is wrong.
 PLAUSIBLE = (1e-7, 2e-2)
-
-
-@dataclass(frozen=True)
-class Column:
-    """What a header means: the quantity, the unit it is in, and the factor to SI."""
-
-    header: str
-    key: str
-    unit: str = ""
-    factor: float = 1.0
-
-
-@dataclass
-class Table:
-    """The cells of a file before they are a scan: one list a column, and where each row was."""
-
-    path: str | PathLike[str]
-    columns: list[Column]
-    cells: list[list[str]] = field(default_factory=list)
-    lines: list[int] = field(default_factory=list)
-    provenance: list[str] = field(default_factory=list)
-
-    def error(self, found: str, expected: str, row: int | None, column: Column) -> InputError:
-        """Make the error that names file, line and column."""
-        line = None if row is None else self.lines[row]
-        return InputError(found, expected, path=self.path, line=line, column=column.header)
 
 
 def read_quad_scan(path: str | PathLike[str]) -> QuadScan:
@@ -82,20 +59,24 @@ def read_quad_scan(path: str | PathLike[str]) -> QuadScan:
     [0.0002, 0.00012, 0.00018]
     """
     is_hdf5 = Path(path).suffix.lower() in {".h5", ".hdf5"}
-    table = _read_hdf5(path) if is_hdf5 else _read_csv(path)
+    table = read_hdf5(path) if is_hdf5 else _read_csv(path)
+    if not table.cells:
+        raise InputError("a header and no rows", "at least three settings", path=path)
     return _scan_of(table)
 
 
 def _read_csv(path: str | PathLike[str]) -> Table:
     provenance: list[str] = []
     numbered = enumerate(text_lines(path), start=1)
-    header = next(_rows(numbered, provenance), None)
+    rows = _rows(numbered, provenance, path)
+    header = next(rows, None)
     if header is None:
         raise InputError("no header and no rows", "a header line such as Q2_A,size_x_um", path=path)
     line, names = header
-    table = Table(path, [_column(name, path, line) for name in names], provenance=provenance)
-    _check_header(table, line)
-    for line, cells in _rows(numbered, provenance):
+    _check_is_header(names, path, line)
+    table = Table(path, [column_of(name, path, line) for name in names], provenance=provenance)
+    check_header(table, line)
+    for line, cells in rows:
         if len(cells) != len(names):
             raise InputError(
                 f"{len(cells)} cells", f"{len(names)}, as in the header", path=path, line=line
@@ -109,13 +90,47 @@ def _read_csv(path: str | PathLike[str]) -> Table:
             )
         table.cells.append(cells)
         table.lines.append(line)
-    if not table.cells:
-        raise InputError("a header and no rows", "at least three settings", path=path)
     return table
 
 
+def _check_is_header(names: list[str], path: str | PathLike[str], line: int) -> None:
+    """Recognise what is put in the place of a CSV header, and say what to do about it."""
+    if names[0].startswith("format") and "beamfit-" in names[0]:
+        raise InputError(
+            "a lattice where the scan should be",
+            "the scan first and the lattice after --lattice; are they swapped?",
+            path=path,
+            line=line,
+        )
+    separators = {";": "semicolons", "\t": "tabs", " ": "spaces"}
+    if len(names) == 1:
+        for character, word in separators.items():
+            if character in names[0] and "size_" in names[0]:
+                raise InputError(
+                    f"columns separated by {word}",
+                    "a comma between columns and a decimal point in numbers",
+                    path=path,
+                    line=line,
+                )
+    if all(_is_number(name) for name in names):
+        raise InputError(
+            "numbers where the header should be",
+            "a header line such as Q2_A,size_x_um",
+            path=path,
+            line=line,
+        )
+
+
+def _is_number(cell: str) -> bool:
+    try:
+        float(cell)
+    except ValueError:
+        return False
+    return True
+
+
 def _rows(
-    numbered: Iterator[tuple[int, str]], provenance: list[str]
+    numbered: Iterator[tuple[int, str]], provenance: list[str], path: str | PathLike[str]
 ) -> Iterator[tuple[int, list[str]]]:
     """Yield cells with their line number; comments go to the provenance, blanks are skipped."""
     for number, line in numbered:
@@ -123,104 +138,15 @@ def _rows(
         if text.startswith("#"):
             provenance.append(text.lstrip("# ").rstrip())
         elif text.strip(",;\t "):
-            yield number, [cell.strip() for cell in next(csv.reader([line]))]
-
-
-def _read_hdf5(path: str | PathLike[str]) -> Table:
-    import h5py
-
-    digest(path)  # says what is wrong with the path itself
-    try:
-        with h5py.File(path, "r") as store:
-            names = [n for n in store if isinstance(store[n], h5py.Dataset)]
-            if names and max(store[n].size for n in names) > MOST_ROWS:
-                raise InputError(f"more than {MOST_ROWS} rows", "a scan of settings", path=path)
-            data = [
-                np.atleast_1d(store[n].asstr()[()] if store[n].dtype.kind in "OS" else store[n][()])
-                for n in names
-            ]
-            provenance = [f"{key}: {value}" for key, value in store.attrs.items()]
-    except OSError:
-        raise InputError("a file that is not HDF5", "an HDF5 file", path=path) from None
-    lengths = {n: len(d) for n, d in zip(names, data, strict=True)}
-    if len(set(lengths.values())) > 1:
-        raise InputError(f"datasets of lengths {lengths}", "one length for all", path=path)
-    table = Table(path, [_column(n, path, None) for n in names], provenance=provenance)
-    _check_header(table, None)
-    table.cells = [[_text(v) for v in row] for row in zip(*data, strict=True)]
-    table.lines = list(range(1, len(table.cells) + 1))
-    return table
-
-
-def _text(value: object) -> str:
-    return value if isinstance(value, str) else repr(float(value))
-
-
-def _column(header: str, path: str | PathLike[str], line: int | None) -> Column:
-    """Understand one header, or say what it should have been."""
-    if header in ("shot", "screen", "energy_MeV", "energy_spread") or CARRIED.fullmatch(header):
-        return Column(header, header)
-    if size := SIZE.fullmatch(header):
-        key, unit = size.groups()
-        if unit in LENGTHS:
-            return Column(header, key, unit, LENGTHS[unit])
-        known = "one of m, mm, um at the end, such as " + f"{key}_um"
-        raise InputError(f"unknown unit '{unit}'", known, path=path, line=line, column=header)
-    name, _, unit = header.rpartition("_")
-    if name and unit in SETTINGS and not header.startswith("size_"):
-        return Column(header, f"setting {name}", unit)
-    raise InputError(
-        f"unknown unit '{unit}'" if name else "a name without a unit",
-        "a magnet with _A, _kG or _k1 at the end, "
-        + nearest(
-            header,
-            [
-                "size_x_um",
-                "size_x_error_um",
-                "size_y_um",
-                "size_y_error_um",
-                "resolution_um",
-                "energy_MeV",
-                "energy_spread",
-                "shot",
-                "screen",
-            ],
-        )
-        + "; begin a name with note_ to carry a column along unread",
-        path=path,
-        line=line,
-        column=header,
-    )
-
-
-def _check_header(table: Table, line: int | None) -> None:
-    keys = [c.key for c in table.columns]
-    twice = [c for c in table.columns if keys.count(c.key) > 1]
-    if twice:
-        raise InputError(
-            "a column twice",
-            "each quantity once",
-            path=table.path,
-            line=line,
-            column=twice[0].header,
-        )
-    sizes = [k for k in keys if k in ("size_x", "size_y")]
-    if not sizes or not any(k.startswith("setting ") for k in keys):
-        missing = (
-            "a beam size column, such as size_x_um"
-            if not sizes
-            else ("a magnet setting column, such as Q2_A, Q2_kG or Q2_k1")
-        )
-        found = "columns " + ", ".join(c.header for c in table.columns)
-        raise InputError(found, missing, path=table.path, line=line)
-    for plane in "xy":
-        if f"size_{plane}_error" in keys and f"size_{plane}" not in keys:
-            raise InputError(
-                f"size_{plane}_error without size_{plane}",
-                f"a column size_{plane}_um",
-                path=table.path,
-                line=line,
-            )
+            try:
+                yield number, [cell.strip() for cell in next(csv.reader([line]))]
+            except csv.Error:  # a carriage return within the line
+                raise InputError(
+                    "line ends that are carriage returns",
+                    "line feeds: save the file as CSV (UTF-8) again",
+                    path=path,
+                    line=number,
+                ) from None
 
 
 def _scan_of(table: Table) -> QuadScan:
@@ -234,6 +160,7 @@ def _scan_of(table: Table) -> QuadScan:
     for plane in "xy":
         _check_sizes(table, numbers, plane, by_key)
     _check_energy(table, numbers, by_key)
+    _check_optional(table, numbers, by_key)
     settings = {k.removeprefix("setting "): k for k in numbers if k.startswith("setting ")}
     planes = [p for p in "xy" if f"size_{p}" in numbers]
     try:
@@ -269,7 +196,8 @@ def _numbers(table: Table, index: int, column: Column) -> np.ndarray:
             values[row] = np.nan if may_be_blank and cell == "" else float(cell) * column.factor
         except ValueError:
             found = f"'{cell}'" if cell else "an empty cell"
-            raise table.error(found, "a number", row, column) from None
+            point = " with a decimal point" if "," in cell else ""
+            raise table.error(found, f"a number{point}", row, column) from None
         if cell and not np.isfinite(values[row]):
             raise table.error(f"'{cell}'", "a finite number", row, column)
     return values
@@ -297,8 +225,15 @@ def _check_sizes(table: Table, numbers: dict, plane: str, by_key: dict) -> None:
 
 def _check_plausible(table: Table, size: np.ndarray, column: Column) -> None:
     """Recognise a header whose unit cannot be meant: sizes of metres or of atoms."""
-    middle = float(np.nanmedian(size))
-    if PLAUSIBLE[0] <= middle and float(np.nanmax(size)) <= PLAUSIBLE[1]:
+    middle, row = float(np.nanmedian(size)), int(np.nanargmax(size))
+    if PLAUSIBLE[0] <= middle <= PLAUSIBLE[1]:
+        if size[row] > PLAUSIBLE[1]:
+            raise table.error(
+                f"{size[row] / column.factor:g} {column.unit}, implausible for a beam",
+                "sizes below 20 mm; is this row in another unit?",
+                row,
+                column,
+            )
         return
     written = middle / column.factor
     likely = min(("um", "mm", "m"), key=lambda u: abs(np.log(written * LENGTHS[u] / 2e-4)))
@@ -319,7 +254,8 @@ def _check_errors(
     if missing.any():
         row = int(np.argmax(missing))
         raise table.error("an empty cell", "an error for each size, or none at all", row, column)
-    ratio = float(np.nanmedian(error / size))
+    with np.errstate(over="ignore"):
+        ratio = float(np.nanmedian(error / size))
     if not 1e-6 < ratio < 1.0:
         raise table.error(
             f"errors that are {ratio:g} of the sizes",
@@ -342,3 +278,23 @@ def _check_energy(table: Table, numbers: dict, by_key: dict) -> None:
             row,
             column,
         )
+
+
+def _check_optional(table: Table, numbers: dict, by_key: dict) -> None:
+    """Check the resolution, the energy spread and the screens, where they are given."""
+    for key, most, expected in (
+        ("resolution", PLAUSIBLE[1], "a resolution between 0 and 20 mm"),
+        ("energy_spread", 0.2, "a relative spread between 0 and 0.2; is it in %?"),
+    ):
+        if key in numbers:
+            wrong = (numbers[key] < 0) | (numbers[key] > most)
+            if wrong.any():
+                row, index = int(np.argmax(wrong)), by_key[key]
+                found = f"'{table.cells[row][index]}'"
+                raise table.error(found, expected, row, table.columns[index])
+    if "screen" in by_key:
+        index = by_key["screen"]
+        for row, cells in enumerate(table.cells):
+            if not cells[index]:
+                expected = "the name of a screen of the lattice"
+                raise table.error("an empty cell", expected, row, table.columns[index])

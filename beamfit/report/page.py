@@ -52,7 +52,15 @@ def write_report(
 
     Examples
     --------
-    ``beamfit.write_report("otr2.html", fit)``
+    >>> import tempfile
+    >>> from beamfit.optics.elements import Drift, Quadrupole, Screen
+    >>> line = beamfit.Beamline((Quadrupole("Q", 0.1), Drift("D", 2.0), Screen("S")), 135.0)
+    >>> sizes = [3.4e-4, 1.9e-4, 0.9e-4, 1.9e-4, 3.4e-4]
+    >>> scan = beamfit.QuadScan({"Q": [-1.0, 1.5, 4.0, 6.5, 9.0]}, {"Q": "k1"}, {"x": sizes})
+    >>> page = Path(tempfile.mkdtemp()) / "scan.html"
+    >>> write_report(page, beamfit.fit_emittance(scan, line))
+    >>> page.read_text().startswith("<!DOCTYPE html>")
+    True
     """
     suffix = Path(path).suffix.lower()
     if suffix not in (".html", ".pdf"):

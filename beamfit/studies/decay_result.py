@@ -78,6 +78,15 @@ class DecayFit:
         Model minus reading, mA.
     identifiability : Separability
         Whether the record tells a from b.
+
+    Examples
+    --------
+    >>> from beamfit.studies.decay import fit_decay
+    >>> from beamfit.studies.decay_record import DecayRecord
+    >>> hours = np.linspace(0.0, 36000.0, 40)
+    >>> fit = fit_decay(DecayRecord(hours, 100.0 / (1.0 + 100.0 * 1e-7 * hours)))
+    >>> isinstance(fit, DecayFit), f"{fit.a.value:.2e}"
+    (True, '1.00e-07')
     """
 
     record: str

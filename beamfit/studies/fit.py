@@ -20,6 +20,18 @@ class EmittanceFit:
     """A fitted scan: one `PlaneFit` a plane, with the scan and the line it came from.
 
     Prints as a table; in a notebook it shows as one.
+
+    Examples
+    --------
+    >>> from beamfit.optics.beamline import Beamline
+    >>> from beamfit.optics.elements import Drift, Quadrupole, Screen
+    >>> from beamfit.studies.emittance import fit_emittance
+    >>> line = Beamline((Quadrupole("Q", 0.1), Drift("D", 2.0), Screen("S")), 135.0)
+    >>> sizes = [3.4e-4, 1.9e-4, 0.9e-4, 1.9e-4, 3.4e-4]
+    >>> scan = QuadScan({"Q": [-1.0, 1.5, 4.0, 6.5, 9.0]}, {"Q": "k1"}, {"x": sizes})
+    >>> fit = fit_emittance(scan, line)
+    >>> [p.plane for p in fit.planes], fit.x.dof
+    (['x'], 2)
     """
 
     planes: tuple[PlaneFit, ...]

@@ -113,7 +113,8 @@ def systematics(fit: EmittanceFit, plane: str) -> list[Change]:
     magnets = tuple(n for n, v in fit.scan.settings.items() if np.ptp(v) > 0)
     upstream = fit.line.upto(result.screen.name).elements
     drifts = tuple(e.name for e in upstream if isinstance(e, Drift))
-    matrices, changed = _rows_and_slopes(
+    matrices = transfer_rows(scanned, rows.settings, rows.energy, places=rows.places)
+    changed = _slopes(
         scanned, rows.settings, rows.energy, places=rows.places, magnets=magnets, drifts=drifts
     )
     given = plane_input(fit.scan, scanned, rows, matrices, plane)
@@ -121,7 +122,7 @@ def systematics(fit: EmittanceFit, plane: str) -> list[Change]:
     changed = np.asarray(changed.planes)[:, "xy".index(plane)]
     slope = changed[keep, rows.which[keep], 0]  # (n, 3, changes)
     known_slope = 2.0 * (given.r16 * given.energy_spread**2)[:, None] * slope[:, 2]
-    by_r11, by_r12, by_known = _log_emittance_gradient(
+    gradient = _log_emittance_gradient(
         np.array([q.value for q in result.sigma]),
         given.r11,
         given.r12,
@@ -130,7 +131,8 @@ def systematics(fit: EmittanceFit, plane: str) -> list[Change]:
         result.points.error,
         method=result.method,
     )
-    relative = np.asarray(by_r11 @ slope[:, 0] + by_r12 @ slope[:, 1] + by_known @ known_slope)
+    by_r11, by_r12, by_known = (np.asarray(g) for g in gradient)
+    relative = by_r11 @ slope[:, 0] + by_r12 @ slope[:, 1] + by_known @ known_slope
     # ln βγ rises by E²/(E² - m²) for each relative step of the energy.
     energy = given.energy.mean()
     stiffer = energy**2 / (energy**2 - fit.line.mass**2)
@@ -164,8 +166,8 @@ def _scaled(line: Beamline, magnet: str, factor: Array) -> Beamline:
 
 
 @partial(jax.jit, static_argnames=("places", "magnets", "drifts"))
-def _rows_and_slopes(line, settings, energy, *, places, magnets, drifts):
-    """Transfer matrices of all rows, and their derivatives by each change in the last axis."""
+def _slopes(line, settings, energy, *, places, magnets, drifts):
+    """Derivatives of the transfer matrices of all rows, by each change in the last axis."""
 
     def rows(change: Array) -> TransferMatrix:
         moved = line
@@ -176,7 +178,7 @@ def _rows_and_slopes(line, settings, energy, *, places, magnets, drifts):
         return transfer_rows(moved, settings, energy * (1.0 + change[-1]), places)
 
     none = jnp.zeros(len(magnets) + len(drifts) + 1)
-    return rows(none), jax.jacfwd(rows)(none)
+    return jax.jacfwd(rows)(none)
 
 
 @partial(jax.jit, static_argnames="method")

@@ -19,7 +19,7 @@ CLEAR, CLEAR_BESIDE_ANOTHER = 4.0, 3.0
 # ... and noise would lift it so far less often than this, counting the degrees of freedom.
 CHANCE = 2e-3
 # Sizes that miss every beam by this much, rms and relative, follow no beam.
-LOST = 0.2
+LOST = 0.15
 
 
 class Evidence(NamedTuple):

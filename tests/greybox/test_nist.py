@@ -96,7 +96,7 @@ def test_certified_values_are_reached_to_six_digits(name):
     assert r @ r == pytest.approx(table["rss"], rel=2e-8 if name != "Lanczos1" else 1)
     fit = solve(p)
     np.testing.assert_allclose(fit.theta, table["certified"], rtol=5e-7)
-    assert fit.status == Status.CONVERGED
+    assert fit.status == Status.converged
     assert fit.kkt.worst < 1e-6
     assert fit.dof == len(table["y"]) - len(table["certified"])
     # Lanczos1 is exact data: its residuals, 1e-13, are rounding.

@@ -26,6 +26,7 @@ def test_twiss_go_in_and_come_out(given_twiss):
         beam.sigma,
         emittance * np.array([[beta, -alpha], [-alpha, (1 + alpha**2) / beta]]),
         rtol=1e-12,
+        atol=1e-290,
     )
 
 

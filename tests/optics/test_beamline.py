@@ -63,7 +63,7 @@ def test_every_element_class_has_a_case():
 @pytest.mark.parametrize("case", CASES)
 def test_determinant_is_one_in_both_planes(case):
     r = CASES[case].matrix(energy=135.0)
-    for plane in r:
+    for plane in (r.x, r.y):
         assert np.linalg.det(plane[:2, :2]) == pytest.approx(1.0, abs=1e-14)
 
 
@@ -124,7 +124,7 @@ def test_two_parts_of_a_quadrupole_make_the_whole(k1, part):
     pieces = (
         Quadrupole("B", 0.4 * (1 - part), k1).matrix() @ Quadrupole("A", 0.4 * part, k1).matrix()
     )
-    for got, expected in zip(pieces, whole, strict=True):
+    for got, expected in ((pieces.x, whole.x), (pieces.y, whole.y)):
         np.testing.assert_allclose(got, expected, rtol=1e-12, atol=1e-13)
 
 
@@ -132,8 +132,7 @@ def test_two_halves_of_a_combined_dipole_make_the_whole():
     whole = SectorDipole("B", 3.0, 0.3, 0.1, 0.2, k1=1.5).matrix()
     first = SectorDipole("B1", 3.0, 0.15, 0.1, 0.0, k1=1.5).matrix()
     second = SectorDipole("B2", 3.0, 0.15, 0.0, 0.2, k1=1.5).matrix()
-    for got, expected in zip(second @ first, whole, strict=True):
-        np.testing.assert_allclose(got, expected, rtol=1e-13, atol=1e-14)
+    np.testing.assert_allclose((second @ first).planes, whole.planes, rtol=1e-13, atol=1e-14)
 
 
 def test_a_quadrupole_at_zero_is_a_drift_and_stays_differentiable():

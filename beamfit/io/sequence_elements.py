@@ -1,0 +1,228 @@
+"""From the elements of a MAD or elegant line to the tables of a beamfit lattice.
+
+What a first-order, uncoupled line of one energy cannot hold is refused, never dropped.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Iterable, Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from beamfit.errors import InputError
+    from beamfit.io.sequence_source import Source
+
+__all__ = ["element_tables"]
+
+# Parameters that bend, focus, couple or accelerate in a way beamfit does not model.
+UNMODELLED = {
+    "ks": "a solenoid field",
+    "ksi": "a solenoid field",
+    "b": "a field given as B",
+    "k1s": "a skew gradient",
+    "k0s": "a skew bend",
+    "ktap": "a tapered field",
+    "fse": "a field error",
+    "etilt": "a tilt error",
+    "bore": "a field given by its bore",
+    "use_bn": "a field given by B1, B2, ...",
+    "volt": "an accelerating voltage",
+    "ex": "an electric field",
+    "ey": "an electric field",
+    "kill_ent_fringe": "an edge switched off",
+    "kill_exi_fringe": "an edge switched off",
+}
+EDGES = ("edge1_effects", "edge2_effects")
+
+
+def element_tables(
+    elements: Iterable[Any], described: Mapping[str, Any], source: Source
+) -> list[dict[str, Any]]:
+    """Translate a line.
+
+    Parameters
+    ----------
+    elements : iterable of at.Element
+        The expanded line.
+    described : mapping of str to mapping
+        What the file says of each element: the parameters pyAT may have dropped.
+    source : Source
+        The file, for messages.
+
+    Returns
+    -------
+    list of dict
+        Tables with the keys of a TOML lattice. Markers and screens that occur several times
+        are numbered as elegant numbers them, NAME#1, NAME#2.
+
+    Raises
+    ------
+    InputError
+        If an element does what beamfit does not model; it names element, type and file.
+    """
+    elements = list(elements)
+    tables = [_Translation(e, described.get(e.FamName, {}), source).table() for e in elements]
+    places = Counter(t["name"] for t in tables if t["type"] in ("marker", "screen"))
+    seen: Counter[str] = Counter()
+    for table in tables:
+        name = table["name"]
+        if table["type"] == "drift" and name in places:
+            table["name"] = f"{name}.drift"  # half of a monitor with a length
+        elif places[name] > 1:
+            seen[name] += 1
+            table["name"] = f"{name}#{seen[name]}"
+    return tables
+
+
+class _Translation:
+    """One element and what the file says of it."""
+
+    def __init__(self, element: Any, said: Mapping[str, Any], source: Source) -> None:
+        self.element, self.said, self.source = element, said, source
+        self.name = element.FamName
+        self.type = str(getattr(element, "origin", None) or type(element).__name__).upper()
+        self.length = float(getattr(element, "Length", 0.0))
+
+    def table(self) -> dict[str, Any]:
+        kind = type(self.element).__name__
+        if kind == "Monitor":
+            return {"type": "screen", "name": self.name}
+        if kind == "Marker" and self.type in ("MARKER", "MARK", "WATCH"):
+            return {"type": "marker", "name": self.name}
+        self.check_unmodelled()
+        if kind == "Quadrupole":
+            return self.quadrupole()
+        if kind == "Dipole":
+            return self.dipole()
+        if kind == "ThinMultipole":
+            return self.thin_multipole()
+        if any(self.polynom("PolynomB")[:2]) or any(self.polynom("PolynomA")[:2]):
+            raise self.refuse("with a dipole or quadrupole component of its own")
+        return self.space()
+
+    def refuse(self, what: str, expected: str = "") -> InputError:
+        return self.source.error(
+            f"element '{self.name}' of type '{self.type}' {what}, which beamfit does not model",
+            expected or "a line without it: cut the line after it, or set it to zero",
+            self.name,
+        )
+
+    def number(self, key: str) -> float:
+        """Return a parameter as the file has it; 0 where it has none or it is not a number."""
+        try:
+            return float(self.said.get(key, 0.0))
+        except (TypeError, ValueError):
+            return 0.0
+
+    def polynom(self, key: str) -> list[float]:
+        return [float(v) for v in np.atleast_1d(getattr(self.element, key, []))] + [0.0, 0.0]
+
+    def check_unmodelled(self) -> None:
+        for key, meaning in UNMODELLED.items():
+            if self.number(key) != 0.0:
+                raise self.refuse(f"with {meaning} ({key.upper()} = {self.number(key):g})")
+        for key in EDGES:
+            if key in self.said and self.number(key) == 0.0:
+                raise self.refuse(f"with an edge switched off ({key.upper()} = 0)")
+        if type(self.element).__name__ == "ThinMultipole":
+            return
+        for key in ("knl", "ksl"):
+            values = self.said.get(key, ())
+            values = values if isinstance(values, tuple | list) else (values,)
+            if any(float(v) for v in values[:2]):
+                raise self.refuse(f"with multipole components of its own ({key.upper()})")
+
+    def space(self) -> dict[str, Any]:
+        """A length without focusing: drifts, collimators, correctors, sextupoles, ..."""
+        if self.length == 0.0:
+            return {"type": "marker", "name": self.name}
+        return {"type": "drift", "name": self.name, "length_m": self.length}
+
+    def quarter_turns(self) -> int:
+        """Tilt of the element in units of 90°."""
+        turns = self.number("tilt") / (math.pi / 2)
+        # Four digits: files write pi/2 as 1.5708.
+        if abs(turns - round(turns)) > 1e-4:
+            raise self.refuse(
+                f"tilted by {math.degrees(self.number('tilt')):g} degrees",
+                "upright elements, or bends tilted by a multiple of 90 degrees",
+            )
+        return round(turns) % 4
+
+    def quadrupole(self) -> dict[str, Any]:
+        k1 = self.polynom("PolynomB")[1]
+        if self.polynom("PolynomB")[0] or any(self.polynom("PolynomA")[:2]):
+            raise self.refuse("with a dipole or skew component of its own")
+        if self.length <= 0.0:
+            raise self.refuse(f"of length {self.length:g} m", "a length above zero")
+        sign = -1.0 if self.quarter_turns() % 2 else 1.0
+        return {
+            "type": "quadrupole",
+            "name": self.name,
+            "length_m": self.length,
+            "k1_per_m2": sign * k1 + 0.0,
+        }
+
+    def dipole(self) -> dict[str, Any]:
+        k1, angle = self.polynom("PolynomB")[1], float(self.element.BendingAngle)
+        edges = [float(self.element.EntranceAngle), float(self.element.ExitAngle)]
+        self.check_dipole(angle)
+        turns = self.quarter_turns()
+        k1 = -k1 if turns % 2 else k1
+        if angle == 0.0:
+            straight = {"type": "quadrupole", "k1_per_m2": k1} if k1 else {"type": "drift"}
+            return {"name": self.name, "length_m": self.length} | straight
+        if self.type == "RBEND" and angle < 0.0:
+            # pyAT adds |angle|/2 to the edges of an RBEND. MAD-X adds angle/2, so that the
+            # faces stay parallel whichever way it bends.
+            edges = [e + angle for e in edges]
+        if turns in (2, 3):  # bends the other way; the edges are counted with the bend
+            angle, edges = -angle, [-e for e in edges]
+        return {
+            "type": "sector_dipole",
+            "name": self.name,
+            "radius_m": self.length / abs(angle),
+            "angle_deg": math.degrees(angle),
+            "entrance_edge_deg": math.degrees(edges[0]),
+            "exit_edge_deg": math.degrees(edges[1]),
+            "bend_plane": "y" if turns % 2 else "x",
+            "k1_per_m2": k1,
+        }
+
+    def check_dipole(self, angle: float) -> None:
+        if any(self.polynom("PolynomA")[:2]):
+            raise self.refuse("with a skew component of its own")
+        if self.type == "RBEN":
+            raise self.refuse(
+                "(rectangular; pyAT and elegant read its length differently)",
+                "CSBEND or SBEN with the arc length and E1 = E2 = ANGLE/2",
+            )
+        if self.length <= 0.0:
+            raise self.refuse(f"of length {self.length:g} m", "a length above zero")
+        k0 = self.number("k0")
+        if k0 and abs(k0 * self.length - angle) > 1e-9:
+            raise self.refuse(f"with a field (K0 = {k0:g}) that is not ANGLE/L")
+        # elegant takes FINT = 0.5 where the file has none, MAD takes 0.
+        usual = 0.5 if self.source.dialect == "elegant" else 0.0
+        integrals = [self.number(k) for k in ("fint", "fintx", "fint1", "fint2")]
+        if "fint" not in self.said:
+            integrals.append(usual)
+        gap = self.number("hgap") or self.number("hgapx")
+        if gap and any(integrals):
+            raise self.refuse(
+                "with a fringe field (HGAP and FINT)",
+                "HGAP = 0, or a TOML lattice with effective edge angles",
+            )
+
+    def thin_multipole(self) -> dict[str, Any]:
+        normal, skew = self.polynom("PolynomB"), self.polynom("PolynomA")
+        if normal[0] or skew[0] or skew[1]:
+            raise self.refuse("with a dipole or skew component of its own")
+        if not normal[1]:
+            return {"type": "marker", "name": self.name}
+        sign = -1.0 if self.quarter_turns() % 2 else 1.0
+        return {"type": "thin_lens", "name": self.name, "k1l_per_m": sign * normal[1]}

@@ -1,0 +1,347 @@
+"""MAD-X, MAD-8 and elegant lines, against pyAT's and MAD-X's own matrices of the same file."""
+
+import sys
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from beamfit.errors import InputError
+from beamfit.io.line import build_line, load_lattice, read_lattice
+
+at = pytest.importorskip("at", reason="accelerator-toolbox is not installed")
+
+# A quadrupole, a corrector (at zero: pyAT's matrix is about the kicked orbit), a bend with
+# edges and gradient, and a monitor with a length.
+MADX = """! a comment: with a colon
+beam, particle=electron, energy=0.135;
+kq := 3.7;
+Q1: quadrupole, l=0.12, k1:=kq;
+C1: hkicker, l=0.1, kick=0;
+B1: sbend, l=0.4, angle=0.3, e1=0.1, e2=0.05, k1=0.4;
+BPM: monitor, l=0.06;
+OTR: instrument;
+LC: sequence, l=3.0, refer=centre;
+Q1, at=0.06;
+C1, at=0.5;
+B1, at=1.0;
+BPM, at=2.0;
+OTR, at=3.0;
+endsequence;
+"""
+MAD8 = """COMMENT
+ a block
+ENDCOMMENT
+BEAM, PARTICLE=ELECTRON, ENERGY=0.135
+KQ := 3.7
+Q1: QUAD, L=0.12, K1=KQ
+D1: DRIF, L=0.68
+D2: DRIF, L=1.8
+B1: SBEN, L=0.4, ANGLE=0.3, E1=0.1, &
+    E2=0.05, K1=0.4
+OTR: PROF
+LC: LINE=(Q1,D1,B1,D2,OTR)
+"""
+ELEGANT = """! elegant
+% 3.7 sto kq
+"Q1": KQUAD, L=0.12, K1="kq"
+D1: DRIFT, L=0.68
+D2: DRIFT, L=1.77
+B1: CSBEND, L=0.4, ANGLE=0.3, E1=0.1, &
+    E2=0.05, K1=0.4
+W1: WATCH, FILENAME="%s.w1"
+BPM: MONI, L=0.06
+LC: LINE=(Q1,D1,B1,D2,W1,BPM)
+"""
+FILES = {"line.madx": MADX, "line.mad8": MAD8, "line.lte": ELEGANT}
+LOADERS = {"line.madx": at.load_madx, "line.mad8": at.load_mad8, "line.lte": at.load_elegant}
+# pyAT knows neither MAD-8's short keywords nor its profile monitors.
+FULL = {"QUAD,": "QUADRUPOLE,", "DRIF,": "DRIFT,", "SBEN,": "SBEND,", "PROF": "MONITOR"}
+# Nor does it read an expression after "sto", which leaves its number on the stack.
+RPN = {"% 3.7 sto kq\n": "\n", '"kq"': "3.7"}
+
+
+@pytest.fixture
+def written(tmp_path):
+    def write(name, text):
+        path = tmp_path / name
+        path.write_text(text)
+        return path
+
+    return write
+
+
+def refused(path, **options):
+    with pytest.raises(InputError) as raised:
+        read_lattice(path, **options)
+    return str(raised.value)
+
+
+def planes_of(m66):
+    """Both planes of a 6x6 matrix on (x, x', y, y', δ, ct), as beamfit orders them."""
+    return m66[np.ix_([0, 1, 4], [0, 1, 4])], m66[np.ix_([2, 3, 4], [2, 3, 4])]
+
+
+@pytest.mark.filterwarnings("ignore::at.AtWarning")
+@pytest.mark.parametrize("name", FILES)
+def test_matrix_is_that_of_pyat(name, written):
+    ours = load_lattice(written(name, FILES[name]), energy=135.0).matrix()
+    text = FILES[name]
+    for short, full in FULL.items() if name.endswith("mad8") else RPN.items():
+        text = text.replace(short, full)
+    ring = LOADERS[name](written("peer_" + name, text), use="LC", energy=135e6)
+    for element in ring:
+        if hasattr(element, "NumIntSteps"):
+            element.NumIntSteps = 200
+    x, y = planes_of(at.find_m66(ring.disable_6d(copy=True), orbit=np.zeros(6))[0])
+    np.testing.assert_allclose(ours.x, x, atol=1e-6)
+    np.testing.assert_allclose(ours.y, y, atol=1e-6)
+
+
+def test_the_three_dialects_say_the_same(written):
+    r = [
+        load_lattice(written(n, t), energy=135.0).upto(last).matrix().planes
+        for (n, t), last in zip(FILES.items(), ("OTR", "OTR", "BPM.drift"), strict=True)
+    ]
+    np.testing.assert_allclose(r[0], r[1], atol=1e-12)
+    np.testing.assert_allclose(r[0], r[2], atol=1e-12)
+
+
+BENDS = {
+    "sbend": "b: sbend, l=0.5, angle=0.3, e1=0.1, e2=0.05, k1=0.7;",
+    "negative": "b: sbend, l=0.5, angle=-0.3, e1=0.1, e2=0.05, k1=0.7;",
+    "rbend": "b: rbend, l=0.5, angle=0.3, e1=0.02, e2=0.05;",
+    "negative rbend": "b: rbend, l=0.5, angle=-0.3, e1=0.02, e2=0.05;",
+    "vertical": "b: sbend, l=0.5, angle=0.3, e1=0.1, e2=0.05, k1=0.7, tilt=pi/2;",
+    "the other vertical": "b: sbend, l=0.5, angle=0.3, e1=0.1, e2=0.05, k1=0.7, tilt=-pi/2;",
+    "upside down": "b: sbend, l=0.5, angle=0.3, e1=0.1, e2=0.05, k1=0.7, tilt=pi;",
+    "off": "b: sbend, l=0.5, angle=0, e1=0.1, k1=0.7;",
+    "turned quadrupole": "b: quadrupole, l=0.5, k1=1.3, tilt=pi/2;",
+    "thin": "b: multipole, knl={0, 1.3, 4};",
+    "sextupole": "b: sextupole, l=0.5, k2=5;",
+}
+
+
+@pytest.mark.parametrize("bend", BENDS)
+def test_matrix_is_that_of_madx(bend, written):
+    cpymad = pytest.importorskip("cpymad.madx", reason="cpymad is not installed")
+    text = f"""beam, particle=electron, energy=135;
+    q: quadrupole, l=0.12, k1=2.1;
+    {BENDS[bend]}
+    s: monitor;
+    lc: sequence, l=3, refer=centre; q, at=0.2; b, at=1; s, at=3; endsequence;
+    """
+    ours = load_lattice(written("line.madx", text)).matrix()
+    madx = cpymad.Madx(stdout=False)
+    madx.input(text)
+    madx.use(sequence="lc")
+    twiss = madx.twiss(sequence="lc", betx=1, bety=1, rmatrix=True)
+    m66 = [[twiss[f"re{i}{j}"][-1] for j in (1, 2, 3, 4, 6)] for i in (1, 2, 3, 4, 6)]
+    x, y = planes_of(np.array(m66))
+    # MAD-X's p_t is δ·β; at 135 GeV β = 1 to 7e-12.
+    np.testing.assert_allclose(ours.x, x, atol=1e-9)
+    np.testing.assert_allclose(ours.y, y, atol=1e-9)
+    madx.quit()
+
+
+def test_what_a_scan_needs_is_told_without_building(written):
+    file = read_lattice(written("line.madx", MADX))
+    assert file.calibrations == {"Q1": "k1"}
+    assert file.places == ["BPM", "OTR"]
+    assert file.default_screen == "OTR"
+    assert (file.energy, file.particle) == (pytest.approx(135.0), "electron")
+    assert next(e for e in file.elements if e["name"] == "Q1")["k1_per_m2"] == 3.7
+    # halves of the monitor before and after its centre, where the size is measured
+    assert build_line(file).upto("BPM").length == pytest.approx(2.0)
+    line = read_lattice(written("line.lte", ELEGANT), energy=135.0)
+    assert line.places == ["W1", "BPM"]
+    assert build_line(line).upto("BPM").length == pytest.approx(0.12 + 0.68 + 0.4 + 1.77 + 0.03)
+
+
+def test_a_marker_can_be_the_screen(written):
+    path = written("a.lte", "Q: QUAD, L=0.1, K1=1\nM: MARK\nLC: LINE=(Q,M)")
+    file = read_lattice(path, energy=50.0)
+    assert file.default_screen is None
+    assert file.places == ["M"]
+
+
+def test_repeated_monitors_are_numbered_and_quadrupoles_are_in_series(written):
+    text = "Q: QUAD, L=0.1, K1=1\nM: MONI\nC: LINE=(Q,M)\nLC: LINE=(2*C)"
+    file = read_lattice(written("a.lte", text), use="lc", energy=50.0)
+    assert [e["name"] for e in file.elements] == ["Q", "M#1", "Q", "M#2"]
+    assert file.calibrations == {"Q": "k1"}
+
+
+@pytest.mark.parametrize(
+    ("beam", "energy"),
+    [
+        ("energy=0.135", 135.0),
+        ("pc=0.135", np.hypot(135.0, 0.51099895)),
+        ("gamma=200", 200 * 0.51099895),
+        ("particle=proton, energy=1.2", 1200.0),
+    ],
+)
+def test_energy_of_the_beam(beam, energy, written):
+    text = MADX.replace("particle=electron, energy=0.135", beam)
+    path = written("a.madx", text)
+    assert read_lattice(path).energy == pytest.approx(energy, rel=1e-6)
+    assert read_lattice(path, energy=2000.0).energy == 2000.0
+
+
+def test_the_beam_of_the_sequence_counts(written):
+    path = written("a.madx", MADX + "beam, sequence=lc, particle=positron, energy=0.2;\n")
+    assert read_lattice(path).energy == pytest.approx(200.0)
+    assert read_lattice(path).particle == "positron"
+
+
+def test_nothing_is_printed(written, capfd):
+    for name, text in FILES.items():
+        read_lattice(written(name, text), energy=135.0)
+        refused(written("bad_" + name, text.replace("L=0.12", "L=0.1*").replace("l=0.12", "l=*")))
+    assert capfd.readouterr() == ("", "")
+
+
+ELEMENTS = {
+    "solenoid": ("e: solenoid, l=0.2, ks=0.1;", "'e' of type 'SOLENOID'"),
+    "skew by k1s": ("e: quadrupole, l=0.2, k1=1, k1s=0.3;", "'e' of type 'QUADRUPOLE'"),
+    "skew by tilt": ("e: quadrupole, l=0.2, k1=1, tilt=pi/4;", "tilted by 45 degrees"),
+    "tilt without value": ("e: quadrupole, l=0.2, k1=1, tilt;", "'tilt' without a value"),
+    "thin dipole": ("e: multipole, knl={0.1};", "'e' of type 'MULTIPOLE'"),
+    "thin skew": ("e: multipole, knl={0, 0.1}, ksl={0, 0.1};", "'e' of type 'MULTIPOLE'"),
+    "cavity": ("e: rfcavity, l=0.2, volt=10, freq=2856;", "VOLT = 10"),
+    "fringe": ("e: sbend, l=0.2, angle=0.1, hgap=0.01, fint=0.5;", "fringe field"),
+    "field": ("e: sbend, l=0.2, angle=0.1, k0=0.7;", "K0 = 0.7"),
+    "quadrupole error": ("e: sextupole, l=0.2, knl={0, 0.1};", "'e' of type 'SEXTUPOLE'"),
+    "no length": ("e: quadrupole, l=0, k1=3;", "length 0 m"),
+    "unknown type": ("w: wiggler, l=0.2;", "'w' of type 'WIGGLER'"),
+    "undefined": ("w: quadrupole, l=0.2, k1=kx;", "undefined 'kx'"),
+    "no such length": ("e: sbend, angle=0.2;", "'l'"),
+}
+
+
+@pytest.mark.parametrize("case", ELEMENTS)
+def test_focusing_that_is_not_modelled_is_refused_by_name(case, written):
+    line, said = ELEMENTS[case]
+    text = f"beam, energy=0.1;\n\n{line}\nd: drift, l=1;\nlc: line=(d, {line[0]}, d);\n"
+    path = written("a.madx", text)
+    message = refused(path)
+    assert said in message
+    assert str(path) in message
+    if case != "no such length":
+        assert message.startswith(f"{path}:3:")
+
+
+@pytest.mark.parametrize(
+    ("element", "said"),
+    [
+        ("E: SOLENOID, L=0.2, KS=0.1", "SOLENOID"),
+        ("E: RFCA, L=0.2, VOLT=1e6, FREQ=2856e6", "VOLT"),
+        ("E: KQUSE, L=0.2, K1=1, K2=3", "quadrupole component"),
+        ("E: MULT, L=0.2, KNL=0.3, ORDER=1", "multipole components"),
+        ("E: QUAD, L=0.2, K1=1, FSE=0.01", "FSE"),
+        ("E: SBEN, L=0.2, ANGLE=0.1, HGAP=0.01", "fringe field"),
+        ("E: CSBEND, L=0.2, ANGLE=0.1, EDGE1_EFFECTS=0", "EDGE1_EFFECTS"),
+        ("E: RBEN, L=0.2, ANGLE=0.1", "RBEN"),
+        ("E: EMATRIX, L=0.2", "EMATRIX"),
+    ],
+)
+def test_elegant_elements_that_are_refused(element, said, written):
+    path = written("a.lte", f"{element}\nLC: LINE=(E)\n")
+    message = refused(path, energy=100.0)
+    assert message.startswith(f"{path}:1:")
+    assert said in message
+
+
+def test_elements_without_strength_are_drifts(written):
+    text = """beam, energy=0.1;
+    a: solenoid, l=0.2; b: rfcavity, l=0.3; c: kicker, l=0.1, hkick=1e-4; d: octupole, l=0.5, k3=7;
+    f: rcollimator, l=0.2; g: multipole; h: vkicker;
+    lc: line=(a, b, c, d, f, g, h);
+    """
+    file = read_lattice(written("a.madx", text))
+    assert {e["type"] for e in file.elements} == {"drift", "marker"}
+    assert build_line(file).length == pytest.approx(1.3)
+
+
+def test_which_line(written):
+    text = ELEGANT + "RING: LINE=(LC,LC)\n"
+    path = written("a.lte", text)
+    message = refused(path, energy=100.0)
+    assert "LC, RING" in message
+    assert "--use" in message
+    assert "did you mean RING?" in refused(path, energy=100.0, use="RNIG")
+    assert read_lattice(path, energy=100.0, use="ring").name == "RING"
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "said"),
+    [
+        ("a.madx", MADX.replace("beam, particle=electron, energy=0.135;", ""), "--energy"),
+        ("a.lte", ELEGANT, "--energy"),
+        ("a.madx", MADX.replace("energy=0.135", "energy=135e6"), "GeV"),
+        ("a.madx", MADX.replace("electron", "muon"), "particle 'muon'"),
+        ("a.madx", "x = 3;\n", "no LINE"),
+        ("a.madx", "beam, energy=1; lc: line=(lc);", "lc"),
+        ("a.lte", "C: CHARGE, TOTAL=1e-9\nLC: LINE=(C)", "without elements"),
+        ("a.madx", "beam, energy=1; d: drift, l=1; lc: line=(d, pi);", "3.14159"),
+        ("a.madx", "beam, energy=1; k := 3**; lc: line=(k);", "'3**'"),
+        ("a.madx", "beam, energy=k; k := 3**; d: drift, l=1; lc: line=(d);", "BEAM"),
+        ("a.madx", MADX.replace("at=0.5", "at=0.1"), "overlap"),
+        ("a.madx", "call, file='nowhere.madx';\n", "nowhere.madx"),
+        ("a.ele", "&run_setup\n lattice = line.lte\n&end\n", "command file"),
+        ("a.madx", "beam, energy=1;\nx := ().__class__;\n", "a.madx:2"),
+        ("a.madx", "x = ()->_＿class__;\n", "a.madx:1"),
+        ("a.madx", "", "empty"),
+    ],
+)
+def test_files_that_cannot_be_used(name, text, said, written):
+    message = refused(written(name, text), energy=9.0 if "CHARGE" in text else None)
+    assert said in message
+    assert name in message
+    assert "\n" not in message
+
+
+@pytest.mark.parametrize(
+    ("name", "old", "new", "line"),
+    [
+        ("line.madx", "l=0.12,", "l=0.12*,", 4),
+        ("line.mad8", "L=0.68", "L=0.68)(", 7),
+        ("line.lte", "L=0.68", "L=0.68+", 4),
+        ("line.lte", "W1,BPM)", "W1,BPM}", 10),
+    ],
+)
+def test_a_statement_that_does_not_parse_is_located(name, old, new, line, written):
+    path = written(name, FILES[name].replace(old, new))
+    assert refused(path, energy=135.0).startswith(f"{path}:{line}:")
+
+
+def test_called_files_are_found_beside_the_file(written):
+    written("optics.madx", MADX)
+    assert read_lattice(written("main.madx", 'call, file="optics.madx";')).name == "LC"
+
+
+def test_without_pyat(written, monkeypatch):
+    monkeypatch.setitem(sys.modules, "at", None)
+    path = written("line.madx", MADX)
+    assert "pip install 'beamfit[lattice]'" in refused(path)
+
+
+@given(
+    st.sampled_from(sorted(FILES)),
+    st.integers(0, 500),
+    st.integers(0, 20),
+    st.text(alphabet="(){}[],;:=!\"'&*/%+- \n.qLéé", max_size=6),
+)
+def test_any_damage_is_read_or_refused(tmp_path_factory, name, start, length, damage):
+    text = FILES[name]
+    path = tmp_path_factory.getbasetemp() / f"damaged_{name}"
+    path.write_text(text[:start] + damage + text[start + length :])
+    try:
+        read_lattice(path, energy=135.0)
+    except InputError as error:
+        said = str(error)
+    else:
+        return
+    assert str(path) in said
+    assert "\n" not in said
