@@ -53,6 +53,7 @@ def write_report(
     Examples
     --------
     >>> import tempfile
+    >>> import beamfit
     >>> from beamfit.optics.elements import Drift, Quadrupole, Screen
     >>> line = beamfit.Beamline((Quadrupole("Q", 0.1), Drift("D", 2.0), Screen("S")), 135.0)
     >>> sizes = [3.4e-4, 1.9e-4, 0.9e-4, 1.9e-4, 3.4e-4]
