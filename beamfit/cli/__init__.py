@@ -11,6 +11,7 @@ import click
 
 from beamfit import __version__
 from beamfit.cli.emittance import emittance
+from beamfit.cli.lifetime import lifetime
 from beamfit.errors import InputError
 
 __all__ = ["cli", "main"]
@@ -22,10 +23,11 @@ __all__ = ["cli", "main"]
 )
 @click.version_option(__version__, prog_name="beamfit")
 def cli() -> None:
-    """Beam emittance from quadrupole scans, with errors you can defend."""
+    """Beam emittance and lifetime from scans and decays, with errors you can defend."""
 
 
 cli.add_command(emittance)
+cli.add_command(lifetime)
 
 
 def main() -> None:

@@ -2,18 +2,11 @@
 
 from __future__ import annotations
 
-import json
-import math
-import os
-import shlex
-import sys
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from beamfit import __version__
-from beamfit.errors import InputError
+from beamfit.cli.document import check_report_name, command_line, json_text
 from beamfit.io.lattice import LatticeFile
 from beamfit.io.line import build_line, read_lattice
 from beamfit.io.measurement import read_quad_scan
@@ -89,7 +82,7 @@ def emittance(
     SCAN is a CSV or HDF5 file with columns such as Q2_A (or Q2_kG, Q2_k1), size_x_um,
     size_x_error_um, size_y_um, and optionally energy_MeV, screen, shot.
     """
-    _check_report(report)
+    check_report_name(report)
     measured = read_quad_scan(scan)
     described = read_lattice(lattice, use=use, energy=energy)
     check_names(
@@ -111,30 +104,15 @@ def emittance(
         robust=robust,
     )
     inputs = {str(scan): measured.sha256, str(lattice): described.sha256}
-    command = shlex.join(["beamfit", *sys.argv[1:]])
+    command = command_line()
     if report is not None:
         from beamfit.report.page import write_report
 
         write_report(report, fit, command=command, inputs=inputs)
     if as_json:
-        click.echo(_json(fit, command, inputs))
+        click.echo(json_text(command, inputs, _results(fit)))
     else:
         _print(fit, described, report)
-
-
-def _check_report(report: str | None) -> None:
-    """Find out before the fit whether its report could be written."""
-    if report is None:
-        return
-    if Path(report).suffix.lower() not in (".html", ".pdf"):
-        raise InputError(f"report '{report}'", "a name ending in .html or .pdf")
-    folder = Path(report).parent
-    if Path(report).is_dir():
-        raise InputError(f"report '{report}', which is a folder", "the name of a file")
-    if not folder.is_dir():
-        raise InputError(f"report '{report}'", f"a folder that exists; '{folder}' is none")
-    if not os.access(folder, os.W_OK):
-        raise InputError(f"report '{report}'", f"a folder one may write to; '{folder}' is not")
 
 
 def _planes(plane: str | None, scan: QuadScan) -> tuple[str, ...]:
@@ -147,10 +125,10 @@ def _planes(plane: str | None, scan: QuadScan) -> tuple[str, ...]:
     return (plane,)
 
 
-def _json(fit: EmittanceFit, command: str, inputs: dict[str, str | None]) -> str:
+def _results(fit: EmittanceFit) -> list[dict[str, Any]]:
     from beamfit.studies.sensitivity import range_sensitivity, systematics
 
-    results = [
+    return [
         p.to_json()
         | {
             "systematics": [c._asdict() for c in systematics(fit, p.plane)],
@@ -158,17 +136,6 @@ def _json(fit: EmittanceFit, command: str, inputs: dict[str, str | None]) -> str
         }
         for p in fit.planes
     ]
-    document = {"beamfit": __version__, "command": command, "inputs": inputs, "results": results}
-    return json.dumps(_finite(document), indent=2, allow_nan=False)
-
-
-def _finite(value: Any) -> Any:
-    """Replace numbers JSON cannot hold by null."""
-    if isinstance(value, dict):
-        return {k: _finite(v) for k, v in value.items()}
-    if isinstance(value, list | tuple):
-        return [_finite(v) for v in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def _print(fit: EmittanceFit, lattice: LatticeFile, report: str | None) -> None:

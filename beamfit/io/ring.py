@@ -1,4 +1,7 @@
-"""Rings from a TOML file, a Twiss table (CSV or TFS) or a pyAT lattice."""
+"""Rings from a TOML file, a Twiss table (CSV or TFS) or a pyAT lattice.
+
+A file is checked before the values are built, for which alone JAX is imported.
+"""
 
 from __future__ import annotations
 
@@ -12,10 +15,11 @@ import numpy as np
 from beamfit.errors import InputError, nearest
 from beamfit.io.files import read_text
 from beamfit.io.twiss import read_twiss
-from beamfit.lifetime.ring import Gas, Operation, Optics, Ring, gas_mixture
 
 if TYPE_CHECKING:
     import at
+
+    from beamfit.lifetime.ring import Gas, Operation, Optics, Ring
 
 __all__ = ["read_operation", "read_ring", "ring_from_pyat"]
 
@@ -122,6 +126,8 @@ def _optics(table: dict[str, Any], circumference: float, path: Path) -> Optics:
     """The ring's optics: a table beside the file, or averages as a ring of one point."""
     if "twiss" not in table:
         averages = _numbers(table, OPTICS_KEYS, path)
+        from beamfit.lifetime.ring import Optics  # JAX from here on
+
         points = {field: np.array([value]) for field, value in averages.items()}
         return Optics(weight=np.ones(1), **points)
     if len(table) > 1:
@@ -161,6 +167,8 @@ def read_ring(path: str | Path) -> Ring:
     del machine["coupling"]
     aperture = _numbers(_table(document, "acceptance", path), ACCEPTANCE_KEYS, path)
     optics = _optics(_table(document, "optics", path), machine["circumference"], path)
+    from beamfit.lifetime.ring import Ring
+
     return Ring(**machine, **aperture, optics=optics)
 
 
@@ -201,10 +209,14 @@ def read_operation(path: str | Path) -> Operation:
             path=path,
             column="rf_voltage_kV",
         )
+    from beamfit.lifetime.ring import Operation  # JAX from here on
+
     return Operation(**values, gas=_gas(table.get("gas", {"N2": 1.0}), path))
 
 
 def _gas(fractions: dict[str, float], path: Path) -> Gas:
+    from beamfit.lifetime.ring import gas_mixture
+
     try:
         return gas_mixture(**fractions)
     except (TypeError, ValueError) as error:
@@ -253,6 +265,8 @@ def ring_from_pyat(
     >>> print(f"{ring.energy_loss / 1e3:.1f} keV, {ring.optics.beta_x.size} points")
     34.7 keV, 32 points
     """
+    from beamfit.lifetime.ring import Optics, Ring
+
     loss, voltage = lattice.get_energy_loss(), lattice.get_rf_voltage()
     if voltage <= loss:
         expected = f"more than the loss of {loss:.6g} V a turn, or no beam is stored"

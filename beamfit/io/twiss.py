@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import csv
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from beamfit.errors import InputError, nearest
 from beamfit.io.files import text_lines
-from beamfit.lifetime.ring import Optics
+
+if TYPE_CHECKING:
+    from beamfit.lifetime.ring import Optics
 
 __all__ = ["read_twiss"]
 
@@ -122,5 +125,7 @@ def read_twiss(path: str | Path, circumference: float) -> Optics:
             raise InputError(
                 f"{values[bad[0]]}", "a usable value", path=path, line=line, column=sought
             )
+    from beamfit.lifetime.ring import Optics  # JAX from here on: the table is in order
+
     weight = _weights(columns.pop("s_m"), circumference, rows, path)
     return Optics(weight, *columns.values())

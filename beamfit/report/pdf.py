@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import io
 import textwrap
-from collections.abc import Callable, Mapping
 from typing import Any
 
 from matplotlib.backends.backend_pdf import PdfPages
-from matplotlib.figure import Figure, FigureBase
+from matplotlib.figure import Figure
+
+from beamfit.report.document import Page, Picture
 
 __all__ = ["pdf_of"]
 
@@ -39,12 +40,12 @@ class _Pages:
             (MARGIN + x) / WIDTH, self.y / HEIGHT, words, fontsize=size, va="top", **style
         )
 
-    def paragraph(self, words: str, columns: int = 98, **style: Any) -> None:
-        """Write wrapped text."""
+    def paragraph(self, words: str, columns: int = 98, step: float = 1.0, **style: Any) -> None:
+        """Write wrapped text, each line so many usual ones high."""
         for line in textwrap.wrap(words, columns) or [""]:
-            self.room(1)
+            self.room(step)
             self.text(line, **style)
-            self.y -= LINE
+            self.y -= step * LINE
 
     def heading(self, words: str) -> None:
         self.room(4)
@@ -67,30 +68,36 @@ class _Pages:
         self.y -= 0.3 * LINE
 
 
-def _picture_page(drawings: list[tuple[str, float, Callable[[FigureBase], None]]]) -> Figure:
-    """Put the pictures below one another on one page."""
+def _picture_pages(pictures: list[Picture]) -> list[Figure]:
+    """Put the pictures below one another on as few pages as hold them."""
+    room, groups = 0.0, []
+    for picture in pictures:
+        if picture.height > room:
+            groups.append([])
+            room = HEIGHT - 2 * MARGIN
+        groups[-1].append(picture)
+        room -= picture.height
+    return [_picture_page(group) for group in groups]
+
+
+def _picture_page(pictures: list[Picture]) -> Figure:
     page = Figure(figsize=(WIDTH, HEIGHT), layout="constrained")
     page.get_layout_engine().set(rect=(0.06, 0.05, 0.88, 0.9), hspace=0.06)
-    heights = [height for _, height, _ in drawings]
+    heights = [picture.height for picture in pictures]
     empty = max(HEIGHT - 2 * MARGIN - sum(heights), 0.01)
-    parts = page.subfigures(len(drawings) + 1, 1, height_ratios=[*heights, empty])
-    for part, (_, _, draw) in zip(parts, drawings, strict=False):
-        draw(part)
+    parts = page.subfigures(len(pictures) + 1, 1, height_ratios=[*heights, empty])
+    for part, picture in zip(parts, pictures, strict=False):
+        picture.draw(part)
     return page
 
 
-def pdf_of(
-    content: Mapping[str, Any],
-    drawings: list[tuple[str, float, Callable[[FigureBase], None]]],
-) -> bytes:
+def pdf_of(page: Page) -> bytes:
     """Make the PDF of a report.
 
     Parameters
     ----------
-    content : mapping
-        The report's tables, as the HTML template takes them.
-    drawings : list of (str, float, callable)
-        The pictures, as `beamfit.report.figures.pictures` lists them.
+    page : Page
+        The report.
 
     Returns
     -------
@@ -98,38 +105,28 @@ def pdf_of(
         The file.
     """
     pages = _Pages()
-    pages.text(content["title"], size=16, weight="bold")
-    pages.y -= 2 * LINE
-    pages.paragraph(content["subtitle"], color="0.35")
-    planes = content["planes"]
-    for p in planes:
+    pages.paragraph(page.title, 52, size=16, weight="bold", step=1.6)
+    pages.y -= 0.4 * LINE
+    pages.paragraph(page.subtitle, color="0.35")
+    for verdict in page.verdicts:
         pages.y -= 0.5 * LINE
         pages.room(4)
-        colour = COLOUR.get(p["status"], "#b3261e")
-        pages.text(f"{p['plane']}: {p['headline']}", size=11.5, weight="bold", color=colour)
-        pages.y -= 1.4 * LINE
-        pages.paragraph(p["message"])
-    names = [p["plane"] for p in planes]
-    for title, key in (
-        ("Result", "results"),
-        ("What the data determine", "identifiability"),
-        ("If the line were a little different: change of the normalised emittance", "budget"),
-        ("If some points were left out: normalised emittance (shift)", "ranges"),
-    ):
-        pages.heading(title)
-        rows = [[label, *cells] for label, cells in content[key]]
-        if rows:
-            pages.table(["", *names], rows)
-    for p in planes:
-        pages.heading(f"Points, {p['plane']} plane")
-        pages.table(p["point_header"], p["point_rows"])
+        colour = COLOUR.get(verdict.status, "#b3261e")
+        pages.paragraph(verdict.headline, 80, size=11.5, weight="bold", color=colour, step=1.4)
+        pages.paragraph(verdict.message)
+    for table in page.tables:
+        pages.heading(table.title)
+        if table.note:
+            pages.paragraph(table.note, color="0.35")
+        if table.rows:
+            pages.table(table.header, table.rows)
     pages.heading("Provenance")
-    for label, value in content["provenance"]:
+    for label, value in page.provenance:
         pages.paragraph(f"{label}: {value}", size=8.5)
-    for note in content["notes"]:
+    for note in page.notes:
         pages.paragraph(note, size=8.5, color="0.35")
     buffer = io.BytesIO()
     with PdfPages(buffer) as document:
-        for page in [pages.pages[0], _picture_page(drawings), *pages.pages[1:]]:
-            document.savefig(page)
+        for each in [pages.pages[0], *_picture_pages(page.pictures), *pages.pages[1:]]:
+            document.savefig(each)
     return buffer.getvalue()

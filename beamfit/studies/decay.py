@@ -15,7 +15,7 @@ from beamfit.studies.decay_record import DecayRecord
 from beamfit.studies.decay_result import DecayFit
 from beamfit.studies.decay_verdict import judge, judge_constant
 
-__all__ = ["fit_decay", "fit_decays"]
+__all__ = ["fit_decay", "fit_decays", "padded_size"]
 
 FEWEST = 5
 # Records solved in one call; fewer are filled up, so that one number is compiled.
@@ -102,7 +102,7 @@ def fit_decays(records: Sequence[DecayRecord]) -> tuple[DecayFit, ...]:
         if _says_nothing(record):
             fits[k] = judge_constant(record)
         else:
-            groups.setdefault(_padded_size(len(record)), []).append(k)
+            groups.setdefault(padded_size(len(record)), []).append(k)
     for members in groups.values():
         for first in range(0, len(members), TOGETHER):
             chosen = members[first : first + TOGETHER]
@@ -128,7 +128,7 @@ def _weight(record: DecayRecord) -> np.ndarray:
     return np.ones(len(record)) if record.error is None else 1 / record.error
 
 
-def _padded_size(rows: int) -> int:
+def padded_size(rows: int) -> int:
     """64, 256, 1024, ...: every length is compiled once, for a second or two, so keep few."""
     size = 64
     while size < rows:
@@ -137,6 +137,6 @@ def _padded_size(rows: int) -> int:
 
 
 def _padded(record: DecayRecord, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    extra = (0, _padded_size(len(record)) - len(record))
+    extra = (0, padded_size(len(record)) - len(record))
     time = np.pad(record.time, extra, mode="edge")
     return time, np.pad(record.current, extra, mode="edge"), np.pad(weight, extra)

@@ -139,7 +139,7 @@ class LifetimeTrace:
     lifetime : array, shape (m,)
         Lifetime, h; infinite where no decay is seen, negative where the current rises.
     error : array, shape (m,)
-        Standard deviation, h, from the scatter within the window.
+        Standard deviation, h, from the scatter within the window; NaN where nothing changes.
     """
 
     time: np.ndarray
@@ -195,7 +195,7 @@ def moving_lifetime(record: DecayRecord, window: float) -> LifetimeTrace:
         error = math.sqrt(left @ left / (apart.size - 2) / spread)
         rows.append((at, level, slope, error))
     at, level, slope, error = np.transpose(rows)
-    with np.errstate(divide="ignore"):
+    with np.errstate(divide="ignore", invalid="ignore"):
         return LifetimeTrace(at, level, -level / slope / HOUR, level * error / slope**2 / HOUR)
 
 

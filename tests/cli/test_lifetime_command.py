@@ -1,0 +1,229 @@
+"""`beamfit lifetime` as a person and as a script use it."""
+
+import hashlib
+import json
+import os
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+import beamfit
+
+APS = "measurements/aps_1999_decay.csv"
+RING = "lattices/spear3_2003.toml"
+
+
+def write_record(path, time, current, **columns):
+    """A record file with any further columns."""
+    table = {"time_s": time, "beam_current_mA": current, **columns}
+    rows = zip(*(np.broadcast_to(values, len(time)) for values in table.values()), strict=True)
+    lines = [",".join(f"{value:.10g}" for value in row) for row in rows]
+    path.write_text("\n".join([",".join(table), *lines]) + "\n")
+    return path
+
+
+def decay(time, i0=500.0, a=2e-8, b=1e-6):
+    """Equation 44, by its own words."""
+    return i0 * np.exp(-b * time) / (1 + a / b * i0 * -np.expm1(-b * time))
+
+
+def test_json_follows_the_contract(run, root):
+    status, out, err = run("lifetime", APS, "--json")
+    assert (status, err) == (0, "")
+    document = json.loads(out)
+    assert list(document) == ["beamfit", "command", "inputs", "results"]
+    assert document["command"] == f"beamfit lifetime {APS} --json"
+    assert document["inputs"] == {APS: hashlib.sha256((root / APS).read_bytes()).hexdigest()}
+    [result] = document["results"]
+    assert {
+        "record", "status", "message", "a", "b", "i0", "lifetime_start", "lifetime_end",
+        "lifetime_mean", "chi2", "dof", "identifiability",
+    } <= set(result)  # fmt: skip
+    assert (result["record"], result["status"]) == ("aps_1999_decay.csv", "converged")
+    # The whole record of 529 readings gives 6.996(30)e-8 and 7.17(27)e-7.
+    assert result["a"]["value"] == pytest.approx(6.996e-8, abs=3 * result["a"]["error"])
+    assert result["b"]["value"] == pytest.approx(7.17e-7, abs=3 * result["b"]["error"])
+    assert result["a"]["unit"] == "1/(mA s)"
+    assert "budget" not in result
+
+
+def test_the_budget_adds_up_beside_the_measured_values(run):
+    status, out, _ = run("lifetime", APS, "--ring", RING, "--json")
+    assert status == 0
+    [result] = json.loads(out)["results"]
+    budget = {k: v["value"] for k, v in result["budget"].items() if k != "operation"}
+    parts = [budget[f"a_{cause}"] for cause in ("touschek", "bremsstrahlung", "elastic")]
+    assert budget["a"] == pytest.approx(sum(parts), rel=1e-12)
+    mean = result["mean_current"]["value"]
+    rate = budget["a"] * mean + budget["b"]
+    assert 1 / rate / 3600 == pytest.approx(budget["lifetime_mean"], rel=1e-12)
+    # 30.4 h at 500 mA in 280 bunches (reference/spear3_lifetime.json), all else linear.
+    assert 1 / (500 * 3600 * budget["a_touschek"]) == pytest.approx(30.4, abs=0.06)
+
+
+def test_fills_at_two_voltages_are_cut_and_each_has_its_own_budget(run, tmp_path):
+    time = np.arange(0.0, 7200.0, 10.0)
+    second = time >= 3600
+    current = decay(time % 3600)
+    voltage = np.where(second, 1600.0, 3200.0)
+    path = write_record(tmp_path / "two.csv", time, current, rf_voltage_kV=voltage)
+    status, out, _ = run("lifetime", path, "--ring", RING, "--json")
+    assert status == 0
+    first, other = json.loads(out)["results"]
+    assert (first["record"], other["record"]) == ("two.csv#1", "two.csv#2")
+    assert other["start"]["value"] == 3600
+    assert other["a"]["value"] == pytest.approx(2e-8, rel=1e-4)
+    touschek = [1 / (500 * 3600 * r["budget"]["a_touschek"]["value"]) for r in (first, other)]
+    assert touschek == pytest.approx([30.4, 8.2], abs=0.06)
+
+
+def test_a_change_of_setting_without_a_refill_also_cuts(run, tmp_path):
+    time = np.arange(0.0, 7200.0, 10.0)
+    scraper = np.where(time >= 3600, 3.0, 6.0)
+    path = write_record(tmp_path / "scraped.csv", time, decay(time), scraper_y_mm=scraper)
+    status, out, _ = run("lifetime", path, "--json")
+    assert status == 0
+    assert [r["dof"] for r in json.loads(out)["results"]] == [357, 357]
+
+
+def test_a_slow_refill_is_an_event_and_not_an_error(run, tmp_path):
+    time = np.arange(0.0, 9000.0, 10.0)
+    filling = (time >= 3600) & (time < 5000)
+    current = np.where(time < 3600, decay(time), decay(time - 5000))
+    current = np.where(filling, current[359] - 300 + 0.2 * (time - 3600), current)
+    path = write_record(tmp_path / "slow.csv", time, current)
+    status, out, _ = run("lifetime", path)
+    assert status == 0
+    assert "slow refill at 3600 s" in out
+    assert out.count("converged") == 2
+
+
+def test_a_record_too_short_has_a_lifetime_and_null_errors_of_a_and_b(run, tmp_path):
+    time = np.linspace(0, 60, 1000)
+    noise = 1e-3 * np.random.default_rng(1).normal(size=time.size)
+    error = np.full(time.size, 1e-3)
+    path = write_record(
+        tmp_path / "minute.csv", time, decay(time) + noise, beam_current_error_mA=error
+    )
+    status, out, _ = run("lifetime", path, "--json")
+    assert status == 0
+    [result] = json.loads(out)["results"]
+    assert result["status"] == "unidentified"
+    assert result["a"]["error"] is None
+    assert result["b"]["error"] is None
+    tau = 1 / (2e-8 * 500 + 1e-6) / 3600
+    found = result["lifetime_mean"]
+    assert found["value"] == pytest.approx(tau, abs=4 * found["error"])
+
+
+def test_tables_and_report(run, tmp_path):
+    report = tmp_path / "aps.html"
+    status, out, err = run("lifetime", APS, "--ring", RING, "--report", report)
+    assert (status, err) == (0, "")
+    for words in ("converged", "lifetime at the mean current", "a, Touschek", "b, measured"):
+        assert words in out
+    assert report.read_text().startswith("<!DOCTYPE html>")
+
+
+def test_help_has_examples(run):
+    status, out, _ = run("lifetime", "--help")
+    assert status == 0
+    assert "beamfit lifetime fill1.csv fill2.h5 --ring" in out
+
+
+TIME = np.arange(0.0, 600.0, 10.0)
+BAD = {
+    "time": (np.r_[TIME[:30], TIME[29:-1]], decay(TIME), {}, "times that increase"),
+    "negative": (TIME, np.r_[decay(TIME)[:-1], -1.0], {}, "a current of zero or more"),
+    "rising": (TIME, 100 + TIME / 100, {}, "a decay; cut out refills"),
+    "units": (TIME, np.r_[decay(TIME)[:30], decay(TIME)[30:] / 1e3], {}, "one unit throughout"),
+    "short": (TIME[:3], decay(TIME)[:3], {}, "5 or more"),
+    "no beam": (TIME, np.r_[decay(TIME)[:3], 0 * TIME[3:]], {}, "a stored beam"),
+    "voltage": (TIME, decay(TIME), {"rf_voltage_kV": 800.0}, "more than the loss of 877.974 kV"),
+    "scraper": (TIME, decay(TIME), {"scraper_y_mm": 0.0}, "above zero"),
+}
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_bad_input_is_one_line_and_status_2(run, tmp_path, name):
+    time, current, columns, words = BAD[name]
+    path = write_record(tmp_path / "bad.csv", time, current, **columns)
+    status, out, err = run("lifetime", path, "--ring", RING)
+    assert (status, out) == (2, "")
+    assert err.count("\n") == 1
+    assert err.startswith("beamfit: ")
+    assert "bad.csv" in err
+    assert words in err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("missing.csv",), "missing.csv: no such file"),
+        ((APS, APS), "a record given twice"),
+        ((APS, "--ring", "missing.toml"), "missing.toml: no such file"),
+        ((APS, "--report", "page.doc"), "a name ending in .html or .pdf"),
+        ((), "Missing argument"),
+    ],
+)
+def test_bad_arguments(run, arguments, words):
+    status, out, err = run("lifetime", *arguments)
+    assert (status, out, err.count("\n")) == (2, "", 1)
+    assert words in err
+
+
+def test_a_gap_is_no_error(run, tmp_path):
+    time = np.r_[TIME, TIME + 3600]
+    path = write_record(tmp_path / "gap.csv", time, decay(time))
+    status, out, _ = run("lifetime", path)
+    assert status == 0
+    assert "gap at" in out
+    assert "120 over" in out
+
+
+def test_bad_files_are_answered_without_jax(root, tmp_path):
+    ring = tmp_path / "ring.toml"
+    ring.write_text((root / RING).read_text().replace("energy_GeV", "energy_TeV"))
+    bad = write_record(tmp_path / "bad.csv", TIME, -decay(TIME))
+    script = (
+        "import sys\n"
+        "from beamfit.cli import main\n"
+        "try:\n    main()\n"
+        "except SystemExit as stop:\n    print(stop.code, 'jax' in sys.modules)\n"
+    )
+    for arguments in ([bad], [APS, "--ring", ring]):
+        done = subprocess.run(
+            [sys.executable, "-c", script, "lifetime", *map(str, arguments)],
+            capture_output=True,
+            text=True,
+            cwd=root,
+            check=True,
+            env={**os.environ, "PYTHONPATH": os.path.dirname(os.path.dirname(beamfit.__file__))},
+        )
+        assert done.stdout == "2 False\n"
+        assert done.stderr.count("\n") == 1
+
+
+def test_a_study_of_a_shift(run):
+    path = "measurements/spear3_shift_simulated.csv"
+    status, out, err = run("lifetime", path, "--ring", RING, "--study", "--json")
+    assert (status, err) == (0, "")
+    document = json.loads(out)
+    assert len(document["results"]) == 30
+    study = document["study"]
+    assert study["scales"]["status"] == "converged"
+    true = {"touschek": 1.12, "bremsstrahlung": 1.30, "elastic": 0.85, "desorption": 1.25}
+    for name, value in true.items():
+        scale = study["scales"][name]
+        assert scale["value"] == pytest.approx(value, abs=3 * scale["error"])
+    assert study["anomaly"]["moved"] == []
+    assert study["best"]["lifetime"]["value"] >= study["best"]["usual"]["value"]
+    assert study["next"][0]["information"] >= study["next"][-1]["information"] > 0
+
+
+def test_a_study_needs_a_ring(run):
+    status, out, err = run("lifetime", APS, "--study")
+    assert (status, out) == (2, "")
+    assert "--ring" in err

@@ -1,0 +1,81 @@
+"""The report page of decay records."""
+
+import base64
+import re
+
+import numpy as np
+import pytest
+
+import beamfit
+from beamfit.io.ring import read_operation, read_ring
+from beamfit.studies.decay_record import DecayRecord
+from beamfit.studies.decays import study_record
+from beamfit.studies.loss_budget import Machine
+
+
+@pytest.fixture(scope="module")
+def studies(root):
+    ring = root / "lattices/spear3_2003.toml"
+    machine = Machine(read_ring(ring), read_operation(ring))
+    record = beamfit.read_decay_record(root / "measurements/aps_1999_decay.csv")
+    return (study_record(record, machine),)
+
+
+def pictures_of(page):
+    return re.findall(r"data:image/svg\+xml;base64,([^\"]+)", page)
+
+
+def test_everything_a_colleague_asks_for_is_there(studies, tmp_path):
+    path = tmp_path / "aps.html"
+    beamfit.write_report(path, studies, command="beamfit lifetime ...", inputs={"a": "f" * 64})
+    page = path.read_text()
+    for words in (
+        "39.149 ± 0.016 h", "(7.01 ± 0.11)e-08 1/(mA s)", "share of a in the loss",
+        "a, Touschek", "b, measured", "Provenance", "f" * 64, "beamfit lifetime ...",
+        "Advanced Photon Source", beamfit.__version__,
+    ):  # fmt: skip
+        assert words in page, words
+    pictures = pictures_of(page)
+    assert len(pictures) == 3
+    for picture in pictures:
+        assert b"</svg>" in base64.b64decode(picture)
+    assert not re.search(r"(src|href)=[\"'](?!data:)", page)
+
+
+def test_pdf_is_whole(studies, tmp_path):
+    beamfit.write_report(tmp_path / "aps.pdf", studies)
+    content = (tmp_path / "aps.pdf").read_bytes()
+    assert content.startswith(b"%PDF")
+    assert content.rstrip().endswith(b"%%EOF")
+
+
+def test_a_record_that_says_nothing_still_has_a_page(tmp_path):
+    study = study_record(DecayRecord(np.arange(20.0), np.full(20, 100.0), name="<flat>"))
+    for suffix in ("html", "pdf"):
+        beamfit.write_report(tmp_path / f"flat.{suffix}", (study,))
+    page = (tmp_path / "flat.html").read_text()
+    assert "lifetime not determined" in page
+    assert "&lt;flat&gt;" in page
+    assert len(pictures_of(page)) == 2
+
+
+def test_refills_are_listed(tmp_path):
+    time = np.arange(0.0, 8000.0, 10.0)
+    saw = 100 * np.exp(-(time % 2000) / 36000)
+    beamfit.write_report(tmp_path / "saw.html", (study_record(DecayRecord(time, saw)),))
+    page = (tmp_path / "saw.html").read_text()
+    assert page.count("<td>refill</td>") == 3
+    assert "record#4" in page
+
+
+def test_many_decays_have_a_row_each_and_alike_verdicts_are_said_once(tmp_path):
+    time = np.arange(0.0, 12000.0, 10.0)
+    saw = 100 * np.exp(-(time % 2000) / 36000) + 1e-3 * np.sin(time)
+    errors = np.full(time.size, 1e-3)
+    study = study_record(DecayRecord(time, saw, errors))
+    assert len(study.decays) == 6
+    for suffix in ("html", "pdf"):
+        beamfit.write_report(tmp_path / f"many.{suffix}", (study,))
+    page = (tmp_path / "many.html").read_text()
+    assert "<td>record#6</td>" in page
+    assert page.count('<div class="verdict') < 6

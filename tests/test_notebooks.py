@@ -1,0 +1,40 @@
+"""The notebooks run, and say what their text says."""
+
+import os
+import warnings
+
+import pytest
+
+
+@pytest.fixture
+def executed(root):
+    """Execute a notebook in a kernel of its own; its text output, cell by cell."""
+
+    def run(name):
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of the notebook machinery, not of beamfit
+            import nbformat
+            from nbclient import NotebookClient
+
+            notebook = nbformat.read(root / "docs/notebooks" / name, as_version=4)
+            os.environ["PYTHONPATH"] = os.pathsep.join(
+                [str(root), *filter(None, [os.environ.get("PYTHONPATH")])]
+            )
+            os.environ.setdefault("MPLBACKEND", "module://matplotlib_inline.backend_inline")
+            place = {"metadata": {"path": str(root / "docs/notebooks")}}
+            NotebookClient(notebook, timeout=300, resources=place).execute()
+        outputs = [o for cell in notebook.cells for o in cell.get("outputs", ())]
+        pictures = sum("image/png" in o.get("data", {}) for o in outputs)
+        return "".join(o.get("text", "") for o in outputs), pictures
+
+    return run
+
+
+def test_the_lifetime_study_runs(executed):
+    text, pictures = executed("lifetime_study.ipynb")
+    assert pictures == 2
+    assert "a and b are determined" in text
+    assert "bremsstrahlung and elastic" in text
+    assert "not separable by" in text
+    assert "30 decays: converged" in text
+    assert "b moved since later fill 5" in text
