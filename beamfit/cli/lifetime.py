@@ -102,7 +102,7 @@ def lifetime(
 def _print(studies: tuple[RecordStudy, ...], shift: Shift | None, report: str | None) -> None:
     from rich.console import Console
 
-    from beamfit.cli.terminal import decay_tables, shift_lines
+    from beamfit.cli.decay_terminal import decay_tables, shift_lines
 
     console = Console(highlight=False, markup=False)
     for study in studies:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import emcee
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -119,6 +118,8 @@ def sample_scales(fit: ScaleFit, steps: int = 1500, seed: int = 0) -> ScaleSampl
     spread = np.sqrt(np.diag(fit.covariance)) * fit.error_scale
     spread = np.where(np.isfinite(spread), np.minimum(spread, 0.3), 0.3)
     start = np.abs(fit.vector + spread * random.normal(size=(WALKERS, 4)))
+    import emcee  # here, because it costs every other command half a second
+
     sampler = emcee.EnsembleSampler(
         WALKERS, 4, lambda x: np.asarray(_log_posteriors(x, parts)), vectorize=True
     )

@@ -2,11 +2,15 @@
 
 import hashlib
 import json
+import subprocess
+import sys
+from pathlib import Path
 
 import pytest
 
 import beamfit
 
+ROOT = Path(__file__).resolve().parents[2]
 REAL = ("emittance", "measurements/lcls_otr2.csv", "--lattice", "lattices/lcls_otr2.toml")
 
 
@@ -89,3 +93,19 @@ def test_help_has_an_example(run):
         assert status == 0
         assert "xample" in out
         assert "beamfit emittance" in out
+
+
+def test_the_fit_loads_nothing_of_other_studies():
+    """emcee brings scipy.stats, half a second that an emittance does not need."""
+    check = (
+        "import sys; sys.argv = ['beamfit', 'emittance', 'measurements/lcls_otr2.csv', "
+        "'--lattice', 'lattices/lcls_otr2.toml']\n"
+        "from beamfit.cli import main\n"
+        "try: main()\n"
+        "except SystemExit: pass\n"
+        "print({'emcee', 'scipy.stats', 'matplotlib'} & set(sys.modules), file=sys.stderr)"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", check], capture_output=True, text=True, cwd=ROOT, check=True
+    )
+    assert done.stderr.strip() == "set()"
