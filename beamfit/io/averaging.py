@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from beamfit.studies.scans import QuadScan
+from beamfit.studies.scans import QuadScan, row_keys
 
 __all__ = ["average_shots"]
 
@@ -74,11 +74,8 @@ def average_shots(scan: QuadScan, *, marked: bool) -> QuadScan:
 
 def _groups(scan: QuadScan) -> list[np.ndarray]:
     """Rows of equal settings, energy and screen, in the order of first appearance."""
-    columns = [*scan.settings.values()]
-    columns += [] if scan.energy is None else [scan.energy]
-    keys = list(zip(*columns, *([] if scan.screen is None else [scan.screen]), strict=True))
     rows: dict[tuple, list[int]] = {}
-    for i, key in enumerate(keys):
+    for i, key in enumerate(row_keys(scan.settings, scan.energy, scan.screen)):
         rows.setdefault(key, []).append(i)
     return [np.array(r) for r in rows.values()]
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from beamfit.errors import InputError, nearest
 
-__all__ = ["PlaneRows", "QuadScan", "check_names", "first_unusable"]
+__all__ = ["PlaneRows", "QuadScan", "check_names", "first_unusable", "row_keys"]
 
 PLANES = ("x", "y")
 
@@ -213,7 +213,7 @@ class QuadScan:
 
     def _check_three_settings(self, plane: str) -> None:
         rows = self.rows(plane)
-        keys = set(_row_keys(rows.settings, rows.energy, rows.screen))
+        keys = set(row_keys(rows.settings, rows.energy, rows.screen))
         if len(keys) < 3:
             raise self.unusable(
                 f"{len(keys)} distinct settings in plane {plane}",
@@ -221,7 +221,7 @@ class QuadScan:
             )
 
 
-def _row_keys(
+def row_keys(
     settings: Mapping[str, np.ndarray], energy: np.ndarray | None, screen: tuple[str, ...] | None
 ) -> list[tuple]:
     """What makes two rows the same measurement: all settings, the energy and the screen."""
