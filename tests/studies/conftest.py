@@ -4,6 +4,9 @@ import numpy as np
 import pytest
 
 import beamfit
+from beamfit.io.ring import read_operation, read_ring
+from beamfit.studies.decays import study_record
+from beamfit.studies.loss_budget import Machine
 
 TABLE_2 = np.array([2.62035, 1.55237, 1.40828]) * 1e-8  # report, table 2, first row, SI
 
@@ -39,6 +42,18 @@ def gtf_sizes(gtf):
     currents = np.linspace(0.0, 3.9, 14)
     rows = design(gtf, {"Q2": currents})
     return currents, rows, np.sqrt(rows @ TABLE_2)
+
+
+@pytest.fixture(scope="session")
+def machine(root):
+    path = root / "lattices/spear3_2003.toml"
+    return Machine(read_ring(path), read_operation(path))
+
+
+@pytest.fixture(scope="session")
+def decays(root):
+    record = beamfit.read_decay_record(root / "measurements/spear3_shift_simulated.csv")
+    return study_record(record).decays
 
 
 def scan_of(magnet, unit, settings, sizes, relative=0.02, seed=None, errors=True):

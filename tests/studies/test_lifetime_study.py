@@ -10,7 +10,6 @@ from scipy.optimize import brentq
 import beamfit
 from beamfit.errors import InputError
 from beamfit.inference.quantity import Status
-from beamfit.io.ring import read_operation, read_ring
 from beamfit.lifetime.bunch import rf_acceptance
 from beamfit.lifetime.decay import current
 from beamfit.lifetime.losses import loss_coefficients
@@ -20,24 +19,11 @@ from beamfit.studies.decay_record import Conditions, DecayRecord
 from beamfit.studies.decay_summary import summarise
 from beamfit.studies.decays import study_record
 from beamfit.studies.lifetime import fit_scales
-from beamfit.studies.loss_budget import Machine
 from beamfit.studies.next_decay import Candidate, next_decays
 from beamfit.studies.operating_point import Limits, best_operating_point
 from beamfit.studies.scale_sample import budget_intervals, sample_scales
 
 TRUE = np.array([1.12, 1.30, 0.85, 1.25])  # measurements/make_spear3_shift.py
-
-
-@pytest.fixture(scope="module")
-def machine(root):
-    path = root / "lattices/spear3_2003.toml"
-    return Machine(read_ring(path), read_operation(path))
-
-
-@pytest.fixture(scope="module")
-def decays(root):
-    record = beamfit.read_decay_record(root / "measurements/spear3_shift_simulated.csv")
-    return study_record(record).decays
 
 
 @pytest.fixture(scope="module")

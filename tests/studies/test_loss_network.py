@@ -4,33 +4,18 @@ import jax
 import numpy as np
 import pytest
 
-import beamfit
 from beamfit.errors import InputError
 from beamfit.inference.quantity import Status
-from beamfit.io.ring import read_operation, read_ring
 from beamfit.lifetime.decay import current
 from beamfit.lifetime.losses import loss_coefficients
 from beamfit.lifetime.scaled import loss_terms, scaled_losses
 from beamfit.studies.decay_record import Conditions, DecayRecord
 from beamfit.studies.decays import study_record
 from beamfit.studies.lifetime import fit_scales
-from beamfit.studies.loss_budget import Machine
 from beamfit.studies.loss_network import SIGNS, fit_loss_network
 
 TRUE = np.array([1.12, 1.30, 0.85, 1.25])
 INPUTS = ("rf_voltage", "scraper_y", "pressure", "bunches")
-
-
-@pytest.fixture(scope="module")
-def machine(root):
-    path = root / "lattices/spear3_2003.toml"
-    return Machine(read_ring(path), read_operation(path))
-
-
-@pytest.fixture(scope="module")
-def decays(root):
-    record = beamfit.read_decay_record(root / "measurements/spear3_shift_simulated.csv")
-    return study_record(record).decays
 
 
 @pytest.fixture(scope="module")
