@@ -11,7 +11,7 @@ import numpy as np
 from beamfit.errors import InputError
 from beamfit.sampling import store as disk
 from beamfit.sampling.convergence import Diagnostics, diagnose
-from beamfit.sampling.moves import fitted, moves_of, share_of, student_about
+from beamfit.sampling.moves import about, fitted, moves_of, share_of
 from beamfit.sampling.posterior import Posterior
 from beamfit.sampling.progress import Watch
 from beamfit.sampling.store import Checkpoint, Provenance
@@ -131,11 +131,11 @@ def first_walkers(
     array, shape (number, n), or None
         None if no feasible point was found, however near the fit's optimum.
     """
-    proposal = student_about(target.mode, target.covariance, 10.0)
+    proposal = about(target.covariance, target.widening, target.blocks, 10.0)
     found = np.zeros((0, len(target.mode)))
     centre, reach = target.mode, 1.0
     for _ in range(TRIES):
-        offsets = proposal.draw(random, number) - proposal.location
+        offsets = proposal.draw(random, number) - target.mode
         points = centre + reach * offsets
         # Walkers may start anywhere, so those outside a bound are mirrored into it.
         points = np.where(points < target.lower, 2 * target.lower - points, points)
@@ -161,7 +161,7 @@ def _begin(
         accepted=np.zeros(walkers),
         accepted_before=np.zeros(walkers),
         random_state=random.get_state(),
-        proposal=student_about(target.mode, target.covariance, 5.0),
+        proposal=about(target.covariance, target.widening, target.blocks, 5.0),
         share=0.5,
         began=0,
         producing=False,
@@ -250,7 +250,7 @@ def _next_stage(target: Target, state: Checkpoint) -> Checkpoint:
     half = slice((state.began + steps) // 2, steps)
     recent, log_prob = state.chain[half], state.log_prob[half]
     points, logs = recent.reshape(-1, recent.shape[2]), log_prob.ravel()
-    proposal = fitted(points, logs)
+    proposal = fitted(points, state.proposal)
     # Chance of its own, so that looking at a proposal does not change the chain.
     drawn = proposal.draw(np.random.RandomState(steps), 8 * recent.shape[1])
     density = [target.log_probability(part) for part in np.split(drawn, 8)]

@@ -11,18 +11,20 @@ from jax import Array
 
 from beamfit.errors import InputError
 
-__all__ = ["FRACTION", "LOG_NOISE", "Likelihood", "log_likelihood", "outlier_density"]
+__all__ = ["FRACTION", "LOG_NOISE", "Group", "Likelihood", "log_likelihood", "outlier_density"]
 
 LOG_NOISE, FRACTION = "log_noise", "outlier_fraction"
 # An outlier's own error is unknown: anything from so many to so many of the stated ones.
 NARROWEST, WIDEST = 3.0, 1e5
 
 
-class Likelihood(NamedTuple):
-    """Which likelihood, as words.
+class Group(NamedTuple):
+    """How the points of one group scatter.
 
     Attributes
     ----------
+    label : str
+        Of the group, before the names of its numbers; empty where there is one group only.
     noise : str
         ``known``: the errors are right. ``inferred``: they are right up to a common factor, whose
         logarithm is free with a flat prior.
@@ -30,23 +32,48 @@ class Likelihood(NamedTuple):
         Whether an unknown fraction of the points, flat from 0 to 1/2, are outliers.
     """
 
+    label: str = ""
     noise: str = "known"
     outliers: bool = False
 
     @property
+    def prefix(self) -> str:
+        """Before the names of its numbers."""
+        return f"{self.label}." if self.label else ""
+
+    @property
     def names(self) -> tuple[str, ...]:
         """The numbers it adds to those of the model."""
-        return (LOG_NOISE,) * (self.noise == "inferred") + (FRACTION,) * self.outliers
+        added = (LOG_NOISE,) * (self.noise == "inferred") + (FRACTION,) * self.outliers
+        return tuple(self.prefix + name for name in added)
+
+
+class Likelihood(NamedTuple):
+    """How the points scatter, group by group.
+
+    Attributes
+    ----------
+    groups : tuple of Group
+        In the order of the residuals.
+    """
+
+    groups: tuple[Group, ...] = (Group(),)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The numbers it adds to those of the model."""
+        return tuple(name for group in self.groups for name in group.names)
 
     def check(self) -> None:
-        """Refuse a noise that is neither.
+        """Refuse a noise that is neither known nor inferred.
 
         Raises
         ------
         InputError
         """
-        if self.noise not in ("known", "inferred"):
-            raise InputError(f"noise '{self.noise}'", "known or inferred")
+        for group in self.groups:
+            if group.noise not in ("known", "inferred"):
+                raise InputError(f"noise '{group.noise}'", "known or inferred")
 
 
 def outlier_density(residual: Array) -> Array:
@@ -79,13 +106,29 @@ def outlier_density(residual: Array) -> Array:
     return jnp.where(near, limit, between) / math.log(WIDEST / NARROWEST)
 
 
-def log_likelihood(residual: Array, likelihood: Likelihood, extra: Array) -> Array:
+def _of_group(residual: Array, group: Group, extra: list[Array]) -> Array:
+    log_scale = extra.pop(0) if group.noise == "inferred" else 0.0
+    scaled = residual * jnp.exp(-log_scale)
+    normal = -0.5 * scaled**2
+    if not group.outliers:
+        return jnp.sum(normal) - residual.size * log_scale
+    fraction = extra.pop(0)
+    inside = (fraction >= 0) & (fraction <= 0.5)
+    safe = jnp.where(inside, fraction, 0.25)
+    good = normal - 0.5 * math.log(2 * math.pi) + jnp.log1p(-safe)
+    tiny = jnp.finfo(float).tiny
+    wild = jnp.log(jnp.maximum(safe, tiny)) + jnp.log(outlier_density(scaled) + tiny)
+    value = jnp.sum(jnp.logaddexp(good, wild)) - residual.size * log_scale
+    return jnp.where(inside, value, -jnp.inf)
+
+
+def log_likelihood(residuals: tuple[Array, ...], likelihood: Likelihood, extra: Array) -> Array:
     """Log likelihood of residuals, up to a constant.
 
     Parameters
     ----------
-    residual : array, shape (n,)
-        In units of the stated errors.
+    residuals : tuple of array
+        One vector a group, in units of the stated errors.
     likelihood : Likelihood
         Which.
     extra : array, shape (len(likelihood.names),)
@@ -94,30 +137,15 @@ def log_likelihood(residual: Array, likelihood: Likelihood, extra: Array) -> Arr
     Returns
     -------
     float
-        -r²/2 summed; with noise factor s also -n ln s. With outliers each point is good with
+        -r²/2 summed; with a noise factor s also -n ln s. With outliers each point is good with
         probability 1 - f, else drawn from `outlier_density` in units of s: the mixture of
         D. W. Hogg, J. Bovy and D. Lang, arXiv:1008.4686 (2010), section 3.
 
     Examples
     --------
-    >>> print(log_likelihood(jnp.array([1.0, 2.0]), Likelihood(), jnp.zeros(0)))
+    >>> print(log_likelihood((jnp.array([1.0, 2.0]),), Likelihood(), jnp.zeros(0)))
     -2.5
     """
-    count = 0
-    log_scale = 0.0
-    if likelihood.noise == "inferred":
-        log_scale, count = extra[0], 1
-    scaled = residual * jnp.exp(-log_scale)
-    normal = -0.5 * scaled**2
-    if likelihood.outliers:
-        fraction = extra[count]
-        inside = (fraction >= 0) & (fraction <= 0.5)
-        safe = jnp.where(inside, fraction, 0.25)
-        normal = normal - 0.5 * math.log(2 * math.pi) + jnp.log1p(-safe)
-        tiny = jnp.finfo(float).tiny
-        wild = jnp.log(jnp.maximum(safe, tiny)) + jnp.log(outlier_density(scaled) + tiny)
-        value = jnp.sum(jnp.logaddexp(normal, wild))
-        value = jnp.where(inside, value, -jnp.inf)
-    else:
-        value = jnp.sum(normal)
-    return value - residual.size * log_scale
+    own = list(extra)
+    pairs = zip(residuals, likelihood.groups, strict=True)
+    return sum((_of_group(residual, group, own) for residual, group in pairs), jnp.zeros(()))

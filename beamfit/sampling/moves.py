@@ -4,25 +4,50 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.linalg import solve_triangular
-from scipy.special import gammaln, logsumexp
+from scipy.special import gammaln
 
-__all__ = ["Student", "fitted", "moves_of", "share_of", "student_about"]
+__all__ = ["Proposal", "Student", "Widening", "about", "fitted", "moves_of", "share_of"]
 
-# Degrees of freedom tried: from tails that cover anything to a normal distribution in effect.
-DEGREES = (3.0, 5.0, 10.0, 30.0, 1e4)
+# Degrees of freedom tried, from heavy tails to nearly none; a normal distribution has too few.
+DEGREES = (4.0, 6.0, 10.0, 30.0)
+
+
+class Widening(NamedTuple):
+    """How numbers spread with a noise that is itself inferred: twice the noise, twice as wide.
+
+    Attributes
+    ----------
+    centre : array, shape (n,)
+        From where distances are measured, the logarithm of the noise included.
+    source : array of int, shape (n,)
+        Place of the logarithm that widens each number; -1 for none.
+    """
+
+    centre: np.ndarray
+    source: np.ndarray
+
+    def log_factors(self, points: np.ndarray) -> np.ndarray:
+        """Log of how much wider than at the centre each number is, shape (m, n)."""
+        logs = points[:, self.source] - self.centre[self.source]
+        return np.where(self.source < 0, 0.0, logs)
+
+    def evened(self, points: np.ndarray) -> np.ndarray:
+        """Points in distances that do not widen, shape (m, n)."""
+        return (points - self.centre) * np.exp(-self.log_factors(points))
+
+    def widened(self, evened: np.ndarray) -> np.ndarray:
+        """The inverse: a source is widened by nothing, so its own distance is at hand."""
+        logs = np.where(self.source < 0, 0.0, evened[:, self.source])
+        return self.centre + evened * np.exp(logs)
 
 
 @dataclass(frozen=True, eq=False)
 class Student:
-    """A multivariate Student distribution to leap with, whatever the place one leaps from.
-
-    As a proposal of `emcee.moves.MHMove` it makes an independence sampler (L. Tierney, Annals of
-    Statistics 22, 1701 (1994), section 2.3): exact whatever the proposal, fast where it is near
-    the posterior.
+    """A multivariate Student distribution.
 
     Parameters
     ----------
@@ -67,6 +92,52 @@ class Student:
         power = 0.5 * (self.degrees + len(self.location))
         return self._norm - power * np.log1p(squares / self.degrees)
 
+
+@dataclass(frozen=True, eq=False)
+class Proposal:
+    """Where to leap, whatever the place one leaps from.
+
+    As a proposal of `emcee.moves.MHMove` it makes an independence sampler (L. Tierney, Annals of
+    Statistics 22, 1701 (1994), section 2.3): exact whatever the proposal, fast where it is near
+    the posterior.
+
+    Parameters
+    ----------
+    widening : Widening
+        In which distances the parts are Student distributions.
+    blocks : tuple of array of int
+        Which numbers each part is for; together all of them, each once.
+    parts : tuple of Student
+        Independent of each other: one heavy tail should not make all of them heavy.
+
+    Examples
+    --------
+    >>> plain = Widening(np.zeros(2), np.array([-1, -1]))
+    >>> leap = about(np.eye(2), plain, (np.array([0, 1]),))
+    >>> new, log_ratio = leap(np.zeros((4, 2)), np.random.RandomState(0))
+    >>> new.shape, bool((log_ratio > 0).all())  # from the centre one only leaps outwards
+    ((4, 2), True)
+    """
+
+    widening: Widening
+    blocks: tuple[np.ndarray, ...]
+    parts: tuple[Student, ...]
+
+    def draw(self, random: np.random.RandomState, number: int) -> np.ndarray:
+        """Draw points, shape (number, n)."""
+        evened = np.empty((number, len(self.widening.centre)))
+        for block, part in zip(self.blocks, self.parts, strict=True):
+            evened[:, block] = part.draw(random, number)
+        return self.widening.widened(evened)
+
+    def log_density(self, points: np.ndarray) -> np.ndarray:
+        """Log density at points of shape (m, n)."""
+        logs = self.widening.log_factors(points)
+        evened = (points - self.widening.centre) * np.exp(-logs)
+        pairs = zip(self.blocks, self.parts, strict=True)
+        found = sum(part.log_density(evened[:, block]) for block, part in pairs)
+        return found - logs.sum(axis=1)
+
     def __call__(
         self, coords: np.ndarray, random: np.random.RandomState
     ) -> tuple[np.ndarray, np.ndarray]:
@@ -89,61 +160,77 @@ def _root(covariance: np.ndarray) -> np.ndarray:
     return np.diag(scale)
 
 
-def student_about(location: np.ndarray, covariance: np.ndarray, degrees: float = 5.0) -> Student:
-    """Make a Student distribution of a location and the covariance of a fit.
+def about(
+    covariance: np.ndarray,
+    widening: Widening,
+    blocks: tuple[np.ndarray, ...],
+    degrees: float = 5.0,
+) -> Proposal:
+    """Leap about a centre with the covariance of a fit.
 
-    Examples
-    --------
-    >>> student_about(np.zeros(2), np.array([[4.0, 0.0], [0.0, 1.0]])).root.round(3).tolist()
-    [[2.0, 0.0], [0.0, 1.0]]
+    Parameters
+    ----------
+    covariance : array, shape (n, n)
+        Of which each block is used.
+    widening, blocks
+        As of `Proposal`.
+    degrees : float
+        Of freedom.
+
+    Returns
+    -------
+    Proposal
     """
-    return Student(np.asarray(location, float), _root(covariance), degrees)
+    parts = (
+        Student(np.zeros(len(block)), _root(covariance[np.ix_(block, block)]), degrees)
+        for block in blocks
+    )
+    return Proposal(widening, blocks, tuple(parts))
 
 
-def fitted(points: np.ndarray, log_prob: np.ndarray) -> Student:
-    """Fit a Student distribution to draws from a posterior.
+def fitted(points: np.ndarray, before: Proposal) -> Proposal:
+    """Fit a proposal to draws from a posterior.
 
     Parameters
     ----------
     points : array, shape (m, n)
         Draws.
-    log_prob : array, shape (m,)
-        Log of their posterior density.
+    before : Proposal
+        Whose widening and blocks to keep.
 
     Returns
     -------
-    Student
-        With the draws' mean and covariance and, of a few degrees of freedom, those for which the
-        ratio w of posterior to proposal varies least, by the mean of w times that of 1/w: walkers
-        stick where w is large, in tails that the proposal does not reach.
+    Proposal
+        Each part with the draws' mean and covariance and, of a few degrees of freedom, those of
+        the highest likelihood.
 
     Examples
     --------
     >>> draws = np.random.RandomState(0).standard_normal((4000, 2))
-    >>> fitted(draws, -0.5 * np.sum(draws**2, axis=1)).degrees > 20
-    True
+    >>> plain = Widening(np.zeros(2), np.array([-1, -1]))
+    >>> fitted(draws, about(np.eye(2), plain, (np.array([0, 1]),))).parts[0].degrees
+    30.0
     """
+    evened = before.widening.evened(points)
+    parts = (_student(evened[:, block]) for block in before.blocks)
+    return Proposal(before.widening, before.blocks, tuple(parts))
+
+
+def _student(points: np.ndarray) -> Student:
     location, covariance = points.mean(axis=0), np.atleast_2d(np.cov(points, rowvar=False))
     # A Student distribution is wider than its scale matrix by dof/(dof - 2).
-    tried = [
-        student_about(location, covariance * max((dof - 2) / dof, 0.5), dof) for dof in DEGREES
-    ]
-
-    def uneven(proposal: Student) -> float:
-        ratio = log_prob - proposal.log_density(points)
-        return float(logsumexp(ratio) + logsumexp(-ratio))
-
-    return min(tried, key=uneven)
+    tried = [Student(location, _root(covariance * (dof - 2) / dof), dof) for dof in DEGREES]
+    return max(tried, key=lambda part: float(np.mean(part.log_density(points))))
 
 
 def share_of(
-    proposal: Student, points: np.ndarray, log_prob: np.ndarray, drawn: np.ndarray, found: np.ndarray
+    proposal: Proposal, points: np.ndarray, log_prob: np.ndarray, drawn: np.ndarray, found: np.ndarray
 ) -> float:
     """Share of steps to leap: the more leaps are accepted, the more are tried.
 
     Parameters
     ----------
-    proposal : Student
+    proposal : Proposal
         To be used.
     points, log_prob : array, shape (m, n) and (m,)
         Draws from the posterior.
@@ -162,12 +249,12 @@ def share_of(
     return 0.9 if accepted > 0.15 else (0.5 if accepted > 0.03 else 0.1)
 
 
-def moves_of(proposal: Student, share: float) -> list[tuple[Any, float]]:
+def moves_of(proposal: Proposal, share: float) -> list[tuple[Any, float]]:
     """Mix moves for emcee.
 
     Parameters
     ----------
-    proposal : Student
+    proposal : Proposal
         For the leaps.
     share : float
         Of steps that leap.

@@ -135,10 +135,10 @@ class Posterior:
     @property
     def shown(self) -> tuple[str, ...]:
         """Names of what is asked for: derived numbers, then sampled ones but for hidden ones."""
-        own = tuple(name for name in self.names if name not in self.target.hidden)
+        every = (*self.target.derived_names, *self.names)
         # The factor on the errors is shown, not its logarithm.
-        own = tuple(name for name in own if name != "log_noise")
-        return (*self.target.derived_names, *own)
+        hidden = [name for name in self.names if name.endswith("log_noise")]
+        return tuple(name for name in every if name not in (*hidden, *self.target.hidden))
 
     @property
     def draws(self) -> np.ndarray:
@@ -245,8 +245,7 @@ class Posterior:
         return {
             "status": self.status.value,
             "message": self.message,
-            "noise": self.target.likelihood.noise,
-            "outliers": self.target.likelihood.outliers,
+            "likelihood": [group._asdict() for group in self.target.likelihood.groups],
             "priors": dict(self.priors),
             "quantities": [self._json_of(name) for name in shown],
             "correlations": {"names": list(shown), "values": found.values.tolist()},

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from beamfit.errors import InputError
-from beamfit.sampling.moves import Student
+from beamfit.sampling.moves import Proposal, Student, Widening
 from beamfit.sampling.target import Target
 
 if TYPE_CHECKING:
@@ -56,7 +56,7 @@ class Checkpoint(NamedTuple):
         Of these, before `began`.
     random_state : tuple
         Of numpy's Mersenne twister, after the last step.
-    proposal : Student
+    proposal : Proposal
         Of the leaps.
     share : float
         Of steps that leap.
@@ -73,7 +73,7 @@ class Checkpoint(NamedTuple):
     accepted: np.ndarray
     accepted_before: np.ndarray
     random_state: tuple
-    proposal: Student
+    proposal: Proposal
     share: float
     began: int
     producing: bool
@@ -134,9 +134,16 @@ def _write(
         group.create_dataset("log_prob", data=state.log_prob, maxshape=(None, walkers))
 
         proposal = file.create_group("proposal")
-        proposal.attrs["degrees"], proposal.attrs["share"] = state.proposal.degrees, state.share
-        proposal.create_dataset("location", data=state.proposal.location)
-        proposal.create_dataset("root", data=state.proposal.root)
+        proposal.attrs["share"] = state.share
+        proposal.create_dataset("centre", data=state.proposal.widening.centre)
+        proposal.create_dataset("source", data=state.proposal.widening.source)
+        pairs = zip(state.proposal.blocks, state.proposal.parts, strict=True)
+        for number, (block, part) in enumerate(pairs):
+            one = proposal.create_group(f"part_{number:03d}")
+            one.attrs["degrees"] = part.degrees
+            one.create_dataset("numbers", data=block)
+            one.create_dataset("location", data=part.location)
+            one.create_dataset("root", data=part.root)
 
         observed = file.create_group("observed")
         for name, values in target.observed.items():
@@ -287,16 +294,22 @@ def _checkpoint(file: h5py.File) -> Checkpoint:
     chain, log_prob = group["chain"][:], group["log_prob"][:]
     if chain.shape[:2] != log_prob.shape or len(chain) != steps:
         raise ValueError("sizes that do not agree")
-    parts = [group.attrs[f"random_state_{i}"] for i in range(5)]
-    random_state = (str(parts[0]), parts[1], int(parts[2]), int(parts[3]), float(parts[4]))
+    kind, keys, *rest = (group.attrs[f"random_state_{i}"] for i in range(5))
+    random_state = (str(kind), keys, int(rest[0]), int(rest[1]), float(rest[2]))
+    parts = [one for name, one in sorted(proposal.items()) if name.startswith("part_")]
     return Checkpoint(
         chain=chain,
         log_prob=log_prob,
         accepted=group["accepted"][:],
         accepted_before=group["accepted_before"][:],
         random_state=random_state,
-        proposal=Student(
-            proposal["location"][:], proposal["root"][:], float(proposal.attrs["degrees"])
+        proposal=Proposal(
+            Widening(proposal["centre"][:], proposal["source"][:]),
+            tuple(part["numbers"][:] for part in parts),
+            tuple(
+                Student(part["location"][:], part["root"][:], float(part.attrs["degrees"]))
+                for part in parts
+            ),
         ),
         share=float(proposal.attrs["share"]),
         began=int(group.attrs["began"]),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property, partial
@@ -14,6 +15,7 @@ import numpy as np
 from jax import Array
 
 from beamfit.sampling.likelihood import FRACTION, LOG_NOISE, Likelihood, log_likelihood
+from beamfit.sampling.moves import Widening
 from beamfit.sampling.priors import Distribution, in_words
 
 __all__ = ["Derived", "Law", "Target", "covariance_of"]
@@ -28,7 +30,8 @@ class Law(NamedTuple):
     Attributes
     ----------
     residual : callable
-        ``residual(data, theta)``, shape (points,), in units of the stated errors.
+        ``residual(data, theta)``: a tuple of vectors, one for each group of points, in units of
+        the stated errors.
     log_prior : callable
         ``log_prior(data, theta)``: -inf outside what is allowed, never NaN.
     derive : callable
@@ -37,7 +40,7 @@ class Law(NamedTuple):
         ``build(data, theta)``: the study's own object, for functions of the user's.
     """
 
-    residual: Callable[[Any, Array], Array]
+    residual: Callable[[Any, Array], tuple[Array, ...]]
     log_prior: Callable[[Any, Array], Array]
     derive: Callable[[Any, Array], Array]
     build: Callable[[Any, Array], Any]
@@ -94,8 +97,8 @@ class Target:
         Of the fit: the spread of the first walkers and the shape of the first proposals.
     likelihood : Likelihood
         Errors known or not, outliers or not.
-    noise : float
-        Factor on the stated errors that the fit's residuals show.
+    noise : tuple of float
+        Factor on the stated errors that the fit's residuals show, one a group.
     noise_unit : str
         Unit of a stated error of 1; "1" where errors were stated.
     priors : mapping of str to distribution
@@ -112,11 +115,15 @@ class Target:
         Status and sentence of the fit.
     hidden : tuple of str
         Numbers nobody asks for.
+    remark : str
+        A further sentence on what was left out.
+    group_of : tuple of int
+        Which group's noise widens each of the law's numbers; the first if empty.
 
     Examples
     --------
     >>> def residual(data, theta):
-    ...     return (theta[0] - data) / 0.1
+    ...     return ((theta[0] - data) / 0.1,)
     >>> def flat(data, theta):
     ...     return 0.0
     >>> law = Law(residual, flat, lambda data, theta: theta[:0], lambda data, theta: theta)
@@ -135,7 +142,7 @@ class Target:
     mode: np.ndarray
     covariance: np.ndarray
     likelihood: Likelihood = Likelihood()
-    noise: float = 1.0
+    noise: tuple[float, ...] = (1.0,)
     noise_unit: str = "1"
     priors: Mapping[str, Distribution] = field(default_factory=dict)
     derived: Derived = Derived()
@@ -144,17 +151,23 @@ class Target:
     open_directions: str = ""
     verdict: tuple[str, str] = ("converged", "")
     hidden: tuple[str, ...] = ()
+    remark: str = ""
+    group_of: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
         self.likelihood.check()
         extra = self.likelihood.names
         # Where each of the likelihood's own numbers may lie, begins, and how far it spreads.
-        at = np.log(max(self.noise, 1e-300))
-        rows = {
-            LOG_NOISE: (at - NOISE_REACH, at + NOISE_REACH, at, 0.1),
-            FRACTION: (0.0, 0.5, 0.1, 0.07),
-        }
-        low, high, middle, spread = np.array([rows[name] for name in extra]).reshape(-1, 4).T
+        rows = np.zeros((0, 4))
+        for group, noise in zip(self.likelihood.groups, self.noise, strict=True):
+            at = math.log(max(noise, 1e-300))
+            own = {
+                LOG_NOISE: (at - NOISE_REACH, at + NOISE_REACH, at, 0.1),
+                FRACTION: (0.0, 0.5, 0.1, 0.07),
+            }
+            short = (name.removeprefix(group.prefix) for name in group.names)
+            rows = np.concatenate([rows, np.array([own[name] for name in short]).reshape(-1, 4)])
+        low, high, middle, spread = rows.T
         ends = {
             "lower": np.concatenate([np.asarray(self.lower, float), low]),
             "upper": np.concatenate([np.asarray(self.upper, float), high]),
@@ -208,22 +221,52 @@ class Target:
         return thetas[..., : thetas.shape[-1] - len(self.likelihood.names)]
 
     @cached_property
+    def widening(self) -> Widening:
+        """How the noise, where it is inferred, widens the law's numbers."""
+        places = [
+            self.names.index(group.prefix + LOG_NOISE) if group.noise == "inferred" else -1
+            for group in self.likelihood.groups
+        ]
+        count = len(self.names) - len(self.likelihood.names)
+        group_of = self.group_of or (0,) * count
+        source = np.full(len(self.names), -1)
+        source[:count] = [places[group] for group in group_of]
+        return Widening(self.mode, source)
+
+    @cached_property
+    def blocks(self) -> tuple[np.ndarray, ...]:
+        """Numbers that belong together: those of each group, and each of the likelihood's own."""
+        count = len(self.names) - len(self.likelihood.names)
+        group_of = np.array(self.group_of or (0,) * count)
+        blocks = [np.flatnonzero(group_of == group) for group in np.unique(group_of)]
+        own = [np.array([place]) for place in range(count, len(self.names))]
+        return (*blocks, *own)
+
+    @cached_property
     def derived_names(self) -> tuple[str, ...]:
         """Names of the derived numbers, the noise included where it is inferred."""
-        return self.derived.names + ("noise",) * (LOG_NOISE in self.names)
+        return self.derived.names + tuple(self._noises)
 
     @cached_property
     def derived_units(self) -> tuple[str, ...]:
         """Their units."""
-        return self.derived.units + (self.noise_unit,) * (LOG_NOISE in self.names)
+        return self.derived.units + (self.noise_unit,) * len(self._noises)
+
+    @cached_property
+    def _noises(self) -> dict[str, int]:
+        """Place of each noise factor's logarithm among the sampled numbers."""
+        return {
+            f"{group.prefix}noise": self.names.index(group.prefix + LOG_NOISE)
+            for group in self.likelihood.groups
+            if group.noise == "inferred"
+        }
 
     def derive(self, thetas: np.ndarray) -> np.ndarray:
         """The derived numbers at many points, shape (m, k)."""
         parts = [np.zeros((len(thetas), 0))]
         if self.derived.names:
             parts.append(self.each(self.law.derive, thetas))
-        if LOG_NOISE in self.names:
-            parts.append(np.exp(thetas[:, [self.names.index(LOG_NOISE)]]))
+        parts.append(np.exp(thetas[:, list(self._noises.values())]))
         return np.concatenate(parts, axis=1)
 
     @cached_property
@@ -263,7 +306,9 @@ def covariance_of(law: Law, data: Any, mode: np.ndarray, width: np.ndarray) -> n
     array, shape (n, n)
         (JᵀJ + 1/width²)⁻¹, computed with columns of unit length.
     """
-    jacobian = np.asarray(jax.jacfwd(lambda theta: law.residual(data, theta))(jnp.asarray(mode)))
+    jacobian = np.asarray(
+        jax.jacfwd(lambda theta: jnp.concatenate(law.residual(data, theta)))(jnp.asarray(mode))
+    )
     rows = np.concatenate([jacobian, np.diag(1.0 / np.asarray(width, float))])
     scale = np.linalg.norm(rows, axis=0)
     scale = np.where(scale > 0, scale, 1.0)

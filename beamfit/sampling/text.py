@@ -9,11 +9,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from beamfit.inference.quantity import display_unit
+from beamfit.sampling.likelihood import Group, Likelihood  # noqa: F401 - Group for the example
 
 if TYPE_CHECKING:
     from beamfit.sampling.posterior import Posterior
 
-__all__ = ["HEADER", "as_html", "as_text", "diagnostic_rows", "interval_rows", "plain_name"]
+__all__ = ["HEADER", "as_html", "as_text", "diagnostic_rows", "interval_rows", "noise_words", "plain_name"]
 
 HEADER = ["", "median", "68 % interval", "95 % interval", "unit"]
 # A table of more numbers is cut, and says so.
@@ -90,12 +91,10 @@ def diagnostic_rows(posterior: Posterior) -> list[tuple[str, list[str]]]:
     list of (str, list of str)
         Label and cell.
     """
-    d, likelihood = posterior.diagnostics, posterior.target.likelihood
-    errors = "inferred with the beam" if likelihood.noise == "inferred" else "as stated"
-    errors += ", with an unknown fraction of outliers" if likelihood.outliers else ""
+    d = posterior.diagnostics
     rows = [
         ("status", posterior.status.value.replace("_", " ")),
-        ("noise of the points", errors.replace("with the beam", "with the rest")),
+        ("errors of the points", noise_words(posterior.target.likelihood)),
         ("priors", "; ".join(f"{n}: {p}" for n, p in posterior.priors.items()) or "flat"),
     ]
     if d.steps:
@@ -108,6 +107,24 @@ def diagnostic_rows(posterior: Posterior) -> list[tuple[str, list[str]]]:
             ("seed", str(posterior.seed)),
         ]
     return [(label, [cell]) for label, cell in rows]
+
+
+def noise_words(likelihood: Likelihood) -> str:
+    """Say of each group of points what is taken of its errors.
+
+    Examples
+    --------
+    >>> noise_words(Likelihood((Group("x", "inferred"), Group("y"))))
+    'x inferred from the residuals; y as stated'
+    """
+    said = []
+    for group in likelihood.groups:
+        words = "inferred from the residuals" if group.noise == "inferred" else "as stated"
+        said.append(words + (", with outliers" if group.outliers else ""))
+    if len(set(said)) == 1:
+        return said[0]
+    labels = (group.label for group in likelihood.groups)
+    return "; ".join(f"{label} {words}" for label, words in zip(labels, said, strict=True))
 
 
 def as_text(posterior: Posterior) -> str:

@@ -9,7 +9,7 @@ from beamfit.sampling.likelihood import FRACTION
 from beamfit.sampling.posterior import Posterior
 from beamfit.sampling.store import Checkpoint
 from beamfit.sampling.target import Target
-from beamfit.sampling.text import plain_name
+from beamfit.sampling.text import noise_words, plain_name
 from beamfit.status import Status
 
 __all__ = ["conclude", "held_by_priors", "refused"]
@@ -59,7 +59,7 @@ def held_by_priors(target: Target, draws: np.ndarray) -> tuple[str, ...]:
         prior = target.priors.get(name)
         before = box[i] if prior is None else min(float(prior.std()), box[i])
         # How many points are outliers is asked on the way; its prior is the sampler's own.
-        if name != FRACTION and np.isfinite(before) and spread[i] > LITTLE * before:
+        if not name.endswith(FRACTION) and np.isfinite(before) and spread[i] > LITTLE * before:
             names.append(name)
     return tuple(names)
 
@@ -102,6 +102,7 @@ def conclude(
     status, message = _judge(target, found, target_ess, budget, len(draws) > 0, shown)
     if len(draws):
         message = f"{message} {_sampled(found, state.began)}."
+    message = f"{message} {target.remark}".strip()
     return Posterior(
         target=target,
         chain=chain,
@@ -147,12 +148,11 @@ def _judge(
             "measure more, or bring a prior of which you are sure."
         )
         return Status.unidentified, said
-    if target.verdict[0] == "poor_fit" and target.likelihood.noise == "known":
+    groups = target.likelihood.groups
+    if target.verdict[0] == "poor_fit" and all(group.noise == "known" for group in groups):
         said = (
             "The fit is poor, and with errors taken as known the intervals are too narrow: mend "
             "the model, or infer the noise."
         )
         return Status.poor_fit, said
-    inferred = target.likelihood.noise == "inferred"
-    basis = "the noise inferred from the residuals" if inferred else "the errors as stated"
-    return Status.converged, f"The walkers agree, with {basis}."
+    return Status.converged, f"The walkers agree; errors {noise_words(target.likelihood)}."
