@@ -255,8 +255,9 @@ class Target:
     @cached_property
     def _noises(self) -> dict[str, int]:
         """Place of each noise factor's logarithm among the sampled numbers."""
+        word = "error_factor" if self.noise_unit == "1" else "noise"
         return {
-            f"{group.prefix}noise": self.names.index(group.prefix + LOG_NOISE)
+            f"{group.prefix}{word}": self.names.index(group.prefix + LOG_NOISE)
             for group in self.likelihood.groups
             if group.noise == "inferred"
         }

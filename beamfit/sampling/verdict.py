@@ -149,7 +149,9 @@ def _judge(
         )
         return Status.unidentified, said
     groups = target.likelihood.groups
-    if target.verdict[0] == "poor_fit" and all(group.noise == "known" for group in groups):
+    if target.verdict[0] == "poor_fit" and all(
+        group.noise == "known" and not group.outliers for group in groups
+    ):
         said = (
             "The fit is poor, and with errors taken as known the intervals are too narrow: mend "
             "the model, or infer the noise."

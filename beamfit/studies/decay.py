@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any
 
 import jax
@@ -67,7 +68,7 @@ def fit_decay(record: DecayRecord, shape: Callable[[Any], Any] | None = None) ->
         solution = solve_shaped(record.time, record.current, weight, shape)
     else:
         solution = solve_decay(*_padded(record, weight))
-    return judge(record, solution)
+    return replace(judge(record, solution), shaped=shape is not None)
 
 
 def fit_decays(records: Sequence[DecayRecord]) -> tuple[DecayFit, ...]:
