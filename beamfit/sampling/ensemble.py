@@ -12,6 +12,7 @@ from beamfit.errors import InputError
 from beamfit.sampling import store as disk
 from beamfit.sampling.convergence import Diagnostics, diagnose
 from beamfit.sampling.moves import about, fitted, moves_of, share_of
+from beamfit.sampling.place import check_place
 from beamfit.sampling.posterior import Posterior
 from beamfit.sampling.progress import Watch
 from beamfit.sampling.store import Checkpoint, Provenance
@@ -87,7 +88,7 @@ def draw(
     _check_options(n, target_ess, budget, walkers)
     provenance = provenance or Provenance()
     if store is not None:
-        disk.check_place(store)
+        check_place(store)
     state = None if store is None else disk.load(store, target, seed, walkers)
     if target.open_directions:
         return refused(target, seed, "unidentified", target.open_directions)

@@ -21,7 +21,7 @@ from beamfit.sampling.target import Target
 if TYPE_CHECKING:
     import h5py
 
-__all__ = ["Checkpoint", "Provenance", "check_place", "finished", "load", "save"]
+__all__ = ["Checkpoint", "Provenance", "finished", "load", "save"]
 
 FORMAT = "beamfit-posterior-1"
 PACKAGES = ("emcee", "h5py", "jax", "numpy", "scipy")
@@ -78,23 +78,6 @@ class Checkpoint(NamedTuple):
     began: int
     producing: bool
     seed: int
-
-
-def check_place(path: str | PathLike[str]) -> None:
-    """Find out before anything is computed whether a store could be written.
-
-    Raises
-    ------
-    InputError
-        If the path is a folder's, or its folder does not exist or may not be written to.
-    """
-    folder = Path(path).parent
-    if Path(path).is_dir():
-        raise InputError("a folder", "the name of a file", path=path)
-    if not folder.is_dir():
-        raise InputError(f"no folder '{folder}'", "a folder that exists", path=path)
-    if not os.access(folder, os.W_OK):
-        raise InputError(f"folder '{folder}' that may not be written to", "another", path=path)
 
 
 def _text(group: h5py.Group, fields: Mapping[str, Any]) -> None:

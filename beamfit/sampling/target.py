@@ -18,6 +18,9 @@ from beamfit.sampling.likelihood import FRACTION, LOG_NOISE, Likelihood, log_lik
 from beamfit.sampling.moves import Widening
 from beamfit.sampling.priors import Distribution, in_words
 
+# Not in the package: priors and the place of a store are looked at before JAX is loaded.
+jax.config.update("jax_enable_x64", True)
+
 __all__ = ["Derived", "Law", "Target", "covariance_of"]
 
 # The noise is sought within a factor e^10 of where the fit saw it.

@@ -14,9 +14,9 @@ from beamfit.sampling.likelihood import Group, Likelihood  # noqa: F401 - Group 
 if TYPE_CHECKING:
     from beamfit.sampling.posterior import Posterior
 
-__all__ = ["HEADER", "as_html", "as_text", "diagnostic_rows", "interval_rows", "noise_words", "plain_name"]
+__all__ = ["HEADER", "as_html", "as_text", "diagnostic_rows", "in_unit", "interval_rows", "noise_words", "plain_name"]
 
-HEADER = ["", "median", "68 % interval", "95 % interval", "unit"]
+HEADER = ["", "median", "68 % interval", "95 % interval"]
 # A table of more numbers is cut, and says so.
 MOST_ROWS = 40
 
@@ -32,9 +32,15 @@ def plain_name(name: str) -> str:
     return name.replace(".", " ").replace("_", " ").replace("normalized", "normalised")
 
 
-def _scaled(values: np.ndarray, unit: str) -> tuple[np.ndarray, str]:
-    """Values in a unit in which they are easily read."""
-    size = float(np.max(np.abs(values)))
+def in_unit(values: np.ndarray, unit: str) -> tuple[np.ndarray, str]:
+    """Values in a unit in which they are easily read, and that unit.
+
+    Examples
+    --------
+    >>> in_unit(np.array([7e-7]), "m")[1], in_unit(np.array([7e-8]), "1/s")[1]
+    ('µm', '1e-8 1/s')
+    """
+    size = float(np.quantile(np.abs(values), 0.98))
     factor, shown = display_unit(size, unit)
     if unit != "m" and size > 0 and not 1e-3 <= size < 1e5:
         power = math.floor(math.log10(size))
@@ -60,9 +66,10 @@ def interval_rows(posterior: Posterior) -> list[list[str]]:
         found = posterior.quantiles(name)
         label = plain_name(name)
         if not np.isfinite(found).all():
-            rows.append([label, "not determined", "-", "-", ""])
+            rows.append([label, "not determined", "-", "-"])
             continue
-        (low, one, middle, other, high), unit = _scaled(found, posterior.unit(name))
+        (low, one, middle, other, high), unit = in_unit(found, posterior.unit(name))
+        label = f"{label}, {unit}" if unit else label
         width = 0.5 * (other - one)
         places = 4 if width <= 0 else min(max(1 - math.floor(math.log10(width)), 0), 12)
 
@@ -70,12 +77,12 @@ def interval_rows(posterior: Posterior) -> list[list[str]]:
             return f"{value:.{places}f}"
 
         if name in posterior.held:
-            rows.append([label, "not determined", "the prior's", "the prior's", unit])
+            rows.append([label, "not determined", "the prior's", "the prior's"])
         else:
             spans = [f"{text(one)} to {text(other)}", f"{text(low)} to {text(high)}"]
-            rows.append([label, text(middle), *spans, unit])
+            rows.append([label, text(middle), *spans])
     left = len(posterior.shown) - MOST_ROWS
-    return [*rows, [f"and {left} more", "", "", "", ""]] if left > 0 else rows
+    return [*rows, [f"and {left} more", "", "", ""]] if left > 0 else rows
 
 
 def diagnostic_rows(posterior: Posterior) -> list[tuple[str, list[str]]]:
