@@ -1,0 +1,129 @@
+"""Posteriors against plain emcee, side by side in one run: python benchmarks/sampling.py
+
+The peer is what one writes first: emcee's stretch move on a scalar log-probability in numpy, 32
+walkers from a ball about the same fit. Both are judged by emcee's own autocorrelation time on a
+chain without its beginning; compilation is left out of ours and said.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+
+import emcee
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+import beamfit
+from beamfit.lifetime.decay import current
+from beamfit.sampling.posterior import Posterior
+from beamfit.studies.decay import fit_decay
+from beamfit.studies.decay_record import DecayRecord
+
+WALKERS, STEPS, DISCARD, REPEATS = 32, 4000, 500, 3
+
+
+def plain(
+    log_prob: Callable[[np.ndarray], float], start: np.ndarray, spread: np.ndarray, seed: int
+) -> tuple[float, float, np.ndarray]:
+    """Effective samples a second of emcee as it comes, its autocorrelation time, its draws."""
+    random = np.random.default_rng(seed)
+    walkers = start + random.standard_normal((WALKERS, len(start))) @ np.linalg.cholesky(spread).T
+    sampler = emcee.EnsembleSampler(WALKERS, len(start), log_prob)
+    sampler.random_state = np.random.RandomState(seed).get_state()
+    began = time.perf_counter()
+    sampler.run_mcmc(walkers, STEPS)
+    seconds = time.perf_counter() - began
+    longest = float(np.max(sampler.get_autocorr_time(discard=DISCARD, tol=0, quiet=True)))
+    effective = (STEPS - DISCARD) * WALKERS / longest
+    return effective / seconds, longest, sampler.get_chain(discard=DISCARD, flat=True)
+
+
+def ours(sample: Callable[..., Posterior], seed: int) -> tuple[float, float, Posterior]:
+    """The same of beamfit, warm-up and judging included."""
+    began = time.perf_counter()
+    found = sample(seed=seed, target_ess=40_000, noise="known")
+    seconds = time.perf_counter() - began
+    d = found.diagnostics
+    return float(np.min(d.effective)) / seconds, float(np.max(d.autocorrelation)), found
+
+
+def scan() -> tuple[str, Callable, np.ndarray, np.ndarray, Callable[..., Posterior]]:
+    """The 14-point scan: three numbers, scaled to 1e-8 so that the peer has no worse units."""
+    measured = beamfit.read_quad_scan("measurements/gtf_simulated.csv")
+    fit = beamfit.fit_emittance(measured, beamfit.load_lattice("lattices/gtf.toml"))
+    p = fit.x.points
+    a, b, size, error, known = p.r11, p.r12, p.size, p.error, p.known
+
+    def log_prob(theta: np.ndarray) -> float:
+        s11, s12, s22 = theta * 1e-8
+        if not (s11 > 0 and s22 > 0 and s11 * s22 > s12 * s12):
+            return -math.inf
+        squared = a * a * s11 + 2 * a * b * s12 + b * b * s22 + known
+        return -0.5 * float(np.sum(((squared - size**2) / (2 * size * error)) ** 2))
+
+    start = np.array([q.value for q in fit.x.sigma]) * 1e8
+    return "14-point scan", log_prob, start, fit.x.covariance * 1e16, fit.sample
+
+
+def decay() -> tuple[str, Callable, np.ndarray, np.ndarray, Callable[..., Posterior]]:
+    """A simulated 1000-point decay: I0, a, b."""
+    time_s = np.linspace(0.0, 8 * 3600.0, 1000)
+    noise = 1e-2 * np.random.default_rng(1).normal(size=1000)
+    readings = np.array(current(time_s, 500.0, 2e-8, 1e-6)) + noise
+    fit = fit_decay(DecayRecord(time_s, readings, np.full(1000, 1e-2)))
+
+    def log_prob(theta: np.ndarray) -> float:
+        i0, a, b = theta[0], theta[1] * 1e-8, theta[2] * 1e-6
+        if not (i0 > 0 and a >= 0 and b > 0):
+            return -math.inf
+        model = i0 * np.exp(-b * time_s) / (1 + a / b * i0 * -np.expm1(-b * time_s))
+        return -0.5 * float(np.sum(((model - readings) / 1e-2) ** 2))
+
+    start = np.array([fit.i0.value, fit.a.value * 1e8, fit.b.value * 1e6])
+    errors = np.array([fit.i0.error_raw, fit.a.error_raw * 1e8, fit.b.error_raw * 1e6])
+    return "1000-point decay", log_prob, start, np.diag(errors**2), fit.sample
+
+
+def main() -> None:
+    """Print the table."""
+    table = Table(title="Effective samples a second, medians of three runs", box=None)
+    for name in ("", "plain emcee", "τ, steps", "beamfit", "τ, steps", "ratio", "means differ by"):
+        table.add_column(name, justify="right" if name else "left")
+    compiling = []
+    for name, log_prob, start, spread, sample in (scan(), decay()):
+        began = time.perf_counter()
+        ours(sample, 0)
+        compiling.append(f"{name} {time.perf_counter() - began:.1f} s")
+        theirs = [plain(log_prob, start, spread, seed) for seed in range(REPEATS)]
+        mine = [ours(sample, 1 + seed) for seed in range(REPEATS)]
+        peer, own = (float(np.median([run[0] for run in runs])) for runs in (theirs, mine))
+        times = (float(np.median([run[1] for run in runs])) for runs in (theirs, mine))
+        draws, others = mine[0][2].draws, theirs[0][2]
+        unit = others.mean(axis=0) / start
+        off = np.abs(draws.mean(axis=0) / (start / np.array(_scale(name))) / 1.0 - unit)
+        off = np.max(off * np.abs(start) / others.std(axis=0))
+        first, second = times
+        table.add_row(
+            name,
+            f"{peer:.0f}/s",
+            f"{first:.0f}",
+            f"{own:.0f}/s",
+            f"{second:.1f}",
+            f"{own / peer:.1f}",
+            f"{off:.3f} sd",
+        )
+    console = Console()
+    console.print(table)
+    console.print("First run of each, compilation included: " + ", ".join(compiling))
+
+
+def _scale(name: str) -> tuple[float, float, float]:
+    """What the peer's numbers are multiplied by, against ours."""
+    return (1e8, 1e8, 1e8) if "scan" in name else (1.0, 1e8, 1e6)
+
+
+if __name__ == "__main__":
+    main()
