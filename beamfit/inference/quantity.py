@@ -69,7 +69,9 @@ class Quantity:
         return f"{value:.{max(places, 0)}f} ± {error:.{max(places, 0)}f}{end}"
 
     def _prefix(self) -> tuple[float, str]:
-        return display_unit(max(abs(self.value), self.error or 0.0) if self.value else 0.0, self.unit)
+        return display_unit(
+            max(abs(self.value), self.error or 0.0) if self.value else 0.0, self.unit
+        )
 
 
 def display_unit(size: float, unit: str) -> tuple[float, str]:

@@ -39,18 +39,14 @@ def with_beam_posterior(page: Page, fit: EmittanceFit, posterior: Posterior) -> 
     return _added(page, [("", posterior)], beam_posterior_pictures(fit, posterior))
 
 
-def with_decay_posteriors(
-    page: Page, pairs: Sequence[tuple[DecayFit, Posterior]]
-) -> Page:
+def with_decay_posteriors(page: Page, pairs: Sequence[tuple[DecayFit, Posterior]]) -> Page:
     """Add the posteriors of decays to their page."""
     pictures = [picture for fit, found in pairs for picture in decay_posterior_pictures(fit, found)]
     names = [(f"{fit.record}: " if len(pairs) > 1 else "", found) for fit, found in pairs]
     return _added(page, names, pictures)
 
 
-def _added(
-    page: Page, named: Sequence[tuple[str, Posterior]], pictures: list[Picture]
-) -> Page:
+def _added(page: Page, named: Sequence[tuple[str, Posterior]], pictures: list[Picture]) -> Page:
     verdicts = [
         Verdict(found.status.value, f"{name}posterior {_headline(found)}", found.message)
         for name, found in named
@@ -79,11 +75,24 @@ def _correlations(name: str, found: Posterior) -> Table:
     names = [each for each in names if "sigma" not in each][:MOST_CORRELATED] or names
     values = found.correlations(names).values
     rows = [
-        [plain_name(each), *(f"{value:.2f}" for value in row[: i + 1]), *[""] * (len(names) - i - 1)]
+        [
+            plain_name(each),
+            *(_coefficient(v) for v in row[: i + 1]),
+            *[""] * (len(names) - i - 1),
+        ]
         for i, (each, row) in enumerate(zip(names, values, strict=True))
     ]
     title = f"{name}Correlations of the posterior"
     return Table(title, ["", *(plain_name(each) for each in names)], rows, numeric=True)
+
+
+def _coefficient(value: float) -> str:
+    """Two digits, and more where one and nearly one would look the same."""
+    return (
+        f"{value:.4f}"
+        if 0.99 < abs(value) < 0.99995
+        else f"{value + 0.0:.2f}".replace("-0.00", "0.00")
+    )
 
 
 def _diagnostics(name: str, found: Posterior) -> Table:

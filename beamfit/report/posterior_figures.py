@@ -215,9 +215,7 @@ def beam_posterior_pictures(fit: EmittanceFit, posterior: Posterior) -> list[Pic
                 Picture(
                     f"numbers of the {p.plane} plane in pairs",
                     _height(names),
-                    partial(
-                        draw_pairs, posterior=posterior, names=names, colour=COLOUR[p.plane]
-                    ),
+                    partial(draw_pairs, posterior=posterior, names=names, colour=COLOUR[p.plane]),
                 )
             )
             listed.append(

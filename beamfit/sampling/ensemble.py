@@ -113,9 +113,7 @@ def _check_options(n: int, target_ess: float, budget: int, walkers: int) -> None
         raise InputError(f"a budget of {budget} steps", f"{BLOCK} or more")
 
 
-def first_walkers(
-    target: Target, number: int, random: np.random.RandomState
-) -> np.ndarray | None:
+def first_walkers(target: Target, number: int, random: np.random.RandomState) -> np.ndarray | None:
     """Place walkers inside the feasible set, spread as the fit's covariance says.
 
     Parameters
@@ -231,7 +229,9 @@ def _block(target: Target, state: Checkpoint, start: np.ndarray | None) -> Check
         vectorize=True,
     )
     if start is None:
-        last: Any = emcee.State(state.chain[-1], state.log_prob[-1], random_state=state.random_state)
+        last: Any = emcee.State(
+            state.chain[-1], state.log_prob[-1], random_state=state.random_state
+        )
     else:
         last = emcee.State(start, random_state=state.random_state)
     sampler.run_mcmc(last, BLOCK, skip_initial_state_check=True)

@@ -224,7 +224,11 @@ def _student(points: np.ndarray) -> Student:
 
 
 def share_of(
-    proposal: Proposal, points: np.ndarray, log_prob: np.ndarray, drawn: np.ndarray, found: np.ndarray
+    proposal: Proposal,
+    points: np.ndarray,
+    log_prob: np.ndarray,
+    drawn: np.ndarray,
+    found: np.ndarray,
 ) -> float:
     """Share of steps to leap: the more leaps are accepted, the more are tried.
 

@@ -226,7 +226,9 @@ class Posterior:
             One row a draw.
         """
         build = self.target.law.build
-        return self.target.each(lambda data, theta: function(build(data, theta)), self.thinned(number))
+        return self.target.each(
+            lambda data, theta: function(build(data, theta)), self.thinned(number)
+        )
 
     def band(self, function: Callable[[Any], Any], probability: float = ONE_SIGMA) -> Band:
         """Median and credible interval of a curve, point by point; `function` as for `derive`."""

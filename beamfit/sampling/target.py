@@ -75,6 +75,11 @@ def _log_densities(data: Any, thetas: Array, law: Law, likelihood: Likelihood) -
     return jax.vmap(one)(thetas)
 
 
+@partial(jax.jit, static_argnames=("law",))
+def _jacobian(data: Any, theta: Array, law: Law) -> Array:
+    return jax.jacfwd(lambda moved: jnp.concatenate(law.residual(data, moved)))(theta)
+
+
 @partial(jax.jit, static_argnames=("function",))
 def _each(data: Any, thetas: Array, function: Callable[[Any, Array], Any]) -> Any:
     return jax.vmap(function, (None, 0))(data, thetas)
@@ -144,11 +149,11 @@ class Target:
     upper: np.ndarray
     mode: np.ndarray
     covariance: np.ndarray
-    likelihood: Likelihood = Likelihood()
+    likelihood: Likelihood = field(default_factory=Likelihood)
     noise: tuple[float, ...] = (1.0,)
     noise_unit: str = "1"
     priors: Mapping[str, Distribution] = field(default_factory=dict)
-    derived: Derived = Derived()
+    derived: Derived = field(default_factory=Derived)
     observed: Mapping[str, np.ndarray] = field(default_factory=dict)
     priors_own: tuple[str, ...] = ()
     open_directions: str = ""
@@ -310,9 +315,7 @@ def covariance_of(law: Law, data: Any, mode: np.ndarray, width: np.ndarray) -> n
     array, shape (n, n)
         (JᵀJ + 1/width²)⁻¹, computed with columns of unit length.
     """
-    jacobian = np.asarray(
-        jax.jacfwd(lambda theta: jnp.concatenate(law.residual(data, theta)))(jnp.asarray(mode))
-    )
+    jacobian = np.asarray(_jacobian(data, jnp.asarray(mode), law))
     rows = np.concatenate([jacobian, np.diag(1.0 / np.asarray(width, float))])
     scale = np.linalg.norm(rows, axis=0)
     scale = np.where(scale > 0, scale, 1.0)

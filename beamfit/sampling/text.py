@@ -14,7 +14,16 @@ from beamfit.sampling.likelihood import Group, Likelihood  # noqa: F401 - Group 
 if TYPE_CHECKING:
     from beamfit.sampling.posterior import Posterior
 
-__all__ = ["HEADER", "as_html", "as_text", "diagnostic_rows", "in_unit", "interval_rows", "noise_words", "plain_name"]
+__all__ = [
+    "HEADER",
+    "as_html",
+    "as_text",
+    "diagnostic_rows",
+    "in_unit",
+    "interval_rows",
+    "noise_words",
+    "plain_name",
+]
 
 HEADER = ["", "median", "68 % interval", "95 % interval"]
 # A table of more numbers is cut, and says so.

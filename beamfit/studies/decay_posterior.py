@@ -135,7 +135,9 @@ def decay_target(
         upper=np.full(3, np.inf),
         mode=mode,
         covariance=covariance,
-        likelihood=Likelihood((Group("", noise or ("inferred" if inferred else "known"), outliers),)),
+        likelihood=Likelihood(
+            (Group("", noise or ("inferred" if inferred else "known"), outliers),)
+        ),
         noise=(max(factor, 1e-12),),
         noise_unit="mA" if record.error is None else "1",
         priors=priors,
@@ -169,9 +171,7 @@ def _start(
     return mode, width
 
 
-def _covariance(
-    data: Readings, mode: np.ndarray, width: np.ndarray, factor: float
-) -> np.ndarray:
+def _covariance(data: Readings, mode: np.ndarray, width: np.ndarray, factor: float) -> np.ndarray:
     # The residuals are in stated errors, the widths are absolute: bring both to the true noise.
     return covariance_of(LAW, data, mode, width / factor) * factor**2
 

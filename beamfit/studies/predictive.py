@@ -43,16 +43,12 @@ def _noise_factor(posterior: Posterior, prefix: str, number: int) -> np.ndarray:
     return np.exp(posterior.thinned()[:, posterior.names.index(name)])
 
 
-def _expected(
-    posterior: Posterior, draws: np.ndarray, error: np.ndarray, prefix: str
-) -> Expected:
+def _expected(posterior: Posterior, draws: np.ndarray, error: np.ndarray, prefix: str) -> Expected:
     noise = _noise_factor(posterior, prefix, len(draws))
     normal = np.random.default_rng(posterior.seed).standard_normal(draws.shape)
     readings = draws + noise[:, None] * error * normal
     low, median, high = np.quantile(draws, (0.16, 0.5, 0.84), axis=0)
-    return Expected(
-        median, np.stack([low, high]), np.quantile(readings, (0.025, 0.975), axis=0)
-    )
+    return Expected(median, np.stack([low, high]), np.quantile(readings, (0.025, 0.975), axis=0))
 
 
 def expected_sizes(

@@ -76,9 +76,7 @@ def test_outliers_are_left_alone():
         return integrate.dblquad(lambda f, m: g(f, m) * density(f, m), 0.8, 1.2, 0, 0.5)[0]
 
     norm = moment(lambda f, m: 1.0)
-    assert found.values("level").mean() == pytest.approx(
-        moment(lambda f, m: m) / norm, abs=0.002
-    )
+    assert found.values("level").mean() == pytest.approx(moment(lambda f, m: m) / norm, abs=0.002)
     assert found.values("outlier_fraction").mean() == pytest.approx(
         moment(lambda f, m: f) / norm, rel=0.03
     )

@@ -22,9 +22,7 @@ BLOCK = (np.array([0, 1]),)
 def moved(density, moves, seed):
     start = exact_draws(density, WALKERS, seed)
     stated = target(density)
-    sampler = emcee.EnsembleSampler(
-        WALKERS, 2, stated.log_probability, moves=moves, vectorize=True
-    )
+    sampler = emcee.EnsembleSampler(WALKERS, 2, stated.log_probability, moves=moves, vectorize=True)
     state = emcee.State(start, random_state=np.random.RandomState(seed).get_state())
     return sampler.run_mcmc(state, STEPS).coords, float(sampler.acceptance_fraction.mean())
 
