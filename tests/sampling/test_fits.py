@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-import jax.numpy as jnp
+import sys
+import types
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy import stats
@@ -259,12 +262,31 @@ def test_readings_that_show_nothing():
 
 
 def test_a_shape_of_a_is_not_sampled():
-    fit = fit_decay(decay(2e-8, 1e-6, 7200.0), shape=lambda i: jnp.ones_like(i))
+    fit = replace(fit_decay(decay(2e-8, 1e-6, 7200.0)), shaped=True)
     with pytest.raises(InputError, match="a shape of a"):
         fit.sample()
 
 
 def test_arviz_is_asked_for_by_name(beam, monkeypatch):
-    monkeypatch.setitem(__import__("sys").modules, "arviz", None)
+    monkeypatch.setitem(sys.modules, "arviz", None)
     with pytest.raises(InputError, match="pip install arviz"):
         beam.to_arviz()
+
+
+@pytest.mark.parametrize("version", ["0.23.4", "1.2.0"])
+def test_arviz_gets_walkers_as_chains(beam, monkeypatch, version):
+    """Both forms of its from_dict: groups as arguments, and as one mapping from 1.0 on."""
+    given = {}
+
+    def from_dict(*groups, **named):
+        given.update(groups[0] if groups else named)
+        return len(groups)
+
+    module = types.SimpleNamespace(__version__=version, from_dict=from_dict)
+    monkeypatch.setitem(sys.modules, "arviz", module)
+    assert beam.to_arviz() == (1 if version[0] == "1" else 0)
+    steps, walkers, _ = beam.chain.shape
+    assert set(given) == {"posterior", "sample_stats", "observed_data"}
+    assert given["posterior"]["x.emittance"].shape == (walkers, steps)
+    np.testing.assert_array_equal(given["posterior"]["x.sigma11"], beam.chain[:, :, 0].T)
+    assert given["sample_stats"]["lp"].shape == (walkers, steps)
