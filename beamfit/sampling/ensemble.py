@@ -92,6 +92,7 @@ def draw(
     state = None if store is None else disk.load(store, target, seed, walkers)
     if target.open_directions:
         return refused(target, seed, "unidentified", target.open_directions)
+    start = None
     if state is None:
         random = np.random.RandomState(seed)
         start = first_walkers(target, walkers, random)
@@ -99,8 +100,6 @@ def draw(
             said = "no point within the bounds and constraints was found; relax them"
             return refused(target, seed, "infeasible", said)
         state = _begin(target, start, random, seed)
-    else:
-        start = None
     return _run(target, state, start, target_ess, budget, store, provenance, progress)
 
 

@@ -283,17 +283,28 @@ class Target:
         """Tells one problem from another: data, names, bounds, priors, likelihood."""
         found = hashlib.sha256()
         for name, values in sorted(self.observed.items()):
-            values = np.asarray(values)
-            found.update(f"{name}{values.shape}".encode())
-            found.update(values.tobytes() if values.dtype != object else repr(values).encode())
-        for leaf in jax.tree.leaves(self.data):
-            found.update(np.asarray(leaf).tobytes())
+            found.update(name.encode() + _digits(values))
+        # Bounds of the noise follow the fit and are not compared.
+        for values in (*jax.tree.leaves(self.data), self.own(self.lower), self.own(self.upper)):
+            found.update(_digits(values))
         words = [repr(self.names), repr(self.likelihood), self.law.residual.__qualname__]
         words += [f"{name}~{in_words(prior)}" for name, prior in sorted(self.priors.items())]
         found.update("|".join(words).encode())
-        # Bounds of the noise follow the fit, whose last digits are the solver's.
-        found.update(self.own(self.lower).tobytes() + self.own(self.upper).tobytes())
         return found.hexdigest()
+
+
+def _digits(values: Any) -> bytes:
+    """Shape and values, numbers to nine digits: the last ones depend on how code was compiled."""
+    values = np.asarray(values)
+    if values.dtype.kind not in "fiub":
+        return repr(values.tolist()).encode()
+    share, power = np.frexp(np.where(np.isfinite(values), values, 0.0).astype(float))
+    parts = (
+        np.round(share * 2.0**30).astype(np.int64),
+        power.astype(np.int64),
+        np.isfinite(values),
+    )
+    return repr(values.shape).encode() + b"".join(part.tobytes() for part in parts)
 
 
 def covariance_of(law: Law, data: Any, mode: np.ndarray, width: np.ndarray) -> np.ndarray:

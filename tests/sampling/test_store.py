@@ -235,3 +235,14 @@ def test_writing_costs_little(tmp_path):
         draw(target(banana), store=tmp_path / "chain.h5", seed=1, target_ess=1e9, budget=3000)
     assert sum(spent) < 0.1 * (time.perf_counter() - began)
     assert len(spent) >= 3
+
+
+def test_the_last_digits_do_not_make_another_problem(store):
+    """A command compiles without optimisation: the same scan has other last digits there."""
+    base = {"none": np.array([0.1, 3e-9])}
+    one, other = (
+        target(half_normal, data=base),
+        target(half_normal, data={"none": base["none"] * (1 + 4e-16)}),
+    )
+    assert one.digest == other.digest
+    assert one.digest != target(half_normal, data={"none": base["none"] * (1 + 1e-7)}).digest
