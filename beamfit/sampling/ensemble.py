@@ -25,8 +25,8 @@ __all__ = ["draw", "first_walkers"]
 # interrupted decides as the uninterrupted one did.
 BLOCK = 50
 # Warm-up: rounds that end at these steps, until the walkers agree so well within half a round.
-ROUNDS = (100, 250, 500, 900, 1500, 2500, 4000)
-WARM = 1.1
+ROUNDS = (100, 250, 500, 900, 1500, 2500)
+WARM = 1.15
 FEWEST_WALKERS = 64
 # Share of time that may go into writing checkpoints.
 WRITING = 0.05

@@ -33,7 +33,7 @@ def near(posterior, name, mean, sd):
 
 
 def test_banana():
-    found = draw(target(banana), seed=1, target_ess=4000)
+    found = draw(target(banana), seed=1, target_ess=1500)
     assert found.status is Status.converged
     mean, sd, about = BANANA
     near(found, "x", mean, sd)

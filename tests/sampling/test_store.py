@@ -21,7 +21,7 @@ from beamfit.sampling.priors import Normal
 from beamfit.sampling.store import Provenance
 from tests.sampling.targets import banana, half_normal, target
 
-OPTIONS = {"seed": 5, "target_ess": 1e9, "budget": 1000, "walkers": 16}
+OPTIONS = {"seed": 5, "target_ess": 1e9, "budget": 700, "walkers": 16}
 
 
 @pytest.fixture(scope="module")
@@ -38,7 +38,7 @@ def test_emcee_reads_the_store(tmp_path, whole):
     path = tmp_path / "chain.h5"
     posterior = draw(target(half_normal), store=path, **OPTIONS)
     backend = stored_chain(path)
-    assert backend.iteration == 1000
+    assert backend.iteration == 700
     assert backend.shape == (16, 2)
     kept = backend.get_chain(discard=posterior.warmup)
     np.testing.assert_array_equal(kept, posterior.chain)
@@ -121,7 +121,7 @@ def test_killed_at_any_moment_the_finished_chain_is_the_uninterrupted_one(tmp_pa
         )
         assert process.stdout.readline() == b"begun\n"
         # Before the first checkpoint, between and within later ones; in the end it may finish.
-        until = time.monotonic() + random.uniform(0.0, 1.0) + 0.1 * attempt
+        until = time.monotonic() + random.uniform(0.0, 1.0) + 0.3 * attempt
         while time.monotonic() < until and process.poll() is None:
             time.sleep(0.005)
         if process.poll() is None:
@@ -137,8 +137,8 @@ def test_killed_at_any_moment_the_finished_chain_is_the_uninterrupted_one(tmp_pa
             break
     assert b"finished" in output
     assert kills >= 3
-    assert len(seen - {1000}) >= 2  # it was interrupted at different places
-    assert stored_chain(path).iteration == 1000
+    assert len(seen - {700}) >= 2  # it was interrupted at different places
+    assert stored_chain(path).iteration == 700
     finished = draw(target(half_normal), store=path, **OPTIONS)
     np.testing.assert_array_equal(finished.chain, whole.chain)
     np.testing.assert_array_equal(finished.log_prob, whole.log_prob)
