@@ -31,7 +31,11 @@ ON_A_LINE = 0.95
 
 
 def draw_pairs(
-    figure: FigureBase, posterior: Posterior, names: Sequence[str], colour: str = BLUE
+    figure: FigureBase,
+    posterior: Posterior,
+    names: Sequence[str],
+    title: str = "",
+    colour: str = BLUE,
 ) -> None:
     """Draw the distribution of each number and of each pair.
 
@@ -43,6 +47,8 @@ def draw_pairs(
         With draws.
     names : sequence of str
         Numbers.
+    title : str
+        Of the whole.
     colour : str
         Of the draws.
     """
@@ -78,6 +84,8 @@ def draw_pairs(
             if row == n - 1:
                 axes.set_xlabel(labels[column], fontsize=8)
     figure.align_labels()
+    if title:
+        figure.suptitle(title, x=0.01, ha="left", fontsize=11, weight="bold")
 
 
 def _label(name: str, unit: str) -> str:
@@ -207,25 +215,30 @@ def beam_posterior_pictures(fit: EmittanceFit, posterior: Posterior) -> list[Pic
     """Two pictures a sampled plane."""
     if not posterior.chain.size:
         return []
-    listed = []
-    for p in fit.planes:
-        names = _of_plane(posterior, p.plane)
-        if names:
-            listed.append(
-                Picture(
-                    f"numbers of the {p.plane} plane in pairs",
-                    _height(names),
-                    partial(draw_pairs, posterior=posterior, names=names, colour=COLOUR[p.plane]),
-                )
-            )
-            listed.append(
-                Picture(
-                    f"sizes expected in the {p.plane} plane",
-                    3.4,
-                    partial(draw_expected_sizes, fit=fit, posterior=posterior, plane=p.plane),
-                )
-            )
-    return listed
+    sampled = [(p.plane, names) for p in fit.planes if (names := _of_plane(posterior, p.plane))]
+    expected = [
+        Picture(
+            f"sizes expected in the {plane} plane",
+            3.4,
+            partial(draw_expected_sizes, fit=fit, posterior=posterior, plane=plane),
+        )
+        for plane, _ in sampled
+    ]
+    pairs = [
+        Picture(
+            f"numbers of the {plane} plane in pairs",
+            _height(names),
+            partial(
+                draw_pairs,
+                posterior=posterior,
+                names=names,
+                title=f"{plane} plane: posterior",
+                colour=COLOUR[plane],
+            ),
+        )
+        for plane, names in sampled
+    ]
+    return expected + pairs
 
 
 def _of_plane(posterior: Posterior, plane: str) -> list[str]:
@@ -244,7 +257,7 @@ def decay_posterior_pictures(fit: DecayFit, posterior: Posterior) -> list[Pictur
         Picture(
             f"numbers of {fit.record} in pairs",
             _height(names),
-            partial(draw_pairs, posterior=posterior, names=names),
+            partial(draw_pairs, posterior=posterior, names=names, title=f"{fit.record}: posterior"),
         ),
         Picture(
             f"current expected of {fit.record}",
