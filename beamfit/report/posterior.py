@@ -57,6 +57,7 @@ def _added(page: Page, named: Sequence[tuple[str, Posterior]], pictures: list[Pi
     further = [
         table
         for name, found in named
+        if found.chain.size
         for table in (_correlations(name, found), _diagnostics(name, found))
     ]
     return page._replace(
@@ -74,25 +75,23 @@ def _correlations(name: str, found: Posterior) -> Table:
     names = [each for each in found.shown if not each.endswith(".emittance")]
     names = [each for each in names if "sigma" not in each][:MOST_CORRELATED] or names
     values = found.correlations(names).values
+    count = len(names)
     rows = [
         [
-            plain_name(each),
+            f"{i + 1} {plain_name(each)}",
             *(_coefficient(v) for v in row[: i + 1]),
-            *[""] * (len(names) - i - 1),
+            *[""] * (count - i - 1),
         ]
         for i, (each, row) in enumerate(zip(names, values, strict=True))
     ]
     title = f"{name}Correlations of the posterior"
-    return Table(title, ["", *(plain_name(each) for each in names)], rows, numeric=True)
+    return Table(title, ["", *(str(i + 1) for i in range(count))], rows, numeric=True)
 
 
 def _coefficient(value: float) -> str:
     """Two digits, and more where one and nearly one would look the same."""
-    return (
-        f"{value:.4f}"
-        if 0.99 < abs(value) < 0.99995
-        else f"{value + 0.0:.2f}".replace("-0.00", "0.00")
-    )
+    nearly_one = 0.99 < abs(value) < 0.99995
+    return f"{value:.4f}" if nearly_one else f"{value:.2f}".replace("-0.00", "0.00")
 
 
 def _diagnostics(name: str, found: Posterior) -> Table:

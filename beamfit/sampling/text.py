@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from html import escape
+from importlib.metadata import version
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -121,6 +122,7 @@ def diagnostic_rows(posterior: Posterior) -> list[tuple[str, list[str]]]:
             ("split R-hat, largest", f"{np.max(d.rhat):.4f}"),
             ("proposals accepted", f"{100 * posterior.acceptance:.0f} %"),
             ("seed", str(posterior.seed)),
+            ("sampler", f"emcee {version('emcee')}"),
         ]
     return [(label, [cell]) for label, cell in rows]
 
