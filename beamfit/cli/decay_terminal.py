@@ -10,7 +10,7 @@ from rich.text import Text
 from beamfit.cli.terminal import status_table, verdict_text
 from beamfit.inference.quantity import Status
 from beamfit.studies.decay_tables import budget_rows as loss_rows
-from beamfit.studies.decay_tables import decay_rows, separability_rows, shift_rows
+from beamfit.studies.decay_tables import check_rows, decay_rows, separability_rows, shift_rows
 from beamfit.studies.decays import RecordStudy
 from beamfit.studies.shift import Shift
 
@@ -31,10 +31,12 @@ def decay_tables(study: RecordStudy) -> Iterator[Table | Text]:
         decays = study.decays[first : first + ABREAST]
         names = [d.fit.record for d in decays]
         statuses = [d.fit.status for d in decays]
-        rows = decay_rows(decays) + separability_rows(decays)[:2]
+        rows = decay_rows(decays) + separability_rows(decays)[:2] + check_rows(decays)
         yield status_table("", names, statuses, rows)
         for d in decays:
             yield verdict_text(d.fit.record, d.fit.status, d.fit.message)
+            if d.checks is not None and d.checks.constant_a.status is Status.poor_fit:
+                yield verdict_text("constant a", Status.poor_fit, d.checks.constant_a.message)
         losses = loss_rows(decays)
         if losses:
             yield status_table("\nLosses from first principles", names, statuses, losses)

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
+from beamfit.inference.quantity import Status
 from beamfit.report.decay_figures import decay_pictures
 from beamfit.report.document import Page, Table, Verdict, by_name, provenance, written
 from beamfit.studies.decay_tables import (
     budget_rows,
+    check_rows,
     decay_rows,
     event_rows,
     separability_rows,
@@ -22,6 +24,10 @@ ERRORS = (
     "dI/dt = -a I² - b I. Errors are one standard deviation, scaled by sqrt(χ²/dof) where that "
     "exceeds 1. “Not determined” means the record puts no error on the value; it is not to be "
     "quoted."
+)
+CHECKS = (
+    "Analyses that take the lifetime as constant, for comparison: their errors do not contain the "
+    "bias stated. “Constant a” asks whether a power of the current describes the loss better."
 )
 BUDGET = (
     "Computed for the ring file and the record's own settings, nothing fitted. The percentages are "
@@ -100,6 +106,7 @@ def _side_by_side(decays: Sequence[Decay]) -> list[Table]:
     parts = [
         ("Result", ERRORS, decay_rows),
         ("What the records determine", "", separability_rows),
+        ("Beside it", CHECKS, check_rows),
         ("Losses from first principles", BUDGET, budget_rows),
     ]
     return [
@@ -153,7 +160,10 @@ def _verdict(decay: Decay) -> Verdict:
     fit = decay.fit
     value = f"lifetime {fit.lifetime_mean} at {fit.mean_current:.4g} mA"
     headline = value if fit.lifetime_mean.error is not None else "lifetime not determined"
-    return Verdict(fit.status.value, f"{fit.record}: {headline}", fit.message)
+    message = fit.message
+    if decay.checks is not None and decay.checks.constant_a.status is Status.poor_fit:
+        message = f"{message} {decay.checks.constant_a.message}"
+    return Verdict(fit.status.value, f"{fit.record}: {headline}", message)
 
 
 def _shift_verdicts(shift: Shift | None) -> list[Verdict]:

@@ -2,14 +2,22 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 
-from beamfit.inference.quantity import Quantity
+from beamfit.inference.quantity import Quantity, Status
 from beamfit.lifetime.scaled import MECHANISMS
 from beamfit.studies.decays import Decay, RecordStudy
 from beamfit.studies.shift import Shift
 
-__all__ = ["budget_rows", "decay_rows", "event_rows", "separability_rows", "shift_rows"]
+__all__ = [
+    "budget_rows",
+    "check_rows",
+    "decay_rows",
+    "event_rows",
+    "separability_rows",
+    "shift_rows",
+]
 
 Rows = list[tuple[str, list[str]]]
 MOST_EVENTS = 100
@@ -81,6 +89,47 @@ def separability_rows(decays: Sequence[Decay]) -> Rows:
             ("true errors are larger by", lambda d: f"{_verdict(d).error_inflation:.1f} times"),
         ],
     )
+
+
+def check_rows(decays: Sequence[Decay]) -> Rows:
+    """Label and one cell per decay for what simpler analyses say, and whether a is constant.
+
+    Parameters
+    ----------
+    decays : sequence of Decay
+        Decays of one record.
+
+    Returns
+    -------
+    list of (str, list of str)
+        Lifetimes with their bias from the (a, b) fit.
+    """
+    return _laid_out(
+        decays,
+        [
+            ("single exponential", lambda d: _one_lifetime(d, "single_exponential")),
+            ("line through ln I", lambda d: _one_lifetime(d, "log_linear")),
+            ("constant a", _constant_a),
+        ],
+    )
+
+
+def _one_lifetime(decay: Decay, name: str) -> str:
+    found = None if decay.checks is None else getattr(decay.checks, name)
+    if found is None:
+        return "-"
+    known = math.isfinite(found.bias_start)
+    bias = f"{100 * found.bias_start:+.2g} % at start, " if known else ""
+    return f"{found.lifetime} ({bias}{found.rms_residual:.3g} mA rms)"
+
+
+def _constant_a(decay: Decay) -> str:
+    if decay.checks is None:
+        return "-"
+    found = decay.checks.constant_a
+    said = {Status.converged: "not contradicted", Status.poor_fit: "rejected"}
+    chance = f" (p = {found.p_value:.2g})"
+    return said[found.status] + chance if found.status in said else "the record cannot tell"
 
 
 def _verdict(decay: Decay):
