@@ -106,7 +106,7 @@ def _side_by_side(decays: Sequence[Decay]) -> list[Table]:
     parts = [
         ("Result", ERRORS, decay_rows),
         ("What the records determine", "", separability_rows),
-        ("Beside it", CHECKS, check_rows),
+        ("Simpler analyses, and whether a is constant", CHECKS, check_rows),
         ("Losses from first principles", BUDGET, budget_rows),
     ]
     return [
