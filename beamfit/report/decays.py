@@ -8,10 +8,13 @@ from beamfit.inference.quantity import Status
 from beamfit.report.decay_figures import decay_pictures
 from beamfit.report.document import Page, Table, Verdict, by_name, provenance, written
 from beamfit.studies.decay_tables import (
+    FEW,
+    alike,
     budget_rows,
     check_rows,
     decay_rows,
     event_rows,
+    overview,
     separability_rows,
     shift_rows,
 )
@@ -37,19 +40,8 @@ SHIFT = (
     "Scales multiply the ring file's first principles. Brackets are 68 % credible intervals. The "
     "best point is sought within the range of settings seen."
 )
-# Decays beside one another in one table, and how many have every number shown.
-ABREAST, FEW = 2, 4
-SHORT = {
-    "Result": ("status", "current at the start", "lifetime at the mean current"),
-    "a and b": ("a", "b", "chi2/dof"),
-    "Losses from first principles": (
-        "RF voltage",
-        "scraper",
-        "bunches",
-        "lifetime at the mean, computed",
-        "lifetime at the mean, measured",
-    ),
-}
+# Decays beside one another in one table.
+ABREAST = 2
 
 
 def decay_page(
@@ -121,20 +113,9 @@ def _side_by_side(decays: Sequence[Decay]) -> list[Table]:
 
 def _one_below_another(decays: Sequence[Decay]) -> list[Table]:
     """The main numbers of many decays, one row each."""
-    every = dict(decay_rows(decays)) | dict(budget_rows(decays))
-    names = [decay.fit.record for decay in decays]
-    shown = {
-        title: [label for label in labels if label in every] for title, labels in SHORT.items()
-    }
     return [
-        Table(
-            title,
-            ["decay", *(label.removeprefix("lifetime at the mean, ") for label in labels)],
-            [list(row) for row in zip(names, *(every[label] for label in labels), strict=True)],
-            {"Result": ERRORS}.get(title, ""),
-        )
-        for title, labels in shown.items()
-        if labels
+        Table(title, header, rows, {"Result": ERRORS}.get(title, ""))
+        for title, header, rows in overview(decays)
     ]
 
 
@@ -142,18 +123,7 @@ def _verdicts(decays: Sequence[Decay]) -> list[Verdict]:
     """One for each decay; of many decays one for each thing said."""
     if len(decays) <= FEW:
         return [_verdict(decay) for decay in decays]
-    alike: dict[tuple[str, str], list[str]] = {}
-    for decay in decays:
-        said = (decay.fit.status.value, decay.fit.message)
-        alike.setdefault(said, []).append(decay.fit.record)
-    return [
-        Verdict(
-            status,
-            names[0] if len(names) == 1 else f"{len(names)} decays, {names[0]} to {names[-1]}",
-            message,
-        )
-        for (status, message), names in alike.items()
-    ]
+    return [Verdict(status.value, who, message) for status, who, message in alike(decays)]
 
 
 def _verdict(decay: Decay) -> Verdict:

@@ -275,3 +275,20 @@ def test_a_constant_record_is_an_answer_not_an_error(run, tmp_path):
     assert result["a"]["error"] is result["b"]["error"] is None
     assert result["lifetime_mean"]["error"] is None
     assert "more digits" in result["message"]
+
+
+def test_many_decays_are_a_row_each_and_nothing_is_cut_short(run, tmp_path, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "80")
+    time = np.arange(0.0, 10000.0, 10.0)
+    noise = 1e-3 * np.random.default_rng(3).normal(size=time.size)
+    saw = 100 * np.exp(-(time % 2000) / 36000) + noise
+    path = write_record(tmp_path / "a_rather_long_name_of_a_topup_record.csv", time, saw)
+    _, shown, _ = run("lifetime", str(path), "--ring", RING)
+    assert "…" not in shown
+    for number in range(1, 6):
+        assert len([row for row in shown.splitlines() if row.startswith(f"#{number} ")]) == 3
+    two = write_record(tmp_path / "two.csv", time[:400], saw[:400])
+    _, shown, _ = run("lifetime", str(two), "--ring", RING)
+    assert "…" not in shown
+    assert shown.count("lifetime at the mean current ") == 2
+    assert shown.count("a, Touschek ") == 2
