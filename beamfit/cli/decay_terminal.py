@@ -7,17 +7,22 @@ from collections.abc import Iterator
 from rich.table import Table
 from rich.text import Text
 
-from beamfit.cli.terminal import status_table, verdict_text
+from beamfit.cli.terminal import plain_table, status_table, verdict_text
 from beamfit.inference.quantity import Status
+from beamfit.studies.decay_tables import (
+    FEW,
+    alike,
+    check_rows,
+    decay_rows,
+    overview,
+    separability_rows,
+    shift_rows,
+)
 from beamfit.studies.decay_tables import budget_rows as loss_rows
-from beamfit.studies.decay_tables import decay_rows, separability_rows, shift_rows
 from beamfit.studies.decays import RecordStudy
 from beamfit.studies.shift import Shift
 
 __all__ = ["decay_tables", "shift_lines"]
-
-# Decays beside one another in one table.
-ABREAST = 2
 
 
 def decay_tables(study: RecordStudy) -> Iterator[Table | Text]:
@@ -27,18 +32,33 @@ def decay_tables(study: RecordStudy) -> Iterator[Table | Text]:
         said = "; ".join(str(event) for event in study.events[:8])
         left = len(study.events) - 8
         yield Text(f"Cut at or left out: {said}" + (f"; {left} more" if left > 0 else ""))
-    for first in range(0, len(study.decays), ABREAST):
-        decays = study.decays[first : first + ABREAST]
-        names = [d.fit.record for d in decays]
-        statuses = [d.fit.status for d in decays]
-        rows = decay_rows(decays) + separability_rows(decays)[:2]
-        yield status_table("", names, statuses, rows)
-        for d in decays:
-            yield verdict_text(d.fit.record, d.fit.status, d.fit.message)
-        losses = loss_rows(decays)
-        if losses:
-            yield status_table("\nLosses from first principles", names, statuses, losses)
+    if len(study.decays) > FEW:
+        yield from _many(study)
+        return
+    for decay in study.decays:
+        name, status = decay.fit.record, decay.fit.status
+        rows = decay_rows([decay]) + separability_rows([decay])[:2] + check_rows([decay])
+        yield status_table("", [name], [status], rows)
+        yield verdict_text(name, status, decay.fit.message)
+        if decay.checks is not None and decay.checks.constant_a.status is Status.poor_fit:
+            yield verdict_text("constant a", Status.poor_fit, decay.checks.constant_a.message)
+        if losses := loss_rows([decay]):
+            yield status_table("\nLosses from first principles", [name], [status], losses)
         yield Text("")
+
+
+def _many(study: RecordStudy) -> Iterator[Table | Text]:
+    """One row a decay; the name of the record is above."""
+    for title, header, rows in overview(study.decays):
+        table = plain_table(f"\n{title}")
+        for label in header:
+            table.add_column(label, no_wrap=label != header[-1])
+        for name, *cells in rows:
+            table.add_row(name.removeprefix(study.record.name), *cells)
+        yield table
+    for status, names, message in alike(study.decays):
+        yield verdict_text(names, status, message)
+    yield Text("")
 
 
 def shift_lines(shift: Shift) -> Iterator[Table | Text]:

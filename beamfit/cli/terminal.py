@@ -43,9 +43,10 @@ def status_table(
 ) -> Table:
     """One column a result, the status in its colour."""
     table = plain_table(title)
-    table.add_column("")
+    # A label cut short says nothing; a number may go on in the next line.
+    table.add_column("", no_wrap=True)
     for name in names:
-        table.add_column(name, no_wrap=len(names) < 3)
+        table.add_column(name, overflow="fold")
     for label, cells in rows:
         shown = [
             Text(c, style=f"bold {COLOUR.get(s, 'red')}") if label == "status" else Text(c)

@@ -8,12 +8,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.experimental import checkify
-from scipy import linalg, stats
+from scipy import linalg
 
 from beamfit.greybox import kkt, problem
 from beamfit.greybox.fit import Attempt, Fit, Limited, Status, Variable
 from beamfit.greybox.implicit import Implicit
+from beamfit.greybox.kkt import TOLERANCE
 from beamfit.greybox.problem import Problem
+from beamfit.greybox.verdict import Evidence, judge
 
 __all__ = [
     "Slopes",
@@ -25,8 +27,6 @@ __all__ = [
     "slopes",
     "state",
 ]
-
-_TOLERANCE = 1e-6  # within which a limit counts as reached and a point as an optimum
 
 
 class Slopes(NamedTuple):
@@ -49,7 +49,6 @@ class State(NamedTuple):
     kkt: kkt.KKT
 
 
-@jax.jit
 def first_order(core, theta):
     """The parts of `Slopes`, compiled once for each structure of problem."""
     r, r_jacobian = problem.residual(core, theta), jax.jacfwd(problem.residual, 1)(core, theta)
@@ -66,7 +65,8 @@ def constraint_slopes(core, theta):
 
 def slopes(p: Problem, theta: np.ndarray) -> Slopes:
     """Evaluate values and first derivatives at a point."""
-    return Slopes(*(np.asarray(part) for part in first_order(p.core, jnp.asarray(theta, float))))
+    parts = p.compiled(first_order)(np.asarray(theta, float))
+    return Slopes(*(np.asarray(part) for part in parts))
 
 
 def _gradient_scale(p: Problem, theta: np.ndarray, at: Slopes) -> np.ndarray:
@@ -108,7 +108,7 @@ def state(p: Problem, theta: np.ndarray) -> State:
     scale = _gradient_scale(p, theta, at)
     bounds = kkt.Limits(theta, p.lower, p.upper)
     limits = kkt.Limits(at.constraints, p.constraint_lower, p.constraint_upper)
-    found = kkt.multipliers(at.gradient, at.jacobian, bounds, limits, scale, _TOLERANCE)
+    found = kkt.multipliers(at.gradient, at.jacobian, bounds, limits, scale, TOLERANCE)
     size = at.cost if p.objectives else 0.5 * scale.size
     distance = kkt.residual(at.gradient, at.jacobian, bounds, limits, scale, found, size)
     return State(theta, at, found, distance)
@@ -216,7 +216,10 @@ def conclude(p: Problem, s: State, attempts: tuple[Attempt, ...], seconds: float
             strict=True,
         )
     )  # fmt: skip
-    status, message = _verdict(p, s, attempts, variables, constraints, blind, chi2, dof, judged)
+    evidence = Evidence(
+        p, s.kkt, float(s.at.cost), attempts, variables, constraints, blind, chi2, dof, judged
+    )
+    status, message = judge(evidence)
     return Fit(
         p, s.theta, status, message, float(s.at.cost), chi2, dof, s.kkt, variables, constraints,
         spread.covariance, spread.unseen, float(scale), attempts, seconds,
@@ -225,69 +228,10 @@ def conclude(p: Problem, s: State, attempts: tuple[Attempt, ...], seconds: float
 
 def _states(multiplier: np.ndarray, limits: kkt.Limits) -> list[str]:
     """Whether each value is free, at its lower or upper limit, or fixed."""
-    low, high = limits.reached(_TOLERANCE)
+    low, high = limits.reached(TOLERANCE)
     fixed = limits.lower == limits.upper
     cases = [fixed, low & ((multiplier > 0) | ~high), high]
     return np.select(cases, ["fixed", "lower", "upper"], "free").tolist()
-
-
-def _list(names) -> str:
-    """A few names for a sentence."""
-    names = list(names)
-    return ", ".join(names[:4]) + (f" and {len(names) - 4} more" if len(names) > 4 else "")
-
-
-def _verdict(p, s, attempts, variables, constraints, blind, chi2, dof, judged):
-    """Status and sentence, the gravest first."""
-    if s.kkt.feasibility > _TOLERANCE:
-        crossed = kkt.Limits(s.at.constraints, p.constraint_lower, p.constraint_upper).violation
-        worst = constraints[int(np.argmax(crossed))] if constraints else None
-        place = (
-            f" '{worst.name}' ends at {worst.value:.4g}, outside" if worst else " bounds: outside"
-        )
-        limits = f" [{worst.lower:.4g}, {worst.upper:.4g}]" if worst else ""
-        return Status.infeasible, (
-            f"no point within all constraints was found from {_starts(attempts)}:{place}{limits}; "
-            "relax it, free more numbers, or start elsewhere."
-        )
-    if p.objectives and s.at.cost < -1e15:
-        return Status.unbounded, (
-            f"the cost falls without end (down to {s.at.cost:.3g}); bound the free numbers, or "
-            "check the sign of the objective."
-        )
-    if s.kkt.worst > _TOLERANCE:
-        return Status.not_converged, (
-            f"no optimum was reached from {_starts(attempts)} (KKT residual {s.kkt.worst:.1e} "
-            f"after {sum(a.iterations for a in attempts)} iterations); give more starts "
-            "or iterations, or a better start."
-        )
-    asked = ~p.nuisance
-    if (blind & asked).any():
-        names = _list(np.array(p.names)[blind & asked])
-        return Status.unidentified, (
-            f"the data do not determine {names}; add data of another kind, a prior, or fix it."
-        )
-    chance = stats.chi2.sf(chi2, dof) if dof > 0 else 1.0
-    if judged and p.records and chance < 1e-3:
-        return Status.poor_fit, (
-            f"chi2 = {chi2:.4g} for {dof} degrees of freedom happens by chance in {chance:.1e} of "
-            "cases; the model misses something or the errors are too small."
-        )
-    held = [v for v, ask in zip(variables, asked, strict=True) if ask]
-    held = [v for v in held if v.state in ("lower", "upper")]
-    if held:
-        names = _list(f"{v.name} ({v.state})" for v in held)
-        return Status.at_limit, (
-            f"the best value lies at a bound: {names}; the bound decides it, not the data, so "
-            "justify or widen it."
-        )
-    return Status.converged, (
-        f"an optimum was reached from {_starts(attempts)} (KKT residual {s.kkt.worst:.1e})."
-    )
-
-
-def _starts(attempts: tuple[Attempt, ...]) -> str:
-    return f"{len(attempts)} start{'s' if len(attempts) != 1 else ''}"
 
 
 def refused(

@@ -25,8 +25,7 @@ class Descent(NamedTuple):
 
 
 def descend(
-    residual: Callable[[np.ndarray], np.ndarray],
-    jacobian: Callable[[np.ndarray], np.ndarray],
+    linearise: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]],
     x: np.ndarray,
     lower: np.ndarray,
     upper: np.ndarray,
@@ -37,10 +36,9 @@ def descend(
 
     Parameters
     ----------
-    residual : callable
-        ``residual(x)``, shape (m,).
-    jacobian : callable
-        ``jacobian(x)``, shape (m, n).
+    linearise : callable
+        ``linearise(x)`` gives the residuals, shape (m,), and their Jacobian, shape (m, n): nearly
+        every step is accepted, and two calls cost more than one.
     x : array, shape (n,)
         Start; its residuals are finite.
     lower, upper : array, shape (n,)
@@ -56,22 +54,22 @@ def descend(
 
     Examples
     --------
-    >>> found = descend(lambda x: np.array([x[0] - 3.0, 2.0 * x[1]]), lambda x: np.diag([1.0, 2.0]),
-    ...                 np.array([0.0, 1.0]), np.array([-1.0, 0.5]), np.array([9.0, 9.0]))
+    >>> def linearise(x):
+    ...     return np.array([x[0] - 3.0, 2.0 * x[1]]), np.diag([1.0, 2.0])
+    >>> found = descend(linearise, np.array([0.0, 1.0]), np.array([-1.0, 0.5]), np.full(2, 9.0))
     >>> np.round(found.x, 12).tolist()
     [3.0, 0.5]
     """
     x = np.clip(x, lower, upper)
-    r, scale, damping, growth = residual(x), np.zeros(len(x)), 1e-3, 2.0
-    fresh = True
+    (r, j), n = linearise(x), len(x)
+    scale, damping, growth, fresh = np.zeros(n), 1e-3, 2.0, True
     for count in range(iterations):
         if fresh:
-            j = jacobian(x)
             if not np.all(np.isfinite(j)):
                 return Descent(x, count, False)
             scale = np.maximum(scale, np.linalg.norm(j, axis=0))
-            q, triangle = np.linalg.qr(j)
-            reduced, slope = q.T @ r, j.T @ r
+            both = np.linalg.qr(np.column_stack([j, r]), mode="r")
+            triangle, reduced, slope = both[:n, :n], both[:n, n], j.T @ r
         blocked = ((x <= lower) & (slope > 0)) | ((x >= upper) & (slope < 0))
         weight = np.sqrt(damping) * np.where(scale > 0, scale, 1.0)
         step = _step(triangle, reduced, weight, lower - x, upper - x, blocked)
@@ -80,13 +78,13 @@ def descend(
         promised = -(slope @ step) - 0.5 * np.sum((triangle @ step) ** 2)
         if np.linalg.norm(scale * step) <= tolerance * np.linalg.norm(scale * x):
             return Descent(x, count, True)
-        r_new = residual(new)
+        r_new, j_new = linearise(new)
         gained = 0.5 * (r - r_new) @ (r + r_new)
         # Pinning can spoil a long step; a short one always promises something.
         ratio = gained / promised if np.isfinite(gained) and promised > 0 else -1.0
         fresh = ratio > 1e-4
         if fresh:
-            x, r = new, r_new
+            x, r, j = new, r_new, j_new
             damping *= max(1 / 3, 1 - (2 * min(ratio, 1.0) - 1) ** 3)
             growth = 2.0
         elif promised <= 1e-16 * (r @ r):

@@ -13,7 +13,9 @@ from typing import NamedTuple
 import numpy as np
 from scipy.optimize import nnls
 
-__all__ = ["KKT", "Limits", "Multipliers", "multipliers", "residual"]
+__all__ = ["KKT", "TOLERANCE", "Limits", "Multipliers", "multipliers", "residual"]
+
+TOLERANCE = 1e-6  # within which a limit counts as reached and a point as an optimum
 
 
 class Limits(NamedTuple):
@@ -77,7 +79,7 @@ def multipliers(
     bounds: Limits,
     limits: Limits,
     scale: np.ndarray,
-    tolerance: float = 1e-6,
+    tolerance: float = TOLERANCE,
 ) -> Multipliers:
     """Find the multipliers of the right signs that come nearest to stationarity.
 

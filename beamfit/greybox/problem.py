@@ -8,9 +8,9 @@ stand on these.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, lru_cache, partial
 from typing import Any
 
 import jax
@@ -34,6 +34,12 @@ class Core:
     priors: tuple[Prior, ...]
     constraints: tuple[Constraint, ...]
     objectives: tuple[Objective, ...]
+
+
+@lru_cache(maxsize=256)
+def _compiled(function: Callable, structure: jax.tree_util.PyTreeDef) -> Callable:
+    """A function of (core, theta, ...), compiled to take the leaves of the core instead."""
+    return jax.jit(lambda leaves, *rest: function(structure.unflatten(leaves), *rest))
 
 
 def _model_at(core: Core, theta: jax.Array) -> Any:
@@ -183,6 +189,20 @@ class Problem:
     def errors_known(self) -> bool:
         """Whether any record brings measurement errors."""
         return any(record.error is not None for record in self.records)
+
+    def compiled(self, function: Callable) -> Callable:
+        """A function of (core, theta, ...) as a compiled function of (theta, ...) at this core.
+
+        Compiled once for each structure of problem. A search calls it a thousand times, and walking
+        the tree of the core for every call takes longer than the numbers of a small network.
+        """
+        leaves, structure = self._flat
+        return partial(_compiled(function, structure), leaves)
+
+    @cached_property
+    def _flat(self) -> tuple[list[jax.Array], jax.tree_util.PyTreeDef]:
+        leaves, structure = jax.tree_util.tree_flatten(self.core)
+        return [jnp.asarray(leaf, float) for leaf in leaves], structure
 
     def model_at(self, theta) -> Any:
         """The model with the free numbers set to theta."""

@@ -13,12 +13,11 @@ from beamfit.errors import InputError
 from beamfit.greybox import assess, problem
 from beamfit.greybox.fit import Attempt, Fit, Status
 from beamfit.greybox.gauss_newton import descend
+from beamfit.greybox.kkt import TOLERANCE
 from beamfit.greybox.problem import Problem
 from beamfit.greybox.programs import SOLVERS, Program
 
 __all__ = ["search", "solve", "starting_points"]
-
-_OPTIMUM = 1e-6
 
 
 def solve(
@@ -140,8 +139,8 @@ def starting_points(p: Problem, number: int, seed: int) -> list[np.ndarray]:
 
 def _rank(s: assess.State) -> tuple:
     """Order of preference: optima by cost, then feasible points, then the least infeasible."""
-    good = s.kkt.worst <= _OPTIMUM
-    feasible = s.kkt.feasibility <= _OPTIMUM
+    good = s.kkt.worst <= TOLERANCE
+    feasible = s.kkt.feasibility <= TOLERANCE
     return (not good, not feasible, s.at.cost if feasible else s.kkt.feasibility)
 
 
@@ -171,9 +170,14 @@ def search(
         theta[moving] = x
         return theta
 
+    both = p.compiled(_linearised)
+
+    def linearise(x):
+        r, j = both(full(x))
+        return np.asarray(r), np.asarray(j)[:, moving]
+
     end = descend(
-        lambda x: np.asarray(problem.residual(p.core, full(x))),
-        lambda x: np.asarray(assess.first_order(p.core, full(x))[1])[:, moving],
+        linearise,
         start[moving],
         p.lower[moving],
         p.upper[moving],
@@ -184,17 +188,18 @@ def search(
     return s, Attempt("Gauss-Newton", s.theta, float(s.at.cost), s.kkt, end.iterations, said)
 
 
-@jax.jit
+def _linearised(core, theta):
+    return problem.residual(core, theta), jax.jacfwd(problem.residual, 1)(core, theta)
+
+
 def _values(core, theta):
     return problem.cost(core, theta), problem.constraints(core, theta)
 
 
-@jax.jit
 def _first(core, theta):
     return jax.grad(problem.cost, 1)(core, theta), assess.constraint_slopes(core, theta)
 
 
-@jax.jit
 def _exact(core, theta, sigma, y):
     """Hessian of the Lagrangian sigma * cost - y @ constraints."""
 
@@ -204,7 +209,6 @@ def _exact(core, theta, sigma, y):
     return jax.hessian(lagrangian)(theta)
 
 
-@jax.jit
 def _squares(core, theta, sigma, y):
     """Gauss-Newton's part of it."""
     j = jax.jacfwd(problem.residual, 1)(core, theta)
@@ -213,7 +217,7 @@ def _squares(core, theta, sigma, y):
 
 def _program(p: Problem, start: np.ndarray, moving: np.ndarray, iterations: int, hessian: str):
     """Search with the solvers for constraints, until one ends on an optimum."""
-    first = np.asarray(_first(p.core, start)[0])
+    first = np.asarray(p.compiled(_first)(start)[0])
     # Numbers far from 1 are measured in their own size; a steep cost is flattened, as IPOPT does.
     span = p.upper - p.lower
     size = np.maximum(np.abs(start), np.where(np.isfinite(span), 0.1 * span, 0.0))
@@ -225,7 +229,7 @@ def _program(p: Problem, start: np.ndarray, moving: np.ndarray, iterations: int,
     for stage in (stage for stage in SOLVERS if stage.hessian in usable):
         second = _squares if stage.hessian == "gauss_newton" else _exact
         program = _scaled(p, start, moving, unit, flat, second)
-        near = best is not None and best.kkt.feasibility <= _OPTIMUM
+        near = best is not None and best.kkt.feasibility <= TOLERANCE
         begin = best.theta if near else start
         end = stage.solve(program, (begin / unit)[moving], min(stage.steps, iterations))
         theta = start.copy()
@@ -234,7 +238,7 @@ def _program(p: Problem, start: np.ndarray, moving: np.ndarray, iterations: int,
         tried, steps, said = [*tried, stage.name], steps + end.iterations, end.said
         if best is None or _rank(s) < _rank(best):
             best = s
-        if best.kkt.worst <= _OPTIMUM:
+        if best.kkt.worst <= TOLERANCE:
             break
     return best, Attempt(", ".join(tried), best.theta, float(best.at.cost), best.kkt, steps, said)
 
@@ -243,6 +247,7 @@ def _scaled(p: Problem, start, moving, unit, flat, second) -> Program:
     """The problem for a solver: moving numbers in their units, cost flattened, last point kept."""
     scale = unit[moving]
     kept: dict = {}
+    at = {function: p.compiled(function) for function in (_values, _first, second)}
 
     def remember(function, x):
         key = (function, x.tobytes())
@@ -251,7 +256,7 @@ def _scaled(p: Problem, start, moving, unit, flat, second) -> Program:
                 kept.clear()
             theta = start.copy()
             theta[moving] = x * scale
-            kept[key] = [np.asarray(part) for part in function(p.core, theta)]
+            kept[key] = [np.asarray(part) for part in at[function](theta)]
         return kept[key]
 
     def values(x):
@@ -265,7 +270,7 @@ def _scaled(p: Problem, start, moving, unit, flat, second) -> Program:
     def hessian(x, sigma, y):
         theta = start.copy()
         theta[moving] = x * scale
-        h = np.asarray(second(p.core, theta, sigma * flat, y))
+        h = np.asarray(at[second](theta, sigma * flat, y))
         return h[np.ix_(moving, moving)] * np.outer(scale, scale)
 
     return Program(

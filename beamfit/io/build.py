@@ -26,7 +26,6 @@ from beamfit.optics.elements import (
     SectorDipole,
     ThinLens,
 )
-from beamfit.optics.particle import ELECTRON_MASS, PROTON_MASS
 
 __all__ = ["beamline_of"]
 
@@ -41,7 +40,7 @@ def beamline_of(file: LatticeFile) -> Beamline:
     >>> beamline_of(lattice).length
     2.0
     """
-    mass = PROTON_MASS if file.particle == "proton" else ELECTRON_MASS
+    mass = file.rest_energy
     design = None
     if file.design is not None:
         twiss = {p: (t["beta_m"], t["alpha"]) for p, t in file.design.items() if p != "at"}

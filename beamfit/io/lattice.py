@@ -13,6 +13,7 @@ from typing import Any
 from beamfit.errors import InputError, nearest
 from beamfit.io.files import digest, read_text
 from beamfit.io.lattice_keys import ELEMENTS, FORMAT, NUMBER, STRENGTHS, TEXT, TOP, amiss
+from beamfit.particles import REST_ENERGY
 
 __all__ = ["LatticeFile", "read_toml_lattice"]
 
@@ -43,7 +44,7 @@ class LatticeFile:
     @property
     def rest_energy(self) -> float:
         """Rest energy of the particle, MeV."""
-        return 938.27208943 if self.particle == "proton" else 0.51099895069
+        return REST_ENERGY[self.particle]
 
     @property
     def places(self) -> list[str]:
@@ -131,13 +132,13 @@ class _Reader:
             raise self.error(f"format {found!r}", f'format = "{FORMAT}"', "format")
         self.check_keys(document, *TOP, element=None)
         energy, particle = document["energy_MeV"], document.get("particle", "electron")
-        if particle not in ("electron", "positron", "proton"):
+        if particle not in REST_ENERGY:
             raise self.error(f"particle '{particle}'", "electron, positron or proton", "particle")
-        rest = 938.272 if particle == "proton" else 0.511
+        rest = REST_ENERGY[particle]
         if not rest < energy <= 1e7:
             raise self.error(
                 f"{energy:g} MeV",
-                f"a total energy between {rest:g} MeV and 10 TeV; is it in GeV or eV?",
+                f"a total energy between {rest:.6g} MeV and 10 TeV; is it in GeV or eV?",
                 "energy_MeV",
             )
         if not document["element"]:

@@ -18,6 +18,7 @@ from beamfit.io.files import digest, read_text
 from beamfit.io.lattice import LatticeFile
 from beamfit.io.sequence_elements import element_tables
 from beamfit.io.sequence_source import Source
+from beamfit.particles import REST_ENERGY
 
 __all__ = ["read_sequence"]
 
@@ -282,18 +283,18 @@ def _beam(parser: Any, source: Source, name: str, energy: float | None) -> tuple
                 raise source.error(
                     f"a BEAM that cannot be read ({cause})", "energy = ..."
                 ) from None
-    if particle not in ("electron", "positron", "proton"):
+    if particle not in REST_ENERGY:
         raise source.error(f"particle '{particle}'", "electron, positron or proton")
     if total is None:
         where = (
             "--energy in MeV" if source.dialect == ELEGANT else "BEAM, ENERGY = or --energy in MeV"
         )
         raise source.error("no beam energy in the file", f"{where} (energy= from Python)")
-    rest = 938.272 if particle == "proton" else 0.511
+    rest = REST_ENERGY[particle]
     if not rest < total <= 1e7:
         raise source.error(
             f"an energy of {total:g} MeV",
-            f"a total energy between {rest:g} MeV and 10 TeV; BEAM is in GeV, --energy in MeV",
+            f"a total energy between {rest:.6g} MeV and 10 TeV; BEAM is in GeV, --energy in MeV",
         )
     return particle, float(total)
 

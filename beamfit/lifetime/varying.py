@@ -98,12 +98,12 @@ def _minimise(
     time: np.ndarray, measured: np.ndarray, weight: np.ndarray, shape: Shape, free: int
 ) -> _Minimum:
     """Fit the first `free` parameters, starting from a constant a."""
-    span, reference = float(time[-1]), float(measured.mean())
+    span, reference = float(time[-1]), float(measured[weight > 0].mean())
     values = solve_decay(time, measured, weight).values
     quadratic = float(values.a) * reference * span
     start = np.array([values.i0 / reference, values.rate_mean * span, quadratic, 0.0])
     # Weights of order one keep the optimiser's tolerances meaningful.
-    size = np.sqrt(np.mean(weight**2))
+    size = np.sqrt(np.mean(weight[weight > 0] ** 2))
     data = (time / span, measured / reference, weight / size, reference)
 
     def full(parameters: np.ndarray) -> np.ndarray:
@@ -120,7 +120,7 @@ def _minimise(
         gtol=1e-15,
     )
     inverse = np.linalg.pinv(np.linalg.qr(found.jac * size * reference, mode="r"))
-    residuals = found.fun * size / weight * reference
+    residuals = found.fun * size / np.where(weight > 0, weight, np.inf) * reference
     success = bool(found.success and np.isfinite(found.x).all())
     return _Minimum(full(found.x), inverse @ inverse.T, residuals, success)
 
@@ -154,7 +154,7 @@ def solve_shaped(
     Parameters
     ----------
     time, measured, weight : array, shape (n,)
-        Times from 0 s, currents mA, 1/error 1/mA.
+        Times from 0 s, currents mA, 1/error 1/mA; zero for padding.
     shape : callable
         Dependence of a on the current in mA, up to a factor; written with JAX.
 
@@ -177,7 +177,7 @@ def solve_shaped(
     1.0000e-06
     """
     found = _minimise(time, measured, weight, shape, free=3)
-    point = (jnp.asarray(found.theta), time, float(measured.mean()))
+    point = (jnp.asarray(found.theta), time, float(measured[weight > 0].mean()))
     slopes = np.asarray(jax.jacfwd(_physical)(*point, shape=shape))[:, :3]
     spread = slopes @ found.covariance @ slopes.T
     errors = np.sqrt(np.diag(spread))
@@ -197,7 +197,7 @@ def solve_power(time: np.ndarray, measured: np.ndarray, weight: np.ndarray) -> P
     Parameters
     ----------
     time, measured, weight : array, shape (n,)
-        Times from 0 s, currents mA, 1/error 1/mA.
+        Times from 0 s, currents mA, 1/error 1/mA; zero for padding.
 
     Returns
     -------

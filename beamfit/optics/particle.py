@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from typing import Any
 
+from beamfit.particles import REST_ENERGY
+
 __all__ = ["ELECTRON_MASS", "PROTON_MASS", "beta_gamma", "rigidity"]
 
-# Rest energies in MeV, CODATA 2022 (NIST).
-ELECTRON_MASS = 0.51099895069
-PROTON_MASS = 938.27208943
+# MeV
+ELECTRON_MASS = REST_ENERGY["electron"]
+PROTON_MASS = REST_ENERGY["proton"]
 # Speed of light in the unit MeV/(T m) that turns p c into B rho: exact by definition.
 _LIGHT = 299.792458
 

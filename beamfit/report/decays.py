@@ -4,12 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
+from beamfit.inference.quantity import Status
 from beamfit.report.decay_figures import decay_pictures
 from beamfit.report.document import Page, Table, Verdict, by_name, provenance, written
 from beamfit.studies.decay_tables import (
+    FEW,
+    alike,
     budget_rows,
+    check_rows,
     decay_rows,
     event_rows,
+    overview,
     separability_rows,
     shift_rows,
 )
@@ -23,6 +28,10 @@ ERRORS = (
     "exceeds 1. “Not determined” means the record puts no error on the value; it is not to be "
     "quoted."
 )
+CHECKS = (
+    "Analyses that take the lifetime as constant, for comparison: their errors do not contain the "
+    "bias stated. “Constant a” asks whether a power of the current describes the loss better."
+)
 BUDGET = (
     "Computed for the ring file and the record's own settings, nothing fitted. The percentages are "
     "shares of the computed loss at the mean current."
@@ -31,19 +40,8 @@ SHIFT = (
     "Scales multiply the ring file's first principles. Brackets are 68 % credible intervals. The "
     "best point is sought within the range of settings seen."
 )
-# Decays beside one another in one table, and how many have every number shown.
-ABREAST, FEW = 2, 4
-SHORT = {
-    "Result": ("status", "current at the start", "lifetime at the mean current"),
-    "a and b": ("a", "b", "chi2/dof"),
-    "Losses from first principles": (
-        "RF voltage",
-        "scraper",
-        "bunches",
-        "lifetime at the mean, computed",
-        "lifetime at the mean, measured",
-    ),
-}
+# Decays beside one another in one table.
+ABREAST = 2
 
 
 def decay_page(
@@ -100,6 +98,7 @@ def _side_by_side(decays: Sequence[Decay]) -> list[Table]:
     parts = [
         ("Result", ERRORS, decay_rows),
         ("What the records determine", "", separability_rows),
+        ("Simpler analyses, and whether a is constant", CHECKS, check_rows),
         ("Losses from first principles", BUDGET, budget_rows),
     ]
     return [
@@ -114,20 +113,9 @@ def _side_by_side(decays: Sequence[Decay]) -> list[Table]:
 
 def _one_below_another(decays: Sequence[Decay]) -> list[Table]:
     """The main numbers of many decays, one row each."""
-    every = dict(decay_rows(decays)) | dict(budget_rows(decays))
-    names = [decay.fit.record for decay in decays]
-    shown = {
-        title: [label for label in labels if label in every] for title, labels in SHORT.items()
-    }
     return [
-        Table(
-            title,
-            ["decay", *(label.removeprefix("lifetime at the mean, ") for label in labels)],
-            [list(row) for row in zip(names, *(every[label] for label in labels), strict=True)],
-            {"Result": ERRORS}.get(title, ""),
-        )
-        for title, labels in shown.items()
-        if labels
+        Table(title, header, rows, {"Result": ERRORS}.get(title, ""))
+        for title, header, rows in overview(decays)
     ]
 
 
@@ -135,25 +123,17 @@ def _verdicts(decays: Sequence[Decay]) -> list[Verdict]:
     """One for each decay; of many decays one for each thing said."""
     if len(decays) <= FEW:
         return [_verdict(decay) for decay in decays]
-    alike: dict[tuple[str, str], list[str]] = {}
-    for decay in decays:
-        said = (decay.fit.status.value, decay.fit.message)
-        alike.setdefault(said, []).append(decay.fit.record)
-    return [
-        Verdict(
-            status,
-            names[0] if len(names) == 1 else f"{len(names)} decays, {names[0]} to {names[-1]}",
-            message,
-        )
-        for (status, message), names in alike.items()
-    ]
+    return [Verdict(status.value, who, message) for status, who, message in alike(decays)]
 
 
 def _verdict(decay: Decay) -> Verdict:
     fit = decay.fit
     value = f"lifetime {fit.lifetime_mean} at {fit.mean_current:.4g} mA"
     headline = value if fit.lifetime_mean.error is not None else "lifetime not determined"
-    return Verdict(fit.status.value, f"{fit.record}: {headline}", fit.message)
+    message = fit.message
+    if decay.checks is not None and decay.checks.constant_a.status is Status.poor_fit:
+        message = f"{message} {decay.checks.constant_a.message}"
+    return Verdict(fit.status.value, f"{fit.record}: {headline}", message)
 
 
 def _shift_verdicts(shift: Shift | None) -> list[Verdict]:

@@ -16,7 +16,7 @@ from beamfit.studies.decay_record import DecayRecord
 from beamfit.studies.decay_result import DecayFit
 from beamfit.studies.decay_verdict import judge, judge_constant
 
-__all__ = ["fit_decay", "fit_decays", "padded_size"]
+__all__ = ["fit_decay", "fit_decays", "padded", "padded_size"]
 
 FEWEST = 5
 # Records solved in one call; fewer are filled up, so that one number is compiled.
@@ -63,12 +63,10 @@ def fit_decay(record: DecayRecord, shape: Callable[[Any], Any] | None = None) ->
     """
     if _says_nothing(record):
         return judge_constant(record)
-    weight = _weight(record)
     if shape is not None:
-        solution = solve_shaped(record.time, record.current, weight, shape)
-    else:
-        solution = solve_decay(*_padded(record, weight))
-    return replace(judge(record, solution), shaped=shape is not None)
+        shaped = judge(record, solve_shaped(*padded(record), shape))
+        return replace(shaped, shaped=True)
+    return judge(record, solve_decay(*padded(record)))
 
 
 def fit_decays(records: Sequence[DecayRecord]) -> tuple[DecayFit, ...]:
@@ -107,9 +105,9 @@ def fit_decays(records: Sequence[DecayRecord]) -> tuple[DecayFit, ...]:
     for members in groups.values():
         for first in range(0, len(members), TOGETHER):
             chosen = members[first : first + TOGETHER]
-            padded = [_padded(records[k], _weight(records[k])) for k in chosen]
-            padded += padded[:1] * (TOGETHER - len(chosen))
-            stacked = [np.stack(arrays) for arrays in zip(*padded, strict=True)]
+            rows = [padded(records[k]) for k in chosen]
+            rows += rows[:1] * (TOGETHER - len(chosen))
+            stacked = [np.stack(arrays) for arrays in zip(*rows, strict=True)]
             solutions = solve_decays(*stacked)
             for row, k in enumerate(chosen):
                 one = jax.tree.map(lambda leaf, r=row: leaf[r], solutions)
@@ -125,10 +123,6 @@ def _says_nothing(record: DecayRecord) -> bool:
     return bool(np.ptp(record.current) == 0)
 
 
-def _weight(record: DecayRecord) -> np.ndarray:
-    return np.ones(len(record)) if record.error is None else 1 / record.error
-
-
 def padded_size(rows: int) -> int:
     """64, 256, 1024, ...: every length is compiled once, for a second or two, so keep few."""
     size = 64
@@ -137,7 +131,9 @@ def padded_size(rows: int) -> int:
     return size
 
 
-def _padded(record: DecayRecord, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def padded(record: DecayRecord) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Time, current and weight 1/error of a record, lengthened by readings of no weight."""
+    weight = np.ones(len(record)) if record.error is None else 1 / record.error
     extra = (0, padded_size(len(record)) - len(record))
     time = np.pad(record.time, extra, mode="edge")
     return time, np.pad(record.current, extra, mode="edge"), np.pad(weight, extra)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy.special import fdtrc
@@ -12,14 +13,16 @@ from beamfit.errors import InputError
 from beamfit.inference.quantity import Quantity, Status
 from beamfit.lifetime.solve import solve_decay
 from beamfit.lifetime.varying import solve_power
-from beamfit.studies.decay import fit_decay
+from beamfit.studies.decay import fit_decay, padded
 from beamfit.studies.decay_record import DecayRecord
 from beamfit.studies.decay_result import DecayFit
 
 __all__ = [
     "ConstantA",
+    "DecayChecks",
     "LifetimeTrace",
     "OneLifetime",
+    "check_decay",
     "constant_a_test",
     "log_linear",
     "moving_lifetime",
@@ -50,6 +53,16 @@ class OneLifetime:
     rms_residual: float
     bias_start: float
     bias_mean: float
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the fields as JSON's types; a bias that is not known is null."""
+        known = [b if math.isfinite(b) else None for b in (self.bias_start, self.bias_mean)]
+        return {
+            "lifetime": self.lifetime.to_json(),
+            "rms_residual": {"value": self.rms_residual, "error": None, "unit": "mA"},
+            "bias_start": known[0],
+            "bias_mean": known[1],
+        }
 
     def __str__(self) -> str:
         return (
@@ -86,12 +99,11 @@ def single_exponential(record: DecayRecord) -> OneLifetime:
     >>> print(single_exponential(DecayRecord(t, 500 / (1 + t / 36000))).lifetime.value > 10)
     True
     """
-    weight = np.ones(len(record)) if record.error is None else 1 / record.error
-    found = solve_decay(record.time, record.current, weight, np.array([1.0, 1.0, 0.0]))
+    found = solve_decay(*padded(record), np.array([1.0, 1.0, 0.0]))
     scale = math.sqrt(float(found.sum_squares) / (len(record) - 2))
     scale = scale if record.error is None else max(1.0, scale)
     rate, error = float(found.values.b), float(found.errors.b) * scale
-    return _one_lifetime(rate, error, found.residuals, fit_decay(record))
+    return _one_lifetime(rate, error, found.residuals[: len(record)], fit_decay(record))
 
 
 def log_linear(record: DecayRecord) -> OneLifetime:
@@ -221,6 +233,15 @@ class ConstantA:
     exponent: Quantity
     p_value: float
 
+    def to_json(self) -> dict[str, Any]:
+        """Return the fields as JSON's types."""
+        return {
+            "status": self.status.value,
+            "message": self.message,
+            "exponent": self.exponent.to_json(),
+            "p_value": self.p_value,
+        }
+
     def __str__(self) -> str:
         return f"{self.status}. {self.message}"
 
@@ -254,10 +275,9 @@ def constant_a_test(record: DecayRecord) -> ConstantA:
     >>> print(constant_a_test(record).status)
     converged
     """
-    weight = np.ones(len(record)) if record.error is None else 1 / record.error
-    constant = solve_decay(record.time, record.current, weight)
-    power = solve_power(record.time, record.current, weight)
-    residuals = weight * power.residuals
+    readings = padded(record)
+    constant, power = solve_decay(*readings), solve_power(*readings)
+    residuals = (readings[2] * power.residuals)[: len(record)]
     neighbours = max(0.0, float(residuals[1:] @ residuals[:-1]) / power.sum_squares)
     independent = (1 - neighbours) / (1 + neighbours)
     dof = max((len(record) - 4) * independent, 1.0)
@@ -281,3 +301,60 @@ def constant_a_test(record: DecayRecord) -> ConstantA:
         return ConstantA(Status.poor_fit, message, exponent, chance)
     message = f"A constant a describes the record (p = {chance:.2g}, exponent {exponent})."
     return ConstantA(Status.converged, message, exponent, chance)
+
+
+@dataclass(frozen=True)
+class DecayChecks:
+    """What stands beside an (a, b) fit.
+
+    Parameters
+    ----------
+    single_exponential : OneLifetime
+        From `single_exponential`.
+    log_linear : OneLifetime or None
+        From `log_linear`; None where a current is zero.
+    constant_a : ConstantA
+        From `constant_a_test`.
+    """
+
+    single_exponential: OneLifetime
+    log_linear: OneLifetime | None
+    constant_a: ConstantA
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the fields as JSON's types."""
+        line = self.log_linear
+        return {
+            "single_exponential": self.single_exponential.to_json(),
+            "log_linear": None if line is None else line.to_json(),
+            "constant_a": self.constant_a.to_json(),
+        }
+
+
+def check_decay(record: DecayRecord) -> DecayChecks | None:
+    """Do every check of a decay.
+
+    Parameters
+    ----------
+    record : DecayRecord
+        One decay.
+
+    Returns
+    -------
+    DecayChecks or None
+        None for a record that does not decay, of which nothing can be said.
+
+    Examples
+    --------
+    >>> t = np.linspace(0, 8 * 3600, 500)
+    >>> checks = check_decay(DecayRecord(t, 500 / (1 + t / 36000)))
+    >>> f"{checks.log_linear.bias_start:.2f}", checks.constant_a.status.value
+    ('0.38', 'converged')
+    """
+    if np.ptp(record.current) == 0:
+        return None
+    return DecayChecks(
+        single_exponential(record),
+        log_linear(record) if record.current.min() > 0 else None,
+        constant_a_test(record),
+    )

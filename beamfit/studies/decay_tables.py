@@ -2,17 +2,41 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 
-from beamfit.inference.quantity import Quantity
+from beamfit.inference.quantity import Quantity, Status
 from beamfit.lifetime.scaled import MECHANISMS
 from beamfit.studies.decays import Decay, RecordStudy
 from beamfit.studies.shift import Shift
 
-__all__ = ["budget_rows", "decay_rows", "event_rows", "separability_rows", "shift_rows"]
+__all__ = [
+    "FEW",
+    "alike",
+    "budget_rows",
+    "check_rows",
+    "decay_rows",
+    "event_rows",
+    "overview",
+    "separability_rows",
+    "shift_rows",
+]
 
 Rows = list[tuple[str, list[str]]]
 MOST_EVENTS = 100
+# How many decays have every number shown; of more only the main ones, a row each.
+FEW = 4
+SHORT = {
+    "Result": ("status", "current at the start", "lifetime at the mean current"),
+    "a and b": ("a", "b", "chi2/dof"),
+    "Losses from first principles": (
+        "RF voltage",
+        "scraper",
+        "bunches",
+        "lifetime at the mean, computed",
+        "lifetime at the mean, measured",
+    ),
+}
 # Percent of the loss below which a mechanism's digits say nothing.
 NEGLIGIBLE = 1e-6
 
@@ -83,6 +107,47 @@ def separability_rows(decays: Sequence[Decay]) -> Rows:
     )
 
 
+def check_rows(decays: Sequence[Decay]) -> Rows:
+    """Label and one cell per decay for what simpler analyses say, and whether a is constant.
+
+    Parameters
+    ----------
+    decays : sequence of Decay
+        Decays of one record.
+
+    Returns
+    -------
+    list of (str, list of str)
+        Lifetimes with their bias from the (a, b) fit.
+    """
+    return _laid_out(
+        decays,
+        [
+            ("single exponential", lambda d: _one_lifetime(d, "single_exponential")),
+            ("line through ln I", lambda d: _one_lifetime(d, "log_linear")),
+            ("constant a", _constant_a),
+        ],
+    )
+
+
+def _one_lifetime(decay: Decay, name: str) -> str:
+    found = None if decay.checks is None else getattr(decay.checks, name)
+    if found is None:
+        return "-"
+    known = math.isfinite(found.bias_start)
+    bias = f"{100 * found.bias_start:+.2g} % at start, " if known else ""
+    return f"{found.lifetime} ({bias}{found.rms_residual:.3g} mA rms)"
+
+
+def _constant_a(decay: Decay) -> str:
+    if decay.checks is None:
+        return "-"
+    found = decay.checks.constant_a
+    said = {Status.converged: "not contradicted", Status.poor_fit: "rejected"}
+    chance = f" (p = {found.p_value:.2g})"
+    return said[found.status] + chance if found.status in said else "the record cannot tell"
+
+
 def _verdict(decay: Decay):
     return decay.fit.identifiability
 
@@ -151,6 +216,53 @@ def _with_share(decay: Decay, name: str) -> str:
 def _pressure(decay: Decay) -> float:
     operation = decay.budget.operation
     return float(operation.pressure_base + operation.pressure_slope * decay.budget.current)
+
+
+def overview(decays: Sequence[Decay]) -> list[tuple[str, list[str], list[list[str]]]]:
+    """The main numbers of many decays, one row each.
+
+    Parameters
+    ----------
+    decays : sequence of Decay
+        More than `FEW`.
+
+    Returns
+    -------
+    list of (str, list of str, list of list of str)
+        Title, header and rows of each table.
+    """
+    every = dict(decay_rows(decays)) | dict(budget_rows(decays))
+    every["chi2/dof"] = [
+        "not testable" if d.fit.noise_inferred else f"{d.fit.chi2 / d.fit.dof:.3g}" for d in decays
+    ]
+    names = [decay.fit.record for decay in decays]
+    tables = []
+    for title, wanted in SHORT.items():
+        labels = [label for label in wanted if label in every]
+        if labels:
+            header = ["decay", *(label.removeprefix("lifetime at the mean, ") for label in labels)]
+            columns = [every[label] for label in labels]
+            tables.append((title, header, [list(r) for r in zip(names, *columns, strict=True)]))
+    return tables
+
+
+def alike(decays: Sequence[Decay]) -> list[tuple[Status, str, str]]:
+    """Status, decays and message for each different verdict on many decays."""
+    found: dict[tuple[Status, str], list[str]] = {}
+    for decay in decays:
+        verdicts = [(decay.fit.status, decay.fit.message)]
+        if decay.checks is not None and decay.checks.constant_a.status is Status.poor_fit:
+            verdicts.append((Status.poor_fit, decay.checks.constant_a.message))
+        for said in verdicts:
+            found.setdefault(said, []).append(decay.fit.record)
+    return [
+        (status, names[0] if len(names) == 1 else _several(names), message)
+        for (status, message), names in found.items()
+    ]
+
+
+def _several(names: Sequence[str]) -> str:
+    return f"{len(names)} decays, {names[0]} to {names[-1]}"
 
 
 def event_rows(study: RecordStudy) -> list[list[str]]:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 
 from beamfit.errors import InputError
 from beamfit.studies.decay import FEWEST, fit_decay
+from beamfit.studies.decay_checks import DecayChecks, check_decay
 from beamfit.studies.decay_record import DecayRecord
 from beamfit.studies.decay_result import DecayFit
 from beamfit.studies.loss_budget import Budget, Machine, budget
@@ -44,10 +46,16 @@ class Decay:
     fit: DecayFit
     budget: Budget | None
 
+    @cached_property
+    def checks(self) -> DecayChecks | None:
+        """What simpler analyses say of it, and whether a is constant; None if nothing decays."""
+        return check_decay(self.segment)
+
     def to_json(self) -> dict[str, Any]:
         """Give one entry of the ``results`` list of the JSON contract."""
         start = {"value": self.offset, "error": None, "unit": "s"}
-        shown = self.fit.to_json() | {"start": start}
+        checks = {} if self.checks is None else self.checks.to_json()
+        shown = self.fit.to_json() | {"start": start} | checks
         return shown if self.budget is None else shown | {"budget": self.budget.to_json()}
 
 

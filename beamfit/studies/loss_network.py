@@ -6,6 +6,7 @@ with bunches and scraper opening and rise with pressure, at every point and not 
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -29,7 +30,7 @@ from beamfit.studies.decays import Decay
 from beamfit.studies.lifetime import ScaleFit, stacked_terms
 from beamfit.studies.loss_budget import Machine, operation_during
 
-__all__ = ["Certificate", "NetworkFit", "fit_loss_network"]
+__all__ = ["Box", "Certificate", "NetworkFit", "fit_loss_network"]
 
 INPUTS = ("rf_voltage", "scraper_y", "pressure", "bunches")
 # How the loss moves with each input; nothing is known of the sign for the RF voltage.
@@ -39,6 +40,43 @@ OUTPUTS = ("log_a", "log_b")
 ALONE, CORRECTION = 3.0, 0.3
 MOST = 30.0
 ROUNDING = 1e-9
+# Voltages at which a correction is looked at.
+VOLTAGES = 65
+
+
+class Box(NamedTuple):
+    """A range of operation, the ends in SI: what a network is asked to hold over.
+
+    Parameters
+    ----------
+    rf_voltage, scraper_y, pressure, bunches : (float, float)
+        V, m, Pa at the mean current, and number.
+
+    Raises
+    ------
+    InputError
+        From `corners`, if a range is empty or not positive and finite.
+
+    Examples
+    --------
+    >>> box = Box((1.6e6, 3.2e6), (3e-3, 6e-3), (1e-8, 1e-7), (100, 300))
+    >>> box.corners()[0].round(2).tolist()
+    [1.6, 1.1, 2.3, 4.61]
+    """
+
+    rf_voltage: tuple[float, float]
+    scraper_y: tuple[float, float]
+    pressure: tuple[float, float]
+    bunches: tuple[float, float]
+
+    def corners(self) -> tuple[np.ndarray, np.ndarray]:
+        """Both corners in the network's inputs."""
+        for name, (low, high) in zip(self._fields, self, strict=True):
+            if not 0 < low <= high < np.inf:
+                expected = "0 < lower <= upper, finite"
+                raise InputError(f"range {low:g} to {high:g}", expected, column=name)
+        low, high = np.array(self, float).T
+        return _scaled(*low), _scaled(*high)
 
 
 class Certificate(NamedTuple):
@@ -51,15 +89,16 @@ class Certificate(NamedTuple):
     gains : array, shape (2, 4, 2)
         Enclosures of the slopes of the network's ln a and ln b by the four inputs over the box,
         rounded outward; of a correction, those of its factor.
-    convex : bool
-        Whether the lifetime has a single maximum in the RF voltage, by construction: of a network
-        alone it has, of a correction it is not known.
+    single_maximum : str
+        Whether the lifetime has a single maximum in the RF voltage: "certified" by convex nodes of
+        a network alone; of a correction "seen" or "broken" at points of the box, since first
+        principles have no enclosure; "not asked".
     """
 
     lower: np.ndarray
     upper: np.ndarray
     gains: np.ndarray
-    convex: bool
+    single_maximum: str
 
     @property
     def holds(self) -> bool:
@@ -132,8 +171,12 @@ class _Data(NamedTuple):
 def _inputs(operation: Operation, current: float) -> np.ndarray:
     """Inputs in units near one; logarithms where the losses go as powers."""
     pressure = operation.pressure_base + operation.pressure_slope * current
-    values = [1e3 * operation.scraper_y, 1e9 * pressure, operation.bunches]
-    return np.array([1e-6 * float(operation.rf_voltage), *np.log(np.array(values, float))])
+    return _scaled(operation.rf_voltage, operation.scraper_y, pressure, operation.bunches)
+
+
+def _scaled(rf_voltage, scraper_y, pressure, bunches) -> np.ndarray:
+    values = np.array([1e3 * scraper_y, 1e9 * pressure, bunches], float)
+    return np.array([1e-6 * float(rf_voltage), *np.log(values)])
 
 
 def _logs(model: Mapping[str, MLP], inputs: Array, base: Array) -> Array:
@@ -187,12 +230,13 @@ def _network(inputs: np.ndarray, means: np.ndarray, hidden: int, seed: int) -> M
     return MLP(layers, pairs, ports, outputs, weights, biases)
 
 
-def _free(net: MLP) -> list[Free]:
+def _free(net: MLP, single_maximum: bool) -> list[Free]:
     """Weights within the signs that make the network obey."""
+    positive = ("convex->out", "rising->out") if single_maximum else ("rising->out",)
     found = []
     for name, weights in net.weights.items():
         low, high = np.full(weights.shape, -MOST), np.full(weights.shape, MOST)
-        if name in ("convex->out", "rising->out"):
+        if name in positive:
             low[:] = 0.0
         if name == "rest->rising":
             for row, key in enumerate(INPUTS[1:]):
@@ -215,6 +259,8 @@ def fit_loss_network(
     *,
     hidden: int = 4,
     floor: float = 0.02,
+    box: Box | None = None,
+    single_maximum: bool = True,
     starts: int = 3,
     seed: int = 0,
 ) -> NetworkFit:
@@ -234,18 +280,23 @@ def fit_loss_network(
     floor : float, optional
         Relative error added to both loss rates of each decay, for pressure readings and what the
         network cannot follow.
+    box : Box, optional
+        The operating box of the certificate, outside which nothing is predicted; what the decays
+        span by default. Where it is wider than that, errors are those of an extrapolation.
+    single_maximum : bool, optional
+        Whether a network alone must give the lifetime a single maximum in the RF voltage.
     starts, seed : int, optional
         Of the search.
 
     Returns
     -------
     NetworkFit
-        With a certificate of its signs over the box that the decays span.
+        With a certificate of its signs over the box.
 
     Raises
     ------
     InputError
-        If there are fewer than four decays, or a scraper is infinitely far away.
+        If there are fewer than four decays, a scraper is infinitely far away, or the box is empty.
 
     Notes
     -----
@@ -271,15 +322,45 @@ def fit_loss_network(
     width = ALONE if corrected is None else CORRECTION
     problem = Problem(
         model={"map": net},
-        free=_free(net),
+        free=_free(net, single_maximum or corrected is not None),
         records=[Record("decays", _predict, data, seen, error=1.0)],
         priors=[Prior("map", 0.0, width)],
     )
     fit = solve(problem, starts=starts, seed=seed, iterations=300)
-    low, high = inputs.min(0), inputs.max(0)
+    low, high = (inputs.min(0), inputs.max(0)) if box is None else box.corners()
     enclosed = over_cells(fit.model["map"], low, high, 2)
     gains = np.stack([np.min(enclosed.lower, axis=0), np.max(enclosed.upper, axis=0)], axis=-1)
-    return NetworkFit(fit, Certificate(low, high, gains, corrected is None), machine, scales)
+    if corrected is None:
+        maximum = "certified" if single_maximum else "not asked"
+    else:
+        maximum = _maximum_seen(fit, scales, machine, low, high, float(np.max(terms.current)))
+    return NetworkFit(fit, Certificate(low, high, gains, maximum), machine, scales)
+
+
+def _maximum_seen(
+    fit: Fit, scales: np.ndarray, machine: Machine, low: np.ndarray, high: np.ndarray, current
+) -> str:
+    """Look along the voltage at every corner of the other settings."""
+    corners = itertools.product(*zip(low[1:], high[1:], strict=True))
+    voltages = np.linspace(low[0], high[0], VOLTAGES)
+    for scraper, pressure, bunches in corners:
+        operation = machine.operation._replace(
+            scraper_y=1e-3 * np.exp(scraper),
+            pressure_base=1e-9 * np.exp(pressure),
+            pressure_slope=0.0,
+            bunches=np.exp(bunches),
+        )
+        terms = jax.lax.map(
+            lambda v, o=operation: loss_terms(machine.ring, o._replace(rf_voltage=v), current),
+            jnp.asarray(1e6 * voltages),
+        )
+        rest = np.tile([scraper, pressure, bunches], (VOLTAGES, 1))
+        inputs = jnp.asarray(np.column_stack([voltages, rest]))
+        a, b = np.exp(np.asarray(_logs(fit.model, inputs, _base(scales, terms)))).T
+        turns = np.diff(np.sign(np.diff(a * current + b)))
+        if np.count_nonzero(turns) > 1 or turns.min(initial=0) < 0:
+            return "broken"
+    return "seen"
 
 
 def _typical(measured: Summaries) -> np.ndarray:

@@ -227,3 +227,68 @@ def test_a_study_needs_a_ring(run):
     status, out, err = run("lifetime", APS, "--study")
     assert (status, out) == (2, "")
     assert "--ring" in err
+
+
+def test_simpler_analyses_stand_beside_with_their_bias(run):
+    """The real record leaves a single exponential ten times the residual of (a, b)."""
+    _, out, _ = run("lifetime", APS, "--json")
+    [result] = json.loads(out)["results"]
+    for name in ("single_exponential", "log_linear"):
+        simple = result[name]
+        start = result["lifetime_start"]["value"]
+        assert simple["bias_start"] == pytest.approx(simple["lifetime"]["value"] / start - 1)
+        assert simple["bias_start"] == pytest.approx(0.11, abs=0.01)
+        assert simple["rms_residual"]["value"] > 10 * result["rms_residual"]["value"]
+    assert result["constant_a"]["status"] == "unidentified"
+    assert result["constant_a"]["exponent"]["error"] is None
+    _, shown, _ = run("lifetime", APS)
+    assert "single exponential" in shown
+    assert "the record cannot tell" in shown
+
+
+def test_a_lengthening_bunch_is_not_taken_for_gas(run, tmp_path):
+    """SIMULATED: a falls as I^-0.2; a constant a invents a gas loss, and the command says so."""
+    time = np.arange(0.0, 12 * 3600, 60.0)
+    step, beam = 60.0, [500.0]
+    for _ in time[1:]:
+        rate = 4e-8 * (beam[-1] / 500) ** -0.2 * beam[-1]
+        middle = beam[-1] * np.exp(-rate * step / 2)
+        beam.append(beam[-1] * np.exp(-4e-8 * (middle / 500) ** -0.2 * middle * step))
+    noise = 1e-3 * np.random.default_rng(2).normal(size=time.size)
+    path = write_record(tmp_path / "long.csv", time, np.array(beam) + noise)
+    status, out, _ = run("lifetime", str(path), "--json")
+    assert status == 0
+    [result] = json.loads(out)["results"]
+    checked = result["constant_a"]
+    assert checked["status"] == "poor_fit"
+    assert checked["exponent"]["value"] == pytest.approx(-0.2, abs=4 * checked["exponent"]["error"])
+    _, shown, _ = run("lifetime", str(path))
+    assert "not a gas loss" in " ".join(shown.split())
+
+
+def test_a_constant_record_is_an_answer_not_an_error(run, tmp_path):
+    path = write_record(tmp_path / "flat.csv", np.arange(0.0, 600.0, 10.0), 100.0)
+    status, out, err = run("lifetime", str(path), "--json")
+    assert (status, err) == (0, "")
+    [result] = json.loads(out)["results"]
+    assert result["status"] == "unidentified"
+    assert result["a"]["error"] is result["b"]["error"] is None
+    assert result["lifetime_mean"]["error"] is None
+    assert "more digits" in result["message"]
+
+
+def test_many_decays_are_a_row_each_and_nothing_is_cut_short(run, tmp_path, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "80")
+    time = np.arange(0.0, 10000.0, 10.0)
+    noise = 1e-3 * np.random.default_rng(3).normal(size=time.size)
+    saw = 100 * np.exp(-(time % 2000) / 36000) + noise
+    path = write_record(tmp_path / "a_rather_long_name_of_a_topup_record.csv", time, saw)
+    _, shown, _ = run("lifetime", str(path), "--ring", RING)
+    assert "…" not in shown
+    for number in range(1, 6):
+        assert len([row for row in shown.splitlines() if row.startswith(f"#{number} ")]) == 3
+    two = write_record(tmp_path / "two.csv", time[:400], saw[:400])
+    _, shown, _ = run("lifetime", str(two), "--ring", RING)
+    assert "…" not in shown
+    assert shown.count("lifetime at the mean current ") == 2
+    assert shown.count("a, Touschek ") == 2

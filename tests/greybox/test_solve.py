@@ -9,10 +9,12 @@ from appendices import (
     A_T,
     B_T,
     CURRENTS,
+    LIMITS,
     SIGMA,
     appendix_a,
     appendix_b,
     appendix_c,
+    certified_constraints,
     point_constraints,
     simulated_scan,
     transport,
@@ -27,7 +29,7 @@ from beamfit.greybox.implicit import Implicit
 from beamfit.greybox.maps import Foreign
 from beamfit.greybox.mlp import dense
 from beamfit.greybox.problem import Constraint, Free, Objective, Prior, Problem, Record
-from beamfit.greybox.solve import solve, starting_points
+from beamfit.greybox.solve import search, solve, starting_points
 
 X = np.linspace(-1.0, 1.0, 21)
 
@@ -248,6 +250,18 @@ def test_several_starts_find_the_better_valley_and_repeat_exactly():
     assert not np.array_equal(starting_points(p, 3, 1)[1], starting_points(p, 3, 2)[1])
 
 
+def test_the_progress_bar_goes_to_standard_error_and_only_when_asked(capsys, monkeypatch):
+    monkeypatch.setenv("FORCE_COLOR", "1")  # a terminal, as far as rich can tell
+    record = Record("r", line, X, 2.0 * X, 0.1)
+    p = Problem({"slope": 0.0, "offset": 0.0}, [Free("")], [record])
+    solve(p, starts=3)
+    assert capsys.readouterr() == ("", "")
+    solve(p, starts=3, progress=True)
+    said = capsys.readouterr()
+    assert said.out == ""
+    assert "fitting" in said.err
+
+
 def test_foreign_code_fits_with_first_derivatives():
     square = Foreign(["x"], ["y"], lambda x: x**2, lambda x: np.diag(2 * x))
     record = Record("r", lambda m, _: square(m["x"][None]), None, [4.0], 0.1)
@@ -323,10 +337,27 @@ def test_a_certified_gain_holds_between_the_points():
     assert tame.cost > wild.cost
 
 
-def test_appendix_b_has_28_point_constraints():
+def test_appendix_b_reaches_an_optimum_from_random_starts():
+    """28 gains at points; a network of 22 weights. At least 19 of 20 starts end on an optimum."""
     p = appendix_b(simulated_scan(1), point_constraints())
     assert len(p.constraint_names) == 28
     assert len(p.names) == 25
+    fit = solve(p, starts=20, seed=7)
+    assert sum(attempt.kkt.worst <= 1e-6 for attempt in fit.attempts) >= 19
+    # Any invertible change of (A, B) is taken up by sigma: the beam is not determined.
+    assert fit.status == Status.unidentified
+    assert np.isnan(fit["s11"].error)
+
+
+def test_appendix_b_certified_on_cells_is_broken_nowhere():
+    """The whole of 20 starts is benchmarks/greybox.py; here one, sampled densely."""
+    p = appendix_b(simulated_scan(1), certified_constraints())
+    state, _ = search(p, starting_points(p, 4, 7)[3])
+    currents = jnp.linspace(0.0, 3.9, 20001)[:, None]
+    net = p.model_at(state.theta)["map"]
+    gains = jax.jit(lambda n: jax.vmap(jax.jacfwd(n.values))(currents))(net)[..., 0]
+    assert np.all(np.max(gains, axis=0) <= np.array(list(LIMITS.values())) + 1e-8)
+    assert 2 * state.at.cost < 5.0  # and the scan is still described
 
 
 BAD = {

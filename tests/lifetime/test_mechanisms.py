@@ -12,7 +12,7 @@ import pytest
 
 from beamfit.errors import InputError
 from beamfit.io.ring import read_operation, read_ring, ring_from_pyat
-from beamfit.lifetime.bunch import lengthening, quantum_rate
+from beamfit.lifetime.bunch import equal_bunches, lengthening, quantum_rate
 from beamfit.lifetime.gas import (
     bremsstrahlung_cross_section,
     elastic_cross_section,
@@ -301,3 +301,12 @@ def test_derivatives_by_every_setting(ring, operation):
     for name, value in settings.items():
         up, down = (rate(settings | {name: value * factor}) for factor in (1.0001, 0.9999))
         assert float(slopes[name]) == pytest.approx(float(up - down) / (2e-4 * value), rel=1e-5)
+
+
+def test_a_fill_pattern_loses_as_its_number_of_equal_bunches():
+    """Bunch by bunch, dI_k/dt = -k I_k², against the one equation for the ring."""
+    currents = np.array([2.0] * 240 + [20.0] + [0.0] * 131)
+    by_bunch = np.sum(1e-6 * currents**2)
+    total = currents.sum()
+    assert 1e-6 / equal_bunches(currents) * total**2 == pytest.approx(by_bunch, rel=1e-14)
+    assert equal_bunches(np.full(280, 0.3)) == pytest.approx(280)

@@ -12,7 +12,7 @@ from beamfit.lifetime.scaled import loss_terms, scaled_losses
 from beamfit.studies.decay_record import Conditions, DecayRecord
 from beamfit.studies.decays import study_record
 from beamfit.studies.lifetime import fit_scales
-from beamfit.studies.loss_network import SIGNS, fit_loss_network
+from beamfit.studies.loss_network import SIGNS, Box, fit_loss_network
 
 TRUE = np.array([1.12, 1.30, 0.85, 1.25])
 INPUTS = ("rf_voltage", "scraper_y", "pressure", "bunches")
@@ -47,6 +47,7 @@ def test_a_broken_sign_is_seen(alone):
 
 
 def test_the_lifetime_has_a_single_maximum_in_the_voltage(alone):
+    assert alone.certificate.single_maximum == "certified"
     net, certificate = alone.fit.model["map"], alone.certificate
     random = np.random.default_rng(4)
     voltages = np.linspace(certificate.lower[0], certificate.upper[0], 200)
@@ -115,6 +116,20 @@ def test_a_correction_finds_what_first_principles_miss(machine):
     assert before > 0.03
     assert after < 0.015
     assert network.certificate.holds
+    assert network.certificate.single_maximum == "seen"
+
+
+def test_a_box_of_ones_own_and_a_voltage_left_free(decays, machine):
+    """Over a wider box the signs hold all the same; inside it a prediction has an error."""
+    box = Box((1.2e6, 3.6e6), (2e-3, 1e-2), (1e-8, 1e-6), (50, 372))
+    network = fit_loss_network(decays, machine, box=box, single_maximum=False, starts=1)
+    assert network.certificate.single_maximum == "not asked"
+    assert network.certificate.holds
+    np.testing.assert_allclose(network.certificate.upper, [3.6, *np.log([10, 1000, 372])])
+    a, _ = network.losses(machine.operation._replace(rf_voltage=1.25e6), 480.0)
+    assert a.error > 0
+    with pytest.raises(InputError, match="pressure"):
+        Box((1.2e6, 3.6e6), (2e-3, 1e-2), (0.0, 1e-6), (50, 372)).corners()
 
 
 def test_too_few_decays(decays, machine):
