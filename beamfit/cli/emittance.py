@@ -7,12 +7,14 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from beamfit.cli.document import check_report_name, command_line, json_text
+from beamfit.cli.sampling import Sampling, print_posterior, sampling_options
 from beamfit.io.lattice import LatticeFile
 from beamfit.io.line import build_line, read_lattice
 from beamfit.io.measurement import read_quad_scan
 from beamfit.studies.scans import QuadScan, check_names
 
 if TYPE_CHECKING:
+    from beamfit.sampling.posterior import Posterior
     from beamfit.studies.fit import EmittanceFit
 
 __all__ = ["emittance"]
@@ -22,6 +24,7 @@ Examples:
   beamfit emittance measurements/lcls_otr2.csv --lattice lattices/lcls_otr2.toml
   beamfit emittance scan.csv --lattice line.toml --plane x --report scan.pdf
   beamfit emittance scan.csv --lattice line.madx --use LINE --json
+  beamfit emittance scan.csv --lattice line.toml --sample --store scan.h5 --report scan.html
 """
 
 
@@ -55,6 +58,7 @@ Examples:
     default=None,
     help="Write a report page.",
 )
+@sampling_options
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object and nothing else.")
 @click.option(
     "--use", metavar="NAME", default=None, help="Line or sequence of a MAD-X or elegant file."
@@ -76,6 +80,9 @@ def emittance(
     as_json: bool,
     use: str | None,
     energy: float | None,
+    sample: bool,
+    store: str | None,
+    seed: int,
 ) -> None:
     """Fit the emittance to a quadrupole scan and say whether to believe it.
 
@@ -83,6 +90,8 @@ def emittance(
     size_x_error_um, size_y_um, and optionally energy_MeV, screen, shot.
     """
     check_report_name(report)
+    sampling = Sampling(sample, store, seed)
+    sampling.check()
     measured = read_quad_scan(scan)
     described = read_lattice(lattice, use=use, energy=energy)
     check_names(
@@ -105,14 +114,18 @@ def emittance(
     )
     inputs = {str(scan): measured.sha256, str(lattice): described.sha256}
     command = command_line()
+    posterior = None
+    if sampling.wanted:
+        posterior = fit.sample(**sampling.options(command, inputs, progress=not as_json))
     if report is not None:
         from beamfit.report.page import write_report
 
-        write_report(report, fit, command=command, inputs=inputs)
+        write_report(report, fit, posterior, command=command, inputs=inputs)
     if as_json:
-        click.echo(json_text(command, inputs, _results(fit)))
+        further = {} if posterior is None else {"posterior": posterior.to_json()}
+        click.echo(json_text(command, inputs, _results(fit), further))
     else:
-        _print(fit, described, report)
+        _print(fit, described, report, posterior)
 
 
 def _planes(plane: str | None, scan: QuadScan) -> tuple[str, ...]:
@@ -138,7 +151,9 @@ def _results(fit: EmittanceFit) -> list[dict[str, Any]]:
     ]
 
 
-def _print(fit: EmittanceFit, lattice: LatticeFile, report: str | None) -> None:
+def _print(
+    fit: EmittanceFit, lattice: LatticeFile, report: str | None, posterior: Posterior | None
+) -> None:
     """Show tables, the verdict and what the budget is."""
     from rich.console import Console
 
@@ -153,5 +168,7 @@ def _print(fit: EmittanceFit, lattice: LatticeFile, report: str | None) -> None:
     console.print(range_table(fit))
     errors = fit.scan.error_source if fit.scan.error else "inferred from the residuals"
     console.print(f"Errors of the sizes: {errors}.", style="dim")
+    if posterior is not None:
+        print_posterior(console, "Posterior", posterior)
     if report is not None:
         console.print(f"Report written to {report}", style="bold")

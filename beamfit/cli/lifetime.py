@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from beamfit.cli.document import check_report_name, command_line, json_text
+from beamfit.cli.sampling import Sampling, print_posterior, sampling_options
 from beamfit.errors import InputError
 from beamfit.io.decay_record import read_decay_record
 from beamfit.io.files import digest
 
 if TYPE_CHECKING:
+    from beamfit.sampling.posterior import Posterior
     from beamfit.studies.decays import RecordStudy
     from beamfit.studies.shift import Shift
 
@@ -20,6 +22,7 @@ __all__ = ["lifetime"]
 EXAMPLE = """\b
 Examples:
   beamfit lifetime measurements/aps_1999_decay.csv
+  beamfit lifetime measurements/aps_1999_decay.csv --sample --report aps.html
   beamfit lifetime fill1.csv fill2.h5 --ring lattices/spear3_2003.toml
   beamfit lifetime fill1.csv --ring ring.toml --report fill1.html --json
   beamfit lifetime measurements/spear3_shift_simulated.csv --ring lattices/spear3_2003.toml --study
@@ -48,9 +51,17 @@ Examples:
     help="Fit the ring's loss mechanisms to all decays together: scales, loss budget with credible "
     "intervals, best operating point, next decay, anomaly. Needs --ring.",
 )
+@sampling_options
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object and nothing else.")
 def lifetime(
-    record: tuple[str, ...], ring: str | None, report: str | None, study: bool, as_json: bool
+    record: tuple[str, ...],
+    ring: str | None,
+    report: str | None,
+    study: bool,
+    sample: bool,
+    store: str | None,
+    seed: int,
+    as_json: bool,
 ) -> None:
     """Fit the lifetime to decay records and say what they cannot tell.
 
@@ -60,6 +71,8 @@ def lifetime(
     dI/dt = -a I² - b I, the lifetime at its start, mean current and end, and a verdict.
     """
     check_report_name(report)
+    sampling = Sampling(sample, store, seed)
+    sampling.check()
     if study and ring is None:
         raise InputError("--study without a ring", "--ring FILE.toml")
     inputs = {path: digest(path) for path in record}
@@ -87,19 +100,40 @@ def lifetime(
 
         shift = study_shift([decay for each in studies for decay in each.decays], machine)
     command = command_line()
+    posteriors = None
+    if sampling.wanted:
+        options = sampling.options(command, inputs, progress=not as_json)
+        posteriors = _sampled(studies, options)
     if report is not None:
         from beamfit.report.page import write_report
 
-        write_report(report, studies, command=command, inputs=inputs, shift=shift)
+        write_report(report, studies, posteriors, command=command, inputs=inputs, shift=shift)
     if as_json:
         results = [decay.to_json() for study in studies for decay in study.decays]
+        if posteriors is not None:
+            pairs = zip(results, posteriors, strict=True)
+            results = [result | {"posterior": p.to_json()} for result, p in pairs]
         further = {} if shift is None else {"study": shift.to_json()}
         click.echo(json_text(command, inputs, results, further))
     else:
-        _print(studies, shift, report)
+        _print(studies, shift, report, posteriors or [])
 
 
-def _print(studies: tuple[RecordStudy, ...], shift: Shift | None, report: str | None) -> None:
+def _sampled(studies: tuple[RecordStudy, ...], options: dict[str, Any]) -> list[Posterior]:
+    """One posterior a decay; a store holds one."""
+    fits = [decay.fit for study in studies for decay in study.decays]
+    if options["store"] is not None and len(fits) > 1:
+        found = f"--store for {len(fits)} decays"
+        raise InputError(found, "a record of one decay, or no --store")
+    return [fit.sample(**options) for fit in fits]
+
+
+def _print(
+    studies: tuple[RecordStudy, ...],
+    shift: Shift | None,
+    report: str | None,
+    posteriors: list[Posterior],
+) -> None:
     from rich.console import Console
 
     from beamfit.cli.decay_terminal import decay_tables, shift_lines
@@ -108,6 +142,9 @@ def _print(studies: tuple[RecordStudy, ...], shift: Shift | None, report: str | 
     for study in studies:
         for shown in decay_tables(study):
             console.print(shown)
+    names = [decay.fit.record for study in studies for decay in study.decays]
+    for name, posterior in zip(names, posteriors, strict=False):
+        print_posterior(console, f"Posterior of {name}", posterior)
     if shift is not None:
         for line in shift_lines(shift):
             console.print(line)

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import numpy as np
@@ -14,6 +14,10 @@ from beamfit.errors import InputError, nearest
 from beamfit.greybox.kkt import KKT
 from beamfit.greybox.problem import Problem
 from beamfit.status import Status
+
+if TYPE_CHECKING:
+    from beamfit.sampling.posterior import Posterior
+    from beamfit.sampling.priors import Distribution
 
 __all__ = ["Attempt", "Fit", "Limited", "Quantity", "Status", "Variable"]
 
@@ -167,6 +171,45 @@ class Fit:
         size = np.abs(slope) @ np.abs(self.undetermined)
         error = np.where(np.any(unseen > 1e-6 * size + 1e-300, axis=1), np.nan, error)
         return Quantity(value, error.reshape(value.shape))
+
+    def sample(
+        self,
+        *,
+        noise: str | None = None,
+        outliers: bool = False,
+        priors: Mapping[str, Distribution] | None = None,
+        **options: Any,
+    ) -> Posterior:
+        """Draw from the posterior of the free numbers, within all bounds and constraints.
+
+        Parameters
+        ----------
+        noise : {"known", "inferred"}, optional
+            Whether the errors are right, or right up to a common factor that is inferred. By
+            default they are inferred where no record has any or the fit enlarged them.
+        outliers : bool
+            Let an unknown fraction of the points be outliers.
+        priors : mapping of str to distribution, optional
+            By name of a free number, besides the problem's own: `Normal`, `LogNormal`, `Uniform`,
+            `HalfNormal` of `beamfit.sampling.priors`, or a frozen one of scipy.stats.
+        **options
+            ``seed, target_ess, budget, walkers, store, provenance, progress`` of
+            `beamfit.sampling.ensemble.draw`.
+
+        Returns
+        -------
+        Posterior
+            A direction that nothing holds is named in its message, and nothing is sampled.
+
+        Raises
+        ------
+        InputError
+            If an option is not understood, or a constraint is an equation.
+        """
+        from beamfit.greybox.posterior import target_of
+        from beamfit.sampling.ensemble import draw
+
+        return draw(target_of(self, noise, outliers, priors), **options)
 
     def __str__(self) -> str:
         """A table of the verdict, the numbers and the active constraints."""

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from beamfit.status import Status
 
-__all__ = ["Quantity", "Status"]
+__all__ = ["Quantity", "Status", "display_unit"]
 
 _PREFIXES = ((1.0, ""), (1e-3, "m"), (1e-6, "µ"), (1e-9, "n"), (1e-12, "p"))
 
@@ -69,9 +69,32 @@ class Quantity:
         return f"{value:.{max(places, 0)}f} ± {error:.{max(places, 0)}f}{end}"
 
     def _prefix(self) -> tuple[float, str]:
-        """Choose nm, µm, mm for lengths; leave other units alone."""
-        if self.unit != "m" or self.value == 0:
-            return 1.0, "" if self.unit == "1" else self.unit
-        size = max(abs(self.value), self.error or 0.0)
-        factor, prefix = next((p for p in _PREFIXES if size >= 0.1 * p[0]), _PREFIXES[-1])
-        return factor, prefix + self.unit
+        return display_unit(
+            max(abs(self.value), self.error or 0.0) if self.value else 0.0, self.unit
+        )
+
+
+def display_unit(size: float, unit: str) -> tuple[float, str]:
+    """Choose nm, µm, mm for lengths of a size; leave other units alone.
+
+    Parameters
+    ----------
+    size : float
+        In the SI unit.
+    unit : str
+        The SI unit, "1" for a pure number.
+
+    Returns
+    -------
+    (float, str)
+        What to divide by, and the unit to write.
+
+    Examples
+    --------
+    >>> display_unit(7e-7, "m")
+    (1e-06, 'µm')
+    """
+    if unit != "m" or size == 0:
+        return 1.0, "" if unit == "1" else unit
+    factor, prefix = next((p for p in _PREFIXES if size >= 0.1 * p[0]), _PREFIXES[-1])
+    return factor, prefix + unit

@@ -15,7 +15,10 @@ from beamfit.report.document import html_of
 from beamfit.report.emittance import emittance_page
 from beamfit.report.figures import STYLE
 from beamfit.report.pdf import pdf_of
-from beamfit.studies.decays import RecordStudy
+from beamfit.report.posterior import with_beam_posterior, with_decay_posteriors
+from beamfit.sampling.posterior import Posterior
+from beamfit.studies.decay_result import DecayFit
+from beamfit.studies.decays import Decay, RecordStudy
 from beamfit.studies.fit import EmittanceFit
 from beamfit.studies.shift import Shift
 
@@ -24,7 +27,8 @@ __all__ = ["write_report"]
 
 def write_report(
     path: str | PathLike[str],
-    result: EmittanceFit | Sequence[RecordStudy],
+    result: EmittanceFit | DecayFit | Sequence[RecordStudy],
+    posterior: Posterior | Sequence[Posterior] | None = None,
     *,
     command: str | None = None,
     inputs: Mapping[str, str | None] | None = None,
@@ -36,8 +40,10 @@ def write_report(
     ----------
     path : str or path
         Ends in ``.html`` (self-contained) or ``.pdf``. An existing file is replaced whole.
-    result : EmittanceFit, or sequence of RecordStudy
-        The emittance of a scan, or the lifetimes of decay records.
+    result : EmittanceFit, DecayFit, or sequence of RecordStudy
+        The emittance of a scan, the lifetime of a decay, or those of whole records.
+    posterior : Posterior or sequence of Posterior, optional
+        What `sample` of the fit gave; of records one for each decay.
     command : str, optional
         The command that made it.
     inputs : mapping of str to str, optional
@@ -69,7 +75,21 @@ def write_report(
     with rc_context(STYLE):
         if isinstance(result, EmittanceFit):
             page = emittance_page(result, command, inputs)
+            if posterior is not None:
+                page = with_beam_posterior(page, result, posterior)
         else:
-            page = decay_page(result, command, inputs, shift)
+            studies = (_study_of(result),) if isinstance(result, DecayFit) else result
+            page = decay_page(studies, command, inputs, shift)
+            if posterior is not None:
+                found = [posterior] if isinstance(posterior, Posterior) else posterior
+                fits = [decay.fit for study in studies for decay in study.decays]
+                page = with_decay_posteriors(page, list(zip(fits, found, strict=True)))
         content = html_of(page) if suffix == ".html" else pdf_of(page)
     write_atomically(path, content)
+
+
+def _study_of(fit: DecayFit) -> RecordStudy:
+    """A fit by itself as the study of its record."""
+    if fit.readings is None:
+        raise InputError("a fit without its readings", "the result of fit_decay or fit_decays")
+    return RecordStudy(fit.readings, (Decay(fit.readings, 0.0, fit, None),), ())

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any
 
 import jax
@@ -63,7 +64,8 @@ def fit_decay(record: DecayRecord, shape: Callable[[Any], Any] | None = None) ->
     if _says_nothing(record):
         return judge_constant(record)
     if shape is not None:
-        return judge(record, solve_shaped(*padded(record), shape))
+        shaped = judge(record, solve_shaped(*padded(record), shape))
+        return replace(shaped, shaped=True)
     return judge(record, solve_decay(*padded(record)))
 
 

@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from beamfit.inference.quantity import Quantity, Status
+
+if TYPE_CHECKING:
+    from beamfit.sampling.posterior import Posterior
+    from beamfit.sampling.priors import Distribution
+    from beamfit.studies.decay_record import DecayRecord
 
 __all__ = ["DecayFit", "Separability"]
 
@@ -78,6 +84,10 @@ class DecayFit:
         Model minus reading, mA.
     identifiability : Separability
         Whether the record tells a from b.
+    readings : DecayRecord, optional
+        What was fitted.
+    shaped : bool
+        Whether a was given a dependence on the current.
 
     Examples
     --------
@@ -105,6 +115,57 @@ class DecayFit:
     noise_inferred: bool
     residuals: np.ndarray
     identifiability: Separability
+    readings: DecayRecord | None = None
+    shaped: bool = False
+
+    def sample(
+        self,
+        *,
+        noise: str | None = None,
+        outliers: bool = False,
+        priors: Mapping[str, Distribution] | None = None,
+        **options: Any,
+    ) -> Posterior:
+        """Draw I0, a and b from their posterior, flat above zero; lifetimes are derived.
+
+        Parameters
+        ----------
+        noise : {"known", "inferred"}, optional
+            Whether the errors are right, or right up to a common factor that is inferred. By
+            default they are inferred where the record has none or the fit enlarged them.
+        outliers : bool
+            Let an unknown fraction of the readings be outliers.
+        priors : mapping of str to distribution, optional
+            On ``i0``, ``a`` or ``b``: `Normal`, `LogNormal`, `Uniform`, `HalfNormal` of
+            `beamfit.sampling.priors`, or a frozen one of scipy.stats.
+        **options
+            ``seed, target_ess, budget, walkers, store, provenance, progress`` of
+            `beamfit.sampling.ensemble.draw`.
+
+        Returns
+        -------
+        Posterior
+
+        Raises
+        ------
+        InputError
+            As `beamfit.studies.decay_posterior.decay_target` and `draw`.
+
+        Examples
+        --------
+        >>> from beamfit.studies.decay import fit_decay
+        >>> from beamfit.studies.decay_record import DecayRecord
+        >>> t = np.linspace(0, 8 * 3600, 100)
+        >>> noise = 1e-2 * np.random.default_rng(1).normal(size=t.size)
+        >>> fit = fit_decay(DecayRecord(t, 100.0 / (1.0 + 100.0 * 1e-7 * t) + noise))
+        >>> posterior = fit.sample(seed=1)
+        >>> posterior.status.value, bool(posterior.values("b").min() >= 0)
+        ('converged', True)
+        """
+        from beamfit.sampling.ensemble import draw
+        from beamfit.studies.decay_posterior import decay_target
+
+        return draw(decay_target(self, noise, outliers, priors), **options)
 
     def __str__(self) -> str:
         rows = [f"{self.record}: {self.status}. {self.message}"]

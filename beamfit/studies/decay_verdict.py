@@ -199,6 +199,7 @@ def judge_constant(record: DecayRecord) -> DecayFit:
         noise_inferred=record.error is None,
         residuals=np.zeros(len(record)),
         identifiability=Separability(False, None, None, None, None, 1.0),
+        readings=record,
     )
 
 
@@ -247,4 +248,5 @@ def judge(record: DecayRecord, solution: Solution) -> DecayFit:
         noise_inferred=inferred,
         residuals=residuals,
         identifiability=separability,
+        readings=record,
     )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -11,6 +12,8 @@ from beamfit.studies.tables import as_html, as_text
 
 if TYPE_CHECKING:
     from beamfit.optics.beamline import Beamline
+    from beamfit.sampling.posterior import Posterior
+    from beamfit.sampling.priors import Distribution
 
 __all__ = ["EmittanceFit"]
 
@@ -50,6 +53,43 @@ class EmittanceFit:
     def y(self) -> PlaneFit:
         """The fit of the y plane."""
         return self["y"]
+
+    def sample(
+        self,
+        planes: tuple[str, ...] | None = None,
+        *,
+        noise: str | None = None,
+        outliers: bool | None = None,
+        priors: Mapping[str, Distribution] | None = None,
+        **options: Any,
+    ) -> Posterior:
+        """Draw σ of the planes from its posterior, flat over positive definite matrices.
+
+        Parameters
+        ----------
+        planes : tuple of str, optional
+            Which; all that were fitted if None.
+        noise, outliers, priors
+            As `beamfit.studies.beam_posterior.beam_target`, with priors on ``x.sigma11`` and so on.
+        **options
+            ``seed, target_ess, budget, walkers, store, provenance, progress`` of
+            `beamfit.sampling.ensemble.draw`.
+
+        Returns
+        -------
+        Posterior
+            Of ``x.sigma11`` ...; ``x.emittance``, ``x.normalized_emittance``, ``x.beta``,
+            ``x.alpha``, ``x.mismatch`` are derived.
+
+        Raises
+        ------
+        InputError
+            As `beam_target` and `draw`.
+        """
+        from beamfit.sampling.ensemble import draw
+        from beamfit.studies.beam_posterior import beam_target
+
+        return draw(beam_target(self, planes, noise, outliers, priors), **options)
 
     def to_json(self) -> list[dict[str, Any]]:
         """Give the ``results`` list of the JSON contract."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
@@ -20,6 +20,9 @@ from beamfit.lifetime.scaled import MECHANISMS, Terms, loss_terms, scaled_losses
 from beamfit.studies.decay_summary import Summaries, loss_parts, summarise
 from beamfit.studies.decays import Decay
 from beamfit.studies.loss_budget import Machine, operation_during
+
+if TYPE_CHECKING:
+    from beamfit.sampling.posterior import Posterior
 
 __all__ = ["ScaleFit", "fit_scales", "pulls", "stacked_terms", "whitener"]
 
@@ -89,6 +92,12 @@ class ScaleFit:
         rows = [f"{len(self.names)} decays: {self.status}. {self.message}"]
         rows += [f"  {name:15s} {getattr(self, name)}" for name in MECHANISMS]
         return "\n".join([*rows, f"  chi²/dof {self.chi2:.4g}/{self.dof}"])
+
+    def sample(self, seed: int = 0, **options: Any) -> Posterior:
+        """Draw the scales from their posterior: see `beamfit.studies.scale_sample`."""
+        from beamfit.studies.scale_sample import sample_scales
+
+        return sample_scales(self, seed, **options)
 
     def to_json(self) -> dict[str, Any]:
         """Return the scales and the verdict as JSON's types."""

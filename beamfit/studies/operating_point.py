@@ -12,8 +12,9 @@ from beamfit.errors import InputError
 from beamfit.inference.quantity import Quantity
 from beamfit.lifetime.ring import Operation
 from beamfit.lifetime.scaled import Terms, loss_terms, scaled_losses
+from beamfit.sampling.posterior import Posterior
 from beamfit.studies.lifetime import ScaleFit
-from beamfit.studies.scale_sample import ScaleSample, losses_of
+from beamfit.studies.scale_sample import losses_of
 
 __all__ = ["BestPoint", "Limits", "best_operating_point"]
 
@@ -88,7 +89,7 @@ def _lifetime(fit: ScaleFit, draws: np.ndarray, operation: Operation, current: f
 
 
 def best_operating_point(
-    fit: ScaleFit, sample: ScaleSample, limits: Limits, current: float
+    fit: ScaleFit, sample: Posterior, limits: Limits, current: float
 ) -> BestPoint:
     """Find the settings of the longest lifetime within limits.
 
@@ -96,7 +97,7 @@ def best_operating_point(
     ----------
     fit : ScaleFit
         Fitted scales.
-    sample : ScaleSample
+    sample : Posterior
         Their draws.
     limits : Limits
         What may be set.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -10,126 +10,119 @@ import numpy as np
 from jax import Array
 
 from beamfit.lifetime.ring import Operation
-from beamfit.lifetime.scaled import Terms, loss_terms, scaled_losses
+from beamfit.lifetime.scaled import MECHANISMS, Terms, loss_terms, scaled_losses
+from beamfit.sampling.posterior import Interval, Posterior
+from beamfit.sampling.target import Law, Target
+from beamfit.studies.decay_summary import Summaries
 from beamfit.studies.lifetime import ScaleFit, pulls, whitener
 
-__all__ = ["Interval", "ScaleSample", "budget_intervals", "sample_scales"]
+__all__ = ["Interval", "budget_intervals", "sample_scales"]
 
-WALKERS = 32
 LARGEST = 1e3
 HOUR = 3600.0
 
 
-class ScaleSample(NamedTuple):
-    """Draws from the posterior of the scales.
+class Study(NamedTuple):
+    """What the decays say of the scales.
 
     Attributes
     ----------
-    draws : array, shape (n, 4)
-        Touschek, bremsstrahlung, elastic, desorption.
-    autocorrelation : float
-        Steps between independent draws, the longest of the four; the chain is as long as 50 of
-        them, or the intervals are rough.
-    steps : int
-        Length of the chain kept, in steps.
+    terms, measured : Terms, Summaries
+        First principles, and the decays.
+    pressure_error : Array
+        Relative error of the pressure readings.
+    mean, error : Array
+        Shape (4,), priors; an infinite error for none.
+    unit : Array
+        Factor on the errors of the decays.
     """
 
-    draws: np.ndarray
-    autocorrelation: float
-    steps: int
+    terms: Terms
+    measured: Summaries
+    pressure_error: Array
+    mean: Array
+    error: Array
+    unit: Array
 
 
-class Interval(NamedTuple):
-    """A number's median and the ends of its central credible interval.
-
-    Attributes
-    ----------
-    name : str
-        What it is.
-    median, lower, upper : float
-        In `unit`.
-    unit : str
-        Unit.
-    separable : bool
-        Whether the data separate it; if not, the interval is the bounds' and not to be quoted.
-    """
-
-    name: str
-    median: float
-    lower: float
-    upper: float
-    unit: str
-    separable: bool = True
-
-    def __str__(self) -> str:
-        said = f"{self.name}: {self.median:.4g} ({self.lower:.4g} to {self.upper:.4g}) {self.unit}"
-        return said if self.separable else f"{said}, not separable"
+def _no_residual(data: Study, scales: Array) -> tuple[Array, ...]:
+    """The weights move with the scales, so that the density is written as a whole below."""
+    return (jnp.zeros(0),)
 
 
-@jax.jit
-def _log_posterior(scales: Array, fit_parts: tuple) -> Array:
-    terms, measured, pressure_error, mean, error, unit = fit_parts
-    weight = whitener(scales, terms, measured, pressure_error)
-    off = pulls(scales, terms, measured, weight)
+def _log_density(data: Study, scales: Array) -> Array:
+    weight = whitener(scales, data.terms, data.measured, data.pressure_error)
+    off = pulls(scales, data.terms, data.measured, weight)
     # det(W)/det(R) is the normalisation that changes with the scales.
     volume = jnp.abs(jnp.linalg.det(weight))
-    known = jnp.abs(jnp.linalg.det(measured.root)) > 0
+    known = jnp.abs(jnp.linalg.det(data.measured.root)) > 0
     volume = jnp.sum(jnp.where(known, jnp.log(jnp.where(known, volume, 1.0)), 0.0))
-    prior = jnp.sum(((scales - mean) / error) ** 2)
-    value = volume - 0.5 * jnp.sum(off**2) / unit**2 - 0.5 * prior
-    inside = jnp.all((scales >= 0) & (scales <= LARGEST))
-    return jnp.where(inside & jnp.isfinite(value), value, -jnp.inf)
+    prior = jnp.sum(((scales - data.mean) / data.error) ** 2)
+    return volume - 0.5 * jnp.sum(off**2) / data.unit**2 - 0.5 * prior
 
 
-_log_posteriors = jax.jit(jax.vmap(_log_posterior, (0, None)))
+def _itself(data: Study, scales: Array) -> Array:
+    return scales
 
 
-def sample_scales(fit: ScaleFit, steps: int = 1500, seed: int = 0) -> ScaleSample:
+def _nothing(data: Study, scales: Array) -> Array:
+    return scales[:0]
+
+
+LAW = Law(_no_residual, _log_density, _nothing, _itself)
+
+
+def sample_scales(fit: ScaleFit, seed: int = 0, **options: Any) -> Posterior:
     """Draw scales from their posterior.
 
     Parameters
     ----------
     fit : ScaleFit
         Where to start, and the data.
-    steps : int, optional
-        Steps of each of 32 walkers, of which the first third is left out.
     seed : int, optional
         Of the random numbers.
+    **options
+        As of `beamfit.sampling.ensemble.draw`.
 
     Returns
     -------
-    ScaleSample
-        With the priors of the fit, otherwise flat from 0 to 1000.
-
-    Notes
-    -----
-    Affine-invariant ensemble (Goodman and Weare 2010) by emcee. The pressure errors are
-    integrated out as in the fit.
+    Posterior
+        Of Touschek, bremsstrahlung, elastic, desorption, with the priors of the fit, otherwise
+        flat from 0 to 1000. The pressure errors are integrated out as in the fit.
     """
-    parts = (
-        fit.terms,
-        fit.measured,
-        fit.pressure_error,
-        fit.prior_mean,
-        fit.prior_error,
-        fit.error_scale,
-    )
-    random = np.random.default_rng(seed)
-    spread = np.sqrt(np.diag(fit.covariance)) * fit.error_scale
-    spread = np.where(np.isfinite(spread), np.minimum(spread, 0.3), 0.3)
-    start = np.abs(fit.vector + spread * random.normal(size=(WALKERS, 4)))
-    import emcee  # here, because it costs every other command half a second
+    from beamfit.sampling.ensemble import draw
 
-    sampler = emcee.EnsembleSampler(
-        WALKERS, 4, lambda x: np.asarray(_log_posteriors(x, parts)), vectorize=True
+    spread = np.sqrt(np.diag(fit.covariance)) * fit.error_scale
+    wide = ~np.isfinite(spread) | (spread > 0.3)
+    covariance = np.where(np.isfinite(fit.covariance), fit.covariance, 0.0) * fit.error_scale**2
+    covariance[wide] = covariance[:, wide] = 0.0
+    covariance[wide, wide] = 0.3**2
+    unknown = tuple(name for name in MECHANISMS if getattr(fit, name).error is None)
+    target = Target(
+        law=LAW,
+        data=Study(
+            fit.terms,
+            fit.measured,
+            fit.pressure_error,
+            fit.prior_mean,
+            fit.prior_error,
+            fit.error_scale,
+        ),
+        names=MECHANISMS,
+        units=("1",) * 4,
+        lower=np.zeros(4),
+        upper=np.full(4, LARGEST),
+        mode=fit.vector,
+        covariance=covariance,
+        observed={
+            "mean current mA": np.asarray(fit.measured.current),
+            "loss rates 1/s": np.asarray(fit.measured.parts),
+            "decays": np.array(fit.names),
+        },
+        priors_own=unknown,
+        verdict=(fit.status.value, fit.message),
     )
-    sampler.random_state = np.random.RandomState(seed).get_state()
-    sampler.run_mcmc(start, steps)
-    burnt = steps // 3
-    time = sampler.get_autocorr_time(discard=burnt, quiet=True, tol=0)
-    return ScaleSample(
-        sampler.get_chain(discard=burnt, flat=True), float(np.max(time)), steps - burnt
-    )
+    return draw(target, seed=seed, **options)
 
 
 def losses_of(draws: Array, terms: Terms) -> tuple[Array, Array]:
@@ -139,7 +132,7 @@ def losses_of(draws: Array, terms: Terms) -> tuple[Array, Array]:
 
 def budget_intervals(
     fit: ScaleFit,
-    sample: ScaleSample,
+    sample: Posterior,
     operation: Operation,
     current: float,
     probability: float = 0.68,
@@ -150,7 +143,7 @@ def budget_intervals(
     ----------
     fit : ScaleFit
         The fit.
-    sample : ScaleSample
+    sample : Posterior
         Its draws.
     operation : Operation
         Settings and vacuum.

@@ -131,7 +131,7 @@ def test_bad_requests(machine, decays, fit, sample):
 
 
 def test_sampling_agrees_with_the_linear_errors(fit, sample):
-    assert sample.steps > 20 * sample.autocorrelation
+    assert sample.diagnostics.settled
     error = np.sqrt(np.diag(fit.covariance)) * fit.error_scale
     assert np.abs(sample.draws.mean(0) - fit.vector).max() < 0.25 * error.max()
     assert sample.draws.std(0) == pytest.approx(error, rel=0.2)

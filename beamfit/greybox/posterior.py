@@ -1,0 +1,169 @@
+"""The posterior of a fitted problem, for the sampler."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from beamfit.errors import InputError
+from beamfit.greybox import tree
+from beamfit.greybox.problem import Core
+from beamfit.sampling.likelihood import Group, Likelihood
+from beamfit.sampling.priors import Distribution, checked
+from beamfit.sampling.target import Law, Target, covariance_of
+
+if TYPE_CHECKING:
+    from beamfit.greybox.fit import Fit
+
+__all__ = ["LAW", "Sampled", "target_of"]
+
+# A number that is an undetermined direction's in less than this share is not part of it.
+PART = 0.05
+
+
+@tree.node()
+class Sampled:
+    """A problem for the sampler: its core, all numbers, which of them move, and the limits."""
+
+    core: Core
+    theta: Any
+    moving: Any
+    lower: Any
+    upper: Any
+
+
+def _model(data: Sampled, moved: jax.Array) -> Any:
+    theta = data.theta.at[data.moving].set(moved)
+    return tree.replace(data.core.model, data.core.chosen, theta)
+
+
+def _residual(data: Sampled, moved: jax.Array) -> tuple[jax.Array]:
+    """Residuals of the records; priors are no measurements and know no common noise."""
+    model = _model(data, moved)
+    parts = [record.residual(model) for record in data.core.records]
+    return (jnp.concatenate(parts) if parts else jnp.zeros(0),)
+
+
+def _log_prior(data: Sampled, moved: jax.Array) -> jax.Array:
+    """Priors and further objectives, and -inf where a constraint is broken."""
+    model, core = _model(data, moved), data.core
+    value = sum((-0.5 * jnp.sum(p.residual(model) ** 2) for p in core.priors), jnp.zeros(()))
+    for objective in core.objectives:
+        value -= jnp.sum(objective.weight * objective.function(model, objective.data))
+    found = [jnp.ravel(c.function(model, c.data)) for c in core.constraints]
+    if found:
+        held = jnp.concatenate(found)
+        inside = jnp.all((held >= data.lower) & (held <= data.upper))
+        value = jnp.where(inside, value, -jnp.inf)
+    return value
+
+
+def _no_more(data: Sampled, moved: jax.Array) -> jax.Array:
+    return moved[:0]
+
+
+LAW = Law(_residual, _log_prior, _no_more, _model)
+
+
+def target_of(
+    fit: Fit,
+    noise: str | None,
+    outliers: bool,
+    priors: Mapping[str, Distribution] | None,
+) -> Target:
+    """State the posterior of a fit.
+
+    Parameters
+    ----------
+    fit : Fit
+        The fit.
+    noise : {"known", "inferred"} or None
+        None: inferred where no record has errors or the fit enlarged them, else known.
+    outliers : bool
+        Whether some points may be outliers.
+    priors : mapping of str to distribution, or None
+        In addition to the problem's own.
+
+    Returns
+    -------
+    Target
+
+    Raises
+    ------
+    InputError
+        If a constraint is an equation, an option is not understood, or a prior's name is not that
+        of a free number.
+    """
+    p = fit.problem
+    equations = p.constraint_lower == p.constraint_upper
+    if equations.any():
+        name = p.constraint_names[int(np.argmax(equations))]
+        expected = "limits that differ: nothing that is drawn at random meets an equation"
+        raise InputError(f"the equation '{name}'", expected)
+    if noise is None:
+        noise = "inferred" if not p.errors_known or fit.scale > 1 else "known"
+    moving = np.flatnonzero(p.lower < p.upper)
+    names = tuple(p.names[i] for i in moving)
+    priors = checked(priors, names)
+    fixed = fit.theta.copy()
+    fixed[moving] = 0.0  # the solver's last digits do not make it another problem
+    data = Sampled(p.core, fixed, moving, p.constraint_lower, p.constraint_upper)
+    lower, upper = p.lower[moving], p.upper[moving]
+    data = jax.tree.map(jnp.asarray, data)
+    width = np.where(np.isfinite(upper - lower), 0.5 * (upper - lower), np.inf)
+    for name, prior in priors.items():
+        width[names.index(name)] = min(width[names.index(name)], float(prior.std()))
+    mode = fit.theta[moving]
+    held, loose = _open(fit, moving, names, width)
+    extra = Law(_with_priors, _log_prior, _no_more, _model)
+    return Target(
+        law=LAW,
+        data=data,
+        names=names,
+        units=("",) * len(names),
+        lower=lower,
+        upper=upper,
+        mode=mode,
+        covariance=covariance_of(extra, data, mode, width) * fit.scale**2,
+        likelihood=Likelihood((Group("", noise, outliers),)),
+        noise=(fit.scale,),
+        noise_unit="1",
+        priors=priors,
+        observed={
+            f"{record.name} {what}": np.asarray(getattr(record, what))
+            for record in p.records
+            for what in ("measured", "error")
+            if getattr(record, what) is not None
+        },
+        priors_own=held,
+        open_directions=loose,
+        verdict=(fit.status.value, fit.message),
+        hidden=tuple(names[i] for i in range(len(names)) if p.nuisance[moving[i]]),
+    )
+
+
+def _with_priors(data: Sampled, moved: jax.Array) -> tuple[jax.Array]:
+    model = _model(data, moved)
+    parts = [part.residual(model) for part in (*data.core.records, *data.core.priors)]
+    return (jnp.concatenate(parts) if parts else jnp.zeros(0),)
+
+
+def _open(
+    fit: Fit, moving: np.ndarray, names: tuple[str, ...], width: np.ndarray
+) -> tuple[tuple[str, ...], str]:
+    """Numbers of undetermined directions, and a sentence if nothing else holds some of them."""
+    seen = np.abs(fit.undetermined[moving]) if fit.undetermined.size else np.zeros((len(names), 0))
+    part = np.any(seen > PART * np.max(seen, axis=0, initial=1e-300), axis=1)
+    loose = [name for name, p, w in zip(names, part, width, strict=True) if p and np.isinf(w)]
+    held = tuple(name for name, p in zip(names, part, strict=True) if p)
+    if not loose:
+        return held, ""
+    shown = ", ".join(loose[:6]) + (", ..." if len(loose) > 6 else "")
+    return held, (
+        f"the data do not determine {shown}, and neither bounds nor priors hold them, so that "
+        "there is no posterior; bound them, give priors, or measure what tells them apart"
+    )

@@ -1,0 +1,1 @@
+"""Drawing from posteriors: targets, moves, convergence, stores. It knows nothing of beams."""

@@ -1,0 +1,292 @@
+"""`sample` of every kind of fit: problems, scans, decays."""
+
+from __future__ import annotations
+
+import sys
+import types
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy import stats
+
+import beamfit
+from beamfit.errors import InputError
+from beamfit.greybox.problem import Constraint, Free, Prior, Problem, Record
+from beamfit.greybox.solve import solve
+from beamfit.lifetime.decay import current
+from beamfit.sampling.priors import Normal, Uniform
+from beamfit.status import Status
+from beamfit.studies.decay import fit_decay
+from beamfit.studies.decay_record import DecayRecord
+from beamfit.studies.predictive import expected_current, expected_sizes
+
+X = np.linspace(0.0, 1.0, 12)
+Y = 1.0 + 2.0 * X + 0.1 * np.random.default_rng(1).normal(size=12)
+
+
+def line(model, x):
+    return model["slope"] * x + model["offset"]
+
+
+def only_the_sum(model, x):
+    return (model["slope"] + model["offset"]) * x
+
+
+def the_sum(model, data):
+    return model["slope"] + model["offset"]
+
+
+def linear(free=None, predict=line, error=0.1, **more):
+    free = free or [Free("slope"), Free("offset")]
+    record = Record("scan", predict, X, Y, error=error)
+    return Problem({"slope": 1.0, "offset": 0.0}, free, [record], **more)
+
+
+def test_a_linear_problem_has_the_fits_own_normal_posterior():
+    fit = solve(linear())
+    found = fit.sample(seed=1, noise="known", target_ess=20_000)
+    sd = np.sqrt(np.diag(fit.covariance))
+    np.testing.assert_allclose(found.draws.mean(0), fit.theta, atol=0.03 * sd.min())
+    np.testing.assert_allclose(found.draws.std(0), sd, rtol=0.03)
+    expected = fit.covariance[0, 1] / sd[0] / sd[1]
+    assert found.correlations().values[0, 1] == pytest.approx(expected, abs=0.02)
+    derived = found.derive(lambda model: model["slope"] + model["offset"])
+    assert derived.std() == pytest.approx(
+        float(fit.derive(lambda m: the_sum(m, None)).error), rel=0.05
+    )
+
+
+def test_a_constraint_is_kept_and_cuts_the_normal_distribution():
+    """slope + offset <= limit: its posterior is a normal distribution cut there."""
+    free = solve(linear())
+    limit = float(free.theta.sum()) - 0.05
+    fit = solve(linear(constraints=[Constraint("sum", the_sum, upper=limit)]))
+    found = fit.sample(seed=1, noise="known", target_ess=8000)
+    total = found.values("slope") + found.values("offset")
+    assert total.max() <= limit
+    sd = float(np.sqrt(free.covariance.sum()))
+    exact = stats.truncnorm(-np.inf, (limit - free.theta.sum()) / sd, free.theta.sum(), sd)
+    assert total.mean() == pytest.approx(exact.mean(), abs=0.05 * exact.std())
+    assert total.std() == pytest.approx(exact.std(), rel=0.05)
+
+
+def test_an_equation_cannot_be_sampled():
+    fit = solve(linear(constraints=[Constraint("sum", the_sum, lower=3.0, upper=3.0)]))
+    with pytest.raises(InputError, match="the equation 'sum'"):
+        fit.sample()
+
+
+def test_a_direction_that_nothing_holds_is_named():
+    found = solve(linear(predict=only_the_sum)).sample()
+    assert found.status is Status.unidentified
+    assert "do not determine slope, offset" in found.message
+    assert found.chain.size == 0
+
+
+def test_a_direction_that_bounds_hold_is_sampled_and_named():
+    free = [Free("slope", -5, 5), Free("offset", -5, 5)]
+    found = solve(linear(free, only_the_sum)).sample(seed=1, noise="known")
+    assert found.status is Status.unidentified
+    assert found.held == ("slope", "offset")
+    assert "the prior's or the bounds', not the data's" in found.message
+    total = found.values("slope") + found.values("offset")
+    assert total.std() < 0.06  # what the data do see
+
+
+def test_a_prior_makes_an_open_direction_proper():
+    fit = solve(linear(predict=only_the_sum))
+    priors = {"offset": Normal(1.0, 0.01), "slope": Uniform(-10.0, 10.0)}
+    found = fit.sample(seed=1, noise="known", priors=priors)
+    assert found.chain.size
+    assert found.values("offset").std() == pytest.approx(0.01, rel=0.05)
+    with pytest.raises(InputError, match="did you mean offset"):
+        fit.sample(priors={"ofset": Normal(0.0, 1.0)})
+    with pytest.raises(InputError, match="a prior of type float"):
+        fit.sample(priors={"offset": 1.0})
+
+
+def test_the_problems_own_priors_count_once():
+    fit = solve(linear(priors=[Prior("slope", 2.0, 0.001)]))
+    found = fit.sample(seed=1, noise="known", target_ess=8000)
+    assert found.values("slope").std() == pytest.approx(0.001, rel=0.05)
+    # A common noise factor is the records' and does not widen the prior.
+    inferred = fit.sample(seed=1, noise="inferred", target_ess=8000)
+    assert inferred.values("slope").std() == pytest.approx(0.001, rel=0.05)
+
+
+def test_fixed_numbers_do_not_move():
+    fit = solve(linear([Free("slope"), Free("offset", 1.0, 1.0)]))
+    assert fit.sample(seed=1).names[0] == "slope"
+    assert "offset" not in fit.sample(seed=1).names
+
+
+def test_without_errors_the_noise_is_inferred():
+    found = solve(linear(error=None)).sample(seed=1)
+    assert "error_factor" in found.shown
+    assert found["error_factor"].value == pytest.approx(0.065, rel=0.3)
+
+
+@pytest.fixture(scope="module")
+def otr2():
+    scan = beamfit.read_quad_scan("measurements/lcls_otr2.csv")
+    return beamfit.fit_emittance(scan, beamfit.load_lattice("lattices/lcls_otr2.toml"))
+
+
+@pytest.fixture(scope="module")
+def beam(otr2):
+    return otr2.sample(seed=1)
+
+
+def test_a_real_scan(otr2, beam):
+    """Medians agree with the fit; two degrees of freedom make Student's wide tails."""
+    assert beam.status is Status.converged
+    for plane in "xy":
+        fit = otr2[plane].normalized_emittance
+        found = beam.interval(f"{plane}.normalized_emittance")
+        assert found.median == pytest.approx(fit.value, abs=0.2 * fit.error)
+        # t with 2 degrees of freedom holds 68.3 % within 1.32 scale units.
+        assert 0.5 * (found.upper - found.lower) == pytest.approx(1.32 * fit.error, rel=0.12)
+    sigma = beam.draws
+    assert (sigma[:, 0] * sigma[:, 2] > sigma[:, 1] ** 2).all()
+    emittance = np.sqrt(sigma[:, 0] * sigma[:, 2] - sigma[:, 1] ** 2)
+    np.testing.assert_allclose(beam.values("x.emittance"), emittance, rtol=1e-9)
+    sizes = beam.derive(lambda beams: beams["y"].l11)
+    assert sizes.mean() == pytest.approx(np.sqrt(otr2.y.sigma[0].value), rel=0.02)
+
+
+def test_noise_known_gives_the_unscaled_errors(otr2):
+    found = otr2.sample(("x",), noise="known", seed=1, target_ess=8000)
+    assert found.status is Status.poor_fit
+    assert "too narrow" in found.message
+    raw = otr2.x.normalized_emittance.error_raw
+    assert found["x.normalized_emittance"].error == pytest.approx(raw, rel=0.05)
+    assert found.names == ("x.sigma11", "x.sigma12", "x.sigma22")
+
+
+def test_a_scan_that_determines_nothing_is_not_sampled():
+    line = beamfit.Beamline(
+        (beamfit.Quadrupole("Q", 0.1), beamfit.Drift("D", 2.0), beamfit.Screen("S")), 135.0
+    )
+    k1 = np.full(6, 3.0) + 1e-9 * np.arange(6)
+    noise = 1 + 0.02 * np.random.default_rng(1).normal(size=6)
+    scan = beamfit.QuadScan({"Q": k1}, {"Q": "k1"}, {"x": 1e-4 * noise}, {"x": np.full(6, 2e-6)})
+    fit = beamfit.fit_emittance(scan, line)
+    found = fit.sample()
+    assert found.status is Status.unidentified
+    assert "does not determine sigma11, sigma12 and sigma22" in found.message
+    assert all(q["interval_68"] is None for q in found.to_json()["quantities"])
+    box = {
+        "x.sigma11": Uniform(0.5e-8, 4e-8),
+        "x.sigma12": Uniform(-2e-8, 3e-8),
+        "x.sigma22": Uniform(0.3e-8, 2e-8),
+    }
+    boxed = fit.sample(priors=box, noise="known", seed=1)
+    assert boxed.chain.size
+    assert boxed.status is Status.unidentified
+    assert "x.emittance" in boxed.held
+
+
+def test_expected_sizes_hold_the_points(otr2, beam):
+    p = otr2.y.points
+    found = expected_sizes(beam, "y", p.r11, p.r12, p.known, p.error)
+    low, high = found.reading
+    assert ((p.size > low) & (p.size < high)).all()
+    assert (found.model[0] > low).all()
+    np.testing.assert_allclose(found.median, p.model, rtol=0.02)
+
+
+def decay(a, b, span, number=200, sd=0.01, seed=3):
+    t = np.linspace(0.0, span, number)
+    noise = sd * np.random.default_rng(seed).normal(size=number)
+    return DecayRecord(t, np.array(current(t, 500.0, a, b)) + noise, np.full(number, sd))
+
+
+def test_a_decay_at_the_bound_of_b():
+    """Pure Touschek: b's posterior is a normal distribution cut at zero."""
+    fit = fit_decay(decay(2e-8, 0.0, 2 * 3600.0))
+    found = fit.sample(seed=1, noise="known", target_ess=8000)
+    b = found.values("b")
+    assert b.min() >= 0
+    exact = stats.truncnorm(-fit.b.value / fit.b.error_raw, np.inf, fit.b.value, fit.b.error_raw)
+    assert b.mean() == pytest.approx(exact.mean(), rel=0.05)
+    assert b.std() == pytest.approx(exact.std(), rel=0.06)
+
+
+def test_a_and_b_not_separable_are_the_bounds_and_the_lifetime_is_not():
+    fit = fit_decay(decay(2e-8, 1e-6, 120.0))
+    found = fit.sample(seed=1, noise="known", target_ess=8000)
+    assert found.status is Status.unidentified
+    assert set(found.held) == {"a", "b"}
+    lifetime = found["lifetime_mean"]
+    assert lifetime.error == pytest.approx(fit.lifetime_mean.error_raw, rel=0.08)
+    rows = {q["name"]: q for q in found.to_json()["quantities"]}
+    assert rows["a"]["interval_95"] is None
+    assert rows["a"]["error"] is None
+    assert rows["lifetime_mean"]["interval_95"] is not None
+
+
+def test_the_real_decay():
+    fit = fit_decay(beamfit.read_decay_record("measurements/aps_1999_decay.csv"))
+    found = fit.sample(seed=1)
+    assert found.status is Status.converged
+    for name in ("a", "b", "lifetime_mean"):
+        quantity = getattr(fit, name)
+        assert found[name].value == pytest.approx(quantity.value, abs=0.15 * quantity.error)
+        assert found[name].error == pytest.approx(quantity.error, rel=0.15)
+    expected = expected_current(found, fit.readings.time, np.ones(len(fit.readings)))
+    low, high = expected.reading
+    inside = np.mean((fit.readings.current > low) & (fit.readings.current < high))
+    assert inside > 0.85
+
+
+def test_outliers_do_not_pull():
+    t = np.linspace(0, 36000, 200)
+    noise = 1e-2 * np.random.default_rng(2).normal(size=200)
+    readings = np.array(current(t, 100.0, 1e-7, 1e-7)) + noise
+    readings[[50, 51, 140]] += [0.5, 0.4, -0.6]
+    fit = fit_decay(DecayRecord(t, readings, np.full(200, 1e-2)))
+    found = fit.sample(seed=1, noise="known", outliers=True)
+    rate = 1e-7 * readings.mean() + 1e-7
+    truth = 1 / rate / 3600
+    assert abs(found["lifetime_mean"].value - truth) < 4 * found["lifetime_mean"].error
+    assert found["lifetime_mean"].error < 0.3 * fit.lifetime_mean.error
+    low, high = found.quantiles("outlier_fraction", (0.025, 0.975))
+    assert low < 3 / 200 < high
+
+
+def test_readings_that_show_nothing():
+    found = fit_decay(DecayRecord([0, 60, 120, 180, 240], [100.0] * 5)).sample()
+    assert found.status is Status.unidentified
+    assert "neither decay nor noise" in found.message
+
+
+def test_a_shape_of_a_is_not_sampled():
+    fit = replace(fit_decay(decay(2e-8, 1e-6, 7200.0)), shaped=True)
+    with pytest.raises(InputError, match="a shape of a"):
+        fit.sample()
+
+
+def test_arviz_is_asked_for_by_name(beam, monkeypatch):
+    monkeypatch.setitem(sys.modules, "arviz", None)
+    with pytest.raises(InputError, match="pip install arviz"):
+        beam.to_arviz()
+
+
+@pytest.mark.parametrize("version", ["0.23.4", "1.2.0"])
+def test_arviz_gets_walkers_as_chains(beam, monkeypatch, version):
+    """Both forms of its from_dict: groups as arguments, and as one mapping from 1.0 on."""
+    given = {}
+
+    def from_dict(*groups, **named):
+        given.update(groups[0] if groups else named)
+        return len(groups)
+
+    module = types.SimpleNamespace(__version__=version, from_dict=from_dict)
+    monkeypatch.setitem(sys.modules, "arviz", module)
+    assert beam.to_arviz() == (1 if version[0] == "1" else 0)
+    steps, walkers, _ = beam.chain.shape
+    assert set(given) == {"posterior", "sample_stats", "observed_data"}
+    assert given["posterior"]["x.emittance"].shape == (walkers, steps)
+    np.testing.assert_array_equal(given["posterior"]["x.sigma11"], beam.chain[:, :, 0].T)
+    assert given["sample_stats"]["lp"].shape == (walkers, steps)

@@ -1,0 +1,248 @@
+"""Stores: emcee's layout, resumption after SIGKILL, files that are not ours."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import emcee
+import h5py
+import numpy as np
+import pytest
+
+from beamfit.errors import InputError
+from beamfit.sampling import ensemble
+from beamfit.sampling.ensemble import draw
+from beamfit.sampling.priors import Normal
+from beamfit.sampling.store import Provenance
+from tests.sampling.targets import banana, half_normal, target
+
+OPTIONS = {"seed": 5, "target_ess": 1e9, "budget": 700, "walkers": 16}
+
+
+@pytest.fixture(scope="module")
+def whole():
+    """The uninterrupted chain."""
+    return draw(target(half_normal), **OPTIONS)
+
+
+def stored_chain(path):
+    return emcee.backends.HDFBackend(str(path), read_only=True)
+
+
+def test_emcee_reads_the_store(tmp_path, whole):
+    path = tmp_path / "chain.h5"
+    posterior = draw(target(half_normal), store=path, **OPTIONS)
+    backend = stored_chain(path)
+    assert backend.iteration == 700
+    assert backend.shape == (16, 2)
+    kept = backend.get_chain(discard=posterior.warmup)
+    np.testing.assert_array_equal(kept, posterior.chain)
+    np.testing.assert_array_equal(
+        backend.get_log_prob(discard=posterior.warmup), posterior.log_prob
+    )
+    assert backend.random_state[0] == "MT19937"
+    np.testing.assert_array_equal(posterior.chain, whole.chain)
+
+
+def test_groups_say_where_it_comes_from(tmp_path):
+    path = tmp_path / "chain.h5"
+    observed = {"size m": np.array([1.0, 2.0]), "screen": np.array(["A", "B"])}
+    stated = target(half_normal, observed=observed)
+    found = draw(
+        stated,
+        seed=3,
+        store=path,
+        target_ess=500,
+        provenance=Provenance("beamfit x", {"scan.csv": "ab12"}),
+    )
+    with h5py.File(path, "r") as file:
+        assert set(file) == {"mcmc", "observed", "fit", "posterior", "proposal", "provenance"}
+        np.testing.assert_array_equal(file["observed/size m"][:], [1.0, 2.0])
+        assert [v.decode() for v in file["observed/screen"][:]] == ["A", "B"]
+        np.testing.assert_array_equal(file["fit/mode"][:], stated.mode)
+        source = dict(file["provenance"].attrs)
+        assert source["seed"] == "3"
+        assert source["command"] == "beamfit x"
+        assert json.loads(source["inputs"]) == {"scan.csv": "ab12"}
+        assert {"emcee", "jax", "numpy", "python", "beamfit"} <= set(json.loads(source["versions"]))
+        assert file["posterior"].attrs["finished"] == "true"
+        assert json.loads(file["posterior"].attrs["summary"]) == json.loads(
+            json.dumps(found.to_json())
+        )
+
+
+def test_a_larger_target_goes_on_from_the_store(tmp_path):
+    path = tmp_path / "chain.h5"
+    first = draw(target(half_normal), seed=1, store=path, target_ess=1000)
+    again = draw(target(half_normal), seed=1, store=path, target_ess=1000)
+    np.testing.assert_array_equal(first.chain, again.chain)
+    longer = draw(target(half_normal), seed=1, store=path, target_ess=20_000)
+    straight = draw(target(half_normal), seed=1, target_ess=20_000)
+    assert len(longer.chain) > len(first.chain)
+    np.testing.assert_array_equal(longer.chain, straight.chain)
+
+
+VICTIM = """
+import sys
+import time
+from tests.sampling.test_store import OPTIONS
+from tests.sampling.targets import half_normal, target
+from beamfit.sampling import ensemble
+from beamfit.sampling.ensemble import draw
+ensemble.WRITING = 1e9  # a checkpoint after every block: as many moments to be killed at
+advance = ensemble._block
+
+def slowly(*arguments):
+    time.sleep(0.05)
+    return advance(*arguments)
+
+ensemble._block = slowly
+print("begun", flush=True)
+draw(target(half_normal), store=sys.argv[1], **OPTIONS)
+print("finished", flush=True)
+"""
+
+
+def test_killed_at_any_moment_the_finished_chain_is_the_uninterrupted_one(tmp_path, whole):
+    """SIGKILL after delays that fall before, between and within checkpoints."""
+    path = tmp_path / "chain.h5"
+    random = np.random.default_rng(1)
+    kills, seen = 0, set()
+    for attempt in range(40):
+        process = subprocess.Popen(
+            [sys.executable, "-c", VICTIM, str(path)],
+            stdout=subprocess.PIPE,
+            env=os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)},
+        )
+        assert process.stdout.readline() == b"begun\n"
+        # Before the first checkpoint, between and within later ones; in the end it may finish.
+        until = time.monotonic() + random.uniform(0.0, 1.0) + 0.3 * attempt
+        while time.monotonic() < until and process.poll() is None:
+            time.sleep(0.005)
+        if process.poll() is None:
+            os.kill(process.pid, signal.SIGKILL)
+            kills += 1
+        output = process.communicate()[0]
+        if path.exists():
+            backend = stored_chain(path)
+            seen.add(backend.iteration)
+            found = backend.get_chain()  # the file is whole
+            assert np.isfinite(found).all()
+        if b"finished" in output:
+            break
+    assert b"finished" in output
+    assert kills >= 3
+    assert len(seen - {700}) >= 2  # it was interrupted at different places
+    assert stored_chain(path).iteration == 700
+    finished = draw(target(half_normal), store=path, **OPTIONS)
+    np.testing.assert_array_equal(finished.chain, whole.chain)
+    np.testing.assert_array_equal(finished.log_prob, whole.log_prob)
+    assert finished.acceptance == whole.acceptance
+
+
+def test_killed_while_writing_leaves_the_old_file(tmp_path):
+    """The write itself is cut at every point: what is under the name stays whole."""
+    path = tmp_path / "chain.h5"
+    draw(target(half_normal), seed=1, store=path, target_ess=500)
+    before = path.read_bytes()
+    beside = tmp_path / ".chain.h5.partial"
+    for cut in (0, 100, len(before) // 2):
+        beside.write_bytes(before[:cut])  # what a process killed in the middle leaves
+        again = draw(target(half_normal), seed=1, store=path, target_ess=500)
+        assert path.read_bytes() == before
+        assert len(again.chain) > 0
+
+
+def refused(path, **changed):
+    before = path.read_bytes()
+    options = {"seed": 1, "target_ess": 500, "store": path} | changed
+    stated = options.pop("stated", None) or target(half_normal)
+    with pytest.raises(InputError) as error:
+        draw(stated, **options)
+    assert path.read_bytes() == before
+    said = str(error.value)
+    assert str(path) in said
+    assert "name another file" in said
+    return said
+
+
+@pytest.fixture
+def store(tmp_path):
+    path = tmp_path / "chain.h5"
+    draw(target(half_normal), seed=1, store=path, target_ess=500)
+    return path
+
+
+@pytest.mark.parametrize("share", [0.0, 0.01, 0.5, 0.95])
+def test_a_truncated_file_is_refused_and_left(store, share):
+    whole = store.read_bytes()
+    store.write_bytes(whole[: int(share * len(whole))])
+    assert "not HDF5, or is damaged" in refused(store)
+
+
+def test_a_foreign_file_is_refused_and_left(tmp_path):
+    path = tmp_path / "other.h5"
+    path.write_text("Q2_A,size_x_um\n")
+    assert "not HDF5" in refused(path)
+    with h5py.File(path, "w") as file:
+        file["size_x_um"] = np.arange(3.0)
+    assert "beamfit did not write" in refused(path)
+
+
+def test_a_chain_of_emcee_alone_is_foreign(tmp_path):
+    path = tmp_path / "emcee.h5"
+    backend = emcee.backends.HDFBackend(str(path))
+    sampler = emcee.EnsembleSampler(8, 2, lambda x: -0.5 * x @ x, backend=backend)
+    sampler.run_mcmc(np.random.default_rng(1).normal(size=(8, 2)), 5)
+    assert "beamfit did not write" in refused(path)
+
+
+def test_another_problem_is_refused_and_left(store):
+    assert "seed 1" in refused(store, seed=2)
+    assert "of 64 walkers" in refused(store, walkers=32)
+    assert "other numbers, x, y" in refused(store, stated=target(half_normal, n=3))
+    other = target(half_normal, observed={"size": np.ones(3)})
+    assert "another problem" in refused(store, stated=other)
+    prior = target(half_normal, priors={"x": Normal(0.0, 1.0)})
+    assert "another problem" in refused(store, stated=prior)
+
+
+def test_a_place_that_cannot_be_written_is_known_before_sampling(tmp_path, monkeypatch):
+    monkeypatch.setattr(ensemble, "_run", None)
+    with pytest.raises(InputError, match="folder that exists"):
+        draw(target(half_normal), store=tmp_path / "no" / "chain.h5")
+    with pytest.raises(InputError, match="the name of a file"):
+        draw(target(half_normal), store=tmp_path)
+
+
+def test_writing_costs_little(tmp_path):
+    """The rule by which checkpoints are spaced: their share of the time, measured."""
+    spent = []
+    original = ensemble.disk.save
+
+    def timed(*arguments):
+        spent.append(original(*arguments))
+        return spent[-1]
+
+    began = time.perf_counter()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(ensemble.disk, "save", timed)
+        draw(target(banana), store=tmp_path / "chain.h5", seed=1, target_ess=1e9, budget=3000)
+    assert sum(spent) < 0.1 * (time.perf_counter() - began)
+    assert len(spent) >= 3
+
+
+def test_the_last_digits_do_not_make_another_problem(store):
+    """A command compiles without optimisation: the same scan has other last digits there."""
+    base = {"none": np.array([0.1, 3e-9])}
+    one, other = (
+        target(half_normal, data=base),
+        target(half_normal, data={"none": base["none"] * (1 + 4e-16)}),
+    )
+    assert one.digest == other.digest
+    assert one.digest != target(half_normal, data={"none": base["none"] * (1 + 1e-7)}).digest
