@@ -20,6 +20,7 @@ _HOME = {
     "Drift": "beamfit.optics.elements",
     "EmittanceFit": "beamfit.studies.fit",
     "InputError": "beamfit.errors",
+    "Posterior": "beamfit.sampling.posterior",
     "QuadScan": "beamfit.studies.scans",
     "Quadrupole": "beamfit.optics.elements",
     "Screen": "beamfit.optics.elements",
