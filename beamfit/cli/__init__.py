@@ -12,6 +12,7 @@ import click
 from beamfit import __version__
 from beamfit.cli.emittance import emittance
 from beamfit.cli.lifetime import lifetime
+from beamfit.cli.setpoint import setpoint
 from beamfit.errors import InputError
 
 __all__ = ["cli", "main"]
@@ -28,6 +29,7 @@ def cli() -> None:
 
 cli.add_command(emittance)
 cli.add_command(lifetime)
+cli.add_command(setpoint)
 
 
 def main() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 
 import jax
 
@@ -20,7 +21,7 @@ from beamfit.studies.scenario_data import (
     varied_magnets,
 )
 
-__all__ = ["WIDTH", "calibration_numbers", "calibration_problem", "usual_bounds"]
+__all__ = ["WIDTH", "calibration_numbers", "calibration_problem", "usual_bounds", "with_numbers"]
 
 # The report's bounds are 167.23 ± 20 for the slope and 43.17 ± 20 for the intercept (appendix C).
 WIDTH = 20.0 / 167.23
@@ -137,3 +138,44 @@ def calibration_problem(seen: Seen, told: Assumptions) -> Problem:
 def _magnet_of(name: str, line: Beamline) -> str:
     """The magnet a calibration number belongs to; names may hold dots themselves."""
     return next(m for m in line.magnets if name in calibration_numbers(line, m))
+
+
+def with_numbers(line: Beamline, numbers: Mapping[str, float]) -> Beamline:
+    """Put calibration numbers into a line.
+
+    Parameters
+    ----------
+    line : Beamline
+        The line.
+    numbers : mapping of str to float
+        Such as ``{"Q2.slope": 160.0}``.
+
+    Returns
+    -------
+    Beamline
+
+    Raises
+    ------
+    InputError
+        If the line has no such number.
+
+    Examples
+    --------
+    >>> from beamfit.optics.elements import Quadrupole
+    >>> line = Beamline((Quadrupole("Q", 0.1),), energy=100.0)
+    >>> float(with_numbers(line, {"Q.scale": 1.1})["Q"].calibration.scale)
+    1.1
+    """
+    known = {n: v for m in line.magnets for n, v in calibration_numbers(line, m).items()}
+    for name in numbers:
+        if name not in known:
+            raise InputError(f"a calibration number '{name}'", nearest(name, list(known)))
+    for magnet in line.magnets:
+        own = calibration_numbers(line, magnet)
+        if set(own) & set(numbers):
+            old = line[magnet]
+            leaves_, structure = jax.tree_util.tree_flatten(old.calibration)
+            values = [numbers.get(name, v) for name, v in zip(own, leaves_, strict=True)]
+            new = jax.tree_util.tree_unflatten(structure, values)
+            line = line.with_element(replace(old, calibration=new))
+    return line

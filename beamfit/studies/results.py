@@ -246,6 +246,7 @@ class PlaneFit:
             "dof": self.dof,
             "rms_residual": self.rms_residual.to_json(),
             "identifiability": self.identifiability.to_json(),
+            "covariance": self.covariance.tolist() if np.isfinite(self.covariance).all() else None,
             "error_scale": self.error_scale,
             "noise": self.noise,
             "method": self.method,
