@@ -7,10 +7,11 @@ import re
 from beamfit.errors import InputError
 from beamfit.studies.assumptions import Anchor
 
-__all__ = ["anchor_of", "bounds_of", "priors_of"]
+__all__ = ["anchor_of", "bounds_of", "limits_of", "priors_of"]
 
 PRIOR = "NAME=MEAN+-SD such as Q2.slope=167.23+-3.3446"
 BOUNDS = "NAME=LOWER:UPPER such as Q2.slope=147.23:187.23"
+VARY = "MAGNET=LOW:HIGH such as Q2=0:10"
 ANCHOR = "first-principles=2%, determinant, or a setting such as Q2=0"
 
 
@@ -79,6 +80,28 @@ def bounds_of(texts: tuple[str, ...]) -> dict[str, tuple[float, float]]:
     for text in texts:
         name, low, high = _pair(text, "bounds", ":", BOUNDS)
         _once(found, name, "bounds", (low, high))
+    return found
+
+
+def limits_of(texts: tuple[str, ...]) -> dict[str, tuple[float, float]]:
+    """Read --vary options, ``MAGNET=LOW:HIGH``.
+
+    Raises
+    ------
+    InputError
+        If there is none, one is not of that form, or a magnet is given twice.
+
+    Examples
+    --------
+    >>> limits_of(("Q2=0:10",))
+    {'Q2': (0.0, 10.0)}
+    """
+    if not texts:
+        raise InputError("no --vary", VARY)
+    found: dict[str, tuple[float, float]] = {}
+    for text in texts:
+        name, low, high = _pair(text, "vary", ":", VARY)
+        _once(found, name, "vary", (low, high))
     return found
 
 

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
+from beamfit.cli.assumptions import limits_of
 from beamfit.cli.document import command_line, json_text
 from beamfit.errors import InputError
 from beamfit.inference.quantity import Quantity
@@ -98,7 +99,7 @@ def setpoint(
     The search is global within the limits: local minima are listed, not mistaken for the answer.
     """
     beams = _beams(sigma, fitted, plane)
-    limits = _limits(vary)
+    limits = limits_of(vary)
     wishes = [_wish(text, plane) for text in target]
     described = read_lattice(lattice, use=use, energy=energy)
 
@@ -146,22 +147,6 @@ def _beams(sigma: str | None, fitted: str | None, plane: str) -> dict[str, Fitte
     if len(numbers) != 3:
         raise InputError(f"--sigma '{sigma}'", "three numbers S11,S12,S22 in m², m rad, rad²")
     return {plane: FittedBeam(np.array(numbers), None, "given", {})}
-
-
-def _limits(texts: tuple[str, ...]) -> dict[str, tuple[float, float]]:
-    if not texts:
-        raise InputError("no --vary", "MAGNET=LOW:HIGH such as Q2=0:10")
-    found: dict[str, tuple[float, float]] = {}
-    for text in texts:
-        parts = re.fullmatch(r"\s*(.+?)\s*=([^:]+):([^:]+)", text)
-        try:
-            name, low, high = parts[1], float(parts[2]), float(parts[3])
-        except (TypeError, ValueError):
-            raise InputError(f"--vary '{text}'", "MAGNET=LOW:HIGH such as Q2=0:10") from None
-        if name in found:
-            raise InputError(f"--vary {name} given twice", "each magnet once")
-        found[name] = (low, high)
-    return found
 
 
 def _wish(text: str, plane: str) -> tuple[str, str, object]:

@@ -1,8 +1,8 @@
 """Errors where bounds may be all that is known of a number.
 
 A number that the data leave open ends on a bound or anywhere between two; its error is then a
-matter of the bounds. Here bounds count as a uniform prior of their width, and every quantity is
-asked which share of its variance rests on them.
+matter of the bounds. Here bounds count as such information, and every quantity is asked which
+share of its variance rests on them.
 """
 
 from __future__ import annotations
@@ -13,9 +13,8 @@ import numpy as np
 
 __all__ = ["MOST_SHARE", "Spread", "spread_of"]
 
-# A quantity counts as determined while bounds carry less than this share of its variance: taking
-# them for a prior then changes its error by at most 15 %.
-MOST_SHARE = 0.25
+# A quantity counts as determined while bounds carry less than this share of its variance.
+MOST_SHARE = 0.5
 # The variance of what nothing limits.
 UNSEEN = 1e60
 
@@ -47,7 +46,7 @@ def spread_of(
     held: np.ndarray | None = None,
     with_prior: np.ndarray | None = None,
 ) -> Spread:
-    """Covariance of numbers from the Jacobian of residuals, bounds counted as uniform priors.
+    """Covariance of numbers from the Jacobian of residuals, bounds counted as information.
 
     Parameters
     ----------
@@ -67,21 +66,23 @@ def spread_of(
 
     Notes
     -----
-    A uniform distribution of width w has the variance w²/12. Then Var(q) = g C g with
-    C = (JᵀJ + B)⁻¹, B = diag(12/w²), and C B C is the part of C that B carries.
+    A number that data leave open ends on one of its bounds, while the truth may lie anywhere
+    between them: the mean square distance from an end of a range of width w is w²/3 (and not
+    w²/12, as from its middle). Then Var(q) = g C g with C = (JᵀJ + B)⁻¹, B = diag(3/w²), and
+    C B C is the part of C that B carries.
 
     Examples
     --------
     >>> s = spread_of(np.array([[1.0, 0.0]]), np.array([0.0, 0.0]), np.array([100.0, 6.0]))
     >>> s.share(np.eye(2)).round(3).tolist(), s.error(np.eye(2)).round(2).tolist()
-    ([0.001, 1.0], [1.0, 1.73])
+    ([0.0, 1.0], [1.0, 3.46])
     """
     n = jacobian.shape[1]
     width = np.asarray(upper, float) - np.asarray(lower, float)
     usable = np.isfinite(width) & (width > 0)
     if with_prior is not None:
         usable &= ~with_prior
-    information = np.where(usable, 12.0 / np.where(usable, width, 1.0) ** 2, 0.0)
+    information = np.where(usable, 3.0 / np.where(usable, width, 1.0) ** 2, 0.0)
     loose = np.ones(n, bool) if held is None else ~held
     rows = np.vstack([jacobian, np.diag(np.sqrt(information))])[:, loose]
     length = np.linalg.norm(rows, axis=0)

@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-__all__ = ["Found", "descend_all"]
+__all__ = ["Found", "descend_all", "descend_one"]
 
 # A point is at rest when no loose number changes the cost by more than this, per unit of residual.
 _LEVEL = 1e-9
@@ -87,13 +87,40 @@ def descend_all(
     """
 
     def one(start: Array) -> Found:
-        return _descend(partial(residual, data), start, lower, upper, iterations, tolerance)
+        return descend_one(partial(residual, data), start, lower, upper, iterations, tolerance)
 
     return jax.vmap(one)(starts)
 
 
-def _descend(residual, start, lower, upper, iterations, tolerance) -> Found:
-    """One start; a state that has come to rest no longer changes."""
+def descend_one(
+    residual: Callable[[Array], Array],
+    start: Array,
+    lower: Array,
+    upper: Array,
+    iterations: int = 300,
+    tolerance: float = 1e-10,
+) -> Found:
+    """Minimise from one start; a pure JAX function, to be vectorised over anything.
+
+    Parameters
+    ----------
+    residual : callable
+        ``residual(theta)``, shape (m,).
+    start, lower, upper, iterations, tolerance
+        As for `descend_all`.
+
+    Returns
+    -------
+    Found
+
+    Examples
+    --------
+    >>> import beamfit.optics
+    >>> fit = jax.vmap(lambda y: descend_one(lambda t: t - y, jnp.zeros(1), -jnp.ones(1),
+    ...                                      jnp.ones(1)).theta)
+    >>> fit(jnp.array([0.5, 3.0])).ravel().tolist()
+    [0.5, 1.0]
+    """
     jacobian = jax.jacfwd(residual)
 
     def step(s: _State) -> _State:

@@ -41,6 +41,8 @@ class EmittanceFit:
         Changes of the unknowns that leave the sizes as they are.
     fit : Fit or None
         The grey-box fit of a scenario; None where transport is known and the fit is linear.
+    stated : Problem or None
+        A scenario's problem as it was stated, starting from first principles.
 
     Examples
     --------
@@ -63,6 +65,7 @@ class EmittanceFit:
     parameters: tuple[Parameter, ...] = ()
     null_directions: tuple[str, ...] = ()
     fit: Fit | None = None
+    stated: Problem | None = None
 
     @property
     def problem(self) -> Problem:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 import numpy as np
+from scipy.optimize import nnls
 
 from beamfit.errors import InputError
 from beamfit.greybox.mlp import MLP, Port, dense
@@ -76,20 +77,20 @@ def signed_network(
     node, out = _pattern(rising)
     net = dense(inputs, outputs, [hidden], seed=seed)
     first, last = "layer0->layer1", "layer1->layer2"
-    slope = 0.3
+    thresholds = np.linspace(-1.5, 1.5, hidden) if hidden > 1 else np.zeros(1)
     start = {first: np.zeros((len(inputs), hidden)), last: np.zeros((hidden, len(outputs)))}
     lead = int(np.argmax(node != 0)) if node.any() else 0
     way = node[lead] or 1.0
-    start[first][lead] = slope * way
+    start[first][lead] = way
     towards = np.where(out != 0, out, 1.0)
-    start[last] += towards / (hidden * slope)
+    start[last] += _straight(thresholds)[:, None] * towards
     model = MLP(
         net.layers,
         net.connections,
         net.input_ports,
         net.output_ports,
         start,
-        {"layer1": np.linspace(-0.2, 0.2, hidden), "layer2": np.zeros(len(outputs))},
+        {"layer1": way * thresholds, "layer2": np.zeros(len(outputs))},
     )
     bounds = {
         f"weights.{first}": _ends(np.broadcast_to(node[:, None], (len(inputs), hidden))),
@@ -98,6 +99,12 @@ def signed_network(
         "biases.layer2": _ends(np.zeros(len(outputs))),
     }
     return model, bounds
+
+
+def _straight(thresholds: np.ndarray) -> np.ndarray:
+    """Weights, none negative, that make the nodes add up to a straight line from -1 to 1."""
+    x = np.linspace(-1.0, 1.0, 41)
+    return nnls(np.tanh(x[:, None] + thresholds), x)[0]
 
 
 def _ends(sign: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

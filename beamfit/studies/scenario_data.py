@@ -165,8 +165,13 @@ def beam_free(beams: Mapping[str, Mapping[str, float]]) -> list[Free]:
     """The beam's numbers as free ones: l11 and l22 positive."""
     free = []
     for plane, numbers in beams.items():
-        for name, value in numbers.items():
-            reach = (value - 0.5 * abs(value) - 0.1, value + 0.5 * abs(value) + 0.1)
+        angle = float(np.hypot(numbers["l21"], numbers["l22"]))
+        reach = {
+            "l11": (0.5 * numbers["l11"], 1.5 * numbers["l11"]),
+            "l21": (-angle, angle),
+            "l22": (0.1 * angle, angle),
+        }
+        for name in numbers:
             low = -np.inf if name == "l21" else 1e-6
-            free.append(Free(f"beam.{plane}.{name}", low, np.inf, (max(reach[0], low), reach[1])))
+            free.append(Free(f"beam.{plane}.{name}", low, np.inf, reach[name]))
     return free

@@ -14,6 +14,7 @@ from jax import Array
 
 from beamfit.greybox import assess, tree
 from beamfit.greybox.fit import Fit
+from beamfit.greybox.problem import Problem
 from beamfit.inference.bounded import MOST_SHARE, Spread, spread_of
 from beamfit.inference.identifiability import chi2_probability, scaled_directions
 from beamfit.inference.quantity import Quantity, Status
@@ -29,7 +30,10 @@ from beamfit.studies.scenario_words import null_directions, verdict_words
 from beamfit.studies.sigma import emittance_parts
 from beamfit.studies.verdict import CLEAR, POOR_FIT, phase_coverage
 
-__all__ = ["Found", "Judged", "judged", "result_of"]
+# A further decrease of χ² below this changes nothing anybody asks for.
+SETTLED = 0.01
+
+__all__ = ["Found", "Judged", "judged", "result_of", "with_slope"]
 
 
 class Found(NamedTuple):
@@ -51,12 +55,17 @@ class Judged(NamedTuple):
     jacobian : ndarray
         Residuals by free numbers, shape (m, n), priors and anchors among the residuals.
     spread : Spread
-        Covariance with bounds counted as uniform priors.
+        Covariance with bounds counted as information.
+    settled : bool
+        Whether the search ended at an optimum, as far as the data can tell: the decrease of χ²
+        that a further Gauss-Newton step promises is below 0.01. Networks have flat valleys in
+        which a strict optimum is never reached and nothing changes any more.
     """
 
     fit: Fit
     jacobian: np.ndarray
     spread: Spread
+    settled: bool
 
     def quantities(self, function: Callable[[Any, Any], Array], data: Any) -> Found:
         """Values of ``function(model, data)`` with raw errors, and which the data determine.
@@ -64,7 +73,7 @@ class Judged(NamedTuple):
         The function is compiled once if it is defined at the top of a module.
         """
         core, theta = self.fit.problem.core, jnp.asarray(self.fit.theta)
-        value, slope = (np.asarray(v) for v in _with_slope(function, core, theta, data))
+        value, slope = (np.asarray(v) for v in with_slope(function, core, theta, data))
         usable = np.isfinite(value) & np.isfinite(slope).all(axis=-1)
         slope = np.where(usable[:, None], slope, 0.0)
         share = self.spread.share(slope)
@@ -72,7 +81,9 @@ class Judged(NamedTuple):
 
 
 @partial(jax.jit, static_argnums=0)
-def _with_slope(function, core, theta, data) -> tuple[Array, Array]:
+def with_slope(function, core, theta, data) -> tuple[Array, Array]:
+    """``function(model, data)`` as a flat vector, with its derivatives by the free numbers."""
+
     def of_theta(t):
         return jnp.ravel(function(tree.replace(core.model, core.chosen, t), data))
 
@@ -82,14 +93,22 @@ def _with_slope(function, core, theta, data) -> tuple[Array, Array]:
 def judged(fit: Fit) -> Judged:
     """Linearise a fit at its end; weights held by their bounds stay where they are."""
     p = fit.problem
-    jacobian = assess.slopes(p, fit.theta).residual_jacobian
+    at = assess.slopes(p, fit.theta)
     edge = np.array([v.state in ("lower", "upper") for v in fit.variables])
     held = (edge & p.nuisance) | (p.lower == p.upper)
     with_prior = np.isin(np.array(p.names), [prior.name for prior in p.priors])
-    return Judged(fit, jacobian, spread_of(jacobian, p.lower, p.upper, held, with_prior))
+    spread = spread_of(at.residual_jacobian, p.lower, p.upper, held, with_prior)
+    outward = ((fit.theta <= p.lower) & (at.gradient > 0)) | (
+        (fit.theta >= p.upper) & (at.gradient < 0)
+    )
+    pull = np.where(outward | held, 0.0, at.gradient)
+    settled = fit.status is not Status.not_converged or bool(spread.error(pull) ** 2 < SETTLED)
+    return Judged(fit, at.residual_jacobian, spread, settled)
 
 
-def result_of(seen: Seen, scenario: str, told: Assumptions, fit: Fit) -> EmittanceFit:
+def result_of(
+    seen: Seen, scenario: str, told: Assumptions, stated: Problem, fit: Fit
+) -> EmittanceFit:
     """Make the result of a scenario.
 
     Parameters
@@ -100,6 +119,8 @@ def result_of(seen: Seen, scenario: str, told: Assumptions, fit: Fit) -> Emittan
         Which scenario.
     told : Assumptions
         What it was told.
+    stated : Problem
+        The problem, starting from first principles.
     fit : Fit
         The trained problem.
 
@@ -121,6 +142,7 @@ def result_of(seen: Seen, scenario: str, told: Assumptions, fit: Fit) -> Emittan
         parameters=parameters,
         null_directions=null_directions(scenario, told, planes, parameters),
         fit=fit,
+        stated=stated,
     )
 
 
@@ -187,7 +209,7 @@ def _plane(
     n = j.quantities(_numbers, _places(seen, scenario, plane))
     known_noise = work.evidence.noise_known
     distance = float(n.value[0] / (2.0 * n.error[0] * fit.scale)) if n.error[0] > 0 else 0.0
-    found = fit.status not in (Status.not_finite, Status.not_converged, Status.infeasible)
+    found = j.settled and fit.status not in (Status.not_finite, Status.infeasible)
     clear = bool(n.known[0]) and distance >= CLEAR
     determined = clear and found
 

@@ -16,6 +16,7 @@ from beamfit.greybox.problem import Problem
 from beamfit.greybox.solve import solve, starting_points
 from beamfit.inference.many_starts import descend_all
 from beamfit.optics.beamline import Beamline
+from beamfit.status import Status
 from beamfit.studies.assumptions import Assumptions
 from beamfit.studies.calibration import calibration_problem
 from beamfit.studies.fit import EmittanceFit
@@ -28,7 +29,7 @@ from beamfit.studies.transport_network import transport_problem
 __all__ = ["fit_scenario", "scenario_problem", "train"]
 
 # Steps of the search from many starts; what is left is for the polish.
-STEPS = 300
+STEPS, POLISH = 300, 300
 
 
 def scenario_problem(seen: Seen, scenario: str, told: Assumptions) -> Problem:
@@ -73,15 +74,15 @@ def train(problem: Problem, starts: int, seed: int = 0) -> Fit:
         From the cheapest start; KKT residual, states and multipliers as of `solve`.
     """
     if starts == 1:
-        return solve(problem)
+        return solve(problem, iterations=POLISH)
     points = jnp.asarray(np.array(starting_points(problem, starts, seed)))
     lower, upper = jnp.asarray(problem.lower), jnp.asarray(problem.upper)
     found = descend_all(greybox.residual, problem.core, points, lower, upper, STEPS)
     cost = np.asarray(found.cost)
     if not np.isfinite(cost).any():
-        return solve(problem)
+        return solve(problem, iterations=POLISH)
     best = np.asarray(found.theta)[int(np.nanargmin(cost))]
-    return solve(replace(problem, model=problem.model_at(best)))
+    return solve(replace(problem, model=problem.model_at(best)), iterations=POLISH)
 
 
 def fit_scenario(
@@ -119,5 +120,18 @@ def fit_scenario(
     told.check_scenario(scenario)
     seen = see(scan, line, planes, method)
     problem = scenario_problem(seen, scenario, told)
-    fit = train(problem, told.starts if scenario.endswith("network") else 1, told.seed)
-    return result_of(seen, scenario, told, fit)
+    network = scenario.endswith("network")
+    fit = train(problem, told.starts if network else 1, told.seed)
+    if not network and _stranded(fit):
+        fit = train(problem, told.starts, told.seed)
+    return result_of(seen, scenario, told, problem, fit)
+
+
+def _stranded(fit: Fit) -> bool:
+    """Whether a search ended where one start may have led it astray.
+
+    A beam of no emittance is a stationary point of every fit in its Cholesky factor, so a start
+    near it (the known-transport fit with a wrong calibration, say) may never leave it.
+    """
+    flat = any(v.name.endswith(".l22") and v.state == "lower" for v in fit.variables)
+    return flat or (fit.status is not Status.converged and fit.chi2 > 2.0 * max(fit.dof, 1))
