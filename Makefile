@@ -6,7 +6,7 @@ export OPENBLAS_NUM_THREADS := 1
 export OMP_NUM_THREADS := 1
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
-.PHONY: demo test bench lint clean
+.PHONY: demo test coverage bench lint clean
 .DEFAULT_GOAL := demo
 
 .venv/runtime: pyproject.toml constraints.txt
@@ -29,6 +29,10 @@ demo: .venv/runtime
 test: .venv/test lint
 	$(BIN)/python -m pytest --quiet --numprocesses 2
 
+# Errors of every scenario held against 500 simulated scans each.
+coverage: .venv/test
+	BEAMFIT_COVERAGE=500 $(BIN)/python -m pytest --quiet tests/studies/test_coverage.py
+
 lint: .venv/test
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
@@ -38,6 +42,7 @@ bench: .venv/bench
 	$(BIN)/python benchmarks/emittance.py
 	$(BIN)/python benchmarks/lifetime.py
 	$(BIN)/python benchmarks/greybox.py 20 0
+	$(BIN)/python benchmarks/scenarios.py
 
 clean:
 	rm -rf .venv demo dist build

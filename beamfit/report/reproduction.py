@@ -100,8 +100,8 @@ def _verdicts(found: Reproduction) -> list[Verdict]:
             "of the intercept in Appendix C, to all digits. Between slopes of "
             f"{high.slope} and {low.slope} chi2 moves by "
             f"{abs(high.chi2 - low.chi2):.2f} while the emittance goes from "
-            f"{1e9 * high.emittance:.2f} to {1e9 * low.emittance:.2f} nm; which bound a fit ends on "
-            "is a matter of the noise. With a 2 % prior on the "
+            f"{1e9 * high.emittance:.2f} to {1e9 * low.emittance:.2f} nm; which bound a fit ends "
+            "on is a matter of the noise. With a 2 % prior on the "
             f"slope it is {found.prior.x.emittance}.",
         ),
     ]

@@ -99,7 +99,12 @@ def information_of(fit: EmittanceFit) -> Information:
     p, theta = fit.problem, linearised_at(fit)
     jacobian = assess.slopes(p, theta).residual_jacobian
     # Errors as the fit scaled them: a fit that misses its sizes learns less from the next one.
-    jacobian = jacobian / max(plane.error_scale for plane in fit.planes)
+    scale = max(plane.error_scale for plane in fit.planes)
+    rows = np.concatenate(
+        [np.full(r.measured.size, scale if r.name.startswith("size") else 1.0) for r in p.records]
+        + [np.ones(len(jacobian) - sum(r.measured.size for r in p.records))]
+    )
+    jacobian = jacobian / rows[:, None]
     held = p.lower == p.upper
     if fit.fit is not None and _determined(fit):
         edge = np.array([v.state in ("lower", "upper") for v in fit.fit.variables])

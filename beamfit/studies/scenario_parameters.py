@@ -59,21 +59,20 @@ def parameters_of(seen: Seen, scenario: str, told: Assumptions, j: Judged) -> tu
 def _calibration(told: Assumptions, j: Judged):
     p = j.fit.problem
     every = np.eye(len(p.names))
-    errors, shares = j.spread.error(every), j.spread.share(every)
+    errors, raws, shares = j.scaled.error(every), j.spread.error(every), j.scaled.share(every)
     for i, variable in enumerate(j.fit.variables):
         if variable.name.startswith("beam."):
             continue
-        raw = float(errors[i])
         determined = shares[i] < MOST_SHARE
         edge = variable.state in ("lower", "upper")
         status = Status.converged if determined else Status.unidentified
         if edge:
             status = Status.at_limit
-        error = raw * j.fit.scale if determined and not edge else None
+        error, raw = (float(errors[i]), float(raws[i])) if determined and not edge else (None, None)
         unit = next((u for end, u in UNITS.items() if variable.name.endswith(end)), "1")
         yield Parameter(
             name=variable.name,
-            value=Quantity(variable.value, error, unit, None if error is None else raw),
+            value=Quantity(variable.value, error, unit, raw),
             status=status,
             state=variable.state,
             lower=variable.lower,
@@ -115,16 +114,16 @@ def _strengths(seen: Seen, told: Assumptions, j: Judged):
         length = float(seen.scanned[name].length)
         found = j.quantities(_k1, _Asked(name, jnp.asarray(at), length, energy))
         for i, current in enumerate(at):
-            yield _derived(j, f"{name}.k1 at {current:g}", found, i)
+            yield _derived(f"{name}.k1 at {current:g}", found, i)
         if told.hysteresis:
             both = jnp.array([[middle, 1.0], [middle, -1.0]])
             found = j.quantities(_loop, _Asked(name, both, length, energy))
-            yield _derived(j, f"{name}.k1 rising less falling at {middle:g}", found, 0)
+            yield _derived(f"{name}.k1 rising less falling at {middle:g}", found, 0)
 
 
-def _derived(j: Judged, name: str, found: Found, i: int) -> Parameter:
-    raw, known = float(found.error[i]), bool(found.known[i])
-    error = (raw * j.fit.scale, raw) if known else (None, None)
+def _derived(name: str, found: Found, i: int) -> Parameter:
+    error = (float(found.error[i]), float(found.raw[i])) if found.known[i] else (None, None)
+    known = bool(found.known[i])
     return Parameter(
         name=name,
         value=Quantity(float(found.value[i]), error[0], "1/m^2", error[1]),

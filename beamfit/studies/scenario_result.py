@@ -37,10 +37,11 @@ __all__ = ["Found", "Judged", "judged", "result_of", "with_slope"]
 
 
 class Found(NamedTuple):
-    """Values, their raw errors, whether data and priors determine them, and their slopes."""
+    """Values, errors (as quoted, and raw), whether they are determined, and their slopes."""
 
     value: np.ndarray
     error: np.ndarray
+    raw: np.ndarray
     known: np.ndarray
     slope: np.ndarray
 
@@ -53,9 +54,12 @@ class Judged(NamedTuple):
     fit : Fit
         Of the grey-box core.
     jacobian : ndarray
-        Residuals by free numbers, shape (m, n), priors and anchors among the residuals.
+        Residuals by free numbers, shape (m, n), priors and anchors among them, as scaled.
     spread : Spread
-        Covariance with bounds counted as information.
+        Covariance with bounds counted as information, errors as given.
+    scaled : Spread
+        The same with the sizes' errors enlarged by sqrt(χ²/dof) where that exceeds 1. Priors and
+        anchors are not enlarged: that the sizes miss the model says nothing against them.
     settled : bool
         Whether the search ended at an optimum, as far as the data can tell: the decrease of χ²
         that a further Gauss-Newton step promises is below 0.01. Networks have flat valleys in
@@ -65,6 +69,7 @@ class Judged(NamedTuple):
     fit: Fit
     jacobian: np.ndarray
     spread: Spread
+    scaled: Spread
     settled: bool
 
     def quantities(self, function: Callable[[Any, Any], Array], data: Any) -> Found:
@@ -76,8 +81,8 @@ class Judged(NamedTuple):
         value, slope = (np.asarray(v) for v in with_slope(function, core, theta, data))
         usable = np.isfinite(value) & np.isfinite(slope).all(axis=-1)
         slope = np.where(usable[:, None], slope, 0.0)
-        share = self.spread.share(slope)
-        return Found(value, self.spread.error(slope), usable & (share < MOST_SHARE), slope)
+        known = usable & (self.scaled.share(slope) < MOST_SHARE)
+        return Found(value, self.scaled.error(slope), self.spread.error(slope), known, slope)
 
 
 @partial(jax.jit, static_argnums=0)
@@ -98,12 +103,16 @@ def judged(fit: Fit) -> Judged:
     held = (edge & p.nuisance) | (p.lower == p.upper)
     with_prior = np.isin(np.array(p.names), [prior.name for prior in p.priors])
     spread = spread_of(at.residual_jacobian, p.lower, p.upper, held, with_prior)
+    sizes = [np.full(r.measured.size, r.name.startswith("size")) for r in p.records]
+    sizes = np.concatenate([*sizes, np.zeros(len(at.residual) - sum(map(len, sizes)), bool)])
+    rows = at.residual_jacobian / np.where(sizes, fit.scale, 1.0)[:, None]
+    scaled = spread_of(rows, p.lower, p.upper, held, with_prior)
     outward = ((fit.theta <= p.lower) & (at.gradient > 0)) | (
         (fit.theta >= p.upper) & (at.gradient < 0)
     )
     pull = np.where(outward | held, 0.0, at.gradient)
     settled = fit.status is not Status.not_converged or bool(spread.error(pull) ** 2 < SETTLED)
-    return Judged(fit, at.residual_jacobian, spread, settled)
+    return Judged(fit, rows, spread, scaled, settled)
 
 
 def result_of(
@@ -208,7 +217,7 @@ def _plane(
     work, fit = seen.works[plane], j.fit
     n = j.quantities(_numbers, _places(seen, scenario, plane))
     known_noise = work.evidence.noise_known
-    distance = float(n.value[0] / (2.0 * n.error[0] * fit.scale)) if n.error[0] > 0 else 0.0
+    distance = float(n.value[0] / (2.0 * n.error[0])) if n.error[0] > 0 else 0.0
     found = j.settled and fit.status not in (Status.not_finite, Status.infeasible)
     clear = bool(n.known[0]) and distance >= CLEAR
     determined = clear and found
@@ -217,8 +226,7 @@ def _plane(
         value = float(n.value[i] * factor)
         if not (determined and n.known[i]):
             return Quantity(value, None, unit)
-        raw = float(n.error[i] * factor)
-        return Quantity(value, raw * fit.scale, unit, raw)
+        return Quantity(value, float(n.error[i] * factor), unit, float(n.raw[i] * factor))
 
     points = _points(seen, plane, fit)
     probability = chi2_probability(fit.chi2, fit.dof)

@@ -133,15 +133,13 @@ def verdict_words(
     if status is Status.poor_fit:
         ratio = fit.chi2 / fit.dof
         words = (
-            f"Poor fit: chi2/dof = {ratio:.2g}, errors are scaled by {math.sqrt(ratio):.1f}. "
-            + words
+            f"Poor fit: chi2/dof = {ratio:.2g} over all planes; the sizes' errors are scaled by "
+            f"{math.sqrt(ratio):.1f}. " + words
         )
     open_ones = [p.name for p in parameters if p.status is not Status.converged]
     if open_ones:
-        words += (
-            f" {', '.join(open_ones)} not determined by the data: what depends on it has no error, "
-            "and the emittance hardly does."
-        )
+        words += f" {', '.join(open_ones)} not determined: what depends on it has no error"
+        words += ", and the emittance hardly does." if scenario == "calibration" else "."
     priors = [p.name for p in parameters if p.prior is not None]
     if priors:
         words += f" Rests on the prior of {', '.join(priors)}."
