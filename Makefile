@@ -6,7 +6,7 @@ export OPENBLAS_NUM_THREADS := 1
 export OMP_NUM_THREADS := 1
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
-.PHONY: demo test calibrate bench lint clean
+.PHONY: demo test calibrate coverage bench lint clean
 .DEFAULT_GOAL := demo
 
 .venv/runtime: pyproject.toml constraints.txt
@@ -33,6 +33,10 @@ test: .venv/test lint
 calibrate: .venv/test
 	$(BIN)/python -m pytest --quiet -m calibrate --numprocesses 2 -rP tests/sampling
 
+# Errors of every scenario held against 500 simulated scans each.
+coverage: .venv/test
+	BEAMFIT_COVERAGE=500 $(BIN)/python -m pytest --quiet tests/studies/test_coverage.py
+
 lint: .venv/test
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
@@ -43,6 +47,7 @@ bench: .venv/bench
 	$(BIN)/python benchmarks/lifetime.py
 	$(BIN)/python benchmarks/greybox.py 20 0
 	$(BIN)/python benchmarks/sampling.py
+	$(BIN)/python benchmarks/scenarios.py
 
 clean:
 	rm -rf .venv demo dist build

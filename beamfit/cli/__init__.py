@@ -10,8 +10,10 @@ from pathlib import Path
 import click
 
 from beamfit import __version__
+from beamfit.cli.design import design
 from beamfit.cli.emittance import emittance
 from beamfit.cli.lifetime import lifetime
+from beamfit.cli.setpoint import setpoint
 from beamfit.errors import InputError
 
 __all__ = ["cli", "main"]
@@ -28,6 +30,8 @@ def cli() -> None:
 
 cli.add_command(emittance)
 cli.add_command(lifetime)
+cli.add_command(setpoint)
+cli.add_command(design)
 
 
 def main() -> None:

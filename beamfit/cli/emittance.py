@@ -6,11 +6,13 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from beamfit.cli.assumptions import anchor_of, bounds_of, priors_of
 from beamfit.cli.document import check_report_name, command_line, json_text
 from beamfit.cli.sampling import Sampling, print_posterior, sampling_options
 from beamfit.io.lattice import LatticeFile
 from beamfit.io.line import build_line, read_lattice
 from beamfit.io.measurement import read_quad_scan
+from beamfit.studies.assumptions import SCENARIOS, Assumptions
 from beamfit.studies.scans import QuadScan, check_names
 
 if TYPE_CHECKING:
@@ -25,6 +27,8 @@ Examples:
   beamfit emittance scan.csv --lattice line.toml --plane x --report scan.pdf
   beamfit emittance scan.csv --lattice line.madx --use LINE --json
   beamfit emittance scan.csv --lattice line.toml --sample --store scan.h5 --report scan.html
+  beamfit emittance measurements/gtf_simulated.csv --lattice lattices/gtf.toml \\
+    --scenario calibration --prior Q2.slope=167.23+-3.3446
 """
 
 
@@ -52,6 +56,42 @@ Examples:
 )
 @click.option("--robust", is_flag=True, help="Give each point a probability of being an outlier.")
 @click.option(
+    "--scenario",
+    type=click.Choice(SCENARIOS),
+    default="known",
+    show_default=True,
+    help="What is unknown besides the beam: nothing, R11 and R12, the magnets' calibration, or k1 "
+    "as a function of the current.",
+)
+@click.option(
+    "--prior",
+    multiple=True,
+    metavar="NAME=MEAN+-SD",
+    help="Calibration: what is known of a number, such as Q2.slope=167.23+-3.3446 (or ±).",
+)
+@click.option(
+    "--bounds",
+    multiple=True,
+    metavar="NAME=LOW:HIGH",
+    help="Calibration: bounds of a number; ± 12 % of the slope unless given.",
+)
+@click.option(
+    "--anchor",
+    multiple=True,
+    metavar="ANCHOR",
+    help="Networks: what ties them to the lattice: first-principles=2%, a setting such as Q2=0, "
+    "or determinant.",
+)
+@click.option(
+    "--hysteresis",
+    is_flag=True,
+    help="Focusing network: branches of k1 for rising and falling currents, by the order of rows.",
+)
+@click.option("--hidden", type=int, default=5, show_default=True, help="Networks: hidden nodes.")
+@click.option(
+    "--starts", type=int, default=20, show_default=True, help="Networks: starts of the training."
+)
+@click.option(
     "--report",
     type=click.Path(),
     metavar="FILE.html|FILE.pdf",
@@ -76,6 +116,13 @@ def emittance(
     plane: str | None,
     method: str,
     robust: bool,
+    scenario: str,
+    prior: tuple[str, ...],
+    bounds: tuple[str, ...],
+    anchor: tuple[str, ...],
+    hysteresis: bool,
+    hidden: int,
+    starts: int,
     report: str | None,
     as_json: bool,
     use: str | None,
@@ -92,6 +139,10 @@ def emittance(
     check_report_name(report)
     sampling = Sampling(sample, store, seed)
     sampling.check()
+    told = Assumptions(
+        priors_of(prior), bounds_of(bounds), anchor_of(anchor), hysteresis, hidden, starts, seed
+    )
+    told.check_scenario(scenario)
     measured = read_quad_scan(scan)
     described = read_lattice(lattice, use=use, energy=energy)
     check_names(
@@ -111,6 +162,8 @@ def emittance(
         planes=planes,
         method=method.replace("-", "_"),
         robust=robust,
+        scenario=scenario,
+        **vars(told),
     )
     inputs = {str(scan): measured.sha256, str(lattice): described.sha256}
     command = command_line()
@@ -139,6 +192,9 @@ def _planes(plane: str | None, scan: QuadScan) -> tuple[str, ...]:
 
 
 def _results(fit: EmittanceFit) -> list[dict[str, Any]]:
+    if fit.scenario != "known":
+        return fit.to_json()
+
     from beamfit.studies.sensitivity import range_sensitivity, systematics
 
     return [
@@ -157,15 +213,25 @@ def _print(
     """Show tables, the verdict and what the budget is."""
     from rich.console import Console
 
-    from beamfit.cli.terminal import budget_table, range_table, result_table, verdict_lines
+    from beamfit.cli.terminal import (
+        budget_table,
+        range_table,
+        result_table,
+        scenario_lines,
+        verdict_lines,
+    )
 
     # Names are shown as they are: a bracket in one is not a style.
     console = Console(highlight=False, markup=False)
     console.print(result_table(fit))
     for p in fit.planes:
         console.print(verdict_lines(p))
-    console.print(budget_table(fit))
-    console.print(range_table(fit))
+    if fit.scenario == "known":
+        console.print(budget_table(fit))
+        console.print(range_table(fit))
+    else:
+        for shown in scenario_lines(fit):
+            console.print(shown)
     errors = fit.scan.error_source if fit.scan.error else "inferred from the residuals"
     console.print(f"Errors of the sizes: {errors}.", style="dim")
     if posterior is not None:

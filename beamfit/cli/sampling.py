@@ -73,7 +73,7 @@ def sampling_options(command: Callable[..., Any]) -> Callable[..., Any]:
             type=click.IntRange(0, 2**32 - 1),
             default=1,
             show_default=True,
-            help="Of the random numbers of --sample.",
+            help="Of all random numbers: draws, starts of networks.",
         ),
         click.option(
             "--store",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 from rich.table import Table
 from rich.text import Text
@@ -11,13 +11,14 @@ from beamfit.inference.quantity import Status
 from beamfit.studies.fit import EmittanceFit
 from beamfit.studies.results import PlaneFit
 from beamfit.studies.sensitivity import budget_rows, range_rows
-from beamfit.studies.tables import result_rows
+from beamfit.studies.tables import parameter_rows, result_rows
 
 __all__ = [
     "budget_table",
     "plain_table",
     "range_table",
     "result_table",
+    "scenario_lines",
     "status_table",
     "verdict_lines",
     "verdict_text",
@@ -74,6 +75,21 @@ def verdict_text(name: str, status: Status, message: str) -> Text:
 def verdict_lines(plane: PlaneFit) -> Text:
     """Say the verdict of one plane in its colour."""
     return verdict_text(plane.plane, plane.status, plane.message)
+
+
+def scenario_lines(fit: EmittanceFit) -> Iterator[Table | Text]:
+    """Lay out what was fitted besides the beam, and what the data leave open."""
+    if fit.parameters:
+        table = plain_table("")
+        for name in ("Fitted too", "value", "bounds", "prior", "state"):
+            table.add_column(name)
+        for name, cells in parameter_rows(fit.parameters):
+            table.add_row(name, *cells)
+        yield table
+    for words in fit.null_directions:
+        yield Text("Left open: ", style="bold").append(words + ".", style="not bold")
+    if fit.scenario.endswith("network"):
+        yield Text(f"Anchor: {fit.anchor}.", style="dim")
 
 
 def budget_table(fit: EmittanceFit) -> Table:

@@ -10,7 +10,12 @@ from beamfit.report.figures import pictures
 from beamfit.studies.fit import EmittanceFit
 from beamfit.studies.results import PlaneFit
 from beamfit.studies.sensitivity import budget_rows, range_rows
-from beamfit.studies.tables import identifiability_rows, point_rows, result_rows
+from beamfit.studies.tables import (
+    identifiability_rows,
+    parameter_rows,
+    point_rows,
+    result_rows,
+)
 
 __all__ = ["emittance_page"]
 
@@ -46,6 +51,27 @@ def emittance_page(
     tables = [
         by_name("Result", names, result_rows(fit.planes), ERRORS),
         by_name("What the data determine", names, identifiability_rows(fit.planes)),
+        *(_budgets(fit, names) if fit.scenario == "known" else _fitted_too(fit)),
+        *(Table(f"Points, {p.plane} plane", *point_rows(p), numeric=True) for p in fit.planes),
+    ]
+    energy = f"{float(line.energy):g} MeV"
+    if fit.scenario != "known":
+        energy += f", scenario {fit.scenario}"
+    return Page(
+        title=f"Emittance of {scan.name}",
+        subtitle=f"{len(scan)} settings on line {line.name}, {energy}; {written()}",
+        verdicts=[_verdict(p) for p in fit.planes],
+        tables=tables,
+        pictures=[Picture(*each) for each in pictures(fit)],
+        pictures_title="Scan and fit",
+        provenance=provenance(inputs, [("errors of the sizes", source)], command),
+        notes=scan.provenance,
+    )
+
+
+def _budgets(fit: EmittanceFit, names: list[str]) -> list[Table]:
+    """What the emittance would be with another line or fewer points."""
+    return [
         by_name(
             "If the line were a little different",
             names,
@@ -59,19 +85,20 @@ def emittance_page(
             range_rows(fit),
             "Normalised emittance, and its shift in standard errors of the full fit.",
         ),
-        *(Table(f"Points, {p.plane} plane", *point_rows(p), numeric=True) for p in fit.planes),
     ]
-    energy = f"{float(line.energy):g} MeV"
-    return Page(
-        title=f"Emittance of {scan.name}",
-        subtitle=f"{len(scan)} settings on line {line.name}, {energy}; {written()}",
-        verdicts=[_verdict(p) for p in fit.planes],
-        tables=tables,
-        pictures=[Picture(*each) for each in pictures(fit)],
-        pictures_title="Scan and fit",
-        provenance=provenance(inputs, [("errors of the sizes", source)], command),
-        notes=scan.provenance,
-    )
+
+
+def _fitted_too(fit: EmittanceFit) -> list[Table]:
+    """What a scenario fitted besides the beam, and what the data leave open."""
+    rows = [[name, *cells] for name, cells in parameter_rows(fit.parameters)]
+    header = ["fitted too", "value", "bounds", "prior", "state"]
+    parts = [Table(f"Scenario {fit.scenario}", header, rows, f"Anchor: {fit.anchor}.")]
+    if not rows:
+        parts = []
+    if fit.null_directions:
+        listed = [[words + "."] for words in fit.null_directions]
+        parts.append(Table("Left open by the data", [], listed))
+    return parts
 
 
 def _verdict(p: PlaneFit) -> Verdict:

@@ -54,7 +54,10 @@ def draw_scan(figure: FigureBase, fit: EmittanceFit, plane: str) -> None:
     varied = [n for n, v in p.points.settings.items() if np.ptp(v) > 0]
     if len(varied) == 1:
         at = p.points.settings[varied[0]]
-        _curves(above, fit, p, varied[0])
+        if fit.scenario == "transport-network":  # known at the measured currents alone
+            above.plot(at, 1e6 * p.points.model, "_", ms=14, mew=2, color=COLOUR[plane], alpha=0.6)
+        else:
+            _curves(above, fit, p, varied[0])
         below.set_xlabel(f"{varied[0]}, {UNITS[fit.scan.units[varied[0]]]}")
     else:
         at = np.arange(1, len(p.points.size) + 1)
@@ -100,7 +103,8 @@ def _curves(axes: Axes, fit: EmittanceFit, p: PlaneFit, magnet: str) -> None:
         style = ["-", "--", ":", "-."][index % 4]
         name = "fit" if len(screens) == 1 else f"fit at {screen}"
         axes.plot(grid, 1e6 * size, style, color=COLOUR[p.plane], lw=1.6, label=name)
-        if np.isfinite(p.covariance).all():
+        # In a scenario the beam's errors go with those of the calibration: no band of σ alone.
+        if fit.scenario == "known" and np.isfinite(p.covariance).all():
             variance = np.einsum("ij,jk,ik->i", design, p.covariance, design)
             half = p.error_scale * np.sqrt(variance) / (2.0 * np.maximum(size, 1e-9))
             axes.fill_between(
@@ -144,7 +148,7 @@ def draw_ellipses(figure: FigureBase, fit: EmittanceFit) -> None:
     fit : EmittanceFit
         A fit with a positive emittance in at least one plane.
     """
-    drawn = [p for p in fit.planes if p.emittance.value > 0]
+    drawn = [p for p in fit.planes if _has_ellipses(p)]
     start, screen = figure.subplots(1, 2)
     for p in drawn:
         _ellipse(start, p, p.beta.value, p.alpha.value)
@@ -177,9 +181,14 @@ def pictures(fit: EmittanceFit) -> list[tuple[str, float, Callable[[FigureBase],
         (f"scan of the {p.plane} plane", 4.6, partial(draw_scan, fit=fit, plane=p.plane))
         for p in fit.planes
     ]
-    if any(p.emittance.value > 0 for p in fit.planes):
+    if any(_has_ellipses(p) for p in fit.planes):
         listed.append(("phase ellipses", 3.4, partial(draw_ellipses, fit=fit)))
     return listed
+
+
+def _has_ellipses(p: PlaneFit) -> bool:
+    """Whether the beam has an area, and is known at the screen as well."""
+    return p.emittance.value > 0 and bool(np.isfinite(p.screen.beta.value))
 
 
 def _ellipse(axes: Axes, p: PlaneFit, beta: float, alpha: float) -> None:

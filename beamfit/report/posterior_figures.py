@@ -16,7 +16,12 @@ from beamfit.sampling.posterior import Posterior
 from beamfit.sampling.text import in_unit, plain_name
 from beamfit.studies.decay_result import DecayFit
 from beamfit.studies.fit import EmittanceFit
-from beamfit.studies.predictive import Expected, expected_current, expected_sizes
+from beamfit.studies.predictive import (
+    Expected,
+    expected_current,
+    expected_scenario_sizes,
+    expected_sizes,
+)
 
 __all__ = ["beam_posterior_pictures", "decay_posterior_pictures", "draw_pairs"]
 
@@ -155,9 +160,12 @@ def draw_expected_sizes(
     plane : str
         "x" or "y".
     """
-    p, given = fit[plane].points, posterior.target.data[plane]
-    error = np.asarray(given.error)
-    found = expected_sizes(posterior, plane, p.r11, p.r12, p.known, error)
+    p = fit[plane].points
+    if fit.scenario == "known":
+        error = np.asarray(posterior.target.data[plane].error)
+        found = expected_sizes(posterior, plane, p.r11, p.r12, p.known, error)
+    else:
+        error, found = p.error, expected_scenario_sizes(posterior, fit, plane)
     varied = [n for n, v in p.settings.items() if np.ptp(v) > 0]
     if len(varied) == 1:
         at, label = p.settings[varied[0]], f"{varied[0]}, {UNITS[fit.scan.units[varied[0]]]}"
@@ -244,6 +252,8 @@ def beam_posterior_pictures(fit: EmittanceFit, posterior: Posterior) -> list[Pic
 def _of_plane(posterior: Posterior, plane: str) -> list[str]:
     wanted = ["normalized_emittance", "beta", "alpha", "error_factor", "outlier_fraction"]
     names = [f"{plane}.{name}" for name in wanted]
+    # What was fitted besides the beam, in a scenario.
+    names += [name for name in posterior.names if not name.startswith(("x.", "y.", "beam."))]
     return [name for name in names if name in posterior.shown][:MOST_NUMBERS]
 
 

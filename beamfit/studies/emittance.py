@@ -1,8 +1,9 @@
-"""The emittance fit with known transport: a scan and a line in, a judged result out."""
+"""The emittance fit: a scan and a line in, a judged result out; here with known transport."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 
 import numpy as np
 
@@ -11,6 +12,7 @@ from beamfit.inference.identifiability import scaled_directions
 from beamfit.inference.quantity import Quantity
 from beamfit.optics.beamline import Beamline
 from beamfit.optics.particle import beta_gamma
+from beamfit.studies.assumptions import Anchor, Assumptions
 from beamfit.studies.fit import EmittanceFit
 from beamfit.studies.plane import PlaneWork, next_measurement, work_on
 from beamfit.studies.results import Identifiability, PlaneFit, ScreenTwiss
@@ -36,6 +38,14 @@ def fit_emittance(
     planes: tuple[str, ...] | None = None,
     method: str = "size_squared",
     robust: bool = False,
+    scenario: str = "known",
+    priors: Mapping[str, tuple[float, float]] | None = None,
+    bounds: Mapping[str, tuple[float, float]] | None = None,
+    anchor: Anchor | None = None,
+    hysteresis: bool = False,
+    hidden: int = 5,
+    starts: int = 20,
+    seed: int = 0,
 ) -> EmittanceFit:
     """Fit the beam matrix at the start of a line to a scan, and judge the result.
 
@@ -51,6 +61,19 @@ def fit_emittance(
         The residual: the report's ``error_linear`` or ``error_nonlinear``.
     robust : bool
         Give each point a probability of being an outlier (with "size_squared").
+    scenario : {"known", "transport-network", "calibration", "focusing-network"}
+        What is unknown besides the beam: nothing; R11 and R12; slope and offset of the scanned
+        magnets' calibration; k1 as a function of the current. All planes are then fitted
+        together. See docs/scenarios.md for what each cannot know.
+    priors, bounds : mapping of str to (float, float), optional
+        Calibration number, such as "Q2.slope", to mean and standard deviation, or to lower and
+        upper bound ("calibration").
+    anchor : Anchor, optional
+        What ties a network to first principles.
+    hysteresis : bool
+        Two branches of k1, for rising and falling currents ("focusing-network").
+    hidden, starts, seed : int
+        Hidden nodes of a network, starts of its training, seed of their random numbers.
 
     Returns
     -------
@@ -82,6 +105,16 @@ def fit_emittance(
     ('converged', '2.0000 nm')
     """
     _check_options(method, robust)
+    told = Assumptions(
+        priors or {}, bounds or {}, anchor or Anchor(), hysteresis, hidden, starts, seed
+    )
+    told.check_scenario(scenario)
+    if scenario != "known":
+        if robust:
+            raise InputError(f"a robust fit in scenario {scenario}", "scenario known")
+        from beamfit.studies.scenarios import fit_scenario  # loads the grey-box core
+
+        return fit_scenario(scan, line, scenario, told, planes, method)
     check_names(scan, *names_of(line))
     scanned = scanned_line(scan, line)
     asked = planes or scan.planes

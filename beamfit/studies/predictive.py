@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -13,8 +13,9 @@ from beamfit.lifetime.decay import current
 from beamfit.optics.beam import BeamMatrix
 from beamfit.sampling.posterior import Posterior
 from beamfit.studies.decay_posterior import DecayNumbers
+from beamfit.studies.fit import EmittanceFit
 
-__all__ = ["Expected", "expected_current", "expected_sizes"]
+__all__ = ["Expected", "expected_current", "expected_scenario_sizes", "expected_sizes"]
 
 
 class Expected(NamedTuple):
@@ -84,6 +85,33 @@ def expected_sizes(
         return jnp.sqrt(first**2 + (r12 * beam.l22) ** 2 + known)
 
     return _expected(posterior, posterior.derive(sizes), error, f"{plane}.")
+
+
+def expected_scenario_sizes(posterior: Posterior, fit: EmittanceFit, plane: str) -> Expected:
+    """Sizes that the posterior of a scenario expects.
+
+    Parameters
+    ----------
+    posterior : Posterior
+        Of `EmittanceFit.sample`.
+    fit : EmittanceFit
+        Of a scenario.
+    plane : str
+        "x" or "y".
+
+    Returns
+    -------
+    Expected
+        In m.
+    """
+    record = next(r for r in fit.problem.records if r.name == f"size {plane}")
+    squared = fit[plane].method == "size_squared"
+
+    def sizes(model: Any) -> Array:
+        found = record.predict(model, record.data)
+        return 1e-6 * (jnp.sqrt(found) if squared else found)
+
+    return _expected(posterior, posterior.derive(sizes), fit[plane].points.error, "")
 
 
 def expected_current(posterior: Posterior, time: np.ndarray, error: np.ndarray) -> Expected:

@@ -12,7 +12,7 @@ from beamfit.inference.quantity import Quantity, Status
 if TYPE_CHECKING:
     from beamfit.optics.beam import BeamMatrix
 
-__all__ = ["Identifiability", "PlaneFit", "Points", "ScreenTwiss"]
+__all__ = ["Identifiability", "Parameter", "PlaneFit", "Points", "ScreenTwiss"]
 
 
 class Points(NamedTuple):
@@ -46,6 +46,45 @@ class Points(NamedTuple):
     r11: np.ndarray
     r12: np.ndarray
     known: np.ndarray
+
+
+class Parameter(NamedTuple):
+    """A number fitted besides the beam: a calibration number, or k1 of a network.
+
+    Attributes
+    ----------
+    name : str
+        Such as "Q2.slope".
+    value : Quantity
+        With an error only if data and priors determine it.
+    status : Status
+        ``converged``, ``unidentified``, or ``at_limit`` for a number that ends on a bound.
+    state : str
+        ``free``, ``lower`` or ``upper``.
+    lower, upper : float
+        Bounds; infinite where there is none.
+    prior : tuple of float, or None
+        Mean and standard deviation.
+    multiplier : float
+        d(χ²/2)/d(bound) where it ends on one.
+    """
+
+    name: str
+    value: Quantity
+    status: Status
+    state: str
+    lower: float
+    upper: float
+    prior: tuple[float, float] | None
+    multiplier: float
+
+    def to_json(self) -> dict[str, Any]:
+        """Give one entry of ``parameters``."""
+        return self._asdict() | {
+            "value": self.value.to_json(),
+            "status": str(self.status),
+            "prior": None if self.prior is None else list(self.prior),
+        }
 
 
 class ScreenTwiss(NamedTuple):
@@ -207,6 +246,7 @@ class PlaneFit:
             "dof": self.dof,
             "rms_residual": self.rms_residual.to_json(),
             "identifiability": self.identifiability.to_json(),
+            "covariance": self.covariance.tolist() if np.isfinite(self.covariance).all() else None,
             "error_scale": self.error_scale,
             "noise": self.noise,
             "method": self.method,

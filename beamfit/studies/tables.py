@@ -6,12 +6,19 @@ from collections.abc import Callable
 from html import escape
 
 from beamfit.inference.quantity import Quantity
-from beamfit.studies.results import PlaneFit
+from beamfit.studies.results import Parameter, PlaneFit
 
 # A longer table of points is cut, and says so.
 MOST_ROWS = 500
 
-__all__ = ["as_html", "as_text", "identifiability_rows", "point_rows", "result_rows"]
+__all__ = [
+    "as_html",
+    "as_text",
+    "identifiability_rows",
+    "parameter_rows",
+    "point_rows",
+    "result_rows",
+]
 
 
 def result_rows(planes: tuple[PlaneFit, ...]) -> list[tuple[str, list[str]]]:
@@ -98,6 +105,19 @@ def identifiability_rows(
         ("betatron phase seen", lambda p: _degrees(p.identifiability.phase_coverage)),
     ]
     return [(label, [cell(p) for p in planes]) for label, cell in rows]
+
+
+def parameter_rows(parameters: tuple[Parameter, ...]) -> list[tuple[str, list[str]]]:
+    """Name, value, bounds, prior and state of every number fitted besides the beam."""
+    rows = []
+    for p in parameters:
+        bounded = abs(p.lower) < 1e300 or abs(p.upper) < 1e300
+        said = f"{p.state} bound, multiplier {p.multiplier:.2g}" if p.state != "free" else "free"
+        value = _cell(p.value).replace("(not determined)", "(open)")
+        prior = f"{p.prior[0]:.6g} ± {p.prior[1]:.3g}" if p.prior else "-"
+        limits = f"{p.lower:.6g} to {p.upper:.6g}" if bounded else "-"
+        rows.append((p.name, [value, limits, prior, said]))
+    return rows
 
 
 def _condition(value: float | None) -> str:

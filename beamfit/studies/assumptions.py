@@ -1,0 +1,150 @@
+"""What a user tells a scenario besides the data: priors, bounds, anchors. Plain values, no JAX."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+from beamfit.errors import InputError, nearest
+
+__all__ = ["SCENARIOS", "Anchor", "Assumptions"]
+
+SCENARIOS = ("known", "transport-network", "calibration", "focusing-network")
+
+
+@dataclass(frozen=True)
+class Anchor:
+    """What ties a network to first principles; without it a scan cannot tell scale from beam.
+
+    Parameters
+    ----------
+    deviation : float, optional
+        Relative standard deviation of the network from first principles, independent at each
+        measured setting: of R11 and R12 in units of their rms over the scan
+        (transport-network), of k1 at the largest current (focusing-network).
+    at : tuple of mapping, optional
+        Settings, magnet name to value, at which first principles hold.
+    sd : float
+        Relative standard deviation there.
+    determinant : bool
+        Ask for det T = 1 at every setting, with C and D two further free functions of the
+        network (transport-network).
+
+    Raises
+    ------
+    InputError
+        If a deviation is not positive.
+
+    Examples
+    --------
+    >>> Anchor(deviation=0.02).words
+    'first principles to 2 %'
+    """
+
+    deviation: float | None = None
+    at: tuple[Mapping[str, float], ...] = ()
+    sd: float = 1e-3
+    determinant: bool = False
+
+    def __post_init__(self) -> None:
+        for name in ("deviation", "sd"):
+            value = getattr(self, name)
+            if value is not None and not (math.isfinite(value) and value > 0):
+                raise InputError(f"anchor {name} {value}", "a positive relative deviation")
+
+    @property
+    def words(self) -> str:
+        """The anchor in words; "none" if nothing is tied."""
+        parts = []
+        if self.deviation is not None:
+            parts.append(f"first principles to {100 * self.deviation:.3g} %")
+        for place in self.at:
+            where = ", ".join(f"{n} = {v:g}" for n, v in place.items())
+            parts.append(f"first principles at {where} to {100 * self.sd:.3g} %")
+        if self.determinant:
+            parts.append("det T = 1 with C and D free")
+        return " and ".join(parts) or "none"
+
+
+@dataclass(frozen=True)
+class Assumptions:
+    """Everything a scenario is told besides scan and line.
+
+    Parameters
+    ----------
+    priors : mapping of str to (float, float), optional
+        Calibration number, such as ``Q2.slope``, to mean and standard deviation.
+    bounds : mapping of str to (float, float), optional
+        The same to a lower and an upper bound.
+    anchor : Anchor, optional
+        For the networks.
+    hysteresis : bool
+        Whether k1 of a focusing network may differ between rising and falling current.
+    hidden : int
+        Hidden nodes of a network.
+    starts, seed : int
+        Starts of a network's training, and the seed of their random numbers.
+
+    Raises
+    ------
+    InputError
+        If a prior's standard deviation is not positive, bounds are reversed or not finite, or a
+        count is below one.
+
+    Examples
+    --------
+    >>> Assumptions(priors={"Q2.slope": (167.23, 3.3446)}).priors["Q2.slope"]
+    (167.23, 3.3446)
+    """
+
+    priors: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    bounds: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    anchor: Anchor = field(default_factory=Anchor)
+    hysteresis: bool = False
+    hidden: int = 5
+    starts: int = 20
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        for name, (mean, sd) in self.priors.items():
+            if not (math.isfinite(mean) and math.isfinite(sd) and sd > 0):
+                raise InputError(
+                    f"prior {name} = {mean:g}+-{sd:g}", "a finite mean and a positive deviation"
+                )
+        for name, (low, high) in self.bounds.items():
+            if not (math.isfinite(low) and math.isfinite(high) and low < high):
+                raise InputError(f"bounds {name} = {low:g}:{high:g}", "finite bounds, lower first")
+            mean = self.priors.get(name, (low, 0.0))[0]
+            if not low <= mean <= high:
+                raise InputError(
+                    f"prior mean {mean:g} of {name} outside its bounds {low:g}:{high:g}",
+                    "a mean within the bounds",
+                )
+        for name in ("hidden", "starts"):
+            if getattr(self, name) < 1:
+                raise InputError(f"{getattr(self, name)} {name}", "at least one")
+
+    def check_scenario(self, scenario: str) -> None:
+        """Refuse an unknown scenario, and what a scenario has no use for.
+
+        Raises
+        ------
+        InputError
+            If the scenario is unknown, or priors, bounds, an anchor or branches do not apply.
+        """
+        if scenario not in SCENARIOS:
+            raise InputError(f"scenario '{scenario}'", nearest(scenario, list(SCENARIOS)))
+        named = [*self.priors, *self.bounds]
+        if named and scenario != "calibration":
+            raise InputError(
+                f"a prior or bounds on {named[0]} with scenario {scenario}",
+                "scenario calibration, whose calibration numbers are free",
+            )
+        networks = ("transport-network", "focusing-network")
+        if self.anchor != Anchor() and scenario not in networks:
+            raise InputError(f"an anchor with scenario {scenario}", " or ".join(networks))
+        if self.anchor.determinant and scenario != "transport-network":
+            raise InputError(f"anchor determinant with scenario {scenario}", "transport-network")
+        if self.hysteresis and scenario != "focusing-network":
+            raise InputError(f"hysteresis with scenario {scenario}", "focusing-network")

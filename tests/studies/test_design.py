@@ -1,0 +1,129 @@
+"""What to measure next: against brute force, and against what the measurement then does."""
+
+import numpy as np
+import pytest
+
+import beamfit
+from beamfit.errors import InputError
+from beamfit.studies.design import plan_measurements
+from tests.studies.conftest import TABLE_2, design
+
+
+@pytest.fixture(scope="module")
+def scan(root):
+    return beamfit.read_quad_scan(root / "measurements/gtf_simulated.csv")
+
+
+@pytest.fixture(scope="module")
+def known(scan, gtf):
+    return beamfit.fit_emittance(scan, gtf)
+
+
+@pytest.fixture(scope="module")
+def free(scan, gtf):
+    return beamfit.fit_emittance(scan, gtf, scenario="calibration")
+
+
+def emittance_error(fit, rows, relative):
+    """Relative emittance error after further rows, by inverting the normal matrix anew."""
+    x = fit.x
+    sigma = np.array([q.value for q in x.sigma])
+    information = np.linalg.inv(x.covariance)
+    for row in rows:
+        information = information + np.outer(row, row) / (2 * relative * (row @ sigma)) ** 2
+    gradient = np.array([sigma[2], -2 * sigma[1], sigma[0]]) / (2 * x.emittance.value)
+    return np.sqrt(gradient @ np.linalg.inv(information) @ gradient) / x.emittance.value
+
+
+def test_the_first_point_is_the_best_of_all(gtf, known):
+    limits = {"Q2": (0.0, 5.0)}
+    advice = plan_measurements(known, limits=limits, count=1)
+    [step] = advice.steps
+    currents = np.linspace(0.0, 5.0, 41)
+    rows = design(gtf, {"Q2": currents})
+    relative = float(np.median(known.x.points.error / known.x.points.size))
+    errors = [emittance_error(known, [row], relative) for row in rows]
+    assert step.candidate.settings["Q2"] == pytest.approx(currents[int(np.argmin(errors))])
+    assert step.relative_error["x"] == pytest.approx(min(errors), rel=1e-4)
+    assert advice.now["x"] == pytest.approx(known.x.emittance.relative, rel=1e-4)
+
+
+def test_d_optimal_is_best_in_volume(gtf, known):
+    advice = plan_measurements(known, limits={"Q2": (0.0, 5.0)}, criterion="D", count=1)
+    currents = np.linspace(0.0, 5.0, 41)
+    rows = design(gtf, {"Q2": currents})
+    sigma = np.array([q.value for q in known.x.sigma])
+    relative = float(np.median(known.x.points.error / known.x.points.size))
+    # det(A + r rT/v) = det A (1 + rT A^-1 r/v)
+    gains = [row @ known.x.covariance @ row / (2 * relative * (row @ sigma)) ** 2 for row in rows]
+    best = currents[int(np.argmax(gains))]
+    assert advice.steps[0].candidate.settings["Q2"] == pytest.approx(best)
+
+
+def test_measuring_what_is_advised_does_what_was_promised(gtf, scan, known):
+    advice = plan_measurements(known, limits={"Q2": (0.0, 5.0)}, count=4)
+    more = np.array([s.candidate.settings["Q2"] for s in advice.steps])
+    sizes = np.sqrt(design(gtf, {"Q2": more}) @ TABLE_2)
+    together = beamfit.QuadScan(
+        {"Q2": np.append(scan.settings["Q2"], more)},
+        {"Q2": "A"},
+        {"x": np.append(scan.size["x"], sizes)},
+        {"x": np.append(scan.error["x"], 0.02 * sizes)},
+    )
+    after = beamfit.fit_emittance(together, gtf).x.emittance.relative
+    assert after == pytest.approx(advice.steps[-1].relative_error["x"], rel=0.05)
+
+
+def test_it_stops_at_the_goal_and_when_nothing_is_left_to_gain(known):
+    near = plan_measurements(known, goal=0.0100, count=10)
+    assert near.steps[-1].relative_error["x"] <= 0.0100 < near.steps[-2].relative_error["x"]
+    assert near.stop.startswith("Stop")
+    done = plan_measurements(known, goal=0.05)
+    assert done.steps == ()
+    long = plan_measurements(known, count=200)
+    assert len(long.steps) < 100
+    assert "repeat the scan instead" in long.stop
+
+
+def test_an_open_calibration_is_told_which_measurement_closes_it(free):
+    advice = plan_measurements(free)
+    assert not advice.identified
+    verdicts = {o.words: o.identified for o in advice.options}
+    assert verdicts["the same scan on a new screen in the middle of D1"]
+    assert verdicts["a prior of 2 % on Q2.slope"]
+    assert not verdicts["the same scan at 38.12 MeV"]
+    assert not any(s.identified for s in advice.steps)
+    assert "It would be determined with" in advice.message
+
+
+def test_and_that_measurement_closes_it(root):
+    """The second screen of gtf_two_screens.toml is the advised kind."""
+    scan = beamfit.read_quad_scan(root / "measurements/gtf_two_screens_simulated.csv")
+    line = beamfit.load_lattice(root / "lattices/gtf_two_screens.toml")
+    first = np.array(scan.screen) == "SCREEN"
+    alone = beamfit.QuadScan(
+        {"Q2": scan.settings["Q2"][first]}, {"Q2": "A"}, {"x": scan.size["x"][first]},
+        {"x": scan.error["x"][first]}, screen=("SCREEN",) * 14,
+    )  # fmt: skip
+    before = beamfit.fit_emittance(alone, line, scenario="calibration")
+    option = next(
+        o for o in plan_measurements(before).options if o.words == "the same scan on screen PRE"
+    )
+    assert before.x.emittance.error is None
+    assert option.identified
+    after = beamfit.fit_emittance(scan, line, scenario="calibration")
+    assert after.x.emittance.relative == pytest.approx(option.relative_error["x"], rel=0.2)
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"limits": {"Q9": (0.0, 1.0)}}, "Q9"),
+        ({"limits": {"Q2": (1.0, 0.0)}}, "lower first"),
+        ({"criterion": "A"}, "emittance or D"),
+        ({"count": 0}, "at least one"),
+    ],
+)
+def test_bad_wishes_are_named(known, options, words):
+    with pytest.raises(InputError, match=words):
+        plan_measurements(known, **options)
