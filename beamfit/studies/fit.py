@@ -122,8 +122,8 @@ class EmittanceFit:
         Returns
         -------
         Posterior
-            Of ``x.sigma11`` ... (in a scenario of its free numbers); ``x.emittance``, ``x.normalized_emittance``, ``x.beta``,
-            ``x.alpha``, ``x.mismatch`` are derived.
+            Of ``x.sigma11`` ... (in a scenario of its free numbers); ``x.emittance``,
+            ``x.normalized_emittance``, ``x.beta``, ``x.alpha``, ``x.mismatch`` are derived.
 
         Raises
         ------

@@ -89,7 +89,8 @@ def scenario_target(
     -------
     Target
         Of the problem's numbers; ``x.emittance``, ``x.normalized_emittance``, ``x.beta`` and
-        ``x.alpha`` are derived, and the prior's own where the scenario does not determine them.
+        ``x.alpha`` are derived, and the prior's own where the
+        fit gives them no error.
 
     Raises
     ------
@@ -101,7 +102,9 @@ def scenario_target(
     energy = np.mean(fit.scan.energy) if fit.scan.energy is not None else fit.line.energy
     factor = {plane: jnp.asarray(beta_gamma(float(energy), fit.line.mass)) for plane in planes}
     names = tuple(f"{plane}.{name}" for plane in planes for name in TWISS)
-    doubtful = {p.plane for p in fit.planes if not p.identifiability.determined}
+    open_ones = tuple(
+        f"{p.plane}.{name}" for p in fit.planes for name in TWISS if getattr(p, name).error is None
+    )
     own = plain.likelihood.names
     count = len(plain.names) - len(own)
     return replace(
@@ -115,6 +118,6 @@ def scenario_target(
         mode=plain.mode[:count],
         covariance=plain.covariance[:count, :count],
         derived=Derived(names, tuple(TWISS.values()) * len(planes)),
-        priors_own=(*plain.priors_own, *(n for n in names if n.split(".")[0] in doubtful)),
+        priors_own=(*plain.priors_own, *open_ones),
         hidden=(*plain.hidden, *(n for n in plain.names if n.startswith("beam."))),
     )
