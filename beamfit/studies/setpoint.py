@@ -13,15 +13,15 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from beamfit.errors import InputError, nearest
+from beamfit.errors import InputError
 from beamfit.greybox import tree
 from beamfit.inference.many_starts import descend_all
 from beamfit.inference.quantity import Quantity, Status
 from beamfit.optics.beamline import Beamline
+from beamfit.studies.setpoint_checks import checked_place
 
 __all__ = ["Beam", "Minimum", "PlaneBeam", "Setpoint", "Target", "find_setpoint"]
 
-KINDS = ("size", "divergence", "match")
 # Starts of the search: enough for the handful of minima a few magnets have.
 STARTS = 256
 # Two end points are one minimum if they differ by less than this share of the range.
@@ -191,7 +191,7 @@ def find_setpoint(
     >>> round(1e6 * found.predicted[0].size.value, 3), len(found.others)
     (100.0, 1)
     """
-    screen = _checked(line, beams, vary, targets, screen)
+    screen = checked_place(line, beams, vary, targets, screen)
     low, high = (np.array([v[i] for v in vary.values()], float) for i in (0, 1))
     middle, reach = 0.5 * (low + high), 0.5 * (high - low)
     planes = tuple(dict.fromkeys(t.plane for t in targets))
@@ -220,59 +220,6 @@ def find_setpoint(
         status, words, listed[0], tuple(listed[1:]), errors, limits, screen, predicted,
         tuple(targets),
     )  # fmt: skip
-
-
-def _checked(line, beams, vary, targets, screen) -> str:
-    """Refuse names and ranges that cannot be used; name the screen."""
-    if not targets:
-        raise InputError("no target", "a size, a divergence or a match")
-    if not vary:
-        raise InputError("no magnet to vary", f"some of {', '.join(line.magnets)}")
-    for name, (low, high) in vary.items():
-        if name not in line.magnets:
-            raise InputError(f"no magnet '{name}' in the line", nearest(name, list(line.magnets)))
-        if not (math.isfinite(low) and math.isfinite(high) and low < high):
-            raise InputError(f"limits {low:g}:{high:g} of {name}", "finite limits, lower first")
-    if screen is None and not line.screens:
-        raise InputError("a line without a screen", "a screen where the beam is wanted")
-    place = line.screens[-1] if screen is None else screen
-    names = [e.name for e in line.elements]
-    if place not in names:
-        raise InputError(f"no place '{place}' in the line", nearest(place, names))
-    late = [n for n in vary if names.index(n) > names.index(place)]
-    if late:
-        raise InputError(f"{late[0]}, downstream of {place}", "magnets between start and screen")
-    _check_targets(beams, targets)
-    for plane, beam in beams.items():
-        _check_beam(plane, beam.sigma)
-    return place
-
-
-def _check_targets(beams, targets) -> None:
-    for target in targets:
-        if target.kind not in KINDS:
-            raise InputError(f"target '{target.kind}'", nearest(target.kind, list(KINDS)))
-        if target.plane not in beams:
-            raise InputError(
-                f"a target in plane {target.plane}, whose beam is not given", "a beam matrix of it"
-            )
-        positive = target.value[0] if target.kind == "match" else target.value
-        if not (math.isfinite(positive) and positive > 0):
-            raise InputError(f"target {target.kind} {positive:g}", "a positive number")
-
-
-def _check_beam(plane: str, sigma: np.ndarray) -> None:
-    s11, s12, s22 = sigma
-    if not (s11 > 0 and s11 * s22 > s12**2):
-        raise InputError(
-            f"sigma = {s11:g}, {s12:g}, {s22:g} in plane {plane}",
-            "sigma11 > 0 and sigma11*sigma22 > sigma12**2: a positive definite matrix in SI",
-        )
-    if s11 > 1.0:
-        raise InputError(
-            f"sigma11 = {s11:g} m^2 in plane {plane}, a beam of {math.sqrt(s11):.2g} m",
-            "SI units, such as 2.6e-8",
-        )
 
 
 def _starts(count: int, seed: int) -> np.ndarray:
