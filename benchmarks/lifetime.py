@@ -25,8 +25,8 @@ from beamfit.io.ring import ring_from_pyat
 from beamfit.lifetime.losses import population
 from beamfit.lifetime.solve import solve_decay
 from beamfit.lifetime.touschek import piwinski_rate
-from beamfit.studies.decay import fit_decay, fit_decays
-from beamfit.studies.decay_record import DecayRecord
+from beamfit.studies.decay.fit import fit_decay, fit_decays
+from beamfit.studies.decay.record import DecayRecord
 
 sys.path.insert(0, str(Path(__file__).parent))
 import spear3_lattice

@@ -20,8 +20,8 @@ from rich.table import Table
 import beamfit
 from beamfit.lifetime.decay import current
 from beamfit.sampling.posterior import Posterior
-from beamfit.studies.decay import fit_decay
-from beamfit.studies.decay_record import DecayRecord
+from beamfit.studies.decay.fit import fit_decay
+from beamfit.studies.decay.record import DecayRecord
 
 WALKERS, STEPS, DISCARD, REPEATS = 32, 4000, 500, 3
 

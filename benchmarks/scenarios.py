@@ -22,9 +22,9 @@ import beamfit
 from beamfit.greybox import problem as greybox
 from beamfit.greybox.solve import starting_points
 from beamfit.inference.many_starts import descend_all
-from beamfit.studies.assumptions import Anchor, Assumptions
-from beamfit.studies.scenario_data import see
-from beamfit.studies.scenarios import STEPS, scenario_problem, train
+from beamfit.studies.scan.assumptions import Anchor, Assumptions
+from beamfit.studies.scan.scenario_data import see
+from beamfit.studies.scan.scenarios import STEPS, scenario_problem, train
 
 ROOT = Path(__file__).parents[1]
 OPTIONS = {"ipopt.print_level": 0, "print_time": 0, "ipopt.tol": 1e-9, "ipopt.max_iter": 3000}

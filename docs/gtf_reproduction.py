@@ -9,7 +9,7 @@ from pathlib import Path
 import beamfit
 from beamfit.io.files import digest
 from beamfit.report.reproduction import write_reproduction
-from beamfit.studies.reproduction import reproduce
+from beamfit.studies.scan.reproduction import reproduce
 
 ROOT = Path(__file__).resolve().parents[1]
 INPUTS = ("measurements/gtf_simulated.csv", "lattices/gtf.toml")

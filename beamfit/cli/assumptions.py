@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 
 from beamfit.errors import InputError
-from beamfit.studies.assumptions import Anchor
+from beamfit.studies.scan.assumptions import Anchor
 
 __all__ = ["anchor_of", "bounds_of", "limits_of", "priors_of"]
 

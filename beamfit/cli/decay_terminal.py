@@ -9,7 +9,9 @@ from rich.text import Text
 
 from beamfit.cli.terminal import plain_table, status_table, verdict_text
 from beamfit.inference.quantity import Status
-from beamfit.studies.decay_tables import (
+from beamfit.studies.decay.shift import Shift
+from beamfit.studies.decay.study import RecordStudy
+from beamfit.studies.decay.tables import (
     FEW,
     alike,
     check_rows,
@@ -18,9 +20,7 @@ from beamfit.studies.decay_tables import (
     separability_rows,
     shift_rows,
 )
-from beamfit.studies.decay_tables import budget_rows as loss_rows
-from beamfit.studies.decays import RecordStudy
-from beamfit.studies.shift import Shift
+from beamfit.studies.decay.tables import budget_rows as loss_rows
 
 __all__ = ["decay_tables", "shift_lines"]
 

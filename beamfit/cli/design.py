@@ -11,11 +11,11 @@ from beamfit.cli.document import command_line, json_text
 from beamfit.errors import InputError
 from beamfit.io.line import build_line, read_lattice
 from beamfit.io.measurement import read_quad_scan
-from beamfit.studies.assumptions import SCENARIOS, Assumptions
-from beamfit.studies.scans import check_names
+from beamfit.studies.scan.assumptions import SCENARIOS, Assumptions
+from beamfit.studies.scan.scans import check_names
 
 if TYPE_CHECKING:
-    from beamfit.studies.design import Advice
+    from beamfit.studies.scan.design import Advice
 
 __all__ = ["design"]
 
@@ -89,8 +89,8 @@ def design(
         described.rest_energy,
     )
 
-    from beamfit.studies.design import plan_measurements  # JAX from here on
-    from beamfit.studies.emittance import fit_emittance
+    from beamfit.studies.scan.design import plan_measurements  # JAX from here on
+    from beamfit.studies.scan.emittance import fit_emittance
 
     fit = fit_emittance(measured, build_line(described), scenario=scenario, **vars(told))
     advice = plan_measurements(

@@ -12,12 +12,12 @@ from beamfit.cli.sampling import Sampling, print_posterior, sampling_options
 from beamfit.io.lattice import LatticeFile
 from beamfit.io.line import build_line, read_lattice
 from beamfit.io.measurement import read_quad_scan
-from beamfit.studies.assumptions import SCENARIOS, Assumptions
-from beamfit.studies.scans import QuadScan, check_names
+from beamfit.studies.scan.assumptions import SCENARIOS, Assumptions
+from beamfit.studies.scan.scans import QuadScan, check_names
 
 if TYPE_CHECKING:
     from beamfit.sampling.posterior import Posterior
-    from beamfit.studies.fit import EmittanceFit
+    from beamfit.studies.scan.fit import EmittanceFit
 
 __all__ = ["emittance"]
 
@@ -154,7 +154,7 @@ def emittance(
     )
     planes = _planes(plane, measured)
 
-    from beamfit.studies.emittance import fit_emittance  # JAX from here on
+    from beamfit.studies.scan.emittance import fit_emittance  # JAX from here on
 
     fit = fit_emittance(
         measured,
@@ -195,7 +195,7 @@ def _results(fit: EmittanceFit) -> list[dict[str, Any]]:
     if fit.scenario != "known":
         return fit.to_json()
 
-    from beamfit.studies.sensitivity import range_sensitivity, systematics
+    from beamfit.studies.scan.sensitivity import range_sensitivity, systematics
 
     return [
         p.to_json()

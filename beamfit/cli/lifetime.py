@@ -14,8 +14,8 @@ from beamfit.io.files import digest
 
 if TYPE_CHECKING:
     from beamfit.sampling.posterior import Posterior
-    from beamfit.studies.decays import RecordStudy
-    from beamfit.studies.shift import Shift
+    from beamfit.studies.decay.shift import Shift
+    from beamfit.studies.decay.study import RecordStudy
 
 __all__ = ["lifetime"]
 
@@ -87,16 +87,16 @@ def lifetime(
         inputs[ring] = digest(ring)
         described, operation = read_ring(ring), read_operation(ring)
 
-        from beamfit.studies.loss_budget import Machine  # JAX from here on
+        from beamfit.studies.decay.loss_budget import Machine  # JAX from here on
 
         machine = Machine(described, operation)
 
-    from beamfit.studies.decays import study_record
+    from beamfit.studies.decay.study import study_record
 
     studies = tuple(study_record(each, machine) for each in records)
     shift = None
     if study:
-        from beamfit.studies.shift import study_shift
+        from beamfit.studies.decay.shift import study_shift
 
         shift = study_shift([decay for each in studies for decay in each.decays], machine)
     command = command_line()

@@ -15,7 +15,7 @@ from beamfit.io.line import build_line, read_lattice
 from beamfit.io.result import FittedBeam, read_fitted_beams
 
 if TYPE_CHECKING:
-    from beamfit.studies.setpoint import Setpoint
+    from beamfit.studies.scan.setpoint import Setpoint
 
 __all__ = ["setpoint"]
 
@@ -103,7 +103,7 @@ def setpoint(
     wishes = [_wish(text, plane) for text in target]
     described = read_lattice(lattice, use=use, energy=energy)
 
-    from beamfit.studies.setpoint import Beam, Target, find_setpoint  # JAX from here on
+    from beamfit.studies.scan.setpoint import Beam, Target, find_setpoint  # JAX from here on
 
     line = build_line(described)
     for beam in beams.values():
@@ -187,7 +187,7 @@ def _recalibrated(line, numbers: dict[str, float]):
     """Put fitted calibration numbers into the line, so that the beam meets its own magnets."""
     if not numbers:
         return line
-    from beamfit.studies.calibration import with_numbers
+    from beamfit.studies.scan.calibration import with_numbers
 
     return with_numbers(line, numbers)
 

@@ -8,10 +8,10 @@ from rich.table import Table
 from rich.text import Text
 
 from beamfit.inference.quantity import Status
-from beamfit.studies.fit import EmittanceFit
-from beamfit.studies.results import PlaneFit
-from beamfit.studies.sensitivity import budget_rows, range_rows
-from beamfit.studies.tables import parameter_rows, result_rows
+from beamfit.studies.scan.fit import EmittanceFit
+from beamfit.studies.scan.results import PlaneFit
+from beamfit.studies.scan.sensitivity import budget_rows, range_rows
+from beamfit.studies.scan.tables import parameter_rows, result_rows
 
 __all__ = [
     "budget_table",

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from beamfit.studies.scans import QuadScan, row_keys
+from beamfit.studies.scan.scans import QuadScan, row_keys
 
 __all__ = ["average_shots"]
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from beamfit.errors import InputError, nearest
 from beamfit.io.files import text_lines
-from beamfit.studies.decay_record import Conditions, DecayRecord, first_fault
+from beamfit.studies.decay.record import Conditions, DecayRecord, first_fault
 
 __all__ = ["read_decay_record"]
 

@@ -23,7 +23,7 @@ from beamfit.io.columns import (
 )
 from beamfit.io.files import digest, text_lines
 from beamfit.io.hdf5_table import read_hdf5
-from beamfit.studies.scans import QuadScan, first_unusable
+from beamfit.studies.scan.scans import QuadScan, first_unusable
 
 __all__ = ["read_quad_scan"]
 

@@ -12,8 +12,8 @@ from matplotlib.figure import FigureBase
 from beamfit.errors import InputError
 from beamfit.lifetime.decay import current
 from beamfit.report.document import Picture
-from beamfit.studies.decay_checks import moving_lifetime
-from beamfit.studies.decays import Decay, RecordStudy
+from beamfit.studies.decay.checks import moving_lifetime
+from beamfit.studies.decay.study import Decay, RecordStudy
 
 __all__ = ["decay_pictures", "draw_budget", "draw_lifetime", "draw_record"]
 

@@ -7,7 +7,9 @@ from collections.abc import Mapping, Sequence
 from beamfit.inference.quantity import Status
 from beamfit.report.decay_figures import decay_pictures
 from beamfit.report.document import Page, Table, Verdict, by_name, provenance, written
-from beamfit.studies.decay_tables import (
+from beamfit.studies.decay.shift import Shift
+from beamfit.studies.decay.study import Decay, RecordStudy
+from beamfit.studies.decay.tables import (
     FEW,
     alike,
     budget_rows,
@@ -18,8 +20,6 @@ from beamfit.studies.decay_tables import (
     separability_rows,
     shift_rows,
 )
-from beamfit.studies.decays import Decay, RecordStudy
-from beamfit.studies.shift import Shift
 
 __all__ = ["decay_page"]
 

@@ -7,10 +7,10 @@ from collections.abc import Mapping
 from beamfit.inference.quantity import Status
 from beamfit.report.document import Page, Picture, Table, Verdict, by_name, provenance, written
 from beamfit.report.figures import pictures
-from beamfit.studies.fit import EmittanceFit
-from beamfit.studies.results import PlaneFit
-from beamfit.studies.sensitivity import budget_rows, range_rows
-from beamfit.studies.tables import (
+from beamfit.studies.scan.fit import EmittanceFit
+from beamfit.studies.scan.results import PlaneFit
+from beamfit.studies.scan.sensitivity import budget_rows, range_rows
+from beamfit.studies.scan.tables import (
     identifiability_rows,
     parameter_rows,
     point_rows,

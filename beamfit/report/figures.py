@@ -13,9 +13,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import FigureBase
 
 from beamfit.inference.quantity import Status
-from beamfit.studies.fit import EmittanceFit
-from beamfit.studies.results import PlaneFit
-from beamfit.studies.transport import scanned_line, transfer_rows
+from beamfit.studies.scan.fit import EmittanceFit
+from beamfit.studies.scan.results import PlaneFit
+from beamfit.studies.scan.transport import scanned_line, transfer_rows
 
 __all__ = ["STYLE", "draw_ellipses", "draw_scan", "pictures"]
 

@@ -17,10 +17,10 @@ from beamfit.report.figures import STYLE
 from beamfit.report.pdf import pdf_of
 from beamfit.report.posterior import with_beam_posterior, with_decay_posteriors
 from beamfit.sampling.posterior import Posterior
-from beamfit.studies.decay_result import DecayFit
-from beamfit.studies.decays import Decay, RecordStudy
-from beamfit.studies.fit import EmittanceFit
-from beamfit.studies.shift import Shift
+from beamfit.studies.decay.result import DecayFit
+from beamfit.studies.decay.shift import Shift
+from beamfit.studies.decay.study import Decay, RecordStudy
+from beamfit.studies.scan.fit import EmittanceFit
 
 __all__ = ["write_report"]
 

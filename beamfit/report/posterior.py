@@ -8,8 +8,8 @@ from beamfit.report.document import Page, Picture, Table, Verdict
 from beamfit.report.posterior_figures import beam_posterior_pictures, decay_posterior_pictures
 from beamfit.sampling.posterior import Posterior
 from beamfit.sampling.text import HEADER, diagnostic_rows, interval_rows, plain_name
-from beamfit.studies.decay_result import DecayFit
-from beamfit.studies.fit import EmittanceFit
+from beamfit.studies.decay.result import DecayFit
+from beamfit.studies.scan.fit import EmittanceFit
 
 __all__ = ["with_beam_posterior", "with_decay_posteriors"]
 

@@ -13,15 +13,12 @@ from matplotlib.ticker import MaxNLocator, NullLocator
 from beamfit.report.document import Picture
 from beamfit.report.figures import COLOUR, UNITS
 from beamfit.sampling.posterior import Posterior
+from beamfit.sampling.predictive import Expected
 from beamfit.sampling.text import in_unit, plain_name
-from beamfit.studies.decay_result import DecayFit
-from beamfit.studies.fit import EmittanceFit
-from beamfit.studies.predictive import (
-    Expected,
-    expected_current,
-    expected_scenario_sizes,
-    expected_sizes,
-)
+from beamfit.studies.decay.predictive import expected_current
+from beamfit.studies.decay.result import DecayFit
+from beamfit.studies.scan.fit import EmittanceFit
+from beamfit.studies.scan.predictive import expected_scenario_sizes, expected_sizes
 
 __all__ = ["beam_posterior_pictures", "decay_posterior_pictures", "draw_pairs"]
 

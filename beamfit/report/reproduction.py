@@ -15,9 +15,9 @@ from matplotlib.figure import FigureBase
 from beamfit.io.files import write_atomically
 from beamfit.report.document import Page, Picture, Table, Verdict, html_of, provenance, written
 from beamfit.report.figures import STYLE
-from beamfit.studies.fit import EmittanceFit
-from beamfit.studies.reproduction import TABLE_2, Held, Reproduction
-from beamfit.studies.transport import transfer_rows
+from beamfit.studies.scan.fit import EmittanceFit
+from beamfit.studies.scan.reproduction import TABLE_2, Held, Reproduction
+from beamfit.studies.scan.transport import transfer_rows
 
 __all__ = ["reproduction_page", "write_reproduction"]
 

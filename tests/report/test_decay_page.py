@@ -8,9 +8,9 @@ import pytest
 
 import beamfit
 from beamfit.io.ring import read_operation, read_ring
-from beamfit.studies.decay_record import DecayRecord
-from beamfit.studies.decays import study_record
-from beamfit.studies.loss_budget import Machine
+from beamfit.studies.decay.loss_budget import Machine
+from beamfit.studies.decay.record import DecayRecord
+from beamfit.studies.decay.study import study_record
 
 
 @pytest.fixture(scope="module")

@@ -7,8 +7,8 @@ import pytest
 
 import beamfit
 from beamfit.report.posterior_figures import draw_pairs
-from beamfit.studies.decay import fit_decay
-from beamfit.studies.decay_record import DecayRecord
+from beamfit.studies.decay.fit import fit_decay
+from beamfit.studies.decay.record import DecayRecord
 
 
 @pytest.fixture(scope="module")

@@ -6,8 +6,8 @@ import re
 import pytest
 
 import beamfit
-from beamfit.studies.assumptions import Anchor
-from beamfit.studies.reproduction import TABLE_2, reproduce
+from beamfit.studies.scan.assumptions import Anchor
+from beamfit.studies.scan.reproduction import TABLE_2, reproduce
 
 
 @pytest.fixture(scope="module")
@@ -33,7 +33,7 @@ def test_beams_of_any_emittance_fit_when_the_transport_is_a_network(found):
 
 
 def test_the_published_calibration_is_two_bounds(found):
-    from beamfit.studies.reproduction import BOUNDS
+    from beamfit.studies.scan.reproduction import BOUNDS
 
     assert BOUNDS["Q2.slope"][0] == 147.230
     assert BOUNDS["Q2.intercept"][1] == 63.170

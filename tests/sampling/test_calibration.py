@@ -13,10 +13,10 @@ from beamfit.lifetime.decay import current
 from beamfit.optics.elements import Drift, Quadrupole, Screen
 from beamfit.sampling.calibration import rank, uniformity
 from beamfit.sampling.priors import Uniform
-from beamfit.studies.beam_posterior import beam_target
-from beamfit.studies.decay import fit_decay
-from beamfit.studies.decay_record import DecayRecord
-from beamfit.studies.scans import QuadScan
+from beamfit.studies.decay.fit import fit_decay
+from beamfit.studies.decay.record import DecayRecord
+from beamfit.studies.scan.beam_posterior import beam_target
+from beamfit.studies.scan.scans import QuadScan
 
 
 @pytest.fixture(scope="module")

@@ -17,9 +17,10 @@ from beamfit.greybox.solve import solve
 from beamfit.lifetime.decay import current
 from beamfit.sampling.priors import Normal, Uniform
 from beamfit.status import Status
-from beamfit.studies.decay import fit_decay
-from beamfit.studies.decay_record import DecayRecord
-from beamfit.studies.predictive import expected_current, expected_sizes
+from beamfit.studies.decay.fit import fit_decay
+from beamfit.studies.decay.predictive import expected_current
+from beamfit.studies.decay.record import DecayRecord
+from beamfit.studies.scan.predictive import expected_sizes
 
 X = np.linspace(0.0, 1.0, 12)
 Y = 1.0 + 2.0 * X + 0.1 * np.random.default_rng(1).normal(size=12)

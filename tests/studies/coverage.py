@@ -13,8 +13,8 @@ from beamfit.greybox import problem as greybox
 from beamfit.greybox import tree
 from beamfit.inference.bounded import MOST_SHARE, spread_of
 from beamfit.inference.many_starts import descend_one
-from beamfit.studies.scenario_model import sigma_of
-from beamfit.studies.sigma import emittance_parts
+from beamfit.studies.scan.scenario_model import sigma_of
+from beamfit.studies.scan.sigma import emittance_parts
 
 
 def drawn(problem, theta, key):

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 import beamfit
-from beamfit.studies.assumptions import Anchor, Assumptions
-from beamfit.studies.known_problem import known_problem
-from beamfit.studies.scenario_data import see
-from beamfit.studies.scenarios import scenario_problem
+from beamfit.studies.scan.assumptions import Anchor, Assumptions
+from beamfit.studies.scan.known_problem import known_problem
+from beamfit.studies.scan.scenario_data import see
+from beamfit.studies.scan.scenarios import scenario_problem
 from tests.studies.coverage import binomial_limits, coverage, deviations
 
 ALL = os.environ.get("BEAMFIT_COVERAGE")

@@ -8,14 +8,14 @@ import pytest
 from beamfit.errors import InputError
 from beamfit.io.decay_record import read_decay_record
 from beamfit.lifetime.decay import current_by_rate
-from beamfit.studies.decay import fit_decay, fit_decays
-from beamfit.studies.decay_checks import (
+from beamfit.studies.decay.checks import (
     constant_a_test,
     log_linear,
     moving_lifetime,
     single_exponential,
 )
-from beamfit.studies.decay_record import DecayRecord
+from beamfit.studies.decay.fit import fit_decay, fit_decays
+from beamfit.studies.decay.record import DecayRecord
 
 APS = Path("../shared/data/aps_decay/aps_1999-02-11_9h_decay.csv")
 CONTRACT = (

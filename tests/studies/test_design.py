@@ -5,7 +5,7 @@ import pytest
 
 import beamfit
 from beamfit.errors import InputError
-from beamfit.studies.design import plan_measurements
+from beamfit.studies.scan.design import plan_measurements
 from tests.studies.conftest import TABLE_2, design
 
 

@@ -14,14 +14,14 @@ from beamfit.lifetime.bunch import rf_acceptance
 from beamfit.lifetime.decay import current
 from beamfit.lifetime.losses import loss_coefficients
 from beamfit.lifetime.scaled import MECHANISMS, loss_terms, scaled_losses
-from beamfit.studies.anomaly import find_anomaly
-from beamfit.studies.decay_record import Conditions, DecayRecord
-from beamfit.studies.decay_summary import summarise
-from beamfit.studies.decays import study_record
-from beamfit.studies.lifetime import fit_scales
-from beamfit.studies.next_decay import Candidate, next_decays
-from beamfit.studies.operating_point import Limits, best_operating_point
-from beamfit.studies.scale_sample import budget_intervals, sample_scales
+from beamfit.studies.decay.anomaly import find_anomaly
+from beamfit.studies.decay.next_decay import Candidate, next_decays
+from beamfit.studies.decay.operating_point import Limits, best_operating_point
+from beamfit.studies.decay.record import Conditions, DecayRecord
+from beamfit.studies.decay.scale_sample import budget_intervals, sample_scales
+from beamfit.studies.decay.scales import fit_scales
+from beamfit.studies.decay.study import study_record
+from beamfit.studies.decay.summary import summarise
 
 TRUE = np.array([1.12, 1.30, 0.85, 1.25])  # measurements/make_spear3_shift.py
 

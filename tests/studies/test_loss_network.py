@@ -9,10 +9,10 @@ from beamfit.inference.quantity import Status
 from beamfit.lifetime.decay import current
 from beamfit.lifetime.losses import loss_coefficients
 from beamfit.lifetime.scaled import loss_terms, scaled_losses
-from beamfit.studies.decay_record import Conditions, DecayRecord
-from beamfit.studies.decays import study_record
-from beamfit.studies.lifetime import fit_scales
-from beamfit.studies.loss_network import SIGNS, Box, fit_loss_network
+from beamfit.studies.decay.loss_network import SIGNS, Box, fit_loss_network
+from beamfit.studies.decay.record import Conditions, DecayRecord
+from beamfit.studies.decay.scales import fit_scales
+from beamfit.studies.decay.study import study_record
 
 TRUE = np.array([1.12, 1.30, 0.85, 1.25])
 INPUTS = ("rf_voltage", "scraper_y", "pressure", "bunches")

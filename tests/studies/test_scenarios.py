@@ -10,12 +10,12 @@ from beamfit.errors import InputError
 from beamfit.greybox.bounds import over_cells
 from beamfit.optics.calibration import IntegratedGradient, SlopeIntercept
 from beamfit.optics.elements import Quadrupole, Screen
-from beamfit.studies.assumptions import Anchor, Assumptions
-from beamfit.studies.calibration import with_numbers
-from beamfit.studies.scenario_data import see
-from beamfit.studies.scenario_model import UNIT
-from beamfit.studies.scenarios import scenario_problem, train
-from beamfit.studies.transport_network import certificate_of
+from beamfit.studies.scan.assumptions import Anchor, Assumptions
+from beamfit.studies.scan.calibration import with_numbers
+from beamfit.studies.scan.scenario_data import see
+from beamfit.studies.scan.scenario_model import UNIT
+from beamfit.studies.scan.scenarios import scenario_problem, train
+from beamfit.studies.scan.transport_network import certificate_of
 from tests.studies.conftest import TABLE_2
 
 TRUE_EMITTANCE = np.sqrt(TABLE_2[0] * TABLE_2[2] - TABLE_2[1] ** 2)

@@ -2,9 +2,9 @@ import numpy as np
 import pytest
 
 from beamfit.errors import InputError
-from beamfit.studies.decay import fit_decays
-from beamfit.studies.decay_record import Conditions, DecayRecord
-from beamfit.studies.segments import noise_of, split_record
+from beamfit.studies.decay.fit import fit_decays
+from beamfit.studies.decay.record import Conditions, DecayRecord
+from beamfit.studies.decay.segments import noise_of, split_record
 
 
 def decay(time, i0=100.0, lifetime=36000.0, noise=1e-3, seed=1):

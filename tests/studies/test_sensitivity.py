@@ -7,7 +7,7 @@ import pytest
 
 import beamfit
 from beamfit.optics.elements import Drift
-from beamfit.studies.sensitivity import range_sensitivity, systematics
+from beamfit.studies.scan.sensitivity import range_sensitivity, systematics
 from tests.studies.conftest import scan_of
 
 

@@ -8,7 +8,7 @@ import pytest
 
 from beamfit.errors import InputError
 from beamfit.optics.beam import BeamMatrix
-from beamfit.studies.setpoint import Beam, Target, find_setpoint
+from beamfit.studies.scan.setpoint import Beam, Target, find_setpoint
 
 # Appendix D, in SI.
 SIGMA = np.array([2.6367971055566173, 1.5738242270790272, 1.435441121463094]) * 1e-8

@@ -1,0 +1,1 @@
+"""From a record of beam current to lifetimes and loss mechanisms."""

@@ -1,0 +1,360 @@
+"""What simpler analyses of a decay say, how far off they are, and whether a is constant."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy.special import fdtrc
+
+from beamfit.errors import InputError
+from beamfit.inference.quantity import Quantity, Status
+from beamfit.lifetime.solve import solve_decay
+from beamfit.lifetime.varying import solve_power
+from beamfit.studies.decay.fit import fit_decay, padded
+from beamfit.studies.decay.record import DecayRecord
+from beamfit.studies.decay.result import DecayFit
+
+__all__ = [
+    "ConstantA",
+    "DecayChecks",
+    "LifetimeTrace",
+    "OneLifetime",
+    "check_decay",
+    "constant_a_test",
+    "log_linear",
+    "moving_lifetime",
+    "single_exponential",
+]
+
+HOUR = 3600.0
+FEWEST_IN_WINDOW = 5
+REJECTED = 1e-3
+
+
+@dataclass(frozen=True)
+class OneLifetime:
+    """A lifetime from an analysis that takes it as constant, and its bias.
+
+    Parameters
+    ----------
+    lifetime : Quantity
+        The lifetime, h.
+    rms_residual : float
+        Root mean square of the residuals, mA.
+    bias_start, bias_mean : float
+        Relative difference from the lifetime that the (a, b) fit gives at the first reading and
+        at the mean current; NaN where that fit gives none.
+    """
+
+    lifetime: Quantity
+    rms_residual: float
+    bias_start: float
+    bias_mean: float
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the fields as JSON's types; a bias that is not known is null."""
+        known = [b if math.isfinite(b) else None for b in (self.bias_start, self.bias_mean)]
+        return {
+            "lifetime": self.lifetime.to_json(),
+            "rms_residual": {"value": self.rms_residual, "error": None, "unit": "mA"},
+            "bias_start": known[0],
+            "bias_mean": known[1],
+        }
+
+    def __str__(self) -> str:
+        return (
+            f"{self.lifetime}, {100 * self.bias_start:+.3g} % from the lifetime at the start, "
+            f"{100 * self.bias_mean:+.3g} % from that at the mean current"
+        )
+
+
+def _one_lifetime(rate: float, error: float, residuals: np.ndarray, fit: DecayFit) -> OneLifetime:
+    bias = [
+        1 / rate / HOUR / quantity.value - 1 for quantity in (fit.lifetime_start, fit.lifetime_mean)
+    ]
+    spread = error / rate**2 / HOUR
+    lifetime = Quantity(1 / rate / HOUR, spread, "h", spread)
+    return OneLifetime(lifetime, float(np.sqrt(np.mean(residuals**2))), *bias)
+
+
+def single_exponential(record: DecayRecord) -> OneLifetime:
+    """Fit I0 exp(-t/tau), the law of report equation 41, for comparison.
+
+    Parameters
+    ----------
+    record : DecayRecord
+        One decay.
+
+    Returns
+    -------
+    OneLifetime
+        Lifetime with its formal error, which does not contain the stated bias.
+
+    Examples
+    --------
+    >>> t = np.linspace(0, 8 * 3600, 500)
+    >>> print(single_exponential(DecayRecord(t, 500 / (1 + t / 36000))).lifetime.value > 10)
+    True
+    """
+    found = solve_decay(*padded(record), np.array([1.0, 1.0, 0.0]))
+    scale = math.sqrt(float(found.sum_squares) / (len(record) - 2))
+    scale = scale if record.error is None else max(1.0, scale)
+    rate, error = float(found.values.b), float(found.errors.b) * scale
+    return _one_lifetime(rate, error, found.residuals[: len(record)], fit_decay(record))
+
+
+def log_linear(record: DecayRecord) -> OneLifetime:
+    """Fit a straight line to ln I, as control rooms do, for comparison.
+
+    Parameters
+    ----------
+    record : DecayRecord
+        One decay, all currents positive.
+
+    Returns
+    -------
+    OneLifetime
+        Lifetime with its formal error, which does not contain the stated bias.
+
+    Raises
+    ------
+    InputError
+        If a current is zero.
+
+    Examples
+    --------
+    >>> t = np.linspace(0, 8 * 3600, 500)
+    >>> print(f"{log_linear(DecayRecord(t, 500 / (1 + t / 36000))).bias_start:.2f}")
+    0.38
+    """
+    if record.current.min() <= 0:
+        raise InputError("a current of zero", "positive ones for a logarithm", path=record.name)
+    logs = np.log(record.current)
+    (slope, level), covariance = np.polyfit(record.time, logs, 1, cov=True)
+    residuals = np.exp(level + slope * record.time) - record.current
+    return _one_lifetime(-slope, math.sqrt(covariance[0, 0]), residuals, fit_decay(record))
+
+
+@dataclass(frozen=True, eq=False)
+class LifetimeTrace:
+    """Momentary lifetime along a record.
+
+    Parameters
+    ----------
+    time : array, shape (m,)
+        Mean time of each window, s.
+    current : array, shape (m,)
+        Mean current in it, mA.
+    lifetime : array, shape (m,)
+        Lifetime, h; infinite where no decay is seen, negative where the current rises.
+    error : array, shape (m,)
+        Standard deviation, h, from the scatter within the window; NaN where nothing changes.
+    """
+
+    time: np.ndarray
+    current: np.ndarray
+    lifetime: np.ndarray
+    error: np.ndarray
+
+
+def moving_lifetime(record: DecayRecord, window: float) -> LifetimeTrace:
+    """Momentary lifetime from straight lines over a moving window.
+
+    Parameters
+    ----------
+    record : DecayRecord
+        A record without steps.
+    window : float
+        Length of the window, s.
+
+    Returns
+    -------
+    LifetimeTrace
+        One value for each reading whose window lies within the record and holds five readings.
+        Neighbouring values share readings. The lifetime is that at the window's mean current,
+        too long by a share of (window/lifetime)²/60, for a decay by gas and by Touschek alike.
+
+    Raises
+    ------
+    InputError
+        If no window fits.
+
+    Examples
+    --------
+    >>> t = np.arange(0.0, 7200.0, 10.0)
+    >>> trace = moving_lifetime(DecayRecord(t, 100 * np.exp(-t / 36000)), 600.0)
+    >>> print(f"{trace.lifetime.min():.4f} to {trace.lifetime.max():.4f} h")
+    10.0000 to 10.0000 h
+    """
+    time, current = record.time, record.current
+    centres = np.flatnonzero((time >= window / 2) & (time <= record.span - window / 2))
+    first = np.searchsorted(time, time[centres] - window / 2, side="left")
+    last = np.searchsorted(time, time[centres] + window / 2, side="right")
+    full = last - first >= FEWEST_IN_WINDOW
+    if not full.any():
+        expected = f"one that holds {FEWEST_IN_WINDOW} readings and fits into {record.span:.6g} s"
+        raise InputError(f"a window of {window:.6g} s", expected, path=record.name)
+    rows = []
+    for start, end in zip(first[full], last[full], strict=True):
+        at, level = time[start:end].mean(), current[start:end].mean()
+        apart, off = time[start:end] - at, current[start:end] - level
+        spread = apart @ apart
+        slope = apart @ off / spread
+        left = off - slope * apart
+        error = math.sqrt(left @ left / (apart.size - 2) / spread)
+        rows.append((at, level, slope, error))
+    at, level, slope, error = np.transpose(rows)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return LifetimeTrace(at, level, -level / slope / HOUR, level * error / slope**2 / HOUR)
+
+
+@dataclass(frozen=True)
+class ConstantA:
+    """Whether one record contradicts a constant a.
+
+    Parameters
+    ----------
+    status : Status
+        `converged` if a constant a describes the record, `poor_fit` if it is rejected,
+        `unidentified` if the record cannot tell.
+    message : str
+        The verdict in a sentence.
+    exponent : Quantity
+        s in a(I) proportional to I^s: 0 for constant a, -1/3 for a strongly lengthening bunch.
+    p_value : float
+        Probability of a worse contradiction if a is constant.
+    """
+
+    status: Status
+    message: str
+    exponent: Quantity
+    p_value: float
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the fields as JSON's types."""
+        return {
+            "status": self.status.value,
+            "message": self.message,
+            "exponent": self.exponent.to_json(),
+            "p_value": self.p_value,
+        }
+
+    def __str__(self) -> str:
+        return f"{self.status}. {self.message}"
+
+
+def constant_a_test(record: DecayRecord) -> ConstantA:
+    """Test whether a is constant, against a power of the current.
+
+    Parameters
+    ----------
+    record : DecayRecord
+        One decay.
+
+    Returns
+    -------
+    ConstantA
+        Exponent, probability (F test, with the number of readings reduced for correlated
+        residuals), and the verdict.
+
+    Notes
+    -----
+    A bunch that lengthens with its current loses less at high current than a constant a says. A
+    constant a then leaves a remainder that the fit takes for a gas term: repeat the fit with
+    the bunch's own law, `fit_decay(record, shape=...)`.
+
+    Examples
+    --------
+    >>> from beamfit.lifetime.decay import current
+    >>> t = np.linspace(0, 8 * 3600, 500)
+    >>> noise = 1e-3 * np.random.default_rng(1).normal(size=t.size)
+    >>> record = DecayRecord(t, np.array(current(t, 500.0, 2e-8, 1e-6)) + noise)
+    >>> print(constant_a_test(record).status)
+    converged
+    """
+    readings = padded(record)
+    constant, power = solve_decay(*readings), solve_power(*readings)
+    residuals = (readings[2] * power.residuals)[: len(record)]
+    neighbours = max(0.0, float(residuals[1:] @ residuals[:-1]) / power.sum_squares)
+    independent = (1 - neighbours) / (1 + neighbours)
+    dof = max((len(record) - 4) * independent, 1.0)
+    unit = power.sum_squares / (len(record) - 4)
+    if record.error is not None:
+        unit = max(1.0, unit)
+    excess = max(0.0, float(constant.sum_squares) - power.sum_squares) / unit * independent
+    chance = float(fdtrc(1.0, dof, excess))
+    raw = power.error * math.sqrt(unit)
+    error = raw / math.sqrt(independent)
+    exponent = Quantity(power.exponent, error, "1", raw)
+    if not power.converged or not error < 1 / 3:
+        message = "The record cannot tell a constant a from one that depends on the current"
+        unknown = Quantity(power.exponent, None, "1")
+        return ConstantA(Status.unidentified, f"{message}: record longer.", unknown, chance)
+    if chance < REJECTED:
+        message = (
+            f"A constant a is rejected (p = {chance:.2g}): a goes as I^{power.exponent:.3f}, "
+            "so b of the constant-a fit is not a gas loss; fit with the shape of a."
+        )
+        return ConstantA(Status.poor_fit, message, exponent, chance)
+    message = f"A constant a describes the record (p = {chance:.2g}, exponent {exponent})."
+    return ConstantA(Status.converged, message, exponent, chance)
+
+
+@dataclass(frozen=True)
+class DecayChecks:
+    """What stands beside an (a, b) fit.
+
+    Parameters
+    ----------
+    single_exponential : OneLifetime
+        From `single_exponential`.
+    log_linear : OneLifetime or None
+        From `log_linear`; None where a current is zero.
+    constant_a : ConstantA
+        From `constant_a_test`.
+    """
+
+    single_exponential: OneLifetime
+    log_linear: OneLifetime | None
+    constant_a: ConstantA
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the fields as JSON's types."""
+        line = self.log_linear
+        return {
+            "single_exponential": self.single_exponential.to_json(),
+            "log_linear": None if line is None else line.to_json(),
+            "constant_a": self.constant_a.to_json(),
+        }
+
+
+def check_decay(record: DecayRecord) -> DecayChecks | None:
+    """Do every check of a decay.
+
+    Parameters
+    ----------
+    record : DecayRecord
+        One decay.
+
+    Returns
+    -------
+    DecayChecks or None
+        None for a record that does not decay, of which nothing can be said.
+
+    Examples
+    --------
+    >>> t = np.linspace(0, 8 * 3600, 500)
+    >>> checks = check_decay(DecayRecord(t, 500 / (1 + t / 36000)))
+    >>> f"{checks.log_linear.bias_start:.2f}", checks.constant_a.status.value
+    ('0.38', 'converged')
+    """
+    if np.ptp(record.current) == 0:
+        return None
+    return DecayChecks(
+        single_exponential(record),
+        log_linear(record) if record.current.min() > 0 else None,
+        constant_a_test(record),
+    )

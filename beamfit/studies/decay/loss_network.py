@@ -1,0 +1,373 @@
+"""a and b by a network that obeys physics everywhere: alone, or as a correction (report 3.4.2).
+
+The network's outputs are logarithms, so a and b are positive. Signs of its weights make both fall
+with bunches and scraper opening and rise with pressure, at every point and not only at data.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from beamfit.errors import InputError
+from beamfit.greybox.bounds import over_cells
+from beamfit.greybox.fit import Fit
+from beamfit.greybox.mlp import MLP, Layer, Port
+from beamfit.greybox.problem import Free, Prior, Problem, Record
+from beamfit.greybox.solve import solve
+from beamfit.inference.quantity import Quantity
+from beamfit.lifetime.ring import Operation
+from beamfit.lifetime.scaled import Terms, loss_terms, scaled_losses
+from beamfit.studies.decay.loss_budget import Machine, operation_during
+from beamfit.studies.decay.scales import ScaleFit, stacked_terms
+from beamfit.studies.decay.study import Decay
+from beamfit.studies.decay.summary import Summaries, loss_parts, summarise
+
+__all__ = ["Box", "Certificate", "NetworkFit", "fit_loss_network"]
+
+INPUTS = ("rf_voltage", "scraper_y", "pressure", "bunches")
+# How the loss moves with each input; nothing is known of the sign for the RF voltage.
+SIGNS = {"scraper_y": -1, "pressure": 1, "bunches": -1}
+OUTPUTS = ("log_a", "log_b")
+# Widths of the priors on weights: alone the network covers decades, a correction is near zero.
+ALONE, CORRECTION = 3.0, 0.3
+MOST = 30.0
+ROUNDING = 1e-9
+# Voltages at which a correction is looked at.
+VOLTAGES = 65
+
+
+class Box(NamedTuple):
+    """A range of operation, the ends in SI: what a network is asked to hold over.
+
+    Parameters
+    ----------
+    rf_voltage, scraper_y, pressure, bunches : (float, float)
+        V, m, Pa at the mean current, and number.
+
+    Raises
+    ------
+    InputError
+        From `corners`, if a range is empty or not positive and finite.
+
+    Examples
+    --------
+    >>> box = Box((1.6e6, 3.2e6), (3e-3, 6e-3), (1e-8, 1e-7), (100, 300))
+    >>> box.corners()[0].round(2).tolist()
+    [1.6, 1.1, 2.3, 4.61]
+    """
+
+    rf_voltage: tuple[float, float]
+    scraper_y: tuple[float, float]
+    pressure: tuple[float, float]
+    bunches: tuple[float, float]
+
+    def corners(self) -> tuple[np.ndarray, np.ndarray]:
+        """Both corners in the network's inputs."""
+        for name, (low, high) in zip(self._fields, self, strict=True):
+            if not 0 < low <= high < np.inf:
+                expected = "0 < lower <= upper, finite"
+                raise InputError(f"range {low:g} to {high:g}", expected, column=name)
+        low, high = np.array(self, float).T
+        return _scaled(*low), _scaled(*high)
+
+
+class Certificate(NamedTuple):
+    """What holds for all inputs in the operating box.
+
+    Attributes
+    ----------
+    lower, upper : array, shape (4,)
+        Corners of the box: RF voltage MV, logarithms of scraper mm, pressure nPa, bunches.
+    gains : array, shape (2, 4, 2)
+        Enclosures of the slopes of the network's ln a and ln b by the four inputs over the box,
+        rounded outward; of a correction, those of its factor.
+    single_maximum : str
+        Whether the lifetime has a single maximum in the RF voltage: "certified" by convex nodes of
+        a network alone; of a correction "seen" or "broken" at points of the box, since first
+        principles have no enclosure; "not asked".
+    """
+
+    lower: np.ndarray
+    upper: np.ndarray
+    gains: np.ndarray
+    single_maximum: str
+
+    @property
+    def holds(self) -> bool:
+        """Whether every slope of known sign has it, within rounding."""
+        ends = {-1: 1, 1: 0}
+        return all(
+            bool(np.all(-sign * self.gains[:, INPUTS.index(name), ends[sign]] <= ROUNDING))
+            for name, sign in SIGNS.items()
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class NetworkFit:
+    """A fitted network of losses.
+
+    Parameters
+    ----------
+    fit : Fit
+        Of the grey-box core, with its status, message and covariance.
+    certificate : Certificate
+        Signs that hold everywhere in the box.
+    machine : Machine
+        The ring and its usual operation.
+    scales : array, shape (4,), or None
+        Scales of the first principles that the network corrects; None if it stands alone.
+    """
+
+    fit: Fit
+    certificate: Certificate
+    machine: Machine
+    scales: np.ndarray | None
+
+    def losses(self, operation: Operation, current: float) -> tuple[Quantity, Quantity]:
+        """Predict a and b at a setting.
+
+        Parameters
+        ----------
+        operation : Operation
+            Settings and vacuum.
+        current : float
+            Mean current, mA.
+
+        Returns
+        -------
+        tuple of Quantity
+            a, 1/(mA s), and b, 1/s. Outside the operating box the network is not to be believed,
+            and the errors are None.
+        """
+        terms = loss_terms(self.machine.ring, operation, current)
+        at = _inputs(operation, current)
+        base = _base(self.scales, jax.tree.map(lambda part: part[None], terms))
+        found = self.fit.derive(lambda model: _logs(model, at[None], base)[0])
+        inside = np.all((at >= self.certificate.lower - ROUNDING)
+                        & (at <= self.certificate.upper + ROUNDING))  # fmt: skip
+        values = np.exp(found.value)
+        errors = [float(v * e) if inside and np.isfinite(e) else None
+                  for v, e in zip(values, found.error, strict=True)]  # fmt: skip
+        units = ("1/(mA s)", "1/s")
+        a, b = (Quantity(float(v), e, u) for v, e, u in zip(values, errors, units, strict=True))
+        return a, b
+
+
+class _Data(NamedTuple):
+    inputs: Array
+    base: Array
+    current: Array
+    weight: Array
+
+
+def _inputs(operation: Operation, current: float) -> np.ndarray:
+    """Inputs in units near one; logarithms where the losses go as powers."""
+    pressure = operation.pressure_base + operation.pressure_slope * current
+    return _scaled(operation.rf_voltage, operation.scraper_y, pressure, operation.bunches)
+
+
+def _scaled(rf_voltage, scraper_y, pressure, bunches) -> np.ndarray:
+    values = np.array([1e3 * scraper_y, 1e9 * pressure, bunches], float)
+    return np.array([1e-6 * float(rf_voltage), *np.log(values)])
+
+
+def _logs(model: Mapping[str, MLP], inputs: Array, base: Array) -> Array:
+    return base + jax.vmap(model["map"].values)(inputs)
+
+
+def _predict(model: Mapping[str, MLP], data: _Data) -> Array:
+    logs = _logs(model, data.inputs, data.base)
+    parts = loss_parts(jnp.exp(logs[:, 0]), jnp.exp(logs[:, 1]), data.current)
+    return jnp.einsum("nij,nj->ni", data.weight, parts)
+
+
+def _base(scales: np.ndarray | None, terms: Terms) -> Array:
+    """ln a and ln b of first principles, which the network corrects; zero if it stands alone."""
+    if scales is None:
+        return jnp.zeros((terms.current.size, 2))
+    losses = jax.vmap(scaled_losses, (None, 0))(jnp.asarray(scales), terms)
+    return jnp.log(jnp.stack(losses, axis=-1))
+
+
+def _network(inputs: np.ndarray, means: np.ndarray, hidden: int, seed: int) -> MLP:
+    """Additive in the voltage and the rest: convex nodes for one, rising ones for the other.
+
+    ln a = convex(V) + monotonic(Y, P, M). The rate a I + b is then log-convex in V, as a sum of
+    log-convex functions, so the lifetime has a single maximum.
+    """
+    middle, half = inputs.mean(0), np.maximum(np.ptp(inputs, axis=0) / 2, 1e-3)
+    ports = [
+        Port(name, "voltage" if k == 0 else "rest", max(k - 1, 0), half[k], middle[k])
+        for k, name in enumerate(INPUTS)
+    ]
+    layers = [
+        Layer("voltage", "identity", 1),
+        Layer("rest", "identity", 3),
+        Layer("convex", "logcosh", 2, bias=True),
+        Layer("rising", "tanh", hidden, bias=True),
+        Layer("out", "linear", 2, bias=True),
+    ]
+    random = np.random.default_rng(seed)
+    direction = np.array([SIGNS[name] for name in INPUTS[1:]])[:, None]
+    weights = {
+        "voltage->convex": random.normal(0, 1, (1, 2)),
+        "voltage->out": random.normal(0, 0.1, (1, 2)),
+        "convex->out": np.abs(random.normal(0, 0.3, (2, 2))),
+        "rest->rising": direction * np.abs(random.normal(0, 0.5, (3, hidden))),
+        "rising->out": np.abs(random.normal(0, 0.3, (hidden, 2))),
+    }
+    biases = {"out": np.zeros(2), "rising": random.normal(0, 0.5, hidden)}
+    outputs = [Port(name, "out", k, 1.0, means[k]) for k, name in enumerate(OUTPUTS)]
+    pairs = [tuple(name.split("->")) for name in weights]
+    return MLP(layers, pairs, ports, outputs, weights, biases)
+
+
+def _free(net: MLP, single_maximum: bool) -> list[Free]:
+    """Weights within the signs that make the network obey."""
+    positive = ("convex->out", "rising->out") if single_maximum else ("rising->out",)
+    found = []
+    for name, weights in net.weights.items():
+        low, high = np.full(weights.shape, -MOST), np.full(weights.shape, MOST)
+        if name in positive:
+            low[:] = 0.0
+        if name == "rest->rising":
+            for row, key in enumerate(INPUTS[1:]):
+                low[row], high[row] = (0.0, MOST) if SIGNS[key] > 0 else (-MOST, 0.0)
+        found.append(Free(f"map.weights.{name}", low, high, start=(-1.0, 1.0), nuisance=True))
+    return [*found, Free("map.biases", -MOST, MOST, start=(-1.0, 1.0), nuisance=True)]
+
+
+def _floored(measured: Summaries, floor: float) -> Array:
+    """Weight W of unit covariance with an independent relative error of each part added."""
+    spread = measured.root * (floor * measured.parts)[:, None, :]
+    covariance = jnp.eye(2) + spread @ jnp.swapaxes(spread, 1, 2)
+    return jnp.linalg.solve(jnp.linalg.cholesky(covariance), measured.root)
+
+
+def fit_loss_network(
+    decays: Sequence[Decay],
+    machine: Machine,
+    corrected: ScaleFit | None = None,
+    *,
+    hidden: int = 4,
+    floor: float = 0.02,
+    box: Box | None = None,
+    single_maximum: bool = True,
+    starts: int = 3,
+    seed: int = 0,
+) -> NetworkFit:
+    """Fit a network of a and b to decays at different settings.
+
+    Parameters
+    ----------
+    decays : sequence of Decay
+        Fitted decays whose records carry their settings.
+    machine : Machine
+        The ring, and what the records do not say.
+    corrected : ScaleFit, optional
+        First principles that the network multiplies: a = a_fp exp(network). Without it the
+        network stands alone.
+    hidden : int, optional
+        Nodes for scraper, pressure and bunches together; two more serve the voltage.
+    floor : float, optional
+        Relative error added to both loss rates of each decay, for pressure readings and what the
+        network cannot follow.
+    box : Box, optional
+        The operating box of the certificate, outside which nothing is predicted; what the decays
+        span by default. Where it is wider than that, errors are those of an extrapolation.
+    single_maximum : bool, optional
+        Whether a network alone must give the lifetime a single maximum in the RF voltage.
+    starts, seed : int, optional
+        Of the search.
+
+    Returns
+    -------
+    NetworkFit
+        With a certificate of its signs over the box.
+
+    Raises
+    ------
+    InputError
+        If there are fewer than four decays, a scraper is infinitely far away, or the box is empty.
+
+    Notes
+    -----
+    Weights are regularised by a normal prior of width 3 alone and 0.3 as a correction, so that a
+    correction the data do not ask for stays zero. First principles themselves fall with bunches
+    and scraper and rise with pressure, so the signs hold for the product.
+    """
+    if len(decays) < 4:
+        raise InputError(f"{len(decays)} decays", "4 or more at different settings")
+    terms, measured = stacked_terms(decays, machine), summarise(tuple(decays))
+    settings = [operation_during(d.segment, machine) for d in decays]
+    inputs = np.stack(
+        [_inputs(o, d.fit.mean_current) for o, d in zip(settings, decays, strict=True)]
+    )
+    if not np.isfinite(inputs).all():
+        raise InputError("a setting that is not finite", "RF voltage, scraper, pressure, bunches")
+    scales = None if corrected is None else corrected.vector
+    means = np.zeros(2) if corrected is not None else _typical(measured)
+    net = _network(inputs, means, hidden, seed)
+    weight = _floored(measured, floor)
+    data = _Data(jnp.asarray(inputs), _base(scales, terms), measured.current, weight)
+    seen = jnp.einsum("nij,nj->ni", weight, measured.parts)
+    width = ALONE if corrected is None else CORRECTION
+    problem = Problem(
+        model={"map": net},
+        free=_free(net, single_maximum or corrected is not None),
+        records=[Record("decays", _predict, data, seen, error=1.0)],
+        priors=[Prior("map", 0.0, width)],
+    )
+    fit = solve(problem, starts=starts, seed=seed, iterations=300)
+    low, high = (inputs.min(0), inputs.max(0)) if box is None else box.corners()
+    enclosed = over_cells(fit.model["map"], low, high, 2)
+    gains = np.stack([np.min(enclosed.lower, axis=0), np.max(enclosed.upper, axis=0)], axis=-1)
+    if corrected is None:
+        maximum = "certified" if single_maximum else "not asked"
+    else:
+        maximum = _maximum_seen(fit, scales, machine, low, high, float(np.max(terms.current)))
+    return NetworkFit(fit, Certificate(low, high, gains, maximum), machine, scales)
+
+
+def _maximum_seen(
+    fit: Fit, scales: np.ndarray, machine: Machine, low: np.ndarray, high: np.ndarray, current
+) -> str:
+    """Look along the voltage at every corner of the other settings."""
+    corners = itertools.product(*zip(low[1:], high[1:], strict=True))
+    voltages = np.linspace(low[0], high[0], VOLTAGES)
+    for scraper, pressure, bunches in corners:
+        operation = machine.operation._replace(
+            scraper_y=1e-3 * np.exp(scraper),
+            pressure_base=1e-9 * np.exp(pressure),
+            pressure_slope=0.0,
+            bunches=np.exp(bunches),
+        )
+        terms = jax.lax.map(
+            lambda v, o=operation: loss_terms(machine.ring, o._replace(rf_voltage=v), current),
+            jnp.asarray(1e6 * voltages),
+        )
+        rest = np.tile([scraper, pressure, bunches], (VOLTAGES, 1))
+        inputs = jnp.asarray(np.column_stack([voltages, rest]))
+        a, b = np.exp(np.asarray(_logs(fit.model, inputs, _base(scales, terms)))).T
+        turns = np.diff(np.sign(np.diff(a * current + b)))
+        if np.count_nonzero(turns) > 1 or turns.min(initial=0) < 0:
+            return "broken"
+    return "seen"
+
+
+def _typical(measured: Summaries) -> np.ndarray:
+    """Means of ln a and ln b, from the decays where both are positive."""
+    quadratic, rate = np.asarray(measured.parts).T
+    good = (quadratic > 0) & (rate > quadratic)
+    if not good.any():
+        raise InputError("no decay with positive a and b", "one at least, for a start")
+    a, b = quadratic[good] / np.asarray(measured.current)[good], (rate - quadratic)[good]
+    return np.array([np.log(a).mean(), np.log(b).mean()])

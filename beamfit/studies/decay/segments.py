@@ -1,0 +1,224 @@
+"""Cutting a record into clean decays: refills, loss steps, dropouts, gaps, saturation."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy.ndimage import median_filter
+
+from beamfit.studies.decay.record import DecayRecord
+
+__all__ = ["Event", "Split", "noise_of", "split_record"]
+
+# Robust z-score at which a step or spike is an event: one false alarm in 1e20 Gaussian readings.
+THRESHOLD = 10.0
+# Readings below this share of the largest one near them are dropouts of the monitor.
+DROPOUT = 0.02
+WINDOW = 9
+FEWEST = 8
+# A gap is this many usual sampling intervals.
+GAP = 10.0
+
+
+class Event(NamedTuple):
+    """Something in a record other than a smooth decay.
+
+    Attributes
+    ----------
+    kind : str
+        `refill`, `loss`, `dropout`, `spike`, `saturated`, `gap` or `short` (a piece too short
+        to keep).
+    time : float
+        When it begins, s from the record's start.
+    duration : float
+        How long it lasts, s.
+    change : float
+        Change of the current, mA.
+    """
+
+    kind: str
+    time: float
+    duration: float
+    change: float
+
+    def __str__(self) -> str:
+        return f"{self.kind} at {self.time:.0f} s ({self.change:+.4g} mA)"
+
+
+class Split(NamedTuple):
+    """A record's clean decays, and what lies between them.
+
+    Attributes
+    ----------
+    segments : tuple of DecayRecord
+        Decays without steps; named after the record, with #1, #2, ... if there is more than one.
+    events : tuple of Event
+        What was cut away or noted, in order of time.
+    """
+
+    segments: tuple[DecayRecord, ...]
+    events: tuple[Event, ...]
+
+
+def noise_of(time: np.ndarray, current: np.ndarray) -> float:
+    """Noise of single readings, from how far each lies off the line through its neighbours.
+
+    Parameters
+    ----------
+    time, current : array, shape (n,)
+        Readings; n at least 3.
+
+    Returns
+    -------
+    float
+        Robust standard deviation, in the unit of the current.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> t = np.arange(1000.0)
+    >>> noise = 0.01 * np.random.default_rng(1).normal(size=1000)
+    >>> f"{noise_of(t, 100 - t / 100 + noise):.3f}"
+    '0.010'
+    """
+    share = (time[1:-1] - time[:-2]) / (time[2:] - time[:-2])
+    off = current[1:-1] - (1 - share) * current[:-2] - share * current[2:]
+    off = off / np.sqrt(1 + share**2 + (1 - share) ** 2)
+    return float(1.4826 * np.median(np.abs(off)))
+
+
+def _dropouts(current: np.ndarray) -> tuple[np.ndarray, int]:
+    """Readings near zero although the beam comes back, and where it is gone for good."""
+    flagged = np.zeros(current.size, bool)
+    for start in np.flatnonzero(current[1:] < DROPOUT * current[:-1]) + 1:
+        if flagged[start]:
+            continue
+        back = np.flatnonzero(current[start:] >= DROPOUT * current[start - 1])
+        if not back.size:
+            return flagged, int(start)
+        flagged[start : start + back[0]] = True
+    return flagged, current.size
+
+
+def _saturated(current: np.ndarray) -> np.ndarray:
+    """A run of identical largest readings, far longer than any other run of equal ones."""
+    starts = np.flatnonzero(np.diff(current, prepend=np.nan) != 0)
+    lengths = np.diff(np.append(starts, current.size))
+    flagged = np.zeros(current.size, bool)
+    top = current[starts] == current.max()
+    others = lengths[~top]
+    usual = others.max() if others.size else current.size
+    for start, length in zip(starts[top], lengths[top], strict=True):
+        if length >= 5 and length > 5 * usual:
+            flagged[start : start + length] = True
+    return flagged
+
+
+def _flattened(time: np.ndarray, current: np.ndarray) -> np.ndarray:
+    """The readings without their decay: level, but for noise, steps and spikes."""
+    interval = np.diff(time)
+    slope = median_filter(np.diff(current) / interval, WINDOW, mode="nearest")
+    return current - np.concatenate([[0.0], np.cumsum(slope * interval)])
+
+
+def _spikes(time: np.ndarray, current: np.ndarray, noise: float) -> np.ndarray:
+    """Up to three readings off the running median, which follows steps exactly."""
+    level = _flattened(time, current)
+    return np.abs(level - median_filter(level, 7, mode="nearest")) > THRESHOLD * noise
+
+
+def _runs(flags: np.ndarray) -> list[tuple[int, int]]:
+    """First and past-the-last index of each run of true values."""
+    edges = np.flatnonzero(np.diff(np.r_[False, flags, False].astype(int)))
+    return list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))
+
+
+def _event(record: DecayRecord, kind: str, first: int, last: int, change_from: int) -> Event:
+    """An event from reading `first` to `last`, its change counted from another reading."""
+    time, current = record.time, record.current
+    change = current[last if change_from == first else first] - current[change_from]
+    return Event(kind, float(time[first]), float(time[last] - time[first]), float(change))
+
+
+def _noise(record: DecayRecord, kept: np.ndarray) -> float:
+    scatter = noise_of(record.time[kept], record.current[kept])
+    return max(scatter, (record.resolution or 0.0) / 2)
+
+
+def _beam_readings(record: DecayRecord) -> tuple[np.ndarray, list[Event]]:
+    """Indices of the readings that show the beam, and what the others are."""
+    dropped, end_of_beam = _dropouts(record.current)
+    found = {"dropout": dropped, "saturated": _saturated(record.current)}
+    kept = np.flatnonzero(~dropped & ~found["saturated"] & (np.arange(len(record)) < end_of_beam))
+    if kept.size >= FEWEST:
+        found["spike"] = np.zeros(len(record), bool)
+        spikes = _spikes(record.time[kept], record.current[kept], _noise(record, kept))
+        found["spike"][kept[spikes]] = True
+        kept = kept[~spikes]
+    events = [
+        _event(record, kind, first, end - 1, max(first - 1, 0))
+        for kind, flags in found.items()
+        for first, end in _runs(flags)
+    ]
+    if end_of_beam < len(record):
+        events.append(_event(record, "loss", end_of_beam, len(record) - 1, end_of_beam - 1))
+    return kept, events
+
+
+def _steps(time: np.ndarray, current: np.ndarray, noise: float) -> np.ndarray:
+    """Change from each reading to the next beyond what the decay around it explains, or zero."""
+    change = np.diff(current)
+    excess = np.diff(_flattened(time, current))
+    usual = 1.4826 * np.median(np.abs(excess))
+    allowed = THRESHOLD * max(usual, np.sqrt(2) * noise) + 0.5 * np.abs(change - excess)
+    return np.where(np.abs(excess) > allowed, change, 0.0)
+
+
+def split_record(record: DecayRecord) -> Split:
+    """Cut a record at refills and loss steps, and drop readings that are not of the beam.
+
+    Parameters
+    ----------
+    record : DecayRecord
+        Any record: one decay, fills with refills between them, or top-up.
+
+    Returns
+    -------
+    Split
+        Decays of at least 8 readings, and the events between and in them.
+
+    Notes
+    -----
+    A step must exceed ten robust standard deviations of the changes between readings, so slow
+    or noisy changes stay in. A gap alone does not end a decay; a step across it does.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> t = np.arange(0.0, 4000.0, 10.0)
+    >>> saw = 100 * np.exp(-(t % 2000) / 36000)
+    >>> split = split_record(DecayRecord(t, saw))
+    >>> len(split.segments), str(split.events[0])
+    (2, 'refill at 2000 s (+5.378 mA)')
+    """
+    kept, events = _beam_readings(record)
+    if kept.size < FEWEST:
+        return Split((), tuple(events))
+    steps = _steps(record.time[kept], record.current[kept], _noise(record, kept))
+    for before in np.flatnonzero(steps):
+        kind = "refill" if steps[before] > 0 else "loss"
+        at = float(record.time[kept[before + 1]])
+        events.append(Event(kind, at, 0.0, float(steps[before])))
+    interval = np.diff(record.time)
+    for before in np.flatnonzero(interval > GAP * np.median(interval)):
+        events.append(_event(record, "gap", before, before + 1, before))
+
+    pieces = np.split(kept, np.flatnonzero(steps) + 1)
+    long = [piece for piece in pieces if piece.size >= FEWEST]
+    for piece in pieces:
+        if piece.size < FEWEST:
+            events.append(_event(record, "short", piece[0], piece[-1], piece[0]))
+    names = [record.name if len(long) == 1 else f"{record.name}#{k + 1}" for k in range(len(long))]
+    segments = tuple(record.select(rows, name) for rows, name in zip(long, names, strict=True))
+    return Split(segments, tuple(sorted(events, key=lambda event: event.time)))

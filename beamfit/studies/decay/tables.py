@@ -1,0 +1,322 @@
+"""Decays and their loss budgets as rows of text: the one list that terminal and report show."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+
+from beamfit.inference.quantity import Quantity, Status
+from beamfit.lifetime.scaled import MECHANISMS
+from beamfit.studies.decay.shift import Shift
+from beamfit.studies.decay.study import Decay, RecordStudy
+
+__all__ = [
+    "FEW",
+    "alike",
+    "budget_rows",
+    "check_rows",
+    "decay_rows",
+    "event_rows",
+    "overview",
+    "separability_rows",
+    "shift_rows",
+]
+
+Rows = list[tuple[str, list[str]]]
+MOST_EVENTS = 100
+# How many decays have every number shown; of more only the main ones, a row each.
+FEW = 4
+SHORT = {
+    "Result": ("status", "current at the start", "lifetime at the mean current"),
+    "a and b": ("a", "b", "chi2/dof"),
+    "Losses from first principles": (
+        "RF voltage",
+        "scraper",
+        "bunches",
+        "lifetime at the mean, computed",
+        "lifetime at the mean, measured",
+    ),
+}
+# Percent of the loss below which a mechanism's digits say nothing.
+NEGLIGIBLE = 1e-6
+
+
+def _laid_out(decays: Sequence[Decay], rows: list[tuple[str, Callable[[Decay], object]]]) -> Rows:
+    return [(label, [str(cell(decay)) for decay in decays]) for label, cell in rows]
+
+
+def decay_rows(decays: Sequence[Decay]) -> Rows:
+    """Label and one cell per decay, for every number a fit has.
+
+    Parameters
+    ----------
+    decays : sequence of Decay
+        Decays of one record.
+
+    Returns
+    -------
+    list of (str, list of str)
+        Rows in the order they are read.
+    """
+    return _laid_out(
+        decays,
+        [
+            ("status", lambda d: d.fit.status.value.replace("_", " ")),
+            ("readings", lambda d: f"{len(d.segment)} over {_span(d.segment.span)}"),
+            ("current at the start", lambda d: d.fit.i0),
+            ("lifetime at the start", lambda d: d.fit.lifetime_start),
+            ("lifetime at the mean current", lambda d: d.fit.lifetime_mean),
+            ("lifetime at the end", lambda d: d.fit.lifetime_end),
+            ("a", lambda d: d.fit.a),
+            ("b", lambda d: d.fit.b),
+            ("chi2/dof", _chi2),
+            ("rms residual", lambda d: f"{d.fit.rms_residual:.3g} mA"),
+            ("errors", _noise),
+        ],
+    )
+
+
+def _span(seconds: float) -> str:
+    if seconds >= 3600:
+        return f"{seconds / 3600:.3g} h"
+    return f"{seconds / 60:.3g} min" if seconds >= 60 else f"{seconds:.3g} s"
+
+
+def _chi2(decay: Decay) -> str:
+    fit = decay.fit
+    if fit.noise_inferred:
+        return f"not testable ({fit.dof} dof)"
+    return f"{fit.chi2:.4g}/{fit.dof} = {fit.chi2 / fit.dof:.3g}"
+
+
+def _noise(decay: Decay) -> str:
+    return "inferred from the residuals" if decay.fit.noise_inferred else "as given"
+
+
+def separability_rows(decays: Sequence[Decay]) -> Rows:
+    """Label and one cell per decay for what the record tells of a and b apart."""
+    return _laid_out(
+        decays,
+        [
+            ("a and b", lambda d: "separable" if _verdict(d).separable else "not separable"),
+            ("share of a in the loss", _share),
+            ("correlation of a and b", lambda d: _number(_verdict(d).correlation, ".6f")),
+            ("neighbouring residuals", lambda d: _number(_verdict(d).residual_correlation, ".2f")),
+            ("true errors are larger by", lambda d: f"{_verdict(d).error_inflation:.1f} times"),
+        ],
+    )
+
+
+def check_rows(decays: Sequence[Decay]) -> Rows:
+    """Label and one cell per decay for what simpler analyses say, and whether a is constant.
+
+    Parameters
+    ----------
+    decays : sequence of Decay
+        Decays of one record.
+
+    Returns
+    -------
+    list of (str, list of str)
+        Lifetimes with their bias from the (a, b) fit.
+    """
+    return _laid_out(
+        decays,
+        [
+            ("single exponential", lambda d: _one_lifetime(d, "single_exponential")),
+            ("line through ln I", lambda d: _one_lifetime(d, "log_linear")),
+            ("constant a", _constant_a),
+        ],
+    )
+
+
+def _one_lifetime(decay: Decay, name: str) -> str:
+    found = None if decay.checks is None else getattr(decay.checks, name)
+    if found is None:
+        return "-"
+    known = math.isfinite(found.bias_start)
+    bias = f"{100 * found.bias_start:+.2g} % at start, " if known else ""
+    return f"{found.lifetime} ({bias}{found.rms_residual:.3g} mA rms)"
+
+
+def _constant_a(decay: Decay) -> str:
+    if decay.checks is None:
+        return "-"
+    found = decay.checks.constant_a
+    said = {Status.converged: "not contradicted", Status.poor_fit: "rejected"}
+    chance = f" (p = {found.p_value:.2g})"
+    return said[found.status] + chance if found.status in said else "the record cannot tell"
+
+
+def _verdict(decay: Decay):
+    return decay.fit.identifiability
+
+
+def _number(value: float | None, form: str) -> str:
+    return "-" if value is None else f"{value:{form}}"
+
+
+def _share(decay: Decay) -> str:
+    verdict = _verdict(decay)
+    return "-" if verdict.share is None else str(Quantity(verdict.share, verdict.share_error, "1"))
+
+
+def budget_rows(decays: Sequence[Decay]) -> Rows:
+    """Label and one cell per decay: first principles beside the measured a, b and lifetime.
+
+    Parameters
+    ----------
+    decays : sequence of Decay
+        Decays with budgets; without them there are no rows.
+
+    Returns
+    -------
+    list of (str, list of str)
+        Every mechanism with its share of the loss at the mean current.
+    """
+    if not decays or any(decay.budget is None for decay in decays):
+        return []
+    quadratic = ("a_touschek", "a_bremsstrahlung", "a_elastic")
+    linear = ("b_bremsstrahlung", "b_elastic", "b_quantum")
+    labels = {"touschek": "Touschek", "elastic": "elastic gas"}
+
+    def part(name: str) -> tuple[str, Callable[[Decay], str]]:
+        kind, _, cause = name.partition("_")
+        label = f"{kind}, {labels.get(cause, cause)}"
+        return label, lambda d: _with_share(d, name)
+
+    return _laid_out(
+        decays,
+        [
+            ("RF voltage", lambda d: f"{float(d.budget.operation.rf_voltage) / 1e3:.6g} kV"),
+            ("scraper", lambda d: f"{float(d.budget.operation.scraper_y) * 1e3:.4g} mm"),
+            ("bunches", lambda d: f"{float(d.budget.operation.bunches):.6g}"),
+            ("pressure at the mean current", lambda d: f"{_pressure(d):.3g} Pa"),
+            *map(part, quadratic),
+            ("a, sum", lambda d: f"{d.budget.losses.a:.4g} 1/(mA s)"),
+            ("a, measured", lambda d: d.fit.a),
+            *map(part, linear),
+            ("b, sum", lambda d: f"{d.budget.losses.b:.4g} 1/s"),
+            ("b, measured", lambda d: d.fit.b),
+            ("lifetime at the mean, computed", lambda d: f"{d.budget.lifetime:.4g} h"),
+            ("lifetime at the mean, measured", lambda d: d.fit.lifetime_mean),
+        ],
+    )
+
+
+def _with_share(decay: Decay, name: str) -> str:
+    value = float(getattr(decay.budget.losses, name))
+    rate = value * decay.budget.current if name[0] == "a" else value
+    share = 100 * rate * 3600 * decay.budget.lifetime
+    if share < NEGLIGIBLE:
+        return "negligible"
+    return f"{value:.4g} {'1/(mA s)' if name[0] == 'a' else '1/s'} ({share:.3g} % of the loss)"
+
+
+def _pressure(decay: Decay) -> float:
+    operation = decay.budget.operation
+    return float(operation.pressure_base + operation.pressure_slope * decay.budget.current)
+
+
+def overview(decays: Sequence[Decay]) -> list[tuple[str, list[str], list[list[str]]]]:
+    """The main numbers of many decays, one row each.
+
+    Parameters
+    ----------
+    decays : sequence of Decay
+        More than `FEW`.
+
+    Returns
+    -------
+    list of (str, list of str, list of list of str)
+        Title, header and rows of each table.
+    """
+    every = dict(decay_rows(decays)) | dict(budget_rows(decays))
+    every["chi2/dof"] = [
+        "not testable" if d.fit.noise_inferred else f"{d.fit.chi2 / d.fit.dof:.3g}" for d in decays
+    ]
+    names = [decay.fit.record for decay in decays]
+    tables = []
+    for title, wanted in SHORT.items():
+        labels = [label for label in wanted if label in every]
+        if labels:
+            header = ["decay", *(label.removeprefix("lifetime at the mean, ") for label in labels)]
+            columns = [every[label] for label in labels]
+            tables.append((title, header, [list(r) for r in zip(names, *columns, strict=True)]))
+    return tables
+
+
+def alike(decays: Sequence[Decay]) -> list[tuple[Status, str, str]]:
+    """Status, decays and message for each different verdict on many decays."""
+    found: dict[tuple[Status, str], list[str]] = {}
+    for decay in decays:
+        verdicts = [(decay.fit.status, decay.fit.message)]
+        if decay.checks is not None and decay.checks.constant_a.status is Status.poor_fit:
+            verdicts.append((Status.poor_fit, decay.checks.constant_a.message))
+        for said in verdicts:
+            found.setdefault(said, []).append(decay.fit.record)
+    return [
+        (status, names[0] if len(names) == 1 else _several(names), message)
+        for (status, message), names in found.items()
+    ]
+
+
+def _several(names: Sequence[str]) -> str:
+    return f"{len(names)} decays, {names[0]} to {names[-1]}"
+
+
+def event_rows(study: RecordStudy) -> list[list[str]]:
+    """Kind, time, duration and change of what was cut away; a long list is cut, and says so."""
+    rows = [
+        [event.kind, f"{event.time:.0f} s", f"{event.duration:.0f} s", f"{event.change:+.4g} mA"]
+        for event in study.events[:MOST_EVENTS]
+    ]
+    left = len(study.events) - len(rows)
+    return rows + ([[f"{left} more", "", "", ""]] if left else [])
+
+
+def shift_rows(shift: Shift) -> Rows:
+    """Label and one cell for each answer of a study of many decays.
+
+    Parameters
+    ----------
+    shift : Shift
+        The study.
+
+    Returns
+    -------
+    list of (str, list of str)
+        Scales, loss budget, best point, next decay, anomaly.
+    """
+    fit, best = shift.fit, shift.best
+    rows = [("status", fit.status.value.replace("_", " "))]
+    for name in MECHANISMS:
+        scale = getattr(fit, name)
+        said = "not separable" if scale.error is None else str(scale)
+        rows.append((f"{name}, scale on the ring file", said))
+    rows.append(("chi2/dof", f"{fit.chi2:.4g}/{fit.dof}"))
+    for row in shift.budget:
+        shown = f"{row.median:.4g} ({row.lower:.4g} to {row.upper:.4g}) {row.unit}"
+        label = f"{row.name} at {shift.current:.4g} mA"
+        rows.append((label, shown if row.separable else f"{shown}, not separable"))
+    voltage = Quantity(best.rf_voltage.value / 1e3, _over(best.rf_voltage.error, 1e3), "kV")
+    shown = str(voltage) if voltage.error is not None else f"{voltage.value:.6g} kV, at its limit"
+    rows += [
+        ("best RF voltage", shown),
+        ("best scraper and bunches", f"{1e3 * best.scraper_y:.4g} mm, {best.bunches:.6g}"),
+        ("lifetime there", str(best.lifetime)),
+        ("lifetime at the usual settings", str(best.usual)),
+    ]
+    for number, proposal in enumerate(shift.proposals, 1):
+        operation = proposal.candidate.operation
+        said = (
+            f"{float(operation.rf_voltage) / 1e3:.6g} kV, {1e3 * float(operation.scraper_y):.4g} "
+            f"mm, {float(operation.bunches):.6g} bunches, {proposal.candidate.current:.4g} mA "
+            f"(information {proposal.information:.3g})"
+        )
+        rows.append((f"next decay, choice {number}", said))
+    return [(label, [cell]) for label, cell in rows]
+
+
+def _over(value: float | None, unit: float) -> float | None:
+    return None if value is None else value / unit

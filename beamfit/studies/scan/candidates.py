@@ -1,0 +1,281 @@
+"""Further measurements to consider: settings within limits, other screens, other energies."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+
+from beamfit.errors import InputError, nearest
+from beamfit.optics.beamline import Beamline
+from beamfit.optics.elements import Drift, Screen
+from beamfit.studies.scan.fit import EmittanceFit
+from beamfit.studies.scan.information import Information, linearised_at
+from beamfit.studies.scan.scenario_model import (
+    NetworkRows,
+    Rows,
+    predict_network,
+    predict_sizes,
+)
+from beamfit.studies.scan.scenario_result import with_slope
+
+__all__ = ["Candidate", "Considered", "candidate_rows", "further_options"]
+
+COUNT, REACH = 41, 0.5
+# Other energies to consider where none is named: what a linac can usually do.
+USUAL_ENERGIES = (0.8, 1.25)
+
+
+class Candidate(NamedTuple):
+    """A further measurement: settings of the magnets, screen, and energy in MeV."""
+
+    settings: dict[str, float]
+    screen: str
+    energy: float
+    words: str
+
+
+class Considered(NamedTuple):
+    """A candidate with its rows of the Jacobian, one a plane."""
+
+    candidate: Candidate
+    rows: np.ndarray
+
+
+def candidate_rows(
+    fit: EmittanceFit,
+    base: Information,
+    limits: Mapping[str, tuple[float, float]] | None,
+    energies: tuple[float, ...],
+) -> list[Considered]:
+    """List single further measurements with their rows of the Jacobian.
+
+    Parameters
+    ----------
+    fit : EmittanceFit
+        What is measured already.
+    base : Information
+        Its information.
+    limits : mapping of str to (float, float), or None
+        Magnets that may be set, each in turn over 41 settings, the others at their median.
+    energies : tuple of float
+        Further energies, MeV.
+
+    Returns
+    -------
+    list of Considered
+        At every screen of the line, and every energy.
+
+    Raises
+    ------
+    InputError
+        If limits name no magnet of the line, or are reversed.
+    """
+    held = {n: float(np.median(v)) for n, v in fit.scan.settings.items()}
+    ranges = _ranges(fit, limits)
+    own = _own_energy(fit)
+    screens = _screens(fit)
+    found = []
+    for name, (low, high) in ranges.items():
+        values = np.linspace(low, high, COUNT)
+        start = held.get(name, float(fit.line[name].setting))
+        table = {n: np.full(COUNT, v) for n, v in (held | {name: start}).items()}
+        table[name] = values
+        for screen in screens:
+            for energy in (own, *energies):
+                rows = _rows(fit, base, fit.line, table, screen, np.full(COUNT, energy))
+                found += [
+                    Considered(_named(fit, table, i, screen, energy, own, screens), rows[:, i])
+                    for i in range(COUNT)
+                ]
+    return found
+
+
+def _ranges(fit: EmittanceFit, limits) -> dict[str, tuple[float, float]]:
+    if limits is None:
+        varied = {n: v for n, v in fit.scan.settings.items() if np.ptp(v) > 0}
+        return {
+            n: (float(v.min() - REACH * np.ptp(v)), float(v.max() + REACH * np.ptp(v)))
+            for n, v in varied.items()
+        }
+    for name, (low, high) in limits.items():
+        if name not in fit.line.magnets:
+            raise InputError(
+                f"limits of '{name}'", nearest(name, list(fit.line.magnets)) + ", a magnet"
+            )
+        if not (np.isfinite(low) and np.isfinite(high) and low < high):
+            raise InputError(f"limits {low:g}:{high:g} of {name}", "finite limits, lower first")
+        if fit.scenario == "transport-network" and np.ptp(fit.scan.settings.get(name, [0.0])) == 0:
+            raise InputError(f"limits of '{name}', which was not scanned", "a scanned magnet")
+    return dict(limits)
+
+
+def _own_energy(fit: EmittanceFit) -> float:
+    return float(fit.line.energy) if fit.scan.energy is None else float(fit.scan.energy.mean())
+
+
+def _screens(fit: EmittanceFit) -> tuple[str, ...]:
+    """Screens to measure at: all of the line, downstream of a scanned magnet."""
+    measured = fit.scan.screen or (fit.line.screens[-1],)
+    if fit.scenario == "transport-network":  # another screen has another network
+        return tuple(dict.fromkeys(measured))
+    names = [e.name for e in fit.line.elements]
+    first = min(names.index(n) for n, v in fit.scan.settings.items() if np.ptp(v) > 0)
+    later = [s for s in fit.line.screens if names.index(s) > first]
+    return tuple(dict.fromkeys((*measured, *later)))
+
+
+def _named(fit, table, i, screen, energy, own, screens) -> Candidate:
+    settings = {n: float(v[i]) for n, v in table.items()}
+    words = ", ".join(f"{n} = {v:.4g}" for n, v in settings.items())
+    words += f" on {screen}" if len(screens) > 1 else ""
+    words += f" at {energy:g} MeV" if energy != own else ""
+    return Candidate(settings, screen, float(energy), words)
+
+
+def _rows(
+    fit: EmittanceFit,
+    base: Information,
+    line: Beamline,
+    table: Mapping[str, np.ndarray],
+    screen: str,
+    energy: np.ndarray,
+) -> np.ndarray:
+    """Derivatives of sizes by the free numbers over their errors, shape (planes, m, n)."""
+    problem, theta = fit.problem, linearised_at(fit)
+    found = []
+    for plane in fit.planes:
+        relative = np.median(plane.points.error / plane.points.size) * plane.error_scale
+        if fit.scenario == "transport-network":
+            data, predict = _network_rows(fit, plane.plane, table, screen), predict_network
+        else:
+            data, predict = _line_rows(fit, line, plane.plane, table, screen, energy), predict_sizes
+        size, slope = (
+            np.asarray(v) for v in with_slope(predict, problem.core, jnp.asarray(theta), data)
+        )
+        found.append(slope / (max(float(relative), 1e-4) * size)[:, None])
+    return np.array(found)
+
+
+def _line_rows(fit, line, plane, table, screen, energy) -> Rows:
+    count = len(energy)
+    branches = any(len(getattr(e, "shape", ())) == 2 for e in _settings_of(fit, plane).values())
+    settings = {n: jnp.asarray(v) for n, v in table.items()}
+    if branches:  # a further point is measured on the rising branch
+        settings = {
+            n: jnp.stack([v, jnp.ones(count)], -1) if np.ptp(fit.scan.settings[n]) > 0 else v
+            for n, v in settings.items()
+        }
+    element = line[screen]
+    return Rows(
+        plane,
+        (screen,),
+        False,
+        line,
+        settings,
+        jnp.asarray(energy),
+        jnp.zeros(count, int),
+        jnp.full(count, float(line.energy_spread)),
+        jnp.full(count, float(getattr(element, "resolution", 0.0))),
+    )
+
+
+def _settings_of(fit, plane) -> dict:
+    record = next(r for r in fit.problem.records if r.name == f"size {plane}")
+    return record.data.settings
+
+
+def _network_rows(fit, plane, table, screen) -> NetworkRows:
+    net = fit.fit.model["map"]
+    record = next(r for r in fit.problem.records if r.name == f"size {plane}")
+    measured = fit.scan.screen or (screen,) * len(fit.scan)
+    keep = np.flatnonzero(~np.isnan(fit.scan.size[plane]))
+    which = next(i for i, k in enumerate(keep) if measured[k] == screen)
+    count = len(next(iter(table.values())))
+    inputs = [table.get(n, np.full(count, _own_energy(fit))) for n in net.inputs]
+    return NetworkRows(
+        plane,
+        False,
+        jnp.asarray(np.stack(inputs, -1)),
+        jnp.tile(record.data.columns[which], (count, 1)),
+        jnp.full(count, float(np.median(np.asarray(record.data.known)))),
+    )
+
+
+def further_options(
+    fit: EmittanceFit, base: Information, energies: tuple[float, ...]
+) -> Iterator[tuple[str, np.ndarray]]:
+    """Kinds of measurement that might identify a scenario, each with its rows.
+
+    A single size at every other screen, the same scan at it; the same scan at other energies;
+    and, where the line has no second screen, at screens one could put into its drifts.
+
+    Parameters
+    ----------
+    fit : EmittanceFit
+        What is measured already.
+    base : Information
+        Its information.
+    energies : tuple of float
+        Energies to consider, MeV; 20 % below and 25 % above if empty.
+
+    Yields
+    ------
+    tuple of str and ndarray
+        Words, and rows of shape (m, n).
+    """
+    table = {n: np.asarray(v) for n, v in fit.scan.settings.items()}
+    own = _own_energy(fit)
+    energy = np.full(len(fit.scan), own) if fit.scan.energy is None else fit.scan.energy
+    if fit.scenario != "transport-network":
+        for line, screen, words in _other_screens(fit):
+            rows = _rows(fit, base, line, table, screen, energy)
+            best = min(range(rows.shape[1]), key=lambda i: _worst(base.with_rows(rows[:, i])))
+            at = ", ".join(f"{n} = {v[best]:.4g}" for n, v in table.items())
+            yield f"one size on {words} ({at})", rows[:, best]
+            yield f"the same scan on {words}", rows.reshape(-1, rows.shape[-1])
+        for factor in energies or tuple(own * f for f in USUAL_ENERGIES):
+            screen = (fit.scan.screen or (fit.line.screens[-1],))[-1]
+            rows = _rows(fit, base, fit.line, table, screen, np.full(len(fit.scan), factor))
+            yield f"the same scan at {factor:.4g} MeV", rows.reshape(-1, rows.shape[-1])
+    for words, rows in _priors(fit):
+        yield words, rows
+
+
+def _worst(after: Information) -> float:
+    """Relative error that counts bounds as nothing: large while they decide."""
+    share = float(after.share().max())
+    return max(after.relative_error().values()) / max(1.0 - share, 1e-6)
+
+
+def _other_screens(fit: EmittanceFit) -> list[tuple[Beamline, str, str]]:
+    """Screens that were not used, or else places for one in the drifts after the magnets."""
+    used = set(fit.scan.screen or (fit.line.screens[-1],))
+    unused = [s for s in _screens(fit) if s not in used]
+    if unused:
+        return [(fit.line, s, f"screen {s}") for s in unused]
+    names = [e.name for e in fit.line.elements]
+    last = max(names.index(n) for n, v in fit.scan.settings.items() if np.ptp(v) > 0)
+    found = []
+    for i, element in enumerate(fit.line.elements):
+        if i > last and isinstance(element, Drift) and element.length > 0.3:
+            half = replace(element, length=0.5 * element.length)
+            parts = (half, Screen("NEW"), half)
+            elements = (*fit.line.elements[:i], *parts, *fit.line.elements[i + 1 :])
+            words = f"a new screen in the middle of {element.name}"
+            found.append((replace(fit.line, elements=elements), "NEW", words))
+    return found
+
+
+def _priors(fit: EmittanceFit) -> Iterator[tuple[str, np.ndarray]]:
+    """A 2 % measurement of each slope, as from a field map of the magnet."""
+    p = fit.problem
+    for i, name in enumerate(p.names):
+        if not p.nuisance[i] and name.endswith((".slope", ".scale", "coefficients.1")):
+            value = abs(float(p.start[i]))
+            row = np.zeros((1, len(p.names)))
+            row[0, i] = 1.0 / (0.02 * value)
+            yield f"a prior of 2 % on {name}", row

@@ -1,0 +1,344 @@
+"""The beam matrix of one plane from measured sizes: the one-point functions of the fit.
+
+The model is report eq. 37 with the two terms every screen adds,
+
+    size² = R11² σ11 + 2 R11 R12 σ12 + R12² σ22 + (R16 σ_δ)² + resolution²
+
+linear in σ. Everything here is a pure JAX function of one scan in one plane; many scans are
+a vmap of it.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+from jax.typing import ArrayLike
+
+import beamfit.optics  # noqa: F401 - switches JAX to double precision
+from beamfit.studies.scan.zero_emittance import zero_emittance
+
+__all__ = [
+    "SigmaFit",
+    "SizeData",
+    "emittance_parts",
+    "fit_sizes",
+    "solve_size",
+    "solve_size_squared",
+]
+
+# A direction of σ is lost when its diagonal of R is this far below the largest.
+_RANK = 1e-10
+
+
+class SizeData(NamedTuple):
+    """One scan in one plane, as the fit sees it.
+
+    Attributes
+    ----------
+    r11 : Array
+        Shape (n,), start of line to screen.
+    r12 : Array
+        Shape (n,), m.
+    known : Array
+        Shape (n,), m²: size² not due to σ (dispersion and resolution).
+    size : Array
+        Shape (n,), rms sizes in m.
+    error : Array
+        Shape (n,), their standard errors in m; infinite takes a point out.
+    """
+
+    r11: Array
+    r12: Array
+    known: Array
+    size: Array
+    error: Array
+
+    @property
+    def design(self) -> Array:
+        """Coefficients of σ11, σ12, σ22 in size², shape (n, 3)."""
+        return jnp.stack([self.r11**2, 2.0 * self.r11 * self.r12, self.r12**2], axis=-1)
+
+
+class SigmaFit(NamedTuple):
+    """A fitted beam matrix and what is needed to judge it.
+
+    Attributes
+    ----------
+    sigma : Array
+        Shape (3,): σ11 (m²), σ12 (m rad), σ22 (rad²) of the best positive (semi)definite
+        matrix.
+    covariance : Array
+        Shape (3, 3), for the errors as given (not χ²-scaled); NaN if ``full_rank`` is false.
+    chi2 : Array
+        χ² of ``sigma``.
+    determinant : Array
+        det σ of the best symmetric matrix, positive or not, m² rad².
+    determinant_error : Array
+        Its standard error.
+    chi2_zero : Array
+        The smallest χ² a beam of zero emittance reaches.
+    full_rank : Array
+        Whether the settings separate the three numbers at all.
+    positive : Array
+        Whether the best symmetric matrix is positive definite; if not, ``sigma`` is the best
+        one of zero emittance.
+    converged : Array
+        Whether the iteration ended at a minimum; always so for the linear fit.
+    """
+
+    sigma: Array
+    covariance: Array
+    chi2: Array
+    determinant: Array
+    determinant_error: Array
+    chi2_zero: Array
+    full_rank: Array
+    positive: Array
+    converged: Array
+
+
+def emittance_parts(sigma: ArrayLike) -> Array:
+    """Emittance, β and α of a positive definite σ.
+
+    Parameters
+    ----------
+    sigma : Array
+        Shape (3,): σ11, σ12, σ22.
+
+    Returns
+    -------
+    Array
+        Shape (3,): sqrt(det σ) in m, σ11/ε in m, -σ12/ε.
+
+    Examples
+    --------
+    >>> emittance_parts(jnp.array([2.0, -1.0, 1.0])).tolist()
+    [1.0, 2.0, 1.0]
+    """
+    s11, s12, s22 = jnp.asarray(sigma)
+    emittance = jnp.sqrt(s11 * s22 - s12**2)
+    return jnp.stack([emittance, s11 / emittance, -s12 / emittance])
+
+
+def solve_size_squared(data: SizeData, weight: ArrayLike = 1.0) -> SigmaFit:
+    """Fit size² by weighted linear least squares: the report's ``error_linear``.
+
+    Parameters
+    ----------
+    data : SizeData
+        One scan in one plane.
+    weight : float or Array
+        Factor on each squared residual, shape (n,) or scalar.
+
+    Returns
+    -------
+    SigmaFit
+        The best positive semidefinite σ. The problem is convex: where the unconstrained
+        solution is positive definite it is the answer, else the answer has det σ = 0.
+
+    Notes
+    -----
+    Residual (model² - size²)/(2 size error): Appendix A of the report. QR of the scaled
+    design, so that its condition is not squared.
+    """
+    _, _, target, scale = _linear(data, weight)
+    design = data.design * scale[:, None]
+    sigma, covariance, full_rank = _least_squares(design, target)
+    determinant = sigma[0] * sigma[2] - sigma[1] ** 2
+    gradient = jnp.stack([sigma[2], -2.0 * sigma[1], sigma[0]])
+    degenerate, chi2_zero = zero_emittance(data.r11, data.r12, target, scale)
+    positive = full_rank & (determinant > 0.0) & (sigma[0] > 0.0)
+    best = jnp.where(positive, sigma, degenerate)
+    return SigmaFit(
+        sigma=best,
+        covariance=covariance,
+        chi2=jnp.sum((design @ best - target) ** 2),
+        determinant=determinant,
+        determinant_error=jnp.sqrt(gradient @ covariance @ gradient),
+        chi2_zero=chi2_zero,
+        full_rank=full_rank,
+        positive=positive,
+        converged=jnp.asarray(True),
+    )
+
+
+def _linear(data: SizeData, weight: ArrayLike) -> tuple[Array, Array, Array, Array]:
+    """R11, R12, measured size² over its error, and one over that error."""
+    scale = jnp.sqrt(weight) / (2.0 * data.size * data.error)
+    return data.r11, data.r12, (data.size**2 - data.known) * scale, scale
+
+
+def _least_squares(design: Array, target: Array) -> tuple[Array, Array, Array]:
+    """Solve by QR with unit columns; a direction the rows do not have leaves NaN errors."""
+    norm = jnp.linalg.norm(design, axis=0)
+    norm = jnp.where(norm > 0.0, norm, 1.0)
+    q, r = jnp.linalg.qr(design / norm)
+    diagonal = jnp.abs(jnp.diagonal(r))
+    full_rank = jnp.min(diagonal) > _RANK * jnp.max(diagonal)
+    r = jnp.where(full_rank, r, jnp.eye(3))
+    inverse = _inverse_triangle(r) / norm[:, None]
+    sigma = inverse @ (q.T @ target)
+    return sigma, jnp.where(full_rank, inverse @ inverse.T, jnp.nan), full_rank
+
+
+def _inverse_triangle(r: Array) -> Array:
+    """Invert an upper triangular 3 × 3 matrix in closed form (a batch of 10 000 is one pass)."""
+    a, b, c = r[0, 0], r[1, 1], r[2, 2]
+    r01, r02, r12 = r[0, 1], r[0, 2], r[1, 2]
+    zero = jnp.zeros_like(a)
+    return jnp.stack(
+        [
+            jnp.stack([1 / a, -r01 / (a * b), (r01 * r12 - r02 * b) / (a * b * c)]),
+            jnp.stack([zero, 1 / b, -r12 / (b * c)]),
+            jnp.stack([zero, zero, 1 / c]),
+        ]
+    )
+
+
+def solve_size(data: SizeData, weight: ArrayLike = 1.0) -> SigmaFit:
+    """Fit the size itself: the report's ``error_nonlinear``.
+
+    Parameters
+    ----------
+    data : SizeData
+        One scan in one plane.
+    weight : float or Array
+        Factor on each squared residual.
+
+    Returns
+    -------
+    SigmaFit
+        As `solve_size_squared`, from which it starts.
+
+    Notes
+    -----
+    Residual (model - size)/error (Appendices A and C of the report), by Levenberg-Marquardt
+    on the Cholesky factor of σ in units of its start, so that every iterate has a size.
+    """
+    start = solve_size_squared(data, weight)
+    scale = jnp.sqrt(weight) / data.error
+    design = data.design
+    unit = jnp.sqrt(jnp.abs(start.sigma[jnp.array([0, 2])]))
+
+    def sigma_of(p: Array) -> Array:
+        return jnp.stack(
+            [
+                (p[0] * unit[0]) ** 2,
+                p[0] * p[1] * unit[0] * unit[1],
+                (p[1] ** 2 + p[2] ** 2) * unit[1] ** 2,
+            ]
+        )
+
+    def residual(p: Array) -> Array:
+        squared = jnp.maximum(design @ sigma_of(p) + data.known, 1e-30)
+        return (jnp.sqrt(squared) - data.size) * scale
+
+    correlation = start.sigma[1] / (unit[0] * unit[1])
+    width = jnp.sqrt(jnp.maximum(1.0 - correlation**2, 1e-6))
+    p, converged = _levenberg_marquardt(residual, jnp.stack([jnp.ones(()), correlation, width]))
+    sigma = sigma_of(p)
+    model = jnp.sqrt(design @ sigma + data.known)
+    _, covariance, full_rank = _least_squares(design * (0.5 * scale / model)[:, None], data.size)
+    determinant = sigma[0] * sigma[2] - sigma[1] ** 2
+    gradient = jnp.stack([sigma[2], -2.0 * sigma[1], sigma[0]])
+    chi2 = jnp.sum(residual(p) ** 2)
+    flat = jnp.sqrt(design @ zero_emittance(*_linear(data, weight))[0] + data.known)
+    flat_chi2 = jnp.sum(((flat - data.size) * scale) ** 2)
+    return start._replace(
+        sigma=sigma,
+        covariance=covariance,
+        chi2=chi2,
+        determinant=determinant,
+        determinant_error=jnp.sqrt(gradient @ covariance @ gradient),
+        chi2_zero=jnp.maximum(chi2, jnp.minimum(flat_chi2, start.chi2_zero)),
+        full_rank=full_rank,
+        positive=start.positive & (determinant > 0.0),
+        converged=converged,
+    )
+
+
+def _levenberg_marquardt(residual, start: Array) -> tuple[Array, Array]:
+    """Minimise |residual|² over three numbers; return them and whether they settled."""
+    jacobian = jax.jacfwd(residual)
+
+    def step(state):
+        p, chi2, damping, _, count = state
+        j, r = jacobian(p), residual(p)
+        normal = j.T @ j
+        change = jnp.linalg.solve(
+            normal + damping * jnp.diag(jnp.diagonal(normal) + 1e-30), j.T @ r
+        )
+        tried = p - change
+        chi2_tried = jnp.sum(residual(tried) ** 2)
+        better = chi2_tried <= chi2
+        small = jnp.max(jnp.abs(change)) < 1e-11
+        return (
+            jnp.where(better, tried, p),
+            jnp.where(better, chi2_tried, chi2),
+            jnp.where(better, damping * 0.1, damping * 10.0),
+            small,
+            count + 1,
+        )
+
+    def unfinished(state):
+        return ~state[3] & (state[4] < 100)
+
+    first = (start, jnp.sum(residual(start) ** 2), jnp.asarray(1e-4), jnp.asarray(False), 0)
+    p, _, _, settled, _ = jax.lax.while_loop(unfinished, step, first)
+    return p, settled
+
+
+@partial(jax.jit, static_argnames="method")
+def fit_sizes(
+    r11: ArrayLike,
+    r12: ArrayLike,
+    size: ArrayLike,
+    error: ArrayLike,
+    known: ArrayLike = 0.0,
+    method: str = "size_squared",
+) -> SigmaFit:
+    """Fit one scan or many in one call, from transfer-matrix elements and sizes.
+
+    Parameters
+    ----------
+    r11, r12 : array
+        Transfer-matrix elements from the start to the screen, shape (n,) or (scans, n).
+    size, error : array
+        Rms sizes and standard errors in m, shape (n,) or (scans, n).
+    known : array
+        Size² in m² that dispersion and resolution contribute; broadcast.
+    method : {"size_squared", "size"}
+        Which residual: the report's ``error_linear`` or ``error_nonlinear``.
+
+    Returns
+    -------
+    SigmaFit
+        Arrays with the leading shape of ``size``.
+
+    Examples
+    --------
+    Ten thousand simulated scans of one line:
+
+    >>> r11, r12 = jnp.linspace(1, -1, 9), jnp.full(9, 2.0)
+    >>> true = jnp.sqrt(r11**2 * 4e-8 + r12**2 * 1e-8)
+    >>> noise = 1 + 0.02 * jax.random.normal(jax.random.key(0), (10_000, 9))
+    >>> fits = fit_sizes(r11, r12, true * noise, 0.02 * true)
+    >>> fits.sigma.shape, bool(abs(fits.determinant.mean() / 4e-16 - 1) < 0.05)
+    ((10000, 3), True)
+    """
+    solve = {"size_squared": solve_size_squared, "size": solve_size}[method]
+    shape = jnp.broadcast_shapes(*(jnp.shape(v) for v in (r11, r12, size, error, known)))
+    arrays = [
+        jnp.broadcast_to(jnp.asarray(v, float), shape) for v in (r11, r12, known, size, error)
+    ]
+
+    def one(*columns: Array) -> SigmaFit:
+        return solve(SizeData(*columns))
+
+    for _ in shape[:-1]:
+        one = jax.vmap(one)
+    return one(*arrays)
