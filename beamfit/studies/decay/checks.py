@@ -32,6 +32,7 @@ __all__ = [
 HOUR = 3600.0
 FEWEST_IN_WINDOW = 5
 REJECTED = 1e-3
+EXACT = 1e-8
 
 
 @dataclass(frozen=True)
@@ -284,6 +285,8 @@ def constant_a_test(record: DecayRecord) -> ConstantA:
     unit = power.sum_squares / (len(record) - 4)
     if record.error is not None:
         unit = max(1.0, unit)
+    # Below this share of the current differences are those of the integration, not of the beam.
+    unit = max(unit, float(np.mean((readings[2][: len(record)] * EXACT * record.current) ** 2)))
     excess = max(0.0, float(constant.sum_squares) - power.sum_squares) / unit * independent
     chance = float(fdtrc(1.0, dof, excess))
     raw = power.error * math.sqrt(unit)
