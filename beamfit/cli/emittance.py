@@ -227,11 +227,14 @@ def _print(
     for p in fit.planes:
         console.print(verdict_lines(p))
     if fit.scenario == "known":
-        console.print(budget_table(fit))
-        console.print(range_table(fit))
+        for table in (budget_table(fit), range_table(fit)):
+            console.print()
+            console.print(table)
     else:
+        console.print()
         for shown in scenario_lines(fit):
             console.print(shown)
+    console.print()
     errors = fit.scan.error_source if fit.scan.error else "inferred from the residuals"
     console.print(f"Errors of the sizes: {errors}.", style="dim")
     if posterior is not None:

@@ -94,17 +94,17 @@ def scenario_lines(fit: EmittanceFit) -> Iterator[Table | Text]:
 
 def budget_table(fit: EmittanceFit) -> Table:
     """Lay out what small errors of the line would do to the normalised emittance."""
-    return _by_plane(fit, "\nChange of the normalised emittance if", budget_rows(fit))
+    return _by_plane(fit, "Change of the normalised emittance if", budget_rows(fit))
 
 
 def range_table(fit: EmittanceFit) -> Table:
     """Lay out the normalised emittance without some of the points."""
-    return _by_plane(fit, "\nNormalised emittance (shift in std. errors)", range_rows(fit))
+    return _by_plane(fit, "Normalised emittance (shift in std. errors)", range_rows(fit))
 
 
 def _by_plane(fit: EmittanceFit, title: str, rows: list[tuple[str, list[str]]]) -> Table:
     table = plain_table("")
-    table.add_column(title.strip(), no_wrap=True)
+    table.add_column(title, no_wrap=True)
     for p in fit.planes:
         table.add_column(p.plane, no_wrap=True)
     for label, cells in rows:

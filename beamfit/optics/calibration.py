@@ -18,6 +18,7 @@ from jax.typing import ArrayLike
 from beamfit.optics.particle import ELECTRON_MASS, rigidity
 
 __all__ = [
+    "SETTING_UNITS",
     "Calibration",
     "CurrentPolynomial",
     "FocusingStrength",
@@ -25,6 +26,10 @@ __all__ = [
     "IntegratedStrength",
     "SlopeIntercept",
 ]
+
+
+SETTING_UNITS = {"A": "A", "kG": "kG", "k1": "1/m²", "k1l": "1/m"}
+"""How the unit of a setting is written for people."""
 
 
 @partial(jax.tree_util.register_dataclass, data_fields=["slope", "intercept"], meta_fields=[])

@@ -32,7 +32,6 @@ STYLE = {
 }
 # More points than this are drawn as an image: as curves they would fill the page with bytes.
 MANY = 500
-UNITS = {"A": "A", "kG": "kG", "k1": "1/m²", "k1l": "1/m"}
 
 
 def draw_scan(figure: FigureBase, fit: EmittanceFit, plane: str) -> None:
@@ -58,7 +57,7 @@ def draw_scan(figure: FigureBase, fit: EmittanceFit, plane: str) -> None:
             above.plot(at, 1e6 * p.points.model, "_", ms=14, mew=2, color=COLOUR[plane], alpha=0.6)
         else:
             _curves(above, fit, p, varied[0])
-        below.set_xlabel(f"{varied[0]}, {UNITS[fit.scan.units[varied[0]]]}")
+        below.set_xlabel(f"{varied[0]}, {p.points.units[varied[0]]}")
     else:
         at = np.arange(1, len(p.points.size) + 1)
         above.plot(at, 1e6 * p.points.model, "_", ms=14, mew=2, color=COLOUR[plane], alpha=0.6)

@@ -11,7 +11,7 @@ from matplotlib.figure import FigureBase
 from matplotlib.ticker import MaxNLocator, NullLocator
 
 from beamfit.report.document import Picture
-from beamfit.report.figures import COLOUR, UNITS
+from beamfit.report.figures import COLOUR
 from beamfit.sampling.posterior import Posterior
 from beamfit.sampling.predictive import Expected
 from beamfit.sampling.text import in_unit, plain_name
@@ -165,7 +165,7 @@ def draw_expected_sizes(
         error, found = p.error, expected_scenario_sizes(posterior, fit, plane)
     varied = [n for n, v in p.settings.items() if np.ptp(v) > 0]
     if len(varied) == 1:
-        at, label = p.settings[varied[0]], f"{varied[0]}, {UNITS[fit.scan.units[varied[0]]]}"
+        at, label = p.settings[varied[0]], f"{varied[0]}, {p.units[varied[0]]}"
     else:
         at, label = np.arange(1, len(p.size) + 1), "measurement"
     axes: Axes = figure.subplots()

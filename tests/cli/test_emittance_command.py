@@ -62,7 +62,12 @@ def test_both_planes_of_a_scan_that_has_one(run):
 def test_the_tables_and_the_verdict(run):
     status, out, err = run(*REAL)
     assert (status, err) == (0, "")
-    for words in ("0.705 ± 0.016 µm", "chi2/dof = 9.2", "drift D1 +1 cm", "without Q525 = -4.219"):
+    for words in (
+        "0.705 ± 0.016 µm",
+        "chi2/dof = 9.2",
+        "drift D1 +1 cm",
+        "without Q525 = -4.219 kG",
+    ):
         assert words in out
 
 

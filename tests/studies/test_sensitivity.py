@@ -78,7 +78,7 @@ def test_range_rows_are_refits_without_the_point(gtf, gtf_sizes):
         {"x": scan.error["x"][keep]},
     )
     expected = beamfit.fit_emittance(less, gtf).x
-    assert rows[4].left_out == "without Q2 = 1.2"
+    assert rows[4].left_out == "without Q2 = 1.2 A"
     assert rows[4].normalized_emittance == pytest.approx(
         expected.normalized_emittance.value, rel=1e-9
     )

@@ -105,7 +105,7 @@ def test_a_one_sided_scan_says_what_would_fix_it(otr2):
         assert "zero emittance" in fit.message
         assert fit.identifiability.next_measurement in fit.message
     # As far towards the waist, at -0.1 kG, as half the scanned range goes.
-    assert "Measure next near Q525 = -2.3, beyond the scanned range" in fit.message
+    assert "Measure next near Q525 = -2.3 kG, beyond the scanned range" in fit.message
 
 
 @pytest.mark.parametrize("seed", range(6))
@@ -122,7 +122,7 @@ def test_following_the_advice_leads_to_the_answer(otr2, seed):
         fit = beamfit.fit_emittance(scan, otr2).x
         if fit.emittance.error is not None:
             break
-        advised = float(re.search(r"near Q525 = (\S+),", fit.message)[1])
+        advised = float(re.search(r"near Q525 = (\S+) kG,", fit.message)[1])
         [size] = np.sqrt(design(otr2, {"Q525": [advised]}) @ sigma)
         settings.append(advised)
         measured.append(size * (1 + 0.02 * rng.normal()))

@@ -19,6 +19,8 @@ from beamfit.studies.scan.results import Identifiability, PlaneFit, ScreenTwiss
 from beamfit.studies.scan.scans import QuadScan, check_names
 from beamfit.studies.scan.transport import (
     names_of,
+    own_settings,
+    own_units,
     plane_input,
     scan_rows,
     scanned_line,
@@ -197,7 +199,8 @@ def _plane_fit(w: PlaneWork, line: Beamline, verdict: Verdict, advice: str | Non
         ),
         screen=ScreenTwiss(
             name=w.given.last_screen,
-            settings=_own_settings(line, w.given.last_screen),
+            settings=own_settings(line, w.given.last_screen),
+            units=own_units(line, w.given.last_screen),
             beta=quantity(d.screen[0], d.screen_error[0], "m"),
             alpha=quantity(d.screen[1], d.screen_error[1], "1"),
             size=quantity(d.screen[2], d.screen_error[2], "m", linear),
@@ -215,11 +218,6 @@ def _plane_fit(w: PlaneWork, line: Beamline, verdict: Verdict, advice: str | Non
         identifiability=_identifiability(w, determined, advice),
         points=w.points,
     )
-
-
-def _own_settings(line: Beamline, screen: str) -> dict[str, float]:
-    part = line.upto(screen)
-    return {name: float(line[name].setting) for name in part.magnets}
 
 
 def _identifiability(w: PlaneWork, determined: bool, advice: str | None) -> Identifiability:

@@ -88,6 +88,7 @@ def work_on(
     model = fit.sigma @ np.stack([r11**2, 2.0 * r11 * r12, r12**2]) + given.known
     points = Points(
         settings=given.settings,
+        units=given.units,
         screen=given.screen,
         size=given.size,
         error=error * unit,
@@ -185,11 +186,11 @@ def next_measurement(work: PlaneWork, scanned: Beamline) -> str | None:
     values = work.given.settings[found.magnet]
     inside = values.min() <= found.setting <= values.max()
     held = [
-        f"{n} = {np.median(v):.3g}" for n, v in work.given.settings.items() if n != found.magnet
+        f"{n} = {np.median(v):.3g} {p.units[n]}" for n, v in p.settings.items() if n != found.magnet
     ]
     others = f", with {', '.join(held)} at {work.given.last_screen}" if held else ""
     return (
-        f"Measure next near {found.magnet} = {found.setting:.3g}, "
+        f"Measure next near {found.magnet} = {found.setting:.3g} {p.units[found.magnet]}, "
         f"{'inside' if inside else 'beyond'} the scanned range{others}: of single points it would "
         "sharpen the emittance most; then judge again."
     )

@@ -22,6 +22,8 @@ class Points(NamedTuple):
     ----------
     settings : dict of str to ndarray
         Magnet name to setting.
+    units : dict of str to str
+        Magnet name to the unit of its settings.
     screen : tuple of str
         Where each was measured.
     size, error, model : ndarray
@@ -37,6 +39,7 @@ class Points(NamedTuple):
     """
 
     settings: dict[str, np.ndarray]
+    units: dict[str, str]
     screen: tuple[str, ...]
     size: np.ndarray
     error: np.ndarray
@@ -96,6 +99,8 @@ class ScreenTwiss(NamedTuple):
         The screen.
     settings : dict of str to float
         The settings it holds for.
+    units : dict of str to str
+        Their units.
     beta, alpha : Quantity
         Twiss parameters.
     size : Quantity
@@ -104,6 +109,7 @@ class ScreenTwiss(NamedTuple):
 
     name: str
     settings: dict[str, float]
+    units: dict[str, str]
     beta: Quantity
     alpha: Quantity
     size: Quantity
@@ -253,6 +259,7 @@ class PlaneFit:
             "screen": {
                 "name": self.screen.name,
                 "settings": self.screen.settings,
+                "units": self.screen.units,
                 "beta": self.screen.beta.to_json(),
                 "alpha": self.screen.alpha.to_json(),
                 "size": self.screen.size.to_json(),
@@ -260,6 +267,7 @@ class PlaneFit:
             "mismatch": None if self.mismatch is None else self.mismatch.to_json(),
             "points": {
                 "settings": {n: v.tolist() for n, v in self.points.settings.items()},
+                "units": self.points.units,
                 "screen": list(self.points.screen),
                 "size_m": self.points.size.tolist(),
                 "error_m": self.points.error.tolist(),

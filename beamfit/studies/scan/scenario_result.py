@@ -28,6 +28,7 @@ from beamfit.studies.scan.scenario_model import line_of, network_elements, row_e
 from beamfit.studies.scan.scenario_parameters import parameters_of
 from beamfit.studies.scan.scenario_words import null_directions, verdict_words
 from beamfit.studies.scan.sigma import emittance_parts
+from beamfit.studies.scan.transport import own_settings, own_units
 from beamfit.studies.scan.verdict import CLEAR, POOR_FIT, phase_coverage
 
 # A further decrease of χ² below this changes nothing anybody asks for.
@@ -240,7 +241,7 @@ def _plane(
     words = verdict_words(scenario, told, fit, status, distance, parameters, bool(n.known[0]))
     sigma_known = determined and bool(n.known[3:6].all())
     factor = float(beta_gamma(work.given.energy.mean(), seen.line.mass))
-    own = {m: float(line[m].setting) for m in line.upto(work.given.last_screen).magnets}
+    own = own_settings(line, work.given.last_screen)
     return PlaneFit(
         plane=plane,
         status=status,
@@ -253,6 +254,7 @@ def _plane(
         screen=ScreenTwiss(
             name=work.given.last_screen,
             settings=own,
+            units=own_units(line, work.given.last_screen),
             beta=quantity(6, "m"),
             alpha=quantity(7, "1"),
             size=quantity(8, "m"),

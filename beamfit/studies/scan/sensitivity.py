@@ -251,7 +251,9 @@ def range_sensitivity(plane: PlaneFit) -> list[RangeRow]:
 
 def _place(points: Points, i: int) -> str:
     """Name a point by its screen, where there are several, and the settings that vary."""
-    varied = [f"{n} = {v[i]:.4g}" for n, v in points.settings.items() if np.ptp(v) > 0]
+    varied = [
+        f"{n} = {v[i]:.4g} {points.units[n]}" for n, v in points.settings.items() if np.ptp(v) > 0
+    ]
     screen = [points.screen[i]] if len(set(points.screen)) > 1 else []
     return ", ".join(screen + varied)
 

@@ -35,7 +35,8 @@ def result_rows(planes: tuple[PlaneFit, ...]) -> list[tuple[str, list[str]]]:
         Rows in the order they are read.
     """
     at = f"at {planes[0].screen.name}"
-    own = ", ".join(f"{n} = {v:.4g}" for n, v in planes[0].screen.settings.items()) or "-"
+    there = planes[0].screen
+    own = ", ".join(f"{n} = {v:.4g} {there.units[n]}" for n, v in there.settings.items()) or "-"
     rows: list[tuple[str, Callable[[PlaneFit], object]]] = [
         ("status", lambda p: p.status.value.replace("_", " ")),
         ("normalised emittance", lambda p: p.normalized_emittance),
@@ -138,7 +139,7 @@ def point_rows(plane: PlaneFit) -> tuple[list[str], list[list[str]]]:
         Column names, and one list of cells a point.
     """
     p = plane.points
-    header = [*p.settings, "size µm", "error µm", "fit µm", "pull"]
+    header = [*(f"{n} {p.units[n]}" for n in p.settings), "size µm", "error µm", "fit µm", "pull"]
     screens = len(set(p.screen)) > 1
     header = (["screen"] if screens else []) + header
     if p.outlier_probability is not None:

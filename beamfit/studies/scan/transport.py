@@ -13,7 +13,12 @@ import numpy as np
 from jax import Array
 
 from beamfit.optics.beamline import Beamline
-from beamfit.optics.calibration import FocusingStrength, IntegratedGradient, IntegratedStrength
+from beamfit.optics.calibration import (
+    SETTING_UNITS,
+    FocusingStrength,
+    IntegratedGradient,
+    IntegratedStrength,
+)
 from beamfit.optics.elements import Marker, Screen, ThinLens, TransferMatrix
 from beamfit.studies.scan.scans import QuadScan
 
@@ -21,6 +26,8 @@ __all__ = [
     "PlaneInput",
     "ScanRows",
     "names_of",
+    "own_settings",
+    "own_units",
     "plane_input",
     "scan_rows",
     "scanned_line",
@@ -56,6 +63,8 @@ class PlaneInput(NamedTuple):
     ----------
     settings : dict of str to ndarray
         Magnet name to setting.
+    units : dict of str to str
+        Magnet name to the unit of its settings.
     energy : ndarray
         Total energy, MeV.
     screen : tuple of str
@@ -78,6 +87,7 @@ class PlaneInput(NamedTuple):
     """
 
     settings: dict[str, np.ndarray]
+    units: dict[str, str]
     energy: np.ndarray
     screen: tuple[str, ...]
     size: np.ndarray
@@ -205,6 +215,7 @@ def plane_input(
     design = rows.places.index(scanned.design.at) if scanned.design else 0
     return PlaneInput(
         settings=measured.settings,
+        units={name: SETTING_UNITS[scan.units[name]] for name in measured.settings},
         energy=rows.energy[keep],
         screen=screen,
         size=measured.size,
@@ -218,3 +229,13 @@ def plane_input(
         to_screen=every[-1, rows.which[-1]],
         to_design=every[-1, design],
     )
+
+
+def own_settings(line: Beamline, screen: str) -> dict[str, float]:
+    """The lattice's own setting of every magnet up to a screen."""
+    return {name: float(line[name].setting) for name in line.upto(screen).magnets}
+
+
+def own_units(line: Beamline, screen: str) -> dict[str, str]:
+    """The units of `own_settings`."""
+    return {n: SETTING_UNITS[line[n].calibration.unit] for n in line.upto(screen).magnets}
