@@ -13,6 +13,7 @@ __version__ = "0.1.0"
 # Public name -> module. Loaded on first use, so that `beamfit --help` and a bad file are
 # answered before JAX has been imported.
 _HOME = {
+    "Anchor": "beamfit.studies.scan.assumptions",
     "BeamMatrix": "beamfit.optics.beam",
     "Beamline": "beamfit.optics.beamline",
     "DecayFit": "beamfit.studies.decay.result",
@@ -27,6 +28,7 @@ _HOME = {
     "SectorDipole": "beamfit.optics.elements",
     "ThinLens": "beamfit.optics.elements",
     "constant_a_test": "beamfit.studies.decay.checks",
+    "find_setpoint": "beamfit.studies.scan.setpoint",
     "fit_decay": "beamfit.studies.decay.fit",
     "fit_decays": "beamfit.studies.decay.fit",
     "fit_emittance": "beamfit.studies.scan.emittance",

@@ -20,8 +20,8 @@ from rich.table import Table
 
 import beamfit
 from beamfit.greybox import problem as greybox
+from beamfit.greybox.many_starts import descend_all
 from beamfit.greybox.solve import starting_points
-from beamfit.inference.many_starts import descend_all
 from beamfit.studies.scan.assumptions import Anchor, Assumptions
 from beamfit.studies.scan.scenario_data import see
 from beamfit.studies.scan.scenarios import STEPS, scenario_problem, train

@@ -12,9 +12,9 @@ import numpy as np
 
 from beamfit.greybox import problem as greybox
 from beamfit.greybox.fit import Fit
+from beamfit.greybox.many_starts import descend_all
 from beamfit.greybox.problem import Problem
 from beamfit.greybox.solve import solve, starting_points
-from beamfit.inference.many_starts import descend_all
 from beamfit.optics.beamline import Beamline
 from beamfit.status import Status
 from beamfit.studies.scan.assumptions import Assumptions

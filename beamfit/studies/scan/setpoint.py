@@ -15,7 +15,7 @@ from jax import Array
 
 from beamfit.errors import InputError
 from beamfit.greybox import tree
-from beamfit.inference.many_starts import descend_all
+from beamfit.greybox.many_starts import descend_all
 from beamfit.inference.quantity import Quantity, Status
 from beamfit.optics.beamline import Beamline
 from beamfit.studies.scan.setpoint_checks import checked_place

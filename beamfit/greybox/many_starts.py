@@ -77,7 +77,7 @@ def descend_all(
 
     Examples
     --------
-    >>> import beamfit.optics
+    >>> import beamfit.greybox
     >>> def miss(target, t):
     ...     return t**2 - target
     >>> starts, low, high = jnp.array([[1.0], [5.0]]), jnp.array([0.0]), jnp.array([9.0])
@@ -115,7 +115,7 @@ def descend_one(
 
     Examples
     --------
-    >>> import beamfit.optics
+    >>> import beamfit.greybox
     >>> fit = jax.vmap(lambda y: descend_one(lambda t: t - y, jnp.zeros(1), -jnp.ones(1),
     ...                                      jnp.ones(1)).theta)
     >>> fit(jnp.array([0.5, 3.0])).ravel().round(9).tolist()

@@ -1,0 +1,35 @@
+"""Bounds as information: exact where data decide, and a Monte Carlo of an open number."""
+
+import numpy as np
+
+from beamfit.inference.bounded import spread_of
+
+
+def test_far_bounds_leave_the_covariance_of_the_data():
+    jacobian = np.random.default_rng(1).normal(size=(9, 3))
+    found = spread_of(jacobian, np.full(3, -1e6), np.full(3, 1e6))
+    np.testing.assert_allclose(found.covariance, np.linalg.inv(jacobian.T @ jacobian), rtol=1e-8)
+    assert np.all(found.share(np.eye(3)) < 1e-10)
+
+
+def test_without_bounds_an_open_direction_has_no_useful_error():
+    found = spread_of(np.array([[1.0, 1.0]]), np.full(2, -np.inf), np.full(2, np.inf))
+    along, across = found.error(np.array([[1.0, 1.0], [1.0, -1.0]]))
+    assert along < 1.001
+    assert across > 1e5
+
+
+def test_an_open_number_is_as_uncertain_as_an_end_of_its_range():
+    """Truth anywhere in 0 to 6, answer on an end: mean square distance 36/3."""
+    truth = np.random.default_rng(2).uniform(0.0, 6.0, 200_000)
+    found = spread_of(np.zeros((1, 1)), np.zeros(1), np.full(1, 6.0))
+    np.testing.assert_allclose(found.error(np.eye(1)), np.sqrt(np.mean(truth**2)), rtol=5e-3)
+    np.testing.assert_allclose(found.share(np.eye(1)), 1.0)
+
+
+def test_held_numbers_do_not_move_and_a_prior_takes_the_place_of_bounds():
+    jacobian = np.array([[2.0, 1.0], [0.0, 1.0]])
+    held = spread_of(jacobian, np.zeros(2), np.ones(2), held=np.array([False, True]))
+    assert held.covariance[1].tolist() == [0.0, 0.0]
+    prior = spread_of(jacobian, np.zeros(2), np.ones(2), with_prior=np.array([True, True]))
+    np.testing.assert_allclose(prior.covariance, np.linalg.inv(jacobian.T @ jacobian), rtol=1e-10)
