@@ -11,7 +11,7 @@ import numpy as np
 
 from beamfit.errors import InputError
 from beamfit.greybox import tree
-from beamfit.greybox.problem import Core
+from beamfit.greybox.problem import Core, Prior
 from beamfit.sampling.likelihood import Group, Likelihood
 from beamfit.sampling.priors import Distribution, checked
 from beamfit.sampling.target import Law, Target, covariance_of
@@ -139,11 +139,19 @@ def target_of(
             for what in ("measured", "error")
             if getattr(record, what) is not None
         },
+        stated={prior.name: _words(prior) for prior in p.priors},
         priors_own=held,
         open_directions=loose,
         verdict=(fit.status.value, fit.message),
         hidden=tuple(names[i] for i in range(len(names)) if p.nuisance[moving[i]]),
     )
+
+
+def _words(prior: Prior) -> str:
+    """A normal prior in words; of many numbers only that it is one."""
+    if np.size(prior.mean) == np.size(prior.sd) == 1:
+        return f"normal, {float(prior.mean):.6g} ± {float(prior.sd):.3g}"
+    return "normal"
 
 
 def _with_priors(data: Sampled, moved: jax.Array) -> tuple[jax.Array]:

@@ -92,7 +92,7 @@ def _fitted_too(fit: EmittanceFit) -> list[Table]:
     """What a scenario fitted besides the beam, and what the data leave open."""
     rows = [[name, *cells] for name, cells in parameter_rows(fit.parameters)]
     header = ["fitted too", "value", "bounds", "prior", "state"]
-    parts = [Table(f"Scenario {fit.scenario}", header, rows, f"Anchor: {fit.anchor}.")]
+    parts = [Table(f"Scenario {fit.scenario}", header, rows, _anchor(fit))]
     if not rows:
         parts = []
     if fit.null_directions:
@@ -106,3 +106,8 @@ def _verdict(p: PlaneFit) -> Verdict:
     value = f"normalised emittance {p.normalized_emittance}"
     headline = value if determined else "emittance not determined"
     return Verdict(p.status.value, f"{p.plane}: {headline}", p.message)
+
+
+def _anchor(fit: EmittanceFit) -> str:
+    """What ties a network to the lattice; a calibration has priors instead."""
+    return f"Anchor: {fit.anchor}." if fit.scenario.endswith("network") else ""

@@ -237,8 +237,9 @@ class Posterior:
 
     @property
     def priors(self) -> Mapping[str, str]:
-        """The priors given to `sample`, in words."""
-        return {name: in_words(prior) for name, prior in self.target.priors.items()}
+        """The priors, the problem's own and those given to `sample`, in words."""
+        given = {name: in_words(prior) for name, prior in self.target.priors.items()}
+        return {**self.target.stated, **given}
 
     def to_json(self) -> dict[str, Any]:
         """Give the ``posterior`` object of the JSON contract; intervals are null where held."""

@@ -125,6 +125,8 @@ class Target:
         Numbers nobody asks for.
     remark : str
         A further sentence on what was left out.
+    stated : mapping of str to str
+        Priors that are part of the law, in words.
     group_of : tuple of int
         Which group's noise widens each of the law's numbers; the first if empty.
 
@@ -160,6 +162,7 @@ class Target:
     verdict: tuple[str, str] = ("converged", "")
     hidden: tuple[str, ...] = ()
     remark: str = ""
+    stated: Mapping[str, str] = field(default_factory=dict)
     group_of: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:

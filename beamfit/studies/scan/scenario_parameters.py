@@ -63,7 +63,7 @@ def _calibration(told: Assumptions, j: Judged):
     for i, variable in enumerate(j.fit.variables):
         if variable.name.startswith("beam."):
             continue
-        determined = shares[i] < MOST_SHARE
+        determined = j.settled and shares[i] < MOST_SHARE
         edge = variable.state in ("lower", "upper")
         status = Status.converged if determined else Status.unidentified
         if edge:
@@ -114,16 +114,16 @@ def _strengths(seen: Seen, told: Assumptions, j: Judged):
         length = float(seen.scanned[name].length)
         found = j.quantities(_k1, _Asked(name, jnp.asarray(at), length, energy))
         for i, current in enumerate(at):
-            yield _derived(f"{name}.k1 at {current:g}", found, i)
+            yield _derived(f"{name}.k1 at {current:g}", found, i, j.settled)
         if told.hysteresis:
             both = jnp.array([[middle, 1.0], [middle, -1.0]])
             found = j.quantities(_loop, _Asked(name, both, length, energy))
-            yield _derived(f"{name}.k1 rising less falling at {middle:g}", found, 0)
+            yield _derived(f"{name}.k1 rising less falling at {middle:g}", found, 0, j.settled)
 
 
-def _derived(name: str, found: Found, i: int) -> Parameter:
-    error = (float(found.error[i]), float(found.raw[i])) if found.known[i] else (None, None)
-    known = bool(found.known[i])
+def _derived(name: str, found: Found, i: int, settled: bool) -> Parameter:
+    known = settled and bool(found.known[i])
+    error = (float(found.error[i]), float(found.raw[i])) if known else (None, None)
     return Parameter(
         name=name,
         value=Quantity(float(found.value[i]), error[0], "1/m^2", error[1]),

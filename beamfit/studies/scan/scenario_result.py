@@ -26,10 +26,11 @@ from beamfit.studies.scan.results import Identifiability, Parameter, PlaneFit, P
 from beamfit.studies.scan.scenario_data import Seen
 from beamfit.studies.scan.scenario_model import line_of, network_elements, row_elements, sigma_of
 from beamfit.studies.scan.scenario_parameters import parameters_of
+from beamfit.studies.scan.scenario_verdict import verdicts_on
 from beamfit.studies.scan.scenario_words import null_directions, verdict_words
 from beamfit.studies.scan.sigma import emittance_parts
 from beamfit.studies.scan.transport import own_settings, own_units
-from beamfit.studies.scan.verdict import CLEAR, POOR_FIT, phase_coverage
+from beamfit.studies.scan.verdict import CLEAR, POOR_FIT, Verdict, few_words, phase_coverage
 
 # A further decrease of χ² below this changes nothing anybody asks for.
 SETTLED = 0.01
@@ -142,7 +143,12 @@ def result_of(
     j = judged(fit)
     line = line_of(fit.model, seen.scanned)
     parameters = parameters_of(seen, scenario, told, j)
-    planes = tuple(_plane(seen, scenario, told, j, plane, line, parameters) for plane in seen.works)
+    points = {plane: _points(seen, plane, fit) for plane in seen.works}
+    verdicts = verdicts_on(seen, points)
+    planes = tuple(
+        _plane(seen, scenario, told, j, plane, line, parameters, points[plane], verdicts[plane])
+        for plane in seen.works
+    )
     return EmittanceFit(
         planes,
         seen.scan,
@@ -212,8 +218,10 @@ def _plane(
     told: Assumptions,
     j: Judged,
     plane: str,
-    line,
+    line: Beamline,
     parameters: tuple[Parameter, ...],
+    points: Points,
+    on_sizes: Verdict,
 ) -> PlaneFit:
     work, fit = seen.works[plane], j.fit
     n = j.quantities(_numbers, _places(seen, scenario, plane))
@@ -221,7 +229,7 @@ def _plane(
     distance = float(n.value[0] / (2.0 * n.error[0])) if n.error[0] > 0 else 0.0
     found = j.settled and fit.status not in (Status.not_finite, Status.infeasible)
     clear = bool(n.known[0]) and distance >= CLEAR
-    determined = clear and found
+    determined = clear and found and on_sizes.cause is None
 
     def quantity(i: int, unit: str, factor: float = 1.0) -> Quantity:
         value = float(n.value[i] * factor)
@@ -229,7 +237,6 @@ def _plane(
             return Quantity(value, None, unit)
         return Quantity(value, float(n.error[i] * factor), unit, float(n.raw[i] * factor))
 
-    points = _points(seen, plane, fit)
     probability = chi2_probability(fit.chi2, fit.dof)
     poor = known_noise and probability is not None and probability < POOR_FIT
     status = Status.unidentified if not determined else Status.converged
@@ -239,6 +246,9 @@ def _plane(
     elif determined and poor:
         status = Status.poor_fit
     words = verdict_words(scenario, told, fit, status, distance, parameters, bool(n.known[0]))
+    words += few_words(known_noise, work.evidence.dof) if determined else ""
+    if clear and found and on_sizes.cause is not None:
+        words = f"Not determined in scenario {scenario}: {on_sizes.cause}."
     sigma_known = determined and bool(n.known[3:6].all())
     factor = float(beta_gamma(work.given.energy.mean(), seen.line.mass))
     own = own_settings(line, work.given.last_screen)

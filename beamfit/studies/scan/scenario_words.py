@@ -106,6 +106,11 @@ def verdict_words(
     -------
     str
     """
+    if status is Status.not_converged and scenario.endswith("network"):
+        return (
+            f"The search from {told.starts} starts came to no rest (chi2 = {fit.chi2:.4g}); give "
+            "more starts, another seed, or fewer hidden nodes."
+        )
     if status in (Status.not_finite, Status.not_converged, Status.infeasible):
         return fit.message[0].upper() + fit.message[1:]
     tied = "" if told.anchor.words == "none" else f" with {told.anchor.words}"

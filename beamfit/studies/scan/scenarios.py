@@ -23,13 +23,15 @@ from beamfit.studies.scan.fit import EmittanceFit
 from beamfit.studies.scan.focusing_network import focusing_problem
 from beamfit.studies.scan.scans import QuadScan
 from beamfit.studies.scan.scenario_data import Seen, see
-from beamfit.studies.scan.scenario_result import result_of
+from beamfit.studies.scan.scenario_result import judged, result_of
 from beamfit.studies.scan.transport_network import transport_problem
 
 __all__ = ["fit_scenario", "scenario_problem", "train"]
 
 # Steps of the search from many starts; what is left is for the polish.
 STEPS, POLISH = 300, 300
+# How many of the best ends may be polished.
+POLISHED = 4
 
 
 def scenario_problem(seen: Seen, scenario: str, told: Assumptions) -> Problem:
@@ -78,11 +80,15 @@ def train(problem: Problem, starts: int, seed: int = 0) -> Fit:
     points = jnp.asarray(np.array(starting_points(problem, starts, seed)))
     lower, upper = jnp.asarray(problem.lower), jnp.asarray(problem.upper)
     found = descend_all(greybox.residual, problem.core, points, lower, upper, STEPS)
-    cost = np.asarray(found.cost)
-    if not np.isfinite(cost).any():
-        return solve(problem, iterations=POLISH)
-    best = np.asarray(found.theta)[int(np.nanargmin(cost))]
-    return solve(replace(problem, model=problem.model_at(best)), iterations=POLISH)
+    cost = np.where(np.isfinite(found.cost), found.cost, np.inf)
+    ends = np.asarray(found.theta)[np.argsort(cost, kind="stable")[:POLISHED]]
+    fits = []
+    for end in ends:
+        fits.append(solve(replace(problem, model=problem.model_at(end)), iterations=POLISH))
+        # The cheapest end that comes to rest is the answer; most often it is the first.
+        if np.isfinite(fits[-1].chi2) and judged(fits[-1]).settled:
+            return fits[-1]
+    return min(fits, key=lambda fit: fit.cost if np.isfinite(fit.cost) else np.inf)
 
 
 def fit_scenario(

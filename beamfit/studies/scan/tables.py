@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from html import escape
 
+import numpy as np
+
 from beamfit.inference.quantity import Quantity
 from beamfit.studies.scan.results import Parameter, PlaneFit
 
@@ -76,6 +78,8 @@ def _chi2(p: PlaneFit) -> str:
 
 
 def _noise(p: PlaneFit) -> str:
+    if p.chi2 is None and not np.isfinite(p.points.error).all():
+        return "not known"
     if p.chi2 is None:
         return f"inferred, {100 * float((p.points.error / p.points.size).mean()):.2g} % of size"
     return "as given" if p.error_scale == 1.0 else f"given, scaled by {p.error_scale:.2f}"

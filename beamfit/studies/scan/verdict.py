@@ -11,7 +11,7 @@ from scipy.special import stdtrit
 from beamfit.inference.identifiability import chi2_probability, one_sided_probability
 from beamfit.inference.quantity import Status
 
-__all__ = ["Evidence", "Verdict", "judge", "phase_coverage", "waist_bracketed"]
+__all__ = ["Evidence", "Verdict", "few_words", "judge", "phase_coverage", "waist_bracketed"]
 
 # A fit this unlikely to be noise alone is a poor fit (docs/design.md, the JSON contract).
 POOR_FIT = 1e-3
@@ -25,6 +25,8 @@ CHANCE = 2e-3
 LOST = 0.15
 # A robust fit must keep this many degrees of freedom, and may doubt this share of the points.
 ROBUST_DOF, DOUBTED = 4, 0.2
+# From so many degrees of freedom on, Student's distribution is nearly normal.
+MANY = 8
 
 
 class Evidence(NamedTuple):
@@ -141,12 +143,7 @@ def judge(e: Evidence, next_measurement: str | None, other_plane_clear: bool = F
             f"errors, and the lattice. {clear}.",
             None,
         )
-    if not e.noise_known and e.dof < 8:
-        reach = float(stdtrit(e.dof, 0.975))
-        clear += (
-            f"; noise inferred on {e.dof} degrees of freedom: 95 % of answers lie within "
-            f"{reach:.1f} errors"
-        )
+    clear += few_words(e.noise_known, e.dof)
     if e.noise_known and e.chi2 > e.dof > 0:
         clear += f"; errors are scaled by sqrt(chi2/dof) = {math.sqrt(e.chi2 / e.dof):.2f}"
     return Verdict(Status.converged, clear + ".", None)
@@ -197,6 +194,23 @@ def _cause(e: Evidence, other_plane_clear: bool) -> str | None:
             )
         return f"zero emittance lies only {distance:.1f} standard errors away" + _one_sided(e)
     return None
+
+
+def few_words(noise_known: bool, dof: int) -> str:
+    """Say how far errors reach whose noise was inferred from few residuals.
+
+    Examples
+    --------
+    >>> few_words(False, 2)
+    '; noise inferred on 2 degrees of freedom: 95 % of answers lie within 4.3 errors'
+    """
+    if noise_known or not 0 < dof < MANY:
+        return ""
+    reach = float(stdtrit(dof, 0.975))
+    return (
+        f"; noise inferred on {dof} degrees of freedom: 95 % of answers lie within "
+        f"{reach:.1f} errors"
+    )
 
 
 def _one_sided(e: Evidence) -> str:
