@@ -64,7 +64,7 @@ def _many(study: RecordStudy) -> Iterator[Table | Text]:
 def shift_lines(shift: Shift) -> Iterator[Table | Text]:
     """Lay out a study of many decays and its verdicts."""
     fit = shift.fit
-    names = [f"{len(fit.names)} decays"]
+    names = ["1 decay" if len(fit.names) == 1 else f"{len(fit.names)} decays"]
     yield status_table("First principles fitted to", names, [fit.status], shift_rows(shift))
     yield verdict_text("all decays", fit.status, fit.message)
     yield verdict_text("operating point", Status.converged, shift.best.message)

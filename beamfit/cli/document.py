@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 import os
 import shlex
 import sys
@@ -13,6 +12,7 @@ from typing import Any
 
 from beamfit import __version__
 from beamfit.errors import InputError
+from beamfit.inference.quantity import finite
 
 __all__ = ["check_report_name", "command_line", "json_text"]
 
@@ -75,13 +75,4 @@ def json_text(
     """
     document = {"beamfit": __version__, "command": command, "inputs": inputs, "results": results}
     document |= further or {}
-    return json.dumps(_finite(document), indent=2, allow_nan=False)
-
-
-def _finite(value: Any) -> Any:
-    """Replace numbers JSON cannot hold by null."""
-    if isinstance(value, Mapping):
-        return {k: _finite(v) for k, v in value.items()}
-    if isinstance(value, list | tuple):
-        return [_finite(v) for v in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
+    return json.dumps(finite(document), indent=2, allow_nan=False)

@@ -8,9 +8,11 @@ from typing import TYPE_CHECKING, Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from scipy.linalg import null_space
 
 from beamfit.errors import InputError
 from beamfit.greybox import tree
+from beamfit.greybox.kkt import TOLERANCE
 from beamfit.greybox.problem import Core, Prior
 from beamfit.sampling.likelihood import Group, Likelihood
 from beamfit.sampling.priors import Distribution, checked
@@ -23,6 +25,8 @@ __all__ = ["LAW", "Sampled", "target_of"]
 
 # A number that is an undetermined direction's in less than this share is not part of it.
 PART = 0.05
+# Another optimum: a chi-square larger by less than 6, more than six errors away.
+NEAR_COST, FAR = 3.0, 6.0
 
 
 @tree.node()
@@ -118,7 +122,8 @@ def target_of(
     for name, prior in priors.items():
         width[names.index(name)] = min(width[names.index(name)], float(prior.std()))
     mode = fit.theta[moving]
-    held, loose = _open(fit, moving, names, width)
+    with_prior = np.array([name in priors for name in names])
+    held, loose = _open(fit, moving, names, with_prior, width)
     extra = Law(_with_priors, _log_prior, _no_more, _model)
     return Target(
         law=LAW,
@@ -139,12 +144,27 @@ def target_of(
             for what in ("measured", "error")
             if getattr(record, what) is not None
         },
+        remark=_other_optimum(fit, moving),
         stated={prior.name: _words(prior) for prior in p.priors},
         priors_own=held,
         open_directions=loose,
         verdict=(fit.status.value, fit.message),
         hidden=tuple(names[i] for i in range(len(names)) if p.nuisance[moving[i]]),
     )
+
+
+def _other_optimum(fit: Fit, moving: np.ndarray) -> str:
+    """Warn of another optimum the search met: walkers that start at one do not find the other."""
+    spread = fit.scale * np.sqrt(np.diag(fit.covariance)[moving])
+    for attempt in fit.attempts:
+        off = np.abs(attempt.theta - fit.theta)[moving]
+        near = attempt.kkt.worst <= TOLERANCE and attempt.cost - fit.cost < NEAR_COST
+        if near and np.any(off > FAR * spread) and np.all(spread > 0):
+            return (
+                "The search met another optimum of nearly the same cost far from this one: the "
+                "intervals are those about one of them."
+            )
+    return ""
 
 
 def _words(prior: Prior) -> str:
@@ -161,13 +181,16 @@ def _with_priors(data: Sampled, moved: jax.Array) -> tuple[jax.Array]:
 
 
 def _open(
-    fit: Fit, moving: np.ndarray, names: tuple[str, ...], width: np.ndarray
+    fit: Fit, moving: np.ndarray, names: tuple[str, ...], with_prior: np.ndarray, width: np.ndarray
 ) -> tuple[tuple[str, ...], str]:
-    """Numbers of undetermined directions, and a sentence if nothing else holds some of them."""
-    seen = np.abs(fit.undetermined[moving]) if fit.undetermined.size else np.zeros((len(names), 0))
-    part = np.any(seen > PART * np.max(seen, axis=0, initial=1e-300), axis=1)
-    loose = [name for name, p, w in zip(names, part, width, strict=True) if p and np.isinf(w)]
-    held = tuple(name for name, p in zip(names, part, strict=True) if p)
+    """Numbers that bounds alone hold, and a sentence if nothing at all holds some of them.
+
+    A prior on one number holds every direction along which it moves.
+    """
+    unseen = fit.undetermined[moving] if fit.undetermined.size else np.zeros((len(names), 0))
+    beyond_priors = _not_moving(unseen, with_prior)
+    beyond_bounds = _not_moving(beyond_priors, np.isfinite(width))
+    held, loose = (_along(part, names) for part in (beyond_priors, beyond_bounds))
     if not loose:
         return held, ""
     shown = ", ".join(loose[:6]) + (", ..." if len(loose) > 6 else "")
@@ -175,3 +198,17 @@ def _open(
         f"the data do not determine {shown}, and neither bounds nor priors hold them, so that "
         "there is no posterior; bound them, give priors, or measure what tells them apart"
     )
+
+
+def _not_moving(directions: np.ndarray, chosen: np.ndarray) -> np.ndarray:
+    """The directions, combined, along which the chosen numbers stay where they are."""
+    if not directions.shape[1] or not chosen.any():
+        return directions
+    return directions @ null_space(directions[chosen], rcond=PART)
+
+
+def _along(directions: np.ndarray, names: tuple[str, ...]) -> tuple[str, ...]:
+    """Numbers that move along some direction by more than a small part of the largest."""
+    size = np.abs(directions)
+    moved = np.any(size > PART * np.max(size, axis=0, initial=1e-300), axis=1)
+    return tuple(name for name, m in zip(names, moved, strict=True) if m)

@@ -86,6 +86,8 @@ def draw(
     n = len(target.names)
     walkers = walkers or max(FEWEST_WALKERS, 4 * n)
     _check_options(n, target_ess, budget, walkers)
+    if not (isinstance(seed, int | np.integer) and 0 <= seed < 2**32):
+        raise InputError(f"seed {seed!r}", "a whole number from 0 to 4294967295")
     provenance = provenance or Provenance()
     if store is not None:
         check_place(store)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from beamfit.errors import InputError, nearest
-from beamfit.inference.quantity import Quantity
+from beamfit.inference.quantity import Quantity, finite
 from beamfit.sampling.convergence import Diagnostics
 from beamfit.sampling.priors import in_words
 from beamfit.sampling.target import Target
@@ -26,6 +26,8 @@ __all__ = ["Band", "Correlations", "Interval", "Posterior"]
 ONE_SIGMA = 0.6826894921370859
 # Draws from which functions of the user's are computed, unless all are asked for.
 ENOUGH_DRAWS = 4000
+# Beyond this R-hat walkers sit in places of their own.
+APART = 1.2
 
 
 class Interval(NamedTuple):
@@ -173,7 +175,7 @@ class Posterior:
         values = self.values(name)
         if not values.size:
             return Quantity(float("nan"), None, self.unit(name))
-        error = None if name in self.held else float(np.std(values))
+        error = None if name in self.held or self.apart else float(np.std(values))
         return Quantity(float(np.mean(values)), error, self.unit(name))
 
     def quantiles(
@@ -245,7 +247,7 @@ class Posterior:
         """Give the ``posterior`` object of the JSON contract; intervals are null where held."""
         d, shown = self.diagnostics, self.shown
         found = self.correlations(shown)
-        return {
+        document = {
             "status": self.status.value,
             "message": self.message,
             "likelihood": [group._asdict() for group in self.target.likelihood.groups],
@@ -264,11 +266,18 @@ class Posterior:
                 "seed": self.seed,
             },
         }
+        return finite(document)
+
+    @property
+    def apart(self) -> bool:
+        """Whether the walkers lie so far apart that no interval of theirs means anything."""
+        rhat = self.diagnostics.rhat
+        return bool(rhat.size and np.max(rhat) > APART)
 
     def _json_of(self, name: str) -> dict[str, Any]:
         quantity = self[name].to_json()
         low, one, middle, other, high = (float(v) for v in self.quantiles(name))
-        known = name not in self.held
+        known = name not in self.held and not self.apart
         return {
             "name": name,
             "value": quantity["value"],

@@ -61,6 +61,8 @@ class Normal:
 
     def __post_init__(self) -> None:
         _positive(self.sd, "a standard deviation of")
+        if not math.isfinite(self.centre):
+            raise InputError(f"a centre of {self.centre}", "a finite number")
 
     def logpdf(self, x: np.ndarray) -> np.ndarray:
         """Log density at x."""
@@ -248,7 +250,9 @@ def checked(
     for name, prior in (priors or {}).items():
         if name not in names:
             raise InputError(f"a prior on '{name}'", nearest(name, list(names)))
-        if isinstance(prior, type) or not isinstance(prior, Distribution):
+        # scipy.stats.norm has the methods too; norm(0, 1) is frozen and carries its `dist`.
+        unfrozen = isinstance(prior, type) or hasattr(prior, "freeze")
+        if unfrozen or not isinstance(prior, Distribution):
             expected = "Normal, LogNormal, Uniform, HalfNormal or a frozen scipy.stats distribution"
             raise InputError(f"a prior of type {type(prior).__name__} on '{name}'", expected)
     return dict(priors or {})

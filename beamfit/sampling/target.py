@@ -183,11 +183,16 @@ class Target:
             "lower": np.concatenate([np.asarray(self.lower, float), low]),
             "upper": np.concatenate([np.asarray(self.upper, float), high]),
         }
+        mode = np.array(self.mode, float)
         for i, name in enumerate((*self.names, *extra)):
             if name in self.priors:
                 first, last = self.priors[name].support()
                 ends["lower"][i] = max(ends["lower"][i], first)
                 ends["upper"][i] = min(ends["upper"][i], last)
+                # A prior may leave out where the fit ended: begin well inside it.
+                if i < len(mode) and not first < mode[i] < last:
+                    prior_mean = float(self.priors[name].mean())
+                    mode[i] = prior_mean if first < prior_mean < last else 0.5 * (first + last)
         n = len(self.names)
         covariance = np.zeros((n + len(extra),) * 2)
         covariance[:n, :n] = self.covariance
@@ -195,7 +200,7 @@ class Target:
         fields = ends | {
             "names": (*self.names, *extra),
             "units": (*self.units, *("1" for _ in extra)),
-            "mode": np.concatenate([np.asarray(self.mode, float), middle]),
+            "mode": np.concatenate([mode, middle]),
             "covariance": covariance,
             "data": jax.tree.map(jnp.asarray, self.data),
         }

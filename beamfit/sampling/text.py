@@ -88,6 +88,8 @@ def interval_rows(posterior: Posterior) -> list[list[str]]:
 
         if name in posterior.held:
             rows.append([label, "not determined", "the prior's", "the prior's"])
+        elif posterior.apart:
+            rows.append([label, "not determined", "walkers disagree", "walkers disagree"])
         else:
             spans = [f"{text(one)} to {text(other)}", f"{text(low)} to {text(high)}"]
             rows.append([label, text(middle), *spans])

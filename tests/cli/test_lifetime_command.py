@@ -292,3 +292,22 @@ def test_many_decays_are_a_row_each_and_nothing_is_cut_short(run, tmp_path, monk
     assert "…" not in shown
     assert shown.count("lifetime at the mean current ") == 2
     assert shown.count("a, Touschek ") == 2
+
+
+@pytest.mark.parametrize(
+    ("column", "value", "said"),
+    [
+        ("rf_voltage_kV", 3.2e6, "beam's energy"),
+        ("scraper_y_mm", 0.006, "check the unit"),
+        ("pressure_Pa", 1e5, "check the unit"),
+    ],
+)
+def test_a_setting_in_another_unit_is_refused(run, tmp_path, column, value, said):
+    time = np.arange(0.0, 3600.0, 60.0)
+    path = write_record(tmp_path / "slip.csv", time, decay(time), **{column: value})
+    status, out, err = run("lifetime", str(path), "--ring", RING)
+    assert (status, out) == (2, "")
+    assert err.count("\n") == 1
+    assert "slip.csv" in err
+    assert column in err
+    assert said in err

@@ -162,3 +162,15 @@ def test_a_record_cannot_be_changed():
     with pytest.raises(ValueError, match="read-only"):
         record.current[0] = 4.0
     assert record.select([0, 2]).conditions.bunches.tolist() == [280.0, 280.0]
+
+
+def test_a_dead_first_reading_is_a_dropout_and_not_a_refill():
+    time = np.arange(0.0, 6000.0, 10.0)
+    noise = 5e-3 * np.random.default_rng(8).normal(size=time.size)
+    current = 200.0 / (1 + 1e-5 * time) + noise
+    dead = current.copy()
+    dead[:2] = 0.0
+    found = split_record(DecayRecord(time, dead))
+    assert [event.kind for event in found.events] == ["dropout"]
+    assert len(found.segments) == 1
+    np.testing.assert_array_equal(found.segments[0].current, current[2:])

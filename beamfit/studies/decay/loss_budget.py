@@ -123,6 +123,11 @@ def operation_during(record: DecayRecord, machine: Machine) -> Operation:
         expected = f"more than the loss of {loss / 1e3:.6g} kV a turn, or no beam is stored"
         found = f"{said['rf_voltage'] / 1e3:.6g} kV"
         raise InputError(found, expected, path=record.name, column="rf_voltage_kV")
+    energy = float(machine.ring.energy)
+    if said.get("rf_voltage", 0.0) > energy:
+        found = f"{said['rf_voltage'] / 1e3:.6g} kV"
+        expected = f"less than the beam's energy, {energy / 1e6:.6g} MeV; check the unit"
+        raise InputError(found, expected, path=record.name, column="rf_voltage_kV")
     if "pressure" in said:
         read = said.pop("pressure")
         mean = usual.pressure_base + usual.pressure_slope * float(record.current.mean())

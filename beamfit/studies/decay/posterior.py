@@ -143,9 +143,22 @@ def decay_target(
         priors=priors,
         derived=Derived(LIFETIMES, ("h",) * 3),
         observed=_observed(record),
-        priors_own=() if separable else ("a", "b"),
+        # A prior on one of the two tells them apart, if anything does.
+        priors_own=() if separable or {"a", "b"} & set(priors) else ("a", "b"),
+        remark=_correlated(fit),
         open_directions=_nothing(fit) if nothing_seen else "",
         verdict=(fit.status.value, fit.message),
+    )
+
+
+def _correlated(fit: DecayFit) -> str:
+    """The likelihood takes readings as independent; say so where they are not."""
+    larger = fit.identifiability.error_inflation
+    if larger <= 1:
+        return ""
+    return (
+        "Neighbouring residuals are correlated, which this likelihood does not know: true "
+        f"intervals are about {larger:.1f} times as wide, or more."
     )
 
 

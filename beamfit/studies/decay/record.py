@@ -12,6 +12,16 @@ from beamfit.errors import InputError
 __all__ = ["Conditions", "DecayRecord", "Fault", "first_fault"]
 
 
+# Beyond these a column is in another unit than its name says: RF voltages up to LEP's 3.6 GV, a
+# scraper from 0.1 mm, a vacuum in which a beam can be stored.
+PLAUSIBLE = {
+    "rf_voltage": (1e3, 4e9, "V"),
+    "scraper_y": (1e-4, 0.5, "m"),
+    "pressure": (1e-14, 1e-2, "Pa"),
+    "bunches": (1.0, 1e5, "bunches"),
+}
+
+
 class Conditions(NamedTuple):
     """Operating conditions along a record, in SI; None where the file does not give them.
 
@@ -67,6 +77,21 @@ def _unit_change(current: np.ndarray) -> int | None:
     return None
 
 
+def _odd_setting(conditions: Conditions) -> Fault | None:
+    """A setting that is negative, or no machine has in the unit of its column."""
+    for name, (low, high, unit) in PLAUSIBLE.items():
+        values = getattr(conditions, name)
+        if values is None:
+            continue
+        if (row := _first(values < 0)) is not None:
+            return Fault(row, name, f"a negative {name}, {values[row]:.6g}", "zero or more")
+        row = _first((values > high) | ((values < low) & (values > 0)))
+        if row is not None:
+            expected = f"{low:g} to {high:g} {unit}; check the unit of the column"
+            return Fault(row, name, f"{name} {values[row]:.3g} {unit}", expected)
+    return None
+
+
 def first_fault(
     time: np.ndarray, current: np.ndarray, error: np.ndarray | None, conditions: Conditions
 ) -> Fault | None:
@@ -105,9 +130,8 @@ def first_fault(
         return Fault(row, "current", found, "a current of zero or more; subtract the DCCT's offset")
     if error is not None and (row := _first(error <= 0)) is not None:
         return Fault(row, "error", f"an error of {error[row]:.6g} mA", "a positive one")
-    for name, values in conditions._asdict().items():
-        if values is not None and (row := _first(values < 0)) is not None:
-            return Fault(row, name, f"a negative {name}, {values[row]:.6g}", "zero or more")
+    if (fault := _odd_setting(conditions)) is not None:
+        return fault
     if (row := _unit_change(current)) is not None:
         found = f"{current[row]:.6g} mA after {current[row - 1]:.6g} mA, a factor of 1000"
         return Fault(row, "current", found, "one unit throughout, A or mA")

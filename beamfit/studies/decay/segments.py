@@ -15,6 +15,8 @@ __all__ = ["Event", "Split", "noise_of", "split_record"]
 THRESHOLD = 10.0
 # Readings below this share of the largest one near them are dropouts of the monitor.
 DROPOUT = 0.02
+# So many dead readings at most may stand before the beam is seen.
+DEAD = 5
 WINDOW = 9
 FEWEST = 8
 # A gap is this many usual sampling intervals.
@@ -91,6 +93,10 @@ def noise_of(time: np.ndarray, current: np.ndarray) -> float:
 def _dropouts(current: np.ndarray) -> tuple[np.ndarray, int]:
     """Readings near zero although the beam comes back, and where it is gone for good."""
     flagged = np.zeros(current.size, bool)
+    # A few dead readings before the beam is seen have no reading before them to compare with.
+    first = int(np.argmax(current > DROPOUT * np.median(current)))
+    if first <= DEAD and np.median(current) > 0:
+        flagged[:first] = True
     for start in np.flatnonzero(current[1:] < DROPOUT * current[:-1]) + 1:
         if flagged[start]:
             continue

@@ -294,7 +294,7 @@ def shift_rows(shift: Shift) -> Rows:
         scale = getattr(fit, name)
         said = "not separable" if scale.error is None else str(scale)
         rows.append((f"{name}, scale on the ring file", said))
-    rows.append(("chi2/dof", f"{fit.chi2:.4g}/{fit.dof}"))
+    rows.append(("chi2/dof", f"{fit.chi2:.4g}/{fit.dof}" if fit.dof > 0 else "not testable"))
     for row in shift.budget:
         shown = f"{row.median:.4g} ({row.lower:.4g} to {row.upper:.4g}) {row.unit}"
         label = f"{row.name} at {shift.current:.4g} mA"

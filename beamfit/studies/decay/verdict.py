@@ -152,7 +152,7 @@ def _status(
     if verdict.error_inflation > 1:
         remarks.append(
             f"Neighbouring residuals are correlated ({verdict.residual_correlation:.2f}), so the "
-            f"true errors are about {verdict.error_inflation:.1f} times those given"
+            f"true errors are about {verdict.error_inflation:.1f} times those given, or more"
         )
     remarks += _quantised(record, scale)
     step = _step(record, solution.residuals[: len(record)])
