@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 
 from beamfit.errors import InputError
+from beamfit.inference.quantity import Status
 from beamfit.io.decay_record import read_decay_record
 from beamfit.lifetime.decay import current_by_rate
+from beamfit.studies.decay import checks
 from beamfit.studies.decay.checks import (
     constant_a_test,
     log_linear,
@@ -293,3 +295,17 @@ def test_the_bias_of_the_moving_lifetime_is_as_stated(a, b):
     lifetime = 1 / (a * trace.current[0] + b) / HOUR
     stated = (2 / lifetime) ** 2 / 60
     assert trace.lifetime[0] / lifetime - 1 == pytest.approx(stated, rel=0.1)
+
+
+def test_averaging_neighbours_costs_the_test_of_a_nothing(monkeypatch):
+    """SIMULATED: 3000 readings of a decay with a going as I^-0.2, averaged to 1024 and not."""
+    time = np.linspace(0.0, 12 * 3600.0, 3000)
+    exact = current_by_rate(time, 500.0, lambda i: 4e-8 * (i / 500) ** -0.2 * i)
+    noise = 0.02 * np.random.default_rng(4).normal(size=time.size)
+    record = DecayRecord(time, np.asarray(exact) + noise)
+    averaged = constant_a_test(record)
+    monkeypatch.setattr(checks, "ENOUGH", 10_000)
+    plain = constant_a_test(record)
+    assert averaged.exponent.value == pytest.approx(plain.exponent.value, abs=plain.exponent.error)
+    assert averaged.exponent.error == pytest.approx(plain.exponent.error, rel=0.15)
+    assert averaged.status == plain.status == Status.poor_fit

@@ -33,6 +33,8 @@ HOUR = 3600.0
 FEWEST_IN_WINDOW = 5
 REJECTED = 1e-3
 EXACT = 1e-8
+# Readings from which the test of a constant a can tell all that it can.
+ENOUGH = 1024
 
 
 @dataclass(frozen=True)
@@ -247,6 +249,21 @@ class ConstantA:
         return f"{self.status}. {self.message}"
 
 
+def _averaged(record: DecayRecord) -> DecayRecord:
+    """A long record as the means of neighbouring readings: the curve is smooth between them."""
+    if len(record) <= ENOUGH:
+        return record
+    first = np.linspace(0, len(record), ENOUGH, endpoint=False).astype(int)
+    count = np.diff(first, append=len(record))
+    time, current = (
+        np.add.reduceat(values, first) / count for values in (record.time, record.current)
+    )
+    error = record.error
+    if error is not None:
+        error = np.sqrt(np.add.reduceat(error**2, first)) / count
+    return DecayRecord(time, current, error, record.name)
+
+
 def constant_a_test(record: DecayRecord) -> ConstantA:
     """Test whether a is constant, against a power of the current.
 
@@ -259,7 +276,7 @@ def constant_a_test(record: DecayRecord) -> ConstantA:
     -------
     ConstantA
         Exponent, probability (F test, with the number of readings reduced for correlated
-        residuals), and the verdict.
+        residuals), and the verdict. Of more than 1024 readings neighbours are averaged.
 
     Notes
     -----
@@ -276,6 +293,7 @@ def constant_a_test(record: DecayRecord) -> ConstantA:
     >>> print(constant_a_test(record).status)
     converged
     """
+    record = _averaged(record)
     readings = padded(record)
     constant, power = solve_decay(*readings), solve_power(*readings)
     residuals = (readings[2] * power.residuals)[: len(record)]
@@ -298,8 +316,8 @@ def constant_a_test(record: DecayRecord) -> ConstantA:
         return ConstantA(Status.unidentified, f"{message}: record longer.", unknown, chance)
     if chance < REJECTED:
         message = (
-            f"A constant a is rejected (p = {chance:.2g}): a goes as I^{power.exponent:.3f}, "
-            "so b of the constant-a fit is not a gas loss; fit with the shape of a."
+            f"A constant a is rejected (p = {max(chance, 1e-300):.2g}): a goes as "
+            f"I^{power.exponent:.3f}, so b of the constant-a fit is not a gas loss; fit with the shape of a."
         )
         return ConstantA(Status.poor_fit, message, exponent, chance)
     message = f"A constant a describes the record (p = {chance:.2g}, exponent {exponent})."
