@@ -317,7 +317,8 @@ def constant_a_test(record: DecayRecord) -> ConstantA:
     if chance < REJECTED:
         message = (
             f"A constant a is rejected (p = {max(chance, 1e-300):.2g}): a goes as "
-            f"I^{power.exponent:.3f}, so b of the constant-a fit is not a gas loss; fit with the shape of a."
+            f"I^{power.exponent:.3f}, so b of the constant-a fit is not a gas loss; fit with the "
+            "shape of a."
         )
         return ConstantA(Status.poor_fit, message, exponent, chance)
     message = f"A constant a describes the record (p = {chance:.2g}, exponent {exponent})."
