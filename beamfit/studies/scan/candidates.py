@@ -14,13 +14,13 @@ from beamfit.optics.beamline import Beamline
 from beamfit.optics.elements import Drift, Screen
 from beamfit.studies.scan.fit import EmittanceFit
 from beamfit.studies.scan.information import Information, linearised_at
+from beamfit.studies.scan.scenario_judged import with_slope
 from beamfit.studies.scan.scenario_model import (
     NetworkRows,
     Rows,
     predict_network,
     predict_sizes,
 )
-from beamfit.studies.scan.scenario_result import with_slope
 
 __all__ = ["Candidate", "Considered", "candidate_rows", "further_options"]
 

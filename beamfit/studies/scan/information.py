@@ -10,8 +10,8 @@ import numpy as np
 from beamfit.greybox import assess
 from beamfit.inference.bounded import MOST_SHARE, Spread, spread_of
 from beamfit.studies.scan.fit import EmittanceFit
+from beamfit.studies.scan.scenario_judged import with_slope
 from beamfit.studies.scan.scenario_model import sigma_of
-from beamfit.studies.scan.scenario_result import with_slope
 from beamfit.studies.scan.sigma import emittance_parts
 from beamfit.studies.scan.verdict import CLEAR
 

@@ -17,7 +17,7 @@ from beamfit.studies.scan.results import Parameter
 from beamfit.studies.scan.scenario_data import Seen, varied_magnets
 
 if TYPE_CHECKING:
-    from beamfit.studies.scan.scenario_result import Found, Judged
+    from beamfit.studies.scan.scenario_judged import Found, Judged
 
 __all__ = ["parameters_of"]
 

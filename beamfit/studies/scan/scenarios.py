@@ -23,7 +23,8 @@ from beamfit.studies.scan.fit import EmittanceFit
 from beamfit.studies.scan.focusing_network import focusing_problem
 from beamfit.studies.scan.scans import QuadScan
 from beamfit.studies.scan.scenario_data import Seen, see
-from beamfit.studies.scan.scenario_result import judged, result_of
+from beamfit.studies.scan.scenario_judged import judged
+from beamfit.studies.scan.scenario_result import result_of
 from beamfit.studies.scan.transport_network import transport_problem
 
 __all__ = ["fit_scenario", "scenario_problem", "train"]
