@@ -63,7 +63,7 @@ WISH = "size=200um, divergence=140urad (with _x or _y), match, or match=BETA_M:A
     type=click.Path(),
     metavar="RESULT.json",
     default=None,
-    help="Output of beamfit emittance --json: the beam with its errors.",
+    help="Output of beamfit emittance --json: the beam with its errors, at the scan's energy.",
 )
 @click.option(
     "--vary",
