@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
 
-from beamfit.errors import InputError
+from beamfit.errors import InputError, nearest
 from beamfit.studies.scan.assumptions import Anchor
 
-__all__ = ["anchor_of", "bounds_of", "limits_of", "priors_of"]
+if TYPE_CHECKING:
+    from beamfit.io.lattice import LatticeFile
+
+__all__ = ["anchor_of", "bounds_of", "check_magnets", "limits_of", "priors_of"]
 
 PRIOR = "NAME=MEAN+-SD such as Q2.slope=167.23+-3.3446"
 BOUNDS = "NAME=LOWER:UPPER such as Q2.slope=147.23:187.23"
@@ -15,17 +20,32 @@ VARY = "MAGNET=LOW:HIGH such as Q2=0:10"
 ANCHOR = "first-principles=2%, determinant, or a setting such as Q2=0"
 
 
-def _pair(text: str, option: str, separator: str, expected: str) -> tuple[str, float, float]:
-    """Split NAME=A<separator>B into its name and two numbers."""
+# A network may miss first principles by this; more is a per cent sign left out.
+LOOSEST = 0.5
+
+
+def _fraction(text: str) -> float:
+    """Read a relative number, also in per cent."""
+    text = text.strip()
+    return float(text[:-1]) / 100.0 if text.endswith("%") else float(text)
+
+
+def _parts(text: str, option: str, separator: str, expected: str) -> tuple[str, str, str]:
+    """Split NAME=A<separator>B into its name and two words."""
     name, equals, rest = text.partition("=")
     parts = re.split(separator, rest)
+    if not name.strip() or not equals or len(parts) != 2:
+        raise InputError(f"--{option} '{text}'", expected)
+    return name.strip(), parts[0], parts[1]
+
+
+def _range(text: str, option: str, expected: str) -> tuple[str, float, float]:
+    """Read NAME=LOWER:UPPER."""
+    name, low, high = _parts(text, option, ":", expected)
     try:
-        first, second = (float(part.replace("%", "e-2")) for part in parts)
+        return name, float(low), float(high)
     except ValueError:
         raise InputError(f"--{option} '{text}'", expected) from None
-    if not name.strip() or not equals:
-        raise InputError(f"--{option} '{text}'", expected)
-    return name.strip(), first, second
 
 
 def _once(found: dict, name: str, option: str, value: tuple[float, float]) -> None:
@@ -58,8 +78,12 @@ def priors_of(texts: tuple[str, ...]) -> dict[str, tuple[float, float]]:
     """
     found: dict[str, tuple[float, float]] = {}
     for text in texts:
-        name, mean, sd = _pair(text, "prior", r"\+-|\+/-|±", PRIOR)
-        _once(found, name, "prior", (mean, sd * abs(mean) if text.strip().endswith("%") else sd))
+        name, middle, width = _parts(text, "prior", r"\+-|\+/-|±", PRIOR)
+        try:
+            mean, sd = float(middle), _fraction(width)
+        except ValueError:
+            raise InputError(f"--prior '{text}'", PRIOR) from None
+        _once(found, name, "prior", (mean, sd * abs(mean) if "%" in width else sd))
     return found
 
 
@@ -78,7 +102,7 @@ def bounds_of(texts: tuple[str, ...]) -> dict[str, tuple[float, float]]:
     """
     found: dict[str, tuple[float, float]] = {}
     for text in texts:
-        name, low, high = _pair(text, "bounds", ":", BOUNDS)
+        name, low, high = _range(text, "bounds", BOUNDS)
         _once(found, name, "bounds", (low, high))
     return found
 
@@ -100,9 +124,25 @@ def limits_of(texts: tuple[str, ...]) -> dict[str, tuple[float, float]]:
         raise InputError("no --vary", VARY)
     found: dict[str, tuple[float, float]] = {}
     for text in texts:
-        name, low, high = _pair(text, "vary", ":", VARY)
+        name, low, high = _range(text, "vary", VARY)
         _once(found, name, "vary", (low, high))
     return found
+
+
+def check_magnets(limits: Mapping[str, tuple[float, float]], lattice: LatticeFile) -> None:
+    """Refuse limits of a magnet that a lattice file does not have.
+
+    Raises
+    ------
+    InputError
+        Naming the file and the nearest magnet.
+    """
+    for name in limits:
+        if name not in lattice.calibrations:
+            known = list(lattice.calibrations)
+            raise InputError(
+                f"--vary {name}: no magnet '{name}'", nearest(name, known), path=lattice.path
+            )
 
 
 def anchor_of(texts: tuple[str, ...]) -> Anchor:
@@ -133,14 +173,21 @@ def anchor_of(texts: tuple[str, ...]) -> Anchor:
             determinant = True
             continue
         try:
-            parts = dict(part.split("=") for part in text.split(","))
-            values = {name.strip(): float(v.replace("%", "e-2")) for name, v in parts.items()}
+            parts = [part.split("=") for part in text.split(",")]
+            named = {name.strip(): value for name, value in parts}
+            if "first-principles" not in named:
+                places.append({name: float(value) for name, value in named.items()})
+                continue
+            [(_, value)] = named.items()
+            found = _fraction(value)
         except ValueError:
             raise InputError(f"--anchor '{text}'", ANCHOR) from None
-        if "first-principles" in values:
-            if len(values) > 1 or deviation is not None:
-                raise InputError(f"--anchor '{text}'", ANCHOR)
-            deviation = values["first-principles"]
-        else:
-            places.append(values)
+        if deviation is not None:
+            raise InputError(f"--anchor '{text}' beside another", "first-principles once")
+        if found > LOOSEST and "%" not in value:
+            raise InputError(
+                f"--anchor '{text}', a deviation of {100 * found:g} %",
+                f"{ANCHOR}; was {value.strip()}% meant?",
+            )
+        deviation = found
     return Anchor(deviation=deviation, at=tuple(places), determinant=determinant)

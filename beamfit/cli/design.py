@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from beamfit.cli.assumptions import anchor_of, bounds_of, limits_of, priors_of
+from beamfit.cli.assumptions import anchor_of, bounds_of, check_magnets, limits_of, priors_of
 from beamfit.cli.document import command_line, json_text
 from beamfit.errors import InputError
 from beamfit.io.line import build_line, read_lattice
@@ -15,9 +15,13 @@ from beamfit.studies.scan.assumptions import SCENARIOS, Assumptions
 from beamfit.studies.scan.scans import check_names
 
 if TYPE_CHECKING:
+    from beamfit.io.lattice import LatticeFile
     from beamfit.studies.scan.design import Advice
 
 __all__ = ["design"]
+
+# MeV, as for the energy of a lattice.
+HIGHEST = 1e7
 
 EXAMPLE = """\b
 Examples:
@@ -88,6 +92,8 @@ def design(
         described.default_screen,
         described.rest_energy,
     )
+    check_magnets(limits or {}, described)
+    _check_energies(others, described)
 
     from beamfit.studies.scan.design import plan_measurements  # JAX from here on
     from beamfit.studies.scan.emittance import fit_emittance
@@ -120,9 +126,17 @@ def _energies(text: str) -> tuple[float, ...]:
         found = tuple(float(part) for part in text.split(",") if part.strip())
     except ValueError:
         raise InputError(f"--energies '{text}'", "numbers in MeV, such as 25,35") from None
-    if any(not e > 0 for e in found):
-        raise InputError(f"--energies '{text}'", "positive energies in MeV")
     return found
+
+
+def _check_energies(energies: tuple[float, ...], lattice: LatticeFile) -> None:
+    for energy in energies:
+        if not lattice.rest_energy < energy <= HIGHEST:
+            raise InputError(
+                f"--energies {energy:g} MeV",
+                f"total energies between the {lattice.particle}'s rest energy of "
+                f"{lattice.rest_energy:.6g} MeV and 10 TeV; is it in GeV or eV?",
+            )
 
 
 def _print(advice: Advice, title: str) -> None:

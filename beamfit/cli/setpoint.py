@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import click
 
-from beamfit.cli.assumptions import limits_of
+from beamfit.cli.assumptions import check_magnets, limits_of
 from beamfit.cli.document import command_line, json_text
 from beamfit.errors import InputError
 from beamfit.inference.quantity import Quantity
@@ -31,6 +33,13 @@ UNITS = {
     "size": {"nm": 1e-9, "um": 1e-6, "µm": 1e-6, "mm": 1e-3, "m": 1.0},
     "divergence": {"nrad": 1e-9, "urad": 1e-6, "µrad": 1e-6, "mrad": 1e-3, "rad": 1.0},
 }
+# Energies that differ by less than this share are one: a magnet's setting is known no better.
+SAME_ENERGY = 1e-3
+CALIBRATED = (
+    "The beam was fitted together with the calibration, and only the beam's covariance is in the "
+    "file: the two are correlated, and without that the errors here are too large, on the GTF line "
+    "1.2 to 4.6 times."
+)
 WISH = "size=200um, divergence=140urad (with _x or _y), match, or match=BETA_M:ALPHA"
 
 
@@ -54,7 +63,7 @@ WISH = "size=200um, divergence=140urad (with _x or _y), match, or match=BETA_M:A
     type=click.Path(),
     metavar="RESULT.json",
     default=None,
-    help="Output of beamfit emittance --json: the beam with its errors.",
+    help="Output of beamfit emittance --json: the beam with its errors, at the scan's energy.",
 )
 @click.option(
     "--vary",
@@ -98,14 +107,24 @@ def setpoint(
 
     The search is global within the limits: local minima are listed, not mistaken for the answer.
     """
-    beams = _beams(sigma, fitted, plane)
+    _check_one(sigma, fitted)
     limits = limits_of(vary)
     wishes = [_wish(text, plane) for text in target]
     described = read_lattice(lattice, use=use, energy=energy)
+    check_magnets(limits, described)
+    beams = (
+        read_fitted_beams(fitted, described.rest_energy)
+        if sigma is None
+        else {plane: _given(sigma)}
+    )
+    used = {p: beams[p] for p in dict.fromkeys(p for _, p, _ in wishes) if p in beams}
+    own = _energy(used, fitted, energy)
 
     from beamfit.studies.scan.setpoint import Beam, Target, find_setpoint  # JAX from here on
 
     line = build_line(described)
+    if own is not None:
+        line = replace(line, energy=own)
     for beam in beams.values():
         line = _recalibrated(line, beam.calibration)
     wanted = [Target(kind, p, value or _design(line, p)) for kind, p, value in wishes]
@@ -124,20 +143,24 @@ def setpoint(
         from beamfit.io.files import digest
 
         inputs[fitted] = digest(fitted)
-    doubted = [p for p in {t.plane for t in wanted} if beams[p].status == "unidentified"]
+    doubted = {p: beam.doubt for p, beam in used.items() if beam.doubt is not None}
+    notes = _notes(found, used, described.energy)
     if as_json:
-        entry = found.to_json() | {"beam_undetermined": doubted}
+        message = " ".join([found.message, *notes, *_warnings(doubted)])
+        entry = found.to_json() | {"message": message, "beam_undetermined": list(doubted)}
         click.echo(json_text(command_line(), inputs, [entry]))
     else:
-        _print(found, line, doubted)
+        _print(found, line.name, notes, _warnings(doubted))
 
 
-def _beams(sigma: str | None, fitted: str | None, plane: str) -> dict[str, FittedBeam]:
+def _check_one(sigma: str | None, fitted: str | None) -> None:
     if (sigma is None) == (fitted is None):
         said = "neither --sigma nor --fit" if sigma is None else "both --sigma and --fit"
         raise InputError(said, "one of them: the beam at the start of the line")
-    if fitted is not None:
-        return read_fitted_beams(fitted)
+
+
+def _given(sigma: str) -> FittedBeam:
+    """Read --sigma."""
     import numpy as np
 
     try:
@@ -146,7 +169,7 @@ def _beams(sigma: str | None, fitted: str | None, plane: str) -> dict[str, Fitte
         numbers = []
     if len(numbers) != 3:
         raise InputError(f"--sigma '{sigma}'", "three numbers S11,S12,S22 in m², m rad, rad²")
-    return {plane: FittedBeam(np.array(numbers), None, "given", {})}
+    return FittedBeam(np.array(numbers))
 
 
 def _wish(text: str, plane: str) -> tuple[str, str, object]:
@@ -164,13 +187,51 @@ def _wish(text: str, plane: str) -> tuple[str, str, object]:
         except ValueError:
             raise InputError(f"--target '{text}'", WISH) from None
         return kind, own, (beta, alpha)
-    parts = re.fullmatch(r"\s*([-+0-9.eE]+)\s*([a-zµ]+)\s*", rest)
+    # The Greek letter mu and the micro sign look alike.
+    parts = re.fullmatch(r"\s*([-+0-9.eE]+)\s*([a-zµ]+)\s*", rest.replace("\u03bc", "\u00b5"))
     try:
         return kind, own, float(parts[1]) * UNITS[kind][parts[2]]
     except (TypeError, ValueError, KeyError):
         raise InputError(
             f"--target '{text}'", f"a number with a unit: {', '.join(UNITS[kind])}"
         ) from None
+
+
+def _energy(
+    beams: Mapping[str, FittedBeam], fitted: str | None, asked: float | None
+) -> float | None:
+    """Energy the beams were measured at, MeV; None where they do not say.
+
+    A beam matrix in geometric units holds at its own energy only.
+    """
+    found = {f"plane {p}": b.energy for p, b in beams.items() if b.energy is not None}
+    given = found if asked is None else found | {"--energy": asked}
+    if found and max(given.values()) - min(given.values()) > SAME_ENERGY * min(given.values()):
+        listed = ", ".join(f"{e:g} MeV ({name})" for name, e in given.items())
+        raise InputError(f"energies {listed}", "one energy for beam and line", path=fitted)
+    return next(iter(found.values()), None)
+
+
+def _notes(found: Setpoint, beams: Mapping[str, FittedBeam], lattice: float) -> list[str]:
+    """What to know of the answer, one sentence each."""
+    said = []
+    if abs(found.energy - lattice) > SAME_ENERGY * lattice:
+        said.append(
+            f"At {found.energy:g} MeV, the energy of the scan; the lattice has {lattice:g} MeV."
+        )
+    if any(beam.calibration and beam.covariance is not None for beam in beams.values()):
+        said.append(CALIBRATED)
+    if all(beam.covariance is None and beam.doubt is None for beam in beams.values()):
+        said.append("No errors: the beam was given without its own (--fit brings them).")
+    return said
+
+
+def _warnings(doubted: Mapping[str, str]) -> list[str]:
+    return [
+        f"The fit does not determine the beam of plane {plane}: {why.rstrip('.')}. The settings "
+        "are for its numbers as they stand."
+        for plane, why in doubted.items()
+    ]
 
 
 def _design(line, plane: str) -> tuple[float, float]:
@@ -192,17 +253,17 @@ def _recalibrated(line, numbers: dict[str, float]):
     return with_numbers(line, numbers)
 
 
-def _print(found: Setpoint, line, doubted: list[str]) -> None:
+def _print(found: Setpoint, line: str, notes: list[str], warnings: list[str]) -> None:
     from rich.console import Console
 
     from beamfit.cli.terminal import plain_table, verdict_text
 
     console = Console(highlight=False, markup=False)
-    table = plain_table(f"Best settings of {line.name} for the beam at {found.screen}")
+    table = plain_table(f"Best settings of {line} for the beam at {found.screen}")
     for name in ("", "setting", "± from the beam"):
         table.add_column(name)
     for name, value in found.best.settings.items():
-        unit, error = line[name].calibration.unit, found.setting_error[name]
+        unit, error = found.units[name], found.setting_error[name]
         table.add_row(name, f"{value:.6g} {unit}", "-" if error is None else f"{error:.2g} {unit}")
     table.add_row("objective", f"{found.best.objective:.6g}", "")
     for p in found.predicted:
@@ -215,12 +276,10 @@ def _print(found: Setpoint, line, doubted: list[str]) -> None:
             at = ", ".join(f"{n} = {v:.5g}" for n, v in m.settings.items())
             console.print(f"  {at}: objective {m.objective:.6g}")
     console.print(verdict_text("set point", found.status, found.message))
-    for plane in doubted:
-        console.print(
-            f"The fit does not determine the beam of plane {plane}: the settings are for its "
-            "numbers as they stand, with no error.",
-            style="bold red",
-        )
+    for note in notes:
+        console.print(note)
+    for warning in warnings:
+        console.print(warning, style="bold red")
 
 
 def _shown(key: str, q) -> str:

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Mapping
 from os import PathLike
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -15,6 +17,9 @@ from beamfit.errors import InputError
 __all__ = ["FittedBeam", "read_fitted_beams"]
 
 HOW = "the output of beamfit emittance --json"
+NUMBERS = ("sigma11", "sigma12", "sigma22")
+# Correlations rounded by a fit of nearly dependent numbers may have eigenvalues below zero by this.
+ROUNDED = 1e-9
 
 
 class FittedBeam(NamedTuple):
@@ -26,25 +31,30 @@ class FittedBeam(NamedTuple):
         σ11 (m²), σ12 (m rad), σ22 (rad²).
     covariance : ndarray or None
         Shape (3, 3), scaled as the errors are; None where the fit determined none.
-    status : str
-        Of the fit.
     calibration : dict of str to float
         Fitted calibration numbers that go with it, such as "Q2.slope".
+    energy : float or None
+        Mean total energy of the sizes it was fitted to, MeV; None if the file does not say.
+    doubt : str or None
+        Why the fit does not determine the beam; None if it does.
     """
 
     sigma: np.ndarray
-    covariance: np.ndarray | None
-    status: str
-    calibration: dict[str, float]
+    covariance: np.ndarray | None = None
+    calibration: Mapping[str, float] = MappingProxyType({})
+    energy: float | None = None
+    doubt: str | None = None
 
 
-def read_fitted_beams(path: str | PathLike[str]) -> dict[str, FittedBeam]:
+def read_fitted_beams(path: str | PathLike[str], rest_energy: float) -> dict[str, FittedBeam]:
     """Read the fitted beam of each plane.
 
     Parameters
     ----------
     path : str or path
         A file with the JSON object of ``beamfit emittance --json``.
+    rest_energy : float
+        Of the particle, MeV: a file may hold no energy but both emittances, whose ratio is βγ.
 
     Returns
     -------
@@ -54,22 +64,28 @@ def read_fitted_beams(path: str | PathLike[str]) -> dict[str, FittedBeam]:
     Raises
     ------
     InputError
-        If the file cannot be read or is something else.
+        If the file cannot be read or is something else, if a number in it is missing or cannot
+        be, or if the beam was fitted together with a network: it belongs to the network's optics,
+        which the file does not hold.
 
     Examples
     --------
     >>> import tempfile
     >>> file = Path(tempfile.mkdtemp()) / "fit.json"
-    >>> entry = {"plane": "x", "status": "converged", "covariance": None}
-    >>> entry |= {f"sigma{k}": {"value": 1e-8} for k in ("11", "12", "22")}
+    >>> entry = {"plane": "x", "status": "converged", "message": "Good.", "covariance": None}
+    >>> entry |= {f"sigma{k}": {"value": 1e-8, "error": None} for k in ("11", "12", "22")}
     >>> _ = file.write_text(json.dumps({"beamfit": "0.1.0", "results": [entry]}))
-    >>> read_fitted_beams(file)["x"].sigma.tolist()
-    [1e-08, 1e-08, 1e-08]
+    >>> beam = read_fitted_beams(file, 0.511)["x"]
+    >>> beam.sigma.tolist(), beam.doubt
+    ([1e-08, 1e-08, 1e-08], 'sigma11, sigma12, sigma22 have no error (converged: Good.)')
     """
     try:
         document = json.loads(Path(path).read_text())
         entries = document["results"]
-        found = {entry["plane"]: _beam(entry) for entry in entries}
+        found = {entry["plane"]: _beam(entry, rest_energy) for entry in entries}
+    except InputError as error:
+        error.path = path
+        raise
     except OSError as error:
         raise InputError(f"no readable file ({error.strerror})", HOW, path=path) from None
     except (ValueError, KeyError, TypeError, AttributeError):
@@ -79,14 +95,92 @@ def read_fitted_beams(path: str | PathLike[str]) -> dict[str, FittedBeam]:
     return found
 
 
-def _beam(entry: Mapping[str, Any]) -> FittedBeam:
-    sigma = np.array([entry[f"sigma{k}"]["value"] for k in ("11", "12", "22")], float)
+def _beam(entry: Mapping[str, Any], rest_energy: float) -> FittedBeam:
+    _check_optics(entry)
+    where = f"of plane {entry['plane']}"
+    sigma = [_number(entry[name]["value"], f"{name} {where}") for name in NUMBERS]
     covariance = entry.get("covariance")
     if covariance is not None:
-        covariance = np.array(covariance, float) * float(entry.get("error_scale", 1.0)) ** 2
+        scale = _number(entry.get("error_scale", 1.0), f"error_scale {where}")
+        covariance = _covariance(covariance, where) * scale**2
     numbers = {
-        p["name"]: float(p["value"]["value"])
+        p["name"]: _number(p["value"]["value"], p["name"])
         for p in entry.get("parameters", ())
         if entry.get("scenario") == "calibration"
     }
-    return FittedBeam(sigma, covariance, str(entry["status"]), numbers)
+    energy = _energy(entry, rest_energy, where)
+    return FittedBeam(np.array(sigma), covariance, numbers, energy, _doubt(entry))
+
+
+def _energy(entry: Mapping[str, Any], rest_energy: float, where: str) -> float | None:
+    """Total energy in MeV, E² = m²(1 + (βγ)²) where only the emittances say it."""
+    if "energy" in entry:
+        energy = _number(entry["energy"]["value"], f"energy {where}")
+        if not energy > rest_energy:
+            raise InputError(f"energy {where} = {energy:g} MeV", f"more than {rest_energy:g} MeV")
+        return energy
+    geometric, normalised = (
+        (entry.get(name) or {}).get("value") for name in ("emittance", "normalized_emittance")
+    )
+    if not geometric or normalised is None:
+        return None
+    ratio = _number(normalised, f"normalized_emittance {where}") / _number(
+        geometric, f"emittance {where}"
+    )
+    return rest_energy * math.hypot(1.0, ratio)
+
+
+def _check_optics(entry: Mapping[str, Any]) -> None:
+    """Refuse a beam that belongs to optics other than the lattice's."""
+    scenario, anchor = entry.get("scenario", "known"), str(entry.get("anchor", "none"))
+    # An anchor at single settings is "first principles at ..." and leaves the scale open.
+    tied = scenario == "transport-network" and anchor.startswith("first principles to ")
+    if scenario not in ("known", "calibration") and not tied:
+        raise InputError(
+            f"a beam of scenario {scenario} with anchor {anchor}, which belongs to the optics of "
+            "that network and not to the lattice's",
+            "a result of scenario known or calibration, or of transport-network with "
+            "--anchor first-principles=2%",
+        )
+
+
+def _number(value: object, name: str) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        raise InputError(f"{name} = {json.dumps(value)}", f"a finite number, as in {HOW}")
+    return float(value)
+
+
+def _covariance(rows: object, where: str) -> np.ndarray:
+    """Check a covariance by its correlations, which have no unit."""
+    name = f"covariance {where}"
+    if not (
+        isinstance(rows, list)
+        and len(rows) == 3
+        and all(isinstance(row, list) and len(row) == 3 for row in rows)
+    ):
+        raise InputError(f"{name} of another shape", "three rows of three numbers")
+    found = np.array([[_number(v, f"a number in the {name}") for v in row] for row in rows])
+    variance = np.diagonal(found)
+    sd = np.sqrt(np.where(variance > 0, variance, 1.0))
+    correlation = found / np.outer(sd, sd)
+    if (
+        variance.min() < 0
+        or found[variance == 0].any()
+        or not np.allclose(correlation, correlation.T, rtol=0.0, atol=1e-6)
+        or np.linalg.eigvalsh(correlation).min() < -ROUNDED
+    ):
+        raise InputError(
+            f"{name} that no numbers have", "a symmetric matrix without negative eigenvalues"
+        )
+    return found
+
+
+def _doubt(entry: Mapping[str, Any]) -> str | None:
+    """Why the fit does not determine the beam, in its own words."""
+    open_ones = [name for name in NUMBERS if entry[name].get("error") is None]
+    why = f"({entry['status']}: {entry.get('message', 'without a reason')})"
+    if open_ones:
+        return f"{', '.join(open_ones)} have no error {why}"
+    if entry.get("covariance") is None:
+        return f"no covariance of sigma11, sigma12, sigma22 {why}"
+    return f"the emittance is open {why}" if entry["status"] == "unidentified" else None

@@ -55,6 +55,12 @@ def test_the_terminal_says_what_is_left_open(run):
         (("--bounds", "Q2.slope=1"), "NAME=LOWER:UPPER"),
         (("--anchor", "first-principles=2%"), "transport-network or focusing-network"),
         (("--anchor", "first-principles"), "first-principles=2%"),
+        (("--anchor", "first-principles=2"), "was 2% meant?"),
+        (("--anchor", "Q2=0%"), "first-principles=2%"),
+        (("--anchor", "Q2=1,first-principles=2%"), "first-principles=2%"),
+        (("--anchor", "first-principles=2%", "--anchor", "first-principles=3%"), "once"),
+        (("--bounds", "Q2.slope=147%:187"), "NAME=LOWER:UPPER"),
+        (("--prior", "Q2.slope=167%+-3"), "NAME=MEAN+-SD"),
         (("--hidden", "0"), "at least one"),
         (("--hysteresis",), "focusing-network"),
     ],
@@ -81,7 +87,16 @@ def test_design_as_json_and_on_the_terminal(run):
 
 @pytest.mark.parametrize(
     ("options", "words"),
-    [(("--goal", "0"), "per cent"), (("--energies", "a"), "MeV"), (("--vary", "Q2"), "MAGNET=")],
+    [
+        (("--goal", "0"), "per cent"),
+        (("--energies", "a"), "MeV"),
+        (("--energies", "25,0.1"), "rest energy of 0.510999 MeV"),
+        (("--energies", "1e9"), "10 TeV"),
+        (("--energies", "nan"), "rest energy"),
+        (("--vary", "Q2"), "MAGNET="),
+        (("--vary", "Q2=0:10%"), "MAGNET="),
+        (("--vary", "Q9=0:10"), "lattices/gtf.toml: --vary Q9: no magnet"),
+    ],
 )
 def test_bad_wishes_of_a_design(run, options, words):
     status, _, err = run("design", *GTF, *options)

@@ -2,7 +2,10 @@
 
 import json
 
+import numpy as np
 import pytest
+
+from beamfit.io.line import load_lattice
 
 APPENDIX_D = (
     "setpoint", "--lattice", "lattices/gtf.toml",
@@ -18,6 +21,8 @@ def test_appendix_d_as_json(run):
     assert list(document) == ["beamfit", "command", "inputs", "results"]
     [result] = document["results"]
     assert result["settings"]["Q2"] == pytest.approx(1.08860, abs=5e-6)
+    assert result["units"] == {"Q2": "A"}
+    assert result["energy"]["value"] == 30.5
     assert result["objective"] == pytest.approx(2.1138, abs=5e-4)
     assert result["size"]["value"] == pytest.approx(199.55e-6, abs=1e-8)
     assert result["divergence"]["value"] == pytest.approx(141.38e-6, abs=1e-8)
@@ -29,6 +34,14 @@ def test_the_table(run):
     assert (status, err) == (0, "")
     for words in ("1.0886 A", "2.11378", "199.55 µm", "Q2 = 2.97: objective 5647.55"):
         assert words in out
+
+
+@pytest.mark.parametrize("micro", ["\u00b5", "\u03bc"])
+def test_the_micro_sign_and_the_greek_letter_are_one_unit(run, micro):
+    wish = ("--target", f"size=200{micro}m", "--target", f"divergence=140{micro}rad")
+    status, out, _ = run(*APPENDIX_D[:7], *wish, "--json")
+    assert status == 0
+    assert json.loads(out)["results"][0]["settings"]["Q2"] == pytest.approx(1.08860, abs=5e-6)
 
 
 def test_the_fitted_beam_brings_its_errors(run, tmp_path):
@@ -54,7 +67,9 @@ def test_the_fitted_beam_brings_its_errors(run, tmp_path):
         (("--target", "width=200um"), "size=200um"),
         (("--fit", "nowhere.json"), "both --sigma and --fit"),
         (("--target", "match"), "without design Twiss"),
-        (("--vary", "Q9=0:1"), "no magnet 'Q9'"),
+        (("--vary", "Q9=0:1"), "lattices/gtf.toml: --vary Q9: no magnet 'Q9'"),
+        (("--vary", "Q1=0:10%"), "MAGNET=LOW:HIGH"),
+        (("--target", "match=5:nan"), "alpha = nan"),
     ],
 )
 def test_bad_words_are_one_line(run, change, words):
@@ -70,3 +85,107 @@ def test_a_file_that_is_no_result(run, tmp_path):
     status, _, err = run(*APPENDIX_D[:3], "--fit", other, *APPENDIX_D[5:])
     assert status == 2
     assert "no fitted beams; expected the output of beamfit emittance --json" in err
+
+
+SIGMA = (2.6367971e-8, 1.5738242e-8, 1.4354411e-8)
+FIT = {
+    "plane": "x",
+    "status": "converged",
+    "message": "Determined.",
+    **{
+        f"sigma{k}": {"value": v, "error": 0.02 * v}
+        for k, v in zip((11, 12, 22), SIGMA, strict=True)
+    },
+    "covariance": np.diag((0.02 * np.array(SIGMA)) ** 2).tolist(),
+    "error_scale": 1.0,
+}
+
+
+@pytest.fixture
+def of_fit(run, tmp_path):
+    """Run `beamfit setpoint --fit` on a result that differs from a good one."""
+
+    def call(change, *options):
+        file = tmp_path / "fit.json"
+        file.write_text(json.dumps({"beamfit": "0.1.0", "results": [FIT | change]}))
+        wish = ("--vary", "Q2=0:2", "--target", "size=200um")
+        return run("setpoint", "--lattice", "lattices/gtf.toml", "--fit", file, *wish, *options)
+
+    return call
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"scenario": "focusing-network", "anchor": "first principles to 2 %"}, "not to the lat"),
+        ({"scenario": "transport-network", "anchor": "none"}, "scenario transport-network"),
+        (
+            {"scenario": "transport-network", "anchor": "first principles at Q2 = 0 to 0.1 %"},
+            "--anchor first-principles=2%",
+        ),
+        ({"covariance": [[1e-20, 0], [0, 1e-20]]}, "three rows of three numbers"),
+        ({"covariance": "none"}, "three rows of three numbers"),
+        ({"covariance": [[1e-20, 0, 0], [0, float("inf"), 0], [0, 0, 1e-20]]}, "finite number"),
+        ({"covariance": [[1e-20, 0, 0], [0, 1e-20, 0], [0, 0, -1e-20]]}, "negative eigenvalues"),
+        ({"covariance": [[1e-20, 2e-20, 0], [2e-20, 1e-20, 0], [0, 0, 1e-20]]}, "symmetric"),
+        ({"covariance": [[1e-20, 1e-21, 0], [0, 1e-20, 0], [0, 0, 1e-20]]}, "symmetric"),
+        ({"covariance": [[0, 1e-20, 0], [1e-20, 1e-20, 0], [0, 0, 1e-20]]}, "symmetric"),
+        ({"sigma11": {"value": None, "error": None}}, "sigma11 of plane x = null"),
+        ({"sigma12": {"value": "1e-8", "error": None}}, 'sigma12 of plane x = "1e-8"'),
+        ({"error_scale": None}, "error_scale of plane x"),
+        ({"energy": {"value": 0.1}}, "0.1 MeV"),
+    ],
+)
+def test_a_damaged_or_foreign_result_is_refused(of_fit, change, words):
+    status, out, err = of_fit(change)
+    assert (status, out) == (2, "")
+    assert "fit.json: " in err
+    assert words in err
+    assert err.count("\n") == 1
+
+
+def test_a_doubted_beam_is_named_with_its_reason(of_fit):
+    change = {"covariance": None, "message": "The waist is not bracketed."}
+    status, out, _ = of_fit(change, "--json")
+    assert status == 0
+    [result] = json.loads(out)["results"]
+    assert result["beam_undetermined"] == ["x"]
+    assert "The waist is not bracketed" in result["message"]
+    assert "The waist is not bracketed" in " ".join(of_fit(change)[1].split())
+
+
+def test_the_beam_is_carried_at_the_energy_of_its_scan(of_fit, root):
+    status, out, _ = of_fit({"energy": {"value": 25.0, "error": None, "unit": "MeV"}}, "--json")
+    assert status == 0
+    [result] = json.loads(out)["results"]
+    assert result["energy"]["value"] == 25.0
+    assert "At 25 MeV" in result["message"]
+    assert "30.5 MeV" in result["message"]
+    line = load_lattice(root / "lattices/gtf.toml")
+    a, b = np.asarray(line.matrix(result["settings"], 25.0).x)[0, :2]
+    size = np.sqrt(a * a * SIGMA[0] + 2 * a * b * SIGMA[1] + b * b * SIGMA[2])
+    assert size == pytest.approx(200e-6, rel=1e-6)
+
+
+def test_two_energies_are_refused(run, tmp_path):
+    file = tmp_path / "fit.json"
+    planes = [{"plane": p, "energy": {"value": e}} for p, e in (("x", 25.0), ("y", 30.5))]
+    file.write_text(json.dumps({"results": [FIT | p for p in planes]}))
+    wish = ("--vary", "Q2=0:2", "--target", "size=200um", "--target", "size_y=200um")
+    status, _, err = run("setpoint", "--lattice", "lattices/gtf.toml", "--fit", file, *wish)
+    assert status == 2
+    assert "energies 25 MeV (plane x), 30.5 MeV (plane y); expected one energy" in err
+
+
+def test_a_calibrated_beam_says_that_its_errors_are_too_large(of_fit):
+    slope = {"name": "Q2.slope", "value": {"value": 160.0, "error": 3.0}}
+    status, out, _ = of_fit({"scenario": "calibration", "parameters": [slope]}, "--json")
+    assert status == 0
+    assert "errors here are too large" in json.loads(out)["results"][0]["message"]
+
+
+def test_a_bare_beam_says_why_it_has_no_errors(run):
+    _, out, _ = run(*APPENDIX_D, "--json")
+    assert (
+        "No errors: the beam was given without its own" in json.loads(out)["results"][0]["message"]
+    )

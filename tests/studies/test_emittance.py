@@ -175,7 +175,9 @@ def test_energies_row_by_row(gtf):
     scan = beamfit.QuadScan(
         {"Q2": currents}, {"Q2": "A"}, {"x": sizes}, {"x": 0.02 * np.array(sizes)}, energy=energies
     )
-    fit = beamfit.fit_emittance(scan, gtf).x
+    result = beamfit.fit_emittance(scan, gtf)
+    assert result.to_json()[0]["energy"]["value"] == 30.5
+    fit = result.x
     np.testing.assert_allclose([q.value for q in fit.sigma], TABLE_2, rtol=1e-9)
     gamma = 30.5 / 0.51099895069
     assert fit.normalized_emittance.value / fit.emittance.value == pytest.approx(

@@ -100,6 +100,7 @@ def test_a_match_reaches_the_design_and_its_objective_is_bmag_less_one(three_qua
         ({"targets": [Target("size", "y", 1e-4)]}, "plane y"),
         ({"targets": [Target("size", "x", -1e-4)]}, "positive"),
         ({"beams": {"x": Beam(np.array([1.0, 2.0, 1.0]) * 1e-8)}}, "positive definite"),
+        ({"targets": [Target("match", "x", (5.0, np.inf))]}, "alpha = inf in plane x"),
         ({"beams": {"x": Beam(1e8 * SIGMA)}}, "SI units"),
     ],
 )
@@ -107,3 +108,9 @@ def test_bad_input_is_named(gtf, change, words):
     given = {"beams": {"x": Beam(SIGMA)}, "vary": {"Q2": (0.0, 10.0)}, "targets": WISH} | change
     with pytest.raises(InputError, match=words):
         find_setpoint(gtf, given["beams"], given["vary"], given["targets"])
+
+
+def test_the_json_has_units_and_the_energy_of_the_line(gtf):
+    found = find_setpoint(gtf, {"x": Beam(SIGMA)}, {"Q2": (0.0, 10.0)}, WISH).to_json()
+    assert found["units"] == {"Q2": "A"}
+    assert (found["energy"]["value"], found["energy"]["unit"]) == (float(gtf.energy), "MeV")

@@ -6,7 +6,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from beamfit.errors import InputError
+from beamfit.inference.quantity import Quantity
 from beamfit.studies.scan.results import Parameter, PlaneFit
 from beamfit.studies.scan.scans import QuadScan
 from beamfit.studies.scan.tables import as_html, as_text, parameter_rows
@@ -148,7 +151,7 @@ class EmittanceFit:
 
     def to_json(self) -> list[dict[str, Any]]:
         """Give the ``results`` list of the JSON contract."""
-        entries = [p.to_json() for p in self.planes]
+        entries = [p.to_json() | {"energy": self._energy(p.plane).to_json()} for p in self.planes]
         if self.scenario == "known":
             return entries
         own = {
@@ -158,6 +161,13 @@ class EmittanceFit:
             "null_directions": list(self.null_directions),
         }
         return [entry | own for entry in entries]
+
+    def _energy(self, plane: str) -> Quantity:
+        """Mean total energy of the rows in which a plane was measured, MeV."""
+        if self.scan.energy is None:
+            return Quantity(float(self.line.energy), None, "MeV")
+        measured = np.isfinite(self.scan.size[plane])
+        return Quantity(float(self.scan.energy[measured].mean()), None, "MeV")
 
     def __str__(self) -> str:
         heading = f"{self.scan.name} on {self.line.name}, fit of {self.planes[0].method}"

@@ -94,6 +94,10 @@ class Setpoint:
         The beam there, with the beam's uncertainty carried along.
     targets : tuple of Target
         What was wanted.
+    units : dict of str to str
+        Of the settings.
+    energy : float
+        Total energy of the beam, MeV.
     """
 
     status: Status
@@ -105,6 +109,8 @@ class Setpoint:
     screen: str
     predicted: tuple[PlaneBeam, ...]
     targets: tuple[Target, ...]
+    units: dict[str, str]
+    energy: float
 
     def to_json(self) -> dict[str, Any]:
         """Give the entry of ``results`` of the JSON contract; size and so on of the first plane."""
@@ -114,9 +120,11 @@ class Setpoint:
             "status": str(self.status),
             "message": self.message,
             "settings": self.best.settings,
+            "units": self.units,
             "setting_errors": self.setting_error,
             "objective": self.best.objective,
             "screen": self.screen,
+            "energy": Quantity(self.energy, None, "MeV").to_json(),
             **planes[self.targets[0].plane],
             "planes": planes,
             "targets": [t._asdict() for t in self.targets],
@@ -216,9 +224,10 @@ def find_setpoint(
     status = Status.at_limit if limits else Status.converged
     errors = _setting_errors(search, beams, best, edge)
     words = _words(listed, limits, predicted, targets)
+    units = {name: line[name].calibration.unit for name in vary}
     return Setpoint(
         status, words, listed[0], tuple(listed[1:]), errors, limits, screen, predicted,
-        tuple(targets),
+        tuple(targets), units, float(line.energy),
     )  # fmt: skip
 
 
@@ -301,7 +310,7 @@ def _predicted(search: _Search, plane: str, beam: Beam, theta: np.ndarray) -> Pl
     if beam.covariance is not None and np.isfinite(beam.covariance).all():
         slope = np.asarray(jax.jacfwd(of_sigma)(search.sigma[plane]))
         variance = np.einsum("ij,jk,ik->i", slope, beam.covariance, slope)
-        error = [float(v) for v in np.sqrt(variance)]
+        error = [float(v) for v in np.sqrt(np.maximum(variance, 0.0))]
     units = ("m", "rad", "m", "1")
     return PlaneBeam(
         plane, *(Quantity(float(v), e, u) for v, e, u in zip(value, error, units, strict=True))
@@ -338,7 +347,7 @@ def _setting_errors(search, beams, theta, edge) -> dict[str, float | None]:
     for plane in search.planes:
         moved = -np.linalg.solve(second, np.asarray(mixed[plane])[loose])
         variance += np.einsum("ij,jk,ik->i", moved, beams[plane].covariance, moved)
-    found = np.sqrt(variance) * np.asarray(search.reach)[loose]
+    found = np.sqrt(np.maximum(variance, 0.0)) * np.asarray(search.reach)[loose]
     return none | {search.names[i]: float(e) for i, e in zip(loose, found, strict=True)}
 
 

@@ -66,6 +66,11 @@ def _check_targets(beams, targets) -> None:
         positive = target.value[0] if target.kind == "match" else target.value
         if not (math.isfinite(positive) and positive > 0):
             raise InputError(f"target {target.kind} {positive:g}", "a positive number")
+        if target.kind == "match" and not math.isfinite(target.value[1]):
+            raise InputError(
+                f"target match with alpha = {target.value[1]:g} in plane {target.plane}",
+                "a finite alpha",
+            )
 
 
 def _check_beam(plane: str, sigma: np.ndarray) -> None:
