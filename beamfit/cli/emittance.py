@@ -198,12 +198,12 @@ def _results(fit: EmittanceFit) -> list[dict[str, Any]]:
     from beamfit.studies.scan.sensitivity import range_sensitivity, systematics
 
     return [
-        p.to_json()
+        entry
         | {
             "systematics": [c._asdict() for c in systematics(fit, p.plane)],
             "range": [r._asdict() for r in range_sensitivity(p)],
         }
-        for p in fit.planes
+        for p, entry in zip(fit.planes, fit.to_json(), strict=True)
     ]
 
 

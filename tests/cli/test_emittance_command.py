@@ -114,3 +114,16 @@ def test_the_fit_loads_nothing_of_other_studies():
         [sys.executable, "-c", check], capture_output=True, text=True, cwd=ROOT, check=True
     )
     assert done.stderr.strip() == "set()"
+
+
+def test_the_energy_of_the_rows_is_in_the_result(run, tmp_path, root):
+    """A scan at another energy than the lattice's."""
+    header, *rows = (
+        line for line in (root / "measurements/gtf_simulated.csv").read_text().splitlines()
+        if not line.startswith("#")
+    )  # fmt: skip
+    scan = tmp_path / "scan.csv"
+    scan.write_text("\n".join([f"{header},energy_MeV", *(f"{row},25" for row in rows)]))
+    _, out, _ = run("emittance", scan, "--lattice", "lattices/gtf.toml", "--json")
+    [result] = json.loads(out)["results"]
+    assert (result["energy"]["value"], result["energy"]["unit"]) == (25.0, "MeV")

@@ -5,7 +5,9 @@ import pytest
 
 import beamfit
 from beamfit.errors import InputError
+from beamfit.studies.scan.candidates import candidate_rows
 from beamfit.studies.scan.design import plan_measurements
+from beamfit.studies.scan.information import information_of
 from tests.studies.conftest import TABLE_2, design
 
 
@@ -127,3 +129,12 @@ def test_and_that_measurement_closes_it(root):
 def test_bad_wishes_are_named(known, options, words):
     with pytest.raises(InputError, match=words):
         plan_measurements(known, **options)
+
+
+def test_zero_is_not_listed_as_its_rounding(known):
+    """linspace(-1.7, 1.7, 41) misses zero by 2.2e-16."""
+    limits = {"Q2": (-1.7, 1.7)}
+    found = candidate_rows(known, information_of(known), limits, ())
+    settings = [c.candidate.settings["Q2"] for c in found]
+    assert 0.0 in settings
+    assert min(abs(s) for s in settings if s) > 1e-3

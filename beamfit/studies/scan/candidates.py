@@ -25,6 +25,8 @@ from beamfit.studies.scan.scenario_model import (
 __all__ = ["Candidate", "Considered", "candidate_rows", "further_options"]
 
 COUNT, REACH = 41, 0.5
+# A setting below this share of the range is the rounding of zero.
+ROUNDING = 1e-9
 # Other energies to consider where none is named: what a linac can usually do.
 USUAL_ENERGIES = (0.8, 1.25)
 
@@ -81,6 +83,7 @@ def candidate_rows(
     found = []
     for name, (low, high) in ranges.items():
         values = np.linspace(low, high, COUNT)
+        values[np.abs(values) < ROUNDING * (high - low)] = 0.0
         start = held.get(name, float(fit.line[name].setting))
         table = {n: np.full(COUNT, v) for n, v in (held | {name: start}).items()}
         table[name] = values
