@@ -3,12 +3,22 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from os import PathLike
 
 from beamfit.errors import InputError, nearest
 
-__all__ = ["CARRIED", "LENGTHS", "MOST_ROWS", "Column", "Table", "check_header", "column_of"]
+__all__ = [
+    "CARRIED",
+    "LENGTHS",
+    "MOST_ROWS",
+    "Column",
+    "Table",
+    "check_header",
+    "check_separator",
+    "column_of",
+]
 
 # More rows than any scan: such a file is a log, and is refused before it fills the memory.
 MOST_ROWS = 100_000
@@ -42,6 +52,35 @@ class Table:
         """Make the error that names file, line and column."""
         line = None if row is None else self.lines[row]
         return InputError(found, expected, path=self.path, line=line, column=column.header)
+
+
+def check_separator(
+    names: Sequence[str], sign: str, path: str | PathLike[str], line: int | None
+) -> None:
+    """Refuse a header whose columns are separated by something else than commas.
+
+    Parameters
+    ----------
+    names : sequence of str
+        Its columns.
+    sign : str
+        A word by which it is known to be a header of this kind of file.
+    path, line
+        For the message.
+
+    Raises
+    ------
+    InputError
+        If there is one column, with a separator in its name.
+    """
+    for character, word in {";": "semicolons", "\t": "tabs", " ": "spaces"}.items():
+        if len(names) == 1 and character in names[0] and sign in names[0]:
+            raise InputError(
+                f"columns separated by {word}",
+                "a comma between columns and a decimal point in numbers",
+                path=path,
+                line=line,
+            )
 
 
 def column_of(header: str, path: str | PathLike[str], line: int | None) -> Column:

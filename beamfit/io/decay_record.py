@@ -10,6 +10,7 @@ import h5py
 import numpy as np
 
 from beamfit.errors import InputError, nearest
+from beamfit.io.columns import check_separator
 from beamfit.io.files import text_lines
 from beamfit.studies.decay.record import Conditions, DecayRecord, first_fault
 
@@ -40,6 +41,7 @@ def _seconds(cell: str) -> float:
 
 def _choose(names: list[str], path: Path, line: int | None) -> dict[str, str]:
     """Which column holds which quantity; no unknown, doubled or missing one."""
+    check_separator(names, "time", path, line)
     chosen: dict[str, str] = {}
     for name in names:
         if name not in COLUMNS:

@@ -19,6 +19,7 @@ from beamfit.io.columns import (
     Column,
     Table,
     check_header,
+    check_separator,
     column_of,
 )
 from beamfit.io.files import digest, text_lines
@@ -102,16 +103,7 @@ def _check_is_header(names: list[str], path: str | PathLike[str], line: int) -> 
             path=path,
             line=line,
         )
-    separators = {";": "semicolons", "\t": "tabs", " ": "spaces"}
-    if len(names) == 1:
-        for character, word in separators.items():
-            if character in names[0] and "size_" in names[0]:
-                raise InputError(
-                    f"columns separated by {word}",
-                    "a comma between columns and a decimal point in numbers",
-                    path=path,
-                    line=line,
-                )
+    check_separator(names, "size_", path, line)
     if all(_is_number(name) for name in names):
         raise InputError(
             "numbers where the header should be",

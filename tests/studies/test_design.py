@@ -138,3 +138,8 @@ def test_zero_is_not_listed_as_its_rounding(known):
     settings = [c.candidate.settings["Q2"] for c in found]
     assert 0.0 in settings
     assert min(abs(s) for s in settings if s) > 1e-3
+
+
+def test_an_energy_that_no_electron_has_is_refused(known):
+    with pytest.raises(InputError, match=r"of 0\.1 MeV"):
+        plan_measurements(known, energies=(0.1,))

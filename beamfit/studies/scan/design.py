@@ -164,6 +164,7 @@ def plan_measurements(
         raise InputError(f"criterion '{criterion}'", "emittance or D")
     if count < 1 or (goal is not None and not goal > 0):
         raise InputError(f"{count} points to a goal of {goal}", "at least one, and a positive goal")
+    _check_energies(energies, float(fit.line.mass))
     base = information_of(fit)
     candidates = candidate_rows(fit, base, limits, energies)
     now, steps = base, []
@@ -205,3 +206,10 @@ def _options(
         share = float(after.share().max())
         found.append(Option(words, after.relative_error(), share, after.identified))
     return tuple(found)
+
+
+def _check_energies(energies: tuple[float, ...], rest: float) -> None:
+    for energy in energies:
+        if not rest < energy <= 1e7:
+            expected = f"a total energy between {rest:.6g} MeV and 10 TeV"
+            raise InputError(f"an energy of {energy:g} MeV", expected)
