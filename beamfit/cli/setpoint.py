@@ -273,7 +273,7 @@ def _print(found: Setpoint, line: str, notes: list[str], warnings: list[str]) ->
     if len(found.others):
         console.print("\nOther minima", style="bold")
         for m in found.others[:5]:
-            at = ", ".join(f"{n} = {v:.5g}" for n, v in m.settings.items())
+            at = ", ".join(f"{n} = {v:.5g} {found.units[n]}" for n, v in m.settings.items())
             console.print(f"  {at}: objective {m.objective:.6g}")
     console.print(verdict_text("set point", found.status, found.message))
     for note in notes:

@@ -32,7 +32,7 @@ def test_appendix_d_as_json(run):
 def test_the_table(run):
     status, out, err = run(*APPENDIX_D)
     assert (status, err) == (0, "")
-    for words in ("1.0886 A", "2.11378", "199.55 µm", "Q2 = 2.97: objective 5647.55"):
+    for words in ("1.0886 A", "2.11378", "199.55 µm", "Q2 = 2.97 A: objective 5647.55"):
         assert words in out
 
 

@@ -11,6 +11,7 @@ import numpy as np
 
 from beamfit.errors import InputError, nearest
 from beamfit.optics.beamline import Beamline
+from beamfit.optics.calibration import SETTING_UNITS
 from beamfit.optics.elements import Drift, Screen
 from beamfit.studies.scan.fit import EmittanceFit
 from beamfit.studies.scan.information import Information, linearised_at
@@ -131,9 +132,15 @@ def _screens(fit: EmittanceFit) -> tuple[str, ...]:
     return tuple(dict.fromkeys((*measured, *later)))
 
 
+def _in_words(fit: EmittanceFit, settings: Mapping[str, float]) -> str:
+    """Settings with the units of the scan."""
+    units = fit.scan.units
+    return ", ".join(f"{n} = {v:.4g} {SETTING_UNITS[units[n]]}" for n, v in settings.items())
+
+
 def _named(fit, table, i, screen, energy, own, screens) -> Candidate:
     settings = {n: float(v[i]) for n, v in table.items()}
-    words = ", ".join(f"{n} = {v:.4g}" for n, v in settings.items())
+    words = _in_words(fit, settings)
     words += f" on {screen}" if len(screens) > 1 else ""
     words += f" at {energy:g} MeV" if energy != own else ""
     return Candidate(settings, screen, float(energy), words)
@@ -237,7 +244,7 @@ def further_options(
         for line, screen, words in _other_screens(fit):
             rows = _rows(fit, base, line, table, screen, energy)
             best = min(range(rows.shape[1]), key=lambda i: _worst(base.with_rows(rows[:, i])))
-            at = ", ".join(f"{n} = {v[best]:.4g}" for n, v in table.items())
+            at = _in_words(fit, {n: float(v[best]) for n, v in table.items()})
             yield f"one size on {words} ({at})", rows[:, best]
             yield f"the same scan on {words}", rows.reshape(-1, rows.shape[-1])
         for factor in energies or tuple(own * f for f in USUAL_ENERGIES):

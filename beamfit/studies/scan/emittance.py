@@ -153,7 +153,10 @@ def _outlier_words(work: PlaneWork) -> str:
     if not len(doubted):
         return ""
     places = [
-        ", ".join(f"{n} = {v[i]:.4g}" for n, v in work.points.settings.items()) for i in doubted
+        ", ".join(
+            f"{n} = {v[i]:.4g} {work.points.units[n]}" for n, v in work.points.settings.items()
+        )
+        for i in doubted
     ]
     return (
         f" {len(doubted)} of {len(probability)} points more likely outliers than not: "

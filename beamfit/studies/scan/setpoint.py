@@ -18,6 +18,7 @@ from beamfit.greybox import tree
 from beamfit.greybox.many_starts import descend_all
 from beamfit.inference.quantity import Quantity, Status
 from beamfit.optics.beamline import Beamline
+from beamfit.optics.calibration import SETTING_UNITS
 from beamfit.studies.scan.setpoint_checks import checked_place
 
 __all__ = ["Beam", "Minimum", "PlaneBeam", "Setpoint", "Target", "find_setpoint"]
@@ -223,8 +224,8 @@ def find_setpoint(
     predicted = tuple(_predicted(search, p, beams[p], best) for p in planes)
     status = Status.at_limit if limits else Status.converged
     errors = _setting_errors(search, beams, best, edge)
-    words = _words(listed, limits, predicted, targets)
-    units = {name: line[name].calibration.unit for name in vary}
+    units = {name: SETTING_UNITS[line[name].calibration.unit] for name in vary}
+    words = _words(listed, limits, predicted, targets, units)
     return Setpoint(
         status, words, listed[0], tuple(listed[1:]), errors, limits, screen, predicted,
         tuple(targets), units, float(line.energy),
@@ -351,7 +352,7 @@ def _setting_errors(search, beams, theta, edge) -> dict[str, float | None]:
     return none | {search.names[i]: float(e) for i, e in zip(loose, found, strict=True)}
 
 
-def _words(minima, limits, predicted, targets) -> str:
+def _words(minima, limits, predicted, targets, units) -> str:
     """A sentence on how well the wish is met, one on limits, one on other minima."""
     by_plane = {p.plane: p for p in predicted}
     said = []
@@ -365,7 +366,7 @@ def _words(minima, limits, predicted, targets) -> str:
         words += f" {', '.join(limits)} at a limit: a wider one would do better."
     if len(minima) > 1:
         other = minima[1]
-        at = ", ".join(f"{n} = {v:.4g}" for n, v in other.settings.items())
+        at = ", ".join(f"{n} = {v:.4g} {units[n]}" for n, v in other.settings.items())
         alike = other.objective - minima[0].objective < 1e-6 * (1.0 + minima[0].objective)
         lead = "Other settings do as well, such as" if alike else "The next local minimum is"
         words += f" {lead} {at} (objective {other.objective:.6g})."
