@@ -8,7 +8,7 @@ from rich.table import Table
 from rich.text import Text
 
 from beamfit.cli.terminal import plain_table, status_table, verdict_text
-from beamfit.inference.quantity import Status
+from beamfit.quantity import Status
 from beamfit.studies.decay.shift import Shift
 from beamfit.studies.decay.study import RecordStudy
 from beamfit.studies.decay.tables import (

@@ -143,7 +143,7 @@ def _print(advice: Advice, title: str) -> None:
     from rich.console import Console
 
     from beamfit.cli.terminal import plain_table, verdict_text
-    from beamfit.inference.quantity import Status
+    from beamfit.quantity import Status
 
     console = Console(highlight=False, markup=False)
     console.print(f"{title}, scenario {advice.scenario}: error of the emittance", style="bold")

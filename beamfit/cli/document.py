@@ -12,7 +12,7 @@ from typing import Any
 
 from beamfit import __version__
 from beamfit.errors import InputError
-from beamfit.inference.quantity import finite
+from beamfit.quantity import finite
 
 __all__ = ["check_report_name", "command_line", "json_text"]
 

@@ -12,9 +12,9 @@ import click
 from beamfit.cli.assumptions import check_magnets, limits_of
 from beamfit.cli.document import command_line, json_text
 from beamfit.errors import InputError
-from beamfit.inference.quantity import Quantity
 from beamfit.io.line import build_line, read_lattice
 from beamfit.io.result import FittedBeam, read_fitted_beams
+from beamfit.quantity import Quantity
 
 if TYPE_CHECKING:
     from beamfit.studies.scan.setpoint import Setpoint

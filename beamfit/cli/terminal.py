@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 from rich.table import Table
 from rich.text import Text
 
-from beamfit.inference.quantity import Status
+from beamfit.quantity import Status
 from beamfit.studies.scan.fit import EmittanceFit
 from beamfit.studies.scan.results import PlaneFit
 from beamfit.studies.scan.sensitivity import budget_rows, range_rows

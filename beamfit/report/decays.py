@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-from beamfit.inference.quantity import Status
+from beamfit.quantity import Status
 from beamfit.report.decay_figures import decay_pictures
 from beamfit.report.document import Page, Table, Verdict, by_name, provenance, written
 from beamfit.studies.decay.shift import Shift

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from beamfit.inference.quantity import Status
+from beamfit.quantity import Status
 from beamfit.report.document import Page, Picture, Table, Verdict, by_name, provenance, written
 from beamfit.report.figures import pictures
 from beamfit.studies.scan.fit import EmittanceFit

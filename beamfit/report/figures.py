@@ -12,7 +12,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import FigureBase
 
-from beamfit.inference.quantity import Status
+from beamfit.quantity import Status
 from beamfit.studies.scan.fit import EmittanceFit
 from beamfit.studies.scan.results import PlaneFit
 from beamfit.studies.scan.transport import scanned_line, transfer_rows

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from beamfit.errors import InputError, nearest
-from beamfit.inference.quantity import Quantity, finite
+from beamfit.quantity import Quantity, finite
 from beamfit.sampling.convergence import Diagnostics
 from beamfit.sampling.priors import in_words
 from beamfit.sampling.target import Target

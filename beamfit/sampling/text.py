@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from beamfit.inference.quantity import display_unit
+from beamfit.quantity import display_unit
 from beamfit.sampling.likelihood import Group, Likelihood  # noqa: F401 - Group for the example
 
 if TYPE_CHECKING:

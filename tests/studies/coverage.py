@@ -11,8 +11,8 @@ import numpy as np
 
 from beamfit.greybox import problem as greybox
 from beamfit.greybox import tree
+from beamfit.greybox.bounded import MOST_SHARE, spread_of
 from beamfit.greybox.many_starts import descend_one
-from beamfit.inference.bounded import MOST_SHARE, spread_of
 from beamfit.studies.scan.scenario_model import sigma_of
 from beamfit.studies.scan.sigma import emittance_parts
 

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from beamfit.errors import InputError
-from beamfit.inference.quantity import Status
 from beamfit.io.decay_record import read_decay_record
 from beamfit.lifetime.decay import current_by_rate
+from beamfit.quantity import Status
 from beamfit.studies.decay import checks
 from beamfit.studies.decay.checks import (
     constant_a_test,

@@ -8,10 +8,10 @@ from scipy.optimize import least_squares
 
 import beamfit
 from beamfit.errors import InputError
-from beamfit.inference.quantity import Status
 from beamfit.optics.beam import BeamMatrix
 from beamfit.optics.beamline import Beamline
 from beamfit.optics.elements import Drift, Quadrupole, Screen, SectorDipole, ThinLens
+from beamfit.quantity import Status
 from tests.studies.conftest import TABLE_2, design, scan_of
 
 TRUE_EMITTANCE = float(np.sqrt(TABLE_2[0] * TABLE_2[2] - TABLE_2[1] ** 2))

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import beamfit
-from beamfit.inference.quantity import Status
+from beamfit.quantity import Status
 
 
 @pytest.fixture(scope="module")

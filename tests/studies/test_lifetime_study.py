@@ -9,11 +9,11 @@ from scipy.optimize import brentq
 
 import beamfit
 from beamfit.errors import InputError
-from beamfit.inference.quantity import Status
 from beamfit.lifetime.bunch import rf_acceptance
 from beamfit.lifetime.decay import current
 from beamfit.lifetime.losses import loss_coefficients
 from beamfit.lifetime.scaled import MECHANISMS, loss_terms, scaled_losses
+from beamfit.quantity import Status
 from beamfit.studies.decay.anomaly import find_anomaly
 from beamfit.studies.decay.next_decay import Candidate, next_decays
 from beamfit.studies.decay.operating_point import Limits, best_operating_point

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import beamfit
-from beamfit.inference.quantity import Status
+from beamfit.quantity import Status
 from beamfit.studies.scan.verdict import phase_coverage, waist_bracketed
 from beamfit.studies.scan.zero_emittance import zero_emittance
 from tests.studies.conftest import TABLE_2, design, scan_of

@@ -11,8 +11,8 @@ import numpy as np
 from scipy.special import chdtrc
 
 from beamfit.errors import InputError
-from beamfit.inference.quantity import Quantity, Status
 from beamfit.lifetime.scaled import scaled_losses
+from beamfit.quantity import Quantity, Status
 from beamfit.studies.decay.scales import ScaleFit, pulls, stacked_terms, whitener
 from beamfit.studies.decay.study import Decay
 from beamfit.studies.decay.summary import summarise

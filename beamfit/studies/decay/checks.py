@@ -10,9 +10,9 @@ import numpy as np
 from scipy.special import fdtrc
 
 from beamfit.errors import InputError
-from beamfit.inference.quantity import Quantity, Status
 from beamfit.lifetime.solve import solve_decay
 from beamfit.lifetime.varying import solve_power
+from beamfit.quantity import Quantity, Status
 from beamfit.studies.decay.fit import fit_decay, padded
 from beamfit.studies.decay.record import DecayRecord
 from beamfit.studies.decay.result import DecayFit

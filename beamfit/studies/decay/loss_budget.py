@@ -7,9 +7,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from beamfit.errors import InputError
-from beamfit.inference.quantity import Quantity
 from beamfit.lifetime.losses import Losses, loss_coefficients
 from beamfit.lifetime.ring import Operation, Ring
+from beamfit.quantity import Quantity
 from beamfit.studies.decay.record import DecayRecord
 
 __all__ = ["Budget", "Machine", "budget", "operation_during"]

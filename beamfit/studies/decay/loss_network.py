@@ -22,9 +22,9 @@ from beamfit.greybox.fit import Fit
 from beamfit.greybox.mlp import MLP, Layer, Port
 from beamfit.greybox.problem import Free, Prior, Problem, Record
 from beamfit.greybox.solve import solve
-from beamfit.inference.quantity import Quantity
 from beamfit.lifetime.ring import Operation
 from beamfit.lifetime.scaled import Terms, loss_terms, scaled_losses
+from beamfit.quantity import Quantity
 from beamfit.studies.decay.loss_budget import Machine, operation_during
 from beamfit.studies.decay.scales import ScaleFit, stacked_terms
 from beamfit.studies.decay.study import Decay

@@ -9,9 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from beamfit.errors import InputError
-from beamfit.inference.quantity import Quantity
 from beamfit.lifetime.ring import Operation
 from beamfit.lifetime.scaled import Terms, loss_terms, scaled_losses
+from beamfit.quantity import Quantity
 from beamfit.sampling.posterior import Posterior
 from beamfit.studies.decay.scale_sample import losses_of
 from beamfit.studies.decay.scales import ScaleFit

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from beamfit.inference.quantity import Quantity, Status
+from beamfit.quantity import Quantity, Status
 
 if TYPE_CHECKING:
     from beamfit.sampling.posterior import Posterior

@@ -14,9 +14,9 @@ from jax import Array
 from scipy.optimize import least_squares
 
 from beamfit.errors import InputError, nearest
-from beamfit.inference.identifiability import chi2_probability
-from beamfit.inference.quantity import Quantity, Status
 from beamfit.lifetime.scaled import MECHANISMS, Terms, loss_terms, scaled_losses
+from beamfit.quantity import Quantity, Status
+from beamfit.statistics import chi2_probability
 from beamfit.studies.decay.loss_budget import Machine, operation_during
 from beamfit.studies.decay.study import Decay
 from beamfit.studies.decay.summary import Summaries, loss_parts, summarise

@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 
-from beamfit.inference.quantity import Quantity, Status
 from beamfit.lifetime.scaled import MECHANISMS
+from beamfit.quantity import Quantity, Status
 from beamfit.studies.decay.shift import Shift
 from beamfit.studies.decay.study import Decay, RecordStudy
 

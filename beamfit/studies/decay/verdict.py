@@ -7,9 +7,9 @@ import math
 import numpy as np
 
 from beamfit.errors import InputError
-from beamfit.inference.identifiability import chi2_probability
-from beamfit.inference.quantity import Quantity, Status
 from beamfit.lifetime.solve import Physical, Solution
+from beamfit.quantity import Quantity, Status
+from beamfit.statistics import chi2_probability
 from beamfit.studies.decay.record import DecayRecord
 from beamfit.studies.decay.result import DecayFit, Separability
 

@@ -10,9 +10,9 @@ import numpy as np
 from jax import Array
 
 from beamfit.errors import InputError
-from beamfit.inference.quantity import Status
 from beamfit.optics.beam import BeamMatrix
 from beamfit.optics.particle import beta_gamma
+from beamfit.quantity import Status
 from beamfit.sampling.likelihood import Group, Likelihood
 from beamfit.sampling.priors import Distribution, checked
 from beamfit.sampling.target import Derived, Law, Target

@@ -8,10 +8,10 @@ from collections.abc import Mapping
 import numpy as np
 
 from beamfit.errors import InputError
-from beamfit.inference.identifiability import scaled_directions
-from beamfit.inference.quantity import Quantity
 from beamfit.optics.beamline import Beamline
 from beamfit.optics.particle import beta_gamma
+from beamfit.quantity import Quantity
+from beamfit.statistics import scaled_directions
 from beamfit.studies.scan.assumptions import Anchor, Assumptions
 from beamfit.studies.scan.fit import EmittanceFit
 from beamfit.studies.scan.plane import PlaneWork, next_measurement, work_on

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from beamfit.errors import InputError
-from beamfit.inference.quantity import Quantity
+from beamfit.quantity import Quantity
 from beamfit.studies.scan.results import Parameter, PlaneFit
 from beamfit.studies.scan.scans import QuadScan
 from beamfit.studies.scan.tables import as_html, as_text, parameter_rows

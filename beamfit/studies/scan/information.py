@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from beamfit.greybox import assess
-from beamfit.inference.bounded import MOST_SHARE, Spread, spread_of
+from beamfit.greybox.bounded import MOST_SHARE, Spread, spread_of
 from beamfit.studies.scan.fit import EmittanceFit
 from beamfit.studies.scan.scenario_judged import with_slope
 from beamfit.studies.scan.scenario_model import sigma_of

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from beamfit.inference.quantity import Quantity, Status
+from beamfit.quantity import Quantity, Status
 
 if TYPE_CHECKING:
     from beamfit.optics.beam import BeamMatrix

@@ -12,9 +12,9 @@ import numpy as np
 from jax import Array
 
 from beamfit.greybox import assess, tree
+from beamfit.greybox.bounded import MOST_SHARE, Spread, spread_of
 from beamfit.greybox.fit import Fit
-from beamfit.inference.bounded import MOST_SHARE, Spread, spread_of
-from beamfit.inference.quantity import Status
+from beamfit.quantity import Status
 
 __all__ = ["Found", "Judged", "judged", "with_slope"]
 

@@ -10,8 +10,8 @@ import numpy as np
 from jax import Array
 
 from beamfit.greybox import tree
-from beamfit.inference.bounded import MOST_SHARE
-from beamfit.inference.quantity import Quantity, Status
+from beamfit.greybox.bounded import MOST_SHARE
+from beamfit.quantity import Quantity, Status
 from beamfit.studies.scan.assumptions import Assumptions
 from beamfit.studies.scan.results import Parameter
 from beamfit.studies.scan.scenario_data import Seen, varied_magnets

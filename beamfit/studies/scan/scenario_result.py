@@ -13,10 +13,10 @@ from jax import Array
 from beamfit.greybox import tree
 from beamfit.greybox.fit import Fit
 from beamfit.greybox.problem import Problem
-from beamfit.inference.identifiability import chi2_probability, scaled_directions
-from beamfit.inference.quantity import Quantity, Status
 from beamfit.optics.beamline import Beamline
 from beamfit.optics.particle import beta_gamma
+from beamfit.quantity import Quantity, Status
+from beamfit.statistics import chi2_probability, scaled_directions
 from beamfit.studies.scan.assumptions import Assumptions
 from beamfit.studies.scan.fit import EmittanceFit
 from beamfit.studies.scan.results import Identifiability, Parameter, PlaneFit, Points, ScreenTwiss

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from beamfit.greybox.fit import Fit
-from beamfit.inference.quantity import Status
+from beamfit.quantity import Status
 from beamfit.studies.scan.assumptions import Assumptions
 from beamfit.studies.scan.results import Parameter, PlaneFit
 

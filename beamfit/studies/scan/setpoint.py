@@ -16,9 +16,9 @@ from jax import Array
 from beamfit.errors import InputError
 from beamfit.greybox import tree
 from beamfit.greybox.many_starts import descend_all
-from beamfit.inference.quantity import Quantity, Status
 from beamfit.optics.beamline import Beamline
 from beamfit.optics.calibration import SETTING_UNITS
+from beamfit.quantity import Quantity, Status
 from beamfit.studies.scan.setpoint_checks import checked_place
 
 __all__ = ["Beam", "Minimum", "PlaneBeam", "Setpoint", "Target", "find_setpoint"]

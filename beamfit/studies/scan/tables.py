@@ -7,7 +7,7 @@ from html import escape
 
 import numpy as np
 
-from beamfit.inference.quantity import Quantity
+from beamfit.quantity import Quantity
 from beamfit.studies.scan.results import Parameter, PlaneFit
 
 # A longer table of points is cut, and says so.

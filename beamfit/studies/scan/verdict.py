@@ -8,8 +8,8 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import stdtrit
 
-from beamfit.inference.identifiability import chi2_probability, one_sided_probability
-from beamfit.inference.quantity import Status
+from beamfit.quantity import Status
+from beamfit.statistics import chi2_probability, one_sided_probability
 
 __all__ = ["Evidence", "Verdict", "few_words", "judge", "phase_coverage", "waist_bracketed"]
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from beamfit.inference.bounded import spread_of
+from beamfit.greybox.bounded import spread_of
 
 
 def test_far_bounds_leave_the_covariance_of_the_data():

@@ -1,1 +1,0 @@
-"""Statistics that know nothing about beams: what data determine, and quantities with errors."""

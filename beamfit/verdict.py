@@ -1,0 +1,54 @@
+"""Verdicts as rules: a list of small functions of evidence, each with its sentence."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple, TypeVar
+
+from beamfit.status import Status
+
+__all__ = ["Finding", "Rule", "judge"]
+
+Evidence = TypeVar("Evidence")
+
+
+class Finding(NamedTuple):
+    """What a rule found: a status, the cause in words, and what to do about it."""
+
+    status: Status
+    cause: str
+    remedy: str = ""
+
+    @property
+    def message(self) -> str:
+        """Cause and remedy as one text."""
+        return f"{self.cause} {self.remedy}".strip()
+
+
+Rule = Callable[[Evidence], Finding | None]
+
+
+def judge(evidence: Evidence, rules: Sequence[Rule[Evidence]]) -> Finding:
+    """Give the finding of the first rule that has one: rules stand in order of gravity.
+
+    Parameters
+    ----------
+    evidence
+        What the rules look at.
+    rules : sequence of callable
+        Each takes the evidence and gives a `Finding` or None; the last one always finds something.
+
+    Returns
+    -------
+    Finding
+
+    Examples
+    --------
+    >>> def lost(points):
+    ...     return Finding(Status.unidentified, "Too few points.") if points < 3 else None
+    >>> def fine(points):
+    ...     return Finding(Status.converged, "Enough points.")
+    >>> judge(2, (lost, fine)).status.value, judge(9, (lost, fine)).status.value
+    ('unidentified', 'converged')
+    """
+    return next(found for rule in rules if (found := rule(evidence)) is not None)

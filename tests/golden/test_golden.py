@@ -1,0 +1,141 @@
+"""What commands and fits said, kept word for word and number for number.
+
+A change of an expected file is a change of what users read: it stands in a commit of its own
+that names the defect or the rule behind it. ``python -m tests.golden.test_golden`` writes them anew.
+"""
+
+import json
+import math
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+EXPECTED = Path(__file__).parent / "expected"
+DATA = "tests/golden/data"
+GTF, LCLS = "--lattice lattices/gtf.toml", "--lattice lattices/lcls_otr2.toml"
+CALIBRATION = "--scenario calibration --prior Q2.slope=167.23+-3.3446 --bounds Q2.intercept=0:90"
+
+COMMANDS = {
+    "lcls": f"emittance measurements/lcls_otr2.csv {LCLS}",
+    "gtf": f"emittance measurements/gtf_simulated.csv {GTF}",
+    "no_errors": f"emittance {DATA}/no_errors.csv {GTF}",
+    "poor": f"emittance {DATA}/poor.csv {GTF}",
+    "outlier": f"emittance {DATA}/outlier.csv {GTF}",
+    "outlier_robust": f"emittance {DATA}/outlier.csv {GTF} --robust",
+    "noise": f"emittance {DATA}/noise.csv {GTF}",
+    "one_sided": f"emittance {DATA}/one_sided.csv {GTF}",
+    "three_points": f"emittance {DATA}/three_points.csv {GTF}",
+    "calibration": f"emittance measurements/gtf_simulated.csv {GTF} {CALIBRATION}",
+    "two_screens": "emittance measurements/gtf_two_screens_simulated.csv "
+    "--lattice lattices/gtf_two_screens.toml --scenario calibration",
+    "transport_network": f"emittance measurements/gtf_simulated.csv {GTF} "
+    "--scenario transport-network --anchor first-principles=2%",
+    "aps": "lifetime measurements/aps_1999_decay.csv",
+    "short_decay": f"lifetime {DATA}/short_decay.csv",
+    "spear3": "lifetime measurements/spear3_shift_simulated.csv --ring lattices/spear3_2003.toml",
+    "design": f"design measurements/gtf_simulated.csv {GTF}",
+    "setpoint": f"setpoint {GTF} --sigma 2.6367971e-8,1.5738242e-8,1.4354411e-8 --vary Q2=0:10 "
+    "--target size=200um --target divergence=140urad",
+}
+REFUSED = {
+    "bad_size": f"emittance {DATA}/negative_size.csv {GTF}",
+    "bad_lattice": "emittance measurements/gtf_simulated.csv --lattice lattices/lcls_otr2.toml",
+    "bad_prior": f"emittance measurements/gtf_simulated.csv {GTF} --prior Q2.slope=1+-1",
+}
+NUMBER = re.compile(r"(?<![A-Za-z_\d.])[-+]?\d+(?:\.\d+)?(?:[eE][-+]?\d+)?")
+# Shown to two or three digits, the last of which may turn with the machine's rounding.
+SHOWN, COMPUTED = 0.02, 1e-5
+# Rounding errors in themselves, or the way a search took.
+IDLE = {"seconds", "kkt", "beamfit", "command", "iterations"}
+
+
+def said(arguments):
+    """Status, output and error line of a command in a process of its own."""
+    call = [sys.executable, "-c", "from beamfit.cli import main; main()", *arguments.split()]
+    done = subprocess.run(
+        call, cwd=ROOT, capture_output=True, text=True, env=os.environ | {"COLUMNS": "100"}
+    )
+    return done.returncode, done.stdout, done.stderr
+
+
+def split(text):
+    """The words and the numbers of a text."""
+    return NUMBER.sub("#", " ".join(text.split())), [float(n) for n in NUMBER.findall(text)]
+
+
+def alike(found, expected, tolerance):
+    return all(
+        math.isclose(a, b, rel_tol=tolerance, abs_tol=1e-12)
+        for a, b in zip(found, expected, strict=True)
+    )
+
+
+def differences(found, expected, place="results"):
+    """Paths at which two objects of JSON differ; floats may differ by rounding."""
+    if isinstance(expected, dict) and isinstance(found, dict):
+        for key in expected.keys() | found.keys():
+            if key in IDLE:
+                continue
+            if key not in found or key not in expected:
+                yield f"{place}.{key} only in {'found' if key in found else 'expected'}"
+            else:
+                yield from differences(found[key], expected[key], f"{place}.{key}")
+    elif isinstance(expected, list) and isinstance(found, list) and len(found) == len(expected):
+        for i, (a, b) in enumerate(zip(found, expected, strict=True)):
+            yield from differences(a, b, f"{place}[{i}]")
+    elif isinstance(expected, str) and isinstance(found, str):
+        (words, numbers), (other, others) = split(found), split(expected)
+        if words != other or not alike(numbers, others, SHOWN):
+            yield f"{place}: '{found}' for '{expected}'"
+    elif isinstance(expected, float) and isinstance(found, int | float):
+        if not math.isclose(found, expected, rel_tol=COMPUTED, abs_tol=1e-30):
+            yield f"{place}: {found} for {expected}"
+    elif found != expected:
+        yield f"{place}: {found} for {expected}"
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_text(name):
+    status, out, _ = said(COMMANDS[name])
+    words, numbers = split(out)
+    expected, others = split((EXPECTED / f"{name}.txt").read_text())
+    assert status == 0
+    assert words == expected
+    assert alike(numbers, others, SHOWN)
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_json(name):
+    status, out, _ = said(COMMANDS[name] + " --json")
+    expected = json.loads((EXPECTED / f"{name}.json").read_text())
+    assert status == 0
+    assert list(differences(json.loads(out), expected, name)) == []
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_refusal(name):
+    status, out, error = said(REFUSED[name])
+    assert (status, out) == (2, "")
+    assert error == (EXPECTED / f"{name}.txt").read_text()
+
+
+def write(names):
+    """Write what is said now as what is expected."""
+    for name, command in COMMANDS.items():
+        if not names or name in names:
+            for form, options in (("txt", ""), ("json", " --json")):
+                status, out, error = said(command + options)
+                assert status == 0, error
+                (EXPECTED / f"{name}.{form}").write_text(out)
+    for name, command in REFUSED.items():
+        if not names or name in names:
+            (EXPECTED / f"{name}.txt").write_text(said(command)[2])
+
+
+if __name__ == "__main__":
+    write(sys.argv[1:])
