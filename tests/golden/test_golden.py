@@ -1,7 +1,8 @@
 """What commands and fits said, kept word for word and number for number.
 
 A change of an expected file is a change of what users read: it stands in a commit of its own
-that names the defect or the rule behind it. ``python -m tests.golden.test_golden`` writes them anew.
+that names the defect or the rule behind it. They are written anew by
+``python -m tests.golden.test_golden NAME …``.
 """
 
 import json
@@ -76,27 +77,32 @@ def alike(found, expected, tolerance):
 
 
 def differences(found, expected, place="results"):
-    """Paths at which two objects of JSON differ; floats may differ by rounding."""
-    if isinstance(expected, dict) and isinstance(found, dict):
-        for key in expected.keys() | found.keys():
-            if key in IDLE:
-                continue
-            if key not in found or key not in expected:
-                yield f"{place}.{key} only in {'found' if key in found else 'expected'}"
-            else:
-                yield from differences(found[key], expected[key], f"{place}.{key}")
-    elif isinstance(expected, list) and isinstance(found, list) and len(found) == len(expected):
-        for i, (a, b) in enumerate(zip(found, expected, strict=True)):
-            yield from differences(a, b, f"{place}[{i}]")
-    elif isinstance(expected, str) and isinstance(found, str):
-        (words, numbers), (other, others) = split(found), split(expected)
-        if words != other or not alike(numbers, others, SHOWN):
-            yield f"{place}: '{found}' for '{expected}'"
-    elif isinstance(expected, float) and isinstance(found, int | float):
-        if not math.isclose(found, expected, rel_tol=COMPUTED, abs_tol=1e-30):
-            yield f"{place}: {found} for {expected}"
-    elif found != expected:
-        yield f"{place}: {found} for {expected}"
+    """Paths at which two objects of JSON differ; numbers may differ by rounding."""
+    match found, expected:
+        case (dict(), dict()):
+            for key in (expected.keys() | found.keys()) - IDLE:
+                if key in found and key in expected:
+                    yield from differences(found[key], expected[key], f"{place}.{key}")
+                else:
+                    yield f"{place}.{key} only in {'found' if key in found else 'expected'}"
+        case (list(), list()) if len(found) == len(expected):
+            for i, (a, b) in enumerate(zip(found, expected, strict=True)):
+                yield from differences(a, b, f"{place}[{i}]")
+        case _:
+            if not same(found, expected):
+                yield f"{place}: {found} for {expected}"
+
+
+def same(found, expected):
+    """Whether two values are the same up to rounding."""
+    match found, expected:
+        case (str(), str()):
+            (words, numbers), (other, others) = split(found), split(expected)
+            return words == other and alike(numbers, others, SHOWN)
+        case (int() | float(), float()):
+            return math.isclose(found, expected, rel_tol=COMPUTED, abs_tol=1e-30)
+        case _:
+            return found == expected
 
 
 @pytest.mark.parametrize("name", COMMANDS)
