@@ -8,14 +8,14 @@ from beamfit.quantity import Status
 from beamfit.report.document import Page, Picture, Table, Verdict, by_name, provenance, written
 from beamfit.report.figures import pictures
 from beamfit.studies.scan.fit import EmittanceFit
-from beamfit.studies.scan.results import PlaneFit
-from beamfit.studies.scan.sensitivity import budget_rows, range_rows
-from beamfit.studies.scan.tables import (
+from beamfit.studies.scan.results import (
+    PlaneFit,
     identifiability_rows,
     parameter_rows,
     point_rows,
     result_rows,
 )
+from beamfit.studies.scan.sensitivity import budget_rows, range_rows
 
 __all__ = ["emittance_page"]
 
@@ -51,11 +51,11 @@ def emittance_page(
     tables = [
         by_name("Result", names, result_rows(fit.planes), ERRORS),
         by_name("What the data determine", names, identifiability_rows(fit.planes)),
-        *(_budgets(fit, names) if fit.scenario == "known" else _fitted_too(fit)),
+        *(_budgets(fit, names) if fit.statement.closed else _fitted_too(fit)),
         *(Table(f"Points, {p.plane} plane", *point_rows(p), numeric=True) for p in fit.planes),
     ]
     energy = f"{float(line.energy):g} MeV"
-    if fit.scenario != "known":
+    if not fit.statement.closed:
         energy += f", scenario {fit.scenario}"
     return Page(
         title=f"Emittance of {scan.name}",
@@ -110,4 +110,4 @@ def _verdict(p: PlaneFit) -> Verdict:
 
 def _anchor(fit: EmittanceFit) -> str:
     """What ties a network to the lattice; a calibration has priors instead."""
-    return f"Anchor: {fit.anchor}." if fit.scenario.endswith("network") else ""
+    return f"Anchor: {fit.anchor}." if fit.statement.network else ""

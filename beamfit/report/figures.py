@@ -53,7 +53,7 @@ def draw_scan(figure: FigureBase, fit: EmittanceFit, plane: str) -> None:
     varied = [n for n, v in p.points.settings.items() if np.ptp(v) > 0]
     if len(varied) == 1:
         at = p.points.settings[varied[0]]
-        if fit.scenario == "transport-network":  # known at the measured currents alone
+        if not fit.statement.whole_map:  # known at the measured currents alone
             above.plot(at, 1e6 * p.points.model, "_", ms=14, mew=2, color=COLOUR[plane], alpha=0.6)
         else:
             _curves(above, fit, p, varied[0])
@@ -103,7 +103,7 @@ def _curves(axes: Axes, fit: EmittanceFit, p: PlaneFit, magnet: str) -> None:
         name = "fit" if len(screens) == 1 else f"fit at {screen}"
         axes.plot(grid, 1e6 * size, style, color=COLOUR[p.plane], lw=1.6, label=name)
         # In a scenario the beam's errors go with those of the calibration: no band of σ alone.
-        if fit.scenario == "known" and np.isfinite(p.covariance).all():
+        if fit.statement.closed and np.isfinite(p.covariance).all():
             variance = np.einsum("ij,jk,ik->i", design, p.covariance, design)
             half = p.error_scale * np.sqrt(variance) / (2.0 * np.maximum(size, 1e-9))
             axes.fill_between(

@@ -158,7 +158,7 @@ def draw_expected_sizes(
         "x" or "y".
     """
     p = fit[plane].points
-    if fit.scenario == "known":
+    if fit.statement.closed:
         error = np.asarray(posterior.target.data[plane].error)
         found = expected_sizes(posterior, plane, p.r11, p.r12, p.known, error)
     else:

@@ -13,6 +13,7 @@ from beamfit.optics.beam import BeamMatrix
 from beamfit.sampling.posterior import Posterior
 from beamfit.sampling.predictive import Expected, expected
 from beamfit.studies.scan.fit import EmittanceFit
+from beamfit.studies.scan.model import size_squared
 
 __all__ = ["expected_scenario_sizes", "expected_sizes"]
 
@@ -45,9 +46,8 @@ def expected_sizes(
     """
 
     def sizes(beams: Mapping[str, BeamMatrix]) -> Array:
-        beam = beams[plane]
-        first = r11 * beam.l11 + r12 * beam.l21
-        return jnp.sqrt(first**2 + (r12 * beam.l22) ** 2 + known)
+        sigma = beams[plane].sigma
+        return jnp.sqrt(size_squared((sigma[0, 0], sigma[0, 1], sigma[1, 1]), r11, r12, known))
 
     return expected(posterior, posterior.derive(sizes), error, f"{plane}.")
 
@@ -70,10 +70,10 @@ def expected_scenario_sizes(posterior: Posterior, fit: EmittanceFit, plane: str)
         In m.
     """
     record = next(r for r in fit.problem.records if r.name == f"size {plane}")
-    squared = fit[plane].method == "size_squared"
+    at = fit.seen.measured(plane)
 
     def sizes(model: Any) -> Array:
-        found = record.predict(model, record.data)
-        return 1e-6 * (jnp.sqrt(found) if squared else found)
+        found = record.predict(model, record.data)[at]
+        return 1e-6 * (jnp.sqrt(found) if record.data.squared else found)
 
     return expected(posterior, posterior.derive(sizes), fit[plane].points.error, "")

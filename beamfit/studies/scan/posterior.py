@@ -3,24 +3,26 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import NamedTuple
+from dataclasses import replace
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
 from beamfit.errors import InputError
+from beamfit.greybox import tree
+from beamfit.greybox.posterior import LAW, Sampled, target_of
 from beamfit.optics.beam import BeamMatrix
 from beamfit.optics.particle import beta_gamma
 from beamfit.quantity import Status
 from beamfit.sampling.likelihood import Group, Likelihood
 from beamfit.sampling.priors import Distribution, checked
 from beamfit.sampling.target import Derived, Law, Target
-from beamfit.studies.scan.fit import EmittanceFit
+from beamfit.studies.scan.model import UNIT, size_squared
 from beamfit.studies.scan.results import PlaneFit
-from beamfit.studies.scan.transport import plane_input, scan_rows, scanned_line, transfer_rows
 
-__all__ = ["Sizes", "beam_target"]
+__all__ = ["Sizes", "beam_target", "scenario_target"]
 
 NAMES, UNITS = ("sigma11", "sigma12", "sigma22"), ("m^2", "m rad", "rad^2")
 TWISS = {"emittance": "m", "normalized_emittance": "m", "beta": "m", "alpha": "1", "mismatch": "1"}
@@ -56,12 +58,7 @@ class Sizes(NamedTuple):
 
     def squared(self, sigma: Array) -> Array:
         """Size² of a beam matrix at every point (report equation 37)."""
-        return (
-            sigma[0] * self.r11**2
-            + 2.0 * sigma[1] * self.r11 * self.r12
-            + sigma[2] * self.r12**2
-            + self.known
-        )
+        return size_squared(sigma, self.r11, self.r12, self.known)
 
 
 # The planes by name; a name in a mapping is structure to JAX, so that each pair compiles once.
@@ -121,7 +118,7 @@ LAWS = {
 
 
 def beam_target(
-    fit: EmittanceFit,
+    fit: Any,
     planes: tuple[str, ...] | None = None,
     noise: str | None = None,
     outliers: bool | None = None,
@@ -131,7 +128,7 @@ def beam_target(
 
     Parameters
     ----------
-    fit : EmittanceFit
+    fit : Any
         The fit.
     planes : tuple of str, optional
         Which; all that were fitted if None.
@@ -197,7 +194,7 @@ def beam_target(
     )
 
 
-def _planes(fit: EmittanceFit, planes: tuple[str, ...] | None) -> list[PlaneFit]:
+def _planes(fit: Any, planes: tuple[str, ...] | None) -> list[PlaneFit]:
     fitted = [p.plane for p in fit.planes]
     for plane in planes or ():
         if plane not in fitted:
@@ -220,23 +217,21 @@ def _start(p: PlaneFit, priors: Mapping[str, Distribution]) -> tuple[np.ndarray,
     return np.array([q.mean() for q in own]), np.diag([float(q.std()) ** 2 for q in own])
 
 
-def _sizes(fit: EmittanceFit, p: PlaneFit) -> Sizes:
-    scanned = scanned_line(fit.scan, fit.line)
-    rows = scan_rows(fit.scan, scanned)
-    matrices = transfer_rows(scanned, rows.settings, rows.energy, places=rows.places)
-    given = plane_input(fit.scan, scanned, rows, matrices, p.plane)
+def _sizes(fit: Any, p: PlaneFit) -> Sizes:
+    look, i = fit.seen.look, "xy".index(p.plane)
+    given = fit.scan.error.get(p.plane)
     # A robust fit widened the errors of points it doubts; a mixture does its own doubting.
-    stated = given.error if given.error is not None else given.size
+    stated = p.points.size if given is None else given[fit.seen.measured(p.plane)]
     error = stated if p.points.outlier_probability is not None else p.points.error
     design = getattr(fit.line.design, p.plane, None) or (1.0, 0.0)
     return Sizes(
-        r11=given.r11,
-        r12=given.r12,
-        known=given.known,
-        size=given.size,
+        r11=p.points.r11,
+        r12=p.points.r12,
+        known=p.points.known,
+        size=p.points.size,
         error=np.nan_to_num(error, nan=1.0),
-        factor=np.asarray(float(beta_gamma(given.energy.mean(), fit.line.mass))),
-        to_design=given.to_design[:2, :2],
+        factor=np.asarray(float(beta_gamma(fit.seen.energy(p.plane), fit.line.mass))),
+        to_design=look.to_design[i, :2, :2],
         design=np.array([float(v) for v in design]),
     )
 
@@ -248,12 +243,12 @@ def _group(p: PlaneFit, noise: str | None, outliers: bool | None) -> Group:
     return Group(p.plane, noise, robust if outliers is None else outliers)
 
 
-def _derived(fit: EmittanceFit, chosen: list[PlaneFit]) -> Derived:
+def _derived(fit: Any, chosen: list[PlaneFit]) -> Derived:
     names = tuple(f"{p.plane}.{name}" for p in chosen for name in TWISS)
     return Derived(names, tuple(TWISS.values()) * len(chosen))
 
 
-def _without_design(fit: EmittanceFit, chosen: list[PlaneFit]) -> tuple[str, ...]:
+def _without_design(fit: Any, chosen: list[PlaneFit]) -> tuple[str, ...]:
     return tuple(f"{p.plane}.mismatch" for p in chosen if p.mismatch is None)
 
 
@@ -271,3 +266,101 @@ def _observed(chosen: list[PlaneFit], data: Planes) -> dict[str, np.ndarray]:
         found[f"{p.plane} size m"] = np.asarray(data[p.plane].size)
         found[f"{p.plane} error m"] = np.asarray(data[p.plane].error)
     return found
+
+
+@tree.node()
+class _Data:
+    """A sampled problem, and the factor to normalised emittance of each plane."""
+
+    sampled: Sampled
+    factor: dict[str, Any]
+
+
+def _beams(data: _Data, theta: Array) -> dict[str, Any]:
+    return LAW.build(data.sampled, theta)["beam"]
+
+
+def _residual(data: _Data, theta: Array) -> tuple[Array, ...]:
+    return LAW.residual(data.sampled, theta)
+
+
+def _log_prior(data: _Data, theta: Array) -> Array:
+    """The problem's own priors, and a beam that is flat in σ and not in its Cholesky factor.
+
+    With σ11 = l11², σ12 = l11 l21 and σ22 = l21² + l22² the determinant of the change of
+    variables is 4 l11² l22.
+    """
+    volume = jnp.zeros(())
+    for beam in _beams(data, theta).values():
+        volume += 2 * jnp.log(jnp.abs(beam["l11"])) + jnp.log(jnp.abs(beam["l22"]))
+    return LAW.log_prior(data.sampled, theta) + volume
+
+
+def _derive(data: _Data, theta: Array) -> Array:
+    """Emittance, normalised emittance, β and α of each plane from its Cholesky factor."""
+    found = []
+    for plane, beam in sorted(_beams(data, theta).items()):
+        emittance = UNIT**2 * beam["l11"] * beam["l22"]
+        found += [emittance, data.factor[plane] * emittance]
+        found += [beam["l11"] / beam["l22"], -beam["l21"] / beam["l22"]]
+    return jnp.stack(found)
+
+
+def _build(data: _Data, theta: Array) -> Any:
+    return LAW.build(data.sampled, theta)
+
+
+_LAW = Law(_residual, _log_prior, _derive, _build)
+
+
+def scenario_target(
+    fit: Any,
+    noise: str | None,
+    outliers: bool | None,
+    priors: Mapping[str, Distribution] | None,
+) -> Target:
+    """State the posterior of a scenario, all planes together.
+
+    Parameters
+    ----------
+    fit : Any
+        Of any scenario but "known".
+    noise, outliers, priors
+        As `beamfit.greybox.fit.Fit.sample`.
+
+    Returns
+    -------
+    Target
+        Of the problem's numbers; ``x.emittance``, ``x.normalized_emittance``, ``x.beta`` and
+        ``x.alpha`` are derived, and the prior's own where the
+        fit gives them no error.
+
+    Raises
+    ------
+    InputError
+        As `Fit.sample`.
+    """
+    plain = target_of(fit.fit, noise, bool(outliers), priors)
+    planes = sorted(p.plane for p in fit.planes)
+    energy = np.mean(fit.scan.energy) if fit.scan.energy is not None else fit.line.energy
+    factor = {plane: jnp.asarray(beta_gamma(float(energy), fit.line.mass)) for plane in planes}
+    names = tuple(f"{plane}.{name}" for plane in planes for name in TWISS)
+    open_ones = tuple(
+        f"{p.plane}.{name}" for p in fit.planes for name in TWISS if getattr(p, name).error is None
+    )
+    own = plain.likelihood.names
+    count = len(plain.names) - len(own)
+    return replace(
+        plain,
+        law=_LAW,
+        data=_Data(plain.data, factor),
+        names=plain.names[:count],
+        units=plain.units[:count],
+        lower=plain.lower[:count],
+        upper=plain.upper[:count],
+        mode=plain.mode[:count],
+        covariance=plain.covariance[:count, :count],
+        derived=Derived(names, tuple(TWISS.values()) * len(planes)),
+        priors_own=(*plain.priors_own, *open_ones),
+        hidden=(*plain.hidden, *(n for n in plain.names if n.startswith("beam."))),
+    )
