@@ -119,8 +119,8 @@ def _poor(e: Evidence) -> str | None:
     if not (e.errors_known and e.problem.records and chance < _UNLIKELY):
         return None
     return (
-        f"chi2 = {e.chi2:.4g} for {e.dof:.4g} degrees of freedom happens by chance in {chance:.1e} of "
-        "cases; the model misses something or the errors are too small."
+        f"chi2 = {e.chi2:.4g} for {e.dof:.4g} degrees of freedom happens by chance in {chance:.1e} "
+        "of cases; the model misses something or the errors are too small."
     )
 
 
