@@ -1,22 +1,21 @@
-"""Twiss tables along a ring: this package's CSV, and the TFS that MAD-X writes."""
+"""Twiss tables along a ring: this package's columns, and those of the TFS that MAD-X writes."""
 
 from __future__ import annotations
 
-import csv
-from pathlib import Path
+from os import PathLike
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from beamfit.errors import InputError, nearest
-from beamfit.io.files import text_lines
+from beamfit.errors import nearest
+from beamfit.io.table import Sheet, read_sheet
 
 if TYPE_CHECKING:
     from beamfit.lifetime.ring import Optics
 
 __all__ = ["read_twiss"]
 
-# column of a CSV file, and of a TFS file; the vertical dispersion may be missing
+# column here, and in a TFS file; the vertical dispersion may be missing
 COLUMNS = {
     "s_m": "S",
     "beta_x_m": "BETX",
@@ -29,54 +28,10 @@ COLUMNS = {
     "dispersion_slope_y": "DPY",
 }
 MAY_BE_MISSING = {"dispersion_y_m", "dispersion_slope_y"}
+POSITIVE = {"beta_x_m", "beta_y_m"}
 
 
-def _rows(path: Path) -> tuple[dict[str, int], list[tuple[int, list[str]]], bool]:
-    """Column positions, numbered rows, and whether the file is TFS."""
-    numbered = [(i, line.strip()) for i, line in enumerate(text_lines(path), 1) if line.strip()]
-    if any(line.startswith("*") for _, line in numbered):
-        header = next(line.split()[1:] for _, line in numbered if line.startswith("*"))
-        rows = [(i, line.split()) for i, line in numbered if line[0] not in "@*$#"]
-        return {name.upper(): k for k, name in enumerate(header)}, rows, True
-    numbered = [(i, line) for i, line in numbered if not line.startswith("#")]
-    if not numbered:
-        raise InputError("an empty file", "a header and rows", path=path)
-    cells = [(i, next(csv.reader([line]))) for i, line in numbered]
-    header = [name.strip() for name in cells[0][1]]
-    return {name: k for k, name in enumerate(header)}, cells[1:], False
-
-
-def _column(name: str, position: int, rows: list[tuple[int, list[str]]], path: Path) -> np.ndarray:
-    values = np.empty(len(rows))
-    for row, (line, cells) in enumerate(rows):
-        try:
-            values[row] = float(cells[position])
-        except (IndexError, ValueError):
-            found = repr(cells[position]) if position < len(cells) else "no cell"
-            raise InputError(found, "a number", path=path, line=line, column=name) from None
-    return values
-
-
-def _weights(s: np.ndarray, circumference: float, rows: list, path: Path) -> np.ndarray:
-    """Share of the ring for each point (trapezoid); the table covers the ring or a part 1/k."""
-    if s.size < 2 or np.any(np.diff(s) < 0):
-        line = rows[int(np.argmin(np.diff(s))) + 1][0] if s.size > 1 else None
-        raise InputError("s falls", "positions that rise", path=path, line=line, column="s_m")
-    span = s[-1] - s[0]
-    parts = circumference / span if span > 0 else 0.0
-    if abs(parts - max(1, round(parts))) > 1e-3 * parts:
-        raise InputError(
-            f"a table over {span:.6g} m",
-            f"the circumference of {circumference:.6g} m or a whole fraction of it",
-            path=path,
-            column="s_m",
-        )
-    steps = np.diff(s)
-    weight = (np.r_[steps, 0.0] + np.r_[0.0, steps]) / 2
-    return weight / span
-
-
-def read_twiss(path: str | Path, circumference: float) -> Optics:
+def read_twiss(path: str | PathLike[str], circumference: float) -> Optics:
     """Read the optics along a ring.
 
     Parameters
@@ -106,26 +61,40 @@ def read_twiss(path: str | Path, circumference: float) -> Optics:
     >>> print(f"mean beta_y {optics.average(optics.beta_y):.3f} m")
     mean beta_y 8.785 m
     """
-    path = Path(path)
-    header, rows, is_tfs = _rows(path)
-    columns: dict[str, np.ndarray] = {}
-    for name, tfs_name in COLUMNS.items():
-        sought = tfs_name if is_tfs else name
-        if sought in header:
-            columns[name] = _column(sought, header[sought], rows, path)
-        elif name in MAY_BE_MISSING:
-            columns[name] = np.zeros(len(rows))
-        else:
-            known = nearest(sought, list(header))
-            raise InputError(f"no column '{sought}', but {known}", f"'{sought}'", path=path)
-        values = columns[name]
-        usable = np.isfinite(values) & ((values > 0) | (not name.startswith("beta")))
-        if (bad := np.flatnonzero(~usable)).size:
-            line = rows[bad[0]][0]
-            raise InputError(
-                f"{values[bad[0]]}", "a usable value", path=path, line=line, column=sought
-            )
+    sheet = read_sheet(path, "s_m,beta_x_m,beta_y_m")
+    columns = {name: _column(sheet, name) for name in COLUMNS}
     from beamfit.lifetime.ring import Optics  # JAX from here on: the table is in order
 
-    weight = _weights(columns.pop("s_m"), circumference, rows, path)
+    weight = _weights(sheet, columns.pop("s_m"), circumference)
     return Optics(weight, *columns.values())
+
+
+def _column(sheet: Sheet, name: str) -> np.ndarray:
+    """A column under its own name or that of a TFS file."""
+    header = next((h for h in (name, COLUMNS[name]) if h in sheet.names), None)
+    if header is None:
+        if name in MAY_BE_MISSING:
+            return np.zeros(len(sheet))
+        known = nearest(name, list(sheet.names))
+        raise sheet.header_error(f"no column '{name}', but {known}", f"'{name}'")
+    values = sheet.numbers(header)
+    if name in POSITIVE and (values <= 0).any():
+        row = int(np.argmax(values <= 0))
+        raise sheet.error(f"{values[row]:g}", "a positive beta function", row, header)
+    return values
+
+
+def _weights(sheet: Sheet, s: np.ndarray, circumference: float) -> np.ndarray:
+    """Share of the ring for each point (trapezoid); the table covers the ring or a part 1/k."""
+    steps = np.diff(s)
+    if s.size < 2 or np.any(steps < 0):
+        row = int(np.argmin(steps)) + 1 if s.size > 1 else None
+        raise sheet.error("s falls", "positions that rise", row, "s_m")
+    span = s[-1] - s[0]
+    parts = circumference / span if span > 0 else 0.0
+    if abs(parts - max(1, round(parts))) > 1e-3 * parts:
+        found = f"a table over {span:.6g} m"
+        expected = f"the circumference of {circumference:.6g} m or a whole fraction of it"
+        raise sheet.error(found, expected, None, "s_m")
+    weight = (np.r_[steps, 0.0] + np.r_[0.0, steps]) / 2
+    return weight / span
