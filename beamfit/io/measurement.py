@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 
 from beamfit.errors import InputError, nearest
-from beamfit.io.files import digest
 from beamfit.io.table import UNITS, Column, Sheet, columns_of, read_sheet
 from beamfit.studies.scan.scans import QuadScan, first_unusable, row_keys
 
@@ -95,7 +94,7 @@ def read_quad_scan(path: str | PathLike[str]) -> QuadScan:
             error_source="the file",
             name=Path(path).stem,
             path=path,
-            sha256=digest(path),
+            sha256=sheet.sha256,
             provenance=sheet.comments,
             columns={name: c.header for name, c in settings.items()}
             | {key: c.header for key, c in columns.items()}

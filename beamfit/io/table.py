@@ -7,6 +7,7 @@ with a table as such is found and named here.
 from __future__ import annotations
 
 import csv
+import hashlib
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -62,6 +63,8 @@ class Sheet:
         Line of the header.
     comments : tuple of str
         Comment lines, TFS descriptors, or attributes of an HDF5 file.
+    sha256 : str
+        Digest of the file.
     """
 
     path: str | PathLike[str]
@@ -70,6 +73,7 @@ class Sheet:
     lines: Sequence[int] | None
     header: int | None
     comments: tuple[str, ...]
+    sha256: str = ""
 
     def __len__(self) -> int:
         return len(self.cells[0])
@@ -232,8 +236,8 @@ def read_sheet(path: str | PathLike[str], example: str, most: int | None = None)
     if Path(path).suffix.lower() in HDF5:
         return _read_hdf5(path, most)
     names, header, separator = None, None, ""
-    comments, rows, lines = [], [], []
-    for line, text in enumerate(text_lines(path), start=1):
+    comments, rows, lines, seen = [], [], [], hashlib.sha256()
+    for line, text in enumerate(text_lines(path, seen), start=1):
         start = text.strip()[:1]
         if start == "#" or (start in ("@", "$") and (names is None or separator == " ")):
             comments.append(text.strip().lstrip("# ").rstrip())
@@ -256,7 +260,7 @@ def read_sheet(path: str | PathLike[str], example: str, most: int | None = None)
     if names is None:
         raise InputError("no header and no rows", f"a header line such as {example}", path=path)
     cells = list(zip(*rows, strict=True)) if rows else [()] * len(names)
-    return Sheet(path, tuple(names), cells, lines, header, tuple(comments))
+    return Sheet(path, tuple(names), cells, lines, header, tuple(comments), seen.hexdigest())
 
 
 def _split(text: str, separator: str, path: str | PathLike[str], line: int) -> list[str]:
@@ -303,7 +307,7 @@ def _check_length(
 def _read_hdf5(path: str | PathLike[str], most: int | None) -> Sheet:
     import h5py
 
-    digest(path)  # says what is wrong with the path itself
+    sha256 = digest(path)  # says what is wrong with the path itself
     try:
         with h5py.File(path, "r") as store:
             names = tuple(n for n in store if isinstance(store.get(n), h5py.Dataset))
@@ -323,7 +327,7 @@ def _read_hdf5(path: str | PathLike[str], most: int | None) -> Sheet:
         if len(column) != usual:
             expected = f"{usual}, as in '{like}': datasets of equal lengths"
             raise InputError(f"{len(column)} readings", expected, path=path, column=name)
-    return Sheet(path, names, cells, None, None, comments)
+    return Sheet(path, names, cells, None, None, comments, sha256)
 
 
 def _dataset(data: Any, name: str, path: str | PathLike[str], most: int | None) -> list[Any]:
