@@ -206,8 +206,8 @@ def find_setpoint(
     planes = tuple(dict.fromkeys(t.plane for t in targets))
     sigma = {p: jnp.asarray(beams[p].sigma, float) for p in planes}
     search = _Search(
-        tuple(vary), screen, planes, tuple(targets), line, sigma, jnp.asarray(middle),
-        jnp.asarray(reach),
+        tuple(vary), screen, planes, tuple(targets), line.condensed((*vary, screen), line.energy),
+        sigma, jnp.asarray(middle), jnp.asarray(reach),
     )  # fmt: skip
     one = jnp.ones(len(vary))
     found = descend_all(_residual, search, jnp.asarray(_starts(len(vary), seed)), -one, one)
