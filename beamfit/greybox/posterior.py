@@ -31,13 +31,17 @@ NEAR_COST, FAR = 3.0, 6.0
 
 @tree.node()
 class Sampled:
-    """A problem for the sampler: its core, all numbers, which of them move, and the limits."""
+    """A problem for the sampler: its core, all numbers, which move, the limits, padding apart.
+
+    `rows` are the residuals that count, None for all.
+    """
 
     core: Core
     theta: Any
     moving: Any
     lower: Any
     upper: Any
+    rows: Any = None
 
 
 def _model(data: Sampled, moved: jax.Array) -> Any:
@@ -49,7 +53,8 @@ def _residual(data: Sampled, moved: jax.Array) -> tuple[jax.Array]:
     """Residuals of the records; priors are no measurements and know no common noise."""
     model = _model(data, moved)
     parts = [record.residual(model) for record in data.core.records]
-    return (jnp.concatenate(parts) if parts else jnp.zeros(0),)
+    whole = jnp.concatenate(parts) if parts else jnp.zeros(0)
+    return (whole if data.rows is None else whole[data.rows],)
 
 
 def _log_prior(data: Sampled, moved: jax.Array) -> jax.Array:
@@ -115,7 +120,9 @@ def target_of(
     priors = checked(priors, names)
     fixed = fit.theta.copy()
     fixed[moving] = 0.0  # the solver's last digits do not make it another problem
-    data = Sampled(p.core, fixed, moving, p.constraint_lower, p.constraint_upper)
+    used = np.concatenate([np.zeros(0, bool), *(record.used for record in p.records)])
+    rows = None if used.all() else np.flatnonzero(used)
+    data = Sampled(p.core, fixed, moving, p.constraint_lower, p.constraint_upper, rows)
     lower, upper = p.lower[moving], p.upper[moving]
     data = jax.tree.map(jnp.asarray, data)
     width = np.where(np.isfinite(upper - lower), 0.5 * (upper - lower), np.inf)
@@ -155,7 +162,7 @@ def target_of(
 
 def _other_optimum(fit: Fit, moving: np.ndarray) -> str:
     """Warn of another optimum the search met: walkers that start at one do not find the other."""
-    spread = fit.scale * np.sqrt(np.diag(fit.covariance)[moving])
+    spread = np.sqrt(np.diag(fit.covariance)[moving])
     for attempt in fit.attempts:
         off = np.abs(attempt.theta - fit.theta)[moving]
         near = attempt.kkt.worst <= TOLERANCE and attempt.cost - fit.cost < NEAR_COST
