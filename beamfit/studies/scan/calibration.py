@@ -175,6 +175,7 @@ def _state(seen: Seen, told: Assumptions) -> Problem:
     """Beams and calibrations free, all planes together."""
     numbers, beams = _free_numbers(seen, told), beam_numbers(seen)
     magnets = {n.magnet: seen.scanned[n.magnet].calibration for n in numbers.values()}
+    seen = seen.keeping(magnets)
     free, priors = beam_free(beams), []
     for name, number in numbers.items():
         low, high = number.value - number.reach, number.value + number.reach

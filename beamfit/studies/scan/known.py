@@ -40,7 +40,11 @@ from beamfit.studies.scan.transport import (
 )
 from beamfit.studies.scan.verdict import LOST, Evidence, waist_bracketed
 
-__all__ = ["SCENARIO", "next_measurement", "pulls", "see", "works_of"]
+__all__ = ["METHODS", "SCENARIO", "next_measurement", "pulls", "see", "works_of"]
+
+
+# The residual: the report's ``error_linear`` or ``error_nonlinear``.
+METHODS = ("size_squared", "size")
 
 
 def see(
@@ -70,9 +74,10 @@ def see(
     asked = planes or scan.planes
     for plane in asked:
         scan.rows(plane)  # says so if it was not measured
-    rows = scan_rows(scan, scanned_line(scan, line), method == "size_squared")
+    scanned = scanned_line(scan, line)
+    rows = scan_rows(scan, scanned, method == METHODS[0])
     look = Look(*(np.asarray(part) for part in look_through(rows)))
-    seen = Seen(scan, line, asked, method, robust, rows, look, {})
+    seen = Seen(scan, line, scanned, asked, method, robust, rows, look, {})
     # A plane that is not asked for still testifies to the settings and the optics.
     return seen._replace(works=works_of(seen, look, (*asked, *scan.planes)))
 

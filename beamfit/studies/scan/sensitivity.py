@@ -19,6 +19,7 @@ from jax import Array
 from beamfit.optics.beamline import Beamline
 from beamfit.optics.calibration import CurrentPolynomial, SlopeIntercept
 from beamfit.optics.elements import Drift
+from beamfit.optics.sections import Series
 from beamfit.studies.scan.fit import EmittanceFit
 from beamfit.studies.scan.model import emittance_parts, size_squared
 from beamfit.studies.scan.results import PlaneFit, Points
@@ -114,15 +115,18 @@ def systematics(fit: EmittanceFit, plane: str) -> list[Change]:
     magnets = varied_magnets(fit.scan)
     upstream = fit.line.upto(result.screen.name).elements
     drifts = tuple(e.name for e in upstream if isinstance(e, Drift))
-    size, error = np.full((2, len(rows.energy)), np.inf)
-    size[:], size[fit.seen.measured(plane)] = 1.0, p.size
-    error[fit.seen.measured(plane)] = p.error
+    keep = fit.seen.measured(plane)
+    size, error = np.ones(len(rows.energy)), np.full(len(rows.energy), np.inf)
+    size[keep], error[keep] = p.size, p.error
     sigma = np.array([q.value for q in result.sigma])
-    relative = np.asarray(_changes(rows, sigma, size, error, magnets=magnets, drifts=drifts))
+    stored = replace(rows, line=fit.seen.scanned.stored_by_kind((*rows.settings, *rows.places)))
+    by_change, by_lengths = _changes(stored, sigma, size, error, magnets=magnets)
+    by_length = np.concatenate([*by_lengths, np.zeros(0)])[: len(drifts)]  # the rest is downstream
+    relative = np.concatenate([by_change[:-1], by_length, by_change[-1:]])
     # ln βγ rises by E²/(E² - m²) for each relative step of the energy.
     energy = fit.seen.energy(plane)
     stiffer = energy**2 / (energy**2 - fit.line.mass**2)
-    causes = [f"{n} {_word(rows.line, n)} +1 %" for n in magnets]
+    causes = [f"{n} {_word(fit.seen.scanned, n)} +1 %" for n in magnets]
     causes += [f"drift {n} +1 cm" for n in drifts] + ["energy +1 %"]
     normalised = relative + np.append(np.zeros(len(relative) - 1), stiffer)
     return [
@@ -151,21 +155,20 @@ def _scaled(line: Beamline, magnet: str, factor: Array) -> Beamline:
     return line.with_element(replace(element, calibration=c))
 
 
-@partial(jax.jit, static_argnames=("magnets", "drifts"))
-def _changes(rows: Rows, sigma: Array, size: Array, error: Array, *, magnets, drifts) -> Array:
-    """Derivatives of ln ε of the fit by each change.
+@partial(jax.jit, static_argnames="magnets")
+def _changes(rows: Rows, sigma: Array, size: Array, error: Array, *, magnets):
+    """Derivatives of ln ε of the fit by each magnet's strength and ln E, and by lengths of drifts.
 
     At the minimum the slope F(σ, rows) of χ² is zero, so dσ = -(∂F/∂σ)⁻¹ ∂F/∂rows: exact for
-    either residual, without differentiating the solver.
+    either residual, without differentiating the solver. One reverse pass carries that back to
+    every number of the line, however long it is.
     """
     unit = jnp.abs(sigma)
 
-    def elements(change: Array) -> tuple[Array, ...]:
-        moved = rows.line
+    def elements(change: Array, lengths: list[Array]) -> tuple[Array, ...]:
+        moved = _with_lengths(rows.line, lengths)
         for i, name in enumerate(magnets):
             moved = _scaled(moved, name, 1.0 + change[i])
-        for i, name in enumerate(drifts, start=len(magnets)):
-            moved = moved.with_element(Drift(name, rows.line[name].length + change[i]))
         energy = rows.energy * (1.0 + change[-1])
         return replace(rows, line=moved, energy=energy).elements({})
 
@@ -175,13 +178,29 @@ def _changes(rows: Rows, sigma: Array, size: Array, error: Array, *, magnets, dr
             return jnp.sum(((squared - size**2) / (2.0 * size * error)) ** 2)
         return jnp.sum(((jnp.sqrt(squared) - size) / error) ** 2)
 
-    none, here = jnp.zeros(len(magnets) + len(drifts) + 1), sigma / unit
-    seen, slopes = elements(none), jax.jacfwd(elements)(none)
-    slope = jax.grad(chi2)
+    series = [s for s in rows.line.elements if isinstance(s, Series)]
+    lengths = [k.length for s in series for k in s.kinds if isinstance(k, Drift)]
+    none, here, slope = jnp.zeros(len(magnets) + 1), sigma / unit, jax.grad(chi2)
+    seen = elements(none, lengths)
     by_sigma = jax.grad(lambda s: jnp.log(emittance_parts(s * unit)[0]))(here)
     weights = jnp.linalg.solve(jax.jacfwd(slope)(here, seen), by_sigma)
-    gradient = jax.grad(lambda seen: -weights @ slope(here, seen))(seen)
-    return sum(g @ s for g, s in zip(gradient, slopes, strict=True))
+
+    def moved_emittance(change: Array, lengths: list[Array]) -> Array:
+        return -weights @ slope(here, elements(change, lengths))
+
+    return jax.grad(moved_emittance, (0, 1))(none, lengths)
+
+
+def _with_lengths(line: Beamline, lengths: list[Array]) -> Beamline:
+    """Give the drifts of a line that is stored by kind other lengths."""
+    left = iter(lengths)
+    elements = []
+    for part in line.elements:
+        if isinstance(part, Series):
+            kinds = (Drift("", next(left)) if isinstance(k, Drift) else k for k in part.kinds)
+            part = replace(part, kinds=tuple(kinds))
+        elements.append(part)
+    return replace(line, elements=tuple(elements))
 
 
 def range_sensitivity(plane: PlaneFit) -> list[RangeRow]:

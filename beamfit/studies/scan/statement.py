@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -17,7 +17,7 @@ from beamfit.studies.scan.model import UNIT, Asked, predict_sizes
 from beamfit.studies.scan.results import Parameter, Points
 from beamfit.studies.scan.scans import QuadScan
 from beamfit.studies.scan.sigma import SigmaFit
-from beamfit.studies.scan.transport import Look, Rows, padded
+from beamfit.studies.scan.transport import Look, Rows, padded, scan_rows
 from beamfit.studies.scan.verdict import Evidence
 
 __all__ = [
@@ -67,6 +67,8 @@ class Seen(NamedTuple):
     ----------
     scan, line : QuadScan, Beamline
         As given.
+    scanned : Beamline
+        The line with the calibrations of the scan's columns.
     planes : tuple of str
         Those that are asked for.
     method : str
@@ -74,7 +76,7 @@ class Seen(NamedTuple):
     robust : bool
         Whether points may be doubted.
     rows : Rows
-        The scan's rows through the line with the calibrations of its columns, padded.
+        The scan's rows through that line, padded; what no row changes is multiplied out.
     look : Look
         The same, with every magnet as the lattice has it; NumPy arrays.
     works : dict of str to Work
@@ -83,6 +85,7 @@ class Seen(NamedTuple):
 
     scan: QuadScan
     line: Beamline
+    scanned: Beamline
     planes: tuple[str, ...]
     method: str
     robust: bool
@@ -90,14 +93,13 @@ class Seen(NamedTuple):
     look: Look
     works: dict[str, Work]
 
-    @property
-    def scanned(self) -> Beamline:
-        """The line with the calibrations of the scan's columns."""
-        return self.rows.line
-
     def of_plane(self, plane: str, settings: Mapping[str, Any] | None = None) -> Rows:
         """The rows of one plane, with other settings if any are given."""
         return replace(self.rows, plane=plane, settings=settings or self.rows.settings)
+
+    def keeping(self, magnets: Iterable[str]) -> Seen:
+        """The same with rows in which further magnets may change."""
+        return self._replace(rows=scan_rows(self.scan, self.scanned, self.rows.squared, magnets))
 
     def measured(self, plane: str) -> np.ndarray:
         """Indices of the rows in which a plane was measured."""
@@ -159,7 +161,7 @@ def asked_of(seen: Seen, plane: str, whole_map: bool = True) -> Asked:
         plane,
         seen.rows.places[-1] if whole_map else None,
         design.at if twiss else None,
-        seen.scanned,
+        seen.rows.line,
         np.asarray(factor),
         np.array(twiss or (np.nan, np.nan), float),
     )

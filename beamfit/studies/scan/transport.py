@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
-from functools import partial
+from functools import lru_cache, partial
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jax.typing import ArrayLike
 
 from beamfit.greybox import tree
 from beamfit.greybox.problem import padded_length
@@ -22,6 +23,7 @@ from beamfit.optics.calibration import (
     IntegratedStrength,
 )
 from beamfit.optics.elements import Marker, Screen, ThinLens, TransferMatrix
+from beamfit.optics.sections import Series
 from beamfit.studies.scan.model import line_of
 from beamfit.studies.scan.scans import QuadScan
 
@@ -36,8 +38,12 @@ __all__ = [
     "padded",
     "scan_rows",
     "scanned_line",
+    "seen_line",
     "transfer_rows",
 ]
+
+# Elements, times rows, whose matrices are held at once where each row has its own energy.
+MOST_AT_ONCE = 100_000
 
 
 def names_of(line: Beamline) -> tuple[dict[str, str], list[str], str | None, float]:
@@ -65,19 +71,26 @@ def scanned_line(scan: QuadScan, line: Beamline) -> Beamline:
     >>> magnet.calibration.unit, round(float(magnet.k1(energy=100.0)), 9)
     ('kG', 3.0)
     """
-    meanings = {
-        "kG": IntegratedGradient(mass=line.mass),
-        "k1": FocusingStrength(),
-        "k1l": IntegratedStrength(),
-    }
     for name, unit in scan.units.items():
-        magnet = line[name]
-        if isinstance(magnet, ThinLens) and unit == "k1":
+        if isinstance(line[name], ThinLens) and unit == "k1":
             raise scan.unusable(
                 f"k1 for '{name}', which has no length",
                 f"a column {name}_k1l (inverse focal length, 1/m) or {name}_kG",
                 name,
             )
+    return _with_meanings(_Same(line), tuple(scan.units.items()))
+
+
+@lru_cache(maxsize=64)
+def _with_meanings(same: _Same, units: tuple[tuple[str, str], ...]) -> Beamline:
+    line = same.line
+    meanings = {
+        "kG": IntegratedGradient(mass=line.mass),
+        "k1": FocusingStrength(),
+        "k1l": IntegratedStrength(),
+    }
+    for name, unit in units:
+        magnet = line[name]
         if unit != magnet.calibration.unit:
             meaning = meanings[unit]
             strength = magnet.calibration.k1l(magnet.setting, magnet.length, line.energy)
@@ -167,7 +180,9 @@ def padded(values: Any, n: int | None = None) -> np.ndarray:
     return np.concatenate([values, np.repeat(values[-1:], more, axis=0)])
 
 
-def scan_rows(scan: QuadScan, scanned: Beamline, squared: bool = True) -> Rows:
+def scan_rows(
+    scan: QuadScan, scanned: Beamline, squared: bool = True, keep: Iterable[str] = ()
+) -> Rows:
     """The rows of a scan, of the x plane, padded.
 
     Parameters
@@ -178,11 +193,13 @@ def scan_rows(scan: QuadScan, scanned: Beamline, squared: bool = True) -> Rows:
         From `scanned_line`.
     squared : bool
         As for `Rows`.
+    keep : iterable of str
+        Magnets that may change besides those of the scan.
 
     Returns
     -------
     Rows
-        Places in the order of the line.
+        Places in the order of the line. All of the line that nothing changes is multiplied out.
     """
     n = len(scan)
     named = scan.screen or (scanned.screens[-1],) * n
@@ -194,13 +211,16 @@ def scan_rows(scan: QuadScan, scanned: Beamline, squared: bool = True) -> Rows:
     def column(values: Any, default: float) -> np.ndarray:
         return padded(np.full(n, float(default)) if values is None else values)
 
+    energy = column(scan.energy, scanned.energy)
+    ends = (*places, scanned.design.at) if scanned.design else places
+    every = np.append(energy, scanned.energy)
     return Rows(
         "x",
         places,
         squared,
-        scanned,
+        seen_line(scanned, (*scan.settings, *keep), every, ends),
         {name: padded(v) for name, v in scan.settings.items()},
-        column(scan.energy, scanned.energy),
+        energy,
         padded(which),
         column(scan.energy_spread, scanned.energy_spread),
         padded(np.array(own)[which] if scan.resolution is None else scan.resolution),
@@ -246,7 +266,6 @@ def look_through(rows: Rows) -> Look:
     )
 
 
-@partial(jax.jit, static_argnames="places")
 def transfer_rows(
     line: Beamline, settings: Mapping[str, Array], energy: Array, places: tuple[str, ...]
 ) -> TransferMatrix:
@@ -255,11 +274,12 @@ def transfer_rows(
     Parameters
     ----------
     line : Beamline
-        The line, with the calibrations of the scan's columns.
+        The line, with the calibrations of the scan's columns. What no setting moves is
+        multiplied out first; a line that is traced is taken as it is (see `seen_line`).
     settings : mapping of str to Array
         Magnet name to settings, shape (n,).
     energy : Array
-        MeV, shape (n,).
+        MeV, shape (n,), or one number.
     places : tuple of str
         Element names.
 
@@ -268,13 +288,52 @@ def transfer_rows(
     TransferMatrix
         ``planes`` of shape (n, 2, places, 3, 3).
     """
+    if not any(isinstance(v, jax.core.Tracer) for v in jax.tree.leaves(line)):
+        line = seen_line(line, settings, energy, places)
+    return _rows(line, dict(settings), energy, places)
 
-    def one(setting: Mapping[str, Array], at: Array) -> TransferMatrix:
-        found = line.matrices(places, setting, at)
-        return TransferMatrix(jnp.stack([jnp.asarray(found[p].planes) for p in places], axis=-4))
 
-    every = jax.vmap(one)(dict(settings), energy)
-    return TransferMatrix(jnp.swapaxes(every.planes, 1, 2))
+def seen_line(
+    line: Beamline, settings: Iterable[str], energy: ArrayLike, places: Iterable[str]
+) -> Beamline:
+    """A line as rows of these settings and energies see it: all else multiplied out."""
+    own = () if isinstance(energy, jax.core.Tracer) else np.unique(energy)
+    keep = frozenset((*settings, *places))
+    return _condensed(_Same(line), keep, float(own[0]) if len(own) == 1 else None)
+
+
+class _Same(NamedTuple):
+    """A line that is itself and no other: scan after scan of it shares what it is made into."""
+
+    line: Beamline
+
+    def __hash__(self) -> int:
+        return id(self.line)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Same) and self.line is other.line
+
+
+@lru_cache(maxsize=64)
+def _condensed(same: _Same, keep: frozenset[str], energy: float | None) -> Beamline:
+    return same.line.condensed(keep, energy)
+
+
+@partial(jax.jit, static_argnames="places")
+def _rows(
+    line: Beamline, settings: dict[str, Array], energy: Array, places: tuple[str, ...]
+) -> TransferMatrix:
+    def one(row: tuple[dict[str, Array], Array]) -> Array:
+        setting, at = row
+        found = line.matrices(places, setting, energy if at is None else at)
+        return jnp.stack([jnp.asarray(found[p].planes) for p in places], axis=-3)
+
+    rows = (settings, None if jnp.ndim(energy) == 0 else energy)
+    long = max((e.order.size for e in line.elements if isinstance(e, Series)), default=0)
+    if jnp.size(energy) * long <= MOST_AT_ONCE:
+        return TransferMatrix(jax.vmap(one)(rows))
+    by_turns = jax.lax.map(jax.checkpoint(one), rows, batch_size=max(1, MOST_AT_ONCE // long))
+    return TransferMatrix(by_turns)
 
 
 def own_settings(line: Beamline, screen: str) -> dict[str, float]:
