@@ -12,7 +12,7 @@ from scipy.linalg import null_space
 
 from beamfit.errors import InputError
 from beamfit.greybox import tree
-from beamfit.greybox.kkt import TOLERANCE
+from beamfit.greybox.assess import TOLERANCE
 from beamfit.greybox.problem import Core, Prior
 from beamfit.sampling.likelihood import Group, Likelihood
 from beamfit.sampling.priors import Distribution, checked
