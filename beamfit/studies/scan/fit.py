@@ -114,7 +114,7 @@ def fit_emittance(
     )
     told.check_scenario(scenario, robust)
     statement = scenario_of(scenario)
-    seen = see(scan, line, planes, method, robust)
+    seen = see(scan, line, planes, method, robust, at_once=statement.closed)
     if statement.closed:
         return EmittanceFit(judged_beam(seen), scan, line, statement, told, seen)
     stated = statement.state(seen, told)
