@@ -11,10 +11,12 @@ from jax import Array
 
 from beamfit.lifetime.ring import Operation
 from beamfit.lifetime.scaled import MECHANISMS, Terms, loss_terms, scaled_losses
-from beamfit.sampling.posterior import Interval, Posterior
+from beamfit.sampling.posterior import Posterior
+from beamfit.sampling.summary import Interval
 from beamfit.sampling.target import Law, Target
 from beamfit.studies.decay.scales import ScaleFit, pulls, whitener
 from beamfit.studies.decay.summary import Summaries
+from beamfit.verdict import Finding
 
 __all__ = ["Interval", "budget_intervals", "sample_scales"]
 
@@ -120,7 +122,7 @@ def sample_scales(fit: ScaleFit, seed: int = 0, **options: Any) -> Posterior:
             "decays": np.array(fit.names),
         },
         priors_own=unknown,
-        verdict=(fit.status.value, fit.message),
+        verdict=Finding(fit.status, fit.message),
     )
     return draw(target, seed=seed, **options)
 
