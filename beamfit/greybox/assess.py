@@ -8,9 +8,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.experimental import checkify
-from scipy import linalg
 
 from beamfit.greybox import kkt, problem
+from beamfit.greybox.covariance import (
+    MOST_SHARE,
+    Group,
+    Spread,
+    directions,
+    groups_of,
+    spread_of,
+    triangle,
+)
 from beamfit.greybox.fit import Attempt, Fit, Limited, Status, Variable
 from beamfit.greybox.implicit import Implicit
 from beamfit.greybox.kkt import TOLERANCE
@@ -114,36 +122,54 @@ def state(p: Problem, theta: np.ndarray) -> State:
     return State(theta, at, found, distance)
 
 
-class _Spread(NamedTuple):
-    """Covariance along the active limits, its rank, unseen directions, and what is held."""
+class _Known(NamedTuple):
+    """What a point's residuals tell: groups of noise, spreads, directions not seen, rank.
 
-    covariance: np.ndarray
-    rank: int
+    `blind` tells which numbers would be open even if what is at a bound truly were there.
+    """
+
+    groups: tuple[Group, ...]
+    spread: Spread
+    raw: Spread
     unseen: np.ndarray
-    held: np.ndarray
+    rank: int
+    blind: np.ndarray
 
 
-def _spread(p: Problem, s: State) -> _Spread:
-    """Covariance in the tangent of what is held; singular values tell what is not determined."""
-    fixed = p.lower == p.upper
+def _known(p: Problem, s: State, held: np.ndarray, edge: np.ndarray) -> _Known:
+    """Tell what the residuals know, along the limits that hold.
+
+    For the degrees of freedom a number at an active bound is held; its error and that of what
+    hangs on it are those of a number that the bound only limits. Weights that nobody asks for
+    stay on their bounds.
+    """
     scale = _gradient_scale(p, s.theta, s.at)
-    held = fixed | (np.abs(s.found.bounds) > 1e-9 * scale)
     equal = p.constraint_lower == p.constraint_upper
     pulls = np.abs(s.found.constraints) * np.linalg.norm(s.at.jacobian / scale, axis=1)
-    rows = np.vstack([np.eye(len(s.theta))[held], s.at.jacobian[equal | (pulls > 1e-9)]])
-    length = np.linalg.norm(s.at.residual_jacobian, axis=0)
-    unit = np.where(length > 0, 1 / np.where(length > 0, length, 1.0), 1.0)
-    tangent = linalg.null_space(rows * unit) if len(rows) else np.eye(len(s.theta))
-    if tangent.shape[1] == 0:
-        return _Spread(np.zeros((len(s.theta),) * 2), 0, np.zeros((len(s.theta), 0)), held)
-    seen = s.at.residual_jacobian * unit @ tangent
-    _, sizes, directions = linalg.svd(seen, full_matrices=True)
-    rank = int(np.sum(sizes > 1e-10 * max(sizes[0], 1e-300))) if sizes.size else 0
-    along = unit[:, None] * (tangent @ directions.T)
-    spread = along[:, :rank] / sizes[:rank]
-    unseen = along[:, rank:]
+    equations = s.at.jacobian[equal | (pulls > 1e-9)]
+    ends = np.cumsum([record.measured.size for record in p.records], dtype=int)
+    blocks = [triangle(part) for part in np.split(s.at.residual_jacobian, ends)]
+    half, unseen, _ = directions(np.vstack(blocks), np.vstack([np.eye(len(held))[held], equations]))
+    groups = groups_of(
+        [(record.name, record.error is not None) for record in p.records],
+        np.split(s.at.residual, ends)[:-1],
+        [int(record.used.sum()) for record in p.records],
+        blocks[:-1],
+        half,
+    )
+    still = (edge & p.nuisance) | (p.lower == p.upper)
+
+    def spread(factors, still):
+        parts = [block / f for block, f in zip(blocks, [*factors, 1.0], strict=True)]
+        return spread_of(np.vstack(parts), p.lower, p.upper, still, p.with_prior, equations)
+
+    factors = [group.factor for group in groups]
+    scaled = spread(factors, still)
+    raw = spread([1.0 if group.errors_given else group.factor for group in groups], still)
+    given_bounds = scaled if np.array_equal(still, held) else spread(factors, held)
+    blind = (given_bounds.share(np.eye(len(held))) >= MOST_SHARE) & ~held
     unseen = unseen / np.where((n := np.linalg.norm(unseen, axis=0)) > 0, n, 1.0)
-    return _Spread(spread @ spread.T, rank, unseen, held)
+    return _Known(groups, scaled, raw, unseen, half.shape[1], blind)
 
 
 def _inner_failure(p: Problem, theta: np.ndarray) -> str | None:
@@ -190,22 +216,26 @@ def conclude(p: Problem, s: State, attempts: tuple[Attempt, ...], seconds: float
             "numbers to where a root exists."
         )
         return refused(p, Status.not_converged, said, seconds, s.theta, attempts)
-    spread = _spread(p, s)
+    fixed = p.lower == p.upper
+    bounds = kkt.Limits(s.theta, p.lower, p.upper)
+    edge = np.array(_states(s.found.bounds, bounds))
+    at_edge = np.isin(edge, ("lower", "upper"))
+    held = fixed | (np.abs(s.found.bounds) > 1e-9 * _gradient_scale(p, s.theta, s.at))
+    known = _known(p, s, held, at_edge)
     chi2 = float(s.at.residual @ s.at.residual)
-    dof = len(s.at.residual) - spread.rank
+    priors = len(s.at.residual) - sum(record.measured.size for record in p.records)
+    dof = sum(group.count for group in known.groups) + priors - known.rank
     ratio = chi2 / dof if dof > 0 else np.nan
     judged = p.errors_known or not p.records
     scale = (np.sqrt(max(1.0, ratio)) if dof > 0 else 1.0) if judged else np.sqrt(ratio)
-    raw = np.sqrt(np.diag(spread.covariance))
-    blind = np.any(np.abs(spread.unseen) > 1e-6, axis=1) | (scale * raw > p.upper - p.lower)
-    raw = np.where(blind | spread.held, np.nan, raw)
-    fixed = p.lower == p.upper
-    blind &= ~fixed & ~spread.held
-    edge = _states(s.found.bounds, kkt.Limits(s.theta, p.lower, p.upper))
+    one = np.eye(len(s.theta))
+    nothing = (known.spread.share(one) >= MOST_SHARE) | held
+    nothing |= any(group.unknown for group in known.groups)
+    errors = (np.where(nothing, np.nan, part.error(one)) for part in (known.spread, known.raw))
     variables = tuple(
         Variable(name, *map(float, numbers), state, float(gradient))
         for name, *numbers, state, gradient in zip(
-            p.names, s.theta, scale * raw, raw, p.lower, p.upper, edge, s.found.bounds, strict=True
+            p.names, s.theta, *errors, p.lower, p.upper, edge, s.found.bounds, strict=True
         )
     )
     limits = kkt.Limits(s.at.constraints, p.constraint_lower, p.constraint_upper)
@@ -216,13 +246,16 @@ def conclude(p: Problem, s: State, attempts: tuple[Attempt, ...], seconds: float
             strict=True,
         )
     )  # fmt: skip
+    # What has no errors cannot speak for or against the model.
+    silent = [group for group in known.groups if not group.errors_given]
+    spoken = chi2 - sum(g.chi2 for g in silent), dof - sum(g.dof for g in silent)
     evidence = Evidence(
-        p, s.kkt, float(s.at.cost), attempts, variables, constraints, blind, chi2, dof, judged
+        p, s.kkt, float(s.at.cost), attempts, variables, constraints, known.blind, *spoken, judged
     )
     status, message = judge(evidence)
     return Fit(
-        p, s.theta, status, message, float(s.at.cost), chi2, dof, s.kkt, variables, constraints,
-        spread.covariance, spread.unseen, float(scale), attempts, seconds,
+        p, s.theta, status, message, float(s.at.cost), chi2, dof, known.groups, s.kkt, variables,
+        constraints, known.spread, known.raw, known.unseen, float(scale), attempts, seconds,
     )  # fmt: skip
 
 
@@ -250,10 +283,11 @@ def refused(
         for name, v, a, b in zip(p.names, theta, p.lower, p.upper, strict=True)
     )
     limits = zip(p.constraint_names, p.constraint_lower, p.constraint_upper, strict=True)
+    lost = Spread(np.full((n, n), nan), np.eye(n), np.ones(n), np.zeros(n))
     constraints = tuple(
         Limited(name, nan, float(a), float(b), "free", nan) for name, a, b in limits
     )
     return Fit(
-        p, theta, status, message, nan, nan, 0, kkt.KKT(inf, inf, inf), variables, constraints,
-        np.full((n, n), nan), np.eye(n), nan, attempts, seconds,
+        p, theta, status, message, nan, nan, 0, (), kkt.KKT(inf, inf, inf), variables,
+        constraints, lost, lost, np.eye(n), nan, attempts, seconds,
     )  # fmt: skip

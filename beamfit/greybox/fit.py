@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import numpy as np
 
 from beamfit.errors import InputError, nearest
+from beamfit.greybox import tree
+from beamfit.greybox.covariance import MOST_SHARE, Group, Spread
 from beamfit.greybox.kkt import KKT, TOLERANCE
 from beamfit.greybox.problem import Problem
 from beamfit.status import Status
@@ -21,17 +23,17 @@ if TYPE_CHECKING:
     from beamfit.sampling.posterior import Posterior
     from beamfit.sampling.priors import Distribution
 
+__all__ = ["Attempt", "Derived", "Fit", "Limited", "Status", "Variable"]
+
 # Another optimum: a chi-square larger by less than 6.
 NEAR_COST = 3.0
-
-__all__ = ["Attempt", "Fit", "Limited", "Quantity", "Status", "Variable"]
 
 
 class Variable(NamedTuple):
     """A free number: value, error, bounds, state and reduced gradient d(cost)/d(bound).
 
-    `error` is one standard deviation, enlarged by sqrt(chi2/dof) where that exceeds 1, and NaN
-    where the data do not determine the value; `error_raw` is not enlarged. `state` is ``free``,
+    `error` is one standard deviation, NaN where the data do not determine the value; `error_raw`
+    takes errors that were given as they are (`Fit.covariance_raw`). `state` is ``free``,
     ``lower``, ``upper`` or ``fixed``.
     """
 
@@ -56,11 +58,27 @@ class Limited(NamedTuple):
     multiplier: float
 
 
-class Quantity(NamedTuple):
-    """A derived number with its error; NaN where the data do not determine it."""
+class Derived(NamedTuple):
+    """Numbers computed from a fit, all of the shape of `value`.
+
+    `error` and `error_raw` are NaN where the data do not determine the value: where `share`, the
+    part of its variance that rests on bounds or on nothing, is `MOST_SHARE` or more. `slope` has
+    the derivatives by the free numbers along one more axis.
+    """
 
     value: np.ndarray
     error: np.ndarray
+    error_raw: np.ndarray
+    share: np.ndarray
+    slope: np.ndarray
+
+
+@partial(jax.jit, static_argnums=(0, 1))
+def _with_slope(function, chosen, model, theta, data):
+    def of_theta(t):
+        return function(tree.replace(model, chosen, t), data)
+
+    return of_theta(theta), jax.jacfwd(of_theta)(theta)
 
 
 class Attempt(NamedTuple):
@@ -92,16 +110,19 @@ class Fit:
         Cost, and sum of squared residuals, priors included.
     dof : int
         Residuals less the directions they determine.
+    groups : tuple of Group
+        The noise of each record.
     kkt : KKT
         How far from an optimum, computed here and not by a solver.
     variables, constraints : tuple
         The free numbers and the constraint elements, with bounds, states and multipliers.
-    covariance : array, shape (n, n)
-        Of the determined directions along the active limits, not enlarged; in linear approximation.
+    spread, spread_raw : Spread
+        Errors in linear approximation along the active limits, bounds counted as information:
+        each record's residuals divided by the scale of its group, or by 1 where errors were given.
     undetermined : array, shape (n, k)
         Directions in theta that the residuals do not see.
     scale : float
-        Factor on errors: sqrt(chi2/dof) where above 1, or wherever the noise is inferred.
+        sqrt(chi2/dof) of all residuals where above 1, or wherever all noise is inferred.
     attempts : tuple of Attempt
         Every start; the best one is the answer.
     seconds : float
@@ -115,10 +136,12 @@ class Fit:
     cost: float
     chi2: float
     dof: int
+    groups: tuple[Group, ...]
     kkt: KKT
     variables: tuple[Variable, ...]
     constraints: tuple[Limited, ...]
-    covariance: np.ndarray
+    spread: Spread
+    spread_raw: Spread
     undetermined: np.ndarray
     scale: float
     attempts: tuple[Attempt, ...]
@@ -128,6 +151,23 @@ class Fit:
     def model(self) -> Any:
         """The model with the fitted numbers."""
         return self.problem.model_at(self.theta)
+
+    @property
+    def covariance(self) -> np.ndarray:
+        """Covariance of the free numbers, shape (n, n), zero along open directions."""
+        return self.spread.seen
+
+    @property
+    def covariance_raw(self) -> np.ndarray:
+        """The same with errors that were given taken as they are."""
+        return self.spread_raw.seen
+
+    def group(self, name: str) -> Group:
+        """The noise of the record of a name."""
+        known = {group.name: group for group in self.groups}
+        if name not in known:
+            raise InputError(f"no record '{name}'", nearest(name, list(known)))
+        return known[name]
 
     @property
     def iterations(self) -> int:
@@ -150,32 +190,45 @@ class Fit:
             raise InputError(f"no result '{name}'", nearest(name, list(self._rows)))
         return self._rows[name]
 
-    def derive(self, function: Callable[[Any], Any]) -> Quantity:
-        """Compute a quantity from the fitted model with its error, in linear approximation.
+    def derive(self, function: Callable[[Any, Any], Any], data: Any = None) -> Derived:
+        """Compute quantities from the fitted model with their errors, in linear approximation.
 
         Parameters
         ----------
         function : callable
-            ``function(model)``, an array of any shape, in JAX.
+            ``function(model, data)``, an array of any shape, in JAX. Defined at the top of a
+            module, it is compiled once for all fits of one structure.
+        data : pytree, optional
+            What it needs besides the model.
 
         Returns
         -------
-        Quantity
-            Value and error of that shape; the error is NaN where the quantity moves along a
-            direction the data do not determine.
+        Derived
+
+        Examples
+        --------
+        >>> from beamfit.greybox.problem import Free, Problem, Record
+        >>> from beamfit.greybox.solve import solve
+        >>> def level(model, data):
+        ...     return model["level"] + 0 * data
+        >>> def double(model, data):
+        ...     return 2 * model["level"]
+        >>> record = Record("scan", level, np.zeros(4), [1.0, 1.2, 0.9, 0.9], error=0.2)
+        >>> found = solve(Problem({"level": 0.0}, [Free("level")], [record])).derive(double)
+        >>> round(float(found.value), 9), round(float(found.error), 9)
+        (2.0, 0.2)
         """
-
-        def of_theta(theta):
-            return function(self.problem.model_at(theta))
-
-        value = np.asarray(of_theta(self.theta))
-        slope = np.asarray(jax.jacfwd(of_theta)(self.theta)).reshape(value.size, -1)
-        variance = np.einsum("ij,jk,ik->i", slope, self.covariance, slope)
-        error = self.scale * np.sqrt(np.maximum(variance, 0.0))
-        unseen = np.abs(slope @ self.undetermined)
-        size = np.abs(slope) @ np.abs(self.undetermined)
-        error = np.where(np.any(unseen > 1e-6 * size + 1e-300, axis=1), np.nan, error)
-        return Quantity(value, error.reshape(value.shape))
+        core = self.problem.core
+        found = _with_slope(function, core.chosen, core.model, self.theta, data)
+        value, slope = (np.asarray(part) for part in found)
+        usable = np.isfinite(value) & np.isfinite(slope).all(axis=-1)
+        flat = np.where(usable[..., None], slope, 0.0)
+        share = np.where(usable, self.spread.share(flat), 1.0)
+        known = (share < MOST_SHARE) & ~any(group.unknown for group in self.groups)
+        errors = (
+            np.where(known, part.error(flat), np.nan) for part in (self.spread, self.spread_raw)
+        )
+        return Derived(value, *errors, share, slope)
 
     def sample(
         self,
@@ -226,8 +279,8 @@ class Fit:
         return Optimum(
             self.theta,
             Finding(self.status, self.message),
-            [self.scale for _ in self.problem.records],
-            [record.error is not None for record in self.problem.records],
+            [group.scale for group in self.groups],
+            [group.errors_given for group in self.groups],
             self.undetermined,
             [a.theta for a in near if a.cost - self.cost < NEAR_COST],
         )

@@ -253,7 +253,7 @@ def target_of(
         covariance=covariance,
         groups=_groups(p, optimum, stated.labels, noise, outliers),
         noise=noise_found,
-        counts=tuple(_used(record) for record in p.records),
+        counts=tuple(record.used for record in p.records),
         noise_unit="1" if any(optimum.given) else stated.noise_unit,
         priors=priors,
         derived=Derived(tuple(stated.derived), tuple(stated.derived.values())),
@@ -332,11 +332,6 @@ def _widths(
     return np.minimum(width, spread)
 
 
-def _used(record: Record) -> np.ndarray:
-    """Which values of a record count, the others being padding."""
-    return np.broadcast_to(np.asarray(record.weight) > 0, record.measured.shape).ravel()
-
-
 def _groups(
     p: Problem, optimum: Optimum, labels: Mapping[str, str], noise: str | None, outliers: bool
 ) -> tuple[Group, ...]:
@@ -357,7 +352,7 @@ def _observed(p: Problem) -> dict[str, np.ndarray]:
             values = getattr(record, what)
             if values is not None:
                 every = np.broadcast_to(values, record.measured.shape).ravel()
-                found[f"{record.name} {what}"] = every[_used(record)]
+                found[f"{record.name} {what}"] = every[record.used]
     return found
 
 

@@ -21,7 +21,21 @@ from beamfit.errors import InputError
 from beamfit.greybox import tree
 from beamfit.greybox.terms import Constraint, Free, Objective, Prior, Record
 
-__all__ = ["Constraint", "Free", "Objective", "Prior", "Problem", "Record"]
+__all__ = ["Constraint", "Free", "Objective", "Prior", "Problem", "Record", "padded_length"]
+
+# Records are padded to powers of two from here on.
+SHORTEST = 8
+
+
+def padded_length(n: int) -> int:
+    """The length to pad a record of n values to, so that a growing one is not compiled anew.
+
+    Examples
+    --------
+    >>> [padded_length(n) for n in (3, 8, 9, 100)]
+    [8, 8, 16, 128]
+    """
+    return max(SHORTEST, 1 << max(n - 1, 0).bit_length())
 
 
 @tree.node("chosen")
@@ -161,6 +175,14 @@ class Problem:
         return self._column("nuisance").astype(bool)
 
     @cached_property
+    def with_prior(self) -> np.ndarray:
+        """Whether each free number has a prior of its own."""
+        own = [prior.name for prior in self.priors if prior.function is None]
+        told = {leaf.path for name in own for leaf in tree.find_leaves(self.core.model, name)}
+        parts = [np.full(leaf.size, leaf.path in told) for leaf in self.core.chosen]
+        return np.concatenate(parts)
+
+    @cached_property
     def start_range(self) -> np.ndarray:
         """Range of random starts, shape (2, free); NaN where none was given."""
         ends = [
@@ -279,14 +301,12 @@ def _check_shapes(problem: Problem) -> None:
                 f"a prediction of shape {found} for record '{record.name}'",
                 f"the shape of its measured values, {record.measured.shape}",
             )
-        if record.error is not None and record.error.shape not in ((), record.measured.shape):
-            raise InputError(
-                f"errors of shape {record.error.shape} in record '{record.name}'",
-                f"a number or the shape of the measured values, {record.measured.shape}",
-            )
+        for what, given in (("errors", record.error), ("weights", record.weight)):
+            if given is not None and given.shape not in ((), record.measured.shape):
+                raise InputError(
+                    f"{what} of shape {given.shape} in record '{record.name}'",
+                    f"a number or the shape of the measured values, {record.measured.shape}",
+                )
     for prior in problem.priors:
         jax.eval_shape(prior.residual, problem.core.model)
-    known = [record.error is not None for record in problem.records]
-    if any(known) and not all(known):
-        raise InputError("records with and without errors", "errors for all records or for none")
     _ = (problem.lower, problem.upper, problem.constraint_lower, problem.constraint_upper)

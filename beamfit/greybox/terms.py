@@ -55,15 +55,17 @@ class Record:
     measured : array
         What was measured.
     error : float or array, optional
-        One standard deviation of it. Where no record has errors, the noise is inferred from the
-        residuals and the fit cannot be judged.
-    weight : float
-        Weight of the record's chi-square among several objectives.
+        One standard deviation of it. Without, the record's noise is inferred from its residuals,
+        which then cannot speak against the model; records of both kinds may stand together.
+    weight : float or array
+        Weight of the record's chi-square among several objectives, or of each value. Values of
+        weight 0 are padding and count nowhere, so that records of a few lengths
+        (`beamfit.greybox.problem.padded_length`) share compiled code.
 
     Raises
     ------
     InputError
-        If a measured value is not finite, or an error not positive.
+        If a measured value is not finite, an error not positive, or a weight negative.
     """
 
     name: str
@@ -71,7 +73,7 @@ class Record:
     data: Any
     measured: Any
     error: Any = None
-    weight: float = 1.0
+    weight: Any = 1.0
 
     def __post_init__(self):
         measured = np.asarray(self.measured, float)
@@ -87,8 +89,10 @@ class Record:
                 f"an error of '{self.name}' that is not positive and finite",
                 "one standard deviation of each value",
             )
-        if not self.weight > 0:
-            raise InputError(f"weight {self.weight} of '{self.name}'", "a positive weight")
+        weight = np.asarray(self.weight, float)
+        if not (np.all(np.isfinite(weight)) and np.all(weight >= 0) and np.any(weight > 0)):
+            raise InputError(f"weight {weight} of '{self.name}'", "positive weights, 0 for padding")
+        object.__setattr__(self, "weight", jnp.asarray(weight))
         object.__setattr__(self, "measured", jnp.asarray(measured))
         object.__setattr__(self, "error", None if error is None else jnp.asarray(error))
 
@@ -96,7 +100,12 @@ class Record:
         """Weighted residuals (predicted - measured)/error as a flat vector."""
         scale = 1.0 if self.error is None else self.error
         difference = (self.predict(model, self.data) - self.measured) / scale
-        return jnp.ravel(jnp.sqrt(self.weight) * difference)
+        return jnp.ravel(jnp.where(self.weight > 0, jnp.sqrt(self.weight) * difference, 0.0))
+
+    @property
+    def used(self) -> np.ndarray:
+        """Which values count, shape (values,)."""
+        return np.broadcast_to(np.asarray(self.weight) > 0, self.measured.shape).ravel()
 
 
 @tree.node("name", "function")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from functools import partial
+from itertools import cycle
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -32,12 +33,7 @@ from beamfit.table import Table, labelled
 __all__ = ["decay_page", "draw_budget", "draw_lifetime", "draw_record"]
 
 HOUR = 3600.0
-CAUSES = {
-    "Touschek": "#1f5fa8",
-    "bremsstrahlung": "#c98a00",
-    "elastic gas": "#2c7a3f",
-    "quantum": "#7b4fa3",
-}
+COLOURS = (BLUE, "#c98a00", "#2c7a3f", "#7b4fa3", RED, "#4f9aa3", "0.5")
 # Decays shown in one budget; more have no room for their names.
 MOST_BARS = 12
 
@@ -286,7 +282,7 @@ def draw_budget(figure: FigureBase, decays: Sequence[Decay]) -> None:
     shown = decays[:MOST_BARS]
     place = np.arange(len(shown))[::-1]
     left = np.zeros(len(shown))
-    for cause, colour in CAUSES.items():
+    for cause, colour in zip(decays[0].budget.rates, cycle(COLOURS), strict=False):
         width = np.array([decay.budget.rates[cause] for decay in shown])
         label = cause if width.max() > 1e-4 * left.max(initial=width.max()) else None
         axes.barh(place, width, 0.6, left, color=colour, label=label)

@@ -48,7 +48,7 @@ def test_in_series_a_network_finds_a_parameter_nobody_measured():
     assert fit.chi2 < 1.5 * 60
     new = np.column_stack([random.uniform(260, 390, 40), random.uniform(2e6, 1.9e7, 40)])
     truth = [p * van_der_waals_volume(t, p) / (GAS * t) for t, p in new]
-    found = fit.derive(lambda m: jax.vmap(m["gas"].first)(new)[:, 0])
+    found = fit.derive(lambda m, x: jax.vmap(m["gas"].first)(x)[:, 0], new)
     off = np.abs(found.value - truth)
     assert np.max(off) < 6e-3
     assert np.mean(off < 2 * found.error) > 0.8
@@ -77,7 +77,7 @@ def test_in_parallel_a_network_clears_up_what_physics_leaves(free_rate):
     alone = solve(Problem({"gas": law}, [Free("gas", 0.1, 2.0)], [record]))
     assert alone.status == "poor_fit"
     between = np.linspace(0.1, 3.9, 77)
-    found = fit.derive(lambda m: predict(m, between[:, None]))
+    found = fit.derive(predict, between[:, None])
     assert np.max(np.abs(found.value - decay_with_ripple(between))) < 0.05
     assert np.mean(np.abs(found.value - decay_with_ripple(between)) < 2 * found.error) > 0.8
 

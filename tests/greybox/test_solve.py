@@ -54,11 +54,13 @@ def test_a_straight_line_has_the_textbook_answer_and_covariance():
     # The solver stops where the gradient no longer tells: a few parts in 1e11 here.
     np.testing.assert_allclose(fit.theta, expected, rtol=1e-9)
     spread = 0.01 * np.linalg.inv(design.T @ design)
-    np.testing.assert_allclose(fit.covariance, spread, rtol=1e-10, atol=1e-15)
+    np.testing.assert_allclose(fit.covariance_raw, spread, rtol=1e-10, atol=1e-15)
     assert fit.status == Status.converged
     assert fit.dof == 19
-    at_one = fit.derive(lambda m: m["slope"] + m["offset"])
-    assert at_one.error == pytest.approx(fit.scale * np.sqrt(fit.covariance.sum()), rel=1e-12)
+    np.testing.assert_allclose(fit.covariance, fit.scale**2 * spread, rtol=1e-10, atol=1e-15)
+    at_one = fit.derive(lambda m, _: m["slope"] + m["offset"])
+    assert at_one.error == pytest.approx(np.sqrt(fit.covariance.sum()), rel=1e-12)
+    assert at_one.error_raw == pytest.approx(np.sqrt(spread.sum()), rel=1e-10)
 
 
 def test_a_bound_that_holds_is_named_with_its_price():
@@ -214,10 +216,10 @@ def test_undetermined_directions_are_told_apart():
     assert np.isnan(fit["a"].error)
     assert np.isfinite(fit["c"].error)
     assert fit["c"].value == pytest.approx(0.0, abs=1e-12)
-    product = fit.derive(lambda m: m["a"] * m["b"])
+    product = fit.derive(lambda m, _: m["a"] * m["b"])
     assert product.value == pytest.approx(6.0)
     assert product.error == pytest.approx(0.1 / np.sqrt((X**2).sum()), rel=1e-6)
-    assert np.isnan(fit.derive(lambda m: m["a"]).error)
+    assert np.isnan(fit.derive(lambda m, _: m["a"]).error)
 
 
 def test_nuisance_numbers_do_not_decide_the_verdict():
@@ -360,6 +362,11 @@ def test_appendix_b_certified_on_cells_is_broken_nowhere():
     assert 2 * state.at.cost < 5.0  # and the scan is still described
 
 
+def line_problem_weighted(weight):
+    record = Record("scan", line, X, X, 0.1, weight)
+    return Problem({"slope": 1.0, "offset": 0.0}, [Free("")], [record])
+
+
 BAD = {
     "did you mean slope": lambda: line_problem([Free("slop")]),
     "free twice": lambda: line_problem([Free("slope"), Free("")]),
@@ -372,11 +379,8 @@ BAD = {
     "not positive": lambda: Record("r", line, X, X, 0.0),
     "above 0": lambda: Prior("slope", 0.0, 0.0),
     "nothing to fit": lambda: Problem({"a": 1.0}, [Free("a")]),
-    "errors for all records or for none": lambda: Problem(
-        {"slope": 1.0, "offset": 0.0},
-        [Free("")],
-        [Record("a", line, X, X, 0.1), Record("b", line, X, X)],
-    ),
+    "positive weights": lambda: Record("r", line, X, X, 0.1, weight=-np.ones(21)),
+    "weights of shape": lambda: line_problem_weighted(np.ones(3)),
     "exact, gauss_newton": lambda: solve(line_problem(), hessian="newton"),
     "no result 'slop'": lambda: solve(line_problem())["slop"],
 }

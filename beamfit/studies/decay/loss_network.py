@@ -150,7 +150,7 @@ class NetworkFit:
         terms = loss_terms(self.machine.ring, operation, current)
         at = _inputs(operation, current)
         base = _base(self.scales, jax.tree.map(lambda part: part[None], terms))
-        found = self.fit.derive(lambda model: _logs(model, at[None], base)[0])
+        found = self.fit.derive(_logs_at, (at[None], base))
         inside = np.all((at >= self.certificate.lower - ROUNDING)
                         & (at <= self.certificate.upper + ROUNDING))  # fmt: skip
         values = np.exp(found.value)
@@ -181,6 +181,10 @@ def _scaled(rf_voltage, scraper_y, pressure, bunches) -> np.ndarray:
 
 def _logs(model: Mapping[str, MLP], inputs: Array, base: Array) -> Array:
     return base + jax.vmap(model["map"].values)(inputs)
+
+
+def _logs_at(model: Mapping[str, MLP], data: tuple[Array, Array]) -> Array:
+    return _logs(model, *data)[0]
 
 
 def _predict(model: Mapping[str, MLP], data: _Data) -> Array:

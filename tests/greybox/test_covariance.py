@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from beamfit.greybox.bounded import spread_of
+from beamfit.greybox.covariance import directions, spread_of, triangle
 
 
 def test_far_bounds_leave_the_covariance_of_the_data():
@@ -33,3 +33,27 @@ def test_held_numbers_do_not_move_and_a_prior_takes_the_place_of_bounds():
     assert held.covariance[1].tolist() == [0.0, 0.0]
     prior = spread_of(jacobian, np.zeros(2), np.ones(2), with_prior=np.array([True, True]))
     np.testing.assert_allclose(prior.covariance, np.linalg.inv(jacobian.T @ jacobian), rtol=1e-10)
+
+
+def test_rows_that_outnumber_columns_are_reduced_first_and_give_the_same():
+    rows = np.random.default_rng(3).normal(size=(500, 4)) * [1.0, 1e6, 1e-6, 1.0]
+    whole = directions(rows)[0]
+    np.testing.assert_allclose(whole @ whole.T, np.linalg.inv(rows.T @ rows), rtol=1e-9)
+    assert triangle(rows).shape == (4, 4)
+
+
+def test_what_is_open_has_no_error_and_rests_on_nothing():
+    rows = np.array([[1.0, 1.0, 0.0], [0.0, 0.0, 2.0]])
+    found = spread_of(rows, np.full(3, -np.inf), np.full(3, np.inf))
+    asked = np.array([[1.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]])
+    np.testing.assert_allclose(found.error(asked), [1.0, 0.5, np.inf])
+    np.testing.assert_allclose(found.share(asked), [0.0, 0.0, 1.0])
+    assert found.seen[2, 2] == 0.25
+
+
+def test_directions_keep_to_equations_of_any_size():
+    rows, rule = np.eye(3), np.array([[1e-9, -1e-9, 0.0]])
+    half, unseen, _ = directions(rows, rule)
+    assert half.shape == (3, 2)
+    assert unseen.shape == (3, 0)
+    np.testing.assert_allclose(half[0], half[1])

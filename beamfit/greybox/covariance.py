@@ -1,0 +1,241 @@
+"""What residuals, priors and bounds tell of the free numbers: errors, shares, degrees of freedom.
+
+The one place for singular values: columns are scaled to unit length, rows are reduced by QR before
+any singular value is taken, and one cut tells what is seen from what is not. Bounds count as
+information, since a number that the data leave open ends on a bound or anywhere between two.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+__all__ = ["MOST_SHARE", "Group", "Spread", "directions", "groups_of", "spread_of", "triangle"]
+
+# A quantity counts as determined while bounds carry less than this share of its variance.
+MOST_SHARE = 0.5
+# A direction is seen while its singular value is above this share of the largest.
+CUT = 1e-10
+# A quantity moves along an open direction if more than this share of its terms remains.
+PART = 1e-6
+# The standard deviation, in units of the best known direction, of one that nothing limits.
+FAR = 1e12
+
+
+class Group(NamedTuple):
+    """The noise of one record.
+
+    `rows` are its rows among the residuals, `count` those of a weight above zero, `dof` is `count`
+    less the trace of the hat matrix over them. `scale` is sqrt(chi2/dof), at least 1 where errors
+    were given, NaN without a degree of freedom.
+    """
+
+    name: str
+    rows: slice
+    errors_given: bool
+    chi2: float
+    count: int
+    dof: float
+    scale: float
+
+    @property
+    def factor(self) -> float:
+        """What divides the rows for their information; 1 where the scatter says nothing."""
+        return self.scale if self.scale > 0 else 1.0
+
+    @property
+    def unknown(self) -> bool:
+        """Whether neither errors nor scatter tell the noise."""
+        return not (self.errors_given or self.scale >= 0)
+
+
+class Spread(NamedTuple):
+    """How far the free numbers may be off.
+
+    `half` (n, k) has the covariance of the directions that are seen, half @ half.T; `open` (n, u)
+    are the others, `FAR` long, `reach` (n,) how far each number moves along one at most;
+    `from_bounds` (n,) is the information of the bounds.
+    """
+
+    half: np.ndarray
+    open: np.ndarray
+    reach: np.ndarray
+    from_bounds: np.ndarray
+
+    @property
+    def seen(self) -> np.ndarray:
+        """Covariance of what residuals, priors or bounds limit, shape (n, n)."""
+        return self.half @ self.half.T
+
+    @property
+    def covariance(self) -> np.ndarray:
+        """Covariance, huge along open directions: for designs, which add information."""
+        return self.seen + self.open @ self.open.T
+
+    def error(self, gradient: np.ndarray) -> np.ndarray:
+        """Standard error of quantities by their gradients, shape (..., n) to (...)."""
+        size = np.linalg.norm(gradient @ self.half, axis=-1)
+        return np.where(self._open(gradient), np.inf, size)
+
+    def share(self, gradient: np.ndarray) -> np.ndarray:
+        """Share of each quantity's variance that rests on bounds or on nothing, from 0 to 1."""
+        along = gradient @ self.half
+        from_bounds = (along @ self.half.T) ** 2 @ self.from_bounds
+        whole = np.sum(along**2, axis=-1)
+        share = from_bounds / np.where(whole > 0, whole, 1.0)
+        return np.where(self._open(gradient), 1.0, share)
+
+    def _open(self, gradient: np.ndarray) -> np.ndarray:
+        moved = np.max(np.abs(gradient @ self.open), axis=-1, initial=0.0)
+        return moved > PART * (np.abs(gradient) @ self.reach)
+
+
+def triangle(rows: np.ndarray) -> np.ndarray:
+    """The triangle R of rows = Q R where there are more rows than columns: RᵀR = rowsᵀrows."""
+    return np.linalg.qr(rows, mode="r") if rows.shape[0] > rows.shape[1] else rows
+
+
+def directions(
+    rows: np.ndarray, equations: np.ndarray | None = None, cut: float = CUT
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Split the space of numbers into what rows see, in units of its error, and what they do not.
+
+    Parameters
+    ----------
+    rows : ndarray
+        Shape (m, n), a Jacobian of residuals in units of their errors.
+    equations : ndarray, optional
+        Shape (e, n): directions must be orthogonal to these.
+    cut : float
+        On singular values relative to the largest, columns scaled to unit length.
+
+    Returns
+    -------
+    half : ndarray, shape (n, k)
+        half @ half.T is the inverse of rowsᵀrows on the k directions that are seen.
+    open : ndarray, shape (n, u)
+        The others, `FAR` long.
+    reach : ndarray, shape (n,)
+        How far each number can move along one of those.
+    """
+    n = rows.shape[1]
+    rows = triangle(rows)
+    length = np.linalg.norm(rows, axis=0)
+    unit = 1.0 / np.where(length > 0, length, 1.0)
+    tangent = np.eye(n)
+    if equations is not None and len(equations):
+        # Rows of one size each: the rank of equations does not depend on their units.
+        scaled = equations * unit
+        size = np.linalg.norm(scaled, axis=1, keepdims=True)
+        tangent = _null(scaled / np.where(size > 0, size, 1.0))
+    if not tangent.shape[1]:
+        return np.zeros((n, 0)), np.zeros((n, 0)), unit
+    _, sizes, turned = np.linalg.svd(rows * unit @ tangent, full_matrices=True)
+    largest = np.max(sizes, initial=0.0)
+    rank = int(np.sum(sizes > cut * largest))
+    along = unit[:, None] * (tangent @ turned.T)
+    far = FAR / largest if largest > 0 else FAR
+    return along[:, :rank] / sizes[:rank], along[:, rank:] * far, unit * far
+
+
+def _null(rows: np.ndarray) -> np.ndarray:
+    """An orthonormal basis of what is orthogonal to a few rows."""
+    _, sizes, turned = np.linalg.svd(rows, full_matrices=True)
+    return turned[int(np.sum(sizes > CUT * np.max(sizes, initial=0.0))) :].T
+
+
+def spread_of(
+    jacobian: np.ndarray,
+    lower: np.ndarray,
+    upper: np.ndarray,
+    held: np.ndarray | None = None,
+    with_prior: np.ndarray | None = None,
+    equations: np.ndarray | None = None,
+) -> Spread:
+    """Spread of numbers from the Jacobian of residuals, bounds counted as information.
+
+    Parameters
+    ----------
+    jacobian : ndarray
+        Shape (m, n), of residuals in units of their errors, priors among them.
+    lower, upper : ndarray
+        Shape (n,); infinite where there is no bound.
+    held : ndarray of bool, optional
+        Numbers that do not move.
+    with_prior : ndarray of bool, optional
+        Numbers with a prior of their own, whose bounds add nothing.
+    equations : ndarray, optional
+        Shape (e, n): gradients of the constraints that hold.
+
+    Returns
+    -------
+    Spread
+
+    Notes
+    -----
+    A number that data leave open ends on one of its bounds, while the truth may lie anywhere
+    between them: the mean square distance from an end of a range of width w is w²/3 (and not
+    w²/12, as from its middle). Then Var(q) = g C g with C = (JᵀJ + B)⁻¹, B = diag(3/w²), and
+    C B C is the part of C that B carries.
+
+    Examples
+    --------
+    >>> s = spread_of(np.array([[1.0, 0.0]]), np.array([0.0, 0.0]), np.array([100.0, 6.0]))
+    >>> s.share(np.eye(2)).round(3).tolist(), s.error(np.eye(2)).round(2).tolist()
+    ([0.0, 1.0], [1.0, 3.46])
+    """
+    n = jacobian.shape[1]
+    width = np.asarray(upper, float) - np.asarray(lower, float)
+    usable = np.isfinite(width) & (width > 0)
+    if with_prior is not None:
+        usable &= ~with_prior
+    loose = np.ones(n, bool) if held is None else ~held
+    information = np.where(usable & loose, 3.0 / np.where(usable, width, 1.0) ** 2, 0.0)
+    rows = np.vstack([triangle(jacobian), np.diag(np.sqrt(information))])[:, loose]
+    found = directions(rows, None if equations is None else equations[:, loose])
+    whole = [np.zeros((n, *part.shape[1:])) for part in found]
+    for out, part in zip(whole, found, strict=True):
+        out[loose] = part
+    return Spread(*whole, information)
+
+
+def groups_of(
+    names: Sequence[tuple[str, bool]],
+    residuals: Sequence[np.ndarray],
+    counts: Sequence[int],
+    blocks: Sequence[np.ndarray],
+    half: np.ndarray,
+) -> tuple[Group, ...]:
+    """Chi-square, degrees of freedom and noise of each record.
+
+    Parameters
+    ----------
+    names : sequence of (str, bool)
+        Of each record, and whether its errors were given.
+    residuals : sequence of ndarray
+        In units of their errors, zero where the weight is.
+    counts : sequence of int
+        Residuals of a weight above zero.
+    blocks : sequence of ndarray
+        `triangle` of each record's rows of the Jacobian.
+    half : ndarray
+        Of the directions that all rows together see: the trace of a block's part of the hat
+        matrix J (JᵀJ)⁻¹ Jᵀ is the sum of squares of block @ half.
+
+    Returns
+    -------
+    tuple of Group
+    """
+    found, first = [], 0
+    for (name, given), r, count, block in zip(names, residuals, counts, blocks, strict=True):
+        chi2 = float(r @ r)
+        dof = round(count - float(np.sum((block @ half) ** 2)), 9)
+        scale = math.sqrt(chi2 / dof) if dof > 0 else math.nan
+        rows = slice(first, first := first + len(r))
+        found.append(
+            Group(name, rows, given, chi2, count, dof, max(1.0, scale) if given else scale)
+        )
+    return tuple(found)
