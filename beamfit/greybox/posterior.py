@@ -18,7 +18,7 @@ from beamfit.greybox import tree
 from beamfit.greybox.problem import Core, Prior, Problem, Record
 from beamfit.sampling.likelihood import Group
 from beamfit.sampling.priors import Distribution, checked
-from beamfit.sampling.target import Derived, Law, Target, covariance_of, slopes_of
+from beamfit.sampling.target import Law, Target, covariance_of, slopes_of
 from beamfit.verdict import Finding
 
 __all__ = ["Optimum", "Sampled", "Statement", "record_of", "target_of"]
@@ -256,7 +256,7 @@ def target_of(
         counts=tuple(record.used for record in p.records),
         noise_unit="1" if any(optimum.given) else stated.noise_unit,
         priors=priors,
-        derived=Derived(tuple(stated.derived), tuple(stated.derived.values())),
+        derived=stated.derived,
         observed=_observed(p),
         remark=" ".join(filter(None, (stated.remark, ELSEWHERE if far else ""))),
         stated={prior.name: _words(prior) for prior in p.priors},
