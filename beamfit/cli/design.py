@@ -96,7 +96,7 @@ def design(
     _check_energies(others, described)
 
     from beamfit.studies.scan.design import plan_measurements  # JAX from here on
-    from beamfit.studies.scan.emittance import fit_emittance
+    from beamfit.studies.scan.fit import fit_emittance
 
     fit = fit_emittance(measured, build_line(described), scenario=scenario, **vars(told))
     advice = plan_measurements(

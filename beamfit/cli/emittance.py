@@ -154,7 +154,7 @@ def emittance(
     )
     planes = _planes(plane, measured)
 
-    from beamfit.studies.scan.emittance import fit_emittance  # JAX from here on
+    from beamfit.studies.scan.fit import fit_emittance  # JAX from here on
 
     fit = fit_emittance(
         measured,
@@ -192,7 +192,7 @@ def _planes(plane: str | None, scan: QuadScan) -> tuple[str, ...]:
 
 
 def _results(fit: EmittanceFit) -> list[dict[str, Any]]:
-    if fit.scenario != "known":
+    if not fit.statement.closed:
         return fit.to_json()
 
     from beamfit.studies.scan.sensitivity import range_sensitivity, systematics
@@ -226,7 +226,7 @@ def _print(
     console.print(result_table(fit))
     for p in fit.planes:
         console.print(verdict_lines(p))
-    if fit.scenario == "known":
+    if fit.statement.closed:
         for table in (budget_table(fit), range_table(fit)):
             console.print()
             console.print(table)

@@ -9,9 +9,8 @@ from rich.text import Text
 
 from beamfit.quantity import Status
 from beamfit.studies.scan.fit import EmittanceFit
-from beamfit.studies.scan.results import PlaneFit
+from beamfit.studies.scan.results import PlaneFit, parameter_rows, result_rows
 from beamfit.studies.scan.sensitivity import budget_rows, range_rows
-from beamfit.studies.scan.tables import parameter_rows, result_rows
 
 __all__ = [
     "budget_table",
@@ -88,7 +87,7 @@ def scenario_lines(fit: EmittanceFit) -> Iterator[Table | Text]:
         yield table
     for words in fit.null_directions:
         yield Text("Left open: ", style="bold").append(words + ".", style="not bold")
-    if fit.scenario.endswith("network"):
+    if fit.statement.network:
         yield Text(f"Anchor: {fit.anchor}.", style="dim")
 
 

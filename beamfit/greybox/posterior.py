@@ -92,15 +92,15 @@ class Statement(NamedTuple):
         ``quoted(model)`` puts them in the place of the problem's own, ``own(model)`` is the inverse
         and NaN outside its domain.
     renamed : mapping of str to str
-        New names of numbers that `quoted` replaces.
+        How users call numbers of the problem.
     log_volume : callable
         ``log_volume(model, data)``, added to the log density: of a prior that is flat in something
         else than the sampled numbers.
     units : mapping of str to str
         Of sampled numbers.
     lower, width : mapping of str to float
-        Lower bounds of sampled numbers besides the problem's own, and how far from the optimum each
-        may be at most where the data do not say.
+        Lower bounds of sampled numbers instead of the problem's own, and how far from the optimum
+        each may be at most where the data do not say.
     labels : mapping of str to str
         What stands for a record before the names of its noise; by default nothing if there is one
         record, else its name.
@@ -283,12 +283,9 @@ def _refuse_equations(p: Problem) -> None:
 
 
 def _bounds(p: Problem, moving: np.ndarray, stated: Statement) -> tuple[np.ndarray, np.ndarray]:
-    """Bounds of what is sampled; those of numbers that are replaced stay with the law."""
-    own = [p.names[i] for i in moving]
-    new = np.array([name in stated.renamed for name in own])
-    least = [stated.lower.get(stated.renamed.get(name, name), -np.inf) for name in own]
-    lower = np.maximum(np.where(new, -np.inf, p.lower[moving]), least)
-    return lower, np.where(new, np.inf, p.upper[moving])
+    """Bounds of what is sampled."""
+    lower = {stated.renamed.get(p.names[i], p.names[i]): p.lower[i] for i in moving}
+    return np.array(list((lower | dict(stated.lower)).values())), p.upper[moving]
 
 
 def _changed(p: Problem, stated: Statement, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -18,8 +18,8 @@ from beamfit.sampling.posterior import Expected, Posterior
 from beamfit.sampling.summary import in_unit, plain_name
 from beamfit.studies.decay.posterior import expected_current
 from beamfit.studies.decay.result import DecayFit
-from beamfit.studies.scan.beam_posterior import expected_sizes
 from beamfit.studies.scan.fit import EmittanceFit
+from beamfit.studies.scan.posterior import expected_sizes
 from beamfit.table import Table
 
 __all__ = ["draw_pairs", "with_beam_posterior", "with_decay_posteriors"]
@@ -259,7 +259,7 @@ def draw_expected_sizes(
     plane : str
         "x" or "y".
     """
-    p, found = fit[plane].points, expected_sizes(posterior, fit, plane)
+    p, found = fit[plane].points, expected_sizes(posterior, plane)
     varied = [n for n, v in p.settings.items() if np.ptp(v) > 0]
     if len(varied) == 1:
         at, label = p.settings[varied[0]], f"{varied[0]}, {p.units[varied[0]]}"
