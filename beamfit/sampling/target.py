@@ -14,12 +14,13 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from beamfit.compile_cache import prepare_jax
 from beamfit.sampling.likelihood import FRACTION, LOG_NOISE, Likelihood, log_likelihood
 from beamfit.sampling.moves import Widening
 from beamfit.sampling.priors import Distribution, in_words
 
 # Not in the package: priors and the place of a store are looked at before JAX is loaded.
-jax.config.update("jax_enable_x64", True)
+prepare_jax()
 
 __all__ = ["Derived", "Law", "Target", "covariance_of"]
 
