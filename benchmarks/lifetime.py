@@ -22,10 +22,10 @@ from rich.table import Table
 from scipy.optimize import curve_fit
 
 from beamfit.io.ring import ring_from_pyat
-from beamfit.lifetime.losses import population
-from beamfit.lifetime.solve import solve_decay
+from beamfit.lifetime.bunch import population
 from beamfit.lifetime.touschek import piwinski_rate
 from beamfit.studies.decay.fit import fit_decay, fit_decays
+from beamfit.studies.decay.model import solve_decay
 from beamfit.studies.decay.record import DecayRecord
 
 sys.path.insert(0, str(Path(__file__).parent))

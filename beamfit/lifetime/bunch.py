@@ -2,18 +2,44 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import jax
 import jax.numpy as jnp
 from jax import Array
+from scipy import constants
+
+from beamfit.lifetime.ring import Operation, Ring
 
 __all__ = [
+    "Bunch",
+    "bunch_in_bucket",
     "bunch_length",
     "equal_bunches",
     "lengthening",
+    "population",
+    "quantum_loss",
     "quantum_rate",
     "rf_acceptance",
+    "stored_bunch",
     "synchrotron_tune",
+    "vertical_acceptance",
 ]
+
+
+class Bunch(NamedTuple):
+    """The bunch that a bucket holds.
+
+    Attributes
+    ----------
+    length : float
+        Rms length, m.
+    acceptance : float or array, shape (n,)
+        Momentum acceptance of bucket and lattice together, relative.
+    """
+
+    length: jax.Array
+    acceptance: jax.Array
 
 
 def rf_acceptance(
@@ -196,3 +222,101 @@ def equal_bunches(bunch_currents: Array) -> Array:
     """
     currents = jnp.asarray(bunch_currents, float)
     return jnp.sum(currents) ** 2 / jnp.sum(currents**2)
+
+
+def population(ring: Ring, bunch_current: Array) -> Array:
+    """Electrons in a bunch of the given current, mA.
+
+    Parameters
+    ----------
+    ring : Ring
+        The ring.
+    bunch_current : float
+        Current of one bunch, mA.
+
+    Returns
+    -------
+    float
+        I_b C/(e c).
+
+    Examples
+    --------
+    >>> from types import SimpleNamespace
+    >>> print(f"{population(SimpleNamespace(circumference=234.144), 500 / 280):.3e}")
+    8.705e+09
+    """
+    return bunch_current * 1e-3 * ring.circumference / (constants.e * constants.c)
+
+
+def bunch_in_bucket(ring: Ring, voltage: Array, bunch_current: Array) -> Bunch:
+    """Length and momentum acceptance of a bunch at an RF voltage and bunch current.
+
+    Parameters
+    ----------
+    ring : Ring
+        The ring.
+    voltage : float
+        RF voltage, V.
+    bunch_current : float
+        Current of one bunch, mA; it lengthens the bunch if the ring has an impedance.
+
+    Returns
+    -------
+    Bunch
+        Length and acceptance min(delta_RF, delta_lattice).
+
+    Examples
+    --------
+    >>> from beamfit.io.ring import read_ring
+    >>> bunch = bunch_in_bucket(read_ring("lattices/spear3_2003.toml"), 3.2e6, 0.0)
+    >>> print(f"{1e3 * bunch.length:.3f} mm, {100 * bunch.acceptance:.1f} %")
+    4.972 mm, 3.0 %
+    """
+    bucket = (voltage, ring.energy, ring.energy_loss, ring.momentum_compaction, ring.harmonic)
+    tune = synchrotron_tune(*bucket)
+    natural = bunch_length(tune, ring.circumference, ring.momentum_compaction, ring.energy_spread)
+    slope = jnp.sqrt(voltage**2 - ring.energy_loss**2)
+    phase_spread = ring.momentum_compaction * ring.energy_spread / tune
+    strength = jnp.sqrt(jnp.pi) / 2 * bunch_current * 1e-3 * ring.impedance
+    ratio = lengthening(strength / (ring.harmonic * slope * phase_spread**3))
+    return Bunch(natural * ratio, jnp.minimum(rf_acceptance(*bucket), ring.momentum_acceptance))
+
+
+def stored_bunch(ring: Ring, operation: Operation, current: Array) -> Bunch:
+    """One of the equal bunches of a beam of the given current, mA."""
+    return bunch_in_bucket(ring, operation.rf_voltage, current / operation.bunches)
+
+
+def vertical_acceptance(chamber: Array, scraper: Array, scraper_beta_y: Array) -> Array:
+    """Vertical acceptance left by chamber and scraper, m rad.
+
+    Parameters
+    ----------
+    chamber : float
+        Acceptance of the chamber, m rad.
+    scraper : float
+        Distance from the beam to the scraper jaw, m.
+    scraper_beta_y : float
+        Twiss beta at the scraper, m.
+
+    Returns
+    -------
+    float
+        min(chamber, scraper²/beta).
+
+    Examples
+    --------
+    >>> print(f"{vertical_acceptance(4e-6, 3e-3, 10.0):.1e}")
+    9.0e-07
+    """
+    return jnp.minimum(chamber, scraper**2 / scraper_beta_y)
+
+
+def quantum_loss(ring: Ring, operation: Operation, current: Array) -> Array:
+    """Loss rate from quantum fluctuations in the vertical plane and in energy, 1/s."""
+    aperture = vertical_acceptance(ring.acceptance_y, operation.scraper_y, ring.scraper_beta_y)
+    acceptance = stored_bunch(ring, operation, current).acceptance
+    energy = ring.optics.average(jnp.broadcast_to(acceptance, ring.optics.weight.shape)) ** 2
+    return quantum_rate(aperture, ring.emittance_y, ring.damping_time_y) + quantum_rate(
+        energy, ring.energy_spread**2, ring.damping_time_z
+    )

@@ -2,44 +2,21 @@
 
 from __future__ import annotations
 
+import jax
 import jax.numpy as jnp
 from jax import Array
 from scipy import constants
 
-from beamfit.lifetime.ring import Gas
-from beamfit.lifetime.touschek import ELECTRON_RADIUS
+from beamfit.lifetime.bunch import stored_bunch, vertical_acceptance
+from beamfit.lifetime.ring import ELECTRON_RADIUS, Gas, Operation, Ring
 
 __all__ = [
     "bremsstrahlung_cross_section",
+    "bremsstrahlung_loss",
     "elastic_cross_section",
+    "elastic_loss",
     "gas_rate_coefficient",
-    "vertical_acceptance",
 ]
-
-
-def vertical_acceptance(chamber: Array, scraper: Array, scraper_beta_y: Array) -> Array:
-    """Vertical acceptance left by chamber and scraper, m rad.
-
-    Parameters
-    ----------
-    chamber : float
-        Acceptance of the chamber, m rad.
-    scraper : float
-        Distance from the beam to the scraper jaw, m.
-    scraper_beta_y : float
-        Twiss beta at the scraper, m.
-
-    Returns
-    -------
-    float
-        min(chamber, scraper²/beta).
-
-    Examples
-    --------
-    >>> print(f"{vertical_acceptance(4e-6, 3e-3, 10.0):.1e}")
-    9.0e-07
-    """
-    return jnp.minimum(chamber, scraper**2 / scraper_beta_y)
 
 
 def elastic_cross_section(
@@ -150,3 +127,22 @@ def gas_rate_coefficient(cross_section: Array, gas: Gas, temperature: Array) -> 
     27.72 h
     """
     return constants.c * jnp.sum(gas.atoms * cross_section) / (constants.k * temperature)
+
+
+def elastic_loss(ring: Ring, operation: Operation, current: Array) -> Array:
+    """Loss rate by elastic scattering for each pascal, 1/(s Pa)."""
+    aperture = vertical_acceptance(ring.acceptance_y, operation.scraper_y, ring.scraper_beta_y)
+    mean_beta = ring.optics.average(ring.optics.beta_y)
+    charge = operation.gas.charge
+    section = elastic_cross_section(charge, ring.relativistic_gamma, mean_beta, aperture)
+    return gas_rate_coefficient(section, operation.gas, operation.temperature)
+
+
+def bremsstrahlung_loss(ring: Ring, operation: Operation, current: Array) -> Array:
+    """Loss rate by bremsstrahlung for each pascal, averaged over the ring, 1/(s Pa)."""
+    acceptance = stored_bunch(ring, operation, current).acceptance
+    points = jnp.broadcast_to(acceptance, ring.optics.weight.shape)
+    charge = operation.gas.charge
+    sections = jax.vmap(lambda point: bremsstrahlung_cross_section(charge, point))(points)
+    section = ring.optics.weight @ sections
+    return gas_rate_coefficient(section, operation.gas, operation.temperature)

@@ -8,9 +8,18 @@ import jax
 import jax.numpy as jnp
 from scipy import constants
 
-__all__ = ["ELECTRON_MASS_EV", "Gas", "Operation", "Optics", "Ring", "gas_mixture"]
+__all__ = [
+    "ELECTRON_MASS_EV",
+    "ELECTRON_RADIUS",
+    "Gas",
+    "Operation",
+    "Optics",
+    "Ring",
+    "gas_mixture",
+]
 
 ELECTRON_MASS_EV = constants.m_e * constants.c**2 / constants.e
+ELECTRON_RADIUS = constants.physical_constants["classical electron radius"][0]
 
 # Atoms in a molecule: the gases of an electron ring's residual-gas spectra.
 MOLECULES = {

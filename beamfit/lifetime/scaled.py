@@ -7,12 +7,10 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jax import Array
 
-from beamfit.lifetime.losses import loss_coefficients
+from beamfit.lifetime.losses import MECHANISMS, Losses, added, terms_of
 from beamfit.lifetime.ring import Operation, Ring
 
-__all__ = ["MECHANISMS", "Terms", "loss_terms", "scaled_losses"]
-
-MECHANISMS = ("touschek", "bremsstrahlung", "elastic", "desorption")
+__all__ = ["Terms", "loss_terms", "scaled_losses", "scaled_parts"]
 
 
 class Terms(NamedTuple):
@@ -20,12 +18,8 @@ class Terms(NamedTuple):
 
     Attributes
     ----------
-    touschek : float
-        a_T, 1/(mA s).
-    bremsstrahlung, elastic : float
-        Loss rate for each pascal, 1/(s Pa).
-    quantum : float
-        Quantum loss rate, 1/s; not scaled.
+    parts : tuple of float
+        The term of each of `MECHANISMS`.
     pressure : float
         Pressure at the mean current, Pa.
     rise : float
@@ -34,10 +28,7 @@ class Terms(NamedTuple):
         Mean current, mA.
     """
 
-    touschek: Array
-    bremsstrahlung: Array
-    elastic: Array
-    quantum: Array
+    parts: tuple[Array, ...]
     pressure: Array
     rise: Array
     current: Array
@@ -73,16 +64,9 @@ def loss_terms(ring: Ring, operation: Operation, current: Array) -> Terms:
     >>> print(f"{terms.pressure:.1e} Pa, P1/P0 = {terms.rise:.3f} /mA")
     1.0e-07 Pa, P1/P0 = 0.008 /mA
     """
-    # With one pascal of base pressure the parts of b are the coefficients themselves.
-    one = loss_coefficients(
-        ring, operation._replace(pressure_base=1.0, pressure_slope=0.0), current
-    )
     base, slope = operation.pressure_base, operation.pressure_slope
     return Terms(
-        touschek=one.a_touschek,
-        bremsstrahlung=one.b_bremsstrahlung,
-        elastic=one.b_elastic,
-        quantum=one.b_quantum,
+        terms_of(ring, operation, current),
         pressure=jnp.asarray(base + slope * current, float),
         rise=jnp.asarray(slope / base, float),
         current=jnp.asarray(current, float),
@@ -95,8 +79,8 @@ def scaled_losses(scales: Array, terms: Terms, pressure_factor: Array = 1.0) -> 
     Parameters
     ----------
     scales : array, shape (4,)
-        Factors on Touschek, bremsstrahlung, elastic scattering, and on P1/P0 (desorption); 1 is
-        the ring file.
+        A factor for each of `SCALES`: on Touschek, bremsstrahlung, elastic scattering, and on
+        P1/P0 (desorption); 1 is the ring file. What is not fitted keeps its size.
     terms : Terms
         First principles at one setting.
     pressure_factor : float, optional
@@ -122,7 +106,18 @@ def scaled_losses(scales: Array, terms: Terms, pressure_factor: Array = 1.0) -> 
     >>> print(f"{1 / (a * 500 + b) / 3600:.2f} h")
     18.37 h
     """
-    rise = scales[3] * terms.rise
+    losses = scaled_parts(scales, terms, pressure_factor)
+    return losses.a, losses.b
+
+
+def scaled_parts(scales: Array, terms: Terms, pressure_factor: Array = 1.0) -> Losses:
+    """The parts that `scaled_losses` adds up."""
+    *sizes, desorption = jnp.asarray(scales, float)
+    factors = iter(sizes)
+    parts = tuple(
+        term * next(factors) if m.vary else term
+        for m, term in zip(MECHANISMS, terms.parts, strict=True)
+    )
+    rise = desorption * terms.rise
     base = terms.pressure * pressure_factor / (1 + rise * terms.current)
-    gas = (scales[1] * terms.bremsstrahlung + scales[2] * terms.elastic) * base
-    return scales[0] * terms.touschek + gas * rise, gas + terms.quantum
+    return added(parts, base, base * rise)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
 
 import jax
@@ -11,11 +12,16 @@ from jax import Array
 from jax.scipy.special import i0e
 from scipy import constants
 
-from beamfit.lifetime.ring import Optics, Ring
+from beamfit.lifetime.bunch import bunch_in_bucket, population, stored_bunch
+from beamfit.lifetime.ring import ELECTRON_RADIUS, Operation, Optics, Ring
 
-__all__ = ["ELECTRON_RADIUS", "bruck_rate", "piwinski_rate", "piwinski_shape"]
-
-ELECTRON_RADIUS = constants.physical_constants["classical electron radius"][0]
+__all__ = [
+    "bruck_rate",
+    "piwinski_rate",
+    "piwinski_shape",
+    "touschek_loss",
+    "touschek_shape",
+]
 
 
 def _spectrum(log_kappa: Array, floor: Array) -> Array:
@@ -209,3 +215,42 @@ def bruck_rate(ring: Ring, population: Array, length: Array, acceptance: Array) 
     density = jax.vmap(local)(ring.optics, acceptance)
     scale = ELECTRON_RADIUS**2 * constants.c * population / (8 * jnp.pi * lorentz**2 * length)
     return scale * ring.optics.average(density)
+
+
+def touschek_loss(ring: Ring, operation: Operation, current: Array) -> Array:
+    """Touschek part of a, 1/(mA s)."""
+    bunch = stored_bunch(ring, operation, current)
+    # The rate is proportional to the population, so one milliampere in the ring gives a itself.
+    single = population(ring, 1 / operation.bunches)
+    return piwinski_rate(ring, single, bunch.length, bunch.acceptance)
+
+
+def touschek_shape(ring: Ring, operation: Operation) -> Callable[[Array], Array]:
+    """How the Touschek part of a depends on the beam current through bunch lengthening.
+
+    Parameters
+    ----------
+    ring : Ring
+        The ring, with its impedance.
+    operation : Operation
+        RF voltage and number of bunches.
+
+    Returns
+    -------
+    callable
+        Current in mA to a_T relative to that at zero current; for `fit_decay`'s `shape`.
+
+    Examples
+    --------
+    >>> from beamfit.io.ring import read_operation, read_ring
+    >>> ring = read_ring("lattices/spear3_2003.toml")._replace(impedance=0.4)
+    >>> shape = touschek_shape(ring, read_operation("lattices/spear3_2003.toml"))
+    >>> print(f"{shape(500.0):.4f}")
+    0.9085
+    """
+
+    def shape(current: Array) -> Array:
+        natural = bunch_in_bucket(ring, operation.rf_voltage, 0.0).length
+        return natural / stored_bunch(ring, operation, current).length
+
+    return shape

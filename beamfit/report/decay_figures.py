@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import partial
+from itertools import cycle
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -19,12 +20,7 @@ __all__ = ["decay_pictures", "draw_budget", "draw_lifetime", "draw_record"]
 
 HOUR = 3600.0
 BLUE, RED = "#1f5fa8", "#b5421f"
-CAUSES = {
-    "Touschek": "#1f5fa8",
-    "bremsstrahlung": "#c98a00",
-    "elastic gas": "#2c7a3f",
-    "quantum": "#7b4fa3",
-}
+COLOURS = ("#1f5fa8", "#c98a00", "#2c7a3f", "#7b4fa3", "#b5421f", "#4f9aa3", "0.5")
 # More points than this are drawn as an image: as curves they would fill the page with bytes.
 MANY = 500
 # Decays shown in one budget; more have no room for their names.
@@ -149,7 +145,7 @@ def draw_budget(figure: FigureBase, decays: Sequence[Decay]) -> None:
     shown = decays[:MOST_BARS]
     place = np.arange(len(shown))[::-1]
     left = np.zeros(len(shown))
-    for cause, colour in CAUSES.items():
+    for cause, colour in zip(decays[0].budget.rates, cycle(COLOURS), strict=False):
         width = np.array([decay.budget.rates[cause] for decay in shown])
         label = cause if width.max() > 1e-4 * left.max(initial=width.max()) else None
         axes.barh(place, width, 0.6, left, color=colour, label=label)

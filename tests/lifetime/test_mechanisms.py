@@ -12,16 +12,28 @@ import pytest
 
 from beamfit.errors import InputError
 from beamfit.io.ring import read_operation, read_ring, ring_from_pyat
-from beamfit.lifetime.bunch import equal_bunches, lengthening, quantum_rate
+from beamfit.lifetime.bunch import (
+    bunch_in_bucket,
+    equal_bunches,
+    lengthening,
+    population,
+    quantum_rate,
+    vertical_acceptance,
+)
 from beamfit.lifetime.gas import (
     bremsstrahlung_cross_section,
     elastic_cross_section,
     gas_rate_coefficient,
-    vertical_acceptance,
 )
-from beamfit.lifetime.losses import bunch_in_bucket, loss_coefficients, population, touschek_shape
+from beamfit.lifetime.losses import loss_coefficients
 from beamfit.lifetime.ring import gas_mixture
-from beamfit.lifetime.touschek import _bruck_shape, bruck_rate, piwinski_rate, piwinski_shape
+from beamfit.lifetime.touschek import (
+    _bruck_shape,
+    bruck_rate,
+    piwinski_rate,
+    piwinski_shape,
+    touschek_shape,
+)
 
 HOUR = 3600.0
 SPEAR3 = "lattices/spear3_2003.toml"

@@ -11,8 +11,8 @@ import beamfit
 from beamfit.errors import InputError
 from beamfit.lifetime.bunch import rf_acceptance
 from beamfit.lifetime.decay import current
-from beamfit.lifetime.losses import loss_coefficients
-from beamfit.lifetime.scaled import MECHANISMS, loss_terms, scaled_losses
+from beamfit.lifetime.losses import SCALES, loss_coefficients
+from beamfit.lifetime.scaled import loss_terms, scaled_losses
 from beamfit.quantity import Status
 from beamfit.studies.decay.anomaly import find_anomaly
 from beamfit.studies.decay.next_decay import Candidate, next_decays
@@ -80,7 +80,7 @@ def test_the_summary_is_the_information_of_the_readings(decays):
 
 def test_the_scales_of_the_shift_are_found(fit):
     assert fit.status is Status.converged
-    for name, true in zip(MECHANISMS, TRUE, strict=True):
+    for name, true in zip(SCALES, TRUE, strict=True):
         found = getattr(fit, name)
         assert abs(found.value - true) < 3 * found.error, name
     assert fit.touschek.error < 0.002

@@ -10,10 +10,9 @@ import numpy as np
 from scipy.special import fdtrc
 
 from beamfit.errors import InputError
-from beamfit.lifetime.solve import solve_decay
-from beamfit.lifetime.varying import solve_power
 from beamfit.quantity import Quantity, Status
-from beamfit.studies.decay.fit import fit_decay, padded
+from beamfit.studies.decay.fit import fit_decay
+from beamfit.studies.decay.model import constant_shape, padded, solve_decay
 from beamfit.studies.decay.record import DecayRecord
 from beamfit.studies.decay.result import DecayFit
 
@@ -295,29 +294,31 @@ def constant_a_test(record: DecayRecord) -> ConstantA:
     """
     record = _averaged(record)
     readings = padded(record)
-    constant, power = solve_decay(*readings), solve_power(*readings)
+    constant = solve_decay(*readings)
+    power = solve_decay(*readings, np.ones(4), constant_shape)
+    found = float(power.values.exponent)
     residuals = (readings[2] * power.residuals)[: len(record)]
-    neighbours = max(0.0, float(residuals[1:] @ residuals[:-1]) / power.sum_squares)
+    neighbours = max(0.0, float(residuals[1:] @ residuals[:-1]) / float(power.sum_squares))
     independent = (1 - neighbours) / (1 + neighbours)
     dof = max((len(record) - 4) * independent, 1.0)
-    unit = power.sum_squares / (len(record) - 4)
+    unit = float(power.sum_squares) / (len(record) - 4)
     if record.error is not None:
         unit = max(1.0, unit)
     # Below this share of the current differences are those of the integration, not of the beam.
     unit = max(unit, float(np.mean((readings[2][: len(record)] * EXACT * record.current) ** 2)))
-    excess = max(0.0, float(constant.sum_squares) - power.sum_squares) / unit * independent
+    excess = max(0.0, float(constant.sum_squares) - float(power.sum_squares)) / unit * independent
     chance = float(fdtrc(1.0, dof, excess))
-    raw = power.error * math.sqrt(unit)
+    raw = float(power.errors.exponent) * math.sqrt(unit)
     error = raw / math.sqrt(independent)
-    exponent = Quantity(power.exponent, error, "1", raw)
+    exponent = Quantity(found, error, "1", raw)
     if not power.converged or not error < 1 / 3:
         message = "The record cannot tell a constant a from one that depends on the current"
-        unknown = Quantity(power.exponent, None, "1")
+        unknown = Quantity(found, None, "1")
         return ConstantA(Status.unidentified, f"{message}: record longer.", unknown, chance)
     if chance < REJECTED:
         message = (
             f"A constant a is rejected (p = {max(chance, 1e-300):.2g}): a goes as "
-            f"I^{power.exponent:.3f}, so b of the constant-a fit is not a gas loss; fit with the "
+            f"I^{found:.3f}, so b of the constant-a fit is not a gas loss; fit with the "
             "shape of a."
         )
         return ConstantA(Status.poor_fit, message, exponent, chance)

@@ -10,17 +10,16 @@ import jax
 import numpy as np
 
 from beamfit.errors import InputError
-from beamfit.lifetime.solve import solve_decay, solve_decays
-from beamfit.lifetime.varying import solve_shaped
+from beamfit.studies.decay.model import padded, padded_size, solve_decay, solve_decays
 from beamfit.studies.decay.record import DecayRecord
 from beamfit.studies.decay.result import DecayFit
 from beamfit.studies.decay.verdict import judge, judge_constant
 
-__all__ = ["fit_decay", "fit_decays", "padded", "padded_size"]
+__all__ = ["fit_decay", "fit_decays"]
 
 FEWEST = 5
 # Records solved in one call; fewer are filled up, so that one number is compiled.
-TOGETHER = 64
+TOGETHER = 16
 
 
 def fit_decay(record: DecayRecord, shape: Callable[[Any], Any] | None = None) -> DecayFit:
@@ -32,7 +31,7 @@ def fit_decay(record: DecayRecord, shape: Callable[[Any], Any] | None = None) ->
         One decay, without refills or steps: cut others with `split_record` first.
     shape : callable, optional
         How a depends on the current in mA, up to a factor, where it is not constant; for
-        example `beamfit.lifetime.losses.touschek_shape(ring, operation)`. The rate equation is
+        example `beamfit.lifetime.touschek.touschek_shape(ring, operation)`. The rate equation is
         then integrated, and `a` is the value at the mean current.
 
     Returns
@@ -64,7 +63,7 @@ def fit_decay(record: DecayRecord, shape: Callable[[Any], Any] | None = None) ->
     if _says_nothing(record):
         return judge_constant(record)
     if shape is not None:
-        shaped = judge(record, solve_shaped(*padded(record), shape))
+        shaped = judge(record, solve_decay(*padded(record), shape=shape))
         return replace(shaped, shaped=True)
     return judge(record, solve_decay(*padded(record)))
 
@@ -121,19 +120,3 @@ def _says_nothing(record: DecayRecord) -> bool:
         expected = f"{FEWEST} or more for a decay"
         raise InputError(f"{len(record)} readings", expected, path=record.name)
     return bool(np.ptp(record.current) == 0)
-
-
-def padded_size(rows: int) -> int:
-    """64, 256, 1024, ...: every length is compiled once, for a second or two, so keep few."""
-    size = 64
-    while size < rows:
-        size *= 4
-    return size
-
-
-def padded(record: DecayRecord) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Time, current and weight 1/error of a record, lengthened by readings of no weight."""
-    weight = np.ones(len(record)) if record.error is None else 1 / record.error
-    extra = (0, padded_size(len(record)) - len(record))
-    time = np.pad(record.time, extra, mode="edge")
-    return time, np.pad(record.current, extra, mode="edge"), np.pad(weight, extra)

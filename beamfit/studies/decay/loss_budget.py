@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from beamfit.errors import InputError
-from beamfit.lifetime.losses import Losses, loss_coefficients
+from beamfit.lifetime.losses import MECHANISMS, Losses, loss_coefficients
 from beamfit.lifetime.ring import Operation, Ring
 from beamfit.quantity import Quantity
 from beamfit.studies.decay.record import DecayRecord
@@ -44,14 +44,8 @@ class Budget(NamedTuple):
     @property
     def rates(self) -> dict[str, float]:
         """Loss rate at the mean current by cause, 1/h."""
-        touschek, slowed, deflected, *base = (float(part) for part in self.losses)
-        current = self.current
-        return {
-            "Touschek": HOUR * touschek * current,
-            "bremsstrahlung": HOUR * (slowed * current + base[0]),
-            "elastic gas": HOUR * (deflected * current + base[1]),
-            "quantum": HOUR * base[2],
-        }
+        rates = self.losses.rates(self.current)
+        return {m.label: HOUR * rates[m.name] for m in MECHANISMS}
 
     @property
     def lifetime(self) -> float:

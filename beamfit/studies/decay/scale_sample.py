@@ -9,8 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from beamfit.lifetime.losses import MECHANISMS, SCALES
 from beamfit.lifetime.ring import Operation
-from beamfit.lifetime.scaled import MECHANISMS, Terms, loss_terms, scaled_losses
+from beamfit.lifetime.scaled import Terms, loss_terms, scaled_losses, scaled_parts
 from beamfit.sampling.posterior import Interval, Posterior
 from beamfit.sampling.target import Law, Target
 from beamfit.studies.decay.scales import ScaleFit, pulls, whitener
@@ -97,7 +98,7 @@ def sample_scales(fit: ScaleFit, seed: int = 0, **options: Any) -> Posterior:
     covariance = np.where(np.isfinite(fit.covariance), fit.covariance, 0.0) * fit.error_scale**2
     covariance[wide] = covariance[:, wide] = 0.0
     covariance[wide, wide] = 0.3**2
-    unknown = tuple(name for name in MECHANISMS if getattr(fit, name).error is None)
+    unknown = tuple(name for name in SCALES if getattr(fit, name).error is None)
     target = Target(
         law=LAW,
         data=Study(
@@ -108,7 +109,7 @@ def sample_scales(fit: ScaleFit, seed: int = 0, **options: Any) -> Posterior:
             fit.prior_error,
             fit.error_scale,
         ),
-        names=MECHANISMS,
+        names=tuple(SCALES),
         units=("1",) * 4,
         lower=np.zeros(4),
         upper=np.full(4, LARGEST),
@@ -159,13 +160,11 @@ def budget_intervals(
     """
     terms = loss_terms(fit.machine.ring, operation, current)
     draws = np.asarray(sample.draws)
-    a, b = (np.asarray(part) for part in losses_of(draws, terms))
-    pressure = float(terms.pressure)
-    touschek = draws[:, 0] * float(terms.touschek) * current
+    losses = jax.vmap(scaled_parts, (0, None))(jnp.asarray(draws), terms)
+    a, b = np.asarray(losses.a), np.asarray(losses.b)
+    rates = losses.rates(current)
     rows = {
-        "touschek": (HOUR * touschek, "1/h"),
-        "bremsstrahlung": (HOUR * draws[:, 1] * float(terms.bremsstrahlung) * pressure, "1/h"),
-        "elastic": (HOUR * draws[:, 2] * float(terms.elastic) * pressure, "1/h"),
+        **{m.name: (HOUR * np.asarray(rates[m.name]), "1/h") for m in MECHANISMS if m.vary},
         "a": (a, "1/(mA s)"),
         "b": (b, "1/s"),
         "lifetime": (1 / (a * current + b) / HOUR, "h"),

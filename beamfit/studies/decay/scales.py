@@ -14,7 +14,8 @@ from jax import Array
 from scipy.optimize import least_squares
 
 from beamfit.errors import InputError, nearest
-from beamfit.lifetime.scaled import MECHANISMS, Terms, loss_terms, scaled_losses
+from beamfit.lifetime.losses import SCALES
+from beamfit.lifetime.scaled import Terms, loss_terms, scaled_losses
 from beamfit.quantity import Quantity, Status
 from beamfit.statistics import chi2_probability
 from beamfit.studies.decay.loss_budget import Machine, operation_during
@@ -90,7 +91,7 @@ class ScaleFit:
 
     def __str__(self) -> str:
         rows = [f"{len(self.names)} decays: {self.status}. {self.message}"]
-        rows += [f"  {name:15s} {getattr(self, name)}" for name in MECHANISMS]
+        rows += [f"  {name:15s} {getattr(self, name)}" for name in SCALES]
         return "\n".join([*rows, f"  chi²/dof {self.chi2:.4g}/{self.dof}"])
 
     def sample(self, seed: int = 0, **options: Any) -> Posterior:
@@ -104,7 +105,7 @@ class ScaleFit:
         return {
             "status": self.status.value,
             "message": self.message,
-            **{name: getattr(self, name).to_json() for name in MECHANISMS},
+            **{name: getattr(self, name).to_json() for name in SCALES},
             "chi2": self.chi2,
             "dof": self.dof,
             "decays": list(self.names),
@@ -199,11 +200,12 @@ _slopes = jax.jit(jax.jacfwd(pulls))
 def _check_priors(priors: Mapping[str, tuple[float, float]]) -> tuple[np.ndarray, np.ndarray]:
     mean, error = np.ones(4), np.full(4, np.inf)
     for name, (value, spread) in priors.items():
-        if name not in MECHANISMS:
-            raise InputError(f"a prior on '{name}'", nearest(name, list(MECHANISMS)))
+        if name not in SCALES:
+            raise InputError(f"a prior on '{name}'", nearest(name, list(SCALES)))
         if not (value >= 0 and spread > 0):
             raise InputError(f"{name} = {value} ± {spread}", "a mean of 0 or more, an error above")
-        mean[MECHANISMS.index(name)], error[MECHANISMS.index(name)] = value, spread
+        place = list(SCALES).index(name)
+        mean[place], error[place] = value, spread
     return mean, error
 
 
@@ -317,7 +319,7 @@ def _verdict(vector, covariance, scale, chi2, dof, success, decays):
         return Status.not_converged, "The search for the scales did not end: look at the records."
     blind = [
         name
-        for name, known in zip(MECHANISMS, _separable(vector, covariance, scale), strict=True)
+        for name, known in zip(SCALES, _separable(vector, covariance, scale), strict=True)
         if not known
     ]
     if blind:

@@ -10,7 +10,7 @@ import numpy as np
 from jax import Array
 
 from beamfit.lifetime.decay import current
-from beamfit.studies.decay.fit import padded_size
+from beamfit.studies.decay.model import padded_size
 from beamfit.studies.decay.study import Decay
 
 __all__ = ["Summaries", "loss_parts", "summarise"]

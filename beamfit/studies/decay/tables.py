@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 
-from beamfit.lifetime.scaled import MECHANISMS
+from beamfit.lifetime.losses import LINEAR, QUADRATIC, SCALES, Mechanism
 from beamfit.quantity import Quantity, Status
 from beamfit.studies.decay.shift import Shift
 from beamfit.studies.decay.study import Decay, RecordStudy
@@ -176,14 +176,9 @@ def budget_rows(decays: Sequence[Decay]) -> Rows:
     """
     if not decays or any(decay.budget is None for decay in decays):
         return []
-    quadratic = ("a_touschek", "a_bremsstrahlung", "a_elastic")
-    linear = ("b_bremsstrahlung", "b_elastic", "b_quantum")
-    labels = {"touschek": "Touschek", "elastic": "elastic gas"}
 
-    def part(name: str) -> tuple[str, Callable[[Decay], str]]:
-        kind, _, cause = name.partition("_")
-        label = f"{kind}, {labels.get(cause, cause)}"
-        return label, lambda d: _with_share(d, name)
+    def part(kind: str, mechanism: Mechanism) -> tuple[str, Callable[[Decay], str]]:
+        return f"{kind}, {mechanism.label}", lambda d: _with_share(d, f"{kind}_{mechanism.name}")
 
     return _laid_out(
         decays,
@@ -192,10 +187,10 @@ def budget_rows(decays: Sequence[Decay]) -> Rows:
             ("scraper", lambda d: f"{float(d.budget.operation.scraper_y) * 1e3:.4g} mm"),
             ("bunches", lambda d: f"{float(d.budget.operation.bunches):.6g}"),
             ("pressure at the mean current", lambda d: f"{_pressure(d):.3g} Pa"),
-            *map(part, quadratic),
+            *(part("a", m) for m in QUADRATIC),
             ("a, sum", lambda d: f"{d.budget.losses.a:.4g} 1/(mA s)"),
             ("a, measured", lambda d: d.fit.a),
-            *map(part, linear),
+            *(part("b", m) for m in LINEAR),
             ("b, sum", lambda d: f"{d.budget.losses.b:.4g} 1/s"),
             ("b, measured", lambda d: d.fit.b),
             ("lifetime at the mean, computed", lambda d: f"{d.budget.lifetime:.4g} h"),
@@ -290,7 +285,7 @@ def shift_rows(shift: Shift) -> Rows:
     """
     fit, best = shift.fit, shift.best
     rows = [("status", fit.status.value.replace("_", " "))]
-    for name in MECHANISMS:
+    for name in SCALES:
         scale = getattr(fit, name)
         said = "not separable" if scale.error is None else str(scale)
         rows.append((f"{name}, scale on the ring file", said))

@@ -7,9 +7,9 @@ import math
 import numpy as np
 
 from beamfit.errors import InputError
-from beamfit.lifetime.solve import Physical, Solution
 from beamfit.quantity import Quantity, Status
 from beamfit.statistics import chi2_probability
+from beamfit.studies.decay.model import Physical, Solution
 from beamfit.studies.decay.record import DecayRecord
 from beamfit.studies.decay.result import DecayFit, Separability
 
