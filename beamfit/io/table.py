@@ -13,7 +13,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
-from statistics import mode
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -321,7 +320,8 @@ def _read_hdf5(path: str | PathLike[str], most: int | None) -> Sheet:
         ) from None
     if not names:
         raise InputError("no datasets", "one dataset a column", path=path)
-    usual = mode(sorted(len(column) for column in cells))
+    lengths = sorted(len(column) for column in cells)
+    usual = max(lengths, key=lengths.count)
     like = next(n for n, column in zip(names, cells, strict=True) if len(column) == usual)
     for name, column in zip(names, cells, strict=True):
         if len(column) != usual:
