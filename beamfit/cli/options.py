@@ -11,7 +11,6 @@ from typing import Any, NamedTuple
 import click
 
 from beamfit.errors import InputError
-from beamfit.sampling.place import check_place
 from beamfit.studies.scan.assumptions import SCENARIOS
 from beamfit.studies.scan.typed import anchor_of, bounds_of, limits_of, priors_of
 
@@ -23,11 +22,17 @@ def _parsed(read: Callable[[Any], Any]) -> Callable[..., Any]:
     return lambda context, parameter, value: None if value is None else read(value)
 
 
+def _check_place(path: str) -> None:
+    from beamfit.sampling.place import check_place
+
+    check_place(path)
+
+
 def _report(path: str) -> str:
     """Find out before anything is computed whether the report could be written."""
     if Path(path).suffix.lower() not in (".html", ".pdf"):
         raise InputError(f"report '{path}'", "a name ending in .html or .pdf")
-    check_place(path)
+    _check_place(path)
     return path
 
 
@@ -139,7 +144,7 @@ class Sampling(NamedTuple):
         if self.store is not None:
             if not self.wanted:
                 raise InputError("--store without --sample", "--sample, which fills the store")
-            check_place(self.store)
+            _check_place(self.store)
 
     def check_one(self, fits: int) -> None:
         """Refuse to keep the draws of several fits in one store."""

@@ -32,11 +32,8 @@ ELEMENTS: dict[str, dict[str, Key]] = {
     "quadrupole": {
         "name": NAME,
         "length_m": LENGTH,
-        "current_A": OPTIONAL,
-        "integrated_gradient_kG": OPTIONAL,
-        "k1_per_m2": OPTIONAL,
-        "slope": OPTIONAL,
-        "intercept": OPTIONAL,
+        **dict.fromkeys(("current_A", "integrated_gradient_kG", "k1_per_m2"), OPTIONAL),
+        **dict.fromkeys(("slope", "intercept"), OPTIONAL),
         "gradient_polynomial_T_per_m": Key(kind=LIST, default=None),
         "signed_intercept": Key(kind=FLAG, default=False),
     },
