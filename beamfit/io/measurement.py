@@ -161,20 +161,13 @@ def _sizes(sheet: Sheet, column: Column) -> np.ndarray:
     if not PLAUSIBLE[0] <= middle <= PLAUSIBLE[1]:
         written, lengths = middle / column.factor, UNITS["length"]
         likely = min(("um", "mm", "m"), key=lambda u: abs(np.log(written * lengths[u] / 2e-4)))
-        raise sheet.error(
-            f"sizes around {written:g} {column.unit}, implausible for a beam",
-            f"sizes between 0.1 um and 20 mm; if these are {likely}, "
-            f"rename the column {column.key}_{likely}",
-            None,
-            column.header,
-        )
+        found = f"sizes around {written:g} {column.unit}, implausible for a beam"
+        expected = f"sizes between 0.1 um and 20 mm; if these are {likely}, rename the column "
+        raise sheet.error(found, f"{expected}{column.key}_{likely}", None, column.header)
     if size[row] > PLAUSIBLE[1]:
-        raise sheet.error(
-            f"{size[row] / column.factor:g} {column.unit}, implausible for a beam",
-            "sizes below 20 mm; is this row in another unit?",
-            row,
-            column.header,
-        )
+        found = f"{size[row] / column.factor:g} {column.unit}, implausible for a beam"
+        expected = "sizes below 20 mm; is this row in another unit?"
+        raise sheet.error(found, expected, row, column.header)
     return size
 
 
