@@ -37,6 +37,8 @@ Shape = Callable[[Array], Array]
 # Physics allows 0 to 1, so 30 moves no value that the record determines (by 4e-5 of it where the
 # verdict turns, nothing beyond); it keeps records too short for their noise from running away.
 PRIOR_WIDTH = 30.0
+# Most steps with a shape: in a valley without a bottom the record cannot tell anyway.
+FEW_STEPS = 100
 
 
 class DecayNumbers(NamedTuple):
@@ -195,7 +197,7 @@ def decay_problem(record: DecayRecord, shape: Shape | None = None) -> Problem:
     2.000e-08
     """
     time, measured, _ = readings = padded(record)
-    start, width = (np.asarray(part) for part in _start(*_scaled(np.stack(readings))[:3]))
+    start, noise, width = (np.asarray(p) for p in _start(*_scaled(np.stack(readings))[:3]))
     span, mean = record.span, float(record.current.mean())
     loss, quadratic = start[1] / span, start[2] / span
     rows = slice(len(record))
@@ -207,7 +209,7 @@ def decay_problem(record: DecayRecord, shape: Shape | None = None) -> Problem:
                 "decay", _predicted(shape), Moments(time[rows], mean), measured[rows], record.error
             )
         ],
-        [] if shape else [Prior("a", 0.0, width / span / mean)],
+        [] if shape else [Prior("a", 0.0, width / noise / span / mean)],
     )
 
 
@@ -257,8 +259,8 @@ def _scaled(readings: Array) -> tuple[Array, Array, Array, tuple[Array, Array]]:
 
 
 @jax.jit
-def _start(time: Array, measured: Array, weight: Array) -> tuple[Array, Array]:
-    """Start, and standard deviation of the weak prior on the quadratic part.
+def _start(time: Array, measured: Array, weight: Array) -> tuple[Array, Array, Array]:
+    """Start, noise in units of the weights, and width of the prior on the quadratic part.
 
     Integrated once, the law is linear in theta: I(t) = p0 - p1 ∫I dt - p2 ∫I(I - 1) dt in scaled
     units. The integrals average the noise, so the start is good for a decay of any length.
@@ -286,7 +288,8 @@ def _start(time: Array, measured: Array, weight: Array) -> tuple[Array, Array]:
     straight, noise, error = solve(1e9 * normal[2, 2] + 1e-300)
     width = PRIOR_WIDTH * (jnp.abs(straight[1]) + 3 * noise * error) + 1e-300
     bent, less, _ = solve((noise / width) ** 2)
-    return bent, width / jnp.maximum(jnp.minimum(noise, less), 1e-300)
+    least = 1e-15 * jnp.sqrt(jnp.mean(target**2))
+    return bent, jnp.maximum(jnp.minimum(noise, less), least), width
 
 
 def _inverse(matrix: Array) -> Array:
@@ -300,7 +303,8 @@ def _solve(readings: Array, free: Array, shape: Shape | None = None) -> tuple[Ar
     """Scale, search, and turn theta into physical numbers; few arrays out, for each costs time."""
     time, measured, weight, unit = _scaled(readings)
     scaled_shape = None if shape is None else lambda beam: shape(beam * unit[1])
-    start, width = _start(time, measured, weight)
+    start, noise, width = _start(time, measured, weight)
+    weight = weight / noise
 
     def off(theta: Array, law: Shape | None) -> tuple[Array, Array]:
         model = beam_current(_numbers(theta), Moments(time, 1.0), law)
@@ -322,16 +326,20 @@ def _solve(readings: Array, free: Array, shape: Shape | None = None) -> tuple[Ar
     found = descend_one(constant, start, -reach[:3], reach[:3])
     if shape is not None:
         begin = jnp.append(found.theta, 0.0)
-        shaped = lambda theta: off(theta, scaled_shape)[0]  # noqa: E731
-        found = descend_one(shaped, begin, -reach, reach)
+        found = descend_one(lambda t: off(t, scaled_shape)[0], begin, -reach, reach, FEW_STEPS)
     (residual, values), (jacobian, slopes) = jax.vmap(
         lambda step: jax.jvp(answer, (found.theta,), (step,)), out_axes=(None, 0)
     )(jnp.diag(free))
-    spread = slopes.T @ _root(jacobian, free)
-    errors = jnp.linalg.norm(spread, axis=1)
-    correlation = spread[1] @ spread[2] / (errors[1] * errors[2])
+    root = _root(jacobian, free)
+    if shape is None:
+        # At rest, one step of Gauss and Newton more is free, and ends at rounding.
+        step = jnp.where(found.rested, -root @ (root.T @ (jacobian @ residual)), 0.0)
+        values, residual = values + step @ slopes, residual + step @ jacobian
+    spread = slopes.T @ root
+    errors = jnp.linalg.norm(spread, axis=1) / noise
+    correlation = (spread[1] @ spread[2]) / noise**2 / (errors[1] * errors[2])
     residual = residual[: time.size]
-    rest = jnp.stack([correlation, residual @ residual, found.rested])
+    rest = jnp.stack([correlation, noise**2 * (residual @ residual), found.rested])
     residuals = jnp.where(weight > 0, residual / weight, 0.0) * unit[1]
     return jnp.concatenate([values, errors, rest]), residuals
 
