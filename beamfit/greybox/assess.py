@@ -246,8 +246,11 @@ def conclude(p: Problem, s: State, attempts: tuple[Attempt, ...], seconds: float
             strict=True,
         )
     )  # fmt: skip
+    # What has no errors cannot speak for or against the model.
+    silent = [group for group in known.groups if not group.errors_given]
+    spoken = chi2 - sum(g.chi2 for g in silent), dof - sum(g.dof for g in silent)
     evidence = Evidence(
-        p, s.kkt, float(s.at.cost), attempts, variables, constraints, known.blind, chi2, dof, judged
+        p, s.kkt, float(s.at.cost), attempts, variables, constraints, known.blind, *spoken, judged
     )
     status, message = judge(evidence)
     return Fit(

@@ -21,8 +21,8 @@ _UNLIKELY = 1e-3  # chance of a chi-square below which a fit counts as poor
 class Evidence(NamedTuple):
     """What a verdict rests on.
 
-    `blind` tells which free numbers the data do not determine, `errors_known` whether chi-square
-    means anything.
+    `blind` tells which free numbers the data do not determine. `chi2` and `dof` are of what has
+    errors, `errors_known` tells whether there is any.
     """
 
     problem: Problem
@@ -33,7 +33,7 @@ class Evidence(NamedTuple):
     constraints: tuple[Limited, ...]
     blind: np.ndarray
     chi2: float
-    dof: int
+    dof: float
     errors_known: bool
 
 
@@ -119,8 +119,8 @@ def _poor(e: Evidence) -> str | None:
     if not (e.errors_known and e.problem.records and chance < _UNLIKELY):
         return None
     return (
-        f"chi2 = {e.chi2:.4g} for {e.dof} degrees of freedom happens by chance in {chance:.1e} of "
-        "cases; the model misses something or the errors are too small."
+        f"chi2 = {e.chi2:.4g} for {e.dof:.4g} degrees of freedom happens by chance in {chance:.1e} "
+        "of cases; the model misses something or the errors are too small."
     )
 
 

@@ -8,6 +8,7 @@ import tempfile
 from collections.abc import Iterator
 from os import PathLike
 from pathlib import Path
+from typing import Any
 
 from beamfit.errors import InputError
 
@@ -31,7 +32,7 @@ def _opened(path: str | PathLike[str]):
     try:
         return open(path, "rb")
     except FileNotFoundError:
-        raise InputError("no such file", "an existing file", path=path) from None
+        raise InputError("no such file", "a readable file", path=path) from None
     except IsADirectoryError:
         raise InputError("a directory", "a file", path=path) from None
     except (OSError, ValueError) as error:  # a name with a zero byte is a ValueError
@@ -41,13 +42,15 @@ def _opened(path: str | PathLike[str]):
         ) from None
 
 
-def text_lines(path: str | PathLike[str]) -> Iterator[str]:
+def text_lines(path: str | PathLike[str], seen: Any = None) -> Iterator[str]:
     """Read a text file line by line in bounded memory.
 
     Parameters
     ----------
     path : str or path
         The file.
+    seen : hash object, optional
+        Is fed what was read, so that a digest needs no second reading.
 
     Yields
     ------
@@ -64,6 +67,8 @@ def text_lines(path: str | PathLike[str]) -> Iterator[str]:
     with _opened(path) as stream:
         while raw := stream.readline(LONGEST_LINE + 1):
             number += 1
+            if seen is not None:
+                seen.update(raw)
             if number == 1:
                 _check_signature(raw, path)
             if b"\0" in raw:
@@ -92,7 +97,7 @@ def _check_signature(start: bytes, path: str | PathLike[str]) -> None:
             raise InputError(found, expected, path=path, line=1)
 
 
-def read_text(path: str | PathLike[str]) -> str:
+def read_text(path: str | PathLike[str], seen: Any = None) -> str:
     """Read a whole text file of modest size, such as a lattice.
 
     Raises
@@ -101,7 +106,7 @@ def read_text(path: str | PathLike[str]) -> str:
         As `text_lines`, and if the file is larger than any lattice.
     """
     lines, size = [], 0
-    for line in text_lines(path):
+    for line in text_lines(path, seen):
         lines.append(line)
         size += len(line) + 1
         if size > LARGEST_TEXT:

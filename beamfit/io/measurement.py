@@ -1,35 +1,47 @@
-"""Quadrupole scans from CSV and HDF5 files (the column contract of docs/files.md)."""
+"""Quadrupole scans: what the columns of a file mean, and shots that become points."""
 
 from __future__ import annotations
 
-import csv
-from collections.abc import Iterator
+import re
 from dataclasses import replace
 from os import PathLike
 from pathlib import Path
 
 import numpy as np
 
-from beamfit.errors import InputError
-from beamfit.io.averaging import average_shots
-from beamfit.io.columns import (
-    CARRIED,
-    LENGTHS,
-    MOST_ROWS,
-    Column,
-    Table,
-    check_header,
-    check_separator,
-    column_of,
-)
-from beamfit.io.files import digest, text_lines
-from beamfit.io.hdf5_table import read_hdf5
-from beamfit.studies.scan.scans import QuadScan, first_unusable
+from beamfit.errors import InputError, nearest
+from beamfit.io.table import UNITS, Column, Sheet, columns_of, read_sheet
+from beamfit.studies.scan.scans import QuadScan, first_unusable, row_keys
 
-__all__ = ["read_quad_scan"]
+__all__ = ["average_shots", "read_quad_scan"]
 
+QUANTITIES = {
+    "size_x": "length",
+    "size_x_error": "length",
+    "size_y": "length",
+    "size_y_error": "length",
+    "resolution": "length",
+    "energy": "energy in MeV",
+    "energy_spread": "",
+    "shot": "",
+    "screen": "",
+}
+SETTINGS = ("A", "kG", "k1", "k1l")
+CARRIED = re.compile(r"note_.*|time|timestamp|charge_[np]C")
+# More rows than any scan: such a file is a log, and is refused before it fills the memory.
+MOST_ROWS = 100_000
 # Rms sizes on a screen; outside this a header's unit is wrong.
 PLAUSIBLE = (1e-7, 2e-2)
+# Further quantities: from (open), to, and how to say it.
+RANGES = {
+    "energy": (0.511, 1e7, "a total energy between 0.511 MeV and 10 TeV; is it in GeV or eV?"),
+    "resolution": (-1e-300, PLAUSIBLE[1], "a resolution between 0 and 20 mm"),
+    "energy_spread": (-1e-300, 0.2, "a relative spread between 0 and 0.2; is it in %?"),
+}
+# Below this many shots a setting's own scatter is too uncertain to weight it by.
+ENOUGH_SHOTS = 5
+# With fewer repeats in all (two or three accidental ones) the scatter says nothing.
+ENOUGH_DEGREES = 3
 
 
 def read_quad_scan(path: str | PathLike[str]) -> QuadScan:
@@ -59,234 +71,244 @@ def read_quad_scan(path: str | PathLike[str]) -> QuadScan:
     >>> read_quad_scan(file).rows("x").size.round(9).tolist()
     [0.0002, 0.00012, 0.00018]
     """
-    is_hdf5 = Path(path).suffix.lower() in {".h5", ".hdf5"}
-    table = read_hdf5(path) if is_hdf5 else _read_csv(path)
-    if not table.cells:
-        raise InputError("a header and no rows", "at least three settings", path=path)
-    return _scan_of(table)
-
-
-def _read_csv(path: str | PathLike[str]) -> Table:
-    provenance: list[str] = []
-    numbered = enumerate(text_lines(path), start=1)
-    rows = _rows(numbered, provenance, path)
-    header = next(rows, None)
-    if header is None:
-        raise InputError("no header and no rows", "a header line such as Q2_A,size_x_um", path=path)
-    line, names = header
-    _check_is_header(names, path, line)
-    table = Table(path, [column_of(name, path, line) for name in names], provenance=provenance)
-    check_header(table, line)
-    for line, cells in rows:
-        if len(cells) != len(names):
-            raise InputError(
-                f"{len(cells)} cells", f"{len(names)}, as in the header", path=path, line=line
-            )
-        if len(table.cells) == MOST_ROWS:
-            raise InputError(
-                f"more than {MOST_ROWS} rows",
-                "a scan of settings; average the shots or cut the file",
-                path=path,
-                line=line,
-            )
-        table.cells.append(cells)
-        table.lines.append(line)
-    return table
-
-
-def _check_is_header(names: list[str], path: str | PathLike[str], line: int) -> None:
-    """Recognise what is put in the place of a CSV header, and say what to do about it."""
-    if names[0].startswith("format") and "beamfit-" in names[0]:
-        raise InputError(
-            "a lattice where the scan should be",
-            "the scan first and the lattice after --lattice; are they swapped?",
-            path=path,
-            line=line,
-        )
-    check_separator(names, "size_", path, line)
-    if all(_is_number(name) for name in names):
-        raise InputError(
-            "numbers where the header should be",
-            "a header line such as Q2_A,size_x_um",
-            path=path,
-            line=line,
-        )
-
-
-def _is_number(cell: str) -> bool:
-    try:
-        float(cell)
-    except ValueError:
-        return False
-    return True
-
-
-def _rows(
-    numbered: Iterator[tuple[int, str]], provenance: list[str], path: str | PathLike[str]
-) -> Iterator[tuple[int, list[str]]]:
-    """Yield cells with their line number; comments go to the provenance, blanks are skipped."""
-    for number, line in numbered:
-        text = line.strip()
-        if text.startswith("#"):
-            provenance.append(text.lstrip("# ").rstrip())
-        elif text.strip(",;\t "):
-            try:
-                yield number, [cell.strip() for cell in next(csv.reader([line]))]
-            except csv.Error:  # a carriage return within the line
-                raise InputError(
-                    "line ends that are carriage returns",
-                    "line feeds: save the file as CSV (UTF-8) again",
-                    path=path,
-                    line=number,
-                ) from None
-
-
-def _scan_of(table: Table) -> QuadScan:
-    """Turn checked cells into a scan in SI."""
-    numbers = {
-        c.key: _numbers(table, i, c)
-        for i, c in enumerate(table.columns)
-        if c.key not in ("screen", "shot") and not CARRIED.fullmatch(c.key)
+    sheet = read_sheet(path, "Q2_A,size_x_um", MOST_ROWS)
+    columns = columns_of(sheet, QUANTITIES, lambda header: _setting(header, sheet))
+    _check_columns(sheet, columns)
+    settings = {c.key.removeprefix("setting "): c for c in columns.values() if c.unit in SETTINGS}
+    planes = [p for p in "xy" if f"size_{p}" in columns]
+    size = {p: _sizes(sheet, columns[f"size_{p}"]) for p in planes}
+    error = {
+        p: _errors(sheet, columns[f"size_{p}_error"], size[p])
+        for p in planes
+        if f"size_{p}_error" in columns
     }
-    by_key = {c.key: i for i, c in enumerate(table.columns)}
-    for plane in "xy":
-        _check_sizes(table, numbers, plane, by_key)
-    _check_energy(table, numbers, by_key)
-    _check_optional(table, numbers, by_key)
-    settings = {k.removeprefix("setting "): k for k in numbers if k.startswith("setting ")}
-    planes = [p for p in "xy" if f"size_{p}" in numbers]
+    further = {key: _within(sheet, columns[key]) for key in RANGES if key in columns}
     try:
         scan = QuadScan(
-            settings={name: numbers[key] for name, key in settings.items()},
-            units={n: table.columns[by_key[k]].unit for n, k in settings.items()},
-            size={p: numbers[f"size_{p}"] for p in planes},
-            error={p: numbers[f"size_{p}_error"] for p in planes if f"size_{p}_error" in numbers},
-            energy=numbers.get("energy_MeV"),
-            screen=tuple(r[by_key["screen"]] for r in table.cells) if "screen" in by_key else None,
-            resolution=numbers.get("resolution"),
-            energy_spread=numbers.get("energy_spread"),
+            settings={name: sheet.numbers(c.header) for name, c in settings.items()},
+            units={name: c.unit for name, c in settings.items()},
+            size=size,
+            error=error,
+            **further,
+            screen=_screens(sheet, columns.get("screen")),
             error_source="the file",
-            name=Path(table.path).stem,
-            path=table.path,
-            sha256=digest(table.path),
-            provenance=tuple(table.provenance),
-            columns={n: table.columns[by_key[k]].header for n, k in settings.items()}
-            | {c.key: c.header for c in table.columns},
+            name=Path(path).stem,
+            path=path,
+            sha256=sheet.sha256,
+            provenance=sheet.comments,
+            columns={name: c.header for name, c in settings.items()}
+            | {key: c.header for key, c in columns.items()}
+            | {c.header: c.header for c in columns.values()},
         )
     except InputError as error:
-        raise replace(error, path=table.path) from None
-    return average_shots(scan, marked="shot" in by_key)
+        raise replace(error, path=path) from None
+    return average_shots(scan, marked="shot" in columns)
 
 
-def _numbers(table: Table, index: int, column: Column) -> np.ndarray:
-    """Read one column; a blank size or error is NaN, anything else must be a number."""
-    may_be_blank = column.key.startswith("size_")
-    values = np.empty(len(table.cells))
-    for row, cells in enumerate(table.cells):
-        cell = cells[index]
-        try:
-            values[row] = np.nan if may_be_blank and cell == "" else float(cell) * column.factor
-        except ValueError:
-            found = f"'{cell}'" if cell else "an empty cell"
-            point = " with a decimal point" if "," in cell else ""
-            raise table.error(found, f"a number{point}", row, column) from None
-        if cell and not np.isfinite(values[row]):
-            raise table.error(f"'{cell}'", "a finite number", row, column)
-    return values
-
-
-def _check_sizes(table: Table, numbers: dict, plane: str, by_key: dict) -> None:
-    for key, what in ((f"size_{plane}", "beam size"), (f"size_{plane}_error", "error")):
-        if key in numbers:
-            wrong = first_unusable(numbers[key], blank=True)
-            if wrong:
-                column = table.columns[by_key[key]]
-                cell = table.cells[wrong[0]][by_key[key]]
-                raise table.error(
-                    f"'{cell}'", f"a positive {what} in {column.unit}", wrong[0], column
-                )
-    if f"size_{plane}" not in numbers:
-        return
-    size, column = numbers[f"size_{plane}"], table.columns[by_key[f"size_{plane}"]]
-    if np.isnan(size).all():
-        raise table.error("no number at all", f"sizes in {column.unit}", None, column)
-    _check_plausible(table, size, column)
-    if f"size_{plane}_error" in numbers:
-        _check_errors(table, size, numbers[f"size_{plane}_error"], by_key, plane)
-
-
-def _check_plausible(table: Table, size: np.ndarray, column: Column) -> None:
-    """Recognise a header whose unit cannot be meant: sizes of metres or of atoms."""
-    middle, row = float(np.nanmedian(size)), int(np.nanargmax(size))
-    if PLAUSIBLE[0] <= middle <= PLAUSIBLE[1]:
-        if size[row] > PLAUSIBLE[1]:
-            raise table.error(
-                f"{size[row] / column.factor:g} {column.unit}, implausible for a beam",
-                "sizes below 20 mm; is this row in another unit?",
-                row,
-                column,
-            )
-        return
-    written = middle / column.factor
-    likely = min(("um", "mm", "m"), key=lambda u: abs(np.log(written * LENGTHS[u] / 2e-4)))
-    raise table.error(
-        f"sizes around {written:g} {column.unit}, implausible for a beam",
-        f"sizes between 0.1 um and 20 mm; if these are {likely}, "
-        f"rename the column {column.key}_{likely}",
-        None,
-        column,
+def _setting(header: str, sheet: Sheet) -> Column:
+    """A magnet's setting, or a column that is carried along unread."""
+    if CARRIED.fullmatch(header):
+        return Column(header, header)
+    name, _, unit = header.rpartition("_")
+    if name and unit in SETTINGS and not header.startswith("size_"):
+        return Column(header, f"setting {name}", unit)
+    usual = ["size_x_um", "size_x_error_um", "size_y_um", "size_y_error_um", "resolution_um"]
+    usual += ["energy_MeV", "energy_spread", "shot", "screen"]
+    raise sheet.header_error(
+        f"unknown unit '{unit}'" if name else "a name without a unit",
+        "a magnet with _A, _kG or _k1 at the end, "
+        + nearest(header, usual)
+        + "; begin a name with note_ to carry a column along unread",
+        header,
     )
 
 
-def _check_errors(
-    table: Table, size: np.ndarray, error: np.ndarray, by_key: dict, plane: str
-) -> None:
-    column = table.columns[by_key[f"size_{plane}_error"]]
+def _check_columns(sheet: Sheet, columns: dict[str, Column]) -> None:
+    """Check that the columns make a scan, and that there are rows."""
+    if not {"size_x", "size_y"} & set(columns):
+        missing = "a beam size column, such as size_x_um"
+    elif not any(c.unit in SETTINGS for c in columns.values()):
+        missing = "a magnet setting column, such as Q2_A, Q2_kG or Q2_k1"
+    else:
+        missing = ""
+    if missing:
+        raise sheet.header_error("columns " + ", ".join(sheet.names), missing)
+    for plane in "xy":
+        if f"size_{plane}_error" in columns and f"size_{plane}" not in columns:
+            found = f"size_{plane}_error without size_{plane}"
+            raise sheet.header_error(found, f"a column size_{plane}_um")
+    if not len(sheet):
+        raise sheet.error("a header and no rows", "at least three settings")
+
+
+def _positive(sheet: Sheet, column: Column, what: str) -> np.ndarray:
+    """Lengths in m; NaN where the cell is blank."""
+    values = sheet.numbers(column.header, blank=True) * column.factor
+    if wrong := first_unusable(values, blank=True):
+        cell = sheet[column.header][wrong[0]]
+        expected = f"a positive {what} in {column.unit}"
+        raise sheet.error(f"'{cell}'", expected, wrong[0], column.header)
+    return values
+
+
+def _sizes(sheet: Sheet, column: Column) -> np.ndarray:
+    """Sizes in m, in a unit that can be meant: no beam is metres wide, or as small as atoms."""
+    size = _positive(sheet, column, "beam size")
+    if np.isnan(size).all():
+        expected = f"sizes in {column.unit}"
+        raise sheet.error("no number at all", expected, None, column.header)
+    middle, row = float(np.nanmedian(size)), int(np.nanargmax(size))
+    if not PLAUSIBLE[0] <= middle <= PLAUSIBLE[1]:
+        written, lengths = middle / column.factor, UNITS["length"]
+        likely = min(("um", "mm", "m"), key=lambda u: abs(np.log(written * lengths[u] / 2e-4)))
+        raise sheet.error(
+            f"sizes around {written:g} {column.unit}, implausible for a beam",
+            f"sizes between 0.1 um and 20 mm; if these are {likely}, "
+            f"rename the column {column.key}_{likely}",
+            None,
+            column.header,
+        )
+    if size[row] > PLAUSIBLE[1]:
+        raise sheet.error(
+            f"{size[row] / column.factor:g} {column.unit}, implausible for a beam",
+            "sizes below 20 mm; is this row in another unit?",
+            row,
+            column.header,
+        )
+    return size
+
+
+def _errors(sheet: Sheet, column: Column, size: np.ndarray) -> np.ndarray:
+    """Errors in m, one for each size and smaller than it."""
+    error = _positive(sheet, column, "error")
     missing = np.isnan(error) & ~np.isnan(size)
     if missing.any():
-        row = int(np.argmax(missing))
-        raise table.error("an empty cell", "an error for each size, or none at all", row, column)
+        expected, row = "an error for each size, or none at all", int(np.argmax(missing))
+        raise sheet.error("an empty cell", expected, row, column.header)
     with np.errstate(over="ignore"):
         ratio = float(np.nanmedian(error / size))
     if not 1e-6 < ratio < 1.0:
-        raise table.error(
-            f"errors that are {ratio:g} of the sizes",
-            "errors in the unit of the header",
-            None,
-            column,
-        )
+        found = f"errors that are {ratio:g} of the sizes"
+        raise sheet.error(found, "errors in the unit of the header", None, column.header)
+    return error
 
 
-def _check_energy(table: Table, numbers: dict, by_key: dict) -> None:
-    if "energy_MeV" not in numbers:
-        return
-    column, energy = table.columns[by_key["energy_MeV"]], numbers["energy_MeV"]
-    wrong = (energy <= 0.511) | (energy > 1e7)
+def _within(sheet: Sheet, column: Column) -> np.ndarray:
+    """A further quantity, within what it can be."""
+    low, high, expected = RANGES[column.key]
+    values = sheet.numbers(column.header) * column.factor
+    wrong = (values <= low) | (values > high)
     if wrong.any():
         row = int(np.argmax(wrong))
-        raise table.error(
-            f"{energy[row]:g} MeV",
-            "a total energy between 0.511 MeV and 10 TeV; is it in GeV or eV?",
-            row,
-            column,
-        )
+        raise sheet.error(f"'{sheet[column.header][row]}'", expected, row, column.header)
+    return values
 
 
-def _check_optional(table: Table, numbers: dict, by_key: dict) -> None:
-    """Check the resolution, the energy spread and the screens, where they are given."""
-    for key, most, expected in (
-        ("resolution", PLAUSIBLE[1], "a resolution between 0 and 20 mm"),
-        ("energy_spread", 0.2, "a relative spread between 0 and 0.2; is it in %?"),
-    ):
-        if key in numbers:
-            wrong = (numbers[key] < 0) | (numbers[key] > most)
-            if wrong.any():
-                row, index = int(np.argmax(wrong)), by_key[key]
-                found = f"'{table.cells[row][index]}'"
-                raise table.error(found, expected, row, table.columns[index])
-    if "screen" in by_key:
-        index = by_key["screen"]
-        for row, cells in enumerate(table.cells):
-            if not cells[index]:
-                expected = "the name of a screen of the lattice"
-                raise table.error("an empty cell", expected, row, table.columns[index])
+def _screens(sheet: Sheet, column: Column | None) -> tuple[str, ...] | None:
+    if column is None:
+        return None
+    names = tuple(str(name) for name in sheet[column.header])
+    if "" in names:
+        expected = "the name of a screen of the lattice"
+        raise sheet.error("an empty cell", expected, names.index(""), column.header)
+    return names
+
+
+def average_shots(scan: QuadScan, *, marked: bool) -> QuadScan:
+    """Average the rows that repeat a setting, an energy and a screen.
+
+    Parameters
+    ----------
+    scan : QuadScan
+        One row a shot.
+    marked : bool
+        Whether the file says its rows are shots. If not, rows that carry errors of their own
+        stay as they are: each is a measurement by itself.
+
+    Returns
+    -------
+    QuadScan
+        One row a setting. The error is the standard error of the mean, s/√n with n - 1 in s;
+        where a setting has fewer than five shots, s is the relative scatter pooled over all
+        settings, because two or three shots can agree by chance. With fewer than three
+        repeats in all the errors of the file stand, or there are none and the fit infers them.
+
+    Examples
+    --------
+    >>> shots = QuadScan({"Q": [0, 0, 1, 1, 2, 2.0]}, {"Q": "A"},
+    ...                  {"x": [1.0e-4, 1.2e-4, 2.0e-4, 2.2e-4, 3.0e-4, 3.2e-4]})
+    >>> average_shots(shots, marked=True).size["x"].round(6).tolist()
+    [0.00011, 0.00021, 0.00031]
+    """
+    groups = _groups(scan)
+    repeated = max(len(g) for g in groups) > 1
+    if not repeated or (scan.error and not marked):
+        return scan if scan.error else replace(scan, error_source="none given")
+    first = [g[0] for g in groups]
+    size = {p: np.array([_mean(v[g]) for g in groups]) for p, v in scan.size.items()}
+    scatter = {p: _standard_error(scan.size[p], groups) for p in scan.size}
+    known = {p: e for p, e in scatter.items() if e is not None}
+    # Too few repeats for a scatter: what the file says of its shots is kept.
+    given = {p: _of_the_mean(e, groups) for p, e in scan.error.items() if p not in known}
+
+    def pick(values: np.ndarray | None) -> np.ndarray | None:
+        return None if values is None else values[first]
+
+    return replace(
+        scan,
+        settings={n: v[first] for n, v in scan.settings.items()},
+        size=size,
+        error=known | given,
+        energy=pick(scan.energy),
+        resolution=pick(scan.resolution),
+        energy_spread=pick(scan.energy_spread),
+        screen=None if scan.screen is None else tuple(scan.screen[i] for i in first),
+        shots=np.array([len(g) for g in groups]),
+        error_source="the scatter of the shots (standard error of the mean)"
+        if known
+        else ("the file" if given else "none given"),
+    )
+
+
+def _groups(scan: QuadScan) -> list[np.ndarray]:
+    """Rows of equal settings, energy and screen, in the order of first appearance."""
+    rows: dict[tuple, list[int]] = {}
+    for i, key in enumerate(row_keys(scan.settings, scan.energy, scan.screen)):
+        rows.setdefault(key, []).append(i)
+    return [np.array(r) for r in rows.values()]
+
+
+def _mean(values: np.ndarray) -> float:
+    """Mean of the shots that were measured; NaN where none was."""
+    measured = values[~np.isnan(values)]
+    return float(measured.mean()) if len(measured) else np.nan
+
+
+def _of_the_mean(error: np.ndarray, groups: list[np.ndarray]) -> np.ndarray:
+    """Errors of the means of shots that bring errors of their own."""
+    return np.array(
+        [
+            np.sqrt(np.nanmean(error[g] ** 2) / np.sum(~np.isnan(error[g])))
+            if (~np.isnan(error[g])).any()
+            else np.nan
+            for g in groups
+        ]
+    )
+
+
+def _standard_error(sizes: np.ndarray, groups: list[np.ndarray]) -> np.ndarray | None:
+    """Standard error of each mean in m, or None where too few repeat or all agree."""
+    shots = [sizes[g][~np.isnan(sizes[g])] for g in groups]
+    degrees = sum(max(len(s) - 1, 0) for s in shots)
+    if degrees < ENOUGH_DEGREES:
+        return None
+    relative = sum(((s - s.mean()) ** 2).sum() / s.mean() ** 2 for s in shots if len(s) > 1)
+    pooled = np.sqrt(relative / degrees)
+    if pooled == 0.0:
+        return None
+    errors = np.full(len(groups), np.nan)
+    for i, s in enumerate(shots):
+        if len(s):
+            own = s.std(ddof=1) if len(s) >= ENOUGH_SHOTS else 0.0
+            errors[i] = (own or pooled * s.mean()) / np.sqrt(len(s))
+    return errors

@@ -7,9 +7,7 @@ range over which certified gains hold) and ``cells`` on a gain.
 from __future__ import annotations
 
 import os
-import tempfile
 from collections import Counter
-from pathlib import Path
 from xml.etree import ElementTree as Plain
 
 import numpy as np
@@ -17,6 +15,7 @@ from defusedxml import DefusedXmlException, ElementTree
 
 from beamfit.errors import InputError
 from beamfit.greybox.mlp import MLP, Gain, Layer, Port, connection
+from beamfit.io.files import read_text, write_atomically
 
 __all__ = ["format_network", "network_from", "parse_network", "read_network", "write_network"]
 
@@ -180,11 +179,7 @@ def read_network(path: str | os.PathLike[str]) -> MLP:
     InputError
         If the file cannot be read or is not a network.
     """
-    try:
-        text = Path(path).read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{error}", "a readable XML file in UTF-8", path) from None
-    return parse_network(text, path)
+    return parse_network(read_text(path), path)
 
 
 def write_network(path: str | os.PathLike[str], net: MLP) -> None:
@@ -197,15 +192,7 @@ def write_network(path: str | os.PathLike[str], net: MLP) -> None:
     net : MLP
         The network.
     """
-    target = Path(path)
-    handle, temporary = tempfile.mkstemp(dir=target.parent, prefix=target.name, suffix=".part")
-    try:
-        with open(handle, "w", encoding="utf-8") as file:
-            file.write(format_network(net))
-        os.replace(temporary, target)
-    except BaseException:
-        os.unlink(temporary)
-        raise
+    write_atomically(path, format_network(net).encode())
 
 
 def _need(e: Plain.Element, key: str) -> str:

@@ -7,14 +7,14 @@ import math
 from collections.abc import Mapping
 from os import PathLike
 from pathlib import Path
-from types import MappingProxyType
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from beamfit.errors import InputError
+from beamfit.studies.scan.wishes import Beam
 
-__all__ = ["FittedBeam", "read_fitted_beams"]
+__all__ = ["read_fitted_beams"]
 
 HOW = "the output of beamfit emittance --json"
 NUMBERS = ("sigma11", "sigma12", "sigma22")
@@ -22,31 +22,7 @@ NUMBERS = ("sigma11", "sigma12", "sigma22")
 ROUNDED = 1e-9
 
 
-class FittedBeam(NamedTuple):
-    """A fitted beam of one plane.
-
-    Attributes
-    ----------
-    sigma : ndarray
-        σ11 (m²), σ12 (m rad), σ22 (rad²).
-    covariance : ndarray or None
-        Shape (3, 3), scaled as the errors are; None where the fit determined none.
-    calibration : dict of str to float
-        Fitted calibration numbers that go with it, such as "Q2.slope".
-    energy : float or None
-        Mean total energy of the sizes it was fitted to, MeV; None if the file does not say.
-    doubt : str or None
-        Why the fit does not determine the beam; None if it does.
-    """
-
-    sigma: np.ndarray
-    covariance: np.ndarray | None = None
-    calibration: Mapping[str, float] = MappingProxyType({})
-    energy: float | None = None
-    doubt: str | None = None
-
-
-def read_fitted_beams(path: str | PathLike[str], rest_energy: float) -> dict[str, FittedBeam]:
+def read_fitted_beams(path: str | PathLike[str], rest_energy: float) -> dict[str, Beam]:
     """Read the fitted beam of each plane.
 
     Parameters
@@ -58,7 +34,7 @@ def read_fitted_beams(path: str | PathLike[str], rest_energy: float) -> dict[str
 
     Returns
     -------
-    dict of str to FittedBeam
+    dict of str to Beam
         By plane.
 
     Raises
@@ -95,7 +71,7 @@ def read_fitted_beams(path: str | PathLike[str], rest_energy: float) -> dict[str
     return found
 
 
-def _beam(entry: Mapping[str, Any], rest_energy: float) -> FittedBeam:
+def _beam(entry: Mapping[str, Any], rest_energy: float) -> Beam:
     _check_optics(entry)
     where = f"of plane {entry['plane']}"
     sigma = [_number(entry[name]["value"], f"{name} {where}") for name in NUMBERS]
@@ -109,7 +85,7 @@ def _beam(entry: Mapping[str, Any], rest_energy: float) -> FittedBeam:
         if entry.get("scenario") == "calibration"
     }
     energy = _energy(entry, rest_energy, where)
-    return FittedBeam(np.array(sigma), covariance, numbers, energy, _doubt(entry))
+    return Beam(np.array(sigma), covariance, numbers, energy, _doubt(entry))
 
 
 def _energy(entry: Mapping[str, Any], rest_energy: float, where: str) -> float | None:

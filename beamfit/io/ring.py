@@ -6,136 +6,89 @@ A file is checked before the values are built, for which alone JAX is imported.
 from __future__ import annotations
 
 import math
-import tomllib
+from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from beamfit.errors import InputError, nearest
-from beamfit.io.files import read_text
-from beamfit.io.twiss import read_twiss
+from beamfit.io.table import Sheet, read_sheet
+from beamfit.io.toml import REQUIRED, TABLE, TEXT, Key, Section, read_toml
 
 if TYPE_CHECKING:
     import at
 
-    from beamfit.lifetime.ring import Gas, Operation, Optics, Ring
+    from beamfit.lifetime.ring import Operation, Optics, Ring
 
-__all__ = ["read_operation", "read_ring", "ring_from_pyat"]
+__all__ = ["read_operation", "read_ring", "read_twiss", "ring_from_pyat"]
 
 INFINITE = math.inf
-# key of the file: (field of the value, SI value of one unit, default; None: it must be there)
-RING_KEYS = {
-    "energy_GeV": ("energy", 1e9, None),
-    "circumference_m": ("circumference", 1.0, None),
-    "harmonic_number": ("harmonic", 1.0, None),
-    "momentum_compaction": ("momentum_compaction", 1.0, None),
-    "energy_loss_keV": ("energy_loss", 1e3, None),
-    "energy_spread": ("energy_spread", 1.0, None),
-    "emittance_x_nm": ("emittance_x", 1e-9, None),
-    "emittance_y_nm": ("emittance_y", 1e-9, math.nan),
-    "coupling": ("coupling", 1.0, math.nan),
-    "damping_time_y_ms": ("damping_time_y", 1e-3, INFINITE),
-    "damping_time_z_ms": ("damping_time_z", 1e-3, INFINITE),
-    "impedance_ohm": ("impedance", 1.0, 0.0),
+TABLES = {
+    name: Key(kind=TABLE, default=None) for name in ("ring", "acceptance", "optics", "operation")
 }
-ACCEPTANCE_KEYS = {
-    "momentum": ("momentum_acceptance", 1.0, INFINITE),
-    "vertical_mm_mrad": ("acceptance_y", 1e-6, INFINITE),
-    "scraper_beta_y_m": ("scraper_beta_y", 1.0, 1.0),
+
+
+def _positive(field: str, factor: float = 1.0, default: Any = REQUIRED) -> Key:
+    return Key(field, factor, default, low=0.0, said="a positive number")
+
+
+RING = {
+    "name": Key(kind=TEXT, default=""),
+    "energy_GeV": _positive("energy", 1e9),
+    "circumference_m": _positive("circumference"),
+    "harmonic_number": _positive("harmonic"),
+    "momentum_compaction": Key("momentum_compaction"),
+    "energy_loss_keV": _positive("energy_loss", 1e3),
+    "energy_spread": _positive("energy_spread"),
+    "emittance_x_nm": _positive("emittance_x", 1e-9),
+    "emittance_y_nm": _positive("emittance_y", 1e-9, None),
+    "coupling": _positive("coupling", 1.0, None),
+    "damping_time_y_ms": _positive("damping_time_y", 1e-3, INFINITE),
+    "damping_time_z_ms": _positive("damping_time_z", 1e-3, INFINITE),
+    "impedance_ohm": _positive("impedance", 1.0, 0.0),
 }
-OPTICS_KEYS = {
-    "beta_x_m": ("beta_x", 1.0, None),
-    "beta_y_m": ("beta_y", 1.0, None),
-    "alpha_x": ("alpha_x", 1.0, 0.0),
-    "alpha_y": ("alpha_y", 1.0, 0.0),
-    "dispersion_x_m": ("dispersion_x", 1.0, 0.0),
-    "dispersion_y_m": ("dispersion_y", 1.0, 0.0),
-    "dispersion_slope_x": ("slope_x", 1.0, 0.0),
-    "dispersion_slope_y": ("slope_y", 1.0, 0.0),
+ACCEPTANCE = {
+    "momentum": _positive("momentum_acceptance", 1.0, INFINITE),
+    "vertical_mm_mrad": _positive("acceptance_y", 1e-6, INFINITE),
+    "scraper_beta_y_m": _positive("scraper_beta_y", 1.0, 1.0),
 }
-OPERATION_KEYS = {
-    "rf_voltage_kV": ("rf_voltage", 1e3, None),
-    "bunches": ("bunches", 1.0, None),
-    "scraper_y_mm": ("scraper_y", 1e-3, INFINITE),
-    "pressure_base_Pa": ("pressure_base", 1.0, None),
-    "pressure_slope_Pa_per_mA": ("pressure_slope", 1.0, 0.0),
-    "temperature_K": ("temperature", 1.0, 300.0),
+OPTICS = {
+    "beta_x_m": _positive("beta_x"),
+    "beta_y_m": _positive("beta_y"),
+    "alpha_x": Key("alpha_x", default=0.0),
+    "alpha_y": Key("alpha_y", default=0.0),
+    "dispersion_x_m": Key("dispersion_x", default=0.0),
+    "dispersion_y_m": Key("dispersion_y", default=0.0),
+    "dispersion_slope_x": Key("slope_x", default=0.0),
+    "dispersion_slope_y": Key("slope_y", default=0.0),
 }
-MAY_BE_ZERO = {"impedance_ohm", "pressure_base_Pa", "pressure_slope_Pa_per_mA"}
-ANY_SIGN = {name for name in OPTICS_KEYS if not name.startswith("beta")} | {"momentum_compaction"}
+OPERATION = {
+    "rf_voltage_kV": _positive("rf_voltage", 1e3),
+    "bunches": _positive("bunches"),
+    "scraper_y_mm": _positive("scraper_y", 1e-3, INFINITE),
+    "pressure_base_Pa": Key("pressure_base", low=-1e-300, said="a positive number, or zero"),
+    "pressure_slope_Pa_per_mA": _positive("pressure_slope", 1.0, 0.0),
+    "temperature_K": _positive("temperature", 1.0, 300.0),
+    "gas": Key("gas", kind=TABLE, default={"N2": 1.0}),
+}
+# column here, and in a TFS file; the vertical dispersion may be missing
+COLUMNS = {
+    "s_m": "S",
+    "beta_x_m": "BETX",
+    "beta_y_m": "BETY",
+    "alpha_x": "ALFX",
+    "alpha_y": "ALFY",
+    "dispersion_x_m": "DX",
+    "dispersion_y_m": "DY",
+    "dispersion_slope_x": "DPX",
+    "dispersion_slope_y": "DPY",
+}
+MAY_BE_MISSING = {"dispersion_y_m", "dispersion_slope_y"}
+POSITIVE = {"beta_x_m", "beta_y_m"}
 
 
-def _document(path: Path) -> dict[str, Any]:
-    try:
-        return tomllib.loads(read_text(path))
-    except tomllib.TOMLDecodeError as error:
-        raise InputError(str(error), "a ring file in TOML", path=path) from error
-
-
-def _table(document: dict[str, Any], name: str, path: Path) -> dict[str, Any]:
-    table = document.get(name, {})
-    if not isinstance(table, dict):
-        raise InputError(f"{name} = {table!r}", f"a table [{name}]", path=path, column=name)
-    return table
-
-
-def _number(
-    table: dict[str, Any], key: str, unit: float, default: float | None, path: Path
-) -> float:
-    """One value in SI, its type and sign checked."""
-    if key not in table:
-        if default is None:
-            raise InputError("the key is missing", "a number", path=path, column=key)
-        return default
-    value = table[key]
-    if isinstance(value, bool) or not isinstance(value, int | float) or math.isnan(value):
-        raise InputError(f"{value!r}", "a number", path=path, column=key)
-    if key not in ANY_SIGN and (value < 0 or (value == 0 and key not in MAY_BE_ZERO)):
-        raise InputError(f"{value!r}", "a positive number", path=path, column=key)
-    return value * unit
-
-
-def _numbers(
-    table: dict[str, Any],
-    keys: dict[str, tuple[str, float, float | None]],
-    path: Path,
-    also: tuple[str, ...] = (),
-) -> dict[str, float]:
-    """Values of a table by field; a key that the table does not know is an error."""
-    for key in table:
-        if key not in keys and key not in also:
-            raise InputError("an unknown key", nearest(key, list(keys)), path=path, column=key)
-    return {
-        field: _number(table, key, unit, default, path)
-        for key, (field, unit, default) in keys.items()
-    }
-
-
-def _vertical_emittance(machine: dict[str, float], path: Path) -> float:
-    """From the emittance itself or the coupling, whichever the file gives."""
-    coupling, emittance_y = machine["coupling"], machine["emittance_y"]
-    if math.isnan(emittance_y) == math.isnan(coupling):
-        amount = "neither" if math.isnan(coupling) else "both"
-        found = f"{amount} of emittance_y_nm and coupling"
-        raise InputError(found, "one of them", path=path, column="coupling")
-    return machine["emittance_x"] * coupling if math.isnan(emittance_y) else emittance_y
-
-
-def _optics(table: dict[str, Any], circumference: float, path: Path) -> Optics:
-    """The ring's optics: a table beside the file, or averages as a ring of one point."""
-    if "twiss" not in table:
-        averages = _numbers(table, OPTICS_KEYS, path)
-        from beamfit.lifetime.ring import Optics  # JAX from here on
-
-        points = {field: np.array([value]) for field, value in averages.items()}
-        return Optics(weight=np.ones(1), **points)
-    if len(table) > 1:
-        raise InputError("averages beside a table", "one of them", path=path, column="twiss")
-    return read_twiss(path.parent / str(table["twiss"]), circumference)
-
-
-def read_ring(path: str | Path) -> Ring:
+def read_ring(path: str | PathLike[str]) -> Ring:
     """Read a storage ring.
 
     Parameters
@@ -160,19 +113,39 @@ def read_ring(path: str | Path) -> Ring:
     >>> print(f"{ring.emittance_y:.3e} m rad at {ring.optics.beta_y.size} points")
     3.610e-11 m rad at 761 points
     """
-    path = Path(path)
-    document = _document(path)
-    machine = _numbers(_table(document, "ring", path), RING_KEYS, path, also=("name",))
-    machine["emittance_y"] = _vertical_emittance(machine, path)
-    del machine["coupling"]
-    aperture = _numbers(_table(document, "acceptance", path), ACCEPTANCE_KEYS, path)
-    optics = _optics(_table(document, "optics", path), machine["circumference"], path)
+    top = _top(path)
+    section = top.section("ring")
+    machine = section.values(RING)
+    section.one_of(("emittance_y_nm", "coupling"))
+    if (coupling := machine.pop("coupling")) is not None:
+        machine["emittance_y"] = machine["emittance_x"] * coupling
+    aperture = top.section("acceptance").values(ACCEPTANCE)
+    optics = _optics(top.section("optics"), machine["circumference"])
     from beamfit.lifetime.ring import Ring
 
     return Ring(**machine, **aperture, optics=optics)
 
 
-def read_operation(path: str | Path) -> Operation:
+def _top(path: str | PathLike[str]) -> Section:
+    top = read_toml(path, "a ring")
+    top.values(TABLES)
+    return top
+
+
+def _optics(section: Section, circumference: float) -> Optics:
+    """The ring's optics: a table beside the file, or averages as a ring of one point."""
+    if "twiss" in section.table:
+        if len(section.table) > 1:
+            raise section.error("averages beside a table", "one of them", "twiss")
+        section.values({"twiss": Key(kind=TEXT)})
+        return read_twiss(Path(section.path).parent / section.table["twiss"], circumference)
+    averages = section.values(OPTICS)
+    from beamfit.lifetime.ring import Optics  # JAX from here on
+
+    return Optics(np.ones(1), **{field: np.array([value]) for field, value in averages.items()})
+
+
+def read_operation(path: str | PathLike[str]) -> Operation:
     """Read the settings and the vacuum from the `[operation]` table of a ring file.
 
     Parameters
@@ -196,33 +169,91 @@ def read_operation(path: str | Path) -> Operation:
     >>> read_operation("lattices/spear3_2003.toml").rf_voltage
     3200000.0
     """
-    path = Path(path)
-    document = _document(path)
-    table = _table(document, "operation", path)
-    values = _numbers(table, OPERATION_KEYS, path, also=("gas",))
-    ring = _table(document, "ring", path)
-    loss = _number(ring, "energy_loss_keV", 1e3, None, path)
+    top = _top(path)
+    section = top.section("operation")
+    values, loss = section.values(OPERATION), top.section("ring").values(RING)["energy_loss"]
     if values["rf_voltage"] <= loss:
-        raise InputError(
+        raise section.error(
             f"{values['rf_voltage'] / 1e3:.6g} kV",
             f"more than the loss of {loss / 1e3:.6g} kV a turn, or no beam is stored",
-            path=path,
-            column="rf_voltage_kV",
+            "rf_voltage_kV",
         )
-    from beamfit.lifetime.ring import Operation  # JAX from here on
-
-    return Operation(**values, gas=_gas(table.get("gas", {"N2": 1.0}), path))
-
-
-def _gas(fractions: dict[str, float], path: Path) -> Gas:
-    from beamfit.lifetime.ring import gas_mixture
+    from beamfit.lifetime.ring import Operation, gas_mixture  # JAX from here on
 
     try:
-        return gas_mixture(**fractions)
+        gas = gas_mixture(**values.pop("gas"))
     except (TypeError, ValueError) as error:
-        raise InputError(
-            str(error), "partial pressures by molecule", path=path, column="gas"
-        ) from error
+        raise section.error(str(error), "partial pressures by molecule", "gas") from error
+    return Operation(**values, gas=gas)
+
+
+def read_twiss(path: str | PathLike[str], circumference: float) -> Optics:
+    """Read the optics along a ring.
+
+    Parameters
+    ----------
+    path : str or path
+        CSV with the columns `s_m, beta_x_m, beta_y_m, alpha_x, alpha_y, dispersion_x_m,
+        dispersion_slope_x` (and optionally the vertical dispersion), or MAD-X TFS. The table
+        covers the whole ring, or one of its equal (or mirror-symmetric) parts. Points close
+        together, inside magnets too: averages are taken by the trapezoidal rule.
+    circumference : float
+        Circumference of the ring, m.
+
+    Returns
+    -------
+    Optics
+        One point for each row.
+
+    Raises
+    ------
+    InputError
+        With file, line and column, if a column is missing, a cell is not a number, a Twiss beta
+        is not positive, or the table does not cover the ring.
+
+    Examples
+    --------
+    >>> optics = read_twiss("lattices/spear3_2003_twiss.csv", 234.144)
+    >>> print(f"mean beta_y {optics.average(optics.beta_y):.3f} m")
+    mean beta_y 8.785 m
+    """
+    sheet = read_sheet(path, "s_m,beta_x_m,beta_y_m")
+    columns = {name: _column(sheet, name) for name in COLUMNS}
+    from beamfit.lifetime.ring import Optics  # JAX from here on: the table is in order
+
+    weight = _weights(sheet, columns.pop("s_m"), circumference)
+    return Optics(weight, *columns.values())
+
+
+def _column(sheet: Sheet, name: str) -> np.ndarray:
+    """A column under its own name or that of a TFS file."""
+    header = next((h for h in (name, COLUMNS[name]) if h in sheet.names), None)
+    if header is None:
+        if name in MAY_BE_MISSING:
+            return np.zeros(len(sheet))
+        known = nearest(name, list(sheet.names))
+        raise sheet.header_error(f"no column '{name}', but {known}", f"'{name}'")
+    values = sheet.numbers(header)
+    if name in POSITIVE and (values <= 0).any():
+        row = int(np.argmax(values <= 0))
+        raise sheet.error(f"{values[row]:g}", "a positive beta function", row, header)
+    return values
+
+
+def _weights(sheet: Sheet, s: np.ndarray, circumference: float) -> np.ndarray:
+    """Share of the ring for each point (trapezoid); the table covers the ring or a part 1/k."""
+    steps = np.diff(s)
+    if s.size < 2 or np.any(steps < 0):
+        row = int(np.argmin(steps)) + 1 if s.size > 1 else None
+        raise sheet.error("s falls", "positions that rise", row, "s_m")
+    span = s[-1] - s[0]
+    parts = circumference / span if span > 0 else 0.0
+    if abs(parts - max(1, round(parts))) > 1e-3 * parts:
+        found = f"a table over {span:.6g} m"
+        expected = f"the circumference of {circumference:.6g} m or a whole fraction of it"
+        raise sheet.error(found, expected, None, "s_m")
+    weight = (np.r_[steps, 0.0] + np.r_[0.0, steps]) / 2
+    return weight / span
 
 
 def ring_from_pyat(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import io
 import re
 import unicodedata
@@ -14,11 +15,10 @@ from types import MappingProxyType
 from typing import Any
 
 from beamfit.errors import InputError, nearest
-from beamfit.io.files import digest, read_text
+from beamfit.io.files import read_text
 from beamfit.io.lattice import LatticeFile
-from beamfit.io.sequence_elements import element_tables
-from beamfit.io.sequence_source import Source
-from beamfit.particles import REST_ENERGY
+from beamfit.io.sequence_elements import Source, element_tables
+from beamfit.particles import REST_ENERGY, expected_energy
 
 __all__ = ["read_sequence"]
 
@@ -85,7 +85,8 @@ def read_sequence(
             "the lattice file (.lte) that its &run_setup names",
             path=path,
         )
-    source = Source(path, read_text(path), DIALECTS[suffix])
+    seen = hashlib.sha256()
+    source = Source(path, read_text(path, seen), DIALECTS[suffix])
     with _silence() as said:
         try:
             parser = _parser(source)
@@ -104,7 +105,7 @@ def read_sequence(
     units = {"quadrupole": "k1", "thin_lens": "k1l"}
     return LatticeFile(
         path=path,
-        sha256=digest(path),
+        sha256=seen.hexdigest(),
         name=name,
         energy=total,
         particle=particle,
@@ -284,18 +285,15 @@ def _beam(parser: Any, source: Source, name: str, energy: float | None) -> tuple
                     f"a BEAM that cannot be read ({cause})", "energy = ..."
                 ) from None
     if particle not in REST_ENERGY:
-        raise source.error(f"particle '{particle}'", "electron, positron or proton")
+        raise source.error(f"particle '{particle}'", nearest(particle, list(REST_ENERGY)))
     if total is None:
         where = (
             "--energy in MeV" if source.dialect == ELEGANT else "BEAM, ENERGY = or --energy in MeV"
         )
         raise source.error("no beam energy in the file", f"{where} (energy= from Python)")
-    rest = REST_ENERGY[particle]
-    if not rest < total <= 1e7:
-        raise source.error(
-            f"an energy of {total:g} MeV",
-            f"a total energy between {rest:.6g} MeV and 10 TeV; BEAM is in GeV, --energy in MeV",
-        )
+    if expected := expected_energy(total, particle):
+        found = f"an energy of {total:g} MeV"
+        raise source.error(found, f"{expected}; BEAM is in GeV, --energy in MeV")
     return particle, float(total)
 
 

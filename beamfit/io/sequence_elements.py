@@ -1,4 +1,4 @@
-"""From the elements of a MAD or elegant line to the tables of a beamfit lattice.
+"""The elements of a MAD or elegant file as the tables of a beamfit lattice.
 
 What a first-order, uncoupled line of one energy cannot hold is refused, never dropped.
 """
@@ -6,17 +6,18 @@ What a first-order, uncoupled line of one energy cannot hold is refused, never d
 from __future__ import annotations
 
 import math
+import re
 from collections import Counter
 from collections.abc import Iterable, Mapping
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass
+from os import PathLike
+from typing import Any
 
 import numpy as np
 
-if TYPE_CHECKING:
-    from beamfit.errors import InputError
-    from beamfit.io.sequence_source import Source
+from beamfit.errors import InputError
 
-__all__ = ["element_tables"]
+__all__ = ["Source", "element_tables"]
 
 # Parameters that bend, focus, couple or accelerate in a way beamfit does not model.
 UNMODELLED = {
@@ -37,6 +38,26 @@ UNMODELLED = {
     "kill_exi_fringe": "an edge switched off",
 }
 EDGES = ("edge1_effects", "edge2_effects")
+
+
+@dataclass(frozen=True)
+class Source:
+    """The file being read, to say where something stands."""
+
+    path: str | PathLike[str]
+    text: str
+    dialect: str
+
+    def line_of(self, name: str) -> int | None:
+        """Line on which a name is defined, if it is in this file."""
+        pattern = re.compile(rf'\s*"?{re.escape(name)}"?\s*(:|=)', re.IGNORECASE)
+        lines = enumerate(self.text.splitlines(), start=1)
+        return next((n for n, t in lines if pattern.match(t)), None)
+
+    def error(self, found: str, expected: str, name: str | None = None) -> InputError:
+        """Make the error that names the file, and the line that defines ``name``."""
+        line = None if name is None else self.line_of(name)
+        return InputError(found, expected, path=self.path, line=line)
 
 
 def element_tables(

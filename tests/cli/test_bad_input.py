@@ -99,12 +99,17 @@ SCANS = {
         changed(",0.3,74", ",300,74").replace(",0.5,96", ",500,96").replace(",0.3,57", ",300,57"),
         ["size_x_error_um", "errors"],
     ),
-    "semicolons": (GOOD.replace(",", ";"), [":1:", "semicolons", "comma"]),
-    "tabs": (GOOD.replace(",", "\t"), [":1:", "tabs", "comma"]),
-    "spaces": (GOOD.replace(",", "  "), [":1:", "spaces", "comma"]),
     "decimal commas": (
         GOOD.replace(",", ";").replace(".", ","),
-        [":1:", "semicolons", "decimal point"],
+        [":2:", "'111,4'", "decimal point"],
+    ),
+    "decimal commas between tabs": (
+        GOOD.replace(",", "\t").replace(".", ","),
+        [":2:", "'111,4'", "decimal point"],
+    ),
+    "commas after a header of semicolons": (
+        HEADER.replace(",", ";") + "\n" + "\n".join(ROWS),
+        [":2:", "1 cells", "5"],
     ),
     "quoted decimal commas": (changed("53.6", '"53,6"'), [":4:", "53,6", "decimal point"]),
     "a column twice": (changed("size_y_um", "size_x_um"), [":1:", "size_x_um", "twice"]),

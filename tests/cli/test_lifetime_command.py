@@ -313,10 +313,11 @@ def test_a_setting_in_another_unit_is_refused(run, tmp_path, column, value, said
     assert said in err
 
 
-def test_a_record_with_semicolons_is_told_so(run, tmp_path):
+def test_a_decimal_comma_between_semicolons_is_told_so(run, tmp_path):
     path = tmp_path / "semi.csv"
     path.write_text("time_s;beam_current_mA\n0;100\n10;99,9\n")
     status, out, err = run("lifetime", str(path))
     assert (status, out) == (2, "")
-    assert "semi.csv:1" in err
-    assert "separated by semicolons" in err
+    assert "semi.csv:3" in err
+    assert "'99,9'" in err
+    assert "a decimal point" in err

@@ -42,6 +42,14 @@ def test_iso_and_unix_time_agree(tmp_path):
     assert iso.time.tolist() == unix.time.tolist() == [0.0, 60.5]
 
 
+@pytest.mark.parametrize("separator", [";", "\t", " "])
+def test_separators_and_units_do_not_matter(tmp_path, separator):
+    text = "time_s,beam_current_uA,rf_voltage_MV\n0,102e3,3.2\n60,101e3,3.2\n"
+    record = read_decay_record(write(tmp_path, text.replace(",", separator)))
+    np.testing.assert_allclose(record.current, [102.0, 101.0])
+    np.testing.assert_allclose(record.conditions.rf_voltage, 3.2e6)
+
+
 def test_hdf5_is_the_same_record(tmp_path):
     path = tmp_path / "run.h5"
     with h5py.File(path, "w") as file:
@@ -53,7 +61,7 @@ def test_hdf5_is_the_same_record(tmp_path):
     assert record.time.tolist() == [0.0, 60.0]
     assert record.start == 918720000.0
     assert record.conditions.pressure.tolist() == [1e-7, 1e-7]
-    assert record.comments == ("ring = APS",)
+    assert record.comments == ("ring: APS",)
 
 
 @pytest.mark.parametrize(

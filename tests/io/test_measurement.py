@@ -69,8 +69,22 @@ def test_provenance_is_kept_wherever_it_stands(read):
         PLAIN.rstrip("\n"),
         PLAIN.replace("Q_kG", '"Q_kG"').replace("60", '"60"'),
         PLAIN.replace("60", "6.0E1"),
+        PLAIN.replace(",", ";"),
+        PLAIN.replace(",", "\t"),
+        PLAIN.replace(",", "  "),
     ],
-    ids=["BOM", "CRLF", "Excel", "spaces", "no last line end", "quotes", "exponent"],
+    ids=[
+        "BOM",
+        "CRLF",
+        "Excel",
+        "spaces",
+        "no last line end",
+        "quotes",
+        "exponent",
+        "semicolons",
+        "tabs",
+        "blanks between",
+    ],
 )
 def test_how_programs_write_csv(text, read):
     scan = read(text)

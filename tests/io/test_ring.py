@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from beamfit.errors import InputError
-from beamfit.io.ring import read_operation, read_ring, ring_from_pyat
-from beamfit.io.twiss import read_twiss
+from beamfit.io.ring import read_operation, read_ring, read_twiss, ring_from_pyat
 from beamfit.lifetime.losses import loss_coefficients
 
 SPEAR3 = Path("lattices/spear3_2003.toml")
@@ -62,6 +61,10 @@ def test_averages_stand_for_a_table(tmp_path):
         ("[optics]\n", "[optics]\nbeta_x_m = 3\n", "twiss", "averages beside a table"),
         ("circumference_m = 234", "circumference_m = 250", "s_m", "a whole fraction of it"),
         ("[ring]", "[ring", None, "a ring file in TOML"),
+        ("[acceptance]", "[aceptance]", "aceptance", "did you mean acceptance?"),
+        ("energy_spread = 0.0009", "energy_spread = nan #", "energy_spread", "toml:11:"),
+        ("gas]\nN2 = 1.0", "gas.x]\nN2 = 1.0", "gas", "partial pressures"),
+        ("N2 = 1.0", "Xe = 1.0", "gas", "toml:32:"),
     ],
 )
 def test_bad_rings_are_named_by_key(tmp_path, old, new, column, words):

@@ -4,148 +4,64 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import replace
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from scipy.linalg import block_diag
 
 from beamfit.errors import InputError
-from beamfit.greybox import tree
+from beamfit.greybox import assess, problem, tree
+from beamfit.greybox.fit import Fit, Variable
+from beamfit.greybox.kkt import TOLERANCE
 from beamfit.greybox.many_starts import descend_all
+from beamfit.greybox.problem import Free, Problem, Record
+from beamfit.greybox.solve import solve
 from beamfit.optics.beamline import Beamline
 from beamfit.optics.calibration import SETTING_UNITS
-from beamfit.quantity import Quantity, Status
-from beamfit.studies.scan.setpoint_checks import checked_place
+from beamfit.quantity import Quantity
+from beamfit.studies.scan.calibration import with_numbers
+from beamfit.studies.scan.setpoint_result import (
+    Evidence,
+    Minimum,
+    PlaneBeam,
+    Setpoint,
+    doubts_on,
+    notes_on,
+    reached_words,
+    verdict_on,
+)
+from beamfit.studies.scan.wishes import Beam, Target, checked_place, common_energy, resolved
 
 __all__ = ["Beam", "Minimum", "PlaneBeam", "Setpoint", "Target", "find_setpoint"]
 
-# Starts of the search: enough for the handful of minima a few magnets have.
+# Starts of the search: enough for the minima that a few magnets have.
 STARTS = 256
 # Two end points are one minimum if they differ by less than this share of the range.
 SAME = 1e-3
+MOST_MINIMA = 10
 
 
-class Target(NamedTuple):
-    """What is wanted at the screen in one plane.
+@tree.node("names", "planes", "wishes")
+class _Wanted:
+    """The data of a search.
 
-    Attributes
-    ----------
-    kind : str
-        "size" (value in m), "divergence" (rad), or "match" to a design (β in m, α).
-    plane : str
-        "x" or "y".
-    value : float or tuple of float
-        The wanted value.
+    Magnets, planes and the wishes' kinds and rows among the planes are structure. `values` has
+    shape (wishes, 2), `middle` and `reach` (magnets,), `sigma` (planes, 3).
     """
-
-    kind: str
-    plane: str
-    value: Any
-
-
-class Beam(NamedTuple):
-    """σ11 (m²), σ12 (m rad), σ22 (rad²) of a plane at the start, and their covariance or None."""
-
-    sigma: np.ndarray
-    covariance: np.ndarray | None = None
-
-
-class PlaneBeam(NamedTuple):
-    """The beam predicted at the screen in one plane."""
-
-    plane: str
-    size: Quantity
-    divergence: Quantity
-    beta: Quantity
-    alpha: Quantity
-
-
-class Minimum(NamedTuple):
-    """Settings at which the objective has a minimum, and its value there."""
-
-    settings: dict[str, float]
-    objective: float
-
-
-@dataclass(frozen=True)
-class Setpoint:
-    """The best settings, what they give, and how sure that is.
-
-    Attributes
-    ----------
-    status : Status
-        ``converged``, or ``at_limit`` if a setting ends on a limit.
-    message : str
-        In a sentence or two.
-    best : Minimum
-        The best settings.
-    others : tuple of Minimum
-        Further local minima, best first.
-    setting_error : dict of str to float or None
-        How far the best setting moves with one standard deviation of the beam.
-    limits : tuple of str
-        Magnets whose setting ends on a limit.
-    screen : str
-        Where.
-    predicted : tuple of PlaneBeam
-        The beam there, with the beam's uncertainty carried along.
-    targets : tuple of Target
-        What was wanted.
-    units : dict of str to str
-        Of the settings.
-    energy : float
-        Total energy of the beam, MeV.
-    """
-
-    status: Status
-    message: str
-    best: Minimum
-    others: tuple[Minimum, ...]
-    setting_error: dict[str, float | None]
-    limits: tuple[str, ...]
-    screen: str
-    predicted: tuple[PlaneBeam, ...]
-    targets: tuple[Target, ...]
-    units: dict[str, str]
-    energy: float
-
-    def to_json(self) -> dict[str, Any]:
-        """Give the entry of ``results`` of the JSON contract; size and so on of the first plane."""
-        planes = {p.plane: {k: getattr(p, k).to_json() for k in p._fields[1:]}
-                  for p in self.predicted}  # fmt: skip
-        return {
-            "status": str(self.status),
-            "message": self.message,
-            "settings": self.best.settings,
-            "units": self.units,
-            "setting_errors": self.setting_error,
-            "objective": self.best.objective,
-            "screen": self.screen,
-            "energy": Quantity(self.energy, None, "MeV").to_json(),
-            **planes[self.targets[0].plane],
-            "planes": planes,
-            "targets": [t._asdict() for t in self.targets],
-            "other_minima": [m._asdict() for m in self.others],
-            "at_limit": list(self.limits),
-        }
-
-
-@tree.node("names", "place", "planes", "targets")
-class _Search:
-    """The data of a search: what is varied, where the beam is asked for, what is wanted."""
 
     names: tuple[str, ...]
-    place: str
     planes: tuple[str, ...]
-    targets: tuple[Target, ...]
+    wishes: tuple[tuple[str, int], ...]
     line: Any
-    sigma: Any
+    values: Any
     middle: Any
     reach: Any
+    sigma: Any
 
 
 def find_setpoint(
@@ -164,29 +80,37 @@ def find_setpoint(
     line : Beamline
         From where the beam matrix is known to the screen.
     beams : mapping of str to Beam
-        Plane to beam at the start.
+        Plane to beam at the start. A beam that says at which energy it was measured is carried at
+        that, and one that was fitted with a calibration meets it.
     vary : mapping of str to (float, float)
         Magnet to its limits, in the unit of its calibration. The others stay as the line has them.
     targets : sequence of Target
         What is wanted. The objective is the sum of (size - target)² in µm² and (divergence -
         target)² in µrad² (Appendix D), and of BMAG - 1 for a match.
     screen : str, optional
-        Where; the line's last screen if None.
+        Where; the line's last screen if None, or the place of its design for matches to that.
     seed : int
         Of the starts.
 
     Returns
     -------
     Setpoint
-        The lowest of the minima found from 256 starts that fill the box.
+        The lowest of the minima found from 256 starts that fill the box. Its status says whether
+        the wish is met, and if not what keeps it from being met.
 
     Raises
     ------
     InputError
-        If a magnet, screen or plane is unknown, limits are reversed, or nothing is wanted.
+        If a magnet, screen or plane is unknown, limits are reversed, nothing is wanted, or beams
+        are of different energies.
 
     Notes
     -----
+    The miss of a size is stated as a vector: with R the transfer matrix, σ = L Lᵀ the beam at the
+    start and v the first row of R L, the size is |v| and the miss (1 - target/|v|) v. Its square is
+    (size - target)², and where the target is out of reach the linear picture of v still has the
+    curvature that the picture of |v| lacks, so that Gauss-Newton comes to rest there too.
+
     The predicted beam has the error that the beam matrix gives it at fixed settings. The best
     setting I of a beam σ has ∂f/∂I(I, σ) = 0, so it moves by -(∂²f/∂I²)⁻¹ ∂²f/∂I∂σ dσ; that is its
     error.
@@ -200,36 +124,56 @@ def find_setpoint(
     >>> round(1e6 * found.predicted[0].size.value, 3), len(found.others)
     (100.0, 1)
     """
+    targets, screen = resolved(line, targets, screen)
     screen = checked_place(line, beams, vary, targets, screen)
-    low, high = (np.array([v[i] for v in vary.values()], float) for i in (0, 1))
-    middle, reach = 0.5 * (low + high), 0.5 * (high - low)
-    planes = tuple(dict.fromkeys(t.plane for t in targets))
-    sigma = {p: jnp.asarray(beams[p].sigma, float) for p in planes}
-    search = _Search(
-        tuple(vary), screen, planes, tuple(targets), line, sigma, jnp.asarray(middle),
-        jnp.asarray(reach),
-    )  # fmt: skip
-    one = jnp.ones(len(vary))
-    found = descend_all(_residual, search, jnp.asarray(_starts(len(vary), seed)), -one, one)
-    settled = np.where(np.asarray(found.rested), 2.0 * np.asarray(found.cost), np.inf)
-    if not np.isfinite(settled).any():
-        raise InputError("a beam that no setting within the limits can carry", "other limits")
-    minima = _distinct(np.asarray(found.theta), settled)
-    best = minima[0][0]
-    listed = [
-        Minimum(dict(zip(vary, map(float, middle + reach * t), strict=True)), f) for t, f in minima
-    ]
-    edge = np.abs(best) >= 1.0 - 1e-9
-    limits = tuple(n for n, e in zip(vary, edge, strict=True) if e)
-    predicted = tuple(_predicted(search, p, beams[p], best) for p in planes)
-    status = Status.at_limit if limits else Status.converged
-    errors = _setting_errors(search, beams, best, edge)
+    used = {plane: beams[plane] for plane in dict.fromkeys(t.plane for t in targets)}
+    energy = common_energy(used)
+    carrying = line if energy is None else replace(line, energy=energy)
+    for beam in beams.values():
+        carrying = with_numbers(carrying, beam.calibration)
+    wanted = _wanted(carrying.upto(screen), used, vary, targets)
+    minima, fit = _search(_stated(wanted), _starts(len(vary), seed))
     units = {name: SETTING_UNITS[line[name].calibration.unit] for name in vary}
-    words = _words(listed, limits, predicted, targets, units)
+    listed = [Minimum(_settings(wanted, theta), value) for theta, value in minima]
+    predicted = _predicted(wanted, used, fit.theta)
+    evidence = Evidence(
+        reached_words(targets, predicted, listed[0].objective),
+        _relative_misses(wanted, fit.theta),
+        listed[0].objective,
+        fit.kkt.worst <= TOLERANCE,
+        tuple(n for n, v in zip(vary, fit.variables, strict=True) if _pulled(v, fit.cost)),
+    )
+    status, message = verdict_on(evidence, listed, units)
     return Setpoint(
-        status, words, listed[0], tuple(listed[1:]), errors, limits, screen, predicted,
-        tuple(targets), units, float(line.energy),
+        status, message, listed[0], tuple(listed[1:]), _setting_errors(wanted, used, fit.theta),
+        tuple(n for n, t in zip(vary, fit.theta, strict=True) if abs(t) == 1.0), screen,
+        predicted, targets, units, float(carrying.energy), line.name,
+        notes_on(used, float(carrying.energy), float(line.energy)), doubts_on(used),
     )  # fmt: skip
+
+
+def _wanted(line, beams, vary, targets) -> _Wanted:
+    """Gather the data of a search; `line` ends at the place."""
+    low, high = np.array([*vary.values()], float).T
+    planes = tuple(beams)
+    return _Wanted(
+        tuple(vary),
+        planes,
+        tuple((t.kind, planes.index(t.plane)) for t in targets),
+        line,
+        jnp.array([np.broadcast_to(t.value, 2) for t in targets], float),
+        jnp.asarray(0.5 * (low + high)),
+        jnp.asarray(0.5 * (high - low)),
+        jnp.array([beam.sigma for beam in beams.values()], float),
+    )
+
+
+def _stated(wanted: _Wanted) -> Problem:
+    """The search as a problem: settings from -1 to 1 between their limits, no miss "measured"."""
+    size = len(wanted.names)
+    none = np.zeros((len(wanted.wishes), 2))
+    record = Record("wishes", _misses, wanted, none, error=1.0)
+    return Problem({"settings": jnp.zeros(size)}, [Free("settings", -1.0, 1.0)], [record])
 
 
 def _starts(count: int, seed: int) -> np.ndarray:
@@ -239,141 +183,143 @@ def _starts(count: int, seed: int) -> np.ndarray:
     return np.stack([even, *(random.permutation(even) for _ in range(count - 1))], -1)
 
 
-def _at_screen(search: _Search, theta: Array) -> dict[str, Array]:
-    """σ11, σ12, σ22 at the place, by plane."""
-    settings = dict(zip(search.names, search.middle + search.reach * theta, strict=True))
-    matrix = search.line.matrices((search.place,), settings)[search.place]
-    found = {}
-    for plane in search.planes:
-        r = getattr(matrix, plane)[:2, :2]
-        s11, s12, s22 = search.sigma[plane]
-        m = r @ jnp.stack([jnp.stack([s11, s12]), jnp.stack([s12, s22])]) @ r.T
-        found[plane] = jnp.stack([m[0, 0], m[0, 1], m[1, 1]])
-    return found
+def _settings(wanted: _Wanted, theta) -> dict[str, float]:
+    values = np.asarray(wanted.middle + wanted.reach * theta)
+    return dict(zip(wanted.names, map(float, values), strict=True))
 
 
-def _residual(search: _Search, theta: Array) -> Array:
-    """Misses of the targets: µm, µrad, and the two whose squares add to BMAG - 1."""
-    at, parts = _at_screen(search, theta), []
-    for target in search.targets:
-        s11, s12, s22 = at[target.plane]
-        if target.kind == "size":
-            parts.append(1e6 * (jnp.sqrt(s11) - target.value))
-        elif target.kind == "divergence":
-            parts.append(1e6 * (jnp.sqrt(s22) - target.value))
-        else:
-            beta, alpha = target.value
-            emittance = jnp.sqrt(s11 * s22 - s12**2)
-            ratio = jnp.sqrt(s11 / emittance / beta)
-            parts.append((ratio - 1.0 / ratio) / math.sqrt(2.0))
-            parts.append((ratio * alpha + s12 / emittance / ratio) / math.sqrt(2.0))
-    return jnp.stack(parts)
+def _at_place(wanted: _Wanted, theta: Array) -> Array:
+    """R L of each plane, shape (planes, 2, 2), with σ = L Lᵀ: rows are size and divergence."""
+    settings = dict(zip(wanted.names, wanted.middle + wanted.reach * theta, strict=True))
+    matrix = wanted.line.matrix(settings)
+    r = jnp.stack([getattr(matrix, plane)[:2, :2] for plane in wanted.planes])
+    l11 = jnp.sqrt(wanted.sigma[:, 0])
+    l21 = wanted.sigma[:, 1] / l11
+    l22 = jnp.sqrt(wanted.sigma[:, 2] - l21**2)
+    columns = [jnp.stack([l11, l21], -1), jnp.stack([jnp.zeros_like(l22), l22], -1)]
+    return r @ jnp.stack(columns, -1)
 
 
-def _distinct(theta: np.ndarray, objective: np.ndarray) -> list[tuple[np.ndarray, float]]:
-    """End points that are different minima, best first; wherever a search got stuck is dropped."""
-    kept: list[tuple[np.ndarray, float]] = []
-    for i in np.argsort(objective, kind="stable"):
-        if not np.isfinite(objective[i]):
-            continue
-        if all(np.abs(theta[i] - t).max() > 2.0 * SAME for t, _ in kept):
-            kept.append((theta[i], float(objective[i])))
-        if len(kept) == 10:
+def _far(row: int, vectors: Array, value: Array) -> Array:
+    """Miss of a size (row 0, µm) or a divergence (row 1, µrad), along its vector."""
+    v = vectors[row]
+    return 1e6 * (1.0 - value[0] / jnp.linalg.norm(v)) * v
+
+
+def _mismatched(vectors: Array, value: Array) -> Array:
+    """The two numbers whose squares add to BMAG - 1."""
+    (s11, s12), emittance = vectors @ vectors[0], jnp.linalg.det(vectors)
+    ratio = jnp.sqrt(s11 / emittance / value[0])
+    other = ratio * value[1] + s12 / emittance / ratio
+    return jnp.stack([ratio - 1.0 / ratio, other]) / math.sqrt(2.0)
+
+
+MISSES = {"size": partial(_far, 0), "divergence": partial(_far, 1), "match": _mismatched}
+
+
+def _misses(model: Any, wanted: _Wanted) -> Array:
+    """Miss of every wish, shape (wishes, 2); the objective is the sum of squares."""
+    at = _at_place(wanted, model["settings"])
+    pairs = zip(wanted.wishes, wanted.values, strict=True)
+    return jnp.stack([MISSES[kind](at[row], value) for (kind, row), value in pairs])
+
+
+def _search(stated: Problem, starts: np.ndarray) -> tuple[list[tuple[np.ndarray, float]], Fit]:
+    """Descend from every start and let the core judge the lowest; minima, best first."""
+    found = descend_all(
+        problem.residual, stated.core, jnp.asarray(starts), stated.lower, stated.upper
+    )
+    theta, cost = np.asarray(found.theta), np.asarray(found.cost)
+    if not np.isfinite(cost).any():
+        raise InputError("a beam that no setting within the limits can carry", "other limits")
+    order = [i for i in np.argsort(cost, kind="stable") if np.isfinite(cost[i])]
+    fit = solve(replace(stated, model={"settings": theta[order[0]]}))
+    minima = [(fit.theta, 2.0 * float(fit.cost))]
+    for i in order:
+        if len(minima) == MOST_MINIMA:
             break
-    return kept
+        if any(np.abs(theta[i] - t).max() <= 2.0 * SAME for t, _ in minima):
+            continue
+        # Where a search got stuck is no minimum.
+        if assess.state(stated, theta[i]).kkt.worst <= TOLERANCE:
+            minima.append((theta[i], 2.0 * float(cost[i])))
+    return minima, fit
 
 
 @jax.jit
-def _screen_numbers(search: _Search, theta: Array) -> Array:
-    """Size, divergence, β, α at the place, one row a plane."""
-    rows = []
-    for s11, s12, s22 in _at_screen(search, theta).values():
-        emittance = jnp.sqrt(s11 * s22 - s12**2)
-        rows.append(jnp.stack([jnp.sqrt(s11), jnp.sqrt(s22), s11 / emittance, -s12 / emittance]))
-    return jnp.stack(rows)
+def _numbers(wanted: _Wanted, theta: Array) -> tuple[Array, Array]:
+    """Size, divergence, β and α of each plane, shape (planes, 4), and their slopes by σ."""
+
+    def of_sigma(sigma):
+        v = _at_place(replace(wanted, sigma=sigma), theta)
+        s = v @ jnp.swapaxes(v, -1, -2)
+        s11, s12, s22, emittance = s[:, 0, 0], s[:, 0, 1], s[:, 1, 1], jnp.linalg.det(v)
+        return jnp.stack([jnp.sqrt(s11), jnp.sqrt(s22), s11 / emittance, -s12 / emittance], -1)
+
+    return of_sigma(wanted.sigma), jax.jacfwd(of_sigma)(wanted.sigma)
 
 
-def _with_sigma(search: _Search, sigma: Any) -> _Search:
-    return _Search(
-        search.names, search.place, search.planes, search.targets, search.line, sigma,
-        search.middle, search.reach,
-    )  # fmt: skip
+@jax.jit
+def _curvature(wanted: _Wanted, theta: Array) -> Array:
+    """Second derivatives of the objective by settings and σ together."""
+    size = len(wanted.names)
+
+    def objective(both):
+        sigma = both[size:].reshape(wanted.sigma.shape)
+        return jnp.sum(_misses({"settings": both[:size]}, replace(wanted, sigma=sigma)) ** 2)
+
+    both = jnp.concatenate([theta, wanted.sigma.ravel()])
+    return jax.jacfwd(jax.jacfwd(objective))(both)
 
 
-def _predicted(search: _Search, plane: str, beam: Beam, theta: np.ndarray) -> PlaneBeam:
-    row = search.planes.index(plane)
-
-    def of_sigma(s: Array) -> Array:
-        return _screen_numbers(_with_sigma(search, {**search.sigma, plane: s}), theta)[row]
-
-    value = np.asarray(of_sigma(search.sigma[plane]))
-    error: list[float | None] = [None] * 4
-    if beam.covariance is not None and np.isfinite(beam.covariance).all():
-        slope = np.asarray(jax.jacfwd(of_sigma)(search.sigma[plane]))
-        variance = np.einsum("ij,jk,ik->i", slope, beam.covariance, slope)
-        error = [float(v) for v in np.sqrt(np.maximum(variance, 0.0))]
-    units = ("m", "rad", "m", "1")
-    return PlaneBeam(
-        plane, *(Quantity(float(v), e, u) for v, e, u in zip(value, error, units, strict=True))
-    )
+def _covariance(beam: Beam) -> np.ndarray | None:
+    known = beam.covariance is not None and np.isfinite(beam.covariance).all()
+    return beam.covariance if known else None
 
 
-@partial(jax.jit)
-def _curvature(search: _Search, theta: Array) -> tuple[Array, Any]:
-    """Second derivatives of the objective by settings, and by settings and beam."""
+def _predicted(
+    wanted: _Wanted, beams: Mapping[str, Beam], theta: np.ndarray
+) -> tuple[PlaneBeam, ...]:
+    values, slopes = map(np.asarray, _numbers(wanted, jnp.asarray(theta)))
+    found = []
+    for i, (plane, beam) in enumerate(beams.items()):
+        covariance = _covariance(beam)
+        error: Sequence[float | None] = [None] * 4
+        if covariance is not None:
+            slope = slopes[i, :, i]
+            error = np.sqrt(np.einsum("ij,jk,ik->i", slope, covariance, slope).clip(0)).tolist()
+        parts = zip(values[i].tolist(), error, ("m", "rad", "m", "1"), strict=True)
+        found.append(PlaneBeam(plane, *(Quantity(*part) for part in parts)))
+    return tuple(found)
 
-    def objective(t, sigma):
-        r = _residual(_with_sigma(search, sigma), t)
-        return r @ r
 
-    slope = jax.grad(objective)
-    return jax.jacfwd(slope)(theta, search.sigma), jax.jacfwd(slope, 1)(theta, search.sigma)
+def _relative_misses(wanted: _Wanted, theta: np.ndarray) -> tuple[float, ...]:
+    """Distance of each wish over what is wanted; BMAG - 1 of a match."""
+    lengths = np.linalg.norm(_misses({"settings": theta}, wanted), axis=1)
+    values = 1e6 * np.asarray(wanted.values)[:, 0]
+    pairs = zip(wanted.wishes, lengths, values, strict=True)
+    return tuple(float(m**2 if MISSES[k] is _mismatched else m / v) for (k, _), m, v in pairs)
 
 
-def _setting_errors(search, beams, theta, edge) -> dict[str, float | None]:
+def _pulled(v: Variable, cost: float) -> bool:
+    """Whether a setting on its limit would lower the objective if it went on."""
+    return abs(v.value) == 1.0 and abs(v.reduced_gradient) > 1e-6 * cost
+
+
+def _setting_errors(
+    wanted: _Wanted, beams: Mapping[str, Beam], theta: np.ndarray
+) -> dict[str, float | None]:
     """Error of each best setting due to the beam; None at a limit or without a covariance."""
-    none = dict.fromkeys(search.names)
-    known = all(
-        beams[p].covariance is not None and np.isfinite(beams[p].covariance).all()
-        for p in search.planes
-    )
-    if not known or edge.all():
-        return none
-    second, mixed = _curvature(search, jnp.asarray(theta))
-    loose = np.flatnonzero(~edge)
-    second = np.asarray(second)[np.ix_(loose, loose)]
+    errors: dict[str, float | None] = dict.fromkeys(wanted.names)
+    covariances = [_covariance(beam) for beam in beams.values()]
+    loose = np.flatnonzero(np.abs(theta) < 1.0)
+    if any(c is None for c in covariances) or not loose.size:
+        return errors
+    rows = np.asarray(_curvature(wanted, jnp.asarray(theta)))[loose]
+    second, mixed = rows[:, loose], rows[:, len(theta) :]
     if np.linalg.cond(second) > 1e12:
-        return none
-    variance = np.zeros(len(loose))
-    for plane in search.planes:
-        moved = -np.linalg.solve(second, np.asarray(mixed[plane])[loose])
-        variance += np.einsum("ij,jk,ik->i", moved, beams[plane].covariance, moved)
-    found = np.sqrt(np.maximum(variance, 0.0)) * np.asarray(search.reach)[loose]
-    return none | {search.names[i]: float(e) for i, e in zip(loose, found, strict=True)}
-
-
-def _words(minima, limits, predicted, targets, units) -> str:
-    """A sentence on how well the wish is met, one on limits, one on other minima."""
-    by_plane = {p.plane: p for p in predicted}
-    said = []
-    for t in targets:
-        if t.kind == "match":
-            continue
-        said.append(f"{t.kind} {t.plane} {_micro(t, getattr(by_plane[t.plane], t.kind))}")
-    words = "; ".join(said) or f"BMAG - 1 = {minima[0].objective:.3g} over the planes asked for"
-    words = words[0].upper() + words[1:] + "."
-    if limits:
-        words += f" {', '.join(limits)} at a limit: a wider one would do better."
-    if len(minima) > 1:
-        other = minima[1]
-        at = ", ".join(f"{n} = {v:.4g} {units[n]}" for n, v in other.settings.items())
-        alike = other.objective - minima[0].objective < 1e-6 * (1.0 + minima[0].objective)
-        lead = "Other settings do as well, such as" if alike else "The next local minimum is"
-        words += f" {lead} {at} (objective {other.objective:.6g})."
-    return words
-
-
-def _micro(target: Target, got: Quantity) -> str:
-    unit = "µm" if target.kind == "size" else "µrad"
-    error = "" if got.error is None else f" ± {1e6 * got.error:.2g}"
-    return f"{1e6 * got.value:.4g}{error} {unit} for {1e6 * target.value:.4g} wanted"
+        return errors
+    moved = np.linalg.solve(second, mixed)
+    variance = np.einsum("ij,jk,ik->i", moved, block_diag(*covariances), moved)
+    found = np.sqrt(variance.clip(0)) * np.asarray(wanted.reach)[loose]
+    return errors | {wanted.names[i]: float(e) for i, e in zip(loose, found, strict=True)}

@@ -1,0 +1,350 @@
+"""Named columns from CSV, TFS and HDF5 files, with the place of every value.
+
+A reader of scans, records or optics says which quantities its columns may hold; what can be wrong
+with a table as such is found and named here.
+"""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from os import PathLike
+from pathlib import Path
+from statistics import mode
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from beamfit.errors import InputError, nearest
+from beamfit.io.files import digest, text_lines
+
+__all__ = ["UNITS", "Column", "Sheet", "columns_of", "read_sheet"]
+
+UNITS: dict[str, dict[str, float]] = {
+    # quantity: unit at the end of a name -> factor to SI (a stored current: to mA)
+    "length": {"um": 1e-6, "mm": 1e-3, "m": 1.0, "µm": 1e-6, "μm": 1e-6},
+    "time": {"s": 1.0},
+    "current": {"mA": 1.0, "A": 1e3, "uA": 1e-3},
+    "voltage": {"kV": 1e3, "V": 1.0, "MV": 1e6},
+    "pressure": {"Pa": 1.0, "mbar": 100.0},
+    "energy in MeV": {"MeV": 1.0},
+}
+HDF5 = {".h5", ".hdf5"}
+WORD = re.compile(r'"[^"]*"|\S+')
+
+
+class Column(NamedTuple):
+    """What a header means: the quantity, the unit it is in, and the factor to SI."""
+
+    header: str
+    key: str
+    unit: str = ""
+    factor: float = 1.0
+
+
+@dataclass(frozen=True)
+class Sheet:
+    """The cells of a file, one sequence a column, and where each row stands.
+
+    Attributes
+    ----------
+    path : str or path
+        The file.
+    names : tuple of str
+        Headers, in the order of the file.
+    cells : sequence of sequences
+        Texts (or numbers, of HDF5) of each column.
+    lines : sequence of int or None
+        Line of each row; None for HDF5, whose rows are counted.
+    header : int or None
+        Line of the header.
+    comments : tuple of str
+        Comment lines, TFS descriptors, or attributes of an HDF5 file.
+    sha256 : str
+        Digest of the file.
+    """
+
+    path: str | PathLike[str]
+    names: tuple[str, ...]
+    cells: Sequence[Sequence[Any]]
+    lines: Sequence[int] | None
+    header: int | None
+    comments: tuple[str, ...]
+    sha256: str = ""
+
+    def __len__(self) -> int:
+        return len(self.cells[0])
+
+    def __getitem__(self, name: str) -> Sequence[Any]:
+        return self.cells[self.names.index(name)]
+
+    def error(
+        self, found: str, expected: str, row: int | None = None, column: str | None = None
+    ) -> InputError:
+        """Make the error that names the file, and the row and column if there are any."""
+        if row is not None and self.lines is None:
+            return self.error(f"reading {row + 1}: {found}", expected, None, column)
+        line = None if row is None else self.lines[row]
+        return InputError(found, expected, path=self.path, line=line, column=column)
+
+    def header_error(self, found: str, expected: str, column: str | None = None) -> InputError:
+        """Make the error that names the header, and the column if it is one alone."""
+        return InputError(found, expected, path=self.path, line=self.header, column=column)
+
+    def numbers(
+        self,
+        name: str,
+        *,
+        blank: bool = False,
+        read: Callable[[Any], float] = float,
+        expected: str = "a number",
+    ) -> np.ndarray:
+        """Read a column of finite numbers.
+
+        Parameters
+        ----------
+        name : str
+            Its header.
+        blank : bool
+            Whether a cell may be blank; it is NaN then.
+        read : callable
+            From a cell to a number, or ValueError.
+        expected : str
+            What the cell should have been, for the message.
+
+        Raises
+        ------
+        InputError
+            Naming line and column of the first cell that is no number.
+        """
+        values = np.empty(len(self))
+        for row, cell in enumerate(self[name]):
+            try:
+                values[row] = np.nan if blank and cell == "" else read(cell)
+            except (ValueError, TypeError, OverflowError):
+                comma = " with a decimal point" if "," in str(cell) else ""
+                found = "an empty cell" if cell == "" else f"'{cell}'"
+                raise self.error(found, expected + comma, row, name) from None
+            if cell != "" and not np.isfinite(values[row]):
+                raise self.error(f"'{cell}'", "a finite number", row, name)
+        return values
+
+
+def columns_of(
+    sheet: Sheet,
+    quantities: Mapping[str, str],
+    other: Callable[[str], Column | None] = lambda header: None,
+) -> dict[str, Column]:
+    """Understand every header of a sheet.
+
+    Parameters
+    ----------
+    sheet : Sheet
+        The file.
+    quantities : mapping of str to str
+        Name of a column without its unit to the kind of unit it has, a key of `UNITS`; "" for a
+        pure number or a word.
+    other : callable
+        Understands further headers; gives None for those that nobody knows.
+
+    Returns
+    -------
+    dict of str to Column
+        By quantity.
+
+    Raises
+    ------
+    InputError
+        If a header or its unit is unknown, or a quantity stands twice.
+
+    Examples
+    --------
+    >>> sheet = Sheet("a.csv", ("size_x_mm",), [["0.1"]], [2], 1, ())
+    >>> columns_of(sheet, {"size_x": "length"})["size_x"].factor
+    0.001
+    """
+    found: dict[str, Column] = {}
+    for header in sheet.names:
+        column = _known(header, quantities, sheet) or other(header)
+        if column is None:
+            usual = [f"{q}_{next(iter(UNITS[k]))}" if k else q for q, k in quantities.items()]
+            raise sheet.header_error("an unknown column", nearest(header, usual), header)
+        if column.key in found:
+            raise sheet.header_error(
+                f"{column.key} also in column '{found[column.key].header}'",
+                "one column for it, in one unit, and none twice",
+                header,
+            )
+        found[column.key] = column
+    return found
+
+
+def _known(header: str, quantities: Mapping[str, str], sheet: Sheet) -> Column | None:
+    """The column of a header NAME or NAME_UNIT."""
+    if quantities.get(header) == "":
+        return Column(header, header)
+    name, _, unit = header.rpartition("_")
+    if not (kind := quantities.get(name)):
+        return None
+    units = UNITS[kind]
+    if unit not in units:
+        listed = ", ".join(u for u in units if u.isascii())
+        raise sheet.header_error(
+            f"unknown unit '{unit}'",
+            f"one of {listed} at the end, such as {name}_{next(iter(units))}",
+            header,
+        )
+    return Column(header, name, unit, units[unit])
+
+
+def read_sheet(path: str | PathLike[str], example: str, most: int | None = None) -> Sheet:
+    """Read the columns of a CSV, TFS or HDF5 file.
+
+    Parameters
+    ----------
+    path : str or path
+        The file; HDF5 if its name ends in .h5 or .hdf5, with one dataset a column. Columns of
+        text are separated by commas, semicolons, tabs or blanks: the header tells.
+    example : str
+        A header such as the file should have, for messages.
+    most : int, optional
+        Most rows there may be.
+
+    Returns
+    -------
+    Sheet
+        With stripped cells. Lines that begin with # are its comments.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read, is something else, has no header, or a row has not as many
+        cells as the header.
+
+    Examples
+    --------
+    >>> import tempfile, pathlib
+    >>> file = pathlib.Path(tempfile.mkdtemp()) / "a.csv"
+    >>> _ = file.write_text("# noon\\ns_m;beta_x_m\\n0;1.5\\n\\n1;2.5\\n")
+    >>> sheet = read_sheet(file, "s_m,beta_x_m")
+    >>> sheet.numbers("beta_x_m").tolist(), sheet.lines, sheet.comments
+    ([1.5, 2.5], [3, 5], ('noon',))
+    """
+    if Path(path).suffix.lower() in HDF5:
+        return _read_hdf5(path, most)
+    names, header, separator = None, None, ""
+    comments, rows, lines, seen = [], [], [], hashlib.sha256()
+    for line, text in enumerate(text_lines(path, seen), start=1):
+        start = text.strip()[:1]
+        if start == "#" or (start in ("@", "$") and (names is None or separator == " ")):
+            comments.append(text.strip().lstrip("# ").rstrip())
+        elif names is None and start == "*":  # of a TFS file
+            separator, header = " ", line
+            names = [name.upper() for name in _split(text, " ", path, line)[1:]]
+        elif not text.strip().strip(",;\t "):
+            continue
+        elif names is None:
+            separator = next((s for s in ",;\t" if s in text), " ")
+            names, header = _split(text, separator, path, line), line
+            _check_header(names, example, path, line)
+        else:
+            rows.append(_split(text, separator, path, line))
+            lines.append(line)
+            if len(rows[-1]) != len(names):
+                found, expected = f"{len(rows[-1])} cells", f"{len(names)}, as in the header"
+                raise InputError(found, expected, path=path, line=line)
+            _check_length(len(rows), most, path, line)
+    if names is None:
+        raise InputError("no header and no rows", f"a header line such as {example}", path=path)
+    cells = list(zip(*rows, strict=True)) if rows else [()] * len(names)
+    return Sheet(path, tuple(names), cells, lines, header, tuple(comments), seen.hexdigest())
+
+
+def _split(text: str, separator: str, path: str | PathLike[str], line: int) -> list[str]:
+    """The cells of one line."""
+    if separator == " ":
+        return [word.strip('"') for word in WORD.findall(text)]
+    try:
+        cells = next(csv.reader([text], delimiter=separator, skipinitialspace=separator != "\t"))
+    except csv.Error:  # a carriage return within the line
+        raise InputError(
+            "line ends that are carriage returns",
+            "line feeds: save the file as CSV (UTF-8) again",
+            path=path,
+            line=line,
+        ) from None
+    return [cell.strip() for cell in cells]
+
+
+def _check_header(names: list[str], example: str, path: str | PathLike[str], line: int) -> None:
+    """Tell what is put in the place of a header."""
+    if names[0].startswith("format") and "beamfit-" in names[-1]:
+        raise InputError(
+            "a lattice where the table should be",
+            "the scan first and the lattice after --lattice; are they swapped?",
+            path=path,
+            line=line,
+        )
+    try:
+        [float(name) for name in names]
+    except ValueError:
+        return
+    expected = f"a header line such as {example}"
+    raise InputError("numbers where the header should be", expected, path=path, line=line)
+
+
+def _check_length(
+    rows: int, most: int | None, path: str | PathLike[str], line: int | None = None
+) -> None:
+    if most is not None and rows > most:
+        expected = "fewer: average what is repeated, or cut the file"
+        raise InputError(f"more than {most} rows", expected, path=path, line=line)
+
+
+def _read_hdf5(path: str | PathLike[str], most: int | None) -> Sheet:
+    import h5py
+
+    sha256 = digest(path)  # says what is wrong with the path itself
+    try:
+        with h5py.File(path, "r") as store:
+            names = tuple(n for n in store if isinstance(store.get(n), h5py.Dataset))
+            cells = [_dataset(store[name], name, path, most) for name in names]
+            comments = tuple(f"{key}: {value}" for key, value in store.attrs.items())
+    except InputError:
+        raise
+    except (OSError, RuntimeError, ValueError, TypeError, KeyError):
+        raise InputError(
+            "a file that is not HDF5, or is damaged", "an HDF5 file; text is .csv", path=path
+        ) from None
+    if not names:
+        raise InputError("no datasets", "one dataset a column", path=path)
+    usual = mode(sorted(len(column) for column in cells))
+    like = next(n for n, column in zip(names, cells, strict=True) if len(column) == usual)
+    for name, column in zip(names, cells, strict=True):
+        if len(column) != usual:
+            expected = f"{usual}, as in '{like}': datasets of equal lengths"
+            raise InputError(f"{len(column)} readings", expected, path=path, column=name)
+    return Sheet(path, names, cells, None, None, comments, sha256)
+
+
+def _dataset(data: Any, name: str, path: str | PathLike[str], most: int | None) -> list[Any]:
+    """The values of a dataset: texts or numbers."""
+    import h5py
+
+    found = None
+    if data.shape is None or data.ndim > 1:
+        found, expected = f"a dataset of shape {data.shape}", "a one-dimensional dataset"
+    elif h5py.check_string_dtype(data.dtype) is not None:
+        try:
+            return [str(v) for v in np.atleast_1d(data.asstr("utf-8")[()])]
+        except UnicodeDecodeError:
+            found, expected = "bytes that are not text", "UTF-8 text"
+    elif data.dtype.kind not in "iuf":
+        found, expected = f"values of type {data.dtype}", "numbers or text"
+    if found is not None:
+        raise InputError(found, expected, path=path, column=name)
+    _check_length(data.size, most, path)
+    return np.atleast_1d(data[()]).astype(float).tolist()

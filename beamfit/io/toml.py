@@ -1,0 +1,253 @@
+"""TOML files checked against a schema: which keys a table may have, of what kind, in what range."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+import re
+import tomllib
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from os import PathLike
+from typing import Any, NamedTuple
+
+from beamfit.errors import InputError, nearest
+from beamfit.io.files import read_text
+
+__all__ = ["FLAG", "LIST", "REQUIRED", "TABLE", "TEXT", "Key", "Section", "is_number", "read_toml"]
+
+REQUIRED: Any = object()
+TEXT, LIST, FLAG, TABLE, NUMBER = str, list, bool, dict, (int, float)
+# How each kind of value is called in a message.
+KINDS = {
+    NUMBER: "a number",
+    TEXT: "text in quotes",
+    LIST: "a list",
+    FLAG: "true or false",
+    TABLE: "a table",
+}
+
+
+class Key(NamedTuple):
+    """What may stand under a key.
+
+    Attributes
+    ----------
+    field : str
+        Name of the value it gives; "" for what is only checked.
+    factor : float
+        SI value of one unit.
+    default : object
+        Value where the key is missing, in SI; `REQUIRED` if it must be there.
+    low, high : float
+        Numbers lie between the two and are neither.
+    said : str
+        That range in words.
+    kind : type
+        Of the value.
+    """
+
+    field: str = ""
+    factor: float = 1.0
+    default: Any = REQUIRED
+    low: float = -math.inf
+    high: float = math.inf
+    said: str = ""
+    kind: Any = NUMBER
+
+    def amiss(self, value: object) -> str | None:
+        """Say what should stand there instead of a value, or None if the value is good.
+
+        Examples
+        --------
+        >>> Key(low=0.0, said="a positive number").amiss(-1.0)
+        'a positive number'
+        """
+        usual = KINDS[self.kind]
+        if not isinstance(value, self.kind) or (isinstance(value, bool) and self.kind is not FLAG):
+            return usual
+        if self.kind is TEXT and not value.strip():
+            return "a name"
+        if self.kind is not NUMBER or value == self.default:
+            return None
+        if not is_number(value):
+            return usual
+        return None if self.low < value < self.high else self.said
+
+
+def is_number(value: object) -> bool:
+    """Whether a value of a file is a finite number (an integer of 400 digits is none)."""
+    return isinstance(value, NUMBER) and not isinstance(value, bool) and abs(value) < 1e300
+
+
+@dataclass(frozen=True)
+class Section:
+    """A table of a file, and where in the text it begins.
+
+    Attributes
+    ----------
+    path : str or path
+        The file.
+    lines : tuple of str
+        Its text.
+    table : mapping
+        Keys and values.
+    start : int
+        Line at which the table begins, counted from 0.
+    words : str
+        Where that is, for messages.
+    prefix : str
+        What stands before the names of its own tables.
+    sha256 : str
+        Digest of the file.
+    """
+
+    path: str | PathLike[str]
+    lines: tuple[str, ...]
+    table: Mapping[str, Any]
+    start: int = 0
+    words: str = "at the top level"
+    prefix: str = ""
+    sha256: str = ""
+
+    def error(self, found: str, expected: str, key: str | None = None) -> InputError:
+        """Make the error that names the line on which the key (or the table) stands."""
+        line = self.start + 1 if key is None else self._line(re.escape(key)) + 1
+        return InputError(found, expected, path=self.path, line=line, column=key)
+
+    def _line(self, key: str) -> int:
+        """Where `key =` stands before the next table begins, or where a table of that name does."""
+        value = re.compile(rf"\s*['\"]?{key}['\"]?\s*=")
+        head = re.compile(rf"\s*\[\[?\s*{self.prefix}{key}\s*\]")
+        inside = True
+        for n in range(self.start, len(self.lines)):
+            inside = inside and (n == self.start or not self.lines[n].lstrip().startswith("["))
+            if (inside and value.match(self.lines[n])) or head.match(self.lines[n]):
+                return n
+        return self.start
+
+    def section(self, name: str) -> Section:
+        """A table of this one, empty where there is none.
+
+        Raises
+        ------
+        InputError
+            If something else stands under its name.
+        """
+        table = self.table.get(name, {})
+        if not isinstance(table, dict):
+            raise self.error(f"{name} = {table!r}"[:80], f"a table [{name}]", name)
+        head = re.compile(rf"\s*\[?\s*{re.escape(name)}\b")
+        start = next((n for n, text in enumerate(self.lines) if head.match(text)), 0)
+        return Section(self.path, self.lines, table, start, f"in [{name}]", f"{name}.")
+
+    def sections(self, name: str) -> list[Section]:
+        """The tables of a list of tables [[name]].
+
+        Raises
+        ------
+        InputError
+            If there is none, or one of them is no table.
+        """
+        head = re.compile(rf"\s*\[\[\s*{re.escape(name)}\s*\]\]")
+        heads = [n for n, text in enumerate(self.lines) if head.match(text)]
+        tables = self.table[name]
+        for table in tables or [None]:
+            if not isinstance(table, dict):
+                found = f"{name} {table!r}"[:80] if tables else f"no {name}s"
+                raise self.error(found, f"tables [[{name}]] in their order", name)
+        starts = heads + [0] * (len(tables) - len(heads))
+        return [
+            Section(self.path, self.lines, table, start, f"in {name} {number}", f"{name}.")
+            for number, (table, start) in enumerate(zip(tables, starts, strict=False), 1)
+        ]
+
+    def values(self, keys: Mapping[str, Key]) -> dict[str, Any]:
+        """Check every key, and give the values in SI by field.
+
+        Raises
+        ------
+        InputError
+            If a key is missing, unknown, of another kind or out of its range.
+        """
+        for name, value in self.table.items():
+            if name not in keys:
+                raise self.error("an unknown key", nearest(name, list(keys)), name)
+            if expected := keys[name].amiss(value):
+                raise self.error(f"{value!r}"[:80], expected, name)
+        for name, key in keys.items():
+            if name not in self.table and key.default is REQUIRED:
+                raise self.error(f"the key is missing {self.words}", KINDS[key.kind], name)
+        return {
+            key.field: key.default
+            if name not in self.table
+            else (self.table[name] * key.factor if key.kind is NUMBER else self.table[name])
+            for name, key in keys.items()
+            if key.field
+        }
+
+    def one_of(self, names: Iterable[str]) -> str:
+        """The one of some keys that is given.
+
+        Raises
+        ------
+        InputError
+            If there is none, or more than one.
+        """
+        names = list(names)
+        given = [name for name in names if name in self.table]
+        if len(given) != 1:
+            found = f"{'both' if given else 'neither'} of {' and '.join(given or names)}"
+            expected = "one of " + ", ".join(names)
+            raise self.error(f"{found} {self.words}", expected, (given or names)[-1])
+        return given[0]
+
+
+def read_toml(path: str | PathLike[str], what: str) -> Section:
+    """Read a TOML file.
+
+    Parameters
+    ----------
+    path : str or path
+        The file.
+    what : str
+        What it should be, such as "a lattice".
+
+    Returns
+    -------
+    Section
+        Its top level.
+
+    Raises
+    ------
+    InputError
+        If it cannot be read or does not parse, with the line.
+
+    Examples
+    --------
+    >>> import tempfile, pathlib
+    >>> file = pathlib.Path(tempfile.mkdtemp()) / "a.toml"
+    >>> _ = file.write_text("length_mm = 2.0\\n")
+    >>> read_toml(file, "a lattice").values({"length_mm": Key("length", 1e-3)})
+    {'length': 0.002}
+    """
+    seen = hashlib.sha256()
+    text = read_text(path, seen)
+    lines = tuple(text.splitlines())
+    try:
+        return Section(path, lines, tomllib.loads(text), sha256=seen.hexdigest())
+    except (ValueError, RecursionError) as error:  # integers too long, nesting too deep
+        if re.search(r"^[^#=\n]*\bsize_[xy]_", text, re.MULTILINE):
+            raise InputError(
+                f"a scan where {what} should be",
+                "the scan first and the lattice after --lattice; are they swapped?",
+                path=path,
+            ) from None
+        line = re.search(r"at line (\d+)", str(error))
+        cause = re.sub(r"\s*\(at .*\)", "", str(error))
+        raise InputError(
+            f"TOML that does not parse ({cause})",
+            f"{what} file in TOML",
+            path=path,
+            line=int(line[1]) if line else len(lines),
+        ) from None
