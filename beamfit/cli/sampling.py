@@ -46,7 +46,7 @@ class Sampling(NamedTuple):
             return
         if not self.wanted:
             raise InputError("--store without --sample", "--sample, which fills the store")
-        from beamfit.sampling.place import check_place
+        from beamfit.sampling.store import check_place
 
         check_place(self.store)
 
@@ -95,12 +95,11 @@ def sampling_options(command: Callable[..., Any]) -> Callable[..., Any]:
 def print_posterior(console: Console, title: str, posterior: Posterior) -> None:
     """Show intervals, verdict and diagnostics."""
     from beamfit.cli.terminal import plain_table, verdict_text
-    from beamfit.sampling.text import HEADER, interval_rows
 
-    table = plain_table(f"\n{title}")
-    for name in HEADER:
+    found, table = posterior.table(), plain_table(f"\n{title}")
+    for name in found.header:
         table.add_column(name, no_wrap=True)
-    for row in interval_rows(posterior):
+    for row in found.rows:
         table.add_row(*row)
     console.print(table)
     console.print(verdict_text("posterior", posterior.status, posterior.message))

@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from functools import cached_property
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -31,13 +32,44 @@ class Distribution(Protocol):
         """Ends of the support."""
 
 
+class _OfScipy:
+    """A prior with the names of its field, computed by the distribution of scipy it names."""
+
+    # How scipy calls the distribution, and its arguments.
+    _call: tuple[str, dict[str, float]]
+
+    @cached_property
+    def _frozen(self) -> Any:
+        from scipy import stats  # half a second that only sampling should cost
+
+        name, arguments = self._call
+        return getattr(stats, name)(**arguments)
+
+    def logpdf(self, x: np.ndarray) -> np.ndarray:
+        """Log density at x; -inf outside the support."""
+        return self._frozen.logpdf(x)
+
+    def mean(self) -> float:
+        """Mean."""
+        return float(self._frozen.mean())
+
+    def std(self) -> float:
+        """Standard deviation."""
+        return float(self._frozen.std())
+
+    def support(self) -> tuple[float, float]:
+        """Ends of the support."""
+        low, high = self._frozen.support()
+        return float(low), float(high)
+
+
 def _positive(value: float, what: str) -> None:
     if not (value > 0 and math.isfinite(value)):
         raise InputError(f"{what} {value}", "a positive number")
 
 
 @dataclass(frozen=True)
-class Normal:
+class Normal(_OfScipy):
     """A normal prior.
 
     Parameters
@@ -64,25 +96,13 @@ class Normal:
         if not math.isfinite(self.centre):
             raise InputError(f"a centre of {self.centre}", "a finite number")
 
-    def logpdf(self, x: np.ndarray) -> np.ndarray:
-        """Log density at x."""
-        return -0.5 * ((x - self.centre) / self.sd) ** 2 - math.log(self.sd * math.sqrt(2 * np.pi))
-
-    def mean(self) -> float:
-        """The centre."""
-        return self.centre
-
-    def std(self) -> float:
-        """The standard deviation."""
-        return self.sd
-
-    def support(self) -> tuple[float, float]:
-        """Everything."""
-        return -math.inf, math.inf
+    @property
+    def _call(self) -> tuple[str, dict[str, float]]:
+        return "norm", {"loc": self.centre, "scale": self.sd}
 
 
 @dataclass(frozen=True)
-class LogNormal:
+class LogNormal(_OfScipy):
     """A normal prior on the logarithm: for a number known up to a factor.
 
     Parameters
@@ -111,29 +131,13 @@ class LogNormal:
         _positive(self.median, "a median of")
         _positive(self.log_sd, "a logarithmic standard deviation of")
 
-    def logpdf(self, x: np.ndarray) -> np.ndarray:
-        """Log density at x."""
-        inside = np.asarray(x) > 0
-        log = np.log(np.where(inside, x, 1.0))
-        off = (log - math.log(self.median)) / self.log_sd
-        value = -0.5 * off**2 - log - math.log(self.log_sd * math.sqrt(2 * np.pi))
-        return np.where(inside, value, -np.inf)
-
-    def mean(self) -> float:
-        """Mean."""
-        return self.median * math.exp(0.5 * self.log_sd**2)
-
-    def std(self) -> float:
-        """Standard deviation."""
-        return self.mean() * math.sqrt(math.expm1(self.log_sd**2))
-
-    def support(self) -> tuple[float, float]:
-        """Positive numbers."""
-        return 0.0, math.inf
+    @property
+    def _call(self) -> tuple[str, dict[str, float]]:
+        return "lognorm", {"s": self.log_sd, "scale": self.median}
 
 
 @dataclass(frozen=True)
-class Uniform:
+class Uniform(_OfScipy):
     """A flat prior between two ends.
 
     Parameters
@@ -159,26 +163,13 @@ class Uniform:
         if not (math.isfinite(self.low) and math.isfinite(self.high) and self.low < self.high):
             raise InputError(f"a uniform prior from {self.low} to {self.high}", "two ends in order")
 
-    def logpdf(self, x: np.ndarray) -> np.ndarray:
-        """Log density at x."""
-        inside = (np.asarray(x) >= self.low) & (np.asarray(x) <= self.high)
-        return np.where(inside, -math.log(self.high - self.low), -np.inf)
-
-    def mean(self) -> float:
-        """The middle."""
-        return 0.5 * (self.low + self.high)
-
-    def std(self) -> float:
-        """The width over sqrt(12)."""
-        return (self.high - self.low) / math.sqrt(12.0)
-
-    def support(self) -> tuple[float, float]:
-        """The two ends."""
-        return self.low, self.high
+    @property
+    def _call(self) -> tuple[str, dict[str, float]]:
+        return "uniform", {"loc": self.low, "scale": self.high - self.low}
 
 
 @dataclass(frozen=True)
-class HalfNormal:
+class HalfNormal(_OfScipy):
     """The positive half of a normal prior about zero: small rather than large, never negative.
 
     Parameters
@@ -202,23 +193,9 @@ class HalfNormal:
     def __post_init__(self) -> None:
         _positive(self.scale, "a scale of")
 
-    def logpdf(self, x: np.ndarray) -> np.ndarray:
-        """Log density at x."""
-        value = -0.5 * (np.asarray(x) / self.scale) ** 2
-        value = value + 0.5 * math.log(2 / np.pi) - math.log(self.scale)
-        return np.where(np.asarray(x) >= 0, value, -np.inf)
-
-    def mean(self) -> float:
-        """Mean."""
-        return self.scale * math.sqrt(2 / np.pi)
-
-    def std(self) -> float:
-        """Standard deviation."""
-        return self.scale * math.sqrt(1 - 2 / np.pi)
-
-    def support(self) -> tuple[float, float]:
-        """Zero and above."""
-        return 0.0, math.inf
+    @property
+    def _call(self) -> tuple[str, dict[str, float]]:
+        return "halfnorm", {"scale": self.scale}
 
 
 def checked(

@@ -61,7 +61,7 @@ def test_groups_say_where_it_comes_from(tmp_path):
         provenance=Provenance("beamfit x", {"scan.csv": "ab12"}),
     )
     with h5py.File(path, "r") as file:
-        assert set(file) == {"mcmc", "observed", "fit", "posterior", "proposal", "provenance"}
+        assert set(file) == {"mcmc", "observed", "fit", "posterior", "provenance"}
         np.testing.assert_array_equal(file["observed/size m"][:], [1.0, 2.0])
         assert [v.decode() for v in file["observed/screen"][:]] == ["A", "B"]
         np.testing.assert_array_equal(file["fit/mode"][:], stated.mode)

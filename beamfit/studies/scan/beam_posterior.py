@@ -1,128 +1,88 @@
-"""The posterior of beam matrices: σ of each plane, flat over all that are positive definite."""
+"""The posterior of a scan: σ of each plane, flat over all that are positive definite."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import NamedTuple
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any, Protocol
 
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
 from beamfit.errors import InputError
+from beamfit.greybox.fit import Fit
+from beamfit.greybox.posterior import Optimum, Statement, record_of, target_of
+from beamfit.greybox.problem import Problem
 from beamfit.optics.beam import BeamMatrix
+from beamfit.optics.beamline import Beamline
 from beamfit.optics.particle import beta_gamma
 from beamfit.quantity import Status
-from beamfit.sampling.likelihood import Group, Likelihood
+from beamfit.sampling.posterior import Expected, Posterior
 from beamfit.sampling.priors import Distribution, checked
-from beamfit.sampling.target import Derived, Law, Target
-from beamfit.studies.scan.fit import EmittanceFit
+from beamfit.sampling.target import Target
 from beamfit.studies.scan.results import PlaneFit
-from beamfit.studies.scan.transport import plane_input, scan_rows, scanned_line, transfer_rows
+from beamfit.studies.scan.scans import QuadScan
+from beamfit.studies.scan.scenario_data import see
+from beamfit.studies.scan.scenario_model import UNIT, sigma_of
+from beamfit.verdict import Finding
 
-__all__ = ["Sizes", "beam_target"]
+__all__ = ["beam_target", "expected_sizes"]
 
-NAMES, UNITS = ("sigma11", "sigma12", "sigma22"), ("m^2", "m rad", "rad^2")
+CHOLESKY = ("l11", "l21", "l22")
+SIGMA = {"sigma11": "m^2", "sigma12": "m rad", "sigma22": "rad^2"}
 TWISS = {"emittance": "m", "normalized_emittance": "m", "beta": "m", "alpha": "1", "mismatch": "1"}
+OPEN = "the scan does not determine sigma11, sigma12 and sigma22"
 
 
-class Sizes(NamedTuple):
-    """What was measured in one plane; arrays of shape (n,).
+class Scanned(Protocol):
+    """A fitted scan, of any scenario."""
 
-    Attributes
-    ----------
-    r11, r12 : Array
-        Transfer-matrix elements, start to screen (R12 in m).
-    known : Array
-        Size² in m² that is not due to σ.
-    size, error : Array
-        Rms size and its standard error, m.
-    factor : Array
-        βγ.
-    to_design : Array
-        Shape (2, 2), start to where the design holds.
-    design : Array
-        Shape (2,): design β (m) and α.
-    """
-
-    r11: Array
-    r12: Array
-    known: Array
-    size: Array
-    error: Array
-    factor: Array
-    to_design: Array
-    design: Array
-
-    def squared(self, sigma: Array) -> Array:
-        """Size² of a beam matrix at every point (report equation 37)."""
-        return (
-            sigma[0] * self.r11**2
-            + 2.0 * sigma[1] * self.r11 * self.r12
-            + sigma[2] * self.r12**2
-            + self.known
-        )
+    planes: tuple[PlaneFit, ...]
+    scan: QuadScan
+    line: Beamline
+    fit: Fit | None
+    problem: Problem
 
 
-# The planes by name; a name in a mapping is structure to JAX, so that each pair compiles once.
-Planes = dict[str, Sizes]
+def _quoted(model: Mapping[str, Any]) -> dict[str, Any]:
+    """σ in SI in the place of its Cholesky factor."""
+    beams = model["beam"].items()
+    sigmas = {plane: dict(zip(CHOLESKY, sigma_of(beam), strict=True)) for plane, beam in beams}
+    return {**model, "beam": sigmas}
 
 
-def _sigmas(data: Planes, theta: Array) -> list[tuple[Sizes, Array]]:
-    return [(data[plane], theta[3 * i : 3 * i + 3]) for i, plane in enumerate(sorted(data))]
+def _own(model: Mapping[str, Any]) -> dict[str, Any]:
+    """The Cholesky factor of σ again, NaN where it is not positive definite."""
+    beams = {}
+    for plane, sigma in model["beam"].items():
+        s11, s12, s22 = (sigma[name] / UNIT**2 for name in CHOLESKY)
+        l11 = jnp.sqrt(s11)
+        beams[plane] = {"l11": l11, "l21": s12 / l11, "l22": jnp.sqrt(s22 - s12**2 / s11)}
+    return {**model, "beam": beams}
 
 
-def residual_squared(data: Planes, theta: Array) -> tuple[Array, ...]:
-    """Of size², with the error 2 x dx (the report's ``error_linear``)."""
-    return tuple(
-        (plane.squared(sigma) - plane.size**2) / (2.0 * plane.size * plane.error)
-        for plane, sigma in _sigmas(data, theta)
-    )
+def _beams(model: Mapping[str, Any], data: Any) -> dict[str, Any]:
+    """The beam matrix of each plane, and the model, for functions of the user's."""
+    parts = model["beam"].items()
+    beams = {p: BeamMatrix(*(UNIT * beam[name] for name in CHOLESKY)) for p, beam in parts}
+    return {**beams, "model": model}
 
 
-def residual_size(data: Planes, theta: Array) -> tuple[Array, ...]:
-    """Of the size (the report's ``error_nonlinear``)."""
-    return tuple(
-        (jnp.sqrt(jnp.maximum(plane.squared(sigma), 1e-30)) - plane.size) / plane.error
-        for plane, sigma in _sigmas(data, theta)
-    )
-
-
-def positive_definite(data: Planes, theta: Array) -> Array:
-    """Flat where every σ is positive definite, nothing elsewhere."""
-    inside = jnp.asarray(True)
-    for _, (s11, s12, s22) in _sigmas(data, theta):
-        inside &= (s11 > 0) & (s22 > 0) & (s11 * s22 > s12 * s12)
-    return jnp.where(inside, 0.0, -jnp.inf)
-
-
-def beams(data: Planes, theta: Array) -> dict[str, BeamMatrix]:
-    """The beam matrix of each plane."""
-    pairs = zip(sorted(data), _sigmas(data, theta), strict=True)
-    return {name: BeamMatrix.from_sigma(*sigma) for name, (_, sigma) in pairs}
-
-
-def twiss_numbers(data: Planes, theta: Array) -> Array:
+def _twiss(model: Mapping[str, Any], data: Mapping[str, tuple[Array, ...]]) -> Array:
     """Emittance, normalised emittance, β, α at the start and mismatch, plane after plane."""
-    found = []
-    for name, beam in beams(data, theta).items():
-        plane, twiss = data[name], beam.twiss
-        ideal = BeamMatrix.from_twiss(1.0, plane.design[0], plane.design[1])
-        mismatch = beam.transport(plane.to_design).mismatch(ideal)
-        emittance = beam.emittance
-        found += [emittance, plane.factor * emittance, twiss.beta, twiss.alpha, mismatch]
+    beams, found = _beams(model, data), []
+    for plane, (factor, to_design, design) in sorted(data.items()):
+        beam = beams[plane]
+        mismatch = beam.transport(to_design).mismatch(BeamMatrix.from_twiss(1.0, *design))
+        e, twiss = beam.emittance, beam.twiss
+        found += [e, factor * e, twiss.beta, twiss.alpha, mismatch]
     return jnp.stack(found)
 
 
-LAWS = {
-    "size_squared": Law(residual_squared, positive_definite, twiss_numbers, beams),
-    "size": Law(residual_size, positive_definite, twiss_numbers, beams),
-}
-
-
 def beam_target(
-    fit: EmittanceFit,
-    planes: tuple[str, ...] | None = None,
+    fit: Scanned,
+    planes: Sequence[str] | None = None,
     noise: str | None = None,
     outliers: bool | None = None,
     priors: Mapping[str, Distribution] | None = None,
@@ -133,15 +93,11 @@ def beam_target(
     ----------
     fit : EmittanceFit
         The fit.
-    planes : tuple of str, optional
+    planes : sequence of str, optional
         Which; all that were fitted if None.
-    noise : {"known", "inferred"}, optional
-        None: of each plane inferred where the scan has no errors or the fit enlarged them, else
-        known.
-    outliers : bool, optional
-        None: as the fit was robust or not.
-    priors : mapping of str to distribution, optional
-        On numbers such as ``x.sigma11``, besides the flat prior.
+    noise, outliers, priors
+        As of `beamfit.greybox.posterior.target_of`; priors on ``x.sigma11`` and so on. A robust
+        fit is sampled with outliers by default.
 
     Returns
     -------
@@ -151,7 +107,7 @@ def beam_target(
     Raises
     ------
     InputError
-        If a plane was not fitted, an option is not understood, or a prior's name is not known.
+        If a plane was not fitted, or as `target_of`.
 
     Notes
     -----
@@ -159,115 +115,128 @@ def beam_target(
     A plane whose scan does not determine σ11, σ12 and σ22 has no posterior unless priors on all
     three give it one; it is left out and named.
     """
-    asked = _planes(fit, planes)
-    every = tuple(f"{p.plane}.{name}" for p in asked for name in NAMES)
-    priors = checked(priors, every)
-    kept = [p for p in asked if np.isfinite(p.covariance).all() or _given(p, priors)]
-    lost = ", ".join(f"{p.plane} plane" for p in asked if p not in kept)
-    chosen = kept or asked
-    data = {p.plane: _sizes(fit, p) for p in chosen}
-    groups = tuple(_group(p, noise, outliers) for p in chosen)
-    names = tuple(f"{p.plane}.{name}" for p in chosen for name in NAMES)
-    spread = [_start(p, priors) for p in chosen]
-    covariance = np.zeros((len(names),) * 2)
-    for i, (_, part) in enumerate(spread):
-        covariance[3 * i : 3 * i + 3, 3 * i : 3 * i + 3] = part
-    words = "the scan does not determine sigma11, sigma12 and sigma22"
-    worst = max(chosen, key=lambda p: p.status is Status.poor_fit)
-    return Target(
-        law=LAWS[chosen[0].method],
-        data=data,
-        names=names,
-        units=UNITS * len(chosen),
-        lower=np.tile([0.0, -np.inf, 0.0], len(chosen)),
-        upper=np.full(len(names), np.inf),
-        mode=np.concatenate([mode for mode, _ in spread]),
-        covariance=covariance,
-        likelihood=Likelihood(groups),
-        noise=tuple(p.error_scale for p in chosen),
+    asked = _asked(fit, planes)
+    if fit.fit is not None:
+        problem, optimum, kept = fit.problem, fit.fit.optimum, asked
+    else:
+        checked(priors, [f"{p.plane}.{name}" for p in asked for name in SIGMA])
+        kept = [p for p in asked if np.isfinite(p.covariance).all() or _given(p, priors)]
+        problem, optimum = _of_planes(fit.problem, kept or asked, priors)
+    robust = any(p.points.outlier_probability is not None for p in kept)
+    return target_of(
+        problem,
+        optimum,
+        _stated(fit, kept, asked),
+        noise=noise,
+        outliers=robust if outliers is None else outliers,
         priors=priors,
-        derived=_derived(fit, chosen),
-        observed=_observed(chosen, data),
-        priors_own=_open(chosen, kept),
-        open_directions="" if kept else f"{words} in the {lost}; {chosen[0].message}",
-        verdict=(worst.status.value, worst.message),
-        hidden=_without_design(fit, chosen),
-        group_of=tuple(i for i in range(len(chosen)) for _ in NAMES),
-        remark=f"Left out: the {lost}, because {words}." if kept and lost else "",
     )
 
 
-def _planes(fit: EmittanceFit, planes: tuple[str, ...] | None) -> list[PlaneFit]:
+def _asked(fit: Scanned, planes: Sequence[str] | None) -> list[PlaneFit]:
     fitted = [p.plane for p in fit.planes]
     for plane in planes or ():
         if plane not in fitted:
             raise InputError(f"plane '{plane}'", f"one that was fitted: {', '.join(fitted)}")
+    if fit.fit is not None and planes is not None and list(planes) != fitted:
+        expected = f"all that were fitted, {', '.join(fitted)}: they have their unknowns in common"
+        raise InputError(f"planes {', '.join(planes)} alone", expected)
     return [p for p in fit.planes if planes is None or p.plane in planes]
 
 
-def _given(p: PlaneFit, priors: Mapping[str, Distribution]) -> bool:
+def _given(p: PlaneFit, priors: Mapping[str, Distribution] | None) -> bool:
     """Whether priors on all three numbers make a posterior in any case."""
-    return all(f"{p.plane}.{name}" in priors for name in NAMES)
+    return all(f"{p.plane}.{name}" in (priors or {}) for name in SIGMA)
 
 
-def _start(p: PlaneFit, priors: Mapping[str, Distribution]) -> tuple[np.ndarray, np.ndarray]:
-    """Where to begin and how wide: the fit, or else the priors."""
-    if np.isfinite(p.covariance).all():
-        return np.array([q.value for q in p.sigma]), p.covariance * p.error_scale**2
-    if not _given(p, priors):
-        return np.array([q.value for q in p.sigma]), np.eye(3)
-    own = [priors[f"{p.plane}.{name}"] for name in NAMES]
-    return np.array([q.mean() for q in own]), np.diag([float(q.std()) ** 2 for q in own])
+def _of_planes(
+    problem: Problem, chosen: Sequence[PlaneFit], priors: Mapping[str, Distribution] | None
+) -> tuple[Problem, Optimum]:
+    """The problem of some planes, and where to begin: the fit, or else the priors."""
+    parts = [f"beam.{p.plane}." for p in chosen]
+    own = replace(
+        problem,
+        model={"beam": {p.plane: problem.model["beam"][p.plane] for p in chosen}},
+        free=[f for f in problem.free if any(f.path.startswith(part) for part in parts)],
+        records=[r for r in problem.records if r.data.plane in [p.plane for p in chosen]],
+    )
+    begin = {}
+    for p in chosen:
+        s11, s12, s22 = (q.value / UNIT**2 for q in p.sigma)
+        if not np.isfinite(p.covariance).all() and _given(p, priors):
+            means = (priors[f"{p.plane}.{name}"].mean() for name in SIGMA)
+            s11, s12, s22 = (mean / UNIT**2 for mean in means)
+        l11 = np.sqrt(max(s11, 1e-6))
+        # Walkers begin a little off zero emittance, which is an edge.
+        l22 = np.sqrt(max(s22 - (s12 / l11) ** 2, 1e-4 * max(s22, 1e-6)))
+        begin |= {f"beam.{p.plane}.l11": l11, f"beam.{p.plane}.l21": s12 / l11}
+        begin[f"beam.{p.plane}.l22"] = l22
+    theta = np.array([begin[name] for name in own.names])
+    worst = max(chosen, key=lambda p: p.status is Status.poor_fit)
+    scales, given = [p.error_scale for p in chosen], [p.chi2 is not None for p in chosen]
+    return own, Optimum(theta, Finding(worst.status, worst.message), scales, given)
 
 
-def _sizes(fit: EmittanceFit, p: PlaneFit) -> Sizes:
-    scanned = scanned_line(fit.scan, fit.line)
-    rows = scan_rows(fit.scan, scanned)
-    matrices = transfer_rows(scanned, rows.settings, rows.energy, places=rows.places)
-    given = plane_input(fit.scan, scanned, rows, matrices, p.plane)
-    # A robust fit widened the errors of points it doubts; a mixture does its own doubting.
-    stated = given.error if given.error is not None else given.size
-    error = stated if p.points.outlier_probability is not None else p.points.error
-    design = getattr(fit.line.design, p.plane, None) or (1.0, 0.0)
-    return Sizes(
-        r11=given.r11,
-        r12=given.r12,
-        known=given.known,
-        size=given.size,
-        error=np.nan_to_num(error, nan=1.0),
-        factor=np.asarray(float(beta_gamma(given.energy.mean(), fit.line.mass))),
-        to_design=given.to_design[:2, :2],
-        design=np.array([float(v) for v in design]),
+def _stated(fit: Scanned, kept: Sequence[PlaneFit], asked: Sequence[PlaneFit]) -> Statement:
+    chosen = kept or asked
+    line, energy = fit.line, fit.scan.energy
+    works = see(fit.scan, line, [p.plane for p in chosen], chosen[0].method).works
+    factor = beta_gamma(float(line.energy if energy is None else np.mean(energy)), line.mass)
+    data, hidden = {}, []
+    for p in chosen:
+        twiss = getattr(line.design, p.plane, None)
+        to_design = works[p.plane].given.to_design[:2, :2]
+        data[p.plane] = (np.asarray(factor), to_design, np.asarray(twiss or (1.0, 0.0)))
+        hidden += [] if twiss else [f"{p.plane}.mismatch"]
+    doubtful = [
+        f"{p.plane}.{name}"
+        for p in chosen
+        for name in TWISS
+        if (q := getattr(p, name)) is not None and q.error is None
+    ]
+    lost = ", ".join(f"{p.plane} plane" for p in asked if p not in kept)
+    names = [(p.plane, name) for p in chosen for name in SIGMA]
+    cholesky = [name for _ in chosen for name in CHOLESKY]
+    return Statement(
+        derived={f"{p.plane}.{name}": unit for p in chosen for name, unit in TWISS.items()},
+        derive=_twiss,
+        build=_beams,
+        data=data,
+        quoted=_quoted,
+        own=_own,
+        renamed={
+            f"beam.{plane}.{own}": f"{plane}.{name}"
+            for (plane, name), own in zip(names, cholesky, strict=True)
+        },
+        units={f"{plane}.{name}": SIGMA[name] for plane, name in names},
+        lower={f"{plane}.{name}": 0.0 for plane, name in names if name != "sigma12"},
+        labels={f"size {p.plane}": p.plane for p in chosen},
+        priors_own=doubtful,
+        hidden=hidden,
+        remark=f"Left out: the {lost}, because {OPEN}." if kept and lost else "",
+        nothing="" if kept else f"{OPEN} in the {lost}; {chosen[0].message}",
     )
 
 
-def _group(p: PlaneFit, noise: str | None, outliers: bool | None) -> Group:
-    robust = p.points.outlier_probability is not None
-    if noise is None:
-        noise = "inferred" if p.chi2 is None or p.error_scale > 1 else "known"
-    return Group(p.plane, noise, robust if outliers is None else outliers)
+def expected_sizes(posterior: Posterior, fit: Scanned, plane: str) -> Expected:
+    """Sizes that the posterior of a scan expects, m.
 
+    Parameters
+    ----------
+    posterior : Posterior
+        Of `EmittanceFit.sample`.
+    fit : EmittanceFit
+        The fit.
+    plane : str
+        "x" or "y".
+    """
+    record = record_of(posterior.target, f"size {plane}")
+    squared = fit.planes[0].method == "size_squared"
 
-def _derived(fit: EmittanceFit, chosen: list[PlaneFit]) -> Derived:
-    names = tuple(f"{p.plane}.{name}" for p in chosen for name in TWISS)
-    return Derived(names, tuple(TWISS.values()) * len(chosen))
+    def sizes(drawn: Mapping[str, Any]) -> Array:
+        found = record.predict(drawn["model"], record.data)
+        return 1e-6 * (jnp.sqrt(found) if squared else found)
 
-
-def _without_design(fit: EmittanceFit, chosen: list[PlaneFit]) -> tuple[str, ...]:
-    return tuple(f"{p.plane}.mismatch" for p in chosen if p.mismatch is None)
-
-
-def _open(chosen: list[PlaneFit], kept: list[PlaneFit]) -> tuple[str, ...]:
-    """Twiss numbers that positive definiteness decides where the scan does not."""
-    doubtful = [p for p in chosen if not p.identifiability.determined or p not in kept]
-    return tuple(f"{p.plane}.{name}" for p in doubtful for name in TWISS)
-
-
-def _observed(chosen: list[PlaneFit], data: Planes) -> dict[str, np.ndarray]:
-    found: dict[str, np.ndarray] = {}
-    for p in chosen:
-        found |= {f"{p.plane} {n} setting": v for n, v in p.points.settings.items()}
-        found[f"{p.plane} screen"] = np.array(p.points.screen)
-        found[f"{p.plane} size m"] = np.asarray(data[p.plane].size)
-        found[f"{p.plane} error m"] = np.asarray(data[p.plane].error)
-    return found
+    # Of size²: 2 x dx.
+    slope = 2.0 * np.sqrt(record.measured) if squared else 1.0
+    return posterior.expected(sizes, 1e-6 * np.asarray(record.error) / slope, plane)

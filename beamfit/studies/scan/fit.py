@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from beamfit.errors import InputError
 from beamfit.quantity import Quantity
 from beamfit.studies.scan.results import Parameter, PlaneFit
 from beamfit.studies.scan.scans import QuadScan
@@ -117,7 +116,7 @@ class EmittanceFit:
             Which; all that were fitted if None.
         noise, outliers, priors
             As `beam_posterior.beam_target`, with priors on ``x.sigma11`` and so on; in a scenario
-            on the names of its ``problem``.
+            also on the further names of its ``problem``.
         **options
             ``seed, target_ess, budget, walkers, store, provenance, progress`` of
             `beamfit.sampling.ensemble.draw`.
@@ -125,7 +124,7 @@ class EmittanceFit:
         Returns
         -------
         Posterior
-            Of ``x.sigma11`` ... (in a scenario of its free numbers); ``x.emittance``,
+            Of ``x.sigma11`` ... and what else a scenario fitted; ``x.emittance``,
             ``x.normalized_emittance``, ``x.beta``, ``x.alpha``, ``x.mismatch`` are derived.
 
         Raises
@@ -134,20 +133,9 @@ class EmittanceFit:
             As `beam_target` and `draw`.
         """
         from beamfit.sampling.ensemble import draw
+        from beamfit.studies.scan.beam_posterior import beam_target
 
-        if self.scenario == "known":
-            from beamfit.studies.scan.beam_posterior import beam_target
-
-            return draw(beam_target(self, planes, noise, outliers, priors), **options)
-        fitted = tuple(p.plane for p in self.planes)
-        if planes is not None and tuple(planes) != fitted:
-            raise InputError(
-                f"planes {', '.join(planes)} of scenario {self.scenario}",
-                f"all that were fitted, {', '.join(fitted)}: they have their unknowns in common",
-            )
-        from beamfit.studies.scan.scenario_posterior import scenario_target
-
-        return draw(scenario_target(self, noise, outliers, priors), **options)
+        return draw(beam_target(self, planes, noise, outliers, priors), **options)
 
     def to_json(self) -> list[dict[str, Any]]:
         """Give the ``results`` list of the JSON contract."""
