@@ -26,6 +26,7 @@ __all__ = [
     "beam_current",
     "constant_shape",
     "decay_problem",
+    "decay_record",
     "padded",
     "padded_size",
     "solve_decay",
@@ -33,6 +34,7 @@ __all__ = [
 ]
 
 Shape = Callable[[Array], Array]
+RECORD = "decay"
 # Width of a prior on the quadratic part, in units of the whole loss (whose own error counts in).
 # Physics allows 0 to 1, so 30 moves no value that the record determines (by 4e-5 of it where the
 # verdict turns, nothing beyond); it keeps records too short for their noise from running away.
@@ -173,6 +175,12 @@ def _predicted(shape: Shape | None) -> Callable[[DecayNumbers, Moments], Array]:
     return partial(beam_current, shape=shape)
 
 
+def decay_record(record: DecayRecord, shape: Shape | None = None) -> Record:
+    """The readings, and what the law predicts of them."""
+    at = Moments(record.time, record.current.mean())
+    return Record(RECORD, _predicted(shape), at, record.current, record.error)
+
+
 def decay_problem(record: DecayRecord, shape: Shape | None = None) -> Problem:
     """State the fit of a decay: I0, a and b free, one record, a weak prior on a.
 
@@ -196,19 +204,14 @@ def decay_problem(record: DecayRecord, shape: Shape | None = None) -> Problem:
     >>> print(f"{fit['a'].value:.3e}")
     2.000e-08
     """
-    time, measured, _ = readings = padded(record)
-    start, noise, width = (np.asarray(p) for p in _start(*_scaled(np.stack(readings))[:3]))
+    scaled = _scaled(np.stack(padded(record)))
+    start, noise, width = (np.asarray(part) for part in _start(*scaled[:3]))
     span, mean = record.span, float(record.current.mean())
     loss, quadratic = start[1] / span, start[2] / span
-    rows = slice(len(record))
     return Problem(
         DecayNumbers(start[0] * mean, quadratic / mean, loss - quadratic),
         [Free("i0"), Free("a"), Free("b")],
-        [
-            Record(
-                "decay", _predicted(shape), Moments(time[rows], mean), measured[rows], record.error
-            )
-        ],
+        [decay_record(record, shape)],
         [] if shape else [Prior("a", 0.0, width / noise / span / mean)],
     )
 
