@@ -16,6 +16,7 @@ from beamfit.studies.decay.tables import (
     alike,
     check_rows,
     decay_rows,
+    network_rows,
     overview,
     separability_rows,
     shift_rows,
@@ -70,3 +71,7 @@ def shift_lines(shift: Shift) -> Iterator[Table | Text]:
     yield verdict_text("operating point", Status.converged, shift.best.message)
     if shift.anomaly is not None:
         yield verdict_text("second half", shift.anomaly.status, shift.anomaly.message)
+    if shift.network is not None:
+        fit = shift.network.fit
+        yield status_table("A network of the losses", names, [fit.status], network_rows(shift))
+        yield verdict_text("network", fit.status, fit.message)

@@ -26,6 +26,7 @@ Examples:
   beamfit lifetime fill1.csv fill2.h5 --ring lattices/spear3_2003.toml
   beamfit lifetime fill1.csv --ring ring.toml --report fill1.html --json
   beamfit lifetime measurements/spear3_shift_simulated.csv --ring lattices/spear3_2003.toml --study
+  beamfit lifetime shift.csv --ring ring.toml --study --network correction
 """
 
 
@@ -51,6 +52,13 @@ Examples:
     help="Fit the ring's loss mechanisms to all decays together: scales, loss budget with credible "
     "intervals, best operating point, next decay, anomaly. Needs --ring.",
 )
+@click.option(
+    "--network",
+    type=click.Choice(["alone", "correction"]),
+    default=None,
+    help="With --study: also fit a and b by a network that falls with bunches and scraper and rises "
+    "with pressure; alone, or as a factor on the fitted first principles.",
+)
 @sampling_options
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object and nothing else.")
 def lifetime(
@@ -58,6 +66,7 @@ def lifetime(
     ring: str | None,
     report: str | None,
     study: bool,
+    network: str | None,
     sample: bool,
     store: str | None,
     seed: int,
@@ -75,6 +84,8 @@ def lifetime(
     sampling.check()
     if study and ring is None:
         raise InputError("--study without a ring", "--ring FILE.toml")
+    if network is not None and not study:
+        raise InputError("--network without a study", "--study --ring FILE.toml")
     inputs = {path: digest(path) for path in record}
     if len(inputs) < len(record):
         twice = next(path for path in record if record.count(path) > 1)
@@ -96,9 +107,11 @@ def lifetime(
     studies = tuple(study_record(each, machine) for each in records)
     shift = None
     if study:
+        from beamfit.studies.decay.network import Network
         from beamfit.studies.decay.shift import study_shift
 
-        shift = study_shift([decay for each in studies for decay in each.decays], machine)
+        decays = [decay for each in studies for decay in each.decays]
+        shift = study_shift(decays, machine, network=network and Network(network))
     command = command_line()
     posteriors = None
     if sampling.wanted:

@@ -22,6 +22,7 @@ from beamfit.sampling.posterior import Posterior
 from beamfit.sampling.summary import Interval
 from beamfit.studies.decay.fit import bare
 from beamfit.studies.decay.loss_budget import Machine, operation_during
+from beamfit.studies.decay.network import Network, NetworkFit, fit_loss_network
 from beamfit.studies.decay.next_decay import Candidate, Proposal, next_decays
 from beamfit.studies.decay.operating_point import BestPoint, Limits, best_operating_point
 from beamfit.studies.decay.scales import ScaleFit, fit_scales, pulls, stacked_terms, whitener
@@ -240,6 +241,8 @@ class Shift:
     anomaly : Anomaly or None
         Whether the second half departs from a model fitted to the first; None if the first half
         does not separate the mechanisms.
+    network : NetworkFit or None
+        A network of the losses, where one was asked for.
     """
 
     fit: ScaleFit
@@ -249,6 +252,7 @@ class Shift:
     best: BestPoint
     proposals: tuple[Proposal, ...]
     anomaly: Anomaly | None
+    network: NetworkFit | None = None
 
     def to_json(self) -> dict[str, Any]:
         """Return the answer as JSON's types, in SI, mA and h."""
@@ -263,6 +267,7 @@ class Shift:
             for p in self.proposals
         ]
         best = self.best._asdict() | {"scraper_y": bare(self.best.scraper_y, "m")}
+        found = {} if self.network is None else {"network": self.network.to_json(self.current)}
         return json_of(
             {
                 "scales": self.fit,
@@ -271,11 +276,14 @@ class Shift:
                 "best": best,
                 "next": proposals,
                 "anomaly": self.anomaly,
+                **found,
             }
         )
 
 
-def study_shift(decays: Sequence[Decay], machine: Machine, seed: int = 0) -> Shift:
+def study_shift(
+    decays: Sequence[Decay], machine: Machine, seed: int = 0, network: Network | None = None
+) -> Shift:
     """Study the decays of a shift together.
 
     Parameters
@@ -286,6 +294,8 @@ def study_shift(decays: Sequence[Decay], machine: Machine, seed: int = 0) -> Shi
         The ring, and what the records do not say.
     seed : int, optional
         Of the random numbers.
+    network : Network, optional
+        Also fit a network of the losses: alone, or as a correction of first principles.
 
     Returns
     -------
@@ -310,7 +320,13 @@ def study_shift(decays: Sequence[Decay], machine: Machine, seed: int = 0) -> Shi
         best=best_operating_point(fit, sample, limits, current),
         proposals=next_decays(fit, _candidates(decays, machine, limits, current))[:3],
         anomaly=_anomaly(decays, machine),
+        network=None if network is None else _network(decays, fit, network, seed),
     )
+
+
+def _network(decays: Sequence[Decay], fit: ScaleFit, network: Network, seed: int) -> NetworkFit:
+    corrected = fit if network is Network.correction else None
+    return fit_loss_network(decays, fit.machine, corrected, seed=seed)
 
 
 def _range(settings: Sequence, name: str) -> tuple[float, float]:
