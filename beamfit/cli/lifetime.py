@@ -56,8 +56,8 @@ Examples:
     "--network",
     type=click.Choice(["alone", "correction"]),
     default=None,
-    help="With --study: also fit a and b by a network that falls with bunches and scraper and rises "
-    "with pressure; alone, or as a factor on the fitted first principles.",
+    help="With --study: also fit a and b by a network that falls with bunches and scraper and "
+    "rises with pressure; alone, or as a factor on the fitted first principles.",
 )
 @sampling_options
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object and nothing else.")
