@@ -22,7 +22,7 @@ from rich.table import Table
 
 import beamfit
 from beamfit.greybox import problem as greybox
-from beamfit.greybox.many_starts import descend_all
+from beamfit.greybox.descend import descend_all
 from beamfit.greybox.solve import starting_points
 from beamfit.studies.scan.assumptions import Anchor, Assumptions
 
