@@ -13,6 +13,7 @@ from beamfit.io.line import build_line, read_lattice
 from beamfit.io.measurement import read_quad_scan
 from beamfit.studies.scan.assumptions import SCENARIOS, Assumptions
 from beamfit.studies.scan.scans import check_names
+from beamfit.table import text_of
 
 if TYPE_CHECKING:
     from beamfit.io.lattice import LatticeFile
@@ -142,37 +143,9 @@ def _check_energies(energies: tuple[float, ...], lattice: LatticeFile) -> None:
 def _print(advice: Advice, title: str) -> None:
     from rich.console import Console
 
-    from beamfit.cli.terminal import plain_table, verdict_text
-    from beamfit.quantity import Status
+    from beamfit.cli.terminal import verdict_text
 
     console = Console(highlight=False, markup=False)
     console.print(f"{title}, scenario {advice.scenario}: error of the emittance", style="bold")
-    table = plain_table("")
-    table.add_column("after")
-    for plane in advice.now:
-        table.add_column(plane, justify="right")
-    table.add_row("what is measured", *_cells(advice.now, advice.identified))
-    for number, step in enumerate(advice.steps, 1):
-        if step.identified:
-            cells = _cells(step.relative_error, step.identified)
-            table.add_row(f"{number}. {step.candidate.words}", *cells)
-    if advice.steps and not advice.steps[-1].identified:
-        words = f"{len(advice.steps)} more points of the scan, at the best settings"
-        table.add_row(words, *_cells(advice.now, False))
-    console.print(table)
-    if advice.options:
-        other = plain_table("")
-        other.add_column("\nWhat would identify it")
-        for plane in advice.now:
-            other.add_column(f"error {plane}", justify="right")
-        other.add_column("identified")
-        for option in advice.options:
-            cells = _cells(option.relative_error, option.identified)
-            other.add_row(option.words, *cells, "yes" if option.identified else "no")
-        console.print(other)
-    status = Status.converged if advice.identified else Status.unidentified
-    console.print(verdict_text("design", status, advice.message))
-
-
-def _cells(error: dict[str, float], identified: bool) -> list[str]:
-    return [f"{100 * e:.2f} %" if identified else "not determined" for e in error.values()]
+    click.echo("\n\n".join(map(text_of, advice.tables())))
+    console.print(verdict_text("design", advice.status, advice.message))

@@ -182,8 +182,7 @@ def _print(found: Setpoint) -> None:
     from beamfit.cli.terminal import verdict_text
 
     console = Console(highlight=False, markup=False)
-    for table in found.tables():
-        click.echo(text_of(table))
+    click.echo("\n\n".join(map(text_of, found.tables())))
     console.print(verdict_text("set point", found.status, found.message))
     for note in found.notes:
         console.print(note)

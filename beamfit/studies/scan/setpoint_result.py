@@ -149,11 +149,11 @@ class Setpoint:
             [f"  {_listed(m.settings, self.units, 5)}: objective {m.objective:.6g}"]
             for m in self.others[:5]
         ]
-        return (best, Table("\nOther minima", [], others)) if others else (best,)
+        return (best, Table("Other minima", [], others)) if others else (best,)
 
     def __str__(self) -> str:
         said = [f"{self.status}: {self.message}", *self.notes, *self.doubts.values()]
-        return "\n".join([*map(text_of, self.tables()), "", *said])
+        return "\n\n".join([*map(text_of, self.tables()), "\n".join(said)])
 
     def _repr_html_(self) -> str:
         return "".join(map(html_of, self.tables()))
