@@ -18,11 +18,18 @@ from jax import Array
 
 from beamfit.optics.beamline import Beamline
 from beamfit.optics.calibration import CurrentPolynomial, SlopeIntercept
-from beamfit.optics.elements import Drift, TransferMatrix
+from beamfit.optics.elements import Drift
+from beamfit.optics.sections import Series
 from beamfit.studies.scan.fit import EmittanceFit
 from beamfit.studies.scan.results import PlaneFit, Points
 from beamfit.studies.scan.sigma import emittance_parts, fit_sizes
-from beamfit.studies.scan.transport import plane_input, scan_rows, scanned_line, transfer_rows
+from beamfit.studies.scan.transport import (
+    ScanRows,
+    plane_input,
+    scan_rows,
+    scanned_line,
+    transfer_rows,
+)
 
 __all__ = [
     "Change",
@@ -114,15 +121,9 @@ def systematics(fit: EmittanceFit, plane: str) -> list[Change]:
     upstream = fit.line.upto(result.screen.name).elements
     drifts = tuple(e.name for e in upstream if isinstance(e, Drift))
     matrices = transfer_rows(scanned, rows.settings, rows.energy, places=rows.places)
-    changed = _slopes(
-        scanned, rows.settings, rows.energy, places=rows.places, magnets=magnets, drifts=drifts
-    )
     given = plane_input(fit.scan, scanned, rows, matrices, plane)
     keep = np.flatnonzero(~np.isnan(fit.scan.size[plane]))
-    changed = np.asarray(changed.planes)[:, "xy".index(plane)]
-    slope = changed[keep, rows.which[keep], 0]  # (n, 3, changes)
-    known_slope = 2.0 * (given.r16 * given.energy_spread**2)[:, None] * slope[:, 2]
-    gradient = _log_emittance_gradient(
+    by_r11, by_r12, by_known = _log_emittance_gradient(
         np.array([q.value for q in result.sigma]),
         given.r11,
         given.r12,
@@ -131,8 +132,10 @@ def systematics(fit: EmittanceFit, plane: str) -> list[Change]:
         result.points.error,
         method=result.method,
     )
-    by_r11, by_r12, by_known = (np.asarray(g) for g in gradient)
-    relative = by_r11 @ slope[:, 0] + by_r12 @ slope[:, 1] + by_known @ known_slope
+    by_r16 = np.asarray(by_known) * 2.0 * given.r16 * given.energy_spread**2
+    by_planes = np.zeros(matrices.planes.shape)
+    by_planes[keep, "xy".index(plane), rows.which[keep], 0] = np.stack([by_r11, by_r12, by_r16], -1)
+    relative = _relative_changes(scanned, rows, by_planes, magnets, len(drifts))
     # ln βγ rises by E²/(E² - m²) for each relative step of the energy.
     energy = given.energy.mean()
     stiffer = energy**2 / (energy**2 - fit.line.mass**2)
@@ -165,20 +168,49 @@ def _scaled(line: Beamline, magnet: str, factor: Array) -> Beamline:
     return line.with_element(replace(element, calibration=c))
 
 
-@partial(jax.jit, static_argnames=("places", "magnets", "drifts"))
-def _slopes(line, settings, energy, *, places, magnets, drifts):
-    """Derivatives of the transfer matrices of all rows, by each change in the last axis."""
+def _relative_changes(
+    line: Beamline, rows: ScanRows, by_planes: np.ndarray, magnets: tuple[str, ...], drifts: int
+) -> np.ndarray:
+    """Derivatives by the strength of each magnet, the length of each drift, and ln E.
 
-    def rows(change: Array) -> TransferMatrix:
-        moved = line
+    ``by_planes`` holds the derivatives by the matrices of all rows: one reverse pass carries them
+    back to every number of the line, however long it is.
+    """
+    stored = line.stored_by_kind((*rows.settings, *rows.places))
+    energy = rows.energy if np.ptp(rows.energy) > 0 else rows.energy[0]
+    by_change, by_lengths = _slopes(
+        stored, rows.settings, energy, by_planes, places=rows.places, magnets=magnets
+    )
+    by_length = np.concatenate([*by_lengths, np.zeros(0)])[:drifts]  # the rest lies downstream
+    return np.concatenate([by_change[:-1], by_length, by_change[-1:]])
+
+
+@partial(jax.jit, static_argnames=("places", "magnets"))
+def _slopes(line, settings, energy, by_planes, *, places, magnets):
+    """Derivatives by each magnet's strength and ln E, and by the lengths of drifts."""
+
+    def total(change: Array, lengths: list[Array]) -> Array:
+        moved = _with_lengths(line, lengths)
         for i, name in enumerate(magnets):
             moved = _scaled(moved, name, 1.0 + change[i])
-        for i, name in enumerate(drifts, start=len(magnets)):
-            moved = moved.with_element(Drift(name, line[name].length + change[i]))
-        return transfer_rows(moved, settings, energy * (1.0 + change[-1]), places)
+        rows = transfer_rows(moved, settings, energy * (1.0 + change[-1]), places)
+        return jnp.vdot(by_planes, rows.planes)
 
-    none = jnp.zeros(len(magnets) + len(drifts) + 1)
-    return jax.jacfwd(rows)(none)
+    series = [s for s in line.elements if isinstance(s, Series)]
+    lengths = [k.length for s in series for k in s.kinds if isinstance(k, Drift)]
+    return jax.grad(total, (0, 1))(jnp.zeros(len(magnets) + 1), lengths)
+
+
+def _with_lengths(line: Beamline, lengths: list[Array]) -> Beamline:
+    """Give the drifts of a line that is stored by kind other lengths."""
+    left = iter(lengths)
+    elements = []
+    for part in line.elements:
+        if isinstance(part, Series):
+            kinds = (Drift("", next(left)) if isinstance(k, Drift) else k for k in part.kinds)
+            part = replace(part, kinds=tuple(kinds))
+        elements.append(part)
+    return replace(line, elements=tuple(elements))
 
 
 @partial(jax.jit, static_argnames="method")

@@ -139,7 +139,9 @@ def find_setpoint(
     carrying = line if energy is None else replace(line, energy=energy)
     for beam in beams.values():
         carrying = with_numbers(carrying, beam.calibration)
-    wanted = _wanted(carrying.upto(screen), used, vary, targets)
+    carrying = carrying.upto(screen)
+    short = carrying.condensed((*vary, screen), carrying.energy)
+    wanted = _wanted(short, used, vary, targets)
     minima, fit = _search(_stated(wanted), _starts(len(vary), seed))
     units = {name: SETTING_UNITS[line[name].calibration.unit] for name in vary}
     listed = [Minimum(_settings(wanted, theta), value) for theta, value in minima]

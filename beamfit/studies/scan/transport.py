@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jax.typing import ArrayLike
 
 from beamfit.optics.beamline import Beamline
 from beamfit.optics.calibration import (
@@ -20,6 +21,7 @@ from beamfit.optics.calibration import (
     IntegratedStrength,
 )
 from beamfit.optics.elements import Marker, Screen, ThinLens, TransferMatrix
+from beamfit.optics.sections import Series
 from beamfit.studies.scan.scans import QuadScan
 
 __all__ = [
@@ -31,8 +33,13 @@ __all__ = [
     "plane_input",
     "scan_rows",
     "scanned_line",
+    "seen_line",
     "transfer_rows",
 ]
+
+
+# Elements, times rows, whose matrices are held at once where each row has its own energy.
+MOST_AT_ONCE = 100_000
 
 
 class ScanRows(NamedTuple):
@@ -165,7 +172,6 @@ def scan_rows(scan: QuadScan, scanned: Beamline) -> ScanRows:
     )
 
 
-@partial(jax.jit, static_argnames="places")
 def transfer_rows(
     line: Beamline, settings: Mapping[str, Array], energy: Array, places: tuple[str, ...]
 ) -> TransferMatrix:
@@ -174,11 +180,12 @@ def transfer_rows(
     Parameters
     ----------
     line : Beamline
-        The line, with the calibrations of the scan's columns.
+        The line, with the calibrations of the scan's columns. What no setting moves is
+        multiplied out first; a line that is traced is taken as it is (see `seen_line`).
     settings : mapping of str to Array
         Magnet name to settings, shape (n,).
     energy : Array
-        MeV, shape (n,).
+        MeV, shape (n,), or one number.
     places : tuple of str
         Element names.
 
@@ -187,13 +194,34 @@ def transfer_rows(
     TransferMatrix
         ``planes`` of shape (n, 2, places, 3, 3).
     """
+    if not any(isinstance(v, jax.core.Tracer) for v in jax.tree.leaves(line)):
+        line = seen_line(line, settings, energy, places)
+    return _rows(line, dict(settings), energy, places)
 
-    def one(setting: Mapping[str, Array], at: Array) -> TransferMatrix:
-        found = line.matrices(places, setting, at)
-        return TransferMatrix(jnp.stack([jnp.asarray(found[p].planes) for p in places], axis=-4))
 
-    every = jax.vmap(one)(dict(settings), energy)
-    return TransferMatrix(jnp.swapaxes(every.planes, 1, 2))
+def seen_line(
+    line: Beamline, settings: Iterable[str], energy: ArrayLike, places: Iterable[str]
+) -> Beamline:
+    """A line as rows of these settings and energies see it: all else multiplied out."""
+    own = () if isinstance(energy, jax.core.Tracer) else np.unique(energy)
+    return line.condensed((*settings, *places), own[0] if len(own) == 1 else None)
+
+
+@partial(jax.jit, static_argnames="places")
+def _rows(
+    line: Beamline, settings: dict[str, Array], energy: Array, places: tuple[str, ...]
+) -> TransferMatrix:
+    def one(row: tuple[dict[str, Array], Array]) -> Array:
+        setting, at = row
+        found = line.matrices(places, setting, energy if at is None else at)
+        return jnp.stack([jnp.asarray(found[p].planes) for p in places], axis=-3)
+
+    rows = (settings, None if jnp.ndim(energy) == 0 else energy)
+    long = max((e.order.size for e in line.elements if isinstance(e, Series)), default=0)
+    if jnp.size(energy) * long <= MOST_AT_ONCE:
+        return TransferMatrix(jax.vmap(one)(rows))
+    by_turns = jax.lax.map(jax.checkpoint(one), rows, batch_size=max(1, MOST_AT_ONCE // long))
+    return TransferMatrix(by_turns)
 
 
 def plane_input(
