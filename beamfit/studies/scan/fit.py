@@ -259,8 +259,8 @@ class EmittanceFit:
         planes : tuple of str, optional
             Which; all that were fitted if None.
         noise, outliers, priors
-            As `beam_posterior.beam_target`, with priors on ``x.sigma11`` and so on; in a scenario
-            on the names of its ``problem``.
+            As `beamfit.studies.scan.posterior.beam_target`, with priors on ``x.sigma11`` and so
+            on; in a scenario also on the further names of its ``problem``.
         **options
             ``seed, target_ess, budget, walkers, store, provenance, progress`` of
             `beamfit.sampling.ensemble.draw`.
@@ -268,7 +268,7 @@ class EmittanceFit:
         Returns
         -------
         Posterior
-            Of ``x.sigma11`` ... (in a scenario of its free numbers); ``x.emittance``,
+            Of ``x.sigma11`` ... and what else a scenario fitted; ``x.emittance``,
             ``x.normalized_emittance``, ``x.beta``, ``x.alpha``, ``x.mismatch`` are derived.
 
         Raises
@@ -277,19 +277,9 @@ class EmittanceFit:
             As `beam_target` and `draw`.
         """
         from beamfit.sampling.ensemble import draw
-        from beamfit.studies.scan.posterior import beam_target, scenario_target
+        from beamfit.studies.scan.posterior import beam_target
 
-        if self.statement.closed:
-            target = beam_target(self, planes, noise, outliers, priors)
-        else:
-            fitted = tuple(p.plane for p in self.planes)
-            if planes is not None and tuple(planes) != fitted:
-                raise InputError(
-                    f"planes {', '.join(planes)} of scenario {self.scenario}",
-                    f"all that were fitted, {', '.join(fitted)}: their unknowns are common",
-                )
-            target = scenario_target(self, noise, outliers, priors)
-        return draw(target, **options)
+        return draw(beam_target(self, planes, noise, outliers, priors), **options)
 
     def to_json(self) -> list[dict[str, Any]]:
         """Give the ``results`` list of the JSON contract."""
