@@ -284,8 +284,9 @@ def _refuse_equations(p: Problem) -> None:
 
 def _bounds(p: Problem, moving: np.ndarray, stated: Statement) -> tuple[np.ndarray, np.ndarray]:
     """Bounds of what is sampled."""
-    lower = {stated.renamed.get(p.names[i], p.names[i]): p.lower[i] for i in moving}
-    return np.array(list((lower | dict(stated.lower)).values())), p.upper[moving]
+    called = (stated.renamed.get(p.names[i], p.names[i]) for i in moving)
+    lower = zip(called, p.lower[moving], strict=True)
+    return np.array([stated.lower.get(name, low) for name, low in lower]), p.upper[moving]
 
 
 def _changed(p: Problem, stated: Statement, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
