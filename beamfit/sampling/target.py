@@ -14,6 +14,7 @@ import numpy as np
 from jax import Array
 from scipy.linalg import block_diag
 
+from beamfit.compile_cache import prepare_jax
 from beamfit.sampling.likelihood import LOG_NOISE, Group, log_likelihood
 from beamfit.sampling.moves import Widening
 from beamfit.sampling.priors import Distribution, in_words
@@ -21,7 +22,7 @@ from beamfit.status import Status
 from beamfit.verdict import Finding
 
 # Not in the package: priors and the place of a store are looked at before JAX is loaded.
-jax.config.update("jax_enable_x64", True)
+prepare_jax()
 
 __all__ = ["Law", "Target", "covariance_of", "slopes_of"]
 
