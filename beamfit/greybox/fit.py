@@ -12,7 +12,7 @@ import numpy as np
 
 from beamfit.errors import InputError, nearest
 from beamfit.greybox import tree
-from beamfit.greybox.assess import KKT
+from beamfit.greybox.assess import KKT, TOLERANCE
 from beamfit.greybox.covariance import MOST_SHARE, Group, Spread
 from beamfit.greybox.problem import Problem
 from beamfit.status import Status
@@ -20,8 +20,13 @@ from beamfit.status import Status
 if TYPE_CHECKING:
     from beamfit.sampling.posterior import Posterior
     from beamfit.sampling.priors import Distribution
+    from beamfit.sampling.target import Target
 
 __all__ = ["Attempt", "Derived", "Fit", "Limited", "Status", "Variable"]
+
+
+# Another optimum: a chi-square larger by less than 6, more than six errors away.
+NEAR_COST, FAR = 3.0, 6.0
 
 
 class Variable(NamedTuple):
@@ -259,10 +264,36 @@ class Fit:
         InputError
             If an option is not understood, or a constraint is an equation.
         """
-        from beamfit.greybox.posterior import target_of
         from beamfit.sampling.ensemble import draw
 
-        return draw(target_of(self, noise, outliers, priors), **options)
+        return draw(self.target(noise, outliers, priors), **options)
+
+    def target(
+        self,
+        noise: str | None = None,
+        outliers: bool = False,
+        priors: Mapping[str, Distribution] | None = None,
+    ) -> Target:
+        """State the posterior that `sample` draws from; arguments and errors as there."""
+        from beamfit.greybox.posterior import Mode, target_of
+
+        verdict = (self.status.value, self.message)
+        at = Mode(self.theta, self.scale, self.undetermined, verdict, self._other_optimum())
+        return target_of(self.problem, at, noise, outliers, priors)
+
+    def _other_optimum(self) -> str:
+        """Warn of another optimum the search met: walkers that start at one miss the other."""
+        moving = self.problem.lower < self.problem.upper
+        spread = np.sqrt(np.diag(self.covariance))[moving]
+        for attempt in self.attempts:
+            off = np.abs(attempt.theta - self.theta)[moving]
+            near = attempt.kkt.worst <= TOLERANCE and attempt.cost - self.cost < NEAR_COST
+            if near and np.any(off > FAR * spread) and np.all(spread > 0):
+                return (
+                    "The search met another optimum of nearly the same cost far from this one: the "
+                    "intervals are those about one of them."
+                )
+        return ""
 
     def __str__(self) -> str:
         """A table of the verdict, the numbers and the active constraints."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -12,21 +12,27 @@ from scipy.linalg import null_space
 
 from beamfit.errors import InputError
 from beamfit.greybox import tree
-from beamfit.greybox.assess import TOLERANCE
-from beamfit.greybox.problem import Core, Prior
+from beamfit.greybox.problem import Core, Prior, Problem
 from beamfit.sampling.likelihood import Group, Likelihood
 from beamfit.sampling.priors import Distribution, checked
 from beamfit.sampling.target import Law, Target, covariance_of
 
-if TYPE_CHECKING:
-    from beamfit.greybox.fit import Fit
-
-__all__ = ["LAW", "Sampled", "target_of"]
+__all__ = ["LAW", "Mode", "Sampled", "target_of"]
 
 # A number that is an undetermined direction's in less than this share is not part of it.
 PART = 0.05
-# Another optimum: a chi-square larger by less than 6, more than six errors away.
-NEAR_COST, FAR = 3.0, 6.0
+
+
+class Mode(NamedTuple):
+    """Where a posterior is about: the numbers, (n,), the factor on errors that residuals show, and
+    the directions, (n, k), that no residual sees; the verdict there, and a further remark.
+    """
+
+    theta: np.ndarray
+    scale: float
+    undetermined: np.ndarray
+    verdict: tuple[str, str] = ("converged", "")
+    remark: str = ""
 
 
 @tree.node()
@@ -79,17 +85,20 @@ LAW = Law(_residual, _log_prior, _no_more, _model)
 
 
 def target_of(
-    fit: Fit,
+    p: Problem,
+    at: Mode,
     noise: str | None,
     outliers: bool,
     priors: Mapping[str, Distribution] | None,
 ) -> Target:
-    """State the posterior of a fit.
+    """State the posterior of a problem.
 
     Parameters
     ----------
-    fit : Fit
-        The fit.
+    p : Problem
+        The problem.
+    at : Mode
+        Where a fit ended.
     noise : {"known", "inferred"} or None
         None: inferred where no record has errors or the fit enlarged them, else known.
     outliers : bool
@@ -107,18 +116,17 @@ def target_of(
         If a constraint is an equation, an option is not understood, or a prior's name is not that
         of a free number.
     """
-    p = fit.problem
     equations = p.constraint_lower == p.constraint_upper
     if equations.any():
         name = p.constraint_names[int(np.argmax(equations))]
         expected = "limits that differ: nothing that is drawn at random meets an equation"
         raise InputError(f"the equation '{name}'", expected)
     if noise is None:
-        noise = "inferred" if not p.errors_known or fit.scale > 1 else "known"
+        noise = "inferred" if not p.errors_known or at.scale > 1 else "known"
     moving = np.flatnonzero(p.lower < p.upper)
     names = tuple(p.names[i] for i in moving)
     priors = checked(priors, names)
-    fixed = fit.theta.copy()
+    fixed = at.theta.copy()
     fixed[moving] = 0.0  # the solver's last digits do not make it another problem
     used = np.concatenate([np.zeros(0, bool), *(record.used for record in p.records)])
     rows = None if used.all() else np.flatnonzero(used)
@@ -128,9 +136,9 @@ def target_of(
     width = np.where(np.isfinite(upper - lower), 0.5 * (upper - lower), np.inf)
     for name, prior in priors.items():
         width[names.index(name)] = min(width[names.index(name)], float(prior.std()))
-    mode = fit.theta[moving]
+    mode = at.theta[moving]
     with_prior = np.array([name in priors for name in names])
-    held, loose = _open(fit, moving, names, with_prior, width)
+    held, loose = _open(at, moving, names, with_prior, width)
     extra = Law(_with_priors, _log_prior, _no_more, _model)
     return Target(
         law=LAW,
@@ -140,9 +148,9 @@ def target_of(
         lower=lower,
         upper=upper,
         mode=mode,
-        covariance=covariance_of(extra, data, mode, width) * fit.scale**2,
+        covariance=covariance_of(extra, data, mode, width) * at.scale**2,
         likelihood=Likelihood((Group("", noise, outliers),)),
-        noise=(fit.scale,),
+        noise=(at.scale,),
         noise_unit="1",
         priors=priors,
         observed={
@@ -151,27 +159,13 @@ def target_of(
             for what in ("measured", "error")
             if getattr(record, what) is not None
         },
-        remark=_other_optimum(fit, moving),
+        remark=at.remark,
         stated={prior.name: _words(prior) for prior in p.priors},
         priors_own=held,
         open_directions=loose,
-        verdict=(fit.status.value, fit.message),
+        verdict=at.verdict,
         hidden=tuple(names[i] for i in range(len(names)) if p.nuisance[moving[i]]),
     )
-
-
-def _other_optimum(fit: Fit, moving: np.ndarray) -> str:
-    """Warn of another optimum the search met: walkers that start at one do not find the other."""
-    spread = np.sqrt(np.diag(fit.covariance)[moving])
-    for attempt in fit.attempts:
-        off = np.abs(attempt.theta - fit.theta)[moving]
-        near = attempt.kkt.worst <= TOLERANCE and attempt.cost - fit.cost < NEAR_COST
-        if near and np.any(off > FAR * spread) and np.all(spread > 0):
-            return (
-                "The search met another optimum of nearly the same cost far from this one: the "
-                "intervals are those about one of them."
-            )
-    return ""
 
 
 def _words(prior: Prior) -> str:
@@ -188,13 +182,13 @@ def _with_priors(data: Sampled, moved: jax.Array) -> tuple[jax.Array]:
 
 
 def _open(
-    fit: Fit, moving: np.ndarray, names: tuple[str, ...], with_prior: np.ndarray, width: np.ndarray
+    at: Mode, moving: np.ndarray, names: tuple[str, ...], with_prior: np.ndarray, width: np.ndarray
 ) -> tuple[tuple[str, ...], str]:
     """Numbers that bounds alone hold, and a sentence if nothing at all holds some of them.
 
     A prior on one number holds every direction along which it moves.
     """
-    unseen = fit.undetermined[moving] if fit.undetermined.size else np.zeros((len(names), 0))
+    unseen = at.undetermined[moving] if at.undetermined.size else np.zeros((len(names), 0))
     beyond_priors = _not_moving(unseen, with_prior)
     beyond_bounds = _not_moving(beyond_priors, np.isfinite(width))
     held, loose = (_along(part, names) for part in (beyond_priors, beyond_bounds))

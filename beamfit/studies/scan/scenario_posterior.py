@@ -11,7 +11,7 @@ import numpy as np
 from jax import Array
 
 from beamfit.greybox import tree
-from beamfit.greybox.posterior import LAW, Sampled, target_of
+from beamfit.greybox.posterior import LAW, Sampled
 from beamfit.optics.particle import beta_gamma
 from beamfit.sampling.priors import Distribution
 from beamfit.sampling.target import Derived, Law, Target
@@ -97,7 +97,7 @@ def scenario_target(
     InputError
         As `Fit.sample`.
     """
-    plain = target_of(fit.fit, noise, bool(outliers), priors)
+    plain = fit.fit.target(noise, bool(outliers), priors)
     planes = sorted(p.plane for p in fit.planes)
     energy = np.mean(fit.scan.energy) if fit.scan.energy is not None else fit.line.energy
     factor = {plane: jnp.asarray(beta_gamma(float(energy), fit.line.mass)) for plane in planes}
