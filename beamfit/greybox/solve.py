@@ -325,40 +325,40 @@ def _lanes(p: Problem, points: np.ndarray, budget: Budget) -> tuple[list[State],
     first = budget.iterations if k == 1 else min(STEPS, budget.iterations)
     lanes.go(np.arange(k), first, budget)
     cost = lanes.cost[:k]
-    found: list[State] = []
-    for lane in np.argsort(cost, kind="stable")[:POLISHED]:
+    found: dict[int, State] = {}
+    for lane in np.argsort(cost, kind="stable")[:POLISHED].tolist():
         if not np.isfinite(cost[lane]):
             break
         if not lanes.done[lane]:
-            lanes.go(lane[None], budget.iterations, budget)
-        found.append(_moved_off(p, lanes, int(lane), budget))
-        if _rests(p, found[-1]):
+            lanes.go(np.array([lane]), budget.iterations, budget)
+        found[lane] = _moved_off(p, lanes, lane, budget)
+        if _rests(p, found[lane]):
             break
-    return found, [_account(lanes, lane) for lane in range(k)]
+    accounts = [_account(lanes, lane, found.get(lane)) for lane in range(k)]
+    return list(found.values()), accounts
 
 
-def _account(lanes: _Lanes, lane: int) -> Attempt:
+def _account(lanes: _Lanes, lane: int, s: State | None) -> Attempt:
     theta, name = lanes.theta[lane].copy(), "Levenberg-Marquardt"
     if not np.isfinite(lanes.cost[lane]):
         lost = assess.KKT(np.inf, np.inf, np.inf)
         return Attempt(name, theta, np.nan, lost, int(lanes.steps[lane]), "cost not finite")
     said = "came to rest" if lanes.rested[lane] else "ran out of iterations"
-    s = lanes.state(lane)
+    s = lanes.state(lane) if s is None else s
     return Attempt(name, theta, float(s.at.cost), s.kkt, int(lanes.steps[lane]), said)
 
 
 def _moved_off(p: Problem, lanes: _Lanes, lane: int, budget: Budget) -> State:
     """Judge one end; where the cost bends down there, move off and go on."""
+    s = lanes.state(lane)
     for _ in range(MOVES):
-        s = lanes.state(lane)
-        if not s.at.finite:
-            return s
-        point = assess.lower_beside(p, s, lanes.look)
+        point = assess.lower_beside(p, s, lanes.look) if s.at.finite else None
         if point is None or budget.left <= 0:
             break
         lanes.move(lane, point)
         lanes.go(np.array([lane]), int(lanes.steps[lane]) + budget.iterations, budget)
-    return lanes.state(lane)
+        s = lanes.state(lane)
+    return s
 
 
 # ---- constraints and further objectives: one start after the other
@@ -398,10 +398,10 @@ def _program(
         begin = best.theta if near else start
         for _ in range(1 + MOVES):
             end = stage.solve(
-                program, (begin / scale.unit)[moving], min(stage.steps, budget.iterations), budget
+                program, begin[moving] / program.unit, min(stage.steps, budget.iterations), budget
             )
             theta = start.copy()
-            theta[moving] = end.x * scale.unit[moving]
+            theta[moving] = end.x * program.unit
             theta = np.clip(theta, p.lower, p.upper)
             s = assess.state(p, theta, scale)
             steps, said = steps + end.iterations, end.said
