@@ -9,7 +9,17 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import FigureBase
 
-from beamfit.report.document import BLUE, MANY, RED, Page, Picture, Verdict, provenance, written
+from beamfit.report.document import (
+    BLUE,
+    MANY,
+    RED,
+    Page,
+    Picture,
+    Verdict,
+    legend_below,
+    provenance,
+    written,
+)
 from beamfit.status import Status
 from beamfit.studies.scan.fit import EmittanceFit
 from beamfit.studies.scan.results import (
@@ -125,23 +135,19 @@ def draw_scan(figure: FigureBase, fit: EmittanceFit, plane: str) -> None:
     p = fit[plane]
     above, below = figure.subplots(2, 1, sharex=True, height_ratios=(3, 1))
     at, words = setting_axis(p)
-    below.set_xlabel(words)
     one = _varied(p) if fit.statement.whole_map else []
     if len(one) == 1:
         _curves(above, fit, p, one[0])
     else:  # known at the measured settings alone
         above.plot(at, 1e6 * p.points.model, "_", ms=14, mew=2, color=COLOUR[plane], alpha=0.6)
     _points(above, p, at)
-    above.set_ylabel("rms size, µm")
-    above.set_ylim(bottom=0.0)
-    above.set_title(f"{plane} plane: {_headline(p)}")
+    above.set(title=f"{plane} plane: {_headline(p)}", ylabel="rms size, µm", ylim=(0.0, None))
     below.axhspan(-1, 1, color="0.93")
     below.axhline(0, color="0.6", lw=0.8)
     below.plot(at, p.points.pull, "o", color=COLOUR[plane], ms=5, rasterized=len(at) > MANY)
     finite = np.abs(p.points.pull[np.isfinite(p.points.pull)])
     reach = max(3.0, 1.15 * float(finite.max(initial=0.0)))
-    below.set_ylim(-reach, reach)
-    below.set_ylabel("residual,\nstd. errors")
+    below.set(xlabel=words, ylabel="residual,\nstd. errors", ylim=(-reach, reach))
 
 
 def _varied(p: PlaneFit) -> list[str]:
@@ -216,12 +222,10 @@ def draw_ellipses(figure: FigureBase, fit: EmittanceFit) -> None:
     start.set_title("phase ellipse at the start")
     screen.set_title(f"at {drawn[0].screen.name}")
     for axes in (start, screen):
-        axes.set_xlabel("position, µm")
-        axes.set_ylabel("angle, µrad")
+        axes.set(xlabel="position, µm", ylabel="angle, µrad")
         axes.axhline(0, color="0.85", lw=0.8, zorder=0)
         axes.axvline(0, color="0.85", lw=0.8, zorder=0)
-    handles, labels = start.get_legend_handles_labels()
-    figure.legend(handles, labels, frameon=False, loc="outside lower center", ncols=2)
+    legend_below(figure, start, 2)
 
 
 def _pictures(fit: EmittanceFit) -> list[Picture]:

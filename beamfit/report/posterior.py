@@ -12,7 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import FigureBase
 from matplotlib.ticker import MaxNLocator, NullLocator
 
-from beamfit.report.document import BLUE, MANY, Page, Picture, Verdict
+from beamfit.report.document import BLUE, MANY, Page, Picture, Verdict, legend_below
 from beamfit.report.emittance import COLOUR, setting_axis
 from beamfit.sampling.likelihood import noise_words
 from beamfit.sampling.posterior import Expected, Posterior
@@ -240,11 +240,9 @@ def _expectations(
     style = {"fmt": "o", "color": "black", "ms": 2 if many else 4, "capsize": 0 if many else 2}
     axes.errorbar(at, measured - middle, error, lw=0.8, rasterized=many, label="readings", **style)
     reach = max(np.abs(unit * found.reading - middle).max(), np.abs(measured - middle).max())
+    axes.set(title=f"{title}: what the posterior expects", xlabel=labels[0], ylabel=labels[1])
     axes.set_ylim(-1.15 * reach, 1.15 * reach)
-    axes.set_xlabel(labels[0])
-    axes.set_ylabel(labels[1])
-    axes.set_title(f"{title}: what the posterior expects")
-    axes.figure.legend(frameon=False, loc="outside lower center", ncols=3)
+    legend_below(figure, axes, 3)
 
 
 def of_scan(fit: EmittanceFit, posterior: Posterior) -> Sampled:
