@@ -104,6 +104,8 @@ class Statement(NamedTuple):
     labels : mapping of str to str
         What stands for a record before the names of its noise; by default nothing if there is one
         record, else its name.
+    trusted : sequence of str
+        Records whose errors are right, whatever the residuals show: anchors of a model.
     noise_unit : str
         Of the errors of records that came without.
     priors_own, hidden : sequence of str
@@ -126,6 +128,7 @@ class Statement(NamedTuple):
     lower: Mapping[str, float] = {}
     width: Mapping[str, float] = {}
     labels: Mapping[str, str] = {}
+    trusted: Sequence[str] = ()
     noise_unit: str = "1"
     priors_own: Sequence[str] = ()
     hidden: Sequence[str] = ()
@@ -251,7 +254,7 @@ def target_of(
         upper=upper,
         mode=theta[moving],
         covariance=covariance,
-        groups=_groups(p, optimum, stated.labels, noise, outliers),
+        groups=_groups(p, optimum, stated, noise, outliers),
         noise=noise_found,
         counts=tuple(record.used for record in p.records),
         noise_unit="1" if any(optimum.given) else stated.noise_unit,
@@ -331,15 +334,17 @@ def _widths(
 
 
 def _groups(
-    p: Problem, optimum: Optimum, labels: Mapping[str, str], noise: str | None, outliers: bool
+    p: Problem, optimum: Optimum, stated: Statement, noise: str | None, outliers: bool
 ) -> tuple[Group, ...]:
     """How each record scatters; a factor on errors cannot be inferred where nothing shows it."""
     groups = []
     for record, scale, given in zip(p.records, optimum.scales, optimum.given, strict=True):
-        label = labels.get(record.name, record.name if len(p.records) > 1 else "")
+        label = stated.labels.get(record.name, record.name if len(p.records) > 1 else "")
+        trusted = record.name in stated.trusted
         kind = noise or ("inferred" if scale > 1 or not given else "known")
-        shown = scale > 0 or not given
-        groups.append(Group(label, kind if shown else "known", outliers))
+        if trusted or (given and not scale > 0):
+            kind = "known"
+        groups.append(Group(label, kind, outliers and not trusted))
     return tuple(groups) or (Group("", noise or "known", outliers),)
 
 
