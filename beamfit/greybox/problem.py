@@ -314,7 +314,7 @@ _GROUPS = ("records", "priors", "constraints", "objectives")
 def _shape_of(function: Callable, *arguments: Any) -> tuple[int, ...]:
     """Shape of what a function gives, traced once for each structure and shape of arguments."""
     leaves, structure = jax.tree_util.tree_flatten(arguments)
-    kinds = tuple((np.shape(leaf), np.result_type(leaf)) for leaf in leaves)
+    kinds = tuple((np.shape(leaf), getattr(leaf, "dtype", np.dtype(float))) for leaf in leaves)
     return _traced_shape(function, structure, kinds)
 
 

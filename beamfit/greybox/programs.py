@@ -13,7 +13,7 @@ import jax
 import numpy as np
 from scipy import optimize
 
-from beamfit.greybox import assess, problem
+from beamfit.greybox import assess, curvature, problem
 from beamfit.greybox.problem import Problem
 
 __all__ = ["SOLVERS", "Budget", "Program", "Proposal", "Stage", "scaled"]
@@ -243,7 +243,7 @@ def scaled(
     steepest = max(np.max(np.abs(at.gradient * scale.unit)), 1e-300)
     # Squares are counted in their errors; a steep cost is flattened, as IPOPT does.
     flat = 1.0 / scale.cost if p.objectives else min(1.0, 100.0 / steepest)
-    second = _squares if hessian == "gauss_newton" else assess.lagrangian_hessian
+    second = _squares if hessian == "gauss_newton" else curvature.lagrangian_hessian
     functions = {function: p.compiled(function) for function in (_values, _first, second)}
     kept: dict = {}
 
@@ -268,7 +268,7 @@ def scaled(
         gradient, jacobian = remember(_first, x)
         return flat * gradient[moving] * unit, jacobian[:, moving] * unit / limit[:, None]
 
-    def curvature(x, sigma, y):
+    def bend(x, sigma, y):
         h = np.asarray(functions[second](full(x), sigma * flat, y / limit))
         return h[np.ix_(moving, moving)] * np.outer(unit, unit)
 
@@ -282,7 +282,7 @@ def scaled(
     return Program(
         values,
         slopes,
-        curvature,
+        bend,
         p.lower[moving] / unit,
         p.upper[moving] / unit,
         p.constraint_lower / limit,
