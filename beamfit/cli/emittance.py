@@ -105,7 +105,7 @@ def emittance(
 
 def _results(fit: EmittanceFit) -> list[dict[str, Any]]:
     """What a fit says, and what small errors of the line and parts of the scan would change."""
-    if fit.scenario != "known":
+    if not fit.statement.closed:
         return fit.to_json()
 
     from beamfit.studies.scan.sensitivity import range_sensitivity, systematics
@@ -119,8 +119,8 @@ def _results(fit: EmittanceFit) -> list[dict[str, Any]]:
 def _show(fit: EmittanceFit, posterior: Posterior | None, report: str | None) -> None:
     """Show tables, the verdict and what the budget is."""
     from beamfit.cli.show import Terminal
+    from beamfit.studies.scan.results import parameter_rows, result_rows
     from beamfit.studies.scan.sensitivity import budget_rows, range_rows
-    from beamfit.studies.scan.tables import parameter_rows, result_rows
     from beamfit.table import Table, labelled
 
     terminal, names = Terminal(), [p.plane for p in fit.planes]
@@ -130,7 +130,7 @@ def _show(fit: EmittanceFit, posterior: Posterior | None, report: str | None) ->
     for p in fit.planes:
         terminal.verdict(p.plane, p.status, p.message)
     terminal.line()
-    if fit.scenario == "known":
+    if fit.statement.closed:
         for head, rows in (
             ("Change of the normalised emittance if", budget_rows(fit)),
             ("Normalised emittance (shift in std. errors)", range_rows(fit)),
@@ -143,9 +143,9 @@ def _show(fit: EmittanceFit, posterior: Posterior | None, report: str | None) ->
         terminal.table(Table("", ["Fitted too", "value", "bounds", "prior", "state"], cells))
     for words in fit.null_directions:
         terminal.line(f"Left open: {words}.")
-    if fit.scenario.endswith("network"):
+    if fit.statement.network:
         terminal.line(f"Anchor: {fit.anchor}.", style="dim")
-    if fit.scenario != "known":
+    if not fit.statement.closed:
         terminal.line()
     errors = fit.scan.error_source if fit.scan.error else "inferred from the residuals"
     terminal.line(f"Errors of the sizes: {errors}.", style="dim")

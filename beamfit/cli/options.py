@@ -23,7 +23,7 @@ def _parsed(read: Callable[[Any], Any]) -> Callable[..., Any]:
 
 
 def _check_place(path: str) -> None:
-    from beamfit.sampling.place import check_place
+    from beamfit.sampling.store import check_place
 
     check_place(path)
 

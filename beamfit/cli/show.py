@@ -10,7 +10,6 @@ from rich.text import Text
 
 from beamfit.quantity import Status
 from beamfit.sampling.posterior import Posterior
-from beamfit.sampling.text import HEADER, interval_rows
 from beamfit.table import Table
 
 __all__ = ["Terminal"]
@@ -62,7 +61,7 @@ class Terminal:
 
     def posterior(self, title: str, posterior: Posterior) -> None:
         """Show intervals, verdict and diagnostics."""
-        self.table(Table(f"\n{title}", HEADER, interval_rows(posterior)), wrap=False)
+        self.table(posterior.table(f"\n{title}"), wrap=False)
         self.verdict("posterior", posterior.status, posterior.message)
 
     def report(self, path: str | None) -> None:

@@ -11,9 +11,8 @@ from matplotlib import rc_context
 from beamfit.errors import InputError
 from beamfit.io.files import write_atomically
 from beamfit.report.decays import decay_page
-from beamfit.report.document import html_of
+from beamfit.report.document import STYLE, html_of
 from beamfit.report.emittance import emittance_page
-from beamfit.report.figures import STYLE
 from beamfit.report.pdf import pdf_of
 from beamfit.report.posterior import with_beam_posterior, with_decay_posteriors
 from beamfit.sampling.posterior import Posterior

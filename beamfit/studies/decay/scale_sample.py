@@ -2,75 +2,53 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from collections.abc import Mapping
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from beamfit.greybox.posterior import Optimum, Statement, target_of
+from beamfit.greybox.problem import Free, Prior, Problem, Record
 from beamfit.lifetime.losses import MECHANISMS, SCALES
 from beamfit.lifetime.ring import Operation
 from beamfit.lifetime.scaled import Terms, loss_terms, scaled_losses, scaled_parts
-from beamfit.sampling.posterior import Interval, Posterior
-from beamfit.sampling.target import Law, Target
+from beamfit.sampling.posterior import Posterior
+from beamfit.sampling.summary import Interval
 from beamfit.studies.decay.scales import ScaleFit, pulls, whitener
 from beamfit.studies.decay.summary import Summaries
+from beamfit.verdict import Finding
 
 __all__ = ["Interval", "budget_intervals", "sample_scales"]
 
 LARGEST = 1e3
+# How far walkers begin from scales that the decays do not tell.
+WIDTH = 0.3
 HOUR = 3600.0
 
-
-class Study(NamedTuple):
-    """What the decays say of the scales.
-
-    Attributes
-    ----------
-    terms, measured : Terms, Summaries
-        First principles, and the decays.
-    pressure_error : Array
-        Relative error of the pressure readings.
-    mean, error : Array
-        Shape (4,), priors; an infinite error for none.
-    unit : Array
-        Factor on the errors of the decays.
-    """
-
-    terms: Terms
-    measured: Summaries
-    pressure_error: Array
-    mean: Array
-    error: Array
-    unit: Array
+# First principles, the decays, the relative error of pressure readings, the factor on errors.
+Study = tuple[Terms, Summaries, Array, Array]
 
 
-def _no_residual(data: Study, scales: Array) -> tuple[Array, ...]:
-    """The weights move with the scales, so that the density is written as a whole below."""
-    return (jnp.zeros(0),)
+def _whitened(scales: Mapping[str, Array], study: Study) -> tuple[Array, Array]:
+    terms, measured, pressure_error, _ = study
+    vector = jnp.stack([scales[name] for name in SCALES])
+    weight = whitener(vector, terms, measured, pressure_error)
+    return weight, pulls(vector, terms, measured, weight)
 
 
-def _log_density(data: Study, scales: Array) -> Array:
-    weight = whitener(scales, data.terms, data.measured, data.pressure_error)
-    off = pulls(scales, data.terms, data.measured, weight)
-    # det(W)/det(R) is the normalisation that changes with the scales.
-    volume = jnp.abs(jnp.linalg.det(weight))
-    known = jnp.abs(jnp.linalg.det(data.measured.root)) > 0
-    volume = jnp.sum(jnp.where(known, jnp.log(jnp.where(known, volume, 1.0)), 0.0))
-    prior = jnp.sum(((scales - data.mean) / data.error) ** 2)
-    return volume - 0.5 * jnp.sum(off**2) / data.unit**2 - 0.5 * prior
+def _pulls(scales: Mapping[str, Array], study: Study) -> Array:
+    """Model minus measurement in standard errors, which move with the scales."""
+    return _whitened(scales, study)[1] / study[3]
 
 
-def _itself(data: Study, scales: Array) -> Array:
-    return scales
-
-
-def _nothing(data: Study, scales: Array) -> Array:
-    return scales[:0]
-
-
-LAW = Law(_no_residual, _log_density, _nothing, _itself)
+def _log_volume(scales: Mapping[str, Array], study: Study) -> Array:
+    """det(W)/det(R): the normalisation, which changes with the scales as the errors do."""
+    volume = jnp.abs(jnp.linalg.det(_whitened(scales, study)[0]))
+    known = jnp.abs(jnp.linalg.det(study[1].root)) > 0
+    return jnp.sum(jnp.where(known, jnp.log(jnp.where(known, volume, 1.0)), 0.0))
 
 
 def sample_scales(fit: ScaleFit, seed: int = 0, **options: Any) -> Posterior:
@@ -93,37 +71,24 @@ def sample_scales(fit: ScaleFit, seed: int = 0, **options: Any) -> Posterior:
     """
     from beamfit.sampling.ensemble import draw
 
-    spread = np.sqrt(np.diag(fit.covariance)) * fit.error_scale
-    wide = ~np.isfinite(spread) | (spread > 0.3)
-    covariance = np.where(np.isfinite(fit.covariance), fit.covariance, 0.0) * fit.error_scale**2
-    covariance[wide] = covariance[:, wide] = 0.0
-    covariance[wide, wide] = 0.3**2
-    unknown = tuple(name for name in SCALES if getattr(fit, name).error is None)
-    target = Target(
-        law=LAW,
-        data=Study(
-            fit.terms,
-            fit.measured,
-            fit.pressure_error,
-            fit.prior_mean,
-            fit.prior_error,
-            fit.error_scale,
-        ),
-        names=tuple(SCALES),
-        units=("1",) * 4,
-        lower=np.zeros(4),
-        upper=np.full(4, LARGEST),
-        mode=fit.vector,
-        covariance=covariance,
-        observed={
-            "mean current mA": np.asarray(fit.measured.current),
-            "loss rates 1/s": np.asarray(fit.measured.parts),
-            "decays": np.array(fit.names),
-        },
-        priors_own=unknown,
-        verdict=(fit.status.value, fit.message),
+    names = tuple(SCALES)
+    study = (fit.terms, fit.measured, fit.pressure_error, fit.error_scale)
+    told = zip(names, fit.prior_mean, fit.prior_error, strict=True)
+    problem = Problem(
+        dict(zip(names, fit.vector, strict=True)),
+        [Free(name, 0.0, LARGEST) for name in names],
+        [Record("decays", _pulls, study, np.zeros_like(fit.measured.parts), 1.0)],
+        [Prior(name, mean, error) for name, mean, error in told if np.isfinite(error)],
     )
-    return draw(target, seed=seed, **options)
+    stated = Statement(
+        data=study,
+        log_volume=_log_volume,
+        units=dict.fromkeys(names, "1"),
+        width=dict.fromkeys(names, WIDTH),
+        priors_own=[name for name in names if getattr(fit, name).error is None],
+    )
+    optimum = Optimum(fit.vector, Finding(fit.status, fit.message), [1.0], [True])
+    return draw(target_of(problem, optimum, stated), seed=seed, **options)
 
 
 def losses_of(draws: Array, terms: Terms) -> tuple[Array, Array]:

@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
-from beamfit.greybox import assess
-from beamfit.greybox.bounded import MOST_SHARE, Spread, spread_of
+from beamfit.greybox import assess, tree
+from beamfit.greybox.covariance import MOST_SHARE, Spread, spread_of
 from beamfit.studies.scan.fit import EmittanceFit
-from beamfit.studies.scan.scenario_judged import with_slope
-from beamfit.studies.scan.scenario_model import sigma_of
-from beamfit.studies.scan.sigma import emittance_parts
+from beamfit.studies.scan.model import emittance_parts, sigma_of
 from beamfit.studies.scan.verdict import CLEAR
 
-__all__ = ["Information", "information_of", "linearised_at"]
+__all__ = ["Information", "information_of", "linearised_at", "with_slope"]
 
 
 class Information(NamedTuple):
@@ -106,7 +106,7 @@ def information_of(fit: EmittanceFit) -> Information:
     )
     jacobian = jacobian / rows[:, None]
     held = p.lower == p.upper
-    if fit.fit is not None and _determined(fit):
+    if fit.solved is not None and _determined(fit):
         edge = np.array([v.state in ("lower", "upper") for v in fit.fit.variables])
         held = held | (edge & p.nuisance)
     planes = tuple(plane.plane for plane in fit.planes)
@@ -130,15 +130,25 @@ def linearised_at(fit: EmittanceFit) -> np.ndarray:
     Numbers that the data do not determine end anywhere; what a measurement would tell is then
     asked of the line and the beam one started from.
     """
-    if fit.fit is None:
+    if fit.solved is None:
         return fit.problem.start
-    if _determined(fit) or fit.stated is None:
+    if _determined(fit):
         return fit.fit.theta
     return np.clip(fit.stated.start, fit.stated.lower, fit.stated.upper)
 
 
 def _determined(fit: EmittanceFit) -> bool:
     return all(plane.identifiability.determined for plane in fit.planes)
+
+
+@partial(jax.jit, static_argnums=0)
+def with_slope(function, core, theta, data):
+    """``function(model, data)`` as a flat vector, with its derivatives by the free numbers."""
+
+    def of_theta(t):
+        return jnp.ravel(function(tree.replace(core.model, core.chosen, t), data))
+
+    return of_theta(theta), jax.jacfwd(of_theta)(theta)
 
 
 def _named(plane: str) -> dict:
