@@ -16,7 +16,7 @@ _HOME = {
     "Anchor": "beamfit.studies.scan.assumptions",
     "BeamMatrix": "beamfit.optics.beam",
     "Beamline": "beamfit.optics.beamline",
-    "DecayFit": "beamfit.studies.decay.result",
+    "DecayFit": "beamfit.studies.decay.fit",
     "DecayRecord": "beamfit.studies.decay.record",
     "Drift": "beamfit.optics.elements",
     "EmittanceFit": "beamfit.studies.scan.fit",

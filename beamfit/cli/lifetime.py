@@ -28,6 +28,7 @@ Examples:
   beamfit lifetime fill1.csv fill2.h5 --ring lattices/spear3_2003.toml
   beamfit lifetime fill1.csv --ring ring.toml --report fill1.html --json
   beamfit lifetime measurements/spear3_shift_simulated.csv --ring lattices/spear3_2003.toml --study
+  beamfit lifetime shift.csv --ring ring.toml --study --network correction
 """
 
 
@@ -44,11 +45,18 @@ Examples:
     help="Fit the ring's loss mechanisms to all decays together: scales, loss budget with credible "
     "intervals, best operating point, next decay, anomaly. Needs --ring.",
 )
+@click.option(
+    "--network",
+    type=click.Choice(["alone", "correction"]),
+    help="With --study: also fit a and b by a network that falls with bunches and scraper and "
+    "rises with pressure; alone, or as a factor on the fitted first principles.",
+)
 @options("sample store seed report json")
 def lifetime(
     record: tuple[str, ...],
     ring: str | None,
     study: bool,
+    network: str | None,
     sample: bool,
     store: str | None,
     seed: int,
@@ -66,6 +74,8 @@ def lifetime(
     sampling.check()
     if study and ring is None:
         raise InputError("--study without a ring", "--ring FILE.toml")
+    if network is not None and not study:
+        raise InputError("--network without a study", "--study --ring FILE.toml")
     records = [read_decay_record(path) for path in dict.fromkeys(record)]
     if len(records) < len(record):
         twice = next(path for path in record if record.count(path) > 1)
@@ -77,7 +87,7 @@ def lifetime(
 
     studies = tuple(study_record(each, machine) for each in records)
     decays = [decay for each in studies for decay in each.decays]
-    shift = _shift(decays, machine) if study else None
+    shift = _shift(decays, machine, network) if study else None
     posteriors = None
     if sample:
         sampling.check_one(len(decays))
@@ -114,10 +124,11 @@ def _machine(path: str) -> Machine:
     return Machine(ring, operation)
 
 
-def _shift(decays: list[Decay], machine: Machine) -> Shift:
+def _shift(decays: list[Decay], machine: Machine, network: str | None) -> Shift:
+    from beamfit.studies.decay.network import Network
     from beamfit.studies.decay.shift import study_shift
 
-    return study_shift(decays, machine)
+    return study_shift(decays, machine, network=network and Network(network))
 
 
 def _show(terminal: Terminal, study: RecordStudy) -> None:
@@ -168,7 +179,7 @@ def _show_many(terminal: Terminal, study: RecordStudy) -> None:
 def _show_shift(terminal: Terminal, shift: Shift) -> None:
     """Lay out a study of many decays and its verdicts."""
     from beamfit.quantity import Status
-    from beamfit.studies.decay.tables import shift_rows
+    from beamfit.studies.decay.tables import network_rows, shift_rows
     from beamfit.table import labelled
 
     fit, count = shift.fit, len(shift.fit.names)
@@ -179,3 +190,9 @@ def _show_shift(terminal: Terminal, shift: Shift) -> None:
     terminal.verdict("operating point", Status.converged, shift.best.message)
     if shift.anomaly is not None:
         terminal.verdict("second half", shift.anomaly.status, shift.anomaly.message)
+    if shift.network is not None:
+        found = shift.network.fit
+        terminal.table(
+            labelled("A network of the losses", names, network_rows(shift)), [found.status]
+        )
+        terminal.verdict("network", found.status, found.message)

@@ -61,7 +61,7 @@ class Terminal:
 
     def posterior(self, title: str, posterior: Posterior) -> None:
         """Show intervals, verdict and diagnostics."""
-        self.table(posterior.table(f"\n{title}"), wrap=False)
+        self.table(posterior.table()._replace(title=f"\n{title}"), wrap=False)
         self.verdict("posterior", posterior.status, posterior.message)
 
     def report(self, path: str | None) -> None:

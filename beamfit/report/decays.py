@@ -24,6 +24,7 @@ from beamfit.studies.decay.tables import (
     check_rows,
     decay_rows,
     event_rows,
+    network_rows,
     overview,
     separability_rows,
     shift_rows,
@@ -83,6 +84,8 @@ def decay_page(
     """
     decays = [decay for study in studies for decay in study.decays]
     tables = [] if shift is None else [labelled("All decays", ["value"], shift_rows(shift), SHIFT)]
+    if shift is not None and shift.network is not None:
+        tables.append(labelled("A network of the losses", ["value"], network_rows(shift)))
     tables += _side_by_side(decays) if len(decays) <= FEW else _one_below_another(decays)
     header = ["what", "at", "for", "change"]
     tables += [

@@ -16,8 +16,8 @@ from beamfit.report.emittance import COLOUR
 from beamfit.sampling.likelihood import noise_words
 from beamfit.sampling.posterior import Expected, Posterior
 from beamfit.sampling.summary import in_unit, plain_name
+from beamfit.studies.decay.fit import DecayFit
 from beamfit.studies.decay.posterior import expected_current
-from beamfit.studies.decay.result import DecayFit
 from beamfit.studies.scan.fit import EmittanceFit
 from beamfit.studies.scan.posterior import expected_sizes
 from beamfit.table import Table

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import NamedTuple, Protocol
+from typing import Protocol
 
 import jax.numpy as jnp
 import numpy as np
@@ -11,30 +11,21 @@ from jax import Array
 
 from beamfit.errors import InputError
 from beamfit.greybox.posterior import Optimum, Statement, record_of, target_of
-from beamfit.greybox.problem import Free, Problem, Record
-from beamfit.lifetime.decay import current
+from beamfit.greybox.problem import Free, Problem
+from beamfit.lifetime.decay import HOUR, current
 from beamfit.quantity import Quantity
 from beamfit.sampling.posterior import Expected, Posterior
 from beamfit.sampling.priors import Distribution
 from beamfit.sampling.target import Target
 from beamfit.status import Status
+from beamfit.studies.decay.model import RECORD, DecayNumbers, decay_record
 from beamfit.studies.decay.record import DecayRecord
 from beamfit.verdict import Finding
 
-__all__ = ["DecayNumbers", "decay_target", "expected_current"]
+__all__ = ["decay_target", "expected_current"]
 
-HOUR = 3600.0
 UNITS = {"i0": "mA", "a": "1/(mA s)", "b": "1/s"}
 LIFETIMES = {"lifetime_start": "h", "lifetime_mean": "h", "lifetime_end": "h"}
-RECORD = "decay"
-
-
-class DecayNumbers(NamedTuple):
-    """One draw: current at the first reading, mA, and the coefficients of dI/dt = -a I² - b I."""
-
-    i0: Array
-    a: Array
-    b: Array
 
 
 class Fitted(Protocol):
@@ -52,15 +43,10 @@ class Fitted(Protocol):
     readings: DecayRecord | None
 
 
-def _currents(numbers: DecayNumbers, time: Array) -> Array:
-    """Report equation 44."""
-    return current(time, *numbers)
-
-
 def _lifetimes(numbers: DecayNumbers, at: tuple[Array, Array]) -> Array:
     """Lifetime at the first reading, at the mean current and at the last reading, h."""
     mean, last = at
-    levels = jnp.stack([numbers.i0, mean, current(last, *numbers)])
+    levels = jnp.stack([numbers.i0, mean, current(last, numbers.i0, numbers.a, numbers.b)])
     return 1.0 / (numbers.a * levels + numbers.b) / HOUR
 
 
@@ -102,8 +88,7 @@ def decay_target(
         expected = "a fit of eq. 44 with constant a and b; sample fit_decay(record) without shape"
         raise InputError("a fit with a shape of a(I), which is not sampled", expected)
     free = [Free("i0"), Free("a"), Free("b")]
-    rows = Record(RECORD, _currents, record.time, record.current, record.error)
-    problem = Problem(DecayNumbers(1.0, 0.0, 0.0), free, [rows])
+    problem = Problem(DecayNumbers(1.0, 0.0, 0.0), free, [decay_record(record)])
     theta, rate = _start(fit, record)
     scale = fit.rms_residual * np.sqrt(len(record) / max(fit.dof, 1))
     if record.error is not None:
