@@ -13,6 +13,7 @@ from beamfit.io.measurement import read_quad_scan
 from beamfit.io.result import results_text
 from beamfit.studies.scan.assumptions import Assumptions
 from beamfit.studies.scan.typed import energies_of, goal_of
+from beamfit.table import text_of
 
 if TYPE_CHECKING:
     from beamfit.studies.scan.design import Advice
@@ -81,31 +82,8 @@ def design(
 
 def _show(advice: Advice, title: str) -> None:
     from beamfit.cli.show import Terminal
-    from beamfit.quantity import Status
-    from beamfit.table import Table
 
-    terminal, planes = Terminal(), list(advice.now)
+    terminal = Terminal()
     terminal.line(f"{title}, scenario {advice.scenario}: error of the emittance", style="bold")
-    rows = [["what is measured", *_cells(advice.now, advice.identified)]]
-    rows += [
-        [f"{number}. {step.candidate.words}", *_cells(step.relative_error, True)]
-        for number, step in enumerate(advice.steps, 1)
-        if step.identified
-    ]
-    if advice.steps and not advice.steps[-1].identified:
-        words = f"{len(advice.steps)} more points of the scan, at the best settings"
-        rows.append([words, *_cells(advice.now, False)])
-    terminal.table(Table("", ["after", *planes], rows, numeric=True))
-    if advice.options:
-        header = ["\nWhat would identify it", *(f"error {plane}" for plane in planes), "identified"]
-        rows = [
-            [o.words, *_cells(o.relative_error, o.identified), "yes" if o.identified else "no"]
-            for o in advice.options
-        ]
-        terminal.table(Table("", header, rows, numeric=True))
-    status = Status.converged if advice.identified else Status.unidentified
-    terminal.verdict("design", status, advice.message)
-
-
-def _cells(error: dict[str, float], identified: bool) -> list[str]:
-    return [f"{100 * e:.2f} %" if identified else "not determined" for e in error.values()]
+    click.echo("\n\n".join(map(text_of, advice.tables())))
+    terminal.verdict("design", advice.status, advice.message)

@@ -73,10 +73,7 @@ def lifetime(
     """
     sampling = Sampling(sample, store, seed)
     sampling.check()
-    if study and ring is None:
-        raise InputError("--study without a ring", "--ring FILE.toml")
-    if network is not None and not study:
-        raise InputError("--network without a study", "--study --ring FILE.toml")
+    _check_study(study, ring, network)
     records = [read_decay_record(path) for path in dict.fromkeys(record)]
     if len(records) < len(record):
         twice = next(path for path in record if record.count(path) > 1)
@@ -105,6 +102,13 @@ def lifetime(
         click.echo(results_text(results, inputs, command_line(), **further))
     else:
         _show(studies, posteriors, shift, report)
+
+
+def _check_study(study: bool, ring: str | None, network: str | None) -> None:
+    if study and ring is None:
+        raise InputError("--study without a ring", "--ring FILE.toml")
+    if network is not None and not study:
+        raise InputError("--network without a study", "--study --ring FILE.toml")
 
 
 def _machine(path: str) -> Machine:

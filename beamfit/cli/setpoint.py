@@ -127,8 +127,7 @@ def _show(found: Setpoint) -> None:
     from beamfit.cli.show import Terminal
 
     terminal = Terminal()
-    for table in found.tables():
-        click.echo(text_of(table))
+    click.echo("\n\n".join(map(text_of, found.tables())))
     terminal.verdict("set point", found.status, found.message)
     for note in found.notes:
         terminal.line(note)

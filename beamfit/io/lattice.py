@@ -1,4 +1,7 @@
-"""Lattice files: versioned TOML, checked line by line before any optics is built."""
+"""Lattice files: versioned TOML, checked line by line before any optics is built.
+
+The keys of an element and the element they make stand here together.
+"""
 
 from __future__ import annotations
 
@@ -6,14 +9,20 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from beamfit.errors import InputError, nearest
 from beamfit.io.toml import FLAG, LIST, TABLE, TEXT, Key, Section, is_number, read_toml
 from beamfit.particles import REST_ENERGY, expected_energy
 from beamfit.studies.scan.scans import QuadScan, check_names
 
-__all__ = ["LatticeFile", "read_toml_lattice"]
+if TYPE_CHECKING:
+    from beamfit.optics.calibration import Calibration
+    from beamfit.optics.elements import Element
+
+__all__ = ["LatticeFile", "element_of", "read_toml_lattice"]
 
 FORMAT = "beamfit-lattice-1"
 # Settings a magnet may be given, one of them; the key says the unit.
@@ -246,3 +255,61 @@ def _design(top: Section, names: list[str]) -> Mapping[str, Any] | None:
             expected = f"{plane} = {{ beta_m = ..., alpha = ... }}, beta_m > 0"
             raise section.error(f"design {plane} = {twiss!r}"[:80], expected, plane)
     return section.table
+
+
+def element_of(table: Mapping[str, Any], mass: float) -> Element:
+    """Build the element a checked table describes, for particles of a rest energy in MeV.
+
+    Examples
+    --------
+    >>> element_of({"type": "screen", "name": "S", "resolution_um": 5.0}, mass=0.511).resolution
+    4.9999999999999996e-06
+    """
+    from beamfit.optics import elements
+
+    name = table["name"]
+    match table["type"]:
+        case "drift":
+            return elements.Drift(name, float(table["length_m"]))
+        case "marker":
+            return elements.Marker(name)
+        case "screen":
+            return elements.Screen(name, 1e-6 * table.get("resolution_um", 0.0))
+        case "sector_dipole":
+            edges = [np.radians(table.get(f"{end}_edge_deg", 0.0)) for end in ("entrance", "exit")]
+            return elements.SectorDipole(
+                name,
+                float(np.copysign(table["radius_m"], table["angle_deg"])),
+                float(np.radians(table["angle_deg"])),
+                *map(float, edges),
+                table["bend_plane"],
+                float(table.get("energy_offset", 0.0)),
+                float(table.get("k1_per_m2", 0.0)),
+            )
+        case "thin_lens":
+            return elements.ThinLens(name, *_strength(table, mass))
+        case _:
+            length = float(table["length_m"])
+            return elements.Quadrupole(name, length, *_strength(table, mass))
+
+
+def _strength(table: Mapping[str, Any], mass: float) -> tuple[float, Calibration]:
+    """The setting of a magnet and what it means."""
+    from beamfit.optics import calibration
+
+    if "integrated_gradient_kG" in table:
+        return float(table["integrated_gradient_kG"]), calibration.IntegratedGradient(mass=mass)
+    if "k1_per_m2" in table:
+        return float(table["k1_per_m2"]), calibration.FocusingStrength()
+    if "k1l_per_m" in table:
+        return float(table["k1l_per_m"]), calibration.IntegratedStrength()
+    current = float(table["current_A"])
+    if "slope" in table:
+        line = calibration.SlopeIntercept(float(table["slope"]), float(table["intercept"]))
+        return current, line
+    polynomial = calibration.CurrentPolynomial(
+        tuple(float(c) for c in table["gradient_polynomial_T_per_m"]),
+        signed_intercept=table.get("signed_intercept", False),
+        mass=mass,
+    )
+    return current, polynomial

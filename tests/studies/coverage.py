@@ -12,7 +12,7 @@ import numpy as np
 from beamfit.greybox import problem as greybox
 from beamfit.greybox import tree
 from beamfit.greybox.covariance import MOST_SHARE, spread_of
-from beamfit.greybox.many_starts import descend_one
+from beamfit.greybox.descend import descend_one
 from beamfit.studies.scan.model import emittance_parts, predict_sizes, sigma_of
 
 

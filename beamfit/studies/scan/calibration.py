@@ -183,7 +183,8 @@ def _state(seen: Seen, told: Assumptions) -> Problem:
             low, high = min(low, mean - 6 * sd), max(high, mean + 6 * sd)
             priors.append(Prior(f"magnets.{name}", mean, sd))
         free.append(Free(f"magnets.{name}", *told.bounds.get(name, (low, high))))
-    records = [size_record(seen, plane, seen.of_plane(plane)) for plane in seen.planes]
+    rows = {plane: seen.of_plane(plane, magnets=magnets) for plane in seen.planes}
+    records = [size_record(seen, *each) for each in rows.items()]
     return Problem({"beam": beams, "magnets": magnets}, free, records, priors)
 
 

@@ -232,7 +232,7 @@ def judged_scenario(
     must be determined by the rules of known transport too.
     """
     records = {r.data.plane: r for r in fit.problem.records if r.predict is predict_sizes}
-    asked = [(records[p].data, asked_of(seen, p, scenario.whole_map)) for p in seen.planes]
+    asked = [(rows := records[p].data, asked_of(seen, p, rows.whole_line)) for p in seen.planes]
     derived = fit.derive(_answers, tuple(asked))
     elements = derived.value[:, len(QUANTITIES) :].reshape(len(asked), 3, -1)
     look, beams = list(seen.look), {}

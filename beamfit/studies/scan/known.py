@@ -70,9 +70,10 @@ def see(
     asked = planes or scan.planes
     for plane in asked:
         scan.rows(plane)  # says so if it was not measured
-    rows = scan_rows(scan, scanned_line(scan, line), method == "size_squared")
+    scanned = scanned_line(scan, line)
+    rows = scan_rows(scan, scanned, method == "size_squared")
     look = Look(*(np.asarray(part) for part in look_through(rows)))
-    seen = Seen(scan, line, asked, method, robust, rows, look, {})
+    seen = Seen(scan, line, asked, method, robust, scanned, rows, look, {})
     # A plane that is not asked for still testifies to the settings and the optics.
     return seen._replace(works=works_of(seen, look, (*asked, *scan.planes)))
 

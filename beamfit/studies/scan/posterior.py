@@ -20,7 +20,14 @@ from beamfit.sampling.priors import Distribution
 from beamfit.sampling.target import Target
 from beamfit.studies.scan.assumptions import Assumptions
 from beamfit.studies.scan.known import see
-from beamfit.studies.scan.model import QUANTITIES, UNIT, Asked, asked_numbers, sigma_of
+from beamfit.studies.scan.model import (
+    QUANTITIES,
+    UNIT,
+    Asked,
+    asked_numbers,
+    predict_sizes,
+    sigma_of,
+)
 from beamfit.studies.scan.results import PlaneFit
 from beamfit.studies.scan.statement import Scenario, Seen, asked_of
 from beamfit.verdict import Finding
@@ -166,7 +173,8 @@ def _stated(
     problem: Problem, fit: Scanned, kept: Sequence[PlaneFit], asked: Sequence[PlaneFit]
 ) -> Statement:
     chosen = kept or asked
-    places = [asked_of(fit.seen, p.plane, fit.statement.whole_map) for p in chosen]
+    lines = {r.data.plane: r.data.whole_line for r in problem.records if r.predict is predict_sizes}
+    places = [asked_of(fit.seen, p.plane, lines[p.plane]) for p in chosen]
     shown = {(p.plane, name): getattr(p, name) for p in chosen for name in TWISS}
     lost = ", ".join(f"{p.plane} plane" for p in asked if p not in kept)
     sigmas = [f"{p.plane}.{name}" for p in chosen for name in SIGMA]

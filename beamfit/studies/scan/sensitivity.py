@@ -19,6 +19,7 @@ from jax import Array
 from beamfit.optics.beamline import Beamline
 from beamfit.optics.calibration import CurrentPolynomial, SlopeIntercept
 from beamfit.optics.elements import Drift
+from beamfit.optics.sections import Series
 from beamfit.studies.scan.fit import EmittanceFit
 from beamfit.studies.scan.model import emittance_parts, size_squared
 from beamfit.studies.scan.results import PlaneFit, Points
@@ -114,15 +115,21 @@ def systematics(fit: EmittanceFit, plane: str) -> list[Change]:
     magnets = varied_magnets(fit.scan)
     upstream = fit.line.upto(result.screen.name).elements
     drifts = tuple(e.name for e in upstream if isinstance(e, Drift))
+    stored = fit.seen.scanned.stored_by_kind((*rows.settings, *rows.places))
+    one = rows.energy if np.ptp(rows.energy) > 0 else rows.energy[0]
     size, error = np.full((2, len(rows.energy)), np.inf)
     size[:], size[fit.seen.measured(plane)] = 1.0, p.size
     error[fit.seen.measured(plane)] = p.error
     sigma = np.array([q.value for q in result.sigma])
-    relative = np.asarray(_changes(rows, sigma, size, error, magnets=magnets, drifts=drifts))
+    through = replace(rows, line=stored, energy=one)
+    by_change, by_length = _changes(through, sigma, size, error, magnets=magnets)
+    # Drifts come in the order of the line; the rest of them lies downstream.
+    by_length = np.concatenate([*by_length, np.zeros(0)])[: len(drifts)]
+    relative = np.concatenate([by_change[:-1], by_length, by_change[-1:]])
     # ln βγ rises by E²/(E² - m²) for each relative step of the energy.
     energy = fit.seen.energy(plane)
     stiffer = energy**2 / (energy**2 - fit.line.mass**2)
-    causes = [f"{n} {_word(rows.line, n)} +1 %" for n in magnets]
+    causes = [f"{n} {_word(fit.seen.scanned, n)} +1 %" for n in magnets]
     causes += [f"drift {n} +1 cm" for n in drifts] + ["energy +1 %"]
     normalised = relative + np.append(np.zeros(len(relative) - 1), stiffer)
     return [
@@ -151,21 +158,32 @@ def _scaled(line: Beamline, magnet: str, factor: Array) -> Beamline:
     return line.with_element(replace(element, calibration=c))
 
 
-@partial(jax.jit, static_argnames=("magnets", "drifts"))
-def _changes(rows: Rows, sigma: Array, size: Array, error: Array, *, magnets, drifts) -> Array:
-    """Derivatives of ln ε of the fit by each change.
+def _with_lengths(line: Beamline, lengths: list[Array]) -> Beamline:
+    """Give the drifts of a line that is stored by kind other lengths."""
+    left, elements = iter(lengths), []
+    for part in line.elements:
+        if isinstance(part, Series):
+            kinds = (Drift("", next(left)) if isinstance(k, Drift) else k for k in part.kinds)
+            part = replace(part, kinds=tuple(kinds))
+        elements.append(part)
+    return replace(line, elements=tuple(elements))
+
+
+@partial(jax.jit, static_argnames="magnets")
+def _changes(
+    rows: Rows, sigma: Array, size: Array, error: Array, *, magnets: tuple[str, ...]
+) -> tuple[Array, list[Array]]:
+    """Derivatives of ln ε of the fit by each magnet's strength and ln E, and by drifts' lengths.
 
     At the minimum the slope F(σ, rows) of χ² is zero, so dσ = -(∂F/∂σ)⁻¹ ∂F/∂rows: exact for
-    either residual, without differentiating the solver.
+    either residual, without differentiating the solver. One reverse pass, however long the line.
     """
     unit = jnp.abs(sigma)
 
-    def elements(change: Array) -> tuple[Array, ...]:
-        moved = rows.line
+    def elements(change: Array, lengths: list[Array]) -> tuple[Array, ...]:
+        moved = _with_lengths(rows.line, lengths)
         for i, name in enumerate(magnets):
             moved = _scaled(moved, name, 1.0 + change[i])
-        for i, name in enumerate(drifts, start=len(magnets)):
-            moved = moved.with_element(Drift(name, rows.line[name].length + change[i]))
         energy = rows.energy * (1.0 + change[-1])
         return replace(rows, line=moved, energy=energy).elements({})
 
@@ -175,13 +193,14 @@ def _changes(rows: Rows, sigma: Array, size: Array, error: Array, *, magnets, dr
             return jnp.sum(((squared - size**2) / (2.0 * size * error)) ** 2)
         return jnp.sum(((jnp.sqrt(squared) - size) / error) ** 2)
 
-    none, here = jnp.zeros(len(magnets) + len(drifts) + 1), sigma / unit
-    seen, slopes = elements(none), jax.jacfwd(elements)(none)
+    series = [part for part in rows.line.elements if isinstance(part, Series)]
+    lengths = [k.length for part in series for k in part.kinds if isinstance(k, Drift)]
+    none, here = jnp.zeros(len(magnets) + 1), sigma / unit
+    seen, back = jax.vjp(elements, none, lengths)
     slope = jax.grad(chi2)
     by_sigma = jax.grad(lambda s: jnp.log(emittance_parts(s * unit)[0]))(here)
     weights = jnp.linalg.solve(jax.jacfwd(slope)(here, seen), by_sigma)
-    gradient = jax.grad(lambda seen: -weights @ slope(here, seen))(seen)
-    return sum(g @ s for g, s in zip(gradient, slopes, strict=True))
+    return back(jax.grad(lambda seen: -weights @ slope(here, seen))(seen))
 
 
 def range_sensitivity(plane: PlaneFit) -> list[RangeRow]:

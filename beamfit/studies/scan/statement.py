@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -17,7 +17,7 @@ from beamfit.studies.scan.model import UNIT, Asked, predict_sizes
 from beamfit.studies.scan.results import Parameter, Points
 from beamfit.studies.scan.scans import QuadScan
 from beamfit.studies.scan.sigma import SigmaFit
-from beamfit.studies.scan.transport import Look, Rows, padded
+from beamfit.studies.scan.transport import Look, Rows, padded, seen_line
 from beamfit.studies.scan.verdict import Evidence
 
 __all__ = [
@@ -73,8 +73,10 @@ class Seen(NamedTuple):
         "size_squared" or "size".
     robust : bool
         Whether points may be doubted.
+    scanned : Beamline
+        The line with the calibrations of the scan's columns.
     rows : Rows
-        The scan's rows through the line with the calibrations of its columns, padded.
+        The scan's rows through it, padded.
     look : Look
         The same, with every magnet as the lattice has it; NumPy arrays.
     works : dict of str to Work
@@ -86,18 +88,24 @@ class Seen(NamedTuple):
     planes: tuple[str, ...]
     method: str
     robust: bool
+    scanned: Beamline
     rows: Rows
     look: Look
     works: dict[str, Work]
 
-    @property
-    def scanned(self) -> Beamline:
-        """The line with the calibrations of the scan's columns."""
-        return self.rows.line
-
-    def of_plane(self, plane: str, settings: Mapping[str, Any] | None = None) -> Rows:
-        """The rows of one plane, with other settings if any are given."""
-        return replace(self.rows, plane=plane, settings=settings or self.rows.settings)
+    def of_plane(
+        self,
+        plane: str,
+        settings: Mapping[str, Any] | None = None,
+        magnets: Iterable[str] = (),
+    ) -> Rows:
+        """The rows of one plane, with other settings, and further magnets that can be varied."""
+        rows = replace(self.rows, plane=plane, settings=settings or self.rows.settings)
+        further = [name for name in magnets if name not in rows.settings]
+        if not further:
+            return rows
+        line = seen_line(self.scanned, (*rows.settings, *further), rows.energy, rows.places)
+        return replace(rows, line=line)
 
     def measured(self, plane: str) -> np.ndarray:
         """Indices of the rows in which a plane was measured."""
@@ -150,16 +158,16 @@ def varied_magnets(scan: QuadScan) -> tuple[str, ...]:
     return tuple(n for n, v in scan.settings.items() if np.ptp(v) > 0)
 
 
-def asked_of(seen: Seen, plane: str, whole_map: bool = True) -> Asked:
-    """Where the beam of a plane is asked for."""
+def asked_of(seen: Seen, plane: str, line: Beamline | None = None) -> Asked:
+    """Where the beam of a plane is asked for, through a line; None: only R11 and R12 are known."""
     design = seen.scanned.design
     twiss = getattr(design, plane, None)
     factor = beta_gamma(seen.energy(plane), float(seen.line.mass))
     return Asked(
         plane,
-        seen.rows.places[-1] if whole_map else None,
+        seen.rows.places[-1] if line is not None else None,
         design.at if twiss else None,
-        seen.scanned,
+        line or seen.rows.line,
         np.asarray(factor),
         np.array(twiss or (np.nan, np.nan), float),
     )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jax.typing import ArrayLike
 
 from beamfit.greybox import tree
 from beamfit.greybox.problem import padded_length
@@ -22,6 +23,7 @@ from beamfit.optics.calibration import (
     IntegratedStrength,
 )
 from beamfit.optics.elements import Marker, Screen, ThinLens, TransferMatrix
+from beamfit.optics.sections import Series
 from beamfit.studies.scan.model import line_of
 from beamfit.studies.scan.scans import QuadScan
 
@@ -36,8 +38,12 @@ __all__ = [
     "padded",
     "scan_rows",
     "scanned_line",
+    "seen_line",
     "transfer_rows",
 ]
+
+# Elements, times rows, whose matrices are held at once where each row has its own energy.
+MOST_AT_ONCE = 100_000
 
 
 def names_of(line: Beamline) -> tuple[dict[str, str], list[str], str | None, float]:
@@ -123,9 +129,14 @@ class Rows:
         every = transfer_rows(line, self.settings, self.energy, self.places).planes
         return self.seen(every[:, "xy".index(self.plane)])
 
+    @property
+    def whole_line(self) -> Beamline:
+        """The line that carries the beam anywhere."""
+        return self.line
+
     def seen(self, matrices: Array) -> tuple[Array, Array, Array]:
         """R11, R12 and known size² from one plane's matrices, shape (n, places, 3, 3)."""
-        r = matrices[jnp.arange(len(self.energy)), self.which, 0]
+        r = matrices[jnp.arange(len(self.which)), self.which, 0]
         return r[:, 0], r[:, 1], (r[:, 2] * self.spread) ** 2 + self.resolution**2
 
 
@@ -142,6 +153,10 @@ class NetworkRows:
     inputs: Any
     columns: Any
     known: Any
+
+    @property
+    def whole_line(self) -> None:
+        """None: what the network does not give is unknown."""
 
     def outputs(self, model: Mapping[str, Any]) -> Array:
         """The outputs of the model's network that ``columns`` names, of its shape."""
@@ -182,7 +197,7 @@ def scan_rows(scan: QuadScan, scanned: Beamline, squared: bool = True) -> Rows:
     Returns
     -------
     Rows
-        Places in the order of the line.
+        Places in the order of the line; what no setting of the scan moves is multiplied out.
     """
     n = len(scan)
     named = scan.screen or (scanned.screens[-1],) * n
@@ -194,13 +209,15 @@ def scan_rows(scan: QuadScan, scanned: Beamline, squared: bool = True) -> Rows:
     def column(values: Any, default: float) -> np.ndarray:
         return padded(np.full(n, float(default)) if values is None else values)
 
+    settings, energy = {name: padded(v) for name, v in scan.settings.items()}, scan.energy
+    energy = column(energy, scanned.energy)
     return Rows(
         "x",
         places,
         squared,
-        scanned,
-        {name: padded(v) for name, v in scan.settings.items()},
-        column(scan.energy, scanned.energy),
+        seen_line(scanned, settings, energy, places),
+        settings,
+        energy,
         padded(which),
         column(scan.energy_spread, scanned.energy_spread),
         padded(np.array(own)[which] if scan.resolution is None else scan.resolution),
@@ -246,7 +263,6 @@ def look_through(rows: Rows) -> Look:
     )
 
 
-@partial(jax.jit, static_argnames="places")
 def transfer_rows(
     line: Beamline, settings: Mapping[str, Array], energy: Array, places: tuple[str, ...]
 ) -> TransferMatrix:
@@ -255,11 +271,12 @@ def transfer_rows(
     Parameters
     ----------
     line : Beamline
-        The line, with the calibrations of the scan's columns.
+        The line, with the calibrations of the scan's columns. What no setting moves is
+        multiplied out first; a line that is traced is taken as it is (see `seen_line`).
     settings : mapping of str to Array
         Magnet name to settings, shape (n,).
     energy : Array
-        MeV, shape (n,).
+        MeV, shape (n,), or one number.
     places : tuple of str
         Element names.
 
@@ -268,13 +285,38 @@ def transfer_rows(
     TransferMatrix
         ``planes`` of shape (n, 2, places, 3, 3).
     """
+    if not any(isinstance(v, jax.core.Tracer) for v in jax.tree.leaves(line)):
+        line = seen_line(line, settings, energy, places)
+    return _rows(line, dict(settings), energy, places)
 
-    def one(setting: Mapping[str, Array], at: Array) -> TransferMatrix:
-        found = line.matrices(places, setting, at)
-        return TransferMatrix(jnp.stack([jnp.asarray(found[p].planes) for p in places], axis=-4))
 
-    every = jax.vmap(one)(dict(settings), energy)
-    return TransferMatrix(jnp.swapaxes(every.planes, 1, 2))
+def seen_line(
+    line: Beamline, settings: Iterable[str], energy: ArrayLike, places: Iterable[str]
+) -> Beamline:
+    """A line as rows of these settings and energies see it: all else multiplied out.
+
+    It stays right at its own energy and to where its design holds.
+    """
+    design = (line.design.at,) if line.design else ()
+    own = () if isinstance(energy, jax.core.Tracer) else np.unique(np.append(energy, line.energy))
+    return line.condensed((*settings, *places, *design), own[0] if len(own) == 1 else None)
+
+
+@partial(jax.jit, static_argnames="places")
+def _rows(
+    line: Beamline, settings: dict[str, Array], energy: Array, places: tuple[str, ...]
+) -> TransferMatrix:
+    def one(row: tuple[dict[str, Array], Array]) -> Array:
+        setting, at = row
+        found = line.matrices(places, setting, energy if at is None else at)
+        return jnp.stack([jnp.asarray(found[p].planes) for p in places], axis=-3)
+
+    rows = (settings, None if jnp.ndim(energy) == 0 else energy)
+    long = max((e.order.size for e in line.elements if isinstance(e, Series)), default=0)
+    if jnp.size(energy) * long <= MOST_AT_ONCE:
+        return TransferMatrix(jax.vmap(one)(rows))
+    by_turns = jax.lax.map(jax.checkpoint(one), rows, batch_size=max(1, MOST_AT_ONCE // long))
+    return TransferMatrix(by_turns)
 
 
 def own_settings(line: Beamline, screen: str) -> dict[str, float]:
