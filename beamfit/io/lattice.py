@@ -5,7 +5,7 @@ The keys of an element and the element they make stand here together.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
@@ -16,6 +16,7 @@ import numpy as np
 from beamfit.errors import InputError, nearest
 from beamfit.io.toml import FLAG, LIST, TABLE, TEXT, Key, Section, is_number, read_toml
 from beamfit.particles import REST_ENERGY, expected_energy
+from beamfit.studies.scan.scans import QuadScan, check_names
 
 if TYPE_CHECKING:
     from beamfit.optics.calibration import Calibration
@@ -40,11 +41,8 @@ ELEMENTS: dict[str, dict[str, Key]] = {
     "quadrupole": {
         "name": NAME,
         "length_m": LENGTH,
-        "current_A": OPTIONAL,
-        "integrated_gradient_kG": OPTIONAL,
-        "k1_per_m2": OPTIONAL,
-        "slope": OPTIONAL,
-        "intercept": OPTIONAL,
+        **dict.fromkeys(("current_A", "integrated_gradient_kG", "k1_per_m2"), OPTIONAL),
+        **dict.fromkeys(("slope", "intercept"), OPTIONAL),
         "gradient_polynomial_T_per_m": Key(kind=LIST, default=None),
         "signed_intercept": Key(kind=FLAG, default=False),
     },
@@ -127,7 +125,11 @@ class LatticeFile:
         screens = [e["name"] for e in self.elements if e["type"] == "screen"]
         return screens[-1] if screens else None
 
-    def check_magnets(self, limits: Mapping[str, object]) -> None:
+    def check_scan(self, scan: QuadScan) -> None:
+        """Refuse a scan that names what the lattice does not have, as `scans.check_names`."""
+        check_names(scan, self.calibrations, self.places, self.default_screen, self.rest_energy)
+
+    def check_magnets(self, limits: Iterable[str]) -> None:
         """Refuse limits of a magnet that the lattice does not have.
 
         Raises
@@ -139,6 +141,18 @@ class LatticeFile:
             if name not in self.calibrations:
                 known = nearest(name, list(self.calibrations))
                 raise InputError(f"--vary {name}: no magnet '{name}'", known, path=self.path)
+
+    def check_energies(self, energies: Iterable[float]) -> None:
+        """Refuse energies in MeV that the particle cannot have.
+
+        Raises
+        ------
+        InputError
+            Naming the first.
+        """
+        for energy in energies:
+            if expected := expected_energy(energy, self.particle):
+                raise InputError(f"--energies {energy:g} MeV", expected)
 
 
 def read_toml_lattice(path: str | PathLike[str]) -> LatticeFile:
