@@ -39,6 +39,8 @@ __all__ = [
 
 # Leaving out one of more points than this tells nothing.
 MOST_POINTS = 50
+# Nobody reads a budget of more causes than this.
+MOST_CAUSES = 30
 
 
 class Change(NamedTuple):
@@ -262,10 +264,18 @@ def _place(points: Points, i: int) -> str:
 
 
 def budget_rows(fit: EmittanceFit) -> list[tuple[str, list[str]]]:
-    """Cause and one cell per plane: the change of the normalised emittance."""
+    """Cause and one cell per plane: the change of the normalised emittance.
+
+    Of a long line the largest changes, and how large the others are at most.
+    """
     columns = [{c.cause: c for c in systematics(fit, p.plane)} for p in fit.planes]
-    causes = dict.fromkeys(cause for column in columns for cause in column)
-    return [
+    largest: dict[str, float] = {}
+    for change in (c for column in columns for c in column.values()):
+        size = abs(change.normalized_emittance)
+        largest[change.cause] = max(size, largest.get(change.cause, 0.0))
+    ranked = sorted(largest, key=largest.__getitem__, reverse=True)
+    shown, others = frozenset(ranked[:MOST_CAUSES]), ranked[MOST_CAUSES:]
+    rows = [
         (
             cause,
             [
@@ -273,8 +283,13 @@ def budget_rows(fit: EmittanceFit) -> list[tuple[str, list[str]]]:
                 for column in columns
             ],
         )
-        for cause in causes
+        for cause in largest
+        if cause in shown
     ]
+    if others:
+        most = [f"±{100 * largest[others[0]]:.2g} % at most" for _ in columns]
+        rows.append((f"{len(others)} other causes, each", most))
+    return rows
 
 
 def range_rows(fit: EmittanceFit) -> list[tuple[str, list[str]]]:
