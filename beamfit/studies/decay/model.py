@@ -13,7 +13,7 @@ import numpy as np
 from jax import Array
 
 from beamfit.greybox.many_starts import descend_one
-from beamfit.greybox.problem import Free, Prior, Problem, Record
+from beamfit.greybox.problem import Free, Prior, Problem, Record, padded_length
 from beamfit.lifetime.decay import current, current_by_rate
 from beamfit.studies.decay.record import DecayRecord
 
@@ -39,6 +39,8 @@ RECORD = "decay"
 # Physics allows 0 to 1, so 30 moves no value that the record determines (by 4e-5 of it where the
 # verdict turns, nothing beyond); it keeps records too short for their noise from running away.
 PRIOR_WIDTH = 30.0
+# Where the search for the plain law may rest: one step of Gauss and Newton ends it at rounding.
+NEAR = 1e-8
 # Most steps with a shape: in a valley without a bottom the record cannot tell anyway.
 FEW_STEPS = 100
 
@@ -154,11 +156,8 @@ def beam_current(numbers: DecayNumbers, at: Moments, shape: Shape | None = None)
 
 
 def padded_size(rows: int) -> int:
-    """64, 256, 1024, ...: every length is compiled once, for a second or two, so keep few."""
-    size = 64
-    while size < rows:
-        size *= 4
-    return size
+    """A few lengths from 64: each is compiled once, for a second or two."""
+    return padded_length(max(rows, 64))
 
 
 def padded(record: DecayRecord) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -326,7 +325,7 @@ def _solve(readings: Array, free: Array, shape: Shape | None = None) -> tuple[Ar
     start, plain = start * free[:3], jnp.array([1.0, 0.1, 0.05]) * free[:3]
     start = jnp.where(jnp.isfinite(constant(start)).all(), start, plain)
     reach = jnp.where(free > 0, jnp.inf, 0.0)
-    found = descend_one(constant, start, -reach[:3], reach[:3])
+    found = descend_one(constant, start, -reach[:3], reach[:3], tolerance=NEAR)
     if shape is not None:
         begin = jnp.append(found.theta, 0.0)
         found = descend_one(lambda t: off(t, scaled_shape)[0], begin, -reach, reach, FEW_STEPS)
@@ -335,7 +334,6 @@ def _solve(readings: Array, free: Array, shape: Shape | None = None) -> tuple[Ar
     )(jnp.diag(free))
     root = _root(jacobian, free)
     if shape is None:
-        # At rest, one step of Gauss and Newton more is free, and ends at rounding.
         step = jnp.where(found.rested, -root @ (root.T @ (jacobian @ residual)), 0.0)
         values, residual = values + step @ slopes, residual + step @ jacobian
     spread = slopes.T @ root
