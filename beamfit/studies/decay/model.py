@@ -65,20 +65,8 @@ class Moments(NamedTuple):
 
 
 class Physical(NamedTuple):
-    """What one decay says, in the units of the record (s and mA).
-
-    Attributes
-    ----------
-    i0 : float
-        Current at the first time, mA.
-    a, b : float
-        Loss coefficients, 1/(mA s) and 1/s.
-    rate_start, rate_end, rate_mean : float
-        Relative loss rate at the first and last time and at the mean current, 1/s.
-    share : float
-        Share of a in the loss at the mean current: 1 all Touschek-like, 0 all gas-like.
-    exponent : float
-        Power of the current by which a departs from its shape.
+    """What one decay says, in s and mA: loss rates at the first and last time and at the mean
+    current, the share of a in the loss there, the power by which a departs from its shape.
     """
 
     i0: Array
@@ -92,20 +80,8 @@ class Physical(NamedTuple):
 
 
 class Solution(NamedTuple):
-    """Least-squares solution of the decay law.
-
-    Attributes
-    ----------
-    values, errors : Physical
-        Values, and standard deviations for weights that are 1/error.
-    correlation : float
-        Correlation of a and b.
-    residuals : array, shape (n,)
-        Model minus measurement, mA.
-    sum_squares : float
-        Weighted sum of squares.
-    converged : bool
-        Whether the search came to rest.
+    """Values and errors for weights of 1/error, the correlation of a and b, residuals in mA,
+    the weighted sum of squares, and whether the search came to rest.
     """
 
     values: Physical
@@ -134,21 +110,10 @@ def _rate(numbers: DecayNumbers, mean: Array, shape: Shape | None) -> Shape:
 
 
 def beam_current(numbers: DecayNumbers, at: Moments, shape: Shape | None = None) -> Array:
-    """Current of a decay: report equation 44, or 42 integrated where a has a shape.
+    """Current, mA: report equation 44, or 42 integrated where a has a shape.
 
-    Parameters
-    ----------
-    numbers : DecayNumbers
-        The law; with a shape, a is the value at the mean current.
-    at : Moments
-        Times and mean current.
-    shape : callable, optional
-        Dependence of a on the current in mA, up to a factor; written with JAX.
-
-    Returns
-    -------
-    array
-        mA.
+    The shape is a dependence on the current in mA, up to a factor, in JAX; a is then the value at
+    the mean current.
     """
     if shape is None:
         return current(at.time, numbers.i0, numbers.a, numbers.b)
@@ -420,23 +385,5 @@ def solve_decay(
 
 
 def solve_decays(time: np.ndarray, measured: np.ndarray, weight: np.ndarray) -> Solution:
-    """Fit the decay law to many records of one padded length at once.
-
-    Parameters
-    ----------
-    time, measured, weight : array, shape (m, n)
-        As for `solve_decay`, one row a record.
-
-    Returns
-    -------
-    Solution
-        Each leaf with a first axis of length m.
-
-    Examples
-    --------
-    >>> time = np.linspace(0.0, 36000.0, 100) * np.ones((2, 1))
-    >>> measured = np.array(current(time, np.array([[500.0], [100.0]]), 2e-8, 1e-6))
-    >>> print(solve_decays(time, measured, np.ones((2, 100))).values.i0)
-    [500. 100.]
-    """
+    """`solve_decay` for records of one padded length at once, arrays of shape (m, n)."""
     return _unpacked(*_solve_many(np.stack([time, measured, weight], axis=1), CONSTANT))
