@@ -31,7 +31,7 @@ _HOME = {
     "find_setpoint": "beamfit.studies.scan.setpoint",
     "fit_decay": "beamfit.studies.decay.fit",
     "fit_decays": "beamfit.studies.decay.fit",
-    "fit_emittance": "beamfit.studies.scan.emittance",
+    "fit_emittance": "beamfit.studies.scan.fit",
     "fit_sizes": "beamfit.studies.scan.sigma",
     "load_lattice": "beamfit.io.line",
     "loss_coefficients": "beamfit.lifetime.losses",

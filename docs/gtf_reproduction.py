@@ -22,6 +22,7 @@ from matplotlib.figure import FigureBase
 
 import beamfit
 from beamfit.greybox.fit import Fit
+from beamfit.greybox.solve import solve
 from beamfit.io.files import digest, write_atomically
 from beamfit.optics.beam import BeamMatrix
 from beamfit.optics.beamline import Beamline
@@ -38,13 +39,12 @@ from beamfit.report.document import (
 )
 from beamfit.studies.scan.assumptions import Assumptions
 from beamfit.studies.scan.calibration import with_numbers
-from beamfit.studies.scan.emittance import fit_emittance
-from beamfit.studies.scan.fit import EmittanceFit
+from beamfit.studies.scan.fit import EmittanceFit, fit_emittance
+from beamfit.studies.scan.known import see
+from beamfit.studies.scan.model import UNIT
 from beamfit.studies.scan.scans import QuadScan
-from beamfit.studies.scan.scenario_data import see
-from beamfit.studies.scan.scenario_model import UNIT
-from beamfit.studies.scan.scenarios import scenario_problem, train
 from beamfit.studies.scan.transport import transfer_rows
+from beamfit.studies.scan.transport_network import SCENARIO
 from beamfit.table import Table
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -143,12 +143,12 @@ def reproduce(scan: QuadScan, line: Beamline, starts: int = 20) -> Reproduction:
 def _held(scan: QuadScan, line: Beamline, words: str, sigma, starts: int) -> Held:
     """Train the network of A and B for a beam that is held."""
     told = Assumptions(starts=starts)
-    problem = scenario_problem(see(scan, line, ("x",), "size_squared"), "transport-network", told)
+    problem = SCENARIO.state(see(scan, line, ("x",)), told)
     beam = BeamMatrix.from_sigma(*(1e-8 / UNIT**2 * s for s in sigma))
     numbers = {k: float(getattr(beam, k)) for k in ("l11", "l21", "l22")}
     model = problem.model | {"beam": {"x": numbers}}
     weights = [f for f in problem.free if not f.path.startswith("beam.")]
-    fit = train(replace(problem, model=model, free=weights), starts)
+    fit = solve(replace(problem, model=model, free=weights), starts)
     emittance = 1e-8 * float(np.sqrt(sigma[0] * sigma[2] - sigma[1] ** 2))
     return Held(words, sigma, emittance, fit.chi2, fit)
 

@@ -12,8 +12,8 @@ import numpy as np
 
 from beamfit.errors import InputError, nearest
 from beamfit.greybox import tree
+from beamfit.greybox.assess import KKT, TOLERANCE
 from beamfit.greybox.covariance import MOST_SHARE, Group, Spread
-from beamfit.greybox.kkt import KKT, TOLERANCE
 from beamfit.greybox.problem import Problem
 from beamfit.status import Status
 from beamfit.verdict import Finding

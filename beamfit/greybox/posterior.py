@@ -18,7 +18,7 @@ from beamfit.greybox import tree
 from beamfit.greybox.problem import Core, Prior, Problem, Record
 from beamfit.sampling.likelihood import Group
 from beamfit.sampling.priors import Distribution, checked
-from beamfit.sampling.target import Derived, Law, Target, covariance_of, slopes_of
+from beamfit.sampling.target import Law, Target, covariance_of, slopes_of
 from beamfit.verdict import Finding
 
 __all__ = ["Optimum", "Sampled", "Statement", "record_of", "target_of"]
@@ -92,15 +92,15 @@ class Statement(NamedTuple):
         ``quoted(model)`` puts them in the place of the problem's own, ``own(model)`` is the inverse
         and NaN outside its domain.
     renamed : mapping of str to str
-        New names of numbers that `quoted` replaces.
+        How users call numbers of the problem.
     log_volume : callable
         ``log_volume(model, data)``, added to the log density: of a prior that is flat in something
         else than the sampled numbers.
     units : mapping of str to str
         Of sampled numbers.
     lower, width : mapping of str to float
-        Lower bounds of sampled numbers besides the problem's own, and how far from the optimum each
-        may be at most where the data do not say.
+        Lower bounds of sampled numbers instead of the problem's own, and how far from the optimum
+        each may be at most where the data do not say.
     labels : mapping of str to str
         What stands for a record before the names of its noise; by default nothing if there is one
         record, else its name.
@@ -256,7 +256,7 @@ def target_of(
         counts=tuple(record.used for record in p.records),
         noise_unit="1" if any(optimum.given) else stated.noise_unit,
         priors=priors,
-        derived=Derived(tuple(stated.derived), tuple(stated.derived.values())),
+        derived=stated.derived,
         observed=_observed(p),
         remark=" ".join(filter(None, (stated.remark, ELSEWHERE if far else ""))),
         stated={prior.name: _words(prior) for prior in p.priors},
@@ -283,12 +283,9 @@ def _refuse_equations(p: Problem) -> None:
 
 
 def _bounds(p: Problem, moving: np.ndarray, stated: Statement) -> tuple[np.ndarray, np.ndarray]:
-    """Bounds of what is sampled; those of numbers that are replaced stay with the law."""
-    own = [p.names[i] for i in moving]
-    new = np.array([name in stated.renamed for name in own])
-    least = [stated.lower.get(stated.renamed.get(name, name), -np.inf) for name in own]
-    lower = np.maximum(np.where(new, -np.inf, p.lower[moving]), least)
-    return lower, np.where(new, np.inf, p.upper[moving])
+    """Bounds of what is sampled."""
+    lower = {stated.renamed.get(p.names[i], p.names[i]): p.lower[i] for i in moving}
+    return np.array(list((lower | dict(stated.lower)).values())), p.upper[moving]
 
 
 def _changed(p: Problem, stated: Statement, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

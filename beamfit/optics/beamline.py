@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
+from itertools import groupby
 from typing import NamedTuple
 
 import jax
 from jax.typing import ArrayLike
 
 from beamfit.errors import InputError, nearest
-from beamfit.optics.elements import IDENTITY, Element, Marker, Screen, TransferMatrix
+from beamfit.optics.elements import IDENTITY, Element, Screen, TransferMatrix
 from beamfit.optics.particle import ELECTRON_MASS
+from beamfit.optics.sections import Section, Series, in_series
 
 __all__ = ["Beamline", "Design"]
 
@@ -69,7 +71,7 @@ class Beamline:
     2.0595
     """
 
-    elements: tuple[Element, ...]
+    elements: tuple[Element | Section | Series, ...]
     energy: ArrayLike
     name: str = "line"
     mass: float = ELECTRON_MASS
@@ -83,12 +85,17 @@ class Beamline:
         return len(self.elements)
 
     def _index(self, name: str) -> int:
-        names = [e.name for e in self.elements]
-        if name not in names:
-            raise InputError(f"no element '{name}' in line '{self.name}'", nearest(name, names))
-        return names.index(name)
+        if name not in self._first:
+            known = [e.name for e in self.elements]
+            raise InputError(f"no element '{name}' in line '{self.name}'", nearest(name, known))
+        return self._first[name]
 
-    @property
+    @cached_property
+    def _first(self) -> dict[str, int]:
+        """Where the first element of each name stands."""
+        return {e.name: i for i, e in reversed(tuple(enumerate(self.elements)))}
+
+    @cached_property
     def magnets(self) -> tuple[str, ...]:
         """Names of the elements that have a setting."""
         return tuple(dict.fromkeys(e.name for e in self.elements if e.setting is not None))
@@ -123,6 +130,7 @@ class Beamline:
 
         Examples
         --------
+        >>> from beamfit.optics.elements import Marker
         >>> line = Beamline((Marker("A"), Marker("B"), Marker("C")), energy=100.0)
         >>> [e.name for e in line.between("A", "C").elements]
         ['B', 'C']
@@ -137,6 +145,7 @@ class Beamline:
 
         Examples
         --------
+        >>> from beamfit.optics.elements import Marker
         >>> line = Beamline((Marker("A"), Marker("B"), Marker("C")), energy=100.0)
         >>> [e.name for e in line.upto("B").elements]
         ['A', 'B']
@@ -233,11 +242,55 @@ class Beamline:
         for place in places:
             self._index(place)
         energy = self.energy if energy is None else energy
-        total, found = IDENTITY, {}
-        for element in self.elements:
-            if not isinstance(element, Marker | Screen):
-                part = element.matrix(settings.get(element.name), energy)
-                total = part if total is IDENTITY else part @ total
+        total, found, start = IDENTITY, {}, 0
+        for i, element in enumerate(self.elements, start=1):
             if element.name in places:
-                found[element.name] = total
+                part = in_series(self.elements[start:i], settings).matrix(None, energy)
+                total = part if total is IDENTITY else part @ total
+                found[element.name], start = total, i
         return {place: found[place] for place in places}
+
+    def condensed(self, keep: Iterable[str], energy: ArrayLike | None = None) -> Beamline:
+        """Multiply out everything between some elements, before anything is traced.
+
+        Parameters
+        ----------
+        keep : iterable of str
+            Names of the elements that stay: magnets that will be varied, places.
+        energy : float, optional
+            The only energy in MeV the line will be asked at. If None, elements that feel the
+            energy are kept, stored by kind, and the line is right at every energy.
+
+        Returns
+        -------
+        Beamline
+            A line with the same matrices, of a few elements.
+
+        Examples
+        --------
+        >>> from beamfit.optics.elements import Drift
+        >>> line = Beamline((Drift("A", 1.0), Drift("B", 2.0), Screen("S")), energy=100.0)
+        >>> [type(e).__name__ for e in line.condensed(("S",)).elements]
+        ['Section', 'Screen']
+        """
+
+        def one(part: Series) -> Section | Series:
+            if energy is None:
+                return part.multiplied()
+            return Section(part.matrix(None, energy).planes, part.length)
+
+        return replace(self, elements=self._parts(keep, one))
+
+    def stored_by_kind(self, keep: Iterable[str]) -> Beamline:
+        """Return the line with everything between some elements stored by kind, as arrays.
+
+        Its derivatives by all its numbers are then a few arrays, too.
+        """
+        return replace(self, elements=self._parts(keep, lambda part: part))
+
+    def _parts(self, keep: Iterable[str], one: Callable) -> tuple:
+        """The elements of some names, and what ``one`` makes of the series between them."""
+        keep, parts = frozenset(keep), []
+        for kept, run in groupby(self.elements, lambda e: e.name in keep):
+            parts.extend(run if kept else [one(s) for s in [in_series(run)] if s.kinds])
+        return tuple(parts)

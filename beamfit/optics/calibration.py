@@ -1,7 +1,7 @@
 """What a magnet's setting means: from amperes, kilogauss or 1/m² to focusing strength.
 
 Each calibration is a frozen value with ``unit`` (the word a scan's column header ends in) and
-``k1l(setting, length, energy)``, the integrated strength in 1/m.
+``k1l(setting, length, energy)``, the integrated strength in 1/m, of any shape.
 """
 
 from __future__ import annotations
@@ -11,10 +11,10 @@ from functools import partial
 from typing import ClassVar
 
 import jax
-import jax.numpy as jnp
 from jax import Array
 from jax.typing import ArrayLike
 
+from beamfit.optics.focusing import array_module
 from beamfit.optics.particle import ELECTRON_MASS, rigidity
 
 __all__ = [
@@ -59,7 +59,7 @@ class SlopeIntercept:
 
     def k1l(self, setting: ArrayLike, length: ArrayLike, energy: ArrayLike) -> Array:
         """Integrated strength in 1/m at a current in A, a length in m, an energy in MeV."""
-        return jnp.asarray((self.slope * setting + self.intercept) / energy * length)
+        return (self.slope * setting + self.intercept) / energy * length
 
 
 @partial(
@@ -99,9 +99,9 @@ class CurrentPolynomial:
         """Gradient in T/m at a current in A."""
         remanent, *rest = self.coefficients
         if self.signed_intercept:
-            remanent = remanent * jnp.sign(current)
+            remanent = remanent * array_module(current).sign(current)
         rising = sum(c * current ** (n + 1) for n, c in enumerate(rest))
-        return jnp.asarray(remanent + rising, float)
+        return remanent + rising
 
     def k1l(self, setting: ArrayLike, length: ArrayLike, energy: ArrayLike) -> Array:
         """Integrated strength in 1/m at a current in A, a length in m, an energy in MeV."""
@@ -132,7 +132,7 @@ class IntegratedGradient:
 
     def k1l(self, setting: ArrayLike, length: ArrayLike, energy: ArrayLike) -> Array:
         """Integrated strength in 1/m at an integrated gradient in kG and an energy in MeV."""
-        return jnp.asarray(0.1 * self.scale * setting / rigidity(energy, self.mass))
+        return 0.1 * self.scale * setting / rigidity(energy, self.mass)
 
 
 @partial(jax.tree_util.register_dataclass, data_fields=["scale"], meta_fields=[])
@@ -151,7 +151,7 @@ class FocusingStrength:
 
     def k1l(self, setting: ArrayLike, length: ArrayLike, energy: ArrayLike) -> Array:
         """Integrated strength in 1/m at a k1 in 1/m² and a length in m."""
-        return jnp.asarray(self.scale * setting * length)
+        return self.scale * setting * length
 
 
 @partial(jax.tree_util.register_dataclass, data_fields=["scale"], meta_fields=[])
@@ -170,7 +170,7 @@ class IntegratedStrength:
 
     def k1l(self, setting: ArrayLike, length: ArrayLike, energy: ArrayLike) -> Array:
         """Integrated strength in 1/m, which is the setting."""
-        return jnp.asarray(self.scale * setting)
+        return self.scale * setting
 
 
 Calibration = (

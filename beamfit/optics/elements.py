@@ -1,7 +1,8 @@
 """The elements of a beam line. Each is a frozen value with ``matrix(setting, energy)``.
 
 The mathematics is in focusing.py; here each element only says which strength, length and
-edges it has in each plane. Positive k1 focuses x.
+edges it has in each plane. Positive k1 focuses x. The numbers of an element may be arrays of
+one shape: it then stands for as many elements, and its matrix has that shape before (2, 3, 3).
 """
 
 from __future__ import annotations
@@ -11,13 +12,12 @@ from functools import partial
 from typing import ClassVar
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from jax.typing import ArrayLike
 
 from beamfit.optics.calibration import Calibration, FocusingStrength, IntegratedStrength
-from beamfit.optics.focusing import focusing
+from beamfit.optics.focusing import array_module, focusing
 
 __all__ = [
     "IDENTITY",
@@ -85,14 +85,22 @@ IDENTITY = TransferMatrix(np.stack([np.eye(3)] * 2))
 def _thick(k: ArrayLike, length: ArrayLike, curvature: ArrayLike = 0.0) -> Array:
     """Constant focusing k (1/m²) and curvature h (1/m): u'' + k u = h δ, for any shape of k."""
     c, s, d = (f[..., None, None] for f in focusing(k, length))
-    k, h = (jnp.asarray(v, float)[..., None, None] for v in (k, curvature))
+    xp = array_module(k, curvature)
+    k, h = (xp.asarray(v, float)[..., None, None] for v in (k, curvature))
     straight = c * _COSINE + s * _SINE - k * s * _SLOPE + _LAST
     return straight + h * (d * _DISPERSION + s * _ANGLE)
 
 
 def _kick(strength: ArrayLike) -> Array:
     """A thin lens: u' changes by -strength · u, strength in 1/m, for any shape."""
-    return np.eye(3) - jnp.asarray(strength, float)[..., None, None] * _SLOPE
+    strength = array_module(strength).asarray(strength, float)
+    return np.eye(3) - strength[..., None, None] * _SLOPE
+
+
+def _both(strength: ArrayLike) -> Array:
+    """A strength in x and its opposite in y, along a last axis."""
+    strength = array_module(strength).asarray(strength, float)
+    return strength[..., None] * np.array([1.0, -1.0])
 
 
 @partial(jax.tree_util.register_dataclass, data_fields=["length"], meta_fields=["name"])
@@ -112,7 +120,8 @@ class Drift:
 
     def matrix(self, setting: ArrayLike | None = None, energy: ArrayLike = 1.0) -> TransferMatrix:
         """Transfer matrix of the drift, the same in both planes."""
-        return TransferMatrix(IDENTITY.planes + jnp.asarray(self.length, float) * _SINE)
+        length = array_module(self.length).asarray(self.length, float)
+        return TransferMatrix(IDENTITY.planes + length[..., None, None, None] * _SINE)
 
 
 @partial(
@@ -150,12 +159,13 @@ class Quadrupole:
     def k1(self, setting: ArrayLike | None = None, energy: ArrayLike = 1.0) -> Array:
         """Focusing strength in 1/m², positive in x, at a setting and an energy in MeV."""
         setting = self.setting if setting is None else setting
-        return self.calibration.k1l(setting, self.length, energy) / self.length
+        strength = self.calibration.k1l(setting, self.length, energy)
+        return array_module(strength).asarray(strength, float) / self.length
 
     def matrix(self, setting: ArrayLike | None = None, energy: ArrayLike = 1.0) -> TransferMatrix:
         """Transfer matrix at a setting (the element's own if None) and an energy in MeV."""
-        k1 = self.k1(setting, energy)
-        return TransferMatrix(_thick(jnp.stack([k1, -k1]), self.length))
+        length = array_module(self.length).asarray(self.length, float)
+        return TransferMatrix(_thick(_both(self.k1(setting, energy)), length[..., None]))
 
 
 @partial(
@@ -190,8 +200,7 @@ class ThinLens:
     def matrix(self, setting: ArrayLike | None = None, energy: ArrayLike = 1.0) -> TransferMatrix:
         """Transfer matrix at a setting (the element's own if None) and an energy in MeV."""
         setting = self.setting if setting is None else setting
-        k1l = self.calibration.k1l(setting, 0.0, energy)
-        return TransferMatrix(_kick(jnp.stack([k1l, -k1l])))
+        return TransferMatrix(_kick(_both(self.calibration.k1l(setting, 0.0, energy))))
 
 
 def hard_edge_slice(
@@ -232,9 +241,10 @@ def hard_edge_slice(
     >>> bool(bend < 1.0)
     True
     """
+    xp = array_module(angle, exit_edge, energy_ratio)
     face = angle - exit_edge
-    sine = (jnp.sin(exit_edge) + jnp.sin(face)) / energy_ratio - jnp.sin(face)
-    at_exit = jnp.arcsin(sine)
+    sine = (xp.sin(exit_edge) + xp.sin(face)) / energy_ratio - xp.sin(face)
+    at_exit = xp.arcsin(sine)
     return face + at_exit, at_exit
 
 
@@ -299,20 +309,25 @@ class SectorDipole:
 
     def matrix(self, setting: ArrayLike | None = None, energy: ArrayLike = 1.0) -> TransferMatrix:
         """Transfer matrix about the slice's own orbit; setting and energy do not enter."""
-        ratio = 1.0 + jnp.asarray(self.energy_offset, float)
-        angle, exit_edge = hard_edge_slice(self.angle, self.exit_edge, ratio)
-        radius = self.radius * ratio
+        numbers = (self.radius, self.angle, self.entrance_edge, self.exit_edge, self.energy_offset)
+        xp = array_module(*numbers, self.k1)
+        radius, angle, entrance, leaving, offset, k1 = (
+            xp.asarray(v, float)[..., None] for v in (*numbers, self.k1)
+        )
+        ratio = 1.0 + offset
+        angle, leaving = hard_edge_slice(angle, leaving, ratio)
+        radius = radius * ratio
         h, length = 1.0 / radius, radius * angle
-        entry, leave = h * jnp.tan(self.entrance_edge), h * jnp.tan(exit_edge)
         # +1 in the plane that is bent: there the body focuses by h² and an edge defocuses.
         sign = np.array([1.0, -1.0] if self.bend_plane == "x" else [-1.0, 1.0])
         bent = sign > 0
         body = _thick(
-            jnp.where(bent, h**2, 0.0) + np.array([1.0, -1.0]) * self.k1 / ratio,
+            xp.where(bent, h**2, 0.0) + np.array([1.0, -1.0]) * k1 / ratio,
             length,
-            jnp.where(bent, h, 0.0),
+            xp.where(bent, h, 0.0),
         )
-        return TransferMatrix(_kick(-sign * leave) @ body @ _kick(-sign * entry))
+        entry, leave = (_kick(-sign * h * xp.tan(edge)) for edge in (entrance, leaving))
+        return TransferMatrix(leave @ body @ entry)
 
 
 @partial(jax.tree_util.register_dataclass, data_fields=[], meta_fields=["name"])
@@ -322,7 +337,7 @@ class Marker:
 
     Examples
     --------
-    >>> Marker("M").matrix().x.tolist() == jnp.eye(3).tolist()
+    >>> Marker("M").matrix().x.tolist() == np.eye(3).tolist()
     True
     """
 

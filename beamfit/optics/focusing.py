@@ -7,14 +7,15 @@ here (a quadrupole at zero strength is a drift) holds for all of them.
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from jax.typing import ArrayLike
 
-__all__ = ["Focusing", "focusing"]
+__all__ = ["Focusing", "array_module", "focusing"]
 
 # Below |k L²| = 0.5 the series is used; nine terms leave out less than 1e-18.
 _NEAR, _TERMS = 0.5, 9
@@ -41,6 +42,17 @@ class Focusing(NamedTuple):
     dispersion: Array
 
 
+def array_module(*values: Any) -> Any:
+    """JAX's numpy where a value is JAX's, else numpy: plain numbers need no compiling.
+
+    Examples
+    --------
+    >>> array_module(1.0, jnp.ones(2)).__name__, array_module(1.0, np.ones(2)).__name__
+    ('jax.numpy', 'numpy')
+    """
+    return jnp if any(isinstance(v, jax.Array) for v in values) else np
+
+
 def focusing(k: ArrayLike, length: ArrayLike) -> Focusing:
     """Solve the linear equation of motion over a length of constant focusing.
 
@@ -55,7 +67,7 @@ def focusing(k: ArrayLike, length: ArrayLike) -> Focusing:
     Returns
     -------
     Focusing
-        C, S, D with the broadcast shape of the arguments.
+        C, S, D with the broadcast shape of the arguments; numpy's where the arguments are.
 
     Notes
     -----
@@ -68,26 +80,29 @@ def focusing(k: ArrayLike, length: ArrayLike) -> Focusing:
     >>> [float(f) for f in focusing(0.0, 2.0)]
     [1.0, 2.0, 2.0]
     """
-    k, length = jnp.asarray(k, float), jnp.asarray(length, float)
+    xp = array_module(k, length)
+    k, length = xp.asarray(k, float), xp.asarray(length, float)
     x = k * length**2
-    near = jnp.abs(x) < _NEAR
-    series = _series(jnp.where(near, x, 0.0))
-    c, s, d = jnp.where(near, series, _closed_form(jnp.where(near, 1.0, x)))
+    near = abs(x) < _NEAR
+    series = _series(xp.where(near, x, 0.0))
+    with np.errstate(over="ignore"):  # of an absurd magnet: infinite, as in JAX
+        c, s, d = xp.where(near, series, _closed_form(xp.where(near, 1.0, x)))
     return Focusing(cosine=c, sine=length * s, dispersion=length**2 * d)
 
 
 def _series(x: Array) -> Array:
     """Sum cos √x, sin √x/√x and (1 - cos √x)/x as power series in x, by Horner's scheme."""
-    total = jnp.zeros((3, *jnp.shape(x)))
+    total = np.zeros((3, *x.shape))
     for term in _SERIES[::-1]:
-        total = total * x + term.reshape(3, *[1] * jnp.ndim(x))
+        total = total * x + term.reshape(3, *[1] * x.ndim)
     return total
 
 
 def _closed_form(x: Array) -> Array:
     """Evaluate the same three functions away from x = 0."""
-    root = jnp.sqrt(jnp.abs(x))
-    hyperbolic = jnp.where(x < 0.0, root, 0.0)  # cosh of a large focusing phase would overflow
-    c = jnp.where(x > 0.0, jnp.cos(root), jnp.cosh(hyperbolic))
-    s = jnp.where(x > 0.0, jnp.sin(root), jnp.sinh(hyperbolic)) / root
-    return jnp.stack([c, s, (1.0 - c) / x])
+    xp = array_module(x)
+    root = xp.sqrt(xp.abs(x))
+    hyperbolic = xp.where(x < 0.0, root, 0.0)  # cosh of a large focusing phase would overflow
+    c = xp.where(x > 0.0, xp.cos(root), xp.cosh(hyperbolic))
+    s = xp.where(x > 0.0, xp.sin(root), xp.sinh(hyperbolic)) / root
+    return xp.stack([c, s, (1.0 - c) / x])

@@ -12,14 +12,14 @@ from matplotlib.figure import FigureBase
 from beamfit.report.document import BLUE, MANY, RED, Page, Picture, Verdict, provenance, written
 from beamfit.status import Status
 from beamfit.studies.scan.fit import EmittanceFit
-from beamfit.studies.scan.results import PlaneFit
-from beamfit.studies.scan.sensitivity import budget_rows, range_rows
-from beamfit.studies.scan.tables import (
+from beamfit.studies.scan.results import (
+    PlaneFit,
     identifiability_rows,
     parameter_rows,
     point_rows,
     result_rows,
 )
+from beamfit.studies.scan.sensitivity import budget_rows, range_rows
 from beamfit.studies.scan.transport import scanned_line, transfer_rows
 from beamfit.table import Table, labelled
 
@@ -59,11 +59,11 @@ def emittance_page(
     tables = [
         labelled("Result", names, result_rows(fit.planes), ERRORS),
         labelled("What the data determine", names, identifiability_rows(fit.planes)),
-        *(_budgets(fit, names) if fit.scenario == "known" else _fitted_too(fit)),
+        *(_budgets(fit, names) if fit.statement.closed else _fitted_too(fit)),
         *(Table(f"Points, {p.plane} plane", *point_rows(p), numeric=True) for p in fit.planes),
     ]
     energy = f"{float(line.energy):g} MeV"
-    if fit.scenario != "known":
+    if not fit.statement.closed:
         energy += f", scenario {fit.scenario}"
     return Page(
         title=f"Emittance of {scan.name}",
@@ -118,7 +118,7 @@ def _verdict(p: PlaneFit) -> Verdict:
 
 def _anchor(fit: EmittanceFit) -> str:
     """What ties a network to the lattice; a calibration has priors instead."""
-    return f"Anchor: {fit.anchor}." if fit.scenario.endswith("network") else ""
+    return f"Anchor: {fit.anchor}." if fit.statement.network else ""
 
 
 def draw_scan(figure: FigureBase, fit: EmittanceFit, plane: str) -> None:
@@ -140,7 +140,7 @@ def draw_scan(figure: FigureBase, fit: EmittanceFit, plane: str) -> None:
     varied = [n for n, v in p.points.settings.items() if np.ptp(v) > 0]
     if len(varied) == 1:
         at = p.points.settings[varied[0]]
-        if fit.scenario == "transport-network":  # known at the measured currents alone
+        if not fit.statement.whole_map:  # known at the measured currents alone
             above.plot(at, 1e6 * p.points.model, "_", ms=14, mew=2, color=COLOUR[plane], alpha=0.6)
         else:
             _curves(above, fit, p, varied[0])
@@ -190,7 +190,7 @@ def _curves(axes: Axes, fit: EmittanceFit, p: PlaneFit, magnet: str) -> None:
         name = "fit" if len(screens) == 1 else f"fit at {screen}"
         axes.plot(grid, 1e6 * size, style, color=COLOUR[p.plane], lw=1.6, label=name)
         # In a scenario the beam's errors go with those of the calibration: no band of σ alone.
-        if fit.scenario == "known" and np.isfinite(p.covariance).all():
+        if fit.statement.closed and np.isfinite(p.covariance).all():
             variance = np.einsum("ij,jk,ik->i", design, p.covariance, design)
             half = p.error_scale * np.sqrt(variance) / (2.0 * np.maximum(size, 1e-9))
             axes.fill_between(

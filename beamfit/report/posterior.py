@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import partial
+from importlib.metadata import version
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -12,12 +13,13 @@ from matplotlib.ticker import MaxNLocator, NullLocator
 
 from beamfit.report.document import BLUE, MANY, Page, Picture, Verdict
 from beamfit.report.emittance import COLOUR
+from beamfit.sampling.likelihood import noise_words
 from beamfit.sampling.posterior import Expected, Posterior
 from beamfit.sampling.summary import in_unit, plain_name
 from beamfit.studies.decay.fit import DecayFit
 from beamfit.studies.decay.posterior import expected_current
-from beamfit.studies.scan.beam_posterior import expected_sizes
 from beamfit.studies.scan.fit import EmittanceFit
+from beamfit.studies.scan.posterior import expected_sizes
 from beamfit.table import Table
 
 __all__ = ["draw_pairs", "with_beam_posterior", "with_decay_posteriors"]
@@ -74,7 +76,7 @@ def _added(page: Page, named: Sequence[tuple[str, Posterior]], pictures: list[Pi
         if found.chain.size
         for table in (
             _correlations(name, found),
-            found.how_sampled(f"{name}How the posterior was sampled"),
+            _how_sampled(f"{name}How the posterior was sampled", found),
         )
     ]
     return page._replace(
@@ -109,6 +111,27 @@ def _coefficient(value: float) -> str:
     """Two digits, and more where one and nearly one would look the same."""
     nearly_one = 0.99 < abs(value) < 0.99995
     return f"{value:.4f}" if nearly_one else f"{value:.2f}".replace("-0.00", "0.00")
+
+
+def _how_sampled(title: str, found: Posterior) -> Table:
+    """How the draws were made and what they are worth."""
+    d = found.diagnostics
+    rows = [
+        ["status", found.status.value.replace("_", " ")],
+        ["errors of the points", noise_words(found.target.groups)],
+        ["priors", "; ".join(f"{n}: {p}" for n, p in found.priors.items()) or "flat"],
+    ]
+    if d.steps:
+        rows += [
+            ["draws", f"{d.steps} steps of {d.walkers} walkers after {found.warmup} left out"],
+            ["effective draws, fewest", f"{np.min(d.effective):.0f}"],
+            ["autocorrelation time, longest", f"{np.max(d.autocorrelation):.1f} steps"],
+            ["split R-hat, largest", f"{np.max(d.rhat):.4f}"],
+            ["proposals accepted", f"{100 * found.acceptance:.0f} %"],
+            ["seed", str(found.seed)],
+            ["sampler", f"emcee {version('emcee')}"],
+        ]
+    return Table(title, [], rows)
 
 
 def draw_pairs(
@@ -236,7 +259,7 @@ def draw_expected_sizes(
     plane : str
         "x" or "y".
     """
-    p, found = fit[plane].points, expected_sizes(posterior, fit, plane)
+    p, found = fit[plane].points, expected_sizes(posterior, plane)
     varied = [n for n, v in p.settings.items() if np.ptp(v) > 0]
     if len(varied) == 1:
         at, label = p.settings[varied[0]], f"{varied[0]}, {p.units[varied[0]]}"

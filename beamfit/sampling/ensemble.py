@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Iterator
 from os import PathLike
 
 import numpy as np
 
 from beamfit.errors import InputError
 from beamfit.sampling import store as disk
-from beamfit.sampling.convergence import Diagnostics, diagnose
+from beamfit.sampling.convergence import RULES, Diagnostics, Evidence, diagnose, held_by_priors
 from beamfit.sampling.moves import Proposal, about, fitted, moves_of, share_of
 from beamfit.sampling.posterior import Posterior
 from beamfit.sampling.progress import Watch
-from beamfit.sampling.store import Checkpoint, Provenance
+from beamfit.sampling.store import FROM_PYTHON, Checkpoint, Provenance
 from beamfit.sampling.target import Target
-from beamfit.sampling.verdict import RULES, Evidence, held_by_priors
 from beamfit.status import Status
 from beamfit.verdict import judge
 
@@ -41,7 +41,7 @@ def draw(
     budget: int = 20_000,
     walkers: int | None = None,
     store: str | PathLike[str] | None = None,
-    provenance: Provenance | None = None,
+    provenance: Provenance = FROM_PYTHON,
     progress: bool = False,
 ) -> Posterior:
     """Draw from a posterior until enough is known or the budget is spent.
@@ -62,7 +62,7 @@ def draw(
     store : str or path, optional
         HDF5 file to keep the chain in. If it holds the beginning of this chain, sampling goes on
         from there.
-    provenance : Provenance, optional
+    provenance : Provenance
         For the store.
     progress : bool
         Show a progress bar on standard error.
@@ -99,11 +99,16 @@ def draw(
             return _refused(target, seed, Status.infeasible, said)
         chain = np.zeros((0, *start.shape))
         state = Checkpoint(chain, chain[..., 0], random.get_state(), 0.5, 0, False, seed)
-    kept = _Kept(store, target, provenance or Provenance(), len(state.chain))
+    stored, due, begun = len(state.chain), time.perf_counter(), state
     with Watch(progress, target_ess) as watch:
-        state, found = _run(target, state, start, target_ess, budget, kept, watch)
-    posterior = _concluded(target, state, found, target_ess, budget)
-    kept.finish(state, posterior)
+        for state, found in _blocks(target, begun, start, target_ess, budget):
+            watch.show(state, found)
+            if store is not None and time.perf_counter() >= due:
+                spent = disk.save(store, target, state, provenance)
+                stored, due = len(state.chain), time.perf_counter() + spent / WRITING
+    posterior = _concluded(target, state, target_ess, budget)
+    if store is not None and (stored < len(state.chain) or not disk.finished(store)):
+        disk.save(store, target, state, provenance, posterior.to_json())
     return posterior
 
 
@@ -155,49 +160,22 @@ def first_walkers(target: Target, number: int, random: np.random.RandomState) ->
     return None
 
 
-class _Kept:
-    """Writes checkpoints, seldom enough to take a small share of the time."""
-
-    def __init__(
-        self, store: str | PathLike[str] | None, target: Target, source: Provenance, steps: int
-    ) -> None:
-        self.store, self.target, self.source, self.steps = store, target, source, steps
-        self.due = time.perf_counter()
-
-    def offer(self, state: Checkpoint) -> None:
-        if self.store is not None and time.perf_counter() >= self.due:
-            spent = disk.save(self.store, self.target, state, self.source)
-            self.steps, self.due = len(state.chain), time.perf_counter() + spent / WRITING
-
-    def finish(self, state: Checkpoint, posterior: Posterior) -> None:
-        behind = self.store is not None and self.steps < len(state.chain)
-        if behind or (self.store is not None and not disk.finished(self.store)):
-            disk.save(self.store, self.target, state, self.source, posterior.to_json())
-
-
-def _run(
-    target: Target,
-    state: Checkpoint,
-    start: np.ndarray | None,
-    target_ess: float,
-    budget: int,
-    kept: _Kept,
-    watch: Watch,
-) -> tuple[Checkpoint, Diagnostics]:
+def _blocks(
+    target: Target, state: Checkpoint, start: np.ndarray | None, target_ess: float, budget: int
+) -> Iterator[tuple[Checkpoint, Diagnostics | None]]:
     """Sample block by block; every decision depends on the chain alone."""
     proposal = _proposal(target, state)
     while True:
         found = _judged(state)
         enough = found is not None and found.settled and np.min(found.effective) >= target_ess
         if enough or len(state.chain) + BLOCK > budget:
-            return state, found or diagnose(state.counting)
+            return
         state, start = _block(target, state, start, proposal), None
         if not state.producing and len(state.chain) in ROUNDS:
             state = state._replace(began=len(state.chain))
             proposal = _proposal(target, state)
             state = _next_stage(target, state, proposal)
-        watch.show(state, found)
-        kept.offer(state)
+        yield state, found
 
 
 def _judged(state: Checkpoint) -> Diagnostics | None:
@@ -271,11 +249,10 @@ def _refused(target: Target, seed: int, status: Status, said: str) -> Posterior:
     )
 
 
-def _concluded(
-    target: Target, state: Checkpoint, found: Diagnostics, target_ess: float, budget: int
-) -> Posterior:
+def _concluded(target: Target, state: Checkpoint, target_ess: float, budget: int) -> Posterior:
     """Judge a finished chain."""
     chain, began = state.counting, state.began
+    found = diagnose(chain)
     held = (*target.derived_names, *target.names)
     if len(chain):
         held = held_by_priors(target, chain.reshape(-1, chain.shape[2]))

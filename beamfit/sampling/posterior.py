@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from importlib.metadata import version
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -13,7 +12,7 @@ import numpy as np
 from beamfit.errors import InputError, nearest
 from beamfit.quantity import Quantity
 from beamfit.sampling.convergence import Diagnostics
-from beamfit.sampling.likelihood import LOG_NOISE, noise_words
+from beamfit.sampling.likelihood import LOG_NOISE
 from beamfit.sampling.priors import in_words
 from beamfit.sampling.summary import Interval, Summary, interval_table
 from beamfit.sampling.target import Target
@@ -142,27 +141,25 @@ class Posterior:
         return self.chain.reshape(-1, len(self.names))
 
     @cached_property
-    def _derived(self) -> np.ndarray:
-        return self.target.derive(self.draws)
+    def _numbers(self) -> dict[str, tuple[str, np.ndarray]]:
+        """Unit and draws of every number, the derived ones first."""
+        t = self.target
+        columns = np.concatenate([t.derive(self.draws), self.draws], axis=1).T
+        units = zip((*t.derived_units, *t.units), columns, strict=True)
+        return dict(zip((*t.derived_names, *t.names), units, strict=True))
+
+    def _number(self, name: str) -> tuple[str, np.ndarray]:
+        if name not in self._numbers:
+            raise InputError(f"no sampled number '{name}'", nearest(name, list(self._numbers)))
+        return self._numbers[name]
 
     def unit(self, name: str) -> str:
         """Unit of a number."""
-        self._check(name)
-        if name in self.names:
-            return self.target.units[self.names.index(name)]
-        return self.target.derived_units[self.target.derived_names.index(name)]
+        return self._number(name)[0]
 
     def values(self, name: str) -> np.ndarray:
         """All draws of one number, sampled or derived, shape (steps x walkers,)."""
-        self._check(name)
-        if name in self.names:
-            return self.draws[:, self.names.index(name)]
-        return self._derived[:, self.target.derived_names.index(name)]
-
-    def _check(self, name: str) -> None:
-        known = [*self.target.derived_names, *self.names]
-        if name not in known:
-            raise InputError(f"no sampled number '{name}'", nearest(name, known))
+        return self._number(name)[1]
 
     def __getitem__(self, name: str) -> Quantity:
         """Mean and standard deviation of a number; no error where the data do not decide it."""
@@ -279,26 +276,6 @@ class Posterior:
         """Medians and intervals of all numbers that are asked for."""
         return interval_table([self.summary(name) for name in self.shown], title, note)
 
-    def how_sampled(self, title: str) -> Table:
-        """How the draws were made and what they are worth, as a table without a head."""
-        d = self.diagnostics
-        rows = [
-            ["status", self.status.value.replace("_", " ")],
-            ["errors of the points", noise_words(self.target.groups)],
-            ["priors", "; ".join(f"{n}: {p}" for n, p in self.priors.items()) or "flat"],
-        ]
-        if d.steps:
-            rows += [
-                ["draws", f"{d.steps} steps of {d.walkers} walkers after {self.warmup} left out"],
-                ["effective draws, fewest", f"{np.min(d.effective):.0f}"],
-                ["autocorrelation time, longest", f"{np.max(d.autocorrelation):.1f} steps"],
-                ["split R-hat, largest", f"{np.max(d.rhat):.4f}"],
-                ["proposals accepted", f"{100 * self.acceptance:.0f} %"],
-                ["seed", str(self.seed)],
-                ["sampler", f"emcee {version('emcee')}"],
-            ]
-        return Table(title, [], rows)
-
     def to_json(self) -> dict[str, Any]:
         """Give the ``posterior`` object of the JSON contract; intervals are null where held."""
         d = self.diagnostics
@@ -343,9 +320,8 @@ class Posterior:
             expected = "the package arviz; install it with: pip install arviz"
             raise InputError("no ArviZ", expected) from None
         shape, observed = self.chain.shape[:2], self.target.observed.items()
-        names = (*self.names, *self.target.derived_names)
         groups = {
-            "posterior": {name: self.values(name).reshape(shape).T for name in names},
+            "posterior": {n: v.reshape(shape).T for n, (_, v) in self._numbers.items()},
             "sample_stats": {"lp": self.log_prob.T},
             "observed_data": {n: v for n, v in observed if np.asarray(v).dtype.kind == "f"},
         }

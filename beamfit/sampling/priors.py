@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cached_property
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, ClassVar, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -32,18 +32,32 @@ class Distribution(Protocol):
         """Ends of the support."""
 
 
+@dataclass(frozen=True)
 class _OfScipy:
     """A prior with the names of its field, computed by the distribution of scipy it names."""
 
-    # How scipy calls the distribution, and its arguments.
-    _call: tuple[str, dict[str, float]]
+    # How scipy calls it, and which of the fields must be above zero.
+    _name: ClassVar[str]
+    _positive: ClassVar[tuple[str, ...]] = ()
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            value = getattr(self, field.name)
+            least = 0.0 if field.name in self._positive else -math.inf
+            if not (math.isfinite(value) and value > least):
+                kind = "a positive number" if least == 0 else "a finite number"
+                words = field.name.replace("_", " ")
+                raise InputError(f"{type(self).__name__} with {words} {value}", kind)
+
+    def _arguments(self) -> dict[str, float]:
+        """The fields as scipy calls them."""
+        raise NotImplementedError
 
     @cached_property
     def _frozen(self) -> Any:
         from scipy import stats  # half a second that only sampling should cost
 
-        name, arguments = self._call
-        return getattr(stats, name)(**arguments)
+        return getattr(stats, self._name)(**self._arguments())
 
     def logpdf(self, x: np.ndarray) -> np.ndarray:
         """Log density at x; -inf outside the support."""
@@ -61,11 +75,6 @@ class _OfScipy:
         """Ends of the support."""
         low, high = self._frozen.support()
         return float(low), float(high)
-
-
-def _positive(value: float, what: str) -> None:
-    if not (value > 0 and math.isfinite(value)):
-        raise InputError(f"{what} {value}", "a positive number")
 
 
 @dataclass(frozen=True)
@@ -88,17 +97,13 @@ class Normal(_OfScipy):
     -0.225791
     """
 
+    _name = "norm"
+    _positive = ("sd",)
     centre: float
     sd: float
 
-    def __post_init__(self) -> None:
-        _positive(self.sd, "a standard deviation of")
-        if not math.isfinite(self.centre):
-            raise InputError(f"a centre of {self.centre}", "a finite number")
-
-    @property
-    def _call(self) -> tuple[str, dict[str, float]]:
-        return "norm", {"loc": self.centre, "scale": self.sd}
+    def _arguments(self) -> dict[str, float]:
+        return {"loc": self.centre, "scale": self.sd}
 
 
 @dataclass(frozen=True)
@@ -124,16 +129,13 @@ class LogNormal(_OfScipy):
     (-inf, 2.01)
     """
 
+    _name = "lognorm"
+    _positive = ("median", "log_sd")
     median: float
     log_sd: float
 
-    def __post_init__(self) -> None:
-        _positive(self.median, "a median of")
-        _positive(self.log_sd, "a logarithmic standard deviation of")
-
-    @property
-    def _call(self) -> tuple[str, dict[str, float]]:
-        return "lognorm", {"s": self.log_sd, "scale": self.median}
+    def _arguments(self) -> dict[str, float]:
+        return {"s": self.log_sd, "scale": self.median}
 
 
 @dataclass(frozen=True)
@@ -156,16 +158,17 @@ class Uniform(_OfScipy):
     [-1.3863, -inf]
     """
 
+    _name = "uniform"
     low: float
     high: float
 
     def __post_init__(self) -> None:
-        if not (math.isfinite(self.low) and math.isfinite(self.high) and self.low < self.high):
+        super().__post_init__()
+        if not self.low < self.high:
             raise InputError(f"a uniform prior from {self.low} to {self.high}", "two ends in order")
 
-    @property
-    def _call(self) -> tuple[str, dict[str, float]]:
-        return "uniform", {"loc": self.low, "scale": self.high - self.low}
+    def _arguments(self) -> dict[str, float]:
+        return {"loc": self.low, "scale": self.high - self.low}
 
 
 @dataclass(frozen=True)
@@ -188,14 +191,12 @@ class HalfNormal(_OfScipy):
     (0.7979, -inf)
     """
 
+    _name = "halfnorm"
+    _positive = ("scale",)
     scale: float
 
-    def __post_init__(self) -> None:
-        _positive(self.scale, "a scale of")
-
-    @property
-    def _call(self) -> tuple[str, dict[str, float]]:
-        return "halfnorm", {"scale": self.scale}
+    def _arguments(self) -> dict[str, float]:
+        return {"scale": self.scale}
 
 
 def checked(

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
     from beamfit.sampling.target import Target
 
-__all__ = ["Checkpoint", "Provenance", "check_place", "finished", "load", "save"]
+__all__ = ["FROM_PYTHON", "Checkpoint", "Provenance", "check_place", "finished", "load", "save"]
 
 # Another number for every change of what a store holds or of how a problem is told from another.
 KIND, FORMAT = "beamfit-posterior", "2"
@@ -44,6 +44,9 @@ class Provenance(NamedTuple):
 
     command: str = "from Python"
     inputs: Mapping[str, str | None] = {}
+
+
+FROM_PYTHON = Provenance()
 
 
 class Checkpoint(NamedTuple):

@@ -14,6 +14,7 @@ import numpy as np
 from jax import Array
 from scipy.linalg import block_diag
 
+from beamfit.compile_cache import prepare_jax
 from beamfit.sampling.likelihood import LOG_NOISE, Group, log_likelihood
 from beamfit.sampling.moves import Widening
 from beamfit.sampling.priors import Distribution, in_words
@@ -21,9 +22,9 @@ from beamfit.status import Status
 from beamfit.verdict import Finding
 
 # Not in the package: priors and the place of a store are looked at before JAX is loaded.
-jax.config.update("jax_enable_x64", True)
+prepare_jax()
 
-__all__ = ["Derived", "Law", "Target", "covariance_of", "slopes_of"]
+__all__ = ["Law", "Target", "covariance_of", "slopes_of"]
 
 GOOD = Finding(Status.converged, "")
 
@@ -48,19 +49,6 @@ class Law(NamedTuple):
     log_prior: Callable[[Any, Array], Array]
     derive: Callable[[Any, Array], Array]
     build: Callable[[Any, Array], Any]
-
-
-class Derived(NamedTuple):
-    """Numbers computed from the sampled ones.
-
-    Attributes
-    ----------
-    names, units : tuple of str
-        One an element of what ``Law.derive`` gives.
-    """
-
-    names: tuple[str, ...] = ()
-    units: tuple[str, ...] = ()
 
 
 @partial(jax.jit, static_argnames=("law", "groups"))
@@ -116,8 +104,8 @@ class Target:
         Unit of a stated error of 1; "1" where errors were stated.
     priors : mapping of str to distribution
         In addition to the law's own.
-    derived : Derived
-        Names and units of the derived numbers.
+    derived : mapping of str to str
+        Names and units of what ``Law.derive`` gives.
     observed : mapping of str to array
         The data, for the store, and to tell one problem from another.
     priors_own : tuple of str
@@ -163,7 +151,7 @@ class Target:
     counts: tuple[np.ndarray, ...] = ()
     noise_unit: str = "1"
     priors: Mapping[str, Distribution] = field(default_factory=dict)
-    derived: Derived = field(default_factory=Derived)
+    derived: Mapping[str, str] = field(default_factory=dict)
     observed: Mapping[str, np.ndarray] = field(default_factory=dict)
     priors_own: tuple[str, ...] = ()
     open_directions: str = ""
@@ -249,16 +237,16 @@ class Target:
     def derived_names(self) -> tuple[str, ...]:
         """Names of the derived numbers, the noise included where it is inferred."""
         word = "error_factor" if self.noise_unit == "1" else "noise"
-        return (*self.derived.names, *(g.prefix + word for g in self.groups if g.inferred))
+        return (*self.derived, *(g.prefix + word for g in self.groups if g.inferred))
 
     @cached_property
     def derived_units(self) -> tuple[str, ...]:
         """Their units."""
-        return (*self.derived.units, *(self.noise_unit for g in self.groups if g.inferred))
+        return (*self.derived.values(), *(self.noise_unit for g in self.groups if g.inferred))
 
     def derive(self, thetas: np.ndarray) -> np.ndarray:
         """The derived numbers at many points, shape (m, k)."""
-        parts = [self.each(self.law.derive, thetas)] if self.derived.names else []
+        parts = [self.each(self.law.derive, thetas)] if self.derived else []
         noises = [self.names.index(g.prefix + LOG_NOISE) for g in self.groups if g.inferred]
         return np.concatenate([*parts, np.exp(thetas[:, noises])], axis=1)
 

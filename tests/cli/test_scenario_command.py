@@ -77,7 +77,7 @@ def test_design_as_json_and_on_the_terminal(run):
     status, out, err = run("design", *GTF, "--vary", "Q2=0:5", "--goal", "1%", "--json")
     assert (status, err) == (0, "")
     [result] = json.loads(out)["results"]
-    assert result["status"] == "identified"
+    assert result["status"] == "converged"
     assert 0.0 <= result["next"][0]["settings"]["Q2"] <= 5.0
     assert result["next"][-1]["relative_error"]["x"] <= 0.01
     status, out, _ = run("design", *GTF, "--scenario", "calibration")

@@ -20,7 +20,7 @@ from beamfit.status import Status
 from beamfit.studies.decay.fit import fit_decay
 from beamfit.studies.decay.posterior import expected_current
 from beamfit.studies.decay.record import DecayRecord
-from beamfit.studies.scan.beam_posterior import expected_sizes
+from beamfit.studies.scan.posterior import expected_sizes
 
 X = np.linspace(0.0, 1.0, 12)
 Y = 1.0 + 2.0 * X + 0.1 * np.random.default_rng(1).normal(size=12)
@@ -188,7 +188,7 @@ def test_a_scan_that_determines_nothing_is_not_sampled():
 
 def test_expected_sizes_hold_the_points(otr2, beam):
     p = otr2.y.points
-    found = expected_sizes(beam, otr2, "y")
+    found = expected_sizes(beam, "y")
     low, high = found.reading
     assert ((p.size > low) & (p.size < high)).all()
     assert (found.model[0] > low).all()

@@ -5,9 +5,9 @@ import pytest
 
 import beamfit
 from beamfit.errors import InputError
+from beamfit.quantity import Status
 from beamfit.studies.scan.candidates import candidate_rows
 from beamfit.studies.scan.design import plan_measurements
-from beamfit.studies.scan.information import information_of
 from tests.studies.conftest import TABLE_2, design
 
 
@@ -98,6 +98,21 @@ def test_an_open_calibration_is_told_which_measurement_closes_it(free):
     assert "It would be determined with" in advice.message
 
 
+def test_each_plane_has_the_errors_of_its_own_fit(root, otr2):
+    """The scale of y is no business of x, nor the other way round."""
+    scan = beamfit.read_quad_scan(root / "measurements/lcls_otr2.csv")
+    fit = beamfit.fit_emittance(scan, otr2)
+    assert fit.x.error_scale > 1.5 * fit.y.error_scale
+    now = plan_measurements(fit, count=1).now
+    for plane in fit.planes:
+        assert now[plane.plane] == pytest.approx(plane.emittance.relative, rel=1e-3)
+
+
+def test_the_status_is_one_of_all_statuses(known, free):
+    assert plan_measurements(known, count=1).to_json()["status"] == Status.converged
+    assert plan_measurements(free, count=1).to_json()["status"] == Status.unidentified
+
+
 def test_and_that_measurement_closes_it(root):
     """The second screen of gtf_two_screens.toml is the advised kind."""
     scan = beamfit.read_quad_scan(root / "measurements/gtf_two_screens_simulated.csv")
@@ -134,7 +149,7 @@ def test_bad_wishes_are_named(known, options, words):
 def test_zero_is_not_listed_as_its_rounding(known):
     """linspace(-1.7, 1.7, 41) misses zero by 2.2e-16."""
     limits = {"Q2": (-1.7, 1.7)}
-    found = candidate_rows(known, information_of(known), limits, ())
+    found = candidate_rows(known, limits, ())
     settings = [c.candidate.settings["Q2"] for c in found]
     assert 0.0 in settings
     assert min(abs(s) for s in settings if s) > 1e-3

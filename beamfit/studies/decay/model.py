@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from beamfit.greybox.many_starts import descend_one
+from beamfit.greybox.descend import descend_one
 from beamfit.greybox.problem import Free, Prior, Problem, Record, padded_length
 from beamfit.lifetime.decay import current, current_by_rate
 from beamfit.studies.decay.record import DecayRecord

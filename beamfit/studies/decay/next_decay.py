@@ -10,9 +10,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from beamfit.errors import InputError
+from beamfit.greybox.design import Information, scores
 from beamfit.lifetime.decay import current as decayed
 from beamfit.lifetime.ring import Operation
-from beamfit.lifetime.scaled import loss_terms, scaled_losses
+from beamfit.lifetime.scaled import Terms, loss_terms, scaled_losses
 from beamfit.studies.decay.scales import ScaleFit, pulls, whitener
 from beamfit.studies.decay.summary import Summaries, information_root, loss_parts
 
@@ -65,8 +66,8 @@ class Proposal(NamedTuple):
 _slopes = jax.jit(jax.jacfwd(pulls))
 
 
-def _information(fit: ScaleFit, candidate: Candidate) -> np.ndarray:
-    """What the candidate would add to the information on the scales, shape (4, 4)."""
+def _rows(fit: ScaleFit, candidate: Candidate) -> np.ndarray:
+    """What the candidate would measure by the scales, over its errors, shape (2, scales)."""
     scales = jnp.asarray(fit.vector)
     terms = loss_terms(fit.machine.ring, candidate.operation, candidate.current)
     a, b = scaled_losses(scales, terms)
@@ -77,9 +78,13 @@ def _information(fit: ScaleFit, candidate: Candidate) -> np.ndarray:
     root = information_root(time, weight, candidate.current, parts, mean)
     one = Summaries(mean[None], parts[None], root[None])
     stacked = jax.tree.map(lambda part: jnp.asarray(part)[None], terms._replace(current=mean))
-    white = whitener(scales, stacked, one, fit.pressure_error)
-    rows = np.asarray(_slopes(scales, stacked, one, white)).reshape(-1, 4)
-    return rows.T @ rows
+    return _rows_of(fit, stacked, one)
+
+
+def _rows_of(fit: ScaleFit, terms: Terms, measured: Summaries) -> np.ndarray:
+    weight = whitener(fit.vector, terms, measured, fit.pressure_error)
+    slopes = _slopes(fit.vector, terms, measured, weight)
+    return np.asarray(slopes).reshape(-1, len(fit.vector))
 
 
 def next_decays(fit: ScaleFit, candidates: Sequence[Candidate]) -> tuple[Proposal, ...]:
@@ -108,18 +113,21 @@ def next_decays(fit: ScaleFit, candidates: Sequence[Candidate]) -> tuple[Proposa
         if not min(candidate.current, candidate.duration, candidate.noise) > 0:
             raise InputError(f"{candidate[1:]}", "current, duration and noise above zero")
     known = _known(fit)
-    before = np.linalg.slogdet(known)[1]
-    proposals = []
-    for candidate in candidates:
-        after = known + _information(fit, candidate)
-        gain = 0.5 * (np.linalg.slogdet(after)[1] - before)
-        errors = np.sqrt(np.diag(np.linalg.inv(after))) * fit.error_scale
-        proposals.append(Proposal(candidate, float(gain), errors))
+    rows = np.array([_rows(fit, candidate) for candidate in candidates])
+    [before] = scores(known, np.zeros((1, *rows.shape[1:])), volume=True)
+    gains = 0.5 * (before - scores(known, rows, volume=True))
+    proposals = [
+        Proposal(candidate, float(gain), known.with_rows(own).error * fit.error_scale)
+        for candidate, own, gain in zip(candidates, rows, gains, strict=True)
+    ]
     return tuple(sorted(proposals, key=lambda proposal: -proposal.information))
 
 
-def _known(fit: ScaleFit) -> np.ndarray:
-    """Information so far, with a wide prior where there is none."""
-    weight = whitener(fit.vector, fit.terms, fit.measured, fit.pressure_error)
-    rows = np.asarray(_slopes(fit.vector, fit.terms, fit.measured, weight)).reshape(-1, 4)
-    return rows.T @ rows + np.diag(1 / fit.prior_error**2) + np.eye(4) / WIDE**2
+def _known(fit: ScaleFit) -> Information:
+    """Information on the scales so far, with a wide prior where there is none."""
+    one = np.eye(len(fit.vector))
+    rows = np.vstack(
+        [_rows_of(fit, fit.terms, fit.measured), np.diag(1 / fit.prior_error), one / WIDE]
+    )
+    free = np.full(len(one), np.inf)
+    return Information(rows, np.ones(len(one)), one, free > 0, -free, free)

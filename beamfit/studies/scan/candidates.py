@@ -10,18 +10,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from beamfit.errors import InputError, nearest
+from beamfit.greybox.design import Information
 from beamfit.optics.beamline import Beamline
 from beamfit.optics.calibration import SETTING_UNITS
 from beamfit.optics.elements import Drift, Screen
 from beamfit.studies.scan.fit import EmittanceFit
-from beamfit.studies.scan.information import Information, linearised_at
-from beamfit.studies.scan.scenario_judged import with_slope
-from beamfit.studies.scan.scenario_model import (
-    NetworkRows,
-    Rows,
-    predict_network,
-    predict_sizes,
-)
+from beamfit.studies.scan.information import linearised_at, with_slope
+from beamfit.studies.scan.model import predict_sizes, spoken
+from beamfit.studies.scan.transport import NetworkRows, Rows
 
 __all__ = ["Candidate", "Considered", "candidate_rows", "further_options"]
 
@@ -50,7 +46,6 @@ class Considered(NamedTuple):
 
 def candidate_rows(
     fit: EmittanceFit,
-    base: Information,
     limits: Mapping[str, tuple[float, float]] | None,
     energies: tuple[float, ...],
 ) -> list[Considered]:
@@ -60,8 +55,6 @@ def candidate_rows(
     ----------
     fit : EmittanceFit
         What is measured already.
-    base : Information
-        Its information.
     limits : mapping of str to (float, float), or None
         Magnets that may be set, each in turn over 41 settings, the others at their median.
     energies : tuple of float
@@ -90,7 +83,7 @@ def candidate_rows(
         table[name] = values
         for screen in screens:
             for energy in (own, *energies):
-                rows = _rows(fit, base, fit.line, table, screen, np.full(COUNT, energy))
+                rows = _rows(fit, fit.line, table, screen, np.full(COUNT, energy))
                 found += [
                     Considered(_named(fit, table, i, screen, energy, own, screens), rows[:, i])
                     for i in range(COUNT)
@@ -148,7 +141,6 @@ def _named(fit, table, i, screen, energy, own, screens) -> Candidate:
 
 def _rows(
     fit: EmittanceFit,
-    base: Information,
     line: Beamline,
     table: Mapping[str, np.ndarray],
     screen: str,
@@ -160,7 +152,7 @@ def _rows(
     for plane in fit.planes:
         relative = np.median(plane.points.error / plane.points.size) * plane.error_scale
         if fit.scenario == "transport-network":
-            data, predict = _network_rows(fit, plane.plane, table, screen), predict_network
+            data, predict = _network_rows(fit, plane.plane, table, screen), predict_sizes
         else:
             data, predict = _line_rows(fit, line, plane.plane, table, screen, energy), predict_sizes
         size, slope = (
@@ -203,7 +195,7 @@ def _network_rows(fit, plane, table, screen) -> NetworkRows:
     record = next(r for r in fit.problem.records if r.name == f"size {plane}")
     measured = fit.scan.screen or (screen,) * len(fit.scan)
     keep = np.flatnonzero(~np.isnan(fit.scan.size[plane]))
-    which = next(i for i, k in enumerate(keep) if measured[k] == screen)
+    which = next(k for k in keep if measured[k] == screen)
     count = len(next(iter(table.values())))
     inputs = [table.get(n, np.full(count, _own_energy(fit))) for n in net.inputs]
     return NetworkRows(
@@ -242,14 +234,14 @@ def further_options(
     energy = np.full(len(fit.scan), own) if fit.scan.energy is None else fit.scan.energy
     if fit.scenario != "transport-network":
         for line, screen, words in _other_screens(fit):
-            rows = _rows(fit, base, line, table, screen, energy)
+            rows = _rows(fit, line, table, screen, energy)
             best = min(range(rows.shape[1]), key=lambda i: _worst(base.with_rows(rows[:, i])))
             at = _in_words(fit, {n: float(v[best]) for n, v in table.items()})
             yield f"one size on {words} ({at})", rows[:, best]
             yield f"the same scan on {words}", rows.reshape(-1, rows.shape[-1])
         for factor in energies or tuple(own * f for f in USUAL_ENERGIES):
             screen = (fit.scan.screen or (fit.line.screens[-1],))[-1]
-            rows = _rows(fit, base, fit.line, table, screen, np.full(len(fit.scan), factor))
+            rows = _rows(fit, fit.line, table, screen, np.full(len(fit.scan), factor))
             yield f"the same scan at {factor:.4g} MeV", rows.reshape(-1, rows.shape[-1])
     for words, rows in _priors(fit):
         yield words, rows
@@ -257,8 +249,7 @@ def further_options(
 
 def _worst(after: Information) -> float:
     """Relative error that counts bounds as nothing: large while they decide."""
-    share = float(after.share().max())
-    return max(after.relative_error().values()) / max(1.0 - share, 1e-6)
+    return float(after.relative_error.max() / max(1.0 - after.share.max(), 1e-6))
 
 
 def _other_screens(fit: EmittanceFit) -> list[tuple[Beamline, str, str]]:
@@ -288,4 +279,4 @@ def _priors(fit: EmittanceFit) -> Iterator[tuple[str, np.ndarray]]:
             value = abs(float(p.start[i]))
             row = np.zeros((1, len(p.names)))
             row[0, i] = 1.0 / (0.02 * value)
-            yield f"a prior of 2 % on {name}", row
+            yield f"a prior of 2 % on {spoken(name)}", row

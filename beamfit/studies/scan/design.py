@@ -7,16 +7,24 @@ the advice holds for calibrations and networks as well as for the beam alone.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from beamfit.errors import InputError
-from beamfit.studies.scan.candidates import Candidate, candidate_rows, further_options
+from beamfit.greybox.design import Information, greedy
+from beamfit.status import Status
+from beamfit.studies.scan.candidates import (
+    Candidate,
+    Considered,
+    candidate_rows,
+    further_options,
+)
 from beamfit.studies.scan.fit import EmittanceFit
-from beamfit.studies.scan.information import Information, information_of
+from beamfit.studies.scan.information import by_plane, identified, information_of
+from beamfit.table import Table, html_of, json_of, text_of
 
 __all__ = ["CRITERIA", "Advice", "Option", "Step", "plan_measurements"]
 
@@ -88,19 +96,54 @@ class Advice:
             return f"{first} {self.stop}"
         return f"{first} Measure next at {self.steps[0].candidate.words}. {self.stop}"
 
+    @property
+    def status(self) -> Status:
+        """``converged`` where the data determine the emittance, ``unidentified`` where not."""
+        return Status.converged if self.identified else Status.unidentified
+
     def to_json(self) -> dict[str, Any]:
         """Give the entry of ``results`` of the JSON contract."""
-        return {
+        found = {
             "scenario": self.scenario,
             "criterion": self.criterion,
-            "status": "identified" if self.identified else "unidentified",
+            "status": self.status,
             "message": self.message,
             "relative_error": self.now,
             "next": [s.candidate._asdict() | {"relative_error": s.relative_error,
                      "identified": s.identified} for s in self.steps],
             "stop": self.stop,
-            "options": [o._asdict() for o in self.options],
+            "options": self.options,
         }  # fmt: skip
+        return json_of(found)
+
+    def tables(self) -> tuple[Table, ...]:
+        """Lay out the errors after each measurement, and what would identify an open scenario."""
+        rows = [["what is measured", *_cells(self.now, self.identified)]]
+        rows += [
+            [f"{number}. {step.candidate.words}", *_cells(step.relative_error, True)]
+            for number, step in enumerate(self.steps, 1)
+            if step.identified
+        ]
+        if self.steps and not self.steps[-1].identified:
+            words = f"{len(self.steps)} more points of the scan, at the best settings"
+            rows.append([words, *_cells(self.now, False)])
+        steps = Table("", ["after", *self.now], rows, numeric=True)
+        header = ["What would identify it", *(f"error {plane}" for plane in self.now), "identified"]
+        rows = [
+            [o.words, *_cells(o.relative_error, o.identified), "yes" if o.identified else "no"]
+            for o in self.options
+        ]
+        return (steps, Table("", header, rows)) if rows else (steps,)
+
+    def __str__(self) -> str:
+        return "\n\n".join([*map(text_of, self.tables()), f"{self.status}: {self.message}"])
+
+    def _repr_html_(self) -> str:
+        return "".join(map(html_of, self.tables()))
+
+
+def _cells(error: Mapping[str, float], known: bool) -> list[str]:
+    return [f"{100 * e:.2f} %" if known else "not determined" for e in error.values()]
 
 
 def plan_measurements(
@@ -150,7 +193,7 @@ def plan_measurements(
     --------
     >>> from beamfit.optics.beamline import Beamline
     >>> from beamfit.optics.elements import Drift, Quadrupole, Screen
-    >>> from beamfit.studies.scan.emittance import fit_emittance
+    >>> from beamfit.studies.scan.fit import fit_emittance
     >>> from beamfit.studies.scan.scans import QuadScan
     >>> line = Beamline((Quadrupole("Q", 0.1), Drift("D", 2.0), Screen("S")), 135.0)
     >>> sizes = np.array([3.4e-4, 1.9e-4, 0.9e-4, 1.9e-4, 3.4e-4])
@@ -166,46 +209,55 @@ def plan_measurements(
         raise InputError(f"{count} points to a goal of {goal}", "at least one, and a positive goal")
     _check_energies(energies, float(fit.line.mass))
     base = information_of(fit)
-    candidates = candidate_rows(fit, base, limits, energies)
-    now, steps = base, []
-    stop = f"Listed are the best {count}."
-    for _ in range(count):
-        if goal is not None and now.identified and max(now.relative_error().values()) <= goal:
-            stop = f"Stop: the goal of {100 * goal:.3g} % is reached."
-            break
-        scores = [now.score(criterion, c.rows) for c in candidates]
-        best = int(np.argmin(scores))
-        after = now.with_rows(candidates[best].rows)
-        gain = 1.0 - scores[best] / now.score(criterion, None)
-        if now.identified and criterion == "emittance" and gain < LEAST_GAIN:
-            stop = (
-                f"Stop: the best further point sharpens the emittance by {100 * max(gain, 0):.1g} "
-                "%; repeat the scan instead, or improve the size measurement."
-            )
-            break
-        now = after
-        steps.append(Step(candidates[best].candidate, now.relative_error(), now.identified))
-    if goal is not None and steps and now.identified:
-        if max(now.relative_error().values()) <= goal and not stop.startswith("Stop"):
-            stop = f"Stop after these: the goal of {100 * goal:.3g} % is reached."
-        elif not stop.startswith("Stop"):
-            stop = f"The goal of {100 * goal:.3g} % needs more than these {count}."
-    options = () if base.identified else _options(fit, base, energies)
+    considered = candidate_rows(fit, limits, energies)
+    steps, stop = _steps(fit, base, considered, criterion, goal, count)
+    options = () if identified(base) else tuple(_options(fit, base, energies))
     return Advice(
-        fit.scenario, criterion, base.identified, base.relative_error(), tuple(steps), stop, options
+        fit.scenario, criterion, identified(base), by_plane(fit, base), steps, stop, options
     )
 
 
-def _options(
-    fit: EmittanceFit, base: Information, energies: tuple[float, ...]
-) -> tuple[Option, ...]:
+def _steps(
+    fit: EmittanceFit,
+    base: Information,
+    considered: Sequence[Considered],
+    criterion: str,
+    goal: float | None,
+    count: int,
+) -> tuple[tuple[Step, ...], str]:
+    """The best measurement, the best after that, and why the list ends."""
+    aim = "" if goal is None else f"goal of {100 * goal:.3g} %"
+
+    def sharp(known: Information) -> bool:
+        return goal is not None and identified(known) and known.relative_error.max() <= goal
+
+    now, steps = base, []
+    for choice in greedy(base, np.array([c.rows for c in considered]), criterion == "D"):
+        if len(steps) == count:
+            break
+        if sharp(now):
+            return tuple(steps), f"Stop: the {aim} is reached."
+        if identified(now) and criterion == "emittance" and choice.gain < LEAST_GAIN:
+            return tuple(steps), (
+                "Stop: the best further point sharpens the emittance by "
+                f"{100 * max(choice.gain, 0):.1g} %; repeat the scan instead, or improve the size "
+                "measurement."
+            )
+        now = choice.known
+        found = considered[choice.index].candidate
+        steps.append(Step(found, by_plane(fit, now), identified(now)))
+    if sharp(now):
+        return tuple(steps), f"Stop after these: the {aim} is reached."
+    if goal is not None and identified(now):
+        return tuple(steps), f"The {aim} needs more than these {count}."
+    return tuple(steps), f"Listed are the best {count}."
+
+
+def _options(fit: EmittanceFit, base: Information, energies: tuple[float, ...]) -> Iterator[Option]:
     """What each kind of further measurement would make of the emittance."""
-    found = []
     for words, rows in further_options(fit, base, energies):
         after = base.with_rows(rows)
-        share = float(after.share().max())
-        found.append(Option(words, after.relative_error(), share, after.identified))
-    return tuple(found)
+        yield Option(words, by_plane(fit, after), float(after.share.max()), identified(after))
 
 
 def _check_energies(energies: tuple[float, ...], rest: float) -> None:

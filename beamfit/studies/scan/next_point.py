@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from beamfit.greybox.design import Information, rows_of, scores
 from beamfit.studies.scan.results import Points
 
 __all__ = ["Candidate", "best_candidate", "best_symmetric", "candidate_settings", "plausible_sigma"]
@@ -108,12 +109,7 @@ def best_candidate(
     Returns
     -------
     Candidate or None
-        None if no candidate improves the error.
-
-    Notes
-    -----
-    One more point with row m and variance v changes the covariance to C - C m mᵀ C/(v + mᵀ C m)
-    (rank-one update of the normal equations), and the emittance's variance is ∇ε C ∇ε.
+            None without a candidate.
 
     Examples
     --------
@@ -122,17 +118,15 @@ def best_candidate(
     1.0
     """
     emittance = np.sqrt(sigma[0] * sigma[2] - sigma[1] ** 2)
-    gradient = np.array([sigma[2], -2.0 * sigma[1], sigma[0]]) / (2.0 * emittance)
-    before = gradient @ covariance @ gradient
-    best: Candidate | None = None
+    gradient = np.array([[sigma[2], -2.0 * sigma[1], sigma[0]]]) / (2.0 * emittance)
+    free = np.full(3, np.inf)
+    known = Information(
+        rows_of(covariance), np.array([emittance]), gradient, np.ones(3, bool), -free, free
+    )
+    found = []
     for name, settings, design in rows:
         squared = np.maximum(design @ sigma, 1e-30)
-        spread = design @ covariance
-        gain = (spread @ gradient) ** 2 / (
-            (2.0 * relative * squared) ** 2 + np.einsum("ij,ij->i", spread, design)
-        )
-        k = int(np.argmax(gain))
-        error = float(np.sqrt(max(before - gain[k], 0.0)) / emittance)
-        if best is None or error < best.relative_error:
-            best = Candidate(name, float(settings[k]), error)
-    return best
+        errors = scores(known, (design / (2.0 * relative * squared)[:, None])[:, None, :])
+        best = int(np.argmin(errors))
+        found.append(Candidate(name, float(settings[best]), float(errors[best])))
+    return min(found, key=lambda c: c.relative_error, default=None)

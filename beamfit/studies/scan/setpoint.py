@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from functools import partial
 from typing import Any
 
 import jax
@@ -16,10 +15,10 @@ from scipy.linalg import block_diag
 
 from beamfit.errors import InputError
 from beamfit.greybox import assess, problem, tree
+from beamfit.greybox.assess import TOLERANCE
+from beamfit.greybox.descend import descend_all
 from beamfit.greybox.fit import Fit, Variable
-from beamfit.greybox.kkt import TOLERANCE
-from beamfit.greybox.many_starts import descend_all
-from beamfit.greybox.problem import Free, Problem, Record
+from beamfit.greybox.problem import Free, Problem, Record, padded_length
 from beamfit.greybox.solve import solve
 from beamfit.optics.beamline import Beamline
 from beamfit.optics.calibration import SETTING_UNITS
@@ -35,7 +34,14 @@ from beamfit.studies.scan.setpoint_result import (
     reached_words,
     verdict_on,
 )
-from beamfit.studies.scan.wishes import Beam, Target, checked_place, common_energy, resolved
+from beamfit.studies.scan.wishes import (
+    KINDS,
+    Beam,
+    Target,
+    checked_place,
+    common_energy,
+    resolved,
+)
 
 __all__ = ["Beam", "Minimum", "PlaneBeam", "Setpoint", "Target", "find_setpoint"]
 
@@ -44,21 +50,23 @@ STARTS = 256
 # Two end points are one minimum if they differ by less than this share of the range.
 SAME = 1e-3
 MOST_MINIMA = 10
+PLANES = ("x", "y")
 
 
-@tree.node("names", "planes", "wishes")
+@tree.node("names")
 class _Wanted:
-    """The data of a search.
+    """The data of a search: magnets (by name), their line, the wishes, the beams.
 
-    Magnets, planes and the wishes' kinds and rows among the planes are structure. `values` has
-    shape (wishes, 2), `middle` and `reach` (magnets,), `sigma` (planes, 3).
+    Of the wishes `kinds` and `planes`, shape (wishes,), `values` (wishes, 2) and `weight` (wishes,
+    1), padded to a length that searches share; `middle` and `reach` (magnets,), `sigma` (2, 3).
     """
 
     names: tuple[str, ...]
-    planes: tuple[str, ...]
-    wishes: tuple[tuple[str, int], ...]
     line: Any
+    kinds: Any
+    planes: Any
     values: Any
+    weight: Any
     middle: Any
     reach: Any
     sigma: Any
@@ -131,14 +139,17 @@ def find_setpoint(
     carrying = line if energy is None else replace(line, energy=energy)
     for beam in beams.values():
         carrying = with_numbers(carrying, beam.calibration)
-    wanted = _wanted(carrying.upto(screen), used, vary, targets)
+    carrying = carrying.upto(screen)
+    short = carrying.condensed((*vary, screen), carrying.energy)
+    wanted = _wanted(short, used, vary, targets)
     minima, fit = _search(_stated(wanted), _starts(len(vary), seed))
     units = {name: SETTING_UNITS[line[name].calibration.unit] for name in vary}
     listed = [Minimum(_settings(wanted, theta), value) for theta, value in minima]
     predicted = _predicted(wanted, used, fit.theta)
+    misses = _relative_misses(wanted, targets, fit.theta)
     evidence = Evidence(
-        reached_words(targets, predicted, listed[0].objective),
-        _relative_misses(wanted, fit.theta),
+        reached_words(targets, predicted, misses),
+        misses,
         listed[0].objective,
         fit.kkt.worst <= TOLERANCE,
         tuple(n for n, v in zip(vary, fit.variables, strict=True) if _pulled(v, fit.cost)),
@@ -155,25 +166,29 @@ def find_setpoint(
 def _wanted(line, beams, vary, targets) -> _Wanted:
     """Gather the data of a search; `line` ends at the place."""
     low, high = np.array([*vary.values()], float).T
-    planes = tuple(beams)
+    size = padded_length(len(targets))
+    padded = [*targets, *[targets[0]] * (size - len(targets))]
+    other = next(iter(beams.values()))
     return _Wanted(
         tuple(vary),
-        planes,
-        tuple((t.kind, planes.index(t.plane)) for t in targets),
         line,
-        jnp.array([np.broadcast_to(t.value, 2) for t in targets], float),
+        jnp.array([KINDS.index(t.kind) for t in padded]),
+        jnp.array([PLANES.index(t.plane) for t in padded]),
+        jnp.array([np.broadcast_to(t.value, 2) for t in padded], float),
+        np.arange(size)[:, None] < len(targets),
         jnp.asarray(0.5 * (low + high)),
         jnp.asarray(0.5 * (high - low)),
-        jnp.array([beam.sigma for beam in beams.values()], float),
+        jnp.array([beams.get(plane, other).sigma for plane in PLANES], float),
     )
 
 
 def _stated(wanted: _Wanted) -> Problem:
     """The search as a problem: settings from -1 to 1 between their limits, no miss "measured"."""
-    size = len(wanted.names)
-    none = np.zeros((len(wanted.wishes), 2))
-    record = Record("wishes", _misses, wanted, none, error=1.0)
-    return Problem({"settings": jnp.zeros(size)}, [Free("settings", -1.0, 1.0)], [record])
+    none = np.zeros(wanted.values.shape)
+    weight = np.broadcast_to(wanted.weight, none.shape)
+    record = Record("wishes", _misses, wanted, none, error=1.0, weight=weight)
+    start = jnp.zeros(len(wanted.names))
+    return Problem({"settings": start}, [Free("settings", -1.0, 1.0)], [record])
 
 
 def _starts(count: int, seed: int) -> np.ndarray:
@@ -189,10 +204,9 @@ def _settings(wanted: _Wanted, theta) -> dict[str, float]:
 
 
 def _at_place(wanted: _Wanted, theta: Array) -> Array:
-    """R L of each plane, shape (planes, 2, 2), with σ = L Lᵀ: rows are size and divergence."""
+    """R L of both planes, shape (2, 2, 2), with σ = L Lᵀ: rows are size and divergence."""
     settings = dict(zip(wanted.names, wanted.middle + wanted.reach * theta, strict=True))
-    matrix = wanted.line.matrix(settings)
-    r = jnp.stack([getattr(matrix, plane)[:2, :2] for plane in wanted.planes])
+    r = wanted.line.matrix(settings).planes[:, :2, :2]
     l11 = jnp.sqrt(wanted.sigma[:, 0])
     l21 = wanted.sigma[:, 1] / l11
     l22 = jnp.sqrt(wanted.sigma[:, 2] - l21**2)
@@ -200,28 +214,24 @@ def _at_place(wanted: _Wanted, theta: Array) -> Array:
     return r @ jnp.stack(columns, -1)
 
 
-def _far(row: int, vectors: Array, value: Array) -> Array:
-    """Miss of a size (row 0, µm) or a divergence (row 1, µrad), along its vector."""
-    v = vectors[row]
-    return 1e6 * (1.0 - value[0] / jnp.linalg.norm(v)) * v
-
-
-def _mismatched(vectors: Array, value: Array) -> Array:
-    """The two numbers whose squares add to BMAG - 1."""
-    (s11, s12), emittance = vectors @ vectors[0], jnp.linalg.det(vectors)
-    ratio = jnp.sqrt(s11 / emittance / value[0])
-    other = ratio * value[1] + s12 / emittance / ratio
-    return jnp.stack([ratio - 1.0 / ratio, other]) / math.sqrt(2.0)
-
-
-MISSES = {"size": partial(_far, 0), "divergence": partial(_far, 1), "match": _mismatched}
-
-
 def _misses(model: Any, wanted: _Wanted) -> Array:
-    """Miss of every wish, shape (wishes, 2); the objective is the sum of squares."""
+    """Miss of every wish, shape (wishes, 2); the objective is the sum of their squares.
+
+    Of sizes in µm and divergences in µrad, along the vector; of matches the two numbers whose
+    squares add to BMAG - 1. In the order of KINDS.
+    """
     at = _at_place(wanted, model["settings"])
-    pairs = zip(wanted.wishes, wanted.values, strict=True)
-    return jnp.stack([MISSES[kind](at[row], value) for (kind, row), value in pairs])
+
+    def miss(kind, plane, value):
+        vectors = at[plane]
+        (s11, s12), emittance = vectors @ vectors[0], jnp.linalg.det(vectors)
+        far = 1e6 * (1.0 - value[0] / jnp.linalg.norm(vectors, axis=1))[:, None] * vectors
+        ratio = jnp.sqrt(s11 / emittance / value[0])
+        other = ratio * value[1] + s12 / emittance / ratio
+        mismatch = jnp.stack([ratio - 1.0 / ratio, other]) / math.sqrt(2.0)
+        return jnp.concatenate([far, mismatch[None]])[kind]
+
+    return jax.vmap(miss)(wanted.kinds, wanted.planes, wanted.values)
 
 
 def _search(stated: Problem, starts: np.ndarray) -> tuple[list[tuple[np.ndarray, float]], Fit]:
@@ -266,7 +276,8 @@ def _curvature(wanted: _Wanted, theta: Array) -> Array:
 
     def objective(both):
         sigma = both[size:].reshape(wanted.sigma.shape)
-        return jnp.sum(_misses({"settings": both[:size]}, replace(wanted, sigma=sigma)) ** 2)
+        misses = _misses({"settings": both[:size]}, replace(wanted, sigma=sigma))
+        return jnp.sum(wanted.weight * misses**2)
 
     both = jnp.concatenate([theta, wanted.sigma.ravel()])
     return jax.jacfwd(jax.jacfwd(objective))(both)
@@ -282,8 +293,8 @@ def _predicted(
 ) -> tuple[PlaneBeam, ...]:
     values, slopes = map(np.asarray, _numbers(wanted, jnp.asarray(theta)))
     found = []
-    for i, (plane, beam) in enumerate(beams.items()):
-        covariance = _covariance(beam)
+    for plane, beam in beams.items():
+        i, covariance = PLANES.index(plane), _covariance(beam)
         error: Sequence[float | None] = [None] * 4
         if covariance is not None:
             slope = slopes[i, :, i]
@@ -293,12 +304,11 @@ def _predicted(
     return tuple(found)
 
 
-def _relative_misses(wanted: _Wanted, theta: np.ndarray) -> tuple[float, ...]:
+def _relative_misses(wanted: _Wanted, targets, theta: np.ndarray) -> tuple[float, ...]:
     """Distance of each wish over what is wanted; BMAG - 1 of a match."""
-    lengths = np.linalg.norm(_misses({"settings": theta}, wanted), axis=1)
-    values = 1e6 * np.asarray(wanted.values)[:, 0]
-    pairs = zip(wanted.wishes, lengths, values, strict=True)
-    return tuple(float(m**2 if MISSES[k] is _mismatched else m / v) for (k, _), m, v in pairs)
+    lengths = np.linalg.norm(_misses({"settings": jnp.asarray(theta)}, wanted), axis=1)
+    pairs = zip(targets, lengths, strict=False)  # the rest is padding
+    return tuple(float(m / (1e6 * t.value) if np.ndim(t.value) == 0 else m**2) for t, m in pairs)
 
 
 def _pulled(v: Variable, cost: float) -> bool:
@@ -311,7 +321,7 @@ def _setting_errors(
 ) -> dict[str, float | None]:
     """Error of each best setting due to the beam; None at a limit or without a covariance."""
     errors: dict[str, float | None] = dict.fromkeys(wanted.names)
-    covariances = [_covariance(beam) for beam in beams.values()]
+    covariances = [_covariance(beams[p]) if p in beams else np.zeros((3, 3)) for p in PLANES]
     loose = np.flatnonzero(np.abs(theta) < 1.0)
     if any(c is None for c in covariances) or not loose.size:
         return errors

@@ -149,11 +149,11 @@ class Setpoint:
             [f"  {_listed(m.settings, self.units, 5)}: objective {m.objective:.6g}"]
             for m in self.others[:5]
         ]
-        return (best, Table("\nOther minima", [], others)) if others else (best,)
+        return (best, Table("Other minima", [], others)) if others else (best,)
 
     def __str__(self) -> str:
         said = [f"{self.status}: {self.message}", *self.notes, *self.doubts.values()]
-        return "\n".join([*map(text_of, self.tables()), "", *said])
+        return "\n\n".join([*map(text_of, self.tables()), "\n".join(said)])
 
     def _repr_html_(self) -> str:
         return "".join(map(html_of, self.tables()))
@@ -192,7 +192,8 @@ def _restless(e: Evidence) -> Finding | None:
         return None
     return Finding(
         Status.not_converged,
-        f"{e.reached} That is the best point found, but no optimum of the search:",
+        f"{e.reached} That is the best point found, but the objective still falls there, or jumps "
+        "as a magnet changes sign:",
         "narrow the limits around it, or search again with another seed.",
     )
 
@@ -254,16 +255,20 @@ def verdict_on(
 
 
 def reached_words(
-    targets: Sequence[Target], predicted: Sequence[PlaneBeam], objective: float
+    targets: Sequence[Target], predicted: Sequence[PlaneBeam], misses: Sequence[float]
 ) -> str:
-    """Say what is reached of each size and divergence, or of the matches."""
+    """Say what is reached of each size and divergence, and of the matches together."""
     by_plane = {p.plane: p for p in predicted}
+    alone = [np.ndim(t.value) == 0 for t in targets]
     said = [
         f"{t.kind} {t.plane} {_micro(t, getattr(by_plane[t.plane], t.kind))}"
-        for t in targets
-        if np.ndim(t.value) == 0
+        for t, own in zip(targets, alone, strict=True)
+        if own
     ]
-    words = "; ".join(said) or f"BMAG - 1 = {objective:.3g} over the planes asked for"
+    if not all(alone):
+        mismatch = sum(m for m, own in zip(misses, alone, strict=True) if not own)
+        said.append(f"BMAG - 1 = {mismatch:.3g} over the planes asked for")
+    words = "; ".join(said)
     return words[0].upper() + words[1:] + "."
 
 

@@ -1,0 +1,174 @@
+"""What to measure next: what further rows of the Jacobian would tell, in linear approximation.
+
+A candidate is the derivatives of what it would measure by the free numbers, over its own errors.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+
+from beamfit.greybox.covariance import Spread, spread_of
+
+__all__ = ["Choice", "Information", "greedy", "rows_of", "scores"]
+
+
+class Information(NamedTuple):
+    """What is known of some quantities, ready to be added to.
+
+    Attributes
+    ----------
+    jacobian : ndarray
+        Shape (m, n), residuals by free numbers, in units of their errors, priors among them.
+    value, slope : ndarray
+        The quantities, shape (k,), and their derivatives by the free numbers, (k, n).
+    asked : ndarray of bool
+        Which numbers are asked for, shape (n,): those whose error ellipsoid "volume" means.
+    lower, upper : ndarray
+        Bounds, shape (n,).
+    held, with_prior : ndarray of bool, optional
+        What does not move, and what has a prior of its own.
+
+    Examples
+    --------
+    >>> one = Information(np.eye(2), np.ones(1), np.array([[0.6, 0.8]]), np.ones(2, bool),
+    ...                   np.full(2, -np.inf), np.full(2, np.inf))
+    >>> one.relative_error.tolist(), one.with_rows(np.sqrt(3.0) * np.eye(2)).relative_error.tolist()
+    ([1.0], [0.5])
+    """
+
+    jacobian: np.ndarray
+    value: np.ndarray
+    slope: np.ndarray
+    asked: np.ndarray
+    lower: np.ndarray
+    upper: np.ndarray
+    held: np.ndarray | None = None
+    with_prior: np.ndarray | None = None
+
+    @property
+    def spread(self) -> Spread:
+        """Spread of the numbers, bounds counted as information."""
+        return spread_of(self.jacobian, self.lower, self.upper, self.held, self.with_prior)
+
+    @property
+    def share(self) -> np.ndarray:
+        """Share of each quantity's variance that rests on bounds, shape (k,)."""
+        return self.spread.share(self.slope)
+
+    @property
+    def error(self) -> np.ndarray:
+        """Standard error of each quantity, shape (k,)."""
+        return self.spread.error(self.slope)
+
+    @property
+    def relative_error(self) -> np.ndarray:
+        """Relative error of each quantity, shape (k,)."""
+        return self.error / np.abs(self.value)
+
+    def with_rows(self, rows: np.ndarray) -> Information:
+        """The information with further rows of the Jacobian."""
+        return self._replace(jacobian=np.vstack([self.jacobian, rows]))
+
+
+class Choice(NamedTuple):
+    """The best candidate given those before it: its place, its gain, and what is known with it.
+
+    `gain` is the relative decrease of the score.
+    """
+
+    index: int
+    gain: float
+    known: Information
+
+
+def rows_of(covariance: np.ndarray) -> np.ndarray:
+    """Rows of a Jacobian whose information is the inverse of a covariance, shape (n, n).
+
+    Examples
+    --------
+    >>> np.abs(rows_of(np.diag([4.0, 0.25]))).tolist()
+    [[0.5, 0.0], [0.0, 2.0]]
+    """
+    unit = np.sqrt(np.diagonal(covariance))
+    sizes, turned = np.linalg.eigh(covariance / np.outer(unit, unit))
+    return (turned / np.sqrt(np.maximum(sizes, 1e-14 * sizes[-1]))).T / unit
+
+
+def scores(known: Information, candidates: np.ndarray, volume: bool = False) -> np.ndarray:
+    """What is to be small after each candidate alone.
+
+    Parameters
+    ----------
+    known : Information
+        What is known so far.
+    candidates : ndarray
+        Shape (candidates, rows, n); rows of zeros for none.
+    volume : bool
+        Score the logarithm of the determinant of the covariance of what is asked for
+        (D-optimality), not the root of the summed squares of the relative errors.
+
+    Returns
+    -------
+    ndarray, shape (candidates,)
+
+    Notes
+    -----
+    Rows G turn the covariance C into C - C Gᵀ (1 + G C Gᵀ)⁻¹ G C (Woodbury).
+
+    Examples
+    --------
+    >>> one = Information(np.eye(2), np.ones(1), np.array([[1.0, 0.0]]), np.ones(2, bool),
+    ...                   np.full(2, -np.inf), np.full(2, np.inf))
+    >>> scores(one, np.array([[[0.0, 9.0]], [[np.sqrt(3.0), 0.0]]])).round(6).tolist()
+    [1.0, 0.5]
+    """
+    covariance = known.spread.covariance
+    moved = candidates @ covariance
+    inner = np.eye(candidates.shape[1]) + moved @ np.swapaxes(candidates, 1, 2)
+    if volume:
+        at = np.flatnonzero(known.asked)
+        unit = np.sqrt(np.diagonal(covariance)[at])
+        gain = np.swapaxes(moved[..., at], 1, 2) @ np.linalg.solve(inner, moved[..., at])
+        return np.linalg.slogdet((covariance[np.ix_(at, at)] - gain) / np.outer(unit, unit))[1]
+    slope = known.slope / known.value[:, None]
+    told = moved @ slope.T
+    before = np.einsum("ij,jk,ik->", slope, covariance, slope)
+    gain = np.einsum("cij,cij->c", told, np.linalg.solve(inner, told))
+    return np.sqrt(np.maximum(before - gain, 0.0))
+
+
+def greedy(known: Information, candidates: np.ndarray, volume: bool = False) -> Iterator[Choice]:
+    """Choose candidates one after the other, each the best given those before, without end.
+
+    Parameters
+    ----------
+    known, candidates, volume
+        As for `scores`.
+
+    Yields
+    ------
+    Choice
+
+    Notes
+    -----
+    D-optimality of a set chosen so is at least (1 - 1/e) of the best set's gain (submodularity of
+    the log-determinant; Nemhauser, Wolsey, Fisher, Math. Programming 14, 265 (1978)).
+
+    Examples
+    --------
+    >>> one = Information(np.eye(2), np.ones(2), np.eye(2), np.ones(2, bool),
+    ...                   np.full(2, -np.inf), np.full(2, np.inf))
+    >>> steps = greedy(one, np.array([[[2.0, 0.0]], [[0.0, 1.0]]]))
+    >>> [next(steps).index for _ in range(3)]
+    [0, 1, 1]
+    """
+    none = np.zeros((1, *candidates.shape[1:]))
+    while True:
+        [before] = scores(known, none, volume)
+        after = scores(known, candidates, volume)
+        best = int(np.argmin(after))
+        known = known.with_rows(candidates[best])
+        yield Choice(best, float(1.0 - after[best] / before), known)
