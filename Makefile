@@ -27,7 +27,7 @@ demo: .venv/runtime
 	$(BIN)/beamfit emittance measurements/lcls_otr2.csv --lattice lattices/lcls_otr2.toml --report demo/lcls_otr2.html
 
 test: .venv/test lint
-	$(BIN)/python -m pytest --quiet --numprocesses 2
+	$(BIN)/python -m pytest --quiet --numprocesses 2 --dist loadfile
 
 # Simulation-based calibration of the posteriors: minutes, so not part of `make test`.
 calibrate: .venv/test

@@ -13,10 +13,13 @@ def expected_energy(energy: float, particle: str) -> str | None:
 
     Examples
     --------
-    >>> expected_energy(0.135, "electron")
-    'a total energy between 0.510999 MeV and 10 TeV; is it in GeV or eV?'
+    >>> expected_energy(0.135, "electron").partition(" and ")[0]
+    "a total energy between the electron's rest energy of 0.510999 MeV"
     """
     rest = REST_ENERGY[particle]
     if rest < energy <= _HIGHEST:
         return None
-    return f"a total energy between {rest:.6g} MeV and 10 TeV; is it in GeV or eV?"
+    return (
+        f"a total energy between the {particle}'s rest energy of {rest:.6g} MeV and 10 TeV; "
+        "is it in GeV or eV?"
+    )

@@ -105,9 +105,12 @@ def main() -> None:
 
 
 def cold() -> None:
-    """Time whole commands: help, a bad file, the fit, and importing JAX alone."""
+    """Time whole commands: help, a bad file, the fit, a script, importing JAX alone."""
     run = [sys.executable, "-c", "from beamfit.cli import main; main()"]
     fit = [*run, "emittance", str(SCAN), "--lattice", str(LATTICE)]
+    script = f"""import beamfit
+line = beamfit.load_lattice({str(LATTICE)!r})
+print(beamfit.fit_emittance(beamfit.read_quad_scan({str(SCAN)!r}), line))"""
     commands = {
         "python -c 'import jax, scipy.optimize'": [
             sys.executable,
@@ -122,6 +125,7 @@ def cold() -> None:
             "--lattice",
             str(LATTICE),
         ],
+        "a script with one fit, compile cache kept": [sys.executable, "-c", script],
         "beamfit emittance, compile cache kept": fit,
         "beamfit emittance, nothing compiled before": fit,
     }

@@ -15,16 +15,16 @@ from pathlib import Path
 import casadi
 import jax.numpy as jnp
 import numpy as np
+from beamfit.studies.scan.scenarios import STEPS, scenario_problem, train
 from rich.console import Console
 from rich.table import Table
 
 import beamfit
 from beamfit.greybox import problem as greybox
-from beamfit.greybox.many_starts import descend_all
+from beamfit.greybox.descend import descend_all
 from beamfit.greybox.solve import starting_points
 from beamfit.studies.scan.assumptions import Anchor, Assumptions
-from beamfit.studies.scan.scenario_data import see
-from beamfit.studies.scan.scenarios import STEPS, scenario_problem, train
+from beamfit.studies.scan.known import see
 
 ROOT = Path(__file__).parents[1]
 OPTIONS = {"ipopt.print_level": 0, "print_time": 0, "ipopt.tol": 1e-9, "ipopt.max_iter": 3000}

@@ -1,5 +1,6 @@
 """Where the reference numbers are, and the two real lines every test may use."""
 
+import gc
 import os
 from pathlib import Path
 
@@ -18,6 +19,27 @@ settings.register_profile("beamfit", deadline=None, max_examples=40, derandomize
 settings.load_profile("beamfit")
 
 ROOT = Path(__file__).resolve().parents[1]
+# JAX keeps every program it compiled; past this many MB they are dropped between two modules.
+# Those that are needed again come from the cache on disk.
+MOST_MEMORY = 1000
+
+
+def resident():
+    """Memory of this process in MB; 0 where the system does not say."""
+    pages = Path("/proc/self/statm")
+    if not pages.exists():
+        return 0.0
+    return int(pages.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 2**20
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _programs_of_one_module():
+    yield
+    if resident() > MOST_MEMORY:
+        import jax
+
+        jax.clear_caches()
+        gc.collect()
 
 
 @pytest.fixture(scope="session")

@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 import os
 import sys
-from pathlib import Path
 
 import click
 
@@ -36,7 +35,6 @@ cli.add_command(design)
 
 def main() -> None:
     """Run the command line: exit 0 when answered, 2 with one line on unusable input."""
-    _compile_quickly()
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):  # a terminal without µ shows a mark instead
             stream.reconfigure(errors="replace")
@@ -59,25 +57,6 @@ def main() -> None:
     except OSError as error:
         sys.stdout = None  # what is left in its buffer has nowhere to go
         _fail(f"output that cannot be written ({error.strerror}); expected room for it")
-
-
-def _compile_quickly() -> None:
-    """Tell JAX, before it is imported, that each function runs a few times at most.
-
-    Compiling is most of a command's time: keep what was compiled for the next command, and
-    do not optimise code that runs for microseconds. Both only where the user has not chosen.
-    """
-    cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "beamfit"
-    try:
-        cache.mkdir(parents=True, exist_ok=True)
-        usable = os.access(cache, os.W_OK)
-    except OSError:
-        usable = False
-    if usable:
-        os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(cache))
-    os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
-    os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "-1")
-    os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0")
 
 
 def _fail(message: str) -> None:

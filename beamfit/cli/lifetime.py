@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import click
 
-from beamfit.cli.document import check_report_name, command_line, json_text
-from beamfit.cli.sampling import Sampling, print_posterior, sampling_options
+import beamfit
+from beamfit.cli.options import Sampling, command_line, options
 from beamfit.errors import InputError
 from beamfit.io.decay_record import read_decay_record
 from beamfit.io.files import digest
+from beamfit.io.result import results_text
 
 if TYPE_CHECKING:
-    from beamfit.sampling.posterior import Posterior
+    from beamfit.cli.show import Terminal
+    from beamfit.studies.decay.loss_budget import Machine
     from beamfit.studies.decay.shift import Shift
-    from beamfit.studies.decay.study import RecordStudy
+    from beamfit.studies.decay.study import Decay, RecordStudy
 
 __all__ = ["lifetime"]
 
@@ -26,24 +28,16 @@ Examples:
   beamfit lifetime fill1.csv fill2.h5 --ring lattices/spear3_2003.toml
   beamfit lifetime fill1.csv --ring ring.toml --report fill1.html --json
   beamfit lifetime measurements/spear3_shift_simulated.csv --ring lattices/spear3_2003.toml --study
+  beamfit lifetime shift.csv --ring ring.toml --study --network correction
 """
 
 
 @click.command(epilog=EXAMPLE)
-@click.argument("record", nargs=-1, required=True, type=click.Path())
+@click.argument("record", nargs=-1, required=True)
 @click.option(
     "--ring",
-    type=click.Path(),
     metavar="FILE.toml",
-    default=None,
     help="Ring, for the loss budget from first principles beside the measured a and b.",
-)
-@click.option(
-    "--report",
-    type=click.Path(),
-    metavar="FILE.html|FILE.pdf",
-    default=None,
-    help="Write a report page.",
 )
 @click.option(
     "--study",
@@ -51,16 +45,22 @@ Examples:
     help="Fit the ring's loss mechanisms to all decays together: scales, loss budget with credible "
     "intervals, best operating point, next decay, anomaly. Needs --ring.",
 )
-@sampling_options
-@click.option("--json", "as_json", is_flag=True, help="Print one JSON object and nothing else.")
+@click.option(
+    "--network",
+    type=click.Choice(["alone", "correction"]),
+    help="With --study: also fit a and b by a network that falls with bunches and scraper and "
+    "rises with pressure; alone, or as a factor on the fitted first principles.",
+)
+@options("sample store seed report json")
 def lifetime(
     record: tuple[str, ...],
     ring: str | None,
-    report: str | None,
     study: bool,
+    network: str | None,
     sample: bool,
     store: str | None,
     seed: int,
+    report: str | None,
     as_json: bool,
 ) -> None:
     """Fit the lifetime to decay records and say what they cannot tell.
@@ -70,83 +70,133 @@ def lifetime(
     It is cut into decays at refills, losses and changes of setting. Each decay gives I0, a, b of
     dI/dt = -a I² - b I, the lifetime at its start, mean current and end, and a verdict.
     """
-    check_report_name(report)
     sampling = Sampling(sample, store, seed)
     sampling.check()
-    if study and ring is None:
-        raise InputError("--study without a ring", "--ring FILE.toml")
-    inputs = {path: digest(path) for path in record}
-    if len(inputs) < len(record):
+    _check_study(study, ring, network)
+    records = [read_decay_record(path) for path in dict.fromkeys(record)]
+    if len(records) < len(record):
         twice = next(path for path in record if record.count(path) > 1)
         raise InputError("a record given twice", "each record once", path=twice)
-    records = [read_decay_record(path) for path in record]
-    machine = None
-    if ring is not None:
-        from beamfit.io.ring import read_operation, read_ring
+    machine = None if ring is None else _machine(ring)
+    inputs = {path: digest(path) for path in (*record, ring) if path is not None}
 
-        inputs[ring] = digest(ring)
-        described, operation = read_ring(ring), read_operation(ring)
-
-        from beamfit.studies.decay.loss_budget import Machine  # JAX from here on
-
-        machine = Machine(described, operation)
-
-    from beamfit.studies.decay.study import study_record
+    from beamfit.studies.decay.study import study_record  # JAX from here on
 
     studies = tuple(study_record(each, machine) for each in records)
-    shift = None
-    if study:
-        from beamfit.studies.decay.shift import study_shift
-
-        shift = study_shift([decay for each in studies for decay in each.decays], machine)
-    command = command_line()
+    decays = [decay for each in studies for decay in each.decays]
+    shift = _shift(decays, machine, network) if study else None
     posteriors = None
-    if sampling.wanted:
-        options = sampling.options(command, inputs, progress=not as_json)
-        posteriors = _sampled(studies, options)
+    if sample:
+        sampling.check_one(len(decays))
+        drawn = sampling.arguments(inputs, quiet=as_json)
+        posteriors = [decay.fit.sample(**drawn) for decay in decays]
     if report is not None:
-        from beamfit.report.page import write_report
-
-        write_report(report, studies, posteriors, command=command, inputs=inputs, shift=shift)
+        said = {"command": command_line(), "inputs": inputs, "shift": shift}
+        beamfit.write_report(report, studies, posteriors, **said)
     if as_json:
-        results = [decay.to_json() for study in studies for decay in study.decays]
-        if posteriors is not None:
-            pairs = zip(results, posteriors, strict=True)
-            results = [result | {"posterior": p.to_json()} for result, p in pairs]
-        further = {} if shift is None else {"study": shift.to_json()}
-        click.echo(json_text(command, inputs, results, further))
-    else:
-        _print(studies, shift, report, posteriors or [])
+        results = [decay.to_json() for decay in decays]
+        for result, posterior in zip(results, posteriors or (), strict=False):
+            result["posterior"] = posterior
+        further = {} if shift is None else {"study": shift}
+        click.echo(results_text(results, inputs, command_line(), **further))
+        return
 
+    from beamfit.cli.show import Terminal
 
-def _sampled(studies: tuple[RecordStudy, ...], options: dict[str, Any]) -> list[Posterior]:
-    """One posterior a decay; a store holds one."""
-    fits = [decay.fit for study in studies for decay in study.decays]
-    if options["store"] is not None and len(fits) > 1:
-        found = f"--store for {len(fits)} decays"
-        raise InputError(found, "a record of one decay, or no --store")
-    return [fit.sample(**options) for fit in fits]
-
-
-def _print(
-    studies: tuple[RecordStudy, ...],
-    shift: Shift | None,
-    report: str | None,
-    posteriors: list[Posterior],
-) -> None:
-    from rich.console import Console
-
-    from beamfit.cli.decay_terminal import decay_tables, shift_lines
-
-    console = Console(highlight=False, markup=False)
-    for study in studies:
-        for shown in decay_tables(study):
-            console.print(shown)
-    names = [decay.fit.record for study in studies for decay in study.decays]
-    for name, posterior in zip(names, posteriors, strict=False):
-        print_posterior(console, f"Posterior of {name}", posterior)
+    terminal = Terminal()
+    for each in studies:
+        _show(terminal, each)
+    for decay, posterior in zip(decays, posteriors or (), strict=False):
+        terminal.posterior(f"Posterior of {decay.fit.record}", posterior)
     if shift is not None:
-        for line in shift_lines(shift):
-            console.print(line)
-    if report is not None:
-        console.print(f"Report written to {report}", style="bold")
+        _show_shift(terminal, shift)
+    terminal.report(report)
+
+
+def _check_study(study: bool, ring: str | None, network: str | None) -> None:
+    if study and ring is None:
+        raise InputError("--study without a ring", "--ring FILE.toml")
+    if network is not None and not study:
+        raise InputError("--network without a study", "--study --ring FILE.toml")
+
+
+def _machine(path: str) -> Machine:
+    ring, operation = beamfit.read_ring(path), beamfit.read_operation(path)
+
+    from beamfit.studies.decay.loss_budget import Machine
+
+    return Machine(ring, operation)
+
+
+def _shift(decays: list[Decay], machine: Machine, network: str | None) -> Shift:
+    from beamfit.studies.decay.network import Network
+    from beamfit.studies.decay.shift import study_shift
+
+    return study_shift(decays, machine, network=network and Network(network))
+
+
+def _show(terminal: Terminal, study: RecordStudy) -> None:
+    """Lay out a record: what was cut away, and every decay with its verdict and budget."""
+    from beamfit.quantity import Status
+    from beamfit.studies.decay.tables import (
+        FEW,
+        budget_rows,
+        check_rows,
+        decay_rows,
+        separability_rows,
+    )
+    from beamfit.table import labelled
+
+    terminal.line(str(study.record), style="bold")
+    if study.events:
+        said = "; ".join(str(event) for event in study.events[:8])
+        left = len(study.events) - 8
+        terminal.line(f"Cut at or left out: {said}" + (f"; {left} more" if left > 0 else ""))
+    if len(study.decays) > FEW:
+        _show_many(terminal, study)
+        return
+    for decay in study.decays:
+        name, status = decay.fit.record, decay.fit.status
+        rows = decay_rows([decay]) + separability_rows([decay])[:2] + check_rows([decay])
+        terminal.table(labelled("", [name], rows), [status])
+        terminal.verdict(name, status, decay.fit.message)
+        if decay.checks is not None and decay.checks.constant_a.status is Status.poor_fit:
+            terminal.verdict("constant a", Status.poor_fit, decay.checks.constant_a.message)
+        if losses := budget_rows([decay]):
+            terminal.table(labelled("\nLosses from first principles", [name], losses))
+        terminal.line()
+
+
+def _show_many(terminal: Terminal, study: RecordStudy) -> None:
+    """One row a decay; the name of the record is above."""
+    from beamfit.studies.decay.tables import alike, overview
+    from beamfit.table import Table
+
+    for title, header, rows in overview(study.decays):
+        cells = [[name.removeprefix(study.record.name), *found] for name, *found in rows]
+        terminal.table(Table(f"\n{title}", header, cells))
+    for status, names, message in alike(study.decays):
+        terminal.verdict(names, status, message)
+    terminal.line()
+
+
+def _show_shift(terminal: Terminal, shift: Shift) -> None:
+    """Lay out a study of many decays and its verdicts."""
+    from beamfit.quantity import Status
+    from beamfit.studies.decay.tables import network_rows, shift_rows
+    from beamfit.table import labelled
+
+    fit, count = shift.fit, len(shift.fit.names)
+    names = ["1 decay" if count == 1 else f"{count} decays"]
+    table = labelled("First principles fitted to", names, shift_rows(shift))
+    terminal.table(table, [fit.status])
+    terminal.verdict("all decays", fit.status, fit.message)
+    terminal.verdict("operating point", Status.converged, shift.best.message)
+    if shift.anomaly is not None:
+        terminal.verdict("second half", shift.anomaly.status, shift.anomaly.message)
+    if shift.network is not None:
+        found = shift.network.fit
+        terminal.table(
+            labelled("A network of the losses", names, network_rows(shift)), [found.status]
+        )
+        terminal.verdict("network", found.status, found.message)

@@ -2,25 +2,25 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import click
 import numpy as np
 
-from beamfit.cli.assumptions import check_magnets, limits_of
-from beamfit.cli.document import command_line, json_text
+import beamfit
+from beamfit.cli.options import command_line, options
 from beamfit.errors import InputError
 from beamfit.io.files import digest
 from beamfit.io.line import build_line, read_lattice
-from beamfit.io.result import read_fitted_beams
+from beamfit.io.result import read_fitted_beams, results_text
+from beamfit.studies.scan.typed import target_of
 from beamfit.studies.scan.wishes import Beam, Target, common_energy
 from beamfit.table import text_of
 
 if TYPE_CHECKING:
     from beamfit.io.lattice import LatticeFile
-    from beamfit.studies.scan.setpoint import Setpoint
+    from beamfit.studies.scan.setpoint_result import Setpoint
 
 __all__ = ["setpoint"]
 
@@ -32,41 +32,22 @@ Examples:
   beamfit emittance scan.csv --lattice line.toml --json > fit.json
   beamfit setpoint --lattice line.toml --fit fit.json --vary Q1=-5:0 --vary Q2=0:5 --target match
 """
-UNITS = {
-    "size": {"nm": 1e-9, "um": 1e-6, "µm": 1e-6, "mm": 1e-3, "m": 1.0},
-    "divergence": {"nrad": 1e-9, "urad": 1e-6, "µrad": 1e-6, "mrad": 1e-3, "rad": 1.0},
-}
-WISH = "size=200um, divergence=140urad (with _x or _y), match, or match=BETA_M:ALPHA"
 
 
 @click.command(epilog=EXAMPLE)
-@click.option(
-    "--lattice",
-    required=True,
-    type=click.Path(),
-    metavar="FILE",
-    help="Lattice, from where the beam is known to the screen.",
-)
+@options("lattice use energy")
 @click.option(
     "--sigma",
     metavar="S11,S12,S22",
-    default=None,
     help="Beam matrix of the plane at the start, in m², m rad, rad².",
 )
 @click.option(
     "--fit",
     "fitted",
-    type=click.Path(),
     metavar="RESULT.json",
-    default=None,
     help="Output of beamfit emittance --json: the beam with its errors, at the scan's energy.",
 )
-@click.option(
-    "--vary",
-    multiple=True,
-    metavar="MAGNET=LOW:HIGH",
-    help="A magnet and its limits, in the unit of its calibration.",
-)
+@options("vary")
 @click.option(
     "--target",
     multiple=True,
@@ -81,49 +62,40 @@ WISH = "size=200um, divergence=140urad (with _x or _y), match, or match=BETA_M:A
     show_default=True,
     help="Plane of --sigma and of targets that name none.",
 )
-@click.option("--screen", metavar="NAME", default=None, help="Where; the last screen by default.")
-@click.option("--json", "as_json", is_flag=True, help="Print one JSON object and nothing else.")
-@click.option(
-    "--use", metavar="NAME", default=None, help="Line or sequence of a MAD-X or elegant file."
-)
-@click.option("--energy", type=float, metavar="MEV", default=None, help="Total energy.")
+@click.option("--screen", metavar="NAME", help="Where; the last screen by default.")
+@options("json")
 def setpoint(
     lattice: str,
+    use: str | None,
+    energy: float | None,
     sigma: str | None,
     fitted: str | None,
-    vary: tuple[str, ...],
+    limits: dict[str, tuple[float, float]],
     target: tuple[str, ...],
     plane: str,
     screen: str | None,
     as_json: bool,
-    use: str | None,
-    energy: float | None,
 ) -> None:
     """Find the magnet settings that bring the beam nearest to a wanted size and divergence.
 
     The search is global within the limits: local minima are listed, not mistaken for the answer.
     """
-    _check_one(sigma, fitted)
-    limits = limits_of(vary)
-    targets = [_wish(text, plane) for text in target]
-    described = read_lattice(lattice, use=use, energy=energy)
-    check_magnets(limits, described)
-    beams = _given(sigma, plane) if fitted is None else _fitted(fitted, described, targets, energy)
-
-    from beamfit.studies.scan.setpoint import find_setpoint  # JAX from here on
-
-    found = find_setpoint(build_line(described), beams, limits, targets, screen=screen)
-    inputs = {str(lattice): described.sha256} | ({} if fitted is None else {fitted: digest(fitted)})
-    if as_json:
-        click.echo(json_text(command_line(), inputs, [found.to_json()]))
-    else:
-        _print(found)
-
-
-def _check_one(sigma: str | None, fitted: str | None) -> None:
     if (sigma is None) == (fitted is None):
         said = "neither --sigma nor --fit" if sigma is None else "both --sigma and --fit"
         raise InputError(said, "one of them: the beam at the start of the line")
+    if not limits:
+        raise InputError("no --vary", "MAGNET=LOW:HIGH such as Q2=0:10")
+    targets = [target_of(text, plane) for text in target]
+    described = read_lattice(lattice, use=use, energy=energy)
+    described.check_magnets(limits)
+    beams = _given(sigma, plane) if fitted is None else _fitted(fitted, described, targets, energy)
+    line = build_line(described)  # JAX from here on
+    found = beamfit.find_setpoint(line, beams, limits, targets, screen=screen)
+    inputs = {lattice: described.sha256} | ({} if fitted is None else {fitted: digest(fitted)})
+    if as_json:
+        click.echo(results_text([found], inputs, command_line()))
+    else:
+        _show(found)
 
 
 def _given(sigma: str | None, plane: str) -> dict[str, Beam]:
@@ -151,40 +123,13 @@ def _fitted(
     return beams
 
 
-def _wish(text: str, plane: str) -> Target:
-    """Kind, plane and value of a target; None for the lattice's own design."""
-    name, _, rest = text.partition("=")
-    kind, _, own = name.strip().partition("_")
-    if kind not in (*UNITS, "match") or own not in ("", "x", "y"):
-        raise InputError(f"--target '{text}'", WISH)
-    own = own or plane
-    if kind == "match":
-        if not rest:
-            return Target(kind, own)
-        try:
-            beta, alpha = (float(part) for part in rest.split(":"))
-        except ValueError:
-            raise InputError(f"--target '{text}'", WISH) from None
-        return Target(kind, own, (beta, alpha))
-    # The Greek letter mu and the micro sign look alike.
-    parts = re.fullmatch(r"\s*([-+0-9.eE]+)\s*([a-zµ]+)\s*", rest.replace("\u03bc", "\u00b5"))
-    try:
-        return Target(kind, own, float(parts[1]) * UNITS[kind][parts[2]])
-    except (TypeError, ValueError, KeyError):
-        raise InputError(
-            f"--target '{text}'", f"a number with a unit: {', '.join(UNITS[kind])}"
-        ) from None
+def _show(found: Setpoint) -> None:
+    from beamfit.cli.show import Terminal
 
-
-def _print(found: Setpoint) -> None:
-    from rich.console import Console
-
-    from beamfit.cli.terminal import verdict_text
-
-    console = Console(highlight=False, markup=False)
+    terminal = Terminal()
     click.echo("\n\n".join(map(text_of, found.tables())))
-    console.print(verdict_text("set point", found.status, found.message))
+    terminal.verdict("set point", found.status, found.message)
     for note in found.notes:
-        console.print(note)
+        terminal.line(note)
     for warning in found.doubts.values():
-        console.print(warning, style="bold red")
+        terminal.line(warning, style="bold red")

@@ -4,6 +4,6 @@ It knows nothing about beams. The parts are imported from their modules:
 `maps`, `mlp`, `bounds`, `difference`, `problem`, `solve`, `fit`.
 """
 
-import jax
+from beamfit.compile_cache import prepare_jax
 
-jax.config.update("jax_enable_x64", True)
+prepare_jax()

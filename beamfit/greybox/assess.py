@@ -1,40 +1,54 @@
-"""From a point to a verdict: optimum or not, what the data determine, what holds the answer."""
+"""Is a point an optimum, and what does it cost to hold its limits? Our own answer, not a solver's.
+
+At an optimum of cost f within limits on c(theta) and bounds on theta there are multipliers y, z
+with grad f = J_c^T y + z (stationarity), y and z zero where a limit is not reached, not negative at
+a lower and not positive at an upper limit (Nocedal & Wright, Numerical Optimization, 2nd ed.,
+section 12.1); and the Lagrangian does not bend downward along the limits that hold (12.5). So a
+multiplier is d(cost)/d(limit), with cost = chi-square/2. Everything is judged in the problem's own
+sizes, so that no answer hangs on units.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
-from jax.experimental import checkify
+from scipy.optimize import nnls
 
-from beamfit.greybox import kkt, problem
-from beamfit.greybox.covariance import (
-    MOST_SHARE,
-    Group,
-    Spread,
-    directions,
-    groups_of,
-    spread_of,
-    triangle,
-)
-from beamfit.greybox.fit import Attempt, Fit, Limited, Status, Variable
-from beamfit.greybox.implicit import Implicit
-from beamfit.greybox.kkt import TOLERANCE
+from beamfit.greybox import problem
+from beamfit.greybox.covariance import null_space, triangle
 from beamfit.greybox.problem import Problem
-from beamfit.greybox.verdict import Evidence, judge
 
 __all__ = [
+    "KKT",
+    "TOLERANCE",
+    "Bend",
+    "Limits",
+    "Multipliers",
+    "Scale",
     "Slopes",
     "State",
-    "conclude",
-    "constraint_slopes",
-    "first_order",
-    "refused",
+    "gradient_size",
+    "lower_beside",
+    "multipliers",
+    "scale_of",
+    "second_order",
     "slopes",
     "state",
 ]
+
+TOLERANCE = 1e-6  # within which a limit counts as reached and a point as an optimum
+# A bound is reached, too, where moving onto it changes the cost by less than this share.
+CLOSE = 1e-8
+# A Newton step of a further objective longer than this, in the sizes of the numbers, is no end.
+STEP = 1e-3
+# Bending down by less than this share of the strongest curvature is rounding.
+FLAT = 1e-6
+# Points beside one are so far off in the sizes of the numbers, along so many of the weakest
+# directions of squares, or at random or inward from bounds.
+NEAR, WEAKEST, AROUND = 1e-3, 2, 4
 
 
 class Slopes(NamedTuple):
@@ -47,22 +61,108 @@ class Slopes(NamedTuple):
     constraints: np.ndarray
     jacobian: np.ndarray
 
+    @property
+    def finite(self) -> bool:
+        """Whether everything is."""
+        return all(np.all(np.isfinite(part)) for part in self)
+
+
+class Scale(NamedTuple):
+    """Sizes taken from the problem itself: of the free numbers, constraint values and the cost."""
+
+    unit: np.ndarray
+    limit: np.ndarray
+    cost: float
+
+
+class Limits(NamedTuple):
+    """Values with their lower and upper limits, their sizes, and how near counts as reached."""
+
+    value: np.ndarray
+    lower: np.ndarray
+    upper: np.ndarray
+    size: np.ndarray
+    near: np.ndarray
+
+    @property
+    def violation(self) -> np.ndarray:
+        """By how much each limit is crossed, in sizes."""
+        return (
+            np.maximum(np.maximum(self.lower - self.value, self.value - self.upper), 0) / self.size
+        )
+
+    @property
+    def reached(self) -> tuple[np.ndarray, np.ndarray]:
+        """Which lower and upper limits are reached."""
+        return self.value - self.lower <= self.near, self.upper - self.value <= self.near
+
+    def distance(self, multiplier: np.ndarray) -> np.ndarray:
+        """Distance from the limit a multiplier belongs to; zero where there is none."""
+        low, high = self.value - self.lower, self.upper - self.value
+        return np.where(multiplier > 0, low, np.where(multiplier < 0, high, 0.0))
+
+    def states(self, multiplier: np.ndarray) -> np.ndarray:
+        """Whether each value is free, at its lower or upper limit, or fixed."""
+        low, high = self.reached
+        cases = [self.lower == self.upper, low & ((multiplier > 0) | ~high), high]
+        return np.select(cases, ["fixed", "lower", "upper"], "free")
+
+
+class Multipliers(NamedTuple):
+    """Multipliers of the bounds (reduced gradients) and of the constraints."""
+
+    bounds: np.ndarray
+    constraints: np.ndarray
+
+
+class KKT(NamedTuple):
+    """How far a point is from an optimum; all three are zero at one.
+
+    `stationarity` is the largest component of the Lagrangian's gradient in units of its terms,
+    `feasibility` the largest violation in the size of what is limited, `complementarity` the
+    largest multiplier times distance from its limit, in units of the cost.
+    """
+
+    stationarity: float
+    feasibility: float
+    complementarity: float
+
+    @property
+    def worst(self) -> float:
+        """The largest of the three."""
+        return max(self)
+
+
+class Bend(NamedTuple):
+    """The second-order test: the lowest curvature, the direction down, the Newton step.
+
+    `direction` (n,) leads to lower cost, None where there is none.
+    """
+
+    direction: np.ndarray | None
+    newton: float = 0.0
+    flat: bool = False
+
 
 class State(NamedTuple):
-    """A point with its multipliers and its distance from an optimum."""
+    """A point with its limits, their multipliers and its distance from an optimum."""
 
     theta: np.ndarray
     at: Slopes
-    found: kkt.Multipliers
-    kkt: kkt.KKT
+    bounds: Limits
+    limits: Limits
+    found: Multipliers
+    kkt: KKT
+    scale: Scale
+    bend: Bend | None = None
 
 
 def first_order(core, theta):
     """The parts of `Slopes`, compiled once for each structure of problem."""
-    r, r_jacobian = problem.residual(core, theta), jax.jacfwd(problem.residual, 1)(core, theta)
+    r, j = problem.residual(core, theta), jax.jacfwd(problem.residual, 1)(core, theta)
     cost, gradient = jax.value_and_grad(problem.cost, 1)(core, theta)
     c = problem.constraints(core, theta)
-    return r, r_jacobian, cost, gradient, c, constraint_slopes(core, theta)
+    return r, j, cost, gradient, c, constraint_slopes(core, theta)
 
 
 def constraint_slopes(core, theta):
@@ -77,24 +177,54 @@ def slopes(p: Problem, theta: np.ndarray) -> Slopes:
     return Slopes(*(np.asarray(part) for part in parts))
 
 
-def _gradient_scale(p: Problem, theta: np.ndarray, at: Slopes) -> np.ndarray:
-    """Size of a gradient component that matters.
+def of_squares(residual: np.ndarray, jacobian: np.ndarray) -> Slopes:
+    """The slopes of a problem of squares alone, from residuals and Jacobian."""
+    none = np.zeros(0)
+    cost = 0.5 * residual @ residual
+    with np.errstate(invalid="ignore"):
+        gradient = jacobian.T @ residual
+    return Slopes(residual, jacobian, cost, gradient, none, none.reshape(0, len(jacobian.T)))
 
-    A residual vector moved by one standard deviation, or by 1e-6 of the measured values where the
-    errors are unknown, is the least that counts; for further objectives, the cost over the value.
+
+def scale_of(p: Problem, start: np.ndarray, at: Slopes) -> Scale:
+    """The sizes of a problem, from a start, the bounds and the slopes there.
+
+    A number is as large as its start or a tenth of its range, else as the change that moves the
+    residuals by one or doubles the cost; what is limited as its limits, its value at the start and
+    the change along the numbers; a further objective as its change along them.
     """
-    if p.errors_known or not p.records:
-        least = 1.0
-    else:
-        least = 1e-6 * np.sqrt(sum(float(jnp.sum(rec.measured**2)) for rec in p.records))
-    size = max(np.linalg.norm(at.residual), least)
-    scale = np.linalg.norm(at.residual_jacobian, axis=0) * size
+    width = p.upper - p.lower
+    length, pull = np.linalg.norm(at.residual_jacobian, axis=0), np.abs(at.gradient)
+    unit = np.maximum(np.abs(start), np.where(np.isfinite(width), 0.1 * width, 0.0))
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        for other in (1.0 / length, abs(at.cost) / pull):
+            usable = (unit == 0) & np.isfinite(other) & (other > 0)
+            unit = np.where(usable, other, unit)
+    unit = np.where(unit > 0, unit, 1.0)
+    ends = [
+        np.where(np.isfinite(e), np.abs(e), 0.0) for e in (p.constraint_lower, p.constraint_upper)
+    ]
+    moved = np.max(np.abs(at.jacobian) * unit, axis=1, initial=0.0)
+    limit = np.max([*ends, np.abs(at.constraints), moved], axis=0, initial=0.0)
+    sizes = [float(np.max(pull * unit, initial=0.0)), abs(float(at.cost)), 1.0]
+    return Scale(unit, np.where(limit > 0, limit, 1.0), next(v for v in sizes if v > 0))
+
+
+def gradient_size(p: Problem, at: Slopes, scale: Scale) -> np.ndarray:
+    """Size of a gradient component that matters, per unit of each number.
+
+    A residual vector as long as `Problem.least_residual` is the least that counts; for further
+    objectives, the scale of the cost.
+    """
+    size = max(np.linalg.norm(at.residual), p.least_residual)
+    found = np.linalg.norm(at.residual_jacobian, axis=0) * size
     if p.objectives:
-        scale = scale + max(1.0, abs(at.cost)) / np.maximum(1.0, np.abs(theta))
-    return np.maximum(scale, max(1e-12 * np.max(scale), 1e-100))
+        found = found + scale.cost / scale.unit
+    largest = np.max(found * scale.unit, initial=0.0)
+    return np.maximum(found, max(1e-12 * largest, 1e-100) / scale.unit)
 
 
-def state(p: Problem, theta: np.ndarray) -> State:
+def state(p: Problem, theta: np.ndarray, scale: Scale, at: Slopes | None = None) -> State:
     """Find the multipliers at a point and measure how far it is from an optimum.
 
     Parameters
@@ -103,191 +233,236 @@ def state(p: Problem, theta: np.ndarray) -> State:
         The problem.
     theta : array, shape (n,)
         The point.
+    scale : Scale
+        Of the problem.
+    at : Slopes, optional
+        At the point, where they are known.
 
     Returns
     -------
     State
         With an infinite residual where something is not finite.
     """
-    at = slopes(p, theta)
-    if not all(np.all(np.isfinite(part)) for part in at):
-        none = kkt.Multipliers(np.zeros(len(theta)), np.zeros(len(at.constraints)))
-        return State(theta, at, none, kkt.KKT(np.inf, np.inf, np.inf))
-    scale = _gradient_scale(p, theta, at)
-    bounds = kkt.Limits(theta, p.lower, p.upper)
-    limits = kkt.Limits(at.constraints, p.constraint_lower, p.constraint_upper)
-    found = kkt.multipliers(at.gradient, at.jacobian, bounds, limits, scale, TOLERANCE)
-    size = at.cost if p.objectives else 0.5 * scale.size
-    distance = kkt.residual(at.gradient, at.jacobian, bounds, limits, scale, found, size)
-    return State(theta, at, found, distance)
-
-
-class _Known(NamedTuple):
-    """What a point's residuals tell: groups of noise, spreads, directions not seen, rank.
-
-    `blind` tells which numbers would be open even if what is at a bound truly were there.
-    """
-
-    groups: tuple[Group, ...]
-    spread: Spread
-    raw: Spread
-    unseen: np.ndarray
-    rank: int
-    blind: np.ndarray
-
-
-def _known(p: Problem, s: State, held: np.ndarray, edge: np.ndarray) -> _Known:
-    """Tell what the residuals know, along the limits that hold.
-
-    For the degrees of freedom a number at an active bound is held; its error and that of what
-    hangs on it are those of a number that the bound only limits. Weights that nobody asks for
-    stay on their bounds.
-    """
-    scale = _gradient_scale(p, s.theta, s.at)
-    equal = p.constraint_lower == p.constraint_upper
-    pulls = np.abs(s.found.constraints) * np.linalg.norm(s.at.jacobian / scale, axis=1)
-    equations = s.at.jacobian[equal | (pulls > 1e-9)]
-    ends = np.cumsum([record.measured.size for record in p.records], dtype=int)
-    blocks = [triangle(part) for part in np.split(s.at.residual_jacobian, ends)]
-    half, unseen, _ = directions(np.vstack(blocks), np.vstack([np.eye(len(held))[held], equations]))
-    groups = groups_of(
-        [(record.name, record.error is not None) for record in p.records],
-        np.split(s.at.residual, ends)[:-1],
-        [int(record.used.sum()) for record in p.records],
-        blocks[:-1],
-        half,
+    at = slopes(p, theta) if at is None else at
+    size = gradient_size(p, at, scale) if at.finite else 1.0 / scale.unit
+    cost = scale.cost if p.objectives else max(float(at.cost), 0.5 * p.least_residual**2)
+    near = TOLERANCE * np.minimum(np.maximum(np.abs(theta), np.abs(p.start)), p.upper - p.lower)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        # Where the gradient pushes to a bound that is as good as reached.
+        pushed = np.abs(at.gradient) > TOLERANCE * size
+        near = np.where(pushed, np.maximum(near, CLOSE * cost / np.abs(at.gradient)), near)
+    near = np.where(np.isfinite(near), near, 0.0)
+    bounds = Limits(theta, p.lower, p.upper, scale.unit, near)
+    limits = Limits(
+        at.constraints, p.constraint_lower, p.constraint_upper, scale.limit, TOLERANCE * scale.limit
     )
-    still = (edge & p.nuisance) | (p.lower == p.upper)
-
-    def spread(factors, still):
-        parts = [block / f for block, f in zip(blocks, [*factors, 1.0], strict=True)]
-        return spread_of(np.vstack(parts), p.lower, p.upper, still, p.with_prior, equations)
-
-    factors = [group.factor for group in groups]
-    scaled = spread(factors, still)
-    raw = spread([1.0 if group.errors_given else group.factor for group in groups], still)
-    given_bounds = scaled if np.array_equal(still, held) else spread(factors, held)
-    blind = (given_bounds.share(np.eye(len(held))) >= MOST_SHARE) & ~held
-    unseen = unseen / np.where((n := np.linalg.norm(unseen, axis=0)) > 0, n, 1.0)
-    return _Known(groups, scaled, raw, unseen, half.shape[1], blind)
+    if not at.finite:
+        none = Multipliers(np.zeros(len(theta)), np.zeros(len(at.constraints)))
+        return State(theta, at, bounds, limits, none, KKT(np.inf, np.inf, np.inf), scale)
+    found = multipliers(at.gradient, at.jacobian, bounds, limits, size)
+    distance = residual(at.gradient, at.jacobian, bounds, limits, size, found, cost)
+    return State(theta, at, bounds, limits, found, distance, scale)
 
 
-def _inner_failure(p: Problem, theta: np.ndarray) -> str | None:
-    """What an implicit map inside the model says of its own convergence at the answer."""
-    parts = jax.tree_util.tree_leaves(p.core, is_leaf=lambda part: isinstance(part, Implicit))
-    if not any(isinstance(part, Implicit) for part in parts):
-        return None
-    look = checkify.checkify(
-        jax.jit(lambda core, t: (problem.cost(core, t), problem.constraints(core, t))),
-        errors=checkify.user_checks,
+def multipliers(
+    gradient: np.ndarray, jacobian: np.ndarray, bounds: Limits, limits: Limits, scale: np.ndarray
+) -> Multipliers:
+    """Find the multipliers of the right signs that come nearest to stationarity.
+
+    Parameters
+    ----------
+    gradient : array, shape (n,)
+        Of the cost.
+    jacobian : array, shape (m, n)
+        Of the constraints.
+    bounds, limits : Limits
+        Of the n free numbers and of the m constraints.
+    scale : array, shape (n,)
+        Size of a component of the gradient that matters.
+
+    Returns
+    -------
+    Multipliers
+
+    Examples
+    --------
+    Minimise (x-3)^2/2 with x <= 1: the cost falls by 2 for each unit the bound gives way.
+
+    >>> one, none = np.ones(1), np.zeros(0)
+    >>> at = Limits(one, np.array([-np.inf]), one, one, 1e-6 * one)
+    >>> free = Limits(none, none, none, none, none)
+    >>> multipliers(np.array([-2.0]), np.zeros((0, 1)), at, free, one).bounds.tolist()
+    [-2.0]
+    """
+    n = len(gradient)
+    low, high = (np.concatenate(pair) for pair in zip(bounds.reached, limits.reached, strict=True))
+    if not (low[n:].any() or high[n:].any()):
+        own = np.where(low[:n] & (gradient > 0) | high[:n] & (gradient < 0), gradient, 0.0)
+        return Multipliers(own, np.zeros(len(limits.value)))
+    rows = np.vstack([np.eye(n), np.reshape(jacobian, (-1, n))])
+    chosen = np.concatenate([np.flatnonzero(low), np.flatnonzero(high)])
+    sign = np.concatenate([np.ones(low.sum()), -np.ones(high.sum())])
+    found = np.zeros(len(rows))
+    columns = (sign[:, None] * rows[chosen] / scale).T
+    size = np.linalg.norm(columns, axis=0)
+    columns = columns / np.where(size > 0, size, 1.0)
+    right = gradient / scale
+    guess, _ = nnls(columns, right, maxiter=50 * columns.shape[1])
+    used = guess > 0
+    # One plain least-squares solution on the support: nnls stops at a tolerance.
+    sharp = np.linalg.lstsq(columns[:, used], right, rcond=None)[0]
+    guess[used] = np.where(sharp > 0, sharp, guess[used])
+    np.add.at(found, chosen, sign * guess / np.where(size > 0, size, 1.0))
+    return Multipliers(found[:n], found[n:])
+
+
+def residual(
+    gradient: np.ndarray,
+    jacobian: np.ndarray,
+    bounds: Limits,
+    limits: Limits,
+    scale: np.ndarray,
+    found: Multipliers,
+    cost: float,
+) -> KKT:
+    """Measure how far a point with multipliers is from an optimum, `cost` being a size of it."""
+    pull = np.reshape(jacobian, (-1, len(gradient)))
+    left = gradient - found.bounds - pull.T @ found.constraints
+    size = scale + np.abs(found.constraints) @ np.abs(pull)
+    parts = ((found.bounds, bounds), (found.constraints, limits))
+    products = [np.abs(y * part.distance(y)) for y, part in parts]
+    crossed = np.concatenate([bounds.violation, limits.violation, [0.0]])
+    return KKT(
+        float(np.max(np.abs(left) / size, initial=0.0)),
+        float(np.max(crossed)),
+        float(np.max(np.concatenate(products), initial=0.0) / cost),
     )
-    said = look(p.core, jnp.asarray(theta, float))[0].get()
-    return None if said is None else said.removesuffix(" (`check` failed)")
 
 
-def conclude(p: Problem, s: State, attempts: tuple[Attempt, ...], seconds: float) -> Fit:
-    """Judge the best point of a search.
+def lagrangian_hessian(core, theta, sigma, y):
+    """Hessian of the Lagrangian sigma * cost - y @ constraints."""
+
+    def lagrangian(t):
+        return sigma * problem.cost(core, t) - y @ problem.constraints(core, t)
+
+    return jax.hessian(lagrangian)(theta)
+
+
+def second_order(
+    p: Problem, s: State, exact: bool, lagrangian: Callable[[np.ndarray], np.ndarray]
+) -> tuple[State, np.ndarray | None]:
+    """The second-order test of a point that is an optimum to first order.
 
     Parameters
     ----------
     p : Problem
         The problem.
     s : State
-        The best point.
-    attempts : tuple of Attempt
-        Every start.
-    seconds : float
-        Time taken.
+        The point.
+    exact : bool
+        Whether second derivatives may be asked for.
+    lagrangian : callable
+        ``lagrangian(points)``, with the point's multipliers.
 
     Returns
     -------
-    Fit
+    State
+        With its `Bend`.
+    array, shape (n,), or None
+        Another point, from where to go on, if the cost falls beside this one.
     """
-    failure = _inner_failure(p, s.theta)
-    if not np.isfinite(s.kkt.worst) and not failure:
-        said = (
-            "the cost or a derivative is not finite at the end of the search; bound the free "
-            "numbers away from there, or use a parametrisation that stays defined."
-        )
-        return refused(p, Status.not_finite, said, seconds, s.theta, attempts)
-    if failure:
-        said = (
-            f"{failure} at the end of the search; start it nearer to its root, or bound the free "
-            "numbers to where a root exists."
-        )
-        return refused(p, Status.not_converged, said, seconds, s.theta, attempts)
-    fixed = p.lower == p.upper
-    bounds = kkt.Limits(s.theta, p.lower, p.upper)
-    edge = np.array(_states(s.found.bounds, bounds))
-    at_edge = np.isin(edge, ("lower", "upper"))
-    held = fixed | (np.abs(s.found.bounds) > 1e-9 * _gradient_scale(p, s.theta, s.at))
-    known = _known(p, s, held, at_edge)
-    chi2 = float(s.at.residual @ s.at.residual)
-    priors = len(s.at.residual) - sum(record.measured.size for record in p.records)
-    dof = sum(group.count for group in known.groups) + priors - known.rank
-    ratio = chi2 / dof if dof > 0 else np.nan
-    judged = p.errors_known or not p.records
-    scale = (np.sqrt(max(1.0, ratio)) if dof > 0 else 1.0) if judged else np.sqrt(ratio)
-    one = np.eye(len(s.theta))
-    nothing = (known.spread.share(one) >= MOST_SHARE) | held
-    nothing |= any(group.unknown for group in known.groups)
-    errors = (np.where(nothing, np.nan, part.error(one)) for part in (known.spread, known.raw))
-    variables = tuple(
-        Variable(name, *map(float, numbers), state, float(gradient))
-        for name, *numbers, state, gradient in zip(
-            p.names, s.theta, *errors, p.lower, p.upper, edge, s.found.bounds, strict=True
-        )
-    )
-    limits = kkt.Limits(s.at.constraints, p.constraint_lower, p.constraint_upper)
-    constraints = tuple(
-        Limited(name, *map(float, numbers), state, float(y))
-        for name, *numbers, state, y in zip(
-            p.constraint_names, *limits, _states(s.found.constraints, limits), s.found.constraints,
-            strict=True,
-        )
-    )  # fmt: skip
-    # What has no errors cannot speak for or against the model.
-    silent = [group for group in known.groups if not group.errors_given]
-    spoken = chi2 - sum(g.chi2 for g in silent), dof - sum(g.dof for g in silent)
-    evidence = Evidence(
-        p, s.kkt, float(s.at.cost), attempts, variables, constraints, known.blind, *spoken, judged
-    )
-    status, message = judge(evidence)
-    return Fit(
-        p, s.theta, status, message, float(s.at.cost), chi2, dof, known.groups, s.kkt, variables,
-        constraints, known.spread, known.raw, known.unseen, float(scale), attempts, seconds,
-    )  # fmt: skip
+    if not (p.objectives and exact):
+        point = lower_beside(p, s, lagrangian)
+        return s._replace(bend=Bend(None if point is None else point - s.theta)), point
+    bent = _bend(p, s)
+    directions = [] if bent.direction is None else [bent.direction]
+    if bent.flat:
+        # Nothing of second order tells: look around, always at the same points.
+        random = np.random.default_rng(0).normal(size=(AROUND, len(s.theta)))
+        tangent = _tangent(p, s)
+        directions += list(random @ tangent @ tangent.T * s.scale.unit)
+    for direction in directions:
+        point = _along(p, s, direction, lagrangian)
+        if point is not None:
+            return s._replace(bend=bent._replace(direction=direction)), point
+    return s._replace(bend=bent._replace(direction=None)), None
 
 
-def _states(multiplier: np.ndarray, limits: kkt.Limits) -> list[str]:
-    """Whether each value is free, at its lower or upper limit, or fixed."""
-    low, high = limits.reached(TOLERANCE)
-    fixed = limits.lower == limits.upper
-    cases = [fixed, low & ((multiplier > 0) | ~high), high]
-    return np.select(cases, ["fixed", "lower", "upper"], "free").tolist()
+def lower_beside(
+    p: Problem, s: State, lagrangian: Callable[[np.ndarray], np.ndarray]
+) -> np.ndarray | None:
+    """A lower point beside one where squares end, if the cost bends down there.
+
+    The squares' own curvature never does; what their residuals bend shows first where that is
+    weakest. Numbers at a bound are tried inward, whatever the force that holds them.
+    """
+    tangent, unit = _tangent(p, s), s.scale.unit
+    if not tangent.shape[1]:
+        return None
+    rows = triangle(s.at.residual_jacobian * unit) @ tangent
+    weakest = tangent @ np.linalg.svd(rows, full_matrices=True)[2][-WEAKEST:].T * unit[:, None]
+    low, high = s.bounds.reached
+    inward = np.flatnonzero((low ^ high) & ~p.nuisance & (p.lower < p.upper))[:AROUND]
+    pushes = [
+        np.where(np.arange(len(unit)) == i, unit * (1.0 if low[i] else -1.0), 0) for i in inward
+    ]
+    sides = [(w, -w) for w in weakest.T]
+    every = [s.theta, *(np.clip(s.theta + NEAR * d, p.lower, p.upper)
+                        for d in (*(d for pair in sides for d in pair), *pushes))]  # fmt: skip
+    cost = lagrangian(np.array(every))
+    gain = cost[0] - cost[1:]
+    gain = np.where(np.isfinite(gain), gain, -np.inf)
+    least = 1e-9 * abs(cost[0]) + 1e-12 * p.least_residual**2
+    for i, (w, back) in enumerate(sides):
+        forth, other = gain[2 * i], gain[2 * i + 1]
+        if forth + other > least:
+            return _along(p, s, w if forth > other else back, lagrangian)
+    for i, push in enumerate(pushes):
+        if gain[2 * len(sides) + i] > least:
+            return _along(p, s, push, lagrangian)
+    return None
 
 
-def refused(
-    p: Problem,
-    status: Status,
-    message: str,
-    seconds: float,
-    theta: np.ndarray | None = None,
-    attempts: tuple[Attempt, ...] = (),
-) -> Fit:
-    """A fit without an answer: where it stopped, and nothing determined."""
-    theta = p.start if theta is None else theta
-    n, nan, inf = len(theta), np.nan, np.inf
-    variables = tuple(
-        Variable(name, float(v), nan, nan, float(a), float(b), "free", nan)
-        for name, v, a, b in zip(p.names, theta, p.lower, p.upper, strict=True)
-    )
-    limits = zip(p.constraint_names, p.constraint_lower, p.constraint_upper, strict=True)
-    lost = Spread(np.full((n, n), nan), np.eye(n), np.ones(n), np.zeros(n))
-    constraints = tuple(
-        Limited(name, nan, float(a), float(b), "free", nan) for name, a, b in limits
-    )
-    return Fit(
-        p, theta, status, message, nan, nan, 0, (), kkt.KKT(inf, inf, inf), variables,
-        constraints, lost, lost, np.eye(n), nan, attempts, seconds,
-    )  # fmt: skip
+def _along(
+    p: Problem, s: State, direction: np.ndarray, lagrangian: Callable[[np.ndarray], np.ndarray]
+) -> np.ndarray | None:
+    """The best of some points along a direction, None if none is better by what counts."""
+    steps = [sign * step for step in (NEAR, 10 * NEAR, 100 * NEAR, 0.5) for sign in (1.0, -1.0)]
+    points = [s.theta, *(np.clip(s.theta + t * direction, p.lower, p.upper) for t in steps)]
+    cost = lagrangian(np.array(points))
+    cost = np.where(np.isfinite(cost), cost, np.inf)
+    best = int(np.argmin(cost))
+    count = max(len(s.at.residual) - len(s.theta), 1)
+    noise = 1.0 if p.errors_known or not p.records else 2 * s.at.cost / count
+    counts = 1e-9 * s.scale.cost if p.objectives else max(1e-3 * noise, 1e-6 * s.at.cost)
+    return points[best] if cost[0] - cost[best] > counts else None
+
+
+def _bend(p: Problem, s: State) -> Bend:
+    """Curvature on the directions that active limits leave, from exact derivatives."""
+    unit, cost = s.scale.unit, s.scale.cost
+    h = np.asarray(p.compiled(lagrangian_hessian)(s.theta, 1.0, s.found.constraints))
+    h = h * np.outer(unit, unit) / cost
+    tangent = _tangent(p, s)
+    if not tangent.shape[1] or not np.all(np.isfinite(h)):
+        return Bend(None)
+    values, vectors = np.linalg.eigh(tangent.T @ h @ tangent)
+    left = s.at.gradient - s.found.bounds - s.at.jacobian.T @ s.found.constraints
+    slope = vectors.T @ (tangent.T @ (left * unit / cost))
+    largest = np.max(np.abs(values))
+    steep = values > FLAT * largest
+    newton = np.max(np.abs(slope[steep] / values[steep]), initial=0.0)
+    down = tangent @ vectors[:, 0] * unit if values[0] < -FLAT * max(largest, FLAT) else None
+    return Bend(down, float(newton), not steep.all() or largest < TOLERANCE)
+
+
+def _tangent(p: Problem, s: State) -> np.ndarray:
+    """Directions, in the sizes of the numbers, that keep to the limits held by a force."""
+    unit = s.scale.unit
+    size = gradient_size(p, s.at, s.scale)
+    held = (p.lower == p.upper) | (np.abs(s.found.bounds) > TOLERANCE * size)
+    equal = p.constraint_lower == p.constraint_upper
+    pulls = np.abs(s.found.constraints) * np.linalg.norm(s.at.jacobian / size, axis=1)
+    rows = np.vstack([np.eye(len(unit))[held], s.at.jacobian[equal | (pulls > TOLERANCE)] * unit])
+    length = np.linalg.norm(rows, axis=1, keepdims=True)
+    return null_space(rows / np.where(length > 0, length, 1.0))

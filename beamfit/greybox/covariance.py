@@ -13,7 +13,16 @@ from typing import NamedTuple
 
 import numpy as np
 
-__all__ = ["MOST_SHARE", "Group", "Spread", "directions", "groups_of", "spread_of", "triangle"]
+__all__ = [
+    "MOST_SHARE",
+    "Group",
+    "Spread",
+    "directions",
+    "groups_of",
+    "null_space",
+    "spread_of",
+    "triangle",
+]
 
 # A quantity counts as determined while bounds carry less than this share of its variance.
 MOST_SHARE = 0.5
@@ -130,7 +139,7 @@ def directions(
         # Rows of one size each: the rank of equations does not depend on their units.
         scaled = equations * unit
         size = np.linalg.norm(scaled, axis=1, keepdims=True)
-        tangent = _null(scaled / np.where(size > 0, size, 1.0))
+        tangent = null_space(scaled / np.where(size > 0, size, 1.0))
     if not tangent.shape[1]:
         return np.zeros((n, 0)), np.zeros((n, 0)), unit
     _, sizes, turned = np.linalg.svd(rows * unit @ tangent, full_matrices=True)
@@ -141,8 +150,8 @@ def directions(
     return along[:, :rank] / sizes[:rank], along[:, rank:] * far, unit * far
 
 
-def _null(rows: np.ndarray) -> np.ndarray:
-    """An orthonormal basis of what is orthogonal to a few rows."""
+def null_space(rows: np.ndarray) -> np.ndarray:
+    """An orthonormal basis of what is orthogonal to a few rows of one size."""
     _, sizes, turned = np.linalg.svd(rows, full_matrices=True)
     return turned[int(np.sum(sizes > CUT * np.max(sizes, initial=0.0))) :].T
 

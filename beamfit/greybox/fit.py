@@ -12,16 +12,21 @@ import numpy as np
 
 from beamfit.errors import InputError, nearest
 from beamfit.greybox import tree
+from beamfit.greybox.assess import KKT, TOLERANCE
 from beamfit.greybox.covariance import MOST_SHARE, Group, Spread
-from beamfit.greybox.kkt import KKT
 from beamfit.greybox.problem import Problem
 from beamfit.status import Status
+from beamfit.verdict import Finding
 
 if TYPE_CHECKING:
+    from beamfit.greybox.posterior import Optimum
     from beamfit.sampling.posterior import Posterior
     from beamfit.sampling.priors import Distribution
 
 __all__ = ["Attempt", "Derived", "Fit", "Limited", "Status", "Variable"]
+
+# Another optimum: a chi-square larger by less than 6.
+NEAR_COST = 3.0
 
 
 class Variable(NamedTuple):
@@ -262,7 +267,23 @@ class Fit:
         from beamfit.greybox.posterior import target_of
         from beamfit.sampling.ensemble import draw
 
-        return draw(target_of(self, noise, outliers, priors), **options)
+        told = {"noise": noise, "outliers": outliers, "priors": priors}
+        return draw(target_of(self.problem, self.optimum, **told), **options)
+
+    @property
+    def optimum(self) -> Optimum:
+        """What the sampler needs to know of this fit."""
+        from beamfit.greybox.posterior import Optimum
+
+        near = [a for a in self.attempts if a.kkt.worst <= TOLERANCE]
+        return Optimum(
+            self.theta,
+            Finding(self.status, self.message),
+            [group.scale for group in self.groups],
+            [group.errors_given for group in self.groups],
+            self.undetermined,
+            [a.theta for a in near if a.cost - self.cost < NEAR_COST],
+        )
 
     def __str__(self) -> str:
         """A table of the verdict, the numbers and the active constraints."""

@@ -1,97 +1,212 @@
-"""The posterior of a fitted problem, for the sampler."""
+"""The posterior of a problem about its optimum, for the sampler: one statement for every study."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from functools import lru_cache, partial
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from scipy.linalg import null_space
+from scipy.sparse.csgraph import connected_components
 
 from beamfit.errors import InputError
 from beamfit.greybox import tree
-from beamfit.greybox.kkt import TOLERANCE
-from beamfit.greybox.problem import Core, Prior
-from beamfit.sampling.likelihood import Group, Likelihood
+from beamfit.greybox.problem import Core, Prior, Problem, Record
+from beamfit.sampling.likelihood import Group
 from beamfit.sampling.priors import Distribution, checked
-from beamfit.sampling.target import Law, Target, covariance_of
+from beamfit.sampling.target import Law, Target, covariance_of, slopes_of
+from beamfit.verdict import Finding
 
-if TYPE_CHECKING:
-    from beamfit.greybox.fit import Fit
-
-__all__ = ["LAW", "Sampled", "target_of"]
+__all__ = ["Optimum", "Sampled", "Statement", "record_of", "target_of"]
 
 # A number that is an undetermined direction's in less than this share is not part of it.
 PART = 0.05
-# Another optimum: a chi-square larger by less than 6, more than six errors away.
-NEAR_COST, FAR = 3.0, 6.0
+# Another optimum is one more than six errors away.
+FAR = 6.0
+ELSEWHERE = (
+    "The search met another optimum of nearly the same cost far from this one: the intervals are "
+    "those about one of them."
+)
+
+
+class Optimum(NamedTuple):
+    """Where a search ended and what a fit says there.
+
+    Attributes
+    ----------
+    theta : array, shape (n,)
+        The problem's free numbers.
+    verdict : Finding
+        On the fit.
+    scales : sequence of float
+        Factor on the errors of each record that its residuals show; NaN where they show nothing.
+    given : sequence of bool
+        Whether each record came with errors.
+    undetermined : array, shape (n, k), optional
+        Directions that neither records nor priors see.
+    others : sequence of array
+        Further optima of nearly the same cost.
+    """
+
+    theta: np.ndarray
+    verdict: Finding
+    scales: Sequence[float]
+    given: Sequence[bool]
+    undetermined: np.ndarray | None = None
+    others: Sequence[np.ndarray] = ()
+
+
+def _same(model: Any) -> Any:
+    return model
+
+
+def _no_volume(model: Any, data: Any) -> jax.Array:
+    return jnp.zeros(())
+
+
+def _model_itself(model: Any, data: Any) -> Any:
+    return model
+
+
+class Statement(NamedTuple):
+    """What a study adds to its problem for the sampler; by default nothing.
+
+    The functions stand at the top of modules, so that they are compiled once.
+
+    Attributes
+    ----------
+    derived : mapping of str to str
+        Names and units of the numbers that `derive` gives.
+    derive : callable
+        ``derive(model, data)``, shape (len(derived),).
+    build : callable
+        ``build(model, data)``: what a user's functions of a draw are given.
+    data : pytree
+        Of these functions.
+    quoted, own : callable
+        A change of variables to those in which the prior is flat and which are sampled:
+        ``quoted(model)`` puts them in the place of the problem's own, ``own(model)`` is the inverse
+        and NaN outside its domain.
+    renamed : mapping of str to str
+        How users call numbers of the problem.
+    log_volume : callable
+        ``log_volume(model, data)``, added to the log density: of a prior that is flat in something
+        else than the sampled numbers.
+    units : mapping of str to str
+        Of sampled numbers.
+    lower, width : mapping of str to float
+        Lower bounds of sampled numbers instead of the problem's own, and how far from the optimum
+        each may be at most where the data do not say.
+    labels : mapping of str to str
+        What stands for a record before the names of its noise; by default nothing if there is one
+        record, else its name.
+    noise_unit : str
+        Of the errors of records that came without.
+    priors_own, hidden : sequence of str
+        Numbers that the prior decides, and those nobody asks for.
+    remark : str
+        A further sentence.
+    nothing : str
+        Why there is no posterior; empty where there is one.
+    """
+
+    derived: Mapping[str, str] = {}
+    derive: Callable[[Any, Any], jax.Array] = _model_itself
+    build: Callable[[Any, Any], Any] = _model_itself
+    data: Any = None
+    quoted: Callable[[Any], Any] = _same
+    own: Callable[[Any], Any] = _same
+    renamed: Mapping[str, str] = {}
+    log_volume: Callable[[Any, Any], jax.Array] = _no_volume
+    units: Mapping[str, str] = {}
+    lower: Mapping[str, float] = {}
+    width: Mapping[str, float] = {}
+    labels: Mapping[str, str] = {}
+    noise_unit: str = "1"
+    priors_own: Sequence[str] = ()
+    hidden: Sequence[str] = ()
+    remark: str = ""
+    nothing: str = ""
 
 
 @tree.node()
 class Sampled:
-    """A problem for the sampler: its core, all numbers, which move, the limits, padding apart.
-
-    `rows` are the residuals that count, None for all.
-    """
+    """A problem for the sampler: its core, all numbers, which move, bounds, a study's data."""
 
     core: Core
     theta: Any
     moving: Any
-    lower: Any
-    upper: Any
-    rows: Any = None
+    ends: Any
+    more: Any
 
 
-def _model(data: Sampled, moved: jax.Array) -> Any:
-    theta = data.theta.at[data.moving].set(moved)
-    return tree.replace(data.core.model, data.core.chosen, theta)
+@lru_cache(maxsize=64)
+def _law(own, log_volume, derive, build) -> tuple[Law, Callable]:
+    """The law of a study's functions, and its residuals with the problem's priors at their end."""
 
+    def model_of(data: Sampled, moved: jax.Array) -> Any:
+        theta = data.theta.at[data.moving].set(moved)
+        return own(tree.replace(data.core.model, data.core.chosen, theta))
 
-def _residual(data: Sampled, moved: jax.Array) -> tuple[jax.Array]:
-    """Residuals of the records; priors are no measurements and know no common noise."""
-    model = _model(data, moved)
-    parts = [record.residual(model) for record in data.core.records]
-    whole = jnp.concatenate(parts) if parts else jnp.zeros(0)
-    return (whole if data.rows is None else whole[data.rows],)
+    def residual(data: Sampled, moved: jax.Array) -> tuple[jax.Array, ...]:
+        """Of the records; priors are no measurements and know no common noise."""
+        model = model_of(data, moved)
+        return tuple(record.residual(model) for record in data.core.records) or (jnp.zeros(0),)
 
+    def with_priors(data: Sampled, moved: jax.Array) -> tuple[jax.Array, ...]:
+        model = model_of(data, moved)
+        priors = [prior.residual(model) for prior in data.core.priors]
+        return *residual(data, moved), jnp.concatenate([jnp.zeros(0), *priors])
 
-def _log_prior(data: Sampled, moved: jax.Array) -> jax.Array:
-    """Priors and further objectives, and -inf where a constraint is broken."""
-    model, core = _model(data, moved), data.core
-    value = sum((-0.5 * jnp.sum(p.residual(model) ** 2) for p in core.priors), jnp.zeros(()))
-    for objective in core.objectives:
-        value -= jnp.sum(objective.weight * objective.function(model, objective.data))
-    found = [jnp.ravel(c.function(model, c.data)) for c in core.constraints]
-    if found:
-        held = jnp.concatenate(found)
-        inside = jnp.all((held >= data.lower) & (held <= data.upper))
-        value = jnp.where(inside, value, -jnp.inf)
-    return value
+    def log_prior(data: Sampled, moved: jax.Array) -> jax.Array:
+        """Priors and further objectives, and -inf where a bound or constraint is broken."""
+        model, core = model_of(data, moved), data.core
+        value = log_volume(model, data.more)
+        for prior in core.priors:
+            value -= 0.5 * jnp.sum(prior.residual(model) ** 2)
+        for objective in core.objectives:
+            value -= jnp.sum(objective.weight * objective.function(model, objective.data))
+        theta = tree.read(model, core.chosen)
+        inside = jnp.all((theta >= data.ends[0]) & (theta <= data.ends[1]))
+        for constraint in core.constraints:
+            held = constraint.function(model, constraint.data)
+            inside &= jnp.all((held >= constraint.lower) & (held <= constraint.upper))
+        return jnp.where(inside, value, -jnp.inf)
 
-
-def _no_more(data: Sampled, moved: jax.Array) -> jax.Array:
-    return moved[:0]
-
-
-LAW = Law(_residual, _log_prior, _no_more, _model)
+    law = Law(
+        residual,
+        log_prior,
+        lambda data, moved: derive(model_of(data, moved), data.more),
+        lambda data, moved: build(model_of(data, moved), data.more),
+    )
+    return law, with_priors
 
 
 def target_of(
-    fit: Fit,
-    noise: str | None,
-    outliers: bool,
-    priors: Mapping[str, Distribution] | None,
+    problem: Problem,
+    optimum: Optimum,
+    stated: Statement | None = None,
+    *,
+    noise: str | None = None,
+    outliers: bool = False,
+    priors: Mapping[str, Distribution] | None = None,
 ) -> Target:
-    """State the posterior of a fit.
+    """State the posterior of a problem.
 
     Parameters
     ----------
-    fit : Fit
-        The fit.
+    problem : Problem
+        What was fitted.
+    optimum : Optimum
+        Where the sampler begins.
+    stated : Statement, optional
+        What a study adds.
     noise : {"known", "inferred"} or None
-        None: inferred where no record has errors or the fit enlarged them, else known.
+        None: of each record inferred where it has no errors or the fit enlarged them, else known.
     outliers : bool
         Whether some points may be outliers.
     priors : mapping of str to distribution, or None
@@ -100,78 +215,153 @@ def target_of(
     Returns
     -------
     Target
+        Flat in the numbers that are sampled but for the problem's own priors and `priors`.
 
     Raises
     ------
     InputError
         If a constraint is an equation, an option is not understood, or a prior's name is not that
-        of a free number.
+        of a sampled number.
     """
-    p = fit.problem
+    _refuse_equations(problem)
+    p, stated = problem, stated or Statement()
+    moving = np.flatnonzero(p.lower < p.upper)
+    names = tuple(stated.renamed.get(p.names[i], p.names[i]) for i in moving)
+    priors = checked(priors, names)
+    lower, upper = _bounds(p, moving, stated)
+    theta, turn = _changed(p, stated, optimum.theta)
+    law, with_priors = _law(stated.own, stated.log_volume, stated.derive, stated.build)
+    data = _data(p, theta, moving, stated)
+    slopes = slopes_of(law._replace(residual=with_priors), data, theta[moving])
+    noise_found = tuple(scale if scale > 0 else 1.0 for scale in optimum.scales) or (1.0,)
+    width = _widths(upper - lower, names, stated.width, priors)
+    covariance = covariance_of(slopes, (*noise_found, 1.0), width)
+    unseen = np.zeros((len(theta), 0)) if optimum.undetermined is None else optimum.undetermined
+    with_prior = np.array([name in priors for name in names])
+    held, loose = _open((turn @ unseen)[moving], names, with_prior, width)
+    steps = [(turn @ (other - optimum.theta))[moving] for other in optimum.others]
+    far = any(np.any(np.abs(step) > FAR * np.sqrt(np.diag(covariance))) for step in steps)
+    group_of, block_of = _belonging(slopes, bool(p.constraints))
+    return Target(
+        law=law,
+        data=data,
+        names=names,
+        units=tuple(stated.units.get(name, "") for name in names),
+        lower=lower,
+        upper=upper,
+        mode=theta[moving],
+        covariance=covariance,
+        groups=_groups(p, optimum, stated.labels, noise, outliers),
+        noise=noise_found,
+        counts=tuple(record.used for record in p.records),
+        noise_unit="1" if any(optimum.given) else stated.noise_unit,
+        priors=priors,
+        derived=stated.derived,
+        observed=_observed(p),
+        remark=" ".join(filter(None, (stated.remark, ELSEWHERE if far else ""))),
+        stated={prior.name: _words(prior) for prior in p.priors},
+        priors_own=(*held, *stated.priors_own),
+        open_directions=stated.nothing or loose,
+        verdict=optimum.verdict,
+        hidden=(*(names[i] for i in np.flatnonzero(p.nuisance[moving])), *stated.hidden),
+        group_of=group_of,
+        block_of=block_of,
+    )
+
+
+def record_of(target: Target, name: str) -> Record:
+    """The record of a name in what is sampled, for what a posterior expects of it."""
+    return next(record for record in target.data.core.records if record.name == name)
+
+
+def _refuse_equations(p: Problem) -> None:
     equations = p.constraint_lower == p.constraint_upper
     if equations.any():
         name = p.constraint_names[int(np.argmax(equations))]
         expected = "limits that differ: nothing that is drawn at random meets an equation"
         raise InputError(f"the equation '{name}'", expected)
-    if noise is None:
-        noise = "inferred" if not p.errors_known or fit.scale > 1 else "known"
-    moving = np.flatnonzero(p.lower < p.upper)
-    names = tuple(p.names[i] for i in moving)
-    priors = checked(priors, names)
-    fixed = fit.theta.copy()
-    fixed[moving] = 0.0  # the solver's last digits do not make it another problem
-    used = np.concatenate([np.zeros(0, bool), *(record.used for record in p.records)])
-    rows = None if used.all() else np.flatnonzero(used)
-    data = Sampled(p.core, fixed, moving, p.constraint_lower, p.constraint_upper, rows)
-    lower, upper = p.lower[moving], p.upper[moving]
-    data = jax.tree.map(jnp.asarray, data)
-    width = np.where(np.isfinite(upper - lower), 0.5 * (upper - lower), np.inf)
-    for name, prior in priors.items():
-        width[names.index(name)] = min(width[names.index(name)], float(prior.std()))
-    mode = fit.theta[moving]
-    with_prior = np.array([name in priors for name in names])
-    held, loose = _open(fit, moving, names, with_prior, width)
-    extra = Law(_with_priors, _log_prior, _no_more, _model)
-    return Target(
-        law=LAW,
-        data=data,
-        names=names,
-        units=("",) * len(names),
-        lower=lower,
-        upper=upper,
-        mode=mode,
-        covariance=covariance_of(extra, data, mode, width) * fit.scale**2,
-        likelihood=Likelihood((Group("", noise, outliers),)),
-        noise=(fit.scale,),
-        noise_unit="1",
-        priors=priors,
-        observed={
-            f"{record.name} {what}": np.asarray(getattr(record, what))
-            for record in p.records
-            for what in ("measured", "error")
-            if getattr(record, what) is not None
-        },
-        remark=_other_optimum(fit, moving),
-        stated={prior.name: _words(prior) for prior in p.priors},
-        priors_own=held,
-        open_directions=loose,
-        verdict=(fit.status.value, fit.message),
-        hidden=tuple(names[i] for i in range(len(names)) if p.nuisance[moving[i]]),
-    )
 
 
-def _other_optimum(fit: Fit, moving: np.ndarray) -> str:
-    """Warn of another optimum the search met: walkers that start at one do not find the other."""
-    spread = np.sqrt(np.diag(fit.covariance)[moving])
-    for attempt in fit.attempts:
-        off = np.abs(attempt.theta - fit.theta)[moving]
-        near = attempt.kkt.worst <= TOLERANCE and attempt.cost - fit.cost < NEAR_COST
-        if near and np.any(off > FAR * spread) and np.all(spread > 0):
-            return (
-                "The search met another optimum of nearly the same cost far from this one: the "
-                "intervals are those about one of them."
-            )
-    return ""
+def _bounds(p: Problem, moving: np.ndarray, stated: Statement) -> tuple[np.ndarray, np.ndarray]:
+    """Bounds of what is sampled."""
+    lower = {stated.renamed.get(p.names[i], p.names[i]): p.lower[i] for i in moving}
+    return np.array(list((lower | dict(stated.lower)).values())), p.upper[moving]
+
+
+def _changed(p: Problem, stated: Statement, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The optimum in the numbers that are sampled, and their derivatives by the problem's own."""
+    if stated.quoted is _same:
+        return np.array(theta), np.eye(len(theta))
+    found, turn = _with_slope(stated.quoted, p.core, jnp.asarray(theta))
+    return np.array(found), np.asarray(turn)
+
+
+@partial(jax.jit, static_argnums=0)
+def _with_slope(
+    quoted: Callable[[Any], Any], core: Core, theta: jax.Array
+) -> tuple[jax.Array, ...]:
+    def sampled(own: jax.Array) -> jax.Array:
+        return tree.read(quoted(tree.replace(core.model, core.chosen, own)), core.chosen)
+
+    return sampled(theta), jax.jacfwd(sampled)(theta)
+
+
+def _data(p: Problem, theta: np.ndarray, moving: np.ndarray, stated: Statement) -> Sampled:
+    """What the law needs; the solver's last digits do not make it another problem."""
+    fixed = np.array(theta)
+    fixed[moving] = 0.0
+    core = replace(p.core, model=tree.replace(p.core.model, p.core.chosen, jnp.asarray(fixed)))
+    loose = p.lower == p.upper
+    ends = np.where(loose, -np.inf, p.lower), np.where(loose, np.inf, p.upper)
+    return jax.tree.map(jnp.asarray, Sampled(core, fixed, moving, ends, stated.data))
+
+
+def _widths(
+    box: np.ndarray,
+    names: Sequence[str],
+    told: Mapping[str, float],
+    priors: Mapping[str, Distribution],
+) -> np.ndarray:
+    """How far each number may be from the optimum where the data do not say."""
+    width = np.where(np.isfinite(box), 0.5 * box, np.inf)
+    width = np.minimum(width, [told.get(name, np.inf) for name in names])
+    spread = [float(priors[name].std()) if name in priors else np.inf for name in names]
+    return np.minimum(width, spread)
+
+
+def _groups(
+    p: Problem, optimum: Optimum, labels: Mapping[str, str], noise: str | None, outliers: bool
+) -> tuple[Group, ...]:
+    """How each record scatters; a factor on errors cannot be inferred where nothing shows it."""
+    groups = []
+    for record, scale, given in zip(p.records, optimum.scales, optimum.given, strict=True):
+        label = labels.get(record.name, record.name if len(p.records) > 1 else "")
+        kind = noise or ("inferred" if scale > 1 or not given else "known")
+        shown = scale > 0 or not given
+        groups.append(Group(label, kind if shown else "known", outliers))
+    return tuple(groups) or (Group("", noise or "known", outliers),)
+
+
+def _observed(p: Problem) -> dict[str, np.ndarray]:
+    found = {}
+    for record in p.records:
+        for what in ("measured", "error"):
+            values = getattr(record, what)
+            if values is not None:
+                every = np.broadcast_to(values, record.measured.shape).ravel()
+                found[f"{record.name} {what}"] = every[record.used]
+    return found
+
+
+def _belonging(slopes: Sequence[np.ndarray], joined: bool) -> tuple[tuple[int, ...], ...]:
+    """Which record says most of each number, and which numbers some record or prior sees together.
+
+    Constraints are not looked into: where there are any, all numbers belong together.
+    """
+    sizes = np.array([np.linalg.norm(part, axis=0) for part in slopes])
+    together = (sizes.T @ sizes > 0) | joined
+    blocks = connected_components(together, directed=False)[1]
+    return tuple(map(int, np.argmax(sizes[:-1], axis=0))), tuple(map(int, blocks))
 
 
 def _words(prior: Prior) -> str:
@@ -181,20 +371,13 @@ def _words(prior: Prior) -> str:
     return "normal"
 
 
-def _with_priors(data: Sampled, moved: jax.Array) -> tuple[jax.Array]:
-    model = _model(data, moved)
-    parts = [part.residual(model) for part in (*data.core.records, *data.core.priors)]
-    return (jnp.concatenate(parts) if parts else jnp.zeros(0),)
-
-
 def _open(
-    fit: Fit, moving: np.ndarray, names: tuple[str, ...], with_prior: np.ndarray, width: np.ndarray
+    unseen: np.ndarray, names: tuple[str, ...], with_prior: np.ndarray, width: np.ndarray
 ) -> tuple[tuple[str, ...], str]:
     """Numbers that bounds alone hold, and a sentence if nothing at all holds some of them.
 
     A prior on one number holds every direction along which it moves.
     """
-    unseen = fit.undetermined[moving] if fit.undetermined.size else np.zeros((len(names), 0))
     beyond_priors = _not_moving(unseen, with_prior)
     beyond_bounds = _not_moving(beyond_priors, np.isfinite(width))
     held, loose = (_along(part, names) for part in (beyond_priors, beyond_bounds))

@@ -212,6 +212,27 @@ class Problem:
         """Whether any record brings measurement errors."""
         return any(record.error is not None for record in self.records)
 
+    @cached_property
+    def size(self) -> int:
+        """How many values were measured, padding included."""
+        return sum(record.measured.size for record in self.records)
+
+    @cached_property
+    def least_residual(self) -> float:
+        """The least length of the residuals that counts: one standard deviation.
+
+        Where no record has errors it is 1e-6 of the measured values.
+        """
+        if self.errors_known or not self.records:
+            return 1.0
+        squares = [np.sum(r.used * np.asarray(r.measured).ravel() ** 2) for r in self.records]
+        return 1e-6 * float(np.sqrt(sum(squares))) or 1.0
+
+    def has_part(self, kind: type) -> bool:
+        """Whether a part of the problem is of a class."""
+        parts = jax.tree_util.tree_leaves(self.core, is_leaf=lambda part: isinstance(part, kind))
+        return any(isinstance(part, kind) for part in parts)
+
     def compiled(self, function: Callable) -> Callable:
         """A function of (core, theta, ...) as a compiled function of (theta, ...) at this core.
 

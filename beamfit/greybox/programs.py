@@ -1,17 +1,38 @@
 """Solvers for fits with constraints: Uno first, scipy where it fails.
 
-They only propose points. Whether a point is an optimum is decided in `kkt`.
+They only propose points. Whether a point is an optimum is decided in `assess`.
 """
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from typing import NamedTuple
 
+import jax
 import numpy as np
 from scipy import optimize
 
-__all__ = ["SOLVERS", "Program", "Proposal", "Stage"]
+from beamfit.greybox import assess, problem
+from beamfit.greybox.problem import Problem
+
+__all__ = ["SOLVERS", "Budget", "Program", "Proposal", "Stage", "scaled"]
+
+
+class Budget(NamedTuple):
+    """How long a search may go on: steps from one start, and a moment on the clock or None."""
+
+    iterations: int
+    until: float | None
+
+    @property
+    def left(self) -> float:
+        """Seconds left."""
+        return np.inf if self.until is None else self.until - time.perf_counter()
+
+
+class _TimeIsUp(Exception):
+    """Ends a solver that cannot be told of a limit."""
 
 
 class Program(NamedTuple):
@@ -19,6 +40,7 @@ class Program(NamedTuple):
 
     `values(x)` gives cost and constraints, `slopes(x)` the cost's gradient and the constraints'
     Jacobian, `hessian(x, sigma, y)` the Hessian of sigma * cost - y @ constraints.
+    `lagrangian(y)` gives a function of points in the problem's own numbers.
     """
 
     values: Callable[[np.ndarray], tuple[float, np.ndarray]]
@@ -28,6 +50,7 @@ class Program(NamedTuple):
     upper: np.ndarray
     c_lower: np.ndarray
     c_upper: np.ndarray
+    lagrangian: Callable[[np.ndarray], Callable[[np.ndarray], np.ndarray]]
 
 
 class Proposal(NamedTuple):
@@ -41,7 +64,7 @@ class Proposal(NamedTuple):
 def _uno(preset: str) -> Callable[[Program, np.ndarray, int], Proposal]:
     """A solver by Uno with one of its presets."""
 
-    def solve(program: Program, x: np.ndarray, iterations: int) -> Proposal:
+    def solve(program: Program, x: np.ndarray, iterations: int, budget: Budget) -> Proposal:
         import unopy
 
         solver = unopy.UnoSolver()
@@ -50,7 +73,7 @@ def _uno(preset: str) -> Callable[[Program, np.ndarray, int], Proposal]:
         solver.set_option("max_iterations", iterations)
         solver.set_option("primal_tolerance", 1e-9)
         solver.set_option("dual_tolerance", 1e-8)
-        solver.set_option("time_limit", 120.0)
+        solver.set_option("time_limit", float(min(120.0, max(budget.left, 0.01))))
         found = solver.optimize(_uno_model(unopy, program, x))
         # Uno reports an infeasible problem as an optimisation status of success.
         said = f"{found.solution_status.name}, {found.optimization_status.name}"
@@ -104,7 +127,7 @@ def _uno_model(unopy, program: Program, x: np.ndarray):
     return model
 
 
-def _slsqp(program: Program, x: np.ndarray, iterations: int) -> Proposal:
+def _slsqp(program: Program, x: np.ndarray, iterations: int, budget: Budget) -> Proposal:
     """Solve by scipy's sequential quadratic programming."""
     sides = [(1.0, program.c_lower), (-1.0, program.c_upper)]
     equal = program.c_lower == program.c_upper
@@ -125,15 +148,26 @@ def _slsqp(program: Program, x: np.ndarray, iterations: int) -> Proposal:
                 "jac": lambda at: program.slopes(at)[1][equal],
             }
         )
-    found = optimize.minimize(
-        lambda at: program.values(at)[0],
-        x,
-        jac=lambda at: program.slopes(at)[0],
-        bounds=optimize.Bounds(program.lower, program.upper),
-        constraints=rules,
-        method="SLSQP",
-        options={"maxiter": iterations, "ftol": 1e-15},
-    )
+    last = [x]
+
+    def in_time(at):
+        if budget.left <= 0:
+            raise _TimeIsUp
+        last[0] = at.copy()
+
+    try:
+        found = optimize.minimize(
+            lambda at: program.values(at)[0],
+            x,
+            jac=lambda at: program.slopes(at)[0],
+            bounds=optimize.Bounds(program.lower, program.upper),
+            constraints=rules,
+            method="SLSQP",
+            callback=in_time,
+            options={"maxiter": iterations, "ftol": 1e-15},
+        )
+    except _TimeIsUp:
+        return Proposal(last[0], 0, "time is up")
     return Proposal(found.x, int(found.nit), found.message)
 
 
@@ -143,7 +177,7 @@ class Stage(NamedTuple):
     name: str
     hessian: str
     steps: int
-    solve: Callable[[Program, np.ndarray, int], Proposal]
+    solve: Callable[[Program, np.ndarray, int, Budget], Proposal]
 
 
 SOLVERS: tuple[Stage, ...] = (
@@ -153,3 +187,99 @@ SOLVERS: tuple[Stage, ...] = (
     Stage("scipy SLSQP", "none", 300, _slsqp),
 )
 """In the order of trying."""
+
+
+def _values(core, theta):
+    return problem.cost(core, theta), problem.constraints(core, theta)
+
+
+def _first(core, theta):
+    return jax.grad(problem.cost, 1)(core, theta), assess.constraint_slopes(core, theta)
+
+
+def _squares(core, theta, sigma, y):
+    """Gauss-Newton's part of the Hessian of the Lagrangian."""
+    j = jax.jacfwd(problem.residual, 1)(core, theta)
+    return sigma * j.T @ j
+
+
+def scaled(
+    p: Problem,
+    start: np.ndarray,
+    moving: np.ndarray,
+    at: assess.Slopes,
+    scale: assess.Scale,
+    hessian: str,
+) -> Program:
+    """A problem for a solver: moving numbers, cost and constraints in their sizes.
+
+    Parameters
+    ----------
+    p : Problem
+        The problem.
+    start : array, shape (n,)
+        Holds the numbers that do not move.
+    moving : array of int
+        Which do.
+    at : Slopes
+        At the start.
+    scale : Scale
+        Of the problem.
+    hessian : str
+        ``gauss_newton`` or anything else for the exact one.
+
+    Returns
+    -------
+    Program
+        That remembers its last points.
+    """
+    unit = scale.unit[moving]
+    steepest = max(np.max(np.abs(at.gradient * scale.unit)), 1e-300)
+    # Squares are counted in their errors; a steep cost is flattened, as IPOPT does.
+    flat = 1.0 / scale.cost if p.objectives else min(1.0, 100.0 / steepest)
+    second = _squares if hessian == "gauss_newton" else assess.lagrangian_hessian
+    functions = {function: p.compiled(function) for function in (_values, _first, second)}
+    kept: dict = {}
+
+    def full(x):
+        theta = start.copy()
+        theta[moving] = x * unit
+        return theta
+
+    def remember(function, x):
+        key = (function, x.tobytes())
+        if key not in kept:
+            if len(kept) > 8:
+                kept.clear()
+            kept[key] = [np.asarray(part) for part in functions[function](full(x))]
+        return kept[key]
+
+    def values(x):
+        cost, c = remember(_values, x)
+        return flat * float(cost), c / scale.limit
+
+    def slopes(x):
+        gradient, jacobian = remember(_first, x)
+        return flat * gradient[moving] * unit, jacobian[:, moving] * unit / scale.limit[:, None]
+
+    def curvature(x, sigma, y):
+        h = np.asarray(functions[second](full(x), sigma * flat, y / scale.limit))
+        return h[np.ix_(moving, moving)] * np.outer(unit, unit)
+
+    def lagrangian(y):
+        def at_points(points):
+            found = (functions[_values](point) for point in points)
+            return np.array([float(cost) - y @ np.asarray(c) for cost, c in found])
+
+        return at_points
+
+    return Program(
+        values,
+        slopes,
+        curvature,
+        p.lower[moving] / unit,
+        p.upper[moving] / unit,
+        p.constraint_lower / scale.limit,
+        p.constraint_upper / scale.limit,
+        lagrangian,
+    )

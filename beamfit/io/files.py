@@ -37,9 +37,7 @@ def _opened(path: str | PathLike[str]):
         raise InputError("a directory", "a file", path=path) from None
     except (OSError, ValueError) as error:  # a name with a zero byte is a ValueError
         cause = getattr(error, "strerror", None) or error
-        raise InputError(
-            f"a file that cannot be read ({cause})", "a readable file", path=path
-        ) from None
+        raise InputError(f"a file that cannot be read ({cause})", "a readable file", path) from None
 
 
 def text_lines(path: str | PathLike[str], seen: Any = None) -> Iterator[str]:
@@ -74,18 +72,13 @@ def text_lines(path: str | PathLike[str], seen: Any = None) -> Iterator[str]:
             if b"\0" in raw:
                 raise InputError("a binary file", "a text file", path=path, line=number)
             if len(raw) > LONGEST_LINE:
-                raise InputError(
-                    f"a line of more than {LONGEST_LINE} characters",
-                    "a text table",
-                    path=path,
-                    line=number,
-                )
+                found = f"a line of more than {LONGEST_LINE} characters"
+                raise InputError(found, "a text table", path, number)
             try:
                 line = raw.decode("utf-8-sig" if number == 1 else "utf-8")
             except UnicodeDecodeError:
-                raise InputError(
-                    "bytes that are not text", "UTF-8 text", path=path, line=number
-                ) from None
+                found = "bytes that are not text"
+                raise InputError(found, "UTF-8 text", path, number) from None
             yield line.rstrip("\r\n")
     if number == 0:
         raise InputError("an empty file", "a file with content", path=path)
@@ -110,9 +103,8 @@ def read_text(path: str | PathLike[str], seen: Any = None) -> str:
         lines.append(line)
         size += len(line) + 1
         if size > LARGEST_TEXT:
-            raise InputError(
-                f"more than {LARGEST_TEXT // 1_000_000} MB of text", "a lattice file", path=path
-            )
+            found = f"more than {LARGEST_TEXT // 1_000_000} MB of text"
+            raise InputError(found, "a lattice file", path)
     return "\n".join(lines) + "\n"
 
 
@@ -160,6 +152,5 @@ def write_atomically(path: str | PathLike[str], content: bytes) -> None:
     except OSError as error:
         if temporary is not None and os.path.exists(temporary):
             os.unlink(temporary)
-        raise InputError(
-            f"a place that cannot be written ({error.strerror})", "a writable path", path=path
-        ) from None
+        found = f"a place that cannot be written ({error.strerror})"
+        raise InputError(found, "a writable path", path) from None

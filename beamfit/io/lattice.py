@@ -1,18 +1,28 @@
-"""Lattice files: versioned TOML, checked line by line before any optics is built."""
+"""Lattice files: versioned TOML, checked line by line before any optics is built.
+
+The keys of an element and the element they make stand here together.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from beamfit.errors import InputError, nearest
 from beamfit.io.toml import FLAG, LIST, TABLE, TEXT, Key, Section, is_number, read_toml
 from beamfit.particles import REST_ENERGY, expected_energy
+from beamfit.studies.scan.scans import QuadScan, check_names
 
-__all__ = ["LatticeFile", "read_toml_lattice"]
+if TYPE_CHECKING:
+    from beamfit.optics.calibration import Calibration
+    from beamfit.optics.elements import Element
+
+__all__ = ["LatticeFile", "element_of", "read_toml_lattice"]
 
 FORMAT = "beamfit-lattice-1"
 # Settings a magnet may be given, one of them; the key says the unit.
@@ -31,11 +41,8 @@ ELEMENTS: dict[str, dict[str, Key]] = {
     "quadrupole": {
         "name": NAME,
         "length_m": LENGTH,
-        "current_A": OPTIONAL,
-        "integrated_gradient_kG": OPTIONAL,
-        "k1_per_m2": OPTIONAL,
-        "slope": OPTIONAL,
-        "intercept": OPTIONAL,
+        **dict.fromkeys(("current_A", "integrated_gradient_kG", "k1_per_m2"), OPTIONAL),
+        **dict.fromkeys(("slope", "intercept"), OPTIONAL),
         "gradient_polynomial_T_per_m": Key(kind=LIST, default=None),
         "signed_intercept": Key(kind=FLAG, default=False),
     },
@@ -118,7 +125,11 @@ class LatticeFile:
         screens = [e["name"] for e in self.elements if e["type"] == "screen"]
         return screens[-1] if screens else None
 
-    def check_magnets(self, limits: Mapping[str, object]) -> None:
+    def check_scan(self, scan: QuadScan) -> None:
+        """Refuse a scan that names what the lattice does not have, as `scans.check_names`."""
+        check_names(scan, self.calibrations, self.places, self.default_screen, self.rest_energy)
+
+    def check_magnets(self, limits: Iterable[str]) -> None:
         """Refuse limits of a magnet that the lattice does not have.
 
         Raises
@@ -130,6 +141,18 @@ class LatticeFile:
             if name not in self.calibrations:
                 known = nearest(name, list(self.calibrations))
                 raise InputError(f"--vary {name}: no magnet '{name}'", known, path=self.path)
+
+    def check_energies(self, energies: Iterable[float]) -> None:
+        """Refuse energies in MeV that the particle cannot have.
+
+        Raises
+        ------
+        InputError
+            Naming the first.
+        """
+        for energy in energies:
+            if expected := expected_energy(energy, self.particle):
+                raise InputError(f"--energies {energy:g} MeV", expected)
 
 
 def read_toml_lattice(path: str | PathLike[str]) -> LatticeFile:
@@ -232,3 +255,61 @@ def _design(top: Section, names: list[str]) -> Mapping[str, Any] | None:
             expected = f"{plane} = {{ beta_m = ..., alpha = ... }}, beta_m > 0"
             raise section.error(f"design {plane} = {twiss!r}"[:80], expected, plane)
     return section.table
+
+
+def element_of(table: Mapping[str, Any], mass: float) -> Element:
+    """Build the element a checked table describes, for particles of a rest energy in MeV.
+
+    Examples
+    --------
+    >>> element_of({"type": "screen", "name": "S", "resolution_um": 5.0}, mass=0.511).resolution
+    4.9999999999999996e-06
+    """
+    from beamfit.optics import elements
+
+    name = table["name"]
+    match table["type"]:
+        case "drift":
+            return elements.Drift(name, float(table["length_m"]))
+        case "marker":
+            return elements.Marker(name)
+        case "screen":
+            return elements.Screen(name, 1e-6 * table.get("resolution_um", 0.0))
+        case "sector_dipole":
+            edges = [np.radians(table.get(f"{end}_edge_deg", 0.0)) for end in ("entrance", "exit")]
+            return elements.SectorDipole(
+                name,
+                float(np.copysign(table["radius_m"], table["angle_deg"])),
+                float(np.radians(table["angle_deg"])),
+                *map(float, edges),
+                table["bend_plane"],
+                float(table.get("energy_offset", 0.0)),
+                float(table.get("k1_per_m2", 0.0)),
+            )
+        case "thin_lens":
+            return elements.ThinLens(name, *_strength(table, mass))
+        case _:
+            length = float(table["length_m"])
+            return elements.Quadrupole(name, length, *_strength(table, mass))
+
+
+def _strength(table: Mapping[str, Any], mass: float) -> tuple[float, Calibration]:
+    """The setting of a magnet and what it means."""
+    from beamfit.optics import calibration
+
+    if "integrated_gradient_kG" in table:
+        return float(table["integrated_gradient_kG"]), calibration.IntegratedGradient(mass=mass)
+    if "k1_per_m2" in table:
+        return float(table["k1_per_m2"]), calibration.FocusingStrength()
+    if "k1l_per_m" in table:
+        return float(table["k1l_per_m"]), calibration.IntegratedStrength()
+    current = float(table["current_A"])
+    if "slope" in table:
+        line = calibration.SlopeIntercept(float(table["slope"]), float(table["intercept"]))
+        return current, line
+    polynomial = calibration.CurrentPolynomial(
+        tuple(float(c) for c in table["gradient_polynomial_T_per_m"]),
+        signed_intercept=table.get("signed_intercept", False),
+        mass=mass,
+    )
+    return current, polynomial

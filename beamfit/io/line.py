@@ -2,20 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
-
-import numpy as np
+from typing import TYPE_CHECKING
 
 from beamfit.errors import InputError
-from beamfit.io.lattice import LatticeFile, read_toml_lattice
+from beamfit.io.lattice import LatticeFile, element_of, read_toml_lattice
 
 if TYPE_CHECKING:
     from beamfit.optics.beamline import Beamline
-    from beamfit.optics.calibration import Calibration
-    from beamfit.optics.elements import Element
 
 __all__ = ["build_line", "load_lattice", "read_lattice"]
 
@@ -102,61 +97,10 @@ def build_line(file: LatticeFile) -> Beamline:
         twiss = {p: (t["beta_m"], t["alpha"]) for p, t in file.design.items() if p != "at"}
         design = Design(at=file.design["at"], **twiss)
     return Beamline(
-        tuple(_element(table, mass) for table in file.elements),
+        tuple(element_of(table, mass) for table in file.elements),
         energy=file.energy,
         name=file.name,
         mass=mass,
         energy_spread=file.energy_spread,
         design=design,
     )
-
-
-def _element(table: Mapping[str, Any], mass: float) -> Element:
-    from beamfit.optics import elements
-
-    name = table["name"]
-    match table["type"]:
-        case "drift":
-            return elements.Drift(name, float(table["length_m"]))
-        case "marker":
-            return elements.Marker(name)
-        case "screen":
-            return elements.Screen(name, 1e-6 * table.get("resolution_um", 0.0))
-        case "sector_dipole":
-            edges = [np.radians(table.get(f"{end}_edge_deg", 0.0)) for end in ("entrance", "exit")]
-            return elements.SectorDipole(
-                name,
-                float(np.copysign(table["radius_m"], table["angle_deg"])),
-                float(np.radians(table["angle_deg"])),
-                *map(float, edges),
-                table["bend_plane"],
-                float(table.get("energy_offset", 0.0)),
-                float(table.get("k1_per_m2", 0.0)),
-            )
-        case "thin_lens":
-            return elements.ThinLens(name, *_strength(table, mass))
-        case _:
-            length = float(table["length_m"])
-            return elements.Quadrupole(name, length, *_strength(table, mass))
-
-
-def _strength(table: Mapping[str, Any], mass: float) -> tuple[float, Calibration]:
-    """The setting of a magnet and what it means."""
-    from beamfit.optics import calibration
-
-    if "integrated_gradient_kG" in table:
-        return float(table["integrated_gradient_kG"]), calibration.IntegratedGradient(mass=mass)
-    if "k1_per_m2" in table:
-        return float(table["k1_per_m2"]), calibration.FocusingStrength()
-    if "k1l_per_m" in table:
-        return float(table["k1l_per_m"]), calibration.IntegratedStrength()
-    current = float(table["current_A"])
-    if "slope" in table:
-        line = calibration.SlopeIntercept(float(table["slope"]), float(table["intercept"]))
-        return current, line
-    polynomial = calibration.CurrentPolynomial(
-        tuple(float(c) for c in table["gradient_polynomial_T_per_m"]),
-        signed_intercept=table.get("signed_intercept", False),
-        mass=mass,
-    )
-    return current, polynomial

@@ -161,20 +161,13 @@ def _sizes(sheet: Sheet, column: Column) -> np.ndarray:
     if not PLAUSIBLE[0] <= middle <= PLAUSIBLE[1]:
         written, lengths = middle / column.factor, UNITS["length"]
         likely = min(("um", "mm", "m"), key=lambda u: abs(np.log(written * lengths[u] / 2e-4)))
-        raise sheet.error(
-            f"sizes around {written:g} {column.unit}, implausible for a beam",
-            f"sizes between 0.1 um and 20 mm; if these are {likely}, "
-            f"rename the column {column.key}_{likely}",
-            None,
-            column.header,
-        )
+        found = f"sizes around {written:g} {column.unit}, implausible for a beam"
+        expected = f"sizes between 0.1 um and 20 mm; if these are {likely}, rename the column "
+        raise sheet.error(found, f"{expected}{column.key}_{likely}", None, column.header)
     if size[row] > PLAUSIBLE[1]:
-        raise sheet.error(
-            f"{size[row] / column.factor:g} {column.unit}, implausible for a beam",
-            "sizes below 20 mm; is this row in another unit?",
-            row,
-            column.header,
-        )
+        found = f"{size[row] / column.factor:g} {column.unit}, implausible for a beam"
+        expected = "sizes below 20 mm; is this row in another unit?"
+        raise sheet.error(found, expected, row, column.header)
     return size
 
 
@@ -240,75 +233,55 @@ def average_shots(scan: QuadScan, *, marked: bool) -> QuadScan:
     >>> average_shots(shots, marked=True).size["x"].round(6).tolist()
     [0.00011, 0.00021, 0.00031]
     """
-    groups = _groups(scan)
-    repeated = max(len(g) for g in groups) > 1
-    if not repeated or (scan.error and not marked):
+    rows: dict[tuple, int] = {}
+    keys = row_keys(scan.settings, scan.energy, scan.screen)
+    group = np.array([rows.setdefault(key, len(rows)) for key in keys])
+    if len(rows) == len(group) or (scan.error and not marked):
         return scan if scan.error else replace(scan, error_source="none given")
-    first = [g[0] for g in groups]
-    size = {p: np.array([_mean(v[g]) for g in groups]) for p, v in scan.size.items()}
-    scatter = {p: _standard_error(scan.size[p], groups) for p in scan.size}
-    known = {p: e for p, e in scatter.items() if e is not None}
-    # Too few repeats for a scatter: what the file says of its shots is kept.
-    given = {p: _of_the_mean(e, groups) for p, e in scan.error.items() if p not in known}
-
-    def pick(values: np.ndarray | None) -> np.ndarray | None:
-        return None if values is None else values[first]
-
+    size, scatter, given = {}, {}, {}
+    for plane, values in scan.size.items():
+        size[plane], error = _shot_means(values, group)
+        if error is not None:
+            scatter[plane] = error
+        elif plane in scan.error:  # too few repeats: what the file says of its shots is kept
+            shots, mean_square = _means(scan.error[plane] ** 2, group)
+            given[plane] = np.sqrt(mean_square / shots)
+    first = np.unique(group, return_index=True)[1]
+    said = "the scatter of the shots (standard error of the mean)" if scatter else "the file"
     return replace(
         scan,
         settings={n: v[first] for n, v in scan.settings.items()},
         size=size,
-        error=known | given,
-        energy=pick(scan.energy),
-        resolution=pick(scan.resolution),
-        energy_spread=pick(scan.energy_spread),
+        error=scatter | given,
+        **{
+            name: None if (values := getattr(scan, name)) is None else values[first]
+            for name in ("energy", "resolution", "energy_spread")
+        },
         screen=None if scan.screen is None else tuple(scan.screen[i] for i in first),
-        shots=np.array([len(g) for g in groups]),
-        error_source="the scatter of the shots (standard error of the mean)"
-        if known
-        else ("the file" if given else "none given"),
+        shots=np.bincount(group),
+        error_source=said if scatter or given else "none given",
     )
 
 
-def _groups(scan: QuadScan) -> list[np.ndarray]:
-    """Rows of equal settings, energy and screen, in the order of first appearance."""
-    rows: dict[tuple, list[int]] = {}
-    for i, key in enumerate(row_keys(scan.settings, scan.energy, scan.screen)):
-        rows.setdefault(key, []).append(i)
-    return [np.array(r) for r in rows.values()]
+def _means(values: np.ndarray, group: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """How many numbers each group has, and their mean; NaN, a shot not measured, is none."""
+    measured = ~np.isnan(values)
+    number = np.bincount(group, measured)
+    with np.errstate(invalid="ignore"):
+        return number, np.bincount(group, np.where(measured, values, 0.0)) / number
 
 
-def _mean(values: np.ndarray) -> float:
-    """Mean of the shots that were measured; NaN where none was."""
-    measured = values[~np.isnan(values)]
-    return float(measured.mean()) if len(measured) else np.nan
+def _shot_means(size: np.ndarray, group: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
+    """Mean of the shots of each setting, m, and its standard error.
 
-
-def _of_the_mean(error: np.ndarray, groups: list[np.ndarray]) -> np.ndarray:
-    """Errors of the means of shots that bring errors of their own."""
-    return np.array(
-        [
-            np.sqrt(np.nanmean(error[g] ** 2) / np.sum(~np.isnan(error[g])))
-            if (~np.isnan(error[g])).any()
-            else np.nan
-            for g in groups
-        ]
-    )
-
-
-def _standard_error(sizes: np.ndarray, groups: list[np.ndarray]) -> np.ndarray | None:
-    """Standard error of each mean in m, or None where too few repeat or all agree."""
-    shots = [sizes[g][~np.isnan(sizes[g])] for g in groups]
-    degrees = sum(max(len(s) - 1, 0) for s in shots)
-    if degrees < ENOUGH_DEGREES:
-        return None
-    relative = sum(((s - s.mean()) ** 2).sum() / s.mean() ** 2 for s in shots if len(s) > 1)
-    pooled = np.sqrt(relative / degrees)
-    if pooled == 0.0:
-        return None
-    errors = np.full(len(groups), np.nan)
-    for i, s in enumerate(shots):
-        if len(s):
-            own = s.std(ddof=1) if len(s) >= ENOUGH_SHOTS else 0.0
-            errors[i] = (own or pooled * s.mean()) / np.sqrt(len(s))
-    return errors
+    The error is None where too few repeat or all agree.
+    """
+    number, mean = _means(size, group)
+    square = number * _means((size - mean[group]) ** 2, group)[1]
+    degrees = np.maximum(number - 1, 0).sum()
+    pooled = np.sqrt(np.nansum(square / mean**2) / max(degrees, 1))
+    if degrees < ENOUGH_DEGREES or pooled == 0.0:
+        return mean, None
+    own = np.sqrt(square / np.maximum(number - 1, 1))
+    deviation = np.where((number >= ENOUGH_SHOTS) & (own > 0), own, pooled * mean)
+    return mean, deviation / np.sqrt(np.where(number > 0, number, np.nan))

@@ -1,25 +1,60 @@
-"""Results of earlier commands: the JSON that ``beamfit emittance --json`` wrote."""
+"""Results as the one JSON object that commands print, and the fitted beams of such an object."""
 
 from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from os import PathLike
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from beamfit import __version__
 from beamfit.errors import InputError
 from beamfit.studies.scan.wishes import Beam
+from beamfit.table import json_of
 
-__all__ = ["read_fitted_beams"]
+__all__ = ["read_fitted_beams", "results_text"]
 
 HOW = "the output of beamfit emittance --json"
 NUMBERS = ("sigma11", "sigma12", "sigma22")
 # Correlations rounded by a fit of nearly dependent numbers may have eigenvalues below zero by this.
 ROUNDED = 1e-9
+
+
+def results_text(
+    results: Sequence[Any],
+    inputs: Mapping[str, str | None],
+    command: str = "",
+    **further: Any,
+) -> str:
+    """Write the one JSON object of a command, or of a script that answers as one.
+
+    Parameters
+    ----------
+    results : sequence
+        Results, or what they give as JSON; one entry each.
+    inputs : mapping of str to str
+        Input files and their SHA-256, as `QuadScan.sha256` or `beamfit.io.files.digest`.
+    command : str
+        The command line.
+    **further
+        What concerns all results together, after them.
+
+    Returns
+    -------
+    str
+        JSON text; numbers that JSON cannot hold are null.
+
+    Examples
+    --------
+    >>> json.loads(results_text([{"a": float("inf")}], {}))["results"]
+    [{'a': None}]
+    """
+    document = {"beamfit": __version__, "command": command, "inputs": inputs, "results": results}
+    return json.dumps(json_of(document | further), indent=2, allow_nan=False)
 
 
 def read_fitted_beams(path: str | PathLike[str], rest_energy: float) -> dict[str, Beam]:

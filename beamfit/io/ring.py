@@ -173,11 +173,9 @@ def read_operation(path: str | PathLike[str]) -> Operation:
     section = top.section("operation")
     values, loss = section.values(OPERATION), top.section("ring").values(RING)["energy_loss"]
     if values["rf_voltage"] <= loss:
-        raise section.error(
-            f"{values['rf_voltage'] / 1e3:.6g} kV",
-            f"more than the loss of {loss / 1e3:.6g} kV a turn, or no beam is stored",
-            "rf_voltage_kV",
-        )
+        found = f"{values['rf_voltage'] / 1e3:.6g} kV"
+        expected = f"more than the loss of {loss / 1e3:.6g} kV a turn, or no beam is stored"
+        raise section.error(found, expected, "rf_voltage_kV")
     from beamfit.lifetime.ring import Operation, gas_mixture  # JAX from here on
 
     try:

@@ -13,7 +13,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
-from statistics import mode
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -173,11 +172,9 @@ def columns_of(
             usual = [f"{q}_{next(iter(UNITS[k]))}" if k else q for q, k in quantities.items()]
             raise sheet.header_error("an unknown column", nearest(header, usual), header)
         if column.key in found:
-            raise sheet.header_error(
-                f"{column.key} also in column '{found[column.key].header}'",
-                "one column for it, in one unit, and none twice",
-                header,
-            )
+            twice = f"{column.key} also in column '{found[column.key].header}'"
+            expected = "one column for it, in one unit, and none twice"
+            raise sheet.header_error(twice, expected, header)
         found[column.key] = column
     return found
 
@@ -192,11 +189,8 @@ def _known(header: str, quantities: Mapping[str, str], sheet: Sheet) -> Column |
     units = UNITS[kind]
     if unit not in units:
         listed = ", ".join(u for u in units if u.isascii())
-        raise sheet.header_error(
-            f"unknown unit '{unit}'",
-            f"one of {listed} at the end, such as {name}_{next(iter(units))}",
-            header,
-        )
+        expected = f"one of {listed} at the end, such as {name}_{next(iter(units))}"
+        raise sheet.header_error(f"unknown unit '{unit}'", expected, header)
     return Column(header, name, unit, units[unit])
 
 
@@ -270,24 +264,16 @@ def _split(text: str, separator: str, path: str | PathLike[str], line: int) -> l
     try:
         cells = next(csv.reader([text], delimiter=separator, skipinitialspace=separator != "\t"))
     except csv.Error:  # a carriage return within the line
-        raise InputError(
-            "line ends that are carriage returns",
-            "line feeds: save the file as CSV (UTF-8) again",
-            path=path,
-            line=line,
-        ) from None
+        expected = "line feeds: save the file as CSV (UTF-8) again"
+        raise InputError("line ends that are carriage returns", expected, path, line) from None
     return [cell.strip() for cell in cells]
 
 
 def _check_header(names: list[str], example: str, path: str | PathLike[str], line: int) -> None:
     """Tell what is put in the place of a header."""
     if names[0].startswith("format") and "beamfit-" in names[-1]:
-        raise InputError(
-            "a lattice where the table should be",
-            "the scan first and the lattice after --lattice; are they swapped?",
-            path=path,
-            line=line,
-        )
+        expected = "the scan first and the lattice after --lattice; are they swapped?"
+        raise InputError("a lattice where the table should be", expected, path, line)
     try:
         [float(name) for name in names]
     except ValueError:
@@ -316,12 +302,12 @@ def _read_hdf5(path: str | PathLike[str], most: int | None) -> Sheet:
     except InputError:
         raise
     except (OSError, RuntimeError, ValueError, TypeError, KeyError):
-        raise InputError(
-            "a file that is not HDF5, or is damaged", "an HDF5 file; text is .csv", path=path
-        ) from None
+        found = "a file that is not HDF5, or is damaged"
+        raise InputError(found, "an HDF5 file; text is .csv", path) from None
     if not names:
         raise InputError("no datasets", "one dataset a column", path=path)
-    usual = mode(sorted(len(column) for column in cells))
+    lengths = sorted(len(column) for column in cells)
+    usual = max(lengths, key=lengths.count)
     like = next(n for n, column in zip(names, cells, strict=True) if len(column) == usual)
     for name, column in zip(names, cells, strict=True):
         if len(column) != usual:

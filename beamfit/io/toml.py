@@ -238,16 +238,9 @@ def read_toml(path: str | PathLike[str], what: str) -> Section:
         return Section(path, lines, tomllib.loads(text), sha256=seen.hexdigest())
     except (ValueError, RecursionError) as error:  # integers too long, nesting too deep
         if re.search(r"^[^#=\n]*\bsize_[xy]_", text, re.MULTILINE):
-            raise InputError(
-                f"a scan where {what} should be",
-                "the scan first and the lattice after --lattice; are they swapped?",
-                path=path,
-            ) from None
-        line = re.search(r"at line (\d+)", str(error))
-        cause = re.sub(r"\s*\(at .*\)", "", str(error))
-        raise InputError(
-            f"TOML that does not parse ({cause})",
-            f"{what} file in TOML",
-            path=path,
-            line=int(line[1]) if line else len(lines),
-        ) from None
+            expected = "the scan first and the lattice after --lattice; are they swapped?"
+            raise InputError(f"a scan where {what} should be", expected, path) from None
+        told = re.search(r"at line (\d+)", str(error))
+        line = int(told[1]) if told else len(lines)
+        found = "TOML that does not parse ({})".format(re.sub(r"\s*\(at .*\)", "", str(error)))
+        raise InputError(found, f"{what} file in TOML", path, line) from None

@@ -1,5 +1,5 @@
 """How a stored beam decays: the law, the loss mechanisms, and the fit of the law's parameters."""
 
-import jax
+from beamfit.compile_cache import prepare_jax
 
-jax.config.update("jax_enable_x64", True)
+prepare_jax()

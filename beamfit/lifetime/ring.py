@@ -8,6 +8,8 @@ import jax
 import jax.numpy as jnp
 from scipy import constants
 
+from beamfit.particles import REST_ENERGY
+
 __all__ = [
     "ELECTRON_MASS_EV",
     "ELECTRON_RADIUS",
@@ -18,7 +20,7 @@ __all__ = [
     "gas_mixture",
 ]
 
-ELECTRON_MASS_EV = constants.m_e * constants.c**2 / constants.e
+ELECTRON_MASS_EV = 1e6 * REST_ENERGY["electron"]
 ELECTRON_RADIUS = constants.physical_constants["classical electron radius"][0]
 
 # Atoms in a molecule: the gases of an electron ring's residual-gas spectra.

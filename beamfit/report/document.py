@@ -14,29 +14,34 @@ import jinja2
 from matplotlib.figure import Figure, FigureBase
 
 import beamfit
+from beamfit.status import Status
+from beamfit.table import Table
 
-__all__ = ["Page", "Picture", "Table", "Verdict", "by_name", "html_of", "provenance", "written"]
+__all__ = ["STYLE", "Page", "Picture", "Verdict", "html_of", "provenance", "written"]
+
+
+STYLE = {
+    "font.size": 10,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.titleweight": "bold",
+    "axes.titlesize": 11,
+    "axes.titlelocation": "left",
+    "figure.dpi": 110,
+    "text.parse_math": False,  # a $ in a name is a $
+}
+# Blue and red of the page; those of the planes.
+BLUE, RED = "#1f5fa8", "#b5421f"
+# More points than this are drawn as an image: as curves they would fill the page with bytes.
+MANY = 500
 
 
 class Verdict(NamedTuple):
     """A status with its headline and its sentence."""
 
-    status: str
+    status: Status
     headline: str
     message: str
-
-
-class Table(NamedTuple):
-    """A table under a heading; an empty header leaves the head row out.
-
-    `numeric` sets all cells but the first column's flush right.
-    """
-
-    title: str
-    header: list[str]
-    rows: list[list[str]]
-    note: str = ""
-    numeric: bool = False
 
 
 class Picture(NamedTuple):
@@ -58,35 +63,6 @@ class Page(NamedTuple):
     pictures_title: str
     provenance: list[tuple[str, str]]
     notes: tuple[str, ...]
-
-
-def by_name(
-    title: str,
-    names: list[str],
-    rows: list[tuple[str, list[str]]],
-    note: str = "",
-    numeric: bool = False,
-) -> Table:
-    """Make a table of labelled rows with one column a result.
-
-    Parameters
-    ----------
-    title : str
-        Heading.
-    names : list of str
-        One a result.
-    rows : list of (str, list of str)
-        Label and cells.
-    note : str, optional
-        A sentence between heading and table.
-    numeric : bool, optional
-        Whether cells are set flush right.
-
-    Returns
-    -------
-    Table
-    """
-    return Table(title, ["", *names], [[label, *cells] for label, cells in rows], note, numeric)
 
 
 def provenance(

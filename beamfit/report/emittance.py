@@ -1,23 +1,31 @@
-"""The report of an emittance fit."""
+"""The report of an emittance fit: its tables, the scan with its residuals, the ellipses."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import partial
 
-from beamfit.quantity import Status
-from beamfit.report.document import Page, Picture, Table, Verdict, by_name, provenance, written
-from beamfit.report.figures import pictures
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import FigureBase
+
+from beamfit.report.document import BLUE, MANY, RED, Page, Picture, Verdict, provenance, written
+from beamfit.status import Status
 from beamfit.studies.scan.fit import EmittanceFit
-from beamfit.studies.scan.results import PlaneFit
-from beamfit.studies.scan.sensitivity import budget_rows, range_rows
-from beamfit.studies.scan.tables import (
+from beamfit.studies.scan.results import (
+    PlaneFit,
     identifiability_rows,
     parameter_rows,
     point_rows,
     result_rows,
 )
+from beamfit.studies.scan.sensitivity import budget_rows, range_rows
+from beamfit.studies.scan.transport import scanned_line, transfer_rows
+from beamfit.table import Table, labelled
 
-__all__ = ["emittance_page"]
+__all__ = ["COLOUR", "draw_ellipses", "draw_scan", "emittance_page"]
+
+COLOUR = {"x": BLUE, "y": RED}
 
 ERRORS = (
     "Errors are one standard deviation, scaled by sqrt(χ²/dof) where that exceeds 1. "
@@ -49,20 +57,20 @@ def emittance_page(
     names = [p.plane for p in fit.planes]
     source = scan.error_source if scan.error else "none in the file; inferred"
     tables = [
-        by_name("Result", names, result_rows(fit.planes), ERRORS),
-        by_name("What the data determine", names, identifiability_rows(fit.planes)),
-        *(_budgets(fit, names) if fit.scenario == "known" else _fitted_too(fit)),
+        labelled("Result", names, result_rows(fit.planes), ERRORS),
+        labelled("What the data determine", names, identifiability_rows(fit.planes)),
+        *(_budgets(fit, names) if fit.statement.closed else _fitted_too(fit)),
         *(Table(f"Points, {p.plane} plane", *point_rows(p), numeric=True) for p in fit.planes),
     ]
     energy = f"{float(line.energy):g} MeV"
-    if fit.scenario != "known":
+    if not fit.statement.closed:
         energy += f", scenario {fit.scenario}"
     return Page(
         title=f"Emittance of {scan.name}",
         subtitle=f"{len(scan)} settings on line {line.name}, {energy}; {written()}",
         verdicts=[_verdict(p) for p in fit.planes],
         tables=tables,
-        pictures=[Picture(*each) for each in pictures(fit)],
+        pictures=_pictures(fit),
         pictures_title="Scan and fit",
         provenance=provenance(inputs, [("errors of the sizes", source)], command),
         notes=scan.provenance,
@@ -72,14 +80,14 @@ def emittance_page(
 def _budgets(fit: EmittanceFit, names: list[str]) -> list[Table]:
     """What the emittance would be with another line or fewer points."""
     return [
-        by_name(
+        labelled(
             "If the line were a little different",
             names,
             budget_rows(fit),
             "Relative change of the normalised emittance, from exact derivatives.",
             numeric=True,
         ),
-        by_name(
+        labelled(
             "If some points were left out",
             names,
             range_rows(fit),
@@ -105,9 +113,164 @@ def _verdict(p: PlaneFit) -> Verdict:
     determined = p.status is not Status.unidentified
     value = f"normalised emittance {p.normalized_emittance}"
     headline = value if determined else "emittance not determined"
-    return Verdict(p.status.value, f"{p.plane}: {headline}", p.message)
+    return Verdict(p.status, f"{p.plane}: {headline}", p.message)
 
 
 def _anchor(fit: EmittanceFit) -> str:
     """What ties a network to the lattice; a calibration has priors instead."""
-    return f"Anchor: {fit.anchor}." if fit.scenario.endswith("network") else ""
+    return f"Anchor: {fit.anchor}." if fit.statement.network else ""
+
+
+def draw_scan(figure: FigureBase, fit: EmittanceFit, plane: str) -> None:
+    """Draw one plane's sizes with the fit, and the residuals in standard errors below.
+
+    One varied magnet gives a curve against its setting; several give the points in order.
+
+    Parameters
+    ----------
+    figure : Figure or SubFigure
+        Where to.
+    fit : EmittanceFit
+        The fit.
+    plane : str
+        "x" or "y".
+    """
+    p = fit[plane]
+    above, below = figure.subplots(2, 1, sharex=True, height_ratios=(3, 1))
+    varied = [n for n, v in p.points.settings.items() if np.ptp(v) > 0]
+    if len(varied) == 1:
+        at = p.points.settings[varied[0]]
+        if not fit.statement.whole_map:  # known at the measured currents alone
+            above.plot(at, 1e6 * p.points.model, "_", ms=14, mew=2, color=COLOUR[plane], alpha=0.6)
+        else:
+            _curves(above, fit, p, varied[0])
+        below.set_xlabel(f"{varied[0]}, {p.points.units[varied[0]]}")
+    else:
+        at = np.arange(1, len(p.points.size) + 1)
+        above.plot(at, 1e6 * p.points.model, "_", ms=14, mew=2, color=COLOUR[plane], alpha=0.6)
+        below.set_xlabel("measurement")
+    _points(above, p, at)
+    above.set_ylabel("rms size, µm")
+    above.set_ylim(bottom=0.0)
+    above.set_title(f"{plane} plane: {_headline(p)}")
+    below.axhspan(-1, 1, color="0.93")
+    below.axhline(0, color="0.6", lw=0.8)
+    below.plot(at, p.points.pull, "o", color=COLOUR[plane], ms=5, rasterized=len(at) > MANY)
+    finite = np.abs(p.points.pull[np.isfinite(p.points.pull)])
+    reach = max(3.0, 1.15 * float(finite.max(initial=0.0)))
+    below.set_ylim(-reach, reach)
+    below.set_ylabel("residual,\nstd. errors")
+
+
+def _headline(p: PlaneFit) -> str:
+    if p.status is Status.unidentified:
+        return "emittance not determined"
+    return f"normalised emittance {p.normalized_emittance}"
+
+
+def _curves(axes: Axes, fit: EmittanceFit, p: PlaneFit, magnet: str) -> None:
+    """One fitted curve for each screen, with the one-sigma band where σ has errors."""
+    scanned = scanned_line(fit.scan, fit.line)
+    values = p.points.settings[magnet]
+    margin = 0.04 * np.ptp(values)
+    grid = np.linspace(values.min() - margin, values.max() + margin, 201)
+    table = {n: np.full(len(grid), np.median(v)) for n, v in p.points.settings.items()}
+    table[magnet] = grid
+    screens = tuple(dict.fromkeys(p.points.screen))
+    energy = np.full(len(grid), float(fit.line.energy))
+    matrices = transfer_rows(scanned, table, energy, places=screens)
+    every = np.asarray(matrices.planes)[:, "xy".index(p.plane)]
+    sigma = np.array([q.value for q in p.sigma])
+    for index, screen in enumerate(screens):
+        a, b = every[:, index, 0, 0], every[:, index, 0, 1]
+        design = np.stack([a**2, 2 * a * b, b**2], -1)
+        known = float(np.median(p.points.known[[s == screen for s in p.points.screen]]))
+        size = np.sqrt(np.maximum(design @ sigma + known, 0.0))
+        style = ["-", "--", ":", "-."][index % 4]
+        name = "fit" if len(screens) == 1 else f"fit at {screen}"
+        axes.plot(grid, 1e6 * size, style, color=COLOUR[p.plane], lw=1.6, label=name)
+        # In a scenario the beam's errors go with those of the calibration: no band of σ alone.
+        if fit.statement.closed and np.isfinite(p.covariance).all():
+            variance = np.einsum("ij,jk,ik->i", design, p.covariance, design)
+            half = p.error_scale * np.sqrt(variance) / (2.0 * np.maximum(size, 1e-9))
+            axes.fill_between(
+                grid,
+                1e6 * np.maximum(size - half, 0),
+                1e6 * (size + half),
+                color=COLOUR[p.plane],
+                alpha=0.15,
+                lw=0,
+            )
+    axes.legend(frameon=False, loc="best")
+
+
+def _points(axes: Axes, p: PlaneFit, at: np.ndarray) -> None:
+    """Measured points; what the robust fit doubts is drawn hollow."""
+    error = np.nan_to_num(1e6 * p.points.error)
+    doubt = p.points.outlier_probability
+    good = np.ones(len(at), bool) if doubt is None else doubt < 0.5
+    for keep, face in ((good, COLOUR[p.plane]), (~good, "white")):
+        if keep.any():
+            axes.errorbar(
+                at[keep],
+                1e6 * p.points.size[keep],
+                error[keep],
+                fmt="o",
+                ms=5,
+                capsize=3,
+                color=COLOUR[p.plane],
+                mfc=face,
+                rasterized=len(at) > MANY,
+            )
+
+
+def draw_ellipses(figure: FigureBase, fit: EmittanceFit) -> None:
+    """Draw the one-sigma phase ellipses at the start of the line and at the screen.
+
+    Parameters
+    ----------
+    figure : Figure or SubFigure
+        Where to.
+    fit : EmittanceFit
+        A fit with a positive emittance in at least one plane.
+    """
+    drawn = [p for p in fit.planes if _has_ellipses(p)]
+    start, screen = figure.subplots(1, 2)
+    for p in drawn:
+        _ellipse(start, p, p.beta.value, p.alpha.value)
+        _ellipse(screen, p, p.screen.beta.value, p.screen.alpha.value)
+    start.set_title("phase ellipse at the start")
+    screen.set_title(f"at {drawn[0].screen.name}")
+    for axes in (start, screen):
+        axes.set_xlabel("position, µm")
+        axes.set_ylabel("angle, µrad")
+        axes.axhline(0, color="0.85", lw=0.8, zorder=0)
+        axes.axvline(0, color="0.85", lw=0.8, zorder=0)
+    handles, labels = start.get_legend_handles_labels()
+    figure.legend(handles, labels, frameon=False, loc="outside lower center", ncols=2)
+
+
+def _pictures(fit: EmittanceFit) -> list[Picture]:
+    listed = [
+        Picture(f"scan of the {p.plane} plane", 4.6, partial(draw_scan, fit=fit, plane=p.plane))
+        for p in fit.planes
+    ]
+    if any(_has_ellipses(p) for p in fit.planes):
+        listed.append(Picture("phase ellipses", 3.4, partial(draw_ellipses, fit=fit)))
+    return listed
+
+
+def _has_ellipses(p: PlaneFit) -> bool:
+    """Whether the beam has an area, and is known at the screen as well."""
+    return p.emittance.value > 0 and bool(np.isfinite(p.screen.beta.value))
+
+
+def _ellipse(axes: Axes, p: PlaneFit, beta: float, alpha: float) -> None:
+    """The points (u, u') of one sigma: u = sqrt(εβ) cos φ, u' = -sqrt(ε/β)(α cos φ + sin φ)."""
+    turn = np.linspace(0.0, 2.0 * np.pi, 181)
+    e = p.emittance.value
+    u = np.sqrt(e * beta) * np.cos(turn)
+    angle = -np.sqrt(e / beta) * (alpha * np.cos(turn) + np.sin(turn))
+    sure = p.status is not Status.unidentified
+    label = p.plane if sure else f"{p.plane} (not determined)"
+    axes.plot(1e6 * u, 1e6 * angle, "-" if sure else ":", color=COLOUR[p.plane], label=label)

@@ -11,13 +11,12 @@ from matplotlib import rc_context
 from beamfit.errors import InputError
 from beamfit.io.files import write_atomically
 from beamfit.report.decays import decay_page
-from beamfit.report.document import html_of
+from beamfit.report.document import STYLE, html_of
 from beamfit.report.emittance import emittance_page
-from beamfit.report.figures import STYLE
 from beamfit.report.pdf import pdf_of
 from beamfit.report.posterior import with_beam_posterior, with_decay_posteriors
 from beamfit.sampling.posterior import Posterior
-from beamfit.studies.decay.result import DecayFit
+from beamfit.studies.decay.fit import DecayFit
 from beamfit.studies.decay.shift import Shift
 from beamfit.studies.decay.study import Decay, RecordStudy
 from beamfit.studies.scan.fit import EmittanceFit

@@ -10,12 +10,14 @@ from matplotlib.backends.backend_pdf import PdfPages
 from matplotlib.figure import Figure
 
 from beamfit.report.document import Page, Picture
+from beamfit.status import Status
+from beamfit.table import Table
 
 __all__ = ["pdf_of"]
 
 WIDTH, HEIGHT, MARGIN = 8.27, 11.69, 0.75  # A4, inches
 LINE = 0.185
-COLOUR = {"converged": "#2c7a3f", "poor_fit": "#c98a00"}
+COLOUR = {Status.converged: "#2c7a3f", Status.poor_fit: "#c98a00"}
 
 
 class _Pages:
@@ -53,15 +55,17 @@ class _Pages:
         self.text(words, size=12, weight="bold")
         self.y -= 1.5 * LINE
 
-    def table(self, header: list[str], rows: list[list[str]]) -> None:
+    def table(self, table: Table) -> None:
         """Write a table whose columns are as wide as their longest cell."""
-        lines = ([header] if header else []) + rows
-        widths = [max(len(line[i]) for line in lines) for i in range(len(lines[0]))]
+        lines = ([table.header] if table.header else []) + list(table.rows)
+        count = max(len(line) for line in lines)
+        lines = [[*line, *[""] * (count - len(line))] for line in lines]
+        widths = [max(len(line[i]) for line in lines) for i in range(count)]
         for number, cells in enumerate(lines):
             self.room(1)
             x = 0.0
             for cell, width in zip(cells, widths, strict=True):
-                bold = "bold" if header and number == 0 else "normal"
+                bold = "bold" if table.header and number == 0 else "normal"
                 self.text(cell, x=x, size=8.5, weight=bold)
                 x += 0.078 * width + 0.28
             self.y -= LINE
@@ -119,7 +123,7 @@ def pdf_of(page: Page) -> bytes:
         if table.note:
             pages.paragraph(table.note, color="0.35")
         if table.rows:
-            pages.table(table.header, table.rows)
+            pages.table(table)
     pages.heading("Provenance")
     for label, value in page.provenance:
         pages.paragraph(f"{label}: {value}", size=8.5)

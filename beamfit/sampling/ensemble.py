@@ -3,21 +3,21 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Iterator
 from os import PathLike
-from typing import Any
 
 import numpy as np
 
 from beamfit.errors import InputError
 from beamfit.sampling import store as disk
-from beamfit.sampling.convergence import Diagnostics, diagnose
-from beamfit.sampling.moves import about, fitted, moves_of, share_of
-from beamfit.sampling.place import check_place
+from beamfit.sampling.convergence import RULES, Diagnostics, Evidence, diagnose, held_by_priors
+from beamfit.sampling.moves import Proposal, about, fitted, moves_of, share_of
 from beamfit.sampling.posterior import Posterior
 from beamfit.sampling.progress import Watch
-from beamfit.sampling.store import Checkpoint, Provenance
+from beamfit.sampling.store import FROM_PYTHON, Checkpoint, Provenance
 from beamfit.sampling.target import Target
-from beamfit.sampling.verdict import conclude, refused
+from beamfit.status import Status
+from beamfit.verdict import judge
 
 __all__ = ["draw", "first_walkers"]
 
@@ -41,7 +41,7 @@ def draw(
     budget: int = 20_000,
     walkers: int | None = None,
     store: str | PathLike[str] | None = None,
-    provenance: Provenance | None = None,
+    provenance: Provenance = FROM_PYTHON,
     progress: bool = False,
 ) -> Posterior:
     """Draw from a posterior until enough is known or the budget is spent.
@@ -62,7 +62,7 @@ def draw(
     store : str or path, optional
         HDF5 file to keep the chain in. If it holds the beginning of this chain, sampling goes on
         from there.
-    provenance : Provenance, optional
+    provenance : Provenance
         For the store.
     progress : bool
         Show a progress bar on standard error.
@@ -83,35 +83,44 @@ def draw(
     `beamfit.sampling.moves`. The proposals of the leaps are refitted to the walkers during the
     warm-up and stay fixed afterwards, so that what is kept is an exact Markov chain.
     """
-    n = len(target.names)
-    walkers = walkers or max(FEWEST_WALKERS, 4 * n)
-    _check_options(n, target_ess, budget, walkers)
-    if not (isinstance(seed, int | np.integer) and 0 <= seed < 2**32):
-        raise InputError(f"seed {seed!r}", "a whole number from 0 to 4294967295")
-    provenance = provenance or Provenance()
+    walkers = walkers or max(FEWEST_WALKERS, 4 * len(target.names))
+    _check_options(len(target.names), seed, target_ess, budget, walkers)
+    state = None
     if store is not None:
-        check_place(store)
-    state = None if store is None else disk.load(store, target, seed, walkers)
+        disk.check_place(store)
+        state = disk.load(store, target, seed, walkers)
     if target.open_directions:
-        return refused(target, seed, "unidentified", target.open_directions)
-    start = None
+        return _refused(target, seed, Status.unidentified, target.open_directions)
+    start, random = None, np.random.RandomState(seed)
     if state is None:
-        random = np.random.RandomState(seed)
         start = first_walkers(target, walkers, random)
         if start is None:
             said = "no point within the bounds and constraints was found; relax them"
-            return refused(target, seed, "infeasible", said)
-        state = _begin(target, start, random, seed)
-    return _run(target, state, start, target_ess, budget, store, provenance, progress)
+            return _refused(target, seed, Status.infeasible, said)
+        chain = np.zeros((0, *start.shape))
+        state = Checkpoint(chain, chain[..., 0], random.get_state(), 0.5, 0, False, seed)
+    stored, due, begun = len(state.chain), time.perf_counter(), state
+    with Watch(progress, target_ess) as watch:
+        for state, found in _blocks(target, begun, start, target_ess, budget):
+            watch.show(state, found)
+            if store is not None and time.perf_counter() >= due:
+                spent = disk.save(store, target, state, provenance)
+                stored, due = len(state.chain), time.perf_counter() + spent / WRITING
+    posterior = _concluded(target, state, target_ess, budget)
+    if store is not None and (stored < len(state.chain) or not disk.finished(store)):
+        disk.save(store, target, state, provenance, posterior.to_json())
+    return posterior
 
 
-def _check_options(n: int, target_ess: float, budget: int, walkers: int) -> None:
+def _check_options(n: int, seed: int, target_ess: float, budget: int, walkers: int) -> None:
     if walkers < 2 * n or walkers % 2:
         raise InputError(f"{walkers} walkers for {n} numbers", f"an even number from {2 * n} on")
     if not target_ess > 0:
         raise InputError(f"a target of {target_ess} effective samples", "a positive number")
     if budget < BLOCK:
         raise InputError(f"a budget of {budget} steps", f"{BLOCK} or more")
+    if not (isinstance(seed, int | np.integer) and 0 <= seed < 2**32):
+        raise InputError(f"seed {seed!r}", "a whole number from 0 to 4294967295")
 
 
 def first_walkers(target: Target, number: int, random: np.random.RandomState) -> np.ndarray | None:
@@ -151,118 +160,123 @@ def first_walkers(target: Target, number: int, random: np.random.RandomState) ->
     return None
 
 
-def _begin(
-    target: Target, start: np.ndarray, random: np.random.RandomState, seed: int
-) -> Checkpoint:
-    walkers, n = start.shape
-    return Checkpoint(
-        chain=np.zeros((0, walkers, n)),
-        log_prob=np.zeros((0, walkers)),
-        accepted=np.zeros(walkers),
-        accepted_before=np.zeros(walkers),
-        random_state=random.get_state(),
-        proposal=about(target.covariance, target.widening, target.blocks, 5.0),
-        share=0.5,
-        began=0,
-        producing=False,
-        seed=seed,
-    )
-
-
-def _run(
-    target: Target,
-    state: Checkpoint,
-    start: np.ndarray | None,
-    target_ess: float,
-    budget: int,
-    store: str | PathLike[str] | None,
-    provenance: Provenance,
-    progress: bool,
-) -> Posterior:
+def _blocks(
+    target: Target, state: Checkpoint, start: np.ndarray | None, target_ess: float, budget: int
+) -> Iterator[tuple[Checkpoint, Diagnostics | None]]:
     """Sample block by block; every decision depends on the chain alone."""
-    spent, due = 0.0, time.perf_counter()
-    stored = len(state.chain)
-    with Watch(progress, target_ess, len(state.chain)) as watch:
-        while True:
-            found = _judged(state)
-            enough = found is not None and found.settled and np.min(found.effective) >= target_ess
-            steps = len(state.chain)
-            if enough or steps + BLOCK > budget:
-                break
-            state = _next_stage(target, _block(target, state, start))
-            start = None
-            watch.show(state, found)
-            if store is not None and time.perf_counter() >= due:
-                spent = disk.save(store, target, state, provenance)
-                stored = len(state.chain)
-                due = time.perf_counter() + spent / WRITING
-    kept = state.chain[state.began :] if state.producing else state.chain[:0]
-    final = found if found is not None and found.steps == len(kept) else diagnose(kept)
-    posterior = conclude(target, state, final, target_ess, budget)
-    if store is not None and (stored < len(state.chain) or not disk.finished(store)):
-        disk.save(store, target, state, provenance, posterior.to_json())
-    return posterior
+    proposal = _proposal(target, state)
+    while True:
+        found = _judged(state)
+        enough = found is not None and found.settled and np.min(found.effective) >= target_ess
+        if enough or len(state.chain) + BLOCK > budget:
+            return
+        state, start = _block(target, state, start, proposal), None
+        if not state.producing and len(state.chain) in ROUNDS:
+            state = state._replace(began=len(state.chain))
+            proposal = _proposal(target, state)
+            state = _next_stage(target, state, proposal)
+        yield state, found
 
 
 def _judged(state: Checkpoint) -> Diagnostics | None:
     """Judge the chain at lengths that grow by a quarter, None between them."""
-    length = len(state.chain) - state.began
-    if not state.producing or length < 2 * BLOCK:
+    length = len(state.counting)
+    if length < 2 * BLOCK:
         return None
     look = 2 * BLOCK
     while look < length:
         look = BLOCK * int(np.ceil(1.25 * look / BLOCK))
-    return diagnose(state.chain[state.began :]) if look == length else None
+    return diagnose(state.counting) if look == length else None
 
 
-def _block(target: Target, state: Checkpoint, start: np.ndarray | None) -> Checkpoint:
+def _block(
+    target: Target, state: Checkpoint, start: np.ndarray | None, proposal: Proposal
+) -> Checkpoint:
     """Advance the chain by one block."""
     import emcee
 
-    walkers, n = state.chain.shape[1:]
     backend = emcee.backends.Backend()
     sampler = emcee.EnsembleSampler(
-        walkers,
-        n,
+        *state.chain.shape[1:],
         target.log_probability,
-        moves=moves_of(state.proposal, state.share),
+        moves=moves_of(proposal, state.share),
         backend=backend,
         vectorize=True,
     )
-    if start is None:
-        last: Any = emcee.State(
-            state.chain[-1], state.log_prob[-1], random_state=state.random_state
-        )
-    else:
-        last = emcee.State(start, random_state=state.random_state)
+    at, log_prob = (state.chain[-1], state.log_prob[-1]) if start is None else (start, None)
+    last = emcee.State(at, log_prob, random_state=state.random_state)
     sampler.run_mcmc(last, BLOCK, skip_initial_state_check=True)
     return state._replace(
         chain=np.concatenate([state.chain, backend.chain]),
         log_prob=np.concatenate([state.log_prob, backend.log_prob]),
-        accepted=state.accepted + backend.accepted,
         random_state=backend.random_state,
     )
 
 
-def _next_stage(target: Target, state: Checkpoint) -> Checkpoint:
-    """Refit the proposals at the end of a round of the warm-up; end it when walkers agree."""
-    steps = len(state.chain)
-    if state.producing or steps not in ROUNDS:
-        return state
-    half = slice((state.began + steps) // 2, steps)
+def _half_round(state: Checkpoint) -> slice:
+    """The later half of the round of the warm-up that ended where the present stage began."""
+    before = max((end for end in ROUNDS if end < state.began), default=0)
+    return slice((before + state.began) // 2, state.began)
+
+
+def _proposal(target: Target, state: Checkpoint) -> Proposal:
+    """How to leap: about the fit at first, then as fitted to the walkers of half a round."""
+    first = about(target.covariance, target.widening, target.blocks, 5.0)
+    recent = state.chain[_half_round(state)]
+    return fitted(recent.reshape(-1, recent.shape[2]), first) if state.began else first
+
+
+def _next_stage(target: Target, state: Checkpoint, proposal: Proposal) -> Checkpoint:
+    """How often to leap from now on, and whether the walkers agree, which ends the warm-up."""
+    half = _half_round(state)
     recent, log_prob = state.chain[half], state.log_prob[half]
-    points, logs = recent.reshape(-1, recent.shape[2]), log_prob.ravel()
-    proposal = fitted(points, state.proposal)
     # Chance of its own, so that looking at a proposal does not change the chain.
-    drawn = proposal.draw(np.random.RandomState(steps), 8 * recent.shape[1])
+    drawn = proposal.draw(np.random.RandomState(state.began), 8 * recent.shape[1])
     density = [target.log_probability(part) for part in np.split(drawn, 8)]
-    share = share_of(proposal, points, logs, drawn, np.concatenate(density))
-    agreed = bool(np.max(diagnose(recent).rhat) < WARM) and state.began > 0
-    done = agreed or steps == ROUNDS[-1]
-    return state._replace(
-        proposal=proposal,
-        share=share,
-        began=steps,
-        producing=done,
-        accepted_before=state.accepted,
+    points = recent.reshape(-1, recent.shape[2])
+    share = share_of(proposal, points, log_prob.ravel(), drawn, np.concatenate(density))
+    agreed = state.began > ROUNDS[0] and np.max(diagnose(recent).rhat) < WARM
+    return state._replace(share=share, producing=bool(agreed) or state.began == ROUNDS[-1])
+
+
+def _refused(target: Target, seed: int, status: Status, said: str) -> Posterior:
+    """A posterior that was not sampled, and why."""
+    chain = np.zeros((0, 0, len(target.names)))
+    every, nothing = (*target.derived_names, *target.names), diagnose(chain)
+    message = f"Not sampled: {said}."
+    return Posterior(
+        target, chain, chain[..., 0], status, message, nothing, float("nan"), 0, seed, every
+    )
+
+
+def _concluded(target: Target, state: Checkpoint, target_ess: float, budget: int) -> Posterior:
+    """Judge a finished chain."""
+    chain, began = state.counting, state.began
+    found = diagnose(chain)
+    held = (*target.derived_names, *target.names)
+    if len(chain):
+        held = held_by_priors(target, chain.reshape(-1, chain.shape[2]))
+    held = tuple(dict.fromkeys((*target.priors_own, *held)))
+    shown = tuple(name for name in held if name not in target.hidden)
+    verdict = judge(
+        Evidence(found, target.names, target_ess, budget, shown, target.verdict, target.groups),
+        RULES,
+    )
+    sampled = (
+        f"{np.min(found.effective):.0f} effective draws after {began} steps left out "
+        f"(autocorrelation {np.max(found.autocorrelation):.1f} steps, "
+        f"R-hat {np.max(found.rhat):.3f})."
+    )
+    said = (verdict.message, sampled if len(chain) else "", target.remark)
+    return Posterior(
+        target=target,
+        chain=chain,
+        log_prob=state.log_prob[len(state.log_prob) - len(chain) :],
+        status=verdict.status,
+        message=" ".join(part for part in said if part),
+        diagnostics=found,
+        acceptance=state.acceptance,
+        warmup=began,
+        seed=state.seed,
+        held=held,
     )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax
@@ -11,11 +12,31 @@ from jax import Array
 
 from beamfit.errors import InputError
 
-__all__ = ["FRACTION", "LOG_NOISE", "Group", "Likelihood", "log_likelihood", "outlier_density"]
+__all__ = [
+    "FRACTION",
+    "LOG_NOISE",
+    "Group",
+    "Own",
+    "log_likelihood",
+    "noise_words",
+    "outlier_density",
+]
 
 LOG_NOISE, FRACTION = "log_noise", "outlier_fraction"
 # An outlier's own error is unknown: anything from so many to so many of the stated ones.
 NARROWEST, WIDEST = 3.0, 1e5
+# The noise is sought within a factor e^10 of where the fit saw it.
+NOISE_REACH = 10.0
+
+
+class Own(NamedTuple):
+    """A number of the likelihood's own: where it may lie, begins, and how far it spreads."""
+
+    name: str
+    lower: float
+    upper: float
+    start: float
+    spread: float
 
 
 class Group(NamedTuple):
@@ -42,38 +63,42 @@ class Group(NamedTuple):
         return f"{self.label}." if self.label else ""
 
     @property
-    def names(self) -> tuple[str, ...]:
-        """The numbers it adds to those of the model."""
-        added = (LOG_NOISE,) * (self.noise == "inferred") + (FRACTION,) * self.outliers
-        return tuple(self.prefix + name for name in added)
+    def inferred(self) -> bool:
+        """Whether the factor on its errors is free."""
+        return self.noise == "inferred"
 
-
-class Likelihood(NamedTuple):
-    """How the points scatter, group by group.
-
-    Attributes
-    ----------
-    groups : tuple of Group
-        In the order of the residuals.
-    """
-
-    groups: tuple[Group, ...] = (Group(),)
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """The numbers it adds to those of the model."""
-        return tuple(name for group in self.groups for name in group.names)
-
-    def check(self) -> None:
-        """Refuse a noise that is neither known nor inferred.
+    def own(self, factor: float = 1.0) -> tuple[Own, ...]:
+        """The numbers it adds to those of the model, where the errors seem so much too small.
 
         Raises
         ------
         InputError
+            If the noise is neither known nor inferred.
         """
-        for group in self.groups:
-            if group.noise not in ("known", "inferred"):
-                raise InputError(f"noise '{group.noise}'", "known or inferred")
+        if self.noise not in ("known", "inferred"):
+            raise InputError(f"noise '{self.noise}'", "known or inferred")
+        at = math.log(max(factor, 1e-300))
+        noise = Own(self.prefix + LOG_NOISE, at - NOISE_REACH, at + NOISE_REACH, at, 0.1)
+        fraction = Own(self.prefix + FRACTION, 0.0, 0.5, 0.1, 0.07)
+        return (noise,) * self.inferred + (fraction,) * self.outliers
+
+
+def noise_words(groups: Sequence[Group]) -> str:
+    """Say of each group of points what is taken of its errors.
+
+    Examples
+    --------
+    >>> noise_words((Group("x", "inferred"), Group("y")))
+    'x inferred from the residuals; y as stated'
+    """
+    said = [
+        ("inferred from the residuals" if group.inferred else "as stated")
+        + (", with outliers" if group.outliers else "")
+        for group in groups
+    ]
+    if len(set(said)) == 1:
+        return said[0]
+    return "; ".join(f"{g.label} {words}" for g, words in zip(groups, said, strict=True))
 
 
 def outlier_density(residual: Array) -> Array:
@@ -106,33 +131,38 @@ def outlier_density(residual: Array) -> Array:
     return jnp.where(near, limit, between) / math.log(WIDEST / NARROWEST)
 
 
-def _of_group(residual: Array, group: Group, extra: list[Array]) -> Array:
-    log_scale = extra.pop(0) if group.noise == "inferred" else 0.0
+def _of_group(residual: Array, counts: Array, group: Group, extra: list[Array]) -> Array:
+    log_scale = extra.pop(0) if group.inferred else 0.0
     scaled = residual * jnp.exp(-log_scale)
-    normal = -0.5 * scaled**2
-    if not group.outliers:
-        return jnp.sum(normal) - residual.size * log_scale
-    fraction = extra.pop(0)
-    inside = (fraction >= 0) & (fraction <= 0.5)
-    safe = jnp.where(inside, fraction, 0.25)
-    good = normal - 0.5 * math.log(2 * math.pi) + jnp.log1p(-safe)
-    tiny = jnp.finfo(float).tiny
-    wild = jnp.log(jnp.maximum(safe, tiny)) + jnp.log(outlier_density(scaled) + tiny)
-    value = jnp.sum(jnp.logaddexp(good, wild)) - residual.size * log_scale
+    each = -0.5 * scaled**2
+    inside = True
+    if group.outliers:
+        fraction = extra.pop(0)
+        inside = (fraction >= 0) & (fraction <= 0.5)
+        safe = jnp.where(inside, fraction, 0.25)
+        good = each - 0.5 * math.log(2 * math.pi) + jnp.log1p(-safe)
+        tiny = jnp.finfo(float).tiny
+        wild = jnp.log(jnp.maximum(safe, tiny)) + jnp.log(outlier_density(scaled) + tiny)
+        each = jnp.logaddexp(good, wild)
+    value = jnp.sum(jnp.where(counts, each - log_scale, 0.0))
     return jnp.where(inside, value, -jnp.inf)
 
 
-def log_likelihood(residuals: tuple[Array, ...], likelihood: Likelihood, extra: Array) -> Array:
+def log_likelihood(
+    residuals: Sequence[Array], counts: Sequence[Array], groups: Sequence[Group], extra: Array
+) -> Array:
     """Log likelihood of residuals, up to a constant.
 
     Parameters
     ----------
-    residuals : tuple of array
+    residuals : sequence of array
         One vector a group, in units of the stated errors.
-    likelihood : Likelihood
-        Which.
-    extra : array, shape (len(likelihood.names),)
-        Its own numbers.
+    counts : sequence of bool or array of bool
+        Which of them count; the others fill a vector up to its length.
+    groups : sequence of Group
+        How they scatter.
+    extra : array, shape (k,)
+        The groups' own numbers, in order.
 
     Returns
     -------
@@ -143,9 +173,9 @@ def log_likelihood(residuals: tuple[Array, ...], likelihood: Likelihood, extra: 
 
     Examples
     --------
-    >>> print(log_likelihood((jnp.array([1.0, 2.0]),), Likelihood(), jnp.zeros(0)))
+    >>> print(log_likelihood([jnp.array([1.0, 2.0])], [True], [Group()], jnp.zeros(0)))
     -2.5
     """
     own = list(extra)
-    pairs = zip(residuals, likelihood.groups, strict=True)
-    return sum((_of_group(residual, group, own) for residual, group in pairs), jnp.zeros(()))
+    parts = zip(residuals, counts, groups, strict=True)
+    return sum((_of_group(*part, own) for part in parts), jnp.zeros(()))

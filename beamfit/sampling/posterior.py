@@ -10,17 +10,19 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from beamfit.errors import InputError, nearest
-from beamfit.quantity import Quantity, finite
+from beamfit.quantity import Quantity
 from beamfit.sampling.convergence import Diagnostics
+from beamfit.sampling.likelihood import LOG_NOISE
 from beamfit.sampling.priors import in_words
+from beamfit.sampling.summary import Interval, Summary, interval_table
 from beamfit.sampling.target import Target
-from beamfit.sampling.text import as_html, as_text
 from beamfit.status import Status
+from beamfit.table import Table, html_of, json_of, text_of
 
 if TYPE_CHECKING:
     from arviz import InferenceData
 
-__all__ = ["Band", "Correlations", "Interval", "Posterior"]
+__all__ = ["Band", "Correlations", "Expected", "Interval", "Posterior"]
 
 # One standard deviation of a normal distribution to each side.
 ONE_SIGMA = 0.6826894921370859
@@ -28,34 +30,7 @@ ONE_SIGMA = 0.6826894921370859
 ENOUGH_DRAWS = 4000
 # Beyond this R-hat walkers sit in places of their own.
 APART = 1.2
-
-
-class Interval(NamedTuple):
-    """A number's median and central credible interval.
-
-    Attributes
-    ----------
-    name : str
-        What it is.
-    median, lower, upper : float
-        In `unit`.
-    unit : str
-        Unit.
-    separable : bool
-        Whether the data decide it; if not, the interval is the prior's or the bounds' and is not
-        to be quoted.
-    """
-
-    name: str
-    median: float
-    lower: float
-    upper: float
-    unit: str
-    separable: bool = True
-
-    def __str__(self) -> str:
-        said = f"{self.name}: {self.median:.4g} ({self.lower:.4g} to {self.upper:.4g}) {self.unit}"
-        return said if self.separable else f"{said}, not separable"
+QUANTILES = (0.025, 0.16, 0.5, 0.84, 0.975)
 
 
 class Correlations(NamedTuple):
@@ -71,6 +46,24 @@ class Band(NamedTuple):
     lower: np.ndarray
     median: np.ndarray
     upper: np.ndarray
+
+
+class Expected(NamedTuple):
+    """What a posterior expects of measurements; arrays of shape (n,) or (2, n).
+
+    Attributes
+    ----------
+    median : array, shape (n,)
+        Of the model.
+    model : array, shape (2, n)
+        Ends of the 68 % interval of the model: how well the curve is known.
+    reading : array, shape (2, n)
+        Ends of the 95 % interval of a further reading, its noise included: where points should lie.
+    """
+
+    median: np.ndarray
+    model: np.ndarray
+    reading: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,7 +132,7 @@ class Posterior:
         """Names of what is asked for: derived numbers, then sampled ones but for hidden ones."""
         every = (*self.target.derived_names, *self.names)
         # The factor on the errors is shown, not its logarithm.
-        hidden = [name for name in self.names if name.endswith("log_noise")]
+        hidden = [name for name in self.names if name.endswith(LOG_NOISE)]
         return tuple(name for name in every if name not in (*hidden, *self.target.hidden))
 
     @property
@@ -148,27 +141,25 @@ class Posterior:
         return self.chain.reshape(-1, len(self.names))
 
     @cached_property
-    def _derived(self) -> np.ndarray:
-        return self.target.derive(self.draws)
+    def _numbers(self) -> dict[str, tuple[str, np.ndarray]]:
+        """Unit and draws of every number, the derived ones first."""
+        t = self.target
+        columns = np.concatenate([t.derive(self.draws), self.draws], axis=1).T
+        units = zip((*t.derived_units, *t.units), columns, strict=True)
+        return dict(zip((*t.derived_names, *t.names), units, strict=True))
+
+    def _number(self, name: str) -> tuple[str, np.ndarray]:
+        if name not in self._numbers:
+            raise InputError(f"no sampled number '{name}'", nearest(name, list(self._numbers)))
+        return self._numbers[name]
 
     def unit(self, name: str) -> str:
         """Unit of a number."""
-        self._check(name)
-        if name in self.names:
-            return self.target.units[self.names.index(name)]
-        return self.target.derived_units[self.target.derived_names.index(name)]
+        return self._number(name)[0]
 
     def values(self, name: str) -> np.ndarray:
         """All draws of one number, sampled or derived, shape (steps x walkers,)."""
-        self._check(name)
-        if name in self.names:
-            return self.draws[:, self.names.index(name)]
-        return self._derived[:, self.target.derived_names.index(name)]
-
-    def _check(self, name: str) -> None:
-        known = [*self.target.derived_names, *self.names]
-        if name not in known:
-            raise InputError(f"no sampled number '{name}'", nearest(name, known))
+        return self._number(name)[1]
 
     def __getitem__(self, name: str) -> Quantity:
         """Mean and standard deviation of a number; no error where the data do not decide it."""
@@ -178,9 +169,7 @@ class Posterior:
         error = None if name in self.held or self.apart else float(np.std(values))
         return Quantity(float(np.mean(values)), error, self.unit(name))
 
-    def quantiles(
-        self, name: str, probabilities: Sequence[float] = (0.025, 0.16, 0.5, 0.84, 0.975)
-    ) -> np.ndarray:
+    def quantiles(self, name: str, probabilities: Sequence[float] = QUANTILES) -> np.ndarray:
         """Quantiles of a number; NaN where nothing was sampled."""
         values = self.values(name)
         if not values.size:
@@ -237,36 +226,39 @@ class Posterior:
         ends = (0.5 - 0.5 * probability, 0.5, 0.5 + 0.5 * probability)
         return Band(*np.quantile(self.derive(function), ends, axis=0))
 
+    def expected(
+        self, function: Callable[[Any], Any], error: np.ndarray, label: str = ""
+    ) -> Expected:
+        """Expect readings such as were measured, and further ones like them.
+
+        Parameters
+        ----------
+        function : callable
+            As for `derive`: the model at each point, shape (n,).
+        error : array, shape (n,)
+            Stated errors.
+        label : str
+            Of the group of points, whose noise goes with them.
+
+        Returns
+        -------
+        Expected
+        """
+        draws, name = self.derive(function), f"{label}.{LOG_NOISE}".lstrip(".")
+        noise = np.ones(len(draws))
+        if name in self.names:
+            noise = np.exp(self.thinned()[:, self.names.index(name)])
+        normal = np.random.default_rng(self.seed).standard_normal(draws.shape)
+        readings = draws + noise[:, None] * error * normal
+        low, median, high = np.quantile(draws, (0.16, 0.5, 0.84), axis=0)
+        ends = np.quantile(readings, (QUANTILES[0], QUANTILES[-1]), axis=0)
+        return Expected(median, np.stack([low, high]), ends)
+
     @property
     def priors(self) -> Mapping[str, str]:
         """The priors, the problem's own and those given to `sample`, in words."""
         given = {name: in_words(prior) for name, prior in self.target.priors.items()}
         return {**self.target.stated, **given}
-
-    def to_json(self) -> dict[str, Any]:
-        """Give the ``posterior`` object of the JSON contract; intervals are null where held."""
-        d, shown = self.diagnostics, self.shown
-        found = self.correlations(shown)
-        document = {
-            "status": self.status.value,
-            "message": self.message,
-            "likelihood": [group._asdict() for group in self.target.likelihood.groups],
-            "priors": dict(self.priors),
-            "quantities": [self._json_of(name) for name in shown],
-            "correlations": {"names": list(shown), "values": found.values.tolist()},
-            "diagnostics": {
-                "names": list(self.names),
-                "autocorrelation": d.autocorrelation.tolist(),
-                "effective_samples": d.effective.tolist(),
-                "rhat": d.rhat.tolist(),
-                "steps": d.steps,
-                "walkers": d.walkers,
-                "warmup": self.warmup,
-                "acceptance": self.acceptance,
-                "seed": self.seed,
-            },
-        }
-        return finite(document)
 
     @property
     def apart(self) -> bool:
@@ -274,34 +266,70 @@ class Posterior:
         rhat = self.diagnostics.rhat
         return bool(rhat.size and np.max(rhat) > APART)
 
-    def _json_of(self, name: str) -> dict[str, Any]:
-        quantity = self[name].to_json()
-        low, one, middle, other, high = (float(v) for v in self.quantiles(name))
-        known = name not in self.held and not self.apart
-        return {
-            "name": name,
-            "value": quantity["value"],
-            "error": quantity["error"],
-            "median": middle,
-            "interval_68": [one, other] if known else None,
-            "interval_95": [low, high] if known else None,
-            "unit": quantity["unit"],
+    def summary(self, name: str) -> Summary:
+        """A number's mean, standard deviation and quantiles, and whether they may be quoted."""
+        doubt = "walkers disagree" if self.apart else ""
+        doubt = "the prior's" if name in self.held else doubt
+        return Summary(name, self[name], self.quantiles(name), doubt)
+
+    def table(self, title: str = "", note: str = "") -> Table:
+        """Medians and intervals of all numbers that are asked for."""
+        return interval_table([self.summary(name) for name in self.shown], title, note)
+
+    def to_json(self) -> dict[str, Any]:
+        """Give the ``posterior`` object of the JSON contract; intervals are null where held."""
+        d = self.diagnostics
+        document = {
+            "status": self.status,
+            "message": self.message,
+            "likelihood": self.target.groups,
+            "priors": self.priors,
+            "quantities": [self.summary(name) for name in self.shown],
+            "correlations": self.correlations(),
+            "diagnostics": {
+                "names": self.names,
+                "autocorrelation": d.autocorrelation,
+                "effective_samples": d.effective,
+                "rhat": d.rhat,
+                "steps": d.steps,
+                "walkers": d.walkers,
+                "warmup": self.warmup,
+                "acceptance": self.acceptance,
+                "seed": self.seed,
+            },
         }
+        return json_of(document)
 
     def to_arviz(self) -> InferenceData:
-        """Convert to ArviZ, for its plots and diagnostics.
+        """Convert to ArviZ, for its plots and diagnostics: walkers as chains.
+
+        Returns
+        -------
+        arviz.InferenceData
+            Groups posterior (sampled and derived numbers), sample_stats and observed_data (an
+            xarray.DataTree from ArviZ 1.0 on).
 
         Raises
         ------
         InputError
             If arviz is not installed.
         """
-        from beamfit.sampling.exchange import arviz_of
-
-        return arviz_of(self)
+        try:
+            import arviz
+        except ImportError:
+            expected = "the package arviz; install it with: pip install arviz"
+            raise InputError("no ArviZ", expected) from None
+        shape, observed = self.chain.shape[:2], self.target.observed.items()
+        groups = {
+            "posterior": {n: v.reshape(shape).T for n, (_, v) in self._numbers.items()},
+            "sample_stats": {"lp": self.log_prob.T},
+            "observed_data": {n: v for n, v in observed if np.asarray(v).dtype.kind == "f"},
+        }
+        as_one = int(arviz.__version__.split(".")[0]) >= 1
+        return arviz.from_dict(groups) if as_one else arviz.from_dict(**groups)
 
     def __str__(self) -> str:
-        return as_text(self)
+        return f"{self.status}: {self.message}\n{text_of(self.table())}"
 
     def _repr_html_(self) -> str:
-        return as_html(self)
+        return html_of(self.table(f"{self.status}: {self.message}"))

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from dataclasses import dataclass, fields
+from functools import cached_property
+from typing import Any, ClassVar, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -31,13 +32,53 @@ class Distribution(Protocol):
         """Ends of the support."""
 
 
-def _positive(value: float, what: str) -> None:
-    if not (value > 0 and math.isfinite(value)):
-        raise InputError(f"{what} {value}", "a positive number")
+@dataclass(frozen=True)
+class _OfScipy:
+    """A prior with the names of its field, computed by the distribution of scipy it names."""
+
+    # How scipy calls it, and which of the fields must be above zero.
+    _name: ClassVar[str]
+    _positive: ClassVar[tuple[str, ...]] = ()
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            value = getattr(self, field.name)
+            least = 0.0 if field.name in self._positive else -math.inf
+            if not (math.isfinite(value) and value > least):
+                kind = "a positive number" if least == 0 else "a finite number"
+                words = field.name.replace("_", " ")
+                raise InputError(f"{type(self).__name__} with {words} {value}", kind)
+
+    def _arguments(self) -> dict[str, float]:
+        """The fields as scipy calls them."""
+        raise NotImplementedError
+
+    @cached_property
+    def _frozen(self) -> Any:
+        from scipy import stats  # half a second that only sampling should cost
+
+        return getattr(stats, self._name)(**self._arguments())
+
+    def logpdf(self, x: np.ndarray) -> np.ndarray:
+        """Log density at x; -inf outside the support."""
+        return self._frozen.logpdf(x)
+
+    def mean(self) -> float:
+        """Mean."""
+        return float(self._frozen.mean())
+
+    def std(self) -> float:
+        """Standard deviation."""
+        return float(self._frozen.std())
+
+    def support(self) -> tuple[float, float]:
+        """Ends of the support."""
+        low, high = self._frozen.support()
+        return float(low), float(high)
 
 
 @dataclass(frozen=True)
-class Normal:
+class Normal(_OfScipy):
     """A normal prior.
 
     Parameters
@@ -56,33 +97,17 @@ class Normal:
     -0.225791
     """
 
+    _name = "norm"
+    _positive = ("sd",)
     centre: float
     sd: float
 
-    def __post_init__(self) -> None:
-        _positive(self.sd, "a standard deviation of")
-        if not math.isfinite(self.centre):
-            raise InputError(f"a centre of {self.centre}", "a finite number")
-
-    def logpdf(self, x: np.ndarray) -> np.ndarray:
-        """Log density at x."""
-        return -0.5 * ((x - self.centre) / self.sd) ** 2 - math.log(self.sd * math.sqrt(2 * np.pi))
-
-    def mean(self) -> float:
-        """The centre."""
-        return self.centre
-
-    def std(self) -> float:
-        """The standard deviation."""
-        return self.sd
-
-    def support(self) -> tuple[float, float]:
-        """Everything."""
-        return -math.inf, math.inf
+    def _arguments(self) -> dict[str, float]:
+        return {"loc": self.centre, "scale": self.sd}
 
 
 @dataclass(frozen=True)
-class LogNormal:
+class LogNormal(_OfScipy):
     """A normal prior on the logarithm: for a number known up to a factor.
 
     Parameters
@@ -104,36 +129,17 @@ class LogNormal:
     (-inf, 2.01)
     """
 
+    _name = "lognorm"
+    _positive = ("median", "log_sd")
     median: float
     log_sd: float
 
-    def __post_init__(self) -> None:
-        _positive(self.median, "a median of")
-        _positive(self.log_sd, "a logarithmic standard deviation of")
-
-    def logpdf(self, x: np.ndarray) -> np.ndarray:
-        """Log density at x."""
-        inside = np.asarray(x) > 0
-        log = np.log(np.where(inside, x, 1.0))
-        off = (log - math.log(self.median)) / self.log_sd
-        value = -0.5 * off**2 - log - math.log(self.log_sd * math.sqrt(2 * np.pi))
-        return np.where(inside, value, -np.inf)
-
-    def mean(self) -> float:
-        """Mean."""
-        return self.median * math.exp(0.5 * self.log_sd**2)
-
-    def std(self) -> float:
-        """Standard deviation."""
-        return self.mean() * math.sqrt(math.expm1(self.log_sd**2))
-
-    def support(self) -> tuple[float, float]:
-        """Positive numbers."""
-        return 0.0, math.inf
+    def _arguments(self) -> dict[str, float]:
+        return {"s": self.log_sd, "scale": self.median}
 
 
 @dataclass(frozen=True)
-class Uniform:
+class Uniform(_OfScipy):
     """A flat prior between two ends.
 
     Parameters
@@ -152,33 +158,21 @@ class Uniform:
     [-1.3863, -inf]
     """
 
+    _name = "uniform"
     low: float
     high: float
 
     def __post_init__(self) -> None:
-        if not (math.isfinite(self.low) and math.isfinite(self.high) and self.low < self.high):
+        super().__post_init__()
+        if not self.low < self.high:
             raise InputError(f"a uniform prior from {self.low} to {self.high}", "two ends in order")
 
-    def logpdf(self, x: np.ndarray) -> np.ndarray:
-        """Log density at x."""
-        inside = (np.asarray(x) >= self.low) & (np.asarray(x) <= self.high)
-        return np.where(inside, -math.log(self.high - self.low), -np.inf)
-
-    def mean(self) -> float:
-        """The middle."""
-        return 0.5 * (self.low + self.high)
-
-    def std(self) -> float:
-        """The width over sqrt(12)."""
-        return (self.high - self.low) / math.sqrt(12.0)
-
-    def support(self) -> tuple[float, float]:
-        """The two ends."""
-        return self.low, self.high
+    def _arguments(self) -> dict[str, float]:
+        return {"loc": self.low, "scale": self.high - self.low}
 
 
 @dataclass(frozen=True)
-class HalfNormal:
+class HalfNormal(_OfScipy):
     """The positive half of a normal prior about zero: small rather than large, never negative.
 
     Parameters
@@ -197,28 +191,12 @@ class HalfNormal:
     (0.7979, -inf)
     """
 
+    _name = "halfnorm"
+    _positive = ("scale",)
     scale: float
 
-    def __post_init__(self) -> None:
-        _positive(self.scale, "a scale of")
-
-    def logpdf(self, x: np.ndarray) -> np.ndarray:
-        """Log density at x."""
-        value = -0.5 * (np.asarray(x) / self.scale) ** 2
-        value = value + 0.5 * math.log(2 / np.pi) - math.log(self.scale)
-        return np.where(np.asarray(x) >= 0, value, -np.inf)
-
-    def mean(self) -> float:
-        """Mean."""
-        return self.scale * math.sqrt(2 / np.pi)
-
-    def std(self) -> float:
-        """Standard deviation."""
-        return self.scale * math.sqrt(1 - 2 / np.pi)
-
-    def support(self) -> tuple[float, float]:
-        """Zero and above."""
-        return 0.0, math.inf
+    def _arguments(self) -> dict[str, float]:
+        return {"scale": self.scale}
 
 
 def checked(

@@ -15,15 +15,18 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from beamfit.errors import InputError
-from beamfit.sampling.moves import Proposal, Student, Widening
-from beamfit.sampling.target import Target
 
 if TYPE_CHECKING:
     import h5py
 
-__all__ = ["Checkpoint", "Provenance", "finished", "load", "save"]
+    from beamfit.sampling.target import Target
 
-FORMAT = "beamfit-posterior-1"
+__all__ = ["FROM_PYTHON", "Checkpoint", "Provenance", "check_place", "finished", "load", "save"]
+
+# Another number for every change of what a store holds or of how a problem is told from another.
+KIND, FORMAT = "beamfit-posterior", "2"
+# Agreement of log densities of the same model, compiled by two versions.
+SAME = 1e-6
 PACKAGES = ("emcee", "h5py", "jax", "numpy", "scipy")
 REMEDY = "; name another file, or move this one away"
 
@@ -43,6 +46,9 @@ class Provenance(NamedTuple):
     inputs: Mapping[str, str | None] = {}
 
 
+FROM_PYTHON = Provenance()
+
+
 class Checkpoint(NamedTuple):
     """All that is needed to go on as if nothing had happened.
 
@@ -50,18 +56,12 @@ class Checkpoint(NamedTuple):
     ----------
     chain, log_prob : array, shape (steps, walkers, n) and (steps, walkers)
         Every step, the warm-up included.
-    accepted : array, shape (walkers,)
-        Proposals taken.
-    accepted_before : array, shape (walkers,)
-        Of these, before `began`.
     random_state : tuple
         Of numpy's Mersenne twister, after the last step.
-    proposal : Proposal
-        Of the leaps.
     share : float
         Of steps that leap.
     began : int
-        Step at which this proposal came into use.
+        Step at which the present proposal came into use; it follows from the chain before.
     producing : bool
         Whether the warm-up is over, so that the chain from `began` on counts.
     seed : int
@@ -70,94 +70,91 @@ class Checkpoint(NamedTuple):
 
     chain: np.ndarray
     log_prob: np.ndarray
-    accepted: np.ndarray
-    accepted_before: np.ndarray
     random_state: tuple
-    proposal: Proposal
     share: float
     began: int
     producing: bool
     seed: int
 
+    @property
+    def counting(self) -> np.ndarray:
+        """The part of the chain that counts."""
+        return self.chain[self.began if self.producing else len(self.chain) :]
 
-def _text(group: h5py.Group, fields: Mapping[str, Any]) -> None:
-    for name, value in fields.items():
-        group.attrs[name] = value if isinstance(value, str) else json.dumps(value)
+    @property
+    def acceptance(self) -> float:
+        """Share of proposals taken in the part that counts; of all before there is one."""
+        first = max(self.began - 1, 0) if len(self.counting) else 0
+        return float(np.mean(_moved(self.chain[first:])))
 
 
-def _write(
-    place: Path,
+def _moved(chain: np.ndarray) -> np.ndarray:
+    """Whether each walker moved in each step, shape (steps - 1, walkers)."""
+    return np.any(np.diff(chain, axis=0) != 0, axis=2)
+
+
+def check_place(path: str | PathLike[str]) -> None:
+    """Find out before anything is computed whether a store could be written.
+
+    Raises
+    ------
+    InputError
+        If the path is a folder's, or its folder does not exist or may not be written to.
+    """
+    folder = Path(path).parent
+    if Path(path).is_dir():
+        raise InputError("a folder", "the name of a file", path=path)
+    if not folder.is_dir():
+        raise InputError(f"no folder '{folder}'", "a folder that exists", path=path)
+    if not os.access(folder, os.W_OK):
+        raise InputError(f"folder '{folder}' that may not be written to", "another", path=path)
+
+
+def _contents(
     target: Target,
     state: Checkpoint,
     provenance: Provenance,
     summary: Mapping[str, Any] | None,
-) -> None:
-    import h5py
-
-    with h5py.File(place, "w") as file:
-        file.attrs["format"] = FORMAT
-        file.attrs["problem"] = target.digest
-        group = file.create_group("mcmc")  # the layout of emcee.backends.HDFBackend
-        steps, walkers, n = state.chain.shape
-        attributes = {
-            "version": version("emcee"),
-            "nwalkers": walkers,
-            "ndim": n,
-            "has_blobs": False,
-            "iteration": steps,
-        }
-        attributes |= {f"random_state_{i}": part for i, part in enumerate(state.random_state)}
-        attributes |= {"names": list(target.names), "units": list(target.units)}
-        attributes |= {"began": state.began, "producing": state.producing}
-        for name, value in attributes.items():
-            group.attrs[name] = value
-        group.create_dataset("accepted", data=state.accepted)
-        group.create_dataset("accepted_before", data=state.accepted_before)
-        group.create_dataset("chain", data=state.chain, maxshape=(None, walkers, n))
-        group.create_dataset("log_prob", data=state.log_prob, maxshape=(None, walkers))
-
-        proposal = file.create_group("proposal")
-        proposal.attrs["share"] = state.share
-        proposal.create_dataset("centre", data=state.proposal.widening.centre)
-        proposal.create_dataset("source", data=state.proposal.widening.source)
-        pairs = zip(state.proposal.blocks, state.proposal.parts, strict=True)
-        for number, (block, part) in enumerate(pairs):
-            one = proposal.create_group(f"part_{number:03d}")
-            one.attrs["degrees"] = part.degrees
-            one.create_dataset("numbers", data=block)
-            one.create_dataset("location", data=part.location)
-            one.create_dataset("root", data=part.root)
-
-        observed = file.create_group("observed")
-        for name, values in target.observed.items():
-            values = np.asarray(values)
-            text = values.dtype.kind in "UO"
-            observed.create_dataset(name, data=values.astype(object) if text else values)
-        fit = file.create_group("fit")
-        _text(fit, {"status": target.verdict[0], "message": target.verdict[1]})
-        fit.attrs["names"] = list(target.names)
-        for name in ("mode", "covariance", "lower", "upper"):
-            fit.create_dataset(name, data=getattr(target, name))
-        posterior = file.create_group("posterior")
-        finished = summary is not None
-        _text(posterior, {"finished": finished, "summary": summary or {}})
-        _text(
-            file.create_group("provenance"),
-            {
-                "versions": {name: version(name) for name in PACKAGES}
-                | {"python": platform.python_version(), "beamfit": _own_version()},
-                "seed": str(state.seed),
-                "inputs": dict(provenance.inputs),
-                "command": provenance.command,
-            },
-        )
-        file.flush()
-
-
-def _own_version() -> str:
+) -> dict[str, tuple[Mapping[str, Any], Mapping[str, Any]]]:
+    """Attributes and arrays of each group of a store."""
     from beamfit import __version__
 
-    return __version__
+    _, walkers, n = state.chain.shape
+    random = {f"random_state_{i}": part for i, part in enumerate(state.random_state)}
+    emcee = {  # the layout of emcee.backends.HDFBackend
+        "version": version("emcee"),
+        "nwalkers": walkers,
+        "ndim": n,
+        "has_blobs": False,
+        "iteration": len(state.chain),
+    }
+    own = {"names": list(target.names), "units": list(target.units), "share": state.share}
+    own |= {"began": state.began, "producing": state.producing}
+    accepted = _moved(state.chain).sum(axis=0)
+    chain = {"accepted": accepted, "chain": state.chain, "log_prob": state.log_prob}
+    fit = {"status": target.verdict.status.value, "message": target.verdict.message}
+    places = {name: getattr(target, name) for name in ("mode", "covariance", "lower", "upper")}
+    versions = {name: version(name) for name in PACKAGES}
+    versions |= {"python": platform.python_version(), "beamfit": __version__}
+    source = {
+        "versions": json.dumps(versions),
+        "seed": str(state.seed),
+        "inputs": json.dumps(dict(provenance.inputs)),
+        "command": provenance.command,
+    }
+    done = {"finished": json.dumps(summary is not None), "summary": json.dumps(summary or {})}
+    return {
+        "mcmc": (random | emcee | own, chain),
+        "observed": ({}, {name: _storable(values) for name, values in target.observed.items()}),
+        "fit": (fit | {"names": list(target.names)}, places),
+        "posterior": (done, {}),
+        "provenance": (source, {}),
+    }
+
+
+def _storable(values: Any) -> np.ndarray:
+    values = np.asarray(values)
+    return values.astype(object) if values.dtype.kind in "UO" else values
 
 
 def save(
@@ -192,12 +189,20 @@ def save(
     InputError
         If the place cannot be written.
     """
+    import h5py
+
     began = time.perf_counter()
     path = Path(path)
     # One name for all attempts: what a killed process left is overwritten, not collected.
     beside = path.with_name(f".{path.name}.partial")
     try:
-        _write(beside, target, state, provenance, summary)
+        with h5py.File(beside, "w") as file:
+            file.attrs["format"], file.attrs["problem"] = f"{KIND}-{FORMAT}", target.digest
+            for name, parts in _contents(target, state, provenance, summary).items():
+                group = file.create_group(name)
+                group.attrs.update(parts[0])
+                for key, values in parts[1].items():
+                    group.create_dataset(key, data=values)
         with open(beside, "rb+") as stream:
             os.fsync(stream.fileno())
         os.replace(beside, path)
@@ -239,62 +244,61 @@ def load(path: str | PathLike[str], target: Target, seed: int, walkers: int) -> 
 
     try:
         with h5py.File(path, "r") as file:
-            if file.attrs.get("format") != FORMAT:
+            kind, _, number = str(file.attrs.get("format", "")).rpartition("-")
+            if kind != KIND:
                 found = "an HDF5 file that beamfit did not write"
-                raise InputError(found, f"a posterior store ({FORMAT}){REMEDY}", path=path)
-            _check_same(file, path, target, seed, walkers)
-            return _checkpoint(file)
+                raise InputError(found, f"a posterior store ({KIND}-{FORMAT}){REMEDY}", path=path)
+            if number != FORMAT:
+                found = f"a posterior store of format {number}, of another version of beamfit"
+                raise InputError(found, f"format {FORMAT}{REMEDY}", path=path)
+            state = _checkpoint(file)
+            names = tuple(str(name) for name in file["mcmc"].attrs["names"])
+            digest = file.attrs["problem"]
     except InputError:
         raise
     except (OSError, RuntimeError, ValueError, TypeError, KeyError, AttributeError):
         raise InputError(
             "a file that is not HDF5, or is damaged", f"a posterior store{REMEDY}", path=path
         ) from None
+    difference = _difference(state, names, digest, target, seed, walkers)
+    if difference is not None:
+        raise InputError(difference[0], f"{difference[1]}{REMEDY}", path=path)
+    return state
 
 
-def _check_same(
-    file: h5py.File, path: str | PathLike[str], target: Target, seed: int, walkers: int
-) -> None:
-    """Refuse to continue another problem."""
-    names = tuple(str(name) for name in file["mcmc"].attrs["names"])
+def _difference(
+    state: Checkpoint, names: tuple[str, ...], digest: str, target: Target, seed: int, walkers: int
+) -> tuple[str, str] | None:
+    """In what a store is not the one to continue, and what would be; None if it is."""
     if names != target.names:
         found = f"the posterior of other numbers, {', '.join(names)}"
-        raise InputError(found, f"one of {', '.join(target.names)}{REMEDY}", path=path)
-    if file.attrs["problem"] != target.digest:
+        return found, f"one of {', '.join(target.names)}"
+    if digest != target.digest:
         found = "the posterior of another problem (other data, bounds, priors or likelihood)"
-        raise InputError(found, f"one of the present problem{REMEDY}", path=path)
-    began = int(file["provenance"].attrs["seed"])
-    if began != seed:
-        raise InputError(f"a chain begun with seed {began}", f"seed {seed}{REMEDY}", path=path)
-    found = int(file["mcmc"].attrs["nwalkers"])
-    if found != walkers:
-        raise InputError(f"a chain of {found} walkers", f"{walkers}{REMEDY}", path=path)
+        return found, "one of the present problem"
+    if state.seed != seed:
+        return f"a chain begun with seed {state.seed}", f"seed {seed}"
+    if state.chain.shape[1] != walkers:
+        return f"a chain of {state.chain.shape[1]} walkers", f"{walkers}"
+    # Models are functions, which no digest can compare: their values at the walkers can be.
+    if len(state.chain):
+        now = target.log_probability(state.chain[-1])
+        if not np.allclose(now, state.log_prob[-1], rtol=SAME, atol=1e3 * SAME):
+            return "the posterior of another model (other density)", "one of the present problem"
+    return None
 
 
 def _checkpoint(file: h5py.File) -> Checkpoint:
-    group, proposal = file["mcmc"], file["proposal"]
-    steps = int(group.attrs["iteration"])
+    group = file["mcmc"]
     chain, log_prob = group["chain"][:], group["log_prob"][:]
-    if chain.shape[:2] != log_prob.shape or len(chain) != steps:
+    if chain.shape[:2] != log_prob.shape or len(chain) != int(group.attrs["iteration"]):
         raise ValueError("sizes that do not agree")
     kind, keys, *rest = (group.attrs[f"random_state_{i}"] for i in range(5))
-    random_state = (str(kind), keys, int(rest[0]), int(rest[1]), float(rest[2]))
-    parts = [one for name, one in sorted(proposal.items()) if name.startswith("part_")]
     return Checkpoint(
         chain=chain,
         log_prob=log_prob,
-        accepted=group["accepted"][:],
-        accepted_before=group["accepted_before"][:],
-        random_state=random_state,
-        proposal=Proposal(
-            Widening(proposal["centre"][:], proposal["source"][:]),
-            tuple(part["numbers"][:] for part in parts),
-            tuple(
-                Student(part["location"][:], part["root"][:], float(part.attrs["degrees"]))
-                for part in parts
-            ),
-        ),
-        share=float(proposal.attrs["share"]),
+        random_state=(str(kind), keys, int(rest[0]), int(rest[1]), float(rest[2])),
+        share=float(group.attrs["share"]),
         began=int(group.attrs["began"]),
         producing=bool(group.attrs["producing"]),
         seed=int(file["provenance"].attrs["seed"]),

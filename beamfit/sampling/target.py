@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, partial
 from typing import Any, NamedTuple
@@ -13,18 +12,21 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from scipy.linalg import block_diag
 
-from beamfit.sampling.likelihood import FRACTION, LOG_NOISE, Likelihood, log_likelihood
+from beamfit.compile_cache import prepare_jax
+from beamfit.sampling.likelihood import LOG_NOISE, Group, log_likelihood
 from beamfit.sampling.moves import Widening
 from beamfit.sampling.priors import Distribution, in_words
+from beamfit.status import Status
+from beamfit.verdict import Finding
 
 # Not in the package: priors and the place of a store are looked at before JAX is loaded.
-jax.config.update("jax_enable_x64", True)
+prepare_jax()
 
-__all__ = ["Derived", "Law", "Target", "covariance_of"]
+__all__ = ["Law", "Target", "covariance_of", "slopes_of"]
 
-# The noise is sought within a factor e^10 of where the fit saw it.
-NOISE_REACH = 10.0
+GOOD = Finding(Status.converged, "")
 
 
 class Law(NamedTuple):
@@ -49,35 +51,24 @@ class Law(NamedTuple):
     build: Callable[[Any, Array], Any]
 
 
-class Derived(NamedTuple):
-    """Numbers computed from the sampled ones.
-
-    Attributes
-    ----------
-    names, units : tuple of str
-        One an element of what ``Law.derive`` gives.
-    """
-
-    names: tuple[str, ...] = ()
-    units: tuple[str, ...] = ()
-
-
-@partial(jax.jit, static_argnames=("law", "likelihood"))
-def _log_densities(data: Any, thetas: Array, law: Law, likelihood: Likelihood) -> Array:
-    count = thetas.shape[1] - len(likelihood.names)
+@partial(jax.jit, static_argnames=("law", "groups"))
+def _log_densities(
+    data: Any, counts: Any, thetas: Array, law: Law, groups: tuple[Group, ...]
+) -> Array:
+    count = thetas.shape[1] - sum(len(group.own()) for group in groups)
 
     def one(theta: Array) -> Array:
         own, extra = theta[:count], theta[count:]
-        prior = law.log_prior(data, own)
-        value = prior + log_likelihood(law.residual(data, own), likelihood, extra)
+        likelihood = log_likelihood(law.residual(data, own), counts, groups, extra)
+        value = law.log_prior(data, own) + likelihood
         return jnp.where(jnp.isfinite(value), value, -jnp.inf)
 
     return jax.vmap(one)(thetas)
 
 
 @partial(jax.jit, static_argnames=("law",))
-def _jacobian(data: Any, theta: Array, law: Law) -> Array:
-    return jax.jacfwd(lambda moved: jnp.concatenate(law.residual(data, moved)))(theta)
+def _jacobian(data: Any, theta: Array, law: Law) -> list[Array]:
+    return jax.jacfwd(lambda moved: list(law.residual(data, moved)))(theta)
 
 
 @partial(jax.jit, static_argnames=("function",))
@@ -103,24 +94,26 @@ class Target:
         Where a fit found the optimum.
     covariance : array, shape (n, n)
         Of the fit: the spread of the first walkers and the shape of the first proposals.
-    likelihood : Likelihood
-        Errors known or not, outliers or not.
+    groups : tuple of Group
+        How the points scatter, one for each of the law's vectors of residuals.
     noise : tuple of float
         Factor on the stated errors that the fit's residuals show, one a group.
+    counts : tuple of array of bool
+        Which residuals of each group count; all if empty.
     noise_unit : str
         Unit of a stated error of 1; "1" where errors were stated.
     priors : mapping of str to distribution
         In addition to the law's own.
-    derived : Derived
-        Names and units of the derived numbers.
+    derived : mapping of str to str
+        Names and units of what ``Law.derive`` gives.
     observed : mapping of str to array
         The data, for the store, and to tell one problem from another.
     priors_own : tuple of str
         Numbers, derived ones too, that the prior or the bounds decide and not the data.
     open_directions : str
         In words, what neither data nor priors nor bounds hold; if not empty, nothing is sampled.
-    verdict : (str, str)
-        Status and sentence of the fit.
+    verdict : Finding
+        On the fit.
     hidden : tuple of str
         Numbers nobody asks for.
     remark : str
@@ -129,6 +122,8 @@ class Target:
         Priors that are part of the law, in words.
     group_of : tuple of int
         Which group's noise widens each of the law's numbers; the first if empty.
+    block_of : tuple of int
+        Which of the law's numbers are proposed together; all if empty.
 
     Examples
     --------
@@ -151,58 +146,48 @@ class Target:
     upper: np.ndarray
     mode: np.ndarray
     covariance: np.ndarray
-    likelihood: Likelihood = field(default_factory=Likelihood)
+    groups: tuple[Group, ...] = (Group(),)
     noise: tuple[float, ...] = (1.0,)
+    counts: tuple[np.ndarray, ...] = ()
     noise_unit: str = "1"
     priors: Mapping[str, Distribution] = field(default_factory=dict)
-    derived: Derived = field(default_factory=Derived)
+    derived: Mapping[str, str] = field(default_factory=dict)
     observed: Mapping[str, np.ndarray] = field(default_factory=dict)
     priors_own: tuple[str, ...] = ()
     open_directions: str = ""
-    verdict: tuple[str, str] = ("converged", "")
+    verdict: Finding = GOOD
     hidden: tuple[str, ...] = ()
     remark: str = ""
     stated: Mapping[str, str] = field(default_factory=dict)
     group_of: tuple[int, ...] = ()
+    block_of: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
-        self.likelihood.check()
-        extra = self.likelihood.names
-        # Where each of the likelihood's own numbers may lie, begins, and how far it spreads.
-        rows = np.zeros((0, 4))
-        for group, noise in zip(self.likelihood.groups, self.noise, strict=True):
-            at = math.log(max(noise, 1e-300))
-            own = {
-                LOG_NOISE: (at - NOISE_REACH, at + NOISE_REACH, at, 0.1),
-                FRACTION: (0.0, 0.5, 0.1, 0.07),
-            }
-            short = (name.removeprefix(group.prefix) for name in group.names)
-            rows = np.concatenate([rows, np.array([own[name] for name in short]).reshape(-1, 4)])
-        low, high, middle, spread = rows.T
-        ends = {
-            "lower": np.concatenate([np.asarray(self.lower, float), low]),
-            "upper": np.concatenate([np.asarray(self.upper, float), high]),
-        }
-        mode = np.array(self.mode, float)
-        for i, name in enumerate((*self.names, *extra)):
-            if name in self.priors:
-                first, last = self.priors[name].support()
-                ends["lower"][i] = max(ends["lower"][i], first)
-                ends["upper"][i] = min(ends["upper"][i], last)
-                # A prior may leave out where the fit ended: begin well inside it.
-                if i < len(mode) and not first < mode[i] < last:
-                    prior_mean = float(self.priors[name].mean())
-                    mode[i] = prior_mean if first < prior_mean < last else 0.5 * (first + last)
-        n = len(self.names)
-        covariance = np.zeros((n + len(extra),) * 2)
-        covariance[:n, :n] = self.covariance
-        covariance[n:, n:] = np.diag(spread**2)
-        fields = ends | {
-            "names": (*self.names, *extra),
-            "units": (*self.units, *("1" for _ in extra)),
-            "mode": np.concatenate([mode, middle]),
-            "covariance": covariance,
+        pairs = zip(self.groups, self.noise, strict=True)
+        own = [number for group, factor in pairs for number in group.own(factor)]
+        low, high, start, spread = np.array([number[1:] for number in own]).reshape(-1, 4).T
+        names = (*self.names, *(number.name for number in own))
+        lower, upper, mode = (
+            np.concatenate([np.asarray(part, float), more])
+            for part, more in ((self.lower, low), (self.upper, high), (self.mode, start))
+        )
+        for name, prior in self.priors.items():
+            i, (first, last) = names.index(name), prior.support()
+            lower[i], upper[i] = max(lower[i], first), min(upper[i], last)
+            # A prior may leave out where the fit ended: begin well inside it.
+            if not first < mode[i] < last:
+                mean = float(prior.mean())
+                mode[i] = mean if first < mean < last else 0.5 * (first + last)
+        fields = {
+            "names": names,
+            "units": (*self.units, *("1" for _ in own)),
+            "lower": lower,
+            "upper": upper,
+            "mode": mode,
+            "covariance": block_diag(np.asarray(self.covariance), np.diag(spread**2)),
+            "counts": self.counts or (True,) * len(self.groups),
             "data": jax.tree.map(jnp.asarray, self.data),
+            "_count": len(self.names),
         }
         for key, value in fields.items():
             object.__setattr__(self, key, value)
@@ -220,82 +205,62 @@ class Target:
         array, shape (m,)
             -inf outside bounds and constraints; never NaN.
         """
-        value = np.array(_log_densities(self.data, thetas, self.law, self.likelihood))
+        value = np.array(_log_densities(self.data, self.counts, thetas, self.law, self.groups))
         value[~((thetas >= self.lower) & (thetas <= self.upper)).all(axis=1)] = -np.inf
         for name, prior in self.priors.items():
             inside = np.isfinite(value)
-            at = thetas[inside, self.names.index(name)]
-            value[inside] += prior.logpdf(at)
+            value[inside] += prior.logpdf(thetas[inside, self.names.index(name)])
         return np.where(np.isnan(value), -np.inf, value)
 
     def each(self, function: Callable[[Any, Array], Any], thetas: np.ndarray) -> Any:
         """Evaluate ``function(data, theta)`` at many points, compiled."""
-        return jax.tree.map(np.asarray, _each(self.data, self.own(thetas), function))
-
-    def own(self, thetas: np.ndarray) -> np.ndarray:
-        """The law's own numbers, without the likelihood's."""
-        return thetas[..., : thetas.shape[-1] - len(self.likelihood.names)]
+        own = thetas[..., : self._count]
+        return jax.tree.map(np.asarray, _each(self.data, own, function))
 
     @cached_property
     def widening(self) -> Widening:
         """How the noise, where it is inferred, widens the law's numbers."""
-        places = [
-            self.names.index(group.prefix + LOG_NOISE) if group.noise == "inferred" else -1
-            for group in self.likelihood.groups
-        ]
-        count = len(self.names) - len(self.likelihood.names)
-        group_of = self.group_of or (0,) * count
+        noises = [group.prefix + LOG_NOISE for group in self.groups]
+        places = np.array([self.names.index(n) if n in self.names else -1 for n in noises])
         source = np.full(len(self.names), -1)
-        source[:count] = [places[group] for group in group_of]
+        source[: self._count] = places[list(self.group_of or (0,) * self._count)]
         return Widening(self.mode, source)
 
     @cached_property
     def blocks(self) -> tuple[np.ndarray, ...]:
-        """Numbers that belong together: those of each group, and each of the likelihood's own."""
-        count = len(self.names) - len(self.likelihood.names)
-        group_of = np.array(self.group_of or (0,) * count)
-        blocks = [np.flatnonzero(group_of == group) for group in np.unique(group_of)]
-        own = [np.array([place]) for place in range(count, len(self.names))]
-        return (*blocks, *own)
+        """Numbers that are proposed together; each of the likelihood's own is by itself."""
+        block_of = np.array(self.block_of or (0,) * self._count, int)
+        blocks = [np.flatnonzero(block_of == block) for block in np.unique(block_of)]
+        return (*blocks, *(np.array([i]) for i in range(self._count, len(self.names))))
 
     @cached_property
     def derived_names(self) -> tuple[str, ...]:
         """Names of the derived numbers, the noise included where it is inferred."""
-        return self.derived.names + tuple(self._noises)
+        word = "error_factor" if self.noise_unit == "1" else "noise"
+        return (*self.derived, *(g.prefix + word for g in self.groups if g.inferred))
 
     @cached_property
     def derived_units(self) -> tuple[str, ...]:
         """Their units."""
-        return self.derived.units + (self.noise_unit,) * len(self._noises)
-
-    @cached_property
-    def _noises(self) -> dict[str, int]:
-        """Place of each noise factor's logarithm among the sampled numbers."""
-        word = "error_factor" if self.noise_unit == "1" else "noise"
-        return {
-            f"{group.prefix}{word}": self.names.index(group.prefix + LOG_NOISE)
-            for group in self.likelihood.groups
-            if group.noise == "inferred"
-        }
+        return (*self.derived.values(), *(self.noise_unit for g in self.groups if g.inferred))
 
     def derive(self, thetas: np.ndarray) -> np.ndarray:
         """The derived numbers at many points, shape (m, k)."""
-        parts = [np.zeros((len(thetas), 0))]
-        if self.derived.names:
-            parts.append(self.each(self.law.derive, thetas))
-        parts.append(np.exp(thetas[:, list(self._noises.values())]))
-        return np.concatenate(parts, axis=1)
+        parts = [self.each(self.law.derive, thetas)] if self.derived else []
+        noises = [self.names.index(g.prefix + LOG_NOISE) for g in self.groups if g.inferred]
+        return np.concatenate([*parts, np.exp(thetas[:, noises])], axis=1)
 
     @cached_property
     def digest(self) -> str:
-        """Tells one problem from another: data, names, bounds, priors, likelihood."""
+        """Tells one problem from another: data, names, bounds, priors, groups."""
         found = hashlib.sha256()
         for name, values in sorted(self.observed.items()):
             found.update(name.encode() + _digits(values))
         # Bounds of the noise follow the fit and are not compared.
-        for values in (*jax.tree.leaves(self.data), self.own(self.lower), self.own(self.upper)):
+        ends = self.lower[: self._count], self.upper[: self._count]
+        for values in (*jax.tree.leaves(self.data), *ends):
             found.update(_digits(values))
-        words = [repr(self.names), repr(self.likelihood), self.law.residual.__qualname__]
+        words = [repr(self.names), *(repr(tuple(group)) for group in self.groups)]
         words += [f"{name}~{in_words(prior)}" for name, prior in sorted(self.priors.items())]
         found.update("|".join(words).encode())
         return found.hexdigest()
@@ -315,17 +280,22 @@ def _digits(values: Any) -> bytes:
     return repr(values.shape).encode() + b"".join(part.tobytes() for part in parts)
 
 
-def covariance_of(law: Law, data: Any, mode: np.ndarray, width: np.ndarray) -> np.ndarray:
+def slopes_of(law: Law, data: Any, theta: np.ndarray) -> list[np.ndarray]:
+    """Derivatives of a law's vectors of residuals by its numbers, each of shape (rows, n)."""
+    return [np.asarray(part) for part in _jacobian(data, jnp.asarray(theta), law)]
+
+
+def covariance_of(
+    slopes: Sequence[np.ndarray], noise: Sequence[float], width: np.ndarray
+) -> np.ndarray:
     """Covariance of a linearised fit, held by weak normal priors where the data say little.
 
     Parameters
     ----------
-    law : Law
-        Of which the residuals.
-    data : pytree
-        Its data.
-    mode : array, shape (n,)
-        Where.
+    slopes : sequence of array
+        From `slopes_of`.
+    noise : sequence of float
+        Factor on the stated errors of each.
     width : array, shape (n,)
         Width of the prior on each number; infinite for none.
 
@@ -333,9 +303,14 @@ def covariance_of(law: Law, data: Any, mode: np.ndarray, width: np.ndarray) -> n
     -------
     array, shape (n, n)
         (JᵀJ + 1/width²)⁻¹, computed with columns of unit length.
+
+    Examples
+    --------
+    >>> covariance_of([np.array([[2.0], [0.0]])], [1.0], np.array([np.inf])).tolist()
+    [[0.25]]
     """
-    jacobian = np.asarray(_jacobian(data, jnp.asarray(mode), law))
-    rows = np.concatenate([jacobian, np.diag(1.0 / np.asarray(width, float))])
+    parts = [part / factor for part, factor in zip(slopes, noise, strict=True)]
+    rows = np.concatenate([*parts, np.diag(1.0 / np.asarray(width, float))])
     scale = np.linalg.norm(rows, axis=0)
     scale = np.where(scale > 0, scale, 1.0)
     # A direction that nothing holds is left as wide as the number itself.

@@ -171,7 +171,6 @@ def write(path, content):
 def answer(capfd, monkeypatch, *arguments):
     """Run the command in this process."""
     monkeypatch.setattr(sys, "argv", ["beamfit", "emittance", *map(str, arguments)])
-    monkeypatch.setattr("beamfit.cli._compile_quickly", lambda: None)  # JAX is other tests' too
     with pytest.raises(SystemExit) as stopped:
         main()
     said = capfd.readouterr()

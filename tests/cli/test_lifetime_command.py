@@ -223,6 +223,22 @@ def test_a_study_of_a_shift(run):
     assert study["next"][0]["information"] >= study["next"][-1]["information"] > 0
 
 
+def test_a_network_of_the_losses(run):
+    """Where first principles describe the shift, a correction of them changes little and obeys."""
+    path = "measurements/spear3_shift_simulated.csv"
+    options = ("--ring", RING, "--study", "--network", "correction")
+    status, out, err = run("lifetime", path, *options, "--json")
+    assert (status, err) == (0, "")
+    study = json.loads(out)["study"]
+    network = study["network"]
+    assert network["certificate"]["holds"] is True
+    assert network["certificate"]["single_maximum"] == "seen"
+    assert network["lifetime"]["value"] == pytest.approx(study["best"]["usual"]["value"], rel=0.03)
+    status, out, err = run("lifetime", path, "--network", "alone")
+    assert (status, out) == (2, "")
+    assert "--study" in err
+
+
 def test_a_study_needs_a_ring(run):
     status, out, err = run("lifetime", APS, "--study")
     assert (status, out) == (2, "")

@@ -6,7 +6,7 @@ import pytest
 from appendices import appendix_a, appendix_c, simulated_scan
 
 from beamfit.greybox import problem
-from beamfit.greybox.many_starts import descend_all
+from beamfit.greybox.descend import descend_all
 from beamfit.greybox.solve import solve, starting_points
 
 

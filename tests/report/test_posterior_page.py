@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import beamfit
-from beamfit.report.posterior_figures import draw_pairs
+from beamfit.report.posterior import draw_pairs
 from beamfit.studies.decay.fit import fit_decay
 from beamfit.studies.decay.record import DecayRecord
 

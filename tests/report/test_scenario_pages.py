@@ -7,7 +7,16 @@ import pytest
 
 import beamfit
 from beamfit.studies.scan.assumptions import Anchor
-from beamfit.studies.scan.reproduction import TABLE_2, reproduce
+
+
+@pytest.fixture(scope="module")
+def script(root):
+    """The script that writes the page, as a module."""
+    place = root / "docs/gtf_reproduction.py"
+    spec = importlib.util.spec_from_file_location("gtf_reproduction", place)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
 
 
 @pytest.fixture(scope="module")
@@ -17,12 +26,12 @@ def inputs(root):
 
 
 @pytest.fixture(scope="module")
-def found(inputs):
-    return reproduce(*inputs, starts=6)
+def found(script, inputs):
+    return script.reproduce(*inputs, starts=6)
 
 
-def test_the_first_beam_matrix_is_found_again(found):
-    for got, true in zip(found.known.x.sigma, TABLE_2["known"][0], strict=True):
+def test_the_first_beam_matrix_is_found_again(script, found):
+    for got, true in zip(found.known.x.sigma, script.TABLE_2["known"][0], strict=True):
         assert abs(1e8 * got.value - true) < 3 * 1e8 * got.error
 
 
@@ -32,11 +41,9 @@ def test_beams_of_any_emittance_fit_when_the_transport_is_a_network(found):
     assert all(h.chi2 < 14.0 for h in found.held)
 
 
-def test_the_published_calibration_is_two_bounds(found):
-    from beamfit.studies.scan.reproduction import BOUNDS
-
-    assert BOUNDS["Q2.slope"][0] == 147.230
-    assert BOUNDS["Q2.intercept"][1] == 63.170
+def test_the_published_calibration_is_two_bounds(script, found):
+    assert script.BOUNDS["Q2.slope"][0] == 147.230
+    assert script.BOUNDS["Q2.intercept"][1] == 63.170
     states = {p.name: p.state for p in found.calibration.parameters}
     assert set(states.values()) <= {"lower", "upper"}
     first, last = found.steep[0], found.steep[-1]
@@ -44,11 +51,7 @@ def test_the_published_calibration_is_two_bounds(found):
     assert first.emittance / last.emittance == pytest.approx(last.slope / first.slope, rel=0.02)
 
 
-def test_the_script_writes_the_page(root, tmp_path, monkeypatch, found):
-    place = root / "docs/gtf_reproduction.py"
-    spec = importlib.util.spec_from_file_location("gtf_reproduction", place)
-    script = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(script)
+def test_the_script_writes_the_page(script, tmp_path, monkeypatch, found):
     monkeypatch.setattr(script, "reproduce", lambda scan, line: found)
     page = tmp_path / "page.html"
     script.main(page)

@@ -11,12 +11,12 @@ import pytest
 import beamfit
 from beamfit.lifetime.decay import current
 from beamfit.optics.elements import Drift, Quadrupole, Screen
-from beamfit.sampling.calibration import rank, uniformity
 from beamfit.sampling.priors import Uniform
 from beamfit.studies.decay.fit import fit_decay
 from beamfit.studies.decay.record import DecayRecord
-from beamfit.studies.scan.beam_posterior import beam_target
+from beamfit.studies.scan.posterior import beam_target
 from beamfit.studies.scan.scans import QuadScan
+from tests.sampling.ranks import rank, uniformity
 
 
 @pytest.fixture(scope="module")

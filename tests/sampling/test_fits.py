@@ -18,9 +18,9 @@ from beamfit.lifetime.decay import current
 from beamfit.sampling.priors import Normal, Uniform
 from beamfit.status import Status
 from beamfit.studies.decay.fit import fit_decay
-from beamfit.studies.decay.predictive import expected_current
+from beamfit.studies.decay.posterior import expected_current
 from beamfit.studies.decay.record import DecayRecord
-from beamfit.studies.scan.predictive import expected_sizes
+from beamfit.studies.scan.posterior import expected_sizes
 
 X = np.linspace(0.0, 1.0, 12)
 Y = 1.0 + 2.0 * X + 0.1 * np.random.default_rng(1).normal(size=12)
@@ -188,7 +188,7 @@ def test_a_scan_that_determines_nothing_is_not_sampled():
 
 def test_expected_sizes_hold_the_points(otr2, beam):
     p = otr2.y.points
-    found = expected_sizes(beam, "y", p.r11, p.r12, p.known, p.error)
+    found = expected_sizes(beam, "y")
     low, high = found.reading
     assert ((p.size > low) & (p.size < high)).all()
     assert (found.model[0] > low).all()
@@ -233,7 +233,7 @@ def test_the_real_decay():
         quantity = getattr(fit, name)
         assert found[name].value == pytest.approx(quantity.value, abs=0.15 * quantity.error)
         assert found[name].error == pytest.approx(quantity.error, rel=0.15)
-    expected = expected_current(found, fit.readings.time, np.ones(len(fit.readings)))
+    expected = expected_current(found)
     low, high = expected.reading
     inside = np.mean((fit.readings.current > low) & (fit.readings.current < high))
     assert inside > 0.85

@@ -10,7 +10,7 @@ from scipy import integrate, stats
 from beamfit.errors import InputError
 from beamfit.sampling.convergence import autocorrelation_times, split_rhat
 from beamfit.sampling.ensemble import draw
-from beamfit.sampling.likelihood import Group, Likelihood, log_likelihood, outlier_density
+from beamfit.sampling.likelihood import Group, log_likelihood, outlier_density
 from beamfit.sampling.target import Law, Target
 from tests.sampling.targets import itself, none_derived
 
@@ -23,7 +23,7 @@ def flat(data, theta):
     return jnp.zeros(())
 
 
-def level(y, error, likelihood, noise=1.0):
+def level(y, error, group, noise=1.0):
     law = Law(residual, flat, none_derived, itself)
     spread = noise**2 * error**2 / len(y)
     return Target(
@@ -35,7 +35,7 @@ def level(y, error, likelihood, noise=1.0):
         [np.inf],
         [float(np.median(y))],
         [[spread]],
-        likelihood=Likelihood((likelihood,)),
+        groups=(group,),
         noise=(noise,),
     )
 
@@ -87,11 +87,21 @@ def test_the_outlier_density_is_a_mean_over_widths():
 
 
 def test_groups_have_noises_of_their_own():
-    likelihood = Likelihood((Group("x", "inferred"), Group("y", "known")))
-    assert likelihood.names == ("x.log_noise",)
+    groups = (Group("x", "inferred"), Group("y", "known"))
+    assert [number.name for group in groups for number in group.own()] == ["x.log_noise"]
     parts = (jnp.array([2.0, 4.0]), jnp.array([3.0]))
-    value = log_likelihood(parts, likelihood, jnp.array([np.log(2.0)]))
+    value = log_likelihood(parts, (True, True), groups, jnp.array([np.log(2.0)]))
     assert float(value) == pytest.approx(-0.5 * (1 + 4) - 2 * np.log(2) - 4.5)
+
+
+def test_rows_that_only_fill_a_vector_count_nowhere():
+    """With the noise inferred and outliers: the same density with three rows more."""
+    group, extra = Group("", "inferred", True), jnp.array([0.3, 0.2])
+    own = jnp.array([0.5, -1.0, 7.0])
+    padded = jnp.concatenate([own, jnp.array([0.0, 9.0, jnp.nan])])
+    counts = jnp.arange(6) < 3
+    bare = log_likelihood([own], [True], [group], extra)
+    assert float(log_likelihood([padded], [counts], [group], extra)) == pytest.approx(float(bare))
 
 
 def test_noise_of_another_name():

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
 import signal
 import subprocess
 import sys
 import time
+import types
 
 import emcee
 import h5py
@@ -61,7 +63,7 @@ def test_groups_say_where_it_comes_from(tmp_path):
         provenance=Provenance("beamfit x", {"scan.csv": "ab12"}),
     )
     with h5py.File(path, "r") as file:
-        assert set(file) == {"mcmc", "observed", "fit", "posterior", "proposal", "provenance"}
+        assert set(file) == {"mcmc", "observed", "fit", "posterior", "provenance"}
         np.testing.assert_array_equal(file["observed/size m"][:], [1.0, 2.0])
         assert [v.decode() for v in file["observed/screen"][:]] == ["A", "B"]
         np.testing.assert_array_equal(file["fit/mode"][:], stated.mode)
@@ -213,28 +215,48 @@ def test_another_problem_is_refused_and_left(store):
 
 
 def test_a_place_that_cannot_be_written_is_known_before_sampling(tmp_path, monkeypatch):
-    monkeypatch.setattr(ensemble, "_run", None)
+    monkeypatch.setattr(ensemble, "_blocks", None)
     with pytest.raises(InputError, match="folder that exists"):
         draw(target(half_normal), store=tmp_path / "no" / "chain.h5")
     with pytest.raises(InputError, match="the name of a file"):
         draw(target(half_normal), store=tmp_path)
 
 
-def test_writing_costs_little(tmp_path):
-    """The rule by which checkpoints are spaced: their share of the time, measured."""
-    spent = []
-    original = ensemble.disk.save
+def test_checkpoints_are_spaced_by_what_they_cost(tmp_path, monkeypatch):
+    """A clock that ticks once a look, and checkpoints that cost two ticks: forty between them."""
+    ticks, saved = itertools.count(), []
+    clock = types.SimpleNamespace(perf_counter=lambda: next(ticks))
 
-    def timed(*arguments):
-        spent.append(original(*arguments))
-        return spent[-1]
+    def save(*arguments):
+        saved.append(clock.perf_counter())
+        return 2.0
 
-    began = time.perf_counter()
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(ensemble.disk, "save", timed)
-        draw(target(banana), store=tmp_path / "chain.h5", seed=1, target_ess=1e9, budget=3000)
-    assert sum(spent) < 0.1 * (time.perf_counter() - began)
-    assert len(spent) >= 3
+    monkeypatch.setattr(ensemble, "time", clock)
+    monkeypatch.setattr(ensemble.disk, "save", save)
+    draw(target(banana), store=tmp_path / "chain.h5", seed=1, target_ess=1e9, budget=6000)
+    assert ensemble.WRITING == 0.05
+    assert np.all(np.diff(saved[:-1]) >= 2.0 / 0.05)  # the last one is the finished chain
+    assert len(saved) >= 3
+
+
+def test_stores_of_another_format_or_model_are_refused(store):
+    """An old one by its number; one of another model by the density at its walkers."""
+    with h5py.File(store, "a") as file:
+        file.attrs["format"] = "beamfit-posterior-1"
+    assert "a posterior store of format 1" in refused(store)
+    with h5py.File(store, "a") as file:
+        file.attrs["format"] = "beamfit-posterior-2"
+        file["mcmc/log_prob"][-1] += 0.1
+    assert "another model" in refused(store)
+
+
+def test_a_store_does_not_know_names_of_functions(store):
+    def renamed(data, theta):
+        return half_normal(data, theta)
+
+    before = store.read_bytes()
+    draw(target(renamed), seed=1, target_ess=500, store=store)
+    assert store.read_bytes() == before
 
 
 def test_the_last_digits_do_not_make_another_problem(store):

@@ -11,10 +11,9 @@ import numpy as np
 
 from beamfit.greybox import problem as greybox
 from beamfit.greybox import tree
-from beamfit.greybox.bounded import MOST_SHARE, spread_of
-from beamfit.greybox.many_starts import descend_one
-from beamfit.studies.scan.scenario_model import sigma_of
-from beamfit.studies.scan.sigma import emittance_parts
+from beamfit.greybox.covariance import MOST_SHARE, spread_of
+from beamfit.greybox.descend import descend_one
+from beamfit.studies.scan.model import emittance_parts, predict_sizes, sigma_of
 
 
 def drawn(problem, theta, key):
@@ -24,7 +23,7 @@ def drawn(problem, theta, key):
     keys = jax.random.split(key, len(core.records) + len(core.priors))
     for record, k in zip(core.records, keys, strict=False):
         true = record.predict(model, record.data)
-        if record.name.startswith("size") and record.data.squared:
+        if record.predict is predict_sizes and record.data.squared:
             size = jnp.sqrt(true)
             sd = record.error / (2.0 * jnp.sqrt(record.measured))
             size = size + sd * jax.random.normal(k, size.shape)

@@ -10,9 +10,8 @@ import pytest
 
 import beamfit
 from beamfit.studies.scan.assumptions import Anchor, Assumptions
-from beamfit.studies.scan.known_problem import known_problem
-from beamfit.studies.scan.scenario_data import see
-from beamfit.studies.scan.scenarios import scenario_problem
+from beamfit.studies.scan.fit import scenario_of
+from beamfit.studies.scan.known import see
 from tests.studies.coverage import binomial_limits, coverage, deviations
 
 ALL = os.environ.get("BEAMFIT_COVERAGE")
@@ -41,7 +40,7 @@ def seen(root):
     for key, (scan, lattice) in pairs.items():
         scan = beamfit.read_quad_scan(root / f"measurements/{scan}.csv")
         line = beamfit.load_lattice(root / f"lattices/{lattice}.toml")
-        found[key] = see(scan, line, None, "size_squared")
+        found[key] = see(scan, line)
     return found
 
 
@@ -49,10 +48,7 @@ def seen(root):
 def test_intervals_hold_the_truth_as_often_as_they_say(seen, case):
     scan, scenario, told, number = CASES[case]
     number = int(ALL) if ALL else number
-    if scenario == "known":
-        problem = known_problem(beamfit.fit_emittance(seen[scan].scan, seen[scan].line))
-    else:
-        problem = scenario_problem(seen[scan], scenario, told)
+    problem = scenario_of(scenario).state(seen[scan], told)
     pulls, known = deviations(problem, problem.start, number=number, seed=3)
     assert known.all()
     one, two = coverage(pulls)
@@ -63,7 +59,7 @@ def test_intervals_hold_the_truth_as_often_as_they_say(seen, case):
 
 
 def test_the_check_sees_errors_that_are_a_third_too_small(seen):
-    problem = known_problem(beamfit.fit_emittance(seen["one"].scan, seen["one"].line))
+    problem = scenario_of("known").state(seen["one"], Assumptions())
     pulls, _ = deviations(problem, problem.start, number=500, seed=3)
     one, _ = coverage(1.5 * pulls)
     assert one < binomial_limits(500, 0.6827)[0]

@@ -2,8 +2,16 @@ import numpy as np
 import pytest
 from scipy.optimize import curve_fit
 
+from beamfit.greybox.solve import solve
 from beamfit.lifetime.decay import current_by_rate
-from beamfit.studies.decay.model import constant_shape, solve_decay, solve_decays
+from beamfit.studies.decay.model import (
+    constant_shape,
+    decay_problem,
+    padded,
+    solve_decay,
+    solve_decays,
+)
+from beamfit.studies.decay.record import DecayRecord
 
 
 def law(time, i0, a, b):
@@ -146,3 +154,19 @@ def test_the_exponent_of_a_constant_a_is_zero():
     assert fit.converged
     assert abs(fit.values.exponent) < 4 * fit.errors.exponent
     assert fit.errors.exponent < 0.05
+
+
+@pytest.mark.parametrize("stated", [None, 0.01])
+@pytest.mark.parametrize("shape", [None, constant_shape, lambda beam: 1 / (1 + beam / 2000)])
+def test_the_fast_path_answers_the_problem(shape, stated):
+    """Against the core's own search, errors and noise for the same statement."""
+    time = np.linspace(0, 8 * 3600, 200)
+    error = None if stated is None else np.full(200, stated)
+    record = DecayRecord(time, noisy(time, 500.0, 4e-8, 2e-6, 0.01, 8), error)
+    fast = solve_decay(*padded(record), shape=shape)
+    fit = solve(decay_problem(record, shape))
+    scale = np.sqrt(fast.sum_squares / 197) if stated is None else 1.0
+    for name in ("i0", "a", "b"):
+        assert fit[name].value == pytest.approx(float(getattr(fast.values, name)), rel=1e-8)
+        error = float(getattr(fast.errors, name)) * scale
+        assert fit[name].error_raw == pytest.approx(error, rel=1e-4)

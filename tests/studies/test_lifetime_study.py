@@ -14,12 +14,11 @@ from beamfit.lifetime.decay import current
 from beamfit.lifetime.losses import SCALES, loss_coefficients
 from beamfit.lifetime.scaled import loss_terms, scaled_losses
 from beamfit.quantity import Status
-from beamfit.studies.decay.anomaly import find_anomaly
 from beamfit.studies.decay.next_decay import Candidate, next_decays
 from beamfit.studies.decay.operating_point import Limits, best_operating_point
 from beamfit.studies.decay.record import Conditions, DecayRecord
-from beamfit.studies.decay.scale_sample import budget_intervals, sample_scales
-from beamfit.studies.decay.scales import fit_scales
+from beamfit.studies.decay.scales import fit_scales, sample_scales
+from beamfit.studies.decay.shift import budget_intervals, find_anomaly
 from beamfit.studies.decay.study import study_record
 from beamfit.studies.decay.summary import summarise
 

@@ -8,13 +8,14 @@ import pytest
 import beamfit
 from beamfit.errors import InputError
 from beamfit.greybox.bounds import over_cells
+from beamfit.greybox.solve import solve
 from beamfit.optics.calibration import IntegratedGradient, SlopeIntercept
 from beamfit.optics.elements import Quadrupole, Screen
 from beamfit.studies.scan.assumptions import Anchor, Assumptions
 from beamfit.studies.scan.calibration import with_numbers
-from beamfit.studies.scan.scenario_data import see
-from beamfit.studies.scan.scenario_model import UNIT
-from beamfit.studies.scan.scenarios import scenario_problem, train
+from beamfit.studies.scan.known import see
+from beamfit.studies.scan.model import UNIT
+from beamfit.studies.scan.transport_network import SCENARIO as TRANSPORT_NETWORK
 from beamfit.studies.scan.transport_network import certificate_of
 from tests.studies.conftest import TABLE_2
 
@@ -364,6 +365,5 @@ def test_three_quads_two_screens_two_energies(three_quads):
 
 
 def test_training_from_many_starts_is_no_worse_than_from_one(scan, gtf):
-    seen = see(scan, gtf, None, "size_squared")
-    problem = scenario_problem(seen, "transport-network", Assumptions(anchor=ANCHOR))
-    assert train(problem, 20).cost <= train(problem, 1).cost + 1e-9
+    problem = TRANSPORT_NETWORK.state(see(scan, gtf), Assumptions(anchor=ANCHOR))
+    assert solve(problem, 20).cost <= solve(problem, 1).cost + 1e-9

@@ -10,11 +10,12 @@ import numpy as np
 from scipy.special import fdtrc
 
 from beamfit.errors import InputError
+from beamfit.lifetime.decay import HOUR
 from beamfit.quantity import Quantity, Status
-from beamfit.studies.decay.fit import fit_decay
+from beamfit.studies.decay.fit import DecayFit, bare, fit_decay
 from beamfit.studies.decay.model import constant_shape, padded, solve_decay
 from beamfit.studies.decay.record import DecayRecord
-from beamfit.studies.decay.result import DecayFit
+from beamfit.table import json_of
 
 __all__ = [
     "ConstantA",
@@ -28,7 +29,6 @@ __all__ = [
     "single_exponential",
 ]
 
-HOUR = 3600.0
 FEWEST_IN_WINDOW = 5
 REJECTED = 1e-3
 EXACT = 1e-8
@@ -58,13 +58,7 @@ class OneLifetime:
 
     def to_json(self) -> dict[str, Any]:
         """Return the fields as JSON's types; a bias that is not known is null."""
-        known = [b if math.isfinite(b) else None for b in (self.bias_start, self.bias_mean)]
-        return {
-            "lifetime": self.lifetime.to_json(),
-            "rms_residual": {"value": self.rms_residual, "error": None, "unit": "mA"},
-            "bias_start": known[0],
-            "bias_mean": known[1],
-        }
+        return json_of(vars(self) | {"rms_residual": bare(self.rms_residual, "mA")})
 
     def __str__(self) -> str:
         return (
@@ -237,12 +231,7 @@ class ConstantA:
 
     def to_json(self) -> dict[str, Any]:
         """Return the fields as JSON's types."""
-        return {
-            "status": self.status.value,
-            "message": self.message,
-            "exponent": self.exponent.to_json(),
-            "p_value": self.p_value,
-        }
+        return json_of(vars(self))
 
     def __str__(self) -> str:
         return f"{self.status}. {self.message}"
@@ -285,7 +274,7 @@ def constant_a_test(record: DecayRecord) -> ConstantA:
 
     Examples
     --------
-    >>> from beamfit.lifetime.decay import current
+    >>> from beamfit.lifetime.decay import HOUR, current
     >>> t = np.linspace(0, 8 * 3600, 500)
     >>> noise = 1e-3 * np.random.default_rng(1).normal(size=t.size)
     >>> record = DecayRecord(t, np.array(current(t, 500.0, 2e-8, 1e-6)) + noise)
@@ -346,12 +335,7 @@ class DecayChecks:
 
     def to_json(self) -> dict[str, Any]:
         """Return the fields as JSON's types."""
-        line = self.log_linear
-        return {
-            "single_exponential": self.single_exponential.to_json(),
-            "log_linear": None if line is None else line.to_json(),
-            "constant_a": self.constant_a.to_json(),
-        }
+        return json_of(vars(self))
 
 
 def check_decay(record: DecayRecord) -> DecayChecks | None:

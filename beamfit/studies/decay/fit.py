@@ -2,24 +2,192 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import replace
-from typing import Any
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
 import jax
 import numpy as np
 
 from beamfit.errors import InputError
-from beamfit.studies.decay.model import padded, padded_size, solve_decay, solve_decays
+from beamfit.lifetime.decay import HOUR
+from beamfit.quantity import Quantity, Status
+from beamfit.studies.decay.model import (
+    Solution,
+    padded,
+    padded_size,
+    solve_decay,
+    solve_decays,
+)
 from beamfit.studies.decay.record import DecayRecord
-from beamfit.studies.decay.result import DecayFit
-from beamfit.studies.decay.verdict import judge, judge_constant
+from beamfit.studies.decay.verdict import (
+    BELIEVED,
+    DETERMINED,
+    Evidence,
+    Separability,
+    finding_of,
+)
 
-__all__ = ["fit_decay", "fit_decays"]
+if TYPE_CHECKING:
+    from beamfit.sampling.posterior import Posterior
+    from beamfit.sampling.priors import Distribution
+
+__all__ = ["DecayFit", "bare", "fit_decay", "fit_decays"]
 
 FEWEST = 5
-# Records solved in one call; fewer are filled up, so that one number is compiled.
+# Records solved in one call; fewer are filled up, so that one number is compiled. A call takes as
+# many steps as its slowest record.
 TOGETHER = 16
+UNITS = {
+    "a": "1/(mA s)",
+    "b": "1/s",
+    "i0": "mA",
+    "lifetime_start": "h",
+    "lifetime_end": "h",
+    "lifetime_mean": "h",
+}
+
+
+def bare(value: float, unit: str) -> dict[str, Any]:
+    """A number that has no error, as JSON."""
+    return {"value": value, "error": None, "unit": unit}
+
+
+@dataclass(frozen=True, eq=False)
+class DecayFit:
+    """The result of `fit_decay`.
+
+    Parameters
+    ----------
+    record : str
+        Name of the record.
+    status : Status
+        `converged`; `poor_fit` if chi² is improbable (below 1e-3); `infeasible` if a or b is
+        negative by more than its error allows; `unidentified` if a and b, or the lifetime
+        itself, are not determined; `not_finite` if the search failed.
+    message : str
+        One sentence or two of cause and remedy.
+    i0, a, b : Quantity
+        Current at the first reading, mA, and the coefficients of dI/dt = -a I² - b I.
+    lifetime_start, lifetime_end, lifetime_mean : Quantity
+        Lifetime 1/(a I + b) at the first and last reading and at the mean current, h.
+    mean_current : float
+        Mean current of the record, mA.
+    chi2 : float
+        Weighted sum of squares. Without errors in the record the noise is inferred from the
+        residuals, and chi2 equals dof.
+    dof : int
+        Readings less parameters.
+    rms_residual : float
+        Root mean square of the residuals, mA.
+    noise_inferred : bool
+        Whether the record came without errors.
+    residuals : array, shape (n,)
+        Model minus reading, mA.
+    identifiability : Separability
+        Whether the record tells a from b.
+    readings : DecayRecord, optional
+        What was fitted.
+    shaped : bool
+        Whether a was given a dependence on the current.
+
+    Examples
+    --------
+    >>> hours = np.linspace(0.0, 36000.0, 40)
+    >>> fit = fit_decay(DecayRecord(hours, 100.0 / (1.0 + 100.0 * 1e-7 * hours)))
+    >>> isinstance(fit, DecayFit), f"{fit.a.value:.2e}"
+    (True, '1.00e-07')
+    """
+
+    record: str
+    status: Status
+    message: str
+    i0: Quantity
+    a: Quantity
+    b: Quantity
+    lifetime_start: Quantity
+    lifetime_end: Quantity
+    lifetime_mean: Quantity
+    mean_current: float
+    chi2: float
+    dof: int
+    rms_residual: float
+    noise_inferred: bool
+    residuals: np.ndarray
+    identifiability: Separability
+    readings: DecayRecord | None = None
+    shaped: bool = False
+
+    def sample(
+        self,
+        *,
+        noise: str | None = None,
+        outliers: bool = False,
+        priors: Mapping[str, Distribution] | None = None,
+        **options: Any,
+    ) -> Posterior:
+        """Draw I0, a and b from their posterior, flat above zero; lifetimes are derived.
+
+        Parameters
+        ----------
+        noise : {"known", "inferred"}, optional
+            Whether the errors are right, or right up to a common factor that is inferred. By
+            default they are inferred where the record has none or the fit enlarged them.
+        outliers : bool
+            Let an unknown fraction of the readings be outliers.
+        priors : mapping of str to distribution, optional
+            On ``i0``, ``a`` or ``b``: `Normal`, `LogNormal`, `Uniform`, `HalfNormal` of
+            `beamfit.sampling.priors`, or a frozen one of scipy.stats.
+        **options
+            ``seed, target_ess, budget, walkers, store, provenance, progress`` of
+            `beamfit.sampling.ensemble.draw`.
+
+        Returns
+        -------
+        Posterior
+
+        Raises
+        ------
+        InputError
+            As `beamfit.studies.decay.posterior.decay_target` and `draw`.
+
+        Examples
+        --------
+        >>> t = np.linspace(0, 8 * 3600, 100)
+        >>> noise = 1e-2 * np.random.default_rng(1).normal(size=t.size)
+        >>> fit = fit_decay(DecayRecord(t, 100.0 / (1.0 + 100.0 * 1e-7 * t) + noise))
+        >>> posterior = fit.sample(seed=1)
+        >>> posterior.status.value, bool(posterior.values("b").min() >= 0)
+        ('converged', True)
+        """
+        from beamfit.sampling.ensemble import draw
+        from beamfit.studies.decay.posterior import decay_target
+
+        return draw(decay_target(self, noise, outliers, priors), **options)
+
+    def __str__(self) -> str:
+        rows = [f"{self.record}: {self.status}. {self.message}"]
+        rows += [f"  {name:15s} {getattr(self, name)}" for name in UNITS]
+        rows.append(
+            f"  chi²/dof {self.chi2:.4g}/{self.dof}, residual {self.rms_residual:.3g} mA rms"
+        )
+        return "\n".join(rows)
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the result as one JSON object, as `beamfit lifetime --json` prints it."""
+        return {
+            "record": self.record,
+            "status": self.status.value,
+            "message": self.message,
+            **{name: getattr(self, name).to_json() for name in UNITS},
+            "mean_current": bare(self.mean_current, "mA"),
+            "chi2": self.chi2,
+            "dof": self.dof,
+            "rms_residual": bare(self.rms_residual, "mA"),
+            "noise_inferred": self.noise_inferred,
+            "identifiability": self.identifiability.to_json(),
+        }
 
 
 def fit_decay(record: DecayRecord, shape: Callable[[Any], Any] | None = None) -> DecayFit:
@@ -61,11 +229,8 @@ def fit_decay(record: DecayRecord, shape: Callable[[Any], Any] | None = None) ->
     converged 28.704763 ± 0.000026 h
     """
     if _says_nothing(record):
-        return judge_constant(record)
-    if shape is not None:
-        shaped = judge(record, solve_decay(*padded(record), shape=shape))
-        return replace(shaped, shaped=True)
-    return judge(record, solve_decay(*padded(record)))
+        return _constant(record)
+    return _judged(record, solve_decay(*padded(record), shape=shape), shaped=shape is not None)
 
 
 def fit_decays(records: Sequence[DecayRecord]) -> tuple[DecayFit, ...]:
@@ -98,7 +263,7 @@ def fit_decays(records: Sequence[DecayRecord]) -> tuple[DecayFit, ...]:
     groups: dict[int, list[int]] = {}
     for k, record in enumerate(records):
         if _says_nothing(record):
-            fits[k] = judge_constant(record)
+            fits[k] = _constant(record)
         else:
             groups.setdefault(padded_size(len(record)), []).append(k)
     for members in groups.values():
@@ -110,7 +275,7 @@ def fit_decays(records: Sequence[DecayRecord]) -> tuple[DecayFit, ...]:
             solutions = solve_decays(*stacked)
             for row, k in enumerate(chosen):
                 one = jax.tree.map(lambda leaf, r=row: leaf[r], solutions)
-                fits[k] = judge(records[k], one)
+                fits[k] = _judged(records[k], one)
     return tuple(fits[k] for k in range(len(records)))
 
 
@@ -120,3 +285,83 @@ def _says_nothing(record: DecayRecord) -> bool:
         expected = f"{FEWEST} or more for a decay"
         raise InputError(f"{len(record)} readings", expected, path=record.name)
     return bool(np.ptp(record.current) == 0)
+
+
+def _constant(record: DecayRecord) -> DecayFit:
+    """The result for readings that are all equal: no decay is seen, and no noise either."""
+    level = float(record.current[0])
+    unknown = {name: Quantity(math.nan, None, unit) for name, unit in UNITS.items()}
+    message = (
+        f"All {len(record)} readings are {level:.6g} mA, so neither decay nor noise is seen: "
+        "record longer, or read the monitor with more digits."
+    )
+    return DecayFit(
+        record=record.name,
+        status=Status.unidentified,
+        message=message,
+        **unknown | {"i0": Quantity(level, None, "mA")},
+        mean_current=level,
+        chi2=0.0,
+        dof=len(record) - 1,
+        rms_residual=0.0,
+        noise_inferred=record.error is None,
+        residuals=np.zeros(len(record)),
+        identifiability=Separability(False, None, None, None, None, 1.0),
+        readings=record,
+    )
+
+
+def _quantity(evidence: Evidence, name: str, known: bool) -> Quantity:
+    """I0, a or b; without an error where it is not determined."""
+    value, error = evidence.scaled(name)
+    if not math.isfinite(value):
+        return Quantity(math.nan, None, UNITS[name])
+    if not known or not math.isfinite(error):
+        return Quantity(value, None, UNITS[name])
+    return Quantity(value, error, UNITS[name], error / evidence.scale * evidence.raw)
+
+
+def _lifetime(evidence: Evidence, name: str, known: bool) -> Quantity:
+    """Lifetime in hours from a loss rate; no error where the rate is not clear of zero."""
+    rate, error = evidence.scaled(name)
+    if not rate > 0:
+        return Quantity(math.nan, None, "h")
+    if not (known and error < DETERMINED * rate):
+        return Quantity(1 / rate / HOUR, None, "h")
+    error = error / rate**2 / HOUR
+    return Quantity(1 / rate / HOUR, error, "h", error / evidence.scale * evidence.raw)
+
+
+def _judged(record: DecayRecord, solution: Solution, shaped: bool = False) -> DecayFit:
+    """Turn a solution into quantities, a status and its sentence."""
+    evidence = Evidence.of(record, solution)
+    rate, error = evidence.scaled("rate_mean")
+    if rate < -BELIEVED * error:
+        first, last = record.current[0], record.current[-1]
+        expected = "a decay; cut out refills with split_record"
+        found = f"a current that rises, {first:.6g} to {last:.6g} mA"
+        raise InputError(found, expected, path=record.name, column="current")
+    separability = evidence.separability
+    known = bool(solution.converged)
+    apart = known and separability.separable
+    finding = finding_of(evidence, separability)
+    return DecayFit(
+        record=record.name,
+        status=finding.status,
+        message=finding.message,
+        i0=_quantity(evidence, "i0", known),
+        a=_quantity(evidence, "a", apart),
+        b=_quantity(evidence, "b", apart),
+        lifetime_start=_lifetime(evidence, "rate_start", known),
+        lifetime_end=_lifetime(evidence, "rate_end", known),
+        lifetime_mean=_lifetime(evidence, "rate_mean", known),
+        mean_current=float(record.current.mean()),
+        chi2=evidence.chi2,
+        dof=evidence.dof,
+        rms_residual=float(np.sqrt(np.mean(evidence.residuals**2))),
+        noise_inferred=record.error is None,
+        residuals=evidence.residuals,
+        identifiability=separability,
+        readings=record,
+        shaped=shaped,
+    )

@@ -7,14 +7,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from beamfit.errors import InputError
+from beamfit.lifetime.decay import HOUR
 from beamfit.lifetime.losses import MECHANISMS, Losses, loss_coefficients
 from beamfit.lifetime.ring import Operation, Ring
 from beamfit.quantity import Quantity
 from beamfit.studies.decay.record import DecayRecord
 
 __all__ = ["Budget", "Machine", "budget", "operation_during"]
-
-HOUR = 3600.0
 
 
 class Machine(NamedTuple):

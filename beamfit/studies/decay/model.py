@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from beamfit.greybox.many_starts import descend_one
+from beamfit.greybox.descend import descend_one
 from beamfit.greybox.problem import Free, Prior, Problem, Record
 from beamfit.lifetime.decay import current, current_by_rate
 from beamfit.studies.decay.record import DecayRecord
@@ -26,6 +26,7 @@ __all__ = [
     "beam_current",
     "constant_shape",
     "decay_problem",
+    "decay_record",
     "padded",
     "padded_size",
     "solve_decay",
@@ -33,10 +34,13 @@ __all__ = [
 ]
 
 Shape = Callable[[Array], Array]
+RECORD = "decay"
 # Width of a prior on the quadratic part, in units of the whole loss (whose own error counts in).
 # Physics allows 0 to 1, so 30 moves no value that the record determines (by 4e-5 of it where the
 # verdict turns, nothing beyond); it keeps records too short for their noise from running away.
 PRIOR_WIDTH = 30.0
+# Most steps with a shape: in a valley without a bottom the record cannot tell anyway.
+FEW_STEPS = 100
 
 
 class DecayNumbers(NamedTuple):
@@ -171,6 +175,12 @@ def _predicted(shape: Shape | None) -> Callable[[DecayNumbers, Moments], Array]:
     return partial(beam_current, shape=shape)
 
 
+def decay_record(record: DecayRecord, shape: Shape | None = None) -> Record:
+    """The readings, and what the law predicts of them."""
+    at = Moments(record.time, record.current.mean())
+    return Record(RECORD, _predicted(shape), at, record.current, record.error)
+
+
 def decay_problem(record: DecayRecord, shape: Shape | None = None) -> Problem:
     """State the fit of a decay: I0, a and b free, one record, a weak prior on a.
 
@@ -194,20 +204,15 @@ def decay_problem(record: DecayRecord, shape: Shape | None = None) -> Problem:
     >>> print(f"{fit['a'].value:.3e}")
     2.000e-08
     """
-    time, measured, _ = readings = padded(record)
-    start, width = (np.asarray(part) for part in _start(*_scaled(np.stack(readings))[:3]))
+    scaled = _scaled(np.stack(padded(record)))
+    start, noise, width = (np.asarray(part) for part in _start(*scaled[:3]))
     span, mean = record.span, float(record.current.mean())
     loss, quadratic = start[1] / span, start[2] / span
-    rows = slice(len(record))
     return Problem(
         DecayNumbers(start[0] * mean, quadratic / mean, loss - quadratic),
         [Free("i0"), Free("a"), Free("b")],
-        [
-            Record(
-                "decay", _predicted(shape), Moments(time[rows], mean), measured[rows], record.error
-            )
-        ],
-        [] if shape else [Prior("a", 0.0, width / span / mean)],
+        [decay_record(record, shape)],
+        [] if shape else [Prior("a", 0.0, width / noise / span / mean)],
     )
 
 
@@ -257,8 +262,8 @@ def _scaled(readings: Array) -> tuple[Array, Array, Array, tuple[Array, Array]]:
 
 
 @jax.jit
-def _start(time: Array, measured: Array, weight: Array) -> tuple[Array, Array]:
-    """Start, and standard deviation of the weak prior on the quadratic part.
+def _start(time: Array, measured: Array, weight: Array) -> tuple[Array, Array, Array]:
+    """Start, noise in units of the weights, and width of the prior on the quadratic part.
 
     Integrated once, the law is linear in theta: I(t) = p0 - p1 ∫I dt - p2 ∫I(I - 1) dt in scaled
     units. The integrals average the noise, so the start is good for a decay of any length.
@@ -286,7 +291,8 @@ def _start(time: Array, measured: Array, weight: Array) -> tuple[Array, Array]:
     straight, noise, error = solve(1e9 * normal[2, 2] + 1e-300)
     width = PRIOR_WIDTH * (jnp.abs(straight[1]) + 3 * noise * error) + 1e-300
     bent, less, _ = solve((noise / width) ** 2)
-    return bent, width / jnp.maximum(jnp.minimum(noise, less), 1e-300)
+    least = 1e-15 * jnp.sqrt(jnp.mean(target**2))
+    return bent, jnp.maximum(jnp.minimum(noise, less), least), width
 
 
 def _inverse(matrix: Array) -> Array:
@@ -300,7 +306,8 @@ def _solve(readings: Array, free: Array, shape: Shape | None = None) -> tuple[Ar
     """Scale, search, and turn theta into physical numbers; few arrays out, for each costs time."""
     time, measured, weight, unit = _scaled(readings)
     scaled_shape = None if shape is None else lambda beam: shape(beam * unit[1])
-    start, width = _start(time, measured, weight)
+    start, noise, width = _start(time, measured, weight)
+    weight = weight / noise
 
     def off(theta: Array, law: Shape | None) -> tuple[Array, Array]:
         model = beam_current(_numbers(theta), Moments(time, 1.0), law)
@@ -322,16 +329,20 @@ def _solve(readings: Array, free: Array, shape: Shape | None = None) -> tuple[Ar
     found = descend_one(constant, start, -reach[:3], reach[:3])
     if shape is not None:
         begin = jnp.append(found.theta, 0.0)
-        shaped = lambda theta: off(theta, scaled_shape)[0]  # noqa: E731
-        found = descend_one(shaped, begin, -reach, reach)
+        found = descend_one(lambda t: off(t, scaled_shape)[0], begin, -reach, reach, FEW_STEPS)
     (residual, values), (jacobian, slopes) = jax.vmap(
         lambda step: jax.jvp(answer, (found.theta,), (step,)), out_axes=(None, 0)
     )(jnp.diag(free))
-    spread = slopes.T @ _root(jacobian, free)
-    errors = jnp.linalg.norm(spread, axis=1)
-    correlation = spread[1] @ spread[2] / (errors[1] * errors[2])
+    root = _root(jacobian, free)
+    if shape is None:
+        # At rest, one step of Gauss and Newton more is free, and ends at rounding.
+        step = jnp.where(found.rested, -root @ (root.T @ (jacobian @ residual)), 0.0)
+        values, residual = values + step @ slopes, residual + step @ jacobian
+    spread = slopes.T @ root
+    errors = jnp.linalg.norm(spread, axis=1) / noise
+    correlation = (spread[1] @ spread[2]) / noise**2 / (errors[1] * errors[2])
     residual = residual[: time.size]
-    rest = jnp.stack([correlation, residual @ residual, found.rested])
+    rest = jnp.stack([correlation, noise**2 * (residual @ residual), found.rested])
     residuals = jnp.where(weight > 0, residual / weight, 0.0) * unit[1]
     return jnp.concatenate([values, errors, rest]), residuals
 

@@ -13,8 +13,7 @@ from beamfit.lifetime.ring import Operation
 from beamfit.lifetime.scaled import Terms, loss_terms, scaled_losses
 from beamfit.quantity import Quantity
 from beamfit.sampling.posterior import Posterior
-from beamfit.studies.decay.scale_sample import losses_of
-from beamfit.studies.decay.scales import ScaleFit
+from beamfit.studies.decay.scales import ScaleFit, losses_of
 
 __all__ = ["BestPoint", "Limits", "best_operating_point"]
 

@@ -3,79 +3,55 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import NamedTuple
+from typing import Protocol
 
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
 from beamfit.errors import InputError
-from beamfit.lifetime.decay import current
-from beamfit.sampling.likelihood import Group, Likelihood
-from beamfit.sampling.priors import Distribution, checked
-from beamfit.sampling.target import Derived, Law, Target, covariance_of
+from beamfit.greybox.posterior import Optimum, Statement, record_of, target_of
+from beamfit.greybox.problem import Free, Problem
+from beamfit.lifetime.decay import HOUR, current
+from beamfit.quantity import Quantity
+from beamfit.sampling.posterior import Expected, Posterior
+from beamfit.sampling.priors import Distribution
+from beamfit.sampling.target import Target
+from beamfit.status import Status
+from beamfit.studies.decay.model import RECORD, DecayNumbers, decay_record
 from beamfit.studies.decay.record import DecayRecord
-from beamfit.studies.decay.result import DecayFit
+from beamfit.verdict import Finding
 
-__all__ = ["DecayNumbers", "Readings", "decay_target"]
+__all__ = ["decay_target", "expected_current"]
 
-HOUR = 3600.0
-NAMES, UNITS = ("i0", "a", "b"), ("mA", "1/(mA s)", "1/s")
-LIFETIMES = ("lifetime_start", "lifetime_mean", "lifetime_end")
-
-
-class DecayNumbers(NamedTuple):
-    """One draw: current at the first reading, mA, and the coefficients of dI/dt = -a I² - b I."""
-
-    i0: Array
-    a: Array
-    b: Array
+UNITS = {"i0": "mA", "a": "1/(mA s)", "b": "1/s"}
+LIFETIMES = {"lifetime_start": "h", "lifetime_mean": "h", "lifetime_end": "h"}
 
 
-class Readings(NamedTuple):
-    """A record as the sampler sees it; times s and currents mA, of shape (n,).
+class Fitted(Protocol):
+    """A fitted decay."""
 
-    Attributes
-    ----------
-    time, current, error : Array
-        Error 1 mA where none was stated.
-    mean_current : Array
-        Mean of the record, mA.
-    """
-
-    time: Array
-    current: Array
-    error: Array
-    mean_current: Array
+    status: Status
+    message: str
+    i0: Quantity
+    a: Quantity
+    b: Quantity
+    mean_current: float
+    chi2: float
+    dof: int
+    rms_residual: float
+    readings: DecayRecord | None
 
 
-def residual(data: Readings, theta: Array) -> tuple[Array, ...]:
-    """Of report equation 44."""
-    return ((current(data.time, *theta) - data.current) / data.error,)
-
-
-def flat(data: Readings, theta: Array) -> Array:
-    """Flat; the bounds keep the numbers from being negative."""
-    return jnp.zeros(())
-
-
-def numbers(data: Readings, theta: Array) -> DecayNumbers:
-    """The draw by name."""
-    return DecayNumbers(*theta)
-
-
-def lifetimes(data: Readings, theta: Array) -> Array:
+def _lifetimes(numbers: DecayNumbers, at: tuple[Array, Array]) -> Array:
     """Lifetime at the first reading, at the mean current and at the last reading, h."""
-    i0, a, b = theta
-    at = jnp.stack([i0, data.mean_current, current(data.time[-1], i0, a, b)])
-    return 1.0 / (a * at + b) / HOUR
-
-
-LAW = Law(residual, flat, lifetimes, numbers)
+    mean, last = at
+    levels = jnp.stack([numbers.i0, mean, current(last, numbers.i0, numbers.a, numbers.b)])
+    return 1.0 / (numbers.a * levels + numbers.b) / HOUR
 
 
 def decay_target(
-    fit: DecayFit,
+    fit: Fitted,
     noise: str | None = None,
     outliers: bool = False,
     priors: Mapping[str, Distribution] | None = None,
@@ -86,12 +62,8 @@ def decay_target(
     ----------
     fit : DecayFit
         The fit, with its readings.
-    noise : {"known", "inferred"}, optional
-        None: inferred where the record has no errors or the fit enlarged them, else known.
-    outliers : bool
-        Whether some readings may be outliers.
-    priors : mapping of str to distribution, optional
-        On i0, a, b, besides the flat prior above zero.
+    noise, outliers, priors
+        As of `beamfit.greybox.posterior.target_of`; priors on i0, a, b.
 
     Returns
     -------
@@ -101,8 +73,7 @@ def decay_target(
     Raises
     ------
     InputError
-        If the fit has no readings or another law than a constant a, an option is not understood,
-        or a prior's name is not known.
+        If the fit has no readings or another law than a constant a, or as `target_of`.
 
     Notes
     -----
@@ -116,44 +87,35 @@ def decay_target(
     if fit.shaped:
         expected = "a fit of eq. 44 with constant a and b; sample fit_decay(record) without shape"
         raise InputError("a fit with a shape of a(I), which is not sampled", expected)
-    priors = checked(priors, NAMES)
-    inferred = record.error is None or fit.chi2 > fit.dof
-    stated = np.ones(len(record)) if record.error is None else record.error
-    data = Readings(record.time, record.current, stated, np.asarray(fit.mean_current))
-    mode, width = _start(fit, record, priors)
+    free = [Free("i0"), Free("a"), Free("b")]
+    problem = Problem(DecayNumbers(1.0, 0.0, 0.0), free, [decay_record(record)])
+    theta, rate = _start(fit, record)
     scale = fit.rms_residual * np.sqrt(len(record) / max(fit.dof, 1))
-    factor = scale if record.error is None else max(1.0, np.sqrt(fit.chi2 / max(fit.dof, 1)))
-    covariance = _covariance(data, mode, width, max(factor, 1e-12))
-    nothing_seen = not fit.rms_residual > 0 and record.error is None
-    separable = fit.identifiability.separable
-    return Target(
-        law=LAW,
-        data=data,
-        names=NAMES,
+    if record.error is not None:
+        scale = max(1.0, np.sqrt(fit.chi2 / max(fit.dof, 1)))
+    nothing = f"the readings show neither decay nor noise; {fit.message}".rstrip(".")
+    seen = fit.rms_residual > 0 or record.error is not None
+    # A prior on one of the two tells them apart, if anything does.
+    apart = fit.identifiability.separable or {"a", "b"} & set(priors or {})
+    stated = Statement(
+        derived=LIFETIMES,
+        derive=_lifetimes,
+        data=(fit.mean_current, record.time[-1]),
         units=UNITS,
-        lower=np.zeros(3),
-        upper=np.full(3, np.inf),
-        mode=mode,
-        covariance=covariance,
-        likelihood=Likelihood(
-            (Group("", noise or ("inferred" if inferred else "known"), outliers),)
-        ),
-        noise=(max(factor, 1e-12),),
-        noise_unit="mA" if record.error is None else "1",
-        priors=priors,
-        derived=Derived(LIFETIMES, ("h",) * 3),
-        observed=_observed(record),
-        # A prior on one of the two tells them apart, if anything does.
-        priors_own=() if separable or {"a", "b"} & set(priors) else ("a", "b"),
-        remark=_correlated(fit),
-        open_directions=_nothing(fit) if nothing_seen else "",
-        verdict=(fit.status.value, fit.message),
+        lower=dict.fromkeys(UNITS, 0.0),
+        width={"a": rate / fit.mean_current, "b": rate},
+        noise_unit="mA",
+        priors_own=() if apart else ("a", "b"),
+        remark=_correlated(fit.identifiability.error_inflation),
+        nothing="" if seen else nothing,
     )
+    verdict, given = Finding(fit.status, fit.message), [record.error is not None]
+    optimum = Optimum(theta, verdict, [max(scale, 1e-12)], given)
+    return target_of(problem, optimum, stated, noise=noise, outliers=outliers, priors=priors)
 
 
-def _correlated(fit: DecayFit) -> str:
+def _correlated(larger: float) -> str:
     """The likelihood takes readings as independent; say so where they are not."""
-    larger = fit.identifiability.error_inflation
     if larger <= 1:
         return ""
     return (
@@ -162,33 +124,24 @@ def _correlated(fit: DecayFit) -> str:
     )
 
 
-def _nothing(fit: DecayFit) -> str:
-    return f"the readings show neither decay nor noise; {fit.message}".rstrip(".")
-
-
-def _start(
-    fit: DecayFit, record: DecayRecord, priors: Mapping[str, Distribution]
-) -> tuple[np.ndarray, np.ndarray]:
-    """Where to begin, within the bounds, and how far each number can be from there at most."""
-    values = np.array([fit.i0.value, fit.a.value, fit.b.value])
+def _start(fit: Fitted, record: DecayRecord) -> tuple[np.ndarray, float]:
+    """Where to begin, a and b not negative, and the whole loss rate at the mean current, 1/s."""
     mean = fit.mean_current
-    rate = values[1] * mean + values[2]
+    rate = fit.a.value * mean + fit.b.value
     if not (np.isfinite(rate) and rate > 0):
         rate = 1.0 / max(record.span, 1.0)
-    share = np.clip(np.nan_to_num(values[1] * mean / rate, nan=0.5), 0.0, 1.0)
-    mode = np.array([values[0], share * rate / mean, (1.0 - share) * rate])
-    width = np.array([np.inf, rate / mean, rate])
-    for i, name in enumerate(NAMES):
-        if name in priors:
-            width[i] = min(width[i], float(priors[name].std()))
-    return mode, width
+    share = np.clip(np.nan_to_num(fit.a.value * mean / rate, nan=0.5), 0.0, 1.0)
+    return np.array([fit.i0.value, share * rate / mean, (1.0 - share) * rate]), rate
 
 
-def _covariance(data: Readings, mode: np.ndarray, width: np.ndarray, factor: float) -> np.ndarray:
-    # The residuals are in stated errors, the widths are absolute: bring both to the true noise.
-    return covariance_of(LAW, data, mode, width / factor) * factor**2
+def expected_current(posterior: Posterior) -> Expected:
+    """Currents that the posterior of a decay expects at its readings, mA.
 
-
-def _observed(record: DecayRecord) -> dict[str, np.ndarray]:
-    found = {"time s": record.time, "current mA": record.current}
-    return found if record.error is None else found | {"error mA": record.error}
+    Parameters
+    ----------
+    posterior : Posterior
+        Of `DecayFit.sample`.
+    """
+    record = record_of(posterior.target, RECORD)
+    error = np.ones(1) if record.error is None else np.asarray(record.error)
+    return posterior.expected(lambda numbers: record.predict(numbers, record.data), error)

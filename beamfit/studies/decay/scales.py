@@ -5,15 +5,18 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from scipy.optimize import least_squares
 
 from beamfit.errors import InputError, nearest
+from beamfit.greybox.covariance import spread_of
+from beamfit.greybox.posterior import Optimum, Statement, target_of
+from beamfit.greybox.problem import Free, Prior, Problem, Record, residual
+from beamfit.greybox.solve import solve
 from beamfit.lifetime.losses import SCALES
 from beamfit.lifetime.scaled import Terms, loss_terms, scaled_losses
 from beamfit.quantity import Quantity, Status
@@ -21,16 +24,29 @@ from beamfit.statistics import chi2_probability
 from beamfit.studies.decay.loss_budget import Machine, operation_during
 from beamfit.studies.decay.study import Decay
 from beamfit.studies.decay.summary import Summaries, loss_parts, summarise
+from beamfit.table import json_of
+from beamfit.verdict import Finding, judge
 
 if TYPE_CHECKING:
     from beamfit.sampling.posterior import Posterior
 
-__all__ = ["ScaleFit", "fit_scales", "pulls", "stacked_terms", "whitener"]
+__all__ = [
+    "ScaleFit",
+    "fit_scales",
+    "losses_of",
+    "pulls",
+    "sample_scales",
+    "stacked_terms",
+    "whitener",
+]
 
 POOR_FIT = 1e-3
 # A scale known to a third or worse cannot be told from a third more or less of another cause.
 SEPARABLE = 1 / 3
 PRESSURE_ERROR = 0.05
+LARGEST = 1e3
+# How far walkers begin from scales that the decays do not tell.
+WIDTH = 0.3
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,15 +60,15 @@ class ScaleFit:
         separable from the others; `not_converged` if the search failed.
     message : str
         Cause and remedy.
-    touschek, bremsstrahlung, elastic, desorption : Quantity
-        Factors on the ring file's values; without an error where the decays do not separate the
-        mechanism.
+    scales : mapping of str to Quantity
+        Factors on the ring file's values: touschek, bremsstrahlung, elastic, desorption, also as
+        attributes; without an error where the decays do not separate the mechanism.
     chi2 : float
         Sum of squares, priors not counted.
     dof : int
-        Two numbers a decay, less the four scales.
-    vector, covariance : array, shape (4,) and (4, 4)
-        All four scales whether separable or not, and their linearised covariance, not enlarged;
+        Two numbers a decay, less the scales.
+    vector, covariance : array, shape (n,) and (n, n)
+        All scales whether separable or not, and their linearised covariance, not enlarged;
         its entries are infinite along directions that nothing determines.
     error_scale : float
         sqrt(chi²/dof) where above 1.
@@ -66,16 +82,13 @@ class ScaleFit:
         What each decay says.
     names : tuple of str
         Names of the decays.
-    prior_mean, prior_error : array, shape (4,)
+    prior_mean, prior_error : array, shape (n,)
         Priors on the scales; an infinite error for none.
     """
 
     status: Status
     message: str
-    touschek: Quantity
-    bremsstrahlung: Quantity
-    elastic: Quantity
-    desorption: Quantity
+    scales: Mapping[str, Quantity]
     chi2: float
     dof: int
     vector: np.ndarray
@@ -91,25 +104,23 @@ class ScaleFit:
 
     def __str__(self) -> str:
         rows = [f"{len(self.names)} decays: {self.status}. {self.message}"]
-        rows += [f"  {name:15s} {getattr(self, name)}" for name in SCALES]
+        rows += [f"  {name:15s} {scale}" for name, scale in self.scales.items()]
         return "\n".join([*rows, f"  chi²/dof {self.chi2:.4g}/{self.dof}"])
 
-    def sample(self, seed: int = 0, **options: Any) -> Posterior:
-        """Draw the scales from their posterior: see `beamfit.studies.decay.scale_sample`."""
-        from beamfit.studies.decay.scale_sample import sample_scales
+    def __getattr__(self, name: str) -> Quantity:
+        if name in SCALES and "scales" in vars(self):
+            return self.scales[name]
+        raise AttributeError(f"a ScaleFit has no '{name}'")
 
+    def sample(self, seed: int = 0, **options: Any) -> Posterior:
+        """Draw the scales from their posterior: see `sample_scales`."""
         return sample_scales(self, seed, **options)
 
     def to_json(self) -> dict[str, Any]:
         """Return the scales and the verdict as JSON's types."""
-        return {
-            "status": self.status.value,
-            "message": self.message,
-            **{name: getattr(self, name).to_json() for name in SCALES},
-            "chi2": self.chi2,
-            "dof": self.dof,
-            "decays": list(self.names),
-        }
+        verdict = {"status": self.status, "message": self.message}
+        rest = {"chi2": self.chi2, "dof": self.dof, "decays": self.names}
+        return json_of({**verdict, **self.scales, **rest})
 
 
 def stacked_terms(decays: Sequence[Decay], machine: Machine) -> Terms:
@@ -149,7 +160,7 @@ def whitener(scales: Array, terms: Terms, measured: Summaries, pressure_error: A
 
     Parameters
     ----------
-    scales : array, shape (4,)
+    scales : array, shape (n scales,)
         Where the model is linearised in the pressure.
     terms, measured : Terms, Summaries
         Each of n decays.
@@ -178,7 +189,7 @@ def pulls(scales: Array, terms: Terms, measured: Summaries, weight: Array) -> Ar
 
     Parameters
     ----------
-    scales : array, shape (4,)
+    scales : array, shape (n scales,)
         Factors.
     terms, measured : Terms, Summaries
         Each of n decays.
@@ -194,18 +205,15 @@ def pulls(scales: Array, terms: Terms, measured: Summaries, weight: Array) -> Ar
     return jnp.einsum("nij,nj->ni", weight, off)
 
 
-_slopes = jax.jit(jax.jacfwd(pulls))
-
-
 def _check_priors(priors: Mapping[str, tuple[float, float]]) -> tuple[np.ndarray, np.ndarray]:
-    mean, error = np.ones(4), np.full(4, np.inf)
+    told = dict.fromkeys(SCALES, (1.0, np.inf))
     for name, (value, spread) in priors.items():
         if name not in SCALES:
             raise InputError(f"a prior on '{name}'", nearest(name, list(SCALES)))
         if not (value >= 0 and spread > 0):
             raise InputError(f"{name} = {value} ± {spread}", "a mean of 0 or more, an error above")
-        place = list(SCALES).index(name)
-        mean[place], error[place] = value, spread
+        told[name] = (value, spread)
+    mean, error = np.array(list(told.values()), float).T
     return mean, error
 
 
@@ -251,98 +259,178 @@ def fit_scales(
         raise InputError("no decay", "one or more; several settings separate the mechanisms")
     terms, measured = stacked_terms(decays, machine), summarise(tuple(decays))
     mean, error = _check_priors(priors or {})
-    vector, success = mean, True
-    for _ in range(4):  # the weight moves little with the scales: it settles in two or three
+
+    def stated(vector: np.ndarray) -> Problem:
         weight = whitener(vector, terms, measured, pressure_error)
-        found = _search(vector, terms, measured, weight, (mean, error))
-        vector, success = found.x, found.success
-    weight = whitener(vector, terms, measured, pressure_error)
-    residual = np.asarray(pulls(vector, terms, measured, weight)).ravel()
-    jacobian = np.asarray(_slopes(vector, terms, measured, weight)).reshape(-1, 4)
-    covariance = _covariance(np.vstack([jacobian, np.diag(1 / error)]))
+        nothing = np.zeros(measured.parts.shape)
+        record = Record("decays", _weighted, (terms, measured, weight), nothing, 1.0)
+        return _problem(vector, record, mean, error)
+
+    vector = mean
+    for _ in range(4):  # the weight moves little with the scales: it settles in two or three
+        found = solve(stated(vector))
+        vector = found.theta
+    problem = stated(vector)
+    rows = np.asarray(_slopes(problem.core, vector))
+    unbounded = np.full(vector.shape, np.inf)
+    spread = spread_of(rows, -unbounded, unbounded)
+    blind = ~np.isfinite(spread.error(np.eye(vector.size)))
+    covariance = np.where(np.outer(blind, blind), np.inf, spread.seen)
+    off = np.asarray(problem.records[0].residual(problem.core.model))
     seen = int(np.sum(np.any(np.asarray(measured.root) != 0, axis=-1)))
-    chi2, dof = float(residual @ residual), seen - 4
+    chi2, dof = float(off @ off), seen - vector.size
     scale = math.sqrt(max(1.0, chi2 / dof)) if dof > 0 else 1.0
-    quantities = _quantities(vector, covariance, scale)
-    status, message = _verdict(vector, covariance, scale, chi2, dof, success, decays)
+    scales = _quantities(vector, np.sqrt(np.diag(covariance)), scale)
+    ended = found.status not in (Status.not_converged, Status.not_finite)
+    verdict = judge(_Evidence(scales, chi2, dof, ended, len(decays)), RULES)
     return ScaleFit(
-        status, message, *quantities, chi2, dof, vector, covariance, scale, pressure_error,
-        machine, terms, measured, tuple(d.fit.record for d in decays), mean, error,
+        verdict.status, verdict.cause, scales, chi2, dof, vector, covariance, scale,
+        pressure_error, machine, terms, measured, tuple(d.fit.record for d in decays), mean, error,
     )  # fmt: skip
 
 
-def _search(vector, terms, measured, weight, prior):
-    mean, error = prior
+def _vector(model: Mapping[str, Array]) -> Array:
+    return jnp.stack([model[name] for name in SCALES])
 
-    def residual(scales):
-        data = np.asarray(pulls(scales, terms, measured, weight)).ravel()
-        return np.concatenate([data, (scales - mean) / error])
 
-    def slopes(scales):
-        data = np.asarray(_slopes(scales, terms, measured, weight)).reshape(-1, 4)
-        return np.vstack([data, np.diag(1 / error)])
+def _weighted(model: Mapping[str, Array], data: tuple[Terms, Summaries, Array]) -> Array:
+    """Model minus measurement, in standard errors taken at the last scales."""
+    return pulls(_vector(model), *data)
 
-    start = np.maximum(vector, 1e-3)
-    return least_squares(
-        residual, start, slopes, bounds=(0, 1e3), x_scale="jac", xtol=1e-12, ftol=1e-12, gtol=1e-12
+
+def _problem(vector: np.ndarray, record: Record, mean: np.ndarray, error: np.ndarray) -> Problem:
+    """A factor for each of `SCALES`, the decays, and what is known beforehand."""
+    told = zip(SCALES, mean, error, strict=True)
+    return Problem(
+        dict(zip(SCALES, vector, strict=True)),
+        [Free(name, 0.0, LARGEST) for name in SCALES],
+        [record],
+        [Prior(name, value, spread) for name, value, spread in told if np.isfinite(spread)],
     )
 
 
-def _covariance(jacobian: np.ndarray) -> np.ndarray:
-    """Inverse information; infinite along what nothing determines."""
-    _, sizes, directions = np.linalg.svd(jacobian, full_matrices=False)
-    known = sizes > 1e-12 * max(sizes[0], 1e-300)
-    spread = (directions[known].T / sizes[known]) @ (directions[known].T / sizes[known]).T
-    blind = np.abs(directions[~known]).max(axis=0, initial=0.0) > 1e-6
-    spread[np.ix_(blind, blind)] = np.inf
-    return spread
+@jax.jit
+def _slopes(core: Any, theta: Array) -> Array:
+    return jax.jacfwd(residual, 1)(core, theta)
 
 
-def _separable(vector: np.ndarray, covariance: np.ndarray, scale: float) -> np.ndarray:
-    error = scale * np.sqrt(np.diag(covariance))
+def _quantities(vector: np.ndarray, raw: np.ndarray, scale: float) -> dict[str, Quantity]:
+    errors = np.stack([scale * raw, raw], axis=1)
     # Against 1 where the value is smaller: a mechanism found absent, 0.0 ± 0.1, is separable.
-    return error < SEPARABLE * np.maximum(vector, 1.0)
+    known = errors[:, 0] < SEPARABLE * np.maximum(vector, 1.0)
+    return {
+        name: Quantity(float(v), *((float(e[0]), "1", float(e[1])) if k else (None, "1")))
+        for name, v, e, k in zip(SCALES, vector, errors, known, strict=True)
+    }
 
 
-def _quantities(vector: np.ndarray, covariance: np.ndarray, scale: float) -> list[Quantity]:
-    known = _separable(vector, covariance, scale)
-    raw = np.sqrt(np.diag(covariance))
-    return [
-        Quantity(float(v), float(scale * e), "1", float(e)) if k else Quantity(float(v), None, "1")
-        for v, e, k in zip(vector, raw, known, strict=True)
-    ]
+class _Evidence(NamedTuple):
+    """What the rules look at."""
+
+    scales: Mapping[str, Quantity]
+    chi2: float
+    dof: int
+    ended: bool
+    decays: int
+
+    @property
+    def improbable(self) -> bool:
+        """Whether chi² is."""
+        return self.dof > 0 and chi2_probability(self.chi2, self.dof) < POOR_FIT
 
 
-def _verdict(vector, covariance, scale, chi2, dof, success, decays):
-    """Status and sentence, the gravest first."""
-    if not success:
-        return Status.not_converged, "The search for the scales did not end: look at the records."
-    blind = [
-        name
-        for name, known in zip(SCALES, _separable(vector, covariance, scale), strict=True)
-        if not known
-    ]
-    if blind:
-        cures = {
-            "touschek": "the RF voltage or the number of bunches",
-            "bremsstrahlung": "the scraper at constant pressure",
-            "elastic": "the scraper at constant pressure",
-            "desorption": "the current at constant settings",
-        }
-        advice = ", ".join(dict.fromkeys(cures[name] for name in blind))
-        missed = dof > 0 and chi2_probability(chi2, dof) < POOR_FIT
-        more = (
-            f" First principles miss something besides: chi²/dof is {chi2 / dof:.3g}."
-            if missed
-            else ""
-        )
-        return Status.unidentified, (
-            f"{' and '.join(blind)} not separable by {len(decays)} decays: vary {advice}, or give "
-            f"a prior.{more}"
-        )
-    if dof > 0 and chi2_probability(chi2, dof) < POOR_FIT:
-        return Status.poor_fit, (
-            f"chi²/dof is {chi2 / dof:.3g}, improbable for first principles with these scales; "
-            "the errors are enlarged to match: look for an anomaly, or correct by a network."
-        )
-    return Status.converged, "Every mechanism is separable."
+def _lost(e: _Evidence) -> Finding | None:
+    said = "The search for the scales did not end: look at the records."
+    return None if e.ended else Finding(Status.not_converged, said)
+
+
+def _blind(e: _Evidence) -> Finding | None:
+    names = [name for name, scale in e.scales.items() if scale.error is None]
+    if not names:
+        return None
+    advice = ", ".join(dict.fromkeys(SCALES[name] for name in names))
+    more = f" First principles miss something besides: chi²/dof is {e.chi2 / e.dof:.3g}."
+    return Finding(
+        Status.unidentified,
+        f"{' and '.join(names)} not separable by {e.decays} decays: vary {advice}, or give "
+        f"a prior.{more if e.improbable else ''}",
+    )
+
+
+def _improbable(e: _Evidence) -> Finding | None:
+    if not e.improbable:
+        return None
+    return Finding(
+        Status.poor_fit,
+        f"chi²/dof is {e.chi2 / e.dof:.3g}, improbable for first principles with these scales; "
+        "the errors are enlarged to match: look for an anomaly, or correct by a network.",
+    )
+
+
+def _separable(e: _Evidence) -> Finding:
+    return Finding(Status.converged, "Every mechanism is separable.")
+
+
+RULES = (_lost, _blind, _improbable, _separable)
+
+
+# First principles, the decays, the relative error of pressure readings, the factor on errors.
+Study = tuple[Terms, Summaries, Array, Array]
+
+
+def _whitened(scales: Mapping[str, Array], study: Study) -> tuple[Array, Array]:
+    terms, measured, pressure_error, _ = study
+    weight = whitener(_vector(scales), terms, measured, pressure_error)
+    return weight, pulls(_vector(scales), terms, measured, weight)
+
+
+def _pulls(scales: Mapping[str, Array], study: Study) -> Array:
+    """Model minus measurement in standard errors, which move with the scales."""
+    return _whitened(scales, study)[1] / study[3]
+
+
+def _log_volume(scales: Mapping[str, Array], study: Study) -> Array:
+    """det(W)/det(R): the normalisation, which changes with the scales as the errors do."""
+    volume = jnp.abs(jnp.linalg.det(_whitened(scales, study)[0]))
+    known = jnp.abs(jnp.linalg.det(study[1].root)) > 0
+    return jnp.sum(jnp.where(known, jnp.log(jnp.where(known, volume, 1.0)), 0.0))
+
+
+def sample_scales(fit: ScaleFit, seed: int = 0, **options: Any) -> Posterior:
+    """Draw scales from their posterior.
+
+    Parameters
+    ----------
+    fit : ScaleFit
+        Where to start, and the data.
+    seed : int, optional
+        Of the random numbers.
+    **options
+        As of `beamfit.sampling.ensemble.draw`.
+
+    Returns
+    -------
+    Posterior
+        Of Touschek, bremsstrahlung, elastic, desorption, with the priors of the fit, otherwise
+        flat from 0 to 1000. The pressure errors are integrated out as in the fit.
+    """
+    from beamfit.sampling.ensemble import draw
+
+    names = tuple(SCALES)
+    study = (fit.terms, fit.measured, fit.pressure_error, fit.error_scale)
+    record = Record("decays", _pulls, study, np.zeros(fit.measured.parts.shape), 1.0)
+    problem = _problem(fit.vector, record, fit.prior_mean, fit.prior_error)
+    stated = Statement(
+        data=study,
+        log_volume=_log_volume,
+        units=dict.fromkeys(names, "1"),
+        width=dict.fromkeys(names, WIDTH),
+        priors_own=[name for name, scale in fit.scales.items() if scale.error is None],
+    )
+    optimum = Optimum(fit.vector, Finding(fit.status, fit.message), [1.0], [True])
+    return draw(target_of(problem, optimum, stated), seed=seed, **options)
+
+
+def losses_of(draws: Array, terms: Terms) -> tuple[Array, Array]:
+    """Coefficients a and b of many draws at one setting, each of shape (n,)."""
+    return jax.vmap(scaled_losses, (0, None))(jnp.asarray(draws), terms)

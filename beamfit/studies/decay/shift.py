@@ -1,23 +1,223 @@
-"""A shift as one answer: scales, loss budget, best point, next decay, anomaly."""
+"""A shift as one answer: scales, loss budget, best point, next decay, and what has changed."""
 
 from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
+import jax
+import jax.numpy as jnp
 import numpy as np
+from scipy.special import chdtrc
 
-from beamfit.studies.decay.anomaly import Anomaly, find_anomaly
+from beamfit.errors import InputError
+from beamfit.lifetime.decay import HOUR
+from beamfit.lifetime.losses import MECHANISMS
+from beamfit.lifetime.ring import Operation
+from beamfit.lifetime.scaled import loss_terms, scaled_losses, scaled_parts
+from beamfit.quantity import Quantity, Status
+from beamfit.sampling.posterior import Posterior
+from beamfit.sampling.summary import Interval
+from beamfit.studies.decay.fit import bare
 from beamfit.studies.decay.loss_budget import Machine, operation_during
+from beamfit.studies.decay.network import Network, NetworkFit, fit_loss_network
 from beamfit.studies.decay.next_decay import Candidate, Proposal, next_decays
 from beamfit.studies.decay.operating_point import BestPoint, Limits, best_operating_point
-from beamfit.studies.decay.scale_sample import Interval, budget_intervals, sample_scales
-from beamfit.studies.decay.scales import ScaleFit, fit_scales
+from beamfit.studies.decay.scales import ScaleFit, fit_scales, pulls, stacked_terms, whitener
 from beamfit.studies.decay.study import Decay
+from beamfit.studies.decay.summary import summarise
+from beamfit.table import json_of
 
-__all__ = ["Shift", "study_shift"]
+__all__ = ["Anomaly", "Shift", "budget_intervals", "find_anomaly", "study_shift"]
+
+# Chance of a false alarm in one call.
+FALSE_ALARM = 1e-3
+
+
+class Anomaly(NamedTuple):
+    """What moved, and since when.
+
+    Attributes
+    ----------
+    status : Status
+        `converged` if the decays follow the model, `poor_fit` if something moved.
+    message : str
+        The verdict in a sentence.
+    since : str or None
+        Name of the first decay after the change.
+    moved : tuple of str
+        "a", "b", both or none.
+    a, b : Quantity
+        Relative change of a and b since then, in units of 1.
+    probability : float
+        Chance of so large a change, at any time, if nothing moved.
+    """
+
+    status: Status
+    message: str
+    since: str | None
+    moved: tuple[str, ...]
+    a: Quantity
+    b: Quantity
+    probability: float
+
+
+class _Linear(NamedTuple):
+    """Readings minus model (2n,), slopes by relative changes of a and b (2n, 2), and the root
+    of their covariance, with the errors of scales and pressures in it."""
+
+    off: np.ndarray
+    change: np.ndarray
+    root: np.ndarray
+
+    def since(self, first: int) -> tuple[np.ndarray, np.ndarray]:
+        """Whitened readings and slopes if the change began with a decay."""
+        later = np.where(np.arange(len(self.off))[:, None] < 2 * first, 0.0, self.change)
+        return np.linalg.solve(self.root, self.off), np.linalg.solve(self.root, later)
+
+
+def _linearised(fit: ScaleFit, decays: Sequence[Decay]) -> _Linear:
+    terms, measured = stacked_terms(decays, fit.machine), summarise(tuple(decays))
+    scales = jnp.asarray(fit.vector)
+    weight = whitener(scales, terms, measured, fit.pressure_error)
+    off = np.asarray(pulls(scales, terms, measured, weight)).ravel()
+    by_scale = np.asarray(jax.jacfwd(pulls)(scales, terms, measured, weight)).reshape(
+        -1, scales.size
+    )
+    a, b = (np.asarray(part) for part in scaled_losses(scales, terms))
+    quadratic = a * np.asarray(terms.current)
+    zero = np.zeros_like(b)
+    # parts are (a I, a I + b)
+    change = np.stack([np.stack([quadratic, zero], -1), np.stack([quadratic, b], -1)], axis=1)
+    change = np.einsum("nij,njk->nik", np.asarray(weight), change).reshape(-1, 2)
+    known = np.where(np.isfinite(fit.covariance), fit.covariance, 0.0)
+    covariance = fit.error_scale**2 * (np.eye(off.size) + by_scale @ known @ by_scale.T)
+    return _Linear(-off, change, np.linalg.cholesky(covariance))
+
+
+def _fitted(off: np.ndarray, change: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
+    """Fall of chi², the changes that bring it, and their covariance."""
+    information = change.T @ change
+    covariance = np.linalg.pinv(information)
+    found = covariance @ (change.T @ off)
+    return float(found @ information @ found), found, covariance
+
+
+def find_anomaly(fit: ScaleFit, decays: Sequence[Decay]) -> Anomaly:
+    """Look for a lasting change of a or b against the fitted model.
+
+    Parameters
+    ----------
+    fit : ScaleFit
+        Model fitted to earlier decays, taken to be in order.
+    decays : sequence of Decay
+        Later decays, in order of time.
+
+    Returns
+    -------
+    Anomaly
+        The change and its start that explain the decays best, if chance does not.
+
+    Raises
+    ------
+    InputError
+        If there is no decay, or a record's settings store no beam.
+
+    Notes
+    -----
+    For each possible start, the relative changes of a and b from there on are fitted by linear
+    least squares with the covariance of readings, pressure gauge and scales. The fall of chi² has
+    two degrees of freedom; its probability is multiplied by the number of starts. A pressure
+    rise that the gauge shows is part of the model and no anomaly.
+    """
+    if not decays:
+        raise InputError("no decay", "one or more to compare with the model")
+    linear = _linearised(fit, decays)
+    trials = [_fitted(*linear.since(first)) for first in range(len(decays))]
+    falls = np.array([fall for fall, _, _ in trials])
+    best = int(np.argmax(falls))
+    fall, found, covariance = trials[best]
+    chance = min(1.0, len(decays) * float(chdtrc(2, fall)))
+    error = np.sqrt(np.diag(covariance))
+    a, b = (Quantity(float(v), float(e), "1") for v, e in zip(found, error, strict=True))
+    if chance > FALSE_ALARM:
+        message = f"{len(decays)} decays follow the model (p = {chance:.2g})."
+        return Anomaly(Status.converged, message, None, (), a, b, chance)
+    moved = _moved(*linear.since(best), fall)
+    names = " and ".join(moved)
+    since = decays[best].fit.record
+    causes = {
+        ("a",): "the bunch or the momentum acceptance changed, or the beam-induced pressure",
+        (
+            "b",
+        ): "a gas loss that the gauge does not see: a leak away from it, heavier gas, aperture",
+        ("a", "b"): "gas with desorption, or an aperture, that gauge and settings do not show",
+    }
+    changes = ", ".join(
+        f"{name} by {100 * q.value:+.3g} ± {100 * q.error:.2g} %"
+        for name, q in (("a", a), ("b", b))
+        if name in moved
+    )
+    message = f"{names} moved since {since} ({changes}; p = {chance:.2g}): {causes[moved]}."
+    return Anomaly(Status.poor_fit, message, since, moved, a, b, chance)
+
+
+def _moved(off: np.ndarray, change: np.ndarray, fall: float) -> tuple[str, ...]:
+    """Whether one of the two explains as much as both, within 10.8 of chi² (p = 1e-3)."""
+    alone = {name: _fitted(off, change[:, [k]])[0] for k, name in enumerate("ab")}
+    best = max(alone, key=alone.get)
+    return (best,) if fall - alone[best] < 10.8 else ("a", "b")
+
+
+def budget_intervals(
+    fit: ScaleFit,
+    sample: Posterior,
+    operation: Operation,
+    current: float,
+    probability: float = 0.68,
+) -> tuple[Interval, ...]:
+    """The loss budget at a setting, with credible intervals.
+
+    Parameters
+    ----------
+    fit : ScaleFit
+        The fit.
+    sample : Posterior
+        Its draws.
+    operation : Operation
+        Settings and vacuum.
+    current : float
+        Beam current, mA.
+    probability : float, optional
+        Of the intervals.
+
+    Returns
+    -------
+    tuple of Interval
+        Loss rates 1/h by mechanism, a, b, and the lifetime h.
+    """
+    terms = loss_terms(fit.machine.ring, operation, current)
+    draws = np.asarray(sample.draws)
+    losses = jax.vmap(scaled_parts, (0, None))(jnp.asarray(draws), terms)
+    a, b = np.asarray(losses.a), np.asarray(losses.b)
+    rates = losses.rates(current)
+    rows = {
+        **{m.name: (HOUR * np.asarray(rates[m.name]), "1/h") for m in MECHANISMS if m.vary},
+        "a": (a, "1/(mA s)"),
+        "b": (b, "1/s"),
+        "lifetime": (1 / (a * current + b) / HOUR, "h"),
+    }
+    ends = [50, 50 - 50 * probability, 50 + 50 * probability]
+    return tuple(
+        Interval(name, *np.percentile(values, ends), unit, _separable(fit, name))
+        for name, (values, unit) in rows.items()
+    )
+
+
+def _separable(fit: ScaleFit, name: str) -> bool:
+    return name not in fit.scales or fit.scales[name].error is not None
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,6 +241,8 @@ class Shift:
     anomaly : Anomaly or None
         Whether the second half departs from a model fitted to the first; None if the first half
         does not separate the mechanisms.
+    network : NetworkFit or None
+        A network of the losses, where one was asked for.
     """
 
     fit: ScaleFit
@@ -50,47 +252,38 @@ class Shift:
     best: BestPoint
     proposals: tuple[Proposal, ...]
     anomaly: Anomaly | None
+    network: NetworkFit | None = None
 
     def to_json(self) -> dict[str, Any]:
         """Return the answer as JSON's types, in SI, mA and h."""
-        best = self.best
-        return {
-            "scales": self.fit.to_json(),
-            "current": {"value": self.current, "error": None, "unit": "mA"},
-            "budget": [row._asdict() for row in self.budget],
-            "best": {
-                "rf_voltage": best.rf_voltage.to_json(),
-                "scraper_y": {"value": best.scraper_y, "error": None, "unit": "m"},
-                "bunches": best.bunches,
-                "lifetime": best.lifetime.to_json(),
-                "usual": best.usual.to_json(),
-                "message": best.message,
-            },
-            "next": [
-                {
-                    "rf_voltage_V": float(p.candidate.operation.rf_voltage),
-                    "scraper_y_m": float(p.candidate.operation.scraper_y),
-                    "bunches": float(p.candidate.operation.bunches),
-                    "current_mA": p.candidate.current,
-                    "information": p.information,
-                }
-                for p in self.proposals
-            ],
-            "anomaly": None
-            if self.anomaly is None
-            else {
-                "status": self.anomaly.status.value,
-                "message": self.anomaly.message,
-                "since": self.anomaly.since,
-                "moved": list(self.anomaly.moved),
-                "a": self.anomaly.a.to_json(),
-                "b": self.anomaly.b.to_json(),
-                "probability": self.anomaly.probability,
-            },
-        }
+        proposals = [
+            {
+                "rf_voltage_V": float(p.candidate.operation.rf_voltage),
+                "scraper_y_m": float(p.candidate.operation.scraper_y),
+                "bunches": float(p.candidate.operation.bunches),
+                "current_mA": p.candidate.current,
+                "information": p.information,
+            }
+            for p in self.proposals
+        ]
+        best = self.best._asdict() | {"scraper_y": bare(self.best.scraper_y, "m")}
+        found = {} if self.network is None else {"network": self.network.to_json(self.current)}
+        return json_of(
+            {
+                "scales": self.fit,
+                "current": bare(self.current, "mA"),
+                "budget": self.budget,
+                "best": best,
+                "next": proposals,
+                "anomaly": self.anomaly,
+                **found,
+            }
+        )
 
 
-def study_shift(decays: Sequence[Decay], machine: Machine, seed: int = 0) -> Shift:
+def study_shift(
+    decays: Sequence[Decay], machine: Machine, seed: int = 0, network: Network | None = None
+) -> Shift:
     """Study the decays of a shift together.
 
     Parameters
@@ -101,6 +294,8 @@ def study_shift(decays: Sequence[Decay], machine: Machine, seed: int = 0) -> Shi
         The ring, and what the records do not say.
     seed : int, optional
         Of the random numbers.
+    network : Network, optional
+        Also fit a network of the losses: alone, or as a correction of first principles.
 
     Returns
     -------
@@ -113,7 +308,7 @@ def study_shift(decays: Sequence[Decay], machine: Machine, seed: int = 0) -> Shi
         As for `fit_scales`.
     """
     fit = fit_scales(decays, machine)
-    sample = sample_scales(fit, seed=seed)
+    sample = fit.sample(seed=seed)
     current = max(decay.fit.mean_current for decay in decays)
     settings = [operation_during(decay.segment, machine) for decay in decays]
     limits = Limits(*(_range(settings, name) for name in Limits._fields))
@@ -125,7 +320,13 @@ def study_shift(decays: Sequence[Decay], machine: Machine, seed: int = 0) -> Shi
         best=best_operating_point(fit, sample, limits, current),
         proposals=next_decays(fit, _candidates(decays, machine, limits, current))[:3],
         anomaly=_anomaly(decays, machine),
+        network=None if network is None else _network(decays, fit, network, seed),
     )
+
+
+def _network(decays: Sequence[Decay], fit: ScaleFit, network: Network, seed: int) -> NetworkFit:
+    corrected = fit if network is Network.correction else None
+    return fit_loss_network(decays, fit.machine, corrected, seed=seed)
 
 
 def _range(settings: Sequence, name: str) -> tuple[float, float]:

@@ -10,10 +10,9 @@ import numpy as np
 
 from beamfit.errors import InputError
 from beamfit.studies.decay.checks import DecayChecks, check_decay
-from beamfit.studies.decay.fit import FEWEST, fit_decay
+from beamfit.studies.decay.fit import FEWEST, DecayFit, fit_decay
 from beamfit.studies.decay.loss_budget import Budget, Machine, budget
 from beamfit.studies.decay.record import DecayRecord
-from beamfit.studies.decay.result import DecayFit
 from beamfit.studies.decay.segments import Event, split_record
 
 __all__ = ["Decay", "RecordStudy", "study_record"]

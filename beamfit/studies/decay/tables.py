@@ -5,10 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 
-from beamfit.lifetime.losses import LINEAR, QUADRATIC, SCALES, Mechanism
+from beamfit.lifetime.losses import LINEAR, QUADRATIC, Mechanism
+from beamfit.lifetime.ring import Operation
 from beamfit.quantity import Quantity, Status
 from beamfit.studies.decay.shift import Shift
 from beamfit.studies.decay.study import Decay, RecordStudy
+from beamfit.table import cell
 
 __all__ = [
     "FEW",
@@ -17,12 +19,14 @@ __all__ = [
     "check_rows",
     "decay_rows",
     "event_rows",
+    "network_rows",
     "overview",
     "separability_rows",
     "shift_rows",
 ]
 
 Rows = list[tuple[str, list[str]]]
+Row = tuple[str, Callable[[Decay], object]]
 MOST_EVENTS = 100
 # How many decays have every number shown; of more only the main ones, a row each.
 FEW = 4
@@ -41,39 +45,8 @@ SHORT = {
 NEGLIGIBLE = 1e-6
 
 
-def _laid_out(decays: Sequence[Decay], rows: list[tuple[str, Callable[[Decay], object]]]) -> Rows:
-    return [(label, [str(cell(decay)) for decay in decays]) for label, cell in rows]
-
-
-def decay_rows(decays: Sequence[Decay]) -> Rows:
-    """Label and one cell per decay, for every number a fit has.
-
-    Parameters
-    ----------
-    decays : sequence of Decay
-        Decays of one record.
-
-    Returns
-    -------
-    list of (str, list of str)
-        Rows in the order they are read.
-    """
-    return _laid_out(
-        decays,
-        [
-            ("status", lambda d: d.fit.status.value.replace("_", " ")),
-            ("readings", lambda d: f"{len(d.segment)} over {_span(d.segment.span)}"),
-            ("current at the start", lambda d: d.fit.i0),
-            ("lifetime at the start", lambda d: d.fit.lifetime_start),
-            ("lifetime at the mean current", lambda d: d.fit.lifetime_mean),
-            ("lifetime at the end", lambda d: d.fit.lifetime_end),
-            ("a", lambda d: d.fit.a),
-            ("b", lambda d: d.fit.b),
-            ("chi2/dof", _chi2),
-            ("rms residual", lambda d: f"{d.fit.rms_residual:.3g} mA"),
-            ("errors", _noise),
-        ],
-    )
+def _laid_out(decays: Sequence[Decay], rows: Sequence[Row]) -> Rows:
+    return [(label, [cell(value(decay)) for decay in decays]) for label, value in rows]
 
 
 def _span(seconds: float) -> str:
@@ -93,124 +66,123 @@ def _noise(decay: Decay) -> str:
     return "inferred from the residuals" if decay.fit.noise_inferred else "as given"
 
 
-def separability_rows(decays: Sequence[Decay]) -> Rows:
-    """Label and one cell per decay for what the record tells of a and b apart."""
-    return _laid_out(
-        decays,
-        [
-            ("a and b", lambda d: "separable" if _verdict(d).separable else "not separable"),
-            ("share of a in the loss", _share),
-            ("correlation of a and b", lambda d: _number(_verdict(d).correlation, ".6f")),
-            ("neighbouring residuals", lambda d: _number(_verdict(d).residual_correlation, ".2f")),
-            ("true errors are larger by", lambda d: f"{_verdict(d).error_inflation:.1f} times"),
-        ],
-    )
+RESULT: tuple[Row, ...] = (
+    ("status", lambda d: d.fit.status),
+    ("readings", lambda d: f"{len(d.segment)} over {_span(d.segment.span)}"),
+    ("current at the start", lambda d: d.fit.i0),
+    ("lifetime at the start", lambda d: d.fit.lifetime_start),
+    ("lifetime at the mean current", lambda d: d.fit.lifetime_mean),
+    ("lifetime at the end", lambda d: d.fit.lifetime_end),
+    ("a", lambda d: d.fit.a),
+    ("b", lambda d: d.fit.b),
+    ("chi2/dof", _chi2),
+    ("rms residual", lambda d: f"{d.fit.rms_residual:.3g} mA"),
+    ("errors", _noise),
+)
 
 
-def check_rows(decays: Sequence[Decay]) -> Rows:
-    """Label and one cell per decay for what simpler analyses say, and whether a is constant.
-
-    Parameters
-    ----------
-    decays : sequence of Decay
-        Decays of one record.
-
-    Returns
-    -------
-    list of (str, list of str)
-        Lifetimes with their bias from the (a, b) fit.
-    """
-    return _laid_out(
-        decays,
-        [
-            ("single exponential", lambda d: _one_lifetime(d, "single_exponential")),
-            ("line through ln I", lambda d: _one_lifetime(d, "log_linear")),
-            ("constant a", _constant_a),
-        ],
-    )
-
-
-def _one_lifetime(decay: Decay, name: str) -> str:
-    found = None if decay.checks is None else getattr(decay.checks, name)
-    if found is None:
-        return "-"
-    known = math.isfinite(found.bias_start)
-    bias = f"{100 * found.bias_start:+.2g} % at start, " if known else ""
-    return f"{found.lifetime} ({bias}{found.rms_residual:.3g} mA rms)"
-
-
-def _constant_a(decay: Decay) -> str:
-    if decay.checks is None:
-        return "-"
-    found = decay.checks.constant_a
-    said = {Status.converged: "not contradicted", Status.poor_fit: "rejected"}
-    chance = f" (p = {found.p_value:.2g})"
-    return said[found.status] + chance if found.status in said else "the record cannot tell"
-
-
-def _verdict(decay: Decay):
-    return decay.fit.identifiability
+def decay_rows(decays: Sequence[Decay]) -> Rows:
+    """Label and one cell per decay, for every number a fit has."""
+    return _laid_out(decays, RESULT)
 
 
 def _number(value: float | None, form: str) -> str:
     return "-" if value is None else f"{value:{form}}"
 
 
-def _share(decay: Decay) -> str:
-    verdict = _verdict(decay)
-    return "-" if verdict.share is None else str(Quantity(verdict.share, verdict.share_error, "1"))
+def _share(decay: Decay) -> Quantity | None:
+    found = decay.fit.identifiability
+    return None if found.share is None else Quantity(found.share, found.share_error, "1")
+
+
+APART: tuple[Row, ...] = (
+    ("a and b", lambda d: "separable" if d.fit.identifiability.separable else "not separable"),
+    ("share of a in the loss", _share),
+    ("correlation of a and b", lambda d: _number(d.fit.identifiability.correlation, ".6f")),
+    (
+        "neighbouring residuals",
+        lambda d: _number(d.fit.identifiability.residual_correlation, ".2f"),
+    ),
+    ("true errors are larger by", lambda d: f"{d.fit.identifiability.error_inflation:.1f} times"),
+)
+
+
+def separability_rows(decays: Sequence[Decay]) -> Rows:
+    """Label and one cell per decay for what the record tells of a and b apart."""
+    return _laid_out(decays, APART)
+
+
+def _one_lifetime(decay: Decay, name: str) -> str | None:
+    found = None if decay.checks is None else getattr(decay.checks, name)
+    if found is None:
+        return None
+    known = math.isfinite(found.bias_start)
+    bias = f"{100 * found.bias_start:+.2g} % at start, " if known else ""
+    return f"{found.lifetime} ({bias}{found.rms_residual:.3g} mA rms)"
+
+
+def _constant_a(decay: Decay) -> str | None:
+    if decay.checks is None:
+        return None
+    found = decay.checks.constant_a
+    said = {Status.converged: "not contradicted", Status.poor_fit: "rejected"}
+    chance = f" (p = {found.p_value:.2g})"
+    return said[found.status] + chance if found.status in said else "the record cannot tell"
+
+
+CHECKS: tuple[Row, ...] = (
+    ("single exponential", lambda d: _one_lifetime(d, "single_exponential")),
+    ("line through ln I", lambda d: _one_lifetime(d, "log_linear")),
+    ("constant a", _constant_a),
+)
+
+
+def check_rows(decays: Sequence[Decay]) -> Rows:
+    """Label and one cell per decay for what simpler analyses say, and whether a is constant."""
+    return _laid_out(decays, CHECKS)
+
+
+def _part(kind: str, mechanism: Mechanism) -> Row:
+    """A mechanism's part of a or b, with its share of the loss at the mean current."""
+    name, unit = f"{kind}_{mechanism.name}", {"a": "1/(mA s)", "b": "1/s"}[kind]
+
+    def shown(decay: Decay) -> str:
+        budget = decay.budget
+        value = float(getattr(budget.losses, name))
+        rate = value * {"a": budget.current, "b": 1.0}[kind]
+        share = 100 * rate * 3600 * budget.lifetime
+        if share < NEGLIGIBLE:
+            return "negligible"
+        return f"{value:.4g} {unit} ({share:.3g} % of the loss)"
+
+    return f"{kind}, {mechanism.label}", shown
+
+
+def _pressure(decay: Decay) -> str:
+    operation, current = decay.budget.operation, decay.budget.current
+    return f"{float(operation.pressure_base + operation.pressure_slope * current):.3g} Pa"
+
+
+BUDGET: tuple[Row, ...] = (
+    ("RF voltage", lambda d: f"{float(d.budget.operation.rf_voltage) / 1e3:.6g} kV"),
+    ("scraper", lambda d: f"{float(d.budget.operation.scraper_y) * 1e3:.4g} mm"),
+    ("bunches", lambda d: f"{float(d.budget.operation.bunches):.6g}"),
+    ("pressure at the mean current", _pressure),
+    *(_part("a", mechanism) for mechanism in QUADRATIC),
+    ("a, sum", lambda d: f"{d.budget.losses.a:.4g} 1/(mA s)"),
+    ("a, measured", lambda d: d.fit.a),
+    *(_part("b", mechanism) for mechanism in LINEAR),
+    ("b, sum", lambda d: f"{d.budget.losses.b:.4g} 1/s"),
+    ("b, measured", lambda d: d.fit.b),
+    ("lifetime at the mean, computed", lambda d: f"{d.budget.lifetime:.4g} h"),
+    ("lifetime at the mean, measured", lambda d: d.fit.lifetime_mean),
+)
 
 
 def budget_rows(decays: Sequence[Decay]) -> Rows:
-    """Label and one cell per decay: first principles beside the measured a, b and lifetime.
-
-    Parameters
-    ----------
-    decays : sequence of Decay
-        Decays with budgets; without them there are no rows.
-
-    Returns
-    -------
-    list of (str, list of str)
-        Every mechanism with its share of the loss at the mean current.
-    """
-    if not decays or any(decay.budget is None for decay in decays):
-        return []
-
-    def part(kind: str, mechanism: Mechanism) -> tuple[str, Callable[[Decay], str]]:
-        return f"{kind}, {mechanism.label}", lambda d: _with_share(d, f"{kind}_{mechanism.name}")
-
-    return _laid_out(
-        decays,
-        [
-            ("RF voltage", lambda d: f"{float(d.budget.operation.rf_voltage) / 1e3:.6g} kV"),
-            ("scraper", lambda d: f"{float(d.budget.operation.scraper_y) * 1e3:.4g} mm"),
-            ("bunches", lambda d: f"{float(d.budget.operation.bunches):.6g}"),
-            ("pressure at the mean current", lambda d: f"{_pressure(d):.3g} Pa"),
-            *(part("a", m) for m in QUADRATIC),
-            ("a, sum", lambda d: f"{d.budget.losses.a:.4g} 1/(mA s)"),
-            ("a, measured", lambda d: d.fit.a),
-            *(part("b", m) for m in LINEAR),
-            ("b, sum", lambda d: f"{d.budget.losses.b:.4g} 1/s"),
-            ("b, measured", lambda d: d.fit.b),
-            ("lifetime at the mean, computed", lambda d: f"{d.budget.lifetime:.4g} h"),
-            ("lifetime at the mean, measured", lambda d: d.fit.lifetime_mean),
-        ],
-    )
-
-
-def _with_share(decay: Decay, name: str) -> str:
-    value = float(getattr(decay.budget.losses, name))
-    rate = value * decay.budget.current if name[0] == "a" else value
-    share = 100 * rate * 3600 * decay.budget.lifetime
-    if share < NEGLIGIBLE:
-        return "negligible"
-    return f"{value:.4g} {'1/(mA s)' if name[0] == 'a' else '1/s'} ({share:.3g} % of the loss)"
-
-
-def _pressure(decay: Decay) -> float:
-    operation = decay.budget.operation
-    return float(operation.pressure_base + operation.pressure_slope * decay.budget.current)
+    """Label and one cell per decay: first principles beside the measured; empty without a ring."""
+    known = decays and all(decay.budget is not None for decay in decays)
+    return _laid_out(decays, BUDGET) if known else []
 
 
 def overview(decays: Sequence[Decay]) -> list[tuple[str, list[str], list[list[str]]]]:
@@ -270,48 +242,49 @@ def event_rows(study: RecordStudy) -> list[list[str]]:
     return rows + ([[f"{left} more", "", "", ""]] if left else [])
 
 
+def _setting(operation: Operation) -> str:
+    voltage, scraper = float(operation.rf_voltage) / 1e3, 1e3 * float(operation.scraper_y)
+    return f"{voltage:.6g} kV, {scraper:.4g} mm, {float(operation.bunches):.6g} bunches"
+
+
 def shift_rows(shift: Shift) -> Rows:
-    """Label and one cell for each answer of a study of many decays.
-
-    Parameters
-    ----------
-    shift : Shift
-        The study.
-
-    Returns
-    -------
-    list of (str, list of str)
-        Scales, loss budget, best point, next decay, anomaly.
-    """
-    fit, best = shift.fit, shift.best
-    rows = [("status", fit.status.value.replace("_", " "))]
-    for name in SCALES:
-        scale = getattr(fit, name)
-        said = "not separable" if scale.error is None else str(scale)
+    """Label and one cell for each answer of a study of many decays."""
+    fit, best, at = shift.fit, shift.best, f"at {shift.current:.4g} mA"
+    rows: list[tuple[str, object]] = [("status", fit.status)]
+    for name, scale in fit.scales.items():
+        said = "not separable" if scale.error is None else scale
         rows.append((f"{name}, scale on the ring file", said))
     rows.append(("chi2/dof", f"{fit.chi2:.4g}/{fit.dof}" if fit.dof > 0 else "not testable"))
     for row in shift.budget:
         shown = f"{row.median:.4g} ({row.lower:.4g} to {row.upper:.4g}) {row.unit}"
-        label = f"{row.name} at {shift.current:.4g} mA"
-        rows.append((label, shown if row.separable else f"{shown}, not separable"))
-    voltage = Quantity(best.rf_voltage.value / 1e3, _over(best.rf_voltage.error, 1e3), "kV")
-    shown = str(voltage) if voltage.error is not None else f"{voltage.value:.6g} kV, at its limit"
+        rows.append((f"{row.name} {at}", shown if row.separable else f"{shown}, not separable"))
+    volts, error = best.rf_voltage.value / 1e3, best.rf_voltage.error
+    inside = Quantity(volts, None if error is None else error / 1e3, "kV")
     rows += [
-        ("best RF voltage", shown),
+        ("best RF voltage", f"{volts:.6g} kV, at its limit" if error is None else inside),
         ("best scraper and bunches", f"{1e3 * best.scraper_y:.4g} mm, {best.bunches:.6g}"),
-        ("lifetime there", str(best.lifetime)),
-        ("lifetime at the usual settings", str(best.usual)),
+        ("lifetime there", best.lifetime),
+        ("lifetime at the usual settings", best.usual),
     ]
     for number, proposal in enumerate(shift.proposals, 1):
-        operation = proposal.candidate.operation
-        said = (
-            f"{float(operation.rf_voltage) / 1e3:.6g} kV, {1e3 * float(operation.scraper_y):.4g} "
-            f"mm, {float(operation.bunches):.6g} bunches, {proposal.candidate.current:.4g} mA "
-            f"(information {proposal.information:.3g})"
-        )
-        rows.append((f"next decay, choice {number}", said))
-    return [(label, [cell]) for label, cell in rows]
+        asked = proposal.candidate
+        said = f"{asked.current:.4g} mA (information {proposal.information:.3g})"
+        rows.append((f"next decay, choice {number}", f"{_setting(asked.operation)}, {said}"))
+    return [(label, [cell(value)]) for label, value in rows]
 
 
-def _over(value: float | None, unit: float) -> float | None:
-    return None if value is None else value / unit
+def network_rows(shift: Shift) -> Rows:
+    """Label and one cell for what a network of the losses says, and what it obeys."""
+    network, at = shift.network, f"at the usual settings, {shift.current:.4g} mA"
+    a, b, lifetime = network.predict(network.machine.operation, shift.current)
+    held = network.certificate
+    rows = [
+        ("status", network.fit.status),
+        ("chi2/dof", f"{network.fit.chi2:.4g}/{network.fit.dof}"),
+        (f"a {at}", a),
+        (f"b {at}", b),
+        (f"lifetime {at}", lifetime),
+        ("falls with scraper and bunches, rises with pressure", held.holds),
+        ("single maximum of the lifetime in the RF voltage", held.single_maximum),
+    ]
+    return [(label, [cell(value)]) for label, value in rows]

@@ -5,12 +5,36 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 from beamfit.errors import InputError, nearest
 
-__all__ = ["SCENARIOS", "Anchor", "Assumptions"]
+__all__ = ["SCENARIOS", "Anchor", "Assumptions", "Entry"]
 
-SCENARIOS = ("known", "transport-network", "calibration", "focusing-network")
+
+class Entry(NamedTuple):
+    """A scenario as it is known before JAX is loaded: the module that has it, what it takes."""
+
+    module: str
+    robust: bool = False
+    numbers: bool = False
+    anchor: bool = False
+    determinant: bool = False
+    branches: bool = False
+
+
+# A further scenario is a module with a `SCENARIO` and a line here.
+SCENARIOS = {
+    "known": Entry("known", robust=True),
+    "transport-network": Entry("transport_network", anchor=True, determinant=True),
+    "calibration": Entry("calibration", numbers=True),
+    "focusing-network": Entry("focusing_network", anchor=True, branches=True),
+}
+
+
+def _taking(what: str) -> str:
+    """The scenarios that take something."""
+    return " or ".join(name for name, entry in SCENARIOS.items() if getattr(entry, what))
 
 
 @dataclass(frozen=True)
@@ -125,7 +149,7 @@ class Assumptions:
             if getattr(self, name) < 1:
                 raise InputError(f"{getattr(self, name)} {name}", "at least one")
 
-    def check_scenario(self, scenario: str) -> None:
+    def check_scenario(self, scenario: str, robust: bool = False) -> None:
         """Refuse an unknown scenario, and what a scenario has no use for.
 
         Raises
@@ -135,16 +159,27 @@ class Assumptions:
         """
         if scenario not in SCENARIOS:
             raise InputError(f"scenario '{scenario}'", nearest(scenario, list(SCENARIOS)))
+        entry = SCENARIOS[scenario]
         named = [*self.priors, *self.bounds]
-        if named and scenario != "calibration":
+        if named and not entry.numbers:
             raise InputError(
                 f"a prior or bounds on {named[0]} with scenario {scenario}",
-                "scenario calibration, whose calibration numbers are free",
+                f"scenario {_taking('numbers')}, whose calibration numbers are free",
             )
-        networks = ("transport-network", "focusing-network")
-        if self.anchor != Anchor() and scenario not in networks:
-            raise InputError(f"an anchor with scenario {scenario}", " or ".join(networks))
-        if self.anchor.determinant and scenario != "transport-network":
-            raise InputError(f"anchor determinant with scenario {scenario}", "transport-network")
-        if self.hysteresis and scenario != "focusing-network":
-            raise InputError(f"hysteresis with scenario {scenario}", "focusing-network")
+        refused = {
+            "anchor": self.anchor != Anchor(),
+            "determinant": self.anchor.determinant,
+            "branches": self.hysteresis,
+        }
+        words = {
+            "anchor": "an anchor",
+            "determinant": "anchor determinant",
+            "branches": "hysteresis",
+        }
+        if robust and not entry.robust:
+            raise InputError(
+                f"a robust fit in scenario {scenario}", f"scenario {_taking('robust')}"
+            )
+        for what, asked in refused.items():
+            if asked and not getattr(entry, what):
+                raise InputError(f"{words[what]} with scenario {scenario}", _taking(what))

@@ -2,142 +2,120 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
+from enum import Enum
+from typing import NamedTuple
 
 import jax
 
 from beamfit.errors import InputError, nearest
+from beamfit.greybox.fit import Fit
 from beamfit.greybox.problem import Free, Prior, Problem
 from beamfit.greybox.tree import leaves
 from beamfit.optics.beamline import Beamline
+from beamfit.optics.calibration import CurrentPolynomial, SlopeIntercept
+from beamfit.quantity import Quantity
+from beamfit.status import Status
 from beamfit.studies.scan.assumptions import Assumptions
-from beamfit.studies.scan.scenario_data import (
+from beamfit.studies.scan.results import Parameter
+from beamfit.studies.scan.statement import (
+    Scenario,
     Seen,
     beam_free,
     beam_numbers,
-    plane_rows,
     size_record,
     varied_magnets,
 )
 
-__all__ = ["WIDTH", "calibration_numbers", "calibration_problem", "usual_bounds", "with_numbers"]
+__all__ = ["SCENARIO", "WIDTH", "Kind", "Number", "numbers_of_magnets", "with_numbers"]
 
 # The report's bounds are 167.23 ± 20 for the slope and 43.17 ± 20 for the intercept (appendix C).
 WIDTH = 20.0 / 167.23
-OFFSETS = ("intercept", "coefficients.0")
 
 
-def calibration_numbers(line: Beamline, magnet: str) -> dict[str, float]:
-    """The numbers of a magnet's calibration by name.
+class Kind(Enum):
+    """What a number of a calibration does to k1: scales it, shifts it, or bends its curve."""
+
+    slope = "slope"
+    offset = "offset"
+    bend = "bend"
+
+
+# The numbers of a calibration in the order of its fields; of any further ones the last.
+_SCALE = ((Kind.slope, "1"),)
+_MEANINGS = {
+    SlopeIntercept: ((Kind.slope, "MeV/(m^2 A)"), (Kind.offset, "MeV/m^2")),
+    CurrentPolynomial: ((Kind.offset, "T/m"), (Kind.slope, "T/(m A)"), (Kind.bend, "1")),
+}
+
+
+class Number(NamedTuple):
+    """A number of a magnet's calibration as the lattice has it.
+
+    Attributes
+    ----------
+    magnet, path : str
+        Whose, and where in its calibration.
+    value : float
+        In ``unit``.
+    kind : Kind
+        What it does.
+    reach : float
+        Half the width of its usual bounds.
+    unit : str
+        Of the value.
+    """
+
+    magnet: str
+    path: str
+    value: float
+    kind: Kind
+    reach: float
+    unit: str
+
+    @property
+    def name(self) -> str:
+        """As users call it."""
+        return f"{self.magnet}.{self.path}"
+
+
+def numbers_of_magnets(line: Beamline, magnets: tuple[str, ...] | None = None) -> dict[str, Number]:
+    """The numbers of the calibrations of magnets, by name.
 
     Parameters
     ----------
     line : Beamline
         The line.
-    magnet : str
-        A magnet of it.
+    magnets : tuple of str, optional
+        Which; all of the line if None.
 
     Returns
     -------
-    dict of str to float
-        Such as ``{"Q2.slope": 167.23, "Q2.intercept": 43.17}``.
+    dict of str to Number
+        Bounds reach as far in proportion to the slope as the report's: 12 % of the slope, for the
+        offset 12 % of what one ampere gives, for any other number 12 % of itself.
 
     Examples
     --------
     >>> from beamfit.optics.elements import Quadrupole
-    >>> calibration_numbers(Beamline((Quadrupole("Q", 0.1),), energy=100.0), "Q")
-    {'Q.scale': 1.0}
+    >>> magnet = Quadrupole("Q2", 0.1, 0.0, SlopeIntercept(167.23, 43.17))
+    >>> found = numbers_of_magnets(Beamline((magnet,), energy=100.0))
+    >>> [(name, n.value, round(n.reach, 2)) for name, n in found.items()]
+    [('Q2.slope', 167.23, 20.0), ('Q2.intercept', 43.17, 20.0)]
     """
-    calibration = line[magnet].calibration
-    values = jax.tree_util.tree_leaves(calibration)
-    return {
-        f"{magnet}.{leaf.path}": float(value)
-        for leaf, value in zip(leaves(calibration), values, strict=True)
-    }
-
-
-def usual_bounds(numbers: Mapping[str, float]) -> dict[str, tuple[float, float]]:
-    """Bounds of the numbers of one calibration that are free unless said otherwise.
-
-    Slope (or scale, or gradient per ampere) and offset, as wide in proportion to the slope as the
-    report's: ± 12 % of the slope, and for the offset ± 12 % of what one ampere gives.
-
-    Examples
-    --------
-    >>> found = usual_bounds({"Q2.slope": 167.23, "Q2.intercept": 43.17})
-    >>> {name: (round(a, 2), round(b, 2)) for name, (a, b) in found.items()}
-    {'Q2.slope': (147.23, 187.23), 'Q2.intercept': (23.17, 63.17)}
-    """
-    words = {name.split(".", 1)[1] if "." in name else name: name for name in numbers}
-    kinds = {name: _kind(name) for name in words.values()}
-    steep = next((numbers[n] for n, k in kinds.items() if k == "slope"), 1.0)
-    reach = WIDTH * abs(steep)
-    return {n: (numbers[n] - reach, numbers[n] + reach) for n, k in kinds.items() if k != "higher"}
-
-
-def _kind(name: str) -> str:
-    """Whether a number is a slope, an offset or of higher order."""
-    if name.endswith(OFFSETS):
-        return "offset"
-    return "slope" if name.endswith(("slope", "scale", "coefficients.1")) else "higher"
-
-
-def calibration_problem(seen: Seen, told: Assumptions) -> Problem:
-    """State the problem: beams and calibrations free, all planes together.
-
-    Parameters
-    ----------
-    seen : Seen
-        The scan.
-    told : Assumptions
-        Priors and bounds. Naming a number of a magnet that was not scanned frees it too.
-
-    Returns
-    -------
-    Problem
-
-    Raises
-    ------
-    InputError
-        If a prior or bound names no calibration number of the line.
-    """
-    line = seen.scanned
-    known = {n: v for m in line.magnets for n, v in calibration_numbers(line, m).items()}
-    named = [*told.priors, *told.bounds]
-    for name in named:
-        if name not in known:
-            raise InputError(f"a prior or bounds on '{name}'", nearest(name, list(known)))
-    varied = varied_magnets(seen)
-    usual: dict[str, tuple[float, float]] = {}
-    for magnet in line.magnets:
-        own = calibration_numbers(line, magnet)
-        bounds = usual_bounds(own)
-        usual |= {
-            n: bounds.get(n, (v - WIDTH * abs(v) - 1e-3, v + WIDTH * abs(v) + 1e-3))
-            for n, v in own.items()
-            if (magnet in varied and n in bounds) or n in named
-        }
-    magnets = dict.fromkeys(_magnet_of(name, line) for name in usual)
-    beams = beam_numbers(seen)
-    free = beam_free(beams)
-    for name, (low, high) in usual.items():
-        if name in told.priors:
-            mean, sd = told.priors[name]
-            low, high = min(low, mean - 6 * sd), max(high, mean + 6 * sd)
-        low, high = told.bounds.get(name, (low, high))
-        free.append(Free(name, low, high))
-    return Problem(
-        {"beam": beams} | {name: line[name].calibration for name in magnets},
-        free,
-        [size_record(seen, plane, plane_rows(seen, plane)) for plane in seen.planes],
-        [Prior(name, *told.priors[name]) for name in told.priors],
-    )
-
-
-def _magnet_of(name: str, line: Beamline) -> str:
-    """The magnet a calibration number belongs to; names may hold dots themselves."""
-    return next(m for m in line.magnets if name in calibration_numbers(line, m))
+    found = {}
+    for magnet in line.magnets if magnets is None else magnets:
+        calibration = line[magnet].calibration
+        meanings = _MEANINGS.get(type(calibration), _SCALE)
+        values = [float(v) for v in jax.tree_util.tree_leaves(calibration)]
+        told = [meanings[min(i, len(meanings) - 1)] for i in range(len(values))]
+        slopes = [v for v, (kind, _) in zip(values, told, strict=True) if kind is Kind.slope]
+        for leaf, value, (kind, unit) in zip(leaves(calibration), values, told, strict=True):
+            own = WIDTH * abs(value) + 1e-3 if kind is Kind.bend else WIDTH * abs(slopes[0])
+            number = Number(magnet, leaf.path, value, kind, own, unit)
+            found[number.name] = number
+    return found
 
 
 def with_numbers(line: Beamline, numbers: Mapping[str, float]) -> Beamline:
@@ -166,16 +144,103 @@ def with_numbers(line: Beamline, numbers: Mapping[str, float]) -> Beamline:
     >>> float(with_numbers(line, {"Q.scale": 1.1})["Q"].calibration.scale)
     1.1
     """
-    known = {n: v for m in line.magnets for n, v in calibration_numbers(line, m).items()}
+    known = numbers_of_magnets(line)
     for name in numbers:
         if name not in known:
             raise InputError(f"a calibration number '{name}'", nearest(name, list(known)))
-    for magnet in line.magnets:
-        own = calibration_numbers(line, magnet)
-        if set(own) & set(numbers):
-            old = line[magnet]
-            leaves_, structure = jax.tree_util.tree_flatten(old.calibration)
-            values = [numbers.get(name, v) for name, v in zip(own, leaves_, strict=True)]
-            new = jax.tree_util.tree_unflatten(structure, values)
-            line = line.with_element(replace(old, calibration=new))
+    for magnet in dict.fromkeys(known[name].magnet for name in numbers):
+        old = line[magnet]
+        structure = jax.tree_util.tree_structure(old.calibration)
+        own = [numbers.get(n, v.value) for n, v in known.items() if v.magnet == magnet]
+        new = jax.tree_util.tree_unflatten(structure, own)
+        line = line.with_element(replace(old, calibration=new))
     return line
+
+
+def _free_numbers(seen: Seen, told: Assumptions) -> dict[str, Number]:
+    """Slope and offset of the scanned magnets, and whatever is named."""
+    known, varied = numbers_of_magnets(seen.scanned), varied_magnets(seen.scan)
+    named = [*told.priors, *told.bounds]
+    for name in named:
+        if name not in known:
+            raise InputError(f"a prior or bounds on '{name}'", nearest(name, list(known)))
+    return {
+        name: number
+        for name, number in known.items()
+        if name in named or (number.magnet in varied and number.kind is not Kind.bend)
+    }
+
+
+def _state(seen: Seen, told: Assumptions) -> Problem:
+    """Beams and calibrations free, all planes together."""
+    numbers, beams = _free_numbers(seen, told), beam_numbers(seen)
+    magnets = {n.magnet: seen.scanned[n.magnet].calibration for n in numbers.values()}
+    free, priors = beam_free(beams), []
+    for name, number in numbers.items():
+        low, high = number.value - number.reach, number.value + number.reach
+        if name in told.priors:
+            mean, sd = told.priors[name]
+            low, high = min(low, mean - 6 * sd), max(high, mean + 6 * sd)
+            priors.append(Prior(f"magnets.{name}", mean, sd))
+        free.append(Free(f"magnets.{name}", *told.bounds.get(name, (low, high))))
+    rows = {plane: seen.of_plane(plane, magnets=magnets) for plane in seen.planes}
+    records = [size_record(seen, *each) for each in rows.items()]
+    return Problem({"beam": beams, "magnets": magnets}, free, records, priors)
+
+
+def _parameters(seen: Seen, told: Assumptions, fit: Fit) -> Iterator[Parameter]:
+    settled = fit.status is not Status.not_converged
+    for name, number in _free_numbers(seen, told).items():
+        v = fit[f"magnets.{name}"]
+        edge = v.state in ("lower", "upper")
+        known = settled and not edge and v.error == v.error
+        status = Status.converged if known else Status.at_limit if edge else Status.unidentified
+        error, raw = (v.error, v.error_raw) if known else (None, None)
+        yield Parameter(
+            name=name,
+            value=Quantity(v.value, error, number.unit, raw),
+            status=status,
+            state=v.state,
+            lower=v.lower,
+            upper=v.upper,
+            prior=told.priors.get(name),
+            multiplier=v.reduced_gradient,
+        )
+
+
+def _null_directions(
+    seen: Seen, parameters: tuple[Parameter, ...], identified: bool
+) -> tuple[str, ...]:
+    known, said = numbers_of_magnets(seen.scanned), []
+    for parameter in parameters:
+        if parameter.status is Status.converged:
+            continue
+        if known[parameter.name].kind is Kind.offset:
+            said.append(
+                f"{parameter.name}: a shift of k1 is undone by a lens at that magnet in the beam, "
+                "so beta and alpha change and the emittance does not (exact for a thin lens)"
+            )
+        elif not identified:
+            said.append(
+                f"{parameter.name}: a steeper calibration with a beam of smaller emittance gives "
+                "the same sizes (emittance as 1/slope)"
+            )
+    if not identified and not said:
+        said.append("the calibration and the beam together: no single number is to blame")
+    return tuple(said)
+
+
+def _remedy(seen: Seen) -> str:
+    known = numbers_of_magnets(seen.scanned, varied_magnets(seen.scan))
+    slope = next((n for n, v in known.items() if v.kind is Kind.slope), "the slope")
+    return f"a prior on {slope}, or a second screen (see beamfit design)"
+
+
+SCENARIO = Scenario(
+    "calibration",
+    _state,
+    _parameters,
+    _null_directions,
+    _remedy,
+    aside=", and the emittance hardly does",
+)

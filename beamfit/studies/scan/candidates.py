@@ -15,14 +15,9 @@ from beamfit.optics.beamline import Beamline
 from beamfit.optics.calibration import SETTING_UNITS
 from beamfit.optics.elements import Drift, Screen
 from beamfit.studies.scan.fit import EmittanceFit
-from beamfit.studies.scan.information import linearised_at
-from beamfit.studies.scan.scenario_judged import with_slope
-from beamfit.studies.scan.scenario_model import (
-    NetworkRows,
-    Rows,
-    predict_network,
-    predict_sizes,
-)
+from beamfit.studies.scan.information import linearised_at, with_slope
+from beamfit.studies.scan.model import predict_sizes, spoken
+from beamfit.studies.scan.transport import NetworkRows, Rows
 
 __all__ = ["Candidate", "Considered", "candidate_rows", "further_options"]
 
@@ -157,7 +152,7 @@ def _rows(
     for plane in fit.planes:
         relative = np.median(plane.points.error / plane.points.size) * plane.error_scale
         if fit.scenario == "transport-network":
-            data, predict = _network_rows(fit, plane.plane, table, screen), predict_network
+            data, predict = _network_rows(fit, plane.plane, table, screen), predict_sizes
         else:
             data, predict = _line_rows(fit, line, plane.plane, table, screen, energy), predict_sizes
         size, slope = (
@@ -200,7 +195,7 @@ def _network_rows(fit, plane, table, screen) -> NetworkRows:
     record = next(r for r in fit.problem.records if r.name == f"size {plane}")
     measured = fit.scan.screen or (screen,) * len(fit.scan)
     keep = np.flatnonzero(~np.isnan(fit.scan.size[plane]))
-    which = next(i for i, k in enumerate(keep) if measured[k] == screen)
+    which = next(k for k in keep if measured[k] == screen)
     count = len(next(iter(table.values())))
     inputs = [table.get(n, np.full(count, _own_energy(fit))) for n in net.inputs]
     return NetworkRows(
@@ -284,4 +279,4 @@ def _priors(fit: EmittanceFit) -> Iterator[tuple[str, np.ndarray]]:
             value = abs(float(p.start[i]))
             row = np.zeros((1, len(p.names)))
             row[0, i] = 1.0 / (0.02 * value)
-            yield f"a prior of 2 % on {name}", row
+            yield f"a prior of 2 % on {spoken(name)}", row

@@ -193,7 +193,7 @@ def plan_measurements(
     --------
     >>> from beamfit.optics.beamline import Beamline
     >>> from beamfit.optics.elements import Drift, Quadrupole, Screen
-    >>> from beamfit.studies.scan.emittance import fit_emittance
+    >>> from beamfit.studies.scan.fit import fit_emittance
     >>> from beamfit.studies.scan.scans import QuadScan
     >>> line = Beamline((Quadrupole("Q", 0.1), Drift("D", 2.0), Screen("S")), 135.0)
     >>> sizes = np.array([3.4e-4, 1.9e-4, 0.9e-4, 1.9e-4, 3.4e-4])

@@ -1,27 +1,157 @@
-"""A fitted scan: its planes, and the scan and line they came from."""
+"""The emittance fit: a scan and a line in, a judged result out, in every scenario by one path."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
+from html import escape
+from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from beamfit.errors import InputError
+from beamfit.greybox.fit import Fit
+from beamfit.greybox.problem import Problem
+from beamfit.greybox.solve import solve
+from beamfit.optics.beamline import Beamline
 from beamfit.quantity import Quantity
-from beamfit.studies.scan.results import Parameter, PlaneFit
+from beamfit.status import Status
+from beamfit.studies.scan.assumptions import SCENARIOS, Anchor, Assumptions
+from beamfit.studies.scan.judged import judged_beam, judged_scenario
+from beamfit.studies.scan.known import see
+from beamfit.studies.scan.model import line_of
+from beamfit.studies.scan.results import Parameter, PlaneFit, parameter_rows, result_rows
 from beamfit.studies.scan.scans import QuadScan
-from beamfit.studies.scan.tables import as_html, as_text, parameter_rows
+from beamfit.studies.scan.statement import Scenario, Seen
+from beamfit.table import Table, html_of, json_of, labelled, text_of
 
 if TYPE_CHECKING:
-    from beamfit.greybox.fit import Fit
-    from beamfit.greybox.problem import Problem
-    from beamfit.optics.beamline import Beamline
     from beamfit.sampling.posterior import Posterior
     from beamfit.sampling.priors import Distribution
 
-__all__ = ["EmittanceFit"]
+__all__ = ["EmittanceFit", "fit_emittance", "scenario_of"]
+
+METHODS = ("size_squared", "size")
+
+
+def fit_emittance(
+    scan: QuadScan,
+    line: Beamline,
+    *,
+    planes: tuple[str, ...] | None = None,
+    method: str = "size_squared",
+    robust: bool = False,
+    scenario: str = "known",
+    priors: Mapping[str, tuple[float, float]] | None = None,
+    bounds: Mapping[str, tuple[float, float]] | None = None,
+    anchor: Anchor | None = None,
+    hysteresis: bool = False,
+    hidden: int = 5,
+    starts: int = 20,
+    seed: int = 0,
+) -> EmittanceFit:
+    """Fit the beam matrix at the start of a line to a scan, and judge the result.
+
+    Parameters
+    ----------
+    scan : QuadScan
+        The measured sizes.
+    line : Beamline
+        The line, from where the beam matrix is wanted to the screens.
+    planes : tuple of str, optional
+        ("x",), ("y",) or both; all planes of the scan if None.
+    method : {"size_squared", "size"}
+        The residual: the report's ``error_linear`` or ``error_nonlinear``.
+    robust : bool
+        Give each point a probability of being an outlier (with "size_squared").
+    scenario : {"known", "transport-network", "calibration", "focusing-network"}
+        What is unknown besides the beam: nothing; R11 and R12; slope and offset of the scanned
+        magnets' calibration; k1 as a function of the current. All planes are then fitted
+        together. See docs/scenarios.md for what each cannot know.
+    priors, bounds : mapping of str to (float, float), optional
+        Calibration number, such as "Q2.slope", to mean and standard deviation, or to lower and
+        upper bound ("calibration").
+    anchor : Anchor, optional
+        What ties a network to first principles.
+    hysteresis : bool
+        Two branches of k1, for rising and falling currents ("focusing-network").
+    hidden, starts, seed : int
+        Hidden nodes of a network, starts of its training, seed of their random numbers.
+
+    Returns
+    -------
+    EmittanceFit
+        Values, errors, statuses and sentences; `print` it.
+
+    Raises
+    ------
+    InputError
+        If the line lacks a magnet or screen of the scan, or an option is unknown.
+
+    Notes
+    -----
+    One geometric beam matrix at the start is common to all rows, also where their energies
+    differ. Errors are those of the linear theory of least squares, propagated to ε, β, α by
+    their gradients; see docs/emittance.md.
+
+    Examples
+    --------
+    >>> from beamfit.optics.beam import BeamMatrix
+    >>> from beamfit.optics.elements import Drift, Quadrupole, Screen
+    >>> line = Beamline((Quadrupole("Q", 0.1), Drift("D", 2.0), Screen("S")), energy=135.0)
+    >>> k1 = np.linspace(-2.0, 12.0, 8)
+    >>> sizes = [float(BeamMatrix.from_twiss(2e-9, 5.0, 0.0).transport(
+    ...     line.matrix({"Q": k}).x).l11) for k in k1]
+    >>> scan = QuadScan({"Q": k1}, {"Q": "k1"}, {"x": sizes}, {"x": 0.02 * np.array(sizes)})
+    >>> fit = fit_emittance(scan, line)
+    >>> fit.x.status.value, f"{fit.x.emittance.value * 1e9:.4f} nm"
+    ('converged', '2.0000 nm')
+    """
+    if method not in METHODS:
+        raise InputError(f"method '{method}'", "size_squared or size")
+    if robust and method != METHODS[0]:
+        raise InputError("a robust fit of size", 'method "size_squared" with robust')
+    told = Assumptions(
+        priors or {}, bounds or {}, anchor or Anchor(), hysteresis, hidden, starts, seed
+    )
+    told.check_scenario(scenario, robust)
+    statement = scenario_of(scenario)
+    seen = see(scan, line, planes, method, robust)
+    if statement.closed:
+        return EmittanceFit(judged_beam(seen), scan, line, statement, told, seen)
+    stated = statement.state(seen, told)
+    fit = _solved(stated, statement, told)
+    parameters = tuple(statement.parameters(seen, told, fit))
+    found = line_of(fit.model, seen.scanned)
+    judged = judged_scenario(seen, found, statement, told, fit, parameters)
+    identified = all(p.identifiability.determined for p in judged)
+    left = statement.null_directions(seen, parameters, identified)
+    return EmittanceFit(judged, scan, found, statement, told, seen, parameters, left, fit)
+
+
+def scenario_of(name: str) -> Scenario:
+    """The scenario of a name, from its module.
+
+    Examples
+    --------
+    >>> scenario_of("transport-network").whole_map
+    False
+    """
+    return import_module(f"beamfit.studies.scan.{SCENARIOS[name].module}").SCENARIO
+
+
+def _solved(problem: Problem, scenario: Scenario, told: Assumptions) -> Fit:
+    """Solve, a network from many starts, and so whatever one start may have led astray.
+
+    A beam of no emittance is a stationary point of every fit in its Cholesky factor, so a start
+    near it (the known-transport fit with a wrong calibration, say) may never leave it.
+    """
+    fit = solve(problem, told.starts if scenario.network else 1, told.seed)
+    flat = any(fit[f"beam.{plane}.l22"].state == "lower" for plane in problem.model["beam"])
+    lost = fit.status is not Status.converged and fit.chi2 > 2.0 * max(fit.dof, 1)
+    if (flat or lost) and not scenario.network:
+        fit = solve(problem, told.starts, told.seed)
+    return fit
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,24 +168,23 @@ class EmittanceFit:
         The scan.
     line : Beamline
         The line; in a scenario with the calibration or the network of k1 as fitted.
-    scenario : str
-        "known", "transport-network", "calibration" or "focusing-network".
-    anchor : str
-        What ties a network to first principles, in words.
+    statement : Scenario
+        What was unknown besides the beam.
+    told : Assumptions
+        What was known besides the data.
+    seen : Seen
+        The scan through the line as it was given.
     parameters : tuple of Parameter
         Numbers fitted besides the beam.
     null_directions : tuple of str
         Changes of the unknowns that leave the sizes as they are.
-    fit : Fit or None
-        The grey-box fit of a scenario; None where transport is known and the fit is linear.
-    stated : Problem or None
-        A scenario's problem as it was stated, starting from first principles.
+    solved : Fit or None
+        The grey-box fit where there was one; None where the fit is linear and in closed form.
 
     Examples
     --------
     >>> from beamfit.optics.beamline import Beamline
     >>> from beamfit.optics.elements import Drift, Quadrupole, Screen
-    >>> from beamfit.studies.scan.emittance import fit_emittance
     >>> line = Beamline((Quadrupole("Q", 0.1), Drift("D", 2.0), Screen("S")), 135.0)
     >>> sizes = [3.4e-4, 1.9e-4, 0.9e-4, 1.9e-4, 3.4e-4]
     >>> scan = QuadScan({"Q": [-1.0, 1.5, 4.0, 6.5, 9.0]}, {"Q": "k1"}, {"x": sizes})
@@ -67,25 +196,41 @@ class EmittanceFit:
     planes: tuple[PlaneFit, ...]
     scan: QuadScan
     line: Beamline
-    scenario: str = "known"
-    anchor: str = "none"
+    statement: Scenario
+    told: Assumptions
+    seen: Seen
     parameters: tuple[Parameter, ...] = ()
     null_directions: tuple[str, ...] = ()
-    fit: Fit | None = None
-    stated: Problem | None = None
+    solved: Fit | None = None
+
+    @property
+    def scenario(self) -> str:
+        """The name of the scenario."""
+        return self.statement.name
+
+    @property
+    def anchor(self) -> str:
+        """What ties a network to first principles, in words."""
+        return self.told.anchor.words
+
+    @cached_property
+    def stated(self) -> Problem:
+        """The grey-box problem of all planes together, starting from first principles.
+
+        Numbers of the beam are ``beam.x.l11``, ``beam.x.l21``, ``beam.x.l22``: the Cholesky factor
+        of σ in units of 1e-4 (m, rad); those of a calibration ``magnets.Q2.slope`` and so on.
+        """
+        return self.statement.state(self.seen, self.told)
+
+    @cached_property
+    def fit(self) -> Fit:
+        """The grey-box fit; of a linear one solved when it is asked for, from its closed form."""
+        return solve(self.stated) if self.solved is None else self.solved
 
     @property
     def problem(self) -> Problem:
-        """The grey-box problem of all planes together, as it was fitted or could be.
-
-        Numbers of the beam are ``beam.x.l11``, ``beam.x.l21``, ``beam.x.l22``: the Cholesky factor
-        of σ in units of 1e-4 (m, rad).
-        """
-        if self.fit is not None:
-            return self.fit.problem
-        from beamfit.studies.scan.known_problem import known_problem
-
-        return known_problem(self)
+        """The problem as it was fitted or could be."""
+        return self.stated if self.solved is None else self.solved.problem
 
     def __getitem__(self, plane: str) -> PlaneFit:
         return {p.plane: p for p in self.planes}[plane]
@@ -116,8 +261,8 @@ class EmittanceFit:
         planes : tuple of str, optional
             Which; all that were fitted if None.
         noise, outliers, priors
-            As `beam_posterior.beam_target`, with priors on ``x.sigma11`` and so on; in a scenario
-            on the names of its ``problem``.
+            As `beamfit.studies.scan.posterior.beam_target`, with priors on ``x.sigma11`` and so
+            on; in a scenario also on the further names of its ``problem``.
         **options
             ``seed, target_ess, budget, walkers, store, provenance, progress`` of
             `beamfit.sampling.ensemble.draw`.
@@ -125,7 +270,7 @@ class EmittanceFit:
         Returns
         -------
         Posterior
-            Of ``x.sigma11`` ... (in a scenario of its free numbers); ``x.emittance``,
+            Of ``x.sigma11`` ... and what else a scenario fitted; ``x.emittance``,
             ``x.normalized_emittance``, ``x.beta``, ``x.alpha``, ``x.mismatch`` are derived.
 
         Raises
@@ -134,52 +279,39 @@ class EmittanceFit:
             As `beam_target` and `draw`.
         """
         from beamfit.sampling.ensemble import draw
+        from beamfit.studies.scan.posterior import beam_target
 
-        if self.scenario == "known":
-            from beamfit.studies.scan.beam_posterior import beam_target
-
-            return draw(beam_target(self, planes, noise, outliers, priors), **options)
-        fitted = tuple(p.plane for p in self.planes)
-        if planes is not None and tuple(planes) != fitted:
-            raise InputError(
-                f"planes {', '.join(planes)} of scenario {self.scenario}",
-                f"all that were fitted, {', '.join(fitted)}: they have their unknowns in common",
-            )
-        from beamfit.studies.scan.scenario_posterior import scenario_target
-
-        return draw(scenario_target(self, noise, outliers, priors), **options)
+        return draw(beam_target(self, planes, noise, outliers, priors), **options)
 
     def to_json(self) -> list[dict[str, Any]]:
         """Give the ``results`` list of the JSON contract."""
         entries = [p.to_json() | {"energy": self._energy(p.plane).to_json()} for p in self.planes]
-        if self.scenario == "known":
-            return entries
         own = {
             "scenario": self.scenario,
             "anchor": self.anchor,
-            "parameters": [p.to_json() for p in self.parameters],
+            "parameters": json_of(self.parameters),
             "null_directions": list(self.null_directions),
         }
-        return [entry | own for entry in entries]
+        return entries if self.statement.closed else [entry | own for entry in entries]
 
     def _energy(self, plane: str) -> Quantity:
         """Mean total energy of the rows in which a plane was measured, MeV."""
-        if self.scan.energy is None:
-            return Quantity(float(self.line.energy), None, "MeV")
-        measured = np.isfinite(self.scan.size[plane])
-        return Quantity(float(self.scan.energy[measured].mean()), None, "MeV")
+        return Quantity(self.seen.energy(plane), None, "MeV")
+
+    def _table(self, title: str) -> Table:
+        return labelled(title, [p.plane for p in self.planes], result_rows(self.planes))
 
     def __str__(self) -> str:
         heading = f"{self.scan.name} on {self.line.name}, fit of {self.planes[0].method}"
-        text = as_text(heading.replace("_", " "), self.planes)
-        if self.scenario == "known":
-            return text
-        rows = parameter_rows(self.parameters)
-        width = max((len(row[0]) for row in rows), default=0)
-        lines = [f"scenario {self.scenario}, anchor: {self.anchor}"]
-        lines += [f"{name.ljust(width)}  {'  '.join(cells)}".rstrip() for name, cells in rows]
-        lines += [f"Left open: {words}." for words in self.null_directions]
-        return "\n".join([text, "", *lines])
+        lines = [heading.replace("_", " "), "", text_of(self._table("")), ""]
+        lines += [f"{p.plane}: {p.message}" for p in self.planes]
+        if not self.statement.closed:
+            rows = [[name, *cells] for name, cells in parameter_rows(self.parameters)]
+            lines += ["", f"scenario {self.scenario}, anchor: {self.anchor}"]
+            lines += [text_of(Table("", [], rows))] if rows else []
+            lines += [f"Left open: {words}." for words in self.null_directions]
+        return "\n".join(lines)
 
     def _repr_html_(self) -> str:
-        return as_html(self.planes)
+        notes = (f"<p><b>{p.plane}</b>: {escape(p.message)}</p>" for p in self.planes)
+        return html_of(self._table("")) + "".join(notes)

@@ -7,195 +7,179 @@ branch, so that rising and falling currents have curves of their own.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, ClassVar
+
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy.optimize import nnls
+from jax import Array
+from jax.typing import ArrayLike
 
 from beamfit.errors import InputError
-from beamfit.greybox.mlp import MLP, Port, dense
-from beamfit.greybox.problem import Free, Problem, Record
+from beamfit.greybox import tree
+from beamfit.greybox.fit import Derived, Fit
+from beamfit.greybox.mlp import MLP, Port
+from beamfit.greybox.problem import Problem, Record
+from beamfit.quantity import Quantity
+from beamfit.status import Status
 from beamfit.studies.scan.assumptions import Assumptions
-from beamfit.studies.scan.scenario_data import (
+from beamfit.studies.scan.results import Parameter
+from beamfit.studies.scan.signed_network import known_record, signed_network, weight_free
+from beamfit.studies.scan.statement import (
+    Scenario,
     Seen,
     beam_free,
     beam_numbers,
-    branch_of,
-    plane_rows,
     size_record,
     varied_magnets,
 )
-from beamfit.studies.scan.scenario_model import NetworkStrength
+from beamfit.studies.scan.transport import padded
 
-__all__ = ["MOST", "first_strength", "focusing_problem", "predict_strength", "signed_network"]
-
-# Bounds of the weights: the report's (appendix B).
-MOST = 10.0
+__all__ = ["SCENARIO", "NetworkStrength", "branch_of"]
 
 
-def first_strength(seen: Seen, magnet: str, current: np.ndarray) -> np.ndarray:
+@partial(jax.tree_util.register_dataclass, data_fields=["network"], meta_fields=["unit"])
+@dataclass(frozen=True)
+class NetworkStrength:
+    """A magnet whose strength is a network of its current: k1 = network(I, branch)/E.
+
+    It takes the place of a calibration in a line. A setting is the current in A, or the pair of
+    current and branch (+1 rising, -1 falling); a current alone is taken midway between branches.
+
+    Parameters
+    ----------
+    network : MLP
+        One input (current) or two (current, branch); its output is k1 · E in MeV/m².
+    unit : str
+        The word of a scan's column, as for other calibrations.
+
+    Examples
+    --------
+    >>> from beamfit.greybox.mlp import Layer, Port
+    >>> net = MLP([Layer("in", "identity", 1), Layer("out", "linear", 1)], [("in", "out")],
+    ...           [Port("I", "in")], [Port("k1E", "out")], {"in->out": [[160.0]]})
+    >>> float(NetworkStrength(net).k1l(2.0, length=0.1, energy=32.0))
+    1.0
+    """
+
+    network: MLP
+    unit: str = "A"
+    inputs: ClassVar[tuple[str, ...]] = ("current", "branch")
+
+    def k1l(self, setting: ArrayLike, length: ArrayLike, energy: ArrayLike) -> Array:
+        """Integrated strength in 1/m at a setting, a length in m, an energy in MeV."""
+        at = jnp.atleast_1d(jnp.asarray(setting, float))
+        missing = len(self.network.inputs) - at.shape[0]
+        at = jnp.concatenate([at, jnp.zeros(missing)]) if missing > 0 else at
+        return self.network.values(at[: len(self.network.inputs)])[0] / energy * length
+
+
+def branch_of(settings: np.ndarray) -> np.ndarray:
+    """Branch of each setting in the order of measuring: +1 reached rising, -1 falling.
+
+    A setting that repeats the one before keeps its branch; the first takes the next one's, as a
+    magnet is brought to the start of a ramp from beyond it.
+
+    Examples
+    --------
+    >>> branch_of(np.array([0.0, 1.0, 2.0, 2.0, 1.0, 0.0])).tolist()
+    [1.0, 1.0, 1.0, 1.0, -1.0, -1.0]
+    """
+    steps = np.sign(np.diff(settings))
+    found = np.concatenate([[0.0], steps])
+    for i in range(1, len(found)):
+        found[i] = found[i] or found[i - 1]
+    first = next((f for f in found if f != 0.0), 1.0)
+    return np.where(found == 0.0, first, found)
+
+
+def _first_strength(seen: Seen, magnet: str, current: np.ndarray) -> np.ndarray:
     """k1 · E in MeV/m² as the lattice has it, at settings of a magnet."""
     element, energy = seen.scanned[magnet], float(seen.scanned.energy)
-    each = [element.calibration.k1l(c, element.length, energy) for c in np.atleast_1d(current)]
-    return np.asarray(each, float) * energy / element.length
+    return np.asarray(_strengths(element.calibration, current, element.length, energy)) * energy
 
 
-def predict_strength(model, data) -> jax.Array:
-    """k1 · E of a magnet's network at settings, for a record of what is known beforehand."""
-    (name,) = data.keys()
-    return jax.vmap(model[name].network.values)(data[name])[:, 0]
+@jax.jit
+def _strengths(calibration: Any, settings: Array, length: float, energy: float) -> Array:
+    """k1 in 1/m² at settings of shape (n,), or (n, 2) with branches."""
+    return jax.vmap(lambda s: calibration.k1l(s, length, energy))(settings) / length
 
 
-def signed_network(
-    inputs: list[Port], outputs: list[Port], rising: np.ndarray, hidden: int, seed: int
-) -> tuple[MLP, dict[str, tuple[np.ndarray, np.ndarray]]]:
-    """Make a network that starts as a straight line, with bounds that keep it monotonic.
+@tree.node("magnet")
+class _Asked:
+    """Settings of a magnet at which k1 is asked for, shape (n,) or (n, 2), with length, energy."""
 
-    Parameters
-    ----------
-    inputs, outputs : list of Port
-        Scaled so that the range of interest is -1 to 1 on both sides.
-    rising : ndarray
-        Shape (outputs, inputs): +1 where an output must rise with an input, -1 where it must
-        fall, 0 where it is free. A row of zeros asks nothing of its output. An input with a
-        zero elsewhere is free for all outputs, and so is one that asks of the outputs another
-        pattern of signs than the first does.
-    hidden, seed : int
-        Hidden tanh nodes, and the seed of their thresholds.
-
-    Returns
-    -------
-    tuple of MLP and dict
-        The network, and lower and upper bounds by connection or layer.
-
-    Notes
-    -----
-    Each hidden node moves one way with an input and each output one way with the node, so each
-    gain is a sum of terms of one sign; no point of the range has to be asked. A rising
-    function of one input can be approximated by such a sum as well as one likes.
-    """
-    node, out = _pattern(rising)
-    net = dense(inputs, outputs, [hidden], seed=seed)
-    first, last = "layer0->layer1", "layer1->layer2"
-    thresholds = np.linspace(-1.5, 1.5, hidden) if hidden > 1 else np.zeros(1)
-    start = {first: np.zeros((len(inputs), hidden)), last: np.zeros((hidden, len(outputs)))}
-    lead = int(np.argmax(node != 0)) if node.any() else 0
-    way = node[lead] or 1.0
-    start[first][lead] = way
-    towards = np.where(out != 0, out, 1.0)
-    start[last] += _straight(thresholds)[:, None] * towards
-    model = MLP(
-        net.layers,
-        net.connections,
-        net.input_ports,
-        net.output_ports,
-        start,
-        {"layer1": way * thresholds, "layer2": np.zeros(len(outputs))},
-    )
-    bounds = {
-        f"weights.{first}": _ends(np.broadcast_to(node[:, None], (len(inputs), hidden))),
-        f"weights.{last}": _ends(np.broadcast_to(out, (hidden, len(outputs)))),
-        "biases.layer1": _ends(np.zeros(hidden)),
-        "biases.layer2": _ends(np.zeros(len(outputs))),
-    }
-    return model, bounds
+    magnet: str
+    settings: Any
+    length: Any
+    energy: Any
 
 
-def _straight(thresholds: np.ndarray) -> np.ndarray:
-    """Weights, none negative, that make the nodes add up to a straight line from -1 to 1."""
-    x = np.linspace(-1.0, 1.0, 41)
-    return nnls(np.tanh(x[:, None] + thresholds), x)[0]
+def _k1(model: Any, asked: _Asked) -> Array:
+    return _strengths(model["magnets"][asked.magnet], asked.settings, asked.length, asked.energy)
 
 
-def _ends(sign: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    return np.where(sign > 0, 0.0, -MOST), np.where(sign < 0, 0.0, MOST)
+def _loop(model: Any, asked: _Asked) -> Array:
+    """Width of the hysteresis loop: k1 of the first setting less that of the second."""
+    up, down = _k1(model, asked)
+    return (up - down)[None]
 
 
-def _pattern(rising: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Signs of input to node and of node to output that give the gains their signs."""
-    node, out = np.zeros(rising.shape[1]), np.zeros(rising.shape[0])
-    asked = rising.any(axis=1)
-    for i in range(rising.shape[1]):
-        column = rising[:, i]
-        if not asked.any() or not column[asked].all():
-            continue
-        if not out.any():
-            out, node[i] = -column, -1.0
-        elif np.array_equal(column, -out) or np.array_equal(column, out):
-            lead = int(np.argmax(asked))
-            node[i] = column[lead] * out[lead]
-    return node, out
+def _predicted(model: Any, asked: _Asked) -> Array:
+    """k1 · E, for a record of what is known beforehand."""
+    return _k1(model, asked) * asked.energy
 
 
-def weight_free(path: str, bounds: dict[str, tuple[np.ndarray, np.ndarray]]) -> list[Free]:
-    """The weights of a network as free numbers that nobody asks for."""
-    return [Free(f"{path}.{k}", a, b, (-1.5, 1.5), nuisance=True) for k, (a, b) in bounds.items()]
-
-
-def focusing_problem(seen: Seen, told: Assumptions) -> Problem:
-    """State the problem: beams and one network of k1 for each scanned magnet.
-
-    Parameters
-    ----------
-    seen : Seen
-        The scan.
-    told : Assumptions
-        Hidden nodes, anchor, branches.
-
-    Returns
-    -------
-    Problem
-
-    Raises
-    ------
-    InputError
-        If a scanned magnet has no length, branches are asked of a scan that has but one, or an
-        anchor names a magnet that was not scanned.
-    """
-    varied, scan = varied_magnets(seen), seen.scan
-    branches: dict[str, np.ndarray] = {}
-    if told.hysteresis:
-        branches = {name: branch_of(scan.settings[name]) for name in varied}
-        single = [name for name, b in branches.items() if np.ptp(b) == 0]
-        if single:
-            raise scan.unusable(
-                f"settings of '{single[0]}' that only rise or only fall, with hysteresis",
-                "rows in the order of measuring, with rising and falling settings",
-                single[0],
-            )
-    _check_places(told, varied)
+def _state(seen: Seen, told: Assumptions) -> Problem:
+    """Beams and one network of k1 for each scanned magnet."""
+    varied = varied_magnets(seen.scan)
+    branches = _branches(seen, varied) if told.hysteresis else {}
+    for name in (name for place in told.anchor.at for name in place):
+        if name not in varied:
+            raise InputError(f"an anchor at '{name}'", f"a scanned magnet: {', '.join(varied)}")
+    strengths, records = {}, []
     beams = beam_numbers(seen)
-    model: dict = {"beam": beams}
-    free, records = beam_free(beams), []
+    free = beam_free(beams)
     for name in varied:
         if not seen.scanned[name].length:
             raise InputError(f"a network of k1 for '{name}', which has no length", "a quadrupole")
-        strength, bounds = _strength(seen, name, told, branches)
-        model[name] = strength
-        free += weight_free(f"{name}.network", bounds)
-        records += _anchors(seen, name, told, branches)
-    records = [
-        *(size_record(seen, p, plane_rows(seen, p, branches)) for p in seen.planes),
-        *records,
-    ]
-    return Problem(model, free, records)
+        strengths[name], bounds = _strength(seen, name, told, name in branches)
+        free += weight_free(f"magnets.{name}.network", bounds)
+        records += _anchors(seen, name, told, name in branches)
+    settings = seen.rows.settings | {
+        name: np.stack([seen.rows.settings[name], padded(branch)], -1)
+        for name, branch in branches.items()
+    }
+    sizes = [size_record(seen, plane, seen.of_plane(plane, settings)) for plane in seen.planes]
+    return Problem({"beam": beams, "magnets": strengths}, free, [*sizes, *records])
 
 
-def _check_places(told: Assumptions, varied: tuple[str, ...]) -> None:
-    for place in told.anchor.at:
-        for name in place:
-            if name not in varied:
-                raise InputError(f"an anchor at '{name}'", f"a scanned magnet: {', '.join(varied)}")
+def _branches(seen: Seen, varied: tuple[str, ...]) -> dict[str, np.ndarray]:
+    """Branch of every row, where settings both rise and fall."""
+    branches = {name: branch_of(seen.scan.settings[name]) for name in varied}
+    single = [name for name, branch in branches.items() if np.ptp(branch) == 0]
+    if single:
+        raise seen.scan.unusable(
+            f"settings of '{single[0]}' that only rise or only fall, with hysteresis",
+            "rows in the order of measuring, with rising and falling settings",
+            single[0],
+        )
+    return branches
 
 
-def _strength(seen: Seen, name: str, told: Assumptions, branches):
+def _strength(
+    seen: Seen, name: str, told: Assumptions, branches: bool
+) -> tuple[NetworkStrength, dict[str, tuple[np.ndarray, np.ndarray]]]:
     """A network that starts as the straight line between the lattice's own k1 at both ends."""
     settings = seen.scan.settings[name]
     low, high = float(settings.min()), float(settings.max())
-    ends = first_strength(seen, name, np.array([low, high]))
+    ends = _first_strength(seen, name, np.array([low, high]))
     ports = [Port("I", "", 0, (high - low) / 2, (high + low) / 2)]
     rising = [np.sign(ends[1] - ends[0]) or 1.0]
-    if name in branches:
+    if branches:
         # A branch moves k1 by a few per cent of its range at most: small weights do it.
         ports.append(Port("branch", "", 0, 10.0, 0.0))
         rising.append(0.0)
@@ -205,21 +189,70 @@ def _strength(seen: Seen, name: str, told: Assumptions, branches):
     return NetworkStrength(net, seen.scanned[name].calibration.unit), bounds
 
 
-def _anchors(seen: Seen, name: str, told: Assumptions, branches) -> list[Record]:
-    """What is known of k1 beforehand, as records."""
-    anchor, found = told.anchor, []
-    largest = float(np.abs(first_strength(seen, name, seen.scan.settings[name])).max())
-    if anchor.deviation is not None:
-        at = np.unique(seen.scan.settings[name])
-        found.append(_known(seen, name, at, anchor.deviation * largest, branches))
+def _anchors(seen: Seen, name: str, told: Assumptions, branches: bool) -> Iterator[Record]:
+    """What is known of k1 beforehand, midway between the branches where there are two."""
+    settings, anchor = seen.scan.settings[name], told.anchor
+    largest = float(np.abs(_first_strength(seen, name, settings)).max())
     places = np.array([place[name] for place in anchor.at if name in place], float)
-    if len(places):
-        found.append(_known(seen, name, places, anchor.sd * largest, branches))
-    return found
+    element, energy = seen.scanned[name], float(seen.scanned.energy)
+    for at, sd in ((np.unique(settings), anchor.deviation), (places, anchor.sd)):
+        if sd is None or not len(at):
+            continue
+        points = np.stack([at, np.zeros(len(at))], -1) if branches else at
+        data = _Asked(name, padded(points), float(element.length), energy)
+        values = _first_strength(seen, name, at)
+        yield known_record(f"anchor {name}", _predicted, data, values, sd * largest)
 
 
-def _known(seen: Seen, name: str, at: np.ndarray, sd: float, branches) -> Record:
-    """k1 · E of the lattice at settings, midway between the branches where there are two."""
-    points = np.stack([at, np.zeros(len(at))], -1) if name in branches else at[:, None]
-    data = {name: jnp.asarray(points)}
-    return Record(f"anchor {name}", predict_strength, data, first_strength(seen, name, at), sd)
+def _parameters(seen: Seen, told: Assumptions, fit: Fit) -> Iterator[Parameter]:
+    """k1 at both ends and the middle of the scanned range, and the width of the loop."""
+    energy, settled = float(seen.scanned.energy), fit.status is not Status.not_converged
+    for name in varied_magnets(seen.scan):
+        low, high = (float(f(seen.scan.settings[name])) for f in (np.min, np.max))
+        middle = 0.5 * (low + high)
+        at = np.array([low, middle, high])
+        length = float(seen.scanned[name].length)
+        found = fit.derive(_k1, _Asked(name, at, length, energy))
+        for i, current in enumerate(at):
+            yield _derived(f"{name}.k1 at {current:g}", found, i, settled)
+        if told.hysteresis:
+            both = np.array([[middle, 1.0], [middle, -1.0]])
+            found = fit.derive(_loop, _Asked(name, both, length, energy))
+            yield _derived(f"{name}.k1 rising less falling at {middle:g}", found, 0, settled)
+
+
+def _derived(name: str, found: Derived, i: int, settled: bool) -> Parameter:
+    known = settled and bool(np.isfinite(found.error[i]))
+    errors = (float(found.error[i]), float(found.error_raw[i])) if known else (None, None)
+    return Parameter(
+        name=name,
+        value=Quantity(float(found.value[i]), errors[0], "1/m^2", errors[1]),
+        status=Status.converged if known else Status.unidentified,
+        state="free",
+        lower=-np.inf,
+        upper=np.inf,
+        prior=None,
+        multiplier=0.0,
+    )
+
+
+def _null_directions(
+    seen: Seen, parameters: tuple[Parameter, ...], identified: bool
+) -> tuple[str, ...]:
+    said = (
+        "at each setting k1 is free to take up what the beam leaves: another beam with another "
+        "curve k1(I) gives the same sizes"
+    )
+    return () if identified else (said,)
+
+
+def _remedy(seen: Seen) -> str:
+    return (
+        "sizes at a second screen, or an anchor to the lattice's calibration "
+        "(--anchor first-principles=2%)"
+    )
+
+
+SCENARIO = Scenario(
+    "focusing-network", _state, _parameters, _null_directions, _remedy, network=True
+)

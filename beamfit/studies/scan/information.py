@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
+from functools import partial
+
+import jax
 import jax.numpy as jnp
 import numpy as np
 
-from beamfit.greybox import assess
+from beamfit.greybox import assess, tree
 from beamfit.greybox.covariance import MOST_SHARE
 from beamfit.greybox.design import Information
 from beamfit.studies.scan.fit import EmittanceFit
-from beamfit.studies.scan.scenario_judged import with_slope
-from beamfit.studies.scan.scenario_model import sigma_of
-from beamfit.studies.scan.sigma import emittance_parts
+from beamfit.studies.scan.model import emittance_parts, predict_sizes, sigma_of
 from beamfit.studies.scan.verdict import CLEAR
 
-__all__ = ["by_plane", "identified", "information_of", "linearised_at"]
+__all__ = ["by_plane", "identified", "information_of", "linearised_at", "with_slope"]
 
 
 def by_plane(fit: EmittanceFit, known: Information) -> dict[str, float]:
@@ -45,13 +46,13 @@ def information_of(fit: EmittanceFit) -> Information:
     jacobian = assess.slopes(p, theta).residual_jacobian
     # Errors as the fit scaled them: a fit that misses its sizes learns less from the next one.
     scale = {plane.plane: plane.error_scale for plane in fit.planes}
-    sizes = [scale[r.data.plane] if r.name.startswith("size") else 1.0 for r in p.records]
+    sizes = [scale[r.data.plane] if r.predict is predict_sizes else 1.0 for r in p.records]
     rows = np.ones(len(jacobian))
     counts = [r.measured.size for r in p.records]
     rows[: sum(counts)] = np.repeat(sizes, counts)
     jacobian = jacobian / rows[:, None]
     held = p.lower == p.upper
-    if fit.fit is not None and _determined(fit):
+    if fit.solved is not None and _determined(fit):
         edge = np.array([v.state in ("lower", "upper") for v in fit.fit.variables])
         held = held | (edge & p.nuisance)
     planes = tuple(plane.plane for plane in fit.planes)
@@ -74,15 +75,25 @@ def linearised_at(fit: EmittanceFit) -> np.ndarray:
     Numbers that the data do not determine end anywhere; what a measurement would tell is then
     asked of the line and the beam one started from.
     """
-    if fit.fit is None:
+    if fit.solved is None:
         return fit.problem.start
-    if _determined(fit) or fit.stated is None:
+    if _determined(fit):
         return fit.fit.theta
     return np.clip(fit.stated.start, fit.stated.lower, fit.stated.upper)
 
 
 def _determined(fit: EmittanceFit) -> bool:
     return all(plane.identifiability.determined for plane in fit.planes)
+
+
+@partial(jax.jit, static_argnums=0)
+def with_slope(function, core, theta, data):
+    """``function(model, data)`` as a flat vector, with its derivatives by the free numbers."""
+
+    def of_theta(t):
+        return jnp.ravel(function(tree.replace(core.model, core.chosen, t), data))
+
+    return of_theta(theta), jax.jacfwd(of_theta)(theta)
 
 
 def _named(plane: str) -> dict:

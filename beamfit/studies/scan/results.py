@@ -1,18 +1,32 @@
-"""What a fit says of one plane: frozen values that answer whether to believe them."""
+"""What a fit says of one plane: frozen values that say whether to believe them, and a table."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from beamfit.quantity import Quantity, Status
+from beamfit.optics.beam import BeamMatrix
+from beamfit.quantity import Quantity
+from beamfit.status import Status
+from beamfit.table import cell, json_of
 
-if TYPE_CHECKING:
-    from beamfit.optics.beam import BeamMatrix
+__all__ = [
+    "Identifiability",
+    "Parameter",
+    "PlaneFit",
+    "Points",
+    "ScreenTwiss",
+    "identifiability_rows",
+    "parameter_rows",
+    "point_rows",
+    "result_rows",
+]
 
-__all__ = ["Identifiability", "Parameter", "PlaneFit", "Points", "ScreenTwiss"]
+# A longer table of points is cut, and says so.
+MOST_ROWS = 500
 
 
 class Points(NamedTuple):
@@ -80,14 +94,6 @@ class Parameter(NamedTuple):
     upper: float
     prior: tuple[float, float] | None
     multiplier: float
-
-    def to_json(self) -> dict[str, Any]:
-        """Give one entry of ``parameters``."""
-        return self._asdict() | {
-            "value": self.value.to_json(),
-            "status": str(self.status),
-            "prior": None if self.prior is None else list(self.prior),
-        }
 
 
 class ScreenTwiss(NamedTuple):
@@ -229,50 +235,154 @@ class PlaneFit:
         InputError
             If the data allow no positive definite one (status ``unidentified``).
         """
-        from beamfit.optics.beam import BeamMatrix
-
         return BeamMatrix.from_sigma(*(q.value for q in self.sigma))
 
     def to_json(self) -> dict[str, Any]:
         """Give one entry of ``results`` in the JSON contract."""
-        s11, s12, s22 = self.sigma
-        probability = self.points.outlier_probability
-        return {
-            "plane": self.plane,
-            "status": str(self.status),
-            "message": self.message,
-            "emittance": self.emittance.to_json(),
-            "normalized_emittance": self.normalized_emittance.to_json(),
-            "beta": self.beta.to_json(),
-            "alpha": self.alpha.to_json(),
-            "sigma11": s11.to_json(),
-            "sigma12": s12.to_json(),
-            "sigma22": s22.to_json(),
-            "chi2": self.chi2,
-            "dof": self.dof,
-            "rms_residual": self.rms_residual.to_json(),
-            "identifiability": self.identifiability.to_json(),
-            "covariance": self.covariance.tolist() if np.isfinite(self.covariance).all() else None,
-            "error_scale": self.error_scale,
-            "noise": self.noise,
-            "method": self.method,
-            "screen": {
-                "name": self.screen.name,
-                "settings": self.screen.settings,
-                "units": self.screen.units,
-                "beta": self.screen.beta.to_json(),
-                "alpha": self.screen.alpha.to_json(),
-                "size": self.screen.size.to_json(),
-            },
-            "mismatch": None if self.mismatch is None else self.mismatch.to_json(),
-            "points": {
-                "settings": {n: v.tolist() for n, v in self.points.settings.items()},
-                "units": self.points.units,
-                "screen": list(self.points.screen),
-                "size_m": self.points.size.tolist(),
-                "error_m": self.points.error.tolist(),
-                "model_m": self.points.model.tolist(),
-                "pull": self.points.pull.tolist(),
-                "outlier_probability": None if probability is None else probability.tolist(),
-            },
-        }
+        p, screen = self.points, self.screen
+        names = ("emittance", "normalized_emittance", "beta", "alpha", "chi2", "dof")
+        names += ("rms_residual", "error_scale", "noise", "method", "mismatch", "identifiability")
+        sigma = zip(("sigma11", "sigma12", "sigma22"), self.sigma, strict=True)
+        entry = {name: getattr(self, name) for name in ("plane", "status", "message", *names)}
+        points = {name: getattr(p, name) for name in ("settings", "units", "screen", "pull")}
+        sizes = {f"{name}_m": getattr(p, name) for name in ("size", "error", "model")}
+        return json_of(
+            entry
+            | dict(sigma)
+            | {
+                "covariance": self.covariance if np.isfinite(self.covariance).all() else None,
+                "screen": screen,
+                "points": points | sizes | {"outlier_probability": p.outlier_probability},
+            }
+        )
+
+
+def result_rows(planes: tuple[PlaneFit, ...]) -> list[tuple[str, list[str]]]:
+    """Label and one cell per plane, for every number a result has.
+
+    Parameters
+    ----------
+    planes : tuple of PlaneFit
+        The planes of a fit.
+
+    Returns
+    -------
+    list of (str, list of str)
+        Rows in the order they are read.
+    """
+    at = f"at {planes[0].screen.name}"
+    there = planes[0].screen
+    own = ", ".join(f"{n} = {v:.4g} {there.units[n]}" for n, v in there.settings.items()) or "-"
+    rows: list[tuple[str, Callable[[PlaneFit], object]]] = [
+        ("status", lambda p: p.status),
+        ("normalised emittance", lambda p: p.normalized_emittance),
+        ("geometric emittance", lambda p: p.emittance),
+        ("beta at the start", lambda p: p.beta),
+        ("alpha at the start", lambda p: p.alpha),
+        ("sigma11", lambda p: p.sigma[0]),
+        ("sigma12", lambda p: p.sigma[1]),
+        ("sigma22", lambda p: p.sigma[2]),
+        (f"beta {at}", lambda p: p.screen.beta),
+        (f"alpha {at}", lambda p: p.screen.alpha),
+        (f"size {at}", lambda p: p.screen.size),
+        (f"{at}, for", lambda p: own),
+    ]
+    if any(p.mismatch is not None for p in planes):
+        rows.append(("mismatch BMAG", lambda p: p.mismatch))
+    rows += [
+        ("chi2/dof", _chi2),
+        ("rms residual", lambda p: f"{p.rms_residual.value * 1e6:.3g} µm"),
+        ("errors", _noise),
+        ("waist bracketed", lambda p: p.identifiability.waist_bracketed),
+        ("phase seen", lambda p: _degrees(p.identifiability.phase_coverage)),
+        ("zero emittance at", lambda p: f"{p.identifiability.zero_distance:.1f} sigma"),
+    ]
+    return [(label, [cell(value(p)) for p in planes]) for label, value in rows]
+
+
+def _chi2(p: PlaneFit) -> str:
+    if p.chi2 is None:
+        return f"not testable ({p.dof} dof)"
+    return f"{p.chi2:.2f}/{p.dof}" + (f" = {p.chi2 / p.dof:.2f}" if p.dof else "")
+
+
+def _noise(p: PlaneFit) -> str:
+    if p.chi2 is None and not np.isfinite(p.points.error).all():
+        return "not known"
+    if p.chi2 is None:
+        return f"inferred, {100 * float((p.points.error / p.points.size).mean()):.2g} % of size"
+    return "as given" if p.error_scale == 1.0 else f"given, scaled by {p.error_scale:.2f}"
+
+
+def _degrees(value: float | None) -> str:
+    return "-" if value is None else f"{value:.0f}° of 180°"
+
+
+def identifiability_rows(
+    planes: tuple[PlaneFit, ...],
+) -> list[tuple[str, list[str]]]:
+    """Label and one cell per plane for what the data determine."""
+    rows: list[tuple[str, Callable[[PlaneFit], object]]] = [
+        ("emittance", lambda p: "determined" if p.identifiability.determined else "not determined"),
+        ("left open", lambda p: ", ".join(p.identifiability.undetermined) or "nothing"),
+        (
+            "singular values",
+            lambda p: ", ".join(f"{v:.3g}" for v in p.identifiability.singular_values),
+        ),
+        ("condition", lambda p: _condition(p.identifiability.condition)),
+        ("zero emittance at", lambda p: f"{p.identifiability.zero_distance:.1f} standard errors"),
+        ("waist bracketed", lambda p: p.identifiability.waist_bracketed),
+        ("betatron phase seen", lambda p: _degrees(p.identifiability.phase_coverage)),
+    ]
+    return [(label, [cell(value(p)) for p in planes]) for label, value in rows]
+
+
+def parameter_rows(parameters: tuple[Parameter, ...]) -> list[tuple[str, list[str]]]:
+    """Name, value, bounds, prior and state of every number fitted besides the beam."""
+    rows = []
+    for p in parameters:
+        bounded = abs(p.lower) < 1e300 or abs(p.upper) < 1e300
+        said = f"{p.state} bound, multiplier {p.multiplier:.2g}" if p.state != "free" else "free"
+        value = cell(p.value).replace("(not determined)", "(open)")
+        prior = f"{p.prior[0]:.6g} ± {p.prior[1]:.3g}" if p.prior else "-"
+        limits = f"{p.lower:.6g} to {p.upper:.6g}" if bounded else "-"
+        rows.append((p.name, [value, limits, prior, said]))
+    return rows
+
+
+def _condition(value: float | None) -> str:
+    return "infinite" if value is None else f"{value:.3g}"
+
+
+def point_rows(plane: PlaneFit) -> tuple[list[str], list[list[str]]]:
+    """Header and rows of the point-by-point table of one plane.
+
+    Parameters
+    ----------
+    plane : PlaneFit
+        The plane.
+
+    Returns
+    -------
+    tuple
+        Column names, and one list of cells a point.
+    """
+    p = plane.points
+    header = [*(f"{n} {p.units[n]}" for n in p.settings), "size µm", "error µm", "fit µm", "pull"]
+    screens = len(set(p.screen)) > 1
+    header = (["screen"] if screens else []) + header
+    if p.outlier_probability is not None:
+        header.append("P(outlier)")
+    rows = []
+    for i in range(min(len(p.size), MOST_ROWS)):
+        cells = [p.screen[i]] if screens else []
+        cells += [f"{values[i]:.5g}" for values in p.settings.values()]
+        cells += [f"{1e6 * v[i]:.2f}" for v in (p.size, p.error, p.model)]
+        cells.append(f"{p.pull[i]:+.2f}")
+        if p.outlier_probability is not None:
+            cells.append(f"{p.outlier_probability[i]:.2f}")
+        rows.append(cells)
+    left = len(p.size) - len(rows)
+    if left > 0:
+        rows.append([f"{left} more"] + [""] * (len(header) - 1))
+    return header, rows

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import expit
 
+from beamfit.studies.scan.model import size_squared
 from beamfit.studies.scan.sigma import SigmaFit, fit_sizes
 
 __all__ = ["RobustFit", "fit_robust"]
@@ -77,8 +78,7 @@ def fit_robust(
     """
 
     def pulls(sigma: np.ndarray, error: np.ndarray) -> np.ndarray:
-        model = sigma[0] * r11**2 + 2 * sigma[1] * r11 * r12 + sigma[2] * r12**2 + known
-        return (model - size**2) / (2.0 * size * error)
+        return (size_squared(sigma, r11, r12, known) - size**2) / (2.0 * size * error)
 
     n = len(size)
     left_out = np.unique(np.linspace(0, n - 1, min(n, STARTS)).round().astype(int))

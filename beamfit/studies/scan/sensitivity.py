@@ -21,15 +21,11 @@ from beamfit.optics.calibration import CurrentPolynomial, SlopeIntercept
 from beamfit.optics.elements import Drift
 from beamfit.optics.sections import Series
 from beamfit.studies.scan.fit import EmittanceFit
+from beamfit.studies.scan.model import emittance_parts, size_squared
 from beamfit.studies.scan.results import PlaneFit, Points
-from beamfit.studies.scan.sigma import emittance_parts, fit_sizes
-from beamfit.studies.scan.transport import (
-    ScanRows,
-    plane_input,
-    scan_rows,
-    scanned_line,
-    transfer_rows,
-)
+from beamfit.studies.scan.sigma import fit_sizes
+from beamfit.studies.scan.statement import varied_magnets
+from beamfit.studies.scan.transport import Rows, padded
 
 __all__ = [
     "Change",
@@ -102,7 +98,7 @@ def systematics(fit: EmittanceFit, plane: str) -> list[Change]:
     --------
     >>> from beamfit.optics.beam import BeamMatrix
     >>> from beamfit.optics.elements import Quadrupole, Screen
-    >>> from beamfit.studies.scan.emittance import fit_emittance
+    >>> from beamfit.studies.scan.fit import fit_emittance
     >>> from beamfit.studies.scan.scans import QuadScan
     >>> line = Beamline((Quadrupole("Q", 0.1), Drift("D", 2.0), Screen("S")), energy=135.0)
     >>> k1 = np.linspace(-2.0, 12.0, 8)
@@ -115,31 +111,25 @@ def systematics(fit: EmittanceFit, plane: str) -> list[Change]:
     result = fit[plane]
     if result.emittance.error is None:
         return []
-    scanned = scanned_line(fit.scan, fit.line)
-    rows = scan_rows(fit.scan, scanned)
-    magnets = tuple(n for n, v in fit.scan.settings.items() if np.ptp(v) > 0)
+    rows, p = fit.seen.of_plane(plane), result.points
+    magnets = varied_magnets(fit.scan)
     upstream = fit.line.upto(result.screen.name).elements
     drifts = tuple(e.name for e in upstream if isinstance(e, Drift))
-    matrices = transfer_rows(scanned, rows.settings, rows.energy, places=rows.places)
-    given = plane_input(fit.scan, scanned, rows, matrices, plane)
-    keep = np.flatnonzero(~np.isnan(fit.scan.size[plane]))
-    by_r11, by_r12, by_known = _log_emittance_gradient(
-        np.array([q.value for q in result.sigma]),
-        given.r11,
-        given.r12,
-        given.known,
-        given.size,
-        result.points.error,
-        method=result.method,
-    )
-    by_r16 = np.asarray(by_known) * 2.0 * given.r16 * given.energy_spread**2
-    by_planes = np.zeros(matrices.planes.shape)
-    by_planes[keep, "xy".index(plane), rows.which[keep], 0] = np.stack([by_r11, by_r12, by_r16], -1)
-    relative = _relative_changes(scanned, rows, by_planes, magnets, len(drifts))
+    stored = fit.seen.scanned.stored_by_kind((*rows.settings, *rows.places))
+    one = rows.energy if np.ptp(rows.energy) > 0 else rows.energy[0]
+    size, error = np.full((2, len(rows.energy)), np.inf)
+    size[:], size[fit.seen.measured(plane)] = 1.0, p.size
+    error[fit.seen.measured(plane)] = p.error
+    sigma = np.array([q.value for q in result.sigma])
+    through = replace(rows, line=stored, energy=one)
+    by_change, by_length = _changes(through, sigma, size, error, magnets=magnets)
+    # Drifts come in the order of the line; the rest of them lies downstream.
+    by_length = np.concatenate([*by_length, np.zeros(0)])[: len(drifts)]
+    relative = np.concatenate([by_change[:-1], by_length, by_change[-1:]])
     # ln βγ rises by E²/(E² - m²) for each relative step of the energy.
-    energy = given.energy.mean()
+    energy = fit.seen.energy(plane)
     stiffer = energy**2 / (energy**2 - fit.line.mass**2)
-    causes = [f"{n} {_word(scanned, n)} +1 %" for n in magnets]
+    causes = [f"{n} {_word(fit.seen.scanned, n)} +1 %" for n in magnets]
     causes += [f"drift {n} +1 cm" for n in drifts] + ["energy +1 %"]
     normalised = relative + np.append(np.zeros(len(relative) - 1), stiffer)
     return [
@@ -168,43 +158,9 @@ def _scaled(line: Beamline, magnet: str, factor: Array) -> Beamline:
     return line.with_element(replace(element, calibration=c))
 
 
-def _relative_changes(
-    line: Beamline, rows: ScanRows, by_planes: np.ndarray, magnets: tuple[str, ...], drifts: int
-) -> np.ndarray:
-    """Derivatives by the strength of each magnet, the length of each drift, and ln E.
-
-    ``by_planes`` holds the derivatives by the matrices of all rows: one reverse pass carries them
-    back to every number of the line, however long it is.
-    """
-    stored = line.stored_by_kind((*rows.settings, *rows.places))
-    energy = rows.energy if np.ptp(rows.energy) > 0 else rows.energy[0]
-    by_change, by_lengths = _slopes(
-        stored, rows.settings, energy, by_planes, places=rows.places, magnets=magnets
-    )
-    by_length = np.concatenate([*by_lengths, np.zeros(0)])[:drifts]  # the rest lies downstream
-    return np.concatenate([by_change[:-1], by_length, by_change[-1:]])
-
-
-@partial(jax.jit, static_argnames=("places", "magnets"))
-def _slopes(line, settings, energy, by_planes, *, places, magnets):
-    """Derivatives by each magnet's strength and ln E, and by the lengths of drifts."""
-
-    def total(change: Array, lengths: list[Array]) -> Array:
-        moved = _with_lengths(line, lengths)
-        for i, name in enumerate(magnets):
-            moved = _scaled(moved, name, 1.0 + change[i])
-        rows = transfer_rows(moved, settings, energy * (1.0 + change[-1]), places)
-        return jnp.vdot(by_planes, rows.planes)
-
-    series = [s for s in line.elements if isinstance(s, Series)]
-    lengths = [k.length for s in series for k in s.kinds if isinstance(k, Drift)]
-    return jax.grad(total, (0, 1))(jnp.zeros(len(magnets) + 1), lengths)
-
-
 def _with_lengths(line: Beamline, lengths: list[Array]) -> Beamline:
     """Give the drifts of a line that is stored by kind other lengths."""
-    left = iter(lengths)
-    elements = []
+    left, elements = iter(lengths), []
     for part in line.elements:
         if isinstance(part, Series):
             kinds = (Drift("", next(left)) if isinstance(k, Drift) else k for k in part.kinds)
@@ -213,29 +169,38 @@ def _with_lengths(line: Beamline, lengths: list[Array]) -> Beamline:
     return replace(line, elements=tuple(elements))
 
 
-@partial(jax.jit, static_argnames="method")
-def _log_emittance_gradient(sigma, r11, r12, known, size, error, *, method):
-    """Gradient of ln ε of the fit by R11, R12 and the known part, each of shape (n,).
+@partial(jax.jit, static_argnames="magnets")
+def _changes(
+    rows: Rows, sigma: Array, size: Array, error: Array, *, magnets: tuple[str, ...]
+) -> tuple[Array, list[Array]]:
+    """Derivatives of ln ε of the fit by each magnet's strength and ln E, and by drifts' lengths.
 
     At the minimum the slope F(σ, rows) of χ² is zero, so dσ = -(∂F/∂σ)⁻¹ ∂F/∂rows: exact for
-    either residual, without differentiating the solver.
+    either residual, without differentiating the solver. One reverse pass, however long the line.
     """
     unit = jnp.abs(sigma)
 
-    def chi2(relative: Array, rows: tuple[Array, Array, Array]) -> Array:
-        a, b, extra = rows
-        design = jnp.stack([a**2, 2.0 * a * b, b**2], -1)
-        squared = design @ (relative * unit) + extra
-        if method == "size":
-            return jnp.sum(((jnp.sqrt(squared) - size) / error) ** 2)
-        return jnp.sum(((squared - size**2) / (2.0 * size * error)) ** 2)
+    def elements(change: Array, lengths: list[Array]) -> tuple[Array, ...]:
+        moved = _with_lengths(rows.line, lengths)
+        for i, name in enumerate(magnets):
+            moved = _scaled(moved, name, 1.0 + change[i])
+        energy = rows.energy * (1.0 + change[-1])
+        return replace(rows, line=moved, energy=energy).elements({})
 
-    rows, here = (r11, r12, known), sigma / unit
+    def chi2(relative: Array, seen: tuple[Array, ...]) -> Array:
+        squared = size_squared(relative * unit, *seen)
+        if rows.squared:
+            return jnp.sum(((squared - size**2) / (2.0 * size * error)) ** 2)
+        return jnp.sum(((jnp.sqrt(squared) - size) / error) ** 2)
+
+    series = [part for part in rows.line.elements if isinstance(part, Series)]
+    lengths = [k.length for part in series for k in part.kinds if isinstance(k, Drift)]
+    none, here = jnp.zeros(len(magnets) + 1), sigma / unit
+    seen, back = jax.vjp(elements, none, lengths)
     slope = jax.grad(chi2)
-    curvature = jax.jacfwd(slope)(here, rows)
     by_sigma = jax.grad(lambda s: jnp.log(emittance_parts(s * unit)[0]))(here)
-    weights = jnp.linalg.solve(curvature, by_sigma)
-    return jax.grad(lambda rows: -weights @ slope(here, rows))(rows)
+    weights = jnp.linalg.solve(jax.jacfwd(slope)(here, seen), by_sigma)
+    return back(jax.grad(lambda seen: -weights @ slope(here, seen))(seen))
 
 
 def range_sensitivity(plane: PlaneFit) -> list[RangeRow]:
@@ -261,12 +226,7 @@ def range_sensitivity(plane: PlaneFit) -> list[RangeRow]:
     near = p.size <= 2.0 * p.size.min()
     if 4 <= near.sum() < n:
         rows.append(("only sizes within 2 x the smallest", near))
-    # One at a time: a batch of another shape would be compiled for this table alone.
-    fits = [
-        fit_sizes(p.r11, p.r12, p.size, np.where(k, p.error, np.inf), p.known, method=plane.method)
-        for _, k in rows
-    ]
-    emittance = [math.sqrt(f.determinant) if f.positive else math.nan for f in fits]
+    emittance = [_without(plane, ~k) for _, k in rows]
     factor = (
         plane.normalized_emittance.value / plane.emittance.value if plane.emittance.value else 0
     )
@@ -279,6 +239,17 @@ def range_sensitivity(plane: PlaneFit) -> list[RangeRow]:
         )
         for (name, _), e in zip(rows, emittance, strict=True)
     ]
+
+
+def _without(plane: PlaneFit, left_out: np.ndarray) -> float:
+    """The emittance without some points; NaN where the rest has none."""
+    p = plane.points
+    rows = (p.r11, p.r12, p.size, np.where(left_out, np.inf, p.error), p.known)
+    full = [padded(v) for v in rows]
+    full[3][len(p.size) :] = np.inf
+    # One at a time: a batch of another shape would be compiled for this table alone.
+    fit = fit_sizes(*full, method=plane.method)
+    return math.sqrt(fit.determinant) if fit.positive else math.nan
 
 
 def _place(points: Points, i: int) -> str:

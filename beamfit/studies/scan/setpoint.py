@@ -15,9 +15,9 @@ from scipy.linalg import block_diag
 
 from beamfit.errors import InputError
 from beamfit.greybox import assess, problem, tree
+from beamfit.greybox.assess import TOLERANCE
+from beamfit.greybox.descend import descend_all
 from beamfit.greybox.fit import Fit, Variable
-from beamfit.greybox.kkt import TOLERANCE
-from beamfit.greybox.many_starts import descend_all
 from beamfit.greybox.problem import Free, Problem, Record, padded_length
 from beamfit.greybox.solve import solve
 from beamfit.optics.beamline import Beamline

@@ -1,11 +1,7 @@
-"""The beam matrix of one plane from measured sizes: the one-point functions of the fit.
+"""The beam matrix of a plane from measured sizes in closed form: the fast path of the model.
 
-The model is report eq. 37 with the two terms every screen adds,
-
-    size² = R11² σ11 + 2 R11 R12 σ12 + R12² σ22 + (R16 σ_δ)² + resolution²
-
-linear in σ. Everything here is a pure JAX function of one scan in one plane; many scans are
-a vmap of it.
+Size² is linear in σ (model.py). Everything here is a pure JAX function of one scan in one plane;
+many scans are a vmap of it.
 """
 
 from __future__ import annotations
@@ -18,20 +14,23 @@ import jax.numpy as jnp
 from jax import Array
 from jax.typing import ArrayLike
 
-import beamfit.optics  # noqa: F401 - switches JAX to double precision
-from beamfit.studies.scan.zero_emittance import zero_emittance
+from beamfit.studies.scan.model import coefficients, numbers_of
 
 __all__ = [
+    "ClosedForm",
     "SigmaFit",
     "SizeData",
-    "emittance_parts",
+    "closed_form",
     "fit_sizes",
     "solve_size",
     "solve_size_squared",
+    "zero_emittance",
 ]
 
 # A direction of σ is lost when its diagonal of R is this far below the largest.
 _RANK = 1e-10
+# Directions tried at once for the best beam of no emittance, and how often the search zooms in.
+_DIRECTIONS, _ZOOMS = 48, 5
 
 
 class SizeData(NamedTuple):
@@ -60,7 +59,7 @@ class SizeData(NamedTuple):
     @property
     def design(self) -> Array:
         """Coefficients of σ11, σ12, σ22 in size², shape (n, 3)."""
-        return jnp.stack([self.r11**2, 2.0 * self.r11 * self.r12, self.r12**2], axis=-1)
+        return jnp.stack(coefficients(self.r11, self.r12), axis=-1)
 
 
 class SigmaFit(NamedTuple):
@@ -99,29 +98,6 @@ class SigmaFit(NamedTuple):
     full_rank: Array
     positive: Array
     converged: Array
-
-
-def emittance_parts(sigma: ArrayLike) -> Array:
-    """Emittance, β and α of a positive definite σ.
-
-    Parameters
-    ----------
-    sigma : Array
-        Shape (3,): σ11, σ12, σ22.
-
-    Returns
-    -------
-    Array
-        Shape (3,): sqrt(det σ) in m, σ11/ε in m, -σ12/ε.
-
-    Examples
-    --------
-    >>> emittance_parts(jnp.array([2.0, -1.0, 1.0])).tolist()
-    [1.0, 2.0, 1.0]
-    """
-    s11, s12, s22 = jnp.asarray(sigma)
-    emittance = jnp.sqrt(s11 * s22 - s12**2)
-    return jnp.stack([emittance, s11 / emittance, -s12 / emittance])
 
 
 def solve_size_squared(data: SizeData, weight: ArrayLike = 1.0) -> SigmaFit:
@@ -292,6 +268,9 @@ def _levenberg_marquardt(residual, start: Array) -> tuple[Array, Array]:
     return p, settled
 
 
+SOLVE = {"size_squared": solve_size_squared, "size": solve_size}
+
+
 @partial(jax.jit, static_argnames="method")
 def fit_sizes(
     r11: ArrayLike,
@@ -330,7 +309,7 @@ def fit_sizes(
     >>> fits.sigma.shape, bool(abs(fits.determinant.mean() / 4e-16 - 1) < 0.05)
     ((10000, 3), True)
     """
-    solve = {"size_squared": solve_size_squared, "size": solve_size}[method]
+    solve = SOLVE[method]
     shape = jnp.broadcast_shapes(*(jnp.shape(v) for v in (r11, r12, size, error, known)))
     arrays = [
         jnp.broadcast_to(jnp.asarray(v, float), shape) for v in (r11, r12, known, size, error)
@@ -342,3 +321,106 @@ def fit_sizes(
     for _ in shape[:-1]:
         one = jax.vmap(one)
     return one(*arrays)
+
+
+def zero_emittance(r11: Array, r12: Array, target: Array, scale: Array) -> tuple[Array, Array]:
+    """Find the beam of no emittance that fits best: how far the data are from allowing one.
+
+    Such a beam is a line in phase space, σ = v vᵀ: a direction and a length. For a direction
+    the length is linear least squares, and the direction is searched over the half circle,
+    in coordinates in which the scan looks at it evenly.
+
+    Parameters
+    ----------
+    r11, r12 : Array
+        Shape (n,).
+    target : Array
+        Shape (n,): measured size² less what is known, over its error.
+    scale : Array
+        Shape (n,): one over the error of size².
+
+    Returns
+    -------
+    tuple of Array
+        σ of shape (3,), and its χ².
+    """
+    used = jnp.where(scale > 0.0, 1.0, 0.0)
+    g11 = jnp.sum(used * r11**2)
+    g12 = jnp.sum(used * r11 * r12)
+    g22 = jnp.sum(used * r12**2)
+    # Coordinates in which the rows look in all directions evenly.
+    rest = jnp.sqrt(jnp.maximum(g22 - g12**2 / g11, _RANK * g22))
+    along, across = r11 / jnp.sqrt(g11), (r12 - r11 * g12 / g11) / rest
+
+    # Of a direction θ the row is linear in (1, cos 2θ, sin 2θ): sums over rows are done once.
+    parts = 0.5 * jnp.stack([along**2 + across**2, along**2 - across**2, 2.0 * along * across])
+    parts = parts * scale
+    projection, gram = parts @ target, parts @ parts.T
+
+    def length_and_gain(angle: Array) -> tuple[Array, Array]:
+        basis = jnp.stack([jnp.ones_like(angle), jnp.cos(2.0 * angle), jnp.sin(2.0 * angle)])
+        norm = jnp.sum((gram @ basis) * basis, axis=0)
+        overlap = jnp.maximum(projection @ basis, 0.0)
+        length = overlap / jnp.where(norm > 0.0, norm, 1.0)
+        return length, length * overlap
+
+    steps = (jnp.arange(_DIRECTIONS) + 0.5) / _DIRECTIONS - 0.5
+
+    def zoom(_: int, state: tuple[Array, Array]) -> tuple[Array, Array]:
+        angle, width = state
+        tried = angle + width * steps
+        return tried[jnp.argmax(length_and_gain(tried)[1])], 2.0 * width / _DIRECTIONS
+
+    angle, _ = jax.lax.fori_loop(0, _ZOOMS, zoom, (jnp.asarray(0.0), jnp.asarray(jnp.pi)))
+    length, gain = length_and_gain(angle)
+    chi2 = jnp.sum(target**2) - gain
+    w = jnp.sin(angle) / rest
+    v1, v2 = jnp.cos(angle) / jnp.sqrt(g11) - w * g12 / g11, w
+    return length * jnp.stack([v1**2, v1 * v2, v2**2]), chi2
+
+
+class ClosedForm(NamedTuple):
+    """A plane in closed form: the fit, `numbers_of` it, and their errors, not scaled."""
+
+    fit: SigmaFit
+    value: Array
+    error: Array
+
+
+@partial(jax.jit, static_argnames="method")
+def closed_form(
+    sizes: SizeData,
+    factor: Array,
+    to_screen: Array,
+    to_design: Array,
+    design: Array,
+    method: str = "size_squared",
+) -> ClosedForm:
+    """Fit planes and carry σ and its covariance to everything people quote.
+
+    Parameters
+    ----------
+    sizes : SizeData
+        Arrays of shape (planes, n).
+    factor, to_screen, to_design, design
+        As for `numbers_of`, with a leading axis of planes.
+    method : str
+        As for `fit_sizes`.
+
+    Returns
+    -------
+    ClosedForm
+        With that leading axis. Errors are those of linear propagation, sqrt(∇f C ∇f).
+    """
+
+    def one(plane: SizeData, *at: Array) -> ClosedForm:
+        fit = SOLVE[method](plane)
+
+        def numbers(sigma: Array) -> Array:
+            return numbers_of(sigma, *at)
+
+        slope = jax.jacfwd(numbers)(fit.sigma)
+        error = jnp.sqrt(jnp.sum((slope @ fit.covariance) * slope, axis=1))
+        return ClosedForm(fit, numbers(fit.sigma), error)
+
+    return jax.vmap(one)(sizes, factor, to_screen, to_design, design)

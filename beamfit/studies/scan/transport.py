@@ -1,11 +1,11 @@
-"""A scan seen through a line: from settings to the numbers a fit of sizes needs."""
+"""A scan seen through a line: from settings to R11, R12 and what is known of each size."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -13,6 +13,8 @@ import numpy as np
 from jax import Array
 from jax.typing import ArrayLike
 
+from beamfit.greybox import tree
+from beamfit.greybox.problem import padded_length
 from beamfit.optics.beamline import Beamline
 from beamfit.optics.calibration import (
     SETTING_UNITS,
@@ -22,91 +24,26 @@ from beamfit.optics.calibration import (
 )
 from beamfit.optics.elements import Marker, Screen, ThinLens, TransferMatrix
 from beamfit.optics.sections import Series
+from beamfit.studies.scan.model import line_of
 from beamfit.studies.scan.scans import QuadScan
 
 __all__ = [
-    "PlaneInput",
-    "ScanRows",
+    "Look",
+    "NetworkRows",
+    "Rows",
+    "look_through",
     "names_of",
     "own_settings",
     "own_units",
-    "plane_input",
+    "padded",
     "scan_rows",
     "scanned_line",
     "seen_line",
     "transfer_rows",
 ]
 
-
 # Elements, times rows, whose matrices are held at once where each row has its own energy.
 MOST_AT_ONCE = 100_000
-
-
-class ScanRows(NamedTuple):
-    """The rows of a scan as the line sees them, and one more: the line's own settings.
-
-    Attributes
-    ----------
-    settings : dict of str to ndarray
-        Magnet name to setting, shape (n + 1,), in the scan's units.
-    energy : ndarray
-        Total energy in MeV, shape (n + 1,).
-    places : tuple of str
-        Screens of the scan in the order of the line, then the element of the design Twiss.
-    which : ndarray
-        Index into ``places``, shape (n + 1,); the last row's is the last screen of the line.
-    """
-
-    settings: dict[str, np.ndarray]
-    energy: np.ndarray
-    places: tuple[str, ...]
-    which: np.ndarray
-
-
-class PlaneInput(NamedTuple):
-    """One plane of a scan, carried to its screens; arrays of shape (n,).
-
-    Attributes
-    ----------
-    settings : dict of str to ndarray
-        Magnet name to setting.
-    units : dict of str to str
-        Magnet name to the unit of its settings.
-    energy : ndarray
-        Total energy, MeV.
-    screen : tuple of str
-        Where each size was measured.
-    size : ndarray
-        Rms size, m.
-    error : ndarray or None
-        Standard error, m.
-    r11, r12, r16 : ndarray
-        Transfer-matrix elements from the start (R12, R16 in m).
-    energy_spread : ndarray
-        Relative momentum spread.
-    known : ndarray
-        Size² in m² due to dispersion and resolution.
-    last_screen : str
-        The scan's last screen along the line.
-    to_screen, to_design : ndarray
-        Shape (3, 3): start to the last screen and to the design's place, magnets as the
-        lattice sets them.
-    """
-
-    settings: dict[str, np.ndarray]
-    units: dict[str, str]
-    energy: np.ndarray
-    screen: tuple[str, ...]
-    size: np.ndarray
-    error: np.ndarray | None
-    r11: np.ndarray
-    r12: np.ndarray
-    r16: np.ndarray
-    energy_spread: np.ndarray
-    known: np.ndarray
-    last_screen: str
-    to_screen: np.ndarray
-    to_design: np.ndarray
 
 
 def names_of(line: Beamline) -> tuple[dict[str, str], list[str], str | None, float]:
@@ -156,19 +93,173 @@ def scanned_line(scan: QuadScan, line: Beamline) -> Beamline:
     return line
 
 
-def scan_rows(scan: QuadScan, scanned: Beamline) -> ScanRows:
-    """Collect the rows of a scan for `transfer_rows`."""
+@tree.node("plane", "places", "squared")
+class Rows:
+    """Rows of a scan seen through a line: what predicts their sizes besides the model.
+
+    Parameters
+    ----------
+    plane : str
+        "x" or "y".
+    places : tuple of str
+        Screens.
+    squared : bool
+        Whether size² in µm² is compared (the report's ``error_linear``), or size in µm.
+    line : Beamline
+        The line, with the calibrations of the scan's columns.
+    settings : dict of str to Array
+        Magnet name to settings, shape (n,), or (n, 2) with the branch.
+    energy, which, spread, resolution : Array
+        MeV, index into places, relative momentum spread and point-spread rms in m, shape (n,).
+    """
+
+    plane: str
+    places: tuple[str, ...]
+    squared: bool
+    line: Beamline
+    settings: Any
+    energy: Any
+    which: Any
+    spread: Any
+    resolution: Any
+
+    def elements(self, model: Mapping[str, Any]) -> tuple[Array, Array, Array]:
+        """R11, R12 and known size² (m²) of every row, shape (n,) each, through the model's line."""
+        line = line_of(model, self.line)
+        every = transfer_rows(line, self.settings, self.energy, self.places).planes
+        return self.seen(every[:, "xy".index(self.plane)])
+
+    @property
+    def whole_line(self) -> Beamline:
+        """The line that carries the beam anywhere."""
+        return self.line
+
+    def seen(self, matrices: Array) -> tuple[Array, Array, Array]:
+        """R11, R12 and known size² from one plane's matrices, shape (n, places, 3, 3)."""
+        r = matrices[jnp.arange(len(self.which)), self.which, 0]
+        return r[:, 0], r[:, 1], (r[:, 2] * self.spread) ** 2 + self.resolution**2
+
+
+@tree.node("plane", "squared")
+class NetworkRows:
+    """Rows of a scan whose R11 and R12 are outputs of a network of the settings.
+
+    ``inputs`` has shape (n, inputs) and ``columns`` (n, 2), the outputs that are R11 and R12 at
+    each row's screen; ``known`` (n,) is the size² that is not due to the beam, m².
+    """
+
+    plane: str
+    squared: bool
+    inputs: Any
+    columns: Any
+    known: Any
+
+    @property
+    def whole_line(self) -> None:
+        """None: what the network does not give is unknown."""
+
+    def outputs(self, model: Mapping[str, Any]) -> Array:
+        """The outputs of the model's network that ``columns`` names, of its shape."""
+        every = jax.vmap(model["map"].values)(self.inputs)
+        return jnp.take_along_axis(every, self.columns, axis=1)
+
+    def elements(self, model: Mapping[str, Any]) -> tuple[Array, Array, Array]:
+        """R11, R12 and known size² (m²) of every row, shape (n,) each."""
+        found = self.outputs(model)  # A and B first, then C and D if the network has them
+        return found[:, 0], found[:, 1], self.known
+
+
+def padded(values: Any, n: int | None = None) -> np.ndarray:
+    """Repeat the last row until there are as many as `padded_length` says, or n.
+
+    Examples
+    --------
+    >>> padded([1.0, 2.0]).tolist()
+    [1.0, 2.0, 2.0, 2.0, 2.0, 2.0, 2.0, 2.0]
+    """
+    values = np.asarray(values)
+    more = (padded_length(len(values)) if n is None else n) - len(values)
+    return np.concatenate([values, np.repeat(values[-1:], more, axis=0)])
+
+
+def scan_rows(scan: QuadScan, scanned: Beamline, squared: bool = True) -> Rows:
+    """The rows of a scan, of the x plane, padded.
+
+    Parameters
+    ----------
+    scan : QuadScan
+        The scan.
+    scanned : Beamline
+        From `scanned_line`.
+    squared : bool
+        As for `Rows`.
+
+    Returns
+    -------
+    Rows
+        Places in the order of the line; what no setting of the scan moves is multiplied out.
+    """
     n = len(scan)
     named = scan.screen or (scanned.screens[-1],) * n
-    order = [e.name for e in scanned.elements]
-    screens = tuple(sorted(set(named), key=order.index))
-    design = (scanned.design.at,) if scanned.design else ()
-    own = float(scanned.energy)
-    return ScanRows(
-        settings={k: np.append(v, float(scanned[k].setting)) for k, v in scan.settings.items()},
-        energy=np.append(np.full(n, own) if scan.energy is None else scan.energy, own),
-        places=tuple(dict.fromkeys((*screens, *design))),
-        which=np.array([screens.index(s) for s in named] + [len(screens) - 1]),
+    order = {e.name: i for i, e in enumerate(scanned.elements)}
+    places = tuple(sorted(set(named), key=order.__getitem__))
+    own = [float(getattr(scanned[s], "resolution", 0.0)) for s in places]
+    which = np.array([places.index(s) for s in named])
+
+    def column(values: Any, default: float) -> np.ndarray:
+        return padded(np.full(n, float(default)) if values is None else values)
+
+    settings, energy = {name: padded(v) for name, v in scan.settings.items()}, scan.energy
+    energy = column(energy, scanned.energy)
+    return Rows(
+        "x",
+        places,
+        squared,
+        seen_line(scanned, settings, energy, places),
+        settings,
+        energy,
+        padded(which),
+        column(scan.energy_spread, scanned.energy_spread),
+        padded(np.array(own)[which] if scan.resolution is None else scan.resolution),
+    )
+
+
+class Look(NamedTuple):
+    """Both planes of a scan's rows through a line, shape (2, rows), and further along it.
+
+    Attributes
+    ----------
+    r11, r12, known : Array
+        Transfer-matrix elements to the screens (R12 in m), size² not due to the beam, m².
+    to_screen, to_design : Array
+        Shape (2, 3, 3): start to the scan's last screen and to the design's place, magnets as the
+        lattice sets them.
+    """
+
+    r11: Array
+    r12: Array
+    known: Array
+    to_screen: Array
+    to_design: Array
+
+
+@jax.jit
+def look_through(rows: Rows) -> Look:
+    """Carry the rows of a scan to their screens, in both planes and one pass."""
+    line = rows.line
+    last = rows.places[-1]
+    places = (*rows.places, line.design.at) if line.design else rows.places
+    places = tuple(dict.fromkeys(places))
+    settings = {n: jnp.append(v, line[n].setting) for n, v in rows.settings.items()}
+    energy = jnp.append(rows.energy, line.energy)
+    every = transfer_rows(line, settings, energy, places).planes
+    seen = [rows.seen(every[:-1, plane]) for plane in (0, 1)]
+    own = every[-1]
+    at = places.index(line.design.at) if line.design else 0
+    return Look(
+        *(jnp.stack(part) for part in zip(*seen, strict=True)),
+        own[:, places.index(last)],
+        own[:, at],
     )
 
 
@@ -202,9 +293,13 @@ def transfer_rows(
 def seen_line(
     line: Beamline, settings: Iterable[str], energy: ArrayLike, places: Iterable[str]
 ) -> Beamline:
-    """A line as rows of these settings and energies see it: all else multiplied out."""
-    own = () if isinstance(energy, jax.core.Tracer) else np.unique(energy)
-    return line.condensed((*settings, *places), own[0] if len(own) == 1 else None)
+    """A line as rows of these settings and energies see it: all else multiplied out.
+
+    It stays right at its own energy and to where its design holds.
+    """
+    design = (line.design.at,) if line.design else ()
+    own = () if isinstance(energy, jax.core.Tracer) else np.unique(np.append(energy, line.energy))
+    return line.condensed((*settings, *places, *design), own[0] if len(own) == 1 else None)
 
 
 @partial(jax.jit, static_argnames="places")
@@ -222,41 +317,6 @@ def _rows(
         return TransferMatrix(jax.vmap(one)(rows))
     by_turns = jax.lax.map(jax.checkpoint(one), rows, batch_size=max(1, MOST_AT_ONCE // long))
     return TransferMatrix(by_turns)
-
-
-def plane_input(
-    scan: QuadScan, scanned: Beamline, rows: ScanRows, matrices: TransferMatrix, plane: str
-) -> PlaneInput:
-    """Select what the fit of one plane needs from the matrices of a scan's rows."""
-    measured = scan.rows(plane)
-    keep = np.flatnonzero(~np.isnan(scan.size[plane]))
-    every = np.asarray(matrices.planes)[:, "xy".index(plane)]
-    r = every[keep, rows.which[keep]]
-    spread = measured.energy_spread
-    if spread is None:
-        spread = np.full(len(keep), float(scanned.energy_spread))
-    resolution = measured.resolution
-    screen = tuple(rows.places[i] for i in rows.which[keep])
-    if resolution is None:
-        own = {s: float(getattr(scanned[s], "resolution", 0.0)) for s in set(screen)}
-        resolution = np.array([own[s] for s in screen])
-    design = rows.places.index(scanned.design.at) if scanned.design else 0
-    return PlaneInput(
-        settings=measured.settings,
-        units={name: SETTING_UNITS[scan.units[name]] for name in measured.settings},
-        energy=rows.energy[keep],
-        screen=screen,
-        size=measured.size,
-        error=measured.error,
-        r11=r[:, 0, 0],
-        r12=r[:, 0, 1],
-        r16=r[:, 0, 2],
-        energy_spread=spread,
-        known=(r[:, 0, 2] * spread) ** 2 + resolution**2,
-        last_screen=rows.places[rows.which[-1]],
-        to_screen=every[-1, rows.which[-1]],
-        to_design=every[-1, design],
-    )
 
 
 def own_settings(line: Beamline, screen: str) -> dict[str, float]:

@@ -7,10 +7,10 @@ large: see docs/scenarios.md.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from beamfit.errors import InputError
@@ -18,18 +18,19 @@ from beamfit.greybox.bounds import over_cells
 from beamfit.greybox.mlp import MLP, Port
 from beamfit.greybox.problem import Problem, Record
 from beamfit.studies.scan.assumptions import Assumptions
-from beamfit.studies.scan.focusing_network import signed_network, weight_free
-from beamfit.studies.scan.scenario_data import (
+from beamfit.studies.scan.results import Parameter
+from beamfit.studies.scan.signed_network import known_record, signed_network, weight_free
+from beamfit.studies.scan.statement import (
+    Scenario,
     Seen,
     beam_free,
     beam_numbers,
     size_record,
     varied_magnets,
 )
-from beamfit.studies.scan.scenario_model import NetworkRows, network_elements, predict_network
-from beamfit.studies.scan.transport import transfer_rows
+from beamfit.studies.scan.transport import NetworkRows, padded, transfer_rows
 
-__all__ = ["Certificate", "Gain", "certificate_of", "network_rows", "transport_problem"]
+__all__ = ["SCENARIO", "Certificate", "Gain", "certificate_of", "network_rows"]
 
 CELLS = 32
 ELEMENTS = "ABCD"
@@ -67,45 +68,48 @@ class Certificate(NamedTuple):
 
 
 class _Layout(NamedTuple):
-    """Inputs with their ranges, screens, and how many elements of T a screen has."""
+    """Inputs of the network with their columns, whether the last is the energy, elements of T."""
 
-    inputs: tuple[str, ...]
-    low: np.ndarray
-    high: np.ndarray
-    places: tuple[str, ...]
+    names: tuple[str, ...]
+    columns: np.ndarray
+    with_energy: bool
     elements: int
+
+    @property
+    def low(self) -> np.ndarray:
+        return self.columns.min(axis=0)
+
+    @property
+    def high(self) -> np.ndarray:
+        return self.columns.max(axis=0)
 
 
 def _layout(seen: Seen, told: Assumptions) -> _Layout:
-    varied = varied_magnets(seen)
-    columns = {name: seen.scan.settings[name] for name in varied}
-    if seen.scan.energy is not None and np.ptp(seen.scan.energy) > 0:
-        columns["energy"] = seen.scan.energy
-    order = [e.name for e in seen.scanned.elements]
-    named = seen.scan.screen or (seen.scanned.screens[-1],)
-    places = tuple(sorted(set(named), key=order.index))
-    low, high = (np.array([f(v) for v in columns.values()]) for f in (np.min, np.max))
-    return _Layout(tuple(columns), low, high, places, 4 if told.anchor.determinant else 2)
+    scan, varied = seen.scan, varied_magnets(seen.scan)
+    columns = [scan.settings[name] for name in varied]
+    with_energy = scan.energy is not None and np.ptp(scan.energy) > 0
+    names = (*varied, "energy") if with_energy else varied
+    columns += [scan.energy] if with_energy else []
+    return _Layout(names, np.stack(columns, -1), with_energy, 4 if told.anchor.determinant else 2)
 
 
 def _first_principles(seen: Seen, lay: _Layout, points: np.ndarray) -> np.ndarray:
     """A, B, C, D of the line, shape (points, planes, places, 4)."""
-    held = {n: np.median(v) for n, v in seen.scan.settings.items()}
-    settings = {n: jnp.full(len(points), v) for n, v in held.items()}
-    energy = jnp.full(len(points), float(np.mean(seen.works[seen.planes[0]].given.energy)))
-    for i, name in enumerate(lay.inputs):
-        if name == "energy":
-            energy = jnp.asarray(points[:, i])
-        else:
-            settings[name] = jnp.asarray(points[:, i])
-    every = np.asarray(transfer_rows(seen.scanned, settings, energy, lay.places).planes)
-    r = every[:, ["xy".index(p) for p in seen.planes]]
+    n, full = len(points), padded(points)
+    settings = {k: np.full(len(full), np.median(v)) for k, v in seen.scan.settings.items()}
+    energy = np.full(len(full), seen.energy(seen.planes[0]))
+    columns = list(full.T)
+    if lay.with_energy:
+        energy = columns.pop()
+    settings |= dict(zip(lay.names, columns, strict=False))
+    every = np.asarray(transfer_rows(seen.scanned, settings, energy, seen.rows.places).planes)
+    r = every[:n, ["xy".index(p) for p in seen.planes]]
     return np.stack([r[..., 0, 0], r[..., 0, 1], r[..., 1, 0], r[..., 1, 1]], -1)
 
 
 def _grid(lay: _Layout) -> np.ndarray:
     """Points that fill the box, its edges included."""
-    number = max(3, round(600 ** (1 / len(lay.inputs))))
+    number = max(3, round(600 ** (1 / len(lay.names))))
     axes = [np.linspace(a, b, number) for a, b in zip(lay.low, lay.high, strict=True)]
     return np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, len(axes))
 
@@ -113,139 +117,135 @@ def _grid(lay: _Layout) -> np.ndarray:
 def _signs(seen: Seen, lay: _Layout, grid: np.ndarray) -> np.ndarray:
     """Signs of the gains of A and B by first principles, shape (outputs, inputs); 0 if mixed."""
     half = 0.5 * (lay.high - lay.low)
-    found = []
-    for i in range(len(lay.inputs)):
-        step = np.zeros(len(lay.inputs))
+    found = np.zeros((len(seen.planes) * len(seen.rows.places) * lay.elements, len(half)))
+    # Nothing is asked of the gains by the energy, nor of C and D.
+    for i in range(len(half) - lay.with_energy):
+        step = np.zeros(len(half))
         step[i] = 1e-4 * half[i]
-        change = _first_principles(seen, lay, grid + step) - _first_principles(
-            seen, lay, grid - step
-        )
-        down, up = (change < 0).all(axis=0), (change > 0).all(axis=0)
-        sign = up.astype(int) - down.astype(int)
-        sign[..., 2:] = 0  # nothing is asked of C and D
-        if lay.inputs[i] == "energy":
-            sign[:] = 0
-        found.append(sign[..., : lay.elements].reshape(-1))
-    return np.array(found, float).T
+        up, down = (_first_principles(seen, lay, grid + s) for s in (step, -step))
+        sign = ((up > down).all(axis=0)).astype(int) - ((up < down).all(axis=0)).astype(int)
+        sign[..., 2:] = 0
+        found[:, i] = sign[..., : lay.elements].ravel()
+    return found
 
 
 def network_rows(seen: Seen, lay: _Layout, plane: str) -> NetworkRows:
     """Inputs of the network and the place of A and B among its outputs, for one plane's rows."""
-    given = seen.works[plane].given
-    columns = [given.energy if n == "energy" else given.settings[n] for n in lay.inputs]
-    which = np.array([lay.places.index(s) for s in given.screen])
     return NetworkRows(
         plane,
-        seen.squared,
-        jnp.asarray(np.stack(columns, -1)),
-        jnp.asarray(_columns(seen, lay, plane, which)),
-        jnp.asarray(given.known),
+        seen.rows.squared,
+        padded(lay.columns),
+        _columns(seen, lay, plane, seen.rows.which),
+        seen.look.known["xy".index(plane)],
     )
 
 
 def _columns(seen: Seen, lay: _Layout, plane: str, which: np.ndarray) -> np.ndarray:
-    first = (seen.planes.index(plane) * len(lay.places) + which) * lay.elements
+    first = (seen.planes.index(plane) * len(seen.rows.places) + which) * lay.elements
     return first[:, None] + np.arange(lay.elements)
 
 
-def transport_problem(seen: Seen, told: Assumptions) -> Problem:
-    """State the problem: beams, and one network for A and B of every plane and screen.
-
-    Parameters
-    ----------
-    seen : Seen
-        The scan.
-    told : Assumptions
-        Hidden nodes, anchor.
-
-    Returns
-    -------
-    Problem
-
-    Raises
-    ------
-    InputError
-        If an anchor names a magnet that was not scanned.
-    """
+def _state(seen: Seen, told: Assumptions) -> Problem:
+    """Beams, and one network for A and B of every plane and screen."""
     lay = _layout(seen, told)
-    for place in told.anchor.at:
-        for name in place:
-            if name not in lay.inputs:
-                raise InputError(
-                    f"an anchor at '{name}'", f"a scanned magnet: {', '.join(lay.inputs)}"
-                )
+    for name in (name for place in told.anchor.at for name in place):
+        if name not in lay.names:
+            raise InputError(f"an anchor at '{name}'", f"a scanned magnet: {', '.join(lay.names)}")
     grid = _grid(lay)
     first = _first_principles(seen, lay, grid)[..., : lay.elements].reshape(len(grid), -1)
+    inputs = [
+        Port(n, "", 0, (b - a) / 2, (b + a) / 2)
+        for n, a, b in zip(lay.names, lay.low, lay.high, strict=True)
+    ]
+    outputs = [
+        Port(name, "", 0, np.ptp(v) / 2 or 1.0, (v.max() + v.min()) / 2)
+        for name, v in zip(_names(seen, lay), first.T, strict=True)
+    ]
     signs = _signs(seen, lay, grid)
-    net, bounds = signed_network(
-        [
-            Port(n, "", 0, (b - a) / 2, (b + a) / 2)
-            for n, a, b in zip(lay.inputs, lay.low, lay.high, strict=True)
-        ],
-        [
-            Port(name, "", 0, np.ptp(v) / 2 or 1.0, (v.max() + v.min()) / 2)
-            for name, v in zip(_names(seen, lay), first.T, strict=True)
-        ],
-        signs,
-        told.hidden,
-        told.seed,
-    )
-    beams = beam_numbers(seen)
-    records = []
+    net, bounds = signed_network(inputs, outputs, signs, told.hidden, told.seed)
+    beams, records = beam_numbers(seen), []
     for plane in seen.planes:
         rows = network_rows(seen, lay, plane)
-        records.append(size_record(seen, plane, rows, predict_network))
-        records += _anchors(seen, lay, told, plane, rows)
-    return Problem(
-        {"beam": beams, "map": net}, beam_free(beams) + weight_free("map", bounds), records
-    )
+        records += [size_record(seen, plane, rows), *_anchors(seen, lay, told, rows)]
+    free = beam_free(beams) + weight_free("map", bounds)
+    return Problem({"beam": beams, "map": net}, free, records)
 
 
 def _names(seen: Seen, lay: _Layout) -> list[str]:
-    several = len(lay.places) > 1
+    places = seen.rows.places
     return [
-        f"{e}_{plane}" + (f"@{place}" if several else "")
+        f"{e}_{plane}" + (f"@{place}" if len(places) > 1 else "")
         for plane in seen.planes
-        for place in lay.places
+        for place in places
         for e in ELEMENTS[: lay.elements]
     ]
 
 
-def _anchors(seen: Seen, lay: _Layout, told: Assumptions, plane: str, rows) -> list[Record]:
+def _anchors(seen: Seen, lay: _Layout, told: Assumptions, rows: NetworkRows) -> Iterator[Record]:
     """What ties the network to first principles, as records."""
-    anchor, found = told.anchor, []
-    own = _first_principles(seen, lay, np.asarray(rows.inputs))[:, seen.planes.index(plane)]
-    which = np.asarray(rows.columns)[:, 0] // lay.elements % len(lay.places)
-    own = own[np.arange(len(own)), which]
-    size = np.sqrt(np.mean(own**2, axis=0))
+    anchor, plane, at = told.anchor, rows.plane, seen.measured(rows.plane)
+    i, places = seen.planes.index(plane), len(seen.rows.places)
+    points, which = lay.columns[at], seen.rows.which[at]
+    own = _first_principles(seen, lay, points)[np.arange(len(at)), i, which]
+    size = np.sqrt(np.mean(own**2, axis=0))[: lay.elements]
+
+    def known(name, inputs, screens, values, sd, predict=_outputs, elements=lay.elements):
+        columns = _columns(seen, lay, plane, padded(screens))[:, :elements]
+        data = NetworkRows(plane, rows.squared, padded(inputs), columns, rows.known)
+        return known_record(name, predict, data, values, sd)
+
     if anchor.deviation is not None:
-        only = rows.columns[:, :2]
         sd = anchor.deviation * size[:2]
-        found.append(_known(f"anchor {plane}", rows, rows.inputs, only, own[:, :2], sd))
+        yield known(f"anchor {plane}", points, which, own[:, :2], sd, elements=2)
     for place in anchor.at:
         middle = 0.5 * (lay.low + lay.high)
-        point = np.array([[place.get(n, m) for n, m in zip(lay.inputs, middle, strict=True)]])
-        here = _first_principles(seen, lay, point)[0, seen.planes.index(plane), :, : lay.elements]
-        points = np.repeat(point, len(lay.places), axis=0)
-        columns = _columns(seen, lay, plane, np.arange(len(lay.places)))
-        sd = anchor.sd * size[: lay.elements]
-        name = f"anchor {plane} at one setting"
-        found.append(_known(name, rows, jnp.asarray(points), jnp.asarray(columns), here, sd))
+        point = np.array([[place.get(n, m) for n, m in zip(lay.names, middle, strict=True)]])
+        here = _first_principles(seen, lay, point)[0, i, :, : lay.elements]
+        inputs, screens = np.repeat(point, places, axis=0), np.arange(places)
+        yield known(f"anchor {plane} at one setting", inputs, screens, here, anchor.sd * size)
     if anchor.determinant:
-        found.append(Record(f"det T {plane}", _determinant, rows, np.ones(len(own)), DETERMINANT))
-    return found
+        yield known(f"det T {plane}", points, which, np.ones(len(at)), DETERMINANT, _determinant)
 
 
-def _known(name: str, rows: NetworkRows, inputs, columns, values, sd) -> Record:
-    data = NetworkRows(rows.plane, rows.squared, inputs, columns, rows.known)
-    error = np.broadcast_to(sd, np.shape(values))
-    return Record(name, network_elements, data, values, error)
+def _outputs(model, rows: NetworkRows) -> jax.Array:
+    return rows.outputs(model)
 
 
 def _determinant(model, rows: NetworkRows) -> jax.Array:
     """A D - B C at every row."""
-    a, b, c, d = network_elements(model, rows).T
+    a, b, c, d = rows.outputs(model).T
     return a * d - b * c
+
+
+def _null_directions(
+    seen: Seen, parameters: tuple[Parameter, ...], identified: bool
+) -> tuple[str, ...]:
+    gauge = (
+        "[A B] -> [A B] G with sigma -> G^-1 sigma G^-T leaves every size as it is, for any "
+        "invertible 2 x 2 matrix G (four directions; the emittance goes as 1/det G)"
+    )
+    pointwise = (
+        "at each setting one size is measured for two numbers A and B: what one gives the other "
+        "can take"
+    )
+    return () if identified else (gauge, pointwise)
+
+
+def _remedy(seen: Seen) -> str:
+    return (
+        "an anchor to first principles at every setting (--anchor first-principles=2%); T known at "
+        "single settings or det T = 1 with C and D free do not suffice"
+    )
+
+
+SCENARIO = Scenario(
+    "transport-network",
+    _state,
+    null_directions=_null_directions,
+    remedy=_remedy,
+    network=True,
+    whole_map=False,
+)
 
 
 def certificate_of(problem: Problem, net: MLP) -> Certificate:

@@ -1,17 +1,30 @@
-"""Whether a scan determines the emittance, and the sentence that says so."""
+"""Whether a scan determines the emittance: evidence, and rules that each have their sentence."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 from scipy.special import stdtrit
 
-from beamfit.quantity import Status
 from beamfit.statistics import chi2_probability, one_sided_probability
+from beamfit.status import Status
+from beamfit.verdict import Finding, judge
 
-__all__ = ["Evidence", "Verdict", "few_words", "judge", "phase_coverage", "waist_bracketed"]
+__all__ = [
+    "BEAM_RULES",
+    "CLEAR",
+    "LOST",
+    "SCENARIO_RULES",
+    "Evidence",
+    "Unknowns",
+    "cause_of",
+    "judge",
+    "phase_coverage",
+    "waist_bracketed",
+]
 
 # A fit this unlikely to be noise alone is a poor fit (docs/design.md, the JSON contract).
 POOR_FIT = 1e-3
@@ -30,7 +43,7 @@ MANY = 8
 
 
 class Evidence(NamedTuple):
-    """The numbers a verdict is made of.
+    """What tells whether sizes determine a beam when the line is known.
 
     Attributes
     ----------
@@ -58,6 +71,12 @@ class Evidence(NamedTuple):
         Share of the points the robust fit thinks bad; 0 for a plain fit.
     robust : bool
         Whether the fit was robust: its noise then rests on its own judgement.
+    neighbour : bool
+        Whether the other plane of the same scan is determined by the full rule. It shares
+        magnets, screen and settings, so a misfit here is then a matter of the profile and
+        not of noise, and three standard errors suffice.
+    advice : str or None
+        What to measure, for the remedy.
     """
 
     full_rank: bool
@@ -74,126 +93,270 @@ class Evidence(NamedTuple):
     swamped: bool = False
     outliers: float = 0.0
     robust: bool = False
+    neighbour: bool = False
+    advice: str | None = None
+
+    @property
+    def vouched(self) -> bool:
+        """A neighbour vouches for given errors, a bracketed waist and a miss of up to 20 %."""
+        return (
+            self.neighbour and self.noise_known and bool(self.bracketed) and self.misfit <= VOUCHED
+        )
+
+    @property
+    def distance(self) -> float:
+        """Standard errors from zero emittance, the lesser of both."""
+        return min(self.determinant_distance, self.zero_distance)
+
+    @property
+    def poor(self) -> bool:
+        """Whether given errors make the residuals improbable."""
+        return self.noise_known and improbable(self.chi2, self.dof)
+
+    @property
+    def chance(self) -> float:
+        """How often noise alone comes this far from zero emittance."""
+        rests_on_residuals = not self.noise_known or self.robust or self.chi2 > self.dof
+        return one_sided_probability(self.distance, self.dof if rests_on_residuals else None)
 
 
-class Verdict(NamedTuple):
-    """A status and its sentence; ``cause`` is None where the emittance is determined."""
-
-    status: Status
-    message: str
-    cause: str | None
+def improbable(chi2: float, dof: float) -> bool:
+    """Whether noise alone gives such a χ² less than once in a thousand."""
+    probability = chi2_probability(chi2, dof)
+    return probability is not None and probability < POOR_FIT
 
 
-def judge(e: Evidence, next_measurement: str | None, other_plane_clear: bool = False) -> Verdict:
-    """Decide whether the emittance is determined, and how good the fit is.
+def _no_rank(e: Evidence) -> str | None:
+    if e.full_rank:
+        return None
+    return (
+        "the settings do not separate the three numbers of the beam matrix, as if the "
+        "scanned magnet were downstream of the screen or hardly moved"
+    )
 
-    Parameters
-    ----------
-    e : Evidence
-        The numbers.
-    next_measurement : str or None
-        What to measure, for the remedy.
-    other_plane_clear : bool
-        Whether the other plane of the same scan is determined by the full rule. It shares
-        magnets, screen and settings, so a misfit here is then a matter of the profile and
-        not of noise, and three standard errors suffice.
 
-    Returns
-    -------
-    Verdict
-        ``unidentified`` takes precedence over every other status.
+def _doubted(e: Evidence) -> str | None:
+    if not (e.robust and (e.dof < ROBUST_DOF or e.outliers > DOUBTED)):
+        return None
+    return (
+        f"the robust fit doubts {100 * e.outliers:.0f} % of the points and keeps {e.dof} "
+        "degrees of freedom, too few to tell outliers from noise; measure more settings"
+    )
 
-    Notes
-    -----
-    The two distances from zero emittance must both exceed four standard errors, and the
-    probability of that by chance (Student's t where the errors rest on these residuals,
-    normal where they were known and fit) must be under 0.2 %. On simulated noise and
-    one-sided scans this rule is measured in docs/verdict.md.
+
+def _three_points(e: Evidence) -> str | None:
+    if e.dof:
+        return None
+    return (
+        "three points fit any three numbers exactly and leave nothing to judge them by; "
+        "measure a fourth setting"
+    )
+
+
+def _lost(e: Evidence) -> str | None:
+    if not (e.misfit > LOST and (e.poor or not e.noise_known)) or e.vouched:
+        return None
+    return (
+        f"the sizes follow no beam through this line, the best one misses them by "
+        f"{100 * e.misfit:.0f} % rms; check settings, units, energy and screen"
+    )
+
+
+def _swamped(e: Evidence) -> str | None:
+    if not e.swamped:
+        return None
+    return (
+        "resolution and dispersion alone are larger than a measured size; check "
+        "resolution_um and energy_spread"
+    )
+
+
+def _not_positive(e: Evidence) -> str | None:
+    return None if e.positive else "no beam fits better than one of zero emittance" + _one_sided(e)
+
+
+def _near_zero(e: Evidence) -> str | None:
+    """Both distances must exceed four standard errors; three do where a neighbour vouches."""
+    if e.distance >= (CLEAR_BESIDE_ANOTHER if e.vouched else CLEAR):
+        return None
+    return f"zero emittance lies only {e.distance:.1f} standard errors away" + _one_sided(e)
+
+
+def _by_chance(e: Evidence) -> str | None:
+    if e.vouched or not e.chance > CHANCE:
+        return None
+    return (
+        f"zero emittance lies {e.distance:.1f} standard errors away, but with {e.dof} "
+        f"degrees of freedom noise does that in {100 * e.chance:.2g} % of scans; measure "
+        "more settings"
+    )
+
+
+# What keeps sizes from determining an emittance, gravest first.
+CAUSES: tuple[Callable[[Evidence], str | None], ...] = (
+    _no_rank, _doubted, _three_points, _lost, _swamped, _not_positive, _near_zero, _by_chance
+)  # fmt: skip
+
+
+def cause_of(e: Evidence) -> str | None:
+    """Name what keeps the emittance from being determined; None if nothing does.
 
     Examples
     --------
     >>> good = Evidence(True, True, True, 11.0, 11, True, 31.0, 30.0, 0.02, True)
-    >>> judge(good, None).status.value
-    'converged'
+    >>> cause_of(good), cause_of(good._replace(zero_distance=3.5))
+    (None, 'zero emittance lies only 3.5 standard errors away')
     """
-    # A neighbour vouches for a scan that has errors and a waist, and misses by no more than 20 %.
-    vouched = other_plane_clear and e.noise_known and bool(e.bracketed) and e.misfit <= VOUCHED
-    cause = _cause(e, vouched)
-    if cause is not None:
-        remedy = f" {next_measurement}" if next_measurement else ""
-        return Verdict(Status.unidentified, f"Not determined: {cause}.{remedy}", cause)
-    if not e.converged:
-        return Verdict(
-            Status.not_converged,
-            "The iteration did not settle; use the plain fit of size squared, which needs none.",
-            None,
-        )
-    clear = (
-        "The scan determines the emittance: zero is "
-        f"{_number(min(e.determinant_distance, e.zero_distance))} standard "
-        f"errors away" + _waist_words(e.bracketed)
+    return next((cause for rule in CAUSES if (cause := rule(e)) is not None), None)
+
+
+def _undetermined(e: Evidence) -> Finding | None:
+    cause = cause_of(e)
+    if cause is None:
+        return None
+    return Finding(Status.unidentified, f"Not determined: {cause}.", e.advice or "")
+
+
+def _unsettled(e: Evidence) -> Finding | None:
+    if e.converged:
+        return None
+    said = "The iteration did not settle; use the plain fit of size squared, which needs none."
+    return Finding(Status.not_converged, said)
+
+
+def _poor(e: Evidence) -> Finding | None:
+    if not e.poor:
+        return None
+    probability, ratio = chi2_probability(e.chi2, e.dof), e.chi2 / e.dof
+    return Finding(
+        Status.poor_fit,
+        f"Poor fit: chi2/dof = {_number(ratio)} (probability {probability:.1g}); the "
+        f"sizes miss the model by {math.sqrt(ratio):.1f} times their errors, and all "
+        "errors are scaled by that. Check how the sizes are taken from the profile, their "
+        f"errors, and the lattice. {_clear(e)}.",
     )
-    probability = chi2_probability(e.chi2, e.dof)
-    if e.noise_known and probability is not None and probability < POOR_FIT:
-        return Verdict(
-            Status.poor_fit,
-            f"Poor fit: chi2/dof = {_number(e.chi2 / e.dof)} (probability {probability:.1g}); the "
-            f"sizes miss the model by {math.sqrt(e.chi2 / e.dof):.1f} times their errors, and all "
-            "errors are scaled by that. Check how the sizes are taken from the profile, their "
-            f"errors, and the lattice. {clear}.",
-            None,
-        )
-    clear += few_words(e.noise_known, e.dof)
+
+
+def _determined(e: Evidence) -> Finding:
+    words = _clear(e) + few_words(e.noise_known, e.dof)
     if e.noise_known and e.chi2 > e.dof > 0:
-        clear += f"; errors are scaled by sqrt(chi2/dof) = {math.sqrt(e.chi2 / e.dof):.2f}"
-    return Verdict(Status.converged, clear + ".", None)
+        words += f"; errors are scaled by sqrt(chi2/dof) = {math.sqrt(e.chi2 / e.dof):.2f}"
+    return Finding(Status.converged, words + ".")
 
 
-def _cause(e: Evidence, other_plane_clear: bool) -> str | None:
-    """Name what keeps the emittance from being determined; None if nothing does."""
-    if not e.full_rank:
-        return (
-            "the settings do not separate the three numbers of the beam matrix, as if the "
-            "scanned magnet were downstream of the screen or hardly moved"
-        )
-    if e.robust and (e.dof < ROBUST_DOF or e.outliers > DOUBTED):
-        return (
-            f"the robust fit doubts {100 * e.outliers:.0f} % of the points and keeps {e.dof} "
-            "degrees of freedom, too few to tell outliers from noise; measure more settings"
-        )
-    if e.dof == 0:
-        return (
-            "three points fit any three numbers exactly and leave nothing to judge them by; "
-            "measure a fourth setting"
-        )
-    probability = chi2_probability(e.chi2, e.dof)
-    poor = e.noise_known and probability is not None and probability < POOR_FIT
-    if e.misfit > LOST and (poor or not e.noise_known) and not other_plane_clear:
-        return (
-            f"the sizes follow no beam through this line, the best one misses them by "
-            f"{100 * e.misfit:.0f} % rms; check settings, units, energy and screen"
-        )
-    if e.swamped:
-        return (
-            "resolution and dispersion alone are larger than a measured size; check "
-            "resolution_um and energy_spread"
-        )
-    if not e.positive:
-        return "no beam fits better than one of zero emittance" + _one_sided(e)
-    distance = min(e.determinant_distance, e.zero_distance)
-    rests_on_residuals = not e.noise_known or e.robust or e.chi2 > e.dof
-    estimated = e.dof if rests_on_residuals else None
-    needed = CLEAR_BESIDE_ANOTHER if other_plane_clear else CLEAR
-    chance = one_sided_probability(distance, estimated)
-    if distance < needed or (chance > CHANCE and not other_plane_clear):
-        if distance >= needed:
-            return (
-                f"zero emittance lies {distance:.1f} standard errors away, but with {e.dof} "
-                f"degrees of freedom noise does that in {100 * chance:.2g} % of scans; measure "
-                "more settings"
-            )
-        return f"zero emittance lies only {distance:.1f} standard errors away" + _one_sided(e)
-    return None
+# Of sizes whose line is known; on simulated noise and one-sided scans measured in docs/verdict.md.
+BEAM_RULES = (_undetermined, _unsettled, _poor, _determined)
+
+
+class Unknowns(NamedTuple):
+    """What tells whether sizes determine a beam when more than the beam is unknown.
+
+    Attributes
+    ----------
+    scenario, tied : str
+        Its name, and what ties it to first principles, in words.
+    cause : str or None
+        What keeps sizes from determining a beam even if the line were as found (`cause_of`).
+    ending : Finding or None
+        How the search ended, where that was no answer.
+    on_data : bool
+        Whether the error of the emittance rests on data and priors, not on bounds.
+    distance : float
+        Standard errors between det σ and zero.
+    chi2, dof : float
+        Of the plane's own sizes.
+    noise_known : bool
+        Whether their errors were given.
+    points_dof : int
+        Points less three.
+    edges, remedy, remark : str
+        Numbers that end on bounds; what is needed; what else is open or rests on priors.
+    """
+
+    scenario: str
+    tied: str
+    cause: str | None
+    ending: Finding | None
+    on_data: bool
+    distance: float
+    chi2: float
+    dof: float
+    noise_known: bool
+    points_dof: int
+    edges: str
+    remedy: str
+    remark: str
+
+    @property
+    def clear(self) -> bool:
+        """Whether the emittance is known and clearly not zero."""
+        return self.on_data and self.distance >= CLEAR
+
+
+def _refuted_by_sizes(u: Unknowns) -> Finding | None:
+    """Priors and anchors can make a covariance finite where the sizes are noise or too few."""
+    if not u.clear or u.ending is not None or u.cause is None:
+        return None
+    said = f"Not determined in scenario {u.scenario}: {u.cause}."
+    return Finding(Status.unidentified, said)
+
+
+def _no_answer(u: Unknowns) -> Finding | None:
+    """What the data do not determine has no optimum to settle in: that comes first."""
+    if u.ending is None or (not u.clear and u.ending.status is Status.not_converged):
+        return None
+    return u.ending
+
+
+def _left_open(u: Unknowns) -> Finding | None:
+    if u.clear and u.ending is None:
+        return None
+    why = (
+        f"zero emittance lies only {u.distance:.1f} standard errors away"
+        if u.on_data
+        else "its value is decided by bounds and starting point, not by the data"
+    )
+    said = f"Not determined in scenario {u.scenario}{u.tied}: {why}{u.edges}."
+    return Finding(Status.unidentified, said, f"Needed: {u.remedy}.")
+
+
+def _poor_in_scenario(u: Unknowns) -> Finding | None:
+    if not (u.noise_known and improbable(u.chi2, u.dof)):
+        return None
+    ratio = u.chi2 / u.dof
+    words = (
+        f"Poor fit: chi2/dof = {ratio:.2g}; the sizes' errors are scaled by {math.sqrt(ratio):.1f}."
+    )
+    return Finding(Status.poor_fit, f"{words} {_in_scenario(u)}")
+
+
+def _determined_in_scenario(u: Unknowns) -> Finding:
+    return Finding(Status.converged, _in_scenario(u))
+
+
+def _in_scenario(u: Unknowns) -> str:
+    return (
+        f"Determined in scenario {u.scenario}{u.tied}: zero emittance is {u.distance:.0f} standard "
+        f"errors away.{u.remark}{few_words(u.noise_known, u.points_dof)}"
+    )
+
+
+# Of sizes when more than the beam is unknown.
+SCENARIO_RULES = (
+    _refuted_by_sizes, _no_answer, _left_open, _poor_in_scenario, _determined_in_scenario
+)  # fmt: skip
+
+
+def _clear(e: Evidence) -> str:
+    waist = {
+        None: "",
+        True: " and the waist is bracketed",
+        False: ", though the waist is not bracketed",
+    }
+    return (
+        f"The scan determines the emittance: zero is {_number(e.distance)} standard errors away"
+        + waist[e.bracketed]
+    )
 
 
 def few_words(noise_known: bool, dof: int) -> str:
@@ -215,12 +378,6 @@ def few_words(noise_known: bool, dof: int) -> str:
 
 def _one_sided(e: Evidence) -> str:
     return "; the smallest size is at the end of the scan" if e.smallest_at_end else ""
-
-
-def _waist_words(bracketed: bool | None) -> str:
-    if bracketed is None:
-        return ""
-    return " and the waist is bracketed" if bracketed else ", though the waist is not bracketed"
 
 
 def _number(value: float) -> str:

@@ -9,7 +9,8 @@ from __future__ import annotations
 import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from enum import StrEnum
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -22,6 +23,7 @@ from beamfit.greybox.fit import Fit
 from beamfit.greybox.mlp import MLP, Layer, Port
 from beamfit.greybox.problem import Free, Prior, Problem, Record
 from beamfit.greybox.solve import solve
+from beamfit.lifetime.decay import HOUR
 from beamfit.lifetime.ring import Operation
 from beamfit.lifetime.scaled import Terms, loss_terms, scaled_losses
 from beamfit.quantity import Quantity
@@ -29,8 +31,9 @@ from beamfit.studies.decay.loss_budget import Machine, operation_during
 from beamfit.studies.decay.scales import ScaleFit, stacked_terms
 from beamfit.studies.decay.study import Decay
 from beamfit.studies.decay.summary import Summaries, loss_parts, summarise
+from beamfit.table import json_of
 
-__all__ = ["Box", "Certificate", "NetworkFit", "fit_loss_network"]
+__all__ = ["Box", "Certificate", "Network", "NetworkFit", "fit_loss_network"]
 
 INPUTS = ("rf_voltage", "scraper_y", "pressure", "bunches")
 # How the loss moves with each input; nothing is known of the sign for the RF voltage.
@@ -42,6 +45,13 @@ MOST = 30.0
 ROUNDING = 1e-9
 # Voltages at which a correction is looked at.
 VOLTAGES = 65
+
+
+class Network(StrEnum):
+    """What a network of the losses is to be: all of a and b, or a factor on first principles."""
+
+    alone = "alone"
+    correction = "correction"
 
 
 class Box(NamedTuple):
@@ -103,11 +113,14 @@ class Certificate(NamedTuple):
     @property
     def holds(self) -> bool:
         """Whether every slope of known sign has it, within rounding."""
-        ends = {-1: 1, 1: 0}
-        return all(
-            bool(np.all(-sign * self.gains[:, INPUTS.index(name), ends[sign]] <= ROUNDING))
-            for name, sign in SIGNS.items()
-        )
+        known = [INPUTS.index(name) for name in SIGNS]
+        sign = np.array(list(SIGNS.values()))
+        worst = np.where(sign > 0, -self.gains[:, known, 0], self.gains[:, known, 1])
+        return bool(np.all(worst <= ROUNDING))
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the range and the slopes as JSON's types."""
+        return json_of({"holds": self.holds, **self._asdict()})
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,7 +135,7 @@ class NetworkFit:
         Signs that hold everywhere in the box.
     machine : Machine
         The ring and its usual operation.
-    scales : array, shape (4,), or None
+    scales : array, or None
         Scales of the first principles that the network corrects; None if it stands alone.
     """
 
@@ -147,18 +160,28 @@ class NetworkFit:
             a, 1/(mA s), and b, 1/s. Outside the operating box the network is not to be believed,
             and the errors are None.
         """
+        return self.predict(operation, current)[:2]
+
+    def predict(self, operation: Operation, current: float) -> tuple[Quantity, ...]:
+        """a, 1/(mA s), b, 1/s, and the lifetime, h, as `losses`."""
         terms = loss_terms(self.machine.ring, operation, current)
         at = _inputs(operation, current)
         base = _base(self.scales, jax.tree.map(lambda part: part[None], terms))
-        found = self.fit.derive(_logs_at, (at[None], base))
-        inside = np.all((at >= self.certificate.lower - ROUNDING)
-                        & (at <= self.certificate.upper + ROUNDING))  # fmt: skip
-        values = np.exp(found.value)
-        errors = [float(v * e) if inside and np.isfinite(e) else None
-                  for v, e in zip(values, found.error, strict=True)]  # fmt: skip
-        units = ("1/(mA s)", "1/s")
-        a, b = (Quantity(float(v), e, u) for v, e, u in zip(values, errors, units, strict=True))
-        return a, b
+        found = self.fit.derive(_answer, (at[None], base, current))
+        ends = self.certificate.lower - ROUNDING, self.certificate.upper + ROUNDING
+        inside = np.all((at >= ends[0]) & (at <= ends[1]))
+        errors = [float(e) if inside and np.isfinite(e) else None for e in found.error]
+        units = ("1/(mA s)", "1/s", "h")
+        return tuple(
+            Quantity(float(v), e, u) for v, e, u in zip(found.value, errors, units, strict=True)
+        )
+
+    def to_json(self, current: float) -> dict[str, Any]:
+        """Return the verdict, and a, b and lifetime at the usual settings, as JSON's types."""
+        found = {name: getattr(self.fit, name) for name in ("status", "message", "chi2", "dof")}
+        a, b, lifetime = self.predict(self.machine.operation, current)
+        told = {"a": a, "b": b, "lifetime": lifetime, "certificate": self.certificate}
+        return json_of(found | told)
 
 
 class _Data(NamedTuple):
@@ -183,8 +206,11 @@ def _logs(model: Mapping[str, MLP], inputs: Array, base: Array) -> Array:
     return base + jax.vmap(model["map"].values)(inputs)
 
 
-def _logs_at(model: Mapping[str, MLP], data: tuple[Array, Array]) -> Array:
-    return _logs(model, *data)[0]
+def _answer(model: Mapping[str, MLP], data: tuple[Array, Array, Array]) -> Array:
+    """a, b and the lifetime, h, at one setting."""
+    inputs, base, current = data
+    a, b = jnp.exp(_logs(model, inputs, base)[0])
+    return jnp.stack([a, b, 1 / (a * current + b) / HOUR])
 
 
 def _predict(model: Mapping[str, MLP], data: _Data) -> Array:

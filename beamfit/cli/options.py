@@ -1,0 +1,170 @@
+"""The options that several commands share, declared once, and what becomes of them."""
+
+from __future__ import annotations
+
+import shlex
+import sys
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import click
+
+from beamfit.errors import InputError
+from beamfit.studies.scan.assumptions import SCENARIOS
+from beamfit.studies.scan.typed import anchor_of, bounds_of, limits_of, priors_of
+
+__all__ = ["Sampling", "command_line", "options"]
+
+
+def _parsed(read: Callable[[Any], Any]) -> Callable[..., Any]:
+    """Have click give a command what a reader of the library makes of the text."""
+    return lambda context, parameter, value: None if value is None else read(value)
+
+
+def _check_place(path: str) -> None:
+    from beamfit.sampling.store import check_place
+
+    check_place(path)
+
+
+def _report(path: str) -> str:
+    """Find out before anything is computed whether the report could be written."""
+    if Path(path).suffix.lower() not in (".html", ".pdf"):
+        raise InputError(f"report '{path}'", "a name ending in .html or .pdf")
+    _check_place(path)
+    return path
+
+
+SHARED: dict[str, Callable[..., Any]] = {
+    "scan": click.argument("scan"),
+    "lattice": click.option(
+        "--lattice",
+        required=True,
+        metavar="FILE",
+        help="Lattice: TOML, MAD-X (.madx, .seq), MAD-8 (.mad8) or elegant (.lte).",
+    ),
+    "use": click.option(
+        "--use", metavar="NAME", help="Line or sequence of a lattice with several."
+    ),
+    "energy": click.option(
+        "--energy",
+        type=float,
+        metavar="MEV",
+        help="Total energy, instead of the lattice's own; elegant files have none.",
+    ),
+    "scenario": click.option(
+        "--scenario",
+        type=click.Choice(list(SCENARIOS)),
+        default="known",
+        show_default=True,
+        help="What is unknown besides the beam: nothing, R11 and R12, the magnets' calibration, "
+        "or k1 as a function of the current.",
+    ),
+    "prior": click.option(
+        "--prior",
+        "priors",
+        multiple=True,
+        metavar="NAME=MEAN+-SD",
+        callback=_parsed(priors_of),
+        help="Calibration: what is known of a number, such as Q2.slope=167.23+-3.3446 (or ±).",
+    ),
+    "bounds": click.option(
+        "--bounds",
+        multiple=True,
+        metavar="NAME=LOW:HIGH",
+        callback=_parsed(bounds_of),
+        help="Calibration: bounds of a number; ± 12 % of the slope unless given.",
+    ),
+    "anchor": click.option(
+        "--anchor",
+        multiple=True,
+        metavar="ANCHOR",
+        callback=_parsed(anchor_of),
+        help="Networks: what ties them to the lattice: first-principles=2%, a setting such as "
+        "Q2=0, or determinant.",
+    ),
+    "vary": click.option(
+        "--vary",
+        "limits",
+        multiple=True,
+        metavar="MAGNET=LOW:HIGH",
+        callback=_parsed(limits_of),
+        help="A magnet and its limits, in the unit of its calibration.",
+    ),
+    "report": click.option(
+        "--report",
+        metavar="FILE.html|FILE.pdf",
+        callback=_parsed(_report),
+        help="Write a report page.",
+    ),
+    "sample": click.option(
+        "--sample",
+        is_flag=True,
+        help="Draw from the posterior: credible intervals, correlations, predictions.",
+    ),
+    "store": click.option(
+        "--store",
+        metavar="FILE.h5",
+        help="Keep the draws of --sample (emcee's HDF5 layout); goes on from an earlier run.",
+    ),
+    "seed": click.option(
+        "--seed",
+        type=click.IntRange(0, 2**32 - 1),
+        default=1,
+        show_default=True,
+        help="Of all random numbers: draws, starts of networks.",
+    ),
+    "json": click.option(
+        "--json", "as_json", is_flag=True, help="Print one JSON object and nothing else."
+    ),
+}
+
+
+def options(names: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+    """Add shared options to a command, in the order of their names."""
+
+    def add(command: Callable[..., Any]) -> Callable[..., Any]:
+        for name in reversed(names.split()):
+            command = SHARED[name](command)
+        return command
+
+    return add
+
+
+class Sampling(NamedTuple):
+    """What --sample, --store and --seed say."""
+
+    wanted: bool
+    store: str | None
+    seed: int
+
+    def check(self) -> None:
+        """Find out before anything is computed whether the store could be written."""
+        if self.store is not None:
+            if not self.wanted:
+                raise InputError("--store without --sample", "--sample, which fills the store")
+            _check_place(self.store)
+
+    def check_one(self, fits: int) -> None:
+        """Refuse to keep the draws of several fits in one store."""
+        if self.store is not None and fits > 1:
+            found = f"--store for {fits} decays"
+            raise InputError(found, "a record of one decay, or no --store")
+
+    def arguments(self, inputs: Mapping[str, str | None], *, quiet: bool) -> dict[str, Any]:
+        """Arguments for the `sample` of a fit."""
+        from beamfit.sampling.store import Provenance
+
+        source = Provenance(command_line(), dict(inputs))
+        return {
+            "seed": self.seed,
+            "store": self.store,
+            "provenance": source,
+            "progress": not quiet,
+        }
+
+
+def command_line() -> str:
+    """The command as it was typed, quoted for a shell."""
+    return shlex.join(["beamfit", *sys.argv[1:]])

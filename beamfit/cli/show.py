@@ -1,0 +1,70 @@
+"""Results on a terminal: tables with coloured statuses, verdicts, posteriors. Loaded with rich."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from rich.console import Console
+from rich.table import Table as RichTable
+from rich.text import Text
+
+from beamfit.quantity import Status
+from beamfit.sampling.posterior import Posterior
+from beamfit.table import Table
+
+__all__ = ["Terminal"]
+
+COLOUR = {Status.converged: "green", Status.poor_fit: "yellow"}
+
+
+def _style(status: Status) -> str:
+    return f"bold {COLOUR.get(status, 'red')}"
+
+
+class Terminal:
+    """Where a command answers."""
+
+    def __init__(self) -> None:
+        # Names are shown as they are: a bracket in one is not a style.
+        self.console = Console(highlight=False, markup=False)
+
+    def line(self, text: str = "", style: str = "") -> None:
+        """Say a line."""
+        self.console.print(text, style=style or None)
+
+    def table(self, table: Table, statuses: Sequence[Status] = (), *, wrap: bool = True) -> None:
+        """Lay out a table; its first row has a colour where it is the results' statuses."""
+        rich = RichTable(
+            title=table.title,
+            title_justify="left",
+            title_style="bold",
+            box=None,
+            pad_edge=False,
+            header_style="bold",
+        )
+        # A label cut short says nothing; a number may go on in the next line.
+        for i, name in enumerate(table.header):
+            side = "right" if table.numeric and i else "left"
+            rich.add_column(name, no_wrap=i == 0 or not wrap, overflow="fold", justify=side)
+        for number, (label, *cells) in enumerate(table.rows):
+            styles = (
+                [_style(s) for s in statuses] if number == 0 and statuses else [""] * len(cells)
+            )
+            shown = [Text(c, style=s) for c, s in zip(cells, styles, strict=True)]
+            rich.add_row(label, *shown)
+        self.console.print(rich)
+
+    def verdict(self, name: str, status: Status, message: str) -> None:
+        """Say a verdict in its colour."""
+        text = Text(f"\n{name}: ", style=_style(status))
+        self.console.print(text.append(message, style="default not bold"))
+
+    def posterior(self, title: str, posterior: Posterior) -> None:
+        """Show intervals, verdict and diagnostics."""
+        self.table(posterior.table()._replace(title=f"\n{title}"), wrap=False)
+        self.verdict("posterior", posterior.status, posterior.message)
+
+    def report(self, path: str | None) -> None:
+        """Say where the report is, if there is one."""
+        if path is not None:
+            self.line(f"Report written to {path}", style="bold")

@@ -1,0 +1,221 @@
+"""The posterior of a scan: σ of each plane, flat over all that are positive definite."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, Protocol
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from beamfit.errors import InputError
+from beamfit.greybox.fit import Fit
+from beamfit.greybox.posterior import Optimum, Statement, record_of, target_of
+from beamfit.greybox.problem import Problem
+from beamfit.optics.beam import BeamMatrix
+from beamfit.quantity import Status
+from beamfit.sampling.posterior import Expected, Posterior
+from beamfit.sampling.priors import Distribution
+from beamfit.sampling.target import Target
+from beamfit.studies.scan.assumptions import Assumptions
+from beamfit.studies.scan.known import see
+from beamfit.studies.scan.model import (
+    QUANTITIES,
+    UNIT,
+    Asked,
+    asked_numbers,
+    predict_sizes,
+    sigma_of,
+)
+from beamfit.studies.scan.results import PlaneFit
+from beamfit.studies.scan.statement import Scenario, Seen, asked_of
+from beamfit.verdict import Finding
+
+__all__ = ["beam_target", "expected_sizes"]
+
+CHOLESKY, SIGMA = ("l11", "l21", "l22"), ("sigma11", "sigma12", "sigma22")
+TWISS = ("emittance", "normalized_emittance", "beta", "alpha", "mismatch")
+PLACES = np.array([list(QUANTITIES).index(name) for name in TWISS])
+OPEN = "the scan does not determine sigma11, sigma12 and sigma22"
+
+
+class Scanned(Protocol):
+    """A fitted scan, of any scenario."""
+
+    planes: tuple[PlaneFit, ...]
+    statement: Scenario
+    told: Assumptions
+    seen: Seen
+    solved: Fit | None
+
+
+def _quoted(model: Mapping[str, Any]) -> dict[str, Any]:
+    """σ in SI in the place of its Cholesky factor."""
+    beams = model["beam"].items()
+    sigmas = {plane: dict(zip(CHOLESKY, sigma_of(beam), strict=True)) for plane, beam in beams}
+    return {**model, "beam": sigmas}
+
+
+def _own(model: Mapping[str, Any]) -> dict[str, Any]:
+    """The Cholesky factor of σ again, NaN where it is not positive definite."""
+    beams = {}
+    for plane, sigma in model["beam"].items():
+        s11, s12, s22 = (sigma[name] / UNIT**2 for name in CHOLESKY)
+        l11 = jnp.sqrt(s11)
+        beams[plane] = {"l11": l11, "l21": s12 / l11, "l22": jnp.sqrt(s22 - s12**2 / s11)}
+    return {**model, "beam": beams}
+
+
+def _beams(model: Mapping[str, Any], asked: Any) -> dict[str, Any]:
+    """The beam matrix of each plane, and the model, for functions of the user's."""
+    parts = model["beam"].items()
+    beams = {p: BeamMatrix(*(UNIT * beam[name] for name in CHOLESKY)) for p, beam in parts}
+    return {**beams, "model": model}
+
+
+def _twiss(model: Mapping[str, Any], asked: Sequence[Asked]) -> Array:
+    """Emittance, normalised emittance, β, α at the start and mismatch, plane after plane."""
+    return jnp.concatenate([asked_numbers(model, plane)[PLACES] for plane in asked])
+
+
+def beam_target(
+    fit: Scanned,
+    planes: Sequence[str] | None = None,
+    noise: str | None = None,
+    outliers: bool | None = None,
+    priors: Mapping[str, Distribution] | None = None,
+) -> Target:
+    """State the posterior of a fitted scan.
+
+    Parameters
+    ----------
+    fit : EmittanceFit
+        The fit.
+    planes : sequence of str, optional
+        Which; all that were fitted if None.
+    noise, outliers, priors
+        As of `beamfit.greybox.posterior.target_of`; priors on ``x.sigma11`` and so on. A robust
+        fit is sampled with outliers by default, and with the errors that were stated.
+
+    Returns
+    -------
+    Target
+        Names ``x.sigma11`` and so on, derived numbers ``x.emittance`` and so on.
+
+    Raises
+    ------
+    InputError
+        If a plane was not fitted, or as `target_of`.
+
+    Notes
+    -----
+    The likelihood compares what the fit compared, size² or size, so that its maximum is the fit.
+    Where transport is known, a plane whose scan does not determine σ11, σ12 and σ22 has no
+    posterior unless priors on all three give it one; it is left out and named.
+    """
+    asked = _asked(fit, planes)
+    if fit.solved is not None:
+        problem, optimum, kept = fit.solved.problem, fit.solved.optimum, asked
+    else:
+        given = [p for p in asked if all(f"{p.plane}.{name}" in (priors or {}) for name in SIGMA)]
+        kept = [p for p in asked if np.isfinite(p.covariance).all() or p in given]
+        names, seen = tuple(p.plane for p in kept or asked), fit.seen
+        if seen.robust:  # a mixture does its own doubting
+            seen = see(seen.scan, seen.line, names, seen.method)
+        problem = fit.statement.state(seen._replace(planes=names), fit.told)
+        optimum = _optimum(problem.names, kept or asked, given, priors or {})
+    return target_of(
+        problem,
+        optimum,
+        _stated(problem, fit, kept, asked),
+        noise=noise,
+        outliers=fit.seen.robust if outliers is None else outliers,
+        priors=priors,
+    )
+
+
+def _asked(fit: Scanned, planes: Sequence[str] | None) -> list[PlaneFit]:
+    fitted = [p.plane for p in fit.planes]
+    for plane in planes or ():
+        if plane not in fitted:
+            raise InputError(f"plane '{plane}'", f"one that was fitted: {', '.join(fitted)}")
+    if fit.solved is not None and planes is not None and list(planes) != fitted:
+        expected = f"all that were fitted, {', '.join(fitted)}: their unknowns are common"
+        raise InputError(f"planes {', '.join(planes)} of this scenario", expected)
+    return [p for p in fit.planes if planes is None or p.plane in planes]
+
+
+def _optimum(
+    names: Sequence[str],
+    chosen: Sequence[PlaneFit],
+    given: Sequence[PlaneFit],
+    priors: Mapping[str, Distribution],
+) -> Optimum:
+    """Where to begin: the fit, or else the priors; a little off zero emittance, an edge."""
+    begin = {}
+    for p in chosen:
+        s11, s12, s22 = (q.value / UNIT**2 for q in p.sigma)
+        if not np.isfinite(p.covariance).all() and p in given:
+            means = (priors[f"{p.plane}.{name}"].mean() for name in SIGMA)
+            s11, s12, s22 = (mean / UNIT**2 for mean in means)
+        l11 = np.sqrt(max(s11, 1e-6))
+        l22 = np.sqrt(max(s22 - (s12 / l11) ** 2, 1e-4 * max(s22, 1e-6)))
+        numbers = zip(CHOLESKY, (l11, s12 / l11, l22), strict=True)
+        begin |= {f"beam.{p.plane}.{name}": value for name, value in numbers}
+    theta = np.array([begin[name] for name in names])
+    worst = max(chosen, key=lambda p: p.status is Status.poor_fit)
+    scales, known = [p.error_scale for p in chosen], [p.chi2 is not None for p in chosen]
+    return Optimum(theta, Finding(worst.status, worst.message), scales, known)
+
+
+def _stated(
+    problem: Problem, fit: Scanned, kept: Sequence[PlaneFit], asked: Sequence[PlaneFit]
+) -> Statement:
+    chosen = kept or asked
+    lines = {r.data.plane: r.data.whole_line for r in problem.records if r.predict is predict_sizes}
+    places = [asked_of(fit.seen, p.plane, lines[p.plane]) for p in chosen]
+    shown = {(p.plane, name): getattr(p, name) for p in chosen for name in TWISS}
+    lost = ", ".join(f"{p.plane} plane" for p in asked if p not in kept)
+    sigmas = [f"{p.plane}.{name}" for p in chosen for name in SIGMA]
+    own = [f"beam.{p.plane}.{name}" for p in chosen for name in CHOLESKY]
+    # As users name them in a calibration: Q2.slope.
+    renamed = {name: name.removeprefix("magnets.") for name in problem.names}
+    return Statement(
+        derived={f"{plane}.{name}": QUANTITIES[name] for plane, name in shown},
+        derive=_twiss,
+        build=_beams,
+        data=places,
+        quoted=_quoted,
+        own=_own,
+        renamed=renamed | dict(zip(own, sigmas, strict=True)),
+        units={name: QUANTITIES[name.split(".")[1]] for name in sigmas},
+        lower={f"{p.plane}.{name}": 0.0 for p in chosen for name in ("sigma11", "sigma22")},
+        labels={f"size {p.plane}": p.plane for p in chosen},
+        priors_own=[f"{p}.{name}" for (p, name), q in shown.items() if q and q.error is None],
+        hidden=[f"{plane}.{name}" for (plane, name), q in shown.items() if q is None],
+        remark=f"Left out: the {lost}, because {OPEN}." if kept and lost else "",
+        nothing="" if kept else f"{OPEN} in the {lost}; {chosen[0].message}",
+    )
+
+
+def expected_sizes(posterior: Posterior, plane: str) -> Expected:
+    """Sizes that the posterior of a scan expects at the points of a plane, m.
+
+    Parameters
+    ----------
+    posterior : Posterior
+        Of `EmittanceFit.sample`.
+    plane : str
+        "x" or "y".
+    """
+    record = record_of(posterior.target, f"size {plane}")
+    at, squared = np.flatnonzero(record.used), record.data.squared
+
+    def sizes(drawn: Mapping[str, Any]) -> Array:
+        found = record.predict(drawn["model"], record.data)[at]
+        return 1e-6 * (jnp.sqrt(found) if squared else found)
+
+    # Of size²: 2 x dx.
+    slope = 2.0 * np.sqrt(np.asarray(record.measured)) if squared else np.ones(len(record.used))
+    return posterior.expected(sizes, 1e-6 * (np.asarray(record.error) / slope)[at], plane)

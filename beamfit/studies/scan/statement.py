@@ -1,0 +1,220 @@
+"""What a scenario is: a value that states a scan as a problem and says what it cannot know."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from beamfit.greybox.fit import Fit
+from beamfit.greybox.problem import Free, Problem, Record
+from beamfit.optics.beamline import Beamline
+from beamfit.optics.particle import beta_gamma
+from beamfit.studies.scan.assumptions import Assumptions
+from beamfit.studies.scan.model import UNIT, Asked, predict_sizes
+from beamfit.studies.scan.results import Parameter, Points
+from beamfit.studies.scan.scans import QuadScan
+from beamfit.studies.scan.sigma import SigmaFit
+from beamfit.studies.scan.transport import Look, Rows, padded, seen_line
+from beamfit.studies.scan.verdict import Evidence
+
+__all__ = [
+    "Scenario",
+    "Seen",
+    "Work",
+    "asked_of",
+    "beam_free",
+    "beam_numbers",
+    "size_record",
+    "varied_magnets",
+]
+
+
+class Work(NamedTuple):
+    """One plane fitted in closed form through a line.
+
+    Attributes
+    ----------
+    points : Points
+        Point by point, with the errors as used.
+    fit : SigmaFit
+        As fitted, errors as they were put in.
+    value, error : ndarray
+        `numbers_of` the plane, shape (11,), and their errors for the noise as used, not scaled.
+    covariance : ndarray
+        Shape (3, 3), of σ, likewise.
+    scale : float
+        sqrt(χ²/dof) where that exceeds 1.
+    evidence : Evidence
+        For the verdict.
+    """
+
+    points: Points
+    fit: SigmaFit
+    value: np.ndarray
+    error: np.ndarray
+    covariance: np.ndarray
+    scale: float
+    evidence: Evidence
+
+
+class Seen(NamedTuple):
+    """A scan through its line, with the fit of known transport of each plane to start from.
+
+    Attributes
+    ----------
+    scan, line : QuadScan, Beamline
+        As given.
+    planes : tuple of str
+        Those that are asked for.
+    method : str
+        "size_squared" or "size".
+    robust : bool
+        Whether points may be doubted.
+    scanned : Beamline
+        The line with the calibrations of the scan's columns.
+    rows : Rows
+        The scan's rows through it, padded.
+    look : Look
+        The same, with every magnet as the lattice has it; NumPy arrays.
+    works : dict of str to Work
+        Plane to its fit; of every plane that was measured.
+    """
+
+    scan: QuadScan
+    line: Beamline
+    planes: tuple[str, ...]
+    method: str
+    robust: bool
+    scanned: Beamline
+    rows: Rows
+    look: Look
+    works: dict[str, Work]
+
+    def of_plane(
+        self,
+        plane: str,
+        settings: Mapping[str, Any] | None = None,
+        magnets: Iterable[str] = (),
+    ) -> Rows:
+        """The rows of one plane, with other settings, and further magnets that can be varied."""
+        rows = replace(self.rows, plane=plane, settings=settings or self.rows.settings)
+        further = [name for name in magnets if name not in rows.settings]
+        if not further:
+            return rows
+        line = seen_line(self.scanned, (*rows.settings, *further), rows.energy, rows.places)
+        return replace(rows, line=line)
+
+    def measured(self, plane: str) -> np.ndarray:
+        """Indices of the rows in which a plane was measured."""
+        return np.flatnonzero(~np.isnan(self.scan.size[plane]))
+
+    def energy(self, plane: str) -> float:
+        """Mean total energy of those rows, MeV."""
+        return float(self.rows.energy[self.measured(plane)].mean())
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """What is unknown besides the beam, as a value that everybody asks and nobody compares.
+
+    Parameters
+    ----------
+    name : str
+        As users call it.
+    state : callable
+        ``state(seen, told)``: the problem, starting from first principles.
+    parameters : callable
+        ``parameters(seen, told, fit)``: the numbers fitted besides the beam.
+    null_directions : callable
+        ``null_directions(seen, parameters, identified)``: what the data leave open, in words.
+    remedy : callable
+        ``remedy(seen)``: what would determine the emittance, in words.
+    aside : str
+        What an undetermined parameter means for the emittance, in words.
+    closed : bool
+        Whether the fit is linear in σ, and done in closed form.
+    network : bool
+        Whether a network is trained, from many starts, which an anchor may tie.
+    whole_map : bool
+        Whether the map is the line's, so that the beam is known at every place and any setting.
+    """
+
+    name: str
+    state: Callable[[Seen, Assumptions], Problem]
+    parameters: Callable[[Seen, Assumptions, Fit], Iterator[Parameter]] = lambda *_: iter(())
+    null_directions: Callable[[Seen, tuple[Parameter, ...], bool], tuple[str, ...]] = lambda *_: ()
+    remedy: Callable[[Seen], str] = lambda _: ""
+    aside: str = ""
+    closed: bool = False
+    network: bool = False
+    whole_map: bool = True
+
+
+def varied_magnets(scan: QuadScan) -> tuple[str, ...]:
+    """Magnets whose setting changes during a scan."""
+    return tuple(n for n, v in scan.settings.items() if np.ptp(v) > 0)
+
+
+def asked_of(seen: Seen, plane: str, line: Beamline | None = None) -> Asked:
+    """Where the beam of a plane is asked for, through a line; None: only R11 and R12 are known."""
+    design = seen.scanned.design
+    twiss = getattr(design, plane, None)
+    factor = beta_gamma(seen.energy(plane), float(seen.line.mass))
+    return Asked(
+        plane,
+        seen.rows.places[-1] if line is not None else None,
+        design.at if twiss else None,
+        line or seen.rows.line,
+        np.asarray(factor),
+        np.array(twiss or (np.nan, np.nan), float),
+    )
+
+
+def size_record(seen: Seen, plane: str, rows: Any) -> Record:
+    """The measured sizes of a plane, in µm² or µm, with the errors the known-transport fit used.
+
+    Rows without a size have weight 0, and so has padding.
+    """
+    points, at = seen.works[plane].points, seen.measured(plane)
+    # Three points without errors tell no noise; the verdict refuses them whatever stands here.
+    error = np.where(np.isfinite(points.error), points.error, 0.05 * points.size)
+    weight, columns = np.zeros(len(padded(seen.scan.size[plane]))), []
+    weight[at] = 1.0
+    for values in (1e6 * points.size, 1e6 * error):
+        columns.append(np.full(len(weight), values[0]))
+        columns[-1][at] = values
+    size, error = columns
+    if rows.squared:
+        size, error = size**2, 2.0 * size * error
+    return Record(f"size {plane}", predict_sizes, rows, size, error, weight)
+
+
+def beam_numbers(seen: Seen) -> dict[str, dict[str, float]]:
+    """Cholesky factors to start from: the known-transport fit, kept off zero emittance."""
+    found = {}
+    for plane in seen.planes:
+        s11, s12, s22 = (float(v) / UNIT**2 for v in seen.works[plane].fit.sigma)
+        l11 = np.sqrt(max(s11, 1e-6))
+        l21 = s12 / l11
+        l22 = np.sqrt(max(s22 - l21**2, 0.0025 * max(s22, 1e-6)))
+        found[plane] = {"l11": l11, "l21": l21, "l22": l22}
+    return found
+
+
+def beam_free(beams: Mapping[str, Mapping[str, float]]) -> list[Free]:
+    """The beam's numbers as free ones: l11 and l22 positive."""
+    free = []
+    for plane, numbers in beams.items():
+        angle = float(np.hypot(numbers["l21"], numbers["l22"]))
+        reach = {
+            "l11": (0.5 * numbers["l11"], 1.5 * numbers["l11"]),
+            "l21": (-angle, angle),
+            "l22": (0.1 * angle, angle),
+        }
+        for name in numbers:
+            low = -np.inf if name == "l21" else 1e-6
+            free.append(Free(f"beam.{plane}.{name}", low, np.inf, reach[name]))
+    return free

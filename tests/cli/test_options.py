@@ -1,0 +1,74 @@
+"""What commands share: help with an example, the same options, a library scripts can call."""
+
+import json
+import subprocess
+import sys
+
+import pytest
+
+from beamfit.cli import cli
+from beamfit.errors import InputError
+from beamfit.io.line import read_lattice
+from beamfit.io.measurement import read_quad_scan
+from beamfit.io.result import results_text
+from beamfit.quantity import Quantity
+from beamfit.studies.scan.typed import anchor_of, bounds_of, limits_of, priors_of, target_of
+
+LIGHT = """
+import sys
+from beamfit.cli import main
+try:
+    main()
+finally:
+    heavy = {"jax", "matplotlib", "h5py", "rich", "scipy.optimize"} & set(sys.modules)
+    sys.stderr.write(",".join(sorted(heavy)))
+"""
+
+
+@pytest.mark.parametrize("command", sorted(cli.commands))
+def test_help_shows_an_example_and_loads_nothing_heavy(command):
+    done = subprocess.run(
+        [sys.executable, "-c", LIGHT, command, "--help"], capture_output=True, text=True
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+    assert f"beamfit {command} " in done.stdout.split("Examples:")[1]
+
+
+def test_an_option_means_the_same_in_every_command():
+    said = {}
+    for command in cli.commands.values():
+        for option in command.params:
+            if hasattr(option, "help") and option.name not in ("plane",):
+                text = (option.opts, option.metavar, option.default, option.help)
+                assert said.setdefault(option.name, text) == text
+
+
+def test_a_script_reads_what_people_type():
+    assert priors_of(["Q.slope=100±2%"]) == {"Q.slope": (100.0, 2.0)}
+    assert bounds_of(["Q.slope=-1e2:3"]) == {"Q.slope": (-100.0, 3.0)}
+    assert limits_of([]) == {}
+    assert anchor_of(["determinant"]).determinant
+    assert target_of("match_y=5:-1") == ("match", "y", (5.0, -1.0))
+    for wrong in ("=1+-2", "Q", "Q=1", "Q=1+-2+-3", "Q=+-", "Q=1+-x"):
+        with pytest.raises(InputError, match="NAME=MEAN"):
+            priors_of([wrong])
+    with pytest.raises(InputError, match="given twice"):
+        limits_of(["Q=0:1", " Q =0:2"])
+
+
+def test_a_script_checks_names_and_writes_the_document(root):
+    scan = read_quad_scan(root / "measurements/gtf_simulated.csv")
+    lattice = read_lattice(root / "lattices/gtf.toml")
+    lattice.check_scan(scan)
+    lattice.check_magnets(["Q2"])
+    lattice.check_energies([25.0])
+    with pytest.raises(InputError, match="did you mean Q525"):
+        read_lattice(root / "lattices/lcls_otr2.toml").check_scan(scan)
+    with pytest.raises(InputError, match="10 TeV"):
+        lattice.check_energies([25.0, 0.1])
+    inputs = {"scan": scan.sha256, "lattice": lattice.sha256}
+    text = results_text([{"size": Quantity(1e-4, float("nan"), "m")}], inputs, "me", more=[1.0])
+    document = json.loads(text)
+    assert list(document) == ["beamfit", "command", "inputs", "results", "more"]
+    assert document["results"][0]["size"]["error"] is None
+    assert [len(sha256) for sha256 in document["inputs"].values()] == [64, 64]

@@ -1,0 +1,67 @@
+"""Scripts keep what they compiled, where the user allows it and nowhere else."""
+
+import json
+import os
+import subprocess
+import sys
+
+import pytest
+
+# Says where code is kept and how often it was found there; runs one of the package's functions.
+SCRIPT = """
+import json, sys
+import jax
+{before}
+found = []
+jax.monitoring.register_event_listener(lambda name, **more: found.append(name))
+from beamfit.optics.beam import BeamMatrix
+import jax.numpy as jnp
+value = jax.jit(lambda x: jnp.linalg.qr(x)[1])(jnp.eye(3))
+count = lambda end: sum(name.endswith("compilation_cache/" + end) for name in found)
+counts = [count("cache_hits"), count("cache_misses")]
+least = jax.config.jax_persistent_cache_min_compile_time_secs
+print(json.dumps([jax.config.jax_compilation_cache_dir, *counts, str(value.dtype), least]))
+"""
+CHOSEN = ("JAX_", "XLA_")
+
+
+def run(before="", **environment):
+    kept = {k: v for k, v in os.environ.items() if not k.startswith(CHOSEN)}
+    done = subprocess.run(
+        [sys.executable, "-c", SCRIPT.format(before=before)],
+        env=kept | {"PYTHONPATH": os.pathsep.join(sys.path)} | environment,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert done.stderr == ""
+    return json.loads(done.stdout)
+
+
+def test_the_second_script_compiles_nothing(tmp_path):
+    folder, hits, misses, dtype, _ = run(XDG_CACHE_HOME=str(tmp_path))
+    assert folder == str(tmp_path / "beamfit")
+    assert (hits, dtype) == (0, "float64")
+    assert misses > 0
+    assert run(XDG_CACHE_HOME=str(tmp_path))[1:3] == [misses, 0]
+
+
+@pytest.mark.parametrize("home", ["/dev/null", "/proc/none"])
+def test_a_home_where_nobody_can_write_is_no_obstacle(home):
+    folder, hits, *_ = run(XDG_CACHE_HOME=home)
+    assert (folder, hits) == (None, 0)
+
+
+def test_what_the_user_has_set_stands(tmp_path):
+    mine = str(tmp_path / "mine")
+    environment = {
+        "JAX_COMPILATION_CACHE_DIR": mine,
+        "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "7",
+    }
+    folder, *_, least = run(XDG_CACHE_HOME=str(tmp_path), **environment)
+    assert (folder, least) == (mine, 7.0)
+    before = f"jax.config.update('jax_compilation_cache_dir', {mine!r})"
+    assert run(before, XDG_CACHE_HOME=str(tmp_path))[0] == mine
+    off = "jax.config.update('jax_enable_compilation_cache', False)"
+    assert run(off, XDG_CACHE_HOME=str(tmp_path))[1:3] == [0, 0]
+    assert not (tmp_path / "beamfit").exists() or not list((tmp_path / "beamfit").iterdir())
