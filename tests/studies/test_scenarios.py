@@ -400,7 +400,7 @@ def test_the_closed_form_is_the_answer_of_the_problem(root, otr2, method):
     scan = beamfit.read_quad_scan(root / "measurements/lcls_otr2.csv")
     fast = beamfit.fit_emittance(scan, otr2, method=method)
     for plane in "xy":
-        asked = asked_of(fast.seen, plane, fast.seen.rows.line)
+        asked = asked_of(fast.seen, plane)
         found = fast.fit.derive(asked_numbers, asked)
         work = fast.seen.works[plane]
         np.testing.assert_allclose(found.value, work.value, rtol=1e-10)

@@ -235,7 +235,8 @@ def judged_scenario(
     """
     records = {r.data.plane: r for r in fit.problem.records if r.predict is predict_sizes}
     rows = tuple(records[plane].data for plane in seen.planes)
-    asked = tuple(asked_of(seen, r.plane, r.whole_line) for r in rows)
+    whole = scenario.whole_map
+    asked = tuple(asked_of(seen, r.plane, whole, r.line if whole else None) for r in rows)
     derived = fit.derive(_numbers, asked)
     elements = np.asarray(_elements(fit.model, rows))
     look, beams = list(seen.look), {}

@@ -86,7 +86,7 @@ def see(
     rows = scan_rows(scan, scanned, method == METHODS[0])
     # A plane that is not asked for still testifies to the settings and the optics.
     planes = tuple(dict.fromkeys((*asked, *scan.planes)))
-    seen = Seen(scan, line, asked, method, robust, scanned, rows, None, {})
+    seen = Seen(scan, line, scanned, asked, method, robust, rows, None, {})
     if robust or not at_once:
         look = jax.tree.map(np.asarray, look_through(rows))
         return seen._replace(look=look, works=works_of(seen, look, planes))
