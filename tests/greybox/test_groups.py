@@ -6,6 +6,7 @@ import pytest
 
 from beamfit.errors import InputError
 from beamfit.greybox import fit as fits
+from beamfit.greybox.descend import _walks
 from beamfit.greybox.problem import Free, Prior, Problem, Record, padded_length
 from beamfit.greybox.solve import solve
 
@@ -136,3 +137,16 @@ def test_without_errors_and_freedom_nothing_is_said_of_errors():
     assert np.isnan(fit["slope"].error)
     assert np.isnan(fit.derive(product, 1.0).error)
     assert np.isnan(fit.groups[0].scale)
+
+
+def test_a_padded_record_that_grows_is_not_compiled_anew():
+    counts = set()
+    for n in (9, 12, 16):
+        size = padded_length(n)
+        x, y = np.zeros(size), np.zeros(size)
+        x[:n], y[:n] = X[:n], noisy(1, 0.1, X[:n])
+        record = Record("r", line, x, y, 0.1, weight=np.arange(size) < n)
+        p = Problem({"slope": 0.0, "offset": 0.0}, [Free("")], [record])
+        assert solve(p).group("r").dof == n - 2
+        counts.add(p.compiled(_walks).func._cache_size())  # of this structure, in any shape
+    assert len(counts) == 1
