@@ -113,14 +113,17 @@ def target_of(
     Raises
     ------
     InputError
-        If a constraint is an equation, an option is not understood, or a prior's name is not that
-        of a free number.
+        If a constraint is an equation, only some records have errors, an option is not understood,
+        or a prior's name is not that of a free number.
     """
     equations = p.constraint_lower == p.constraint_upper
     if equations.any():
         name = p.constraint_names[int(np.argmax(equations))]
         expected = "limits that differ: nothing that is drawn at random meets an equation"
         raise InputError(f"the equation '{name}'", expected)
+    if len({record.error is None for record in p.records}) > 1:
+        expected = "errors for all records or for none: one factor on them is sampled"
+        raise InputError("records with and without errors", expected)
     if noise is None:
         noise = "inferred" if not p.errors_known or at.scale > 1 else "known"
     moving = np.flatnonzero(p.lower < p.upper)

@@ -57,6 +57,8 @@ def test_each_record_has_noise_of_its_own():
     assert fit["other"].error_raw == pytest.approx(expected)
     assert fit.status == "poor_fit"  # the silent record cannot hide what the other says
     assert fit.group("silent") is silent
+    with pytest.raises(InputError, match="errors for all records or for none"):
+        fit.sample()
     with pytest.raises(InputError, match="did you mean silent"):
         fit.group("silnt")
 
