@@ -152,3 +152,9 @@ def test_a_padded_record_that_grows_is_not_compiled_anew():
         assert solve(p).group("r").dof == n - 2
         counts.add(p.compiled(_walks).func._cache_size())  # of this structure, in any shape
     assert len(counts) == 1
+
+
+def test_data_without_errors_that_are_met_exactly_leave_no_error():
+    fit = solve(Problem({"other": 1.0}, [Free("other")], [Record("r", other, X, 3.0 * X)]))
+    assert fit["other"].error == pytest.approx(0.0, abs=1e-12)
+    assert fit["other"].value == pytest.approx(3.0)
