@@ -118,7 +118,7 @@ def compare(name, p, build, starts):
             theta, iterations, _ = run(point)
             times.append(1e3 * (time.perf_counter() - began))
             theta = np.clip(theta, p.lower, p.upper)
-            state = assess.state(p, theta)
+            state = assess.state(p, theta, assess.scale_of(p, point, assess.slopes(p, point)))
             good += state.kkt.worst <= 1e-6
             costs.append(float(state.at.cost))
             steps.append(iterations)

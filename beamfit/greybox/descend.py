@@ -5,20 +5,25 @@ Nielsen's damping (IMM-REP-1999-05). A step solves the damped linear problem by 
 equations, and pins the numbers that would leave their bounds, so iterates end exactly on them;
 scipy's bounded methods stay strictly inside, which blurs the verdict "at its bound". Written for
 `jax.vmap`: twenty starts take the time of a few. It proposes points; whether one is an optimum is
-for `beamfit.greybox.optimum` to say.
+for `beamfit.greybox.assess` to say.
 """
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
-__all__ = ["Found", "Walk", "descend_all", "descend_one", "walk"]
+from beamfit.greybox.problem import Problem
+from beamfit.greybox.problem import residual as problem_residual
+
+__all__ = ["Found", "Lanes", "Walk", "descend_all", "descend_one", "walk"]
 
 DAMPING = 1e-3
 # On the length of a step relative to the numbers, both in units of the Jacobian's columns.
@@ -29,6 +34,8 @@ STUCK = 1e30
 ROUNDING = 1e-16
 # Rounds of pinning in a step; what the last one pushes out is clipped.
 PINNED = 3
+# With a limit of time the clock is looked at after so many steps.
+SEGMENT = 50
 
 
 class Found(NamedTuple):
@@ -245,3 +252,73 @@ def _next(theta, residual, jacobian, scale, damping, lower, upper) -> Array:
     # Exactly on a bound, or the number is not known to be there.
     found = jnp.where(held <= low, lower, jnp.where(held >= high, upper, inside))
     return jnp.where(jnp.all(jnp.isfinite(held)), found, theta)
+
+
+class Lanes:
+    """Searches of a problem side by side: one compiled call moves them on, or looks at points."""
+
+    def __init__(self, p: Problem, points: np.ndarray):
+        self.p, self.call = p, p.compiled(_walks)
+        k, n = points.shape
+        self.theta, self.limit = np.array(points), np.zeros(k, int)
+        self.damping, self.growth = np.full(k, DAMPING), np.full(k, 2.0)
+        self.size, self.steps = np.zeros((k, n)), np.zeros(k, int)
+        self.done, self.rested = np.zeros(k, bool), np.zeros(k, bool)
+
+    def go(self, lanes: np.ndarray, limit: int, until: float | None) -> None:
+        """Move some searches on to a number of steps, or until a moment on the clock."""
+        self.limit[:] = 0
+        reached = limit if until is None else 0
+        while True:
+            reached = min(max(reached, int(np.min(self.steps[lanes])) + SEGMENT), limit)
+            self.limit[lanes] = np.where(self.done[lanes], 0, reached)
+            self._call()
+            unfinished = ~self.done[lanes] & (self.steps[lanes] < limit)
+            if not unfinished.any() or (until is not None and time.perf_counter() >= until):
+                return
+
+    def _call(self) -> None:
+        args = (self.theta, self.damping, self.growth, self.size, self.steps, self.limit)
+        s = [np.asarray(part) for part in self.call(*args, self.p.lower, self.p.upper)]
+        self.theta, self.residual, self.jacobian, self.size, self.damping, self.growth, *s = s
+        self.steps, rested, stuck = s
+        self.rested |= rested
+        self.done |= rested | stuck
+
+    @property
+    def cost(self) -> np.ndarray:
+        """Half the sum of squares of each; infinite where something is not finite."""
+        cost = 0.5 * np.sum(self.residual**2, axis=1)
+        return np.where(np.isfinite(cost), cost, np.inf)
+
+    def look(self, points: np.ndarray) -> np.ndarray:
+        """Cost at points, without moving."""
+        k, found = len(self.theta), []
+        for part in np.split(points, range(k, len(points), k)):
+            filled = np.concatenate([part, np.repeat(part[:1], k - len(part), axis=0)])
+            none = np.zeros(k, int)
+            args = (filled, self.damping, self.growth, self.size, none, none)
+            r = np.asarray(self.call(*args, self.p.lower, self.p.upper)[1])
+            found.append(0.5 * np.sum(r**2, axis=1)[: len(part)])
+        return np.concatenate(found)
+
+    def move(self, lane: int, point: np.ndarray) -> None:
+        """Begin one search anew."""
+        self.theta, self.size = self.theta.copy(), self.size.copy()
+        self.damping, self.growth = self.damping.copy(), self.growth.copy()
+        self.theta[lane], self.size[lane] = point, 0.0
+        self.damping[lane], self.growth[lane] = DAMPING, 2.0
+        self.done[lane] = self.rested[lane] = False
+
+
+def _walks(core, starts, damping, growth, size, steps, limit, lower, upper):
+    """Searches from starts, each with its own memory and limit of steps."""
+    residual = partial(problem_residual, core)
+
+    def one(theta, damping, growth, size, steps, limit):
+        memory = (damping, growth, size, steps)
+        s = walk(residual, theta, lower, upper, limit, memory=memory)
+        parts = (s.theta, s.residual, s.jacobian, s.scale, s.damping, s.growth)
+        return (*parts, s.steps, s.rested, s.stuck)
+
+    return jax.vmap(one)(starts, damping, growth, size, steps, limit)

@@ -1,9 +1,14 @@
-"""Constraints on gains: at points, or certified everywhere in a box (report 3.1.3, eqs 38-39)."""
+"""Derivatives of maps and rules on them (report 3.1, eqs 38-39).
+
+Forward sensitivities, adjoints, gains of order 1 to 3; constraints on gains at points or certified
+everywhere in a box; signs of weights that make a network rise or fall by construction.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import jax
@@ -11,12 +16,164 @@ import jax.numpy as jnp
 import numpy as np
 
 from beamfit.errors import InputError
-from beamfit.greybox.bounds import cells, gain_bounds
-from beamfit.greybox.maps import positions
-from beamfit.greybox.sensitivity import gain
+from beamfit.greybox import tree
+from beamfit.greybox.activations import KINDS
+from beamfit.greybox.bounds import Network, cells, gain_bounds
+from beamfit.greybox.maps import Map, positions
 from beamfit.greybox.terms import Constraint
 
-__all__ = ["certified_gain", "gain_at", "part"]
+__all__ = [
+    "adjoints",
+    "certified_gain",
+    "gain",
+    "gain_at",
+    "monotone_signs",
+    "part",
+    "sensitivities",
+]
+
+
+def _restricted(m: Map, x: jax.Array, variables: tuple[str, ...]):
+    """The map as a function of chosen inputs and leaves: the function and where it stands."""
+    at = positions([v for v in variables if v in m.inputs], m.inputs, "input")
+    found = [leaf for v in variables if v not in m.inputs for leaf in tree.find_leaves(m, v)]
+    start = jnp.concatenate([x[jnp.array(at, int)], tree.read(m, found)])
+
+    def function(v):
+        point = x.at[jnp.array(at, int)].set(v[: len(at)])
+        return tree.replace(m, found, v[len(at) :])(point)
+
+    return function, start
+
+
+def sensitivities(m: Map, x: jax.Array, variables: Sequence[str] | None = None) -> jax.Array:
+    """Derivatives of every output by chosen variables, one forward sweep for each variable.
+
+    Parameters
+    ----------
+    m : Map
+        The map.
+    x : array, shape (inputs,)
+        The point.
+    variables : sequence of str, optional
+        Names of inputs, or paths of the map's own numbers; an array's elements follow in C order.
+        Inputs come first. All inputs if not given.
+
+    Returns
+    -------
+    jax.Array, shape (outputs, variables)
+
+    Raises
+    ------
+    InputError
+        If a variable is neither an input nor a path in the map.
+
+    Examples
+    --------
+    >>> from beamfit.greybox.maps import Affine
+    >>> m = Affine(["u", "v"], ["y"], [[2.0, 3.0]])
+    >>> sensitivities(m, jnp.array([5.0, 7.0]), ["v", "matrix"]).tolist()
+    [[3.0, 5.0, 7.0]]
+    """
+    chosen = m.inputs if variables is None else tuple(variables)
+    return _forward(m, jnp.asarray(x, float), chosen)
+
+
+@partial(jax.jit, static_argnums=2)
+def _forward(m: Map, x: jax.Array, variables: tuple[str, ...]) -> jax.Array:
+    """Forward sweeps, compiled once for each structure of map."""
+    function, start = _restricted(m, x, variables)
+    return jax.jacfwd(function)(start)
+
+
+def adjoints(
+    m: Map,
+    x: jax.Array,
+    functions: Sequence[str] | None = None,
+    variables: Sequence[str] | None = None,
+) -> jax.Array:
+    """Derivatives of chosen outputs by the variables, one backward sweep for each output.
+
+    Parameters
+    ----------
+    m : Map
+        The map.
+    x : array, shape (inputs,)
+        The point.
+    functions : sequence of str, optional
+        Names of outputs; all if not given.
+    variables : sequence of str, optional
+        As in `sensitivities`.
+
+    Returns
+    -------
+    jax.Array, shape (functions, variables)
+
+    Raises
+    ------
+    InputError
+        If a name is not known.
+
+    Examples
+    --------
+    >>> from beamfit.greybox.maps import Affine
+    >>> m = Affine(["u"], ["y", "z"], [[2.0], [3.0]])
+    >>> adjoints(m, jnp.array([5.0]), ["z"]).tolist()
+    [[3.0]]
+    """
+    rows = positions(m.outputs if functions is None else functions, m.outputs, "output")
+    chosen = m.inputs if variables is None else tuple(variables)
+    return _backward(m, jnp.asarray(x, float), tuple(rows), chosen)
+
+
+@partial(jax.jit, static_argnums=(2, 3))
+def _backward(m: Map, x: jax.Array, rows: tuple[int, ...], variables: tuple[str, ...]):
+    """Backward sweeps, compiled once for each structure of map."""
+    function, start = _restricted(m, x, variables)
+    _, pull = jax.vjp(function, start)
+    return jax.vmap(lambda w: pull(w)[0])(jnp.eye(len(m.outputs))[jnp.array(rows)])
+
+
+def gain(m: Map, x: jax.Array, output: str, by: Sequence[str]) -> jax.Array:
+    """The gain dⁿy/du1...dun at one point, by nested forward derivatives (report 3.1.3).
+
+    Parameters
+    ----------
+    m : Map
+        Any map, not only a network.
+    x : array, shape (inputs,)
+        The point.
+    output : str
+        The output y.
+    by : sequence of str
+        The inputs u1...un; their number is the order.
+
+    Returns
+    -------
+    jax.Array, scalar
+
+    Raises
+    ------
+    InputError
+        If a name is not known.
+
+    Examples
+    --------
+    >>> from beamfit.greybox.maps import Formula
+    >>> cube = Formula(["u"], ["y"], lambda _, x: x**3)
+    >>> float(gain(cube, jnp.array([2.0]), "y", ["u", "u"]))
+    12.0
+    """
+    (row,) = positions([output], m.outputs, "output")
+    unit = jnp.eye(len(m.inputs))
+
+    def derivative(function, i):
+        return lambda point: jax.jvp(function, (point,), (unit[i],))[1]
+
+    function = lambda point: m(point)[row]  # noqa: E731
+    for i in positions(by, m.inputs, "input"):
+        function = derivative(function, i)
+    return function(jnp.asarray(x, float))
 
 
 def part(model: Any, path: str) -> Any:
@@ -180,3 +337,58 @@ def certified_gain(
     if not found:
         raise InputError(f"no limit on d{output}/d{by}", "lower, upper or both")
     return found
+
+
+def monotone_signs(net: Network, signs: Mapping[str, int]) -> dict[str, np.ndarray]:
+    """Signs of the weights that make every output monotonic in chosen inputs by construction.
+
+    With weights of these signs (0: free) each path from such an input to an output is a product of
+    rising node functions and weights of one overall sign, so the gain has that sign everywhere,
+    not only where it was looked at.
+
+    Parameters
+    ----------
+    net : Network
+        All its node functions between input and output must rise: identity, linear, sigmoid, tanh.
+    signs : mapping of str to int
+        Input name to +1 (outputs rise) or -1 (outputs fall); other inputs stay free.
+
+    Returns
+    -------
+    dict of str to array
+        Connection name to signs, of the shape of its weights.
+
+    Raises
+    ------
+    InputError
+        If a node function falls somewhere, an input is not the only one of its node, or an input
+        layer is fed by another layer.
+
+    Examples
+    --------
+    >>> from beamfit.greybox.mlp import dense
+    >>> from beamfit.greybox.mlp import dense
+    >>> signs = monotone_signs(dense(["u", "v"], ["y"], [2]), {"u": -1})
+    >>> signs["layer0->layer1"].tolist(), signs["layer1->layer2"].tolist()
+    ([[-1.0, -1.0], [0.0, 0.0]], [[1.0], [1.0]])
+    """
+    positions(list(signs), [port.name for port in net.input_ports], "input")
+    entry = {port.layer for port in net.input_ports}
+    places = [(port.layer, port.node) for port in net.input_ports]
+    falling = [layer.name for layer in net.layers if not KINDS[layer.kind].monotonic]
+    if falling:
+        raise InputError(f"layers {', '.join(falling)} that fall somewhere", "rising layers only")
+    if len(set(places)) < len(places) or any(target in entry for _, target in net.connections):
+        raise InputError("shared input nodes or layers that feed the inputs", "plain input layers")
+    rows = {name: np.zeros(layer.size) for layer in net.layers if (name := layer.name) in entry}
+    for port in net.input_ports:
+        rows[port.layer][port.node] = signs.get(port.name, 0) * np.sign(port.scale)
+    flips = {np.sign(port.scale) for port in net.output_ports}
+    if flips != {1.0}:
+        raise InputError("an output with a negative scale", "positive scales for monotonic outputs")
+    return {
+        f"{a}->{b}": np.broadcast_to(
+            rows[a][:, None] if a in rows else 1.0, net.weights[f"{a}->{b}"].shape
+        )
+        for a, b in net.connections
+    }

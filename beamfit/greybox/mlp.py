@@ -15,8 +15,8 @@ from beamfit.errors import InputError, nearest
 from beamfit.greybox import tree
 from beamfit.greybox.activations import KINDS
 from beamfit.greybox.bounds import gain_bounds, over_cells
+from beamfit.greybox.gains import gain
 from beamfit.greybox.maps import positions
-from beamfit.greybox.sensitivity import gain
 
 __all__ = ["MLP", "Gain", "Layer", "Port", "connection", "dense"]
 

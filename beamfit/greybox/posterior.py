@@ -104,6 +104,8 @@ class Statement(NamedTuple):
     labels : mapping of str to str
         What stands for a record before the names of its noise; by default nothing if there is one
         record, else its name.
+    trusted : sequence of str
+        Records whose errors are right, whatever the residuals show: anchors of a model.
     noise_unit : str
         Of the errors of records that came without.
     priors_own, hidden : sequence of str
@@ -126,6 +128,7 @@ class Statement(NamedTuple):
     lower: Mapping[str, float] = {}
     width: Mapping[str, float] = {}
     labels: Mapping[str, str] = {}
+    trusted: Sequence[str] = ()
     noise_unit: str = "1"
     priors_own: Sequence[str] = ()
     hidden: Sequence[str] = ()
@@ -251,7 +254,7 @@ def target_of(
         upper=upper,
         mode=theta[moving],
         covariance=covariance,
-        groups=_groups(p, optimum, stated.labels, noise, outliers),
+        groups=_groups(p, optimum, stated, noise, outliers),
         noise=noise_found,
         counts=tuple(record.used for record in p.records),
         noise_unit="1" if any(optimum.given) else stated.noise_unit,
@@ -284,8 +287,9 @@ def _refuse_equations(p: Problem) -> None:
 
 def _bounds(p: Problem, moving: np.ndarray, stated: Statement) -> tuple[np.ndarray, np.ndarray]:
     """Bounds of what is sampled."""
-    lower = {stated.renamed.get(p.names[i], p.names[i]): p.lower[i] for i in moving}
-    return np.array(list((lower | dict(stated.lower)).values())), p.upper[moving]
+    called = (stated.renamed.get(p.names[i], p.names[i]) for i in moving)
+    lower = zip(called, p.lower[moving], strict=True)
+    return np.array([stated.lower.get(name, low) for name, low in lower]), p.upper[moving]
 
 
 def _changed(p: Problem, stated: Statement, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -330,15 +334,17 @@ def _widths(
 
 
 def _groups(
-    p: Problem, optimum: Optimum, labels: Mapping[str, str], noise: str | None, outliers: bool
+    p: Problem, optimum: Optimum, stated: Statement, noise: str | None, outliers: bool
 ) -> tuple[Group, ...]:
     """How each record scatters; a factor on errors cannot be inferred where nothing shows it."""
     groups = []
     for record, scale, given in zip(p.records, optimum.scales, optimum.given, strict=True):
-        label = labels.get(record.name, record.name if len(p.records) > 1 else "")
+        label = stated.labels.get(record.name, record.name if len(p.records) > 1 else "")
+        trusted = record.name in stated.trusted
         kind = noise or ("inferred" if scale > 1 or not given else "known")
-        shown = scale > 0 or not given
-        groups.append(Group(label, kind if shown else "known", outliers))
+        if trusted or (given and not scale > 0):
+            kind = "known"
+        groups.append(Group(label, kind, outliers and not trusted))
     return tuple(groups) or (Group("", noise or "known", outliers),)
 
 

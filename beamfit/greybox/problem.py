@@ -292,9 +292,7 @@ class Problem:
     @cached_property
     def _constraint_shapes(self) -> list[tuple[Constraint, tuple[int, ...]]]:
         """Each constraint with the shape of its values."""
-        return [
-            (c, jax.eval_shape(c.function, self.core.model, c.data).shape) for c in self.constraints
-        ]
+        return [(c, _shape_of(c.function, self.core.model, c.data)) for c in self.constraints]
 
     def _limits(self, what: str) -> np.ndarray:
         """One limit of every constraint, spread over its elements."""
@@ -313,10 +311,23 @@ class Problem:
 _GROUPS = ("records", "priors", "constraints", "objectives")
 
 
+def _shape_of(function: Callable, *arguments: Any) -> tuple[int, ...]:
+    """Shape of what a function gives, traced once for each structure and shape of arguments."""
+    leaves, structure = jax.tree_util.tree_flatten(arguments)
+    kinds = tuple((np.shape(leaf), getattr(leaf, "dtype", np.dtype(float))) for leaf in leaves)
+    return _traced_shape(function, structure, kinds)
+
+
+@lru_cache(maxsize=1024)
+def _traced_shape(function, structure, kinds) -> tuple[int, ...]:
+    leaves = [jax.ShapeDtypeStruct(*kind) for kind in kinds]
+    return jax.eval_shape(function, *structure.unflatten(leaves)).shape
+
+
 def _check_shapes(problem: Problem) -> None:
     """Refuse predictions, priors and limits whose shapes do not fit, before anything runs."""
     for record in problem.records:
-        found = jax.eval_shape(record.predict, problem.core.model, record.data).shape
+        found = _shape_of(record.predict, problem.core.model, record.data)
         if found != record.measured.shape:
             raise InputError(
                 f"a prediction of shape {found} for record '{record.name}'",

@@ -13,7 +13,7 @@ import jax
 import numpy as np
 from scipy import optimize
 
-from beamfit.greybox import assess, problem
+from beamfit.greybox import assess, curvature, problem
 from beamfit.greybox.problem import Problem
 
 __all__ = ["SOLVERS", "Budget", "Program", "Proposal", "Stage", "scaled"]
@@ -40,7 +40,7 @@ class Program(NamedTuple):
 
     `values(x)` gives cost and constraints, `slopes(x)` the cost's gradient and the constraints'
     Jacobian, `hessian(x, sigma, y)` the Hessian of sigma * cost - y @ constraints.
-    `lagrangian(y)` gives a function of points in the problem's own numbers.
+    `unit` is the size of x; `lagrangian(y)` gives a function of points in the problem's numbers.
     """
 
     values: Callable[[np.ndarray], tuple[float, np.ndarray]]
@@ -50,6 +50,7 @@ class Program(NamedTuple):
     upper: np.ndarray
     c_lower: np.ndarray
     c_upper: np.ndarray
+    unit: np.ndarray
     lagrangian: Callable[[np.ndarray], Callable[[np.ndarray], np.ndarray]]
 
 
@@ -203,6 +204,11 @@ def _squares(core, theta, sigma, y):
     return sigma * j.T @ j
 
 
+def _tame(size: np.ndarray) -> np.ndarray:
+    """Sizes near 1 are left alone: solvers' own steps and tolerances are made for those."""
+    return np.where((size > 1e2) | (size < 1e-2), size, 1.0)
+
+
 def scaled(
     p: Problem,
     start: np.ndarray,
@@ -233,11 +239,11 @@ def scaled(
     Program
         That remembers its last points.
     """
-    unit = scale.unit[moving]
+    unit, limit = _tame(scale.unit)[moving], _tame(scale.limit)
     steepest = max(np.max(np.abs(at.gradient * scale.unit)), 1e-300)
     # Squares are counted in their errors; a steep cost is flattened, as IPOPT does.
     flat = 1.0 / scale.cost if p.objectives else min(1.0, 100.0 / steepest)
-    second = _squares if hessian == "gauss_newton" else assess.lagrangian_hessian
+    second = _squares if hessian == "gauss_newton" else curvature.lagrangian_hessian
     functions = {function: p.compiled(function) for function in (_values, _first, second)}
     kept: dict = {}
 
@@ -256,14 +262,14 @@ def scaled(
 
     def values(x):
         cost, c = remember(_values, x)
-        return flat * float(cost), c / scale.limit
+        return flat * float(cost), c / limit
 
     def slopes(x):
         gradient, jacobian = remember(_first, x)
-        return flat * gradient[moving] * unit, jacobian[:, moving] * unit / scale.limit[:, None]
+        return flat * gradient[moving] * unit, jacobian[:, moving] * unit / limit[:, None]
 
-    def curvature(x, sigma, y):
-        h = np.asarray(functions[second](full(x), sigma * flat, y / scale.limit))
+    def bend(x, sigma, y):
+        h = np.asarray(functions[second](full(x), sigma * flat, y / limit))
         return h[np.ix_(moving, moving)] * np.outer(unit, unit)
 
     def lagrangian(y):
@@ -276,10 +282,11 @@ def scaled(
     return Program(
         values,
         slopes,
-        curvature,
+        bend,
         p.lower[moving] / unit,
         p.upper[moving] / unit,
-        p.constraint_lower / scale.limit,
-        p.constraint_upper / scale.limit,
+        p.constraint_lower / limit,
+        p.constraint_upper / limit,
+        unit,
         lagrangian,
     )

@@ -4,17 +4,13 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterable
-from functools import partial
 
-import jax
 import numpy as np
-from rich.console import Console
-from rich.progress import track
 
 from beamfit.errors import InputError
-from beamfit.greybox import assess, problem
+from beamfit.greybox import assess, curvature
 from beamfit.greybox.assess import TOLERANCE, State
-from beamfit.greybox.descend import DAMPING, walk
+from beamfit.greybox.descend import Lanes
 from beamfit.greybox.fit import Attempt, Fit
 from beamfit.greybox.problem import Problem
 from beamfit.greybox.programs import SOLVERS, Budget, scaled
@@ -26,8 +22,6 @@ __all__ = ["search", "solve", "starting_points"]
 
 # Steps from many starts; what is left is for the polish of the cheapest ends.
 STEPS, POLISHED = 300, 4
-# With a limit of time the clock is looked at after so many steps.
-SEGMENT = 50
 # Searches side by side at least, so that the points beside an end are looked at in one call.
 LANES = 4
 # Bytes that Jacobians of starts searched together may take.
@@ -136,6 +130,9 @@ def _check(starts: int, iterations: int, hessian: str, seconds: float | None) ->
 def _bar(points: np.ndarray, progress: bool) -> Iterable:
     if not progress:
         return points
+    from rich.console import Console  # a tenth of a second that only a bar should cost
+    from rich.progress import track
+
     return track(points, "fitting", console=Console(stderr=True), transient=True)
 
 
@@ -175,7 +172,7 @@ def _drawn(p: Problem, number: int, seed: int) -> np.ndarray:
 
 def _good(s: State) -> bool:
     """Whether a point is an optimum, to second order."""
-    bent = s.bend is not None and (s.bend.direction is not None or s.bend.newton > assess.STEP)
+    bent = s.bend is not None and (s.bend.direction is not None or s.bend.newton > curvature.STEP)
     return s.kkt.worst <= TOLERANCE and not bent
 
 
@@ -229,82 +226,6 @@ def search(
 # ---- least squares within bounds: all starts at once
 
 
-class _Lanes:
-    """Searches side by side: one compiled call moves them on, or looks at points."""
-
-    def __init__(self, p: Problem, points: np.ndarray):
-        self.p, self.call = p, p.compiled(_walks)
-        k, n = points.shape
-        self.theta, self.limit = np.array(points), np.zeros(k, int)
-        self.damping, self.growth = np.full(k, DAMPING), np.full(k, 2.0)
-        self.size, self.steps = np.zeros((k, n)), np.zeros(k, int)
-        self.done, self.rested = np.zeros(k, bool), np.zeros(k, bool)
-
-    def go(self, lanes: np.ndarray, limit: int, budget: Budget) -> None:
-        """Move some searches on to a number of steps, or until time is up."""
-        self.limit[:] = 0
-        reached = limit if budget.until is None else 0
-        while True:
-            reached = min(max(reached, int(np.min(self.steps[lanes])) + SEGMENT), limit)
-            self.limit[lanes] = np.where(self.done[lanes], 0, reached)
-            self._call()
-            unfinished = ~self.done[lanes] & (self.steps[lanes] < limit)
-            if not unfinished.any() or budget.left <= 0:
-                return
-
-    def _call(self) -> None:
-        args = (self.theta, self.damping, self.growth, self.size, self.steps, self.limit)
-        s = [np.asarray(part) for part in self.call(*args, self.p.lower, self.p.upper)]
-        self.theta, self.residual, self.jacobian, self.size, self.damping, self.growth, *s = s
-        self.steps, rested, stuck = s
-        self.rested |= rested
-        self.done |= rested | stuck
-
-    @property
-    def cost(self) -> np.ndarray:
-        """Half the sum of squares of each; infinite where something is not finite."""
-        cost = 0.5 * np.sum(self.residual**2, axis=1)
-        return np.where(np.isfinite(cost), cost, np.inf)
-
-    def look(self, points: np.ndarray) -> np.ndarray:
-        """Cost at points, without moving."""
-        k, found = len(self.theta), []
-        for part in np.split(points, range(k, len(points), k)):
-            filled = np.concatenate([part, np.repeat(part[:1], k - len(part), axis=0)])
-            none = np.zeros(k, int)
-            args = (filled, self.damping, self.growth, self.size, none, none)
-            r = np.asarray(self.call(*args, self.p.lower, self.p.upper)[1])
-            found.append(0.5 * np.sum(r**2, axis=1)[: len(part)])
-        return np.concatenate(found)
-
-    def move(self, lane: int, point: np.ndarray) -> None:
-        """Begin one search anew."""
-        self.theta, self.size = self.theta.copy(), self.size.copy()
-        self.damping, self.growth = self.damping.copy(), self.growth.copy()
-        self.theta[lane], self.size[lane] = point, 0.0
-        self.damping[lane], self.growth[lane] = DAMPING, 2.0
-        self.done[lane] = self.rested[lane] = False
-
-    def state(self, lane: int, scale: assess.Scale | None = None) -> State:
-        """One search's end, judged."""
-        at = assess.of_squares(self.residual[lane], self.jacobian[lane])
-        scale = assess.scale_of(self.p, self.theta[lane], at) if scale is None else scale
-        return assess.state(self.p, self.theta[lane].copy(), scale, at)
-
-
-def _walks(core, starts, damping, growth, size, steps, limit, lower, upper):
-    """Searches from starts, each with its own memory and limit of steps."""
-    residual = partial(problem.residual, core)
-
-    def one(theta, damping, growth, size, steps, limit):
-        memory = (damping, growth, size, steps)
-        s = walk(residual, theta, lower, upper, limit, memory=memory)
-        parts = (s.theta, s.residual, s.jacobian, s.scale, s.damping, s.growth)
-        return (*parts, s.steps, s.rested, s.stuck)
-
-    return jax.vmap(one)(starts, damping, growth, size, steps, limit)
-
-
 def _together(
     p: Problem, points: np.ndarray, budget: Budget, progress: bool
 ) -> tuple[list[State], tuple[Attempt, ...]]:
@@ -321,44 +242,51 @@ def _together(
 def _lanes(p: Problem, points: np.ndarray, budget: Budget) -> tuple[list[State], list[Attempt]]:
     k = len(points)
     spare = 0 if points.shape[1] * p.size > MEMORY / 64 else max(0, LANES - k)
-    lanes = _Lanes(p, np.concatenate([points, np.repeat(points[:1], spare, axis=0)]))
+    lanes = Lanes(p, np.concatenate([points, np.repeat(points[:1], spare, axis=0)]))
     first = budget.iterations if k == 1 else min(STEPS, budget.iterations)
-    lanes.go(np.arange(k), first, budget)
+    lanes.go(np.arange(k), first, budget.until)
     cost = lanes.cost[:k]
-    found: list[State] = []
-    for lane in np.argsort(cost, kind="stable")[:POLISHED]:
+    found: dict[int, State] = {}
+    for lane in np.argsort(cost, kind="stable")[:POLISHED].tolist():
         if not np.isfinite(cost[lane]):
             break
         if not lanes.done[lane]:
-            lanes.go(lane[None], budget.iterations, budget)
-        found.append(_moved_off(p, lanes, int(lane), budget))
-        if _rests(p, found[-1]):
+            lanes.go(np.array([lane]), budget.iterations, budget.until)
+        found[lane] = _moved_off(p, lanes, lane, budget)
+        if _rests(p, found[lane]):
             break
-    return found, [_account(lanes, lane) for lane in range(k)]
+    accounts = [_account(p, lanes, lane, found.get(lane)) for lane in range(k)]
+    return list(found.values()), accounts
 
 
-def _account(lanes: _Lanes, lane: int) -> Attempt:
+def _account(p: Problem, lanes: Lanes, lane: int, s: State | None) -> Attempt:
     theta, name = lanes.theta[lane].copy(), "Levenberg-Marquardt"
     if not np.isfinite(lanes.cost[lane]):
         lost = assess.KKT(np.inf, np.inf, np.inf)
         return Attempt(name, theta, np.nan, lost, int(lanes.steps[lane]), "cost not finite")
     said = "came to rest" if lanes.rested[lane] else "ran out of iterations"
-    s = lanes.state(lane)
+    s = _judged(p, lanes, lane) if s is None else s
     return Attempt(name, theta, float(s.at.cost), s.kkt, int(lanes.steps[lane]), said)
 
 
-def _moved_off(p: Problem, lanes: _Lanes, lane: int, budget: Budget) -> State:
+def _judged(p: Problem, lanes: Lanes, lane: int) -> State:
+    """One search's end."""
+    theta = lanes.theta[lane].copy()
+    at = assess.of_squares(lanes.residual[lane], lanes.jacobian[lane])
+    return assess.state(p, theta, assess.scale_of(p, theta, at), at)
+
+
+def _moved_off(p: Problem, lanes: Lanes, lane: int, budget: Budget) -> State:
     """Judge one end; where the cost bends down there, move off and go on."""
+    s = _judged(p, lanes, lane)
     for _ in range(MOVES):
-        s = lanes.state(lane)
-        if not s.at.finite:
-            return s
-        point = assess.lower_beside(p, s, lanes.look)
+        point = curvature.lower_beside(p, s, lanes.look) if s.at.finite else None
         if point is None or budget.left <= 0:
             break
         lanes.move(lane, point)
-        lanes.go(np.array([lane]), int(lanes.steps[lane]) + budget.iterations, budget)
-    return lanes.state(lane)
+        lanes.go(np.array([lane]), int(lanes.steps[lane]) + budget.iterations, budget.until)
+        s = _judged(p, lanes, lane)
+    return s
 
 
 # ---- constraints and further objectives: one start after the other
@@ -398,16 +326,18 @@ def _program(
         begin = best.theta if near else start
         for _ in range(1 + MOVES):
             end = stage.solve(
-                program, (begin / scale.unit)[moving], min(stage.steps, budget.iterations), budget
+                program, begin[moving] / program.unit, min(stage.steps, budget.iterations), budget
             )
             theta = start.copy()
-            theta[moving] = end.x * scale.unit[moving]
+            theta[moving] = end.x * program.unit
             theta = np.clip(theta, p.lower, p.upper)
             s = assess.state(p, theta, scale)
             steps, said = steps + end.iterations, end.said
             point = None
             if s.kkt.worst <= TOLERANCE:
-                s, point = assess.second_order(p, s, exact, program.lagrangian(s.found.constraints))
+                s, point = curvature.second_order(
+                    p, s, exact, program.lagrangian(s.found.constraints)
+                )
             if best is None or _best(p, [best, s]) == 1:
                 best = s
             if point is None or budget.left <= 0:

@@ -12,7 +12,7 @@ from jax.experimental import checkify
 from scipy.special import chdtrc
 
 from beamfit import verdict
-from beamfit.greybox import assess, problem
+from beamfit.greybox import assess, curvature, problem
 from beamfit.greybox.assess import TOLERANCE, State
 from beamfit.greybox.covariance import (
     MOST_SHARE,
@@ -286,7 +286,7 @@ def _restless(e: Evidence) -> Finding | None:
         why = f"KKT residual {e.state.kkt.worst:.1e}"
     elif bend is not None and bend.direction is not None:
         why = "the cost still bends down there"
-    elif bend is not None and bend.newton > assess.STEP:
+    elif bend is not None and bend.newton > curvature.STEP:
         why = f"the next step is {bend.newton:.1e} of the numbers' sizes"
     if why is None:
         return None

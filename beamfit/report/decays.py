@@ -12,7 +12,17 @@ from matplotlib.figure import FigureBase
 
 from beamfit.errors import InputError
 from beamfit.lifetime.decay import current
-from beamfit.report.document import BLUE, MANY, RED, Page, Picture, Verdict, provenance, written
+from beamfit.report.document import (
+    BLUE,
+    MANY,
+    RED,
+    Page,
+    Picture,
+    Verdict,
+    legend_below,
+    provenance,
+    written,
+)
 from beamfit.status import Status
 from beamfit.studies.decay.checks import moving_lifetime
 from beamfit.studies.decay.shift import Shift
@@ -156,14 +166,13 @@ def _verdict(decay: Decay) -> Verdict:
 def _shift_verdicts(shift: Shift | None) -> list[Verdict]:
     if shift is None:
         return []
-    fit, best = shift.fit, shift.best
+    fit, best, change = shift.fit, shift.best, shift.anomaly
     said = [
         Verdict(fit.status, f"{len(fit.names)} decays together", fit.message),
         Verdict(Status.converged, f"best lifetime {best.lifetime}", best.message),
     ]
-    found = shift.anomaly
-    if found is not None:
-        said.append(Verdict(found.status, "second half against the first", found.message))
+    if change is not None:
+        said.append(Verdict(change.status, "second half against the first", change.message))
     return said
 
 
@@ -180,29 +189,25 @@ def draw_record(figure: FigureBase, study: RecordStudy) -> None:
     above, below = figure.subplots(2, 1, sharex=True, height_ratios=(3, 1))
     record, scale, unit = study.record, *_time_unit(study.record.span)
     many = len(record) > MANY
-    size = 2 if many else 5
-    above.plot(
-        record.time / scale, record.current, "o", ms=size, color="0.65", rasterized=many, zorder=1
-    )
+    dots = partial(dict, marker="o", ls="", ms=2 if many else 5, rasterized=many)
+    above.plot(record.time / scale, record.current, **dots(color="0.65", zorder=1))
     for decay in study.decays:
         at = (decay.offset + decay.segment.time) / scale
-        above.plot(at, decay.segment.current, "o", ms=size, color=BLUE, rasterized=many, zorder=2)
+        above.plot(at, decay.segment.current, **dots(color=BLUE, zorder=2))
         grid = np.linspace(0, decay.segment.span, 200)
         fit = decay.fit
         if np.isfinite(fit.a.value):
             law = np.asarray(current(grid, fit.i0.value, fit.a.value, fit.b.value))
             above.plot((decay.offset + grid) / scale, law, color=RED, lw=1.3, zorder=3)
-        below.plot(at, fit.residuals, "o", ms=size, color=BLUE, rasterized=many)
+        below.plot(at, fit.residuals, **dots(color=BLUE))
     above.plot([], [], "o", color=BLUE, ms=5, label="readings")
     above.plot([], [], color=RED, label="fit")
     if sum(len(d.segment) for d in study.decays) < len(record):
         above.plot([], [], "o", color="0.65", ms=5, label="left out")
     above.legend(frameon=False, loc="best")
-    above.set_ylabel("beam current, mA")
-    above.set_title(record.name)
+    above.set(title=record.name, ylabel="beam current, mA")
     below.axhline(0, color="0.6", lw=0.8)
-    below.set_ylabel("fit - reading,\nmA")
-    below.set_xlabel(f"time, {unit}")
+    below.set(xlabel=f"time, {unit}", ylabel="fit - reading,\nmA")
 
 
 def _time_unit(span: float) -> tuple[float, str]:
@@ -239,11 +244,8 @@ def draw_lifetime(figure: FigureBase, study: RecordStudy) -> None:
     known = [top for top in tops if np.isfinite(top)]
     if known:
         axes.set_ylim(0.6 * min(known), 1.4 * max(known))
-    axes.set_ylabel("lifetime, h")
-    axes.set_xlabel(f"time, {unit}")
-    axes.set_title("momentary lifetime")
-    handles, labels = axes.get_legend_handles_labels()
-    figure.legend(handles, labels, frameon=False, loc="outside lower center", ncols=2)
+    axes.set(title="momentary lifetime", xlabel=f"time, {unit}", ylabel="lifetime, h")
+    legend_below(figure, axes, 2)
 
 
 def _momentary(axes: Axes, decay: Decay, scale: float) -> float:
@@ -258,17 +260,12 @@ def _momentary(axes: Axes, decay: Decay, scale: float) -> float:
     seen = np.isfinite(trace.lifetime[every]) & (trace.lifetime[every] > 0)
     if not seen.any():
         return np.nan
-    axes.errorbar(
-        (decay.offset + trace.time[every][seen]) / scale,
-        trace.lifetime[every][seen],
-        trace.error[every][seen],
-        fmt="o",
-        ms=3,
-        lw=0.8,
-        color=BLUE,
-        zorder=2,
+    time, lifetime, error = (
+        part[every][seen] for part in (trace.time, trace.lifetime, trace.error)
     )
-    return float(np.median(trace.lifetime[every][seen]))
+    at = (decay.offset + time) / scale
+    axes.errorbar(at, lifetime, error, fmt="o", ms=3, lw=0.8, color=BLUE, zorder=2)
+    return float(np.median(lifetime))
 
 
 def draw_budget(figure: FigureBase, decays: Sequence[Decay]) -> None:
@@ -298,13 +295,10 @@ def draw_budget(figure: FigureBase, decays: Sequence[Decay]) -> None:
             axes.errorbar(1 / found.value, y, xerr=error, fmt="D", color="black", mfc=hollow, ms=5)
     axes.errorbar([], [], fmt="D", color="black", ms=5, label="measured")
     axes.set_yticks(place, [decay.fit.record for decay in shown])
-    axes.set_ylim(-0.6, len(shown) - 0.4)
-    axes.set_xlim(left=0)
-    axes.set_xlabel("loss rate at the mean current, 1/h")
     more = f", {MOST_BARS} of {len(decays)} decays" if len(decays) > MOST_BARS else ""
-    axes.set_title(f"computed losses{more}")
-    handles, labels = axes.get_legend_handles_labels()
-    figure.legend(handles, labels, frameon=False, loc="outside lower center", ncols=5)
+    axes.set(title=f"computed losses{more}", xlabel="loss rate at the mean current, 1/h")
+    axes.set(xlim=(0, None), ylim=(-0.6, len(shown) - 0.4))
+    legend_below(figure, axes, 5)
 
 
 def _pictures(studies: Sequence[RecordStudy]) -> list[Picture]:

@@ -11,13 +11,23 @@ from importlib.metadata import version
 from typing import NamedTuple
 
 import jinja2
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure, FigureBase
 
 import beamfit
 from beamfit.status import Status
 from beamfit.table import Table
 
-__all__ = ["STYLE", "Page", "Picture", "Verdict", "html_of", "provenance", "written"]
+__all__ = [
+    "STYLE",
+    "Page",
+    "Picture",
+    "Verdict",
+    "html_of",
+    "legend_below",
+    "provenance",
+    "written",
+]
 
 
 STYLE = {
@@ -82,6 +92,12 @@ def provenance(
 def written() -> str:
     """When this is, for a subtitle."""
     return "written " + datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")
+
+
+def legend_below(figure: FigureBase, axes: Axes, columns: int) -> None:
+    """Put the legend of some axes below their figure, in so many columns."""
+    shown = axes.get_legend_handles_labels()
+    figure.legend(*shown, frameon=False, loc="outside lower center", ncols=columns)
 
 
 def html_of(page: Page) -> bytes:

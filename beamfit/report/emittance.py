@@ -9,7 +9,17 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import FigureBase
 
-from beamfit.report.document import BLUE, MANY, RED, Page, Picture, Verdict, provenance, written
+from beamfit.report.document import (
+    BLUE,
+    MANY,
+    RED,
+    Page,
+    Picture,
+    Verdict,
+    legend_below,
+    provenance,
+    written,
+)
 from beamfit.status import Status
 from beamfit.studies.scan.fit import EmittanceFit
 from beamfit.studies.scan.results import (
@@ -23,7 +33,7 @@ from beamfit.studies.scan.sensitivity import budget_rows, range_rows
 from beamfit.studies.scan.transport import scanned_line, transfer_rows
 from beamfit.table import Table, labelled
 
-__all__ = ["COLOUR", "draw_ellipses", "draw_scan", "emittance_page"]
+__all__ = ["COLOUR", "draw_ellipses", "draw_scan", "emittance_page", "setting_axis"]
 
 COLOUR = {"x": BLUE, "y": RED}
 
@@ -68,7 +78,7 @@ def emittance_page(
     return Page(
         title=f"Emittance of {scan.name}",
         subtitle=f"{len(scan)} settings on line {line.name}, {energy}; {written()}",
-        verdicts=[_verdict(p) for p in fit.planes],
+        verdicts=[Verdict(p.status, f"{p.plane}: {_headline(p)}", p.message) for p in fit.planes],
         tables=tables,
         pictures=_pictures(fit),
         pictures_title="Scan and fit",
@@ -79,46 +89,33 @@ def emittance_page(
 
 def _budgets(fit: EmittanceFit, names: list[str]) -> list[Table]:
     """What the emittance would be with another line or fewer points."""
+    changed = "Relative change of the normalised emittance, from exact derivatives."
+    shifted = "Normalised emittance, and its shift in standard errors of the full fit."
+    title, other = "If the line were a little different", "If some points were left out"
     return [
-        labelled(
-            "If the line were a little different",
-            names,
-            budget_rows(fit),
-            "Relative change of the normalised emittance, from exact derivatives.",
-            numeric=True,
-        ),
-        labelled(
-            "If some points were left out",
-            names,
-            range_rows(fit),
-            "Normalised emittance, and its shift in standard errors of the full fit.",
-        ),
+        labelled(title, names, budget_rows(fit), changed, numeric=True),
+        labelled(other, names, range_rows(fit), shifted),
     ]
 
 
 def _fitted_too(fit: EmittanceFit) -> list[Table]:
     """What a scenario fitted besides the beam, and what the data leave open."""
+    header, parts = ["fitted too", "value", "bounds", "prior", "state"], []
     rows = [[name, *cells] for name, cells in parameter_rows(fit.parameters)]
-    header = ["fitted too", "value", "bounds", "prior", "state"]
-    parts = [Table(f"Scenario {fit.scenario}", header, rows, _anchor(fit))]
-    if not rows:
-        parts = []
+    if rows:
+        # What ties a network to the lattice; a calibration has priors instead.
+        anchor = f"Anchor: {fit.anchor}." if fit.statement.network else ""
+        parts.append(Table(f"Scenario {fit.scenario}", header, rows, anchor))
     if fit.null_directions:
         listed = [[words + "."] for words in fit.null_directions]
         parts.append(Table("Left open by the data", [], listed))
     return parts
 
 
-def _verdict(p: PlaneFit) -> Verdict:
-    determined = p.status is not Status.unidentified
-    value = f"normalised emittance {p.normalized_emittance}"
-    headline = value if determined else "emittance not determined"
-    return Verdict(p.status, f"{p.plane}: {headline}", p.message)
-
-
-def _anchor(fit: EmittanceFit) -> str:
-    """What ties a network to the lattice; a calibration has priors instead."""
-    return f"Anchor: {fit.anchor}." if fit.statement.network else ""
+def _headline(p: PlaneFit) -> str:
+    if p.status is Status.unidentified:
+        return "emittance not determined"
+    return f"normalised emittance {p.normalized_emittance}"
 
 
 def draw_scan(figure: FigureBase, fit: EmittanceFit, plane: str) -> None:
@@ -137,35 +134,32 @@ def draw_scan(figure: FigureBase, fit: EmittanceFit, plane: str) -> None:
     """
     p = fit[plane]
     above, below = figure.subplots(2, 1, sharex=True, height_ratios=(3, 1))
-    varied = [n for n, v in p.points.settings.items() if np.ptp(v) > 0]
-    if len(varied) == 1:
-        at = p.points.settings[varied[0]]
-        if not fit.statement.whole_map:  # known at the measured currents alone
-            above.plot(at, 1e6 * p.points.model, "_", ms=14, mew=2, color=COLOUR[plane], alpha=0.6)
-        else:
-            _curves(above, fit, p, varied[0])
-        below.set_xlabel(f"{varied[0]}, {p.points.units[varied[0]]}")
-    else:
-        at = np.arange(1, len(p.points.size) + 1)
+    at, words = setting_axis(p)
+    one = _varied(p) if fit.statement.whole_map else []
+    if len(one) == 1:
+        _curves(above, fit, p, one[0])
+    else:  # known at the measured settings alone
         above.plot(at, 1e6 * p.points.model, "_", ms=14, mew=2, color=COLOUR[plane], alpha=0.6)
-        below.set_xlabel("measurement")
     _points(above, p, at)
-    above.set_ylabel("rms size, µm")
-    above.set_ylim(bottom=0.0)
-    above.set_title(f"{plane} plane: {_headline(p)}")
+    above.set(title=f"{plane} plane: {_headline(p)}", ylabel="rms size, µm", ylim=(0.0, None))
     below.axhspan(-1, 1, color="0.93")
     below.axhline(0, color="0.6", lw=0.8)
     below.plot(at, p.points.pull, "o", color=COLOUR[plane], ms=5, rasterized=len(at) > MANY)
     finite = np.abs(p.points.pull[np.isfinite(p.points.pull)])
     reach = max(3.0, 1.15 * float(finite.max(initial=0.0)))
-    below.set_ylim(-reach, reach)
-    below.set_ylabel("residual,\nstd. errors")
+    below.set(xlabel=words, ylabel="residual,\nstd. errors", ylim=(-reach, reach))
 
 
-def _headline(p: PlaneFit) -> str:
-    if p.status is Status.unidentified:
-        return "emittance not determined"
-    return f"normalised emittance {p.normalized_emittance}"
+def _varied(p: PlaneFit) -> list[str]:
+    return [name for name, values in p.points.settings.items() if np.ptp(values) > 0]
+
+
+def setting_axis(p: PlaneFit) -> tuple[np.ndarray, str]:
+    """Against what points are drawn: the setting of the one varied magnet, or else their number."""
+    varied = _varied(p)
+    if len(varied) != 1:
+        return np.arange(1, len(p.points.size) + 1), "measurement"
+    return p.points.settings[varied[0]], f"{varied[0]}, {p.points.units[varied[0]]}"
 
 
 def _curves(axes: Axes, fit: EmittanceFit, p: PlaneFit, magnet: str) -> None:
@@ -193,14 +187,8 @@ def _curves(axes: Axes, fit: EmittanceFit, p: PlaneFit, magnet: str) -> None:
         if fit.statement.closed and np.isfinite(p.covariance).all():
             variance = np.einsum("ij,jk,ik->i", design, p.covariance, design)
             half = p.error_scale * np.sqrt(variance) / (2.0 * np.maximum(size, 1e-9))
-            axes.fill_between(
-                grid,
-                1e6 * np.maximum(size - half, 0),
-                1e6 * (size + half),
-                color=COLOUR[p.plane],
-                alpha=0.15,
-                lw=0,
-            )
+            low, high = 1e6 * np.maximum(size - half, 0), 1e6 * (size + half)
+            axes.fill_between(grid, low, high, color=COLOUR[p.plane], alpha=0.15, lw=0)
     axes.legend(frameon=False, loc="best")
 
 
@@ -211,17 +199,9 @@ def _points(axes: Axes, p: PlaneFit, at: np.ndarray) -> None:
     good = np.ones(len(at), bool) if doubt is None else doubt < 0.5
     for keep, face in ((good, COLOUR[p.plane]), (~good, "white")):
         if keep.any():
-            axes.errorbar(
-                at[keep],
-                1e6 * p.points.size[keep],
-                error[keep],
-                fmt="o",
-                ms=5,
-                capsize=3,
-                color=COLOUR[p.plane],
-                mfc=face,
-                rasterized=len(at) > MANY,
-            )
+            style = {"fmt": "o", "ms": 5, "capsize": 3, "color": COLOUR[p.plane], "mfc": face}
+            size = 1e6 * p.points.size[keep]
+            axes.errorbar(at[keep], size, error[keep], rasterized=len(at) > MANY, **style)
 
 
 def draw_ellipses(figure: FigureBase, fit: EmittanceFit) -> None:
@@ -242,12 +222,10 @@ def draw_ellipses(figure: FigureBase, fit: EmittanceFit) -> None:
     start.set_title("phase ellipse at the start")
     screen.set_title(f"at {drawn[0].screen.name}")
     for axes in (start, screen):
-        axes.set_xlabel("position, µm")
-        axes.set_ylabel("angle, µrad")
+        axes.set(xlabel="position, µm", ylabel="angle, µrad")
         axes.axhline(0, color="0.85", lw=0.8, zorder=0)
         axes.axvline(0, color="0.85", lw=0.8, zorder=0)
-    handles, labels = start.get_legend_handles_labels()
-    figure.legend(handles, labels, frameon=False, loc="outside lower center", ncols=2)
+    legend_below(figure, start, 2)
 
 
 def _pictures(fit: EmittanceFit) -> list[Picture]:

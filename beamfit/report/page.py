@@ -14,7 +14,7 @@ from beamfit.report.decays import decay_page
 from beamfit.report.document import STYLE, html_of
 from beamfit.report.emittance import emittance_page
 from beamfit.report.pdf import pdf_of
-from beamfit.report.posterior import with_beam_posterior, with_decay_posteriors
+from beamfit.report.posterior import Sampled, of_decay, of_scan, with_posteriors
 from beamfit.sampling.posterior import Posterior
 from beamfit.studies.decay.fit import DecayFit
 from beamfit.studies.decay.shift import Shift
@@ -74,17 +74,26 @@ def write_report(
     with rc_context(STYLE):
         if isinstance(result, EmittanceFit):
             page = emittance_page(result, command, inputs)
-            if posterior is not None:
-                page = with_beam_posterior(page, result, posterior)
+            sampled = [] if posterior is None else [of_scan(result, posterior)]
         else:
             studies = (_study_of(result),) if isinstance(result, DecayFit) else result
             page = decay_page(studies, command, inputs, shift)
-            if posterior is not None:
-                found = [posterior] if isinstance(posterior, Posterior) else posterior
-                fits = [decay.fit for study in studies for decay in study.decays]
-                page = with_decay_posteriors(page, list(zip(fits, found, strict=True)))
+            sampled = _of_decays(studies, posterior)
+        page = with_posteriors(page, sampled)
         content = html_of(page) if suffix == ".html" else pdf_of(page)
     write_atomically(path, content)
+
+
+def _of_decays(
+    studies: Sequence[RecordStudy], posterior: Posterior | Sequence[Posterior] | None
+) -> list[Sampled]:
+    if posterior is None:
+        return []
+    found = [posterior] if isinstance(posterior, Posterior) else posterior
+    fits = [decay.fit for study in studies for decay in study.decays]
+    many = len(fits) > 1
+    pairs = zip(fits, found, strict=True)
+    return [of_decay(fit, one, f"{fit.record}: " if many else "") for fit, one in pairs]
 
 
 def _study_of(fit: DecayFit) -> RecordStudy:

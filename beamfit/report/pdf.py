@@ -6,6 +6,7 @@ import io
 import textwrap
 from typing import Any
 
+import numpy as np
 from matplotlib.backends.backend_pdf import PdfPages
 from matplotlib.figure import Figure
 
@@ -50,24 +51,29 @@ class _Pages:
             self.y -= step * LINE
 
     def heading(self, words: str) -> None:
-        self.room(4)
+        self.room(7)
         self.y -= LINE
         self.text(words, size=12, weight="bold")
         self.y -= 1.5 * LINE
 
     def table(self, table: Table) -> None:
-        """Write a table whose columns are as wide as their longest cell."""
-        lines = ([table.header] if table.header else []) + list(table.rows)
-        count = max(len(line) for line in lines)
-        lines = [[*line, *[""] * (count - len(line))] for line in lines]
-        widths = [max(len(line[i]) for line in lines) for i in range(count)]
+        """Write a table, its columns as wide as their longest cells, or less to fit the page."""
+        lines = [*([table.header] if table.header else []), *table.rows]
+        count = max(map(len, lines))
+        longest = [
+            max(len(line[i]) if i < len(line) else 0 for line in lines) for i in range(count)
+        ]
+        widths = 0.078 * np.array(longest) + 0.28
+        tight = min(1.0, (WIDTH - 2 * MARGIN) / widths.sum())
+        ends = tight * np.cumsum(widths)
         for number, cells in enumerate(lines):
             self.room(1)
-            x = 0.0
-            for cell, width in zip(cells, widths, strict=True):
-                bold = "bold" if table.header and number == 0 else "normal"
-                self.text(cell, x=x, size=8.5, weight=bold)
-                x += 0.078 * width + 0.28
+            bold = "bold" if table.header and number == 0 else "normal"
+            for i, cell in enumerate(cells):
+                right = table.numeric and i > 0
+                x = ends[i] - 0.28 * tight if right else ends[i] - widths[i] * tight
+                side = "right" if right else "left"
+                self.text(cell, x=x, size=8.5 * max(tight, 0.6), weight=bold, ha=side)
             self.y -= LINE
         self.y -= 0.3 * LINE
 
@@ -122,6 +128,7 @@ def pdf_of(page: Page) -> bytes:
         pages.heading(table.title)
         if table.note:
             pages.paragraph(table.note, color="0.35")
+            pages.y -= 0.4 * LINE
         if table.rows:
             pages.table(table)
     pages.heading("Provenance")

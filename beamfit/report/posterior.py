@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from importlib.metadata import version
+from typing import NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import FigureBase
 from matplotlib.ticker import MaxNLocator, NullLocator
 
-from beamfit.report.document import BLUE, MANY, Page, Picture, Verdict
-from beamfit.report.emittance import COLOUR
+from beamfit.report.document import BLUE, MANY, Page, Picture, Verdict, legend_below
+from beamfit.report.emittance import COLOUR, setting_axis
 from beamfit.sampling.likelihood import noise_words
 from beamfit.sampling.posterior import Expected, Posterior
 from beamfit.sampling.summary import in_unit, plain_name
@@ -22,7 +23,7 @@ from beamfit.studies.scan.fit import EmittanceFit
 from beamfit.studies.scan.posterior import expected_sizes
 from beamfit.table import Table
 
-__all__ = ["draw_pairs", "with_beam_posterior", "with_decay_posteriors"]
+__all__ = ["Sampled", "draw_pairs", "of_decay", "of_scan", "with_posteriors"]
 
 # Shares of the draws inside the contours of one and two standard deviations in two dimensions.
 INSIDE = (0.393, 0.865)
@@ -38,73 +39,50 @@ INTERVALS = (
 MOST_CORRELATED = 8
 
 
-def with_beam_posterior(page: Page, fit: EmittanceFit, posterior: Posterior) -> Page:
-    """Add a posterior to the page of an emittance fit.
+class Sampled(NamedTuple):
+    """A posterior in a report: its label if there are several, and its pictures."""
+
+    label: str
+    posterior: Posterior
+    pictures: list[Picture]
+
+
+def with_posteriors(page: Page, sampled: Sequence[Sampled]) -> Page:
+    """Add posteriors to a page: intervals after its first table, the rest at its end.
 
     Parameters
     ----------
     page : Page
-        Of the fit.
-    fit : EmittanceFit
-        The fit.
-    posterior : Posterior
-        Of its `sample`.
+        Of the fits.
+    sampled : sequence of Sampled
+        From `of_scan` or `of_decay`.
 
     Returns
     -------
     Page
     """
-    return _added(page, [("", posterior)], _beam_pictures(fit, posterior))
-
-
-def with_decay_posteriors(page: Page, pairs: Sequence[tuple[DecayFit, Posterior]]) -> Page:
-    """Add the posteriors of decays to their page."""
-    pictures = [picture for fit, found in pairs for picture in _decay_pictures(fit, found)]
-    names = [(f"{fit.record}: " if len(pairs) > 1 else "", found) for fit, found in pairs]
-    return _added(page, names, pictures)
-
-
-def _added(page: Page, named: Sequence[tuple[str, Posterior]], pictures: list[Picture]) -> Page:
-    verdicts = [
-        Verdict(found.status, f"{name}posterior {_headline(found)}", found.message)
-        for name, found in named
-    ]
-    intervals = [found.table(f"{name}Posterior", INTERVALS) for name, found in named]
-    further = [
-        table
-        for name, found in named
-        if found.chain.size
-        for table in (
-            _correlations(name, found),
-            _how_sampled(f"{name}How the posterior was sampled", found),
-        )
-    ]
+    verdicts, intervals, further = [], [], []
+    for label, found, _ in sampled:
+        said = "sampled" if found.chain.size else "not sampled"
+        verdicts.append(Verdict(found.status, f"{label}posterior {said}", found.message))
+        intervals.append(found.table(f"{label}Posterior", INTERVALS))
+        if found.chain.size:
+            further.append(_correlations(f"{label}Correlations of the posterior", found))
+            further.append(_how_sampled(f"{label}How the posterior was sampled", found))
     return page._replace(
         verdicts=page.verdicts + verdicts,
         tables=page.tables[:1] + intervals + page.tables[1:] + further,
-        pictures=page.pictures + pictures,
+        pictures=[*page.pictures, *(picture for each in sampled for picture in each.pictures)],
     )
 
 
-def _headline(found: Posterior) -> str:
-    return "sampled" if found.chain.size else "not sampled"
-
-
-def _correlations(name: str, found: Posterior) -> Table:
+def _correlations(title: str, found: Posterior) -> Table:
     names = [each for each in found.shown if not each.endswith(".emittance")]
     names = [each for each in names if "sigma" not in each][:MOST_CORRELATED] or names
-    values = found.correlations(names).values
-    count = len(names)
-    rows = [
-        [
-            f"{i + 1} {plain_name(each)}",
-            *(_coefficient(v) for v in row[: i + 1]),
-            *[""] * (count - i - 1),
-        ]
-        for i, (each, row) in enumerate(zip(names, values, strict=True))
-    ]
-    title = f"{name}Correlations of the posterior"
-    return Table(title, ["", *(str(i + 1) for i in range(count))], rows, numeric=True)
+    rows = []
+    for i, row in enumerate(found.correlations(names).values):
+        rows.append([f"{i + 1} {plain_name(names[i])}", *map(_coefficient, row[: i + 1])])
+    return Table(title, ["", *(str(i + 1) for i in range(len(names)))], rows, numeric=True)
 
 
 def _coefficient(value: float) -> str:
@@ -163,30 +141,24 @@ def draw_pairs(
     if (engine := figure.get_layout_engine()) is not None and hasattr(figure, "savefig"):
         engine.set(w_pad=0.02, h_pad=0.02, wspace=0.02, hspace=0.02)
     grid = figure.subplots(n, n, squeeze=False)
-    for row in range(n):
-        for column in range(n):
-            axes: Axes = grid[row, column]
-            if column > row:
-                axes.set_axis_off()
-                continue
-            if column == row:
-                _single(axes, values[row], colour)
-            else:
-                _pair(axes, values[column], values[row], colour)
-            axes.set_xlim(*_ends(values[column]))
-            axes.xaxis.set_major_locator(MaxNLocator(3, prune="both"))
-            axes.yaxis.set_major_locator(
-                NullLocator() if column == row else MaxNLocator(3, prune="both")
-            )
-            axes.tick_params(labelsize=7)
-            axes.ticklabel_format(useOffset=False)
-            axes.tick_params(axis="x", rotation=40, labelbottom=row == n - 1)
-            if column == 0 and row > 0:
-                axes.set_ylabel(labels[row], fontsize=8)
-            elif column != row:
-                axes.tick_params(axis="y", labelleft=False)
-            if row == n - 1:
-                axes.set_xlabel(labels[column], fontsize=8)
+    for (row, column), axes in np.ndenumerate(grid):
+        if column > row:
+            axes.set_axis_off()
+            continue
+        if column == row:
+            _single(axes, values[row], colour)
+        else:
+            _pair(axes, values[column], values[row], colour)
+            axes.yaxis.set_major_locator(MaxNLocator(3, prune="both"))
+        axes.set_xlim(*_ends(values[column]))
+        axes.xaxis.set_major_locator(MaxNLocator(3, prune="both"))
+        axes.ticklabel_format(useOffset=False)
+        axes.tick_params(labelsize=7, labelleft=column == 0)
+        axes.tick_params(axis="x", rotation=40, labelbottom=row == n - 1)
+        if column == 0 < row:
+            axes.set_ylabel(labels[row], fontsize=8)
+        if row == n - 1:
+            axes.set_xlabel(labels[column], fontsize=8)
     figure.align_labels()
     if title:
         figure.suptitle(title, x=0.01, ha="left", fontsize=11, weight="bold")
@@ -210,6 +182,7 @@ def _single(axes: Axes, values: np.ndarray, colour: str) -> None:
     for place, style in zip(np.quantile(values, (0.16, 0.5, 0.84)), (":", "-", ":"), strict=True):
         axes.axvline(place, color=colour, lw=1.1, ls=style)
     axes.spines["left"].set_visible(False)
+    axes.yaxis.set_major_locator(NullLocator())
 
 
 def _pair(axes: Axes, x: np.ndarray, y: np.ndarray, colour: str) -> None:
@@ -243,58 +216,20 @@ def _smoothed(count: np.ndarray) -> np.ndarray:
     return count
 
 
-def draw_expected_sizes(
-    figure: FigureBase, fit: EmittanceFit, posterior: Posterior, plane: str
-) -> None:
-    """Draw measured sizes less the median model, in the posterior's bands.
-
-    Parameters
-    ----------
-    figure : Figure or SubFigure
-        Where to.
-    fit : EmittanceFit
-        The fit.
-    posterior : Posterior
-        Of its `sample`.
-    plane : str
-        "x" or "y".
-    """
-    p, found = fit[plane].points, expected_sizes(posterior, plane)
-    varied = [n for n, v in p.settings.items() if np.ptp(v) > 0]
-    if len(varied) == 1:
-        at, label = p.settings[varied[0]], f"{varied[0]}, {p.units[varied[0]]}"
-    else:
-        at, label = np.arange(1, len(p.size) + 1), "measurement"
-    axes: Axes = figure.subplots()
-    _bands(axes, at, 1e6 * p.size, 1e6 * p.error, found, 1e6, COLOUR[plane])
-    axes.set_xlabel(label)
-    axes.set_ylabel("size - median model, µm")
-    axes.set_title(f"{plane} plane: what the posterior expects")
-
-
-def draw_expected_current(figure: FigureBase, fit: DecayFit, posterior: Posterior) -> None:
-    """Draw readings less the median model, in the posterior's bands."""
-    record = fit.readings
-    axes: Axes = figure.subplots()
-    found, hours = expected_current(posterior), record.time / 3600.0
-    _bands(axes, hours, record.current, record.error, found, 1.0, BLUE)
-    axes.set_xlabel("time, h")
-    axes.set_ylabel("current - median model, mA")
-    axes.set_title(f"{record.name}: what the posterior expects")
-
-
-def _bands(
-    axes: Axes,
+def _expectations(
+    figure: FigureBase,
+    title: str,
+    labels: tuple[str, str],
     at: np.ndarray,
     measured: np.ndarray,
     error: np.ndarray | None,
-    found: Expected,
+    expect: Callable[[], Expected],
     unit: float,
     colour: str,
 ) -> None:
-    order = np.argsort(at, kind="stable")
-    middle = unit * found.median
-    many = len(at) > MANY
+    """Readings less the median model, in the posterior's bands; `unit` is that of `expect`."""
+    axes, order, found = figure.subplots(), np.argsort(at, kind="stable"), expect()
+    middle, many = unit * found.median, len(at) > MANY
     for ends, alpha, label in (
         (found.reading, 0.12, "95 % of further readings"),
         (found.model, 0.35, "68 % of models"),
@@ -304,69 +239,72 @@ def _bands(
     axes.axhline(0, color="0.6", lw=0.8)
     style = {"fmt": "o", "color": "black", "ms": 2 if many else 4, "capsize": 0 if many else 2}
     axes.errorbar(at, measured - middle, error, lw=0.8, rasterized=many, label="readings", **style)
-    inside = unit * found.reading - middle
-    reach = 1.15 * max(np.max(np.abs(inside)), np.max(np.abs(measured - middle)))
-    axes.set_ylim(-reach, reach)
-    axes.figure.legend(frameon=False, loc="outside lower center", ncols=3)
+    reach = max(np.abs(unit * found.reading - middle).max(), np.abs(measured - middle).max())
+    axes.set(title=f"{title}: what the posterior expects", xlabel=labels[0], ylabel=labels[1])
+    axes.set_ylim(-1.15 * reach, 1.15 * reach)
+    legend_below(figure, axes, 3)
 
 
-def _beam_pictures(fit: EmittanceFit, posterior: Posterior) -> list[Picture]:
-    """Two pictures a sampled plane."""
-    if not posterior.chain.size:
-        return []
-    sampled = [(p.plane, names) for p in fit.planes if (names := _of_plane(posterior, p.plane))]
-    expected = [
-        Picture(
-            f"sizes expected in the {plane} plane",
-            3.4,
-            partial(draw_expected_sizes, fit=fit, posterior=posterior, plane=plane),
+def of_scan(fit: EmittanceFit, posterior: Posterior) -> Sampled:
+    """The posterior of a scan, with two pictures a sampled plane."""
+    expected, pairs = [], []
+    for p in fit.planes:
+        names = _of_plane(posterior, p.plane)
+        if not (names and posterior.chain.size):
+            continue
+        at, words = setting_axis(p)
+        draw = partial(
+            _expectations,
+            title=f"{p.plane} plane",
+            labels=(words, "size - median model, µm"),
+            at=at,
+            measured=1e6 * p.points.size,
+            error=1e6 * p.points.error,
+            expect=partial(expected_sizes, posterior, p.plane),
+            unit=1e6,
+            colour=COLOUR[p.plane],
         )
-        for plane, _ in sampled
-    ]
-    pairs = [
-        Picture(
-            f"numbers of the {plane} plane in pairs",
-            _height(names),
-            partial(
-                draw_pairs,
-                posterior=posterior,
-                names=names,
-                title=f"{plane} plane: posterior",
-                colour=COLOUR[plane],
-            ),
-        )
-        for plane, names in sampled
-    ]
-    return expected + pairs
+        expected.append(Picture(f"sizes expected in the {p.plane} plane", 3.4, draw))
+        words, of_plane = f"numbers of the {p.plane} plane in pairs", f"{p.plane} plane: posterior"
+        pairs.append(_pairs(words, posterior, names, of_plane, COLOUR[p.plane]))
+    return Sampled("", posterior, expected + pairs)
 
 
 def _of_plane(posterior: Posterior, plane: str) -> list[str]:
     wanted = ["normalized_emittance", "beta", "alpha", "error_factor", "outlier_fraction"]
     names = [f"{plane}.{name}" for name in wanted]
     # What was fitted besides the beam, in a scenario.
-    names += [name for name in posterior.names if not name.startswith(("x.", "y.", "beam."))]
+    names += [name for name in posterior.names if not name.startswith(("x.", "y."))]
     return [name for name in names if name in posterior.shown][:MOST_NUMBERS]
 
 
-def _decay_pictures(fit: DecayFit, posterior: Posterior) -> list[Picture]:
-    """Two pictures a sampled decay."""
+def of_decay(fit: DecayFit, posterior: Posterior, label: str = "") -> Sampled:
+    """The posterior of a decay, with two pictures if it was sampled."""
     if not posterior.chain.size:
-        return []
+        return Sampled(label, posterior, [])
     wanted = ("lifetime_mean", "a", "b", "noise", "error_factor", "outlier_fraction")
     names = [name for name in wanted if name in posterior.shown][:MOST_NUMBERS]
-    return [
-        Picture(
-            f"numbers of {fit.record} in pairs",
-            _height(names),
-            partial(draw_pairs, posterior=posterior, names=names, title=f"{fit.record}: posterior"),
-        ),
-        Picture(
-            f"current expected of {fit.record}",
-            3.4,
-            partial(draw_expected_current, fit=fit, posterior=posterior),
-        ),
+    draw = partial(
+        _expectations,
+        title=fit.readings.name,
+        labels=("time, h", "current - median model, mA"),
+        at=fit.readings.time / 3600.0,
+        measured=fit.readings.current,
+        error=fit.readings.error,
+        expect=partial(expected_current, posterior),
+        unit=1.0,
+        colour=BLUE,
+    )
+    words = f"numbers of {fit.record} in pairs"
+    pictures = [
+        _pairs(words, posterior, names, f"{fit.record}: posterior", BLUE),
+        Picture(f"current expected of {fit.record}", 3.4, draw),
     ]
+    return Sampled(label, posterior, pictures)
 
 
-def _height(names: Sequence[str]) -> float:
-    return 1.0 + 1.15 * len(names)
+def _pairs(
+    words: str, posterior: Posterior, names: Sequence[str], title: str, colour: str
+) -> Picture:
+    draw = partial(draw_pairs, posterior=posterior, names=names, title=title, colour=colour)
+    return Picture(words, 1.0 + 1.15 * len(names), draw)

@@ -90,7 +90,8 @@ def test_padding_counts_nowhere(error):
     assert (fit.dof, fit.chi2) == (9, pytest.approx(plain.chi2))
     assert fit.group("r")[3:6] == pytest.approx(plain.group("r")[3:6])
     assert fit.status == plain.status
-    targets = [target_of(f, "inferred", True, None) for f in (fit, plain)]
+    told = {"noise": "inferred", "outliers": True}
+    targets = [target_of(f.problem, f.optimum, **told) for f in (fit, plain)]
     points = targets[0].mode + 0.01 * np.random.default_rng(1).normal(size=(5, 4))
     values = [target.log_probability(points) for target in targets]
     np.testing.assert_allclose(values[0], values[1], rtol=1e-9)

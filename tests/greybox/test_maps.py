@@ -13,6 +13,7 @@ from jax.experimental import checkify
 import beamfit.greybox
 from beamfit.errors import InputError
 from beamfit.greybox.difference import TaylorDifference
+from beamfit.greybox.gains import adjoints, gain, sensitivities
 from beamfit.greybox.implicit import Implicit
 from beamfit.greybox.maps import (
     Affine,
@@ -23,7 +24,6 @@ from beamfit.greybox.maps import (
     Series,
 )
 from beamfit.greybox.mlp import MLP, Gain, dense
-from beamfit.greybox.sensitivity import adjoints, gain, sensitivities
 
 AFFINE = Affine(["a", "b"], ["p", "q"], [[1.0, -2.0], [0.5, 3.0]], [0.1, 0.2])
 FORMULA = Formula(

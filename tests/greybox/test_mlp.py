@@ -8,8 +8,8 @@ import pytest
 
 from beamfit.errors import InputError
 from beamfit.greybox.activations import KINDS, Range, range_of
+from beamfit.greybox.gains import monotone_signs
 from beamfit.greybox.mlp import MLP, Gain, Layer, Port, dense
-from beamfit.greybox.monotone import monotone_signs
 from beamfit.io.network import format_network, parse_network, read_network, write_network
 
 # The report's own example (3.1.3), put together from its fragments; weights are its numbers

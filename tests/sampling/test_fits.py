@@ -6,12 +6,14 @@ import sys
 import types
 from dataclasses import replace
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy import stats
 
 import beamfit
 from beamfit.errors import InputError
+from beamfit.greybox.posterior import Statement, target_of
 from beamfit.greybox.problem import Constraint, Free, Prior, Problem, Record
 from beamfit.greybox.solve import solve
 from beamfit.lifetime.decay import current
@@ -20,7 +22,7 @@ from beamfit.status import Status
 from beamfit.studies.decay.fit import fit_decay
 from beamfit.studies.decay.posterior import expected_current
 from beamfit.studies.decay.record import DecayRecord
-from beamfit.studies.scan.posterior import expected_sizes
+from beamfit.studies.scan.posterior import beam_target, expected_sizes
 
 X = np.linspace(0.0, 1.0, 12)
 Y = 1.0 + 2.0 * X + 0.1 * np.random.default_rng(1).normal(size=12)
@@ -124,6 +126,68 @@ def test_without_errors_the_noise_is_inferred():
     found = solve(linear(error=None)).sample(seed=1)
     assert "error_factor" in found.shown
     assert found["error_factor"].value == pytest.approx(0.065, rel=0.3)
+
+
+def exponential(model, x):
+    return np.ones(12) * jnp.exp(model["log"])
+
+
+def to_level(model):
+    return {"log": jnp.exp(model["log"])}
+
+
+def to_log(model):
+    return {"log": jnp.log(model["log"])}
+
+
+def test_a_change_of_variables_is_flat_in_what_is_sampled():
+    """A level fitted by its logarithm and sampled as itself: a normal distribution, cut at zero."""
+    record = Record("scan", exponential, X, Y, error=0.1)
+    fit = solve(Problem({"log": 0.5}, [Free("log")], [record]))
+    stated = Statement(quoted=to_level, own=to_log, renamed={"log": "level"}, lower={"level": 0.0})
+    target = target_of(fit.problem, fit.optimum, stated, noise="known")
+    assert target.names == ("level",)
+    assert target.mode[0] == pytest.approx(Y.mean())
+    assert target.covariance[0, 0] == pytest.approx(0.01 / 12 * fit.group("scan").scale ** 2)
+    at = Y.mean() + np.array([0.0, 0.05, -0.1])
+    value = target.log_probability(at[:, None])
+    exact = stats.norm(Y.mean(), 0.1 / np.sqrt(12)).logpdf(at)
+    np.testing.assert_allclose(value - value[0], exact - exact[0], rtol=1e-9)
+    assert target.log_probability(np.array([[-1.0]]))[0] == -np.inf
+
+
+def test_records_have_noises_of_their_own_and_anchors_none():
+    one = Record("one", line, X, Y, error=0.1)
+    two = Record("two", line, X, 1.01 * Y, error=0.01)
+    fit = solve(Problem({"slope": 1.0, "offset": 0.0}, [Free("slope"), Free("offset")], [one, two]))
+    groups = target_of(fit.problem, fit.optimum, noise="inferred").groups
+    assert [group.prefix for group in groups] == ["one.", "two."]
+    stated = Statement(labels={"one": "x"}, trusted=["two"])
+    groups = target_of(fit.problem, fit.optimum, stated, noise="inferred", outliers=True).groups
+    assert [tuple(group) for group in groups] == [("x", "inferred", True), ("two", "known", False)]
+
+
+def test_known_transport_is_a_calibration_that_is_known():
+    """The same density of σ, whichever scenario states it."""
+    scan = beamfit.read_quad_scan("measurements/gtf_simulated.csv")
+    line = beamfit.load_lattice("lattices/gtf.toml")
+    known = beam_target(beamfit.fit_emittance(scan, line), noise="known")
+    magnet = line["Q2"].calibration
+    values = {f"Q2.{name}": float(getattr(magnet, name)) for name in ("slope", "intercept")}
+    priors = {name: (value, 1e-6 * abs(value)) for name, value in values.items()}
+    told = beamfit.fit_emittance(scan, line, scenario="calibration", priors=priors)
+    free = beam_target(told, noise="known")
+    assert set(free.names) == {*known.names, *values}
+    spread = np.sqrt(np.diag(known.covariance))
+    draws = known.mode + spread * np.random.default_rng(1).normal(size=(6, 3))
+    at = np.empty((6, len(free.names)))
+    for i, name in enumerate(free.names):
+        at[:, i] = values[name] if name in values else draws[:, known.names.index(name)]
+    one, other = known.log_probability(draws), free.log_probability(at)
+    assert np.isfinite(one).sum() >= 3
+    np.testing.assert_array_equal(np.isfinite(one), np.isfinite(other))
+    inside = np.isfinite(one)
+    np.testing.assert_allclose(np.diff(one[inside]), np.diff(other[inside]), rtol=1e-6)
 
 
 @pytest.fixture(scope="module")

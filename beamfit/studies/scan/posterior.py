@@ -173,12 +173,15 @@ def _stated(
     problem: Problem, fit: Scanned, kept: Sequence[PlaneFit], asked: Sequence[PlaneFit]
 ) -> Statement:
     chosen = kept or asked
-    lines = {r.data.plane: r.data.whole_line for r in problem.records if r.predict is predict_sizes}
-    places = [asked_of(fit.seen, p.plane, lines[p.plane]) for p in chosen]
+    rows = {r.data.plane: r.data for r in problem.records if r.predict is predict_sizes}
+    whole = fit.statement.whole_map
+    lines = {plane: r.line if whole else None for plane, r in rows.items()}
+    places = [asked_of(fit.seen, p.plane, whole, lines[p.plane]) for p in chosen]
     shown = {(p.plane, name): getattr(p, name) for p in chosen for name in TWISS}
     lost = ", ".join(f"{p.plane} plane" for p in asked if p not in kept)
     sigmas = [f"{p.plane}.{name}" for p in chosen for name in SIGMA]
     own = [f"beam.{p.plane}.{name}" for p in chosen for name in CHOLESKY]
+    labels = {f"size {p.plane}": p.plane for p in chosen}
     # As users name them in a calibration: Q2.slope.
     renamed = {name: name.removeprefix("magnets.") for name in problem.names}
     return Statement(
@@ -191,7 +194,8 @@ def _stated(
         renamed=renamed | dict(zip(own, sigmas, strict=True)),
         units={name: QUANTITIES[name.split(".")[1]] for name in sigmas},
         lower={f"{p.plane}.{name}": 0.0 for p in chosen for name in ("sigma11", "sigma22")},
-        labels={f"size {p.plane}": p.plane for p in chosen},
+        labels=labels,
+        trusted=[record.name for record in problem.records if record.name not in labels],
         priors_own=[f"{p}.{name}" for (p, name), q in shown.items() if q and q.error is None],
         hidden=[f"{plane}.{name}" for (plane, name), q in shown.items() if q is None],
         remark=f"Left out: the {lost}, because {OPEN}." if kept and lost else "",

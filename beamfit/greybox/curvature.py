@@ -1,0 +1,162 @@
+"""Does the cost bend down at an optimum of first order, and where would it be lower?
+
+An optimum's Lagrangian does not bend downward along the limits that hold (Nocedal & Wright,
+Numerical Optimization, 2nd ed., section 12.5). Objectives are tested with exact derivatives,
+squares by looking at points beside the end: what their residuals bend is not in their Jacobian.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import jax
+import numpy as np
+
+from beamfit.greybox import assess, problem
+from beamfit.greybox.covariance import null_space, triangle
+from beamfit.greybox.problem import Problem
+
+__all__ = ["STEP", "lagrangian_hessian", "lower_beside", "second_order"]
+
+# A Newton step of a further objective longer than this, in the sizes of the numbers, is no end.
+STEP = 1e-3
+# Bending down by less than this share of the strongest curvature is rounding.
+FLAT = 1e-6
+# Points beside one are so far off in the sizes of the numbers, along so many of the weakest
+# directions of squares, or at random or inward from bounds.
+NEAR, WEAKEST, AROUND = 1e-3, 2, 4
+
+# Lagrangian at points, shape (k, n) to (k,).
+Look = Callable[[np.ndarray], np.ndarray]
+
+
+def lagrangian_hessian(core, theta, sigma, y):
+    """Hessian of the Lagrangian sigma * cost - y @ constraints."""
+
+    def lagrangian(t):
+        return sigma * problem.cost(core, t) - y @ problem.constraints(core, t)
+
+    return jax.hessian(lagrangian)(theta)
+
+
+def second_order(
+    p: Problem, s: assess.State, exact: bool, lagrangian: Look
+) -> tuple[assess.State, np.ndarray | None]:
+    """The second-order test of a point that is an optimum to first order.
+
+    Parameters
+    ----------
+    p : Problem
+        The problem.
+    s : State
+        The point.
+    exact : bool
+        Whether second derivatives may be asked for.
+    lagrangian : callable
+        ``lagrangian(points)``, with the point's multipliers.
+
+    Returns
+    -------
+    assess.State
+        With its `assess.Bend`.
+    array, shape (n,), or None
+        Another point, from where to go on, if the cost falls beside this one.
+    """
+    if not (p.objectives and exact):
+        point = lower_beside(p, s, lagrangian)
+        return s._replace(bend=assess.Bend(None if point is None else point - s.theta)), point
+    bent = _bend(p, s)
+    directions = [] if bent.direction is None else [bent.direction]
+    if bent.flat:
+        # Nothing of second order tells: look around, always at the same points.
+        random = np.random.default_rng(0).normal(size=(AROUND, len(s.theta)))
+        tangent = _tangent(p, s)
+        directions += list(random @ tangent @ tangent.T * s.scale.unit)
+    for direction in directions:
+        point = _along(p, s, direction, lagrangian)
+        if point is not None:
+            return s._replace(bend=bent._replace(direction=direction)), point
+    return s._replace(bend=bent._replace(direction=None)), None
+
+
+def lower_beside(p: Problem, s: assess.State, lagrangian: Look) -> np.ndarray | None:
+    """A lower point beside one where squares end, if the cost bends down there.
+
+    The squares' own curvature never does; what their residuals bend shows first where that is
+    weakest. Numbers at a bound are tried inward, whatever the force that holds them.
+    """
+    tangent, unit = _tangent(p, s), s.scale.unit
+    if not tangent.shape[1]:
+        return None
+    rows = triangle(s.at.residual_jacobian * unit) @ tangent
+    weakest = tangent @ np.linalg.svd(rows, full_matrices=True)[2][-WEAKEST:].T * unit[:, None]
+    low, high = s.bounds.reached
+    inward = np.flatnonzero((low ^ high) & ~p.nuisance & (p.lower < p.upper))[:AROUND]
+    pushes = [
+        np.where(np.arange(len(unit)) == i, unit * (1.0 if low[i] else -1.0), 0) for i in inward
+    ]
+    sides = [(w, -w) for w in weakest.T]
+    every = [s.theta, *(np.clip(s.theta + NEAR * d, p.lower, p.upper)
+                        for d in (*(d for pair in sides for d in pair), *pushes))]  # fmt: skip
+    cost = lagrangian(np.array(every))
+    gain = cost[0] - cost[1:]
+    gain = np.where(np.isfinite(gain), gain, -np.inf)
+    least = 1e-9 * abs(cost[0]) + 1e-12 * p.least_residual**2
+    for i, (w, back) in enumerate(sides):
+        forth, other = gain[2 * i], gain[2 * i + 1]
+        if forth + other > least:
+            return _along(p, s, w if forth > other else back, lagrangian)
+    for i, push in enumerate(pushes):
+        if gain[2 * len(sides) + i] > least:
+            return _along(p, s, push, lagrangian)
+    return None
+
+
+def _along(
+    p: Problem,
+    s: assess.State,
+    direction: np.ndarray,
+    lagrangian: Look,
+) -> np.ndarray | None:
+    """The best of some points along a direction, None if none is better by what counts."""
+    steps = [sign * step for step in (NEAR, 10 * NEAR, 100 * NEAR, 0.5) for sign in (1.0, -1.0)]
+    points = [s.theta, *(np.clip(s.theta + t * direction, p.lower, p.upper) for t in steps)]
+    cost = lagrangian(np.array(points))
+    cost = np.where(np.isfinite(cost), cost, np.inf)
+    best = int(np.argmin(cost))
+    count = max(len(s.at.residual) - len(s.theta), 1)
+    noise = 1.0 if p.errors_known or not p.records else 2 * s.at.cost / count
+    counts = 1e-9 * s.scale.cost if p.objectives else max(1e-3 * noise, 1e-6 * s.at.cost)
+    return points[best] if cost[0] - cost[best] > counts else None
+
+
+def _bend(p: Problem, s: assess.State) -> assess.Bend:
+    """Curvature on the directions that active limits leave, from exact derivatives."""
+    unit, cost = s.scale.unit, s.scale.cost
+    h = np.asarray(p.compiled(lagrangian_hessian)(s.theta, 1.0, s.found.constraints))
+    h = h * np.outer(unit, unit) / cost
+    tangent = _tangent(p, s)
+    if not tangent.shape[1] or not np.all(np.isfinite(h)):
+        return assess.Bend(None)
+    values, vectors = np.linalg.eigh(tangent.T @ h @ tangent)
+    left = s.at.gradient - s.found.bounds - s.at.jacobian.T @ s.found.constraints
+    slope = vectors.T @ (tangent.T @ (left * unit / cost))
+    largest = np.max(np.abs(values))
+    steep = values > FLAT * largest
+    newton = np.max(np.abs(slope[steep] / values[steep]), initial=0.0)
+    down = tangent @ vectors[:, 0] * unit if values[0] < -FLAT * max(largest, FLAT) else None
+    return assess.Bend(down, float(newton), not steep.all() or largest < assess.TOLERANCE)
+
+
+def _tangent(p: Problem, s: assess.State) -> np.ndarray:
+    """Directions, in the sizes of the numbers, that keep to the limits held by a force."""
+    unit = s.scale.unit
+    size = assess.gradient_size(p, s.at, s.scale)
+    held = (p.lower == p.upper) | (np.abs(s.found.bounds) > assess.TOLERANCE * size)
+    equal = p.constraint_lower == p.constraint_upper
+    pulls = np.abs(s.found.constraints) * np.linalg.norm(s.at.jacobian / size, axis=1)
+    rows = np.vstack(
+        [np.eye(len(unit))[held], s.at.jacobian[equal | (pulls > assess.TOLERANCE)] * unit]
+    )
+    length = np.linalg.norm(rows, axis=1, keepdims=True)
+    return null_space(rows / np.where(length > 0, length, 1.0))
