@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 from beamfit.status import Status
 
-__all__ = ["Quantity", "Status", "display_unit", "finite"]
+__all__ = ["Quantity", "Status", "display_unit"]
 
 _PREFIXES = ((1.0, ""), (1e-3, "m"), (1e-6, "µ"), (1e-9, "n"), (1e-12, "p"))
 
@@ -100,12 +98,3 @@ def display_unit(size: float, unit: str) -> tuple[float, str]:
         return 1.0, "" if unit == "1" else unit
     factor, prefix = next((p for p in _PREFIXES if size >= 0.1 * p[0]), _PREFIXES[-1])
     return factor, prefix + unit
-
-
-def finite(value: Any) -> Any:
-    """Replace numbers JSON cannot hold by null."""
-    if isinstance(value, Mapping):
-        return {k: finite(v) for k, v in value.items()}
-    if isinstance(value, list | tuple):
-        return [finite(v) for v in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value

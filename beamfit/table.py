@@ -129,6 +129,7 @@ def json_of(value: Any) -> Any:
 
     Examples
     --------
+    >>> import numpy as np
     >>> json_of({"status": Status.converged, "size": np.array([1.0, np.nan])})
     {'status': 'converged', 'size': [1.0, None]}
     """

@@ -65,3 +65,27 @@ def test_what_the_user_has_set_stands(tmp_path):
     off = "jax.config.update('jax_enable_compilation_cache', False)"
     assert run(off, XDG_CACHE_HOME=str(tmp_path))[1:3] == [0, 0]
     assert not (tmp_path / "beamfit").exists() or not list((tmp_path / "beamfit").iterdir())
+
+
+ANSWER = """
+import sys
+import beamfit
+scan = beamfit.read_quad_scan("measurements/lcls_otr2.csv")
+print(beamfit.fit_emittance(scan, beamfit.load_lattice("lattices/lcls_otr2.toml")))
+print(beamfit.fit_decay(beamfit.read_decay_record("measurements/aps_1999_decay.csv")))
+sys.stderr.write(",".join(sorted(set("{heavy}".split()) & set(sys.modules))))
+"""
+HEAVY = "matplotlib h5py rich scipy.stats click jinja2 emcee pandas at unopy"
+
+
+def test_a_first_answer_loads_nothing_that_it_does_not_need(root):
+    done = subprocess.run(
+        [sys.executable, "-c", ANSWER.format(heavy=HEAVY)],
+        cwd=root,
+        env=os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert "normalised emittance" in done.stdout
+    assert done.stderr == ""

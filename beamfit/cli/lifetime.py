@@ -15,6 +15,7 @@ from beamfit.io.result import results_text
 
 if TYPE_CHECKING:
     from beamfit.cli.show import Terminal
+    from beamfit.sampling.posterior import Posterior
     from beamfit.studies.decay.loss_budget import Machine
     from beamfit.studies.decay.shift import Shift
     from beamfit.studies.decay.study import Decay, RecordStudy
@@ -99,18 +100,8 @@ def lifetime(
             result["posterior"] = posterior
         further = {} if shift is None else {"study": shift}
         click.echo(results_text(results, inputs, command_line(), **further))
-        return
-
-    from beamfit.cli.show import Terminal
-
-    terminal = Terminal()
-    for each in studies:
-        _show(terminal, each)
-    for decay, posterior in zip(decays, posteriors or (), strict=False):
-        terminal.posterior(f"Posterior of {decay.fit.record}", posterior)
-    if shift is not None:
-        _show_shift(terminal, shift)
-    terminal.report(report)
+    else:
+        _show(studies, posteriors, shift, report)
 
 
 def _check_study(study: bool, ring: str | None, network: str | None) -> None:
@@ -135,7 +126,27 @@ def _shift(decays: list[Decay], machine: Machine, network: str | None) -> Shift:
     return study_shift(decays, machine, network=network and Network(network))
 
 
-def _show(terminal: Terminal, study: RecordStudy) -> None:
+def _show(
+    studies: tuple[RecordStudy, ...],
+    posteriors: list[Posterior] | None,
+    shift: Shift | None,
+    report: str | None,
+) -> None:
+    """Show every record, and what was drawn and found of all together."""
+    from beamfit.cli.show import Terminal
+
+    terminal = Terminal()
+    for each in studies:
+        _show_record(terminal, each)
+    names = [decay.fit.record for study in studies for decay in study.decays]
+    for name, posterior in zip(names, posteriors or (), strict=False):
+        terminal.posterior(f"Posterior of {name}", posterior)
+    if shift is not None:
+        _show_shift(terminal, shift)
+    terminal.report(report)
+
+
+def _show_record(terminal: Terminal, study: RecordStudy) -> None:
     """Lay out a record: what was cut away, and every decay with its verdict and budget."""
     from beamfit.quantity import Status
     from beamfit.studies.decay.tables import (

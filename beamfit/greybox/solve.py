@@ -6,8 +6,6 @@ import time
 from collections.abc import Iterable
 
 import numpy as np
-from rich.console import Console
-from rich.progress import track
 
 from beamfit.errors import InputError
 from beamfit.greybox import assess, curvature
@@ -132,6 +130,9 @@ def _check(starts: int, iterations: int, hessian: str, seconds: float | None) ->
 def _bar(points: np.ndarray, progress: bool) -> Iterable:
     if not progress:
         return points
+    from rich.console import Console  # a tenth of a second that only a bar should cost
+    from rich.progress import track
+
     return track(points, "fitting", console=Console(stderr=True), transient=True)
 
 

@@ -94,6 +94,11 @@ class Losses(
         """All that is proportional to the current, 1/s."""
         return sum(self[len(QUADRATIC) :])
 
+    @property
+    def units(self) -> tuple[str, ...]:
+        """Unit of each part."""
+        return ("1/(mA s)",) * len(QUADRATIC) + ("1/s",) * len(LINEAR)
+
     def rates(self, current: float) -> dict[str, Array]:
         """Loss rate of each mechanism at a current in mA, 1/s."""
         found = {m.name: 0.0 for m in MECHANISMS}

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -13,6 +11,7 @@ from jax import Array
 from jax.typing import ArrayLike
 
 from beamfit.errors import InputError
+from beamfit.optics.arrays import value
 from beamfit.optics.particle import ELECTRON_MASS, beta_gamma
 
 __all__ = ["BeamMatrix", "Twiss"]
@@ -36,8 +35,7 @@ class Twiss(NamedTuple):
     gamma: Array
 
 
-@partial(jax.tree_util.register_dataclass, data_fields=["l11", "l21", "l22"], meta_fields=[])
-@dataclass(frozen=True)
+@value()
 class BeamMatrix:
     """σ = L Lᵀ of one plane, stored as its Cholesky factor.
 
@@ -94,9 +92,9 @@ class BeamMatrix:
         InputError
             If ε or β is known and not positive.
         """
-        for name, value in (("emittance", emittance), ("beta", beta)):
-            if not isinstance(value, jax.core.Tracer) and not np.all(np.asarray(value) > 0):
-                raise InputError(f"{name} = {value}", "a positive number")
+        for name, given in (("emittance", emittance), ("beta", beta)):
+            if not isinstance(given, jax.core.Tracer) and not np.all(np.asarray(given) > 0):
+                raise InputError(f"{name} = {given}", "a positive number")
         root = jnp.sqrt(emittance / beta)
         return cls(beta * root, -alpha * root, root)
 

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from dataclasses import replace
+from functools import cached_property
 from itertools import groupby
 from typing import NamedTuple
 
-import jax
 from jax.typing import ArrayLike
 
 from beamfit.errors import InputError, nearest
+from beamfit.optics.arrays import value
 from beamfit.optics.elements import IDENTITY, Element, Screen, TransferMatrix
 from beamfit.optics.particle import ELECTRON_MASS
 from beamfit.optics.sections import Section, Series, in_series
@@ -35,12 +35,7 @@ class Design(NamedTuple):
     y: tuple[float, float] | None = None
 
 
-@partial(
-    jax.tree_util.register_dataclass,
-    data_fields=["elements", "energy", "energy_spread"],
-    meta_fields=["name", "mass", "design"],
-)
-@dataclass(frozen=True)
+@value("name", "mass", "design")
 class Beamline:
     """Elements in the order the beam meets them.
 
@@ -279,18 +274,18 @@ class Beamline:
                 return part.multiplied()
             return Section(part.matrix(None, energy).planes, part.length)
 
-        return replace(self, elements=self._parts(keep, one))
+        return self._with_parts(keep, one)
 
     def stored_by_kind(self, keep: Iterable[str]) -> Beamline:
         """Return the line with everything between some elements stored by kind, as arrays.
 
         Its derivatives by all its numbers are then a few arrays, too.
         """
-        return replace(self, elements=self._parts(keep, lambda part: part))
+        return self._with_parts(keep, lambda part: part)
 
-    def _parts(self, keep: Iterable[str], one: Callable) -> tuple:
-        """The elements of some names, and what ``one`` makes of the series between them."""
+    def _with_parts(self, keep: Iterable[str], one: Callable) -> Beamline:
+        """Elements of some names stay; ``one`` says what takes the place of a series between."""
         keep, parts = frozenset(keep), []
         for kept, run in groupby(self.elements, lambda e: e.name in keep):
             parts.extend(run if kept else [one(s) for s in [in_series(run)] if s.kinds])
-        return tuple(parts)
+        return replace(self, elements=tuple(parts))

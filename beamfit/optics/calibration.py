@@ -6,15 +6,12 @@ Each calibration is a frozen value with ``unit`` (the word a scan's column heade
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from functools import partial
 from typing import ClassVar
 
-import jax
 from jax import Array
 from jax.typing import ArrayLike
 
-from beamfit.optics.focusing import array_module
+from beamfit.optics.arrays import array_module, value
 from beamfit.optics.particle import ELECTRON_MASS, rigidity
 
 __all__ = [
@@ -32,8 +29,7 @@ SETTING_UNITS = {"A": "A", "kG": "kG", "k1": "1/m²", "k1l": "1/m"}
 """How the unit of a setting is written for people."""
 
 
-@partial(jax.tree_util.register_dataclass, data_fields=["slope", "intercept"], meta_fields=[])
-@dataclass(frozen=True)
+@value()
 class SlopeIntercept:
     """Focusing strength linear in the current: k1 = (slope · I + intercept)/E.
 
@@ -62,12 +58,7 @@ class SlopeIntercept:
         return (self.slope * setting + self.intercept) / energy * length
 
 
-@partial(
-    jax.tree_util.register_dataclass,
-    data_fields=["coefficients"],
-    meta_fields=["signed_intercept", "mass"],
-)
-@dataclass(frozen=True)
+@value("signed_intercept", "mass")
 class CurrentPolynomial:
     """Gradient as a polynomial of the current, from a magnetic measurement.
 
@@ -108,8 +99,7 @@ class CurrentPolynomial:
         return self.gradient(setting) * length / rigidity(energy, self.mass)
 
 
-@partial(jax.tree_util.register_dataclass, data_fields=["scale"], meta_fields=["mass"])
-@dataclass(frozen=True)
+@value("mass")
 class IntegratedGradient:
     """The setting is the integrated gradient in kG; positive focuses x.
 
@@ -135,8 +125,7 @@ class IntegratedGradient:
         return 0.1 * self.scale * setting / rigidity(energy, self.mass)
 
 
-@partial(jax.tree_util.register_dataclass, data_fields=["scale"], meta_fields=[])
-@dataclass(frozen=True)
+@value()
 class FocusingStrength:
     """The setting is k1 itself, in 1/m²; positive focuses x.
 
@@ -154,8 +143,7 @@ class FocusingStrength:
         return self.scale * setting * length
 
 
-@partial(jax.tree_util.register_dataclass, data_fields=["scale"], meta_fields=[])
-@dataclass(frozen=True)
+@value()
 class IntegratedStrength:
     """The setting is the inverse focal length k1·L of a thin lens, in 1/m.
 

@@ -7,17 +7,15 @@ one shape: it then stands for as many elements, and its matrix has that shape be
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from functools import partial
 from typing import ClassVar
 
-import jax
 import numpy as np
 from jax import Array
 from jax.typing import ArrayLike
 
+from beamfit.optics.arrays import array_module, floats, value
 from beamfit.optics.calibration import Calibration, FocusingStrength, IntegratedStrength
-from beamfit.optics.focusing import array_module, focusing
+from beamfit.optics.focusing import focusing
 
 __all__ = [
     "IDENTITY",
@@ -35,8 +33,7 @@ __all__ = [
 _BY_K1, _BY_K1L = FocusingStrength(), IntegratedStrength()
 
 
-@partial(jax.tree_util.register_dataclass, data_fields=["planes"], meta_fields=[])
-@dataclass(frozen=True)
+@value()
 class TransferMatrix:
     """Linear map of both planes, uncoupled, with dispersion.
 
@@ -85,26 +82,22 @@ IDENTITY = TransferMatrix(np.stack([np.eye(3)] * 2))
 def _thick(k: ArrayLike, length: ArrayLike, curvature: ArrayLike = 0.0) -> Array:
     """Constant focusing k (1/m²) and curvature h (1/m): u'' + k u = h δ, for any shape of k."""
     c, s, d = (f[..., None, None] for f in focusing(k, length))
-    xp = array_module(k, curvature)
-    k, h = (xp.asarray(v, float)[..., None, None] for v in (k, curvature))
+    k, h = (floats(v)[..., None, None] for v in (k, curvature))
     straight = c * _COSINE + s * _SINE - k * s * _SLOPE + _LAST
     return straight + h * (d * _DISPERSION + s * _ANGLE)
 
 
 def _kick(strength: ArrayLike) -> Array:
     """A thin lens: u' changes by -strength · u, strength in 1/m, for any shape."""
-    strength = array_module(strength).asarray(strength, float)
-    return np.eye(3) - strength[..., None, None] * _SLOPE
+    return np.eye(3) - floats(strength)[..., None, None] * _SLOPE
 
 
 def _both(strength: ArrayLike) -> Array:
     """A strength in x and its opposite in y, along a last axis."""
-    strength = array_module(strength).asarray(strength, float)
-    return strength[..., None] * np.array([1.0, -1.0])
+    return floats(strength)[..., None] * np.array([1.0, -1.0])
 
 
-@partial(jax.tree_util.register_dataclass, data_fields=["length"], meta_fields=["name"])
-@dataclass(frozen=True)
+@value("name")
 class Drift:
     """A field-free length in m (report eq. 21).
 
@@ -120,16 +113,10 @@ class Drift:
 
     def matrix(self, setting: ArrayLike | None = None, energy: ArrayLike = 1.0) -> TransferMatrix:
         """Transfer matrix of the drift, the same in both planes."""
-        length = array_module(self.length).asarray(self.length, float)
-        return TransferMatrix(IDENTITY.planes + length[..., None, None, None] * _SINE)
+        return TransferMatrix(IDENTITY.planes + floats(self.length)[..., None, None, None] * _SINE)
 
 
-@partial(
-    jax.tree_util.register_dataclass,
-    data_fields=["length", "setting", "calibration"],
-    meta_fields=["name"],
-)
-@dataclass(frozen=True)
+@value("name")
 class Quadrupole:
     """A quadrupole of constant gradient (report eqs 20 and 22).
 
@@ -159,21 +146,15 @@ class Quadrupole:
     def k1(self, setting: ArrayLike | None = None, energy: ArrayLike = 1.0) -> Array:
         """Focusing strength in 1/m², positive in x, at a setting and an energy in MeV."""
         setting = self.setting if setting is None else setting
-        strength = self.calibration.k1l(setting, self.length, energy)
-        return array_module(strength).asarray(strength, float) / self.length
+        return floats(self.calibration.k1l(setting, self.length, energy)) / self.length
 
     def matrix(self, setting: ArrayLike | None = None, energy: ArrayLike = 1.0) -> TransferMatrix:
         """Transfer matrix at a setting (the element's own if None) and an energy in MeV."""
-        length = array_module(self.length).asarray(self.length, float)
-        return TransferMatrix(_thick(_both(self.k1(setting, energy)), length[..., None]))
+        both = _both(self.k1(setting, energy))
+        return TransferMatrix(_thick(both, floats(self.length)[..., None]))
 
 
-@partial(
-    jax.tree_util.register_dataclass,
-    data_fields=["setting", "calibration"],
-    meta_fields=["name"],
-)
-@dataclass(frozen=True)
+@value("name")
 class ThinLens:
     """A quadrupole of no length: u' changes by -k1l · u in x, +k1l · u in y.
 
@@ -248,12 +229,7 @@ def hard_edge_slice(
     return face + at_exit, at_exit
 
 
-@partial(
-    jax.tree_util.register_dataclass,
-    data_fields=["radius", "angle", "entrance_edge", "exit_edge", "energy_offset", "k1"],
-    meta_fields=["name", "bend_plane"],
-)
-@dataclass(frozen=True)
+@value("name", "bend_plane")
 class SectorDipole:
     """A hard-edged sector dipole with pole-face rotations, in both planes.
 
@@ -309,11 +285,9 @@ class SectorDipole:
 
     def matrix(self, setting: ArrayLike | None = None, energy: ArrayLike = 1.0) -> TransferMatrix:
         """Transfer matrix about the slice's own orbit; setting and energy do not enter."""
-        numbers = (self.radius, self.angle, self.entrance_edge, self.exit_edge, self.energy_offset)
-        xp = array_module(*numbers, self.k1)
-        radius, angle, entrance, leaving, offset, k1 = (
-            xp.asarray(v, float)[..., None] for v in (*numbers, self.k1)
-        )
+        parts = (self.radius, self.angle, self.entrance_edge, self.exit_edge, self.energy_offset)
+        radius, angle, entrance, leaving, offset = (floats(v)[..., None] for v in parts)
+        xp = array_module(*parts)
         ratio = 1.0 + offset
         angle, leaving = hard_edge_slice(angle, leaving, ratio)
         radius = radius * ratio
@@ -322,16 +296,13 @@ class SectorDipole:
         sign = np.array([1.0, -1.0] if self.bend_plane == "x" else [-1.0, 1.0])
         bent = sign > 0
         body = _thick(
-            xp.where(bent, h**2, 0.0) + np.array([1.0, -1.0]) * k1 / ratio,
-            length,
-            xp.where(bent, h, 0.0),
+            xp.where(bent, h**2, 0.0) + _both(self.k1) / ratio, length, xp.where(bent, h, 0.0)
         )
         entry, leave = (_kick(-sign * h * xp.tan(edge)) for edge in (entrance, leaving))
         return TransferMatrix(leave @ body @ entry)
 
 
-@partial(jax.tree_util.register_dataclass, data_fields=[], meta_fields=["name"])
-@dataclass(frozen=True)
+@value("name")
 class Marker:
     """A named place of no length.
 
@@ -350,8 +321,7 @@ class Marker:
         return IDENTITY
 
 
-@partial(jax.tree_util.register_dataclass, data_fields=["resolution"], meta_fields=["name"])
-@dataclass(frozen=True)
+@value("name")
 class Screen:
     """A place where the beam size is measured.
 

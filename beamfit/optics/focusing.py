@@ -7,15 +7,15 @@ here (a quadrupole at zero strength is a drift) holds for all of them.
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from jax.typing import ArrayLike
 
-__all__ = ["Focusing", "array_module", "focusing"]
+from beamfit.optics.arrays import array_module, floats
+
+__all__ = ["Focusing", "focusing"]
 
 # Below |k L²| = 0.5 the series is used; nine terms leave out less than 1e-18.
 _NEAR, _TERMS = 0.5, 9
@@ -40,17 +40,6 @@ class Focusing(NamedTuple):
     cosine: Array
     sine: Array
     dispersion: Array
-
-
-def array_module(*values: Any) -> Any:
-    """JAX's numpy where a value is JAX's, else numpy: plain numbers need no compiling.
-
-    Examples
-    --------
-    >>> array_module(1.0, jnp.ones(2)).__name__, array_module(1.0, np.ones(2)).__name__
-    ('jax.numpy', 'numpy')
-    """
-    return jnp if any(isinstance(v, jax.Array) for v in values) else np
 
 
 def focusing(k: ArrayLike, length: ArrayLike) -> Focusing:
@@ -81,7 +70,7 @@ def focusing(k: ArrayLike, length: ArrayLike) -> Focusing:
     [1.0, 2.0, 2.0]
     """
     xp = array_module(k, length)
-    k, length = xp.asarray(k, float), xp.asarray(length, float)
+    k, length = floats(k), floats(length)
     x = k * length**2
     near = abs(x) < _NEAR
     series = _series(xp.where(near, x, 0.0))

@@ -7,8 +7,7 @@ number of elements nor with their order.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from functools import partial
+from dataclasses import replace
 from typing import Any, ClassVar
 
 import jax
@@ -16,14 +15,13 @@ import numpy as np
 from jax import Array
 from jax.typing import ArrayLike
 
+from beamfit.optics.arrays import array_module, value
 from beamfit.optics.elements import IDENTITY, Marker, Screen, TransferMatrix
-from beamfit.optics.focusing import array_module
 
 __all__ = ["Section", "Series", "in_series"]
 
 
-@partial(jax.tree_util.register_dataclass, data_fields=["planes", "length"], meta_fields=["name"])
-@dataclass(frozen=True)
+@value("name")
 class Section:
     """A part of a line that is known as a whole: its transfer matrix and its length in m.
 
@@ -43,12 +41,7 @@ class Section:
         return TransferMatrix(self.planes)
 
 
-@partial(
-    jax.tree_util.register_dataclass,
-    data_fields=["kinds", "order", "length"],
-    meta_fields=["name"],
-)
-@dataclass(frozen=True)
+@value("name")
 class Series:
     """Elements in series, stored by kind.
 
@@ -82,11 +75,8 @@ class Series:
             return IDENTITY
         planes = [_planes(k, energy) for k in self.kinds]
         traced = [isinstance(p, jax.Array) for p in planes]
-        if all(traced):
-            known, order = [], self.order
-        else:
-            known, order = _multiplied(planes, traced, self.order)
-        every = [*known, *(p for p, t in zip(planes, traced, strict=True) if t)]
+        every, order = _multiplied(planes, traced, self.order)
+        every += [p for p, t in zip(planes, traced, strict=True) if t]
         return TransferMatrix(_product(array_module(*every).concatenate(every)[order]))
 
     def multiplied(self) -> Section | Series:
@@ -103,11 +93,9 @@ class Series:
         feels = [bool(np.isnan(p).any()) for p in planes]
         if not any(feels):
             return Section(self.matrix().planes, self.length)
-        if all(feels):
-            return self
-        (known,), order = _multiplied(planes, feels, self.order)
+        products, order = _multiplied(planes, feels, self.order)
         kept = (k for k, f in zip(self.kinds, feels, strict=True) if f)
-        return Series((Section(known), *kept), order, self.length)
+        return Series((*map(Section, products), *kept), order, self.length)
 
 
 def in_series(elements: Iterable[Any], settings: Mapping[str, ArrayLike] | None = None) -> Series:
@@ -153,22 +141,17 @@ def _multiplied(
 
     Returns the products, and the order of products and elements apart, products counted first.
     """
-    sizes = [len(p) for p in planes]
-    stays = np.repeat(apart, sizes)
+    if all(apart):
+        return [], order
     known = np.concatenate([p for p, a in zip(planes, apart, strict=True) if not a])
+    stays = np.repeat(apart, [len(p) for p in planes])
     # Where an element stands among those of its sort, known or apart.
-    place = np.where(stays, np.cumsum(stays), np.cumsum(~stays)) - 1
-    stays, place = stays[order], place[order]
-    runs = np.split(np.arange(len(order)), np.flatnonzero(np.diff(stays)) + 1)
-    products = [_product(known[place[run]]) for run in runs if not stays[run[0]]]
-    merged, count = [], 0
-    for run in runs:
-        if stays[run[0]]:
-            merged.append(len(products) + place[run])
-        else:
-            merged.append([count])
-            count += 1
-    return [np.stack(products)], np.concatenate(merged)
+    place = (np.where(stays, np.cumsum(stays), np.cumsum(~stays)) - 1)[order]
+    stays = stays[order]
+    first = ~stays & np.append(True, stays[:-1])  # of each run
+    runs = np.split(known[place[~stays]], np.flatnonzero(first[~stays])[1:])
+    merged = np.where(stays, len(runs) + place, np.cumsum(first) - 1)
+    return [np.stack([_product(run) for run in runs])], merged[stays | first]
 
 
 def _product(planes: Array) -> Array:

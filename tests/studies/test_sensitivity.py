@@ -7,7 +7,12 @@ import pytest
 
 import beamfit
 from beamfit.optics.elements import Drift
-from beamfit.studies.scan.sensitivity import range_sensitivity, systematics
+from beamfit.studies.scan.sensitivity import (
+    MOST_CAUSES,
+    budget_rows,
+    range_sensitivity,
+    systematics,
+)
 from tests.studies.conftest import scan_of
 
 
@@ -49,6 +54,28 @@ def test_budget_is_the_slope_of_a_refit(gtf, gtf_sizes, method):
             ends = [getattr(f, attribute).value for f in (up, down)]
             slope = np.log(ends[0] / ends[1]) / (2 * h)
             assert got == pytest.approx(0.01 * slope, rel=1e-5), (cause, attribute)
+
+
+def test_budget_of_a_drift_in_parts_is_that_of_the_whole(gtf, gtf_sizes):
+    """1 cm more is 1 cm more in whichever of sixty parts; the table shows the largest."""
+    currents, _, sizes = gtf_sizes
+    parts = tuple(Drift(f"D2.{i}", gtf["D2"].length / 60) for i in range(60))
+    at = gtf.elements.index(gtf["D2"])
+    long = replace(gtf, elements=(*gtf.elements[:at], *parts, *gtf.elements[at + 1 :]))
+    scan = scan_of("Q2", "A", currents, sizes, seed=4)
+    fit = beamfit.fit_emittance(scan, long)
+    short = {c.cause: c for c in systematics(beamfit.fit_emittance(scan, gtf), "x")}
+    whole = short.pop("drift D2 +1 cm")
+    changes = {c.cause: c for c in systematics(fit, "x")}
+    for part in parts:
+        change = changes.pop(f"drift {part.name} +1 cm")
+        assert change.emittance == pytest.approx(whole.emittance, rel=1e-9)
+    assert list(changes) == list(short)
+    for cause, change in changes.items():
+        assert change.emittance == pytest.approx(short[cause].emittance, rel=1e-9, abs=1e-15)
+    *shown, others = budget_rows(fit)
+    assert len(shown) == MOST_CAUSES
+    assert others[0] == f"{len(short) + 60 - MOST_CAUSES} other causes, each"
 
 
 def test_emittance_is_one_over_the_slope(gtf, gtf_sizes):

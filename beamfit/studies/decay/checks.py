@@ -219,9 +219,10 @@ class ConstantA:
     message : str
         The verdict in a sentence.
     exponent : Quantity
-        s in a(I) proportional to I^s: 0 for constant a, -1/3 for a strongly lengthening bunch.
+        s in a(I) proportional to I^s: 0 for constant a, -1/3 for a strongly lengthening bunch; NaN
+        if the record cannot tell, for the search then ends anywhere.
     p_value : float
-        Probability of a worse contradiction if a is constant.
+        Probability of a worse contradiction if a is constant; NaN if the record cannot tell.
     """
 
     status: Status
@@ -302,8 +303,8 @@ def constant_a_test(record: DecayRecord) -> ConstantA:
     exponent = Quantity(found, error, "1", raw)
     if not power.converged or not error < 1 / 3:
         message = "The record cannot tell a constant a from one that depends on the current"
-        unknown = Quantity(found, None, "1")
-        return ConstantA(Status.unidentified, f"{message}: record longer.", unknown, chance)
+        unknown = Quantity(math.nan, None, "1")
+        return ConstantA(Status.unidentified, f"{message}: record longer.", unknown, math.nan)
     if chance < REJECTED:
         message = (
             f"A constant a is rejected (p = {max(chance, 1e-300):.2g}): a goes as "

@@ -341,10 +341,9 @@ def _judged(record: DecayRecord, solution: Solution, shaped: bool = False) -> De
         expected = "a decay; cut out refills with split_record"
         found = f"a current that rises, {first:.6g} to {last:.6g} mA"
         raise InputError(found, expected, path=record.name, column="current")
-    separability = evidence.separability
     known = bool(solution.converged)
-    apart = known and separability.separable
-    finding = finding_of(evidence, separability)
+    apart = known and evidence.separability.separable
+    finding = finding_of(evidence)
     return DecayFit(
         record=record.name,
         status=finding.status,
@@ -361,7 +360,7 @@ def _judged(record: DecayRecord, solution: Solution, shaped: bool = False) -> De
         rms_residual=float(np.sqrt(np.mean(evidence.residuals**2))),
         noise_inferred=record.error is None,
         residuals=evidence.residuals,
-        identifiability=separability,
+        identifiability=evidence.separability,
         readings=record,
         shaped=shaped,
     )

@@ -12,8 +12,9 @@ from beamfit.lifetime.losses import MECHANISMS, Losses, loss_coefficients
 from beamfit.lifetime.ring import Operation, Ring
 from beamfit.quantity import Quantity
 from beamfit.studies.decay.record import DecayRecord
+from beamfit.table import json_of
 
-__all__ = ["Budget", "Machine", "budget", "operation_during"]
+__all__ = ["Budget", "Machine", "budget", "operation_during", "settings_json"]
 
 
 class Machine(NamedTuple):
@@ -53,21 +54,26 @@ class Budget(NamedTuple):
 
     def to_json(self) -> dict[str, Any]:
         """Return the coefficients as quantities without errors, and the settings in SI."""
-        parts = self.losses._asdict() | {"a": self.losses.a, "b": self.losses.b}
-        units = {"a": "1/(mA s)", "b": "1/s"}
-        rows = {
-            name: Quantity(float(value), None, units[name[0]]).to_json()
-            for name, value in parts.items()
-        }
-        rows["lifetime_mean"] = Quantity(self.lifetime, None, "h").to_json()
-        settings = {
-            "rf_voltage_V": float(self.operation.rf_voltage),
-            "scraper_y_m": float(self.operation.scraper_y),
-            "bunches": float(self.operation.bunches),
+        parts = {"a": self.losses.a, "b": self.losses.b}
+        units = dict.fromkeys(parts, "1/(mA s)") | {"b": "1/s"}
+        of_mechanisms = zip(self.losses._asdict().items(), self.losses.units, strict=True)
+        rows = {name: Quantity(value, None, unit) for (name, value), unit in of_mechanisms}
+        rows |= {name: Quantity(value, None, units[name]) for name, value in parts.items()}
+        rows["lifetime_mean"] = Quantity(self.lifetime, None, "h")
+        pressure = {
             "pressure_base_Pa": float(self.operation.pressure_base),
             "pressure_slope_Pa_per_mA": float(self.operation.pressure_slope),
         }
-        return rows | {"operation": settings}
+        return json_of(rows | {"operation": settings_json(self.operation) | pressure})
+
+
+def settings_json(operation: Operation) -> dict[str, float]:
+    """The settings of an operation, with their units."""
+    return {
+        "rf_voltage_V": float(operation.rf_voltage),
+        "scraper_y_m": float(operation.scraper_y),
+        "bunches": float(operation.bunches),
+    }
 
 
 def operation_during(record: DecayRecord, machine: Machine) -> Operation:

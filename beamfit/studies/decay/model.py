@@ -13,7 +13,7 @@ import numpy as np
 from jax import Array
 
 from beamfit.greybox.descend import descend_one
-from beamfit.greybox.problem import Free, Prior, Problem, Record
+from beamfit.greybox.problem import Free, Prior, Problem, Record, padded_length
 from beamfit.lifetime.decay import current, current_by_rate
 from beamfit.studies.decay.record import DecayRecord
 
@@ -39,6 +39,8 @@ RECORD = "decay"
 # Physics allows 0 to 1, so 30 moves no value that the record determines (by 4e-5 of it where the
 # verdict turns, nothing beyond); it keeps records too short for their noise from running away.
 PRIOR_WIDTH = 30.0
+# Where the search for the plain law may rest: one step of Gauss and Newton ends it at rounding.
+NEAR = 1e-8
 # Most steps with a shape: in a valley without a bottom the record cannot tell anyway.
 FEW_STEPS = 100
 
@@ -63,20 +65,8 @@ class Moments(NamedTuple):
 
 
 class Physical(NamedTuple):
-    """What one decay says, in the units of the record (s and mA).
-
-    Attributes
-    ----------
-    i0 : float
-        Current at the first time, mA.
-    a, b : float
-        Loss coefficients, 1/(mA s) and 1/s.
-    rate_start, rate_end, rate_mean : float
-        Relative loss rate at the first and last time and at the mean current, 1/s.
-    share : float
-        Share of a in the loss at the mean current: 1 all Touschek-like, 0 all gas-like.
-    exponent : float
-        Power of the current by which a departs from its shape.
+    """What one decay says, in s and mA: loss rates at the first and last time and at the mean
+    current, the share of a in the loss there, the power by which a departs from its shape.
     """
 
     i0: Array
@@ -90,20 +80,8 @@ class Physical(NamedTuple):
 
 
 class Solution(NamedTuple):
-    """Least-squares solution of the decay law.
-
-    Attributes
-    ----------
-    values, errors : Physical
-        Values, and standard deviations for weights that are 1/error.
-    correlation : float
-        Correlation of a and b.
-    residuals : array, shape (n,)
-        Model minus measurement, mA.
-    sum_squares : float
-        Weighted sum of squares.
-    converged : bool
-        Whether the search came to rest.
+    """Values and errors for weights of 1/error, the correlation of a and b, residuals in mA,
+    the weighted sum of squares, and whether the search came to rest.
     """
 
     values: Physical
@@ -132,21 +110,10 @@ def _rate(numbers: DecayNumbers, mean: Array, shape: Shape | None) -> Shape:
 
 
 def beam_current(numbers: DecayNumbers, at: Moments, shape: Shape | None = None) -> Array:
-    """Current of a decay: report equation 44, or 42 integrated where a has a shape.
+    """Current, mA: report equation 44, or 42 integrated where a has a shape.
 
-    Parameters
-    ----------
-    numbers : DecayNumbers
-        The law; with a shape, a is the value at the mean current.
-    at : Moments
-        Times and mean current.
-    shape : callable, optional
-        Dependence of a on the current in mA, up to a factor; written with JAX.
-
-    Returns
-    -------
-    array
-        mA.
+    The shape is a dependence on the current in mA, up to a factor, in JAX; a is then the value at
+    the mean current.
     """
     if shape is None:
         return current(at.time, numbers.i0, numbers.a, numbers.b)
@@ -154,11 +121,8 @@ def beam_current(numbers: DecayNumbers, at: Moments, shape: Shape | None = None)
 
 
 def padded_size(rows: int) -> int:
-    """64, 256, 1024, ...: every length is compiled once, for a second or two, so keep few."""
-    size = 64
-    while size < rows:
-        size *= 4
-    return size
+    """A few lengths from 64: each is compiled once, for a second or two."""
+    return padded_length(max(rows, 64))
 
 
 def padded(record: DecayRecord) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -326,7 +290,7 @@ def _solve(readings: Array, free: Array, shape: Shape | None = None) -> tuple[Ar
     start, plain = start * free[:3], jnp.array([1.0, 0.1, 0.05]) * free[:3]
     start = jnp.where(jnp.isfinite(constant(start)).all(), start, plain)
     reach = jnp.where(free > 0, jnp.inf, 0.0)
-    found = descend_one(constant, start, -reach[:3], reach[:3])
+    found = descend_one(constant, start, -reach[:3], reach[:3], tolerance=NEAR)
     if shape is not None:
         begin = jnp.append(found.theta, 0.0)
         found = descend_one(lambda t: off(t, scaled_shape)[0], begin, -reach, reach, FEW_STEPS)
@@ -335,7 +299,6 @@ def _solve(readings: Array, free: Array, shape: Shape | None = None) -> tuple[Ar
     )(jnp.diag(free))
     root = _root(jacobian, free)
     if shape is None:
-        # At rest, one step of Gauss and Newton more is free, and ends at rounding.
         step = jnp.where(found.rested, -root @ (root.T @ (jacobian @ residual)), 0.0)
         values, residual = values + step @ slopes, residual + step @ jacobian
     spread = slopes.T @ root
@@ -422,23 +385,5 @@ def solve_decay(
 
 
 def solve_decays(time: np.ndarray, measured: np.ndarray, weight: np.ndarray) -> Solution:
-    """Fit the decay law to many records of one padded length at once.
-
-    Parameters
-    ----------
-    time, measured, weight : array, shape (m, n)
-        As for `solve_decay`, one row a record.
-
-    Returns
-    -------
-    Solution
-        Each leaf with a first axis of length m.
-
-    Examples
-    --------
-    >>> time = np.linspace(0.0, 36000.0, 100) * np.ones((2, 1))
-    >>> measured = np.array(current(time, np.array([[500.0], [100.0]]), 2e-8, 1e-6))
-    >>> print(solve_decays(time, measured, np.ones((2, 100))).values.i0)
-    [500. 100.]
-    """
+    """`solve_decay` for records of one padded length at once, arrays of shape (m, n)."""
     return _unpacked(*_solve_many(np.stack([time, measured, weight], axis=1), CONSTANT))

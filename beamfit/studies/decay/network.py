@@ -184,11 +184,8 @@ class NetworkFit:
         return json_of(found | told)
 
 
-class _Data(NamedTuple):
-    inputs: Array
-    base: Array
-    current: Array
-    weight: Array
+# The network's inputs, what it is added to, mean currents, weights of the two loss rates.
+Data = tuple[Array, Array, Array, Array]
 
 
 def _inputs(operation: Operation, current: float) -> np.ndarray:
@@ -213,10 +210,10 @@ def _answer(model: Mapping[str, MLP], data: tuple[Array, Array, Array]) -> Array
     return jnp.stack([a, b, 1 / (a * current + b) / HOUR])
 
 
-def _predict(model: Mapping[str, MLP], data: _Data) -> Array:
-    logs = _logs(model, data.inputs, data.base)
-    parts = loss_parts(jnp.exp(logs[:, 0]), jnp.exp(logs[:, 1]), data.current)
-    return jnp.einsum("nij,nj->ni", data.weight, parts)
+def _predict(model: Mapping[str, MLP], data: Data) -> Array:
+    inputs, base, current, weight = data
+    a, b = jnp.exp(_logs(model, inputs, base)).T
+    return jnp.einsum("nij,nj->ni", weight, loss_parts(a, b, current))
 
 
 def _base(scales: np.ndarray | None, terms: Terms) -> Array:
@@ -347,7 +344,7 @@ def fit_loss_network(
     means = np.zeros(2) if corrected is not None else _typical(measured)
     net = _network(inputs, means, hidden, seed)
     weight = _floored(measured, floor)
-    data = _Data(jnp.asarray(inputs), _base(scales, terms), measured.current, weight)
+    data = (jnp.asarray(inputs), _base(scales, terms), measured.current, weight)
     seen = jnp.einsum("nij,nj->ni", weight, measured.parts)
     width = ALONE if corrected is None else CORRECTION
     problem = Problem(

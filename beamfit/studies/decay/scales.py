@@ -124,25 +124,7 @@ class ScaleFit:
 
 
 def stacked_terms(decays: Sequence[Decay], machine: Machine) -> Terms:
-    """First principles at the settings of each decay.
-
-    Parameters
-    ----------
-    decays : sequence of Decay
-        Decays whose records carry their settings.
-    machine : Machine
-        The ring, and what the records do not say.
-
-    Returns
-    -------
-    Terms
-        Each of shape (n,).
-
-    Raises
-    ------
-    InputError
-        As for `beamfit.studies.decay.loss_budget.operation_during`.
-    """
+    """First principles at the settings of each decay, each of shape (n,)."""
     rows = [
         loss_terms(machine.ring, operation_during(d.segment, machine), d.fit.mean_current)
         for d in decays
@@ -156,22 +138,8 @@ def _parts(scales: Array, terms: Terms, factor: Array) -> Array:
 
 @jax.jit
 def whitener(scales: Array, terms: Terms, measured: Summaries, pressure_error: Array) -> Array:
-    """Square root of each decay's information, its pressure reading's error included.
-
-    Parameters
-    ----------
-    scales : array, shape (n scales,)
-        Where the model is linearised in the pressure.
-    terms, measured : Terms, Summaries
-        Each of n decays.
-    pressure_error : float
-        Relative.
-
-    Returns
-    -------
-    array, shape (n, 2, 2)
-        W with WᵀW = Rᵀ (1 + g gᵀ)⁻¹ R, g = R ∂(parts)/∂(factor) times the error: the pressure
-        factor integrated out (Sherman and Morrison).
+    """W of shape (n, 2, 2) with WᵀW = Rᵀ (1 + g gᵀ)⁻¹ R, g = R ∂(parts)/∂(factor) times the
+    relative pressure error: each decay's pressure factor integrated out (Sherman and Morrison).
     """
     ones = jnp.ones_like(terms.current)
     _, slope = jax.jvp(lambda factor: _parts(scales, terms, factor), (ones,), (ones,))
@@ -185,22 +153,7 @@ def whitener(scales: Array, terms: Terms, measured: Summaries, pressure_error: A
 
 @jax.jit
 def pulls(scales: Array, terms: Terms, measured: Summaries, weight: Array) -> Array:
-    """Model minus measurement in standard errors, two for each decay.
-
-    Parameters
-    ----------
-    scales : array, shape (n scales,)
-        Factors.
-    terms, measured : Terms, Summaries
-        Each of n decays.
-    weight : array, shape (n, 2, 2)
-        From `whitener`.
-
-    Returns
-    -------
-    array, shape (n, 2)
-        Uncorrelated where the weight is right.
-    """
+    """Model minus measurement in standard errors, shape (n, 2); `weight` is that of `whitener`."""
     off = _parts(scales, terms, jnp.ones_like(terms.current)) - measured.parts
     return jnp.einsum("nij,nj->ni", weight, off)
 

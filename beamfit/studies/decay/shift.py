@@ -21,7 +21,7 @@ from beamfit.quantity import Quantity, Status
 from beamfit.sampling.posterior import Posterior
 from beamfit.sampling.summary import Interval
 from beamfit.studies.decay.fit import bare
-from beamfit.studies.decay.loss_budget import Machine, operation_during
+from beamfit.studies.decay.loss_budget import Machine, operation_during, settings_json
 from beamfit.studies.decay.network import Network, NetworkFit, fit_loss_network
 from beamfit.studies.decay.next_decay import Candidate, Proposal, next_decays
 from beamfit.studies.decay.operating_point import BestPoint, Limits, best_operating_point
@@ -257,13 +257,8 @@ class Shift:
     def to_json(self) -> dict[str, Any]:
         """Return the answer as JSON's types, in SI, mA and h."""
         proposals = [
-            {
-                "rf_voltage_V": float(p.candidate.operation.rf_voltage),
-                "scraper_y_m": float(p.candidate.operation.scraper_y),
-                "bunches": float(p.candidate.operation.bunches),
-                "current_mA": p.candidate.current,
-                "information": p.information,
-            }
+            settings_json(p.candidate.operation)
+            | {"current_mA": p.candidate.current, "information": p.information}
             for p in self.proposals
         ]
         best = self.best._asdict() | {"scraper_y": bare(self.best.scraper_y, "m")}

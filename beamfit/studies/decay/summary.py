@@ -37,25 +37,7 @@ class Summaries(NamedTuple):
 
 
 def loss_parts(a: Array, b: Array, mean_current: Array) -> Array:
-    """The two numbers by which a decay is compared with a model: a I and a I + b.
-
-    Parameters
-    ----------
-    a, b : float or array
-        Coefficients, 1/(mA s) and 1/s.
-    mean_current : float or array
-        Mean current, mA.
-
-    Returns
-    -------
-    array, shape (..., 2)
-        In 1/s.
-
-    Examples
-    --------
-    >>> [f"{part:.2e}" for part in loss_parts(2e-8, 1e-6, 500.0)]
-    ['1.00e-05', '1.10e-05']
-    """
+    """The two numbers by which a decay is compared with a model: a I and a I + b, in 1/s."""
     quadratic = a * mean_current
     return jnp.stack([quadratic, quadratic + b], axis=-1)
 
@@ -64,24 +46,7 @@ def loss_parts(a: Array, b: Array, mean_current: Array) -> Array:
 def information_root(
     time: Array, weight: Array, i0: Array, parts: Array, mean_current: Array
 ) -> Array:
-    """Square root of the information that readings hold on the two parts, I0 eliminated.
-
-    Parameters
-    ----------
-    time, weight : array, shape (m,)
-        Times from the first reading, s, and 1/error, 1/mA.
-    i0 : float
-        Current at the first reading, mA.
-    parts : array, shape (2,)
-        a I and a I + b, 1/s.
-    mean_current : float
-        I, mA.
-
-    Returns
-    -------
-    array, shape (2, 2)
-        Upper triangle, s.
-    """
+    """Root of the information that readings hold on the two parts, I0 eliminated; a triangle, s."""
 
     def weighted(theta: Array) -> Array:
         quadratic, rate = theta[1], theta[2]

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from functools import cached_property, partial
+from typing import Any
 
 import numpy as np
 
@@ -61,7 +62,8 @@ class Separability:
         return json_of(vars(self))
 
 
-class Evidence(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class Evidence:
     """What the rules look at: a record, its solution, and the size of its noise.
 
     `raw` and `scale` make errors of the solution's: as they were given, or as the residuals show.
@@ -88,18 +90,16 @@ class Evidence(NamedTuple):
 
     def scaled(self, name: str) -> tuple[float, float]:
         """A physical value and its error."""
-        value, error = (
-            getattr(part, name) for part in (self.solution.values, self.solution.errors)
-        )
-        return float(value), float(error) * self.scale
+        values, errors = self.solution.values, self.solution.errors
+        return float(getattr(values, name)), float(getattr(errors, name)) * self.scale
 
-    @property
+    @cached_property
     def separability(self) -> Separability:
         """Of a and b."""
         neighbours = _neighbours(self.residuals)
         # Variance of a mean of residuals that decorrelate exponentially.
-        together = min(max(neighbours, 0.0), 0.999)
-        inflation = math.sqrt((1 + max(neighbours, 0.0)) / (1 - together))
+        together = max(neighbours, 0.0)
+        inflation = math.sqrt((1 + together) / (1 - min(together, 0.999)))
         share, error = self.scaled("share")
         error *= inflation
         finite = math.isfinite(share) and math.isfinite(error)
@@ -113,13 +113,20 @@ class Evidence(NamedTuple):
             error_inflation=inflation,
         )
 
-
-class Judged(NamedTuple):
-    """Evidence, with what has been made of it for several rules."""
-
-    evidence: Evidence
-    separability: Separability
-    step: str | None
+    @cached_property
+    def step(self) -> str | None:
+        """The sentence for a step or spike in the record, whether or not its errors are known."""
+        record, change = self.record, np.diff(self.residuals)
+        usual = 1.4826 * float(np.median(np.abs(change)))
+        floor = max(record.resolution or 0.0, 1e-12 * float(record.current.max()))
+        largest = int(np.argmax(np.abs(change)))
+        if abs(change[largest]) <= STEP * max(usual, floor):
+            return None
+        # Residuals are model minus reading, so a refill lowers them.
+        return (
+            f"The record has a step of {-change[largest]:+.4g} mA at "
+            f"{record.time[largest + 1]:.6g} s: cut it with split_record and fit the pieces"
+        )
 
 
 def _neighbours(residuals: np.ndarray) -> float:
@@ -131,31 +138,16 @@ def _neighbours(residuals: np.ndarray) -> float:
     return correlation if abs(correlation) > 4 / math.sqrt(residuals.size) else 0.0
 
 
-def _step(record: DecayRecord, residuals: np.ndarray) -> str | None:
-    """The sentence for a step or spike in the record, whether or not its errors are known."""
-    change = np.diff(residuals)
-    usual = 1.4826 * float(np.median(np.abs(change)))
-    floor = max(record.resolution or 0.0, 1e-12 * float(record.current.max()))
-    largest = int(np.argmax(np.abs(change)))
-    if abs(change[largest]) <= STEP * max(usual, floor):
-        return None
-    # Residuals are model minus reading, so a refill lowers them.
-    return (
-        f"The record has a step of {-change[largest]:+.4g} mA at {record.time[largest + 1]:.6g} s: "
-        "cut it with split_record and fit the pieces"
-    )
-
-
-def _lost(j: Judged) -> Finding | None:
-    if bool(j.evidence.solution.converged):
+def _lost(e: Evidence) -> Finding | None:
+    if bool(e.solution.converged):
         return None
     cause = "The search found no finite minimum: look at the record for steps."
     return Finding(Status.not_finite, cause)
 
 
-def _within_noise(j: Judged) -> Finding | None:
-    rate, error = j.evidence.scaled("rate_mean")
-    if j.separability.separable or error <= DETERMINED * abs(rate):
+def _within_noise(e: Evidence) -> Finding | None:
+    rate, error = e.scaled("rate_mean")
+    if e.separability.separable or error <= DETERMINED * abs(rate):
         return None
     limit = 1 / max(rate + 1.645 * error, 1e-300) / HOUR
     return Finding(
@@ -165,8 +157,8 @@ def _within_noise(j: Judged) -> Finding | None:
     )
 
 
-def _inseparable(j: Judged) -> Finding | None:
-    found = j.separability
+def _inseparable(e: Evidence) -> Finding | None:
+    found = e.separability
     if found.separable:
         return None
     if found.share_error is None:
@@ -182,30 +174,24 @@ def _inseparable(j: Judged) -> Finding | None:
     )
 
 
-def _stepped(j: Judged) -> Finding | None:
-    return Finding(Status.poor_fit, j.step) if j.step else None
+def _stepped(e: Evidence) -> Finding | None:
+    return Finding(Status.poor_fit, e.step) if e.step else None
 
 
-def _negative(name: str, cause: str, j: Judged) -> Finding | None:
-    value, error = j.evidence.scaled(name)
-    error *= j.separability.error_inflation
+def _negative(name: str, cause: str, e: Evidence) -> Finding | None:
+    value, error = e.scaled(name)
+    error *= e.separability.error_inflation
     if not (value < -BELIEVED * error and value < 0):
         return None
     return Finding(Status.infeasible, f"{name} is negative by {-value / error:.1f} errors; {cause}")
 
 
-def _negative_b(j: Judged) -> Finding | None:
-    cause = "no gas does that, so a is not constant: see constant_a_test, or give the shape of a"
-    return _negative("b", cause, j)
+NOT_GAS = "no gas does that, so a is not constant: see constant_a_test, or give the shape of a"
+RISING = "the loss rate rises as the current falls: look for a changing vacuum or setting"
 
 
-def _negative_a(j: Judged) -> Finding | None:
-    cause = "the loss rate rises as the current falls: look for a changing vacuum or setting"
-    return _negative("a", cause, j)
-
-
-def _improbable(j: Judged) -> Finding | None:
-    chi2, dof = j.evidence.chi2, j.evidence.dof
+def _improbable(e: Evidence) -> Finding | None:
+    chi2, dof = e.chi2, e.dof
     if chi2_probability(chi2, dof) >= POOR_FIT:
         return None
     return Finding(
@@ -215,7 +201,7 @@ def _improbable(j: Judged) -> Finding | None:
     )
 
 
-def _determined(j: Judged) -> Finding:
+def _determined(e: Evidence) -> Finding:
     return Finding(Status.converged, "a and b are determined")
 
 
@@ -224,22 +210,22 @@ RULES = (
     _within_noise,
     _inseparable,
     _stepped,
-    _negative_b,
-    _negative_a,
+    partial(_negative, "b", NOT_GAS),
+    partial(_negative, "a", RISING),
     _improbable,
     _determined,
 )
 
 
-def _noise_inferred(j: Judged) -> str | None:
-    if j.evidence.record.error is not None:
+def _noise_inferred(e: Evidence) -> str | None:
+    if e.record.error is not None:
         return None
-    noise = f"{j.evidence.scale:.3g} mA rms is inferred from the residuals"
+    noise = f"{e.scale:.3g} mA rms is inferred from the residuals"
     return f"The record gives no errors; {noise}"
 
 
-def _correlated(j: Judged) -> str | None:
-    found = j.separability
+def _correlated(e: Evidence) -> str | None:
+    found = e.separability
     if found.error_inflation <= 1:
         return None
     return (
@@ -248,27 +234,26 @@ def _correlated(j: Judged) -> str | None:
     )
 
 
-def _quantised(j: Judged) -> str | None:
-    step, noise = j.evidence.record.resolution, j.evidence.scale
-    if j.evidence.record.error is not None:
-        noise *= float(np.min(j.evidence.record.error))
+def _quantised(e: Evidence) -> str | None:
+    step, noise = e.record.resolution, e.scale
+    if e.record.error is not None:
+        noise *= float(np.min(e.record.error))
     if step is None or step <= 2 * noise:
         return None
     return f"The readings are quantised in steps of {step:.3g} mA"
 
 
-def _step_besides(j: Judged) -> str | None:
-    return None if j.separability.separable else j.step
+def _step_besides(e: Evidence) -> str | None:
+    return None if e.separability.separable else e.step
 
 
 REMARKS = (_noise_inferred, _correlated, _quantised, _step_besides)
 
 
-def finding_of(evidence: Evidence, separability: Separability) -> Finding:
+def finding_of(evidence: Evidence) -> Finding:
     """Status and sentences: the gravest finding, then what is remarkable besides."""
-    judged = Judged(evidence, separability, _step(evidence.record, evidence.residuals))
-    found = judge(judged, RULES)
+    found = judge(evidence, RULES)
     if found.status is Status.not_finite:
         return found
-    remarks = [said for remark in REMARKS if (said := remark(judged))]
+    remarks = [said for remark in REMARKS if (said := remark(evidence))]
     return Finding(found.status, ". ".join([found.cause, *remarks]) + ".")

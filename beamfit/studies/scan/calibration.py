@@ -175,6 +175,7 @@ def _state(seen: Seen, told: Assumptions) -> Problem:
     """Beams and calibrations free, all planes together."""
     numbers, beams = _free_numbers(seen, told), beam_numbers(seen)
     magnets = {n.magnet: seen.scanned[n.magnet].calibration for n in numbers.values()}
+    seen = seen.keeping(magnets)
     free, priors = beam_free(beams), []
     for name, number in numbers.items():
         low, high = number.value - number.reach, number.value + number.reach
@@ -183,8 +184,7 @@ def _state(seen: Seen, told: Assumptions) -> Problem:
             low, high = min(low, mean - 6 * sd), max(high, mean + 6 * sd)
             priors.append(Prior(f"magnets.{name}", mean, sd))
         free.append(Free(f"magnets.{name}", *told.bounds.get(name, (low, high))))
-    rows = {plane: seen.of_plane(plane, magnets=magnets) for plane in seen.planes}
-    records = [size_record(seen, *each) for each in rows.items()]
+    records = [size_record(seen, plane, seen.of_plane(plane)) for plane in seen.planes]
     return Problem({"beam": beams, "magnets": magnets}, free, records, priors)
 
 

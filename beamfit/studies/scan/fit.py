@@ -18,7 +18,7 @@ from beamfit.quantity import Quantity
 from beamfit.status import Status
 from beamfit.studies.scan.assumptions import SCENARIOS, Anchor, Assumptions
 from beamfit.studies.scan.judged import judged_beam, judged_scenario
-from beamfit.studies.scan.known import see
+from beamfit.studies.scan.known import METHODS, see
 from beamfit.studies.scan.model import line_of
 from beamfit.studies.scan.results import Parameter, PlaneFit, parameter_rows, result_rows
 from beamfit.studies.scan.scans import QuadScan
@@ -30,8 +30,6 @@ if TYPE_CHECKING:
     from beamfit.sampling.priors import Distribution
 
 __all__ = ["EmittanceFit", "fit_emittance", "scenario_of"]
-
-METHODS = ("size_squared", "size")
 
 
 def fit_emittance(
@@ -116,7 +114,7 @@ def fit_emittance(
     )
     told.check_scenario(scenario, robust)
     statement = scenario_of(scenario)
-    seen = see(scan, line, planes, method, robust)
+    seen = see(scan, line, planes, method, robust, at_once=statement.closed)
     if statement.closed:
         return EmittanceFit(judged_beam(seen), scan, line, statement, told, seen)
     stated = statement.state(seen, told)

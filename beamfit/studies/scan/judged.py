@@ -232,7 +232,9 @@ def judged_scenario(
     must be determined by the rules of known transport too.
     """
     records = {r.data.plane: r for r in fit.problem.records if r.predict is predict_sizes}
-    asked = [(rows := records[p].data, asked_of(seen, p, rows.whole_line)) for p in seen.planes]
+    rows = {plane: records[plane].data for plane in seen.planes}
+    whole = scenario.whole_map
+    asked = [(r, asked_of(seen, p, whole, r.line if whole else None)) for p, r in rows.items()]
     derived = fit.derive(_answers, tuple(asked))
     elements = derived.value[:, len(QUANTITIES) :].reshape(len(asked), 3, -1)
     look, beams = list(seen.look), {}

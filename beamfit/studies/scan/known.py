@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import math
+from functools import partial
+from typing import NamedTuple
 
+import jax
 import numpy as np
 
 from beamfit.greybox.problem import Problem
@@ -18,7 +21,7 @@ from beamfit.studies.scan.next_point import (
     plausible_sigma,
 )
 from beamfit.studies.scan.results import Points
-from beamfit.studies.scan.robust import fit_robust
+from beamfit.studies.scan.robust import RobustFit, fit_robust
 from beamfit.studies.scan.scans import QuadScan, check_names
 from beamfit.studies.scan.sigma import ClosedForm, SigmaFit, SizeData, closed_form
 from beamfit.studies.scan.statement import (
@@ -32,6 +35,7 @@ from beamfit.studies.scan.statement import (
 )
 from beamfit.studies.scan.transport import (
     Look,
+    Rows,
     look_through,
     names_of,
     scan_rows,
@@ -40,7 +44,11 @@ from beamfit.studies.scan.transport import (
 )
 from beamfit.studies.scan.verdict import LOST, Evidence, waist_bracketed
 
-__all__ = ["SCENARIO", "next_measurement", "pulls", "see", "works_of"]
+__all__ = ["METHODS", "SCENARIO", "next_measurement", "pulls", "see", "works_of"]
+
+
+# The residual: the report's ``error_linear`` or ``error_nonlinear``.
+METHODS = ("size_squared", "size")
 
 
 def see(
@@ -49,6 +57,7 @@ def see(
     planes: tuple[str, ...] | None = None,
     method: str = "size_squared",
     robust: bool = False,
+    at_once: bool = False,
 ) -> Seen:
     """Look at a scan through its line, and fit it with the line as it is.
 
@@ -56,6 +65,9 @@ def see(
     ----------
     scan, line, planes, method, robust
         As for `beamfit.fit_emittance`.
+    at_once : bool
+        Whether the fit is all that is wanted: it is then one compiled call with the look, where a
+        scenario can use the two of a call each again.
 
     Returns
     -------
@@ -71,11 +83,17 @@ def see(
     for plane in asked:
         scan.rows(plane)  # says so if it was not measured
     scanned = scanned_line(scan, line)
-    rows = scan_rows(scan, scanned, method == "size_squared")
-    look = Look(*(np.asarray(part) for part in look_through(rows)))
-    seen = Seen(scan, line, asked, method, robust, scanned, rows, look, {})
+    rows = scan_rows(scan, scanned, method == METHODS[0])
     # A plane that is not asked for still testifies to the settings and the optics.
-    return seen._replace(works=works_of(seen, look, (*asked, *scan.planes)))
+    planes = tuple(dict.fromkeys((*asked, *scan.planes)))
+    seen = Seen(scan, line, scanned, asked, method, robust, rows, None, {})
+    if robust or not at_once:
+        look = jax.tree.map(np.asarray, look_through(rows))
+        return seen._replace(look=look, works=works_of(seen, look, planes))
+    sizes = _sizes(seen, {plane: _stated(seen, plane) for plane in planes})
+    look, found = jax.tree.map(np.asarray, _look_and_fit(rows, sizes, method))
+    works = {p: _work(seen, p, look, found, i) for i, p in enumerate(planes)}
+    return seen._replace(look=look, works=works)
 
 
 def works_of(seen: Seen, look: Look, planes: tuple[str, ...]) -> dict[str, Work]:
@@ -84,73 +102,91 @@ def works_of(seen: Seen, look: Look, planes: tuple[str, ...]) -> dict[str, Work]
     Where the file has no errors, every size is taken to have the same relative error, the
     one that makes χ² equal to its degrees of freedom.
     """
-    planes = tuple(dict.fromkeys(planes))
-    drawn = {plane: _points(seen, look, plane) for plane in planes}
-    found = _closed(seen, look, drawn)
-    return {p: _work(seen, p, *drawn[p], found, i) for i, p in enumerate(planes)}
+    doubts = {plane: _doubt(seen, look, plane) if seen.robust else None for plane in planes}
+    errors = {p: _stated(seen, p) if d is None else d.error for p, d in doubts.items()}
+    found = jax.tree.map(np.asarray, _fit(look, _sizes(seen, errors), seen.method))
+    return {p: _work(seen, p, look, found, i, doubts[p]) for i, p in enumerate(planes)}
 
 
-def _points(seen: Seen, look: Look, plane: str) -> tuple[Points, int]:
-    """The points of a plane before the fit, and how many a robust fit gives up."""
-    scan, at, i = seen.scan, seen.measured(plane), "xy".index(plane)
-    size, given = scan.size[plane][at], scan.error.get(plane)
+def _stated(seen: Seen, plane: str) -> np.ndarray:
+    """Errors of the file, or errors in proportion to the sizes, up to a factor."""
+    return seen.scan.error.get(plane, seen.scan.size[plane])[seen.measured(plane)]
+
+
+def _doubt(seen: Seen, look: Look, plane: str) -> RobustFit:
+    at, i = seen.measured(plane), "xy".index(plane)
     r11, r12, known = (part[i, at] for part in look[:3])
-    error, probability, lost = size if given is None else given[at], None, 0
-    if seen.robust:
-        doubt = fit_robust(r11, r12, size, error, known, given is not None)
-        probability, error = doubt.outlier_probability, doubt.error
-        lost = int(np.sum(probability > 0.5))
-    points = Points(
-        settings={name: v[at] for name, v in scan.settings.items()},
-        units={name: SETTING_UNITS[scan.units[name]] for name in scan.settings},
-        screen=tuple(seen.rows.places[j] for j in seen.rows.which[at]),
-        size=size,
-        error=error,
-        model=size,
-        pull=np.zeros(len(size)),
-        outlier_probability=probability,
-        r11=r11,
-        r12=r12,
-        known=known,
+    size, given = seen.scan.size[plane][at], plane in seen.scan.error
+    return fit_robust(r11, r12, size, _stated(seen, plane), known, given)
+
+
+class _Sizes(NamedTuple):
+    """What `closed_form` needs besides the look; where one plane was measured, it is both."""
+
+    which: np.ndarray
+    size: np.ndarray
+    error: np.ndarray
+    factor: np.ndarray
+    design: np.ndarray
+
+
+def _sizes(seen: Seen, errors: dict[str, np.ndarray]) -> _Sizes:
+    shape = (2, len(seen.rows.energy))
+    found = _Sizes(
+        np.zeros(2, int), np.full(shape, 1e-4), np.full(shape, np.inf), np.ones(2), np.ones((2, 2))
     )
-    return points, lost
+    for i, (plane, error) in enumerate(errors.items()):
+        own, at, asked = slice(i, None), seen.measured(plane), asked_of(seen, plane)
+        found.which[own] = "xy".index(plane)
+        found.size[own, at], found.error[own, at] = seen.scan.size[plane][at], error
+        found.error[own, len(seen.scan) :] = np.inf
+        found.factor[own], found.design[own] = asked.factor, asked.design
+    return found
 
 
-def _closed(seen: Seen, look: Look, drawn: dict[str, tuple[Points, int]]) -> ClosedForm:
-    """Both planes in one call; where one was measured, it stands for both."""
-    planes = [*drawn, *drawn][:2]
-    length = len(seen.rows.energy)
-    size, error = np.full((2, length), 1e-4), np.full((2, length), np.inf)
-    for i, plane in enumerate(planes):
-        points, at = drawn[plane][0], seen.measured(plane)
-        size[i, at], error[i, at] = points.size, points.error
-    which = ["xy".index(plane) for plane in planes]
-    asked = [asked_of(seen, plane) for plane in planes]
-    r11, r12, known, to_screen, to_design = (part[which] for part in look)
-    found = closed_form(
-        SizeData(r11, r12, known, size, error),
-        np.array([a.factor for a in asked]),
-        to_screen,
-        to_design,
-        np.array([a.design for a in asked]),
-        seen.method,
-    )
-    return ClosedForm(type(found.fit)(*map(np.asarray, found.fit)), *map(np.asarray, found[1:]))
+@partial(jax.jit, static_argnames="method")
+def _fit(look: Look, sizes: _Sizes, method: str) -> ClosedForm:
+    r11, r12, known, *places = (part[sizes.which] for part in look)
+    rows = SizeData(r11, r12, known, sizes.size, sizes.error)
+    return closed_form(rows, sizes.factor, *places, sizes.design, method)
 
 
-def _work(seen: Seen, plane: str, points: Points, lost: int, found: ClosedForm, i: int) -> Work:
-    fit = type(found.fit)(*(part[i] for part in found.fit))
+@partial(jax.jit, static_argnames="method")
+def _look_and_fit(rows: Rows, sizes: _Sizes, method: str) -> tuple[Look, ClosedForm]:
+    look = look_through(rows)
+    return look, _fit(look, sizes, method)
+
+
+def _work(
+    seen: Seen, plane: str, look: Look, found: ClosedForm, i: int, doubt: RobustFit | None = None
+) -> Work:
+    scan, at = seen.scan, seen.measured(plane)
+    fit = SigmaFit(*(part[i] for part in found.fit))
+    probability = None if doubt is None else doubt.outlier_probability
+    lost = 0 if doubt is None else int(np.sum(probability > 0.5))
+    size, error = scan.size[plane][at], _stated(seen, plane) if doubt is None else doubt.error
+    r11, r12, known = (part["xy".index(plane), at] for part in look[:3])
     noise_known = plane in seen.scan.error
-    dof = max(len(points.size) - lost - 3, 0)
+    dof = max(len(size) - lost - 3, 0)
     unit = 1.0
     if not noise_known:
         unit = math.sqrt(float(fit.chi2) / dof) if dof > 0 else math.nan
     chi2 = float(fit.chi2) if noise_known else float(dof)
     scale = math.sqrt(max(1.0, chi2 / dof)) if dof > 0 else 1.0
-    squared = size_squared(fit.sigma, points.r11, points.r12, points.known)
-    model, error = np.sqrt(np.maximum(squared, 0.0)), points.error * unit
-    pull = pulls(points.size, model, error, seen.rows.squared)
-    points = points._replace(error=error, model=model, pull=pull)
+    model = np.sqrt(np.maximum(size_squared(fit.sigma, r11, r12, known), 0.0))
+    points = Points(
+        settings={name: v[at] for name, v in scan.settings.items()},
+        units={name: SETTING_UNITS[scan.units[name]] for name in scan.settings},
+        screen=tuple(seen.rows.places[j] for j in seen.rows.which[at]),
+        size=size,
+        error=error * unit,
+        model=model,
+        pull=pulls(size, model, error * unit, seen.rows.squared),
+        outlier_probability=probability,
+        r11=r11,
+        r12=r12,
+        known=known,
+    )
     return Work(
         points=points,
         fit=fit,

@@ -173,8 +173,10 @@ def _stated(
     problem: Problem, fit: Scanned, kept: Sequence[PlaneFit], asked: Sequence[PlaneFit]
 ) -> Statement:
     chosen = kept or asked
-    lines = {r.data.plane: r.data.whole_line for r in problem.records if r.predict is predict_sizes}
-    places = [asked_of(fit.seen, p.plane, lines[p.plane]) for p in chosen]
+    rows = {r.data.plane: r.data for r in problem.records if r.predict is predict_sizes}
+    whole = fit.statement.whole_map
+    lines = {plane: r.line if whole else None for plane, r in rows.items()}
+    places = [asked_of(fit.seen, p.plane, whole, lines[p.plane]) for p in chosen]
     shown = {(p.plane, name): getattr(p, name) for p in chosen for name in TWISS}
     lost = ", ".join(f"{p.plane} plane" for p in asked if p not in kept)
     sigmas = [f"{p.plane}.{name}" for p in chosen for name in SIGMA]

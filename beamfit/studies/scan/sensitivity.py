@@ -39,6 +39,8 @@ __all__ = [
 
 # Leaving out one of more points than this tells nothing.
 MOST_POINTS = 50
+# Nobody reads a budget of more causes than this.
+MOST_CAUSES = 30
 
 
 class Change(NamedTuple):
@@ -115,16 +117,13 @@ def systematics(fit: EmittanceFit, plane: str) -> list[Change]:
     magnets = varied_magnets(fit.scan)
     upstream = fit.line.upto(result.screen.name).elements
     drifts = tuple(e.name for e in upstream if isinstance(e, Drift))
-    stored = fit.seen.scanned.stored_by_kind((*rows.settings, *rows.places))
-    one = rows.energy if np.ptp(rows.energy) > 0 else rows.energy[0]
-    size, error = np.full((2, len(rows.energy)), np.inf)
-    size[:], size[fit.seen.measured(plane)] = 1.0, p.size
-    error[fit.seen.measured(plane)] = p.error
+    keep = fit.seen.measured(plane)
+    size, error = np.ones(len(rows.energy)), np.full(len(rows.energy), np.inf)
+    size[keep], error[keep] = p.size, p.error
     sigma = np.array([q.value for q in result.sigma])
-    through = replace(rows, line=stored, energy=one)
-    by_change, by_length = _changes(through, sigma, size, error, magnets=magnets)
-    # Drifts come in the order of the line; the rest of them lies downstream.
-    by_length = np.concatenate([*by_length, np.zeros(0)])[: len(drifts)]
+    stored = replace(rows, line=fit.seen.scanned.stored_by_kind((*rows.settings, *rows.places)))
+    by_change, by_lengths = _changes(stored, sigma, size, error, magnets=magnets)
+    by_length = np.concatenate([*by_lengths, np.zeros(0)])[: len(drifts)]  # the rest is downstream
     relative = np.concatenate([by_change[:-1], by_length, by_change[-1:]])
     # ln βγ rises by E²/(E² - m²) for each relative step of the energy.
     energy = fit.seen.energy(plane)
@@ -158,25 +157,13 @@ def _scaled(line: Beamline, magnet: str, factor: Array) -> Beamline:
     return line.with_element(replace(element, calibration=c))
 
 
-def _with_lengths(line: Beamline, lengths: list[Array]) -> Beamline:
-    """Give the drifts of a line that is stored by kind other lengths."""
-    left, elements = iter(lengths), []
-    for part in line.elements:
-        if isinstance(part, Series):
-            kinds = (Drift("", next(left)) if isinstance(k, Drift) else k for k in part.kinds)
-            part = replace(part, kinds=tuple(kinds))
-        elements.append(part)
-    return replace(line, elements=tuple(elements))
-
-
 @partial(jax.jit, static_argnames="magnets")
-def _changes(
-    rows: Rows, sigma: Array, size: Array, error: Array, *, magnets: tuple[str, ...]
-) -> tuple[Array, list[Array]]:
-    """Derivatives of ln ε of the fit by each magnet's strength and ln E, and by drifts' lengths.
+def _changes(rows: Rows, sigma: Array, size: Array, error: Array, *, magnets):
+    """Derivatives of ln ε of the fit by each magnet's strength and ln E, and by lengths of drifts.
 
     At the minimum the slope F(σ, rows) of χ² is zero, so dσ = -(∂F/∂σ)⁻¹ ∂F/∂rows: exact for
-    either residual, without differentiating the solver. One reverse pass, however long the line.
+    either residual, without differentiating the solver. One reverse pass carries that back to
+    every number of the line, however long it is.
     """
     unit = jnp.abs(sigma)
 
@@ -193,14 +180,29 @@ def _changes(
             return jnp.sum(((squared - size**2) / (2.0 * size * error)) ** 2)
         return jnp.sum(((jnp.sqrt(squared) - size) / error) ** 2)
 
-    series = [part for part in rows.line.elements if isinstance(part, Series)]
-    lengths = [k.length for part in series for k in part.kinds if isinstance(k, Drift)]
-    none, here = jnp.zeros(len(magnets) + 1), sigma / unit
-    seen, back = jax.vjp(elements, none, lengths)
-    slope = jax.grad(chi2)
+    series = [s for s in rows.line.elements if isinstance(s, Series)]
+    lengths = [k.length for s in series for k in s.kinds if isinstance(k, Drift)]
+    none, here, slope = jnp.zeros(len(magnets) + 1), sigma / unit, jax.grad(chi2)
+    seen = elements(none, lengths)
     by_sigma = jax.grad(lambda s: jnp.log(emittance_parts(s * unit)[0]))(here)
     weights = jnp.linalg.solve(jax.jacfwd(slope)(here, seen), by_sigma)
-    return back(jax.grad(lambda seen: -weights @ slope(here, seen))(seen))
+
+    def moved_emittance(change: Array, lengths: list[Array]) -> Array:
+        return -weights @ slope(here, elements(change, lengths))
+
+    return jax.grad(moved_emittance, (0, 1))(none, lengths)
+
+
+def _with_lengths(line: Beamline, lengths: list[Array]) -> Beamline:
+    """Give the drifts of a line that is stored by kind other lengths."""
+    left = iter(lengths)
+    elements = []
+    for part in line.elements:
+        if isinstance(part, Series):
+            kinds = (Drift("", next(left)) if isinstance(k, Drift) else k for k in part.kinds)
+            part = replace(part, kinds=tuple(kinds))
+        elements.append(part)
+    return replace(line, elements=tuple(elements))
 
 
 def range_sensitivity(plane: PlaneFit) -> list[RangeRow]:
@@ -262,10 +264,18 @@ def _place(points: Points, i: int) -> str:
 
 
 def budget_rows(fit: EmittanceFit) -> list[tuple[str, list[str]]]:
-    """Cause and one cell per plane: the change of the normalised emittance."""
+    """Cause and one cell per plane: the change of the normalised emittance.
+
+    Of a long line the largest changes, and how large the others are at most.
+    """
     columns = [{c.cause: c for c in systematics(fit, p.plane)} for p in fit.planes]
-    causes = dict.fromkeys(cause for column in columns for cause in column)
-    return [
+    largest: dict[str, float] = {}
+    for change in (c for column in columns for c in column.values()):
+        size = abs(change.normalized_emittance)
+        largest[change.cause] = max(size, largest.get(change.cause, 0.0))
+    ranked = sorted(largest, key=largest.__getitem__, reverse=True)
+    shown, others = frozenset(ranked[:MOST_CAUSES]), ranked[MOST_CAUSES:]
+    rows = [
         (
             cause,
             [
@@ -273,8 +283,13 @@ def budget_rows(fit: EmittanceFit) -> list[tuple[str, list[str]]]:
                 for column in columns
             ],
         )
-        for cause in causes
+        for cause in largest
+        if cause in shown
     ]
+    if others:
+        most = [f"±{100 * largest[others[0]]:.2g} % at most" for _ in columns]
+        rows.append((f"{len(others)} other causes, each", most))
+    return rows
 
 
 def range_rows(fit: EmittanceFit) -> list[tuple[str, list[str]]]:

@@ -17,7 +17,7 @@ from beamfit.studies.scan.model import UNIT, Asked, predict_sizes
 from beamfit.studies.scan.results import Parameter, Points
 from beamfit.studies.scan.scans import QuadScan
 from beamfit.studies.scan.sigma import SigmaFit
-from beamfit.studies.scan.transport import Look, Rows, padded, seen_line
+from beamfit.studies.scan.transport import Look, Rows, padded, scan_rows
 from beamfit.studies.scan.verdict import Evidence
 
 __all__ = [
@@ -67,16 +67,16 @@ class Seen(NamedTuple):
     ----------
     scan, line : QuadScan, Beamline
         As given.
+    scanned : Beamline
+        The line with the calibrations of the scan's columns.
     planes : tuple of str
         Those that are asked for.
     method : str
         "size_squared" or "size".
     robust : bool
         Whether points may be doubted.
-    scanned : Beamline
-        The line with the calibrations of the scan's columns.
     rows : Rows
-        The scan's rows through it, padded.
+        The scan's rows through that line, padded; what no row changes is multiplied out.
     look : Look
         The same, with every magnet as the lattice has it; NumPy arrays.
     works : dict of str to Work
@@ -85,27 +85,21 @@ class Seen(NamedTuple):
 
     scan: QuadScan
     line: Beamline
+    scanned: Beamline
     planes: tuple[str, ...]
     method: str
     robust: bool
-    scanned: Beamline
     rows: Rows
     look: Look
     works: dict[str, Work]
 
-    def of_plane(
-        self,
-        plane: str,
-        settings: Mapping[str, Any] | None = None,
-        magnets: Iterable[str] = (),
-    ) -> Rows:
-        """The rows of one plane, with other settings, and further magnets that can be varied."""
-        rows = replace(self.rows, plane=plane, settings=settings or self.rows.settings)
-        further = [name for name in magnets if name not in rows.settings]
-        if not further:
-            return rows
-        line = seen_line(self.scanned, (*rows.settings, *further), rows.energy, rows.places)
-        return replace(rows, line=line)
+    def of_plane(self, plane: str, settings: Mapping[str, Any] | None = None) -> Rows:
+        """The rows of one plane, with other settings if any are given."""
+        return replace(self.rows, plane=plane, settings=settings or self.rows.settings)
+
+    def keeping(self, magnets: Iterable[str]) -> Seen:
+        """The same with rows in which further magnets may change."""
+        return self._replace(rows=scan_rows(self.scan, self.scanned, self.rows.squared, magnets))
 
     def measured(self, plane: str) -> np.ndarray:
         """Indices of the rows in which a plane was measured."""
@@ -158,14 +152,14 @@ def varied_magnets(scan: QuadScan) -> tuple[str, ...]:
     return tuple(n for n, v in scan.settings.items() if np.ptp(v) > 0)
 
 
-def asked_of(seen: Seen, plane: str, line: Beamline | None = None) -> Asked:
-    """Where the beam of a plane is asked for, through a line; None: only R11 and R12 are known."""
+def asked_of(seen: Seen, plane: str, whole_map: bool = True, line: Beamline | None = None) -> Asked:
+    """Where the beam of a plane is asked for, through a line: the rows' own, if none is given."""
     design = seen.scanned.design
     twiss = getattr(design, plane, None)
     factor = beta_gamma(seen.energy(plane), float(seen.line.mass))
     return Asked(
         plane,
-        seen.rows.places[-1] if line is not None else None,
+        seen.rows.places[-1] if whole_map else None,
         design.at if twiss else None,
         line or seen.rows.line,
         np.asarray(factor),

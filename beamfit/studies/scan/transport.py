@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
-from functools import partial
+from functools import lru_cache, partial
 from typing import Any, NamedTuple
 
 import jax
@@ -71,19 +71,26 @@ def scanned_line(scan: QuadScan, line: Beamline) -> Beamline:
     >>> magnet.calibration.unit, round(float(magnet.k1(energy=100.0)), 9)
     ('kG', 3.0)
     """
-    meanings = {
-        "kG": IntegratedGradient(mass=line.mass),
-        "k1": FocusingStrength(),
-        "k1l": IntegratedStrength(),
-    }
     for name, unit in scan.units.items():
-        magnet = line[name]
-        if isinstance(magnet, ThinLens) and unit == "k1":
+        if isinstance(line[name], ThinLens) and unit == "k1":
             raise scan.unusable(
                 f"k1 for '{name}', which has no length",
                 f"a column {name}_k1l (inverse focal length, 1/m) or {name}_kG",
                 name,
             )
+    return _with_meanings(_Same(line), tuple(scan.units.items()))
+
+
+@lru_cache(maxsize=64)
+def _with_meanings(same: _Same, units: tuple[tuple[str, str], ...]) -> Beamline:
+    line = same.line
+    meanings = {
+        "kG": IntegratedGradient(mass=line.mass),
+        "k1": FocusingStrength(),
+        "k1l": IntegratedStrength(),
+    }
+    for name, unit in units:
+        magnet = line[name]
         if unit != magnet.calibration.unit:
             meaning = meanings[unit]
             strength = magnet.calibration.k1l(magnet.setting, magnet.length, line.energy)
@@ -129,14 +136,9 @@ class Rows:
         every = transfer_rows(line, self.settings, self.energy, self.places).planes
         return self.seen(every[:, "xy".index(self.plane)])
 
-    @property
-    def whole_line(self) -> Beamline:
-        """The line that carries the beam anywhere."""
-        return self.line
-
     def seen(self, matrices: Array) -> tuple[Array, Array, Array]:
         """R11, R12 and known size² from one plane's matrices, shape (n, places, 3, 3)."""
-        r = matrices[jnp.arange(len(self.which)), self.which, 0]
+        r = matrices[jnp.arange(len(self.energy)), self.which, 0]
         return r[:, 0], r[:, 1], (r[:, 2] * self.spread) ** 2 + self.resolution**2
 
 
@@ -153,10 +155,6 @@ class NetworkRows:
     inputs: Any
     columns: Any
     known: Any
-
-    @property
-    def whole_line(self) -> None:
-        """None: what the network does not give is unknown."""
 
     def outputs(self, model: Mapping[str, Any]) -> Array:
         """The outputs of the model's network that ``columns`` names, of its shape."""
@@ -182,7 +180,9 @@ def padded(values: Any, n: int | None = None) -> np.ndarray:
     return np.concatenate([values, np.repeat(values[-1:], more, axis=0)])
 
 
-def scan_rows(scan: QuadScan, scanned: Beamline, squared: bool = True) -> Rows:
+def scan_rows(
+    scan: QuadScan, scanned: Beamline, squared: bool = True, keep: Iterable[str] = ()
+) -> Rows:
     """The rows of a scan, of the x plane, padded.
 
     Parameters
@@ -193,11 +193,13 @@ def scan_rows(scan: QuadScan, scanned: Beamline, squared: bool = True) -> Rows:
         From `scanned_line`.
     squared : bool
         As for `Rows`.
+    keep : iterable of str
+        Magnets that may change besides those of the scan.
 
     Returns
     -------
     Rows
-        Places in the order of the line; what no setting of the scan moves is multiplied out.
+        Places in the order of the line. All of the line that nothing changes is multiplied out.
     """
     n = len(scan)
     named = scan.screen or (scanned.screens[-1],) * n
@@ -209,14 +211,15 @@ def scan_rows(scan: QuadScan, scanned: Beamline, squared: bool = True) -> Rows:
     def column(values: Any, default: float) -> np.ndarray:
         return padded(np.full(n, float(default)) if values is None else values)
 
-    settings, energy = {name: padded(v) for name, v in scan.settings.items()}, scan.energy
-    energy = column(energy, scanned.energy)
+    energy = column(scan.energy, scanned.energy)
+    ends = (*places, scanned.design.at) if scanned.design else places
+    every = np.append(energy, scanned.energy)
     return Rows(
         "x",
         places,
         squared,
-        seen_line(scanned, settings, energy, places),
-        settings,
+        seen_line(scanned, (*scan.settings, *keep), every, ends),
+        {name: padded(v) for name, v in scan.settings.items()},
         energy,
         padded(which),
         column(scan.energy_spread, scanned.energy_spread),
@@ -293,13 +296,27 @@ def transfer_rows(
 def seen_line(
     line: Beamline, settings: Iterable[str], energy: ArrayLike, places: Iterable[str]
 ) -> Beamline:
-    """A line as rows of these settings and energies see it: all else multiplied out.
+    """A line as rows of these settings and energies see it: all else multiplied out."""
+    own = () if isinstance(energy, jax.core.Tracer) else np.unique(energy)
+    keep = frozenset((*settings, *places))
+    return _condensed(_Same(line), keep, float(own[0]) if len(own) == 1 else None)
 
-    It stays right at its own energy and to where its design holds.
-    """
-    design = (line.design.at,) if line.design else ()
-    own = () if isinstance(energy, jax.core.Tracer) else np.unique(np.append(energy, line.energy))
-    return line.condensed((*settings, *places, *design), own[0] if len(own) == 1 else None)
+
+class _Same(NamedTuple):
+    """A line that is itself and no other: scan after scan of it shares what it is made into."""
+
+    line: Beamline
+
+    def __hash__(self) -> int:
+        return id(self.line)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Same) and self.line is other.line
+
+
+@lru_cache(maxsize=64)
+def _condensed(same: _Same, keep: frozenset[str], energy: float | None) -> Beamline:
+    return same.line.condensed(keep, energy)
 
 
 @partial(jax.jit, static_argnames="places")
