@@ -11,7 +11,7 @@ import numpy as np
 from jax import Array
 
 from beamfit.errors import InputError
-from beamfit.greybox.posterior import Optimum, Statement, record_of, target_of
+from beamfit.greybox.posterior import Optimum, Statement, predicted, target_of
 from beamfit.lifetime.decay import HOUR, current
 from beamfit.quantity import Quantity
 from beamfit.sampling.posterior import Expected, Posterior
@@ -142,6 +142,5 @@ def expected_current(posterior: Posterior) -> Expected:
     posterior : Posterior
         Of `DecayFit.sample`.
     """
-    record = record_of(posterior.target, RECORD)
-    error = np.ones(1) if record.error is None else np.asarray(record.error)
-    return posterior.expected(lambda numbers: record.predict(numbers, record.data), error)
+    draws, _, error = predicted(posterior, RECORD)
+    return posterior.expected(draws, error)
