@@ -15,13 +15,14 @@ from scipy.sparse.csgraph import connected_components
 
 from beamfit.errors import InputError
 from beamfit.greybox import tree
-from beamfit.greybox.problem import Core, Prior, Problem, Record
+from beamfit.greybox.problem import Core, Prior, Problem
 from beamfit.sampling.likelihood import Group
+from beamfit.sampling.posterior import Posterior
 from beamfit.sampling.priors import Distribution, checked
 from beamfit.sampling.target import Law, Target, covariance_of, slopes_of
 from beamfit.verdict import Finding
 
-__all__ = ["Optimum", "Sampled", "Statement", "record_of", "target_of"]
+__all__ = ["Optimum", "Predicted", "Sampled", "Statement", "predicted", "target_of"]
 
 # A number that is an undetermined direction's in less than this share is not part of it.
 PART = 0.05
@@ -272,9 +273,40 @@ def target_of(
     )
 
 
-def record_of(target: Target, name: str) -> Record:
-    """The record of a name in what is sampled, for what a posterior expects of it."""
-    return next(record for record in target.data.core.records if record.name == name)
+class Predicted(NamedTuple):
+    """A record's values that count: what draws predict, (m, n); measured and error, (n,)."""
+
+    draws: np.ndarray
+    measured: np.ndarray
+    error: np.ndarray
+
+
+def predicted(posterior: Posterior, name: str) -> Predicted:
+    """Predictions of a record by draws from the posterior of its problem.
+
+    Parameters
+    ----------
+    posterior : Posterior
+        Of a target by `target_of`.
+    name : str
+        The record's.
+
+    Returns
+    -------
+    Predicted
+        Errors of 1 where the record came without.
+    """
+    target = posterior.target
+    records = target.data.core.records
+    place = [record.name for record in records].index(name)
+    record, used = records[place], records[place].used
+    residual = target.each(target.law.residual, posterior.thinned())[place][:, used]
+    error = np.ones(1) if record.error is None else record.error
+    measured, error, weight = (
+        np.broadcast_to(part, record.measured.shape).ravel()[used]
+        for part in (record.measured, error, record.weight)
+    )
+    return Predicted(measured + residual * error / np.sqrt(weight), measured, error)
 
 
 def _refuse_equations(p: Problem) -> None:

@@ -226,15 +226,13 @@ class Posterior:
         ends = (0.5 - 0.5 * probability, 0.5, 0.5 + 0.5 * probability)
         return Band(*np.quantile(self.derive(function), ends, axis=0))
 
-    def expected(
-        self, function: Callable[[Any], Any], error: np.ndarray, label: str = ""
-    ) -> Expected:
+    def expected(self, draws: np.ndarray, error: np.ndarray, label: str = "") -> Expected:
         """Expect readings such as were measured, and further ones like them.
 
         Parameters
         ----------
-        function : callable
-            As for `derive`: the model at each point, shape (n,).
+        draws : array, shape (m, n)
+            What `thinned` draws predict at each point.
         error : array, shape (n,)
             Stated errors.
         label : str
@@ -244,8 +242,7 @@ class Posterior:
         -------
         Expected
         """
-        draws, name = self.derive(function), f"{label}.{LOG_NOISE}".lstrip(".")
-        noise = np.ones(len(draws))
+        name, noise = f"{label}.{LOG_NOISE}".lstrip("."), np.ones(len(draws))
         if name in self.names:
             noise = np.exp(self.thinned()[:, self.names.index(name)])
         normal = np.random.default_rng(self.seed).standard_normal(draws.shape)

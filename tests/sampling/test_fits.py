@@ -257,6 +257,7 @@ def test_expected_sizes_hold_the_points(otr2, beam):
     assert ((p.size > low) & (p.size < high)).all()
     assert (found.model[0] > low).all()
     np.testing.assert_allclose(found.median, p.model, rtol=0.02)
+    np.testing.assert_array_equal(expected_sizes(beam, "y").median, found.median)
 
 
 def decay(a, b, span, number=200, sd=0.01, seed=3):

@@ -11,7 +11,7 @@ from jax import Array
 
 from beamfit.errors import InputError
 from beamfit.greybox.fit import Fit
-from beamfit.greybox.posterior import Optimum, Statement, record_of, target_of
+from beamfit.greybox.posterior import Optimum, Statement, predicted, target_of
 from beamfit.greybox.problem import Problem
 from beamfit.optics.beam import BeamMatrix
 from beamfit.quantity import Status
@@ -213,13 +213,8 @@ def expected_sizes(posterior: Posterior, plane: str) -> Expected:
     plane : str
         "x" or "y".
     """
-    record = record_of(posterior.target, f"size {plane}")
-    at, squared = np.flatnonzero(record.used), record.data.squared
-
-    def sizes(drawn: Mapping[str, Any]) -> Array:
-        found = record.predict(drawn["model"], record.data)[at]
-        return 1e-6 * (jnp.sqrt(found) if squared else found)
-
-    # Of size²: 2 x dx.
-    slope = 2.0 * np.sqrt(np.asarray(record.measured)) if squared else np.ones(len(record.used))
-    return posterior.expected(sizes, 1e-6 * (np.asarray(record.error) / slope)[at], plane)
+    draws, measured, error = predicted(posterior, f"size {plane}")
+    records = {record.name: record for record in posterior.target.data.core.records}
+    if records[f"size {plane}"].data.squared:  # the error of size² is 2 x dx
+        draws, error = np.sqrt(draws), error / (2.0 * np.sqrt(measured))
+    return posterior.expected(1e-6 * draws, 1e-6 * error, plane)
