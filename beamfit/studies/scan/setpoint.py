@@ -12,13 +12,15 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from scipy.linalg import block_diag
+from scipy.stats import qmc
 
 from beamfit.errors import InputError
 from beamfit.greybox import tree
 from beamfit.greybox.assess import TOLERANCE
+from beamfit.greybox.descend import Found, descend_all
 from beamfit.greybox.fit import Fit, Variable
-from beamfit.greybox.problem import Free, Problem, Record, padded_length
-from beamfit.greybox.solve import solve
+from beamfit.greybox.problem import Free, Problem, Record, padded_length, residual
+from beamfit.greybox.solve import search, solve
 from beamfit.optics.beamline import Beamline
 from beamfit.optics.calibration import SETTING_UNITS
 from beamfit.quantity import Quantity
@@ -47,6 +49,8 @@ __all__ = ["Beam", "Minimum", "PlaneBeam", "Setpoint", "Target", "find_setpoint"
 # Starts of the search: enough for the minima that a few magnets have; no number fills the box of
 # many magnets, whose wishes can usually be met in many ways.
 STARTS, FEW, MANY = 256, 64, 8
+# Of each of them, and how sharp; the lowest goes on to the end.
+STEPS, SHARP = 300, 1e-10
 # Two end points are one minimum if they differ by less than this share of the range.
 SAME = 1e-3
 MOST_MINIMA = 10
@@ -142,11 +146,9 @@ def find_setpoint(
     carrying = carrying.upto(screen)
     short = carrying.condensed((*vary, screen), carrying.energy)
     wanted = _wanted(short, used, vary, targets)
-    fit = solve(_stated(wanted), FEW if len(vary) > MANY else STARTS, seed)
-    if not np.isfinite(fit.cost):
-        raise InputError("a beam that no setting within the limits can carry", "other limits")
+    minima, fit = _search(_stated(wanted), seed)
     units = {name: SETTING_UNITS[line[name].calibration.unit] for name in vary}
-    listed = [Minimum(_settings(wanted, theta), value) for theta, value in _minima(fit)]
+    listed = [Minimum(_settings(wanted, theta), value) for theta, value in minima]
     predicted = _predicted(wanted, used, fit.theta)
     misses = _relative_misses(wanted, targets, fit.theta)
     evidence = Evidence(
@@ -228,33 +230,49 @@ def _at_place(wanted: _Wanted, theta: Array) -> Array:
 def _misses(model: Any, wanted: _Wanted) -> Array:
     """Miss of every wish, shape (wishes, 2); the objective is the sum of their squares.
 
-    Of sizes in µm and divergences in µrad, along the vector; of matches the two numbers whose
-    squares add to BMAG - 1. In the order of KINDS.
+    Of sizes in µm and divergences in µrad, along the vector; of matches two numbers whose squares
+    add to BMAG - 1, linear in R. In the order of KINDS.
     """
     at = _at_place(wanted, model["settings"])
 
     def miss(kind, plane, value):
-        vectors = at[plane]
-        (s11, s12), emittance = vectors @ vectors[0], jnp.linalg.det(vectors)
-        far = 1e6 * (1.0 - value[0] / jnp.linalg.norm(vectors, axis=1))[:, None] * vectors
-        ratio = jnp.sqrt(s11 / emittance / value[0])
-        other = ratio * value[1] + s12 / emittance / ratio
-        mismatch = jnp.stack([ratio - 1.0 / ratio, other]) / math.sqrt(2.0)
+        vectors, (beta, alpha) = at[plane], value
+        far = 1e6 * (1.0 - beta / jnp.linalg.norm(vectors, axis=1))[:, None] * vectors
+        # N = D⁻¹ R L/√ε is a rotation where the beam is matched; BMAG = |N|²/2 and det N = 1.
+        inverse = jnp.array([[1.0, 0.0], [alpha, beta]]) / jnp.sqrt(beta)
+        n = inverse @ vectors / jnp.sqrt(jnp.linalg.det(vectors))
+        mismatch = jnp.stack([n[0, 0] - n[1, 1], n[0, 1] + n[1, 0]]) / math.sqrt(2.0)
         return jnp.concatenate([far, mismatch[None]])[kind]
 
     return jax.vmap(miss)(wanted.kinds, wanted.planes, wanted.values)
 
 
-def _minima(fit: Fit) -> list[tuple[np.ndarray, float]]:
-    """The best point, then the other ends of the search that are minima, best first."""
-    found = [(fit.theta, 2.0 * fit.cost)]
-    for end in sorted(fit.attempts, key=lambda a: a.cost):
-        # Where a search got stuck is no minimum.
-        if not end.kkt.worst <= TOLERANCE or len(found) == MOST_MINIMA:
-            continue
-        if all(np.abs(end.theta - theta).max() > 2.0 * SAME for theta, _ in found):
-            found.append((end.theta, 2.0 * end.cost))
-    return found
+def _search(stated: Problem, seed: int) -> tuple[list[tuple[np.ndarray, float]], Fit]:
+    """Descend from points that fill the box, and let the core go on from the lowest and judge it.
+
+    Gives minima, best first, and the fit of the best.
+    """
+    count = len(stated.names)
+    starts = qmc.LatinHypercube(count, rng=seed).random(FEW if count > MANY else STARTS)
+    found = descend_all(
+        residual, stated.core, 2.0 * starts - 1.0, stated.lower, stated.upper, STEPS, SHARP
+    )
+    found = Found(*map(np.asarray, found))
+    ends, cost = found.theta, found.cost
+    if not np.isfinite(cost).any():
+        raise InputError("a beam that no setting within the limits can carry", "other limits")
+    order = np.argsort(cost, kind="stable")
+    fit = solve(replace(stated, model={"settings": ends[order[0]]}))
+    minima = [(fit.theta, 2.0 * float(fit.cost))]
+    for i in order[found.rested[order]]:
+        if len(minima) == MOST_MINIMA:
+            break
+        if all(np.abs(ends[i] - theta).max() > 2.0 * SAME for theta, _ in minima):
+            _, end = search(stated, ends[i], STEPS)
+            # Where a search got stuck is no minimum.
+            if end.kkt.worst <= TOLERANCE:
+                minima.append((end.theta, 2.0 * end.cost))
+    return minima, fit
 
 
 @jax.jit
