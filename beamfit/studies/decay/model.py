@@ -39,7 +39,8 @@ RECORD = "decay"
 # Physics allows 0 to 1, so 30 moves no value that the record determines (by 4e-5 of it where the
 # verdict turns, nothing beyond); it keeps records too short for their noise from running away.
 PRIOR_WIDTH = 30.0
-# Where the search for the plain law may rest: one step of Gauss and Newton ends it at rounding.
+# Where the search for the plain law may rest: one more step of Gauss and Newton ends each
+# search at rounding.
 NEAR = 1e-8
 # Most steps with a shape: in a valley without a bottom the record cannot tell anyway.
 FEW_STEPS = 100
@@ -298,9 +299,8 @@ def _solve(readings: Array, free: Array, shape: Shape | None = None) -> tuple[Ar
         lambda step: jax.jvp(answer, (found.theta,), (step,)), out_axes=(None, 0)
     )(jnp.diag(free))
     root = _root(jacobian, free)
-    if shape is None:
-        step = jnp.where(found.rested, -root @ (root.T @ (jacobian @ residual)), 0.0)
-        values, residual = values + step @ slopes, residual + step @ jacobian
+    step = jnp.where(found.rested, -root @ (root.T @ (jacobian @ residual)), 0.0)
+    values, residual = values + step @ slopes, residual + step @ jacobian
     spread = slopes.T @ root
     errors = jnp.linalg.norm(spread, axis=1) / noise
     correlation = (spread[1] @ spread[2]) / noise**2 / (errors[1] * errors[2])
