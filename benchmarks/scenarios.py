@@ -15,16 +15,17 @@ from pathlib import Path
 import casadi
 import jax.numpy as jnp
 import numpy as np
-from beamfit.studies.scan.scenarios import STEPS, scenario_problem, train
 from rich.console import Console
 from rich.table import Table
 
 import beamfit
 from beamfit.greybox import problem as greybox
 from beamfit.greybox.descend import descend_all
-from beamfit.greybox.solve import starting_points
+from beamfit.greybox.solve import solve, starting_points
 from beamfit.studies.scan.assumptions import Anchor, Assumptions
 from beamfit.studies.scan.known import see
+from beamfit.studies.scan.model import predict_sizes
+from beamfit.studies.scan.transport_network import SCENARIO
 
 ROOT = Path(__file__).parents[1]
 OPTIONS = {"ipopt.print_level": 0, "print_time": 0, "ipopt.tol": 1e-9, "ipopt.max_iter": 3000}
@@ -56,13 +57,15 @@ def symbolic(problem):
     found = []
     for record in problem.records:
         measured, error = np.asarray(record.measured), np.asarray(record.error)
+        weight = np.broadcast_to(record.weight, measured.shape)  # 0 for padding
         for i, current in enumerate(np.asarray(record.data.inputs)[:, 0]):
             a, b = elements(float(current))
-            if record.name.startswith("size"):
+            if record.predict is predict_sizes:
                 size2 = 1e4 * ((a * l11 + b * l21) ** 2 + (b * l22) ** 2)
-                found.append((size2 - measured[i]) / error[i])
+                found.append(weight[i] * (size2 - measured[i]) / error[i])
             else:
-                found += [(v - measured[i, k]) / error[i, k] for k, v in enumerate((a, b))]
+                miss = [(v - measured[i, k]) / error[i, k] for k, v in enumerate((a, b))]
+                found += [weight[i, k] * m for k, m in enumerate(miss)]
     return t, casadi.vertcat(*found)
 
 
@@ -83,7 +86,7 @@ def ours(problem):
     def run(starts):
         lower, upper = jnp.asarray(problem.lower), jnp.asarray(problem.upper)
         points = jnp.asarray(np.array(starts))
-        found = descend_all(greybox.residual, problem.core, points, lower, upper, STEPS)
+        found = descend_all(greybox.residual, problem.core, points, lower, upper)
         return 2.0 * np.asarray(found.cost)
 
     return run
@@ -106,10 +109,10 @@ def compare(name, problem, count, table):
     search = ours(problem)
     began = time.perf_counter()
     search(starts)
-    train(problem, count)
+    solve(problem, count)
     first = time.perf_counter() - began
     costs, searched = timed(lambda: search(starts))
-    fit, whole = timed(lambda: train(problem, count))
+    fit, whole = timed(lambda: solve(problem, count))
     theirs, peer = timed(lambda: run(starts), 1)
     rows = [
         ("beamfit: search", costs, searched, first),
@@ -124,12 +127,12 @@ def compare(name, problem, count, table):
 def main(count=20):
     scan = beamfit.read_quad_scan(ROOT / "measurements/gtf_simulated.csv")
     line = beamfit.load_lattice(ROOT / "lattices/gtf.toml")
-    seen = see(scan, line, None, "size_squared")
+    seen = see(scan, line)
     table = Table(title=f"Transport network, SIMULATED scan of 14 points, {count} starts")
     for column in ("problem", "tool", "χ² best", "χ² median", "s warm", "ratio", "s first"):
         table.add_column(column)
     for name, anchor in (("no anchor", Anchor()), ("anchor 2 %", Anchor(deviation=0.02))):
-        problem = scenario_problem(seen, "transport-network", Assumptions(anchor=anchor))
+        problem = SCENARIO.state(seen, Assumptions(anchor=anchor))
         compare(name, problem, count, table)
     Console(width=110).print(table)
 

@@ -32,6 +32,8 @@ CUT = 1e-10
 PART = 1e-6
 # The standard deviation, in units of the best known direction, of one that nothing limits.
 FAR = 1e12
+# The noise of data that a model meets exactly, which must not be zero.
+EXACT = 1e-30
 
 
 class Group(NamedTuple):
@@ -53,7 +55,7 @@ class Group(NamedTuple):
     @property
     def factor(self) -> float:
         """What divides the rows for their information; 1 where the scatter says nothing."""
-        return self.scale if self.scale > 0 else 1.0
+        return 1.0 if math.isnan(self.scale) else max(self.scale, EXACT)
 
     @property
     def unknown(self) -> bool:

@@ -167,6 +167,6 @@ def test_the_fast_path_answers_the_problem(shape, stated):
     fit = solve(decay_problem(record, shape))
     scale = np.sqrt(fast.sum_squares / 197) if stated is None else 1.0
     for name in ("i0", "a", "b"):
-        assert fit[name].value == pytest.approx(float(getattr(fast.values, name)), rel=1e-8)
+        assert fit[name].value == pytest.approx(float(getattr(fast.values, name)), rel=1e-10)
         error = float(getattr(fast.errors, name)) * scale
-        assert fit[name].error_raw == pytest.approx(error, rel=1e-4)
+        assert fit[name].error_raw == pytest.approx(error, rel=1e-7)

@@ -132,6 +132,22 @@ def test_and_that_measurement_closes_it(root):
     assert after.x.emittance.relative == pytest.approx(option.relative_error["x"], rel=0.2)
 
 
+def test_settings_mean_what_their_column_says(gtf, scan, known):
+    """The same scan in k1, of a lattice that is set in amperes."""
+    magnet = gtf["Q2"]
+    k1 = np.array([float(magnet.k1(i, gtf.energy)) for i in scan.settings["Q2"]])
+    twin = beamfit.QuadScan({"Q2": k1}, {"Q2": "k1"}, scan.size, scan.error)
+    steps = [plan_measurements(f, count=2).steps for f in (known, beamfit.fit_emittance(twin, gtf))]
+    for own, other in zip(*steps, strict=True):
+        assert other.relative_error["x"] == pytest.approx(own.relative_error["x"], rel=1e-9)
+    assert "1/m²" in steps[1][0].candidate.words
+
+
+def test_a_magnet_that_was_not_scanned_may_be_set(known):
+    [step] = plan_measurements(known, limits={"Q1": (0.0, 1.0)}, count=1).steps
+    assert set(step.candidate.settings) == {"Q1", "Q2"}
+
+
 @pytest.mark.parametrize(
     ("options", "words"),
     [

@@ -1,5 +1,7 @@
 """Scenarios: what each finds on simulated scans with a known truth, and what it says it cannot."""
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -14,7 +16,8 @@ from beamfit.optics.elements import Quadrupole, Screen
 from beamfit.studies.scan.assumptions import Anchor, Assumptions
 from beamfit.studies.scan.calibration import with_numbers
 from beamfit.studies.scan.known import see
-from beamfit.studies.scan.model import UNIT
+from beamfit.studies.scan.model import UNIT, asked_numbers
+from beamfit.studies.scan.statement import asked_of
 from beamfit.studies.scan.transport_network import SCENARIO as TRANSPORT_NETWORK
 from beamfit.studies.scan.transport_network import certificate_of
 from tests.studies.conftest import TABLE_2
@@ -367,3 +370,86 @@ def test_three_quads_two_screens_two_energies(three_quads):
 def test_training_from_many_starts_is_no_worse_than_from_one(scan, gtf):
     problem = TRANSPORT_NETWORK.state(see(scan, gtf), Assumptions(anchor=ANCHOR))
     assert solve(problem, 20).cost <= solve(problem, 1).cost + 1e-9
+
+
+@pytest.mark.parametrize("plane", ["x", "y"])
+def test_the_same_data_and_model_have_one_error(otr2_both, plane):
+    """A calibration that is told is no unknown; each plane has the noise of its own sizes."""
+    known, told = (fit[plane] for fit in otr2_both)
+    for name in ("emittance", "normalized_emittance", "beta", "alpha", "mismatch"):
+        a, b = getattr(known, name), getattr(told, name)
+        assert b.value == pytest.approx(a.value, rel=1e-6)
+        assert b.error == pytest.approx(a.error, rel=1e-6)
+        assert b.error_raw == pytest.approx(a.error_raw, rel=1e-6)
+    assert (told.status, told.dof) == (known.status, known.dof)
+    assert told.chi2 == pytest.approx(known.chi2, rel=1e-6)
+    assert told.error_scale == pytest.approx(known.error_scale, rel=1e-6)
+
+
+@pytest.fixture(scope="module")
+def otr2_both(root, otr2):
+    scan = beamfit.read_quad_scan(root / "measurements/lcls_otr2.csv")
+    priors = {"Q525.scale": (1.0, 1e-9)}
+    told = beamfit.fit_emittance(scan, otr2, scenario="calibration", priors=priors)
+    return beamfit.fit_emittance(scan, otr2), told
+
+
+@pytest.mark.parametrize("method", ["size_squared", "size"])
+def test_the_closed_form_is_the_answer_of_the_problem(root, otr2, method):
+    """Values, errors and noise of the fast path against the core's fit of the same statement."""
+    scan = beamfit.read_quad_scan(root / "measurements/lcls_otr2.csv")
+    fast = beamfit.fit_emittance(scan, otr2, method=method)
+    for plane in "xy":
+        asked = asked_of(fast.seen, plane)
+        found = fast.fit.derive(asked_numbers, asked)
+        work = fast.seen.works[plane]
+        np.testing.assert_allclose(found.value, work.value, rtol=1e-10)
+        group = fast.fit.group(f"size {plane}")
+        assert group.scale == pytest.approx(fast[plane].error_scale, rel=1e-9)
+        assert group.dof == pytest.approx(fast[plane].dof, abs=1e-9)
+        tolerance = 1e-7 if method == "size_squared" else 1e-5
+        np.testing.assert_allclose(found.error_raw, work.error, rtol=tolerance)
+
+
+@pytest.mark.parametrize("name", ["map", "beam", "x", "magnets"])
+def test_a_magnet_may_have_any_name(scan, gtf, with_prior, name):
+    elements = tuple(replace(e, name=name) if e.name == "Q2" else e for e in gtf.elements)
+    line = replace(gtf, elements=elements)
+    renamed = replace(scan, settings={name: scan.settings["Q2"]}, units={name: "A"}, columns={})
+    told = {f"{name}.slope": PRIOR["Q2.slope"]}
+    fit = beamfit.fit_emittance(renamed, line, scenario="calibration", priors=told)
+    assert fit.x.emittance.value == pytest.approx(with_prior.x.emittance.value, rel=1e-9)
+    assert {p.name for p in fit.parameters} == {f"{name}.slope", f"{name}.intercept"}
+    assert fit.line[name].calibration.slope == pytest.approx(
+        named(fit, f"{name}.slope").value.value
+    )
+
+
+def test_every_start_of_a_training_is_kept_and_said(anchored):
+    assert len(anchored.fit.attempts) == 20
+    assert "20 starts" in anchored.fit.message
+
+
+def test_one_more_point_compiles_nothing(scan, gtf):
+    """From 15 to 16 points, both padded to 16: the compiled calls are those of before."""
+    compiled = []
+
+    def heard(event, seconds, **_):
+        if event == "/jax/core/compile/backend_compile_duration":
+            compiled.append(event)
+
+    def longer(n):
+        settings = {"Q2": np.append(scan.settings["Q2"], scan.settings["Q2"][:n])}
+        columns = [{"x": np.append(v["x"], v["x"][:n])} for v in (scan.size, scan.error)]
+        return beamfit.QuadScan(settings, {"Q2": "A"}, *columns)
+
+    options = ({}, {"scenario": "calibration", "priors": PRIOR})
+    for told in options:
+        beamfit.fit_emittance(longer(1), gtf, **told)
+    jax.monitoring.register_event_duration_secs_listener(heard)
+    try:
+        for told in options:
+            beamfit.fit_emittance(longer(2), gtf, **told)
+    finally:
+        jax.monitoring.clear_event_listeners()
+    assert compiled == []

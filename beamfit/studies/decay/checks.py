@@ -32,6 +32,8 @@ __all__ = [
 FEWEST_IN_WINDOW = 5
 REJECTED = 1e-3
 EXACT = 1e-8
+# Below 1e-12 a bias is rounding.
+BIAS_DIGITS = 12
 # Readings from which the test of a constant a can tell all that it can.
 ENOUGH = 1024
 
@@ -69,7 +71,8 @@ class OneLifetime:
 
 def _one_lifetime(rate: float, error: float, residuals: np.ndarray, fit: DecayFit) -> OneLifetime:
     bias = [
-        1 / rate / HOUR / quantity.value - 1 for quantity in (fit.lifetime_start, fit.lifetime_mean)
+        round(1 / rate / HOUR / quantity.value - 1, BIAS_DIGITS)
+        for quantity in (fit.lifetime_start, fit.lifetime_mean)
     ]
     spread = error / rate**2 / HOUR
     lifetime = Quantity(1 / rate / HOUR, spread, "h", spread)

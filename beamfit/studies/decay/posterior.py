@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Protocol
 
 import jax.numpy as jnp
@@ -11,14 +12,13 @@ from jax import Array
 
 from beamfit.errors import InputError
 from beamfit.greybox.posterior import Optimum, Statement, predicted, target_of
-from beamfit.greybox.problem import Free, Problem
 from beamfit.lifetime.decay import HOUR, current
 from beamfit.quantity import Quantity
 from beamfit.sampling.posterior import Expected, Posterior
 from beamfit.sampling.priors import Distribution
 from beamfit.sampling.target import Target
 from beamfit.status import Status
-from beamfit.studies.decay.model import RECORD, DecayNumbers, decay_record
+from beamfit.studies.decay.model import RECORD, DecayNumbers, decay_problem
 from beamfit.studies.decay.record import DecayRecord
 from beamfit.verdict import Finding
 
@@ -87,8 +87,8 @@ def decay_target(
     if fit.shaped:
         expected = "a fit of eq. 44 with constant a and b; sample fit_decay(record) without shape"
         raise InputError("a fit with a shape of a(I), which is not sampled", expected)
-    free = [Free("i0"), Free("a"), Free("b")]
-    problem = Problem(DecayNumbers(1.0, 0.0, 0.0), free, [decay_record(record)])
+    # The fit's weak prior only keeps a search from running away; the bounds do that here.
+    problem = replace(decay_problem(record), priors=())
     theta, rate = _start(fit, record)
     scale = fit.rms_residual * np.sqrt(len(record) / max(fit.dof, 1))
     if record.error is not None:

@@ -14,16 +14,16 @@ from beamfit.greybox.design import Information
 from beamfit.optics.beamline import Beamline
 from beamfit.optics.calibration import SETTING_UNITS
 from beamfit.optics.elements import Drift, Screen
+from beamfit.studies.scan.calibration import Kind, numbers_of_magnets
 from beamfit.studies.scan.fit import EmittanceFit
 from beamfit.studies.scan.information import linearised_at, with_slope
 from beamfit.studies.scan.model import predict_sizes, spoken
+from beamfit.studies.scan.next_point import candidate_settings
+from beamfit.studies.scan.statement import varied_magnets
 from beamfit.studies.scan.transport import NetworkRows, Rows
 
 __all__ = ["Candidate", "Considered", "candidate_rows", "further_options"]
 
-COUNT, REACH = 41, 0.5
-# A setting below this share of the range is the rounding of zero.
-ROUNDING = 1e-9
 # Other energies to consider where none is named: what a linac can usually do.
 USUAL_ENERGIES = (0.8, 1.25)
 
@@ -70,65 +70,55 @@ def candidate_rows(
     InputError
         If limits name no magnet of the line, or are reversed.
     """
-    held = {n: float(np.median(v)) for n, v in fit.scan.settings.items()}
-    ranges = _ranges(fit, limits)
-    own = _own_energy(fit)
-    screens = _screens(fit)
-    found = []
-    for name, (low, high) in ranges.items():
-        values = np.linspace(low, high, COUNT)
-        values[np.abs(values) < ROUNDING * (high - low)] = 0.0
-        start = held.get(name, float(fit.line[name].setting))
-        table = {n: np.full(COUNT, v) for n, v in (held | {name: start}).items()}
-        table[name] = values
+    own, screens, found = _own_energy(fit), _screens(fit), []
+    for name, table in candidate_settings(fit.scan.settings, _checked(fit, limits)):
+        count = len(table[name])
         for screen in screens:
             for energy in (own, *energies):
-                rows = _rows(fit, fit.line, table, screen, np.full(COUNT, energy))
+                rows = _rows(fit, fit.seen.scanned, table, screen, np.full(count, energy))
                 found += [
                     Considered(_named(fit, table, i, screen, energy, own, screens), rows[:, i])
-                    for i in range(COUNT)
+                    for i in range(count)
                 ]
     return found
 
 
-def _ranges(fit: EmittanceFit, limits) -> dict[str, tuple[float, float]]:
-    if limits is None:
-        varied = {n: v for n, v in fit.scan.settings.items() if np.ptp(v) > 0}
-        return {
-            n: (float(v.min() - REACH * np.ptp(v)), float(v.max() + REACH * np.ptp(v)))
-            for n, v in varied.items()
-        }
-    for name, (low, high) in limits.items():
-        if name not in fit.line.magnets:
+def _checked(fit: EmittanceFit, limits):
+    """Limits of magnets that can be set, refused if they cannot be used."""
+    for name, (low, high) in (limits or {}).items():
+        if name not in fit.seen.scanned.magnets:
             raise InputError(
-                f"limits of '{name}'", nearest(name, list(fit.line.magnets)) + ", a magnet"
+                f"limits of '{name}'", nearest(name, list(fit.seen.scanned.magnets)) + ", a magnet"
             )
         if not (np.isfinite(low) and np.isfinite(high) and low < high):
             raise InputError(f"limits {low:g}:{high:g} of {name}", "finite limits, lower first")
-        if fit.scenario == "transport-network" and np.ptp(fit.scan.settings.get(name, [0.0])) == 0:
+        if not fit.statement.whole_map and name not in varied_magnets(fit.scan):
             raise InputError(f"limits of '{name}', which was not scanned", "a scanned magnet")
-    return dict(limits)
+    return limits
 
 
 def _own_energy(fit: EmittanceFit) -> float:
-    return float(fit.line.energy) if fit.scan.energy is None else float(fit.scan.energy.mean())
+    return (
+        float(fit.seen.scanned.energy) if fit.scan.energy is None else float(fit.scan.energy.mean())
+    )
 
 
 def _screens(fit: EmittanceFit) -> tuple[str, ...]:
     """Screens to measure at: all of the line, downstream of a scanned magnet."""
-    measured = fit.scan.screen or (fit.line.screens[-1],)
-    if fit.scenario == "transport-network":  # another screen has another network
+    measured = fit.scan.screen or (fit.seen.scanned.screens[-1],)
+    if not fit.statement.whole_map:  # another screen has another network
         return tuple(dict.fromkeys(measured))
-    names = [e.name for e in fit.line.elements]
-    first = min(names.index(n) for n, v in fit.scan.settings.items() if np.ptp(v) > 0)
-    later = [s for s in fit.line.screens if names.index(s) > first]
+    names = [e.name for e in fit.seen.scanned.elements]
+    first = min(names.index(n) for n in varied_magnets(fit.scan))
+    later = [s for s in fit.seen.scanned.screens if names.index(s) > first]
     return tuple(dict.fromkeys((*measured, *later)))
 
 
 def _in_words(fit: EmittanceFit, settings: Mapping[str, float]) -> str:
     """Settings with the units of the scan."""
-    units = fit.scan.units
-    return ", ".join(f"{n} = {v:.4g} {SETTING_UNITS[units[n]]}" for n, v in settings.items())
+    line = fit.seen.scanned
+    units = {n: SETTING_UNITS[line[n].calibration.unit] for n in settings}
+    return ", ".join(f"{n} = {v:.4g} {units[n]}" for n, v in settings.items())
 
 
 def _named(fit, table, i, screen, energy, own, screens) -> Candidate:
@@ -151,27 +141,30 @@ def _rows(
     found = []
     for plane in fit.planes:
         relative = np.median(plane.points.error / plane.points.size) * plane.error_scale
-        if fit.scenario == "transport-network":
-            data, predict = _network_rows(fit, plane.plane, table, screen), predict_sizes
+        if fit.statement.whole_map:
+            data = _line_rows(fit, line, plane.plane, table, screen, energy)
         else:
-            data, predict = _line_rows(fit, line, plane.plane, table, screen, energy), predict_sizes
-        size, slope = (
-            np.asarray(v) for v in with_slope(predict, problem.core, jnp.asarray(theta), data)
-        )
+            data = _network_rows(fit, plane.plane, table, screen)
+        both = with_slope(predict_sizes, problem.core, jnp.asarray(theta), data)
+        size, slope = map(np.asarray, both)
         found.append(slope / (max(float(relative), 1e-4) * size)[:, None])
     return np.array(found)
 
 
+def _measured(fit: EmittanceFit, plane: str) -> Rows | NetworkRows:
+    """The rows of a plane that were measured."""
+    sizes = (r.data for r in fit.problem.records if r.predict is predict_sizes)
+    return next(rows for rows in sizes if rows.plane == plane)
+
+
 def _line_rows(fit, line, plane, table, screen, energy) -> Rows:
     count = len(energy)
-    branches = any(len(getattr(e, "shape", ())) == 2 for e in _settings_of(fit, plane).values())
-    settings = {n: jnp.asarray(v) for n, v in table.items()}
-    if branches:  # a further point is measured on the rising branch
-        settings = {
-            n: jnp.stack([v, jnp.ones(count)], -1) if np.ptp(fit.scan.settings[n]) > 0 else v
-            for n, v in settings.items()
-        }
-    element = line[screen]
+    shapes = {n: np.ndim(v) for n, v in _measured(fit, plane).settings.items()}
+    # Where a magnet has branches, a further point is measured on the rising one.
+    settings = {
+        n: jnp.stack([v, jnp.ones(count)], -1) if shapes.get(n) == 2 else jnp.asarray(v)
+        for n, v in table.items()
+    }
     return Rows(
         plane,
         (screen,),
@@ -181,29 +174,23 @@ def _line_rows(fit, line, plane, table, screen, energy) -> Rows:
         jnp.asarray(energy),
         jnp.zeros(count, int),
         jnp.full(count, float(line.energy_spread)),
-        jnp.full(count, float(getattr(element, "resolution", 0.0))),
+        jnp.full(count, float(getattr(line[screen], "resolution", 0.0))),
     )
 
 
-def _settings_of(fit, plane) -> dict:
-    record = next(r for r in fit.problem.records if r.name == f"size {plane}")
-    return record.data.settings
-
-
 def _network_rows(fit, plane, table, screen) -> NetworkRows:
-    net = fit.fit.model["map"]
-    record = next(r for r in fit.problem.records if r.name == f"size {plane}")
-    measured = fit.scan.screen or (screen,) * len(fit.scan)
-    keep = np.flatnonzero(~np.isnan(fit.scan.size[plane]))
-    which = next(k for k in keep if measured[k] == screen)
+    measured, seen = _measured(fit, plane), fit.seen
+    place = seen.rows.places.index(screen)
+    which = next(i for i in seen.measured(plane) if seen.rows.which[i] == place)
     count = len(next(iter(table.values())))
-    inputs = [table.get(n, np.full(count, _own_energy(fit))) for n in net.inputs]
+    names = fit.fit.model["map"].inputs
+    inputs = [table.get(n, np.full(count, _own_energy(fit))) for n in names]
     return NetworkRows(
         plane,
         False,
         jnp.asarray(np.stack(inputs, -1)),
-        jnp.tile(record.data.columns[which], (count, 1)),
-        jnp.full(count, float(np.median(np.asarray(record.data.known)))),
+        jnp.tile(measured.columns[which], (count, 1)),
+        jnp.full(count, float(np.median(np.asarray(measured.known)))),
     )
 
 
@@ -232,7 +219,7 @@ def further_options(
     table = {n: np.asarray(v) for n, v in fit.scan.settings.items()}
     own = _own_energy(fit)
     energy = np.full(len(fit.scan), own) if fit.scan.energy is None else fit.scan.energy
-    if fit.scenario != "transport-network":
+    if fit.statement.whole_map:
         for line, screen, words in _other_screens(fit):
             rows = _rows(fit, line, table, screen, energy)
             best = min(range(rows.shape[1]), key=lambda i: _worst(base.with_rows(rows[:, i])))
@@ -240,8 +227,8 @@ def further_options(
             yield f"one size on {words} ({at})", rows[:, best]
             yield f"the same scan on {words}", rows.reshape(-1, rows.shape[-1])
         for factor in energies or tuple(own * f for f in USUAL_ENERGIES):
-            screen = (fit.scan.screen or (fit.line.screens[-1],))[-1]
-            rows = _rows(fit, fit.line, table, screen, np.full(len(fit.scan), factor))
+            screen = (fit.scan.screen or (fit.seen.scanned.screens[-1],))[-1]
+            rows = _rows(fit, fit.seen.scanned, table, screen, np.full(len(fit.scan), factor))
             yield f"the same scan at {factor:.4g} MeV", rows.reshape(-1, rows.shape[-1])
     for words, rows in _priors(fit):
         yield words, rows
@@ -254,29 +241,32 @@ def _worst(after: Information) -> float:
 
 def _other_screens(fit: EmittanceFit) -> list[tuple[Beamline, str, str]]:
     """Screens that were not used, or else places for one in the drifts after the magnets."""
-    used = set(fit.scan.screen or (fit.line.screens[-1],))
+    used = set(fit.scan.screen or (fit.seen.scanned.screens[-1],))
     unused = [s for s in _screens(fit) if s not in used]
     if unused:
-        return [(fit.line, s, f"screen {s}") for s in unused]
-    names = [e.name for e in fit.line.elements]
-    last = max(names.index(n) for n, v in fit.scan.settings.items() if np.ptp(v) > 0)
+        return [(fit.seen.scanned, s, f"screen {s}") for s in unused]
+    names = [e.name for e in fit.seen.scanned.elements]
+    last = max(names.index(n) for n in varied_magnets(fit.scan))
     found = []
-    for i, element in enumerate(fit.line.elements):
+    for i, element in enumerate(fit.seen.scanned.elements):
         if i > last and isinstance(element, Drift) and element.length > 0.3:
             half = replace(element, length=0.5 * element.length)
             parts = (half, Screen("NEW"), half)
-            elements = (*fit.line.elements[:i], *parts, *fit.line.elements[i + 1 :])
+            elements = (*fit.seen.scanned.elements[:i], *parts, *fit.seen.scanned.elements[i + 1 :])
             words = f"a new screen in the middle of {element.name}"
-            found.append((replace(fit.line, elements=elements), "NEW", words))
+            found.append((replace(fit.seen.scanned, elements=elements), "NEW", words))
     return found
 
 
 def _priors(fit: EmittanceFit) -> Iterator[tuple[str, np.ndarray]]:
     """A 2 % measurement of each slope, as from a field map of the magnet."""
-    p = fit.problem
-    for i, name in enumerate(p.names):
-        if not p.nuisance[i] and name.endswith((".slope", ".scale", "coefficients.1")):
-            value = abs(float(p.start[i]))
-            row = np.zeros((1, len(p.names)))
-            row[0, i] = 1.0 / (0.02 * value)
+    slopes = {
+        f"magnets.{name}": number.value
+        for name, number in numbers_of_magnets(fit.seen.scanned).items()
+        if number.kind is Kind.slope
+    }
+    for i, name in enumerate(fit.problem.names):
+        if name in slopes:
+            row = np.zeros((1, len(fit.problem.names)))
+            row[0, i] = 1.0 / (0.02 * abs(slopes[name]))
             yield f"a prior of 2 % on {spoken(name)}", row

@@ -31,6 +31,7 @@ __all__ = ["CRITERIA", "Advice", "Option", "Step", "plan_measurements"]
 CRITERIA = ("emittance", "D")
 # A further point that sharpens the emittance by less than this is not worth its shift time.
 LEAST_GAIN = 0.01
+TIE = " Tie the network to first principles (--anchor first-principles=2%)."
 
 
 class Step(NamedTuple):
@@ -68,6 +69,8 @@ class Advice:
         Why the list ends there.
     options : tuple of Option
         For a scenario that is not identified: which kind of measurement would identify it.
+    tie : str
+        What else could, in words.
     """
 
     scenario: str
@@ -77,6 +80,7 @@ class Advice:
     steps: tuple[Step, ...]
     stop: str
     options: tuple[Option, ...]
+    tie: str = ""
 
     @property
     def message(self) -> str:
@@ -89,9 +93,7 @@ class Advice:
             best = min(good, key=lambda o: max(o.relative_error.values()))
             return f"{first} It would be determined with {best.words}."
         if not self.identified:
-            tie = " Tie the network to first principles (--anchor first-principles=2%)."
-            network = tie if self.scenario.endswith("network") else ""
-            return f"{first} None of the measurements considered would change that.{network}"
+            return f"{first} None of the measurements considered would change that.{self.tie}"
         if not self.steps:
             return f"{first} {self.stop}"
         return f"{first} Measure next at {self.steps[0].candidate.words}. {self.stop}"
@@ -213,7 +215,14 @@ def plan_measurements(
     steps, stop = _steps(fit, base, considered, criterion, goal, count)
     options = () if identified(base) else tuple(_options(fit, base, energies))
     return Advice(
-        fit.scenario, criterion, identified(base), by_plane(fit, base), steps, stop, options
+        fit.scenario,
+        criterion,
+        identified(base),
+        by_plane(fit, base),
+        steps,
+        stop,
+        options,
+        TIE if fit.statement.network else "",
     )
 
 

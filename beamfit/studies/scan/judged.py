@@ -6,6 +6,7 @@ import math
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
@@ -207,14 +208,15 @@ def _outlier_words(p: Points) -> str:
     )
 
 
-def _answers(model: Mapping[str, Any], data: tuple[tuple[Any, Asked], ...]) -> Array:
-    """`QUANTITIES` of each plane, then R11, R12 and known size² of each of its rows."""
-    return jnp.stack(
-        [
-            jnp.concatenate([asked_numbers(model, asked), *rows.elements(model)])
-            for rows, asked in data
-        ]
-    )
+def _numbers(model: Mapping[str, Any], asked: tuple[Asked, ...]) -> Array:
+    """`QUANTITIES` of each plane."""
+    return jnp.stack([asked_numbers(model, each) for each in asked])
+
+
+@jax.jit
+def _elements(model: Mapping[str, Any], rows: tuple[Any, ...]) -> Array:
+    """R11, R12 and known size² of each plane's rows."""
+    return jnp.stack([jnp.stack(each.elements(model)) for each in rows])
 
 
 def judged_scenario(
@@ -232,11 +234,11 @@ def judged_scenario(
     must be determined by the rules of known transport too.
     """
     records = {r.data.plane: r for r in fit.problem.records if r.predict is predict_sizes}
-    rows = {plane: records[plane].data for plane in seen.planes}
+    rows = tuple(records[plane].data for plane in seen.planes)
     whole = scenario.whole_map
-    asked = [(r, asked_of(seen, p, whole, r.line if whole else None)) for p, r in rows.items()]
-    derived = fit.derive(_answers, tuple(asked))
-    elements = derived.value[:, len(QUANTITIES) :].reshape(len(asked), 3, -1)
+    asked = tuple(asked_of(seen, r.plane, whole, r.line if whole else None) for r in rows)
+    derived = fit.derive(_numbers, asked)
+    elements = np.asarray(_elements(fit.model, rows))
     look, beams = list(seen.look), {}
     for plane, found in zip(seen.planes, elements, strict=True):
         for i in range(3):
@@ -245,7 +247,7 @@ def judged_scenario(
     again = seen._replace(works=works_of(seen, Look(*look), seen.planes))
     beside, jacobian = _beside(again), _loose_jacobian(fit)
     for i, plane in enumerate(seen.planes):
-        own = Derived(*(part[i, : len(QUANTITIES)] for part in derived))
+        own = Derived(*(part[i] for part in derived))
         evidence = again.works[plane].evidence._replace(neighbour=beside[plane])
         points = _points_at(seen, plane, own.value[SIGMA], *elements[i])
         group = next((g for g in fit.groups if g.name == records[plane].name), NOTHING)

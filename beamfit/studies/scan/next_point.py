@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -13,6 +14,8 @@ __all__ = ["Candidate", "best_candidate", "best_symmetric", "candidate_settings"
 
 # Candidates reach half the scanned range beyond either end.
 REACH, COUNT = 0.5, 41
+# A setting below this share of the range is the rounding of zero.
+ROUNDING = 1e-9
 
 
 class Candidate(NamedTuple):
@@ -23,19 +26,23 @@ class Candidate(NamedTuple):
     relative_error: float
 
 
-def candidate_settings(settings: dict[str, np.ndarray]) -> list[tuple[str, dict[str, np.ndarray]]]:
-    """Settings to consider: each scanned magnet over and beyond its range, others held.
+def candidate_settings(
+    settings: Mapping[str, np.ndarray],
+    limits: Mapping[str, tuple[float, float]] | None = None,
+) -> list[tuple[str, dict[str, np.ndarray]]]:
+    """Settings to consider: one magnet after the other over its range, the others held.
 
     Parameters
     ----------
-    settings : dict of str to ndarray
+    settings : mapping of str to ndarray
         The settings already measured.
+    limits : mapping of str to (float, float), optional
+        Magnets and their ranges; each scanned one, half its range beyond either end if None.
 
     Returns
     -------
     list of (str, dict)
-        For each magnet that was varied, the settings of all magnets, each of shape (41,). The
-        others stay at their median.
+        For each magnet the settings of all, each of shape (41,). The others stay at their median.
 
     Examples
     --------
@@ -43,14 +50,15 @@ def candidate_settings(settings: dict[str, np.ndarray]) -> list[tuple[str, dict[
     >>> name, table["Q"][[0, -1]].tolist()
     ('Q', [-1.0, 3.0])
     """
+    if limits is None:
+        spans = {n: (v.min(), v.max(), REACH * np.ptp(v)) for n, v in settings.items()}
+        limits = {n: (low - far, high + far) for n, (low, high, far) in spans.items() if far > 0}
+    held = {n: np.full(COUNT, np.median(v)) for n, v in settings.items()}
     found = []
-    for name, values in settings.items():
-        span = np.ptp(values)
-        if span == 0:
-            continue
-        table = {n: np.full(COUNT, np.median(v)) for n, v in settings.items()}
-        table[name] = np.linspace(values.min() - REACH * span, values.max() + REACH * span, COUNT)
-        found.append((name, table))
+    for name, (low, high) in limits.items():
+        values = np.linspace(low, high, COUNT)
+        values[np.abs(values) < ROUNDING * (high - low)] = 0.0
+        found.append((name, held | {name: values}))
     return found
 
 

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 from jax import Array
 from jax.typing import ArrayLike
 
+from beamfit.greybox.descend import descend_one
 from beamfit.studies.scan.model import coefficients, numbers_of
 
 __all__ = [
@@ -192,8 +193,8 @@ def solve_size(data: SizeData, weight: ArrayLike = 1.0) -> SigmaFit:
 
     Notes
     -----
-    Residual (model - size)/error (Appendices A and C of the report), by Levenberg-Marquardt
-    on the Cholesky factor of σ in units of its start, so that every iterate has a size.
+    Residual (model - size)/error (Appendices A and C of the report), on the Cholesky factor of σ
+    in units of its start, so that every iterate has a size.
     """
     start = solve_size_squared(data, weight)
     scale = jnp.sqrt(weight) / data.error
@@ -215,13 +216,14 @@ def solve_size(data: SizeData, weight: ArrayLike = 1.0) -> SigmaFit:
 
     correlation = start.sigma[1] / (unit[0] * unit[1])
     width = jnp.sqrt(jnp.maximum(1.0 - correlation**2, 1e-6))
-    p, converged = _levenberg_marquardt(residual, jnp.stack([jnp.ones(()), correlation, width]))
-    sigma = sigma_of(p)
+    first, free = jnp.stack([jnp.ones(()), correlation, width]), jnp.full(3, jnp.inf)
+    end = descend_one(residual, first, -free, free)
+    sigma = sigma_of(end.theta)
     model = jnp.sqrt(design @ sigma + data.known)
     _, covariance, full_rank = _least_squares(design * (0.5 * scale / model)[:, None], data.size)
     determinant = sigma[0] * sigma[2] - sigma[1] ** 2
     gradient = jnp.stack([sigma[2], -2.0 * sigma[1], sigma[0]])
-    chi2 = jnp.sum(residual(p) ** 2)
+    chi2 = 2.0 * end.cost
     flat = jnp.sqrt(design @ zero_emittance(*_linear(data, weight))[0] + data.known)
     flat_chi2 = jnp.sum(((flat - data.size) * scale) ** 2)
     return start._replace(
@@ -233,39 +235,8 @@ def solve_size(data: SizeData, weight: ArrayLike = 1.0) -> SigmaFit:
         chi2_zero=jnp.maximum(chi2, jnp.minimum(flat_chi2, start.chi2_zero)),
         full_rank=full_rank,
         positive=start.positive & (determinant > 0.0),
-        converged=converged,
+        converged=end.rested,
     )
-
-
-def _levenberg_marquardt(residual, start: Array) -> tuple[Array, Array]:
-    """Minimise |residual|² over three numbers; return them and whether they settled."""
-    jacobian = jax.jacfwd(residual)
-
-    def step(state):
-        p, chi2, damping, _, count = state
-        j, r = jacobian(p), residual(p)
-        normal = j.T @ j
-        change = jnp.linalg.solve(
-            normal + damping * jnp.diag(jnp.diagonal(normal) + 1e-30), j.T @ r
-        )
-        tried = p - change
-        chi2_tried = jnp.sum(residual(tried) ** 2)
-        better = chi2_tried <= chi2
-        small = jnp.max(jnp.abs(change)) < 1e-11
-        return (
-            jnp.where(better, tried, p),
-            jnp.where(better, chi2_tried, chi2),
-            jnp.where(better, damping * 0.1, damping * 10.0),
-            small,
-            count + 1,
-        )
-
-    def unfinished(state):
-        return ~state[3] & (state[4] < 100)
-
-    first = (start, jnp.sum(residual(start) ** 2), jnp.asarray(1e-4), jnp.asarray(False), 0)
-    p, _, _, settled, _ = jax.lax.while_loop(unfinished, step, first)
-    return p, settled
 
 
 SOLVE = {"size_squared": solve_size_squared, "size": solve_size}
