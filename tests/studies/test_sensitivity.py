@@ -2,6 +2,8 @@
 
 from dataclasses import replace
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -13,6 +15,7 @@ from beamfit.studies.scan.sensitivity import (
     range_sensitivity,
     systematics,
 )
+from beamfit.studies.scan.transport import transfer_rows
 from tests.studies.conftest import scan_of
 
 
@@ -166,3 +169,18 @@ def test_robust_fit_of_clean_data_is_the_plain_fit(gtf, gtf_sizes):
     assert robust.emittance.value == pytest.approx(plain.emittance.value, rel=1e-9)
     assert robust.points.outlier_probability.max() < 0.01
     assert robust.emittance.error == pytest.approx(plain.emittance.error, rel=0.01)
+
+
+def test_a_line_inside_a_users_trace_is_no_trace_of_it(otr2):
+    """What is kept of a line is numbers, also where it was first seen inside a function of JAX."""
+    settings = {"Q525": np.linspace(-4.0, -1.0, 3)}
+    energy = np.full(3, 135.0)
+    traced = jax.tree.map(jnp.asarray, otr2)  # a line whose numbers are JAX's own
+
+    def size(k):
+        return transfer_rows(traced, {"Q525": settings["Q525"] * k}, energy, ("OTR2",)).planes.sum()
+
+    inside = jax.jit(size)(1.0)
+    outside = transfer_rows(traced, settings, energy, ("OTR2",)).planes.sum()
+    assert float(inside) == pytest.approx(float(outside), rel=1e-12)
+    assert np.isfinite(jax.grad(size)(1.0))

@@ -299,7 +299,9 @@ def seen_line(
     """A line as rows of these settings and energies see it: all else multiplied out."""
     own = () if isinstance(energy, jax.core.Tracer) else np.unique(energy)
     keep = frozenset((*settings, *places))
-    return _condensed(_Same(line), keep, float(own[0]) if len(own) == 1 else None)
+    # Kept beyond a trace that this may be called in: what is known is computed, never traced.
+    with jax.ensure_compile_time_eval():
+        return _condensed(_Same(line), keep, float(own[0]) if len(own) == 1 else None)
 
 
 class _Same(NamedTuple):
