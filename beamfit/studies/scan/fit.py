@@ -10,14 +10,12 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from beamfit.errors import InputError
-from beamfit.greybox.fit import Fit
 from beamfit.greybox.problem import Problem
-from beamfit.greybox.solve import solve
 from beamfit.optics.beamline import Beamline
 from beamfit.quantity import Quantity
 from beamfit.status import Status
 from beamfit.studies.scan.assumptions import SCENARIOS, Anchor, Assumptions
-from beamfit.studies.scan.judged import judged_beam, judged_scenario
+from beamfit.studies.scan.judged import judged_beam
 from beamfit.studies.scan.known import METHODS, see
 from beamfit.studies.scan.model import line_of
 from beamfit.studies.scan.results import Parameter, PlaneFit, parameter_rows, result_rows
@@ -26,6 +24,7 @@ from beamfit.studies.scan.statement import Scenario, Seen
 from beamfit.table import Table, html_of, json_of, labelled, text_of
 
 if TYPE_CHECKING:
+    from beamfit.greybox.fit import Fit
     from beamfit.sampling.posterior import Posterior
     from beamfit.sampling.priors import Distribution
 
@@ -94,6 +93,7 @@ def fit_emittance(
 
     Examples
     --------
+    >>> import numpy as np
     >>> from beamfit.optics.beam import BeamMatrix
     >>> from beamfit.optics.elements import Drift, Quadrupole, Screen
     >>> line = Beamline((Quadrupole("Q", 0.1), Drift("D", 2.0), Screen("S")), energy=135.0)
@@ -117,6 +117,9 @@ def fit_emittance(
     seen = see(scan, line, planes, method, robust, at_once=statement.closed)
     if statement.closed:
         return EmittanceFit(judged_beam(seen), scan, line, statement, told, seen)
+
+    from beamfit.studies.scan.unknowns import judged_scenario  # solvers only where they are needed
+
     stated = statement.state(seen, told)
     fit = _solved(stated, statement, told)
     parameters = tuple(statement.parameters(seen, told, fit))
@@ -144,6 +147,8 @@ def _solved(problem: Problem, scenario: Scenario, told: Assumptions) -> Fit:
     A beam of no emittance is a stationary point of every fit in its Cholesky factor, so a start
     near it (the known-transport fit with a wrong calibration, say) may never leave it.
     """
+    from beamfit.greybox.solve import solve
+
     fit = solve(problem, told.starts if scenario.network else 1, told.seed)
     flat = any(fit[f"beam.{plane}.l22"].state == "lower" for plane in problem.model["beam"])
     lost = fit.status is not Status.converged and fit.chi2 > 2.0 * max(fit.dof, 1)
@@ -223,6 +228,8 @@ class EmittanceFit:
     @cached_property
     def fit(self) -> Fit:
         """The grey-box fit; of a linear one solved when it is asked for, from its closed form."""
+        from beamfit.greybox.solve import solve
+
         return solve(self.stated) if self.solved is None else self.solved
 
     @property

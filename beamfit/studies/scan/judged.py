@@ -1,69 +1,29 @@
-"""From a solved statement to a judged result of each plane, whatever the scenario."""
+"""From a solved statement to a judged result of each plane; here of the closed form."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jax import Array
 
-from beamfit.greybox import assess, tree
-from beamfit.greybox.covariance import Group
-from beamfit.greybox.fit import Derived, Fit
 from beamfit.optics.beamline import Beamline
 from beamfit.quantity import Quantity
 from beamfit.statistics import scaled_directions
 from beamfit.status import Status
-from beamfit.studies.scan.assumptions import Anchor, Assumptions
-from beamfit.studies.scan.known import next_measurement, pulls, works_of
-from beamfit.studies.scan.model import (
-    QUANTITIES,
-    Asked,
-    asked_numbers,
-    coefficients,
-    predict_sizes,
-    size_squared,
-    spoken,
-)
-from beamfit.studies.scan.results import (
-    Identifiability,
-    Parameter,
-    PlaneFit,
-    Points,
-    ScreenTwiss,
-)
-from beamfit.studies.scan.statement import Scenario, Seen, asked_of
-from beamfit.studies.scan.transport import Look, own_settings, own_units
-from beamfit.studies.scan.verdict import (
-    BEAM_RULES,
-    LOST,
-    SCENARIO_RULES,
-    Evidence,
-    Unknowns,
-    cause_of,
-    judge,
-    phase_coverage,
-)
+from beamfit.studies.scan.known import next_measurement
+from beamfit.studies.scan.model import QUANTITIES, coefficients
+from beamfit.studies.scan.results import Identifiability, PlaneFit, Points, ScreenTwiss
+from beamfit.studies.scan.statement import Seen
+from beamfit.studies.scan.transport import own_settings, own_units
+from beamfit.studies.scan.verdict import BEAM_RULES, LOST, cause_of, judge, phase_coverage
 from beamfit.verdict import Finding
 
-__all__ = ["judged_beam", "judged_scenario"]
+__all__ = ["SIGMA", "Answer", "beside", "judged_beam", "plane_fit", "units_of"]
 
 SIGMA = slice(4, 7)
 # What the three numbers of size² alone tell: σ, and the size at the screen.
 LINEAR = np.isin(list(QUANTITIES), ("sigma11", "sigma12", "sigma22", "screen_size"))
-# Ends of a search that are no answer.
-NO_ANSWER = (
-    Status.not_finite,
-    Status.infeasible,
-    Status.not_converged,
-    Status.contradictory_bounds,
-)
-# The noise of a record whose fit was refused.
-NOTHING = Group("", slice(0), True, math.nan, 0, 0.0, math.nan)
 
 
 class Answer(NamedTuple):
@@ -87,7 +47,7 @@ class Answer(NamedTuple):
     advice: str | None = None
 
 
-def _plane_fit(seen: Seen, line: Beamline, plane: str, a: Answer) -> PlaneFit:
+def plane_fit(seen: Seen, line: Beamline, plane: str, a: Answer) -> PlaneFit:
     """The result of a plane: errors only for what the data determine."""
     numbers = [
         Quantity(float(v), float(e), unit, float(r))
@@ -133,7 +93,7 @@ def _plane_fit(seen: Seen, line: Beamline, plane: str, a: Answer) -> PlaneFit:
     )
 
 
-def _beside(seen: Seen) -> dict[str, bool]:
+def beside(seen: Seen) -> dict[str, bool]:
     """Of each plane, whether another one is determined by itself and may vouch for it."""
     clear = {plane: cause_of(w.evidence) is None for plane, w in seen.works.items()}
     return {plane: any(c for p, c in clear.items() if p != plane) for plane in clear}
@@ -141,16 +101,16 @@ def _beside(seen: Seen) -> dict[str, bool]:
 
 def judged_beam(seen: Seen) -> tuple[PlaneFit, ...]:
     """Judge each plane of the closed form: nothing but the beam is unknown."""
-    beside = _beside(seen)
+    vouching = beside(seen)
     return tuple(
-        _plane_fit(seen, seen.line, plane, _beam_answer(seen, plane, beside[plane]))
+        plane_fit(seen, seen.line, plane, _beam_answer(seen, plane, vouching[plane]))
         for plane in seen.planes
     )
 
 
-def _beam_answer(seen: Seen, plane: str, beside: bool) -> Answer:
+def _beam_answer(seen: Seen, plane: str, neighbour: bool) -> Answer:
     w = seen.works[plane]
-    evidence, p = w.evidence._replace(neighbour=beside), w.points
+    evidence, p = w.evidence._replace(neighbour=neighbour), w.points
     finding, advice = judge(evidence, BEAM_RULES), None
     determined = finding.status is not Status.unidentified
     if not determined:
@@ -181,13 +141,13 @@ def _beam_answer(seen: Seen, plane: str, beside: bool) -> Answer:
         distance=e.distance,
         points=p,
         jacobian=jacobian,
-        units=np.array(_units(sigma)),
+        units=np.array(units_of(sigma)),
         names=list(QUANTITIES)[SIGMA],
         advice=advice,
     )
 
 
-def _units(sigma: np.ndarray) -> list[float]:
+def units_of(sigma: np.ndarray) -> list[float]:
     """A change of σ11, σ12 and σ22 by 100 %."""
     return [float(sigma[0]), math.sqrt(max(float(sigma[0] * sigma[2]), 0.0)), float(sigma[2])]
 
@@ -206,178 +166,3 @@ def _outlier_words(p: Points) -> str:
         + "; ".join(places)
         + "."
     )
-
-
-def _numbers(model: Mapping[str, Any], asked: tuple[Asked, ...]) -> Array:
-    """`QUANTITIES` of each plane."""
-    return jnp.stack([asked_numbers(model, each) for each in asked])
-
-
-@jax.jit
-def _elements(model: Mapping[str, Any], rows: tuple[Any, ...]) -> Array:
-    """R11, R12 and known size² of each plane's rows."""
-    return jnp.stack([jnp.stack(each.elements(model)) for each in rows])
-
-
-def judged_scenario(
-    seen: Seen,
-    line: Beamline,
-    scenario: Scenario,
-    told: Assumptions,
-    fit: Fit,
-    parameters: tuple[Parameter, ...],
-) -> tuple[PlaneFit, ...]:
-    """Judge each plane of a scenario's fit.
-
-    Priors and anchors can make a covariance finite where the sizes are noise or too few to judge.
-    So each plane is fitted once more in closed form with the line as the scenario found it, and
-    must be determined by the rules of known transport too.
-    """
-    records = {r.data.plane: r for r in fit.problem.records if r.predict is predict_sizes}
-    rows = tuple(records[plane].data for plane in seen.planes)
-    whole = scenario.whole_map
-    asked = tuple(asked_of(seen, r.plane, whole, r.line if whole else None) for r in rows)
-    derived = fit.derive(_numbers, asked)
-    elements = np.asarray(_elements(fit.model, rows))
-    look, beams = list(seen.look), {}
-    for plane, found in zip(seen.planes, elements, strict=True):
-        for i in range(3):
-            look[i] = look[i].copy()
-            look[i]["xy".index(plane)] = found[i]
-    again = seen._replace(works=works_of(seen, Look(*look), seen.planes))
-    beside, jacobian = _beside(again), _loose_jacobian(fit)
-    for i, plane in enumerate(seen.planes):
-        own = Derived(*(part[i] for part in derived))
-        evidence = again.works[plane].evidence._replace(neighbour=beside[plane])
-        points = _points_at(seen, plane, own.value[SIGMA], *elements[i])
-        group = next((g for g in fit.groups if g.name == records[plane].name), NOTHING)
-        unknowns = _unknowns(seen, scenario, told, fit, parameters, own, group, evidence)
-        beams[plane] = _scenario_answer(fit, own, group, unknowns, points, jacobian)
-    return tuple(_plane_fit(seen, line, plane, a) for plane, a in beams.items())
-
-
-def _points_at(seen: Seen, plane: str, sigma: np.ndarray, *elements: np.ndarray) -> Points:
-    """The points of the known-transport fit, with this fit's model."""
-    r11, r12, known = (part[seen.measured(plane)] for part in elements)
-    points = seen.works[plane].points
-    model = np.sqrt(np.maximum(size_squared(sigma, r11, r12, known), 0.0))
-    pull = pulls(points.size, model, points.error, seen.rows.squared)
-    return points._replace(model=model, pull=pull, r11=r11, r12=r12, known=known)
-
-
-def _unknowns(
-    seen: Seen,
-    scenario: Scenario,
-    told: Assumptions,
-    fit: Fit,
-    parameters: tuple[Parameter, ...],
-    own: Derived,
-    group: Group,
-    evidence: Evidence,
-) -> Unknowns:
-    tied, error = told.anchor.words, float(fit.spread.error(np.nan_to_num(own.slope[0])))
-    distance = float(own.value[0]) / (2.0 * error) if error > 0 else 0.0
-    edges = "".join(
-        f"; {p.name} ends at its {p.state} bound {p.value.value:.6g} "
-        f"(d(chi2/2)/d(bound) = {p.multiplier:.2g})"
-        for p in parameters
-        if p.status is Status.at_limit
-    )
-    left = [p.name for p in parameters if p.status is not Status.converged]
-    priors = [p.name for p in parameters if p.prior is not None]
-    remark = ""
-    if left:
-        remark = f" {', '.join(left)} not determined: what depends on it has no error"
-        remark += f"{scenario.aside}."
-    if priors:
-        remark += f" Rests on the prior of {', '.join(priors)}."
-    return Unknowns(
-        scenario=scenario.name,
-        tied=f" with {tied}" if told.anchor != Anchor() else "",
-        cause=cause_of(evidence),
-        ending=_ending(scenario, told, fit),
-        on_data=bool(np.isfinite(own.error[0])),
-        distance=distance if math.isfinite(distance) else 0.0,
-        chi2=group.chi2,
-        dof=group.dof,
-        noise_known=evidence.noise_known,
-        points_dof=evidence.dof,
-        edges=edges,
-        remedy=scenario.remedy(seen),
-        remark=remark,
-    )
-
-
-def _ending(scenario: Scenario, told: Assumptions, fit: Fit) -> Finding | None:
-    """How the search ended, where that was at no optimum."""
-    if fit.status is Status.not_converged and scenario.network:
-        said = (
-            f"The search from {told.starts} starts came to no rest (chi2 = {fit.chi2:.4g}); give "
-            "more starts, another seed, or fewer hidden nodes."
-        )
-        return Finding(fit.status, said)
-    if fit.status not in NO_ANSWER:
-        return None
-    return Finding(fit.status, fit.message[0].upper() + fit.message[1:])
-
-
-def _scenario_answer(
-    fit: Fit, own: Derived, group: Group, u: Unknowns, points: Points, jacobian: np.ndarray
-) -> Answer:
-    p, theta = fit.problem, fit.theta
-    determined = u.clear and u.ending is None and u.cause is None
-    error = np.where(determined, own.error, np.nan)
-    sigma, slopes = own.value[SIGMA], np.nan_to_num(own.slope[SIGMA])
-    beam = {leaf.path for leaf in tree.find_leaves(p.core.model, "beam")}
-    further = [
-        i
-        for i, name in enumerate(p.names)
-        if name not in beam and not p.nuisance[i] and p.lower[i] < p.upper[i]
-    ]
-    asked = np.vstack([slopes, np.eye(len(theta))[further]])
-    units = np.array([*_units(sigma), *(abs(theta[i]) or 1.0 for i in further)])
-    known = np.isfinite(error[SIGMA]).all()
-    return Answer(
-        finding=judge(u, SCENARIO_RULES),
-        determined=determined,
-        value=own.value,
-        error=error,
-        raw=own.error_raw,
-        covariance=slopes @ fit.covariance_raw @ slopes.T if known else np.full((3, 3), np.nan),
-        chi2=group.chi2,
-        dof=round(group.dof),
-        scale=group.scale if group.scale > 0 else 1.0,
-        noise="inferred from the fit with known transport",
-        distance=u.distance,
-        points=points,
-        jacobian=_marginal(jacobian, asked, units),
-        units=np.ones(len(units)),
-        names=[*list(QUANTITIES)[SIGMA], *(spoken(p.names[i]) for i in further)],
-    )
-
-
-def _loose_jacobian(fit: Fit) -> np.ndarray:
-    """Residuals by free numbers, errors as scaled, without weights that bounds hold."""
-    p = fit.problem
-    rows = assess.slopes(p, fit.theta).residual_jacobian.copy()
-    for group in fit.groups:
-        rows[group.rows] /= group.factor
-    edge = np.array([v.state in ("lower", "upper") for v in fit.variables])
-    rows[:, (edge & p.nuisance) | (p.lower == p.upper)] = 0.0
-    return rows
-
-
-def _marginal(jacobian: np.ndarray, slopes: np.ndarray, units: np.ndarray) -> np.ndarray:
-    """A Jacobian of asked numbers whose normal matrix is their marginal information.
-
-    Free numbers move along the asked ones or, by the rest, along what leaves those as they are;
-    what the rest can undo in the residuals is taken out (the Schur complement, by projection).
-    """
-    scaled = slopes / units[:, None]
-    _, sizes, turned = np.linalg.svd(scaled, full_matrices=True)
-    rest = jacobian @ turned[len(sizes) :].T
-    length = np.linalg.norm(rest, axis=0)
-    undone, seen, _ = np.linalg.svd(rest / np.where(length > 0, length, 1.0), full_matrices=False)
-    undone = undone[:, seen > 1e-10 * seen.max(initial=0.0)]
-    along = jacobian @ np.linalg.pinv(scaled)
-    return along - undone @ (undone.T @ along)

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from beamfit.greybox.fit import Fit
 from beamfit.greybox.problem import Free, Problem, Record
 from beamfit.optics.beamline import Beamline
 from beamfit.optics.particle import beta_gamma
@@ -19,6 +18,9 @@ from beamfit.studies.scan.scans import QuadScan
 from beamfit.studies.scan.sigma import SigmaFit
 from beamfit.studies.scan.transport import Look, Rows, padded, scan_rows
 from beamfit.studies.scan.verdict import Evidence
+
+if TYPE_CHECKING:
+    from beamfit.greybox.fit import Fit
 
 __all__ = [
     "Scenario",
