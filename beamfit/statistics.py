@@ -7,7 +7,16 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import chdtrc, ndtr, stdtr
 
-__all__ = ["Directions", "chi2_probability", "one_sided_probability", "scaled_directions"]
+__all__ = [
+    "POOR_FIT",
+    "Directions",
+    "chi2_probability",
+    "one_sided_probability",
+    "scaled_directions",
+]
+
+# A fit this unlikely to be noise alone is a poor fit: the contract of the JSON output.
+POOR_FIT = 1e-3
 
 
 class Directions(NamedTuple):

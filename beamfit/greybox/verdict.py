@@ -26,13 +26,13 @@ from beamfit.greybox.covariance import (
 from beamfit.greybox.fit import Attempt, Fit, Limited, Variable
 from beamfit.greybox.implicit import Implicit
 from beamfit.greybox.problem import Problem
+from beamfit.statistics import POOR_FIT
 from beamfit.status import Status
 from beamfit.verdict import Finding
 
 __all__ = ["RULES", "Evidence", "Known", "Search", "conclude", "known", "refused", "settled"]
 
 # Chance of a chi-square below which a fit counts as poor.
-UNLIKELY = 1e-3
 # A further decrease of chi-square below this changes nothing anybody asks for.
 SETTLED = 0.01
 # Below this the cost counts as without end, in its own size.
@@ -307,7 +307,7 @@ def _undetermined(e: Evidence) -> Finding | None:
 def _poor(e: Evidence) -> Finding | None:
     """Say that the residuals are larger than the errors allow."""
     chance = float(chdtrc(e.dof, e.chi2)) if e.dof > 0 else 1.0
-    if not e.problem.errors_known or chance >= UNLIKELY:
+    if not e.problem.errors_known or chance >= POOR_FIT:
         return None
     cause = (
         f"chi2 = {e.chi2:.4g} for {e.dof:.4g} degrees of freedom happens by chance in {chance:.1e} "

@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import FigureBase
 
 from beamfit.errors import InputError
-from beamfit.lifetime.decay import current
+from beamfit.lifetime.decay import HOUR, current
 from beamfit.report.document import (
     BLUE,
     MANY,
@@ -43,7 +43,6 @@ from beamfit.table import Table, labelled
 
 __all__ = ["decay_page", "draw_budget", "draw_lifetime", "draw_record"]
 
-HOUR = 3600.0
 COLOURS = (BLUE, "#c98a00", "#2c7a3f", "#7b4fa3", RED, "#4f9aa3", "0.5")
 # Decays shown in one budget; more have no room for their names.
 MOST_BARS = 12

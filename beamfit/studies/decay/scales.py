@@ -20,7 +20,7 @@ from beamfit.greybox.solve import solve
 from beamfit.lifetime.losses import SCALES
 from beamfit.lifetime.scaled import Terms, loss_terms, scaled_losses
 from beamfit.quantity import Quantity, Status
-from beamfit.statistics import chi2_probability
+from beamfit.statistics import POOR_FIT, chi2_probability
 from beamfit.studies.decay.loss_budget import Machine, operation_during
 from beamfit.studies.decay.study import Decay
 from beamfit.studies.decay.summary import Summaries, loss_parts, summarise
@@ -40,7 +40,6 @@ __all__ = [
     "whitener",
 ]
 
-POOR_FIT = 1e-3
 # A scale known to a third or worse cannot be told from a third more or less of another cause.
 SEPARABLE = 1 / 3
 PRESSURE_ERROR = 0.05

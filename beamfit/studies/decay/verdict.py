@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from beamfit.lifetime.decay import HOUR
-from beamfit.statistics import chi2_probability
+from beamfit.statistics import POOR_FIT, chi2_probability
 from beamfit.status import Status
 from beamfit.studies.decay.model import Solution
 from beamfit.studies.decay.record import DecayRecord
@@ -24,7 +24,6 @@ __all__ = ["Evidence", "Separability", "finding_of"]
 SEPARABLE = 0.2
 # A loss rate less than three errors from zero leaves the lifetime without an upper limit.
 DETERMINED = 1 / 3
-POOR_FIT = 1e-3
 # A change between neighbouring residuals of so many times their usual one is a step, not noise.
 STEP = 12.0
 # How many errors below zero an unphysical a or b, or a rising current, is believed.

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import stdtrit
 
-from beamfit.statistics import chi2_probability, one_sided_probability
+from beamfit.statistics import POOR_FIT, chi2_probability, one_sided_probability
 from beamfit.status import Status
 from beamfit.verdict import Finding, judge
 
@@ -26,8 +26,6 @@ __all__ = [
     "waist_bracketed",
 ]
 
-# A fit this unlikely to be noise alone is a poor fit (docs/design.md, the JSON contract).
-POOR_FIT = 1e-3
 # The emittance is determined if zero is this many standard errors away ...
 CLEAR, CLEAR_BESIDE_ANOTHER = 4.0, 3.0
 # (sizes of such a scan may miss the beam by this much, relative and rms)
