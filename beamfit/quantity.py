@@ -9,6 +9,8 @@ from beamfit.status import Status
 
 __all__ = ["Quantity", "Status", "display_unit"]
 
+# 95 % of a normal distribution lie within so many standard deviations.
+NORMAL_REACH = 1.96
 _PREFIXES = ((1.0, ""), (1e-3, "m"), (1e-6, "µ"), (1e-9, "n"), (1e-12, "p"))
 
 
@@ -27,11 +29,17 @@ class Quantity:
         SI unit, "1" for a pure number.
     error_raw : float or None
         The error before that scaling.
+    interval_95 : tuple of float, or None
+        What holds the truth in 95 % of cases. Left out, it is the value ± 1.96 errors, as of a
+        normal distribution; None without an error. A value that the data do not determine may
+        have a limit here.
 
     Examples
     --------
     >>> print(Quantity(0.70468e-6, 0.0156e-6, "m"))
     0.705 ± 0.016 µm
+    >>> Quantity(1.0, 0.5, "1").interval_95
+    (0.02, 1.98)
     >>> print(Quantity(4.1e-8, None, "m"))
     41 nm (not determined)
     """
@@ -40,17 +48,26 @@ class Quantity:
     error: float | None
     unit: str
     error_raw: float | None = None
+    interval_95: tuple[float, float] | None = None
+
+    def __post_init__(self) -> None:
+        if self.interval_95 is None and self.error is not None:
+            reach = NORMAL_REACH * self.error
+            object.__setattr__(self, "interval_95", (self.value - reach, self.value + reach))
 
     @property
     def relative(self) -> float | None:
         """Error over value, or None."""
         return None if self.error is None or self.value == 0 else self.error / abs(self.value)
 
-    def to_json(self) -> dict[str, float | str | None]:
+    def to_json(self) -> dict[str, float | str | list[float] | None]:
         """Give the object of the JSON contract; numbers that are not finite are null."""
         fields = {"value": self.value, "error": self.error, "error_raw": self.error_raw}
         finite = {k: v if v is not None and math.isfinite(v) else None for k, v in fields.items()}
-        return {**finite, "unit": self.unit}
+        interval = None
+        if self.interval_95 is not None and all(map(math.isfinite, self.interval_95)):
+            interval = list(self.interval_95)
+        return {**finite, "unit": self.unit, "interval_95": interval}
 
     def __str__(self) -> str:
         factor, unit = self._prefix()
