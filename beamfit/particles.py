@@ -1,9 +1,13 @@
 """Particles a lattice may carry: plain numbers, for files and optics alike."""
 
-__all__ = ["REST_ENERGY", "expected_energy"]
+from typing import Any
+
+__all__ = ["ENERGY_KEYS", "REST_ENERGY", "expected_energy", "total_energy"]
 
 REST_ENERGY = {"electron": 0.51099895069, "positron": 0.51099895069, "proton": 938.27208943}
 """MeV, CODATA 2022 (NIST)."""
+ENERGY_KEYS = {"energy_MeV": "total", "kinetic_energy_MeV": "kinetic", "momentum_MeV": "momentum"}
+"""How files say the energy of a beam, and what that is; a momentum is p c."""
 # MeV, beyond every machine: such a number is in another unit.
 _HIGHEST = 1e7
 
@@ -23,3 +27,30 @@ def expected_energy(energy: float, particle: str) -> str | None:
         f"a total energy between the {particle}'s rest energy of {rest:.6g} MeV and 10 TeV; "
         "is it in GeV or eV?"
     )
+
+
+def total_energy(number: Any, kind: str, rest: float) -> Any:
+    """Total energy in MeV, E = T + m or E² = (pc)² + m², from what a file says.
+
+    Parameters
+    ----------
+    number : float or array
+        MeV.
+    kind : {"total", "kinetic", "momentum"}
+        What it is.
+    rest : float
+        Rest energy in MeV.
+
+    Returns
+    -------
+    float or array
+        Of the shape of ``number``.
+
+    Examples
+    --------
+    >>> total_energy(3.0, "kinetic", 4.0), total_energy(3.0, "momentum", 4.0)
+    (7.0, 5.0)
+    """
+    if kind == "momentum":
+        return (number**2 + rest**2) ** 0.5
+    return number + rest if kind == "kinetic" else number

@@ -28,7 +28,7 @@ Examples:
 
 
 @click.command(epilog=EXAMPLE)
-@options("scan lattice use energy scenario prior bounds anchor vary")
+@options("scan ignore skip-bad lattice use energy scenario prior bounds anchor vary")
 @click.option(
     "--energies", metavar="MEV,MEV", default="", help="Further energies the beam can be had at."
 )
@@ -44,6 +44,8 @@ Examples:
 @options("json")
 def design(
     scan: str,
+    ignore: tuple[str, ...],
+    skip_bad: bool,
     lattice: str,
     use: str | None,
     energy: float | None,
@@ -63,7 +65,8 @@ def design(
     """
     Assumptions(**told).check_scenario(scenario)
     aim, others = None if goal is None else goal_of(goal), energies_of(energies)
-    measured, described = read_quad_scan(scan), read_lattice(lattice, use=use, energy=energy)
+    measured = read_quad_scan(scan, ignore=ignore, skip_bad=skip_bad)
+    described = read_lattice(lattice, use=use, energy=energy)
     described.check_scan(measured)
     described.check_magnets(limits)
     described.check_energies(others)

@@ -31,7 +31,7 @@ Examples:
 
 
 @click.command(epilog=EXAMPLE)
-@options("scan lattice use energy")
+@options("scan ignore skip-bad lattice use energy")
 @click.option(
     "--plane",
     type=click.Choice(["x", "y", "both"]),
@@ -56,6 +56,8 @@ Examples:
 @options("sample store seed report json")
 def emittance(
     scan: str,
+    ignore: tuple[str, ...],
+    skip_bad: bool,
     lattice: str,
     use: str | None,
     energy: float | None,
@@ -71,13 +73,15 @@ def emittance(
 ) -> None:
     """Fit the emittance to a quadrupole scan and say whether to believe it.
 
-    SCAN is a CSV or HDF5 file with columns such as Q2_A (or Q2_kG, Q2_k1), size_x_um,
-    size_x_error_um, size_y_um, and optionally energy_MeV, screen, shot.
+    SCAN is a CSV or HDF5 file with columns such as Q2_A (or Q2_kG, Q2_T_per_m, Q2_k1), size_x_um
+    (or sigma_x_mm, fwhm_x_um, ...), size_x_error_um, size_y_um, and optionally energy_MeV,
+    screen, shot.
     """
     sampling = Sampling(sample, store, told["seed"])
     sampling.check()
     Assumptions(**told).check_scenario(scenario)
-    measured, described = read_quad_scan(scan), read_lattice(lattice, use=use, energy=energy)
+    measured = read_quad_scan(scan, ignore=ignore, skip_bad=skip_bad)
+    described = read_lattice(lattice, use=use, energy=energy)
     described.check_scan(measured)
     planes = {None: measured.planes, "both": ("x", "y")}.get(plane, (plane,))
     for each in planes:
@@ -149,6 +153,8 @@ def _show(fit: EmittanceFit, posterior: Posterior | None, report: str | None) ->
         terminal.line()
     errors = fit.scan.error_source if fit.scan.error else "inferred from the residuals"
     terminal.line(f"Errors of the sizes: {errors}.", style="dim")
+    for note in fit.notes:
+        terminal.line(note)
     if posterior is not None:
         terminal.posterior("Posterior", posterior)
     terminal.report(report)

@@ -38,6 +38,17 @@ def _report(path: str) -> str:
 
 SHARED: dict[str, Callable[..., Any]] = {
     "scan": click.argument("scan"),
+    "ignore": click.option(
+        "--ignore",
+        multiple=True,
+        metavar="COLUMN",
+        help="A column of the scan to leave unread; * and ? stand for any letters.",
+    ),
+    "skip-bad": click.option(
+        "--skip-bad",
+        is_flag=True,
+        help="Leave out rows of the scan with something wrong in them; they are counted and named.",
+    ),
     "lattice": click.option(
         "--lattice",
         required=True,

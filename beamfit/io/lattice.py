@@ -14,8 +14,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from beamfit.errors import InputError, nearest
+from beamfit.io.gradient_table import gradient_table
 from beamfit.io.toml import FLAG, LIST, TABLE, TEXT, Key, Section, is_number, read_toml
-from beamfit.particles import REST_ENERGY, expected_energy
+from beamfit.particles import ENERGY_KEYS, REST_ENERGY, expected_energy, total_energy
 from beamfit.studies.scan.scans import QuadScan, check_names
 
 if TYPE_CHECKING:
@@ -29,11 +30,14 @@ FORMAT = "beamfit-lattice-1"
 STRENGTHS = {
     "current_A": "A",
     "integrated_gradient_kG": "kG",
+    "gradient_T_per_m": "T_per_m",
     "k1_per_m2": "k1",
     "k1l_per_m": "k1l",
 }
 LINE, POLYNOMIAL = {"slope", "intercept"}, {"gradient_polynomial_T_per_m"}
-NAME, NUMBER, OPTIONAL = Key(kind=TEXT), Key(), Key(default=None)
+TABLE_KEYS = ("gradient_table", "gradient_table_file")
+CALIBRATIONS = (LINE, POLYNOMIAL, *({key} for key in TABLE_KEYS))
+NAME, OPTIONAL = Key(kind=TEXT), Key(default=None)
 LENGTH = Key(low=0.0, said="a positive number")
 EDGE = Key(default=0.0, low=-90.0, high=90.0, said="an angle below 90 degrees")
 ELEMENTS: dict[str, dict[str, Key]] = {
@@ -41,10 +45,13 @@ ELEMENTS: dict[str, dict[str, Key]] = {
     "quadrupole": {
         "name": NAME,
         "length_m": LENGTH,
-        **dict.fromkeys(("current_A", "integrated_gradient_kG", "k1_per_m2"), OPTIONAL),
+        **dict.fromkeys(("current_A", "integrated_gradient_kG"), OPTIONAL),
+        **dict.fromkeys(("gradient_T_per_m", "k1_per_m2"), OPTIONAL),
         **dict.fromkeys(("slope", "intercept"), OPTIONAL),
         "gradient_polynomial_T_per_m": Key(kind=LIST, default=None),
         "signed_intercept": Key(kind=FLAG, default=False),
+        "gradient_table": Key(kind=LIST, default=None),
+        "gradient_table_file": Key(kind=TEXT, default=None),
     },
     "thin_lens": {"name": NAME, "integrated_gradient_kG": OPTIONAL, "k1l_per_m": OPTIONAL},
     "sector_dipole": {
@@ -69,7 +76,7 @@ ELEMENTS: dict[str, dict[str, Key]] = {
 }
 TOP = {
     "format": NAME,
-    "energy_MeV": NUMBER,
+    **dict.fromkeys(ENERGY_KEYS, OPTIONAL),
     "element": Key(kind=LIST),
     "name": Key("name", kind=TEXT, default=""),
     "source": Key("source", kind=TEXT, default=""),
@@ -166,24 +173,36 @@ def read_toml_lattice(path: str | PathLike[str]) -> LatticeFile:
     top = read_toml(path, "a lattice")
     if (found := top.table.get("format")) != FORMAT:
         raise top.error(f"format {found!r}"[:80], f'format = "{FORMAT}"', "format")
-    said, energy = top.values(TOP), top.table["energy_MeV"]
+    said = top.values(TOP)
     if said["particle"] not in REST_ENERGY:
         known = nearest(said["particle"], list(REST_ENERGY))
         raise top.error(f"particle '{said['particle']}'", known, "particle")
-    if expected := expected_energy(energy, said["particle"]):
-        raise top.error(f"{energy:g} MeV", expected, "energy_MeV")
+    energy = _energy(top, said["particle"])
     sections = top.sections("element")
     elements = tuple(_element(section, i) for i, section in enumerate(sections, 1))
     _check_unique(elements, sections)
     return LatticeFile(
         path=path,
         sha256=top.sha256,
-        energy=float(energy),
+        energy=energy,
         elements=elements,
         calibrations={e["name"]: u for e in elements for k, u in _settings(e["type"]) if k in e},
         design=_design(top, [e["name"] for e in elements]),
         **said | {"name": said["name"] or Path(path).stem},
     )
+
+
+def _energy(top: Section, particle: str) -> float:
+    """Total energy in MeV, from the one of its three keys that is there."""
+    key = top.one_of(ENERGY_KEYS)
+    number, kind = float(top.table[key]), ENERGY_KEYS[key]
+    total = total_energy(number, kind, REST_ENERGY[particle])
+    expected = expected_energy(total, particle)
+    if expected is None and kind != "total" and not number > 0.0:
+        expected = f"a {kind} energy above zero" if kind == "kinetic" else "a momentum above zero"
+    if expected:
+        raise top.error(f"{number:g} MeV", expected, key)
+    return total
 
 
 def _settings(kind: str) -> list[tuple[str, str]]:
@@ -206,12 +225,15 @@ def _element(section: Section, number: int) -> Mapping[str, Any]:
         raise section.error(found, "x or y", "bend_plane")
     if section.table.get("angle_deg") == 0:
         raise section.error("a dipole that does not bend", "a drift", "angle_deg")
-    return {"name": f"{kind}{number}"} | section.table
+    table = {"name": f"{kind}{number}"} | section.table
+    if given := set(TABLE_KEYS) & set(table):
+        table["gradient_table"] = gradient_table(section, given.pop(), table["length_m"])
+    return table
 
 
 def _check_strength(section: Section, setting: str) -> None:
     """With a current exactly one calibration, otherwise none."""
-    given = (LINE | POLYNOMIAL) & set(section.table)
+    given = set().union(*CALIBRATIONS) & set(section.table)
     name, current = section.table["name"], setting == "current_A"
     if "signed_intercept" in section.table and not given >= POLYNOMIAL:
         expected = "gradient_polynomial_T_per_m beside it, whose first number it signs"
@@ -219,9 +241,9 @@ def _check_strength(section: Section, setting: str) -> None:
     if given and not current:
         found = f"{name} with {setting} and a current calibration"
         raise section.error(found, "current_A = ... for its setting, or no calibration", setting)
-    if current and given not in (LINE, POLYNOMIAL):
+    if current and given not in CALIBRATIONS:
         found = f"{name} set by current_A without one calibration"
-        expected = "both slope and intercept, or gradient_polynomial_T_per_m"
+        expected = "both slope and intercept, gradient_polynomial_T_per_m, or one gradient table"
         raise section.error(found, expected, setting)
     for key in given & POLYNOMIAL:
         numbers = section.table[key]
@@ -299,6 +321,8 @@ def _strength(table: Mapping[str, Any], mass: float) -> tuple[float, Calibration
 
     if "integrated_gradient_kG" in table:
         return float(table["integrated_gradient_kG"]), calibration.IntegratedGradient(mass=mass)
+    if "gradient_T_per_m" in table:
+        return float(table["gradient_T_per_m"]), calibration.Gradient(mass=mass)
     if "k1_per_m2" in table:
         return float(table["k1_per_m2"]), calibration.FocusingStrength()
     if "k1l_per_m" in table:
@@ -307,6 +331,9 @@ def _strength(table: Mapping[str, Any], mass: float) -> tuple[float, Calibration
     if "slope" in table:
         line = calibration.SlopeIntercept(float(table["slope"]), float(table["intercept"]))
         return current, line
+    if "gradient_table" in table:
+        currents, gradients = zip(*table["gradient_table"], strict=True)
+        return current, calibration.CurrentTable(currents, gradients, mass=mass)
     polynomial = calibration.CurrentPolynomial(
         tuple(float(c) for c in table["gradient_polynomial_T_per_m"]),
         signed_intercept=table.get("signed_intercept", False),

@@ -2,40 +2,32 @@
 
 from __future__ import annotations
 
-import re
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from os import PathLike
 from pathlib import Path
 
 import numpy as np
 
-from beamfit.errors import InputError, nearest
-from beamfit.io.table import UNITS, Column, Sheet, columns_of, read_sheet
-from beamfit.studies.scan.scans import QuadScan, first_unusable, row_keys
+from beamfit.errors import InputError
+from beamfit.io.scan_columns import ENERGIES, SETTINGS, column_notes, scan_columns
+from beamfit.io.table import UNITS, Column, Sheet, read_sheet
+from beamfit.studies.scan.scans import POSSIBLE, USUAL, QuadScan, first_unusable, row_keys
 
 __all__ = ["average_shots", "read_quad_scan"]
 
-QUANTITIES = {
-    "size_x": "length",
-    "size_x_error": "length",
-    "size_y": "length",
-    "size_y_error": "length",
-    "resolution": "length",
-    "energy": "energy in MeV",
-    "energy_spread": "",
-    "shot": "",
-    "screen": "",
-}
-SETTINGS = ("A", "kG", "k1", "k1l")
-CARRIED = re.compile(r"note_.*|time|timestamp|charge_[np]C")
 # More rows than any scan: such a file is a log, and is refused before it fills the memory.
 MOST_ROWS = 100_000
-# Rms sizes on a screen; outside this a header's unit is wrong.
-PLAUSIBLE = (1e-7, 2e-2)
+# A size this many times the usual one of its column, and larger than most beams, has slipped.
+SLIPPED = 100.0
+# Rows left out that a note names one by one.
+MOST_NAMED = 5
 # Further quantities: from (open), to, and how to say it.
 RANGES = {
     "energy": (0.511, 1e7, "a total energy between 0.511 MeV and 10 TeV; is it in GeV or eV?"),
-    "resolution": (-1e-300, PLAUSIBLE[1], "a resolution between 0 and 20 mm"),
+    "kinetic_energy": (0.0, 1e7, "a kinetic energy between 0 and 10 TeV; is it in GeV or eV?"),
+    "momentum": (0.0, 1e7, "a momentum (p c) between 0 and 10 TeV; is it in GeV or eV?"),
+    "resolution": (-1e-300, USUAL[1], "a resolution between 0 and 20 mm"),
     "energy_spread": (-1e-300, 0.2, "a relative spread between 0 and 0.2; is it in %?"),
 }
 # Below this many shots a setting's own scatter is too uncertain to weight it by.
@@ -44,7 +36,9 @@ ENOUGH_SHOTS = 5
 ENOUGH_DEGREES = 3
 
 
-def read_quad_scan(path: str | PathLike[str]) -> QuadScan:
+def read_quad_scan(
+    path: str | PathLike[str], *, ignore: Iterable[str] = (), skip_bad: bool = False
+) -> QuadScan:
     """Read a quadrupole scan.
 
     Parameters
@@ -52,6 +46,10 @@ def read_quad_scan(path: str | PathLike[str]) -> QuadScan:
     path : str or path
         A CSV file whose header carries the units, or an HDF5 file (``.h5``, ``.hdf5``) with
         one dataset a column under the same names.
+    ignore : iterable of str
+        Columns to leave unread; * and ? stand for any letters.
+    skip_bad : bool
+        Leave out rows with something wrong in them; ``notes`` counts and names them.
 
     Returns
     -------
@@ -67,78 +65,92 @@ def read_quad_scan(path: str | PathLike[str]) -> QuadScan:
     --------
     >>> import tempfile, pathlib
     >>> file = pathlib.Path(tempfile.mkdtemp()) / "scan.csv"
-    >>> _ = file.write_text("Q2_A,size_x_um\\n0,200\\n1,120\\n2,180\\n")
-    >>> read_quad_scan(file).rows("x").size.round(9).tolist()
+    >>> _ = file.write_text("Q2_A,size_x_um\\n0,200\\n1,120\\n2,180\\n3,none\\n")
+    >>> scan = read_quad_scan(file, skip_bad=True)
+    >>> scan.rows("x").size.round(9).tolist()
     [0.0002, 0.00012, 0.00018]
+    >>> scan.notes
+    ("1 of 4 rows was left out: line 5, column 'size_x_um', 'none'.",)
     """
-    sheet = read_sheet(path, "Q2_A,size_x_um", MOST_ROWS)
-    columns = columns_of(sheet, QUANTITIES, lambda header: _setting(header, sheet))
-    _check_columns(sheet, columns)
-    settings = {c.key.removeprefix("setting "): c for c in columns.values() if c.unit in SETTINGS}
-    planes = [p for p in "xy" if f"size_{p}" in columns]
-    size = {p: _sizes(sheet, columns[f"size_{p}"]) for p in planes}
-    error = {
-        p: _errors(sheet, columns[f"size_{p}_error"], size[p])
-        for p in planes
-        if f"size_{p}_error" in columns
-    }
-    further = {key: _within(sheet, columns[key]) for key in RANGES if key in columns}
+    sheet = read_sheet(path, "Q2_A,size_x_um", MOST_ROWS, ragged=skip_bad).without(ignore)
+    columns = scan_columns(sheet)
+    if skip_bad:
+        sheet = sheet.good(lambda rows: _values(rows, columns))
+        usual = _usual(_values(sheet, columns))
+        sheet = sheet.good(lambda rows: _check_slipped(rows, columns, usual))
+    values = _values(sheet, columns)
+    _check_sizes(sheet, columns, values)
     try:
-        scan = QuadScan(
-            settings={name: sheet.numbers(c.header) for name, c in settings.items()},
-            units={name: c.unit for name, c in settings.items()},
-            size=size,
-            error=error,
-            **further,
-            screen=_screens(sheet, columns.get("screen")),
-            error_source="the file",
-            name=Path(path).stem,
-            path=path,
-            sha256=sheet.sha256,
-            provenance=sheet.comments,
-            columns={name: c.header for name, c in settings.items()}
-            | {key: c.header for key, c in columns.items()}
-            | {c.header: c.header for c in columns.values()},
-        )
+        scan = _scan(sheet, columns, values)
     except InputError as error:
         raise replace(error, path=path) from None
     return average_shots(scan, marked="shot" in columns)
 
 
-def _setting(header: str, sheet: Sheet) -> Column:
-    """A magnet's setting, or a column that is carried along unread."""
-    if CARRIED.fullmatch(header):
-        return Column(header, header)
-    name, _, unit = header.rpartition("_")
-    if name and unit in SETTINGS and not header.startswith("size_"):
-        return Column(header, f"setting {name}", unit)
-    usual = ["size_x_um", "size_x_error_um", "size_y_um", "size_y_error_um", "resolution_um"]
-    usual += ["energy_MeV", "energy_spread", "shot", "screen"]
-    raise sheet.header_error(
-        f"unknown unit '{unit}'" if name else "a name without a unit",
-        "a magnet with _A, _kG or _k1 at the end, "
-        + nearest(header, usual)
-        + "; begin a name with note_ to carry a column along unread",
-        header,
+def _scan(
+    sheet: Sheet, columns: Mapping[str, Column], values: Mapping[str, np.ndarray]
+) -> QuadScan:
+    """The scan of these numbers, one row a line of the file."""
+    magnets = {k.removeprefix("setting "): c for k, c in columns.items() if c.unit in SETTINGS}
+    energies = [(values[key], kind) for key, kind in ENERGIES.items() if key in values]
+    energy, kind = energies[0] if energies else (None, "total")
+    headers = {key: c.header for key, c in columns.items()}
+    return QuadScan(
+        settings={name: values[c.key] for name, c in magnets.items()},
+        units={name: c.unit for name, c in magnets.items()},
+        size={p: values[f"size_{p}"] for p in "xy" if f"size_{p}" in values},
+        error={p: values[f"size_{p}_error"] for p in "xy" if f"size_{p}_error" in values},
+        energy=energy,
+        energy_kind=kind,
+        resolution=values.get("resolution"),
+        energy_spread=values.get("energy_spread"),
+        screen=_screens(sheet, columns.get("screen")),
+        error_source="the file",
+        name=Path(sheet.path).stem,
+        path=sheet.path,
+        sha256=sheet.sha256,
+        provenance=sheet.comments,
+        notes=(*column_notes(columns), *_left_out(sheet)),
+        columns={name: c.header for name, c in magnets.items()}
+        | headers
+        | {header: header for header in headers.values()},
     )
 
 
-def _check_columns(sheet: Sheet, columns: dict[str, Column]) -> None:
-    """Check that the columns make a scan, and that there are rows."""
-    if not {"size_x", "size_y"} & set(columns):
-        missing = "a beam size column, such as size_x_um"
-    elif not any(c.unit in SETTINGS for c in columns.values()):
-        missing = "a magnet setting column, such as Q2_A, Q2_kG or Q2_k1"
-    else:
-        missing = ""
-    if missing:
-        raise sheet.header_error("columns " + ", ".join(sheet.names), missing)
+def _values(sheet: Sheet, columns: Mapping[str, Column]) -> dict[str, np.ndarray]:
+    """The numbers of a scan in SI by quantity; what is wrong with a row by itself is refused."""
+    values: dict[str, np.ndarray] = {}
     for plane in "xy":
-        if f"size_{plane}_error" in columns and f"size_{plane}" not in columns:
-            found = f"size_{plane}_error without size_{plane}"
-            raise sheet.header_error(found, f"a column size_{plane}_um")
-    if not len(sheet):
-        raise sheet.error("a header and no rows", "at least three settings")
+        size, error = f"size_{plane}", f"size_{plane}_error"
+        if size in columns:
+            values[size] = _positive(sheet, columns[size], "beam size")
+        if error in columns:
+            values[error] = _positive(sheet, columns[error], "error")
+            missing = np.isnan(values[error]) & ~np.isnan(values[size])
+            if missing.any():
+                expected, row = "an error for each size, or none at all", int(np.argmax(missing))
+                raise sheet.error("an empty cell", expected, row, columns[error].header)
+    values |= {key: _within(sheet, columns[key]) for key in RANGES if key in columns}
+    _screens(sheet, columns.get("screen"))
+    settings = [c for c in columns.values() if c.unit in SETTINGS]
+    return values | {c.key: sheet.numbers(c.header) for c in settings}
+
+
+def _left_out(sheet: Sheet) -> tuple[str, ...]:
+    """Count and name the rows that were left out, as a note."""
+    if not sheet.bad:
+        return ()
+    named = [
+        (f"line {e.line}, " if e.line else "")
+        + (f"column '{e.column}', " if e.column else "")
+        + e.found
+        for e in sheet.bad[:MOST_NAMED]
+    ]
+    more = len(sheet.bad) - len(named)
+    named += [f"{more} more"] if more else []
+    were = "was" if len(sheet.bad) == 1 else "were"
+    total = len(sheet) + len(sheet.bad)
+    return (f"{len(sheet.bad)} of {total} rows {were} left out: {'; '.join(named)}.",)
 
 
 def _positive(sheet: Sheet, column: Column, what: str) -> np.ndarray:
@@ -151,39 +163,54 @@ def _positive(sheet: Sheet, column: Column, what: str) -> np.ndarray:
     return values
 
 
-def _sizes(sheet: Sheet, column: Column) -> np.ndarray:
-    """Sizes in m, in a unit that can be meant: no beam is metres wide, or as small as atoms."""
-    size = _positive(sheet, column, "beam size")
-    if np.isnan(size).all():
-        expected = f"sizes in {column.unit}"
-        raise sheet.error("no number at all", expected, None, column.header)
-    middle, row = float(np.nanmedian(size)), int(np.nanargmax(size))
-    if not PLAUSIBLE[0] <= middle <= PLAUSIBLE[1]:
-        written, lengths = middle / column.factor, UNITS["length"]
-        likely = min(("um", "mm", "m"), key=lambda u: abs(np.log(written * lengths[u] / 2e-4)))
-        found = f"sizes around {written:g} {column.unit}, implausible for a beam"
-        expected = f"sizes between 0.1 um and 20 mm; if these are {likely}, rename the column "
-        raise sheet.error(found, f"{expected}{column.key}_{likely}", None, column.header)
-    if size[row] > PLAUSIBLE[1]:
-        found = f"{size[row] / column.factor:g} {column.unit}, implausible for a beam"
-        expected = "sizes below 20 mm; is this row in another unit?"
-        raise sheet.error(found, expected, row, column.header)
-    return size
+def _usual(values: Mapping[str, np.ndarray]) -> dict[str, float]:
+    """The median size of each plane that has one, m."""
+    sizes = {p: values[f"size_{p}"] for p in "xy" if f"size_{p}" in values}
+    return {p: float(np.nanmedian(v)) for p, v in sizes.items() if not np.isnan(v).all()}
 
 
-def _errors(sheet: Sheet, column: Column, size: np.ndarray) -> np.ndarray:
-    """Errors in m, one for each size and smaller than it."""
-    error = _positive(sheet, column, "error")
-    missing = np.isnan(error) & ~np.isnan(size)
-    if missing.any():
-        expected, row = "an error for each size, or none at all", int(np.argmax(missing))
-        raise sheet.error("an empty cell", expected, row, column.header)
-    with np.errstate(over="ignore"):
-        ratio = float(np.nanmedian(error / size))
-    if not 1e-6 < ratio < 1.0:
-        found = f"errors that are {ratio:g} of the sizes"
-        raise sheet.error(found, "errors in the unit of the header", None, column.header)
-    return error
+def _check_slipped(sheet: Sheet, columns: Mapping[str, Column], usual: Mapping[str, float]) -> None:
+    """Refuse a size that is far larger than the others of its column and than most beams."""
+    for plane, middle in usual.items():
+        column = columns[f"size_{plane}"]
+        size = _positive(sheet, column, "beam size")
+        slipped = np.nan_to_num(size) > max(USUAL[1], SLIPPED * middle)
+        if slipped.any():
+            row = int(np.argmax(slipped))
+            found = f"{size[row] / column.factor:g} {column.unit}, where the others are around "
+            found += f"{middle / column.factor:.3g}"
+            raise sheet.error(found, "sizes in one unit", row, column.header)
+
+
+def _check_sizes(
+    sheet: Sheet, columns: Mapping[str, Column], values: Mapping[str, np.ndarray]
+) -> None:
+    """Check that sizes and errors are in a unit that can be meant: no beam is metres wide."""
+    usual = _usual(values)
+    for plane in (p for p in "xy" if f"size_{p}" in columns):
+        column, error = columns[f"size_{plane}"], columns.get(f"size_{plane}_error")
+        if plane not in usual:
+            expected = f"sizes in {column.unit}"
+            raise sheet.error("no number at all", expected, None, column.header)
+        if not POSSIBLE[0] <= usual[plane] <= POSSIBLE[1]:
+            raise _implausible(sheet, column, usual[plane] / column.factor)
+        if error is not None:
+            with np.errstate(over="ignore"):
+                ratio = float(np.nanmedian(values[f"size_{plane}_error"] / values[f"size_{plane}"]))
+            if not 1e-6 < ratio < 1.0:
+                found = f"errors that are {ratio:g} of the sizes"
+                raise sheet.error(found, "errors in the unit of the header", None, error.header)
+    _check_slipped(sheet, columns, usual)
+
+
+def _implausible(sheet: Sheet, column: Column, written: float) -> InputError:
+    """Ask for the unit in which numbers around this one would be a beam's sizes."""
+    lengths = UNITS["length"]
+    likely = min(("um", "mm", "m"), key=lambda u: abs(np.log(written * lengths[u] / 2e-4)))
+    found = f"sizes around {written:g} {column.unit}, implausible for a beam"
+    expected = f"sizes between {1e9 * POSSIBLE[0]:g} nm and {1e3 * POSSIBLE[1]:g} mm; if these are "
+    expected += f"{likely}, rename the column {column.key}_{likely}"
+    return sheet.error(found, expected, None, column.header)
 
 
 def _within(sheet: Sheet, column: Column) -> np.ndarray:

@@ -8,9 +8,11 @@ from __future__ import annotations
 
 import csv
 import hashlib
+import itertools
 import re
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from fnmatch import fnmatchcase
 from os import PathLike
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -32,6 +34,9 @@ UNITS: dict[str, dict[str, float]] = {
     "energy in MeV": {"MeV": 1.0},
 }
 HDF5 = {".h5", ".hdf5"}
+# How Excel says which separator a file has.
+SEPARATOR_LINE = re.compile(r"\s*\"?sep=.\"?\s*$", re.IGNORECASE)
+TFS_LINES = ("@", "$")
 WORD = re.compile(r'"[^"]*"|\S+')
 
 
@@ -64,6 +69,8 @@ class Sheet:
         Comment lines, TFS descriptors, or attributes of an HDF5 file.
     sha256 : str
         Digest of the file.
+    bad : tuple of InputError
+        What is wrong with rows that were left out on request.
     """
 
     path: str | PathLike[str]
@@ -73,6 +80,7 @@ class Sheet:
     header: int | None
     comments: tuple[str, ...]
     sha256: str = ""
+    bad: tuple[InputError, ...] = ()
 
     def __len__(self) -> int:
         return len(self.cells[0])
@@ -92,6 +100,58 @@ class Sheet:
     def header_error(self, found: str, expected: str, column: str | None = None) -> InputError:
         """Make the error that names the header, and the column if it is one alone."""
         return InputError(found, expected, path=self.path, line=self.header, column=column)
+
+    def without(self, patterns: Iterable[str]) -> Sheet:
+        """Leave out columns by name, in which * and ? stand for any letters.
+
+        Raises
+        ------
+        InputError
+            If no column has such a name, or none is left.
+        """
+        left = list(self.names)
+        for pattern in patterns:
+            if not any(fnmatchcase(name, pattern) for name in self.names):
+                raise self.header_error(
+                    f"no column '{pattern}'", nearest(pattern, list(self.names))
+                )
+            left = [name for name in left if not fnmatchcase(name, pattern)]
+        if not left:
+            raise self.header_error("no column that is not ignored", "a column to read")
+        cells = [self[name] for name in left]
+        return replace(self, names=tuple(left), cells=cells)
+
+    def rows(self, keep: Sequence[int]) -> Sheet:
+        """Some of the rows."""
+        lines = None if self.lines is None else [self.lines[row] for row in keep]
+        return replace(self, cells=[[c[row] for row in keep] for c in self.cells], lines=lines)
+
+    def good(self, check: Callable[[Sheet], object]) -> Sheet:
+        """Leave out the rows that a check of each row refuses, and keep what it said of them.
+
+        Raises
+        ------
+        InputError
+            If no row is left: the first that was wrong.
+        """
+        keep: list[int] = []
+        bad = list(self.bad)
+        waiting = [range(len(self))]
+        while waiting:
+            rows = waiting.pop()
+            try:
+                check(self.rows(rows))
+                keep += rows
+            except InputError as error:
+                if len(rows) == 1:
+                    bad.append(error)
+                else:
+                    half = len(rows) // 2
+                    waiting += [rows[half:], rows[:half]]
+        if not keep:
+            _raise_first(bad)
+        bad.sort(key=lambda error: error.line or 0)
+        return replace(self.rows(keep), bad=tuple(bad))
 
     def numbers(
         self,
@@ -194,7 +254,9 @@ def _known(header: str, quantities: Mapping[str, str], sheet: Sheet) -> Column |
     return Column(header, name, unit, units[unit])
 
 
-def read_sheet(path: str | PathLike[str], example: str, most: int | None = None) -> Sheet:
+def read_sheet(
+    path: str | PathLike[str], example: str, most: int | None = None, *, ragged: bool = False
+) -> Sheet:
     """Read the columns of a CSV, TFS or HDF5 file.
 
     Parameters
@@ -206,11 +268,14 @@ def read_sheet(path: str | PathLike[str], example: str, most: int | None = None)
         A header such as the file should have, for messages.
     most : int, optional
         Most rows there may be.
+    ragged : bool
+        Whether rows that have not as many cells as the header are left out, and named in ``bad``.
 
     Returns
     -------
     Sheet
-        With stripped cells. Lines that begin with # are its comments.
+        With stripped cells. Lines that begin with # are its comments; separators at the end of
+        lines are dropped.
 
     Raises
     ------
@@ -230,31 +295,46 @@ def read_sheet(path: str | PathLike[str], example: str, most: int | None = None)
     if Path(path).suffix.lower() in HDF5:
         return _read_hdf5(path, most)
     names, header, separator = None, None, ""
-    comments, rows, lines, seen = [], [], [], hashlib.sha256()
+    comments, rows, lines, bad, seen = [], [], [], [], hashlib.sha256()
     for line, text in enumerate(text_lines(path, seen), start=1):
         start = text.strip()[:1]
-        if start == "#" or (start in ("@", "$") and (names is None or separator == " ")):
+        if start == "#" or (start in TFS_LINES and (names is None or separator == " ")):
             comments.append(text.strip().lstrip("# ").rstrip())
         elif names is None and start == "*":  # of a TFS file
             separator, header = " ", line
             names = [name.upper() for name in _split(text, " ", path, line)[1:]]
-        elif not text.strip().strip(",;\t "):
+        elif not text.strip().strip(",;\t ") or (names is None and SEPARATOR_LINE.match(text)):
             continue
         elif names is None:
             separator = next((s for s in ",;\t" if s in text), " ")
-            names, header = _split(text, separator, path, line), line
+            names, header = _without_blanks(_split(text, separator, path, line), 0), line
             _check_header(names, example, path, line)
         else:
-            rows.append(_split(text, separator, path, line))
-            lines.append(line)
-            if len(rows[-1]) != len(names):
-                found, expected = f"{len(rows[-1])} cells", f"{len(names)}, as in the header"
-                raise InputError(found, expected, path=path, line=line)
-            _check_length(len(rows), most, path, line)
+            cells = _without_blanks(_split(text, separator, path, line), len(names))
+            found, expected = f"{len(cells)} cells", f"{len(names)}, as in the header"
+            wrong = InputError(found, expected, path=path, line=line)
+            whole = len(cells) == len(names)
+            (rows if whole else bad).append(cells if whole else wrong)
+            lines += [line] * whole
+            _check_length(len(rows) + len(bad), most, path, line)
+            _raise_first(() if ragged else bad)
     if names is None:
         raise InputError("no header and no rows", f"a header line such as {example}", path=path)
+    _raise_first(() if rows else bad)
     cells = list(zip(*rows, strict=True)) if rows else [()] * len(names)
-    return Sheet(path, tuple(names), cells, lines, header, tuple(comments), seen.hexdigest())
+    said = (tuple(comments), seen.hexdigest(), tuple(bad))
+    return Sheet(path, tuple(names), cells, lines, header, *said)
+
+
+def _raise_first(errors: Sequence[InputError]) -> None:
+    for error in errors:
+        raise error
+
+
+def _without_blanks(cells: list[str], least: int) -> list[str]:
+    """Drop the blank cells that separators at the end of a line make, beyond some cells."""
+    more = len(list(itertools.takewhile(lambda cell: cell == "", reversed(cells))))
+    return cells[: max(len(cells) - more, least)]
 
 
 def _split(text: str, separator: str, path: str | PathLike[str], line: int) -> list[str]:

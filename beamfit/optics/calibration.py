@@ -18,14 +18,16 @@ __all__ = [
     "SETTING_UNITS",
     "Calibration",
     "CurrentPolynomial",
+    "CurrentTable",
     "FocusingStrength",
+    "Gradient",
     "IntegratedGradient",
     "IntegratedStrength",
     "SlopeIntercept",
 ]
 
 
-SETTING_UNITS = {"A": "A", "kG": "kG", "k1": "1/m²", "k1l": "1/m"}
+SETTING_UNITS = {"A": "A", "kG": "kG", "T_per_m": "T/m", "k1": "1/m²", "k1l": "1/m"}
 """How the unit of a setting is written for people."""
 
 
@@ -99,6 +101,73 @@ class CurrentPolynomial:
         return self.gradient(setting) * length / rigidity(energy, self.mass)
 
 
+@value("currents", "gradients", "mass")
+class CurrentTable:
+    """Gradient by straight lines between the points of a magnetic measurement.
+
+    Parameters
+    ----------
+    currents : tuple of float
+        A, rising.
+    gradients : tuple of float
+        T/m at these currents; beyond the table its first and last line go on.
+    scale : float
+        Factor on the gradient; 1 trusts the table.
+    mass : float
+        Rest energy of the particle, MeV.
+
+    Examples
+    --------
+    >>> q = CurrentTable((0.0, 1.0, 3.0), (0.1, 2.1, 5.1))
+    >>> [round(float(q.gradient(i)), 3) for i in (0.5, 2.0, 4.0)]
+    [1.1, 3.6, 6.6]
+    """
+
+    currents: tuple[float, ...]
+    gradients: tuple[float, ...]
+    scale: ArrayLike = 1.0
+    mass: float = ELECTRON_MASS
+    unit: ClassVar[str] = "A"
+
+    def gradient(self, current: ArrayLike) -> Array:
+        """Gradient in T/m at a current in A."""
+        xp = array_module(current, self.scale)
+        at, values = xp.asarray(self.currents), xp.asarray(self.gradients)
+        i = xp.clip(xp.searchsorted(at, current) - 1, 0, len(self.currents) - 2)
+        rise = (values[i + 1] - values[i]) / (at[i + 1] - at[i])
+        return self.scale * (values[i] + rise * (current - at[i]))
+
+    def k1l(self, setting: ArrayLike, length: ArrayLike, energy: ArrayLike) -> Array:
+        """Integrated strength in 1/m at a current in A, a length in m, an energy in MeV."""
+        return self.gradient(setting) * length / rigidity(energy, self.mass)
+
+
+@value("mass")
+class Gradient:
+    """The setting is the gradient in T/m; positive focuses x.
+
+    Parameters
+    ----------
+    scale : float
+        Factor on the setting; 1 trusts the control system.
+    mass : float
+        Rest energy of the particle, MeV.
+
+    Examples
+    --------
+    >>> round(float(Gradient().k1l(2.0, length=0.1, energy=135.0)), 6)
+    0.44414
+    """
+
+    scale: ArrayLike = 1.0
+    mass: float = ELECTRON_MASS
+    unit: ClassVar[str] = "T_per_m"
+
+    def k1l(self, setting: ArrayLike, length: ArrayLike, energy: ArrayLike) -> Array:
+        """Integrated strength in 1/m at a gradient in T/m, a length in m, an energy in MeV."""
+        return self.scale * setting * length / rigidity(energy, self.mass)
+
+
 @value("mass")
 class IntegratedGradient:
     """The setting is the integrated gradient in kG; positive focuses x.
@@ -162,5 +231,11 @@ class IntegratedStrength:
 
 
 Calibration = (
-    SlopeIntercept | CurrentPolynomial | IntegratedGradient | FocusingStrength | IntegratedStrength
+    SlopeIntercept
+    | CurrentPolynomial
+    | CurrentTable
+    | Gradient
+    | IntegratedGradient
+    | FocusingStrength
+    | IntegratedStrength
 )

@@ -72,6 +72,8 @@ def emittance_page(
         *(_budgets(fit, names) if fit.statement.closed else _fitted_too(fit)),
         *(Table(f"Points, {p.plane} plane", *point_rows(p), numeric=True) for p in fit.planes),
     ]
+    if fit.notes:
+        tables.append(Table("About the input", [], [[note] for note in fit.notes]))
     energy = f"{float(line.energy):g} MeV"
     if not fit.statement.closed:
         energy += f", scenario {fit.scenario}"

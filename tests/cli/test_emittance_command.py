@@ -127,3 +127,17 @@ def test_the_energy_of_the_rows_is_in_the_result(run, tmp_path, root):
     _, out, _ = run("emittance", scan, "--lattice", "lattices/gtf.toml", "--json")
     [result] = json.loads(out)["results"]
     assert (result["energy"]["value"], result["energy"]["unit"]) == (25.0, "MeV")
+
+
+def test_rows_left_out_are_named_in_the_answer(run, tmp_path, root):
+    lines = (root / "measurements/lcls_otr2.csv").read_text().splitlines()
+    head, rows = lines[:6], lines[6:]
+    lines = [*head[:5], head[5] + ",pressure_mbar", *(row + ",1e-9" for row in rows)]
+    path = tmp_path / "scan.csv"
+    path.write_text("\n".join([*lines, "-1.5,off,off,off,off,,\n"]))
+    plain = ["emittance", str(path), *REAL[2:], "--ignore", "pressure*"]
+    assert run(*plain)[0] == 2
+    _, out, _ = run(*plain, "--skip-bad", "--json")
+    note = f"1 of 6 rows was left out: line {len(lines) + 1}, column 'size_x_um', 'off'."
+    assert [r["notes"] for r in json.loads(out)["results"]] == [[note]] * 2
+    assert note in " ".join(run(*plain, "--skip-bad")[1].split())

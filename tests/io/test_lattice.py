@@ -12,6 +12,7 @@ from beamfit.io.line import build_line, load_lattice, read_lattice
 from beamfit.optics.calibration import CurrentPolynomial, IntegratedGradient, SlopeIntercept
 from beamfit.optics.elements import Drift, Marker, Quadrupole, Screen, SectorDipole, ThinLens
 from beamfit.optics.particle import PROTON_MASS
+from beamfit.particles import REST_ENERGY
 
 # Every element and every key once; the line numbers below count on it.
 WHOLE = """format = "beamfit-lattice-1"
@@ -318,3 +319,84 @@ def test_any_lines_left_out_are_read_or_refused(tmp_path_factory, left_out):
     path = tmp_path_factory.getbasetemp() / "lines.toml"
     path.write_text("\n".join(lines))
     read_or_refuse(path)
+
+
+def in_lattice(tmp_path, quadrupole, top="energy_MeV = 135.0"):
+    path = tmp_path / "line.toml"
+    path.write_text(
+        f'format = "beamfit-lattice-1"\n{top}\n[[element]]\ntype = "quadrupole"\nname = "Q"\n'
+        f'length_m = 0.2\n{quadrupole}\n[[element]]\ntype = "screen"\nname = "S"\n'
+    )
+    return path
+
+
+MEASURED = [(-2.0, -4.1), (0.0, 0.2), (1.0, 2.3), (3.0, 5.9)]
+
+
+@pytest.mark.parametrize(
+    ("column", "factor"),
+    [("gradient_T_per_m", 1.0), ("integrated_gradient_T", 0.2), ("integrated_gradient_kG", 2.0)],
+)
+def test_a_measured_gradient_is_followed_between_its_points(column, factor, tmp_path):
+    pairs = [list(p) for p in MEASURED]
+    inline = load_lattice(in_lattice(tmp_path, f"current_A = 0\ngradient_table = {pairs}"))
+    rows = [f"{i};{factor * g!r}" for i, g in reversed(MEASURED)]
+    (tmp_path / "q.csv").write_text("\n".join([f"# coil 3\ncurrent_A;{column}", *rows]))
+    said = 'current_A = 0\ngradient_table_file = "q.csv"'
+    from_file = load_lattice(in_lattice(tmp_path, said))
+    currents, gradients = np.transpose(MEASURED)
+    for current in np.linspace(-2.0, 3.0, 11):
+        expected = np.interp(current, currents, gradients)
+        for line in (inline, from_file):
+            k1 = float(line["Q"].k1(current, 135.0))
+            # Bρ = p/(0.299792458 GeV/c per T m)
+            p = np.sqrt(135.0**2 - 0.51099895069**2) / 299.792458
+            assert k1 == pytest.approx(expected / p, rel=1e-12)
+    assert from_file["Q"].calibration.unit == "A"
+
+
+@pytest.mark.parametrize(
+    ("quadrupole", "words"),
+    [
+        ("current_A = 0\ngradient_table = [[0, 1]]", "1 points"),
+        ("current_A = 0\ngradient_table = [[0, 1], [1, 2], [0, 3]]", "0 A twice"),
+        ("current_A = 0\ngradient_table = [[0, 1], [1]]", "pairs"),
+        ('current_A = 0\ngradient_table = [[0, 1], [1, "2"]]', "pairs"),
+        ("current_A = 0\ngradient_table = [[0, 1], [1, 2]]\nslope = 1.0", "without one"),
+        ("k1_per_m2 = 0\ngradient_table = [[0, 1], [1, 2]]", "no calibration"),
+        ('current_A = 0\ngradient_table_file = "none.csv"', "none.csv: no such file"),
+        ('current_A = 0\ngradient_table_file = "bad.csv"', "bad.csv:1: .*current_A and one of"),
+        ("gradient_T_per_m = 1\nk1_per_m2 = 2", "both"),
+    ],
+)
+def test_gradient_tables_that_cannot_be_used(quadrupole, words, tmp_path):
+    (tmp_path / "bad.csv").write_text("current_A\n1\n2\n")
+    with pytest.raises(InputError, match=words):
+        read_lattice(in_lattice(tmp_path, quadrupole))
+
+
+@pytest.mark.parametrize("particle", ["electron", "proton"])
+def test_momentum_and_kinetic_energy_of_the_lattice(particle, tmp_path):
+    rest = REST_ENERGY[particle]
+    total = rest + 70.0
+    momentum = np.sqrt(total**2 - rest**2)
+    for key, value in (
+        ("energy_MeV", total),
+        ("kinetic_energy_MeV", 70.0),
+        ("momentum_MeV", float(momentum)),
+    ):
+        top = f'{key} = {value!r}\nparticle = "{particle}"'
+        found = read_lattice(in_lattice(tmp_path, "gradient_T_per_m = 1.5", top))
+        assert found.energy == pytest.approx(total, rel=1e-14)
+        assert found.calibrations == {"Q": "T_per_m"}
+        # k1 = G/(Bρ)
+        k1 = float(build_line(found)["Q"].k1(energy=found.energy))
+        assert k1 == pytest.approx(1.5 * 299.792458 / momentum, rel=1e-12)
+    for top in (
+        "kinetic_energy_MeV = -1",
+        "momentum_MeV = 0",
+        "energy_MeV = 135\nmomentum_MeV = 1",
+    ):
+        with pytest.raises(InputError) as raised:
+            read_lattice(in_lattice(tmp_path, "k1_per_m2 = 1", top))
+        assert raised.value.column in top

@@ -288,3 +288,41 @@ def test_json_has_the_contract(gtf, gtf_sizes):
         assert {"value", "error", "unit", "error_raw"} == set(result[name])
     assert result["emittance"]["unit"] == "m"
     assert result["status"] == "converged"
+
+
+def test_a_gradient_is_the_integrated_gradient_over_the_length(otr2):
+    """1 T/m over the magnet's length of 0.108 m is 1.08 kG."""
+    settings, sizes = np.linspace(-4.0, -1.0, 6), np.array([111, 80, 60, 54, 70, 104]) * 1e-6
+    fits = [
+        beamfit.fit_emittance(scan_of("Q525", unit, values, sizes), otr2).x
+        for unit, values in (("kG", settings), ("T_per_m", settings / 1.08))
+    ]
+    assert fits[1].emittance.value == pytest.approx(fits[0].emittance.value, rel=1e-12)
+    assert fits[1].points.units == {"Q525": "T/m"}
+
+
+@pytest.mark.parametrize(("kind", "number"), [("kinetic", 134.48900104931), ("total", 135.0)])
+def test_an_energy_means_what_its_column_says(kind, number, otr2):
+    settings, sizes = np.linspace(-4.0, -1.0, 6), np.array([111, 80, 60, 54, 70, 104]) * 1e-6
+    scan = scan_of("Q525", "kG", settings, sizes)
+    own = replace(scan, energy=np.full(6, number), energy_kind=kind)
+    fit = beamfit.fit_emittance(own, otr2)
+    expected = beamfit.fit_emittance(scan, otr2).x.normalized_emittance.value
+    assert fit.x.normalized_emittance.value == pytest.approx(expected, rel=1e-12)
+    assert fit.to_json()[0]["energy"]["value"] == pytest.approx(135.0, rel=1e-14)
+
+
+def test_units_that_no_beam_or_magnet_explains_are_refused_or_questioned(otr2):
+    settings, sizes = np.linspace(-4.0, -1.0, 6), np.array([111, 80, 60, 54, 70, 104]) * 1e-6
+    with pytest.raises(InputError, match="um or mm"):
+        scan_of("Q525", "kG", settings, 1e6 * sizes)
+    with pytest.raises(InputError, match="T/m"):
+        beamfit.fit_emittance(scan_of("Q525", "kG", 1e4 * settings, sizes), otr2)
+    assert beamfit.fit_emittance(scan_of("Q525", "kG", settings, sizes), otr2).notes == ()
+    odd = scan_of("Q525", "kG", 200.0 * settings, 1e3 * sizes)
+    fit = beamfit.fit_emittance(odd, otr2)
+    assert ["sizes" in note.lower() for note in fit.notes] == [True, False]
+    assert "T/m" in fit.notes[1]
+    assert fit.notes[0] in str(fit)
+    assert fit.notes[0] in fit.to_json()[0]["notes"]
+    np.testing.assert_array_equal(fit.scan.size["x"], 1e3 * sizes)

@@ -18,6 +18,7 @@ from beamfit.studies.scan.assumptions import SCENARIOS, Anchor, Assumptions
 from beamfit.studies.scan.judged import judged_beam
 from beamfit.studies.scan.known import METHODS, see
 from beamfit.studies.scan.model import line_of
+from beamfit.studies.scan.questions import questions
 from beamfit.studies.scan.results import Parameter, PlaneFit, parameter_rows, result_rows
 from beamfit.studies.scan.scans import QuadScan
 from beamfit.studies.scan.statement import Scenario, Seen
@@ -113,7 +114,7 @@ def fit_emittance(
         priors or {}, bounds or {}, anchor or Anchor(), hysteresis, hidden, starts, seed
     )
     told.check_scenario(scenario, robust)
-    statement = scenario_of(scenario)
+    statement, scan = scenario_of(scenario), scan.of_particle(line.mass)
     seen = see(scan, line, planes, method, robust, at_once=statement.closed)
     if statement.closed:
         return EmittanceFit(judged_beam(seen), scan, line, statement, told, seen)
@@ -212,6 +213,11 @@ class EmittanceFit:
         return self.statement.name
 
     @property
+    def notes(self) -> tuple[str, ...]:
+        """What was done to the numbers of the file, and what is odd about them, in sentences."""
+        return (*self.scan.notes, *questions(self.scan, self.seen.scanned))
+
+    @property
     def anchor(self) -> str:
         """What ties a network to first principles, in words."""
         return self.told.anchor.words
@@ -290,7 +296,10 @@ class EmittanceFit:
 
     def to_json(self) -> list[dict[str, Any]]:
         """Give the ``results`` list of the JSON contract."""
-        entries = [p.to_json() | {"energy": self._energy(p.plane).to_json()} for p in self.planes]
+        common = {"notes": list(self.notes)} if self.notes else {}
+        entries = [
+            p.to_json() | {"energy": self._energy(p.plane).to_json()} | common for p in self.planes
+        ]
         own = {
             "scenario": self.scenario,
             "anchor": self.anchor,
@@ -310,6 +319,7 @@ class EmittanceFit:
         heading = f"{self.scan.name} on {self.line.name}, fit of {self.planes[0].method}"
         lines = [heading.replace("_", " "), "", text_of(self._table("")), ""]
         lines += [f"{p.plane}: {p.message}" for p in self.planes]
+        lines += ["", *self.notes] if self.notes else []
         if not self.statement.closed:
             rows = [[name, *cells] for name, cells in parameter_rows(self.parameters)]
             lines += ["", f"scenario {self.scenario}, anchor: {self.anchor}"]
@@ -319,4 +329,5 @@ class EmittanceFit:
 
     def _repr_html_(self) -> str:
         notes = (f"<p><b>{p.plane}</b>: {escape(p.message)}</p>" for p in self.planes)
-        return html_of(self._table("")) + "".join(notes)
+        more = (f"<p>{escape(note)}</p>" for note in self.notes)
+        return html_of(self._table("")) + "".join((*notes, *more))

@@ -20,6 +20,7 @@ from beamfit.studies.scan.next_point import (
     candidate_settings,
     plausible_sigma,
 )
+from beamfit.studies.scan.questions import check_gradients
 from beamfit.studies.scan.results import Points
 from beamfit.studies.scan.robust import RobustFit, fit_robust
 from beamfit.studies.scan.scans import QuadScan, check_names
@@ -83,6 +84,7 @@ def see(
     for plane in asked:
         scan.rows(plane)  # says so if it was not measured
     scanned = scanned_line(scan, line)
+    check_gradients(scan, scanned)
     rows = scan_rows(scan, scanned, method == METHODS[0])
     # A plane that is not asked for still testifies to the settings and the optics.
     planes = tuple(dict.fromkeys((*asked, *scan.planes)))

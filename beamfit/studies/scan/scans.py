@@ -6,17 +6,28 @@ Plain numpy, so that a bad file is reported before JAX is ever loaded.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from os import PathLike
 from typing import NamedTuple
 
 import numpy as np
 
 from beamfit.errors import InputError, nearest
+from beamfit.particles import total_energy
 
-__all__ = ["PlaneRows", "QuadScan", "check_names", "first_unusable", "row_keys"]
+__all__ = [
+    "POSSIBLE",
+    "USUAL",
+    "PlaneRows",
+    "QuadScan",
+    "check_names",
+    "first_unusable",
+    "row_keys",
+]
 
 PLANES = ("x", "y")
+# Rms sizes in m that a beam can have, and that most have: outside a unit is wrong, or questioned.
+POSSIBLE, USUAL = (1e-8, 0.3), (1e-7, 2e-2)
 
 
 class PlaneRows(NamedTuple):
@@ -87,13 +98,16 @@ class QuadScan:
     settings : mapping of str to array
         Magnet name to settings, each of shape (n,), in the unit ``units`` names.
     units : mapping of str to str
-        Magnet name to ``"A"``, ``"kG"`` (integrated gradient), ``"k1"`` (1/m²) or ``"k1l"`` (1/m).
+        Magnet name to ``"A"``, ``"kG"`` (integrated gradient), ``"T_per_m"`` (gradient), ``"k1"``
+        (1/m²) or ``"k1l"`` (1/m).
     size : mapping of str to array
         Plane ("x", "y") to rms sizes in m, shape (n,); NaN where a row has none.
     error : mapping of str to array, optional
         Plane to standard errors in m. A plane left out has no errors: the fit infers them.
     energy : array, optional
-        Total energy of each row in MeV; the lattice's if None.
+        Energy of each row in MeV; the lattice's if None.
+    energy_kind : {"total", "kinetic", "momentum"}
+        What that is; a momentum is p c.
     screen : sequence of str, optional
         Screen of each row; the lattice's only one if None.
     resolution, energy_spread : array, optional
@@ -106,6 +120,8 @@ class QuadScan:
         What to call the scan, and the file it came from.
     provenance : tuple of str
         Comment lines of the file.
+    notes : tuple of str
+        What was done to the numbers of the file, for whoever reads the result.
     columns : mapping of str to str
         What the file called each thing, for error messages.
 
@@ -127,6 +143,7 @@ class QuadScan:
     size: Mapping[str, np.ndarray]
     error: Mapping[str, np.ndarray] = field(default_factory=dict)
     energy: np.ndarray | None = None
+    energy_kind: str = "total"
     screen: tuple[str, ...] | None = None
     resolution: np.ndarray | None = None
     energy_spread: np.ndarray | None = None
@@ -136,6 +153,7 @@ class QuadScan:
     path: str | PathLike[str] | None = None
     sha256: str | None = None
     provenance: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
     columns: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -183,6 +201,21 @@ class QuadScan:
             energy_spread=spread,
         )
 
+    def of_particle(self, rest_energy: float) -> QuadScan:
+        """The same scan with total energies, for a particle of a rest energy in MeV.
+
+        Examples
+        --------
+        >>> scan = QuadScan({"Q": [0.0, 1.0, 2.0]}, {"Q": "A"}, {"x": [2e-4, 1e-4, 3e-4]},
+        ...                 energy=[3.0, 3.0, 3.0], energy_kind="momentum")
+        >>> scan.of_particle(4.0).energy.tolist()
+        [5.0, 5.0, 5.0]
+        """
+        if self.energy is None or self.energy_kind == "total":
+            return self
+        total = total_energy(self.energy, self.energy_kind, rest_energy)
+        return replace(self, energy=total, energy_kind="total")
+
     def unusable(self, found: str, expected: str, key: str | None = None) -> InputError:
         """Make the error that names this scan's file and the column of ``key``."""
         column = None if key is None else self.columns.get(key, key)
@@ -210,6 +243,13 @@ class QuadScan:
             wrong = first_unusable(values, blank=blank)
             if wrong:
                 raise self.unusable(f"{wrong[1]} at point {wrong[0] + 1}", "a positive number", key)
+        for plane, size in self.size.items():
+            middle = float(np.nanmedian(size)) if not np.isnan(size).all() else 1e-4
+            if not POSSIBLE[0] <= middle <= POSSIBLE[1]:
+                found = f"sizes around {middle:g} m, which no beam has"
+                raise self.unusable(
+                    found, "rms sizes in m: are these in um or mm?", f"size_{plane}"
+                )
 
     def _check_three_settings(self, plane: str) -> None:
         rows = self.rows(plane)
@@ -276,6 +316,7 @@ def check_names(
                 f"slope and intercept for {name} in the lattice, or a column {name}_kG",
                 name,
             )
+    scan = scan.of_particle(rest_energy)
     if scan.energy is not None and scan.energy.min() <= rest_energy:
         raise scan.unusable(
             f"{scan.energy.min():g} MeV",

@@ -141,7 +141,7 @@ def _word(line: Beamline, magnet: str) -> str:
     calibration = line[magnet].calibration
     if isinstance(calibration, SlopeIntercept):
         return "slope"
-    return "gradient" if calibration.unit in ("A", "kG") else "strength"
+    return "gradient" if calibration.unit in ("A", "kG", "T_per_m") else "strength"
 
 
 def _scaled(line: Beamline, magnet: str, factor: Array) -> Beamline:

@@ -19,6 +19,7 @@ from beamfit.optics.beamline import Beamline
 from beamfit.optics.calibration import (
     SETTING_UNITS,
     FocusingStrength,
+    Gradient,
     IntegratedGradient,
     IntegratedStrength,
 )
@@ -72,9 +73,9 @@ def scanned_line(scan: QuadScan, line: Beamline) -> Beamline:
     ('kG', 3.0)
     """
     for name, unit in scan.units.items():
-        if isinstance(line[name], ThinLens) and unit == "k1":
+        if isinstance(line[name], ThinLens) and unit in ("k1", "T_per_m"):
             raise scan.unusable(
-                f"k1 for '{name}', which has no length",
+                f"{SETTING_UNITS[unit]} for '{name}', which has no length",
                 f"a column {name}_k1l (inverse focal length, 1/m) or {name}_kG",
                 name,
             )
@@ -86,6 +87,7 @@ def _with_meanings(same: _Same, units: tuple[tuple[str, str], ...]) -> Beamline:
     line = same.line
     meanings = {
         "kG": IntegratedGradient(mass=line.mass),
+        "T_per_m": Gradient(mass=line.mass),
         "k1": FocusingStrength(),
         "k1l": IntegratedStrength(),
     }

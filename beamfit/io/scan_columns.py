@@ -1,0 +1,151 @@
+"""What the header of a scan means: sizes under their several names, settings, energies."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping
+
+from beamfit.errors import nearest
+from beamfit.io.table import UNITS, Column, Sheet, columns_of
+
+__all__ = ["ENERGIES", "SETTINGS", "column_notes", "scan_columns"]
+
+# How the energy of a row may be given, and what that is.
+ENERGIES = {"energy": "total", "kinetic_energy": "kinetic", "momentum": "momentum"}
+QUANTITIES = {
+    **dict.fromkeys(("size_x", "size_x_error", "size_y", "size_y_error"), "length"),
+    "resolution": "length",
+    **dict.fromkeys(ENERGIES, "energy in MeV"),
+    "energy_spread": "",
+    "shot": "",
+    "screen": "",
+}
+SETTINGS = ("A", "kG", "T_per_m", "k1", "k1l")
+CARRIED = re.compile(r"note_.*|time|timestamp|charge_[np]C")
+# Words for a width, and how many of it are one rms: a Gaussian's FWHM is sqrt(8 ln 2) rms.
+FWHM = 1.0 / math.sqrt(8.0 * math.log(2.0))
+WIDTHS = {"size": 1.0, "sigma": 1.0, "sig": 1.0, "rms": 1.0, "fwhm": FWHM}
+ERRORS = {"error", "err", "std", "sd"}
+# A plane and a width written as one word, as in xrms and sigmax.
+ONE_WORD = re.compile(r"([xy])(size|sigma|sig|rms|fwhm)|(size|sigma|sig|rms|fwhm)([xy])")
+
+
+def scan_columns(sheet: Sheet) -> dict[str, Column]:
+    """Understand every header of a scan.
+
+    Parameters
+    ----------
+    sheet : Sheet
+        The file.
+
+    Returns
+    -------
+    dict of str to Column
+        By quantity: ``size_x``, ``size_x_error``, ..., ``setting Q2``, one of `ENERGIES`, and
+        those of `QUANTITIES`.
+
+    Raises
+    ------
+    InputError
+        If a header is unknown or a quantity stands twice, a needed one is missing, there are no
+        rows, or an error belongs to another width than the size.
+
+    Examples
+    --------
+    >>> sheet = Sheet("a.csv", ("Q_T_per_m", "fwhm_x_mm"), [["1"], ["2.3548"]], [2], 1, ())
+    >>> columns = scan_columns(sheet)
+    >>> list(columns), round(2.3548 * columns["size_x"].factor, 7)
+    (['setting Q', 'size_x'], 0.001)
+    """
+    columns = columns_of(sheet, QUANTITIES, lambda header: _other(header, sheet))
+    if not {"size_x", "size_y"} & set(columns):
+        missing = "a beam size column, such as size_x_um"
+    elif not any(c.unit in SETTINGS for c in columns.values()):
+        missing = "a magnet setting column, such as Q2_A, Q2_kG or Q2_k1"
+    else:
+        missing = ""
+    if missing:
+        raise sheet.header_error("columns " + ", ".join(sheet.names), missing)
+    for plane in "xy":
+        _check_error(sheet, columns, plane)
+    given = [columns[e].header for e in ENERGIES if e in columns]
+    if len(given) > 1:
+        raise sheet.header_error("columns " + " and ".join(given), "one of them", given[1])
+    if not len(sheet):
+        raise sheet.error("a header and no rows", "at least three settings")
+    return columns
+
+
+def _check_error(sheet: Sheet, columns: Mapping[str, Column], plane: str) -> None:
+    """Check that an error column has its size column, and is of the same width."""
+    size, error = columns.get(f"size_{plane}"), columns.get(f"size_{plane}_error")
+    if error is None:
+        return
+    if size is None:
+        found = f"{error.header} without sizes in {plane}"
+        raise sheet.header_error(found, f"a column size_{plane}_um", error.header)
+    if _is_fwhm(size) != _is_fwhm(error):
+        found = f"an error beside '{size.header}' of which only one is a FWHM"
+        raise sheet.header_error(found, "sizes and errors of one width", error.header)
+
+
+def _other(header: str, sheet: Sheet) -> Column:
+    """A size under another name, a magnet's setting, or a column that is carried along unread."""
+    if CARRIED.fullmatch(header):
+        return Column(header, header)
+    if (column := _size(header)) is not None:
+        return column
+    unit = next((u for u in SETTINGS if header.endswith(f"_{u}")), "")
+    name = header.removesuffix(f"_{unit}") if unit else ""
+    if name and not re.match(r"(size|sigma|rms|fwhm)_[xy](_|$)", name):
+        return Column(header, f"setting {name}", unit)
+    usual = [f"{q}_um" for q in QUANTITIES if q.startswith("size")]
+    usual += ["resolution_um", "energy_MeV", "kinetic_energy_MeV", "momentum_MeV", "energy_spread"]
+    usual += ["shot", "screen"]
+    before, _, last = header.rpartition("_")
+    raise sheet.header_error(
+        f"unknown unit '{last}'" if before else "a name without a unit",
+        "a magnet with _A, _kG, _T_per_m or _k1 at the end, "
+        + nearest(header, usual)
+        + "; --ignore a column, or begin its name with note_, to leave it unread",
+        header,
+    )
+
+
+def _size(header: str) -> Column | None:
+    """The column of a size or its error: a width, a plane, a unit, in any sensible order.
+
+    ``sigma_x_mm``, ``x_rms_um``, ``rms_x_err_mm``, ``fwhm_y_um_std``; None if it is no size.
+    """
+    words = header.split("_")
+    place = next((i for i in (-1, -2) if len(words) > 1 and words[i] in UNITS["length"]), None)
+    if place is None:
+        return None
+    unit = words.pop(place)
+    said = []
+    for word in map(str.lower, words):
+        both = ONE_WORD.fullmatch(word)
+        said += [part for part in both.groups() if part] if both else [word]
+    planes, widths, errors = ([w for w in said if w in of] for of in ("xy", WIDTHS, ERRORS))
+    known = len(planes) + len(widths) + len(errors) == len(said) - said.count("beam")
+    # "rms_size", "size_fwhm" are one width said in full; a sigma of a size may be its error.
+    one = len(widths) == 1 or sorted(widths) in (["rms", "size"], ["fwhm", "size"])
+    if not (known and one and len(planes) == 1 and len(errors) <= 1):
+        return None
+    rms = FWHM if "fwhm" in widths else 1.0
+    key = f"size_{planes[0]}" + ("_error" if errors else "")
+    return Column(header, key, unit, UNITS["length"][unit] * rms)
+
+
+def _is_fwhm(column: Column) -> bool:
+    return column.factor != UNITS["length"][column.unit]
+
+
+def column_notes(columns: Mapping[str, Column]) -> list[str]:
+    """Say which sizes were made of others, in sentences."""
+    made = [c.header for key, c in columns.items() if key in ("size_x", "size_y") and _is_fwhm(c)]
+    if not made:
+        return []
+    listed = " and ".join(made)
+    return [f"Sizes are FWHM/2.3548 of {listed}, which is their rms for a Gaussian profile only."]

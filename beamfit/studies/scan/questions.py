@@ -1,0 +1,91 @@
+"""Numbers that only a wrong unit explains, or hardly anything else: refused, or asked about."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from beamfit.optics.beamline import Beamline
+from beamfit.optics.elements import Quadrupole
+from beamfit.optics.particle import rigidity
+from beamfit.studies.scan.scans import USUAL, QuadScan
+
+__all__ = ["check_gradients", "questions"]
+
+# Gradients in T/m beyond which a magnet is a plasma lens at least, and beyond any lens.
+STRONG, IMPOSSIBLE = 500.0, 1e4
+
+
+def gradients(scan: QuadScan, scanned: Beamline) -> dict[str, float]:
+    """The largest gradient in T/m of each scanned quadrupole that has a length."""
+    energy = float(scanned.energy) if scan.energy is None else scan.energy
+    found = {}
+    for name, settings in scan.settings.items():
+        magnet = scanned[name]
+        if isinstance(magnet, Quadrupole):
+            k1 = np.asarray(magnet.k1(settings, energy))
+            found[name] = float(np.abs(k1 * rigidity(energy, scanned.mass)).max())
+    return found
+
+
+def check_gradients(scan: QuadScan, scanned: Beamline) -> None:
+    """Refuse settings that no magnet can have.
+
+    Parameters
+    ----------
+    scan : QuadScan
+        With total energies.
+    scanned : Beamline
+        The line, with the calibrations of the scan's columns.
+
+    Raises
+    ------
+    InputError
+        Naming the magnet and its gradient.
+    """
+    for name, gradient in gradients(scan, scanned).items():
+        if gradient > IMPOSSIBLE:
+            largest = float(np.abs(scan.settings[name]).max())
+            raise scan.unusable(
+                f"settings of '{name}' up to {largest:g}, which are {gradient:.3g} T/m",
+                f"a gradient below {IMPOSSIBLE:g} T/m: is the unit of the settings, the length or "
+                "calibration of the magnet, or the energy another one?",
+                name,
+            )
+
+
+def questions(scan: QuadScan, scanned: Beamline) -> tuple[str, ...]:
+    """Ask about sizes and settings that are possible, and yet more likely in a wrong unit.
+
+    Parameters
+    ----------
+    scan, scanned
+        As for `check_gradients`.
+
+    Returns
+    -------
+    tuple of str
+        Sentences; nothing was changed because of them.
+    """
+    return (*_of_sizes(scan), *_of_gradients(scan, scanned))
+
+
+def _of_sizes(scan: QuadScan) -> Iterator[str]:
+    for plane, size in scan.size.items():
+        middle = float(np.nanmedian(size))
+        if not USUAL[0] <= middle <= USUAL[1]:
+            unusual = "large" if middle > USUAL[1] else "small"
+            yield (
+                f"Sizes in {plane} around {1e3 * middle:.3g} mm are taken as they stand, but are "
+                f"unusually {unusual}: is that the unit they are in?"
+            )
+
+
+def _of_gradients(scan: QuadScan, scanned: Beamline) -> Iterator[str]:
+    for name, gradient in gradients(scan, scanned).items():
+        if gradient > STRONG:
+            yield (
+                f"Settings of {name} are taken as they stand, but mean gradients up to "
+                f"{gradient:.3g} T/m: are its unit, length and calibration right?"
+            )
