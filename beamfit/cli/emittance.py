@@ -8,7 +8,7 @@ import click
 
 import beamfit
 from beamfit.cli.options import Sampling, command_line, options
-from beamfit.io.line import build_line, read_lattice
+from beamfit.io.line import build_line, lattice_of
 from beamfit.io.measurement import read_quad_scan
 from beamfit.io.result import results_text
 from beamfit.studies.scan.assumptions import Assumptions
@@ -31,7 +31,7 @@ Examples:
 
 
 @click.command(epilog=EXAMPLE)
-@options("scan ignore skip-bad lattice use energy")
+@options("scan ignore skip-bad maybe-lattice use energy particle")
 @click.option(
     "--plane",
     type=click.Choice(["x", "y", "both"]),
@@ -58,9 +58,10 @@ def emittance(
     scan: str,
     ignore: tuple[str, ...],
     skip_bad: bool,
-    lattice: str,
+    lattice: str | None,
     use: str | None,
     energy: float | None,
+    particle: str | None,
     plane: str | None,
     method: str,
     robust: bool,
@@ -81,8 +82,7 @@ def emittance(
     sampling.check()
     Assumptions(**told).check_scenario(scenario)
     measured = read_quad_scan(scan, ignore=ignore, skip_bad=skip_bad)
-    described = read_lattice(lattice, use=use, energy=energy)
-    described.check_scan(measured)
+    described = lattice_of(measured, lattice, use=use, energy=energy, particle=particle)
     planes = {None: measured.planes, "both": ("x", "y")}.get(plane, (plane,))
     for each in planes:
         measured.rows(each)  # says so if it was not measured
@@ -96,7 +96,7 @@ def emittance(
         scenario=scenario,
         **told,
     )
-    inputs = {scan: measured.sha256, lattice: described.sha256}
+    inputs = {scan: measured.sha256} | ({} if lattice is None else {lattice: described.sha256})
     posterior = fit.sample(**sampling.arguments(inputs, quiet=as_json)) if sample else None
     if report is not None:
         beamfit.write_report(report, fit, posterior, command=command_line(), inputs=inputs)

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import click
 
 from beamfit.errors import InputError
+from beamfit.particles import REST_ENERGY
 from beamfit.studies.scan.assumptions import SCENARIOS
 from beamfit.studies.scan.typed import anchor_of, bounds_of, limits_of, priors_of
 
@@ -36,6 +37,11 @@ def _report(path: str) -> str:
     return path
 
 
+LATTICE = {
+    "metavar": "FILE",
+    "help": "Lattice: TOML, MAD-X (.madx, .seq), MAD-8 (.mad8) or elegant (.lte). The emittance of "
+    "rows that have their own r11_x, r12_x, ... needs none.",
+}
 SHARED: dict[str, Callable[..., Any]] = {
     "scan": click.argument("scan"),
     "ignore": click.option(
@@ -49,11 +55,12 @@ SHARED: dict[str, Callable[..., Any]] = {
         is_flag=True,
         help="Leave out rows of the scan with something wrong in them; they are counted and named.",
     ),
-    "lattice": click.option(
-        "--lattice",
-        required=True,
-        metavar="FILE",
-        help="Lattice: TOML, MAD-X (.madx, .seq), MAD-8 (.mad8) or elegant (.lte).",
+    "lattice": click.option("--lattice", required=True, **LATTICE),
+    "maybe-lattice": click.option("--lattice", **LATTICE),
+    "particle": click.option(
+        "--particle",
+        type=click.Choice(list(REST_ENERGY)),
+        help="Of a scan without a lattice; electrons unless said.",
     ),
     "use": click.option(
         "--use", metavar="NAME", help="Line or sequence of a lattice with several."
@@ -62,7 +69,8 @@ SHARED: dict[str, Callable[..., Any]] = {
         "--energy",
         type=float,
         metavar="MEV",
-        help="Total energy, instead of the lattice's own; elegant files have none.",
+        help="Total energy, instead of the lattice's own; elegant files and scans without a "
+        "lattice have none.",
     ),
     "scenario": click.option(
         "--scenario",

@@ -8,12 +8,16 @@ from typing import TYPE_CHECKING
 
 from beamfit.errors import InputError
 from beamfit.io.lattice import LatticeFile, element_of, read_toml_lattice
+from beamfit.particles import REST_ENERGY, expected_energy
+from beamfit.studies.scan.scans import QuadScan
 
 if TYPE_CHECKING:
     from beamfit.optics.beamline import Beamline
 
-__all__ = ["build_line", "load_lattice", "read_lattice"]
+__all__ = ["build_line", "lattice_of", "load_lattice", "read_lattice"]
 
+# What the place is called where matrices of rows begin.
+START = "start"
 FOREIGN = {".madx", ".seq", ".mad8", ".mad", ".lte", ".ele", ".elegant"}
 
 
@@ -78,6 +82,75 @@ def read_lattice(
                 f"--{option} for a TOML lattice", f"none: the file has {instead}", path=path
             )
     return read_toml_lattice(path)
+
+
+def lattice_of(
+    scan: QuadScan,
+    path: str | None = None,
+    *,
+    use: str | None = None,
+    energy: float | None = None,
+    particle: str | None = None,
+) -> LatticeFile:
+    """Read the lattice of a scan, or make that of rows which have matrices of their own.
+
+    Parameters
+    ----------
+    scan : QuadScan
+        The scan.
+    path : str, optional
+        The lattice file; None where the rows have matrices.
+    use, energy
+        As for `load_lattice`; the energy in MeV also of rows without a lattice.
+    particle : str, optional
+        Of rows without a lattice, electrons if None.
+
+    Returns
+    -------
+    LatticeFile
+        Checked to have what the scan names.
+
+    Raises
+    ------
+    InputError
+        As `read_lattice` and `LatticeFile.check_scan`; if both or neither of matrices and lattice
+        are given, or rows without a lattice have no energy.
+    """
+    if scan.transfer is None:
+        if path is None:
+            expected = "--lattice FILE, or columns r11_x, r12_x, ... of every row"
+            raise scan.unusable("a scan and no lattice", expected)
+        if particle is not None:
+            raise InputError("--particle with a lattice", "none: the lattice says it", path=path)
+        file = read_lattice(path, use=use, energy=energy)
+        file.check_scan(scan)
+        return file
+    if path is not None or use is not None:
+        found = "rows with matrices of their own, and a lattice"
+        raise scan.unusable(found, "no --lattice, or no columns r11_x, r12_x, ...")
+    return _rows_lattice(scan, energy, particle or "electron")
+
+
+def _rows_lattice(scan: QuadScan, energy: float | None, particle: str) -> LatticeFile:
+    """The lattice of rows with matrices of their own: their screens, and where these begin."""
+    rest = REST_ENERGY[particle]
+    total = scan.of_particle(rest).energy
+    if energy is None and total is None:
+        raise scan.unusable("no beam energy", "a column energy_MeV, or --energy in MeV")
+    own = float(total.mean()) if energy is None else energy
+    if expected := expected_energy(own, particle):
+        raise scan.unusable(f"an energy of {own:g} MeV", expected, "energy")
+    names = [name for name in dict.fromkeys(scan.screen or ()) if name != START]
+    return LatticeFile(
+        path=scan.path or scan.name,
+        sha256=scan.sha256 or "",
+        name="matrices of the rows",
+        energy=own,
+        particle=particle,
+        energy_spread=0.0,
+        elements=tuple({"type": "screen", "name": name} for name in (*names, START)),
+        calibrations={},
+    )
 
 
 def build_line(file: LatticeFile) -> Beamline:

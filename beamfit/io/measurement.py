@@ -20,6 +20,8 @@ __all__ = ["average_shots", "read_quad_scan"]
 MOST_ROWS = 100_000
 # A size this many times the usual one of its column, and larger than most beams, has slipped.
 SLIPPED = 100.0
+# Of the matrix of a plane, where rows have their own.
+ELEMENTS = (11, 12, 16)
 # Rows left out that a note names one by one.
 MOST_NAMED = 5
 # Further quantities: from (open), to, and how to say it.
@@ -95,16 +97,23 @@ def _scan(
     energies = [(values[key], kind) for key, kind in ENERGIES.items() if key in values]
     energy, kind = energies[0] if energies else (None, "total")
     headers = {key: c.header for key, c in columns.items()}
+    planes = [p for p in "xy" if f"size_{p}" in values]
+    own = {
+        p: np.stack([values.get(f"r{i}_{p}", np.zeros(len(sheet))) for i in ELEMENTS], axis=-1)
+        for p in planes
+        if f"r11_{p}" in values
+    }
     return QuadScan(
         settings={name: values[c.key] for name, c in magnets.items()},
         units={name: c.unit for name, c in magnets.items()},
-        size={p: values[f"size_{p}"] for p in "xy" if f"size_{p}" in values},
-        error={p: values[f"size_{p}_error"] for p in "xy" if f"size_{p}_error" in values},
+        size={p: values[f"size_{p}"] for p in planes},
+        error={p: values[f"size_{p}_error"] for p in planes if f"size_{p}_error" in values},
         energy=energy,
         energy_kind=kind,
         resolution=values.get("resolution"),
         energy_spread=values.get("energy_spread"),
         screen=_screens(sheet, columns.get("screen")),
+        transfer=own or None,
         error_source="the file",
         name=Path(sheet.path).stem,
         path=sheet.path,
@@ -132,8 +141,9 @@ def _values(sheet: Sheet, columns: Mapping[str, Column]) -> dict[str, np.ndarray
                 raise sheet.error("an empty cell", expected, row, columns[error].header)
     values |= {key: _within(sheet, columns[key]) for key in RANGES if key in columns}
     _screens(sheet, columns.get("screen"))
-    settings = [c for c in columns.values() if c.unit in SETTINGS]
-    return values | {c.key: sheet.numbers(c.header) for c in settings}
+    elements = [f"r{i}_{p}" for i in ELEMENTS for p in "xy"]
+    plain = [c for key, c in columns.items() if c.unit in SETTINGS or key in elements]
+    return values | {c.key: sheet.numbers(c.header) for c in plain}
 
 
 def _left_out(sheet: Sheet) -> tuple[str, ...]:
@@ -261,7 +271,7 @@ def average_shots(scan: QuadScan, *, marked: bool) -> QuadScan:
     [0.00011, 0.00021, 0.00031]
     """
     rows: dict[tuple, int] = {}
-    keys = row_keys(scan.settings, scan.energy, scan.screen)
+    keys = row_keys(scan)
     group = np.array([rows.setdefault(key, len(rows)) for key in keys])
     if len(rows) == len(group) or (scan.error and not marked):
         return scan if scan.error else replace(scan, error_source="none given")
@@ -285,6 +295,7 @@ def average_shots(scan: QuadScan, *, marked: bool) -> QuadScan:
             for name in ("energy", "resolution", "energy_spread")
         },
         screen=None if scan.screen is None else tuple(scan.screen[i] for i in first),
+        transfer=scan.transfer and {p: r[first] for p, r in scan.transfer.items()},
         shots=np.bincount(group),
         error_source=said if scatter or given else "none given",
     )

@@ -21,12 +21,17 @@ QUANTITIES = {
     "shot": "",
     "screen": "",
 }
+# What tells rows apart besides settings of magnets.
+SEEN = {"screen", "r11_x", "r11_y"}
 SETTINGS = ("A", "kG", "T_per_m", "k1", "k1l")
 CARRIED = re.compile(r"note_.*|time|timestamp|charge_[np]C")
 # Words for a width, and how many of it are one rms: a Gaussian's FWHM is sqrt(8 ln 2) rms.
 FWHM = 1.0 / math.sqrt(8.0 * math.log(2.0))
 WIDTHS = {"size": 1.0, "sigma": 1.0, "sig": 1.0, "rms": 1.0, "fwhm": FWHM}
 ERRORS = {"error", "err", "std", "sd"}
+# Elements of the matrix from where the beam is asked for to the row's screen, m and 1.
+ELEMENT = re.compile(r"r(1[126])(?:_([xy]))?(?:_m)?|r(3[346])(?:_m)?", re.IGNORECASE)
+OF_Y = {"33": "11", "34": "12", "36": "16"}
 # A plane and a width written as one word, as in xrms and sigmax.
 ONE_WORD = re.compile(r"([xy])(size|sigma|sig|rms|fwhm)|(size|sigma|sig|rms|fwhm)([xy])")
 
@@ -61,14 +66,15 @@ def scan_columns(sheet: Sheet) -> dict[str, Column]:
     columns = columns_of(sheet, QUANTITIES, lambda header: _other(header, sheet))
     if not {"size_x", "size_y"} & set(columns):
         missing = "a beam size column, such as size_x_um"
-    elif not any(c.unit in SETTINGS for c in columns.values()):
-        missing = "a magnet setting column, such as Q2_A, Q2_kG or Q2_k1"
+    elif not (any(c.unit in SETTINGS for c in columns.values()) or SEEN & set(columns)):
+        missing = "a magnet setting column, such as Q2_A, Q2_kG or Q2_k1, or a column screen"
     else:
         missing = ""
     if missing:
         raise sheet.header_error("columns " + ", ".join(sheet.names), missing)
     for plane in "xy":
         _check_error(sheet, columns, plane)
+        _check_elements(sheet, columns, plane)
     given = [columns[e].header for e in ENERGIES if e in columns]
     if len(given) > 1:
         raise sheet.header_error("columns " + " and ".join(given), "one of them", given[1])
@@ -90,12 +96,24 @@ def _check_error(sheet: Sheet, columns: Mapping[str, Column], plane: str) -> Non
         raise sheet.header_error(found, "sizes and errors of one width", error.header)
 
 
+def _check_elements(sheet: Sheet, columns: Mapping[str, Column], plane: str) -> None:
+    """Check that a measured plane has both its matrix elements where the file has any."""
+    given = [key for key in columns if re.match(r"r1[126]_", key)]
+    for element in (f"r11_{plane}", f"r12_{plane}"):
+        if given and f"size_{plane}" in columns and element not in columns:
+            found = f"{columns[given[0]].header} and no {element}"
+            raise sheet.header_error(found, f"r11 and r12 of every plane that has sizes, {element}")
+
+
 def _other(header: str, sheet: Sheet) -> Column:
     """A size under another name, a magnet's setting, or a column that is carried along unread."""
     if CARRIED.fullmatch(header):
         return Column(header, header)
     if (column := _size(header)) is not None:
         return column
+    if (named := ELEMENT.fullmatch(header)) is not None:
+        of_x, plane, of_y = named.groups()
+        return Column(header, f"r{OF_Y[of_y]}_y" if of_y else f"r{of_x}_{plane or 'x'}")
     unit = next((u for u in SETTINGS if header.endswith(f"_{u}")), "")
     name = header.removesuffix(f"_{unit}") if unit else ""
     if name and not re.match(r"(size|sigma|rms|fwhm)_[xy](_|$)", name):

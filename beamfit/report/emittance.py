@@ -137,7 +137,7 @@ def draw_scan(figure: FigureBase, fit: EmittanceFit, plane: str) -> None:
     p = fit[plane]
     above, below = figure.subplots(2, 1, sharex=True, height_ratios=(3, 1))
     at, words = setting_axis(p)
-    one = _varied(p) if fit.statement.whole_map else []
+    one = _varied(p) if fit.statement.whole_map and not fit.scan.transfer else []
     if len(one) == 1:
         _curves(above, fit, p, one[0])
     else:  # known at the measured settings alone

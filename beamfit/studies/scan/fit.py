@@ -22,6 +22,7 @@ from beamfit.studies.scan.questions import questions
 from beamfit.studies.scan.results import Parameter, PlaneFit, parameter_rows, result_rows
 from beamfit.studies.scan.scans import QuadScan
 from beamfit.studies.scan.statement import Scenario, Seen
+from beamfit.studies.scan.transport import rows_line
 from beamfit.table import Table, html_of, json_of, labelled, text_of
 
 if TYPE_CHECKING:
@@ -34,7 +35,7 @@ __all__ = ["EmittanceFit", "fit_emittance", "scenario_of"]
 
 def fit_emittance(
     scan: QuadScan,
-    line: Beamline,
+    line: Beamline | None = None,
     *,
     planes: tuple[str, ...] | None = None,
     method: str = "size_squared",
@@ -54,8 +55,9 @@ def fit_emittance(
     ----------
     scan : QuadScan
         The measured sizes.
-    line : Beamline
-        The line, from where the beam matrix is wanted to the screens.
+    line : Beamline, optional
+        The line, from where the beam matrix is wanted to the screens. Rows with matrices of their
+        own have none; the beam is then that where the matrices begin.
     planes : tuple of str, optional
         ("x",), ("y",) or both; all planes of the scan if None.
     method : {"size_squared", "size"}
@@ -114,6 +116,8 @@ def fit_emittance(
         priors or {}, bounds or {}, anchor or Anchor(), hysteresis, hidden, starts, seed
     )
     told.check_scenario(scenario, robust)
+    line = rows_line(scan) if line is None else line
+    _check_own(scan, line, scenario)
     statement, scan = scenario_of(scenario), scan.of_particle(line.mass)
     seen = see(scan, line, planes, method, robust, at_once=statement.closed)
     if statement.closed:
@@ -129,6 +133,17 @@ def fit_emittance(
     identified = all(p.identifiability.determined for p in judged)
     left = statement.null_directions(seen, parameters, identified)
     return EmittanceFit(judged, scan, found, statement, told, seen, parameters, left, fit)
+
+
+def _check_own(scan: QuadScan, line: Beamline, scenario: str) -> None:
+    """Refuse to have the matrices of rows both given and unknown, or given twice."""
+    if scan.transfer is None:
+        return
+    if line.magnets or float(line.length) > 0.0:
+        raise scan.unusable("rows with matrices of their own and a line", "one of the two")
+    if scenario != "known":
+        expected = "scenario known, or settings and a lattice"
+        raise scan.unusable(f"scenario {scenario} for rows with matrices of their own", expected)
 
 
 def scenario_of(name: str) -> Scenario:

@@ -248,7 +248,7 @@ def next_measurement(seen: Seen, plane: str) -> str | None:
     work = seen.works[plane]
     e, p = work.evidence, work.points
     nothing_to_build_on = e.misfit > LOST or e.swamped or not e.full_rank
-    if nothing_to_build_on or not np.isfinite(work.covariance).all():
+    if seen.scan.transfer or nothing_to_build_on or not np.isfinite(work.covariance).all():
         return None
     covariance = work.covariance * work.scale**2
     start = work.fit.sigma if e.positive else best_symmetric(p)

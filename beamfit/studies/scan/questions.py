@@ -21,7 +21,7 @@ def gradients(scan: QuadScan, scanned: Beamline) -> dict[str, float]:
     """The largest gradient in T/m of each scanned quadrupole that has a length."""
     energy = float(scanned.energy) if scan.energy is None else scan.energy
     found = {}
-    for name, settings in scan.settings.items():
+    for name, settings in () if scan.transfer else scan.settings.items():
         magnet = scanned[name]
         if isinstance(magnet, Quadrupole):
             k1 = np.asarray(magnet.k1(settings, energy))

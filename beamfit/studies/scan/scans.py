@@ -19,6 +19,7 @@ __all__ = [
     "POSSIBLE",
     "USUAL",
     "PlaneRows",
+    "Profile",
     "QuadScan",
     "check_names",
     "first_unusable",
@@ -60,6 +61,20 @@ class PlaneRows(NamedTuple):
     energy_spread: np.ndarray | None
 
 
+class Profile(NamedTuple):
+    """A projection of the beam from which a size was taken, to be shown.
+
+    ``row`` is the row of the scan; position (m), counts and, where there is one, the curve that was
+    fitted to them have shape (n,).
+    """
+
+    plane: str
+    row: int
+    position: np.ndarray
+    counts: np.ndarray
+    curve: np.ndarray | None
+
+
 def first_unusable(values: np.ndarray, *, blank: bool = False) -> tuple[int, str] | None:
     """Find the first value that is not a positive finite number.
 
@@ -91,12 +106,13 @@ def first_unusable(values: np.ndarray, *, blank: bool = False) -> tuple[int, str
 
 @dataclass(frozen=True, eq=False)
 class QuadScan:
-    """Beam sizes against magnet settings, in one or both planes.
+    """Beam sizes against magnet settings or at several screens, in one or both planes.
 
     Parameters
     ----------
     settings : mapping of str to array
-        Magnet name to settings, each of shape (n,), in the unit ``units`` names.
+        Magnet name to settings, each of shape (n,), in the unit ``units`` names; empty where
+        nothing was scanned.
     units : mapping of str to str
         Magnet name to ``"A"``, ``"kG"`` (integrated gradient), ``"T_per_m"`` (gradient), ``"k1"``
         (1/m²) or ``"k1l"`` (1/m).
@@ -114,6 +130,11 @@ class QuadScan:
         Point-spread rms in m and relative momentum spread of each row.
     shots : array, optional
         How many shots each row is the mean of.
+    transfer : mapping of str to array, optional
+        Plane to R11, R12 (m) and, where there is dispersion, R16 (m) of each row, shape (n, 2) or
+        (n, 3): the rows' own matrices, which need no lattice. Settings then only label the rows.
+    profiles : tuple of Profile
+        What the sizes were taken from, to be shown.
     error_source : str
         Where the errors come from, in words, for the report.
     name, path, sha256 : str
@@ -148,6 +169,8 @@ class QuadScan:
     resolution: np.ndarray | None = None
     energy_spread: np.ndarray | None = None
     shots: np.ndarray | None = None
+    transfer: Mapping[str, np.ndarray] | None = None
+    profiles: tuple[Profile, ...] = ()
     error_source: str = "given"
     name: str = "scan"
     path: str | PathLike[str] | None = None
@@ -163,13 +186,15 @@ class QuadScan:
         for key in ("energy", "resolution", "energy_spread"):
             if getattr(self, key) is not None:
                 object.__setattr__(self, key, np.asarray(getattr(self, key), float))
+        if self.transfer is not None:
+            object.__setattr__(self, "transfer", self._whole_transfer(self.transfer))
         self._check_shapes()
         self._check_values()
         for plane in self.planes:
             self._check_three_settings(plane)
 
     def __len__(self) -> int:
-        return len(next(iter(self.settings.values())))
+        return len(next(iter(self.size.values())))
 
     @property
     def planes(self) -> tuple[str, ...]:
@@ -222,15 +247,28 @@ class QuadScan:
         return InputError(found, expected, path=self.path, column=column)
 
     def _check_shapes(self) -> None:
-        if not self.settings:
-            raise self.unusable("no magnet settings", "a column such as Q2_A, Q2_kG or Q2_k1")
+        if not self.settings and self.screen is None and self.transfer is None:
+            expected = "a column such as Q2_A, Q2_kG or Q2_k1, or several screens"
+            raise self.unusable("no magnet settings", expected)
         if not self.planes:
             raise self.unusable("no beam sizes", "a column such as size_x_um")
         lengths = {k: len(v) for k, v in self.settings.items()}
         lengths |= {f"size_{p}": len(v) for p, v in self.size.items()}
         lengths |= {f"size_{p}_error": len(v) for p, v in self.error.items()}
+        lengths |= {f"R in {p}": len(v) for p, v in (self.transfer or {}).items()}
         if len(set(lengths.values())) != 1:
             raise self.unusable(f"lengths {lengths}", "one length for all columns")
+
+    def _whole_transfer(self, given: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+        """R11, R12 and R16 of each row and plane, shape (n, 3)."""
+        found = {}
+        for plane in self.planes:
+            r = np.asarray(given.get(plane, ()), float)
+            if r.ndim != 2 or r.shape[1] not in (2, 3) or not np.isfinite(r).all():
+                expected = f"r11_{plane} and r12_{plane} (m) of every row, finite"
+                raise self.unusable(f"no matrix elements in plane {plane}", expected)
+            found[plane] = np.pad(r, ((0, 0), (0, 3 - r.shape[1])))
+        return found
 
     def _check_values(self) -> None:
         for name, values in self.settings.items():
@@ -252,24 +290,22 @@ class QuadScan:
                 )
 
     def _check_three_settings(self, plane: str) -> None:
-        rows = self.rows(plane)
-        keys = set(row_keys(rows.settings, rows.energy, rows.screen))
+        measured = ~np.isnan(self.size[plane])
+        keys = {key for key, one in zip(row_keys(self), measured, strict=True) if one}
         if len(keys) < 3:
+            distinct = "settings" if self.settings or self.transfer else "screens"
             raise self.unusable(
-                f"{len(keys)} distinct settings in plane {plane}",
+                f"{len(keys)} distinct {distinct} in plane {plane}",
                 "at least three: the beam matrix has three numbers",
             )
 
 
-def row_keys(
-    settings: Mapping[str, np.ndarray], energy: np.ndarray | None, screen: tuple[str, ...] | None
-) -> list[tuple]:
-    """What makes two rows the same measurement: all settings, the energy and the screen."""
-    n = len(next(iter(settings.values())))
-    columns = [list(v) for v in settings.values()]
-    columns.append([None] * n if energy is None else list(energy))
-    columns.append([None] * n if screen is None else list(screen))
-    return list(zip(*columns, strict=True))
+def row_keys(scan: QuadScan) -> list[tuple]:
+    """What makes rows the same measurement: all settings, the energy, screen and own matrices."""
+    columns = [list(v) for v in scan.settings.values()]
+    columns += [list(v) for v in (scan.energy, scan.screen) if v is not None]
+    columns += [list(map(tuple, v)) for v in (scan.transfer or {}).values()]
+    return list(zip(*columns, strict=True)) if columns else [()] * len(scan)
 
 
 def check_names(
@@ -305,7 +341,7 @@ def check_names(
     >>> scan = QuadScan({"Q": [0.0, 1.0, 2.0]}, {"Q": "A"}, {"x": [2e-4, 1e-4, 3e-4]})
     >>> check_names(scan, {"Q": "A"}, ["OTR"], "OTR")
     """
-    for name, unit in scan.units.items():
+    for name, unit in () if scan.transfer else scan.units.items():
         if name not in calibrations:
             raise scan.unusable(
                 f"no magnet '{name}' in the lattice", nearest(name, list(calibrations)), name

@@ -150,7 +150,9 @@ class Scenario:
 
 
 def varied_magnets(scan: QuadScan) -> tuple[str, ...]:
-    """Magnets whose setting changes during a scan."""
+    """Magnets whose setting changes during a scan; of rows with matrices of their own none."""
+    if scan.transfer:
+        return ()
     return tuple(n for n, v in scan.settings.items() if np.ptp(v) > 0)
 
 

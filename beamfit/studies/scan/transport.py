@@ -24,6 +24,7 @@ from beamfit.optics.calibration import (
     IntegratedStrength,
 )
 from beamfit.optics.elements import Marker, Screen, ThinLens, TransferMatrix
+from beamfit.optics.particle import ELECTRON_MASS
 from beamfit.optics.sections import Series
 from beamfit.studies.scan.model import line_of
 from beamfit.studies.scan.scans import QuadScan
@@ -37,6 +38,7 @@ __all__ = [
     "own_settings",
     "own_units",
     "padded",
+    "rows_line",
     "scan_rows",
     "scanned_line",
     "seen_line",
@@ -72,6 +74,8 @@ def scanned_line(scan: QuadScan, line: Beamline) -> Beamline:
     >>> magnet.calibration.unit, round(float(magnet.k1(energy=100.0)), 9)
     ('kG', 3.0)
     """
+    if scan.transfer:
+        return line
     for name, unit in scan.units.items():
         if isinstance(line[name], ThinLens) and unit in ("k1", "T_per_m"):
             raise scan.unusable(
@@ -102,6 +106,51 @@ def _with_meanings(same: _Same, units: tuple[tuple[str, str], ...]) -> Beamline:
     return line
 
 
+def rows_line(
+    scan: QuadScan, energy: float | None = None, mass: float = ELECTRON_MASS, start: str = "start"
+) -> Beamline:
+    """The line of rows that have matrices of their own: where these begin, and nothing else.
+
+    Parameters
+    ----------
+    scan : QuadScan
+        With ``transfer``.
+    energy : float, optional
+        Total energy in MeV; the mean of the rows' if None.
+    mass : float
+        Rest energy in MeV.
+    start : str
+        What to call the place where the matrices begin.
+
+    Returns
+    -------
+    Beamline
+        The rows' screens and the start, all in one place.
+
+    Raises
+    ------
+    InputError
+        If the rows have no matrices, or there is no energy.
+
+    Examples
+    --------
+    >>> rows = [[1.0, 0.0], [1.0, 1.0], [1.0, 2.0]]
+    >>> scan = QuadScan({}, {}, {"x": [1e-4, 2e-4, 3e-4]}, transfer={"x": rows})
+    >>> rows_line(scan, energy=100.0).screens
+    ('start',)
+    """
+    if scan.transfer is None:
+        expected = "a lattice, or columns r11_x, r12_x, ... of every row"
+        raise scan.unusable("a scan without a line", expected)
+    scan = scan.of_particle(mass)
+    if energy is None and scan.energy is None:
+        expected = "a column energy_MeV, --energy, or a line of that energy"
+        raise scan.unusable("no beam energy", expected)
+    names = [name for name in dict.fromkeys(scan.screen or ()) if name != start]
+    own = float(np.mean(scan.energy)) if energy is None else energy
+    return Beamline(tuple(Screen(n) for n in (*names, start)), own, "rows", mass)
+
+
 @tree.node("plane", "places", "squared")
 class Rows:
     """Rows of a scan seen through a line: what predicts their sizes besides the model.
@@ -120,6 +169,8 @@ class Rows:
         Magnet name to settings, shape (n,), or (n, 2) with the branch.
     energy, which, spread, resolution : Array
         MeV, index into places, relative momentum spread and point-spread rms in m, shape (n,).
+    given : Array or None
+        Shape (2, n, 3): R11, R12 and R16 of both planes where the rows have them from elsewhere.
     """
 
     plane: str
@@ -131,16 +182,22 @@ class Rows:
     which: Any
     spread: Any
     resolution: Any
+    given: Any = None
 
     def elements(self, model: Mapping[str, Any]) -> tuple[Array, Array, Array]:
         """R11, R12 and known size² (m²) of every row, shape (n,) each, through the model's line."""
+        if self.given is not None:
+            return self.known(self.given["xy".index(self.plane)])
         line = line_of(model, self.line)
         every = transfer_rows(line, self.settings, self.energy, self.places).planes
         return self.seen(every[:, "xy".index(self.plane)])
 
     def seen(self, matrices: Array) -> tuple[Array, Array, Array]:
         """R11, R12 and known size² from one plane's matrices, shape (n, places, 3, 3)."""
-        r = matrices[jnp.arange(len(self.energy)), self.which, 0]
+        return self.known(matrices[jnp.arange(len(self.energy)), self.which, 0])
+
+    def known(self, r: Array) -> tuple[Array, Array, Array]:
+        """R11, R12 and known size² from R11, R12 and R16, shape (n, 3)."""
         return r[:, 0], r[:, 1], (r[:, 2] * self.spread) ** 2 + self.resolution**2
 
 
@@ -203,11 +260,13 @@ def scan_rows(
     Rows
         Places in the order of the line. All of the line that nothing changes is multiplied out.
     """
-    n = len(scan)
+    n, own = len(scan), scan.transfer
     named = scan.screen or (scanned.screens[-1],) * n
     order = {e.name: i for i, e in enumerate(scanned.elements)}
-    places = tuple(sorted(set(named), key=order.__getitem__))
-    own = [float(getattr(scanned[s], "resolution", 0.0)) for s in places]
+    # Rows with matrices of their own: the beam is asked for where those begin, the last place.
+    seen = {*named, scanned.screens[-1]} if own else set(named)
+    places = tuple(sorted(seen, key=order.__getitem__))
+    resolution = [float(getattr(scanned[s], "resolution", 0.0)) for s in places]
     which = np.array([places.index(s) for s in named])
 
     def column(values: Any, default: float) -> np.ndarray:
@@ -216,16 +275,19 @@ def scan_rows(
     energy = column(scan.energy, scanned.energy)
     ends = (*places, scanned.design.at) if scanned.design else places
     every = np.append(energy, scanned.energy)
+    settings = {} if own else scan.settings
     return Rows(
         "x",
         places,
         squared,
-        seen_line(scanned, (*scan.settings, *keep), every, ends),
-        {name: padded(v) for name, v in scan.settings.items()},
+        seen_line(scanned, (*settings, *keep), every, ends),
+        {name: padded(v) for name, v in settings.items()},
         energy,
         padded(which),
         column(scan.energy_spread, scanned.energy_spread),
-        padded(np.array(own)[which] if scan.resolution is None else scan.resolution),
+        padded(np.array(resolution)[which] if scan.resolution is None else scan.resolution),
+        # A plane that was not measured has no rows, whatever stands there.
+        np.stack([padded(own.get(p, next(iter(own.values())))) for p in "xy"]) if own else None,
     )
 
 
@@ -258,7 +320,10 @@ def look_through(rows: Rows) -> Look:
     settings = {n: jnp.append(v, line[n].setting) for n, v in rows.settings.items()}
     energy = jnp.append(rows.energy, line.energy)
     every = transfer_rows(line, settings, energy, places).planes
-    seen = [rows.seen(every[:-1, plane]) for plane in (0, 1)]
+    if rows.given is None:
+        seen = [rows.seen(every[:-1, plane]) for plane in (0, 1)]
+    else:
+        seen = [rows.known(r) for r in rows.given]
     own = every[-1]
     at = places.index(line.design.at) if line.design else 0
     return Look(
