@@ -38,8 +38,8 @@ class Quantity:
     --------
     >>> print(Quantity(0.70468e-6, 0.0156e-6, "m"))
     0.705 ± 0.016 µm
-    >>> Quantity(1.0, 0.5, "1").interval_95
-    (0.02, 1.98)
+    >>> Quantity(0.0, 1.0, "1").interval_95
+    (-1.96, 1.96)
     >>> print(Quantity(4.1e-8, None, "m"))
     41 nm (not determined)
     """

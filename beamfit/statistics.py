@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
-from scipy.special import chdtrc, ndtr, stdtr
+from scipy.special import chdtrc, fdtrc, ndtr, stdtr
 
 __all__ = [
     "POOR_FIT",
@@ -96,35 +97,47 @@ def _in_words(row: np.ndarray, names: list[str]) -> str:
     return words.removeprefix(" + ").strip() if not words.startswith(" - ") else words.strip()
 
 
-def chi2_probability(chi2: float, dof: int) -> float | None:
+def chi2_probability(chi2: float, dof: float, error_dof: float = math.inf) -> float | None:
     """Probability of a χ² at least this large if the errors are right; None without freedom.
+
+    Parameters
+    ----------
+    chi2, dof : float
+        χ² and its degrees of freedom.
+    error_dof : float
+        Degrees of freedom that the errors themselves were taken from: χ²/dof is then distributed
+        as Fisher's F.
 
     Examples
     --------
-    >>> round(chi2_probability(18.3, 2), 7)
-    0.0001062
+    >>> round(chi2_probability(18.3, 2), 7), round(chi2_probability(18.3, 2, 20), 7)
+    (0.0001062, 0.0015077)
     """
-    return float(chdtrc(dof, chi2)) if dof > 0 else None
+    if not dof > 0:
+        return None
+    if math.isinf(error_dof):
+        return float(chdtrc(dof, chi2))
+    return float(fdtrc(dof, error_dof, chi2 / dof))
 
 
-def one_sided_probability(deviations: float, dof: int | None) -> float:
+def one_sided_probability(deviations: float, dof: float) -> float:
     """Chance that noise alone lifts a quantity this many standard errors above zero.
 
     Parameters
     ----------
     deviations : float
         Value over its standard error.
-    dof : int or None
-        Degrees of freedom from which the error was taken, for Student's distribution; None
+    dof : float
+        Degrees of freedom from which the error was taken, for Student's distribution; infinite
         where the errors were known beforehand, for the normal one.
 
     Examples
     --------
-    >>> round(one_sided_probability(3.0, None), 5)
+    >>> round(one_sided_probability(3.0, math.inf), 5)
     0.00135
     >>> round(one_sided_probability(3.0, 2), 3)
     0.048
     """
-    if dof is None:
+    if math.isinf(dof):
         return float(ndtr(-deviations))
     return float(stdtr(dof, -deviations)) if dof > 0 else 1.0

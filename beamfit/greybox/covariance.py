@@ -41,7 +41,7 @@ class Group(NamedTuple):
 
     `rows` are its rows among the residuals, `count` those of a weight above zero, `dof` is `count`
     less the trace of the hat matrix over them. `scale` is sqrt(chi2/dof), at least 1 where errors
-    were given, NaN without a degree of freedom.
+    were given, NaN without a degree of freedom; a guess at the noise adds its own to both.
     """
 
     name: str
@@ -214,7 +214,7 @@ def spread_of(
 
 
 def groups_of(
-    names: Sequence[tuple[str, bool]],
+    named: Sequence[tuple[str, bool, tuple[float, float]]],
     residuals: Sequence[np.ndarray],
     counts: Sequence[int],
     blocks: Sequence[np.ndarray],
@@ -224,8 +224,9 @@ def groups_of(
 
     Parameters
     ----------
-    names : sequence of (str, bool)
-        Of each record, and whether its errors were given.
+    named : sequence of (str, bool, (float, float))
+        Name of each record, whether its errors were given, and degrees of freedom and sum of
+        squares of a guess at its noise.
     residuals : sequence of ndarray
         In units of their errors, zero where the weight is.
     counts : sequence of int
@@ -239,12 +240,20 @@ def groups_of(
     Returns
     -------
     tuple of Group
+
+    Notes
+    -----
+    A guess s0 worth ν0 degrees of freedom makes the variance (ν0 s0² + χ²)/(ν0 + dof): a scaled
+    inverse χ² prior, A. Gelman et al., Bayesian Data Analysis (3rd ed., 2013), section 2.6.
     """
     found, first = [], 0
-    for (name, given), r, count, block in zip(names, residuals, counts, blocks, strict=True):
+    for (name, given, before), r, count, block in zip(
+        named, residuals, counts, blocks, strict=True
+    ):
         chi2 = float(r @ r)
         dof = round(count - float(np.sum((block @ half) ** 2)), 9)
-        scale = math.sqrt(chi2 / dof) if dof > 0 else math.nan
+        freedom, squares = before
+        scale = math.sqrt((squares + chi2) / (freedom + dof)) if dof > 0 else math.nan
         rows = slice(first, first := first + len(r))
         found.append(
             Group(name, rows, given, chi2, count, dof, max(1.0, scale) if given else scale)

@@ -376,7 +376,7 @@ def _groups(
         kind = noise or ("inferred" if scale > 1 or not given else "known")
         if trusted or (given and not scale > 0):
             kind = "known"
-        groups.append(Group(label, kind, outliers and not trusted))
+        groups.append(Group(label, kind, outliers and not trusted, record.prior_noise))
     return tuple(groups) or (Group("", noise or "known", outliers),)
 
 

@@ -210,7 +210,7 @@ class Problem:
     @property
     def errors_known(self) -> bool:
         """Whether any record brings measurement errors."""
-        return any(record.error is not None for record in self.records)
+        return any(record.errors_given for record in self.records)
 
     @cached_property
     def size(self) -> int:

@@ -39,7 +39,7 @@ class Free(NamedTuple):
     nuisance: bool = False
 
 
-@tree.node("name", "predict")
+@tree.node("name", "predict", "worth")
 class Record:
     """Measured data and the function that predicts them.
 
@@ -61,6 +61,11 @@ class Record:
         Weight of the record's chi-square among several objectives, or of each value. Values of
         weight 0 are padding and count nowhere, so that records of a few lengths
         (`beamfit.greybox.problem.padded_length`) share compiled code.
+    worth : float
+        Degrees of freedom that `error` is worth: infinite where it is known; a few where it rests
+        on a guess, which the residuals correct.
+    guess : float
+        That guess in units of `error`.
 
     Raises
     ------
@@ -74,6 +79,8 @@ class Record:
     measured: Any
     error: Any = None
     weight: Any = 1.0
+    worth: float = np.inf
+    guess: Any = 1.0
 
     def __post_init__(self):
         measured = np.asarray(self.measured, float)
@@ -101,6 +108,18 @@ class Record:
         scale = 1.0 if self.error is None else self.error
         difference = (self.predict(model, self.data) - self.measured) / scale
         return jnp.ravel(jnp.where(self.weight > 0, jnp.sqrt(self.weight) * difference, 0.0))
+
+    @property
+    def errors_given(self) -> bool:
+        """Whether its errors are known, so that residuals can speak against the model."""
+        return self.error is not None and np.isinf(self.worth)
+
+    @property
+    def prior_noise(self) -> tuple[float, float]:
+        """The guess at errors that are not known: degrees of freedom and its sum of squares."""
+        if self.error is None or self.errors_given:
+            return 0.0, 0.0
+        return self.worth, self.worth * float(self.guess) ** 2
 
     @property
     def used(self) -> np.ndarray:

@@ -104,7 +104,7 @@ def known(p: Problem, s: State) -> Known:
     blocks = [triangle(part) for part in np.split(s.at.residual_jacobian, ends)]
     half, unseen, _ = directions(np.vstack(blocks), np.vstack([np.eye(len(held))[held], equations]))
     groups = groups_of(
-        [(record.name, record.error is not None) for record in p.records],
+        [(r.name, r.errors_given, r.prior_noise) for r in p.records],
         np.split(s.at.residual, ends)[:-1],
         [int(record.used.sum()) for record in p.records],
         blocks[:-1],

@@ -27,7 +27,7 @@ class Entry(NamedTuple):
 SCENARIOS = {
     "known": Entry("known", robust=True),
     "transport-network": Entry("transport_network", anchor=True, determinant=True),
-    "calibration": Entry("calibration", numbers=True),
+    "calibration": Entry("calibration", robust=True, numbers=True),
     "focusing-network": Entry("focusing_network", anchor=True, branches=True),
 }
 

@@ -16,7 +16,7 @@ from beamfit.quantity import Quantity
 from beamfit.status import Status
 from beamfit.studies.scan.assumptions import SCENARIOS, Anchor, Assumptions
 from beamfit.studies.scan.judged import judged_beam
-from beamfit.studies.scan.known import METHODS, see
+from beamfit.studies.scan.known import METHODS, WEIGHTS, see
 from beamfit.studies.scan.model import line_of
 from beamfit.studies.scan.questions import questions
 from beamfit.studies.scan.results import Parameter, PlaneFit, parameter_rows, result_rows
@@ -40,6 +40,7 @@ def fit_emittance(
     planes: tuple[str, ...] | None = None,
     method: str = "size_squared",
     robust: bool = False,
+    weights: str = "model",
     scenario: str = "known",
     priors: Mapping[str, tuple[float, float]] | None = None,
     bounds: Mapping[str, tuple[float, float]] | None = None,
@@ -64,6 +65,10 @@ def fit_emittance(
         The residual: the report's ``error_linear`` or ``error_nonlinear``.
     robust : bool
         Give each point a probability of being an outlier (with "size_squared").
+    weights : {"model", "measured"}
+        Whose size the errors of size² are taken at. That of the model has no part in the noise;
+        with the measured one, as older programs have it, the emittance comes out too small, by
+        3 to 7 times the square of the relative size error.
     scenario : {"known", "transport-network", "calibration", "focusing-network"}
         What is unknown besides the beam: nothing; R11 and R12; slope and offset of the scanned
         magnets' calibration; k1 as a function of the current. All planes are then fitted
@@ -110,6 +115,8 @@ def fit_emittance(
     """
     if method not in METHODS:
         raise InputError(f"method '{method}'", "size_squared or size")
+    if weights not in WEIGHTS:
+        raise InputError(f"weights '{weights}'", " or ".join(WEIGHTS))
     if robust and method != METHODS[0]:
         raise InputError("a robust fit of size", 'method "size_squared" with robust')
     told = Assumptions(
@@ -119,17 +126,17 @@ def fit_emittance(
     line = rows_line(scan) if line is None else line
     _check_own(scan, line, scenario)
     statement, scan = scenario_of(scenario), scan.of_particle(line.mass)
-    seen = see(scan, line, planes, method, robust, at_once=statement.closed)
+    seen = see(scan, line, planes, method, robust, weights, at_once=statement.closed)
     if statement.closed:
         return EmittanceFit(judged_beam(seen), scan, line, statement, told, seen)
 
-    from beamfit.studies.scan.unknowns import judged_scenario  # solvers only where they are needed
+    from beamfit.studies.scan.unknowns import judged_scenario, settled_fit  # loads the solvers
 
-    stated = statement.state(seen, told)
-    fit = _solved(stated, statement, told)
+    settled = settled_fit(seen, _solved(statement.state(seen, told), statement, told))
+    fit, seen, _ = settled
     parameters = tuple(statement.parameters(seen, told, fit))
     found = line_of(fit.model, seen.scanned)
-    judged = judged_scenario(seen, found, statement, told, fit, parameters)
+    judged = judged_scenario(settled, found, statement, told, parameters)
     identified = all(p.identifiability.determined for p in judged)
     left = statement.null_directions(seen, parameters, identified)
     return EmittanceFit(judged, scan, found, statement, told, seen, parameters, left, fit)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -13,15 +14,19 @@ from beamfit.statistics import scaled_directions
 from beamfit.status import Status
 from beamfit.studies.scan.known import next_measurement
 from beamfit.studies.scan.model import QUANTITIES, coefficients
+from beamfit.studies.scan.next_point import best_symmetric
+from beamfit.studies.scan.noise import reach_of
 from beamfit.studies.scan.results import Identifiability, PlaneFit, Points, ScreenTwiss
-from beamfit.studies.scan.statement import Seen
+from beamfit.studies.scan.statement import Seen, asked_of
 from beamfit.studies.scan.transport import own_settings, own_units
-from beamfit.studies.scan.verdict import BEAM_RULES, LOST, cause_of, judge, phase_coverage
+from beamfit.studies.scan.verdict import BEAM_RULES, LOST, judge, phase_coverage
 from beamfit.verdict import Finding
 
-__all__ = ["SIGMA", "Answer", "beside", "judged_beam", "plane_fit", "units_of"]
+__all__ = ["SIGMA", "Answer", "judged_beam", "plane_fit", "units_of"]
 
 SIGMA = slice(4, 7)
+# Draws for an upper limit, and how many of them must be beams.
+DRAWS, ENOUGH = 20_000, 100
 # What the three numbers of size² alone tell: σ, and the size at the screen.
 LINEAR = np.isin(list(QUANTITIES), ("sigma11", "sigma12", "sigma22", "screen_size"))
 
@@ -39,6 +44,8 @@ class Answer(NamedTuple):
     dof: int
     scale: float
     noise: str
+    rests_on: float
+    limits: tuple[float | None, float | None]
     distance: float
     points: Points
     jacobian: np.ndarray
@@ -47,14 +54,28 @@ class Answer(NamedTuple):
     advice: str | None = None
 
 
+def _quantity(value: float, error: float, raw: float, unit: str, reach: float) -> Quantity:
+    value, error = float(value), float(error)
+    if not math.isfinite(error):
+        return Quantity(value, None, unit)
+    interval = (value - reach * error, value + reach * error)
+    return Quantity(value, error, unit, float(raw), interval)
+
+
+def _limited(q: Quantity, limit: float | None) -> Quantity:
+    """A quantity that is not determined but cannot exceed a limit."""
+    if q.error is not None or limit is None:
+        return q
+    return replace(q, interval_95=(0.0, limit))
+
+
 def plane_fit(seen: Seen, line: Beamline, plane: str, a: Answer) -> PlaneFit:
     """The result of a plane: errors only for what the data determine."""
     numbers = [
-        Quantity(float(v), float(e), unit, float(r))
-        if math.isfinite(e)
-        else Quantity(float(v), None, unit)
-        for v, e, r, unit in zip(a.value, a.error, a.raw, QUANTITIES.values(), strict=True)
+        _quantity(*each, reach_of(a.rests_on))
+        for each in zip(a.value, a.error, a.raw, QUANTITIES.values(), strict=True)
     ]
+    numbers[:2] = [_limited(q, limit) for q, limit in zip(numbers[:2], a.limits, strict=True)]
     emittance, normalized, beta, alpha, s11, s12, s22, *screen, mismatch = numbers
     place, p, e = seen.rows.places[-1], a.points, seen.works[plane].evidence
     found = scaled_directions(a.jacobian, a.units, a.names)
@@ -93,24 +114,14 @@ def plane_fit(seen: Seen, line: Beamline, plane: str, a: Answer) -> PlaneFit:
     )
 
 
-def beside(seen: Seen) -> dict[str, bool]:
-    """Of each plane, whether another one is determined by itself and may vouch for it."""
-    clear = {plane: cause_of(w.evidence) is None for plane, w in seen.works.items()}
-    return {plane: any(c for p, c in clear.items() if p != plane) for plane in clear}
-
-
 def judged_beam(seen: Seen) -> tuple[PlaneFit, ...]:
     """Judge each plane of the closed form: nothing but the beam is unknown."""
-    vouching = beside(seen)
-    return tuple(
-        plane_fit(seen, seen.line, plane, _beam_answer(seen, plane, vouching[plane]))
-        for plane in seen.planes
-    )
+    return tuple(plane_fit(seen, seen.line, p, _beam_answer(seen, p)) for p in seen.planes)
 
 
-def _beam_answer(seen: Seen, plane: str, neighbour: bool) -> Answer:
+def _beam_answer(seen: Seen, plane: str) -> Answer:
     w = seen.works[plane]
-    evidence, p = w.evidence._replace(neighbour=neighbour), w.points
+    evidence, p = w.evidence, w.points
     finding, advice = judge(evidence, BEAM_RULES), None
     determined = finding.status is not Status.unidentified
     if not determined:
@@ -125,7 +136,7 @@ def _beam_answer(seen: Seen, plane: str, neighbour: bool) -> Answer:
     raw = np.where(shown, w.error, np.nan)
     sigma = w.fit.sigma
     with np.errstate(divide="ignore", invalid="ignore"):
-        scale = 2.0 * p.size * p.error * w.scale
+        scale = 2.0 * p.weighed * p.error * w.scale
         jacobian = np.stack(coefficients(p.r11, p.r12), -1) / scale[:, None]
     return Answer(
         finding=finding,
@@ -138,6 +149,8 @@ def _beam_answer(seen: Seen, plane: str, neighbour: bool) -> Answer:
         dof=e.dof,
         scale=w.scale,
         noise="inferred from the residuals",
+        rests_on=e.rests_on,
+        limits=(None, None) if determined else _limits(seen, plane),
         distance=e.distance,
         points=p,
         jacobian=jacobian,
@@ -145,6 +158,58 @@ def _beam_answer(seen: Seen, plane: str, neighbour: bool) -> Answer:
         names=list(QUANTITIES)[SIGMA],
         advice=advice,
     )
+
+
+def _limits(seen: Seen, plane: str) -> tuple[float | None, float | None]:
+    """Upper limits of the emittance and the normalised one, where the sizes follow some beam."""
+    w = seen.works[plane]
+    e = w.evidence
+    if not e.full_rank or e.misfit > LOST or e.swamped or (e.dof == 0 and not e.noise_known):
+        return None, None
+    start = w.fit.sigma if e.positive else best_symmetric(w.points)
+    limit = upper_limit(start, w.covariance * w.scale**2, e.rests_on)
+    return limit, None if limit is None else limit * float(asked_of(seen, plane).factor)
+
+
+def upper_limit(sigma: np.ndarray, covariance: np.ndarray, rests_on: float) -> float | None:
+    """What the emittance exceeds in 5 % of the posterior, flat over positive definite σ, m.
+
+    Parameters
+    ----------
+    sigma, covariance : ndarray
+        The best symmetric matrix, positive or not, and its covariance.
+    rests_on : float
+        Degrees of freedom of that covariance: of the t distribution that is drawn from.
+
+    Returns
+    -------
+    float or None
+        None where hardly any such beam is compatible with the sizes.
+
+    Examples
+    --------
+    >>> covariance = 1e-2 * np.eye(3)
+    >>> round(upper_limit(np.array([1.0, 0.0, 1.0]), covariance, math.inf), 2)
+    1.12
+    >>> upper_limit(np.array([1.0, 0.0, -1.0]), covariance, math.inf) is None
+    True
+    """
+    draws = np.random.default_rng(0)
+    norm = np.sqrt(np.diag(covariance))
+    if not (np.isfinite(norm).all() and np.all(norm > 0)):
+        return None
+    # Half the root of the matrix of correlations: the numbers differ by orders of magnitude.
+    values, vectors = np.linalg.eigh(covariance / np.outer(norm, norm))
+    root = vectors * np.sqrt(np.maximum(values, 0.0))
+    z = draws.standard_normal((DRAWS, 3))
+    if math.isfinite(rests_on):
+        z /= np.sqrt(draws.chisquare(rests_on, (DRAWS, 1)) / rests_on)
+    s11, s12, s22 = (sigma + (z @ root.T) * norm).T
+    determinant = s11 * s22 - s12**2
+    beams = determinant[(s11 > 0) & (determinant > 0)]
+    if len(beams) < ENOUGH:
+        return None
+    return float(np.sqrt(np.quantile(beams, 0.95)))
 
 
 def units_of(sigma: np.ndarray) -> list[float]:
@@ -158,11 +223,5 @@ def _outlier_words(p: Points) -> str:
     doubted = [] if probability is None else np.flatnonzero(probability > 0.5)
     if not len(doubted):
         return ""
-    places = [
-        ", ".join(f"{n} = {v[i]:.4g} {p.units[n]}" for n, v in p.settings.items()) for i in doubted
-    ]
-    return (
-        f" {len(doubted)} of {len(probability)} points more likely outliers than not: "
-        + "; ".join(places)
-        + "."
-    )
+    places = "; ".join(p.where(i) for i in doubted)
+    return f" {len(doubted)} of {len(probability)} points more likely outliers than not: {places}."

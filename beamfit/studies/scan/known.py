@@ -12,7 +12,9 @@ import numpy as np
 from beamfit.greybox.problem import Problem
 from beamfit.optics.beamline import Beamline
 from beamfit.optics.calibration import SETTING_UNITS
+from beamfit.statistics import chi2_probability
 from beamfit.studies.scan.assumptions import Assumptions
+from beamfit.studies.scan.influence import Influence, influence_of
 from beamfit.studies.scan.model import coefficients, size_squared
 from beamfit.studies.scan.next_point import (
     best_candidate,
@@ -20,6 +22,7 @@ from beamfit.studies.scan.next_point import (
     candidate_settings,
     plausible_sigma,
 )
+from beamfit.studies.scan.noise import Noise, noise_of
 from beamfit.studies.scan.questions import check_gradients
 from beamfit.studies.scan.results import Points
 from beamfit.studies.scan.robust import RobustFit, fit_robust
@@ -45,11 +48,13 @@ from beamfit.studies.scan.transport import (
 )
 from beamfit.studies.scan.verdict import LOST, Evidence, waist_bracketed
 
-__all__ = ["METHODS", "SCENARIO", "next_measurement", "pulls", "see", "works_of"]
+__all__ = ["METHODS", "SCENARIO", "WEIGHTS", "next_measurement", "pulls", "see", "works_of"]
 
 
 # The residual: the report's ``error_linear`` or ``error_nonlinear``.
 METHODS = ("size_squared", "size")
+# Whose size errors are taken at.
+WEIGHTS = ("model", "measured")
 
 
 def see(
@@ -58,13 +63,14 @@ def see(
     planes: tuple[str, ...] | None = None,
     method: str = "size_squared",
     robust: bool = False,
+    weights: str = "model",
     at_once: bool = False,
 ) -> Seen:
     """Look at a scan through its line, and fit it with the line as it is.
 
     Parameters
     ----------
-    scan, line, planes, method, robust
+    scan, line, planes, method, robust, weights
         As for `beamfit.fit_emittance`.
     at_once : bool
         Whether the fit is all that is wanted: it is then one compiled call with the look, where a
@@ -88,38 +94,30 @@ def see(
     rows = scan_rows(scan, scanned, method == METHODS[0])
     # A plane that is not asked for still testifies to the settings and the optics.
     planes = tuple(dict.fromkeys((*asked, *scan.planes)))
-    seen = Seen(scan, line, scanned, asked, method, robust, rows, None, {})
+    noises = {plane: noise_of(scan, plane) for plane in planes}
+    seen = Seen(scan, line, scanned, asked, method, robust, weights, rows, noises, None, {})
     if robust or not at_once:
         look = jax.tree.map(np.asarray, look_through(rows))
         return seen._replace(look=look, works=works_of(seen, look, planes))
-    sizes = _sizes(seen, {plane: _stated(seen, plane) for plane in planes})
-    look, found = jax.tree.map(np.asarray, _look_and_fit(rows, sizes, method))
+    sizes = _sizes(seen, {plane: noises[plane].error for plane in planes})
+    look, found = jax.tree.map(np.asarray, _look_and_fit(rows, sizes, method, weights))
     works = {p: _work(seen, p, look, found, i) for i, p in enumerate(planes)}
     return seen._replace(look=look, works=works)
 
 
 def works_of(seen: Seen, look: Look, planes: tuple[str, ...]) -> dict[str, Work]:
-    """Fit planes in closed form, given what is seen of them.
-
-    Where the file has no errors, every size is taken to have the same relative error, the
-    one that makes χ² equal to its degrees of freedom.
-    """
+    """Fit planes in closed form, given what is seen of them."""
     doubts = {plane: _doubt(seen, look, plane) if seen.robust else None for plane in planes}
-    errors = {p: _stated(seen, p) if d is None else d.error for p, d in doubts.items()}
-    found = jax.tree.map(np.asarray, _fit(look, _sizes(seen, errors), seen.method))
+    errors = {p: seen.noises[p].error if d is None else d.error for p, d in doubts.items()}
+    sizes = _sizes(seen, errors)
+    found = jax.tree.map(np.asarray, _fit(look, sizes, seen.method, seen.weights))
     return {p: _work(seen, p, look, found, i, doubts[p]) for i, p in enumerate(planes)}
-
-
-def _stated(seen: Seen, plane: str) -> np.ndarray:
-    """Errors of the file, or errors in proportion to the sizes, up to a factor."""
-    return seen.scan.error.get(plane, seen.scan.size[plane])[seen.measured(plane)]
 
 
 def _doubt(seen: Seen, look: Look, plane: str) -> RobustFit:
     at, i = seen.measured(plane), "xy".index(plane)
     r11, r12, known = (part[i, at] for part in look[:3])
-    size, given = seen.scan.size[plane][at], plane in seen.scan.error
-    return fit_robust(r11, r12, size, _stated(seen, plane), known, given)
+    return fit_robust(r11, r12, seen.scan.size[plane][at], seen.noises[plane], known, seen.weights)
 
 
 class _Sizes(NamedTuple):
@@ -128,6 +126,7 @@ class _Sizes(NamedTuple):
     which: np.ndarray
     size: np.ndarray
     error: np.ndarray
+    relative: np.ndarray
     factor: np.ndarray
     design: np.ndarray
 
@@ -135,45 +134,50 @@ class _Sizes(NamedTuple):
 def _sizes(seen: Seen, errors: dict[str, np.ndarray]) -> _Sizes:
     shape = (2, len(seen.rows.energy))
     found = _Sizes(
-        np.zeros(2, int), np.full(shape, 1e-4), np.full(shape, np.inf), np.ones(2), np.ones((2, 2))
+        np.zeros(2, int),
+        np.full(shape, 1e-4),
+        np.full(shape, np.inf),
+        np.zeros(2),
+        np.ones(2),
+        np.ones((2, 2)),
     )
     for i, (plane, error) in enumerate(errors.items()):
         own, at, asked = slice(i, None), seen.measured(plane), asked_of(seen, plane)
         found.which[own] = "xy".index(plane)
         found.size[own, at], found.error[own, at] = seen.scan.size[plane][at], error
         found.error[own, len(seen.scan) :] = np.inf
+        found.relative[own] = seen.noises[plane].relative
         found.factor[own], found.design[own] = asked.factor, asked.design
     return found
 
 
-@partial(jax.jit, static_argnames="method")
-def _fit(look: Look, sizes: _Sizes, method: str) -> ClosedForm:
+@partial(jax.jit, static_argnames=("method", "weights"))
+def _fit(look: Look, sizes: _Sizes, method: str, weights: str) -> ClosedForm:
     r11, r12, known, *places = (part[sizes.which] for part in look)
-    rows = SizeData(r11, r12, known, sizes.size, sizes.error)
-    return closed_form(rows, sizes.factor, *places, sizes.design, method)
+    rows = SizeData(r11, r12, known, sizes.size, sizes.error, sizes.relative)
+    return closed_form(rows, sizes.factor, *places, sizes.design, method, weights)
 
 
-@partial(jax.jit, static_argnames="method")
-def _look_and_fit(rows: Rows, sizes: _Sizes, method: str) -> tuple[Look, ClosedForm]:
+@partial(jax.jit, static_argnames=("method", "weights"))
+def _look_and_fit(rows: Rows, sizes: _Sizes, method: str, weights: str) -> tuple[Look, ClosedForm]:
     look = look_through(rows)
-    return look, _fit(look, sizes, method)
+    return look, _fit(look, sizes, method, weights)
 
 
 def _work(
     seen: Seen, plane: str, look: Look, found: ClosedForm, i: int, doubt: RobustFit | None = None
 ) -> Work:
-    scan, at = seen.scan, seen.measured(plane)
+    scan, at, noise = seen.scan, seen.measured(plane), seen.noises[plane]
     fit = SigmaFit(*(part[i] for part in found.fit))
     probability = None if doubt is None else doubt.outlier_probability
     lost = 0 if doubt is None else int(np.sum(probability > 0.5))
-    size, error = scan.size[plane][at], _stated(seen, plane) if doubt is None else doubt.error
+    size = scan.size[plane][at]
     r11, r12, known = (part["xy".index(plane), at] for part in look[:3])
-    noise_known = plane in seen.scan.error
     dof = max(len(size) - lost - 3, 0)
-    unit = 1.0
-    if not noise_known:
-        unit = math.sqrt(float(fit.chi2) / dof) if dof > 0 else math.nan
-    chi2 = float(fit.chi2) if noise_known else float(dof)
+    unit, chi2 = 1.0, float(fit.chi2)
+    if not noise.known:
+        unit = math.sqrt((noise.dof + chi2) / (noise.dof + dof))
+        chi2 = float(dof)
     scale = math.sqrt(max(1.0, chi2 / dof)) if dof > 0 else 1.0
     model = np.sqrt(np.maximum(size_squared(fit.sigma, r11, r12, known), 0.0))
     points = Points(
@@ -181,66 +185,84 @@ def _work(
         units={name: SETTING_UNITS[scan.units[name]] for name in scan.settings},
         screen=tuple(seen.rows.places[j] for j in seen.rows.which[at]),
         size=size,
-        error=error * unit,
+        error=fit.error[at] * unit,
+        weighed=fit.weighed[at],
         model=model,
-        pull=pulls(size, model, error * unit, seen.rows.squared),
+        pull=np.zeros(len(at)),
         outlier_probability=probability,
         r11=r11,
         r12=r12,
         known=known,
     )
+    points = points._replace(pull=pulls(points, seen.rows.squared))
+    covariance = fit.covariance * unit**2
     return Work(
         points=points,
         fit=fit,
         value=found.value[i],
         error=found.error[i] * unit,
-        covariance=fit.covariance * unit**2,
+        covariance=covariance,
         scale=scale,
-        evidence=_evidence(fit, points, chi2, dof, noise_known, scale * unit),
+        evidence=_evidence(fit, points, chi2, dof, noise, scale, unit),
     )
 
 
-def pulls(size: np.ndarray, model: np.ndarray, error: np.ndarray, squared: bool) -> np.ndarray:
+def pulls(p: Points, squared: bool) -> np.ndarray:
     """Residual of the quantity that was fitted, over its error."""
-    return (size**2 - model**2) / (2.0 * size * error) if squared else (size - model) / error
+    if squared:
+        return (p.size**2 - p.model**2) / (2.0 * p.weighed * p.error)
+    return (p.size - p.model) / p.error
 
 
 def _evidence(
-    fit: SigmaFit, points: Points, chi2: float, dof: int, noise_known: bool, unit: float
+    fit: SigmaFit, p: Points, chi2: float, dof: int, noise: Noise, scale: float, unit: float
 ) -> Evidence:
-    """Gather what the verdict rests on; ``unit`` is the factor on the fit's own errors."""
+    """Gather what the verdict rests on; ``scale * unit`` is the factor on the fit's own errors."""
+    factor, doubt = scale * unit, p.outlier_probability
     with np.errstate(invalid="ignore", divide="ignore"):
-        determinant = float(fit.determinant / fit.determinant_error / unit)
-        zero = math.sqrt(max(float(fit.chi2_zero - fit.chi2), 0.0)) / unit if unit else math.inf
-    doubt = points.outlier_probability
+        determinant = float(fit.determinant / fit.determinant_error / factor)
+        zero = math.sqrt(max(float(fit.chi2_zero - fit.chi2), 0.0)) / factor
+        error = 0.5 * factor * float(fit.determinant_error / np.sqrt(fit.determinant))
     weight = 1.0 if doubt is None else 1.0 - doubt
-    relative = (points.model - points.size) / points.size
+    relative = (p.model - p.size) / p.size
+    alone = doubt is None and dof > 1 and bool(fit.positive)
+    one = _one_magnet(p)
     return Evidence(
         full_rank=bool(fit.full_rank),
         positive=bool(fit.positive),
         converged=bool(fit.converged),
         chi2=chi2,
         dof=dof,
-        noise_known=noise_known,
+        noise_known=noise.known,
+        probability=noise.probability(chi2, dof),
+        # A robust fit's noise rests on its own judgement.
+        rests_on=noise.rests_on(chi2, dof) if doubt is None or not noise.known else float(dof),
         determinant_distance=0.0 if math.isnan(determinant) else determinant,
         zero_distance=0.0 if math.isnan(zero) else zero,
         misfit=float(np.sqrt(np.sum(weight * relative**2) / max(dof, 1))),
-        bracketed=waist_bracketed(
-            points.settings, points.screen, points.size, np.nan_to_num(points.error)
-        ),
-        smallest_at_end=_smallest_at_end(points),
-        swamped=bool((points.known > points.size**2).any()),
+        bracketed=waist_bracketed(p.settings, p.screen, p.size, p.error),
+        smallest_at_end=one is not None and one[np.argmin(p.size)] in (one.min(), one.max()),
+        swamped=bool((p.known > p.size**2).any()),
         outliers=0.0 if doubt is None else float(np.mean(doubt > 0.5)),
         robust=doubt is not None,
+        influence=influence_of(p, noise, fit.sigma, error) if alone else Influence(),
+        constant=None if one is None or dof == 0 else _constant(p, noise),
     )
 
 
-def _smallest_at_end(points: Points) -> bool:
-    """Whether one magnet was scanned and its first or last setting gave the smallest size."""
-    varied = [v for v in points.settings.values() if np.ptp(v) > 0]
-    if len(varied) != 1 or len(set(points.screen)) > 1:
-        return False
-    return bool(varied[0][np.argmin(points.size)] in (varied[0].min(), varied[0].max()))
+def _one_magnet(p: Points) -> np.ndarray | None:
+    """The settings of the one magnet that was scanned before one screen."""
+    varied = [v for v in p.settings.values() if np.ptp(v) > 0]
+    return varied[0] if len(varied) == 1 and len(set(p.screen)) == 1 else None
+
+
+def _constant(p: Points, noise: Noise) -> float:
+    """How often noise alone makes constant sizes differ as much as these do."""
+    weight = p.error**-2.0
+    mean = float(weight @ p.size / weight.sum())
+    off = float(weight @ (p.size - mean) ** 2)
+    dof = len(p.size) - 1
+    return chi2_probability(off, dof, math.inf if noise.known else noise.dof + dof - 2)
 
 
 def next_measurement(seen: Seen, plane: str) -> str | None:

@@ -64,7 +64,7 @@ def candidate_settings(
 
 def best_symmetric(points: Points) -> np.ndarray:
     """The least-squares matrix with no regard to its sign, shape (3,)."""
-    weight = 1.0 / (2.0 * points.size * points.error)
+    weight = 1.0 / (2.0 * points.weighed * points.error)
     r11, r12 = points.r11, points.r12
     design = np.stack([r11**2, 2 * r11 * r12, r12**2], -1) * weight[:, None]
     norm = np.linalg.norm(design, axis=0)

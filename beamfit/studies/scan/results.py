@@ -42,6 +42,8 @@ class Points(NamedTuple):
         Where each was measured.
     size, error, model : ndarray
         Measured rms size, its error as used, and the fitted size, m.
+    weighed : ndarray
+        The size that the error of size² was taken at, m: the model's, or the measured one.
     pull : ndarray
         Residual of the fitted quantity over its error as used.
     outlier_probability : ndarray or None
@@ -58,11 +60,18 @@ class Points(NamedTuple):
     size: np.ndarray
     error: np.ndarray
     model: np.ndarray
+    weighed: np.ndarray
     pull: np.ndarray
     outlier_probability: np.ndarray | None
     r11: np.ndarray
     r12: np.ndarray
     known: np.ndarray
+
+    def where(self, i: int) -> str:
+        """The settings of a point, in words."""
+        settings = (f"{n} = {v[i]:.4g} {self.units[n]}" for n, v in self.settings.items())
+        screen = [f"screen {self.screen[i]}"] if len(set(self.screen)) > 1 else []
+        return ", ".join([*settings, *screen])
 
 
 class Parameter(NamedTuple):

@@ -7,7 +7,7 @@ many scans are a vmap of it.
 from __future__ import annotations
 
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -15,7 +15,7 @@ from jax import Array
 from jax.typing import ArrayLike
 
 from beamfit.greybox.descend import descend_one
-from beamfit.studies.scan.model import coefficients, numbers_of
+from beamfit.studies.scan.model import coefficients, numbers_of, size_squared
 
 __all__ = [
     "ClosedForm",
@@ -30,6 +30,8 @@ __all__ = [
 
 # A direction of σ is lost when its diagonal of R is this far below the largest.
 _RANK = 1e-10
+# How often weights are taken anew from the model, and how far its size may be from the measured.
+ROUNDS, FURTHEST = 6, 3.0
 # Directions tried at once for the best beam of no emittance, and how often the search zooms in.
 _DIRECTIONS, _ZOOMS = 48, 5
 
@@ -49,6 +51,9 @@ class SizeData(NamedTuple):
         Shape (n,), rms sizes in m.
     error : Array
         Shape (n,), their standard errors in m; infinite takes a point out.
+    relative : Array
+        Shape () or (n,): 1 where the error is a share of the size, so that it grows with the
+        model's size; 0 where it is as it stands.
     """
 
     r11: Array
@@ -56,6 +61,7 @@ class SizeData(NamedTuple):
     known: Array
     size: Array
     error: Array
+    relative: ArrayLike = 0.0
 
     @property
     def design(self) -> Array:
@@ -88,6 +94,10 @@ class SigmaFit(NamedTuple):
         one of zero emittance.
     converged : Array
         Whether the iteration ended at a minimum; always so for the linear fit.
+    error : Array
+        Shape (n,): errors of the sizes as the weights took them, m.
+    weighed : Array
+        Shape (n,): the sizes that the errors of size² were taken at, m.
     """
 
     sigma: Array
@@ -99,17 +109,19 @@ class SigmaFit(NamedTuple):
     full_rank: Array
     positive: Array
     converged: Array
+    error: Array
+    weighed: Array
 
 
-def solve_size_squared(data: SizeData, weight: ArrayLike = 1.0) -> SigmaFit:
+def solve_size_squared(data: SizeData, weights: str = "model") -> SigmaFit:
     """Fit size² by weighted linear least squares: the report's ``error_linear``.
 
     Parameters
     ----------
     data : SizeData
         One scan in one plane.
-    weight : float or Array
-        Factor on each squared residual, shape (n,) or scalar.
+    weights : {"model", "measured"}
+        Whose size the error of size² is taken at.
 
     Returns
     -------
@@ -120,10 +132,13 @@ def solve_size_squared(data: SizeData, weight: ArrayLike = 1.0) -> SigmaFit:
     Notes
     -----
     Residual (model² - size²)/(2 size error): Appendix A of the report. QR of the scaled
-    design, so that its condition is not squared.
+    design, so that its condition is not squared. With the measured size in the weights a size
+    that noise made small counts for more, which makes σ small by 3 r² to 7 r² for a relative
+    noise r, however many points there are; the model's size has no part in the noise.
     """
-    _, _, target, scale = _linear(data, weight)
-    design = data.design * scale[:, None]
+    size, error = _weighed(data, weights)
+    scale = 0.5 / (size * error)
+    target, design = (data.size**2 - data.known) * scale, data.design * scale[:, None]
     sigma, covariance, full_rank = _least_squares(design, target)
     determinant = sigma[0] * sigma[2] - sigma[1] ** 2
     gradient = jnp.stack([sigma[2], -2.0 * sigma[1], sigma[0]])
@@ -140,13 +155,36 @@ def solve_size_squared(data: SizeData, weight: ArrayLike = 1.0) -> SigmaFit:
         full_rank=full_rank,
         positive=positive,
         converged=jnp.asarray(True),
+        error=error,
+        weighed=size,
     )
 
 
-def _linear(data: SizeData, weight: ArrayLike) -> tuple[Array, Array, Array, Array]:
-    """R11, R12, measured size² over its error, and one over that error."""
-    scale = jnp.sqrt(weight) / (2.0 * data.size * data.error)
-    return data.r11, data.r12, (data.size**2 - data.known) * scale, scale
+def _weighed(data: SizeData, weights: str) -> tuple[Array, Array]:
+    """Sizes to take the error of size² at, and errors there: of a model fitted with the last."""
+
+    def again(_: int, size: Array) -> Array:
+        scale = 0.5 / (size * error_at(size, data.size, data.error, data.relative))
+        target = (data.size**2 - data.known) * scale
+        sigma = _least_squares(data.design * scale[:, None], target)[0]
+        return weighed_size(data.size, size_squared(sigma, data.r11, data.r12, data.known))
+
+    rounds = ROUNDS if weights == "model" else 0
+    size = jax.lax.fori_loop(0, rounds, again, data.size)
+    return size, error_at(size, data.size, data.error, data.relative)
+
+
+def weighed_size(measured: Array, squared: Array) -> Array:
+    """The model's size to weigh by, within `FURTHEST` of the measured one: one wild point, or
+    a negative size², must not take all weight.
+    """
+    low, high = (measured / FURTHEST) ** 2, (measured * FURTHEST) ** 2
+    return jnp.sqrt(jnp.clip(squared, low, high))
+
+
+def error_at(size: Any, measured: Any, error: Any, relative: Any) -> Any:
+    """The error of a size that differs from the measured one: one that is a share grows with it."""
+    return error * (1.0 + relative * (size / measured - 1.0))
 
 
 def _least_squares(design: Array, target: Array) -> tuple[Array, Array, Array]:
@@ -176,15 +214,15 @@ def _inverse_triangle(r: Array) -> Array:
     )
 
 
-def solve_size(data: SizeData, weight: ArrayLike = 1.0) -> SigmaFit:
+def solve_size(data: SizeData, weights: str = "model") -> SigmaFit:
     """Fit the size itself: the report's ``error_nonlinear``.
 
     Parameters
     ----------
     data : SizeData
         One scan in one plane.
-    weight : float or Array
-        Factor on each squared residual.
+    weights : {"model", "measured"}
+        Whose size an error that is a share of the size is taken at.
 
     Returns
     -------
@@ -196,8 +234,8 @@ def solve_size(data: SizeData, weight: ArrayLike = 1.0) -> SigmaFit:
     Residual (model - size)/error (Appendices A and C of the report), on the Cholesky factor of σ
     in units of its start, so that every iterate has a size.
     """
-    start = solve_size_squared(data, weight)
-    scale = jnp.sqrt(weight) / data.error
+    start = solve_size_squared(data, weights)
+    scale = 1.0 / start.error
     design = data.design
     unit = jnp.sqrt(jnp.abs(start.sigma[jnp.array([0, 2])]))
 
@@ -224,7 +262,9 @@ def solve_size(data: SizeData, weight: ArrayLike = 1.0) -> SigmaFit:
     determinant = sigma[0] * sigma[2] - sigma[1] ** 2
     gradient = jnp.stack([sigma[2], -2.0 * sigma[1], sigma[0]])
     chi2 = 2.0 * end.cost
-    flat = jnp.sqrt(design @ zero_emittance(*_linear(data, weight))[0] + data.known)
+    linear = 0.5 / (start.weighed * start.error)
+    target = (data.size**2 - data.known) * linear
+    flat = jnp.sqrt(design @ zero_emittance(data.r11, data.r12, target, linear)[0] + data.known)
     flat_chi2 = jnp.sum(((flat - data.size) * scale) ** 2)
     return start._replace(
         sigma=sigma,
@@ -242,7 +282,7 @@ def solve_size(data: SizeData, weight: ArrayLike = 1.0) -> SigmaFit:
 SOLVE = {"size_squared": solve_size_squared, "size": solve_size}
 
 
-@partial(jax.jit, static_argnames="method")
+@partial(jax.jit, static_argnames=("method", "weights"))
 def fit_sizes(
     r11: ArrayLike,
     r12: ArrayLike,
@@ -250,6 +290,9 @@ def fit_sizes(
     error: ArrayLike,
     known: ArrayLike = 0.0,
     method: str = "size_squared",
+    *,
+    relative: ArrayLike = 0.0,
+    weights: str = "model",
 ) -> SigmaFit:
     """Fit one scan or many in one call, from transfer-matrix elements and sizes.
 
@@ -263,6 +306,10 @@ def fit_sizes(
         Size² in m² that dispersion and resolution contribute; broadcast.
     method : {"size_squared", "size"}
         Which residual: the report's ``error_linear`` or ``error_nonlinear``.
+    relative : array
+        1 where an error is a share of the size and so grows with the model's; broadcast.
+    weights : {"model", "measured"}
+        Whose size the error of size² is taken at.
 
     Returns
     -------
@@ -281,13 +328,12 @@ def fit_sizes(
     ((10000, 3), True)
     """
     solve = SOLVE[method]
-    shape = jnp.broadcast_shapes(*(jnp.shape(v) for v in (r11, r12, size, error, known)))
-    arrays = [
-        jnp.broadcast_to(jnp.asarray(v, float), shape) for v in (r11, r12, known, size, error)
-    ]
+    given = (r11, r12, known, size, error, relative)
+    shape = jnp.broadcast_shapes(*(jnp.shape(v) for v in given))
+    arrays = [jnp.broadcast_to(jnp.asarray(v, float), shape) for v in given]
 
     def one(*columns: Array) -> SigmaFit:
-        return solve(SizeData(*columns))
+        return solve(SizeData(*columns), weights)
 
     for _ in shape[:-1]:
         one = jax.vmap(one)
@@ -358,7 +404,7 @@ class ClosedForm(NamedTuple):
     error: Array
 
 
-@partial(jax.jit, static_argnames="method")
+@partial(jax.jit, static_argnames=("method", "weights"))
 def closed_form(
     sizes: SizeData,
     factor: Array,
@@ -366,6 +412,7 @@ def closed_form(
     to_design: Array,
     design: Array,
     method: str = "size_squared",
+    weights: str = "model",
 ) -> ClosedForm:
     """Fit planes and carry σ and its covariance to everything people quote.
 
@@ -375,7 +422,7 @@ def closed_form(
         Arrays of shape (planes, n).
     factor, to_screen, to_design, design
         As for `numbers_of`, with a leading axis of planes.
-    method : str
+    method, weights : str
         As for `fit_sizes`.
 
     Returns
@@ -385,7 +432,7 @@ def closed_form(
     """
 
     def one(plane: SizeData, *at: Array) -> ClosedForm:
-        fit = SOLVE[method](plane)
+        fit = SOLVE[method](plane, weights)
 
         def numbers(sigma: Array) -> Array:
             return numbers_of(sigma, *at)

@@ -13,6 +13,7 @@ from beamfit.optics.beamline import Beamline
 from beamfit.optics.particle import beta_gamma
 from beamfit.studies.scan.assumptions import Assumptions
 from beamfit.studies.scan.model import UNIT, Asked, predict_sizes
+from beamfit.studies.scan.noise import Noise
 from beamfit.studies.scan.results import Parameter, Points
 from beamfit.studies.scan.scans import QuadScan
 from beamfit.studies.scan.sigma import SigmaFit
@@ -77,8 +78,12 @@ class Seen(NamedTuple):
         "size_squared" or "size".
     robust : bool
         Whether points may be doubted.
+    weights : str
+        "model" or "measured": whose size the errors are taken at.
     rows : Rows
         The scan's rows through that line, padded; what no row changes is multiplied out.
+    noises : dict of str to Noise
+        Of every plane that was measured.
     look : Look
         The same, with every magnet as the lattice has it; NumPy arrays.
     works : dict of str to Work
@@ -91,7 +96,9 @@ class Seen(NamedTuple):
     planes: tuple[str, ...]
     method: str
     robust: bool
+    weights: str
     rows: Rows
+    noises: dict[str, Noise]
     look: Look
     works: dict[str, Work]
 
@@ -174,20 +181,20 @@ def asked_of(seen: Seen, plane: str, whole_map: bool = True, line: Beamline | No
 def size_record(seen: Seen, plane: str, rows: Any) -> Record:
     """The measured sizes of a plane, in µm² or µm, with the errors the known-transport fit used.
 
-    Rows without a size have weight 0, and so has padding.
+    Rows without a size have weight 0, and so has padding. Errors nobody gave are a guess.
     """
-    points, at = seen.works[plane].points, seen.measured(plane)
-    # Three points without errors tell no noise; the verdict refuses them whatever stands here.
-    error = np.where(np.isfinite(points.error), points.error, 0.05 * points.size)
+    work, noise, at = seen.works[plane], seen.noises[plane], seen.measured(plane)
     weight, columns = np.zeros(len(padded(seen.scan.size[plane]))), []
     weight[at] = 1.0
-    for values in (1e6 * points.size, 1e6 * error):
-        columns.append(np.full(len(weight), values[0]))
-        columns[-1][at] = values
-    size, error = columns
+    points, guess = work.points, float(work.fit.error[at[0]] / work.points.error[0])
+    for values in (points.size, points.error, points.weighed):
+        columns.append(np.full(len(weight), 1e6 * values[0]))
+        columns[-1][at] = 1e6 * values
+    size, error, weighed = columns
     if rows.squared:
-        size, error = size**2, 2.0 * size * error
-    return Record(f"size {plane}", predict_sizes, rows, size, error, weight)
+        size, error = size**2, 2.0 * weighed * error
+    worth = np.inf if noise.known else noise.dof
+    return Record(f"size {plane}", predict_sizes, rows, size, error, weight, worth, guess)
 
 
 def beam_numbers(seen: Seen) -> dict[str, dict[str, float]]:

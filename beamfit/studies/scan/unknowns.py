@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Any
+from dataclasses import replace
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -14,10 +15,12 @@ from jax import Array
 from beamfit.greybox import assess, tree
 from beamfit.greybox.covariance import Group
 from beamfit.greybox.fit import Derived, Fit
+from beamfit.greybox.problem import Record
+from beamfit.greybox.solve import solve
 from beamfit.optics.beamline import Beamline
 from beamfit.status import Status
 from beamfit.studies.scan.assumptions import Anchor, Assumptions
-from beamfit.studies.scan.judged import SIGMA, Answer, beside, plane_fit, units_of
+from beamfit.studies.scan.judged import SIGMA, Answer, plane_fit, units_of
 from beamfit.studies.scan.known import pulls, works_of
 from beamfit.studies.scan.model import (
     QUANTITIES,
@@ -28,12 +31,12 @@ from beamfit.studies.scan.model import (
     spoken,
 )
 from beamfit.studies.scan.results import Parameter, PlaneFit, Points
-from beamfit.studies.scan.statement import Scenario, Seen, asked_of
+from beamfit.studies.scan.statement import Scenario, Seen, asked_of, size_record
 from beamfit.studies.scan.transport import Look
-from beamfit.studies.scan.verdict import SCENARIO_RULES, Evidence, Unknowns, cause_of, judge
+from beamfit.studies.scan.verdict import SCENARIO_RULES, Unknowns, cause_of, judge
 from beamfit.verdict import Finding
 
-__all__ = ["judged_scenario"]
+__all__ = ["judged_scenario", "settled_fit"]
 
 # Ends of a search that are no answer.
 NO_ANSWER = (
@@ -42,6 +45,8 @@ NO_ANSWER = (
     Status.not_converged,
     Status.contradictory_bounds,
 )
+# How often errors are taken anew at most, and what change of them no longer matters.
+ROUNDS, SAME = 5, 1e-3
 # The noise of a record whose fit was refused.
 NOTHING = Group("", slice(0), True, math.nan, 0, 0.0, math.nan)
 
@@ -57,62 +62,109 @@ def _elements(model: Mapping[str, Any], rows: tuple[Any, ...]) -> Array:
     return jnp.stack([jnp.stack(each.elements(model)) for each in rows])
 
 
+class Found(NamedTuple):
+    """A scenario's fit and, of the line as it found it, each plane fitted in closed form."""
+
+    fit: Fit
+    seen: Seen
+    elements: np.ndarray
+
+
+def settled_fit(seen: Seen, fit: Fit) -> Found:
+    """Solve again with errors taken at the fitted sizes, until these change no more.
+
+    Where the line was wrong, so were the sizes that known transport weighed by, the noise it saw in
+    its residuals, and the points it doubted.
+    """
+    found = _through(seen, fit)
+    for _ in range(ROUNDS):
+        records = tuple(_renewed(record, found) for record in fit.problem.records)
+        if all(
+            new is old or np.allclose(new.error, old.error, rtol=SAME)
+            for new, old in zip(records, fit.problem.records, strict=True)
+        ):
+            break
+        fit = solve(replace(fit.problem, model=fit.model, records=records))
+        found = _through(seen, fit)
+    return found
+
+
+def _renewed(record: Record, found: Found) -> Record:
+    """The sizes of a plane with their errors as the last closed form took them."""
+    if record.predict is not predict_sizes:
+        return record
+    return size_record(found.seen, record.data.plane, record.data)
+
+
+def _through(seen: Seen, fit: Fit) -> Found:
+    """See the scan through the line as a fit found it."""
+    rows = tuple(record.data for record in _size_records(seen, fit))
+    elements = np.asarray(_elements(fit.model, rows))
+    look = list(seen.look)
+    for plane, found in zip(seen.planes, elements, strict=True):
+        for i in range(3):
+            look[i] = look[i].copy()
+            look[i]["xy".index(plane)] = found[i]
+    works = works_of(seen, Look(*look), seen.planes)
+    return Found(fit, seen._replace(works={**seen.works, **works}), elements)
+
+
+def _size_records(seen: Seen, fit: Fit) -> list[Record]:
+    """The records of sizes, in the order of the planes."""
+    records = {r.data.plane: r for r in fit.problem.records if r.predict is predict_sizes}
+    return [records[plane] for plane in seen.planes]
+
+
 def judged_scenario(
-    seen: Seen,
+    found: Found,
     line: Beamline,
     scenario: Scenario,
     told: Assumptions,
-    fit: Fit,
     parameters: tuple[Parameter, ...],
 ) -> tuple[PlaneFit, ...]:
     """Judge each plane of a scenario's fit.
 
     Priors and anchors can make a covariance finite where the sizes are noise or too few to judge.
-    So each plane is fitted once more in closed form with the line as the scenario found it, and
-    must be determined by the rules of known transport too.
+    So each plane must be determined by the rules of known transport too, with the line as the
+    scenario found it.
     """
-    records = {r.data.plane: r for r in fit.problem.records if r.predict is predict_sizes}
-    rows = tuple(records[plane].data for plane in seen.planes)
+    fit, seen, elements = found
+    records = _size_records(seen, fit)
     whole = scenario.whole_map
-    asked = tuple(asked_of(seen, r.plane, whole, r.line if whole else None) for r in rows)
+    asked = tuple(
+        asked_of(seen, r.data.plane, whole, r.data.line if whole else None) for r in records
+    )
     derived = fit.derive(_numbers, asked)
-    elements = np.asarray(_elements(fit.model, rows))
-    look, beams = list(seen.look), {}
-    for plane, found in zip(seen.planes, elements, strict=True):
-        for i in range(3):
-            look[i] = look[i].copy()
-            look[i]["xy".index(plane)] = found[i]
-    again = seen._replace(works=works_of(seen, Look(*look), seen.planes))
-    vouching, jacobian = beside(again), _loose_jacobian(fit)
-    for i, plane in enumerate(seen.planes):
+    jacobian, beams = _loose_jacobian(fit), []
+    for i, (plane, record) in enumerate(zip(seen.planes, records, strict=True)):
         own = Derived(*(part[i] for part in derived))
-        evidence = again.works[plane].evidence._replace(neighbour=vouching[plane])
         points = _points_at(seen, plane, own.value[SIGMA], *elements[i])
-        group = next((g for g in fit.groups if g.name == records[plane].name), NOTHING)
-        unknowns = _unknowns(seen, scenario, told, fit, parameters, own, group, evidence)
-        beams[plane] = _scenario_answer(fit, own, group, unknowns, points, jacobian)
-    return tuple(plane_fit(seen, line, plane, a) for plane, a in beams.items())
+        group = next((g for g in fit.groups if g.name == record.name), NOTHING)
+        unknowns = _unknowns(seen, plane, scenario, told, fit, parameters, own, group)
+        answer = _scenario_answer(fit, own, group, unknowns, points, jacobian)
+        beams.append(plane_fit(seen, line, plane, answer))
+    return tuple(beams)
 
 
 def _points_at(seen: Seen, plane: str, sigma: np.ndarray, *elements: np.ndarray) -> Points:
-    """The points of the known-transport fit, with this fit's model."""
+    """The points of the closed form, with this fit's model."""
     r11, r12, known = (part[seen.measured(plane)] for part in elements)
-    points = seen.works[plane].points
     model = np.sqrt(np.maximum(size_squared(sigma, r11, r12, known), 0.0))
-    pull = pulls(points.size, model, points.error, seen.rows.squared)
-    return points._replace(model=model, pull=pull, r11=r11, r12=r12, known=known)
+    points = seen.works[plane].points._replace(model=model)
+    return points._replace(pull=pulls(points, seen.rows.squared))
 
 
 def _unknowns(
     seen: Seen,
+    plane: str,
     scenario: Scenario,
     told: Assumptions,
     fit: Fit,
     parameters: tuple[Parameter, ...],
     own: Derived,
     group: Group,
-    evidence: Evidence,
 ) -> Unknowns:
+    evidence, noise = seen.works[plane].evidence, seen.noises[plane]
     tied, error = told.anchor.words, float(fit.spread.error(np.nan_to_num(own.slope[0])))
     distance = float(own.value[0]) / (2.0 * error) if error > 0 else 0.0
     edges = "".join(
@@ -138,8 +190,8 @@ def _unknowns(
         distance=distance if math.isfinite(distance) else 0.0,
         chi2=group.chi2,
         dof=group.dof,
-        noise_known=evidence.noise_known,
-        points_dof=evidence.dof,
+        probability=noise.probability(group.chi2, group.dof),
+        rests_on=noise.rests_on(group.chi2, group.dof),
         edges=edges,
         remedy=scenario.remedy(seen),
         remark=remark,
@@ -185,7 +237,9 @@ def _scenario_answer(
         chi2=group.chi2,
         dof=round(group.dof),
         scale=group.scale if group.scale > 0 else 1.0,
-        noise="inferred from the fit with known transport",
+        noise="inferred from the residuals",
+        rests_on=u.rests_on,
+        limits=(None, None),
         distance=u.distance,
         points=points,
         jacobian=_marginal(jacobian, asked, units),

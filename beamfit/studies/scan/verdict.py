@@ -7,10 +7,11 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
-from scipy.special import stdtrit
 
-from beamfit.statistics import POOR_FIT, chi2_probability, one_sided_probability
+from beamfit.statistics import POOR_FIT, one_sided_probability
 from beamfit.status import Status
+from beamfit.studies.scan.influence import Influence
+from beamfit.studies.scan.noise import reach_of
 from beamfit.verdict import Finding, judge
 
 __all__ = [
@@ -27,17 +28,19 @@ __all__ = [
 ]
 
 # The emittance is determined if zero is this many standard errors away ...
-CLEAR, CLEAR_BESIDE_ANOTHER = 4.0, 3.0
-# (sizes of such a scan may miss the beam by this much, relative and rms)
-VOUCHED = 0.2
+CLEAR = 4.0
 # ... and noise would lift it so far less often than this, counting the degrees of freedom.
 CHANCE = 2e-3
 # Sizes that miss every beam by this much, rms and relative, follow no beam.
 LOST = 0.15
 # A robust fit must keep this many degrees of freedom, and may doubt this share of the points.
 ROBUST_DOF, DOUBTED = 4, 0.2
-# From so many degrees of freedom on, Student's distribution is nearly normal.
+# Below so many degrees of freedom Student's distribution is told in words.
 MANY = 8
+# Sizes answer a magnet if a constant size is less likely than this.
+CONSTANT = 0.01
+# Above this probability of χ² the errors are overstated.
+OVERSTATED = 0.999
 
 
 class Evidence(NamedTuple):
@@ -53,6 +56,14 @@ class Evidence(NamedTuple):
         Points less three.
     noise_known : bool
         Whether the errors were given, not inferred from these residuals.
+    probability : float or None
+        Of a χ² at least this large; None where there is nothing to judge it by.
+    rests_on : float
+        Degrees of freedom of the errors as scaled; infinite for errors that were given.
+    influence : Influence
+        What single points do to the answer.
+    constant : float or None
+        Probability that noise alone makes the sizes differ, if one magnet was scanned.
     determinant_distance : float
         det σ over its scaled standard error.
     zero_distance : float
@@ -69,10 +80,6 @@ class Evidence(NamedTuple):
         Share of the points the robust fit thinks bad; 0 for a plain fit.
     robust : bool
         Whether the fit was robust: its noise then rests on its own judgement.
-    neighbour : bool
-        Whether the other plane of the same scan is determined by the full rule. It shares
-        magnets, screen and settings, so a misfit here is then a matter of the profile and
-        not of noise, and three standard errors suffice.
     advice : str or None
         What to measure, for the remedy.
     """
@@ -83,6 +90,8 @@ class Evidence(NamedTuple):
     chi2: float
     dof: int
     noise_known: bool
+    probability: float | None
+    rests_on: float
     determinant_distance: float
     zero_distance: float
     misfit: float
@@ -91,15 +100,9 @@ class Evidence(NamedTuple):
     swamped: bool = False
     outliers: float = 0.0
     robust: bool = False
-    neighbour: bool = False
+    influence: Influence = Influence()
+    constant: float | None = None
     advice: str | None = None
-
-    @property
-    def vouched(self) -> bool:
-        """A neighbour vouches for given errors, a bracketed waist and a miss of up to 20 %."""
-        return (
-            self.neighbour and self.noise_known and bool(self.bracketed) and self.misfit <= VOUCHED
-        )
 
     @property
     def distance(self) -> float:
@@ -109,19 +112,12 @@ class Evidence(NamedTuple):
     @property
     def poor(self) -> bool:
         """Whether given errors make the residuals improbable."""
-        return self.noise_known and improbable(self.chi2, self.dof)
+        return self.probability is not None and self.probability < POOR_FIT
 
     @property
     def chance(self) -> float:
         """How often noise alone comes this far from zero emittance."""
-        rests_on_residuals = not self.noise_known or self.robust or self.chi2 > self.dof
-        return one_sided_probability(self.distance, self.dof if rests_on_residuals else None)
-
-
-def improbable(chi2: float, dof: float) -> bool:
-    """Whether noise alone gives such a χ² less than once in a thousand."""
-    probability = chi2_probability(chi2, dof)
-    return probability is not None and probability < POOR_FIT
+        return one_sided_probability(self.distance, self.rests_on)
 
 
 def _no_rank(e: Evidence) -> str | None:
@@ -142,18 +138,38 @@ def _doubted(e: Evidence) -> str | None:
     )
 
 
-def _three_points(e: Evidence) -> str | None:
-    if e.dof:
+def _too_few(e: Evidence) -> str | None:
+    if not e.dof:
+        return (
+            "three points fit any three numbers exactly and leave nothing to judge them by; "
+            "measure a fourth setting"
+        )
+    if e.dof == 1 and not e.noise_known:
+        return (
+            "four points without errors leave one residual, which may be small by accident; "
+            "measure a fifth setting or give the errors of the sizes"
+        )
+    return None
+
+
+def _unanswered(e: Evidence) -> str | None:
+    if e.constant is None or e.constant < CONSTANT:
         return None
     return (
-        "three points fit any three numbers exactly and leave nothing to judge them by; "
-        "measure a fourth setting"
+        "the sizes do not answer the magnet, one size meets them all within their errors "
+        f"(probability {e.constant:.2g}); check that the magnet moved, that the screen shows the "
+        "beam, and scan further"
     )
 
 
 def _lost(e: Evidence) -> str | None:
-    if not (e.misfit > LOST and (e.poor or not e.noise_known)) or e.vouched:
+    if not (e.misfit > LOST and (e.poor or not e.noise_known)):
         return None
+    if e.influence.outlier:
+        return (
+            f"the sizes follow no beam with the point at {e.influence.outlier}, and do without it; "
+            "measure it again, or give it little weight with --robust"
+        )
     return (
         f"the sizes follow no beam through this line, the best one misses them by "
         f"{100 * e.misfit:.0f} % rms; check settings, units, energy and screen"
@@ -174,25 +190,25 @@ def _not_positive(e: Evidence) -> str | None:
 
 
 def _near_zero(e: Evidence) -> str | None:
-    """Both distances must exceed four standard errors; three do where a neighbour vouches."""
-    if e.distance >= (CLEAR_BESIDE_ANOTHER if e.vouched else CLEAR):
+    if e.distance >= CLEAR:
         return None
     return f"zero emittance lies only {e.distance:.1f} standard errors away" + _one_sided(e)
 
 
 def _by_chance(e: Evidence) -> str | None:
-    if e.vouched or not e.chance > CHANCE:
+    if not e.chance > CHANCE:
         return None
     return (
-        f"zero emittance lies {e.distance:.1f} standard errors away, but with {e.dof} "
-        f"degrees of freedom noise does that in {100 * e.chance:.2g} % of scans; measure "
-        "more settings"
+        f"zero emittance lies {e.distance:.1f} standard errors away, but with errors that rest "
+        f"on {e.rests_on:.3g} degrees of freedom noise does that in {100 * e.chance:.2g} % of "
+        "scans; measure more settings"
     )
 
 
 # What keeps sizes from determining an emittance, gravest first.
 CAUSES: tuple[Callable[[Evidence], str | None], ...] = (
-    _no_rank, _doubted, _three_points, _lost, _swamped, _not_positive, _near_zero, _by_chance
+    _no_rank, _doubted, _too_few, _lost, _unanswered, _swamped, _not_positive, _near_zero,
+    _by_chance,
 )  # fmt: skip
 
 
@@ -201,7 +217,7 @@ def cause_of(e: Evidence) -> str | None:
 
     Examples
     --------
-    >>> good = Evidence(True, True, True, 11.0, 11, True, 31.0, 30.0, 0.02, True)
+    >>> good = Evidence(True, True, True, 11.0, 11, True, 0.44, math.inf, 31.0, 30.0, 0.02, True)
     >>> cause_of(good), cause_of(good._replace(zero_distance=3.5))
     (None, 'zero emittance lies only 3.5 standard errors away')
     """
@@ -225,25 +241,48 @@ def _unsettled(e: Evidence) -> Finding | None:
 def _poor(e: Evidence) -> Finding | None:
     if not e.poor:
         return None
-    probability, ratio = chi2_probability(e.chi2, e.dof), e.chi2 / e.dof
+    ratio = e.chi2 / e.dof
+    blame = "Check how the sizes are taken from the profile, their errors, and the lattice."
+    if e.influence.outlier:
+        blame = (
+            f"Without the point at {e.influence.outlier} the rest fits (probability "
+            f"{e.influence.without:.1g}): measure it again, or fit with --robust."
+        )
     return Finding(
         Status.poor_fit,
-        f"Poor fit: chi2/dof = {_number(ratio)} (probability {probability:.1g}); the "
+        f"Poor fit: chi2/dof = {_number(ratio)} (probability {e.probability:.1g}); the "
         f"sizes miss the model by {math.sqrt(ratio):.1f} times their errors, and all "
-        "errors are scaled by that. Check how the sizes are taken from the profile, their "
-        f"errors, and the lattice. {_clear(e)}.",
+        f"errors are scaled by that. {blame} {_clear(e)}{_carried(e)}.",
+    )
+
+
+def _one_refutes(e: Evidence) -> Finding | None:
+    """Sizes without errors have no χ² to be poor by, but one of them can refute the others."""
+    if e.noise_known or not e.influence.outlier:
+        return None
+    return Finding(
+        Status.poor_fit,
+        f"Poor fit: the point at {e.influence.outlier} lies farther from what the others say than "
+        f"their scatter allows (probability {e.influence.chance:.1g}) and spoils value and errors. "
+        f"Measure it again, or fit with --robust. {_clear(e)}.",
     )
 
 
 def _determined(e: Evidence) -> Finding:
-    words = _clear(e) + few_words(e.noise_known, e.dof)
+    words = _clear(e) + few_words(e.rests_on) + _carried(e)
     if e.noise_known and e.chi2 > e.dof > 0:
         words += f"; errors are scaled by sqrt(chi2/dof) = {math.sqrt(e.chi2 / e.dof):.2f}"
+    if e.noise_known and e.probability is not None and e.probability > OVERSTATED:
+        words += (
+            f"; chi2/dof = {_number(e.chi2 / e.dof)} is less than noise of the stated errors "
+            f"leaves (probability {1 - e.probability:.1g}): they seem overstated, and so is the "
+            "error here"
+        )
     return Finding(Status.converged, words + ".")
 
 
 # Of sizes whose line is known; on simulated noise and one-sided scans measured in docs/verdict.md.
-BEAM_RULES = (_undetermined, _unsettled, _poor, _determined)
+BEAM_RULES = (_undetermined, _unsettled, _poor, _one_refutes, _determined)
 
 
 class Unknowns(NamedTuple):
@@ -263,10 +302,10 @@ class Unknowns(NamedTuple):
         Standard errors between det σ and zero.
     chi2, dof : float
         Of the plane's own sizes.
-    noise_known : bool
-        Whether their errors were given.
-    points_dof : int
-        Points less three.
+    probability : float or None
+        Of that χ².
+    rests_on : float
+        Degrees of freedom of the errors as scaled.
     edges, remedy, remark : str
         Numbers that end on bounds; what is needed; what else is open or rests on priors.
     """
@@ -279,8 +318,8 @@ class Unknowns(NamedTuple):
     distance: float
     chi2: float
     dof: float
-    noise_known: bool
-    points_dof: int
+    probability: float | None
+    rests_on: float
     edges: str
     remedy: str
     remark: str
@@ -319,7 +358,7 @@ def _left_open(u: Unknowns) -> Finding | None:
 
 
 def _poor_in_scenario(u: Unknowns) -> Finding | None:
-    if not (u.noise_known and improbable(u.chi2, u.dof)):
+    if u.probability is None or u.probability >= POOR_FIT:
         return None
     ratio = u.chi2 / u.dof
     words = (
@@ -335,7 +374,7 @@ def _determined_in_scenario(u: Unknowns) -> Finding:
 def _in_scenario(u: Unknowns) -> str:
     return (
         f"Determined in scenario {u.scenario}{u.tied}: zero emittance is {u.distance:.0f} standard "
-        f"errors away.{u.remark}{few_words(u.noise_known, u.points_dof)}"
+        f"errors away.{u.remark}{few_words(u.rests_on)}"
     )
 
 
@@ -357,20 +396,33 @@ def _clear(e: Evidence) -> str:
     )
 
 
-def few_words(noise_known: bool, dof: int) -> str:
-    """Say how far errors reach whose noise was inferred from few residuals.
+def _carried(e: Evidence) -> str:
+    """Say of a point that decides the answer what the others say."""
+    point, shift = e.influence.carrying, e.influence.shift
+    if not point:
+        return ""
+    if math.isnan(shift):
+        return f"; it rests on the point at {point}, without which the rest determines none"
+    more = "larger" if shift > 0 else "smaller"
+    return (
+        f"; it rests on the point at {point}: without it the emittance is {abs(shift):.1f} errors "
+        f"{more}"
+    )
+
+
+def few_words(rests_on: float) -> str:
+    """Say how far errors reach that rest on few degrees of freedom.
 
     Examples
     --------
-    >>> few_words(False, 2)
-    '; noise inferred on 2 degrees of freedom: 95 % of answers lie within 4.3 errors'
+    >>> few_words(2.0)
+    '; errors rest on 2 degrees of freedom: 95 % of answers lie within 4.3 of them'
     """
-    if noise_known or not 0 < dof < MANY:
+    if not 0 < rests_on < MANY:
         return ""
-    reach = float(stdtrit(dof, 0.975))
     return (
-        f"; noise inferred on {dof} degrees of freedom: 95 % of answers lie within "
-        f"{reach:.1f} errors"
+        f"; errors rest on {rests_on:.3g} degrees of freedom: 95 % of answers lie within "
+        f"{reach_of(rests_on):.1f} of them"
     )
 
 
