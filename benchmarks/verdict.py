@@ -110,7 +110,9 @@ def row(words, fits, truth=1e-6):
     below = f"{100 * np.mean([truth < limit for limit in limits]):5.0f} %" if limits else "    -  "
     poor = np.mean([f.status.value == "poor_fit" for f in fits])
     if not given:
-        print(f"{words:44s}{100 * share:7.1f} %{'-':>9s}{'-':>9s}{'-':>9s}{100 * poor:7.1f} %  {below}")
+        print(
+            f"{words:44s}{100 * share:7.1f} %" + 3 * f"{'-':>9s}" + f"{100 * poor:7.1f} %  {below}"
+        )
         return
     inside = np.mean([q.interval_95[0] <= truth <= q.interval_95[1] for q in given])
     wild = np.mean([abs(q.value - truth) > 4 * q.error for q in given])

@@ -31,6 +31,7 @@ RANGES = {
     "momentum": (0.0, 1e7, "a momentum (p c) between 0 and 10 TeV; is it in GeV or eV?"),
     "resolution": (-1e-300, USUAL[1], "a resolution between 0 and 20 mm"),
     "energy_spread": (-1e-300, 0.2, "a relative spread between 0 and 0.2; is it in %?"),
+    "shots": (0.5, 1e9, "how many shots the row is the mean of, and its errors are taken from"),
 }
 # Below this many shots a setting's own scatter is too uncertain to weight it by.
 ENOUGH_SHOTS = 5
@@ -112,6 +113,7 @@ def _scan(
         energy_kind=kind,
         resolution=values.get("resolution"),
         energy_spread=values.get("energy_spread"),
+        shots=values.get("shots"),
         screen=_screens(sheet, columns.get("screen")),
         transfer=own or None,
         error_source="the file",

@@ -19,6 +19,7 @@ QUANTITIES = {
     **dict.fromkeys(ENERGIES, "energy in MeV"),
     "energy_spread": "",
     "shot": "",
+    "shots": "",
     "screen": "",
 }
 # What tells rows apart besides settings of magnets.
@@ -120,7 +121,7 @@ def _other(header: str, sheet: Sheet) -> Column:
         return Column(header, f"setting {name}", unit)
     usual = [f"{q}_um" for q in QUANTITIES if q.startswith("size")]
     usual += ["resolution_um", "energy_MeV", "kinetic_energy_MeV", "momentum_MeV", "energy_spread"]
-    usual += ["shot", "screen"]
+    usual += ["shot", "shots", "screen"]
     before, _, last = header.rpartition("_")
     raise sheet.header_error(
         f"unknown unit '{last}'" if before else "a name without a unit",

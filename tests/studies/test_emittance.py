@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.optimize import least_squares
+from scipy.special import stdtrit
 
 import beamfit
 from beamfit.errors import InputError
@@ -37,7 +38,7 @@ def test_covariance_is_the_textbook_inverse_and_propagates(gtf, gtf_sizes):
     currents, rows, sizes = gtf_sizes
     fit = beamfit.fit_emittance(scan_of("Q2", "A", currents, sizes, seed=3), gtf).x
     p = fit.points
-    weighted = rows / (2 * p.size * p.error)[:, None]
+    weighted = rows / (2 * p.weighed * p.error)[:, None]
     covariance = np.linalg.inv(weighted.T @ weighted)
     np.testing.assert_allclose(fit.covariance, covariance, rtol=1e-6)
     s11, s12, s22 = (q.value for q in fit.sigma)
@@ -108,15 +109,17 @@ def test_without_errors_the_noise_is_inferred_and_said(gtf, gtf_sizes):
     assert fit.status is Status.converged
     assert fit.chi2 is None
     assert "inferred" in fit.noise
-    # With errors that make χ² equal to its degrees of freedom the two fits are one.
-    relative = fit.points.error[0] / fit.points.size[0]
-    given = beamfit.QuadScan(
-        {"Q2": currents}, {"Q2": "A"}, scan.size, {"x": relative * scan.size["x"]}
+    # A guess of 5 % worth two degrees of freedom, and what the residuals say of errors of 5 %.
+    guess = beamfit.QuadScan({"Q2": currents}, {"Q2": "A"}, scan.size, {"x": 0.05 * scan.size["x"]})
+    same = beamfit.fit_emittance(guess, gtf).x
+    relative = 0.05 * np.sqrt((2 + same.chi2) / (2 + same.dof))
+    np.testing.assert_allclose(fit.points.error / fit.points.model, relative, rtol=1e-6)
+    assert fit.emittance.value == pytest.approx(same.emittance.value, rel=1e-9)
+    assert fit.emittance.error == pytest.approx(
+        same.emittance.error_raw * relative / 0.05, rel=1e-9
     )
-    same = beamfit.fit_emittance(given, gtf).x
-    assert same.chi2 == pytest.approx(same.dof, rel=1e-9)
-    assert fit.emittance.error == pytest.approx(same.emittance.error_raw, rel=1e-9)
-    assert relative == pytest.approx(0.02, rel=0.5)
+    reach = (fit.emittance.interval_95[1] - fit.emittance.value) / fit.emittance.error
+    assert reach == pytest.approx(float(stdtrit(2 + same.dof, 0.975)))
 
 
 def test_several_magnets_screens_planes_and_resolution(three_quads):
@@ -285,7 +288,7 @@ def test_json_has_the_contract(gtf, gtf_sizes):
     contract |= {"sigma11", "sigma12", "sigma22", "chi2", "dof", "rms_residual", "identifiability"}
     assert contract <= set(result)
     for name in ("emittance", "normalized_emittance", "beta", "alpha", "sigma11", "sigma22"):
-        assert {"value", "error", "unit", "error_raw"} == set(result[name])
+        assert {"value", "error", "unit", "error_raw", "interval_95"} == set(result[name])
     assert result["emittance"]["unit"] == "m"
     assert result["status"] == "converged"
 

@@ -199,7 +199,7 @@ def test_no_positive_matrix_is_better_than_the_answer(seed):
     rng = np.random.default_rng(seed)
     r11, r12 = np.linspace(1, -1, 6), np.full(6, 2.0)
     size = 1e-4 * rng.uniform(0.5, 2.0, 6)
-    fit = beamfit.fit_sizes(r11, r12, size, 0.02 * size)
+    fit = beamfit.fit_sizes(r11, r12, size, 0.02 * size, weights="measured")
     rows = np.stack([r11**2, 2 * r11 * r12, r12**2], -1)
     scale = 1 / (2 * size * 0.02 * size)
     for factor in (

@@ -43,7 +43,6 @@ class Answer(NamedTuple):
     chi2: float
     dof: int
     scale: float
-    noise: str
     rests_on: float
     limits: tuple[float | None, float | None]
     distance: float
@@ -98,8 +97,9 @@ def plane_fit(seen: Seen, line: Beamline, plane: str, a: Answer) -> PlaneFit:
         rms_residual=Quantity(float(np.sqrt(np.mean((p.size - p.model) ** 2))), None, "m"),
         covariance=a.covariance,
         error_scale=a.scale,
-        noise="given" if e.noise_known else a.noise,
+        noise=seen.noises[plane].words,
         method=seen.method,
+        weights=seen.weights,
         identifiability=Identifiability(
             determined=a.determined,
             singular_values=tuple(float(v) for v in found.singular_values),
@@ -148,7 +148,6 @@ def _beam_answer(seen: Seen, plane: str) -> Answer:
         chi2=e.chi2,
         dof=e.dof,
         scale=w.scale,
-        noise="inferred from the residuals",
         rests_on=e.rests_on,
         limits=(None, None) if determined else _limits(seen, plane),
         distance=e.distance,
@@ -196,7 +195,7 @@ def upper_limit(sigma: np.ndarray, covariance: np.ndarray, rests_on: float) -> f
     """
     draws = np.random.default_rng(0)
     norm = np.sqrt(np.diag(covariance))
-    if not (np.isfinite(norm).all() and np.all(norm > 0)):
+    if not (rests_on > 0 and np.isfinite(norm).all() and np.all(norm > 0)):
         return None
     # Half the root of the matrix of correlations: the numbers differ by orders of magnitude.
     values, vectors = np.linalg.eigh(covariance / np.outer(norm, norm))

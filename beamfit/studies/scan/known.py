@@ -187,6 +187,7 @@ def _work(
         size=size,
         error=fit.error[at] * unit,
         weighed=fit.weighed[at],
+        relative=noise.relative if seen.weights == WEIGHTS[0] else 0.0,
         model=model,
         pull=np.zeros(len(at)),
         outlier_probability=probability,

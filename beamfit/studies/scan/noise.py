@@ -39,12 +39,15 @@ class Noise(NamedTuple):
         Whether they are errors, and no guess.
     dof : float
         Degrees of freedom they are worth: those of the shots, infinite where they are given.
+    words : str
+        Where they come from.
     """
 
     error: np.ndarray
     relative: float
     known: bool
     dof: float
+    words: str = "given"
 
     def probability(self, chi2: float, dof: int) -> float | None:
         """How often noise alone gives such a χ², the errors' own uncertainty included."""
@@ -100,14 +103,15 @@ def noise_of(scan: QuadScan, plane: str) -> Noise:
     measured = ~np.isnan(scan.size[plane])
     size = scan.size[plane][measured]
     if plane not in scan.error:
-        return Noise(GUESS * size, 1.0, False, GUESS_DOF)
+        return Noise(GUESS * size, 1.0, False, GUESS_DOF, "inferred from the residuals")
     error = scan.error[plane][measured]
     freedom = None if scan.shots is None else np.asarray(scan.shots, float)[measured] - 1.0
     if freedom is not None and freedom.sum() > 0:
         scatter = (error / size) ** 2 * (freedom + 1.0)
         pooled = float(freedom @ scatter / freedom.sum())
         shrunken = (POOL_DOF * pooled + freedom * scatter) / (POOL_DOF + freedom)
-        return Noise(size * np.sqrt(shrunken / (freedom + 1.0)), 1.0, True, float(freedom.sum()))
+        error = size * np.sqrt(shrunken / (freedom + 1.0))
+        return Noise(error, 1.0, True, float(freedom.sum()), "scatter of shots")
     share = error / size
     same = len(share) > 1 and float(np.ptp(share)) < SAME_SHARE * float(share.mean())
     return Noise(error, float(same), True, math.inf)

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from beamfit.optics.beam import BeamMatrix
-from beamfit.quantity import Quantity
+from beamfit.quantity import Quantity, display_unit
 from beamfit.status import Status
 from beamfit.table import cell, json_of
 
@@ -44,6 +44,8 @@ class Points(NamedTuple):
         Measured rms size, its error as used, and the fitted size, m.
     weighed : ndarray
         The size that the error of size² was taken at, m: the model's, or the measured one.
+    relative : float
+        1 where errors grow with that size, 0 where they are as they stand.
     pull : ndarray
         Residual of the fitted quantity over its error as used.
     outlier_probability : ndarray or None
@@ -61,6 +63,7 @@ class Points(NamedTuple):
     error: np.ndarray
     model: np.ndarray
     weighed: np.ndarray
+    relative: float
     pull: np.ndarray
     outlier_probability: np.ndarray | None
     r11: np.ndarray
@@ -209,6 +212,8 @@ class PlaneFit:
         The factor on errors: sqrt(χ²/dof) where that exceeds 1.
     noise : str
         Where the errors came from, in words.
+    method, weights : str
+        As for `beamfit.fit_emittance`.
     identifiability : Identifiability
         What the data determine.
     points : Points
@@ -232,6 +237,7 @@ class PlaneFit:
     error_scale: float
     noise: str
     method: str
+    weights: str
     identifiability: Identifiability
     points: Points
 
@@ -250,7 +256,15 @@ class PlaneFit:
         """Give one entry of ``results`` in the JSON contract."""
         p, screen = self.points, self.screen
         names = ("emittance", "normalized_emittance", "beta", "alpha", "chi2", "dof")
-        names += ("rms_residual", "error_scale", "noise", "method", "mismatch", "identifiability")
+        names += (
+            "rms_residual",
+            "error_scale",
+            "noise",
+            "method",
+            "weights",
+            "mismatch",
+            "identifiability",
+        )
         sigma = zip(("sigma11", "sigma12", "sigma22"), self.sigma, strict=True)
         entry = {name: getattr(self, name) for name in ("plane", "status", "message", *names)}
         points = {name: getattr(p, name) for name in ("settings", "units", "screen", "pull")}
@@ -285,6 +299,7 @@ def result_rows(planes: tuple[PlaneFit, ...]) -> list[tuple[str, list[str]]]:
     rows: list[tuple[str, Callable[[PlaneFit], object]]] = [
         ("status", lambda p: p.status),
         ("normalised emittance", lambda p: p.normalized_emittance),
+        ("95 % of answers", _interval),
         ("geometric emittance", lambda p: p.emittance),
         ("beta at the start", lambda p: p.beta),
         ("alpha at the start", lambda p: p.alpha),
@@ -309,6 +324,17 @@ def result_rows(planes: tuple[PlaneFit, ...]) -> list[tuple[str, list[str]]]:
     return [(label, [cell(value(p)) for p in planes]) for label, value in rows]
 
 
+def _interval(p: PlaneFit) -> str:
+    q = p.normalized_emittance
+    if q.interval_95 is None:
+        return "-"
+    low, high = q.interval_95
+    factor, unit = display_unit(abs(high), q.unit)
+    if q.error is None:
+        return f"below {high / factor:.3g} {unit}"
+    return f"{low / factor:.3g} to {high / factor:.3g} {unit}"
+
+
 def _chi2(p: PlaneFit) -> str:
     if p.chi2 is None:
         return f"not testable ({p.dof} dof)"
@@ -316,11 +342,9 @@ def _chi2(p: PlaneFit) -> str:
 
 
 def _noise(p: PlaneFit) -> str:
-    if p.chi2 is None and not np.isfinite(p.points.error).all():
-        return "not known"
     if p.chi2 is None:
-        return f"inferred, {100 * float((p.points.error / p.points.size).mean()):.2g} % of size"
-    return "as given" if p.error_scale == 1.0 else f"given, scaled by {p.error_scale:.2f}"
+        return f"inferred, {100 * float((p.points.error / p.points.weighed).mean()):.2g} % of size"
+    return p.noise if p.error_scale == 1.0 else f"{p.noise}, scaled by {p.error_scale:.2f}"
 
 
 def _degrees(value: float | None) -> str:

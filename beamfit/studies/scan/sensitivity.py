@@ -21,9 +21,10 @@ from beamfit.optics.calibration import CurrentPolynomial, SlopeIntercept
 from beamfit.optics.elements import Drift
 from beamfit.optics.sections import Series
 from beamfit.studies.scan.fit import EmittanceFit
+from beamfit.studies.scan.known import WEIGHTS
 from beamfit.studies.scan.model import emittance_parts, size_squared
 from beamfit.studies.scan.results import PlaneFit, Points
-from beamfit.studies.scan.sigma import fit_sizes
+from beamfit.studies.scan.sigma import error_at, fit_sizes, weighed_size
 from beamfit.studies.scan.statement import varied_magnets
 from beamfit.studies.scan.transport import Rows, padded
 
@@ -118,11 +119,13 @@ def systematics(fit: EmittanceFit, plane: str) -> list[Change]:
     upstream = fit.line.upto(result.screen.name).elements
     drifts = tuple(e.name for e in upstream if isinstance(e, Drift))
     keep = fit.seen.measured(plane)
-    size, error = np.ones(len(rows.energy)), np.full(len(rows.energy), np.inf)
-    size[keep], error[keep] = p.size, p.error
+    size, weighed, sharp = np.ones((3, len(rows.energy))) * [[1.0], [1.0], [0.0]]
+    size[keep], weighed[keep], sharp[keep] = p.size, p.weighed, 1.0 / p.error
+    follows = fit.seen.weights == WEIGHTS[0]
+    noise = _Weighing(weighed, sharp, np.array(p.relative), np.array(float(follows)))
     sigma = np.array([q.value for q in result.sigma])
     stored = replace(rows, line=fit.seen.scanned.stored_by_kind((*rows.settings, *rows.places)))
-    by_change, by_lengths = _changes(stored, sigma, size, error, magnets=magnets)
+    by_change, by_lengths = _changes(stored, sigma, size, noise, magnets=magnets)
     by_length = np.concatenate([*by_lengths, np.zeros(0)])[: len(drifts)]  # the rest is downstream
     relative = np.concatenate([by_change[:-1], by_length, by_change[-1:]])
     # ln βγ rises by E²/(E² - m²) for each relative step of the energy.
@@ -157,13 +160,23 @@ def _scaled(line: Beamline, magnet: str, factor: Array) -> Beamline:
     return line.with_element(replace(element, calibration=c))
 
 
+class _Weighing(NamedTuple):
+    """Sizes that weights are taken at, 1/error there, and whether each follows the model's size."""
+
+    weighed: Array
+    sharp: Array
+    relative: Array
+    follows: Array
+
+
 @partial(jax.jit, static_argnames="magnets")
-def _changes(rows: Rows, sigma: Array, size: Array, error: Array, *, magnets):
+def _changes(rows: Rows, sigma: Array, size: Array, noise: _Weighing, *, magnets):
     """Derivatives of ln ε of the fit by each magnet's strength and ln E, and by lengths of drifts.
 
-    At the minimum the slope F(σ, rows) of χ² is zero, so dσ = -(∂F/∂σ)⁻¹ ∂F/∂rows: exact for
-    either residual, without differentiating the solver. One reverse pass carries that back to
-    every number of the line, however long it is.
+    At the answer the weighted residuals F(σ, rows) = Σ w ∂m²/∂σ (m² - size²) vanish, so dσ =
+    -(∂F/∂σ)⁻¹ ∂F/∂rows: exact for either residual, without differentiating the solver, weights
+    that follow the model included. One reverse pass carries that back to every number of the line,
+    however long it is.
     """
     unit = jnp.abs(sigma)
 
@@ -174,15 +187,20 @@ def _changes(rows: Rows, sigma: Array, size: Array, error: Array, *, magnets):
         energy = rows.energy * (1.0 + change[-1])
         return replace(rows, line=moved, energy=energy).elements({})
 
-    def chi2(relative: Array, seen: tuple[Array, ...]) -> Array:
-        squared = size_squared(relative * unit, *seen)
-        if rows.squared:
-            return jnp.sum(((squared - size**2) / (2.0 * size * error)) ** 2)
-        return jnp.sum(((jnp.sqrt(squared) - size) / error) ** 2)
+    def slope(relative: Array, seen: tuple[Array, ...]) -> Array:
+        def squared_of(r: Array) -> Array:
+            return size_squared(r * unit, *seen)
+
+        squared, back = jax.vjp(squared_of, relative)
+        if not rows.squared:
+            return back((jnp.sqrt(squared) - size) * noise.sharp**2 / jnp.sqrt(squared))[0]
+        at = noise.weighed + noise.follows * (weighed_size(size, squared) - noise.weighed)
+        grown = error_at(at, noise.weighed, 1.0, noise.relative)
+        return back((squared - size**2) * (noise.sharp / (at * grown)) ** 2)[0]
 
     series = [s for s in rows.line.elements if isinstance(s, Series)]
     lengths = [k.length for s in series for k in s.kinds if isinstance(k, Drift)]
-    none, here, slope = jnp.zeros(len(magnets) + 1), sigma / unit, jax.grad(chi2)
+    none, here = jnp.zeros(len(magnets) + 1), sigma / unit
     seen = elements(none, lengths)
     by_sigma = jax.grad(lambda s: jnp.log(emittance_parts(s * unit)[0]))(here)
     weights = jnp.linalg.solve(jax.jacfwd(slope)(here, seen), by_sigma)
@@ -246,11 +264,12 @@ def range_sensitivity(plane: PlaneFit) -> list[RangeRow]:
 def _without(plane: PlaneFit, left_out: np.ndarray) -> float:
     """The emittance without some points; NaN where the rest has none."""
     p = plane.points
-    rows = (p.r11, p.r12, p.size, np.where(left_out, np.inf, p.error), p.known)
+    error = error_at(p.size, p.weighed, p.error, p.relative)
+    rows = (p.r11, p.r12, p.size, np.where(left_out, np.inf, error), p.known)
     full = [padded(v) for v in rows]
     full[3][len(p.size) :] = np.inf
     # One at a time: a batch of another shape would be compiled for this table alone.
-    fit = fit_sizes(*full, method=plane.method)
+    fit = fit_sizes(*full, method=plane.method, relative=p.relative, weights=plane.weights)
     return math.sqrt(fit.determinant) if fit.positive else math.nan
 
 

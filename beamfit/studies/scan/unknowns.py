@@ -237,7 +237,6 @@ def _scenario_answer(
         chi2=group.chi2,
         dof=round(group.dof),
         scale=group.scale if group.scale > 0 else 1.0,
-        noise="inferred from the residuals",
         rests_on=u.rests_on,
         limits=(None, None),
         distance=u.distance,
