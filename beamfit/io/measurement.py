@@ -8,10 +8,12 @@ from os import PathLike
 from pathlib import Path
 
 import numpy as np
+from scipy.special import fdtrc
 
 from beamfit.errors import InputError
 from beamfit.io.scan_columns import ENERGIES, SETTINGS, column_notes, scan_columns
 from beamfit.io.table import UNITS, Column, Sheet, read_sheet
+from beamfit.statistics import POOR_FIT
 from beamfit.studies.scan.scans import POSSIBLE, USUAL, QuadScan, first_unusable, row_keys
 
 __all__ = ["average_shots", "read_quad_scan"]
@@ -33,8 +35,6 @@ RANGES = {
     "energy_spread": (-1e-300, 0.2, "a relative spread between 0 and 0.2; is it in %?"),
     "shots": (0.5, 1e9, "how many shots the row is the mean of, and its errors are taken from"),
 }
-# Below this many shots a setting's own scatter is too uncertain to weight it by.
-ENOUGH_SHOTS = 5
 # With fewer repeats in all (two or three accidental ones) the scatter says nothing.
 ENOUGH_DEGREES = 3
 
@@ -260,10 +260,11 @@ def average_shots(scan: QuadScan, *, marked: bool) -> QuadScan:
     Returns
     -------
     QuadScan
-        One row a setting. The error is the standard error of the mean, s/√n with n - 1 in s;
-        where a setting has fewer than five shots, s is the relative scatter pooled over all
-        settings, because two or three shots can agree by chance. With fewer than three
-        repeats in all the errors of the file stand, or there are none and the fit infers them.
+        One row a setting. The error is the standard error of the mean, s/√n with n - 1 in s, and
+        ``shots`` says of how many, so that the fit can even out what few shots say by chance.
+        With fewer than three repeats in all the errors of the file stand, or there are none and
+        the fit infers them. Rows that are not said to be shots, and differ at one setting far
+        more than at the others, stay as they are.
 
     Examples
     --------
@@ -277,6 +278,8 @@ def average_shots(scan: QuadScan, *, marked: bool) -> QuadScan:
     group = np.array([rows.setdefault(key, len(rows)) for key in keys])
     if len(rows) == len(group) or (scan.error and not marked):
         return scan if scan.error else replace(scan, error_source="none given")
+    if not marked and not all(_alike(values, group) for values in scan.size.values()):
+        return replace(scan, error_source="none given")
     size, scatter, given = {}, {}, {}
     for plane, values in scan.size.items():
         size[plane], error = _shot_means(values, group)
@@ -311,17 +314,38 @@ def _means(values: np.ndarray, group: np.ndarray) -> tuple[np.ndarray, np.ndarra
         return number, np.bincount(group, np.where(measured, values, 0.0)) / number
 
 
+def _scatter(size: np.ndarray, group: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Of each setting the mean of its shots, how many may still differ, and their square sum."""
+    number, mean = _means(size, group)
+    with np.errstate(invalid="ignore"):
+        square = number * _means((size - mean[group]) ** 2, group)[1]
+    return mean, np.maximum(number - 1, 0), np.nan_to_num(square)
+
+
+def _alike(size: np.ndarray, group: np.ndarray) -> bool:
+    """Whether repeats scatter as if by one relative noise: the largest against all others by F."""
+    mean, degrees, square = _scatter(size, group)
+    square = square / mean**2
+    others, rest = degrees.sum() - degrees, square.sum() - square
+    tested = (degrees > 0) & (others >= ENOUGH_DEGREES)
+    if not tested.any():
+        return True
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ratio = (square / degrees) / (rest / others)
+    chance = fdtrc(degrees[tested], others[tested], np.nan_to_num(ratio[tested], nan=1.0))
+    return bool(chance.min() * tested.sum() > POOR_FIT)
+
+
 def _shot_means(size: np.ndarray, group: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
     """Mean of the shots of each setting, m, and its standard error.
 
-    The error is None where too few repeat or all agree.
+    The error is None where too few repeat or all agree; of a setting that has one shot, or whose
+    shots agree to the last digit, it is that of all settings together.
     """
-    number, mean = _means(size, group)
-    square = number * _means((size - mean[group]) ** 2, group)[1]
-    degrees = np.maximum(number - 1, 0).sum()
-    pooled = np.sqrt(np.nansum(square / mean**2) / max(degrees, 1))
-    if degrees < ENOUGH_DEGREES or pooled == 0.0:
+    mean, degrees, square = _scatter(size, group)
+    pooled = np.sqrt(np.nansum(square / mean**2) / max(degrees.sum(), 1))
+    if degrees.sum() < ENOUGH_DEGREES or pooled == 0.0:
         return mean, None
-    own = np.sqrt(square / np.maximum(number - 1, 1))
-    deviation = np.where((number >= ENOUGH_SHOTS) & (own > 0), own, pooled * mean)
-    return mean, deviation / np.sqrt(np.where(number > 0, number, np.nan))
+    own = np.sqrt(square / np.maximum(degrees, 1))
+    deviation = np.where((degrees > 0) & (own > 0), own, pooled * mean)
+    return mean, deviation / np.sqrt(np.where(np.isnan(mean), np.nan, degrees + 1))

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 
 from beamfit.errors import InputError
 from beamfit.io.measurement import read_quad_scan
+from beamfit.studies.scan.noise import noise_of
 
 PLAIN = "Q_kG,size_x_um,size_x_error_um\n-4,111.5,1.5\n-3,60,0.5\n-1,104,1\n"
 
@@ -125,15 +126,37 @@ def test_five_shots_give_the_standard_error_of_their_mean(read):
     assert "standard error" in scan.error_source
 
 
-def test_fewer_than_five_shots_share_their_relative_scatter(read):
+def test_shots_even_out_over_the_settings(read):
+    """Of each setting its own scatter; the fit takes it together with that of all."""
     sizes = [[100.0, 104.0], [50.0, 50.0], [80.0, 79.0, 84.0]]
     rows = [f"{i},{s}" for i, shots in enumerate(sizes) for s in shots]
     scan = read("\n".join(["Q_A,size_x_um", *rows]))
     # by hand: squares of the deviations over the squared mean, over the degrees of freedom
     squares = 2 * (2 / 102) ** 2 + 0.0 + (1 + 4 + 9) / 81**2
     pooled = np.sqrt(squares / (1 + 1 + 2))
-    expected = [pooled * m / np.sqrt(n) for m, n in ((102, 2), (50, 2), (81, 3))]
-    np.testing.assert_allclose(scan.error["x"], 1e-6 * np.array(expected), rtol=1e-12)
+    own = np.array(
+        [np.sqrt(8) / np.sqrt(2), pooled * 50 / np.sqrt(2), np.sqrt(14 / 2) / np.sqrt(3)]
+    )
+    np.testing.assert_allclose(scan.error["x"], 1e-6 * own, rtol=1e-12)
+    relative, freedom = own / [102, 50, 81] * np.sqrt([2, 2, 3]), np.array([1, 1, 2])
+    together = freedom @ relative**2 / freedom.sum()
+    shrunken = np.sqrt((20 * together + freedom * relative**2) / (20 + freedom))
+    noise = noise_of(scan, "x")
+    expected = 1e-6 * shrunken * [102, 50, 81] / np.sqrt([2, 2, 3])
+    np.testing.assert_allclose(noise.error, expected, rtol=1e-12)
+    assert noise.dof == 4
+
+
+def test_repeats_that_differ_far_more_than_others_are_not_averaged(read):
+    """A setting met twice with another history is two measurements, not two shots."""
+    sizes = [[100, 101], [90, 90.5], [80, 81], [75, 95], [85, 84.2], [99, 98.5]]
+    rows = [f"{i},{s}" for i, shots in enumerate(sizes) for s in shots]
+    text = "\n".join(["Q_A,size_x_um", *rows])
+    scan = read(text)
+    assert len(scan) == 12
+    assert scan.shots is None and not scan.error
+    marked = "\n".join(["Q_A,size_x_um,shot", *(f"{r},{i}" for i, r in enumerate(rows))])
+    assert len(read(marked)) == 6
 
 
 def test_rows_with_errors_of_their_own_are_averaged_only_if_marked_as_shots(read):

@@ -46,7 +46,7 @@ NO_ANSWER = (
     Status.contradictory_bounds,
 )
 # How often errors are taken anew at most, and what change of them no longer matters.
-ROUNDS, SAME = 5, 1e-3
+ROUNDS, SAME = 3, 1e-2
 # The noise of a record whose fit was refused.
 NOTHING = Group("", slice(0), True, math.nan, 0, 0.0, math.nan)
 
@@ -84,7 +84,8 @@ def settled_fit(seen: Seen, fit: Fit) -> Found:
             for new, old in zip(records, fit.problem.records, strict=True)
         ):
             break
-        fit = solve(replace(fit.problem, model=fit.model, records=records))
+        again = solve(replace(fit.problem, model=fit.model, records=records))
+        fit = replace(again, attempts=(*fit.attempts, *again.attempts))
         found = _through(seen, fit)
     return found
 
