@@ -154,7 +154,8 @@ def test_repeats_that_differ_far_more_than_others_are_not_averaged(read):
     text = "\n".join(["Q_A,size_x_um", *rows])
     scan = read(text)
     assert len(scan) == 12
-    assert scan.shots is None and not scan.error
+    assert scan.shots is None
+    assert not scan.error
     marked = "\n".join(["Q_A,size_x_um,shot", *(f"{r},{i}" for i, r in enumerate(rows))])
     assert len(read(marked)) == 6
 
