@@ -127,7 +127,7 @@ def _beam_answer(seen: Seen, plane: str) -> Answer:
     if not determined:
         advice = next_measurement(seen, plane)
         finding = judge(evidence._replace(advice=advice), BEAM_RULES)
-    finding = finding._replace(remedy=finding.remedy + _outlier_words(p))
+    finding = finding._replace(remedy=f"{finding.remedy} {_outlier_words(p)}".strip())
     e = evidence
     # The three numbers of size² can be known although the emittance is not.
     linear = determined or (e.full_rank and e.positive and e.misfit <= LOST and e.dof > 0)
@@ -223,4 +223,4 @@ def _outlier_words(p: Points) -> str:
     if not len(doubted):
         return ""
     places = "; ".join(p.where(i) for i in doubted)
-    return f" {len(doubted)} of {len(probability)} points more likely outliers than not: {places}."
+    return f"{len(doubted)} of {len(probability)} points more likely outliers than not: {places}."
