@@ -9,6 +9,7 @@ problem's own sizes, so that no answer hangs on units.
 
 from __future__ import annotations
 
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -147,16 +148,13 @@ class State(NamedTuple):
 
 def first_order(core, theta):
     """The parts of `Slopes`, compiled once for each structure of problem."""
-    r, j = problem.residual(core, theta), jax.jacfwd(problem.residual, 1)(core, theta)
-    cost, gradient = jax.value_and_grad(problem.cost, 1)(core, theta)
+    r, j = problem.with_slope(partial(problem.residual, core), theta)
+    further, pull = jax.value_and_grad(problem.further, 1)(core, theta)
     c = problem.constraints(core, theta)
-    return r, j, cost, gradient, c, constraint_slopes(core, theta)
-
-
-def constraint_slopes(core, theta):
-    """Jacobian of the constraints, by as few sweeps as there are variables or constraints."""
+    # By as few sweeps as there are variables or constraints.
     few = jax.eval_shape(problem.constraints, core, theta).shape < theta.shape
-    return (jax.jacrev if few else jax.jacfwd)(problem.constraints, 1)(core, theta)
+    slopes = (jax.jacrev if few else jax.jacfwd)(problem.constraints, 1)(core, theta)
+    return r, j, 0.5 * r @ r + further, r @ j + pull, c, slopes
 
 
 def slopes(p: Problem, theta: np.ndarray) -> Slopes:

@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from beamfit.greybox.problem import Problem
+from beamfit.greybox.problem import Problem, with_slope
 from beamfit.greybox.problem import residual as problem_residual
 
 __all__ = ["Found", "Lanes", "Walk", "descend_all", "descend_one", "walk"]
@@ -188,17 +188,9 @@ def descend_all(
 
 
 def _advance(residual, lower: Array, upper: Array, tolerance: float, s: Walk) -> Walk:
-    """Look at the point tried, take or refuse it, and find the next one.
-
-    Residuals and Jacobian come of one evaluation: nearly every step is accepted.
-    """
-
-    def twice(t):
-        r = residual(t)
-        return r, r
-
+    """Look at the point tried, take or refuse it, and find the next one."""
     first = s.steps < 0
-    j, r = jax.jacfwd(twice, has_aux=True)(s.trial)
+    r, j = with_slope(residual, s.trial)
     finite = jnp.all(jnp.isfinite(r)) & jnp.all(jnp.isfinite(j))
     gained = 0.5 * (s.residual - r) @ (s.residual + r)
     ratio = jnp.where(finite & (s.promised > 0), gained / s.promised, -1.0)

@@ -14,7 +14,7 @@ from beamfit.errors import InputError, nearest
 from beamfit.greybox import tree
 from beamfit.greybox.assess import KKT, TOLERANCE
 from beamfit.greybox.covariance import MOST_SHARE, Group, Spread
-from beamfit.greybox.problem import Problem
+from beamfit.greybox.problem import Problem, with_slope
 from beamfit.status import Status
 from beamfit.verdict import Finding
 
@@ -75,10 +75,7 @@ class Derived(NamedTuple):
 
 @partial(jax.jit, static_argnums=(0, 1))
 def _with_slope(function, chosen, model, theta, data):
-    def of_theta(t):
-        return function(tree.replace(model, chosen, t), data)
-
-    return of_theta(theta), jax.jacfwd(of_theta)(theta)
+    return with_slope(lambda t: function(tree.replace(model, chosen, t), data), theta)
 
 
 class Attempt(NamedTuple):
@@ -119,6 +116,8 @@ class Fit:
     spread, spread_raw : Spread
         Errors in linear approximation along the active limits, bounds counted as information:
         each record's residuals divided by the scale of its group, or by 1 where errors were given.
+    jacobian : array, shape (m, n)
+        Derivatives of the residuals, in units of their errors, priors last.
     undetermined : array, shape (n, k)
         Directions in theta that the residuals do not see.
     scale : float
@@ -142,6 +141,7 @@ class Fit:
     constraints: tuple[Limited, ...]
     spread: Spread
     spread_raw: Spread
+    jacobian: np.ndarray
     undetermined: np.ndarray
     scale: float
     attempts: tuple[Attempt, ...]

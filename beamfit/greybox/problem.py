@@ -72,9 +72,24 @@ def residual(core: Core, theta: jax.Array) -> jax.Array:
 def cost(core: Core, theta: jax.Array) -> jax.Array:
     """Half the sum of squared residuals plus the further objectives."""
     r = residual(core, theta)
+    return 0.5 * r @ r + further(core, theta)
+
+
+def further(core: Core, theta: jax.Array) -> jax.Array:
+    """The sum of the further objectives."""
     model = _model_at(core, theta)
-    extra = [jnp.sum(o.weight * o.function(model, o.data)) for o in core.objectives]
-    return 0.5 * r @ r + sum(extra)
+    return sum((jnp.sum(o.weight * o.function(model, o.data)) for o in core.objectives), 0.0)
+
+
+def with_slope(function: Callable[[jax.Array], jax.Array], theta: jax.Array):
+    """A function's value and its derivatives, of one evaluation: half the code to compile."""
+
+    def twice(t):
+        value = function(t)
+        return value, value
+
+    slope, value = jax.jacfwd(twice, has_aux=True)(theta)
+    return value, slope
 
 
 @jax.jit

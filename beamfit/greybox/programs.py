@@ -7,9 +7,9 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from functools import lru_cache
 from typing import NamedTuple
 
-import jax
 import numpy as np
 from scipy import optimize
 
@@ -194,16 +194,6 @@ def _values(core, theta):
     return problem.cost(core, theta), problem.constraints(core, theta)
 
 
-def _first(core, theta):
-    return jax.grad(problem.cost, 1)(core, theta), assess.constraint_slopes(core, theta)
-
-
-def _squares(core, theta, sigma, y):
-    """Gauss-Newton's part of the Hessian of the Lagrangian."""
-    j = jax.jacfwd(problem.residual, 1)(core, theta)
-    return sigma * j.T @ j
-
-
 def _tame(size: np.ndarray) -> np.ndarray:
     """Sizes near 1 are left alone: solvers' own steps and tolerances are made for those."""
     return np.where((size > 1e2) | (size < 1e-2), size, 1.0)
@@ -243,38 +233,36 @@ def scaled(
     steepest = max(np.max(np.abs(at.gradient * scale.unit)), 1e-300)
     # Squares are counted in their errors; a steep cost is flattened, as IPOPT does.
     flat = 1.0 / scale.cost if p.objectives else min(1.0, 100.0 / steepest)
-    second = _squares if hessian == "gauss_newton" else curvature.lagrangian_hessian
-    functions = {function: p.compiled(function) for function in (_values, _first, second)}
-    kept: dict = {}
 
     def full(x):
         theta = start.copy()
         theta[moving] = x * unit
         return theta
 
-    def remember(function, x):
-        key = (function, x.tobytes())
-        if key not in kept:
-            if len(kept) > 8:
-                kept.clear()
-            kept[key] = [np.asarray(part) for part in functions[function](full(x))]
-        return kept[key]
+    @lru_cache(maxsize=8)
+    def parts(function, x):
+        return [np.asarray(part) for part in p.compiled(function)(full(np.frombuffer(x)))]
 
     def values(x):
-        cost, c = remember(_values, x)
+        cost, c = parts(_values, x.tobytes())
         return flat * float(cost), c / limit
 
     def slopes(x):
-        gradient, jacobian = remember(_first, x)
-        return flat * gradient[moving] * unit, jacobian[:, moving] * unit / limit[:, None]
+        s = assess.Slopes(*parts(assess.first_order, x.tobytes()))
+        return flat * s.gradient[moving] * unit, s.jacobian[:, moving] * unit / limit[:, None]
+
+    def squares(x, sigma, y):
+        rows = parts(assess.first_order, x.tobytes())[1][:, moving] * unit
+        return sigma * flat * rows.T @ rows
 
     def bend(x, sigma, y):
-        h = np.asarray(functions[second](full(x), sigma * flat, y / limit))
+        exact = p.compiled(curvature.lagrangian_hessian)
+        h = np.asarray(exact(full(x), sigma * flat, y / limit))
         return h[np.ix_(moving, moving)] * np.outer(unit, unit)
 
     def lagrangian(y):
         def at_points(points):
-            found = (functions[_values](point) for point in points)
+            found = (p.compiled(_values)(point) for point in points)
             return np.array([float(cost) - y @ np.asarray(c) for cost, c in found])
 
         return at_points
@@ -282,7 +270,7 @@ def scaled(
     return Program(
         values,
         slopes,
-        bend,
+        squares if hessian == "gauss_newton" else bend,
         p.lower[moving] / unit,
         p.upper[moving] / unit,
         p.constraint_lower / limit,

@@ -22,6 +22,8 @@ __all__ = ["search", "solve", "starting_points"]
 
 # Steps from many starts; what is left is for the polish of the cheapest ends.
 STEPS, POLISHED = 300, 4
+# A search whose cost falls by less than this share in so many steps gains nothing.
+NOTHING, STRETCH = 1e-7, 100
 # Searches side by side at least, so that the points beside an end are looked at in one call.
 LANES = 4
 # Bytes that Jacobians of starts searched together may take.
@@ -243,20 +245,28 @@ def _lanes(p: Problem, points: np.ndarray, budget: Budget) -> tuple[list[State],
     k = len(points)
     spare = 0 if points.shape[1] * p.size > MEMORY / 64 else max(0, LANES - k)
     lanes = Lanes(p, np.concatenate([points, np.repeat(points[:1], spare, axis=0)]))
-    first = budget.iterations if k == 1 else min(STEPS, budget.iterations)
-    lanes.go(np.arange(k), first, budget.until)
+    lanes.go(np.arange(k), min(STEPS, budget.iterations), budget.until)
     cost = lanes.cost[:k]
     found: dict[int, State] = {}
     for lane in np.argsort(cost, kind="stable")[:POLISHED].tolist():
         if not np.isfinite(cost[lane]):
             break
-        if not lanes.done[lane]:
-            lanes.go(np.array([lane]), budget.iterations, budget.until)
+        _go_on(p, lanes, lane, budget.iterations, budget)
         found[lane] = _moved_off(p, lanes, lane, budget)
         if _rests(p, found[lane]):
             break
     accounts = [_account(p, lanes, lane, found.get(lane)) for lane in range(k)]
     return list(found.values()), accounts
+
+
+def _go_on(p: Problem, lanes: Lanes, lane: int, limit: int, budget: Budget) -> None:
+    """Polish one search until it rests, or has settled in a flat valley where it gains nothing."""
+    while not lanes.done[lane] and lanes.steps[lane] < limit and budget.left > 0:
+        before = lanes.cost[lane]
+        lanes.go(np.array([lane]), min(limit, int(lanes.steps[lane]) + STRETCH), budget.until)
+        gained = before - lanes.cost[lane]
+        if gained < NOTHING * before and settled(p, _judged(p, lanes, lane)):
+            return
 
 
 def _account(p: Problem, lanes: Lanes, lane: int, s: State | None) -> Attempt:
@@ -284,7 +294,7 @@ def _moved_off(p: Problem, lanes: Lanes, lane: int, budget: Budget) -> State:
         if point is None or budget.left <= 0:
             break
         lanes.move(lane, point)
-        lanes.go(np.array([lane]), int(lanes.steps[lane]) + budget.iterations, budget.until)
+        _go_on(p, lanes, lane, int(lanes.steps[lane]) + budget.iterations, budget)
         s = _judged(p, lanes, lane)
     return s
 

@@ -207,8 +207,8 @@ def conclude(p: Problem, s: State, search: Search, seconds: float) -> Fit:
     message = " ".join([finding.message, *_remarks(evidence)])
     return Fit(
         p, s.theta, finding.status, message, float(s.at.cost), chi2, dof, found.groups, s.kkt,
-        variables, constraints, found.spread, found.raw, found.unseen, float(scale),
-        search.attempts, seconds,
+        variables, constraints, found.spread, found.raw, s.at.residual_jacobian, found.unseen,
+        float(scale), search.attempts, seconds,
     )  # fmt: skip
 
 
@@ -250,7 +250,7 @@ def refused(
     )
     return Fit(
         p, theta, status, message, nan, nan, 0, (), assess.KKT(inf, inf, inf), variables,
-        constraints, lost, lost, np.eye(n), nan, attempts, seconds,
+        constraints, lost, lost, np.zeros((p.size, n)), np.eye(n), nan, attempts, seconds,
     )  # fmt: skip
 
 

@@ -388,14 +388,58 @@ def _condensed(same: _Same, keep: frozenset[str], energy: float | None) -> Beaml
     return same.line.condensed(keep, energy)
 
 
+def _from_strengths(
+    places: tuple[str, ...], strengths: dict[str, Array], line: Beamline, energy: Array
+) -> Array:
+    found = line.matrices(places, strengths, energy)
+    return jnp.stack([jnp.asarray(found[p].planes) for p in places], axis=-3)
+
+
+# A row has few strengths, the weights of a network are many: so the line is differentiated by
+# strengths alone, and what those hang on is carried through one small product.
+_by_strengths = jax.custom_jvp(_from_strengths, nondiff_argnums=(0,))
+
+
+@partial(_by_strengths.defjvp, symbolic_zeros=True)
+def _through_strengths(places, given, changes):
+    strengths, *others = given
+    found = _from_strengths(places, *given)
+    slopes = jax.jacfwd(partial(_from_strengths, places))(*given)
+    moved = [slopes[name] * d for name, d in changes[0].items() if not _still(d)]
+    leaves, kind = jax.tree.flatten(others)
+    rest = jax.tree.leaves(changes[1:], is_leaf=_still)
+    moving = [i for i, d in enumerate(rest) if not _still(d)]
+
+    def by_rest(values):
+        every = dict(enumerate(leaves)) | dict(zip(moving, values, strict=True))
+        return _from_strengths(places, strengths, *jax.tree.unflatten(kind, every.values()))
+
+    if moving:
+        at, along = ([part[i] for i in moving] for part in (leaves, rest))
+        moved.append(jax.jvp(by_rest, (at,), (along,))[1])
+    return found, sum(moved, jnp.zeros_like(found))
+
+
+def _still(change: Any) -> bool:
+    return isinstance(change, jax.custom_derivatives.SymbolicZero)
+
+
 @partial(jax.jit, static_argnames="places")
 def _rows(
     line: Beamline, settings: dict[str, Array], energy: Array, places: tuple[str, ...]
 ) -> TransferMatrix:
+    bare = line
+    for name in settings:
+        bare = bare.with_element(replace(line[name], calibration=IntegratedStrength(), setting=0.0))
+
     def one(row: tuple[dict[str, Array], Array]) -> Array:
         setting, at = row
-        found = line.matrices(places, setting, energy if at is None else at)
-        return jnp.stack([jnp.asarray(found[p].planes) for p in places], axis=-3)
+        at = energy if at is None else at
+        strengths = {
+            name: jnp.asarray(line[name].calibration.k1l(v, line[name].length, at), float)
+            for name, v in setting.items()
+        }
+        return _by_strengths(places, strengths, bare, at)
 
     rows = (settings, None if jnp.ndim(energy) == 0 else energy)
     long = max((e.order.size for e in line.elements if isinstance(e, Series)), default=0)

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from beamfit.greybox import assess, tree
+from beamfit.greybox import tree
 from beamfit.greybox.covariance import Group
 from beamfit.greybox.fit import Derived, Fit
 from beamfit.greybox.problem import Record
@@ -251,7 +251,7 @@ def _scenario_answer(
 def _loose_jacobian(fit: Fit) -> np.ndarray:
     """Residuals by free numbers, errors as scaled, without weights that bounds hold."""
     p = fit.problem
-    rows = assess.slopes(p, fit.theta).residual_jacobian.copy()
+    rows = fit.jacobian.copy()
     for group in fit.groups:
         rows[group.rows] /= group.factor
     edge = np.array([v.state in ("lower", "upper") for v in fit.variables])
