@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 from beamfit.quantity import Quantity
 from beamfit.status import Status
 
-__all__ = ["Table", "cell", "html_of", "json_of", "labelled", "text_of"]
+__all__ = ["Table", "cell", "html_of", "json_of", "labelled", "plain_name", "text_of"]
 
 
 class Table(NamedTuple):
@@ -148,3 +148,14 @@ def json_of(value: Any) -> Any:
     if isinstance(value, list | tuple):
         return [json_of(v) for v in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def plain_name(name: str) -> str:
+    """Write a name as words.
+
+    Examples
+    --------
+    >>> plain_name("x.normalized_emittance")
+    'x normalised emittance'
+    """
+    return name.replace(".", " ").replace("_", " ").replace("normalized", "normalised")

@@ -14,7 +14,6 @@ from typing import NamedTuple
 
 import jax
 import numpy as np
-from scipy.optimize import nnls
 
 from beamfit.greybox import problem
 from beamfit.greybox.problem import Problem
@@ -293,6 +292,8 @@ def multipliers(
     size = np.linalg.norm(columns, axis=0)
     columns = columns / np.where(size > 0, size, 1.0)
     right = gradient / scale
+    from scipy.optimize import nnls  # a third of a second that only limits should cost
+
     guess, _ = nnls(columns, right, maxiter=50 * columns.shape[1])
     used = guess > 0
     # One plain least-squares solution on the support: nnls stops at a tolerance.

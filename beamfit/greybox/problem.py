@@ -172,7 +172,8 @@ class Problem:
     @cached_property
     def start(self) -> np.ndarray:
         """The model's own values of the free numbers."""
-        return np.asarray(tree.read(self.core.model, self.core.chosen))
+        values = jax.tree_util.tree_leaves(self.core.model)
+        return np.concatenate([np.asarray(values[leaf.index]).ravel() for leaf in self.core.chosen])
 
     @cached_property
     def lower(self) -> np.ndarray:
@@ -264,7 +265,7 @@ class Problem:
 
     def model_at(self, theta) -> Any:
         """The model with the free numbers set to theta."""
-        return _model_at(self.core, jnp.asarray(theta, float))
+        return _model_at(self.core, np.asarray(theta, float))
 
     def residual(self, theta) -> jax.Array:
         """Residuals in units of their errors, priors last, shape (values,)."""

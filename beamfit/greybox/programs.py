@@ -11,7 +11,6 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
-from scipy import optimize
 
 from beamfit.greybox import assess, curvature, problem
 from beamfit.greybox.problem import Problem
@@ -130,6 +129,8 @@ def _uno_model(unopy, program: Program, x: np.ndarray):
 
 def _slsqp(program: Program, x: np.ndarray, iterations: int, budget: Budget) -> Proposal:
     """Solve by scipy's sequential quadratic programming."""
+    from scipy import optimize
+
     sides = [(1.0, program.c_lower), (-1.0, program.c_upper)]
     equal = program.c_lower == program.c_upper
     rules = [

@@ -9,7 +9,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.experimental import checkify
-from scipy.special import chdtrc
 
 from beamfit import verdict
 from beamfit.greybox import assess, curvature, problem
@@ -23,16 +22,15 @@ from beamfit.greybox.covariance import (
     spread_of,
     triangle,
 )
+from beamfit.greybox.equations import Implicit
 from beamfit.greybox.fit import Attempt, Fit, Limited, Variable
-from beamfit.greybox.implicit import Implicit
 from beamfit.greybox.problem import Problem
-from beamfit.statistics import POOR_FIT
+from beamfit.statistics import POOR_FIT, chi2_probability
 from beamfit.status import Status
 from beamfit.verdict import Finding
 
 __all__ = ["RULES", "Evidence", "Known", "Search", "conclude", "known", "refused", "settled"]
 
-# Chance of a chi-square below which a fit counts as poor.
 # A further decrease of chi-square below this changes nothing anybody asks for.
 SETTLED = 0.01
 # Below this the cost counts as without end, in its own size.
@@ -306,7 +304,7 @@ def _undetermined(e: Evidence) -> Finding | None:
 
 def _poor(e: Evidence) -> Finding | None:
     """Say that the residuals are larger than the errors allow."""
-    chance = float(chdtrc(e.dof, e.chi2)) if e.dof > 0 else 1.0
+    chance = chi2_probability(e.chi2, e.dof) if e.dof > 0 else 1.0
     if not e.problem.errors_known or chance >= POOR_FIT:
         return None
     cause = (

@@ -15,13 +15,12 @@ from matplotlib.ticker import MaxNLocator, NullLocator
 from beamfit.report.document import BLUE, MANY, Page, Picture, Verdict, legend_below
 from beamfit.report.emittance import COLOUR, setting_axis
 from beamfit.sampling.likelihood import noise_words
-from beamfit.sampling.posterior import Expected, Posterior
-from beamfit.sampling.summary import in_unit, plain_name
+from beamfit.sampling.posterior import Expected, Posterior, in_unit
 from beamfit.studies.decay.fit import DecayFit
 from beamfit.studies.decay.posterior import expected_current
 from beamfit.studies.scan.fit import EmittanceFit
 from beamfit.studies.scan.posterior import expected_sizes
-from beamfit.table import Table
+from beamfit.table import Table, plain_name
 
 __all__ = ["Sampled", "draw_pairs", "of_decay", "of_scan", "with_posteriors"]
 

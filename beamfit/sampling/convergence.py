@@ -7,9 +7,9 @@ from typing import NamedTuple
 import numpy as np
 
 from beamfit.sampling.likelihood import FRACTION, Group, noise_words
-from beamfit.sampling.summary import plain_name
 from beamfit.sampling.target import Target
 from beamfit.status import Status
+from beamfit.table import plain_name
 from beamfit.verdict import Finding
 
 __all__ = [

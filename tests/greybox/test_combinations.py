@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from beamfit.greybox.difference import TaylorDifference
+from beamfit.greybox.equations import TaylorDifference
 from beamfit.greybox.maps import Formula, Parallel, Series
 from beamfit.greybox.mlp import Port, dense
 from beamfit.greybox.problem import Free, Prior, Problem, Record

@@ -12,9 +12,8 @@ from jax.experimental import checkify
 
 import beamfit.greybox
 from beamfit.errors import InputError
-from beamfit.greybox.difference import TaylorDifference
+from beamfit.greybox.equations import Implicit, TaylorDifference
 from beamfit.greybox.gains import adjoints, gain, sensitivities
-from beamfit.greybox.implicit import Implicit
 from beamfit.greybox.maps import (
     Affine,
     Foreign,

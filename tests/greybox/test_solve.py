@@ -23,9 +23,9 @@ from appendices import (
 from beamfit.errors import InputError
 from beamfit.greybox import programs
 from beamfit.greybox import solve as solving
+from beamfit.greybox.equations import Implicit
 from beamfit.greybox.fit import Status
 from beamfit.greybox.gains import certified_gain
-from beamfit.greybox.implicit import Implicit
 from beamfit.greybox.maps import Foreign
 from beamfit.greybox.mlp import dense
 from beamfit.greybox.problem import Constraint, Free, Objective, Prior, Problem, Record

@@ -18,8 +18,7 @@ from beamfit.lifetime.losses import MECHANISMS
 from beamfit.lifetime.ring import Operation
 from beamfit.lifetime.scaled import loss_terms, scaled_losses, scaled_parts
 from beamfit.quantity import Quantity, Status
-from beamfit.sampling.posterior import Posterior
-from beamfit.sampling.summary import Interval
+from beamfit.sampling.posterior import Interval, Posterior
 from beamfit.studies.decay.fit import bare
 from beamfit.studies.decay.loss_budget import Machine, operation_during, settings_json
 from beamfit.studies.decay.network import Network, NetworkFit, fit_loss_network

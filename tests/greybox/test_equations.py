@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from beamfit.errors import InputError
-from beamfit.greybox.difference import TaylorDifference
+from beamfit.greybox.equations import TaylorDifference
 from beamfit.greybox.problem import Free, Problem, Record
 from beamfit.greybox.solve import solve
 
