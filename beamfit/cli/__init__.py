@@ -11,6 +11,7 @@ import click
 from beamfit import __version__
 from beamfit.cli.design import design
 from beamfit.cli.emittance import emittance
+from beamfit.cli.example import example
 from beamfit.cli.lifetime import lifetime
 from beamfit.cli.setpoint import setpoint
 from beamfit.errors import InputError
@@ -31,6 +32,7 @@ cli.add_command(emittance)
 cli.add_command(lifetime)
 cli.add_command(setpoint)
 cli.add_command(design)
+cli.add_command(example)
 
 
 def main() -> None:

@@ -1,0 +1,55 @@
+"""A first scan, lattice and decay, small and commented, to run the commands on."""
+
+from __future__ import annotations
+
+from importlib.resources import files
+from os import PathLike
+from pathlib import Path
+
+from beamfit.errors import InputError
+from beamfit.io.files import write_atomically
+
+__all__ = ["EXAMPLE_FILES", "write_example"]
+
+EXAMPLE_FILES = ("scan.csv", "lattice.toml", "decay.csv")
+
+
+def write_example(folder: str | PathLike[str]) -> tuple[Path, ...]:
+    """Write the example files into a folder, which is made if it is not there.
+
+    Parameters
+    ----------
+    folder : str or path
+        Where to.
+
+    Returns
+    -------
+    tuple of Path
+        The scan, its lattice, and a decay record; all SIMULATED.
+
+    Raises
+    ------
+    InputError
+        If one of the files is there already (nothing is written then), or the folder cannot be
+        written.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> [path.name for path in write_example(tempfile.mkdtemp())]
+    ['scan.csv', 'lattice.toml', 'decay.csv']
+    """
+    targets = tuple(Path(folder) / name for name in EXAMPLE_FILES)
+    try:
+        Path(folder).mkdir(parents=True, exist_ok=True)
+        there = [path for path in targets if path.exists() or path.is_symlink()]
+    except (OSError, ValueError) as error:  # a name with a zero byte is a ValueError
+        cause = getattr(error, "strerror", None) or error
+        found = f"a place where no folder can be ({cause})"
+        raise InputError(found, "a folder to write into", path=folder) from None
+    if there:
+        found = "a file that is there already and is not overwritten"
+        raise InputError(found, "a folder without it, such as a new one", path=there[0])
+    for path in targets:
+        write_atomically(path, (files("beamfit") / "example" / path.name).read_bytes())
+    return targets

@@ -1,0 +1,92 @@
+"""The example files: written whole, never over others, answered at once, as README shows them."""
+
+import re
+import subprocess
+import sys
+from importlib.resources import files
+
+import numpy as np
+import pytest
+
+from beamfit import read_decay_record, read_quad_scan
+from beamfit.io.example import EXAMPLE_FILES
+
+GROUP = re.compile(r"```\w*\n(.*?)```", re.DOTALL)
+
+
+def run_module(*arguments):
+    call = [sys.executable, "-m", "beamfit", *map(str, arguments)]
+    return subprocess.run(call, capture_output=True, text=True)
+
+
+def test_a_new_folder_is_made_and_nothing_in_it_overwritten(tmp_path):
+    folder = tmp_path / "a" / "first"
+    done = run_module("example", folder)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert sorted(p.name for p in folder.iterdir()) == sorted(EXAMPLE_FILES)
+    (folder / "scan.csv").unlink()
+    (folder / "decay.csv").write_text("mine")
+    again = run_module("example", folder)
+    assert (again.returncode, again.stdout) == (2, "")
+    assert "lattice.toml: a file that is there already" in again.stderr
+    assert (folder / "decay.csv").read_text() == "mine"
+    assert not (folder / "scan.csv").exists()
+
+
+def test_a_place_that_is_no_folder_is_refused(run, tmp_path):
+    (tmp_path / "taken").write_text("")
+    status, out, error = run("example", tmp_path / "taken")
+    assert (status, out, error.count("\n")) == (2, "", 1)
+    assert "taken: a place where no folder can be" in error
+
+
+def test_the_commands_it_names_answer_it(run, tmp_path):
+    _, said, _ = run("example", tmp_path)
+    commands = [line.split() for line in said.splitlines() if line.startswith("  beamfit ")]
+    assert {words[1] for words in commands} >= {"emittance", "lifetime"}
+    for _, *arguments in commands:
+        status, out, error = run(*arguments)
+        assert (status, error) == (0, "")
+        assert "converged" in out
+
+
+def test_readme_shows_the_files_and_the_answer(run, tmp_path, root):
+    blocks = GROUP.findall((root / "README.md").read_text())
+    for name in ("scan.csv", "lattice.toml"):
+        assert (files("beamfit") / "example" / name).read_text() in blocks
+    run("example", tmp_path)
+    (answer,) = (block for block in blocks if "beamfit emittance first/" in block)
+    scan, lattice = tmp_path / "scan.csv", tmp_path / "lattice.toml"
+    said = " ".join(run("emittance", scan, "--lattice", lattice)[1].split())
+    shown = [line for line in answer.splitlines()[1:] if line != "..."]
+    for line in shown:
+        assert " ".join(line.split()) in said
+
+
+def sizes_of(plane, current, emittance, beta, alpha):
+    """Rms sizes in m behind the example's quadrupole and drift, written out anew."""
+    momentum = np.sqrt(100.0**2 - 0.51099895**2)
+    k1 = 299.792458 * 0.5 * current / momentum * (1 if plane == "x" else -1)
+    root = np.sqrt(k1.astype(complex)) + 1e-12
+    c, s = np.cos(root * 0.1).real, (np.sin(root * 0.1) / root).real
+    r11, r12 = c - 2.0 * k1 * s, s + 2.0 * c
+    gamma = (1 + alpha**2) / beta
+    geometric = emittance / (momentum / 0.51099895)
+    spread = r11**2 * beta - 2 * r11 * r12 * alpha + r12**2 * gamma
+    return np.sqrt(geometric * spread + 10e-6**2)
+
+
+@pytest.mark.parametrize(("plane", "truth"), [("x", (1e-6, 8, 0.5)), ("y", (1.2e-6, 6, -0.4))])
+def test_the_scan_is_what_its_head_says(plane, truth):
+    rows = read_quad_scan(files("beamfit") / "example" / "scan.csv").rows(plane)
+    true = sizes_of(plane, rows.settings["Q1"], *truth)
+    pull = (rows.size - true) / (0.02 * true)
+    assert 0.3 < np.sqrt(np.mean(pull**2)) < 1.7
+    np.testing.assert_allclose(rows.error, 0.02 * true, rtol=0.05)
+
+
+def test_the_decay_is_what_its_head_says():
+    record = read_decay_record(files("beamfit") / "example" / "decay.csv")
+    fall = np.exp(-1.5e-5 * record.time)
+    true = 100.0 * fall / (1 + 4e-7 / 1.5e-5 * 100.0 * (1 - fall))
+    assert 0.005 < np.std(record.current - true) < 0.02
