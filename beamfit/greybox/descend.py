@@ -36,6 +36,8 @@ ROUNDING = 1e-16
 PINNED = 3
 # With a limit of time the clock is looked at after so many steps.
 SEGMENT = 50
+# Searches in a compiled call, where their Jacobians have no more than so many numbers.
+WIDTH, LARGE = 4, 2**18
 
 
 class Found(NamedTuple):
@@ -247,35 +249,52 @@ def _next(theta, residual, jacobian, scale, damping, lower, upper) -> Array:
 
 
 class Lanes:
-    """Searches of a problem side by side: one compiled call moves them on, or looks at points."""
+    """Searches of a problem side by side, or points looked at: a few in a compiled call.
+
+    The call has one width however many searches there are, so that they share its code; one that
+    is polished alone does not wait for all.
+    """
 
     def __init__(self, p: Problem, points: np.ndarray):
         self.p, self.call = p, p.compiled(_walks)
         k, n = points.shape
-        self.theta, self.limit = np.array(points), np.zeros(k, int)
+        self.width = WIDTH if n * p.size <= LARGE else 1
+        self.theta = np.array(points)
         self.damping, self.growth = np.full(k, DAMPING), np.full(k, 2.0)
         self.size, self.steps = np.zeros((k, n)), np.zeros(k, int)
         self.done, self.rested = np.zeros(k, bool), np.zeros(k, bool)
+        rows = p.residual_count
+        self.residual, self.jacobian = np.full((k, rows), np.inf), np.zeros((k, rows, n))
 
     def go(self, lanes: np.ndarray, limit: int, until: float | None) -> None:
         """Move some searches on to a number of steps, or until a moment on the clock."""
-        self.limit[:] = 0
         reached = limit if until is None else 0
         while True:
             reached = min(max(reached, int(np.min(self.steps[lanes])) + SEGMENT), limit)
-            self.limit[lanes] = np.where(self.done[lanes], 0, reached)
-            self._call()
+            moving = lanes[~self.done[lanes]]
+            for some in np.split(moving, range(self.width, len(moving), self.width)):
+                self._move(some, reached)
             unfinished = ~self.done[lanes] & (self.steps[lanes] < limit)
             if not unfinished.any() or (until is not None and time.perf_counter() >= until):
                 return
 
-    def _call(self) -> None:
-        args = (self.theta, self.damping, self.growth, self.size, self.steps, self.limit)
-        s = [np.asarray(part) for part in self.call(*args, self.p.lower, self.p.upper)]
-        self.theta, self.residual, self.jacobian, self.size, self.damping, self.growth, *s = s
-        self.steps, rested, stuck = s
-        self.rested |= rested
-        self.done |= rested | stuck
+    def _move(self, some: np.ndarray, limit: int) -> None:
+        memory = (self.damping, self.growth, self.size, self.steps)
+        found = self._called(limit, self.theta[some], *(part[some] for part in memory))
+        *state, rested, stuck = found
+        names = ("theta", "residual", "jacobian", "size", "damping", "growth", "steps")
+        for name, part in zip(names, state, strict=True):
+            getattr(self, name)[some] = part
+        self.rested[some] = rested
+        self.done[some] = rested | stuck
+
+    def _called(self, limit: int, *state: np.ndarray) -> list[np.ndarray]:
+        """The call for no more searches than its width, filled up with the first of them."""
+        k = len(state[0])
+        every = [*state, np.full(k, limit)]
+        filled = [np.concatenate([v, np.repeat(v[:1], self.width - k, axis=0)]) for v in every]
+        found = self.call(*filled, self.p.lower, self.p.upper)
+        return [np.asarray(part)[:k] for part in found]
 
     @property
     def cost(self) -> np.ndarray:
@@ -285,19 +304,15 @@ class Lanes:
 
     def look(self, points: np.ndarray) -> np.ndarray:
         """Cost at points, without moving."""
-        k, found = len(self.theta), []
-        for part in np.split(points, range(k, len(points), k)):
-            filled = np.concatenate([part, np.repeat(part[:1], k - len(part), axis=0)])
-            none = np.zeros(k, int)
-            args = (filled, self.damping, self.growth, self.size, none, none)
-            r = np.asarray(self.call(*args, self.p.lower, self.p.upper)[1])
-            found.append(0.5 * np.sum(r**2, axis=1)[: len(part)])
+        found = []
+        for part in np.split(points, range(self.width, len(points), self.width)):
+            k = len(part)
+            memory = np.full(k, DAMPING), np.full(k, 2.0), np.zeros_like(part), np.zeros(k, int)
+            found.append(0.5 * np.sum(self._called(0, part, *memory)[1] ** 2, axis=1))
         return np.concatenate(found)
 
     def move(self, lane: int, point: np.ndarray) -> None:
         """Begin one search anew."""
-        self.theta, self.size = self.theta.copy(), self.size.copy()
-        self.damping, self.growth = self.damping.copy(), self.growth.copy()
         self.theta[lane], self.size[lane] = point, 0.0
         self.damping[lane], self.growth[lane] = DAMPING, 2.0
         self.done[lane] = self.rested[lane] = False

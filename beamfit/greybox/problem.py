@@ -234,6 +234,11 @@ class Problem:
         return sum(record.measured.size for record in self.records)
 
     @cached_property
+    def residual_count(self) -> int:
+        """How many residuals there are, those of priors included."""
+        return self.size + sum(_shape_of(p.residual, self.core.model)[0] for p in self.priors)
+
+    @cached_property
     def least_residual(self) -> float:
         """The least length of the residuals that counts: one standard deviation.
 

@@ -24,8 +24,6 @@ __all__ = ["search", "solve", "starting_points"]
 STEPS, POLISHED = 300, 4
 # A search whose cost falls by less than this share in so many steps gains nothing.
 NOTHING, STRETCH = 1e-7, 100
-# Searches side by side at least, so that the points beside an end are looked at in one call.
-LANES = 4
 # Bytes that Jacobians of starts searched together may take.
 MEMORY = 2**24
 # How often a search moves off where the cost bends down.
@@ -243,8 +241,7 @@ def _together(
 
 def _lanes(p: Problem, points: np.ndarray, budget: Budget) -> tuple[list[State], list[Attempt]]:
     k = len(points)
-    spare = 0 if points.shape[1] * p.size > MEMORY / 64 else max(0, LANES - k)
-    lanes = Lanes(p, np.concatenate([points, np.repeat(points[:1], spare, axis=0)]))
+    lanes = Lanes(p, points)
     lanes.go(np.arange(k), min(STEPS, budget.iterations), budget.until)
     cost = lanes.cost[:k]
     found: dict[int, State] = {}
