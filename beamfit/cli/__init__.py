@@ -9,6 +9,7 @@ import sys
 import click
 
 from beamfit import __version__
+from beamfit.cli.check import check
 from beamfit.cli.design import design
 from beamfit.cli.emittance import emittance
 from beamfit.cli.example import example
@@ -33,6 +34,7 @@ cli.add_command(lifetime)
 cli.add_command(setpoint)
 cli.add_command(design)
 cli.add_command(example)
+cli.add_command(check)
 
 
 def main() -> None:

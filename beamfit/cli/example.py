@@ -25,5 +25,6 @@ def example(folder: str) -> None:
     """
     scan, lattice, decay = (shlex.quote(str(path)) for path in write_example(folder))
     click.echo(f"Written: {scan}, {lattice}, {decay} (simulated). Now run")
+    click.echo(f"  beamfit check {scan} {lattice} {decay}")
     click.echo(f"  beamfit emittance {scan} --lattice {lattice}")
     click.echo(f"  beamfit lifetime {decay}")

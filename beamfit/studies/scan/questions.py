@@ -11,7 +11,7 @@ from beamfit.optics.elements import Quadrupole
 from beamfit.optics.particle import rigidity
 from beamfit.studies.scan.scans import USUAL, QuadScan
 
-__all__ = ["check_gradients", "questions"]
+__all__ = ["check_gradients", "of_sizes", "questions"]
 
 # Gradients in T/m beyond which a magnet is a plasma lens at least, and beyond any lens.
 STRONG, IMPOSSIBLE = 500.0, 1e4
@@ -68,10 +68,11 @@ def questions(scan: QuadScan, scanned: Beamline) -> tuple[str, ...]:
     tuple of str
         Sentences; nothing was changed because of them.
     """
-    return (*_of_sizes(scan), *_of_gradients(scan, scanned))
+    return (*of_sizes(scan), *_of_gradients(scan, scanned))
 
 
-def _of_sizes(scan: QuadScan) -> Iterator[str]:
+def of_sizes(scan: QuadScan) -> Iterator[str]:
+    """Ask about the sizes alone."""
     for plane, size in scan.size.items():
         middle = float(np.nanmedian(size))
         if not USUAL[0] <= middle <= USUAL[1]:

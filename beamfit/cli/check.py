@@ -1,0 +1,74 @@
+"""`beamfit check`: what was understood of files, before anything is fitted."""
+
+from __future__ import annotations
+
+import sys
+from typing import Any
+
+import click
+
+from beamfit.cli.options import command_line, options
+from beamfit.errors import InputError
+from beamfit.io.result import results_text
+from beamfit.io.understood import Understood, understand, with_lattice
+from beamfit.table import text_of
+
+__all__ = ["check"]
+
+EXAMPLE = """\b
+Examples:
+  beamfit check measurements/lcls_otr2.csv lattices/lcls_otr2.toml
+  beamfit check fill1.csv fill2.h5 ring.toml --json
+"""
+
+
+@click.command(epilog=EXAMPLE)
+@click.argument("files", nargs=-1, required=True, metavar="FILE...")
+@options("ignore skip-bad use energy json")
+def check(
+    files: tuple[str, ...],
+    ignore: tuple[str, ...],
+    skip_bad: bool,
+    use: str | None,
+    energy: float | None,
+    as_json: bool,
+) -> None:
+    """Say what is understood of scans, lattices, records of beam current and rings.
+
+    Of each FILE the kind, the rows, the magnets and their units, the range of the sizes and where
+    their errors are from, the energy, and what is odd about it; of a scan also whether each lattice
+    given beside it has what it names. All files are gone through; one that cannot be used gives
+    its line, and exit status 2.
+    """
+    found: list[Understood] = []
+    wrong: list[tuple[str, InputError]] = []
+    for path in dict.fromkeys(files):
+        try:
+            read = understand(path, ignore=ignore, skip_bad=skip_bad, use=use, energy=energy)
+            found.append(read)
+        except InputError as error:
+            wrong.append((path, error))
+    lattices = [each for each in found if each.kind == "lattice"]
+    found = [_on_all(each, lattices) if each.kind == "scan" else each for each in found]
+    if as_json:
+        said: list[Any] = [*found]
+        said += [{"file": path, "kind": None, "error": str(error)} for path, error in wrong]
+        inputs = {each.path: each.sha256 for each in found}
+        click.echo(results_text(said, inputs, command_line()))
+    else:
+        _show(found)
+    for _, error in wrong:
+        click.echo(f"beamfit: {error}", err=True)
+    sys.exit(2 if wrong else 0)
+
+
+def _on_all(scan: Understood, lattices: list[Understood]) -> Understood:
+    for lattice in lattices:
+        scan = with_lattice(scan, lattice)
+    return scan
+
+
+def _show(found: list[Understood]) -> None:
+    """One table a file, and below it what is odd."""
+    for each in found:
+        click.echo("\n".join([text_of(each.table()), *(f"Note: {n}" for n in each.notes), ""]))

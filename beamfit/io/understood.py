@@ -1,0 +1,343 @@
+"""What a file says, as beamfit reads it: for a person to see before anything is fitted."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from itertools import islice
+from os import PathLike
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from beamfit.errors import InputError
+from beamfit.io.decay_record import read_decay_record
+from beamfit.io.files import digest, text_lines
+from beamfit.io.lattice import CALIBRATIONS, STRENGTHS, LatticeFile
+from beamfit.io.line import FOREIGN, build_line, read_lattice
+from beamfit.io.measurement import read_quad_scan
+from beamfit.io.ring import read_operation, read_ring
+from beamfit.io.table import HDF5, read_sheet
+from beamfit.io.toml import read_toml
+from beamfit.quantity import display_unit
+from beamfit.studies.decay.record import DecayRecord
+from beamfit.studies.decay.segments import split_record
+from beamfit.studies.scan.scans import QuadScan
+from beamfit.table import Table
+
+__all__ = ["Understood", "understand", "with_lattice"]
+
+SAID = {"A": "A", "kG": "kG integrated gradient", "T_per_m": "T/m", "k1": "1/m² (k1)"}
+SAID |= {"k1l": "1/m (k1l)"}
+CONDITIONS = {"rf_voltage": "V", "scraper_y": "m", "pressure": "Pa", "bunches": ""}
+# Magnets of a lattice that are told one by one, and lines of a table searched for its header.
+MOST_MAGNETS, HEAD = 20, 1000
+
+
+class Fact(NamedTuple):
+    """One thing understood: what it is, in words, and as numbers for JSON."""
+
+    label: str
+    words: str
+    value: Any
+
+
+@dataclass(frozen=True)
+class Understood:
+    """What a file was understood to say.
+
+    Attributes
+    ----------
+    path : str
+        The file.
+    kind : str
+        ``scan``, ``lattice``, ``record`` or ``ring``.
+    sha256 : str
+        Its digest.
+    facts : tuple of Fact
+        What it says.
+    notes : tuple of str
+        What was done to its numbers, and what is odd about them.
+    content : QuadScan, LatticeFile, DecayRecord or Ring
+        What was read.
+    """
+
+    path: str
+    kind: str
+    sha256: str
+    facts: tuple[Fact, ...]
+    notes: tuple[str, ...]
+    content: Any
+
+    def table(self) -> Table:
+        """The facts to be shown."""
+        return Table(f"{self.path}: a {self.kind}", [], [[f.label, f.words] for f in self.facts])
+
+    def to_json(self) -> dict[str, Any]:
+        """Give one entry of ``results`` of ``beamfit check --json``."""
+        contents = {fact.label.replace(" ", "_"): fact.value for fact in self.facts}
+        return {
+            "file": self.path,
+            "kind": self.kind,
+            "sha256": self.sha256,
+            "contents": contents,
+            "notes": list(self.notes),
+        }
+
+
+def understand(
+    path: str | PathLike[str],
+    *,
+    ignore: Sequence[str] = (),
+    skip_bad: bool = False,
+    use: str | None = None,
+    energy: float | None = None,
+) -> Understood:
+    """Read a file of any kind that beamfit takes, and say what it holds.
+
+    Parameters
+    ----------
+    path : str or path
+        A scan, a lattice, a record of beam current, or a ring.
+    ignore, skip_bad
+        Of a scan, as for `read_quad_scan`.
+    use, energy
+        Of a MAD-X or elegant file, as for `load_lattice`.
+
+    Returns
+    -------
+    Understood
+        Its kind and its contents.
+
+    Raises
+    ------
+    InputError
+        As the reader of that kind of file.
+
+    Examples
+    --------
+    >>> found = understand("measurements/aps_1999_decay.csv")
+    >>> found.kind, found.facts[0].words
+    ('record', '27 over 8.81 h')
+    """
+    kind = _kind(path)
+    if kind == "scan":
+        content = read_quad_scan(path, ignore=ignore, skip_bad=skip_bad)
+        facts, notes = _of_scan(content), (*content.notes, *_questions(content))
+    elif kind == "lattice":
+        foreign = Path(path).suffix.lower() in FOREIGN
+        content = read_lattice(path, use=use, energy=energy) if foreign else read_lattice(path)
+        facts, notes = _of_lattice(content), ()
+    elif kind == "record":
+        content = read_decay_record(path)
+        facts, notes = _of_record(content), ()
+    else:
+        content = read_ring(path)
+        facts, notes = _of_ring(path, content), ()
+    return Understood(str(path), kind, digest(path), tuple(facts), notes, content)
+
+
+def with_lattice(scan: Understood, lattice: Understood) -> Understood:
+    """Add to a scan whether a lattice has what it names, and what its settings mean there."""
+    label = f"on {Path(lattice.path).name}"
+    try:
+        lattice.content.check_scan(scan.content)
+    except InputError as error:
+        said = str(replace(error, path=None))
+        return replace(scan, facts=(*scan.facts, Fact(label, said, {"fits": False, "why": said})))
+    from beamfit.studies.scan.questions import questions  # JAX from here on
+    from beamfit.studies.scan.transport import scanned_line
+
+    line = build_line(lattice.content)
+    own = scan.content.of_particle(line.mass)
+    asked = questions(own, scanned_line(own, line))
+    notes = (*scan.notes, *(note for note in asked if note not in scan.notes))
+    fact = Fact(label, "has all its magnets and screens", {"fits": True})
+    return replace(scan, facts=(*scan.facts, fact), notes=notes)
+
+
+def _kind(path: str | PathLike[str]) -> str:
+    """What a file is, by its name and its head."""
+    suffix = Path(path).suffix.lower()
+    if suffix in FOREIGN:
+        return "lattice"
+    if suffix == ".toml":
+        tables = read_toml(path, "a lattice or a ring").table
+        return "ring" if "ring" in tables and "element" not in tables else "lattice"
+    if suffix in HDF5:
+        head = ",".join(read_sheet(path, "Q2_A,size_x_um").names)
+    elif suffix == ".mat":
+        return "scan"
+    else:
+        lines = (text.strip() for text in islice(text_lines(path), HEAD))
+        head = next((text for text in lines if text and not text.startswith("#")), "")
+    if re.search(r"\bbeta_x_m\b|\bBETX\b", head):
+        found = "the optics of a ring"
+        raise InputError(found, "the ring file (TOML) that names it under [optics] twiss", path)
+    return "record" if "beam_current" in head else "scan"
+
+
+def _range(values: np.ndarray, unit: str = "") -> Fact:
+    """From the smallest to the largest, lengths in a unit of their size."""
+    low, high = float(np.nanmin(values)), float(np.nanmax(values))
+    factor, said = display_unit(max(abs(low), abs(high)), unit or "1")
+    words = f"{low / factor:.6g}" if low == high else f"{low / factor:.4g} to {high / factor:.4g}"
+    return Fact("", f"{words} {said}".strip(), {"low": low, "high": high, "unit": unit or "1"})
+
+
+def _of_scan(scan: QuadScan) -> list[Fact]:
+    rows = {p: int(np.isfinite(scan.size[p]).sum()) for p in scan.planes}
+    counted = ", ".join(f"{p} ({n} rows)" for p, n in rows.items())
+    facts = [Fact("rows", str(len(scan)), len(scan)), Fact("planes", counted, rows)]
+    for name, values in scan.settings.items():
+        unit, distinct = scan.units[name], len(np.unique(values))
+        span = _range(values)
+        words = f"{span.words} {SAID[unit]}, {distinct} setting" + ("s" if distinct > 1 else "")
+        value = span.value | {"unit": unit, "settings": distinct}
+        facts.append(Fact(f"magnet {name}", words, value))
+    for p in scan.planes:
+        facts += _of_plane(scan, p)
+    if scan.transfer is not None:
+        facts.append(Fact("matrices", "R11 and R12 of each row: no lattice is needed", True))
+    if scan.energy is not None:
+        said = _range(scan.energy, "MeV")
+        kind = "momentum p c" if scan.energy_kind == "momentum" else f"{scan.energy_kind} energy"
+        value = said.value | {"kind": scan.energy_kind}
+        facts.append(Fact("energy", f"{said.words}, {kind}", value))
+    if scan.screen is not None:
+        counts = Counter(scan.screen)
+        words = ", ".join(f"{name} ({n} rows)" for name, n in counts.items())
+        facts.append(Fact("screens", words, dict(counts)))
+    further = {"resolution": "m", "energy_spread": "", "shots": ""}
+    facts += [
+        _range(getattr(scan, key), unit)._replace(label=key.replace("_", " "))
+        for key, unit in further.items()
+        if getattr(scan, key) is not None
+    ]
+    return facts
+
+
+def _of_plane(scan: QuadScan, plane: str) -> list[Fact]:
+    """Range and column of the sizes of one plane, and where their errors are from."""
+    key = f"size_{plane}"
+    said, column = _range(scan.size[plane], "m"), scan.columns.get(key, key)
+    size = Fact(f"size {plane}", f"{said.words}, column {column}", said.value | {"column": column})
+    if plane not in scan.error:
+        words = "none: the noise is inferred from the residuals"
+        return [size, Fact(f"errors {plane}", words, None)]
+    share = float(np.nanmedian(scan.error[plane] / scan.size[plane]))
+    words = f"{100 * share:.2g} % of the size in the middle, from {scan.error_source}"
+    value = {"median_relative": share, "source": scan.error_source}
+    return [size, Fact(f"errors {plane}", words, value)]
+
+
+def _questions(scan: QuadScan) -> tuple[str, ...]:
+    from beamfit.studies.scan.questions import of_sizes
+
+    return tuple(of_sizes(scan))
+
+
+def _of_lattice(file: LatticeFile) -> list[Fact]:
+    kinds = Counter(element["type"] for element in file.elements)
+    length = sum(map(_length, file.elements))
+    listed = ", ".join(f"{n} {kind.replace('_', ' ')}" for kind, n in kinds.items())
+    energy = {"value": file.energy, "unit": "MeV", "particle": file.particle}
+    facts = [
+        Fact("name", file.name, file.name),
+        Fact("energy", f"{file.energy:.6g} MeV total, {file.particle}s", energy),
+        Fact("elements", listed, dict(kinds)),
+        Fact("length", f"{length:.6g} m", length),
+    ]
+    magnets = [e for e in file.elements if e["name"] in file.calibrations]
+    facts += [_magnet(e, file.calibrations[e["name"]]) for e in magnets[:MOST_MAGNETS]]
+    if (more := len(file.calibrations) - MOST_MAGNETS) > 0:
+        facts.append(Fact("further magnets", f"{more}, set as these", more))
+    screens = [e["name"] for e in file.elements if e["type"] == "screen"]
+    words = ", ".join(screens) or "none: sizes need one"
+    facts.append(Fact("screens", words, screens))
+    if file.energy_spread:
+        facts.append(Fact("energy spread", f"{file.energy_spread:.3g}", file.energy_spread))
+    if file.design is not None:
+        facts.append(Fact("design Twiss", f"at {file.design['at']}", dict(file.design)))
+    return facts
+
+
+def _magnet(element: Any, unit: str) -> Fact:
+    """What a magnet is set to where no scan says, and how a current becomes a gradient."""
+    key = next(key for key, its in STRENGTHS.items() if its == unit and key in element)
+    words = f"{element[key]:g} {SAID[unit]}"
+    if "length_m" in element:
+        words += f", {element['length_m']:g} m long"
+    how = [k for keys in CALIBRATIONS for k in sorted(keys) if k in element]
+    if how:
+        words += ", " + " and ".join(f"{k} {_short(element[k])}" for k in how)
+    return Fact(f"magnet {element['name']}", words, {"setting": element[key], "unit": unit})
+
+
+def _short(value: Any) -> str:
+    """A calibration number, numbers, or how many of a table."""
+    if isinstance(value, list | tuple):
+        few = len(value) <= 4 and not any(isinstance(v, list | tuple) for v in value)
+        return ", ".join(f"{v:g}" for v in value) if few else f"of {len(value)} points"
+    return f"{value:g}" if isinstance(value, int | float) else str(value)
+
+
+def _length(element: Any) -> float:
+    """Length of an element along the beam, m."""
+    if element["type"] == "sector_dipole":
+        return abs(element["radius_m"] * np.radians(element["angle_deg"]))
+    return float(element.get("length_m", 0.0))
+
+
+def _of_record(record: DecayRecord) -> list[Fact]:
+    hours = record.span / 3600
+    words = f"{len(record)} over {hours:.3g} h"
+    facts = [
+        Fact("readings", words, {"count": len(record), "span_h": hours}),
+        _range(record.current, "mA")._replace(label="beam current"),
+    ]
+    errors = "none: the noise is inferred from the residuals"
+    given = None if record.error is None else _range(record.error, "mA")
+    facts.append(Fact("errors", errors if given is None else given.words, given and given.value))
+    if record.start is not None:
+        began = datetime.fromtimestamp(record.start, UTC).isoformat(timespec="seconds")
+        facts.append(Fact("began", began, began))
+    conditions = record.conditions._asdict()
+    facts += [
+        _range(values, CONDITIONS[name])._replace(label=name.replace("_", " "))
+        for name, values in conditions.items()
+        if values is not None
+    ]
+    split = split_record(record)
+    kinds = Counter(event.kind for event in split.events)
+    cut = ", ".join(f"{n} × {kind}" for kind, n in kinds.items()) or "nothing cut away"
+    count = len(split.segments)
+    value = {"count": count, "events": dict(kinds)}
+    facts.append(Fact("decays", f"{count} ({cut})", value))
+    return facts
+
+
+def _of_ring(path: str | PathLike[str], ring: Any) -> list[Fact]:
+    said = [
+        ("energy", ring.energy / 1e9, "GeV"),
+        ("circumference", ring.circumference, "m"),
+        ("energy loss a turn", ring.energy_loss / 1e3, "keV"),
+        ("emittance x", 1e9 * ring.emittance_x, "nm"),
+        ("emittance y", 1e9 * ring.emittance_y, "nm"),
+        ("points of the optics", len(ring.optics.weight), ""),
+    ]
+    if "operation" in read_toml(path, "a ring").table:
+        operation = read_operation(path)
+        said += [
+            ("RF voltage", operation.rf_voltage / 1e3, "kV"),
+            ("bunches", operation.bunches, ""),
+            ("pressure without beam", operation.pressure_base, "Pa"),
+        ]
+    return [
+        Fact(label, f"{float(v):.6g} {unit}".strip(), {"value": float(v), "unit": unit or "1"})
+        for label, v, unit in said
+    ]
