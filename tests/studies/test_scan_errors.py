@@ -251,3 +251,45 @@ def test_good_scans_of_two_percent_are_not_refused(otr2, true, points, errors):
         fit = beamfit.fit_emittance(otr2_scan(settings, size, error), otr2).x
         refused += fit.emittance.error is None
     assert refused <= 6  # 2 %, and three standard deviations of a binomial
+
+
+def test_an_anchor_has_a_part_that_all_settings_share(gtf, gtf_sizes):
+    """R11 and R12 both 2 % off at every setting: 4 % of the emittance, whatever their number."""
+    currents, _, sizes = gtf_sizes
+    scan = scan_of("Q2", "A", currents, 1.02 * sizes, 0.01, seed=1)
+    anchor = beamfit.Anchor(deviation=0.02)
+    fit = beamfit.fit_emittance(scan, gtf, scenario="transport-network", anchor=anchor).x
+    assert fit.emittance.relative > 0.035
+    truth = math.sqrt(TABLE_2[0] * TABLE_2[2] - TABLE_2[1] ** 2)
+    assert abs(fit.emittance.value - truth) < 1.96 * fit.emittance.error
+
+
+def test_a_remedy_is_not_the_prior_that_was_given(gtf, gtf_sizes):
+    currents, _, sizes = gtf_sizes
+    scan = scan_of("Q2", "A", currents, sizes, 0.02, seed=1)
+    wide = {"Q2.slope": (167.23, 60.0)}
+    without = beamfit.fit_emittance(scan, gtf, scenario="calibration").x
+    given = beamfit.fit_emittance(scan, gtf, scenario="calibration", priors=wide).x
+    assert without.status is given.status is Status.unidentified
+    assert "a prior on Q2.slope" in without.message
+    assert "second screen" in given.message
+    assert "a prior on Q2.slope" not in given.message
+
+
+def test_a_scenario_that_frees_nothing_says_so(otr2):
+    """Three screens' worth of rows with the magnet held: no calibration is free."""
+    parts = [*otr2.upto("OTR2").elements]
+    line = replace(otr2, elements=tuple(parts))
+    held = dict.fromkeys(line.magnets, np.zeros(5))
+    energy = np.linspace(60.0, 140.0, 5)
+    sigma = np.asarray(BEAM.sigma)
+    sizes = []
+    for e in energy:
+        m = np.asarray(replace(line, energy=float(e)).matrix({"Q525": -3.0}).x)
+        sizes.append(math.sqrt((m @ sigma @ m.T)[0, 0]))
+    held["Q525"] = np.full(5, -3.0)
+    scan = beamfit.QuadScan(
+        {"Q525": held["Q525"]}, {"Q525": "kG"}, {"x": sizes}, {"x": 0.01 * np.array(sizes)}, energy
+    )
+    fit = beamfit.fit_emittance(scan, line, scenario="calibration").x
+    assert "Nothing is free besides the beam" in fit.message

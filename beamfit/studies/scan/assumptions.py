@@ -44,9 +44,10 @@ class Anchor:
     Parameters
     ----------
     deviation : float, optional
-        Relative standard deviation of the network from first principles, independent at each
-        measured setting: of R11 and R12 in units of their rms over the scan
-        (transport-network), of k1 at the largest current (focusing-network).
+        Relative standard deviation of the network from first principles: of R11 and R12 in units
+        of their rms over the scan (transport-network), of k1 at the largest current
+        (focusing-network). It counts twice, independent at each measured setting and once in
+        common at all of them, as a wrong energy would: that does not average out.
     at : tuple of mapping, optional
         Settings, magnet name to value, at which first principles hold.
     sd : float

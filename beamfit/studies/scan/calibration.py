@@ -230,10 +230,15 @@ def _null_directions(
     return tuple(said)
 
 
-def _remedy(seen: Seen) -> str:
+def _remedy(seen: Seen, told: Assumptions) -> str:
     known = numbers_of_magnets(seen.scanned, varied_magnets(seen.scan))
-    slope = next((n for n, v in known.items() if v.kind is Kind.slope), "the slope")
-    return f"a prior on {slope}, or a second screen (see beamfit design)"
+    slopes = [name for name, number in known.items() if number.kind is Kind.slope]
+    without = [name for name in slopes if name not in told.priors]
+    second = "a second screen (see beamfit design)"
+    if without:
+        return f"a prior on {without[0]}, or {second}"
+    tighter = f", or a tighter prior on {slopes[0]} than the one given" if slopes else ""
+    return f"{second}, more settings{tighter}"
 
 
 SCENARIO = Scenario(

@@ -27,7 +27,12 @@ from beamfit.quantity import Quantity
 from beamfit.status import Status
 from beamfit.studies.scan.assumptions import Assumptions
 from beamfit.studies.scan.results import Parameter
-from beamfit.studies.scan.signed_network import known_record, signed_network, weight_free
+from beamfit.studies.scan.signed_network import (
+    common_errors,
+    known_record,
+    signed_network,
+    weight_free,
+)
 from beamfit.studies.scan.statement import (
     Scenario,
     Seen,
@@ -133,6 +138,11 @@ def _predicted(model: Any, asked: _Asked) -> Array:
     return _k1(model, asked) * asked.energy
 
 
+def _less_common(model: Any, asked: _Asked) -> Array:
+    """The same without the error that all settings share."""
+    return _predicted(model, asked) / (1.0 + model["anchor"][asked.magnet])
+
+
 def _state(seen: Seen, told: Assumptions) -> Problem:
     """Beams and one network of k1 for each scanned magnet."""
     varied = varied_magnets(seen.scan)
@@ -154,7 +164,9 @@ def _state(seen: Seen, told: Assumptions) -> Problem:
         for name, branch in branches.items()
     }
     sizes = [size_record(seen, plane, seen.of_plane(plane, settings)) for plane in seen.planes]
-    return Problem({"beam": beams, "magnets": strengths}, free, [*sizes, *records])
+    common, further, priors = common_errors(told, varied)
+    model = {"beam": beams, "magnets": strengths} | common
+    return Problem(model, [*free, *further], [*sizes, *records], priors)
 
 
 def _branches(seen: Seen, varied: tuple[str, ...]) -> dict[str, np.ndarray]:
@@ -195,13 +207,17 @@ def _anchors(seen: Seen, name: str, told: Assumptions, branches: bool) -> Iterat
     largest = float(np.abs(_first_strength(seen, name, settings)).max())
     places = np.array([place[name] for place in anchor.at if name in place], float)
     element, energy = seen.scanned[name], float(seen.scanned.energy)
-    for at, sd in ((np.unique(settings), anchor.deviation), (places, anchor.sd)):
+    ties = (
+        (np.unique(settings), anchor.deviation, _less_common),
+        (places, anchor.sd, _predicted),
+    )
+    for at, sd, predict in ties:
         if sd is None or not len(at):
             continue
         points = np.stack([at, np.zeros(len(at))], -1) if branches else at
         data = _Asked(name, padded(points), float(element.length), energy)
         values = _first_strength(seen, name, at)
-        yield known_record(f"anchor {name}", _predicted, data, values, sd * largest)
+        yield known_record(f"anchor {name}", predict, data, values, sd * largest)
 
 
 def _parameters(seen: Seen, told: Assumptions, fit: Fit) -> Iterator[Parameter]:
@@ -246,7 +262,7 @@ def _null_directions(
     return () if identified else (said,)
 
 
-def _remedy(seen: Seen) -> str:
+def _remedy(seen: Seen, told: Assumptions) -> str:
     return (
         "sizes at a second screen, or an anchor to the lattice's calibration "
         "(--anchor first-principles=2%)"

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import numpy as np
 from scipy.optimize import nnls
 
 from beamfit.greybox.mlp import MLP, Port, dense
-from beamfit.greybox.problem import Free, Record
+from beamfit.greybox.problem import Free, Prior, Record
+from beamfit.studies.scan.assumptions import Assumptions
 from beamfit.studies.scan.transport import padded
 
-__all__ = ["MOST", "known_record", "signed_network", "weight_free"]
+__all__ = ["MOST", "common_errors", "known_record", "signed_network", "weight_free"]
 
 # Bounds of the weights: the report's (appendix B).
 MOST = 10.0
@@ -102,6 +103,25 @@ def _pattern(rising: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def weight_free(path: str, bounds: dict[str, tuple[np.ndarray, np.ndarray]]) -> list[Free]:
     """The weights of a network as free numbers that nobody asks for."""
     return [Free(f"{path}.{k}", a, b, (-1.5, 1.5), nuisance=True) for k, (a, b) in bounds.items()]
+
+
+def common_errors(
+    told: Assumptions, names: Iterable[str]
+) -> tuple[dict[str, dict[str, float]], list[Free], list[Prior]]:
+    """The error that all settings share: part of a model, its free numbers, and their priors.
+
+    A wrong energy or slope moves every setting alike, and does not average out over them. How much
+    of a deviation is common nobody knows, so it may be all of it.
+    """
+    names, sd = list(names), told.anchor.deviation
+    if sd is None:
+        return {}, [], []
+    free = [Free(f"anchor.{name}", -0.9, nuisance=True) for name in names]
+    return (
+        {"anchor": dict.fromkeys(names, 0.0)},
+        free,
+        [Prior(f"anchor.{name}", 0.0, sd) for name in names],
+    )
 
 
 def known_record(

@@ -134,7 +134,7 @@ class Scenario:
     null_directions : callable
         ``null_directions(seen, parameters, identified)``: what the data leave open, in words.
     remedy : callable
-        ``remedy(seen)``: what would determine the emittance, in words.
+        ``remedy(seen, told)``: what would determine the emittance, in words.
     aside : str
         What an undetermined parameter means for the emittance, in words.
     closed : bool
@@ -149,7 +149,7 @@ class Scenario:
     state: Callable[[Seen, Assumptions], Problem]
     parameters: Callable[[Seen, Assumptions, Fit], Iterator[Parameter]] = lambda *_: iter(())
     null_directions: Callable[[Seen, tuple[Parameter, ...], bool], tuple[str, ...]] = lambda *_: ()
-    remedy: Callable[[Seen], str] = lambda _: ""
+    remedy: Callable[[Seen, Assumptions], str] = lambda *_: ""
     aside: str = ""
     closed: bool = False
     network: bool = False

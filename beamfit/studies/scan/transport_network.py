@@ -19,7 +19,12 @@ from beamfit.greybox.mlp import MLP, Port
 from beamfit.greybox.problem import Problem, Record
 from beamfit.studies.scan.assumptions import Assumptions
 from beamfit.studies.scan.results import Parameter
-from beamfit.studies.scan.signed_network import known_record, signed_network, weight_free
+from beamfit.studies.scan.signed_network import (
+    common_errors,
+    known_record,
+    signed_network,
+    weight_free,
+)
 from beamfit.studies.scan.statement import (
     Scenario,
     Seen,
@@ -168,7 +173,8 @@ def _state(seen: Seen, told: Assumptions) -> Problem:
         rows = network_rows(seen, lay, plane)
         records += [size_record(seen, plane, rows), *_anchors(seen, lay, told, rows)]
     free = beam_free(beams) + weight_free("map", bounds)
-    return Problem({"beam": beams, "map": net}, free, records)
+    common, further, priors = common_errors(told, seen.planes)
+    return Problem({"beam": beams, "map": net} | common, [*free, *further], records, priors)
 
 
 def _names(seen: Seen, lay: _Layout) -> list[str]:
@@ -196,7 +202,8 @@ def _anchors(seen: Seen, lay: _Layout, told: Assumptions, rows: NetworkRows) -> 
 
     if anchor.deviation is not None:
         sd = anchor.deviation * size[:2]
-        yield known(f"anchor {plane}", points, which, own[:, :2], sd, elements=2)
+        name = f"anchor {plane}"
+        yield known(name, points, which, own[:, :2], sd, predict=_less_common, elements=2)
     for place in anchor.at:
         middle = 0.5 * (lay.low + lay.high)
         point = np.array([[place.get(n, m) for n, m in zip(lay.names, middle, strict=True)]])
@@ -209,6 +216,11 @@ def _anchors(seen: Seen, lay: _Layout, told: Assumptions, rows: NetworkRows) -> 
 
 def _outputs(model, rows: NetworkRows) -> jax.Array:
     return rows.outputs(model)
+
+
+def _less_common(model, rows: NetworkRows) -> jax.Array:
+    """A and B without the error that all settings share."""
+    return rows.outputs(model) / (1.0 + model["anchor"][rows.plane])
 
 
 def _determinant(model, rows: NetworkRows) -> jax.Array:
@@ -231,7 +243,7 @@ def _null_directions(
     return () if identified else (gauge, pointwise)
 
 
-def _remedy(seen: Seen) -> str:
+def _remedy(seen: Seen, told: Assumptions) -> str:
     return (
         "an anchor to first principles at every setting (--anchor first-principles=2%); T known at "
         "single settings or det T = 1 with C and D free do not suffice"

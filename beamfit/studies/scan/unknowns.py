@@ -85,7 +85,9 @@ def settled_fit(seen: Seen, fit: Fit) -> Found:
         ):
             break
         again = solve(replace(fit.problem, model=fit.model, records=records))
-        fit = replace(again, attempts=(*fit.attempts, *again.attempts))
+        # The search is the first one; the few steps from its end are told with it.
+        said = fit.message if again.status is fit.status else again.message
+        fit = replace(again, attempts=(*fit.attempts, *again.attempts), message=said)
         found = _through(seen, fit)
     return found
 
@@ -180,6 +182,8 @@ def _unknowns(
     if left:
         remark = f" {', '.join(left)} not determined: what depends on it has no error"
         remark += f"{scenario.aside}."
+    if not parameters and not scenario.network:
+        remark += " Nothing is free besides the beam, so this is the fit with known transport."
     if priors:
         remark += f" Rests on the prior of {', '.join(priors)}."
     return Unknowns(
@@ -194,7 +198,7 @@ def _unknowns(
         probability=noise.probability(group.chi2, group.dof),
         rests_on=noise.rests_on(group.chi2, group.dof),
         edges=edges,
-        remedy=scenario.remedy(seen),
+        remedy=scenario.remedy(seen, told),
         remark=remark,
     )
 
