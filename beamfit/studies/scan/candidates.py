@@ -20,7 +20,7 @@ from beamfit.studies.scan.information import linearised_at, with_slope
 from beamfit.studies.scan.model import predict_sizes, spoken
 from beamfit.studies.scan.next_point import candidate_settings
 from beamfit.studies.scan.statement import varied_magnets
-from beamfit.studies.scan.transport import NetworkRows, Rows
+from beamfit.studies.scan.transport import NetworkRows, Rows, damping_of
 
 __all__ = ["Candidate", "Considered", "candidate_rows", "further_options"]
 
@@ -70,7 +70,7 @@ def candidate_rows(
     InputError
         If limits name no magnet of the line, or are reversed.
     """
-    own, screens, found = _own_energy(fit), _screens(fit), []
+    own, screens, found = fit.seen.energy, _screens(fit), []
     for name, table in candidate_settings(fit.scan.settings, _checked(fit, limits)):
         count = len(table[name])
         for screen in screens:
@@ -95,12 +95,6 @@ def _checked(fit: EmittanceFit, limits):
         if not fit.statement.whole_map and name not in varied_magnets(fit.scan):
             raise InputError(f"limits of '{name}', which was not scanned", "a scanned magnet")
     return limits
-
-
-def _own_energy(fit: EmittanceFit) -> float:
-    return (
-        float(fit.seen.scanned.energy) if fit.scan.energy is None else float(fit.scan.energy.mean())
-    )
 
 
 def _screens(fit: EmittanceFit) -> tuple[str, ...]:
@@ -175,6 +169,7 @@ def _line_rows(fit, line, plane, table, screen, energy) -> Rows:
         jnp.zeros(count, int),
         jnp.full(count, float(line.energy_spread)),
         jnp.full(count, float(getattr(line[screen], "resolution", 0.0))),
+        damping_of(np.asarray(energy), fit.seen.energy, float(line.mass)),
     )
 
 
@@ -184,13 +179,14 @@ def _network_rows(fit, plane, table, screen) -> NetworkRows:
     which = next(i for i in seen.measured(plane) if seen.rows.which[i] == place)
     count = len(next(iter(table.values())))
     names = fit.fit.model["map"].inputs
-    inputs = [table.get(n, np.full(count, _own_energy(fit))) for n in names]
+    inputs = [table.get(n, np.full(count, fit.seen.energy)) for n in names]
     return NetworkRows(
         plane,
         False,
         jnp.asarray(np.stack(inputs, -1)),
         jnp.tile(measured.columns[which], (count, 1)),
         jnp.full(count, float(np.median(np.asarray(measured.known)))),
+        jnp.ones(count),
     )
 
 
@@ -217,7 +213,7 @@ def further_options(
         Words, and rows of shape (m, n).
     """
     table = {n: np.asarray(v) for n, v in fit.scan.settings.items()}
-    own = _own_energy(fit)
+    own = fit.seen.energy
     energy = np.full(len(fit.scan), own) if fit.scan.energy is None else fit.scan.energy
     if fit.statement.whole_map:
         for line, screen, words in _other_screens(fit):

@@ -95,9 +95,10 @@ def fit_emittance(
 
     Notes
     -----
-    One geometric beam matrix at the start is common to all rows, also where their energies
-    differ. Errors are those of the linear theory of least squares, propagated to ε, β, α by
-    their gradients; see docs/emittance.md.
+    One beam matrix at the start is common to all rows. Where their energies differ it is that of
+    the mean energy, and scales with 1/βγ: the normalised emittance is common. Errors are those of
+    the linear theory of least squares, propagated to ε, β, α by their gradients; see
+    docs/emittance.md.
 
     Examples
     --------
@@ -319,9 +320,7 @@ class EmittanceFit:
     def to_json(self) -> list[dict[str, Any]]:
         """Give the ``results`` list of the JSON contract."""
         common = {"notes": list(self.notes)} if self.notes else {}
-        entries = [
-            p.to_json() | {"energy": self._energy(p.plane).to_json()} | common for p in self.planes
-        ]
+        entries = [p.to_json() | {"energy": self._energy.to_json()} | common for p in self.planes]
         own = {
             "scenario": self.scenario,
             "anchor": self.anchor,
@@ -330,9 +329,10 @@ class EmittanceFit:
         }
         return entries if self.statement.closed else [entry | own for entry in entries]
 
-    def _energy(self, plane: str) -> Quantity:
-        """Mean total energy of the rows in which a plane was measured, MeV."""
-        return Quantity(self.seen.energy(plane), None, "MeV")
+    @property
+    def _energy(self) -> Quantity:
+        """Mean total energy of the rows, MeV."""
+        return Quantity(self.seen.energy, None, "MeV")
 
     def _table(self, title: str) -> Table:
         return labelled(title, [p.plane for p in self.planes], result_rows(self.planes))

@@ -280,7 +280,7 @@ def next_measurement(seen: Seen, plane: str) -> str | None:
         return None
     rows, screen = [], seen.rows.places[-1]
     for name, table in candidate_settings(p.settings):
-        energy = np.full(len(table[name]), seen.energy(plane))
+        energy = np.full(len(table[name]), seen.energy)
         matrices = transfer_rows(seen.scanned, table, energy, places=(screen,))
         r = np.asarray(matrices.planes)[:, "xy".index(plane), 0]
         rows.append((name, table[name], np.stack(coefficients(r[:, 0, 0], r[:, 0, 1]), -1)))

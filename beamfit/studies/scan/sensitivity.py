@@ -129,7 +129,7 @@ def systematics(fit: EmittanceFit, plane: str) -> list[Change]:
     by_length = np.concatenate([*by_lengths, np.zeros(0)])[: len(drifts)]  # the rest is downstream
     relative = np.concatenate([by_change[:-1], by_length, by_change[-1:]])
     # ln βγ rises by E²/(E² - m²) for each relative step of the energy.
-    energy = fit.seen.energy(plane)
+    energy = fit.seen.energy
     stiffer = energy**2 / (energy**2 - fit.line.mass**2)
     causes = [f"{n} {_word(fit.seen.scanned, n)} +1 %" for n in magnets]
     causes += [f"drift {n} +1 cm" for n in drifts] + ["energy +1 %"]

@@ -114,9 +114,10 @@ class Seen(NamedTuple):
         """Indices of the rows in which a plane was measured."""
         return np.flatnonzero(~np.isnan(self.scan.size[plane]))
 
-    def energy(self, plane: str) -> float:
-        """Mean total energy of those rows, MeV."""
-        return float(self.rows.energy[self.measured(plane)].mean())
+    @property
+    def energy(self) -> float:
+        """Mean total energy of the rows, MeV: that of the beam that is asked for."""
+        return float(self.rows.energy[: len(self.scan)].mean())
 
 
 @dataclass(frozen=True)
@@ -167,7 +168,7 @@ def asked_of(seen: Seen, plane: str, whole_map: bool = True, line: Beamline | No
     """Where the beam of a plane is asked for, through a line: the rows' own, if none is given."""
     design = seen.scanned.design
     twiss = getattr(design, plane, None)
-    factor = beta_gamma(seen.energy(plane), float(seen.line.mass))
+    factor = beta_gamma(seen.energy, float(seen.line.mass))
     return Asked(
         plane,
         seen.rows.places[-1] if whole_map else None,

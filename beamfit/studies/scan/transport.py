@@ -24,7 +24,7 @@ from beamfit.optics.calibration import (
     IntegratedStrength,
 )
 from beamfit.optics.elements import Marker, Screen, ThinLens, TransferMatrix
-from beamfit.optics.particle import ELECTRON_MASS
+from beamfit.optics.particle import ELECTRON_MASS, beta_gamma
 from beamfit.optics.sections import Series
 from beamfit.studies.scan.model import line_of
 from beamfit.studies.scan.scans import QuadScan
@@ -33,6 +33,7 @@ __all__ = [
     "Look",
     "NetworkRows",
     "Rows",
+    "damping_of",
     "look_through",
     "names_of",
     "own_settings",
@@ -169,6 +170,9 @@ class Rows:
         Magnet name to settings, shape (n,), or (n, 2) with the branch.
     energy, which, spread, resolution : Array
         MeV, index into places, relative momentum spread and point-spread rms in m, shape (n,).
+    damping : Array
+        sqrt(βγ/βγ_row), shape (n,): the beam that is asked for, at the scan's mean energy, has this
+        times the size at another one, since the normalised emittance is what stays.
     given : Array or None
         Shape (2, n, 3): R11, R12 and R16 of both planes where the rows have them from elsewhere.
     """
@@ -182,10 +186,11 @@ class Rows:
     which: Any
     spread: Any
     resolution: Any
+    damping: Any
     given: Any = None
 
     def elements(self, model: Mapping[str, Any]) -> tuple[Array, Array, Array]:
-        """R11, R12 and known size² (m²) of every row, shape (n,) each, through the model's line."""
+        """R11, R12, damped, and known size² (m²) of every row, shape (n,), by the model's line."""
         if self.given is not None:
             return self.known(self.given["xy".index(self.plane)])
         line = line_of(model, self.line)
@@ -198,7 +203,8 @@ class Rows:
 
     def known(self, r: Array) -> tuple[Array, Array, Array]:
         """R11, R12 and known size² from R11, R12 and R16, shape (n, 3)."""
-        return r[:, 0], r[:, 1], (r[:, 2] * self.spread) ** 2 + self.resolution**2
+        known = (r[:, 2] * self.spread) ** 2 + self.resolution**2
+        return self.damping * r[:, 0], self.damping * r[:, 1], known
 
 
 @tree.node("plane", "squared")
@@ -206,7 +212,8 @@ class NetworkRows:
     """Rows of a scan whose R11 and R12 are outputs of a network of the settings.
 
     ``inputs`` has shape (n, inputs) and ``columns`` (n, 2), the outputs that are R11 and R12 at
-    each row's screen; ``known`` (n,) is the size² that is not due to the beam, m².
+    each row's screen; ``known`` (n,) is the size² that is not due to the beam, m², ``damping`` that
+    of `Rows`.
     """
 
     plane: str
@@ -214,6 +221,7 @@ class NetworkRows:
     inputs: Any
     columns: Any
     known: Any
+    damping: Any
 
     def outputs(self, model: Mapping[str, Any]) -> Array:
         """The outputs of the model's network that ``columns`` names, of its shape."""
@@ -223,7 +231,7 @@ class NetworkRows:
     def elements(self, model: Mapping[str, Any]) -> tuple[Array, Array, Array]:
         """R11, R12 and known size² (m²) of every row, shape (n,) each."""
         found = self.outputs(model)  # A and B first, then C and D if the network has them
-        return found[:, 0], found[:, 1], self.known
+        return self.damping * found[:, 0], self.damping * found[:, 1], self.known
 
 
 def padded(values: Any, n: int | None = None) -> np.ndarray:
@@ -286,9 +294,15 @@ def scan_rows(
         padded(which),
         column(scan.energy_spread, scanned.energy_spread),
         padded(np.array(resolution)[which] if scan.resolution is None else scan.resolution),
+        damping_of(energy, float(energy[:n].mean()), float(scanned.mass)),
         # A plane that was not measured has no rows, whatever stands there.
         np.stack([padded(own.get(p, next(iter(own.values())))) for p in "xy"]) if own else None,
     )
+
+
+def damping_of(energy: np.ndarray, mean: float, mass: float) -> np.ndarray:
+    """Square root of the ratio of a geometric emittance to that at the mean energy."""
+    return np.sqrt(beta_gamma(mean, mass) / beta_gamma(energy, mass))
 
 
 class Look(NamedTuple):

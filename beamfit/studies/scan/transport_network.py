@@ -102,7 +102,7 @@ def _first_principles(seen: Seen, lay: _Layout, points: np.ndarray) -> np.ndarra
     """A, B, C, D of the line, shape (points, planes, places, 4)."""
     n, full = len(points), padded(points)
     settings = {k: np.full(len(full), np.median(v)) for k, v in seen.scan.settings.items()}
-    energy = np.full(len(full), seen.energy(seen.planes[0]))
+    energy = np.full(len(full), seen.energy)
     columns = list(full.T)
     if lay.with_energy:
         energy = columns.pop()
@@ -142,6 +142,7 @@ def network_rows(seen: Seen, lay: _Layout, plane: str) -> NetworkRows:
         padded(lay.columns),
         _columns(seen, lay, plane, seen.rows.which),
         seen.look.known["xy".index(plane)],
+        seen.rows.damping,
     )
 
 
@@ -197,7 +198,7 @@ def _anchors(seen: Seen, lay: _Layout, told: Assumptions, rows: NetworkRows) -> 
 
     def known(name, inputs, screens, values, sd, predict=_outputs, elements=lay.elements):
         columns = _columns(seen, lay, plane, padded(screens))[:, :elements]
-        data = NetworkRows(plane, rows.squared, padded(inputs), columns, rows.known)
+        data = NetworkRows(plane, rows.squared, padded(inputs), columns, rows.known, rows.damping)
         return known_record(name, predict, data, values, sd)
 
     if anchor.deviation is not None:
