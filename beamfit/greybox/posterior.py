@@ -15,7 +15,7 @@ from scipy.sparse.csgraph import connected_components
 
 from beamfit.errors import InputError
 from beamfit.greybox import tree
-from beamfit.greybox.problem import Core, Prior, Problem
+from beamfit.greybox.problem import Core, Prior, Problem, with_slope
 from beamfit.sampling.likelihood import Group
 from beamfit.sampling.posterior import Posterior
 from beamfit.sampling.priors import Distribution, checked
@@ -339,7 +339,7 @@ def _with_slope(
     def sampled(own: jax.Array) -> jax.Array:
         return tree.read(quoted(tree.replace(core.model, core.chosen, own)), core.chosen)
 
-    return sampled(theta), jax.jacfwd(sampled)(theta)
+    return with_slope(sampled, theta)
 
 
 def _data(p: Problem, theta: np.ndarray, moving: np.ndarray, stated: Statement) -> Sampled:
