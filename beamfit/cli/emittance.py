@@ -8,22 +8,29 @@ import click
 
 import beamfit
 from beamfit.cli.options import Sampling, command_line, options
-from beamfit.io.line import build_line, lattice_of
-from beamfit.io.measurement import read_quad_scan
+from beamfit.io.inputs import read_inputs
+from beamfit.io.line import build_line
 from beamfit.io.result import results_text
 from beamfit.studies.scan.assumptions import Assumptions
 
 if TYPE_CHECKING:
+    from beamfit.cli.show import Terminal
+    from beamfit.io.emittance_gui import EmittanceGuiFile
+    from beamfit.optics.beamline import Beamline
     from beamfit.sampling.posterior import Posterior
     from beamfit.studies.scan.fit import EmittanceFit
+    from beamfit.studies.scan.size_methods import SizeMethods
 
 __all__ = ["emittance"]
 
+# What `read_inputs` takes besides the scan.
+GIVEN = ["lattice", "use", "energy", "particle", "ignore", "skip_bad", "size_method"]
 EXAMPLE = """\b
 Examples:
   beamfit emittance measurements/lcls_otr2.csv --lattice lattices/lcls_otr2.toml
   beamfit emittance scan.csv --lattice line.toml --plane x --report scan.pdf
   beamfit emittance scan.csv --lattice line.madx --use LINE --json
+  beamfit emittance Emittance-scan-OTRS_IN20_571.mat --report scan.html
   beamfit emittance scan.csv --lattice line.toml --sample --store scan.h5 --report scan.html
   beamfit emittance measurements/gtf_simulated.csv --lattice lattices/gtf.toml \\
     --scenario calibration --prior Q2.slope=167.23+-3.3446
@@ -31,7 +38,7 @@ Examples:
 
 
 @click.command(epilog=EXAMPLE)
-@options("scan ignore skip-bad maybe-lattice use energy particle")
+@options("scan ignore skip-bad size-method maybe-lattice use energy particle")
 @click.option(
     "--plane",
     type=click.Choice(["x", "y", "both"]),
@@ -45,7 +52,7 @@ Examples:
     help="What the fit compares: size² (linear) or size.",
 )
 @click.option("--robust", is_flag=True, help="Give each point a probability of being an outlier.")
-@options("scenario prior bounds anchor")
+@options("weights scenario prior bounds anchor")
 @click.option(
     "--hysteresis",
     is_flag=True,
@@ -56,15 +63,10 @@ Examples:
 @options("sample store seed report json")
 def emittance(
     scan: str,
-    ignore: tuple[str, ...],
-    skip_bad: bool,
-    lattice: str | None,
-    use: str | None,
-    energy: float | None,
-    particle: str | None,
     plane: str | None,
     method: str,
     robust: bool,
+    weights: str,
     scenario: str,
     sample: bool,
     store: str | None,
@@ -76,51 +78,72 @@ def emittance(
 
     SCAN is a CSV or HDF5 file with columns such as Q2_A (or Q2_kG, Q2_T_per_m, Q2_k1), size_x_um
     (or sigma_x_mm, fwhm_x_um, ...), size_x_error_um, size_y_um, and optionally energy_MeV,
-    screen, shot.
+    screen, shot; or a .mat file of SLAC's emittance_gui.
     """
     sampling = Sampling(sample, store, told["seed"])
     sampling.check()
+    given = {name: told.pop(name) for name in GIVEN}
     Assumptions(**told).check_scenario(scenario)
-    measured = read_quad_scan(scan, ignore=ignore, skip_bad=skip_bad)
-    described = lattice_of(measured, lattice, use=use, energy=energy, particle=particle)
+    measured, described, inputs, gui = read_inputs(scan, **given)
     planes = {None: measured.planes, "both": ("x", "y")}.get(plane, (plane,))
     for each in planes:
         measured.rows(each)  # says so if it was not measured
 
-    fit = beamfit.fit_emittance(  # JAX from here on
+    line = build_line(described)  # JAX from here on
+    fit = beamfit.fit_emittance(
         measured,
-        build_line(described),
+        line,
         planes=planes,
         method=method.replace("-", "_"),
         robust=robust,
+        weights=weights,
         scenario=scenario,
         **told,
     )
-    inputs = {scan: measured.sha256} | ({} if lattice is None else {lattice: described.sha256})
+    methods = () if gui is None else compared(gui, line, planes)
     posterior = fit.sample(**sampling.arguments(inputs, quiet=as_json)) if sample else None
     if report is not None:
-        beamfit.write_report(report, fit, posterior, command=command_line(), inputs=inputs)
+        told = {"command": command_line(), "inputs": inputs, "methods": methods}
+        beamfit.write_report(report, fit, posterior, **told)
     if as_json:
         further = {} if posterior is None else {"posterior": posterior}
-        click.echo(results_text(_results(fit), inputs, command_line(), **further))
+        click.echo(results_text(_results(fit, methods), inputs, command_line(), **further))
     else:
-        _show(fit, posterior, report)
+        _show(fit, posterior, report, methods)
 
 
-def _results(fit: EmittanceFit) -> list[dict[str, Any]]:
+def compared(
+    gui: EmittanceGuiFile, line: Beamline, planes: tuple[str, ...]
+) -> tuple[SizeMethods, ...]:
+    """What the size methods of a file of emittance_gui say of some planes."""
+    from beamfit.studies.scan.size_methods import compare_size_methods
+
+    found = compare_size_methods(gui.scans, line, gui.stored)
+    return tuple(m for m in found if m.plane in planes)
+
+
+def _results(fit: EmittanceFit, methods: tuple[SizeMethods, ...]) -> list[dict[str, Any]]:
     """What a fit says, and what small errors of the line and parts of the scan would change."""
     if not fit.statement.closed:
         return fit.to_json()
+    ways = {m.plane: {"size_methods": m} for m in methods}
 
     from beamfit.studies.scan.sensitivity import range_sensitivity, systematics
 
     return [
-        entry | {"systematics": systematics(fit, p.plane), "range": range_sensitivity(p)}
+        entry
+        | {"systematics": systematics(fit, p.plane), "range": range_sensitivity(p)}
+        | ways.get(p.plane, {})
         for p, entry in zip(fit.planes, fit.to_json(), strict=True)
     ]
 
 
-def _show(fit: EmittanceFit, posterior: Posterior | None, report: str | None) -> None:
+def _show(
+    fit: EmittanceFit,
+    posterior: Posterior | None,
+    report: str | None,
+    methods: tuple[SizeMethods, ...],
+) -> None:
     """Show tables, the verdict and what the budget is."""
     from beamfit.cli.show import Terminal
     from beamfit.studies.scan.results import parameter_rows, result_rows
@@ -151,10 +174,20 @@ def _show(fit: EmittanceFit, posterior: Posterior | None, report: str | None) ->
         terminal.line(f"Anchor: {fit.anchor}.", style="dim")
     if not fit.statement.closed:
         terminal.line()
+    _about_the_input(terminal, fit, methods)
+    if posterior is not None:
+        terminal.posterior("Posterior", posterior)
+    terminal.report(report)
+
+
+def _about_the_input(
+    terminal: Terminal, fit: EmittanceFit, methods: tuple[SizeMethods, ...]
+) -> None:
+    """Say what other sizes give, where the errors are from, and what is odd about the file."""
+    for way in methods:
+        terminal.table(way.table())
+        terminal.line()
     errors = fit.scan.error_source if fit.scan.error else "inferred from the residuals"
     terminal.line(f"Errors of the sizes: {errors}.", style="dim")
     for note in fit.notes:
         terminal.line(note)
-    if posterior is not None:
-        terminal.posterior("Posterior", posterior)
-    terminal.report(report)

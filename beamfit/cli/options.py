@@ -57,6 +57,18 @@ SHARED: dict[str, Callable[..., Any]] = {
     ),
     "lattice": click.option("--lattice", required=True, **LATTICE),
     "maybe-lattice": click.option("--lattice", **LATTICE),
+    "size-method": click.option(
+        "--size-method",
+        metavar="NAME",
+        help="Which sizes of a .mat file of emittance_gui; RMS unless said.",
+    ),
+    "weights": click.option(
+        "--weights",
+        type=click.Choice(["model", "measured"]),
+        default="model",
+        show_default=True,
+        help="Whose size the error of size squared is taken at; measured sizes bias the answer.",
+    ),
     "particle": click.option(
         "--particle",
         type=click.Choice(list(REST_ENERGY)),

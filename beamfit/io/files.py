@@ -12,7 +12,7 @@ from typing import Any
 
 from beamfit.errors import InputError
 
-__all__ = ["digest", "read_text", "text_lines", "write_atomically"]
+__all__ = ["digest", "read_bytes", "read_text", "text_lines", "write_atomically"]
 
 # A text line of a scan or a lattice is short; a longer one is another kind of file.
 LONGEST_LINE = 100_000
@@ -106,6 +106,23 @@ def read_text(path: str | PathLike[str], seen: Any = None) -> str:
             found = f"more than {LARGEST_TEXT // 1_000_000} MB of text"
             raise InputError(found, "a lattice file", path)
     return "\n".join(lines) + "\n"
+
+
+def read_bytes(path: str | PathLike[str], most: int, expected: str) -> tuple[bytes, str]:
+    """Read a whole file of up to ``most`` bytes, and give its SHA-256 too.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read, is empty, or is larger; ``expected`` says what it should be.
+    """
+    with _opened(path) as stream:
+        content = stream.read(most + 1)
+    if not content:
+        raise InputError("an empty file", "a file with content", path=path)
+    if len(content) > most:
+        raise InputError(f"more than {most // 1_000_000} MB", expected, path=path)
+    return content, hashlib.sha256(content).hexdigest()
 
 
 def digest(path: str | PathLike[str]) -> str:

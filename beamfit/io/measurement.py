@@ -11,6 +11,7 @@ import numpy as np
 from scipy.special import fdtrc
 
 from beamfit.errors import InputError
+from beamfit.io.emittance_gui import is_emittance_gui, read_emittance_gui
 from beamfit.io.scan_columns import ENERGIES, SETTINGS, column_notes, scan_columns
 from beamfit.io.table import UNITS, Column, Sheet, read_sheet
 from beamfit.statistics import POOR_FIT
@@ -48,7 +49,8 @@ def read_quad_scan(
     ----------
     path : str or path
         A CSV file whose header carries the units, or an HDF5 file (``.h5``, ``.hdf5``) with
-        one dataset a column under the same names.
+        one dataset a column under the same names; or a file of emittance_gui (``.mat``), of which
+        these are the RMS sizes (see `beamfit.io.emittance_gui.read_emittance_gui`).
     ignore : iterable of str
         Columns to leave unread; * and ? stand for any letters.
     skip_bad : bool
@@ -75,6 +77,8 @@ def read_quad_scan(
     >>> scan.notes
     ("1 of 4 rows was left out: line 5, column 'size_x_um', 'none'.",)
     """
+    if is_emittance_gui(path):
+        return read_emittance_gui(path).scan()
     sheet = read_sheet(path, "Q2_A,size_x_um", MOST_ROWS, ragged=skip_bad).without(ignore)
     columns = scan_columns(sheet)
     if skip_bad:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from functools import partial
 
@@ -29,22 +30,40 @@ from beamfit.studies.scan.results import (
     point_rows,
     result_rows,
 )
+from beamfit.studies.scan.scans import Profile
 from beamfit.studies.scan.sensitivity import budget_rows, range_rows
+from beamfit.studies.scan.size_methods import SizeMethods
 from beamfit.studies.scan.transport import scanned_line, transfer_rows
 from beamfit.table import Table, labelled
 
-__all__ = ["COLOUR", "draw_ellipses", "draw_scan", "emittance_page", "setting_axis"]
+__all__ = [
+    "COLOUR",
+    "draw_ellipses",
+    "draw_profiles",
+    "draw_scan",
+    "emittance_page",
+    "setting_axis",
+]
 
+# Profiles in a row of the picture, and in all.
+PROFILES_ABREAST, MOST_PROFILES = 3, 12
 COLOUR = {"x": BLUE, "y": RED}
 
 ERRORS = (
     "Errors are one standard deviation, scaled by sqrt(χ²/dof) where that exceeds 1. "
     "“Not determined” means the data put no error on the value; it is not to be quoted."
 )
+METHODS = (
+    "“Measured weights” is emittance_gui's own method, computed here. The error over all methods "
+    "has the spread of the methods in it, as a systematic."
+)
 
 
 def emittance_page(
-    fit: EmittanceFit, command: str | None, inputs: Mapping[str, str | None] | None
+    fit: EmittanceFit,
+    command: str | None,
+    inputs: Mapping[str, str | None] | None,
+    methods: tuple[SizeMethods, ...] = (),
 ) -> Page:
     """Lay out an emittance fit.
 
@@ -56,6 +75,8 @@ def emittance_page(
         The command that made it.
     inputs : mapping of str to str, or None
         Input files and their SHA-256; the scan's own if None.
+    methods : tuple of SizeMethods
+        What other ways of taking the sizes say.
 
     Returns
     -------
@@ -72,6 +93,7 @@ def emittance_page(
         *(_budgets(fit, names) if fit.statement.closed else _fitted_too(fit)),
         *(Table(f"Points, {p.plane} plane", *point_rows(p), numeric=True) for p in fit.planes),
     ]
+    tables += [way.table()._replace(note=METHODS) for way in methods]
     if fit.notes:
         tables.append(Table("About the input", [], [[note] for note in fit.notes]))
     energy = f"{float(line.energy):g} MeV"
@@ -206,6 +228,34 @@ def _points(axes: Axes, p: PlaneFit, at: np.ndarray) -> None:
             axes.errorbar(at[keep], size, error[keep], rasterized=len(at) > MANY, **style)
 
 
+def draw_profiles(figure: FigureBase, profiles: list[Profile], fit: EmittanceFit) -> None:
+    """Draw the projected profiles from which sizes of one plane were taken.
+
+    Parameters
+    ----------
+    figure : Figure or SubFigure
+        Where to.
+    profiles : list of Profile
+        Of one plane.
+    fit : EmittanceFit
+        For the settings of their rows.
+    """
+    across = min(PROFILES_ABREAST, len(profiles))
+    every = figure.subplots(math.ceil(len(profiles) / across), across, squeeze=False).ravel()
+    for axes, p in zip(every, profiles, strict=False):
+        position = 1e3 * (p.position - np.average(p.position, weights=np.maximum(p.counts, 1e-300)))
+        axes.step(position, p.counts, where="mid", color="0.6", lw=0.8)
+        if p.curve is not None:
+            axes.plot(position, p.curve, color=COLOUR[p.plane], lw=1.2)
+        settings = [f"{n} = {v[p.row]:.4g}" for n, v in fit.scan.settings.items()]
+        axes.set_title(", ".join(settings) or (fit.scan.screen or [""])[p.row], fontsize=7)
+        axes.set_yticks([])
+        axes.tick_params(labelsize=7)
+    for axes in every[len(profiles) :]:
+        axes.set_axis_off()
+    figure.suptitle(f"projected profiles in {profiles[0].plane}, mm from their centres", fontsize=9)
+
+
 def draw_ellipses(figure: FigureBase, fit: EmittanceFit) -> None:
     """Draw the one-sigma phase ellipses at the start of the line and at the screen.
 
@@ -235,6 +285,11 @@ def _pictures(fit: EmittanceFit) -> list[Picture]:
         Picture(f"scan of the {p.plane} plane", 4.6, partial(draw_scan, fit=fit, plane=p.plane))
         for p in fit.planes
     ]
+    for p in fit.planes:
+        if shown := [f for f in fit.scan.profiles if f.plane == p.plane][:MOST_PROFILES]:
+            height = 0.6 + 1.3 * math.ceil(len(shown) / PROFILES_ABREAST)
+            draw = partial(draw_profiles, profiles=shown, fit=fit)
+            listed.append(Picture(f"profiles of the {p.plane} plane", height, draw))
     if any(_has_ellipses(p) for p in fit.planes):
         listed.append(Picture("phase ellipses", 3.4, partial(draw_ellipses, fit=fit)))
     return listed

@@ -20,6 +20,7 @@ from beamfit.studies.decay.fit import DecayFit
 from beamfit.studies.decay.shift import Shift
 from beamfit.studies.decay.study import Decay, RecordStudy
 from beamfit.studies.scan.fit import EmittanceFit
+from beamfit.studies.scan.size_methods import SizeMethods
 
 __all__ = ["write_report"]
 
@@ -32,6 +33,7 @@ def write_report(
     command: str | None = None,
     inputs: Mapping[str, str | None] | None = None,
     shift: Shift | None = None,
+    methods: tuple[SizeMethods, ...] = (),
 ) -> None:
     """Write a report page of a fit.
 
@@ -49,6 +51,8 @@ def write_report(
         Input files and their SHA-256; a scan's own if None.
     shift : Shift, optional
         The study of all decays together, to go before them.
+    methods : tuple of SizeMethods
+        What other ways of taking the sizes of a scan say.
 
     Raises
     ------
@@ -73,7 +77,7 @@ def write_report(
         raise InputError(f"report '{path}'", "a name ending in .html or .pdf", path=path)
     with rc_context(STYLE):
         if isinstance(result, EmittanceFit):
-            page = emittance_page(result, command, inputs)
+            page = emittance_page(result, command, inputs, methods)
             sampled = [] if posterior is None else [of_scan(result, posterior)]
         else:
             studies = (_study_of(result),) if isinstance(result, DecayFit) else result

@@ -238,7 +238,9 @@ class EmittanceFit:
     @property
     def notes(self) -> tuple[str, ...]:
         """What was done to the numbers of the file, and what is odd about them, in sentences."""
-        return (*self.scan.notes, *questions(self.scan, self.seen.scanned))
+        measured = self.seen.weights == "measured"
+        own = ("Errors of size squared are taken at the measured sizes, on request.",) * measured
+        return (*self.scan.notes, *questions(self.scan, self.seen.scanned), *own)
 
     @property
     def anchor(self) -> str:

@@ -1,0 +1,365 @@
+"""Files of SLAC's emittance_gui: a scan or several monitors, with its matrices and size methods."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from datetime import datetime, timedelta
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from beamfit.errors import InputError, nearest
+from beamfit.io.lattice import LatticeFile
+from beamfit.io.matlab import read_variable
+from beamfit.quantity import Quantity
+from beamfit.studies.scan.scans import Profile, QuadScan
+
+__all__ = ["EmittanceGuiFile", "is_emittance_gui", "read_emittance_gui"]
+
+# GeV, of files that have none; the electron's is the only particle there.
+USUAL_ENERGY = 0.135
+# The size method that answers unless another is asked for.
+USUAL_METHOD = "RMS"
+# Where the sizes stand in `stats`, µm.
+SIZE = {"x": 2, "y": 3}
+EXPECTED = "a file saved by emittance_gui"
+
+
+@dataclass(frozen=True)
+class EmittanceGuiFile:
+    """What such a file holds.
+
+    Attributes
+    ----------
+    scans : dict of str to QuadScan
+        One for each way of taking the sizes from the profiles, with the rows' own matrices.
+    stored : dict of str to dict of str to Quantity
+        Method and plane to the normalised emittance that the program found, m.
+    lattice : LatticeFile
+        The energy, the monitor, and the design Twiss parameters where the matrices begin.
+    """
+
+    scans: Mapping[str, QuadScan]
+    stored: Mapping[str, Mapping[str, Quantity]]
+    lattice: LatticeFile
+
+    def scan(self, method: str | None = None) -> QuadScan:
+        """The scan of a size method: "RMS" or, where there is none, the first.
+
+        Raises
+        ------
+        InputError
+            If there is no such method.
+        """
+        names = list(self.scans)
+        wanted = (USUAL_METHOD if USUAL_METHOD in names else names[0]) if method is None else method
+        if wanted not in self.scans:
+            found = f"no size method '{wanted}'"
+            raise InputError(found, nearest(wanted, names), self.lattice.path)
+        return self.scans[wanted]
+
+
+def is_emittance_gui(path: str | PathLike[str]) -> bool:
+    """Whether a file is one by its name."""
+    return Path(path).suffix.lower() == ".mat"
+
+
+def read_emittance_gui(path: str | PathLike[str]) -> EmittanceGuiFile:
+    """Read a file that SLAC's emittance_gui saved.
+
+    Parameters
+    ----------
+    path : str or path
+        A MATLAB file (version 5 to 7) with a struct ``data``; docs/files.md names its fields.
+
+    Returns
+    -------
+    EmittanceGuiFile
+        Errors of the sizes are standard errors over the shots. Settings that failed or were taken
+        out (``status``, ``use``) are left out and counted in the notes of each scan.
+
+    Raises
+    ------
+    InputError
+        If it is another file, is damaged, or lacks sizes or matrices.
+
+    Examples
+    --------
+    >>> read_emittance_gui("orbit.csv")
+    Traceback (most recent call last):
+    beamfit.errors.InputError: orbit.csv: no such file; expected a readable file
+    """
+    data, sha256 = read_variable(path, "data")
+    source = _Fields(path, data)
+    try:
+        return _read(source, sha256)
+    except InputError as error:
+        error.path = path
+        raise
+    except (TypeError, ValueError, IndexError, KeyError, AttributeError, OverflowError) as error:
+        found = f"a struct 'data' that is laid out otherwise ({type(error).__name__})"
+        raise InputError(found, EXPECTED, path) from None
+
+
+class _Fields:
+    """The fields of the struct, each as the array it is."""
+
+    def __init__(self, path: str | PathLike[str], data: Any) -> None:
+        self.path = path
+        if data.dtype.names is None or data.size != 1:
+            raise InputError("a variable 'data' that is no struct", EXPECTED, path)
+        self.record = data.ravel()[0]
+        self.names = data.dtype.names
+
+    def error(self, found: str, field: str) -> InputError:
+        return InputError(found, EXPECTED, self.path, column=field)
+
+    def get(self, field: str) -> np.ndarray | None:
+        """A field as an array; None if the file has none, or an empty one."""
+        if field not in self.names:
+            return None
+        value = np.asarray(self.record[field])
+        return value if value.size else None
+
+    def need(self, field: str) -> np.ndarray:
+        if (value := self.get(field)) is None:
+            raise self.error("a field that is missing or empty", field)
+        return value
+
+    def numbers(self, field: str, n: int | None = None) -> np.ndarray:
+        """A field of finite numbers, flat; of n of them if that is said."""
+        value = self.need(field)
+        if value.dtype.kind not in "iuf" or not np.isfinite(value).all():
+            raise self.error("something else than finite numbers", field)
+        if n is not None and value.size != n:
+            raise self.error(f"{value.size} numbers for {n} settings", field)
+        return value.ravel().astype(float)
+
+    def number(self, field: str, usual: float) -> float:
+        return usual if self.get(field) is None else float(self.numbers(field, 1)[0])
+
+
+def _text(value: Any) -> str:
+    """A text out of the arrays of one that MATLAB makes of it."""
+    while isinstance(value, np.ndarray) and value.size == 1:
+        value = value.ravel()[0]
+    return str(value).strip() if isinstance(value, str) else ""
+
+
+def _texts(value: np.ndarray | None) -> list[str]:
+    return [] if value is None else [_text(v) for v in value.ravel()]
+
+
+def _read(source: _Fields, sha256: str) -> EmittanceGuiFile:
+    several = _text(source.get("type")) == "multi"
+    beams = _beams(source)
+    n, _, methods = beams.shape
+    used = np.ones(n, bool)
+    for field in ("status", "use"):
+        if source.get(field) is not None:
+            used &= source.numbers(field, n) > 0
+    names = [_method(beams[:, :, k], k) for k in range(methods)]
+    shared = _shared(source, np.flatnonzero(used), n, several) | {"sha256": sha256}
+    scans = {}
+    for k, name in enumerate(names):
+        sizes, shots = _sizes(beams[used, :, k])
+        error = _standard_errors(beams[used, :, k])
+        scans[name] = QuadScan(
+            **shared,
+            size=sizes,
+            error=error,
+            shots=shots if error else None,
+            profiles=_profiles(source.get("beam"), np.flatnonzero(used), k),
+            name=f"{Path(source.path).stem}, {name} sizes",
+        )
+    return EmittanceGuiFile(scans, _stored(source, names), _lattice(source, sha256, several))
+
+
+def _beams(source: _Fields) -> np.ndarray:
+    """Records of the beam by setting, shot and method."""
+    field, usual = ("beamList", 3) if source.get("beamList") is not None else ("beam", 2)
+    beams = source.need(field)
+    if beams.dtype.names is None or "stats" not in beams.dtype.names:
+        raise source.error("no sizes", field)
+    if beams.ndim != usual:
+        found = f"sizes of shape {beams.shape}, as of slices"
+        expected = "a scan of the whole beam; write the sizes of a slice as CSV, with r11_x, ..."
+        raise InputError(found, expected, source.path, column=field)
+    return beams if usual == 3 else beams[:, None, :]
+
+
+def _shared(source: _Fields, used: np.ndarray, n: int, several: bool) -> dict[str, Any]:
+    """What scans of all methods share: settings or monitors, matrices, provenance."""
+    cells = source.need("rMatrix").ravel()
+    if len(cells) != n:
+        raise source.error(f"{len(cells)} matrices for {n} settings", "rMatrix")
+    matrices = []
+    for i in used:
+        r = np.asarray(cells[i], float)
+        if r.shape != (6, 6) or not np.isfinite(r).all():
+            raise source.error(f"matrix {i + 1} of shape {r.shape}", "rMatrix")
+        matrices.append(r)
+    r = np.array(matrices).reshape(-1, 6, 6)
+    monitors, magnet = _texts(source.get("name")), _text(source.get("quadName")) or "quadrupole"
+    settings, units, screen = {}, {}, None
+    if several:
+        listed = monitors if len(monitors) == n else [f"monitor {i + 1}" for i in range(n)]
+        screen = tuple(listed[i] for i in used)
+    else:
+        settings, units = {magnet: source.numbers("quadVal", n)[used]}, {magnet: "kG"}
+    left = n - len(used)
+    notes = [f"{left} of {n} settings failed or were taken out, by status and use."] if left else []
+    if source.get("energy") is None:
+        notes.append(f"The file has no energy; {1e3 * USUAL_ENERGY:g} MeV is taken, as there.")
+    return {
+        "settings": settings,
+        "units": units,
+        "screen": screen,
+        "energy": np.full(len(used), _energy(source)),
+        "transfer": {"x": r[:, 0, [0, 1, 5]], "y": r[:, 2, [2, 3, 5]]},
+        "path": source.path,
+        "provenance": tuple(_provenance(source, monitors)),
+        "notes": tuple(notes),
+        "error_source": "the scatter of the shots (standard error of the mean)",
+    }
+
+
+def _provenance(source: _Fields, monitors: list[str]) -> list[str]:
+    said = [f"emittance_gui, {_text(source.get('type')) or 'scan'}"]
+    said += [f"{word} {name}" for word, name in
+             (("monitor", ", ".join(monitors)), ("quadrupole", _text(source.get("quadName"))))
+             if name]  # fmt: skip
+    if source.get("ts") is not None:
+        days = source.number("ts", 0.0)
+        if 366 < days < 1e6:  # MATLAB counts days from the year 0
+            moment = datetime(1, 1, 1) + timedelta(days=days - 367)
+            said.append(f"{moment:%Y-%m-%d %H:%M:%S}")
+    if source.get("charge") is not None:
+        said.append(f"charge {source.number('charge', 0.0):.3g} nC")
+    return said
+
+
+def _method(beams: np.ndarray, k: int) -> str:
+    """The name of a size method, from any shot that has it."""
+    named = (_text(v) for v in beams["method"].ravel()) if "method" in beams.dtype.names else ()
+    return next((name for name in named if name), f"method {k + 1}")
+
+
+def _stats(beams: np.ndarray, plane: str) -> np.ndarray:
+    """Sizes in m of settings and shots; NaN for shots that failed."""
+    found = np.full(beams.shape, np.nan)
+    for place, stats in np.ndenumerate(beams["stats"]):
+        values = np.asarray(stats)
+        if values.dtype.kind in "iuf" and values.size > SIZE[plane]:
+            size = 1e-6 * float(values.ravel()[SIZE[plane]])
+            found[place] = size if 0.0 < size < math.inf else np.nan
+    return found
+
+
+def _sizes(beams: np.ndarray) -> tuple[dict[str, np.ndarray], np.ndarray]:
+    """Mean sizes of the planes in m, and how many shots they rest on."""
+    sizes, shots = {}, np.zeros(len(beams), int)
+    for plane in SIZE:
+        each = _stats(beams, plane)
+        good = np.isfinite(each)
+        if good.any():
+            number = good.sum(axis=1)
+            total = np.where(good, each, 0.0).sum(axis=1)
+            sizes[plane] = np.where(number > 0, total / np.maximum(number, 1), np.nan)
+            shots = np.maximum(shots, number)
+    return sizes, shots
+
+
+def _standard_errors(beams: np.ndarray) -> dict[str, np.ndarray]:
+    """s/√n of the shots in m, s with n - 1; none where a setting has no scatter to tell it."""
+    found = {}
+    for plane in SIZE:
+        each = _stats(beams, plane)
+        good = np.isfinite(each)
+        number = good.sum(axis=1)
+        measured = number > 0
+        if measured.any() and number[measured].min() > 1:
+            mean = np.where(good, each, 0.0).sum(axis=1) / np.maximum(number, 1)
+            square = np.where(good, (each - mean[:, None]) ** 2, 0.0).sum(axis=1)
+            error = np.sqrt(square / np.maximum(number - 1, 1) / np.maximum(number, 1))
+            if (error[measured] > 0.0).all():
+                found[plane] = np.where(measured, error, np.nan)
+    return found
+
+
+def _profiles(beam: np.ndarray | None, used: np.ndarray, k: int) -> tuple[Profile, ...]:
+    """Projected profiles of one method, as far as the file has them."""
+    found = []
+    if beam is None or beam.dtype.names is None or beam.ndim < 2 or k >= beam.shape[1]:
+        return ()
+    for row, i in enumerate(used):
+        for plane in SIZE:
+            record = beam[(i, k, *(0,) * (beam.ndim - 2))]
+            field = f"prof{plane}"
+            values = np.asarray(record[field]) if field in beam.dtype.names else np.zeros(0)
+            if values.ndim == 2 and values.shape[0] in (2, 3) and values.dtype.kind in "iuf":
+                position, counts, *curve = np.asarray(values, float)
+                found.append(Profile(plane, row, 1e-6 * position, counts, *(curve or [None])))
+    return tuple(found)
+
+
+def _stored(source: _Fields, methods: list[str]) -> dict[str, dict[str, Quantity]]:
+    """The program's own normalised emittances and their errors, m."""
+    values, errors = source.get("twiss"), source.get("twissstd")
+    if values is None or errors is None:
+        return {}
+    shape = (4, 2, len(methods))
+    values, errors = (np.asarray(v, float) for v in (values, errors))
+    if values.ndim < 3 or values.shape[:3] != shape or errors.shape != values.shape:
+        return {}
+    first = (slice(None),) * 3 + (0,) * (values.ndim - 3)
+    values, errors = values[first], errors[first]
+    return {
+        name: {
+            plane: Quantity(float(values[0, p, k]), float(errors[0, p, k]), "m")
+            for p, plane in enumerate(SIZE)
+            if np.isfinite([values[0, p, k], errors[0, p, k]]).all()
+        }
+        for k, name in enumerate(methods)
+    }
+
+
+def _energy(source: _Fields) -> float:
+    """Total energy, MeV."""
+    energy = 1e3 * source.number("energy", USUAL_ENERGY)
+    if not 1.0 < energy < 1e6:
+        raise source.error(f"an energy of {1e-3 * energy:g} GeV", "energy")
+    return energy
+
+
+def _lattice(source: _Fields, sha256: str, several: bool) -> LatticeFile:
+    """Energy, monitors and design Twiss parameters, as of a line."""
+    monitors = _texts(source.get("name")) or ["screen"]
+    # Of several monitors the matrices begin somewhere before; of one, at it.
+    places = [*dict.fromkeys(monitors), "start"] if several else monitors[:1]
+    n = source.need("rMatrix").size
+    if several and len(monitors) != n:
+        places = [*(f"monitor {i + 1}" for i in range(n)), "start"]
+    design = None
+    twiss = source.get("twiss0")
+    if twiss is not None and twiss.shape == (3, 2) and twiss.dtype.kind in "iuf":
+        beta, alpha = np.asarray(twiss[1:], float)
+        if np.isfinite([beta, alpha]).all() and beta.min() > 0.0:
+            design = {"at": places[-1]} | {
+                p: {"beta_m": float(beta[i]), "alpha": float(alpha[i])} for i, p in enumerate(SIZE)
+            }
+    return LatticeFile(
+        path=source.path,
+        sha256=sha256,
+        name=f"matrices of {Path(source.path).name}",
+        energy=_energy(source),
+        particle="electron",
+        energy_spread=0.0,
+        elements=tuple({"type": "screen", "name": name or "screen"} for name in places),
+        calibrations={},
+        design=design,
+    )
