@@ -453,7 +453,9 @@ def _rows(
             name: jnp.asarray(line[name].calibration.k1l(v, line[name].length, at), float)
             for name, v in setting.items()
         }
-        return _by_strengths(places, strengths, bare, at)
+        # Of monitors alone nothing is set, and there is nothing to differentiate by.
+        through = _by_strengths if strengths else _from_strengths
+        return through(places, strengths, bare, at)
 
     rows = (settings, None if jnp.ndim(energy) == 0 else energy)
     long = max((e.order.size for e in line.elements if isinstance(e, Series)), default=0)
