@@ -167,7 +167,7 @@ def measured_weights(fit: EmittanceFit, plane: str) -> Quantity:
     found, dof = fit_sizes(p.r11, p.r12, size, error, p.known, weights="measured"), len(size) - 3
     if not (bool(found.positive) and bool(found.full_rank)):
         return Quantity(math.nan, None, "m")
-    factor = beta_gamma(fit.seen.energy(plane), float(fit.line.mass))
+    factor = beta_gamma(fit.seen.energy, float(fit.line.mass))
     value = factor * float(emittance_parts(found.sigma)[0])
     if dof < 1:
         return Quantity(value, None, "m")
