@@ -14,7 +14,7 @@ NORMAL_REACH = 1.96
 _PREFIXES = ((1.0, ""), (1e-3, "m"), (1e-6, "µ"), (1e-9, "n"), (1e-12, "p"))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Quantity:
     """A value, its standard error and its unit.
 
@@ -84,6 +84,12 @@ class Quantity:
             value, error, places = value / 10**power, error / 10**power, places + power
             return f"({value:.{max(places, 0)}f} ± {error:.{max(places, 0)}f})e{power:+03d}{end}"
         return f"{value:.{max(places, 0)}f} ± {error:.{max(places, 0)}f}{end}"
+
+    def __repr__(self) -> str:
+        return f"<Quantity {self}>"
+
+    def _repr_html_(self) -> str:
+        return str(self).replace("^2", "<sup>2</sup>")
 
     def _prefix(self) -> tuple[float, str]:
         return display_unit(

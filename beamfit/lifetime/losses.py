@@ -15,6 +15,7 @@ from beamfit.lifetime.bunch import quantum_loss
 from beamfit.lifetime.gas import bremsstrahlung_loss, elastic_loss
 from beamfit.lifetime.ring import Operation, Ring
 from beamfit.lifetime.touschek import touschek_loss
+from beamfit.shown import shown
 
 __all__ = [
     "LINEAR",
@@ -69,6 +70,7 @@ SCALES = {m.name: m.vary for m in MECHANISMS if m.vary} | {
 }
 
 
+@shown
 class Losses(
     namedtuple("_Parts", [f"a_{m.name}" for m in QUADRATIC] + [f"b_{m.name}" for m in LINEAR])
 ):

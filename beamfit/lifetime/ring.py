@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from scipy import constants
 
 from beamfit.particles import REST_ENERGY
+from beamfit.shown import shown
 
 __all__ = [
     "ELECTRON_MASS_EV",
@@ -38,6 +39,7 @@ MOLECULES = {
 }
 
 
+@shown
 class Optics(NamedTuple):
     """Optical functions at points along the ring, and the share of the ring each stands for.
 
@@ -72,6 +74,7 @@ class Optics(NamedTuple):
         return jnp.sum(self.weight * values)
 
 
+@shown
 class Ring(NamedTuple):
     """A storage ring as the loss mechanisms see it.
 
@@ -128,6 +131,7 @@ class Ring(NamedTuple):
         return self.energy / ELECTRON_MASS_EV
 
 
+@shown
 class Gas(NamedTuple):
     """Atoms of the residual gas, element by element.
 
@@ -143,6 +147,7 @@ class Gas(NamedTuple):
     atoms: jax.Array
 
 
+@shown
 class Operation(NamedTuple):
     """The settings an operator can change, and the vacuum that results.
 

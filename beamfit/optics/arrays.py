@@ -12,6 +12,8 @@ import numpy as np
 from jax import Array
 from jax.typing import ArrayLike
 
+from beamfit.shown import shown
+
 __all__ = ["array_module", "floats", "value"]
 
 C = TypeVar("C", bound=type)
@@ -34,7 +36,7 @@ def value(*structure: str) -> Callable[[C], C]:
     def make(cls: C) -> C:
         cls = dataclass(frozen=True)(cls)
         data = [f.name for f in fields(cls) if f.name not in structure]
-        return jax.tree_util.register_dataclass(cls, data, list(structure))
+        return shown(jax.tree_util.register_dataclass(cls, data, list(structure)))
 
     return make
 

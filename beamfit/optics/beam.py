@@ -13,10 +13,12 @@ from jax.typing import ArrayLike
 from beamfit.errors import InputError
 from beamfit.optics.arrays import value
 from beamfit.optics.particle import ELECTRON_MASS, beta_gamma
+from beamfit.shown import shown
 
 __all__ = ["BeamMatrix", "Twiss"]
 
 
+@shown
 class Twiss(NamedTuple):
     """Twiss parameters of one plane.
 

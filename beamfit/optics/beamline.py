@@ -15,10 +15,16 @@ from beamfit.optics.arrays import value
 from beamfit.optics.elements import IDENTITY, Element, Screen, TransferMatrix
 from beamfit.optics.particle import ELECTRON_MASS
 from beamfit.optics.sections import Section, Series, in_series
+from beamfit.shown import brief, shown
+from beamfit.table import Table
 
 __all__ = ["Beamline", "Design"]
 
+# Elements of a line that a notebook shows.
+MOST_SHOWN = 40
 
+
+@shown
 class Design(NamedTuple):
     """Twiss parameters a line was designed for.
 
@@ -72,6 +78,20 @@ class Beamline:
     mass: float = ELECTRON_MASS
     energy_spread: ArrayLike = 0.0
     design: Design | None = None
+
+    @property
+    def headline(self) -> str:
+        """The line in a line."""
+        magnets, screens = (", ".join(names[:6]) for names in (self.magnets, self.screens))
+        said = f"{len(self)} elements, {brief(self.length)} m, {brief(self.energy)} MeV"
+        return f"{self.name}: {said}; magnets {magnets or 'none'}; screens {screens or 'none'}"
+
+    def tables(self) -> tuple[Table, ...]:
+        """The first elements, to be shown."""
+        few = self.elements[:MOST_SHOWN]
+        rows = [[e.name, type(e).__name__, brief(e.length), brief(e.setting)] for e in few]
+        more = f"the first {len(few)} of {len(self)}" if len(few) < len(self) else ""
+        return (Table(self.headline, ["element", "kind", "length m", "setting"], rows, more),)
 
     def __getitem__(self, name: str) -> Element:
         return self.elements[self._index(name)]

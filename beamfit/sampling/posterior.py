@@ -16,6 +16,7 @@ from beamfit.sampling.convergence import Diagnostics
 from beamfit.sampling.likelihood import LOG_NOISE
 from beamfit.sampling.priors import in_words
 from beamfit.sampling.target import Target
+from beamfit.shown import brief, shown
 from beamfit.status import Status
 from beamfit.table import Table, html_of, json_of, plain_name, text_of
 
@@ -110,11 +111,26 @@ def interval_table(rows: Sequence[Summary], title: str = "", note: str = "") -> 
     return Table(title, HEADER, [*cells, *([[f"and {left} more"]] if left > 0 else [])], note)
 
 
+@shown
 class Correlations(NamedTuple):
     """Correlation coefficients of numbers, one row and column a name."""
 
     names: tuple[str, ...]
     values: np.ndarray
+
+    @property
+    def headline(self) -> str:
+        """Of what, in a line."""
+        return f"of {', '.join(self.names)}"
+
+    def tables(self) -> tuple[Table, ...]:
+        """The coefficients, to be shown."""
+        rows = [
+            [plain_name(name), *(f"{value:.3f}" for value in row)]
+            for name, row in zip(self.names, self.values, strict=True)
+        ]
+        header = ["", *map(plain_name, self.names)]
+        return (Table("Correlation coefficients", header, rows, numeric=True),)
 
 
 class Band(NamedTuple):
@@ -143,6 +159,7 @@ class Expected(NamedTuple):
     reading: np.ndarray
 
 
+@shown
 @dataclass(frozen=True, eq=False)
 class Posterior:
     """Draws from a posterior, with a verdict on them. Prints as a table.
@@ -341,6 +358,12 @@ class Posterior:
         """Whether the walkers lie so far apart that no interval of theirs means anything."""
         rhat = self.diagnostics.rhat
         return bool(rhat.size and np.max(rhat) > APART)
+
+    @property
+    def headline(self) -> str:
+        """Status, numbers and draws in a line."""
+        draws = self.chain.shape[0] * self.chain.shape[1]
+        return f"{self.status}: {draws} draws of {brief(self.names)}"
 
     def summary(self, name: str) -> Summary:
         """A number's mean, standard deviation and quantiles, and whether they may be quoted."""

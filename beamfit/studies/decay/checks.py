@@ -12,6 +12,7 @@ from scipy.special import fdtrc
 from beamfit.errors import InputError
 from beamfit.lifetime.decay import HOUR
 from beamfit.quantity import Quantity, Status
+from beamfit.shown import shown
 from beamfit.studies.decay.fit import DecayFit, bare, fit_decay
 from beamfit.studies.decay.model import constant_shape, padded, solve_decay
 from beamfit.studies.decay.record import DecayRecord
@@ -38,6 +39,7 @@ BIAS_DIGITS = 12
 ENOUGH = 1024
 
 
+@shown
 @dataclass(frozen=True)
 class OneLifetime:
     """A lifetime from an analysis that takes it as constant, and its bias.
@@ -137,6 +139,7 @@ def log_linear(record: DecayRecord) -> OneLifetime:
     return _one_lifetime(-slope, math.sqrt(covariance[0, 0]), residuals, fit_decay(record))
 
 
+@shown
 @dataclass(frozen=True, eq=False)
 class LifetimeTrace:
     """Momentary lifetime along a record.
@@ -210,6 +213,7 @@ def moving_lifetime(record: DecayRecord, window: float) -> LifetimeTrace:
         return LifetimeTrace(at, level, -level / slope / HOUR, level * error / slope**2 / HOUR)
 
 
+@shown
 @dataclass(frozen=True)
 class ConstantA:
     """Whether one record contradicts a constant a.

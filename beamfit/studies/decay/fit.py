@@ -13,6 +13,7 @@ import numpy as np
 from beamfit.errors import InputError
 from beamfit.lifetime.decay import HOUR
 from beamfit.quantity import Quantity, Status
+from beamfit.shown import shown
 from beamfit.studies.decay.model import (
     Solution,
     padded,
@@ -28,6 +29,7 @@ from beamfit.studies.decay.verdict import (
     Separability,
     finding_of,
 )
+from beamfit.table import Table, cell, labelled, plain_name
 
 if TYPE_CHECKING:
     from beamfit.sampling.posterior import Posterior
@@ -54,6 +56,7 @@ def bare(value: float, unit: str) -> dict[str, Any]:
     return {"value": value, "error": None, "unit": unit}
 
 
+@shown
 @dataclass(frozen=True, eq=False)
 class DecayFit:
     """The result of `fit_decay`.
@@ -165,6 +168,18 @@ class DecayFit:
         from beamfit.studies.decay.posterior import decay_target
 
         return draw(decay_target(self, noise, outliers, priors), **options)
+
+    @property
+    def headline(self) -> str:
+        """The record, its status and its lifetime in a line."""
+        return f"{self.record} {cell(self.status)}: mean lifetime {self.lifetime_mean}"
+
+    def tables(self) -> tuple[Table, ...]:
+        """The numbers, to be shown."""
+        rows = [(plain_name(name), [getattr(self, name)]) for name in UNITS]
+        rows.append(("chi2/dof", [f"{self.chi2:.4g}/{self.dof}"]))
+        rows.append(("rms residual", [f"{self.rms_residual:.3g} mA"]))
+        return (labelled(f"{self.record}: {cell(self.status)}", [], rows),)
 
     def __str__(self) -> str:
         rows = [f"{self.record}: {self.status}. {self.message}"]

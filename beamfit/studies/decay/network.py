@@ -27,6 +27,7 @@ from beamfit.lifetime.decay import HOUR
 from beamfit.lifetime.ring import Operation
 from beamfit.lifetime.scaled import Terms, loss_terms, scaled_losses
 from beamfit.quantity import Quantity
+from beamfit.shown import shown
 from beamfit.studies.decay.loss_budget import Machine, operation_during
 from beamfit.studies.decay.scales import ScaleFit, stacked_terms
 from beamfit.studies.decay.study import Decay
@@ -123,6 +124,7 @@ class Certificate(NamedTuple):
         return json_of({"holds": self.holds, **self._asdict()})
 
 
+@shown
 @dataclass(frozen=True, eq=False)
 class NetworkFit:
     """A fitted network of losses.

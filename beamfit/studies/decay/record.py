@@ -8,10 +8,14 @@ from typing import NamedTuple
 import numpy as np
 
 from beamfit.errors import InputError
+from beamfit.shown import shown
+from beamfit.table import Table
 
 __all__ = ["Conditions", "DecayRecord", "Fault", "first_fault"]
 
 
+# Readings of a record that a notebook shows.
+MOST_SHOWN = 20
 # Beyond these a column is in another unit than its name says: RF voltages up to LEP's 3.6 GV, a
 # scraper from 0.1 mm, a vacuum in which a beam can be stored.
 PLAUSIBLE = {
@@ -22,6 +26,7 @@ PLAUSIBLE = {
 }
 
 
+@shown
 class Conditions(NamedTuple):
     """Operating conditions along a record, in SI; None where the file does not give them.
 
@@ -147,6 +152,7 @@ def _frozen(values: object, rows: int, quantity: str) -> np.ndarray:
     return array
 
 
+@shown
 @dataclass(frozen=True, eq=False, repr=False)
 class DecayRecord:
     """Beam current against time, validated and immutable.
@@ -220,8 +226,17 @@ class DecayRecord:
             f"{self.current[0]:.6g} to {self.current[-1]:.6g} mA"
         )
 
-    def __repr__(self) -> str:
-        return f"<DecayRecord {self}>"
+    @property
+    def headline(self) -> str:
+        """The record in a line."""
+        return str(self)
+
+    def tables(self) -> tuple[Table, ...]:
+        """The first readings, to be shown."""
+        few = range(min(len(self), MOST_SHOWN))
+        rows = [[f"{self.time[i]:.6g}", f"{self.current[i]:.6g}"] for i in few]
+        more = f"the first {len(few)} of {len(self)} readings" if len(few) < len(self) else ""
+        return (Table(str(self), ["time s", "beam current mA"], rows, more, numeric=True),)
 
     @property
     def span(self) -> float:

@@ -20,6 +20,7 @@ from beamfit.greybox.solve import solve
 from beamfit.lifetime.losses import SCALES
 from beamfit.lifetime.scaled import Terms, loss_terms, scaled_losses
 from beamfit.quantity import Quantity, Status
+from beamfit.shown import shown
 from beamfit.statistics import POOR_FIT, chi2_probability
 from beamfit.studies.decay.loss_budget import Machine, operation_during
 from beamfit.studies.decay.study import Decay
@@ -48,6 +49,7 @@ LARGEST = 1e3
 WIDTH = 0.3
 
 
+@shown
 @dataclass(frozen=True, eq=False)
 class ScaleFit:
     """Scales on the mechanisms of first principles, from many decays.

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.ndimage import median_filter
 
+from beamfit.shown import shown
 from beamfit.studies.decay.record import DecayRecord
 
 __all__ = ["Event", "Split", "noise_of", "split_record"]
@@ -48,6 +49,7 @@ class Event(NamedTuple):
         return f"{self.kind} at {self.time:.0f} s ({self.change:+.4g} mA)"
 
 
+@shown
 class Split(NamedTuple):
     """A record's clean decays, and what lies between them.
 

@@ -19,6 +19,7 @@ from beamfit.lifetime.ring import Operation
 from beamfit.lifetime.scaled import loss_terms, scaled_losses, scaled_parts
 from beamfit.quantity import Quantity, Status
 from beamfit.sampling.posterior import Interval, Posterior
+from beamfit.shown import shown
 from beamfit.studies.decay.fit import bare
 from beamfit.studies.decay.loss_budget import Machine, operation_during, settings_json
 from beamfit.studies.decay.network import Network, NetworkFit, fit_loss_network
@@ -219,6 +220,7 @@ def _separable(fit: ScaleFit, name: str) -> bool:
     return name not in fit.scales or fit.scales[name].error is not None
 
 
+@shown
 @dataclass(frozen=True, eq=False)
 class Shift:
     """What many decays say together.

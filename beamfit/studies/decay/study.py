@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from beamfit.errors import InputError
+from beamfit.shown import shown
 from beamfit.studies.decay.checks import DecayChecks, check_decay
 from beamfit.studies.decay.fit import FEWEST, DecayFit, fit_decay
 from beamfit.studies.decay.loss_budget import Budget, Machine, budget
@@ -24,6 +25,7 @@ SETTINGS = ("rf_voltage", "scraper_y", "bunches")
 SHORTEST = 8
 
 
+@shown
 @dataclass(frozen=True, eq=False)
 class Decay:
     """One decay of a record.
@@ -58,6 +60,7 @@ class Decay:
         return shown if self.budget is None else shown | {"budget": self.budget.to_json()}
 
 
+@shown
 @dataclass(frozen=True, eq=False)
 class RecordStudy:
     """A record with its decays and what lies between them.

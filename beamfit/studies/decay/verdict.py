@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from beamfit.lifetime.decay import HOUR
+from beamfit.shown import shown
 from beamfit.statistics import POOR_FIT, chi2_probability
 from beamfit.status import Status
 from beamfit.studies.decay.model import Solution
@@ -30,6 +31,7 @@ STEP = 12.0
 BELIEVED = 5.0
 
 
+@shown
 @dataclass(frozen=True)
 class Separability:
     """Whether the record tells a from b.

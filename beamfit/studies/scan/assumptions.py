@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 from beamfit.errors import InputError, nearest
+from beamfit.shown import shown
 
 __all__ = ["SCENARIOS", "Anchor", "Assumptions", "Entry"]
 
@@ -37,6 +38,7 @@ def _taking(what: str) -> str:
     return " or ".join(name for name, entry in SCENARIOS.items() if getattr(entry, what))
 
 
+@shown
 @dataclass(frozen=True)
 class Anchor:
     """What ties a network to first principles; without it a scan cannot tell scale from beam.

@@ -15,6 +15,7 @@ import numpy as np
 
 from beamfit.errors import InputError
 from beamfit.greybox.design import Information, greedy
+from beamfit.shown import shown
 from beamfit.status import Status
 from beamfit.studies.scan.candidates import (
     Candidate,
@@ -24,7 +25,7 @@ from beamfit.studies.scan.candidates import (
 )
 from beamfit.studies.scan.fit import EmittanceFit
 from beamfit.studies.scan.information import by_plane, identified, information_of
-from beamfit.table import Table, html_of, json_of, text_of
+from beamfit.table import Table, json_of, text_of
 
 __all__ = ["CRITERIA", "Advice", "Option", "Step", "plan_measurements"]
 
@@ -51,6 +52,7 @@ class Option(NamedTuple):
     identified: bool
 
 
+@shown
 @dataclass(frozen=True)
 class Advice:
     """What to measure next, and when to stop.
@@ -81,6 +83,11 @@ class Advice:
     stop: str
     options: tuple[Option, ...]
     tie: str = ""
+
+    @property
+    def headline(self) -> str:
+        """The advice in a line."""
+        return self.message
 
     @property
     def message(self) -> str:
@@ -139,9 +146,6 @@ class Advice:
 
     def __str__(self) -> str:
         return "\n\n".join([*map(text_of, self.tables()), f"{self.status}: {self.message}"])
-
-    def _repr_html_(self) -> str:
-        return "".join(map(html_of, self.tables()))
 
 
 def _cells(error: Mapping[str, float], known: bool) -> list[str]:

@@ -13,6 +13,7 @@ from beamfit.errors import InputError
 from beamfit.greybox.problem import Problem
 from beamfit.optics.beamline import Beamline
 from beamfit.quantity import Quantity
+from beamfit.shown import shown
 from beamfit.status import Status
 from beamfit.studies.scan.assumptions import SCENARIOS, Anchor, Assumptions
 from beamfit.studies.scan.judged import judged_beam
@@ -181,6 +182,7 @@ def _solved(problem: Problem, scenario: Scenario, told: Assumptions) -> Fit:
     return fit
 
 
+@shown
 @dataclass(frozen=True, eq=False)
 class EmittanceFit:
     """A fitted scan: one `PlaneFit` a plane, with the scan and the line it came from.
@@ -229,6 +231,12 @@ class EmittanceFit:
     parameters: tuple[Parameter, ...] = ()
     null_directions: tuple[str, ...] = ()
     solved: Fit | None = None
+
+    @property
+    def headline(self) -> str:
+        """The scan, the line, and what was found in each plane, in a line."""
+        found = "; ".join(p.headline for p in self.planes)
+        return f"{self.scan.name} on {self.line.name}: {found}"
 
     @property
     def scenario(self) -> str:

@@ -10,8 +10,9 @@ import numpy as np
 
 from beamfit.optics.beam import BeamMatrix
 from beamfit.quantity import Quantity, display_unit
+from beamfit.shown import shown
 from beamfit.status import Status
-from beamfit.table import cell, json_of
+from beamfit.table import Table, cell, json_of, labelled
 
 __all__ = [
     "Identifiability",
@@ -29,6 +30,7 @@ __all__ = [
 MOST_ROWS = 500
 
 
+@shown
 class Points(NamedTuple):
     """The points of a fit, each array of shape (n,).
 
@@ -77,6 +79,7 @@ class Points(NamedTuple):
         return ", ".join([*settings, *screen])
 
 
+@shown
 class Parameter(NamedTuple):
     """A number fitted besides the beam: a calibration number, or k1 of a network.
 
@@ -108,6 +111,7 @@ class Parameter(NamedTuple):
     multiplier: float
 
 
+@shown
 class ScreenTwiss(NamedTuple):
     """The beam at the screen, with every magnet at the lattice's own setting.
 
@@ -133,6 +137,7 @@ class ScreenTwiss(NamedTuple):
     size: Quantity
 
 
+@shown
 @dataclass(frozen=True)
 class Identifiability:
     """What the scan determines.
@@ -180,6 +185,7 @@ class Identifiability:
         }
 
 
+@shown
 @dataclass(frozen=True, eq=False)
 class PlaneFit:
     """The fitted beam of one plane at the start of the line.
@@ -240,6 +246,18 @@ class PlaneFit:
     weights: str
     identifiability: Identifiability
     points: Points
+
+    @property
+    def headline(self) -> str:
+        """The plane, its status and its emittance in a line."""
+        status = cell(self.status)
+        if self.status is Status.unidentified:
+            return f"{self.plane} {status}: emittance not determined"
+        return f"{self.plane} {status}: normalised emittance {self.normalized_emittance}"
+
+    def tables(self) -> tuple[Table, ...]:
+        """All numbers, to be shown."""
+        return (labelled("", [self.plane], result_rows((self,))),)
 
     @property
     def beam(self) -> BeamMatrix:

@@ -14,6 +14,8 @@ import numpy as np
 
 from beamfit.errors import InputError, nearest
 from beamfit.particles import total_energy
+from beamfit.shown import shown
+from beamfit.table import Table
 
 __all__ = [
     "POSSIBLE",
@@ -27,10 +29,13 @@ __all__ = [
 ]
 
 PLANES = ("x", "y")
+# Rows of a scan that a notebook shows.
+MOST_SHOWN = 20
 # Rms sizes in m that a beam can have, and that most have: outside a unit is wrong, or questioned.
 POSSIBLE, USUAL = (1e-8, 0.3), (1e-7, 2e-2)
 
 
+@shown
 class PlaneRows(NamedTuple):
     """The rows of a scan in which one plane was measured.
 
@@ -104,6 +109,7 @@ def first_unusable(values: np.ndarray, *, blank: bool = False) -> tuple[int, str
     return index, f"the value {values[index]:g}"
 
 
+@shown
 @dataclass(frozen=True, eq=False)
 class QuadScan:
     """Beam sizes against magnet settings or at several screens, in one or both planes.
@@ -200,6 +206,26 @@ class QuadScan:
     def planes(self) -> tuple[str, ...]:
         """The planes that were measured."""
         return tuple(p for p in PLANES if p in self.size)
+
+    @property
+    def headline(self) -> str:
+        """The scan in a line."""
+        scanned = ", ".join(f"{name} ({self.units[name]})" for name in self.settings)
+        screens = f", {len(set(self.screen))} screens" if self.screen else ""
+        errors = "errors given" if self.error else "no errors"
+        seen = f"{len(self)} rows of {scanned or 'no magnet'}{screens}"
+        return f"{self.name}: {seen}, planes {', '.join(self.planes)}, {errors}"
+
+    def tables(self) -> tuple[Table, ...]:
+        """The first rows, to be shown."""
+        columns = {f"{n} {self.units[n]}": v for n, v in self.settings.items()}
+        for p in self.planes:
+            columns[f"size {p} µm"] = 1e6 * self.size[p]
+            columns |= {f"error {p} µm": 1e6 * self.error[p]} if p in self.error else {}
+        few = range(min(len(self), MOST_SHOWN))
+        rows = [[f"{values[i]:.5g}" for values in columns.values()] for i in few]
+        more = f"the first {len(few)} of {len(self)} rows" if len(few) < len(self) else ""
+        return (Table(self.headline, list(columns), rows, more, numeric=True),)
 
     def rows(self, plane: str) -> PlaneRows:
         """Select the rows in which one plane was measured.

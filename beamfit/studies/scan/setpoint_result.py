@@ -9,9 +9,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from beamfit.quantity import Quantity
+from beamfit.shown import shown
 from beamfit.status import Status
 from beamfit.studies.scan.wishes import SAME_ENERGY, Beam, Target
-from beamfit.table import Table, html_of, json_of, text_of
+from beamfit.table import Table, cell, json_of, text_of
 from beamfit.verdict import Finding, judge
 
 __all__ = [
@@ -59,6 +60,7 @@ class Minimum(NamedTuple):
     objective: float
 
 
+@shown
 @dataclass(frozen=True)
 class Setpoint:
     """The best settings found, what they give, and how sure that is.
@@ -112,6 +114,11 @@ class Setpoint:
     notes: tuple[str, ...]
     doubts: Mapping[str, str]
 
+    @property
+    def headline(self) -> str:
+        """The settings found, in a line."""
+        return f"{cell(self.status)}: {_listed(self.best.settings, self.units, 4)}"
+
     def to_json(self) -> dict[str, Any]:
         """Give the entry of ``results`` of the JSON contract; size and so on of the first plane."""
         planes = {p.plane: {k: getattr(p, k) for k in SHOWN} for p in self.predicted}
@@ -154,9 +161,6 @@ class Setpoint:
     def __str__(self) -> str:
         said = [f"{self.status}: {self.message}", *self.notes, *self.doubts.values()]
         return "\n\n".join([*map(text_of, self.tables()), "\n".join(said)])
-
-    def _repr_html_(self) -> str:
-        return "".join(map(html_of, self.tables()))
 
 
 class Evidence(NamedTuple):

@@ -15,6 +15,7 @@ from jax import Array
 from jax.typing import ArrayLike
 
 from beamfit.greybox.descend import descend_one
+from beamfit.shown import shown
 from beamfit.studies.scan.model import coefficients, numbers_of, size_squared
 
 __all__ = [
@@ -69,6 +70,7 @@ class SizeData(NamedTuple):
         return jnp.stack(coefficients(self.r11, self.r12), axis=-1)
 
 
+@shown
 class SigmaFit(NamedTuple):
     """A fitted beam matrix and what is needed to judge it.
 
