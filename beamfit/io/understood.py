@@ -16,6 +16,7 @@ import numpy as np
 
 from beamfit.errors import InputError
 from beamfit.io.decay_record import read_decay_record
+from beamfit.io.emittance_gui import is_emittance_gui, read_emittance_gui
 from beamfit.io.files import digest, text_lines
 from beamfit.io.lattice import CALIBRATIONS, STRENGTHS, LatticeFile
 from beamfit.io.line import FOREIGN, build_line, read_lattice
@@ -126,8 +127,13 @@ def understand(
     """
     kind = _kind(path)
     if kind == "scan":
-        content = read_quad_scan(path, ignore=ignore, skip_bad=skip_bad)
+        gui = read_emittance_gui(path) if is_emittance_gui(path) else None
+        content = (
+            read_quad_scan(path, ignore=ignore, skip_bad=skip_bad) if gui is None else gui.scan()
+        )
         facts, notes = _of_scan(content), (*content.notes, *_questions(content))
+        if gui is not None:
+            facts.append(Fact("size methods", ", ".join(gui.scans), list(gui.scans)))
     elif kind == "lattice":
         foreign = Path(path).suffix.lower() in FOREIGN
         content = read_lattice(path, use=use, energy=energy) if foreign else read_lattice(path)
@@ -170,7 +176,7 @@ def _kind(path: str | PathLike[str]) -> str:
         return "ring" if "ring" in tables and "element" not in tables else "lattice"
     if suffix in HDF5:
         head = ",".join(read_sheet(path, "Q2_A,size_x_um").names)
-    elif suffix == ".mat":
+    elif is_emittance_gui(path):
         return "scan"
     else:
         lines = (text.strip() for text in islice(text_lines(path), HEAD))

@@ -85,6 +85,12 @@ def test_sizes_and_settings_in_another_unit_are_asked_about(files):
     assert any("3e+03 T/m" in note for note in said.notes)
 
 
+def test_a_file_of_emittance_gui(shared):
+    found = facts(understand(shared / "data/lcls_otr2/test_scan2.mat"))
+    assert len(found["size methods"]) == 7
+    assert (found["matrices"], found["shots"]["high"]) == (True, 5)
+
+
 def test_a_lattice(files):
     found = understand(files / "line.toml")
     said = facts(found)
