@@ -52,8 +52,14 @@ ELEMENTS: dict[str, dict[str, Key]] = {
         "signed_intercept": Key(kind=FLAG, default=False),
         "gradient_table": Key(kind=LIST, default=None),
         "gradient_table_file": Key(kind=TEXT, default=None),
+        "supply": Key(kind=TEXT, default=None),
     },
-    "thin_lens": {"name": NAME, "integrated_gradient_kG": OPTIONAL, "k1l_per_m": OPTIONAL},
+    "thin_lens": {
+        "name": NAME,
+        "supply": Key(kind=TEXT, default=None),
+        "integrated_gradient_kG": OPTIONAL,
+        "k1l_per_m": OPTIONAL,
+    },
     "sector_dipole": {
         "name": NAME,
         "radius_m": Key(low=0.0, said="a positive number; a negative angle bends the other way"),
@@ -181,12 +187,18 @@ def read_toml_lattice(path: str | PathLike[str]) -> LatticeFile:
     sections = top.sections("element")
     elements = tuple(_element(section, i) for i, section in enumerate(sections, 1))
     _check_unique(elements, sections)
+    _check_supplies(elements, sections)
     return LatticeFile(
         path=path,
         sha256=top.sha256,
         energy=energy,
         elements=elements,
-        calibrations={e["name"]: u for e in elements for k, u in _settings(e["type"]) if k in e},
+        calibrations={
+            e.get("supply", e["name"]): u
+            for e in elements
+            for k, u in _settings(e["type"])
+            if k in e
+        },
         design=_design(top, [e["name"] for e in elements]),
         **said | {"name": said["name"] or Path(path).stem},
     )
@@ -259,6 +271,23 @@ def _check_unique(elements: tuple[Mapping[str, Any], ...], sections: list[Sectio
             expected = f"another name: element {seen[element['name']]} has it"
             raise section.error(f"the name '{element['name']}' used again", expected, "name")
         seen[element["name"]] = number
+
+
+def _check_supplies(elements: tuple[Mapping[str, Any], ...], sections: list[Section]) -> None:
+    """Check that magnets on one supply are set by one number, and no element has its name."""
+    names, first = {e["name"] for e in elements}, {}
+    for element, section in zip(elements, sections, strict=True):
+        if (supply := element.get("supply")) is None:
+            continue
+        if supply in names:
+            raise section.error(f"supply '{supply}'", "another name: an element has it", "supply")
+        setting = {key: element[key] for key in STRENGTHS if key in element}
+        if first.setdefault(supply, setting) != setting:
+            found, expected = (
+                ", ".join(f"{key} = {v:g}" for key, v in said.items())
+                for said in (setting, first[supply])
+            )
+            raise section.error(f"{found} on supply '{supply}'", f"{expected}, as above", "supply")
 
 
 def _design(top: Section, names: list[str]) -> Mapping[str, Any] | None:

@@ -169,6 +169,10 @@ def build_line(file: LatticeFile) -> Beamline:
     if file.design is not None:
         twiss = {p: (t["beta_m"], t["alpha"]) for p, t in file.design.items() if p != "at"}
         design = Design(at=file.design["at"], **twiss)
+    supplies: dict[str, tuple[str, ...]] = {}
+    for table in file.elements:
+        if "supply" in table:
+            supplies[table["supply"]] = (*supplies.get(table["supply"], ()), table["name"])
     return Beamline(
         tuple(element_of(table, mass) for table in file.elements),
         energy=file.energy,
@@ -176,4 +180,5 @@ def build_line(file: LatticeFile) -> Beamline:
         mass=mass,
         energy_spread=file.energy_spread,
         design=design,
+        supplies=tuple(supplies.items()),
     )

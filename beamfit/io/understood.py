@@ -258,9 +258,10 @@ def _of_lattice(file: LatticeFile) -> list[Fact]:
         Fact("elements", listed, dict(kinds)),
         Fact("length", f"{length:.6g} m", length),
     ]
-    magnets = [e for e in file.elements if e["name"] in file.calibrations]
-    facts += [_magnet(e, file.calibrations[e["name"]]) for e in magnets[:MOST_MAGNETS]]
-    if (more := len(file.calibrations) - MOST_MAGNETS) > 0:
+    units = [(e, file.calibrations.get(e.get("supply", e["name"]))) for e in file.elements]
+    magnets = [(e, unit) for e, unit in units if unit is not None]
+    facts += [_magnet(e, unit) for e, unit in magnets[:MOST_MAGNETS]]
+    if (more := len(magnets) - MOST_MAGNETS) > 0:
         facts.append(Fact("further magnets", f"{more}, set as these", more))
     screens = [e["name"] for e in file.elements if e["type"] == "screen"]
     words = ", ".join(screens) or "none: sizes need one"
@@ -281,6 +282,7 @@ def _magnet(element: Any, unit: str) -> Fact:
     how = [k for keys in CALIBRATIONS for k in sorted(keys) if k in element]
     if how:
         words += ", " + " and ".join(f"{k} {_short(element[k])}" for k in how)
+    words += f", on supply {element['supply']}" if "supply" in element else ""
     return Fact(f"magnet {element['name']}", words, {"setting": element[key], "unit": unit})
 
 

@@ -41,7 +41,7 @@ class Design(NamedTuple):
     y: tuple[float, float] | None = None
 
 
-@value("name", "mass", "design")
+@value("name", "mass", "design", "supplies")
 class Beamline:
     """Elements in the order the beam meets them.
 
@@ -59,10 +59,13 @@ class Beamline:
         Relative momentum spread σ_δ, which widens the beam where there is dispersion.
     design : Design, optional
         The Twiss parameters the line was designed for, at one of its elements.
+    supplies : tuple of (str, tuple of str)
+        Names of supplies and of the magnets on each: a setting of a supply sets them all, each
+        with its own length and calibration, and none of them has a setting of its own.
 
     Notes
     -----
-    Magnets of one name are in series on one supply: a setting of that name sets them all.
+    Magnets of one name are alike and in series: a setting of that name sets them all.
 
     Examples
     --------
@@ -78,6 +81,7 @@ class Beamline:
     mass: float = ELECTRON_MASS
     energy_spread: ArrayLike = 0.0
     design: Design | None = None
+    supplies: tuple[tuple[str, tuple[str, ...]], ...] = ()
 
     @property
     def headline(self) -> str:
@@ -94,7 +98,8 @@ class Beamline:
         return (Table(self.headline, ["element", "kind", "length m", "setting"], rows, more),)
 
     def __getitem__(self, name: str) -> Element:
-        return self.elements[self._index(name)]
+        """The element of a name; of a supply the first magnet on it."""
+        return self.elements[self._index(self.members(name)[0])]
 
     def __len__(self) -> int:
         return len(self.elements)
@@ -106,14 +111,35 @@ class Beamline:
         return self._first[name]
 
     @cached_property
+    def _set_apart(self) -> frozenset[str]:
+        """Magnets on supplies, which those who compute what a supply does may set one by one."""
+        return frozenset(member for _, members in self.supplies for member in members)
+
+    @cached_property
     def _first(self) -> dict[str, int]:
         """Where the first element of each name stands."""
         return {e.name: i for i, e in reversed(tuple(enumerate(self.elements)))}
 
     @cached_property
     def magnets(self) -> tuple[str, ...]:
-        """Names of the elements that have a setting."""
-        return tuple(dict.fromkeys(e.name for e in self.elements if e.setting is not None))
+        """Names that have a setting: of elements, and of supplies in place of their magnets."""
+        supply = {member: name for name, members in self.supplies for member in members}
+        names = (e.name for e in self.elements if e.setting is not None)
+        return tuple(dict.fromkeys(supply.get(name, name) for name in names))
+
+    def members(self, name: str) -> tuple[str, ...]:
+        """The magnets of this line on a supply; of any other name itself.
+
+        Examples
+        --------
+        >>> from beamfit.optics.elements import Quadrupole
+        >>> pair = (Quadrupole("QF", 0.1), Quadrupole("QD", 0.1))
+        >>> line = Beamline(pair, 100.0, supplies=(("QS", ("QF", "QD")),))
+        >>> line.members("QS"), line.members("QF"), line.magnets
+        (('QF', 'QD'), ('QF',), ('QS',))
+        """
+        found = dict(self.supplies).get(name, (name,))
+        return tuple(member for member in found if member in self._first) or (name,)
 
     @property
     def screens(self) -> tuple[str, ...]:
@@ -249,11 +275,12 @@ class Beamline:
         [1.0, 3.0]
         """
         settings = dict(settings or {})
-        unknown = sorted(set(settings) - set(self.magnets))
+        unknown = sorted(set(settings) - set(self.magnets) - self._set_apart)
         if unknown:
             raise InputError(
                 f"a setting for '{unknown[0]}'", nearest(unknown[0], list(self.magnets))
             )
+        settings = {member: v for name, v in settings.items() for member in self.members(name)}
         for place in places:
             self._index(place)
         energy = self.energy if energy is None else energy
@@ -305,7 +332,7 @@ class Beamline:
 
     def _with_parts(self, keep: Iterable[str], one: Callable) -> Beamline:
         """Elements of some names stay; ``one`` says what takes the place of a series between."""
-        keep, parts = frozenset(keep), []
+        keep, parts = frozenset(m for name in keep for m in self.members(name)), []
         for kept, run in groupby(self.elements, lambda e: e.name in keep):
             parts.extend(run if kept else [one(s) for s in [in_series(run)] if s.kinds])
         return replace(self, elements=tuple(parts))

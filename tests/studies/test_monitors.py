@@ -161,3 +161,52 @@ def test_elements_that_are_missing_are_named(answer, tmp_path):
     code, _, err = answer("emittance", "own.csv", "--energy", "135")
     assert code == 2
     assert "r11_y" in err
+
+
+THREE = ("W0", "W1", "W4")
+
+
+def test_three_monitors_give_values_and_say_that_nothing_tests_them():
+    scan = wire_scan(THREE, 0.01)
+    fit = beamfit.fit_emittance(scan, fodo()).x
+    assert (fit.status.value, fit.dof) == ("converged", 0)
+    assert "not testable" in fit.message
+    # Linear propagation from the sizes, by differences of the exact solution.
+    r = seen_from(fodo(), THREE)["x"]
+    design = np.stack([r[:, 0] ** 2, 2 * r[:, 0] * r[:, 1], r[:, 1] ** 2], -1)
+
+    def emittance(size):
+        s11, s12, s22 = np.linalg.solve(design, size**2)
+        return np.sqrt(s11 * s22 - s12**2)
+
+    size, error = scan.size["x"], scan.error["x"]
+    step = 1e-5 * size
+    slopes = [(emittance(size + d) - emittance(size - d)) / (2 * d.sum()) for d in np.diag(step)]
+    assert fit.emittance.value == pytest.approx(emittance(size), rel=1e-9)
+    assert fit.emittance.error == pytest.approx(np.hypot.reduce(slopes * error), rel=1e-6)
+
+
+def test_three_monitors_without_errors_and_three_settings_of_a_magnet_are_refused():
+    scan = wire_scan(THREE, 0.01)
+    bare = beamfit.QuadScan({}, {}, scan.size, screen=THREE)
+    assert beamfit.fit_emittance(bare, fodo()).x.status.value == "unidentified"
+    moved = beamfit.QuadScan(
+        {"Q0": [8.0, 8.5, 9.0]}, {"Q0": "k1"}, scan.size, scan.error, screen=THREE
+    )
+    assert beamfit.fit_emittance(moved, fodo()).x.status.value == "unidentified"
+
+
+def test_errors_of_three_monitors_cover():
+    """95 % of intervals of the answers that are given hold the truth, within binomial limits."""
+    r, truth = {"x": seen_from(fodo(), THREE)["x"]}, 2e-9
+    true, rng, line = sizes_at(r)["x"], np.random.default_rng(12), fodo()
+    held = []
+    for _ in range(200):
+        size = true * (1 + 0.02 * rng.normal(size=3))
+        scan = beamfit.QuadScan({}, {}, {"x": size}, {"x": 0.02 * true}, screen=THREE)
+        found = beamfit.fit_emittance(scan, line).x.emittance
+        if found.error is not None:
+            low, high = found.interval_95
+            held.append(low < truth < high)
+    assert len(held) > 150
+    assert abs(np.mean(held) - 0.95) < 4 * np.sqrt(0.95 * 0.05 / len(held))

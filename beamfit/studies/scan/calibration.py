@@ -106,6 +106,11 @@ def numbers_of_magnets(line: Beamline, magnets: tuple[str, ...] | None = None) -
     """
     found = {}
     for magnet in line.magnets if magnets is None else magnets:
+        if len(line.members(magnet)) > 1:  # each of them has numbers of its own
+            if magnets is None:
+                continue
+            wrong = f"a calibration of '{magnet}', which feeds several magnets"
+            raise InputError(wrong, "scenario known, or a scan of magnets on supplies of their own")
         calibration = line[magnet].calibration
         meanings = _MEANINGS.get(type(calibration), _SCALE)
         values = [float(v) for v in jax.tree_util.tree_leaves(calibration)]
@@ -149,7 +154,7 @@ def with_numbers(line: Beamline, numbers: Mapping[str, float]) -> Beamline:
         if name not in known:
             raise InputError(f"a calibration number '{name}'", nearest(name, list(known)))
     for magnet in dict.fromkeys(known[name].magnet for name in numbers):
-        old = line[magnet]
+        old = line[line.members(magnet)[0]]
         structure = jax.tree_util.tree_structure(old.calibration)
         own = [numbers.get(n, v.value) for n, v in known.items() if v.magnet == magnet]
         new = jax.tree_util.tree_unflatten(structure, own)

@@ -103,7 +103,9 @@ def _screens(fit: EmittanceFit) -> tuple[str, ...]:
     if not fit.statement.whole_map:  # another screen has another network
         return tuple(dict.fromkeys(measured))
     names = [e.name for e in fit.seen.scanned.elements]
-    first = min(names.index(n) for n in varied_magnets(fit.scan))
+    line = fit.seen.scanned
+    magnets = [m for name in varied_magnets(fit.scan) for m in line.members(name)]
+    first = min(map(names.index, magnets), default=-1)
     later = [s for s in fit.seen.scanned.screens if names.index(s) > first]
     return tuple(dict.fromkeys((*measured, *later)))
 
@@ -242,7 +244,8 @@ def _other_screens(fit: EmittanceFit) -> list[tuple[Beamline, str, str]]:
     if unused:
         return [(fit.seen.scanned, s, f"screen {s}") for s in unused]
     names = [e.name for e in fit.seen.scanned.elements]
-    last = max(names.index(n) for n in varied_magnets(fit.scan))
+    magnets = [m for n in varied_magnets(fit.scan) for m in fit.seen.scanned.members(n)]
+    last = max(map(names.index, magnets), default=-1)
     found = []
     for i, element in enumerate(fit.seen.scanned.elements):
         if i > last and isinstance(element, Drift) and element.length > 0.3:

@@ -146,6 +146,9 @@ def _less_common(model: Any, asked: _Asked) -> Array:
 def _state(seen: Seen, told: Assumptions) -> Problem:
     """Beams and one network of k1 for each scanned magnet."""
     varied = varied_magnets(seen.scan)
+    if several := [name for name in varied if len(seen.scanned.members(name)) > 1]:
+        found = f"a network of k1 for '{several[0]}', which feeds several magnets"
+        raise InputError(found, "a scan of magnets on supplies of their own")
     branches = _branches(seen, varied) if told.hysteresis else {}
     for name in (name for place in told.anchor.at for name in place):
         if name not in varied:

@@ -248,6 +248,7 @@ def _evidence(
         robust=doubt is not None,
         influence=influence_of(p, noise, fit.sigma, error) if alone else Influence(),
         constant=None if one is None or dof == 0 else _constant(p, noise),
+        scanned=any(np.ptp(v) > 0 for v in p.settings.values()) or len(set(p.screen)) < 3,
     )
 
 

@@ -22,10 +22,11 @@ def gradients(scan: QuadScan, scanned: Beamline) -> dict[str, float]:
     energy = float(scanned.energy) if scan.energy is None else scan.energy
     found = {}
     for name, settings in () if scan.transfer else scan.settings.items():
-        magnet = scanned[name]
-        if isinstance(magnet, Quadrupole):
-            k1 = np.asarray(magnet.k1(settings, energy))
-            found[name] = float(np.abs(k1 * rigidity(energy, scanned.mass)).max())
+        for magnet in (scanned[member] for member in scanned.members(name)):
+            if isinstance(magnet, Quadrupole):
+                k1 = np.asarray(magnet.k1(settings, energy))
+                largest = float(np.abs(k1 * rigidity(energy, scanned.mass)).max())
+                found[name] = max(found.get(name, 0.0), largest)
     return found
 
 

@@ -354,9 +354,9 @@ def _interval(p: PlaneFit) -> str:
 
 
 def _chi2(p: PlaneFit) -> str:
-    if p.chi2 is None:
+    if p.chi2 is None or not p.dof:
         return f"not testable ({p.dof} dof)"
-    return f"{p.chi2:.2f}/{p.dof}" + (f" = {p.chi2 / p.dof:.2f}" if p.dof else "")
+    return f"{p.chi2:.2f}/{p.dof} = {p.chi2 / p.dof:.2f}"
 
 
 def _noise(p: PlaneFit) -> str:

@@ -149,15 +149,17 @@ def _word(line: Beamline, magnet: str) -> str:
 
 def _scaled(line: Beamline, magnet: str, factor: Array) -> Beamline:
     """Scale what a magnet's setting means: the slope of a line, else all of the strength."""
-    element = line[magnet]
-    c = element.calibration
-    if isinstance(c, SlopeIntercept):
-        c = replace(c, slope=c.slope * factor)
-    elif isinstance(c, CurrentPolynomial):
-        c = replace(c, coefficients=tuple(v * factor for v in c.coefficients))
-    else:
-        c = replace(c, scale=c.scale * factor)
-    return line.with_element(replace(element, calibration=c))
+    for member in line.members(magnet):
+        element = line[member]
+        c = element.calibration
+        if isinstance(c, SlopeIntercept):
+            c = replace(c, slope=c.slope * factor)
+        elif isinstance(c, CurrentPolynomial):
+            c = replace(c, coefficients=tuple(v * factor for v in c.coefficients))
+        else:
+            c = replace(c, scale=c.scale * factor)
+        line = line.with_element(replace(element, calibration=c))
+    return line
 
 
 class _Weighing(NamedTuple):

@@ -78,7 +78,8 @@ def scanned_line(scan: QuadScan, line: Beamline) -> Beamline:
     if scan.transfer:
         return line
     for name, unit in scan.units.items():
-        if isinstance(line[name], ThinLens) and unit in ("k1", "T_per_m"):
+        lens = any(isinstance(line[m], ThinLens) for m in line.members(name))
+        if lens and unit in ("k1", "T_per_m"):
             raise scan.unusable(
                 f"{SETTING_UNITS[unit]} for '{name}', which has no length",
                 f"a column {name}_k1l (inverse focal length, 1/m) or {name}_kG",
@@ -96,8 +97,8 @@ def _with_meanings(same: _Same, units: tuple[tuple[str, str], ...]) -> Beamline:
         "k1": FocusingStrength(),
         "k1l": IntegratedStrength(),
     }
-    for name, unit in units:
-        magnet = line[name]
+    for member, unit in [(m, unit) for name, unit in units for m in line.members(name)]:
+        magnet = line[member]
         if unit != magnet.calibration.unit:
             meaning = meanings[unit]
             strength = magnet.calibration.k1l(magnet.setting, magnet.length, line.energy)
@@ -442,16 +443,16 @@ def _still(change: Any) -> bool:
 def _rows(
     line: Beamline, settings: dict[str, Array], energy: Array, places: tuple[str, ...]
 ) -> TransferMatrix:
-    bare = line
-    for name in settings:
-        bare = bare.with_element(replace(line[name], calibration=IntegratedStrength(), setting=0.0))
+    bare, members = line, [(m, name) for name in settings for m in line.members(name)]
+    for m, _ in members:
+        bare = bare.with_element(replace(line[m], calibration=IntegratedStrength(), setting=0.0))
 
     def one(row: tuple[dict[str, Array], Array]) -> Array:
         setting, at = row
         at = energy if at is None else at
         strengths = {
-            name: jnp.asarray(line[name].calibration.k1l(v, line[name].length, at), float)
-            for name, v in setting.items()
+            m: jnp.asarray(line[m].calibration.k1l(setting[name], line[m].length, at), float)
+            for m, name in members
         }
         # Of monitors alone nothing is set, and there is nothing to differentiate by.
         through = _by_strengths if strengths else _from_strengths

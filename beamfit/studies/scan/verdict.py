@@ -80,6 +80,8 @@ class Evidence(NamedTuple):
         Share of the points the robust fit thinks bad; 0 for a plain fit.
     robust : bool
         Whether the fit was robust: its noise then rests on its own judgement.
+    scanned : bool
+        Whether a magnet was moved; sizes at several monitors are all there is otherwise.
     advice : str or None
         What to measure, for the remedy.
     """
@@ -102,6 +104,7 @@ class Evidence(NamedTuple):
     robust: bool = False
     influence: Influence = Influence()
     constant: float | None = None
+    scanned: bool = True
     advice: str | None = None
 
     @property
@@ -139,7 +142,7 @@ def _doubted(e: Evidence) -> str | None:
 
 
 def _too_few(e: Evidence) -> str | None:
-    if not e.dof:
+    if not e.dof and (e.scanned or not e.noise_known):
         return (
             "three points fit any three numbers exactly and leave nothing to judge them by; "
             "measure a fourth setting"
@@ -270,6 +273,11 @@ def _one_refutes(e: Evidence) -> Finding | None:
 
 def _determined(e: Evidence) -> Finding:
     words = _clear(e) + few_words(e.rests_on) + _carried(e)
+    if not e.dof:
+        words += (
+            "; not testable: three monitors give three numbers exactly, and nothing is left to "
+            "test line and stated errors by, from which the error here is propagated"
+        )
     if e.noise_known and e.chi2 > e.dof > 0:
         words += f"; errors are scaled by sqrt(chi2/dof) = {math.sqrt(e.chi2 / e.dof):.2f}"
     if e.noise_known and e.probability is not None and e.probability > OVERSTATED:

@@ -141,7 +141,7 @@ def checked_place(
     names = [e.name for e in line.elements]
     if place not in names:
         raise InputError(f"no place '{place}' in the line", nearest(place, names))
-    late = [n for n in vary if names.index(n) > names.index(place)]
+    late = [n for n in vary if names.index(line.members(n)[0]) > names.index(place)]
     if late:
         raise InputError(f"{late[0]}, downstream of {place}", "magnets between start and screen")
     for target in targets:
