@@ -16,9 +16,8 @@ from beamfit.io.result import results_text
 if TYPE_CHECKING:
     from beamfit.cli.show import Terminal
     from beamfit.sampling.posterior import Posterior
-    from beamfit.studies.decay.loss_budget import Machine
     from beamfit.studies.decay.shift import Shift
-    from beamfit.studies.decay.study import Decay, RecordStudy
+    from beamfit.studies.decay.study import Decay, Machine, RecordStudy
 
 __all__ = ["lifetime"]
 
@@ -114,7 +113,7 @@ def _check_study(study: bool, ring: str | None, network: str | None) -> None:
 def _machine(path: str) -> Machine:
     ring, operation = beamfit.read_ring(path), beamfit.read_operation(path)
 
-    from beamfit.studies.decay.loss_budget import Machine
+    from beamfit.studies.decay.study import Machine
 
     return Machine(ring, operation)
 

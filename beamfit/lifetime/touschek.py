@@ -1,4 +1,4 @@
-"""Touschek scattering: Piwinski's rate, and Bruck's as its limit for a flat, slow bunch."""
+"""Touschek scattering: Piwinski's rate."""
 
 from __future__ import annotations
 
@@ -16,7 +16,6 @@ from beamfit.lifetime.bunch import bunch_in_bucket, population, stored_bunch
 from beamfit.lifetime.ring import ELECTRON_RADIUS, Operation, Optics, Ring
 
 __all__ = [
-    "bruck_rate",
     "piwinski_rate",
     "piwinski_shape",
     "touschek_loss",
@@ -155,62 +154,6 @@ def piwinski_rate(
         b1, gap = _width_coefficients(ring, optics)
         floor = (1 - lorentz**-2) * acceptance**2
         return piwinski_shape(floor, b1, gap, nodes) / _volume(ring, optics)
-
-    density = jax.vmap(local)(ring.optics, acceptance)
-    scale = ELECTRON_RADIUS**2 * constants.c * population / (8 * jnp.pi * lorentz**2 * length)
-    return scale * ring.optics.average(density)
-
-
-def _bruck_shape(xi: Array, nodes: int = 64) -> Array:
-    """D(xi) of H. Bruck, as one integral: sqrt(xi) ∫₁^∞ (w - 1 - ln(w)/2)/w² exp(-xi w) dw."""
-    roots, weights = np.polynomial.legendre.leggauss(nodes)
-    upper = jnp.log1p(45 / xi)
-    log_w = upper * (roots + 1) / 2
-    w = jnp.exp(log_w)
-    return (
-        jnp.sqrt(xi) * upper / 2 * jnp.sum(weights * (1 - (1 + log_w / 2) / w) * jnp.exp(-xi * w))
-    )
-
-
-@jax.jit
-def bruck_rate(ring: Ring, population: Array, length: Array, acceptance: Array) -> Array:
-    """Touschek loss rate by Bruck's formula for a flat, non-relativistic bunch, 1/s.
-
-    Kept as the limit that `piwinski_rate` must reach for a small emittance, not for use: it is
-    14 to 17 % optimistic at SPEAR3.
-
-    Parameters
-    ----------
-    ring, population, length, acceptance
-        As for `piwinski_rate`.
-
-    Returns
-    -------
-    float
-        1/tau_T.
-
-    Notes
-    -----
-    H. Bruck, Accelerateurs circulaires de particules (1966), chapter 30; with
-    xi = (delta/(gamma sigma_x'))², sigma_x' the rms angle within a thin slice of the bunch.
-
-    Examples
-    --------
-    >>> from beamfit.lifetime.touschek import _bruck_shape
-    >>> f"{_bruck_shape(0.01):.6f}"
-    '0.265805'
-    """
-    lorentz = ring.relativistic_gamma
-    acceptance = jnp.broadcast_to(acceptance, ring.optics.weight.shape)
-
-    def local(optics: Optics, acceptance: Array) -> Array:
-        tilt = optics.alpha_x * optics.dispersion_x + optics.beta_x * optics.slope_x
-        spread_x = ring.energy_spread * optics.dispersion_x
-        size2 = ring.emittance_x * optics.beta_x + spread_x**2
-        # rms angle within a thin slice of the bunch, the relative motion that scatters
-        angle2 = ring.emittance_x / optics.beta_x * (1 + (ring.energy_spread * tilt) ** 2 / size2)
-        xi = (acceptance / lorentz) ** 2 / angle2
-        return _bruck_shape(xi) / (_volume(ring, optics) * acceptance**3)
 
     density = jax.vmap(local)(ring.optics, acceptance)
     scale = ELECTRON_RADIUS**2 * constants.c * population / (8 * jnp.pi * lorentz**2 * length)

@@ -11,8 +11,7 @@ import beamfit
 from beamfit.errors import InputError
 from beamfit.lifetime.bunch import rf_acceptance
 from beamfit.lifetime.decay import current
-from beamfit.lifetime.losses import SCALES, loss_coefficients
-from beamfit.lifetime.scaled import loss_terms, scaled_losses
+from beamfit.lifetime.losses import SCALES, loss_coefficients, loss_terms, scaled_losses
 from beamfit.quantity import Status
 from beamfit.studies.decay.next_decay import Candidate, next_decays
 from beamfit.studies.decay.operating_point import Limits, best_operating_point

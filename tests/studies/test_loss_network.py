@@ -6,8 +6,7 @@ import pytest
 
 from beamfit.errors import InputError
 from beamfit.lifetime.decay import current
-from beamfit.lifetime.losses import loss_coefficients
-from beamfit.lifetime.scaled import loss_terms, scaled_losses
+from beamfit.lifetime.losses import loss_coefficients, loss_terms, scaled_losses
 from beamfit.quantity import Status
 from beamfit.studies.decay.network import SIGNS, Box, fit_loss_network
 from beamfit.studies.decay.record import Conditions, DecayRecord

@@ -24,13 +24,12 @@ from beamfit.greybox.mlp import MLP, Layer, Port
 from beamfit.greybox.problem import Free, Prior, Problem, Record
 from beamfit.greybox.solve import solve
 from beamfit.lifetime.decay import HOUR
+from beamfit.lifetime.losses import Terms, loss_terms, scaled_losses
 from beamfit.lifetime.ring import Operation
-from beamfit.lifetime.scaled import Terms, loss_terms, scaled_losses
 from beamfit.quantity import Quantity
 from beamfit.shown import shown
-from beamfit.studies.decay.loss_budget import Machine, operation_during
 from beamfit.studies.decay.scales import ScaleFit, stacked_terms
-from beamfit.studies.decay.study import Decay
+from beamfit.studies.decay.study import Decay, Machine, operation_during
 from beamfit.studies.decay.summary import Summaries, loss_parts, summarise
 from beamfit.table import json_of
 
@@ -40,6 +39,10 @@ INPUTS = ("rf_voltage", "scraper_y", "pressure", "bunches")
 # How the loss moves with each input; nothing is known of the sign for the RF voltage.
 SIGNS = {"scraper_y": -1, "pressure": 1, "bunches": -1}
 OUTPUTS = ("log_a", "log_b")
+# Weights with a sign: from the inputs that the loss rises or falls with, and, as sums of rising
+# and of convex nodes are such, to the outputs; the last makes the lifetime have one maximum.
+RISING, POSITIVE = "rest->rising", ("rising->out", "convex->out")
+DIRECTION = np.array([SIGNS[name] for name in INPUTS[1:]])[:, None]
 # Widths of the priors on weights: alone the network covers decades, a correction is near zero.
 ALONE, CORRECTION = 3.0, 0.3
 MOST = 30.0
@@ -245,12 +248,11 @@ def _network(inputs: np.ndarray, means: np.ndarray, hidden: int, seed: int) -> M
         Layer("out", "linear", 2, bias=True),
     ]
     random = np.random.default_rng(seed)
-    direction = np.array([SIGNS[name] for name in INPUTS[1:]])[:, None]
     weights = {
         "voltage->convex": random.normal(0, 1, (1, 2)),
         "voltage->out": random.normal(0, 0.1, (1, 2)),
         "convex->out": np.abs(random.normal(0, 0.3, (2, 2))),
-        "rest->rising": direction * np.abs(random.normal(0, 0.5, (3, hidden))),
+        RISING: DIRECTION * np.abs(random.normal(0, 0.5, (3, hidden))),
         "rising->out": np.abs(random.normal(0, 0.3, (hidden, 2))),
     }
     biases = {"out": np.zeros(2), "rising": random.normal(0, 0.5, hidden)}
@@ -261,15 +263,11 @@ def _network(inputs: np.ndarray, means: np.ndarray, hidden: int, seed: int) -> M
 
 def _free(net: MLP, single_maximum: bool) -> list[Free]:
     """Weights within the signs that make the network obey."""
-    positive = ("convex->out", "rising->out") if single_maximum else ("rising->out",)
+    held = dict.fromkeys(POSITIVE if single_maximum else POSITIVE[:1], 1) | {RISING: DIRECTION}
     found = []
     for name, weights in net.weights.items():
-        low, high = np.full(weights.shape, -MOST), np.full(weights.shape, MOST)
-        if name in positive:
-            low[:] = 0.0
-        if name == "rest->rising":
-            for row, key in enumerate(INPUTS[1:]):
-                low[row], high[row] = (0.0, MOST) if SIGNS[key] > 0 else (-MOST, 0.0)
+        sign = np.broadcast_to(held.get(name, 0), weights.shape)
+        low, high = np.where(sign > 0, 0.0, -MOST), np.where(sign < 0, 0.0, MOST)
         found.append(Free(f"map.weights.{name}", low, high, start=(-1.0, 1.0), nuisance=True))
     return [*found, Free("map.biases", -MOST, MOST, start=(-1.0, 1.0), nuisance=True)]
 

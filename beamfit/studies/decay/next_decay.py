@@ -12,8 +12,8 @@ import numpy as np
 from beamfit.errors import InputError
 from beamfit.greybox.design import Information, scores
 from beamfit.lifetime.decay import current as decayed
+from beamfit.lifetime.losses import Terms, loss_terms, scaled_losses
 from beamfit.lifetime.ring import Operation
-from beamfit.lifetime.scaled import Terms, loss_terms, scaled_losses
 from beamfit.studies.decay.scales import ScaleFit, pulls, whitener
 from beamfit.studies.decay.summary import Summaries, information_root, loss_parts
 

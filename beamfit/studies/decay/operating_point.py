@@ -9,15 +9,15 @@ import jax.numpy as jnp
 import numpy as np
 
 from beamfit.errors import InputError
+from beamfit.lifetime.decay import HOUR
+from beamfit.lifetime.losses import Terms, loss_terms, scaled_losses
 from beamfit.lifetime.ring import Operation
-from beamfit.lifetime.scaled import Terms, loss_terms, scaled_losses
 from beamfit.quantity import Quantity
 from beamfit.sampling.posterior import Posterior
 from beamfit.studies.decay.scales import ScaleFit, losses_of
 
 __all__ = ["BestPoint", "Limits", "best_operating_point"]
 
-HOUR = 3600.0
 GRID = 33
 
 

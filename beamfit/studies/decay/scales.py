@@ -17,13 +17,11 @@ from beamfit.greybox.covariance import spread_of
 from beamfit.greybox.posterior import Optimum, Statement, target_of
 from beamfit.greybox.problem import Free, Prior, Problem, Record, residual
 from beamfit.greybox.solve import solve
-from beamfit.lifetime.losses import SCALES
-from beamfit.lifetime.scaled import Terms, loss_terms, scaled_losses
+from beamfit.lifetime.losses import SCALES, Terms, loss_terms, scaled_losses
 from beamfit.quantity import Quantity, Status
 from beamfit.shown import shown
 from beamfit.statistics import POOR_FIT, chi2_probability
-from beamfit.studies.decay.loss_budget import Machine, operation_during
-from beamfit.studies.decay.study import Decay
+from beamfit.studies.decay.study import Decay, Machine, operation_during
 from beamfit.studies.decay.summary import Summaries, loss_parts, summarise
 from beamfit.table import json_of
 from beamfit.verdict import Finding, judge

@@ -14,19 +14,17 @@ from scipy.special import chdtrc
 
 from beamfit.errors import InputError
 from beamfit.lifetime.decay import HOUR
-from beamfit.lifetime.losses import MECHANISMS
+from beamfit.lifetime.losses import MECHANISMS, loss_terms, scaled_losses, scaled_parts
 from beamfit.lifetime.ring import Operation
-from beamfit.lifetime.scaled import loss_terms, scaled_losses, scaled_parts
 from beamfit.quantity import Quantity, Status
 from beamfit.sampling.posterior import Interval, Posterior
 from beamfit.shown import shown
 from beamfit.studies.decay.fit import bare
-from beamfit.studies.decay.loss_budget import Machine, operation_during, settings_json
 from beamfit.studies.decay.network import Network, NetworkFit, fit_loss_network
 from beamfit.studies.decay.next_decay import Candidate, Proposal, next_decays
 from beamfit.studies.decay.operating_point import BestPoint, Limits, best_operating_point
 from beamfit.studies.decay.scales import ScaleFit, fit_scales, pulls, stacked_terms, whitener
-from beamfit.studies.decay.study import Decay
+from beamfit.studies.decay.study import Decay, Machine, operation_during, settings_json
 from beamfit.studies.decay.summary import summarise
 from beamfit.table import json_of
 
