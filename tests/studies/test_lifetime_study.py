@@ -202,7 +202,8 @@ def test_the_next_decay_closes_the_gap(machine, decays):
 def test_an_anomaly_is_named_and_dated(machine, fit, decays, change, moved):
     reference = fit_scales(decays, machine)
     truth = machine._replace(operation=machine.operation)
-    found = find_anomaly(replace(reference, vector=np.ones(4)), simulated(truth, 8, change, 5))
+    at_one = replace(reference, fit=replace(reference.fit, theta=np.ones(4)))
+    found = find_anomaly(at_one, simulated(truth, 8, change, 5))
     assert found.moved == moved
     assert found.since == ("fill5" if moved else None)
     for name, factor in zip("ab", change, strict=True):

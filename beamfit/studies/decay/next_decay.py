@@ -126,8 +126,11 @@ def next_decays(fit: ScaleFit, candidates: Sequence[Candidate]) -> tuple[Proposa
 def _known(fit: ScaleFit) -> Information:
     """Information on the scales so far, with a wide prior where there is none."""
     one = np.eye(len(fit.vector))
-    rows = np.vstack(
-        [_rows_of(fit, fit.terms, fit.measured), np.diag(1 / fit.prior_error), one / WIDE]
-    )
+    rows = np.vstack([_rows_of(fit, fit.terms, fit.measured), *_priors(fit), one / WIDE])
     free = np.full(len(one), np.inf)
     return Information(rows, np.ones(len(one)), one, free > 0, -free, free)
+
+
+def _priors(fit: ScaleFit) -> list[np.ndarray]:
+    problem = fit.fit.problem
+    return [np.equal(problem.names, prior.name) / prior.sd for prior in problem.priors]

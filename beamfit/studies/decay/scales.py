@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
@@ -14,6 +14,7 @@ from jax import Array
 
 from beamfit.errors import InputError, nearest
 from beamfit.greybox.covariance import spread_of
+from beamfit.greybox.fit import Fit
 from beamfit.greybox.posterior import Optimum, Statement, target_of
 from beamfit.greybox.problem import Free, Prior, Problem, Record, residual
 from beamfit.greybox.solve import solve
@@ -42,6 +43,7 @@ __all__ = [
 # A scale known to a third or worse cannot be told from a third more or less of another cause.
 SEPARABLE = 1 / 3
 PRESSURE_ERROR = 0.05
+RECORD = "decays"
 LARGEST = 1e3
 # How far walkers begin from scales that the decays do not tell.
 WIDTH = 0.3
@@ -62,15 +64,13 @@ class ScaleFit:
     scales : mapping of str to Quantity
         Factors on the ring file's values: touschek, bremsstrahlung, elastic, desorption, also as
         attributes; without an error where the decays do not separate the mechanism.
-    chi2 : float
-        Sum of squares, priors not counted.
+    fit : Fit
+        Of the core, with the priors among its parts.
     dof : int
         Two numbers a decay, less the scales.
-    vector, covariance : array, shape (n,) and (n, n)
-        All scales whether separable or not, and their linearised covariance, not enlarged;
-        its entries are infinite along directions that nothing determines.
-    error_scale : float
-        sqrt(chi²/dof) where above 1.
+    covariance : array, shape (n, n)
+        Linearised, not enlarged, of all scales whether separable or not; its entries are infinite
+        along directions that nothing determines.
     pressure_error : float
         Relative error of the pressure readings, of each record independently.
     machine : Machine
@@ -81,25 +81,34 @@ class ScaleFit:
         What each decay says.
     names : tuple of str
         Names of the decays.
-    prior_mean, prior_error : array, shape (n,)
-        Priors on the scales; an infinite error for none.
     """
 
     status: Status
     message: str
     scales: Mapping[str, Quantity]
-    chi2: float
+    fit: Fit
     dof: int
-    vector: np.ndarray
     covariance: np.ndarray
-    error_scale: float
     pressure_error: float
     machine: Machine
     terms: Terms
     measured: Summaries
     names: tuple[str, ...]
-    prior_mean: np.ndarray
-    prior_error: np.ndarray
+
+    @property
+    def vector(self) -> np.ndarray:
+        """All scales, separable or not, shape (n,)."""
+        return self.fit.theta
+
+    @property
+    def chi2(self) -> float:
+        """Sum of squares, priors not counted."""
+        return self.fit.group(RECORD).chi2
+
+    @property
+    def error_scale(self) -> float:
+        """sqrt(chi²/dof) where above 1."""
+        return math.sqrt(max(1.0, self.chi2 / self.dof)) if self.dof > 0 else 1.0
 
     def __str__(self) -> str:
         rows = [f"{len(self.names)} decays: {self.status}. {self.message}"]
@@ -157,16 +166,13 @@ def pulls(scales: Array, terms: Terms, measured: Summaries, weight: Array) -> Ar
     return jnp.einsum("nij,nj->ni", weight, off)
 
 
-def _check_priors(priors: Mapping[str, tuple[float, float]]) -> tuple[np.ndarray, np.ndarray]:
-    told = dict.fromkeys(SCALES, (1.0, np.inf))
+def _checked(priors: Mapping[str, tuple[float, float]]) -> list[Prior]:
     for name, (value, spread) in priors.items():
         if name not in SCALES:
             raise InputError(f"a prior on '{name}'", nearest(name, list(SCALES)))
         if not (value >= 0 and spread > 0):
             raise InputError(f"{name} = {value} ± {spread}", "a mean of 0 or more, an error above")
-        told[name] = (value, spread)
-    mean, error = np.array(list(told.values()), float).T
-    return mean, error
+    return [Prior(name, *priors[name]) for name in SCALES if name in priors]
 
 
 def fit_scales(
@@ -210,35 +216,35 @@ def fit_scales(
     if not decays:
         raise InputError("no decay", "one or more; several settings separate the mechanisms")
     terms, measured = stacked_terms(decays, machine), summarise(tuple(decays))
-    mean, error = _check_priors(priors or {})
-
-    def stated(vector: np.ndarray) -> Problem:
+    known = _checked(priors or {})
+    nothing = np.zeros(measured.parts.shape)
+    vector = np.array([priors[name][0] if name in (priors or {}) else 1.0 for name in SCALES])
+    for _ in range(5):  # the weight moves little with the scales: it settles in two or three
         weight = whitener(vector, terms, measured, pressure_error)
-        nothing = np.zeros(measured.parts.shape)
-        record = Record("decays", _weighted, (terms, measured, weight), nothing, 1.0)
-        return _problem(vector, record, mean, error)
-
-    vector = mean
-    for _ in range(4):  # the weight moves little with the scales: it settles in two or three
-        found = solve(stated(vector))
+        record = Record(RECORD, _weighted, (terms, measured, weight), nothing, 1.0)
+        found = solve(_problem(vector, record, known))
         vector = found.theta
-    problem = stated(vector)
-    rows = np.asarray(_slopes(problem.core, vector))
-    unbounded = np.full(vector.shape, np.inf)
-    spread = spread_of(rows, -unbounded, unbounded)
-    blind = ~np.isfinite(spread.error(np.eye(vector.size)))
-    covariance = np.where(np.outer(blind, blind), np.inf, spread.seen)
-    off = np.asarray(problem.records[0].residual(problem.core.model))
     seen = int(np.sum(np.any(np.asarray(measured.root) != 0, axis=-1)))
-    chi2, dof = float(off @ off), seen - vector.size
+    covariance, dof = _covariance(found), seen - vector.size
+    chi2 = found.group(RECORD).chi2
     scale = math.sqrt(max(1.0, chi2 / dof)) if dof > 0 else 1.0
     scales = _quantities(vector, np.sqrt(np.diag(covariance)), scale)
     ended = found.status not in (Status.not_converged, Status.not_finite)
     verdict = judge(_Evidence(scales, chi2, dof, ended, len(decays)), RULES)
+    names = tuple(d.fit.record for d in decays)
     return ScaleFit(
-        verdict.status, verdict.cause, scales, chi2, dof, vector, covariance, scale,
-        pressure_error, machine, terms, measured, tuple(d.fit.record for d in decays), mean, error,
+        verdict.status, verdict.cause, scales, found, dof, covariance, pressure_error, machine,
+        terms, measured, names,
     )  # fmt: skip
+
+
+def _covariance(found: Fit) -> np.ndarray:
+    """Of the scales without their bounds, which stand for nothing known; infinite where open."""
+    rows = np.asarray(_slopes(found.problem.core, found.theta))
+    unbounded = np.full(found.theta.shape, np.inf)
+    spread = spread_of(rows, -unbounded, unbounded)
+    blind = ~np.isfinite(spread.error(np.eye(found.theta.size)))
+    return np.where(np.outer(blind, blind), np.inf, spread.seen)
 
 
 def _vector(model: Mapping[str, Array]) -> Array:
@@ -250,15 +256,10 @@ def _weighted(model: Mapping[str, Array], data: tuple[Terms, Summaries, Array]) 
     return pulls(_vector(model), *data)
 
 
-def _problem(vector: np.ndarray, record: Record, mean: np.ndarray, error: np.ndarray) -> Problem:
+def _problem(vector: np.ndarray, record: Record, priors: Sequence[Prior]) -> Problem:
     """A factor for each of `SCALES`, the decays, and what is known beforehand."""
-    told = zip(SCALES, mean, error, strict=True)
-    return Problem(
-        dict(zip(SCALES, vector, strict=True)),
-        [Free(name, 0.0, LARGEST) for name in SCALES],
-        [record],
-        [Prior(name, value, spread) for name, value, spread in told if np.isfinite(spread)],
-    )
+    free = [Free(name, 0.0, LARGEST) for name in SCALES]
+    return Problem(dict(zip(SCALES, vector, strict=True)), free, [record], priors)
 
 
 @jax.jit
@@ -370,8 +371,8 @@ def sample_scales(fit: ScaleFit, seed: int = 0, **options: Any) -> Posterior:
 
     names = tuple(SCALES)
     study = (fit.terms, fit.measured, fit.pressure_error, fit.error_scale)
-    record = Record("decays", _pulls, study, np.zeros(fit.measured.parts.shape), 1.0)
-    problem = _problem(fit.vector, record, fit.prior_mean, fit.prior_error)
+    record = Record(RECORD, _pulls, study, np.zeros(fit.measured.parts.shape), 1.0)
+    problem = replace(fit.fit.problem, records=[record])
     stated = Statement(
         data=study,
         log_volume=_log_volume,
