@@ -147,15 +147,16 @@ def _show(
 
 def _show_record(terminal: Terminal, study: RecordStudy) -> None:
     """Lay out a record: what was cut away, and every decay with its verdict and budget."""
-    from beamfit.quantity import Status
     from beamfit.studies.decay.tables import (
         FEW,
+        SYSTEMATIC,
         budget_rows,
         check_rows,
         decay_rows,
         separability_rows,
+        systematic_rows,
     )
-    from beamfit.table import labelled
+    from beamfit.table import Table, labelled
 
     terminal.line(str(study.record), style="bold")
     if study.events:
@@ -170,8 +171,8 @@ def _show_record(terminal: Terminal, study: RecordStudy) -> None:
         rows = decay_rows([decay]) + separability_rows([decay])[:2] + check_rows([decay])
         terminal.table(labelled("", [name], rows), [status])
         terminal.verdict(name, status, decay.fit.message)
-        if decay.checks is not None and decay.checks.constant_a.status is Status.poor_fit:
-            terminal.verdict("constant a", Status.poor_fit, decay.checks.constant_a.message)
+        if decay.systematics:
+            terminal.table(Table("\nWhat no residual shows", SYSTEMATIC, systematic_rows(decay)))
         if losses := budget_rows([decay]):
             terminal.table(labelled("\nLosses from first principles", [name], losses))
         terminal.line()

@@ -170,6 +170,8 @@ def _law(own, log_volume, derive, build) -> tuple[Law, Callable]:
         """Priors and further objectives, and -inf where a bound or constraint is broken."""
         model, core = model_of(data, moved), data.core
         value = log_volume(model, data.more)
+        for record in core.records:
+            value += record.log_volume(model)
         for prior in core.priors:
             value -= 0.5 * jnp.sum(prior.residual(model) ** 2)
         for objective in core.objectives:

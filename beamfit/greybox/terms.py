@@ -11,6 +11,7 @@ import numpy as np
 
 from beamfit.errors import InputError
 from beamfit.greybox import tree
+from beamfit.greybox.correlated import log_volume, whitened
 
 __all__ = ["Constraint", "Free", "Objective", "Prior", "Record"]
 
@@ -39,7 +40,7 @@ class Free(NamedTuple):
     nuisance: bool = False
 
 
-@tree.node("name", "predict", "worth")
+@tree.node("name", "predict", "worth", "apart")
 class Record:
     """Measured data and the function that predicts them.
 
@@ -66,6 +67,11 @@ class Record:
         on a guess, which the residuals correct.
     guess : float
         That guess in units of `error`.
+    apart : callable, optional
+        ``apart(model, data)``, shape (values - 1,), for errors with a memory: the time between
+        neighbouring values over the correlation time of their errors. Residuals are then those of
+        independent errors (`beamfit.greybox.correlated.whitened`). A sampler may vary the
+        correlation time; a search takes it as fixed. Such a record has no padding.
 
     Raises
     ------
@@ -81,6 +87,7 @@ class Record:
     weight: Any = 1.0
     worth: float = np.inf
     guess: Any = 1.0
+    apart: Callable[[Any, Any], jax.Array] | None = None
 
     def __post_init__(self):
         measured = np.asarray(self.measured, float)
@@ -104,10 +111,15 @@ class Record:
         object.__setattr__(self, "error", None if error is None else jnp.asarray(error))
 
     def residual(self, model: Any) -> jax.Array:
-        """Weighted residuals (predicted - measured)/error as a flat vector."""
+        """Weighted residuals (predicted - measured)/error as a flat vector, whitened."""
         scale = 1.0 if self.error is None else self.error
         difference = (self.predict(model, self.data) - self.measured) / scale
-        return jnp.ravel(jnp.where(self.weight > 0, jnp.sqrt(self.weight) * difference, 0.0))
+        rows = jnp.ravel(jnp.where(self.weight > 0, jnp.sqrt(self.weight) * difference, 0.0))
+        return rows if self.apart is None else whitened(rows, self.apart(model, self.data))
+
+    def log_volume(self, model: Any) -> jax.Array:
+        """What whitening adds to the logarithm of the density."""
+        return jnp.zeros(()) if self.apart is None else log_volume(self.apart(model, self.data))
 
     @property
     def errors_given(self) -> bool:

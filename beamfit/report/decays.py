@@ -29,6 +29,7 @@ from beamfit.studies.decay.shift import Shift
 from beamfit.studies.decay.study import Decay, RecordStudy
 from beamfit.studies.decay.tables import (
     FEW,
+    SYSTEMATIC,
     alike,
     budget_rows,
     check_rows,
@@ -38,6 +39,7 @@ from beamfit.studies.decay.tables import (
     overview,
     separability_rows,
     shift_rows,
+    systematic_rows,
 )
 from beamfit.table import Table, labelled
 
@@ -96,6 +98,12 @@ def decay_page(
     if shift is not None and shift.network is not None:
         tables.append(labelled("A network of the losses", ["value"], network_rows(shift)))
     tables += _side_by_side(decays) if len(decays) <= FEW else _one_below_another(decays)
+    if len(decays) <= FEW:
+        tables += [
+            Table(f"What no residual of {d.fit.record} shows", SYSTEMATIC, systematic_rows(d))
+            for d in decays
+            if d.systematics
+        ]
     header = ["what", "at", "for", "change"]
     tables += [
         Table(f"Cut at or left out of {study.record.name}", header, event_rows(study))
@@ -156,10 +164,7 @@ def _verdict(decay: Decay) -> Verdict:
     fit = decay.fit
     value = f"lifetime {fit.lifetime_mean} at {fit.mean_current:.4g} mA"
     headline = value if fit.lifetime_mean.error is not None else "lifetime not determined"
-    message = fit.message
-    if decay.checks is not None and decay.checks.constant_a.status is Status.poor_fit:
-        message = f"{message} {decay.checks.constant_a.message}"
-    return Verdict(fit.status, f"{fit.record}: {headline}", message)
+    return Verdict(fit.status, f"{fit.record}: {headline}", fit.message)
 
 
 def _shift_verdicts(shift: Shift | None) -> list[Verdict]:

@@ -4,8 +4,8 @@ from scipy.optimize import curve_fit
 
 from beamfit.greybox.solve import solve
 from beamfit.lifetime.decay import current_by_rate
+from beamfit.studies.decay.law import constant_shape
 from beamfit.studies.decay.model import (
-    constant_shape,
     decay_problem,
     padded,
     solve_decay,
@@ -150,7 +150,7 @@ def test_a_known_shape_gives_the_true_gas_term():
 def test_the_exponent_of_a_constant_a_is_zero():
     time = np.linspace(0, 36000, 300)
     measured = noisy(time, 500.0, 3e-8, 1e-6, 1e-3, 7)
-    fit = solve_decay(time, measured, np.full(300, 1e3), np.ones(4), constant_shape)
+    fit = solve_decay(time, measured, np.full(300, 1e3), free=np.ones(4), shape=constant_shape)
     assert fit.converged
     assert abs(fit.values.exponent) < 4 * fit.errors.exponent
     assert fit.errors.exponent < 0.05

@@ -1,4 +1,4 @@
-"""What simpler analyses of a decay say, how far off they are, and whether a is constant."""
+"""What simpler analyses of a decay say, and how far off they are."""
 
 from __future__ import annotations
 
@@ -7,19 +7,18 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.special import fdtrc
 
 from beamfit.errors import InputError
 from beamfit.lifetime.decay import HOUR
-from beamfit.quantity import Quantity, Status
+from beamfit.quantity import Quantity
 from beamfit.shown import shown
+from beamfit.studies.decay.departures import ConstantA
 from beamfit.studies.decay.fit import DecayFit, bare, fit_decay
-from beamfit.studies.decay.model import constant_shape, padded, solve_decay
+from beamfit.studies.decay.model import padded, solve_decay
 from beamfit.studies.decay.record import DecayRecord
 from beamfit.table import json_of
 
 __all__ = [
-    "ConstantA",
     "DecayChecks",
     "LifetimeTrace",
     "OneLifetime",
@@ -31,12 +30,8 @@ __all__ = [
 ]
 
 FEWEST_IN_WINDOW = 5
-REJECTED = 1e-3
-EXACT = 1e-8
 # Below 1e-12 a bias is rounding.
 BIAS_DIGITS = 12
-# Readings from which the test of a constant a can tell all that it can.
-ENOUGH = 1024
 
 
 @shown
@@ -100,7 +95,7 @@ def single_exponential(record: DecayRecord) -> OneLifetime:
     >>> print(single_exponential(DecayRecord(t, 500 / (1 + t / 36000))).lifetime.value > 10)
     True
     """
-    found = solve_decay(*padded(record), np.array([1.0, 1.0, 0.0]))
+    found = solve_decay(*padded(record), free=np.array([1.0, 1.0, 0.0, 0.0]))
     scale = math.sqrt(float(found.sum_squares) / (len(record) - 2))
     scale = scale if record.error is None else max(1.0, scale)
     rate, error = float(found.values.b), float(found.errors.b) * scale
@@ -213,53 +208,6 @@ def moving_lifetime(record: DecayRecord, window: float) -> LifetimeTrace:
         return LifetimeTrace(at, level, -level / slope / HOUR, level * error / slope**2 / HOUR)
 
 
-@shown
-@dataclass(frozen=True)
-class ConstantA:
-    """Whether one record contradicts a constant a.
-
-    Parameters
-    ----------
-    status : Status
-        `converged` if a constant a describes the record, `poor_fit` if it is rejected,
-        `unidentified` if the record cannot tell.
-    message : str
-        The verdict in a sentence.
-    exponent : Quantity
-        s in a(I) proportional to I^s: 0 for constant a, -1/3 for a strongly lengthening bunch; NaN
-        if the record cannot tell, for the search then ends anywhere.
-    p_value : float
-        Probability of a worse contradiction if a is constant; NaN if the record cannot tell.
-    """
-
-    status: Status
-    message: str
-    exponent: Quantity
-    p_value: float
-
-    def to_json(self) -> dict[str, Any]:
-        """Return the fields as JSON's types."""
-        return json_of(vars(self))
-
-    def __str__(self) -> str:
-        return f"{self.status}. {self.message}"
-
-
-def _averaged(record: DecayRecord) -> DecayRecord:
-    """A long record as the means of neighbouring readings: the curve is smooth between them."""
-    if len(record) <= ENOUGH:
-        return record
-    first = np.linspace(0, len(record), ENOUGH, endpoint=False).astype(int)
-    count = np.diff(first, append=len(record))
-    time, current = (
-        np.add.reduceat(values, first) / count for values in (record.time, record.current)
-    )
-    error = record.error
-    if error is not None:
-        error = np.sqrt(np.add.reduceat(error**2, first)) / count
-    return DecayRecord(time, current, error, record.name)
-
-
 def constant_a_test(record: DecayRecord) -> ConstantA:
     """Test whether a is constant, against a power of the current.
 
@@ -271,14 +219,20 @@ def constant_a_test(record: DecayRecord) -> ConstantA:
     Returns
     -------
     ConstantA
-        Exponent, probability (F test, with the number of readings reduced for correlated
-        residuals), and the verdict. Of more than 1024 readings neighbours are averaged.
+        Exponent, probability, and the verdict: part of every fit, as `DecayFit.constant_a`.
+
+    Raises
+    ------
+    InputError
+        As for `fit_decay`, and for readings that are all equal.
 
     Notes
     -----
     A bunch that lengthens with its current loses less at high current than a constant a says. A
     constant a then leaves a remainder that the fit takes for a gas term: repeat the fit with
-    the bunch's own law, `fit_decay(record, shape=...)`.
+    the bunch's own law, `fit_decay(record, shape=...)`. The exponent is estimated beside I0, a and
+    b in linear approximation about a constant a, and its error contains the noise's memory
+    (`beamfit.greybox.correlated`): the score test.
 
     Examples
     --------
@@ -289,38 +243,10 @@ def constant_a_test(record: DecayRecord) -> ConstantA:
     >>> print(constant_a_test(record).status)
     converged
     """
-    record = _averaged(record)
-    readings = padded(record)
-    constant = solve_decay(*readings)
-    power = solve_decay(*readings, np.ones(4), constant_shape)
-    found = float(power.values.exponent)
-    residuals = (readings[2] * power.residuals)[: len(record)]
-    neighbours = max(0.0, float(residuals[1:] @ residuals[:-1]) / float(power.sum_squares))
-    independent = (1 - neighbours) / (1 + neighbours)
-    dof = max((len(record) - 4) * independent, 1.0)
-    unit = float(power.sum_squares) / (len(record) - 4)
-    if record.error is not None:
-        unit = max(1.0, unit)
-    # Below this share of the current differences are those of the integration, not of the beam.
-    unit = max(unit, float(np.mean((readings[2][: len(record)] * EXACT * record.current) ** 2)))
-    excess = max(0.0, float(constant.sum_squares) - float(power.sum_squares)) / unit * independent
-    chance = float(fdtrc(1.0, dof, excess))
-    raw = float(power.errors.exponent) * math.sqrt(unit)
-    error = raw / math.sqrt(independent)
-    exponent = Quantity(found, error, "1", raw)
-    if not power.converged or not error < 1 / 3:
-        message = "The record cannot tell a constant a from one that depends on the current"
-        unknown = Quantity(math.nan, None, "1")
-        return ConstantA(Status.unidentified, f"{message}: record longer.", unknown, math.nan)
-    if chance < REJECTED:
-        message = (
-            f"A constant a is rejected (p = {max(chance, 1e-300):.2g}): a goes as "
-            f"I^{found:.3f}, so b of the constant-a fit is not a gas loss; fit with the "
-            "shape of a."
-        )
-        return ConstantA(Status.poor_fit, message, exponent, chance)
-    message = f"A constant a describes the record (p = {chance:.2g}, exponent {exponent})."
-    return ConstantA(Status.converged, message, exponent, chance)
+    found = fit_decay(record).constant_a
+    if found is None:
+        raise InputError("readings that are all equal", "a decay", path=record.name)
+    return found
 
 
 @dataclass(frozen=True)
@@ -333,13 +259,10 @@ class DecayChecks:
         From `single_exponential`.
     log_linear : OneLifetime or None
         From `log_linear`; None where a current is zero.
-    constant_a : ConstantA
-        From `constant_a_test`.
     """
 
     single_exponential: OneLifetime
     log_linear: OneLifetime | None
-    constant_a: ConstantA
 
     def to_json(self) -> dict[str, Any]:
         """Return the fields as JSON's types."""
@@ -363,13 +286,12 @@ def check_decay(record: DecayRecord) -> DecayChecks | None:
     --------
     >>> t = np.linspace(0, 8 * 3600, 500)
     >>> checks = check_decay(DecayRecord(t, 500 / (1 + t / 36000)))
-    >>> f"{checks.log_linear.bias_start:.2f}", checks.constant_a.status.value
-    ('0.38', 'converged')
+    >>> f"{checks.log_linear.bias_start:.2f}"
+    '0.38'
     """
     if np.ptp(record.current) == 0:
         return None
     return DecayChecks(
         single_exponential(record),
         log_linear(record) if record.current.min() > 0 else None,
-        constant_a_test(record),
     )

@@ -14,22 +14,12 @@ from beamfit.errors import InputError
 from beamfit.lifetime.decay import HOUR
 from beamfit.quantity import Quantity, Status
 from beamfit.shown import shown
-from beamfit.studies.decay.model import (
-    Solution,
-    padded,
-    padded_size,
-    solve_decay,
-    solve_decays,
-)
+from beamfit.studies.decay.departures import Change, ConstantA, LifetimeLaw
+from beamfit.studies.decay.evidence import BELIEVED, DETERMINED, Evidence, Separability
+from beamfit.studies.decay.model import Solution, padded, padded_size, solve_decay, solve_decays
 from beamfit.studies.decay.record import DecayRecord
-from beamfit.studies.decay.verdict import (
-    BELIEVED,
-    DETERMINED,
-    Evidence,
-    Separability,
-    finding_of,
-)
-from beamfit.table import Table, cell, labelled, plain_name
+from beamfit.studies.decay.verdict import finding_of
+from beamfit.table import Table, cell, json_of, labelled, plain_name
 
 if TYPE_CHECKING:
     from beamfit.sampling.posterior import Posterior
@@ -51,7 +41,7 @@ UNITS = {
 }
 
 
-def bare(value: float, unit: str) -> dict[str, Any]:
+def bare(value: float | None, unit: str) -> dict[str, Any]:
     """A number that has no error, as JSON."""
     return {"value": value, "error": None, "unit": unit}
 
@@ -66,9 +56,9 @@ class DecayFit:
     record : str
         Name of the record.
     status : Status
-        `converged`; `poor_fit` if chi² is improbable (below 1e-3); `infeasible` if a or b is
-        negative by more than its error allows; `unidentified` if a and b, or the lifetime
-        itself, are not determined; `not_finite` if the search failed.
+        `converged`; `poor_fit` if chi² is improbable (below 1e-3) or the record refutes constant a
+        and b; `infeasible` if a or b is negative by more than its error allows; `unidentified` if
+        a and b, or the lifetime itself, are not determined; `not_finite` if the search failed.
     message : str
         One sentence or two of cause and remedy.
     i0, a, b : Quantity
@@ -90,6 +80,14 @@ class DecayFit:
         Model minus reading, mA.
     identifiability : Separability
         Whether the record tells a from b.
+    constant_a : ConstantA or None
+        Whether the record contradicts a constant a; None where nothing decays.
+    correlation_time : float or None
+        Of the errors of the readings, s; None where they are independent.
+    lifetimes : LifetimeLaw or None
+        The lifetime by current, where a constant a is refuted.
+    change : Change or None
+        When the loss rate changed, where that explains a refuted law.
     readings : DecayRecord, optional
         What was fitted.
     shaped : bool
@@ -119,6 +117,10 @@ class DecayFit:
     noise_inferred: bool
     residuals: np.ndarray
     identifiability: Separability
+    constant_a: ConstantA | None = None
+    correlation_time: float | None = None
+    lifetimes: LifetimeLaw | None = None
+    change: Change | None = None
     readings: DecayRecord | None = None
     shaped: bool = False
 
@@ -202,6 +204,14 @@ class DecayFit:
             "rms_residual": bare(self.rms_residual, "mA"),
             "noise_inferred": self.noise_inferred,
             "identifiability": self.identifiability.to_json(),
+            **json_of(
+                {
+                    "constant_a": self.constant_a,
+                    "correlation_time": bare(self.correlation_time, "s"),
+                    "lifetime_by_current": self.lifetimes,
+                    "change": self.change,
+                }
+            ),
         }
 
 
@@ -245,7 +255,7 @@ def fit_decay(record: DecayRecord, shape: Callable[[Any], Any] | None = None) ->
     """
     if _says_nothing(record):
         return _constant(record)
-    return _judged(record, solve_decay(*padded(record), shape=shape), shaped=shape is not None)
+    return _judged(record, solve_decay(*padded(record), shape=shape), shape)
 
 
 def fit_decays(records: Sequence[DecayRecord]) -> tuple[DecayFit, ...]:
@@ -275,12 +285,13 @@ def fit_decays(records: Sequence[DecayRecord]) -> tuple[DecayFit, ...]:
     ['1.000e-08', '1.000e-08']
     """
     fits: dict[int, DecayFit] = {}
-    groups: dict[int, list[int]] = {}
+    groups: dict[tuple[int, bool], list[int]] = {}
     for k, record in enumerate(records):
         if _says_nothing(record):
             fits[k] = _constant(record)
         else:
-            groups.setdefault(padded_size(len(record)), []).append(k)
+            size = padded_size(len(record)), record.gauge is None
+            groups.setdefault(size, []).append(k)
     for members in groups.values():
         for first in range(0, len(members), TOGETHER):
             chosen = members[first : first + TOGETHER]
@@ -333,7 +344,9 @@ def _quantity(evidence: Evidence, name: str, known: bool) -> Quantity:
         return Quantity(math.nan, None, UNITS[name])
     if not known or not math.isfinite(error):
         return Quantity(value, None, UNITS[name])
-    return Quantity(value, error, UNITS[name], error / evidence.scale * evidence.raw)
+    reach = float(getattr(evidence.reach, name))
+    raw = float(getattr(evidence.raw, name))
+    return Quantity(value, error, UNITS[name], raw, (value - reach, value + reach))
 
 
 def _lifetime(evidence: Evidence, name: str, known: bool) -> Quantity:
@@ -343,13 +356,17 @@ def _lifetime(evidence: Evidence, name: str, known: bool) -> Quantity:
         return Quantity(math.nan, None, "h")
     if not (known and error < DETERMINED * rate):
         return Quantity(1 / rate / HOUR, None, "h")
-    error = error / rate**2 / HOUR
-    return Quantity(1 / rate / HOUR, error, "h", error / evidence.scale * evidence.raw)
+    reach, raw = (float(getattr(part, name)) for part in (evidence.reach, evidence.raw))
+    interval = tuple(1 / max(rate + sign * reach, 1e-300) / HOUR for sign in (1, -1))
+    error, raw = (part / rate**2 / HOUR for part in (error, raw))
+    return Quantity(1 / rate / HOUR, error, "h", raw, interval)
 
 
-def _judged(record: DecayRecord, solution: Solution, shaped: bool = False) -> DecayFit:
+def _judged(
+    record: DecayRecord, solution: Solution, shape: Callable[[Any], Any] | None = None
+) -> DecayFit:
     """Turn a solution into quantities, a status and its sentence."""
-    evidence = Evidence.of(record, solution)
+    evidence = Evidence.of(record, solution, shape)
     rate, error = evidence.scaled("rate_mean")
     if rate < -BELIEVED * error:
         first, last = record.current[0], record.current[-1]
@@ -376,6 +393,10 @@ def _judged(record: DecayRecord, solution: Solution, shaped: bool = False) -> De
         noise_inferred=record.error is None,
         residuals=evidence.residuals,
         identifiability=evidence.separability,
+        constant_a=evidence.constant_a,
+        correlation_time=evidence.correlation_time,
+        lifetimes=evidence.lifetimes,
+        change=evidence.change if evidence.refuted else None,
         readings=record,
-        shaped=shaped,
+        shaped=shape is not None,
     )

@@ -1,4 +1,4 @@
-"""The law of a decay: what is free in it, the least-squares problem, and its fast path."""
+"""A decay as a least-squares problem, and its fast path."""
 
 from __future__ import annotations
 
@@ -14,26 +14,30 @@ from jax import Array
 
 from beamfit.greybox.descend import descend_one
 from beamfit.greybox.problem import Free, Prior, Problem, Record, padded_length
-from beamfit.lifetime.decay import current, current_by_rate
+from beamfit.studies.decay.law import (
+    DecayNumbers,
+    Moments,
+    Physical,
+    Shape,
+    beam_current,
+    bent_current,
+    cumulative,
+    physical,
+    scaled_numbers,
+)
 from beamfit.studies.decay.record import DecayRecord
 
 __all__ = [
-    "DecayNumbers",
-    "Moments",
-    "Physical",
-    "Shape",
+    "Expansion",
     "Solution",
-    "beam_current",
-    "constant_shape",
     "decay_problem",
-    "decay_record",
+    "expanded",
     "padded",
     "padded_size",
     "solve_decay",
     "solve_decays",
 ]
 
-Shape = Callable[[Array], Array]
 RECORD = "decay"
 # Width of a prior on the quadratic part, in units of the whole loss (whose own error counts in).
 # Physics allows 0 to 1, so 30 moves no value that the record determines (by 4e-5 of it where the
@@ -42,83 +46,35 @@ PRIOR_WIDTH = 30.0
 # Where the search for the plain law may rest: one more step of Gauss and Newton ends each
 # search at rounding.
 NEAR = 1e-8
+CONSTANT = np.array([1.0, 1.0, 1.0, 0.0])
 # Most steps with a shape: in a valley without a bottom the record cannot tell anyway.
 FEW_STEPS = 100
 
 
-class DecayNumbers(NamedTuple):
-    """Current at the first reading, mA, and a, 1/(mA s), and b, 1/s, of dI/dt = -a I² - b I.
-
-    `exponent` is the power of the current by which a departs from its known dependence.
-    """
-
-    i0: Array
-    a: Array
-    b: Array
-    exponent: Array = 0.0
-
-
-class Moments(NamedTuple):
-    """When a current is asked for: times, s, and the record's mean current, mA."""
-
-    time: Array
-    mean: Array
-
-
-class Physical(NamedTuple):
-    """What one decay says, in s and mA: loss rates at the first and last time and at the mean
-    current, the share of a in the loss there, the power by which a departs from its shape.
-    """
-
-    i0: Array
-    a: Array
-    b: Array
-    rate_start: Array
-    rate_end: Array
-    rate_mean: Array
-    share: Array
-    exponent: Array
-
-
 class Solution(NamedTuple):
-    """Values and errors for weights of 1/error, the correlation of a and b, residuals in mA,
-    the weighted sum of squares, and whether the search came to rest.
+    """Values and errors for weights of 1/error, what a straight drift of the readings by 1 mA over
+    the record adds to each value, the correlation of a and b, residuals in mA, the weighted sum of
+    squares, what a free exponent would take off it, and whether the search came to rest.
     """
 
     values: Physical
     errors: Physical
+    drift: Physical
     correlation: Array
     residuals: Array
     sum_squares: Array
+    fall: Array
     converged: Array
 
 
-def constant_shape(beam: Array) -> Array:
-    """The shape of a constant a: ones."""
-    return jnp.ones_like(beam, dtype=float)
-
-
-def _rate(numbers: DecayNumbers, mean: Array, shape: Shape | None) -> Shape:
-    """Relative loss rate as a function of the current."""
-
-    def rate(beam: Array) -> Array:
-        if shape is None:
-            return numbers.a * beam + numbers.b
-        relative = shape(beam) / shape(mean) * (beam / mean) ** numbers.exponent
-        return numbers.a * relative * beam + numbers.b
-
-    return rate
-
-
-def beam_current(numbers: DecayNumbers, at: Moments, shape: Shape | None = None) -> Array:
-    """Current, mA: report equation 44, or 42 integrated where a has a shape.
-
-    The shape is a dependence on the current in mA, up to a factor, in JAX; a is then the value at
-    the mean current.
+class Expansion(NamedTuple):
+    """A law about a solution: residuals over errors (n,), their slopes by the four scaled numbers
+    (n, 4), the last of them the exponent, and the slopes of `Physical` by the same (8, 4).
     """
-    if shape is None:
-        return current(at.time, numbers.i0, numbers.a, numbers.b)
-    return current_by_rate(at.time, numbers.i0, _rate(numbers, at.mean, shape))
+
+    residuals: np.ndarray
+    rows: np.ndarray
+    slopes: np.ndarray
 
 
 def padded_size(rows: int) -> int:
@@ -126,12 +82,16 @@ def padded_size(rows: int) -> int:
     return padded_length(max(rows, 64))
 
 
-def padded(record: DecayRecord) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Time, current and weight 1/error of a record, lengthened by readings of no weight."""
+def padded(record: DecayRecord) -> tuple[np.ndarray, ...]:
+    """Time, current and weight 1/error of a record, lengthened by readings of no weight.
+
+    A fourth is the gauge, where the pressure changes by itself.
+    """
     weight = np.ones(len(record)) if record.error is None else 1 / record.error
     extra = (0, padded_size(len(record)) - len(record))
-    time = np.pad(record.time, extra, mode="edge")
-    return time, np.pad(record.current, extra, mode="edge"), np.pad(weight, extra)
+    columns = [record.time, record.current] + ([] if record.gauge is None else [record.gauge])
+    time, current, *gauge = (np.pad(column, extra, mode="edge") for column in columns)
+    return time, current, np.pad(weight, extra), *gauge
 
 
 @lru_cache(maxsize=64)
@@ -140,13 +100,13 @@ def _predicted(shape: Shape | None) -> Callable[[DecayNumbers, Moments], Array]:
     return partial(beam_current, shape=shape)
 
 
-def decay_record(record: DecayRecord, shape: Shape | None = None) -> Record:
-    """The readings, and what the law predicts of them."""
-    at = Moments(record.time, record.current.mean())
-    return Record(RECORD, _predicted(shape), at, record.current, record.error)
+def _apart(model: DecayNumbers, at: Moments) -> Array:
+    return jnp.diff(at.time) * jnp.exp(-model.log_memory)
 
 
-def decay_problem(record: DecayRecord, shape: Shape | None = None) -> Problem:
+def decay_problem(
+    record: DecayRecord, shape: Shape | None = None, memory: float | None = None
+) -> Problem:
     """State the fit of a decay: I0, a and b free, one record, a weak prior on a.
 
     Parameters
@@ -155,6 +115,8 @@ def decay_problem(record: DecayRecord, shape: Shape | None = None) -> Problem:
         The readings.
     shape : callable, optional
         As for `beam_current`.
+    memory : float, optional
+        Correlation time of the errors, s.
 
     Returns
     -------
@@ -170,73 +132,58 @@ def decay_problem(record: DecayRecord, shape: Shape | None = None) -> Problem:
     2.000e-08
     """
     scaled = _scaled(np.stack(padded(record)))
-    start, noise, width = (np.asarray(part) for part in _start(*scaled[:3]))
+    start, noise, width = (np.asarray(part) for part in _start(scaled))
     span, mean = record.span, float(record.current.mean())
     loss, quadratic = start[1] / span, start[2] / span
-    return Problem(
-        DecayNumbers(start[0] * mean, quadratic / mean, loss - quadratic),
-        [Free("i0"), Free("a"), Free("b")],
-        [decay_record(record, shape)],
-        [] if shape else [Prior("a", 0.0, width / noise / span / mean)],
-    )
+    numbers = DecayNumbers(start[0] * mean, quadratic / mean, loss - quadratic)
+    at, apart = Moments(record.time, mean, record.gauge), None
+    if memory is not None:
+        numbers, apart = numbers._replace(log_memory=math.log(memory)), _apart
+    readings = Record(RECORD, _predicted(shape), at, record.current, record.error, apart=apart)
+    priors = [] if shape else [Prior("a", 0.0, width / noise / span / mean)]
+    return Problem(numbers, [Free("i0"), Free("a"), Free("b")], [readings], priors)
 
 
-# The fast path works with theta: current at the start over the mean, loss in one span at the mean
-# current, the part of it that is proportional to current, and the exponent. The second is well
-# determined by any record, the third only by a long one, and the two are nearly uncorrelated.
-def _numbers(theta: Array) -> DecayNumbers:
-    start, loss, quadratic, *exponent = theta
-    return DecayNumbers(start, quadratic, loss - quadratic, *exponent)
+class _Readings(NamedTuple):
+    """Times from 0 to 1, currents about 1, weights; the span, s, and the mean current, mA."""
+
+    at: Moments
+    measured: Array
+    weight: Array
+    unit: tuple[Array, Array]
+
+    @property
+    def pressure(self) -> Array:
+        """Over its mean, at the first and the last reading."""
+        if self.at.gauge is None:
+            return jnp.ones(2)
+        last = jnp.sum(self.weight > 0) - 1
+        pairs = jnp.array([1, last]), jnp.array([0, last - 1])
+        gauge, time = (part[pairs[0]] - part[pairs[1]] for part in (self.at.gauge, self.at.time))
+        return gauge / time
 
 
-def _physical(theta: Array, end: Array, unit: tuple[Array, Array], shape: Shape | None) -> Array:
-    """Physical values from theta and the last current."""
-    span, mean = unit
-    numbers = _numbers(theta)
-    rate = _rate(numbers, 1.0, shape)
-    return jnp.stack(
-        Physical(
-            i0=numbers.i0 * mean,
-            a=numbers.a / (mean * span),
-            b=numbers.b / span,
-            rate_start=rate(numbers.i0) / span,
-            rate_end=rate(end) / span,
-            rate_mean=theta[1] / span,
-            share=theta[2] / theta[1],
-            exponent=jnp.asarray(numbers.exponent, float),
-        )
-    )
-
-
-def _cumulative(values: Array) -> Array:
-    """Cumulative sum by two small triangular products: JAX's own takes seconds to compile."""
-    side = math.isqrt(values.size - 1) + 1
-    square = jnp.pad(values, (0, side**2 - values.size)).reshape(side, side)
-    within = square @ jnp.triu(jnp.ones((side, side)))
-    before = jnp.tril(jnp.ones((side, side)), -1) @ within[:, -1]
-    return (within + before[:, None]).ravel()[: values.size]
-
-
-def _scaled(readings: Array) -> tuple[Array, Array, Array, tuple[Array, Array]]:
-    """Time from 0 to 1, currents about 1, their weight; the span, s, and the mean current, mA."""
-    time, measured, weight = readings
+def _scaled(rows: Array) -> _Readings:
+    time, measured, weight, *gauge = rows
     used = weight > 0
     span = jnp.max(jnp.where(used, time, 0.0))
     mean = jnp.sum(jnp.where(used, measured, 0.0)) / jnp.sum(used)
-    return time / span, measured / mean, weight * mean, (span, mean)
+    at = Moments(time / span, 1.0, gauge[0] / span if gauge else None)
+    return _Readings(at, measured / mean, weight * mean, (span, mean))
 
 
 @jax.jit
-def _start(time: Array, measured: Array, weight: Array) -> tuple[Array, Array, Array]:
+def _start(readings: _Readings) -> tuple[Array, Array, Array]:
     """Start, noise in units of the weights, and width of the prior on the quadratic part.
 
     Integrated once, the law is linear in theta: I(t) = p0 - p1 ∫I dt - p2 ∫I(I - 1) dt in scaled
     units. The integrals average the noise, so the start is good for a decay of any length.
     """
+    time, measured, weight = readings.at.time, readings.measured, readings.weight
     steps = jnp.diff(time, prepend=0.0)
 
     def integral(values: Array) -> Array:
-        return _cumulative(steps * (values + jnp.roll(values, 1)) / 2)
+        return cumulative(steps * (values + jnp.roll(values, 1)) / 2)
 
     columns = (jnp.ones_like(time), -integral(measured), -integral(measured * (measured - 1)))
     rows, target = weight * jnp.stack(columns), weight * measured
@@ -267,53 +214,93 @@ def _inverse(matrix: Array) -> Array:
     return jnp.stack(columns, axis=1) / (first @ columns[0])
 
 
-def _solve(readings: Array, free: Array, shape: Shape | None = None) -> tuple[Array, Array]:
-    """Scale, search, and turn theta into physical numbers; few arrays out, for each costs time."""
-    time, measured, weight, unit = _scaled(readings)
-    scaled_shape = None if shape is None else lambda beam: shape(beam * unit[1])
-    start, noise, width = _start(time, measured, weight)
-    weight = weight / noise
+def _law(theta: Array, at: Moments, shape: Shape | None) -> Array:
+    """Currents from the four numbers; without a shape to first order in the exponent."""
+    numbers = scaled_numbers(theta)
+    return bent_current(numbers, at) if shape is None else beam_current(numbers, at, shape)
 
-    def off(theta: Array, law: Shape | None) -> tuple[Array, Array]:
-        model = beam_current(_numbers(theta), Moments(time, 1.0), law)
-        residual = weight * (model - measured)
-        # The prior holds the plain law, from which a search with a shape begins.
-        return (jnp.append(residual, theta[2] / width) if law is None else residual), model[-1]
+
+def _expanded(theta: Array, readings: _Readings, shape: Shape | None) -> tuple[Array, ...]:
+    """Residuals over errors and physical values at four scaled numbers, and their slopes."""
+
+    def answer(numbers: Array) -> tuple[Array, Array]:
+        model = _law(numbers, readings.at, shape)
+        values = physical(numbers, model[-1], readings.pressure, readings.unit, shape)
+        return readings.weight * (model - readings.measured), values
+
+    (residual, values), (rows, slopes) = jax.vmap(
+        lambda step: jax.jvp(answer, (theta,), (step,)), out_axes=(None, 0)
+    )(jnp.eye(4))
+    return residual, values, rows, slopes
+
+
+def _in_units(shape: Shape | None, mean: Array) -> Shape | None:
+    """A shape of the current over its mean."""
+    return None if shape is None else lambda beam: shape(beam * mean)
+
+
+def _solve(rows: Array, free: Array, shape: Shape | None = None) -> tuple[Array, Array]:
+    """Scale, search, and turn theta into physical numbers; few arrays out, for each costs time."""
+    readings = _scaled(rows)
+    shape = _in_units(shape, readings.unit[1])
+    start, noise, width = _start(readings)
+    readings = readings._replace(weight=readings.weight / noise)
+    at, measured, weight, unit = readings
 
     def constant(theta: Array) -> Array:
-        return off(theta, None)[0]
-
-    def answer(theta: Array) -> tuple[Array, Array]:
-        residual, end = off(theta, scaled_shape)
-        return residual, _physical(theta, end, unit, scaled_shape)
+        """Residuals of the plain law, from which a search with a shape begins, and the prior."""
+        model = beam_current(scaled_numbers(jnp.append(theta, 0.0)), at)
+        return jnp.append(weight * (model - measured), theta[2] / width)
 
     # A start taken from noise can lie where the law has no value; a plain decay never does.
     start, plain = start * free[:3], jnp.array([1.0, 0.1, 0.05]) * free[:3]
     start = jnp.where(jnp.isfinite(constant(start)).all(), start, plain)
     reach = jnp.where(free > 0, jnp.inf, 0.0)
     found = descend_one(constant, start, -reach[:3], reach[:3], tolerance=NEAR)
+    theta, prior = jnp.append(found.theta, 0.0), jnp.eye(4)[2] / width
     if shape is not None:
-        begin = jnp.append(found.theta, 0.0)
-        found = descend_one(lambda t: off(t, scaled_shape)[0], begin, -reach, reach, FEW_STEPS)
-    (residual, values), (jacobian, slopes) = jax.vmap(
-        lambda step: jax.jvp(answer, (found.theta,), (step,)), out_axes=(None, 0)
-    )(jnp.diag(free))
-    root = _root(jacobian, free)
-    step = jnp.where(found.rested, -root @ (root.T @ (jacobian @ residual)), 0.0)
-    values, residual = values + step @ slopes, residual + step @ jacobian
+
+        def shaped(theta: Array) -> Array:
+            return weight * (_law(theta, at, shape) - measured)
+
+        found = descend_one(shaped, theta, -reach, reach, FEW_STEPS)
+        theta, prior = found.theta, jnp.zeros(4)
+    residual, values, rows, slopes = _expanded(theta, readings, shape)
+    used = free.at[3].set(1.0)
+    rows, slopes = rows * used[:, None], slopes * used[:, None]
+    step, root, score = _stepped(residual, rows, prior * used, theta, free[3])
+    step = jnp.where(found.rested, step, 0.0)
+    values, residual = values + step @ slopes, residual + step @ rows
     spread = slopes.T @ root
-    errors = jnp.linalg.norm(spread, axis=1) / noise
-    correlation = (spread[1] @ spread[2]) / noise**2 / (errors[1] * errors[2])
-    residual = residual[: time.size]
-    rest = jnp.stack([correlation, noise**2 * (residual @ residual), found.rested])
+    errors = jnp.linalg.norm(spread, axis=1)
+    correlation = (spread[1] @ spread[2]) / (errors[1] * errors[2])
+    drift = spread @ (root.T @ (rows @ (weight * at.time))) / unit[1]
+    values = values.at[-1].set(jnp.where(free[3] > 0, values[-1], score[0]))
+    errors = errors.at[-1].set(jnp.where(free[3] > 0, errors[-1], score[1]))
+    fall = jnp.where(free[3] > 0, 0.0, noise**2 * score[2])
+    rest = jnp.stack([correlation, noise**2 * (residual @ residual), fall, found.rested])
     residuals = jnp.where(weight > 0, residual / weight, 0.0) * unit[1]
-    return jnp.concatenate([values, errors, rest]), residuals
+    return jnp.concatenate([values, errors / noise, drift, rest]), residuals
 
 
-def _root(jacobian: Array, free: Array) -> Array:
-    """Root R of the covariance R Rᵀ of theta, from the slopes by its free numbers, shape (n, m)."""
-    factor = jnp.linalg.qr(jnp.concatenate([jacobian.T, jnp.diag(1 - free)]), mode="r")
-    return jax.scipy.linalg.solve_triangular(factor, jnp.eye(len(free)))
+def _stepped(
+    residual: Array, rows: Array, prior: Array, theta: Array, free: Array
+) -> tuple[Array, Array, tuple[Array, ...]]:
+    """The last step of Gauss and Newton, the root of the covariance, and of an exponent that is
+    not free what it would be: estimate, error, and the squares that it would take away.
+    """
+    matrix = jnp.concatenate([rows.T, residual[:, None]], axis=1)
+    known = jnp.append(prior, prior @ theta)
+    # What moves nothing, as a number held at zero does, gets a row of its own.
+    blind = 1.0 * (jnp.abs(rows).sum(axis=1) == 0)
+    held = jnp.append(jnp.diag(blind), jnp.zeros((4, 1)), axis=1)
+    factor = jnp.linalg.qr(jnp.concatenate([matrix, known[None], held]), mode="r")
+    root = jax.scipy.linalg.solve_triangular(factor[:4, :4], jnp.eye(4))
+    error = jnp.where(blind[3] > 0, jnp.inf, jnp.abs(root[3, 3]))
+    score = -root[3, 3] * factor[3, 4], error, factor[3, 4] ** 2
+    loose = jnp.ones(4).at[3].set(free)
+    root = root * jnp.outer(loose, loose)
+    return -root @ factor[:4, 4], root, score
 
 
 _solve_one = jax.jit(_solve, static_argnames="shape")
@@ -323,26 +310,49 @@ _solve_many = jax.jit(jax.vmap(_solve, in_axes=(0, None)))
 def _unpacked(summary: Array, residuals: Array) -> Solution:
     leaves = np.moveaxis(np.asarray(summary), -1, 0)
     size = len(Physical._fields)
-    correlation, squares, done = leaves[2 * size :]
-    finite = np.isfinite(leaves[:size]).all(axis=0)
+    values, errors, drift = (Physical(*leaves[k * size : (k + 1) * size]) for k in range(3))
+    correlation, squares, fall, done = leaves[3 * size :]
+    # The exponent is only looked at, and may have no value.
+    finite = np.isfinite(leaves[: size - 1]).all(axis=0)
     return Solution(
-        values=Physical(*leaves[:size]),
-        errors=Physical(*leaves[size : 2 * size]),
+        values=values,
+        errors=errors,
+        drift=drift,
         correlation=correlation,
         residuals=np.asarray(residuals),
         sum_squares=squares,
+        fall=fall,
         converged=(done > 0) & finite,
     )
 
 
-CONSTANT, SHAPED = np.ones(3), np.array([1.0, 1.0, 1.0, 0.0])
+@partial(jax.jit, static_argnames="shape")
+def _expansion(rows: Array, theta: Array, shape: Shape | None) -> tuple[Array, ...]:
+    readings = _scaled(rows)
+    shape = _in_units(shape, readings.unit[1])
+    residual, _, slopes, physical_slopes = _expanded(theta, readings, shape)
+    return residual, slopes, physical_slopes
+
+
+def expanded(
+    record: DecayRecord, values: Physical, shape: Shape | None = None, exponent: float = 0.0
+) -> Expansion:
+    """Expand the law about a solution's values, for what plain least squares does not do."""
+    mean, rows = float(record.current.mean()), len(record)
+    span = record.span
+    theta = [values.i0 / mean, values.rate_mean * span, values.a * mean * span, exponent]
+    found = _expansion(np.stack(padded(record)), np.array(theta, float), shape)
+    residuals, slopes, of_physical = (np.asarray(part) for part in found)
+    return Expansion(residuals[:rows], slopes[:, :rows].T, of_physical.T)
 
 
 def solve_decay(
     time: np.ndarray,
     measured: np.ndarray,
     weight: np.ndarray,
-    free: np.ndarray | None = None,
+    gauge: np.ndarray | None = None,
+    *,
+    free: np.ndarray = CONSTANT,
     shape: Shape | None = None,
 ) -> Solution:
     """Fit the decay law to one record: the fast path of `decay_problem`.
@@ -355,9 +365,11 @@ def solve_decay(
         Currents, mA.
     weight : array, shape (n,)
         1/error, 1/mA; zero for padding.
-    free : array, shape (3,) or (4,), optional
-        Ones where a parameter is fitted; (1, 1, 0) holds a at zero: a single exponential. With a
-        shape the fourth is the exponent, held at zero by default.
+    gauge : array, shape (n,), optional
+        As of `Moments`.
+    free : array, shape (4,), optional
+        Ones where a parameter is fitted; (1, 1, 0, 0) holds a at zero: a single exponential. The
+        last is the exponent, which only a search with a shape may fit.
     shape : callable, optional
         As for `beam_current`.
 
@@ -374,16 +386,16 @@ def solve_decay(
 
     Examples
     --------
+    >>> from beamfit.lifetime.decay import current
     >>> time = np.linspace(0.0, 36000.0, 100)
     >>> fit = solve_decay(time, np.array(current(time, 500.0, 2e-8, 1e-6)), np.ones(100))
     >>> print(f"{fit.values.a:.6e} {fit.values.b:.6e} {fit.converged}")
     2.000000e-08 1.000000e-06 True
     """
-    if free is None:
-        free = CONSTANT if shape is None else SHAPED
-    return _unpacked(*_solve_one(np.stack([time, measured, weight]), free, shape))
+    rows = (time, measured, weight) if gauge is None else (time, measured, weight, gauge)
+    return _unpacked(*_solve_one(np.stack(rows), free, shape))
 
 
-def solve_decays(time: np.ndarray, measured: np.ndarray, weight: np.ndarray) -> Solution:
+def solve_decays(*rows: np.ndarray) -> Solution:
     """`solve_decay` for records of one padded length at once, arrays of shape (m, n)."""
-    return _unpacked(*_solve_many(np.stack([time, measured, weight], axis=1), CONSTANT))
+    return _unpacked(*_solve_many(np.stack(rows, axis=1), CONSTANT))

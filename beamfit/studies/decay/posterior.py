@@ -11,20 +11,25 @@ import numpy as np
 from jax import Array
 
 from beamfit.errors import InputError
-from beamfit.greybox.posterior import Optimum, Statement, predicted, target_of
+from beamfit.greybox import tree
+from beamfit.greybox.correlated import range_of
+from beamfit.greybox.posterior import Optimum, Sampled, Statement, target_of
+from beamfit.greybox.problem import Free
 from beamfit.lifetime.decay import HOUR, current
 from beamfit.quantity import Quantity
 from beamfit.sampling.posterior import Expected, Posterior
 from beamfit.sampling.priors import Distribution
 from beamfit.sampling.target import Target
 from beamfit.status import Status
-from beamfit.studies.decay.model import RECORD, DecayNumbers, decay_problem
+from beamfit.studies.decay.law import DecayNumbers
+from beamfit.studies.decay.model import decay_problem
 from beamfit.studies.decay.record import DecayRecord
 from beamfit.verdict import Finding
 
 __all__ = ["decay_target", "expected_current"]
 
 UNITS = {"i0": "mA", "a": "1/(mA s)", "b": "1/s"}
+SAMPLED = UNITS | {"log_memory": "1"}
 LIFETIMES = {"lifetime_start": "h", "lifetime_mean": "h", "lifetime_end": "h"}
 
 
@@ -40,6 +45,7 @@ class Fitted(Protocol):
     chi2: float
     dof: int
     rms_residual: float
+    correlation_time: float | None
     readings: DecayRecord | None
 
 
@@ -77,6 +83,9 @@ def decay_target(
 
     Notes
     -----
+    Errors that are correlated are so in the likelihood, and the correlation time is sampled too,
+    flat in its logarithm as in `beamfit.greybox.correlated.memory_of`.
+
     Where the record does not tell a from b, the two bounds a ≥ 0 and b ≥ 0 make the posterior a
     line across all shares of a in the loss. The lifetime at the mean current is then as well
     determined as ever; a and b are marked as the bounds'.
@@ -88,8 +97,12 @@ def decay_target(
         expected = "a fit of eq. 44 with constant a and b; sample fit_decay(record) without shape"
         raise InputError("a fit with a shape of a(I), which is not sampled", expected)
     # The fit's weak prior only keeps a search from running away; the bounds do that here.
-    problem = replace(decay_problem(record), priors=())
+    problem = replace(decay_problem(record, memory=fit.correlation_time), priors=())
     theta, rate = _start(fit, record)
+    if fit.correlation_time is not None:
+        lower, upper = np.log(range_of(record.time))
+        problem = replace(problem, free=[*problem.free, Free("log_memory", lower, upper)])
+        theta = np.append(theta, np.log(fit.correlation_time))
     scale = fit.rms_residual * np.sqrt(len(record) / max(fit.dof, 1))
     if record.error is not None:
         scale = max(1.0, np.sqrt(fit.chi2 / max(fit.dof, 1)))
@@ -101,27 +114,16 @@ def decay_target(
         derived=LIFETIMES,
         derive=_lifetimes,
         data=(fit.mean_current, record.time[-1]),
-        units=UNITS,
+        units=SAMPLED,
         lower=dict.fromkeys(UNITS, 0.0),
-        width={"a": rate / fit.mean_current, "b": rate},
+        width={"a": rate / fit.mean_current, "b": rate, "log_memory": 1.0},
         noise_unit="mA",
         priors_own=() if apart else ("a", "b"),
-        remark=_correlated(fit.identifiability.error_inflation),
         nothing="" if seen else nothing,
     )
     verdict, given = Finding(fit.status, fit.message), [record.error is not None]
     optimum = Optimum(theta, verdict, [max(scale, 1e-12)], given)
     return target_of(problem, optimum, stated, noise=noise, outliers=outliers, priors=priors)
-
-
-def _correlated(larger: float) -> str:
-    """The likelihood takes readings as independent; say so where they are not."""
-    if larger <= 1:
-        return ""
-    return (
-        "Neighbouring residuals are correlated, which this likelihood does not know: true "
-        f"intervals are about {larger:.1f} times as wide, or more."
-    )
 
 
 def _start(fit: Fitted, record: DecayRecord) -> tuple[np.ndarray, float]:
@@ -134,6 +136,14 @@ def _start(fit: Fitted, record: DecayRecord) -> tuple[np.ndarray, float]:
     return np.array([fit.i0.value, share * rate / mean, (1.0 - share) * rate]), rate
 
 
+def _currents(data: Sampled, theta: Array) -> Array:
+    """What one draw predicts of the readings."""
+    core = data.core
+    record = core.records[0]
+    model = tree.replace(core.model, core.chosen, data.theta.at[data.moving].set(theta))
+    return record.predict(model, record.data)
+
+
 def expected_current(posterior: Posterior) -> Expected:
     """Currents that the posterior of a decay expects at its readings, mA.
 
@@ -142,5 +152,7 @@ def expected_current(posterior: Posterior) -> Expected:
     posterior : Posterior
         Of `DecayFit.sample`.
     """
-    draws, _, error = predicted(posterior, RECORD)
-    return posterior.expected(draws, error)
+    target = posterior.target
+    error = target.data.core.records[0].error
+    draws = target.each(_currents, posterior.thinned())
+    return posterior.expected(draws, np.ones(1) if error is None else np.asarray(error))

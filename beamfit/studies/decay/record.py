@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -24,6 +25,10 @@ PLAUSIBLE = {
     "pressure": (1e-14, 1e-2, "Pa"),
     "bunches": (1.0, 1e5, "bunches"),
 }
+
+# A pressure that departs from P0 + P1 I by less than this share of the record's mean, on average
+# up to any time, follows the current.
+FOLLOWS = 2e-3
 
 
 @shown
@@ -250,6 +255,26 @@ class DecayRecord:
         if levels.size < 2 or levels.size > len(self) / 2:
             return None
         return float(np.diff(levels).min())
+
+    @cached_property
+    def gauge(self) -> np.ndarray | None:
+        """Integral of the pressure over its mean, s, where it does not follow the current.
+
+        None where no pressure is given, or it is P0 + P1 I with positive P0 to within `FOLLOWS`:
+        the beam's own gas is part of a, as in the report.
+        """
+        pressure = self.conditions.pressure
+        if pressure is None or not pressure.mean() > 0:
+            return None
+        slope, base = np.polyfit(self.current, pressure, 1)
+        lone = self._integral(pressure - base - slope * self.current)
+        if base > 0 and np.abs(lone).max() < FOLLOWS * pressure.mean() * self.span:
+            return None
+        return self._integral(pressure / self._integral(pressure)[-1] * self.span)
+
+    def _integral(self, values: np.ndarray) -> np.ndarray:
+        parts = np.diff(self.time) * (values[1:] + values[:-1]) / 2
+        return np.concatenate([[0.0], np.cumsum(parts)])
 
     def select(self, rows: np.ndarray | slice, name: str | None = None) -> DecayRecord:
         """Take some of the readings.

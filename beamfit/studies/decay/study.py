@@ -7,6 +7,7 @@ from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.integrate import trapezoid
 
 from beamfit.errors import InputError
 from beamfit.lifetime.decay import HOUR
@@ -18,6 +19,7 @@ from beamfit.studies.decay.checks import DecayChecks, check_decay
 from beamfit.studies.decay.fit import FEWEST, DecayFit, fit_decay
 from beamfit.studies.decay.record import DecayRecord
 from beamfit.studies.decay.segments import Event, split_record
+from beamfit.studies.decay.systematics import Systematic, systematics
 from beamfit.table import json_of
 
 __all__ = [
@@ -113,7 +115,8 @@ def operation_during(record: DecayRecord, machine: Machine) -> Operation:
     Operation
         With medians over the record. A pressure reading scales the machine's base pressure and
         its rise with current by one factor: a single decay spans too little current to tell the
-        two apart.
+        two apart. One that does not follow the current enters the fit as it is, and stands here
+        by its mean.
 
     Raises
     ------
@@ -151,6 +154,10 @@ def operation_during(record: DecayRecord, machine: Machine) -> Operation:
         raise InputError(found, expected, path=record.name, column="rf_voltage_kV")
     if "pressure" in said:
         read = said.pop("pressure")
+        if record.gauge is not None:
+            # The fit has the gauge's own course: b is the gas at its mean, and a is without gas.
+            whole = trapezoid(record.conditions.pressure, record.time)
+            return usual._replace(**said, pressure_base=whole / record.span, pressure_slope=0.0)
         mean = usual.pressure_base + usual.pressure_slope * float(record.current.mean())
         if not mean > 0:
             usual, mean = usual._replace(pressure_base=1.0, pressure_slope=0.0), 1.0
@@ -220,11 +227,17 @@ class Decay:
         """What simpler analyses say of it, and whether a is constant; None if nothing decays."""
         return check_decay(self.segment)
 
+    @cached_property
+    def systematics(self) -> tuple[Systematic, ...]:
+        """What no residual shows."""
+        return systematics(self.fit)
+
     def to_json(self) -> dict[str, Any]:
         """Give one entry of the ``results`` list of the JSON contract."""
         start = {"value": self.offset, "error": None, "unit": "s"}
         checks = {} if self.checks is None else self.checks.to_json()
         shown = self.fit.to_json() | {"start": start} | checks
+        shown |= {"systematics": json_of(self.systematics)}
         return shown if self.budget is None else shown | {"budget": self.budget.to_json()}
 
 

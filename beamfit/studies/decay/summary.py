@@ -65,7 +65,8 @@ def _one(decay: Decay) -> tuple[float, np.ndarray, np.ndarray]:
         # sqrt(sum/dof): the noise that the residuals show.
         error = np.full(rows, fit.rms_residual * np.sqrt(rows / fit.dof))
     else:
-        error = segment.error * max(1.0, np.sqrt(fit.chi2 / fit.dof))
+        pulls = fit.residuals / segment.error
+        error = segment.error * max(1.0, np.sqrt(pulls @ pulls / fit.dof))
     weight = 1 / (error * fit.identifiability.error_inflation)
     extra = (0, padded_size(rows) - rows)
     time, weight = np.pad(segment.time, extra, mode="edge"), np.pad(weight, extra)

@@ -14,6 +14,7 @@ from beamfit.table import cell
 
 __all__ = [
     "FEW",
+    "SYSTEMATIC",
     "alike",
     "budget_rows",
     "check_rows",
@@ -23,6 +24,7 @@ __all__ = [
     "overview",
     "separability_rows",
     "shift_rows",
+    "systematic_rows",
 ]
 
 Rows = list[tuple[str, list[str]]]
@@ -103,7 +105,7 @@ APART: tuple[Row, ...] = (
         "neighbouring residuals",
         lambda d: _number(d.fit.identifiability.residual_correlation, ".2f"),
     ),
-    ("true errors are larger by", lambda d: f"{d.fit.identifiability.error_inflation:.1f} times"),
+    ("errors enlarged for that", lambda d: f"{d.fit.identifiability.error_inflation:.1f} times"),
 )
 
 
@@ -122,9 +124,9 @@ def _one_lifetime(decay: Decay, name: str) -> str | None:
 
 
 def _constant_a(decay: Decay) -> str | None:
-    if decay.checks is None:
+    found = decay.fit.constant_a
+    if found is None:
         return None
-    found = decay.checks.constant_a
     said = {Status.converged: "not contradicted", Status.poor_fit: "rejected"}
     chance = f" (p = {found.p_value:.2g})"
     return said[found.status] + chance if found.status in said else "the record cannot tell"
@@ -135,11 +137,28 @@ CHECKS: tuple[Row, ...] = (
     ("line through ln I", lambda d: _one_lifetime(d, "log_linear")),
     ("constant a", _constant_a),
 )
+LIFETIMES: tuple[Row, ...] = (
+    ("lifetime by current", lambda d: d.fit.lifetimes and str(d.fit.lifetimes)),
+)
+SYSTEMATIC = ["if the", "a", "b", "lifetime at the mean"]
 
 
 def check_rows(decays: Sequence[Decay]) -> Rows:
     """Label and one cell per decay for what simpler analyses say, and whether a is constant."""
-    return _laid_out(decays, CHECKS)
+    rows = _laid_out(decays, CHECKS)
+    if any(decay.fit.lifetimes for decay in decays):
+        rows += _laid_out(decays, LIFETIMES)
+    return rows
+
+
+def systematic_rows(decay: Decay) -> list[list[str]]:
+    """A cause in each row, and by how much it moves a, b and the lifetime at the mean current."""
+    fit = decay.fit
+    values = fit.a.value, fit.b.value, fit.lifetime_mean.value
+    return [
+        [cause, *(f"{100 * moved / value:+.2g} %" for moved, value in zip(by, values, strict=True))]
+        for cause, *by in decay.systematics
+    ]
 
 
 def _part(kind: str, mechanism: Mechanism) -> Row:
@@ -217,11 +236,8 @@ def alike(decays: Sequence[Decay]) -> list[tuple[Status, str, str]]:
     """Status, decays and message for each different verdict on many decays."""
     found: dict[tuple[Status, str], list[str]] = {}
     for decay in decays:
-        verdicts = [(decay.fit.status, decay.fit.message)]
-        if decay.checks is not None and decay.checks.constant_a.status is Status.poor_fit:
-            verdicts.append((Status.poor_fit, decay.checks.constant_a.message))
-        for said in verdicts:
-            found.setdefault(said, []).append(decay.fit.record)
+        said = decay.fit.status, decay.fit.message
+        found.setdefault(said, []).append(decay.fit.record)
     return [
         (status, names[0] if len(names) == 1 else _several(names), message)
         for (status, message), names in found.items()

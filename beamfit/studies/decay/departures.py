@@ -1,0 +1,343 @@
+"""How a decay may depart from constant a and b: an exponent of the current, a change in time."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy.special import stdtr
+
+from beamfit.greybox.correlated import Memory, is_correlated, memory_of, whitened
+from beamfit.lifetime.decay import HOUR
+from beamfit.quantity import Quantity
+from beamfit.shown import shown
+from beamfit.status import Status
+from beamfit.studies.decay.law import Physical, constant_shape
+from beamfit.studies.decay.model import Expansion, Solution, expanded, padded, solve_decay
+from beamfit.studies.decay.record import DecayRecord
+from beamfit.table import json_of
+
+__all__ = [
+    "Change",
+    "ConstantA",
+    "LifetimeLaw",
+    "PowerLaw",
+    "averaged",
+    "change_of_rate",
+    "constant_a",
+    "lifetime_law",
+    "power_law",
+]
+
+REJECTED = 1e-3
+# Below this share of the current differences are those of the arithmetic, not of the beam.
+EXACT = 1e-12
+# An exponent known worse than this tells no bunch that lengthens from one that does not.
+TELLING = 1 / 3
+# A departure of so many errors is found with 90 % at a false alarm rate of `REJECTED`.
+FOUND = 4.57
+# Readings from which a search with an exponent learns all that it can.
+ENOUGH = 1024
+# Times looked at for a change of the loss rate, how often about the best of them, and how much more
+# of chi² it must explain than an exponent does: it has a number more, chosen among many.
+TIMES, FINER, BETTER = 40, 3, 15.0
+# A change that leaves less of the squares is no noise that looks like one.
+REST = 0.1
+# Currents at which a lifetime is offered.
+CURRENTS = 5
+
+
+@shown
+@dataclass(frozen=True)
+class ConstantA:
+    """Whether one record contradicts a constant a.
+
+    Parameters
+    ----------
+    status : Status
+        `converged` if a constant a describes the record, `poor_fit` if it is rejected,
+        `unidentified` if the record cannot tell.
+    message : str
+        The verdict in a sentence.
+    exponent : Quantity
+        s in a(I) proportional to I^s: 0 for constant a, -1/3 for a strongly lengthening bunch,
+        above 0 where the loss rate falls otherwise, as in a vacuum that recovers; NaN if the
+        record cannot tell.
+    p_value : float
+        Probability of a worse contradiction if a is constant; NaN if the record cannot tell.
+    """
+
+    status: Status
+    message: str
+    exponent: Quantity
+    p_value: float
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the fields as JSON's types."""
+        return json_of(vars(self))
+
+    def __str__(self) -> str:
+        return f"{self.status}. {self.message}"
+
+
+def constant_a(
+    record: DecayRecord,
+    exponent: float,
+    error: float,
+    unit: float,
+    raw: float | None = None,
+    chance: float | None = None,
+) -> ConstantA:
+    """Judge an exponent that was estimated beside I0, a and b.
+
+    `error` is for noise of size 1 and `unit` the mean square that is left, unless a `chance` says
+    that the error is whole.
+    """
+    over = 1.0 if record.error is None else record.error
+    floor = float(np.mean((EXACT * record.current / over) ** 2))
+    size = max(unit, floor) if record.error is None else max(unit, floor, 1.0)
+    raw = float(error) * math.sqrt(max(unit, floor)) if raw is None else raw
+    if chance is None:
+        error = float(error) * math.sqrt(size)
+        chance = float(2 * stdtr(max(len(record) - 4, 1), -abs(exponent) / error))
+    if not error < TELLING:
+        message = "The record cannot tell a constant a from one that depends on the current"
+        unknown = Quantity(math.nan, None, "1")
+        return ConstantA(Status.unidentified, f"{message}: record longer.", unknown, math.nan)
+    found = Quantity(float(exponent), float(error), "1", raw)
+    if chance >= REJECTED:
+        message = (
+            f"A constant a describes the record (p = {chance:.2g}, exponent {found}; one of "
+            f"{FOUND * error:.2g} would be seen)."
+        )
+        return ConstantA(Status.converged, message, found, chance)
+    cause = (
+        "so b of the constant-a fit is not a gas loss; fit with the shape of a"
+        if exponent < 0
+        else "which no bunch length does: look for a vacuum that changes, as after a fill"
+    )
+    message = (
+        f"A constant a is rejected (p = {max(chance, 1e-300):.2g}): a goes as "
+        f"I^{found.value:.3f}, {cause}."
+    )
+    return ConstantA(Status.poor_fit, message, found, chance)
+
+
+def averaged(record: DecayRecord) -> DecayRecord:
+    """A long record as the means of neighbouring readings: the curve is smooth between them."""
+    if len(record) <= ENOUGH:
+        return record
+    first = np.linspace(0, len(record), ENOUGH, endpoint=False).astype(int)
+    count = np.diff(first, append=len(record))
+    time, current = (
+        np.add.reduceat(values, first) / count for values in (record.time, record.current)
+    )
+    error = record.error
+    if error is not None:
+        error = np.sqrt(np.add.reduceat(error**2, first)) / count
+    return DecayRecord(time, current, error, record.name)
+
+
+class PowerLaw(NamedTuple):
+    """A decay with a going as I^s: the readings it was fitted to, and what was found."""
+
+    record: DecayRecord
+    solution: Solution
+
+
+def power_law(record: DecayRecord, test: ConstantA) -> PowerLaw | None:
+    """The law with a free exponent, where a constant a is rejected and the search comes to rest."""
+    if test.status is not Status.poor_fit or record.gauge is not None:
+        return None
+    record = averaged(record)
+    found = solve_decay(*padded(record), free=np.ones(4), shape=constant_shape)
+    return PowerLaw(record, found) if found.converged else None
+
+
+@shown
+@dataclass(frozen=True)
+class LifetimeLaw:
+    """The lifetime as a function of the current, where constant a and b do not describe it.
+
+    Parameters
+    ----------
+    current : tuple of float
+        Currents, mA, from the last to the first of the record.
+    lifetime : tuple of Quantity
+        Lifetime at each, h, of a law with a going as a power of the current.
+    exponent : Quantity
+        The power.
+    """
+
+    current: tuple[float, ...]
+    lifetime: tuple[Quantity, ...]
+    exponent: Quantity
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the fields as JSON's types."""
+        return json_of(vars(self))
+
+    def __str__(self) -> str:
+        pairs = zip(self.current, self.lifetime, strict=True)
+        return ", ".join(f"{lifetime} at {current:.4g} mA" for current, lifetime in pairs)
+
+
+def lifetime_law(found: PowerLaw, correlated: bool) -> LifetimeLaw:
+    """Lifetimes with their errors from a fitted power law.
+
+    The loss rate in one span is q x^(1 + s) + (p - q) of x = I/mean, with the search's numbers.
+    """
+    record, values = found.record, found.solution.values
+    mean, span = float(record.current.mean()), record.span
+    x = np.geomspace(record.current.min(), record.current.max(), CURRENTS) / mean
+    power = x ** (1 + values.exponent)
+    loss, quadratic = values.rate_mean * span, values.a * mean * span
+    rates = (quadratic * power + loss - quadratic) / span
+    slopes = np.stack(
+        [np.zeros_like(x), np.ones_like(x), power - 1, quadratic * power * np.log(x)], axis=1
+    )
+    about = expanded(record, values, constant_shape, values.exponent)
+    errors = _errors(np.vstack([slopes / span, np.eye(4)[3]]), about, record, correlated)
+    lifetimes = tuple(
+        Quantity(1 / rate / HOUR, error / rate**2 / HOUR, "h") if rate > 3 * error
+        else Quantity(math.nan, None, "h")
+        for rate, error in zip(rates, errors, strict=False)
+    )  # fmt: skip
+    exponent = Quantity(float(values.exponent), float(errors[-1]), "1")
+    return LifetimeLaw(tuple(map(float, x * mean)), lifetimes, exponent)
+
+
+def _errors(
+    slopes: np.ndarray, about: Expansion, record: DecayRecord, correlated: bool
+) -> np.ndarray:
+    """Errors of quantities by their slopes, with the noise that the residuals show."""
+    given = float(record.error is not None)
+    if correlated:
+        return memory_of(about.rows, about.residuals, record.time).moments(slopes, given).error
+    factor = np.linalg.qr(about.rows, mode="r")
+    spread = np.linalg.norm(np.linalg.solve(factor.T, slopes.T), axis=0)
+    size = math.sqrt(float(about.residuals @ about.residuals) / (len(record) - 4))
+    return spread * max(size, given)
+
+
+@shown
+class Change(NamedTuple):
+    """A change of the loss rate in a record.
+
+    Attributes
+    ----------
+    time : float
+        When, s from the first reading.
+    before, after : Quantity
+        Lifetime at that moment's current before and after it, h.
+    left : array, shape (n,)
+        Residuals of the law with the change, over their errors.
+    """
+
+    time: float
+    before: Quantity
+    after: Quantity
+    left: np.ndarray
+
+    def is_the_cause(self, residuals: np.ndarray) -> bool:
+        """Whether it leaves independent noise, or hardly anything, of correlated residuals."""
+        rest = float(self.left @ self.left) / float(residuals @ residuals)
+        return rest < REST or not is_correlated(self.left, 5)
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the time and the two lifetimes as JSON's types."""
+        return json_of({"time": self.time, "before": self.before, "after": self.after})
+
+    def __str__(self) -> str:
+        return (
+            f"the loss rate changed near t = {self.time:.4g} s, where the lifetime went from "
+            f"{self.before} to {self.after}"
+        )
+
+
+def change_of_rate(
+    record: DecayRecord, about: Expansion, values: Physical, memory: Memory | None
+) -> Change | None:
+    """Look for one change of the loss rate that explains more than an exponent does.
+
+    Every time is tried by linear least squares about the fit; None unless a change is improbable
+    by chance at all times tried, and better than an exponent by `BETTER` of chi².
+    """
+    over = np.reshape(1.0 if record.error is None else record.error, (-1, 1))
+    model = record.current + about.residuals * over[:, 0]
+    whiten = _whitener(record.time, memory)
+    rows = whiten(np.column_stack([about.rows, about.residuals]))
+    basis = np.linalg.qr(rows[:, :3])[0]
+
+    def beside_the_law(columns: np.ndarray) -> np.ndarray:
+        return columns - basis @ (basis.T @ columns)
+
+    def kinks(times: np.ndarray) -> np.ndarray:
+        return whiten(_kinks(record.time, model, float(values.b), times) / over)
+
+    power, residual = beside_the_law(rows[:, 3:]).T
+    times = np.linspace(0.05, 0.95, TIMES) * record.span
+    for _ in range(FINER):
+        falls = _falls(beside_the_law(kinks(times)), residual)
+        at, step = float(times[np.argmax(falls)]), times[1] - times[0]
+        times = np.linspace(at - step, at + step, TIMES)
+    fall, dof = float(np.max(falls)), len(record) - 4
+    unit = max((residual @ residual - fall) / dof, 1e-300 if record.error is None else 1.0)
+    chance = TIMES * 2 * stdtr(dof, -math.sqrt(fall / unit))
+    if chance > REJECTED or fall - _falls(power[:, None], residual)[0] < BETTER * unit:
+        return None
+    columns = np.column_stack([rows[:, :3], kinks(np.array([at]))])
+    return _change(record, columns, rows[:, 4], values, at, math.sqrt(unit))
+
+
+def _whitener(time: np.ndarray, memory: Memory | None) -> Callable[[np.ndarray], np.ndarray]:
+    if memory is None:
+        return np.asarray
+    apart = np.diff(time) / memory.time[memory.likely]
+    return partial(whitened, apart=apart, xp=np)
+
+
+def _falls(columns: np.ndarray, residual: np.ndarray) -> np.ndarray:
+    """What each column by itself takes off the sum of squares."""
+    squares = np.sum(columns**2, axis=0)
+    return (columns.T @ residual) ** 2 / np.where(squares > 0, squares, np.inf)
+
+
+def _kinks(time: np.ndarray, model: np.ndarray, b: float, times: np.ndarray) -> np.ndarray:
+    """Change of the current for a loss rate that is larger by 1/s from each time on.
+
+    As in `bent_current`: -I² exp(bt) ∫ exp(-bt)/I dt from there.
+    """
+    inner = np.exp(-b * time) / model
+    parts = np.diff(time) * (inner[1:] + inner[:-1]) / 2
+    whole = np.concatenate([[0.0], np.cumsum(parts)])
+    since = np.maximum(whole[:, None] - np.interp(times, time, whole), 0.0)
+    return -((model**2 * np.exp(b * time))[:, None]) * since
+
+
+def _change(
+    record: DecayRecord,
+    columns: np.ndarray,
+    residual: np.ndarray,
+    values: Physical,
+    at: float,
+    size: float,
+) -> Change:
+    """The two lifetimes at one moment, from the law with a change there."""
+    mean, span = float(record.current.mean()), record.span
+    factor = np.linalg.qr(columns, mode="r")
+    half = np.linalg.inv(factor) * size
+    step = -np.linalg.lstsq(columns, residual, rcond=None)[0]
+    x = float(np.interp(at, record.time, record.current)) / mean
+    here = float(values.rate_mean) + float(values.a) * mean * (x - 1)
+    slopes = np.array([[0, 1 / span, (x - 1) / span, 0], [0, 1 / span, (x - 1) / span, 1]])
+    rates, errors = here + slopes @ step, np.linalg.norm(slopes @ half, axis=1)
+    before, after = (
+        Quantity(1 / rate / HOUR, error / rate**2 / HOUR, "h")
+        for rate, error in zip(rates, errors, strict=True)
+    )
+    return Change(at, before, after, residual + columns @ step)

@@ -1,0 +1,271 @@
+"""What a solution of the decay law is worth: values and errors with the noise that is there."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from scipy.special import stdtrit
+
+from beamfit.greybox.correlated import Memory, is_correlated, memory_of
+from beamfit.shown import shown
+from beamfit.status import Status
+from beamfit.studies.decay.departures import (
+    Change,
+    ConstantA,
+    LifetimeLaw,
+    change_of_rate,
+    constant_a,
+    lifetime_law,
+    power_law,
+)
+from beamfit.studies.decay.law import Physical, Shape
+from beamfit.studies.decay.model import Expansion, Solution, expanded
+from beamfit.studies.decay.record import DecayRecord
+from beamfit.table import json_of
+
+__all__ = ["BELIEVED", "DETERMINED", "SEPARABLE", "Evidence", "Separability"]
+
+# The share of a in the loss lies between 0 and 1: known to 0.2, the record tells pure Touschek
+# from pure gas at five standard deviations; known worse, a and b are one number.
+SEPARABLE = 0.2
+# A loss rate less than three errors from zero leaves the lifetime without an upper limit.
+DETERMINED = 1 / 3
+# How many errors below zero an unphysical a or b, or a rising current, is believed.
+BELIEVED = 5.0
+# A change between neighbouring residuals of so many times their usual one is a step, not noise.
+STEP = 12.0
+NUMBERS = 3
+# Of so few readings the noise tells nothing of its memory.
+FEWEST = 12
+
+
+@shown
+@dataclass(frozen=True)
+class Separability:
+    """Whether the record tells a from b.
+
+    Parameters
+    ----------
+    separable : bool
+        Whether the share of a in the loss is known to better than 0.2.
+    share, share_error : float or None
+        Share of a in the loss at the mean current (0: all gas-like, 1: all Touschek-like), and
+        its standard deviation.
+    correlation : float or None
+        Correlation of a and b; near -1 on every record, also where both are well determined.
+    residual_correlation : float or None
+        Correlation of the errors of neighbouring readings; zero where none is seen.
+    error_inflation : float
+        By how much that makes the errors larger than independent readings would; they contain it.
+    """
+
+    separable: bool
+    share: float | None
+    share_error: float | None
+    correlation: float | None
+    residual_correlation: float | None
+    error_inflation: float
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the fields as JSON's types."""
+        return json_of(vars(self))
+
+
+@dataclass(frozen=True, eq=False)
+class Evidence:
+    """What the rules look at: a record, what was found, and the size and memory of its noise.
+
+    Parameters
+    ----------
+    record : DecayRecord
+        The readings.
+    solution : Solution
+        By plain least squares.
+    values, errors, raw, reach : Physical
+        What is quoted; its standard deviations; those for errors as stated and independent; and
+        how far 95 % reach.
+    residuals : array, shape (n,)
+        Model less reading, mA.
+    chi2 : float
+        Sum of squares in units of the errors, whitened; equal to `dof` where there are none.
+    dof : int
+        Readings less numbers.
+    noise : float
+        What multiplies errors that were given (at least 1), or the noise in mA.
+    memory : Memory or None
+        What the record tells of the correlation time, where the errors are correlated.
+    constant_a : ConstantA
+        Whether the record contradicts a constant a.
+    changed : bool
+        Whether one change of the loss rate is what correlates the residuals.
+    """
+
+    record: DecayRecord
+    solution: Solution
+    shape: Shape | None
+    values: Physical
+    errors: Physical
+    raw: Physical
+    reach: Physical
+    residuals: np.ndarray
+    chi2: float
+    dof: int
+    noise: float
+    memory: Memory | None
+    constant_a: ConstantA
+    changed: bool
+
+    @classmethod
+    def of(cls, record: DecayRecord, solution: Solution, shape: Shape | None = None) -> Evidence:
+        """Weigh a solution; without errors the weights were 1/mA, and residuals are the noise."""
+        residuals = np.asarray(solution.residuals[: len(record)])
+        over = residuals if record.error is None else residuals / record.error
+        if bool(solution.converged) and len(record) >= FEWEST and is_correlated(over, NUMBERS):
+            found = expanded(record, solution.values, shape)
+            if is_correlated(_left(found.rows, found.residuals), NUMBERS + 1):
+                change = change_of_rate(record, found, solution.values, None)
+                if change is not None and change.is_the_cause(found.residuals):
+                    return cls._independent(record, solution, shape, changed=True)
+                return cls._with_memory(record, solution, shape, found)
+        return cls._independent(record, solution, shape)
+
+    @classmethod
+    def _independent(
+        cls,
+        record: DecayRecord,
+        solution: Solution,
+        shape: Shape | None,
+        changed: bool = False,
+    ) -> Evidence:
+        residuals = np.asarray(solution.residuals[: len(record)])
+        dof, squares = len(record) - NUMBERS, float(solution.sum_squares)
+        raw = math.sqrt(squares / dof) if record.error is None else 1.0
+        chi2 = float(dof) if record.error is None else squares
+        noise = raw * max(1.0, math.sqrt(chi2 / dof))
+        far = float(stdtrit(dof, 0.975)) if record.error is None else 1.96
+        errors = _times(solution.errors, noise)
+        left = max(squares - float(solution.fall), 0.0) / max(dof - 1, 1)
+        found = constant_a(record, solution.values.exponent, solution.errors.exponent, left)
+        reach = _times(errors, far)
+        raws = _times(solution.errors, raw)
+        return cls(
+            record, solution, shape, _times(solution.values, 1.0), errors, raws, reach,
+            residuals, chi2, dof, noise, None, found, changed,
+        )  # fmt: skip
+
+    @classmethod
+    def _with_memory(
+        cls, record: DecayRecord, solution: Solution, shape: Shape | None, found: Expansion
+    ) -> Evidence:
+        """Generalised least squares about the solution, the exponent free and held."""
+        given = record.error is not None
+        free = memory_of(found.rows, found.residuals, record.time)
+        power = free.moments(found.slopes, float(given))
+        held = memory_of(found.rows[:, :NUMBERS], found.residuals, record.time)
+        moved = held.moments(found.slopes[:, :NUMBERS], float(given))
+        likely = held.likely
+        size = math.sqrt(held.squares[likely] / held.dof)
+        after = found.residuals + found.rows[:, :NUMBERS] @ held.mean_step
+        raw = 1.0 if given else math.sqrt(float(solution.sum_squares) / held.dof)
+        raw_exponent = float(solution.errors.exponent) * raw
+        test = constant_a(
+            record, power.shift[-1], power.error[-1], 1.0, raw_exponent, power.chance[-1]
+        )
+        return cls(
+            record, solution, shape,
+            Physical(*(np.array(solution.values) + moved.shift)),
+            Physical(*moved.error), _times(solution.errors, raw), Physical(*moved.reach),
+            after * (record.error if given else 1.0),
+            held.squares[likely] if given else float(held.dof), held.dof,
+            max(1.0, size) if given else size, held, test, False,
+        )  # fmt: skip
+
+    def scaled(self, name: str) -> tuple[float, float]:
+        """A value and its error."""
+        return float(getattr(self.values, name)), float(getattr(self.errors, name))
+
+    @property
+    def inflation(self) -> float:
+        """By how much the memory of the noise enlarges errors."""
+        if self.memory is None:
+            return 1.0
+        plain = math.sqrt(float(self.solution.sum_squares) / self.dof)
+        plain = plain if self.record.error is None else max(1.0, plain)
+        return max(
+            getattr(self.errors, name) / getattr(self.solution.errors, name) / plain
+            for name in ("rate_mean", "share")
+        )
+
+    @property
+    def correlation_time(self) -> float | None:
+        """Of the errors, s; None where they are independent."""
+        return None if self.memory is None else float(self.memory.time[self.memory.likely])
+
+    @cached_property
+    def separability(self) -> Separability:
+        """Of a and b."""
+        share, error = self.scaled("share")
+        finite = math.isfinite(share) and math.isfinite(error)
+        correlation, length = float(self.solution.correlation), self.correlation_time
+        usual = float(np.median(np.diff(self.record.time)))
+        return Separability(
+            separable=finite and error < SEPARABLE,
+            share=share if finite else None,
+            share_error=error if finite else None,
+            correlation=correlation if math.isfinite(correlation) else None,
+            residual_correlation=0.0 if length is None else math.exp(-usual / length),
+            error_inflation=self.inflation,
+        )
+
+    @property
+    def refuted(self) -> bool:
+        """Whether the record contradicts constant a and b, or shows values that no beam has."""
+        if self.changed or self.constant_a.status is Status.poor_fit:
+            return True
+        return any(value < -BELIEVED * error for value, error in map(self.scaled, "ab"))
+
+    @cached_property
+    def lifetimes(self) -> LifetimeLaw | None:
+        """The lifetime by current, where a constant a is refuted."""
+        found = power_law(self.record, self.constant_a) if self.shape is None else None
+        return None if found is None else lifetime_law(found, self.memory is not None)
+
+    @cached_property
+    def change(self) -> Change | None:
+        """A change of the loss rate in the record that explains it better than an exponent."""
+        values = self.solution.values
+        found = expanded(self.record, values, self.shape)
+        return change_of_rate(self.record, found, values, self.memory)
+
+    def drift_of_one_error(self, name: str) -> float:
+        """Straight drift of the monitor over the record, mA, that moves a value by its error."""
+        moved = abs(float(getattr(self.solution.drift, name)))
+        return float(getattr(self.errors, name)) / moved if moved > 0 else math.inf
+
+    @cached_property
+    def step(self) -> str | None:
+        """The sentence for a step or spike in the record, whether or not its errors are known."""
+        record, change = self.record, np.diff(self.residuals)
+        usual = 1.4826 * float(np.median(np.abs(change)))
+        floor = max(record.resolution or 0.0, 1e-12 * float(record.current.max()))
+        largest = int(np.argmax(np.abs(change)))
+        if abs(change[largest]) <= STEP * max(usual, floor):
+            return None
+        # Residuals are model minus reading, so a refill lowers them.
+        return (
+            f"The record has a step of {-change[largest]:+.4g} mA at "
+            f"{record.time[largest + 1]:.6g} s: cut it with split_record and fit the pieces"
+        )
+
+
+def _times(numbers: Physical, factor: float) -> Physical:
+    return Physical(*(float(number) * factor for number in numbers))
+
+
+def _left(rows: np.ndarray, residuals: np.ndarray) -> np.ndarray:
+    """Residuals after the exponent took its part, which is no noise."""
+    return residuals + rows @ np.linalg.lstsq(rows, -residuals, rcond=None)[0]

@@ -1,0 +1,188 @@
+"""The law of a decay: the current it gives, its loss rates, and what an exponent would change."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from beamfit.lifetime.decay import current, current_by_rate, mean_exponential
+
+__all__ = [
+    "DecayNumbers",
+    "Moments",
+    "Physical",
+    "Shape",
+    "beam_current",
+    "bent_current",
+    "constant_shape",
+    "cumulative",
+    "physical",
+    "scaled_numbers",
+]
+
+Shape = Callable[[Array], Array]
+# The least current whose logarithm is taken, in units of the mean.
+LEAST = 1e-12
+# Gauss's nodes and weights for an interval of 1.
+NODES = 0.5 + np.array([-0.5, 0.0, 0.5]) * math.sqrt(0.6)
+WEIGHTS = np.array([5.0, 8.0, 5.0]) / 18
+
+
+class DecayNumbers(NamedTuple):
+    """Current at the first reading, mA, and a, 1/(mA s), and b, 1/s, of dI/dt = -a I² - b I.
+
+    `exponent` is the power of the current by which a departs from its known dependence,
+    `log_memory` the logarithm of the correlation time of the readings' errors, s.
+    """
+
+    i0: Array
+    a: Array
+    b: Array
+    exponent: Array = 0.0
+    log_memory: Array = 0.0
+
+
+class Moments(NamedTuple):
+    """When a current is asked for: times, s, and the record's mean current, mA.
+
+    `gauge` is the integral of the pressure over its mean, s, where the pressure changes in the
+    record: the gas loss is then b times the pressure over its mean.
+    """
+
+    time: Array
+    mean: Array
+    gauge: Array | None = None
+
+
+class Physical(NamedTuple):
+    """What one decay says, in s and mA: loss rates at the first and last time and at the mean
+    current, the share of a in the loss there, the power by which a departs from its shape (where
+    it is not free, its estimate beside the other numbers in linear approximation).
+    """
+
+    i0: Array
+    a: Array
+    b: Array
+    rate_start: Array
+    rate_end: Array
+    rate_mean: Array
+    share: Array
+    exponent: Array
+
+
+def constant_shape(beam: Array) -> Array:
+    """The shape of a constant a: ones."""
+    return jnp.ones_like(beam, dtype=float)
+
+
+def _quadratic(numbers: DecayNumbers, mean: Array, shape: Shape, beam: Array) -> Array:
+    """The part of the relative loss rate that a makes at a current."""
+    # A search through noise may pass a current without a logarithm.
+    log = jnp.log(jnp.maximum(beam / mean, LEAST))
+    relative = shape(beam) / shape(mean) * jnp.exp(numbers.exponent * log)
+    return numbers.a * relative * beam
+
+
+def cumulative(values: Array) -> Array:
+    """Cumulative sum by two small triangular products: JAX's own takes seconds to compile."""
+    side = math.isqrt(values.size - 1) + 1
+    square = jnp.pad(values, (0, side**2 - values.size)).reshape(side, side)
+    within = square @ jnp.triu(jnp.ones((side, side)))
+    before = jnp.tril(jnp.ones((side, side)), -1) @ within[:, -1]
+    return (within + before[:, None]).ravel()[: values.size]
+
+
+def _integral(parts: Array) -> Array:
+    return cumulative(jnp.concatenate([jnp.zeros(1), parts]))
+
+
+def _plain_current(numbers: DecayNumbers, at: Moments) -> Array:
+    """Report equation 44; with a gauge, the same Bernoulli equation for b P(t)/mean.
+
+    1/I = exp(B) (1/I0 + a ∫ exp(-B) dt) with B = b ∫ P dt/mean, the pressure constant between
+    readings.
+    """
+    if at.gauge is None:
+        return current(at.time, numbers.i0, numbers.a, numbers.b)
+    gas = numbers.b * at.gauge
+    parts = jnp.diff(at.time) * jnp.exp(-gas[:-1]) * mean_exponential(jnp.diff(gas))
+    return numbers.i0 * jnp.exp(-gas) / (1 + numbers.a * numbers.i0 * _integral(parts))
+
+
+def beam_current(numbers: DecayNumbers, at: Moments, shape: Shape | None = None) -> Array:
+    """Current, mA: report equation 44, or 42 integrated where a has a shape.
+
+    The shape is a dependence on the current in mA, up to a factor, in JAX; a is then the value at
+    the mean current.
+    """
+    if shape is None:
+        return _plain_current(numbers, at)
+
+    def rate(beam: Array) -> Array:
+        return _quadratic(numbers, at.mean, shape, beam) + numbers.b
+
+    return current_by_rate(at.time, numbers.i0, rate)
+
+
+def bent_current(numbers: DecayNumbers, at: Moments) -> Array:
+    """Current of the plain law to first order in the exponent, the mean current being 1.
+
+    The change u of dI/dt = -a I^(2 + s) - b I obeys du/dt = -(2 a I + b) u - a I² ln I, and
+    I² exp(B) solves this without its last term, so u = -a I² exp(B) ∫ exp(-B) ln I dt.
+    """
+    beam, step = _plain_current(numbers, at), jnp.diff(at.time)
+    if at.gauge is None:
+        gas = numbers.b * at.time
+        node = at.time[:-1, None] + step[:, None] * NODES
+        inner = current(node, numbers.i0, numbers.a, numbers.b)
+        logs = jnp.exp(-numbers.b * node) * jnp.log(jnp.maximum(inner, LEAST))
+        parts = step * (logs @ WEIGHTS)
+    else:
+        gas = numbers.b * at.gauge
+        logs = jnp.exp(-gas) * jnp.log(jnp.maximum(beam, LEAST))
+        parts = step * (logs[1:] + logs[:-1]) / 2
+    bend = -numbers.a * beam**2 * jnp.exp(gas) * _integral(parts)
+    return beam + numbers.exponent * bend
+
+
+def scaled_numbers(theta: Array) -> DecayNumbers:
+    """Numbers of the law from those of the search.
+
+    Its four are: current at the start over the mean, loss in one span at the mean current, the
+    part of it that is proportional to current, and the exponent. The second is well determined by
+    any record, the third only by a long one, and the two are nearly uncorrelated.
+    """
+    start, loss, quadratic, exponent = theta
+    return DecayNumbers(start, quadratic, loss - quadratic, exponent)
+
+
+def physical(
+    theta: Array, end: Array, pressure: Array, unit: tuple[Array, Array], shape: Shape | None
+) -> Array:
+    """`Physical` values from the numbers of the search, the last current, and the pressure over
+    its mean at both ends; `unit` is the span, s, and the mean current, mA.
+    """
+    span, mean = unit
+    numbers = scaled_numbers(theta)
+
+    def rate(beam: Array, gas: Array) -> Array:
+        found = _quadratic(numbers, 1.0, shape or constant_shape, beam) + numbers.b * gas
+        return found / span
+
+    return jnp.stack(
+        Physical(
+            i0=numbers.i0 * mean,
+            a=numbers.a / (mean * span),
+            b=numbers.b / span,
+            rate_start=rate(numbers.i0, pressure[0]),
+            rate_end=rate(end, pressure[1]),
+            rate_mean=theta[1] / span,
+            share=theta[2] / theta[1],
+            exponent=theta[3],
+        )
+    )

@@ -1,0 +1,109 @@
+"""What no residual shows: how far a, b and the lifetime are off for causes that nobody measured."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from beamfit.lifetime.decay import HOUR
+from beamfit.quantity import Status
+from beamfit.shown import shown
+from beamfit.studies.decay.fit import UNITS, DecayFit, bare
+from beamfit.studies.decay.law import Physical
+from beamfit.studies.decay.model import Expansion, expanded
+from beamfit.table import json_of
+
+__all__ = ["Systematic", "systematics"]
+
+# The size of each cause that the table assumes.
+PRESSURE, DRIFT, OFFSET, EXPONENT = 0.01, 0.01, 0.1, -0.1
+
+
+@shown
+class Systematic(NamedTuple):
+    """A cause and by how much it moves what was fitted.
+
+    Attributes
+    ----------
+    cause : str
+        In words, with its size.
+    a, b, lifetime_mean : float
+        Fitted less true value, 1/(mA s), 1/s and h.
+    """
+
+    cause: str
+    a: float
+    b: float
+    lifetime_mean: float
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the cause and the shifts as JSON's types."""
+        moved = {name: bare(getattr(self, name), UNITS[name]) for name in self._fields[1:]}
+        return json_of({"cause": self.cause, **moved})
+
+
+def systematics(fit: DecayFit) -> tuple[Systematic, ...]:
+    """Table of systematic errors of a fitted decay, each cause by itself.
+
+    Parameters
+    ----------
+    fit : DecayFit
+        With its readings, of a constant a.
+
+    Returns
+    -------
+    tuple of Systematic
+        Empty where a and b are impossible or not determined, or a was given a shape. To first
+        order each shift is proportional to its cause.
+
+    Notes
+    -----
+    A change of the readings d moves the numbers by (JᵀWJ)⁻¹ JᵀW d. A pressure that rises by the
+    share e over the record adds -b e (t/T - 1/2) I to dI/dt, and so d = -I² exp(bt) b e
+    ∫ (t/T - 1/2) exp(-bt)/I dt, as of `law.bent_current`.
+
+    Examples
+    --------
+    >>> from beamfit.lifetime.decay import current
+    >>> from beamfit.studies.decay.fit import fit_decay
+    >>> from beamfit.studies.decay.record import DecayRecord
+    >>> t = np.linspace(0, 8 * 3600, 500)
+    >>> noise = 1e-3 * np.random.default_rng(1).normal(size=t.size)
+    >>> fit = fit_decay(DecayRecord(t, np.array(current(t, 500.0, 2e-8, 1e-6)) + noise))
+    >>> [f"{100 * row.a / fit.a.value:.2f} %" for row in systematics(fit)]
+    ['-0.41 %', '0.03 %', '0.00 %', '-10.05 %']
+    """
+    record = fit.readings
+    if record is None or fit.shaped or fit.status is Status.infeasible or fit.a.error is None:
+        return ()
+    about = expanded(record, _values(fit))
+    over = 1.0 if record.error is None else record.error
+    level = record.current + about.residuals * over
+    share = record.time / record.span
+    source = (share - 0.5) * np.exp(-fit.b.value * record.time) / level
+    parts = np.diff(record.time) * (source[1:] + source[:-1]) / 2
+    grown = level**2 * np.exp(fit.b.value * record.time) * np.append(0.0, np.cumsum(parts))
+    causes = {
+        f"pressure rises by {100 * PRESSURE:g} % over the record": -fit.b.value * PRESSURE * grown,
+        f"monitor drifts by {1e3 * DRIFT:g} µA over the record": DRIFT * share,
+        f"monitor reads {OFFSET:g} mA too much": np.full(len(record), OFFSET),
+        f"a goes as I^{EXPONENT:g}, as of a bunch that lengthens": EXPONENT
+        * (about.rows[:, 3] * over),
+    }
+    return tuple(_shift(fit, about, cause, moved / over) for cause, moved in causes.items())
+
+
+def _values(fit: DecayFit) -> Physical:
+    a, b = fit.a.value, fit.b.value
+    rate = a * fit.mean_current + b
+    unused = np.nan
+    return Physical(fit.i0.value, a, b, unused, unused, rate, a * fit.mean_current / rate, 0.0)
+
+
+def _shift(fit: DecayFit, about: Expansion, cause: str, moved: np.ndarray) -> Systematic:
+    """Project a change of the readings on the law."""
+    step = np.linalg.lstsq(about.rows[:, :3], moved, rcond=None)[0]
+    found = Physical(*(about.slopes[:, :3] @ step))
+    rate = fit.a.value * fit.mean_current + fit.b.value
+    return Systematic(cause, found.a, found.b, -found.rate_mean / rate**2 / HOUR)

@@ -1,0 +1,128 @@
+"""Errors of a lifetime where the readings' errors have a memory. All records are simulated."""
+
+import json
+
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+
+from beamfit.greybox.solve import solve
+from beamfit.studies.decay.evidence import Evidence
+from beamfit.studies.decay.fit import fit_decay, fit_decays
+from beamfit.studies.decay.model import decay_problem, padded, solve_decay
+from beamfit.studies.decay.record import DecayRecord
+
+HOUR, SPAN = 3600.0, 8 * 3600.0
+I0, A, B = 500.0, 4e-8, 2e-6
+
+
+def law(time):
+    return I0 * np.exp(-B * time) / (1 + A / B * I0 * -np.expm1(-B * time))
+
+
+def autoregressive(rng, count, correlation):
+    fresh = np.sqrt(1 - correlation**2) * rng.normal(size=count + int(20 / (1 - correlation)))
+    return lfilter([1.0], [1.0, -correlation], fresh)[-count:]
+
+
+def record(correlation, count=200, noise=0.02, seed=0, stated=None):
+    time = np.linspace(0, SPAN, count)
+    off = noise * autoregressive(np.random.default_rng(seed), count, correlation)
+    return DecayRecord(time, law(time) + off, None if stated is None else np.full(count, stated))
+
+
+@pytest.mark.parametrize("correlation", [0.6, 0.95])
+def test_correlated_noise_is_covered(correlation):
+    fits = fit_decays([record(correlation, seed=seed) for seed in range(60)])
+    assert all(fit.status == "converged" for fit in fits)
+    beam = law(np.linspace(0, SPAN, 200))
+    true = {"a": A, "b": B, "lifetime_mean": 1 / (A * beam.mean() + B) / HOUR}
+    for name, value in true.items():
+        found = [getattr(fit, name) for fit in fits]
+        pulls = np.array([abs(q.value - value) / q.error for q in found])
+        # Without the memory 15 to 68 % lie within two errors; 60 records know a share to 3 %.
+        assert np.mean(pulls < 1.96) > 0.88
+        assert np.mean(pulls < 1) < 0.88
+
+
+def test_independent_noise_gives_plain_least_squares():
+    for seed in range(5):
+        plain = record(0.0, seed=seed)
+        fit, solution = fit_decay(plain), solve_decay(*padded(plain))
+        assert fit.a.value == solution.values.a
+        size = (solution.sum_squares / 197) ** 0.5
+        assert fit.a.error == pytest.approx(solution.errors.a * size, rel=1e-12)
+        assert fit.correlation_time is None
+        assert fit.identifiability.error_inflation == 1
+
+
+def test_the_correlation_time_is_that_of_the_noise_however_it_is_sampled():
+    rng = np.random.default_rng(5)
+    time = np.sort(rng.uniform(0, SPAN, 2000))
+    kept = np.exp(-np.diff(time) / 300.0)
+    noise = rng.normal(size=2000)
+    for k in range(1, 2000):
+        noise[k] = kept[k - 1] * noise[k - 1] + np.sqrt(1 - kept[k - 1] ** 2) * noise[k]
+    fit = fit_decay(DecayRecord(time, law(time) + 0.02 * noise))
+    assert fit.correlation_time == pytest.approx(300.0, rel=0.4)
+    assert abs(fit.a.value - A) < 3 * fit.a.error
+
+
+def test_a_random_walk_is_an_answer_too():
+    walk = np.cumsum(np.random.default_rng(6).normal(size=400)) * 0.01
+    time = np.linspace(0, SPAN, 400)
+    fit = fit_decay(DecayRecord(time, law(time) + walk))
+    assert np.isfinite([fit.a.error, fit.b.error, fit.i0.error]).all()
+    assert abs(fit.lifetime_mean.value - 1 / (A * fit.mean_current + B) / HOUR) < (
+        3 * fit.lifetime_mean.error
+    )
+    assert fit.identifiability.residual_correlation > 0.9
+
+
+def test_the_message_says_so_and_json_carries_it():
+    fit = fit_decay(record(0.9, seed=3))
+    assert "which the errors contain" in fit.message
+    assert fit.a.error > 2 * fit.a.error_raw
+    document = json.loads(json.dumps(fit.to_json(), allow_nan=False))
+    assert document["correlation_time"] == {
+        "value": fit.correlation_time, "error": None, "unit": "s",
+    }  # fmt: skip
+    low, high = document["a"]["interval_95"]
+    assert (high - low) / 2 >= 1.9 * fit.a.error
+
+
+def test_stated_errors_are_the_least():
+    fit = fit_decay(record(0.9, seed=4, stated=0.1))
+    assert fit.status == "converged"
+    assert fit.chi2 / fit.dof < 0.2
+    independent = solve_decay(*padded(record(0.9, seed=4, stated=0.1)))
+    assert fit.a.error > 2 * independent.errors.a
+
+
+def test_a_drift_that_moves_a_value_by_its_error_does_so():
+    plain = record(0.0, seed=7)
+    fit = fit_decay(plain)
+    assert "stability is not stated" in fit.message
+    evidence = Evidence.of(plain, solve_decay(*padded(plain)))
+    drift = evidence.drift_of_one_error("b")
+    assert f"{drift:.2g} mA" in fit.message
+    drifted = DecayRecord(plain.time, plain.current + drift * plain.time / SPAN)
+    moved = abs(fit_decay(drifted).b.value - fit.b.value)
+    assert moved == pytest.approx(fit.b.error, rel=0.02)
+
+
+def test_the_core_solves_the_same_problem():
+    noisy = record(0.9, seed=8, stated=0.02)
+    fit = fit_decay(noisy)
+    core = solve(decay_problem(noisy, memory=fit.correlation_time))
+    assert core["a"].value == pytest.approx(fit.a.value, abs=0.2 * fit.a.error)
+    assert core["a"].error == pytest.approx(fit.a.error, rel=0.3)
+    assert core.chi2 / core.dof == pytest.approx(fit.chi2 / fit.dof, rel=0.05)
+
+
+def test_the_sampler_has_the_same_noise():
+    fit = fit_decay(record(0.8, seed=9))
+    posterior = fit.sample(seed=1)
+    low, middle, high = np.percentile(posterior.values("a"), [15.9, 50, 84.1])
+    assert (high - low) / 2 == pytest.approx(fit.a.error, rel=0.2)
+    assert middle == pytest.approx(fit.a.value, abs=0.3 * fit.a.error)
