@@ -6,6 +6,7 @@ Each calibration is a frozen value with ``unit`` (the word a scan's column heade
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import ClassVar
 
 from jax import Array
@@ -24,6 +25,7 @@ __all__ = [
     "IntegratedGradient",
     "IntegratedStrength",
     "SlopeIntercept",
+    "scaled",
 ]
 
 
@@ -239,3 +241,31 @@ Calibration = (
     | FocusingStrength
     | IntegratedStrength
 )
+
+
+def scaled(calibration: Calibration, factor: ArrayLike) -> Calibration:
+    """Scale what a magnet's setting means: the slope of a line, else all of the strength.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        Of one magnet, or of several stored as arrays.
+    factor : float or array
+        Of their shape.
+
+    Returns
+    -------
+    Calibration
+
+    Examples
+    --------
+    >>> scaled(SlopeIntercept(160.0, 40.0), 1.01)
+    SlopeIntercept(slope=161.6, intercept=40.0)
+    """
+    if isinstance(calibration, SlopeIntercept):
+        return replace(calibration, slope=calibration.slope * factor)
+    if isinstance(calibration, CurrentPolynomial):
+        return replace(
+            calibration, coefficients=tuple(v * factor for v in calibration.coefficients)
+        )
+    return replace(calibration, scale=calibration.scale * factor)

@@ -7,8 +7,10 @@ each number of the line; the range table refits without some points.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import replace
 from functools import partial
+from itertools import groupby
 from typing import NamedTuple
 
 import jax
@@ -17,9 +19,17 @@ import numpy as np
 from jax import Array
 
 from beamfit.optics.beamline import Beamline
-from beamfit.optics.calibration import CurrentPolynomial, SlopeIntercept
-from beamfit.optics.elements import Drift
-from beamfit.optics.sections import Series
+from beamfit.optics.calibration import SlopeIntercept, scaled
+from beamfit.optics.elements import (
+    Drift,
+    Element,
+    Marker,
+    Quadrupole,
+    Screen,
+    SectorDipole,
+    ThinLens,
+)
+from beamfit.optics.sections import Series, in_series
 from beamfit.studies.scan.fit import EmittanceFit
 from beamfit.studies.scan.known import WEIGHTS
 from beamfit.studies.scan.model import emittance_parts, size_squared
@@ -40,8 +50,10 @@ __all__ = [
 
 # Leaving out one of more points than this tells nothing.
 MOST_POINTS = 50
-# Nobody reads a budget of more causes than this.
-MOST_CAUSES = 30
+# Nobody reads a budget of more causes than this, nor of smaller changes.
+MOST_CAUSES, SMALLEST = 30, 5e-4
+# Steps of the budget: resolution and dispersion in m, and a momentum spread where none is stated.
+RESOLUTION, DISPERSION, SPREAD = 10e-6, 0.01, 1e-3
 
 
 class Change(NamedTuple):
@@ -81,7 +93,7 @@ class RangeRow(NamedTuple):
 
 
 def systematics(fit: EmittanceFit, plane: str) -> list[Change]:
-    """Change of the emittance for +1 % of each scanned magnet, +1 cm of each drift, +1 % energy.
+    """Change of the emittance for small changes of the line, the energy, the screen and the beam.
 
     Parameters
     ----------
@@ -93,9 +105,12 @@ def systematics(fit: EmittanceFit, plane: str) -> list[Change]:
     Returns
     -------
     list of Change
-        Empty where the emittance is not determined. First order: exact
-        derivatives (through transport, and through the minimum by the implicit function
-        theorem) times the step.
+        The largest change first; empty where the emittance is not determined. For +1 % of each
+        magnet, scanned or not, of the angle of each bend, of the energy and of the screen's scale;
+        for +1 cm of each drift; for 10 µm of resolution and 1 cm of dispersion of the incoming beam
+        (of the line's momentum spread, or 0.1 % where it has none) that were not thought of. First
+        order: exact derivatives (through transport, and through the minimum by the implicit
+        function theorem) times the step.
 
     Examples
     --------
@@ -108,36 +123,93 @@ def systematics(fit: EmittanceFit, plane: str) -> list[Change]:
     >>> sizes = [float(BeamMatrix.from_twiss(2e-9, 5.0, 0.0).transport(
     ...     line.matrix({"Q": k}).x).l11) for k in k1]
     >>> fit = fit_emittance(QuadScan({"Q": k1}, {"Q": "k1"}, {"x": sizes}), line)
-    >>> [c.cause for c in systematics(fit, "x")]
-    ['Q strength +1 %', 'drift D +1 cm', 'energy +1 %']
+    >>> [c.cause for c in systematics(fit, "x")][:2]
+    ['resolution of 10 µm more', 'screen scale +1 %']
     """
     result = fit[plane]
     if result.emittance.error is None:
         return []
     rows, p = fit.seen.of_plane(plane), result.points
-    magnets = varied_magnets(fit.scan)
-    upstream = fit.line.upto(result.screen.name).elements
-    drifts = tuple(e.name for e in upstream if isinstance(e, Drift))
     keep = fit.seen.measured(plane)
     size, weighed, sharp = np.ones((3, len(rows.energy))) * [[1.0], [1.0], [0.0]]
     size[keep], weighed[keep], sharp[keep] = p.size, p.weighed, 1.0 / p.error
     follows = fit.seen.weights == WEIGHTS[0]
     noise = _Weighing(weighed, sharp, np.array(p.relative), np.array(float(follows)))
     sigma = np.array([q.value for q in result.sigma])
-    stored = replace(rows, line=fit.seen.scanned.stored_by_kind((*rows.settings, *rows.places)))
-    by_change, by_lengths = _changes(stored, sigma, size, noise, magnets=magnets)
-    by_length = np.concatenate([*by_lengths, np.zeros(0)])[: len(drifts)]  # the rest is downstream
-    relative = np.concatenate([by_change[:-1], by_length, by_change[-1:]])
+    held = (*rows.settings, *rows.places)
+    stored = replace(rows, line=fit.seen.scanned.stored_by_kind(held))
+    magnets = tuple(rows.settings)
+    by_change, by_parts, by_known = _changes(stored, sigma, size, noise, magnets=magnets)
+    *by_magnet, by_energy = np.asarray(by_change)
+    changes = {
+        f"{n} {_word(fit.seen.scanned, n)} +1 %" + _held(fit, n): 0.01 * float(d)
+        for n, d in zip(magnets, by_magnet, strict=True)
+    }
+    changes |= _of_parts(fit, result.screen.name, held, by_parts)
+    changes["energy +1 %"] = 0.01 * float(by_energy)
+    changes |= _of_screen(fit, p, np.asarray(by_known)[keep])
     # ln βγ rises by E²/(E² - m²) for each relative step of the energy.
     energy = fit.seen.energy
-    stiffer = energy**2 / (energy**2 - fit.line.mass**2)
-    causes = [f"{n} {_word(fit.seen.scanned, n)} +1 %" for n in magnets]
-    causes += [f"drift {n} +1 cm" for n in drifts] + ["energy +1 %"]
-    normalised = relative + np.append(np.zeros(len(relative) - 1), stiffer)
-    return [
-        Change(cause, 0.01 * float(e), 0.01 * float(n))
-        for cause, e, n in zip(causes, relative, normalised, strict=True)
-    ]
+    stiffer = 0.01 * energy**2 / (energy**2 - fit.line.mass**2)
+    found = [Change(c, d, d + stiffer * (c == "energy +1 %")) for c, d in changes.items()]
+    return sorted(found, key=lambda change: -abs(change.normalized_emittance))
+
+
+def _held(fit: EmittanceFit, magnet: str) -> str:
+    return "" if magnet in varied_magnets(fit.scan) else ", not scanned"
+
+
+def _of_parts(
+    fit: EmittanceFit, screen: str, held: Iterable[str], by_parts: list[Array]
+) -> dict[str, float]:
+    """Changes by the elements that no row sets, those up to the last screen."""
+    held, found = frozenset(held), {}
+    upstream = {e.name for e in fit.seen.scanned.upto(screen).elements}
+    left = iter(by_parts)
+    for kept, run in groupby(fit.seen.scanned.elements, lambda e: e.name in held):
+        series = None if kept else in_series(elements := _material(run))
+        if series is None or not series.kinds:
+            continue
+        # An element stands at `order` among those of all kinds, counted kind after kind.
+        by_kind = np.empty(len(elements), object)
+        by_kind[np.asarray(series.order)] = elements
+        slopes = [np.atleast_1d(np.asarray(next(left))) for _ in series.kinds]
+        for element, slope in zip(by_kind, np.concatenate(slopes), strict=True):
+            cause, step = _cause(fit, element)
+            if cause and element.name in upstream:
+                found[cause] = found.get(cause, 0.0) + step * float(slope)
+    return found
+
+
+def _material(run: Iterable[Element]) -> list[Element]:
+    return [e for e in run if not isinstance(e, Marker | Screen)]
+
+
+def _cause(fit: EmittanceFit, element: Element) -> tuple[str, float]:
+    """What a small change of an element is called, and how large it is."""
+    if isinstance(element, Drift):
+        return f"drift {element.name} +1 cm", 0.01
+    if isinstance(element, SectorDipole):
+        return f"bend {element.name} angle +1 %", 0.01
+    if isinstance(element, Quadrupole | ThinLens):
+        word = _word(fit.seen.scanned, element.name)
+        return f"{element.name} {word} +1 %, not scanned", 0.01
+    return "", 0.0
+
+
+def _of_screen(fit: EmittanceFit, p: Points, by_known: np.ndarray) -> dict[str, float]:
+    """Changes by the screen's scale and resolution, and by dispersion of the incoming beam."""
+    spread = float(fit.seen.scanned.energy_spread) or SPREAD
+    if fit.scan.energy_spread is not None:
+        spread = float(np.mean(fit.scan.energy_spread)) or SPREAD
+    # A scale on sizes is one on what is known of them and on σ, whose emittance goes with it.
+    scale = 2.0 * (1.0 - float(by_known @ p.known))
+    dispersed = float(by_known @ (p.r11 * DISPERSION * spread) ** 2)
+    return {
+        "screen scale +1 %": 0.01 * scale,
+        "resolution of 10 µm more": float(by_known.sum()) * RESOLUTION**2,
+        f"dispersion of 1 cm more (spread {100 * spread:.2g} %)": dispersed,
+    }
 
 
 def _word(line: Beamline, magnet: str) -> str:
@@ -145,21 +217,6 @@ def _word(line: Beamline, magnet: str) -> str:
     if isinstance(calibration, SlopeIntercept):
         return "slope"
     return "gradient" if calibration.unit in ("A", "kG", "T_per_m") else "strength"
-
-
-def _scaled(line: Beamline, magnet: str, factor: Array) -> Beamline:
-    """Scale what a magnet's setting means: the slope of a line, else all of the strength."""
-    for member in line.members(magnet):
-        element = line[member]
-        c = element.calibration
-        if isinstance(c, SlopeIntercept):
-            c = replace(c, slope=c.slope * factor)
-        elif isinstance(c, CurrentPolynomial):
-            c = replace(c, coefficients=tuple(v * factor for v in c.coefficients))
-        else:
-            c = replace(c, scale=c.scale * factor)
-        line = line.with_element(replace(element, calibration=c))
-    return line
 
 
 class _Weighing(NamedTuple):
@@ -173,7 +230,7 @@ class _Weighing(NamedTuple):
 
 @partial(jax.jit, static_argnames="magnets")
 def _changes(rows: Rows, sigma: Array, size: Array, noise: _Weighing, *, magnets):
-    """Derivatives of ln ε of the fit by each magnet's strength and ln E, and by lengths of drifts.
+    """Derivatives of ln ε of the fit by strengths and ln E, by parts, and by known size².
 
     At the answer the weighted residuals F(σ, rows) = Σ w ∂m²/∂σ (m² - size²) vanish, so dσ =
     -(∂F/∂σ)⁻¹ ∂F/∂rows: exact for either residual, without differentiating the solver, weights
@@ -182,12 +239,16 @@ def _changes(rows: Rows, sigma: Array, size: Array, noise: _Weighing, *, magnets
     """
     unit = jnp.abs(sigma)
 
-    def elements(change: Array, lengths: list[Array]) -> tuple[Array, ...]:
-        moved = _with_lengths(rows.line, lengths)
+    def elements(change: Array, parts: list[Array], more: Array) -> tuple[Array, ...]:
+        moved = _with_parts(rows.line, parts)
         for i, name in enumerate(magnets):
-            moved = _scaled(moved, name, 1.0 + change[i])
+            for member in moved.members(name):
+                element = moved[member]
+                strength = scaled(element.calibration, 1.0 + change[i])
+                moved = moved.with_element(replace(element, calibration=strength))
         energy = rows.energy * (1.0 + change[-1])
-        return replace(rows, line=moved, energy=energy).elements({})
+        r11, r12, known = replace(rows, line=moved, energy=energy).elements({})
+        return r11, r12, known + more
 
     def slope(relative: Array, seen: tuple[Array, ...]) -> Array:
         def squared_of(r: Array) -> Array:
@@ -201,28 +262,43 @@ def _changes(rows: Rows, sigma: Array, size: Array, noise: _Weighing, *, magnets
         return back((squared - size**2) * (noise.sharp / (at * grown)) ** 2)[0]
 
     series = [s for s in rows.line.elements if isinstance(s, Series)]
-    lengths = [k.length for s in series for k in s.kinds if isinstance(k, Drift)]
+    parts = [jnp.zeros(_count(k)) for s in series for k in s.kinds]
     none, here = jnp.zeros(len(magnets) + 1), sigma / unit
-    seen = elements(none, lengths)
+    seen = elements(none, parts, jnp.zeros(len(size)))
     by_sigma = jax.grad(lambda s: jnp.log(emittance_parts(s * unit)[0]))(here)
     weights = jnp.linalg.solve(jax.jacfwd(slope)(here, seen), by_sigma)
 
-    def moved_emittance(change: Array, lengths: list[Array]) -> Array:
-        return -weights @ slope(here, elements(change, lengths))
+    def moved_emittance(change: Array, parts: list[Array], more: Array) -> Array:
+        return -weights @ slope(here, elements(change, parts, more))
 
-    return jax.grad(moved_emittance, (0, 1))(none, lengths)
+    return jax.grad(moved_emittance, (0, 1, 2))(none, parts, jnp.zeros(len(size)))
 
 
-def _with_lengths(line: Beamline, lengths: list[Array]) -> Beamline:
-    """Give the drifts of a line that is stored by kind other lengths."""
-    left = iter(lengths)
+def _count(kind: Element) -> int:
+    """Elements of a kind that are stored together."""
+    return max((np.shape(v)[0] for v in jax.tree.leaves(kind) if np.ndim(v)), default=1)
+
+
+def _with_parts(line: Beamline, parts: list[Array]) -> Beamline:
+    """A line stored by kind with small changes of the numbers of `_cause`."""
+    left = iter(parts)
     elements = []
     for part in line.elements:
         if isinstance(part, Series):
-            kinds = (Drift("", next(left)) if isinstance(k, Drift) else k for k in part.kinds)
-            part = replace(part, kinds=tuple(kinds))
+            kinds = tuple(_changed(kind, next(left)) for kind in part.kinds)
+            part = replace(part, kinds=kinds)
         elements.append(part)
     return replace(line, elements=tuple(elements))
+
+
+def _changed(kind: Element, change: Array) -> Element:
+    if isinstance(kind, Drift):
+        return replace(kind, length=kind.length + change)
+    if isinstance(kind, SectorDipole):
+        return replace(kind, angle=kind.angle * (1.0 + change))
+    if isinstance(kind, Quadrupole | ThinLens):
+        return replace(kind, calibration=scaled(kind.calibration, 1.0 + change))
+    return kind
 
 
 def range_sensitivity(plane: PlaneFit) -> list[RangeRow]:
@@ -285,9 +361,9 @@ def _place(points: Points, i: int) -> str:
 
 
 def budget_rows(fit: EmittanceFit) -> list[tuple[str, list[str]]]:
-    """Cause and one cell per plane: the change of the normalised emittance.
+    """Cause and one cell per plane: the change of the normalised emittance, the largest first.
 
-    Of a long line the largest changes, and how large the others are at most.
+    Those below 0.05 % share one line.
     """
     columns = [{c.cause: c for c in systematics(fit, p.plane)} for p in fit.planes]
     largest: dict[str, float] = {}
@@ -295,7 +371,7 @@ def budget_rows(fit: EmittanceFit) -> list[tuple[str, list[str]]]:
         size = abs(change.normalized_emittance)
         largest[change.cause] = max(size, largest.get(change.cause, 0.0))
     ranked = sorted(largest, key=largest.__getitem__, reverse=True)
-    shown, others = frozenset(ranked[:MOST_CAUSES]), ranked[MOST_CAUSES:]
+    shown = [cause for cause in ranked if largest[cause] >= SMALLEST][:MOST_CAUSES]
     rows = [
         (
             cause,
@@ -304,12 +380,11 @@ def budget_rows(fit: EmittanceFit) -> list[tuple[str, list[str]]]:
                 for column in columns
             ],
         )
-        for cause in largest
-        if cause in shown
+        for cause in shown
     ]
-    if others:
+    if others := ranked[len(shown) :]:
         most = [f"±{100 * largest[others[0]]:.2g} % at most" for _ in columns]
-        rows.append((f"{len(others)} other causes, each", most))
+        rows.append((f"{len(others)} other cause{'s, each' * (len(others) > 1)}", most))
     return rows
 
 
