@@ -35,7 +35,7 @@ calibrate: .venv/test
 
 # Errors of every scenario held against 500 simulated scans each.
 coverage: .venv/test
-	BEAMFIT_COVERAGE=500 $(BIN)/python -m pytest --quiet tests/studies/test_coverage.py
+	BEAMFIT_COVERAGE=500 $(BIN)/python -m pytest --quiet tests/studies/test_coverage.py tests/studies/test_systematics.py
 
 lint: .venv/test
 	$(BIN)/ruff check .

@@ -11,6 +11,7 @@ from beamfit.cli.options import Sampling, command_line, options
 from beamfit.io.inputs import read_inputs
 from beamfit.io.line import build_line
 from beamfit.io.result import results_text
+from beamfit.io.systematics import read_systematics
 from beamfit.studies.scan.assumptions import Assumptions
 
 if TYPE_CHECKING:
@@ -34,6 +35,7 @@ Examples:
   beamfit emittance scan.csv --lattice line.toml --sample --store scan.h5 --report scan.html
   beamfit emittance measurements/gtf_simulated.csv --lattice lattices/gtf.toml \\
     --scenario calibration --prior Q2.slope=167.23+-3.3446
+  beamfit emittance scan.csv --lattice line.toml --prior size_scale=1+-2% --prior energy=1+-0.5%
 """
 
 
@@ -54,6 +56,12 @@ Examples:
 @click.option("--robust", is_flag=True, help="Give each point a probability of being an outlier.")
 @options("weights scenario prior bounds anchor")
 @click.option(
+    "--systematics",
+    "known",
+    metavar="FILE",
+    help="TOML file of what is known of screen, energy, drifts, magnets: part of the error then.",
+)
+@click.option(
     "--hysteresis",
     is_flag=True,
     help="Focusing network: branches of k1 for rising and falling currents, by the order of rows.",
@@ -68,6 +76,7 @@ def emittance(
     robust: bool,
     weights: str,
     scenario: str,
+    known: str | None,
     sample: bool,
     store: str | None,
     report: str | None,
@@ -83,6 +92,8 @@ def emittance(
     sampling = Sampling(sample, store, told["seed"])
     sampling.check()
     given = {name: told.pop(name) for name in GIVEN}
+    if known is not None:
+        told["priors"] = read_systematics(known) | told["priors"]
     Assumptions(**told).check_scenario(scenario)
     measured, described, inputs, gui = read_inputs(scan, **given)
     planes = {None: measured.planes, "both": ("x", "y")}.get(plane, (plane,))

@@ -14,10 +14,22 @@ from typing import Any, NamedTuple
 from beamfit.errors import InputError, nearest
 from beamfit.io.files import read_text
 
-__all__ = ["FLAG", "LIST", "REQUIRED", "TABLE", "TEXT", "Key", "Section", "is_number", "read_toml"]
+__all__ = [
+    "FLAG",
+    "LIST",
+    "NUMBERS",
+    "REQUIRED",
+    "TABLE",
+    "TEXT",
+    "Key",
+    "Section",
+    "is_number",
+    "read_toml",
+]
 
 REQUIRED: Any = object()
 TEXT, LIST, FLAG, TABLE, NUMBER = str, list, bool, dict, (int, float)
+NUMBERS = (int, float, list)
 # How each kind of value is called in a message.
 KINDS = {
     NUMBER: "a number",
@@ -25,6 +37,7 @@ KINDS = {
     LIST: "a list",
     FLAG: "true or false",
     TABLE: "a table",
+    NUMBERS: "a number or a list of numbers",
 }
 
 

@@ -19,6 +19,7 @@ class Entry(NamedTuple):
     module: str
     robust: bool = False
     numbers: bool = False
+    line: bool = True
     anchor: bool = False
     determinant: bool = False
     branches: bool = False
@@ -27,10 +28,28 @@ class Entry(NamedTuple):
 # A further scenario is a module with a `SCENARIO` and a line here.
 SCENARIOS = {
     "known": Entry("known", robust=True),
-    "transport-network": Entry("transport_network", anchor=True, determinant=True),
+    "transport-network": Entry("transport_network", line=False, anchor=True, determinant=True),
     "calibration": Entry("calibration", robust=True, numbers=True),
     "focusing-network": Entry("focusing_network", anchor=True, branches=True),
 }
+
+
+# Numbers of the screen, of the beam and of elements that every scenario can free, with priors. A
+# network of R11 and R12 has those of the screen alone.
+ON_SCREEN, OF_BEAM = ("size_scale", "wire"), ("resolution", "energy")
+OF_BEAM += ("dispersion", "dispersion_slope")
+OF_ELEMENTS = (".gradient", ".length")
+
+
+def is_systematic(name: str) -> bool:
+    """Whether a prior is one on screen, beam or line rather than on a calibration.
+
+    Examples
+    --------
+    >>> is_systematic("size_scale"), is_systematic("D1.length"), is_systematic("Q2.slope")
+    (True, True, False)
+    """
+    return name in (*ON_SCREEN, *OF_BEAM) or name.endswith(OF_ELEMENTS)
 
 
 def _taking(what: str) -> str:
@@ -101,7 +120,9 @@ class Assumptions:
     Parameters
     ----------
     priors : mapping of str to (float, float), optional
-        Calibration number, such as ``Q2.slope``, to mean and standard deviation.
+        Calibration number, such as ``Q2.slope``, or number of screen, beam and line, such as
+        ``size_scale`` (see `beamfit.studies.scan.systematics.with_systematics`), to mean and
+        standard deviation. A mean of None is that of the line.
     bounds : mapping of str to (float, float), optional
         The same to a lower and an upper bound.
     anchor : Anchor, optional
@@ -135,10 +156,9 @@ class Assumptions:
 
     def __post_init__(self) -> None:
         for name, (mean, sd) in self.priors.items():
-            if not (math.isfinite(mean) and math.isfinite(sd) and sd > 0):
-                raise InputError(
-                    f"prior {name} = {mean:g}+-{sd:g}", "a finite mean and a positive deviation"
-                )
+            if not (math.isfinite(mean or 0.0) and math.isfinite(sd) and sd > 0):
+                expected = "a finite mean and a positive deviation"
+                raise InputError(f"prior {name} = {mean}+-{sd:g}", expected)
         for name, (low, high) in self.bounds.items():
             if not (math.isfinite(low) and math.isfinite(high) and low < high):
                 raise InputError(f"bounds {name} = {low:g}:{high:g}", "finite bounds, lower first")
@@ -152,6 +172,16 @@ class Assumptions:
             if getattr(self, name) < 1:
                 raise InputError(f"{getattr(self, name)} {name}", "at least one")
 
+    @property
+    def systematics(self) -> dict[str, tuple[float | None, float]]:
+        """The priors on screen, beam and line."""
+        return {name: prior for name, prior in self.priors.items() if is_systematic(name)}
+
+    @property
+    def calibrations(self) -> dict[str, tuple[float, float]]:
+        """The priors on calibrations."""
+        return {name: prior for name, prior in self.priors.items() if not is_systematic(name)}
+
     def check_scenario(self, scenario: str, robust: bool = False) -> None:
         """Refuse an unknown scenario, and what a scenario has no use for.
 
@@ -163,7 +193,11 @@ class Assumptions:
         if scenario not in SCENARIOS:
             raise InputError(f"scenario '{scenario}'", nearest(scenario, list(SCENARIOS)))
         entry = SCENARIOS[scenario]
-        named = [*self.priors, *self.bounds]
+        named = [*self.calibrations, *self.bounds]
+        beyond = [name for name in self.systematics if name not in ON_SCREEN]
+        if beyond and not entry.line:
+            expected = f"{' or '.join(ON_SCREEN)}: R11 and R12 are free in it already"
+            raise InputError(f"a prior on {beyond[0]} with scenario {scenario}", expected)
         if named and not entry.numbers:
             raise InputError(
                 f"a prior or bounds on {named[0]} with scenario {scenario}",

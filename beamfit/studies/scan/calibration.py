@@ -165,7 +165,7 @@ def with_numbers(line: Beamline, numbers: Mapping[str, float]) -> Beamline:
 def _free_numbers(seen: Seen, told: Assumptions) -> dict[str, Number]:
     """Slope and offset of the scanned magnets, and whatever is named."""
     known, varied = numbers_of_magnets(seen.scanned), varied_magnets(seen.scan)
-    named = [*told.priors, *told.bounds]
+    named = [*told.calibrations, *told.bounds]
     for name in named:
         if name not in known:
             raise InputError(f"a prior or bounds on '{name}'", nearest(name, list(known)))

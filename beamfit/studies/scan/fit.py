@@ -76,7 +76,9 @@ def fit_emittance(
         together. See docs/scenarios.md for what each cannot know.
     priors, bounds : mapping of str to (float, float), optional
         Calibration number, such as "Q2.slope", to mean and standard deviation, or to lower and
-        upper bound ("calibration").
+        upper bound ("calibration"). In any scenario also priors on screen, beam and line, which
+        become part of the error: "size_scale", "resolution", "wire" (m), "energy", "dispersion"
+        (m), "dispersion_slope", "NAME.gradient", "NAME.length" (m); see docs/systematics.md.
     anchor : Anchor, optional
         What ties a network to first principles.
     hysteresis : bool
@@ -128,6 +130,10 @@ def fit_emittance(
     line = rows_line(scan) if line is None else line
     _check_own(scan, line, scenario)
     statement, scan = scenario_of(scenario), scan.of_particle(line.mass)
+    if told.systematics:
+        from beamfit.studies.scan.systematics import with_systematics
+
+        statement = with_systematics(statement, told)
     seen = see(scan, line, planes, method, robust, weights, at_once=statement.closed)
     if statement.closed:
         return EmittanceFit(judged_beam(seen), scan, line, statement, told, seen)

@@ -51,6 +51,7 @@ class Answer(NamedTuple):
     units: np.ndarray
     names: list[str]
     advice: str | None = None
+    holds: str = "statistics only"
 
 
 def _quantity(value: float, error: float, raw: float, unit: str, reach: float) -> Quantity:
@@ -111,6 +112,7 @@ def plane_fit(seen: Seen, line: Beamline, plane: str, a: Answer) -> PlaneFit:
             next_measurement=a.advice,
         ),
         points=p,
+        holds=a.holds,
     )
 
 

@@ -6,8 +6,9 @@ The physics is report eq. 37 with the two terms that every screen adds,
 
 linear in σ. A model is a dictionary: ``beam`` holds the Cholesky factor of each plane's σ in units
 of 1e-4 (m, rad), so that σ is in 1e-8 SI as in the report's Appendix A; ``magnets`` holds what the
-setting of a magnet means where that is free, ``map`` a network of R11 and R12. Its numbers have
-paths such as ``beam.x.l11`` and ``magnets.Q2.slope``.
+setting of a magnet means where that is free, ``map`` a network of R11 and R12, ``systematics`` what
+is free of screen, energy, drifts and incoming dispersion. Its numbers have paths such as
+``beam.x.l11`` and ``magnets.Q2.slope``.
 """
 
 from __future__ import annotations
@@ -23,6 +24,8 @@ from jax.typing import ArrayLike
 import beamfit.optics  # noqa: F401 - switches JAX to double precision
 from beamfit.greybox import tree
 from beamfit.optics.beamline import Beamline
+from beamfit.optics.calibration import scaled
+from beamfit.optics.particle import beta_gamma
 
 __all__ = [
     "QUANTITIES",
@@ -95,14 +98,31 @@ def sigma_of(beam: Mapping[str, Any]) -> Array:
 
 
 def line_of(model: Mapping[str, Any], line: Beamline) -> Beamline:
-    """Put into a line what a model says of the settings of its magnets."""
+    """Put into a line what a model says of its magnets and drifts."""
     for name, calibration in model.get("magnets", {}).items():
         line = line.with_element(replace(line[name], calibration=calibration))
+    found = model.get("systematics", {})
+    for name, factor in found.get("gradient", {}).items():
+        for member in line.members(name):
+            own = scaled(line[member].calibration, factor)
+            line = line.with_element(replace(line[member], calibration=own))
+    for name, length in found.get("length", {}).items():
+        line = line.with_element(replace(line[name], length=length))
     return line
 
 
 def spoken(path: str) -> str:
-    """The path of a free number as users say it: "Q2.slope", not "magnets.Q2.slope"."""
+    """The path of a free number as users say it: "Q2.slope", not "magnets.Q2.slope".
+
+    Examples
+    --------
+    >>> spoken("magnets.Q2.slope"), spoken("systematics.length.D1"), spoken("systematics.energy")
+    ('Q2.slope', 'D1.length', 'energy')
+    """
+    first, _, rest = path.partition(".")
+    if first == "systematics":
+        kind, _, name = rest.partition(".")
+        return f"{name}.{kind}" if name else kind
     return path.removeprefix("magnets.")
 
 
@@ -203,8 +223,13 @@ class Asked:
     screen: str | None
     place: str | None
     line: Beamline
-    factor: Any
+    energy: Any
     design: Any
+
+    @property
+    def factor(self) -> Any:
+        """βγ."""
+        return beta_gamma(self.energy, self.line.mass)
 
 
 def asked_numbers(model: Mapping[str, Any], asked: Asked) -> Array:
@@ -212,7 +237,10 @@ def asked_numbers(model: Mapping[str, Any], asked: Asked) -> Array:
     to_screen = to_design = jnp.full((2, 2), jnp.nan)
     if asked.screen is not None:
         place = asked.place or asked.screen
-        found = line_of(model, asked.line).matrices(tuple(dict.fromkeys((asked.screen, place))))
+        places = tuple(dict.fromkeys((asked.screen, place)))
+        found = line_of(model, asked.line).matrices(places)
         to_screen, to_design = (getattr(found[at], asked.plane) for at in (asked.screen, place))
     sigma = sigma_of(model["beam"][asked.plane])
+    energy = asked.energy * model.get("systematics", {}).get("energy", 1.0)
+    asked = replace(asked, energy=energy)
     return numbers_of(sigma, asked.factor, to_screen, to_design, asked.design)

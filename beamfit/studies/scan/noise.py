@@ -111,7 +111,7 @@ def noise_of(scan: QuadScan, plane: str) -> Noise:
         pooled = float(freedom @ scatter / freedom.sum())
         shrunken = (POOL_DOF * pooled + freedom * scatter) / (POOL_DOF + freedom)
         error = size * np.sqrt(shrunken / (freedom + 1.0))
-        return Noise(error, 1.0, True, float(freedom.sum()), "scatter of shots")
+        return Noise(error, 1.0, True, float(freedom.sum()), "of the shots")
     share = error / size
     same = len(share) > 1 and float(np.ptp(share)) < SAME_SHARE * float(share.mean())
     return Noise(error, float(same), True, math.inf)

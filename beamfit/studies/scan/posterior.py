@@ -27,6 +27,7 @@ from beamfit.studies.scan.model import (
     asked_numbers,
     predict_sizes,
     sigma_of,
+    spoken,
 )
 from beamfit.studies.scan.results import PlaneFit
 from beamfit.studies.scan.statement import Scenario, Seen, asked_of
@@ -183,7 +184,7 @@ def _stated(
     own = [f"beam.{p.plane}.{name}" for p in chosen for name in CHOLESKY]
     labels = {f"size {p.plane}": p.plane for p in chosen}
     # As users name them in a calibration: Q2.slope.
-    renamed = {name: name.removeprefix("magnets.") for name in problem.names}
+    renamed = {name: spoken(name) for name in problem.names}
     return Statement(
         derived={f"{plane}.{name}": QUANTITIES[name] for plane, name in shown},
         derive=_twiss,

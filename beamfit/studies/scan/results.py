@@ -224,6 +224,8 @@ class PlaneFit:
         What the data determine.
     points : Points
         Point by point.
+    holds : str
+        What the errors hold: statistics only, or also systematics that were given.
     """
 
     plane: str
@@ -246,6 +248,7 @@ class PlaneFit:
     weights: str
     identifiability: Identifiability
     points: Points
+    holds: str = "statistics only"
 
     @property
     def headline(self) -> str:
@@ -317,7 +320,8 @@ def result_rows(planes: tuple[PlaneFit, ...]) -> list[tuple[str, list[str]]]:
     rows: list[tuple[str, Callable[[PlaneFit], object]]] = [
         ("status", lambda p: p.status),
         ("normalised emittance", lambda p: p.normalized_emittance),
-        ("95 % of answers", _interval),
+        ("  95 % of answers", _interval),
+        ("  its error holds", lambda p: p.holds if p.emittance.error is not None else "-"),
         ("geometric emittance", lambda p: p.emittance),
         ("beta at the start", lambda p: p.beta),
         ("alpha at the start", lambda p: p.alpha),

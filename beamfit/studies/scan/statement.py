@@ -10,7 +10,6 @@ import numpy as np
 
 from beamfit.greybox.problem import Free, Problem, Record
 from beamfit.optics.beamline import Beamline
-from beamfit.optics.particle import beta_gamma
 from beamfit.studies.scan.assumptions import Assumptions
 from beamfit.studies.scan.model import UNIT, Asked, predict_sizes
 from beamfit.studies.scan.noise import Noise
@@ -88,6 +87,8 @@ class Seen(NamedTuple):
         The same, with every magnet as the lattice has it; NumPy arrays.
     works : dict of str to Work
         Plane to its fit; of every plane that was measured.
+    kept, any_energy : tuple of str and bool
+        Elements that may change besides the scanned magnets, and whether the energy may.
     """
 
     scan: QuadScan
@@ -101,14 +102,18 @@ class Seen(NamedTuple):
     noises: dict[str, Noise]
     look: Look
     works: dict[str, Work]
+    kept: tuple[str, ...] = ()
+    any_energy: bool = False
 
     def of_plane(self, plane: str, settings: Mapping[str, Any] | None = None) -> Rows:
         """The rows of one plane, with other settings if any are given."""
         return replace(self.rows, plane=plane, settings=settings or self.rows.settings)
 
-    def keeping(self, magnets: Iterable[str]) -> Seen:
-        """The same with rows in which further magnets may change."""
-        return self._replace(rows=scan_rows(self.scan, self.scanned, self.rows.squared, magnets))
+    def keeping(self, names: Iterable[str], any_energy: bool = False) -> Seen:
+        """The same with rows in which further elements, or the energy, may change."""
+        kept, free = (*self.kept, *names), self.any_energy or any_energy
+        rows = scan_rows(self.scan, self.scanned, self.rows.squared, kept, free)
+        return self._replace(rows=rows, kept=kept, any_energy=free)
 
     def measured(self, plane: str) -> np.ndarray:
         """Indices of the rows in which a plane was measured."""
@@ -168,13 +173,12 @@ def asked_of(seen: Seen, plane: str, whole_map: bool = True, line: Beamline | No
     """Where the beam of a plane is asked for, through a line: the rows' own, if none is given."""
     design = seen.scanned.design
     twiss = getattr(design, plane, None)
-    factor = beta_gamma(seen.energy, float(seen.line.mass))
     return Asked(
         plane,
         seen.rows.places[-1] if whole_map else None,
         design.at if twiss else None,
         line or seen.rows.line,
-        np.asarray(factor),
+        np.asarray(seen.energy),
         np.array(twiss or (np.nan, np.nan), float),
     )
 

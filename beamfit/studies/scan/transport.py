@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from functools import lru_cache, partial
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import jax
@@ -192,20 +193,39 @@ class Rows:
 
     def elements(self, model: Mapping[str, Any]) -> tuple[Array, Array, Array]:
         """R11, R12, damped, and known size² (m²) of every row, shape (n,), by the model's line."""
+        found, plane = model.get("systematics", {}), "xy".index(self.plane)
         if self.given is not None:
-            return self.known(self.given["xy".index(self.plane)])
+            return self.known(self.given[plane], found)
+        energy = self.energy * found.get("energy", 1.0)
         line = line_of(model, self.line)
-        every = transfer_rows(line, self.settings, self.energy, self.places).planes
-        return self.seen(every[:, "xy".index(self.plane)])
+        every = transfer_rows(line, self.settings, energy, self.places).planes
+        return self.seen(every[:, plane], found)
 
-    def seen(self, matrices: Array) -> tuple[Array, Array, Array]:
+    def seen(
+        self, matrices: Array, found: Mapping[str, Any] = MappingProxyType({})
+    ) -> tuple[Array, Array, Array]:
         """R11, R12 and known size² from one plane's matrices, shape (n, places, 3, 3)."""
-        return self.known(matrices[jnp.arange(len(self.energy)), self.which, 0])
+        return self.known(matrices[jnp.arange(len(self.energy)), self.which, 0], found)
 
-    def known(self, r: Array) -> tuple[Array, Array, Array]:
-        """R11, R12 and known size² from R11, R12 and R16, shape (n, 3)."""
-        known = (r[:, 2] * self.spread) ** 2 + self.resolution**2
-        return self.damping * r[:, 0], self.damping * r[:, 1], known
+    def known(
+        self, r: Array, found: Mapping[str, Any] = MappingProxyType({})
+    ) -> tuple[Array, Array, Array]:
+        """R11, R12 and known size² from R11, R12 and R16, shape (n, 3), and what was found free.
+
+        Of a round wire of diameter d the rms is d/4, that of a uniform disc seen from the side.
+        """
+        own = found.get("dispersion", 0.0), found.get("dispersion_slope", 0.0)
+        dispersion = r[:, 2] + r[:, 0] * own[0] + r[:, 1] * own[1]
+        known = (dispersion * self.spread) ** 2 + found.get("resolution", self.resolution) ** 2
+        return through_screen(found, self.damping * r[:, 0], self.damping * r[:, 1], known)
+
+
+def through_screen(
+    found: Mapping[str, Any], r11: Array, r12: Array, known: Array
+) -> tuple[Array, Array, Array]:
+    """What a screen or wire makes of them that has a scale and a thickness."""
+    scale, wire = found.get("size_scale", 1.0), found.get("wire", 0.0)
+    return scale * r11, scale * r12, scale**2 * (known + (wire / 4.0) ** 2)
 
 
 @tree.node("plane", "squared")
@@ -232,7 +252,8 @@ class NetworkRows:
     def elements(self, model: Mapping[str, Any]) -> tuple[Array, Array, Array]:
         """R11, R12 and known size² (m²) of every row, shape (n,) each."""
         found = self.outputs(model)  # A and B first, then C and D if the network has them
-        return self.damping * found[:, 0], self.damping * found[:, 1], self.known
+        r11, r12 = self.damping * found[:, 0], self.damping * found[:, 1]
+        return through_screen(model.get("systematics", {}), r11, r12, self.known)
 
 
 def padded(values: Any, n: int | None = None) -> np.ndarray:
@@ -249,7 +270,11 @@ def padded(values: Any, n: int | None = None) -> np.ndarray:
 
 
 def scan_rows(
-    scan: QuadScan, scanned: Beamline, squared: bool = True, keep: Iterable[str] = ()
+    scan: QuadScan,
+    scanned: Beamline,
+    squared: bool = True,
+    keep: Iterable[str] = (),
+    any_energy: bool = False,
 ) -> Rows:
     """The rows of a scan, of the x plane, padded.
 
@@ -262,7 +287,9 @@ def scan_rows(
     squared : bool
         As for `Rows`.
     keep : iterable of str
-        Magnets that may change besides those of the scan.
+        Elements that may change besides the magnets of the scan.
+    any_energy : bool
+        Whether the energy may.
 
     Returns
     -------
@@ -283,7 +310,8 @@ def scan_rows(
 
     energy = column(scan.energy, scanned.energy)
     ends = (*places, scanned.design.at) if scanned.design else places
-    every = np.append(energy, scanned.energy)
+    # What is multiplied out holds for one energy, if there is but one.
+    every = np.append(energy, (1.0 + any_energy) * scanned.energy)
     settings = {} if own else scan.settings
     return Rows(
         "x",

@@ -32,6 +32,7 @@ from beamfit.studies.scan.model import (
 )
 from beamfit.studies.scan.results import Parameter, PlaneFit, Points
 from beamfit.studies.scan.statement import Scenario, Seen, asked_of, size_record
+from beamfit.studies.scan.systematics import effects_of
 from beamfit.studies.scan.transport import Look
 from beamfit.studies.scan.verdict import SCENARIO_RULES, Unknowns, cause_of, judge
 from beamfit.verdict import Finding
@@ -145,6 +146,8 @@ def judged_scenario(
         group = next((g for g in fit.groups if g.name == record.name), NOTHING)
         unknowns = _unknowns(seen, plane, scenario, told, fit, parameters, own, group)
         answer = _scenario_answer(fit, own, group, unknowns, points, jacobian)
+        if told.systematics:
+            answer = answer._replace(holds="statistics, systematics")
         beams.append(plane_fit(seen, line, plane, answer))
     return tuple(beams)
 
@@ -186,6 +189,11 @@ def _unknowns(
         remark += " Nothing is free besides the beam, so this is the fit with known transport."
     if priors:
         remark += f" Rests on the prior of {', '.join(priors)}."
+    effects = effects_of(fit, told, float(own.value[1]), np.nan_to_num(own.slope[1]))
+    rests_on = noise.rests_on(group.chi2, group.dof)
+    if effects is not None:
+        remark += effects.words
+        rests_on *= effects.beyond_statistics**2
     return Unknowns(
         scenario=scenario.name,
         tied=f" with {tied}" if told.anchor != Anchor() else "",
@@ -196,7 +204,7 @@ def _unknowns(
         chi2=group.chi2,
         dof=group.dof,
         probability=noise.probability(group.chi2, group.dof),
-        rests_on=noise.rests_on(group.chi2, group.dof),
+        rests_on=rests_on,
         edges=edges,
         remedy=scenario.remedy(seen, told),
         remark=remark,

@@ -382,7 +382,7 @@ def _determined_in_scenario(u: Unknowns) -> Finding:
 def _in_scenario(u: Unknowns) -> str:
     return (
         f"Determined in scenario {u.scenario}{u.tied}: zero emittance is {u.distance:.0f} standard "
-        f"errors away.{u.remark}{few_words(u.rests_on)}"
+        f"errors away{few_words(u.rests_on)}.{u.remark}"
     )
 
 
