@@ -40,7 +40,6 @@ _HOME = {
     "read_operation": "beamfit.io.ring",
     "read_quad_scan": "beamfit.io.measurement",
     "read_ring": "beamfit.io.ring",
-    "read_systematics": "beamfit.io.systematics",
     "split_record": "beamfit.studies.decay.segments",
     "systematics": "beamfit.studies.scan.sensitivity",
     "write_report": "beamfit.report.page",
