@@ -5,11 +5,15 @@ from __future__ import annotations
 from datetime import UTC, datetime
 from os import PathLike
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from beamfit.io.table import Column, Sheet, columns_of, read_sheet
 from beamfit.studies.decay.record import Conditions, DecayRecord, first_fault
+
+if TYPE_CHECKING:
+    from pandas import DataFrame
 
 __all__ = ["read_decay_record"]
 
@@ -29,13 +33,13 @@ ISO = "ISO 8601"
 UNIX = 1e8
 
 
-def read_decay_record(path: str | PathLike[str]) -> DecayRecord:
+def read_decay_record(path: str | PathLike[str] | DataFrame) -> DecayRecord:
     """Read beam current against time.
 
     Parameters
     ----------
-    path : str or path
-        CSV, or HDF5 if it ends in .h5 or .hdf5 with one dataset for each column. Columns:
+    path : str, path or pandas.DataFrame
+        A frame, CSV, or HDF5 if it ends in .h5 or .hdf5 with one dataset for each column. Columns:
         `time_s` (from any origin, or Unix time) or `time` (ISO 8601, UTC if no zone is given);
         `beam_current_mA` (or `_A`, `_uA`); optionally `beam_current_error_mA`, `rf_voltage_kV`,
         `scraper_y_mm`, `pressure_Pa`, `bunches`. Lines that begin with `#` and
@@ -76,7 +80,7 @@ def read_decay_record(path: str | PathLike[str]) -> DecayRecord:
         time=time,
         current=current,
         error=error,
-        name=Path(path).name,
+        name=Path(sheet.path).name,
         start=float(time[0]) if absolute else None,
         conditions=conditions,
         comments=sheet.comments,

@@ -6,6 +6,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from os import PathLike
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.special import fdtrc
@@ -16,6 +17,9 @@ from beamfit.io.scan_columns import ENERGIES, SETTINGS, column_notes, scan_colum
 from beamfit.io.table import UNITS, Column, Sheet, read_sheet
 from beamfit.statistics import POOR_FIT
 from beamfit.studies.scan.scans import POSSIBLE, USUAL, QuadScan, first_unusable, row_keys
+
+if TYPE_CHECKING:
+    from pandas import DataFrame
 
 __all__ = ["average_shots", "read_quad_scan"]
 
@@ -41,16 +45,17 @@ ENOUGH_DEGREES = 3
 
 
 def read_quad_scan(
-    path: str | PathLike[str], *, ignore: Iterable[str] = (), skip_bad: bool = False
+    path: str | PathLike[str] | DataFrame, *, ignore: Iterable[str] = (), skip_bad: bool = False
 ) -> QuadScan:
     """Read a quadrupole scan.
 
     Parameters
     ----------
-    path : str or path
-        A CSV file whose header carries the units, or an HDF5 file (``.h5``, ``.hdf5``) with
-        one dataset a column under the same names; or a file of emittance_gui (``.mat``), of which
-        these are the RMS sizes (see `beamfit.io.emittance_gui.read_emittance_gui`).
+    path : str, path or pandas.DataFrame
+        A CSV file whose header carries the units, a frame with such columns, or an HDF5 file
+        (``.h5``, ``.hdf5``) with one dataset a column under the same names; or a file of
+        emittance_gui (``.mat``), of which these are the RMS sizes (see
+        `beamfit.io.emittance_gui.read_emittance_gui`).
     ignore : iterable of str
         Columns to leave unread; * and ? stand for any letters.
     skip_bad : bool
@@ -77,7 +82,7 @@ def read_quad_scan(
     >>> scan.notes
     ("1 of 4 rows was left out: line 5, column 'size_x_um', 'none'.",)
     """
-    if is_emittance_gui(path):
+    if isinstance(path, str | PathLike) and is_emittance_gui(path):
         return read_emittance_gui(path).scan()
     sheet = read_sheet(path, "Q2_A,size_x_um", MOST_ROWS, ragged=skip_bad).without(ignore)
     columns = scan_columns(sheet)
@@ -90,7 +95,7 @@ def read_quad_scan(
     try:
         scan = _scan(sheet, columns, values)
     except InputError as error:
-        raise replace(error, path=path) from None
+        raise replace(error, path=sheet.path) from None
     return average_shots(scan, marked="shot" in columns)
 
 

@@ -15,12 +15,15 @@ from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 from os import PathLike
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from beamfit.errors import InputError, nearest
 from beamfit.io.files import digest, text_lines
+
+if TYPE_CHECKING:
+    from pandas import DataFrame
 
 __all__ = ["UNITS", "Column", "Sheet", "columns_of", "read_sheet"]
 
@@ -255,15 +258,20 @@ def _known(header: str, quantities: Mapping[str, str], sheet: Sheet) -> Column |
 
 
 def read_sheet(
-    path: str | PathLike[str], example: str, most: int | None = None, *, ragged: bool = False
+    path: str | PathLike[str] | DataFrame,
+    example: str,
+    most: int | None = None,
+    *,
+    ragged: bool = False,
 ) -> Sheet:
     """Read the columns of a CSV, TFS or HDF5 file.
 
     Parameters
     ----------
-    path : str or path
-        The file; HDF5 if its name ends in .h5 or .hdf5, with one dataset a column. Columns of
-        text are separated by commas, semicolons, tabs or blanks: the header tells.
+    path : str, path or pandas.DataFrame
+        A frame with such columns, or the file; HDF5 if its name ends in .h5 or .hdf5, with one
+        dataset a column. Columns of text are separated by commas, semicolons, tabs or blanks: the
+        header tells.
     example : str
         A header such as the file should have, for messages.
     most : int, optional
@@ -292,6 +300,8 @@ def read_sheet(
     >>> sheet.numbers("beta_x_m").tolist(), sheet.lines, sheet.comments
     ([1.5, 2.5], [3, 5], ('noon',))
     """
+    if hasattr(path, "itertuples"):
+        return _of_frame(path, most)
     if Path(path).suffix.lower() in HDF5:
         return _read_hdf5(path, most)
     names, header, separator = None, None, ""
@@ -324,6 +334,22 @@ def read_sheet(
     cells = list(zip(*rows, strict=True)) if rows else [()] * len(names)
     said = (tuple(comments), seen.hexdigest(), tuple(bad))
     return Sheet(path, tuple(names), cells, lines, header, *said)
+
+
+def _of_frame(frame: DataFrame, most: int | None) -> Sheet:
+    """The columns of a pandas data frame, whose name, if it has one, is in its ``attrs``."""
+    name = str(frame.attrs.get("name", "frame"))
+    if not all(isinstance(column, str) for column in frame.columns):
+        raise InputError("columns without names", "names such as Q2_A and size_x_um", path=name)
+    _check_length(len(frame), most, name)
+    blank = frame.isna()
+    cells = [
+        ["" if missing else v for v, missing in zip(values, blank[column], strict=True)]
+        for column, values in frame.items()
+    ]
+    if not cells:
+        raise InputError("a frame without columns", "a column for each quantity", path=name)
+    return Sheet(name, tuple(frame.columns), cells, None, None, ())
 
 
 def _raise_first(errors: Sequence[InputError]) -> None:

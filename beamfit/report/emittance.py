@@ -33,7 +33,6 @@ from beamfit.studies.scan.results import (
 from beamfit.studies.scan.scans import Profile
 from beamfit.studies.scan.sensitivity import budget_rows, range_rows
 from beamfit.studies.scan.size_methods import SizeMethods
-from beamfit.studies.scan.transport import scanned_line, transfer_rows
 from beamfit.table import Table, labelled
 
 __all__ = [
@@ -188,31 +187,20 @@ def setting_axis(p: PlaneFit) -> tuple[np.ndarray, str]:
 
 def _curves(axes: Axes, fit: EmittanceFit, p: PlaneFit, magnet: str) -> None:
     """One fitted curve for each screen, with the one-sigma band where σ has errors."""
-    scanned = scanned_line(fit.scan, fit.line)
     values = p.points.settings[magnet]
     margin = 0.04 * np.ptp(values)
     grid = np.linspace(values.min() - margin, values.max() + margin, 201)
-    table = {n: np.full(len(grid), np.median(v)) for n, v in p.points.settings.items()}
-    table[magnet] = grid
+    settings = {n: np.median(v) for n, v in p.points.settings.items()} | {magnet: grid}
     screens = tuple(dict.fromkeys(p.points.screen))
-    energy = np.full(len(grid), float(fit.line.energy))
-    matrices = transfer_rows(scanned, table, energy, places=screens)
-    every = np.asarray(matrices.planes)[:, "xy".index(p.plane)]
-    sigma = np.array([q.value for q in p.sigma])
     for index, screen in enumerate(screens):
-        a, b = every[:, index, 0, 0], every[:, index, 0, 1]
-        design = np.stack([a**2, 2 * a * b, b**2], -1)
-        known = float(np.median(p.points.known[[s == screen for s in p.points.screen]]))
-        size = np.sqrt(np.maximum(design @ sigma + known, 0.0))
+        found = fit.predict(settings, p.plane, screen=screen)
         style = ["-", "--", ":", "-."][index % 4]
         name = "fit" if len(screens) == 1 else f"fit at {screen}"
-        axes.plot(grid, 1e6 * size, style, color=COLOUR[p.plane], lw=1.6, label=name)
-        # In a scenario the beam's errors go with those of the calibration: no band of σ alone.
-        if fit.statement.closed and np.isfinite(p.covariance).all():
-            variance = np.einsum("ij,jk,ik->i", design, p.covariance, design)
-            half = p.error_scale * np.sqrt(variance) / (2.0 * np.maximum(size, 1e-9))
-            low, high = 1e6 * np.maximum(size - half, 0), 1e6 * (size + half)
-            axes.fill_between(grid, low, high, color=COLOUR[p.plane], alpha=0.15, lw=0)
+        axes.plot(grid, 1e6 * found.size, style, color=COLOUR[p.plane], lw=1.6, label=name)
+        if np.isfinite(found.error).all():
+            low, high = found.size - found.error, found.size + found.error
+            band = (1e6 * np.maximum(low, 0), 1e6 * high)
+            axes.fill_between(grid, *band, color=COLOUR[p.plane], alpha=0.15, lw=0)
     axes.legend(frameon=False, loc="best")
 
 

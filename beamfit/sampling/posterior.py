@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from beamfit.errors import InputError, nearest
+from beamfit.frames import frame_of
 from beamfit.quantity import Quantity, display_unit
 from beamfit.sampling.convergence import Diagnostics
 from beamfit.sampling.likelihood import LOG_NOISE
@@ -22,6 +23,7 @@ from beamfit.table import Table, html_of, json_of, plain_name, text_of
 
 if TYPE_CHECKING:
     from arviz import InferenceData
+    from pandas import DataFrame
 
 __all__ = ["Band", "Correlations", "Expected", "Interval", "Posterior", "Summary", "in_unit"]
 
@@ -398,6 +400,16 @@ class Posterior:
             },
         }
         return json_of(document)
+
+    def to_frame(self) -> DataFrame:
+        """Give a pandas data frame of all draws, one column a number, sampled or derived.
+
+        Raises
+        ------
+        InputError
+            If pandas is not installed.
+        """
+        return frame_of({name: values for name, (_, values) in self._numbers.items()})
 
     def to_arviz(self) -> InferenceData:
         """Convert to ArviZ, for its plots and diagnostics: walkers as chains.

@@ -11,6 +11,7 @@ import jax
 import numpy as np
 
 from beamfit.errors import InputError
+from beamfit.frames import quantity_frame
 from beamfit.lifetime.decay import HOUR
 from beamfit.quantity import Quantity, Status
 from beamfit.shown import shown
@@ -22,6 +23,8 @@ from beamfit.studies.decay.verdict import finding_of
 from beamfit.table import Table, cell, json_of, labelled, plain_name
 
 if TYPE_CHECKING:
+    from pandas import DataFrame
+
     from beamfit.sampling.posterior import Posterior
     from beamfit.sampling.priors import Distribution
 
@@ -190,6 +193,19 @@ class DecayFit:
             f"  chi²/dof {self.chi2:.4g}/{self.dof}, residual {self.rms_residual:.3g} mA rms"
         )
         return "\n".join(rows)
+
+    def to_frame(self) -> DataFrame:
+        """Give a pandas data frame of all numbers, one row a quantity.
+
+        Columns are value, error, error_raw, low_95, high_95 (NaN where there is none) and unit.
+
+        Raises
+        ------
+        InputError
+            If pandas is not installed.
+        """
+        rows = {(self.record, name): getattr(self, name) for name in UNITS}
+        return quantity_frame(rows, ("record", "quantity"))
 
     def to_json(self) -> dict[str, Any]:
         """Return the result as one JSON object, as `beamfit lifetime --json` prints it."""

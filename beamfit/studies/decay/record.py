@@ -4,13 +4,17 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from beamfit.errors import InputError
+from beamfit.frames import frame_of
 from beamfit.shown import shown
 from beamfit.table import Table
+
+if TYPE_CHECKING:
+    from pandas import DataFrame
 
 __all__ = ["Conditions", "DecayRecord", "Fault", "first_fault"]
 
@@ -230,6 +234,26 @@ class DecayRecord:
             f"{self.name}: {len(self)} readings over {self.span / 3600:.3g} h, "
             f"{self.current[0]:.6g} to {self.current[-1]:.6g} mA"
         )
+
+    def to_frame(self) -> DataFrame:
+        """Give a pandas data frame, its columns named as in a file; `read_decay_record` takes it.
+
+        Raises
+        ------
+        InputError
+            If pandas is not installed.
+        """
+        start, error = self.start or 0.0, self.error
+        columns = {"time_s": start + self.time, "beam_current_mA": self.current}
+        columns |= {} if error is None else {"beam_current_error_mA": error}
+        units = {
+            "rf_voltage": "rf_voltage_V",
+            "scraper_y": "scraper_y_m",
+            "pressure": "pressure_Pa",
+        }
+        conditions = self.conditions._asdict().items()
+        columns |= {units.get(n, n): v for n, v in conditions if v is not None}
+        return frame_of(columns)
 
     @property
     def headline(self) -> str:

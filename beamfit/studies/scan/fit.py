@@ -10,6 +10,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from beamfit.errors import InputError
+from beamfit.frames import quantity_frame
 from beamfit.greybox.problem import Problem
 from beamfit.optics.beamline import Beamline
 from beamfit.quantity import Quantity
@@ -19,6 +20,7 @@ from beamfit.studies.scan.assumptions import SCENARIOS, Anchor, Assumptions
 from beamfit.studies.scan.judged import judged_beam
 from beamfit.studies.scan.known import METHODS, WEIGHTS, see
 from beamfit.studies.scan.model import line_of
+from beamfit.studies.scan.predicted import Prediction, correlations_of, predicted_sizes
 from beamfit.studies.scan.questions import questions
 from beamfit.studies.scan.results import Parameter, PlaneFit, parameter_rows, result_rows
 from beamfit.studies.scan.scans import QuadScan
@@ -27,8 +29,10 @@ from beamfit.studies.scan.transport import rows_line
 from beamfit.table import Table, html_of, json_of, labelled, text_of
 
 if TYPE_CHECKING:
+    from pandas import DataFrame
+
     from beamfit.greybox.fit import Fit
-    from beamfit.sampling.posterior import Posterior
+    from beamfit.sampling.posterior import Correlations, Posterior
     from beamfit.sampling.priors import Distribution
 
 __all__ = ["EmittanceFit", "fit_emittance", "scenario_of"]
@@ -332,6 +336,71 @@ class EmittanceFit:
         from beamfit.studies.scan.posterior import beam_target
 
         return draw(beam_target(self, planes, noise, outliers, priors), **options)
+
+    def predict(
+        self, settings: Mapping[str, Any], plane: str | None = None, *, screen: str | None = None
+    ) -> Prediction:
+        """Predict the sizes of the fitted beam at other settings, with their errors.
+
+        Parameters
+        ----------
+        settings : mapping of str to float or array
+            Magnet to settings, shape (n,) or one number for all, in the unit of the scan's column
+            (of the lattice for a magnet that was not scanned). Others are as the lattice has them.
+        plane : str, optional
+            "x" or "y"; the first that was fitted if None.
+        screen : str, optional
+            Where; the scan's last screen if None.
+
+        Returns
+        -------
+        Prediction
+            ``size`` and ``error`` in m, shape (n,), at the mean energy of the scan.
+
+        Raises
+        ------
+        InputError
+            If a magnet or screen is not in the line, or the fit knows the transport at the
+            measured rows alone.
+
+        Examples
+        --------
+        >>> from beamfit.optics.elements import Drift, Quadrupole, Screen
+        >>> line = Beamline((Quadrupole("Q", 0.1), Drift("D", 2.0), Screen("S")), 135.0)
+        >>> sizes = [3.4e-4, 1.9e-4, 0.9e-4, 1.9e-4, 3.4e-4]
+        >>> scan = QuadScan({"Q": [-1.0, 1.5, 4.0, 6.5, 9.0]}, {"Q": "k1"}, {"x": sizes})
+        >>> fit_emittance(scan, line).predict({"Q": [0.0, 2.0]}).size.round(5).tolist()
+        [0.00028, 0.00016]
+        """
+        return predicted_sizes(self, settings, plane or self.planes[0].plane, screen)
+
+    def correlations(self, plane: str | None = None) -> Correlations:
+        """Correlation coefficients of one plane's σ11, σ12, σ22, emittance, β and α.
+
+        Parameters
+        ----------
+        plane : str, optional
+            "x" or "y"; the first that was fitted if None.
+
+        Returns
+        -------
+        Correlations
+            ``names`` and ``values``, shape (6, 6); NaN where the data do not determine the beam.
+        """
+        return correlations_of(self[plane or self.planes[0].plane])
+
+    def to_frame(self) -> DataFrame:
+        """Give a pandas data frame of all numbers, one row for each plane and quantity.
+
+        Columns are value, error, error_raw, low_95, high_95 (NaN where there is none) and unit.
+
+        Raises
+        ------
+        InputError
+            If pandas is not installed.
+        """
+        rows = {(p.plane, n): q for p in self.planes for n, q in p.quantities.items()}
+        return quantity_frame(rows, ("plane", "quantity"))
 
     def to_json(self) -> list[dict[str, Any]]:
         """Give the ``results`` list of the JSON contract."""

@@ -251,6 +251,15 @@ class PlaneFit:
     holds: str = "statistics only"
 
     @property
+    def quantities(self) -> dict[str, Quantity]:
+        """Every number with an error, by the name it has in JSON."""
+        names = ("emittance", "normalized_emittance", "beta", "alpha")
+        found = {name: getattr(self, name) for name in names}
+        found |= zip(("sigma11", "sigma12", "sigma22"), self.sigma, strict=True)
+        at_screen = {f"screen_{n}": getattr(self.screen, n) for n in ("beta", "alpha", "size")}
+        return found | at_screen | {"rms_residual": self.rms_residual}
+
+    @property
     def headline(self) -> str:
         """The plane, its status and its emittance in a line."""
         status = cell(self.status)

@@ -8,14 +8,18 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from os import PathLike
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from beamfit.errors import InputError, nearest
+from beamfit.frames import frame_of
 from beamfit.particles import total_energy
 from beamfit.shown import shown
 from beamfit.table import Table
+
+if TYPE_CHECKING:
+    from pandas import DataFrame
 
 __all__ = [
     "POSSIBLE",
@@ -226,6 +230,25 @@ class QuadScan:
         rows = [[f"{values[i]:.5g}" for values in columns.values()] for i in few]
         more = f"the first {len(few)} of {len(self)} rows" if len(few) < len(self) else ""
         return (Table(self.headline, list(columns), rows, more, numeric=True),)
+
+    def to_frame(self) -> DataFrame:
+        """Give a pandas data frame, its columns named as in a file; `read_quad_scan` takes it.
+
+        Raises
+        ------
+        InputError
+            If pandas is not installed.
+        """
+        named = {"total": "energy_MeV", "kinetic": "kinetic_energy_MeV", "momentum": "momentum_MeV"}
+        columns = {f"{name}_{self.units[name]}": v for name, v in self.settings.items()}
+        columns |= {f"size_{p}_m": v for p, v in self.size.items()}
+        columns |= {f"size_{p}_error_m": v for p, v in self.error.items()}
+        for p, r in (self.transfer or {}).items():
+            columns |= {f"{name}_{p}": r[:, i] for i, name in enumerate(("r11", "r12", "r16"))}
+        further = {named[self.energy_kind]: self.energy, "screen": self.screen}
+        further |= {"resolution_m": self.resolution, "energy_spread": self.energy_spread}
+        further |= {"shots": self.shots}
+        return frame_of(columns | {k: v for k, v in further.items() if v is not None})
 
     def rows(self, plane: str) -> PlaneRows:
         """Select the rows in which one plane was measured.
