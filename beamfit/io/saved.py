@@ -36,7 +36,8 @@ HOMES = {
     "NetworkStrength": f"{SCAN}.focusing_network",
     **dict.fromkeys(("DecayRecord", "Conditions"), f"{DECAY}.record"),
     "DecayFit": f"{DECAY}.fit",
-    "Separability": f"{DECAY}.verdict",
+    "Separability": f"{DECAY}.evidence",
+    **dict.fromkeys(("ConstantA", "LifetimeLaw", "Change"), f"{DECAY}.departures"),
     **dict.fromkeys(("Beamline", "Design"), f"{OPTICS}.beamline"),
     **dict.fromkeys(
         ("Drift", "Quadrupole", "ThinLens", "SectorDipole", "Marker", "Screen", "TransferMatrix"),

@@ -3,12 +3,14 @@
 import json
 import random
 import re
+from importlib import import_module
 
 import numpy as np
 import pytest
 
 import beamfit
 from beamfit.errors import InputError
+from beamfit.io.saved import HOMES
 from beamfit.table import json_of
 
 
@@ -127,3 +129,8 @@ def test_mutated_files_load_or_are_refused(every, tmp_path):
         refused += said is not None
         assert "\n" not in (said or "")
     assert refused > 100
+
+
+def test_every_kind_of_value_is_where_the_list_says():
+    for name, home in HOMES.items():
+        assert getattr(import_module(home), name).__module__ == home
