@@ -8,8 +8,8 @@ import click
 
 import beamfit
 from beamfit.cli.options import command_line, options
-from beamfit.io.line import build_line, read_lattice
-from beamfit.io.measurement import read_quad_scan
+from beamfit.io.inputs import read_inputs
+from beamfit.io.line import build_line
 from beamfit.io.result import results_text
 from beamfit.studies.scan.assumptions import Assumptions
 from beamfit.studies.scan.typed import energies_of, goal_of
@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 
 __all__ = ["design"]
 
+# What `read_inputs` takes besides the scan.
+GIVEN = ["lattice", "use", "first", "last", "screen", "energy", "ignore", "skip_bad"]
 EXAMPLE = """\b
 Examples:
   beamfit design scan.csv --lattice line.toml --vary Q2=0:5 --goal 0.8%
@@ -28,7 +30,7 @@ Examples:
 
 
 @click.command(epilog=EXAMPLE)
-@options("scan ignore skip-bad lattice use energy scenario prior bounds anchor vary")
+@options("scan ignore skip-bad lattice use from to screen energy scenario prior bounds anchor vary")
 @click.option(
     "--energies", metavar="MEV,MEV", default="", help="Further energies the beam can be had at."
 )
@@ -44,11 +46,6 @@ Examples:
 @options("json")
 def design(
     scan: str,
-    ignore: tuple[str, ...],
-    skip_bad: bool,
-    lattice: str,
-    use: str | None,
-    energy: float | None,
     scenario: str,
     limits: dict[str, tuple[float, float]],
     energies: str,
@@ -63,11 +60,10 @@ def design(
     Magnets move between the limits of --vary, or half the scanned range beyond it. For a
     scenario that the data do not identify it says which kind of measurement would.
     """
-    Assumptions(**told).check_scenario(scenario)
     aim, others = None if goal is None else goal_of(goal), energies_of(energies)
-    measured = read_quad_scan(scan, ignore=ignore, skip_bad=skip_bad)
-    described = read_lattice(lattice, use=use, energy=energy)
-    described.check_scan(measured)
+    given = {name: told.pop(name) for name in GIVEN}
+    Assumptions(**told).check_scenario(scenario)
+    measured, described, inputs, _ = read_inputs(scan, **given)
     described.check_magnets(limits)
     described.check_energies(others)
 
@@ -77,7 +73,6 @@ def design(
     wanted = {"criterion": criterion, "goal": aim, "count": count, "energies": others}
     advice = plan_measurements(fit, limits=limits or None, **wanted)
     if as_json:
-        inputs = {scan: measured.sha256, lattice: described.sha256}
         click.echo(results_text([advice], inputs, command_line()))
     else:
         _show(advice, f"{fit.scan.name} on {fit.line.name}")

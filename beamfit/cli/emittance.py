@@ -25,7 +25,8 @@ if TYPE_CHECKING:
 __all__ = ["emittance"]
 
 # What `read_inputs` takes besides the scan.
-GIVEN = ["lattice", "use", "energy", "particle", "ignore", "skip_bad", "size_method"]
+GIVEN = ["lattice", "use", "first", "last", "screen", "energy", "particle"]
+GIVEN += ["ignore", "skip_bad", "size_method"]
 EXAMPLE = """\b
 Examples:
   beamfit emittance measurements/lcls_otr2.csv --lattice lattices/lcls_otr2.toml
@@ -40,7 +41,7 @@ Examples:
 
 
 @click.command(epilog=EXAMPLE)
-@options("scan ignore skip-bad size-method maybe-lattice use energy particle")
+@options("scan ignore skip-bad size-method maybe-lattice use from to screen energy particle")
 @click.option(
     "--plane",
     type=click.Choice(["x", "y", "both"]),

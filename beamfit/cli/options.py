@@ -77,6 +77,15 @@ SHARED: dict[str, Callable[..., Any]] = {
     "use": click.option(
         "--use", metavar="NAME", help="Line or sequence of a lattice with several."
     ),
+    "from": click.option(
+        "--from", "first", metavar="NAME", help="Element with which the line begins."
+    ),
+    "to": click.option("--to", "last", metavar="NAME", help="Element with which the line ends."),
+    "screen": click.option(
+        "--screen",
+        metavar="NAME",
+        help="Screen or marker at which sizes are measured or wanted; the last screen unless said.",
+    ),
     "energy": click.option(
         "--energy",
         type=float,

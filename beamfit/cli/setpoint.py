@@ -35,7 +35,7 @@ Examples:
 
 
 @click.command(epilog=EXAMPLE)
-@options("lattice use energy")
+@options("lattice use from to screen energy")
 @click.option(
     "--sigma",
     metavar="S11,S12,S22",
@@ -62,11 +62,12 @@ Examples:
     show_default=True,
     help="Plane of --sigma and of targets that name none.",
 )
-@click.option("--screen", metavar="NAME", help="Where; the last screen by default.")
 @options("json")
 def setpoint(
     lattice: str,
     use: str | None,
+    first: str | None,
+    last: str | None,
     energy: float | None,
     sigma: str | None,
     fitted: str | None,
@@ -86,7 +87,7 @@ def setpoint(
     if not limits:
         raise InputError("no --vary", "MAGNET=LOW:HIGH such as Q2=0:10")
     targets = [target_of(text, plane) for text in target]
-    described = read_lattice(lattice, use=use, energy=energy)
+    described = read_lattice(lattice, use=use, energy=energy, first=first, last=last, screen=screen)
     described.check_magnets(limits)
     beams = _given(sigma, plane) if fitted is None else _fitted(fitted, described, targets, energy)
     line = build_line(described)  # JAX from here on
@@ -113,7 +114,7 @@ def _fitted(
     path: str, lattice: LatticeFile, targets: Sequence[Target], energy: float | None
 ) -> dict[str, Beam]:
     """Read --fit, and refuse before JAX is loaded what was measured at another energy."""
-    beams = read_fitted_beams(path, lattice.rest_energy)
+    beams = read_fitted_beams(path, lattice.rest_energy, lattice.sha256)
     asked_for = {t.plane for t in targets}
     try:
         common_energy({p: beam for p, beam in beams.items() if p in asked_for}, energy)

@@ -44,6 +44,9 @@ def read_inputs(
     use: str | None = None,
     energy: float | None = None,
     particle: str | None = None,
+    first: str | None = None,
+    last: str | None = None,
+    screen: str | None = None,
     ignore: Iterable[str] = (),
     skip_bad: bool = False,
     size_method: str | None = None,
@@ -54,7 +57,7 @@ def read_inputs(
     ----------
     scan : str
         CSV, HDF5, or a file of emittance_gui (``.mat``).
-    lattice, use, energy, particle
+    lattice, use, energy, particle, first, last, screen
         As for `beamfit.io.line.lattice_of`. A file of emittance_gui has its own matrices, which a
         lattice replaces.
     ignore, skip_bad
@@ -71,12 +74,14 @@ def read_inputs(
     InputError
         If a file cannot be used, the two do not fit together, or an option does not apply.
     """
+    part = {"use": use, "energy": energy, "particle": particle}
+    part |= {"first": first, "last": last, "screen": screen}
     if not is_emittance_gui(scan):
         if size_method is not None:
             expected = "none: only a .mat file of emittance_gui has several"
             raise InputError(f"--size-method {size_method}", expected, path=scan)
         measured = read_quad_scan(scan, ignore=ignore, skip_bad=skip_bad)
-        described = lattice_of(measured, lattice, use=use, energy=energy, particle=particle)
+        described = lattice_of(measured, lattice, **part)
         return Inputs(measured, described, _digests(scan, measured, lattice, described))
     if skip_bad or tuple(ignore):
         expected = "none: failed settings are left out as the file marks them"
@@ -84,13 +89,13 @@ def read_inputs(
     gui = read_emittance_gui(scan)
     measured = gui.scan(size_method)
     if lattice is None:
-        given = {"--use": use, "--energy": energy, "--particle": particle}
-        if told := next((name for name, value in given.items() if value is not None), None):
-            raise InputError(f"{told} for a MATLAB file", "none: the file says it", path=scan)
+        if told := next((name for name, value in part.items() if value is not None), None):
+            said = {"first": "from", "last": "to"}.get(told, told)
+            raise InputError(f"--{said} for a MATLAB file", "none: the file says it", path=scan)
         return Inputs(measured, gui.lattice, {scan: measured.sha256}, gui)
     note = "The lattice's matrices are used, and not those of the file."
     measured = replace(measured, transfer=None, energy=None, notes=(*measured.notes, note))
-    described = lattice_of(measured, lattice, use=use, energy=energy, particle=particle)
+    described = lattice_of(measured, lattice, **part)
     return Inputs(measured, described, _digests(scan, measured, lattice, described))
 
 

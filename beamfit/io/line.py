@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import replace
 from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from beamfit.errors import InputError
+from beamfit.errors import InputError, nearest
 from beamfit.io.lattice import LatticeFile, element_of, read_toml_lattice
 from beamfit.particles import REST_ENERGY, expected_energy
 from beamfit.studies.scan.scans import QuadScan
@@ -14,7 +16,7 @@ from beamfit.studies.scan.scans import QuadScan
 if TYPE_CHECKING:
     from beamfit.optics.beamline import Beamline
 
-__all__ = ["build_line", "lattice_of", "load_lattice", "read_lattice"]
+__all__ = ["build_line", "lattice_of", "load_lattice", "part_of", "read_lattice"]
 
 # What the place is called where matrices of rows begin.
 START = "start"
@@ -22,7 +24,13 @@ FOREIGN = {".madx", ".seq", ".mad8", ".mad", ".lte", ".ele", ".elegant"}
 
 
 def load_lattice(
-    path: str | PathLike[str], *, use: str | None = None, energy: float | None = None
+    path: str | PathLike[str],
+    *,
+    use: str | None = None,
+    energy: float | None = None,
+    first: str | None = None,
+    last: str | None = None,
+    screen: str | None = None,
 ) -> Beamline:
     """Read a beam line from a file.
 
@@ -35,6 +43,8 @@ def load_lattice(
         Which line or sequence of a MAD-X or elegant file.
     energy : float, optional
         Total energy in MeV of an elegant file, which carries none; overrides a MAD-X beam.
+    first, last, screen
+        As for `part_of`.
 
     Returns
     -------
@@ -64,14 +74,94 @@ def load_lattice(
     >>> load_lattice(file).magnets
     ('Q',)
     """
-    file = read_lattice(path, use=use, energy=energy)
+    file = read_lattice(path, use=use, energy=energy, first=first, last=last, screen=screen)
     return build_line(file)
 
 
+def part_of(
+    file: LatticeFile, first: str | None = None, last: str | None = None, screen: str | None = None
+) -> LatticeFile:
+    """Cut a lattice, and say where sizes are measured unless a scan says.
+
+    Parameters
+    ----------
+    file : LatticeFile
+        The lattice.
+    first, last : str, optional
+        Elements with which the part begins and ends, both in it, as in a RANGE of MAD-X.
+    screen : str, optional
+        Screen or marker at which sizes are measured. Screens after it remain as markers.
+
+    Returns
+    -------
+    LatticeFile
+        Without the design Twiss parameters where their place is cut away.
+
+    Raises
+    ------
+    InputError
+        If there is no such element, or the last stands before the first.
+
+    Examples
+    --------
+    >>> kinds = ("marker", "drift", "screen", "marker")
+    >>> elements = tuple({"type": k, "name": n, "length_m": 1.0} for k, n in zip(kinds, "ABCD"))
+    >>> whole = LatticeFile("a.toml", "", "a", 135.0, "electron", 0.0, elements, {})
+    >>> part = part_of(whole, "B", "D", screen="D")
+    >>> [e["name"] for e in part.elements], part.default_screen
+    (['B', 'C', 'D'], 'D')
+    """
+    names = [e["name"] for e in file.elements]
+    for option, name in (("--from", first), ("--to", last)):
+        if name is not None and name not in names:
+            raise InputError(f"{option} {name}: no such element", nearest(name, names), file.path)
+    if screen is not None and screen not in file.places:
+        known = nearest(screen, file.places) + ", a screen or marker"
+        raise InputError(f"--screen {screen}: no such place", known, file.path)
+    start = 0 if first is None else names.index(first)
+    end = len(names) if last is None else len(names) - names[::-1].index(last)
+    if start >= end:
+        expected = "the upstream element after --from"
+        raise InputError(f"--to {last}, which stands before --from {first}", expected, file.path)
+    elements = file.elements[start:end]
+    if screen is not None:
+        elements = _with_screen(elements, screen)
+    left = {e["name"] for e in elements} | {e.get("supply") for e in elements}
+    if screen is not None and screen not in left:
+        raise InputError(f"--screen {screen}, which is cut away", "a place within", file.path)
+    design = file.design if file.design and file.design["at"] in left else None
+    calibrations = {name: unit for name, unit in file.calibrations.items() if name in left}
+    return replace(file, elements=elements, design=design, calibrations=calibrations)
+
+
+def _with_screen(
+    elements: tuple[Mapping[str, Any], ...], screen: str
+) -> tuple[Mapping[str, Any], ...]:
+    """Make a place the last screen."""
+    found, passed = [], False
+    for e in elements:
+        if e["name"] == screen and e["type"] in ("screen", "marker"):
+            e, passed = dict(e) | {"type": "screen"}, True
+        elif passed and e["type"] == "screen":
+            e = {"type": "marker", "name": e["name"]}
+        found.append(e)
+    return tuple(found)
+
+
 def read_lattice(
-    path: str | PathLike[str], *, use: str | None = None, energy: float | None = None
+    path: str | PathLike[str],
+    *,
+    use: str | None = None,
+    energy: float | None = None,
+    first: str | None = None,
+    last: str | None = None,
+    screen: str | None = None,
 ) -> LatticeFile:
     """Read and check a lattice file of any kind without building it; see `load_lattice`."""
+    return part_of(_whole(path, use, energy), first, last, screen)
+
+
+def _whole(path: str | PathLike[str], use: str | None, energy: float | None) -> LatticeFile:
     if Path(path).suffix.lower() in FOREIGN:
         from beamfit.io.sequence import read_sequence
 
@@ -91,6 +181,9 @@ def lattice_of(
     use: str | None = None,
     energy: float | None = None,
     particle: str | None = None,
+    first: str | None = None,
+    last: str | None = None,
+    screen: str | None = None,
 ) -> LatticeFile:
     """Read the lattice of a scan, or make that of rows which have matrices of their own.
 
@@ -100,7 +193,7 @@ def lattice_of(
         The scan.
     path : str, optional
         The lattice file; None where the rows have matrices.
-    use, energy
+    use, energy, first, last, screen
         As for `load_lattice`; the energy in MeV also of rows without a lattice.
     particle : str, optional
         Of rows without a lattice, electrons if None.
@@ -122,12 +215,13 @@ def lattice_of(
             raise scan.unusable("a scan and no lattice", expected)
         if particle is not None:
             raise InputError("--particle with a lattice", "none: the lattice says it", path=path)
-        file = read_lattice(path, use=use, energy=energy)
+        part = {"first": first, "last": last, "screen": screen}
+        file = read_lattice(path, use=use, energy=energy, **part)
         file.check_scan(scan)
         return file
-    if path is not None or use is not None:
-        found = "rows with matrices of their own, and a lattice"
-        raise scan.unusable(found, "no --lattice, or no columns r11_x, r12_x, ...")
+    if any(told is not None for told in (path, use, first, last, screen)):
+        found = "rows with matrices of their own, and a lattice or a part of one"
+        raise scan.unusable(found, "no --lattice, --use, --from, --to and --screen")
     return _rows_lattice(scan, energy, particle or "electron")
 
 

@@ -57,7 +57,9 @@ def results_text(
     return json.dumps(json_of(document | further), indent=2, allow_nan=False)
 
 
-def read_fitted_beams(path: str | PathLike[str], rest_energy: float) -> dict[str, Beam]:
+def read_fitted_beams(
+    path: str | PathLike[str], rest_energy: float, lattice: str | None = None
+) -> dict[str, Beam]:
     """Read the fitted beam of each plane.
 
     Parameters
@@ -66,6 +68,9 @@ def read_fitted_beams(path: str | PathLike[str], rest_energy: float) -> dict[str
         A file with the JSON object of ``beamfit emittance --json``.
     rest_energy : float
         Of the particle, MeV: a file may hold no energy but both emittances, whose ratio is βγ.
+    lattice : str, optional
+        SHA-256 of the lattice file that the beam is for. A result that does not say in which line
+        it was fitted must name it among its inputs.
 
     Returns
     -------
@@ -76,8 +81,8 @@ def read_fitted_beams(path: str | PathLike[str], rest_energy: float) -> dict[str
     ------
     InputError
         If the file cannot be read or is something else, if a number in it is missing or cannot
-        be, or if the beam was fitted together with a network: it belongs to the network's optics,
-        which the file does not hold.
+        be, if the beam was fitted with another lattice, or together with a network: it belongs to
+        the network's optics, which the file does not hold.
 
     Examples
     --------
@@ -94,6 +99,10 @@ def read_fitted_beams(path: str | PathLike[str], rest_energy: float) -> dict[str
         document = json.loads(Path(path).read_text())
         entries = document["results"]
         found = {entry["plane"]: _beam(entry, rest_energy) for entry in entries}
+        told = all("line" in entry for entry in entries) or "inputs" not in document
+        if lattice is not None and not told and lattice not in document["inputs"].values():
+            said = "a beam that was fitted with another lattice, or with another version of it"
+            raise InputError(said, "a fit with this lattice")
     except InputError as error:
         error.path = path
         raise
@@ -120,7 +129,8 @@ def _beam(entry: Mapping[str, Any], rest_energy: float) -> Beam:
         if entry.get("scenario") == "calibration"
     }
     energy = _energy(entry, rest_energy, where)
-    return Beam(np.array(sigma), covariance, numbers, energy, _doubt(entry))
+    line = (entry.get("line") or {}).get("sha256")
+    return Beam(np.array(sigma), covariance, numbers, energy, _doubt(entry), line)
 
 
 def _energy(entry: Mapping[str, Any], rest_energy: float, where: str) -> float | None:

@@ -17,7 +17,7 @@ from typing import Any
 from beamfit.errors import InputError, nearest
 from beamfit.io.files import read_text
 from beamfit.io.lattice import LatticeFile
-from beamfit.io.sequence_elements import Source, element_tables
+from beamfit.io.sequence_elements import NOTHING_AT_ZERO, Source, element_tables
 from beamfit.particles import REST_ENERGY, expected_energy
 
 __all__ = ["read_sequence"]
@@ -33,7 +33,7 @@ DIALECTS = {
 }
 # What the parsers do not know but the programs do, as the type it is like to first order.
 ALSO_MAD = {
-    "drift": ("rcollimator", "ecollimator", "placeholder"),
+    "drift": ("rcollimator", "ecollimator", "placeholder", *NOTHING_AT_ZERO),
     "monitor": ("imonitor", "blmonitor", "slmonitor", "instrument", "profile", "wire"),
 }
 ALSO_ELEGANT = {"MARK": ("WATCH", "MARKER"), "DRIF": ("EDRIFT", "CSRDRIFT", "LSCDRIFT")}
@@ -42,6 +42,11 @@ ALSO_ELEGANT = {"MARK": ("WATCH", "MARKER"), "DRIF": ("EDRIFT", "CSRDRIFT", "LSC
 HARMFUL = re.compile(r"__|_frame|f_back|f_globals|f_builtins")
 # pyAT takes the parameters of an element that is alone in an elegant LINE for its members.
 ALONE = re.compile(r"(LINE\s*=\s*\([^,()]*)\)", re.IGNORECASE)
+# MAD-X takes a name that nobody defines for zero, pyAT does not know it. Kicks and what focuses to
+# second order are often such names in published files, and are nothing to a linear line.
+NO_MATTER = re.compile(r",\s*(?:[hv]?kick|k[23]s?)\s*:?=\s*[^,;]*", re.IGNORECASE)
+# MAD-X reads these words as it reads all others, in either spelling.
+REFERENCE = re.compile(r"(\bREFER\s*=\s*)\"?(CENTER|CENTRE|ENTRY|EXIT)\"?", re.IGNORECASE)
 ENERGIES = ("energy", "pc", "gamma", "beta", "brho")
 
 
@@ -159,6 +164,8 @@ def _parse(parser: Any, source: Source) -> None:
             raise ValueError("a name that no lattice needs and that could run code")
         if not _balanced(text):  # on which the parser would never end
             raise ValueError("parentheses that do not match")
+        if source.dialect != ELEGANT:
+            text = REFERENCE.sub(_reference, NO_MATTER.sub("", text))
         if source.dialect == ELEGANT:
             parser.rpn.stack.clear()  # a "% 3.7 sto k" leaves its number there
             text = ALONE.sub(r"\1,)", text)
@@ -171,6 +178,10 @@ def _parse(parser: Any, source: Source) -> None:
         parser.parse_lines(source.text.splitlines(keepends=True), final=False)
     except Exception as error:  # whatever evaluating an expression may raise
         raise _unparsed(source, error) from None
+
+
+def _reference(found: re.Match[str]) -> str:
+    return found[1] + found[2].lower().replace("center", "centre")
 
 
 def _balanced(text: str) -> bool:

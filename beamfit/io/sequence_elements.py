@@ -17,7 +17,7 @@ import numpy as np
 
 from beamfit.errors import InputError
 
-__all__ = ["Source", "element_tables"]
+__all__ = ["NOTHING_AT_ZERO", "Source", "element_tables"]
 
 # Parameters that bend, focus, couple or accelerate in a way beamfit does not model.
 UNMODELLED = {
@@ -36,6 +36,19 @@ UNMODELLED = {
     "ey": "an electric field",
     "kill_ent_fringe": "an edge switched off",
     "kill_exi_fringe": "an edge switched off",
+}
+# Elements of MAD-X that are nothing where some parameter is zero; pyAT does not know them.
+NOTHING_AT_ZERO = {
+    "srotation": ("angle",),
+    "xrotation": ("angle",),
+    "yrotation": ("angle",),
+    "translation": ("dx", "dy", "ds"),
+    "dipedge": ("h",),
+    "nllens": ("knll",),
+    "twcavity": ("volt",),
+    "hacdipole": ("volt",),
+    "vacdipole": ("volt",),
+    "beambeam": ("charge",),
 }
 EDGES = ("edge1_effects", "edge2_effects")
 
@@ -146,6 +159,9 @@ class _Translation:
         for key, meaning in UNMODELLED.items():
             if self.number(key) != 0.0:
                 raise self.refuse(f"with {meaning} ({key.upper()} = {self.number(key):g})")
+        for key in NOTHING_AT_ZERO.get(self.type.lower(), ()):
+            if self.number(key) != 0.0:
+                raise self.refuse(f"with {key.upper()} = {self.number(key):g}")
         for key in EDGES:
             if key in self.said and self.number(key) == 0.0:
                 raise self.refuse(f"with an edge switched off ({key.upper()} = 0)")

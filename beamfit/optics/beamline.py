@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import replace
+from dataclasses import fields, is_dataclass, replace
 from functools import cached_property
 from itertools import groupby
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import numpy as np
 from jax.typing import ArrayLike
 
 from beamfit.errors import InputError, nearest
@@ -19,6 +21,16 @@ from beamfit.shown import brief, shown
 from beamfit.table import Table
 
 __all__ = ["Beamline", "Design"]
+
+
+def _plain(value: Any) -> Any:
+    """What a value is made of: names of classes, texts and numbers."""
+    if is_dataclass(value):
+        return [type(value).__name__, *(_plain(getattr(value, f.name)) for f in fields(value))]
+    if isinstance(value, tuple | list):
+        return [_plain(v) for v in value]
+    return value if isinstance(value, str | bool) or value is None else np.asarray(value).tolist()
+
 
 # Elements of a line that a notebook shows.
 MOST_SHOWN = 40
@@ -150,6 +162,12 @@ class Beamline:
     def length(self) -> ArrayLike:
         """Length along the reference orbit, m."""
         return sum(e.length for e in self.elements)
+
+    @cached_property
+    def digest(self) -> str:
+        """SHA-256 of elements and supplies, not of the energy: what a fitted beam belongs to."""
+        said = repr([_plain(self.elements), list(self.supplies), float(self.mass)])
+        return hashlib.sha256(said.encode()).hexdigest()
 
     def between(self, first: str, last: str) -> Beamline:
         """Cut out the line from the exit of ``first`` to the exit of ``last``.

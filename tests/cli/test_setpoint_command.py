@@ -189,3 +189,65 @@ def test_a_bare_beam_says_why_it_has_no_errors(run):
     assert (
         "No errors: the beam was given without its own" in json.loads(out)["results"][0]["message"]
     )
+
+
+GTF = ("--lattice", "lattices/gtf.toml")
+LCLS = ("--lattice", "lattices/lcls_otr2.toml")
+WANTED = ("--vary", "Q2=0:5", "--target", "size=200um")
+
+
+def fitted(run, path, *options):
+    status, out, _ = run("emittance", *options, "--json")
+    assert status == 0
+    path.write_text(out)
+    return json.loads(out)
+
+
+def test_a_beam_of_another_line_is_refused(run, tmp_path, root):
+    """Its matrix holds where its own line begins."""
+    fit = tmp_path / "fit.json"
+    document = fitted(run, fit, "measurements/lcls_otr2.csv", *LCLS)
+    status, out, err = run("setpoint", *GTF, "--fit", fit, *WANTED)
+    assert (status, out, err.count("\n")) == (2, "", 1)
+    assert "fitted in another line than 'GTF'" in err
+    # A result of a version that did not say the line names the lattice among its inputs.
+    for entry in document["results"]:
+        del entry["line"]
+    fit.write_text(json.dumps(document))
+    status, out, err = run("setpoint", *GTF, "--fit", fit, *WANTED)
+    assert (status, out) == (2, "")
+    assert "another lattice" in err
+    assert "fit.json" in err
+    status, _, _ = run("setpoint", *LCLS, "--fit", fit, "--vary", "Q525=-6:6", *WANTED[2:])
+    assert status == 0
+
+
+def test_comments_of_a_lattice_and_its_energy_do_not_make_another_line(run, tmp_path, root):
+    fit, same = tmp_path / "fit.json", tmp_path / "same.toml"
+    fitted(run, fit, "measurements/gtf_simulated.csv", *GTF)
+    text = (root / "lattices/gtf.toml").read_text()
+    same.write_text("# copied\n" + text.replace("energy_MeV = 30.5", "momentum_MeV = 30.6"))
+    assert run("setpoint", "--lattice", same, "--fit", fit, *WANTED)[0] == 0
+    for change in (("1.834615", "1.834616"), ("slope = 167.23", "slope = 167.24")):
+        same.write_text(text.replace(*change))
+        assert run("setpoint", "--lattice", same, "--fit", fit, *WANTED)[0] == 2
+    status, _, err = run("setpoint", *GTF, "--from", "Q2", "--fit", fit, *WANTED)
+    assert (status, "another line" in err) == (2, True)
+
+
+def test_a_magnet_that_was_not_scanned_may_be_set(run, tmp_path):
+    fit = tmp_path / "fit.json"
+    fitted(run, fit, "measurements/gtf_simulated.csv", *GTF)
+    status, out, _ = run("setpoint", *GTF, "--fit", fit, "--vary", "Q1=-1:1", *WANTED[2:], "--json")
+    assert status == 0
+    assert list(json.loads(out)["results"][0]["settings"]) == ["Q1"]
+    scan = "measurements/gtf_simulated.csv"
+    status, out, _ = run("design", scan, *GTF, "--vary", "Q1=-1:1", "--count", "1", "--json")
+    assert status == 0
+    assert "Q1" in json.loads(out)["results"][0]["next"][0]["settings"]
+
+
+def test_a_size_of_nothing_is_refused_in_words(run):
+    status, _, err = run(*APPENDIX_D[:-2], "--target", "size=0um")
+    assert (status, err.count("\n")) == (2, 1)
+    assert "no beam gets to zero" in err

@@ -345,3 +345,82 @@ def test_any_damage_is_read_or_refused(tmp_path_factory, name, start, length, da
         return
     assert str(path) in said
     assert "\n" not in said
+
+
+REFERENCES = ["refer=centre", "REFER=CENTER", "refer=Entry", "REFER = EXIT", 'refer="center"', ""]
+
+
+@pytest.mark.parametrize("refer", REFERENCES)
+def test_every_way_of_counting_places_is_that_of_madx(refer, written):
+    cpymad = pytest.importorskip("cpymad.madx", reason="cpymad is not installed")
+    text = MADX.replace("refer=centre", refer).replace("l=3.0, ;", "l=3.0;")
+    if "entry" in refer.lower() or "exit" in refer.lower():
+        text = text.replace("at=0.06", "at=0.3").replace("at=2.0", "at=2.1")
+    ours = load_lattice(written("line.madx", text)).upto("OTR").matrix()
+    with cpymad.Madx(stdout=False) as madx:
+        madx.input(text + "use, sequence=LC; select, flag=twiss, clear;")
+        table = madx.twiss(sequence="LC", betx=1, bety=1, rmatrix=True).dframe()
+    row = table[table.name.str.startswith("otr")].iloc[-1]
+    for plane, (i, j) in (("x", (1, 2)), ("y", (3, 4))):
+        theirs = [[row[f"re{a}{b}"] for b in (i, j)] for a in (i, j)]
+        np.testing.assert_allclose(getattr(ours, plane)[:2, :2], theirs, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    "element",
+    [
+        "hkicker, l=0.1, kick:=nobody.sets.it",
+        "kicker, hkick:=ch1, vkick:=cv1*2",
+        "vkicker, l=0.1, kick=1e-4",
+        "tkicker, l=0.1",
+        "sextupole, l=0.1, k2:=ks1",
+        "srotation, angle=0",
+        "translation, dx=0",
+        "twcavity, l=0.1, volt=0",
+        "dipedge, h=0, e1=0.1",
+    ],
+)
+def test_what_is_nothing_to_a_linear_line_is_its_length(element, written):
+    text = MADX.replace("hkicker, l=0.1, kick=0", element)
+    found = load_lattice(written("line.madx", text)).upto("OTR").matrix()
+    expected = load_lattice(written("whole.madx", MADX)).upto("OTR").matrix()
+    np.testing.assert_allclose(found.planes, expected.planes, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("element", "word"),
+    [
+        ("srotation, angle=0.1", "ANGLE"),
+        ("translation, dx=1e-3", "DX"),
+        ("dipedge, h=0.2, e1=0.1", "H = 0.2"),
+        ("twcavity, l=0.1, volt=1", "VOLT"),
+        ("quadrupole, l=0.1, k1:=nobody.sets.it", "nobody"),
+    ],
+)
+def test_what_is_something_is_still_refused(element, word, written):
+    text = MADX.replace("hkicker, l=0.1, kick=0", element)
+    said = refused(written("line.madx", text))
+    assert word.lower() in said.lower()
+
+
+def test_a_part_of_a_line_with_a_marker_for_a_screen(written):
+    text = MADX.replace("LC: sequence", "M1: marker;\nLC: sequence").replace(
+        "BPM, at=2.0", "M1, at=1.5;\nBPM, at=2.0"
+    )
+    path = written("line.madx", text)
+    whole = load_lattice(path)
+    assert whole.screens == ("BPM", "OTR")
+    part = load_lattice(path, first="B1", last="BPM", screen="M1")
+    assert part.screens == ("M1",)
+    expected = (
+        whole.between("drift_1", "M1") if "drift_1" in [e.name for e in whole.elements] else 0
+    )
+    np.testing.assert_allclose(part.upto("M1").matrix().planes, expected.matrix().planes)
+    for options, words in (
+        ({"first": "B2"}, "--from B2"),
+        ({"last": "BPM1"}, "did you mean BPM"),
+        ({"first": "OTR", "last": "Q1"}, "before --from OTR"),
+        ({"screen": "Q1"}, "a screen or marker"),
+        ({"screen": "OTR", "last": "BPM"}, "cut away"),
+    ):
+        assert words in refused(path, **options)

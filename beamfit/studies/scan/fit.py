@@ -404,7 +404,8 @@ class EmittanceFit:
 
     def to_json(self) -> list[dict[str, Any]]:
         """Give the ``results`` list of the JSON contract."""
-        common = {"notes": list(self.notes)} if self.notes else {}
+        line = {"name": self.line.name, "sha256": self.seen.line.digest}
+        common = {"line": line} | ({"notes": list(self.notes)} if self.notes else {})
         entries = [p.to_json() | {"energy": self._energy.to_json()} | common for p in self.planes]
         own = {
             "scenario": self.scenario,

@@ -54,6 +54,8 @@ class Beam(NamedTuple):
         Total energy at which it was measured, MeV; None for the line's.
     doubt : str or None
         Why a fit does not determine it; None if it does.
+    line : str or None
+        Digest of the line that it was fitted in (`Beamline.digest`), to be held against another.
     """
 
     sigma: np.ndarray
@@ -61,6 +63,7 @@ class Beam(NamedTuple):
     calibration: Mapping[str, float] = MappingProxyType({})
     energy: float | None = None
     doubt: str | None = None
+    line: str | None = None
 
 
 def common_energy(beams: Mapping[str, Beam], asked: float | None = None) -> float | None:
@@ -148,6 +151,11 @@ def checked_place(
         _check_target(beams, target)
     for plane, beam in beams.items():
         _check_beam(plane, beam.sigma)
+        if beam.line not in (None, line.digest):
+            raise InputError(
+                f"a beam in plane {plane} that was fitted in another line than '{line.name}'",
+                "the lattice of that fit, or a fit in this one: a beam holds where its line begins",
+            )
     return place
 
 
@@ -167,7 +175,8 @@ def _check_target(beams: Mapping[str, Beam], target: Target) -> None:
         )
     positive, *alpha = np.ravel(target.value)
     if not (math.isfinite(positive) and positive > 0):
-        raise InputError(f"target {target.kind} {positive:g}", "a positive number")
+        expected = "a positive number; no beam gets to zero, so ask for the smallest of use"
+        raise InputError(f"target {target.kind} {positive:g}", expected)
     if not np.isfinite(alpha).all():
         said = f"target match with alpha = {alpha[0]:g} in plane {target.plane}"
         raise InputError(said, "a finite alpha")
