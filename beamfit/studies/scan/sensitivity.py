@@ -163,7 +163,7 @@ def _of_parts(
     fit: EmittanceFit, screen: str, held: Iterable[str], by_parts: list[Array]
 ) -> dict[str, float]:
     """Changes by the elements that no row sets, those up to the last screen."""
-    held, found = frozenset(held), {}
+    held, found = frozenset(m for name in held for m in fit.seen.scanned.members(name)), {}
     upstream = {e.name for e in fit.seen.scanned.upto(screen).elements}
     left = iter(by_parts)
     for kept, run in groupby(fit.seen.scanned.elements, lambda e: e.name in held):
@@ -192,8 +192,10 @@ def _cause(fit: EmittanceFit, element: Element) -> tuple[str, float]:
     if isinstance(element, SectorDipole):
         return f"bend {element.name} angle +1 %", 0.01
     if isinstance(element, Quadrupole | ThinLens):
-        word = _word(fit.seen.scanned, element.name)
-        return f"{element.name} {word} +1 %, not scanned", 0.01
+        word, line = _word(fit.seen.scanned, element.name), fit.seen.scanned
+        # What a supply does to its magnets is one cause.
+        name = next((s for s, members in line.supplies if element.name in members), element.name)
+        return f"{name} {word} +1 %, not scanned", 0.01
     return "", 0.0
 
 
