@@ -5,6 +5,7 @@ The keys of an element and the element they make stand here together.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from os import PathLike
@@ -188,6 +189,8 @@ def read_toml_lattice(path: str | PathLike[str]) -> LatticeFile:
     elements = tuple(_element(section, i) for i, section in enumerate(sections, 1))
     _check_unique(elements, sections)
     _check_supplies(elements, sections)
+    for element, section in zip(elements, sections, strict=True):
+        _check_slice(element, section, energy, REST_ENERGY[said["particle"]])
     return LatticeFile(
         path=path,
         sha256=top.sha256,
@@ -290,6 +293,24 @@ def _check_supplies(elements: tuple[Mapping[str, Any], ...], sections: list[Sect
             raise section.error(f"{found} on supply '{supply}'", f"{expected}, as above", "supply")
 
 
+def _check_slice(element: Mapping[str, Any], section: Section, energy: float, rest: float) -> None:
+    """Refuse a slice of less than the rest energy, and one whose circle misses the exit face."""
+    offset = element.get("energy_offset", 0.0)
+    if element["type"] != "sector_dipole" or offset == 0.0:
+        return
+    sliced = energy * (1.0 + offset)
+    found = f"energy_offset {offset:g}, a slice of {sliced:g} MeV"
+    if sliced <= rest:
+        expected = f"more than the rest energy of {rest:.6g} MeV; offsets are of total energies"
+        raise section.error(found, expected, "energy_offset")
+    ratio = ((sliced**2 - rest**2) / (energy**2 - rest**2)) ** 0.5
+    leaving = math.radians(element.get("exit_edge_deg", 0.0))
+    face = math.sin(math.radians(element["angle_deg"]) - leaving)
+    if abs((math.sin(leaving) + face) / ratio - face) >= 1.0:  # as optics.hard_edge_slice
+        expected = "a slice that leaves through the exit face"
+        raise section.error(found, expected, "energy_offset")
+
+
 def _design(top: Section, names: list[str]) -> Mapping[str, Any] | None:
     """Check the design Twiss, if there is one."""
     if "design" not in top.table:
@@ -336,6 +357,7 @@ def element_of(table: Mapping[str, Any], mass: float) -> Element:
                 table["bend_plane"],
                 float(table.get("energy_offset", 0.0)),
                 float(table.get("k1_per_m2", 0.0)),
+                mass=mass,
             )
         case "thin_lens":
             return elements.ThinLens(name, *_strength(table, mass))

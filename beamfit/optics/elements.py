@@ -16,6 +16,7 @@ from jax.typing import ArrayLike
 from beamfit.optics.arrays import array_module, floats, value
 from beamfit.optics.calibration import Calibration, FocusingStrength, IntegratedStrength
 from beamfit.optics.focusing import focusing
+from beamfit.optics.particle import ELECTRON_MASS, beta_gamma
 
 __all__ = [
     "IDENTITY",
@@ -185,9 +186,9 @@ class ThinLens:
 
 
 def hard_edge_slice(
-    angle: ArrayLike, exit_edge: ArrayLike, energy_ratio: ArrayLike
+    angle: ArrayLike, exit_edge: ArrayLike, momentum_ratio: ArrayLike
 ) -> tuple[Array, Array]:
-    """Bend angle and exit edge angle of a slice of another energy in the same fixed magnet.
+    """Bend angle and exit edge angle of a slice of another momentum in the same fixed magnet.
 
     The slice enters on the reference axis, follows a circle of radius ρ·r through the uniform
     field and leaves where that circle meets the exit pole face, which stays where it is. With
@@ -200,7 +201,7 @@ def hard_edge_slice(
         Reference bend angle α, rad.
     exit_edge : float
         Exit pole-face angle ψ_exit, rad; positive defocuses the bend plane.
-    energy_ratio : float
+    momentum_ratio : float
         r = momentum of the slice over the reference momentum.
 
     Returns
@@ -218,18 +219,18 @@ def hard_edge_slice(
 
     Examples
     --------
-    >>> bend, _ = hard_edge_slice(angle=1.0, exit_edge=0.0, energy_ratio=1.01)
+    >>> bend, _ = hard_edge_slice(angle=1.0, exit_edge=0.0, momentum_ratio=1.01)
     >>> bool(bend < 1.0)
     True
     """
-    xp = array_module(angle, exit_edge, energy_ratio)
+    xp = array_module(angle, exit_edge, momentum_ratio)
     face = angle - exit_edge
-    sine = (xp.sin(exit_edge) + xp.sin(face)) / energy_ratio - xp.sin(face)
+    sine = (xp.sin(exit_edge) + xp.sin(face)) / momentum_ratio - xp.sin(face)
     at_exit = xp.arcsin(sine)
     return face + at_exit, at_exit
 
 
-@value("name", "bend_plane")
+@value("name", "bend_plane", "mass")
 class SectorDipole:
     """A hard-edged sector dipole with pole-face rotations, in both planes.
 
@@ -251,15 +252,21 @@ class SectorDipole:
     bend_plane : {"x", "y"}
         The plane that is bent.
     energy_offset : float
-        E_slice/E_proj - 1 of the slice that is transported.
+        E_slice/E_proj - 1, of total energies, of the slice that is transported.
     k1 : float
         Gradient in the magnet, 1/m², positive focuses x.
+    energy : float, optional
+        Total energy in MeV that the magnet is set for, whatever beam comes: radius and angle are
+        those of E_proj = ``energy``. If None it is set anew for every beam.
+    mass : float
+        Rest energy of the particle in MeV.
 
     Notes
     -----
     The body solves u'' + (h² + k) u = h δ in the bend plane, u'' - k u = 0 across it; a
     rotated edge is a thin lens of strength ∓tan ψ/ρ (K. L. Brown, SLAC-75, wedge magnets).
     Both are held against another program and against particles tracked through the field.
+    Radii are as momenta, p² = E² - m², and not as energies.
 
     Examples
     --------
@@ -276,6 +283,8 @@ class SectorDipole:
     bend_plane: str = "x"
     energy_offset: ArrayLike = 0.0
     k1: ArrayLike = 0.0
+    energy: ArrayLike | None = None
+    mass: float = ELECTRON_MASS
     setting: ClassVar[None] = None
 
     @property
@@ -283,12 +292,31 @@ class SectorDipole:
         """Length of the reference orbit in the magnet, m."""
         return self.radius * self.angle
 
+    def momentum_ratio(self, energy: ArrayLike = 1.0) -> Array:
+        """Momentum of the slice over the one the magnet bends by its angle, p² = E² - m².
+
+        A magnet that is set anew for a beam of any energy bends that beam alike.
+
+        Examples
+        --------
+        >>> proton = SectorDipole("B", 1.0, 0.5, energy_offset=0.01, mass=938.27208943)
+        >>> round(float(proton.momentum_ratio(988.27208943)), 3)
+        1.097
+        """
+        offset, own = self.energy_offset, self.energy
+        if own is None and array_module(offset) is np and not np.any(offset):
+            return np.ones(np.shape(offset))
+        reference = floats(energy if own is None else own)
+        return beta_gamma(floats(energy) * (1.0 + offset), self.mass) / beta_gamma(
+            reference, self.mass
+        )
+
     def matrix(self, setting: ArrayLike | None = None, energy: ArrayLike = 1.0) -> TransferMatrix:
-        """Transfer matrix about the slice's own orbit; setting and energy do not enter."""
-        parts = (self.radius, self.angle, self.entrance_edge, self.exit_edge, self.energy_offset)
-        radius, angle, entrance, leaving, offset = (floats(v)[..., None] for v in parts)
-        xp = array_module(*parts)
-        ratio = 1.0 + offset
+        """Transfer matrix of a beam of an energy in MeV, about the slice's own orbit."""
+        ratio = self.momentum_ratio(energy)[..., None]
+        parts = (self.radius, self.angle, self.entrance_edge, self.exit_edge)
+        radius, angle, entrance, leaving = (floats(v)[..., None] for v in parts)
+        xp = array_module(*parts, ratio)
         angle, leaving = hard_edge_slice(angle, leaving, ratio)
         radius = radius * ratio
         h, length = 1.0 / radius, radius * angle

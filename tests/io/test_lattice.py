@@ -106,7 +106,7 @@ def test_every_key_is_understood(write):
     assert qp == Quadrupole("QP", 0.2, -1.0, polynomial)
     assert lens == ThinLens("L", 0.5)
     angles = np.radians([60.0, 2.5, 13.5]).tolist()
-    assert bend == SectorDipole("B", 0.4, *angles, "y", 0.01, 0.3)
+    assert bend == SectorDipole("B", 0.4, *angles, "y", 0.01, 0.3, mass=PROTON_MASS)
     assert marker == Marker("M")
     assert qg == Quadrupole("QG", 0.1, -3.0, IntegratedGradient(mass=PROTON_MASS))
     assert screen == Screen("S", 1e-6 * 5)
@@ -119,7 +119,8 @@ def test_a_bend_the_other_way_turns_the_dispersion(write):
     )
     assert back.length == pytest.approx(there.length)
     edges = {"entrance_edge": -there.entrance_edge, "exit_edge": -there.exit_edge}
-    ours, mirrored = there.matrix().y, replace(back, **edges).matrix().y
+    mirror = replace(back, **edges)
+    ours, mirrored = (bend.matrix(energy=1200.0).y for bend in (there, mirror))
     np.testing.assert_allclose(mirrored[:2, :2], ours[:2, :2], atol=1e-12)
     np.testing.assert_allclose(mirrored[:2, 2], -ours[:2, 2], atol=1e-12)
     assert abs(ours[0, 2]) > 0.1
@@ -178,6 +179,13 @@ ERRORS = {
     "NaN": (("angle_deg = 60.0", "angle_deg = nan"), 42, "angle_deg", "a number"),
     "no angle": (("angle_deg = 60.0", "angle_deg = 0.0"), 42, "angle_deg", "drift"),
     "bend plane": (('bend_plane = "y"', 'bend_plane = "vertical"'), 40, "bend_plane", "x or y"),
+    "slice at rest": (("offset = 0.01", "offset = -0.3"), 45, "energy_offset", "rest energy"),
+    "slice that turns back": (
+        ("offset = 0.01", "offset = -0.2"),
+        45,
+        "energy_offset",
+        "through the exit face",
+    ),
     "no setting": (("k1l_per_m = 0.5\n", ""), 32, None, "k1l_per_m"),
     "two settings": (
         ("k1l_per_m = 0.5", "k1l_per_m = 0.5\nintegrated_gradient_kG = 1"),

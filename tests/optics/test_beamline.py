@@ -29,6 +29,7 @@ CASES = {
     "quadrupole by polynomial": Quadrupole("Q", 0.1, -2.0, CurrentPolynomial((0.1, 2.0, -0.01))),
     "quadrupole by gradient": Quadrupole("Q", 0.108, -4.2, IntegratedGradient()),
     "dipole": SectorDipole("B", 0.4, 1.04, 0.04, 0.23, bend_plane="y", energy_offset=0.02),
+    "dipole that stays": SectorDipole("B", 0.4, 1.04, 0.04, 0.23, energy=130.0),
     "combined dipole": SectorDipole("B", 3.0, 0.3, 0.1, 0.2, k1=1.5),
     "thin lens": ThinLens("L", 0.5),
     "marker": Marker("M"),
