@@ -25,6 +25,8 @@ from beamfit.verdict import Finding
 __all__ = ["SIGMA", "Answer", "judged_beam", "plane_fit", "units_of"]
 
 SIGMA = slice(4, 7)
+# Doubted points that a message names.
+MOST_NAMED = 5
 # Draws for an upper limit, and how many of them must be beams.
 DRAWS, ENOUGH = 20_000, 100
 # What the three numbers of size² alone tell: σ, and the size at the screen.
@@ -224,5 +226,7 @@ def _outlier_words(p: Points) -> str:
     doubted = [] if probability is None else np.flatnonzero(probability > 0.5)
     if not len(doubted):
         return ""
-    places = "; ".join(p.where(i) for i in doubted)
-    return f"{len(doubted)} of {len(probability)} points more likely outliers than not: {places}."
+    places = [p.where(i) for i in doubted[:MOST_NAMED]]
+    places += [f"{len(doubted) - MOST_NAMED} more"] * (len(doubted) > MOST_NAMED)
+    said = f"{len(doubted)} of {len(probability)} points more likely outliers than not"
+    return f"{said}: {'; '.join(places)}."

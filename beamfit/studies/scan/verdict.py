@@ -362,7 +362,7 @@ def _left_open(u: Unknowns) -> Finding | None:
         else "its value is decided by bounds and starting point, not by the data"
     )
     said = f"Not determined in scenario {u.scenario}{u.tied}: {why}{u.edges}."
-    return Finding(Status.unidentified, said, f"Needed: {u.remedy}.")
+    return Finding(Status.unidentified, said, f"Needed: {u.remedy}." if u.remedy else "")
 
 
 def _poor_in_scenario(u: Unknowns) -> Finding | None:
