@@ -6,7 +6,7 @@ export OPENBLAS_NUM_THREADS := 1
 export OMP_NUM_THREADS := 1
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
-.PHONY: demo test calibrate coverage bench lint clean
+.PHONY: demo test calibrate coverage mutations bench lint clean
 .DEFAULT_GOAL := demo
 
 .venv/runtime: pyproject.toml constraints.txt
@@ -36,6 +36,10 @@ calibrate: .venv/test
 # Errors of every scenario held against 500 simulated scans each.
 coverage: .venv/test
 	BEAMFIT_COVERAGE=500 $(BIN)/python -m pytest --quiet tests/studies/test_coverage.py tests/studies/test_systematics.py
+
+# Files with bytes changed, read or refused in one line: 3000 of each kind.
+mutations: .venv/test
+	BEAMFIT_MUTATIONS=9000 $(BIN)/python -m pytest --quiet tests/io/test_mutated_files.py
 
 lint: .venv/test
 	$(BIN)/ruff check .

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from difflib import get_close_matches
 from os import PathLike
 
 __all__ = ["InputError", "nearest"]
+
+# What no person wrote as a word: of a damaged file, say. Its beginning tells enough.
+ENDLESS = re.compile(r"(\S{60})\S{60,}")
 
 
 @dataclass(eq=False)
@@ -45,8 +49,9 @@ class InputError(ValueError):
         place = "" if self.path is None else str(self.path)
         place += "" if self.line is None else f":{self.line}"
         place += ": " if place else ""
-        place += "" if self.column is None else f"column '{self.column}': "
-        return " ".join(f"{place}{self.found}; expected {self.expected}".split())
+        said = "" if self.column is None else f"column '{self.column}': "
+        said = ENDLESS.sub(r"\1...", f"{said}{self.found}; expected {self.expected}")
+        return " ".join(f"{place}{said}".split())
 
 
 def nearest(word: str, known: list[str]) -> str:
