@@ -289,3 +289,26 @@ def test_a_scenario_that_frees_nothing_says_so(otr2):
     scan = beamfit.QuadScan(held, {"Q525": "kG"}, {"x": sizes}, error, energy)
     fit = beamfit.fit_emittance(scan, otr2, scenario="calibration").x
     assert "Nothing is free besides the beam" in fit.message
+
+
+def test_advice_keeps_the_sizes_of_both_planes_within_those_measured(otr2, rows, true):
+    """Towards the waist of x the beam grows in y: so far as it was seen there, and no further."""
+    settings = np.linspace(-8.0, -4.2, 8)
+    sigma = np.asarray(BeamMatrix.from_twiss(1e-6 / 264.1865, 6.0, -9.0).sigma)
+    tall = np.sqrt(rows(settings, "y") @ sigma[[0, 0, 1], [0, 1, 1]])
+    size = true(settings)
+    scan = beamfit.QuadScan(
+        {"Q525": settings},
+        {"Q525": "kG"},
+        {"x": size, "y": tall},
+        {"x": 0.05 * size, "y": 0.01 * tall},
+    )
+    fit = beamfit.fit_emittance(scan, otr2)
+    both = fit.x.identifiability.next_measurement
+    alone = beamfit.fit_emittance(replace(scan, size={"x": size}, error={"x": 0.05 * size}), otr2)
+    free = float(alone.x.identifiability.next_measurement.split("Q525 = ")[1].split()[0])
+    advised = float(both.split("Q525 = ")[1].split()[0])
+    predicted = np.sqrt(rows([advised], "y") @ sigma[[0, 0, 1], [0, 1, 1]])
+    assert predicted[0] <= 1.02 * tall.max()
+    beyond = np.sqrt(rows([free], "y") @ sigma[[0, 0, 1], [0, 1, 1]])
+    assert beyond[0] > tall.max()

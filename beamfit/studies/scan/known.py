@@ -283,8 +283,11 @@ def next_measurement(seen: Seen, plane: str) -> str | None:
     for name, table in candidate_settings(p.settings):
         energy = np.full(len(table[name]), seen.energy)
         matrices = transfer_rows(seen.scanned, table, energy, places=(screen,))
-        r = np.asarray(matrices.planes)[:, "xy".index(plane), 0]
-        rows.append((name, table[name], np.stack(coefficients(r[:, 0, 0], r[:, 0, 1]), -1)))
+        r = np.asarray(matrices.planes)[:, :, 0]
+        usable = _no_larger(seen, r, {plane: sigma})
+        own = np.stack(coefficients(*r[usable, "xy".index(plane), 0, :2].T), -1)
+        if usable.any():
+            rows.append((name, table[name][usable], own))
     relative = max(float(np.median(p.error / p.size)) * work.scale, 1e-3)
     found = best_candidate(sigma, covariance, relative, rows)
     if found is None:
@@ -300,6 +303,16 @@ def next_measurement(seen: Seen, plane: str) -> str | None:
         f"{'inside' if inside else 'beyond'} the scanned range{others}: of single points it would "
         "sharpen the emittance most; then judge again."
     )
+
+
+def _no_larger(seen: Seen, r: np.ndarray, sigmas: dict[str, np.ndarray]) -> np.ndarray:
+    """Settings at which no plane's size exceeds those that were measured: screens have edges."""
+    sigmas = {p: w.fit.sigma for p, w in seen.works.items() if w.evidence.positive} | sigmas
+    usable = np.ones(len(r), bool)
+    for plane, sigma in sigmas.items():
+        a, b = r[:, "xy".index(plane), 0, :2].T
+        usable &= size_squared(sigma, a, b) <= np.nanmax(seen.scan.size[plane]) ** 2
+    return usable
 
 
 def _state(seen: Seen, told: Assumptions) -> Problem:
