@@ -219,6 +219,10 @@ def test_the_command_needs_nothing_but_the_file(save, monkeypatch, capsys, tmp_p
         assert words in text
     code, out, _ = run(monkeypatch, capsys, path, "--size-method", "Gaussian", "--plane", "y")
     assert (code, "Gaussian sizes" in out, "in x, µm" in out) == (0, True, False)
+    code, out, _ = run(monkeypatch, capsys, path, "--weights", "measured", "--json")
+    document = json.loads(out)["results"][0]
+    assert (code, document["weights"]) == (0, "measured")
+    assert "measured sizes" in document["notes"][0]
 
 
 def test_a_lattice_replaces_the_matrices_of_the_file(save, tmp_path):

@@ -11,6 +11,7 @@ from beamfit.errors import InputError
 from beamfit.optics.beam import BeamMatrix
 from beamfit.optics.beamline import Beamline
 from beamfit.optics.elements import Drift, Quadrupole, Screen
+from beamfit.studies.scan.design import plan_measurements
 
 # A focusing cell with five wires; nothing moves.
 FODO = """format = "beamfit-lattice-1"
@@ -210,3 +211,14 @@ def test_errors_of_three_monitors_cover():
             held.append(low < truth < high)
     assert len(held) > 150
     assert abs(np.mean(held) - 0.95) < 4 * np.sqrt(0.95 * 0.05 / len(held))
+
+
+def test_advice_where_no_magnet_moved_needs_limits():
+    fit = beamfit.fit_emittance(wire_scan(WIRES, 0.005), fodo())
+    with pytest.raises(InputError, match="--vary"):
+        plan_measurements(fit)
+    advice = plan_measurements(fit, limits={"Q0": (5.0, 9.0)}, count=1)
+    assert 5.0 <= advice.steps[0].candidate.settings["Q0"] <= 9.0
+    own = wire_scan(WIRES, 0.005, transfer=seen_from(fodo(), WIRES), energy=np.full(5, 135.0))
+    with pytest.raises(InputError, match="a lattice"):
+        plan_measurements(beamfit.fit_emittance(own), limits={"Q0": (5.0, 9.0)})

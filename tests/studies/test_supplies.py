@@ -138,3 +138,17 @@ def test_what_a_supply_cannot_be_asked(pair, tmp_path):
         path.write_text(PAIR.replace(old, new))
         with pytest.raises(InputError, match=words):
             read_lattice(path)
+
+
+def test_currents_beyond_the_measured_table_are_questioned(tmp_path):
+    path = tmp_path / "table.toml"
+    old = "current_A = 2.0\nslope = 500.0\nintercept = 5.0"
+    table = [[i, (500.0 * i + 5.0) / 299.792458] for i in (-2.0, 4.0, 12.0)]
+    path.write_text(PAIR.replace(old, f"current_A = 2.0\ngradient_table = {table}"))
+    fit = beamfit.fit_emittance(knob_scan(), build_line(read_lattice(path)))
+    # k1 = G/(Bρ), and p is 1e-5 below E: the table says what the line did.
+    assert fit.x.emittance.value == pytest.approx(2e-9, rel=1e-3)
+    assert fit.notes == ()
+    path.write_text(PAIR.replace(old, f"current_A = 2.0\ngradient_table = {table[:2]}"))
+    [note] = beamfit.fit_emittance(knob_scan(), build_line(read_lattice(path))).notes
+    assert note.startswith("5 of 11 currents of QS lie beyond the measured -2 to 4 A of QF")

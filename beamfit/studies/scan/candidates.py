@@ -84,7 +84,13 @@ def candidate_rows(
 
 
 def _checked(fit: EmittanceFit, limits):
-    """Limits of magnets that can be set, refused if they cannot be used."""
+    """Limits of magnets that can be set, refused if they cannot be used, or if none can be told."""
+    if fit.scan.transfer:
+        found = "advice on rows with matrices of their own"
+        raise fit.scan.unusable(found, "a lattice in which other settings can be tried")
+    if not limits and not varied_magnets(fit.scan):
+        found = "advice on a scan that moved no magnet"
+        raise fit.scan.unusable(found, "limits of a magnet, such as --vary Q1=LOW:HIGH")
     for name, (low, high) in (limits or {}).items():
         if name not in fit.seen.scanned.magnets:
             raise InputError(

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from beamfit.optics.beamline import Beamline
+from beamfit.optics.calibration import CurrentTable
 from beamfit.optics.elements import Quadrupole
 from beamfit.optics.particle import rigidity
 from beamfit.studies.scan.scans import USUAL, QuadScan
@@ -69,7 +70,7 @@ def questions(scan: QuadScan, scanned: Beamline) -> tuple[str, ...]:
     tuple of str
         Sentences; nothing was changed because of them.
     """
-    return (*of_sizes(scan), *_of_gradients(scan, scanned))
+    return (*of_sizes(scan), *_of_gradients(scan, scanned), *_of_tables(scan, scanned))
 
 
 def of_sizes(scan: QuadScan) -> Iterator[str]:
@@ -91,3 +92,20 @@ def _of_gradients(scan: QuadScan, scanned: Beamline) -> Iterator[str]:
                 f"Settings of {name} are taken as they stand, but mean gradients up to "
                 f"{gradient:.3g} T/m: are its unit, length and calibration right?"
             )
+
+
+def _of_tables(scan: QuadScan, scanned: Beamline) -> Iterator[str]:
+    """Ask about currents beyond those at which a magnet was measured."""
+    for name, settings in () if scan.transfer else scan.settings.items():
+        for magnet in (scanned[member] for member in scanned.members(name)):
+            table = getattr(magnet, "calibration", None)
+            if not isinstance(table, CurrentTable):
+                continue
+            low, high = table.currents[0], table.currents[-1]
+            beyond = int(np.sum((settings < low) | (settings > high)))
+            if beyond:
+                yield (
+                    f"{beyond} of {len(settings)} currents of {name} lie beyond the measured "
+                    f"{low:g} to {high:g} A of {magnet.name}, whose gradient goes on in a straight "
+                    "line there: are they in A?"
+                )
