@@ -9,9 +9,10 @@ import click
 import beamfit
 from beamfit.cli.options import Sampling, command_line, options
 from beamfit.errors import InputError
-from beamfit.io.decay_record import read_decay_record
+from beamfit.io.decay_record import read_lifetime_input
 from beamfit.io.files import digest
 from beamfit.io.result import results_text
+from beamfit.studies.decay.record import LifetimeTable
 
 if TYPE_CHECKING:
     from beamfit.cli.show import Terminal
@@ -29,6 +30,7 @@ Examples:
   beamfit lifetime fill1.csv --ring ring.toml --report fill1.html --json
   beamfit lifetime measurements/spear3_shift_simulated.csv --ring lattices/spear3_2003.toml --study
   beamfit lifetime shift.csv --ring ring.toml --study --network correction
+  beamfit lifetime export.csv --time Time --current SR:DCCT:CURRENT:mA --skip-bad
 """
 
 
@@ -51,12 +53,27 @@ Examples:
     help="With --study: also fit a and b by a network that falls with bunches and scraper and "
     "rises with pressure; alone, or as a factor on the fitted first principles.",
 )
-@options("sample store seed report json")
+@click.option(
+    "--time",
+    metavar="COLUMN[:UNIT]",
+    help="Header of the time, a date or a number in s, min, h, d or ms.",
+)
+@click.option(
+    "--current",
+    metavar="COLUMN:UNIT",
+    help="Header of the beam current and its unit, mA, A or uA, after the last colon, such as "
+    "SR:DCCT:CURRENT:mA. With --time or --current other columns of unknown names are left aside.",
+)
+@options("ignore skip-bad sample store seed report json")
 def lifetime(
     record: tuple[str, ...],
     ring: str | None,
     study: bool,
     network: str | None,
+    time: str | None,
+    current: str | None,
+    ignore: tuple[str, ...],
+    skip_bad: bool,
     sample: bool,
     store: str | None,
     seed: int,
@@ -66,19 +83,29 @@ def lifetime(
     """Fit the lifetime to decay records and say what they cannot tell.
 
     RECORD is a CSV or HDF5 file with columns such as time_s (or ISO time), beam_current_mA,
-    beam_current_error_mA, and optionally rf_voltage_kV, scraper_y_mm, pressure_Pa, bunches.
+    beam_current_error_mA, and optionally rf_voltage_kV, scraper_y_mm, pressure_Pa, bunches; or CSV
+    or JSON of the EPICS Archiver Appliance; or lifetimes by current: tau_h, beam_current_mA.
     It is cut into decays at refills, losses and changes of setting. Each decay gives I0, a, b of
     dI/dt = -a I² - b I, the lifetime at its start, mean current and end, and a verdict.
     """
     sampling = Sampling(sample, store, seed)
     sampling.check()
     _check_study(study, ring, network)
-    records = [read_decay_record(path) for path in dict.fromkeys(record)]
+    said = {"time": time, "current": current, "ignore": ignore, "skip_bad": skip_bad}
+    records = [read_lifetime_input(path, **said) for path in dict.fromkeys(record)]
     if len(records) < len(record):
         twice = next(path for path in record if record.count(path) > 1)
         raise InputError("a record given twice", "each record once", path=twice)
     machine = None if ring is None else _machine(ring)
     inputs = {path: digest(path) for path in (*record, ring) if path is not None}
+
+    tables = [each for each in records if isinstance(each, LifetimeTable)]
+    if tables and (len(tables) < len(records) or sample or study or report or ring):
+        expected = "tables of lifetimes by themselves, without --ring, --study, --sample, --report"
+        raise InputError("a table of lifetimes", expected, path=tables[0].name)
+    if tables:
+        _lifetimes(tables, inputs, as_json)
+        return
 
     from beamfit.studies.decay.study import study_record  # JAX from here on
 
@@ -101,6 +128,26 @@ def lifetime(
         click.echo(results_text(results, inputs, command_line(), **further))
     else:
         _show(studies, posteriors, shift, report)
+
+
+def _lifetimes(tables: list[LifetimeTable], inputs: dict[str, str], as_json: bool) -> None:
+    """Fit and show tables of lifetimes."""
+    from beamfit.studies.decay.lifetimes import fit_lifetimes  # JAX from here on
+
+    fits = [fit_lifetimes(table) for table in tables]
+    if as_json:
+        click.echo(results_text([fit.to_json() for fit in fits], inputs, command_line()))
+        return
+    from beamfit.cli.show import Terminal
+
+    terminal = Terminal()
+    for fit in fits:
+        terminal.line(str(fit.readings), style="bold")
+        terminal.table(fit.table(), [fit.status])
+        terminal.verdict(fit.record, fit.status, fit.message)
+        for note in fit.readings.notes:
+            terminal.line(f"Note: {note}")
+        terminal.line()
 
 
 def _check_study(study: bool, ring: str | None, network: str | None) -> None:
@@ -159,6 +206,8 @@ def _show_record(terminal: Terminal, study: RecordStudy) -> None:
     from beamfit.table import Table, labelled
 
     terminal.line(str(study.record), style="bold")
+    for note in study.record.notes:
+        terminal.line(f"Note: {note}")
     if study.events:
         said = "; ".join(str(event) for event in study.events[:8])
         left = len(study.events) - 8

@@ -1,21 +1,33 @@
-"""Decay records: what the columns of a file mean."""
+"""Decay records and tables of lifetimes: what the columns of a file mean, also of an archive's."""
 
 from __future__ import annotations
 
+import json
+import re
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
 from datetime import UTC, datetime
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING
+from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
 
 import numpy as np
 
-from beamfit.io.table import Column, Sheet, columns_of, read_sheet
-from beamfit.studies.decay.record import Conditions, DecayRecord, first_fault
+from beamfit.errors import InputError
+from beamfit.io.files import digest, text_lines
+from beamfit.io.table import UNITS, Column, Sheet, columns_of, left_out, read_sheet
+from beamfit.studies.decay.record import (
+    Conditions,
+    DecayRecord,
+    LifetimeTable,
+    first_fault,
+)
 
 if TYPE_CHECKING:
     from pandas import DataFrame
 
-__all__ = ["read_decay_record"]
+__all__ = ["read_decay_record", "read_lifetime_input", "read_lifetimes"]
 
 QUANTITIES = {
     "time": "time",
@@ -26,24 +38,109 @@ QUANTITIES = {
     "pressure": "pressure",
     "bunches": "",
 }
+# Of a table of lifetimes.
+LIFETIMES = {
+    "tau": "time",
+    "tau_error": "time",
+    "lifetime": "time",
+    "lifetime_error": "time",
+    "beam_current": "current",
+}
 # What a record calls them.
 CALLED = {"beam_current": "current", "beam_current_error": "error"}
-ISO = "ISO 8601"
-# Seconds beyond this many are counted from 1970, not from the start of a record (1973 or later).
-UNIX = 1e8
+USED = {"time", "nanos", "current", "error", *Conditions._fields}
+DATE, NANOSECONDS = "a date", "ns"
+# Seconds beyond this many are counted from 1970, not from the start of a record (1973 or later);
+# beyond the other they lie after the year 5000, and are milliseconds.
+UNIX, LATEST = 1e8, 1e11
+# Dates as control rooms write them, besides ISO 8601; days before months where both are numbers.
+DATES = ("%d-%b-%Y %H:%M:%S", "%d.%m.%Y %H:%M:%S", "%Y/%m/%d %H:%M:%S")
+FRACTION = re.compile(r"[.,](\d+)$")
+ZONE = re.compile(r"^(.*\d) ?([A-Z][A-Za-z_]+(?:/[A-Za-z_]+)*)$")
+# An archive's own columns: seconds since 1970 and nanoseconds, and what it says of each value.
+SECONDS = {"secs": "s", "seconds": "s", "epochseconds": "s"}
+NANOS = {"nanos", "nanoseconds"}
+ARCHIVE = ("secs", "val", "severity", "status", "nanos")
 
 
-def read_decay_record(path: str | PathLike[str] | DataFrame) -> DecayRecord:
+def read_lifetime_input(
+    path: str | PathLike[str] | DataFrame,
+    *,
+    time: str | None = None,
+    current: str | None = None,
+    ignore: Iterable[str] = (),
+    skip_bad: bool = False,
+) -> DecayRecord | LifetimeTable:
+    """Read what `beamfit lifetime` takes, by its header: as one of the other two readers."""
+    sheet = _sheet(path, skip_bad).without(ignore)
+    if time is None and any(name.startswith(("tau_", "lifetime_")) for name in sheet.names):
+        return _lifetimes(sheet, skip_bad)
+    return _record(sheet, time, current, skip_bad)
+
+
+def read_lifetimes(
+    path: str | PathLike[str] | DataFrame, *, ignore: Iterable[str] = (), skip_bad: bool = False
+) -> LifetimeTable:
+    """Read lifetimes measured at several currents.
+
+    Parameters
+    ----------
+    path : str, path or pandas.DataFrame
+        A frame, CSV or HDF5 with `tau_h` (or `lifetime_h`; also _min, _s) and `beam_current_mA`;
+        optionally `tau_error_h`.
+    ignore, skip_bad
+        As for `read_decay_record`.
+
+    Returns
+    -------
+    LifetimeTable
+
+    Raises
+    ------
+    InputError
+        With file, line and column, as `read_decay_record`.
+
+    Examples
+    --------
+    >>> import pathlib, tempfile
+    >>> file = pathlib.Path(tempfile.mkdtemp()) / "lifetimes.csv"
+    >>> _ = file.write_text("beam_current_mA,tau_h\\n100,50\\n200,33\\n300,25\\n400,20\\n")
+    >>> print(read_lifetimes(file))
+    lifetimes.csv: 4 lifetimes at 100 to 400 mA
+    """
+    return _lifetimes(_sheet(path, skip_bad).without(ignore), skip_bad)
+
+
+def read_decay_record(
+    path: str | PathLike[str] | DataFrame,
+    *,
+    time: str | None = None,
+    current: str | None = None,
+    ignore: Iterable[str] = (),
+    skip_bad: bool = False,
+) -> DecayRecord:
     """Read beam current against time.
 
     Parameters
     ----------
     path : str, path or pandas.DataFrame
-        A frame, CSV, or HDF5 if it ends in .h5 or .hdf5 with one dataset for each column. Columns:
-        `time_s` (from any origin, or Unix time) or `time` (ISO 8601, UTC if no zone is given);
+        A frame, CSV, or HDF5 if it ends in .h5 or .hdf5 with one dataset for each column, or JSON
+        or CSV of the EPICS Archiver Appliance. Columns: `time_s` (_min, _h, _d, _ms; from any
+        origin, or Unix time), or `time` (a date, UTC if no zone is given: ISO 8601, 01-Mar-2024 12:00:00,
+        01.03.2024 12:00:00, an offset or a name such as Europe/Berlin behind it);
         `beam_current_mA` (or `_A`, `_uA`); optionally `beam_current_error_mA`, `rf_voltage_kV`,
-        `scraper_y_mm`, `pressure_Pa`, `bunches`. Lines that begin with `#` and
+        `scraper_y_mm`, `pressure_Pa` (_mbar, _Torr), `bunches`. Lines that begin with `#` and
         HDF5 attributes are kept as comments.
+    time : str, optional
+        Header of the time, with its unit after a last colon unless it is seconds or a date.
+    current : str, optional
+        Header of the current, with its unit after the last colon: ``SR:DCCT:CURRENT:mA``. With
+        `time` or `current` given, columns of unknown names are left aside.
+    ignore : iterable of str, optional
+        Columns to leave unread; * and ? stand for any letters.
+    skip_bad : bool, optional
+        Leave out rows with something wrong in them: no number, a negative current, a time that is
+        repeated or goes back. `notes` counts and names them.
 
     Returns
     -------
@@ -61,43 +158,250 @@ def read_decay_record(path: str | PathLike[str] | DataFrame) -> DecayRecord:
     >>> print(read_decay_record("measurements/aps_1999_decay.csv"))
     aps_1999_decay.csv: 27 readings over 8.81 h, 101.999 to 81.464 mA
     """
-    sheet = read_sheet(path, "time_s,beam_current_mA")
-    found = columns_of(sheet, QUANTITIES, _iso_time)
-    columns = {CALLED.get(key, key): column for key, column in found.items()}
+    return _record(_sheet(path, skip_bad).without(ignore), time, current, skip_bad)
+
+
+def _sheet(path: str | PathLike[str] | DataFrame, skip_bad: bool) -> Sheet:
+    """The columns of a file, an archive's by their own names."""
+    example = "time_s,beam_current_mA"
+    if not isinstance(path, (str, PathLike)):
+        return read_sheet(path, example)
+    if Path(path).suffix.lower() == ".json":
+        return _archive_json(path)
+    head = next((text for text in text_lines(path) if text.strip()), "") if _is_text(path) else ""
+    if re.fullmatch(r"\d{9,11}(,[^,]+){4}\s*", head):
+        return read_sheet(path, ",".join(ARCHIVE), ragged=skip_bad, names=ARCHIVE)
+    return read_sheet(path, example, ragged=skip_bad)
+
+
+def _is_text(path: str | PathLike[str]) -> bool:
+    return Path(path).suffix.lower() not in {".h5", ".hdf5"}
+
+
+def _archive_json(path: str | PathLike[str]) -> Sheet:
+    """Of the EPICS Archiver Appliance: one channel with its data."""
+    expected = 'one channel of the EPICS Archiver Appliance: [{"meta": …, "data": [{"secs": …}]}]'
+    try:
+        channels = json.loads("\n".join(text_lines(path)))
+        if len(channels) != 1:
+            raise InputError(f"{len(channels)} channels", "one: the beam current", path=path)
+        meta, data = channels[0].get("meta", {}), channels[0]["data"]
+        rows = [[str(one["secs"]), str(one["nanos"]), str(one["val"])] for one in data]
+    except (ValueError, TypeError, KeyError, AttributeError):
+        raise InputError("another JSON file", expected, path=path) from None
+    if not rows:
+        raise InputError("no readings", "two or more", path=path)
+    unit = meta.get("EGU", "") if isinstance(meta, dict) else ""
+    called = f"val_{unit}" if unit in UNITS["current"] else "val"
+    said = tuple(f"{key}: {value}" for key, value in meta.items()) if meta else ()
+    cells = list(zip(*rows, strict=True))
+    return Sheet(path, ("secs", "nanos", called), cells, None, None, said, digest(path))
+
+
+def _record(sheet: Sheet, time: str | None, current: str | None, skip_bad: bool) -> DecayRecord:
+    columns = _columns(sheet, time, current)
     for quantity, example in (("time", "time_s"), ("current", "beam_current_mA")):
         if quantity not in columns:
-            raise sheet.header_error(f"no column of {quantity}", f"'{example}' in the header")
+            option = f"'{example}' in the header, or --{quantity} COLUMN:UNIT"
+            raise sheet.header_error(f"no column of {quantity}", option)
+    if skip_bad:
+        sheet = sheet.good(lambda rows: _check_alone(rows, columns))
+        sheet = _forward(sheet, columns)
     values = {key: _values(sheet, column) for key, column in columns.items()}
-    time, current, error = (values.pop(key, None) for key in ("time", "current", "error"))
+    moment = values.pop("time")
+    if "nanos" in values:
+        moment = moment + 1e-9 * values.pop("nanos")
+    beam, error = values.pop("current"), values.pop("error", None)
     conditions = Conditions(**values)
-    if len(time) < 2:
-        raise sheet.error(f"{len(time)} readings", "two or more")
-    if (fault := first_fault(time, current, error, conditions)) is not None:
+    if len(moment) < 2:
+        raise sheet.error(f"{len(moment)} readings", "two or more")
+    _check_base(sheet, columns["time"], moment)
+    if (fault := first_fault(moment, beam, error, conditions)) is not None:
         column = columns[fault.quantity].header
         raise sheet.error(fault.found, fault.expected, fault.row, column)
-    absolute = columns["time"].unit == ISO or time[0] > UNIX
+    absolute = columns["time"].unit == DATE or moment[0] > UNIX
     return DecayRecord(
-        time=time,
-        current=current,
+        time=moment,
+        current=beam,
         error=error,
         name=Path(sheet.path).name,
-        start=float(time[0]) if absolute else None,
+        start=float(moment[0]) if absolute else None,
         conditions=conditions,
         comments=sheet.comments,
+        notes=left_out(sheet),
     )
 
 
-def _iso_time(header: str) -> Column | None:
-    return Column(header, "time", ISO) if header == "time" else None
+def _columns(sheet: Sheet, time: str | None, current: str | None) -> dict[str, Column]:
+    """Every column of a record by what it is; those that were named come first."""
+    named = {}
+    if time is not None:
+        named["time"] = _named_time(sheet, time)
+    if current is not None:
+        named["current"] = _named_current(sheet, current)
+    left = [name for name in sheet.names if name not in {c.header for c in named.values()}]
+    if named:
+        left = [name for name in left if _known(sheet, name)]
+    rest = replace(sheet, names=tuple(left), cells=[sheet[name] for name in left])
+    found = {
+        CALLED.get(key, key): column
+        for key, column in columns_of(rest, QUANTITIES, _archive_column).items()
+    }
+    return {
+        key: column for key, column in found.items() if key in USED and key not in named
+    } | named
+
+
+def _archive_column(header: str) -> Column | None:
+    """Dates, and the columns of an archive."""
+    word, unit = header.lower(), header.removeprefix("val_")
+    if word == "time":
+        return Column(header, "time", DATE)
+    if word in SECONDS:
+        return Column(header, "time", "s")
+    if word in NANOS:
+        return Column(header, "nanos", NANOSECONDS)
+    if unit != header and unit in UNITS["current"]:
+        return Column(header, "current", unit, UNITS["current"][unit])
+    # What an archive says of its values, and values of which nobody said what they are.
+    return Column(header, header) if word in ("severity", "status", "val", "value") else None
+
+
+def _named_time(sheet: Sheet, text: str) -> Column:
+    if text in sheet.names:
+        known = _known(sheet, text)
+        if known is not None and known.key == "time":
+            return known
+        return Column(text, "time", "s" if _is_number(sheet[text]) else DATE)
+    header, _, unit = text.rpartition(":")
+    if header in sheet.names and unit in UNITS["time"]:
+        return Column(header, "time", unit, UNITS["time"][unit])
+    raise _no_such(sheet, header if unit in UNITS["time"] else text)
+
+
+def _known(sheet: Sheet, name: str) -> Column | None:
+    """What a header means by itself; None if nothing."""
+    alone = replace(sheet, names=(name,), cells=[sheet[name]])
+    try:
+        return next(iter(columns_of(alone, QUANTITIES, _archive_column).values()))
+    except InputError:
+        return None
+
+
+def _is_number(cells: Iterable[object]) -> bool:
+    try:
+        float(next(iter(cells), "0"))
+    except ValueError:
+        return False
+    return True
+
+
+def _named_current(sheet: Sheet, text: str) -> Column:
+    header, _, unit = text.rpartition(":")
+    if header in sheet.names and unit in UNITS["current"]:
+        return Column(header, "current", unit, UNITS["current"][unit])
+    if text in sheet.names or header in sheet.names:
+        expected = f"its unit after the last colon, such as {text.removesuffix(':' + unit)}:mA"
+        raise sheet.header_error(f"--current {text} without a unit", expected)
+    raise _no_such(sheet, header or text)
+
+
+def _no_such(sheet: Sheet, name: str) -> InputError:
+    return sheet.header_error(f"no column '{name}'", f"one of {', '.join(sheet.names)}")
 
 
 def _values(sheet: Sheet, column: Column) -> np.ndarray:
-    if column.unit == ISO:
-        return sheet.numbers(column.header, read=_seconds, expected="an ISO 8601 time")
+    if column.unit == DATE:
+        expected = "an ISO 8601 time, such as 2024-03-01T12:00:00+01:00"
+        return sheet.numbers(column.header, read=_seconds, expected=expected)
     return sheet.numbers(column.header) * column.factor
 
 
+def _check_alone(sheet: Sheet, columns: Mapping[str, Column]) -> None:
+    """Refuse a row that is wrong whatever the others are."""
+    for key, column in columns.items():
+        values = _values(sheet, column)
+        low = np.flatnonzero(values < 0)
+        if key == "current" and low.size:
+            found = f"a negative current, {values[low[0]]:.6g} mA"
+            raise sheet.error(found, "zero or more", int(low[0]), column.header)
+
+
+def _forward(sheet: Sheet, columns: Mapping[str, Column]) -> Sheet:
+    """Leave out rows whose time is repeated or goes back."""
+    moment = _values(sheet, columns["time"])
+    if "nanos" in columns:
+        moment = moment + 1e-9 * _values(sheet, columns["nanos"])
+    late = np.concatenate([[-np.inf], np.maximum.accumulate(moment)[:-1]])
+    wrong = np.flatnonzero(moment <= late)
+    bad = [
+        sheet.error(f"time {moment[k]:.10g} s after {late[k]:.10g} s", "times that increase",
+                    int(k), columns["time"].header)
+        for k in wrong
+    ]  # fmt: skip
+    keep = np.flatnonzero(moment > late)
+    kept = sheet.rows([int(k) for k in keep])
+    return replace(kept, bad=tuple(sorted((*sheet.bad, *bad), key=lambda e: e.line or 0)))
+
+
+def _check_base(sheet: Sheet, column: Column, moment: np.ndarray) -> None:
+    if np.max(moment) > LATEST:
+        found = f"{np.max(moment):.6g} s, after the year 5000"
+        name = column.header.removesuffix("_s")
+        expected = f"the unit of the time: of milliseconds {name}_ms, or --time {column.header}:ms"
+        raise sheet.error(found, expected, int(np.argmax(moment)), column.header)
+
+
 def _seconds(cell: str) -> float:
-    """Unix time of an ISO 8601 text; without a zone it is taken as UTC."""
-    moment = datetime.fromisoformat(cell)
-    return (moment if moment.tzinfo else moment.replace(tzinfo=UTC)).timestamp()
+    """Unix time of a date; without a zone it is taken as UTC."""
+    text, zone = cell.strip(), UTC
+    if (match := ZONE.match(text)) is not None and match[2] not in ("T", "Z"):
+        text = match[1].strip()
+        try:
+            zone = ZoneInfo(match[2])
+        except (ZoneInfoNotFoundError, ValueError, OSError):
+            raise ValueError(f"zone {match[2]}") from None
+    moment = _moment(text)
+    return (moment if moment.tzinfo else moment.replace(tzinfo=zone)).timestamp()
+
+
+def _moment(text: str) -> datetime:
+    try:
+        return datetime.fromisoformat(text)
+    except ValueError:
+        fraction = FRACTION.search(text)
+        whole = text[: fraction.start()] if fraction else text
+        part = round(1e6 * float(f"0.{fraction[1]}")) if fraction else 0
+        for form in DATES:
+            try:
+                return datetime.strptime(whole, form).replace(microsecond=min(part, 999_999))
+            except ValueError:
+                continue
+        raise
+
+
+def _lifetimes(sheet: Sheet, skip_bad: bool) -> LifetimeTable:
+    columns = columns_of(sheet, LIFETIMES)
+    kinds = [kind for kind in ("tau", "lifetime") if kind in columns]
+    if len(kinds) != 1 or "beam_current" not in columns:
+        raise sheet.header_error(
+            f"columns {', '.join(sheet.names)}", "lifetime and current: tau_h, beam_current_mA"
+        )
+    wanted = {"current": columns["beam_current"], "lifetime": columns[kinds[0]]}
+    if (error := columns.get(f"{kinds[0]}_error")) is not None:
+        wanted["error"] = error
+    if skip_bad:
+        sheet = sheet.good(lambda rows: [_positive(rows, column) for column in wanted.values()])
+    values = {key: _positive(sheet, column) for key, column in wanted.items()}
+    hours = {key: values[key] / 3600 for key in ("lifetime", "error") if key in values}
+    said = {"comments": sheet.comments, "notes": left_out(sheet)}
+    return LifetimeTable(values["current"], **hours, name=Path(sheet.path).name, **said)
+
+
+def _positive(sheet: Sheet, column: Column) -> np.ndarray:
+    values = _values(sheet, column)
+    bad = np.flatnonzero(values <= 0)
+    if bad.size:
+        found = f"{values[bad[0]] / column.factor:.6g} {column.unit}"
+        raise sheet.error(found, "above zero", int(bad[0]), column.header)
+    return values

@@ -14,7 +14,7 @@ from scipy.special import fdtrc
 from beamfit.errors import InputError
 from beamfit.io.emittance_gui import is_emittance_gui, read_emittance_gui
 from beamfit.io.scan_columns import ENERGIES, SETTINGS, column_notes, scan_columns
-from beamfit.io.table import UNITS, Column, Sheet, read_sheet
+from beamfit.io.table import UNITS, Column, Sheet, left_out, read_sheet
 from beamfit.statistics import POOR_FIT
 from beamfit.studies.scan.scans import POSSIBLE, USUAL, QuadScan, first_unusable, row_keys
 
@@ -29,8 +29,6 @@ MOST_ROWS = 100_000
 SLIPPED = 100.0
 # Of the matrix of a plane, where rows have their own.
 ELEMENTS = (11, 12, 16)
-# Rows left out that a note names one by one.
-MOST_NAMED = 5
 # Further quantities: from (open), to, and how to say it.
 RANGES = {
     "energy": (0.511, 1e7, "a total energy between 0.511 MeV and 10 TeV; is it in GeV or eV?"),
@@ -130,7 +128,7 @@ def _scan(
         path=sheet.path,
         sha256=sheet.sha256,
         provenance=sheet.comments,
-        notes=(*column_notes(columns), *_left_out(sheet)),
+        notes=(*column_notes(columns), *left_out(sheet)),
         columns={name: c.header for name, c in magnets.items()}
         | headers
         | {header: header for header in headers.values()},
@@ -155,23 +153,6 @@ def _values(sheet: Sheet, columns: Mapping[str, Column]) -> dict[str, np.ndarray
     elements = [f"r{i}_{p}" for i in ELEMENTS for p in "xy"]
     plain = [c for key, c in columns.items() if c.unit in SETTINGS or key in elements]
     return values | {c.key: sheet.numbers(c.header) for c in plain}
-
-
-def _left_out(sheet: Sheet) -> tuple[str, ...]:
-    """Count and name the rows that were left out, as a note."""
-    if not sheet.bad:
-        return ()
-    named = [
-        (f"line {e.line}, " if e.line else "")
-        + (f"column '{e.column}', " if e.column else "")
-        + e.found
-        for e in sheet.bad[:MOST_NAMED]
-    ]
-    more = len(sheet.bad) - len(named)
-    named += [f"{more} more"] if more else []
-    were = "was" if len(sheet.bad) == 1 else "were"
-    total = len(sheet) + len(sheet.bad)
-    return (f"{len(sheet.bad)} of {total} rows {were} left out: {'; '.join(named)}.",)
 
 
 def _positive(sheet: Sheet, column: Column, what: str) -> np.ndarray:

@@ -25,17 +25,19 @@ from beamfit.io.files import digest, text_lines
 if TYPE_CHECKING:
     from pandas import DataFrame
 
-__all__ = ["UNITS", "Column", "Sheet", "columns_of", "read_sheet"]
+__all__ = ["UNITS", "Column", "Sheet", "columns_of", "left_out", "read_sheet"]
 
 UNITS: dict[str, dict[str, float]] = {
     # quantity: unit at the end of a name -> factor to SI (a stored current: to mA)
     "length": {"um": 1e-6, "mm": 1e-3, "m": 1.0, "µm": 1e-6, "μm": 1e-6},
-    "time": {"s": 1.0},
-    "current": {"mA": 1.0, "A": 1e3, "uA": 1e-3},
+    "time": {"s": 1.0, "min": 60.0, "h": 3600.0, "d": 86400.0, "ms": 1e-3},
+    "current": {"mA": 1.0, "A": 1e3, "uA": 1e-3, "µA": 1e-3, "μA": 1e-3},
     "voltage": {"kV": 1e3, "V": 1.0, "MV": 1e6},
-    "pressure": {"Pa": 1.0, "mbar": 100.0},
+    "pressure": {"Pa": 1.0, "mbar": 100.0, "Torr": 101325 / 760},
     "energy in MeV": {"MeV": 1.0},
 }
+# Rows left out that a note names one by one.
+MOST_NAMED = 5
 HDF5 = {".h5", ".hdf5"}
 # How Excel says which separator a file has.
 SEPARATOR_LINE = re.compile(r"\s*\"?sep=.\"?\s*$", re.IGNORECASE)
@@ -263,6 +265,7 @@ def read_sheet(
     most: int | None = None,
     *,
     ragged: bool = False,
+    names: Sequence[str] | None = None,
 ) -> Sheet:
     """Read the columns of a CSV, TFS or HDF5 file.
 
@@ -278,6 +281,8 @@ def read_sheet(
         Most rows there may be.
     ragged : bool
         Whether rows that have not as many cells as the header are left out, and named in ``bad``.
+    names : sequence of str, optional
+        The header of a file that has none and is separated by commas.
 
     Returns
     -------
@@ -304,7 +309,7 @@ def read_sheet(
         return _of_frame(path, most)
     if Path(path).suffix.lower() in HDF5:
         return _read_hdf5(path, most)
-    names, header, separator = None, None, ""
+    header, separator = None, "" if names is None else ","
     comments, rows, lines, bad, seen = [], [], [], [], hashlib.sha256()
     for line, text in enumerate(text_lines(path, seen), start=1):
         start = text.strip()[:1]
@@ -350,6 +355,23 @@ def _of_frame(frame: DataFrame, most: int | None) -> Sheet:
     if not cells:
         raise InputError("a frame without columns", "a column for each quantity", path=name)
     return Sheet(name, tuple(frame.columns), cells, None, None, ())
+
+
+def left_out(sheet: Sheet) -> tuple[str, ...]:
+    """Count and name the rows that were left out, as a note."""
+    if not sheet.bad:
+        return ()
+    named = [
+        (f"line {e.line}, " if e.line else "")
+        + (f"column '{e.column}', " if e.column else "")
+        + e.found
+        for e in sheet.bad[:MOST_NAMED]
+    ]
+    more = len(sheet.bad) - len(named)
+    named += [f"{more} more"] if more else []
+    were = "was" if len(sheet.bad) == 1 else "were"
+    total = len(sheet) + len(sheet.bad)
+    return (f"{len(sheet.bad)} of {total} rows {were} left out: {'; '.join(named)}.",)
 
 
 def _raise_first(errors: Sequence[InputError]) -> None:

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from beamfit.errors import InputError
-from beamfit.io.decay_record import read_decay_record
+from beamfit.io.decay_record import read_lifetime_input
 from beamfit.io.emittance_gui import is_emittance_gui, read_emittance_gui
 from beamfit.io.files import digest, text_lines
 from beamfit.io.lattice import CALIBRATIONS, STRENGTHS, LatticeFile
@@ -25,7 +25,7 @@ from beamfit.io.ring import read_operation, read_ring
 from beamfit.io.table import HDF5, read_sheet
 from beamfit.io.toml import read_toml
 from beamfit.quantity import display_unit
-from beamfit.studies.decay.record import DecayRecord
+from beamfit.studies.decay.record import DecayRecord, LifetimeTable
 from beamfit.studies.decay.segments import split_record
 from beamfit.studies.scan.scans import QuadScan
 from beamfit.table import Table
@@ -139,8 +139,8 @@ def understand(
         content = read_lattice(path, use=use, energy=energy) if foreign else read_lattice(path)
         facts, notes = _of_lattice(content), ()
     elif kind == "record":
-        content = read_decay_record(path)
-        facts, notes = _of_record(content), ()
+        content = read_lifetime_input(path, ignore=ignore, skip_bad=skip_bad)
+        facts, notes = _of_record(content), content.notes
     else:
         content = read_ring(path)
         facts, notes = _of_ring(path, content), ()
@@ -174,6 +174,8 @@ def _kind(path: str | PathLike[str]) -> str:
     if suffix == ".toml":
         tables = read_toml(path, "a lattice or a ring").table
         return "ring" if "ring" in tables and "element" not in tables else "lattice"
+    if suffix == ".json":
+        return "record"
     if suffix in HDF5:
         head = ",".join(read_sheet(path, "Q2_A,size_x_um").names)
     elif is_emittance_gui(path):
@@ -301,7 +303,19 @@ def _length(element: Any) -> float:
     return float(element.get("length_m", 0.0))
 
 
-def _of_record(record: DecayRecord) -> list[Fact]:
+def _of_lifetimes(table: LifetimeTable) -> list[Fact]:
+    errors = "none: the scatter of the points" if table.error is None else "given"
+    return [
+        Fact("lifetimes", str(len(table)), len(table)),
+        _range(table.lifetime, "h")._replace(label="lifetime"),
+        _range(table.current, "mA")._replace(label="beam current"),
+        Fact("errors", errors, table.error is not None),
+    ]
+
+
+def _of_record(record: DecayRecord | LifetimeTable) -> list[Fact]:
+    if isinstance(record, LifetimeTable):
+        return _of_lifetimes(record)
     hours = record.span / 3600
     words = f"{len(record)} over {hours:.3g} h"
     facts = [

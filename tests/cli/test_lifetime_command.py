@@ -337,3 +337,47 @@ def test_a_decimal_comma_between_semicolons_is_told_so(run, tmp_path):
     assert "semi.csv:3" in err
     assert "'99,9'" in err
     assert "a decimal point" in err
+
+
+def test_a_table_of_lifetimes_is_judged_like_a_decay(run, tmp_path):
+    path = tmp_path / "lifetimes.csv"
+    current = np.linspace(100, 500, 12)
+    rows = [f"{i:g},{1 / (1e-4 * i + 0.01):.6f},0.1" for i in current]
+    path.write_text("\n".join(["beam_current_mA,tau_h,tau_error_h", *rows]) + "\n")
+    status, out, err = run("lifetime", str(path), "--json")
+    assert (status, err) == (0, "")
+    [result] = json.loads(out)["results"]
+    assert result["status"] == "converged"
+    assert result["a"]["value"] * 3600 == pytest.approx(1e-4, rel=1e-4)
+    status, out, _ = run("lifetime", str(path))
+    assert status == 0
+    assert "12 lifetimes at 100 to 500 mA" in out
+    status, out, err = run("lifetime", str(path), "--sample")
+    assert (status, out) == (2, "")
+    assert "tables of lifetimes by themselves" in err
+
+
+def test_columns_of_an_archive_are_named_on_request(run, tmp_path):
+    time = np.arange(0, 20000, 40)
+    path = tmp_path / "export.csv"
+    rows = [f"{t},{i / 1000:.9f},0.2" for t, i in zip(time, decay(time), strict=True)]
+    rows.insert(7, "270,Disconnected,0.2")
+    path.write_text("\n".join(["Seconds,SR:DCCT:CURRENT,SR:TUNE", *rows]) + "\n")
+    named = ("--time", "Seconds", "--current", "SR:DCCT:CURRENT:A")
+    status, out, err = run("lifetime", str(path), *named)
+    assert (status, out) == (2, "")
+    assert err.count("\n") == 1
+    assert f"{path}:9: column 'SR:DCCT:CURRENT': 'Disconnected'; expected a number" in err
+    status, out, _ = run("lifetime", str(path), *named, "--skip-bad", "--json")
+    assert status == 0
+    [result] = json.loads(out)["results"]
+    assert result["a"]["value"] == pytest.approx(2e-8, rel=1e-3)
+    assert "1 of 501 rows was left out" in result["notes"][0]
+
+
+def test_a_clock_in_milliseconds_is_questioned(run, tmp_path):
+    time = np.arange(0, 36000, 60)
+    path = write_record(tmp_path / "ms.csv", 1000 * time, decay(time))
+    status, out, _ = run("lifetime", str(path), "--json")
+    assert status == 0
+    assert "milliseconds taken for seconds" in json.loads(out)["results"][0]["message"]

@@ -27,6 +27,7 @@ __all__ = [
     "LifetimeLaw",
     "PowerLaw",
     "averaged",
+    "by_independent_noise",
     "change_of_rate",
     "constant_a",
     "lifetime_law",
@@ -84,31 +85,26 @@ class ConstantA:
         return f"{self.status}. {self.message}"
 
 
-def constant_a(
-    record: DecayRecord,
-    exponent: float,
-    error: float,
-    unit: float,
-    raw: float | None = None,
-    chance: float | None = None,
+def by_independent_noise(
+    record: DecayRecord, exponent: float, error: float, left: float
 ) -> ConstantA:
-    """Judge an exponent that was estimated beside I0, a and b.
-
-    `error` is for noise of size 1 and `unit` the mean square that is left, unless a `chance` says
-    that the error is whole.
+    """Judge an exponent estimated beside I0, a and b: its error for noise of size 1, and the mean
+    square that is left.
     """
     over = 1.0 if record.error is None else record.error
-    floor = float(np.mean((EXACT * record.current / over) ** 2))
-    size = max(unit, floor) if record.error is None else max(unit, floor, 1.0)
-    raw = float(error) * math.sqrt(max(unit, floor)) if raw is None else raw
-    if chance is None:
-        error = float(error) * math.sqrt(size)
-        chance = float(2 * stdtr(max(len(record) - 4, 1), -abs(exponent) / error))
+    unit = max(left, float(np.mean((EXACT * record.current / over) ** 2)))
+    whole = error * math.sqrt(unit if record.error is None else max(unit, 1.0))
+    chance = 2 * stdtr(max(len(record) - 4, 1), -abs(exponent) / whole)
+    return constant_a(exponent, whole, error * math.sqrt(unit), chance)
+
+
+def constant_a(exponent: float, error: float, raw: float, chance: float) -> ConstantA:
+    """Judge an exponent by its error and the chance of so large a one where a is constant."""
     if not error < TELLING:
         message = "The record cannot tell a constant a from one that depends on the current"
         unknown = Quantity(math.nan, None, "1")
         return ConstantA(Status.unidentified, f"{message}: record longer.", unknown, math.nan)
-    found = Quantity(float(exponent), float(error), "1", raw)
+    found, chance = Quantity(float(exponent), float(error), "1", float(raw)), float(chance)
     if chance >= REJECTED:
         message = (
             f"A constant a describes the record (p = {chance:.2g}, exponent {found}; one of "

@@ -17,6 +17,7 @@ from beamfit.studies.decay.departures import (
     Change,
     ConstantA,
     LifetimeLaw,
+    by_independent_noise,
     change_of_rate,
     constant_a,
     lifetime_law,
@@ -149,7 +150,8 @@ class Evidence:
         far = float(stdtrit(dof, 0.975)) if record.error is None else 1.96
         errors = _times(solution.errors, noise)
         left = max(squares - float(solution.fall), 0.0) / max(dof - 1, 1)
-        found = constant_a(record, solution.values.exponent, solution.errors.exponent, left)
+        exponent = float(solution.values.exponent), float(solution.errors.exponent)
+        found = by_independent_noise(record, *exponent, left)
         reach = _times(errors, far)
         raws = _times(solution.errors, raw)
         return cls(
@@ -172,9 +174,7 @@ class Evidence:
         after = found.residuals + found.rows[:, :NUMBERS] @ held.mean_step
         raw = 1.0 if given else math.sqrt(float(solution.sum_squares) / held.dof)
         raw_exponent = float(solution.errors.exponent) * raw
-        test = constant_a(
-            record, power.shift[-1], power.error[-1], 1.0, raw_exponent, power.chance[-1]
-        )
+        test = constant_a(power.shift[-1], power.error[-1], raw_exponent, power.chance[-1])
         return cls(
             record, solution, shape,
             Physical(*(np.array(solution.values) + moved.shift)),

@@ -16,7 +16,9 @@ from beamfit.table import Table
 if TYPE_CHECKING:
     from pandas import DataFrame
 
-__all__ = ["Conditions", "DecayRecord", "Fault", "first_fault"]
+__all__ = ["Conditions", "DecayRecord", "Fault", "LifetimeTable", "first_fault"]
+
+FEWEST_LIFETIMES = 4
 
 
 # Readings of a record that a notebook shows.
@@ -182,6 +184,8 @@ class DecayRecord:
         Operating conditions in SI, each of shape (n,).
     comments : tuple of str, optional
         Provenance, as written in the file.
+    notes : tuple of str, optional
+        What was done to its numbers, such as rows left out.
 
     Raises
     ------
@@ -203,6 +207,7 @@ class DecayRecord:
     start: float | None = None
     conditions: Conditions = field(default_factory=Conditions)
     comments: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         rows = np.size(self.time)
@@ -336,3 +341,55 @@ class DecayRecord:
             start=moved,
             conditions=Conditions(*(None if v is None else v[rows] for v in self.conditions)),
         )
+
+
+@shown
+@dataclass(frozen=True, eq=False)
+class LifetimeTable:
+    """Lifetimes measured at several currents.
+
+    Parameters
+    ----------
+    current : array, shape (n,)
+        Beam current, mA.
+    lifetime : array, shape (n,)
+        Lifetime there, h.
+    error : array, shape (n,), optional
+        Standard deviation of each lifetime, h.
+    name : str, optional
+        What to call it.
+    comments, notes : tuple of str, optional
+        Provenance, and what was done to its numbers.
+
+    Raises
+    ------
+    InputError
+        If there are fewer than four points, or a number is not positive.
+    """
+
+    current: np.ndarray
+    lifetime: np.ndarray
+    error: np.ndarray | None = None
+    name: str = "lifetimes"
+    comments: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        rows = np.size(self.current)
+        if rows < FEWEST_LIFETIMES:
+            raise InputError(f"{rows} lifetimes", f"{FEWEST_LIFETIMES} or more", path=self.name)
+        for name in ("current", "lifetime", "error"):
+            values = getattr(self, name)
+            if values is None:
+                continue
+            values = np.array(values, float)
+            if values.shape != (rows,) or not np.all((values > 0) & (values < np.inf)):
+                raise InputError(f"{name} {values}", f"{rows} positive numbers", path=self.name)
+            object.__setattr__(self, name, values)
+
+    def __len__(self) -> int:
+        return self.current.size
+
+    def __str__(self) -> str:
+        low, high = self.current.min(), self.current.max()
+        return f"{self.name}: {len(self)} lifetimes at {low:.4g} to {high:.4g} mA"

@@ -238,6 +238,7 @@ class Decay:
         checks = {} if self.checks is None else self.checks.to_json()
         shown = self.fit.to_json() | {"start": start} | checks
         shown |= {"systematics": json_of(self.systematics)}
+        shown |= {"notes": list(self.segment.notes)} if self.segment.notes else {}
         return shown if self.budget is None else shown | {"budget": self.budget.to_json()}
 
 

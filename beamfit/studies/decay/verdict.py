@@ -3,20 +3,61 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from functools import partial
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
 from beamfit.lifetime.decay import HOUR
 from beamfit.statistics import POOR_FIT, chi2_probability
 from beamfit.status import Status
+from beamfit.studies.decay.departures import Change, ConstantA, LifetimeLaw
 from beamfit.studies.decay.evidence import BELIEVED, DETERMINED, SEPARABLE, Evidence
 from beamfit.verdict import Finding, judge
 
-__all__ = ["finding_of"]
+__all__ = ["TableEvidence", "finding_of", "finding_of_table"]
 
+# Lifetimes, s, that stored beams seldom have, but times in a wrong unit often give.
+SHORTEST, LONGEST = 20.0, 3000 * HOUR
 # One-sided 95 %.
 LIMIT = 1.645
+
+
+class Judged(Protocol):
+    """What rules look at that hold for records and for tables of lifetimes."""
+
+    constant_a: ConstantA
+    lifetimes: LifetimeLaw | None
+    change: Change | None
+    changed: bool
+
+    def scaled(self, name: str) -> tuple[float, float]:
+        """A value and its error."""
+        ...
+
+
+class TableEvidence(NamedTuple):
+    """What the rules look at of a table of lifetimes.
+
+    `numbers` has values and errors of a, b and the share of a in the loss at the mean current,
+    `outliers` names the points that were left out, `noise` is what the points scatter by, h, where
+    they have no errors.
+    """
+
+    numbers: Mapping[str, tuple[float, float]]
+    chi2: float
+    dof: int
+    constant_a: ConstantA
+    lifetimes: LifetimeLaw | None
+    outliers: tuple[str, ...]
+    noise: float | None
+    change: Change | None = None
+    changed: bool = False
+
+    def scaled(self, name: str) -> tuple[float, float]:
+        """A value and its error."""
+        return self.numbers[name]
 
 
 def _lost(e: Evidence) -> Finding | None:
@@ -42,7 +83,7 @@ def _stepped(e: Evidence) -> Finding | None:
     return Finding(Status.poor_fit, e.step) if e.step else None
 
 
-def _negative(name: str, cause: str, e: Evidence) -> Finding | None:
+def _negative(name: str, cause: str, e: Judged) -> Finding | None:
     value, error = e.scaled(name)
     if not (value < -BELIEVED * error and value < 0):
         return None
@@ -58,7 +99,7 @@ NOT_GAS = (
 RISING = "the loss rate rises as the current falls: look for a changing vacuum or setting"
 
 
-def _refuted(e: Evidence) -> Finding | None:
+def _refuted(e: Judged) -> Finding | None:
     """Data that refute constant a and b: what is quoted of them is not of this beam."""
     if e.constant_a.status is not Status.poor_fit and not e.changed:
         return None
@@ -97,7 +138,7 @@ def _improbable(e: Evidence) -> Finding | None:
     )
 
 
-def _determined(e: Evidence) -> Finding:
+def _determined(e: Judged) -> Finding:
     """Each of the two by itself: one that is small is known to be so, but is not told from zero."""
     units = {"a": "1/(mA s)", "b": "1/s"}
     small = {name: e.scaled(name) for name in units}
@@ -124,6 +165,48 @@ RULES = (
     _improbable,
     _determined,
 )
+
+
+def _narrow(e: TableEvidence) -> Finding | None:
+    share, error = e.scaled("share")
+    if error < SEPARABLE:
+        return None
+    return Finding(
+        Status.unidentified,
+        "a and b are not separable by these lifetimes (share of a in the loss "
+        f"{share:.2g} ± {error:.2g}): measure at a wider range of currents",
+    )
+
+
+def _unlikely(e: TableEvidence) -> Finding | None:
+    if e.noise is not None or chi2_probability(e.chi2, e.dof) >= POOR_FIT:
+        return None
+    return Finding(
+        Status.poor_fit,
+        f"chi²/dof is {e.chi2 / e.dof:.3g}, improbable for this law and the stated errors, which "
+        "are enlarged to match",
+    )
+
+
+TABLE_RULES = (
+    partial(_negative, "b", NOT_GAS),
+    partial(_negative, "a", RISING),
+    _refuted,
+    _narrow,
+    _unlikely,
+    _determined,
+)
+
+
+def finding_of_table(evidence: TableEvidence) -> Finding:
+    """Status and sentences on a table of lifetimes."""
+    found = judge(evidence, TABLE_RULES)
+    said = [found.cause.rstrip(".")]
+    if evidence.noise is not None:
+        said.append(f"The table gives no errors; {evidence.noise:.3g} h rms is their scatter")
+    if evidence.outliers:
+        said.append(f"Left out as outliers: {', '.join(evidence.outliers)}")
+    return Finding(found.status, ". ".join(said) + ".")
 
 
 def _noise_inferred(e: Evidence) -> str | None:
@@ -168,7 +251,18 @@ def _drifting(e: Evidence) -> str | None:
     )
 
 
-REMARKS = (_noise_inferred, _correlated, _quantised, _drifting)
+def _odd_clock(e: Evidence) -> str | None:
+    rate, error = e.scaled("rate_mean")
+    if not error < DETERMINED * rate or 1 / LONGEST < rate < 1 / SHORTEST:
+        return None
+    wrong = "milliseconds" if rate < 1 / LONGEST else "minutes or hours"
+    return (
+        f"A lifetime of {1 / rate / HOUR:.2g} h is what {wrong} taken for seconds make: check the "
+        "unit of the time"
+    )
+
+
+REMARKS = (_noise_inferred, _correlated, _quantised, _drifting, _odd_clock)
 
 
 def finding_of(evidence: Evidence) -> Finding:

@@ -1,0 +1,260 @@
+"""A table of lifetimes against current: a, b and the same verdicts as of a decay."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from scipy.special import chdtrc, fdtrc
+
+from beamfit.greybox.fit import Fit
+from beamfit.greybox.problem import Free, Problem, Record, padded_length
+from beamfit.greybox.solve import solve
+from beamfit.lifetime.decay import HOUR
+from beamfit.quantity import Quantity, Status
+from beamfit.shown import shown
+from beamfit.studies.decay.departures import CURRENTS, ConstantA, LifetimeLaw, constant_a
+from beamfit.studies.decay.fit import UNITS, bare
+from beamfit.studies.decay.record import FEWEST_LIFETIMES, LifetimeTable
+from beamfit.studies.decay.verdict import TableEvidence, finding_of_table
+from beamfit.table import Table, json_of, labelled, plain_name
+
+__all__ = ["LifetimeFit", "fit_lifetimes"]
+
+# Points so many robust standard deviations off the law with a free exponent are outliers; no more
+# than a fifth of them.
+OUTLIER, MOST = 5.0, 0.2
+RECORD = "lifetimes"
+
+
+@shown
+@dataclass(frozen=True, eq=False)
+class LifetimeFit:
+    """The result of `fit_lifetimes`.
+
+    Parameters
+    ----------
+    record : str
+        Name of the table.
+    status, message
+        As of `DecayFit`.
+    a, b, lifetime_start, lifetime_mean, lifetime_end : Quantity
+        As of `DecayFit`, the lifetimes at the highest, mean and lowest current.
+    mean_current, chi2, dof
+        As of `DecayFit`.
+    constant_a, lifetimes
+        As of `DecayFit`.
+    share : Quantity
+        Of a in the loss at the mean current.
+    outliers : tuple of int
+        Points that were left out, counted from 0.
+    readings : LifetimeTable
+        What was fitted.
+    """
+
+    record: str
+    status: Status
+    message: str
+    a: Quantity
+    b: Quantity
+    lifetime_start: Quantity
+    lifetime_mean: Quantity
+    lifetime_end: Quantity
+    mean_current: float
+    chi2: float
+    dof: int
+    constant_a: ConstantA
+    lifetimes: LifetimeLaw | None
+    share: Quantity
+    outliers: tuple[int, ...]
+    readings: LifetimeTable
+
+    @property
+    def quantities(self) -> dict[str, Quantity]:
+        """What is quoted, by name."""
+        return {name: getattr(self, name) for name in UNITS if hasattr(self, name)}
+
+    def __str__(self) -> str:
+        rows = [f"{self.record}: {self.status}. {self.message}"]
+        rows += [f"  {name:15s} {value}" for name, value in self.quantities.items()]
+        return "\n".join([*rows, f"  chi²/dof {self.chi2:.4g}/{self.dof}"])
+
+    def table(self) -> Table:
+        """What is quoted, to be shown."""
+        rows = [(plain_name(name), [value]) for name, value in self.quantities.items()]
+        rows.append(("share of a in the loss", [self.share]))
+        tested = self.readings.error is not None
+        chi2 = f"{self.chi2:.4g}/{self.dof}" if tested else f"not testable ({self.dof} dof)"
+        return labelled("", [self.record], [("status", [self.status]), *rows, ("chi2/dof", [chi2])])
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the result as `beamfit lifetime --json` prints it."""
+        found = self.share
+        told = {
+            "record": self.record,
+            "status": self.status,
+            "message": self.message,
+            **self.quantities,
+            "i0": bare(None, "mA"),
+            "mean_current": bare(self.mean_current, "mA"),
+            "chi2": self.chi2,
+            "dof": self.dof,
+            "noise_inferred": self.readings.error is None,
+            "identifiability": {
+                "separable": self.a.error is not None,
+                "share": found.value,
+                "share_error": found.error,
+            },
+            "constant_a": self.constant_a,
+            "lifetime_by_current": self.lifetimes,
+            "outliers": list(self.outliers),
+            "notes": list(self.readings.notes),
+        }
+        return json_of(told)
+
+
+def _rate(model: dict[str, Array], x: Array) -> Array:
+    """Loss rate over that at the mean current, 1, from the share of a there and its exponent."""
+    return model["rate"] * (1 + model["share"] * (x ** (1 + model["exponent"]) - 1))
+
+
+def _lifetimes(model: dict[str, Array], x: Array) -> Array:
+    return 1 / jnp.maximum(_rate(model, x), 1e-6)
+
+
+def _quoted(model: dict[str, Array], ends: Array) -> Array:
+    """a I, b, and the rates at the ends, in units of the usual rate; share and exponent."""
+    quadratic = model["rate"] * model["share"]
+    rest = jnp.stack([quadratic, model["rate"] - quadratic, model["share"], model["exponent"]])
+    return jnp.concatenate([rest, _rate(model, ends)])
+
+
+def _solved(table: LifetimeTable, rows: np.ndarray, exponent: bool) -> Fit:
+    """Fit in units of the mean current and the median lifetime; rows of weight 0 are padding."""
+    size = padded_length(len(table))
+    weight = np.pad(rows.astype(float), (0, size - len(table)))
+    usual = float(np.median(table.lifetime))
+    x, lifetime = (
+        np.pad(values, (0, size - len(table)), mode="edge")
+        for values in (table.current / table.current.mean(), table.lifetime / usual)
+    )
+    error = None
+    if table.error is not None:
+        error = np.pad(table.error / usual, (0, size - len(table)), mode="edge")
+    free = [Free("rate", 1e-3, 1e3), Free("share")] + [Free("exponent", -3.0, 3.0)] * exponent
+    record = Record(RECORD, _lifetimes, x, lifetime, error, weight)
+    return solve(Problem({"rate": 1.0, "share": 0.5, "exponent": 0.0}, free, [record]))
+
+
+def _outliers(table: LifetimeTable) -> np.ndarray:
+    """Which points lie off every smooth law, the farthest first, one at a time."""
+    kept = np.ones(len(table), bool)
+    for _ in range(int(MOST * len(table))):
+        found = _solved(table, kept, exponent=bool(kept.sum() > FEWEST_LIFETIMES))
+        pulls = np.asarray(found.problem.residual(found.theta))[: len(table)]
+        scatter = 1.4826 * np.median(np.abs(pulls[kept]))
+        scatter = scatter if table.error is None else max(1.0, scatter)
+        worst = int(np.argmax(np.abs(pulls)))
+        if abs(pulls[worst]) <= OUTLIER * scatter:
+            break
+        kept[worst] = False
+    return ~kept
+
+
+def _tested(table: LifetimeTable, plain: Fit, power: Fit) -> ConstantA:
+    """Whether a constant a is refuted: by the fall of chi², which knows no curvature."""
+    before, after = plain.group(RECORD), power.group(RECORD)
+    found, dof = power["exponent"], max(after.dof, 1.0)
+    fall = max(before.chi2 - after.chi2, 0.0)
+    if table.error is None:
+        chance = fdtrc(1.0, dof, fall * dof / max(after.chi2, 1e-300))
+    else:
+        chance = chdtrc(1, fall / max(1.0, after.chi2 / dof))
+    return constant_a(found.value, found.error, found.error_raw, float(chance))
+
+
+def fit_lifetimes(table: LifetimeTable) -> LifetimeFit:
+    """Fit 1/tau = a I + b to lifetimes at several currents.
+
+    Parameters
+    ----------
+    table : LifetimeTable
+        Four points or more.
+
+    Returns
+    -------
+    LifetimeFit
+        With the verdicts of a decay. Where a constant a is refuted, the lifetimes are those of a
+        law with a free exponent.
+
+    Notes
+    -----
+    Least squares on the lifetimes themselves: their errors, and not those of 1/tau, are what is
+    stated. Points five robust standard deviations off a law with a free exponent are left out and
+    named.
+
+    Examples
+    --------
+    >>> from beamfit.studies.decay.record import LifetimeTable
+    >>> current = np.linspace(100, 500, 9)
+    >>> fit = fit_lifetimes(LifetimeTable(current, 1 / (1e-4 * current + 0.01), np.full(9, 0.1)))
+    >>> fit.status.value, f"{fit.a.value * 3600:.4e}"
+    ('converged', '1.0000e-04')
+    """
+    left_out = _outliers(table)
+    plain, power = (_solved(table, ~left_out, exponent) for exponent in (False, True))
+    mean, usual = float(table.current.mean()), float(np.median(table.lifetime)) * HOUR
+    test, group = _tested(table, plain, power), plain.group(RECORD)
+    refuted = test.status is Status.poor_fit
+    ends = np.array([table.current.max(), mean, table.current.min()]) / mean
+    law, quoted = (fit.derive(_quoted, ends) for fit in (plain, power if refuted else plain))
+    scale = {"a": usual * mean, "b": usual, "share": 1.0}
+    numbers = {
+        name: (float(value) / unit, float(error) / unit)
+        for (name, unit), value, error in zip(scale.items(), law.value, law.error, strict=False)
+    }
+    raws = [float(law.error_raw[k]) / scale[name] for k, name in enumerate("ab")]
+    evidence = TableEvidence(
+        numbers, float(group.chi2), round(group.dof), test,
+        _by_current(table, power, usual) if refuted else None, _named(table, left_out),
+        None if table.error is not None else group.scale * usual / HOUR,
+    )  # fmt: skip
+    finding = finding_of_table(evidence)
+    known = finding.status is not Status.unidentified
+    start, at_mean, end = map(partial(_lifetime, usual), quoted.value[4:], quoted.error[4:])
+    a, b = (
+        Quantity(value, error if known else None, UNITS[name], raw if known else None)
+        for (name, (value, error)), raw in zip(numbers.items(), raws, strict=False)
+    )
+    return LifetimeFit(
+        table.name, finding.status, finding.message, a, b, start, at_mean, end, mean,
+        evidence.chi2 if table.error is not None else float(evidence.dof), evidence.dof, test,
+        evidence.lifetimes, Quantity(*numbers["share"], "1"),
+        tuple(map(int, np.flatnonzero(left_out))), table,
+    )  # fmt: skip
+
+
+def _lifetime(usual: float, rate: float, error: float) -> Quantity:
+    lifetime = usual / HOUR / rate
+    return Quantity(float(lifetime), float(lifetime * error / rate), "h")
+
+
+def _by_current(table: LifetimeTable, power: Fit, usual: float) -> LifetimeLaw:
+    current = np.geomspace(table.current.min(), table.current.max(), CURRENTS)
+    found = power.derive(_quoted, current / table.current.mean())
+    pairs = zip(found.value[4:], found.error[4:], strict=True)
+    exponent = Quantity(float(found.value[3]), float(found.error[3]), "1")
+    return LifetimeLaw(
+        tuple(map(float, current)), tuple(_lifetime(usual, *pair) for pair in pairs), exponent
+    )
+
+
+def _named(table: LifetimeTable, which: np.ndarray) -> tuple[str, ...]:
+    return tuple(
+        f"point {k + 1} ({table.lifetime[k]:.4g} h at {table.current[k]:.4g} mA)"
+        for k in np.flatnonzero(which)
+    )

@@ -1,0 +1,207 @@
+"""One decay as control rooms export it: every file gives the same record."""
+
+import json
+from datetime import UTC, datetime, timedelta, timezone
+
+import h5py
+import numpy as np
+import pytest
+
+from beamfit.errors import InputError
+from beamfit.io.decay_record import read_decay_record, read_lifetime_input, read_lifetimes
+from beamfit.studies.decay.record import LifetimeTable
+
+START = 1709290800.25  # 2024-03-01T11:00:00.25 UTC
+CURRENT = [200.0, 199.5, 199.1, 198.6]
+TIMES = [0.0, 60.0, 120.0, 200.5]
+
+
+def dates(form, zone=UTC):
+    moments = (datetime.fromtimestamp(START + t, zone) for t in TIMES)
+    return [moment.strftime(form) for moment in moments]
+
+
+def table(header, times, values, separator=","):
+    rows = [f"{t}{separator}{v}" for t, v in zip(times, values, strict=True)]
+    return "\n".join([header.replace(",", separator), *rows]) + "\n"
+
+
+BERLIN = timezone(timedelta(hours=1))
+MILLI = [round(1000 * (START + t)) for t in TIMES]
+SECONDS = [f"{START + t:.2f}" for t in TIMES]
+AMPERE = [v / 1000 for v in CURRENT]
+PV = "SR:DCCT:CURRENT"
+EXPORTS = {
+    "contract": (table("time_s,beam_current_mA", SECONDS, CURRENT), {}),
+    "ampere": (table("time_s,beam_current_A", SECONDS, AMPERE), {}),
+    "microampere": (table("time_s,beam_current_uA", SECONDS, [1000 * v for v in CURRENT]), {}),
+    "semicolons": (table("time_s,beam_current_mA", SECONDS, CURRENT, ";"), {}),
+    "milliseconds": (table("time_ms,beam_current_mA", MILLI, CURRENT), {}),
+    "iso": (table("time,beam_current_mA", dates("%Y-%m-%dT%H:%M:%S.%fZ"), CURRENT), {}),
+    "offset": (
+        table("time,beam_current_mA", dates("%Y-%m-%d %H:%M:%S.%f+01:00", BERLIN), CURRENT), {},
+    ),
+    "zone": (
+        table("Time,beam_current_mA", dates("%Y-%m-%d %H:%M:%S.%f Europe/Berlin", BERLIN), CURRENT),
+        {},
+    ),
+    "matlab": (table("Date,I", dates("%d-%b-%Y %H:%M:%S.%f"), CURRENT),
+               {"time": "Date", "current": "I:mA"}),
+    "german": (table("Zeit;Strom", dates("%d.%m.%Y %H:%M:%S.%f"), CURRENT, ";"),
+               {"time": "Zeit", "current": "Strom:mA"}),
+    "slashes": (table(f"Timestamp,{PV}", dates("%Y/%m/%d %H:%M:%S.%f"), CURRENT),
+                {"time": "Timestamp", "current": f"{PV}:mA"}),
+    "process variable": (table(f"time_s,{PV}", SECONDS, AMPERE), {"current": f"{PV}:A"}),
+    "archiver, no header": (
+        "".join(f"{int(START + t)},{v},0,0,{round((START + t) % 1 * 1e9)}\n"
+                for t, v in zip(TIMES, CURRENT, strict=True)),
+        {"current": "val:mA"},
+    ),
+    "archiver, with header": (
+        "secs,nanos,val,severity,status\n"
+        + "".join(f"{int(START + t)},{round((START + t) % 1 * 1e9)},{v},0,0\n"
+                  for t, v in zip(TIMES, CURRENT, strict=True)),
+        {"current": "val:mA"},
+    ),
+    "further columns": (
+        "time_s,beam_current_mA,SR:TUNE:X,operator\n"
+        + "".join(f"{t},{v},0.22,A. N.\n" for t, v in zip(SECONDS, CURRENT, strict=True)),
+        {"time": "time_s"},
+    ),
+    "a byte-order mark": ("\ufeff" + table("time_s,beam_current_mA", SECONDS, CURRENT), {}),
+}  # fmt: skip
+
+
+def check(record):
+    np.testing.assert_allclose(record.current, CURRENT)
+    np.testing.assert_allclose(record.time, TIMES, atol=1e-5)
+    assert record.start == pytest.approx(START, abs=1e-5)
+
+
+@pytest.mark.parametrize("name", EXPORTS)
+def test_an_export_is_read(tmp_path, name):
+    text, options = EXPORTS[name]
+    path = tmp_path / "export.csv"
+    path.write_text(text, encoding="utf-8")
+    check(read_decay_record(path, **options))
+
+
+def archive(unit):
+    data = [
+        {"secs": int(START + t), "val": v, "nanos": round((START + t) % 1 * 1e9), "severity": 0}
+        for t, v in zip(TIMES, CURRENT, strict=True)
+    ]
+    return [{"meta": {"name": PV, "EGU": unit, "PREC": "3"}, "data": data}]
+
+
+def test_json_of_the_archiver_appliance(tmp_path):
+    path = tmp_path / "export.json"
+    path.write_text(json.dumps(archive("mA")))
+    record = read_decay_record(path)
+    check(record)
+    assert f"name: {PV}" in record.comments
+    path.write_text(json.dumps(archive("")))
+    with pytest.raises(InputError, match=r"no column of current.*--current COLUMN:UNIT"):
+        read_decay_record(path)
+    check(read_decay_record(path, current="val:mA"))
+
+
+def test_hdf5_of_process_variables(tmp_path):
+    path = tmp_path / "export.h5"
+    with h5py.File(path, "w") as file:
+        file["timestamp"], file[PV] = START + np.array(TIMES), CURRENT
+    check(read_decay_record(path, time="timestamp", current=f"{PV}:mA"))
+
+
+@pytest.mark.parametrize(
+    ("header", "times"),
+    [("time_h", [t / 3600 for t in TIMES]), ("time_d", [t / 86400 for t in TIMES]),
+     ("time_min", [t / 60 for t in TIMES])],
+)  # fmt: skip
+def test_times_in_other_units(tmp_path, header, times):
+    path = tmp_path / "export.csv"
+    path.write_text(table(f"{header},beam_current_mA", times, CURRENT))
+    np.testing.assert_allclose(read_decay_record(path).time, TIMES, atol=1e-9)
+
+
+def test_pressures_in_torr_and_mbar(tmp_path):
+    path = tmp_path / "export.csv"
+    for unit, factor in (("Torr", 133.32236842), ("mbar", 100.0)):
+        path.write_text(f"time_s,beam_current_mA,pressure_{unit}\n0,5,1e-9\n60,4.9,1e-9\n")
+        found = read_decay_record(path).conditions.pressure
+        np.testing.assert_allclose(found, 1e-9 * factor, rtol=1e-9)
+
+
+def test_bad_rows_are_left_out_counted_and_named(tmp_path):
+    path = tmp_path / "export.csv"
+    path.write_text(
+        "time_s,beam_current_mA\n0,200\n60,NaN\n120,199\n120,199\n100,199.1\n180,Disconnected\n"
+        "240,-0.1\n300,198\n360\n420,197\n"
+    )
+    record = read_decay_record(path, skip_bad=True)
+    assert record.time.tolist() == [0, 120, 300, 420]
+    [note] = record.notes
+    assert "6 of 10 rows were left out" in note
+    assert "'Disconnected'" in note or "more" in note
+    assert "line 3" in note
+    with pytest.raises(InputError, match="2, as in the header"):
+        read_decay_record(path)
+
+
+def test_milliseconds_called_seconds_are_questioned(tmp_path):
+    path = tmp_path / "export.csv"
+    path.write_text(table("time_s,beam_current_mA", MILLI, CURRENT))
+    with pytest.raises(InputError, match=r"after the year 5000; expected .*time_ms"):
+        read_decay_record(path)
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"current": PV}, "without a unit; expected its unit after the last colon"),
+        ({"current": "SR:DCCT:mA"}, f"no column 'SR:DCCT'; expected one of time_s, {PV}"),
+        ({"time": "when", "current": f"{PV}:mA"}, "no column 'when'"),
+    ],
+)
+def test_a_wrong_name_is_answered_with_those_there_are(tmp_path, options, words):
+    path = tmp_path / "export.csv"
+    path.write_text(table(f"time_s,{PV}", SECONDS, CURRENT))
+    with pytest.raises(InputError, match=words):
+        read_decay_record(path, **options)
+
+
+def test_an_unknown_zone_is_no_date(tmp_path):
+    path = tmp_path / "export.csv"
+    path.write_text("time,beam_current_mA\n2024-03-01 12:00:00 Europe/Atlantis,5\n")
+    with pytest.raises(InputError, match="Atlantis"):
+        read_decay_record(path)
+
+
+@pytest.mark.parametrize(
+    "text", ["{}", "[]", "[1]", "nonsense", '[{"data": []}]', '[{"data": [{"secs": 1}]}]']
+)
+def test_other_json_is_refused_in_a_line(tmp_path, text):
+    path = tmp_path / "export.json"
+    path.write_text(text)
+    with pytest.raises(InputError, match=r"export\.json"):
+        read_decay_record(path)
+
+
+def test_a_table_of_lifetimes(tmp_path):
+    path = tmp_path / "lifetimes.csv"
+    rows = "1,20,1\n2,15,1\n3,12,0.5\n4,10,1\n"
+    path.write_text(f"# IOTA\nbeam_current_mA,tau_min,tau_error_min\n{rows}")
+    found = read_lifetimes(path)
+    np.testing.assert_allclose(found.lifetime, np.array([20, 15, 12, 10]) / 60)
+    np.testing.assert_allclose(found.error, np.array([1, 1, 0.5, 1]) / 60)
+    assert found.comments == ("IOTA",)
+    assert isinstance(read_lifetime_input(path), LifetimeTable)
+    path.write_text("beam_current_mA,tau_min\n1,20\n2,0\n3,12\n4,10\n5,9\n")
+    with pytest.raises(InputError, match=r":3: column 'tau_min': 0 min; expected above zero"):
+        read_lifetimes(path)
+    kept = read_lifetimes(path, skip_bad=True)
+    assert len(kept) == 4
+    assert "1 of 5 rows was left out" in kept.notes[0]
+    path.write_text("beam_current_mA,tau_min\n1,20\n2,5\n")
+    with pytest.raises(InputError, match="2 lifetimes; expected 4 or more"):
+        read_lifetimes(path)
