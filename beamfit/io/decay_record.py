@@ -6,15 +6,14 @@ import json
 import re
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
-from datetime import UTC, datetime
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING
-from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
 
 import numpy as np
 
 from beamfit.errors import InputError
+from beamfit.io.dates import unix_time
 from beamfit.io.files import digest, text_lines
 from beamfit.io.table import UNITS, Column, Sheet, columns_of, left_out, read_sheet
 from beamfit.studies.decay.record import (
@@ -53,10 +52,6 @@ DATE, NANOSECONDS = "a date", "ns"
 # Seconds beyond this many are counted from 1970, not from the start of a record (1973 or later);
 # beyond the other they lie after the year 5000, and are milliseconds.
 UNIX, LATEST = 1e8, 1e11
-# Dates as control rooms write them, besides ISO 8601; days before months where both are numbers.
-DATES = ("%d-%b-%Y %H:%M:%S", "%d.%m.%Y %H:%M:%S", "%Y/%m/%d %H:%M:%S")
-FRACTION = re.compile(r"[.,](\d+)$")
-ZONE = re.compile(r"^(.*\d) ?([A-Z][A-Za-z_]+(?:/[A-Za-z_]+)*)$")
 # An archive's own columns: seconds since 1970 and nanoseconds, and what it says of each value.
 SECONDS = {"secs": "s", "seconds": "s", "epochseconds": "s"}
 NANOS = {"nanos", "nanoseconds"}
@@ -126,8 +121,7 @@ def read_decay_record(
     path : str, path or pandas.DataFrame
         A frame, CSV, or HDF5 if it ends in .h5 or .hdf5 with one dataset for each column, or JSON
         or CSV of the EPICS Archiver Appliance. Columns: `time_s` (_min, _h, _d, _ms; from any
-        origin, or Unix time), or `time` (a date, UTC if no zone is given: ISO 8601, 01-Mar-2024 12:00:00,
-        01.03.2024 12:00:00, an offset or a name such as Europe/Berlin behind it);
+        origin, or Unix time), or `time` (dates as `beamfit.io.dates.unix_time` reads them);
         `beam_current_mA` (or `_A`, `_uA`); optionally `beam_current_error_mA`, `rf_voltage_kV`,
         `scraper_y_mm`, `pressure_Pa` (_mbar, _Torr), `bunches`. Lines that begin with `#` and
         HDF5 attributes are kept as comments.
@@ -313,7 +307,7 @@ def _no_such(sheet: Sheet, name: str) -> InputError:
 def _values(sheet: Sheet, column: Column) -> np.ndarray:
     if column.unit == DATE:
         expected = "an ISO 8601 time, such as 2024-03-01T12:00:00+01:00"
-        return sheet.numbers(column.header, read=_seconds, expected=expected)
+        return sheet.numbers(column.header, read=unix_time, expected=expected)
     return sheet.numbers(column.header) * column.factor
 
 
@@ -350,34 +344,6 @@ def _check_base(sheet: Sheet, column: Column, moment: np.ndarray) -> None:
         name = column.header.removesuffix("_s")
         expected = f"the unit of the time: of milliseconds {name}_ms, or --time {column.header}:ms"
         raise sheet.error(found, expected, int(np.argmax(moment)), column.header)
-
-
-def _seconds(cell: str) -> float:
-    """Unix time of a date; without a zone it is taken as UTC."""
-    text, zone = cell.strip(), UTC
-    if (match := ZONE.match(text)) is not None and match[2] not in ("T", "Z"):
-        text = match[1].strip()
-        try:
-            zone = ZoneInfo(match[2])
-        except (ZoneInfoNotFoundError, ValueError, OSError):
-            raise ValueError(f"zone {match[2]}") from None
-    moment = _moment(text)
-    return (moment if moment.tzinfo else moment.replace(tzinfo=zone)).timestamp()
-
-
-def _moment(text: str) -> datetime:
-    try:
-        return datetime.fromisoformat(text)
-    except ValueError:
-        fraction = FRACTION.search(text)
-        whole = text[: fraction.start()] if fraction else text
-        part = round(1e6 * float(f"0.{fraction[1]}")) if fraction else 0
-        for form in DATES:
-            try:
-                return datetime.strptime(whole, form).replace(microsecond=min(part, 999_999))
-            except ValueError:
-                continue
-        raise
 
 
 def _lifetimes(sheet: Sheet, skip_bad: bool) -> LifetimeTable:
