@@ -8,6 +8,7 @@ import click
 
 import beamfit
 from beamfit.cli.options import Sampling, command_line, options
+from beamfit.errors import InputError
 from beamfit.io.inputs import read_inputs
 from beamfit.io.line import build_line
 from beamfit.io.result import results_text
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
     from beamfit.sampling.posterior import Posterior
     from beamfit.studies.scan.fit import EmittanceFit
     from beamfit.studies.scan.size_methods import SizeMethods
+    from beamfit.studies.scan.slices import SliceFits
 
 __all__ = ["emittance"]
 
@@ -33,6 +35,7 @@ Examples:
   beamfit emittance scan.csv --lattice line.toml --plane x --report scan.pdf
   beamfit emittance scan.csv --lattice line.madx --use LINE --json
   beamfit emittance Emittance-scan-OTRS_IN20_571.mat --report scan.html
+  beamfit emittance measurements/gtf_slices_simulated.csv --lattice lattices/gtf.toml
   beamfit emittance scan.csv --lattice line.toml --sample --store scan.h5 --report scan.html
   beamfit emittance measurements/gtf_simulated.csv --lattice lattices/gtf.toml \\
     --scenario calibration --prior Q2.slope=167.23+-3.3446
@@ -88,7 +91,7 @@ def emittance(
 
     SCAN is a CSV or HDF5 file with columns such as Q2_A (or Q2_kG, Q2_T_per_m, Q2_k1), size_x_um
     (or sigma_x_mm, fwhm_x_um, ...), size_x_error_um, size_y_um, and optionally energy_MeV,
-    screen, shot; or a .mat file of SLAC's emittance_gui.
+    screen, shot, slice; or a .mat file of SLAC's emittance_gui.
     """
     sampling = Sampling(sample, store, told["seed"])
     sampling.check()
@@ -101,27 +104,53 @@ def emittance(
     for each in planes:
         measured.rows(each)  # says so if it was not measured
 
+    if sample and len(measured.slices) > 1:
+        found = f"--sample for {len(measured.slices)} slices"
+        raise InputError(found, "the rows of one slice, or no --sample", path=measured.path)
+
     line = build_line(described)  # JAX from here on
-    fit = beamfit.fit_emittance(
-        measured,
-        line,
-        planes=planes,
-        method=method.replace("-", "_"),
-        robust=robust,
-        weights=weights,
-        scenario=scenario,
-        **told,
-    )
+    told |= {"planes": planes, "method": method.replace("-", "_"), "robust": robust}
+    told |= {"weights": weights, "scenario": scenario}
+    about = {"command": command_line(), "inputs": inputs}
+    if len(measured.slices) > 1:
+        from beamfit.studies.scan.slices import fit_slices
+
+        _answer_slices(fit_slices(measured, line, **told), about, report, as_json)
+        return
+    fit = beamfit.fit_emittance(measured, line, **told)
     methods = () if gui is None else compared(gui, line, planes)
     posterior = fit.sample(**sampling.arguments(inputs, quiet=as_json)) if sample else None
     if report is not None:
-        told = {"command": command_line(), "inputs": inputs, "methods": methods}
-        beamfit.write_report(report, fit, posterior, **told)
+        beamfit.write_report(report, fit, posterior, methods=methods, **about)
     if as_json:
         further = {} if posterior is None else {"posterior": posterior}
-        click.echo(results_text(_results(fit, methods), inputs, command_line(), **further))
+        click.echo(results_text(_results(fit, methods), **about, **further))
     else:
         _show(fit, posterior, report, methods)
+
+
+def _answer_slices(
+    fits: SliceFits, about: dict[str, Any], report: str | None, as_json: bool
+) -> None:
+    """Answer with a row a slice, and what is said of each."""
+    if report is not None:
+        beamfit.write_report(report, fits, **about)
+    if as_json:
+        results = [entry for fit in fits for entry in _results(fit, ())]
+        click.echo(results_text(results, **about))
+        return
+    from beamfit.cli.show import Terminal
+
+    terminal = Terminal()
+    for table in fits.tables():
+        terminal.table(table)
+        terminal.line()
+    for fit in fits:
+        for p in fit.planes:
+            terminal.verdict(f"{fit.scan.slices[0]}, {p.plane}", p.status, p.message)
+    terminal.line()
+    _about_the_input(terminal, fits, ())
+    terminal.report(report)
 
 
 def compared(
@@ -193,7 +222,7 @@ def _show(
 
 
 def _about_the_input(
-    terminal: Terminal, fit: EmittanceFit, methods: tuple[SizeMethods, ...]
+    terminal: Terminal, fit: EmittanceFit | SliceFits, methods: tuple[SizeMethods, ...]
 ) -> None:
     """Say what other sizes give, where the errors are from, and what is odd about the file."""
     for way in methods:

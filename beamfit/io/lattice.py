@@ -18,7 +18,8 @@ from beamfit.errors import InputError, nearest
 from beamfit.io.gradient_table import gradient_table
 from beamfit.io.toml import FLAG, LIST, TABLE, TEXT, Key, Section, is_number, read_toml
 from beamfit.particles import ENERGY_KEYS, REST_ENERGY, expected_energy, total_energy
-from beamfit.studies.scan.scans import QuadScan, check_names
+from beamfit.studies.scan.names import check_names
+from beamfit.studies.scan.scans import QuadScan
 
 if TYPE_CHECKING:
     from beamfit.optics.calibration import Calibration
@@ -140,7 +141,7 @@ class LatticeFile:
         return screens[-1] if screens else None
 
     def check_scan(self, scan: QuadScan) -> None:
-        """Refuse a scan that names what the lattice does not have, as `scans.check_names`."""
+        """Refuse a scan that names what the lattice does not have, as `names.check_names`."""
         check_names(scan, self.calibrations, self.places, self.default_screen, self.rest_energy)
 
     def check_magnets(self, limits: Iterable[str]) -> None:

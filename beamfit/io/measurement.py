@@ -122,6 +122,7 @@ def _scan(
         energy_spread=values.get("energy_spread"),
         shots=values.get("shots"),
         screen=_screens(sheet, columns.get("screen")),
+        slice=tuple(map(str, sheet[columns["slice"].header])) if "slice" in columns else None,
         transfer=own or None,
         error_source="the file",
         name=Path(sheet.path).stem,
@@ -237,7 +238,7 @@ def _screens(sheet: Sheet, column: Column | None) -> tuple[str, ...] | None:
 
 
 def average_shots(scan: QuadScan, *, marked: bool) -> QuadScan:
-    """Average the rows that repeat a setting, an energy and a screen.
+    """Average the rows that repeat a setting, an energy, a screen and a slice.
 
     Parameters
     ----------
@@ -289,7 +290,8 @@ def average_shots(scan: QuadScan, *, marked: bool) -> QuadScan:
             name: None if (values := getattr(scan, name)) is None else values[first]
             for name in ("energy", "resolution", "energy_spread")
         },
-        screen=None if scan.screen is None else tuple(scan.screen[i] for i in first),
+        screen=scan.screen and tuple(scan.screen[i] for i in first),
+        slice=scan.slice and tuple(scan.slice[i] for i in first),
         transfer=scan.transfer and {p: r[first] for p, r in scan.transfer.items()},
         shots=np.bincount(group),
         error_source=said if scatter or given else "none given",

@@ -13,6 +13,7 @@ import numpy as np
 
 from beamfit import __version__
 from beamfit.errors import InputError
+from beamfit.studies.scan.scans import PROJECTED
 from beamfit.studies.scan.wishes import Beam
 from beamfit.table import json_of
 
@@ -97,7 +98,7 @@ def read_fitted_beams(
     """
     try:
         document = json.loads(Path(path).read_text())
-        entries = document["results"]
+        entries = [e for e in document["results"] if e.get("slice", PROJECTED) == PROJECTED]
         found = {entry["plane"]: _beam(entry, rest_energy) for entry in entries}
         told = all("line" in entry for entry in entries) or "inputs" not in document
         if lattice is not None and not told and lattice not in document["inputs"].values():
@@ -111,7 +112,7 @@ def read_fitted_beams(
     except (ValueError, KeyError, TypeError, AttributeError):
         raise InputError("no fitted beams", HOW, path=path) from None
     if not found:
-        raise InputError("no result in the file", HOW, path=path)
+        raise InputError("no result of the whole beam in the file", HOW, path=path)
     return found
 
 

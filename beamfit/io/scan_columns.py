@@ -21,6 +21,7 @@ QUANTITIES = {
     "shot": "",
     "shots": "",
     "screen": "",
+    "slice": "",
 }
 # What tells rows apart besides settings of magnets.
 SEEN = {"screen", "r11_x", "r11_y"}
@@ -121,7 +122,7 @@ def _other(header: str, sheet: Sheet) -> Column:
         return Column(header, f"setting {name}", unit)
     usual = [f"{q}_um" for q in QUANTITIES if q.startswith("size")]
     usual += ["resolution_um", "energy_MeV", "kinetic_energy_MeV", "momentum_MeV", "energy_spread"]
-    usual += ["shot", "shots", "screen"]
+    usual += ["shot", "shots", "screen", "slice"]
     before, _, last = header.rpartition("_")
     raise sheet.header_error(
         f"unknown unit '{last}'" if before else "a name without a unit",

@@ -220,6 +220,9 @@ def _of_scan(scan: QuadScan) -> list[Fact]:
         counts = Counter(scan.screen)
         words = ", ".join(f"{name} ({n} rows)" for name, n in counts.items())
         facts.append(Fact("screens", words, dict(counts)))
+    if scan.slice is not None:
+        words = ", ".join(f"{name} ({scan.slice.count(name)} rows)" for name in scan.slices)
+        facts.append(Fact("slices", words, {name: scan.slice.count(name) for name in scan.slices}))
     further = {"resolution": "m", "energy_spread": "", "shots": ""}
     facts += [
         _range(getattr(scan, key), unit)._replace(label=key.replace("_", " "))

@@ -14,7 +14,8 @@ from jax.typing import ArrayLike
 
 from beamfit.errors import InputError, nearest
 from beamfit.optics.arrays import value
-from beamfit.optics.elements import IDENTITY, Element, Screen, TransferMatrix
+from beamfit.optics.calibration import FocusingStrength, IntegratedStrength
+from beamfit.optics.elements import IDENTITY, Element, Screen, SectorDipole, TransferMatrix
 from beamfit.optics.particle import ELECTRON_MASS
 from beamfit.optics.sections import Section, Series, in_series
 from beamfit.shown import brief, shown
@@ -225,6 +226,31 @@ class Beamline:
             self, elements=tuple(element if e.name == element.name else e for e in self.elements)
         )
 
+    def held(self, energy: ArrayLike) -> Beamline:
+        """Let another beam into the line, whose magnets stay as they are for the line's own.
+
+        Bends, and strengths given as k1, belong to the energy of the line and follow no other;
+        currents and gradients do so anyway. A line that is held already stays held.
+
+        Parameters
+        ----------
+        energy : float
+            Total energy in MeV of the beam that comes, the line's from here on.
+
+        Returns
+        -------
+        Beamline
+
+        Examples
+        --------
+        >>> from beamfit.optics.elements import Quadrupole
+        >>> line = Beamline((Quadrupole("Q", 0.1, 4.0), Screen("S")), energy=100.0)
+        >>> round(float(line.held(101.0)["Q"].k1(energy=101.0)), 4)
+        3.9604
+        """
+        own = {"energy": self.energy, "mass": self.mass}
+        return replace(self, elements=tuple(_held(e, own) for e in self.elements), energy=energy)
+
     def matrix(
         self,
         settings: Mapping[str, ArrayLike] | None = None,
@@ -354,3 +380,14 @@ class Beamline:
         for kept, run in groupby(self.elements, lambda e: e.name in keep):
             parts.extend(run if kept else [one(s) for s in [in_series(run)] if s.kinds])
         return replace(self, elements=tuple(parts))
+
+
+def _held(element: Any, own: Mapping[str, Any]) -> Any:
+    """Tie an element to the energy and mass it is set for, unless it is tied already."""
+    if isinstance(element, SectorDipole):
+        return replace(element, **own) if element.energy is None else element
+    calibration = getattr(element, "calibration", None)
+    if not isinstance(calibration, FocusingStrength | IntegratedStrength):
+        return element
+    tied = calibration if calibration.energy is not None else replace(calibration, **own)
+    return replace(element, calibration=tied)

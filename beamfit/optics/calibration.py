@@ -196,9 +196,19 @@ class IntegratedGradient:
         return 0.1 * self.scale * setting / rigidity(energy, self.mass)
 
 
-@value()
+@value("mass")
 class FocusingStrength:
     """The setting is k1 itself, in 1/m²; positive focuses x.
+
+    Parameters
+    ----------
+    scale : float
+        Factor on the setting.
+    energy : float, optional
+        Total energy in MeV that the magnet is set for, whatever beam comes: a stiffer one is
+        focused less, as 1/p. If None the setting is k1 of every beam.
+    mass : float
+        Rest energy of the particle, MeV.
 
     Examples
     --------
@@ -207,16 +217,23 @@ class FocusingStrength:
     """
 
     scale: ArrayLike = 1.0
+    energy: ArrayLike | None = None
+    mass: float = ELECTRON_MASS
     unit: ClassVar[str] = "k1"
 
     def k1l(self, setting: ArrayLike, length: ArrayLike, energy: ArrayLike) -> Array:
         """Integrated strength in 1/m at a k1 in 1/m² and a length in m."""
-        return self.scale * setting * length
+        return self.scale * setting * length * _stiffness(self, energy)
 
 
-@value()
+@value("mass")
 class IntegratedStrength:
     """The setting is the inverse focal length k1·L of a thin lens, in 1/m.
+
+    Parameters
+    ----------
+    scale, energy, mass : float
+        As for `FocusingStrength`.
 
     Examples
     --------
@@ -225,11 +242,20 @@ class IntegratedStrength:
     """
 
     scale: ArrayLike = 1.0
+    energy: ArrayLike | None = None
+    mass: float = ELECTRON_MASS
     unit: ClassVar[str] = "k1l"
 
     def k1l(self, setting: ArrayLike, length: ArrayLike, energy: ArrayLike) -> Array:
         """Integrated strength in 1/m, which is the setting."""
-        return self.scale * setting
+        return self.scale * setting * _stiffness(self, energy)
+
+
+def _stiffness(magnet: FocusingStrength | IntegratedStrength, energy: ArrayLike) -> ArrayLike:
+    """Rigidity of the beam a magnet is set for over that of the beam that comes."""
+    if magnet.energy is None:
+        return 1.0
+    return rigidity(magnet.energy, magnet.mass) / rigidity(energy, magnet.mass)
 
 
 Calibration = (
@@ -260,7 +286,7 @@ def scaled(calibration: Calibration, factor: ArrayLike) -> Calibration:
     Examples
     --------
     >>> scaled(SlopeIntercept(160.0, 40.0), 1.01)
-    SlopeIntercept(slope=161.6, intercept=40.0)
+    <SlopeIntercept slope=161.6, intercept=40>
     """
     if isinstance(calibration, SlopeIntercept):
         return replace(calibration, slope=calibration.slope * factor)

@@ -37,10 +37,12 @@ from beamfit.table import Table, labelled
 
 __all__ = [
     "COLOUR",
+    "ERRORS",
     "draw_ellipses",
     "draw_profiles",
     "draw_scan",
     "emittance_page",
+    "headline",
     "setting_axis",
 ]
 
@@ -101,7 +103,7 @@ def emittance_page(
     return Page(
         title=f"Emittance of {scan.name}",
         subtitle=f"{len(scan)} settings on line {line.name}, {energy}; {written()}",
-        verdicts=[Verdict(p.status, f"{p.plane}: {_headline(p)}", p.message) for p in fit.planes],
+        verdicts=[Verdict(p.status, f"{p.plane}: {headline(p)}", p.message) for p in fit.planes],
         tables=tables,
         pictures=_pictures(fit),
         pictures_title="Scan and fit",
@@ -135,7 +137,8 @@ def _fitted_too(fit: EmittanceFit) -> list[Table]:
     return parts
 
 
-def _headline(p: PlaneFit) -> str:
+def headline(p: PlaneFit) -> str:
+    """The emittance of a plane, or that it is not determined."""
     if p.status is Status.unidentified:
         return "emittance not determined"
     return f"normalised emittance {p.normalized_emittance}"
@@ -164,7 +167,7 @@ def draw_scan(figure: FigureBase, fit: EmittanceFit, plane: str) -> None:
     else:  # known at the measured settings alone
         above.plot(at, 1e6 * p.points.model, "_", ms=14, mew=2, color=COLOUR[plane], alpha=0.6)
     _points(above, p, at)
-    above.set(title=f"{plane} plane: {_headline(p)}", ylabel="rms size, µm", ylim=(0.0, None))
+    above.set(title=f"{plane} plane: {headline(p)}", ylabel="rms size, µm", ylim=(0.0, None))
     below.axhspan(-1, 1, color="0.93")
     below.axhline(0, color="0.6", lw=0.8)
     below.plot(at, p.points.pull, "o", color=COLOUR[plane], ms=5, rasterized=len(at) > MANY)

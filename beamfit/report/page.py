@@ -15,19 +15,21 @@ from beamfit.report.document import STYLE, html_of
 from beamfit.report.emittance import emittance_page
 from beamfit.report.pdf import pdf_of
 from beamfit.report.posterior import Sampled, of_decay, of_scan, with_posteriors
+from beamfit.report.slices import slices_page
 from beamfit.sampling.posterior import Posterior
 from beamfit.studies.decay.fit import DecayFit
 from beamfit.studies.decay.shift import Shift
 from beamfit.studies.decay.study import Decay, RecordStudy
 from beamfit.studies.scan.fit import EmittanceFit
 from beamfit.studies.scan.size_methods import SizeMethods
+from beamfit.studies.scan.slices import SliceFits
 
 __all__ = ["write_report"]
 
 
 def write_report(
     path: str | PathLike[str],
-    result: EmittanceFit | DecayFit | Sequence[RecordStudy],
+    result: EmittanceFit | SliceFits | DecayFit | Sequence[RecordStudy],
     posterior: Posterior | Sequence[Posterior] | None = None,
     *,
     command: str | None = None,
@@ -41,8 +43,9 @@ def write_report(
     ----------
     path : str or path
         Ends in ``.html`` (self-contained) or ``.pdf``. An existing file is replaced whole.
-    result : EmittanceFit, DecayFit, or sequence of RecordStudy
-        The emittance of a scan, the lifetime of a decay, or those of whole records.
+    result : EmittanceFit, SliceFits, DecayFit, or sequence of RecordStudy
+        The emittance of a scan or of the slices of a beam, the lifetime of a decay, or those of
+        whole records.
     posterior : Posterior or sequence of Posterior, optional
         What `sample` of the fit gave; of records one for each decay.
     command : str, optional
@@ -79,6 +82,8 @@ def write_report(
         if isinstance(result, EmittanceFit):
             page = emittance_page(result, command, inputs, methods)
             sampled = [] if posterior is None else [of_scan(result, posterior)]
+        elif isinstance(result, SliceFits):
+            page, sampled = slices_page(result, command, inputs), []
         else:
             studies = (_study_of(result),) if isinstance(result, DecayFit) else result
             page = decay_page(studies, command, inputs, shift)

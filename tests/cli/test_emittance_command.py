@@ -141,3 +141,34 @@ def test_rows_left_out_are_named_in_the_answer(run, tmp_path, root):
     note = f"1 of 6 rows was left out: line {len(lines) + 1}, column 'size_x_um', 'off'."
     assert [r["notes"] for r in json.loads(out)["results"]] == [[note]] * 2
     assert note in " ".join(run(*plain, "--skip-bad")[1].split())
+
+
+SLICES = (
+    "emittance",
+    "measurements/gtf_slices_simulated.csv",
+    "--lattice",
+    "lattices/gtf.toml",
+)
+
+
+def test_slices_are_fitted_in_one_command(run, tmp_path):
+    page = tmp_path / "slices.html"
+    status, out, err = run(*SLICES, "--report", page)
+    assert (status, err) == (0, "")
+    for name in ("1", "2", "3", "4", "5", "projected"):
+        assert f"\n{name}, x: The scan determines the emittance" in out
+    assert "Slices of gtf_slices_simulated, x plane" in out
+    assert page.read_text().count("<img") == 7
+    status, out, err = run(*SLICES, "--json")
+    assert (status, err) == (0, "")
+    results = json.loads(out)["results"]
+    assert [(r["slice"], r["plane"]) for r in results][::5] == [("1", "x"), ("projected", "x")]
+    assert all(r["systematics"] and r["range"] for r in results)
+    assert results[0]["energy"]["value"] == pytest.approx(30.256)
+
+
+def test_slices_are_sampled_one_by_one(run):
+    status, out, err = run(*SLICES, "--sample")
+    assert (status, out) == (2, "")
+    assert "--sample for 6 slices" in err
+    assert err.count("\n") == 1

@@ -131,6 +131,9 @@ def fit_emittance(
         priors or {}, bounds or {}, anchor or Anchor(), hysteresis, hidden, starts, seed
     )
     told.check_scenario(scenario, robust)
+    if len(scan.slices) > 1:
+        found = f"a scan of {len(scan.slices)} slices of the beam"
+        raise scan.unusable(found, "rows of one, as scan.of_slice(name) gives")
     line = rows_line(scan) if line is None else line
     _check_own(scan, line, scenario)
     statement, scan = scenario_of(scenario), scan.of_particle(line.mass)
@@ -405,7 +408,8 @@ class EmittanceFit:
     def to_json(self) -> list[dict[str, Any]]:
         """Give the ``results`` list of the JSON contract."""
         line = {"name": self.line.name, "sha256": self.seen.line.digest}
-        common = {"line": line} | ({"notes": list(self.notes)} if self.notes else {})
+        common = {"slice": self.scan.slices[0]} if self.scan.slices else {}
+        common |= {"line": line} | ({"notes": list(self.notes)} if self.notes else {})
         entries = [p.to_json() | {"energy": self._energy.to_json()} | common for p in self.planes]
         own = {
             "scenario": self.scenario,

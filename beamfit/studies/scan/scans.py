@@ -23,16 +23,18 @@ if TYPE_CHECKING:
 
 __all__ = [
     "POSSIBLE",
+    "PROJECTED",
     "USUAL",
     "PlaneRows",
     "Profile",
     "QuadScan",
-    "check_names",
     "first_unusable",
     "row_keys",
 ]
 
 PLANES = ("x", "y")
+# What rows that look at no single slice of the beam say for one.
+PROJECTED = "projected"
 # Rows of a scan that a notebook shows.
 MOST_SHOWN = 20
 # Rms sizes in m that a beam can have, and that most have: outside a unit is wrong, or questioned.
@@ -140,6 +142,9 @@ class QuadScan:
         Point-spread rms in m and relative momentum spread of each row.
     shots : array, optional
         How many shots each row is the mean of.
+    slice : sequence of str, optional
+        Slice of the beam each row looks at, "projected" (or blank) for all of it: see `of_slice`.
+        Magnets then stay as they are for the line's energy, whatever the energy of a row.
     transfer : mapping of str to array, optional
         Plane to R11, R12 (m) and, where there is dispersion, R16 (m) of each row, shape (n, 2) or
         (n, 3): the rows' own matrices, which need no lattice. Settings then only label the rows.
@@ -179,6 +184,7 @@ class QuadScan:
     resolution: np.ndarray | None = None
     energy_spread: np.ndarray | None = None
     shots: np.ndarray | None = None
+    slice: tuple[str, ...] | None = None
     transfer: Mapping[str, np.ndarray] | None = None
     profiles: tuple[Profile, ...] = ()
     error_source: str = "given"
@@ -196,6 +202,9 @@ class QuadScan:
         for key in ("energy", "resolution", "energy_spread"):
             if getattr(self, key) is not None:
                 object.__setattr__(self, key, np.asarray(getattr(self, key), float))
+        if self.slice is not None:
+            names = tuple(str(name).strip() or PROJECTED for name in self.slice)
+            object.__setattr__(self, "slice", names)
         if self.transfer is not None:
             object.__setattr__(self, "transfer", self._whole_transfer(self.transfer))
         self._check_shapes()
@@ -210,6 +219,12 @@ class QuadScan:
     def planes(self) -> tuple[str, ...]:
         """The planes that were measured."""
         return tuple(p for p in PLANES if p in self.size)
+
+    @property
+    def slices(self) -> tuple[str, ...]:
+        """The slices of the beam in the order of the rows, the projected beam last."""
+        names = dict.fromkeys(self.slice or ())
+        return tuple(sorted(names, key=PROJECTED.__eq__))
 
     @property
     def headline(self) -> str:
@@ -247,7 +262,7 @@ class QuadScan:
             columns |= {f"{name}_{p}": r[:, i] for i, name in enumerate(("r11", "r12", "r16"))}
         further = {named[self.energy_kind]: self.energy, "screen": self.screen}
         further |= {"resolution_m": self.resolution, "energy_spread": self.energy_spread}
-        further |= {"shots": self.shots}
+        further |= {"shots": self.shots, "slice": self.slice}
         return frame_of(columns | {k: v for k, v in further.items() if v is not None})
 
     def rows(self, plane: str) -> PlaneRows:
@@ -273,6 +288,40 @@ class QuadScan:
             else tuple(s for s, k in zip(self.screen, keep, strict=True) if k),
             resolution=resolution,
             energy_spread=spread,
+        )
+
+    def of_slice(self, name: str) -> QuadScan:
+        """The rows of one slice of the beam, in the planes it was measured in.
+
+        Raises
+        ------
+        InputError
+            If there is none of that name; the nearest is offered.
+
+        Examples
+        --------
+        >>> scan = QuadScan({"Q": [0.0, 1.0, 2.0] * 2}, {"Q": "A"},
+        ...                 {"x": [2e-4, 1e-4, 3e-4, 3e-4, 2e-4, 4e-4]}, slice=[*"aaa", *3 * [""]])
+        >>> scan.slices, scan.of_slice("projected").size["x"].tolist()
+        (('a', 'projected'), [0.0003, 0.0002, 0.0004])
+        """
+        if name not in self.slices:
+            raise self.unusable(f"no slice '{name}'", nearest(name, list(self.slices)), "slice")
+        at = [i for i, own in enumerate(self.slice) if own == name]
+        size = {p: v[at] for p, v in self.size.items() if not np.isnan(v[at]).all()}
+        arrays = {key: getattr(self, key) for key in ("energy", "resolution", "energy_spread")}
+        arrays |= {"shots": self.shots}
+        return replace(
+            self,
+            settings={n: v[at] for n, v in self.settings.items()},
+            size=size,
+            error={p: v[at] for p, v in self.error.items() if p in size},
+            **{key: None if v is None else np.asarray(v)[at] for key, v in arrays.items()},
+            screen=self.screen and tuple(self.screen[i] for i in at),
+            slice=(name,) * len(at),
+            transfer=self.transfer and {p: self.transfer[p][at] for p in size},
+            profiles=tuple(p._replace(row=at.index(p.row)) for p in self.profiles if p.row in at),
+            name=f"{self.name}, slice {name}" if name != PROJECTED else f"{self.name}, {name}",
         )
 
     def of_particle(self, rest_energy: float) -> QuadScan:
@@ -304,6 +353,7 @@ class QuadScan:
         lengths = {k: len(v) for k, v in self.settings.items()}
         lengths |= {f"size_{p}": len(v) for p, v in self.size.items()}
         lengths |= {f"size_{p}_error": len(v) for p, v in self.error.items()}
+        lengths |= {"slice": len(self.slice)} if self.slice is not None else {}
         lengths |= {f"R in {p}": len(v) for p, v in (self.transfer or {}).items()}
         if len(set(lengths.values())) != 1:
             raise self.unusable(f"lengths {lengths}", "one length for all columns")
@@ -340,80 +390,22 @@ class QuadScan:
 
     def _check_three_settings(self, plane: str) -> None:
         measured = ~np.isnan(self.size[plane])
+        distinct = "settings" if self.settings or self.transfer else "screens"
         keys = {key for key, one in zip(row_keys(self), measured, strict=True) if one}
-        if len(keys) < 3:
-            distinct = "settings" if self.settings or self.transfer else "screens"
-            raise self.unusable(
-                f"{len(keys)} distinct {distinct} in plane {plane}",
-                "at least three: the beam matrix has three numbers",
-            )
+        own = self.slice or ("",) * len(self)
+        for name in dict.fromkeys(n for n, one in zip(own, measured, strict=True) if one) or ("",):
+            number = sum(key[0] == name for key in keys)
+            if number < 3:
+                of = f" of slice {name}" if name else ""
+                raise self.unusable(
+                    f"{number} distinct {distinct}{of} in plane {plane}",
+                    "at least three: the beam matrix has three numbers",
+                )
 
 
 def row_keys(scan: QuadScan) -> list[tuple]:
-    """What makes rows the same measurement: all settings, the energy, screen and own matrices."""
-    columns = [list(v) for v in scan.settings.values()]
+    """What makes rows the same measurement: slice, settings, energy, screen and own matrices."""
+    columns = [scan.slice or ("",) * len(scan), *(list(v) for v in scan.settings.values())]
     columns += [list(v) for v in (scan.energy, scan.screen) if v is not None]
     columns += [list(map(tuple, v)) for v in (scan.transfer or {}).values()]
-    return list(zip(*columns, strict=True)) if columns else [()] * len(scan)
-
-
-def check_names(
-    scan: QuadScan,
-    calibrations: Mapping[str, str],
-    places: list[str],
-    default: str | None,
-    rest_energy: float = 0.0,
-) -> None:
-    """Check that a lattice has what a scan names, before anything is computed.
-
-    Parameters
-    ----------
-    scan : QuadScan
-        The scan.
-    calibrations : mapping of str to str
-        Magnet name to the unit of its calibration in the lattice.
-    places : list of str
-        Names a screen may have.
-    default : str or None
-        The screen used where the scan names none.
-    rest_energy : float
-        Of the lattice's particle, MeV.
-
-    Raises
-    ------
-    InputError
-        If a magnet or screen is missing (the nearest is offered), or a current is given for
-        a magnet whose lattice entry has no current calibration.
-
-    Examples
-    --------
-    >>> scan = QuadScan({"Q": [0.0, 1.0, 2.0]}, {"Q": "A"}, {"x": [2e-4, 1e-4, 3e-4]})
-    >>> check_names(scan, {"Q": "A"}, ["OTR"], "OTR")
-    """
-    for name, unit in () if scan.transfer else scan.units.items():
-        if name not in calibrations:
-            raise scan.unusable(
-                f"no magnet '{name}' in the lattice", nearest(name, list(calibrations)), name
-            )
-        if unit == "A" and calibrations[name] != "A":
-            raise scan.unusable(
-                f"currents for '{name}', which the lattice gives no current calibration",
-                f"slope and intercept for {name} in the lattice, or a column {name}_kG",
-                name,
-            )
-    scan = scan.of_particle(rest_energy)
-    if scan.energy is not None and scan.energy.min() <= rest_energy:
-        raise scan.unusable(
-            f"{scan.energy.min():g} MeV",
-            f"total energies above the particle's rest energy of {rest_energy:g} MeV",
-            "energy_MeV",
-        )
-    for screen in sorted(set(scan.screen or ())):
-        if screen not in places:
-            raise scan.unusable(
-                f"no screen '{screen}' in the lattice", nearest(screen, places), "screen"
-            )
-    if scan.screen is None and default is None:
-        raise scan.unusable(
-            "a lattice without a screen", 'an element of type "screen" where sizes were measured'
-        )
+    return list(zip(*columns, strict=True))

@@ -67,6 +67,8 @@ def names_of(line: Beamline) -> tuple[dict[str, str], list[str], str | None, flo
 def scanned_line(scan: QuadScan, line: Beamline) -> Beamline:
     """Give each scanned magnet the meaning its column's unit has, at the same strength.
 
+    Where the rows are of one slice of the beam, magnets stay as they are for the line's energy.
+
     Examples
     --------
     >>> from beamfit.optics.elements import Quadrupole
@@ -86,7 +88,13 @@ def scanned_line(scan: QuadScan, line: Beamline) -> Beamline:
                 f"a column {name}_k1l (inverse focal length, 1/m) or {name}_kG",
                 name,
             )
-    return _with_meanings(_Same(line), tuple(scan.units.items()))
+    line = _with_meanings(_Same(line), tuple(scan.units.items()))
+    if scan.slice is None:
+        return line
+    energies = np.unique(line.energy if scan.energy is None else scan.energy)
+    # The mean of equal numbers may be another one in its last digit.
+    energy = energies[0] if len(energies) == 1 else np.mean(scan.energy)
+    return _held(_Same(line), float(energy))
 
 
 @lru_cache(maxsize=64)
@@ -107,6 +115,11 @@ def _with_meanings(same: _Same, units: tuple[tuple[str, str], ...]) -> Beamline:
             setting = float(strength / meaning.k1l(1.0, magnet.length, line.energy))
             line = line.with_element(replace(magnet, calibration=meaning, setting=setting))
     return line
+
+
+@lru_cache(maxsize=64)
+def _held(same: _Same, energy: float) -> Beamline:
+    return same.line.held(energy)
 
 
 def rows_line(

@@ -1,0 +1,108 @@
+"""The report of the slices of a beam: emittance against slice, then each slice's scan."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import partial
+
+import numpy as np
+from matplotlib.figure import FigureBase
+
+from beamfit.report.document import Page, Picture, Verdict, provenance, written
+from beamfit.report.emittance import COLOUR, ERRORS, draw_scan, headline
+from beamfit.status import Status
+from beamfit.studies.scan.results import identifiability_rows, point_rows, result_rows
+from beamfit.studies.scan.scans import PROJECTED
+from beamfit.studies.scan.slices import SliceFits
+from beamfit.table import Table, labelled
+
+__all__ = ["draw_slices", "slices_page"]
+
+# Scans of more slices than these are in the tables alone.
+MOST_SCANS = 12
+FIXED = (
+    "Each slice is fitted by its own rows and has a beam matrix of its own; magnets stay as they "
+    "are for the line's energy."
+)
+
+
+def slices_page(
+    fits: SliceFits, command: str | None, inputs: Mapping[str, str | None] | None
+) -> Page:
+    """Lay out the fits of the slices of a beam.
+
+    Parameters
+    ----------
+    fits : SliceFits
+        From `fit_slices`.
+    command : str or None
+        The command that made it.
+    inputs : mapping of str to str, or None
+        Input files and their SHA-256; the scan's own if None.
+
+    Returns
+    -------
+    Page
+    """
+    scan, line = fits.scan, fits.fits[0].line
+    if inputs is None:
+        inputs = {str(scan.path): scan.sha256} if scan.path else {}
+    found = [(f"{fit.scan.slices[0]}, {p.plane}", fit, p) for fit in fits for p in fit.planes]
+    names, planes = [name for name, _, _ in found], tuple(p for _, _, p in found)
+    tables = [table._replace(note=FIXED) for table in fits.tables()]
+    tables += [
+        labelled("All numbers", names, result_rows(planes), ERRORS),
+        labelled("What the data determine", names, identifiability_rows(planes)),
+        *(Table(f"Points of slice {n}", *point_rows(p), numeric=True) for n, _, p in found),
+    ]
+    if fits.notes:
+        tables.append(Table("About the input", [], [[note] for note in fits.notes]))
+    pictures = [Picture("emittance of each slice", 3.8, partial(draw_slices, fits=fits))]
+    pictures += [
+        Picture(f"scan of slice {name}", 4.6, partial(draw_scan, fit=fit, plane=p.plane))
+        for name, fit, p in found[:MOST_SCANS]
+    ]
+    source = scan.error_source if scan.error else "none in the file; inferred"
+    return Page(
+        title=f"Slice emittances of {scan.name}",
+        subtitle=f"{len(scan)} rows of {len(fits)} slices on line {line.name}, "
+        f"{float(line.energy):g} MeV; {written()}",
+        verdicts=[Verdict(p.status, f"{name}: {headline(p)}", p.message) for name, _, p in found],
+        tables=tables,
+        pictures=pictures,
+        pictures_title="Slices, and the scan and fit of each",
+        provenance=provenance(inputs, [("errors of the sizes", source)], command),
+        notes=scan.provenance,
+    )
+
+
+def draw_slices(figure: FigureBase, fits: SliceFits) -> None:
+    """Draw the normalised emittance of each slice, and the projected one as a band.
+
+    Slices whose emittance the data do not determine are left out.
+
+    Parameters
+    ----------
+    figure : Figure or SubFigure
+        Where to.
+    fits : SliceFits
+        The fits.
+    """
+    axes = figure.subplots()
+    names = [name for name in fits.slices if name != PROJECTED]
+    for plane in fits.planes:
+        for fit, p in fits.of_plane(plane):
+            name, q = fit.scan.slices[0], p.normalized_emittance
+            if p.status is Status.unidentified or q.error is None:
+                continue
+            value, error = 1e6 * q.value, 1e6 * q.error
+            if name == PROJECTED:
+                axes.axhline(value, color=COLOUR[plane], lw=1.0, ls="--")
+                axes.axhspan(value - error, value + error, color=COLOUR[plane], alpha=0.12, lw=0)
+            else:
+                at = names.index(name)
+                axes.errorbar(at, value, error, fmt="o", ms=5, capsize=3, color=COLOUR[plane])
+    axes.set_xticks(np.arange(len(names)), names)
+    axes.set(xlabel="slice", ylabel="normalised emittance, µm", ylim=(0.0, None))
+    said = ", ".join(f"{plane} {'blue' if plane == 'x' else 'red'}" for plane in fits.planes)
+    axes.set_title(f"normalised emittance by slice ({said}; dashed: projected)")
