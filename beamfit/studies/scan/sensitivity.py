@@ -129,7 +129,7 @@ def systematics(fit: EmittanceFit, plane: str) -> list[Change]:
     result = fit[plane]
     if result.emittance.error is None:
         return []
-    rows, p = fit.seen.of_plane(plane), result.points
+    rows, p = fit.seen.rows, result.points
     keep = fit.seen.measured(plane)
     size, weighed, sharp = np.ones((3, len(rows.energy))) * [[1.0], [1.0], [0.0]]
     size[keep], weighed[keep], sharp[keep] = p.size, p.weighed, 1.0 / p.error
@@ -139,7 +139,9 @@ def systematics(fit: EmittanceFit, plane: str) -> list[Change]:
     held = (*rows.settings, *rows.places)
     stored = replace(rows, line=fit.seen.scanned.stored_by_kind(held))
     magnets = tuple(rows.settings)
-    by_change, by_parts, by_known = _changes(stored, sigma, size, noise, magnets=magnets)
+    by_change, by_parts, by_known = _changes(
+        stored, np.array(plane == "y"), sigma, size, noise, magnets=magnets
+    )
     *by_magnet, by_energy = np.asarray(by_change)
     changes = {
         f"{n} {_word(fit.seen.scanned, n)} +1 %" + _held(fit, n): 0.01 * float(d)
@@ -231,7 +233,7 @@ class _Weighing(NamedTuple):
 
 
 @partial(jax.jit, static_argnames="magnets")
-def _changes(rows: Rows, sigma: Array, size: Array, noise: _Weighing, *, magnets):
+def _changes(rows: Rows, upright: Array, sigma: Array, size: Array, noise: _Weighing, *, magnets):
     """Derivatives of ln ε of the fit by strengths and ln E, by parts, and by known size².
 
     At the answer the weighted residuals F(σ, rows) = Σ w ∂m²/∂σ (m² - size²) vanish, so dσ =
@@ -249,7 +251,9 @@ def _changes(rows: Rows, sigma: Array, size: Array, noise: _Weighing, *, magnets
                 strength = scaled(element.calibration, 1.0 + change[i])
                 moved = moved.with_element(replace(element, calibration=strength))
         energy = rows.energy * (1.0 + change[-1])
-        r11, r12, known = replace(rows, line=moved, energy=energy).elements({})
+        # Both planes in one program, which is compiled once.
+        both = (replace(rows, line=moved, energy=energy, plane=p).elements({}) for p in "xy")
+        r11, r12, known = (jnp.where(upright, y, x) for x, y in zip(*both, strict=True))
         return r11, r12, known + more
 
     def slope(relative: Array, seen: tuple[Array, ...]) -> Array:
