@@ -25,6 +25,7 @@ from beamfit.report.document import (
 )
 from beamfit.status import Status
 from beamfit.studies.decay.checks import moving_lifetime
+from beamfit.studies.decay.fit import DecayFit
 from beamfit.studies.decay.shift import Shift
 from beamfit.studies.decay.study import Decay, RecordStudy
 from beamfit.studies.decay.tables import (
@@ -43,7 +44,7 @@ from beamfit.studies.decay.tables import (
 )
 from beamfit.table import Table, labelled
 
-__all__ = ["decay_page", "draw_budget", "draw_lifetime", "draw_record"]
+__all__ = ["decay_page", "draw_budget", "draw_lifetime", "draw_record", "study_of"]
 
 COLOURS = (BLUE, "#c98a00", "#2c7a3f", "#7b4fa3", RED, "#4f9aa3", "0.5")
 # Decays shown in one budget; more have no room for their names.
@@ -178,6 +179,21 @@ def _shift_verdicts(shift: Shift | None) -> list[Verdict]:
     if change is not None:
         said.append(Verdict(change.status, "second half against the first", change.message))
     return said
+
+
+def study_of(result: DecayFit | RecordStudy) -> RecordStudy:
+    """A fit by itself as the study of its record.
+
+    Raises
+    ------
+    InputError
+        If the fit does not hold what it was fitted to.
+    """
+    if isinstance(result, RecordStudy):
+        return result
+    if result.readings is None:
+        raise InputError("a fit without its readings", "the result of fit_decay or fit_decays")
+    return RecordStudy(result.readings, (Decay(result.readings, 0.0, result, None),), ())
 
 
 def draw_record(figure: FigureBase, study: RecordStudy) -> None:

@@ -23,6 +23,7 @@ __all__ = [
     "Page",
     "Picture",
     "Verdict",
+    "figure_of",
     "html_of",
     "legend_below",
     "provenance",
@@ -124,8 +125,14 @@ def html_of(page: Page) -> bytes:
     return environment.get_template("page.html.j2").render(**content).encode()
 
 
-def _svg(picture: Picture) -> str:
-    figure, buffer = Figure(figsize=(6.4, picture.height), layout="constrained"), io.BytesIO()
+def figure_of(picture: Picture) -> Figure:
+    """Draw a picture by itself."""
+    figure = Figure(figsize=(6.4, picture.height), layout="constrained")
     picture.draw(figure)
-    figure.savefig(buffer, format="svg")
+    return figure
+
+
+def _svg(picture: Picture) -> str:
+    buffer = io.BytesIO()
+    figure_of(picture).savefig(buffer, format="svg")
     return base64.b64encode(buffer.getvalue()).decode()

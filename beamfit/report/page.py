@@ -10,7 +10,7 @@ from matplotlib import rc_context
 
 from beamfit.errors import InputError
 from beamfit.io.files import write_atomically
-from beamfit.report.decays import decay_page
+from beamfit.report.decays import decay_page, study_of
 from beamfit.report.document import STYLE, html_of
 from beamfit.report.emittance import emittance_page
 from beamfit.report.pdf import pdf_of
@@ -19,7 +19,7 @@ from beamfit.report.slices import slices_page
 from beamfit.sampling.posterior import Posterior
 from beamfit.studies.decay.fit import DecayFit
 from beamfit.studies.decay.shift import Shift
-from beamfit.studies.decay.study import Decay, RecordStudy
+from beamfit.studies.decay.study import RecordStudy
 from beamfit.studies.scan.fit import EmittanceFit
 from beamfit.studies.scan.size_methods import SizeMethods
 from beamfit.studies.scan.slices import SliceFits
@@ -85,7 +85,7 @@ def write_report(
         elif isinstance(result, SliceFits):
             page, sampled = slices_page(result, command, inputs), []
         else:
-            studies = (_study_of(result),) if isinstance(result, DecayFit) else result
+            studies = (study_of(result),) if isinstance(result, DecayFit) else result
             page = decay_page(studies, command, inputs, shift)
             sampled = _of_decays(studies, posterior)
         page = with_posteriors(page, sampled)
@@ -103,10 +103,3 @@ def _of_decays(
     many = len(fits) > 1
     pairs = zip(fits, found, strict=True)
     return [of_decay(fit, one, f"{fit.record}: " if many else "") for fit, one in pairs]
-
-
-def _study_of(fit: DecayFit) -> RecordStudy:
-    """A fit by itself as the study of its record."""
-    if fit.readings is None:
-        raise InputError("a fit without its readings", "the result of fit_decay or fit_decays")
-    return RecordStudy(fit.readings, (Decay(fit.readings, 0.0, fit, None),), ())

@@ -3,21 +3,27 @@
 from __future__ import annotations
 
 import io
-import textwrap
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from matplotlib.backends.backend_pdf import PdfPages
 from matplotlib.figure import Figure
+from matplotlib.font_manager import FontProperties
+from matplotlib.textpath import text_to_path
 
 from beamfit.report.document import Page, Picture
 from beamfit.status import Status
 from beamfit.table import Table
 
-__all__ = ["pdf_of"]
+__all__ = ["pages_of", "pdf_of"]
 
 WIDTH, HEIGHT, MARGIN = 8.27, 11.69, 0.75  # A4, inches
 LINE = 0.185
+# Between columns of a table, inches; its letters, from the usual size to the smallest.
+GAP, USUAL, SMALLEST = 0.22, 8.5, 6.0
+# A picture is made smaller by this at most to fit on a page.
+LEAST = 0.7
 COLOUR = {Status.converged: "#2c7a3f", Status.poor_fit: "#c98a00"}
 
 
@@ -29,8 +35,20 @@ class _Pages:
         self.new_page()
 
     def new_page(self) -> None:
-        self.pages.append(Figure(figsize=(WIDTH, HEIGHT)))
+        page = Figure(figsize=(WIDTH, HEIGHT), layout="constrained")
+        page.get_layout_engine().set(w_pad=0.04, h_pad=0.04)
+        self.pages.append(page)
         self.y = HEIGHT - MARGIN
+
+    def numbers(self, title: str) -> None:
+        """Write title and number at the foot of every page."""
+        short = wrapped(title, WIDTH - 2 * MARGIN - 1.0, 8)[0]
+        style = {"y": 0.5 * MARGIN / HEIGHT, "fontsize": 8, "color": "0.35"}
+        for number, page in enumerate(self.pages, 1):
+            page.text(MARGIN / WIDTH, s=short, **style)
+            page.text(
+                1 - MARGIN / WIDTH, s=f"page {number} of {len(self.pages)}", ha="right", **style
+            )
 
     def room(self, lines: float) -> None:
         """Begin a new page unless this many lines still fit."""
@@ -43,11 +61,13 @@ class _Pages:
             (MARGIN + x) / WIDTH, self.y / HEIGHT, words, fontsize=size, va="top", **style
         )
 
-    def paragraph(self, words: str, columns: int = 98, step: float = 1.0, **style: Any) -> None:
+    def paragraph(
+        self, words: str, size: float = 9.5, weight: str = "normal", step: float = 1.0, **style: Any
+    ) -> None:
         """Write wrapped text, each line so many usual ones high."""
-        for line in textwrap.wrap(words, columns) or [""]:
+        for line in wrapped(words, WIDTH - 2 * MARGIN, size, weight):
             self.room(step)
-            self.text(line, **style)
+            self.text(line, size=size, weight=weight, **style)
             self.y -= step * LINE
 
     def heading(self, words: str) -> None:
@@ -57,48 +77,126 @@ class _Pages:
         self.y -= 1.5 * LINE
 
     def table(self, table: Table) -> None:
-        """Write a table, its columns as wide as their longest cells, or less to fit the page."""
+        """Write a table; a cell that its column has no room for goes on in the next line."""
         lines = [*([table.header] if table.header else []), *table.rows]
-        count = max(map(len, lines))
-        longest = [
-            max(len(line[i]) if i < len(line) else 0 for line in lines) for i in range(count)
-        ]
-        widths = 0.078 * np.array(longest) + 0.28
-        tight = min(1.0, (WIDTH - 2 * MARGIN) / widths.sum())
-        ends = tight * np.cumsum(widths)
+        widths, size = _columns(lines)
         for number, cells in enumerate(lines):
-            self.room(1)
-            bold = "bold" if table.header and number == 0 else "normal"
-            for i, cell in enumerate(cells):
-                right = table.numeric and i > 0
-                x = ends[i] - 0.28 * tight if right else ends[i] - widths[i] * tight
-                side = "right" if right else "left"
-                self.text(cell, x=x, size=8.5 * max(tight, 0.6), weight=bold, ha=side)
-            self.y -= LINE
+            head = bool(table.header) and number == 0
+            weight = "bold" if head else "normal"
+            written = [wrapped(c, w, size, weight) for c, w in zip(cells, widths, strict=False)]
+            height = max(map(len, written))
+            if self.y - height * LINE < MARGIN:
+                self.new_page()
+                if table.header and not head:  # the names of the columns again
+                    self._row([[c] for c in table.header], widths, size, table.numeric, True)
+            self._row(written, widths, size, table.numeric, head)
         self.y -= 0.3 * LINE
 
+    def _row(
+        self, cells: list[list[str]], widths: np.ndarray, size: float, numeric: bool, head: bool
+    ) -> None:
+        starts = np.concatenate([[0.0], np.cumsum(widths + GAP)])
+        for i, lines in enumerate(cells):
+            right = numeric and i > 0
+            x, side = (starts[i] + widths[i], "right") if right else (starts[i], "left")
+            for k, words in enumerate(lines):
+                self.y -= k * LINE
+                self.text(words, x=x, size=size, weight="bold" if head else "normal", ha=side)
+                self.y += k * LINE
+        self.y -= LINE * max(map(len, cells))
 
-def _picture_pages(pictures: list[Picture]) -> list[Figure]:
-    """Put the pictures below one another on as few pages as hold them."""
-    room, groups = 0.0, []
-    for picture in pictures:
-        if picture.height > room:
-            groups.append([])
-            room = HEIGHT - 2 * MARGIN
-        groups[-1].append(picture)
-        room -= picture.height
-    return [_picture_page(group) for group in groups]
+    def picture(self, picture: Picture) -> None:
+        """Draw a picture where there is room for it, a little smaller if that keeps the page."""
+        left = self.y - MARGIN
+        if left < LEAST * picture.height:
+            self.new_page()
+            left = self.y - MARGIN
+        height = min(picture.height, left)
+        page = self.pages[-1]
+        above, below = HEIGHT - self.y, self.y - height
+        ratios = {"height_ratios": (above, height, below)}
+        ratios |= {"width_ratios": (0.6 * MARGIN, WIDTH - 1.5 * MARGIN, 0.9 * MARGIN)}
+        place = page.add_gridspec(3, 3, hspace=0, wspace=0, **ratios)[1, 1]
+        picture.draw(page.add_subfigure(place))
+        self.y -= height + 0.6 * LINE
 
 
-def _picture_page(pictures: list[Picture]) -> Figure:
-    page = Figure(figsize=(WIDTH, HEIGHT), layout="constrained")
-    page.get_layout_engine().set(rect=(0.06, 0.05, 0.88, 0.9), hspace=0.06)
-    heights = [picture.height for picture in pictures]
-    empty = max(HEIGHT - 2 * MARGIN - sum(heights), 0.01)
-    parts = page.subfigures(len(pictures) + 1, 1, height_ratios=[*heights, empty])
-    for part, picture in zip(parts, pictures, strict=False):
-        picture.draw(part)
-    return page
+def width_of(words: str, size: float, weight: str = "normal") -> float:
+    """How wide a line of text is, inches."""
+    font = FontProperties(size=size, weight=weight)
+    return text_to_path.get_text_width_height_descent(words, font, ismath=False)[0] / 72
+
+
+def wrapped(words: str, room: float, size: float, weight: str = "normal") -> list[str]:
+    """Break a text into lines that fit into so many inches; within a word where that is longer."""
+    lines = [""]
+    for word in words.split():
+        longer = f"{lines[-1]} {word}".strip()
+        if width_of(longer, size, weight) <= room:
+            lines[-1] = longer
+            continue
+        lines += [""] * bool(lines[-1])
+        for letter in word:
+            if lines[-1] and width_of(lines[-1] + letter, size, weight) > room:
+                lines.append("")
+            lines[-1] += letter
+    return lines
+
+
+def _columns(lines: Sequence[Sequence[str]]) -> tuple[np.ndarray, float]:
+    """Widths of a table's columns in inches and the size of its letters, to fit the page.
+
+    Wide tables have smaller letters, down to a limit; then the widest columns give way.
+    """
+    count = max(map(len, lines))
+    usual = np.zeros(count)
+    for number, cells in enumerate(lines):
+        weight = "bold" if number == 0 else "normal"
+        for i, cell in enumerate(cells):
+            usual[i] = max(usual[i], width_of(cell, USUAL, weight))
+    room = WIDTH - 2 * MARGIN - (count - 1) * GAP
+    size = min(USUAL, max(SMALLEST, USUAL * room / max(usual.sum(), 1e-9)))
+    widths = (usual + 0.01) * size / USUAL
+    while widths.sum() > room * 1.001:
+        order = np.sort(widths)[::-1]
+        widest = widths >= order[0] - 1e-9
+        others = widths[~widest]
+        share = (room - others.sum()) / widest.sum()
+        widths[widest] = max(share, float(others.max(initial=0.0)))
+        if share <= 0:
+            return np.full(count, room / count), size
+    return widths, size
+
+
+def pages_of(page: Page) -> list[Figure]:
+    """Lay a report out on pages: verdicts, the first table, the pictures, what remains."""
+    pages = _Pages()
+    pages.paragraph(page.title, size=16, weight="bold", step=1.6)
+    pages.y -= 0.4 * LINE
+    pages.paragraph(page.subtitle, color="0.35")
+    for verdict in page.verdicts:
+        pages.y -= 0.5 * LINE
+        pages.room(4)
+        colour = COLOUR.get(verdict.status, "#b3261e")
+        pages.paragraph(verdict.headline, size=11.5, weight="bold", color=colour, step=1.4)
+        pages.paragraph(verdict.message)
+    for number, table in enumerate(page.tables):
+        pages.heading(table.title)
+        if table.note:
+            pages.paragraph(table.note, color="0.35")
+            pages.y -= 0.4 * LINE
+        if table.rows:
+            pages.table(table)
+        if number == 0:
+            for picture in page.pictures:
+                pages.picture(picture)
+    pages.heading("Provenance")
+    for label, value in page.provenance:
+        pages.paragraph(f"{label}: {value}", size=8.5)
+    for note in page.notes:
+        pages.paragraph(note, size=8.5, color="0.35")
+    pages.numbers(page.title)
+    return pages.pages
 
 
 def pdf_of(page: Page) -> bytes:
@@ -114,30 +212,8 @@ def pdf_of(page: Page) -> bytes:
     bytes
         The file.
     """
-    pages = _Pages()
-    pages.paragraph(page.title, 52, size=16, weight="bold", step=1.6)
-    pages.y -= 0.4 * LINE
-    pages.paragraph(page.subtitle, color="0.35")
-    for verdict in page.verdicts:
-        pages.y -= 0.5 * LINE
-        pages.room(4)
-        colour = COLOUR.get(verdict.status, "#b3261e")
-        pages.paragraph(verdict.headline, 80, size=11.5, weight="bold", color=colour, step=1.4)
-        pages.paragraph(verdict.message)
-    for table in page.tables:
-        pages.heading(table.title)
-        if table.note:
-            pages.paragraph(table.note, color="0.35")
-            pages.y -= 0.4 * LINE
-        if table.rows:
-            pages.table(table)
-    pages.heading("Provenance")
-    for label, value in page.provenance:
-        pages.paragraph(f"{label}: {value}", size=8.5)
-    for note in page.notes:
-        pages.paragraph(note, size=8.5, color="0.35")
     buffer = io.BytesIO()
     with PdfPages(buffer) as document:
-        for each in [pages.pages[0], *_picture_pages(page.pictures), *pages.pages[1:]]:
+        for each in pages_of(page):
             document.savefig(each)
     return buffer.getvalue()

@@ -13,7 +13,7 @@ from matplotlib.figure import FigureBase
 from matplotlib.ticker import MaxNLocator, NullLocator
 
 from beamfit.report.document import BLUE, MANY, Page, Picture, Verdict, legend_below
-from beamfit.report.emittance import COLOUR, setting_axis
+from beamfit.report.scan_pictures import COLOUR, setting_axis
 from beamfit.sampling.likelihood import noise_words
 from beamfit.sampling.posterior import Expected, Posterior, in_unit
 from beamfit.studies.decay.fit import DecayFit

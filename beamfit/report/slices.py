@@ -9,7 +9,8 @@ import numpy as np
 from matplotlib.figure import FigureBase
 
 from beamfit.report.document import Page, Picture, Verdict, provenance, written
-from beamfit.report.emittance import COLOUR, ERRORS, draw_scan, headline
+from beamfit.report.emittance import ERRORS
+from beamfit.report.scan_pictures import COLOUR, draw_scan, words_of
 from beamfit.status import Status
 from beamfit.studies.scan.results import identifiability_rows, point_rows, result_rows
 from beamfit.studies.scan.scans import PROJECTED
@@ -67,7 +68,7 @@ def slices_page(
         title=f"Slice emittances of {scan.name}",
         subtitle=f"{len(scan)} rows of {len(fits)} slices on line {line.name}, "
         f"{float(line.energy):g} MeV; {written()}",
-        verdicts=[Verdict(p.status, f"{name}: {headline(p)}", p.message) for name, _, p in found],
+        verdicts=[Verdict(p.status, f"{name}: {words_of(p)}", p.message) for name, _, p in found],
         tables=tables,
         pictures=pictures,
         pictures_title="Slices, and the scan and fit of each",

@@ -1,0 +1,157 @@
+"""Figures of results, each a matplotlib Figure: the pictures of the report, one by one.
+
+A figure belongs to no window: save it by ``figure.savefig``, or show it in a notebook.
+
+>>> import beamfit, beamfit.figures
+>>> record = beamfit.read_decay_record("measurements/aps_1999_decay.csv")
+>>> figure = beamfit.figures.decay(beamfit.fit_decay(record))
+>>> type(figure).__name__, len(figure.axes)
+('Figure', 2)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import partial
+from typing import TYPE_CHECKING
+
+from beamfit.errors import InputError
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from beamfit.report.document import Picture
+    from beamfit.sampling.posterior import Posterior
+    from beamfit.studies.decay.fit import DecayFit
+    from beamfit.studies.decay.study import RecordStudy
+    from beamfit.studies.scan.fit import EmittanceFit
+
+__all__ = ["decay", "lifetime", "pairs", "phase_space", "residuals", "scan"]
+
+
+def scan(fit: EmittanceFit, plane: str | None = None) -> Figure:
+    """Draw measured sizes with the fit, its error band, and the residuals below.
+
+    Parameters
+    ----------
+    fit : EmittanceFit
+        The fit.
+    plane : str, optional
+        "x" or "y"; the first that was fitted if None.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+    """
+    from beamfit.report.document import Picture
+    from beamfit.report.scan_pictures import draw_scan
+
+    return _drawn(Picture("scan", 4.6, partial(draw_scan, fit=fit, plane=_plane(fit, plane))))
+
+
+def residuals(fit: EmittanceFit, plane: str | None = None) -> Figure:
+    """Draw the residuals of one plane in standard errors; arguments as of `scan`."""
+    from beamfit.report.document import Picture
+    from beamfit.report.scan_pictures import draw_residuals
+
+    draw = partial(draw_residuals, fit=fit, plane=_plane(fit, plane))
+    return _drawn(Picture("residuals", 2.6, draw))
+
+
+def phase_space(fit: EmittanceFit) -> Figure:
+    """Draw the one-sigma phase ellipses of the planes whose β and α are determined.
+
+    Parameters
+    ----------
+    fit : EmittanceFit
+        The fit.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+        At the start of the line and at the screen.
+
+    Raises
+    ------
+    InputError
+        If the data determine β and α of no plane.
+    """
+    from beamfit.report.document import Picture
+    from beamfit.report.scan_pictures import draw_ellipses, has_ellipses
+
+    if not any(has_ellipses(p) for p in fit.planes):
+        expected = "a plane whose beta and alpha the data determine"
+        raise InputError("a fit without phase ellipses", expected, path=fit.scan.path)
+    return _drawn(Picture("phase ellipses", 3.4, partial(draw_ellipses, fit=fit)))
+
+
+def decay(result: DecayFit | RecordStudy) -> Figure:
+    """Draw a record of beam current with the fit of each decay, and the residuals below.
+
+    Parameters
+    ----------
+    result : DecayFit or RecordStudy
+        Of one decay, or of a whole record.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+    """
+    from beamfit.report.decays import draw_record, study_of
+    from beamfit.report.document import Picture
+
+    return _drawn(Picture("record", 4.4, partial(draw_record, study=study_of(result))))
+
+
+def lifetime(result: DecayFit | RecordStudy) -> Figure:
+    """Draw the momentary lifetime along a record beside that of the fit; argument as of `decay`."""
+    from beamfit.report.decays import draw_lifetime, study_of
+    from beamfit.report.document import Picture
+
+    return _drawn(Picture("lifetime", 3.0, partial(draw_lifetime, study=study_of(result))))
+
+
+def pairs(posterior: Posterior, names: Sequence[str] | None = None) -> Figure:
+    """Draw the distribution of each sampled number and of each pair.
+
+    Parameters
+    ----------
+    posterior : Posterior
+        With draws.
+    names : sequence of str, optional
+        Which, such as ``x.emittance``; the first five that are shown if None.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+
+    Raises
+    ------
+    InputError
+        If nothing was sampled, or a name is unknown.
+    """
+    from beamfit.report.document import Picture
+    from beamfit.report.posterior import MOST_NUMBERS, draw_pairs
+
+    names = tuple(names or posterior.shown[:MOST_NUMBERS])
+    if not posterior.chain.size:
+        raise InputError("a posterior without draws", posterior.message)
+    draw = partial(draw_pairs, posterior=posterior, names=names)
+    return _drawn(Picture("pairs", 1.0 + 1.15 * len(names), draw))
+
+
+def _plane(fit: EmittanceFit, plane: str | None) -> str:
+    """The plane asked for, or the first."""
+    fitted = [p.plane for p in fit.planes]
+    if plane is not None and plane not in fitted:
+        raise InputError(f"no fit of plane '{plane}'", " or ".join(fitted))
+    return plane or fitted[0]
+
+
+def _drawn(picture: Picture) -> Figure:
+    from matplotlib import rc_context
+
+    from beamfit.report.document import STYLE, figure_of
+
+    with rc_context(STYLE):
+        return figure_of(picture)

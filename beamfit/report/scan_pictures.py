@@ -1,0 +1,221 @@
+"""Pictures of a fitted scan: sizes with the fit, residuals, profiles, phase ellipses."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import FigureBase
+
+from beamfit.report.document import BLUE, MANY, RED, legend_below
+from beamfit.studies.scan.fit import EmittanceFit
+from beamfit.studies.scan.results import PlaneFit
+from beamfit.studies.scan.scans import Profile
+
+__all__ = [
+    "COLOUR",
+    "PROFILES_ABREAST",
+    "draw_ellipses",
+    "draw_profiles",
+    "draw_residuals",
+    "draw_scan",
+    "has_ellipses",
+    "setting_axis",
+    "words_of",
+]
+
+# Profiles in a row of the picture.
+PROFILES_ABREAST = 3
+COLOUR = {"x": BLUE, "y": RED}
+# Of further screens: each has a colour, a marker and a line of its own.
+FURTHER = {"x": ("#0f8b8d", "#7b4fa3", "#5a6570"), "y": ("#c98a00", "#8a3b6b", "#5a6570")}
+MARKERS, LINES = "os^D", ("-", "--", ":", "-.")
+
+
+def draw_scan(figure: FigureBase, fit: EmittanceFit, plane: str) -> None:
+    """Draw one plane's sizes with the fit, and the residuals in standard errors below.
+
+    One varied magnet gives a curve against its setting; several give the points in order.
+
+    Parameters
+    ----------
+    figure : Figure or SubFigure
+        Where to.
+    fit : EmittanceFit
+        The fit.
+    plane : str
+        "x" or "y".
+    """
+    p = fit[plane]
+    above, below = figure.subplots(2, 1, sharex=True, height_ratios=(3, 1))
+    at, _ = setting_axis(p)
+    one = _varied(p) if fit.statement.whole_map and not fit.scan.transfer else []
+    _points(above, p, at)
+    if len(one) == 1 and not fit.told.hysteresis:
+        _curves(above, fit, p, one[0])
+    else:  # known at the measured settings alone
+        style = {"ms": 14, "mew": 2, "color": COLOUR[plane], "alpha": 0.6}
+        above.plot(at, 1e6 * p.points.model, "_", label="fit", **style)
+    above.legend(frameon=False, loc="best", fontsize=8)
+    above.set(title=f"{plane} plane: {words_of(p)}", ylabel="rms size, µm", ylim=(0.0, None))
+    _residuals(below, p)
+
+
+def draw_residuals(figure: FigureBase, fit: EmittanceFit, plane: str) -> None:
+    """Draw one plane's residuals in standard errors.
+
+    Parameters
+    ----------
+    figure : Figure or SubFigure
+        Where to.
+    fit : EmittanceFit
+        The fit.
+    plane : str
+        "x" or "y".
+    """
+    axes: Axes = figure.subplots()
+    _residuals(axes, fit[plane])
+    axes.set_title(f"{plane} plane: residuals")
+
+
+def _residuals(axes: Axes, p: PlaneFit) -> None:
+    at, words = setting_axis(p)
+    axes.axhspan(-1, 1, color="0.93")
+    axes.axhline(0, color="0.6", lw=0.8)
+    for rows, colour, marker, _ in _screens(p):
+        many = len(at) > MANY
+        axes.plot(at[rows], p.points.pull[rows], marker, color=colour, ms=5, rasterized=many)
+    finite = np.abs(p.points.pull[np.isfinite(p.points.pull)])
+    reach = max(3.0, 1.15 * float(finite.max(initial=0.0)))
+    axes.set(xlabel=words, ylabel="residual,\nstd. errors", ylim=(-reach, reach))
+
+
+def words_of(p: PlaneFit) -> str:
+    """The answer of a plane, as a heading."""
+    return p.headline.partition(": ")[2]
+
+
+def _varied(p: PlaneFit) -> list[str]:
+    return [name for name, values in p.points.settings.items() if np.ptp(values) > 0]
+
+
+def setting_axis(p: PlaneFit) -> tuple[np.ndarray, str]:
+    """Against what points are drawn: the setting of the one varied magnet, or else their number."""
+    varied = _varied(p)
+    if len(varied) != 1:
+        return np.arange(1, len(p.points.size) + 1), "measurement"
+    return p.points.settings[varied[0]], f"{varied[0]}, {p.points.units[varied[0]]}"
+
+
+def _screens(p: PlaneFit) -> list[tuple[np.ndarray, str, str, str]]:
+    """Rows of each screen, and its colour, marker and name."""
+    colours = (COLOUR[p.plane], *FURTHER[p.plane])
+    return [
+        (np.array([s == name for s in p.points.screen]), colours[i % 4], MARKERS[i % 4], name)
+        for i, name in enumerate(dict.fromkeys(p.points.screen))
+    ]
+
+
+def _curves(axes: Axes, fit: EmittanceFit, p: PlaneFit, magnet: str) -> None:
+    """One fitted curve for each screen, with the band of one standard error where it has one."""
+    values = p.points.settings[magnet]
+    margin = 0.04 * np.ptp(values)
+    grid = np.linspace(values.min() - margin, values.max() + margin, 201)
+    settings = {n: np.median(v) for n, v in p.points.settings.items()} | {magnet: grid}
+    screens = _screens(p)
+    for index, (_, colour, _, screen) in enumerate(screens):
+        found = fit.predict(settings, p.plane, screen=screen)
+        name = "fit" if len(screens) == 1 else f"fit at {screen}"
+        axes.plot(grid, 1e6 * found.size, LINES[index % 4], color=colour, lw=1.6, label=name)
+        if np.isfinite(found.error).all():
+            low, high = found.size - found.error, found.size + found.error
+            axes.fill_between(
+                grid, 1e6 * np.maximum(low, 0), 1e6 * high, color=colour, alpha=0.15, lw=0
+            )
+
+
+def _points(axes: Axes, p: PlaneFit, at: np.ndarray) -> None:
+    """Measured points; what the robust fit doubts is drawn hollow."""
+    error, size = np.nan_to_num(1e6 * p.points.error), 1e6 * p.points.size
+    doubt = p.points.outlier_probability
+    doubted = np.zeros(len(at), bool) if doubt is None else doubt >= 0.5
+    screens = _screens(p)
+    for rows, colour, marker, screen in screens:
+        name = "measured" if len(screens) == 1 else f"measured at {screen}"
+        for keep, face, label in (
+            (rows & ~doubted, colour, name),
+            (rows & doubted, "white", "doubted"),
+        ):
+            if keep.any():
+                style = {"fmt": marker, "ms": 5, "capsize": 3, "color": colour, "mfc": face}
+                style |= {"rasterized": len(at) > MANY, "label": label}
+                axes.errorbar(at[keep], size[keep], error[keep], **style)
+
+
+def draw_profiles(figure: FigureBase, profiles: list[Profile], fit: EmittanceFit) -> None:
+    """Draw the projected profiles from which sizes of one plane were taken.
+
+    Parameters
+    ----------
+    figure : Figure or SubFigure
+        Where to.
+    profiles : list of Profile
+        Of one plane.
+    fit : EmittanceFit
+        For the settings of their rows.
+    """
+    across = min(PROFILES_ABREAST, len(profiles))
+    every = figure.subplots(math.ceil(len(profiles) / across), across, squeeze=False).ravel()
+    for axes, p in zip(every, profiles, strict=False):
+        position = 1e3 * (p.position - np.average(p.position, weights=np.maximum(p.counts, 1e-300)))
+        axes.step(position, p.counts, where="mid", color="0.6", lw=0.8)
+        if p.curve is not None:
+            axes.plot(position, p.curve, color=COLOUR[p.plane], lw=1.2)
+        settings = [f"{n} = {v[p.row]:.4g}" for n, v in fit.scan.settings.items()]
+        axes.set_title(", ".join(settings) or (fit.scan.screen or [""])[p.row], fontsize=7)
+        axes.set_yticks([])
+        axes.tick_params(labelsize=7)
+    for axes in every[len(profiles) :]:
+        axes.set_axis_off()
+    figure.suptitle(f"projected profiles in {profiles[0].plane}, mm from their centres", fontsize=9)
+
+
+def has_ellipses(p: PlaneFit) -> bool:
+    """Whether the data determine β and α, at the start and at the screen."""
+    numbers = (p.emittance, p.beta, p.alpha, p.screen.beta, p.screen.alpha)
+    known = all(q.error is not None and math.isfinite(q.value) for q in numbers)
+    return known and p.emittance.value > 0
+
+
+def draw_ellipses(figure: FigureBase, fit: EmittanceFit) -> None:
+    """Draw the one-sigma phase ellipses at the start of the line and at the screen.
+
+    Parameters
+    ----------
+    figure : Figure or SubFigure
+        Where to.
+    fit : EmittanceFit
+        A fit that determines β and α of at least one plane.
+    """
+    drawn = [p for p in fit.planes if has_ellipses(p)]
+    start, screen = figure.subplots(1, 2)
+    for p in drawn:
+        _ellipse(start, p, p.beta.value, p.alpha.value)
+        _ellipse(screen, p, p.screen.beta.value, p.screen.alpha.value)
+    start.set_title("phase ellipse at the start")
+    screen.set_title(f"at {drawn[0].screen.name}")
+    for axes in (start, screen):
+        axes.set(xlabel="position, µm", ylabel="angle, µrad")
+        axes.axhline(0, color="0.85", lw=0.8, zorder=0)
+        axes.axvline(0, color="0.85", lw=0.8, zorder=0)
+    legend_below(figure, start, 2)
+
+
+def _ellipse(axes: Axes, p: PlaneFit, beta: float, alpha: float) -> None:
+    """The points (u, u') of one sigma: u = sqrt(εβ) cos φ, u' = -sqrt(ε/β)(α cos φ + sin φ)."""
+    turn = np.linspace(0.0, 2.0 * np.pi, 181)
+    e = p.emittance.value
+    u = np.sqrt(e * beta) * np.cos(turn)
+    angle = -np.sqrt(e / beta) * (alpha * np.cos(turn) + np.sin(turn))
+    axes.plot(1e6 * u, 1e6 * angle, color=COLOUR[p.plane], label=p.plane)
