@@ -11,6 +11,8 @@ import numpy as np
 from scipy.special import stdtrit
 
 from beamfit.greybox.correlated import Memory, is_correlated, memory_of
+from beamfit.lifetime.decay import HOUR
+from beamfit.quantity import Quantity
 from beamfit.shown import shown
 from beamfit.status import Status
 from beamfit.studies.decay.departures import (
@@ -28,8 +30,16 @@ from beamfit.studies.decay.model import Expansion, Solution, expanded
 from beamfit.studies.decay.record import DecayRecord
 from beamfit.table import json_of
 
-__all__ = ["BELIEVED", "DETERMINED", "SEPARABLE", "Evidence", "Separability"]
+__all__ = ["BELIEVED", "DETERMINED", "SEPARABLE", "UNITS", "Evidence", "Separability"]
 
+UNITS = {
+    "a": "1/(mA s)",
+    "b": "1/s",
+    "i0": "mA",
+    "lifetime_start": "h",
+    "lifetime_end": "h",
+    "lifetime_mean": "h",
+}
 # The share of a in the loss lies between 0 and 1: known to 0.2, the record tells pure Touschek
 # from pure gas at five standard deviations; known worse, a and b are one number.
 SEPARABLE = 0.2
@@ -187,6 +197,28 @@ class Evidence:
     def scaled(self, name: str) -> tuple[float, float]:
         """A value and its error."""
         return float(getattr(self.values, name)), float(getattr(self.errors, name))
+
+    def quantity(self, name: str, known: bool) -> Quantity:
+        """I0, a or b; without an error where it is not determined."""
+        value, error = self.scaled(name)
+        if not math.isfinite(value):
+            return Quantity(math.nan, None, UNITS[name])
+        if not known or not math.isfinite(error):
+            return Quantity(value, None, UNITS[name])
+        reach, raw = (float(getattr(part, name)) for part in (self.reach, self.raw))
+        return Quantity(value, error, UNITS[name], raw, (value - reach, value + reach))
+
+    def lifetime(self, name: str, known: bool) -> Quantity:
+        """Lifetime in hours from a loss rate; no error where the rate is not clear of zero."""
+        rate, error = self.scaled(name)
+        if not rate > 0:
+            return Quantity(math.nan, None, "h")
+        if not (known and error < DETERMINED * rate):
+            return Quantity(1 / rate / HOUR, None, "h")
+        reach, raw = (float(getattr(part, name)) for part in (self.reach, self.raw))
+        interval = tuple(1 / max(rate + sign * reach, 1e-300) / HOUR for sign in (1, -1))
+        error, raw = (part / rate**2 / HOUR for part in (error, raw))
+        return Quantity(1 / rate / HOUR, error, "h", raw, interval)
 
     @property
     def inflation(self) -> float:

@@ -12,11 +12,10 @@ import numpy as np
 
 from beamfit.errors import InputError
 from beamfit.frames import quantity_frame
-from beamfit.lifetime.decay import HOUR
 from beamfit.quantity import Quantity, Status
 from beamfit.shown import shown
 from beamfit.studies.decay.departures import Change, ConstantA, LifetimeLaw
-from beamfit.studies.decay.evidence import BELIEVED, DETERMINED, Evidence, Separability
+from beamfit.studies.decay.evidence import BELIEVED, UNITS, Evidence, Separability
 from beamfit.studies.decay.model import Solution, padded, padded_size, solve_decay, solve_decays
 from beamfit.studies.decay.record import DecayRecord
 from beamfit.studies.decay.verdict import finding_of
@@ -34,14 +33,6 @@ FEWEST = 5
 # Records solved in one call; fewer are filled up, so that one number is compiled. A call takes as
 # many steps as its slowest record.
 TOGETHER = 16
-UNITS = {
-    "a": "1/(mA s)",
-    "b": "1/s",
-    "i0": "mA",
-    "lifetime_start": "h",
-    "lifetime_end": "h",
-    "lifetime_mean": "h",
-}
 
 
 def bare(value: float | None, unit: str) -> dict[str, Any]:
@@ -353,31 +344,6 @@ def _constant(record: DecayRecord) -> DecayFit:
     )
 
 
-def _quantity(evidence: Evidence, name: str, known: bool) -> Quantity:
-    """I0, a or b; without an error where it is not determined."""
-    value, error = evidence.scaled(name)
-    if not math.isfinite(value):
-        return Quantity(math.nan, None, UNITS[name])
-    if not known or not math.isfinite(error):
-        return Quantity(value, None, UNITS[name])
-    reach = float(getattr(evidence.reach, name))
-    raw = float(getattr(evidence.raw, name))
-    return Quantity(value, error, UNITS[name], raw, (value - reach, value + reach))
-
-
-def _lifetime(evidence: Evidence, name: str, known: bool) -> Quantity:
-    """Lifetime in hours from a loss rate; no error where the rate is not clear of zero."""
-    rate, error = evidence.scaled(name)
-    if not rate > 0:
-        return Quantity(math.nan, None, "h")
-    if not (known and error < DETERMINED * rate):
-        return Quantity(1 / rate / HOUR, None, "h")
-    reach, raw = (float(getattr(part, name)) for part in (evidence.reach, evidence.raw))
-    interval = tuple(1 / max(rate + sign * reach, 1e-300) / HOUR for sign in (1, -1))
-    error, raw = (part / rate**2 / HOUR for part in (error, raw))
-    return Quantity(1 / rate / HOUR, error, "h", raw, interval)
-
-
 def _judged(
     record: DecayRecord, solution: Solution, shape: Callable[[Any], Any] | None = None
 ) -> DecayFit:
@@ -396,12 +362,12 @@ def _judged(
         record=record.name,
         status=finding.status,
         message=finding.message,
-        i0=_quantity(evidence, "i0", known),
-        a=_quantity(evidence, "a", apart),
-        b=_quantity(evidence, "b", apart),
-        lifetime_start=_lifetime(evidence, "rate_start", known),
-        lifetime_end=_lifetime(evidence, "rate_end", known),
-        lifetime_mean=_lifetime(evidence, "rate_mean", known),
+        i0=evidence.quantity("i0", known),
+        a=evidence.quantity("a", apart),
+        b=evidence.quantity("b", apart),
+        lifetime_start=evidence.lifetime("rate_start", known),
+        lifetime_end=evidence.lifetime("rate_end", known),
+        lifetime_mean=evidence.lifetime("rate_mean", known),
         mean_current=float(record.current.mean()),
         chi2=evidence.chi2,
         dof=evidence.dof,

@@ -83,10 +83,7 @@ def padded_size(rows: int) -> int:
 
 
 def padded(record: DecayRecord) -> tuple[np.ndarray, ...]:
-    """Time, current and weight 1/error of a record, lengthened by readings of no weight.
-
-    A fourth is the gauge, where the pressure changes by itself.
-    """
+    """Time, current, weight 1/error, and gauge if any, lengthened by readings of no weight."""
     weight = np.ones(len(record)) if record.error is None else 1 / record.error
     extra = (0, padded_size(len(record)) - len(record))
     columns = [record.time, record.current] + ([] if record.gauge is None else [record.gauge])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import jax.numpy as jnp
 import numpy as np
@@ -12,17 +12,17 @@ from jax import Array
 
 from beamfit.errors import InputError
 from beamfit.greybox import tree
-from beamfit.greybox.correlated import range_of
+from beamfit.greybox.correlated import log_volume, range_of, whitened
 from beamfit.greybox.posterior import Optimum, Sampled, Statement, target_of
-from beamfit.greybox.problem import Free
+from beamfit.greybox.problem import Free, Problem, Record
 from beamfit.lifetime.decay import HOUR, current
 from beamfit.quantity import Quantity
 from beamfit.sampling.posterior import Expected, Posterior
 from beamfit.sampling.priors import Distribution
 from beamfit.sampling.target import Target
 from beamfit.status import Status
-from beamfit.studies.decay.law import DecayNumbers
-from beamfit.studies.decay.model import decay_problem
+from beamfit.studies.decay.law import DecayNumbers, Moments, beam_current
+from beamfit.studies.decay.model import RECORD, decay_problem
 from beamfit.studies.decay.record import DecayRecord
 from beamfit.verdict import Finding
 
@@ -51,7 +51,7 @@ class Fitted(Protocol):
 
 def _lifetimes(numbers: DecayNumbers, at: tuple[Array, Array]) -> Array:
     """Lifetime at the first reading, at the mean current and at the last reading, h."""
-    mean, last = at
+    mean, last, _ = at
     levels = jnp.stack([numbers.i0, mean, current(last, numbers.i0, numbers.a, numbers.b)])
     return 1.0 / (numbers.a * levels + numbers.b) / HOUR
 
@@ -84,7 +84,8 @@ def decay_target(
     Notes
     -----
     Errors that are correlated are so in the likelihood, and the correlation time is sampled too,
-    flat in its logarithm as in `beamfit.greybox.correlated.memory_of`.
+    flat in its logarithm as in `beamfit.greybox.correlated.memory_of` but only up to the length of
+    the record: in a longer memory i0 loses its hold, and a walk its way, for nothing of a and b.
 
     Where the record does not tell a from b, the two bounds a ≥ 0 and b ≥ 0 make the posterior a
     line across all shares of a in the loss. The lifetime at the mean current is then as well
@@ -99,13 +100,13 @@ def decay_target(
     # The fit's weak prior only keeps a search from running away; the bounds do that here.
     problem = replace(decay_problem(record, memory=fit.correlation_time), priors=())
     theta, rate = _start(fit, record)
-    if fit.correlation_time is not None:
-        lower, upper = np.log(range_of(record.time))
-        problem = replace(problem, free=[*problem.free, Free("log_memory", lower, upper)])
-        theta = np.append(theta, np.log(fit.correlation_time))
     scale = fit.rms_residual * np.sqrt(len(record) / max(fit.dof, 1))
     if record.error is not None:
         scale = max(1.0, np.sqrt(fit.chi2 / max(fit.dof, 1)))
+    if fit.correlation_time is not None:
+        inferred = noise == "inferred" or (noise is None and (record.error is None or scale > 1))
+        problem = _with_memory(problem, record, fit.correlation_time, inferred)
+        theta = np.append(theta, np.log(fit.correlation_time))
     nothing = f"the readings show neither decay nor noise; {fit.message}".rstrip(".")
     seen = fit.rms_residual > 0 or record.error is not None
     # A prior on one of the two tells them apart, if anything does.
@@ -113,7 +114,8 @@ def decay_target(
     stated = Statement(
         derived=LIFETIMES,
         derive=_lifetimes,
-        data=(fit.mean_current, record.time[-1]),
+        log_volume=_no_volume if fit.correlation_time is None else _log_volume,
+        data=(fit.mean_current, record.time[-1], problem.records[0].data),
         units=SAMPLED,
         lower=dict.fromkeys(UNITS, 0.0),
         width={"a": rate / fit.mean_current, "b": rate, "log_memory": 1.0},
@@ -124,6 +126,62 @@ def decay_target(
     verdict, given = Finding(fit.status, fit.message), [record.error is not None]
     optimum = Optimum(theta, verdict, [max(scale, 1e-12)], given)
     return target_of(problem, optimum, stated, noise=noise, outliers=outliers, priors=priors)
+
+
+class Remembered(NamedTuple):
+    """What whitened residuals need: when, what was read, its error, the usual interval, and the
+    logarithm of the memory at which the size of the noise is quoted, or NaN where it is known.
+    """
+
+    at: Moments
+    measured: Array
+    error: Array
+    usual: Array
+    quoted: Array
+
+
+def _with_memory(problem: Problem, record: DecayRecord, memory: float, inferred: bool) -> Problem:
+    """The problem with the correlation time free, and residuals of independent errors.
+
+    An unknown noise is sampled by what is new in a usual interval, which a record tells well
+    whatever the memory, and quoted as the whole noise at the fitted memory.
+    """
+    readings = problem.records[0]
+    error = np.ones(1) if record.error is None else record.error
+    usual, quoted = np.median(np.diff(record.time)), np.log(memory) if inferred else np.nan
+    data = Remembered(readings.data, readings.measured, error, usual, quoted)
+    own = Record(RECORD, _new, data, np.zeros(len(record)), None if record.error is None else 1.0)
+    lower, upper = np.log([range_of(record.time)[0], record.span])
+    free = [*problem.free, Free("log_memory", lower, upper)]
+    return replace(problem, free=free, records=[own])
+
+
+def _log_size(model: DecayNumbers, data: Remembered) -> Array:
+    """Logarithm of what whitened residuals are multiplied by."""
+
+    def log_new(log_memory: Array) -> Array:
+        return 0.5 * jnp.log(-jnp.expm1(-2 * data.usual * jnp.exp(-log_memory)))
+
+    known = jnp.isnan(data.quoted)
+    reference = jnp.where(known, model.log_memory, data.quoted)
+    return jnp.where(known, 0.0, log_new(model.log_memory) - log_new(reference))
+
+
+def _new(model: DecayNumbers, data: Remembered) -> Array:
+    apart = jnp.diff(data.at.time) * jnp.exp(-model.log_memory)
+    rows = (beam_current(model, data.at) - data.measured) / data.error
+    return whitened(rows, apart) * jnp.exp(_log_size(model, data))
+
+
+def _log_volume(model: DecayNumbers, data: tuple[Array, Array, Remembered]) -> Array:
+    remembered = data[2]
+    apart = jnp.diff(remembered.at.time) * jnp.exp(-model.log_memory)
+    count = remembered.measured.size
+    return log_volume(apart) + count * _log_size(model, remembered)
+
+
+def _no_volume(model: DecayNumbers, data: tuple[Array, ...]) -> Array:
+    return jnp.zeros(())
 
 
 def _start(fit: Fitted, record: DecayRecord) -> tuple[np.ndarray, float]:
@@ -139,9 +197,9 @@ def _start(fit: Fitted, record: DecayRecord) -> tuple[np.ndarray, float]:
 def _currents(data: Sampled, theta: Array) -> Array:
     """What one draw predicts of the readings."""
     core = data.core
-    record = core.records[0]
+    at = core.records[0].data
     model = tree.replace(core.model, core.chosen, data.theta.at[data.moving].set(theta))
-    return record.predict(model, record.data)
+    return beam_current(model, at.at if isinstance(at, Remembered) else at)
 
 
 def expected_current(posterior: Posterior) -> Expected:
@@ -153,6 +211,9 @@ def expected_current(posterior: Posterior) -> Expected:
         Of `DecayFit.sample`.
     """
     target = posterior.target
-    error = target.data.core.records[0].error
+    record = target.data.core.records[0]
+    error = np.ones(1) if record.error is None else np.asarray(record.error)
+    if isinstance(record.data, Remembered):
+        error = np.asarray(record.data.error)
     draws = target.each(_currents, posterior.thinned())
-    return posterior.expected(draws, np.ones(1) if error is None else np.asarray(error))
+    return posterior.expected(draws, np.broadcast_to(error, draws.shape[1:]))

@@ -9,7 +9,8 @@ import numpy as np
 from beamfit.lifetime.decay import HOUR
 from beamfit.quantity import Status
 from beamfit.shown import shown
-from beamfit.studies.decay.fit import UNITS, DecayFit, bare
+from beamfit.studies.decay.evidence import UNITS
+from beamfit.studies.decay.fit import DecayFit, bare
 from beamfit.studies.decay.law import Physical
 from beamfit.studies.decay.model import Expansion, expanded
 from beamfit.table import json_of
