@@ -54,7 +54,13 @@ SHOWN, COMPUTED = 0.02, 1e-5
 # Rounding errors in themselves, or the way a search took.
 IDLE = {"seconds", "kkt", "beamfit", "command", "iterations"}
 # What is exactly zero is computed as a rounding error of this size.
-ROUNDING = {"systematics": 1e-12, "rms_residual": 1e-15, "pull": 1e-9, "chi2": 1e-20}
+ROUNDING = {
+    "multiplier": 1e-6,
+    "systematics": 1e-12,
+    "rms_residual": 1e-15,
+    "pull": 1e-9,
+    "chi2": 1e-20,
+}
 
 
 def said(arguments):
