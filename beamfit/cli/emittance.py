@@ -185,7 +185,7 @@ def _show(
     report: str | None,
     methods: tuple[SizeMethods, ...],
 ) -> None:
-    """Show tables, the verdict and what the budget is."""
+    """Say the verdict first, then show tables and what the budget is."""
     from beamfit.cli.show import Terminal
     from beamfit.studies.scan.results import parameter_rows, result_rows
     from beamfit.studies.scan.sensitivity import budget_rows, range_rows
@@ -194,9 +194,11 @@ def _show(
     terminal, names = Terminal(), [p.plane for p in fit.planes]
     title = f"{fit.scan.name} on {fit.line.name}"
     statuses = [p.status for p in fit.planes]
-    terminal.table(labelled(title, names, result_rows(fit.planes)), statuses)
+    terminal.line(title, style="bold")
     for p in fit.planes:
-        terminal.verdict(p.plane, p.status, p.message)
+        terminal.answer(p.headline, p.status, p.message)
+    terminal.line()
+    terminal.table(labelled("", names, result_rows(fit.planes)), statuses)
     terminal.line()
     if fit.statement.closed:
         for head, rows in (

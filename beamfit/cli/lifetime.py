@@ -218,8 +218,9 @@ def _show_record(terminal: Terminal, study: RecordStudy) -> None:
     for decay in study.decays:
         name, status = decay.fit.record, decay.fit.status
         rows = decay_rows([decay]) + separability_rows([decay])[:2] + check_rows([decay])
+        terminal.answer(decay.fit.headline, status, decay.fit.message)
+        terminal.line()
         terminal.table(labelled("", [name], rows), [status])
-        terminal.verdict(name, status, decay.fit.message)
         if decay.systematics:
             terminal.table(Table("\nWhat no residual shows", SYSTEMATIC, systematic_rows(decay)))
         if losses := budget_rows([decay]):

@@ -59,6 +59,11 @@ class Terminal:
         text = Text(f"\n{name}: ", style=_style(status))
         self.console.print(text.append(message, style="default not bold"))
 
+    def answer(self, headline: str, status: Status, message: str) -> None:
+        """Say what was found, in the colour of its status, and how far to believe it."""
+        text = Text(f"\n{headline}. ", style=_style(status))
+        self.console.print(text.append(message, style="default not bold"))
+
     def posterior(self, title: str, posterior: Posterior) -> None:
         """Show intervals, verdict and diagnostics."""
         self.table(posterior.table()._replace(title=f"\n{title}"), wrap=False)

@@ -57,12 +57,15 @@ def test_readme_shows_the_files_and_the_answer(run, tmp_path, root):
     for name in ("scan.csv", "lattice.toml"):
         assert (files("beamfit") / "example" / name).read_text() in blocks
     run("example", tmp_path)
-    (answer,) = (block for block in blocks if "beamfit emittance first/" in block)
-    scan, lattice = tmp_path / "scan.csv", tmp_path / "lattice.toml"
-    said = " ".join(run("emittance", scan, "--lattice", lattice)[1].split())
-    shown = [line for line in answer.splitlines()[1:] if line != "..."]
-    for line in shown:
-        assert " ".join(line.split()) in said
+    commands = {
+        "first/": ("--lattice", tmp_path / "lattice.toml", tmp_path / "scan.csv"),
+        "measurements/": ("--lattice", "lattices/lcls_otr2.toml", "measurements/lcls_otr2.csv"),
+    }
+    for place, arguments in commands.items():
+        (answer,) = (block for block in blocks if f"$ beamfit emittance {place}" in block)
+        said = " ".join(run("emittance", *arguments)[1].split())
+        for shown in answer.partition("\n")[2].split("...\n"):
+            assert " ".join(shown.split()) in said
 
 
 def sizes_of(plane, current, emittance, beta, alpha):

@@ -429,8 +429,9 @@ class EmittanceFit:
 
     def __str__(self) -> str:
         heading = f"{self.scan.name} on {self.line.name}, fit of {self.planes[0].method}"
-        lines = [heading.replace("_", " "), "", text_of(self._table("")), ""]
-        lines += [f"{p.plane}: {p.message}" for p in self.planes]
+        lines = [heading.replace("_", " "), ""]
+        lines += [f"{p.headline}. {p.message}" for p in self.planes]
+        lines += ["", text_of(self._table(""))]
         lines += ["", *self.notes] if self.notes else []
         if not self.statement.closed:
             rows = [[name, *cells] for name, cells in parameter_rows(self.parameters)]
@@ -440,6 +441,6 @@ class EmittanceFit:
         return "\n".join(lines)
 
     def _repr_html_(self) -> str:
-        notes = (f"<p><b>{p.plane}</b>: {escape(p.message)}</p>" for p in self.planes)
+        said = (f"<p><b>{escape(p.headline)}.</b> {escape(p.message)}</p>" for p in self.planes)
         more = (f"<p>{escape(note)}</p>" for note in self.notes)
-        return html_of(self._table("")) + "".join((*notes, *more))
+        return "".join((*said, html_of(self._table("")), *more))

@@ -265,7 +265,8 @@ class PlaneFit:
         status = cell(self.status)
         if self.status is Status.unidentified:
             return f"{self.plane} {status}: emittance not determined"
-        return f"{self.plane} {status}: normalised emittance {self.normalized_emittance}"
+        holds = "" if self.emittance.error is None else f" ({self.holds})"
+        return f"{self.plane} {status}: normalised emittance {self.normalized_emittance}{holds}"
 
     def tables(self) -> tuple[Table, ...]:
         """All numbers, to be shown."""
