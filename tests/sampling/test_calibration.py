@@ -46,12 +46,13 @@ def test_known_transport_by_quadrature(gtf, method, noise):
     s11, s12, s22 = grid.T
     positive = (s11 > 0) & (s11 * s22 > s12**2)
     chi2 = np.zeros(len(grid))
-    for a, b, known, size, error in zip(p.r11, p.r12, p.known, p.size, p.error, strict=True):
+    columns = (p.r11, p.r12, p.known, p.size, p.error, p.weighed)
+    for a, b, known, size, error, weighed in zip(*columns, strict=True):
         squared = a * a * s11 + 2 * a * b * s12 + b * b * s22 + known
         if method == "size":
             chi2 += ((np.sqrt(squared) - size) / error) ** 2
         else:
-            chi2 += ((squared - size**2) / (2 * size * error)) ** 2
+            chi2 += ((squared - size**2) / (2 * weighed * error)) ** 2
     # ∫ s^-n exp(-chi2/2s²) d ln s is proportional to chi2^(-n/2).
     log = -0.5 * chi2 if noise == "known" else -0.5 * len(p.size) * np.log(chi2)
     weight = np.exp(log - log.max()) * positive
