@@ -83,6 +83,9 @@ def save_fit(path: str | PathLike[str], fit: EmittanceFit | DecayFit) -> None:
     """
     if isinstance(fit, DecayFit):
         content = _plain(fit)
+    elif not isinstance(fit, EmittanceFit):
+        found = f"a {type(fit).__name__}"
+        raise InputError(found, "one fit of an emittance or a decay", path=path)
     elif fit.statement.closed:
         content = {name: _plain(getattr(fit, name)) for name in OWN}
         content["line"] = _plain(fit.seen.line)

@@ -89,6 +89,11 @@ def test_a_scenario_is_refused_in_words(root, tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
+def test_another_value_is_refused_in_words(every, tmp_path):
+    with pytest.raises(InputError, match="a PlaneFit; expected one fit"):
+        beamfit.save_fit(tmp_path / "a.json", every["planes"].x)
+
+
 def test_other_files_and_formats_are_refused_in_words(every, tmp_path):
     file = tmp_path / "a.json"
     for text in ("{}", "[1]", "no json", '{"format": "beamfit-fit-1"}', "null"):
