@@ -30,7 +30,9 @@ Examples:
 
 
 @click.command(epilog=EXAMPLE)
-@options("scan ignore skip-bad lattice use from to screen energy scenario prior bounds anchor vary")
+@options(
+    "scan ignore skip-bad lattice use from to screen energy scenario prior bounds gain anchor vary"
+)
 @click.option(
     "--energies", metavar="MEV,MEV", default="", help="Further energies the beam can be had at."
 )

@@ -58,7 +58,7 @@ Examples:
     help="What the fit compares: size² (linear) or size.",
 )
 @click.option("--robust", is_flag=True, help="Give each point a probability of being an outlier.")
-@options("weights scenario prior bounds anchor")
+@options("weights scenario prior bounds gain anchor")
 @click.option(
     "--systematics",
     "known",

@@ -13,7 +13,7 @@ import click
 from beamfit.errors import InputError
 from beamfit.particles import REST_ENERGY
 from beamfit.studies.scan.assumptions import SCENARIOS
-from beamfit.studies.scan.typed import anchor_of, bounds_of, limits_of, priors_of
+from beamfit.studies.scan.typed import anchor_of, bounds_of, gains_of, limits_of, priors_of
 
 __all__ = ["Sampling", "command_line", "options"]
 
@@ -114,7 +114,16 @@ SHARED: dict[str, Callable[..., Any]] = {
         multiple=True,
         metavar="NAME=LOW:HIGH",
         callback=_parsed(bounds_of),
-        help="Calibration: bounds of a number; ± 12 % of the slope unless given.",
+        help="Calibration: bounds of a number; ± 12 % of the slope unless given. Transport "
+        "network: of the beam, x.sigma11=2e-8:3e-8 (SI), or of a setting the gains are held over.",
+    ),
+    "gain": click.option(
+        "--gain",
+        "gains",
+        multiple=True,
+        metavar="NAME=LOW:HIGH",
+        callback=_parsed(gains_of),
+        help="Transport network: limits of a gain such as dA_x/dQ2=:-0.0083, in place of signs.",
     ),
     "anchor": click.option(
         "--anchor",

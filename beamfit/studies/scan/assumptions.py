@@ -23,12 +23,15 @@ class Entry(NamedTuple):
     anchor: bool = False
     determinant: bool = False
     branches: bool = False
+    box: bool = False
 
 
 # A further scenario is a module with a `SCENARIO` and a line here.
 SCENARIOS = {
     "known": Entry("known", robust=True),
-    "transport-network": Entry("transport_network", line=False, anchor=True, determinant=True),
+    "transport-network": Entry(
+        "transport_network", line=False, anchor=True, determinant=True, box=True
+    ),
     "calibration": Entry("calibration", robust=True, numbers=True),
     "focusing-network": Entry("focusing_network", anchor=True, branches=True),
 }
@@ -124,7 +127,12 @@ class Assumptions:
         ``size_scale`` (see `beamfit.studies.scan.systematics.with_systematics`), to mean and
         standard deviation. A mean of None is that of the line.
     bounds : mapping of str to (float, float), optional
-        The same to a lower and an upper bound.
+        The same to a lower and an upper bound. Of a transport network the box of the beam
+        (``x.sigma11`` in m² and so on) and that of its inputs (``Q2``).
+    gains : mapping of str to (float, float), optional
+        Gain of a transport network, such as ``dA_x/dQ2`` per unit of the setting, to lower and
+        upper limit, one of which may be infinite. The network is then the report's: its gains are
+        free but for these, which hold everywhere in the box of the inputs.
     anchor : Anchor, optional
         For the networks.
     hysteresis : bool
@@ -148,6 +156,7 @@ class Assumptions:
 
     priors: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     bounds: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    gains: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     anchor: Anchor = field(default_factory=Anchor)
     hysteresis: bool = False
     hidden: int = 5
@@ -168,6 +177,10 @@ class Assumptions:
                     f"prior mean {mean:g} of {name} outside its bounds {low:g}:{high:g}",
                     "a mean within the bounds",
                 )
+        for name, (low, high) in self.gains.items():
+            if not low < high or (math.isinf(low) and math.isinf(high)):
+                expected = "a finite limit at least, lower first"
+                raise InputError(f"gain {name} = {low:g}:{high:g}", expected)
         for name in ("hidden", "starts"):
             if getattr(self, name) < 1:
                 raise InputError(f"{getattr(self, name)} {name}", "at least one")
@@ -198,7 +211,8 @@ class Assumptions:
         if beyond and not entry.line:
             expected = f"{' or '.join(ON_SCREEN)}: R11 and R12 are free in it already"
             raise InputError(f"a prior on {beyond[0]} with scenario {scenario}", expected)
-        if named and not entry.numbers:
+        takes = entry.numbers or (entry.box and not self.calibrations)
+        if named and not takes:
             raise InputError(
                 f"a prior or bounds on {named[0]} with scenario {scenario}",
                 f"scenario {_taking('numbers')}, whose calibration numbers are free",
@@ -207,11 +221,13 @@ class Assumptions:
             "anchor": self.anchor != Anchor(),
             "determinant": self.anchor.determinant,
             "branches": self.hysteresis,
+            "box": bool(self.gains),
         }
         words = {
             "anchor": "an anchor",
             "determinant": "anchor determinant",
             "branches": "hysteresis",
+            "box": "limits of gains",
         }
         if robust and not entry.robust:
             raise InputError(

@@ -49,6 +49,7 @@ def fit_emittance(
     scenario: str = "known",
     priors: Mapping[str, tuple[float, float]] | None = None,
     bounds: Mapping[str, tuple[float, float]] | None = None,
+    gains: Mapping[str, tuple[float, float]] | None = None,
     anchor: Anchor | None = None,
     hysteresis: bool = False,
     hidden: int = 5,
@@ -83,6 +84,11 @@ def fit_emittance(
         upper bound ("calibration"). In any scenario also priors on screen, beam and line, which
         become part of the error: "size_scale", "resolution", "wire" (m), "energy", "dispersion"
         (m), "dispersion_slope", "NAME.gradient", "NAME.length" (m); see docs/systematics.md.
+        Bounds of a "transport-network" are the box of the beam ("x.sigma11", SI) and that of the
+        network's inputs ("Q2"), over which its gains keep to their signs or limits.
+    gains : mapping of str to (float, float), optional
+        Limits of gains in place of their signs, such as {"dA_x/dQ2": (-inf, -0.0083)}, for the
+        report's own network without scales ("transport-network").
     anchor : Anchor, optional
         What ties a network to first principles.
     hysteresis : bool
@@ -127,9 +133,8 @@ def fit_emittance(
         raise InputError(f"weights '{weights}'", " or ".join(WEIGHTS))
     if robust and method != METHODS[0]:
         raise InputError("a robust fit of size", 'method "size_squared" with robust')
-    told = Assumptions(
-        priors or {}, bounds or {}, anchor or Anchor(), hysteresis, hidden, starts, seed
-    )
+    ties = (gains or {}, anchor or Anchor(), hysteresis)
+    told = Assumptions(priors or {}, bounds or {}, *ties, hidden, starts, seed)
     told.check_scenario(scenario, robust)
     if len(scan.slices) > 1:
         found = f"a scan of {len(scan.slices)} slices of the beam"

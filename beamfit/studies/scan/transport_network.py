@@ -16,8 +16,10 @@ import numpy as np
 from beamfit.errors import InputError
 from beamfit.greybox.bounds import over_cells
 from beamfit.greybox.mlp import MLP, Port
-from beamfit.greybox.problem import Problem, Record
+from beamfit.greybox.problem import Free, Problem, Record
+from beamfit.greybox.terms import Constraint
 from beamfit.studies.scan.assumptions import Assumptions
+from beamfit.studies.scan.boxed_network import beam_box, check_box, limited_network
 from beamfit.studies.scan.results import Parameter
 from beamfit.studies.scan.signed_network import (
     common_errors,
@@ -79,14 +81,13 @@ class _Layout(NamedTuple):
     columns: np.ndarray
     with_energy: bool
     elements: int
+    low: np.ndarray
+    high: np.ndarray
 
     @property
-    def low(self) -> np.ndarray:
-        return self.columns.min(axis=0)
-
-    @property
-    def high(self) -> np.ndarray:
-        return self.columns.max(axis=0)
+    def cells(self) -> int:
+        """Along each input, in which gains are enclosed."""
+        return CELLS if len(self.names) == 1 else 8
 
 
 def _layout(seen: Seen, told: Assumptions) -> _Layout:
@@ -95,7 +96,22 @@ def _layout(seen: Seen, told: Assumptions) -> _Layout:
     with_energy = scan.energy is not None and np.ptp(scan.energy) > 0
     names = (*varied, "energy") if with_energy else varied
     columns += [scan.energy] if with_energy else []
-    return _Layout(names, np.stack(columns, -1), with_energy, 4 if told.anchor.determinant else 2)
+    low, high = _box(seen, told, dict(zip(names, columns, strict=True)))
+    elements = 4 if told.anchor.determinant else 2
+    return _Layout(names, np.stack(columns, -1), with_energy, elements, low, high)
+
+
+def _box(seen: Seen, told: Assumptions, columns: dict[str, np.ndarray]) -> np.ndarray:
+    """Ends of the inputs' box: those that were given, or else of the scan; shape (2, inputs)."""
+    ends = []
+    for name, values in columns.items():
+        own = (values.min(), values.max())
+        low, high = told.bounds.get(name, own)
+        if low > own[0] or high < own[1]:
+            found = f"bounds {name} = {low:g}:{high:g}, and a scan from {own[0]:g} to {own[1]:g}"
+            raise seen.scan.unusable(found, "bounds that hold the scan", name)
+        ends.append((low, high))
+    return np.array(ends, float).T
 
 
 def _first_principles(seen: Seen, lay: _Layout, points: np.ndarray) -> np.ndarray:
@@ -157,6 +173,20 @@ def _state(seen: Seen, told: Assumptions) -> Problem:
     for name in (name for place in told.anchor.at for name in place):
         if name not in lay.names:
             raise InputError(f"an anchor at '{name}'", f"a scanned magnet: {', '.join(lay.names)}")
+    check_box(told, lay.names, _names(seen, lay), seen.planes)
+    net, weights, limits = _limited(seen, lay, told) if told.gains else _signed(seen, lay, told)
+    limits += beam_box(told, seen.planes)
+    beams, records = beam_numbers(seen), []
+    for plane in seen.planes:
+        rows = network_rows(seen, lay, plane)
+        records += [size_record(seen, plane, rows), *_anchors(seen, lay, told, rows)]
+    common, further, priors = common_errors(told, seen.planes)
+    free = [*beam_free(beams), *weights, *further]
+    return Problem({"beam": beams, "map": net} | common, free, records, priors, limits)
+
+
+def _signed(seen: Seen, lay: _Layout, told: Assumptions) -> tuple[MLP, list[Free], list]:
+    """A network scaled to its box, whose gains have the signs of first principles."""
     grid = _grid(lay)
     first = _first_principles(seen, lay, grid)[..., : lay.elements].reshape(len(grid), -1)
     inputs = [
@@ -167,15 +197,17 @@ def _state(seen: Seen, told: Assumptions) -> Problem:
         Port(name, "", 0, np.ptp(v) / 2 or 1.0, (v.max() + v.min()) / 2)
         for name, v in zip(_names(seen, lay), first.T, strict=True)
     ]
-    signs = _signs(seen, lay, grid)
-    net, bounds = signed_network(inputs, outputs, signs, told.hidden, told.seed)
-    beams, records = beam_numbers(seen), []
-    for plane in seen.planes:
-        rows = network_rows(seen, lay, plane)
-        records += [size_record(seen, plane, rows), *_anchors(seen, lay, told, rows)]
-    free = beam_free(beams) + weight_free("map", bounds)
-    common, further, priors = common_errors(told, seen.planes)
-    return Problem({"beam": beams, "map": net} | common, [*free, *further], records, priors)
+    net, bounds = signed_network(inputs, outputs, _signs(seen, lay, grid), told.hidden, told.seed)
+    return net, weight_free("map", bounds), []
+
+
+def _limited(
+    seen: Seen, lay: _Layout, told: Assumptions
+) -> tuple[MLP, list[Free], list[Constraint]]:
+    """A network whose gains have the limits that were given."""
+    ends = zip(lay.names, lay.low, lay.high, strict=True)
+    inputs = [Port(n, "", lower=float(a), upper=float(b)) for n, a, b in ends]
+    return limited_network(inputs, _names(seen, lay), told, lay.cells)
 
 
 def _names(seen: Seen, lay: _Layout) -> list[str]:
@@ -267,7 +299,8 @@ def certificate_of(problem: Problem, net: MLP) -> Certificate:
     Parameters
     ----------
     problem : Problem
-        From `transport_problem`; its bounds tell which sign each gain must have.
+        From `transport_problem`; its bounds tell which sign each gain must have. A limit that was
+        given for a gain is a constraint of the problem, and asks for no sign here.
     net : MLP
         The fitted network.
 
@@ -277,8 +310,10 @@ def certificate_of(problem: Problem, net: MLP) -> Certificate:
         For every current in the box, not only the measured ones, outward rounding included.
     """
     ports = net.input_ports
-    low = np.array([p.bias - p.scale for p in ports])
-    high = np.array([p.bias + p.scale for p in ports])
+    # A network that is scaled to its box has it in the scales.
+    scaled = [(p.bias - p.scale, p.bias + p.scale) for p in ports]
+    given = [(p.lower, p.upper) for p in ports]
+    low, high = np.where(np.isfinite(given), given, scaled).T
     bound = over_cells(net, low, high, CELLS if len(ports) == 1 else 8)
     lower, upper = np.asarray(bound.lower).min(axis=0), np.asarray(bound.upper).max(axis=0)
     sign = _asked(problem, net)
@@ -298,5 +333,7 @@ def _asked(problem: Problem, net: MLP) -> np.ndarray:
         for f in problem.free
         if ".weights." in f.path
     }
+    if not ends:  # limits, and no signs
+        return np.zeros((len(net.output_ports), len(net.input_ports)))
     first, last = (ends[f"layer{i}->layer{i + 1}"][...] for i in (0, 1))
     return last[0][:, None] * first[:, 0][None, :]

@@ -16,6 +16,7 @@ __all__ = [
     "anchor_of",
     "bounds_of",
     "energies_of",
+    "gains_of",
     "goal_of",
     "limits_of",
     "priors_of",
@@ -24,6 +25,7 @@ __all__ = [
 
 PRIOR = "NAME=MEAN+-SD such as Q2.slope=167.23+-3.3446"
 BOUNDS = "NAME=LOWER:UPPER such as Q2.slope=147.23:187.23"
+GAINS = "NAME=LOWER:UPPER, one of them may be left out, such as dA_x/dQ2=:-0.0083"
 VARY = "MAGNET=LOW:HIGH such as Q2=0:10"
 ANCHOR = "first-principles=2%, determinant, or a setting such as Q2=0"
 TARGET = "size=200um, divergence=140urad (with _x or _y), match, or match=BETA_M:ALPHA"
@@ -110,6 +112,23 @@ def bounds_of(texts: Iterable[str]) -> dict[str, tuple[float, float]]:
     {'Q2.slope': (147.23, 187.23)}
     """
     return _pairs(texts, "bounds", ":", BOUNDS)
+
+
+def gains_of(texts: Iterable[str]) -> dict[str, tuple[float, float]]:
+    """Read limits of gains, ``NAME=LOWER:UPPER``; one left out is none.
+
+    Raises
+    ------
+    InputError
+        If one is not of that form, or a name is given twice.
+
+    Examples
+    --------
+    >>> gains_of(["dA_x/dQ2=:-0.0083", "dB_x/dQ2=-1:0"])
+    {'dA_x/dQ2': (-inf, -0.0083), 'dB_x/dQ2': (-1.0, 0.0)}
+    """
+    whole = [re.sub(r"=\s*:", "=-inf:", re.sub(r":\s*$", ":inf", text)) for text in texts]
+    return _pairs(whole, "gain", ":", GAINS)
 
 
 def limits_of(texts: Iterable[str]) -> dict[str, tuple[float, float]]:

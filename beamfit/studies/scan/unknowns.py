@@ -220,8 +220,25 @@ def _ending(scenario: Scenario, told: Assumptions, fit: Fit) -> Finding | None:
         )
         return Finding(fit.status, said)
     if fit.status not in NO_ANSWER:
-        return None
+        return _held(fit)
     return Finding(fit.status, fit.message[0].upper() + fit.message[1:])
+
+
+def _held(fit: Fit) -> Finding | None:
+    """Whether a box or a limit that was given holds the answer: it then decides, not the data.
+
+    A constraint that is active counts as exact in the covariance, and a beam in a corner of its box
+    as known to the last digit.
+    """
+    active = [c.name.split("[")[0] for c in fit.constraints if c.state != "free"]
+    if not active:
+        return None
+    named = ", ".join(dict.fromkeys(active))
+    return Finding(
+        Status.unidentified,
+        f"The answer is held by limits that were given ({named}): they decide it, not the data.",
+        "Justify or widen them, or tie the network to first principles.",
+    )
 
 
 def _scenario_answer(
