@@ -10,8 +10,9 @@ from hypothesis import strategies as st
 
 import beamfit
 from beamfit.quantity import Status
+from beamfit.studies.scan.model import phase_coverage
 from beamfit.studies.scan.sigma import zero_emittance
-from beamfit.studies.scan.verdict import phase_coverage, waist_bracketed
+from beamfit.studies.scan.verdict import waist_bracketed
 from tests.studies.conftest import TABLE_2, design, scan_of
 
 TRUE_EMITTANCE = float(np.sqrt(TABLE_2[0] * TABLE_2[2] - TABLE_2[1] ** 2))

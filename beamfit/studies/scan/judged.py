@@ -13,13 +13,13 @@ from beamfit.quantity import Quantity
 from beamfit.statistics import scaled_directions
 from beamfit.status import Status
 from beamfit.studies.scan.known import next_measurement
-from beamfit.studies.scan.model import QUANTITIES, coefficients
+from beamfit.studies.scan.model import QUANTITIES, coefficients, phase_coverage
 from beamfit.studies.scan.next_point import best_symmetric
 from beamfit.studies.scan.noise import reach_of
 from beamfit.studies.scan.results import Identifiability, PlaneFit, Points, ScreenTwiss
 from beamfit.studies.scan.statement import Seen, asked_of
 from beamfit.studies.scan.transport import own_settings, own_units
-from beamfit.studies.scan.verdict import BEAM_RULES, LOST, judge, phase_coverage
+from beamfit.studies.scan.verdict import BEAM_RULES, LOST, judge
 from beamfit.verdict import Finding
 
 __all__ = ["SIGMA", "Answer", "judged_beam", "plane_fit", "units_of"]
@@ -193,7 +193,7 @@ def upper_limit(sigma: np.ndarray, covariance: np.ndarray, rests_on: float) -> f
     --------
     >>> covariance = 1e-2 * np.eye(3)
     >>> round(upper_limit(np.array([1.0, 0.0, 1.0]), covariance, math.inf), 2)
-    1.12
+    1.11
     >>> upper_limit(np.array([1.0, 0.0, -1.0]), covariance, math.inf) is None
     True
     """

@@ -13,11 +13,13 @@ is free of screen, energy, drifts and incoming dispersion. Its numbers have path
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 from jax.typing import ArrayLike
 
@@ -36,6 +38,7 @@ __all__ = [
     "emittance_parts",
     "line_of",
     "numbers_of",
+    "phase_coverage",
     "predict_sizes",
     "sigma_of",
     "size_squared",
@@ -244,3 +247,35 @@ def asked_numbers(model: Mapping[str, Any], asked: Asked) -> Array:
     energy = asked.energy * model.get("systematics", {}).get("energy", 1.0)
     asked = replace(asked, energy=energy)
     return numbers_of(sigma, asked.factor, to_screen, to_design, asked.design)
+
+
+def phase_coverage(r11: np.ndarray, r12: np.ndarray, beta: float, alpha: float) -> float | None:
+    """Betatron phase from which the scan saw the beam, in degrees of a half turn.
+
+    Parameters
+    ----------
+    r11, r12 : ndarray
+        Transfer-matrix elements to the screen, shape (n,).
+    beta, alpha : float
+        Twiss parameters at the start, β in m.
+
+    Returns
+    -------
+    float or None
+        180° less the largest gap between the phases; None if β is not finite.
+
+    Notes
+    -----
+    The phase advance φ to the screen has tan φ = R12/(β R11 - α R12), from
+    R11 = sqrt(β_s/β)(cos φ + α sin φ), R12 = sqrt(β β_s) sin φ.
+
+    Examples
+    --------
+    >>> phase_coverage(np.array([1.0, 0.0]), np.array([0.0, 1.0]), 1.0, 0.0)
+    90.0
+    """
+    if not (math.isfinite(beta) and math.isfinite(alpha)):
+        return None
+    phase = np.sort(np.mod(np.degrees(np.arctan2(r12, beta * r11 - alpha * r12)), 180.0))
+    gaps = np.diff(np.concatenate([phase, [phase[0] + 180.0]]))
+    return float(180.0 - gaps.max())

@@ -264,7 +264,9 @@ class PlaneFit:
         """The plane, its status and its emittance in a line."""
         status = cell(self.status)
         if self.status is Status.unidentified:
-            return f"{self.plane} {status}: emittance not determined"
+            limit = self.normalized_emittance.interval_95
+            known = f": normalised emittance {_interval(self)}, 95 % sure" if limit else ""
+            return f"{self.plane} {status}{known}"
         holds = "" if self.emittance.error is None else f" ({self.holds})"
         return f"{self.plane} {status}: normalised emittance {self.normalized_emittance}{holds}"
 
