@@ -142,13 +142,14 @@ def _answer_slices(
     from beamfit.cli.show import Terminal
 
     terminal = Terminal()
+    terminal.line(f"{fits.scan.name} on {fits.fits[0].line.name}", style="bold")
+    for fit in fits:
+        for p in fit.planes:
+            terminal.answer(f"slice {fit.scan.slices[0]}, {p.headline}", p.status, p.message)
+    terminal.line()
     for table in fits.tables():
         terminal.table(table)
         terminal.line()
-    for fit in fits:
-        for p in fit.planes:
-            terminal.verdict(f"{fit.scan.slices[0]}, {p.plane}", p.status, p.message)
-    terminal.line()
     _about_the_input(terminal, fits, ())
     terminal.report(report)
 

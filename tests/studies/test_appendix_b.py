@@ -124,6 +124,8 @@ def test_the_fit_keeps_to_box_and_gains_and_determines_nothing(scan, line):
     fit = beamfit.fit_emittance(scan, line, scenario="transport-network", **told)
     assert fit.x.status.value == "unidentified"
     assert "box x" in fit.x.message
+    # A corner of the box has no error, which is no knowledge.
+    assert (fit.x.error_scale, fit.x.identifiability.zero_distance) == (1.0, 0.0)
     assert fit.x.emittance.error is None
     sigma = [1e8 * q.value for q in fit.x.sigma]
     for value, (low, high) in zip(sigma, BOX.values(), strict=True):

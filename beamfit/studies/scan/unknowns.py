@@ -173,7 +173,8 @@ def _unknowns(
 ) -> Unknowns:
     evidence, noise = seen.works[plane].evidence, seen.noises[plane]
     tied, error = told.anchor.words, float(fit.spread.error(np.nan_to_num(own.slope[0])))
-    distance = float(own.value[0]) / (2.0 * error) if error > 0 else 0.0
+    held = _held(fit) is not None
+    distance = float(own.value[0]) / (2.0 * error) if error > 0 and not held else 0.0
     edges = "".join(
         f"; {p.name} ends at its {p.state} bound {p.value.value:.6g} "
         f"(d(chi2/2)/d(bound) = {p.multiplier:.2g})"
@@ -267,7 +268,7 @@ def _scenario_answer(
         covariance=slopes @ fit.covariance_raw @ slopes.T if known else np.full((3, 3), np.nan),
         chi2=group.chi2,
         dof=round(group.dof),
-        scale=group.scale if group.scale > 0 else 1.0,
+        scale=group.scale if group.scale > 0 and _held(fit) is None else 1.0,
         rests_on=u.rests_on,
         limits=(None, None),
         distance=u.distance,
