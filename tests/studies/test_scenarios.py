@@ -13,6 +13,7 @@ from beamfit.greybox.bounds import over_cells
 from beamfit.greybox.solve import solve
 from beamfit.optics.calibration import IntegratedGradient, SlopeIntercept
 from beamfit.optics.elements import Quadrupole, Screen
+from beamfit.optics.particle import beta_gamma
 from beamfit.studies.scan.assumptions import Anchor, Assumptions
 from beamfit.studies.scan.calibration import with_numbers
 from beamfit.studies.scan.known import see
@@ -114,12 +115,16 @@ def test_a_second_screen_identifies_the_calibration_and_recovers_the_truth(two):
 
 
 def scan_at(line, currents, energies, sigma, relative=0.01, seed=5):
-    """A simulated scan of Q2 at each of several energies, one after the other."""
+    """A simulated scan of Q2 at each of several energies, one after the other.
+
+    The beam is sigma at their mean energy, with the same normalised emittance at all of them.
+    """
     current, energy = np.tile(currents, len(energies)), np.repeat(energies, len(currents))
     true = []
     for i, e in zip(current, energy, strict=True):
         a, b = np.asarray(line.matrix({"Q2": i}, e).x)[0, :2]
-        true.append(np.sqrt(sigma @ [a * a, 2 * a * b, b * b]))
+        damped = sigma * beta_gamma(np.mean(energies), line.mass) / beta_gamma(e, line.mass)
+        true.append(np.sqrt(damped @ [a * a, 2 * a * b, b * b]))
     true = np.array(true)
     sizes = true * (1 + relative * np.random.default_rng(seed).normal(size=len(true)))
     return beamfit.QuadScan(
