@@ -44,7 +44,8 @@ def main() -> None:
             stream.reconfigure(errors="replace")
     try:
         status = cli.main(prog_name="beamfit", standalone_mode=False) or 0
-        sys.stdout.flush()
+        if sys.stdout is not None:  # None where it was closed before we began
+            sys.stdout.flush()
         sys.exit(status)
     except click.exceptions.NoArgsIsHelpError as error:
         click.echo(error.format_message())

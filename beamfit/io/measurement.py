@@ -9,13 +9,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.special import fdtrc
 
 from beamfit.errors import InputError
 from beamfit.io.emittance_gui import is_emittance_gui, read_emittance_gui
 from beamfit.io.scan_columns import ENERGIES, SETTINGS, column_notes, scan_columns
 from beamfit.io.table import UNITS, Column, Sheet, left_out, read_sheet
 from beamfit.statistics import POOR_FIT
+from beamfit.studies.scan.noise import outstanding
 from beamfit.studies.scan.scans import POSSIBLE, USUAL, QuadScan, first_unusable, row_keys
 
 if TYPE_CHECKING:
@@ -317,15 +317,7 @@ def _scatter(size: np.ndarray, group: np.ndarray) -> tuple[np.ndarray, np.ndarra
 def _alike(size: np.ndarray, group: np.ndarray) -> bool:
     """Whether repeats scatter as if by one relative noise: the largest against all others by F."""
     mean, degrees, square = _scatter(size, group)
-    square = square / mean**2
-    others, rest = degrees.sum() - degrees, square.sum() - square
-    tested = (degrees > 0) & (others >= ENOUGH_DEGREES)
-    if not tested.any():
-        return True
-    with np.errstate(divide="ignore", invalid="ignore"):
-        ratio = (square / degrees) / (rest / others)
-    chance = fdtrc(degrees[tested], others[tested], np.nan_to_num(ratio[tested], nan=1.0))
-    return bool(chance.min() * tested.sum() > POOR_FIT)
+    return bool(outstanding(square / mean**2, degrees).min() > POOR_FIT)
 
 
 def _shot_means(size: np.ndarray, group: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:

@@ -312,3 +312,40 @@ def test_advice_keeps_the_sizes_of_both_planes_within_those_measured(otr2, rows,
     assert predicted[0] <= 1.02 * tall.max()
     beyond = np.sqrt(rows([free], "y") @ sigma[[0, 0, 1], [0, 1, 1]])
     assert beyond[0] > tall.max()
+
+
+@pytest.mark.parametrize("shots", [0, 5])
+def test_noise_that_is_the_same_in_micrometres_is_told(otr2, true, shots):
+    """11 settings with 5 µm everywhere, 4 to 8 % of the size: answers hold as often as they say."""
+    settings, rng, inside, far = np.linspace(-4.5, -1.0, 11), np.random.default_rng(9), 0, 0
+    sizes = true(settings)
+    for _ in range(120):
+        if shots:
+            each = sizes[:, None] + 5e-6 * rng.normal(size=(11, shots))
+            error = each.std(axis=1, ddof=1) / math.sqrt(shots)
+            scan = otr2_scan(settings, each.mean(axis=1), error, shots=np.full(11, shots))
+        else:
+            scan = otr2_scan(settings, sizes + 5e-6 * rng.normal(size=11))
+        q = beamfit.fit_emittance(scan, otr2).x.normalized_emittance
+        assert q.error is not None
+        inside += q.interval_95[0] < 1e-6 < q.interval_95[1]
+        far += abs(q.value - 1e-6) > 4 * q.error
+    assert inside >= 107
+    assert far <= 2
+
+
+def test_one_wild_shot_is_named_and_spoils_no_other_setting(otr2, true):
+    settings, rng = np.linspace(-4.5, -1.0, 11), np.random.default_rng(12)
+    shots = true(settings)[:, None] * (1 + 0.03 * rng.normal(size=(11, 5)))
+    shots[7, 2] = 9e-4
+    error = shots.std(axis=1, ddof=1) / math.sqrt(5)
+    scan = otr2_scan(settings, shots.mean(axis=1), error, shots=np.full(11, 5))
+    others = np.delete(noise_of(scan, "x").error / scan.size["x"], 7)
+    np.testing.assert_allclose(others, 0.03 / math.sqrt(5), rtol=0.5)
+    plain = beamfit.fit_emittance(scan, otr2).x
+    assert f"Q525 = {settings[7]:.4g} kG" in plain.message
+    assert "--robust" in plain.message
+    q = beamfit.fit_emittance(scan, otr2, robust=True).x.normalized_emittance
+    assert q.error is not None
+    assert abs(q.value - 1e-6) < 3 * q.error
+    assert q.relative < 0.05

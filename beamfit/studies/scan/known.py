@@ -23,7 +23,13 @@ from beamfit.studies.scan.next_point import (
     candidate_settings,
     plausible_sigma,
 )
-from beamfit.studies.scan.noise import Noise, noise_of
+from beamfit.studies.scan.noise import (
+    ENOUGH_POINTS,
+    Noise,
+    constant_noise,
+    noise_of,
+    unlikely,
+)
 from beamfit.studies.scan.questions import check_gradients
 from beamfit.studies.scan.results import Points
 from beamfit.studies.scan.robust import RobustFit, fit_robust
@@ -99,11 +105,36 @@ def see(
     seen = Seen(scan, line, scanned, asked, method, robust, weights, rows, noises, None, {})
     if robust or not at_once:
         look = jax.tree.map(np.asarray, look_through(rows))
-        return seen._replace(look=look, works=works_of(seen, look, planes))
+        return _of_its_kind(seen._replace(look=look, works=works_of(seen, look, planes)))
     sizes = _sizes(seen, {plane: noises[plane].error for plane in planes})
     look, found = jax.tree.map(np.asarray, _look_and_fit(rows, sizes, method, weights))
     works = {p: _work(seen, p, look, found, i) for i, p in enumerate(planes)}
-    return seen._replace(look=look, works=works)
+    return _of_its_kind(seen._replace(look=look, works=works))
+
+
+def _of_its_kind(seen: Seen) -> Seen:
+    """Where noise is inferred, fit with the same µm at every point too, and take the likelier."""
+    planes = [p for p, noise in seen.noises.items() if not noise.known]
+    planes = [p for p in planes if len(seen.measured(p)) >= ENOUGH_POINTS]
+    if not planes:
+        return seen
+    noises = {p: constant_noise(seen.works[p].points.size) for p in planes}
+    others = works_of(seen._replace(noises=seen.noises | noises), seen.look, tuple(planes))
+    likelier = [p for p in planes if _unlikely(others[p], 0.0) < _unlikely(seen.works[p], 1.0)]
+    return seen._replace(
+        noises=seen.noises | {p: noises[p] for p in likelier},
+        works=seen.works | {p: others[p] for p in likelier},
+    )
+
+
+def _unlikely(work: Work, relative: float) -> float:
+    """How unlikely the sizes are by a fit, points that it doubts left out."""
+    p = work.points
+    kept = np.ones(len(p.size), bool)
+    if p.outlier_probability is not None:
+        kept = p.outlier_probability < 0.5
+    shape = p.weighed**relative
+    return unlikely((p.size - p.model)[kept], shape[kept])
 
 
 def works_of(seen: Seen, look: Look, planes: tuple[str, ...]) -> dict[str, Work]:
@@ -225,7 +256,7 @@ def _evidence(
         determinant = float(fit.determinant / fit.determinant_error / factor)
         zero = math.sqrt(max(float(fit.chi2_zero - fit.chi2), 0.0)) / factor
         error = 0.5 * factor * float(fit.determinant_error / np.sqrt(fit.determinant))
-    weight = 1.0 if doubt is None else 1.0 - doubt
+    weight = np.ones(len(p.size)) if doubt is None else 1.0 - doubt
     relative = (p.model - p.size) / p.size
     alone = doubt is None and dof > 1 and bool(fit.positive)
     one = _one_magnet(p)
@@ -244,7 +275,7 @@ def _evidence(
         misfit=float(np.sqrt(np.sum(weight * relative**2) / max(dof, 1))),
         bracketed=waist_bracketed(p.settings, p.screen, p.size, p.error),
         smallest_at_end=one is not None and one[np.argmin(p.size)] in (one.min(), one.max()),
-        swamped=bool((p.known > p.size**2).any()),
+        swamped=bool((p.known > (p.size + 2.0 * p.error) ** 2)[weight > 0.5].any()),
         outliers=0.0 if doubt is None else float(np.mean(doubt > 0.5)),
         robust=doubt is not None,
         influence=influence_of(p, noise, fit.sigma, error) if alone else Influence(),

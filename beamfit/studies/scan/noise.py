@@ -6,19 +6,32 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from scipy.special import stdtrit
+from scipy.special import fdtrc, stdtrit
 
 from beamfit.quantity import NORMAL_REACH
 from beamfit.statistics import POOR_FIT, chi2_probability
 from beamfit.studies.scan.scans import QuadScan
 
-__all__ = ["DOUBTFUL", "GUESS", "GUESS_DOF", "Noise", "noise_of", "reach_of"]
+__all__ = [
+    "DOUBTFUL",
+    "ENOUGH_POINTS",
+    "GUESS",
+    "GUESS_DOF",
+    "Noise",
+    "constant_noise",
+    "noise_of",
+    "outstanding",
+    "reach_of",
+    "unlikely",
+]
 
 # Noise without errors in the file: a guess of 5 % of the size, worth two degrees of freedom, so
 # that a few accidentally small residuals are not taken for precision, nor equal sizes for none.
 GUESS, GUESS_DOF = 0.05, 2.0
 # A setting's own scatter counts beside this many degrees of freedom of all settings' together.
 POOL_DOF = 20.0
+# With fewer repeats in all, or points, nothing is told of their kind.
+ENOUGH, ENOUGH_POINTS = 3, 8
 # Errors that are the same share of every size to this relative spread were made as a share of it.
 SAME_SHARE = 0.01
 # Below this probability of χ² the residuals, and no longer the stated errors, tell the noise.
@@ -87,6 +100,9 @@ def noise_of(scan: QuadScan, plane: str) -> Noise:
 
     Notes
     -----
+    Scatter is relative or the same in µm at every setting, whichever its likelihood prefers (of
+    sample variances with f_i degrees of freedom the smaller Σ f_i ln v_i, v_i the pooled variance
+    there). A setting that scatters far more than all others is not pooled and stays as it is.
     The variance of m shots of a setting is s² = (20 s_pool² + (m - 1) s_i²)/(20 + m - 1), with
     their own relative scatter s_i and that of all settings s_pool: few shots can agree by chance.
     This is how a scaled inverse χ² prior of 20 degrees of freedom around s_pool is updated, A.
@@ -107,14 +123,74 @@ def noise_of(scan: QuadScan, plane: str) -> Noise:
     error = scan.error[plane][measured]
     freedom = None if scan.shots is None else np.asarray(scan.shots, float)[measured] - 1.0
     if freedom is not None and freedom.sum() > 0:
-        scatter = (error / size) ** 2 * (freedom + 1.0)
-        pooled = float(freedom @ scatter / freedom.sum())
-        shrunken = (POOL_DOF * pooled + freedom * scatter) / (POOL_DOF + freedom)
-        error = size * np.sqrt(shrunken / (freedom + 1.0))
-        return Noise(error, 1.0, True, float(freedom.sum()), "of the shots")
+        return _of_shots(size, error, freedom)
     share = error / size
     same = len(share) > 1 and float(np.ptp(share)) < SAME_SHARE * float(share.mean())
     return Noise(error, float(same), True, math.inf)
+
+
+def _of_shots(size: np.ndarray, error: np.ndarray, freedom: np.ndarray) -> Noise:
+    """Errors of means of ``freedom`` + 1 shots, evened out over the settings."""
+    scatter = error**2 * (freedom + 1.0)
+    shape, pooled, least, kept = size, 1.0, math.inf, freedom > 0
+    for each in (size, np.full(len(size), np.median(size))):
+        alike = outstanding(freedom * scatter / each**2, freedom) >= POOR_FIT
+        own = freedom * alike
+        variance = float(own @ (scatter / each**2) / own.sum())
+        unlikely = float(own @ np.log(variance * each**2))
+        if unlikely < least:
+            shape, pooled, least, kept = each, variance, unlikely, alike
+    own = scatter / shape**2
+    shrunken = np.where(kept, (POOL_DOF * pooled + freedom * own) / (POOL_DOF + freedom), own)
+    error = shape * np.sqrt(shrunken / (freedom + 1.0))
+    return Noise(error, float(shape is size), True, float(freedom.sum()), "of the shots")
+
+
+def outstanding(square: np.ndarray, degrees: np.ndarray) -> np.ndarray:
+    """How likely some setting scatters so much more than all others, by the F test of each.
+
+    Parameters
+    ----------
+    square, degrees : ndarray
+        Shape (n,): sums of squares and degrees of freedom.
+
+    Returns
+    -------
+    ndarray
+        Shape (n,); 1 where there is nothing to compare.
+
+    Examples
+    --------
+    >>> outstanding(np.array([4.0, 4.0, 400.0]), np.array([4.0, 4.0, 4.0])).round(4).tolist()
+    [1.0, 1.0, 0.0]
+    """
+    others, rest = degrees.sum() - degrees, square.sum() - square
+    tested = (degrees > 0) & (others >= ENOUGH)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ratio = np.nan_to_num((square / degrees) / (rest / others), nan=1.0)
+    chance = np.where(tested, fdtrc(np.maximum(degrees, 1), np.maximum(others, 1), ratio), 1.0)
+    return np.minimum(chance * max(int(tested.sum()), 1), 1.0)
+
+
+def constant_noise(size: np.ndarray) -> Noise:
+    """A guess at noise that is the same in µm at every point."""
+    error = np.full(len(size), GUESS * float(np.median(size)))
+    return Noise(error, 0.0, False, GUESS_DOF, "inferred from the residuals, the same in µm")
+
+
+def unlikely(off: np.ndarray, shape: np.ndarray) -> float:
+    """Minus the logarithm of the likelihood of normal residuals whose deviations go as a shape.
+
+    Their common factor is at its best, and constants are left out.
+
+    Examples
+    --------
+    >>> off = np.array([1.0, -1.0, 1.0])
+    >>> unlikely(off, np.ones(3)) < unlikely(off, np.array([1.0, 2.0, 3.0]))
+    True
+    """
+    scatter = max(float(np.mean((off / shape) ** 2)), 1e-300)
+    return 0.5 * len(off) * math.log(scatter) + float(np.log(shape).sum())
 
 
 def reach_of(dof: float) -> float:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -366,7 +367,8 @@ def _interval(p: PlaneFit) -> str:
     factor, unit = display_unit(abs(high), q.unit)
     if q.error is None:
         return f"below {high / factor:.3g} {unit}"
-    return f"{low / factor:.3g} to {high / factor:.3g} {unit}"
+    places = max(2 - math.floor(math.log10((high - low) / factor)), 0)
+    return f"{low / factor:.{places}f} to {high / factor:.{places}f} {unit}"
 
 
 def _chi2(p: PlaneFit) -> str:
@@ -377,7 +379,10 @@ def _chi2(p: PlaneFit) -> str:
 
 def _noise(p: PlaneFit) -> str:
     if p.chi2 is None:
-        return f"inferred, {100 * float((p.points.error / p.points.weighed).mean()):.2g} % of size"
+        error = p.points.error
+        if not p.points.relative and p.weights == "model":
+            return f"inferred, {1e6 * float(np.median(error)):.2g} µm"
+        return f"inferred, {100 * float((error / p.points.weighed).mean()):.2g} % of size"
     return p.noise if p.error_scale == 1.0 else f"{p.noise}, scaled by {p.error_scale:.2f}"
 
 

@@ -38,7 +38,7 @@ PROJECTED = "projected"
 # Rows of a scan that a notebook shows.
 MOST_SHOWN = 20
 # Rms sizes in m that a beam can have, and that most have: outside a unit is wrong, or questioned.
-POSSIBLE, USUAL = (1e-8, 0.3), (1e-7, 2e-2)
+POSSIBLE, USUAL = (1e-8, 0.3), (1e-6, 2e-2)
 
 
 @shown
@@ -382,7 +382,8 @@ class QuadScan:
                 raise self.unusable(f"{wrong[1]} at point {wrong[0] + 1}", "a positive number", key)
         for plane, size in self.size.items():
             middle = float(np.nanmedian(size)) if not np.isnan(size).all() else 1e-4
-            if not POSSIBLE[0] <= middle <= POSSIBLE[1]:
+            largest = float(np.nanmax(size)) if not np.isnan(size).all() else 1e-4
+            if not (POSSIBLE[0] <= middle and largest <= POSSIBLE[1]):
                 found = f"sizes around {middle:g} m, which no beam has"
                 raise self.unusable(
                     found, "rms sizes in m: are these in um or mm?", f"size_{plane}"
