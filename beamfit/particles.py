@@ -25,7 +25,7 @@ def expected_energy(energy: float, particle: str) -> str | None:
         return None
     return (
         f"a total energy between the {particle}'s rest energy of {rest:.6g} MeV and 10 TeV; "
-        "is it in GeV or eV?"
+        "is it in GeV or eV, or a kinetic energy (kinetic_energy_MeV)?"
     )
 
 

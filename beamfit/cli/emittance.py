@@ -146,6 +146,8 @@ def _answer_slices(
     for fit in fits:
         for p in fit.planes:
             terminal.answer(f"slice {fit.scan.slices[0]}, {p.headline}", p.status, p.message)
+    for note in fits.notes:
+        terminal.line(note)
     terminal.line()
     for table in fits.tables():
         terminal.table(table)
@@ -198,6 +200,8 @@ def _show(
     terminal.line(title, style="bold")
     for p in fit.planes:
         terminal.answer(p.headline, p.status, p.message)
+    for note in fit.notes:  # what is odd about the file belongs to the answer
+        terminal.line(note)
     terminal.line()
     terminal.table(labelled("", names, result_rows(fit.planes)), statuses)
     terminal.line()
@@ -227,11 +231,9 @@ def _show(
 def _about_the_input(
     terminal: Terminal, fit: EmittanceFit | SliceFits, methods: tuple[SizeMethods, ...]
 ) -> None:
-    """Say what other sizes give, where the errors are from, and what is odd about the file."""
+    """Say what other sizes give, and where the errors are from."""
     for way in methods:
         terminal.table(way.table())
         terminal.line()
     errors = fit.scan.error_source if fit.scan.error else "inferred from the residuals"
     terminal.line(f"Errors of the sizes: {errors}.", style="dim")
-    for note in fit.notes:
-        terminal.line(note)

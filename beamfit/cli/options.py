@@ -37,11 +37,8 @@ def _report(path: str) -> str:
     return path
 
 
-LATTICE = {
-    "metavar": "FILE",
-    "help": "Lattice: TOML, MAD-X (.madx, .seq), MAD-8 (.mad8) or elegant (.lte). The emittance of "
-    "rows that have their own r11_x, r12_x, ... needs none.",
-}
+LATTICE = "Lattice: TOML, MAD-X (.madx, .seq), MAD-8 (.mad8) or elegant (.lte)."
+OWN_ROWS = " Rows that have their own r11_x, r12_x, ... need none."
 SHARED: dict[str, Callable[..., Any]] = {
     "scan": click.argument("scan"),
     "ignore": click.option(
@@ -55,8 +52,8 @@ SHARED: dict[str, Callable[..., Any]] = {
         is_flag=True,
         help="Leave out rows of the scan with something wrong in them; they are counted and named.",
     ),
-    "lattice": click.option("--lattice", required=True, **LATTICE),
-    "maybe-lattice": click.option("--lattice", **LATTICE),
+    "lattice": click.option("--lattice", required=True, metavar="FILE", help=LATTICE),
+    "maybe-lattice": click.option("--lattice", metavar="FILE", help=LATTICE + OWN_ROWS),
     "size-method": click.option(
         "--size-method",
         metavar="NAME",

@@ -367,7 +367,7 @@ def _interval(p: PlaneFit) -> str:
     factor, unit = display_unit(abs(high), q.unit)
     if q.error is None:
         return f"below {high / factor:.3g} {unit}"
-    places = max(2 - math.floor(math.log10((high - low) / factor)), 0)
+    places = max(1 - math.floor(math.log10(0.5 * (high - low) / factor)), 0)
     return f"{low / factor:.{places}f} to {high / factor:.{places}f} {unit}"
 
 
