@@ -92,6 +92,8 @@ def emittance(
     SCAN is a CSV or HDF5 file with columns such as Q2_A (or Q2_kG, Q2_T_per_m, Q2_k1), size_x_um
     (or sigma_x_mm, fwhm_x_um, ...), size_x_error_um, size_y_um, and optionally energy_MeV,
     screen, shot, slice; or a .mat file of SLAC's emittance_gui.
+
+    Rows that have their own r11_x, r12_x, ... need no lattice, and so do files of emittance_gui.
     """
     sampling = Sampling(sample, store, told["seed"])
     sampling.check()

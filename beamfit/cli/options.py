@@ -38,7 +38,6 @@ def _report(path: str) -> str:
 
 
 LATTICE = "Lattice: TOML, MAD-X (.madx, .seq), MAD-8 (.mad8) or elegant (.lte)."
-OWN_ROWS = " Rows that have their own r11_x, r12_x, ... need none."
 SHARED: dict[str, Callable[..., Any]] = {
     "scan": click.argument("scan"),
     "ignore": click.option(
@@ -53,7 +52,7 @@ SHARED: dict[str, Callable[..., Any]] = {
         help="Leave out rows of the scan with something wrong in them; they are counted and named.",
     ),
     "lattice": click.option("--lattice", required=True, metavar="FILE", help=LATTICE),
-    "maybe-lattice": click.option("--lattice", metavar="FILE", help=LATTICE + OWN_ROWS),
+    "maybe-lattice": click.option("--lattice", metavar="FILE", help=LATTICE),
     "size-method": click.option(
         "--size-method",
         metavar="NAME",
