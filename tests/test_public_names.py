@@ -26,6 +26,17 @@ def test_importing_the_package_loads_neither_jax_nor_matplotlib():
     assert done.stdout.strip() == "set()"
 
 
+def test_the_command_line_and_a_reader_need_numpy_alone():
+    """Help and bad files are answered before anything heavy is loaded."""
+    check = (
+        "import beamfit, beamfit.cli, sys;"
+        "scan = beamfit.read_quad_scan('measurements/gtf_simulated.csv');"
+        "print({'jax', 'matplotlib', 'scipy', 'pandas'} & set(sys.modules))"
+    )
+    done = subprocess.run([sys.executable, "-c", check], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "set()"
+
+
 def test_an_unknown_name_says_so():
     with pytest.raises(AttributeError, match="no attribute 'emitance'"):
         _ = beamfit.emitance

@@ -14,8 +14,6 @@ from beamfit.errors import InputError
 from beamfit.io.emittance_gui import is_emittance_gui, read_emittance_gui
 from beamfit.io.scan_columns import ENERGIES, SETTINGS, column_notes, scan_columns
 from beamfit.io.table import UNITS, Column, Sheet, left_out, read_sheet
-from beamfit.statistics import POOR_FIT
-from beamfit.studies.scan.noise import outstanding
 from beamfit.studies.scan.scans import POSSIBLE, USUAL, QuadScan, first_unusable, row_keys
 
 if TYPE_CHECKING:
@@ -316,6 +314,9 @@ def _scatter(size: np.ndarray, group: np.ndarray) -> tuple[np.ndarray, np.ndarra
 
 def _alike(size: np.ndarray, group: np.ndarray) -> bool:
     """Whether repeats scatter as if by one relative noise: the largest against all others by F."""
+    from beamfit.statistics import POOR_FIT  # scipy, which most scans are read without
+    from beamfit.studies.scan.noise import outstanding
+
     mean, degrees, square = _scatter(size, group)
     return bool(outstanding(square / mean**2, degrees).min() > POOR_FIT)
 

@@ -26,7 +26,6 @@ from beamfit.io.table import HDF5, read_sheet
 from beamfit.io.toml import read_toml
 from beamfit.quantity import display_unit
 from beamfit.studies.decay.record import DecayRecord, LifetimeTable
-from beamfit.studies.decay.segments import split_record
 from beamfit.studies.scan.scans import QuadScan
 from beamfit.table import Table
 
@@ -337,6 +336,8 @@ def _of_record(record: DecayRecord | LifetimeTable) -> list[Fact]:
         for name, values in conditions.items()
         if values is not None
     ]
+    from beamfit.studies.decay.segments import split_record  # scipy, for records alone
+
     split = split_record(record)
     kinds = Counter(event.kind for event in split.events)
     cut = ", ".join(f"{n} × {kind}" for kind, n in kinds.items()) or "nothing cut away"
