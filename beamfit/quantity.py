@@ -55,6 +55,19 @@ class Quantity:
             reach = NORMAL_REACH * self.error
             object.__setattr__(self, "interval_95", (self.value - reach, self.value + reach))
 
+    @classmethod
+    def reaching(
+        cls, value: float, error: float, unit: str, raw: float | None, reach: float
+    ) -> Quantity:
+        """A quantity whose 95 % interval reaches so far to either side of the value.
+
+        Examples
+        --------
+        >>> Quantity.reaching(10.0, 1.0, "m", None, 4.0).interval_95
+        (6.0, 14.0)
+        """
+        return cls(value, error, unit, raw, (value - reach, value + reach))
+
     @property
     def relative(self) -> float | None:
         """Error over value, or None."""

@@ -6,13 +6,16 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from scipy.special import chdtrc, fdtrc, ndtr, stdtr
+from scipy.special import chdtrc, fdtrc, ndtr, stdtr, stdtrit
+
+from beamfit.quantity import NORMAL_REACH
 
 __all__ = [
     "POOR_FIT",
     "Directions",
     "chi2_probability",
     "one_sided_probability",
+    "reach_of",
     "scaled_directions",
 ]
 
@@ -141,3 +144,14 @@ def one_sided_probability(deviations: float, dof: float) -> float:
     if math.isinf(dof):
         return float(ndtr(-deviations))
     return float(stdtr(dof, -deviations)) if dof > 0 else 1.0
+
+
+def reach_of(dof: float) -> float:
+    """Errors that 95 % of answers lie within, by Student's distribution.
+
+    Examples
+    --------
+    >>> round(reach_of(2), 2), round(reach_of(math.inf), 2)
+    (4.3, 1.96)
+    """
+    return float(stdtrit(dof, 0.975)) if 0 < dof < math.inf else NORMAL_REACH

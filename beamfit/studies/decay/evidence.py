@@ -8,12 +8,12 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from scipy.special import stdtrit
 
 from beamfit.greybox.correlated import Memory, is_correlated, memory_of
 from beamfit.lifetime.decay import HOUR
 from beamfit.quantity import Quantity
 from beamfit.shown import shown
+from beamfit.statistics import reach_of
 from beamfit.status import Status
 from beamfit.studies.decay.departures import (
     Change,
@@ -157,7 +157,7 @@ class Evidence:
         raw = math.sqrt(squares / dof) if record.error is None else 1.0
         chi2 = float(dof) if record.error is None else squares
         noise = raw * max(1.0, math.sqrt(chi2 / dof))
-        far = float(stdtrit(dof, 0.975)) if record.error is None else 1.96
+        far = reach_of(dof if record.error is None else math.inf)
         errors = _times(solution.errors, noise)
         left = max(squares - float(solution.fall), 0.0) / max(dof - 1, 1)
         exponent = float(solution.values.exponent), float(solution.errors.exponent)
@@ -206,7 +206,7 @@ class Evidence:
         if not known or not math.isfinite(error):
             return Quantity(value, None, UNITS[name])
         reach, raw = (float(getattr(part, name)) for part in (self.reach, self.raw))
-        return Quantity(value, error, UNITS[name], raw, (value - reach, value + reach))
+        return Quantity.reaching(value, error, UNITS[name], raw, reach)
 
     def lifetime(self, name: str, known: bool) -> Quantity:
         """Lifetime in hours from a loss rate; no error where the rate is not clear of zero."""

@@ -10,12 +10,11 @@ import numpy as np
 
 from beamfit.optics.beamline import Beamline
 from beamfit.quantity import Quantity
-from beamfit.statistics import scaled_directions
+from beamfit.statistics import reach_of, scaled_directions
 from beamfit.status import Status
 from beamfit.studies.scan.known import next_measurement
 from beamfit.studies.scan.model import QUANTITIES, coefficients, phase_coverage
 from beamfit.studies.scan.next_point import best_symmetric
-from beamfit.studies.scan.noise import reach_of
 from beamfit.studies.scan.results import Identifiability, PlaneFit, Points, ScreenTwiss
 from beamfit.studies.scan.statement import Seen, asked_of
 from beamfit.studies.scan.transport import own_settings, own_units
@@ -60,8 +59,7 @@ def _quantity(value: float, error: float, raw: float, unit: str, reach: float) -
     value, error = float(value), float(error)
     if not math.isfinite(error):
         return Quantity(value, None, unit)
-    interval = (value - reach * error, value + reach * error)
-    return Quantity(value, error, unit, float(raw), interval)
+    return Quantity.reaching(value, error, unit, float(raw), reach * error)
 
 
 def _limited(q: Quantity, limit: float | None) -> Quantity:
@@ -125,14 +123,13 @@ def judged_beam(seen: Seen) -> tuple[PlaneFit, ...]:
 
 def _beam_answer(seen: Seen, plane: str) -> Answer:
     w = seen.works[plane]
-    evidence, p = w.evidence, w.points
-    finding, advice = judge(evidence, BEAM_RULES), None
+    e, p = w.evidence, w.points
+    finding, advice = judge(e, BEAM_RULES), None
     determined = finding.status is not Status.unidentified
     if not determined:
         advice = next_measurement(seen, plane)
-        finding = judge(evidence._replace(advice=advice), BEAM_RULES)
+        finding = judge(e._replace(advice=advice), BEAM_RULES)
     finding = finding._replace(remedy=f"{finding.remedy} {_outlier_words(p)}".strip())
-    e = evidence
     # The three numbers of size² can be known although the emittance is not.
     linear = determined or (e.full_rank and e.positive and e.misfit <= LOST and e.dof > 0)
     shown = np.isfinite(w.error) & np.where(LINEAR, linear, determined)

@@ -6,9 +6,8 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from scipy.special import fdtrc, stdtrit
+from scipy.special import fdtrc
 
-from beamfit.quantity import NORMAL_REACH
 from beamfit.statistics import POOR_FIT, chi2_probability
 from beamfit.studies.scan.scans import QuadScan
 
@@ -21,7 +20,6 @@ __all__ = [
     "constant_noise",
     "noise_of",
     "outstanding",
-    "reach_of",
     "unlikely",
 ]
 
@@ -191,14 +189,3 @@ def unlikely(off: np.ndarray, shape: np.ndarray) -> float:
     """
     scatter = max(float(np.mean((off / shape) ** 2)), 1e-300)
     return 0.5 * len(off) * math.log(scatter) + float(np.log(shape).sum())
-
-
-def reach_of(dof: float) -> float:
-    """Errors that 95 % of answers lie within, by Student's distribution.
-
-    Examples
-    --------
-    >>> round(reach_of(2), 2), round(reach_of(math.inf), 2)
-    (4.3, 1.96)
-    """
-    return float(stdtrit(dof, 0.975)) if 0 < dof < math.inf else NORMAL_REACH

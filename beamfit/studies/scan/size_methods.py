@@ -8,11 +8,11 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.special import stdtrit
 
 from beamfit.optics.beamline import Beamline
 from beamfit.optics.particle import beta_gamma
 from beamfit.quantity import Quantity
+from beamfit.statistics import reach_of
 from beamfit.status import Status
 from beamfit.studies.scan.fit import EmittanceFit, fit_emittance
 from beamfit.studies.scan.model import emittance_parts
@@ -189,5 +189,5 @@ def _covering(rows: list[MethodRow]) -> Quantity:
     errors = [q.error for q in found if q.error is not None]
     statistical = math.sqrt(float(np.mean(np.square(errors)))) if errors else 0.0
     error, middle = math.hypot(spread, statistical), float(values.mean())
-    reach = float(stdtrit(len(values) - 1, 0.975)) * error
-    return Quantity(middle, error, "m", statistical, (middle - reach, middle + reach))
+    reach = reach_of(len(values) - 1) * error
+    return Quantity.reaching(middle, error, "m", statistical, reach)

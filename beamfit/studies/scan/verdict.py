@@ -8,10 +8,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from beamfit.statistics import POOR_FIT, one_sided_probability
+from beamfit.statistics import POOR_FIT, one_sided_probability, reach_of
 from beamfit.status import Status
 from beamfit.studies.scan.influence import Influence
-from beamfit.studies.scan.noise import reach_of
 from beamfit.verdict import Finding, judge
 
 __all__ = [
