@@ -5,6 +5,7 @@ import json
 import numpy as np
 import pytest
 from scipy.optimize import curve_fit
+from scipy.special import stdtrit
 
 from beamfit.studies.decay.lifetimes import fit_lifetimes
 from beamfit.studies.decay.record import LifetimeTable
@@ -55,6 +56,16 @@ def test_errors_cover():
         off = [abs(getattr(f, name).value - true) / getattr(f, name).error for f in fits]
         assert 0.5 < np.mean(np.array(off) < 1) < 0.85
         assert np.mean(np.array(off) < 1.96) > 0.88
+
+
+def test_intervals_are_students_where_the_scatter_tells_the_noise():
+    """Six points without errors: four degrees of freedom, and t reaches 2.78 errors."""
+    current = np.linspace(100, 500, 6)
+    for stated, reach in ((False, stdtrit(4, 0.975)), (True, 1.96)):
+        fit = fit_lifetimes(table(stated=stated, current=current))
+        assert fit.dof == 4
+        for q in (fit.a, fit.b, fit.lifetime_start, fit.lifetime_mean, fit.lifetime_end, fit.share):
+            assert q.interval_95[1] - q.value == pytest.approx(reach * q.error, rel=1e-9)
 
 
 def test_an_outlier_is_left_out_and_named():

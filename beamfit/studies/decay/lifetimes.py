@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -17,6 +18,7 @@ from beamfit.greybox.solve import solve
 from beamfit.lifetime.decay import HOUR
 from beamfit.quantity import Quantity, Status
 from beamfit.shown import shown
+from beamfit.statistics import reach_of
 from beamfit.studies.decay.departures import CURRENTS, ConstantA, LifetimeLaw, constant_a
 from beamfit.studies.decay.evidence import UNITS
 from beamfit.studies.decay.fit import bare
@@ -226,31 +228,41 @@ def fit_lifetimes(table: LifetimeTable) -> LifetimeFit:
     )  # fmt: skip
     finding = finding_of_table(evidence)
     known = finding.status is not Status.unidentified
-    start, at_mean, end = map(partial(_lifetime, usual), quoted.value[4:], quoted.error[4:])
+    far = reach_of(evidence.dof if table.error is None else math.inf)
+    lifetime = partial(_lifetime, usual, far)
+    start, at_mean, end = map(lifetime, quoted.value[4:], quoted.error[4:])
     a, b = (
-        Quantity(value, error if known else None, UNITS[name], raw if known else None)
+        Quantity.reaching(value, error, UNITS[name], raw, far * error)
+        if known
+        else Quantity(value, None, UNITS[name])
         for (name, (value, error)), raw in zip(numbers.items(), raws, strict=False)
     )
+    value, error = numbers["share"]
+    share = Quantity.reaching(value, error, "1", None, far * error)
     return LifetimeFit(
         table.name, finding.status, finding.message, a, b, start, at_mean, end, mean,
         evidence.chi2 if table.error is not None else float(evidence.dof), evidence.dof, test,
-        evidence.lifetimes, Quantity(*numbers["share"], "1"),
+        evidence.lifetimes, share,
         tuple(map(int, np.flatnonzero(left_out))), table,
     )  # fmt: skip
 
 
-def _lifetime(usual: float, rate: float, error: float) -> Quantity:
-    lifetime = usual / HOUR / rate
-    return Quantity(float(lifetime), float(lifetime * error / rate), "h")
+def _lifetime(usual: float, far: float, rate: float, error: float) -> Quantity:
+    lifetime = float(usual / HOUR / rate)
+    spread = float(lifetime * error / rate)
+    return Quantity.reaching(lifetime, spread, "h", None, far * spread)
 
 
 def _by_current(table: LifetimeTable, power: Fit, usual: float) -> LifetimeLaw:
     current = np.geomspace(table.current.min(), table.current.max(), CURRENTS)
     found = power.derive(_quoted, current / table.current.mean())
     pairs = zip(found.value[4:], found.error[4:], strict=True)
-    exponent = Quantity(float(found.value[3]), float(found.error[3]), "1")
+    group = power.group(RECORD)
+    far = reach_of(group.dof if table.error is None else math.inf)
+    value, error = float(found.value[3]), float(found.error[3])
+    exponent = Quantity.reaching(value, error, "1", None, far * error)
     return LifetimeLaw(
-        tuple(map(float, current)), tuple(_lifetime(usual, *pair) for pair in pairs), exponent
+        tuple(map(float, current)), tuple(_lifetime(usual, far, *pair) for pair in pairs), exponent
     )
 
 
