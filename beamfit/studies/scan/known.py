@@ -103,7 +103,8 @@ def see(
     planes = tuple(dict.fromkeys((*asked, *scan.planes)))
     noises = {plane: noise_of(scan, plane) for plane in planes}
     seen = Seen(scan, line, scanned, asked, method, robust, weights, rows, noises, None, {})
-    if robust or not at_once:
+    # Noise that is inferred is fitted in two ways, by the same program.
+    if robust or not at_once or not all(noise.known for noise in noises.values()):
         look = jax.tree.map(np.asarray, look_through(rows))
         return _of_its_kind(seen._replace(look=look, works=works_of(seen, look, planes)))
     sizes = _sizes(seen, {plane: noises[plane].error for plane in planes})
