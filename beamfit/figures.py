@@ -11,16 +11,15 @@ A figure belongs to no window: save it by ``figure.savefig``, or show it in a no
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from beamfit.errors import InputError
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from beamfit.report.document import Picture
     from beamfit.sampling.posterior import Posterior
     from beamfit.studies.decay.fit import DecayFit
     from beamfit.studies.decay.study import RecordStudy
@@ -43,19 +42,16 @@ def scan(fit: EmittanceFit, plane: str | None = None) -> Figure:
     -------
     matplotlib.figure.Figure
     """
-    from beamfit.report.document import Picture
     from beamfit.report.scan_pictures import draw_scan
 
-    return _drawn(Picture("scan", 4.6, partial(draw_scan, fit=fit, plane=_plane(fit, plane))))
+    return _drawn(draw_scan, 4.6, fit=fit, plane=_plane(fit, plane))
 
 
 def residuals(fit: EmittanceFit, plane: str | None = None) -> Figure:
     """Draw the residuals of one plane in standard errors; arguments as of `scan`."""
-    from beamfit.report.document import Picture
     from beamfit.report.scan_pictures import draw_residuals
 
-    draw = partial(draw_residuals, fit=fit, plane=_plane(fit, plane))
-    return _drawn(Picture("residuals", 2.6, draw))
+    return _drawn(draw_residuals, 2.6, fit=fit, plane=_plane(fit, plane))
 
 
 def phase_space(fit: EmittanceFit) -> Figure:
@@ -76,13 +72,12 @@ def phase_space(fit: EmittanceFit) -> Figure:
     InputError
         If the data determine β and α of no plane.
     """
-    from beamfit.report.document import Picture
     from beamfit.report.scan_pictures import draw_ellipses, has_ellipses
 
     if not any(has_ellipses(p) for p in fit.planes):
         expected = "a plane whose beta and alpha the data determine"
         raise InputError("a fit without phase ellipses", expected, path=fit.scan.path)
-    return _drawn(Picture("phase ellipses", 3.4, partial(draw_ellipses, fit=fit)))
+    return _drawn(draw_ellipses, 3.4, fit=fit)
 
 
 def decay(result: DecayFit | RecordStudy) -> Figure:
@@ -98,17 +93,15 @@ def decay(result: DecayFit | RecordStudy) -> Figure:
     matplotlib.figure.Figure
     """
     from beamfit.report.decays import draw_record, study_of
-    from beamfit.report.document import Picture
 
-    return _drawn(Picture("record", 4.4, partial(draw_record, study=study_of(result))))
+    return _drawn(draw_record, 4.4, study=study_of(result))
 
 
 def lifetime(result: DecayFit | RecordStudy) -> Figure:
     """Draw the momentary lifetime along a record beside that of the fit; argument as of `decay`."""
     from beamfit.report.decays import draw_lifetime, study_of
-    from beamfit.report.document import Picture
 
-    return _drawn(Picture("lifetime", 3.0, partial(draw_lifetime, study=study_of(result))))
+    return _drawn(draw_lifetime, 3.0, study=study_of(result))
 
 
 def pairs(posterior: Posterior, names: Sequence[str] | None = None) -> Figure:
@@ -130,14 +123,12 @@ def pairs(posterior: Posterior, names: Sequence[str] | None = None) -> Figure:
     InputError
         If nothing was sampled, or a name is unknown.
     """
-    from beamfit.report.document import Picture
     from beamfit.report.posterior import MOST_NUMBERS, draw_pairs
 
     names = tuple(names or posterior.shown[:MOST_NUMBERS])
     if not posterior.chain.size:
         raise InputError("a posterior without draws", posterior.message)
-    draw = partial(draw_pairs, posterior=posterior, names=names)
-    return _drawn(Picture("pairs", 1.0 + 1.15 * len(names), draw))
+    return _drawn(draw_pairs, 1.0 + 1.15 * len(names), posterior=posterior, names=names)
 
 
 def _plane(fit: EmittanceFit, plane: str | None) -> str:
@@ -148,10 +139,11 @@ def _plane(fit: EmittanceFit, plane: str | None) -> str:
     return plane or fitted[0]
 
 
-def _drawn(picture: Picture) -> Figure:
+def _drawn(draw: Callable[..., None], height: float, **bound: Any) -> Figure:
+    """Draw what the report draws, in its style, so many inches high."""
     from matplotlib import rc_context
 
-    from beamfit.report.document import STYLE, figure_of
+    from beamfit.report.document import STYLE, Picture, figure_of
 
     with rc_context(STYLE):
-        return figure_of(picture)
+        return figure_of(Picture("", height, partial(draw, **bound)))

@@ -8,11 +8,12 @@ from collections.abc import Mapping
 
 from beamfit.errors import nearest
 from beamfit.io.table import UNITS, Column, Sheet, columns_of
+from beamfit.particles import ENERGY_KEYS
 
 __all__ = ["ENERGIES", "SETTINGS", "column_notes", "scan_columns"]
 
-# How the energy of a row may be given, and what that is.
-ENERGIES = {"energy": "total", "kinetic_energy": "kinetic", "momentum": "momentum"}
+# How the energy of a row may be given, without its unit, and what that is.
+ENERGIES = {key.removesuffix("_MeV"): kind for key, kind in ENERGY_KEYS.items()}
 QUANTITIES = {
     **dict.fromkeys(("size_x", "size_x_error", "size_y", "size_y_error"), "length"),
     "resolution": "length",
@@ -121,7 +122,7 @@ def _other(header: str, sheet: Sheet) -> Column:
     if name and not re.match(r"(size|sigma|rms|fwhm)_[xy](_|$)", name):
         return Column(header, f"setting {name}", unit)
     usual = [f"{q}_um" for q in QUANTITIES if q.startswith("size")]
-    usual += ["resolution_um", "energy_MeV", "kinetic_energy_MeV", "momentum_MeV", "energy_spread"]
+    usual += ["resolution_um", *ENERGY_KEYS, "energy_spread"]
     usual += ["shot", "shots", "screen", "slice"]
     before, _, last = header.rpartition("_")
     raise sheet.header_error(

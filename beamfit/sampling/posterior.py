@@ -263,7 +263,7 @@ class Posterior:
         if not values.size:
             return Quantity(float("nan"), None, self.unit(name))
         error = None if name in self.held or self.apart else float(np.std(values))
-        low, high = (float(v) for v in np.quantile(values, (0.025, 0.975)))
+        low, high = map(float, self.quantiles(name, (0.025, 0.975)))
         interval = None if error is None else (low, high)
         return Quantity(float(np.mean(values)), error, self.unit(name), interval_95=interval)
 

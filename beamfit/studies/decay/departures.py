@@ -273,7 +273,7 @@ def change_of_rate(
         return columns - basis @ (basis.T @ columns)
 
     def kinks(times: np.ndarray) -> np.ndarray:
-        return whiten(_kinks(record.time, model, float(values.b), times) / over)
+        return whiten(_kinks(record, model, float(values.b), times) / over)
 
     power, residual = beside_the_law(rows[:, 3:]).T
     times = np.linspace(0.05, 0.95, TIMES) * record.span
@@ -303,14 +303,13 @@ def _falls(columns: np.ndarray, residual: np.ndarray) -> np.ndarray:
     return (columns.T @ residual) ** 2 / np.where(squares > 0, squares, np.inf)
 
 
-def _kinks(time: np.ndarray, model: np.ndarray, b: float, times: np.ndarray) -> np.ndarray:
+def _kinks(record: DecayRecord, model: np.ndarray, b: float, times: np.ndarray) -> np.ndarray:
     """Change of the current for a loss rate that is larger by 1/s from each time on.
 
     As in `bent_current`: -I² exp(bt) ∫ exp(-bt)/I dt from there.
     """
-    inner = np.exp(-b * time) / model
-    parts = np.diff(time) * (inner[1:] + inner[:-1]) / 2
-    whole = np.concatenate([[0.0], np.cumsum(parts)])
+    time = record.time
+    whole = record.integral(np.exp(-b * time) / model)
     since = np.maximum(whole[:, None] - np.interp(times, time, whole), 0.0)
     return -((model**2 * np.exp(b * time))[:, None]) * since
 

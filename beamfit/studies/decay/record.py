@@ -296,12 +296,20 @@ class DecayRecord:
         if pressure is None or not pressure.mean() > 0:
             return None
         slope, base = np.polyfit(self.current, pressure, 1)
-        lone = self._integral(pressure - base - slope * self.current)
+        lone = self.integral(pressure - base - slope * self.current)
         if base > 0 and np.abs(lone).max() < FOLLOWS * pressure.mean() * self.span:
             return None
-        return self._integral(pressure / self._integral(pressure)[-1] * self.span)
+        return self.integral(pressure / self.integral(pressure)[-1] * self.span)
 
-    def _integral(self, values: np.ndarray) -> np.ndarray:
+    def integral(self, values: np.ndarray) -> np.ndarray:
+        """Integral over time from the first reading on, by the trapezoidal rule.
+
+        Examples
+        --------
+        >>> record = DecayRecord([0.0, 1.0, 3.0], [3.0, 2.0, 1.0])
+        >>> record.integral(np.array([1.0, 3.0, 3.0])).tolist()
+        [0.0, 2.0, 8.0]
+        """
         parts = np.diff(self.time) * (values[1:] + values[:-1]) / 2
         return np.concatenate([[0.0], np.cumsum(parts)])
 

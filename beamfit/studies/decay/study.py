@@ -7,7 +7,6 @@ from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.integrate import trapezoid
 
 from beamfit.errors import InputError
 from beamfit.lifetime.decay import HOUR
@@ -156,8 +155,8 @@ def operation_during(record: DecayRecord, machine: Machine) -> Operation:
         read = said.pop("pressure")
         if record.gauge is not None:
             # The fit has the gauge's own course: b is the gas at its mean, and a is without gas.
-            whole = trapezoid(record.conditions.pressure, record.time)
-            return usual._replace(**said, pressure_base=whole / record.span, pressure_slope=0.0)
+            mean = record.integral(record.conditions.pressure)[-1] / record.span
+            return usual._replace(**said, pressure_base=mean, pressure_slope=0.0)
         mean = usual.pressure_base + usual.pressure_slope * float(record.current.mean())
         if not mean > 0:
             usual, mean = usual._replace(pressure_base=1.0, pressure_slope=0.0), 1.0

@@ -83,8 +83,7 @@ def systematics(fit: DecayFit) -> tuple[Systematic, ...]:
     level = record.current + about.residuals * over
     share = record.time / record.span
     source = (share - 0.5) * np.exp(-fit.b.value * record.time) / level
-    parts = np.diff(record.time) * (source[1:] + source[:-1]) / 2
-    grown = level**2 * np.exp(fit.b.value * record.time) * np.append(0.0, np.cumsum(parts))
+    grown = level**2 * np.exp(fit.b.value * record.time) * record.integral(source)
     causes = {
         f"pressure rises by {100 * PRESSURE:g} % over the record": -fit.b.value * PRESSURE * grown,
         f"monitor drifts by {1e3 * DRIFT:g} µA over the record": DRIFT * share,

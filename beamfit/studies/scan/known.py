@@ -53,7 +53,7 @@ from beamfit.studies.scan.transport import (
     scanned_line,
     transfer_rows,
 )
-from beamfit.studies.scan.verdict import LOST, Evidence, waist_bracketed
+from beamfit.studies.scan.verdict import LOST, Evidence, one_magnet, waist_bracketed
 
 __all__ = ["METHODS", "SCENARIO", "WEIGHTS", "next_measurement", "pulls", "see", "works_of"]
 
@@ -260,7 +260,7 @@ def _evidence(
     weight = np.ones(len(p.size)) if doubt is None else 1.0 - doubt
     relative = (p.model - p.size) / p.size
     alone = doubt is None and dof > 1 and bool(fit.positive)
-    one = _one_magnet(p)
+    one = one_magnet(p.settings, p.screen)
     return Evidence(
         full_rank=bool(fit.full_rank),
         positive=bool(fit.positive),
@@ -283,12 +283,6 @@ def _evidence(
         constant=None if one is None or dof == 0 else _constant(p, noise),
         scanned=any(np.ptp(v) > 0 for v in p.settings.values()) or len(set(p.screen)) < 3,
     )
-
-
-def _one_magnet(p: Points) -> np.ndarray | None:
-    """The settings of the one magnet that was scanned before one screen."""
-    varied = [v for v in p.settings.values() if np.ptp(v) > 0]
-    return varied[0] if len(varied) == 1 and len(set(p.screen)) == 1 else None
 
 
 def _constant(p: Points, noise: Noise) -> float:

@@ -14,7 +14,7 @@ import numpy as np
 
 from beamfit.errors import InputError, nearest
 from beamfit.frames import frame_of
-from beamfit.particles import total_energy
+from beamfit.particles import ENERGY_KEYS, total_energy
 from beamfit.shown import shown
 from beamfit.table import Table
 
@@ -254,7 +254,7 @@ class QuadScan:
         InputError
             If pandas is not installed.
         """
-        named = {"total": "energy_MeV", "kinetic": "kinetic_energy_MeV", "momentum": "momentum_MeV"}
+        named = {kind: key for key, kind in ENERGY_KEYS.items()}
         columns = {f"{name}_{self.units[name]}": v for name, v in self.settings.items()}
         columns |= {f"size_{p}_m": v for p, v in self.size.items()}
         columns |= {f"size_{p}_error_m": v for p, v in self.error.items()}

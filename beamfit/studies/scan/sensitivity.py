@@ -29,7 +29,7 @@ from beamfit.optics.elements import (
     SectorDipole,
     ThinLens,
 )
-from beamfit.optics.sections import Series, in_series
+from beamfit.optics.sections import Series
 from beamfit.studies.scan.fit import EmittanceFit
 from beamfit.studies.scan.known import WEIGHTS
 from beamfit.studies.scan.model import emittance_parts, size_squared
@@ -147,7 +147,7 @@ def systematics(fit: EmittanceFit, plane: str) -> list[Change]:
         f"{n} {_word(fit.seen.scanned, n)} +1 %" + _held(fit, n): 0.01 * float(d)
         for n, d in zip(magnets, by_magnet, strict=True)
     }
-    changes |= _of_parts(fit, result.screen.name, held, by_parts)
+    changes |= _of_parts(fit, result.screen.name, held, stored.line, by_parts)
     changes["energy +1 %"] = 0.01 * float(by_energy)
     changes |= _of_screen(fit, p, np.asarray(by_known)[keep])
     # ln βγ rises by E²/(E² - m²) for each relative step of the energy.
@@ -162,16 +162,17 @@ def _held(fit: EmittanceFit, magnet: str) -> str:
 
 
 def _of_parts(
-    fit: EmittanceFit, screen: str, held: Iterable[str], by_parts: list[Array]
+    fit: EmittanceFit, screen: str, held: Iterable[str], stored: Beamline, by_parts: list[Array]
 ) -> dict[str, float]:
     """Changes by the elements that no row sets, those up to the last screen."""
     held, found = frozenset(m for name in held for m in fit.seen.scanned.members(name)), {}
     upstream = {e.name for e in fit.seen.scanned.upto(screen).elements}
-    left = iter(by_parts)
+    left, runs = iter(by_parts), (e for e in stored.elements if isinstance(e, Series))
     for kept, run in groupby(fit.seen.scanned.elements, lambda e: e.name in held):
-        series = None if kept else in_series(elements := _material(run))
-        if series is None or not series.kinds:
+        elements = [] if kept else [e for e in run if not isinstance(e, Marker | Screen)]
+        if not elements:
             continue
+        series = next(runs)
         # An element stands at `order` among those of all kinds, counted kind after kind.
         by_kind = np.empty(len(elements), object)
         by_kind[np.asarray(series.order)] = elements
@@ -181,10 +182,6 @@ def _of_parts(
             if cause and element.name in upstream:
                 found[cause] = found.get(cause, 0.0) + step * float(slope)
     return found
-
-
-def _material(run: Iterable[Element]) -> list[Element]:
-    return [e for e in run if not isinstance(e, Marker | Screen)]
 
 
 def _cause(fit: EmittanceFit, element: Element) -> tuple[str, float]:
