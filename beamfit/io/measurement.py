@@ -291,7 +291,8 @@ def average_shots(scan: QuadScan, *, marked: bool) -> QuadScan:
         screen=scan.screen and tuple(scan.screen[i] for i in first),
         slice=scan.slice and tuple(scan.slice[i] for i in first),
         transfer=scan.transfer and {p: r[first] for p, r in scan.transfer.items()},
-        shots=np.bincount(group),
+        # Errors that the file gives are not taken from these shots.
+        shots=None if given else np.bincount(group),
         error_source=said if scatter or given else "none given",
     )
 

@@ -167,6 +167,17 @@ def test_rows_with_errors_of_their_own_are_averaged_only_if_marked_as_shots(read
     assert len(read(marked.replace("\n2,", "\n2,1,"))) == 3
 
 
+def test_errors_of_the_file_are_no_scatter_of_two_shots(read):
+    """One setting of five was met twice: its errors are averaged, and worth what was stated."""
+    rows = ["0,1,200,4", "1,1,150,3", "1,2,152,3", "2,1,100,2", "3,1,140,3", "4,1,190,4"]
+    scan = read("\n".join(["Q_A,shot,size_x_um,size_x_error_um", *rows]))
+    noise = noise_of(scan, "x")
+    assert noise.dof == np.inf
+    assert noise.words == "given"
+    stated = 1e-6 * np.array([4, 3 / np.sqrt(2), 2, 3, 4])
+    np.testing.assert_allclose(noise.error, stated, rtol=1e-12)
+
+
 def test_shots_of_another_screen_or_energy_are_not_averaged(read):
     rows = ["0,A,100,90", "0,B,100,80", "0,B,100,82", "0,B,120,70", "0,B,120,70"]
     scan = read("\n".join(["Q_A,screen,energy_MeV,size_x_um", *rows]))
