@@ -15,6 +15,7 @@ import numpy as np
 from beamfit.errors import InputError, nearest
 from beamfit.io.lattice import LatticeFile
 from beamfit.io.matlab import read_variable
+from beamfit.io.shots import scatter_of
 from beamfit.quantity import Quantity
 from beamfit.studies.scan.scans import Profile, QuadScan
 
@@ -166,8 +167,7 @@ def _read(source: _Fields, sha256: str) -> EmittanceGuiFile:
     shared = _shared(source, np.flatnonzero(used), n, several) | {"sha256": sha256}
     scans = {}
     for k, name in enumerate(names):
-        sizes, shots = _sizes(beams[used, :, k])
-        error = _standard_errors(beams[used, :, k])
+        sizes, error, shots = _sizes(beams[used, :, k])
         scans[name] = QuadScan(
             **shared,
             size=sizes,
@@ -260,35 +260,27 @@ def _stats(beams: np.ndarray, plane: str) -> np.ndarray:
     return found
 
 
-def _sizes(beams: np.ndarray) -> tuple[dict[str, np.ndarray], np.ndarray]:
-    """Mean sizes of the planes in m, and how many shots they rest on."""
-    sizes, shots = {}, np.zeros(len(beams), int)
+def _sizes(
+    beams: np.ndarray,
+) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray], np.ndarray]:
+    """Mean sizes of the planes, their standard errors, both in m, and how many shots they rest on.
+
+    The error is s/√n of the shots, s with n - 1; a plane has none where a setting has no scatter.
+    """
+    sizes, errors, shots = {}, {}, np.zeros(len(beams), int)
     for plane in SIZE:
         each = _stats(beams, plane)
-        good = np.isfinite(each)
-        if good.any():
-            number = good.sum(axis=1)
-            total = np.where(good, each, 0.0).sum(axis=1)
-            sizes[plane] = np.where(number > 0, total / np.maximum(number, 1), np.nan)
-            shots = np.maximum(shots, number)
-    return sizes, shots
-
-
-def _standard_errors(beams: np.ndarray) -> dict[str, np.ndarray]:
-    """s/√n of the shots in m, s with n - 1; none where a setting has no scatter to tell it."""
-    found = {}
-    for plane in SIZE:
-        each = _stats(beams, plane)
-        good = np.isfinite(each)
-        number = good.sum(axis=1)
-        measured = number > 0
-        if measured.any() and number[measured].min() > 1:
-            mean = np.where(good, each, 0.0).sum(axis=1) / np.maximum(number, 1)
-            square = np.where(good, (each - mean[:, None]) ** 2, 0.0).sum(axis=1)
-            error = np.sqrt(square / np.maximum(number - 1, 1) / np.maximum(number, 1))
-            if (error[measured] > 0.0).all():
-                found[plane] = np.where(measured, error, np.nan)
-    return found
+        group = np.repeat(np.arange(len(beams)), each.shape[1])
+        mean, degrees, square = scatter_of(each.ravel(), group)
+        measured = ~np.isnan(mean)
+        if not measured.any():
+            continue
+        sizes[plane] = mean
+        shots = np.maximum(shots, np.where(measured, degrees + 1, 0).astype(int))
+        error = np.sqrt(square / np.maximum(degrees, 1) / (degrees + 1))
+        if (error[measured] > 0.0).all():
+            errors[plane] = np.where(measured, error, np.nan)
+    return sizes, errors, shots
 
 
 def _profiles(beam: np.ndarray | None, used: np.ndarray, k: int) -> tuple[Profile, ...]:

@@ -1,4 +1,4 @@
-"""Quadrupole scans: what the columns of a file mean, and shots that become points."""
+"""Quadrupole scans: what the columns of a file mean, and the numbers in them."""
 
 from __future__ import annotations
 
@@ -13,13 +13,14 @@ import numpy as np
 from beamfit.errors import InputError
 from beamfit.io.emittance_gui import is_emittance_gui, read_emittance_gui
 from beamfit.io.scan_columns import ENERGIES, SETTINGS, column_notes, scan_columns
+from beamfit.io.shots import average_shots
 from beamfit.io.table import UNITS, Column, Sheet, left_out, read_sheet
-from beamfit.studies.scan.scans import POSSIBLE, USUAL, QuadScan, first_unusable, row_keys
+from beamfit.studies.scan.scans import POSSIBLE, USUAL, QuadScan, first_unusable
 
 if TYPE_CHECKING:
     from pandas import DataFrame
 
-__all__ = ["average_shots", "read_quad_scan"]
+__all__ = ["read_quad_scan"]
 
 # More rows than any scan: such a file is a log, and is refused before it fills the memory.
 MOST_ROWS = 100_000
@@ -36,8 +37,6 @@ RANGES = {
     "energy_spread": (-1e-300, 0.2, "a relative spread between 0 and 0.2; is it in %?"),
     "shots": (0.5, 1e9, "how many shots the row is the mean of, and its errors are taken from"),
 }
-# With fewer repeats in all (two or three accidental ones) the scatter says nothing.
-ENOUGH_DEGREES = 3
 
 
 def read_quad_scan(
@@ -233,105 +232,3 @@ def _screens(sheet: Sheet, column: Column | None) -> tuple[str, ...] | None:
         expected = "the name of a screen of the lattice"
         raise sheet.error("an empty cell", expected, names.index(""), column.header)
     return names
-
-
-def average_shots(scan: QuadScan, *, marked: bool) -> QuadScan:
-    """Average the rows that repeat a setting, an energy, a screen and a slice.
-
-    Parameters
-    ----------
-    scan : QuadScan
-        One row a shot.
-    marked : bool
-        Whether the file says its rows are shots. If not, rows that carry errors of their own
-        stay as they are: each is a measurement by itself.
-
-    Returns
-    -------
-    QuadScan
-        One row a setting. The error is the standard error of the mean, s/√n with n - 1 in s, and
-        ``shots`` says of how many, so that the fit can even out what few shots say by chance.
-        With fewer than three repeats in all the errors of the file stand, or there are none and
-        the fit infers them. Rows that are not said to be shots, and differ at one setting far
-        more than at the others, stay as they are.
-
-    Examples
-    --------
-    >>> shots = QuadScan({"Q": [0, 0, 1, 1, 2, 2.0]}, {"Q": "A"},
-    ...                  {"x": [1.0e-4, 1.2e-4, 2.0e-4, 2.2e-4, 3.0e-4, 3.2e-4]})
-    >>> average_shots(shots, marked=True).size["x"].round(6).tolist()
-    [0.00011, 0.00021, 0.00031]
-    """
-    rows: dict[tuple, int] = {}
-    keys = row_keys(scan)
-    group = np.array([rows.setdefault(key, len(rows)) for key in keys])
-    if len(rows) == len(group) or (scan.error and not marked):
-        return scan if scan.error else replace(scan, error_source="none given")
-    if not marked and not all(_alike(values, group) for values in scan.size.values()):
-        return replace(scan, error_source="none given")
-    size, scatter, given = {}, {}, {}
-    for plane, values in scan.size.items():
-        size[plane], error = _shot_means(values, group)
-        if error is not None:
-            scatter[plane] = error
-        elif plane in scan.error:  # too few repeats: what the file says of its shots is kept
-            shots, mean_square = _means(scan.error[plane] ** 2, group)
-            given[plane] = np.sqrt(mean_square / shots)
-    first = np.unique(group, return_index=True)[1]
-    said = "the scatter of the shots (standard error of the mean)" if scatter else "the file"
-    return replace(
-        scan,
-        settings={n: v[first] for n, v in scan.settings.items()},
-        size=size,
-        error=scatter | given,
-        **{
-            name: None if (values := getattr(scan, name)) is None else values[first]
-            for name in ("energy", "resolution", "energy_spread")
-        },
-        screen=scan.screen and tuple(scan.screen[i] for i in first),
-        slice=scan.slice and tuple(scan.slice[i] for i in first),
-        transfer=scan.transfer and {p: r[first] for p, r in scan.transfer.items()},
-        # Errors that the file gives are not taken from these shots.
-        shots=None if given else np.bincount(group),
-        error_source=said if scatter or given else "none given",
-    )
-
-
-def _means(values: np.ndarray, group: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """How many numbers each group has, and their mean; NaN, a shot not measured, is none."""
-    measured = ~np.isnan(values)
-    number = np.bincount(group, measured)
-    with np.errstate(invalid="ignore"):
-        return number, np.bincount(group, np.where(measured, values, 0.0)) / number
-
-
-def _scatter(size: np.ndarray, group: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Of each setting the mean of its shots, how many may still differ, and their square sum."""
-    number, mean = _means(size, group)
-    with np.errstate(invalid="ignore"):
-        square = number * _means((size - mean[group]) ** 2, group)[1]
-    return mean, np.maximum(number - 1, 0), np.nan_to_num(square)
-
-
-def _alike(size: np.ndarray, group: np.ndarray) -> bool:
-    """Whether repeats scatter as if by one relative noise: the largest against all others by F."""
-    from beamfit.statistics import POOR_FIT  # scipy, which most scans are read without
-    from beamfit.studies.scan.noise import outstanding
-
-    mean, degrees, square = _scatter(size, group)
-    return bool(outstanding(square / mean**2, degrees).min() > POOR_FIT)
-
-
-def _shot_means(size: np.ndarray, group: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
-    """Mean of the shots of each setting, m, and its standard error.
-
-    The error is None where too few repeat or all agree; of a setting that has one shot, or whose
-    shots agree to the last digit, it is that of all settings together.
-    """
-    mean, degrees, square = _scatter(size, group)
-    pooled = np.sqrt(np.nansum(square / mean**2) / max(degrees.sum(), 1))
-    if degrees.sum() < ENOUGH_DEGREES or pooled == 0.0:
-        return mean, None
-    own = np.sqrt(square / np.maximum(degrees, 1))
-    deviation = np.where((degrees > 0) & (own > 0), own, pooled * mean)
-    return mean, deviation / np.sqrt(np.where(np.isnan(mean), np.nan, degrees + 1))
