@@ -20,7 +20,7 @@ from beamfit.studies.scan.information import linearised_at, with_slope
 from beamfit.studies.scan.model import predict_sizes, spoken
 from beamfit.studies.scan.next_point import candidate_settings
 from beamfit.studies.scan.statement import varied_magnets
-from beamfit.studies.scan.transport import NetworkRows, Rows, damping_of
+from beamfit.studies.scan.transport import NetworkRows, Rows, rows_at
 
 __all__ = ["Candidate", "Considered", "candidate_rows", "further_options"]
 
@@ -167,18 +167,9 @@ def _line_rows(fit, line, plane, table, screen, energy) -> Rows:
         n: jnp.stack([v, jnp.ones(count)], -1) if shapes.get(n) == 2 else jnp.asarray(v)
         for n, v in table.items()
     }
-    return Rows(
-        plane,
-        (screen,),
-        False,
-        line,
-        settings,
-        jnp.asarray(energy),
-        jnp.zeros(count, int),
-        jnp.full(count, float(line.energy_spread)),
-        jnp.full(count, float(getattr(line[screen], "resolution", 0.0))),
-        damping_of(np.asarray(energy), fit.seen.energy, float(line.mass)),
-    )
+    resolution = getattr(line[screen], "resolution", 0.0)
+    known = line.energy_spread, resolution, fit.seen.energy
+    return rows_at(line, plane, screen, settings, np.asarray(energy), *known)
 
 
 def _network_rows(fit, plane, table, screen) -> NetworkRows:

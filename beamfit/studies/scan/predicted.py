@@ -14,7 +14,7 @@ from beamfit.sampling.posterior import Correlations
 from beamfit.shown import shown
 from beamfit.studies.scan.model import coefficients, emittance_parts, predict_sizes, size_squared
 from beamfit.studies.scan.results import PlaneFit
-from beamfit.studies.scan.transport import Rows, padded, seen_line
+from beamfit.studies.scan.transport import Rows, padded, rows_at, seen_line
 
 if TYPE_CHECKING:
     from beamfit.studies.scan.posterior import Scanned
@@ -97,7 +97,7 @@ def _rows(
         raise InputError(f"no screen '{place}'", nearest(place, known))
     model = {} if fit.statement.closed else fit.solved.model
     keep = dict.fromkeys((*given, *model.get("magnets", {})))
-    table = {name: given.get(name, np.full(n, float(line[name].setting))) for name in keep}
+    table = {name: padded(given.get(name, np.full(n, float(line[name].setting)))) for name in keep}
     energy = padded(np.full(n, seen.energy))
     resolution = getattr(line[place], "resolution", 0.0)
     if seen.scan.resolution is not None:
@@ -105,19 +105,9 @@ def _rows(
     spread = line.energy_spread
     if seen.scan.energy_spread is not None:
         spread = np.median(seen.scan.energy_spread)
-    one = np.ones(len(energy))
-    return Rows(
-        plane,
-        (place,),
-        False,
-        seen_line(line, tuple(keep), energy, (place,)),
-        {name: padded(values) for name, values in table.items()},
-        energy,
-        np.zeros(len(energy), int),
-        float(spread) * one,
-        float(resolution) * one,
-        one,
-    )
+    known = float(spread), float(resolution), seen.energy
+    seen_by = seen_line(line, tuple(keep), energy, (place,))
+    return rows_at(seen_by, plane, place, table, energy, *known)
 
 
 def correlations_of(p: PlaneFit) -> Correlations:
