@@ -52,6 +52,8 @@ DATE, NANOSECONDS = "a date", "ns"
 # Seconds beyond this many are counted from 1970, not from the start of a record (1973 or later);
 # beyond the other they lie after the year 5000, and are milliseconds.
 UNIX, LATEST = 1e8, 1e11
+# Of a quadrupole scan.
+SIZE = re.compile(r"(size|sigma|rms|fwhm)_[xy]\b|(size|sigma|rms|fwhm)_[xy]_", re.IGNORECASE)
 # An archive's own columns: seconds since 1970 and nanoseconds, and what it says of each value.
 SECONDS = {"secs": "s", "seconds": "s", "epochseconds": "s"}
 NANOS = {"nanos", "nanoseconds"}
@@ -193,6 +195,9 @@ def _archive_json(path: str | PathLike[str]) -> Sheet:
 
 
 def _record(sheet: Sheet, time: str | None, current: str | None, skip_bad: bool) -> DecayRecord:
+    if any(SIZE.match(name) for name in sheet.names) and time is None and current is None:
+        found, expected = "a column of beam sizes", "a record of beam current; `beamfit emittance`"
+        raise sheet.header_error(found, f"{expected} reads scans")
     columns = _columns(sheet, time, current)
     for quantity, example in (("time", "time_s"), ("current", "beam_current_mA")):
         if quantity not in columns:

@@ -25,6 +25,8 @@ SIGNATURES = {
     b"\xff\xfe": ("UTF-16 text", "UTF-8 text; save it as CSV (UTF-8)"),
     b"\xfe\xff": ("UTF-16 text", "UTF-8 text; save it as CSV (UTF-8)"),
 }
+# ° ± ² ³ µ in the code pages of Windows, and what needs none.
+MARKS, ASCII = bytes([0xB0, 0xB1, 0xB2, 0xB3, 0xB5]), bytes(range(128))
 LARGEST_TEXT = 4_000_000
 
 
@@ -58,8 +60,8 @@ def text_lines(path: str | PathLike[str], seen: Any = None) -> Iterator[str]:
     Raises
     ------
     InputError
-        If the file cannot be opened, is empty, is binary, is not UTF-8, or has a line longer
-        than any text table has.
+        If the file cannot be opened, is empty, is binary, is not UTF-8 (µ and ° of Windows and
+        comments apart), or has a line longer than any text table has.
     """
     number = 0
     with _opened(path) as stream:
@@ -74,14 +76,20 @@ def text_lines(path: str | PathLike[str], seen: Any = None) -> Iterator[str]:
             if len(raw) > LONGEST_LINE:
                 found = f"a line of more than {LONGEST_LINE} characters"
                 raise InputError(found, "a text table", path, number)
-            try:
-                line = raw.decode("utf-8-sig" if number == 1 else "utf-8")
-            except UnicodeDecodeError:
-                found = "bytes that are not text"
-                raise InputError(found, "UTF-8 text", path, number) from None
-            yield line.rstrip("\r\n")
+            yield _decoded(raw, path, number).rstrip("\r\n")
     if number == 0:
         raise InputError("an empty file", "a file with content", path=path)
+
+
+def _decoded(raw: bytes, path: str | PathLike[str], number: int) -> str:
+    try:
+        return raw.decode("utf-8-sig" if number == 1 else "utf-8")
+    except UnicodeDecodeError:
+        pass
+    # Windows writes µ, ° and the like in one byte; in a comment any letter may be so.
+    if raw.lstrip().startswith(b"#") or not raw.translate(None, MARKS + ASCII):
+        return raw.decode("cp1252", errors="replace")
+    raise InputError("bytes that are not text", "UTF-8 text", path, number)
 
 
 def _check_signature(start: bytes, path: str | PathLike[str]) -> None:

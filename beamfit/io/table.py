@@ -21,11 +21,12 @@ import numpy as np
 
 from beamfit.errors import InputError, nearest
 from beamfit.io.files import digest, text_lines
+from beamfit.io.headers import HEAD, header_at, separator_of, spelled, with_units
 
 if TYPE_CHECKING:
     from pandas import DataFrame
 
-__all__ = ["UNITS", "Column", "Sheet", "columns_of", "left_out", "read_sheet"]
+__all__ = ["UNITS", "Column", "Sheet", "columns_of", "header_of", "left_out", "read_sheet"]
 
 UNITS: dict[str, dict[str, float]] = {
     # quantity: unit at the end of a name -> factor to SI (a stored current: to mA)
@@ -232,7 +233,12 @@ def columns_of(
     """
     found: dict[str, Column] = {}
     for header in sheet.names:
-        column = _known(header, quantities, sheet) or other(header)
+        said = spelled(header)
+        try:
+            column = _known(said, quantities, sheet) or other(said)
+        except InputError as error:
+            raise replace(error, column=header) from None
+        column = column and column._replace(header=header)
         if column is None:
             usual = [f"{q}_{next(iter(UNITS[k]))}" if k else q for q, k in quantities.items()]
             raise sheet.header_error("an unknown column", nearest(header, usual), header)
@@ -246,10 +252,11 @@ def columns_of(
 
 def _known(header: str, quantities: Mapping[str, str], sheet: Sheet) -> Column | None:
     """The column of a header NAME or NAME_UNIT."""
-    if quantities.get(header) == "":
-        return Column(header, header)
+    for whole in (header, header.lower()):
+        if quantities.get(whole) == "":
+            return Column(header, whole)
     name, _, unit = header.rpartition("_")
-    if not (kind := quantities.get(name)):
+    if not (kind := quantities.get(name := name.lower())):
         return None
     units = UNITS[kind]
     if unit not in units:
@@ -309,9 +316,22 @@ def read_sheet(
         return _of_frame(path, most)
     if Path(path).suffix.lower() in HDF5:
         return _read_hdf5(path, most)
+    return _read_text(path, example, most, ragged, names)
+
+
+def _read_text(
+    path: str | PathLike[str],
+    example: str,
+    most: int | None,
+    ragged: bool,
+    names: Sequence[str] | None,
+) -> Sheet:
     header, separator = None, "" if names is None else ","
     comments, rows, lines, bad, seen = [], [], [], [], hashlib.sha256()
-    for line, text in enumerate(text_lines(path, seen), start=1):
+    source = text_lines(path, seen)
+    head = list(itertools.islice(source, HEAD))
+    title = header_at(head) if names is None else 0
+    for line, text in enumerate(itertools.chain(head, source), start=1):
         start = text.strip()[:1]
         if start == "#" or (start in TFS_LINES and (names is None or separator == " ")):
             comments.append(text.strip().lstrip("# ").rstrip())
@@ -320,15 +340,20 @@ def read_sheet(
             names = [name.upper() for name in _split(text, " ", path, line)[1:]]
         elif not text.strip().strip(",;\t ") or (names is None and SEPARATOR_LINE.match(text)):
             continue
+        elif names is None and line <= title:
+            comments.append(text.strip(",;\t "))
         elif names is None:
-            separator = next((s for s in ",;\t" if s in text), " ")
-            names, header = _without_blanks(_split(text, separator, path, line), 0), line
+            separator = separator_of(text)
+            names, header = _cells(path, text, line), line
             _check_header(names, example, path, line)
         else:
             cells = _without_blanks(_split(text, separator, path, line), len(names))
             found, expected = f"{len(cells)} cells", f"{len(names)}, as in the header"
             wrong = InputError(found, expected, path=path, line=line)
             whole = len(cells) == len(names)
+            if whole and not rows and (units := with_units(names, cells)):
+                names = units
+                continue
             (rows if whole else bad).append(cells if whole else wrong)
             lines += [line] * whole
             _check_length(len(rows) + len(bad), most, path, line)
@@ -383,6 +408,18 @@ def _without_blanks(cells: list[str], least: int) -> list[str]:
     """Drop the blank cells that separators at the end of a line make, beyond some cells."""
     more = len(list(itertools.takewhile(lambda cell: cell == "", reversed(cells))))
     return cells[: max(len(cells) - more, least)]
+
+
+def header_of(path: str | PathLike[str]) -> list[str]:
+    """The header of a file of text, as `read_sheet` finds it; none of an empty one."""
+    head = list(itertools.islice(text_lines(path), HEAD))
+    at = header_at(head)
+    return [spelled(name) for name in _cells(path, head[at], at + 1)]
+
+
+def _cells(path: str | PathLike[str], text: str, line: int = 1) -> list[str]:
+    """The cells of a line by its own separator."""
+    return _without_blanks(_split(text, separator_of(text), path, line), 0)
 
 
 def _split(text: str, separator: str, path: str | PathLike[str], line: int) -> list[str]:

@@ -7,7 +7,6 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
-from itertools import islice
 from os import PathLike
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -17,12 +16,12 @@ import numpy as np
 from beamfit.errors import InputError
 from beamfit.io.decay_record import read_lifetime_input
 from beamfit.io.emittance_gui import is_emittance_gui, read_emittance_gui
-from beamfit.io.files import digest, text_lines
+from beamfit.io.files import digest
 from beamfit.io.lattice import CALIBRATIONS, STRENGTHS, LatticeFile
 from beamfit.io.line import FOREIGN, build_line, read_lattice
 from beamfit.io.measurement import read_quad_scan
 from beamfit.io.ring import read_operation, read_ring
-from beamfit.io.table import HDF5, read_sheet
+from beamfit.io.table import HDF5, header_of, read_sheet
 from beamfit.io.toml import read_toml
 from beamfit.quantity import display_unit
 from beamfit.studies.decay.record import DecayRecord, LifetimeTable
@@ -34,8 +33,8 @@ __all__ = ["Understood", "understand", "with_lattice"]
 SAID = {"A": "A", "kG": "kG integrated gradient", "T_per_m": "T/m", "k1": "1/m² (k1)"}
 SAID |= {"k1l": "1/m (k1l)"}
 CONDITIONS = {"rf_voltage": "V", "scraper_y": "m", "pressure": "Pa", "bunches": ""}
-# Magnets of a lattice that are told one by one, and lines of a table searched for its header.
-MOST_MAGNETS, HEAD = 20, 1000
+# Magnets of a lattice that are told one by one.
+MOST_MAGNETS = 20
 
 
 class Fact(NamedTuple):
@@ -176,16 +175,16 @@ def _kind(path: str | PathLike[str]) -> str:
     if suffix == ".json":
         return "record"
     if suffix in HDF5:
-        head = ",".join(read_sheet(path, "Q2_A,size_x_um").names)
+        names = read_sheet(path, "Q2_A,size_x_um").names
     elif is_emittance_gui(path):
         return "scan"
     else:
-        lines = (text.strip() for text in islice(text_lines(path), HEAD))
-        head = next((text for text in lines if text and not text.startswith("#")), "")
+        names = header_of(path)
+    head = ",".join(names)
     if re.search(r"\bbeta_x_m\b|\bBETX\b", head):
         found = "the optics of a ring"
         raise InputError(found, "the ring file (TOML) that names it under [optics] twiss", path)
-    return "record" if "beam_current" in head else "scan"
+    return "record" if "beam_current" in head.lower() else "scan"
 
 
 def _range(values: np.ndarray, unit: str = "") -> Fact:
