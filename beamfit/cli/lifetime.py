@@ -83,8 +83,8 @@ def lifetime(
     """Fit the lifetime to decay records and say what they cannot tell.
 
     RECORD is a CSV or HDF5 file with columns such as time_s (or ISO time), beam_current_mA,
-    beam_current_error_mA, and optionally rf_voltage_kV, scraper_y_mm, pressure_Pa, bunches; or CSV
-    or JSON of the EPICS Archiver Appliance; or lifetimes by current: tau_h, beam_current_mA.
+    beam_current_error_mA, and optionally rf_voltage_kV, scraper_y_mm, pressure_Pa, bunches,
+    bunch_length_mm; or CSV or JSON of the EPICS Archiver Appliance; or lifetimes by current: tau_h, beam_current_mA.
     It is cut into decays at refills, losses and changes of setting. Each decay gives I0, a, b of
     dI/dt = -a I² - b I, the lifetime at its start, mean current and end, and a verdict.
     """

@@ -36,6 +36,7 @@ QUANTITIES = {
     "scraper_y": "length",
     "pressure": "pressure",
     "bunches": "",
+    "bunch_length": "length or duration",
 }
 # Of a table of lifetimes.
 LIFETIMES = {
@@ -125,8 +126,8 @@ def read_decay_record(
         or CSV of the EPICS Archiver Appliance. Columns: `time_s` (_min, _h, _d, _ms; from any
         origin, or Unix time), or `time` (dates as `beamfit.io.dates.unix_time` reads them);
         `beam_current_mA` (or `_A`, `_uA`); optionally `beam_current_error_mA`, `rf_voltage_kV`,
-        `scraper_y_mm`, `pressure_Pa` (_mbar, _Torr), `bunches`. Lines that begin with `#` and
-        HDF5 attributes are kept as comments.
+        `scraper_y_mm`, `pressure_Pa` (_mbar, _Torr), `bunches`, `bunch_length_mm` (_ps).
+        Lines that begin with `#` and HDF5 attributes are kept as comments.
     time : str, optional
         Header of the time, with its unit after a last colon unless it is seconds or a date.
     current : str, optional

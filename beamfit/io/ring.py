@@ -12,80 +12,93 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from beamfit.errors import InputError, nearest
-from beamfit.io.table import Sheet, read_sheet
-from beamfit.io.toml import REQUIRED, TABLE, TEXT, Key, Section, read_toml
+from beamfit.errors import InputError
+from beamfit.io.ring_tables import RANGES, read_along
+from beamfit.io.toml import NUMBERS, REQUIRED, TABLE, TEXT, Key, Section, read_toml
 
 if TYPE_CHECKING:
     import at
 
-    from beamfit.lifetime.ring import Operation, Optics, Ring
+    from beamfit.lifetime.ring import MeasuredLength, Operation, Ring
 
-__all__ = ["read_operation", "read_ring", "read_twiss", "ring_from_pyat"]
+__all__ = ["read_operation", "read_ring", "ring_from_pyat"]
 
 INFINITE = math.inf
+SHARE = "a positive number that is a share: up to 1, 0.03 for 3 %"
+FILL = "the number of equal bunches, or a list with the charge of each, in any unit"
+LENGTHS = "a number, or one for each of rising bunch currents: bunch_length_mm, bunch_current_mA"
+PRESSURE = "a positive number, or zero, below 1 Pa"
 TABLES = {
     name: Key(kind=TABLE, default=None) for name in ("ring", "acceptance", "optics", "operation")
 }
 
 
-def _positive(field: str, factor: float = 1.0, default: Any = REQUIRED) -> Key:
-    return Key(field, factor, default, low=0.0, said="a positive number")
+def _within(
+    field: str, low: float, high: float, factor: float = 1.0, default: Any = REQUIRED
+) -> Key:
+    """A number that no ring has beyond these ends, which are in the file's unit and no values."""
+    ends = f"below {high:.6g}" if low == 0 else f"between {low:.6g} and {high:.6g}"
+    return Key(field, factor, default, low, high, f"a positive number {ends}")
 
 
 RING = {
     "name": Key(kind=TEXT, default=""),
-    "energy_GeV": _positive("energy", 1e9),
-    "circumference_m": _positive("circumference"),
-    "harmonic_number": _positive("harmonic"),
-    "momentum_compaction": Key("momentum_compaction"),
-    "energy_loss_keV": _positive("energy_loss", 1e3),
-    "energy_spread": _positive("energy_spread"),
-    "emittance_x_nm": _positive("emittance_x", 1e-9),
-    "emittance_y_nm": _positive("emittance_y", 1e-9, None),
-    "coupling": _positive("coupling", 1.0, None),
-    "damping_time_y_ms": _positive("damping_time_y", 1e-3, INFINITE),
-    "damping_time_z_ms": _positive("damping_time_z", 1e-3, INFINITE),
-    "impedance_ohm": _positive("impedance", 1.0, 0.0),
+    "energy_GeV": _within("energy", 0.01, 1e4, 1e9),
+    "circumference_m": _within("circumference", 1.0, 1e6),
+    "harmonic_number": _within("harmonic", 0.99, 1e7),
+    "momentum_compaction": _within("momentum_compaction", 1e-9, 1.0),
+    "energy_loss_keV": _within("energy_loss", 1e-9, 1e8, 1e3),
+    "energy_spread": _within("energy_spread", 1e-7, 0.1),
+    "emittance_x_nm": _within("emittance_x", 1e-9, 1e6, 1e-9),
+    "emittance_y_nm": _within("emittance_y", 1e-9, 1e6, 1e-9, None),
+    "coupling": Key("coupling", 1.0, None, 1e-9, np.nextafter(1.0, 2.0), SHARE),
+    "damping_time_y_ms": _within("damping_time_y", 1e-6, 1e9, 1e-3, INFINITE),
+    "damping_time_z_ms": _within("damping_time_z", 1e-6, 1e9, 1e-3, INFINITE),
+    "impedance_ohm": _within("impedance", 0.0, 1e4, 1.0, 0.0),
 }
 ACCEPTANCE = {
-    "momentum": _positive("momentum_acceptance", 1.0, INFINITE),
-    "vertical_mm_mrad": _positive("acceptance_y", 1e-6, INFINITE),
-    "scraper_beta_y_m": _positive("scraper_beta_y", 1.0, 1.0),
+    "momentum": Key("momentum_acceptance", 1.0, INFINITE, 1e-9, 1.0, SHARE),
+    "momentum_table": Key(kind=TEXT, default=None),
+    "vertical_mm_mrad": _within("acceptance_y", 1e-9, 1e9, 1e-6, INFINITE),
+    "horizontal_mm_mrad": _within("acceptance_x", 1e-9, 1e9, 1e-6, INFINITE),
+    "scraper_beta_y_m": _within("scraper_beta_y", 1e-6, 1e6, 1.0, 1.0),
 }
+
+
+def _optical(field: str, kind: str, default: Any = 0.0) -> Key:
+    low, high, said = RANGES[kind]
+    return Key(field, 1.0, default, low, high, said)
+
+
 OPTICS = {
-    "beta_x_m": _positive("beta_x"),
-    "beta_y_m": _positive("beta_y"),
-    "alpha_x": Key("alpha_x", default=0.0),
-    "alpha_y": Key("alpha_y", default=0.0),
-    "dispersion_x_m": Key("dispersion_x", default=0.0),
-    "dispersion_y_m": Key("dispersion_y", default=0.0),
-    "dispersion_slope_x": Key("slope_x", default=0.0),
-    "dispersion_slope_y": Key("slope_y", default=0.0),
+    "beta_x_m": _optical("beta_x", "beta", REQUIRED),
+    "beta_y_m": _optical("beta_y", "beta", REQUIRED),
+    "alpha_x": _optical("alpha_x", "alpha"),
+    "alpha_y": _optical("alpha_y", "alpha"),
+    "dispersion_x_m": _optical("dispersion_x", "dispersion"),
+    "dispersion_y_m": _optical("dispersion_y", "dispersion"),
+    "dispersion_slope_x": _optical("slope_x", "dispersion"),
+    "dispersion_slope_y": _optical("slope_y", "dispersion"),
 }
 OPERATION = {
-    "rf_voltage_kV": _positive("rf_voltage", 1e3),
-    "bunches": _positive("bunches"),
-    "scraper_y_mm": _positive("scraper_y", 1e-3, INFINITE),
-    "pressure_base_Pa": Key("pressure_base", low=-1e-300, said="a positive number, or zero"),
-    "pressure_slope_Pa_per_mA": _positive("pressure_slope", 1.0, 0.0),
-    "temperature_K": _positive("temperature", 1.0, 300.0),
+    "rf_voltage_kV": _within("rf_voltage", 1e-3, 1e8, 1e3),
+    "bunches": Key("bunches", kind=NUMBERS, low=-1e-300, high=1e9, said=FILL),
+    "bunch_length_mm": Key("length", 1e-3, None, 1e-3, 1e4, LENGTHS, NUMBERS),
+    "bunch_current_mA": Key("current", 1.0, 0.0, -1e-300, 1e4, LENGTHS, NUMBERS),
+    "bunch_length_exponent": Key("exponent", 1.0, 0.0, -1e-300, 1.0, "a power between 0 and 1"),
+    "harmonic_cavity": Key(kind=TABLE, default=None),
+    "scraper_y_mm": _within("scraper_y", 1e-3, 1e4, 1e-3, INFINITE),
+    "pressure_base_Pa": Key("pressure_base", 1.0, REQUIRED, -1e-300, 1.0, PRESSURE),
+    "pressure_slope_Pa_per_mA": Key("pressure_slope", 1.0, 0.0, -1e-300, 1.0, PRESSURE),
+    "temperature_K": _within("temperature", 1.0, 1e4, 1.0, 300.0),
     "gas": Key("gas", kind=TABLE, default={"N2": 1.0}),
 }
-# column here, and in a TFS file; the vertical dispersion may be missing
-COLUMNS = {
-    "s_m": "S",
-    "beta_x_m": "BETX",
-    "beta_y_m": "BETY",
-    "alpha_x": "ALFX",
-    "alpha_y": "ALFY",
-    "dispersion_x_m": "DX",
-    "dispersion_y_m": "DY",
-    "dispersion_slope_x": "DPX",
-    "dispersion_slope_y": "DPY",
+CAVITY = {
+    "number": _within("number", 1.0, 100.0),
+    "voltage_kV": Key("voltage", 1e3, REQUIRED, -1e-300, 1e8, "a voltage of zero or more"),
+    "phase_deg": Key("phase", math.pi / 180, REQUIRED, -361.0, 361.0, "an angle in degrees"),
 }
-MAY_BE_MISSING = {"dispersion_y_m", "dispersion_slope_y"}
-POSITIVE = {"beta_x_m", "beta_y_m"}
+STRETCH = {"stretch": _within("stretch", 0.1, 100.0)}
 
 
 def read_ring(path: str | PathLike[str]) -> Ring:
@@ -95,7 +108,8 @@ def read_ring(path: str | PathLike[str]) -> Ring:
     ----------
     path : str or path
         TOML file with the tables `[ring]`, `[acceptance]` and `[optics]`; see docs/lifetime.md.
-        `[optics]` holds ring averages, or `twiss`, a CSV or TFS file beside it.
+        `[optics]` holds ring averages, or `twiss`, a CSV or TFS file beside it; `momentum_table`
+        of `[acceptance]` is one of the momentum acceptance.
 
     Returns
     -------
@@ -105,7 +119,7 @@ def read_ring(path: str | PathLike[str]) -> Ring:
     Raises
     ------
     InputError
-        If a key is missing, unknown or not a usable number, or the Twiss table is not usable.
+        If a key is missing, unknown or a number that no ring has, or a table is not usable.
 
     Examples
     --------
@@ -114,16 +128,29 @@ def read_ring(path: str | PathLike[str]) -> Ring:
     3.610e-11 m rad at 761 points
     """
     top = _top(path)
-    section = top.section("ring")
+    section, apertures = top.section("ring"), top.section("acceptance")
     machine = section.values(RING)
     section.one_of(("emittance_y_nm", "coupling"))
     if (coupling := machine.pop("coupling")) is not None:
         machine["emittance_y"] = machine["emittance_x"] * coupling
-    aperture = top.section("acceptance").values(ACCEPTANCE)
-    optics = _optics(top.section("optics"), machine["circumference"])
+    _check_loss(section, machine)
+    aperture, table = apertures.values(ACCEPTANCE), apertures.table.get("momentum_table")
+    if table is not None:
+        apertures.one_of(("momentum", "momentum_table"))
+        table = Path(path).parent / table
+    averages = _optics(top.section("optics"))
+    optics, sides = read_along(machine["circumference"], averages, table)
+    aperture |= {} if sides is None else {"momentum_acceptance": sides}
     from beamfit.lifetime.ring import Ring
 
     return Ring(**machine, **aperture, optics=optics)
+
+
+def _check_loss(section: Section, machine: dict[str, Any]) -> None:
+    if machine["energy_loss"] >= machine["energy"]:
+        found = f"{machine['energy_loss'] / 1e3:.6g} keV a turn"
+        expected = f"less than the energy of {machine['energy'] / 1e9:.6g} GeV"
+        raise section.error(found, expected, "energy_loss_keV")
 
 
 def _top(path: str | PathLike[str]) -> Section:
@@ -132,17 +159,14 @@ def _top(path: str | PathLike[str]) -> Section:
     return top
 
 
-def _optics(section: Section, circumference: float) -> Optics:
-    """The ring's optics: a table beside the file, or averages as a ring of one point."""
-    if "twiss" in section.table:
-        if len(section.table) > 1:
-            raise section.error("averages beside a table", "one of them", "twiss")
-        section.values({"twiss": Key(kind=TEXT)})
-        return read_twiss(Path(section.path).parent / section.table["twiss"], circumference)
-    averages = section.values(OPTICS)
-    from beamfit.lifetime.ring import Optics  # JAX from here on
-
-    return Optics(np.ones(1), **{field: np.array([value]) for field, value in averages.items()})
+def _optics(section: Section) -> dict[str, float] | Path:
+    """Averages, or the table beside the file."""
+    if "twiss" not in section.table:
+        return section.values(OPTICS)
+    if len(section.table) > 1:
+        raise section.error("averages beside a table", "one of them", "twiss")
+    section.values({"twiss": Key(kind=TEXT)})
+    return Path(section.path).parent / section.table["twiss"]
 
 
 def read_operation(path: str | PathLike[str]) -> Operation:
@@ -161,7 +185,7 @@ def read_operation(path: str | PathLike[str]) -> Operation:
     Raises
     ------
     InputError
-        If a key is missing, unknown or not a usable number, the gas is unknown, or the RF
+        If a key is missing, unknown or a number that no ring has, the gas is unknown, or the RF
         voltage in the file does not exceed the energy loss per turn given there.
 
     Examples
@@ -170,88 +194,82 @@ def read_operation(path: str | PathLike[str]) -> Operation:
     3200000.0
     """
     top = _top(path)
-    section = top.section("operation")
-    values, loss = section.values(OPERATION), top.section("ring").values(RING)["energy_loss"]
-    if values["rf_voltage"] <= loss:
-        found = f"{values['rf_voltage'] / 1e3:.6g} kV"
-        expected = f"more than the loss of {loss / 1e3:.6g} kV a turn, or no beam is stored"
-        raise section.error(found, expected, "rf_voltage_kV")
-    from beamfit.lifetime.ring import Operation, gas_mixture  # JAX from here on
+    section, ring = top.section("operation"), top.section("ring").values(RING)
+    values = section.values(OPERATION)
+    values |= _bunches(section, values["bunches"], ring["harmonic"]) | _cavity(section)
+    values["bunch_length"] = _length(section, values)
+    if values["bunch_length"] is not None and ring["impedance"] > 0:
+        expected = "one of them: a given bunch length is taken as it is"
+        raise section.error("a bunch length beside impedance_ohm", expected, "bunch_length_mm")
+    from beamfit.lifetime.ring import Operation, gas_mixture, unstored  # JAX from here on
 
     try:
         gas = gas_mixture(**values.pop("gas"))
     except (TypeError, ValueError) as error:
         raise section.error(str(error), "partial pressures by molecule", "gas") from error
-    return Operation(**values, gas=gas)
+    operation = Operation(**values, gas=gas)
+    if amiss := unstored(operation, ring["energy_loss"], ring["energy"]):
+        found = f"{operation.rf_voltage / 1e3:.6g} kV"
+        raise section.error(found, amiss, "rf_voltage_kV")
+    return operation
 
 
-def read_twiss(path: str | PathLike[str], circumference: float) -> Optics:
-    """Read the optics along a ring.
+def _bunches(section: Section, given: float | list[float], buckets: float) -> dict[str, Any]:
+    """How many equal bunches lose as much, and the charges over one of theirs."""
+    charge = np.array(given, float, ndmin=1)
+    if isinstance(given, list):
+        charge = charge[charge > 0]
+        found = f"{len(given)} bunches, {charge.size} filled"
+        many = len(given)
+    else:
+        found, many = f"{given:g} bunches", given
+    if not (charge.size and 1 <= many <= buckets):
+        expected = f"1 to {buckets:g}, the harmonic number"
+        raise section.error(found, expected, "bunches")
+    if not isinstance(given, list):
+        return {"bunches": given}
+    from beamfit.lifetime.bunch import equal_bunches
 
-    Parameters
-    ----------
-    path : str or path
-        CSV with the columns `s_m, beta_x_m, beta_y_m, alpha_x, alpha_y, dispersion_x_m,
-        dispersion_slope_x` (and optionally the vertical dispersion), or MAD-X TFS. The table
-        covers the whole ring, or one of its equal (or mirror-symmetric) parts. Points close
-        together, inside magnets too: averages are taken by the trapezoidal rule.
-    circumference : float
-        Circumference of the ring, m.
-
-    Returns
-    -------
-    Optics
-        One point for each row.
-
-    Raises
-    ------
-    InputError
-        With file, line and column, if a column is missing, a cell is not a number, a Twiss beta
-        is not positive, or the table does not cover the ring.
-
-    Examples
-    --------
-    >>> optics = read_twiss("lattices/spear3_2003_twiss.csv", 234.144)
-    >>> print(f"mean beta_y {optics.average(optics.beta_y):.3f} m")
-    mean beta_y 8.785 m
-    """
-    sheet = read_sheet(path, "s_m,beta_x_m,beta_y_m")
-    columns = {name: _column(sheet, name) for name in COLUMNS}
-    from beamfit.lifetime.ring import Optics  # JAX from here on: the table is in order
-
-    weight = _weights(sheet, columns.pop("s_m"), circumference)
-    return Optics(weight, *columns.values())
+    equal = float(equal_bunches(charge))
+    return {"bunches": equal, "fill": charge / charge.sum() * equal}
 
 
-def _column(sheet: Sheet, name: str) -> np.ndarray:
-    """A column under its own name or that of a TFS file."""
-    header = next((h for h in (name, COLUMNS[name]) if h in sheet.names), None)
-    if header is None:
-        if name in MAY_BE_MISSING:
-            return np.zeros(len(sheet))
-        known = nearest(name, list(sheet.names))
-        raise sheet.header_error(f"no column '{name}', but {known}", f"'{name}'")
-    values = sheet.numbers(header)
-    if name in POSITIVE and (values <= 0).any():
-        row = int(np.argmax(values <= 0))
-        raise sheet.error(f"{values[row]:g}", "a positive beta function", row, header)
-    return values
+def _cavity(section: Section) -> dict[str, Any]:
+    """The second RF system, or what it does to the bunch."""
+    if "harmonic_cavity" not in section.table:
+        return {}
+    cavity = section.section("harmonic_cavity")
+    if "stretch" in cavity.table:
+        return cavity.values(STRETCH)
+    from beamfit.lifetime.ring import HarmonicCavity
+
+    return {"harmonic_cavity": HarmonicCavity(**cavity.values(CAVITY))}
 
 
-def _weights(sheet: Sheet, s: np.ndarray, circumference: float) -> np.ndarray:
-    """Share of the ring for each point (trapezoid); the table covers the ring or a part 1/k."""
-    steps = np.diff(s)
-    if s.size < 2 or np.any(steps < 0):
-        row = int(np.argmin(steps)) + 1 if s.size > 1 else None
-        raise sheet.error("s falls", "positions that rise", row, "s_m")
-    span = s[-1] - s[0]
-    parts = circumference / span if span > 0 else 0.0
-    if abs(parts - max(1, round(parts))) > 1e-3 * parts:
-        found = f"a table over {span:.6g} m"
-        expected = f"the circumference of {circumference:.6g} m or a whole fraction of it"
-        raise sheet.error(found, expected, None, "s_m")
-    weight = (np.r_[steps, 0.0] + np.r_[0.0, steps]) / 2
-    return weight / span
+def _length(section: Section, values: dict[str, Any]) -> MeasuredLength | None:
+    """The bunch length that is given, by bunch current."""
+    given = {key: values.pop(key) for key in ("length", "current", "exponent")}
+    if given["length"] is None:
+        for key in ("bunch_current_mA", "bunch_length_exponent"):
+            if key in section.table:
+                raise section.error(f"{key} without bunch_length_mm", LENGTHS, key)
+        return None
+    if "stretch" in values:
+        found, expected = (
+            "a bunch length beside a stretch",
+            "one of them: the length is taken as is",
+        )
+        raise section.error(found, expected, "bunch_length_mm")
+    current, length = (np.array(given[key], float, ndmin=1) for key in ("current", "length"))
+    if current.shape != length.shape or (np.diff(current) <= 0).any():
+        found = f"{length.size} lengths at {current.size} bunch currents"
+        raise section.error(found, f"{LENGTHS}, as many", "bunch_length_mm")
+    if given["exponent"] > 0 and not current[-1] > 0:
+        expected = "bunch_current_mA, above which the bunch grows with that power"
+        raise section.error("an exponent without a current", expected, "bunch_length_exponent")
+    from beamfit.lifetime.ring import MeasuredLength
+
+    return MeasuredLength(current, length, given["exponent"], values["rf_voltage"])
 
 
 def ring_from_pyat(
@@ -261,6 +279,7 @@ def ring_from_pyat(
     acceptance_y: float = INFINITE,
     scraper_beta_y: float = 1.0,
     impedance: float = 0.0,
+    acceptance_x: float = INFINITE,
 ) -> Ring:
     """Take a ring from a pyAT lattice: its optics at every element and its equilibrium beam.
 
@@ -271,7 +290,7 @@ def ring_from_pyat(
         those at its entrance, as in pyAT's own Touschek lifetime.
     coupling : float
         Vertical over horizontal emittance.
-    momentum_acceptance, acceptance_y, scraper_beta_y, impedance : float, optional
+    momentum_acceptance, acceptance_y, scraper_beta_y, impedance, acceptance_x : float, optional
         As in `Ring`, in SI units.
 
     Returns
@@ -330,4 +349,5 @@ def ring_from_pyat(
         damping_time_z=beam.Tau[2],
         impedance=impedance,
         optics=optics,
+        acceptance_x=acceptance_x,
     )

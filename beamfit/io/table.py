@@ -31,6 +31,7 @@ __all__ = ["UNITS", "Column", "Sheet", "columns_of", "header_of", "left_out", "r
 UNITS: dict[str, dict[str, float]] = {
     # quantity: unit at the end of a name -> factor to SI (a stored current: to mA)
     "length": {"um": 1e-6, "mm": 1e-3, "m": 1.0, "µm": 1e-6, "μm": 1e-6},
+    "length or duration": {"mm": 1e-3, "m": 1.0, "ps": 299792458e-12},
     "time": {"s": 1.0, "min": 60.0, "h": 3600.0, "d": 86400.0, "ms": 1e-3},
     "current": {"mA": 1.0, "A": 1e3, "uA": 1e-3, "µA": 1e-3, "μA": 1e-3},
     "voltage": {"kV": 1e3, "V": 1.0, "MV": 1e6},

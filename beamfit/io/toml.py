@@ -81,11 +81,20 @@ class Key(NamedTuple):
             return usual
         if self.kind is TEXT and not value.strip():
             return "a name"
-        if self.kind is not NUMBER or value == self.default:
+        if self.kind not in (NUMBER, NUMBERS) or value == self.default:
             return None
-        if not is_number(value):
+        if self.kind is NUMBERS and not self.said:  # checked by who asked for it
+            return None
+        numbers = value if isinstance(value, list) else [value]
+        if not numbers or not all(map(is_number, numbers)):
             return usual
-        return None if self.low < value < self.high else self.said
+        return None if all(self.low < number < self.high for number in numbers) else self.said
+
+    def in_si(self, value: Any) -> Any:
+        """A good value in SI; what is neither number nor list of numbers as it is."""
+        if self.kind is NUMBERS and isinstance(value, list):
+            return [number * self.factor for number in value]
+        return value * self.factor if self.kind in (NUMBER, NUMBERS) else value
 
 
 def is_number(value: object) -> bool:
@@ -150,7 +159,7 @@ class Section:
         table = self.table.get(name, {})
         if not isinstance(table, dict):
             raise self.error(f"{name} = {table!r}"[:80], f"a table [{name}]", name)
-        head = re.compile(rf"\s*\[?\s*{re.escape(name)}\b")
+        head = re.compile(rf"\s*\[?\s*({re.escape(self.prefix)})?{re.escape(name)}\b")
         start = next((n for n, text in enumerate(self.lines) if head.match(text)), 0)
         return Section(self.path, self.lines, table, start, f"in [{name}]", f"{name}.")
 
@@ -192,9 +201,7 @@ class Section:
             if name not in self.table and key.default is REQUIRED:
                 raise self.error(f"the key is missing {self.words}", KINDS[key.kind], name)
         return {
-            key.field: key.default
-            if name not in self.table
-            else (self.table[name] * key.factor if key.kind is NUMBER else self.table[name])
+            key.field: key.default if name not in self.table else key.in_si(self.table[name])
             for name, key in keys.items()
             if key.field
         }

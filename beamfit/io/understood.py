@@ -33,6 +33,7 @@ __all__ = ["Understood", "understand", "with_lattice"]
 SAID = {"A": "A", "kG": "kG integrated gradient", "T_per_m": "T/m", "k1": "1/m² (k1)"}
 SAID |= {"k1l": "1/m (k1l)"}
 CONDITIONS = {"rf_voltage": "V", "scraper_y": "m", "pressure": "Pa", "bunches": ""}
+CONDITIONS |= {"bunch_length": "m"}
 # Magnets of a lattice that are told one by one.
 MOST_MAGNETS = 20
 

@@ -10,6 +10,7 @@ from jax import Array
 from scipy import constants
 
 from beamfit.lifetime.ring import Operation, Ring
+from beamfit.lifetime.well import length_and_height
 
 __all__ = [
     "Bunch",
@@ -23,8 +24,11 @@ __all__ = [
     "rf_acceptance",
     "stored_bunch",
     "synchrotron_tune",
+    "up_and_down",
     "vertical_acceptance",
 ]
+# The largest share of its momentum that an electron loses.
+MOST = 0.99
 
 
 class Bunch(NamedTuple):
@@ -34,8 +38,8 @@ class Bunch(NamedTuple):
     ----------
     length : float
         Rms length, m.
-    acceptance : float or array, shape (n,)
-        Momentum acceptance of bucket and lattice together, relative.
+    acceptance : float or array, shape (n,) or (2, n)
+        Momentum acceptance of bucket and lattice together, relative; up and down if they differ.
     """
 
     length: jax.Array
@@ -189,7 +193,8 @@ def quantum_rate(acceptance: Array, emittance: Array, damping_time: Array) -> Ar
     >>> f"{1 / quantum_rate(30.0, 1.0, 5e-3):.0f}"
     '545'
     """
-    xi = acceptance / (2 * emittance)
+    # Beyond this, as without any aperture, nothing is lost that a number could hold.
+    xi = jnp.minimum(acceptance / (2 * emittance), 700.0)
     return 2 * xi * jnp.exp(-xi) / damping_time
 
 
@@ -248,7 +253,9 @@ def population(ring: Ring, bunch_current: Array) -> Array:
     return bunch_current * 1e-3 * ring.circumference / (constants.e * constants.c)
 
 
-def bunch_in_bucket(ring: Ring, voltage: Array, bunch_current: Array) -> Bunch:
+def bunch_in_bucket(
+    ring: Ring, voltage: Array, bunch_current: Array, stretch: Array = 1.0
+) -> Bunch:
     """Length and momentum acceptance of a bunch at an RF voltage and bunch current.
 
     Parameters
@@ -259,6 +266,9 @@ def bunch_in_bucket(ring: Ring, voltage: Array, bunch_current: Array) -> Bunch:
         RF voltage, V.
     bunch_current : float
         Current of one bunch, mA; it lengthens the bunch if the ring has an impedance.
+    stretch : float, optional
+        By how much a second RF system lengthens the bunch. The impedance then acts in a linear
+        bucket of that length, more weakly by as much.
 
     Returns
     -------
@@ -278,13 +288,41 @@ def bunch_in_bucket(ring: Ring, voltage: Array, bunch_current: Array) -> Bunch:
     slope = jnp.sqrt(voltage**2 - ring.energy_loss**2)
     phase_spread = ring.momentum_compaction * ring.energy_spread / tune
     strength = jnp.sqrt(jnp.pi) / 2 * bunch_current * 1e-3 * ring.impedance
-    ratio = lengthening(strength / (ring.harmonic * slope * phase_spread**3))
-    return Bunch(natural * ratio, jnp.minimum(rf_acceptance(*bucket), ring.momentum_acceptance))
+    ratio = lengthening(strength / (ring.harmonic * slope * phase_spread**3 * stretch))
+    length = natural * stretch * ratio
+    return Bunch(length, within_lattice(ring, rf_acceptance(*bucket)))
+
+
+def within_lattice(ring: Ring, height: Array) -> Array:
+    """The momentum acceptance that bucket and lattice leave; no electron loses more than it has."""
+    return jnp.minimum(jnp.minimum(height, MOST), ring.momentum_acceptance)
 
 
 def stored_bunch(ring: Ring, operation: Operation, current: Array) -> Bunch:
-    """One of the equal bunches of a beam of the given current, mA."""
-    return bunch_in_bucket(ring, operation.rf_voltage, current / operation.bunches)
+    """The bunches of a beam of a current in mA, any shape: the length is that of equal bunches
+    which lose as much, the loss of each being its charge squared over its length.
+    """
+    voltage, charge = operation.rf_voltage, jnp.asarray(operation.fill, float)
+    each = jnp.asarray(current, float)[..., None] * charge / operation.bunches
+    plain = bunch_in_bucket(ring, voltage, 0.0)
+    acceptance, stretch = plain.acceptance, operation.stretch
+    if operation.harmonic_cavity is not None:
+        length, height = length_and_height(ring, voltage, operation.harmonic_cavity)
+        acceptance = within_lattice(ring, height)
+        stretch = length / plain.length
+    if (known := operation.bunch_length) is None:
+        lengths = bunch_in_bucket(ring, voltage, each, stretch).length
+    else:
+        there = bunch_in_bucket(ring, known.voltage, 0.0).length
+        above = jnp.maximum(each / known.current[-1], 1.0) ** known.exponent
+        lengths = jnp.interp(each, known.current, known.length) * above * plain.length / there
+    weight = charge**2 / jnp.sum(charge)
+    return Bunch(1 / jnp.sum(weight / lengths, axis=-1), acceptance)
+
+
+def up_and_down(ring: Ring, acceptance: Array) -> Array:
+    """A momentum acceptance at every point, up and down in momentum, shape (2, n)."""
+    return jnp.broadcast_to(acceptance, (2, ring.optics.weight.size))
 
 
 def vertical_acceptance(chamber: Array, scraper: Array, scraper_beta_y: Array) -> Array:
@@ -315,8 +353,8 @@ def vertical_acceptance(chamber: Array, scraper: Array, scraper_beta_y: Array) -
 def quantum_loss(ring: Ring, operation: Operation, current: Array) -> Array:
     """Loss rate from quantum fluctuations in the vertical plane and in energy, 1/s."""
     aperture = vertical_acceptance(ring.acceptance_y, operation.scraper_y, ring.scraper_beta_y)
-    acceptance = stored_bunch(ring, operation, current).acceptance
-    energy = ring.optics.average(jnp.broadcast_to(acceptance, ring.optics.weight.shape)) ** 2
+    sides = up_and_down(ring, stored_bunch(ring, operation, current).acceptance)
+    energy = ring.optics.average(jnp.min(sides, axis=0)) ** 2
     return quantum_rate(aperture, ring.emittance_y, ring.damping_time_y) + quantum_rate(
         energy, ring.energy_spread**2, ring.damping_time_z
     )

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jax import Array
 from scipy import constants
 
-from beamfit.lifetime.bunch import stored_bunch, vertical_acceptance
+from beamfit.lifetime.bunch import stored_bunch, up_and_down, vertical_acceptance
 from beamfit.lifetime.ring import ELECTRON_RADIUS, Gas, Operation, Ring
 
 __all__ = [
@@ -20,9 +20,14 @@ __all__ = [
 
 
 def elastic_cross_section(
-    charge: Array, lorentz: Array, mean_beta_y: Array, acceptance: Array
+    charge: Array,
+    lorentz: Array,
+    beta_y: Array,
+    acceptance_y: Array,
+    beta_x: Array = 0.0,
+    acceptance_x: Array = jnp.inf,
 ) -> Array:
-    """Cross section for an elastic deflection out of the vertical acceptance, m² an atom.
+    """Cross section for an elastic deflection out of the transverse acceptance, m² an atom.
 
     Parameters
     ----------
@@ -30,28 +35,40 @@ def elastic_cross_section(
         Atomic number.
     lorentz : float
         Energy over rest energy.
-    mean_beta_y : float
-        Vertical Twiss beta averaged over the ring, m.
-    acceptance : float
-        Vertical acceptance, m rad.
+    beta_y, acceptance_y : float or array
+        Twiss beta where the atom is, m, and acceptance, m rad, of the vertical plane.
+    beta_x, acceptance_x : float or array, optional
+        Those of the horizontal plane; it has no limit by default.
 
     Returns
     -------
     float or array
-        2 pi r_e² Z²/gamma² <beta_y>/A_y.
+        4 r_e² Z²/gamma² (x phi + y (pi/2 - phi) + sqrt(x y)) with x = beta_x/A_x, y = beta_y/A_y
+        and tan² phi = x/y. Of one plane alone: 2 pi r_e² Z²/gamma² beta/A.
 
     Notes
     -----
-    Rutherford scattering at small angle into one plane: A. Wrulich, CERN 94-01 (1994), p. 409.
-    The horizontal loss, smaller by the ratio of the acceptances, is left out; so is the
-    screening by the electrons, negligible at these angles.
+    Rutherford scattering at small angles: A. Wrulich, CERN 94-01 (1994), p. 409, for one plane.
+    An electron is lost if it leaves either acceptance: the larger of x cos² and y sin² of the
+    azimuth, integrated over it. The sum of both planes counts twice what leaves both: 22 %
+    too much for equal planes, less for others. Screening by the electrons is negligible at these
+    angles.
 
     Examples
     --------
     >>> print(f"{elastic_cross_section(7, 5870.85, 8.7845, 9e-7):.4e}")
     6.9233e-28
     """
-    return 2 * jnp.pi * (ELECTRON_RADIUS * charge / lorentz) ** 2 * mean_beta_y / acceptance
+    x, y = beta_x / acceptance_x, beta_y / acceptance_y
+    turn = jnp.arctan2(_root(x), _root(y))
+    azimuths = x * turn + y * (jnp.pi / 2 - turn) + _root(x) * _root(y)
+    return 4 * (ELECTRON_RADIUS * charge / lorentz) ** 2 * azimuths
+
+
+def _root(ratio: Array) -> Array:
+    """Square root with a zero derivative at zero, where a plane has no limit."""
+    limited = jnp.asarray(ratio) > 0
+    return jnp.where(limited, jnp.sqrt(jnp.where(limited, ratio, 1.0)), 0.0)
 
 
 def bremsstrahlung_cross_section(charge: Array, acceptance: Array) -> Array:
@@ -132,16 +149,16 @@ def gas_rate_coefficient(cross_section: Array, gas: Gas, temperature: Array) -> 
 def elastic_loss(ring: Ring, operation: Operation, current: Array) -> Array:
     """Loss rate by elastic scattering for each pascal, 1/(s Pa)."""
     aperture = vertical_acceptance(ring.acceptance_y, operation.scraper_y, ring.scraper_beta_y)
-    mean_beta = ring.optics.average(ring.optics.beta_y)
-    charge = operation.gas.charge
-    section = elastic_cross_section(charge, ring.relativistic_gamma, mean_beta, aperture)
+    optics, charge = ring.optics, operation.gas.charge[:, None]
+    both = (optics.beta_y, aperture, optics.beta_x, ring.acceptance_x)
+    section = elastic_cross_section(charge, ring.relativistic_gamma, *both) @ optics.weight
     return gas_rate_coefficient(section, operation.gas, operation.temperature)
 
 
 def bremsstrahlung_loss(ring: Ring, operation: Operation, current: Array) -> Array:
     """Loss rate by bremsstrahlung for each pascal, averaged over the ring, 1/(s Pa)."""
-    acceptance = stored_bunch(ring, operation, current).acceptance
-    points = jnp.broadcast_to(acceptance, ring.optics.weight.shape)
+    # A photon takes energy: the acceptance downward counts.
+    _, points = up_and_down(ring, stored_bunch(ring, operation, current).acceptance)
     charge = operation.gas.charge
     sections = jax.vmap(lambda point: bremsstrahlung_cross_section(charge, point))(points)
     section = ring.optics.weight @ sections

@@ -8,12 +8,13 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 from beamfit.errors import InputError
 from beamfit.lifetime.bunch import quantum_loss
 from beamfit.lifetime.gas import bremsstrahlung_loss, elastic_loss
-from beamfit.lifetime.ring import Operation, Ring
+from beamfit.lifetime.ring import Operation, Ring, unstored
 from beamfit.lifetime.touschek import touschek_loss
 from beamfit.shown import shown
 
@@ -32,6 +33,9 @@ __all__ = [
     "scaled_parts",
     "terms_of",
 ]
+
+# Pa; a rise of the pressure over no pressure at all is taken over this.
+NO_PRESSURE = 1e-30
 
 
 class Mechanism(NamedTuple):
@@ -122,14 +126,11 @@ def _terms(ring: Ring, operation: Operation, current: Array) -> tuple[Array, ...
 
 def terms_of(ring: Ring, operation: Operation, current: float | Array) -> tuple[Array, ...]:
     """The term of each mechanism; `InputError` where the RF voltage is known to store no beam."""
-    voltage, loss = operation.rf_voltage, ring.energy_loss
-    known = not isinstance(voltage, jax.core.Tracer) and not isinstance(loss, jax.core.Tracer)
-    if known and bool(jnp.any(jnp.asarray(voltage) <= loss)):
-        raise InputError(
-            f"RF voltage {float(jnp.min(voltage)) / 1e3:.6g} kV",
-            f"more than the loss of {float(loss) / 1e3:.6g} kV a turn, or no beam is stored",
-            column="rf_voltage_kV",
-        )
+    given = operation.rf_voltage, ring.energy_loss, ring.energy
+    known = not any(isinstance(value, jax.core.Tracer) for value in given)
+    if known and (expected := unstored(operation, *given[1:])) is not None:
+        found = f"RF voltage {float(np.min(given[0])) / 1e3:.6g} kV"
+        raise InputError(found, expected, column="rf_voltage_kV")
     return _terms(ring, operation, jnp.asarray(current, float))
 
 
@@ -152,8 +153,8 @@ def loss_coefficients(ring: Ring, operation: Operation, current: float | Array) 
     operation : Operation
         Settings and vacuum.
     current : float
-        Beam current, mA. It matters only through bunch lengthening: without an impedance the
-        coefficients do not depend on it.
+        Beam current, mA. It matters only through bunch lengthening: without it the coefficients
+        do not depend on it.
 
     Returns
     -------
@@ -237,7 +238,7 @@ def loss_terms(ring: Ring, operation: Operation, current: Array) -> Terms:
     return Terms(
         terms_of(ring, operation, current),
         pressure=jnp.asarray(base + slope * current, float),
-        rise=jnp.asarray(slope / base, float),
+        rise=jnp.asarray(slope / jnp.maximum(base, NO_PRESSURE), float),
         current=jnp.asarray(current, float),
     )
 

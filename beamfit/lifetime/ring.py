@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from scipy import constants
 
 from beamfit.particles import REST_ENERGY
@@ -15,10 +16,13 @@ __all__ = [
     "ELECTRON_MASS_EV",
     "ELECTRON_RADIUS",
     "Gas",
+    "HarmonicCavity",
+    "MeasuredLength",
     "Operation",
     "Optics",
     "Ring",
     "gas_mixture",
+    "unstored",
 ]
 
 ELECTRON_MASS_EV = 1e6 * REST_ENERGY["electron"]
@@ -94,8 +98,9 @@ class Ring(NamedTuple):
         Relative rms energy spread.
     emittance_x, emittance_y : float
         Emittances, m rad.
-    momentum_acceptance : float or array, shape (n,)
-        Momentum acceptance of the lattice without RF, relative; infinite if the RF alone limits.
+    momentum_acceptance : float or array, shape (n,) or (2, n)
+        Momentum acceptance of the lattice without RF, relative, up and down where they differ;
+        infinite if the RF alone limits.
     acceptance_y : float
         Vertical acceptance of the chamber, m rad; infinite if the scraper alone limits.
     scraper_beta_y : float
@@ -107,6 +112,12 @@ class Ring(NamedTuple):
         Longitudinal broad-band impedance abs(Z/n), ohm; 0 for a bunch that does not lengthen.
     optics : Optics
         Optical functions along the ring.
+    acceptance_x : float
+        Horizontal acceptance, m rad; infinite to leave horizontal gas losses out.
+
+    Notes
+    -----
+    Emittances and energy spread are those of the stored beam: intrabeam scattering is not computed.
     """
 
     energy: jax.Array
@@ -124,6 +135,7 @@ class Ring(NamedTuple):
     damping_time_z: jax.Array
     impedance: jax.Array
     optics: Optics
+    acceptance_x: jax.Array = np.inf
 
     @property
     def relativistic_gamma(self) -> jax.Array:
@@ -148,6 +160,48 @@ class Gas(NamedTuple):
 
 
 @shown
+class HarmonicCavity(NamedTuple):
+    """A cavity at a harmonic of the main RF.
+
+    Attributes
+    ----------
+    number : float
+        Its frequency over that of the main RF.
+    voltage : float
+        Peak voltage, V.
+    phase : float
+        Phase at the bunch, rad: it gains voltage sin(phase). 0 is the crossing that lengthens the
+        bunch, pi the one that shortens it; a cavity without generator loses, its sine is negative.
+    """
+
+    number: jax.Array
+    voltage: jax.Array
+    phase: jax.Array
+
+
+@shown
+class MeasuredLength(NamedTuple):
+    """A bunch length that is known, and taken as it is.
+
+    Attributes
+    ----------
+    current : array, shape (k,)
+        Bunch currents, mA, rising.
+    length : array, shape (k,)
+        Rms length at each, m; linear in between and constant below.
+    exponent : float
+        Power of the current with which it grows above the last of them.
+    voltage : float
+        RF voltage at which it holds, V; at others it changes as the length at zero current.
+    """
+
+    current: jax.Array
+    length: jax.Array
+    exponent: jax.Array
+    voltage: jax.Array
+
+
+@shown
 class Operation(NamedTuple):
     """The settings an operator can change, and the vacuum that results.
 
@@ -158,7 +212,7 @@ class Operation(NamedTuple):
     scraper_y : float
         Distance from the beam to the nearer vertical scraper jaw, m; infinite if there is none.
     bunches : float
-        Number of equally filled bunches.
+        Number of equally filled bunches, or of those that would lose as much.
     pressure_base : float
         Pressure without beam, Pa.
     pressure_slope : float
@@ -167,6 +221,15 @@ class Operation(NamedTuple):
         Temperature of the gas, K.
     gas : Gas
         Composition of the residual gas.
+    fill : array, shape (k,)
+        Charge of each bunch over that of one of `bunches` equal ones, so that their mean, weighted
+        with the charge, is 1.
+    bunch_length : MeasuredLength or None
+        The length where it is known; None to compute it.
+    harmonic_cavity : HarmonicCavity or None
+        A second RF system.
+    stretch : float
+        By how much such a system lengthens the bunch, where only that is known.
     """
 
     rf_voltage: jax.Array
@@ -176,6 +239,25 @@ class Operation(NamedTuple):
     pressure_slope: jax.Array
     temperature: jax.Array
     gas: Gas
+    fill: jax.Array = np.ones(1)
+    bunch_length: MeasuredLength | None = None
+    harmonic_cavity: HarmonicCavity | None = None
+    stretch: jax.Array = 1.0
+
+
+def unstored(operation: Operation, energy_loss: float, energy: float) -> str | None:
+    """What the RF voltage should be where it stores no beam of that loss and energy, eV; or None.
+
+    The main RF gives what a turn loses, less what the beam gains in a harmonic cavity.
+    """
+    cavity, voltage = operation.harmonic_cavity, np.asarray(operation.rf_voltage)
+    gain = 0.0 if cavity is None else cavity.voltage * np.sin(cavity.phase)
+    if (voltage <= energy_loss - gain).any():
+        lost = f"{float(energy_loss - gain) / 1e3:.6g} kV a turn"
+        return f"more than the loss of {lost}, or no beam is stored"
+    if (voltage > energy).any():
+        return f"less than the beam's energy, {float(energy) / 1e6:.6g} MeV; check the unit"
+    return None
 
 
 def gas_mixture(**fractions: float) -> Gas:

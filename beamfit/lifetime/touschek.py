@@ -12,7 +12,7 @@ from jax import Array
 from jax.scipy.special import i0e
 from scipy import constants
 
-from beamfit.lifetime.bunch import bunch_in_bucket, population, stored_bunch
+from beamfit.lifetime.bunch import population, stored_bunch
 from beamfit.lifetime.ring import ELECTRON_RADIUS, Operation, Optics, Ring
 
 __all__ = [
@@ -95,7 +95,8 @@ def piwinski_shape(floor: Array, b1: Array, gap: Array, nodes: int = 64) -> Arra
     decay = jnp.exp(-gap / (b1 + b2) * t) * i0e(b2 * t)
     integrand = _spectrum(log_kappa, floor) * decay * jnp.exp(log_kappa)
     integral = (upper - lower) / 2 * jnp.sum(weights * integrand)
-    return 2 * jnp.sqrt(jnp.pi * gap) * integral
+    # Far beyond the bunch's momenta the integrals of both signs cancel to rounding.
+    return 2 * jnp.sqrt(jnp.pi * gap) * jnp.maximum(integral, 0.0)
 
 
 def _volume(ring: Ring, optics: Optics) -> Array:
@@ -121,8 +122,9 @@ def piwinski_rate(
         Electrons in the bunch.
     length : float
         Rms bunch length, m.
-    acceptance : float or array, shape (n,)
-        Momentum acceptance, at each point of the ring's optics if it is an array.
+    acceptance : float or array, shape (n,) or (2, n)
+        Momentum acceptance, at each point of the ring's optics if it is an array; up and down if
+        it is two.
     nodes : int, optional
         Quadrature nodes.
 
@@ -130,7 +132,7 @@ def piwinski_rate(
     -------
     float
         1/tau_T at this population: the relative loss rate, half of which is due to each of the
-        two electrons that scatter. With different acceptances up and down, take the mean of two.
+        two electrons that scatter, one up and one down: the mean of both sides where they differ.
 
     Notes
     -----
@@ -147,6 +149,9 @@ def piwinski_rate(
     >>> f"{1 / piwinski_rate(ring, 8.7e9, 4.97e-3, 0.03) / 3600:.1f} h"
     '35.1 h'
     """
+    if jnp.ndim(acceptance) == 2:
+        sides = jax.vmap(lambda side: piwinski_rate(ring, population, length, side, nodes))
+        return jnp.mean(sides(jnp.asarray(acceptance)))
     lorentz = ring.relativistic_gamma
     acceptance = jnp.broadcast_to(acceptance, ring.optics.weight.shape)
 
@@ -176,7 +181,7 @@ def touschek_shape(ring: Ring, operation: Operation) -> Callable[[Array], Array]
     ring : Ring
         The ring, with its impedance.
     operation : Operation
-        RF voltage and number of bunches.
+        RF voltage, bunches, and what else is known of their length.
 
     Returns
     -------
@@ -193,7 +198,7 @@ def touschek_shape(ring: Ring, operation: Operation) -> Callable[[Array], Array]
     """
 
     def shape(current: Array) -> Array:
-        natural = bunch_in_bucket(ring, operation.rf_voltage, 0.0).length
+        natural = stored_bunch(ring, operation, 0.0).length
         return natural / stored_bunch(ring, operation, current).length
 
     return shape

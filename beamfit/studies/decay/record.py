@@ -30,6 +30,7 @@ PLAUSIBLE = {
     "scraper_y": (1e-4, 0.5, "m"),
     "pressure": (1e-14, 1e-2, "Pa"),
     "bunches": (1.0, 1e5, "bunches"),
+    "bunch_length": (1e-5, 1.0, "m"),
 }
 
 # A pressure that departs from P0 + P1 I by less than this share of the record's mean, on average
@@ -51,12 +52,15 @@ class Conditions(NamedTuple):
         Average pressure, Pa.
     bunches : array, shape (n,), or None
         Number of filled bunches.
+    bunch_length : array, shape (n,), or None
+        Rms bunch length, m.
     """
 
     rf_voltage: np.ndarray | None = None
     scraper_y: np.ndarray | None = None
     pressure: np.ndarray | None = None
     bunches: np.ndarray | None = None
+    bunch_length: np.ndarray | None = None
 
 
 class Fault(NamedTuple):
@@ -255,6 +259,7 @@ class DecayRecord:
             "rf_voltage": "rf_voltage_V",
             "scraper_y": "scraper_y_m",
             "pressure": "pressure_Pa",
+            "bunch_length": "bunch_length_m",
         }
         conditions = self.conditions._asdict().items()
         columns |= {units.get(n, n): v for n, v in conditions if v is not None}

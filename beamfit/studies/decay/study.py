@@ -9,9 +9,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from beamfit.errors import InputError
+from beamfit.lifetime.bunch import stored_bunch
 from beamfit.lifetime.decay import HOUR
 from beamfit.lifetime.losses import MECHANISMS, Losses, loss_coefficients
-from beamfit.lifetime.ring import Operation, Ring
+from beamfit.lifetime.ring import MeasuredLength, Operation, Ring, unstored
 from beamfit.quantity import Quantity
 from beamfit.shown import shown
 from beamfit.studies.decay.checks import DecayChecks, check_decay
@@ -58,11 +59,17 @@ class Budget(NamedTuple):
         Coefficients by mechanism, 1/(mA s) and 1/s, as plain numbers.
     current : float
         Mean current of the record, mA.
+    bunch_length : float
+        Rms length of the bunches, m, computed or given.
+    emittances : tuple of float
+        Horizontal and vertical, m rad, as given: intrabeam scattering is not computed.
     """
 
     operation: Operation
     losses: Losses
     current: float
+    bunch_length: float
+    emittances: tuple[float, float]
 
     @property
     def rates(self) -> dict[str, float]:
@@ -141,16 +148,15 @@ def operation_during(record: DecayRecord, machine: Machine) -> Operation:
     for name, value in said.items():
         if not value > 0:
             raise InputError(f"{name} {value:g}", "above zero", path=record.name, column=name)
-    loss = float(machine.ring.energy_loss)
-    if said.get("rf_voltage", np.inf) <= loss:
-        expected = f"more than the loss of {loss / 1e3:.6g} kV a turn, or no beam is stored"
-        found = f"{said['rf_voltage'] / 1e3:.6g} kV"
-        raise InputError(found, expected, path=record.name, column="rf_voltage_kV")
-    energy = float(machine.ring.energy)
-    if said.get("rf_voltage", 0.0) > energy:
-        found = f"{said['rf_voltage'] / 1e3:.6g} kV"
-        expected = f"less than the beam's energy, {energy / 1e6:.6g} MeV; check the unit"
-        raise InputError(found, expected, path=record.name, column="rf_voltage_kV")
+    if "rf_voltage" in said:
+        usual = usual._replace(rf_voltage=said["rf_voltage"])
+        expected = unstored(usual, machine.ring.energy_loss, machine.ring.energy)
+        if expected is not None:
+            found = f"{said['rf_voltage'] / 1e3:.6g} kV"
+            raise InputError(found, expected, path=record.name, column="rf_voltage_kV")
+    if "bunch_length" in said:
+        length = np.array([said.pop("bunch_length")])
+        said["bunch_length"] = MeasuredLength(np.zeros(1), length, 0.0, usual.rf_voltage)
     if "pressure" in said:
         read = said.pop("pressure")
         if record.gauge is not None:
@@ -197,7 +203,10 @@ def budget(record: DecayRecord, machine: Machine) -> Budget:
     operation = operation_during(record, machine)
     current = float(record.current.mean())
     losses = loss_coefficients(machine.ring, operation, current)
-    return Budget(operation, Losses(*(float(part) for part in losses)), current)
+    ring, parts = machine.ring, Losses(*(float(part) for part in losses))
+    length = float(stored_bunch(ring, operation, current).length)
+    emittances = float(ring.emittance_x), float(ring.emittance_y)
+    return Budget(operation, parts, current, length, emittances)
 
 
 @dataclass(frozen=True, eq=False)

@@ -177,6 +177,11 @@ def _part(kind: str, mechanism: Mechanism) -> Row:
     return f"{kind}, {mechanism.label}", shown
 
 
+def _emittances(decay: Decay) -> str:
+    x, y = (f"{1e9 * value:.4g}" for value in decay.budget.emittances)
+    return f"{x} and {y} nm"
+
+
 def _pressure(decay: Decay) -> str:
     operation, current = decay.budget.operation, decay.budget.current
     return f"{float(operation.pressure_base + operation.pressure_slope * current):.3g} Pa"
@@ -186,6 +191,8 @@ BUDGET: tuple[Row, ...] = (
     ("RF voltage", lambda d: f"{float(d.budget.operation.rf_voltage) / 1e3:.6g} kV"),
     ("scraper", lambda d: f"{float(d.budget.operation.scraper_y) * 1e3:.4g} mm"),
     ("bunches", lambda d: f"{float(d.budget.operation.bunches):.6g}"),
+    ("emittances, as given: no intrabeam scattering", _emittances),
+    ("rms bunch length", lambda d: f"{1e3 * d.budget.bunch_length:.4g} mm"),
     ("pressure at the mean current", _pressure),
     *(_part("a", mechanism) for mechanism in QUADRATIC),
     ("a, sum", lambda d: f"{d.budget.losses.a:.4g} 1/(mA s)"),
