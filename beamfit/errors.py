@@ -30,8 +30,8 @@ class InputError(ValueError):
         The file.
     line : int, optional
         Line in the file, counted from 1.
-    column : str, optional
-        The column's name, or the key's in a TOML file.
+    column : str or int, optional
+        The column's name, or the key's in a TOML file; in a text the place in its line, from 1.
 
     Examples
     --------
@@ -43,13 +43,15 @@ class InputError(ValueError):
     expected: str
     path: str | PathLike[str] | None = None
     line: int | None = None
-    column: str | None = None
+    column: str | int | None = None
 
     def __str__(self) -> str:
         place = "" if self.path is None else str(self.path)
         place += "" if self.line is None else f":{self.line}"
+        named = isinstance(self.column, str)
+        place += f":{self.column}" if place and self.column is not None and not named else ""
         place += ": " if place else ""
-        said = "" if self.column is None else f"column '{self.column}': "
+        said = f"column '{self.column}': " if named else ""
         said = ENDLESS.sub(r"\1...", f"{said}{self.found}; expected {self.expected}")
         return " ".join(f"{place}{said}".split())
 

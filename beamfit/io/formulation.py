@@ -1,0 +1,142 @@
+"""Formulations and the tables of numbers they use, from files."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from os import PathLike
+from pathlib import Path
+
+import numpy as np
+
+from beamfit.errors import InputError
+from beamfit.io.files import read_text, text_lines
+from beamfit.language.document import Document
+from beamfit.language.parse import parse_document
+from beamfit.language.xml import parse_xml
+
+__all__ = ["read_formulation", "read_numbers", "read_tables"]
+
+
+def read_formulation(path: str | PathLike[str]) -> Document:
+    """Read a document in either form: XML where it begins with ``<``, else text.
+
+    Parameters
+    ----------
+    path : str or path
+        The file.
+
+    Returns
+    -------
+    Document
+
+    Raises
+    ------
+    InputError
+        With file, line and column, if it cannot be read or is not in the language.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> file = Path(tempfile.mkdtemp()) / "short.bf"
+    >>> _ = file.write_text("output y; y = 2;")
+    >>> read_formulation(file).mapping.outputs[0].name
+    'y'
+    """
+    text = read_text(path)
+    try:
+        return parse_xml(text) if text.lstrip().startswith("<") else parse_document(text)
+    except InputError as error:
+        error.path = path
+        raise
+
+
+def read_numbers(path: str | PathLike[str]) -> np.ndarray:
+    """Read a table of numbers, separated by commas, semicolons or blanks.
+
+    Lines that begin with ``#`` are comments; a first line with a word in it is a header.
+
+    Parameters
+    ----------
+    path : str or path
+        The file.
+
+    Returns
+    -------
+    array, shape (rows, columns)
+
+    Raises
+    ------
+    InputError
+        With file and line, if a line holds no numbers or another count of them.
+    """
+    rows: list[np.ndarray] = []
+    header = True
+    for number, line in enumerate(text_lines(path), 1):
+        words = line.replace(",", " ").replace(";", " ").split()
+        if not words or words[0].startswith("#"):
+            continue
+        try:
+            row = np.array(words, float)
+        except ValueError:
+            if not header:
+                raise InputError(f"'{line.strip()}'", "numbers", path, number) from None
+            row = None
+        header = False
+        if row is None:
+            continue
+        if not np.all(np.isfinite(row)):
+            raise InputError(f"'{line.strip()}'", "finite numbers", path, number)
+        if rows and len(row) != len(rows[0]):
+            raise InputError(f"{len(row)} numbers", f"{len(rows[0])} as above", path, number)
+        rows.append(row)
+    if not rows:
+        raise InputError("no numbers", "rows of numbers", path)
+    return np.array(rows)
+
+
+def read_tables(
+    document: Document, path: str | PathLike[str], given: Mapping[str, str]
+) -> tuple[dict[str, np.ndarray], dict[str, str]]:
+    """Read the tables of a document: files that are given, or those it names, beside it.
+
+    Parameters
+    ----------
+    document : Document
+        From `read_formulation`.
+    path : str or path
+        Its file.
+    given : mapping of str to str
+        Files by the name of the table.
+
+    Returns
+    -------
+    (dict of str to array, dict of str to str)
+        Tables and their files by name.
+
+    Raises
+    ------
+    InputError
+        If a name is not that of a table, a file cannot be read, or a table has another size than
+        the document says.
+    """
+    tables = {table.name: table for table in document.mapping.tables}
+    for name in given:
+        if name not in tables:
+            raise InputError(f"--data {name}=...", f"a table of it: {', '.join(tables) or 'none'}")
+    found, files = {}, {}
+    for name, table in tables.items():
+        file = files[name] = given.get(name, str(Path(path).parent / table.file))
+        try:
+            found[name] = read_numbers(file)
+        except InputError as error:
+            if name in given or error.found != "no such file":
+                raise
+            at = table.at
+            said = f"table '{name}' in the file '{table.file}', which is not there"
+            raise InputError(said, f"--data {name}=FILE", path, at.line, at.column) from None
+        wanted = (table.rows, table.columns)
+        if None not in wanted and found[name].shape != wanted:
+            size = " x ".join(map(str, found[name].shape))
+            expected = f"{table.rows} x {table.columns} as line {table.at.line} of {path} says"
+            raise InputError(f"{size} numbers", expected, file)
+    return found, files

@@ -1,0 +1,280 @@
+"""Expressions to JAX over whole index sets: one array operation for all elements at once.
+
+A value is an array with one axis for each iterator in force (of length 1 where it does not change
+with it), then its own dimensions. Broadcasting does the rest; a sum is a reduction over its axes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from beamfit.language import expression as x
+from beamfit.language.expression import error_at
+from beamfit.language.scope import Axes, Scope, index_of, located, widened
+
+__all__ = ["Setting", "Value", "evaluate", "picked", "placed", "spread"]
+
+
+class Value(NamedTuple):
+    """An array: axes of iterators, then `rank` dimensions of its own."""
+
+    array: jax.Array
+    rank: int = 0
+
+
+@dataclass(frozen=True)
+class Setting:
+    """In which an expression is evaluated.
+
+    `known` holds values of nodes computed elsewhere, by identity; `watch` is told every value.
+    """
+
+    scope: Scope
+    arrays: Mapping[str, jax.Array]
+    axes: Axes
+    bound: Mapping[str, Value] = field(default_factory=dict)
+    known: Mapping[int, Value] = field(default_factory=dict)
+    watch: Callable[[x.Expression, Value, Axes], None] | None = None
+
+
+ELEMENTWISE: dict[str, Callable] = {
+    "sin": jnp.sin, "cos": jnp.cos, "tan": jnp.tan, "asin": jnp.arcsin, "acos": jnp.arccos,
+    "atan": jnp.arctan, "sinh": jnp.sinh, "cosh": jnp.cosh, "tanh": jnp.tanh, "exp": jnp.exp,
+    "asinh": jnp.arcsinh, "acosh": jnp.arccosh, "atanh": jnp.arctanh, "log": jnp.log,
+    "log10": jnp.log10, "sqrt": jnp.sqrt, "abs": jnp.abs, "sign": jnp.sign,
+    "erf": jax.scipy.special.erf, "sigmoid": jax.nn.sigmoid, "atan2": jnp.arctan2,
+}  # fmt: skip
+MATRIX: dict[str, tuple[int, int, Callable]] = {
+    # rank of the argument, of the result
+    "transpose": (2, 2, lambda m: jnp.swapaxes(m, -1, -2)),
+    "inverse": (2, 2, jnp.linalg.inv),
+    "det": (2, 0, jnp.linalg.det),
+    "trace": (2, 0, lambda m: jnp.trace(m, axis1=-2, axis2=-1)),
+    "norm": (1, 0, lambda v: jnp.sqrt(jnp.sum(v * v, axis=-1))),
+}
+FOLDS = {"sum": jnp.sum, "prod": jnp.prod, "min": jnp.min, "max": jnp.max, "mean": jnp.mean}
+
+
+def evaluate(e: x.Expression, s: Setting) -> Value:
+    """Compute an expression for all combinations of the iterators in force."""
+    found = s.known.get(id(e))
+    if found is not None:
+        return _lifted(found, len(s.axes))
+    match e:
+        case x.Number():
+            found = Value(jnp.full((1,) * len(s.axes), e.value))
+        case x.Name():
+            found = _named(e, s)
+        case x.Operation(_, (one,)):
+            inner = evaluate(one, s)
+            found = Value(-inner.array, inner.rank)
+        case x.Operation("^", (base, x.Number() as power)):
+            found = _power(evaluate(base, s), power.value)
+        case x.Operation(symbol, parts):
+            found = _operated(e, symbol, [evaluate(part, s) for part in parts])
+        case x.Application():
+            found = _applied(e, s)
+        case x.Reduction():
+            found = _reduced(e, s)
+        case _:
+            raise TypeError(e)
+    if s.watch is not None:
+        s.watch(e, found, s.axes)
+    return found
+
+
+def _lifted(v: Value, axes: int) -> Value:
+    """A value of outer iterators, for as many iterators as are in force further in."""
+    outer = v.array.ndim - v.rank
+    shape = v.array.shape
+    return Value(v.array.reshape(*shape[:outer], *[1] * (axes - outer), *shape[outer:]), v.rank)
+
+
+def _power(v: Value, power: float) -> Value:
+    # A whole power has derivatives everywhere, and needs no logarithm.
+    whole = power == int(power) and abs(power) <= 64
+    return Value(v.array ** (int(power) if whole else power), v.rank)
+
+
+def spread(values: list[Value], e: x.Expression) -> tuple[list[jax.Array], int]:
+    """Arrays of one rank: numbers spread over the dimensions of the others."""
+    rank = max(v.rank for v in values)
+    for v in values:
+        if v.rank not in (0, rank):
+            raise error_at(e.at, f"'{e}' of {v.rank} and {rank} dimensions", "as many in each part")
+    arrays = [v.array.reshape(*v.array.shape, *[1] * (rank - v.rank)) for v in values]
+    shapes = {v.array.shape[v.array.ndim - rank :] for v in values if v.rank == rank}
+    if len(shapes) > 1:
+        found = " and ".join(" x ".join(map(str, shape)) for shape in sorted(shapes))
+        raise error_at(e.at, f"'{e}' of sizes {found}", "parts of one size")
+    return arrays, rank
+
+
+def _operated(e: x.Expression, symbol: str, parts: list[Value]) -> Value:
+    if symbol == "@":
+        return _product(e, *parts)
+    (a, b), rank = spread(parts, e)
+    match symbol:
+        case "+":
+            return Value(a + b, rank)
+        case "-":
+            return Value(a - b, rank)
+        case "*":
+            return Value(a * b, rank)
+        case "/":
+            return Value(a / b, rank)
+    return Value(a**b, rank)
+
+
+def _product(e: x.Expression, a: Value, b: Value) -> Value:
+    """A product of matrices and vectors."""
+    if not (1 <= a.rank <= 2 and 1 <= b.rank <= 2):
+        raise error_at(e.at, f"'{e}' of {a.rank} and {b.rank} dimensions", "vectors or matrices")
+    inner = a.array.shape[-1], b.array.shape[-1 if b.rank == 1 else -2]
+    if inner[0] != inner[1]:
+        raise error_at(e.at, f"'{e}' of inner lengths {inner[0]} and {inner[1]}", "equal ones")
+    left = a.array if a.rank == 2 else a.array[..., None, :]
+    right = b.array if b.rank == 2 else b.array[..., :, None]
+    found = left @ right
+    found = found if b.rank == 2 else found[..., 0]
+    if a.rank == 1:
+        found = found[..., 0, :] if b.rank == 2 else found[..., 0]
+    return Value(found, a.rank + b.rank - 2)
+
+
+def _applied(e: x.Application, s: Setting) -> Value:
+    values = [evaluate(argument, s) for argument in e.arguments]
+    function = s.scope.functions.get(e.function)
+    if function is not None:
+        # The body sees its arguments; iterators of the caller keep their axes, not their names.
+        hidden = {f"{name}'": one for name, one in s.axes.items()}
+        bound = dict(zip(function.arguments, values, strict=True))
+        return evaluate(function.body, replace(s, axes=hidden, bound=bound))
+    name = e.function
+    if name in MATRIX:
+        return _matrix(e, *MATRIX[name], values[0])
+    if name == "dot":
+        return _product(e, *values)
+    if name in ("sum", "min", "max") and len(values) == 1:
+        own = tuple(range(-values[0].rank, 0))
+        return Value(FOLDS[name](values[0].array, axis=own))
+    if name == "pow":
+        return _operated(e, "^", values)
+    arrays, rank = spread(values, e)
+    if name in ("min", "max"):
+        fold = jnp.minimum if name == "min" else jnp.maximum
+        found = arrays[0]
+        for other in arrays[1:]:
+            found = fold(found, other)
+        return Value(found, rank)
+    return Value(ELEMENTWISE[name](*arrays), rank)
+
+
+def _matrix(e: x.Application, wanted: int, given: int, function: Callable, v: Value) -> Value:
+    if v.rank != wanted:
+        what = "a matrix" if wanted == 2 else "a vector"
+        raise error_at(e.arguments[0].at, f"'{e.arguments[0]}' of {v.rank} dimensions", what)
+    square = v.array.shape[-2:]
+    if e.function in ("inverse", "det", "trace") and square[0] != square[1]:
+        found = f"'{e.arguments[0]}' of {square[0]} x {square[1]}"
+        raise error_at(e.arguments[0].at, found, "a square matrix")
+    return Value(function(v.array), given)
+
+
+def _reduced(e: x.Reduction, s: Setting) -> Value:
+    axes = widened(s.scope, s.axes, e.iterators)
+    body = evaluate(e.body, replace(s, axes=axes))
+    over = tuple(range(len(s.axes), len(axes)))
+    # What does not change with an iterator has one element along it and counts for all.
+    lengths = [len(one) for one in list(axes.values())[len(s.axes) :]]
+    same = np.prod([n for n, i in zip(lengths, over, strict=True) if body.array.shape[i] == 1])
+    found = FOLDS[e.kind](body.array, axis=over)
+    if same != 1 and e.kind in ("sum", "prod"):
+        found = found * same if e.kind == "sum" else found ** int(same)
+    return Value(found, body.rank)
+
+
+# ---- elements of arrays
+
+
+def _named(e: x.Name, s: Setting) -> Value:
+    if e.name in s.bound:
+        if e.indices:
+            raise error_at(e.at, f"'{e}', an index of an argument", "the argument as a whole")
+        return _lifted(s.bound[e.name], len(s.axes))
+    array = s.scope.arrays.get(e.name)
+    if array is None or (array.role == "parameter" and not array.dims):
+        value = s.scope.constant(e.name)
+        if value is None:
+            return Value(jnp.asarray(index_of(s.scope, e, s.axes), float))
+        return Value(jnp.full((1,) * len(s.axes), value))
+    indices = located(s.scope, e, array, s.axes)
+    rank = sum(isinstance(i, x.Whole) for i in e.indices) if e.indices else len(array.dims)
+    return Value(picked(s.arrays[e.name], indices, len(s.axes) + rank), rank)
+
+
+class _View(NamedTuple):
+    """Indices as slices: what to take of each dimension, and the axis that each kept one is."""
+
+    slices: tuple[int | slice, ...]
+    axes: list[int]
+
+
+def _view(indices: list[np.ndarray]) -> _View | None:
+    """Indices as slices, if each runs evenly along an axis of its own; None otherwise."""
+    slices: list[int | slice] = []
+    axes: list[int] = []
+    for index in indices:
+        along = [k for k, n in enumerate(index.shape) if n > 1]
+        if len(along) > 1 or (along and along[0] in axes):
+            return None
+        values = index.ravel()
+        if not along:
+            slices.append(int(values[0]))
+            continue
+        step = int(values[1] - values[0])
+        if step < 1 or np.any(np.diff(values) != step):
+            return None
+        slices.append(slice(int(values[0]), int(values[-1]) + 1, step))
+        axes.append(along[0])
+    return _View(tuple(slices), axes)
+
+
+def picked(array: jax.Array, indices: list[np.ndarray], rank: int) -> jax.Array:
+    """Elements of an array by an index for each dimension, each of the same number of axes."""
+    if not indices:
+        return jnp.reshape(array, (1,) * rank)
+    view = _view(indices)
+    if view is None:
+        return array[tuple(indices)]
+    found = array[view.slices]
+    found = jnp.transpose(found, np.argsort(view.axes))
+    shape = [1] * rank
+    for k, n in zip(sorted(view.axes), found.shape, strict=True):
+        shape[k] = n
+    return found.reshape(shape)
+
+
+def placed(array: jax.Array, indices: list[np.ndarray], value: jax.Array, lengths: list[int]):
+    """The array with elements set, by an index for each dimension as in `picked`.
+
+    `value` has the axes of the indices, of length 1 where it is the same along one of `lengths`.
+    """
+    if not indices:
+        return jnp.reshape(value, ())
+    view = _view(indices)
+    if view is None:
+        return array.at[tuple(indices)].set(jnp.broadcast_to(value, lengths))
+    # Axes along which no index runs have one element.
+    shape = [n if k in view.axes else 1 for k, n in enumerate(lengths)]
+    value = jnp.broadcast_to(value, shape).reshape([shape[k] for k in sorted(view.axes)])
+    value = jnp.transpose(value, np.argsort(np.argsort(view.axes)))
+    if value.shape == array.shape:
+        return value
+    return array.at[view.slices].set(value)

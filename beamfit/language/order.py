@@ -1,0 +1,248 @@
+"""In which order the steps of a mapping are computed: which elements each defines and needs."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+
+from beamfit.errors import InputError
+from beamfit.language import document as d
+from beamfit.language import expression as x
+from beamfit.language.declare import scope_of
+from beamfit.language.expression import error_at
+from beamfit.language.lags import Plan, plan_of
+from beamfit.language.scope import (
+    Array,
+    Read,
+    Scope,
+    Step,
+    located,
+    reads,
+    whole_of,
+    widened,
+)
+from beamfit.language.steps import Call, calls, gains_of, sources, targets, written
+
+__all__ = ["Group", "Order", "checked", "order_of"]
+
+NOBODY = -1
+
+
+class Group(NamedTuple):
+    """Steps that are computed together; those with a plan need their own earlier values."""
+
+    steps: tuple[Step, ...]
+    plan: Plan | None
+
+
+@dataclass(frozen=True, eq=False)
+class Order:
+    """Steps of a mapping in an order of computation.
+
+    `owners` tells for each element of an array which step defines it, `needs` the steps before each
+    step, `given` the inputs, parameters and tables that each reads; `inner` are the orders of the
+    mappings it calls.
+    """
+
+    scope: Scope
+    groups: tuple[Group, ...]
+    owners: dict[str, np.ndarray]
+    needs: dict[int, set[int]]
+    given: dict[int, set[str]] = field(default_factory=dict)
+    inner: dict[str, Order] = field(default_factory=dict)
+
+    def closure(self, names: Iterable[str]) -> tuple[set[int], set[str]]:
+        """The steps, and the names given, that some names hang on."""
+        todo = {n for name in names for n in np.unique(self.owners.get(name, NOBODY)).tolist()}
+        found: set[int] = set()
+        while todo := {n for n in todo if n != NOBODY} - found:
+            found |= todo
+            todo = {before for n in todo for before in self.needs[n]}
+        direct = {name for name in names if name not in self.owners}
+        return found, direct.union(*(self.given[n] for n in found))
+
+
+# ---- the order
+
+
+def order_of(scope: Scope) -> Order:
+    """Sort the steps of a mapping and of all mappings in it.
+
+    Parameters
+    ----------
+    scope : Scope
+        From `beamfit.language.scope.scope_of`.
+
+    Returns
+    -------
+    Order
+
+    Raises
+    ------
+    InputError
+        With its place: a name that is unknown, an element that is defined twice or never, an index
+        outside, an algebraic loop with its cycle.
+    """
+    inner = {name: order_of(c) for name, c in scope.callees.items() if isinstance(c, Scope)}
+    owners: dict[str, np.ndarray] = {}
+    for step in scope.steps:
+        if isinstance(step.what, d.Call):
+            _check_wires(scope, calls(scope, step.what), step)
+        for node, axes in targets(scope, step):
+            _own(scope, owners, step, written(scope, node, axes))
+    needs: dict[int, set[int]] = {step.number: set() for step in scope.steps}
+    given: dict[int, set[str]] = {step.number: set() for step in scope.steps}
+    for step in scope.steps:
+        for e, axes in sources(scope, step):
+            for read in reads(scope, e, axes):
+                if read.array.role in ("output", "real"):
+                    needs[step.number] |= set(_owners_of(owners, read).tolist())
+                else:
+                    given[step.number].add(read.array.name)
+    for array in scope.outputs.values():
+        _check_defined(array, owners)
+    groups = tuple(_group(scope, sorted(c), needs, owners) for c in _components(needs))
+    return Order(scope, groups, owners, needs, given, inner)
+
+
+def _group(scope, numbers: list[int], needs, owners) -> Group:
+    steps = tuple(scope.steps[n] for n in numbers)
+    if len(steps) == 1 and numbers[0] not in needs[numbers[0]]:
+        return Group(steps, None)
+    plan = plan_of(scope, steps, owners)
+    if plan is None:
+        raise _loop(scope, steps, needs)
+    return Group(steps, plan)
+
+
+def _own(scope: Scope, owners: dict[str, np.ndarray], step: Step, write: Read) -> None:
+    """Note which elements a step defines."""
+    array, node = write.array, write.node
+    owner = owners.setdefault(array.name, np.full(max(array.size, 1), NOBODY))
+    shape = [len(s) for s in write.axes.values()]
+    combined = int(np.prod(shape, dtype=np.int64))
+    whole = np.prod([len(dim) for dim in whole_of(node, array)], dtype=np.int64)
+    flat = np.unique(write.flat)
+    if flat.size < combined * whole:
+        unused = [n for n in write.axes if n not in _names(node)]
+        said = f"'{node}' has no index {', '.join(unused)}" if unused else "its index repeats"
+        found = f"'{node}' set more than once by one statement ({said})"
+        raise error_at(node.at, found, "each element once")
+    taken = flat[owner[flat] != NOBODY]
+    if taken.size:
+        other = scope.steps[owner[taken[0]]]
+        found = f"'{array.element(taken[0])}' set twice (also in line {other.at.line})"
+        raise error_at(node.at, found, "each element once")
+    owner[flat] = step.number
+
+
+def _names(e: x.Expression) -> set[str]:
+    inner = set().union(*map(_names, x.children(e)))
+    return inner | {e.name} if isinstance(e, x.Name) else inner
+
+
+def _owners_of(owners: dict[str, np.ndarray], read: Read) -> np.ndarray:
+    """The steps that define what is read there."""
+    owner = owners.get(read.array.name)
+    if owner is None:
+        found = f"'{read.array.name}' is used, and no statement sets it"
+        raise error_at(read.node.at, found, f"a statement {read.array.name} = ...")
+    if owner[0] != NOBODY and np.all(owner == owner[0]):
+        return owner[:1]
+    flat = read.flat
+    missing = flat[owner[flat] == NOBODY]
+    if missing.size:
+        said = f"'{read.array.element(missing[0])}', used in '{read.node}', which no statement sets"
+        raise error_at(read.node.at, said, "a statement that sets this element")
+    return np.unique(owner[flat])
+
+
+def _check_defined(array: Array, owners: dict[str, np.ndarray]) -> None:
+    owner = owners.get(array.name)
+    if owner is None or np.any(owner == NOBODY):
+        at = 0 if owner is None else int(np.argmax(owner == NOBODY))
+        name = array.name if owner is None else array.element(at)
+        raise error_at(array.at, f"output '{name}' that no statement sets", f"{name} = ...;")
+
+
+def _check_wires(scope: Scope, call: Call, step: Step) -> None:
+    """Check indices on the side of what is called, and that each input is given whole."""
+    given: dict[str, np.ndarray] = {}
+    for wire in call.statement.inputs:
+        array = call.callee.inputs[wire.target.name]
+        axes = widened(scope, {}, wire.each)
+        found = Read(array, wire.target, axes, located(scope, wire.target, array, axes))
+        given.setdefault(array.name, np.zeros(max(array.size, 1), bool))[found.flat] = True
+    for name, hit in given.items():
+        array = call.callee.inputs[name]
+        if not hit.all() and array.values is None:
+            missing = array.element(int(np.argmin(hit)))
+            found = f"'{missing}' of {call.statement.mapping} is not given"
+            raise error_at(call.statement.at, found, f"all of {array.said}")
+    for wire in call.statement.outputs:
+        axes = widened(scope, step.axes, wire.each)
+        output, inputs = gains_of(wire, call.callee, call.statement.mapping)
+        located(scope, output, call.callee.outputs[output.name], axes)
+        for e in inputs:
+            array = call.callee.inputs[e.name]
+            if len(e.indices) != len(array.dims):
+                found = f"'{e}' in '{wire.value}'"
+                raise error_at(
+                    e.at, found, f"one number of {array.said} such as {array.element(0)}"
+                )
+            located(scope, e, array, axes)
+
+
+def _components(needs: dict[int, set[int]]) -> list[tuple[int, ...]]:
+    """Strongly connected components, needed ones first (Tarjan's algorithm, no recursion)."""
+    low: dict[int, int] = {}
+    index: dict[int, int] = {}
+    stack: list[int] = []
+    found: list[tuple[int, ...]] = []
+    on: set[int] = set()
+    for root in needs:
+        work = [] if root in index else [(root, iter(sorted(needs[root])))]
+        while work:
+            v, rest = work[-1]
+            if v not in index:
+                index[v] = low[v] = len(index)
+                stack.append(v)
+                on.add(v)
+            for w in rest:
+                if w not in index:
+                    work.append((w, iter(sorted(needs[w]))))
+                    break
+                if w in on:
+                    low[v] = min(low[v], low.get(w, index[w]))
+            else:
+                work.pop()
+                if work:
+                    low[work[-1][0]] = min(low[work[-1][0]], low[v])
+                if low[v] == index[v]:
+                    at = stack.index(v)
+                    found.append(tuple(stack[at:]))
+                    on -= set(stack[at:])
+                    del stack[at:]
+    return found
+
+
+def _loop(scope: Scope, steps: Sequence[Step], needs: dict[int, set[int]]) -> InputError:
+    """An algebraic loop, with the names along its cycle."""
+    members = {s.number for s in steps}
+    path = [steps[0].number]
+    while path.count(path[-1]) == 1:
+        path.append(min(needs[path[-1]] & members))
+    cycle = path[path.index(path[-1]) :]
+    names = [str(targets(scope, scope.steps[n])[0][0]) for n in reversed(cycle)]
+    lines = ", ".join(str(n) for n in sorted({scope.steps[n].at.line for n in cycle}))
+    found = f"an algebraic loop: {' -> '.join(names)} (line {lines})"
+    expected = "statements of which each needs earlier ones only, or earlier times such as y[t-1]"
+    return error_at(scope.steps[min(cycle)].at, found, expected)
+
+
+def checked(mapping: d.Mapping, shapes=None) -> Order:
+    """Names, indices and order of a mapping, checked without computing anything."""
+    return order_of(scope_of(mapping, shapes))

@@ -1,0 +1,324 @@
+"""Text to documents and statements, and what is wrong with a text in words."""
+
+from __future__ import annotations
+
+import json
+import math
+from functools import lru_cache
+from importlib.resources import files
+from typing import Any
+
+from lark import Lark, Token, Transformer
+from lark.exceptions import UnexpectedInput
+
+from beamfit.errors import nearest
+from beamfit.language import document as d
+from beamfit.language import expression as x
+from beamfit.language.expression import Place, error_at
+from beamfit.language.syntax import check_brackets, explained, short
+
+__all__ = ["parse_document", "parse_statements"]
+
+
+def parse_document(text: str) -> d.Document:
+    """Read a document from its text form.
+
+    Parameters
+    ----------
+    text : str
+        As a ``.bf`` file has it.
+
+    Returns
+    -------
+    Document
+
+    Raises
+    ------
+    InputError
+        With line and column, if it is not in the language.
+
+    Examples
+    --------
+    >>> found = parse_document("minimize y; variable x in [0, 1]; input x; output y; y = x^2;")
+    >>> found.problem.variables[0].upper, str(found.mapping.statements[0].value)
+    (1.0, 'x^2')
+    """
+    return _parsed(text, "document")
+
+
+def parse_statements(text: str) -> tuple[d.Statement, ...]:
+    """Read the statements of a mapping, the text of ``<expressions>``.
+
+    Raises
+    ------
+    InputError
+        With line and column, if they are not in the language.
+
+    Examples
+    --------
+    >>> [type(s).__name__ for s in parse_statements("set K = |1:3|; real A[K];")]
+    ['IndexedSet', 'Real']
+    """
+    return tuple(_parsed(text, "statements"))
+
+
+@lru_cache
+def _grammar() -> Lark:
+    text = (files("beamfit.language") / "grammar.lark").read_text()
+    return Lark(text, parser="lalr", start=["document", "statements"], transformer=_Builder(),
+                maybe_placeholders=True)  # fmt: skip
+
+
+def _parsed(text: str, start: str) -> Any:
+    check_brackets(text)
+    try:
+        return _grammar().parse(text, start)
+    except UnexpectedInput as error:
+        raise explained(error, text) from None
+
+
+def _place(children: list[Any]) -> Place:
+    """Where the first of some parts stands."""
+    for child in children:
+        if isinstance(child, Token):
+            return Place(child.line, child.column)
+        if getattr(child, "at", None):
+            return child.at
+    return x.NOWHERE
+
+
+def _number(token: Token) -> float:
+    value = float(token)
+    if math.isinf(value) and "inf" not in token:
+        raise error_at(Place(token.line, token.column), f"'{short(token)}'", "a number below 1e308")
+    return value
+
+
+def _count(token: Token | None, least: int = 0) -> int | None:
+    if token is None:
+        return None
+    if not token.isdigit() or not least <= (value := int(token[:12])) < 10**9:
+        expected = f"a whole number from {least} to a thousand million"
+        raise error_at(Place(token.line, token.column), f"'{short(token)}'", expected)
+    return value
+
+
+def _pair(both: tuple[float, float] | None) -> tuple[float, float]:
+    return (-math.inf, math.inf) if both is None else both
+
+
+class _Builder(Transformer):
+    """Rules of the grammar to the values they stand for."""
+
+    def STRING(self, token):
+        """Without its quotes, where it stood."""
+        try:
+            return token.update(value=json.loads(token))
+        except ValueError:
+            at = Place(token.line, token.column)
+            raise error_at(at, f"{short(token)}", 'a text; a backslash is written "\\\\"') from None
+
+    # expressions
+
+    def number(self, c):
+        _number(c[0])
+        return x.Number(str(c[0]), _place(c))
+
+    def element(self, c):
+        return x.Name(str(c[0]), tuple(part for part in c[1:] if part is not None), _place(c))
+
+    def whole(self, c):
+        return x.Whole(_place(c))
+
+    def operation(self, c):
+        return x.Operation(str(c[1]), (c[0], c[2]), c[0].at)
+
+    def sign(self, c):
+        return c[1] if c[0] == "+" else x.Operation("-", (c[1],), _place(c))
+
+    def application(self, c):
+        return x.Application(str(c[0]), tuple(p for p in c[1:] if p is not None), _place(c))
+
+    def reduction(self, c):
+        if c[0] not in x.REDUCTIONS:
+            raise error_at(_place(c), f"'{c[0]}'", nearest(c[0], list(x.REDUCTIONS)))
+        return x.Reduction(str(c[0]), c[1], c[2], _place(c))
+
+    def iterators(self, c):
+        return tuple(c)
+
+    def each(self, c):
+        return c[0]
+
+    def iterator(self, c):
+        over = c[1] if isinstance(c[1], x.Elements) else str(c[1])
+        return x.Iterator(str(c[0]), over, _place(c))
+
+    def elements(self, c):
+        return x.Elements(tuple(p for p in c if p is not None), True, _place(c))
+
+    def listed(self, c):
+        return x.Elements(tuple(c), False, _place(c))
+
+    # statements
+
+    def set(self, c):
+        for part in c[2].parts:
+            x.check_depth(part)
+        return [d.IndexedSet(str(c[1]), c[2], _place(c[1:]))]
+
+    def dimensions(self, c):
+        return tuple(_count(t, 1) if t.type == "NUMBER" else str(t) for t in c)
+
+    def real(self, c):
+        if c[2] is not None:
+            x.check_depth(c[2])
+        return d.Real(str(c[0]), c[1] or (), c[2], _place(c))
+
+    def reals(self, c):
+        return c[1:]
+
+    def function(self, c):
+        names = tuple(str(t) for t in c[2:-1])
+        return [d.Function(str(c[1]), names, x.check_depth(c[-1]), _place(c[1:]))]
+
+    def wire(self, c):
+        for part in (c[0], c[1]):
+            x.check_depth(part)
+        return d.Wire(c[0], c[1], c[2] or (), _place(c))
+
+    def assignment(self, c):
+        w = self.wire(c)
+        return [d.Assignment(w.target, w.value, w.each, w.at)]
+
+    def wires(self, c):
+        return tuple(w for w in c if w is not None)
+
+    def call(self, c):
+        return [d.Call(str(c[0]), c[1], c[2], c[3] or (), _place(c))]
+
+    def block(self, c):
+        return [d.Block(c[0], tuple(s for part in c[1:] for s in part), _place(c[0]))]
+
+    def statements(self, c):
+        return [s for part in c for s in part]
+
+    # mappings
+
+    def declared(self, c):
+        return d.Declared(str(c[0]), c[1] or (), None, _place(c))
+
+    def given(self, c):
+        values = (_number(c[2]),) if isinstance(c[2], Token) else c[2]
+        return d.Declared(str(c[0]), c[1] or (), values, _place(c))
+
+    def values(self, c):
+        return tuple(_number(t) for t in c if t is not None)
+
+    def table(self, c):
+        return d.DataTable(str(c[1]), str(c[2]), _count(c[3], 1), _count(c[4], 1), _place(c[1:]))
+
+    def attribute(self, c):
+        return str(c[0]), str(c[1])
+
+    def word(self, c):
+        return str(c[0])
+
+    def part(self, c):
+        kind, name, target = c[:3]
+        attributes = tuple(a for a in c[3:-1] if a is not None)
+        named = (("srcName", str(name)), ("dstName", str(target)))
+        head = named if target is not None else (("name", str(name)),)
+        return d.Part(str(kind), (*head, *attributes), c[-1], _place(c))
+
+    def network(self, c):
+        return ("mapping", d.Network(str(c[1]), tuple(c[2:]), _place(c[1:])))
+
+    def inputs(self, c):
+        return ("inputs", c[1:])
+
+    def outputs(self, c):
+        return ("outputs", c[1:])
+
+    def parameters(self, c):
+        return ("parameters", c[1:])
+
+    def title(self, c):
+        return ("title", str(c[1]))
+
+    def mapping(self, c):
+        return ("mapping", _mapping(str(c[1]), c[2:], _place(c[1:])))
+
+    # the problem
+
+    def label(self, c):
+        name = str(c[0])
+        return d.Goal(name, name if c[1] is None else str(c[1]), at=_place(c))
+
+    def pair(self, c):
+        return _number(c[0]), _number(c[1])
+
+    def goal(self, c):
+        weight = 1.0 if c[3] is None else _number(c[3])
+        return ("goal", c[0], d.Goal(c[1].label, c[1].model, weight, c[1].at))
+
+    def variable(self, c):
+        _, name, value, bounds, _, random, _, seed = c
+        value = None if value is None else _number(value)
+        low, high = _pair(bounds)
+        return d.Variable(
+            name.label, name.model, low, high, value, random, _count(seed) or 0, name.at
+        )
+
+    def limit(self, c):
+        low, high = c[2] if len(c) == 3 else (-math.inf, math.inf)
+        if len(c) == 4:
+            end = _number(c[3])
+            low, high = (end if c[2] != "<=" else low), (end if c[2] != ">=" else high)
+        return d.Limit(c[1].label, c[1].model, low, high, c[1].at)
+
+    def setting(self, c):
+        return str(c[0]), str(c[1])
+
+    def solver(self, c):
+        return d.Solver(c[1], tuple(s for s in c[2:] if s is not None), _place(c))
+
+    def document(self, c):
+        return _document(c)
+
+
+def _mapping(name: str, members: list[Any], at: Place = x.NOWHERE) -> d.Mapping:
+    """A mapping of its members in any order."""
+    found: dict[str, list[Any]] = {k: [] for k in ("inputs", "outputs", "parameters", "mapping")}
+    tables, statements = [], []
+    for member in members:
+        if isinstance(member, d.DataTable):
+            tables.append(member)
+        elif isinstance(member, list):
+            statements += member
+        else:
+            kind, what = member
+            found[kind] += what if isinstance(what, list) else [what]
+    groups = (tuple(found[k]) for k in ("mapping", "inputs", "outputs", "parameters"))
+    return d.Mapping(name, tuple(tables), *groups, tuple(statements), at)
+
+
+def _document(items: list[Any]) -> d.Document:
+    """The document of its items in any order."""
+    kinds = (d.Variable, d.Limit, d.Solver)
+    variables, limits, solvers = (tuple(i for i in items if isinstance(i, k)) for k in kinds)
+    tuples = [i for i in items if isinstance(i, tuple)]
+    goals = [i[1:] for i in tuples if i[0] == "goal"]
+    titles = [i[1] for i in tuples if i[0] == "title"]
+    rest = [i for i in items if not isinstance(i, kinds) and i not in tuples]
+    rest += [i for i in tuples if i[0] not in ("goal", "title")]
+    words = {word.lower() for word, _ in goals}
+    if len(words) > 1:
+        raise error_at(goals[1][1].at, "one goal to minimize, one to maximize", "one direction")
+    if len(solvers) > 1:
+        raise error_at(solvers[1].at, "a second solver", "one")
+    problem = None
+    if goals or variables or limits:
+        problem = d.Problem(tuple(g for _, g in goals), variables, limits, words == {"maximize"})
+    mapping = _mapping(titles[0] if titles else "", rest)
+    return d.Document(mapping, problem, solvers[0] if solvers else None)

@@ -1,0 +1,358 @@
+"""What the names of a mapping mean: sets, arrays, functions, other mappings; and its steps.
+
+All of it is known before anything is computed: elements of sets are whole numbers, so that every
+index is checked, and every statement's reach known, without JAX.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from beamfit.errors import InputError, nearest
+from beamfit.language import document as d
+from beamfit.language import expression as x
+from beamfit.language.expression import REDUCTIONS, Place, error_at
+
+__all__ = [
+    "CONSTANTS",
+    "FUNCTIONS",
+    "Array",
+    "Axes",
+    "IndexSet",
+    "Net",
+    "Read",
+    "Scope",
+    "Step",
+    "check_size",
+    "index_of",
+    "located",
+    "reads",
+    "set_of",
+    "whole_of",
+    "widened",
+]
+
+# Elements of a set, and combinations of indices one statement may run over.
+MOST_ELEMENTS, MOST_COMBINED = 2_000_000, 20_000_000
+CONSTANTS = {"pi": float(np.pi)}
+ONE = """sin cos tan asin acos atan sinh cosh tanh asinh acosh atanh exp log log10 sqrt abs sign erf
+sigmoid transpose inverse det trace norm sum"""
+FUNCTIONS: dict[str, tuple[int, int]] = {name: (1, 1) for name in ONE.split()}
+FUNCTIONS |= {"atan2": (2, 2), "pow": (2, 2), "dot": (2, 2), "min": (1, 99), "max": (1, 99)}
+"""Built-in functions: least and most number of arguments."""
+
+
+@dataclass(frozen=True, eq=False)
+class IndexSet:
+    """Whole numbers in order, and where each of them stands."""
+
+    name: str
+    elements: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.elements)
+
+    @cached_property
+    def _sorted(self) -> np.ndarray:
+        return np.argsort(self.elements, kind="stable")
+
+    def positions(self, values: np.ndarray) -> np.ndarray:
+        """Where values stand; -1 for those that are no elements."""
+        order = self._sorted
+        at = np.minimum(np.searchsorted(self.elements, values, sorter=order), len(self) - 1)
+        found = order[at]
+        return np.where(self.elements[found] == values, found, -1)
+
+    def __str__(self) -> str:
+        ends = f"{self.elements[0]} to {self.elements[-1]}"
+        return f"{self.name} ({ends})" if self.name else ends
+
+
+Axes = Mapping[str, IndexSet]
+"""Iterators in force, outermost first."""
+
+
+class Array(NamedTuple):
+    """A number or an array of a mapping."""
+
+    name: str
+    role: str
+    dims: tuple[IndexSet, ...] = ()
+    at: Place = x.NOWHERE
+    values: tuple[float, ...] | None = None
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Its lengths."""
+        return tuple(map(len, self.dims))
+
+    @property
+    def size(self) -> int:
+        """Its number of elements."""
+        return int(np.prod(self.shape, dtype=np.int64))
+
+    @property
+    def said(self) -> str:
+        """Its name with its dimensions."""
+        inner = ", ".join(dim.name or str(len(dim)) for dim in self.dims)
+        return f"{self.name}[{inner}]" if self.dims else self.name
+
+    def element(self, position: int) -> str:
+        """Its name with the index of an element, in C order."""
+        if not self.dims:
+            return self.name
+        at = np.unravel_index(position, self.shape)
+        inner = ", ".join(str(dim.elements[i]) for dim, i in zip(self.dims, at, strict=True))
+        return f"{self.name}[{inner}]"
+
+
+class Step(NamedTuple):
+    """An assignment or a call, with everything it runs over; `number` counts steps of a mapping."""
+
+    number: int
+    axes: dict[str, IndexSet]
+    what: d.Assignment | d.Call
+
+    @property
+    def at(self) -> Place:
+        """Where it stands."""
+        return self.what.at
+
+
+class Read(NamedTuple):
+    """A place where an array is read or written: the node, its axes, an index a dimension."""
+
+    array: Array
+    node: x.Name
+    axes: Axes
+    indices: list[np.ndarray]
+
+    @property
+    def flat(self) -> np.ndarray:
+        """Positions of the elements in C order, one for each combination of indices."""
+        if not self.array.dims:
+            return np.zeros(1, int)
+        return np.ravel_multi_index(np.broadcast_arrays(*self.indices), self.array.shape).ravel()
+
+
+@dataclass(frozen=True, eq=False)
+class Scope:
+    """The names of one mapping.
+
+    `callees` are the scopes of mappings inside, and networks; `inputs` and `outputs` its face.
+    """
+
+    name: str
+    sets: dict[str, IndexSet] = field(default_factory=dict)
+    arrays: dict[str, Array] = field(default_factory=dict)
+    functions: dict[str, d.Function] = field(default_factory=dict)
+    callees: dict[str, Any] = field(default_factory=dict)
+    steps: list[Step] = field(default_factory=list)
+
+    @property
+    def inputs(self) -> dict[str, Array]:
+        """What is given to it."""
+        return {k: a for k, a in self.arrays.items() if a.role == "input"}
+
+    @property
+    def outputs(self) -> dict[str, Array]:
+        """What it gives."""
+        return {k: a for k, a in self.arrays.items() if a.role == "output"}
+
+    def constant(self, name: str) -> float | None:
+        """The value of a name that is the same for ever, or None."""
+        found = self.arrays.get(name)
+        if found is not None and found.role == "parameter" and not found.dims:
+            return found.values[0]
+        return CONSTANTS.get(name) if found is None else None
+
+
+class Net(NamedTuple):
+    """A network as it is called: its numbers and its face."""
+
+    mlp: Any
+    inputs: dict[str, Array]
+    outputs: dict[str, Array]
+
+
+# ---- sets and iterators
+
+
+def check_size(lengths: list[int], at: Place, most: int = MOST_COMBINED) -> None:
+    """Refuse lengths that are empty, or too long together."""
+    total = 1
+    for length in lengths:
+        total *= length
+    if total > most or min(lengths, default=1) < 1:
+        found = f"{total} elements" if total < 10**12 else "more than 1e12 elements"
+        raise error_at(at, found, f"1 to {most}")
+
+
+def set_of(scope: Scope, over: x.Elements, name: str = "") -> IndexSet:
+    """The elements of a set, whole numbers made of numbers and parameters."""
+    ends = [int(index_of(scope, part, {})) for part in over.parts]
+    if not over.ranged:
+        found = np.array(ends)
+        if len(np.unique(found)) < len(found):
+            raise error_at(over.at, f"{over}, which has an element twice", "each element once")
+        return IndexSet(name, found)
+    start, stop, step = (*ends, 1)[:3]
+    if step == 0 or (stop - start) * step < 0:
+        said = f"set {name} = {over}" if name else f"{over}"
+        raise error_at(over.at, f"{said}, an empty set", "a start before the stop")
+    check_size([abs((stop - start) // step) + 1], over.at, MOST_ELEMENTS)
+    return IndexSet(name, np.arange(start, stop + np.sign(step), step))
+
+
+def widened(scope: Scope, axes: Axes, each: tuple[x.Iterator, ...]) -> dict[str, IndexSet]:
+    """Axes with further iterators inside."""
+    found = dict(axes)
+    for it in each:
+        if it.name in found:
+            raise error_at(it.at, f"'{it.name}' runs already", "another name for this iterator")
+        if it.name in scope.arrays or it.name in scope.sets:
+            what = "an array or a set" if it.name in scope.sets else "a variable"
+            raise error_at(it.at, f"'{it.name}', which is {what}", "a new name for the iterator")
+        if isinstance(it.over, x.Elements):
+            found[it.name] = set_of(scope, it.over)
+        elif it.over in scope.sets:
+            found[it.name] = scope.sets[it.over]
+        else:
+            known = nearest(it.over, list(scope.sets))
+            raise error_at(it.at, f"no set '{it.over}' in '{it}'", known)
+    check_size([len(s) for s in found.values()], each[0].at if each else x.NOWHERE)
+    return found
+
+
+# ---- indices
+
+
+def index_of(scope: Scope, e: x.Expression, axes: Axes) -> np.ndarray:
+    """The values of an index for all combinations of iterators, one axis each."""
+    match e:
+        case x.Number():
+            if e.value != int(min(e.value, 2**53)):
+                raise error_at(e.at, f"'{e}' as an index", "a whole number")
+            return np.int64(e.value)
+        case x.Name(name, ()) if name in axes:
+            place = list(axes).index(name)
+            return axes[name].elements.reshape([-1 if i == place else 1 for i in range(len(axes))])
+        case x.Name(name, ()) if (value := scope.constant(name)) is not None:
+            return index_of(scope, x.Number(repr(value), e.at), axes)
+        case x.Operation(symbol, parts) if symbol in "+-*":
+            found = [index_of(scope, part, axes) for part in parts]
+            if max(float(np.max(np.abs(f))) for f in found) > 2**31:
+                raise error_at(e.at, f"'{e}' as an index", "numbers below 2e9")
+            if len(found) == 1:
+                return -found[0]
+            return {"+": np.add, "-": np.subtract, "*": np.multiply}[symbol](*found)
+    known = [*axes, *(n for n in scope.arrays if scope.constant(n) is not None)]
+    if isinstance(e, x.Name) and not e.indices and e.name not in scope.arrays:
+        raise error_at(e.at, f"index '{e}', which is no iterator here", _iterators(e.name, known))
+    raise error_at(e.at, f"'{e}' as an index", "iterators and whole numbers with + - *")
+
+
+def _iterators(name: str, known: list[str]) -> str:
+    return nearest(name, known) if known else "a whole number, or foreach behind the statement"
+
+
+def located(scope: Scope, node: x.Name, array: Array, axes: Axes) -> list[np.ndarray]:
+    """Positions along each dimension of an array, by iterators and then by whole dimensions."""
+    given = node.indices or (x.Whole(),) * len(array.dims)
+    if len(given) != len(array.dims):
+        count = len(given)
+        found = f"{count} {'index' if count == 1 else 'indices'} in '{node}'"
+        wanted = f"{len(array.dims)}: {array.said}" if array.dims else "none: it is a number"
+        raise error_at(node.at, found, wanted)
+    whole = len(whole_of(node, array))
+    rank, indices = len(axes) + whole, []
+    opened = len(axes)
+    for i, dim in zip(given, array.dims, strict=True):
+        if isinstance(i, x.Whole):
+            values = np.arange(len(dim)).reshape([-1 if k == opened else 1 for k in range(rank)])
+            indices.append(values)
+            opened += 1
+            continue
+        values = index_of(scope, i, axes)
+        at = dim.positions(values)
+        if np.any(at < 0):
+            raise _outside(node, i, dim, axes, np.broadcast_to(values, at.shape), at)
+        shape = np.shape(at) or [1] * len(axes)
+        indices.append(np.reshape(at, [*shape, *[1] * whole]))
+    return indices
+
+
+def whole_of(node: x.Name, array: Array) -> list[IndexSet]:
+    """The dimensions of an array that a name takes whole."""
+    if not node.indices:
+        return list(array.dims)
+    pairs = zip(node.indices, array.dims, strict=True)
+    return [dim for i, dim in pairs if isinstance(i, x.Whole)]
+
+
+def _outside(node, index, dim, axes, values, at) -> InputError:
+    """Say which index lies outside its set, and when."""
+    first = np.argwhere(np.atleast_1d(at) < 0)[0]
+    when = [
+        f"{name} = {s.elements[i]}"
+        for (name, s), i, n in zip(axes.items(), first, np.shape(at), strict=False)
+        if n > 1
+    ]
+    value = np.atleast_1d(values)[tuple(first)]
+    said = f"index {index} = {value}" if str(index) != str(value) else f"index {value}"
+    found = f"{said} in '{node}'" + (f" at {', '.join(when)}" if when else "")
+    return error_at(index.at, found, f"an element of {dim}")
+
+
+# ---- what an expression reads, with every name checked
+
+
+def reads(scope: Scope, e: x.Expression, axes: Axes) -> Iterator[Read]:
+    """Walk an expression: check every name, and give every place where an array is read."""
+    match e:
+        case x.Name(name):
+            found = scope.arrays.get(name)
+            if found is not None:
+                yield Read(found, e, axes, located(scope, e, found, axes))
+            elif not (name in axes or name in CONSTANTS) or e.indices:
+                raise _unknown(scope, e, axes)
+        case x.Reduction():
+            yield from reads(scope, e.body, widened(scope, axes, e.iterators))
+        case x.Application():
+            _check_arguments(scope, e)
+            yield from (r for part in e.arguments for r in reads(scope, part, axes))
+        case x.Operation():
+            yield from (r for part in e.parts for r in reads(scope, part, axes))
+        case x.Whole():
+            raise error_at(e.at, "':'", "an expression")
+
+
+def _unknown(scope: Scope, e: x.Name, axes: Axes) -> InputError:
+    if e.name in axes:
+        return error_at(e.at, f"'{e}', an index of the iterator {e.name}", "an array")
+    if e.name in scope.sets:
+        return error_at(e.at, f"the set '{e.name}' in a formula", "a number or an array")
+    if e.name in FUNCTIONS or e.name in scope.functions:
+        return error_at(e.at, f"the function '{e.name}' without arguments", f"{e.name}(...)")
+    known = [*scope.arrays, *axes, *CONSTANTS]
+    return error_at(e.at, f"unknown name '{e.name}'", nearest(e.name, known))
+
+
+def _check_arguments(scope: Scope, e: x.Application) -> None:
+    if e.function in scope.functions:
+        least = most = len(scope.functions[e.function].arguments)
+    elif e.function in FUNCTIONS:
+        least, most = FUNCTIONS[e.function]
+    else:
+        known = nearest(e.function, [*scope.functions, *FUNCTIONS, *REDUCTIONS])
+        if e.function in scope.arrays:
+            known = f"{e.function}[...] for an element, or an operator before the parenthesis"
+        raise error_at(e.at, f"unknown function '{e.function}'", known)
+    if not least <= len(e.arguments) <= most:
+        wanted = f"{least}" if least == most else f"at least {least}"
+        raise error_at(e.at, f"{len(e.arguments)} arguments in '{e}'", wanted)

@@ -1,0 +1,113 @@
+"""What is wrong with a text that is not in the language, in words."""
+
+from __future__ import annotations
+
+import re
+from difflib import get_close_matches
+from typing import Any
+
+from lark import Token
+from lark.exceptions import UnexpectedCharacters, UnexpectedInput, UnexpectedToken
+
+from beamfit.errors import InputError
+from beamfit.language.expression import Place, error_at
+
+__all__ = ["check_brackets", "explained", "short"]
+
+# Brackets open at once, and letters of an odd word that a message shows.
+MOST_OPEN, LONGEST = 60, 30
+BRACKET = re.compile(
+    r"#[^\n]*|//[^\n]*|/\*.*?\*/|\"(?:\\.|[^\"\\\n])*\"|([(\[{])|([)\]}])", re.DOTALL
+)
+STARTS = """minimize maximize variable constraint solver mapping table network input output
+parameter set real function foreach forall layer connection gain in random seed weight"""
+KEYWORDS = STARTS.split()
+SAID = {
+    "NAME": "a name", "NUMBER": "a number", "SIGNED": "a number", "STRING": "a text in quotes",
+    "ADD": "an operator", "MULTIPLY": "an operator", "POWER": "an operator", "SEMICOLON": "';'",
+    "COLON": "':'", "COMMA": "','", "LPAR": "'('", "RPAR": "')'", "LSQB": "'['", "RSQB": "']'",
+    "LBRACE": "'{'", "RBRACE": "'}'", "EQUAL": "'='", "VBAR": "'|'", "COMPARE": "<=, >= or =",
+    "__ANON_0": "'->'", "__ANON_1": "'::'", "PART": "layer, connection, input, output or gain",
+    "$END": "the end",
+}  # fmt: skip
+
+
+def check_brackets(text: str) -> None:
+    """Refuse brackets that a parser could not follow, and name the one that is not closed."""
+    opened = []
+    for match in BRACKET.finditer(text):
+        if match[1]:
+            opened.append(match)
+        elif match[2] and opened and "([{".index(opened[-1][0]) == ")]}".index(match[0]):
+            opened.pop()
+        elif match[2]:
+            wanted = ")]}"["([{".index(opened[-1][0])] if opened else "no bracket here"
+            raise error_at(_at(text, match.start()), f"'{match[0]}'", f"'{wanted}'")
+        if len(opened) > MOST_OPEN:
+            found = f"more than {MOST_OPEN} brackets within each other"
+            raise error_at(_at(text, match.start()), found, "fewer")
+    if opened:
+        at = _at(text, opened[-1].start())
+        closing = ")]}"["([{".index(opened[-1][0])]
+        raise error_at(at, f"'{opened[-1][0]}' that is not closed", f"'{closing}' behind it")
+
+
+def _at(text: str, position: int) -> Place:
+    before = text[:position]
+    return Place(before.count("\n") + 1, position - before.rfind("\n"))
+
+
+def explained(error: UnexpectedInput, text: str) -> InputError:
+    """Say where the text stops making sense, what stands there, and what could."""
+    at = Place(error.line, error.column)
+    if isinstance(error, UnexpectedCharacters):
+        expected = _choices(error.allowed or ())
+        odd = text[error.pos_in_stream]
+        return error_at(at, f"{odd!r}", expected)
+    if not isinstance(error, UnexpectedToken):
+        return error_at(at, "text that ends too early", "the rest of a statement")
+    word, accepted = str(error.token), set(error.accepts or error.expected)
+    before = error.token_history[-1] if error.token_history else None
+    if hint := _misspelt(before, error.token, accepted):
+        return hint
+    ended = before is not None and (error.token.type == "$END" or before.line < error.token.line)
+    if "SEMICOLON" in accepted and ended:
+        behind = Place(before.end_line, before.end_column)
+        return error_at(behind, f"no ';' behind '{short(before)}'", "';' at the end of a statement")
+    if error.token.type == "$END":
+        at = Place(before.end_line, before.end_column) if before is not None else at
+        return error_at(at, "the end of the text", _choices(accepted))
+    if word == "*" and before == "*":
+        return error_at(Place(before.line, before.column), "'**'", "'^' for powers")
+    return error_at(at, f"'{short(word)}'", _choices(accepted))
+
+
+def _misspelt(before: Token | None, token: Token, accepted: set[str]) -> InputError | None:
+    """A word that is nearly a keyword: the one that surprises, or the one before it."""
+    words = {name.lower() for name in accepted} & set(KEYWORDS)
+    close = get_close_matches(str(token).lower(), sorted(words), n=1, cutoff=0.6)
+    if token.type == "NAME" and close:
+        return error_at(Place(token.line, token.column), f"'{short(token)}'",
+                        f"{_choices(accepted)} (did you mean {close[0]}?)")  # fmt: skip
+    if before is None or before.type != "NAME" or str(before) in KEYWORDS:
+        return None
+    at = Place(before.line, before.column)
+    if token.type == "IN" or (token.type == "NAME" and "IN" in accepted):
+        return None
+    close = get_close_matches(str(before).lower(), KEYWORDS, n=1, cutoff=0.6)
+    if token.type in ("NAME", "STRING") and close:
+        return error_at(at, f"'{short(before)}'", f"a statement (did you mean {close[0]}?)")
+    return None
+
+
+def _choices(accepted: Any) -> str:
+    """What could stand there, in words."""
+    said = {SAID.get(name, name.lower()) for name in accepted}
+    if {"real", "set", "a name"} <= said:
+        return "a statement"
+    return " or ".join(filter(None, [", ".join(sorted(said)[:-1]), *sorted(said)[-1:]]))
+
+
+def short(word: str) -> str:
+    """A word as a message shows it."""
+    return word if len(word) <= LONGEST else word[:LONGEST] + "..."

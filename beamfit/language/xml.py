@@ -1,0 +1,404 @@
+"""The report's XML form of a document (its Figure 3 and Appendices A to D), read and written.
+
+Dimensions, ranges and attributes are those of the report; `lower` and `upper` of a network's
+input and `cells` of a gain are beamfit's own (`beamfit.language.network`).
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+from xml.etree import ElementTree as Plain
+from xml.sax import ContentHandler, SAXParseException
+
+from defusedxml import DefusedXmlException
+from defusedxml.sax import parseString
+
+from beamfit.errors import InputError, nearest
+from beamfit.language import document as d
+from beamfit.language.expression import Elements, Place, error_at
+from beamfit.language.parse import parse_statements
+from beamfit.language.text import format_statements, number_text_or_inf
+
+__all__ = ["format_xml", "parse_xml"]
+
+MOST_DEEP = 40
+MLP = "com.pav.pdas.model.mlp.MlpMapping"
+EXPRESSIONS = "com.pav.pdas.model.expression.ExpressionMapping"
+NLP = "com.pav.pdas.optimization.common.NLPProblem"
+NAME = re.compile(r"[^\W\d]\w*")
+KNOWN = {
+    "formulation": "problem mapping solver",
+    "problem": "variable constraint objective",
+    "mapping": "data set mapping input output parameter expressions",
+    "network": "input output gain layer connection",
+    "solver": "parameter",
+    "input": "dimension values", "output": "dimension", "parameter": "dimension values",
+    "set": "elements",
+}  # fmt: skip
+
+
+class Node(NamedTuple):
+    """An element: its text begins where it stands in the file, so that places in it are right."""
+
+    tag: str
+    given: dict[str, str]
+    children: list[Node]
+    text: list[str]
+    at: Place
+
+    def all(self, tag: str) -> list[Node]:
+        """Children of a name."""
+        return [child for child in self.children if child.tag == tag]
+
+    def error(self, found: str, expected: str) -> InputError:
+        """What is wrong with it."""
+        return error_at(self.at, found, expected)
+
+    def need(self, key: str) -> str:
+        """An attribute that must be there."""
+        if key not in self.given:
+            raise self.error(f"<{self.tag}> without {key}", f"an attribute {key}='...'")
+        return self.given[key]
+
+    def name(self, key: str = "name") -> str:
+        """An attribute that names something in expressions."""
+        if not NAME.fullmatch(self.need(key)):
+            raise self.error(f"{key}='{self.given[key]}'", "a name of letters, digits and _")
+        return self.given[key]
+
+    def number(self, key: str, default: Any, kind: Callable[[str], Any] = float) -> Any:
+        """A numeric attribute."""
+        if key not in self.given:
+            return default
+        try:
+            value = kind(self.given[key].strip())
+        except (ValueError, OverflowError):
+            value = math.nan
+        if value != value:
+            said = "a whole number" if kind is int else "a number"
+            raise self.error(f"{key}='{self.given[key]}' in <{self.tag}>", said)
+        return value
+
+
+class _Reader(ContentHandler):
+    """Builds nodes; text is padded to the line and column where it stands in the file."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.root = Node("", {}, [], [], Place(1, 1))
+        self.open = [self.root]
+        self.end = Place(1, 1)
+
+    def _here(self) -> Place:
+        return Place(self._locator.getLineNumber(), self._locator.getColumnNumber() + 1)
+
+    def startElement(self, name, attrs):
+        node = Node(name, dict(attrs.items()), [], [], self._here())
+        if len(self.open) > MOST_DEEP:
+            raise node.error(f"elements within {MOST_DEEP} others", "fewer")
+        self.open[-1].children.append(node)
+        self.open.append(node)
+        self.end = Place(1, 1)
+
+    def endElement(self, name):
+        self.open.pop()
+        self.end = Place(1, 1)
+
+    def characters(self, content):
+        if self.open[-1].tag == "expressions":
+            here = self._here()
+            lines = here.line - self.end.line
+            blanks = here.column - (1 if lines else self.end.column)
+            self.open[-1].text.append("\n" * lines + " " * blanks)
+            more = content.count("\n")
+            column = len(content) - content.rfind("\n") if more else here.column + len(content)
+            self.end = Place(here.line + more, column)
+        self.open[-1].text.append(content)
+
+
+def parse_xml(text: str) -> d.Document:
+    """Read a document from its XML form.
+
+    Parameters
+    ----------
+    text : str
+        With root element ``<formulation>``, or ``<mapping>`` for a mapping without a problem.
+
+    Returns
+    -------
+    Document
+
+    Raises
+    ------
+    InputError
+        With line and column, if it is no such document. Entities, document types and deep nesting
+        are refused.
+
+    Examples
+    --------
+    >>> found = parse_xml("<mapping><output name='y'/><expressions>y = 2;</expressions></mapping>")
+    >>> found.mapping.outputs[0].name, str(found.mapping.statements[0].value)
+    ('y', '2')
+    """
+    reader = _Reader()
+    try:
+        parseString(text.encode(), reader, forbid_dtd=True)
+    except SAXParseException as error:
+        at = Place(error.getLineNumber(), error.getColumnNumber() + 1)
+        raise error_at(at, error.getMessage(), "well-formed XML") from None
+    except DefusedXmlException as error:
+        raise InputError(f"{error}", "XML without entities or a document type") from None
+    (root,) = reader.root.children
+    if root.tag == "mapping":
+        return d.Document(_mapping(root))
+    if root.tag != "formulation":
+        raise root.error(f"an element <{root.tag}>", "<formulation> or <mapping>")
+    _check(root, "formulation")
+    mapping, problem, solver = (_one(root, tag) for tag in ("mapping", "problem", "solver"))
+    if mapping is None:
+        raise root.error("<formulation> without <mapping>", "a mapping to optimise")
+    return d.Document(
+        _mapping(mapping),
+        None if problem is None else _problem(problem),
+        None if solver is None else _solver(solver),
+    )
+
+
+def _check(node: Node, kind: str) -> None:
+    known = KNOWN[kind].split()
+    for child in node.children:
+        if child.tag not in known:
+            raise child.error(f"<{child.tag}> in <{node.tag}>", nearest(child.tag, known))
+    if kind != "expressions" and "".join(node.text).strip() and kind not in ("input", "parameter"):
+        raise node.error(f"text in <{node.tag}>", "elements only")
+
+
+def _one(node: Node, tag: str) -> Node | None:
+    found = node.all(tag)
+    if len(found) > 1:
+        raise found[1].error(f"a second <{tag}>", "one")
+    return found[0] if found else None
+
+
+def _problem(node: Node) -> d.Problem:
+    _check(node, "problem")
+    direction = node.given.get("direction", "minimize").strip().lower()
+    if direction not in ("minimize", "maximize"):
+        found = f"direction='{direction}'"
+        raise node.error(found, nearest(direction, ["minimize", "maximize"]))
+    goals = tuple(
+        d.Goal(*_labels(e), e.number("coefficient", 1.0), at=e.at) for e in node.all("objective")
+    )
+    limits = tuple(d.Limit(*_labels(e), *_bounds(e), at=e.at) for e in node.all("constraint"))
+    variables = tuple(map(_variable, node.all("variable")))
+    return d.Problem(goals, variables, limits, direction == "maximize")
+
+
+def _labels(e: Node) -> tuple[str, str]:
+    key = "modelVariable" if "modelVariable" in e.given else "label"
+    return e.given.get("label", e.name(key)), e.name(key)
+
+
+def _bounds(e: Node) -> tuple[float, float]:
+    return e.number("lower", -math.inf), e.number("upper", math.inf)
+
+
+def _variable(e: Node) -> d.Variable:
+    low, high = _bounds(e)
+    random = None
+    if e.given.get("useRandomInitial", "false").strip().lower() == "true":
+        random = e.number("randomLower", low), e.number("randomUpper", high)
+    seed = e.number("randomSeed", 0, int)
+    if seed < 0:
+        raise e.error(f"randomSeed='{seed}'", "a whole number from 0")
+    return d.Variable(*_labels(e), low, high, e.number("value", None), random, seed, at=e.at)
+
+
+def _solver(node: Node) -> d.Solver:
+    _check(node, "solver")
+    settings = tuple((e.need("name"), e.need("value")) for e in node.all("parameter"))
+    return d.Solver(node.given.get("classname", "default"), settings, node.at)
+
+
+# ---- mappings
+
+
+def _mapping(node: Node) -> d.Mapping:
+    kind = node.given.get("classname", EXPRESSIONS)
+    if kind != EXPRESSIONS:
+        raise node.error(f"classname='{kind}'", nearest(kind, [EXPRESSIONS, MLP]))
+    _check(node, "mapping")
+    tables = tuple(
+        d.DataTable(e.name(), e.need("file"), e.number("rowCount", None, int),
+                    e.number("columnCount", None, int), e.at)
+        for e in node.all("data")
+    )  # fmt: skip
+    inner = tuple(_network(e) if e.given.get("classname") == MLP else _mapping(e)
+                  for e in node.all("mapping"))  # fmt: skip
+    for e in node.all("mapping"):
+        e.name()
+    groups = (tuple(map(_declared, node.all(tag))) for tag in ("input", "output", "parameter"))
+    sets = tuple(map(_set, node.all("set")))
+    text = _one(node, "expressions")
+    statements = parse_statements("".join(text.text)) if text else ()
+    return d.Mapping(
+        node.given.get("name", ""), tables, inner, *groups, (*sets, *statements), node.at
+    )
+
+
+def _declared(e: Node) -> d.Declared:
+    _check(e, e.tag)
+    dimensions: list[str | int] = []
+    for dim in e.all("dimension"):
+        if "set" in dim.given:
+            dimensions.append(dim.name("set"))
+        else:
+            dim.need("size")
+            dimensions.append(dim.number("size", 1, int))
+    values = _one(e, "values")
+    if values is not None:
+        return d.Declared(e.name(), tuple(dimensions), _values(values), e.at)
+    given = (e.number("value", 0.0),) if "value" in e.given else None
+    return d.Declared(e.name(), tuple(dimensions), given, e.at)
+
+
+def _values(e: Node) -> tuple[float, ...]:
+    words = "".join(e.text).strip().removeprefix("[").removesuffix("]").replace(",", " ").split()
+    try:
+        return tuple(float(word) for word in words)
+    except ValueError as error:
+        raise e.error(f"{error} in <{e.tag}>", "numbers separated by commas") from None
+
+
+def _set(e: Node) -> d.IndexedSet:
+    _check(e, "set")
+    inner = _one(e, "elements")
+    if inner is None:
+        raise e.error("<set> without <elements>", "<elements type='range' start='1' stop='9'/>")
+    kind = inner.given.get("type", "range")
+    if kind not in ("range", "list"):
+        raise inner.error(f"type='{kind}'", nearest(kind, ["range", "list"]))
+    numbers = "".join(inner.text).replace(",", " ").split()
+    if kind == "range":
+        keys = ("start", "stop", *(["step"] if "step" in inner.given else []))
+        numbers = [str(inner.number(key, inner.need(key), int)) for key in keys]
+    parts = parse_statements(f"set s = |{', '.join(numbers)}|;")[0].elements.parts
+    return d.IndexedSet(e.name(), Elements(parts, kind == "range", e.at), e.at)
+
+
+def _network(node: Node) -> d.Network:
+    _check(node, "network")
+    parts = []
+    for e in node.children:
+        heads = ("srcName", "dstName") if e.tag == "connection" else ("name",)
+        rest = [(k, v) for k, v in e.given.items() if k not in heads]
+        values = _values(e) if "".join(e.text).strip() else None
+        head = [(k, e.name(k)) for k in heads]
+        parts.append(d.Part(e.tag, (*head, *rest), values, e.at))
+    return d.Network(node.name(), tuple(parts), node.at)
+
+
+# ---- writing
+
+
+def format_xml(document: d.Document) -> str:
+    """Write a document in the report's XML form.
+
+    Parameters
+    ----------
+    document : Document
+        What to write.
+
+    Returns
+    -------
+    str
+    """
+    mapping = _mapping_element(document.mapping)
+    root = mapping
+    if document.problem is not None or document.solver is not None:
+        root = Plain.Element("formulation")
+        root.extend(_problem_elements(document.problem))
+        root.append(mapping)
+        if document.solver is not None:
+            e = Plain.SubElement(root, "solver", classname=document.solver.name)
+            for name, value in document.solver.settings:
+                Plain.SubElement(e, "parameter", name=name, value=value)
+    Plain.indent(root)
+    head = '<?xml version="1.0" encoding="UTF-8"?>\n'
+    return head + Plain.tostring(root, encoding="unicode") + "\n"
+
+
+def _problem_elements(p: d.Problem | None) -> list[Plain.Element]:
+    if p is None:
+        return []
+    e = Plain.Element("problem", classname=NLP, direction="maximize" if p.maximize else "minimize")
+    for v in p.variables:
+        given = _labelled(v)
+        if v.value is not None:
+            given["value"] = number_text_or_inf(v.value)
+        if v.random is not None:
+            low, high = map(number_text_or_inf, v.random)
+            given |= {"useRandomInitial": "true", "randomLower": low, "randomUpper": high}
+        if v.seed:
+            given["randomSeed"] = str(v.seed)
+        Plain.SubElement(e, "variable", given)
+    for limit in p.limits:
+        Plain.SubElement(e, "constraint", _labelled(limit))
+    for goal in p.goals:
+        weight = {} if goal.weight == 1.0 else {"coefficient": number_text_or_inf(goal.weight)}
+        Plain.SubElement(e, "objective", _labelled(goal) | weight)
+    return [e]
+
+
+def _labelled(of: d.Variable | d.Limit | d.Goal) -> dict[str, str]:
+    given = {"label": of.label, "modelVariable": of.model}
+    for key in ("lower", "upper"):
+        if math.isfinite(value := getattr(of, key, math.inf)):
+            given[key] = number_text_or_inf(value)
+    return given
+
+
+def _mapping_element(m: d.Mapping) -> Plain.Element:
+    e = Plain.Element("mapping", {"classname": EXPRESSIONS} | ({"name": m.name} if m.name else {}))
+    for t in m.tables:
+        size = {"rowCount": t.rows, "columnCount": t.columns}
+        given = {k: str(v) for k, v in size.items() if v is not None}
+        Plain.SubElement(e, "data", {"name": t.name, "file": t.file} | given)
+    for inner in m.mappings:
+        e.append(
+            _mapping_element(inner) if isinstance(inner, d.Mapping) else _network_element(inner)
+        )
+    for tag, group in (("input", m.inputs), ("output", m.outputs), ("parameter", m.parameters)):
+        for declared in group:
+            _declare(Plain.SubElement(e, tag, name=declared.name), declared)
+    if m.statements:
+        Plain.SubElement(e, "expressions").text = f"\n{format_statements(m.statements)}\n"
+    return e
+
+
+def _declare(e: Plain.Element, of: d.Declared) -> None:
+    if of.dimensions:
+        e.set("isScalar", "false")
+    for dim in of.dimensions:
+        given = {"type": "ID", "set": dim} if isinstance(dim, str) else None
+        Plain.SubElement(e, "dimension", given or {"type": "size", "size": str(dim)})
+    if of.values is not None and (of.dimensions or len(of.values) != 1):
+        Plain.SubElement(e, "values").text = _row(of.values)
+    elif of.values is not None:
+        e.set("value", number_text_or_inf(of.values[0]))
+
+
+def _row(values: Sequence[float]) -> str:
+    return f"[{', '.join(map(number_text_or_inf, values))}]"
+
+
+def _network_element(n: d.Network) -> Plain.Element:
+    e = Plain.Element("mapping", classname=MLP, name=n.name)
+    for part in n.parts:
+        inner = Plain.SubElement(e, part.kind, dict(part.attributes))
+        if part.values is not None:
+            inner.text = ", ".join(map(number_text_or_inf, part.values))
+    return e
