@@ -29,6 +29,7 @@ Examples:
   beamfit lifetime fill1.csv fill2.h5 --ring lattices/spear3_2003.toml
   beamfit lifetime fill1.csv --ring ring.toml --report fill1.html --json
   beamfit lifetime measurements/spear3_shift_simulated.csv --ring lattices/spear3_2003.toml --study
+  beamfit lifetime shift.csv --ring ring.toml --study --prior rf_voltage=1+-1%
   beamfit lifetime shift.csv --ring ring.toml --study --network correction
   beamfit lifetime export.csv --time Time --current SR:DCCT:CURRENT:mA --skip-bad
 """
@@ -64,7 +65,7 @@ Examples:
     help="Header of the beam current and its unit, mA, A or uA, after the last colon, such as "
     "SR:DCCT:CURRENT:mA. With --time or --current other columns of unknown names are left aside.",
 )
-@options("ignore skip-bad sample store seed report json")
+@options("prior ignore skip-bad sample store seed report json")
 def lifetime(
     record: tuple[str, ...],
     ring: str | None,
@@ -72,6 +73,7 @@ def lifetime(
     network: str | None,
     time: str | None,
     current: str | None,
+    priors: dict[str, tuple[float, float]] | None,
     ignore: tuple[str, ...],
     skip_bad: bool,
     sample: bool,
@@ -84,13 +86,14 @@ def lifetime(
 
     RECORD is a CSV or HDF5 file with columns such as time_s (or ISO time), beam_current_mA,
     beam_current_error_mA, and optionally rf_voltage_kV, scraper_y_mm, pressure_Pa, bunches,
-    bunch_length_mm; or CSV or JSON of the EPICS Archiver Appliance; or lifetimes by current: tau_h, beam_current_mA.
+    bunch_length_mm; or CSV or JSON of the EPICS Archiver Appliance; or lifetimes by current:
+    tau_h, beam_current_mA.
     It is cut into decays at refills, losses and changes of setting. Each decay gives I0, a, b of
     dI/dt = -a I² - b I, the lifetime at its start, mean current and end, and a verdict.
     """
     sampling = Sampling(sample, store, seed)
     sampling.check()
-    _check_study(study, ring, network)
+    _check_study(study, ring, network, priors)
     said = {"time": time, "current": current, "ignore": ignore, "skip_bad": skip_bad}
     records = [read_lifetime_input(path, **said) for path in dict.fromkeys(record)]
     if len(records) < len(record):
@@ -111,7 +114,7 @@ def lifetime(
 
     studies = tuple(study_record(each, machine) for each in records)
     decays = [decay for each in studies for decay in each.decays]
-    shift = _shift(decays, machine, network) if study else None
+    shift = _shift(decays, machine, network, priors) if study else None
     posteriors = None
     if sample:
         sampling.check_one(len(decays))
@@ -150,11 +153,13 @@ def _lifetimes(tables: list[LifetimeTable], inputs: dict[str, str], as_json: boo
         terminal.line()
 
 
-def _check_study(study: bool, ring: str | None, network: str | None) -> None:
+def _check_study(study: bool, ring: str | None, network: str | None, priors: dict | None) -> None:
     if study and ring is None:
         raise InputError("--study without a ring", "--ring FILE.toml")
     if network is not None and not study:
         raise InputError("--network without a study", "--study --ring FILE.toml")
+    if priors and not study:
+        raise InputError("--prior without a study", "--study --ring FILE.toml")
 
 
 def _machine(path: str) -> Machine:
@@ -165,11 +170,16 @@ def _machine(path: str) -> Machine:
     return Machine(ring, operation)
 
 
-def _shift(decays: list[Decay], machine: Machine, network: str | None) -> Shift:
+def _shift(
+    decays: list[Decay],
+    machine: Machine,
+    network: str | None,
+    priors: dict[str, tuple[float, float]] | None,
+) -> Shift:
     from beamfit.studies.decay.network import Network
     from beamfit.studies.decay.shift import study_shift
 
-    return study_shift(decays, machine, network=network and Network(network))
+    return study_shift(decays, machine, network=network and Network(network), priors=priors)
 
 
 def _show(
@@ -252,7 +262,9 @@ def _show_shift(terminal: Terminal, shift: Shift) -> None:
     table = labelled("First principles fitted to", names, shift_rows(shift))
     terminal.table(table, [fit.status])
     terminal.verdict("all decays", fit.status, fit.message)
-    terminal.verdict("operating point", Status.converged, shift.best.message)
+    if shift.untold:
+        terminal.verdict("loss budget", Status.unidentified, shift.untold)
+    terminal.verdict("operating point", shift.best.status, shift.best.message)
     if shift.anomaly is not None:
         terminal.verdict("second half", shift.anomaly.status, shift.anomaly.message)
     if shift.network is not None:

@@ -103,7 +103,8 @@ SHARED: dict[str, Callable[..., Any]] = {
         multiple=True,
         metavar="NAME=MEAN+-SD",
         callback=_parsed(priors_of),
-        help="Calibration: what is known of a number, such as Q2.slope=167.23+-3.3446 (or ±).",
+        help="What is known of a number: calibration, Q2.slope=167.23+-3.3446 (or ±); a study of "
+        "lifetimes, its scales, and rf_voltage=1+-1% for the calibration of that reading.",
     ),
     "bounds": click.option(
         "--bounds",

@@ -196,15 +196,27 @@ class Terms(NamedTuple):
         P1/P0, the rise of the pressure with current over the base pressure, 1/mA.
     current : float
         Mean current, mA.
+    voltages : array, shape (k,), or None
+        True over stated RF voltage where the parts, then of shape (k,), were computed: evenly
+        spaced. None where the voltage is taken as stated.
     """
 
     parts: tuple[Array, ...]
     pressure: Array
     rise: Array
     current: Array
+    voltages: Array | None = None
+
+    def at_voltage(self, scale: Array) -> tuple[Array, ...]:
+        """The parts at a true over stated RF voltage, linear in between."""
+        spacing = self.voltages[..., 1:2] - self.voltages[..., :1]
+        share = jnp.maximum(1 - jnp.abs(scale - self.voltages) / spacing, 0.0)
+        return tuple(jnp.sum(part * share, axis=-1) for part in self.parts)
 
 
-def loss_terms(ring: Ring, operation: Operation, current: Array) -> Terms:
+def loss_terms(
+    ring: Ring, operation: Operation, current: Array, voltages: Array | None = None
+) -> Terms:
     """Compute the terms of one setting.
 
     Parameters
@@ -215,6 +227,8 @@ def loss_terms(ring: Ring, operation: Operation, current: Array) -> Terms:
         Settings and vacuum.
     current : float
         Mean current, mA.
+    voltages : array, shape (k,), optional
+        As of `Terms`, where the RF voltage has a scale of its own.
 
     Returns
     -------
@@ -235,11 +249,18 @@ def loss_terms(ring: Ring, operation: Operation, current: Array) -> Terms:
     1.0e-07 Pa, P1/P0 = 0.008 /mA
     """
     base, slope = operation.pressure_base, operation.pressure_slope
+    if voltages is None:
+        parts = terms_of(ring, operation, current)
+    else:
+        settings = [operation._replace(rf_voltage=operation.rf_voltage * v) for v in voltages]
+        each = [terms_of(ring, setting, current) for setting in settings]
+        parts = tuple(jnp.stack(part, axis=-1) for part in zip(*each, strict=True))
     return Terms(
-        terms_of(ring, operation, current),
+        parts,
         pressure=jnp.asarray(base + slope * current, float),
         rise=jnp.asarray(slope / jnp.maximum(base, NO_PRESSURE), float),
         current=jnp.asarray(current, float),
+        voltages=None if voltages is None else jnp.asarray(voltages, float),
     )
 
 
@@ -248,9 +269,10 @@ def scaled_losses(scales: Array, terms: Terms, pressure_factor: Array = 1.0) -> 
 
     Parameters
     ----------
-    scales : array, shape (4,)
+    scales : array, shape (4,) or (5,)
         A factor for each of `SCALES`: on Touschek, bremsstrahlung, elastic scattering, and on
-        P1/P0 (desorption); 1 is the ring file. What is not fitted keeps its size.
+        P1/P0 (desorption); 1 is the ring file. What is not fitted keeps its size. A fifth is the
+        true over the stated RF voltage, for terms with `voltages`.
     terms : Terms
         First principles at one setting.
     pressure_factor : float, optional
@@ -282,11 +304,11 @@ def scaled_losses(scales: Array, terms: Terms, pressure_factor: Array = 1.0) -> 
 
 def scaled_parts(scales: Array, terms: Terms, pressure_factor: Array = 1.0) -> Losses:
     """The parts that `scaled_losses` adds up."""
-    *sizes, desorption = jnp.asarray(scales, float)
+    *sizes, desorption = jnp.asarray(scales, float)[: len(SCALES)]
+    parts = terms.parts if terms.voltages is None else terms.at_voltage(scales[len(SCALES)])
     factors = iter(sizes)
     parts = tuple(
-        term * next(factors) if m.vary else term
-        for m, term in zip(MECHANISMS, terms.parts, strict=True)
+        term * next(factors) if m.vary else term for m, term in zip(MECHANISMS, parts, strict=True)
     )
     rise = desorption * terms.rise
     base = terms.pressure * pressure_factor / (1 + rise * terms.current)

@@ -174,8 +174,10 @@ def _shift_verdicts(shift: Shift | None) -> list[Verdict]:
     fit, best, change = shift.fit, shift.best, shift.anomaly
     said = [
         Verdict(fit.status, f"{len(fit.names)} decays together", fit.message),
-        Verdict(Status.converged, f"best lifetime {best.lifetime}", best.message),
+        Verdict(best.status, f"best lifetime {best.lifetime}", best.message),
     ]
+    if shift.untold:
+        said.append(Verdict(Status.unidentified, "loss budget", shift.untold))
     if change is not None:
         said.append(Verdict(change.status, "second half against the first", change.message))
     return said

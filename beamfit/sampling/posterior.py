@@ -63,6 +63,8 @@ class Interval(NamedTuple):
     separable: bool = True
 
     def __str__(self) -> str:
+        if not math.isfinite(self.median):
+            return f"{self.name}: not determined"
         said = f"{self.name}: {self.median:.4g} ({self.lower:.4g} to {self.upper:.4g}) {self.unit}"
         return said if self.separable else f"{said}, not separable"
 

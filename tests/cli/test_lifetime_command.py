@@ -239,6 +239,15 @@ def test_a_network_of_the_losses(run):
     assert "--study" in err
 
 
+def test_what_is_known_of_scales_needs_a_study(run):
+    status, out, err = run("lifetime", APS, "--prior", "rf_voltage=1+-1%")
+    assert (status, out) == (2, "")
+    assert "--prior without a study" in err
+    status, out, err = run("lifetime", APS, "--ring", RING, "--study", "--prior", "voltage=1+-1%")
+    assert (status, out) == (2, "")
+    assert "rf_voltage" in err
+
+
 def test_a_study_needs_a_ring(run):
     status, out, err = run("lifetime", APS, "--study")
     assert (status, out) == (2, "")

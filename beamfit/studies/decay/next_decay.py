@@ -12,7 +12,7 @@ import numpy as np
 from beamfit.errors import InputError
 from beamfit.greybox.design import Information, scores
 from beamfit.lifetime.decay import current as decayed
-from beamfit.lifetime.losses import Terms, loss_terms, scaled_losses
+from beamfit.lifetime.losses import Terms, scaled_losses
 from beamfit.lifetime.ring import Operation
 from beamfit.studies.decay.scales import ScaleFit, pulls, whitener
 from beamfit.studies.decay.summary import Summaries, information_root, loss_parts
@@ -69,7 +69,7 @@ _slopes = jax.jit(jax.jacfwd(pulls))
 def _rows(fit: ScaleFit, candidate: Candidate) -> np.ndarray:
     """What the candidate would measure by the scales, over its errors, shape (2, scales)."""
     scales = jnp.asarray(fit.vector)
-    terms = loss_terms(fit.machine.ring, candidate.operation, candidate.current)
+    terms = fit.terms_at(candidate.operation, candidate.current)
     a, b = scaled_losses(scales, terms)
     time = jnp.linspace(0.0, candidate.duration, READINGS)
     mean = jnp.mean(decayed(time, candidate.current, a, b))

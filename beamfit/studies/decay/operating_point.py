@@ -12,7 +12,7 @@ from beamfit.errors import InputError
 from beamfit.lifetime.decay import HOUR
 from beamfit.lifetime.losses import Terms, loss_terms, scaled_losses
 from beamfit.lifetime.ring import Operation
-from beamfit.quantity import Quantity
+from beamfit.quantity import Quantity, Status
 from beamfit.sampling.posterior import Posterior
 from beamfit.studies.decay.scales import ScaleFit, losses_of
 
@@ -49,9 +49,9 @@ class BestPoint(NamedTuple):
     scraper_y, bunches : float
         m, and number: always the upper limits.
     lifetime : Quantity
-        Lifetime there, h.
+        Lifetime there, h; NaN where the decays do not tell it.
     usual : Quantity
-        Lifetime at the machine's usual settings, h.
+        Lifetime at the machine's usual settings, h; NaN where the decays do not tell it.
     message : str
         What limits it.
     """
@@ -63,12 +63,23 @@ class BestPoint(NamedTuple):
     usual: Quantity
     message: str
 
+    @property
+    def status(self) -> Status:
+        """`unidentified` where the decays do not tell the lifetime there."""
+        return Status.unidentified if self.lifetime.error is None else Status.converged
+
 
 def _over_voltages(fit: ScaleFit, operation: Operation, current: float, at: np.ndarray) -> Terms:
     def one(voltage):
         return loss_terms(fit.machine.ring, operation._replace(rf_voltage=voltage), current)
 
-    return jax.lax.map(one, jnp.asarray(at))
+    if fit.voltages is None:
+        return jax.lax.map(one, jnp.asarray(at))
+    shape = (at.size, fit.voltages.size)
+    found = jax.lax.map(one, jnp.asarray(np.outer(at, fit.voltages).ravel()))
+    parts = tuple(part.reshape(shape) for part in found.parts)
+    rest = [part.reshape(shape)[:, 0] for part in found[1:-1]]
+    return Terms(parts, *rest, jnp.broadcast_to(fit.voltages, shape))
 
 
 def _best(draws: np.ndarray, terms: Terms, at: np.ndarray) -> np.ndarray:
@@ -82,8 +93,16 @@ def _best(draws: np.ndarray, terms: Terms, at: np.ndarray) -> np.ndarray:
 
 
 def _lifetime(fit: ScaleFit, draws: np.ndarray, operation: Operation, current: float) -> Quantity:
-    a, b = losses_of(draws, loss_terms(fit.machine.ring, operation, current))
+    terms = fit.terms_at(operation, current)
+    a, b = losses_of(draws, terms)
     hours = np.asarray(1 / (a * current + b) / HOUR)
+
+    def rate(scales):
+        a, b = scaled_losses(scales, terms)
+        return a * current + b
+
+    if not fit.determines(rate):
+        return Quantity(float("nan"), None, "h")
     return Quantity(float(hours.mean()), float(hours.std()), "h")
 
 
@@ -141,16 +160,19 @@ def best_operating_point(
     error = float(np.hypot(found.std(), step / np.sqrt(12)))
     best = float(np.median(found))
     inside = low + step < best < high - step
+    reached = _lifetime(fit, draws, wide._replace(rf_voltage=best), current)
     message = (
         "The best RF voltage lies within its limits, where bucket and lattice acceptance meet."
         if inside
         else "The best RF voltage is at its limit: more range would help."
     )
+    if reached.error is None:
+        message, inside = "The decays do not tell the lifetime at other settings: vary them.", False
     return BestPoint(
         rf_voltage=Quantity(best, error if inside else None, "V"),
         scraper_y=limits.scraper_y[1],
         bunches=limits.bunches[1],
-        lifetime=_lifetime(fit, draws, wide._replace(rf_voltage=best), current),
+        lifetime=reached,
         usual=_lifetime(fit, draws, usual, current),
         message=message,
     )

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
@@ -13,19 +13,20 @@ import numpy as np
 from jax import Array
 
 from beamfit.errors import InputError, nearest
-from beamfit.greybox.covariance import spread_of
+from beamfit.greybox.covariance import Spread, spread_of
 from beamfit.greybox.fit import Fit
 from beamfit.greybox.posterior import Optimum, Statement, target_of
 from beamfit.greybox.problem import Free, Prior, Problem, Record, residual
 from beamfit.greybox.solve import solve
 from beamfit.lifetime.losses import SCALES, Terms, loss_terms, scaled_losses
+from beamfit.lifetime.ring import Operation
 from beamfit.quantity import Quantity, Status
 from beamfit.shown import shown
-from beamfit.statistics import POOR_FIT, chi2_probability
+from beamfit.studies.decay.scale_verdict import VOLTAGE, ScaleEvidence, finding_of_scales
 from beamfit.studies.decay.study import Decay, Machine, operation_during
 from beamfit.studies.decay.summary import Summaries, loss_parts, summarise
 from beamfit.table import json_of
-from beamfit.verdict import Finding, judge
+from beamfit.verdict import Finding
 
 if TYPE_CHECKING:
     from beamfit.sampling.posterior import Posterior
@@ -36,6 +37,7 @@ __all__ = [
     "losses_of",
     "pulls",
     "sample_scales",
+    "spread_of_scales",
     "stacked_terms",
     "whitener",
 ]
@@ -45,6 +47,11 @@ SEPARABLE = 1 / 3
 PRESSURE_ERROR = 0.05
 RECORD = "decays"
 LARGEST = 1e3
+# The scale of the RF voltage is sought within so many errors of its prior, and losses computed at
+# each of them.
+WIDEST = 3
+# A prior that data narrow by less than this share decides by itself.
+NARROWED = 0.2
 # How far walkers begin from scales that the decays do not tell.
 WIDTH = 0.3
 
@@ -63,7 +70,8 @@ class ScaleFit:
         Cause and remedy.
     scales : mapping of str to Quantity
         Factors on the ring file's values: touschek, bremsstrahlung, elastic, desorption, also as
-        attributes; without an error where the decays do not separate the mechanism.
+        attributes; without an error where the decays do not separate the mechanism. rf_voltage,
+        true over stated, where it has a prior.
     fit : Fit
         Of the core, with the priors among its parts.
     dof : int
@@ -110,13 +118,34 @@ class ScaleFit:
         """sqrt(chi²/dof) where above 1."""
         return math.sqrt(max(1.0, self.chi2 / self.dof)) if self.dof > 0 else 1.0
 
+    def terms_at(self, operation: Operation, current: float) -> Terms:
+        """First principles at a setting, for these scales."""
+        return loss_terms(self.machine.ring, operation, current, self.voltages)
+
+    @property
+    def voltages(self) -> np.ndarray | None:
+        """True over stated RF voltages at which losses are computed, if its scale is free."""
+        return None if self.terms.voltages is None else np.asarray(self.terms.voltages[0])
+
+    def determines(self, quantity: Callable[[Array], Array]) -> np.ndarray:
+        """Whether decays and priors, and not the limits of the scales alone, tell quantities.
+
+        ``quantity(scales)`` is an array in JAX; each is told if known to a third of itself, or of
+        what the ring file says where that is more.
+        """
+        vector = jnp.asarray(self.vector)
+        usual = jnp.ones_like(vector)
+        size = np.maximum(np.abs(quantity(vector)), np.abs(quantity(usual)))
+        error = spread_of_scales(self.fit).error(np.asarray(jax.jacfwd(quantity)(vector)))
+        return self.error_scale * error < SEPARABLE * size
+
     def __str__(self) -> str:
         rows = [f"{len(self.names)} decays: {self.status}. {self.message}"]
         rows += [f"  {name:15s} {scale}" for name, scale in self.scales.items()]
         return "\n".join([*rows, f"  chi²/dof {self.chi2:.4g}/{self.dof}"])
 
     def __getattr__(self, name: str) -> Quantity:
-        if name in SCALES and "scales" in vars(self):
+        if name in (*SCALES, VOLTAGE) and name in vars(self).get("scales", {}):
             return self.scales[name]
         raise AttributeError(f"a ScaleFit has no '{name}'")
 
@@ -131,12 +160,14 @@ class ScaleFit:
         return json_of({**verdict, **self.scales, **rest})
 
 
-def stacked_terms(decays: Sequence[Decay], machine: Machine) -> Terms:
-    """First principles at the settings of each decay, each of shape (n,)."""
-    rows = [
-        loss_terms(machine.ring, operation_during(d.segment, machine), d.fit.mean_current)
-        for d in decays
-    ]
+def stacked_terms(
+    decays: Sequence[Decay], machine: Machine, voltages: np.ndarray | None = None
+) -> Terms:
+    """First principles at the settings of each decay, each of shape (n,); `voltages` as of
+    `Terms`.
+    """
+    settings = [(operation_during(d.segment, machine), d.fit.mean_current) for d in decays]
+    rows = [loss_terms(machine.ring, *setting, voltages) for setting in settings]
     return jax.tree.map(lambda *parts: jnp.stack(parts), *rows)
 
 
@@ -168,11 +199,26 @@ def pulls(scales: Array, terms: Terms, measured: Summaries, weight: Array) -> Ar
 
 def _checked(priors: Mapping[str, tuple[float, float]]) -> list[Prior]:
     for name, (value, spread) in priors.items():
-        if name not in SCALES:
-            raise InputError(f"a prior on '{name}'", nearest(name, list(SCALES)))
+        if name not in (*SCALES, VOLTAGE):
+            raise InputError(f"a prior on '{name}'", nearest(name, [*SCALES, VOLTAGE]))
         if not (value >= 0 and spread > 0):
             raise InputError(f"{name} = {value} ± {spread}", "a mean of 0 or more, an error above")
-    return [Prior(name, *priors[name]) for name in SCALES if name in priors]
+    return [Prior(name, *priors[name]) for name in (*SCALES, VOLTAGE) if name in priors]
+
+
+def _voltages(
+    decays: Sequence[Decay], machine: Machine, prior: tuple[float, float] | None
+) -> np.ndarray | None:
+    """Where losses are computed for a free scale of the RF voltage: all must store a beam."""
+    if prior is None:
+        return None
+    mean, error = prior
+    found = mean + error * np.arange(-WIDEST, WIDEST + 1)
+    lowest = min(float(operation_during(d.segment, machine).rf_voltage) for d in decays)
+    if not found[0] * lowest > float(machine.ring.energy_loss):
+        expected = "an error at three times of which every decay is still stored"
+        raise InputError(f"rf_voltage = {mean:g} ± {error:g}", expected)
+    return found
 
 
 def fit_scales(
@@ -195,7 +241,8 @@ def fit_scales(
         Relative error of each record's pressure reading. A common error of the gauge is no such
         error: it scales bremsstrahlung and elastic scattering alike.
     priors : mapping of str to (mean, standard deviation), optional
-        What is known of the scales beforehand.
+        What is known of the scales beforehand. One on rf_voltage, such as (1, 0.01), is the
+        calibration of the reading, and has the true over the read voltage fitted too.
 
     Returns
     -------
@@ -215,40 +262,41 @@ def fit_scales(
     """
     if not decays:
         raise InputError("no decay", "one or more; several settings separate the mechanisms")
-    terms, measured = stacked_terms(decays, machine), summarise(tuple(decays))
-    known = _checked(priors or {})
+    priors = priors or {}
+    known, voltages = _checked(priors), _voltages(decays, machine, priors.get(VOLTAGE))
+    terms, measured = stacked_terms(decays, machine, voltages), summarise(tuple(decays))
     nothing = np.zeros(measured.parts.shape)
-    vector = np.array([priors[name][0] if name in (priors or {}) else 1.0 for name in SCALES])
+    names = (*SCALES, VOLTAGE)[: None if VOLTAGE in priors else -1]
+    vector = np.array([priors.get(name, (1.0, 0.0))[0] for name in names])
     for _ in range(5):  # the weight moves little with the scales: it settles in two or three
         weight = whitener(vector, terms, measured, pressure_error)
         record = Record(RECORD, _weighted, (terms, measured, weight), nothing, 1.0)
-        found = solve(_problem(vector, record, known))
+        found = solve(_problem(dict(zip(names, vector, strict=True)), record, known, voltages))
         vector = found.theta
     seen = int(np.sum(np.any(np.asarray(measured.root) != 0, axis=-1)))
-    covariance, dof = _covariance(found), seen - vector.size
+    spread, dof = spread_of_scales(found), seen - len(SCALES)
+    blind = ~np.isfinite(spread.error(np.eye(vector.size)))
+    covariance = np.where(np.outer(blind, blind), np.inf, spread.seen)
     chi2 = found.group(RECORD).chi2
     scale = math.sqrt(max(1.0, chi2 / dof)) if dof > 0 else 1.0
-    scales = _quantities(vector, np.sqrt(np.diag(covariance)), scale)
+    scales = _quantities(dict(zip(names, vector, strict=True)), covariance, scale, priors)
     ended = found.status not in (Status.not_converged, Status.not_finite)
-    verdict = judge(_Evidence(scales, chi2, dof, ended, len(decays)), RULES)
-    names = tuple(d.fit.record for d in decays)
+    verdict = finding_of_scales(ScaleEvidence(scales, chi2, dof, ended, len(decays)))
     return ScaleFit(
         verdict.status, verdict.cause, scales, found, dof, covariance, pressure_error, machine,
-        terms, measured, names,
+        terms, measured, tuple(d.fit.record for d in decays),
     )  # fmt: skip
 
 
-def _covariance(found: Fit) -> np.ndarray:
-    """Of the scales without their bounds, which stand for nothing known; infinite where open."""
+def spread_of_scales(found: Fit) -> Spread:
+    """Of the scales without their bounds, which stand for nothing known."""
     rows = np.asarray(_slopes(found.problem.core, found.theta))
     unbounded = np.full(found.theta.shape, np.inf)
-    spread = spread_of(rows, -unbounded, unbounded)
-    blind = ~np.isfinite(spread.error(np.eye(found.theta.size)))
-    return np.where(np.outer(blind, blind), np.inf, spread.seen)
+    return spread_of(rows, -unbounded, unbounded)
 
 
 def _vector(model: Mapping[str, Array]) -> Array:
-    return jnp.stack([model[name] for name in SCALES])
+    return jnp.stack([model[name] for name in (*SCALES, VOLTAGE) if name in model])
 
 
 def _weighted(model: Mapping[str, Array], data: tuple[Terms, Summaries, Array]) -> Array:
@@ -256,10 +304,13 @@ def _weighted(model: Mapping[str, Array], data: tuple[Terms, Summaries, Array]) 
     return pulls(_vector(model), *data)
 
 
-def _problem(vector: np.ndarray, record: Record, priors: Sequence[Prior]) -> Problem:
+def _problem(
+    scales: dict[str, float], record: Record, priors: Sequence[Prior], voltages: np.ndarray | None
+) -> Problem:
     """A factor for each of `SCALES`, the decays, and what is known beforehand."""
     free = [Free(name, 0.0, LARGEST) for name in SCALES]
-    return Problem(dict(zip(SCALES, vector, strict=True)), free, [record], priors)
+    free += [] if voltages is None else [Free(VOLTAGE, voltages[0], voltages[-1])]
+    return Problem(scales, free, [record], priors)
 
 
 @jax.jit
@@ -267,64 +318,21 @@ def _slopes(core: Any, theta: Array) -> Array:
     return jax.jacfwd(residual, 1)(core, theta)
 
 
-def _quantities(vector: np.ndarray, raw: np.ndarray, scale: float) -> dict[str, Quantity]:
-    errors = np.stack([scale * raw, raw], axis=1)
-    # Against 1 where the value is smaller: a mechanism found absent, 0.0 ± 0.1, is separable.
-    known = errors[:, 0] < SEPARABLE * np.maximum(vector, 1.0)
-    return {
-        name: Quantity(float(v), *((float(e[0]), "1", float(e[1])) if k else (None, "1")))
-        for name, v, e, k in zip(SCALES, vector, errors, known, strict=True)
-    }
-
-
-class _Evidence(NamedTuple):
-    """What the rules look at."""
-
-    scales: Mapping[str, Quantity]
-    chi2: float
-    dof: int
-    ended: bool
-    decays: int
-
-    @property
-    def improbable(self) -> bool:
-        """Whether chi² is."""
-        return self.dof > 0 and chi2_probability(self.chi2, self.dof) < POOR_FIT
-
-
-def _lost(e: _Evidence) -> Finding | None:
-    said = "The search for the scales did not end: look at the records."
-    return None if e.ended else Finding(Status.not_converged, said)
-
-
-def _blind(e: _Evidence) -> Finding | None:
-    names = [name for name, scale in e.scales.items() if scale.error is None]
-    if not names:
-        return None
-    advice = ", ".join(dict.fromkeys(SCALES[name] for name in names))
-    more = f" First principles miss something besides: chi²/dof is {e.chi2 / e.dof:.3g}."
-    return Finding(
-        Status.unidentified,
-        f"{' and '.join(names)} not separable by {e.decays} decays: vary {advice}, or give "
-        f"a prior.{more if e.improbable else ''}",
-    )
-
-
-def _improbable(e: _Evidence) -> Finding | None:
-    if not e.improbable:
-        return None
-    return Finding(
-        Status.poor_fit,
-        f"chi²/dof is {e.chi2 / e.dof:.3g}, improbable for first principles with these scales; "
-        "the errors are enlarged to match: look for an anomaly, or correct by a network.",
-    )
-
-
-def _separable(e: _Evidence) -> Finding:
-    return Finding(Status.converged, "Every mechanism is separable.")
-
-
-RULES = (_lost, _blind, _improbable, _separable)
+def _quantities(
+    scales: Mapping[str, float],
+    covariance: np.ndarray,
+    scale: float,
+    priors: Mapping[str, tuple[float, float]],
+) -> dict[str, Quantity]:
+    found = {}
+    for (name, value), raw in zip(scales.items(), np.sqrt(np.diag(covariance)), strict=True):
+        # Against 1 where the value is smaller: a mechanism found absent, 0.0 ± 0.1, is separable.
+        known = scale * raw < SEPARABLE * max(value, 1.0)
+        if name == VOLTAGE:
+            known = raw < (1 - NARROWED) * priors[name][1]
+        error = (scale * float(raw), "1", float(raw)) if known else (None, "1")
+        found[name] = Quantity(float(value), *error)
+    return found
 
 
 # First principles, the decays, the relative error of pressure readings, the factor on errors.
@@ -369,7 +377,7 @@ def sample_scales(fit: ScaleFit, seed: int = 0, **options: Any) -> Posterior:
     """
     from beamfit.sampling.ensemble import draw
 
-    names = tuple(SCALES)
+    names = tuple(fit.scales)
     study = (fit.terms, fit.measured, fit.pressure_error, fit.error_scale)
     record = Record(RECORD, _pulls, study, np.zeros(fit.measured.parts.shape), 1.0)
     problem = replace(fit.fit.problem, records=[record])
@@ -377,7 +385,7 @@ def sample_scales(fit: ScaleFit, seed: int = 0, **options: Any) -> Posterior:
         data=study,
         log_volume=_log_volume,
         units=dict.fromkeys(names, "1"),
-        width=dict.fromkeys(names, WIDTH),
+        width=dict.fromkeys(SCALES, WIDTH),
         priors_own=[name for name, scale in fit.scales.items() if scale.error is None],
     )
     optimum = Optimum(fit.vector, Finding(fit.status, fit.message), [1.0], [True])

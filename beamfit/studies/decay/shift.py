@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import jax
@@ -14,12 +15,13 @@ from scipy.special import chdtrc
 
 from beamfit.errors import InputError
 from beamfit.lifetime.decay import HOUR
-from beamfit.lifetime.losses import MECHANISMS, loss_terms, scaled_losses, scaled_parts
+from beamfit.lifetime.losses import MECHANISMS, scaled_losses, scaled_parts
 from beamfit.lifetime.ring import Operation
 from beamfit.quantity import Quantity, Status
 from beamfit.sampling.posterior import Interval, Posterior
 from beamfit.shown import shown
 from beamfit.studies.decay.fit import bare
+from beamfit.studies.decay.held_back import HeldBack, predict_held_back
 from beamfit.studies.decay.network import Network, NetworkFit, fit_loss_network
 from beamfit.studies.decay.next_decay import Candidate, Proposal, next_decays
 from beamfit.studies.decay.operating_point import BestPoint, Limits, best_operating_point
@@ -77,7 +79,8 @@ class _Linear(NamedTuple):
 
 
 def _linearised(fit: ScaleFit, decays: Sequence[Decay]) -> _Linear:
-    terms, measured = stacked_terms(decays, fit.machine), summarise(tuple(decays))
+    terms = stacked_terms(decays, fit.machine, fit.voltages)
+    measured = summarise(tuple(decays))
     scales = jnp.asarray(fit.vector)
     weight = whitener(scales, terms, measured, fit.pressure_error)
     off = np.asarray(pulls(scales, terms, measured, weight)).ravel()
@@ -194,28 +197,28 @@ def budget_intervals(
     Returns
     -------
     tuple of Interval
-        Loss rates 1/h by mechanism, a, b, and the lifetime h.
+        Loss rates 1/h by mechanism, a, b, and the lifetime h; NaN where only the limits of the
+        scales decide.
     """
-    terms = loss_terms(fit.machine.ring, operation, current)
-    draws = np.asarray(sample.draws)
-    losses = jax.vmap(scaled_parts, (0, None))(jnp.asarray(draws), terms)
-    a, b = np.asarray(losses.a), np.asarray(losses.b)
-    rates = losses.rates(current)
-    rows = {
-        **{m.name: (HOUR * np.asarray(rates[m.name]), "1/h") for m in MECHANISMS if m.vary},
-        "a": (a, "1/(mA s)"),
-        "b": (b, "1/s"),
-        "lifetime": (1 / (a * current + b) / HOUR, "h"),
-    }
-    ends = [50, 50 - 50 * probability, 50 + 50 * probability]
+    terms = fit.terms_at(operation, current)
+    units = {m.name: "1/h" for m in MECHANISMS if m.vary}
+    units |= {"a": "1/(mA s)", "b": "1/s", "lifetime": "h"}
+
+    def rows(scales):
+        losses = scaled_parts(scales, terms)
+        rates = losses.rates(current)
+        a, b = losses.a, losses.b
+        parts = [HOUR * rates[name] for name in units if name in rates]
+        return jnp.stack([*parts, a, b, 1 / (a * current + b) / HOUR])
+
+    values = np.asarray(jax.vmap(rows)(jnp.asarray(sample.draws)))
+    ends = np.percentile(values, [50, 50 - 50 * probability, 50 + 50 * probability], axis=0)
+    told = fit.determines(rows)
+    found = np.where(told, ends, np.nan).T
     return tuple(
-        Interval(name, *np.percentile(values, ends), unit, _separable(fit, name))
-        for name, (values, unit) in rows.items()
+        Interval(name, *map(float, of), unit, bool(known))
+        for (name, unit), of, known in zip(units.items(), found, told, strict=True)
     )
-
-
-def _separable(fit: ScaleFit, name: str) -> bool:
-    return name not in fit.scales or fit.scales[name].error is not None
 
 
 @shown
@@ -253,6 +256,22 @@ class Shift:
     anomaly: Anomaly | None
     network: NetworkFit | None = None
 
+    @property
+    def untold(self) -> str:
+        """The sentence on what the decays do not tell of the budget; empty if nothing."""
+        names = [row.name for row in self.budget if not row.separable]
+        if not names:
+            return ""
+        return (
+            f"{', '.join(names)} at {self.current:.4g} mA and the usual settings are not "
+            "determined, only limited by those of the scales: record longer, or vary the settings."
+        )
+
+    @cached_property
+    def held_back(self) -> tuple[HeldBack, ...]:
+        """Each decay as the others predict it."""
+        return predict_held_back(self.fit)
+
     def to_json(self) -> dict[str, Any]:
         """Return the answer as JSON's types, in SI, mA and h."""
         proposals = [
@@ -267,6 +286,8 @@ class Shift:
                 "scales": self.fit,
                 "current": bare(self.current, "mA"),
                 "budget": self.budget,
+                "not_determined": self.untold,
+                "held_back": self.held_back,
                 "best": best,
                 "next": proposals,
                 "anomaly": self.anomaly,
@@ -276,7 +297,11 @@ class Shift:
 
 
 def study_shift(
-    decays: Sequence[Decay], machine: Machine, seed: int = 0, network: Network | None = None
+    decays: Sequence[Decay],
+    machine: Machine,
+    seed: int = 0,
+    network: Network | None = None,
+    priors: Mapping[str, tuple[float, float]] | None = None,
 ) -> Shift:
     """Study the decays of a shift together.
 
@@ -290,6 +315,8 @@ def study_shift(
         Of the random numbers.
     network : Network, optional
         Also fit a network of the losses: alone, or as a correction of first principles.
+    priors : mapping of str to (mean, standard deviation), optional
+        As of `fit_scales`.
 
     Returns
     -------
@@ -301,7 +328,7 @@ def study_shift(
     InputError
         As for `fit_scales`.
     """
-    fit = fit_scales(decays, machine)
+    fit = fit_scales(decays, machine, priors=priors)
     sample = fit.sample(seed=seed)
     current = max(decay.fit.mean_current for decay in decays)
     settings = [operation_during(decay.segment, machine) for decay in decays]
@@ -313,7 +340,7 @@ def study_shift(
         limits=limits,
         best=best_operating_point(fit, sample, limits, current),
         proposals=next_decays(fit, _candidates(decays, machine, limits, current))[:3],
-        anomaly=_anomaly(decays, machine),
+        anomaly=_anomaly(decays, machine, priors),
         network=None if network is None else _network(decays, fit, network, seed),
     )
 
@@ -347,11 +374,13 @@ def _candidates(
     ]
 
 
-def _anomaly(decays: Sequence[Decay], machine: Machine) -> Anomaly | None:
+def _anomaly(
+    decays: Sequence[Decay], machine: Machine, priors: Mapping[str, tuple[float, float]] | None
+) -> Anomaly | None:
     half = len(decays) // 2
     if half < 4:
         return None
-    reference = fit_scales(decays[:half], machine)
+    reference = fit_scales(decays[:half], machine, priors=priors)
     # What the first half does not tell, the second cannot contradict.
     if not np.isfinite(reference.covariance).all():
         return None

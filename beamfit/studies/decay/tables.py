@@ -8,6 +8,7 @@ from collections.abc import Callable, Sequence
 from beamfit.lifetime.losses import LINEAR, QUADRATIC, Mechanism
 from beamfit.lifetime.ring import Operation
 from beamfit.quantity import Quantity, Status
+from beamfit.studies.decay.scale_verdict import VOLTAGE
 from beamfit.studies.decay.shift import Shift
 from beamfit.studies.decay.study import Decay, RecordStudy
 from beamfit.table import cell
@@ -275,12 +276,14 @@ def shift_rows(shift: Shift) -> Rows:
     fit, best, at = shift.fit, shift.best, f"at {shift.current:.4g} mA"
     rows: list[tuple[str, object]] = [("status", fit.status)]
     for name, scale in fit.scales.items():
-        said = "not separable" if scale.error is None else scale
-        rows.append((f"{name}, scale on the ring file", said))
+        of, told = "scale on the ring file", "not separable"
+        if name == VOLTAGE:
+            of, told = "true over read", "not told: its prior's"
+        rows.append((f"{name}, {of}", told if scale.error is None else scale))
     rows.append(("chi2/dof", f"{fit.chi2:.4g}/{fit.dof}" if fit.dof > 0 else "not testable"))
     for row in shift.budget:
         shown = f"{row.median:.4g} ({row.lower:.4g} to {row.upper:.4g}) {row.unit}"
-        rows.append((f"{row.name} {at}", shown if row.separable else f"{shown}, not separable"))
+        rows.append((f"{row.name} {at}", shown if row.separable else "not determined"))
     volts, error = best.rf_voltage.value / 1e3, best.rf_voltage.error
     inside = Quantity(volts, None if error is None else error / 1e3, "kV")
     rows += [
@@ -289,6 +292,11 @@ def shift_rows(shift: Shift) -> Rows:
         ("lifetime there", best.lifetime),
         ("lifetime at the usual settings", best.usual),
     ]
+    if shift.held_back:
+        off = [abs(one.pull) for one in shift.held_back]
+        within = [sum(pull < most for pull in off) for most in (1, 2)]
+        said = f"{within[0]} of {len(off)} within 1, {within[1]} within 2 errors"
+        rows.append(("each decay predicted by the others", said))
     for number, proposal in enumerate(shift.proposals, 1):
         asked = proposal.candidate
         said = f"{asked.current:.4g} mA (information {proposal.information:.3g})"
