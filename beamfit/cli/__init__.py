@@ -15,6 +15,7 @@ from beamfit.cli.emittance import emittance
 from beamfit.cli.example import example
 from beamfit.cli.lifetime import lifetime
 from beamfit.cli.setpoint import setpoint
+from beamfit.cli.solve import solve
 from beamfit.errors import InputError
 
 __all__ = ["cli", "main"]
@@ -35,6 +36,7 @@ cli.add_command(setpoint)
 cli.add_command(design)
 cli.add_command(example)
 cli.add_command(check)
+cli.add_command(solve)
 
 
 def main() -> None:

@@ -5,16 +5,21 @@ from __future__ import annotations
 from collections.abc import Mapping
 from os import PathLike
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from beamfit.errors import InputError
 from beamfit.io.files import read_text, text_lines
+from beamfit.language.check import check_document
 from beamfit.language.document import Document
 from beamfit.language.parse import parse_document
 from beamfit.language.xml import parse_xml
 
-__all__ = ["read_formulation", "read_numbers", "read_tables"]
+if TYPE_CHECKING:
+    from beamfit.language.solution import Solution
+
+__all__ = ["read_formulation", "read_numbers", "read_tables", "solved_formulation"]
 
 
 def read_formulation(path: str | PathLike[str]) -> Document:
@@ -140,3 +145,37 @@ def read_tables(
             expected = f"{table.rows} x {table.columns} as line {table.at.line} of {path} says"
             raise InputError(f"{size} numbers", expected, file)
     return found, files
+
+
+def solved_formulation(
+    document: Document,
+    path: str | PathLike[str],
+    tables: Mapping[str, np.ndarray] | None = None,
+    starts: int = 1,
+) -> Solution:
+    """Solve a document; what is wrong with it is said with its file.
+
+    Parameters
+    ----------
+    document, tables, starts
+        As for `beamfit.language.solution.solve_document`.
+    path : str or path
+        The file of the document.
+
+    Returns
+    -------
+    Solution
+
+    Raises
+    ------
+    InputError
+        With file, line and column.
+    """
+    try:
+        check_document(document, {n: t.shape for n, t in (tables or {}).items()})
+        from beamfit.language.solution import solve_document  # JAX from here on
+
+        return solve_document(document, tables, starts)
+    except InputError as error:
+        error.path = path if error.path is None else error.path
+        raise

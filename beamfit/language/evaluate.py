@@ -16,9 +16,17 @@ import numpy as np
 
 from beamfit.language import expression as x
 from beamfit.language.expression import error_at
-from beamfit.language.scope import Axes, Scope, index_of, located, widened
+from beamfit.language.scope import (
+    Array,
+    Axes,
+    Scope,
+    index_of,
+    located,
+    whole_of,
+    widened,
+)
 
-__all__ = ["Setting", "Value", "evaluate", "picked", "placed", "spread"]
+__all__ = ["Setting", "Value", "evaluate", "picked", "stored"]
 
 
 class Value(NamedTuple):
@@ -102,7 +110,7 @@ def _power(v: Value, power: float) -> Value:
     return Value(v.array ** (int(power) if whole else power), v.rank)
 
 
-def spread(values: list[Value], e: x.Expression) -> tuple[list[jax.Array], int]:
+def _spread(values: list[Value], e: x.Expression) -> tuple[list[jax.Array], int]:
     """Arrays of one rank: numbers spread over the dimensions of the others."""
     rank = max(v.rank for v in values)
     for v in values:
@@ -119,7 +127,7 @@ def spread(values: list[Value], e: x.Expression) -> tuple[list[jax.Array], int]:
 def _operated(e: x.Expression, symbol: str, parts: list[Value]) -> Value:
     if symbol == "@":
         return _product(e, *parts)
-    (a, b), rank = spread(parts, e)
+    (a, b), rank = _spread(parts, e)
     match symbol:
         case "+":
             return Value(a + b, rank)
@@ -166,7 +174,7 @@ def _applied(e: x.Application, s: Setting) -> Value:
         return Value(FOLDS[name](values[0].array, axis=own))
     if name == "pow":
         return _operated(e, "^", values)
-    arrays, rank = spread(values, e)
+    arrays, rank = _spread(values, e)
     if name in ("min", "max"):
         fold = jnp.minimum if name == "min" else jnp.maximum
         found = arrays[0]
@@ -261,7 +269,7 @@ def picked(array: jax.Array, indices: list[np.ndarray], rank: int) -> jax.Array:
     return found.reshape(shape)
 
 
-def placed(array: jax.Array, indices: list[np.ndarray], value: jax.Array, lengths: list[int]):
+def _placed(array: jax.Array, indices: list[np.ndarray], value: jax.Array, lengths: list[int]):
     """The array with elements set, by an index for each dimension as in `picked`.
 
     `value` has the axes of the indices, of length 1 where it is the same along one of `lengths`.
@@ -278,3 +286,22 @@ def placed(array: jax.Array, indices: list[np.ndarray], value: jax.Array, length
     if value.shape == array.shape:
         return value
     return array.at[view.slices].set(value)
+
+
+def stored(
+    old: jax.Array, scope: Scope, array: Array, target: x.Name, axes: Axes, value: Value, e
+) -> jax.Array:
+    """An array with a value, that of the expression e, where a target says."""
+    indices = located(scope, target, array, axes)
+    whole = whole_of(target, array)
+    if value.rank not in (0, len(whole)):
+        said = f"'{e}' of {value.rank} dimensions"
+        number = f"a number, such as an element, for '{target}'"
+        wanted = f"{len(whole)} as in '{target}'" if whole else number
+        raise error_at(e.at, said, wanted)
+    lengths = [*map(len, axes.values()), *map(len, whole)]
+    if value.rank and value.array.shape[-value.rank :] != tuple(map(len, whole)):
+        size = " x ".join(map(str, value.array.shape[-value.rank :]))
+        raise error_at(e.at, f"'{e}' of {size}", f"the size of {array.said}")
+    filled = value.array.reshape(*value.array.shape, *[1] * (len(whole) - value.rank))
+    return _placed(old, indices, filled, lengths)

@@ -5,28 +5,20 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from beamfit.errors import nearest
 from beamfit.greybox import problem as core
 from beamfit.language import document as d
-from beamfit.language import expression as x
+from beamfit.language.check import check_problem
 from beamfit.language.compiled import Program, compile_mapping
 from beamfit.language.expression import error_at
+from beamfit.language.squares import Square, squares_of
 
-__all__ = ["Formulation", "Square", "formulate", "squares_of"]
-
-
-class Square(NamedTuple):
-    """A term of a sum of squares: weight times (body for all iterators) squared."""
-
-    weight: float
-    body: x.Expression
-    each: tuple[x.Iterator, ...] = ()
+__all__ = ["Formulation", "at_start", "formulate", "starts_of"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,39 +127,6 @@ def formulate(document: d.Document, tables: Mapping[str, np.ndarray] | None = No
 # ---- variables
 
 
-def check_problem(document: d.Document) -> None:
-    """Refuse names that the mapping has not, bounds that contradict, and inputs without a value."""
-    p, m = document.problem, document.mapping
-    faces = (p.variables, m.inputs, "input"), ((*p.goals, *p.limits), m.outputs, "output")
-    for group, face, what in faces:
-        known = [one.name for one in face]
-        for one in group:
-            if one.model not in known:
-                found = f"no {what} '{one.model}' in the mapping"
-                raise error_at(one.at, found, nearest(one.model, known))
-    _check_variables(p)
-    names = [v.model for v in p.variables]
-    for one in m.inputs:
-        if one.values is None and one.name not in names:
-            expected = f"variable {one.name};, or input {one.name} = VALUE;"
-            raise error_at(one.at, f"input '{one.name}' without a value", expected)
-
-
-def _check_variables(p: d.Problem) -> None:
-    for one in (*p.variables, *p.limits):
-        if not one.lower <= one.upper:
-            found = f"bounds of '{one.label}' from {one.lower:g} up to {one.upper:g}"
-            raise error_at(one.at, found, "a lower bound that is not above the upper one")
-    names = [v.model for v in p.variables]
-    for v in p.variables:
-        if names.count(v.model) > 1:
-            raise error_at(v.at, f"variable '{v.model}' twice", "each variable once")
-        low, high = v.random or (0.0, 0.0)
-        if not (low <= high and math.isfinite(high - low)):
-            found = f"a random start of '{v.label}' in [{low:g}, {high:g}]"
-            raise error_at(v.at, found, "a finite range, the lower end first")
-
-
 def _free(document: d.Document, program: Program) -> tuple[list, dict[str, np.ndarray], tuple]:
     """Free numbers, the model they start from, and what there is to say about them."""
     arrays = program.scope.inputs
@@ -181,7 +140,7 @@ def _free(document: d.Document, program: Program) -> tuple[list, dict[str, np.nd
         model[v.model] = first_start(v, shape, model.get(v.model))
         free.append(core.Free(v.model, v.lower, v.upper, v.random))
         if v.model not in used:
-            notes.append(f"line {v.at.line}: nothing asked for hangs on the variable '{v.label}', "
+            notes.append(f"Line {v.at.line}: nothing asked for hangs on the variable '{v.label}', "
                          "which stays where it starts.")  # fmt: skip
     return free, model, tuple(notes)
 
@@ -222,42 +181,13 @@ def at_start(made: Formulation, model: dict[str, np.ndarray]) -> Formulation:
     return replace(made, problem=replace(made.problem, model=model))
 
 
-# ---- sums of squares
-
-
-def squares_of(m: d.Mapping, name: str, weight: float = 1.0) -> list[Square] | None:
-    """The terms of an output that is a sum of squares, None for any other."""
-    set_by = {s.target.name: s.value for s in m.statements
-              if isinstance(s, d.Assignment) and not s.each and not s.target.indices}  # fmt: skip
-
-    def terms(e: x.Expression, factor: float, seen: tuple[str, ...]) -> list[Square] | None:
-        match e:
-            case x.Name(n, ()) if n in set_by and n not in seen:
-                return terms(set_by[n], factor, (*seen, n))
-            case x.Operation("^", (body, x.Number() as two)) if two.value == 2.0 and factor > 0:
-                return [Square(factor, body)]
-            case x.Operation("+", (left, right)):
-                both = terms(left, factor, seen), terms(right, factor, seen)
-                return None if None in both else both[0] + both[1]
-            case x.Operation("*", (x.Number() as n, inner)):
-                return terms(inner, factor * n.value, seen)
-            case x.Operation("/", (inner, x.Number() as n)) if n.value != 0:
-                return terms(inner, factor / n.value, seen)
-            case x.Reduction("sum", each, inner):
-                found = terms(inner, factor, seen)
-                return found and [s._replace(each=(*each, *s.each)) for s in found]
-        return None
-
-    return terms(x.Name(name), weight, ())
-
-
 def _unqualified(document: d.Document) -> Iterator[str]:
     """Limits on sums of squares that only zero meets: where they hold, they have no gradient."""
     for c in document.problem.limits:
         squares = squares_of(document.mapping, c.model)
         if squares is not None and c.upper == 0.0:
             yield (
-                f"line {c.at.line}: '{c.label}' is a sum of squares limited to 0. Where it holds "
+                f"Line {c.at.line}: '{c.label}' is a sum of squares limited to 0. Where it holds "
                 "its gradient is zero (no constraint qualification): it has no multiplier and a "
                 f"search crawls. Limit what is squared, {squares[0].body}, element by element."
             )

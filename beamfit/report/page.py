@@ -10,9 +10,11 @@ from matplotlib import rc_context
 
 from beamfit.errors import InputError
 from beamfit.io.files import write_atomically
+from beamfit.language.solution import Solution
 from beamfit.report.decays import decay_page, study_of
 from beamfit.report.document import STYLE, html_of
 from beamfit.report.emittance import emittance_page
+from beamfit.report.formulation import formulation_page
 from beamfit.report.pdf import pdf_of
 from beamfit.report.posterior import Sampled, of_decay, of_scan, with_posteriors
 from beamfit.report.slices import slices_page
@@ -29,7 +31,7 @@ __all__ = ["write_report"]
 
 def write_report(
     path: str | PathLike[str],
-    result: EmittanceFit | SliceFits | DecayFit | Sequence[RecordStudy],
+    result: EmittanceFit | SliceFits | DecayFit | Solution | Sequence[RecordStudy],
     posterior: Posterior | Sequence[Posterior] | None = None,
     *,
     command: str | None = None,
@@ -43,9 +45,9 @@ def write_report(
     ----------
     path : str or path
         Ends in ``.html`` (self-contained) or ``.pdf``. An existing file is replaced whole.
-    result : EmittanceFit, SliceFits, DecayFit, or sequence of RecordStudy
-        The emittance of a scan or of the slices of a beam, the lifetime of a decay, or those of
-        whole records.
+    result : EmittanceFit, SliceFits, DecayFit, Solution, or sequence of RecordStudy
+        The emittance of a scan or of the slices of a beam, the lifetime of a decay, a formulation
+        solved, or the lifetimes of whole records.
     posterior : Posterior or sequence of Posterior, optional
         What `sample` of the fit gave; of records one for each decay.
     command : str, optional
@@ -82,6 +84,8 @@ def write_report(
         if isinstance(result, EmittanceFit):
             page = emittance_page(result, command, inputs, methods)
             sampled = [] if posterior is None else [of_scan(result, posterior)]
+        elif isinstance(result, Solution):
+            page, sampled = formulation_page(result, command, inputs), []
         elif isinstance(result, SliceFits):
             page, sampled = slices_page(result, command, inputs), []
         else:

@@ -1,0 +1,283 @@
+"""A document solved: where searches start, what the solver was told, and what came out."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import islice
+from typing import Any
+
+import numpy as np
+
+from beamfit.greybox.fit import Fit, Limited, Variable
+from beamfit.greybox.solve import solve
+from beamfit.language import document as d
+from beamfit.language.statement import Formulation, at_start, formulate, starts_of
+from beamfit.language.trace import cause_of
+from beamfit.quantity import Quantity
+from beamfit.shown import shown
+from beamfit.statistics import reach_of
+from beamfit.status import Status
+from beamfit.table import Table, cell
+
+__all__ = ["Solution", "solve_document"]
+
+# Draws of the same seeds that are tried until the start is finite.
+MOST_DRAWS = 100
+# Rows of a table on a terminal; JSON has all.
+MOST_ROWS = 40
+# Solver parameters that mean something here: how they are told to `solve`.
+TOLD = {
+    "major iterations limit": "iterations",
+    "iterations limit": "iterations",
+    "time limit": "seconds",
+}
+NOISE = (
+    "Errors take the terms that are squared for residuals of data, with the noise that their own "
+    "scatter shows."
+)
+TOLERANCES = {"major feasibility tolerance", "major optimality tolerance"}
+# At which a point counts as an optimum here (`beamfit.greybox.assess.TOLERANCE`).
+JUDGED = 1e-6
+
+
+@shown
+@dataclass(frozen=True, eq=False)
+class Solution:
+    """What the solver found, in the names of the document.
+
+    Parameters
+    ----------
+    made : Formulation
+        The document and its problem.
+    fit : Fit
+        What was found.
+    notes : tuple of str
+        What was made of the document, its starts and its solver parameters.
+    """
+
+    made: Formulation
+    fit: Fit
+    notes: tuple[str, ...]
+
+    @property
+    def status(self) -> Status:
+        """The verdict."""
+        return self.fit.status
+
+    @property
+    def message(self) -> str:
+        """Its sentence."""
+        return self.fit.message
+
+    @property
+    def objective(self) -> float:
+        """The objective in the terms of the document."""
+        return self.made.factor * self.fit.cost
+
+    @property
+    def solver(self) -> str:
+        """Which solvers were used from the start that led to the answer."""
+        used = [a.solver for a in self.fit.attempts if np.array_equal(a.theta, self.fit.theta)]
+        return (used or [a.solver for a in self.fit.attempts] or ["none"])[0]
+
+    def variables(self) -> list[Variable]:
+        """Free numbers by their labels, with d(objective)/d(bound)."""
+        names = [
+            v.label + self.made.program.scope.inputs[v.model].element(i).removeprefix(v.model)
+            for v in self.made.document.problem.variables
+            for i in range(self.made.program.scope.inputs[v.model].size)
+        ]
+        return [
+            v._replace(name=name, reduced_gradient=self.made.factor * v.reduced_gradient)
+            for name, v in zip(names, self.fit.variables, strict=True)
+        ]
+
+    def constraints(self) -> list[Limited]:
+        """Limited outputs by their labels, with d(objective)/d(limit)."""
+        names = [
+            c.label + self.made.program.scope.outputs[c.model].element(i).removeprefix(c.model)
+            for c in self.made.document.problem.limits
+            for i in range(self.made.program.scope.outputs[c.model].size)
+        ]
+        return [
+            c._replace(name=name, multiplier=self.made.factor * c.multiplier)
+            for name, c in zip(names, self.fit.constraints, strict=True)
+        ]
+
+    def quantity(self, v: Variable) -> Quantity:
+        """A free number with its error; its interval is that of Student's t."""
+        if not math.isfinite(v.error):
+            return Quantity(v.value, None, "1")
+        reach = reach_of(self.fit.dof) * v.error if self.fit.dof > 0 else math.inf
+        return Quantity.reaching(v.value, v.error, "1", v.error_raw, reach)
+
+    def outputs(self) -> dict[str, np.ndarray]:
+        """All outputs of the mapping at the answer."""
+        found = self.made.program(self.fit.model, list(self.made.program.scope.outputs))
+        return {name: np.asarray(value) for name, value in found.items()}
+
+    @property
+    def headline(self) -> str:
+        """Objective and status in a line."""
+        return f"{_goals(self.made.document)} = {self.objective:.10g}, {cell(self.status)}"
+
+    def tables(self) -> list[Table]:
+        """Objective, variables, constraints and outputs as tables."""
+        tables = [_table("variable", self.variables(), self._row, self.made.squares)]
+        if self.fit.constraints:
+            rows = self.constraints()
+            tables.append(_table("constraint", rows, _limited, False, "multiplier"))
+        values = [[n, f"{v:.8g}" if v.ndim == 0 else _range(v)] for n, v in self.outputs().items()]
+        return [*tables, Table("", ["output", "value"], values, numeric=True)]
+
+    def _row(self, v: Variable) -> list[str]:
+        error = ["-" if not math.isfinite(v.error) else f"{v.error:.2g}"] * self.made.squares
+        return [v.name, f"{v.value:.8g}", *error, *_ends(v), v.state, f"{v.reduced_gradient:.3g}"]
+
+    def _variable(self, v: Variable) -> dict[str, Any]:
+        kept = ("name", "lower", "upper", "state", "reduced_gradient")
+        return {key: getattr(v, key) for key in kept} | {"value": self.quantity(v)}
+
+    def to_json(self) -> dict[str, Any]:
+        """The result of the JSON contract."""
+        p = self.made.document.problem
+        return {
+            "name": _goals(self.made.document),
+            "status": self.status,
+            "message": self.message,
+            "objective": self.objective,
+            "direction": "maximize" if p.maximize else "minimize",
+            "least_squares": self.made.squares,
+            "dof": self.fit.dof,
+            "solver": self.solver,
+            "kkt_residual": self.fit.kkt.worst,
+            "variables": [self._variable(v) for v in self.variables()],
+            "constraints": self.constraints(),
+            "outputs": self.outputs(),
+            "starts": [
+                {"objective": self.made.factor * a.cost, "solver": a.solver, "said": a.said}
+                for a in self.fit.attempts
+            ],
+            "notes": self.notes,
+        }
+
+
+def _goals(document: d.Document) -> str:
+    goals = document.problem.goals
+    return " + ".join(g.label if g.weight == 1 else f"{g.weight:g} {g.label}" for g in goals)
+
+
+def _range(values: np.ndarray) -> str:
+    return f"{values.size} from {np.min(values):.5g} to {np.max(values):.5g}"
+
+
+def _ends(row: Variable | Limited) -> list[str]:
+    return [f"{end:.6g}" for end in (row.lower, row.upper)]
+
+
+def _limited(c: Limited) -> list[str]:
+    return [c.name, f"{c.value:.8g}", *_ends(c), c.state, f"{c.multiplier:.3g}"]
+
+
+def _table(name: str, rows: Sequence, row_of, errors: bool, last="reduced gradient") -> Table:
+    header = [name, "value", *["error"] * errors, "lower", "upper", "state", last]
+    more = len(rows) - MOST_ROWS
+    cells = [row_of(row) for row in rows[:MOST_ROWS]]
+    cells += [[f"... and {more} more", *[""] * (len(header) - 1)]] if more > 0 else []
+    return Table("", header, cells, numeric=True)
+
+
+# ---- solving
+
+
+def solve_document(
+    document: d.Document, tables: Mapping[str, np.ndarray] | None = None, starts: int = 1
+) -> Solution:
+    """Solve the problem of a document.
+
+    Parameters
+    ----------
+    document : Document
+        With a problem.
+    tables : mapping of str to array, optional
+        Its data tables by name.
+    starts : int
+        How many searches: the first from the numbers drawn with the seeds of the document (or given
+        in it), the others from numbers drawn within the random ranges or the bounds.
+
+    Returns
+    -------
+    Solution
+        Never raises for a search that fails: its status says so.
+
+    Raises
+    ------
+    InputError
+        With its place, if something in the document is wrong.
+
+    Examples
+    --------
+    >>> from beamfit.language.parse import parse_document
+    >>> text = '''maximize y; variable x in [0, 1] random [0, 1] seed 3;
+    ...   input x; output y; y = x*(2 - x);'''
+    >>> found = solve_document(parse_document(text))
+    >>> print(found.headline, found.variables()[0].state)
+    y = 1, converged upper
+    """
+    made, notes = _started(formulate(document, tables))
+    told, warnings = _told(document.solver)
+    fit = solve(made.problem, starts=starts, **told)
+    notes = (*made.notes, *notes, *warnings)
+    if fit.status is Status.not_finite:
+        goals = [g.model for g in document.problem.goals]
+        names = goals + [c.model for c in document.problem.limits]
+        cause = cause_of(made.program, fit.model, names)
+        notes = (*notes, f"Where it ended, {cause}.") if cause else notes
+    if made.squares and math.isfinite(fit.scale):
+        notes = (*notes, NOISE)
+    return Solution(made, fit, notes)
+
+
+def _started(made: Formulation) -> tuple[Formulation, tuple[str, ...]]:
+    """The problem at its first start that is finite, drawn again from the same seeds if need be."""
+    p = made.problem
+    names = [g.model for g in made.document.problem.goals]
+    names += [c.model for c in made.document.problem.limits]
+    for draws, model in enumerate(islice(starts_of(made), MOST_DRAWS)):
+        theta = np.concatenate([np.ravel(model[v.model]) for v in made.document.problem.variables])
+        if np.isfinite(p.cost(theta)) and np.all(np.isfinite(p.constraint_values(theta))):
+            if draws == 0:
+                return made, ()
+            first = next(starts_of(made))
+            cause = cause_of(made.program, first, names)
+            said = f"At the start of the seeds {cause}; drawn again from the same seeds, "
+            times = "once" if draws == 1 else f"{draws} times"
+            return at_start(made, model), (f"{said}{times}.",)
+        if not any(v.random for v in made.document.problem.variables):
+            break
+    cause = cause_of(made.program, next(starts_of(made)), names)
+    return made, (f"At the start {cause}.",) if cause else ()
+
+
+def _told(solver: d.Solver | None) -> tuple[dict[str, Any], list[str]]:
+    """Options of `solve` from the parameters of a solver, and what could not be used."""
+    told: dict[str, Any] = {}
+    unused, tight = [], []
+    for name, value in solver.settings if solver else ():
+        key = " ".join(name.lower().split())
+        try:
+            number = float(value)
+        except ValueError:
+            number = math.nan
+        if key in TOLD and number > 0:
+            told[TOLD[key]] = int(number) if TOLD[key] == "iterations" else number
+        elif key in TOLERANCES and number > 0:
+            tight += [f"{name} = {value}"] if number < JUDGED else []
+        else:
+            unused.append(name)
+    said = [f"Solver parameters without a meaning here: {', '.join(unused)}."] if unused else []
+    if tight:
+        said.append(f"{', '.join(tight)}: judged at {JUDGED:g} all the same.")
+    return told, said

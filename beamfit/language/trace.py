@@ -1,0 +1,146 @@
+"""Why a document gives no number: the first part of a formula that is not finite, and where."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from beamfit.language import document as d
+from beamfit.language import expression as x
+from beamfit.language.calls import Arrays, defaults, given_to
+from beamfit.language.compiled import Program, carry_out
+from beamfit.language.evaluate import Setting, Value
+from beamfit.language.order import Group
+from beamfit.language.scope import Axes, Scope
+from beamfit.language.steps import calls, sources, targets
+
+__all__ = ["cause_of"]
+
+
+class _FoundError(Exception):
+    """Ends the walk at the first part that is not finite."""
+
+
+def cause_of(
+    program: Program, inputs: Mapping[str, jax.Array], names: Iterable[str], inside: str = ""
+) -> str | None:
+    """Say why some outputs are not finite.
+
+    Parameters
+    ----------
+    program : Program
+        A compiled mapping.
+    inputs : mapping of str to array
+        Where.
+    names : iterable of str
+        The outputs.
+    inside : str
+        What the mapping is called, where it stands in another.
+
+    Returns
+    -------
+    str or None
+        The part of a formula, its place, the index and the numbers in it; None if all is finite.
+
+    Examples
+    --------
+    >>> from beamfit.language.compiled import compile_mapping
+    >>> from beamfit.language.parse import parse_document
+    >>> text = "set K = |1:3|; input a; output y; y = sum(k in K | sqrt(a - k));"
+    >>> cause_of(compile_mapping(parse_document(text).mapping), {"a": 2.5}, ["y"])
+    'sqrt(a - k) is not a number for k = 3 (line 1, column 52): a - k = -0.5'
+    """
+    given = defaults(program.scope) | {n: jnp.asarray(v, float) for n, v in inputs.items()}
+    arrays: Arrays = {n: jnp.asarray(v) for n, v in program.constants.items()} | given
+    for name, value in arrays.items():
+        if not np.all(np.isfinite(value)):
+            return f"{inside}{name} is not finite"
+    for name in program.order.owners:
+        arrays[name] = jnp.zeros(program.scope.arrays[name].shape)
+    wanted, _ = program.order.closure(names)
+    for group in program.order.groups:
+        if wanted.isdisjoint(step.number for step in group.steps):
+            continue
+        try:
+            changed = carry_out(program.order, group, arrays, _Watch())
+        except _FoundError as found:
+            return f"{inside}{found}"
+        if not all(np.all(np.isfinite(array)) for array in changed.values()):
+            return inside + _of_group(program, group, arrays, changed)
+        arrays |= changed
+    return None
+
+
+class _Watch:
+    """Looks at every value; keeps them, to say what went into one that is not finite."""
+
+    def __init__(self) -> None:
+        self.seen: dict[int, Value] = {}
+
+    def __call__(self, e: x.Expression, value: Value, axes: Axes) -> None:
+        array = np.asarray(value.array)
+        self.seen[id(e)] = value
+        if np.all(np.isfinite(array)):
+            return
+        at = np.argwhere(~np.isfinite(array))[0][: len(axes)]
+        when = [
+            f"{name} = {s.elements[i]}"
+            for (name, s), i, n in zip(axes.items(), at, array.shape, strict=False)
+            if n > 1 and "'" not in name
+        ]
+        what = "infinite" if np.any(np.isinf(array)) else "not a number"
+        index = f" for {', '.join(when)}" if when else ""
+        said = f"{e} is {what}{index} (line {e.at.line}, column {e.at.column})"
+        inner = ", ".join(self._said(part, at) for part in x.children(e) if self._tells(part))
+        raise _FoundError(said + (f": {inner}" if inner else ""))
+
+    def _tells(self, part: x.Expression) -> bool:
+        return id(part) in self.seen and not isinstance(part, x.Number)
+
+    def _said(self, part: x.Expression, at: np.ndarray) -> str:
+        array = np.asarray(self.seen[id(part)].array)
+        if array.ndim < len(at):
+            return f"{part} of {array.size} numbers"
+        picked = array[tuple(min(i, n - 1) for i, n in zip(at, array.shape, strict=False))]
+        return f"{part} = {picked:.4g}" if picked.ndim == 0 else f"{part} of {picked.size} numbers"
+
+
+def _of_group(program: Program, group: Group, arrays: Arrays, changed: Arrays) -> str:
+    """What is not finite behind a call or in a recurrence."""
+    scope, step = program.scope, group.steps[0]
+    if group.plan is None and isinstance(step.what, d.Call):
+        found = _of_call(program, step, arrays)
+        if found is not None:
+            return found
+    name, array = next((n, a) for n, a in changed.items() if not np.all(np.isfinite(a)))
+    first = int(np.argmax(~np.isfinite(np.ravel(array))))
+    steps = [s for s in group.steps if name in [node.name for node, _ in targets(scope, s)]]
+    formula = ", ".join(str(e) for s in steps for e, _ in sources(scope, s))
+    element = scope.arrays[name].element(first)
+    return f"{element} is not finite, the first of {name} ({formula}, line {steps[0].at.line})"
+
+
+def _of_call(program: Program, step, arrays: Arrays) -> str | None:
+    """What is not finite in a mapping that is called, for the first point at which it is not."""
+    scope = program.scope
+    call = calls(scope, step.what)
+    if not isinstance(call.callee, Scope):
+        return None
+    inner = Program(program.order.inner[step.what.mapping], {})
+    given = given_to(call, Setting(scope, arrays, step.axes))
+    names = sorted({w.value.name for w in step.what.outputs if isinstance(w.value, x.Name)})
+    lengths = [len(s) for s in step.axes.values()]
+    for at in np.ndindex(*lengths):
+        point = {
+            n: a[tuple(min(i, m - 1) for i, m in zip(at, a.shape, strict=False))]
+            for n, a in given.items()
+        }
+        when = [f"{n} = {s.elements[i]}" for (n, s), i in zip(step.axes.items(), at, strict=True)]
+        where = f" for {', '.join(when)}" if when else ""
+        found = cause_of(inner, point, names, f"in {step.what.mapping}{where}: ")
+        if found is not None:
+            return found
+    return None

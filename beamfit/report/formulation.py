@@ -1,0 +1,95 @@
+"""The report of a solved formulation: verdict, tables, and outputs against their index."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import partial
+from math import ceil
+
+import numpy as np
+from matplotlib.figure import FigureBase
+
+from beamfit.language.solution import Solution
+from beamfit.language.text import format_document
+from beamfit.report.document import BLUE, Page, Picture, Verdict, provenance, written
+from beamfit.table import Table
+
+__all__ = ["draw_outputs", "formulation_page"]
+
+# Outputs that are drawn; the tables have all.
+MOST_DRAWN = 12
+
+
+def formulation_page(
+    found: Solution, command: str | None, inputs: Mapping[str, str | None] | None
+) -> Page:
+    """Lay out a solution.
+
+    Parameters
+    ----------
+    found : Solution
+        From `beamfit.language.solution.solve_document`.
+    command : str or None
+        The command that made it.
+    inputs : mapping of str to str, or None
+        Input files and their SHA-256.
+
+    Returns
+    -------
+    Page
+    """
+    document, p = found.made.document, found.made.problem
+    titles = ["Variables", *["Constraints"] * bool(found.fit.constraints), "Outputs"]
+    tables = [t._replace(title=name) for name, t in zip(titles, found.tables(), strict=True)]
+    if found.notes:
+        tables.append(Table("About the document", [], [[note] for note in found.notes]))
+    text = format_document(document).splitlines()
+    tables.append(Table("The document", [], [[line] for line in text if line]))
+    drawn = list(_drawn(found))
+    pictures = []
+    if drawn:
+        height = 0.6 + 1.7 * ceil(len(drawn) / 2)
+        pictures = [Picture("outputs by index", height, partial(draw_outputs, found=found))]
+    goals = "maximised" if document.problem.maximize else "minimised"
+    counts = f"{len(p.names)} variables, {len(p.constraint_names)} limits"
+    return Page(
+        title=f"Formulation {document.mapping.name}".strip(),
+        subtitle=f"{counts}, {goals}; {written()}",
+        verdicts=[Verdict(found.status, found.headline, found.message)],
+        tables=tables,
+        pictures=pictures,
+        pictures_title="Outputs",
+        provenance=provenance(inputs or {}, [("solver", found.solver)], command),
+        notes=(),
+    )
+
+
+def _drawn(found: Solution):
+    """Outputs with one dimension: name, elements of its set, values."""
+    arrays = found.made.program.scope.outputs
+    lines = [(n, arrays[n].dims[0], v) for n, v in found.outputs().items() if v.ndim == 1]
+    return lines[:MOST_DRAWN]
+
+
+def draw_outputs(figure: FigureBase, found: Solution) -> None:
+    """Draw every output that runs over one set, each in axes of its own.
+
+    Parameters
+    ----------
+    figure : Figure or SubFigure
+        Where to.
+    found : Solution
+        The solution.
+    """
+    drawn = _drawn(found)
+    columns = min(2, len(drawn))
+    grid = figure.subplots(ceil(len(drawn) / columns), columns, squeeze=False)
+    for axes in grid.flat[len(drawn) :]:
+        axes.set_visible(False)
+    for axes, (name, over, values) in zip(grid.flat, drawn, strict=False):
+        few = values.size <= 60
+        axes.plot(over.elements, values, "o-" if few else "-", ms=3, lw=1.0, color=BLUE)
+        axes.set(title=name, xlabel=over.name or "index")
+        axes.locator_params(axis="x", integer=True)
+        if not np.any(np.isfinite(values)):
+            axes.text(0.5, 0.5, "not finite", transform=axes.transAxes, ha="center")
