@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from beamfit.sampling.posterior import Posterior
     from beamfit.studies.decay.shift import Shift
     from beamfit.studies.decay.study import Decay, Machine, RecordStudy
+    from beamfit.studies.decay.trend import Trend
 
 __all__ = ["lifetime"]
 
@@ -31,6 +32,7 @@ Examples:
   beamfit lifetime measurements/spear3_shift_simulated.csv --ring lattices/spear3_2003.toml --study
   beamfit lifetime shift.csv --ring ring.toml --study --prior rf_voltage=1+-1%
   beamfit lifetime shift.csv --ring ring.toml --study --network correction
+  beamfit lifetime week*.csv --trend --report weeks.html
   beamfit lifetime export.csv --time Time --current SR:DCCT:CURRENT:mA --skip-bad
 """
 
@@ -55,6 +57,12 @@ Examples:
     "rises with pressure; alone, or as a factor on the fitted first principles.",
 )
 @click.option(
+    "--trend",
+    is_flag=True,
+    help="Follow the lifetime through all decays: current times lifetime with control limits, by "
+    "the ring to one current and its usual settings if --ring is given; alarms where a or b moved.",
+)
+@click.option(
     "--time",
     metavar="COLUMN[:UNIT]",
     help="Header of the time, a date or a number in s, min, h, d or ms.",
@@ -71,6 +79,7 @@ def lifetime(
     ring: str | None,
     study: bool,
     network: str | None,
+    trend: bool,
     time: str | None,
     current: str | None,
     priors: dict[str, tuple[float, float]] | None,
@@ -103,8 +112,8 @@ def lifetime(
     inputs = {path: digest(path) for path in (*record, ring) if path is not None}
 
     tables = [each for each in records if isinstance(each, LifetimeTable)]
-    if tables and (len(tables) < len(records) or sample or study or report or ring):
-        expected = "tables of lifetimes by themselves, without --ring, --study, --sample, --report"
+    if tables and (len(tables) < len(records) or sample or study or trend or report or ring):
+        expected = "tables of lifetimes by themselves, with no option but --json"
         raise InputError("a table of lifetimes", expected, path=tables[0].name)
     if tables:
         _lifetimes(tables, inputs, as_json)
@@ -115,22 +124,24 @@ def lifetime(
     studies = tuple(study_record(each, machine) for each in records)
     decays = [decay for each in studies for decay in each.decays]
     shift = _shift(decays, machine, network, priors) if study else None
+    course = _trend(studies, machine) if trend else None
     posteriors = None
     if sample:
         sampling.check_one(len(decays))
         drawn = sampling.arguments(inputs, quiet=as_json)
         posteriors = [decay.fit.sample(**drawn) for decay in decays]
     if report is not None:
-        said = {"command": command_line(), "inputs": inputs, "shift": shift}
+        said = {"command": command_line(), "inputs": inputs, "shift": shift, "trend": course}
         beamfit.write_report(report, studies, posteriors, **said)
     if as_json:
         results = [decay.to_json() for decay in decays]
         for result, posterior in zip(results, posteriors or (), strict=False):
             result["posterior"] = posterior
-        further = {} if shift is None else {"study": shift}
+        further = {"study": shift, "trend": course}
+        further = {name: found for name, found in further.items() if found is not None}
         click.echo(results_text(results, inputs, command_line(), **further))
     else:
-        _show(studies, posteriors, shift, report)
+        _show(studies, posteriors, shift, course, report)
 
 
 def _lifetimes(tables: list[LifetimeTable], inputs: dict[str, str], as_json: bool) -> None:
@@ -182,10 +193,17 @@ def _shift(
     return study_shift(decays, machine, network=network and Network(network), priors=priors)
 
 
+def _trend(studies: tuple[RecordStudy, ...], machine: Machine | None) -> Trend:
+    from beamfit.studies.decay.trend import trend_of
+
+    return trend_of(studies, machine)
+
+
 def _show(
     studies: tuple[RecordStudy, ...],
     posteriors: list[Posterior] | None,
     shift: Shift | None,
+    trend: Trend | None,
     report: str | None,
 ) -> None:
     """Show every record, and what was drawn and found of all together."""
@@ -199,6 +217,10 @@ def _show(
         terminal.posterior(f"Posterior of {name}", posterior)
     if shift is not None:
         _show_shift(terminal, shift)
+    if trend is not None:
+        for table in trend.tables():
+            terminal.table(table, wrap=False)
+        terminal.verdict("trend", trend.status, trend.message)
     terminal.report(report)
 
 

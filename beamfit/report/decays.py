@@ -23,6 +23,7 @@ from beamfit.report.document import (
     provenance,
     written,
 )
+from beamfit.report.trend import trend_picture
 from beamfit.status import Status
 from beamfit.studies.decay.checks import moving_lifetime
 from beamfit.studies.decay.fit import DecayFit
@@ -42,6 +43,7 @@ from beamfit.studies.decay.tables import (
     shift_rows,
     systematic_rows,
 )
+from beamfit.studies.decay.trend import Trend
 from beamfit.table import Table, labelled
 
 __all__ = ["decay_page", "draw_budget", "draw_lifetime", "draw_record", "study_of"]
@@ -76,6 +78,7 @@ def decay_page(
     command: str | None,
     inputs: Mapping[str, str | None] | None,
     shift: Shift | None = None,
+    trend: Trend | None = None,
 ) -> Page:
     """Lay out decay records.
 
@@ -89,6 +92,8 @@ def decay_page(
         Input files and their SHA-256.
     shift : Shift, optional
         The study of all decays together.
+    trend : Trend, optional
+        The course of their lifetimes.
 
     Returns
     -------
@@ -98,6 +103,7 @@ def decay_page(
     tables = [] if shift is None else [labelled("All decays", ["value"], shift_rows(shift), SHIFT)]
     if shift is not None and shift.network is not None:
         tables.append(labelled("A network of the losses", ["value"], network_rows(shift)))
+    tables += [] if trend is None else trend.tables()
     tables += _side_by_side(decays) if len(decays) <= FEW else _one_below_another(decays)
     if len(decays) <= FEW:
         tables += [
@@ -118,9 +124,9 @@ def decay_page(
     return Page(
         title=f"Beam lifetime of {title}",
         subtitle=f"{count} in {hours:.3g} h of record; {written()}",
-        verdicts=_shift_verdicts(shift) + _verdicts(decays),
+        verdicts=_shift_verdicts(shift) + _trend_verdicts(trend) + _verdicts(decays),
         tables=tables,
-        pictures=_pictures(studies),
+        pictures=([] if trend is None else [trend_picture(trend)]) + _pictures(studies),
         pictures_title="Records and fits",
         provenance=provenance(inputs or {}, [], command),
         notes=tuple(note for study in studies for note in study.record.comments),
@@ -181,6 +187,10 @@ def _shift_verdicts(shift: Shift | None) -> list[Verdict]:
     if change is not None:
         said.append(Verdict(change.status, "second half against the first", change.message))
     return said
+
+
+def _trend_verdicts(trend: Trend | None) -> list[Verdict]:
+    return [] if trend is None else [Verdict(trend.status, "course of the lifetime", trend.message)]
 
 
 def study_of(result: DecayFit | RecordStudy) -> RecordStudy:

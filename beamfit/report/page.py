@@ -22,6 +22,7 @@ from beamfit.sampling.posterior import Posterior
 from beamfit.studies.decay.fit import DecayFit
 from beamfit.studies.decay.shift import Shift
 from beamfit.studies.decay.study import RecordStudy
+from beamfit.studies.decay.trend import Trend
 from beamfit.studies.scan.fit import EmittanceFit
 from beamfit.studies.scan.size_methods import SizeMethods
 from beamfit.studies.scan.slices import SliceFits
@@ -37,6 +38,7 @@ def write_report(
     command: str | None = None,
     inputs: Mapping[str, str | None] | None = None,
     shift: Shift | None = None,
+    trend: Trend | None = None,
     methods: tuple[SizeMethods, ...] = (),
 ) -> None:
     """Write a report page of a fit.
@@ -56,6 +58,8 @@ def write_report(
         Input files and their SHA-256; a scan's own if None.
     shift : Shift, optional
         The study of all decays together, to go before them.
+    trend : Trend, optional
+        The course of their lifetimes, likewise.
     methods : tuple of SizeMethods
         What other ways of taking the sizes of a scan say.
 
@@ -90,7 +94,7 @@ def write_report(
             page, sampled = slices_page(result, command, inputs), []
         else:
             studies = (study_of(result),) if isinstance(result, DecayFit) else result
-            page = decay_page(studies, command, inputs, shift)
+            page = decay_page(studies, command, inputs, shift, trend)
             sampled = _of_decays(studies, posterior)
         page = with_posteriors(page, sampled)
         content = html_of(page) if suffix == ".html" else pdf_of(page)

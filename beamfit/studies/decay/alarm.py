@@ -1,0 +1,534 @@
+"""An alarm on the loss of a beam, reading by reading: what moved, a or b, since when, by how much.
+
+A likelihood-ratio test over windows of 4 to 128 minutes (T. L. Lai, J. R. Stat. Soc. B 57 (1995)
+613: windows in geometric progression lose little against all of them), and of the two hypotheses
+that a, or that b, is what moved.
+"""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+from typing import NamedTuple
+
+import numpy as np
+
+from beamfit.quantity import Quantity
+
+__all__ = [
+    "Alarm",
+    "Reading",
+    "Reference",
+    "State",
+    "Told",
+    "alarms_of",
+    "started",
+    "watched",
+    "when",
+]
+
+MINUTE = 60.0
+# Windows, s: four begin in turn in each length, so that one of nearly any age is at hand.
+LENGTHS = np.repeat([4.0, 8.0, 16.0, 32.0, 64.0, 128.0], 4) * MINUTE
+PHASES = LENGTHS * np.tile([0.0, 0.25, 0.5, 0.75], 6)
+# Fall of chi² that raises an alarm: 5.5 standard errors, for all windows of 1e6 readings.
+RAISED = 30.0
+# Twice the logarithm of 1000, by Wald's rule: one in a thousand is named wrongly.
+NAMED = 13.8
+# That both moved must explain so much more than the better of the two (p = 1e-3), as in `shift`.
+BOTH = 10.8
+# After so long an alarm goes without a name, s.
+PATIENCE = 60 * MINUTE
+# After a step nothing is looked at for so long; after a gap of so many intervals all begins anew.
+SETTLE, GAP = 10.0, 10.0
+# A reading off the pace before it by so many of its errors, or by such a share of the loss, begins
+# anew: a refill, a lost bunch, a step of the clock.
+JUMP, SHARE = 6.0, 0.15
+# So does a setting, or a gauge, that moves what is expected by more: the two do not answer at once.
+SET = 0.02
+# Readings over which the noise is followed; before an alarm a and b may be off by this much.
+MEMORY, WIDE = 300.0, 0.3
+# What an alarm is called before and after it is named.
+NAMES = ("", "a", "b", "a and b", "a or b")
+
+
+class Reference(NamedTuple):
+    """What the beam loses as long as nothing moves.
+
+    Attributes
+    ----------
+    a, b : float
+        Of dI/dt = -a I² - b I, 1/(mA s) and 1/s.
+    noise : float
+        Standard deviation of a reading, mA.
+    correlation_time : float
+        Of that noise, s; 0 where readings are independent.
+    interval : float
+        Usual time between readings, s.
+    covariance : array, shape (2, 2)
+        Of relative errors of a and b: how well they are known, and how far they wander on an
+        ordinary day.
+    """
+
+    a: float
+    b: float
+    noise: float
+    correlation_time: float = 0.0
+    interval: float = 1.0
+    covariance: np.ndarray = 0.005**2 * np.eye(2)
+
+
+class Reading(NamedTuple):
+    """A reading of the beam current.
+
+    Attributes
+    ----------
+    time : float
+        s, of any origin.
+    current : float
+        mA; zero, negative or NaN is no reading.
+    a_factor, b_factor : float
+        a and b that are expected at the settings and the pressure of the moment, over those of the
+        reference. A pressure that the gauge shows is then no alarm.
+    """
+
+    time: float
+    current: float
+    a_factor: float = 1.0
+    b_factor: float = 1.0
+
+
+class State(NamedTuple):
+    """What is remembered between readings; arrays may have leading axes, of many beams at once.
+
+    Attributes
+    ----------
+    time, current, step, pace : array
+        Last reading, s and mA, seconds since the one before, and by how much ln I rose over the
+        expected in a second of them.
+    expected : array, shape (..., 2)
+        Its factors of a and b.
+    clock, hold : array
+        Seconds watched, and seconds still to wait after a step.
+    path : array, shape (..., 3)
+        Since the last cut: ln I over the expected, and its derivatives by relative changes of a, b.
+    noise : array
+        Variance of readings over that of the reference.
+    factor, covariance : array, shapes (..., 2), (..., 2, 2)
+        a and b over the reference's after earlier alarms, and their relative covariance.
+    age, weight, mean, product : array, shapes (..., w), (..., w), (..., w, 3), (..., w, 5)
+        Of each window and of what came since the alarm, in the last place: seconds, sum of
+        weights, means and central products of the path.
+    raised, excess, before : array
+        Seconds since an alarm was raised, NaN where none is; ln I over the expected at that moment,
+        and the age, s, of the window that showed it.
+    """
+
+    time: np.ndarray
+    current: np.ndarray
+    step: np.ndarray
+    pace: np.ndarray
+    expected: np.ndarray
+    clock: np.ndarray
+    hold: np.ndarray
+    path: np.ndarray
+    noise: np.ndarray
+    factor: np.ndarray
+    covariance: np.ndarray
+    age: np.ndarray
+    weight: np.ndarray
+    mean: np.ndarray
+    product: np.ndarray
+    raised: np.ndarray
+    excess: np.ndarray
+    before: np.ndarray
+
+
+class Told(NamedTuple):
+    """What a reading brought.
+
+    Attributes
+    ----------
+    raised : array of bool
+        Whether an alarm is raised by this reading.
+    moved : array of int
+        What moved, once it is told: a place in `NAMES`; 0 otherwise.
+    change, error : array, shape (..., 2)
+        Relative changes of a and b with their errors; 0 and 0 of what did not move.
+    since : array
+        When the change began, s.
+    """
+
+    raised: np.ndarray
+    moved: np.ndarray
+    change: np.ndarray
+    error: np.ndarray
+    since: np.ndarray
+
+
+def started(reference: Reference, shape: tuple[int, ...] = ()) -> State:
+    """Begin to watch.
+
+    Parameters
+    ----------
+    reference : Reference
+        The usual loss.
+    shape : tuple of int, optional
+        Of many beams watched at once.
+
+    Returns
+    -------
+    State
+    """
+    windows = (*shape, LENGTHS.size + 1)
+    none, zero = np.full(shape, np.nan), np.zeros(shape)
+    return State(
+        time=none, current=none, step=zero, pace=zero, expected=np.ones((*shape, 2)), clock=zero,
+        hold=zero, path=np.zeros((*shape, 3)), noise=np.ones(shape), factor=np.ones((*shape, 2)),
+        covariance=np.broadcast_to(np.asarray(reference.covariance, float), (*shape, 2, 2)),
+        age=np.zeros(windows), weight=np.zeros(windows), mean=np.zeros((*windows, 3)),
+        product=np.zeros((*windows, 5)), raised=none, excess=zero, before=zero,
+    )  # fmt: skip
+
+
+def watched(reference: Reference, state: State, reading: Reading) -> tuple[State, Told]:
+    """Take a reading.
+
+    Parameters
+    ----------
+    reference : Reference
+        The usual loss.
+    state : State
+        Of `started`, or of the reading before.
+    reading : Reading
+        The reading; of many beams, arrays.
+
+    Returns
+    -------
+    State
+        To be given with the next reading.
+    Told
+        Whether an alarm is raised, and what moved once that is told; after that the loss found is
+        the usual one.
+
+    Notes
+    -----
+    ln I follows -∫(a I + b)dt, so that its excess over the expected is linear in relative changes
+    of a and b; each window fits them with an offset for every piece between refills, gaps and
+    steps, by weighted sums of readings freed of their correlation exp(-dt/time) (as in docs,
+    "Noise with a memory"). With information J, score s and the reference's covariance C, the test
+    of a change d = (1, 0) or (0, 1) is (dᵀ M s')²/(dᵀ M d), M = (1 + J C)⁻¹ J, s' = (1 + J C)⁻¹ s.
+    What moved is told by readings after the alarm alone: a window that spans the change bends.
+
+    Examples
+    --------
+    >>> usual = Reference(a=3.7e-8, b=9.3e-6, noise=1e-3)
+    >>> state, beam = started(usual), 500.0
+    >>> for second in range(1800):
+    ...     worse = 1.1 if second > 600 else 1.0
+    ...     beam *= 1 - worse * usual.a * beam - usual.b
+    ...     state, told = watched(usual, state, Reading(second, beam))
+    ...     if told.raised or told.moved:
+    ...         print(second, NAMES[told.moved], f"{100 * told.change[0]:.1f} % in a")
+    """
+    usable = np.isfinite(reading.current) & (np.nan_to_num(reading.current) > 0)
+    reading = reading._replace(current=np.where(usable, reading.current, 1.0))
+    after = _moved_on(reference, state, reading)
+    after = State(*(_where(usable, new, old) for new, old in zip(after, state, strict=True)))
+    return _judged(reference, after, usable)
+
+
+def _where(chosen: np.ndarray, new: np.ndarray, old: np.ndarray) -> np.ndarray:
+    """One or the other, by the leading axes."""
+    shape = np.shape(chosen) + (1,) * (np.ndim(old) - np.ndim(chosen))
+    return np.where(np.reshape(chosen, shape), new, old)
+
+
+class _Step(NamedTuple):
+    """From one reading to the next: seconds, whether the path goes on, and whether it was cut by
+    a step; how far ln I moved against the expected, with derivatives; noise and its memory."""
+
+    seconds: np.ndarray
+    going: np.ndarray
+    cut: np.ndarray
+    moved: np.ndarray
+    expected: np.ndarray
+    noise: np.ndarray
+    memory: np.ndarray
+
+
+def _step(usual: Reference, state: State, reading: Reading) -> _Step:
+    with np.errstate(invalid="ignore", divide="ignore"):
+        seconds = np.asarray(reading.time - state.time)
+        going = (seconds > 0) & (seconds <= max(GAP * usual.interval, MINUTE))
+        seconds = np.where(going, seconds, 1.0)
+        middle = (reading.current + state.current) / 2
+        a_part = usual.a * state.factor[..., 0] * reading.a_factor * middle * seconds
+        b_part = usual.b * state.factor[..., 1] * reading.b_factor * seconds
+        excess = np.log(reading.current / state.current) + a_part + b_part
+        noise = usual.noise / reading.current * np.sqrt(state.noise)
+        memory = np.zeros_like(seconds)
+        if usual.correlation_time:
+            memory = np.exp(-seconds / usual.correlation_time)
+        # A longer interval than the last is held to the pace of the last and to the share.
+        alike = np.where(state.step > 0, np.minimum(seconds, state.step), 0.0)
+        ratio = alike / np.where(state.step > 0, state.step, 1.0)
+        spread = noise * np.sqrt(2 * (1 - memory) * (1 + ratio + ratio**2))
+        off = np.abs(excess - state.pace * alike)
+        level = off <= JUMP * spread + SHARE * (a_part + b_part)
+        expected = np.stack(np.broadcast_arrays(reading.a_factor, reading.b_factor, noise)[:2], -1)
+        level &= (np.abs(expected / state.expected - 1) <= SET).all(-1)
+    moved = np.stack([excess, -a_part, -b_part], axis=-1)
+    return _Step(seconds, going & level, going & ~level, moved, expected, noise, memory)
+
+
+def _moved_on(usual: Reference, state: State, reading: Reading) -> State:
+    """The path from the last reading to this one, and every window with it."""
+    seconds, going, cut, moved, expected, noise, memory = _step(usual, state, reading)
+    between = np.where(going, seconds, 0.0)
+    hold = np.where(cut, SETTLE, np.maximum(state.hold - between, 0.0))
+    path = np.where(going[..., None], state.path + np.where(going[..., None], moved, 0.0), 0.0)
+    begins = ~going | (state.hold > 0)
+    # Of a reading less its memory of the last one: what it alone says, as value and weight.
+    kept = np.where(begins, 0.0, memory)
+    alone = (path - kept[..., None] * state.path) / (1 - kept)[..., None]
+    weight = np.where(hold > 0, 0.0, (1 - kept) / ((1 + kept) * noise**2))
+    windows = _windows(
+        state, np.where(begins[..., None], 0.0, state.weight), alone, weight, between
+    )
+    known = going | cut
+    off = moved[..., 0] ** 2 / (2 * (1 - memory) * noise**2)
+    grown = np.where(going, np.minimum(off, JUMP**2) * state.noise - state.noise, 0.0) / MEMORY
+    return state._replace(
+        time=np.broadcast_to(reading.time, state.time.shape).astype(float),
+        current=np.broadcast_to(reading.current, state.time.shape).astype(float),
+        step=np.where(known, seconds, 0.0),
+        pace=np.where(known, moved[..., 0] / seconds, 0.0),
+        expected=expected,
+        clock=state.clock + between,
+        hold=hold,
+        path=path,
+        noise=np.maximum(state.noise + grown, 1.0),
+        raised=state.raised + between,
+        **windows,
+    )
+
+
+def _windows(
+    state: State, before: np.ndarray, path: np.ndarray, weight: np.ndarray, step: np.ndarray
+) -> dict[str, np.ndarray]:
+    """Weighted means and central products with one reading more (Welford); those due, anew.
+
+    Where the weight before is zero the piece begins, and its offset is free.
+    """
+    clock = state.clock[..., None]
+    turns = np.floor((clock - PHASES) / LENGTHS)
+    due = np.floor((clock + step[..., None] - PHASES) / LENGTHS) > turns
+    due = np.concatenate([due, np.zeros_like(clock, bool)], axis=-1)
+    before = np.where(due, 0.0, before)
+    total = before + weight[..., None]
+    share = np.where(total > 0, weight[..., None] / np.where(total > 0, total, 1.0), 0.0)
+    off = np.where((before > 0)[..., None], path[..., None, :] - state.mean, 0.0)
+    start = (before == 0)[..., None] & (weight > 0)[..., None, None]
+    mean = np.where(start, path[..., None, :], state.mean + share[..., None] * off)
+    y, u, v = np.moveaxis(off, -1, 0)
+    pairs = np.stack([u * u, u * v, v * v, u * y, v * y], axis=-1)
+    product = np.where(due[..., None], 0.0, state.product)
+    product = product + (share * before)[..., None] * pairs
+    age = np.where(due, 0.0, state.age) + step[..., None]
+    return {"age": age, "weight": total, "mean": mean, "product": product}
+
+
+def _tests(state: State) -> tuple[np.ndarray, ...]:
+    """Fall of chi² if a, if b, if both moved, in each window."""
+    uu, uv, vv, uy, vy = np.moveaxis(state.product, -1, 0)
+    covariance = state.covariance[..., None, :, :]
+    caa, cab, cbb = covariance[..., 0, 0], covariance[..., 0, 1], covariance[..., 1, 1]
+    # 1 + J C and its inverse times (J, s), written out: 2 by 2.
+    p, q = 1 + uu * caa + uv * cab, uu * cab + uv * cbb
+    r, t = uv * caa + vv * cab, 1 + uv * cab + vv * cbb
+    det = p * t - q * r
+    maa, mab, mbb = (t * uu - q * uv) / det, (t * uv - q * vv) / det, (p * vv - r * uv) / det
+    sa, sb = (t * uy - q * vy) / det, (p * vy - r * uy) / det
+    by_a = sa**2 / np.where(maa > 0, maa, np.inf)
+    by_b = sb**2 / np.where(mbb > 0, mbb, np.inf)
+    left = mbb - mab**2 / np.where(maa > 0, maa, np.inf)
+    rest = sb - sa * mab / np.where(maa > 0, maa, np.inf)
+    # Where the two are not told apart by rounding, both explain no more than one.
+    both = by_a + np.where(left > 1e-9 * mbb, rest**2 / np.where(left > 0, left, np.inf), 0.0)
+    return by_a, by_b, np.maximum(both, np.maximum(by_a, by_b))
+
+
+def _change(state: State, moved: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Relative changes since the alarm, of what moved alone, their errors, and the covariance.
+
+    Errors contain those of the reference.
+    """
+    uu, uv, vv, uy, vy = np.moveaxis(state.product[..., -1, :], -1, 0)
+    uu, vv = uu + WIDE**-2, vv + WIDE**-2
+    det = uu * vv - uv**2
+    rows = np.stack([np.stack([vv, -uv], -1), np.stack([-uv, uu], -1)], axis=-2)
+    covariance = rows / det[..., None, None]
+    both = np.stack([vv * uy - uv * vy, uu * vy - uv * uy], axis=-1) / det[..., None]
+    total = np.diagonal(covariance + state.covariance, axis1=-2, axis2=-1)
+    caa, cab, cbb = (state.covariance[..., i, j] for i, j in ((0, 0), (0, 1), (1, 1)))
+    a_error = 1 / uu + caa + 2 * uv / uu * cab + (uv / uu) ** 2 * cbb
+    b_error = 1 / vv + cbb + 2 * uv / vv * cab + (uv / vv) ** 2 * caa
+    zero = np.zeros_like(uy)
+    change, error = both, np.sqrt(total)
+    for which, value, square in (
+        (1, (uy / uu, zero), (a_error, zero)),
+        (2, (zero, vy / vv), (zero, b_error)),
+    ):
+        change = _where(moved == which, np.stack(value, -1), change)
+        error = _where(moved == which, np.sqrt(np.stack(square, -1)), error)
+    return change, error, covariance
+
+
+def _judged(usual: Reference, state: State, usable: np.ndarray) -> tuple[State, Told]:
+    by_a, by_b, both = _tests(state)
+    quiet = np.isnan(state.raised)
+    old = state.age[..., :-1] >= MINUTE
+    seen = np.where(old, np.maximum(by_a, by_b)[..., :-1], 0.0)
+    raised = quiet & usable & (seen.max(-1) > RAISED)
+    if raised.any():
+        state = _raised(state, raised, np.argmax(seen, axis=-1))
+    gain_a, gain_b, gain = by_a[..., -1], by_b[..., -1], both[..., -1]
+    most = np.maximum(gain_a, gain_b)
+    apart = np.select(
+        [gain - most > BOTH, gain_a - gain_b > NAMED, gain_b - gain_a > NAMED], [3, 1, 2], 0
+    )
+    late = 4 * (state.raised > PATIENCE)
+    settled = ~quiet & usable & (state.age[..., -1] >= MINUTE)
+    moved = np.where(settled, np.where(apart > 0, apart, late), 0)
+    if not moved.any():
+        nothing = np.zeros_like(state.factor)
+        return state, Told(raised, moved, nothing, nothing, state.time)
+    change, error, covariance = _change(state, moved)
+    told = Told(raised, moved, change, error, _since(usual, state, change))
+    return _adopted(state, moved > 0, change, covariance), told
+
+
+def _raised(state: State, raised: np.ndarray, best: np.ndarray) -> State:
+    """An alarm begins: what comes from now on tells what moved."""
+    anew = raised[..., None] & (np.arange(LENGTHS.size + 1) == LENGTHS.size)
+    level = np.take_along_axis(state.mean[..., 0], best[..., None], -1)[..., 0]
+    age = np.take_along_axis(state.age, best[..., None], -1)[..., 0]
+    return state._replace(
+        age=np.where(anew, 0.0, state.age),
+        weight=np.where(anew, 0.0, state.weight),
+        product=np.where(anew[..., None], 0.0, state.product),
+        raised=np.where(raised, 0.0, state.raised),
+        excess=np.where(raised, state.path[..., 0] - level, state.excess),
+        before=np.where(raised, age, state.before),
+    )
+
+
+def _since(usual: Reference, state: State, change: np.ndarray) -> np.ndarray:
+    """When the loss found later had made the excess that raised the alarm, within its window."""
+    rates = np.stack([usual.a * state.current, np.full_like(state.current, usual.b)], axis=-1)
+    pace = -np.sum(rates * state.factor * change, axis=-1)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        made = np.clip(np.nan_to_num(state.excess / pace), 0.0, state.before)
+    return state.time - state.raised - made
+
+
+def _adopted(state: State, done: np.ndarray, change: np.ndarray, covariance: np.ndarray) -> State:
+    """Where an alarm is told, what was found is the usual loss from now on."""
+    fresh = State(*(np.zeros_like(part) for part in state))
+    factor = state.factor * (1 + change)
+    known = {"factor": factor, "covariance": state.covariance + covariance}
+    named = {name: _where(done, part, getattr(state, name)) for name, part in known.items()}
+    for name in ("age", "weight", "product"):
+        named[name] = _where(done, getattr(fresh, name), getattr(state, name))
+    return state._replace(
+        **named,
+        raised=np.where(done, np.nan, state.raised),
+    )
+
+
+class Alarm(NamedTuple):
+    """A change of the loss.
+
+    Attributes
+    ----------
+    time : float
+        When it was raised, s.
+    since : float
+        When the change began, s.
+    told : float or None
+        When it was told what moved, s; None where the record ends before.
+    moved : str
+        "a", "b", "a and b", or "a or b" where the readings do not tell.
+    a, b : Quantity or None
+        Relative change, of 1; None of what did not move.
+    """
+
+    time: float
+    since: float
+    told: float | None
+    moved: str
+    a: Quantity | None
+    b: Quantity | None
+
+    def said(self, dated: bool) -> str:
+        """In words, with the date where times are Unix times."""
+        changes = [
+            f"{name} moved by {100 * found.value:+.2g} ± {100 * found.error:.1g} %"
+            for name, found in (("a", self.a), ("b", self.b))
+            if found is not None and self.moved != "a or b"
+        ]
+        what = " and ".join(changes) or "a or b moved, the readings do not tell which,"
+        return f"{what} since {when(self.since, dated)}"
+
+
+def alarms_of(
+    reference: Reference,
+    time: np.ndarray,
+    current: np.ndarray,
+    a_factor: float | np.ndarray = 1.0,
+    b_factor: float | np.ndarray = 1.0,
+) -> tuple[Alarm, ...]:
+    """Watch readings from the first to the last.
+
+    Parameters
+    ----------
+    reference : Reference
+        The usual loss.
+    time, current : array, shape (n,)
+        s and mA, with refills and gaps.
+    a_factor, b_factor : float or array, shape (n,)
+        Expected a and b over those of the reference.
+
+    Returns
+    -------
+    tuple of Alarm
+        In order of time.
+    """
+    state, alarms, raised = started(reference), [], None
+    for row in np.stack(np.broadcast_arrays(time, current, a_factor, b_factor), axis=-1):
+        state, told = watched(reference, state, Reading(*row))
+        raised = float(row[0]) if told.raised else raised
+        if told.moved:
+            alarms.append(_alarm(raised, told, float(row[0])))
+            raised = None
+    if raised is not None:
+        change, error, _ = _change(state, np.int64(4))
+        since = _since(reference, state, change)
+        alarms.append(_alarm(raised, Told(True, 4, change, error, since), None))
+    return tuple(alarms)
+
+
+def _alarm(raised: float, told: Told, at: float | None) -> Alarm:
+    moved = NAMES[int(told.moved)]
+    a, b = (
+        Quantity(float(v), float(e), "1") if name in moved.split() else None
+        for name, v, e in zip("ab", told.change, told.error, strict=True)
+    )
+    return Alarm(raised, float(told.since), at, moved, a, b)
+
+
+def when(time: float, dated: bool) -> str:
+    """A time as a date, or in hours of the record."""
+    if not dated:
+        return f"{time / 3600:.2f} h"
+    return datetime.fromtimestamp(60 * round(time / 60), UTC).strftime("%Y-%m-%d %H:%M")

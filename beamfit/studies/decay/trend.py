@@ -1,0 +1,364 @@
+"""Lifetime over weeks: normalised, with control limits, and watched for changes of a and b."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy.special import stdtrit
+
+from beamfit.errors import InputError
+from beamfit.lifetime.decay import HOUR
+from beamfit.lifetime.losses import loss_coefficients
+from beamfit.quantity import Quantity, Status
+from beamfit.shown import shown
+from beamfit.studies.decay.alarm import Alarm, Reference, alarms_of, when
+from beamfit.studies.decay.fit import bare
+from beamfit.studies.decay.study import Decay, Machine, RecordStudy
+from beamfit.studies.decay.summary import summarise
+from beamfit.table import Table, cell, json_of
+
+__all__ = ["Point", "Trend", "trend_of"]
+
+# Decays that say what is usual: the first so many, half of them if there are fewer.
+BASELINE, FEWEST = 20, 3
+# Mean range of two normal numbers, and the degrees of freedom of each moving range.
+RANGE, RANGE_DOF = 1.128, 0.62
+# One point in 370 of a normal distribution lies beyond 3 standard deviations to either side.
+BEYOND = 0.99865
+# a and b wander by so much on an ordinary day.
+WANDER = 0.005
+DAY = 24 * HOUR
+# No monitor is better than this share of the current.
+BEST_MONITOR = 1e-7
+# More readings are watched every second, third, ... one.
+MOST = 50_000
+
+
+class Point(NamedTuple):
+    """One decay.
+
+    Attributes
+    ----------
+    record : str
+        Name of the decay.
+    time : float
+        Of its first reading: Unix time, or s from the start of the record.
+    current : float
+        Mean current, mA.
+    lifetime : Quantity
+        At the mean current, h.
+    normalised : Quantity
+        Current times lifetime, at the reference current and settings where a ring is given, mA h.
+    a, b : Quantity or None
+        Over the usual ones, of 1; None where the decay does not determine or refutes them.
+    beyond : int
+        +1 above the control limits, -1 below, 0 within.
+    """
+
+    record: str
+    time: float
+    current: float
+    lifetime: Quantity
+    normalised: Quantity
+    a: Quantity | None
+    b: Quantity | None
+    beyond: int
+
+
+@shown
+@dataclass(frozen=True, eq=False)
+class Trend:
+    """Many decays in order of time.
+
+    Parameters
+    ----------
+    status : Status
+        `converged` if all is usual, `poor_fit` if an alarm was raised or a lifetime lies beyond the
+        limits, `unidentified` if there are too few lifetimes to say what is usual.
+    message : str
+        The verdict in a sentence.
+    points : tuple of Point
+        The decays whose lifetime is determined.
+    current : float
+        Reference current, mA.
+    scaled : bool
+        Whether lifetimes are scaled by the ring to the reference current and its usual settings.
+    centre, limit : float
+        Usual normalised lifetime, mA h, and how far from it the control limits are.
+    drift : Quantity
+        Relative change of the normalised lifetime in a week.
+    reference : Reference or None
+        Usual a and b; None where the first decays do not give them.
+    alarms : tuple of Alarm
+        Of the readings after the first decays.
+    dated : bool
+        Whether times are Unix times.
+    """
+
+    status: Status
+    message: str
+    points: tuple[Point, ...]
+    current: float
+    scaled: bool
+    centre: float
+    limit: float
+    drift: Quantity
+    reference: Reference | None
+    alarms: tuple[Alarm, ...]
+    dated: bool
+
+    @property
+    def headline(self) -> str:
+        """The verdict in a line."""
+        return f"{cell(self.status)}: {self.message}"
+
+    def tables(self) -> tuple[Table, ...]:
+        """Every lifetime, and every alarm."""
+        header = ["decay", "from", "I, mA", "τ, h", "I τ, mA h", "a, %", "b, %", ""]
+        names = [point.record for point in self.points]
+        shared = (
+            names[0].partition("#")[0] if len({n.partition("#")[0] for n in names}) == 1 else ""
+        )
+        rows = [
+            [
+                point.record.removeprefix(shared) or shared,
+                when(point.time, self.dated).partition("-")[2] or when(point.time, self.dated),
+                f"{point.current:.4g}", f"{point.lifetime.value:.4g}",
+                f"{point.normalised.value:.5g}", _percent(point.a), _percent(point.b),
+                {1: "above", 0: "", -1: "below"}[point.beyond],
+            ]
+            for point in self.points
+        ]  # fmt: skip
+        by = f"by the ring to {self.current:.4g} mA" if self.scaled else "as measured"
+        note = f"I τ is current times lifetime, {by}; a and b are over the usual ones."
+        tables = [Table("Course of the lifetime", header, rows, note, numeric=True)]
+        if self.alarms:
+            rows = [[when(alarm.time, self.dated), alarm.said(self.dated)] for alarm in self.alarms]
+            tables.append(Table("Alarms", ["raised", "what"], rows))
+        return tuple(tables)
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the points, what is usual, and the alarms as JSON's types."""
+        usual = self.reference
+        known = usual and {"a": bare(usual.a, "1/(mA s)"), "b": bare(usual.b, "1/s")}
+        named = ("status", "message", "points", "drift", "alarms")
+        rest = {
+            "current": bare(self.current, "mA"),
+            "scaled_by_ring": self.scaled,
+            "centre": bare(self.centre, "mA h"),
+            "limit": bare(self.limit, "mA h"),
+            "reference": known,
+        }
+        return json_of({name: getattr(self, name) for name in named} | rest)
+
+
+def _percent(ratio: Quantity | None) -> str:
+    if ratio is None:
+        return "-"
+    error = f" ± {100 * ratio.error:.2f}" if 100 * ratio.error >= 0.005 else ""
+    return f"{100 * ratio.value:.2f}{error}"
+
+
+class _Scaled(NamedTuple):
+    """Decays in order of time, and a, b and lifetime of the ring at each over the reference's."""
+
+    decays: list[Decay]
+    time: np.ndarray
+    a: np.ndarray
+    b: np.ndarray
+    lifetime: np.ndarray
+
+
+def trend_of(studies: Sequence[RecordStudy], machine: Machine | None = None) -> Trend:
+    """Follow the lifetime through many decays.
+
+    Parameters
+    ----------
+    studies : sequence of RecordStudy
+        Records, each with its decays; of several, all with dates.
+    machine : Machine, optional
+        The ring, which scales lifetimes to its usual settings and the reference current, the
+        median of all. Otherwise current times lifetime is taken as it is, which is constant where
+        all loss goes with the square of the current.
+
+    Returns
+    -------
+    Trend
+        With control limits from the first decays, 20 or half of them, and with the alarms of
+        `beamfit.studies.decay.alarm` on all readings after those.
+
+    Raises
+    ------
+    InputError
+        If several records are not all dated.
+
+    Notes
+    -----
+    Limits are those of an individuals chart (D. C. Montgomery, Introduction to Statistical Quality
+    Control, 7th ed., section 6.4): 3 standard deviations, these from the mean moving range over
+    1.128, which a slow drift does not widen; Student's quantile, since they come from few points.
+    """
+    if len(studies) > 1 and any(study.record.start is None for study in studies):
+        name = next(study.record.name for study in studies if study.record.start is None)
+        raise InputError("times without a date", "dated records, to put them in order", path=name)
+    dated = all(study.record.start is not None for study in studies)
+    studies = sorted(studies, key=lambda study: study.record.start or 0.0)
+    decays = [decay for study in studies for decay in study.decays]
+    decays = [decay for decay in decays if decay.fit.lifetime_mean.error is not None]
+    if not decays:
+        expected = "one decay at least whose lifetime is determined"
+        raise InputError("no lifetime", expected, path=studies[0].record.name)
+    current = float(np.median([decay.fit.mean_current for decay in decays]))
+    scaled = _scaled(studies, decays, machine, current)
+    first = min(BASELINE, max(len(decays) // 2, FEWEST))
+    usual = _reference(_first(scaled, first)) if len(decays) > first else None
+    values = _normalised(scaled, current if machine else None)
+    centre, limit = _limits(np.array([value.value for value in values[:first]]))
+    points = tuple(
+        _point(decay, time, a, b, value, usual, (centre, limit))
+        for decay, time, a, b, value in zip(*scaled[:4], values, strict=True)
+    )
+    drift = _drift(scaled.time, values, centre)
+    alarms = () if usual is None else _alarms(studies, scaled, first, usual)
+    found = (points, current, machine is not None, centre, limit, drift, usual, alarms, dated)
+    trend = Trend(Status.converged, "", *found)
+    return replace(trend, **dict(zip(("status", "message"), _verdict(trend), strict=True)))
+
+
+def _scaled(
+    studies: Sequence[RecordStudy], decays: list[Decay], machine: Machine | None, current: float
+) -> _Scaled:
+    starts = {id(d): (s.record.start or 0.0) + d.offset for s in studies for d in s.decays}
+    time = np.array([starts[id(decay)] for decay in decays])
+    if machine is None:
+        return _Scaled(decays, time, *np.ones((3, len(decays))))
+    usual = loss_coefficients(machine.ring, machine.operation, current)
+    rate = usual.a * current + usual.b
+    rows = [
+        (d.budget.losses.a / usual.a, d.budget.losses.b / usual.b, d.budget.lifetime * HOUR * rate)
+        for d in decays
+    ]
+    return _Scaled(decays, time, *np.array(rows, float).T)
+
+
+def _first(scaled: _Scaled, count: int) -> _Scaled:
+    return _Scaled(*(part[:count] for part in scaled))
+
+
+def _normalised(scaled: _Scaled, current: float | None) -> list[Quantity]:
+    """Current times lifetime, mA h."""
+    values = []
+    for decay, factor in zip(scaled.decays, scaled.lifetime, strict=True):
+        found = decay.fit.lifetime_mean
+        by = (current or decay.fit.mean_current) / factor
+        values.append(Quantity(by * found.value, by * found.error, "mA h"))
+    return values
+
+
+def _limits(values: np.ndarray) -> tuple[float, float]:
+    """Mean of the first points, and 3 standard deviations of a further one."""
+    if values.size < FEWEST:
+        return float(values.mean()), math.inf
+    spread = float(np.abs(np.diff(values)).mean()) / RANGE
+    reach = stdtrit(RANGE_DOF * (values.size - 1), BEYOND) * math.sqrt(1 + 1 / values.size)
+    return float(values.mean()), float(reach) * spread
+
+
+def _point(
+    decay: Decay, time: float, a: float, b: float, value: Quantity, usual: Reference | None, limits
+) -> Point:
+    centre, limit = limits
+    off = value.value - centre
+    beyond = int(np.sign(off)) if abs(off) > max(limit, 3 * value.error) else 0
+    fit = decay.fit
+    relative: list[Quantity | None] = [None, None]
+    if usual is not None and fit.status is not Status.poor_fit:
+        relative = [
+            None if q.error is None else Quantity(q.value / by, q.error / by, "1")
+            for q, by in ((fit.a, usual.a * a), (fit.b, usual.b * b))
+        ]
+    return Point(fit.record, time, fit.mean_current, fit.lifetime_mean, value, *relative, beyond)
+
+
+def _drift(time: np.ndarray, values: Sequence[Quantity], centre: float) -> Quantity:
+    """Relative slope by least squares, its error from the residuals."""
+    if len(values) < FEWEST + 1 or np.ptp(time) < DAY:
+        return Quantity(math.nan, None, "1")
+    level = np.array([value.value for value in values]) / centre
+    weeks = (time - time.mean()) / (7 * DAY)
+    [slope, _], covariance = np.polyfit(weeks, level, 1, cov=True)
+    return Quantity(float(slope), float(np.sqrt(covariance[0, 0])), "1")
+
+
+def _reference(scaled: _Scaled) -> Reference | None:
+    """Usual a and b of some decays, with their noise; None where they do not give both above zero.
+
+    Least squares on what each decay says of a I and a I + b. How far the decays scatter about it
+    is how far a and b are expected to wander.
+    """
+    measured = summarise(tuple(scaled.decays))
+    current, root = np.asarray(measured.current), np.asarray(measured.root)
+    parts = np.asarray(measured.parts)
+    quadratic, zero = scaled.a * current, np.zeros_like(current)
+    rows = np.stack([np.stack([quadratic, zero], -1), np.stack([quadratic, scaled.b], -1)], axis=1)
+    weighted = np.einsum("nij,njk->nik", root, rows).reshape(-1, 2)
+    seen = np.einsum("nij,nj->ni", root, parts).ravel()
+    size = np.linalg.norm(weighted, axis=0)
+    found = np.linalg.lstsq(weighted / size, seen, rcond=None)[0] / size
+    if not (np.isfinite(found).all() and found.min() > 0):
+        return None
+    relative = weighted * found
+    covariance = np.linalg.pinv(relative.T @ relative, hermitian=True)
+    off = parts[:, 1] / (rows @ found)[:, 1] - 1
+    wander = math.sqrt(float(off @ off) / max(off.size - 2, 1))
+    covariance = covariance + max(WANDER, wander) ** 2 * np.eye(2)
+    return Reference(*map(float, found), *_noise(scaled.decays), covariance)
+
+
+def _noise(decays: Sequence[Decay]) -> tuple[float, float, float]:
+    """Noise of a reading, mA, its correlation time and the interval of readings, s."""
+    fits = [decay.fit for decay in decays]
+    noise = np.median([fit.rms_residual * math.sqrt(len(fit.residuals) / fit.dof) for fit in fits])
+    memory = np.median([fit.correlation_time or 0.0 for fit in fits])
+    noise = max(noise, BEST_MONITOR * np.median([fit.mean_current for fit in fits]))
+    interval = np.median([np.median(np.diff(decay.segment.time)) for decay in decays])
+    return float(noise), float(memory), float(interval)
+
+
+def _alarms(
+    studies: Sequence[RecordStudy], scaled: _Scaled, first: int, usual: Reference
+) -> tuple[Alarm, ...]:
+    """Watch all readings from the decay after the first ones on."""
+    rows = [
+        np.stack([(study.record.start or 0.0) + study.record.time, study.record.current], axis=-1)
+        for study in studies
+    ]
+    rows = np.concatenate(rows)
+    rows = rows[rows[:, 0] >= scaled.time[first]]
+    rows = rows[:: math.ceil(len(rows) / MOST)]
+    place = np.searchsorted(scaled.time, rows[:, 0], side="right") - 1
+    return alarms_of(usual, *rows.T, scaled.a[place], scaled.b[place])
+
+
+def _verdict(trend: Trend) -> tuple[Status, str]:
+    count, centre = len(trend.points), trend.centre
+    many = f"{count} lifetime" + "s" * (count > 1)
+    usual = f"{many}; current times lifetime is usually {centre:.4g} mA h"
+    if not math.isfinite(trend.limit):
+        more = f"{FEWEST + 1} or more decays are needed to say what is usual."
+        return Status.unidentified, f"{usual}; {more}"
+    beyond = sum(point.beyond != 0 for point in trend.points)
+    said = f"{usual} ± {100 * trend.limit / centre:.2g} %, {beyond} beyond that."
+    drift = trend.drift
+    if drift.error is not None and abs(drift.value) > 3 * drift.error:
+        said += f" It changes by {100 * drift.value:+.2g} ± {100 * drift.error:.1g} % a week."
+    if trend.reference is None:
+        said += " Readings are not watched: the first decays give no a and b above zero."
+    if trend.alarms:
+        first = "Alarm" if len(trend.alarms) == 1 else f"{len(trend.alarms)} alarms, the first"
+        said += f" {first}: {trend.alarms[0].said(trend.dated)}."
+    return (Status.poor_fit if beyond or trend.alarms else Status.converged), said
