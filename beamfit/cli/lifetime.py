@@ -122,8 +122,9 @@ def lifetime(
     from beamfit.studies.decay.study import study_record  # JAX from here on
 
     studies = tuple(study_record(each, machine) for each in records)
-    decays = [decay for each in studies for decay in each.decays]
-    shift = _shift(decays, machine, network, priors) if study else None
+    decays = [decay for each in studies for decay in each.answers]
+    single = [decay for each in studies for decay in each.decays or each.pooled]
+    shift = _shift(single, machine, network, priors) if study else None
     course = _trend(studies, machine) if trend else None
     posteriors = None
     if sample:
@@ -212,7 +213,7 @@ def _show(
     terminal = Terminal()
     for each in studies:
         _show_record(terminal, each)
-    names = [decay.fit.record for study in studies for decay in study.decays]
+    names = [decay.fit.record for study in studies for decay in study.answers]
     for name, posterior in zip(names, posteriors or (), strict=False):
         terminal.posterior(f"Posterior of {name}", posterior)
     if shift is not None:
@@ -231,6 +232,7 @@ def _show_record(terminal: Terminal, study: RecordStudy) -> None:
         SYSTEMATIC,
         budget_rows,
         check_rows,
+        counted,
         decay_rows,
         separability_rows,
         systematic_rows,
@@ -240,14 +242,14 @@ def _show_record(terminal: Terminal, study: RecordStudy) -> None:
     terminal.line(str(study.record), style="bold")
     for note in study.record.notes:
         terminal.line(f"Note: {note}")
-    if study.events:
+    if study.pooled:
+        terminal.line(f"Cut at or left out: {counted(study.events)}")
+    elif study.events:
         said = "; ".join(str(event) for event in study.events[:8])
         left = len(study.events) - 8
         terminal.line(f"Cut at or left out: {said}" + (f"; {left} more" if left > 0 else ""))
-    if len(study.decays) > FEW:
-        _show_many(terminal, study)
-        return
-    for decay in study.decays:
+    many = len(study.decays) > FEW
+    for decay in study.pooled if many else study.answers:
         name, status = decay.fit.record, decay.fit.status
         rows = decay_rows([decay]) + separability_rows([decay])[:2] + check_rows([decay])
         terminal.answer(decay.fit.headline, status, decay.fit.message)
@@ -258,6 +260,8 @@ def _show_record(terminal: Terminal, study: RecordStudy) -> None:
         if losses := budget_rows([decay]):
             terminal.table(labelled("\nLosses from first principles", [name], losses))
         terminal.line()
+    if many:
+        _show_many(terminal, study)
 
 
 def _show_many(terminal: Terminal, study: RecordStudy) -> None:

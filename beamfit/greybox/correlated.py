@@ -10,9 +10,19 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
+from scipy.linalg import cho_solve_banded, cholesky_banded
 from scipy.special import stdtr
 
-__all__ = ["Memory", "Moments", "is_correlated", "log_volume", "memory_of", "range_of", "whitened"]
+__all__ = [
+    "Levels",
+    "Memory",
+    "Moments",
+    "is_correlated",
+    "log_volume",
+    "memory_of",
+    "range_of",
+    "whitened",
+]
 
 # Correlation of neighbouring residuals, in standard errors of that of independent ones, from which
 # they count as correlated.
@@ -72,6 +82,45 @@ def is_correlated(residuals: np.ndarray, parameters: int) -> bool:
         return False
     found = float(residuals[1:] @ residuals[:-1]) / squares + parameters / count
     return bool(found > SEEN / np.sqrt(count))
+
+
+class Levels(NamedTuple):
+    """Numbers of which each moves the rows of one block alone: a level for every cycle.
+
+    Attributes
+    ----------
+    first : array of int, shape (k,)
+        Where each block begins; the first at row 0.
+    slope : array, shape (n,)
+        Derivative of each residual by the number of its block.
+    """
+
+    first: np.ndarray
+    slope: np.ndarray
+
+    def left(self, rows: np.ndarray, apart: np.ndarray) -> tuple[np.ndarray, float]:
+        """Whitened rows less what the levels can explain, and half the log of the levels' matrix.
+
+        Whitening carries the last row of a block into the first of the next, so the matrix has
+        three diagonals: O(n). Done twice, for what rounding leaves of the first time.
+        """
+        kept, new, begins = np.exp(-apart), np.sqrt(-np.expm1(-2 * apart)), self.first[1:]
+        own = np.append(self.slope[:1], (self.slope[1:] - kept * self.slope[:-1]) / new)
+        own[begins] = self.slope[begins] / new[begins - 1]
+        carried = -(kept * self.slope[:-1] / new)[begins - 1]
+        matrix = np.zeros((2, self.first.size))
+        matrix[1] = np.add.reduceat(own**2, self.first)
+        matrix[1, :-1] += carried**2
+        matrix[0, 1:] = carried * own[begins]
+        factor = cholesky_banded(matrix)
+        lengths = np.diff(self.first, append=len(rows))
+        for _ in range(2):
+            moment = np.add.reduceat(own[:, None] * rows, self.first)
+            moment[:-1] += carried[:, None] * rows[begins]
+            found = cho_solve_banded((factor, False), moment)
+            rows = rows - own[:, None] * np.repeat(found, lengths, axis=0)
+            rows[begins] -= carried[:, None] * found[:-1]
+        return rows, float(np.sum(np.log(factor[1])))
 
 
 class Moments(NamedTuple):
@@ -160,7 +209,13 @@ def range_of(time: np.ndarray) -> tuple[float, float]:
     return SHORTEST * usual, LONGEST * float(time[-1] - time[0])
 
 
-def memory_of(slopes: np.ndarray, residuals: np.ndarray, time: np.ndarray) -> Memory:
+def memory_of(
+    slopes: np.ndarray,
+    residuals: np.ndarray,
+    time: np.ndarray,
+    levels: Levels | None = None,
+    known: float | None = None,
+) -> Memory:
     """Least squares with correlated errors, averaged over what the residuals leave open of them.
 
     Parameters
@@ -171,6 +226,10 @@ def memory_of(slopes: np.ndarray, residuals: np.ndarray, time: np.ndarray) -> Me
         Model less reading, in the same units.
     time : array, shape (n,)
         When each was taken, increasing.
+    levels : Levels, optional
+        Further numbers, one a block, that are eliminated.
+    known : float, optional
+        The correlation time; 0 for independent errors. Otherwise it is averaged over.
 
     Returns
     -------
@@ -197,19 +256,27 @@ def memory_of(slopes: np.ndarray, residuals: np.ndarray, time: np.ndarray) -> Me
     """
     count, p = slopes.shape
     rows, interval = np.column_stack([slopes, residuals]), np.diff(time)
-    times = np.geomspace(*range_of(time), TIMES)
-    found = [_at(rows, interval / each) for each in times]
+    times = np.geomspace(*range_of(time), TIMES) if known is None else np.array([known])
+    with np.errstate(divide="ignore"):
+        found = [_at(rows, interval / each, levels) for each in times]
+    count -= 0 if levels is None else levels.first.size
     logs, step, half, squares = (np.array(part) for part in zip(*found, strict=True))
     weight = np.exp(logs - logs.max())
     return Memory(weight / weight.sum(), times, step, half, squares, count - p)
 
 
-def _at(rows: np.ndarray, apart: np.ndarray) -> tuple[float, np.ndarray, np.ndarray, float]:
+def _at(
+    rows: np.ndarray, apart: np.ndarray, levels: Levels | None
+) -> tuple[float, np.ndarray, np.ndarray, float]:
     """Log probability, step, half and squares at one correlation time."""
-    factor = np.linalg.qr(whitened(rows, apart, np), mode="r")
+    white, volume, count = whitened(rows, apart, np), 0.0, len(rows)
+    if levels is not None:
+        white, volume = levels.left(white, apart)
+        count -= levels.first.size
+    factor = np.linalg.qr(white, mode="r")
     p = rows.shape[1] - 1
     half = np.linalg.inv(factor[:p, :p])
     squares = max(float(factor[p, p] ** 2), 1e-300)
-    log = log_volume(apart, np) - np.sum(np.log(np.abs(np.diag(factor)[:p])))
-    log -= 0.5 * (len(rows) - p) * np.log(squares)
+    log = log_volume(apart, np) - volume - np.sum(np.log(np.abs(np.diag(factor)[:p])))
+    log -= 0.5 * (count - p) * np.log(squares)
     return log, -half @ factor[:p, p], half, squares

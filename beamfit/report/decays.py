@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from itertools import cycle
 
@@ -27,6 +27,7 @@ from beamfit.report.trend import trend_picture
 from beamfit.status import Status
 from beamfit.studies.decay.checks import moving_lifetime
 from beamfit.studies.decay.fit import DecayFit
+from beamfit.studies.decay.pooled import cycle_lifetimes
 from beamfit.studies.decay.shift import Shift
 from beamfit.studies.decay.study import Decay, RecordStudy
 from beamfit.studies.decay.tables import (
@@ -104,6 +105,8 @@ def decay_page(
     if shift is not None and shift.network is not None:
         tables.append(labelled("A network of the losses", ["value"], network_rows(shift)))
     tables += [] if trend is None else trend.tables()
+    pooled = [decay for study in studies for decay in study.pooled]
+    tables += _side_by_side(pooled)
     tables += _side_by_side(decays) if len(decays) <= FEW else _one_below_another(decays)
     if len(decays) <= FEW:
         tables += [
@@ -120,11 +123,15 @@ def decay_page(
     names = [study.record.name for study in studies]
     title = names[0] if len(names) == 1 else f"{len(names)} records"
     hours = sum(study.record.span for study in studies) / 3600
-    count = f"{len(decays)} decay" + ("s" if len(decays) > 1 else "")
+    counts = {"cycle": sum(d.fit.first.size for d in pooled), "decay": len(decays)}
+    count = ", ".join(f"{n} {what}" + "s" * (n > 1) for what, n in counts.items() if n)
     return Page(
         title=f"Beam lifetime of {title}",
         subtitle=f"{count} in {hours:.3g} h of record; {written()}",
-        verdicts=_shift_verdicts(shift) + _trend_verdicts(trend) + _verdicts(decays),
+        verdicts=_shift_verdicts(shift)
+        + _trend_verdicts(trend)
+        + [_verdict(d) for d in pooled]
+        + _verdicts(decays),
         tables=tables,
         pictures=([] if trend is None else [trend_picture(trend)]) + _pictures(studies),
         pictures_title="Records and fits",
@@ -223,6 +230,8 @@ def draw_record(figure: FigureBase, study: RecordStudy) -> None:
     many = len(record) > MANY
     dots = partial(dict, marker="o", ls="", ms=2 if many else 5, rasterized=many)
     above.plot(record.time / scale, record.current, **dots(color="0.65", zorder=1))
+    for decay in study.pooled:
+        _draw_cycles(above, below, decay.fit, scale, dots)
     for decay in study.decays:
         at = (decay.offset + decay.segment.time) / scale
         above.plot(at, decay.segment.current, **dots(color=BLUE, zorder=2))
@@ -234,12 +243,21 @@ def draw_record(figure: FigureBase, study: RecordStudy) -> None:
         below.plot(at, fit.residuals, **dots(color=BLUE))
     above.plot([], [], "o", color=BLUE, ms=5, label="readings")
     above.plot([], [], color=RED, label="fit")
-    if sum(len(d.segment) for d in study.decays) < len(record):
+    if sum(len(d.segment) for d in study.pooled or study.decays) < len(record):
         above.plot([], [], "o", color="0.65", ms=5, label="left out")
     above.legend(frameon=False, loc="best")
     above.set(title=record.name, ylabel="beam current, mA")
     below.axhline(0, color="0.6", lw=0.8)
     below.set(xlabel=f"time, {unit}", ylabel="fit - reading,\nmA")
+
+
+def _draw_cycles(above: Axes, below: Axes, fit: DecayFit, scale: float, dots: Callable) -> None:
+    """Draw cycles that were fitted together, the law broken between them."""
+    at = (fit.readings.start + fit.readings.time) / scale
+    above.plot(at, fit.readings.current, **dots(color=BLUE, zorder=2))
+    law = np.insert(fit.readings.current + fit.residuals, fit.first, np.nan)
+    above.plot(np.insert(at, fit.first, np.nan), law, color=RED, lw=1.3, zorder=3)
+    below.plot(at, fit.residuals, **dots(color=BLUE))
 
 
 def _time_unit(span: float) -> tuple[float, str]:
@@ -261,6 +279,11 @@ def draw_lifetime(figure: FigureBase, study: RecordStudy) -> None:
     axes: Axes = figure.subplots()
     scale, unit = _time_unit(study.record.span)
     tops = []
+    for decay in () if study.decays else study.pooled:
+        time, lifetime, error = cycle_lifetimes(decay.fit)
+        at = (decay.fit.readings.start + time) / scale
+        axes.errorbar(at, lifetime, error, fmt="o", ms=3, lw=0.8, color=BLUE, zorder=2)
+        axes.plot(at[[0, -1]], 2 * [decay.fit.lifetime_mean.value], color=RED, lw=1.5, zorder=3)
     for decay in study.decays:
         tops.append(_momentary(axes, decay, scale))
         fit = decay.fit
@@ -271,7 +294,10 @@ def draw_lifetime(figure: FigureBase, study: RecordStudy) -> None:
             # A rate of zero or less is no lifetime: leave a hole in the curve.
             inverse = 1 / np.where(rate > 0, rate, np.nan)
             axes.plot((decay.offset + grid) / scale, inverse, color=RED, lw=1.5, zorder=3)
-    axes.errorbar([], [], [], fmt="o", ms=3, color=BLUE, label="straight lines over 1/8 of a decay")
+    seen = (
+        "single cycles, or some together" if study.pooled else "straight lines over 1/8 of a decay"
+    )
+    axes.errorbar([], [], [], fmt="o", ms=3, color=BLUE, label=seen)
     axes.plot([], [], color=RED, label="fit, 1/(a I + b)")
     known = [top for top in tops if np.isfinite(top)]
     if known:
@@ -340,7 +366,7 @@ def _pictures(studies: Sequence[RecordStudy]) -> list[Picture]:
         name = study.record.name
         listed.append(Picture(f"current of {name}", 4.4, partial(draw_record, study=study)))
         listed.append(Picture(f"lifetime of {name}", 3.0, partial(draw_lifetime, study=study)))
-    decays = [decay for study in studies for decay in study.decays]
+    decays = [decay for study in studies for decay in study.answers]
     if all(decay.budget is not None for decay in decays):
         height = 1.5 + 0.3 * min(len(decays), MOST_BARS)
         listed.append(Picture("loss budget", height, partial(draw_budget, decays=decays)))

@@ -107,7 +107,7 @@ def _of_decays(
     if posterior is None:
         return []
     found = [posterior] if isinstance(posterior, Posterior) else posterior
-    fits = [decay.fit for study in studies for decay in study.decays]
+    fits = [decay.fit for study in studies for decay in study.answers]
     many = len(fits) > 1
     pairs = zip(fits, found, strict=True)
     return [of_decay(fit, one, f"{fit.record}: " if many else "") for fit, one in pairs]

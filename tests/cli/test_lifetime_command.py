@@ -319,6 +319,23 @@ def test_many_decays_are_a_row_each_and_nothing_is_cut_short(run, tmp_path, monk
     assert shown.count("a, Touschek ") == 2
 
 
+def test_top_up_is_one_answer_in_terminal_json_and_page(run, tmp_path):
+    time = np.arange(0.0, 7200.0, 10.0)
+    noise = 0.01 * np.random.default_rng(3).normal(size=time.size)
+    path = write_record(tmp_path / "topup.csv", time, decay(time % 180) + noise)
+    page = tmp_path / "topup.html"
+    status, out, _ = run("lifetime", path, "--json", "--report", page)
+    [result] = json.loads(out)["results"]
+    assert (status, result["cycles"], result["record"]) == (0, 40, "topup.csv")
+    truth = 1 / (2e-8 * result["mean_current"]["value"] + 1e-6) / 3600
+    found = result["lifetime_mean"]
+    assert abs(found["value"] - truth) < 2 * found["error"] < 0.02 * truth
+    assert "40 cycles in 2 h of record" in page.read_text()
+    _, shown, _ = run("lifetime", path)
+    assert "refill 39 times" in shown
+    assert shown.count("\nlifetime at the mean current ") == 1
+
+
 @pytest.mark.parametrize(
     ("column", "value", "said"),
     [

@@ -86,6 +86,8 @@ class DecayFit:
         What was fitted.
     shaped : bool
         Whether a was given a dependence on the current.
+    first : array of int, optional
+        Where each cycle begins, of a fit to many cycles.
 
     Examples
     --------
@@ -117,6 +119,7 @@ class DecayFit:
     change: Change | None = None
     readings: DecayRecord | None = None
     shaped: bool = False
+    first: np.ndarray | None = None
 
     def sample(
         self,
@@ -163,6 +166,9 @@ class DecayFit:
         from beamfit.sampling.ensemble import draw
         from beamfit.studies.decay.posterior import decay_target
 
+        if self.first is not None:
+            expected = "one decay; the errors of cycles fitted together are those of the fit"
+            raise InputError("samples of many cycles", expected, path=self.record)
         return draw(decay_target(self, noise, outliers, priors), **options)
 
     @property
@@ -219,6 +225,7 @@ class DecayFit:
                     "change": self.change,
                 }
             ),
+            **({} if self.first is None else {"cycles": self.first.size}),
         }
 
 

@@ -10,7 +10,7 @@ from scipy.ndimage import median_filter
 from beamfit.shown import shown
 from beamfit.studies.decay.record import DecayRecord
 
-__all__ = ["Event", "Split", "noise_of", "split_record"]
+__all__ = ["Event", "Split", "beam_readings", "noise_of", "split_record"]
 
 # Robust z-score at which a step or spike is an event: one false alarm in 1e20 Gaussian readings.
 THRESHOLD = 10.0
@@ -154,16 +154,18 @@ def _noise(record: DecayRecord, kept: np.ndarray) -> float:
     return max(scatter, (record.resolution or 0.0) / 2)
 
 
-def _beam_readings(record: DecayRecord) -> tuple[np.ndarray, list[Event]]:
-    """Indices of the readings that show the beam, and what the others are."""
+def beam_readings(record: DecayRecord, spikes: bool = True) -> tuple[np.ndarray, list[Event]]:
+    """Indices of the readings that show the beam, and what the others are; of short cycles the
+    first readings look like spikes.
+    """
     dropped, end_of_beam = _dropouts(record.current)
     found = {"dropout": dropped, "saturated": _saturated(record.current)}
     kept = np.flatnonzero(~dropped & ~found["saturated"] & (np.arange(len(record)) < end_of_beam))
-    if kept.size >= FEWEST:
+    if spikes and kept.size >= FEWEST:
         found["spike"] = np.zeros(len(record), bool)
-        spikes = _spikes(record.time[kept], record.current[kept], _noise(record, kept))
-        found["spike"][kept[spikes]] = True
-        kept = kept[~spikes]
+        lone = _spikes(record.time[kept], record.current[kept], _noise(record, kept))
+        found["spike"][kept[lone]] = True
+        kept = kept[~lone]
     events = [
         _event(record, kind, first, end - 1, max(first - 1, 0))
         for kind, flags in found.items()
@@ -210,7 +212,7 @@ def split_record(record: DecayRecord) -> Split:
     >>> len(split.segments), str(split.events[0])
     (2, 'refill at 2000 s (+5.378 mA)')
     """
-    kept, events = _beam_readings(record)
+    kept, events = beam_readings(record)
     if kept.size < FEWEST:
         return Split((), tuple(events))
     steps = _steps(record.time[kept], record.current[kept], _noise(record, kept))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -16,9 +17,12 @@ from beamfit.lifetime.ring import MeasuredLength, Operation, Ring, unstored
 from beamfit.quantity import Quantity
 from beamfit.shown import shown
 from beamfit.studies.decay.checks import DecayChecks, check_decay
+from beamfit.studies.decay.cycles import alike, find_cycles, is_refilled, joined
 from beamfit.studies.decay.fit import FEWEST, DecayFit, fit_decay
+from beamfit.studies.decay.pool import FEWEST_CYCLES
+from beamfit.studies.decay.pooled import fit_cycles, stands_alone
 from beamfit.studies.decay.record import DecayRecord
-from beamfit.studies.decay.segments import Event, split_record
+from beamfit.studies.decay.segments import Event, Split, split_record
 from beamfit.studies.decay.systematics import Systematic, systematics
 from beamfit.table import json_of
 
@@ -211,7 +215,7 @@ def budget(record: DecayRecord, machine: Machine) -> Budget:
 
 @dataclass(frozen=True, eq=False)
 class Decay:
-    """One decay of a record.
+    """One decay of a record, or many cycles of it together.
 
     Parameters
     ----------
@@ -232,8 +236,10 @@ class Decay:
 
     @cached_property
     def checks(self) -> DecayChecks | None:
-        """What simpler analyses say of it, and whether a is constant; None if nothing decays."""
-        return check_decay(self.segment)
+        """What simpler analyses say of it, and whether a is constant; None if nothing decays, and
+        for many cycles.
+        """
+        return check_decay(self.segment) if self.fit.first is None else None
 
     @cached_property
     def systematics(self) -> tuple[Systematic, ...]:
@@ -260,17 +266,25 @@ class RecordStudy:
     record : DecayRecord
         The whole record.
     decays : tuple of Decay
-        In order of time; at least one.
+        In order of time; of many cycles those that tell a from b by themselves.
     events : tuple of Event
         Refills, losses, dropouts and what else was cut away.
+    pooled : tuple of Decay
+        Cycles at the same settings fitted together, as of top-up.
     """
 
     record: DecayRecord
     decays: tuple[Decay, ...]
     events: tuple[Event, ...]
+    pooled: tuple[Decay, ...] = ()
+
+    @property
+    def answers(self) -> tuple[Decay, ...]:
+        """What is quoted of the record: cycles together, then single decays; at least one."""
+        return self.pooled + self.decays
 
 
-def _at_settings(segment: DecayRecord) -> list[DecayRecord]:
+def _at_settings(segment: DecayRecord, fewest: int = SHORTEST) -> list[DecayRecord]:
     """Cut where somebody changed a setting."""
     moved = np.zeros(len(segment) - 1, bool)
     for name in SETTINGS:
@@ -278,7 +292,49 @@ def _at_settings(segment: DecayRecord) -> list[DecayRecord]:
         if values is not None:
             moved |= np.abs(np.diff(values)) > CHANGED * np.maximum(values[1:], values[:-1])
     pieces = np.split(np.arange(len(segment)), np.flatnonzero(moved) + 1)
-    return [segment.select(rows) for rows in pieces if len(rows) >= SHORTEST]
+    return [segment.select(rows) for rows in pieces if len(rows) >= fewest]
+
+
+def _pooled(
+    cycles: Sequence[DecayRecord], name: str, machine: Machine | None
+) -> tuple[list[Decay], list[DecayRecord]]:
+    """Cycles at the same settings together, and those of them that also stand alone."""
+    groups, pooled, alone = alike(cycles), [], []
+    many = sum(len(group) >= FEWEST_CYCLES for group in groups)
+    for group in groups:
+        if len(group) < FEWEST_CYCLES:
+            alone += [cycle for cycle in group if len(cycle) >= SHORTEST]
+            continue
+        called = name if many == 1 else f"{name}@{len(pooled) + 1}"
+        fit = fit_cycles(group, called)
+        segment = joined(group, called)
+        losses = None if machine is None else budget(segment, machine)
+        pooled.append(Decay(segment, segment.start, fit, losses))
+        alone += [c for c in group if len(c) >= SHORTEST and stands_alone(c, fit)]
+    return pooled, alone
+
+
+def _refilled(record: DecayRecord) -> Split:
+    """The cycles of what is held by refills in a record, of all its settings, and the decays of
+    the rest; no cycle if nothing is.
+    """
+    sections = _at_settings(record)
+    splits = [find_cycles(section) for section in sections]
+    if not any(map(is_refilled, splits)):
+        return Split((), ())
+    found = [s if is_refilled(s) else split_record(part)
+             for s, part in zip(splits, sections, strict=True)]  # fmt: skip
+    placed = [
+        event._replace(time=event.time + part.start)
+        for split, part in zip(found, sections, strict=True)
+        for event in split.events
+    ]
+    return Split(tuple(c for split in found for c in split.segments), tuple(placed))
+
+
+def _numbered(pieces: Sequence[DecayRecord], name: str) -> list[DecayRecord]:
+    ordered = sorted(pieces, key=lambda piece: piece.start)
+    return [replace(piece, name=f"{name}#{k}") for k, piece in enumerate(ordered, 1)]
 
 
 def _decays(record: DecayRecord) -> tuple[list[DecayRecord], tuple[Event, ...]]:
@@ -296,8 +352,7 @@ def _decays(record: DecayRecord) -> tuple[list[DecayRecord], tuple[Event, ...]]:
             column="current",
         )
     if len(pieces) > 1:
-        names = [f"{record.name}#{number + 1}" for number in range(len(pieces))]
-        pieces = [replace(p, name=name) for p, name in zip(pieces, names, strict=True)]
+        pieces = _numbered(pieces, record.name)
     return pieces, split.events
 
 
@@ -337,7 +392,12 @@ def study_record(record: DecayRecord, machine: Machine | None = None) -> RecordS
         raise InputError(f"{len(record)} readings", expected, path=record.name)
     # Segments move `start` with them: counted from zero it is their place in the record.
     placed = replace(record, start=0.0)
-    pieces, events = _decays(placed)
+    cycles, events = _refilled(placed)
+    pooled, pieces = _pooled(cycles, record.name, machine)
+    if not pooled:
+        pieces, events = _decays(placed)
+    elif len(pieces) > 1:
+        pieces = _numbered(pieces, record.name)
     decays, rising = [], []
     for piece in pieces:
         offset = piece.start
@@ -347,16 +407,17 @@ def study_record(record: DecayRecord, machine: Machine | None = None) -> RecordS
             fit = fit_decay(segment)
         except InputError:
             # A record that does nothing but rise is an error; a slow refill within one is not.
-            if len(pieces) == 1:
+            if len(pieces) == 1 and not pooled:
                 raise
             change = float(segment.current[-1] - segment.current[0])
             rising.append(Event("slow refill", offset, segment.span, change))
             continue
         losses = None if machine is None else budget(segment, machine)
         decays.append(Decay(segment, offset, fit, losses))
-    if not decays:
+    if not decays and not pooled:
         expected = "a decay between refills"
         raise InputError("a current that rises", expected, path=record.name, column="current")
     return RecordStudy(
-        record, tuple(decays), tuple(sorted((*events, *rising), key=lambda event: event.time))
-    )
+        record, tuple(decays), tuple(sorted((*events, *rising), key=lambda event: event.time)),
+        tuple(pooled),
+    )  # fmt: skip

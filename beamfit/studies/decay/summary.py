@@ -10,6 +10,7 @@ import numpy as np
 from jax import Array
 
 from beamfit.lifetime.decay import current
+from beamfit.studies.decay.fit import DecayFit
 from beamfit.studies.decay.model import padded_size
 from beamfit.studies.decay.study import Decay
 
@@ -60,6 +61,8 @@ def information_root(
 
 def _one(decay: Decay) -> tuple[float, np.ndarray, np.ndarray]:
     segment, fit = decay.segment, decay.fit
+    if fit.first is not None:
+        return _together(fit)
     rows = len(segment)
     if fit.noise_inferred:
         # sqrt(sum/dof): the noise that the residuals show.
@@ -73,6 +76,15 @@ def _one(decay: Decay) -> tuple[float, np.ndarray, np.ndarray]:
     parts = np.asarray(loss_parts(fit.a.value, fit.b.value, fit.mean_current))
     root = information_root(time, weight, fit.i0.value, parts, fit.mean_current)
     return fit.mean_current, parts, np.asarray(root)
+
+
+def _together(fit: DecayFit) -> tuple[float, np.ndarray, np.ndarray]:
+    """Many cycles, of which the share of a and the lifetime are uncorrelated."""
+    parts = np.asarray(loss_parts(fit.a.value, fit.b.value, fit.mean_current))
+    error = parts[1] * (fit.lifetime_mean.relative or np.inf)
+    found = fit.identifiability.share_error
+    share = np.inf if found is None else found
+    return fit.mean_current, parts, np.diag([1 / (share * parts[1]), 1 / error])
 
 
 def summarise(decays: tuple[Decay, ...]) -> Summaries:

@@ -55,7 +55,8 @@ def systematics(fit: DecayFit) -> tuple[Systematic, ...]:
     Returns
     -------
     tuple of Systematic
-        Empty where a and b are impossible or not determined, or a was given a shape. To first
+        Empty where a and b are impossible or not determined, a was given a shape, or many cycles
+        were fitted. To first
         order each shift is proportional to its cause.
 
     Notes
@@ -76,7 +77,13 @@ def systematics(fit: DecayFit) -> tuple[Systematic, ...]:
     ['-0.41 %', '0.03 %', '0.00 %', '-10.05 %']
     """
     record = fit.readings
-    if record is None or fit.shaped or fit.status is Status.infeasible or fit.a.error is None:
+    if (
+        record is None
+        or fit.first is not None
+        or fit.shaped
+        or fit.status is Status.infeasible
+        or fit.a.error is None
+    ):
         return ()
     about = expanded(record, _values(fit))
     over = 1.0 if record.error is None else record.error

@@ -9,6 +9,7 @@ from beamfit.lifetime.losses import LINEAR, QUADRATIC, Mechanism
 from beamfit.lifetime.ring import Operation
 from beamfit.quantity import Quantity, Status
 from beamfit.studies.decay.scale_verdict import VOLTAGE
+from beamfit.studies.decay.segments import Event
 from beamfit.studies.decay.shift import Shift
 from beamfit.studies.decay.study import Decay, RecordStudy
 from beamfit.table import cell
@@ -19,6 +20,7 @@ __all__ = [
     "alike",
     "budget_rows",
     "check_rows",
+    "counted",
     "decay_rows",
     "event_rows",
     "network_rows",
@@ -84,9 +86,21 @@ RESULT: tuple[Row, ...] = (
 )
 
 
+CYCLES: tuple[Row, ...] = (
+    ("status", lambda d: d.fit.status),
+    ("cycles", lambda d: f"{d.fit.first.size} at {d.fit.mean_current:.5g} mA"),
+    ("readings", lambda d: f"{len(d.segment)} over {_span(d.segment.span)}"),
+    ("lifetime at the mean current", lambda d: d.fit.lifetime_mean),
+    ("lifetime at the highest current", lambda d: d.fit.lifetime_start),
+    ("lifetime at the lowest current", lambda d: d.fit.lifetime_end),
+    *RESULT[-5:],
+)
+
+
 def decay_rows(decays: Sequence[Decay]) -> Rows:
     """Label and one cell per decay, for every number a fit has."""
-    return _laid_out(decays, RESULT)
+    together = all(decay.fit.first is not None for decay in decays)
+    return _laid_out(decays, CYCLES if together else RESULT)
 
 
 def _number(value: float | None, form: str) -> str:
@@ -146,7 +160,7 @@ SYSTEMATIC = ["if the", "a", "b", "lifetime at the mean"]
 
 def check_rows(decays: Sequence[Decay]) -> Rows:
     """Label and one cell per decay for what simpler analyses say, and whether a is constant."""
-    rows = _laid_out(decays, CHECKS)
+    rows = _laid_out(decays, CHECKS if any(decay.checks for decay in decays) else CHECKS[-1:])
     if any(decay.fit.lifetimes for decay in decays):
         rows += _laid_out(decays, LIFETIMES)
     return rows
@@ -254,6 +268,17 @@ def alike(decays: Sequence[Decay]) -> list[tuple[Status, str, str]]:
 
 def _several(names: Sequence[str]) -> str:
     return f"{len(names)} decays, {names[0]} to {names[-1]}"
+
+
+def counted(events: Sequence[Event]) -> str:
+    """Events of each kind, how many and how large."""
+    said = []
+    for kind in dict.fromkeys(event.kind for event in events):
+        changes = [event.change for event in events if event.kind == kind]
+        low, high = min(changes), max(changes)
+        size = f"{low:+.3g} mA" if len(changes) == 1 else f"{low:+.3g} to {high:+.3g} mA"
+        said.append(f"{kind} {len(changes)} times ({size})")
+    return "; ".join(said)
 
 
 def event_rows(study: RecordStudy) -> list[list[str]]:

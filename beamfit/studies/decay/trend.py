@@ -207,7 +207,7 @@ def trend_of(studies: Sequence[RecordStudy], machine: Machine | None = None) -> 
         raise InputError("times without a date", "dated records, to put them in order", path=name)
     dated = all(study.record.start is not None for study in studies)
     studies = sorted(studies, key=lambda study: study.record.start or 0.0)
-    decays = [decay for study in studies for decay in study.decays]
+    decays = [decay for study in studies for decay in study.decays or study.pooled]
     decays = [decay for decay in decays if decay.fit.lifetime_mean.error is not None]
     if not decays:
         expected = "one decay at least whose lifetime is determined"
@@ -232,7 +232,7 @@ def trend_of(studies: Sequence[RecordStudy], machine: Machine | None = None) -> 
 def _scaled(
     studies: Sequence[RecordStudy], decays: list[Decay], machine: Machine | None, current: float
 ) -> _Scaled:
-    starts = {id(d): (s.record.start or 0.0) + d.offset for s in studies for d in s.decays}
+    starts = {id(d): (s.record.start or 0.0) + d.offset for s in studies for d in s.answers}
     time = np.array([starts[id(decay)] for decay in decays])
     if machine is None:
         return _Scaled(decays, time, *np.ones((3, len(decays))))

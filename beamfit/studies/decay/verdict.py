@@ -10,13 +10,20 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from beamfit.lifetime.decay import HOUR
+from beamfit.quantity import Quantity
 from beamfit.statistics import POOR_FIT, chi2_probability
 from beamfit.status import Status
 from beamfit.studies.decay.departures import Change, ConstantA, LifetimeLaw
-from beamfit.studies.decay.evidence import BELIEVED, DETERMINED, SEPARABLE, Evidence
+from beamfit.studies.decay.evidence import (
+    BELIEVED,
+    DETERMINED,
+    SEPARABLE,
+    Evidence,
+    Separability,
+)
 from beamfit.verdict import Finding, judge
 
-__all__ = ["TableEvidence", "finding_of", "finding_of_table"]
+__all__ = ["TableEvidence", "finding_of", "finding_of_cycles", "finding_of_table"]
 
 # Lifetimes, s, that stored beams seldom have, but times in a wrong unit often give.
 SHORTEST, LONGEST = 20.0, 3000 * HOUR
@@ -58,6 +65,18 @@ class TableEvidence(NamedTuple):
     def scaled(self, name: str) -> tuple[float, float]:
         """A value and its error."""
         return self.numbers[name]
+
+
+class CyclesEvidence(Judged, Protocol):
+    """What the rules look at of many cycles, besides."""
+
+    cycles: int
+    currents: tuple[float, float]
+    parts: tuple[float, list[Quantity]]
+    noise: float | None
+    left_out: tuple[str, ...]
+    separability: Separability
+    correlation_time: float | None
 
 
 def _lost(e: Evidence) -> Finding | None:
@@ -178,7 +197,7 @@ def _narrow(e: TableEvidence) -> Finding | None:
     )
 
 
-def _unlikely(e: TableEvidence) -> Finding | None:
+def _unlikely(e: TableEvidence | CyclesEvidence) -> Finding | None:
     if e.noise is not None or chi2_probability(e.chi2, e.dof) >= POOR_FIT:
         return None
     return Finding(
@@ -206,6 +225,58 @@ def finding_of_table(evidence: TableEvidence) -> Finding:
         said.append(f"The table gives no errors; {evidence.noise:.3g} h rms is their scatter")
     if evidence.outliers:
         said.append(f"Left out as outliers: {', '.join(evidence.outliers)}")
+    return Finding(found.status, ". ".join(said) + ".")
+
+
+def _parts_differ(e: CyclesEvidence) -> Finding | None:
+    chance, lifetimes = e.parts
+    if not e.changed or not lifetimes:
+        return None
+    low, high = (pick(lifetimes, key=lambda q: q.value) for pick in (min, max))
+    return Finding(
+        Status.poor_fit,
+        f"The loss rate is not the same in all cycles (p = {max(chance, 1e-300):.2g}): between "
+        f"lifetimes of {low} and {high} at the mean current in parts of the record. Look for a "
+        "vacuum or a setting that changes, and cut the record there",
+    )
+
+
+def _one_current(e: CyclesEvidence) -> Finding | None:
+    share, error = e.scaled("share")
+    if error < SEPARABLE:
+        return None
+    return Finding(
+        Status.unidentified,
+        f"The lifetime at the mean current is the answer; a and b are not separable at these "
+        f"currents (share of a in the loss {share:.2g} ± {error:.2g}): let the beam decay "
+        "farther once, or measure at another current",
+    )
+
+
+CYCLE_RULES = (
+    partial(_negative, "b", NOT_GAS),
+    partial(_negative, "a", RISING),
+    _within_noise,
+    _parts_differ,
+    _refuted,
+    _one_current,
+    _unlikely,
+    _determined,
+)
+
+
+def finding_of_cycles(evidence: CyclesEvidence) -> Finding:
+    """Status and sentences on many cycles fitted together."""
+    found, (low, high) = judge(evidence, CYCLE_RULES), evidence.currents
+    said = [
+        f"One answer from {evidence.cycles} cycles between {low:.4g} and {high:.4g} mA",
+        found.cause.rstrip("."),
+    ]
+    if evidence.noise is not None:
+        noise = f"{evidence.noise:.3g} mA rms is inferred from the residuals"
+        said.append(f"The record gives no errors; {noise}")
+    said += [text for text in (_correlated(evidence), _odd_clock(evidence)) if text]
+    said += [text[0].upper() + text[1:] for text in evidence.left_out]
     return Finding(found.status, ". ".join(said) + ".")
 
 

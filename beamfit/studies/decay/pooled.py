@@ -1,0 +1,345 @@
+"""Many short cycles, as of top-up: one a and one b, and what they are worth."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from scipy.special import fdtrc
+
+from beamfit.errors import InputError
+from beamfit.greybox.correlated import Memory, is_correlated, memory_of
+from beamfit.lifetime.decay import HOUR
+from beamfit.quantity import Quantity, Status
+from beamfit.studies.decay.departures import (
+    CURRENTS,
+    REJECTED,
+    ConstantA,
+    LifetimeLaw,
+    constant_a,
+)
+from beamfit.studies.decay.evidence import DETERMINED, SEPARABLE, UNITS, Separability
+from beamfit.studies.decay.fit import DecayFit
+from beamfit.studies.decay.law import Physical
+from beamfit.studies.decay.pool import (
+    FEWEST_CYCLES,
+    FEWEST_READINGS,
+    MOST,
+    Pool,
+    averaged,
+    cleaned,
+    solved,
+)
+from beamfit.studies.decay.record import DecayRecord
+from beamfit.studies.decay.verdict import finding_of_cycles
+
+__all__ = ["cycle_lifetimes", "fit_cycles", "stands_alone"]
+
+# Parts of the record whose loss rates are compared, and points of a picture.
+PARTS, POINTS = 8, 60
+# Scatter, over the length squared, of the parabola t² beside its line, halved: the bend of a decay.
+BEND = 1 / 12 / math.sqrt(5)
+
+
+def _slopes(pool: Pool) -> tuple[Physical, np.ndarray]:
+    """Physical values at the highest, lowest and mean current, and slopes by the three numbers."""
+    loss, quadratic, exponent = pool.theta
+    ends = np.array([pool.cycles.current.max(), pool.cycles.current.min()]) / pool.mean
+    unit, mean = pool.unit, pool.mean
+    rates, by = _rates(pool, ends)
+    values = Physical(
+        i0=mean * float(np.mean(pool.level)), a=quadratic / mean / unit,
+        b=(loss - quadratic) / unit, rate_start=rates[0], rate_end=rates[1], rate_mean=loss / unit,
+        share=quadratic / loss, exponent=exponent,
+    )  # fmt: skip
+    slopes = np.array([
+        [0, 0, 0], [0, 1 / mean / unit, 0], [1 / unit, -1 / unit, 0], *by, [1 / unit, 0, 0],
+        [-quadratic / loss**2, 1 / loss, 0], [0, 0, 1],
+    ])  # fmt: skip
+    return values, slopes
+
+
+def _rates(pool: Pool, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Loss rates, 1/s, at currents over the mean, and their slopes."""
+    loss, quadratic, exponent = pool.theta
+    power = x ** (1 + exponent)
+    slopes = np.stack([np.ones_like(x), power - 1, quadratic * power * np.log(x)], axis=1)
+    return (quadratic * power + loss - quadratic) / pool.unit, slopes / pool.unit
+
+
+def _memory(pool: Pool, numbers: int, known: float | None) -> Memory:
+    rows, time = pool.rows[:, :numbers], pool.cycles.time
+    return memory_of(rows, pool.residuals, time, pool.levels, known)
+
+
+@dataclass(frozen=True, eq=False)
+class PooledEvidence:
+    """What the rules look at: a fit to cycles, values, errors, reaches, and the noise.
+
+    Attributes are as of `Evidence`; `left_out` says what was not fitted.
+    """
+
+    pool: Pool
+    held: Memory
+    known: float | None
+    values: Physical
+    errors: Physical
+    raw: Physical
+    reach: Physical
+    constant_a: ConstantA
+    left_out: tuple[str, ...]
+
+    change = None
+
+    @classmethod
+    def of(cls, pool: Pool, left_out: tuple[str, ...]) -> PooledEvidence:
+        """Weigh a fit, with the noise's memory where it has one."""
+        given, parameters = float(pool.cycles.error is not None), pool.level.size + 2
+        known = None if is_correlated(pool.left[:, 3], parameters) else 0.0
+        held, plain = _memory(pool, 2, known), _memory(pool, 2, 0.0)
+        values, slopes = _slopes(pool)
+        moved = held.moments(slopes[:, :2], given)
+        raw = np.linalg.norm(slopes[:, :2] @ plain.half[0], axis=1)
+        raw = raw if given else raw * math.sqrt(plain.squares[0] / plain.dof)
+        moved_values = Physical(*(np.array(values) + moved.shift))
+        found = cls(
+            pool, held, known, moved_values, Physical(*moved.error), Physical(*raw),
+            Physical(*moved.reach), constant_a(math.nan, math.inf, math.inf, math.nan), left_out,
+        )  # fmt: skip
+        return replace(found, constant_a=found.tested()) if found.separability.separable else found
+
+    def tested(self) -> ConstantA:
+        """Whether a constant a is refuted, by an exponent beside the other numbers."""
+        given = float(self.pool.cycles.error is not None)
+        power, slopes = _memory(self.pool, 3, self.known), np.eye(3)[2:]
+        moved = power.moments(slopes, given)
+        return constant_a(
+            float(moved.shift[0]), float(moved.error[0]), float(moved.error[0]), moved.chance[0]
+        )
+
+    def scaled(self, name: str) -> tuple[float, float]:
+        """A value and its error."""
+        return float(getattr(self.values, name)), float(getattr(self.errors, name))
+
+    @property
+    def cycles(self) -> int:
+        """How many."""
+        return self.pool.level.size
+
+    @property
+    def currents(self) -> tuple[float, float]:
+        """Lowest and highest, mA."""
+        return float(self.pool.cycles.current.min()), float(self.pool.cycles.current.max())
+
+    @property
+    def dof(self) -> int:
+        """Readings less numbers."""
+        return self.held.dof
+
+    @property
+    def chi2(self) -> float:
+        """In units of the errors, whitened; equal to `dof` where there are none."""
+        given = self.pool.cycles.error is not None
+        return float(self.held.squares[self.held.likely]) if given else float(self.dof)
+
+    @property
+    def noise(self) -> float | None:
+        """What the readings scatter by, mA, where the file has no errors."""
+        if self.pool.cycles.error is not None:
+            return None
+        return self.pool.mean * math.sqrt(self.held.squares[self.held.likely] / self.dof)
+
+    @property
+    def correlation_time(self) -> float | None:
+        """Of the errors, s; None where they are independent."""
+        return None if self.known == 0 else float(self.held.time[self.held.likely])
+
+    @cached_property
+    def separability(self) -> Separability:
+        """Of a and b."""
+        share, error = self.scaled("share")
+        length, usual = self.correlation_time, float(np.median(np.diff(self.pool.cycles.time)))
+        _, slopes = _slopes(self.pool)
+        a, b = slopes[1:3, :2] @ self.held.half[self.held.likely]
+        return Separability(
+            separable=bool(error < SEPARABLE),
+            share=share,
+            share_error=error,
+            correlation=float(a @ b / np.linalg.norm(a) / np.linalg.norm(b)),
+            residual_correlation=0.0 if length is None else math.exp(-usual / length),
+            error_inflation=max(1.0, self.errors.rate_mean / self.raw.rate_mean),
+        )
+
+    @cached_property
+    def parts(self) -> tuple[float, list[Quantity]]:
+        """The chance that the loss rate is one in all parts of the record, and their lifetimes."""
+        pool = self.pool
+        count = min(PARTS, pool.level.size)
+        part = np.repeat(np.arange(pool.level.size) * count // pool.level.size, pool.cycles.lengths)
+        apart = None
+        if self.correlation_time is not None:
+            apart = np.diff(pool.cycles.time) / self.correlation_time
+        own = pool.rows[:, :1] * (part[:, None] == np.arange(count))
+        every = pool.beside(np.column_stack([own, pool.rows[:, 1], pool.residuals]), apart)
+        columns, residual = every[:, :-1], every[:, -1]
+        step, rest, *_ = np.linalg.lstsq(columns, -residual, rcond=None)
+        dof = self.dof - count + 1
+        unit = float(rest[0]) / dof
+        unit = unit if pool.cycles.error is None else max(unit, 1.0)
+        fall = float(self.held.squares[self.held.likely]) - float(rest[0])
+        chance = float(fdtrc(count - 1, dof, max(fall, 0.0) / (count - 1) / unit))
+        spread = np.linalg.norm(np.linalg.pinv(columns), axis=1) * math.sqrt(unit)
+        rates = (pool.theta[0] + step[:count]) / pool.unit
+        pairs = zip(rates, spread[:count] / pool.unit, strict=True)
+        return chance, [Quantity(1 / r / HOUR, e / r**2 / HOUR, "h") for r, e in pairs if r > 0]
+
+    @property
+    def changed(self) -> bool:
+        """Whether the loss rate is not the same all along the record."""
+        return self.parts[0] < REJECTED
+
+    @cached_property
+    def lifetimes(self) -> LifetimeLaw | None:
+        """The lifetime by current, where the currents are wide enough apart to tell."""
+        if not self.separability.separable:
+            return None
+        refuted = self.constant_a.status is Status.poor_fit
+        pool = solved(self.pool.cycles, 3) if refuted else self.pool
+        numbers = 3 if refuted else 2
+        x = np.geomspace(pool.cycles.current.min(), pool.cycles.current.max(), CURRENTS) / pool.mean
+        rates, slopes = _rates(pool, x)
+        slopes = np.vstack([slopes, np.eye(3)[2]])[:, :numbers]
+        found = _memory(pool, numbers, self.known).moments(
+            slopes, float(pool.cycles.error is not None)
+        )
+        lifetimes = tuple(
+            Quantity(1 / rate / HOUR, error / rate**2 / HOUR, "h") if rate > 3 * error
+            else Quantity(math.nan, None, "h")
+            for rate, error in zip(rates, found.error, strict=False)
+        )  # fmt: skip
+        error = float(found.error[-1]) if refuted else None
+        exponent = Quantity(float(pool.theta[2]), error, "1")
+        return LifetimeLaw(tuple(map(float, x * pool.mean)), lifetimes, exponent)
+
+    def lifetime(self, name: str) -> Quantity:
+        """Lifetime in hours from a loss rate; no error where the rate is not clear of zero."""
+        (rate, error), reach = self.scaled(name), float(getattr(self.reach, name))
+        if not rate > 0:
+            return Quantity(math.nan, None, "h")
+        if not error < DETERMINED * rate:
+            return Quantity(1 / rate / HOUR, None, "h")
+        interval = tuple(1 / max(rate + sign * reach, 1e-300) / HOUR for sign in (1, -1))
+        error, raw = (part / rate**2 / HOUR for part in (error, getattr(self.raw, name)))
+        return Quantity(1 / rate / HOUR, error, "h", float(raw), interval)
+
+
+def stands_alone(cycle: DecayRecord, fit: DecayFit) -> bool:
+    """Whether a cycle by itself would tell a from b, by the bend of its decay and the noise that
+    all cycles show.
+    """
+    noise = fit.rms_residual * fit.identifiability.error_inflation
+    loss = cycle.span / HOUR / fit.lifetime_mean.value
+    bend = float(cycle.current.mean()) * loss**2 * BEND / 2 * math.sqrt(len(cycle))
+    return noise * math.sqrt(max(len(cycle) / MOST, 1.0)) < SEPARABLE * bend
+
+
+def cycle_lifetimes(fit: DecayFit) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Time, s, lifetime and its error, h, of up to 60 parts of a pooled fit; for a picture.
+
+    The slope of the residuals of its cycles is what the loss rate of a part departs by.
+    """
+    record, first = fit.readings, fit.first
+    lengths = np.diff(first, append=len(record))
+    columns = np.column_stack([record.time, fit.residuals])
+    mean = np.add.reduceat(columns, first) / lengths[:, None]
+    since, residual = (columns - np.repeat(mean, lengths, axis=0)).T
+    part = first[np.linspace(0, first.size, min(first.size, POINTS), endpoint=False).astype(int)]
+    count = np.diff(part, append=len(record))
+    at, level = (np.add.reduceat(v, part) / count for v in (record.time, record.current))
+    squares = np.add.reduceat(since**2, part)
+    rate = np.add.reduceat(since * residual, part) / squares / level
+    rate += fit.a.value * level + fit.b.value
+    error = fit.rms_residual / np.sqrt(squares) / level
+    seen = rate > 0
+    return at[seen], 1 / rate[seen] / HOUR, (error / rate**2)[seen] / HOUR
+
+
+def fit_cycles(cycles: Sequence[DecayRecord], name: str = "cycles") -> DecayFit:
+    """Fit one a and one b to many cycles, as of top-up, each with an own current at its start.
+
+    Parameters
+    ----------
+    cycles : sequence of DecayRecord
+        Three or more, of three readings or more, in order of time; as of `find_cycles`. Their
+        `start`, where all have it, says how far apart they lie.
+    name : str, optional
+        What to call them together.
+
+    Returns
+    -------
+    DecayFit
+        Of all cycles: `lifetime_start` and `lifetime_end` are at the highest and the lowest
+        current, `i0` is the mean of the cycles' own, without an error, and `lifetimes` has the
+        lifetime by current where the currents are wide enough apart. Where a and b are not
+        separable the lifetime at the mean current is the answer.
+
+    Raises
+    ------
+    InputError
+        If there are fewer than three cycles, one has fewer than three readings, or they are not in
+        order of time.
+
+    Notes
+    -----
+    Least squares; the currents at the starts are eliminated, so that time and memory grow with the
+    readings alone. Noise with a memory goes on from cycle to cycle (`beamfit.greybox.correlated`).
+    Readings, cycles and heads of cycles that lie far off are left out and counted.
+
+    Examples
+    --------
+    >>> t = np.arange(0.0, 180.0, 10.0)
+    >>> noise = 1e-3 * np.random.default_rng(1).normal(size=(50, 18))
+    >>> cycles = [DecayRecord(t, 500 * np.exp(-t / 36000) + row) for row in noise]
+    >>> print(fit_cycles(cycles).lifetime_mean)
+    10.00041 ± 0.00072 h
+    """
+    if len(cycles) < FEWEST_CYCLES:
+        raise InputError(f"{len(cycles)} cycles", f"{FEWEST_CYCLES} or more", path=name)
+    for cycle in cycles:
+        if len(cycle) < FEWEST_READINGS:
+            found, expected = f"{len(cycle)} readings", f"{FEWEST_READINGS} or more in a cycle"
+            raise InputError(found, expected, path=cycle.name)
+    gathered = averaged(cycles)
+    if np.any(np.diff(gathered.time) <= 0):
+        raise InputError("a cycle before the end of the one before", "an order in time", path=name)
+    pool, left_out = cleaned(gathered)
+    evidence = PooledEvidence.of(pool, left_out)
+    finding = finding_of_cycles(evidence)
+    apart = evidence.separability.separable
+    a, b = (
+        Quantity.reaching(
+            value, error, UNITS[name], float(getattr(evidence.raw, name)),
+            float(getattr(evidence.reach, name)),
+        ) if apart else Quantity(value, None, UNITS[name])
+        for name, (value, error) in ((name, evidence.scaled(name)) for name in "ab")
+    )  # fmt: skip
+    weight = pool.weight
+    return DecayFit(
+        record=name, status=finding.status, message=finding.message,
+        i0=Quantity(float(evidence.values.i0), None, "mA"), a=a, b=b,
+        lifetime_start=evidence.lifetime("rate_start"), lifetime_end=evidence.lifetime("rate_end"),
+        lifetime_mean=evidence.lifetime("rate_mean"), mean_current=pool.mean, chi2=evidence.chi2,
+        dof=evidence.dof,
+        rms_residual=pool.mean * float(np.sqrt(np.mean((pool.left[:, 3] / weight) ** 2))),
+        noise_inferred=pool.cycles.error is None, residuals=pool.mean * pool.residuals / weight,
+        identifiability=evidence.separability, constant_a=evidence.constant_a,
+        correlation_time=evidence.correlation_time, lifetimes=evidence.lifetimes,
+        readings=DecayRecord(
+            pool.cycles.time, pool.cycles.current, pool.cycles.error, name,
+            float(pool.cycles.time[0]),
+        ),
+        first=pool.cycles.first,
+    )  # fmt: skip
