@@ -10,7 +10,7 @@ import numpy as np
 
 from beamfit.language import document as d
 from beamfit.language import expression as x
-from beamfit.language.evaluate import Setting, Value, evaluate, picked, stored
+from beamfit.language.evaluate import Setting, Value, check_rank, evaluate, picked, stored
 from beamfit.language.network import with_weights
 from beamfit.language.scope import Array, Axes, IndexSet, Net, Scope, located, widened
 from beamfit.language.steps import Call, calls, gains_of
@@ -41,6 +41,7 @@ def called(statement: d.Call, s: Setting, inner: Callable[[str], Callable]) -> A
         own_axes, to = widened(s.scope, axes, wire.each), wire.target
         output = gains_of(wire, call.callee, call.statement.mapping)[0]
         part = _output(s, whole, output, call.callee, own_axes, len(axes))
+        check_rank(s.scope, to, s.scope.arrays[to.name], part, wire.value)
         array, old = s.scope.arrays[to.name], made.get(to.name, s.arrays[to.name])
         made[to.name] = stored(old, s.scope, array, to, own_axes, part, wire.value)
     return made
@@ -63,6 +64,7 @@ def _wired(s: Setting, array: Array, wires: list[d.Wire]) -> jax.Array:
     for wire in wires:
         inner = widened(s.scope, s.axes, wire.each)
         value = evaluate(wire.value, Setting(s.scope, s.arrays, inner, s.bound, s.known, s.watch))
+        check_rank(s.scope, wire.target, array, value, wire.value)
         if found is None:
             found = jnp.zeros((*[1] * count, *array.shape))
             if array.values is not None:

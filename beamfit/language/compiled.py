@@ -14,7 +14,7 @@ from beamfit.greybox.maps import Formula
 from beamfit.language import document as d
 from beamfit.language import expression as x
 from beamfit.language.calls import Arrays, called, defaults
-from beamfit.language.evaluate import Setting, evaluate, stored
+from beamfit.language.evaluate import Setting, check_rank, evaluate, stored
 from beamfit.language.expression import error_at
 from beamfit.language.order import Group, Order, checked
 from beamfit.language.recurrence import scanned
@@ -179,4 +179,6 @@ def _assigned(order: Order, step: Step, s: Setting) -> Arrays:
         return called(step.what, s, lambda label: Program(order.inner[label], {}))
     target, e = step.what.target, step.what.value
     array, old = s.scope.arrays[target.name], s.arrays[target.name]
-    return {target.name: stored(old, s.scope, array, target, s.axes, evaluate(e, s), e)}
+    value = evaluate(e, s)
+    check_rank(s.scope, target, array, value, e)
+    return {target.name: stored(old, s.scope, array, target, s.axes, value, e)}

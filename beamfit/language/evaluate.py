@@ -6,7 +6,7 @@ with it), then its own dimensions. Broadcasting does the rest; a sum is a reduct
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
@@ -26,7 +26,11 @@ from beamfit.language.scope import (
     widened,
 )
 
-__all__ = ["Setting", "Value", "evaluate", "picked", "stored"]
+__all__ = ["HIDDEN", "Setting", "Value", "check_rank", "evaluate", "picked", "stored"]
+
+
+# Behind the names of iterators that a function's body does not see.
+HIDDEN = "'"
 
 
 class Value(NamedTuple):
@@ -115,7 +119,8 @@ def _spread(values: list[Value], e: x.Expression) -> tuple[list[jax.Array], int]
     rank = max(v.rank for v in values)
     for v in values:
         if v.rank not in (0, rank):
-            raise error_at(e.at, f"'{e}' of {v.rank} and {rank} dimensions", "as many in each part")
+            found = " and ".join(str(v.rank) for v in values)
+            raise error_at(e.at, f"'{e}' of {found} dimensions", "as many in each part")
     arrays = [v.array.reshape(*v.array.shape, *[1] * (rank - v.rank)) for v in values]
     shapes = {v.array.shape[v.array.ndim - rank :] for v in values if v.rank == rank}
     if len(shapes) > 1:
@@ -161,7 +166,7 @@ def _applied(e: x.Application, s: Setting) -> Value:
     function = s.scope.functions.get(e.function)
     if function is not None:
         # The body sees its arguments; iterators of the caller keep their axes, not their names.
-        hidden = {f"{name}'": one for name, one in s.axes.items()}
+        hidden = {f"{name}{HIDDEN}": one for name, one in s.axes.items()}
         bound = dict(zip(function.arguments, values, strict=True))
         return evaluate(function.body, replace(s, axes=hidden, bound=bound))
     name = e.function
@@ -288,17 +293,42 @@ def _placed(array: jax.Array, indices: list[np.ndarray], value: jax.Array, lengt
     return array.at[view.slices].set(value)
 
 
+def check_rank(scope: Scope, target: x.Name, array: Array, value: Value, e: x.Expression) -> None:
+    """Refuse a value of other dimensions than its target, and name what brings them in."""
+    wanted = len(whole_of(target, array))
+    if value.rank in (0, wanted):
+        return
+    said = f"{value.rank} dimension{'s' * (value.rank != 1)}"
+    whole = next((n for n in _names(e) if _is_whole(scope, n)), None)
+    if wanted or whole is None:
+        expected = f"{wanted or 'no'} dimension{'s' * (wanted != 1)} as in '{target}'"
+        raise error_at(e.at, f"'{e}' of {said}", expected)
+    array = scope.arrays[whole.name]
+    where = "" if whole is e else f" in a formula of {said}"
+    expected = f"a number for '{target}', such as an element of {array.said}"
+    count = len(whole_of(whole, array))
+    found = f"'{whole}' of {count} dimension{'s' * (count != 1)}{where}"
+    raise error_at(whole.at, found, expected)
+
+
+def _names(e: x.Expression) -> Iterator[x.Name]:
+    if isinstance(e, x.Name):
+        yield e
+    elif not isinstance(e, x.Application) or e.function not in MATRIX:
+        for part in x.children(e):
+            yield from _names(part)
+
+
+def _is_whole(scope: Scope, node: x.Name) -> bool:
+    return node.name in scope.arrays and bool(whole_of(node, scope.arrays[node.name]))
+
+
 def stored(
     old: jax.Array, scope: Scope, array: Array, target: x.Name, axes: Axes, value: Value, e
 ) -> jax.Array:
     """An array with a value, that of the expression e, where a target says."""
     indices = located(scope, target, array, axes)
     whole = whole_of(target, array)
-    if value.rank not in (0, len(whole)):
-        said = f"'{e}' of {value.rank} dimensions"
-        number = f"a number, such as an element, for '{target}'"
-        wanted = f"{len(whole)} as in '{target}'" if whole else number
-        raise error_at(e.at, said, wanted)
     lengths = [*map(len, axes.values()), *map(len, whole)]
     if value.rank and value.array.shape[-value.rank :] != tuple(map(len, whole)):
         size = " x ".join(map(str, value.array.shape[-value.rank :]))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -114,7 +114,7 @@ def _group(scope, numbers: list[int], needs, owners) -> Group:
         return Group(steps, None)
     plan = plan_of(scope, steps, owners)
     if plan is None:
-        raise _loop(scope, steps, needs)
+        raise _loop(scope, steps, needs, owners)
     return Group(steps, plan)
 
 
@@ -229,18 +229,33 @@ def _components(needs: dict[int, set[int]]) -> list[tuple[int, ...]]:
     return found
 
 
-def _loop(scope: Scope, steps: Sequence[Step], needs: dict[int, set[int]]) -> InputError:
-    """An algebraic loop, with the names along its cycle."""
+def _loop(scope: Scope, steps: tuple[Step, ...], needs, owners) -> InputError:
+    """An algebraic loop, with the names along a cycle that no time takes apart."""
     members = {s.number for s in steps}
-    path = [steps[0].number]
-    while path.count(path[-1]) == 1:
-        path.append(min(needs[path[-1]] & members))
-    cycle = path[path.index(path[-1]) :]
-    names = [str(targets(scope, scope.steps[n])[0][0]) for n in reversed(cycle)]
+    cycles = (_cycle(n, needs, members) for n in sorted(members))
+    found = sorted((c for c in cycles if c), key=len)
+    parts = ((c, tuple(scope.steps[n] for n in sorted(set(c)))) for c in found)
+    cycle = next((c for c, part in parts if plan_of(scope, part, owners) is None), found[0])
+    names = [str(targets(scope, scope.steps[n])[0][0]) for n in cycle]
     lines = ", ".join(str(n) for n in sorted({scope.steps[n].at.line for n in cycle}))
-    found = f"an algebraic loop: {' -> '.join(names)} (line {lines})"
+    said = f"an algebraic loop: {' -> '.join(names)} (line {lines})"
     expected = "statements of which each needs earlier ones only, or earlier times such as y[t-1]"
-    return error_at(scope.steps[min(cycle)].at, found, expected)
+    return error_at(scope.steps[min(cycle)].at, said, expected)
+
+
+def _cycle(start: int, needs: dict[int, set[int]], members: set[int]) -> list[int]:
+    """The shortest way from a step to itself, what is needed first; empty if there is none."""
+    ways = [[start]]
+    seen: set[int] = set()
+    while ways:
+        way = ways.pop(0)
+        for before in sorted(needs[way[-1]] & members):
+            if before == start:
+                return [start, *reversed(way)]
+            if before not in seen:
+                seen.add(before)
+                ways.append([*way, before])
+    return []
 
 
 def checked(mapping: d.Mapping, shapes=None) -> Order:

@@ -155,10 +155,10 @@ class _Builder(Transformer):
         return x.Iterator(str(c[0]), over, _place(c))
 
     def elements(self, c):
-        return x.Elements(tuple(p for p in c if p is not None), True, _place(c))
+        return x.Elements(tuple(p for p in c[1:] if p is not None), True, _place(c))
 
     def listed(self, c):
-        return x.Elements(tuple(c), False, _place(c))
+        return x.Elements(tuple(c[1:]), False, _place(c))
 
     # statements
 

@@ -67,8 +67,8 @@ class _Output:
 def formulate(document: d.Document, tables: Mapping[str, np.ndarray] | None = None) -> Formulation:
     """State the problem of a document.
 
-    An objective that is a sum of squares becomes a record of residuals without errors, so that
-    least squares are used and the noise is inferred from them; anything else an objective.
+    An objective that is a sum of squares over a set becomes a record of residuals without errors,
+    so that least squares are used and the noise is inferred from them; else it is an objective.
 
     Parameters
     ----------
@@ -90,7 +90,7 @@ def formulate(document: d.Document, tables: Mapping[str, np.ndarray] | None = No
     --------
     >>> from beamfit.greybox.solve import solve
     >>> from beamfit.language.parse import parse_document
-    >>> text = "minimize y; variable x in [0, 9]; input x; output y; y = (x - 2)^2 + (x - 4)^2;"
+    >>> text = "minimize y; variable x; input x; output y; y = sum(k in |2:4| | (x - k)^2);"
     >>> made = formulate(parse_document(text))
     >>> made.squares, round(solve(made.problem)["x"].value, 6)
     (True, 3.0)
@@ -102,7 +102,8 @@ def formulate(document: d.Document, tables: Mapping[str, np.ndarray] | None = No
     check_problem(document)
     weights = {goal.model: goal.weight * (-1 if p.maximize else 1) for goal in p.goals}
     parts = {name: squares_of(document.mapping, name, weight) for name, weight in weights.items()}
-    least = all(part is not None for part in parts.values())
+    # A few squares by themselves are a wish, not data: errors would mean nothing.
+    least = all(parts.values()) and any(s.each for part in parts.values() for s in part)
     program = compile_mapping(document.mapping, tables)
     free, model, notes = _free(document, program)
     constants = {n: jnp.asarray(v) for n, v in program.constants.items()}

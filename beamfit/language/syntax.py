@@ -17,7 +17,7 @@ __all__ = ["check_brackets", "explained", "short"]
 # Brackets open at once, and letters of an odd word that a message shows.
 MOST_OPEN, LONGEST = 60, 30
 BRACKET = re.compile(
-    r"#[^\n]*|//[^\n]*|/\*.*?\*/|\"(?:\\.|[^\"\\\n])*\"|([(\[{])|([)\]}])", re.DOTALL
+    r"#[^\n]*|//[^\n]*|/\*.*?\*/|\"(?:\\.|[^\"\\\n])*\"|([(\[{])|([)\]}])|(/\*)", re.DOTALL
 )
 STARTS = """minimize maximize variable constraint solver mapping table network input output
 parameter set real function foreach forall layer connection gain in random seed weight"""
@@ -26,7 +26,7 @@ SAID = {
     "NAME": "a name", "NUMBER": "a number", "SIGNED": "a number", "STRING": "a text in quotes",
     "ADD": "an operator", "MULTIPLY": "an operator", "POWER": "an operator", "SEMICOLON": "';'",
     "COLON": "':'", "COMMA": "','", "LPAR": "'('", "RPAR": "')'", "LSQB": "'['", "RSQB": "']'",
-    "LBRACE": "'{'", "RBRACE": "'}'", "EQUAL": "'='", "VBAR": "'|'", "COMPARE": "<=, >= or =",
+    "LBRACE": "'{'", "RBRACE": "'}'", "EQUAL": "'='", "BAR": "'|'", "COMPARE": "<=, >= or =",
     "__ANON_0": "'->'", "__ANON_1": "'::'", "PART": "layer, connection, input, output or gain",
     "$END": "the end",
 }  # fmt: skip
@@ -41,8 +41,15 @@ def check_brackets(text: str) -> None:
         elif match[2] and opened and "([{".index(opened[-1][0]) == ")]}".index(match[0]):
             opened.pop()
         elif match[2]:
-            wanted = ")]}"["([{".index(opened[-1][0])] if opened else "no bracket here"
-            raise error_at(_at(text, match.start()), f"'{match[0]}'", f"'{wanted}'")
+            wanted = "no such bracket"
+            if opened:
+                line = _at(text, opened[-1].start()).line
+                closing = ")]}"["([{".index(opened[-1][0])]
+                wanted = f"'{closing}' for the '{opened[-1][0]}' in line {line}"
+            raise error_at(_at(text, match.start()), f"'{match[0]}'", wanted)
+        elif match[3]:
+            at = _at(text, match.start())
+            raise error_at(at, "'/*', a comment that does not end", "'*/' behind it")
         if len(opened) > MOST_OPEN:
             found = f"more than {MOST_OPEN} brackets within each other"
             raise error_at(_at(text, match.start()), found, "fewer")

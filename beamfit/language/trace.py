@@ -12,10 +12,11 @@ from beamfit.language import document as d
 from beamfit.language import expression as x
 from beamfit.language.calls import Arrays, defaults, given_to
 from beamfit.language.compiled import Program, carry_out
-from beamfit.language.evaluate import Setting, Value
+from beamfit.language.evaluate import HIDDEN, Setting, Value, evaluate
+from beamfit.language.lags import Plan
 from beamfit.language.order import Group
-from beamfit.language.scope import Axes, Scope
-from beamfit.language.steps import calls, sources, targets
+from beamfit.language.scope import Axes, IndexSet, Scope, Step
+from beamfit.language.steps import calls
 
 __all__ = ["cause_of"]
 
@@ -87,9 +88,9 @@ class _Watch:
             return
         at = np.argwhere(~np.isfinite(array))[0][: len(axes)]
         when = [
-            f"{name} = {s.elements[i]}"
+            f"{name.rstrip(HIDDEN)} = {s.elements[i]}"
             for (name, s), i, n in zip(axes.items(), at, array.shape, strict=False)
-            if n > 1 and "'" not in name
+            if n > 1
         ]
         what = "infinite" if np.any(np.isinf(array)) else "not a number"
         index = f" for {', '.join(when)}" if when else ""
@@ -109,36 +110,59 @@ class _Watch:
 
 
 def _of_group(program: Program, group: Group, arrays: Arrays, changed: Arrays) -> str:
-    """What is not finite behind a call or in a recurrence."""
-    scope, step = program.scope, group.steps[0]
-    if group.plan is None and isinstance(step.what, d.Call):
-        found = _of_call(program, step, arrays)
+    """What is not finite behind a call, or in steps that advance: at their first bad time."""
+    scope = program.scope
+    for step in group.steps if group.plan is None else group.plan.steps:
+        axes = step.axes
+        if group.plan is not None:
+            time = group.plan.time[step.number]
+            upto = 1 + _first_time(group.plan, changed)
+            axes = axes | {time: IndexSet(axes[time].name, axes[time].elements[:upto])}
+        found = _of_step(program, step, Setting(scope, arrays | changed, axes, watch=_Watch()))
         if found is not None:
             return found
     name, array = next((n, a) for n, a in changed.items() if not np.all(np.isfinite(a)))
-    first = int(np.argmax(~np.isfinite(np.ravel(array))))
-    steps = [s for s in group.steps if name in [node.name for node, _ in targets(scope, s)]]
-    formula = ", ".join(str(e) for s in steps for e, _ in sources(scope, s))
-    element = scope.arrays[name].element(first)
-    return f"{element} is not finite, the first of {name} ({formula}, line {steps[0].at.line})"
+    element = scope.arrays[name].element(int(np.argmax(~np.isfinite(np.ravel(array)))))
+    at = group.steps[0].at
+    return f"{element} is not finite (line {at.line}, column {at.column})"
 
 
-def _of_call(program: Program, step, arrays: Arrays) -> str | None:
+def _first_time(plan: Plan, changed: Arrays) -> int:
+    """The first time at which what advances is not finite."""
+    bad = []
+    for name, w in plan.written.items():
+        rows = np.moveaxis(np.asarray(changed[name]), w.dim, 0)[w.start : w.start + plan.length]
+        bad.append(~np.all(np.isfinite(rows.reshape(plan.length, -1)), axis=1))
+    return int(np.argmax(np.any(bad, axis=0)))
+
+
+def _of_step(program: Program, step: Step, s: Setting) -> str | None:
+    if isinstance(step.what, d.Call):
+        return _of_call(program, step, s)
+    try:
+        evaluate(step.what.value, s)
+    except _FoundError as found:
+        return str(found)
+    return None
+
+
+def _of_call(program: Program, step: Step, s: Setting) -> str | None:
     """What is not finite in a mapping that is called, for the first point at which it is not."""
-    scope = program.scope
-    call = calls(scope, step.what)
+    call = calls(s.scope, step.what)
     if not isinstance(call.callee, Scope):
         return None
     inner = Program(program.order.inner[step.what.mapping], {})
-    given = given_to(call, Setting(scope, arrays, step.axes))
+    try:
+        given = given_to(call, s)
+    except _FoundError as found:
+        return str(found)
     names = sorted({w.value.name for w in step.what.outputs if isinstance(w.value, x.Name)})
-    lengths = [len(s) for s in step.axes.values()]
-    for at in np.ndindex(*lengths):
+    for at in np.ndindex(*[len(one) for one in s.axes.values()]):
         point = {
             n: a[tuple(min(i, m - 1) for i, m in zip(at, a.shape, strict=False))]
             for n, a in given.items()
         }
-        when = [f"{n} = {s.elements[i]}" for (n, s), i in zip(step.axes.items(), at, strict=True)]
+        when = [f"{n} = {one.elements[i]}" for (n, one), i in zip(s.axes.items(), at, strict=True)]
         where = f" for {', '.join(when)}" if when else ""
         found = cause_of(inner, point, names, f"in {step.what.mapping}{where}: ")
         if found is not None:

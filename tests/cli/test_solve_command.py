@@ -19,7 +19,7 @@ def result(run, *arguments):
 def test_the_set_point_of_the_report_in_words_and_in_json(run):
     status, out, error = run("solve", "formulations/appendix_d.bf")
     assert (status, error) == (0, "")
-    assert "I_2       1.0885976  0.011      0     10   free" in out
+    assert "I_2       1.0885976      0     10   free" in out
     assert "obj = 2.1137780" in out
     assert "major step limit" in out
     document, found = result(run, "formulations/appendix_d.xml")
