@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import click
@@ -11,6 +12,7 @@ from beamfit.cli.options import Sampling, command_line, options
 from beamfit.errors import InputError
 from beamfit.io.decay_record import read_lifetime_input
 from beamfit.io.files import digest
+from beamfit.io.monitor import monitor_of
 from beamfit.io.result import results_text
 from beamfit.studies.decay.record import LifetimeTable
 
@@ -26,6 +28,7 @@ __all__ = ["lifetime"]
 EXAMPLE = """\b
 Examples:
   beamfit lifetime measurements/aps_1999_decay.csv
+  beamfit lifetime measurements/aps_1999_decay.csv --monitor-drift 5uA/h
   beamfit lifetime measurements/aps_1999_decay.csv --sample --report aps.html
   beamfit lifetime fill1.csv fill2.h5 --ring lattices/spear3_2003.toml
   beamfit lifetime fill1.csv --ring ring.toml --report fill1.html --json
@@ -73,6 +76,17 @@ Examples:
     help="Header of the beam current and its unit, mA, A or uA, after the last colon, such as "
     "SR:DCCT:CURRENT:mA. With --time or --current other columns of unknown names are left aside.",
 )
+@click.option(
+    "--monitor-drift",
+    metavar="CURRENT/TIME",
+    help="How far the current monitor drifts (one standard deviation), such as 10uA/h; part of the "
+    "errors then.",
+)
+@click.option(
+    "--monitor-offset",
+    metavar="CURRENT",
+    help="How far it is off without beam (one standard deviation), such as 50uA.",
+)
 @options("prior ignore skip-bad sample store seed report json")
 def lifetime(
     record: tuple[str, ...],
@@ -82,6 +96,8 @@ def lifetime(
     trend: bool,
     time: str | None,
     current: str | None,
+    monitor_drift: str | None,
+    monitor_offset: str | None,
     priors: dict[str, tuple[float, float]] | None,
     ignore: tuple[str, ...],
     skip_bad: bool,
@@ -104,6 +120,7 @@ def lifetime(
     sampling.check()
     _check_study(study, ring, network, priors)
     said = {"time": time, "current": current, "ignore": ignore, "skip_bad": skip_bad}
+    monitor = monitor_of(monitor_drift, monitor_offset)
     records = [read_lifetime_input(path, **said) for path in dict.fromkeys(record)]
     if len(records) < len(record):
         twice = next(path for path in record if record.count(path) > 1)
@@ -112,7 +129,8 @@ def lifetime(
     inputs = {path: digest(path) for path in (*record, ring) if path is not None}
 
     tables = [each for each in records if isinstance(each, LifetimeTable)]
-    if tables and (len(tables) < len(records) or sample or study or trend or report or ring):
+    with_more = sample or study or trend or report or ring or monitor
+    if tables and (len(tables) < len(records) or with_more):
         expected = "tables of lifetimes by themselves, with no option but --json"
         raise InputError("a table of lifetimes", expected, path=tables[0].name)
     if tables:
@@ -121,7 +139,7 @@ def lifetime(
 
     from beamfit.studies.decay.study import study_record  # JAX from here on
 
-    studies = tuple(study_record(each, machine) for each in records)
+    studies = tuple(study_record(replace(each, monitor=monitor), machine) for each in records)
     decays = [decay for each in studies for decay in each.answers]
     single = [decay for each in studies for decay in each.decays or each.pooled]
     shift = _shift(single, machine, network, priors) if study else None

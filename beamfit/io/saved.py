@@ -36,6 +36,7 @@ HOMES = {
     "NetworkStrength": f"{SCAN}.focusing_network",
     **dict.fromkeys(("DecayRecord", "Conditions"), f"{DECAY}.record"),
     "DecayFit": f"{DECAY}.fit",
+    "Monitor": f"{DECAY}.monitor",
     "Separability": f"{DECAY}.evidence",
     **dict.fromkeys(("ConstantA", "LifetimeLaw", "Change"), f"{DECAY}.departures"),
     **dict.fromkeys(("Beamline", "Design"), f"{OPTICS}.beamline"),

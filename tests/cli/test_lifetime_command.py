@@ -239,6 +239,19 @@ def test_a_network_of_the_losses(run):
     assert "--study" in err
 
 
+def test_the_command_takes_a_stability(run, root):
+    status, out, err = run("lifetime", APS, "--monitor-drift", "5uA/h", "--json")
+    assert (status, err) == (0, "")
+    [result] = json.loads(out)["results"]
+    plain = beamfit.fit_decay(beamfit.read_decay_record(root / APS))
+    assert result["b"]["error"] > 1.1 * plain.b.error
+    assert result["b"]["error_raw"] == pytest.approx(plain.b.error_raw)
+    assert "drifts by 5 µA/h" in result["message"]
+    status, out, err = run("lifetime", APS, "--monitor-drift", "5uA")
+    assert (status, out) == (2, "")
+    assert len(err.splitlines()) == 1
+
+
 def test_what_is_known_of_scales_needs_a_study(run):
     status, out, err = run("lifetime", APS, "--prior", "rf_voltage=1+-1%")
     assert (status, out) == (2, "")

@@ -16,8 +16,8 @@ from beamfit.lifetime.decay import HOUR
 from beamfit.quantity import Quantity
 from beamfit.shown import shown
 from beamfit.status import Status
-from beamfit.studies.decay.law import Physical, constant_shape
-from beamfit.studies.decay.model import Expansion, Solution, expanded, padded, solve_decay
+from beamfit.studies.decay.law import Expansion, Physical, constant_shape
+from beamfit.studies.decay.model import Solution, expanded, padded, solve_decay
 from beamfit.studies.decay.record import DecayRecord
 from beamfit.table import json_of
 
@@ -77,6 +77,15 @@ class ConstantA:
     exponent: Quantity
     p_value: float
 
+    def widened(self, error: float) -> ConstantA:
+        """The verdict with a further, independent error of the exponent."""
+        exponent = self.exponent
+        if not math.isfinite(exponent.value):
+            return self
+        whole = math.hypot(exponent.error, error)
+        chance = math.erfc(abs(exponent.value) / whole / math.sqrt(2))
+        return constant_a(exponent.value, whole, exponent.error_raw, chance)
+
     def to_json(self) -> dict[str, Any]:
         """Return the fields as JSON's types."""
         return json_of(vars(self))
@@ -135,7 +144,7 @@ def averaged(record: DecayRecord) -> DecayRecord:
     error = record.error
     if error is not None:
         error = np.sqrt(np.add.reduceat(error**2, first)) / count
-    return DecayRecord(time, current, error, record.name)
+    return DecayRecord(time, current, error, record.name, monitor=record.monitor)
 
 
 class PowerLaw(NamedTuple):
@@ -197,7 +206,10 @@ def lifetime_law(found: PowerLaw, correlated: bool) -> LifetimeLaw:
         [np.zeros_like(x), np.ones_like(x), power - 1, quadratic * power * np.log(x)], axis=1
     )
     about = expanded(record, values, constant_shape, values.exponent)
-    errors = _errors(np.vstack([slopes / span, np.eye(4)[3]]), about, record, correlated)
+    slopes = np.vstack([slopes / span, np.eye(4)[3]])
+    errors = _errors(slopes, about, record, correlated)
+    for change in record.monitor_changes:
+        errors = np.hypot(errors, slopes @ np.linalg.lstsq(about.rows, change, rcond=None)[0])
     lifetimes = tuple(
         Quantity(1 / rate / HOUR, error / rate**2 / HOUR, "h") if rate > 3 * error
         else Quantity(math.nan, None, "h")

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -25,12 +26,20 @@ from beamfit.studies.decay.departures import (
     lifetime_law,
     power_law,
 )
-from beamfit.studies.decay.law import Physical, Shape
-from beamfit.studies.decay.model import Expansion, Solution, expanded
+from beamfit.studies.decay.law import Expansion, Physical, Shape
+from beamfit.studies.decay.model import Solution, expanded
 from beamfit.studies.decay.record import DecayRecord
 from beamfit.table import json_of
 
-__all__ = ["BELIEVED", "DETERMINED", "SEPARABLE", "UNITS", "Evidence", "Separability"]
+__all__ = [
+    "BELIEVED",
+    "DETERMINED",
+    "NORMAL",
+    "SEPARABLE",
+    "UNITS",
+    "Evidence",
+    "Separability",
+]
 
 UNITS = {
     "a": "1/(mA s)",
@@ -50,6 +59,8 @@ BELIEVED = 5.0
 # A change between neighbouring residuals of so many times their usual one is a step, not noise.
 STEP = 12.0
 NUMBERS = 3
+# Standard deviations that hold 95 % of a normal distribution.
+NORMAL = 1.96
 # Of so few readings the noise tells nothing of its memory.
 FEWEST = 12
 
@@ -132,7 +143,23 @@ class Evidence:
 
     @classmethod
     def of(cls, record: DecayRecord, solution: Solution, shape: Shape | None = None) -> Evidence:
-        """Weigh a solution; without errors the weights were 1/mA, and residuals are the noise."""
+        """Weigh a solution; without errors the weights were 1/mA, and residuals are the noise.
+        What is stated of the monitor's stability is part of the errors.
+        """
+        found = cls._by_noise(record, solution, shape)
+        changes = record.monitor_changes
+        return found._with_monitor(changes) if changes and solution.converged else found
+
+    def _with_monitor(self, changes: Sequence[np.ndarray]) -> Evidence:
+        about = expanded(self.record, self.solution.values, self.shape)
+        moved = np.linalg.norm([about.moved(change) for change in changes], axis=0)
+        errors = Physical(*np.hypot(self.errors, moved))
+        reach = Physical(*np.hypot(self.reach, NORMAL * moved))
+        test = self.constant_a.widened(moved[-1])
+        return replace(self, errors=errors, reach=reach, constant_a=test)
+
+    @classmethod
+    def _by_noise(cls, record: DecayRecord, solution: Solution, shape: Shape | None) -> Evidence:
         residuals = np.asarray(solution.residuals[: len(record)])
         over = residuals if record.error is None else residuals / record.error
         if bool(solution.converged) and len(record) >= FEWEST and is_correlated(over, NUMBERS):

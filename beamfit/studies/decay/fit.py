@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import jax
@@ -17,6 +17,7 @@ from beamfit.shown import shown
 from beamfit.studies.decay.departures import Change, ConstantA, LifetimeLaw
 from beamfit.studies.decay.evidence import BELIEVED, UNITS, Evidence, Separability
 from beamfit.studies.decay.model import Solution, padded, padded_size, solve_decay, solve_decays
+from beamfit.studies.decay.monitor import Monitor
 from beamfit.studies.decay.record import DecayRecord
 from beamfit.studies.decay.verdict import finding_of
 from beamfit.table import Table, cell, json_of, labelled, plain_name
@@ -229,7 +230,11 @@ class DecayFit:
         }
 
 
-def fit_decay(record: DecayRecord, shape: Callable[[Any], Any] | None = None) -> DecayFit:
+def fit_decay(
+    record: DecayRecord,
+    shape: Callable[[Any], Any] | None = None,
+    monitor: Monitor | None = None,
+) -> DecayFit:
     """Fit the decay law to one decay.
 
     Parameters
@@ -240,6 +245,9 @@ def fit_decay(record: DecayRecord, shape: Callable[[Any], Any] | None = None) ->
         How a depends on the current in mA, up to a factor, where it is not constant; for
         example `beamfit.lifetime.touschek.touschek_shape(ring, operation)`. The rate equation is
         then integrated, and `a` is the value at the mean current.
+    monitor : Monitor, optional
+        Stability of the current monitor, instead of what the record says of it; the errors contain
+        it.
 
     Returns
     -------
@@ -267,6 +275,7 @@ def fit_decay(record: DecayRecord, shape: Callable[[Any], Any] | None = None) ->
     >>> print(fit.status, fit.lifetime_mean)
     converged 28.704763 ± 0.000026 h
     """
+    record = record if monitor is None else replace(record, monitor=monitor)
     if _says_nothing(record):
         return _constant(record)
     return _judged(record, solve_decay(*padded(record), shape=shape), shape)

@@ -14,6 +14,7 @@ from beamfit.lifetime.decay import current, current_by_rate, mean_exponential
 
 __all__ = [
     "DecayNumbers",
+    "Expansion",
     "Moments",
     "Physical",
     "Shape",
@@ -21,6 +22,7 @@ __all__ = [
     "bent_current",
     "constant_shape",
     "cumulative",
+    "monitored_current",
     "physical",
     "scaled_numbers",
 ]
@@ -37,7 +39,8 @@ class DecayNumbers(NamedTuple):
     """Current at the first reading, mA, and a, 1/(mA s), and b, 1/s, of dI/dt = -a I² - b I.
 
     `exponent` is the power of the current by which a departs from its known dependence,
-    `log_memory` the logarithm of the correlation time of the readings' errors, s.
+    `log_memory` the logarithm of the correlation time of the readings' errors, s; `drift`, mA/s,
+    and `offset`, mA, are the monitor's.
     """
 
     i0: Array
@@ -45,6 +48,8 @@ class DecayNumbers(NamedTuple):
     b: Array
     exponent: Array = 0.0
     log_memory: Array = 0.0
+    drift: Array = 0.0
+    offset: Array = 0.0
 
 
 class Moments(NamedTuple):
@@ -73,6 +78,24 @@ class Physical(NamedTuple):
     rate_mean: Array
     share: Array
     exponent: Array
+
+
+class Expansion(NamedTuple):
+    """A law about a solution: residuals over errors (n,), their slopes by the four scaled numbers
+    (n, 4), the last of them the exponent, and the slopes of `Physical` by the same (8, 4).
+    """
+
+    residuals: np.ndarray
+    rows: np.ndarray
+    slopes: np.ndarray
+
+    def moved(self, change: np.ndarray) -> Physical:
+        """What a change of the readings, over their errors, does to the values by least squares;
+        to an exponent beside the other numbers.
+        """
+        step = np.linalg.lstsq(self.rows[:, :3], change, rcond=None)[0]
+        beside = np.linalg.lstsq(self.rows, change, rcond=None)[0]
+        return Physical(*(self.slopes[:, :3] @ step))._replace(exponent=beside[3])
 
 
 def constant_shape(beam: Array) -> Array:
@@ -127,6 +150,11 @@ def beam_current(numbers: DecayNumbers, at: Moments, shape: Shape | None = None)
         return _quadratic(numbers, at.mean, shape, beam) + numbers.b
 
     return current_by_rate(at.time, numbers.i0, rate)
+
+
+def monitored_current(numbers: DecayNumbers, at: Moments) -> Array:
+    """What a monitor with a drift and an offset reads, mA."""
+    return beam_current(numbers, at) + numbers.offset + numbers.drift * at.time
 
 
 def bent_current(numbers: DecayNumbers, at: Moments) -> Array:

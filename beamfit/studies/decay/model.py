@@ -16,6 +16,7 @@ from beamfit.greybox.descend import descend_one
 from beamfit.greybox.problem import Free, Prior, Problem, Record, padded_length
 from beamfit.studies.decay.law import (
     DecayNumbers,
+    Expansion,
     Moments,
     Physical,
     Shape,
@@ -28,7 +29,6 @@ from beamfit.studies.decay.law import (
 from beamfit.studies.decay.record import DecayRecord
 
 __all__ = [
-    "Expansion",
     "Solution",
     "decay_problem",
     "expanded",
@@ -65,16 +65,6 @@ class Solution(NamedTuple):
     sum_squares: Array
     fall: Array
     converged: Array
-
-
-class Expansion(NamedTuple):
-    """A law about a solution: residuals over errors (n,), their slopes by the four scaled numbers
-    (n, 4), the last of them the exponent, and the slopes of `Physical` by the same (8, 4).
-    """
-
-    residuals: np.ndarray
-    rows: np.ndarray
-    slopes: np.ndarray
 
 
 def padded_size(rows: int) -> int:

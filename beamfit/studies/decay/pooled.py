@@ -21,9 +21,10 @@ from beamfit.studies.decay.departures import (
     LifetimeLaw,
     constant_a,
 )
-from beamfit.studies.decay.evidence import DETERMINED, SEPARABLE, UNITS, Separability
+from beamfit.studies.decay.evidence import DETERMINED, NORMAL, SEPARABLE, UNITS, Separability
 from beamfit.studies.decay.fit import DecayFit
 from beamfit.studies.decay.law import Physical
+from beamfit.studies.decay.monitor import Monitor
 from beamfit.studies.decay.pool import (
     FEWEST_CYCLES,
     FEWEST_READINGS,
@@ -91,6 +92,7 @@ class PooledEvidence:
     reach: Physical
     constant_a: ConstantA
     left_out: tuple[str, ...]
+    monitor: Monitor | None = None
 
     change = None
 
@@ -123,6 +125,20 @@ class PooledEvidence:
     def scaled(self, name: str) -> tuple[float, float]:
         """A value and its error."""
         return float(getattr(self.values, name)), float(getattr(self.errors, name))
+
+    def with_monitor(self, monitor: Monitor) -> PooledEvidence:
+        """With a stated stability in the errors, and in the test of a constant a."""
+        pool, slopes, moved = self.pool, _slopes(self.pool)[1], np.zeros(len(Physical._fields))
+        for change in monitor.changes(pool.cycles.time - pool.cycles.time[0]).values():
+            every = pool.beside(np.column_stack([pool.rows, change * pool.weight / pool.mean]))
+            step = np.linalg.lstsq(every[:, :2], every[:, 3], rcond=None)[0]
+            beside = np.linalg.lstsq(every[:, :3], every[:, 3], rcond=None)[0]
+            moved = np.hypot(moved, np.append((slopes[:, :2] @ step)[:-1], beside[2]))
+        return replace(
+            self, monitor=monitor, errors=Physical(*np.hypot(self.errors, moved)),
+            reach=Physical(*np.hypot(self.reach, NORMAL * moved)),
+            constant_a=self.constant_a.widened(moved[-1]),
+        )  # fmt: skip
 
     @property
     def cycles(self) -> int:
@@ -317,6 +333,8 @@ def fit_cycles(cycles: Sequence[DecayRecord], name: str = "cycles") -> DecayFit:
         raise InputError("a cycle before the end of the one before", "an order in time", path=name)
     pool, left_out = cleaned(gathered)
     evidence = PooledEvidence.of(pool, left_out)
+    if cycles[0].monitor is not None:
+        evidence = evidence.with_monitor(cycles[0].monitor)
     finding = finding_of_cycles(evidence)
     apart = evidence.separability.separable
     a, b = (

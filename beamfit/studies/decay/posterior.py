@@ -14,14 +14,14 @@ from beamfit.errors import InputError
 from beamfit.greybox import tree
 from beamfit.greybox.correlated import log_volume, range_of, whitened
 from beamfit.greybox.posterior import Optimum, Sampled, Statement, target_of
-from beamfit.greybox.problem import Free, Problem, Record
+from beamfit.greybox.problem import Free, Prior, Problem, Record
 from beamfit.lifetime.decay import HOUR, current
 from beamfit.quantity import Quantity
 from beamfit.sampling.posterior import Expected, Posterior
 from beamfit.sampling.priors import Distribution
 from beamfit.sampling.target import Target
 from beamfit.status import Status
-from beamfit.studies.decay.law import DecayNumbers, Moments, beam_current
+from beamfit.studies.decay.law import DecayNumbers, Moments, monitored_current
 from beamfit.studies.decay.model import RECORD, decay_problem
 from beamfit.studies.decay.record import DecayRecord
 from beamfit.verdict import Finding
@@ -29,7 +29,9 @@ from beamfit.verdict import Finding
 __all__ = ["decay_target", "expected_current"]
 
 UNITS = {"i0": "mA", "a": "1/(mA s)", "b": "1/s"}
-SAMPLED = UNITS | {"log_memory": "1"}
+SAMPLED = UNITS | {"log_memory": "1", "drift": "mA/s", "offset": "mA"}
+# The monitor is taken to be within so many of its stated errors.
+WIDEST = 8.0
 LIFETIMES = {"lifetime_start": "h", "lifetime_mean": "h", "lifetime_end": "h"}
 
 
@@ -99,7 +101,9 @@ def decay_target(
         raise InputError("a fit with a shape of a(I), which is not sampled", expected)
     # The fit's weak prior only keeps a search from running away; the bounds do that here.
     problem = replace(decay_problem(record, memory=fit.correlation_time), priors=())
+    problem, monitor = _with_monitor(problem, record)
     theta, rate = _start(fit, record)
+    theta = np.append(theta, np.zeros(len(monitor)))
     scale = fit.rms_residual * np.sqrt(len(record) / max(fit.dof, 1))
     if record.error is not None:
         scale = max(1.0, np.sqrt(fit.chi2 / max(fit.dof, 1)))
@@ -118,7 +122,7 @@ def decay_target(
         data=(fit.mean_current, record.time[-1], problem.records[0].data),
         units=SAMPLED,
         lower=dict.fromkeys(UNITS, 0.0),
-        width={"a": rate / fit.mean_current, "b": rate, "log_memory": 1.0},
+        width={"a": rate / fit.mean_current, "b": rate, "log_memory": 1.0, **monitor},
         noise_unit="mA",
         priors_own=() if apart else ("a", "b"),
         nothing="" if seen else nothing,
@@ -126,6 +130,21 @@ def decay_target(
     verdict, given = Finding(fit.status, fit.message), [record.error is not None]
     optimum = Optimum(theta, verdict, [max(scale, 1e-12)], given)
     return target_of(problem, optimum, stated, noise=noise, outliers=outliers, priors=priors)
+
+
+def _with_monitor(problem: Problem, record: DecayRecord) -> tuple[Problem, dict[str, float]]:
+    """The problem with what is stated of the monitor as numbers of a prior, and their sizes."""
+    stated = {} if record.monitor is None else record.monitor._asdict()
+    units = {"drift": HOUR, "offset": 1.0}
+    size = {name: value / units[name] for name, value in stated.items() if value > 0}
+    if not size:
+        return problem, size
+    free = [Free(name, -WIDEST * sd, WIDEST * sd, nuisance=True) for name, sd in size.items()]
+    priors = [Prior(name, 0.0, sd) for name, sd in size.items()]
+    readings = replace(problem.records[0], predict=monitored_current)
+    return replace(
+        problem, free=[*problem.free, *free], priors=[*problem.priors, *priors], records=[readings]
+    ), size
 
 
 class Remembered(NamedTuple):
@@ -169,7 +188,7 @@ def _log_size(model: DecayNumbers, data: Remembered) -> Array:
 
 def _new(model: DecayNumbers, data: Remembered) -> Array:
     apart = jnp.diff(data.at.time) * jnp.exp(-model.log_memory)
-    rows = (beam_current(model, data.at) - data.measured) / data.error
+    rows = (monitored_current(model, data.at) - data.measured) / data.error
     return whitened(rows, apart) * jnp.exp(_log_size(model, data))
 
 
@@ -199,7 +218,7 @@ def _currents(data: Sampled, theta: Array) -> Array:
     core = data.core
     at = core.records[0].data
     model = tree.replace(core.model, core.chosen, data.theta.at[data.moving].set(theta))
-    return beam_current(model, at.at if isinstance(at, Remembered) else at)
+    return monitored_current(model, at.at if isinstance(at, Remembered) else at)
 
 
 def expected_current(posterior: Posterior) -> Expected:

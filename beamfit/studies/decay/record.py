@@ -16,6 +16,8 @@ from beamfit.table import Table
 if TYPE_CHECKING:
     from pandas import DataFrame
 
+    from beamfit.studies.decay.monitor import Monitor
+
 __all__ = ["Conditions", "DecayRecord", "Fault", "LifetimeTable", "first_fault"]
 
 FEWEST_LIFETIMES = 4
@@ -190,6 +192,8 @@ class DecayRecord:
         Provenance, as written in the file.
     notes : tuple of str, optional
         What was done to its numbers, such as rows left out.
+    monitor : Monitor, optional
+        Stability of the current monitor, which errors of results then contain.
 
     Raises
     ------
@@ -212,9 +216,12 @@ class DecayRecord:
     conditions: Conditions = field(default_factory=Conditions)
     comments: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
+    monitor: Monitor | None = None
 
     def __post_init__(self) -> None:
         rows = np.size(self.time)
+        if self.monitor is not None:
+            self.monitor.check()
         if rows < 2:
             raise InputError(f"{rows} readings", "two or more", path=self.name)
         time = np.array(self.time, float)
@@ -305,6 +312,13 @@ class DecayRecord:
         if base > 0 and np.abs(lone).max() < FOLLOWS * pressure.mean() * self.span:
             return None
         return self.integral(pressure / self.integral(pressure)[-1] * self.span)
+
+    @property
+    def monitor_changes(self) -> list[np.ndarray]:
+        """What a stated instability of the monitor does to the readings, over their errors."""
+        over = 1.0 if self.error is None else self.error
+        changes = {} if self.monitor is None else self.monitor.changes(self.time)
+        return [change / over for change in changes.values()]
 
     def integral(self, values: np.ndarray) -> np.ndarray:
         """Integral over time from the first reading on, by the trapezoidal rule.

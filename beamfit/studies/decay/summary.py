@@ -13,6 +13,7 @@ from beamfit.lifetime.decay import current
 from beamfit.studies.decay.fit import DecayFit
 from beamfit.studies.decay.model import padded_size
 from beamfit.studies.decay.study import Decay
+from beamfit.studies.decay.systematics import about_fit
 
 __all__ = ["Summaries", "loss_parts", "summarise"]
 
@@ -74,8 +75,20 @@ def _one(decay: Decay) -> tuple[float, np.ndarray, np.ndarray]:
     extra = (0, padded_size(rows) - rows)
     time, weight = np.pad(segment.time, extra, mode="edge"), np.pad(weight, extra)
     parts = np.asarray(loss_parts(fit.a.value, fit.b.value, fit.mean_current))
-    root = information_root(time, weight, fit.i0.value, parts, fit.mean_current)
-    return fit.mean_current, parts, np.asarray(root)
+    root = np.asarray(information_root(time, weight, fit.i0.value, parts, fit.mean_current))
+    return fit.mean_current, parts, _with_monitor(root, fit)
+
+
+def _with_monitor(root: np.ndarray, fit: DecayFit) -> np.ndarray:
+    """The root with what is stated of the monitor added to the covariance of the parts."""
+    changes = fit.readings.monitor_changes
+    if not changes:
+        return root
+    about = about_fit(fit)
+    moved = [about.moved(change) for change in changes]
+    spread = root @ np.array([[m.a * fit.mean_current, m.rate_mean] for m in moved]).T
+    whole = np.linalg.cholesky(np.eye(2) + spread @ spread.T)
+    return np.linalg.qr(np.linalg.solve(whole, root), mode="r")
 
 
 def _together(fit: DecayFit) -> tuple[float, np.ndarray, np.ndarray]:

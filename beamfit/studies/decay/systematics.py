@@ -11,11 +11,12 @@ from beamfit.quantity import Status
 from beamfit.shown import shown
 from beamfit.studies.decay.evidence import UNITS
 from beamfit.studies.decay.fit import DecayFit, bare
-from beamfit.studies.decay.law import Physical
-from beamfit.studies.decay.model import Expansion, expanded
+from beamfit.studies.decay.law import Expansion, Physical
+from beamfit.studies.decay.model import expanded
+from beamfit.studies.decay.record import DecayRecord
 from beamfit.table import json_of
 
-__all__ = ["Systematic", "systematics"]
+__all__ = ["Systematic", "about_fit", "systematics"]
 
 # The size of each cause that the table assumes.
 PRESSURE, DRIFT, OFFSET, EXPONENT = 0.01, 0.01, 0.1, -0.1
@@ -85,7 +86,7 @@ def systematics(fit: DecayFit) -> tuple[Systematic, ...]:
         or fit.a.error is None
     ):
         return ()
-    about = expanded(record, _values(fit))
+    about = about_fit(fit)
     over = 1.0 if record.error is None else record.error
     level = record.current + about.residuals * over
     share = record.time / record.span
@@ -93,24 +94,36 @@ def systematics(fit: DecayFit) -> tuple[Systematic, ...]:
     grown = level**2 * np.exp(fit.b.value * record.time) * record.integral(source)
     causes = {
         f"pressure rises by {100 * PRESSURE:g} % over the record": -fit.b.value * PRESSURE * grown,
-        f"monitor drifts by {1e3 * DRIFT:g} µA over the record": DRIFT * share,
-        f"monitor reads {OFFSET:g} mA too much": np.full(len(record), OFFSET),
+        **_monitor(record, share),
         f"a goes as I^{EXPONENT:g}, as of a bunch that lengthens": EXPONENT
         * (about.rows[:, 3] * over),
     }
     return tuple(_shift(fit, about, cause, moved / over) for cause, moved in causes.items())
 
 
-def _values(fit: DecayFit) -> Physical:
+def _monitor(record: DecayRecord, share: np.ndarray) -> dict[str, np.ndarray]:
+    """What is stated of the monitor, or else assumed."""
+    if record.monitor is None:
+        return {
+            f"monitor drifts by {1e3 * DRIFT:g} µA over the record": DRIFT * share,
+            f"monitor reads {OFFSET:g} mA too much": np.full(len(record), OFFSET),
+        }
+    stated = record.monitor.changes(record.time)
+    return {f"monitor {cause} (in the errors)": moved for cause, moved in stated.items()}
+
+
+def about_fit(fit: DecayFit) -> Expansion:
+    """The law about a fit of a constant a."""
     a, b = fit.a.value, fit.b.value
     rate = a * fit.mean_current + b
     unused = np.nan
-    return Physical(fit.i0.value, a, b, unused, unused, rate, a * fit.mean_current / rate, 0.0)
+    share = a * fit.mean_current / rate
+    values = Physical(fit.i0.value, a, b, unused, unused, rate, share, 0.0)
+    return expanded(fit.readings, values)
 
 
 def _shift(fit: DecayFit, about: Expansion, cause: str, moved: np.ndarray) -> Systematic:
     """Project a change of the readings on the law."""
-    step = np.linalg.lstsq(about.rows[:, :3], moved, rcond=None)[0]
-    found = Physical(*(about.slopes[:, :3] @ step))
+    found = about.moved(moved)
     rate = fit.a.value * fit.mean_current + fit.b.value
     return Systematic(cause, found.a, found.b, -found.rate_mean / rate**2 / HOUR)

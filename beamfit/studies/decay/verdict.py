@@ -21,6 +21,7 @@ from beamfit.studies.decay.evidence import (
     Evidence,
     Separability,
 )
+from beamfit.studies.decay.monitor import Monitor
 from beamfit.verdict import Finding, judge
 
 __all__ = ["TableEvidence", "finding_of", "finding_of_cycles", "finding_of_table"]
@@ -77,6 +78,7 @@ class CyclesEvidence(Judged, Protocol):
     left_out: tuple[str, ...]
     separability: Separability
     correlation_time: float | None
+    monitor: Monitor | None
 
 
 def _lost(e: Evidence) -> Finding | None:
@@ -276,6 +278,7 @@ def finding_of_cycles(evidence: CyclesEvidence) -> Finding:
         noise = f"{evidence.noise:.3g} mA rms is inferred from the residuals"
         said.append(f"The record gives no errors; {noise}")
     said += [text for text in (_correlated(evidence), _odd_clock(evidence)) if text]
+    said += [] if evidence.monitor is None else [_stated(evidence.monitor)]
     said += [text[0].upper() + text[1:] for text in evidence.left_out]
     return Finding(found.status, ". ".join(said) + ".")
 
@@ -307,8 +310,14 @@ def _quantised(e: Evidence) -> str | None:
     return f"The readings are quantised in steps of {step:.3g} mA"
 
 
+def _stated(monitor: Monitor) -> str:
+    return f"The errors contain a monitor that {monitor} (one standard deviation)"
+
+
 def _drifting(e: Evidence) -> str | None:
     """What no residual shows: a drift of the monitor that is slow against the record."""
+    if e.record.monitor is not None:
+        return _stated(e.record.monitor)
     if e.record.error is not None:
         return None
     names = ("a", "b") if e.separability.separable else ("rate_mean",)
