@@ -70,7 +70,7 @@ def find_cycles(record: DecayRecord) -> Split:
     >>> noise = np.random.default_rng(1).normal(size=t.size)
     >>> split = find_cycles(DecayRecord(t, 500 - (t % 180) / 180 + 0.2 * noise))
     >>> len(split.segments), str(split.events[0])
-    (20, 'refill at 180 s (+0.8954 mA)')
+    (20, 'refill at 180 s (+0.9698 mA)')
     """
     kept, events = beam_readings(record, spikes=False)
     grain = _grain(record.current)

@@ -320,7 +320,7 @@ def fit_cycles(cycles: Sequence[DecayRecord], name: str = "cycles") -> DecayFit:
     >>> noise = 1e-3 * np.random.default_rng(1).normal(size=(50, 18))
     >>> cycles = [DecayRecord(t, 500 * np.exp(-t / 36000) + row) for row in noise]
     >>> print(fit_cycles(cycles).lifetime_mean)
-    10.00041 ± 0.00072 h
+    9.99999 ± 0.00046 h
     """
     if len(cycles) < FEWEST_CYCLES:
         raise InputError(f"{len(cycles)} cycles", f"{FEWEST_CYCLES} or more", path=name)
