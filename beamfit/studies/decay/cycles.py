@@ -10,9 +10,9 @@ from scipy.ndimage import maximum_filter1d
 
 from beamfit.studies.decay.pool import FEWEST_CYCLES, FEWEST_READINGS
 from beamfit.studies.decay.record import Conditions, DecayRecord
-from beamfit.studies.decay.segments import Event, Split, beam_readings
+from beamfit.studies.decay.segments import Event, Split, beam_readings, split_record
 
-__all__ = ["alike", "find_cycles", "is_refilled", "joined"]
+__all__ = ["alike", "cut_at_refills", "find_cycles", "is_refilled", "joined"]
 
 # Standard deviations by which two levels must differ to be two: a false step costs no more than an
 # own current for the rest.
@@ -27,6 +27,8 @@ BLOCK = 16
 NEAR = 8
 # How often steps are sought with the law that those found leave.
 ROUNDS = 20
+# From so many times the cycles and some more on the finer search is taken.
+MORE, FEW = 1.1, 1
 # Share of the usual length below which a piece is the head of a cycle, as of fresh beam.
 SHORT = 0.25
 # Least step as a share of what is lost in the piece that it divides.
@@ -91,6 +93,15 @@ def find_cycles(record: DecayRecord) -> Split:
         events.append(Event(kind, at, 0.0, change))
     cycles = (record.select(piece, f"{record.name}#{k}") for k, piece in enumerate(long, 1))
     return Split(tuple(cycles), tuple(sorted(events, key=lambda event: event.time)))
+
+
+def cut_at_refills(record: DecayRecord) -> Split:
+    """As `split_record`, but as `find_cycles` where that finds more cycles: the former cuts
+    nothing but clear steps between pieces of eight readings, whatever the law of the decay.
+    """
+    clear, fine = split_record(record), find_cycles(record)
+    more = len(fine.segments) > MORE * len(clear.segments) + FEW
+    return fine if more and is_refilled(fine) else clear
 
 
 def is_refilled(split: Split) -> bool:

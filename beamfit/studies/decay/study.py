@@ -17,7 +17,7 @@ from beamfit.lifetime.ring import MeasuredLength, Operation, Ring, unstored
 from beamfit.quantity import Quantity
 from beamfit.shown import shown
 from beamfit.studies.decay.checks import DecayChecks, check_decay
-from beamfit.studies.decay.cycles import alike, find_cycles, is_refilled, joined
+from beamfit.studies.decay.cycles import alike, cut_at_refills, is_refilled, joined
 from beamfit.studies.decay.fit import FEWEST, DecayFit, fit_decay
 from beamfit.studies.decay.pool import FEWEST_CYCLES
 from beamfit.studies.decay.pooled import fit_cycles, stands_alone
@@ -319,11 +319,9 @@ def _refilled(record: DecayRecord) -> Split:
     the rest; no cycle if nothing is.
     """
     sections = _at_settings(record)
-    splits = [find_cycles(section) for section in sections]
-    if not any(map(is_refilled, splits)):
+    found = [cut_at_refills(section) for section in sections]
+    if not any(map(is_refilled, found)):
         return Split((), ())
-    found = [s if is_refilled(s) else split_record(part)
-             for s, part in zip(splits, sections, strict=True)]  # fmt: skip
     placed = [
         event._replace(time=event.time + part.start)
         for split, part in zip(found, sections, strict=True)
