@@ -6,7 +6,12 @@ __all__ = ["Status"]
 
 
 class Status(StrEnum):
-    """How a fit ended. Anything but ``converged`` is a warning with a sentence beside it.
+    """How a fit or a search for an optimum ended, always with a sentence beside it.
+
+    Of a fit to data anything but ``converged`` is a warning. An objective without data is never
+    ``converged``, ``unidentified``, ``at_limit`` or ``poor_fit``: it is ``optimal``,
+    ``local_optimum`` (others were seen, or nobody looked), ``degenerate``, ``saddle``, or has no
+    answer as a fit may have none.
 
     Examples
     --------
@@ -23,3 +28,7 @@ class Status(StrEnum):
     not_converged = "not_converged"
     unbounded = "unbounded"
     contradictory_bounds = "contradictory_bounds"
+    optimal = "optimal"
+    local_optimum = "local_optimum"
+    saddle = "saddle"
+    degenerate = "degenerate"

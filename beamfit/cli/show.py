@@ -14,7 +14,7 @@ from beamfit.table import Table
 
 __all__ = ["Terminal"]
 
-COLOUR = {Status.converged: "green", Status.poor_fit: "yellow"}
+COLOUR = {Status.converged: "green", Status.optimal: "green", Status.poor_fit: "yellow"}
 
 
 def _style(status: Status) -> str:

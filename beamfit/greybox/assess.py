@@ -37,6 +37,9 @@ __all__ = [
 TOLERANCE = 1e-6  # within which a limit counts as reached and a point as an optimum
 # A bound is reached, too, where moving onto it changes the cost by less than this share.
 CLOSE = 1e-8
+# What is limited counts as no larger than this many times its size at the end: a start at which it
+# was exp(100) must not make every end feasible.
+GROWN = 1e3
 
 
 class Slopes(NamedTuple):
@@ -124,12 +127,14 @@ class KKT(NamedTuple):
 class Bend(NamedTuple):
     """The second-order test: the lowest curvature, the direction down, the Newton step.
 
-    `direction` (n,) leads to lower cost, None where there is none.
+    `direction` (n,) leads to lower cost, None where there is none; `clear` tells that the curvature
+    alone says so.
     """
 
     direction: np.ndarray | None
     newton: float = 0.0
     flat: bool = False
+    clear: bool = False
 
 
 class State(NamedTuple):
@@ -238,8 +243,9 @@ def state(p: Problem, theta: np.ndarray, scale: Scale, at: Slopes | None = None)
         near = np.where(pushed, np.maximum(near, CLOSE * cost / np.abs(at.gradient)), near)
     near = np.where(np.isfinite(near), near, 0.0)
     bounds = Limits(theta, p.lower, p.upper, scale.unit, near)
+    size_here = np.fmin(scale.limit, GROWN * scale_of(p, theta, at).limit)
     limits = Limits(
-        at.constraints, p.constraint_lower, p.constraint_upper, scale.limit, TOLERANCE * scale.limit
+        at.constraints, p.constraint_lower, p.constraint_upper, size_here, TOLERANCE * size_here
     )
     if not at.finite:
         none = Multipliers(np.zeros(len(theta)), np.zeros(len(at.constraints)))

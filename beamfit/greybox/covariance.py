@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 __all__ = [
+    "CUT",
     "MOST_SHARE",
     "Group",
     "Spread",

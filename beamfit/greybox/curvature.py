@@ -22,6 +22,10 @@ __all__ = ["STEP", "lagrangian_hessian", "lower_beside", "second_order"]
 STEP = 1e-3
 # Bending down by less than this share of the strongest curvature is rounding.
 FLAT = 1e-6
+# Bending down by more than this is a saddle even where no point looked at is lower, bounds apart.
+PLAIN = 2e-3
+# Slopes below this share of the terms that cancel in them are rounding, too.
+ROUNDING = 1e-13
 # Points beside one are so far off in the sizes of the numbers, along so many of the weakest
 # directions of squares, or at random or inward from bounds.
 NEAR, WEAKEST, AROUND = 1e-3, 2, 4
@@ -71,12 +75,17 @@ def second_order(
         # Nothing of second order tells: look around, always at the same points.
         random = np.random.default_rng(0).normal(size=(AROUND, len(s.theta)))
         tangent = _tangent(p, s)
-        directions += list(random @ tangent @ tangent.T * s.scale.unit)
+        around = random @ tangent @ tangent.T * s.scale.unit
+        # From a bound that nothing pushes to there is one way only.
+        low, high = s.bounds.reached
+        directions += list(np.where(low, np.abs(around), np.where(high, -np.abs(around), around)))
     for direction in directions:
         point = _along(p, s, direction, lagrangian)
         if point is not None:
             return s._replace(bend=bent._replace(direction=direction)), point
-    return s._replace(bend=bent._replace(direction=None)), None
+    if not bent.clear:
+        bent = bent._replace(direction=None)
+    return s._replace(bend=bent), None
 
 
 def lower_beside(p: Problem, s: assess.State, lagrangian: Look) -> np.ndarray | None:
@@ -143,9 +152,14 @@ def _bend(p: Problem, s: assess.State) -> assess.Bend:
     slope = vectors.T @ (tangent.T @ (left * unit / cost))
     largest = np.max(np.abs(values))
     steep = values > FLAT * largest
-    newton = np.max(np.abs(slope[steep] / values[steep]), initial=0.0)
+    terms = np.abs(s.at.gradient) + np.abs(s.found.constraints) @ np.abs(s.at.jacobian)
+    told = steep & (np.abs(slope) > ROUNDING * np.max(terms * unit / cost))
+    newton = np.max(np.abs(slope[told] / values[told]), initial=0.0)
     down = tangent @ vectors[:, 0] * unit if values[0] < -FLAT * max(largest, FLAT) else None
-    return assess.Bend(down, float(newton), not steep.all() or largest < assess.TOLERANCE)
+    clear = values[0] < -PLAIN * max(largest, 1.0) and np.all(
+        np.abs(NEAR * down) < np.minimum(s.theta - p.lower, p.upper - s.theta)
+    )
+    return assess.Bend(down, float(newton), not steep.all() or largest < assess.TOLERANCE, clear)
 
 
 def _tangent(p: Problem, s: assess.State) -> np.ndarray:

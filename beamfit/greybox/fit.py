@@ -288,14 +288,18 @@ class Fit:
     def __str__(self) -> str:
         """A table of the verdict, the numbers and the active constraints."""
         per = f", chi2/dof = {self.chi2 / self.dof:.3g}" if self.dof > 0 else ""
-        lines = [f"{self.status}: {self.message}"]
-        lines += [f"chi2 = {self.chi2:.6g}, dof = {self.dof}{per}, KKT = {self.kkt.worst:.1e}"]
+        fits = self.problem.has_data
+        worth = (
+            f"chi2 = {self.chi2:.6g}, dof = {self.dof}{per}" if fits else f"cost = {self.cost:.6g}"
+        )
+        lines = [f"{self.status}: {self.message}", f"{worth}, KKT = {self.kkt.worst:.1e}"]
         shown = [v for v, n in zip(self.variables, self.problem.nuisance, strict=True) if not n]
         width = max((len(row.name) for row in (*shown, *self.constraints)), default=4)
         for v in shown:
             error = "undetermined" if np.isnan(v.error) else f"{v.error:.2g}"
+            error = f" ± {error:<12}" if fits else ""
             held = "" if v.state == "free" else f"  {v.state}, gradient {v.reduced_gradient:.3g}"
-            lines.append(f"{v.name:<{width}}  {v.value:>13.6g} ± {error:<12}{held}".rstrip())
+            lines.append(f"{v.name:<{width}}  {v.value:>13.6g}{error}{held}".rstrip())
         hidden = len(self.variables) - len(shown)
         lines += [f"and {hidden} nuisance numbers"] if hidden else []
         for c in self.constraints:

@@ -224,6 +224,11 @@ class Problem:
         return self._limits("upper")
 
     @property
+    def has_data(self) -> bool:
+        """Whether anything was measured or known beforehand: a fit, and not an optimum alone."""
+        return bool(self.records or self.priors)
+
+    @property
     def errors_known(self) -> bool:
         """Whether any record brings measurement errors."""
         return any(record.errors_given for record in self.records)

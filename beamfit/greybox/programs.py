@@ -182,13 +182,15 @@ class Stage(NamedTuple):
     solve: Callable[[Program, np.ndarray, int, Budget], Proposal]
 
 
+_SHARP = Stage("Uno filtersqp", "exact", 300, _uno("filtersqp"))
 SOLVERS: tuple[Stage, ...] = (
     Stage("Uno filtersqp with Gauss-Newton", "gauss_newton", 3000, _uno("filtersqp")),
-    Stage("Uno filtersqp", "exact", 300, _uno("filtersqp")),
+    _SHARP,
     Stage("Uno ipopt", "exact", 1000, _uno("ipopt")),
+    _SHARP,
     Stage("scipy SLSQP", "none", 300, _slsqp),
 )
-"""In the order of trying."""
+"""In the order of trying; what an interior point leaves short of its limits is sharpened."""
 
 
 def _values(core, theta):

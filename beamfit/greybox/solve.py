@@ -10,11 +10,14 @@ import numpy as np
 from beamfit.errors import InputError
 from beamfit.greybox import assess, curvature
 from beamfit.greybox.assess import TOLERANCE, State
+from beamfit.greybox.conflict import relaxed
 from beamfit.greybox.descend import Lanes
+from beamfit.greybox.diagnosis import contradictory, not_finite
+from beamfit.greybox.evidence import Search, settled
 from beamfit.greybox.fit import Attempt, Fit
 from beamfit.greybox.problem import Problem
 from beamfit.greybox.programs import SOLVERS, Budget, scaled
-from beamfit.greybox.verdict import Search, conclude, refused, settled
+from beamfit.greybox.verdict import conclude, refused
 from beamfit.status import Status
 
 __all__ = ["search", "solve", "starting_points"]
@@ -26,6 +29,8 @@ STEPS, POLISHED = 300, 4
 NOTHING, STRETCH = 1e-7, 100
 # Bytes that Jacobians of starts searched together may take.
 MEMORY = 2**24
+# Starts of the search for the point nearest to constraints that no search could keep.
+ELASTIC = 6
 # How often a search moves off where the cost bends down.
 MOVES = 3
 
@@ -89,15 +94,10 @@ def solve(
     """
     began = time.perf_counter()
     _check(starts, iterations, hessian, seconds)
-    wrong = [n for n, a, b in zip(p.names, p.lower, p.upper, strict=True) if not a <= b]
-    wrong += [
-        n
-        for n, a, b in zip(p.constraint_names, p.constraint_lower, p.constraint_upper, strict=True)
-        if not a <= b
-    ]
+    wrong = contradictory(p)
     if wrong:
-        said = f"the lower bound of {wrong[0]} lies above its upper bound; correct the bounds."
-        return refused(p, Status.contradictory_bounds, said, time.perf_counter() - began)
+        spent = time.perf_counter() - began
+        return refused(p, Status.contradictory_bounds, wrong[0].message, spent)
     drawn = _drawn(p, starts, seed)
     points = np.clip(drawn, p.lower, p.upper)
     moved = int(np.sum(np.any(points != drawn, axis=1)))
@@ -108,14 +108,23 @@ def solve(
         found, attempts = _together(p, points, budget, progress)
     spent = time.perf_counter() - began
     if not found:
-        place = "the start" if starts == 1 else "any start"
         said = (
-            f"the cost or a constraint is not finite at {place}; "
+            "the cost or a constraint is not finite at any start; "
             "start elsewhere, or use a parametrisation that is defined there."
         )
+        traced = not_finite(p, points[0]) if starts == 1 else []
+        said = traced[0].message if traced else said
         return refused(p, Status.not_finite, said, spent, None, attempts)
-    best = found[_best(p, found)]
-    return conclude(p, best, Search(attempts, moved, seconds, budget.left <= 0), spent)
+    best, conflict = found[_best(p, found)], None
+    if best.kkt.feasibility > TOLERANCE and p.constraints and best.at.finite and budget.left > 0:
+        conflict = relaxed(p, best, starting_points(p, ELASTIC, seed))
+        if conflict.feasible:
+            more, again = _one_by_one(p, conflict.theta[None], budget, hessian)
+            found, attempts = found + more, attempts + again
+            best = found[_best(p, found)]
+    exact = hessian == "exact"
+    done = Search(attempts, moved, seconds, budget.left <= 0, exact, conflict)
+    return conclude(p, best, done, time.perf_counter() - began)
 
 
 def _check(starts: int, iterations: int, hessian: str, seconds: float | None) -> None:
@@ -179,19 +188,23 @@ def _good(s: State) -> bool:
 def _best(p: Problem, found: list[State]) -> int:
     """The cheapest feasible point, or the least infeasible; of equally cheap ones an optimum.
 
-    Equally cheap are those within one standard deviation, or 1e-6 of the cost's scale.
+    Equally cheap are those within one standard deviation, or 1e-6 of the cost's scale
+    at the first start. What a point
+    saves by lying a little outside its limits is no merit: their multipliers tell how much that is.
     """
 
     def rank(s: State) -> tuple:
         feasible = s.kkt.feasibility <= TOLERANCE
-        return (not feasible, s.at.cost if feasible else s.kkt.feasibility)
+        saved = np.abs(s.found.constraints) @ (s.limits.violation * s.limits.size)
+        return (not feasible, s.at.cost + saved if feasible else s.kkt.feasibility)
 
     order = sorted(range(len(found)), key=lambda i: rank(found[i]))
     first = found[order[0]]
     if first.kkt.feasibility > TOLERANCE:
         return order[0]
-    near = TOLERANCE * first.scale.cost if p.objectives else 0.5 * p.least_residual**2
-    alike = [i for i in order if rank(found[i]) <= (False, first.at.cost + near)]
+    # The first start is the problem's own; one far out may lie where all costs are tiny.
+    near = TOLERANCE * found[0].scale.cost if p.objectives else 0.5 * p.least_residual**2
+    alike = [i for i in order if rank(found[i]) <= (False, rank(first)[1] + near)]
     return next((i for i in alike if _rests(p, found[i])), order[0])
 
 
@@ -331,6 +344,8 @@ def _program(
         program = scaled(p, start, moving, at, scale, stage.hessian)
         near = best is not None and best.kkt.feasibility <= TOLERANCE
         begin = best.theta if near else start
+        if not near and stage.name in tried:
+            continue
         for _ in range(1 + MOVES):
             end = stage.solve(
                 program, begin[moving] / program.unit, min(stage.steps, budget.iterations), budget

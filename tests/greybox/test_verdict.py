@@ -37,7 +37,7 @@ def square_at_screen(current):
 def test_the_smallest_size_at_the_gtf_screen_is_the_same_in_every_unit(unit):
     fit = minimise(lambda x: unit * square_at_screen(x[0]), [1.0], 0.0, 4.0)
     exact = minimize_scalar(lambda c: float(square_at_screen(c)), (1.0, 2.0, 3.0), tol=1e-12)
-    assert fit.status == "converged", fit
+    assert fit.status == "optimal", fit
     assert fit.theta[0] == pytest.approx(exact.x, abs=1e-5)
 
 
@@ -50,7 +50,7 @@ def test_rosenbrock_in_any_unit_is_followed_to_its_end(factor, length):
         )
 
     fit = minimise(rosenbrock, [-1.2 * length, length])
-    assert fit.status == "converged", fit
+    assert fit.status == "local_optimum", fit
     np.testing.assert_allclose(fit.theta, [length, length], rtol=1e-6)
 
 
@@ -83,13 +83,13 @@ def test_a_limit_out_of_reach_is_infeasible_in_every_unit(unit):
 
 def test_a_saddle_is_left():
     fit = minimise(lambda x: x[1] ** 2 - x[0] ** 2 + x[0] ** 4 / 4, [0.0, 1.0], -2.0, 2.0)
-    assert fit.status == "converged"
+    assert fit.status == "local_optimum"
     assert fit.cost == pytest.approx(-1.0)
 
 
 def test_a_maximum_is_left():
     fit = minimise(lambda x: jnp.cos(x[0]), [0.0], -4.0, 4.0)
-    assert fit.status == "converged"
+    assert fit.status == "local_optimum"
     assert abs(fit.theta[0]) == pytest.approx(np.pi, abs=1e-6)
 
 
@@ -118,21 +118,14 @@ def test_hock_schittkowski_24_ends_at_its_optimum_from_all_of_20_starts():
         lambda x: ((x[0] - 3) ** 2 - 9) * x[1] ** 3 / (27 * root),
         [1.0, 0.5], 0.0, 10.0, constraints=rules, starts=20, seed=1,
     )  # fmt: skip
-    assert fit.status == "converged"
+    assert fit.status == "optimal"
     np.testing.assert_allclose([a.cost for a in fit.attempts], -1.0, atol=1e-5)
     np.testing.assert_allclose(fit.theta, [3.0, root], rtol=1e-6)
 
 
 def test_an_objective_without_data_is_never_unidentified():
     fit = minimise(lambda x: x[0] ** 2, [1.0, 1.0])  # the second number does nothing
-    assert fit.status == "converged"
-
-
-def test_local_optima_are_spoken_of():
-    fit = minimise(lambda x: (x[0] ** 2 - 1) ** 2 + 0.3 * x[0], [0.9], -2.0, 2.0, starts=12, seed=3)
-    assert fit.status == "converged"
-    assert "several local optima" in fit.message
-    assert fit.theta[0] < 0
+    assert fit.status == "optimal"
 
 
 def test_a_search_in_a_flat_valley_has_settled():

@@ -1,0 +1,236 @@
+"""What is wrong with a problem as it is stated, before anything is searched for."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from beamfit.greybox import assess, tree
+from beamfit.greybox.covariance import CUT, directions
+from beamfit.greybox.evidence import listed
+from beamfit.greybox.problem import Problem, with_slope
+
+__all__ = ["Ailment", "contradictory", "diagnose", "not_finite"]
+
+# Points near the start whose derivatives tell what hangs on what, and how far off in sizes.
+LOOKS, NEAR = 4, 0.3
+# Rows whose sizes differ by more than this are scaled badly.
+APART = 1e8
+
+
+class Ailment(NamedTuple):
+    """A finding: its kind, the numbers, rows or constraints concerned, cause and remedy in words.
+
+    Kinds are ``contradictory_bounds, not_finite, unused, constant, undetermined,
+    dependent_equations, badly_scaled``.
+    """
+
+    kind: str
+    names: tuple[str, ...]
+    message: str
+
+
+def diagnose(p: Problem) -> tuple[Ailment, ...]:
+    """Look for what makes a problem unsolvable or its answer meaningless, without solving it.
+
+    Parameters
+    ----------
+    p : Problem
+        The problem, as stated.
+
+    Returns
+    -------
+    tuple of Ailment
+        Empty where nothing was found; what stands first is graver. Structure is read off the
+        derivatives at the start and a few points beside it, in exact arithmetic of zeros: a number
+        on which nothing depends at any of them is unused. Numbers are undetermined where residuals,
+        priors and equations have a lower structural rank (the size of the largest matching of rows
+        and numbers: A. Pothen & C.-J. Fan, ACM Trans. Math. Software 16 (1990) 303) or a lower rank
+        at every point than there are numbers; an objective may determine any.
+
+    Examples
+    --------
+    >>> from beamfit.greybox.problem import Free, Record
+    >>> def line(model, x):
+    ...     return (model["a"] + model["b"]) * x
+    >>> p = Problem({"a": 1.0, "b": 1.0, "c": 1.0}, [Free("a"), Free("b"), Free("c")],
+    ...             [Record("scan", line, np.arange(3.0), [0.0, 2.0, 4.0], error=0.1)])
+    >>> for found in diagnose(p):
+    ...     print(found.kind, found.names)
+    unused ('c',)
+    undetermined ('a', 'b')
+    """
+    ailing = (*contradictory(p), *not_finite(p, np.clip(p.start, p.lower, p.upper)))
+    if ailing:
+        return ailing
+    looks = [at for at in _looks(p) if at.finite]
+    return (*_unused(p, looks), *_undetermined(p, looks), *_dependent(p, looks), *_scaled(p, looks))
+
+
+def contradictory(p: Problem) -> list[Ailment]:
+    """Bounds and limits of which the lower lies above the upper."""
+    names = (*p.names, *p.constraint_names)
+    low, high = np.append(p.lower, p.constraint_lower), np.append(p.upper, p.constraint_upper)
+    return [
+        Ailment(
+            "contradictory_bounds", (names[i],),
+            f"the lower bound of {names[i]}, {low[i]:g}, lies above its upper bound, {high[i]:g}; "
+            "correct the bounds.",
+        )
+        for i in np.flatnonzero(~(low <= high))
+    ]  # fmt: skip
+
+
+def not_finite(p: Problem, theta: np.ndarray) -> list[Ailment]:
+    """Rows that are NaN or infinite at a point, or whose derivative is, by name."""
+    found = []
+    for what, name, function in _parts(p):
+        value, slope = with_slope(lambda t, f=function: f(p, t), jnp.asarray(theta, float))
+        value, slope = np.asarray(value), np.asarray(slope)
+        bad = np.flatnonzero(~np.isfinite(value))
+        steep = np.argwhere(~np.isfinite(slope))
+        if bad.size:
+            told = f"{what} '{name}' is {value[bad[0]]}"
+            told += f" in {bad.size} of {value.size} values, the first [{bad[0]}]" * (
+                value.size > 1
+            )
+        elif len(steep):
+            row, column = steep[0]
+            told = f"the derivative of {what} '{name}'" + f"[{row}]" * (value.size > 1)
+            told += f" by {p.names[column]} is {slope[row, column]}"
+        else:
+            continue
+        remedy = (
+            "start elsewhere, bound the numbers, or use a parametrisation that is defined there."
+        )
+        found.append(Ailment("not_finite", (name,), f"not finite at the start: {told}; {remedy}"))
+    return found
+
+
+def _parts(p: Problem) -> Iterator[tuple[str, str, Callable[[Problem, jax.Array], Any]]]:
+    """Every function of the problem: what it is, its name, and it as a flat function of theta."""
+
+    def of(function):
+        def flat(p, t):
+            return jnp.ravel(function(tree.replace(p.core.model, p.core.chosen, t)))
+
+        return flat
+
+    for record in p.records:
+        yield "record", record.name, of(record.residual)
+    for prior in p.priors:
+        yield "prior", prior.name, of(prior.residual)
+    for what, group in (("objective", p.objectives), ("constraint", p.constraints)):
+        for part in group:
+            yield what, part.name, of(lambda model, part=part: part.function(model, part.data))
+
+
+def _looks(p: Problem) -> list[assess.Slopes]:
+    random, width = np.random.default_rng(0), np.maximum(np.abs(p.start), 1.0)
+    steps = random.normal(size=(LOOKS, len(width))) * NEAR * width
+    points = [p.start, *(p.start + step for step in steps)]
+    return [assess.slopes(p, np.clip(point, p.lower, p.upper)) for point in points]
+
+
+def _rows(looks: list[assess.Slopes], which: Callable[[assess.Slopes], np.ndarray]) -> np.ndarray:
+    """Which numbers each row hangs on, at any of the points."""
+    return np.any([which(at) != 0 for at in looks], axis=0)
+
+
+def _unused(p: Problem, looks: list[assess.Slopes]) -> Iterator[Ailment]:
+    moving = p.lower < p.upper
+    used = np.any([_rows(looks, part).any(axis=0) for part in _EVERYTHING], axis=0)
+    names = tuple(np.array(p.names)[moving & ~used].tolist())
+    if names:
+        said = f"nothing depends on {listed(names)}; fix or remove what is not needed."
+        yield Ailment("unused", names, said)
+    idle = ~_rows(looks, lambda at: at.jacobian)[:, moving].any(axis=1)
+    names = tuple(np.array(p.constraint_names)[idle].tolist())
+    if names:
+        said = f"{listed(names)} depends on no free number; free what it limits, or remove it."
+        yield Ailment("constant", names, said)
+
+
+_EVERYTHING = (
+    lambda at: at.residual_jacobian,
+    lambda at: at.gradient[None],
+    lambda at: at.jacobian,
+)
+
+
+def _undetermined(p: Problem, looks: list[assess.Slopes]) -> Iterator[Ailment]:
+    """Numbers of which rows, priors and equations see fewer combinations than there are."""
+    if p.objectives:
+        return
+    equal = p.constraint_lower == p.constraint_upper
+
+    def rows(at):
+        return np.vstack([at.residual_jacobian, at.jacobian[equal]])
+
+    on = _rows(looks, rows)
+    used = np.flatnonzero(on.any(axis=0) & (p.lower < p.upper))
+    loose = _unmatched(on[:, used])
+    for at in looks:
+        _, unseen, reach = directions(rows(at)[:, used])
+        moved = np.max(np.abs(unseen), axis=1, initial=0.0) > CUT**0.5 * reach
+        loose = loose & moved if loose.any() else moved
+    names = tuple(np.array(p.names)[used][loose].tolist())
+    if names:
+        said = (
+            f"{len(on)} rows do not determine {listed(names)} each: only "
+            "combinations of them; fix some, or add data or priors."
+        )
+        yield Ailment("undetermined", names, said)
+
+
+def _unmatched(on: np.ndarray) -> np.ndarray:
+    """Columns of the underdetermined part: what alternating paths reach from unmatched ones."""
+    from scipy.sparse import csr_matrix
+    from scipy.sparse.csgraph import maximum_bipartite_matching
+
+    row_of = maximum_bipartite_matching(csr_matrix(on), perm_type="row")
+    loose = row_of < 0
+    while True:
+        rows = on[:, loose].any(axis=1)
+        more = loose | (np.isin(row_of, np.flatnonzero(rows)) & (row_of >= 0))
+        if (more == loose).all():
+            return loose
+        loose = more
+
+
+def _dependent(p: Problem, looks: list[assess.Slopes]) -> Iterator[Ailment]:
+    """Equations among which one follows from the others or contradicts them."""
+    equal = np.flatnonzero(p.constraint_lower == p.constraint_upper)
+    moving = p.lower < p.upper
+    loose = _unmatched(_rows(looks, lambda at: at.jacobian[equal][:, moving]).T)
+    for at in looks:
+        rows = at.jacobian[equal][:, moving].T
+        _, open_ones, reach = directions(rows)
+        same = np.max(np.abs(open_ones), axis=1, initial=0.0) > CUT**0.5 * reach
+        loose = loose & same if loose.any() else same
+    names = tuple(np.array(p.constraint_names)[equal][loose].tolist())
+    if names:
+        said = (
+            f"the equations {listed(names)} are not independent; remove what follows from others."
+        )
+        yield Ailment("dependent_equations", names, said)
+
+
+def _scaled(p: Problem, looks: list[assess.Slopes]) -> Iterator[Ailment]:
+    """Constraints that change far less, or far more, than the others when numbers do."""
+    unit = assess.scale_of(p, p.start, looks[0]).unit
+    size = np.max([np.max(np.abs(at.jacobian) * unit, axis=1, initial=0) for at in looks], axis=0)
+    usual = np.median(size[size > 0]) if (size > 0).any() else 1.0
+    off = (size > 0) & ((size > APART * usual) | (size < usual / APART))
+    names = tuple(np.array(p.constraint_names)[off].tolist())
+    if names:
+        worst = size[off][np.argmax(np.abs(np.log(size[off] / usual)))]
+        said = (
+            f"{listed(names)} changes by {worst:.1e} where others change by {usual:.1e}; state "
+            "it in units in which it is of their size."
+        )
+        yield Ailment("badly_scaled", names, said)

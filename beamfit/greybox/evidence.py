@@ -1,0 +1,147 @@
+"""What a verdict rests on: what was done, and what the residuals tell of the free numbers."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import NamedTuple
+
+import numpy as np
+
+from beamfit.greybox import assess
+from beamfit.greybox.assess import TOLERANCE, State
+from beamfit.greybox.conflict import Conflict
+from beamfit.greybox.covariance import (
+    MOST_SHARE,
+    Group,
+    Spread,
+    directions,
+    groups_of,
+    spread_of,
+    triangle,
+)
+from beamfit.greybox.fit import Attempt, Limited, Variable
+from beamfit.greybox.problem import Problem
+
+__all__ = ["EDGES", "Evidence", "Known", "Search", "known", "listed", "settled"]
+
+# A further decrease of chi-square below this changes nothing anybody asks for.
+SETTLED = 0.01
+EDGES = ("lower", "upper")
+
+
+class Search(NamedTuple):
+    """What was done: every start, how many were moved onto bounds, the limit of time if it cut.
+
+    `exact` tells whether second derivatives could be asked for, `conflict` what kept the search
+    from a feasible point.
+    """
+
+    attempts: tuple[Attempt, ...]
+    moved: int = 0
+    seconds: float | None = None
+    cut: bool = False
+    exact: bool = True
+    conflict: Conflict | None = None
+
+    @property
+    def dropped(self) -> int:
+        """Starts at which something was not finite."""
+        return sum(bool(np.isnan(attempt.cost)) for attempt in self.attempts)
+
+    @property
+    def words(self) -> str:
+        """How many starts there were."""
+        return f"{len(self.attempts)} start{'s' if len(self.attempts) != 1 else ''}"
+
+
+class Known(NamedTuple):
+    """What a point's residuals tell: groups of noise, spreads, directions not seen, rank.
+
+    `blind` tells which numbers would be open even if what is at a bound truly were there.
+    """
+
+    groups: tuple[Group, ...]
+    spread: Spread
+    raw: Spread
+    unseen: np.ndarray
+    rank: int
+    blind: np.ndarray
+    held: np.ndarray
+
+
+class Evidence(NamedTuple):
+    """What a verdict rests on; `chi2` and `dof` are of what has errors."""
+
+    problem: Problem
+    state: State
+    search: Search
+    settled: bool
+    variables: tuple[Variable, ...]
+    constraints: tuple[Limited, ...]
+    blind: np.ndarray
+    chi2: float
+    dof: float
+
+
+def known(p: Problem, s: State) -> Known:
+    """Tell what the residuals know, along the limits that hold.
+
+    For the degrees of freedom a number at an active bound is held; its error and that of what
+    hangs on it are those of a number that the bound only limits. Weights that nobody asks for
+    stay on their bounds.
+    """
+    size = assess.gradient_size(p, s.at, s.scale)
+    fixed = p.lower == p.upper
+    held = fixed | (np.abs(s.found.bounds) > 1e-9 * size)
+    equal = p.constraint_lower == p.constraint_upper
+    pulls = np.abs(s.found.constraints) * np.linalg.norm(s.at.jacobian / size, axis=1)
+    equations = s.at.jacobian[equal | (pulls > 1e-9)]
+    ends = np.cumsum([record.measured.size for record in p.records], dtype=int)
+    blocks = [triangle(part) for part in np.split(s.at.residual_jacobian, ends)]
+    half, unseen, _ = directions(np.vstack(blocks), np.vstack([np.eye(len(held))[held], equations]))
+    groups = groups_of(
+        [(r.name, r.errors_given, r.prior_noise) for r in p.records],
+        np.split(s.at.residual, ends)[:-1],
+        [int(record.used.sum()) for record in p.records],
+        blocks[:-1],
+        half,
+    )
+    still = (np.isin(s.bounds.states(s.found.bounds), EDGES) & p.nuisance) | fixed
+
+    def spread(factors, still):
+        parts = [block / f for block, f in zip(blocks, [*factors, 1.0], strict=True)]
+        return spread_of(np.vstack(parts), p.lower, p.upper, still, p.with_prior, equations)
+
+    factors = [group.factor for group in groups]
+    scaled = spread(factors, still)
+    plain = [1.0 if group.errors_given else group.factor for group in groups]
+    raw = scaled if plain == factors else spread(plain, still)
+    given_bounds = scaled if np.array_equal(still, held) else spread(factors, held)
+    blind = (given_bounds.share(np.eye(len(held))) >= MOST_SHARE) & ~held
+    unseen = unseen / np.where((n := np.linalg.norm(unseen, axis=0)) > 0, n, 1.0)
+    return Known(groups, scaled, raw, unseen, half.shape[1], blind, held)
+
+
+def settled(p: Problem, s: State) -> bool:
+    """Whether the search ended at an optimum as far as the data can tell.
+
+    The decrease of chi-square that a further Gauss-Newton step promises, noise being what the
+    scatter says where no errors were given, is below `SETTLED`. Networks have flat valleys in which
+    a strict optimum is never reached and nothing changes any more.
+    """
+    if p.objectives or not s.at.finite or s.kkt.feasibility > TOLERANCE:
+        return False
+    found = known(p, s)
+    weight = np.ones(len(s.at.residual))
+    for group in found.groups:
+        weight[group.rows] = 1.0 if group.errors_given else group.factor**-2
+    pull = s.at.residual_jacobian.T @ (weight * s.at.residual)
+    outward = np.where(s.bounds.reached[0], pull > 0, s.bounds.reached[1] & (pull < 0))
+    pull = np.where(outward | found.held, 0.0, pull)
+    return bool(np.sum((pull @ found.raw.half) ** 2) < SETTLED)
+
+
+def listed(names: Iterable[str]) -> str:
+    """A few names for a sentence."""
+    names = list(names)
+    return ", ".join(names[:4]) + (f" and {len(names) - 4} more" if len(names) > 4 else "")

@@ -1,0 +1,134 @@
+"""Verdicts on an objective without data: which kind of optimum, or why there is none."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from beamfit.greybox.problem import Constraint, Free, Objective, Problem, Record
+from beamfit.greybox.solve import solve
+
+
+def minimise(function, start, *bounds, rules=(), **options):
+    p = Problem(
+        jnp.asarray(start, float),
+        [Free("", *bounds)],
+        objectives=[Objective("f", lambda x, _: function(x))],
+        constraints=[Constraint(name, lambda x, _, g=g: g(x), None, *ends)
+                     for name, g, *ends in rules],
+    )  # fmt: skip
+    return solve(p, **options)
+
+
+def test_a_convex_problem_is_optimal_from_one_start():
+    """min (x-1)^2 + (y-2)^2 with x + y <= 2: at (0.5, 1.5), multiplier of d(cost)/d(limit) -1."""
+    rule = ("sum", lambda x: x[0] + x[1], -np.inf, 2.0)
+    fit = minimise(lambda x: (x[0] - 1) ** 2 + (x[1] - 2) ** 2, [0.0, 0.0], rules=[rule])
+    assert fit.status == "optimal", fit
+    np.testing.assert_allclose(fit.theta, [0.5, 1.5], atol=1e-6)
+    assert fit["sum"].multiplier == pytest.approx(-1.0, abs=1e-5)
+
+
+def double_well(x):
+    return (x[0] ** 2 - 1) ** 2 + 0.3 * x[0]
+
+
+def test_one_start_cannot_tell_of_others():
+    fit = minimise(double_well, [0.9], -2.0, 2.0)
+    assert fit.status == "local_optimum"
+    assert "more starts tell (7 or more)" in fit.message
+    assert fit.theta[0] > 0
+
+
+def test_other_optima_are_told_with_their_costs():
+    fit = minimise(double_well, [0.9], -2.0, 2.0, starts=12, seed=3)
+    assert fit.status == "local_optimum"
+    roots = np.roots([4, 0, -4, 0.3]).real
+    higher = f"{double_well([max(roots)]):.6g}"
+    assert f"others at {higher} (" in fit.message
+    assert fit.theta[0] == pytest.approx(min(roots), abs=1e-6)
+
+
+def test_starts_that_agree_make_an_optimum():
+    fit = minimise(lambda x: (1 - x[0]) ** 2 + 9 * (x[1] - x[0] ** 2) ** 2, [-1.2, 1.0], starts=8)
+    assert fit.status == "optimal"
+    assert "8 of 8 starts ended on it" in fit.message
+
+
+def test_constraints_that_conflict_are_named_and_no_others():
+    """Of four, `low` and `high` conflict within x <= 1; `far` and `idle` do not matter."""
+    rules = [
+        ("low", lambda x: x[0] + x[1], 3.0, np.inf),
+        ("high", lambda x: x[1], -np.inf, 1.5),
+        ("far", lambda x: x[0] - x[1], -50.0, 50.0),
+        ("idle", lambda x: x[1], -9.0, np.inf),
+    ]
+    fit = minimise(lambda x: x[0] ** 2, [0.0, 0.0], [-5.0, -9.0], [1.0, 9.0], rules=rules)
+    assert fit.status == "infeasible"
+    assert "'low', 'high' cannot hold together within [0] <= 1" in fit.message.replace(
+        fit.problem.names[0], "[0]"
+    )
+    assert "far" not in fit.message
+    assert "idle" not in fit.message
+
+
+def test_one_constraint_that_cannot_hold_is_named_alone():
+    fit = minimise(lambda x: x[0], [0.5], rules=[("square", lambda x: x[0] ** 2, -np.inf, -1.0)])
+    assert fit.status == "infeasible"
+    assert "'square' cannot hold;" in fit.message
+
+
+def test_a_feasible_point_that_the_solvers_missed_is_found_by_relaxing():
+    """From x = 0 sin(x) = 0 has no slope to follow that helps x^2 >= 30."""
+    rules = [("wave", lambda x: jnp.sin(x[0]), 0.0, 0.0), ("out", lambda x: x[0] ** 2, 30.0)]
+    fit = minimise(lambda x: (x[0] - 1) ** 2, [0.0], -20.0, 20.0, rules=rules)
+    assert fit.status in ("local_optimum", "degenerate"), fit
+    assert abs(np.sin(fit.theta[0])) < 1e-5
+
+
+def test_an_objective_without_a_least_value_is_unbounded():
+    fit = minimise(lambda x: x[0] + x[1] ** 2, [1.0, 1.0])
+    assert fit.status == "unbounded"
+    assert fit.problem.names[0] in fit.message
+
+
+def test_a_violation_squared_has_no_constraint_qualification():
+    """As Appendix B is printed: sum(max(g + eps, 0)^2) <= 0."""
+    rule = ("gains", lambda x: jnp.sum(jnp.maximum(x - 1.0, 0.0) ** 2), -np.inf, 0.0)
+    fit = minimise(lambda x: jnp.sum((x - 2.0) ** 2), [0.0, 0.5], rules=[rule])
+    assert fit.status == "degenerate", fit
+    assert "'gains' has no slope where it holds" in fit.message
+    assert "g <= 0 in the place of" in fit.message
+    better = ("gains", lambda x: x, -np.inf, 1.0)
+    fit = minimise(lambda x: jnp.sum((x - 2.0) ** 2), [0.0, 0.5], rules=[better])
+    assert fit.status == "optimal"
+
+
+def test_hock_schittkowski_13_has_no_multipliers():
+    """(1 - x)^3 >= y >= 0 meets in a cusp at the best point (problem 13)."""
+    rule = ("cusp", lambda x: (1 - x[0]) ** 3 - x[1], 0.0)
+    fit = minimise(lambda x: (x[0] - 2) ** 2 + x[1] ** 2, [-2.0, -2.0], 0.0, rules=[rule])
+    assert fit.status == "degenerate", fit
+    assert "no multipliers" in fit.message
+    assert fit.theta[0] == pytest.approx(1.0, abs=5e-3)
+
+
+def test_a_constraint_said_twice_has_no_unique_multiplier():
+    rules = [("one", lambda x: x[0] + x[1], 1.0), ("two", lambda x: 2 * x[0] + 2 * x[1], 2.0)]
+    fit = minimise(lambda x: x[0] ** 2 + x[1] ** 2, [3.0, 0.0], rules=rules)
+    assert fit.status == "degenerate", fit
+    assert "'one', 'two'" in fit.message
+    np.testing.assert_allclose(fit.theta, [0.5, 0.5], atol=1e-6)
+
+
+def test_a_saddle_that_is_not_left_is_called_one():
+    """The minima beside it are nearer than the search looks."""
+    fit = minimise(lambda x: x[1] ** 2 - x[0] ** 2 + 1e8 * x[0] ** 4, [0.0, 1.0])
+    assert fit.status == "saddle", fit
+    assert f"bends down along {fit.problem.names[0]}" in fit.message
+
+
+def test_a_fit_to_data_keeps_its_statuses():
+    record = Record("r", lambda x, _: x, None, np.ones(2), 0.1)
+    fit = solve(Problem(jnp.zeros(2), [Free("", -5, 5)], [record],
+                        objectives=[Objective("f", lambda x, _: x[0] ** 2)]), starts=8)  # fmt: skip
+    assert fit.status == "converged"
