@@ -37,9 +37,10 @@ calibrate: .venv/test
 coverage: .venv/test
 	BEAMFIT_COVERAGE=500 $(BIN)/python -m pytest --quiet tests/studies/test_coverage.py tests/studies/test_systematics.py
 
-# Files with bytes changed, read or refused in one line: 3000 of each kind.
+# Files with bytes changed, read or refused in one line: 3000 of each kind; 10 000 documents.
 mutations: .venv/test
 	BEAMFIT_MUTATIONS=9000 $(BIN)/python -m pytest --quiet tests/io/test_mutated_files.py
+	BEAMFIT_DOCUMENTS=10000 $(BIN)/python -m pytest --quiet tests/language/test_mutated_documents.py
 
 lint: .venv/test
 	$(BIN)/ruff check .

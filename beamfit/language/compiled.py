@@ -27,7 +27,8 @@ __all__ = ["Program", "carry_out", "compile_mapping"]
 class Program:
     """A mapping that can be computed.
 
-    `constants` are tables and parameters; they are arguments, so that code does not hang on them.
+    `constants` are tables, their columns first, and parameters; they are arguments, so that code
+    does not hang on them.
     """
 
     order: Order
@@ -41,7 +42,9 @@ class Program:
     @cached_property
     def constants(self) -> Arrays:
         """Tables, and parameters with dimensions."""
-        found = {name: np.asarray(table, float) for name, table in self.tables.items()}
+        # Columns are read one by one: each lies in one piece of memory.
+        tables = {name: np.asarray(table, float) for name, table in self.tables.items()}
+        found = {name: np.ascontiguousarray(table.T) for name, table in tables.items()}
         for a in self.scope.arrays.values():
             if a.role == "parameter" and a.dims:
                 found[a.name] = np.asarray(a.values, float).reshape(a.shape)
@@ -99,6 +102,7 @@ class Program:
         given = defaults(self.scope) | {n: jnp.asarray(v, float) for n, v in inputs.items()}
         constants = self.constants if constants is None else constants
         arrays = {n: jnp.asarray(v) for n, v in constants.items()} | given
+        arrays |= {n: arrays[n].T for n in self.tables}
         for name in self.order.owners:
             arrays[name] = jnp.zeros(self.scope.arrays[name].shape)
         wanted, _ = self.order.closure(names)

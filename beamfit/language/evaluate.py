@@ -20,6 +20,7 @@ from beamfit.language.scope import (
     Array,
     Axes,
     Scope,
+    check_size,
     index_of,
     located,
     whole_of,
@@ -152,6 +153,8 @@ def _product(e: x.Expression, a: Value, b: Value) -> Value:
     inner = a.array.shape[-1], b.array.shape[-1 if b.rank == 1 else -2]
     if inner[0] != inner[1]:
         raise error_at(e.at, f"'{e}' of inner lengths {inner[0]} and {inner[1]}", "equal ones")
+    shapes = a.array.shape[-a.rank : -1], b.array.shape[b.array.ndim - b.rank :][1:]
+    check_size([*shapes[0], *shapes[1]], e.at)
     left = a.array if a.rank == 2 else a.array[..., None, :]
     right = b.array if b.rank == 2 else b.array[..., :, None]
     found = left @ right

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -29,6 +30,8 @@ from beamfit.language.steps import Call, calls, gains_of, sources, targets, writ
 __all__ = ["Group", "Order", "checked", "order_of"]
 
 NOBODY = -1
+# Elements that all statements of a mapping may run over together.
+MOST_WORK = 30_000_000
 
 
 class Group(NamedTuple):
@@ -54,11 +57,17 @@ class Order:
     given: dict[int, set[str]] = field(default_factory=dict)
     inner: dict[str, Order] = field(default_factory=dict)
 
+    @cached_property
+    def setters(self) -> dict[str, list[int]]:
+        """The steps that set each array."""
+        found = {name: owner[owner != NOBODY] for name, owner in self.owners.items()}
+        return {name: np.flatnonzero(np.bincount(owner)).tolist() for name, owner in found.items()}
+
     def closure(self, names: Iterable[str]) -> tuple[set[int], set[str]]:
         """The steps, and the names given, that some names hang on."""
-        todo = {n for name in names for n in np.unique(self.owners.get(name, NOBODY)).tolist()}
+        todo = {n for name in names for n in self.setters.get(name, ())}
         found: set[int] = set()
-        while todo := {n for n in todo if n != NOBODY} - found:
+        while todo := todo - found:
             found |= todo
             todo = {before for n in todo for before in self.needs[n]}
         direct = {name for name in names if name not in self.owners}
@@ -88,6 +97,7 @@ def order_of(scope: Scope) -> Order:
     """
     inner = {name: order_of(c) for name, c in scope.callees.items() if isinstance(c, Scope)}
     owners: dict[str, np.ndarray] = {}
+    _check_work(scope)
     for step in scope.steps:
         if isinstance(step.what, d.Call):
             _check_wires(scope, calls(scope, step.what), step)
@@ -108,6 +118,15 @@ def order_of(scope: Scope) -> Order:
     return Order(scope, groups, owners, needs, given, inner)
 
 
+def _check_work(scope: Scope) -> None:
+    """Refuse statements that run over more than any computer would go through in a minute."""
+    total = 0
+    for step in scope.steps:
+        total += int(np.prod([len(s) for s in step.axes.values()], dtype=np.int64))
+        if total > MOST_WORK:
+            raise error_at(step.at, f"statements over more than {MOST_WORK} elements", "fewer")
+
+
 def _group(scope, numbers: list[int], needs, owners) -> Group:
     steps = tuple(scope.steps[n] for n in numbers)
     if len(steps) == 1 and numbers[0] not in needs[numbers[0]]:
@@ -125,7 +144,9 @@ def _own(scope: Scope, owners: dict[str, np.ndarray], step: Step, write: Read) -
     shape = [len(s) for s in write.axes.values()]
     combined = int(np.prod(shape, dtype=np.int64))
     whole = np.prod([len(dim) for dim in whole_of(node, array)], dtype=np.int64)
-    flat = np.unique(write.flat)
+    mark = np.zeros(owner.size, bool)
+    mark[write.flat] = True
+    flat = np.flatnonzero(mark)
     if flat.size < combined * whole:
         unused = [n for n in write.axes if n not in _names(node)]
         said = f"'{node}' has no index {', '.join(unused)}" if unused else "its index repeats"
@@ -157,7 +178,7 @@ def _owners_of(owners: dict[str, np.ndarray], read: Read) -> np.ndarray:
     if missing.size:
         said = f"'{read.array.element(missing[0])}', used in '{read.node}', which no statement sets"
         raise error_at(read.node.at, said, "a statement that sets this element")
-    return np.unique(owner[flat])
+    return np.flatnonzero(np.bincount(owner[flat]))
 
 
 def _check_defined(array: Array, owners: dict[str, np.ndarray]) -> None:

@@ -38,7 +38,7 @@ __all__ = [
 ]
 
 # Elements of a set, and combinations of indices one statement may run over.
-MOST_ELEMENTS, MOST_COMBINED = 2_000_000, 20_000_000
+MOST_ELEMENTS, MOST_COMBINED = 2_000_000, 5_000_000
 CONSTANTS = {"pi": float(np.pi)}
 ONE = """sin cos tan asin acos atan sinh cosh tanh asinh acosh atanh exp log log10 sqrt abs sign erf
 sigmoid transpose inverse det trace norm sum"""
@@ -58,11 +58,20 @@ class IndexSet:
         return len(self.elements)
 
     @cached_property
+    def step(self) -> int:
+        """The distance of neighbours where it is everywhere the same; 0 elsewhere."""
+        steps = np.diff(self.elements)
+        return 1 if len(self) == 1 else int(steps[0]) * bool(np.all(steps == steps[0]))
+
+    @cached_property
     def _sorted(self) -> np.ndarray:
         return np.argsort(self.elements, kind="stable")
 
     def positions(self, values: np.ndarray) -> np.ndarray:
         """Where values stand; -1 for those that are no elements."""
+        if self.step == 1:
+            at = values - self.elements[0]
+            return np.where((at >= 0) & (at < len(self)), at, -1)
         order = self._sorted
         at = np.minimum(np.searchsorted(self.elements, values, sorter=order), len(self) - 1)
         found = order[at]

@@ -26,7 +26,7 @@ SAID = {
     "NAME": "a name", "NUMBER": "a number", "SIGNED": "a number", "STRING": "a text in quotes",
     "ADD": "an operator", "MULTIPLY": "an operator", "POWER": "an operator", "SEMICOLON": "';'",
     "COLON": "':'", "COMMA": "','", "LPAR": "'('", "RPAR": "')'", "LSQB": "'['", "RSQB": "']'",
-    "LBRACE": "'{'", "RBRACE": "'}'", "EQUAL": "'='", "BAR": "'|'", "COMPARE": "<=, >= or =",
+    "LBRACE": "'{'", "RBRACE": "'}'", "EQUAL": "'='", "BAR": "'|'", "COMPARE": "<=, >=",
     "__ANON_0": "'->'", "__ANON_1": "'::'", "PART": "layer, connection, input, output or gain",
     "$END": "the end",
 }  # fmt: skip

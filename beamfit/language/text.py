@@ -15,7 +15,8 @@ from beamfit.language.expression import iterators_text
 __all__ = ["format_document", "format_statements"]
 
 WIDTH = 96
-WORD = re.compile(r"[^\W\d]\w*|[+-]?((\d+(\.\d*)?|\.\d+)([eE][+-]?\d+)?|inf)")
+NAME = re.compile(r"[^\W\d]\w*")
+NUMBER = re.compile(r"[+-]?(\d+(\.\d*)?|\.\d+)([eE][+-]?\d+)?")
 
 
 def format_document(document: d.Document) -> str:
@@ -65,8 +66,12 @@ def _negative(value: float) -> bool:
     return math.copysign(1.0, value) < 0
 
 
+def _name(text: str) -> str:
+    return text if NAME.fullmatch(text) else json.dumps(text, ensure_ascii=False)
+
+
 def _word(text: str) -> str:
-    return text if WORD.fullmatch(text) else json.dumps(text, ensure_ascii=False)
+    return text if NUMBER.fullmatch(text) else _name(text)
 
 
 def _pair(low: float, high: float) -> str:
@@ -105,14 +110,14 @@ def _problem(p: d.Problem | None) -> Iterable[str]:
 
 
 def _label(named: d.Goal | d.Variable | d.Limit) -> str:
-    return _word(named.label) + ("" if named.model == named.label else f": {named.model}")
+    return _name(named.label) + ("" if named.model == named.label else f": {named.model}")
 
 
 def _solver(s: d.Solver | None) -> Iterable[str]:
     if s is None:
         return
     settings = [f"  {_word(k)} = {_word(v)};" for k, v in s.settings]
-    name = _word(s.name)
+    name = _name(s.name)
     yield "\n".join([f"solver {name} {{", *settings, "}"]) if settings else f"solver {name};"
 
 

@@ -56,6 +56,7 @@ def cause_of(
     """
     given = defaults(program.scope) | {n: jnp.asarray(v, float) for n, v in inputs.items()}
     arrays: Arrays = {n: jnp.asarray(v) for n, v in program.constants.items()} | given
+    arrays |= {n: arrays[n].T for n in program.tables}
     for name, value in arrays.items():
         if not np.all(np.isfinite(value)):
             return f"{inside}{name} is not finite"

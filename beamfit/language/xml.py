@@ -151,6 +151,10 @@ def parse_xml(text: str) -> d.Document:
         raise error_at(at, error.getMessage(), "well-formed XML") from None
     except DefusedXmlException as error:
         raise InputError(f"{error}", "XML without entities or a document type") from None
+    except InputError:
+        raise
+    except (LookupError, ValueError) as error:
+        raise InputError(f"{error}", "XML in UTF-8", line=1) from None
     (root,) = reader.root.children
     if root.tag == "mapping":
         return d.Document(_mapping(root))
@@ -231,11 +235,7 @@ def _mapping(node: Node) -> d.Mapping:
     if kind != EXPRESSIONS:
         raise node.error(f"classname='{kind}'", nearest(kind, [EXPRESSIONS, MLP]))
     _check(node, "mapping")
-    tables = tuple(
-        d.DataTable(e.name(), e.need("file"), e.number("rowCount", None, int),
-                    e.number("columnCount", None, int), e.at)
-        for e in node.all("data")
-    )  # fmt: skip
+    tables = tuple(map(_table, node.all("data")))
     inner = tuple(_network(e) if e.given.get("classname") == MLP else _mapping(e)
                   for e in node.all("mapping"))  # fmt: skip
     for e in node.all("mapping"):
@@ -247,6 +247,13 @@ def _mapping(node: Node) -> d.Mapping:
     return d.Mapping(
         node.given.get("name", ""), tables, inner, *groups, (*sets, *statements), node.at
     )
+
+
+def _table(e: Node) -> d.DataTable:
+    rows, columns = e.number("rowCount", None, int), e.number("columnCount", None, int)
+    if (rows is None) != (columns is None):
+        raise e.error("one of rowCount and columnCount", "both, or neither")
+    return d.DataTable(e.name(), e.need("file"), rows, columns, e.at)
 
 
 def _declared(e: Node) -> d.Declared:
@@ -355,8 +362,8 @@ def _problem_elements(p: d.Problem | None) -> list[Plain.Element]:
 
 def _labelled(of: d.Variable | d.Limit | d.Goal) -> dict[str, str]:
     given = {"label": of.label, "modelVariable": of.model}
-    for key in ("lower", "upper"):
-        if math.isfinite(value := getattr(of, key, math.inf)):
+    for key, usual in (("lower", -math.inf), ("upper", math.inf)):
+        if (value := getattr(of, key, usual)) != usual:
             given[key] = number_text_or_inf(value)
     return given
 
