@@ -79,6 +79,57 @@ def test_a_vacuum_that_recovers_is_no_bunch_length():
     assert "vacuum" in fit.message or "loss rate changed" in fit.message
 
 
+@pytest.mark.parametrize(
+    ("a", "b", "further", "hours"), [(1e-8, 4e-6, 4e-6, 2.0), (4e-8, 2e-6, 2e-7, 1 / 3)]
+)
+def test_outgassing_is_named_with_its_time_constant_and_lifetimes(a, b, further, hours):
+    time, beam = integrated(lambda t, i: a * i + b + further * np.exp(-t / hours / HOUR))
+    fit = fit_decay(noisy(time, beam))
+    assert fit.status in ("poor_fit", "infeasible")
+    found = fit.outgassing
+    truth = {
+        "time_constant": hours,
+        "a": a,
+        "b": b,
+        "before": 1 / (a * 500 + b + further) / HOUR,
+        "after": 1 / (a * 500 + b) / HOUR,
+    }
+    for name, value in truth.items():
+        told = getattr(found, name)
+        assert abs(told.value - value) < 4 * told.error, name
+        assert told.error < 0.05 * value, name
+    assert fit.change is None
+    assert f"falls with a time constant of {found.time_constant}" in fit.message
+    assert str(found.before) in fit.message
+    assert fit.to_json()["outgassing"]["after"]["unit"] == "h"
+
+
+@pytest.mark.parametrize(
+    "rate",
+    [
+        lambda t, i: A * i + B + (0.0 if t > 3 * HOUR else 3e-6),
+        lambda t, i: A * i + B + (3e-6 if t > 3 * HOUR else 0.0),
+        lambda t, i: A * (i / 500) ** -0.1 * i + B,
+        lambda t, i: A * (i / 500) ** 0.2 * i + B,
+        lambda t, i: A * i + B,
+    ],
+)
+def test_steps_and_exponents_are_no_outgassing(rate):
+    time, beam = integrated(rate)
+    for seed in range(2):
+        fit = fit_decay(noisy(time, beam, seed=seed))
+        assert fit.outgassing is None
+        assert "outgassing" not in fit.message
+
+
+def test_the_errors_of_outgassing_are_those_of_repetition():
+    time, beam = integrated(lambda t, i: A * i + B + 1e-6 * np.exp(-t / HOUR), 120)
+    found = [fit_decay(noisy(time, beam, 5e-3, seed)).outgassing for seed in range(40)]
+    for name, value in (("time_constant", 1.0), ("b", B), ("a", A)):
+        off = np.array([(getattr(o, name).value - value) / getattr(o, name).error for o in found])
+        assert 0.75 < np.sqrt(np.mean(off**2)) < 1.25, name
+
+
 def test_a_change_of_the_loss_rate_is_dated_with_both_lifetimes():
     time, beam = integrated(lambda t, i: A * i + B + (3e-6 if t > 3 * HOUR else 0.0))
     fit = fit_decay(noisy(time, beam, 5e-3))

@@ -32,6 +32,7 @@ __all__ = [
     "constant_a",
     "lifetime_law",
     "power_law",
+    "quantity_errors",
 ]
 
 REJECTED = 1e-3
@@ -207,7 +208,7 @@ def lifetime_law(found: PowerLaw, correlated: bool) -> LifetimeLaw:
     )
     about = expanded(record, values, constant_shape, values.exponent)
     slopes = np.vstack([slopes / span, np.eye(4)[3]])
-    errors = _errors(slopes, about, record, correlated)
+    errors = quantity_errors(slopes, about, record, correlated)
     for change in record.monitor_changes:
         errors = np.hypot(errors, slopes @ np.linalg.lstsq(about.rows, change, rcond=None)[0])
     lifetimes = tuple(
@@ -219,7 +220,7 @@ def lifetime_law(found: PowerLaw, correlated: bool) -> LifetimeLaw:
     return LifetimeLaw(tuple(map(float, x * mean)), lifetimes, exponent)
 
 
-def _errors(
+def quantity_errors(
     slopes: np.ndarray, about: Expansion, record: DecayRecord, correlated: bool
 ) -> np.ndarray:
     """Errors of quantities by their slopes, with the noise that the residuals show."""
@@ -228,7 +229,8 @@ def _errors(
         return memory_of(about.rows, about.residuals, record.time).moments(slopes, given).error
     factor = np.linalg.qr(about.rows, mode="r")
     spread = np.linalg.norm(np.linalg.solve(factor.T, slopes.T), axis=0)
-    size = math.sqrt(float(about.residuals @ about.residuals) / (len(record) - 4))
+    dof = len(record) - about.rows.shape[1]
+    size = math.sqrt(float(about.residuals @ about.residuals) / dof)
     return spread * max(size, given)
 
 

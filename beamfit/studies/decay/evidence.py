@@ -28,6 +28,7 @@ from beamfit.studies.decay.departures import (
 )
 from beamfit.studies.decay.law import Expansion, Physical, Shape
 from beamfit.studies.decay.model import Solution, expanded
+from beamfit.studies.decay.outgassing import Outgassing, outgassing_of
 from beamfit.studies.decay.record import DecayRecord
 from beamfit.table import json_of
 
@@ -299,6 +300,13 @@ class Evidence:
         values = self.solution.values
         found = expanded(self.record, values, self.shape)
         return change_of_rate(self.record, found, values, self.memory)
+
+    @cached_property
+    def outgassing(self) -> Outgassing | None:
+        """A gas loss that relaxes, where that explains a refuted law better than all else."""
+        if not self.refuted or self.shape is not None or self.record.gauge is not None:
+            return None
+        return outgassing_of(self.record, self.change)
 
     def drift_of_one_error(self, name: str) -> float:
         """Straight drift of the monitor over the record, mA, that moves a value by its error."""

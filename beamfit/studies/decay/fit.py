@@ -18,6 +18,7 @@ from beamfit.studies.decay.departures import Change, ConstantA, LifetimeLaw
 from beamfit.studies.decay.evidence import BELIEVED, UNITS, Evidence, Separability
 from beamfit.studies.decay.model import Solution, padded, padded_size, solve_decay, solve_decays
 from beamfit.studies.decay.monitor import Monitor
+from beamfit.studies.decay.outgassing import Outgassing
 from beamfit.studies.decay.record import DecayRecord
 from beamfit.studies.decay.verdict import finding_of
 from beamfit.table import Table, cell, json_of, labelled, plain_name
@@ -83,6 +84,8 @@ class DecayFit:
         The lifetime by current, where a constant a is refuted.
     change : Change or None
         When the loss rate changed, where that explains a refuted law.
+    outgassing : Outgassing or None
+        A gas loss that relaxes, where that explains a refuted law better.
     readings : DecayRecord, optional
         What was fitted.
     shaped : bool
@@ -118,6 +121,7 @@ class DecayFit:
     correlation_time: float | None = None
     lifetimes: LifetimeLaw | None = None
     change: Change | None = None
+    outgassing: Outgassing | None = None
     readings: DecayRecord | None = None
     shaped: bool = False
     first: np.ndarray | None = None
@@ -225,6 +229,7 @@ class DecayFit:
                     "lifetime_by_current": self.lifetimes,
                     "change": self.change,
                 }
+                | ({} if self.outgassing is None else {"outgassing": self.outgassing})
             ),
             **({} if self.first is None else {"cycles": self.first.size}),
         }
@@ -394,7 +399,8 @@ def _judged(
         constant_a=evidence.constant_a,
         correlation_time=evidence.correlation_time,
         lifetimes=evidence.lifetimes,
-        change=evidence.change if evidence.refuted else None,
+        change=evidence.change if evidence.refuted and evidence.outgassing is None else None,
+        outgassing=evidence.outgassing,
         readings=record,
         shaped=shape is not None,
     )

@@ -94,7 +94,7 @@ class PooledEvidence:
     left_out: tuple[str, ...]
     monitor: Monitor | None = None
 
-    change = None
+    change = outgassing = None
 
     @classmethod
     def of(cls, pool: Pool, left_out: tuple[str, ...]) -> PooledEvidence:

@@ -22,6 +22,7 @@ from beamfit.studies.decay.evidence import (
     Separability,
 )
 from beamfit.studies.decay.monitor import Monitor
+from beamfit.studies.decay.outgassing import Outgassing
 from beamfit.verdict import Finding, judge
 
 __all__ = ["TableEvidence", "finding_of", "finding_of_cycles", "finding_of_table"]
@@ -38,6 +39,7 @@ class Judged(Protocol):
     constant_a: ConstantA
     lifetimes: LifetimeLaw | None
     change: Change | None
+    outgassing: Outgassing | None
     changed: bool
 
     def scaled(self, name: str) -> tuple[float, float]:
@@ -61,6 +63,7 @@ class TableEvidence(NamedTuple):
     outliers: tuple[str, ...]
     noise: float | None
     change: Change | None = None
+    outgassing: Outgassing | None = None
     changed: bool = False
 
     def scaled(self, name: str) -> tuple[float, float]:
@@ -108,8 +111,7 @@ def _negative(name: str, cause: str, e: Judged) -> Finding | None:
     value, error = e.scaled(name)
     if not (value < -BELIEVED * error and value < 0):
         return None
-    if e.change is not None:
-        cause = f"{e.change}: cut the record there"
+    cause = _explained(e) or cause
     return Finding(Status.infeasible, f"{name} is negative by {-value / error:.1f} errors; {cause}")
 
 
@@ -120,14 +122,20 @@ NOT_GAS = (
 RISING = "the loss rate rises as the current falls: look for a changing vacuum or setting"
 
 
+def _explained(e: Judged) -> str | None:
+    """What explains a refuted law better than an exponent of the current, and the remedy."""
+    if e.outgassing is not None:
+        return f"{e.outgassing}. Fit what comes later, or give the pressure in a column"
+    return None if e.change is None else f"{e.change}: cut the record there"
+
+
 def _refuted(e: Judged) -> Finding | None:
     """Data that refute constant a and b: what is quoted of them is not of this beam."""
     if e.constant_a.status is not Status.poor_fit and not e.changed:
         return None
     offered = "" if e.lifetimes is None else f". Use the lifetime by current: {e.lifetimes}"
-    if e.change is not None:
-        said = f"{str(e.change).capitalize()}: cut the record there"
-        return Finding(Status.poor_fit, said)
+    if (explained := _explained(e)) is not None:
+        return Finding(Status.poor_fit, explained[0].upper() + explained[1:])
     return Finding(Status.poor_fit, e.constant_a.message.rstrip(".") + offered)
 
 
