@@ -10,16 +10,23 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from beamfit.errors import InputError
-from beamfit.io.files import read_text, text_lines
+from beamfit.io.files import read_text, text_lines, write_atomically
 from beamfit.language.check import check_document
 from beamfit.language.document import Document
 from beamfit.language.parse import parse_document
-from beamfit.language.xml import parse_xml
+from beamfit.language.text import format_document
+from beamfit.language.xml import format_xml, parse_xml
 
 if TYPE_CHECKING:
     from beamfit.language.solution import Solution
 
-__all__ = ["read_formulation", "read_numbers", "read_tables", "solved_formulation"]
+__all__ = [
+    "read_formulation",
+    "read_numbers",
+    "read_tables",
+    "solved_formulation",
+    "write_formulation",
+]
 
 
 def read_formulation(path: str | PathLike[str]) -> Document:
@@ -53,6 +60,33 @@ def read_formulation(path: str | PathLike[str]) -> Document:
     except InputError as error:
         error.path = path
         raise
+
+
+def write_formulation(path: str | PathLike[str], document: Document) -> None:
+    """Write a document, in XML where the name ends in ``.xml``, else as text; whole or not at all.
+
+    Parameters
+    ----------
+    path : str or path
+        Replaced if it exists.
+    document : Document
+        What to write.
+
+    Raises
+    ------
+    InputError
+        If the place cannot be written.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> file = Path(tempfile.mkdtemp()) / "short.xml"
+    >>> write_formulation(file, parse_document("output y; y = 2;"))
+    >>> read_formulation(file) == parse_document("output y; y = 2;")
+    True
+    """
+    xml = Path(path).suffix.lower() == ".xml"
+    write_atomically(path, (format_xml if xml else format_document)(document).encode())
 
 
 def read_numbers(path: str | PathLike[str]) -> np.ndarray:

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from beamfit.greybox.diagnosis import diagnose
 from beamfit.greybox.fit import Fit, Limited, Variable
 from beamfit.greybox.solve import solve
 from beamfit.language import document as d
@@ -37,6 +38,8 @@ NOISE = (
     "Errors take the terms that are squared for residuals of data, with the noise that their own "
     "scatter shows."
 )
+# Kinds of ailments that are found with their place in the document.
+TOLD_ELSEWHERE = {"contradictory_bounds", "not_finite", "unused"}
 TOLERANCES = {"major feasibility tolerance", "major optimality tolerance"}
 # At which a point counts as an optimum here (`beamfit.greybox.assess.TOLERANCE`).
 JUDGED = 1e-6
@@ -229,12 +232,13 @@ def solve_document(
     made, notes = _started(formulate(document, tables))
     told, warnings = _told(document.solver)
     fit = solve(made.problem, starts=starts, **told)
-    notes = (*made.notes, *notes, *warnings)
+    notes = (*made.notes, *notes, *_ailments(made), *warnings)
     if fit.status is Status.not_finite:
         goals = [g.model for g in document.problem.goals]
         names = goals + [c.model for c in document.problem.limits]
         cause = cause_of(made.program, fit.model, names)
-        notes = (*notes, f"Where it ended, {cause}.") if cause else notes
+        told = cause is None or any(cause in note for note in notes)
+        notes = notes if told else (*notes, f"Where it ended, {cause}.")
     if made.squares and math.isfinite(fit.scale):
         notes = (*notes, NOISE)
     return Solution(made, fit, notes)
@@ -259,6 +263,11 @@ def _started(made: Formulation) -> tuple[Formulation, tuple[str, ...]]:
             break
     cause = cause_of(made.program, next(starts_of(made)), names)
     return made, (f"At the start {cause}.",) if cause else ()
+
+
+def _ailments(made: Formulation) -> list[str]:
+    """What the problem suffers from, but for what is told already with its place."""
+    return [found.message for found in diagnose(made.problem) if found.kind not in TOLD_ELSEWHERE]
 
 
 def _told(solver: d.Solver | None) -> tuple[dict[str, Any], list[str]]:
