@@ -51,6 +51,7 @@ bench: .venv/bench
 	$(BIN)/python benchmarks/emittance.py
 	$(BIN)/python benchmarks/lifetime.py
 	$(BIN)/python benchmarks/greybox.py 20 0
+	$(BIN)/python benchmarks/language.py
 	$(BIN)/python benchmarks/sampling.py
 	$(BIN)/python benchmarks/scenarios.py
 

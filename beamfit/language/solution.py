@@ -227,7 +227,7 @@ def solve_document(
     ...   input x; output y; y = x*(2 - x);'''
     >>> found = solve_document(parse_document(text))
     >>> print(found.headline, found.variables()[0].state)
-    y = 1, converged upper
+    y = 1, optimal upper
     """
     made, notes = _started(formulate(document, tables))
     told, warnings = _told(document.solver)
