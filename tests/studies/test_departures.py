@@ -99,6 +99,7 @@ def test_outgassing_is_named_with_its_time_constant_and_lifetimes(a, b, further,
         assert abs(told.value - value) < 4 * told.error, name
         assert told.error < 0.05 * value, name
     assert fit.change is None
+    assert fit.lifetimes is None
     assert f"falls with a time constant of {found.time_constant}" in fit.message
     assert str(found.before) in fit.message
     assert fit.to_json()["outgassing"]["after"]["unit"] == "h"

@@ -290,8 +290,10 @@ class Evidence:
 
     @cached_property
     def lifetimes(self) -> LifetimeLaw | None:
-        """The lifetime by current, where a constant a is refuted."""
-        found = power_law(self.record, self.constant_a) if self.shape is None else None
+        """The lifetime by current, where a constant a is refuted and it is the current's doing."""
+        found = None
+        if self.shape is None and self.outgassing is None:
+            found = power_law(self.record, self.constant_a)
         return None if found is None else lifetime_law(found, self.memory is not None)
 
     @cached_property

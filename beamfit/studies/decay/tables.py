@@ -155,6 +155,13 @@ CHECKS: tuple[Row, ...] = (
 LIFETIMES: tuple[Row, ...] = (
     ("lifetime by current", lambda d: d.fit.lifetimes and str(d.fit.lifetimes)),
 )
+OUTGASSING: tuple[Row, ...] = (
+    ("gas loss relaxes within", lambda d: d.fit.outgassing.time_constant),
+    ("lifetime at first", lambda d: d.fit.outgassing.before),
+    ("without that gas", lambda d: d.fit.outgassing.after),
+    ("a beside it", lambda d: d.fit.outgassing.a),
+    ("b in the end", lambda d: d.fit.outgassing.b),
+)
 SYSTEMATIC = ["if the", "a", "b", "lifetime at the mean"]
 
 
@@ -163,6 +170,8 @@ def check_rows(decays: Sequence[Decay]) -> Rows:
     rows = _laid_out(decays, CHECKS if any(decay.checks for decay in decays) else CHECKS[-1:])
     if any(decay.fit.lifetimes for decay in decays):
         rows += _laid_out(decays, LIFETIMES)
+    if all(decay.fit.outgassing for decay in decays):
+        rows += _laid_out(decays, OUTGASSING)
     return rows
 
 
