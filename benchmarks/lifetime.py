@@ -1,4 +1,4 @@
-"""Lifetime against its peers, side by side in one run: python benchmarks/lifetime.py [--whole]
+"""Lifetime against its peers, side by side: python benchmarks/lifetime.py [--whole | --large]
 
 Touschek lifetime against pyAT on the SPEAR3 2003 ring (on every 40th slice, the time scaled to the
 ring; --whole runs pyAT on all, for minutes), the (I0, a, b) fit against
@@ -8,13 +8,17 @@ scipy.optimize.curve_fit, and a thousand random records.
 from __future__ import annotations
 
 import argparse
+import resource
+import subprocess
 import sys
+import tempfile
 import time
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 
 import at
+import h5py
 import jax
 import numpy as np
 from rich.console import Console
@@ -140,10 +144,37 @@ def random_records(table: Table) -> None:
     )
 
 
+def ten_million() -> None:
+    """`beamfit lifetime FILE --json` of 10 million readings: seconds and the most memory."""
+    time_s = np.arange(10_000_000) * 0.01
+    noise = 0.02 * np.random.default_rng(1).normal(size=time_s.size)
+    current = 500 / (1 + time_s / 36000) + noise
+    call = [sys.executable, "-c", "from beamfit.cli import main; main()", "lifetime"]
+    with tempfile.TemporaryDirectory() as folder:
+        paths = Path(folder) / "big.csv", Path(folder) / "big.h5"
+        with paths[0].open("w") as stream:
+            stream.write("time_s,beam_current_mA\n")
+            for rows in np.array_split(np.column_stack([time_s, current]), 100):
+                np.savetxt(stream, rows, fmt="%.2f,%.4f")
+        with h5py.File(paths[1], "w") as store:
+            store["time_s"], store["beam_current_mA"] = time_s, current
+        for path in paths:
+            begin = time.perf_counter()
+            subprocess.run([*call, str(path), "--json"], check=True, stdout=subprocess.DEVNULL)
+            most = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 1024
+            took = time.perf_counter() - begin
+            print(f"{path.name}: {took:.1f} s, at most {most:.0f} MB (the larger of both)")
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--whole", action="store_true", help="run pyAT on every slice")
-    every = 1 if parser.parse_args().whole else 40
+    parser.add_argument("--large", action="store_true", help="10 million readings from files")
+    asked = parser.parse_args()
+    if asked.large:
+        ten_million()
+        return
+    every = 1 if asked.whole else 40
     table = Table(
         "what", "beamfit", "peer", "ratio", "result", title=f"jax {jax.__version__}, warm"
     )

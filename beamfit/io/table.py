@@ -22,6 +22,7 @@ import numpy as np
 from beamfit.errors import InputError, nearest
 from beamfit.io.files import digest, text_lines
 from beamfit.io.headers import HEAD, header_at, separator_of, spelled, with_units
+from beamfit.io.numeric import numeric_rows
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -131,7 +132,8 @@ class Sheet:
     def rows(self, keep: Sequence[int]) -> Sheet:
         """Some of the rows."""
         lines = None if self.lines is None else [self.lines[row] for row in keep]
-        return replace(self, cells=[[c[row] for row in keep] for c in self.cells], lines=lines)
+        cells = [c[keep] if isinstance(c, np.ndarray) else [c[r] for r in keep] for c in self.cells]
+        return replace(self, cells=cells, lines=lines)
 
     def good(self, check: Callable[[Sheet], object]) -> Sheet:
         """Leave out the rows that a check of each row refuses, and keep what it said of them.
@@ -186,6 +188,8 @@ class Sheet:
         InputError
             Naming line and column of the first cell that is no number.
         """
+        if isinstance(self[name], np.ndarray) and read is float and np.isfinite(self[name]).all():
+            return self[name].astype(float)
         values = np.empty(len(self))
         for row, cell in enumerate(self[name]):
             try:
@@ -338,7 +342,7 @@ def _read_text(
             comments.append(text.strip().lstrip("# ").rstrip())
         elif names is None and start == "*":  # of a TFS file
             separator, header = " ", line
-            names = [name.upper() for name in _split(text, " ", path, line)[1:]]
+            names = list(map(str.upper, _split(text, " ", path, line)[1:]))
         elif not text.strip().strip(",;\t ") or (names is None and SEPARATOR_LINE.match(text)):
             continue
         elif names is None and line <= title:
@@ -355,6 +359,10 @@ def _read_text(
             if whole and not rows and (units := with_units(names, cells)):
                 names = units
                 continue
+            fresh = not rows and not bad
+            if fresh and (good := _good(path, line, separator, names, comments, header)):
+                _check_length(len(good), most, path)
+                return good
             (rows if whole else bad).append(cells if whole else wrong)
             lines += [line] * whole
             _check_length(len(rows) + len(bad), most, path, line)
@@ -365,6 +373,22 @@ def _read_text(
     cells = list(zip(*rows, strict=True)) if rows else [()] * len(names)
     said = (tuple(comments), seen.hexdigest(), tuple(bad))
     return Sheet(path, tuple(names), cells, lines, header, *said)
+
+
+def _good(
+    path: str | PathLike[str],
+    line: int,
+    separator: str,
+    names: Sequence[str],
+    comments: Sequence[str],
+    header: int | None,
+) -> Sheet | None:
+    """The rest of a large file of good numbers; a column `time` has dates."""
+    found = None if "time" in names else numeric_rows(path, line, separator, len(names))
+    if found is None:
+        return None
+    lines = range(line, line + found[0].shape[1])
+    return Sheet(path, tuple(names), list(found[0]), lines, header, tuple(comments), found[1])
 
 
 def _of_frame(frame: DataFrame, most: int | None) -> Sheet:
@@ -482,7 +506,9 @@ def _read_hdf5(path: str | PathLike[str], most: int | None) -> Sheet:
     return Sheet(path, names, cells, None, None, comments, sha256)
 
 
-def _dataset(data: Any, name: str, path: str | PathLike[str], most: int | None) -> list[Any]:
+def _dataset(
+    data: Any, name: str, path: str | PathLike[str], most: int | None
+) -> list[str] | np.ndarray:
     """The values of a dataset: texts or numbers."""
     import h5py
 
@@ -499,4 +525,4 @@ def _dataset(data: Any, name: str, path: str | PathLike[str], most: int | None) 
     if found is not None:
         raise InputError(found, expected, path=path, column=name)
     _check_length(data.size, most, path)
-    return np.atleast_1d(data[()]).astype(float).tolist()
+    return np.atleast_1d(data[()]).astype(float)

@@ -11,6 +11,7 @@ from beamfit.studies.decay.cycles import find_cycles, is_refilled
 from beamfit.studies.decay.pooled import fit_cycles
 from beamfit.studies.decay.record import Conditions, DecayRecord
 from beamfit.studies.decay.study import study_record
+from beamfit.studies.decay.thinning import thinned
 
 LIFETIME = 10.01 * 3600
 
@@ -197,6 +198,25 @@ def test_cycles_at_two_settings_have_two_answers():
     study = study_record(DecayRecord(time, current, name="r", conditions=voltage))
     assert [decay.fit.record for decay in study.pooled] == ["r@1", "r@2"]
     assert [decay.fit.first.size for decay in study.pooled] == [20, 20]
+
+
+def test_very_many_readings_are_averaged_and_the_answer_stays():
+    rng = np.random.default_rng(1)
+    time = np.arange(200_000) * 0.1
+    current = law(time, 500.0, 3.3e-8, 1.1e-5) + 0.02 * rng.normal(size=time.size)
+    current[[7, 50_000]] = 900.0, 0.0
+    record = DecayRecord(time, current, np.full(time.size, 0.02), start=1e9)
+    few = thinned(record)
+    assert len(few) == 50_000
+    assert few.notes == ("The means of 4 readings each were fitted, of 200000 in all.",)
+    assert few.error[1] == pytest.approx(0.02 / np.sqrt(3))
+    assert few.error[0] == pytest.approx(0.01)
+    assert few.start == pytest.approx(1e9 + 0.15, abs=1e-6)
+    exact = law(few.start - 1e9 + few.time, 500.0, 3.3e-8, 1.1e-5)
+    pulls = (few.current - exact) / few.error
+    assert abs(pulls).max() < 6
+    assert np.mean(pulls**2) == pytest.approx(1, abs=0.05)
+    assert thinned(few) is few
 
 
 def test_too_few_are_refused():

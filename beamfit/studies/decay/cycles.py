@@ -266,4 +266,5 @@ def joined(cycles: Sequence[DecayRecord], name: str) -> DecayRecord:
         np.concatenate([cycle.current for cycle in cycles]),
         all_of([cycle.error for cycle in cycles]), name, cycles[0].start,
         Conditions(*map(all_of, zip(*(c.conditions for c in cycles), strict=True))),
+        notes=cycles[0].notes,
     )  # fmt: skip

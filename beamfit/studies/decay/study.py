@@ -24,6 +24,7 @@ from beamfit.studies.decay.pooled import fit_cycles, stands_alone
 from beamfit.studies.decay.record import DecayRecord
 from beamfit.studies.decay.segments import Event, Split, split_record
 from beamfit.studies.decay.systematics import Systematic, systematics
+from beamfit.studies.decay.thinning import thinned
 from beamfit.table import json_of
 
 __all__ = [
@@ -388,6 +389,7 @@ def study_record(record: DecayRecord, machine: Machine | None = None) -> RecordS
     if len(record) < FEWEST:
         expected = f"{FEWEST} or more for a decay"
         raise InputError(f"{len(record)} readings", expected, path=record.name)
+    record = thinned(record)
     # Segments move `start` with them: counted from zero it is their place in the record.
     placed = replace(record, start=0.0)
     cycles, events = _refilled(placed)
