@@ -40,6 +40,9 @@ class Place(NamedTuple):
     line: int | None = None
     column: int | None = None
 
+    def __str__(self) -> str:
+        return f"line {self.line}, column {self.column}"
+
 
 NOWHERE = Place()
 

@@ -141,7 +141,7 @@ def _free(document: d.Document, program: Program) -> tuple[list, dict[str, np.nd
         model[v.model] = first_start(v, shape, model.get(v.model))
         free.append(core.Free(v.model, v.lower, v.upper, v.random))
         if v.model not in used:
-            notes.append(f"Line {v.at.line}: nothing asked for hangs on the variable '{v.label}', "
+            notes.append(f"At {v.at}: nothing asked for hangs on the variable '{v.label}', "
                          "which stays where it starts.")  # fmt: skip
     return free, model, tuple(notes)
 
@@ -188,7 +188,7 @@ def _unqualified(document: d.Document) -> Iterator[str]:
         squares = squares_of(document.mapping, c.model)
         if squares is not None and c.upper == 0.0:
             yield (
-                f"Line {c.at.line}: '{c.label}' is a sum of squares limited to 0. Where it holds "
+                f"At {c.at}: '{c.label}' is a sum of squares limited to 0. Where it holds "
                 "its gradient is zero (no constraint qualification): it has no multiplier and a "
                 f"search crawls. Limit what is squared, {squares[0].body}, element by element."
             )

@@ -95,7 +95,7 @@ class _Watch:
         ]
         what = "infinite" if np.any(np.isinf(array)) else "not a number"
         index = f" for {', '.join(when)}" if when else ""
-        said = f"{e} is {what}{index} (line {e.at.line}, column {e.at.column})"
+        said = f"{e} is {what}{index} ({e.at})"
         inner = ", ".join(self._said(part, at) for part in x.children(e) if self._tells(part))
         raise _FoundError(said + (f": {inner}" if inner else ""))
 
@@ -125,7 +125,7 @@ def _of_group(program: Program, group: Group, arrays: Arrays, changed: Arrays) -
     name, array = next((n, a) for n, a in changed.items() if not np.all(np.isfinite(a)))
     element = scope.arrays[name].element(int(np.argmax(~np.isfinite(np.ravel(array)))))
     at = group.steps[0].at
-    return f"{element} is not finite (line {at.line}, column {at.column})"
+    return f"{element} is not finite ({at})"
 
 
 def _first_time(plan: Plan, changed: Arrays) -> int:

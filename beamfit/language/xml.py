@@ -7,28 +7,21 @@ input and `cells` of a gain are beamfit's own (`beamfit.language.network`).
 from __future__ import annotations
 
 import math
-import re
-from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Sequence
 from xml.etree import ElementTree as Plain
-from xml.sax import ContentHandler, SAXParseException
 
-from defusedxml import DefusedXmlException
-from defusedxml.sax import parseString
-
-from beamfit.errors import InputError, nearest
+from beamfit.errors import nearest
 from beamfit.language import document as d
-from beamfit.language.expression import Elements, Place, error_at
+from beamfit.language.elements import Node, read_elements
+from beamfit.language.expression import Elements
 from beamfit.language.parse import parse_statements
 from beamfit.language.text import format_statements, number_text_or_inf
 
 __all__ = ["format_xml", "parse_xml"]
 
-MOST_DEEP = 40
 MLP = "com.pav.pdas.model.mlp.MlpMapping"
 EXPRESSIONS = "com.pav.pdas.model.expression.ExpressionMapping"
 NLP = "com.pav.pdas.optimization.common.NLPProblem"
-NAME = re.compile(r"[^\W\d]\w*")
 KNOWN = {
     "formulation": "problem mapping solver",
     "problem": "variable constraint objective",
@@ -38,85 +31,6 @@ KNOWN = {
     "input": "dimension values", "output": "dimension", "parameter": "dimension values",
     "set": "elements",
 }  # fmt: skip
-
-
-class Node(NamedTuple):
-    """An element: its text begins where it stands in the file, so that places in it are right."""
-
-    tag: str
-    given: dict[str, str]
-    children: list[Node]
-    text: list[str]
-    at: Place
-
-    def all(self, tag: str) -> list[Node]:
-        """Children of a name."""
-        return [child for child in self.children if child.tag == tag]
-
-    def error(self, found: str, expected: str) -> InputError:
-        """What is wrong with it."""
-        return error_at(self.at, found, expected)
-
-    def need(self, key: str) -> str:
-        """An attribute that must be there."""
-        if key not in self.given:
-            raise self.error(f"<{self.tag}> without {key}", f"an attribute {key}='...'")
-        return self.given[key]
-
-    def name(self, key: str = "name") -> str:
-        """An attribute that names something in expressions."""
-        if not NAME.fullmatch(self.need(key)):
-            raise self.error(f"{key}='{self.given[key]}'", "a name of letters, digits and _")
-        return self.given[key]
-
-    def number(self, key: str, default: Any, kind: Callable[[str], Any] = float) -> Any:
-        """A numeric attribute."""
-        if key not in self.given:
-            return default
-        try:
-            value = kind(self.given[key].strip())
-        except (ValueError, OverflowError):
-            value = math.nan
-        if value != value:
-            said = "a whole number" if kind is int else "a number"
-            raise self.error(f"{key}='{self.given[key]}' in <{self.tag}>", said)
-        return value
-
-
-class _Reader(ContentHandler):
-    """Builds nodes; text is padded to the line and column where it stands in the file."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.root = Node("", {}, [], [], Place(1, 1))
-        self.open = [self.root]
-        self.end = Place(1, 1)
-
-    def _here(self) -> Place:
-        return Place(self._locator.getLineNumber(), self._locator.getColumnNumber() + 1)
-
-    def startElement(self, name, attrs):
-        node = Node(name, dict(attrs.items()), [], [], self._here())
-        if len(self.open) > MOST_DEEP:
-            raise node.error(f"elements within {MOST_DEEP} others", "fewer")
-        self.open[-1].children.append(node)
-        self.open.append(node)
-        self.end = Place(1, 1)
-
-    def endElement(self, name):
-        self.open.pop()
-        self.end = Place(1, 1)
-
-    def characters(self, content):
-        if self.open[-1].tag == "expressions":
-            here = self._here()
-            lines = here.line - self.end.line
-            blanks = here.column - (1 if lines else self.end.column)
-            self.open[-1].text.append("\n" * lines + " " * blanks)
-            more = content.count("\n")
-            column = len(content) - content.rfind("\n") if more else here.column + len(content)
-            self.end = Place(here.line + more, column)
-        self.open[-1].text.append(content)
 
 
 def parse_xml(text: str) -> d.Document:
@@ -143,19 +57,7 @@ def parse_xml(text: str) -> d.Document:
     >>> found.mapping.outputs[0].name, str(found.mapping.statements[0].value)
     ('y', '2')
     """
-    reader = _Reader()
-    try:
-        parseString(text.encode(), reader, forbid_dtd=True)
-    except SAXParseException as error:
-        at = Place(error.getLineNumber(), error.getColumnNumber() + 1)
-        raise error_at(at, error.getMessage(), "well-formed XML") from None
-    except DefusedXmlException as error:
-        raise InputError(f"{error}", "XML without entities or a document type") from None
-    except InputError:
-        raise
-    except (LookupError, ValueError) as error:
-        raise InputError(f"{error}", "XML in UTF-8", line=1) from None
-    (root,) = reader.root.children
+    root = read_elements(text)
     if root.tag == "mapping":
         return d.Document(_mapping(root))
     if root.tag != "formulation":
@@ -192,7 +94,7 @@ def _problem(node: Node) -> d.Problem:
     direction = node.given.get("direction", "minimize").strip().lower()
     if direction not in ("minimize", "maximize"):
         found = f"direction='{direction}'"
-        raise node.error(found, nearest(direction, ["minimize", "maximize"]))
+        raise node.error(found, nearest(direction, ["minimize", "maximize"]), "direction")
     goals = tuple(
         d.Goal(*_labels(e), e.number("coefficient", 1.0), at=e.at) for e in node.all("objective")
     )
@@ -217,7 +119,7 @@ def _variable(e: Node) -> d.Variable:
         random = e.number("randomLower", low), e.number("randomUpper", high)
     seed = e.number("randomSeed", 0, int)
     if seed < 0:
-        raise e.error(f"randomSeed='{seed}'", "a whole number from 0")
+        raise e.error(f"randomSeed='{seed}'", "a whole number from 0", "randomSeed")
     return d.Variable(*_labels(e), low, high, e.number("value", None), random, seed, at=e.at)
 
 
@@ -233,7 +135,8 @@ def _solver(node: Node) -> d.Solver:
 def _mapping(node: Node) -> d.Mapping:
     kind = node.given.get("classname", EXPRESSIONS)
     if kind != EXPRESSIONS:
-        raise node.error(f"classname='{kind}'", nearest(kind, [EXPRESSIONS, MLP]))
+        found = f"classname='{kind}'"
+        raise node.error(found, nearest(kind, [EXPRESSIONS, MLP]), "classname")
     _check(node, "mapping")
     tables = tuple(map(_table, node.all("data")))
     inner = tuple(_network(e) if e.given.get("classname") == MLP else _mapping(e)
@@ -287,7 +190,7 @@ def _set(e: Node) -> d.IndexedSet:
         raise e.error("<set> without <elements>", "<elements type='range' start='1' stop='9'/>")
     kind = inner.given.get("type", "range")
     if kind not in ("range", "list"):
-        raise inner.error(f"type='{kind}'", nearest(kind, ["range", "list"]))
+        raise inner.error(f"type='{kind}'", nearest(kind, ["range", "list"]), "type")
     numbers = "".join(inner.text).replace(",", " ").split()
     if kind == "range":
         keys = ("start", "stop", *(["step"] if "step" in inner.given else []))

@@ -7,6 +7,7 @@ import pytest
 from beamfit.errors import InputError
 from beamfit.language import document as d
 from beamfit.language import expression as x
+from beamfit.language.check import check_document
 from beamfit.language.parse import parse_document
 from beamfit.language.text import format_document
 from beamfit.language.xml import format_xml, parse_xml
@@ -184,3 +185,26 @@ OUTSIDE = "<!DOCTYPE b [<!ENTITY a SYSTEM 'file:///etc/passwd'>]><mapping>&a;</m
 def test_xml_that_cannot_be_used(text, said):
     with pytest.raises(InputError, match=said):
         parse_xml(text)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "culprit", "said"),
+    [
+        ('modelVariable="s12"', 'modelVariable="s21"', "s21", "one of s11, s12, s22"),
+        ('upper="10"', 'upper="-1"', 's11" lower', "bounds of 's11'"),
+        ('rowCount="14"', 'rowCount="many"', "many", "rowCount='many' in <data>"),
+        ('randomSeed="12"', 'randomSeed="-2"', "-2", "a whole number from 0"),
+        ('set="K"', 'set="L"', 'dx_model"', "no set 'L'"),
+        ("sqrt(dx2_model[k])", "sqrt(dx2_modl[k])", "dx2_modl", "did you mean dx2_model"),
+        ('direction="minimize"', 'direction="minimise"', "minimise", "did you mean minimize"),
+        ("2*A[k]", "2 &amp; A[k]", "&amp;", "'&'"),
+        ('<input name="s22" />', "<inputs/>", "<inputs/>", "did you mean input"),
+    ],
+)
+def test_mistakes_in_xml_have_their_place(root, old, new, culprit, said):
+    text = (root / "formulations/appendix_a.xml").read_text().replace(old, new, 1)
+    at = text.index(culprit)
+    place = text.count("\n", 0, at) + 1, at - text.rfind("\n", 0, at)
+    with pytest.raises(InputError, match=said) as found:
+        check_document(parse_xml(text))
+    assert (found.value.line, found.value.column) == place
