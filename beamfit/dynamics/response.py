@@ -1,0 +1,209 @@
+"""Responses whose parameters may change with the operating point (report 3.2, eqs 5-19).
+
+Each physics is a value: names of its parameters, how raw numbers without limits become stable
+ones, and one step under an input that holds from one sample to the next (zero-order hold, exact).
+A step is a function of one sample; whoever uses it scans and maps it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+__all__ = ["ARX", "FIRST_ORDER", "PHYSICS", "SECOND_ORDER", "Physics", "simulate"]
+
+
+class Physics(NamedTuple):
+    """A response of one output to m inputs.
+
+    Attributes
+    ----------
+    name : str
+        As the command line has it.
+    parameters : callable
+        ``parameters(inputs)``: names of p; of each gain one an input.
+    units : callable
+        ``units(inputs)``: powers of (time, output/input) of each parameter.
+    free_states : int
+        Numbers of the state at the start that nobody knows.
+    physical : callable
+        ``physical(q, m)``: stable parameters p of raw numbers q, any of which is allowed.
+    raw : callable
+        Its inverse.
+    begin : callable
+        ``begin(free, u0)``: the state at the first sample.
+    advance : callable
+        ``advance(p, x, u, dt)``: the state after dt under the input u, shape (m,), affine in x.
+        The output is x[0].
+    even : bool
+        Whether it needs samples at equal distances.
+    """
+
+    name: str
+    parameters: Callable[[tuple[str, ...]], tuple[str, ...]]
+    units: Callable[[int], tuple[tuple[int, int], ...]]
+    free_states: int
+    physical: Callable[[jax.Array, int], jax.Array]
+    raw: Callable[[jax.Array, int], jax.Array]
+    begin: Callable[[jax.Array, jax.Array], jax.Array]
+    advance: Callable[[jax.Array, jax.Array, jax.Array, jax.Array], jax.Array]
+    even: bool = False
+
+
+def _gains(inputs: tuple[str, ...], letter: str = "K") -> tuple[str, ...]:
+    return (letter,) if len(inputs) == 1 else tuple(f"{letter}_{name}" for name in inputs)
+
+
+# ---- first order: tau y' + y = K u (eq 5)
+
+
+def _advance_first(p, x, u, dt):
+    settled = p[1:] @ u
+    return settled + (x - settled) * jnp.exp(-dt / p[0])
+
+
+FIRST_ORDER = Physics(
+    "first-order",
+    lambda inputs: ("tau", *_gains(inputs)),
+    lambda m: ((1, 0),) + ((0, 1),) * m,
+    1,
+    lambda q, m: jnp.concatenate([jnp.exp(q[:1]), q[1:]]),
+    lambda p, m: jnp.concatenate([jnp.log(p[:1]), p[1:]]),
+    lambda free, u0: free,
+    _advance_first,
+)
+
+
+# ---- second order: T² y'' + 2 zeta T y' + y = K u; T² = tau1 tau2, 2 zeta T = tau1 + tau2 (eq 8)
+
+
+def _cosh_sinhc(square):
+    """cosh(r) and sinh(r)/r of r² = square, entire functions of it: cos and sin/r below zero.
+
+    The factor e^-|r| of positive squares is left out, so that nothing overflows.
+    """
+    size = jnp.sqrt(jnp.where(jnp.abs(square) > 1e-8, jnp.abs(square), 1.0))
+    fall = jnp.exp(-2.0 * size)
+    grown = 0.5 * (1.0 + fall), 0.5 * (1.0 - fall) / size
+    waving = jnp.cos(size), jnp.sin(size) / size
+    small = 1.0 + square / 2.0, 1.0 + square / 6.0
+    return tuple(
+        jnp.where(square > 1e-8, g, jnp.where(square < -1e-8, w, s))
+        for g, w, s in zip(grown, waving, small, strict=True)
+    )
+
+
+def _advance_second(p, x, u, dt):
+    """The state (y, y') as eq 8 has it, whatever the order of its two lags.
+
+    With s = zeta/T and r² = s² - 1/T², the deviation d from K u moves by
+    e^(-s t) (cosh(rt) (d, d') + t sinh(rt)/(rt) (s d + d', -d/T² - s d')).
+    """
+    time, zeta, settled = p[0], p[1], p[2:] @ u
+    s, square = zeta / time, (zeta**2 - 1.0) * (dt / time) ** 2
+    c, sc = _cosh_sinhc(square)
+    grown = jnp.where(square > 1e-8, jnp.sqrt(jnp.where(square > 1e-8, square, 1.0)), 0.0)
+    fall = jnp.exp(grown - s * dt)
+    d, v = x[0] - settled, x[1]
+    moved = jnp.stack([c * d + dt * sc * (s * d + v), c * v - dt * sc * (d / time**2 + s * v)])
+    return fall * moved + jnp.stack([settled, 0.0 * settled])
+
+
+SECOND_ORDER = Physics(
+    "second-order",
+    lambda inputs: ("T", "zeta", *_gains(inputs)),
+    lambda m: ((1, 0), (0, 0)) + ((0, 1),) * m,
+    2,
+    lambda q, m: jnp.concatenate([jnp.exp(q[:2]), q[2:]]),
+    lambda p, m: jnp.concatenate([jnp.log(p[:2]), p[2:]]),
+    lambda free, u0: free,
+    _advance_second,
+)
+
+
+# ---- difference equation: y(k+1) = -a1 y(k) - a2 y(k-1) + b1 u(k) + b2 u(k-1) (eq 12)
+
+
+def _stable(q, m):
+    """Inside the stability triangle |a2| < 1, |a1| < 1 + a2 whatever q is."""
+    a2 = jnp.tanh(q[1])
+    return jnp.concatenate([jnp.stack([(1.0 + a2) * jnp.tanh(q[0]), a2]), q[2:]])
+
+
+def _unstable(p, m):
+    a2 = jnp.clip(p[1], -0.999, 0.999)
+    a1 = jnp.clip(p[0] / (1.0 + a2), -0.999, 0.999)
+    return jnp.concatenate([jnp.arctanh(jnp.stack([a1, a2])), p[2:]])
+
+
+def _advance_arx(p, x, u, dt):
+    m = u.shape[0]
+    new = -p[0] * x[0] - p[1] * x[1] + p[2 : 2 + m] @ u + p[2 + m :] @ x[2:]
+    return jnp.concatenate([jnp.stack([new, x[0]]), u])
+
+
+ARX = Physics(
+    "arx",
+    lambda inputs: ("a1", "a2", *_gains(inputs, "b1"), *_gains(inputs, "b2")),
+    lambda m: ((0, 0), (0, 0)) + ((0, 1),) * (2 * m),
+    2,
+    _stable,
+    _unstable,
+    lambda free, u0: jnp.concatenate([free, u0]),
+    _advance_arx,
+    even=True,
+)
+
+PHYSICS = {each.name: each for each in (FIRST_ORDER, SECOND_ORDER, ARX)}
+
+
+def simulate(
+    physics: Physics, p: jax.Array, u: jax.Array, dt: jax.Array, free: jax.Array
+) -> jax.Array:
+    """Run a response on its own state (output error).
+
+    Parameters
+    ----------
+    physics : Physics
+        The response.
+    p : array, shape (samples, parameters)
+        Its parameters while the input of each sample holds.
+    u : array, shape (samples, m)
+        Inputs, each from its sample to the next.
+    dt : array, shape (samples,)
+        Time to the next sample; the last is not used.
+    free : array, shape (free states,)
+        The unknown part of the state at the first sample.
+
+    Returns
+    -------
+    jax.Array, shape (samples,)
+        The output at each sample.
+
+    Examples
+    --------
+    >>> p = jnp.tile(jnp.array([2.0, 3.0]), (4, 1))
+    >>> y = simulate(FIRST_ORDER, p, jnp.ones((4, 1)), jnp.full(4, 2.0), jnp.zeros(1))
+    >>> [round(float(v), 4) for v in y]
+    [0.0, 1.8964, 2.594, 2.8506]
+    """
+
+    x0 = physics.begin(free, u[0])
+
+    def affine(p, u, dt):
+        def after(x):
+            moved = physics.advance(p, x, u, dt)
+            return moved, moved
+
+        return jax.jacfwd(after, has_aux=True)(jnp.zeros_like(x0))
+
+    def step(x, now):
+        matrix, shift = now
+        return jnp.sum(matrix * x, axis=1) + shift, x[0]
+
+    # A step is affine in the state: what does not hang on the state is computed for all samples
+    # at once, and the scan, forward and backward, is a product with a small matrix.
+    return jax.lax.scan(step, x0, jax.vmap(affine)(p, u, dt))[1]

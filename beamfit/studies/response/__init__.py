@@ -1,0 +1,1 @@
+"""Responses of a process to its inputs, identified from records of runs."""

@@ -1,0 +1,174 @@
+"""What residuals say of an identified response, and how runs are predicted that it never saw."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from scipy.stats import chi2, f
+
+from beamfit.dynamics.response import Physics, simulate
+from beamfit.greybox.fit import Fit
+from beamfit.studies.response.model import CLOSE, Seen, driven, parameters_at
+from beamfit.studies.response.record import Run
+
+__all__ = ["Checks", "HeldBack", "checks_of", "predict_held"]
+
+# Lags of the tests at most.
+LAGS = 20
+
+
+class Checks(NamedTuple):
+    """Tests of the residuals of the free-running output.
+
+    Attributes
+    ----------
+    free_run_percent : float
+        100 (1 - |residual| / |output - mean|).
+    one_step_percent : float
+        The same for predictions from the reading before, by the noise's memory.
+    nothing_probability : float
+        Chance that a response explains so much of an output that hangs on no input (F).
+    white_probability : float
+        Chance of so large correlations of the residuals in white noise (Ljung and Box 1978).
+    input_probability : float
+        Chance that past inputs and their squares explain so much of the whitened residuals if
+        they have no part in them (F).
+    input_share : float
+        The part of the whitened residuals' squares that they explain.
+    against_constant : float or None
+        By how much the Bayesian information criterion falls from constant parameters.
+    """
+
+    free_run_percent: float
+    one_step_percent: float
+    nothing_probability: float
+    white_probability: float
+    input_probability: float
+    input_share: float
+    against_constant: float | None
+
+    def rows(self) -> list[list[str]]:
+        """Label and value."""
+        rows = [
+            ["free run explains", f"{self.free_run_percent:.2f} %"],
+            ["one step ahead", f"{self.one_step_percent:.2f} %"],
+            ["residuals white", f"p = {self.white_probability:.2g}"],
+            [
+                "inputs in residuals",
+                f"{100 * self.input_share:.1f} %, p = {self.input_probability:.2g}",
+            ],
+        ]
+        if self.against_constant is not None:
+            rows.append(["BIC below constant", f"{self.against_constant:.1f}"])
+        return rows
+
+
+class HeldBack(NamedTuple):
+    """A run that was only predicted: its name, how much is explained, and its rms residual."""
+
+    name: str
+    free_run_percent: float
+    rms: float
+
+    def row(self) -> list[str]:
+        """Label and value."""
+        return [f"held back {self.name}", f"{self.free_run_percent:.2f} %, rms {self.rms:.3g}"]
+
+
+def _percent(rest: np.ndarray, y: np.ndarray) -> float:
+    whole = float(np.linalg.norm(y - y.mean()))
+    return 100.0 * (1.0 - float(np.linalg.norm(rest)) / whole) if whole > 0 else 0.0
+
+
+def checks_of(
+    seen: Seen, residuals: tuple[np.ndarray, ...], fit: Fit, used: int, gain: float
+) -> Checks:
+    """Test the residuals of every run together."""
+    y = np.concatenate([m - m.mean() for m in seen.measured])
+    rest = np.concatenate(residuals)
+    share = _share(residuals)
+    ahead = np.concatenate([_whitened(r, share) for r in residuals])
+    explained, chance = _explained(seen, residuals, share, used)
+    if rest.std() <= CLOSE * seen.size_y:  # what is left is rounding, or the network's own detail
+        explained, chance = 0.0, 1.0
+    return Checks(
+        _percent(rest, y),
+        _percent(ahead, y),
+        _chance(y, rest, used),
+        _white(residuals),
+        chance,
+        explained,
+        gain if callable(fit.model["map"]) else None,
+    )
+
+
+def _chance(y: np.ndarray, rest: np.ndarray, used: int) -> float:
+    whole, left, free = float(y @ y), float(rest @ rest), len(rest) - used
+    if free < 1 or left >= whole:
+        return 1.0
+    return float(f.sf((whole - left) / used / max(left / free, 1e-300), used, free))
+
+
+def _share(residuals: tuple[np.ndarray, ...]) -> float:
+    """Correlation of neighbours."""
+    both = sum(float(r[1:] @ r[:-1]) for r in residuals)
+    return float(np.clip(both / max(sum(float(r @ r) for r in residuals), 1e-300), 0.0, 0.999))
+
+
+def _whitened(r: np.ndarray, share: float) -> np.ndarray:
+    return r[1:] - share * r[:-1]
+
+
+def _white(residuals: tuple[np.ndarray, ...]) -> float:
+    count = sum(map(len, residuals))
+    lags = min(LAGS, count // 5)
+    squares = max(sum(float(r @ r) for r in residuals), 1e-300)
+    found = [sum(float(r[k:] @ r[:-k]) for r in residuals) / squares for k in range(1, lags + 1)]
+    q = count * (count + 2) * sum(c**2 / (count - k) for k, c in enumerate(found, start=1))
+    return float(chi2.sf(q, lags))
+
+
+def _explained(
+    seen: Seen, residuals: tuple[np.ndarray, ...], share: float, used: int
+) -> tuple[float, float]:
+    """How much past inputs explain of the residuals, both whitened alike, and its chance."""
+    parts, targets = [], []
+    lags = int(np.clip(sum(map(len, residuals)) // (10 * len(seen.inputs)), 1, LAGS))
+    for run, r in zip(seen.runs, residuals, strict=True):
+        u = (np.asarray(run.u) - seen.mean_u) / np.where(seen.size_u > 0, seen.size_u, 1.0)
+        index = np.asarray(run.index)
+        late = [u[np.maximum(index - k, 0)] for k in range(1, lags + 1)]
+        columns = np.concatenate([v for each in late for v in (each, each**2)], axis=1)
+        parts.append(columns[1:] - share * columns[:-1])
+        targets.append(_whitened(r, share))
+    design, target = np.vstack(parts), np.concatenate(targets)
+    design = design - design.mean(axis=0)
+    target = target - target.mean()
+    basis, size, _ = np.linalg.svd(design, full_matrices=False)
+    basis = basis[:, size > 1e-6 * size.max(initial=1e-300)]
+    inside, whole = float(np.sum((basis.T @ target) ** 2)), float(target @ target)
+    k, left = basis.shape[1], len(target) - basis.shape[1] - used - 1
+    if left < 1 or whole <= 0 or k == 0:
+        return 0.0, 1.0
+    ratio = (inside / k) / max((whole - inside) / left, 1e-300)
+    return inside / whole, float(f.sf(ratio, k, left))
+
+
+def predict_held(run: Run, output: str, fit: Fit, physics: Physics, delay: int) -> HeldBack:
+    """Predict a run that was held back; only the state at its start is estimated."""
+    seen = driven(run, 0, output, physics, delay)
+    p = parameters_at(physics, fit.model["map"], seen.point)
+    y = run.outputs[output][np.asarray(seen.index)]
+
+    def from_start(free: Any) -> np.ndarray:
+        return np.asarray(simulate(physics, p, seen.u, seen.dt, free)[seen.index])
+
+    zero = jnp.zeros(physics.free_states)
+    base = from_start(zero)
+    moved = np.stack([from_start(e) - base for e in jnp.eye(physics.free_states)], axis=1)
+    target = y - base - float(fit.model["offset"])
+    first = np.linalg.lstsq(moved, target, rcond=1e-10)[0]
+    rest = target - moved @ first
+    return HeldBack(run.name, _percent(rest, y), float(rest.std()))

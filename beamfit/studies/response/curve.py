@@ -1,0 +1,129 @@
+"""What is quoted of an identified response: constants with errors, curves with bands."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from beamfit.dynamics.response import SECOND_ORDER, Physics
+from beamfit.greybox.fit import Derived, Fit
+from beamfit.quantity import Quantity
+from beamfit.studies.response.model import Seen, curves
+from beamfit.table import Table, cell, json_of
+
+__all__ = ["Curve", "curves_of", "quantities_of"]
+
+# Points of a curve; it was visited where so many samples lie within a share of its range.
+POINTS, VISITS, NEAR = 41, 5, 0.05
+SHOWN = 9
+TIME, GAIN, PURE = "s", "output/input", "1"
+
+
+class Curve(NamedTuple):
+    """A parameter against one input, the others at their means.
+
+    Attributes
+    ----------
+    parameter, input : str
+        What, against what.
+    unit : str
+        Of the parameter.
+    at, value, error : ndarray
+        Shape (points,); errors are NaN where the data do not determine the value.
+    visited : ndarray of bool
+        Whether the runs were there.
+    """
+
+    parameter: str
+    input: str
+    unit: str
+    at: np.ndarray
+    value: np.ndarray
+    error: np.ndarray
+    visited: np.ndarray
+
+    def quantity(self, i: int) -> Quantity:
+        """The value at one point, without an error where the runs never were."""
+        known = self.visited[i] and np.isfinite(self.error[i])
+        return Quantity(float(self.value[i]), float(self.error[i]) if known else None, self.unit)
+
+    def table(self) -> Table:
+        """A few points, to be shown."""
+        rows = [
+            [f"{self.at[i]:.4g}", cell(self.quantity(i)), "" if self.visited[i] else "not visited"]
+            for i in np.linspace(0, len(self.at) - 1, SHOWN).round().astype(int)
+        ]
+        return Table(f"{self.parameter} by {self.input}", [self.input, self.parameter, ""], rows)
+
+    def to_json(self) -> dict[str, Any]:
+        """Arrays with null where nothing is known."""
+        known = np.where(self.visited, self.error, np.nan)
+        fields = self._asdict() | {"error": known}
+        return json_of({k: _nulls(v) if k in ("value", "error") else v for k, v in fields.items()})
+
+
+def _nulls(values: np.ndarray) -> list[float | None]:
+    return [float(v) if np.isfinite(v) else None for v in values]
+
+
+def _units(physics: Physics, m: int) -> list[str]:
+    return [TIME if time else GAIN if gain else PURE for time, gain in physics.units(m)]
+
+
+def _constants(model: Any, seen: Any) -> jax.Array:
+    p = curves(model, (seen, seen.point[:1]))[0]
+    if seen.physics is not SECOND_ORDER:
+        return p
+    # Both lags of eq 8 where there are two: T (zeta ± sqrt(zeta² - 1)).
+    root = jnp.sqrt(jnp.maximum(p[1] ** 2 - 1.0, 1e-12))
+    return jnp.concatenate([p, p[0] * (p[1] + jnp.stack([root, -root]))])
+
+
+def _offset(model: Any, seen: Any) -> jax.Array:
+    return model["offset"]
+
+
+def quantities_of(fit: Fit, seen: Seen, physics: Physics) -> dict[str, Quantity]:
+    """Constant parameters with errors, and the offset if it is free."""
+    m = len(seen.inputs)
+    found = fit.derive(_constants, seen.runs[0])
+    names, units = list(physics.parameters(seen.inputs)), _units(physics, m)
+    if physics is SECOND_ORDER and found.value[1] > 1.0:
+        names, units = [*names, "tau1", "tau2"], [*units, TIME, TIME]
+    said = {
+        name: _quantity(found, i, unit)
+        for i, (name, unit) in enumerate(zip(names, units, strict=True))
+    }
+    if any(v.name == "offset" for v in fit.variables):
+        said["offset"] = _quantity(fit.derive(_offset, seen.runs[0]), (), "output")
+    return said
+
+
+def _quantity(found: Derived, i: Any, unit: str) -> Quantity:
+    error, raw = (float(e[i]) for e in (found.error, found.error_raw))
+    known = np.isfinite(error)
+    return Quantity(float(found.value[i]), error if known else None, unit, raw if known else None)
+
+
+def curves_of(fit: Fit, seen: Seen) -> tuple[Curve, ...]:
+    """Every parameter against every input."""
+    physics, m = seen.runs[0].physics, len(seen.inputs)
+    points = np.concatenate([np.asarray(run.point)[: len(t)]
+                             for run, t in zip(seen.runs, seen.time, strict=True)])  # fmt: skip
+    made = []
+    for j, name in enumerate(seen.inputs):
+        low, high = points[:, j].min(), points[:, j].max()
+        grid = np.tile(seen.mean_u, (POINTS, 1))
+        grid[:, j] = at = np.linspace(low, high, POINTS)
+        apart = np.abs(points[:, j][None, :] - at[:, None])
+        visited = np.sum(apart <= NEAR * (high - low), axis=1) >= VISITS
+        found = fit.derive(curves, (seen.runs[0], jnp.asarray(grid)))
+        names = physics.parameters(seen.inputs)
+        made += [
+            Curve(names[i], name, unit, at, found.value[:, i], found.error[:, i], visited)
+            for i, unit in enumerate(_units(physics, m))
+        ]
+    return tuple(made)

@@ -1,0 +1,362 @@
+"""From runs to a judged response: start, delay, free-running fit, noise with a memory, verdict."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+
+from beamfit.dynamics.response import PHYSICS, Physics
+from beamfit.errors import InputError, nearest
+from beamfit.greybox.correlated import is_correlated
+from beamfit.greybox.fit import Fit
+from beamfit.greybox.solve import solve
+from beamfit.quantity import Quantity
+from beamfit.shown import shown
+from beamfit.status import Status
+from beamfit.studies.response.checks import Checks, HeldBack, checks_of, predict_held
+from beamfit.studies.response.curve import Curve, curves_of, quantities_of
+from beamfit.studies.response.model import CLOSE, Seen, driven, network_of, output_of, state
+from beamfit.studies.response.record import Run
+from beamfit.studies.response.starts import Start, best_start
+from beamfit.studies.response.verdict import judged
+from beamfit.table import Table, json_of
+
+if TYPE_CHECKING:
+    from beamfit.sampling.posterior import Posterior
+
+__all__ = ["MAPS", "ResponseFit", "identify"]
+
+MAPS = ("constant", "network")
+# Longest delay that is tried, in samples and as a share of the run.
+LATEST, SHARE = 24, 0.1
+# A delay must raise the logarithm of the likelihood by so much over a shorter one.
+BETTER = 5.0
+# Steps of a round, after which the noise is taken from the residuals again; rounds at most, and
+# the gain in -2 ln L below which nothing is gained any more.
+STEPS, ROUNDS, GAINED = 100, 30, 0.05
+
+
+@shown
+@dataclass(frozen=True, eq=False)
+class ResponseFit:
+    """An identified response of one output.
+
+    Attributes
+    ----------
+    output : str
+        Which.
+    status : Status
+        How far to believe it; ``message`` says why and what to do.
+    model, map : str
+        The physics, and what gives its parameters.
+    delay : int
+        Samples by which the output follows the inputs late.
+    runs : tuple of Run
+        What it was identified from.
+    seen : Seen
+        The same as the model sees it.
+    fit : Fit
+        The grey-box fit.
+    quantities : dict of str to Quantity
+        Constant parameters, and the offset, with errors.
+    curves : tuple of Curve
+        Parameters against the operating point, of a network.
+    noise : tuple of float
+        Rms residual of each run.
+    memory : tuple of float, or None
+        Correlation time of each run's noise, s; None where it has none.
+    checks : Checks
+        What the residuals say.
+    held : tuple of HeldBack
+        How runs are predicted that were not used.
+    """
+
+    output: str
+    status: Status
+    message: str
+    model: str
+    map: str
+    delay: int
+    runs: tuple[Run, ...]
+    seen: Seen
+    fit: Fit
+    quantities: dict[str, Quantity]
+    curves: tuple[Curve, ...]
+    noise: tuple[float, ...]
+    memory: tuple[float, ...] | None
+    checks: Checks
+    held: tuple[HeldBack, ...] = ()
+
+    @property
+    def headline(self) -> str:
+        """What was found, in a line."""
+        said = [f"{name} = {q}" for name, q in list(self.quantities.items())[:3]]
+        found = ", ".join(said) or f"{len(self.curves)} parameter curves"
+        return f"{self.output} {self.status}: {self.model}, {found}"
+
+    @cached_property
+    def fitted(self) -> tuple[np.ndarray, ...]:
+        """The free-running output at the readings of each run."""
+        return tuple(np.asarray(output_of(self.fit.model, run)) for run in self.seen.runs)
+
+    def tables(self) -> tuple[Table, ...]:
+        """All numbers, to be shown."""
+        rows = [[name, str(q)] for name, q in self.quantities.items()]
+        rows += [["delay", f"{self.delay} samples"]]
+        rows += self.checks.rows() + [each.row() for each in self.held]
+        found = [Table(f"{self.output} ({self.model}, {self.map} parameters)", [], rows)]
+        return (*found, *(curve.table() for curve in self.curves))
+
+    def to_json(self) -> dict[str, Any]:
+        """Give one entry of ``results`` in the JSON contract."""
+        names = ("output", "status", "message", "model", "map")
+        entry = {name: getattr(self, name) for name in names}
+        return json_of(
+            entry
+            | {"records": [run.path or run.name for run in self.runs]}
+            | {"delay_samples": self.delay, "parameters": self.quantities}
+            | {"curves": [curve.to_json() for curve in self.curves]}
+            | {"noise_rms": list(self.noise), "noise_memory_s": self.memory}
+            | {"checks": self.checks._asdict(), "held_back": [h._asdict() for h in self.held]}
+        )
+
+    def sample(self, **options: Any) -> Posterior:
+        """Draw the free numbers of a response with constant parameters from their posterior.
+
+        Parameters
+        ----------
+        **options
+            As `beamfit.greybox.fit.Fit.sample`.
+
+        Raises
+        ------
+        InputError
+            If the parameters are a network: the weights are too many and stand for each other.
+        """
+        if self.map != "constant":
+            raise InputError("a posterior of a network", "constant parameters; curves have bands")
+        return self.fit.sample(**options)
+
+
+def identify(
+    runs: Run | Sequence[Run],
+    model: str = "first-order",
+    map: str = "constant",
+    *,
+    output: str | None = None,
+    delay: int | None = None,
+    offset: bool = True,
+    hidden: int = 6,
+    starts: int = 3,
+    seed: int = 0,
+    held: Sequence[Run] = (),
+) -> ResponseFit:
+    """Identify the response of an output to the inputs of some runs.
+
+    Parameters
+    ----------
+    runs : Run or sequence of Run
+        Records with the same inputs and outputs.
+    model : {"first-order", "second-order", "arx"}
+        tau y' + y = K u (report eq 5); T² y'' + 2 zeta T y' + y = K u, which is eq 8 with
+        T² = tau1 tau2 and 2 zeta T = tau1 + tau2; or the difference equation (eq 12), stable by
+        construction.
+    map : {"constant", "network"}
+        Whether parameters are numbers, or a network of the inputs at each moment.
+    output : str, optional
+        Which output, if the runs have several.
+    delay : int, optional
+        Samples by which the output follows late; found among candidates if None.
+    offset : bool
+        Whether the output at rest is a free number; else it is 0.
+    hidden, starts, seed : int
+        Hidden nodes of the network, starts of its training, seed of their weights.
+    held : sequence of Run
+        Runs that are only predicted.
+
+    Returns
+    -------
+    ResponseFit
+
+    Raises
+    ------
+    InputError
+        If runs do not fit together, an option is unknown, no input ever changes, or samples of
+        ``"arx"`` are not at equal distances.
+
+    Notes
+    -----
+    The output runs free from the start of each run (output error): predictions from measured
+    outputs are useless under noise. The first states are estimated. Noise is inferred from the
+    residuals, with a correlation time where neighbours are correlated. Sources: report 3.2;
+    L. Ljung, System Identification (1999), chapters 7 and 16.
+
+    Examples
+    --------
+    >>> t = np.arange(60.0)
+    >>> u = (t // 15) % 2
+    >>> y = [0.0]
+    >>> for value in u[:-1]:
+    ...     y.append(2.0 * value + (y[-1] - 2.0 * value) * np.exp(-1 / 5.0))
+    >>> noise = 0.01 * np.random.default_rng(0).normal(size=60)
+    >>> fit = identify(Run(t, {"valve": u}, {"level": y + noise}))
+    >>> fit.status.value, fit.delay, abs(fit.quantities["tau"].value - 5.0) < 0.1
+    ('converged', 0, True)
+    """
+    runs = (runs,) if isinstance(runs, Run) else tuple(runs)
+    physics = _checked(runs, tuple(held), model, map)
+    output = _output(runs[0], output)
+    start, seen, delay = _start(runs, output, physics, delay, offset)
+    plain = _settled(seen, [(jnp.asarray(start.raw), start.first, (start.offset, offset))])
+    answer = plain
+    if map == "network":
+        raw, first, level = plain.start()
+        nets = [network_of(seen, physics, np.asarray(raw), hidden, seed + k) for k in range(starts)]
+        answer = _settled(seen, [(net, first, level) for net in nets])
+    checks = checks_of(
+        seen,
+        answer.residuals,
+        answer.fit,
+        used_by(answer.fit),
+        plain.likelihood - answer.likelihood,
+    )
+    quantities = quantities_of(answer.fit, seen, physics) if map == "constant" else {}
+    curves = curves_of(answer.fit, seen) if map == "network" else ()
+    ahead = tuple(predict_held(each, output, answer.fit, physics, delay) for each in held)
+    status, message = judged(answer.fit, answer.rests, checks, quantities, curves, ahead, map)
+    parts = (quantities, curves, answer.noise, answer.memory, checks, ahead)
+    return ResponseFit(output, status, message, model, map, delay, runs, seen, answer.fit, *parts)
+
+
+def _output(run: Run, output: str | None) -> str:
+    names = list(run.outputs)
+    if output is not None and output not in names:
+        raise InputError(f"no output '{output}'", nearest(output, names))
+    if output is None and len(names) > 1:
+        raise InputError(f"{len(names)} outputs", f"one of {', '.join(names)}")
+    return output or names[0]
+
+
+def _checked(runs: tuple[Run, ...], held: tuple[Run, ...], model: str, map: str) -> Physics:
+    if model not in PHYSICS:
+        raise InputError(f"model '{model}'", nearest(model, list(PHYSICS)))
+    if map not in MAPS:
+        raise InputError(f"map '{map}'", nearest(map, list(MAPS)))
+    if not runs:
+        raise InputError("no runs", "at least one")
+    first = runs[0]
+    for run in (*runs, *held):
+        if set(run.inputs) != set(first.inputs) or set(run.outputs) != set(first.outputs):
+            said = f"inputs {', '.join(run.inputs)} and outputs {', '.join(run.outputs)}"
+            raise run.unusable(said, f"those of {first.name}: {first.headline.partition(', ')[2]}")
+        if PHYSICS[model].even and run.step is None:
+            raise run.unusable("samples at unequal distances", "equal ones, or --model first-order")
+    for name in first.inputs:
+        if all(np.ptp(run.inputs[name]) == 0 for run in runs):
+            said = f"input {name} at {runs[0].inputs[name][0]:g} all the time"
+            raise first.unusable(said, "an input that changes: a step at least")
+    return PHYSICS[model]
+
+
+def seen_of(runs: tuple[Run, ...], output: str, physics: Physics, delay: int) -> Seen:
+    """The runs as the model sees them."""
+    drives = tuple(driven(run, i, output, physics, delay) for i, run in enumerate(runs))
+    read = [np.isfinite(run.outputs[output]) for run in runs]
+    measured = tuple(run.outputs[output][k] for run, k in zip(runs, read, strict=True))
+    time = tuple(run.time[k] for run, k in zip(runs, read, strict=True))
+    u = np.concatenate([np.stack(list(run.inputs.values()), axis=1) for run in runs])
+    spread = float(np.concatenate(measured).std()) or 1.0
+    return Seen(tuple(runs[0].inputs), output, drives, measured, time, u.mean(0), u.std(0), spread)
+
+
+def _start(
+    runs: tuple[Run, ...], output: str, physics: Physics, delay: int | None, offset: bool
+) -> tuple[Start, Seen, int]:
+    """The best start, and the delay: the shortest of those that fit about as well as any."""
+    shortest = min(map(len, runs))
+    latest = min(LATEST, int(SHARE * shortest))
+    delays = range(latest + 1) if delay is None else (delay,)
+    found = []
+    for late in delays:
+        seen = seen_of(runs, output, physics, late)
+        found.append((best_start(seen, offset), seen, late))
+    count = sum(map(len, found[0][1].measured))
+    least = min(start.squares for start, _, _ in found)
+    near = least * np.exp(2.0 * BETTER / count)
+    return next(each for each in found if each[0].squares <= near)
+
+
+class Settled(NamedTuple):
+    """A fit whose noise is that of its own residuals.
+
+    `likelihood` is -2 ln L with the cost of the Bayesian information criterion, `rests` whether a
+    further round would gain nothing.
+    """
+
+    fit: Fit
+    residuals: tuple[np.ndarray, ...]
+    noise: tuple[float, ...]
+    memory: tuple[float, ...] | None
+    likelihood: float
+    rests: bool
+
+    def start(self) -> tuple[Any, np.ndarray, tuple[float, bool]]:
+        """Where a further search begins."""
+        model = self.fit.model
+        free = any(v.name == "offset" for v in self.fit.variables)
+        return model["map"], np.asarray(model["start"]), (float(model["offset"]), free)
+
+
+def _round(seen: Seen, begin: tuple, noise: Sequence[float], memory: Any = None) -> Settled:
+    """Fit with the noise that the residuals of the round before had."""
+    fit = solve(state(seen, *begin, noise, memory), iterations=STEPS)
+    pairs = zip(seen.runs, seen.measured, strict=True)
+    rest = tuple(y - np.asarray(output_of(fit.model, run)) for run, y in pairs)
+    found = tuple(max(float(r.std()), CLOSE * seen.size_y) for r in rest)
+    minus = sum(2.0 * len(r) * np.log(s) for r, s in zip(rest, found, strict=True))
+    cost = used_by(fit) * np.log(sum(map(len, rest)))
+    kept = None if memory is None else tuple(memory)
+    rests = fit.status not in (Status.not_finite, Status.not_converged)
+    return Settled(fit, rest, found, kept, float(minus + cost), rests)
+
+
+def _settled(seen: Seen, begins: Sequence[tuple]) -> Settled:
+    """Search from each start for a round, then from the best until nothing is gained.
+
+    The noise weighs against the priors of a network, so it is taken anew in every round.
+    """
+    wide = [0.1 * seen.size_y] * len(seen.runs)
+    tried = (_round(seen, begin, wide) for begin in begins)
+    found = min(tried, key=lambda each: each.likelihood)
+    for _ in range(ROUNDS):
+        before, found = found, _round(seen, found.start(), found.noise)
+        if abs(before.likelihood - found.likelihood) < GAINED + 1e-9 * abs(found.likelihood):
+            found = found._replace(rests=True)
+            break
+    if not any(is_correlated(r, used_by(found.fit)) and r.std() > CLOSE * seen.size_y
+               for r in found.residuals):  # fmt: skip
+        return found
+    memory = [_memory(r, t) for r, t in zip(found.residuals, seen.time, strict=True)]
+    white = found
+    for _ in range(3):
+        before, found = found, _round(seen, found.start(), white.noise, memory)
+        if found.rests or abs(before.likelihood - found.likelihood) < GAINED:
+            break
+    return found._replace(rests=white.rests)
+
+
+def used_by(fit: Fit) -> int:
+    """How many numbers the readings determined."""
+    return max(round(sum(group.count - group.dof for group in fit.groups)), 1)
+
+
+def _memory(rest: np.ndarray, time: np.ndarray) -> float:
+    """The correlation time of residuals from their neighbours, s."""
+    rest = rest - rest.mean()
+    share = float(rest[1:] @ rest[:-1]) / max(float(rest @ rest), 1e-300)
+    return float(np.median(np.diff(time))) / -np.log(np.clip(share, 1e-3, 0.999))

@@ -1,0 +1,167 @@
+"""A response as a problem: runs, a map from the operating point to its parameters, its physics."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from beamfit.dynamics.response import Physics, simulate
+from beamfit.greybox import tree
+from beamfit.greybox.mlp import MLP, Port, dense
+from beamfit.greybox.problem import Free, Prior, Problem, Record, padded_length
+from beamfit.studies.response.record import Run
+
+__all__ = [
+    "Driven",
+    "Seen",
+    "curves",
+    "driven",
+    "network_of",
+    "parameters_at",
+    "predicted",
+    "state",
+]
+
+# A residual below this share of the output's scatter is the model's, and not fitted any closer.
+CLOSE = 2e-4
+# Width of the prior on a network's weights, whose inputs and outputs are of size 1.
+WEIGHT = 3.0
+
+
+@tree.node("physics")
+class Driven:
+    """A run as the model sees it: operating points, inputs and steps, padded, and what was read.
+
+    Shapes (samples, inputs), (samples, inputs), (samples,), (readings,); `run` is its number,
+    `memory` the correlation time of its noise, s.
+    """
+
+    physics: Physics
+    point: Any
+    u: Any
+    dt: Any
+    time: Any
+    index: Any
+    run: Any
+    memory: Any
+
+
+class Seen(NamedTuple):
+    """Runs of one output, with what the model needs of them.
+
+    `runs` by `Driven`; `measured` are the readings of each, without missing ones; `size_u` and
+    `size_y` the scatter of inputs and output.
+    """
+
+    inputs: tuple[str, ...]
+    output: str
+    runs: tuple[Driven, ...]
+    measured: tuple[np.ndarray, ...]
+    time: tuple[np.ndarray, ...]
+    mean_u: np.ndarray
+    size_u: np.ndarray
+    size_y: float
+
+
+def driven(run: Run, number: int, output: str, physics: Physics, delay: int) -> Driven:
+    """One run with its inputs `delay` samples late; before the first they are as the first."""
+    n, u = len(run), np.stack(list(run.inputs.values()), axis=1)
+    late = np.concatenate([np.repeat(u[:1], delay, axis=0), u])[:n]
+    longer = padded_length(n) - n
+    late = np.concatenate([late, np.repeat(late[-1:], longer, axis=0)])
+    dt = np.concatenate([np.diff(run.time), np.zeros(longer + 1)])
+    index = np.flatnonzero(np.isfinite(run.outputs[output]))
+    arrays = (jnp.asarray(v) for v in (late, late, dt, run.time[index] - run.time[0], index))
+    return Driven(physics, *arrays, jnp.asarray(number), jnp.asarray(1.0))
+
+
+def parameters_at(physics: Physics, of: Any, point: jax.Array) -> jax.Array:
+    """Parameters p at operating points, shape (points, parameters); `of` a map, or raw numbers."""
+    m = point.shape[1]
+    raw = jax.vmap(of)(point) if callable(of) else jnp.broadcast_to(of, (len(point), len(of)))
+    return jax.vmap(lambda q: physics.physical(q, m))(raw)
+
+
+def predicted(model: Any, seen: Driven) -> jax.Array:
+    """The output where it was read, running free from the start of the run."""
+    p = parameters_at(seen.physics, model["map"], seen.point)
+    y = simulate(seen.physics, p, seen.u, seen.dt, model["start"][seen.run])
+    return model["offset"] + y[seen.index]
+
+
+output_of = jax.jit(predicted)
+
+
+def _apart(model: Any, seen: Driven) -> jax.Array:
+    return jnp.diff(seen.time) / seen.memory
+
+
+def curves(model: Any, asked: tuple[Driven, Any]) -> jax.Array:
+    """Parameters at operating points, shape (points, parameters)."""
+    seen, point = asked
+    return parameters_at(seen.physics, model["map"], point)
+
+
+def network_of(seen: Seen, physics: Physics, raw: np.ndarray, hidden: int, seed: int) -> MLP:
+    """A network that gives constant raw numbers everywhere but for small random weights."""
+    m = len(seen.inputs)
+    wide = np.where(seen.size_u > 0, seen.size_u, 1.0)
+    ports = [Port(n, "", 0, float(s), float(b))
+             for n, s, b in zip(seen.inputs, wide, seen.mean_u, strict=True)]  # fmt: skip
+    gain = seen.size_y / float(np.min(wide))
+    sizes = [gain if power else 1.0 for _, power in physics.units(m)]
+    names = physics.parameters(seen.inputs)
+    outputs = [Port(n, "", 0, s, float(b)) for n, s, b in zip(names, sizes, raw, strict=True)]
+    return dense(ports, outputs, [hidden], seed=seed, spread=0.3)
+
+
+def state(
+    seen: Seen,
+    of: Any,
+    start: np.ndarray,
+    offset: tuple[float, bool],
+    noise: Sequence[float],
+    memory: Sequence[float] | None,
+) -> Problem:
+    """State the problem.
+
+    Parameters
+    ----------
+    seen : Seen
+        The runs.
+    of : array or map
+        Raw numbers, or the map that gives them.
+    start : array, shape (runs, free states)
+        Unknown parts of the first states.
+    offset : (float, bool)
+        Output at rest, and whether it is free.
+    noise : sequence of float
+        A guess at the noise of each run, which its residuals correct.
+    memory : sequence of float, optional
+        The correlation time of each run's noise, s.
+    """
+    records = []
+    for i, (run, y) in enumerate(zip(seen.runs, seen.measured, strict=True)):
+        close = noise[i] <= CLOSE * seen.size_y * 1.001
+        said: dict[str, Any] = {"worth": np.inf if close else 1.0, "error": noise[i]}
+        if memory is not None:
+            run = tree_with(run, memory[i])
+            said["apart"] = _apart
+        records.append(Record(f"run {i + 1}", predicted, run, y, **said))
+    free = [Free("start", nuisance=True), Free("map", nuisance=callable(of))]
+    free += [Free("offset")] if offset[1] else []
+    model = {"map": of, "start": start, "offset": offset[0]}
+    priors = []
+    if isinstance(of, MLP):
+        priors = [Prior("map.weights", 0.0, WEIGHT), Prior("map.biases", 0.0, WEIGHT)]
+    return Problem(model, free, records, priors)
+
+
+def tree_with(run: Driven, memory: float) -> Driven:
+    """The run with another correlation time of its noise."""
+    parts = (run.point, run.u, run.dt, run.time, run.index, run.run)
+    return Driven(run.physics, *parts, jnp.asarray(float(memory)))

@@ -1,0 +1,107 @@
+"""A run of a process: inputs that were set and outputs that were read, against time."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from beamfit.errors import InputError
+from beamfit.shown import shown
+
+__all__ = ["LEAST", "Run"]
+
+# Fewest readings of an output: fewer cannot tell a response from its start.
+LEAST = 8
+
+
+@shown
+@dataclass(frozen=True, eq=False)
+class Run:
+    """One run.
+
+    Parameters
+    ----------
+    time : array, shape (n,)
+        When each row was taken, s; increasing, at any distances.
+    inputs : mapping of str to array
+        What was set, each shape (n,); a value holds until the next row.
+    outputs : mapping of str to array
+        What was read, each shape (n,); NaN where nothing was.
+    name : str
+        Of the run, for messages.
+    path, sha256 : str
+        The file, if there is one.
+    provenance, notes : tuple of str
+        Comments of the file, and what was done to its numbers.
+
+    Raises
+    ------
+    InputError
+        If lengths differ, times do not increase, an input is not finite, or an output has fewer
+        than 8 readings.
+
+    Examples
+    --------
+    >>> t = np.arange(10.0)
+    >>> print(Run(t, {"valve": t > 3}, {"level": t}))
+    run: 10 rows over 9 s, inputs valve, outputs level
+    """
+
+    time: np.ndarray
+    inputs: Mapping[str, np.ndarray]
+    outputs: Mapping[str, np.ndarray]
+    name: str = "run"
+    path: str | None = None
+    sha256: str = ""
+    provenance: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
+
+    def __post_init__(self):
+        object.__setattr__(self, "time", np.asarray(self.time, float))
+        for kind in ("inputs", "outputs"):
+            columns = {name: np.asarray(v, float) for name, v in getattr(self, kind).items()}
+            object.__setattr__(self, kind, columns)
+            if not columns:
+                raise self.unusable(f"no {kind}", "at least one")
+        n = len(self.time)
+        for name, values in {**self.inputs, **self.outputs}.items():
+            if values.shape != (n,):
+                raise self.unusable(f"{len(values)} values of {name}", f"{n}, one a time")
+        late = np.flatnonzero(~(np.diff(self.time) > 0))
+        if late.size or not np.isfinite(self.time).all():
+            k = int(late[0]) + 1 if late.size else 0
+            before = f" after {self.time[k - 1]:.10g} s" if k else ""
+            raise self.unusable(f"time {self.time[k]:.10g} s{before}", "times that increase", k)
+        for name, values in self.inputs.items():
+            if (bad := np.flatnonzero(~np.isfinite(values))).size:
+                raise self.unusable(f"no value of {name}", "a number", int(bad[0]))
+        for name, values in self.outputs.items():
+            if (read := int(np.isfinite(values).sum())) < LEAST:
+                raise self.unusable(f"{read} readings of {name}", f"at least {LEAST}")
+
+    def unusable(self, found: str, expected: str, row: int | None = None) -> InputError:
+        """Make the error that names the run, and the row if there is one."""
+        place = "" if row is None else f"row {row + 1}: "
+        return InputError(f"{place}{found}", expected, path=self.path or self.name)
+
+    def __len__(self) -> int:
+        return len(self.time)
+
+    @property
+    def step(self) -> float | None:
+        """The distance of the samples, s; None where they are not equal (to 1 %)."""
+        apart = np.diff(self.time)
+        usual = float(np.median(apart))
+        return usual if np.allclose(apart, usual, rtol=0.01, atol=0.0) else None
+
+    @property
+    def headline(self) -> str:
+        """How much there is, in a line."""
+        span = self.time[-1] - self.time[0]
+        kinds = f"inputs {', '.join(self.inputs)}, outputs {', '.join(self.outputs)}"
+        return f"{self.name}: {len(self)} rows over {span:.4g} s, {kinds}"
+
+    def __str__(self) -> str:
+        return self.headline

@@ -1,0 +1,122 @@
+"""Where the search for a response begins: the best of many time constants, the rest linear.
+
+For given time constants the output is linear in gains, offset and first states. A grid of time
+constants with linear least squares finds the basin also where noise ruins equation errors.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from scipy.optimize import minimize
+
+from beamfit.dynamics.response import ARX, FIRST_ORDER, SECOND_ORDER, Physics, simulate
+from beamfit.studies.response.model import Driven, Seen
+
+__all__ = ["Start", "best_start"]
+
+# Time constants of the grid, and dampings of a second order.
+TIMES, DAMPINGS = 16, (0.2, 0.6, 1.0, 2.0)
+
+
+class Start(NamedTuple):
+    """Raw numbers, first states (runs, free states), offset, and the sum of squares."""
+
+    raw: np.ndarray
+    first: np.ndarray
+    offset: float
+    squares: float
+
+
+def best_start(seen: Seen, offset: bool) -> Start:
+    """The best of the grid."""
+    physics = seen.runs[0].physics
+    if physics is ARX:
+        return _as_difference(seen, best_start(_through(seen, SECOND_ORDER), offset))
+    apart = min(float(np.median(np.diff(t))) for t in seen.time)
+    span = max(float(t[-1] - t[0]) for t in seen.time)
+    times = np.geomspace(0.3 * apart, span, TIMES)
+    shapes = np.array([[t] for t in times] if physics is FIRST_ORDER
+                      else [[t, z] for t in times for z in DAMPINGS])  # fmt: skip
+    columns = [np.asarray(_columns(run, shapes)) for run in seen.runs]
+    found = [_fitted(seen, s, [c[i] for c in columns], offset) for i, s in enumerate(shapes)]
+    best = min(range(len(shapes)), key=lambda i: found[i].squares)
+
+    def at(logarithms: np.ndarray) -> Start:
+        shape = np.exp(np.clip(logarithms, *np.log([1e-3 * apart, 1e3 * span])))
+        there = [np.asarray(_columns(run, shape[None]))[0] for run in seen.runs]
+        return _fitted(seen, shape, there, offset)
+
+    # To a hundredth of a time constant: delays are compared by what remains.
+    begin = np.log(shapes[best])
+    simplex = begin + 0.3 * np.vstack([np.zeros(len(begin)), np.eye(len(begin))])
+    options = {"initial_simplex": simplex, "xatol": 0.01, "fatol": 0.0, "maxiter": 40}
+    end = minimize(lambda x: at(x).squares, begin, method="Nelder-Mead", options=options)
+    return min(at(end.x), found[best], key=lambda each: each.squares)
+
+
+@jax.jit
+def _columns(run: Driven, shapes: jax.Array) -> jax.Array:
+    """Outputs for unit gains and unit first states, shape (shapes, columns, readings)."""
+    m, k = run.u.shape[1], run.physics.free_states
+
+    def one(shape, gains, first):
+        p = jnp.broadcast_to(jnp.concatenate([shape, gains]), (len(run.u), len(shape) + m))
+        return simulate(run.physics, p, run.u, run.dt, first)[run.index]
+
+    gains = jnp.concatenate([jnp.eye(m), jnp.zeros((k, m))])
+    firsts = jnp.concatenate([jnp.zeros((m, k)), jnp.eye(k)])
+    each = jax.vmap(one, in_axes=(None, 0, 0))
+    return jax.vmap(each, in_axes=(0, None, None))(shapes, gains, firsts)
+
+
+def _fitted(seen: Seen, shape: np.ndarray, columns: list[np.ndarray], offset: bool) -> Start:
+    m, k, runs = len(seen.inputs), seen.runs[0].physics.free_states, len(columns)
+    parts = []
+    for i, column in enumerate(columns):
+        first = np.zeros((column.shape[1], runs * k))
+        first[:, i * k : (i + 1) * k] = column[m:].T
+        parts.append(np.hstack([column[:m].T, first, np.ones((len(first), 1))]))
+    design, y = np.vstack(parts), np.concatenate(seen.measured)
+    if not offset:
+        design = design[:, :-1]
+    size = np.linalg.norm(design, axis=0)
+    size = np.where(size > 0, size, 1.0)
+    found = np.linalg.lstsq(design / size, y, rcond=1e-10)[0] / size
+    rest = float(np.sum((design @ found - y) ** 2))
+    raw = np.concatenate([np.log(shape), found[:m]])
+    first = found[m : m + runs * k].reshape(runs, k)
+    return Start(raw, first, float(found[-1]) if offset else 0.0, rest)
+
+
+def _through(seen: Seen, physics: Physics) -> Seen:
+    runs = tuple(
+        Driven(physics, r.point, r.u, r.dt, r.time, r.index, r.run, r.memory) for r in seen.runs
+    )
+    return seen._replace(runs=runs)
+
+
+def _as_difference(seen: Seen, found: Start) -> Start:
+    """The difference equation whose samples are those of a second order (eqs 13-16)."""
+    m = len(seen.inputs)
+    dt = float(np.median(np.asarray(seen.runs[0].dt)[: len(seen.time[0]) - 1]))
+    p = np.asarray(SECOND_ORDER.physical(jnp.asarray(found.raw), m))
+    advance = partial(SECOND_ORDER.advance, jnp.asarray(p), dt=dt)
+    rest = np.column_stack([advance(jnp.asarray(e), jnp.zeros(m)) for e in np.eye(2)])
+    a1, a2 = -np.trace(rest), np.linalg.det(rest)
+    once = np.stack([np.asarray(advance(jnp.zeros(2), jnp.asarray(e))) for e in np.eye(m)])
+    twice = np.stack([np.asarray(advance(jnp.asarray(s), jnp.asarray(e)))
+                      for s, e in zip(once, np.eye(m), strict=True)])  # fmt: skip
+    b1 = once[:, 0]
+    b2 = twice[:, 0] + a1 * b1 - b1
+    raw = ARX.raw(jnp.asarray(np.concatenate([[a1, a2], b1, b2])), m)
+    # The sample before the first, by running the state backwards.
+    states = np.stack([
+        [s[0], np.linalg.solve(rest, s - np.stack(once, axis=1) @ np.asarray(r.u[0]))[0]]
+        for s, r in zip(found.first, seen.runs, strict=True)
+    ])  # fmt: skip
+    return Start(np.asarray(raw), states, found.offset, found.squares)

@@ -1,0 +1,134 @@
+"""The verdict on an identified response, by rules in order of gravity."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+
+from beamfit.greybox.fit import Fit
+from beamfit.quantity import Quantity
+from beamfit.statistics import POOR_FIT
+from beamfit.status import Status
+from beamfit.studies.response.checks import Checks, HeldBack
+from beamfit.studies.response.curve import Curve
+from beamfit.verdict import Finding, judge
+
+__all__ = ["judged"]
+
+# A curve of which less than this share has an error is not determined.
+HALF = 0.5
+# Held-back runs are predicted where their residual is at most so many times that of the fit.
+WORSE = 2.0
+
+
+class Evidence(NamedTuple):
+    """What the rules look at."""
+
+    fit: Fit
+    rests: bool
+    checks: Checks
+    quantities: Mapping[str, Quantity]
+    curves: tuple[Curve, ...]
+    held: tuple[HeldBack, ...]
+    map: str
+    rms: float
+
+
+def judged(
+    fit: Fit,
+    rests: bool,
+    checks: Checks,
+    quantities: Mapping[str, Quantity],
+    curves: tuple[Curve, ...],
+    held: tuple[HeldBack, ...],
+    map: str,
+) -> tuple[Status, str]:
+    """Status and sentences."""
+    rms = float(np.sqrt(np.mean(np.square(_rms(fit)))))
+    found = judge(Evidence(fit, rests, checks, quantities, curves, held, map, rms), RULES)
+    return found.status, found.message
+
+
+def _rms(fit: Fit) -> list[float]:
+    return [float(group.scale * np.mean(np.asarray(record.error)))
+            for group, record in zip(fit.groups, fit.problem.records, strict=True)]  # fmt: skip
+
+
+def _lost(e: Evidence) -> Finding | None:
+    if e.rests:
+        return None
+    lost = e.fit.status is Status.not_finite
+    return Finding(Status.not_finite if lost else Status.not_converged, e.fit.message)
+
+
+def _nothing(e: Evidence) -> Finding | None:
+    if e.checks.nothing_probability < POOR_FIT:
+        return None
+    cause = "The inputs explain no more of the output than chance would."
+    remedy = "Move the inputs further, record longer, or look for what else drives the output."
+    return Finding(Status.unidentified, cause, remedy)
+
+
+def _open(e: Evidence) -> Finding | None:
+    left = [name for name, q in e.quantities.items() if q.error is None or _wide(q)]
+    left += [
+        f"{c.parameter}({c.input})"
+        for c in e.curves
+        if np.mean(np.isfinite(c.error) & c.visited) < HALF
+    ]
+    if not left:
+        return None
+    cause = f"The runs do not determine {', '.join(left)}."
+    slow = any("tau" in name or name == "T" for name in left)
+    remedy = "Sample faster around steps, and wait until the output settles." if slow else (
+        "Move the inputs over more of their range.")  # fmt: skip
+    return Finding(Status.unidentified, cause, remedy)
+
+
+def _wide(q: Quantity) -> bool:
+    """Whether a time constant is not told from zero or from without end."""
+    return q.unit == "s" and q.error is not None and q.error > 0.5 * abs(q.value)
+
+
+def _refuted(e: Evidence) -> Finding | None:
+    c = e.checks
+    if c.input_probability >= POOR_FIT:
+        return None
+    cause = (
+        f"Past inputs explain {100 * c.input_share:.0f} % of the residuals "
+        f"(p = {c.input_probability:.1g}), so the model lacks a part of the response; the free run "
+        f"explains {c.free_run_percent:.1f} % of the output."
+    )
+    more = "parameters that change with the operating point (--map network), or a higher order"
+    more = "a higher order" if e.map == "network" else more
+    return Finding(Status.poor_fit, cause, f"Try {more}.")
+
+
+def _worse(e: Evidence) -> Finding | None:
+    bad = [h for h in e.held if h.rms > WORSE * e.rms]
+    if not bad:
+        return None
+    cause = (
+        f"Run {bad[0].name}, held back, is predicted with a residual of {bad[0].rms:.3g} rms, "
+        f"where the fit has {e.rms:.3g}."
+    )
+    remedy = "The model does not carry over: use runs that cover its range, or fewer hidden nodes."
+    return Finding(Status.poor_fit, cause, remedy)
+
+
+def _good(e: Evidence) -> Finding:
+    cause = f"The free run explains {e.checks.free_run_percent:.2f} % of the output."
+    if e.checks.white_probability < POOR_FIT:
+        cause += " The noise has a memory, which the errors contain."
+    gain = e.checks.against_constant
+    if gain is not None and gain < 0:
+        cause += " Constant parameters do as well (BIC): the operating point need not be in it."
+    never = {c.input for c in e.curves if not c.visited.all()}
+    if never:
+        cause += f" Parts of the range of {', '.join(sorted(never))} were not visited."
+    return Finding(Status.converged, cause)
+
+
+RULES = (_lost, _nothing, _open, _refuted, _worse, _good)
