@@ -13,6 +13,7 @@ from beamfit.cli.check import check
 from beamfit.cli.design import design
 from beamfit.cli.emittance import emittance
 from beamfit.cli.example import example
+from beamfit.cli.identify import identify
 from beamfit.cli.lifetime import lifetime
 from beamfit.cli.setpoint import setpoint
 from beamfit.cli.solve import solve
@@ -37,6 +38,7 @@ cli.add_command(design)
 cli.add_command(example)
 cli.add_command(check)
 cli.add_command(solve)
+cli.add_command(identify)
 
 
 def main() -> None:

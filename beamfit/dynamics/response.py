@@ -134,8 +134,8 @@ def _stable(q, m):
 
 
 def _unstable(p, m):
-    a2 = jnp.clip(p[1], -0.999, 0.999)
-    a1 = jnp.clip(p[0] / (1.0 + a2), -0.999, 0.999)
+    a2 = jnp.clip(p[1], -0.999999, 0.999999)
+    a1 = jnp.clip(p[0] / (1.0 + a2), -0.999999, 0.999999)
     return jnp.concatenate([jnp.arctanh(jnp.stack([a1, a2])), p[2:]])
 
 

@@ -17,22 +17,26 @@ from beamfit.report.emittance import emittance_page
 from beamfit.report.formulation import formulation_page
 from beamfit.report.pdf import pdf_of
 from beamfit.report.posterior import Sampled, of_decay, of_scan, with_posteriors
+from beamfit.report.response import response_page
 from beamfit.report.slices import slices_page
 from beamfit.sampling.posterior import Posterior
 from beamfit.studies.decay.fit import DecayFit
 from beamfit.studies.decay.shift import Shift
 from beamfit.studies.decay.study import RecordStudy
 from beamfit.studies.decay.trend import Trend
+from beamfit.studies.response.fit import ResponseFit
 from beamfit.studies.scan.fit import EmittanceFit
 from beamfit.studies.scan.size_methods import SizeMethods
 from beamfit.studies.scan.slices import SliceFits
 
 __all__ = ["write_report"]
 
+Reported = EmittanceFit | SliceFits | DecayFit | Solution | ResponseFit
+
 
 def write_report(
     path: str | PathLike[str],
-    result: EmittanceFit | SliceFits | DecayFit | Solution | Sequence[RecordStudy],
+    result: Reported | Sequence[RecordStudy] | Sequence[ResponseFit],
     posterior: Posterior | Sequence[Posterior] | None = None,
     *,
     command: str | None = None,
@@ -47,9 +51,10 @@ def write_report(
     ----------
     path : str or path
         Ends in ``.html`` (self-contained) or ``.pdf``. An existing file is replaced whole.
-    result : EmittanceFit, SliceFits, DecayFit, Solution, or sequence of RecordStudy
+    result : EmittanceFit, SliceFits, DecayFit, Solution, ResponseFit, or sequence
         The emittance of a scan or of the slices of a beam, the lifetime of a decay, a formulation
-        solved, or the lifetimes of whole records.
+        solved, the response of a process; or a sequence of RecordStudy (the lifetimes of whole
+        records) or of ResponseFit (several outputs).
     posterior : Posterior or sequence of Posterior, optional
         What `sample` of the fit gave; of records one for each decay.
     command : str, optional
@@ -85,17 +90,22 @@ def write_report(
     if suffix not in (".html", ".pdf"):
         raise InputError(f"report '{path}'", "a name ending in .html or .pdf", path=path)
     with rc_context(STYLE):
-        if isinstance(result, EmittanceFit):
-            page = emittance_page(result, command, inputs, methods)
-            sampled = [] if posterior is None else [of_scan(result, posterior)]
-        elif isinstance(result, Solution):
-            page, sampled = formulation_page(result, command, inputs), []
-        elif isinstance(result, SliceFits):
-            page, sampled = slices_page(result, command, inputs), []
-        else:
-            studies = (study_of(result),) if isinstance(result, DecayFit) else result
-            page = decay_page(studies, command, inputs, shift, trend)
-            sampled = _of_decays(studies, posterior)
+        several = tuple(result) if isinstance(result, list | tuple) else (result,)
+        sampled: list[Sampled] = []
+        match several[0]:
+            case EmittanceFit() as fit:
+                page = emittance_page(fit, command, inputs, methods)
+                sampled = [] if posterior is None else [of_scan(fit, posterior)]
+            case Solution() as solution:
+                page = formulation_page(solution, command, inputs)
+            case SliceFits() as slices:
+                page = slices_page(slices, command, inputs)
+            case ResponseFit():
+                page = response_page(several, command, inputs)
+            case first:
+                studies = (study_of(first),) if isinstance(first, DecayFit) else several
+                page = decay_page(studies, command, inputs, shift, trend)
+                sampled = _of_decays(studies, posterior)
         page = with_posteriors(page, sampled)
         content = html_of(page) if suffix == ".html" else pdf_of(page)
     write_atomically(path, content)

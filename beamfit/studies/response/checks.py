@@ -10,13 +10,20 @@ from scipy.stats import chi2, f
 
 from beamfit.dynamics.response import Physics, simulate
 from beamfit.greybox.fit import Fit
-from beamfit.studies.response.model import CLOSE, Seen, driven, parameters_at
+from beamfit.studies.response.model import (
+    CLOSE,
+    Seen,
+    changed_by,
+    driven,
+    parameters_at,
+    predicted,
+)
 from beamfit.studies.response.record import Run
 
 __all__ = ["Checks", "HeldBack", "checks_of", "predict_held"]
 
-# Lags of the tests at most.
-LAGS = 20
+# Lags of the tests at most: of residuals, and of inputs.
+LAGS, PAST = 20, 10
 
 
 class Checks(NamedTuple):
@@ -33,10 +40,10 @@ class Checks(NamedTuple):
     white_probability : float
         Chance of so large correlations of the residuals in white noise (Ljung and Box 1978).
     input_probability : float
-        Chance that past inputs and their squares explain so much of the whitened residuals if
-        they have no part in them (F).
+        Chance that past inputs, or parameters that change with the operating point, explain so
+        much of the whitened residuals if they have no part in them (F).
     input_share : float
-        The part of the whitened residuals' squares that they explain.
+        The part of the whitened residuals' squares that these explain.
     against_constant : float or None
         By how much the Bayesian information criterion falls from constant parameters.
     """
@@ -90,7 +97,7 @@ def checks_of(
     rest = np.concatenate(residuals)
     share = _share(residuals)
     ahead = np.concatenate([_whitened(r, share) for r in residuals])
-    explained, chance = _explained(seen, residuals, share, used)
+    explained, chance = _explained(seen, residuals, fit, share)
     if rest.std() <= CLOSE * seen.size_y:  # what is left is rounding, or the network's own detail
         explained, chance = 0.0, 1.0
     return Checks(
@@ -131,29 +138,40 @@ def _white(residuals: tuple[np.ndarray, ...]) -> float:
 
 
 def _explained(
-    seen: Seen, residuals: tuple[np.ndarray, ...], share: float, used: int
+    seen: Seen, residuals: tuple[np.ndarray, ...], fit: Fit, share: float
 ) -> tuple[float, float]:
-    """How much past inputs explain of the residuals, both whitened alike, and its chance."""
-    parts, targets = [], []
-    lags = int(np.clip(sum(map(len, residuals)) // (10 * len(seen.inputs)), 1, LAGS))
+    """How much of the residuals a fuller model would explain, and its chance, all whitened alike.
+
+    A score test (Lagrange multipliers): columns are past inputs, and the slopes of the output by
+    parameters that change with the operating point, less what the model's own numbers can do.
+    """
+    own, further, targets = [], [], []
     for run, r in zip(seen.runs, residuals, strict=True):
         u = (np.asarray(run.u) - seen.mean_u) / np.where(seen.size_u > 0, seen.size_u, 1.0)
         index = np.asarray(run.index)
-        late = [u[np.maximum(index - k, 0)] for k in range(1, lags + 1)]
-        columns = np.concatenate([v for each in late for v in (each, each**2)], axis=1)
-        parts.append(columns[1:] - share * columns[:-1])
+        past = [u[np.maximum(index - k, 0)] for k in range(1, PAST + 1)]
+        slopes = changed_by(fit.model, run, np.concatenate([u, u**2], axis=1))
+        further.append(_whitened(np.concatenate([*past, np.asarray(slopes)], axis=1), share))
+        own.append(_whitened(fit.derive(predicted, run).slope, share))
         targets.append(_whitened(r, share))
-    design, target = np.vstack(parts), np.concatenate(targets)
-    design = design - design.mean(axis=0)
-    target = target - target.mean()
-    basis, size, _ = np.linalg.svd(design, full_matrices=False)
-    basis = basis[:, size > 1e-6 * size.max(initial=1e-300)]
-    inside, whole = float(np.sum((basis.T @ target) ** 2)), float(target @ target)
-    k, left = basis.shape[1], len(target) - basis.shape[1] - used - 1
+    target = np.concatenate(targets)
+    basis = _basis(np.vstack(own))
+    rest = target - basis @ (basis.T @ target)
+    columns = np.vstack(further)
+    new = _basis(columns - basis @ (basis.T @ columns), np.linalg.norm(columns, axis=0))
+    k, left = new.shape[1], len(target) - basis.shape[1] - new.shape[1]
+    inside, whole = float(np.sum((new.T @ rest) ** 2)), float(rest @ rest)
     if left < 1 or whole <= 0 or k == 0:
         return 0.0, 1.0
     ratio = (inside / k) / max((whole - inside) / left, 1e-300)
     return inside / whole, float(f.sf(ratio, k, left))
+
+
+def _basis(columns: np.ndarray, size: np.ndarray | None = None) -> np.ndarray:
+    """Orthonormal columns that span these; those that are nothing beside their size are none."""
+    size = np.linalg.norm(columns, axis=0) if size is None else size
+    found, values, _ = np.linalg.svd(columns / np.where(size > 0, size, 1.0), full_matrices=False)
+    return found[:, values > 1e-6]
 
 
 def predict_held(run: Run, output: str, fit: Fit, physics: Physics, delay: int) -> HeldBack:

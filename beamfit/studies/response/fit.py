@@ -359,4 +359,4 @@ def _memory(rest: np.ndarray, time: np.ndarray) -> float:
     """The correlation time of residuals from their neighbours, s."""
     rest = rest - rest.mean()
     share = float(rest[1:] @ rest[:-1]) / max(float(rest @ rest), 1e-300)
-    return float(np.median(np.diff(time))) / -np.log(np.clip(share, 1e-3, 0.999))
+    return float(np.median(np.diff(time)) / -np.log(np.clip(share, 1e-3, 0.999)))

@@ -79,11 +79,14 @@ def driven(run: Run, number: int, output: str, physics: Physics, delay: int) -> 
     return Driven(physics, *arrays, jnp.asarray(number), jnp.asarray(1.0))
 
 
-def parameters_at(physics: Physics, of: Any, point: jax.Array) -> jax.Array:
-    """Parameters p at operating points, shape (points, parameters); `of` a map, or raw numbers."""
+def parameters_at(physics: Physics, of: Any, point: jax.Array, more: Any = 0.0) -> jax.Array:
+    """Parameters p at operating points, shape (points, parameters); `of` a map, or raw numbers.
+
+    `more` is added to the raw numbers.
+    """
     m = point.shape[1]
     raw = jax.vmap(of)(point) if callable(of) else jnp.broadcast_to(of, (len(point), len(of)))
-    return jax.vmap(lambda q: physics.physical(q, m))(raw)
+    return jax.vmap(lambda q: physics.physical(q, m))(raw + more)
 
 
 def predicted(model: Any, seen: Driven) -> jax.Array:
@@ -94,6 +97,24 @@ def predicted(model: Any, seen: Driven) -> jax.Array:
 
 
 output_of = jax.jit(predicted)
+
+
+@jax.jit
+def changed_by(model: Any, seen: Driven, scaled: jax.Array) -> jax.Array:
+    """Slopes of the output by parameters that change with the operating point.
+
+    The raw numbers get S s more, where s holds the scaled inputs and their squares, shape
+    (samples, 2 m); the slopes are by S at 0, shape (readings, parameters * 2 m).
+    """
+    start = model["start"][seen.run]
+    count = parameters_at(seen.physics, model["map"], seen.point[:1]).shape[1]
+
+    def output(more):
+        p = parameters_at(seen.physics, model["map"], seen.point, scaled @ more.T)
+        return simulate(seen.physics, p, seen.u, seen.dt, start)[seen.index]
+
+    slopes = jax.jacfwd(output)(jnp.zeros((count, scaled.shape[1])))
+    return slopes.reshape(len(slopes), -1)
 
 
 def _apart(model: Any, seen: Driven) -> jax.Array:

@@ -97,9 +97,9 @@ def _refuted(e: Evidence) -> Finding | None:
     if c.input_probability >= POOR_FIT:
         return None
     cause = (
-        f"Past inputs explain {100 * c.input_share:.0f} % of the residuals "
-        f"(p = {c.input_probability:.1g}), so the model lacks a part of the response; the free run "
-        f"explains {c.free_run_percent:.1f} % of the output."
+        f"Past inputs, or parameters that change with them, explain {100 * c.input_share:.0f} % of "
+        f"the residuals (p = {c.input_probability:.1g}): the model lacks a part of the response. "
+        f"The free run explains {c.free_run_percent:.1f} % of the output."
     )
     more = "parameters that change with the operating point (--map network), or a higher order"
     more = "a higher order" if e.map == "network" else more

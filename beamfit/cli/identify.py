@@ -1,0 +1,121 @@
+"""`beamfit identify`: records of runs in, judged responses out."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import click
+
+from beamfit.cli.options import command_line, options
+from beamfit.errors import InputError
+from beamfit.io.files import digest
+
+if TYPE_CHECKING:
+    from beamfit.studies.response.fit import ResponseFit
+
+__all__ = ["identify"]
+
+EXAMPLE = """\b
+Examples:
+  beamfit identify run.csv --model first-order
+  beamfit identify monday.csv tuesday.csv --model second-order --map network --report process.html
+  beamfit identify log.csv --input Valve --output Level --step 4 --hold-back friday.csv --json
+"""
+
+
+@click.command(epilog=EXAMPLE)
+@click.argument("record", nargs=-1, required=True)
+@click.option(
+    "--model",
+    type=click.Choice(["first-order", "second-order", "arx"]),
+    default="first-order",
+    show_default=True,
+    help="tau y' + y = K u; T² y'' + 2 zeta T y' + y = K u; or y(k) = -a1 y(k-1) - a2 y(k-2) + "
+    "b1 u(k-1) + b2 u(k-2).",
+)
+@click.option(
+    "--map",
+    type=click.Choice(["constant", "network"]),
+    default="constant",
+    show_default=True,
+    help="Parameters are numbers, or change with the inputs by a network.",
+)
+@click.option("--input", "inputs", multiple=True, metavar="COLUMN", help="An input of any name.")
+@click.option("--output", "outputs", multiple=True, metavar="COLUMN", help="An output of any name.")
+@click.option("--step", type=float, metavar="SECONDS", help="Distance of rows without a time.")
+@click.option(
+    "--delay", type=click.IntRange(0), metavar="SAMPLES", help="Known delay; found unless said."
+)
+@click.option("--no-offset", is_flag=True, help="The output at rest is 0, and not estimated.")
+@click.option("--hidden", type=click.IntRange(1, 50), default=6, show_default=True,
+              help="Hidden nodes of the network.")  # fmt: skip
+@click.option("--hold-back", multiple=True, metavar="RECORD", help="A run that is only predicted.")
+@options("ignore skip-bad seed report json")
+def identify(
+    record: tuple[str, ...],
+    model: str,
+    map: str,
+    inputs: tuple[str, ...],
+    outputs: tuple[str, ...],
+    step: float | None,
+    delay: int | None,
+    no_offset: bool,
+    hidden: int,
+    hold_back: tuple[str, ...],
+    ignore: tuple[str, ...],
+    skip_bad: bool,
+    seed: int,
+    report: str | None,
+    as_json: bool,
+) -> None:
+    """Identify how the outputs of a process respond to its inputs.
+
+    RECORD is a CSV or HDF5 file with time_s, inputs u_… that hold from row to row, and outputs y_…;
+    several runs are identified together. Each output gives its parameters with errors (as curves of
+    the operating point with --map network), tests of the residuals, and a verdict.
+    """
+    from beamfit.io.run import read_run  # numpy
+
+    said = {"inputs": inputs, "outputs": outputs, "step": step}
+    said |= {"ignore": ignore, "skip_bad": skip_bad}
+    twice = [path for path in record if (*record, *hold_back).count(path) > 1]
+    if twice:
+        raise InputError("a run given twice", "each run once", path=twice[0])
+    runs = [read_run(path, **said) for path in record]
+    held = [read_run(path, **said) for path in hold_back]
+
+    from beamfit.studies.response.fit import identify as fit_response  # JAX from here on
+
+    options = {"delay": delay, "offset": not no_offset, "hidden": hidden, "seed": seed}
+    fits = [
+        fit_response(runs, model, map, output=name, held=held, **options)
+        for name in runs[0].outputs
+    ]
+    digests = {path: digest(path) for path in (*record, *hold_back)}
+    if report is not None:
+        from beamfit.report.page import write_report
+
+        write_report(report, fits, command=command_line(), inputs=digests)
+    if as_json:
+        from beamfit.io.result import results_text
+
+        click.echo(results_text([fit.to_json() for fit in fits], digests, command_line()))
+        return
+    _show(fits, report)
+
+
+def _show(fits: list[ResponseFit], report: str | None) -> None:
+    from beamfit.cli.show import Terminal
+
+    terminal = Terminal()
+    for run in fits[0].runs:
+        terminal.line(run.headline, style="bold")
+        for note in run.notes:
+            terminal.line(f"Note: {note}")
+    for fit in fits:
+        terminal.answer(fit.headline, fit.status, fit.message)
+        terminal.line()
+        for table in fit.tables():
+            terminal.table(table)
+            terminal.line()
+    terminal.report(report)

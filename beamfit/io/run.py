@@ -1,0 +1,140 @@
+"""Records of runs: time, inputs u_… and outputs y_… in the columns of a file."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import replace
+from os import PathLike
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from beamfit.errors import InputError, nearest
+from beamfit.io.dates import unix_time
+from beamfit.io.table import Column, Sheet, columns_of, left_out, read_sheet
+from beamfit.studies.response.record import Run
+
+if TYPE_CHECKING:
+    from pandas import DataFrame
+
+__all__ = ["read_run"]
+
+MOST_ROWS = 2_000_000
+DATE, ASIDE, TIME = "a date", "aside", "time"
+EXAMPLE = "time_s,u_valve,y_level"
+
+
+def read_run(
+    path: str | PathLike[str] | DataFrame,
+    *,
+    inputs: Iterable[str] = (),
+    outputs: Iterable[str] = (),
+    step: float | None = None,
+    ignore: Iterable[str] = (),
+    skip_bad: bool = False,
+) -> Run:
+    """Read a run of a process.
+
+    Parameters
+    ----------
+    path : str, path or pandas.DataFrame
+        A frame, CSV or HDF5 with ``time_s`` (_min, _h, _ms; or ``time`` with dates), inputs ``u_…``
+        and outputs ``y_…``. A blank output was not read.
+    inputs, outputs : iterable of str
+        Columns of other names that are inputs or outputs; what is not named is then left aside.
+    step : float, optional
+        Distance of the rows in s, of a file without a time.
+    ignore : iterable of str
+        Columns to leave unread; * and ? stand for any letters.
+    skip_bad : bool
+        Leave out rows with something wrong in them; ``notes`` counts and names them.
+
+    Returns
+    -------
+    Run
+
+    Raises
+    ------
+    InputError
+        With file, line and column, if a column is missing or unknown, a cell is not a number, or
+        times do not increase.
+
+    Examples
+    --------
+    >>> import pathlib, tempfile
+    >>> file = pathlib.Path(tempfile.mkdtemp()) / "run.csv"
+    >>> rows = "".join(f"{k},{int(k > 2)},{k / 9}\\n" for k in range(10))
+    >>> _ = file.write_text("time_s,u_valve,y_level\\n" + rows)
+    >>> print(read_run(file))
+    run.csv: 10 rows over 9 s, inputs valve, outputs level
+    """
+    sheet = read_sheet(path, EXAMPLE, MOST_ROWS, ragged=skip_bad).without(ignore)
+    named = {"u": tuple(inputs), "y": tuple(outputs)}
+    columns = _columns(sheet, named)
+    if TIME not in columns and step is None:
+        raise sheet.header_error("no column of time", "time_s, or --step SECONDS")
+    kinds = {kind: {k[2:]: c for k, c in columns.items() if k.startswith(f"{kind}_")}
+             for kind in "uy"}  # fmt: skip
+    for kind, word in (("u", "input"), ("y", "output")):
+        if not kinds[kind]:
+            raise sheet.header_error(f"no {word}", f"a column {kind}_…, or --{word} COLUMN")
+    if skip_bad:
+        sheet = sheet.good(lambda rows: _values(rows, columns, kinds))
+    time, u, y = _values(sheet, columns, kinds)
+    if time is None:
+        time = float(step) * np.arange(len(sheet)) if step and step > 0 else None
+    if time is None:
+        raise InputError(f"--step {step}", "seconds between the rows, above 0")
+    late = np.flatnonzero(~(np.diff(time) > 0))
+    if late.size:
+        row = int(late[0]) + 1
+        found = f"time {time[row]:.10g} s after {time[row - 1]:.10g} s"
+        raise sheet.error(found, "times that increase", row, columns[TIME].header)
+    name = Path(sheet.path).name
+    said = {"provenance": sheet.comments, "notes": left_out(sheet), "sha256": sheet.sha256}
+    return Run(time, u, y, name=name, path=str(sheet.path), **said)
+
+
+def _columns(sheet: Sheet, named: dict[str, tuple[str, ...]]) -> dict[str, Column]:
+    """Every column that is read, under ``time``, ``u_…`` or ``y_…``."""
+    found = {}
+    for kind, names in named.items():
+        for name in names:
+            if name not in sheet.names:
+                raise sheet.header_error(f"no column '{name}'", nearest(name, list(sheet.names)))
+            found[name] = Column(name, f"{kind}_{name}")
+    any_named = bool(found)
+
+    def other(header: str) -> Column | None:
+        if header in found:
+            return found[header]
+        if header.lower() == TIME:
+            return Column(header, TIME, DATE)
+        if header[:2] in ("u_", "y_") and len(header) > 2 and not any_named:
+            return Column(header, header)
+        aside = any_named or header.startswith("note_")
+        return Column(header, f"{ASIDE} {header}") if aside else None
+
+    left = [n for n in sheet.names if n not in found]
+    rest = replace(sheet, names=tuple(left), cells=[sheet[n] for n in left])
+    known = columns_of(rest, {TIME: "time"}, other) if left else {}
+    return {k: c for k, c in known.items() if not k.startswith(ASIDE)} | {
+        c.key: c for c in found.values()
+    }
+
+
+def _values(
+    sheet: Sheet, columns: dict[str, Column], kinds: dict[str, dict[str, Column]]
+) -> tuple[np.ndarray | None, dict[str, np.ndarray], dict[str, np.ndarray]]:
+    time = None
+    if TIME in columns:
+        header, unit = columns[TIME].header, columns[TIME].unit
+        if unit == DATE:
+            expected = "an ISO 8601 time, such as 2024-03-01T12:00:00+01:00"
+            time = sheet.numbers(header, read=unix_time, expected=expected)
+        else:
+            time = sheet.numbers(header) * columns[TIME].factor
+    u = {name: sheet.numbers(c.header) for name, c in kinds["u"].items()}
+    y = {name: sheet.numbers(c.header, blank=True) for name, c in kinds["y"].items()}
+    return time, u, y

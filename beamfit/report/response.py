@@ -1,0 +1,118 @@
+"""The report of an identified response."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from functools import partial
+
+import numpy as np
+from matplotlib.figure import FigureBase
+
+from beamfit.report.document import BLUE, RED, Page, Picture, Verdict, provenance, written
+from beamfit.studies.response.fit import ResponseFit
+
+__all__ = ["response_page"]
+
+NOTES = (
+    "Errors are one standard deviation. The model runs free from the start of each run: measured "
+    "outputs enter through their residuals only. Bands are one standard deviation; where they are "
+    "missing the data put none on the curve, or were never there.",
+)
+# Points drawn of one run, and runs drawn.
+MOST, RUNS = 4000, 6
+
+
+def response_page(
+    fits: Sequence[ResponseFit], command: str | None, inputs: Mapping[str, str | None] | None
+) -> Page:
+    """Lay out the responses of some outputs."""
+    first = fits[0]
+    names = ", ".join(run.name for run in first.runs)
+    digests = inputs or {run.path or run.name: run.sha256 or None for run in first.runs}
+    pictures = [picture for fit in fits for picture in _pictures(fit)]
+    remarks = [("said in " + run.name, line) for run in first.runs for line in run.provenance]
+    return Page(
+        title=f"Response of {', '.join(fit.output for fit in fits)}",
+        subtitle=f"identified from {names}; {written()}",
+        verdicts=[Verdict(fit.status, fit.headline, fit.message) for fit in fits],
+        tables=[table for fit in fits for table in fit.tables()],
+        pictures=pictures,
+        pictures_title="Measured and simulated",
+        provenance=provenance(digests, remarks, command),
+        notes=NOTES,
+    )
+
+
+def _pictures(fit: ResponseFit) -> list[Picture]:
+    runs = range(min(len(fit.runs), RUNS))
+    found = [
+        Picture(f"{fit.output} measured and simulated in {fit.runs[i].name}", 4.2,
+                partial(_draw_run, fit, i))
+        for i in runs
+    ]  # fmt: skip
+    found += [
+        Picture(f"{c.parameter} against {c.input} with its band", 2.8, partial(_draw_curve, fit, j))
+        for j, c in enumerate(fit.curves)
+    ]
+    return [*found, Picture(f"Correlations of the residuals of {fit.output}", 2.8,
+                            partial(_draw_correlations, fit))]  # fmt: skip
+
+
+def _draw_run(fit: ResponseFit, i: int, figure: FigureBase) -> None:
+    """Measured and simulated output, their difference, and the inputs."""
+    run, time, y = fit.runs[i], fit.seen.time[i], fit.seen.measured[i]
+    simulated = fit.fitted[i]
+    thin = slice(None, None, max(1, len(time) // MOST))
+    above, middle, below = figure.subplots(3, 1, sharex=True, height_ratios=(3, 1, 1))
+    above.plot(time[thin], y[thin], ".", color="0.6", markersize=3, label="measured")
+    above.plot(time[thin], simulated[thin], color=BLUE, label="simulated")
+    above.set_ylabel(fit.output)
+    above.set_title(run.name)
+    above.legend(frameon=False, loc="best", fontsize=8)
+    middle.plot(time[thin], (y - simulated)[thin], ".", color=RED, markersize=2)
+    middle.axhline(0.0, color="0.7", linewidth=0.8)
+    middle.set_ylabel("difference")
+    for name, values in run.inputs.items():
+        below.step(run.time[thin], values[thin], where="post", label=name)
+    below.set_ylabel("inputs")
+    below.set_xlabel("time (s)")
+    if len(run.inputs) > 1:
+        below.legend(frameon=False, fontsize=8, ncols=len(run.inputs))
+
+
+def _draw_curve(fit: ResponseFit, j: int, figure: FigureBase) -> None:
+    """A parameter against the operating point, dashed where the runs never were."""
+    c = fit.curves[j]
+    axes = figure.subplots()
+    known = c.visited & np.isfinite(c.error)
+    axes.plot(c.at, c.value, "--", color="0.6", linewidth=1)
+    axes.plot(c.at, np.where(c.visited, c.value, np.nan), color=BLUE)
+    low, high = (np.where(known, c.value + s * c.error, np.nan) for s in (-1, 1))
+    axes.fill_between(c.at, low, high, color=BLUE, alpha=0.25, linewidth=0)
+    axes.set_xlabel(c.input)
+    axes.set_ylabel(f"{c.parameter} ({c.unit})" if c.unit == "s" else c.parameter)
+    if c.visited.any():  # the band where data were; a wild end elsewhere is cut off
+        inside = np.concatenate([low[known], high[known], c.value[c.visited]])
+        edge = 0.15 * max(float(np.ptp(inside)), 1e-12)
+        axes.set_ylim(inside.min() - edge, inside.max() + edge)
+
+
+def _draw_correlations(fit: ResponseFit, figure: FigureBase) -> None:
+    """Correlation of residuals with themselves and with past inputs, with the 99 % band of none."""
+    own, others = figure.subplots(1, 2)
+    rest = [y - s for y, s in zip(fit.seen.measured, fit.fitted, strict=True)]
+    count, lags = sum(map(len, rest)), np.arange(1, 21)
+    limit = 2.58 / np.sqrt(count)
+    squares = sum(float(r @ r) for r in rest)
+    own.bar(lags, [sum(float(r[k:] @ r[:-k]) for r in rest) / squares for k in lags], color=BLUE)
+    for j, name in enumerate(fit.seen.inputs):
+        u = [(np.asarray(d.u)[np.asarray(d.index), j] - fit.seen.mean_u[j]) for d in fit.seen.runs]
+        size = np.sqrt(squares * sum(float(v @ v) for v in u)) or 1.0
+        found = [sum(float(r[k:] @ v[:-k]) for r, v in zip(rest, u, strict=True)) for k in lags]
+        others.plot(lags, np.array(found) / size, "o-", markersize=3, label=name)
+    for axes, what in ((own, "with themselves"), (others, "with past inputs")):
+        axes.axhspan(-limit, limit, color="0.9", zorder=0)
+        axes.set_xlabel("samples later")
+        axes.set_title(f"Residuals {what}")
+    if len(fit.seen.inputs) > 1:
+        others.legend(frameon=False, fontsize=8)

@@ -1,0 +1,172 @@
+"""Responses identified from SIMULATED runs: values, errors, verdicts, and what is refused."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from beamfit.dynamics.response import FIRST_ORDER, SECOND_ORDER, simulate
+from beamfit.errors import InputError
+from beamfit.status import Status
+from beamfit.studies.response.fit import identify
+from beamfit.studies.response.record import Run
+
+
+def steps(n, rng, low=0.1, high=2.9, every=8):
+    return np.repeat(rng.uniform(low, high, n // every + 1), every)[:n]
+
+
+def run_of(physics, of_u, n=200, noise=0.1, seed=0, delay=0, apart=None, offset=0.0, name="run"):
+    """A run whose parameters are `of_u(u)`, shape (n, parameters), with noise of its scatter."""
+    rng = np.random.default_rng(seed)
+    dt = np.full(n, 0.5) if apart is None else apart
+    u = steps(n, rng)
+    late = np.concatenate([np.repeat(u[:1], delay), u])[:n]
+    free = jnp.zeros(physics.free_states)
+    y = simulate(
+        physics, jnp.asarray(of_u(late)), jnp.asarray(late)[:, None], jnp.asarray(dt), free
+    )
+    y = np.asarray(y) + offset
+    y = y + noise * y.std() * rng.normal(size=n)
+    return Run(np.concatenate([[0.0], np.cumsum(dt[:-1])]), {"valve": u}, {"level": y}, name=name)
+
+
+def constant(*p):
+    return lambda u: np.tile(np.array(p), (len(u), 1))
+
+
+def varying(u):
+    """The report's eqs 6 and 7."""
+    return np.stack([5 * np.tanh(u) + 0.5, 5 * np.tanh(u / 4) + 5], axis=1)
+
+
+def test_truths_lie_within_their_errors_as_often_as_they_should():
+    pulls = []
+    for seed in range(30):
+        fit = identify(run_of(SECOND_ORDER, constant(2.0, 0.5, 3.0), seed=seed), "second-order",
+                       delay=0)  # fmt: skip
+        assert fit.status is Status.converged, fit.message
+        truths = {"T": 2.0, "zeta": 0.5, "K": 3.0, "offset": 0.0}
+        pulls.append([(q.value - truths[n]) / q.error for n, q in fit.quantities.items()])
+    rms = np.sqrt(np.mean(np.square(pulls), axis=0))
+    assert np.all((rms > 0.7) & (rms < 1.35)), rms
+
+
+def test_noise_with_a_memory_is_in_the_errors():
+    pulls = []
+    for seed in range(24):
+        clean = run_of(FIRST_ORDER, constant(3.0, 2.0), noise=0.0, seed=seed)
+        noise = np.random.default_rng(seed).normal(size=len(clean))
+        for k in range(1, len(noise)):
+            noise[k] += 0.8 * noise[k - 1]
+        level = clean.outputs["level"] + 0.1 * noise
+        fit = identify(Run(clean.time, clean.inputs, {"level": level}), delay=0)
+        pulls.append((fit.quantities["K"].value - 2.0) / fit.quantities["K"].error)
+        assert fit.memory is not None
+    assert 0.6 < np.sqrt(np.mean(np.square(pulls))) < 1.5
+
+
+@pytest.mark.parametrize("delay", [0, 3])
+def test_the_delay_is_found(delay):
+    run = run_of(SECOND_ORDER, constant(2.0, 1.5, 3.0), seed=4, delay=delay)
+    fit = identify(run, "second-order")
+    assert fit.delay == delay
+    tau1, tau2 = (fit.quantities[n] for n in ("tau1", "tau2"))
+    # Eq 8: tau1 tau2 = T², tau1 + tau2 = 2 zeta T.
+    assert abs(tau1.value - 2.0 * (1.5 + np.sqrt(1.25))) < 4 * tau1.error
+    assert abs(tau2.value - 2.0 * (1.5 - np.sqrt(1.25))) < 4 * tau2.error
+
+
+def test_runs_of_several_lengths_gaps_and_uneven_samples_are_one_fit():
+    rng = np.random.default_rng(2)
+    law = constant(3.0, 2.0)
+    one = run_of(FIRST_ORDER, law, 150, seed=1, offset=7.0, name="one")
+    two = run_of(
+        FIRST_ORDER, law, 90, seed=2, offset=7.0, apart=rng.uniform(0.1, 1.0, 90), name="b"
+    )
+    level = two.outputs["level"].copy()
+    level[rng.choice(90, 30, replace=False)] = np.nan
+    two = Run(two.time, two.inputs, {"level": level}, name="two")
+    held = run_of(FIRST_ORDER, law, 80, seed=3, offset=7.0, name="held")
+    fit = identify([one, two], held=[held], delay=0)
+    assert fit.status is Status.converged, fit.message
+    for name, truth in (("tau", 3.0), ("K", 2.0), ("offset", 7.0)):
+        assert abs(fit.quantities[name].value - truth) < 4 * fit.quantities[name].error
+    assert [len(y) for y in fit.fitted] == [150, 60]
+    assert fit.held[0].rms < 1.5 * max(fit.noise)
+
+
+def test_a_constant_model_of_a_process_that_changes_is_refuted_and_a_network_is_not():
+    run = run_of(FIRST_ORDER, varying, 400, seed=5)
+    assert identify(run, delay=0).status is Status.poor_fit
+    fit = identify(run, map="network", delay=0, starts=2)
+    assert fit.status is Status.converged, fit.message
+    assert fit.checks.against_constant > 100
+    tau = fit.curves[0]
+    truth = varying(tau.at)[:, 0]
+    known = tau.visited & np.isfinite(tau.error)
+    assert known.mean() > 0.8
+    pulls = ((tau.value - truth) / tau.error)[known]
+    assert np.sqrt(np.mean(pulls**2)) < 2.0
+    assert np.max(np.abs(tau.value - truth)[known]) < 1.5
+
+
+def test_where_the_runs_never_were_a_curve_has_no_error():
+    run = run_of(FIRST_ORDER, constant(3.0, 2.0), 160, seed=6)
+    low = np.where(run.inputs["valve"] > 1.5, 2.8, 0.2)
+    y = simulate(FIRST_ORDER, jnp.tile(jnp.array([3.0, 2.0]), (160, 1)), jnp.asarray(low)[:, None],
+                 jnp.full(160, 0.5), jnp.zeros(1))  # fmt: skip
+    noise = 0.05 * np.random.default_rng(0).normal(size=160)
+    gap = Run(run.time, {"valve": low}, {"level": np.asarray(y) + noise})
+    curve = identify(gap, map="network", delay=0, starts=1).curves[0]
+    assert not curve.visited[len(curve.at) // 2]
+    assert curve.quantity(len(curve.at) // 2).error is None
+
+
+def test_the_difference_equation_is_identified_inside_the_stability_triangle():
+    fit = identify(run_of(SECOND_ORDER, constant(2.0, 0.5, 3.0), noise=0.02), "arx", delay=0)
+    a1, a2 = (fit.quantities[n] for n in ("a1", "a2"))
+    root = np.exp((-0.5 + 1j * np.sqrt(0.75)) * 0.5 / 2.0)  # eqs 13, 14 with complex lags
+    assert abs(a1.value + 2 * root.real) < 4 * a1.error
+    assert abs(a2.value - abs(root) ** 2) < 4 * a2.error
+
+
+def test_an_output_that_hangs_on_nothing_is_said_to():
+    rng = np.random.default_rng(0)
+    t = np.arange(200.0)
+    run = Run(t, {"valve": (t // 10) % 2}, {"level": rng.normal(size=200)})
+    for model in ("first-order", "second-order", "arx"):
+        assert identify(run, model, delay=0).status is Status.unidentified
+
+
+def test_a_constant_can_be_sampled():
+    fit = identify(run_of(FIRST_ORDER, constant(3.0, 2.0), 80), delay=0)
+    drawn = fit.sample(seed=1, target_ess=60, budget=20_000, progress=False)
+    assert any("map" in name for name in drawn.names)
+    network = identify(
+        run_of(FIRST_ORDER, constant(3.0, 2.0), 80), map="network", delay=0, starts=1
+    )
+    with pytest.raises(InputError, match="network"):
+        network.sample()
+
+
+T = np.arange(20.0)
+BAD = {
+    "time backwards": (lambda: Run(T[::-1], {"u": T}, {"y": T}), "times that increase"),
+    "too short": (lambda: Run(T[:5], {"u": T[:5]}, {"y": T[:5]}), "at least 8"),
+    "a constant input": (lambda: identify(Run(T, {"u": 0 * T}, {"y": T})), "an input that changes"),
+    "uneven samples": (lambda: identify(Run(T**1.5, {"u": T}, {"y": T}), "arx"), "equal"),
+    "an unknown model": (lambda: identify(Run(T, {"u": T}, {"y": T}), "arxx"), "did you mean arx"),
+    "other columns": (
+        lambda: identify([Run(T, {"u": T}, {"y": T}), Run(T, {"v": T}, {"y": T})]),
+        "inputs u",
+    ),
+    "a gap in an input": (lambda: Run(T, {"u": np.log(T - 3)}, {"y": T}), "row 1: no value of u"),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")
+def test_what_cannot_be_used_is_refused_in_words(case):
+    make, words = BAD[case]
+    with pytest.raises(InputError, match=words):
+        make()
