@@ -63,7 +63,7 @@ class Checks(NamedTuple):
             ["one step ahead", f"{self.one_step_percent:.2f} %"],
             ["residuals white", f"p = {self.white_probability:.2g}"],
             [
-                "inputs in residuals",
+                "residuals explained",
                 f"{100 * self.input_share:.1f} %, p = {self.input_probability:.2g}",
             ],
         ]
