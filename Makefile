@@ -54,6 +54,7 @@ bench: .venv/bench
 	$(BIN)/python benchmarks/language.py
 	$(BIN)/python benchmarks/sampling.py
 	$(BIN)/python benchmarks/scenarios.py
+	$(BIN)/python benchmarks/response.py
 
 clean:
 	rm -rf .venv demo dist build

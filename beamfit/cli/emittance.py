@@ -70,7 +70,7 @@ Examples:
     is_flag=True,
     help="Focusing network: branches of k1 for rising and falling currents, by the order of rows.",
 )
-@click.option("--hidden", default=5, show_default=True, help="Networks: hidden nodes.")
+@options("hidden")
 @click.option("--starts", default=20, show_default=True, help="Networks: starts of the training.")
 @options("sample store seed report json")
 def emittance(

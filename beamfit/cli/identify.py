@@ -47,10 +47,8 @@ Examples:
     "--delay", type=click.IntRange(0), metavar="SAMPLES", help="Known delay; found unless said."
 )
 @click.option("--no-offset", is_flag=True, help="The output at rest is 0, and not estimated.")
-@click.option("--hidden", type=click.IntRange(1, 50), default=6, show_default=True,
-              help="Hidden nodes of the network.")  # fmt: skip
 @click.option("--hold-back", multiple=True, metavar="RECORD", help="A run that is only predicted.")
-@options("ignore skip-bad seed report json")
+@options("hidden ignore skip-bad seed report json")
 def identify(
     record: tuple[str, ...],
     model: str,

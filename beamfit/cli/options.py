@@ -130,6 +130,9 @@ SHARED: dict[str, Callable[..., Any]] = {
         help="Networks: what ties them to the lattice: first-principles=2%, a setting such as "
         "Q2=0, or determinant.",
     ),
+    "hidden": click.option(
+        "--hidden", default=5, show_default=True, help="Networks: hidden nodes."
+    ),
     "vary": click.option(
         "--vary",
         "limits",

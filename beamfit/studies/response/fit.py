@@ -151,7 +151,7 @@ def identify(
     output: str | None = None,
     delay: int | None = None,
     offset: bool = True,
-    hidden: int = 6,
+    hidden: int = 5,
     starts: int = 3,
     seed: int = 0,
     held: Sequence[Run] = (),
