@@ -16,6 +16,7 @@ SAMPLES, APART, DELAY = 800, 0.5, 2
 
 
 def main() -> None:
+    """Write the file."""
     random = np.random.default_rng(1)
     u = np.repeat(random.uniform(0.1, 2.9, SAMPLES // 8), 8)
     late = np.concatenate([np.repeat(u[:1], DELAY), u])[:SAMPLES]
