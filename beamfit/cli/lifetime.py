@@ -77,6 +77,12 @@ Examples:
     "SR:DCCT:CURRENT:mA. With --time or --current other columns of unknown names are left aside.",
 )
 @click.option(
+    "--offset",
+    metavar="zero-beam|CURRENT",
+    help="What the current monitor reads without beam, taken off: a current such as 0.12mA, or "
+    "from the record's own readings before injection or after the dump.",
+)
+@click.option(
     "--monitor-drift",
     metavar="CURRENT/TIME",
     help="How far the current monitor drifts (one standard deviation), such as 10uA/h; part of the "
@@ -96,6 +102,7 @@ def lifetime(
     trend: bool,
     time: str | None,
     current: str | None,
+    offset: str | None,
     monitor_drift: str | None,
     monitor_offset: str | None,
     priors: dict[str, tuple[float, float]] | None,
@@ -120,6 +127,7 @@ def lifetime(
     sampling.check()
     _check_study(study, ring, network, priors)
     said = {"time": time, "current": current, "ignore": ignore, "skip_bad": skip_bad}
+    said |= {"offset": offset}
     monitor = monitor_of(monitor_drift, monitor_offset)
     records = [read_lifetime_input(path, **said) for path in dict.fromkeys(record)]
     if len(records) < len(record):
@@ -139,7 +147,9 @@ def lifetime(
 
     from beamfit.studies.decay.study import study_record  # JAX from here on
 
-    studies = tuple(study_record(replace(each, monitor=monitor), machine) for each in records)
+    if monitor is not None:
+        records = [replace(each, monitor=monitor.beside(each.monitor)) for each in records]
+    studies = tuple(study_record(each, machine) for each in records)
     decays = [decay for each in studies for decay in each.answers]
     single = [decay for each in studies for decay in each.decays or each.pooled]
     shift = _shift(single, machine, network, priors) if study else None

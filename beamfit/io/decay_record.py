@@ -15,13 +15,10 @@ import numpy as np
 from beamfit.errors import InputError
 from beamfit.io.dates import unix_time
 from beamfit.io.files import digest, text_lines
-from beamfit.io.table import UNITS, Column, Sheet, columns_of, left_out, read_sheet
-from beamfit.studies.decay.record import (
-    Conditions,
-    DecayRecord,
-    LifetimeTable,
-    first_fault,
-)
+from beamfit.io.offset import offset_of
+from beamfit.io.table import HDF5, UNITS, Column, Sheet, columns_of, left_out, read_sheet
+from beamfit.studies.decay.monitor import Monitor
+from beamfit.studies.decay.record import Conditions, DecayRecord, LifetimeTable, first_fault
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -46,6 +43,8 @@ LIFETIMES = {
     "lifetime_error": "time",
     "beam_current": "current",
 }
+# Columns left aside that a note names.
+MOST_ASIDE = 8
 # What a record calls them.
 CALLED = {"beam_current": "current", "beam_current_error": "error"}
 USED = {"time", "nanos", "current", "error", *Conditions._fields}
@@ -68,12 +67,13 @@ def read_lifetime_input(
     current: str | None = None,
     ignore: Iterable[str] = (),
     skip_bad: bool = False,
+    offset: str | None = None,
 ) -> DecayRecord | LifetimeTable:
     """Read what `beamfit lifetime` takes, by its header: as one of the other two readers."""
     sheet = _sheet(path, skip_bad).without(ignore)
     if time is None and any(name.startswith(("tau_", "lifetime_")) for name in sheet.names):
         return _lifetimes(sheet, skip_bad)
-    return _record(sheet, time, current, skip_bad)
+    return _record(sheet, time, current, skip_bad, offset)
 
 
 def read_lifetimes(
@@ -116,6 +116,7 @@ def read_decay_record(
     current: str | None = None,
     ignore: Iterable[str] = (),
     skip_bad: bool = False,
+    offset: str | None = None,
 ) -> DecayRecord:
     """Read beam current against time.
 
@@ -138,11 +139,15 @@ def read_decay_record(
     skip_bad : bool, optional
         Leave out rows with something wrong in them: no number, a negative current, a time that is
         repeated or goes back. `notes` counts and names them.
+    offset : str, optional
+        What the monitor reads without beam and is taken off: a current such as ``0.12mA``, or
+        ``zero-beam``, from readings of no beam; its error is then part of `monitor`. Readings of
+        no beam are left out.
 
     Returns
     -------
     DecayRecord
-        In s and mA, conditions in SI.
+        In s and mA, conditions in SI; `notes` names columns that were left aside.
 
     Raises
     ------
@@ -155,7 +160,7 @@ def read_decay_record(
     >>> print(read_decay_record("measurements/aps_1999_decay.csv"))
     aps_1999_decay.csv: 27 readings over 8.81 h, 101.999 to 81.464 mA
     """
-    return _record(_sheet(path, skip_bad).without(ignore), time, current, skip_bad)
+    return _record(_sheet(path, skip_bad).without(ignore), time, current, skip_bad, offset)
 
 
 def _sheet(path: str | PathLike[str] | DataFrame, skip_bad: bool) -> Sheet:
@@ -165,14 +170,11 @@ def _sheet(path: str | PathLike[str] | DataFrame, skip_bad: bool) -> Sheet:
         return read_sheet(path, example)
     if Path(path).suffix.lower() == ".json":
         return _archive_json(path)
-    head = next((text for text in text_lines(path) if text.strip()), "") if _is_text(path) else ""
+    lines = () if Path(path).suffix.lower() in HDF5 else text_lines(path)
+    head = next((text for text in lines if text.strip()), "")
     if re.fullmatch(r"\d{9,11}(,[^,]+){4}\s*", head):
         return read_sheet(path, ",".join(ARCHIVE), ragged=skip_bad, names=ARCHIVE)
     return read_sheet(path, example, ragged=skip_bad)
-
-
-def _is_text(path: str | PathLike[str]) -> bool:
-    return Path(path).suffix.lower() not in {".h5", ".hdf5"}
 
 
 def _archive_json(path: str | PathLike[str]) -> Sheet:
@@ -195,7 +197,9 @@ def _archive_json(path: str | PathLike[str]) -> Sheet:
     return Sheet(path, ("secs", "nanos", called), cells, None, None, said, digest(path))
 
 
-def _record(sheet: Sheet, time: str | None, current: str | None, skip_bad: bool) -> DecayRecord:
+def _record(
+    sheet: Sheet, time: str | None, current: str | None, skip_bad: bool, offset: str | None
+) -> DecayRecord:
     if any(SIZE.match(name) for name in sheet.names) and time is None and current is None:
         found, expected = "a column of beam sizes", "a record of beam current; `beamfit emittance`"
         raise sheet.header_error(found, f"{expected} reads scans")
@@ -205,20 +209,25 @@ def _record(sheet: Sheet, time: str | None, current: str | None, skip_bad: bool)
             option = f"'{example}' in the header, or --{quantity} COLUMN:UNIT"
             raise sheet.header_error(f"no column of {quantity}", option)
     if skip_bad:
-        sheet = sheet.good(lambda rows: _check_alone(rows, columns))
+        sheet = sheet.good(lambda rows: _check_alone(rows, columns, offset is None))
         sheet = _forward(sheet, columns)
     values = {key: _values(sheet, column) for key, column in columns.items()}
     moment = values.pop("time")
     if "nanos" in values:
         moment = moment + 1e-9 * values.pop("nanos")
-    beam, error = values.pop("current"), values.pop("error", None)
-    conditions = Conditions(**values)
     if len(moment) < 2:
         raise sheet.error(f"{len(moment)} readings", "two or more")
     _check_base(sheet, columns["time"], moment)
+    found = offset_of(offset, values["current"], sheet.path)
+    values["current"] = values["current"] - found.value
+    moment, *rest = (column[found.beam] for column in (moment, *values.values()))
+    values = dict(zip(values, rest, strict=True))
+    beam, error = values.pop("current"), values.pop("error", None)
+    conditions = Conditions(**values)
     if (fault := first_fault(moment, beam, error, conditions)) is not None:
         column = columns[fault.quantity].header
-        raise sheet.error(fault.found, fault.expected, fault.row, column)
+        row = int(np.flatnonzero(found.beam)[fault.row])
+        raise sheet.error(fault.found, fault.expected, row, column)
     absolute = columns["time"].unit == DATE or moment[0] > UNIX
     return DecayRecord(
         time=moment,
@@ -228,8 +237,17 @@ def _record(sheet: Sheet, time: str | None, current: str | None, skip_bad: bool)
         start=float(moment[0]) if absolute else None,
         conditions=conditions,
         comments=sheet.comments,
-        notes=left_out(sheet),
+        notes=left_out(sheet) + _left_aside(sheet, columns) + found.notes,
+        monitor=Monitor(offset=found.error) if found.error else None,
     )
+
+
+def _left_aside(sheet: Sheet, columns: Mapping[str, Column]) -> tuple[str, ...]:
+    """Name the columns of unknown names that were not read, as a note."""
+    used = {column.header for column in columns.values()}
+    aside = [name for name in sheet.names if name not in used and not _known(sheet, name)]
+    more = [f"{len(aside) - MOST_ASIDE} more"] if len(aside) > MOST_ASIDE else []
+    return (f"Left aside: {', '.join(aside[:MOST_ASIDE] + more)}.",) if aside else ()
 
 
 def _columns(sheet: Sheet, time: str | None, current: str | None) -> dict[str, Column]:
@@ -317,12 +335,12 @@ def _values(sheet: Sheet, column: Column) -> np.ndarray:
     return sheet.numbers(column.header) * column.factor
 
 
-def _check_alone(sheet: Sheet, columns: Mapping[str, Column]) -> None:
+def _check_alone(sheet: Sheet, columns: Mapping[str, Column], positive: bool) -> None:
     """Refuse a row that is wrong whatever the others are."""
     for key, column in columns.items():
         values = _values(sheet, column)
         low = np.flatnonzero(values < 0)
-        if key == "current" and low.size:
+        if key == "current" and positive and low.size:
             found = f"a negative current, {values[low[0]]:.6g} mA"
             raise sheet.error(found, "zero or more", int(low[0]), column.header)
 

@@ -40,6 +40,10 @@ class Monitor(NamedTuple):
             if not 0 <= value < np.inf:
                 raise InputError(f"monitor {name} {value}", "zero or more", column=name)
 
+    def beside(self, other: Monitor | None) -> Monitor:
+        """What is known of one monitor from two sources, added in quadrature."""
+        return self if other is None else Monitor(*map(float, np.hypot(self, other)))
+
     def changes(self, time: np.ndarray) -> dict[str, np.ndarray]:
         """Change of the readings at times in s, mA, by its cause in words."""
         found = {}
