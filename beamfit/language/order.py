@@ -5,9 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from functools import cached_property
+from graphlib import TopologicalSorter
 from typing import NamedTuple
 
 import numpy as np
+from scipy.sparse import csr_matrix
+from scipy.sparse.csgraph import connected_components
 
 from beamfit.errors import InputError
 from beamfit.language import document as d
@@ -30,8 +33,11 @@ from beamfit.language.steps import Call, calls, gains_of, sources, targets, writ
 __all__ = ["Group", "Order", "checked", "order_of"]
 
 NOBODY = -1
-# Elements that all statements of a mapping may run over together.
-MOST_WORK = 30_000_000
+# Names that the message of a loop shows.
+MOST_NAMED = 8
+# Elements that all statements of a mapping may run over together, how many there may be, and from
+# how many of them the cycle of a loop is sought.
+MOST_WORK, MOST_STEPS, MOST_TRIED = 60_000_000, 5_000, 50
 
 
 class Group(NamedTuple):
@@ -119,12 +125,18 @@ def order_of(scope: Scope) -> Order:
 
 
 def _check_work(scope: Scope) -> None:
-    """Refuse statements that run over more than any computer would go through in a minute."""
-    total = 0
+    """Refuse more than any computer would go through in a minute."""
+    total = sum(a.size for a in scope.arrays.values())
     for step in scope.steps:
-        total += int(np.prod([len(s) for s in step.axes.values()], dtype=np.int64))
-        if total > MOST_WORK:
-            raise error_at(step.at, f"statements over more than {MOST_WORK} elements", "fewer")
+        combined = int(np.prod([len(s) for s in step.axes.values()], dtype=np.int64))
+        if isinstance(step.what, d.Call):
+            callee = scope.callees.get(step.what.mapping)
+            if isinstance(callee, Scope):
+                combined *= sum(a.size for a in callee.arrays.values())
+        total += combined
+        if total > MOST_WORK or step.number > MOST_STEPS:
+            found = f"more than {MOST_WORK} elements or {MOST_STEPS} statements in a mapping"
+            raise error_at(step.at, found, "fewer")
 
 
 def _group(scope, numbers: list[int], needs, owners) -> Group:
@@ -217,65 +229,55 @@ def _check_wires(scope: Scope, call: Call, step: Step) -> None:
             located(scope, e, array, axes)
 
 
-def _components(needs: dict[int, set[int]]) -> list[tuple[int, ...]]:
-    """Strongly connected components, needed ones first (Tarjan's algorithm, no recursion)."""
-    low: dict[int, int] = {}
-    index: dict[int, int] = {}
-    stack: list[int] = []
-    found: list[tuple[int, ...]] = []
-    on: set[int] = set()
-    for root in needs:
-        work = [] if root in index else [(root, iter(sorted(needs[root])))]
-        while work:
-            v, rest = work[-1]
-            if v not in index:
-                index[v] = low[v] = len(index)
-                stack.append(v)
-                on.add(v)
-            for w in rest:
-                if w not in index:
-                    work.append((w, iter(sorted(needs[w]))))
-                    break
-                if w in on:
-                    low[v] = min(low[v], low.get(w, index[w]))
-            else:
-                work.pop()
-                if work:
-                    low[work[-1][0]] = min(low[work[-1][0]], low[v])
-                if low[v] == index[v]:
-                    at = stack.index(v)
-                    found.append(tuple(stack[at:]))
-                    on -= set(stack[at:])
-                    del stack[at:]
-    return found
+def _components(needs: dict[int, set[int]]) -> list[list[int]]:
+    """Steps that need one another, each by itself where none does; needed ones first."""
+    pairs = [(a, b) for a, before in needs.items() for b in before]
+    ends = np.array(pairs, int).reshape(-1, 2).T
+    graph = csr_matrix((np.ones(len(pairs)), ends), shape=(len(needs), len(needs)))
+    _, label = connected_components(graph, connection="strong")
+    members: dict[int, list[int]] = {}
+    for number, at in enumerate(label.tolist()):
+        members.setdefault(at, []).append(number)
+    before = {
+        at: {int(label[b]) for n in group for b in needs[n]} - {at} for at, group in members.items()
+    }
+    return [members[at] for at in TopologicalSorter(before).static_order()]
 
 
 def _loop(scope: Scope, steps: tuple[Step, ...], needs, owners) -> InputError:
     """An algebraic loop, with the names along a cycle that no time takes apart."""
     members = {s.number for s in steps}
-    cycles = (_cycle(n, needs, members) for n in sorted(members))
+    cycles = (_cycle(n, needs, members) for n in sorted(members)[:MOST_TRIED])
     found = sorted((c for c in cycles if c), key=len)
     parts = ((c, tuple(scope.steps[n] for n in sorted(set(c)))) for c in found)
     cycle = next((c for c, part in parts if plan_of(scope, part, owners) is None), found[0])
     names = [str(targets(scope, scope.steps[n])[0][0]) for n in cycle]
-    lines = ", ".join(str(n) for n in sorted({scope.steps[n].at.line for n in cycle}))
-    said = f"an algebraic loop: {' -> '.join(names)} (line {lines})"
+    lines = [str(n) for n in sorted({scope.steps[n].at.line for n in cycle})]
+    said = f"an algebraic loop: {' -> '.join(_few(names))} (line {', '.join(_few(lines))})"
     expected = "statements of which each needs earlier ones only, or earlier times such as y[t-1]"
     return error_at(scope.steps[min(cycle)].at, said, expected)
 
 
+def _few(words: list[str]) -> list[str]:
+    return words if len(words) <= MOST_NAMED else [*words[: MOST_NAMED - 2], "...", words[-1]]
+
+
 def _cycle(start: int, needs: dict[int, set[int]], members: set[int]) -> list[int]:
     """The shortest way from a step to itself, what is needed first; empty if there is none."""
-    ways = [[start]]
-    seen: set[int] = set()
-    while ways:
-        way = ways.pop(0)
-        for before in sorted(needs[way[-1]] & members):
+    came: dict[int, int | None] = {start: None}
+    todo = [start]
+    for at in todo:
+        for before in sorted(needs[at] & members):
             if before == start:
-                return [start, *reversed(way)]
-            if before not in seen:
-                seen.add(before)
-                ways.append([*way, before])
+                way: list[int] = [start]
+                back: int | None = at
+                while back is not None:
+                    way.append(back)
+                    back = came[back]
+                return way
+            if before not in came:
+                came[before] = at
+                todo.append(before)
     return []
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections import defaultdict
 from functools import lru_cache
 from importlib.resources import files
 from typing import Any
@@ -103,10 +104,6 @@ def _count(token: Token | None, least: int = 0) -> int | None:
     return value
 
 
-def _pair(both: tuple[float, float] | None) -> tuple[float, float]:
-    return (-math.inf, math.inf) if both is None else both
-
-
 class _Builder(Transformer):
     """Rules of the grammar to the values they stand for."""
 
@@ -154,17 +151,16 @@ class _Builder(Transformer):
         over = c[1] if isinstance(c[1], x.Elements) else str(c[1])
         return x.Iterator(str(c[0]), over, _place(c))
 
-    def elements(self, c):
-        return x.Elements(tuple(p for p in c[1:] if p is not None), True, _place(c))
+    def elements(self, c, ranged=True):
+        parts = tuple(x.check_depth(part) for part in c[1:] if part is not None)
+        return x.Elements(parts, ranged, _place(c))
 
     def listed(self, c):
-        return x.Elements(tuple(c[1:]), False, _place(c))
+        return self.elements(c, False)
 
     # statements
 
     def set(self, c):
-        for part in c[2].parts:
-            x.check_depth(part)
         return [d.IndexedSet(str(c[1]), c[2], _place(c[1:]))]
 
     def dimensions(self, c):
@@ -216,7 +212,8 @@ class _Builder(Transformer):
         return tuple(_number(t) for t in c if t is not None)
 
     def table(self, c):
-        return d.DataTable(str(c[1]), str(c[2]), _count(c[3], 1), _count(c[4], 1), _place(c[1:]))
+        size = _count(c[3], 1), _count(c[4], 1)
+        return "tables", d.DataTable(str(c[1]), str(c[2]), *size, _place(c[1:]))
 
     def attribute(self, c):
         return str(c[0]), str(c[1])
@@ -232,22 +229,22 @@ class _Builder(Transformer):
         return d.Part(str(kind), (*head, *attributes), c[-1], _place(c))
 
     def network(self, c):
-        return ("mapping", d.Network(str(c[1]), tuple(c[2:]), _place(c[1:])))
+        return "mappings", d.Network(str(c[1]), tuple(c[2:]), _place(c[1:]))
 
     def inputs(self, c):
-        return ("inputs", c[1:])
+        return "inputs", c[1:]
 
     def outputs(self, c):
-        return ("outputs", c[1:])
+        return "outputs", c[1:]
 
     def parameters(self, c):
-        return ("parameters", c[1:])
+        return "parameters", c[1:]
 
     def title(self, c):
-        return ("title", str(c[1]))
+        return "titles", str(c[1])
 
     def mapping(self, c):
-        return ("mapping", _mapping(str(c[1]), c[2:], _place(c[1:])))
+        return "mappings", _mapping(str(c[1]), _gathered(c[2:]), _place(c[1:]))
 
     # the problem
 
@@ -260,65 +257,54 @@ class _Builder(Transformer):
 
     def goal(self, c):
         weight = 1.0 if c[3] is None else _number(c[3])
-        return ("goal", c[0], d.Goal(c[1].label, c[1].model, weight, c[1].at))
+        return "goals", [(c[0], d.Goal(c[1].label, c[1].model, weight, c[1].at))]
 
     def variable(self, c):
         _, name, value, bounds, _, random, _, seed = c
         value = None if value is None else _number(value)
-        low, high = _pair(bounds)
-        return d.Variable(
-            name.label, name.model, low, high, value, random, _count(seed) or 0, name.at
-        )
+        low, high = bounds or (-math.inf, math.inf)
+        start = value, random, _count(seed) or 0
+        return "variables", d.Variable(name.label, name.model, low, high, *start, name.at)
 
     def limit(self, c):
         low, high = c[2] if len(c) == 3 else (-math.inf, math.inf)
         if len(c) == 4:
             end = _number(c[3])
             low, high = (end if c[2] != "<=" else low), (end if c[2] != ">=" else high)
-        return d.Limit(c[1].label, c[1].model, low, high, c[1].at)
+        return "limits", d.Limit(c[1].label, c[1].model, low, high, c[1].at)
 
     def setting(self, c):
         return str(c[0]), str(c[1])
 
     def solver(self, c):
-        return d.Solver(c[1], tuple(s for s in c[2:] if s is not None), _place(c))
+        return "solvers", d.Solver(c[1], tuple(s for s in c[2:] if s is not None), _place(c))
 
     def document(self, c):
-        return _document(c)
+        found = _gathered(c)
+        words = {word.lower() for word, _ in found["goals"]}
+        if len(words) > 1:
+            at = found["goals"][1][1].at
+            raise error_at(at, "one goal to minimize, one to maximize", "one direction")
+        if len(found["solvers"]) > 1:
+            raise error_at(found["solvers"][1].at, "a second solver", "one")
+        problem = None
+        if found["goals"] or found["variables"] or found["limits"]:
+            goals = tuple(goal for _, goal in found["goals"])
+            free, limits = tuple(found["variables"]), tuple(found["limits"])
+            problem = d.Problem(goals, free, limits, words == {"maximize"})
+        mapping = _mapping((found["titles"] or [""])[0], found)
+        return d.Document(mapping, problem, (found["solvers"] or [None])[0])
 
 
-def _mapping(name: str, members: list[Any], at: Place = x.NOWHERE) -> d.Mapping:
-    """A mapping of its members in any order."""
-    found: dict[str, list[Any]] = {k: [] for k in ("inputs", "outputs", "parameters", "mapping")}
-    tables, statements = [], []
-    for member in members:
-        if isinstance(member, d.DataTable):
-            tables.append(member)
-        elif isinstance(member, list):
-            statements += member
-        else:
-            kind, what = member
-            found[kind] += what if isinstance(what, list) else [what]
-    groups = (tuple(found[k]) for k in ("mapping", "inputs", "outputs", "parameters"))
-    return d.Mapping(name, tuple(tables), *groups, tuple(statements), at)
+def _gathered(items: list[Any]) -> dict[str, list[Any]]:
+    """Members by their kind, in order; those without one are statements."""
+    found: dict[str, list[Any]] = defaultdict(list)
+    for item in items:
+        kind, what = item if isinstance(item, tuple) else ("statements", item)
+        found[kind] += what if isinstance(what, list) else [what]
+    return found
 
 
-def _document(items: list[Any]) -> d.Document:
-    """The document of its items in any order."""
-    kinds = (d.Variable, d.Limit, d.Solver)
-    variables, limits, solvers = (tuple(i for i in items if isinstance(i, k)) for k in kinds)
-    tuples = [i for i in items if isinstance(i, tuple)]
-    goals = [i[1:] for i in tuples if i[0] == "goal"]
-    titles = [i[1] for i in tuples if i[0] == "title"]
-    rest = [i for i in items if not isinstance(i, kinds) and i not in tuples]
-    rest += [i for i in tuples if i[0] not in ("goal", "title")]
-    words = {word.lower() for word, _ in goals}
-    if len(words) > 1:
-        raise error_at(goals[1][1].at, "one goal to minimize, one to maximize", "one direction")
-    if len(solvers) > 1:
-        raise error_at(solvers[1].at, "a second solver", "one")
-    problem = None
-    if goals or variables or limits:
-        problem = d.Problem(tuple(g for _, g in goals), variables, limits, words == {"maximize"})
-    mapping = _mapping(titles[0] if titles else "", rest)
-    return d.Document(mapping, problem, solvers[0] if solvers else None)
+def _mapping(name: str, found: dict[str, list[Any]], at: Place = x.NOWHERE) -> d.Mapping:
+    groups = ("tables", "mappings", "inputs", "outputs", "parameters", "statements")
+    return d.Mapping(name, *(tuple(found[kind]) for kind in groups), at)

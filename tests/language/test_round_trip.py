@@ -174,6 +174,12 @@ OUTSIDE = "<!DOCTYPE b [<!ENTITY a SYSTEM 'file:///etc/passwd'>]><mapping>&a;</m
         ("<mapping><expressions>y = &nothing;</expressions></mapping>", "undefined entity"),
         ("<mapping><expressions>" + "(" * 99 + "</expressions></mapping>", "more than 60 brackets"),
         ("<mapping><expressions>y = 1" + "+1" * 9999 + ";</expressions></mapping>", "120 levels"),
+        (
+            "<mapping><expressions>y = 1 foreach t in |1:1"
+            + "+1" * 9999
+            + "|;</expressions></mapping>",
+            "120 levels",
+        ),
         ("<mapping><output nam='y'/></mapping>", "<output> without name"),
         ("<mapping><outputs name='y'/></mapping>", "did you mean output"),
         ("<mapping><input name='y z'/></mapping>", "a name of letters"),
