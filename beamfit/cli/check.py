@@ -33,7 +33,7 @@ def check(
     energy: float | None,
     as_json: bool,
 ) -> None:
-    """Say what is understood of scans, lattices, records of beam current and rings.
+    """Say what is understood of scans, lattices, records, rings, runs and formulations.
 
     Of each FILE the kind, the rows, the magnets and their units, the range of the sizes and where
     their errors are from, the energy, and what is odd about it; of a scan also whether each lattice

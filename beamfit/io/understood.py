@@ -3,47 +3,36 @@
 from __future__ import annotations
 
 import re
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from datetime import UTC, datetime
 from os import PathLike
 from pathlib import Path
-from typing import Any, NamedTuple
-
-import numpy as np
+from typing import Any
 
 from beamfit.errors import InputError
 from beamfit.io.decay_record import read_lifetime_input
 from beamfit.io.emittance_gui import is_emittance_gui, read_emittance_gui
+from beamfit.io.facts import (
+    Fact,
+    of_formulation,
+    of_lattice,
+    of_record,
+    of_ring,
+    of_run,
+    of_scan,
+)
 from beamfit.io.files import digest
-from beamfit.io.lattice import CALIBRATIONS, STRENGTHS, LatticeFile
+from beamfit.io.formulation import read_formulation
 from beamfit.io.line import FOREIGN, build_line, read_lattice
 from beamfit.io.measurement import read_quad_scan
-from beamfit.io.ring import read_operation, read_ring
+from beamfit.io.ring import read_ring
+from beamfit.io.run import read_run
 from beamfit.io.table import HDF5, header_of, read_sheet
 from beamfit.io.toml import read_toml
-from beamfit.quantity import display_unit
-from beamfit.studies.decay.record import DecayRecord, LifetimeTable
 from beamfit.studies.scan.scans import QuadScan
 from beamfit.table import Table
 
 __all__ = ["Understood", "understand", "with_lattice"]
-
-SAID = {"A": "A", "kG": "kG integrated gradient", "T_per_m": "T/m", "k1": "1/m² (k1)"}
-SAID |= {"k1l": "1/m (k1l)"}
-CONDITIONS = {"rf_voltage": "V", "scraper_y": "m", "pressure": "Pa", "bunches": ""}
-CONDITIONS |= {"bunch_length": "m"}
-# Magnets of a lattice that are told one by one.
-MOST_MAGNETS = 20
-
-
-class Fact(NamedTuple):
-    """One thing understood: what it is, in words, and as numbers for JSON."""
-
-    label: str
-    words: str
-    value: Any
 
 
 @dataclass(frozen=True)
@@ -55,14 +44,14 @@ class Understood:
     path : str
         The file.
     kind : str
-        ``scan``, ``lattice``, ``record`` or ``ring``.
+        ``scan``, ``lattice``, ``record``, ``ring``, ``run`` or ``formulation``.
     sha256 : str
         Its digest.
     facts : tuple of Fact
         What it says.
     notes : tuple of str
         What was done to its numbers, and what is odd about them.
-    content : QuadScan, LatticeFile, DecayRecord or Ring
+    content : QuadScan, LatticeFile, DecayRecord, Ring, Run or Document
         What was read.
     """
 
@@ -102,7 +91,7 @@ def understand(
     Parameters
     ----------
     path : str or path
-        A scan, a lattice, a record of beam current, or a ring.
+        A scan, a lattice, a record of beam current, a ring, a run of a process, or a formulation.
     ignore, skip_bad
         Of a scan, as for `read_quad_scan`.
     use, energy
@@ -130,19 +119,25 @@ def understand(
         content = (
             read_quad_scan(path, ignore=ignore, skip_bad=skip_bad) if gui is None else gui.scan()
         )
-        facts, notes = _of_scan(content), (*content.notes, *_questions(content))
+        facts, notes = of_scan(content), (*content.notes, *_questions(content))
         if gui is not None:
             facts.append(Fact("size methods", ", ".join(gui.scans), list(gui.scans)))
     elif kind == "lattice":
         foreign = Path(path).suffix.lower() in FOREIGN
         content = read_lattice(path, use=use, energy=energy) if foreign else read_lattice(path)
-        facts, notes = _of_lattice(content), ()
+        facts, notes = of_lattice(content), ()
     elif kind == "record":
         content = read_lifetime_input(path, ignore=ignore, skip_bad=skip_bad)
-        facts, notes = _of_record(content), content.notes
+        facts, notes = of_record(content), content.notes
+    elif kind == "run":
+        content = read_run(path, ignore=ignore, skip_bad=skip_bad)
+        facts, notes = of_run(content), content.notes
+    elif kind == "formulation":
+        content = read_formulation(path)
+        facts, notes = of_formulation(content), ()
     else:
         content = read_ring(path)
-        facts, notes = _of_ring(path, content), ()
+        facts, notes = of_ring(path, content), ()
     return Understood(str(path), kind, digest(path), tuple(facts), notes, content)
 
 
@@ -173,6 +168,8 @@ def _kind(path: str | PathLike[str]) -> str:
     if suffix == ".toml":
         tables = read_toml(path, "a lattice or a ring").table
         return "ring" if "ring" in tables and "element" not in tables else "lattice"
+    if suffix in (".bf", ".xml"):
+        return "formulation"
     if suffix == ".json":
         return "record"
     if suffix in HDF5:
@@ -185,185 +182,12 @@ def _kind(path: str | PathLike[str]) -> str:
     if re.search(r"\bbeta_x_m\b|\bBETX\b", head):
         found = "the optics of a ring"
         raise InputError(found, "the ring file (TOML) that names it under [optics] twiss", path)
+    if {"u_", "y_"} <= {name[:2] for name in names}:
+        return "run"
     return "record" if "beam_current" in head.lower() else "scan"
-
-
-def _range(values: np.ndarray, unit: str = "") -> Fact:
-    """From the smallest to the largest, lengths in a unit of their size."""
-    low, high = float(np.nanmin(values)), float(np.nanmax(values))
-    factor, said = display_unit(max(abs(low), abs(high)), unit or "1")
-    words = f"{low / factor:.6g}" if low == high else f"{low / factor:.4g} to {high / factor:.4g}"
-    return Fact("", f"{words} {said}".strip(), {"low": low, "high": high, "unit": unit or "1"})
-
-
-def _of_scan(scan: QuadScan) -> list[Fact]:
-    rows = {p: int(np.isfinite(scan.size[p]).sum()) for p in scan.planes}
-    counted = ", ".join(f"{p} ({n} rows)" for p, n in rows.items())
-    facts = [Fact("rows", str(len(scan)), len(scan)), Fact("planes", counted, rows)]
-    for name, values in scan.settings.items():
-        unit, distinct = scan.units[name], len(np.unique(values))
-        span = _range(values)
-        words = f"{span.words} {SAID[unit]}, {distinct} setting" + ("s" if distinct > 1 else "")
-        value = span.value | {"unit": unit, "settings": distinct}
-        facts.append(Fact(f"magnet {name}", words, value))
-    for p in scan.planes:
-        facts += _of_plane(scan, p)
-    if scan.transfer is not None:
-        facts.append(Fact("matrices", "R11 and R12 of each row: no lattice is needed", True))
-    if scan.energy is not None:
-        said = _range(scan.energy, "MeV")
-        kind = "momentum p c" if scan.energy_kind == "momentum" else f"{scan.energy_kind} energy"
-        value = said.value | {"kind": scan.energy_kind}
-        facts.append(Fact("energy", f"{said.words}, {kind}", value))
-    if scan.screen is not None:
-        counts = Counter(scan.screen)
-        words = ", ".join(f"{name} ({n} rows)" for name, n in counts.items())
-        facts.append(Fact("screens", words, dict(counts)))
-    if scan.slice is not None:
-        words = ", ".join(f"{name} ({scan.slice.count(name)} rows)" for name in scan.slices)
-        facts.append(Fact("slices", words, {name: scan.slice.count(name) for name in scan.slices}))
-    further = {"resolution": "m", "energy_spread": "", "shots": ""}
-    facts += [
-        _range(getattr(scan, key), unit)._replace(label=key.replace("_", " "))
-        for key, unit in further.items()
-        if getattr(scan, key) is not None
-    ]
-    return facts
-
-
-def _of_plane(scan: QuadScan, plane: str) -> list[Fact]:
-    """Range and column of the sizes of one plane, and where their errors are from."""
-    key = f"size_{plane}"
-    said, column = _range(scan.size[plane], "m"), scan.columns.get(key, key)
-    size = Fact(f"size {plane}", f"{said.words}, column {column}", said.value | {"column": column})
-    if plane not in scan.error:
-        words = "none: the noise is inferred from the residuals"
-        return [size, Fact(f"errors {plane}", words, None)]
-    share = float(np.nanmedian(scan.error[plane] / scan.size[plane]))
-    words = f"{100 * share:.2g} % of the size in the middle, from {scan.error_source}"
-    value = {"median_relative": share, "source": scan.error_source}
-    return [size, Fact(f"errors {plane}", words, value)]
 
 
 def _questions(scan: QuadScan) -> tuple[str, ...]:
     from beamfit.studies.scan.questions import of_sizes
 
     return tuple(of_sizes(scan))
-
-
-def _of_lattice(file: LatticeFile) -> list[Fact]:
-    kinds = Counter(element["type"] for element in file.elements)
-    length = sum(map(_length, file.elements))
-    listed = ", ".join(f"{n} {kind.replace('_', ' ')}" for kind, n in kinds.items())
-    energy = {"value": file.energy, "unit": "MeV", "particle": file.particle}
-    facts = [
-        Fact("name", file.name, file.name),
-        Fact("energy", f"{file.energy:.6g} MeV total, {file.particle}s", energy),
-        Fact("elements", listed, dict(kinds)),
-        Fact("length", f"{length:.6g} m", length),
-    ]
-    units = [(e, file.calibrations.get(e.get("supply", e["name"]))) for e in file.elements]
-    magnets = [(e, unit) for e, unit in units if unit is not None]
-    facts += [_magnet(e, unit) for e, unit in magnets[:MOST_MAGNETS]]
-    if (more := len(magnets) - MOST_MAGNETS) > 0:
-        facts.append(Fact("further magnets", f"{more}, set as these", more))
-    screens = [e["name"] for e in file.elements if e["type"] == "screen"]
-    words = ", ".join(screens) or "none: sizes need one"
-    facts.append(Fact("screens", words, screens))
-    if file.energy_spread:
-        facts.append(Fact("energy spread", f"{file.energy_spread:.3g}", file.energy_spread))
-    if file.design is not None:
-        facts.append(Fact("design Twiss", f"at {file.design['at']}", dict(file.design)))
-    return facts
-
-
-def _magnet(element: Any, unit: str) -> Fact:
-    """What a magnet is set to where no scan says, and how a current becomes a gradient."""
-    key = next(key for key, its in STRENGTHS.items() if its == unit and key in element)
-    words = f"{element[key]:g} {SAID[unit]}"
-    if "length_m" in element:
-        words += f", {element['length_m']:g} m long"
-    how = [k for keys in CALIBRATIONS for k in sorted(keys) if k in element]
-    if how:
-        words += ", " + " and ".join(f"{k} {_short(element[k])}" for k in how)
-    words += f", on supply {element['supply']}" if "supply" in element else ""
-    return Fact(f"magnet {element['name']}", words, {"setting": element[key], "unit": unit})
-
-
-def _short(value: Any) -> str:
-    """A calibration number, numbers, or how many of a table."""
-    if isinstance(value, list | tuple):
-        few = len(value) <= 4 and not any(isinstance(v, list | tuple) for v in value)
-        return ", ".join(f"{v:g}" for v in value) if few else f"of {len(value)} points"
-    return f"{value:g}" if isinstance(value, int | float) else str(value)
-
-
-def _length(element: Any) -> float:
-    """Length of an element along the beam, m."""
-    if element["type"] == "sector_dipole":
-        return abs(element["radius_m"] * np.radians(element["angle_deg"]))
-    return float(element.get("length_m", 0.0))
-
-
-def _of_lifetimes(table: LifetimeTable) -> list[Fact]:
-    errors = "none: the scatter of the points" if table.error is None else "given"
-    return [
-        Fact("lifetimes", str(len(table)), len(table)),
-        _range(table.lifetime, "h")._replace(label="lifetime"),
-        _range(table.current, "mA")._replace(label="beam current"),
-        Fact("errors", errors, table.error is not None),
-    ]
-
-
-def _of_record(record: DecayRecord | LifetimeTable) -> list[Fact]:
-    if isinstance(record, LifetimeTable):
-        return _of_lifetimes(record)
-    hours = record.span / 3600
-    words = f"{len(record)} over {hours:.3g} h"
-    facts = [
-        Fact("readings", words, {"count": len(record), "span_h": hours}),
-        _range(record.current, "mA")._replace(label="beam current"),
-    ]
-    errors = "none: the noise is inferred from the residuals"
-    given = None if record.error is None else _range(record.error, "mA")
-    facts.append(Fact("errors", errors if given is None else given.words, given and given.value))
-    if record.start is not None:
-        began = datetime.fromtimestamp(record.start, UTC).isoformat(timespec="seconds")
-        facts.append(Fact("began", began, began))
-    conditions = record.conditions._asdict()
-    facts += [
-        _range(values, CONDITIONS[name])._replace(label=name.replace("_", " "))
-        for name, values in conditions.items()
-        if values is not None
-    ]
-    from beamfit.studies.decay.segments import split_record  # scipy, for records alone
-
-    split = split_record(record)
-    kinds = Counter(event.kind for event in split.events)
-    cut = ", ".join(f"{n} × {kind}" for kind, n in kinds.items()) or "nothing cut away"
-    count = len(split.segments)
-    value = {"count": count, "events": dict(kinds)}
-    facts.append(Fact("decays", f"{count} ({cut})", value))
-    return facts
-
-
-def _of_ring(path: str | PathLike[str], ring: Any) -> list[Fact]:
-    said = [
-        ("energy", ring.energy / 1e9, "GeV"),
-        ("circumference", ring.circumference, "m"),
-        ("energy loss a turn", ring.energy_loss / 1e3, "keV"),
-        ("emittance x", 1e9 * ring.emittance_x, "nm"),
-        ("emittance y", 1e9 * ring.emittance_y, "nm"),
-        ("points of the optics", len(ring.optics.weight), ""),
-    ]
-    if "operation" in read_toml(path, "a ring").table:
-        operation = read_operation(path)
-        said += [
-            ("RF voltage", operation.rf_voltage / 1e3, "kV"),
-            ("bunches", operation.bunches, ""),
-            ("pressure without beam", operation.pressure_base, "Pa"),
-        ]
-    return [
-        Fact(label, f"{float(v):.6g} {unit}".strip(), {"value": float(v), "unit": unit or "1"})
-        for label, v, unit in said
-    ]

@@ -162,3 +162,16 @@ ONE: LINE=(Q, M); TWO: LINE=(M, Q, M);
     assert status == 0
     assert "100 MeV total, electrons" in out
     assert "2 1/m² (k1), 0.1 m long" in out
+
+
+def test_runs_and_formulations_are_understood(run):
+    run_of, text = "measurements/valve_level_simulated.csv", "formulations/appendix_d.bf"
+    status, out, err = run("check", run_of, text, "--json")
+    assert status == 0, err
+    process, formulation = json.loads(out)["results"]
+    assert process["kind"] == "run"
+    assert process["contents"]["rows"] == {"count": 800, "span_s": 399.5, "step_s": 0.5}
+    assert set(process["contents"]) == {"rows", "input_valve", "output_level"}
+    assert formulation["kind"] == "formulation"
+    assert formulation["contents"]["variables"] == ["I_2"]
+    assert formulation["contents"]["objectives"] == ["obj"]
