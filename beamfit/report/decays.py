@@ -23,6 +23,7 @@ from beamfit.report.document import (
     provenance,
     written,
 )
+from beamfit.report.network import network_pictures
 from beamfit.report.trend import trend_picture
 from beamfit.status import Status
 from beamfit.studies.decay.checks import moving_lifetime
@@ -133,7 +134,7 @@ def decay_page(
         + [_verdict(d) for d in pooled]
         + _verdicts(decays),
         tables=tables,
-        pictures=([] if trend is None else [trend_picture(trend)]) + _pictures(studies),
+        pictures=_of_all(decays, shift, trend) + _pictures(studies),
         pictures_title="Records and fits",
         provenance=provenance(inputs or {}, [], command),
         notes=tuple(note for study in studies for note in study.record.comments),
@@ -357,6 +358,13 @@ def draw_budget(figure: FigureBase, decays: Sequence[Decay]) -> None:
     axes.set(title=f"computed losses{more}", xlabel="loss rate at the mean current, 1/h")
     axes.set(xlim=(0, None), ylim=(-0.6, len(shown) - 0.4))
     legend_below(figure, axes, 5)
+
+
+def _of_all(decays: Sequence[Decay], shift: Shift | None, trend: Trend | None) -> list[Picture]:
+    """Pictures of all decays together."""
+    listed = [] if trend is None else [trend_picture(trend)]
+    known = shift is not None and shift.network is not None
+    return listed + (network_pictures(shift, decays) if known else [])
 
 
 def _pictures(studies: Sequence[RecordStudy]) -> list[Picture]:

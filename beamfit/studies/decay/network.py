@@ -10,12 +10,14 @@ import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from scipy.linalg import block_diag
+from scipy.optimize import nnls
 
 from beamfit.errors import InputError
 from beamfit.greybox.bounds import over_cells
@@ -28,17 +30,18 @@ from beamfit.lifetime.losses import Terms, loss_terms, scaled_losses
 from beamfit.lifetime.ring import Operation
 from beamfit.quantity import Quantity
 from beamfit.shown import shown
-from beamfit.studies.decay.scales import ScaleFit, stacked_terms
+from beamfit.studies.decay.box import INPUTS, SIGNS, Box, Certificate, scaled
+from beamfit.studies.decay.discrepancy import Discrepancy, sized
+from beamfit.studies.decay.scales import PRESSURE_ERROR, ScaleFit, stacked_terms
 from beamfit.studies.decay.study import Decay, Machine, operation_during
 from beamfit.studies.decay.summary import Summaries, loss_parts, summarise
 from beamfit.table import json_of
 
 __all__ = ["Box", "Certificate", "Network", "NetworkFit", "fit_loss_network"]
 
-INPUTS = ("rf_voltage", "scraper_y", "pressure", "bunches")
-# How the loss moves with each input; nothing is known of the sign for the RF voltage.
-SIGNS = {"scraper_y": -1, "pressure": 1, "bunches": -1}
 OUTPUTS = ("log_a", "log_b")
+# Units of a, b and the lifetime.
+LOSSES = ("1/(mA s)", "1/s", "h")
 # Weights with a sign: from the inputs that the loss rises or falls with, and, as sums of rising
 # and of convex nodes are such, to the outputs; the last makes the lifetime have one maximum.
 RISING, POSITIVE = "rest->rising", ("rising->out", "convex->out")
@@ -46,7 +49,11 @@ DIRECTION = np.array([SIGNS[name] for name in INPUTS[1:]])[:, None]
 # Widths of the priors on weights: alone the network covers decades, a correction is near zero.
 ALONE, CORRECTION = 3.0, 0.3
 MOST = 30.0
-ROUNDING = 1e-9
+# Relative error of the model that a first fit is made with, and its correlation length: of half the
+# range of each input, or of that where less was seen. Chosen on simulated shifts.
+TRIAL, LENGTH, SHORTEST = 0.05, 0.8, 0.1
+# Where b is less than this share of the loss it is not told from it.
+SMALLEST = 1e-3
 # Voltages at which a correction is looked at.
 VOLTAGES = 65
 
@@ -56,75 +63,6 @@ class Network(StrEnum):
 
     alone = "alone"
     correction = "correction"
-
-
-class Box(NamedTuple):
-    """A range of operation, the ends in SI: what a network is asked to hold over.
-
-    Parameters
-    ----------
-    rf_voltage, scraper_y, pressure, bunches : (float, float)
-        V, m, Pa at the mean current, and number.
-
-    Raises
-    ------
-    InputError
-        From `corners`, if a range is empty or not positive and finite.
-
-    Examples
-    --------
-    >>> box = Box((1.6e6, 3.2e6), (3e-3, 6e-3), (1e-8, 1e-7), (100, 300))
-    >>> box.corners()[0].round(2).tolist()
-    [1.6, 1.1, 2.3, 4.61]
-    """
-
-    rf_voltage: tuple[float, float]
-    scraper_y: tuple[float, float]
-    pressure: tuple[float, float]
-    bunches: tuple[float, float]
-
-    def corners(self) -> tuple[np.ndarray, np.ndarray]:
-        """Both corners in the network's inputs."""
-        for name, (low, high) in zip(self._fields, self, strict=True):
-            if not 0 < low <= high < np.inf:
-                expected = "0 < lower <= upper, finite"
-                raise InputError(f"range {low:g} to {high:g}", expected, column=name)
-        low, high = np.array(self, float).T
-        return _scaled(*low), _scaled(*high)
-
-
-class Certificate(NamedTuple):
-    """What holds for all inputs in the operating box.
-
-    Attributes
-    ----------
-    lower, upper : array, shape (4,)
-        Corners of the box: RF voltage MV, logarithms of scraper mm, pressure nPa, bunches.
-    gains : array, shape (2, 4, 2)
-        Enclosures of the slopes of the network's ln a and ln b by the four inputs over the box,
-        rounded outward; of a correction, those of its factor.
-    single_maximum : str
-        Whether the lifetime has a single maximum in the RF voltage: "certified" by convex nodes of
-        a network alone; of a correction "seen" or "broken" at points of the box, since first
-        principles have no enclosure; "not asked".
-    """
-
-    lower: np.ndarray
-    upper: np.ndarray
-    gains: np.ndarray
-    single_maximum: str
-
-    @property
-    def holds(self) -> bool:
-        """Whether every slope of known sign has it, within rounding."""
-        known = [INPUTS.index(name) for name in SIGNS]
-        sign = np.array(list(SIGNS.values()))
-        worst = np.where(sign > 0, -self.gains[:, known, 0], self.gains[:, known, 1])
-        return bool(np.all(worst <= ROUNDING))
-
-    def to_json(self) -> dict[str, Any]:
-        """Return the range and the slopes as JSON's types."""
-        return json_of({"holds": self.holds, **self._asdict()})
 
 
 @shown
@@ -142,12 +80,27 @@ class NetworkFit:
         The ring and its usual operation.
     scales : array, or None
         Scales of the first principles that the network corrects; None if it stands alone.
+    discrepancy : Discrepancy
+        What it may be wrong by.
+    vacuum : array, shape (2,)
+        Pressure of the decays, Pa, without beam and for each mA of it, by a straight line.
+    left : array, shape (2n,)
+        What it leaves of the decays, in their errors.
     """
 
     fit: Fit
     certificate: Certificate
     machine: Machine
     scales: np.ndarray | None
+    discrepancy: Discrepancy
+    vacuum: np.ndarray
+    left: np.ndarray
+
+    @property
+    def usual(self) -> Operation:
+        """The machine's usual settings, in the vacuum of the decays."""
+        base, slope = self.vacuum
+        return self.machine.operation._replace(pressure_base=base, pressure_slope=slope)
 
     def losses(self, operation: Operation, current: float) -> tuple[Quantity, Quantity]:
         """Predict a and b at a setting.
@@ -170,22 +123,37 @@ class NetworkFit:
     def predict(self, operation: Operation, current: float) -> tuple[Quantity, ...]:
         """a, 1/(mA s), b, 1/s, and the lifetime, h, as `losses`."""
         terms = loss_terms(self.machine.ring, operation, current)
-        at = _inputs(operation, current)
+        at = _inputs(operation, current)[None]
         base = _base(self.scales, jax.tree.map(lambda part: part[None], terms))
-        found = self.fit.derive(_answer, (at[None], base, current))
-        ends = self.certificate.lower - ROUNDING, self.certificate.upper + ROUNDING
-        inside = np.all((at >= ends[0]) & (at <= ends[1]))
-        errors = [float(e) if inside and np.isfinite(e) else None for e in found.error]
-        units = ("1/(mA s)", "1/s", "h")
-        return tuple(
-            Quantity(float(v), e, u) for v, e, u in zip(found.value, errors, units, strict=True)
-        )
+        logs = self.fit.derive(_at, (at, base))
+        mean, covariance = self.discrepancy.spread(at, logs.slope[0], self.left, self.fit)
+        a, b = np.exp(logs.value[0])
+        rate = a * current + b
+        # By ln a and ln b: of themselves, and of the logarithm of the lifetime.
+        rows = np.array([[1, 0], [0, 1], [-a * current / rate, -b / rate]])
+        spread = np.sum(rows @ covariance * rows, axis=1) + (rows @ mean) ** 2
+        if self.scales is None:
+            spread = spread + self._pressed(at[0], current)
+        inside = self.certificate.holds_at(at[0])
+        named = zip((a, b, 1 / rate / HOUR), np.sqrt(spread), LOSSES, strict=True)
+        return tuple(Quantity(float(v), float(e * v) if inside else None, u) for v, e, u in named)
+
+    def _pressed(self, at: np.ndarray, current: float) -> float:
+        """Variance of ln a and ln b at another pressure than the decays had at that current.
+
+        The pressure went with the current, so that what is of one and what of the other is not
+        told: losses go with a power of the pressure of which only 0 to 1 is known (gas part).
+        """
+        base, slope = self.vacuum
+        off = at[INPUTS.index("pressure")] - np.log(1e9 * (base + slope * current))
+        return off**2 / 3
 
     def to_json(self, current: float) -> dict[str, Any]:
         """Return the verdict, and a, b and lifetime at the usual settings, as JSON's types."""
         found = {name: getattr(self.fit, name) for name in ("status", "message", "chi2", "dof")}
-        a, b, lifetime = self.predict(self.machine.operation, current)
+        a, b, lifetime = self.predict(self.usual, current)
         told = {"a": a, "b": b, "lifetime": lifetime, "certificate": self.certificate}
+        told["model_error"] = dict(zip("ab", self.discrepancy.size, strict=True))
         return json_of(found | told)
 
 
@@ -196,29 +164,22 @@ Data = tuple[Array, Array, Array, Array]
 def _inputs(operation: Operation, current: float) -> np.ndarray:
     """Inputs in units near one; logarithms where the losses go as powers."""
     pressure = operation.pressure_base + operation.pressure_slope * current
-    return _scaled(operation.rf_voltage, operation.scraper_y, pressure, operation.bunches)
-
-
-def _scaled(rf_voltage, scraper_y, pressure, bunches) -> np.ndarray:
-    values = np.array([1e3 * scraper_y, 1e9 * pressure, bunches], float)
-    return np.array([1e-6 * float(rf_voltage), *np.log(values)])
+    return scaled(operation.rf_voltage, operation.scraper_y, pressure, operation.bunches)
 
 
 def _logs(model: Mapping[str, MLP], inputs: Array, base: Array) -> Array:
     return base + jax.vmap(model["map"].values)(inputs)
 
 
-def _answer(model: Mapping[str, MLP], data: tuple[Array, Array, Array]) -> Array:
-    """a, b and the lifetime, h, at one setting."""
-    inputs, base, current = data
-    a, b = jnp.exp(_logs(model, inputs, base)[0])
-    return jnp.stack([a, b, 1 / (a * current + b) / HOUR])
+def _at(model: Mapping[str, MLP], data: tuple[Array, Array]) -> Array:
+    """ln a and ln b at settings, shape (n, 2)."""
+    return _logs(model, *data)
 
 
 def _predict(model: Mapping[str, MLP], data: Data) -> Array:
     inputs, base, current, weight = data
     a, b = jnp.exp(_logs(model, inputs, base)).T
-    return jnp.einsum("nij,nj->ni", weight, loss_parts(a, b, current))
+    return weight @ loss_parts(a, b, current).ravel()
 
 
 def _base(scales: np.ndarray | None, terms: Terms) -> Array:
@@ -272,11 +233,19 @@ def _free(net: MLP, single_maximum: bool) -> list[Free]:
     return [*found, Free("map.biases", -MOST, MOST, start=(-1.0, 1.0), nuisance=True)]
 
 
-def _floored(measured: Summaries, floor: float) -> Array:
-    """Weight W of unit covariance with an independent relative error of each part added."""
-    spread = measured.root * (floor * measured.parts)[:, None, :]
-    covariance = jnp.eye(2) + spread @ jnp.swapaxes(spread, 1, 2)
-    return jnp.linalg.solve(jnp.linalg.cholesky(covariance), measured.root)
+def _statement(measured: Summaries, floor: float) -> tuple[np.ndarray, np.ndarray]:
+    """Weights of what the decays say, and slopes of that by ln a and ln b, (2n, 2n) each.
+
+    With independent relative errors of a, and of b, whose pressure is as good as its reading.
+    """
+    quadratic, rate = np.abs(np.asarray(measured.parts)).T
+    linear = np.maximum(np.abs(rate - quadratic), SMALLEST * rate)
+    zero = np.zeros_like(rate)
+    by = np.stack([np.stack([quadratic, zero], -1), np.stack([quadratic, linear], -1)], axis=1)
+    own = np.asarray(measured.root) @ by * np.array([floor, PRESSURE_ERROR])
+    root = np.linalg.cholesky(np.eye(2) + own @ np.swapaxes(own, 1, 2))
+    weight = np.linalg.solve(root, np.asarray(measured.root))
+    return block_diag(*weight), block_diag(*(weight @ by))
 
 
 def fit_loss_network(
@@ -285,7 +254,7 @@ def fit_loss_network(
     corrected: ScaleFit | None = None,
     *,
     hidden: int = 4,
-    floor: float = 0.02,
+    floor: float = 0.01,
     box: Box | None = None,
     single_maximum: bool = True,
     starts: int = 3,
@@ -305,8 +274,8 @@ def fit_loss_network(
     hidden : int, optional
         Nodes for scraper, pressure and bunches together; two more serve the voltage.
     floor : float, optional
-        Relative error added to both loss rates of each decay, for pressure readings and what the
-        network cannot follow.
+        Independent relative error of a in each decay, for what no input shows; b has that of a
+        pressure reading, 5 %.
     box : Box, optional
         The operating box of the certificate, outside which nothing is predicted; what the decays
         span by default. Where it is wider than that, errors are those of an extrapolation.
@@ -329,7 +298,9 @@ def fit_loss_network(
     -----
     Weights are regularised by a normal prior of width 3 alone and 0.3 as a correction, so that a
     correction the data do not ask for stays zero. First principles themselves fall with bunches
-    and scraper and rise with pressure, so the signs hold for the product.
+    and scraper and rise with pressure, so the signs hold for the product. What the network cannot
+    follow is a smooth random error in its likelihood, whose size the decays themselves tell
+    (`discrepancy`); errors of predictions contain it, and grow away from the decays.
     """
     if len(decays) < 4:
         raise InputError(f"{len(decays)} decays", "4 or more at different settings")
@@ -343,17 +314,29 @@ def fit_loss_network(
     scales = None if corrected is None else corrected.vector
     means = np.zeros(2) if corrected is not None else _typical(measured)
     net = _network(inputs, means, hidden, seed)
-    weight = _floored(measured, floor)
-    data = (jnp.asarray(inputs), _base(scales, terms), measured.current, weight)
-    seen = jnp.einsum("nij,nj->ni", weight, measured.parts)
     width = ALONE if corrected is None else CORRECTION
-    problem = Problem(
-        model={"map": net},
-        free=_free(net, single_maximum or corrected is not None),
-        records=[Record("decays", _predict, data, seen, error=1.0)],
-        priors=[Prior("map", 0.0, width)],
-    )
-    fit = solve(problem, starts=starts, seed=seed, iterations=300)
+    weight, rows = _statement(measured, floor)
+    seen, base = weight @ np.asarray(measured.parts).ravel(), _base(scales, terms)
+
+    def fitted(model: MLP, wrong: Discrepancy, starts: int) -> tuple[Fit, np.ndarray]:
+        whiten = np.linalg.inv(wrong.root)
+        data = (jnp.asarray(inputs), base, measured.current, jnp.asarray(whiten @ weight))
+        problem = Problem(
+            model={"map": model},
+            free=_free(net, single_maximum or corrected is not None),
+            records=[Record("decays", _predict, data, jnp.asarray(whiten @ seen), error=1.0)],
+            priors=[Prior("map", 0.0, width)],
+        )
+        fit = solve(problem, starts=starts, seed=seed, iterations=300)
+        return fit, seen - np.asarray(_predict(fit.model, (*data[:3], jnp.asarray(weight))))
+
+    mean = np.asarray(measured.current)
+    pressure = 1e-9 * np.exp(inputs[:, INPUTS.index("pressure")])
+    vacuum = _line(mean, pressure)
+    length = np.maximum(LENGTH * np.ptp(inputs, axis=0) / 2, SHORTEST)
+    trial = Discrepancy((TRIAL, TRIAL), inputs, length, rows)
+    wrong = sized(trial, *reversed(fitted(net, trial, starts)))
+    fit, left = fitted(net, wrong, starts)
     low, high = (inputs.min(0), inputs.max(0)) if box is None else box.corners()
     enclosed = over_cells(fit.model["map"], low, high, 2)
     gains = np.stack([np.min(enclosed.lower, axis=0), np.max(enclosed.upper, axis=0)], axis=-1)
@@ -361,7 +344,8 @@ def fit_loss_network(
         maximum = "certified" if single_maximum else "not asked"
     else:
         maximum = _maximum_seen(fit, scales, machine, low, high, float(np.max(terms.current)))
-    return NetworkFit(fit, Certificate(low, high, gains, maximum), machine, scales)
+    certificate = Certificate(low, high, gains, maximum)
+    return NetworkFit(fit, certificate, machine, scales, wrong, vacuum, left)
 
 
 def _maximum_seen(
@@ -388,6 +372,13 @@ def _maximum_seen(
         if np.count_nonzero(turns) > 1 or turns.min(initial=0) < 0:
             return "broken"
     return "seen"
+
+
+def _line(current: np.ndarray, pressure: np.ndarray) -> np.ndarray:
+    """P0 and P1 of P = P0 + P1 I, neither negative; relative errors are alike."""
+    rows = np.stack([np.ones_like(current), current], axis=1) / pressure[:, None]
+    size = np.linalg.norm(rows, axis=0)
+    return nnls(rows / size, np.ones_like(current))[0] / size
 
 
 def _typical(measured: Summaries) -> np.ndarray:

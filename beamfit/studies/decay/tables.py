@@ -341,11 +341,12 @@ def shift_rows(shift: Shift) -> Rows:
 def network_rows(shift: Shift) -> Rows:
     """Label and one cell for what a network of the losses says, and what it obeys."""
     network, at = shift.network, f"at the usual settings, {shift.current:.4g} mA"
-    a, b, lifetime = network.predict(network.machine.operation, shift.current)
-    held = network.certificate
+    a, b, lifetime = network.predict(network.usual, shift.current)
+    held, wrong = network.certificate, network.discrepancy.size
     rows = [
         ("status", network.fit.status),
         ("chi2/dof", f"{network.fit.chi2:.4g}/{network.fit.dof}"),
+        ("what it may be wrong by, a and b", " and ".join(f"{100 * size:.2g} %" for size in wrong)),
         (f"a {at}", a),
         (f"b {at}", b),
         (f"lifetime {at}", lifetime),

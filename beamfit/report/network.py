@@ -1,0 +1,139 @@
+"""Pictures of a network of the losses: the report's figures 27 to 30, and a, b by the settings."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import partial
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import FigureBase
+
+from beamfit.lifetime.decay import HOUR, current
+from beamfit.lifetime.losses import loss_terms, scaled_losses
+from beamfit.report.document import BLUE, RED, Picture, legend_below
+from beamfit.studies.decay.shift import Shift
+from beamfit.studies.decay.study import Decay, operation_during
+
+__all__ = ["draw_by_setting", "draw_decays", "network_pictures"]
+
+POINTS = 33
+# Decays shown, as many as the report shows.
+SHOWN = 4
+SETTINGS = {
+    "rf_voltage": (1e6, "RF voltage, MV"),
+    "scraper_y": (1e-3, "scraper, mm"),
+    "bunches": (1.0, "bunches"),
+}
+
+
+def network_pictures(shift: Shift, decays: Sequence[Decay]) -> list[Picture]:
+    """Decays with the network's prediction, then a, b and lifetime by each setting that varied."""
+    listed = [
+        Picture("decays by the network", 4.6, partial(draw_decays, shift=shift, decays=decays))
+    ]
+    for name, (low, high) in shift.limits._asdict().items():
+        if high > 1.01 * low:
+            draw = partial(draw_by_setting, shift=shift, decays=decays, name=name)
+            listed.append(Picture(f"losses by {SETTINGS[name][1]}", 2.6, draw))
+    return listed
+
+
+def draw_decays(figure: FigureBase, shift: Shift, decays: Sequence[Decay]) -> None:
+    """Draw readings and the network's decay at their settings, as the report's figures 27 to 30.
+
+    Parameters
+    ----------
+    figure : Figure or SubFigure
+        Where to.
+    shift : Shift
+        With a network.
+    decays : sequence of Decay
+        What it was fitted to; four of them are drawn.
+    """
+    network = shift.network
+    rows = np.unique(np.linspace(0, len(decays) - 1, SHOWN).round().astype(int))
+    panels = figure.subplots(2, 2, squeeze=False).ravel()
+    for axes, row in zip(panels, rows, strict=False):
+        decay = decays[row]
+        segment, fit = decay.segment, decay.fit
+        operation = operation_during(segment, network.machine)
+        a, b, _ = network.predict(operation, fit.mean_current)
+        hours = segment.time / HOUR
+        law = np.asarray(current(segment.time, fit.i0.value, a.value, b.value))
+        axes.plot(hours, segment.current, ".", color=BLUE, ms=3, label="readings")
+        axes.plot(hours, law, color=RED, lw=1.3, label="network")
+        axes.set_title(fit.record, fontsize="small")
+        rows = (("a", fit.a.value, a.value), ("b", fit.b.value, b.value))
+        said = "\n".join(f"{name} {own:.3e}, network {told:.3e}" for name, own, told in rows)
+        axes.text(0.97, 0.95, said, transform=axes.transAxes, ha="right", va="top", fontsize=7)
+    for axes in panels[2:]:
+        axes.set_xlabel("time, h")
+    for axes in panels[::2]:
+        axes.set_ylabel("current, mA")
+    legend_below(figure, panels[0], 2)
+
+
+def draw_by_setting(figure: FigureBase, shift: Shift, decays: Sequence[Decay], name: str) -> None:
+    """Draw a, b and the lifetime against one setting: network with its error, first principles.
+
+    Parameters
+    ----------
+    figure : Figure or SubFigure
+        Where to.
+    shift : Shift
+        With a network.
+    decays : sequence of Decay
+        Those at the usual other settings are drawn as points.
+    name : str
+        "rf_voltage", "scraper_y" or "bunches".
+    """
+    network = shift.network
+    scale, label = SETTINGS[name]
+    at = np.linspace(*getattr(shift.limits, name), POINTS)
+    settings = [network.usual._replace(**{name: float(value)}) for value in at]
+    told = [network.predict(one, shift.current) for one in settings]
+    first = [_first_principles(shift, one) for one in settings]
+    points = _measured(shift, decays, name)
+    units = ("a, 1/(mA s)", "b, 1/s", f"lifetime at {shift.current:.3g} mA, h")
+    panels = figure.subplots(1, 3)
+    for k, (axes, unit) in enumerate(zip(panels, units, strict=True)):
+        value = np.array([one[k].value for one in told])
+        error = np.array([np.nan if one[k].error is None else one[k].error for one in told])
+        axes.fill_between(at / scale, value - error, value + error, color=RED, alpha=0.2, lw=0)
+        axes.plot(at / scale, value, color=RED, label="network, one error")
+        axes.plot(
+            at / scale, [one[k] for one in first], color="0.5", ls="--", label="first principles"
+        )
+        _points(axes, points, k, scale)
+        axes.set(xlabel=label)
+        axes.set_title(unit, fontsize="small")
+    legend_below(figure, panels[0], 3)
+
+
+def _points(axes: Axes, points: list[tuple[float, list]], k: int, scale: float) -> None:
+    known = [(at, q[k]) for at, q in points if q[k].error is not None]
+    if known:
+        at, value, error = zip(*((at / scale, q.value, q.error) for at, q in known), strict=True)
+        axes.errorbar(at, value, error, fmt="o", ms=4, color=BLUE, label="decays")
+
+
+def _first_principles(shift: Shift, operation) -> tuple[float, float, float]:
+    """a, b and lifetime with the scales of the study."""
+    machine = shift.fit.machine
+    terms = loss_terms(machine.ring, operation, shift.current)
+    a, b = (float(v) for v in scaled_losses(shift.fit.vector, terms))
+    return a, b, 1 / (a * shift.current + b) / HOUR
+
+
+def _measured(shift: Shift, decays: Sequence[Decay], name: str) -> list[tuple[float, list]]:
+    """Decays near the current and the usual settings but for one: its value, and what they say."""
+    usual, found = shift.network.machine.operation, []
+    others = [setting for setting in SETTINGS if setting != name]
+    for decay in decays:
+        at = operation_during(decay.segment, shift.network.machine)
+        near = abs(decay.fit.mean_current / shift.current - 1) < 0.25
+        if near and all(np.isclose(getattr(at, o), getattr(usual, o), rtol=0.01) for o in others):
+            fit = decay.fit
+            found.append((float(getattr(at, name)), [fit.a, fit.b, fit.lifetime_mean]))
+    return found
