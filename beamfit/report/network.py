@@ -11,6 +11,7 @@ from matplotlib.figure import FigureBase
 
 from beamfit.lifetime.decay import HOUR, current
 from beamfit.lifetime.losses import loss_terms, scaled_losses
+from beamfit.lifetime.ring import Operation
 from beamfit.report.document import BLUE, RED, Picture, legend_below
 from beamfit.studies.decay.shift import Shift
 from beamfit.studies.decay.study import Decay, operation_during
@@ -118,12 +119,20 @@ def _points(axes: Axes, points: list[tuple[float, list]], k: int, scale: float) 
         axes.errorbar(at, value, error, fmt="o", ms=4, color=BLUE, label="decays")
 
 
-def _first_principles(shift: Shift, operation) -> tuple[float, float, float]:
-    """a, b and lifetime with the scales of the study."""
-    machine = shift.fit.machine
-    terms = loss_terms(machine.ring, operation, shift.current)
-    a, b = (float(v) for v in scaled_losses(shift.fit.vector, terms))
-    return a, b, 1 / (a * shift.current + b) / HOUR
+def _first_principles(shift: Shift, operation: Operation) -> tuple[float, float, float]:
+    """a, b and lifetime with the scales of the study, at the same pressure.
+
+    A scale is on the ring file's own P1/P0.
+    """
+    machine, at = shift.fit.machine, shift.current
+    usual = machine.operation
+    pressure = operation.pressure_base + operation.pressure_slope * at
+    share = pressure / (usual.pressure_base + usual.pressure_slope * at)
+    operation = operation._replace(
+        pressure_base=share * usual.pressure_base, pressure_slope=share * usual.pressure_slope
+    )
+    a, b = scaled_losses(shift.fit.vector, loss_terms(machine.ring, operation, at))
+    return float(a), float(b), float(1 / (a * at + b) / HOUR)
 
 
 def _measured(shift: Shift, decays: Sequence[Decay], name: str) -> list[tuple[float, list]]:

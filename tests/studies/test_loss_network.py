@@ -1,5 +1,10 @@
 """Networks of a and b: they obey physics everywhere, follow the truth, correct a wrong model."""
 
+import contextlib
+import io
+import re
+import textwrap
+
 import jax
 import numpy as np
 import pytest
@@ -175,3 +180,29 @@ def test_its_errors_hold_the_truth_in_the_box_and_grow_outside(alone, machine):
 def _truth(machine, operation, beam):
     terms = loss_terms(machine.ring, operation, beam)
     return [float(v) for v in scaled_losses(np.r_[TRUE[:3], 1.0], terms)]
+
+
+def test_the_design_questions_of_the_docs_are_answered_and_true(root, machine, monkeypatch):
+    """docs/lifetime.md: its code gives its numbers, and the truth is where they say."""
+    page = (root / "docs/lifetime.md").read_text()
+    part = page.partition("### Two design questions")[2].partition("A worked study")[0]
+    blocks = re.findall(r"(?:^    .*\n|^\n(?=    ))+", part, flags=re.MULTILINE)
+    shown, names = io.StringIO(), {}
+    monkeypatch.chdir(root)
+    with contextlib.redirect_stdout(shown):
+        for block in blocks:
+            code = block.partition("\n\n    475 mA,")[0]
+            exec(textwrap.dedent(code.partition("\n\n    gap 5.5")[0]), names)
+    said = [line.strip() for line in part.splitlines() if re.match(r"    (475|700|gap) ", line)]
+    told = shown.getvalue().splitlines()
+    assert len(told) == len(said) == 8
+    for mine, theirs in zip(told, said, strict=True):
+        assert re.sub(r"[\d.]+", "", mine) == re.sub(r"[\d.]+", "", theirs)
+        numbers = [[float(n) for n in re.findall(r"\d+\.?\d*", line)] for line in (mine, theirs)]
+        np.testing.assert_allclose(*numbers, rtol=0.03)
+    assert [line.count("not determined") for line in told] == [0, 0, 0, 1, 0, 0, 0, 1]
+    network, vacuum = names["network"], {"pressure_base": 2e-8, "pressure_slope": 2e-10}
+    for setting in ({"rf_voltage": 2.4e6}, {"rf_voltage": 1.8e6}, {"scraper_y": 2.83e-3}):
+        a, b = _truth(machine, machine.operation._replace(**vacuum, **setting), 475.0)
+        found = network.predict(network.usual._replace(**setting), 475.0)[2]
+        assert found.value == pytest.approx(1 / (a * 475 + b) / 3600, abs=2.5 * found.error)

@@ -98,7 +98,9 @@ class NetworkFit:
 
     @property
     def usual(self) -> Operation:
-        """The machine's usual settings, in the vacuum of the decays."""
+        """The machine's usual settings, of a network alone in the vacuum of the decays."""
+        if self.scales is not None:
+            return self.machine.operation
         base, slope = self.vacuum
         return self.machine.operation._replace(pressure_base=base, pressure_slope=slope)
 
