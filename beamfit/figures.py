@@ -22,10 +22,21 @@ if TYPE_CHECKING:
 
     from beamfit.sampling.posterior import Posterior
     from beamfit.studies.decay.fit import DecayFit
-    from beamfit.studies.decay.study import RecordStudy
+    from beamfit.studies.decay.shift import Shift
+    from beamfit.studies.decay.study import Decay, RecordStudy
+    from beamfit.studies.decay.trend import Trend
     from beamfit.studies.scan.fit import EmittanceFit
 
-__all__ = ["decay", "lifetime", "pairs", "phase_space", "residuals", "scan"]
+__all__ = [
+    "decay",
+    "lifetime",
+    "network",
+    "pairs",
+    "phase_space",
+    "residuals",
+    "scan",
+    "trend",
+]
 
 
 def scan(fit: EmittanceFit, plane: str | None = None) -> Figure:
@@ -129,6 +140,55 @@ def pairs(posterior: Posterior, names: Sequence[str] | None = None) -> Figure:
     if not posterior.chain.size:
         raise InputError("a posterior without draws", posterior.message)
     return _drawn(draw_pairs, 1.0 + 1.15 * len(names), posterior=posterior, names=names)
+
+
+def trend(result: Trend) -> Figure:
+    """Draw normalised lifetimes with control limits and alarms; a and b over the usual ones below.
+
+    Parameters
+    ----------
+    result : Trend
+        Of `beamfit.studies.decay.trend.trend_of`.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+    """
+    from beamfit.report.trend import draw_trend
+
+    return _drawn(draw_trend, 2.6 if result.reference is None else 5.4, trend=result)
+
+
+def network(shift: Shift, decays: Sequence[Decay], setting: str | None = None) -> Figure:
+    """Draw what a network of the losses says beside decays, or by one setting.
+
+    Parameters
+    ----------
+    shift : Shift
+        A study with a network.
+    decays : sequence of Decay
+        What it was made from.
+    setting : str, optional
+        "rf_voltage", "scraper_y" or "bunches": a, b and lifetime against it. Otherwise four decays.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+
+    Raises
+    ------
+    InputError
+        If the study has no network, or there is no such setting.
+    """
+    from beamfit.report.network import SETTINGS, draw_by_setting, draw_decays
+
+    if shift.network is None:
+        raise InputError("a study without a network", "study_shift(..., network=Network.alone)")
+    if setting is None:
+        return _drawn(draw_decays, 4.6, shift=shift, decays=decays)
+    if setting not in SETTINGS:
+        raise InputError(f"a setting '{setting}'", " or ".join(SETTINGS))
+    return _drawn(draw_by_setting, 2.6, shift=shift, decays=decays, name=setting)
 
 
 def _plane(fit: EmittanceFit, plane: str | None) -> str:

@@ -32,9 +32,22 @@ def executed(root):
 
 def test_the_lifetime_study_runs(executed):
     text, pictures = executed("lifetime_study.ipynb")
-    assert pictures == 2
+    assert pictures == 5
     assert "a and b are determined" in text
     assert "bremsstrahlung and elastic" in text
     assert "not separable by" in text
     assert "30 decays: converged" in text
     assert "b moved since later fill 5" in text
+    assert "Alarm: b moved by +5" in text
+
+
+def test_it_is_shipped_as_it_runs_and_imports_the_package_alone(root):
+    import nbformat
+
+    notebook = nbformat.read(root / "docs/notebooks/lifetime_study.ipynb", as_version=4)
+    code = [cell for cell in notebook.cells if cell.cell_type == "code"]
+    assert all(cell.execution_count == number for number, cell in enumerate(code, 1))
+    lines = [line.strip() for cell in code for line in cell.source.splitlines()]
+    imports = [line for line in lines if line.startswith(("import ", "from "))]
+    assert imports
+    assert all(line.split()[1].split(".")[0] == "beamfit" for line in imports)
