@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import hashlib
+import io
 import os
+import stat
 import tempfile
 from collections.abc import Iterator
+from functools import lru_cache
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -28,10 +31,24 @@ SIGNATURES = {
 # ° ± ² ³ µ in the code pages of Windows, and what needs none.
 MARKS, ASCII = bytes([0xB0, 0xB1, 0xB2, 0xB3, 0xB5]), bytes(range(128))
 LARGEST_TEXT = 4_000_000
+LARGEST_PIPE = 256_000_000
+
+
+@lru_cache(maxsize=8)
+def _piped(path: str) -> bytes:
+    """What a pipe gives: it can be read once, and is looked at several times."""
+    with open(path, "rb") as stream:
+        content = stream.read(LARGEST_PIPE + 1)
+    if len(content) > LARGEST_PIPE:
+        found = f"more than {LARGEST_PIPE // 1_000_000} MB from a pipe"
+        raise InputError(found, "a file, for so much", path=path)
+    return content
 
 
 def _opened(path: str | PathLike[str]):
     try:
+        if stat.S_ISFIFO(os.stat(path).st_mode):
+            return io.BytesIO(_piped(os.fspath(path)))
         return open(path, "rb")
     except FileNotFoundError:
         raise InputError("no such file", "a readable file", path=path) from None

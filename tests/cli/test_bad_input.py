@@ -4,9 +4,12 @@ Each case is what somebody did with a scan or a lattice; the words asserted are 
 say where it is and what to do about it.
 """
 
+import hashlib
+import json
 import os
 import subprocess
 import sys
+import threading
 
 import h5py
 import numpy as np
@@ -332,3 +335,21 @@ def test_ten_million_rows_are_refused_in_bounded_memory(place):
     assert small.returncode == 2
     assert loaded == "[]"
     assert peak - usual < 150
+
+
+@pytest.mark.parametrize("command", ["emittance", "lifetime", "check"])
+def test_a_pipe_is_read_once_and_its_digest_is_that_of_what_it_gave(command, root):
+    """As `beamfit lifetime <(zcat decay.csv.gz)` has it."""
+    name = "lcls_otr2.csv" if command == "emittance" else "aps_1999_decay.csv"
+    content = (root / "measurements" / name).read_bytes()
+    more = ["--lattice", root / "lattices" / "lcls_otr2.toml"] if command == "emittance" else []
+    read, write = os.pipe()
+    threading.Thread(target=lambda: (os.write(write, content), os.close(write))).start()
+    found = subprocess.run(
+        [sys.executable, "-m", "beamfit", command, f"/dev/fd/{read}", *map(str, more), "--json"],
+        pass_fds=[read], capture_output=True, text=True, cwd=root, check=False,
+    )  # fmt: skip
+    os.close(read)
+    assert found.returncode == 0, found.stderr
+    digests = json.loads(found.stdout)["inputs"]
+    assert digests[f"/dev/fd/{read}"] == hashlib.sha256(content).hexdigest()
