@@ -52,6 +52,7 @@ bench: .venv/bench
 	$(BIN)/python benchmarks/lifetime.py
 	$(BIN)/python benchmarks/greybox.py 20 0
 	$(BIN)/python benchmarks/language.py
+	$(BIN)/python benchmarks/optimisation.py 20
 	$(BIN)/python benchmarks/sampling.py
 	$(BIN)/python benchmarks/scenarios.py
 	$(BIN)/python benchmarks/response.py

@@ -167,7 +167,8 @@ class Problem:
     @cached_property
     def names(self) -> tuple[str, ...]:
         """Name of each free number."""
-        return tuple(name for leaf in self.core.chosen for name in tree.element_names(leaf))
+        named = (f.labels or tree.element_names(leaf) for leaf, f in self._spread)
+        return tuple(name for names in named for name in names)
 
     @cached_property
     def start(self) -> np.ndarray:
@@ -210,8 +211,11 @@ class Problem:
     @cached_property
     def constraint_names(self) -> tuple[str, ...]:
         """Name of each constraint element."""
-        leaves = (tree.Leaf(0, c.name, shape) for c, shape in self._constraint_shapes)
-        return tuple(name for leaf in leaves for name in tree.element_names(leaf))
+        return tuple(
+            name
+            for c, shape in self._constraint_shapes
+            for name in c.labels or tree.element_names(tree.Leaf(0, c.name, shape))
+        )
 
     @cached_property
     def constraint_lower(self) -> np.ndarray:

@@ -31,6 +31,8 @@ class Free(NamedTuple):
     nuisance : bool
         True for numbers nobody asks for, such as weights: they may stay undetermined or end on a
         bound without that being the verdict on the fit.
+    labels : tuple of str, optional
+        Names of the numbers of a leaf in C order, in the place of ``path[i]``.
     """
 
     path: str
@@ -38,6 +40,7 @@ class Free(NamedTuple):
     upper: Any = np.inf
     start: tuple[float, float] | None = None
     nuisance: bool = False
+    labels: tuple[str, ...] | None = None
 
 
 @tree.node("name", "predict", "worth", "apart")
@@ -176,7 +179,7 @@ class Prior:
         return jnp.ravel((value - self.mean) / self.sd)
 
 
-@tree.node("name", "function")
+@tree.node("name", "function", "labels")
 class Constraint:
     """lower <= function(model, data) <= upper, element by element; equal ends make an equation.
 
@@ -190,6 +193,8 @@ class Constraint:
         What it needs: any subset of the measured data, points, cells.
     lower, upper : float or array
         Limits.
+    labels : tuple of str, optional
+        Names of its elements in C order, in the place of ``name[i]``.
     """
 
     name: str
@@ -197,6 +202,7 @@ class Constraint:
     data: Any = None
     lower: Any = -np.inf
     upper: Any = np.inf
+    labels: tuple[str, ...] | None = None
 
 
 @tree.node("name", "function")
