@@ -22,7 +22,6 @@ from beamfit.io.facts import (
     of_scan,
 )
 from beamfit.io.files import digest
-from beamfit.io.formulation import read_formulation
 from beamfit.io.line import FOREIGN, build_line, read_lattice
 from beamfit.io.measurement import read_quad_scan
 from beamfit.io.ring import read_ring
@@ -133,6 +132,8 @@ def understand(
         content = read_run(path, ignore=ignore, skip_bad=skip_bad)
         facts, notes = of_run(content), content.notes
     elif kind == "formulation":
+        from beamfit.io.formulation import read_formulation  # scipy
+
         content = read_formulation(path)
         facts, notes = of_formulation(content), ()
     else:
