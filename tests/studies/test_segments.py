@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
 from beamfit.errors import InputError
 from beamfit.studies.decay.fit import fit_decays
@@ -174,3 +175,29 @@ def test_a_dead_first_reading_is_a_dropout_and_not_a_refill():
     assert [event.kind for event in found.events] == ["dropout"]
     assert len(found.segments) == 1
     np.testing.assert_array_equal(found.segments[0].current, current[2:])
+
+
+@pytest.mark.parametrize("kind", ["linear", "small", "smooth"])
+@pytest.mark.parametrize("noise", [0.002, 0.1])
+def test_a_ramp_of_injection_at_the_head_is_cut(kind, noise):
+    ramp = np.clip(TIME / 300, 0, 1)
+    lacking = {
+        "linear": 50 * (1 - ramp),
+        "small": 1 - ramp,
+        "smooth": 30 * np.exp(-TIME / 50),
+    }[kind]
+    split = split_record(DecayRecord(TIME, decay(TIME, lifetime=31 * 3600, noise=noise) - lacking))
+    assert kinds(split) == ["ramp"]
+    [found] = fit_decays(split.segments)
+    off = found.lifetime_mean.value - 31
+    assert abs(off) < 3 * found.lifetime_mean.error < 0.02 * 31
+    assert len(split.segments[0]) > 500
+
+
+def test_noise_with_a_memory_is_no_ramp():
+    for seed in range(40):
+        memory = (0.5, 0.9, 0.97, 0.99)[seed % 4]
+        fresh = np.random.default_rng(seed).normal(size=1600)
+        noise = lfilter([np.sqrt(1 - memory**2)], [1, -memory], fresh)[-600:]
+        split = split_record(DecayRecord(TIME, decay(TIME) + 10.0 ** -(seed % 3) * noise))
+        assert "ramp" not in kinds(split)

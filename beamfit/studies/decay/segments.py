@@ -20,6 +20,9 @@ DROPOUT = 0.02
 DEAD = 5
 WINDOW = 9
 FEWEST = 8
+# Readings whose means are looked at for a ramp at the head, the share of its rise by which a fall
+# ends it, and by how much it exceeds any later rise.
+SMOOTH, FALL, RISE = 5, 0.1, 3.0
 # A gap is this many usual sampling intervals.
 GAP = 10.0
 
@@ -30,8 +33,8 @@ class Event(NamedTuple):
     Attributes
     ----------
     kind : str
-        `refill`, `loss`, `dropout`, `spike`, `saturated`, `gap` or `short` (a piece too short
-        to keep).
+        `refill`, `loss`, `dropout`, `spike`, `saturated`, `gap`, `ramp` (the end of injection at
+        the head of a decay) or `short` (a piece too short to keep).
     time : float
         When it begins, s from the record's start.
     duration : float
@@ -185,6 +188,25 @@ def _steps(time: np.ndarray, current: np.ndarray, noise: float) -> np.ndarray:
     return np.where(np.abs(excess) > allowed, change, 0.0)
 
 
+def _ramp(current: np.ndarray, noise: float) -> int:
+    """How many readings at the head of a piece are of injection: the current still rises, by more
+    than noise and three times more than anywhere later. Half as many again are cut, where a ramp
+    that ends smoothly still counts.
+    """
+    if current.size < 3 * FEWEST:
+        return 0
+    smooth = np.convolve(current, np.full(SMOOTH, 1 / SMOOTH), "valid")
+    top = np.maximum.accumulate(smooth)
+    falls = np.flatnonzero(top - smooth > np.maximum(5 * noise, FALL * (top - smooth[0])))
+    highest = int(np.argmax(smooth[: falls[0] if falls.size else None]))
+    after = smooth[highest:]
+    later = float(np.max(after - np.minimum.accumulate(after)))
+    if smooth[highest] - smooth[0] <= max(6 * noise, RISE * later):
+        return 0
+    cut = int(1.5 * (highest + SMOOTH // 2)) + 1
+    return cut if current.size - cut >= FEWEST else 0
+
+
 def split_record(record: DecayRecord) -> Split:
     """Cut a record at refills and loss steps, and drop readings that are not of the beam.
 
@@ -225,6 +247,11 @@ def split_record(record: DecayRecord) -> Split:
         events.append(_event(record, "gap", before, before + 1, before))
 
     pieces = np.split(kept, np.flatnonzero(steps) + 1)
+    scatter = _noise(record, kept)
+    ramps = [_ramp(record.current[piece], scatter) for piece in pieces]
+    for piece, cut in zip(pieces, ramps, strict=True):
+        events += [_event(record, "ramp", piece[0], piece[cut - 1], piece[0])] if cut else []
+    pieces = [piece[cut:] for piece, cut in zip(pieces, ramps, strict=True)]
     long = [piece for piece in pieces if piece.size >= FEWEST]
     for piece in pieces:
         if piece.size < FEWEST:
