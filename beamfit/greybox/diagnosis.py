@@ -68,6 +68,8 @@ def diagnose(p: Problem) -> tuple[Ailment, ...]:
     if ailing:
         return ailing
     looks = [at for at in _looks(p) if at.finite]
+    if not looks:  # a slope is not finite anywhere near: nothing to read off
+        return ()
     return (*_unused(p, looks), *_undetermined(p, looks), *_dependent(p, looks), *_scaled(p, looks))
 
 

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from beamfit.greybox.assess import slopes
 from beamfit.greybox.diagnosis import diagnose
 from beamfit.greybox.fit import Fit, Limited, Variable
 from beamfit.greybox.solve import solve
@@ -234,9 +235,7 @@ def solve_document(
     fit = solve(made.problem, starts=starts, **told)
     notes = (*made.notes, *notes, *_ailments(made), *warnings)
     if fit.status is Status.not_finite:
-        goals = [g.model for g in document.problem.goals]
-        names = goals + [c.model for c in document.problem.limits]
-        cause = cause_of(made.program, fit.model, names)
+        cause = _cause(made, fit.model)
         told = cause is None or any(cause in note for note in notes)
         notes = notes if told else (*notes, f"Where it ended, {cause}.")
     if made.squares and math.isfinite(fit.scale):
@@ -246,23 +245,25 @@ def solve_document(
 
 def _started(made: Formulation) -> tuple[Formulation, tuple[str, ...]]:
     """The problem at its first start that is finite, drawn again from the same seeds if need be."""
-    p = made.problem
-    names = [g.model for g in made.document.problem.goals]
-    names += [c.model for c in made.document.problem.limits]
-    for draws, model in enumerate(islice(starts_of(made), MOST_DRAWS)):
-        theta = np.concatenate([np.ravel(model[v.model]) for v in made.document.problem.variables])
-        if np.isfinite(p.cost(theta)) and np.all(np.isfinite(p.constraint_values(theta))):
+    p, variables = made.problem, made.document.problem.variables
+    drawn = any(v.random for v in variables)
+    for draws, model in enumerate(islice(starts_of(made), MOST_DRAWS if drawn else 1)):
+        if slopes(p, np.concatenate([np.ravel(model[v.model]) for v in variables])).finite:
             if draws == 0:
                 return made, ()
-            first = next(starts_of(made))
-            cause = cause_of(made.program, first, names)
-            said = f"At the start of the seeds {cause}; drawn again from the same seeds, "
             times = "once" if draws == 1 else f"{draws} times"
-            return at_start(made, model), (f"{said}{times}.",)
-        if not any(v.random for v in made.document.problem.variables):
-            break
-    cause = cause_of(made.program, next(starts_of(made)), names)
+            said = f"At the start of the seeds {_cause(made, next(starts_of(made)))}"
+            return at_start(made, model), (f"{said}; drawn again from the same seeds, {times}.",)
+    cause = _cause(made, next(starts_of(made)))
     return made, (f"At the start {cause}.",) if cause else ()
+
+
+def _cause(made: Formulation, model: Mapping[str, np.ndarray]) -> str | None:
+    """Why the objective, a limit, or a derivative of them is not finite."""
+    problem = made.document.problem
+    names = [one.model for one in (*problem.goals, *problem.limits)]
+    found = cause_of(made.program, model, names)
+    return found or cause_of(made.program, model, names, slopes=True)
 
 
 def _ailments(made: Formulation) -> list[str]:

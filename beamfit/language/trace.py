@@ -26,7 +26,11 @@ class _FoundError(Exception):
 
 
 def cause_of(
-    program: Program, inputs: Mapping[str, jax.Array], names: Iterable[str], inside: str = ""
+    program: Program,
+    inputs: Mapping[str, jax.Array],
+    names: Iterable[str],
+    inside: str = "",
+    slopes: bool = False,
 ) -> str | None:
     """Say why some outputs are not finite.
 
@@ -40,6 +44,8 @@ def cause_of(
         The outputs.
     inside : str
         What the mapping is called, where it stands in another.
+    slopes : bool
+        Say instead where a derivative is infinite: at a root or a fractional power of zero.
 
     Returns
     -------
@@ -67,9 +73,14 @@ def cause_of(
         if wanted.isdisjoint(step.number for step in group.steps):
             continue
         try:
-            changed = carry_out(program.order, group, arrays, _Watch())
+            changed = carry_out(program.order, group, arrays, _Watch(slopes))
         except _FoundError as found:
             return f"{inside}{found}"
+        if slopes and isinstance(group.steps[0].what, d.Call) and group.plan is None:
+            step = group.steps[0]
+            found = _of_call(program, step, Setting(program.scope, arrays, step.axes), slopes)
+            if found is not None:
+                return inside + found
         if not all(np.all(np.isfinite(array)) for array in changed.values()):
             return inside + _of_group(program, group, arrays, changed)
         arrays |= changed
@@ -79,21 +90,25 @@ def cause_of(
 class _Watch:
     """Looks at every value; keeps them, to say what went into one that is not finite."""
 
-    def __init__(self) -> None:
+    def __init__(self, slopes: bool = False) -> None:
         self.seen: dict[int, Value] = {}
+        self.slopes = slopes
 
     def __call__(self, e: x.Expression, value: Value, axes: Axes) -> None:
         array = np.asarray(value.array)
         self.seen[id(e)] = value
-        if np.all(np.isfinite(array)):
+        steep = self.slopes and _may_be_steep(e)
+        bad = ~np.isfinite(array) | (steep & (array == 0))
+        if not bad.any():
             return
-        at = np.argwhere(~np.isfinite(array))[0][: len(axes)]
+        at = np.argwhere(bad)[0][: len(axes)]
         when = [
             f"{name.rstrip(HIDDEN)} = {s.elements[i]}"
             for (name, s), i, n in zip(axes.items(), at, array.shape, strict=False)
             if n > 1
         ]
         what = "infinite" if np.any(np.isinf(array)) else "not a number"
+        what = "zero and has an infinite derivative" if np.all(np.isfinite(array)) else what
         index = f" for {', '.join(when)}" if when else ""
         said = f"{e} is {what}{index} ({e.at})"
         inner = ", ".join(self._said(part, at) for part in x.children(e) if self._tells(part))
@@ -108,6 +123,15 @@ class _Watch:
             return f"{part} of {array.size} numbers"
         picked = array[tuple(min(i, n - 1) for i, n in zip(at, array.shape, strict=False))]
         return f"{part} = {picked:.4g}" if picked.ndim == 0 else f"{part} of {picked.size} numbers"
+
+
+def _may_be_steep(e: x.Expression) -> bool:
+    """Whether a formula has an infinite derivative where it is zero."""
+    if isinstance(e, x.Application):
+        return e.function in ("sqrt", "norm")
+    if not (isinstance(e, x.Operation) and e.symbol == "^"):
+        return False
+    return not (isinstance(e.parts[1], x.Number) and e.parts[1].value >= 1)
 
 
 def _of_group(program: Program, group: Group, arrays: Arrays, changed: Arrays) -> str:
@@ -147,7 +171,7 @@ def _of_step(program: Program, step: Step, s: Setting) -> str | None:
     return None
 
 
-def _of_call(program: Program, step: Step, s: Setting) -> str | None:
+def _of_call(program: Program, step: Step, s: Setting, slopes: bool = False) -> str | None:
     """What is not finite in a mapping that is called, for the first point at which it is not."""
     call = calls(s.scope, step.what)
     if not isinstance(call.callee, Scope):
@@ -165,7 +189,7 @@ def _of_call(program: Program, step: Step, s: Setting) -> str | None:
         }
         when = [f"{n} = {one.elements[i]}" for (n, one), i in zip(s.axes.items(), at, strict=True)]
         where = f" for {', '.join(when)}" if when else ""
-        found = cause_of(inner, point, names, f"in {step.what.mapping}{where}: ")
+        found = cause_of(inner, point, names, f"in {step.what.mapping}{where}: ", slopes)
         if found is not None:
             return found
     return None

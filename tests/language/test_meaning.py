@@ -6,6 +6,7 @@ import pytest
 
 from beamfit.language.compiled import compile_mapping
 from beamfit.language.parse import parse_document
+from beamfit.language.trace import cause_of
 
 
 def values(text, *names, **inputs):
@@ -124,3 +125,14 @@ def test_built_in_functions(function):
     np.testing.assert_allclose(
         found, wanted.get(function, getattr(np, function, None))(0.7), rtol=1e-14
     )
+
+
+def test_an_infinite_derivative_is_traced_too():
+    text = """input a; output y[3]; mapping m { input a; output b; b = sqrt(a) + a^2; }
+        m(a = a*i :: y[i] = b) foreach i in |0:2|;"""
+    program = compile_mapping(parse_document(text).mapping)
+    assert cause_of(program, {"a": 2.0}, ["y"]) is None
+    said = (
+        "in m for i = 0: sqrt(a) is zero and has an infinite derivative (line 1, column 58): a = 0"
+    )
+    assert cause_of(program, {"a": 2.0}, ["y"], slopes=True) == said
