@@ -227,3 +227,17 @@ def test_too_few_are_refused():
         fit_cycles([*cycles, cycles[0]])
     with pytest.raises(InputError, match="samples of many cycles"):
         fit_cycles(cut(*top_up(0.01, 1, hours=0.5))).sample(seed=1)
+
+
+@pytest.mark.parametrize(("memory", "ratio"), [(0.8, 3.0), (0.9, 3.0), (0.8, 5.0), (0.0, 3.0)])
+def test_refills_that_may_be_missed_leave_no_lifetime_with_an_error(memory, ratio):
+    """Noise with a memory, as large as a third of a refill: missed ones make 10 h into 12 to 50."""
+    for seed in (1, 2, 3):
+        time, current, _ = top_up(2.5 / ratio, seed, step=2.0, hours=5.0, memory=memory)
+        for pooled in study_record(DecayRecord(time, current)).pooled:
+            found = pooled.fit.lifetime_mean
+            if memory == 0.0 or ratio == 5.0:
+                assert abs(found.value - 10.02) < 3 * found.error
+            else:
+                assert found.error is None
+                assert "refills below" in pooled.fit.message

@@ -20,7 +20,7 @@ from beamfit.studies.decay.checks import DecayChecks, check_decay
 from beamfit.studies.decay.cycles import alike, cut_at_refills, is_refilled, joined
 from beamfit.studies.decay.fit import FEWEST, DecayFit, fit_decay
 from beamfit.studies.decay.pool import FEWEST_CYCLES
-from beamfit.studies.decay.pooled import fit_cycles, stands_alone
+from beamfit.studies.decay.pooled import fit_cycles, seen_through, stands_alone
 from beamfit.studies.decay.record import DecayRecord
 from beamfit.studies.decay.segments import Event, Split, split_record
 from beamfit.studies.decay.systematics import Systematic, systematics
@@ -307,7 +307,7 @@ def _pooled(
             alone += [cycle for cycle in group if len(cycle) >= SHORTEST]
             continue
         called = name if many == 1 else f"{name}@{len(pooled) + 1}"
-        fit = fit_cycles(group, called)
+        fit = seen_through(fit_cycles(group, called))
         segment = joined(group, called)
         losses = None if machine is None else budget(segment, machine)
         pooled.append(Decay(segment, segment.start, fit, losses))
