@@ -21,7 +21,7 @@ USUAL[list(b"0123456789+-.eE,;\t \r\n")] = True
 
 
 def numeric_rows(
-    path: str | PathLike[str], first: int, separator: str, columns: int
+    path: str | PathLike[str], first: int, separator: str, columns: int, most: int | None = None
 ) -> tuple[np.ndarray, str] | None:
     """Read the rows of a large file that holds nothing but finite numbers from a line on.
 
@@ -35,12 +35,14 @@ def numeric_rows(
         Between cells; a blank stands for any number of blanks.
     columns : int
         Cells of a row.
+    most : int, optional
+        Most rows there may be.
 
     Returns
     -------
     (array, shape (columns, n), and str), or None
-        The values, and the digest of the file. None if the file is small, or a line is anything
-        but so many finite numbers.
+        The values, and the digest of the file. None if the file is small, has more rows, or a
+        line is anything but so many finite numbers: whoever reads line by line says which.
 
     Examples
     --------
@@ -62,6 +64,8 @@ def numeric_rows(
             if rows is None:
                 return None
             parts.append(rows)
+            if most is not None and sum(part.shape[1] for part in parts) > most:
+                return None
     return np.concatenate(parts, axis=1), seen.hexdigest()
 
 

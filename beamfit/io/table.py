@@ -360,8 +360,7 @@ def _read_text(
                 names = units
                 continue
             fresh = not rows and not bad
-            if fresh and (good := _good(path, line, separator, names, comments, header)):
-                _check_length(len(good), most, path)
+            if fresh and (good := _good(path, line, separator, names, most, comments, header)):
                 return good
             (rows if whole else bad).append(cells if whole else wrong)
             lines += [line] * whole
@@ -380,11 +379,12 @@ def _good(
     line: int,
     separator: str,
     names: Sequence[str],
+    most: int | None,
     comments: Sequence[str],
     header: int | None,
 ) -> Sheet | None:
     """The rest of a large file of good numbers; a column `time` has dates."""
-    found = None if "time" in names else numeric_rows(path, line, separator, len(names))
+    found = None if "time" in names else numeric_rows(path, line, separator, len(names), most)
     if found is None:
         return None
     lines = range(line, line + found[0].shape[1])
