@@ -60,7 +60,7 @@ BOOK = {"hs34": -0.8340324, "hs84": -5280335.0 - 2 * 24345.0}
 # what they were made from; of HS5 -1.913 is sqrt(3)/2 + pi/3, as in the book.
 BOOK |= {"hs59": np.nan, "hs21mod": np.nan, "hs35mod": np.nan, "hs5": -np.sqrt(3) / 2 - np.pi / 3}
 BOOK |= {f"hs{n}": 1.362657 for n in range(88, 93)}
-# A placeholder ("needs analysis") and two of other constants than the variants they are named for.
+# A placeholder ("needs analysis"), and a variant of other constants.
 LEFT_OUT = ("hs85", "hs99exp")
 
 
