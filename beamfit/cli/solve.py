@@ -19,6 +19,7 @@ EXAMPLE = """\b
 Examples:
   beamfit solve formulations/appendix_d.bf
   beamfit solve formulations/appendix_a.xml --data d=formulations/fitdata_simulated.csv --start 20
+  beamfit solve model.nl --start 20 --json
 """
 
 
@@ -41,7 +42,7 @@ Examples:
 def solve(
     document: str, data: tuple[str, ...], start: str, report: str | None, as_json: bool
 ) -> None:
-    """Solve a formulation: a constrained problem stated as text (.bf) or in the report's XML.
+    """Solve a formulation: a constrained problem as text (.bf), the report's XML, or AMPL's .nl.
 
     Variables come with bounds, states and reduced gradients, constraints with multipliers; errors
     where the objective is a sum of squares.
@@ -55,12 +56,8 @@ def solve(
         if not (name and equals and file) or name in given:
             raise InputError(f"--data '{text}'", "NAME=FILE, each name once")
         given[name.strip()] = file.strip()
-    from beamfit.io.formulation import read_formulation, read_tables, solved_formulation
-
-    formulation = read_formulation(document)
-    tables, files = read_tables(formulation, document, given)
-    found = solved_formulation(formulation, document, tables, starts)
-    inputs = {path: digest(path) for path in (document, *files.values())}
+    found, files = _solved(document, given, starts)
+    inputs = {path: digest(path) for path in (document, *files)}
     if report is not None:
         from beamfit.report.page import write_report  # matplotlib from here on
 
@@ -73,6 +70,22 @@ def solve(
         _show(found, report)
 
 
+def _solved(document: str, given: dict[str, str], starts: int) -> tuple[Solution, tuple[str, ...]]:
+    """The solution of a document or a ``.nl`` file, and the files of its data."""
+    if document.lower().endswith(".nl"):
+        if given:
+            raise InputError("--data for a .nl file", "none: it holds its numbers", path=document)
+        from beamfit.io.nl import read_nl
+        from beamfit.language.solution import solve_problem
+
+        return solve_problem(read_nl(document), starts), ()
+    from beamfit.io.formulation import read_formulation, read_tables, solved_formulation
+
+    formulation = read_formulation(document)
+    tables, files = read_tables(formulation, document, given)
+    return solved_formulation(formulation, document, tables, starts), tuple(files.values())
+
+
 def _show(found: Solution, report: str | None) -> None:
     from beamfit.cli.show import Terminal
 
@@ -80,7 +93,7 @@ def _show(found: Solution, report: str | None) -> None:
     for table in found.tables():
         terminal.table(table)
         terminal.line()
-    asked = found.made.document.solver
+    asked = found.made.document.solver if found.made else None
     terminal.line(f"Solver: {found.solver}" + (f" (asked for: {asked.name})" if asked else ""))
     for note in found.notes:
         terminal.line(note)

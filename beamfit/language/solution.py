@@ -13,6 +13,7 @@ import numpy as np
 from beamfit.greybox.assess import slopes
 from beamfit.greybox.diagnosis import diagnose
 from beamfit.greybox.fit import Fit, Limited, Variable
+from beamfit.greybox.problem import Problem
 from beamfit.greybox.solve import solve
 from beamfit.language import document as d
 from beamfit.language.statement import Formulation, at_start, formulate, starts_of
@@ -23,7 +24,7 @@ from beamfit.statistics import reach_of
 from beamfit.status import Status
 from beamfit.table import Table, cell
 
-__all__ = ["Solution", "solve_document"]
+__all__ = ["Solution", "solve_document", "solve_problem"]
 
 # Draws of the same seeds that are tried until the start is finite.
 MOST_DRAWS = 100
@@ -53,17 +54,33 @@ class Solution:
 
     Parameters
     ----------
-    made : Formulation
-        The document and its problem.
+    name : str
+        What is minimised or maximised.
     fit : Fit
         What was found.
+    labels, limits : tuple of str
+        Names of the free numbers and of the limited ones.
+    outputs : mapping of str to array
+        Values at the answer.
+    factor : float
+        Objective over cost: negative where it is maximised.
+    squares : bool
+        Whether the objective is a sum of squares, so that there are errors.
     notes : tuple of str
         What was made of the document, its starts and its solver parameters.
+    made : Formulation or None
+        The document and its problem; None of a problem in another form.
     """
 
-    made: Formulation
+    name: str
     fit: Fit
-    notes: tuple[str, ...]
+    labels: tuple[str, ...]
+    limits: tuple[str, ...]
+    outputs: Mapping[str, np.ndarray]
+    factor: float = 1.0
+    squares: bool = False
+    notes: tuple[str, ...] = ()
+    made: Formulation | None = None
 
     @property
     def status(self) -> Status:
@@ -78,7 +95,7 @@ class Solution:
     @property
     def objective(self) -> float:
         """The objective in the terms of the document."""
-        return self.made.factor * self.fit.cost
+        return self.factor * self.fit.cost
 
     @property
     def solver(self) -> str:
@@ -88,26 +105,16 @@ class Solution:
 
     def variables(self) -> list[Variable]:
         """Free numbers by their labels, with d(objective)/d(bound)."""
-        names = [
-            v.label + self.made.program.scope.inputs[v.model].element(i).removeprefix(v.model)
-            for v in self.made.document.problem.variables
-            for i in range(self.made.program.scope.inputs[v.model].size)
-        ]
         return [
-            v._replace(name=name, reduced_gradient=self.made.factor * v.reduced_gradient)
-            for name, v in zip(names, self.fit.variables, strict=True)
+            v._replace(name=name, reduced_gradient=self.factor * v.reduced_gradient)
+            for name, v in zip(self.labels, self.fit.variables, strict=True)
         ]
 
     def constraints(self) -> list[Limited]:
         """Limited outputs by their labels, with d(objective)/d(limit)."""
-        names = [
-            c.label + self.made.program.scope.outputs[c.model].element(i).removeprefix(c.model)
-            for c in self.made.document.problem.limits
-            for i in range(self.made.program.scope.outputs[c.model].size)
-        ]
         return [
-            c._replace(name=name, multiplier=self.made.factor * c.multiplier)
-            for name, c in zip(names, self.fit.constraints, strict=True)
+            c._replace(name=name, multiplier=self.factor * c.multiplier)
+            for name, c in zip(self.limits, self.fit.constraints, strict=True)
         ]
 
     def quantity(self, v: Variable) -> Quantity:
@@ -117,27 +124,23 @@ class Solution:
         reach = reach_of(self.fit.dof) * v.error if self.fit.dof > 0 else math.inf
         return Quantity.reaching(v.value, v.error, "1", v.error_raw, reach)
 
-    def outputs(self) -> dict[str, np.ndarray]:
-        """All outputs of the mapping at the answer."""
-        found = self.made.program(self.fit.model, list(self.made.program.scope.outputs))
-        return {name: np.asarray(value) for name, value in found.items()}
-
     @property
     def headline(self) -> str:
         """Objective and status in a line."""
-        return f"{_goals(self.made.document)} = {self.objective:.10g}, {cell(self.status)}"
+        return f"{self.name} = {self.objective:.10g}, {cell(self.status)}"
 
     def tables(self) -> list[Table]:
         """Objective, variables, constraints and outputs as tables."""
-        tables = [_table("variable", self.variables(), self._row, self.made.squares)]
+        tables = [_table("variable", self.variables(), self._row, self.squares)]
         if self.fit.constraints:
             rows = self.constraints()
             tables.append(_table("constraint", rows, _limited, False, "multiplier"))
-        values = [[n, f"{v:.8g}" if v.ndim == 0 else _range(v)] for n, v in self.outputs().items()]
-        return [*tables, Table("", ["output", "value"], values, numeric=True)]
+        values = [[n, f"{v:.8g}" if v.ndim == 0 else _range(v)] for n, v in self.outputs.items()]
+        tables += [Table("", ["output", "value"], values, numeric=True)] if values else []
+        return tables
 
     def _row(self, v: Variable) -> list[str]:
-        error = ["-" if not math.isfinite(v.error) else f"{v.error:.2g}"] * self.made.squares
+        error = ["-" if not math.isfinite(v.error) else f"{v.error:.2g}"] * self.squares
         return [v.name, f"{v.value:.8g}", *error, *_ends(v), v.state, f"{v.reduced_gradient:.3g}"]
 
     def _variable(self, v: Variable) -> dict[str, Any]:
@@ -146,22 +149,21 @@ class Solution:
 
     def to_json(self) -> dict[str, Any]:
         """The result of the JSON contract."""
-        p = self.made.document.problem
         return {
-            "name": _goals(self.made.document),
+            "name": self.name,
             "status": self.status,
             "message": self.message,
             "objective": self.objective,
-            "direction": "maximize" if p.maximize else "minimize",
-            "least_squares": self.made.squares,
+            "direction": "maximize" if self.factor < 0 else "minimize",
+            "least_squares": self.squares,
             "dof": self.fit.dof,
             "solver": self.solver,
             "kkt_residual": self.fit.kkt.worst,
             "variables": [self._variable(v) for v in self.variables()],
             "constraints": self.constraints(),
-            "outputs": self.outputs(),
+            "outputs": self.outputs,
             "starts": [
-                {"objective": self.made.factor * a.cost, "solver": a.solver, "said": a.said}
+                {"objective": self.factor * a.cost, "solver": a.solver, "said": a.said}
                 for a in self.fit.attempts
             ],
             "notes": self.notes,
@@ -240,7 +242,33 @@ def solve_document(
         notes = notes if told else (*notes, f"Where it ended, {cause}.")
     if made.squares and math.isfinite(fit.scale):
         notes = (*notes, NOISE)
-    return Solution(made, fit, notes)
+    scope, problem = made.program.scope, made.document.problem
+    labels = _labels(problem.variables, scope.inputs), _labels(problem.limits, scope.outputs)
+    outputs = {n: np.asarray(v) for n, v in made.program(fit.model, list(scope.outputs)).items()}
+    name = _goals(made.document)
+    return Solution(name, fit, *labels, outputs, made.factor, made.squares, notes, made)
+
+
+def solve_problem(problem: Problem, starts: int = 1) -> Solution:
+    """Solve a problem that came without a document, such as one of `beamfit.io.nl.read_nl`.
+
+    Its first objective's weight tells whether it is to be maximised.
+    """
+    fit = solve(problem, starts=starts)
+    goal = problem.objectives[0]
+    notes = tuple(found.message for found in diagnose(problem))
+    factor = -1.0 if goal.weight < 0 else 1.0
+    names = problem.names, tuple(c.name for c in fit.constraints)
+    return Solution(goal.name, fit, *names, {}, factor, notes=notes)
+
+
+def _labels(asked: Sequence[d.Variable | d.Limit], arrays: Mapping[str, Any]) -> tuple[str, ...]:
+    """A name for each element of what is free or limited."""
+    return tuple(
+        one.label + arrays[one.model].element(i).removeprefix(one.model)
+        for one in asked
+        for i in range(arrays[one.model].size)
+    )
 
 
 def _started(made: Formulation) -> tuple[Formulation, tuple[str, ...]]:

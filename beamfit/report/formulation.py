@@ -38,22 +38,25 @@ def formulation_page(
     -------
     Page
     """
-    document, p = found.made.document, found.made.problem
-    titles = ["Variables", *["Constraints"] * bool(found.fit.constraints), "Outputs"]
+    p = found.fit.problem
+    titles = ["Variables", *["Constraints"] * bool(found.fit.constraints)]
+    titles += ["Outputs"] * bool(found.outputs)
     tables = [t._replace(title=name) for name, t in zip(titles, found.tables(), strict=True)]
     if found.notes:
         tables.append(Table("About the document", [], [[note] for note in found.notes]))
-    text = format_document(document).splitlines()
-    tables.append(Table("The document", [], [[line] for line in text if line]))
+    if found.made is not None:
+        text = format_document(found.made.document).splitlines()
+        tables.append(Table("The document", [], [[line] for line in text if line]))
     drawn = list(_drawn(found))
     pictures = []
     if drawn:
         height = 0.6 + 1.7 * ceil(len(drawn) / 2)
         pictures = [Picture("outputs by index", height, partial(draw_outputs, found=found))]
-    goals = "maximised" if document.problem.maximize else "minimised"
+    goals = "maximised" if found.factor < 0 else "minimised"
+    called = found.made.document.mapping.name if found.made else found.name
     counts = f"{len(p.names)} variables, {len(p.constraint_names)} limits"
     return Page(
-        title=f"Formulation {document.mapping.name}".strip(),
+        title=f"Formulation {called}".strip(),
         subtitle=f"{counts}, {goals}; {written()}",
         verdicts=[Verdict(found.status, found.headline, found.message)],
         tables=tables,
@@ -66,8 +69,8 @@ def formulation_page(
 
 def _drawn(found: Solution):
     """Outputs with one dimension: name, elements of its set, values."""
-    arrays = found.made.program.scope.outputs
-    lines = [(n, arrays[n].dims[0], v) for n, v in found.outputs().items() if v.ndim == 1]
+    arrays = found.made.program.scope.outputs if found.made else {}
+    lines = [(n, arrays[n].dims[0], v) for n, v in found.outputs.items() if v.ndim == 1]
     return lines[:MOST_DRAWN]
 
 
