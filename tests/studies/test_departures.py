@@ -143,6 +143,23 @@ def test_a_change_of_the_loss_rate_is_dated_with_both_lifetimes():
     assert fit.change.after.value == pytest.approx(after, rel=0.02)
 
 
+def test_a_scraper_that_moved_in_and_out_is_dated_twice():
+    def rate(t, i):
+        return 1.8e-8 * i + (6e-6 if 5000 < t < 7000 else 2e-6)
+
+    time, beam = integrated(rate, 1200, 300.0, 4 * HOUR)
+    fit = fit_decay(noisy(time, beam, 3e-3))
+    assert fit.status in ("poor_fit", "infeasible")
+    assert fit.message.count("near t = ") == 2
+    change = fit.change
+    assert (change.time, change.then.time) == pytest.approx((5000, 7000), rel=0.01)
+    for one, further in ((change, (2e-6, 6e-6)), (change.then, (6e-6, 2e-6))):
+        level = 1.8e-8 * float(np.interp(one.time, time, beam))
+        found = [one.before.value, one.after.value]
+        assert found == pytest.approx([1 / (level + b) / HOUR for b in further], rel=0.02)
+    assert fit.to_json()["change"]["then"]["after"]["unit"] == "h"
+
+
 def test_an_impossible_bend_is_said_before_a_length_is_asked_for():
     """The loss rate doubles in a record too short to tell a from b."""
     time, beam = integrated(lambda t, i: A * i + B + (2e-5 if t > 600 else 0.0), 300, span=1200.0)

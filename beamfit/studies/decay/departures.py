@@ -47,8 +47,9 @@ ENOUGH = 1024
 # Times looked at for a change of the loss rate, how often about the best of them, and how much more
 # of chi² it must explain than an exponent does: it has a number more, chosen among many.
 TIMES, FINER, BETTER = 40, 3, 15.0
-# A change that leaves less of the squares is no noise that looks like one.
-REST = 0.1
+# A change that leaves less of the squares is no noise that looks like one; two of them must leave
+# far less, since slow noise looks like two more often.
+REST, REST_OF_TWO = 0.1, 1e-3
 # Currents at which a lifetime is offered.
 CURRENTS = 5
 
@@ -246,42 +247,51 @@ class Change(NamedTuple):
         Lifetime at that moment's current before and after it, h.
     left : array, shape (n,)
         Residuals of the law with the change, over their errors.
+    then : Change or None
+        A second one, as where a scraper was moved in and out again.
     """
 
     time: float
     before: Quantity
     after: Quantity
     left: np.ndarray
+    then: Change | None = None
 
     def is_the_cause(self, residuals: np.ndarray) -> bool:
         """Whether it leaves independent noise, or hardly anything, of correlated residuals."""
         rest = float(self.left @ self.left) / float(residuals @ residuals)
-        return rest < REST or not is_correlated(self.left, 5)
+        if self.then is None:
+            return rest < REST or not is_correlated(self.left, 5)
+        return rest < REST_OF_TWO or not is_correlated(self.left, 7)
 
     def to_json(self) -> dict[str, Any]:
-        """Return the time and the two lifetimes as JSON's types."""
-        return json_of({"time": self.time, "before": self.before, "after": self.after})
+        """Return the time and the two lifetimes as JSON's types, and of a second change too."""
+        told = {"time": self.time, "before": self.before, "after": self.after}
+        return json_of(told if self.then is None else told | {"then": self.then})
 
     def __str__(self) -> str:
+        again = "" if self.then is None else f", and {str(self.then).partition('changed ')[2]}"
         return (
             f"the loss rate changed near t = {self.time:.4g} s, where the lifetime went from "
-            f"{self.before} to {self.after}"
+            f"{self.before} to {self.after}{again}"
         )
 
 
 def change_of_rate(
     record: DecayRecord, about: Expansion, values: Physical, memory: Memory | None
 ) -> Change | None:
-    """Look for one change of the loss rate that explains more than an exponent does.
+    """Look for a change of the loss rate, or two, that explains more than an exponent does.
 
-    Every time is tried by linear least squares about the fit; None unless a change is improbable
-    by chance at all times tried, and better than an exponent by `BETTER` of chi².
+    Every time is tried by linear least squares about the fit, and every pair of times if no single
+    one leaves independent noise; None unless a change is improbable by chance at all times tried,
+    and better than an exponent by `BETTER` of chi².
     """
     over = np.reshape(1.0 if record.error is None else record.error, (-1, 1))
     model = record.current + about.residuals * over[:, 0]
     whiten = _whitener(record.time, memory)
     rows = whiten(np.column_stack([about.rows, about.residuals]))
     basis = np.linalg.qr(rows[:, :3])[0]
+    least = 1e-300 if record.error is None else 1.0
 
     def beside_the_law(columns: np.ndarray) -> np.ndarray:
         return columns - basis @ (basis.T @ columns)
@@ -290,18 +300,47 @@ def change_of_rate(
         return whiten(_kinks(record, model, float(values.b), times) / over)
 
     power, residual = beside_the_law(rows[:, 3:]).T
-    times = np.linspace(0.05, 0.95, TIMES) * record.span
+    by_power = _falls(power[:, None], residual)[0]
+
+    def found(count: int) -> Change | None:
+        at, fall = _best(lambda times: beside_the_law(kinks(times)), residual, record.span, count)
+        dof = len(record) - 3 - count
+        unit = max((residual @ residual - fall) / dof, least)
+        chance = TIMES**count * 2 * stdtr(dof, -math.sqrt(fall / unit))
+        if chance > REJECTED or fall - by_power < count * BETTER * unit:
+            return None
+        columns = np.column_stack([rows[:, :3], kinks(at)])
+        return _change(record, columns, rows[:, 4], values, at, math.sqrt(unit))
+
+    one = found(1)
+    if memory is not None or (one is not None and one.is_the_cause(about.residuals)):
+        return one
+    two = found(2)
+    return two if two is not None and two.is_the_cause(about.residuals) else one
+
+
+def _best(
+    columns_at: Callable[[np.ndarray], np.ndarray], residual: np.ndarray, span: float, count: int
+) -> tuple[np.ndarray, float]:
+    """The time of a change, or the two of a pair, that take most off the sum of squares."""
+    windows = [np.linspace(0.05, 0.95, TIMES) * span] * count
     for _ in range(FINER):
-        falls = _falls(beside_the_law(kinks(times)), residual)
-        at, step = float(times[np.argmax(falls)]), times[1] - times[0]
-        times = np.linspace(at - step, at + step, TIMES)
-    fall, dof = float(np.max(falls)), len(record) - 4
-    unit = max((residual @ residual - fall) / dof, 1e-300 if record.error is None else 1.0)
-    chance = TIMES * 2 * stdtr(dof, -math.sqrt(fall / unit))
-    if chance > REJECTED or fall - _falls(power[:, None], residual)[0] < BETTER * unit:
-        return None
-    columns = np.column_stack([rows[:, :3], kinks(np.array([at]))])
-    return _change(record, columns, rows[:, 4], values, at, math.sqrt(unit))
+        columns = [columns_at(times) for times in windows]
+        falls = _falls(columns[0], residual) if count == 1 else _pairs(*columns, residual)
+        best = np.unravel_index(np.argmax(falls), falls.shape)
+        at = np.array([times[k] for times, k in zip(windows, best, strict=True)])
+        steps = [times[1] - times[0] for times in windows]
+        windows = [np.linspace(t - d, t + d, TIMES) for t, d in zip(at, steps, strict=True)]
+    return np.sort(at), float(np.max(falls))
+
+
+def _pairs(first: np.ndarray, second: np.ndarray, residual: np.ndarray) -> np.ndarray:
+    """What each column of the one and each of the other take together off the sum of squares."""
+    first, second = (part / np.linalg.norm(part, axis=0) for part in (first, second))
+    a, b, along = (first.T @ residual)[:, None], second.T @ residual, first.T @ second
+    apart = 1 - along**2
+    falls = (a**2 + b**2 - 2 * along * a * b) / np.where(apart > 1e-9, apart, np.inf)
+    return np.where(apart > 1e-9, falls, 0.0)
 
 
 def _whitener(time: np.ndarray, memory: Memory | None) -> Callable[[np.ndarray], np.ndarray]:
@@ -333,20 +372,23 @@ def _change(
     columns: np.ndarray,
     residual: np.ndarray,
     values: Physical,
-    at: float,
+    at: np.ndarray,
     size: float,
 ) -> Change:
-    """The two lifetimes at one moment, from the law with a change there."""
+    """The lifetimes before and after each time, from the law with changes there."""
     mean, span = float(record.current.mean()), record.span
-    factor = np.linalg.qr(columns, mode="r")
-    half = np.linalg.inv(factor) * size
+    half = np.linalg.inv(np.linalg.qr(columns, mode="r")) * size
     step = -np.linalg.lstsq(columns, residual, rcond=None)[0]
-    x = float(np.interp(at, record.time, record.current)) / mean
-    here = float(values.rate_mean) + float(values.a) * mean * (x - 1)
-    slopes = np.array([[0, 1 / span, (x - 1) / span, 0], [0, 1 / span, (x - 1) / span, 1]])
-    rates, errors = here + slopes @ step, np.linalg.norm(slopes @ half, axis=1)
-    before, after = (
-        Quantity(1 / rate / HOUR, error / rate**2 / HOUR, "h")
-        for rate, error in zip(rates, errors, strict=True)
-    )
-    return Change(at, before, after, residual + columns @ step)
+    left, told = residual + columns @ step, None
+    for k in reversed(range(at.size)):
+        x = float(np.interp(at[k], record.time, record.current)) / mean
+        here = float(values.rate_mean) + float(values.a) * mean * (x - 1)
+        slopes = np.tile([0, 1 / span, (x - 1) / span] + [0.0] * at.size, (2, 1))
+        slopes[0, 3 : 3 + k] = slopes[1, 3 : 4 + k] = 1.0
+        rates, errors = here + slopes @ step, np.linalg.norm(slopes @ half, axis=1)
+        lifetimes = (
+            Quantity(1 / rate / HOUR, error / rate**2 / HOUR, "h")
+            for rate, error in zip(rates, errors, strict=True)
+        )
+        told = Change(float(at[k]), *lifetimes, left, told)
+    return told
