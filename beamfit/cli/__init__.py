@@ -10,6 +10,7 @@ import click
 
 from beamfit import __version__
 from beamfit.cli.check import check
+from beamfit.cli.control import control
 from beamfit.cli.design import design
 from beamfit.cli.emittance import emittance
 from beamfit.cli.example import example
@@ -39,6 +40,7 @@ cli.add_command(example)
 cli.add_command(check)
 cli.add_command(solve)
 cli.add_command(identify)
+cli.add_command(control)
 
 
 def main() -> None:

@@ -25,28 +25,7 @@ Examples:
 
 @click.command(epilog=EXAMPLE)
 @click.argument("record", nargs=-1, required=True)
-@click.option(
-    "--model",
-    type=click.Choice(["first-order", "second-order", "arx"]),
-    default="first-order",
-    show_default=True,
-    help="tau y' + y = K u; T² y'' + 2 zeta T y' + y = K u; or y(k) = -a1 y(k-1) - a2 y(k-2) + "
-    "b1 u(k-1) + b2 u(k-2).",
-)
-@click.option(
-    "--map",
-    type=click.Choice(["constant", "network"]),
-    default="constant",
-    show_default=True,
-    help="Parameters are numbers, or change with the inputs by a network.",
-)
-@click.option("--input", "inputs", multiple=True, metavar="COLUMN", help="An input of any name.")
-@click.option("--output", "outputs", multiple=True, metavar="COLUMN", help="An output of any name.")
-@click.option("--step", type=float, metavar="SECONDS", help="Distance of rows without a time.")
-@click.option(
-    "--delay", type=click.IntRange(0), metavar="SAMPLES", help="Known delay; found unless said."
-)
-@click.option("--no-offset", is_flag=True, help="The output at rest is 0, and not estimated.")
+@options("model map input output step delay no-offset")
 @click.option("--hold-back", multiple=True, metavar="RECORD", help="A run that is only predicted.")
 @options("hidden ignore skip-bad seed report json")
 def identify(

@@ -141,6 +141,36 @@ SHARED: dict[str, Callable[..., Any]] = {
         callback=_parsed(limits_of),
         help="A magnet and its limits, in the unit of its calibration.",
     ),
+    "model": click.option(
+        "--model",
+        type=click.Choice(["first-order", "second-order", "arx"]),
+        default="first-order",
+        show_default=True,
+        help="tau y' + y = K u; T² y'' + 2 zeta T y' + y = K u; or y(k) = -a1 y(k-1) - a2 y(k-2) + "
+        "b1 u(k-1) + b2 u(k-2).",
+    ),
+    "map": click.option(
+        "--map",
+        type=click.Choice(["constant", "network"]),
+        default="constant",
+        show_default=True,
+        help="Parameters are numbers, or change with the inputs by a network.",
+    ),
+    "input": click.option(
+        "--input", "inputs", multiple=True, metavar="COLUMN", help="An input of any name."
+    ),
+    "output": click.option(
+        "--output", "outputs", multiple=True, metavar="COLUMN", help="An output of any name."
+    ),
+    "step": click.option(
+        "--step", type=float, metavar="SECONDS", help="Distance of rows without a time."
+    ),
+    "delay": click.option(
+        "--delay", type=click.IntRange(0), metavar="SAMPLES", help="Known delay; found unless said."
+    ),
+    "no-offset": click.option(
+        "--no-offset", is_flag=True, help="The output at rest is 0, and not estimated."
+    ),
     "report": click.option(
         "--report",
         metavar="FILE.html|FILE.pdf",

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-__all__ = ["ARX", "FIRST_ORDER", "PHYSICS", "SECOND_ORDER", "Physics", "simulate"]
+__all__ = ["ARX", "FIRST_ORDER", "PHYSICS", "SECOND_ORDER", "Physics", "run_from", "simulate"]
 
 
 class Physics(NamedTuple):
@@ -190,8 +190,13 @@ def simulate(
     >>> [round(float(v), 4) for v in y]
     [0.0, 1.8964, 2.594, 2.8506]
     """
+    return run_from(physics, p, u, dt, physics.begin(free, u[0]))
 
-    x0 = physics.begin(free, u[0])
+
+def run_from(
+    physics: Physics, p: jax.Array, u: jax.Array, dt: jax.Array, x0: jax.Array
+) -> jax.Array:
+    """Run a response as `simulate`, from a whole state at the first sample."""
 
     def affine(p, u, dt):
         def after(x):

@@ -11,6 +11,7 @@ from matplotlib import rc_context
 from beamfit.errors import InputError
 from beamfit.io.files import write_atomically
 from beamfit.language.solution import Solution
+from beamfit.report.control import control_page
 from beamfit.report.decays import decay_page, study_of
 from beamfit.report.document import STYLE, html_of
 from beamfit.report.emittance import emittance_page
@@ -25,13 +26,14 @@ from beamfit.studies.decay.shift import Shift
 from beamfit.studies.decay.study import RecordStudy
 from beamfit.studies.decay.trend import Trend
 from beamfit.studies.response.fit import ResponseFit
+from beamfit.studies.response.loop import Loop
 from beamfit.studies.scan.fit import EmittanceFit
 from beamfit.studies.scan.size_methods import SizeMethods
 from beamfit.studies.scan.slices import SliceFits
 
 __all__ = ["write_report"]
 
-Reported = EmittanceFit | SliceFits | DecayFit | Solution | ResponseFit
+Reported = EmittanceFit | SliceFits | DecayFit | Solution | ResponseFit | Loop
 
 
 def write_report(
@@ -51,10 +53,10 @@ def write_report(
     ----------
     path : str or path
         Ends in ``.html`` (self-contained) or ``.pdf``. An existing file is replaced whole.
-    result : EmittanceFit, SliceFits, DecayFit, Solution, ResponseFit, or sequence
+    result : EmittanceFit, SliceFits, DecayFit, Solution, ResponseFit, Loop, or sequence
         The emittance of a scan or of the slices of a beam, the lifetime of a decay, a formulation
-        solved, the response of a process; or a sequence of RecordStudy (the lifetimes of whole
-        records) or of ResponseFit (several outputs).
+        solved, the response of a process, a simulated loop; or a sequence of RecordStudy (the
+        lifetimes of whole records) or of ResponseFit (several outputs).
     posterior : Posterior or sequence of Posterior, optional
         What `sample` of the fit gave; of records one for each decay.
     command : str, optional
@@ -102,6 +104,8 @@ def write_report(
                 page = slices_page(slices, command, inputs)
             case ResponseFit():
                 page = response_page(several, command, inputs)
+            case Loop() as loop:
+                page = control_page(loop, command, inputs)
             case first:
                 studies = (study_of(first),) if isinstance(first, DecayFit) else several
                 page = decay_page(studies, command, inputs, shift, trend)

@@ -114,8 +114,10 @@ def bounds_of(texts: Iterable[str]) -> dict[str, tuple[float, float]]:
     return _pairs(texts, "bounds", ":", BOUNDS)
 
 
-def gains_of(texts: Iterable[str]) -> dict[str, tuple[float, float]]:
-    """Read limits of gains, ``NAME=LOWER:UPPER``; one left out is none.
+def gains_of(
+    texts: Iterable[str], option: str = "gain", form: str = GAINS
+) -> dict[str, tuple[float, float]]:
+    """Read limits ``NAME=LOWER:UPPER`` of what `option` names; one left out is none.
 
     Raises
     ------
@@ -128,7 +130,7 @@ def gains_of(texts: Iterable[str]) -> dict[str, tuple[float, float]]:
     {'dA_x/dQ2': (-inf, -0.0083), 'dB_x/dQ2': (-1.0, 0.0)}
     """
     whole = [re.sub(r"=\s*:", "=-inf:", re.sub(r":\s*$", ":inf", text)) for text in texts]
-    return _pairs(whole, "gain", ":", GAINS)
+    return _pairs(whole, option, ":", form)
 
 
 def limits_of(texts: Iterable[str]) -> dict[str, tuple[float, float]]:

@@ -1,0 +1,69 @@
+"""The report of a simulated loop."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import partial
+
+import numpy as np
+from matplotlib.figure import FigureBase
+
+from beamfit.report.document import BLUE, RED, Page, Picture, Verdict, provenance, written
+from beamfit.studies.response.loop import Loop
+
+__all__ = ["control_page"]
+
+NOTES = (
+    "SIMULATED: the process is the fitted model, with the noise of its residuals. Limits of inputs "
+    "and of their rates hold by construction; those of outputs are held off by two standard "
+    "deviations of noise and model, and are passed only where no inputs keep them.",
+)
+
+
+def control_page(loop: Loop, command: str | None, inputs: Mapping[str, str | None] | None) -> Page:
+    """Lay out a loop."""
+    runs = loop.fits[0].runs
+    digests = inputs or {run.path or run.name: run.sha256 or None for run in runs}
+    tables = [*loop.tables(), *(table for fit in loop.fits for table in fit.tables()[:1])]
+    return Page(
+        title=f"Control of {', '.join(r.name for r in loop.control.responses)}",
+        subtitle=f"a loop simulated on models of {', '.join(r.name for r in runs)}; {written()}",
+        verdicts=[Verdict(loop.status, loop.headline, loop.message)]
+        + [Verdict(fit.status, fit.headline, fit.message) for fit in loop.fits],
+        tables=tables,
+        pictures=[Picture("Outputs, targets and inputs of the loop", 5.0, partial(_draw, loop))],
+        pictures_title="Closed loop",
+        provenance=provenance(
+            digests, [(f"said in {r.name}", line) for r in runs for line in r.provenance], command
+        ),
+        notes=NOTES,
+    )
+
+
+def _draw(loop: Loop, figure: FigureBase) -> None:
+    """A row for each output and each input, with their limits."""
+    c, trace = loop.control, loop.trace
+    outputs, inputs = len(c.responses), len(c.inputs)
+    axes = figure.subplots(outputs + inputs, 1, sharex=True, squeeze=False,
+                           height_ratios=[2] * outputs + [1] * inputs)[:, 0]  # fmt: skip
+    for i, r in enumerate(c.responses):
+        axes[i].plot(loop.time, trace.readings[:, i], ".", color="0.6", markersize=3, label="read")
+        axes[i].plot(loop.time, trace.outputs[:, i], color=BLUE, label="output")
+        axes[i].step(loop.time, loop.targets[:, i], where="post", color="0.2", linestyle="--",
+                     linewidth=1, label="target")  # fmt: skip
+        _limit(axes[i], c.limits.below[i], c.limits.above[i])
+        axes[i].set_ylabel(r.name)
+    axes[0].legend(frameon=False, fontsize=8, ncols=4, loc="best")
+    for i, name in enumerate(c.inputs):
+        axes[outputs + i].step(loop.time, trace.inputs[:, i], where="post", color=BLUE)
+        _limit(axes[outputs + i], c.limits.low[i], c.limits.high[i])
+        axes[outputs + i].set_ylabel(name)
+    axes[-1].set_xlabel("time (s)")
+
+
+def _limit(axes, low: float, high: float) -> None:
+    label = "limit"
+    for value in (low, high):
+        if np.isfinite(value):
+            axes.axhline(value, color=RED, linewidth=0.8, label=label)
+            label = None
