@@ -1,6 +1,7 @@
 """Receding-horizon control: limits that hold, targets that are met, and what is said of it."""
 
 import json
+import re
 
 import jax
 import jax.numpy as jnp
@@ -195,3 +196,9 @@ def test_a_wish_outside_the_loop_is_refused(fit, wish):
     control = controller(fit, outputs={"level": (0.0, 2.7)})
     with pytest.raises(InputError):
         simulate_loop(fit, control, [wish], duration=20.0)
+
+
+def test_the_page_s_example_says_what_it_says(root, capsys):
+    (block,) = re.findall(r"```python\n(.*?)```", (root / "docs/control.md").read_text(), re.DOTALL)
+    exec(block, {})
+    assert capsys.readouterr().out.strip() == block.rstrip().rpartition("# ")[2]
