@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
@@ -13,10 +12,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from beamfit.errors import InputError
-from beamfit.io.dates import unix_time
-from beamfit.io.files import digest, text_lines
+from beamfit.io.archive import archive_sheet
+from beamfit.io.dates import dates_in_order
 from beamfit.io.offset import offset_of
-from beamfit.io.table import HDF5, UNITS, Column, Sheet, columns_of, left_out, read_sheet
+from beamfit.io.table import UNITS, Column, Sheet, columns_of, left_out
 from beamfit.studies.decay.monitor import Monitor
 from beamfit.studies.decay.record import Conditions, DecayRecord, LifetimeTable, first_fault
 
@@ -57,7 +56,6 @@ SIZE = re.compile(r"(size|sigma|rms|fwhm)_[xy]\b|(size|sigma|rms|fwhm)_[xy]_", r
 # An archive's own columns: seconds since 1970 and nanoseconds, and what it says of each value.
 SECONDS = {"secs": "s", "seconds": "s", "epochseconds": "s"}
 NANOS = {"nanos", "nanoseconds"}
-ARCHIVE = ("secs", "val", "severity", "status", "nanos")
 
 
 def read_lifetime_input(
@@ -70,7 +68,7 @@ def read_lifetime_input(
     offset: str | None = None,
 ) -> DecayRecord | LifetimeTable:
     """Read what `beamfit lifetime` takes, by its header: as one of the other two readers."""
-    sheet = _sheet(path, skip_bad).without(ignore)
+    sheet = archive_sheet(path, skip_bad).without(ignore)
     if time is None and any(name.startswith(("tau_", "lifetime_")) for name in sheet.names):
         return _lifetimes(sheet, skip_bad)
     return _record(sheet, time, current, skip_bad, offset)
@@ -106,7 +104,7 @@ def read_lifetimes(
     >>> print(read_lifetimes(file))
     lifetimes.csv: 4 lifetimes at 100 to 400 mA
     """
-    return _lifetimes(_sheet(path, skip_bad).without(ignore), skip_bad)
+    return _lifetimes(archive_sheet(path, skip_bad).without(ignore), skip_bad)
 
 
 def read_decay_record(
@@ -160,41 +158,7 @@ def read_decay_record(
     >>> print(read_decay_record("measurements/aps_1999_decay.csv"))
     aps_1999_decay.csv: 27 readings over 8.81 h, 101.999 to 81.464 mA
     """
-    return _record(_sheet(path, skip_bad).without(ignore), time, current, skip_bad, offset)
-
-
-def _sheet(path: str | PathLike[str] | DataFrame, skip_bad: bool) -> Sheet:
-    """The columns of a file, an archive's by their own names."""
-    example = "time_s,beam_current_mA"
-    if not isinstance(path, (str, PathLike)):
-        return read_sheet(path, example)
-    if Path(path).suffix.lower() == ".json":
-        return _archive_json(path)
-    lines = () if Path(path).suffix.lower() in HDF5 else text_lines(path)
-    head = next((text for text in lines if text.strip()), "")
-    if re.fullmatch(r"\d{9,11}(,[^,]+){4}\s*", head):
-        return read_sheet(path, ",".join(ARCHIVE), ragged=skip_bad, names=ARCHIVE)
-    return read_sheet(path, example, ragged=skip_bad)
-
-
-def _archive_json(path: str | PathLike[str]) -> Sheet:
-    """Of the EPICS Archiver Appliance: one channel with its data."""
-    expected = 'one channel of the EPICS Archiver Appliance: [{"meta": …, "data": [{"secs": …}]}]'
-    try:
-        channels = json.loads("\n".join(text_lines(path)))
-        if len(channels) != 1:
-            raise InputError(f"{len(channels)} channels", "one: the beam current", path=path)
-        meta, data = channels[0].get("meta", {}), channels[0]["data"]
-        rows = [[str(one["secs"]), str(one["nanos"]), str(one["val"])] for one in data]
-    except (ValueError, TypeError, KeyError, AttributeError):
-        raise InputError("another JSON file", expected, path=path) from None
-    if not rows:
-        raise InputError("no readings", "two or more", path=path)
-    unit = meta.get("EGU", "") if isinstance(meta, dict) else ""
-    called = f"val_{unit}" if unit in UNITS["current"] else "val"
-    said = tuple(f"{key}: {value}" for key, value in meta.items()) if meta else ()
-    cells = list(zip(*rows, strict=True))
-    return Sheet(path, ("secs", "nanos", called), cells, None, None, said, digest(path))
+    return _record(archive_sheet(path, skip_bad).without(ignore), time, current, skip_bad, offset)
 
 
 def _record(
@@ -207,14 +171,18 @@ def _record(
     for quantity, example in (("time", "time_s"), ("current", "beam_current_mA")):
         if quantity not in columns:
             option = f"'{example}' in the header, or --{quantity} COLUMN:UNIT"
-            raise sheet.header_error(f"no column of {quantity}", option)
+            found = f"no column of {quantity} among {', '.join(sheet.names)}"
+            raise sheet.header_error(found, option)
     if skip_bad:
         sheet = sheet.good(lambda rows: _check_alone(rows, columns, offset is None))
-        sheet = _forward(sheet, columns)
-    values = {key: _values(sheet, column) for key, column in columns.items()}
-    moment = values.pop("time")
-    if "nanos" in values:
-        moment = moment + 1e-9 * values.pop("nanos")
+    notes, moment = (), _moments(sheet, columns)
+    if moment.size > 2 and moment[0] > moment[-1] and np.all(np.diff(moment) <= 0):
+        notes = ("The rows stand newest first, and were read in order of time.",)
+        sheet, moment = sheet.rows(list(range(len(sheet)))[::-1]), moment[::-1]
+    if skip_bad:
+        sheet, moment = _forward(sheet, columns, moment)
+    rest = {key: column for key, column in columns.items() if key not in ("time", "nanos")}
+    values = {key: _values(sheet, column) for key, column in rest.items()}
     if len(moment) < 2:
         raise sheet.error(f"{len(moment)} readings", "two or more")
     _check_base(sheet, columns["time"], moment)
@@ -225,9 +193,12 @@ def _record(
     beam, error = values.pop("current"), values.pop("error", None)
     conditions = Conditions(**values)
     if (fault := first_fault(moment, beam, error, conditions)) is not None:
-        column = columns[fault.quantity].header
+        column = columns[fault.quantity]
         row = int(np.flatnonzero(found.beam)[fault.row])
-        raise sheet.error(fault.found, fault.expected, row, column)
+        if column.unit == DATE:
+            before = int(np.flatnonzero(found.beam)[fault.row - 1])
+            raise _goes_back(sheet, columns, row, sheet[column.header][before])
+        raise sheet.error(fault.found, fault.expected, row, column.header)
     absolute = columns["time"].unit == DATE or moment[0] > UNIX
     return DecayRecord(
         time=moment,
@@ -237,7 +208,7 @@ def _record(
         start=float(moment[0]) if absolute else None,
         conditions=conditions,
         comments=sheet.comments,
-        notes=left_out(sheet) + _left_aside(sheet, columns) + found.notes,
+        notes=notes + left_out(sheet) + _left_aside(sheet, columns) + found.notes,
         monitor=Monitor(offset=found.error) if found.error else None,
     )
 
@@ -261,10 +232,12 @@ def _columns(sheet: Sheet, time: str | None, current: str | None) -> dict[str, C
     if named:
         left = [name for name in left if _known(sheet, name)]
     rest = replace(sheet, names=tuple(left), cells=[sheet[name] for name in left])
-    found = {
-        CALLED.get(key, key): column
-        for key, column in columns_of(rest, QUANTITIES, _archive_column).items()
-    }
+    try:
+        known = columns_of(rest, QUANTITIES, _archive_column)
+    except InputError as error:
+        options = "or name them with --time COLUMN and --current COLUMN:UNIT"
+        raise replace(error, expected=f"{error.expected}; {options}") from None
+    found = {CALLED.get(key, key): column for key, column in known.items()}
     return {
         key: column for key, column in found.items() if key in USED and key not in named
     } | named
@@ -329,10 +302,31 @@ def _no_such(sheet: Sheet, name: str) -> InputError:
 
 
 def _values(sheet: Sheet, column: Column) -> np.ndarray:
+    try:
+        if column.unit == DATE:
+            expected = "an ISO 8601 time, such as 2024-03-01T12:00:00+01:00"
+            return sheet.numbers(column.header, read=dates_in_order(), expected=expected)
+        return sheet.numbers(column.header) * column.factor
+    except InputError as error:
+        if "," in error.found:
+            raise
+        expected = f"{error.expected}; --skip-bad leaves such rows out"
+        raise replace(error, expected=expected) from None
+
+
+def _moments(sheet: Sheet, columns: Mapping[str, Column]) -> np.ndarray:
+    """Times of the rows, s."""
+    moment = _values(sheet, columns["time"])
+    return moment + 1e-9 * _values(sheet, columns["nanos"]) if "nanos" in columns else moment
+
+
+def _goes_back(sheet: Sheet, columns: Mapping[str, Column], row: int, latest: object) -> InputError:
+    """Of a row whose time is not after that of an earlier one."""
+    column = columns["time"]
+    found, expected = f"time {sheet[column.header][row]} after {latest}", "times that increase"
     if column.unit == DATE:
-        expected = "an ISO 8601 time, such as 2024-03-01T12:00:00+01:00"
-        return sheet.numbers(column.header, read=unix_time, expected=expected)
-    return sheet.numbers(column.header) * column.factor
+        expected += "; local times that go back in autumn need their zone, such as Europe/Berlin"
+    return sheet.error(found, expected, row, column.header)
 
 
 def _check_alone(sheet: Sheet, columns: Mapping[str, Column], positive: bool) -> None:
@@ -345,21 +339,18 @@ def _check_alone(sheet: Sheet, columns: Mapping[str, Column], positive: bool) ->
             raise sheet.error(found, "zero or more", int(low[0]), column.header)
 
 
-def _forward(sheet: Sheet, columns: Mapping[str, Column]) -> Sheet:
+def _forward(
+    sheet: Sheet, columns: Mapping[str, Column], moment: np.ndarray
+) -> tuple[Sheet, np.ndarray]:
     """Leave out rows whose time is repeated or goes back."""
-    moment = _values(sheet, columns["time"])
-    if "nanos" in columns:
-        moment = moment + 1e-9 * _values(sheet, columns["nanos"])
     late = np.concatenate([[-np.inf], np.maximum.accumulate(moment)[:-1]])
-    wrong = np.flatnonzero(moment <= late)
-    bad = [
-        sheet.error(f"time {moment[k]:.10g} s after {late[k]:.10g} s", "times that increase",
-                    int(k), columns["time"].header)
-        for k in wrong
-    ]  # fmt: skip
     keep = np.flatnonzero(moment > late)
-    kept = sheet.rows([int(k) for k in keep])
-    return replace(kept, bad=tuple(sorted((*sheet.bad, *bad), key=lambda e: e.line or 0)))
+    cells = sheet[columns["time"].header]
+    last = keep[np.searchsorted(keep, np.arange(moment.size)) - 1]
+    wrong = np.flatnonzero(moment <= late)
+    bad = [_goes_back(sheet, columns, int(k), cells[last[k]]) for k in wrong]
+    bad = tuple(sorted((*sheet.bad, *bad), key=lambda e: e.line or 0))
+    return replace(sheet.rows([int(k) for k in keep]), bad=bad), moment[keep]
 
 
 def _check_base(sheet: Sheet, column: Column, moment: np.ndarray) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 
-__all__ = ["header_at", "separator_of", "spelled", "with_units"]
+__all__ = ["header_at", "separator_of", "spelled", "uncommented", "with_units"]
 
 # Units at the end of a header, as the columns' names have them.
 KNOWN = ("um", "mm", "m", "µm", "μm", "s", "min", "h", "d", "ms", "mA", "A", "uA", "µA", "μA")
@@ -107,6 +107,25 @@ def header_at(lines: Sequence[str]) -> int:
         elif numbers and len(cells) == len(_words(lines[first])):
             break
     return 0 if first is None else first
+
+
+def uncommented(lines: Sequence[str]) -> list[str]:
+    """Some lines, with the header that a # hides above the first numbers, as numpy.savetxt does.
+
+    Examples
+    --------
+    >>> uncommented(["# noon", "# time_s,beam_current_mA", "0,1"])
+    ['# noon', 'time_s,beam_current_mA', '0,1']
+    """
+    found = list(lines)
+    first = next((i for i, text in enumerate(found) if text.strip(" ,;\t")[:1] not in ("", "#")), 0)
+    above = found[first - 1].strip() if first else ""
+    if above.startswith("#"):
+        cells, words = _words(found[first]), _words(above.lstrip("# "))
+        units = any(map(_has_unit, words)) and not any(map(_is_number, words))
+        if units and len(words) == len(cells) and all(map(_is_number, cells)):
+            found[first - 1] = above.lstrip("# ")
+    return found
 
 
 def _is_number(text: str) -> bool:

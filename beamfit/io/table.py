@@ -21,7 +21,7 @@ import numpy as np
 
 from beamfit.errors import InputError, nearest
 from beamfit.io.files import digest, text_lines
-from beamfit.io.headers import HEAD, header_at, separator_of, spelled, with_units
+from beamfit.io.headers import HEAD, header_at, separator_of, spelled, uncommented, with_units
 from beamfit.io.numeric import numeric_rows
 
 if TYPE_CHECKING:
@@ -153,7 +153,8 @@ class Sheet:
                 keep += rows
             except InputError as error:
                 if len(rows) == 1:
-                    bad.append(error)
+                    found = re.sub(r"^reading 1:", f"reading {rows[0] + 1}:", error.found)
+                    bad.append(replace(error, found=found))
                 else:
                     half = len(rows) // 2
                     waiting += [rows[half:], rows[:half]]
@@ -299,8 +300,8 @@ def read_sheet(
     Returns
     -------
     Sheet
-        With stripped cells. Lines that begin with # are its comments; separators at the end of
-        lines are dropped.
+        With stripped cells. Lines that begin with # are its comments, but for a header above
+        numbers that have none; separators at the end of lines are dropped.
 
     Raises
     ------
@@ -335,6 +336,7 @@ def _read_text(
     comments, rows, lines, bad, seen = [], [], [], [], hashlib.sha256()
     source = text_lines(path, seen)
     head = list(itertools.islice(source, HEAD))
+    head = uncommented(head) if names is None else head
     title = header_at(head) if names is None else 0
     for line, text in enumerate(itertools.chain(head, source), start=1):
         start = text.strip()[:1]
@@ -437,7 +439,7 @@ def _without_blanks(cells: list[str], least: int) -> list[str]:
 
 def header_of(path: str | PathLike[str]) -> list[str]:
     """The header of a file of text, as `read_sheet` finds it; none of an empty one."""
-    head = list(itertools.islice(text_lines(path), HEAD))
+    head = uncommented(list(itertools.islice(text_lines(path), HEAD)))
     at = header_at(head)
     return [spelled(name) for name in _cells(path, head[at], at + 1)]
 

@@ -51,6 +51,8 @@ EXPORTS = {
                {"time": "Zeit", "current": "Strom:mA"}),
     "slashes": (table(f"Timestamp,{PV}", dates("%Y/%m/%d %H:%M:%S.%f"), CURRENT),
                 {"time": "Timestamp", "current": f"{PV}:mA"}),
+    "newest first": (table("time_s,beam_current_mA", SECONDS[::-1], CURRENT[::-1]), {}),
+    "numpy.savetxt": ("# noon\n" + table("# time_s,beam_current_mA", SECONDS, CURRENT, " "), {}),
     "process variable": (table(f"time_s,{PV}", SECONDS, AMPERE), {"current": f"{PV}:A"}),
     "archiver, no header": (
         "".join(f"{int(START + t)},{v},0,0,{round((START + t) % 1 * 1e9)}\n"
@@ -205,3 +207,24 @@ def test_a_table_of_lifetimes(tmp_path):
     path.write_text("beam_current_mA,tau_min\n1,20\n2,5\n")
     with pytest.raises(InputError, match="2 lifetimes; expected 4 or more"):
         read_lifetimes(path)
+
+
+def test_an_hour_that_a_zone_has_twice_is_told_by_order(tmp_path):
+    hours = [("01:30", 200.0), ("02:30", 199.0), ("02:30", 198.0), ("03:30", 197.0)]
+    rows = [f"2024-10-27 {hour}:00 Europe/Berlin,{current}" for hour, current in hours]
+    path = tmp_path / "autumn.csv"
+    path.write_text("\n".join(["time,beam_current_mA", *rows]))
+    assert read_decay_record(path).time.tolist() == [0.0, 3600.0, 7200.0, 10800.0]
+    path.write_text(path.read_text().replace(" Europe/Berlin", ""))
+    with pytest.raises(InputError, match=r"02:30:00 after 2024-10-27 02:30:00; .* need their zone"):
+        read_decay_record(path)
+    assert "line 4, column 'time', time 2024" in read_decay_record(path, skip_bad=True).notes[0]
+
+
+def test_a_reading_left_out_is_counted_as_it_stands(tmp_path):
+    rows = [{"secs": k, "nanos": 0, "val": v} for k, v in enumerate([5.0, 4.0, "NaN", 3.0])]
+    path = tmp_path / "channel.json"
+    path.write_text(json.dumps([{"meta": {"EGU": "mA"}, "data": rows}]))
+    assert "reading 3: 'NaN'" in read_decay_record(path, skip_bad=True).notes[0]
+    with pytest.raises(InputError, match=r"'NaN'; .*--skip-bad leaves such rows out"):
+        read_decay_record(path)

@@ -215,6 +215,15 @@ def test_a_gauge_that_follows_the_current_changes_nothing():
     assert fit_decay(with_gauge).a.value == fit_decay(without).a.value
 
 
+def test_a_gauge_of_few_digits_that_follows_the_current_changes_nothing():
+    time, beam = integrated(lambda t, i: A * i + B, 300)
+    pressure = np.round(5e-8 + 2.4e-10 * beam, 8)
+    assert np.unique(pressure).size < 12
+    plain, gauged = fit_decay(noisy(time, beam)), fit_decay(noisy(time, beam, pressure=pressure))
+    assert gauged.a.value == plain.a.value
+    assert gauged.status == "converged"
+
+
 def test_systematics_are_what_refits_say():
     time, beam = integrated(lambda t, i: A * i + B)
     record = noisy(time, beam, 1e-3)

@@ -6,6 +6,7 @@ from beamfit.errors import InputError
 from beamfit.studies.decay.fit import fit_decays
 from beamfit.studies.decay.record import Conditions, DecayRecord
 from beamfit.studies.decay.segments import noise_of, split_record
+from beamfit.studies.decay.study import study_record
 
 
 def decay(time, i0=100.0, lifetime=36000.0, noise=1e-3, seed=1):
@@ -98,6 +99,26 @@ def test_quantised_readings_are_not_steps():
     split = split_record(record)
     assert kinds(split) == []
     assert [len(part) for part in split.segments] == [600]
+
+
+@pytest.mark.parametrize("digits", [6, 2])
+def test_readings_that_are_held_are_those_of_a_slow_monitor(digits):
+    """Repeats lie half a step too high, and are no digits of the monitor."""
+    time = np.arange(0.0, 7200.0)
+    exact = 500 * np.exp(-time / 36000)
+    noise = 0.01 * np.random.default_rng(3).normal(size=time.size)
+    held = np.round(exact + noise, digits)[(time // 5 * 5).astype(int)]
+    study = study_record(DecayRecord(time, held, start=0.0))
+    assert len(study.record) == 1440
+    assert "5760 of 7200 readings repeat" in study.record.notes[0]
+    (fit,) = (decay.fit for decay in study.decays)
+    assert "quantised" not in fit.message or digits == 2
+    assert abs(fit.i0.value - 500) < 3 * fit.i0.error < 0.01
+    assert abs(fit.lifetime_mean.value - 10) < 3 * fit.lifetime_mean.error < 0.01
+
+
+def test_repeats_of_a_coarse_monitor_are_kept():
+    assert len(study_record(DecayRecord(TIME, np.round(decay(TIME), 1))).record) == TIME.size
 
 
 def test_a_gap_is_noted_and_a_refill_in_it_found():

@@ -38,6 +38,10 @@ PLAUSIBLE = {
 # A pressure that departs from P0 + P1 I by less than this share of the record's mean, on average
 # up to any time, follows the current.
 FOLLOWS = 2e-3
+NOT_NEGATIVE = (
+    "a current of zero or more; take off what the monitor reads without beam (--offset), or leave "
+    "such rows out (--skip-bad)"
+)
 
 
 @shown
@@ -107,6 +111,9 @@ def _odd_setting(conditions: Conditions) -> Fault | None:
             continue
         if (row := _first(values < 0)) is not None:
             return Fault(row, name, f"a negative {name}, {values[row]:.6g}", "zero or more")
+        if name == "pressure" and values.any() and (row := _first(values == 0)) is not None:
+            expected = "above zero; leave out a gauge that is off at times with --ignore"
+            return Fault(row, name, "a pressure of zero", expected)
         row = _first((values > high) | ((values < low) & (values > 0)))
         if row is not None:
             expected = f"{low:g} to {high:g} {unit}; check the unit of the column"
@@ -149,7 +156,7 @@ def first_fault(
         return Fault(row, "time", found, "times that increase")
     if (row := _first(current < 0)) is not None:
         found = f"a negative current, {current[row]:.6g} mA"
-        return Fault(row, "current", found, "a current of zero or more; subtract the DCCT's offset")
+        return Fault(row, "current", found, NOT_NEGATIVE)
     if error is not None and (row := _first(error <= 0)) is not None:
         return Fault(row, "error", f"an error of {error[row]:.6g} mA", "a positive one")
     if (fault := _odd_setting(conditions)) is not None:
@@ -158,6 +165,19 @@ def first_fault(
         found = f"{current[row]:.6g} mA after {current[row - 1]:.6g} mA, a factor of 1000"
         return Fault(row, "current", found, "one unit throughout, A or mA")
     return None
+
+
+def _digit(values: np.ndarray) -> float | None:
+    """The step between readings that often repeat; None where they seldom do, or the levels lie at
+    no multiples of it, as of values that are held until the next.
+    """
+    levels = np.unique(values)
+    if levels.size < 2 or levels.size > values.size / 2:
+        return None
+    steps = np.diff(levels)
+    step = float(steps.min())
+    off = np.abs(steps / step - np.round(steps / step))
+    return step if float(np.median(off)) < 0.1 else None
 
 
 def _frozen(values: object, rows: int, quantity: str) -> np.ndarray:
@@ -291,25 +311,25 @@ class DecayRecord:
 
     @property
     def resolution(self) -> float | None:
-        """Step of a coarsely quantised reading, mA; None where readings seldom repeat."""
-        levels = np.unique(self.current)
-        if levels.size < 2 or levels.size > len(self) / 2:
-            return None
-        return float(np.diff(levels).min())
+        """Step of a coarsely quantised reading, mA; None where readings seldom repeat, or lie at
+        no multiples of a step.
+        """
+        return _digit(self.current)
 
     @cached_property
     def gauge(self) -> np.ndarray | None:
         """Integral of the pressure over its mean, s, where it does not follow the current.
 
-        None where no pressure is given, or it is P0 + P1 I with positive P0 to within `FOLLOWS`:
-        the beam's own gas is part of a, as in the report.
+        None where no pressure is given, or it is P0 + P1 I with positive P0 to within `FOLLOWS`
+        or the last digit of the gauge: the beam's own gas is part of a, as in the report.
         """
         pressure = self.conditions.pressure
         if pressure is None or not pressure.mean() > 0:
             return None
         slope, base = np.polyfit(self.current, pressure, 1)
-        lone = self.integral(pressure - base - slope * self.current)
-        if base > 0 and np.abs(lone).max() < FOLLOWS * pressure.mean() * self.span:
+        off = pressure - base - slope * self.current
+        follows = np.abs(self.integral(off)).max() < FOLLOWS * pressure.mean() * self.span
+        if base > 0 and (follows or np.abs(off).max() < (_digit(pressure) or 0.0)):
             return None
         return self.integral(pressure / self.integral(pressure)[-1] * self.span)
 

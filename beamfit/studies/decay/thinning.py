@@ -1,4 +1,4 @@
-"""Records of far more readings than their decays need, as means of neighbours."""
+"""Records of far more readings than their decays need: repeats left out, means of neighbours."""
 
 from __future__ import annotations
 
@@ -14,10 +14,39 @@ __all__ = ["MOST_READINGS", "thinned"]
 MOST_READINGS = 1 << 16
 # Robust standard deviations off the median of its block that a reading may lie.
 OUTLIER = 10.0
+# Repeats are of a monitor slower than its archive if half of the readings are, and nearly all come
+# by equal numbers, or what changes, changes by more than so many digits. Runs so much longer than
+# usual are of a monitor that stands.
+EQUAL, DIGITS, STANDS, FEWEST = 0.95, 3.0, 5, 8
+
+
+def _fresh(record: DecayRecord) -> DecayRecord:
+    """Leave out readings that repeat the one before where the monitor is slower than its archive:
+    they are late, and a curve through them lies half a step too high.
+    """
+    fresh = np.diff(record.current, prepend=np.nan) != 0
+    first = np.flatnonzero(fresh)
+    runs = np.diff(first, append=fresh.size)
+    usual = int(np.median(runs))
+    if not FEWEST <= first.size <= len(record) / 2 or usual < 2:
+        return record
+    change = float(np.median(np.abs(np.diff(record.current[first]))))
+    kept = fresh | np.repeat(runs > STANDS * usual, runs)
+    period = int(np.bincount(runs).argmax())
+    if period > 1 and np.mean(runs % period == 0) > EQUAL:
+        # Two values in a row may be equal by themselves.
+        kept |= (np.arange(fresh.size) - np.repeat(first, runs)) % period == 0
+    elif record.resolution is not None and change <= DIGITS * record.resolution:
+        return record
+    note = (
+        f"{np.sum(~kept)} of {len(record)} readings repeat the one before to the last digit, as of "
+        "a monitor slower than its archive: left out."
+    )
+    return replace(record.select(kept), notes=(*record.notes, note))
 
 
 def thinned(record: DecayRecord) -> DecayRecord:
-    """Average neighbours in blocks of equal numbers, so that up to 65536 are left.
+    """Leave out repeats of a slow monitor, and average neighbours in equal blocks, up to 65536.
 
     Parameters
     ----------
@@ -42,6 +71,7 @@ def thinned(record: DecayRecord) -> DecayRecord:
     >>> thinned(DecayRecord(t, 500 - t / 1e4)).notes
     ('The means of 4 readings each were fitted, of 200000 in all.',)
     """
+    record = _fresh(record)
     size = -(-len(record) // MOST_READINGS)
     if size == 1:
         return record

@@ -1,0 +1,54 @@
+"""Files that hold a beam current: tables, and what the EPICS Archiver Appliance writes."""
+
+from __future__ import annotations
+
+import json
+import re
+from os import PathLike
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from beamfit.errors import InputError
+from beamfit.io.files import digest, text_lines
+from beamfit.io.table import HDF5, UNITS, Sheet, read_sheet
+
+if TYPE_CHECKING:
+    from pandas import DataFrame
+
+__all__ = ["archive_sheet"]
+
+ARCHIVE = ("secs", "val", "severity", "status", "nanos")
+
+
+def archive_sheet(path: str | PathLike[str] | DataFrame, skip_bad: bool) -> Sheet:
+    """The columns of a file, an archive's by their own names."""
+    example = "time_s,beam_current_mA"
+    if not isinstance(path, (str, PathLike)):
+        return read_sheet(path, example)
+    if Path(path).suffix.lower() == ".json":
+        return _archive_json(path)
+    lines = () if Path(path).suffix.lower() in HDF5 else text_lines(path)
+    head = next((text for text in lines if text.strip()), "")
+    if re.fullmatch(r"\d{9,11}(,[^,]+){4}\s*", head):
+        return read_sheet(path, ",".join(ARCHIVE), ragged=skip_bad, names=ARCHIVE)
+    return read_sheet(path, example, ragged=skip_bad)
+
+
+def _archive_json(path: str | PathLike[str]) -> Sheet:
+    """Of the EPICS Archiver Appliance: one channel with its data."""
+    expected = 'one channel of the EPICS Archiver Appliance: [{"meta": …, "data": [{"secs": …}]}]'
+    try:
+        channels = json.loads("\n".join(text_lines(path)))
+        if len(channels) != 1:
+            raise InputError(f"{len(channels)} channels", "one: the beam current", path=path)
+        meta, data = channels[0].get("meta", {}), channels[0]["data"]
+        rows = [[str(one["secs"]), str(one["nanos"]), str(one["val"])] for one in data]
+    except (ValueError, TypeError, KeyError, AttributeError):
+        raise InputError("another JSON file", expected, path=path) from None
+    if not rows:
+        raise InputError("no readings", "two or more", path=path)
+    unit = meta.get("EGU", "") if isinstance(meta, dict) else ""
+    called = f"val_{unit}" if unit in UNITS["current"] else "val"
+    said = tuple(f"{key}: {value}" for key, value in meta.items()) if meta else ()
+    cells = list(zip(*rows, strict=True))
+    return Sheet(path, ("secs", "nanos", called), cells, None, None, said, digest(path))
