@@ -1,0 +1,171 @@
+"""The same loop by beamfit and by do-mpc (CasADi, IPOPT): python benchmarks/control.py [steps]
+
+SIMULATED processes without noise: a second order with an input that has limits and a rate and an
+output below its upper limit, and a first order whose lag and gain change with the input by a
+network. Model, horizon, cost, limits and target are the same; each controls its own plant. Told are
+the cost of the closed loop, by how much limits are passed, and the median time of a step.
+
+    pip install do-mpc casadi
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+import warnings
+
+import jax.numpy as jnp
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from beamfit.dynamics.response import FIRST_ORDER, SECOND_ORDER
+from beamfit.studies.response.receding import Controller, Limits, Response
+
+STEP, HORIZON, SMOOTH, RATE, ABOVE, FIRST = 0.5, 20, 0.1, 0.2, 2.3, 0.4
+HIDDEN = np.array([[1.3, -0.9, 0.7], [-0.6, 1.1, -0.4]])  # slopes and shifts of three nodes
+OUTWARD = np.array([[0.5, -0.3, 0.4], [0.3, -0.4, 0.2]])  # to log tau and K
+SHIFT = np.array([0.7, 1.3])
+SECOND = np.array([2.0, 0.4, 1.5])
+
+
+def network(u, tanh=jnp.tanh):
+    """Raw numbers, log tau and K, of the input."""
+    return OUTWARD @ tanh(HIDDEN[0] * u[0] + HIDDEN[1]) + SHIFT
+
+
+def target(k: int, steps: int) -> float:
+    """A third each of 2.2, 0.6 and 1.6."""
+    return (2.2, 0.6, 1.6)[min(3 * k // steps, 2)]
+
+
+def ours(case: str) -> Controller:
+    """The controller of beamfit."""
+    physics, of = (FIRST_ORDER, network) if case == "network" else (
+        SECOND_ORDER, SECOND_ORDER.raw(jnp.array(SECOND), 1))  # fmt: skip
+    inf, one = np.full(1, np.inf), np.ones(1)
+    limits = Limits(0 * one, 2 * one, RATE * one, -inf, ABOVE * one)
+    responses = (Response("y", physics, of, 0.0, 0, 1.0, 0.2, 0.0),)
+    return Controller(("u",), responses, STEP, one, limits, HORIZON, SMOOTH)
+
+
+def run_ours(case: str, steps: int):
+    """Outputs, inputs and times of steps."""
+    control = ours(case)
+    state = control.begin([FIRST])
+    control(state, [0.0], [1.0])  # compiles
+    y, u, took = [], [], []
+    for k in range(steps):
+        y.append(float(state.x[0][0]))  # the plant is the model: its state is the plant's
+        begin = time.perf_counter()
+        state, given, _ = control(state, [y[-1]], [target(k, steps)])
+        given.block_until_ready()
+        took.append(time.perf_counter() - begin)
+        u.append(float(given[0]))
+    return np.array(y), np.array(u), took
+
+
+def peer_model(case: str):
+    """The process in do-mpc, the last input a state of it for the sake of the rate."""
+    import casadi
+    import do_mpc
+
+    model = do_mpc.model.Model("discrete")
+    u = model.set_variable("_u", "u")
+    last = model.set_variable("_x", "last")
+    model.set_variable("_tvp", "target")
+    if case == "network":
+        x = model.set_variable("_x", "x")
+        inner = [casadi.tanh(a * u + b) for a, b in HIDDEN.T]
+        raw = [sum(w * n for w, n in zip(row, inner, strict=True)) + s
+               for row, s in zip(OUTWARD, SHIFT, strict=True)]  # fmt: skip
+        settled = raw[1] * u
+        model.set_rhs("x", settled + (x - settled) * casadi.exp(-STEP / casadi.exp(raw[0])))
+    else:
+        x = model.set_variable("_x", "x", (2, 1))
+        p, zero = jnp.array(SECOND), jnp.zeros(1)
+        columns = [SECOND_ORDER.advance(p, e, zero, STEP) for e in jnp.eye(2)]
+        drive = np.asarray(SECOND_ORDER.advance(p, jnp.zeros(2), jnp.ones(1), STEP))
+        model.set_rhs("x", np.column_stack(columns) @ x + drive * u)
+    model.set_rhs("last", u + 0 * last)
+    model.setup()
+    return model
+
+
+def peer(case: str, steps: int, now: list[int]):
+    """The controller of do-mpc."""
+    import do_mpc
+
+    model = peer_model(case)
+    mpc = do_mpc.controller.MPC(model)
+    mpc.settings.n_horizon, mpc.settings.t_step = HORIZON, STEP
+    mpc.settings.store_full_solution = False
+    mpc.settings.supress_ipopt_output()
+    error = (model.x["x"][0] - model.tvp["target"]) ** 2
+    mpc.set_objective(mterm=error, lterm=error)
+    mpc.set_rterm(u=SMOOTH)
+    mpc.bounds["lower", "_u", "u"], mpc.bounds["upper", "_u", "u"] = 0.0, 2.0
+    mpc.bounds["upper", "_x", "x"] = [ABOVE] + [np.inf] * (case != "network")
+    moved = model.u["u"] - model.x["last"]
+    mpc.set_nl_cons("up", moved, ub=RATE)
+    mpc.set_nl_cons("down", -moved, ub=RATE)
+    template = mpc.get_tvp_template()
+
+    def wanted(_):
+        template["_tvp", :, "target"] = target(now[0], steps)
+        return template
+
+    mpc.set_tvp_fun(wanted)
+    mpc.setup()
+    return mpc
+
+
+def run_peer(case: str, steps: int):
+    """Outputs, inputs and times of steps."""
+    now, of = [0], ours(case)
+    x = np.asarray(of.begin([FIRST]).x[0])
+    mpc = peer(case, steps, now)
+    mpc.x0 = np.concatenate([[FIRST], x])
+    mpc.u0 = np.array([FIRST])
+    mpc.set_initial_guess()
+    y, u, took = [], [], []
+    r = of.responses[0]
+    for k in range(steps):
+        now[0] = k
+        y.append(float(x[0]))
+        last = u[-1] if u else FIRST
+        begin = time.perf_counter()
+        given = float(mpc.make_step(np.concatenate([[last], x])[:, None])[0, 0])
+        took.append(time.perf_counter() - begin)
+        u.append(given)
+        raw = network(jnp.array([given])) if case == "network" else r.of
+        p = r.physics.physical(raw, 1)
+        x = np.asarray(r.physics.advance(p, jnp.asarray(x), jnp.array([given]), STEP))
+    return np.array(y), np.array(u), took
+
+
+def cost(y: np.ndarray, u: np.ndarray) -> float:
+    """What both minimise, over the whole loop."""
+    wanted = np.array([target(k, len(y)) for k in range(len(y))])
+    return float(np.sum((y - wanted) ** 2) + SMOOTH * np.sum(np.diff(u, prepend=FIRST) ** 2))
+
+
+def main() -> None:
+    """Print the table."""
+    warnings.simplefilter("ignore")
+    steps = int(sys.argv[1]) if len(sys.argv) > 1 else 120
+    table = Table("process", "by", "cost of the loop", "passed by", "ms a step", "slowest", "ratio")
+    for case in ("second order", "network"):
+        found = {"beamfit": run_ours(case, steps), "do-mpc": run_peer(case, steps)}
+        base = np.median(found["beamfit"][2])
+        for name, (y, u, took) in found.items():
+            moves = np.abs(np.diff(u, prepend=FIRST)).max()
+            passed = max(y.max() - ABOVE, u.max() - 2.0, -u.min(), moves - RATE, 0.0)
+            table.add_row(case, name, f"{cost(y, u):.6f}", f"{passed:.1e}",
+                          f"{1e3 * np.median(took):.2f}", f"{1e3 * max(took):.1f}",
+                          f"{np.median(took) / base:.1f}")  # fmt: skip
+    Console(width=100).print(table)
+
+
+if __name__ == "__main__":
+    main()
