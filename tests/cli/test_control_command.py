@@ -48,6 +48,8 @@ def test_a_loop_answers_in_json_and_on_a_page(run, record, tmp_path):
         (("--set", "level=2", "--limit", "valve=2:1"), ["limits 2 to 1 of valve"]),
         (("--set", "level=2", "--rate", "valve=fast"), ["--rate 'valve=fast'"]),
         (("--set", "level=2", "--rate", "pump=1"), ["--rate of 'pump'", "valve"]),
+        (("--set", "level=2", "--for", -3), ["a loop of -3 s", "a step"]),
+        (("--set", "level=nan"), ["nan for level", "finite"]),
         (("--set", "level=9", "--limit", "level=:5"), ["level wanted at 9", "at most 5"]),
     ],
 )

@@ -165,6 +165,9 @@ class Loop:
         for i, name in enumerate(c.inputs):
             ends = touched(self)[:, i]
             said = _range(c.limits.low[i], c.limits.high[i])
+            seen = np.concatenate([run.inputs[name] for run in self.fits[0].runs])
+            if c.limits.low[i] < seen.min() or c.limits.high[i] > seen.max():
+                said += f" (the runs: {_range(seen.min(), seen.max())})"
             rows.append([name, said, f"at it in {ends.sum()} of {len(ends)} steps"])
             if np.isfinite(c.limits.rate[i]):
                 rate, moves = c.limits.rate[i], np.abs(np.diff(self.trace.inputs[:, i]))
@@ -240,7 +243,10 @@ def simulate_loop(
     """
     fits = (fits,) if isinstance(fits, ResponseFit) else tuple(fits)
     last = max([at for _, _, at in (*targets, *disturbances)], default=0.0)
-    long = duration or last + HORIZONS * control.horizon * control.step
+    usual = last + HORIZONS * control.horizon * control.step
+    long = usual if duration is None else duration
+    if not control.step < long < np.inf:
+        raise InputError(f"a loop of {long:g} s", f"more than a step, {control.step:g} s")
     time = control.step * np.arange(int(np.ceil(long / control.step)))
     begin = np.clip(fits[0].seen.mean_u, control.limits.low, control.limits.high)
     rest = [r.offset + float(settled(r, jnp.asarray(begin), control.step)[0])
@@ -272,6 +278,8 @@ def _series(
         if not 0 <= at < time[-1]:
             raise InputError(f"{name} at {at:g} s", f"a time within the loop, 0 to {time[-1]:g} s")
         i = names.index(name)
+        if not np.isfinite(value):
+            raise InputError(f"{value:g} for {name}", "a finite number")
         low, high = control.limits.below[i], control.limits.above[i]
         if not add and not low <= value <= high:
             raise InputError(f"{name} wanted at {value:g}", f"{_range(low, high)}, its limits")
@@ -301,12 +309,16 @@ def _changes(
     trace: Trace,
 ) -> list[Change]:
     """How each step of a target, or of a disturbance, is followed until the next one."""
+    # A change of one output is felt by the others: all are followed until the next one of any.
+    steps = np.diff(np.hstack([wanted, load]), axis=0, prepend=np.nan)
+    every = np.flatnonzero((steps != 0).any(axis=1))
     found = []
     for i, fit in enumerate(fits):
         aim = np.diff(wanted[:, i], prepend=trace.outputs[0, i])
         push = np.diff(load[:, i], prepend=0.0)
         begins = np.flatnonzero((aim != 0) | (push != 0))
-        for k, end in zip(begins, [*begins[1:], len(time)], strict=True):
+        for k in begins:
+            end = min(every[every > k], default=len(time))
             error = trace.outputs[k:end, i] - wanted[k, i]
             step = float(aim[k])
             near = max(SETTLED * abs(step or push[k]), float(np.mean(fit.noise)))
