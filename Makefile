@@ -56,6 +56,7 @@ bench: .venv/bench
 	$(BIN)/python benchmarks/sampling.py
 	$(BIN)/python benchmarks/scenarios.py
 	$(BIN)/python benchmarks/response.py
+	$(BIN)/python benchmarks/control.py
 
 clean:
 	rm -rf .venv demo dist build
