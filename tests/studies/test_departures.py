@@ -147,7 +147,7 @@ def test_a_scraper_that_moved_in_and_out_is_dated_twice():
     def rate(t, i):
         return 1.8e-8 * i + (6e-6 if 5000 < t < 7000 else 2e-6)
 
-    time, beam = integrated(rate, 1200, 300.0, 4 * HOUR)
+    time, beam = integrated(rate, 500, 300.0, 4 * HOUR)
     fit = fit_decay(noisy(time, beam, 3e-3))
     assert fit.status in ("poor_fit", "infeasible")
     assert fit.message.count("near t = ") == 2
@@ -248,3 +248,31 @@ def test_systematics_are_what_refits_say():
             # The exponent is large: what is of second order in it is not in the table.
             near = 0.15 if row is bunch else 0.03
             assert getattr(row, name) == pytest.approx(shift, rel=near, abs=small), (row, name)
+
+
+def test_a_monitor_of_small_currents_is_off_in_proportion():
+    time, beam = integrated(lambda t, i: A * i + B, 300)
+    large = systematics(fit_decay(noisy(time, beam, 1e-3)))
+    # The same decay as of 10 µA: a is larger by as much as the current is smaller.
+    small = systematics(fit_decay(DecayRecord(time, noisy(time, beam, 1e-3).current * 2e-5)))
+    assert "0.0001 mA too much" in small[2].cause
+    for few, many in zip(small, large, strict=True):
+        scale = 50.0 if "monitor" in few.cause else 1.0  # 1 % of 10 µA against 0.02 % of 500 mA
+        assert few.lifetime_mean == pytest.approx(scale * many.lifetime_mean, rel=0.01)
+
+
+def test_a_scraper_that_goes_slowly_is_named():
+    time, beam = integrated(lambda t, i: A * i + B, 300)
+    fits = [
+        fit_decay(noisy(time, beam, scraper_y=np.linspace(6e-3, end, 300)))
+        for end in (5.98e-3, 5e-3)
+    ]
+    assert "scraper" not in fits[0].message
+    assert "The scraper went from 5.952 to 5.048 mm within the decay" in fits[1].message
+
+
+def test_errors_far_above_the_scatter_are_said():
+    time, beam = integrated(lambda t, i: A * i + B, 300)
+    fits = [fit_decay(noisy(time, beam, 2e-3, stated=stated)) for stated in (2e-3, 2e-2)]
+    assert "times the scatter" not in fits[0].message
+    assert "stated errors are 11 times the scatter" in fits[1].message

@@ -86,6 +86,20 @@ def test_currents_too_close_do_not_separate():
     assert fit.lifetime_mean.error < 0.2
 
 
+def test_exact_and_equal_lifetimes_refute_nothing():
+    """What is left is the arithmetic's, and no law."""
+    fit = fit_lifetimes(LifetimeTable([100, 200, 300, 400], [50.0] * 4))
+    assert fit.status == "converged"
+    assert fit.lifetime_mean.value == pytest.approx(50, rel=1e-9)
+    assert 0 < fit.lifetime_mean.error < 1e-9
+
+
+def test_one_current_alone_says_so_without_nan():
+    fit = fit_lifetimes(LifetimeTable([100.0] * 5, [50, 51, 49, 50.5, 50.2]))
+    assert fit.status == "unidentified"
+    assert "nan" not in fit.message
+
+
 def test_json_keeps_the_contract():
     document = json.loads(json.dumps(fit_lifetimes(table(stated=False)).to_json(), allow_nan=False))
     wanted = "record status message a b i0 lifetime_start lifetime_end lifetime_mean chi2 dof"

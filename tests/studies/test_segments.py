@@ -222,3 +222,18 @@ def test_noise_with_a_memory_is_no_ramp():
         noise = lfilter([np.sqrt(1 - memory**2)], [1, -memory], fresh)[-600:]
         split = split_record(DecayRecord(TIME, decay(TIME) + 10.0 ** -(seed % 3) * noise))
         assert "ramp" not in kinds(split)
+
+
+def test_a_setting_that_only_scatters_is_named_with_its_remedy():
+    volts = 3.2e6 * (1 + 0.02 * np.random.default_rng(1).normal(size=TIME.size))
+    record = DecayRecord(TIME, decay(TIME), conditions=Conditions(rf_voltage=volts))
+    with pytest.raises(InputError, match=r"changes of rf_voltage by more than 1 %; .* --ignore"):
+        study_record(record)
+
+
+def test_a_current_that_rises_is_no_decay():
+    time = np.arange(500.0)
+    noise = 5e-3 * np.random.default_rng(1).normal(size=time.size)
+    study = study_record(DecayRecord(time, 100 + time / 100 + noise))
+    assert [decay.fit.status for decay in study.answers] == ["infeasible"]
+    assert "The current rises" in study.answers[0].fit.message

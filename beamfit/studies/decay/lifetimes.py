@@ -19,7 +19,13 @@ from beamfit.lifetime.decay import HOUR
 from beamfit.quantity import Quantity, Status
 from beamfit.shown import shown
 from beamfit.statistics import reach_of
-from beamfit.studies.decay.departures import CURRENTS, ConstantA, LifetimeLaw, constant_a
+from beamfit.studies.decay.departures import (
+    CURRENTS,
+    EXACT,
+    ConstantA,
+    LifetimeLaw,
+    constant_a,
+)
 from beamfit.studies.decay.evidence import UNITS
 from beamfit.studies.decay.fit import bare
 from beamfit.studies.decay.record import FEWEST_LIFETIMES, LifetimeTable
@@ -174,7 +180,7 @@ def _tested(table: LifetimeTable, plain: Fit, power: Fit) -> ConstantA:
     found, dof = power["exponent"], max(after.dof, 1.0)
     fall = max(before.chi2 - after.chi2, 0.0)
     if table.error is None:
-        chance = fdtrc(1.0, dof, fall * dof / max(after.chi2, 1e-300))
+        chance = fdtrc(1.0, dof, fall * dof / max(after.chi2, len(table) * EXACT**2))
     else:
         chance = chdtrc(1, fall / max(1.0, after.chi2 / dof))
     return constant_a(found.value, found.error, found.error_raw, float(chance))
@@ -217,7 +223,7 @@ def fit_lifetimes(table: LifetimeTable) -> LifetimeFit:
     law, quoted = (fit.derive(_quoted, ends) for fit in (plain, power if refuted else plain))
     scale = {"a": usual * mean, "b": usual, "share": 1.0}
     numbers = {
-        name: (float(value) / unit, float(error) / unit)
+        name: (float(value) / unit, max(float(error), EXACT) / unit)
         for (name, unit), value, error in zip(scale.items(), law.value, law.error, strict=False)
     }
     raws = [float(law.error_raw[k]) / scale[name] for k, name in enumerate("ab")]
@@ -249,7 +255,7 @@ def fit_lifetimes(table: LifetimeTable) -> LifetimeFit:
 
 def _lifetime(usual: float, far: float, rate: float, error: float) -> Quantity:
     lifetime = float(usual / HOUR / rate)
-    spread = float(lifetime * error / rate)
+    spread = float(lifetime * max(error / rate, EXACT))
     return Quantity.reaching(lifetime, spread, "h", None, far * spread)
 
 

@@ -277,8 +277,8 @@ def seen_through(fit: DecayFit) -> DecayFit:
     least = CLEAR * fit.rms_residual * math.sqrt(2 * min(mean, 1.0))
     lasts = 2 * half * float(np.median(np.diff(record.time)))
     lifetime = fit.lifetime_mean.value
-    lost = fit.mean_current * lasts / (lifetime * HOUR) if lifetime > 0 else 0.0
-    if lost >= least:
+    lost = fit.mean_current * lasts / (lifetime * HOUR)
+    if lost >= least or not lifetime > 0:  # that of a current that rises is nan
         return fit
     cause = (
         f"A cycle of the {fit.first.size} that were found loses {lost:.2g} mA, and refills below "

@@ -285,13 +285,17 @@ class RecordStudy:
         return self.pooled + self.decays
 
 
+def _steps(record: DecayRecord, name: str) -> np.ndarray:
+    """After which readings somebody changed a setting."""
+    values = getattr(record.conditions, name)
+    if values is None:
+        return np.zeros(len(record) - 1, bool)
+    return np.abs(np.diff(values)) > CHANGED * np.maximum(values[1:], values[:-1])
+
+
 def _at_settings(segment: DecayRecord, fewest: int = SHORTEST) -> list[DecayRecord]:
     """Cut where somebody changed a setting."""
-    moved = np.zeros(len(segment) - 1, bool)
-    for name in SETTINGS:
-        values = getattr(segment.conditions, name)
-        if values is not None:
-            moved |= np.abs(np.diff(values)) > CHANGED * np.maximum(values[1:], values[:-1])
+    moved = np.any([_steps(segment, name) for name in SETTINGS], axis=0)
     pieces = np.split(np.arange(len(segment)), np.flatnonzero(moved) + 1)
     return [segment.select(rows) for rows in pieces if len(rows) >= fewest]
 
@@ -343,13 +347,12 @@ def _decays(record: DecayRecord) -> tuple[list[DecayRecord], tuple[Event, ...]]:
     split = split_record(record)
     pieces = [piece for segment in split.segments for piece in _at_settings(segment)]
     if not pieces:
-        kinds = ", ".join(sorted({event.kind for event in split.events})) or "changes of setting"
-        raise InputError(
-            f"no decay between {kinds}",
-            f"at least {SHORTEST} readings in a row of a stored beam",
-            path=record.name,
-            column="current",
-        )
+        moving = [name for name in SETTINGS if _steps(record, name).any()]
+        changes = f"changes of {', '.join(moving)} by more than {100 * CHANGED:g} %"
+        kinds = ", ".join(sorted({event.kind for event in split.events})) or changes
+        expected = f"at least {SHORTEST} readings in a row of a stored beam"
+        expected += "; leave out a setting that only scatters with --ignore" if moving else ""
+        raise InputError(f"no decay between {kinds}", expected, record.name, column="current")
     if len(pieces) > 1:
         pieces = _numbered(pieces, record.name)
     return pieces, split.events

@@ -18,8 +18,10 @@ from beamfit.table import json_of
 
 __all__ = ["Systematic", "about_fit", "systematics"]
 
-# The size of each cause that the table assumes.
+# The size of each cause that the table assumes; those of the monitor in mA, and in proportion
+# below so many: a monitor of small currents is as good as that.
 PRESSURE, DRIFT, OFFSET, EXPONENT = 0.01, 0.01, 0.1, -0.1
+SMALL = 10.0
 
 
 @shown
@@ -104,9 +106,10 @@ def systematics(fit: DecayFit) -> tuple[Systematic, ...]:
 def _monitor(record: DecayRecord, share: np.ndarray) -> dict[str, np.ndarray]:
     """What is stated of the monitor, or else assumed."""
     if record.monitor is None:
+        size = min(float(record.current.max()) / SMALL, 1.0)
         return {
-            f"monitor drifts by {1e3 * DRIFT:g} µA over the record": DRIFT * share,
-            f"monitor reads {OFFSET:g} mA too much": np.full(len(record), OFFSET),
+            f"monitor drifts by {1e3 * DRIFT * size:.2g} µA over the record": DRIFT * size * share,
+            f"monitor reads {OFFSET * size:.2g} mA too much": np.full(len(record), OFFSET * size),
         }
     stated = record.monitor.changes(record.time)
     return {f"monitor {cause} (in the errors)": moved for cause, moved in stated.items()}

@@ -31,6 +31,12 @@ __all__ = ["TableEvidence", "finding_of", "finding_of_cycles", "finding_of_table
 SHORTEST, LONGEST = 20.0, 3000 * HOUR
 # One-sided 95 %.
 LIMIT = 1.645
+# Below this chi²/dof stated errors are said to be too large.
+CAUTIOUS = 0.25
+# Settings that are said to have gone from one value to another, by more than this share.
+MOVABLE = {"rf_voltage": ("RF voltage", 1e-3, "kV"), "scraper_y": ("scraper", 1e3, "mm")}
+MOVABLE |= {"bunches": ("number of bunches", 1.0, "in all")}
+SLOW = 0.01
 
 
 class Judged(Protocol):
@@ -200,11 +206,9 @@ def _narrow(e: TableEvidence) -> Finding | None:
     share, error = e.scaled("share")
     if error < SEPARABLE:
         return None
-    return Finding(
-        Status.unidentified,
-        "a and b are not separable by these lifetimes (share of a in the loss "
-        f"{share:.2g} ± {error:.2g}): measure at a wider range of currents",
-    )
+    known = f" (share of a in the loss {share:.2g} ± {error:.2g})" if math.isfinite(error) else ""
+    cause = f"a and b are not separable by these lifetimes{known}: measure at a wider range of "
+    return Finding(Status.unidentified, f"{cause}currents")
 
 
 def _unlikely(e: TableEvidence | CyclesEvidence) -> Finding | None:
@@ -263,7 +267,16 @@ def _one_current(e: CyclesEvidence) -> Finding | None:
     )
 
 
+def _rises(e: CyclesEvidence) -> Finding | None:
+    rate, error = e.scaled("rate_mean")
+    if rate > -BELIEVED * error:
+        return None
+    cause = "The current rises, by injection or a drift of the monitor: this is no decay"
+    return Finding(Status.infeasible, cause)
+
+
 CYCLE_RULES = (
+    _rises,
     partial(_negative, "b", NOT_GAS),
     partial(_negative, "a", RISING),
     _within_noise,
@@ -309,6 +322,31 @@ def _correlated(e: Evidence) -> str | None:
     )
 
 
+def _cautious(e: Evidence) -> str | None:
+    """Stated errors far above the scatter: what is quoted is then too large."""
+    if e.record.error is None or e.memory is not None:
+        return None
+    if e.chi2 > CAUTIOUS * e.dof or chi2_probability(e.chi2, e.dof) < 1 - POOR_FIT:
+        return None
+    return (
+        f"chi²/dof is {e.chi2 / e.dof:.2g}: the stated errors are {(e.dof / e.chi2) ** 0.5:.2g} "
+        "times the scatter, and so are those of a and b"
+    )
+
+
+def _moved(e: Evidence) -> str | None:
+    """Settings that go slowly from one value to another, in steps too small to cut at."""
+    part, said = max(len(e.record) // 10, 1), []
+    for name, (called, factor, unit) in MOVABLE.items():
+        values = getattr(e.record.conditions, name)
+        if values is None:
+            continue
+        first, last = (factor * float(np.median(v)) for v in (values[:part], values[-part:]))
+        if abs(last - first) > SLOW * max(first, last):
+            said.append(f"The {called} went from {first:.4g} to {last:.4g} {unit} within the decay")
+    return f"{', '.join(said)}: a and b are of no one setting" if said else None
+
+
 def _quantised(e: Evidence) -> str | None:
     step, noise = e.record.resolution, e.noise
     if e.record.error is not None:
@@ -350,7 +388,15 @@ def _odd_clock(e: Evidence) -> str | None:
     )
 
 
-REMARKS = (_noise_inferred, _correlated, _quantised, _drifting, _odd_clock)
+REMARKS = (
+    _moved,
+    _noise_inferred,
+    _cautious,
+    _correlated,
+    _quantised,
+    _drifting,
+    _odd_clock,
+)
 
 
 def finding_of(evidence: Evidence) -> Finding:
