@@ -12,11 +12,12 @@ from beamfit.greybox.problem import Problem
 from beamfit.status import Status
 from beamfit.verdict import Finding
 
-__all__ = ["crossed", "degenerate", "endless", "local", "optimal", "restless", "saddle"]
+__all__ = ["crossed", "degenerate", "endless", "local", "optimal", "outgrown", "restless", "saddle"]
 
 # Below this the cost counts as without end, in its own size.
 ENDLESS = -1e15
-# A number runs away beyond this many of its sizes.
+# A number runs away beyond this many of its sizes; a pole is where the cost's slope in a number's
+# size is that much larger than the cost.
 AWAY = 1e6
 # From this many starts that agree on one optimum it is taken for the only one: the number of optima
 # expected then is below 1.5 (C. G. E. Boender & A. H. G. Rinnooy Kan, Mathematical Programming 37
@@ -54,14 +55,24 @@ def crossed(e: Evidence) -> Finding | None:
 
 def endless(e: Evidence) -> Finding | None:
     """Say that the cost has no least value."""
-    cost = float(e.state.at.cost)
-    if not e.problem.objectives or cost >= ENDLESS * e.state.scale.cost:
+    cost, far = float(e.state.at.cost), _far(e.state)
+    if not e.problem.objectives or cost >= ENDLESS * e.state.scale.cost or outgrown(e.state):
         return None
-    far = np.abs(e.state.theta) > AWAY * e.state.scale.unit
     along = f" as {listed(np.array(e.problem.names)[far])} grows" if far.any() else ""
     remedy = "bound the free numbers, or check the sign of the objective."
     cause = f"the cost falls without end{along} (down to {cost:.3g});"
     return Finding(Status.unbounded, cause, remedy)
+
+
+def outgrown(s: assess.State) -> bool:
+    """Whether the start's cost was so tiny that its size is no measure of the end's."""
+    cost, scale = s.at.cost, s.scale
+    pole = np.any(np.abs(s.at.gradient) * scale.unit > AWAY * abs(cost))
+    return bool(cost < ENDLESS * scale.cost and np.isfinite(cost) and not (pole or _far(s).any()))
+
+
+def _far(s: assess.State) -> np.ndarray:
+    return np.abs(s.theta) > AWAY * s.scale.unit
 
 
 def degenerate(e: Evidence) -> Finding | None:
@@ -187,8 +198,10 @@ def _convex(p: Problem, s: assess.State) -> bool:
         inside = np.where(ends & (i % 2 == 0), low + random.uniform(size=len(unit)) * width, around)
         points.append(np.clip(inside, p.lower, p.upper))
     for point in points:
-        jacobian = assess.slopes(p, point).jacobian * unit / s.limits.size[:, None]
-        change = jacobian - s.at.jacobian * unit / s.limits.size[:, None]
+        at = assess.slopes(p, point)
+        change = (at.jacobian - s.at.jacobian) * unit / s.limits.size[:, None]
+        if not _above(s, s.theta, s.at, point, at) or not _above(s, point, at, s.theta, s.at):
+            return False
         h = p.compiled(curvature.lagrangian_hessian)(point, 1.0, np.zeros(len(s.limits.size)))
         h = np.asarray(h) * np.outer(unit, unit)
         if not (np.all(np.abs(change) <= 1e-9) and np.all(np.isfinite(h))):
@@ -197,3 +210,12 @@ def _convex(p: Problem, s: assess.State) -> bool:
         if bends[0] < -1e-9 * max(bends[-1], 0.0) - 1e-12 * s.scale.cost:
             return False
     return True
+
+
+def _above(
+    s: assess.State, here: np.ndarray, at: assess.Slopes, there: np.ndarray, then: assess.Slopes
+) -> bool:
+    """Whether the cost there is not below the tangent here: kinks and jumps have no curvature."""
+    rise = at.gradient @ (there - here)
+    rounding = 1e-9 * (abs(at.cost) + abs(then.cost) + abs(rise)) + 1e-12 * s.scale.cost
+    return bool(then.cost - at.cost - rise >= -rounding)

@@ -15,6 +15,7 @@ from beamfit.greybox.descend import Lanes
 from beamfit.greybox.diagnosis import contradictory, not_finite
 from beamfit.greybox.evidence import Search, settled
 from beamfit.greybox.fit import Attempt, Fit
+from beamfit.greybox.optimum import outgrown
 from beamfit.greybox.problem import Problem
 from beamfit.greybox.programs import SOLVERS, Budget, scaled
 from beamfit.greybox.verdict import conclude, refused
@@ -325,6 +326,8 @@ def _one_by_one(
             attempts.append(Attempt("none", point, np.nan, lost, 0, "cost not finite"))
             continue
         s, attempt = _program(p, point, at, budget, hessian)
+        if p.objectives and outgrown(s):  # from there in the sizes it has there
+            s, attempt = _program(p, s.theta, assess.slopes(p, s.theta), budget, hessian)
         found.append(s)
         attempts.append(attempt)
     return found, tuple(attempts)

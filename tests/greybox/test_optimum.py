@@ -91,6 +91,20 @@ def test_an_objective_without_a_least_value_is_unbounded():
     assert fit.problem.names[0] in fit.message
 
 
+def test_a_cost_that_is_tiny_where_it_starts_is_not_without_end():
+    """The start lies so far out in a bell curve that its cost says nothing of the least one."""
+    fit = minimise(lambda x: -jnp.exp(-((x[0] - 8) ** 2)), [0.5], -10.0, 10.0)
+    assert fit.status == "local_optimum", fit
+    np.testing.assert_allclose(fit.theta, [8.0], atol=1e-6)
+
+
+def test_kinks_bend_nothing_and_are_not_convex():
+    fit = minimise(lambda x: -jnp.abs(x[0]) - 0.1 * x[0], [-0.5], -1.0, 1.0)
+    assert fit.status == "local_optimum", fit  # 0.2 above the optimum at the other bound
+    best = minimise(lambda x: jnp.maximum(x[0] ** 2, (x[0] - 2) ** 2), [2.0], -5.0, 5.0)
+    assert best.status == "optimal", best
+
+
 def test_a_violation_squared_has_no_constraint_qualification():
     """As Appendix B is printed: sum(max(g + eps, 0)^2) <= 0."""
     rule = ("gains", lambda x: jnp.sum(jnp.maximum(x - 1.0, 0.0) ** 2), -np.inf, 0.0)
