@@ -255,6 +255,10 @@ class _Builder(Transformer):
     def pair(self, c):
         return _number(c[0]), _number(c[1])
 
+    def half(self, c):
+        end = _number(c[1])
+        return (-math.inf, end) if c[0] == "<=" else (end, math.inf)
+
     def goal(self, c):
         weight = 1.0 if c[3] is None else _number(c[3])
         return "goals", [(c[0], d.Goal(c[1].label, c[1].model, weight, c[1].at))]
@@ -267,10 +271,7 @@ class _Builder(Transformer):
         return "variables", d.Variable(name.label, name.model, low, high, *start, name.at)
 
     def limit(self, c):
-        low, high = c[2] if len(c) == 3 else (-math.inf, math.inf)
-        if len(c) == 4:
-            end = _number(c[3])
-            low, high = (end if c[2] != "<=" else low), (end if c[2] != ">=" else high)
+        low, high = c[2] if len(c) == 3 else (_number(c[3]), _number(c[3]))
         return "limits", d.Limit(c[1].label, c[1].model, low, high, c[1].at)
 
     def setting(self, c):

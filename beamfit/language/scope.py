@@ -358,7 +358,8 @@ def _check_arguments(scope: Scope, e: x.Application) -> None:
     elif e.function in FUNCTIONS:
         least, most = FUNCTIONS[e.function]
     else:
-        known = nearest(e.function, [*scope.functions, *FUNCTIONS, *REDUCTIONS])
+        meant = {"ln": "log", "lg": "log10"}.get(e.function, e.function)
+        known = nearest(meant, [*scope.functions, *FUNCTIONS, *REDUCTIONS])
         if e.function in scope.arrays:
             known = f"{e.function}[...] for an element, or an operator before the parenthesis"
         raise error_at(e.at, f"unknown function '{e.function}'", known)

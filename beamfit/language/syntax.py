@@ -28,7 +28,7 @@ SAID = {
     "COLON": "':'", "COMMA": "','", "LPAR": "'('", "RPAR": "')'", "LSQB": "'['", "RSQB": "']'",
     "LBRACE": "'{'", "RBRACE": "'}'", "EQUAL": "'='", "BAR": "'|'", "COMPARE": "<=, >=",
     "__ANON_0": "'->'", "__ANON_1": "'::'", "PART": "layer, connection, input, output or gain",
-    "$END": "the end",
+    "$END": "the end", "_IN": "in",
 }  # fmt: skip
 
 
@@ -91,7 +91,7 @@ def explained(error: UnexpectedInput, text: str) -> InputError:
 
 def _misspelt(before: Token | None, token: Token, accepted: set[str]) -> InputError | None:
     """A word that is nearly a keyword: the one that surprises, or the one before it."""
-    words = {name.lower() for name in accepted} & set(KEYWORDS)
+    words = {name.lower().lstrip("_") for name in accepted} & set(KEYWORDS)
     close = get_close_matches(str(token).lower(), sorted(words), n=1, cutoff=0.6)
     if token.type == "NAME" and close:
         return error_at(Place(token.line, token.column), f"'{short(token)}'",
@@ -99,7 +99,7 @@ def _misspelt(before: Token | None, token: Token, accepted: set[str]) -> InputEr
     if before is None or before.type != "NAME" or str(before) in KEYWORDS:
         return None
     at = Place(before.line, before.column)
-    if token.type == "IN" or (token.type == "NAME" and "IN" in accepted):
+    if token.type == "_IN" or (token.type == "NAME" and "_IN" in accepted):
         return None
     close = get_close_matches(str(before).lower(), KEYWORDS, n=1, cutoff=0.6)
     if token.type in ("NAME", "STRING") and close:
