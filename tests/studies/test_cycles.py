@@ -241,3 +241,14 @@ def test_refills_that_may_be_missed_leave_no_lifetime_with_an_error(memory, rati
             else:
                 assert found.error is None
                 assert "refills below" in pooled.fit.message
+
+
+def test_long_fills_whose_losses_differ_follow_one_by_one():
+    """One law does not hold for all; the scatter about it is then not the noise of a fill."""
+    time = np.arange(0, 8 * 3600, 120.0)
+    fills = [law(time, 500.0, 2.5e-8, b) for b in (2e-6, 2e-6, 2e-6, 2.5e-6, 2.5e-6, 2.5e-6)]
+    beam = np.concatenate(fills)
+    noise = 3e-3 * np.random.default_rng(1).normal(size=beam.size)
+    study = study_record(DecayRecord(120.0 * np.arange(beam.size), beam + noise))
+    assert study.pooled[0].fit.status == "poor_fit"
+    assert [decay.fit.status for decay in study.decays] == ["converged"] * 6

@@ -35,6 +35,7 @@ from beamfit.studies.decay.pool import (
     solved,
 )
 from beamfit.studies.decay.record import DecayRecord
+from beamfit.studies.decay.segments import noise_of
 from beamfit.studies.decay.verdict import finding_of_cycles
 
 __all__ = ["cycle_lifetimes", "fit_cycles", "seen_through", "stands_alone"]
@@ -45,6 +46,8 @@ PARTS, POINTS = 8, 60
 CLEAR = 6.0
 # Scatter, over the length squared, of the parabola t² beside its line, halved: the bend of a decay.
 BEND = 1 / 12 / math.sqrt(5)
+# Noise with a memory is taken for so many times what neighbouring readings scatter by.
+OWN = 3.0
 
 
 def _slopes(pool: Pool) -> tuple[Physical, np.ndarray]:
@@ -256,9 +259,11 @@ class PooledEvidence:
 
 def stands_alone(cycle: DecayRecord, fit: DecayFit) -> bool:
     """Whether a cycle by itself would tell a from b, by the bend of its decay and the noise that
-    all cycles show.
+    all cycles show; where one law does not hold for all, that of its neighbouring readings.
     """
     noise = fit.rms_residual * fit.identifiability.error_inflation
+    if fit.status is Status.poor_fit:
+        noise = min(noise, OWN * noise_of(cycle.time, cycle.current))
     loss = cycle.span / HOUR / fit.lifetime_mean.value
     bend = float(cycle.current.mean()) * loss**2 * BEND / 2 * math.sqrt(len(cycle))
     return noise * math.sqrt(max(len(cycle) / MOST, 1.0)) < SEPARABLE * bend

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable, Sequence
 
 from beamfit.lifetime.losses import LINEAR, QUADRATIC, Mechanism
 from beamfit.lifetime.ring import Operation
 from beamfit.quantity import Quantity, Status
+from beamfit.studies.decay.fit import DecayFit
 from beamfit.studies.decay.scale_verdict import VOLTAGE
 from beamfit.studies.decay.segments import Event
 from beamfit.studies.decay.shift import Shift
@@ -264,15 +266,24 @@ def overview(decays: Sequence[Decay]) -> list[tuple[str, list[str], list[list[st
 
 
 def alike(decays: Sequence[Decay]) -> list[tuple[Status, str, str]]:
-    """Status, decays and message for each different verdict on many decays."""
-    found: dict[tuple[Status, str], list[str]] = {}
+    """Status, decays and message for each different verdict on many decays; where all is well and
+    only numbers differ, those of the first.
+    """
+    found: dict[tuple[Status, str], list[DecayFit]] = {}
     for decay in decays:
-        said = decay.fit.status, decay.fit.message
-        found.setdefault(said, []).append(decay.fit.record)
-    return [
-        (status, names[0] if len(names) == 1 else _several(names), message)
-        for (status, message), names in found.items()
-    ]
+        fit = decay.fit
+        well = fit.status is Status.converged
+        words = re.sub(r"\d[\d.e+-]*", "#", fit.message) if well else fit.message
+        found.setdefault((fit.status, words), []).append(fit)
+    return [(status, *_said(fits)) for (status, _), fits in found.items()]
+
+
+def _said(fits: Sequence[DecayFit]) -> tuple[str, str]:
+    """Whom a verdict is on, and its sentences."""
+    names, first = [fit.record for fit in fits], fits[0].message
+    if len({fit.message for fit in fits}) > 1:
+        first = f"{first.rstrip('.')} (numbers are the first's)."
+    return (names[0] if len(names) == 1 else _several(names)), first
 
 
 def _several(names: Sequence[str]) -> str:
