@@ -3,6 +3,7 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
 from beamfit.dynamics.response import FIRST_ORDER, SECOND_ORDER, simulate
 from beamfit.errors import InputError
@@ -108,6 +109,39 @@ def test_a_constant_model_of_a_process_that_changes_is_refuted_and_a_network_is_
     pulls = ((tau.value - truth) / tau.error)[known]
     assert np.sqrt(np.mean(pulls**2)) < 2.0
     assert np.max(np.abs(tau.value - truth)[known]) < 1.5
+
+
+def test_a_part_of_the_response_that_the_model_lacks_is_no_noise_with_a_memory():
+    """An undershoot that a delay hides, and a second input of another time constant: their gains
+    would be several errors off."""
+    rng = np.random.default_rng(1)
+    t, u, v = np.arange(400.0), steps(400, rng, -1, 1, 20), steps(400, rng, -1, 1, 15)
+    noise = 0.05 * rng.normal(size=400)
+    fast, slow = np.exp(-1 / 4.0), np.exp(-1 / 40.0)
+
+    def lag(share, of):
+        return lfilter([0.0, 1 - share], [1.0, -share], of)
+
+    under = lag(np.exp(-1 / 8.0), lag(fast, u) - 5.0 * np.diff(lag(fast, u), prepend=0.0))
+    for run in (
+        Run(t, {"u": u}, {"y": under + noise}),
+        Run(t, {"u": u, "v": v}, {"y": 3 * lag(fast, u) + lag(slow, v) + noise}),
+    ):
+        assert identify(run).status is Status.poor_fit
+
+
+def test_inputs_that_move_together_have_no_gains_of_their_own():
+    run = run_of(FIRST_ORDER, constant(3.0, 2.0))
+    other = run.inputs["valve"] + 1e-6 * np.random.default_rng(1).normal(size=len(run))
+    fit = identify(Run(run.time, {**run.inputs, "pump": other}, run.outputs))
+    assert fit.status is Status.unidentified
+    assert "valve, pump move together" in fit.message
+
+
+def test_a_delay_at_the_end_of_the_candidates_is_said():
+    fit = identify(run_of(FIRST_ORDER, constant(3.0, 2.0), delay=22))
+    assert fit.delay == 20
+    assert "say a longer one by --delay" in fit.message
 
 
 def test_where_the_runs_never_were_a_curve_has_no_error():

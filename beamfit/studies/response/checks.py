@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 from scipy.stats import chi2, f
 
-from beamfit.dynamics.response import Physics, simulate
+from beamfit.dynamics.response import FIRST_ORDER, Physics, simulate
 from beamfit.greybox.fit import Fit
 from beamfit.studies.response.model import (
     CLOSE,
@@ -19,11 +20,16 @@ from beamfit.studies.response.model import (
     predicted,
 )
 from beamfit.studies.response.record import Run
+from beamfit.studies.response.starts import driven_by, unit_outputs
 
 __all__ = ["Checks", "HeldBack", "checks_of", "predict_held"]
 
-# Lags of the tests at most: of residuals, and of inputs.
-LAGS, PAST = 20, 10
+# Lags of the tests at most: of residuals, of inputs, and of what whitens.
+LAGS, PAST, ORDER = 20, 10, 8
+# Time constants of further paths that are looked for.
+SLOW = 5
+# Below this part of its variance that other inputs do not give an input's gain is not told apart.
+ALONE = 1e-3
 
 
 class Checks(NamedTuple):
@@ -46,6 +52,8 @@ class Checks(NamedTuple):
         The part of the whitened residuals' squares that these explain.
     against_constant : float or None
         By how much the Bayesian information criterion falls from constant parameters.
+    together : tuple of str
+        Inputs that the others give but for a thousandth of their variance.
     """
 
     free_run_percent: float
@@ -55,6 +63,7 @@ class Checks(NamedTuple):
     input_probability: float
     input_share: float
     against_constant: float | None
+    together: tuple[str, ...] = ()
 
     def rows(self) -> list[list[str]]:
         """Label and value."""
@@ -90,14 +99,13 @@ def _percent(rest: np.ndarray, y: np.ndarray) -> float:
 
 
 def checks_of(
-    seen: Seen, residuals: tuple[np.ndarray, ...], fit: Fit, used: int, gain: float
+    seen: Seen, residuals: tuple[np.ndarray, ...], fit: Fit, used: int, gain: float, delay: int
 ) -> Checks:
     """Test the residuals of every run together."""
     y = np.concatenate([m - m.mean() for m in seen.measured])
     rest = np.concatenate(residuals)
-    share = _share(residuals)
-    ahead = np.concatenate([_whitened(r, share) for r in residuals])
-    explained, chance = _explained(seen, residuals, fit, share)
+    ahead = np.concatenate([_whitened(r, [_share(residuals)]) for r in residuals])
+    explained, chance = _explained(seen, residuals, fit, delay)
     if rest.std() <= CLOSE * seen.size_y:  # what is left is rounding, or the network's own detail
         explained, chance = 0.0, 1.0
     return Checks(
@@ -108,7 +116,21 @@ def checks_of(
         chance,
         explained,
         gain if callable(fit.model["map"]) else None,
+        _together(seen),
     )
+
+
+def _together(seen: Seen) -> tuple[str, ...]:
+    """Inputs whose gains cannot be told apart: their variance inflation is above a thousand."""
+    u = np.concatenate([np.asarray(r.u)[np.asarray(r.index)] for r in seen.runs])
+    u = (u - u.mean(0)) / np.where(seen.size_u > 0, seen.size_u, 1.0)
+    found = []
+    for i, name in enumerate(seen.inputs):
+        one, others = u[:, i], np.delete(u, i, axis=1)
+        rest = one - others @ np.linalg.lstsq(others, one, rcond=1e-10)[0]
+        if rest @ rest < ALONE * (one @ one):
+            found.append(name)
+    return tuple(found)
 
 
 def _chance(y: np.ndarray, rest: np.ndarray, used: int) -> float:
@@ -124,8 +146,21 @@ def _share(residuals: tuple[np.ndarray, ...]) -> float:
     return float(np.clip(both / max(sum(float(r @ r) for r in residuals), 1e-300), 0.0, 0.999))
 
 
-def _whitened(r: np.ndarray, share: float) -> np.ndarray:
-    return r[1:] - share * r[:-1]
+def _whitened(r: np.ndarray, memory: Sequence[float] | np.ndarray) -> np.ndarray:
+    """Less what the readings before tell, the first ones apart."""
+    order = len(memory)
+    return r[order:] - sum(m * r[order - k : -k] for k, m in enumerate(memory, start=1))
+
+
+def _memory(residuals: tuple[np.ndarray, ...]) -> np.ndarray:
+    """How residuals hang on those before: an autoregression, by least squares.
+
+    Of one order only, white noise on top of a drift would stay coloured.
+    """
+    order = max(1, min(ORDER, min(map(len, residuals)) // 20))
+    before = [np.stack([r[order - k : -k] for k in range(1, order + 1)], axis=1) for r in residuals]
+    after = np.concatenate([r[order:] for r in residuals])
+    return np.linalg.lstsq(np.vstack(before), after, rcond=1e-10)[0]
 
 
 def _white(residuals: tuple[np.ndarray, ...]) -> float:
@@ -138,28 +173,44 @@ def _white(residuals: tuple[np.ndarray, ...]) -> float:
 
 
 def _explained(
-    seen: Seen, residuals: tuple[np.ndarray, ...], fit: Fit, share: float
+    seen: Seen, residuals: tuple[np.ndarray, ...], fit: Fit, delay: int
 ) -> tuple[float, float]:
     """How much of the residuals a fuller model would explain, and its chance, all whitened alike.
 
-    A score test (Lagrange multipliers): columns are past inputs, and the slopes of the output by
-    parameters that change with the operating point, less what the model's own numbers can do.
+    A score test (Lagrange multipliers): columns are inputs before, those within the delay too,
+    further paths of first order, and the slopes of the output by parameters that change with the
+    operating point, less what the model's own numbers can do.
     """
-    own, further, targets = [], [], []
-    for run, r in zip(seen.runs, residuals, strict=True):
+    memory = _memory(residuals)
+    apart = min(float(np.median(np.diff(t))) for t in seen.time)
+    times = np.geomspace(apart, max(float(np.ptp(t)) for t in seen.time) / 4, SLOW)[:, None]
+    paths = driven_by(seen, FIRST_ORDER)
+    own, slow, quick, targets = [], [], [], []
+    for run, path, r in zip(seen.runs, paths, residuals, strict=True):
         u = (np.asarray(run.u) - seen.mean_u) / np.where(seen.size_u > 0, seen.size_u, 1.0)
         index = np.asarray(run.index)
-        past = [u[np.maximum(index - k, 0)] for k in range(1, PAST + 1)]
-        slopes = changed_by(fit.model, run, np.concatenate([u, u**2], axis=1))
-        further.append(_whitened(np.concatenate([*past, np.asarray(slopes)], axis=1), share))
-        own.append(_whitened(fit.derive(predicted, run).slope, share))
-        targets.append(_whitened(r, share))
-    target = np.concatenate(targets)
-    basis = _basis(np.vstack(own))
-    rest = target - basis @ (basis.T @ target)
-    columns = np.vstack(further)
+        past = [u[np.clip(index + k, 0, len(u) - 1)] for k in range(-PAST, delay)]
+        slopes = np.asarray(changed_by(fit.model, run, np.concatenate([u, u**2], axis=1)))
+        slow.append(np.asarray(unit_outputs(path, times))[:, : u.shape[1]].reshape(-1, len(r)).T)
+        quick.append(np.concatenate([*past, slopes], axis=1))
+        own.append(fit.derive(predicted, run).slope)
+        targets.append(r)
+
+    def white(parts: list[np.ndarray]) -> np.ndarray:
+        return np.concatenate([_whitened(part, memory) for part in parts])
+
+    basis = _basis(white(own))
+    rest = white(targets)
+    rest = rest - basis @ (basis.T @ rest)
+    few, more = (_tested(rest, basis, white(columns)) for columns in (slow, quick))
+    share, chance = min(few, more, key=lambda each: each[1])
+    return share, min(2.0 * chance, 1.0)
+
+
+def _tested(rest: np.ndarray, basis: np.ndarray, columns: np.ndarray) -> tuple[float, float]:
+    """Share of the squares that columns explain beyond a basis, and its chance (F)."""
     new = _basis(columns - basis @ (basis.T @ columns), np.linalg.norm(columns, axis=0))
-    k, left = new.shape[1], len(target) - basis.shape[1] - new.shape[1]
+    k, left = new.shape[1], len(rest) - basis.shape[1] - new.shape[1]
     inside, whole = float(np.sum((new.T @ rest) ** 2)), float(rest @ rest)
     if left < 1 or whole <= 0 or k == 0:
         return 0.0, 1.0

@@ -211,7 +211,7 @@ def identify(
     runs = (runs,) if isinstance(runs, Run) else tuple(runs)
     physics = _checked(runs, tuple(held), model, map)
     output = _output(runs[0], output)
-    start, seen, delay = _start(runs, output, physics, delay, offset)
+    given, (start, seen, delay) = delay, _start(runs, output, physics, delay, offset)
     plain = _settled(seen, [(jnp.asarray(start.raw), start.first, (start.offset, offset))])
     answer = plain
     if map == "network":
@@ -224,11 +224,13 @@ def identify(
         answer.fit,
         used_by(answer.fit),
         plain.likelihood - answer.likelihood,
+        delay,
     )
     quantities = quantities_of(answer.fit, seen, physics) if map == "constant" else {}
     curves = curves_of(answer.fit, seen) if map == "network" else ()
     ahead = tuple(predict_held(each, output, answer.fit, physics, delay) for each in held)
-    status, message = judged(answer.fit, answer.rests, checks, quantities, curves, ahead, map)
+    evidence = (answer.fit, answer.rests, checks, quantities, curves, ahead, map)
+    status, message = judged(*evidence, given is None and delay == _latest(runs) > 0)
     parts = (quantities, curves, answer.noise, answer.memory, checks, ahead)
     return ResponseFit(output, status, message, model, map, delay, runs, seen, answer.fit, *parts)
 
@@ -278,9 +280,7 @@ def _start(
     runs: tuple[Run, ...], output: str, physics: Physics, delay: int | None, offset: bool
 ) -> tuple[Start, Seen, int]:
     """The best start, and the delay: the shortest of those that fit about as well as any."""
-    shortest = min(map(len, runs))
-    latest = min(LATEST, int(SHARE * shortest))
-    delays = range(latest + 1) if delay is None else (delay,)
+    delays = range(_latest(runs) + 1) if delay is None else (delay,)
     found = []
     for late in delays:
         seen = seen_of(runs, output, physics, late)
@@ -289,6 +289,10 @@ def _start(
     least = min(start.squares for start, _, _ in found)
     near = least * np.exp(2.0 * BETTER / count)
     return next(each for each in found if each[0].squares <= near)
+
+
+def _latest(runs: tuple[Run, ...]) -> int:
+    return min(LATEST, int(SHARE * min(map(len, runs))))
 
 
 class Settled(NamedTuple):

@@ -17,7 +17,7 @@ from scipy.optimize import minimize
 from beamfit.dynamics.response import ARX, FIRST_ORDER, SECOND_ORDER, Physics, simulate
 from beamfit.studies.response.model import Driven, Seen
 
-__all__ = ["Start", "best_start"]
+__all__ = ["Start", "best_start", "driven_by", "unit_outputs"]
 
 # Time constants of the grid, and dampings of a second order.
 TIMES, DAMPINGS = 16, (0.2, 0.6, 1.0, 2.0)
@@ -36,19 +36,21 @@ def best_start(seen: Seen, offset: bool) -> Start:
     """The best of the grid."""
     physics = seen.runs[0].physics
     if physics is ARX:
-        return _as_difference(seen, best_start(_through(seen, SECOND_ORDER), offset))
+        return _as_difference(
+            seen, best_start(seen._replace(runs=driven_by(seen, SECOND_ORDER)), offset)
+        )
     apart = min(float(np.median(np.diff(t))) for t in seen.time)
     span = max(float(t[-1] - t[0]) for t in seen.time)
     times = np.geomspace(0.3 * apart, span, TIMES)
     shapes = np.array([[t] for t in times] if physics is FIRST_ORDER
                       else [[t, z] for t in times for z in DAMPINGS])  # fmt: skip
-    columns = [np.asarray(_columns(run, shapes)) for run in seen.runs]
+    columns = [np.asarray(unit_outputs(run, shapes)) for run in seen.runs]
     found = [_fitted(seen, s, [c[i] for c in columns], offset) for i, s in enumerate(shapes)]
     best = min(range(len(shapes)), key=lambda i: found[i].squares)
 
     def at(logarithms: np.ndarray) -> Start:
         shape = np.exp(np.clip(logarithms, *np.log([1e-3 * apart, 1e3 * span])))
-        there = [np.asarray(_columns(run, shape[None]))[0] for run in seen.runs]
+        there = [np.asarray(unit_outputs(run, shape[None]))[0] for run in seen.runs]
         return _fitted(seen, shape, there, offset)
 
     # To a hundredth of a time constant: delays are compared by what remains.
@@ -60,7 +62,7 @@ def best_start(seen: Seen, offset: bool) -> Start:
 
 
 @jax.jit
-def _columns(run: Driven, shapes: jax.Array) -> jax.Array:
+def unit_outputs(run: Driven, shapes: jax.Array) -> jax.Array:
     """Outputs for unit gains and unit first states, shape (shapes, columns, readings)."""
     m, k = run.u.shape[1], run.physics.free_states
 
@@ -93,11 +95,11 @@ def _fitted(seen: Seen, shape: np.ndarray, columns: list[np.ndarray], offset: bo
     return Start(raw, first, float(found[-1]) if offset else 0.0, rest)
 
 
-def _through(seen: Seen, physics: Physics) -> Seen:
-    runs = tuple(
+def driven_by(seen: Seen, physics: Physics) -> tuple[Driven, ...]:
+    """The runs with another physics."""
+    return tuple(
         Driven(physics, r.point, r.u, r.dt, r.time, r.index, r.run, r.memory) for r in seen.runs
     )
-    return seen._replace(runs=runs)
 
 
 def _as_difference(seen: Seen, found: Start) -> Start:

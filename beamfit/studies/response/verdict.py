@@ -34,6 +34,7 @@ class Evidence(NamedTuple):
     held: tuple[HeldBack, ...]
     map: str
     rms: float
+    latest: bool
 
 
 def judged(
@@ -44,11 +45,16 @@ def judged(
     curves: tuple[Curve, ...],
     held: tuple[HeldBack, ...],
     map: str,
+    latest: bool,
 ) -> tuple[Status, str]:
-    """Status and sentences."""
+    """Status and sentences; `latest` if the delay is the longest that was tried."""
     rms = float(np.sqrt(np.mean(np.square(_rms(fit)))))
-    found = judge(Evidence(fit, rests, checks, quantities, curves, held, map, rms), RULES)
-    return found.status, found.message
+    e = Evidence(fit, rests, checks, quantities, curves, held, map, rms, latest)
+    found = judge(e, RULES)
+    late = (
+        " The delay is the longest that was tried: say a longer one by --delay." if latest else ""
+    )
+    return found.status, found.message + late
 
 
 def _rms(fit: Fit) -> list[float]:
@@ -67,8 +73,18 @@ def _nothing(e: Evidence) -> Finding | None:
     if e.checks.nothing_probability < POOR_FIT:
         return None
     cause = "The inputs explain no more of the output than chance would."
-    remedy = "Move the inputs further, record longer, or look for what else drives the output."
+    remedy = (
+        "Move the inputs further, record longer, try a longer delay (--delay), or look for what "
+        "else drives the output."
+    )
     return Finding(Status.unidentified, cause, remedy)
+
+
+def _joint(e: Evidence) -> Finding | None:
+    if not e.checks.together:
+        return None
+    cause = f"Inputs {', '.join(e.checks.together)} move together: only their joint effect is told."
+    return Finding(Status.unidentified, cause, "Move one at a time, or leave one out.")
 
 
 def _open(e: Evidence) -> Finding | None:
@@ -122,6 +138,9 @@ def _good(e: Evidence) -> Finding:
     cause = f"The free run explains {e.checks.free_run_percent:.2f} % of the output."
     if e.checks.white_probability < POOR_FIT:
         cause += " The noise has a memory, which the errors contain."
+    gains = [q for name, q in e.quantities.items() if name.startswith("K")]
+    if gains and all(q.error is not None and abs(q.value) < 2 * q.error for q in gains):
+        cause += " No gain is told from 0: what is seen is how the runs come to rest by themselves."
     gain = e.checks.against_constant
     if gain is not None and gain < 0:
         cause += " Constant parameters do as well (BIC): the operating point need not be in it."
@@ -131,4 +150,4 @@ def _good(e: Evidence) -> Finding:
     return Finding(Status.converged, cause)
 
 
-RULES = (_lost, _nothing, _open, _refuted, _worse, _good)
+RULES = (_lost, _nothing, _joint, _open, _refuted, _worse, _good)
