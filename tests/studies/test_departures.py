@@ -276,3 +276,14 @@ def test_errors_far_above_the_scatter_are_said():
     fits = [fit_decay(noisy(time, beam, 2e-3, stated=stated)) for stated in (2e-3, 2e-2)]
     assert "times the scatter" not in fits[0].message
     assert "stated errors are 11 times the scatter" in fits[1].message
+
+
+def test_residuals_far_above_the_scatter_of_neighbours_are_said():
+    def bursts(t, i):
+        return 2e-8 * i + 2e-6 + 4e-6 * any(c < t < c + 900 for c in (1500, 5000, 8200))
+
+    time, beam = integrated(bursts, 500, 300.0, 3 * HOUR)
+    said = "look at the residuals before recording longer"
+    assert said in fit_decay(noisy(time, beam, 3e-3)).message
+    plain = integrated(lambda t, i: 2e-8 * i + 2e-6, 500, 300.0, 3 * HOUR)[1]
+    assert said not in fit_decay(noisy(time, plain, 3e-3)).message

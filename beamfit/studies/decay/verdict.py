@@ -23,6 +23,7 @@ from beamfit.studies.decay.evidence import (
 )
 from beamfit.studies.decay.monitor import Monitor
 from beamfit.studies.decay.outgassing import Outgassing
+from beamfit.studies.decay.segments import noise_of
 from beamfit.verdict import Finding, judge
 
 __all__ = ["TableEvidence", "finding_of", "finding_of_cycles", "finding_of_table"]
@@ -33,6 +34,8 @@ SHORTEST, LONGEST = 20.0, 3000 * HOUR
 LIMIT = 1.645
 # Below this chi²/dof stated errors are said to be too large.
 CAUTIOUS = 0.25
+# Residuals so many times the scatter of neighbouring readings are not the monitor's noise.
+WANDERS = 10.0
 # Settings that are said to have gone from one value to another, by more than this share.
 MOVABLE = {"rf_voltage": ("RF voltage", 1e-3, "kV"), "scraper_y": ("scraper", 1e3, "mm")}
 MOVABLE |= {"bunches": ("number of bunches", 1.0, "in all")}
@@ -347,6 +350,19 @@ def _moved(e: Evidence) -> str | None:
     return f"{', '.join(said)}: a and b are of no one setting" if said else None
 
 
+def _wandering(e: Evidence) -> str | None:
+    """Residuals as long as the record, of readings that by themselves are far better than that."""
+    length, record = e.correlation_time, e.record
+    local = noise_of(record.time, record.current)
+    rms = float(np.std(e.residuals))
+    if length is None or length < record.span / 3 or rms < WANDERS * local:
+        return None
+    return (
+        f"Neighbouring readings scatter by {local:.2g} mA alone: the loss rate or the monitor "
+        "changed several times or slowly, so look at the residuals before recording longer"
+    )
+
+
 def _quantised(e: Evidence) -> str | None:
     step, noise = e.record.resolution, e.noise
     if e.record.error is not None:
@@ -393,6 +409,7 @@ REMARKS = (
     _noise_inferred,
     _cautious,
     _correlated,
+    _wandering,
     _quantised,
     _drifting,
     _odd_clock,
