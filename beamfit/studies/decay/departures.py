@@ -50,6 +50,8 @@ TIMES, FINER, BETTER = 40, 3, 15.0
 # A change that leaves less of the squares is no noise that looks like one; two of them must leave
 # far less, since slow noise looks like two more often.
 REST, REST_OF_TWO = 0.1, 1e-3
+# Two changes within so many readings are a step.
+STEP = 3.0
 # Currents at which a lifetime is offered.
 CURRENTS = 5
 
@@ -316,7 +318,11 @@ def change_of_rate(
     if memory is not None or (one is not None and one.is_the_cause(about.residuals)):
         return one
     two = found(2)
-    return two if two is not None and two.is_the_cause(about.residuals) else one
+    if two is None or not two.is_the_cause(about.residuals):
+        return one
+    # A refill, or a loss at once, is a step and no change of the loss rate.
+    lasts = two.then.time - two.time > STEP * float(np.median(np.diff(record.time)))
+    return two if lasts and two.after.value > 0 else one
 
 
 def _best(
