@@ -26,6 +26,9 @@ FLAT = 1e-6
 PLAIN = 2e-3
 # Slopes below this share of the terms that cancel in them are rounding, too.
 ROUNDING = 1e-13
+# A slope at a bound that promises so many times the cost and its change beside the bound is made of
+# rounding, and says nothing of the bound: b/(1 - exp(-b t)) has lost its figures at b = 1e-18.
+LOST = 1e3
 # Points beside one are so far off in the sizes of the numbers, along so many of the weakest
 # directions of squares, or at random or inward from bounds.
 NEAR, WEAKEST, AROUND = 1e-3, 2, 4
@@ -116,8 +119,11 @@ def lower_beside(p: Problem, s: assess.State, lagrangian: Look) -> np.ndarray | 
         if forth + other > least:
             return _along(p, s, w if forth > other else back, lagrangian)
     for i, push in enumerate(pushes):
-        if gain[2 * len(sides) + i] > least:
+        change = gain[2 * len(sides) + i]
+        if change > least:
             return _along(p, s, push, lagrangian)
+        if NEAR * abs(s.at.gradient[inward[i]]) * unit[inward[i]] > LOST * max(cost[0], -change):
+            return every[1 + 2 * len(sides) + i]
     return None
 
 

@@ -208,3 +208,17 @@ def test_a_hundred_thousand_residuals_take_little_memory():
     status, megabytes = run.stdout.split()
     assert status == "converged"
     assert float(megabytes) < 200
+
+
+def test_a_formula_that_loses_its_figures_at_a_bound_does_not_end_there():
+    """b/(1 - exp(-b t)) is rounding at b = 1e-18: chi2 there was 4000 times that of the optimum."""
+    t, truth = 1000.0 * jnp.arange(21), np.array([100.0, 1e-7, 2e-5])
+
+    def decay(p, t):
+        return p[0] * p[2] * jnp.exp(-p[2] * t) / (p[2] + p[1] * p[0] * (1 - jnp.exp(-p[2] * t)))
+
+    y = decay(truth, t) + 0.02 * np.random.default_rng(1).normal(size=21)
+    free = [Free("", np.zeros(3), np.array([500.0, 1.0, 1.0]))]
+    fit = solve(Problem(jnp.array([100.0, 1e-6, 1e-6]), free, [Record("decay", decay, t, y)]))
+    assert fit.status == "converged", fit.message
+    np.testing.assert_allclose(fit.theta, truth, rtol=0.02)
