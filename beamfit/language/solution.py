@@ -242,9 +242,9 @@ def solve_document(
         notes = notes if told else (*notes, f"Where it ended, {cause}.")
     if made.squares and math.isfinite(fit.scale):
         notes = (*notes, NOISE)
-    scope, problem = made.program.scope, made.document.problem
-    labels = _labels(problem.variables, scope.inputs), _labels(problem.limits, scope.outputs)
-    outputs = {n: np.asarray(v) for n, v in made.program(fit.model, list(scope.outputs)).items()}
+    labels = made.problem.names, tuple(c.name for c in fit.constraints)
+    asked = list(made.program.scope.outputs)
+    outputs = {n: np.asarray(v) for n, v in made.program(fit.model, asked).items()}
     name = _goals(made.document)
     return Solution(name, fit, *labels, outputs, made.factor, made.squares, notes, made)
 
@@ -260,15 +260,6 @@ def solve_problem(problem: Problem, starts: int = 1) -> Solution:
     factor = -1.0 if goal.weight < 0 else 1.0
     names = problem.names, tuple(c.name for c in fit.constraints)
     return Solution(goal.name, fit, *names, {}, factor, notes=notes)
-
-
-def _labels(asked: Sequence[d.Variable | d.Limit], arrays: Mapping[str, Any]) -> tuple[str, ...]:
-    """A name for each element of what is free or limited."""
-    return tuple(
-        one.label + arrays[one.model].element(i).removeprefix(one.model)
-        for one in asked
-        for i in range(arrays[one.model].size)
-    )
 
 
 def _started(made: Formulation) -> tuple[Formulation, tuple[str, ...]]:

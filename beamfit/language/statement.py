@@ -116,7 +116,14 @@ def formulate(document: d.Document, tables: Mapping[str, np.ndarray] | None = No
         else:
             objectives.append(core.Objective(name, _Output(program, name), constants, weight))
     limits = [
-        core.Constraint(c.label, _Output(program, c.model), constants, c.lower, c.upper)
+        core.Constraint(
+            c.label,
+            _Output(program, c.model),
+            constants,
+            c.lower,
+            c.upper,
+            _names(c, program.scope.outputs[c.model]),
+        )
         for c in p.limits
     ]
     problem = core.Problem(model, free, records, (), limits, objectives)
@@ -126,6 +133,12 @@ def formulate(document: d.Document, tables: Mapping[str, np.ndarray] | None = No
 
 
 # ---- variables
+
+
+def _names(asked: d.Variable | d.Limit, array: Any) -> tuple[str, ...]:
+    """A name for each element of what is free or limited, in the document's indices."""
+    elements = (array.element(i).removeprefix(asked.model) for i in range(array.size))
+    return tuple(asked.label + element for element in elements)
 
 
 def _free(document: d.Document, program: Program) -> tuple[list, dict[str, np.ndarray], tuple]:
@@ -139,7 +152,8 @@ def _free(document: d.Document, program: Program) -> tuple[list, dict[str, np.nd
     for v in document.problem.variables:
         shape = arrays[v.model].shape
         model[v.model] = first_start(v, shape, model.get(v.model))
-        free.append(core.Free(v.model, v.lower, v.upper, v.random))
+        names = _names(v, arrays[v.model])
+        free.append(core.Free(v.model, v.lower, v.upper, v.random, labels=names))
         if v.model not in used:
             notes.append(f"At {v.at}: nothing asked for hangs on the variable '{v.label}', "
                          "which stays where it starts.")  # fmt: skip

@@ -11,6 +11,7 @@ import pytest
 from beamfit.greybox.solve import solve
 from beamfit.io.formulation import read_formulation, read_numbers
 from beamfit.language.compiled import compile_mapping
+from beamfit.language.parse import parse_document
 from beamfit.language.statement import formulate
 from tests.greybox import appendices as by_hand
 
@@ -175,3 +176,11 @@ def test_limits_without_a_qualification_are_said(root, tables):
     assert [("maxdAdc" in n, "maxdBdc" in n) for n in made.notes] == [(True, False), (False, True)]
     assert all("no constraint qualification" in note for note in made.notes)
     assert formulate(document(root, "appendix_b_elementwise"), tables).notes == ()
+
+
+def test_what_is_said_of_elements_has_their_indices_in_the_document():
+    text = """minimize f; set K = |1:2|; variable e in [2, 3]; input e[K]; output f, g[K];
+        constraint g <= 1; f = sum(k in K | e[k]); g[k] = e[k] foreach k in K;"""
+    made = formulate(parse_document(text))
+    assert made.problem.names == ("e[1]", "e[2]")
+    assert "'g[1]'" in solve(made.problem).message
