@@ -194,6 +194,10 @@ BAD = {
         lambda: identify([Run(T, {"u": T}, {"y": T}), Run(T, {"v": T}, {"y": T})]),
         "inputs u",
     ),
+    "a delay longer than the run": (
+        lambda: identify(Run(T, {"u": T}, {"y": T}), delay=19),
+        "less than the 20 rows",
+    ),
     "a gap in an input": (lambda: Run(T, {"u": np.log(T - 3)}, {"y": T}), "row 1: no value of u"),
 }
 

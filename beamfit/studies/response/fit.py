@@ -211,6 +211,9 @@ def identify(
     runs = (runs,) if isinstance(runs, Run) else tuple(runs)
     physics = _checked(runs, tuple(held), model, map)
     output = _output(runs[0], output)
+    shortest = min(len(run) for run in runs)
+    if delay is not None and delay >= shortest - 1:
+        raise InputError(f"a delay of {delay} samples", f"less than the {shortest} rows of a run")
     given, (start, seen, delay) = delay, _start(runs, output, physics, delay, offset)
     plain = _settled(seen, [(jnp.asarray(start.raw), start.first, (start.offset, offset))])
     answer = plain
