@@ -32,3 +32,10 @@ class Status(StrEnum):
     local_optimum = "local_optimum"
     saddle = "saddle"
     degenerate = "degenerate"
+
+    @property
+    def colour(self) -> str:
+        """How it is shown: green, yellow or red."""
+        good = (Status.converged, Status.optimal)
+        doubtful = (Status.poor_fit, Status.local_optimum)
+        return "green" if self in good else "yellow" if self in doubtful else "red"

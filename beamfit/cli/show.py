@@ -14,11 +14,9 @@ from beamfit.table import Table
 
 __all__ = ["Terminal"]
 
-COLOUR = {Status.converged: "green", Status.optimal: "green", Status.poor_fit: "yellow"}
-
 
 def _style(status: Status) -> str:
-    return f"bold {COLOUR.get(status, 'red')}"
+    return f"bold {status.colour}"
 
 
 class Terminal:

@@ -13,7 +13,6 @@ from matplotlib.font_manager import FontProperties
 from matplotlib.textpath import text_to_path
 
 from beamfit.report.document import Page, Picture
-from beamfit.status import Status
 from beamfit.table import Table
 
 __all__ = ["pages_of", "pdf_of"]
@@ -24,7 +23,7 @@ LINE = 0.185
 GAP, USUAL, SMALLEST = 0.22, 8.5, 6.0
 # A picture is made smaller by this at most to fit on a page.
 LEAST = 0.7
-COLOUR = {Status.converged: "#2c7a3f", Status.poor_fit: "#c98a00"}
+COLOUR = {"green": "#2c7a3f", "yellow": "#c98a00", "red": "#b3261e"}
 
 
 class _Pages:
@@ -177,7 +176,7 @@ def pages_of(page: Page) -> list[Figure]:
     for verdict in page.verdicts:
         pages.y -= 0.5 * LINE
         pages.room(4)
-        colour = COLOUR.get(verdict.status, "#b3261e")
+        colour = COLOUR[verdict.status.colour]
         pages.paragraph(verdict.headline, size=11.5, weight="bold", color=colour, step=1.4)
         pages.paragraph(verdict.message)
     for number, table in enumerate(page.tables):
