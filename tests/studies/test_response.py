@@ -183,12 +183,33 @@ def test_a_constant_can_be_sampled():
         network.sample()
 
 
+def test_columns_may_stand_in_another_order_in_every_run():
+    rng = np.random.default_rng(3)
+    runs = []
+    for names in (("a", "b"), ("b", "a"), ("b", "a")):
+        u = {name: steps(120, rng) for name in ("a", "b")}
+        p = jnp.tile(jnp.array([3.0, 2.0, -1.0]), (120, 1))
+        y = simulate(FIRST_ORDER, p, jnp.stack([u["a"], u["b"]], axis=1), jnp.full(120, 0.5),
+                     jnp.zeros(1))  # fmt: skip
+        level = np.asarray(y) + 0.05 * rng.normal(size=120)
+        runs.append(Run(0.5 * np.arange(120), {n: u[n] for n in names}, {"level": level}))
+    fit = identify(runs[:2], held=runs[2:], delay=0)
+    assert fit.status is Status.converged, fit.message
+    for name, truth in (("K_a", 2.0), ("K_b", -1.0)):
+        assert abs(fit.quantities[name].value - truth) < 4 * fit.quantities[name].error
+    assert fit.held[0].rms < 0.1
+
+
 T = np.arange(20.0)
 BAD = {
     "time backwards": (lambda: Run(T[::-1], {"u": T}, {"y": T}), "times that increase"),
     "too short": (lambda: Run(T[:5], {"u": T[:5]}, {"y": T[:5]}), "at least 8"),
     "a constant input": (lambda: identify(Run(T, {"u": 0 * T}, {"y": T})), "an input that changes"),
     "uneven samples": (lambda: identify(Run(T**1.5, {"u": T}, {"y": T}), "arx"), "equal"),
+    "runs of other steps": (
+        lambda: identify([Run(k * T, {"u": T}, {"y": T}) for k in (1, 2)], "arx"),
+        "samples every 2 s; expected 1 s",
+    ),
     "an unknown model": (lambda: identify(Run(T, {"u": T}, {"y": T}), "arxx"), "did you mean arx"),
     "other columns": (
         lambda: identify([Run(T, {"u": T}, {"y": T}), Run(T, {"v": T}, {"y": T})]),

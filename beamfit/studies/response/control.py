@@ -73,9 +73,9 @@ def controller(
     fits = (fits,) if isinstance(fits, ResponseFit) else tuple(fits)
     seen, names = fits[0].seen, fits[0].seen.inputs
     steps = [_transient(fit) for fit in fits]
-    if any(PHYSICS[fit.model] is ARX for fit in fits) and (every or 1) > 1:
-        raise InputError(f"a step of {every} samples", "1: a difference equation knows no other")
     arx = any(PHYSICS[fit.model] is ARX for fit in fits)
+    if arx and (every or 1) > 1:
+        raise InputError(f"a step of {every} samples", "1: a difference equation knows no other")
     every = every or (1 if arx else max(1, int(np.ceil(max(steps) / MOST))))
     apart = min(float(np.median(np.diff(run.time))) for run in fits[0].runs)
     step, responses = every * apart, tuple(_response(fit, every, every * apart) for fit in fits)

@@ -14,7 +14,7 @@ from beamfit.quantity import Quantity
 from beamfit.studies.response.model import Seen, curves
 from beamfit.table import Table, cell, json_of
 
-__all__ = ["Curve", "curves_of", "quantities_of"]
+__all__ = ["TIME", "Curve", "curves_of", "quantities_of"]
 
 # Points of a curve; it was visited where so many samples lie within a share of its range.
 POINTS, VISITS, NEAR = 41, 5, 0.05
@@ -111,8 +111,7 @@ def _quantity(found: Derived, i: Any, unit: str) -> Quantity:
 def curves_of(fit: Fit, seen: Seen) -> tuple[Curve, ...]:
     """Every parameter against every input."""
     physics, m = seen.runs[0].physics, len(seen.inputs)
-    points = np.concatenate([np.asarray(run.point)[: len(t)]
-                             for run, t in zip(seen.runs, seen.time, strict=True)])  # fmt: skip
+    points = np.concatenate([np.asarray(run.point)[np.asarray(run.index)] for run in seen.runs])
     made = []
     for j, name in enumerate(seen.inputs):
         low, high = points[:, j].min(), points[:, j].max()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -210,6 +210,7 @@ def identify(
     """
     runs = (runs,) if isinstance(runs, Run) else tuple(runs)
     physics = _checked(runs, tuple(held), model, map)
+    runs, held = (tuple(_ordered(run, runs[0]) for run in each) for each in (runs, held))
     output = _output(runs[0], output)
     shortest = min(len(run) for run in runs)
     if delay is not None and delay >= shortest - 1:
@@ -261,11 +262,19 @@ def _checked(runs: tuple[Run, ...], held: tuple[Run, ...], model: str, map: str)
             raise run.unusable(said, f"those of {first.name}: {first.headline.partition(', ')[2]}")
         if PHYSICS[model].even and run.step is None:
             raise run.unusable("samples at unequal distances", "equal ones, or --model first-order")
+        if PHYSICS[model].even and not np.isclose(run.step, first.step, rtol=0.01):
+            expected = f"{first.step:.4g} s, as in {first.name}, or --model first-order"
+            raise run.unusable(f"samples every {run.step:.4g} s", expected)
     for name in first.inputs:
         if all(np.ptp(run.inputs[name]) == 0 for run in runs):
             said = f"input {name} at {runs[0].inputs[name][0]:g} all the time"
             raise first.unusable(said, "an input that changes: a step at least")
     return PHYSICS[model]
+
+
+def _ordered(run: Run, first: Run) -> Run:
+    """The run with its inputs in the order of the first: matrices have them by their place."""
+    return replace(run, inputs={name: run.inputs[name] for name in first.inputs})
 
 
 def seen_of(runs: tuple[Run, ...], output: str, physics: Physics, delay: int) -> Seen:

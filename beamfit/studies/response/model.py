@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import jax
@@ -16,11 +17,14 @@ from beamfit.greybox.problem import Free, Prior, Problem, Record, padded_length
 from beamfit.studies.response.record import Run
 
 __all__ = [
+    "CLOSE",
     "Driven",
     "Seen",
+    "changed_by",
     "curves",
     "driven",
     "network_of",
+    "output_of",
     "parameters_at",
     "predicted",
     "state",
@@ -170,7 +174,7 @@ def state(
         close = noise[i] <= CLOSE * seen.size_y * 1.001
         said: dict[str, Any] = {"worth": np.inf if close else 1.0, "error": noise[i]}
         if memory is not None:
-            run = tree_with(run, memory[i])
+            run = replace(run, memory=jnp.asarray(float(memory[i])))
             said["apart"] = _apart
         records.append(Record(f"run {i + 1}", predicted, run, y, **said))
     free = [Free("start", nuisance=True), Free("map", nuisance=callable(of))]
@@ -180,9 +184,3 @@ def state(
     if isinstance(of, MLP):
         priors = [Prior("map.weights", 0.0, WEIGHT), Prior("map.biases", 0.0, WEIGHT)]
     return Problem(model, free, records, priors)
-
-
-def tree_with(run: Driven, memory: float) -> Driven:
-    """The run with another correlation time of its noise."""
-    parts = (run.point, run.u, run.dt, run.time, run.index, run.run)
-    return Driven(run.physics, *parts, jnp.asarray(float(memory)))

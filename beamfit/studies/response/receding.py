@@ -319,7 +319,6 @@ def _planned(
     last = jnp.zeros(n).at[: len(control.sizes)].set(state.past[-1] / control.sizes)
     hessian = 2.0 * (matrix.T @ matrix + control.smooth * change.T @ change)
     gradient = 2.0 * (matrix.T @ error - control.smooth * change.T @ last)
-    rows, room = _input_rows(control, change, last)
     base = error + jnp.tile(target / size, control.horizon)
     hard, soft = _input_rows(control, change, last), _output_rows(control, matrix, base)
     rows, room = (jnp.concatenate(each) for each in zip(hard, soft, strict=True))

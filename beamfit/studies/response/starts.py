@@ -6,6 +6,7 @@ constants with linear least squares finds the basin also where noise ruins equat
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
 
@@ -97,9 +98,7 @@ def _fitted(seen: Seen, shape: np.ndarray, columns: list[np.ndarray], offset: bo
 
 def driven_by(seen: Seen, physics: Physics) -> tuple[Driven, ...]:
     """The runs with another physics."""
-    return tuple(
-        Driven(physics, r.point, r.u, r.dt, r.time, r.index, r.run, r.memory) for r in seen.runs
-    )
+    return tuple(replace(run, physics=physics) for run in seen.runs)
 
 
 def _as_difference(seen: Seen, found: Start) -> Start:

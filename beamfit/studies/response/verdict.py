@@ -12,7 +12,7 @@ from beamfit.quantity import Quantity
 from beamfit.statistics import POOR_FIT
 from beamfit.status import Status
 from beamfit.studies.response.checks import Checks, HeldBack
-from beamfit.studies.response.curve import Curve
+from beamfit.studies.response.curve import TIME, Curve
 from beamfit.verdict import Finding, judge
 
 __all__ = ["judged"]
@@ -88,24 +88,24 @@ def _joint(e: Evidence) -> Finding | None:
 
 
 def _open(e: Evidence) -> Finding | None:
-    left = [name for name, q in e.quantities.items() if q.error is None or _wide(q)]
-    left += [
-        f"{c.parameter}({c.input})"
+    left = {n: q.unit for n, q in e.quantities.items() if q.error is None or _wide(q)}
+    left |= {
+        f"{c.parameter}({c.input})": c.unit
         for c in e.curves
         if np.mean(np.isfinite(c.error) & c.visited) < HALF
-    ]
+    }
     if not left:
         return None
     cause = f"The runs do not determine {', '.join(left)}."
-    slow = any("tau" in name or name == "T" for name in left)
-    remedy = "Sample faster around steps, and wait until the output settles." if slow else (
-        "Move the inputs over more of their range.")  # fmt: skip
+    remedy = "Move the inputs over more of their range."
+    if TIME in left.values():
+        remedy = "Sample faster around steps, and wait until the output settles."
     return Finding(Status.unidentified, cause, remedy)
 
 
 def _wide(q: Quantity) -> bool:
     """Whether a time constant is not told from zero or from without end."""
-    return q.unit == "s" and q.error is not None and q.error > 0.5 * abs(q.value)
+    return q.unit == TIME and q.error is not None and q.error > 0.5 * abs(q.value)
 
 
 def _refuted(e: Evidence) -> Finding | None:
