@@ -175,11 +175,7 @@ def _undetermined(p: Problem, looks: list[assess.Slopes]) -> Iterator[Ailment]:
 
     on = _rows(looks, rows)
     used = np.flatnonzero(on.any(axis=0) & (p.lower < p.upper))
-    loose = _unmatched(on[:, used])
-    for at in looks:
-        _, unseen, reach = directions(rows(at)[:, used])
-        moved = np.max(np.abs(unseen), axis=1, initial=0.0) > CUT**0.5 * reach
-        loose = loose & moved if loose.any() else moved
+    loose = _open(_unmatched(on[:, used]), [rows(at)[:, used] for at in looks])
     names = tuple(np.array(p.names)[used][loose].tolist())
     if names:
         said = (
@@ -204,16 +200,26 @@ def _unmatched(on: np.ndarray) -> np.ndarray:
         loose = more
 
 
+def _open(loose: np.ndarray, looks: list[np.ndarray]) -> np.ndarray:
+    """Columns along which the rows see nothing at any point; of those that the structure leaves
+    open, if it leaves any.
+    """
+    every = np.ones_like(loose)
+    for rows in looks:
+        _, unseen, reach = directions(rows)
+        every &= np.max(np.abs(unseen), axis=1, initial=0.0) > CUT**0.5 * reach
+    return loose & every if loose.any() else every
+
+
 def _dependent(p: Problem, looks: list[assess.Slopes]) -> Iterator[Ailment]:
     """Equations among which one follows from the others or contradicts them."""
     equal = np.flatnonzero(p.constraint_lower == p.constraint_upper)
     moving = p.lower < p.upper
-    loose = _unmatched(_rows(looks, lambda at: at.jacobian[equal][:, moving]).T)
-    for at in looks:
-        rows = at.jacobian[equal][:, moving].T
-        _, open_ones, reach = directions(rows)
-        same = np.max(np.abs(open_ones), axis=1, initial=0.0) > CUT**0.5 * reach
-        loose = loose & same if loose.any() else same
+
+    def columns(at):
+        return at.jacobian[equal][:, moving].T
+
+    loose = _open(_unmatched(_rows(looks, columns)), list(map(columns, looks)))
     names = tuple(np.array(p.constraint_names)[equal][loose].tolist())
     if names:
         said = (

@@ -48,6 +48,18 @@ def test_numbers_seen_only_together_are_found_though_rows_are_many():
     assert kinds(stated(lambda m, x: m["a"] * m["b"] * x + m["c"])) == {"undetermined": ("a", "b")}
 
 
+def test_a_number_that_is_seen_at_some_points_is_determined():
+    """Whichever of the points is looked at last, `c` counts above and below 0.8 in one of these."""
+
+    def above(m, x):
+        return m["a"] * x + m["b"] + m["c"] * x**2 * jnp.maximum(m["a"] - 0.8, 0.0)
+
+    def below(m, x):
+        return m["a"] * x + m["b"] + m["c"] * x**2 * jnp.maximum(0.8 - m["a"], 0.0)
+
+    assert diagnose(stated(above)) == diagnose(stated(below)) == ()
+
+
 def test_an_equation_determines_what_data_do_not():
     rule = Constraint("tie", lambda m, _: m["a"] - m["b"], None, 0.0, 0.0)
     assert diagnose(stated(lambda m, x: m["a"] * m["b"] * x + m["c"], constraints=[rule])) == ()
