@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from os import PathLike
@@ -14,7 +13,9 @@ import numpy as np
 from beamfit.errors import InputError
 from beamfit.io.archive import archive_sheet
 from beamfit.io.dates import dates_in_order
+from beamfit.io.headers import is_number
 from beamfit.io.offset import offset_of
+from beamfit.io.scan_columns import is_size
 from beamfit.io.table import UNITS, Column, Sheet, columns_of, left_out
 from beamfit.studies.decay.monitor import Monitor
 from beamfit.studies.decay.record import Conditions, DecayRecord, LifetimeTable, first_fault
@@ -51,8 +52,6 @@ DATE, NANOSECONDS = "a date", "ns"
 # Seconds beyond this many are counted from 1970, not from the start of a record (1973 or later);
 # beyond the other they lie after the year 5000, and are milliseconds.
 UNIX, LATEST = 1e8, 1e11
-# Of a quadrupole scan.
-SIZE = re.compile(r"(size|sigma|rms|fwhm)_[xy]\b|(size|sigma|rms|fwhm)_[xy]_", re.IGNORECASE)
 # An archive's own columns: seconds since 1970 and nanoseconds, and what it says of each value.
 SECONDS = {"secs": "s", "seconds": "s", "epochseconds": "s"}
 NANOS = {"nanos", "nanoseconds"}
@@ -164,7 +163,7 @@ def read_decay_record(
 def _record(
     sheet: Sheet, time: str | None, current: str | None, skip_bad: bool, offset: str | None
 ) -> DecayRecord:
-    if any(SIZE.match(name) for name in sheet.names) and time is None and current is None:
+    if any(map(is_size, sheet.names)) and time is None and current is None:
         found, expected = "a column of beam sizes", "a record of beam current; `beamfit emittance`"
         raise sheet.header_error(found, f"{expected} reads scans")
     columns = _columns(sheet, time, current)
@@ -263,7 +262,7 @@ def _named_time(sheet: Sheet, text: str) -> Column:
         known = _known(sheet, text)
         if known is not None and known.key == "time":
             return known
-        return Column(text, "time", "s" if _is_number(sheet[text]) else DATE)
+        return Column(text, "time", "s" if is_number(next(iter(sheet[text]), "0")) else DATE)
     header, _, unit = text.rpartition(":")
     if header in sheet.names and unit in UNITS["time"]:
         return Column(header, "time", unit, UNITS["time"][unit])
@@ -277,14 +276,6 @@ def _known(sheet: Sheet, name: str) -> Column | None:
         return next(iter(columns_of(alone, QUANTITIES, _archive_column).values()))
     except InputError:
         return None
-
-
-def _is_number(cells: Iterable[object]) -> bool:
-    try:
-        float(next(iter(cells), "0"))
-    except ValueError:
-        return False
-    return True
 
 
 def _named_current(sheet: Sheet, text: str) -> Column:

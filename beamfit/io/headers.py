@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 
-__all__ = ["header_at", "separator_of", "spelled", "uncommented", "with_units"]
+__all__ = ["header_at", "is_number", "separator_of", "spelled", "uncommented", "with_units"]
 
 # Units at the end of a header, as the columns' names have them.
 KNOWN = ("um", "mm", "m", "µm", "μm", "s", "min", "h", "d", "ms", "mA", "A", "uA", "µA", "μA")
@@ -99,7 +99,7 @@ def header_at(lines: Sequence[str]) -> int:
         if not text.strip(",;\t ") or text.lstrip()[:1] in ("#", "@", "*", "$"):
             continue
         cells = _words(text)
-        numbers = any(map(_is_number, cells))
+        numbers = any(map(is_number, cells))
         if not numbers and sum(map(_has_unit, cells)) > 1:
             return i
         if first is None:
@@ -122,13 +122,14 @@ def uncommented(lines: Sequence[str]) -> list[str]:
     above = found[first - 1].strip() if first else ""
     if above.startswith("#"):
         cells, words = _words(found[first]), _words(above.lstrip("# "))
-        units = any(map(_has_unit, words)) and not any(map(_is_number, words))
-        if units and len(words) == len(cells) and all(map(_is_number, cells)):
+        units = any(map(_has_unit, words)) and not any(map(is_number, words))
+        if units and len(words) == len(cells) and all(map(is_number, cells)):
             found[first - 1] = above.lstrip("# ")
     return found
 
 
-def _is_number(text: str) -> bool:
+def is_number(text: object) -> bool:
+    """Whether a cell is a number."""
     try:
         float(text)
     except ValueError:

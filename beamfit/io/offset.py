@@ -92,7 +92,7 @@ def _without_beam(dark: np.ndarray, top: float, path) -> tuple[float, float, int
         raise InputError("no readings without beam", expected, path=path)
     off = np.abs(dark - np.median(dark))
     spread = 1.4826 * float(np.median(off))
-    steady = off <= max(OUTLIER * spread, 0.0)
+    steady = off <= OUTLIER * spread
     if float(dark.std()) > STEADY * top and steady.mean() < MOST:
         found = f"readings near zero that scatter by {dark.std():.3g} mA"
         raise InputError(found, expected, path=path)

@@ -11,7 +11,7 @@ from beamfit.io.headers import spelled
 from beamfit.io.table import UNITS, Column, Sheet, columns_of
 from beamfit.particles import ENERGY_KEYS
 
-__all__ = ["ENERGIES", "SETTINGS", "column_notes", "scan_columns"]
+__all__ = ["ENERGIES", "SETTINGS", "column_notes", "is_size", "scan_columns"]
 
 # How the energy of a row may be given, without its unit, and what that is.
 ENERGIES = {key.removesuffix("_MeV"): kind for key, kind in ENERGY_KEYS.items()}
@@ -139,6 +139,12 @@ def _other(header: str, sheet: Sheet) -> Column:
         + "; --ignore a column, or begin its name with note_, to leave it unread",
         header,
     )
+
+
+def is_size(header: str) -> bool:
+    """Whether a header names a beam size or its error, with its unit or without."""
+    said = spelled(header)
+    return any(_size(one) is not None for one in (said, f"{said}_um"))
 
 
 def _size(header: str) -> Column | None:

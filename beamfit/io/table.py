@@ -21,7 +21,15 @@ import numpy as np
 
 from beamfit.errors import InputError, nearest
 from beamfit.io.files import digest, text_lines
-from beamfit.io.headers import HEAD, header_at, separator_of, spelled, uncommented, with_units
+from beamfit.io.headers import (
+    HEAD,
+    header_at,
+    is_number,
+    separator_of,
+    spelled,
+    uncommented,
+    with_units,
+)
 from beamfit.io.numeric import numeric_rows
 
 if TYPE_CHECKING:
@@ -466,12 +474,9 @@ def _check_header(names: list[str], example: str, path: str | PathLike[str], lin
     if names[0].startswith("format") and "beamfit-" in names[-1]:
         expected = "the scan first and the lattice after --lattice; are they swapped?"
         raise InputError("a lattice where the table should be", expected, path, line)
-    try:
-        [float(name) for name in names]
-    except ValueError:
-        return
-    expected = f"a header line such as {example}"
-    raise InputError("numbers where the header should be", expected, path=path, line=line)
+    if all(map(is_number, names)):
+        expected = f"a header line such as {example}"
+        raise InputError("numbers where the header should be", expected, path=path, line=line)
 
 
 def _check_length(

@@ -14,9 +14,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from beamfit.greybox.expression_graph import FUNCTIONS as ELEMENTARY
 from beamfit.language import expression as x
 from beamfit.language.expression import error_at
 from beamfit.language.scope import (
+    FUNCTIONS,
     Array,
     Axes,
     Scope,
@@ -57,11 +59,8 @@ class Setting:
 
 
 ELEMENTWISE: dict[str, Callable] = {
-    "sin": jnp.sin, "cos": jnp.cos, "tan": jnp.tan, "asin": jnp.arcsin, "acos": jnp.arccos,
-    "atan": jnp.arctan, "sinh": jnp.sinh, "cosh": jnp.cosh, "tanh": jnp.tanh, "exp": jnp.exp,
-    "asinh": jnp.arcsinh, "acosh": jnp.arccosh, "atanh": jnp.arctanh, "log": jnp.log,
-    "log10": jnp.log10, "sqrt": jnp.sqrt, "abs": jnp.abs, "sign": jnp.sign,
-    "erf": jax.scipy.special.erf, "sigmoid": jax.nn.sigmoid, "atan2": jnp.arctan2,
+    **{name: function for name, function in ELEMENTARY.items() if name in FUNCTIONS},
+    "sign": jnp.sign, "erf": jax.scipy.special.erf, "sigmoid": jax.nn.sigmoid,
 }  # fmt: skip
 MATRIX: dict[str, tuple[int, int, Callable]] = {
     # rank of the argument, of the result

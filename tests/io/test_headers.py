@@ -64,10 +64,11 @@ def test_a_record_of_a_logger_is_read(tmp_path):
 
 
 def test_scans_and_records_in_each_others_place_are_told_so(tmp_path):
-    (tmp_path / "scan.csv").write_text(HEADS["the manual's"] + ROWS)
     (tmp_path / "decay.csv").write_text("time_s,beam_current_mA\n0,5\n1,4\n")
-    with pytest.raises(InputError, match="`beamfit emittance` reads scans"):
-        read_decay_record(tmp_path / "scan.csv")
+    for head in HEADS["the manual's"], "Q525_A,x_rms_um,x_rms_err_um\n", "Q525,size_x,note_a\n":
+        (tmp_path / "scan.csv").write_text(head + ROWS)
+        with pytest.raises(InputError, match="`beamfit emittance` reads scans"):
+            read_decay_record(tmp_path / "scan.csv")
     with pytest.raises(InputError, match="`beamfit lifetime` reads it"):
         read_quad_scan(tmp_path / "decay.csv")
 

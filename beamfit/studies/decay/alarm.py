@@ -436,16 +436,13 @@ def _since(usual: Reference, state: State, change: np.ndarray) -> np.ndarray:
 
 def _adopted(state: State, done: np.ndarray, change: np.ndarray, covariance: np.ndarray) -> State:
     """Where an alarm is told, what was found is the usual loss from now on."""
-    fresh = State(*(np.zeros_like(part) for part in state))
     factor = state.factor * (1 + change)
     known = {"factor": factor, "covariance": state.covariance + covariance}
     named = {name: _where(done, part, getattr(state, name)) for name, part in known.items()}
     for name in ("age", "weight", "product"):
-        named[name] = _where(done, getattr(fresh, name), getattr(state, name))
-    return state._replace(
-        **named,
-        raised=np.where(done, np.nan, state.raised),
-    )
+        before = getattr(state, name)
+        named[name] = _where(done, np.zeros_like(before), before)
+    return state._replace(**named, raised=np.where(done, np.nan, state.raised))
 
 
 class Alarm(NamedTuple):
