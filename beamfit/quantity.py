@@ -68,6 +68,16 @@ class Quantity:
         """
         return cls(value, error, unit, raw, (value - reach, value + reach))
 
+    def open(self) -> Quantity:
+        """The same of which nothing is known: without an error and an interval.
+
+        Examples
+        --------
+        >>> print(Quantity(2.0, 0.1, "s").open())
+        2 s (not determined)
+        """
+        return Quantity(self.value, None, self.unit)
+
     @property
     def relative(self) -> float | None:
         """Error over value, or None."""

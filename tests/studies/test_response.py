@@ -136,6 +136,9 @@ def test_inputs_that_move_together_have_no_gains_of_their_own():
     fit = identify(Run(run.time, {**run.inputs, "pump": other}, run.outputs))
     assert fit.status is Status.unidentified
     assert "valve, pump move together" in fit.message
+    assert fit.quantities["K_valve"].error is None
+    assert fit.quantities["K_pump"].error is None
+    assert abs(fit.quantities["tau"].value - 3.0) < 4 * fit.quantities["tau"].error
 
 
 def test_a_delay_at_the_end_of_the_candidates_is_said():
@@ -169,7 +172,11 @@ def test_an_output_that_hangs_on_nothing_is_said_to():
     t = np.arange(200.0)
     run = Run(t, {"valve": (t // 10) % 2}, {"level": rng.normal(size=200)})
     for model in ("first-order", "second-order", "arx"):
-        assert identify(run, model, delay=0).status is Status.unidentified
+        fit = identify(run, model, delay=0)
+        assert fit.status is Status.unidentified
+        assert {q.error for q in fit.quantities.values()} == {None}
+    curves = identify(run, map="network", delay=0, starts=1).curves
+    assert all(np.isnan(curve.error).all() for curve in curves)
 
 
 def test_a_constant_can_be_sampled():

@@ -291,9 +291,7 @@ def seen_through(fit: DecayFit) -> DecayFit:
         f"does. Average readings, or give the times of the refills by cutting the record there. "
     )
     names = ("a", "b", "lifetime_start", "lifetime_end", "lifetime_mean")
-    bare = {
-        n: replace(getattr(fit, n), error=None, error_raw=None, interval_95=None) for n in names
-    }
+    bare = {name: getattr(fit, name).open() for name in names}
     return replace(fit, status=Status.unidentified, message=cause + fit.message, **bare)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -11,14 +12,18 @@ import numpy as np
 from beamfit.dynamics.response import SECOND_ORDER, Physics
 from beamfit.greybox.fit import Derived, Fit
 from beamfit.quantity import Quantity
+from beamfit.statistics import POOR_FIT
+from beamfit.studies.response.checks import Checks
 from beamfit.studies.response.model import Seen, curves
 from beamfit.table import Table, cell, json_of
 
-__all__ = ["TIME", "Curve", "curves_of", "quantities_of"]
+__all__ = ["TIME", "Curve", "curves_of", "quantities_of", "told"]
 
 # Points of a curve; it was visited where so many samples lie within a share of its range.
 POINTS, VISITS, NEAR = 41, 5, 0.05
 SHOWN = 9
+# A time constant with an error above this share of itself is not told from 0 or from without end.
+WIDE = 0.5
 TIME, GAIN, PURE = "s", "output/input", "1"
 
 
@@ -106,6 +111,30 @@ def _quantity(found: Derived, i: Any, unit: str) -> Quantity:
     error, raw = (float(e[i]) for e in (found.error, found.error_raw))
     known = np.isfinite(error)
     return Quantity(float(found.value[i]), error if known else None, unit, raw if known else None)
+
+
+def told(
+    quantities: Mapping[str, Quantity], curves: Sequence[Curve], seen: Seen, checks: Checks
+) -> tuple[dict[str, Quantity], tuple[Curve, ...]]:
+    """Without errors where the runs determine nothing: of all where the inputs explain no more than
+    chance, of the gains of inputs that move together, of time constants not told from 0.
+    """
+    nothing = checks.nothing_probability >= POOR_FIT
+    physics, inputs = seen.runs[0].physics, seen.inputs
+    powers = zip(physics.parameters(inputs), physics.units(len(inputs)), strict=True)
+    gains = [name for name, (_, gain) in powers if gain]
+    joint = {n for k, n in enumerate(gains) if inputs[k % len(inputs)] in checks.together}
+
+    def is_open(name: str, q: Quantity) -> bool:
+        wide = q.unit == TIME and q.error is not None and q.error > WIDE * abs(q.value)
+        return nothing or wide or name in joint
+
+    known = {n: q.open() if is_open(n, q) else q for n, q in quantities.items()}
+    blank = (nothing or c.parameter in joint for c in curves)
+    return known, tuple(
+        c._replace(error=np.full_like(c.error, np.nan)) if b else c
+        for c, b in zip(curves, blank, strict=True)
+    )
 
 
 def curves_of(fit: Fit, seen: Seen) -> tuple[Curve, ...]:

@@ -19,7 +19,7 @@ from beamfit.quantity import Quantity
 from beamfit.shown import shown
 from beamfit.status import Status
 from beamfit.studies.response.checks import Checks, HeldBack, checks_of, predict_held
-from beamfit.studies.response.curve import Curve, curves_of, quantities_of
+from beamfit.studies.response.curve import Curve, curves_of, quantities_of, told
 from beamfit.studies.response.model import CLOSE, Seen, driven, network_of, output_of, state
 from beamfit.studies.response.record import Run
 from beamfit.studies.response.starts import Start, best_start
@@ -232,6 +232,7 @@ def identify(
     )
     quantities = quantities_of(answer.fit, seen, physics) if map == "constant" else {}
     curves = curves_of(answer.fit, seen) if map == "network" else ()
+    quantities, curves = told(quantities, curves, seen, checks)
     ahead = tuple(predict_held(each, output, answer.fit, physics, delay) for each in held)
     evidence = (answer.fit, answer.rests, checks, quantities, curves, ahead, map)
     status, message = judged(*evidence, given is None and delay == _latest(runs) > 0)

@@ -88,7 +88,7 @@ def _joint(e: Evidence) -> Finding | None:
 
 
 def _open(e: Evidence) -> Finding | None:
-    left = {n: q.unit for n, q in e.quantities.items() if q.error is None or _wide(q)}
+    left = {n: q.unit for n, q in e.quantities.items() if q.error is None}
     left |= {
         f"{c.parameter}({c.input})": c.unit
         for c in e.curves
@@ -101,11 +101,6 @@ def _open(e: Evidence) -> Finding | None:
     if TIME in left.values():
         remedy = "Sample faster around steps, and wait until the output settles."
     return Finding(Status.unidentified, cause, remedy)
-
-
-def _wide(q: Quantity) -> bool:
-    """Whether a time constant is not told from zero or from without end."""
-    return q.unit == TIME and q.error is not None and q.error > 0.5 * abs(q.value)
 
 
 def _refuted(e: Evidence) -> Finding | None:
