@@ -1,6 +1,7 @@
 """Errors of a lifetime where the readings' errors have a memory. All records are simulated."""
 
 import json
+import re
 
 import numpy as np
 import pytest
@@ -126,3 +127,16 @@ def test_the_sampler_has_the_same_noise():
     low, middle, high = np.percentile(posterior.values("a"), [15.9, 50, 84.1])
     assert (high - low) / 2 == pytest.approx(fit.a.error, rel=0.2)
     assert middle == pytest.approx(fit.a.value, abs=0.3 * fit.a.error)
+
+
+def test_no_record_of_noise_says_more_than_that_its_loss_rate_is_zero():
+    """By the error of a slope, noise sqrt(12/n)/T: rates below zero by chance made 1e5 h and more."""
+    rng, count = np.random.default_rng(3), 200
+    records = [
+        DecayRecord(np.linspace(0, SPAN, count), 500 + 0.02 * rng.normal(size=count))
+        for _ in range(20)
+    ]
+    limit = SPAN * 500 / (1.645 * 0.02 * np.sqrt(12 / count)) / HOUR
+    said = [re.search(r"above ([\d.e+]+) h at 95 %", f.message) for f in fit_decays(records)]
+    assert len(said) == 20
+    assert max(float(found[1]) for found in said) < 1.3 * limit

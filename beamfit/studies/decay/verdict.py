@@ -104,7 +104,8 @@ def _within_noise(e: Evidence) -> Finding | None:
     rate, error = e.scaled("rate_mean")
     if e.separability.separable or error <= DETERMINED * abs(rate):
         return None
-    limit = 1 / max(rate + LIMIT * error, 1e-300) / HOUR
+    # A rate below zero by chance is no reason for a longer lifetime than that of a rate of zero.
+    limit = 1 / (max(rate, 0.0) + LIMIT * error) / HOUR
     return Finding(
         Status.unidentified,
         f"The decay is within its noise: the lifetime is above {limit:.3g} h at 95 %; record "
