@@ -9,8 +9,6 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-__all__ = ["KINDS", "Kind", "Range", "range_of"]
-
 
 class Kind(NamedTuple):
     """A node function and where its derivatives turn.

@@ -18,22 +18,6 @@ import numpy as np
 from beamfit.greybox import problem
 from beamfit.greybox.problem import Problem
 
-__all__ = [
-    "KKT",
-    "TOLERANCE",
-    "Bend",
-    "Limits",
-    "Multipliers",
-    "Scale",
-    "Slopes",
-    "State",
-    "gradient_size",
-    "multipliers",
-    "scale_of",
-    "slopes",
-    "state",
-]
-
 TOLERANCE = 1e-6  # within which a limit counts as reached and a point as an optimum
 # A bound is reached, too, where moving onto it changes the cost by less than this share.
 CLOSE = 1e-8

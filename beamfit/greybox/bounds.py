@@ -19,8 +19,6 @@ import numpy as np
 from beamfit.errors import InputError
 from beamfit.greybox.activations import Range, range_of
 
-__all__ = ["Network", "cells", "gain_bounds", "over_cells"]
-
 _ROUNDING = 2.0**-53
 _TINY = 1e-300  # covers underflow, which a relative error does not
 

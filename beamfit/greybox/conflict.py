@@ -20,8 +20,6 @@ from beamfit.greybox.assess import TOLERANCE, State
 from beamfit.greybox.descend import descend_all
 from beamfit.greybox.problem import Problem
 
-__all__ = ["Conflict", "relaxed"]
-
 
 class Conflict(NamedTuple):
     """The point nearest to all constraints, and names of those that conflict, if any do."""

@@ -13,17 +13,6 @@ import numpy as np
 from scipy.linalg import cho_solve_banded, cholesky_banded
 from scipy.special import stdtr
 
-__all__ = [
-    "Levels",
-    "Memory",
-    "Moments",
-    "is_correlated",
-    "log_volume",
-    "memory_of",
-    "range_of",
-    "whitened",
-]
-
 # Correlation of neighbouring residuals, in standard errors of that of independent ones, from which
 # they count as correlated.
 SEEN = 2.0

@@ -13,18 +13,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-__all__ = [
-    "CUT",
-    "MOST_SHARE",
-    "Group",
-    "Spread",
-    "directions",
-    "groups_of",
-    "null_space",
-    "spread_of",
-    "triangle",
-]
-
 # A quantity counts as determined while bounds carry less than this share of its variance.
 MOST_SHARE = 0.5
 # A direction is seen while its singular value is above this share of the largest.

@@ -16,8 +16,6 @@ from beamfit.greybox import assess, problem
 from beamfit.greybox.covariance import null_space, triangle
 from beamfit.greybox.problem import Problem
 
-__all__ = ["STEP", "lagrangian_hessian", "lower_beside", "second_order"]
-
 # A Newton step of a further objective longer than this, in the sizes of the numbers, is no end.
 STEP = 1e-3
 # Bending down by less than this share of the strongest curvature is rounding.

@@ -15,8 +15,6 @@ import numpy as np
 from beamfit.greybox.assess import TOLERANCE, State, gradient_size, scale_of
 from beamfit.greybox.problem import Problem
 
-__all__ = ["Dependence", "dependence"]
-
 # Gradients count as dependent below this singular value, at an optimum; at a point that is none,
 # where solvers creep towards a place without multipliers, below this one.
 DEPENDENT, NEARLY = 1e-8, 1e-2

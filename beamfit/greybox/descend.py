@@ -23,8 +23,6 @@ from jax import Array
 from beamfit.greybox.problem import Problem, with_slope
 from beamfit.greybox.problem import residual as problem_residual
 
-__all__ = ["Found", "Lanes", "Walk", "descend_all", "descend_one", "walk"]
-
 DAMPING = 1e-3
 # On the length of a step relative to the numbers, both in units of the Jacobian's columns.
 TOLERANCE = 1e-13

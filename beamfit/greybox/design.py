@@ -12,8 +12,6 @@ import numpy as np
 
 from beamfit.greybox.covariance import Spread, spread_of
 
-__all__ = ["Choice", "Information", "greedy", "rows_of", "scores"]
-
 
 class Information(NamedTuple):
     """What is known of some quantities, ready to be added to.

@@ -14,8 +14,6 @@ from beamfit.greybox.covariance import CUT, directions
 from beamfit.greybox.evidence import listed
 from beamfit.greybox.problem import Problem, with_slope
 
-__all__ = ["Ailment", "contradictory", "diagnose", "not_finite"]
-
 # Points near the start whose derivatives tell what hangs on what, and how far off in sizes.
 LOOKS, NEAR = 4, 0.3
 # Rows whose sizes differ by more than this are scaled badly.

@@ -19,8 +19,6 @@ from jax.experimental import checkify
 from beamfit.errors import InputError
 from beamfit.greybox import tree
 
-__all__ = ["Implicit", "Root", "TaylorDifference"]
-
 
 class Root(NamedTuple):
     """What the inner solver found at one point.

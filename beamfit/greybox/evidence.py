@@ -22,8 +22,6 @@ from beamfit.greybox.covariance import (
 from beamfit.greybox.fit import Attempt, Limited, Variable
 from beamfit.greybox.problem import Problem
 
-__all__ = ["EDGES", "Evidence", "Known", "Search", "known", "listed", "settled"]
-
 # A further decrease of chi-square below this changes nothing anybody asks for.
 SETTLED = 0.01
 EDGES = ("lower", "upper")

@@ -13,8 +13,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-__all__ = ["FUNCTIONS", "Node", "constant", "plan", "variable"]
-
 
 class Node(NamedTuple):
     """An operation by name on its arguments; a constant's or variable's `value` is its own."""

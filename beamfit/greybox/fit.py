@@ -23,8 +23,6 @@ if TYPE_CHECKING:
     from beamfit.sampling.posterior import Posterior
     from beamfit.sampling.priors import Distribution
 
-__all__ = ["Attempt", "Derived", "Fit", "Limited", "Status", "Variable"]
-
 # Another optimum: a chi-square larger by less than 6.
 NEAR_COST = 3.0
 

@@ -22,16 +22,6 @@ from beamfit.greybox.bounds import Network, cells, gain_bounds
 from beamfit.greybox.maps import Map, positions
 from beamfit.greybox.terms import Constraint
 
-__all__ = [
-    "adjoints",
-    "certified_gain",
-    "gain",
-    "gain_at",
-    "monotone_signs",
-    "part",
-    "sensitivities",
-]
-
 
 def _restricted(m: Map, x: jax.Array, variables: tuple[str, ...]):
     """The map as a function of chosen inputs and leaves: the function and where it stands."""

@@ -17,16 +17,6 @@ import numpy as np
 from beamfit.errors import InputError, nearest
 from beamfit.greybox import tree
 
-__all__ = [
-    "Affine",
-    "Foreign",
-    "Formula",
-    "Map",
-    "Parallel",
-    "Series",
-    "positions",
-]
-
 
 class Map(Protocol):
     """What every map offers: names, and a function of one point."""

@@ -18,8 +18,6 @@ from beamfit.greybox.bounds import gain_bounds, over_cells
 from beamfit.greybox.gains import gain
 from beamfit.greybox.maps import positions
 
-__all__ = ["MLP", "Gain", "Layer", "Port", "connection", "dense"]
-
 
 class Layer(NamedTuple):
     """A layer: its name, one of the seven node functions, its size, and whether it has a bias."""

@@ -12,8 +12,6 @@ from beamfit.greybox.problem import Problem
 from beamfit.status import Status
 from beamfit.verdict import Finding
 
-__all__ = ["crossed", "degenerate", "endless", "local", "optimal", "outgrown", "restless", "saddle"]
-
 # Below this the cost counts as without end, in its own size.
 ENDLESS = -1e15
 # A number runs away beyond this many of its sizes; a pole is where the cost's slope in a number's

@@ -22,8 +22,6 @@ from beamfit.sampling.priors import Distribution, checked
 from beamfit.sampling.target import Law, Target, covariance_of, slopes_of
 from beamfit.verdict import Finding
 
-__all__ = ["Optimum", "Predicted", "Sampled", "Statement", "predicted", "target_of"]
-
 # A number that is an undetermined direction's in less than this share is not part of it.
 PART = 0.05
 # Another optimum is one more than six errors away.

@@ -21,8 +21,6 @@ from beamfit.errors import InputError
 from beamfit.greybox import tree
 from beamfit.greybox.terms import Constraint, Free, Objective, Prior, Record
 
-__all__ = ["Constraint", "Free", "Objective", "Prior", "Problem", "Record", "padded_length"]
-
 # Records are padded to powers of two from here on.
 SHORTEST = 8
 

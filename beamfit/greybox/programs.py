@@ -15,8 +15,6 @@ import numpy as np
 from beamfit.greybox import assess, curvature, problem
 from beamfit.greybox.problem import Problem
 
-__all__ = ["SOLVERS", "Budget", "Program", "Proposal", "Stage", "scaled"]
-
 
 class Budget(NamedTuple):
     """How long a search may go on: steps from one start, and a moment on the clock or None."""

@@ -9,8 +9,6 @@ import jax
 import jax.numpy as jnp
 from jax.scipy.linalg import cho_factor, cho_solve
 
-__all__ = ["Quadratic", "minimum"]
-
 # Steps at most; mean complementarity and residuals that end them; share of the way to a limit.
 STEPS, CLOSE, SHARE = 40, 1e-9, 0.99
 

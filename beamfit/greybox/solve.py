@@ -21,9 +21,6 @@ from beamfit.greybox.programs import SOLVERS, Budget, scaled
 from beamfit.greybox.verdict import conclude, refused
 from beamfit.status import Status
 
-__all__ = ["search", "solve", "starting_points"]
-
-
 # Steps from many starts; what is left is for the polish of the cheapest ends.
 STEPS, POLISHED = 300, 4
 # A search whose cost falls by less than this share in so many steps gains nothing.

@@ -13,8 +13,6 @@ from beamfit.errors import InputError
 from beamfit.greybox import tree
 from beamfit.greybox.correlated import log_volume, whitened
 
-__all__ = ["Constraint", "Free", "Objective", "Prior", "Record"]
-
 
 class Free(NamedTuple):
     """Numbers of the model that are free.

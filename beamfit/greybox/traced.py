@@ -14,8 +14,6 @@ import numpy as np
 
 from beamfit.errors import InputError
 
-__all__ = ["Table", "traced"]
-
 SAME = {
     "add": "plus", "add_any": "plus", "sub": "minus", "mul": "times", "div": "divide",
     "neg": "negative", "pow": "power", "max": "max", "min": "min", "rem": "rem", "lt": "<",

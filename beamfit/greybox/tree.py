@@ -12,8 +12,6 @@ import numpy as np
 
 from beamfit.errors import InputError, nearest
 
-__all__ = ["Leaf", "element_names", "find_leaves", "leaves", "node", "read", "replace"]
-
 C = TypeVar("C", bound=type)
 
 

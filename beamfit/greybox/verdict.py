@@ -19,8 +19,6 @@ from beamfit.statistics import POOR_FIT, chi2_probability
 from beamfit.status import Status
 from beamfit.verdict import Finding
 
-__all__ = ["RULES", "WITHOUT_DATA", "conclude", "refused"]
-
 
 def _inner_failure(p: Problem, theta: np.ndarray) -> str | None:
     """What an implicit map inside the model says of its own convergence at the answer."""

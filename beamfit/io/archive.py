@@ -15,8 +15,6 @@ from beamfit.io.table import HDF5, UNITS, Sheet, read_sheet
 if TYPE_CHECKING:
     from pandas import DataFrame
 
-__all__ = ["archive_sheet"]
-
 ARCHIVE = ("secs", "val", "severity", "status", "nanos")
 
 

@@ -8,8 +8,6 @@ from collections.abc import Callable
 from datetime import UTC, datetime
 from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
 
-__all__ = ["dates_in_order", "unix_time"]
-
 # Besides ISO 8601; days before months where both are numbers.
 FORMS = ("%d-%b-%Y %H:%M:%S", "%d.%m.%Y %H:%M:%S", "%Y/%m/%d %H:%M:%S")
 FRACTION = re.compile(r"[.,](\d+)$")

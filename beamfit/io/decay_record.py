@@ -23,8 +23,6 @@ from beamfit.studies.decay.record import Conditions, DecayRecord, LifetimeTable,
 if TYPE_CHECKING:
     from pandas import DataFrame
 
-__all__ = ["read_decay_record", "read_lifetime_input", "read_lifetimes"]
-
 QUANTITIES = {
     "time": "time",
     "beam_current": "current",

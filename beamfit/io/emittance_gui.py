@@ -19,8 +19,6 @@ from beamfit.io.shots import scatter_of
 from beamfit.quantity import Quantity
 from beamfit.studies.scan.scans import Profile, QuadScan
 
-__all__ = ["EmittanceGuiFile", "is_emittance_gui", "read_emittance_gui"]
-
 # GeV, of files that have none; the electron's is the only particle there.
 USUAL_ENERGY = 0.135
 # The size method that answers unless another is asked for.

@@ -9,8 +9,6 @@ from pathlib import Path
 from beamfit.errors import InputError
 from beamfit.io.files import write_atomically
 
-__all__ = ["EXAMPLE_FILES", "write_example"]
-
 EXAMPLE_FILES = ("scan.csv", "lattice.toml", "decay.csv")
 
 

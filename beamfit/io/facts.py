@@ -18,8 +18,6 @@ from beamfit.studies.decay.record import DecayRecord, LifetimeTable
 from beamfit.studies.response.record import Run
 from beamfit.studies.scan.scans import QuadScan
 
-__all__ = ["Fact", "of_formulation", "of_lattice", "of_record", "of_ring", "of_run", "of_scan"]
-
 SAID = {"A": "A", "kG": "kG integrated gradient", "T_per_m": "T/m", "k1": "1/m² (k1)"}
 SAID |= {"k1l": "1/m (k1l)"}
 CONDITIONS = {"rf_voltage": "V", "scraper_y": "m", "pressure": "Pa", "bunches": ""}

@@ -15,8 +15,6 @@ from typing import Any
 
 from beamfit.errors import InputError
 
-__all__ = ["digest", "read_bytes", "read_text", "text_lines", "write_atomically"]
-
 # A text line of a scan or a lattice is short; a longer one is another kind of file.
 LONGEST_LINE = 100_000
 # How files begin that are given for text, what they are, and what to do.

@@ -20,14 +20,6 @@ from beamfit.language.xml import format_xml, parse_xml
 if TYPE_CHECKING:
     from beamfit.language.solution import Solution
 
-__all__ = [
-    "read_formulation",
-    "read_numbers",
-    "read_tables",
-    "solved_formulation",
-    "write_formulation",
-]
-
 
 def read_formulation(path: str | PathLike[str]) -> Document:
     """Read a document in either form: XML where it begins with ``<``, else text.

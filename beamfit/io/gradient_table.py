@@ -8,8 +8,6 @@ from pathlib import Path
 from beamfit.io.table import Sheet, columns_of, read_sheet
 from beamfit.io.toml import Section, is_number
 
-__all__ = ["gradient_table"]
-
 EXAMPLE = "current_A,gradient_T_per_m"
 # Columns of the gradient, and what makes them T/m in a magnet of some length in m.
 GRADIENTS = {

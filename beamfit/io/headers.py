@@ -5,8 +5,6 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 
-__all__ = ["header_at", "is_number", "separator_of", "spelled", "uncommented", "with_units"]
-
 # Units at the end of a header, as the columns' names have them.
 KNOWN = ("um", "mm", "m", "µm", "μm", "s", "min", "h", "d", "ms", "mA", "A", "uA", "µA", "μA")
 KNOWN += ("kV", "V", "MV", "Pa", "mbar", "Torr", "MeV", "kG", "T_per_m", "k1", "k1l")

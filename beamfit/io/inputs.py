@@ -13,8 +13,6 @@ from beamfit.io.line import lattice_of
 from beamfit.io.measurement import read_quad_scan
 from beamfit.studies.scan.scans import QuadScan
 
-__all__ = ["Inputs", "read_inputs"]
-
 
 class Inputs(NamedTuple):
     """A scan and its lattice, checked to fit together.

@@ -25,8 +25,6 @@ if TYPE_CHECKING:
     from beamfit.optics.calibration import Calibration
     from beamfit.optics.elements import Element
 
-__all__ = ["LatticeFile", "element_of", "read_toml_lattice"]
-
 FORMAT = "beamfit-lattice-1"
 # Settings a magnet may be given, one of them; the key says the unit.
 STRENGTHS = {

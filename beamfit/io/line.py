@@ -16,8 +16,6 @@ from beamfit.studies.scan.scans import QuadScan
 if TYPE_CHECKING:
     from beamfit.optics.beamline import Beamline
 
-__all__ = ["build_line", "lattice_of", "load_lattice", "part_of", "read_lattice"]
-
 # What the place is called where matrices of rows begin.
 START = "start"
 FOREIGN = {".madx", ".seq", ".mad8", ".mad", ".lte", ".ele", ".elegant"}

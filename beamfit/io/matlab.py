@@ -18,8 +18,6 @@ import numpy as np
 from beamfit.errors import InputError
 from beamfit.io.files import read_bytes
 
-__all__ = ["read_variable"]
-
 # The format: MATLAB, MAT-File Format (The MathWorks), chapter 1.
 HEADER = 128
 COMPRESSED, MATRIX = 15, 14

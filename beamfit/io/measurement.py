@@ -20,8 +20,6 @@ from beamfit.studies.scan.scans import POSSIBLE, USUAL, QuadScan, first_unusable
 if TYPE_CHECKING:
     from pandas import DataFrame
 
-__all__ = ["read_quad_scan"]
-
 # More rows than any scan: such a file is a log, and is refused before it fills the memory.
 MOST_ROWS = 100_000
 # A size this many times the usual one of its column, and larger than most beams, has slipped.

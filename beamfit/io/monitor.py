@@ -8,8 +8,6 @@ from beamfit.errors import InputError
 from beamfit.io.table import UNITS
 from beamfit.studies.decay.monitor import Monitor
 
-__all__ = ["monitor_of"]
-
 
 def monitor_of(drift: str | None, offset: str | None) -> Monitor | None:
     """Read the stability of a current monitor; None if nothing is said of it.

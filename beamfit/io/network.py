@@ -8,8 +8,6 @@ from beamfit.greybox.mlp import MLP
 from beamfit.io.files import read_text, write_atomically
 from beamfit.language.network import format_network, parse_network
 
-__all__ = ["read_network", "write_network"]
-
 
 def read_network(path: str | os.PathLike[str]) -> MLP:
     """Read a network from a file.

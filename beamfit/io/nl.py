@@ -15,8 +15,6 @@ from beamfit.greybox.expression_graph import Node, constant, plan, variable
 from beamfit.greybox.problem import Constraint, Free, Objective, Problem
 from beamfit.io.files import read_text
 
-__all__ = ["OPCODES", "read_nl"]
-
 OPCODES = {
     0: "plus", 1: "minus", 2: "times", 3: "divide", 4: "rem", 5: "power", 6: "less", 11: "min",
     12: "max", 13: "floor", 14: "ceil", 15: "abs", 16: "negative", 20: "or", 21: "and", 22: "<",
@@ -33,7 +31,7 @@ DISCRETE = 4
 DEEPEST = 200
 
 
-class Lines:
+class _Lines:
     """The lines of a file one after the other, and the errors of the last."""
 
     def __init__(self, path: str | PathLike[str]):
@@ -73,7 +71,7 @@ class Lines:
         return [int(word) for word in words[:number]]
 
 
-class Stated:
+class _Stated:
     """What the segments of a file say."""
 
     def __init__(self, n: int, m: int):
@@ -109,7 +107,7 @@ def read_nl(path: str | PathLike[str]) -> Problem:
         With file and line, if it cannot be read, is binary, or has integers, complementarities,
         logical constraints or imported functions.
     """
-    lines = Lines(path)
+    lines = _Lines(path)
     said = _header(lines)
     while not lines.done:
         words = lines.next("a segment")
@@ -118,7 +116,7 @@ def read_nl(path: str | PathLike[str]) -> Problem:
     return _problem(Path(path), said)
 
 
-def _header(lines: Lines) -> Stated:
+def _header(lines: _Lines) -> _Stated:
     first = lines.next("a header that begins with g")
     if not first or first[0][0] != "g":
         found = "a binary file" if first and first[0][0] == "b" else "no header"
@@ -131,10 +129,10 @@ def _header(lines: Lines) -> Stated:
         raise lines.wrong(
             f"{n} variables and {m} constraints", "as many as the file has room for, one at least"
         )
-    return Stated(n, m)
+    return _Stated(n, m)
 
 
-def _segment(lines: Lines, said: Stated, words: list[str]) -> None:
+def _segment(lines: _Lines, said: _Stated, words: list[str]) -> None:
     kind, rest = words[0][0], words[0][1:]
     if kind not in SEGMENTS:
         what = {"F": "an imported function", "L": "a logical constraint"}.get(kind)
@@ -203,20 +201,20 @@ SEGMENTS = {
 }  # fmt: skip
 
 
-def _pair(lines: Lines, size: int) -> tuple[int, float]:
+def _pair(lines: _Lines, size: int) -> tuple[int, float]:
     column, value = lines.numbers(2, "a place and a number")[:2]
     if column not in range(size):
         raise lines.wrong(f"variable {column:g}", f"one of 0 to {size - 1}")
     return int(column), value
 
 
-def _term(lines: Lines, said: Stated) -> Node:
+def _term(lines: _Lines, said: _Stated) -> Node:
     column, value = lines.numbers(2, "a variable and its factor")[:2]
     place = int(column) if np.isfinite(column) else -1
     return Node("times", (constant(value), _known(lines, said, place)))
 
 
-def _limits(lines: Lines) -> tuple[float, float]:
+def _limits(lines: _Lines) -> tuple[float, float]:
     words = lines.numbers(1, "the kind of a bound, 0 to 4, and its ends")
     kind, ends = words[0], words[1:]
     if kind == 5:
@@ -233,7 +231,7 @@ def _limits(lines: Lines) -> tuple[float, float]:
     }[kind]()
 
 
-def _known(lines: Lines, said: Stated, index: int) -> Node:
+def _known(lines: _Lines, said: _Stated, index: int) -> Node:
     if 0 <= index < said.n:
         return variable(index)
     if index not in said.defined:
@@ -242,7 +240,7 @@ def _known(lines: Lines, said: Stated, index: int) -> Node:
     return variable(index)
 
 
-def _expression(lines: Lines, said: Stated, depth: int = 0) -> Node:
+def _expression(lines: _Lines, said: _Stated, depth: int = 0) -> Node:
     """One expression, its operations standing before their arguments."""
     words = lines.next("an expression")
     word = words[0] if words else ""
@@ -271,7 +269,7 @@ def _expression(lines: Lines, said: Stated, depth: int = 0) -> Node:
     return Node(head, arguments)
 
 
-def _chain(lines: Lines, said: Stated, depth: int) -> Node:
+def _chain(lines: _Lines, said: _Stated, depth: int) -> Node:
     """A sum written as a chain of additions: it may be long, but is one level."""
     parts, missing = [], 2
     while missing:
@@ -296,7 +294,7 @@ def _names(path: Path, count: int, word: str) -> tuple[str, ...]:
     return names[:count]
 
 
-def _problem(path: Path, said: Stated) -> Problem:
+def _problem(path: Path, said: _Stated) -> Problem:
     rows, columns, values = (
         (np.array(part) for part in zip(*said.linear, strict=True))
         if (said.linear)

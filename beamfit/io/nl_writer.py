@@ -15,8 +15,6 @@ from beamfit.greybox.traced import Table, traced
 from beamfit.io.files import write_atomically
 from beamfit.io.nl import OPCODES
 
-__all__ = ["write_nl"]
-
 CODES = {name: code for code, name in reversed(OPCODES.items())}
 MANY = ("sum", "min", "max")
 # Expressions deeper than this are cut into definitions.

@@ -11,8 +11,6 @@ from os import PathLike
 
 import numpy as np
 
-__all__ = ["LARGE", "numeric_rows"]
-
 # Bytes from which a file is worth it, and how many are read at a time.
 LARGE, BLOCK = 1_000_000, 1 << 23
 # What numbers and what stands between them are written with.

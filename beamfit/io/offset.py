@@ -11,8 +11,6 @@ import numpy as np
 from beamfit.errors import InputError
 from beamfit.io.table import UNITS
 
-__all__ = ["ZERO_BEAM", "Offset", "offset_of"]
-
 ZERO_BEAM = "zero-beam"
 # Readings below this share of the largest are of no beam, if so many stand in a row. They scatter
 # by less than the other share, or at least so many of them are no outliers.

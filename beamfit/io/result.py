@@ -17,8 +17,6 @@ from beamfit.studies.scan.scans import PROJECTED
 from beamfit.studies.scan.wishes import Beam
 from beamfit.table import json_of
 
-__all__ = ["read_fitted_beams", "results_text"]
-
 HOW = "the output of beamfit emittance --json"
 NUMBERS = ("sigma11", "sigma12", "sigma22")
 # Correlations rounded by a fit of nearly dependent numbers may have eigenvalues below zero by this.

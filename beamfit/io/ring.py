@@ -21,8 +21,6 @@ if TYPE_CHECKING:
 
     from beamfit.lifetime.ring import MeasuredLength, Operation, Ring
 
-__all__ = ["read_operation", "read_ring", "ring_from_pyat"]
-
 INFINITE = math.inf
 SHARE = "a positive number that is a share: up to 1, 0.03 for 3 %"
 FILL = "the number of equal bunches, or a list with the charge of each, in any unit"

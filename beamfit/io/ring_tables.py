@@ -15,8 +15,6 @@ from beamfit.io.table import Sheet, read_sheet
 if TYPE_CHECKING:
     from beamfit.lifetime.ring import Optics
 
-__all__ = ["RANGES", "read_along", "read_twiss"]
-
 # column here, and in a TFS file; the vertical dispersion may be missing
 COLUMNS = {
     "s_m": "S",

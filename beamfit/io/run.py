@@ -18,8 +18,6 @@ from beamfit.studies.response.record import Run
 if TYPE_CHECKING:
     from pandas import DataFrame
 
-__all__ = ["read_run"]
-
 MOST_ROWS = 2_000_000
 DATE, ASIDE, TIME = "a date", "aside", "time"
 EXAMPLE = "time_s,u_valve,y_level"

@@ -19,8 +19,6 @@ from beamfit.studies.decay.fit import DecayFit
 from beamfit.studies.scan.fit import EmittanceFit, scenario_of
 from beamfit.studies.scan.known import see
 
-__all__ = ["load_fit", "save_fit"]
-
 FORMAT = "beamfit-fit-1"
 HOW = "a file that beamfit.save_fit wrote"
 # What a file may hold, by name, and where it is defined. A file names these and nothing else.

@@ -11,8 +11,6 @@ from beamfit.io.headers import spelled
 from beamfit.io.table import UNITS, Column, Sheet, columns_of
 from beamfit.particles import ENERGY_KEYS
 
-__all__ = ["ENERGIES", "SETTINGS", "column_notes", "is_size", "scan_columns"]
-
 # How the energy of a row may be given, without its unit, and what that is.
 ENERGIES = {key.removesuffix("_MeV"): kind for key, kind in ENERGY_KEYS.items()}
 QUANTITIES = {

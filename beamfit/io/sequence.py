@@ -20,8 +20,6 @@ from beamfit.io.lattice import LatticeFile
 from beamfit.io.sequence_elements import NOTHING_AT_ZERO, Source, element_tables
 from beamfit.particles import REST_ENERGY, expected_energy
 
-__all__ = ["read_sequence"]
-
 MADX, MAD8, ELEGANT = "MAD-X", "MAD-8", "elegant"
 DIALECTS = {
     ".madx": MADX,

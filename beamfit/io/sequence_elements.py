@@ -17,8 +17,6 @@ import numpy as np
 
 from beamfit.errors import InputError
 
-__all__ = ["NOTHING_AT_ZERO", "Source", "element_tables"]
-
 # Parameters that bend, focus, couple or accelerate in a way beamfit does not model.
 UNMODELLED = {
     "ks": "a solenoid field",

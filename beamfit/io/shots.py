@@ -8,8 +8,6 @@ import numpy as np
 
 from beamfit.studies.scan.scans import QuadScan, row_keys
 
-__all__ = ["average_shots", "scatter_of"]
-
 # With fewer repeats in all (two or three accidental ones) the scatter says nothing.
 ENOUGH_DEGREES = 3
 

@@ -8,8 +8,6 @@ from typing import Any
 
 from beamfit.io.toml import NUMBERS, TABLE, TEXT, Key, Section, is_number, read_toml
 
-__all__ = ["read_systematics"]
-
 FORMAT = "beamfit-systematics-1"
 # Key of the file: the number's name, and the SI value of one unit.
 TERMS = {

@@ -35,8 +35,6 @@ from beamfit.io.numeric import numeric_rows
 if TYPE_CHECKING:
     from pandas import DataFrame
 
-__all__ = ["UNITS", "Column", "Sheet", "columns_of", "header_of", "left_out", "read_sheet"]
-
 UNITS: dict[str, dict[str, float]] = {
     # quantity: unit at the end of a name -> factor to SI (a stored current: to mA)
     "length": {"um": 1e-6, "mm": 1e-3, "m": 1.0, "µm": 1e-6, "μm": 1e-6},

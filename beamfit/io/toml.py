@@ -14,19 +14,6 @@ from typing import Any, NamedTuple
 from beamfit.errors import InputError, nearest
 from beamfit.io.files import read_text
 
-__all__ = [
-    "FLAG",
-    "LIST",
-    "NUMBERS",
-    "REQUIRED",
-    "TABLE",
-    "TEXT",
-    "Key",
-    "Section",
-    "is_number",
-    "read_toml",
-]
-
 REQUIRED: Any = object()
 TEXT, LIST, FLAG, TABLE, NUMBER = str, list, bool, dict, (int, float)
 NUMBERS = (int, float, list)

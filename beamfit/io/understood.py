@@ -31,8 +31,6 @@ from beamfit.io.toml import read_toml
 from beamfit.studies.scan.scans import QuadScan
 from beamfit.table import Table
 
-__all__ = ["Understood", "understand", "with_lattice"]
-
 
 @dataclass(frozen=True)
 class Understood:

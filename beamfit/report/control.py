@@ -11,8 +11,6 @@ from matplotlib.figure import FigureBase
 from beamfit.report.document import BLUE, RED, Page, Picture, Verdict, provenance, written
 from beamfit.studies.response.loop import Loop
 
-__all__ = ["control_page"]
-
 NOTES = (
     "SIMULATED: the process is the fitted model, with the noise of its residuals. Limits of inputs "
     "and of their rates hold by construction; those of outputs are held off by two standard "

@@ -48,8 +48,6 @@ from beamfit.studies.decay.tables import (
 from beamfit.studies.decay.trend import Trend
 from beamfit.table import Table, labelled
 
-__all__ = ["decay_page", "draw_budget", "draw_lifetime", "draw_record", "study_of"]
-
 COLOURS = (BLUE, "#c98a00", "#2c7a3f", "#7b4fa3", RED, "#4f9aa3", "0.5")
 # Decays shown in one budget; more have no room for their names.
 MOST_BARS = 12

@@ -18,19 +18,6 @@ import beamfit
 from beamfit.status import Status
 from beamfit.table import Table
 
-__all__ = [
-    "STYLE",
-    "Page",
-    "Picture",
-    "Verdict",
-    "figure_of",
-    "html_of",
-    "legend_below",
-    "provenance",
-    "written",
-]
-
-
 STYLE = {
     "font.size": 10,
     "axes.spines.top": False,

@@ -26,8 +26,6 @@ from beamfit.studies.scan.sensitivity import budget_rows, range_rows
 from beamfit.studies.scan.size_methods import SizeMethods
 from beamfit.table import Table, labelled
 
-__all__ = ["ERRORS", "emittance_page"]
-
 # Profiles in the picture.
 MOST_PROFILES = 12
 

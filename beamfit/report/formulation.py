@@ -14,8 +14,6 @@ from beamfit.language.text import format_document
 from beamfit.report.document import BLUE, Page, Picture, Verdict, provenance, written
 from beamfit.table import Table
 
-__all__ = ["draw_outputs", "formulation_page"]
-
 # Outputs that are drawn; the tables have all.
 MOST_DRAWN = 12
 

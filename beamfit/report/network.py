@@ -16,8 +16,6 @@ from beamfit.report.document import BLUE, RED, Picture, legend_below
 from beamfit.studies.decay.shift import Shift
 from beamfit.studies.decay.study import Decay, operation_during
 
-__all__ = ["draw_by_setting", "draw_decays", "network_pictures"]
-
 POINTS = 33
 # Decays shown, as many as the report shows.
 SHOWN = 4

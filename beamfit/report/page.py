@@ -31,8 +31,6 @@ from beamfit.studies.scan.fit import EmittanceFit
 from beamfit.studies.scan.size_methods import SizeMethods
 from beamfit.studies.scan.slices import SliceFits
 
-__all__ = ["write_report"]
-
 Reported = EmittanceFit | SliceFits | DecayFit | Solution | ResponseFit | Loop
 
 

@@ -15,8 +15,6 @@ from matplotlib.textpath import text_to_path
 from beamfit.report.document import Page, Picture
 from beamfit.table import Table
 
-__all__ = ["pages_of", "pdf_of"]
-
 WIDTH, HEIGHT, MARGIN = 8.27, 11.69, 0.75  # A4, inches
 LINE = 0.185
 # Between columns of a table, inches; its letters, from the usual size to the smallest.

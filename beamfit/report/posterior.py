@@ -22,8 +22,6 @@ from beamfit.studies.scan.fit import EmittanceFit
 from beamfit.studies.scan.posterior import expected_sizes
 from beamfit.table import Table, plain_name
 
-__all__ = ["Sampled", "draw_pairs", "of_decay", "of_scan", "with_posteriors"]
-
 # Shares of the draws inside the contours of one and two standard deviations in two dimensions.
 INSIDE = (0.393, 0.865)
 MOST_NUMBERS = 5

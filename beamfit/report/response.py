@@ -11,8 +11,6 @@ from matplotlib.figure import FigureBase
 from beamfit.report.document import BLUE, RED, Page, Picture, Verdict, provenance, written
 from beamfit.studies.response.fit import ResponseFit
 
-__all__ = ["response_page"]
-
 NOTES = (
     "Errors are one standard deviation. The model runs free from the start of each run: measured "
     "outputs enter through their residuals only. Bands are one standard deviation; where they are "

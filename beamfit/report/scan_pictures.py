@@ -13,18 +13,6 @@ from beamfit.studies.scan.fit import EmittanceFit
 from beamfit.studies.scan.results import PlaneFit
 from beamfit.studies.scan.scans import Profile
 
-__all__ = [
-    "COLOUR",
-    "PROFILES_ABREAST",
-    "draw_ellipses",
-    "draw_profiles",
-    "draw_residuals",
-    "draw_scan",
-    "has_ellipses",
-    "setting_axis",
-    "words_of",
-]
-
 # Profiles in a row of the picture.
 PROFILES_ABREAST = 3
 COLOUR = {"x": BLUE, "y": RED}

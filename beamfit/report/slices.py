@@ -17,8 +17,6 @@ from beamfit.studies.scan.scans import PROJECTED
 from beamfit.studies.scan.slices import SliceFits
 from beamfit.table import Table, labelled
 
-__all__ = ["draw_slices", "slices_page"]
-
 # Scans of more slices than these are in the tables alone.
 MOST_SCANS = 12
 FIXED = (

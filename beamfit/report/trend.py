@@ -13,8 +13,6 @@ from matplotlib.figure import FigureBase
 from beamfit.report.document import BLUE, RED, Picture
 from beamfit.studies.decay.trend import Trend
 
-__all__ = ["draw_trend", "trend_picture"]
-
 RELATIVE = ("a", "b")
 
 

@@ -12,16 +12,6 @@ from beamfit.status import Status
 from beamfit.table import plain_name
 from beamfit.verdict import Finding
 
-__all__ = [
-    "RULES",
-    "Diagnostics",
-    "Evidence",
-    "autocorrelation_times",
-    "diagnose",
-    "held_by_priors",
-    "split_rhat",
-]
-
 # Chains that agree; Vehtari et al., Bayesian Analysis 16, 667 (2021), advise 1.01.
 AGREED = 1.01
 # emcee's advice for an estimate of the autocorrelation time that can be believed.

@@ -20,8 +20,6 @@ from beamfit.sampling.target import Target
 from beamfit.status import Status
 from beamfit.verdict import judge
 
-__all__ = ["draw", "first_walkers"]
-
 # Steps between two looks at the chain; every decision falls at a multiple, so that a run that was
 # interrupted decides as the uninterrupted one did.
 BLOCK = 50

@@ -12,16 +12,6 @@ from jax import Array
 
 from beamfit.errors import InputError
 
-__all__ = [
-    "FRACTION",
-    "LOG_NOISE",
-    "Group",
-    "Own",
-    "log_likelihood",
-    "noise_words",
-    "outlier_density",
-]
-
 LOG_NOISE, FRACTION = "log_noise", "outlier_fraction"
 # An outlier's own error is unknown: anything from so many to so many of the stated ones.
 NARROWEST, WIDEST = 3.0, 1e5

@@ -10,8 +10,6 @@ import numpy as np
 from scipy.linalg import solve_triangular
 from scipy.special import gammaln
 
-__all__ = ["Proposal", "Student", "Widening", "about", "fitted", "moves_of", "share_of"]
-
 # Degrees of freedom tried, from heavy tails to nearly none; a normal distribution has too few.
 DEGREES = (4.0, 6.0, 10.0, 30.0)
 

@@ -25,8 +25,6 @@ if TYPE_CHECKING:
     from arviz import InferenceData
     from pandas import DataFrame
 
-__all__ = ["Band", "Correlations", "Expected", "Interval", "Posterior", "Summary", "in_unit"]
-
 # One standard deviation of a normal distribution to each side.
 ONE_SIGMA = 0.6826894921370859
 # Draws from which functions of the user's are computed, unless all are asked for.

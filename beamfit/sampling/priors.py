@@ -12,8 +12,6 @@ import numpy as np
 
 from beamfit.errors import InputError, nearest
 
-__all__ = ["Distribution", "HalfNormal", "LogNormal", "Normal", "Uniform", "checked", "in_words"]
-
 
 @runtime_checkable
 class Distribution(Protocol):

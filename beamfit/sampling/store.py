@@ -21,8 +21,6 @@ if TYPE_CHECKING:
 
     from beamfit.sampling.target import Target
 
-__all__ = ["FROM_PYTHON", "Checkpoint", "Provenance", "check_place", "finished", "load", "save"]
-
 # Another number for every change of what a store holds or of how a problem is told from another.
 KIND, FORMAT = "beamfit-posterior", "2"
 # Agreement of log densities of the same model, compiled by two versions.

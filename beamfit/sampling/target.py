@@ -24,8 +24,6 @@ from beamfit.verdict import Finding
 # Not in the package: priors and the place of a store are looked at before JAX is loaded.
 prepare_jax()
 
-__all__ = ["Law", "Target", "covariance_of", "slopes_of"]
-
 GOOD = Finding(Status.converged, "")
 
 

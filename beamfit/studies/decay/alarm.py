@@ -14,18 +14,6 @@ import numpy as np
 
 from beamfit.quantity import Quantity
 
-__all__ = [
-    "Alarm",
-    "Reading",
-    "Reference",
-    "State",
-    "Told",
-    "alarms_of",
-    "started",
-    "watched",
-    "when",
-]
-
 MINUTE = 60.0
 # Windows, s: four begin in turn in each length, so that one of nearly any age is at hand.
 LENGTHS = np.repeat([4.0, 8.0, 16.0, 32.0, 64.0, 128.0], 4) * MINUTE

@@ -9,8 +9,6 @@ import numpy as np
 from beamfit.errors import InputError
 from beamfit.table import json_of
 
-__all__ = ["INPUTS", "SIGNS", "Box", "Certificate", "scaled"]
-
 INPUTS = ("rf_voltage", "scraper_y", "pressure", "bunches")
 # How the loss moves with each input; nothing is known of the sign for the RF voltage.
 SIGNS = {"scraper_y": -1, "pressure": 1, "bunches": -1}

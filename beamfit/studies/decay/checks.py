@@ -18,17 +18,6 @@ from beamfit.studies.decay.model import padded, solve_decay
 from beamfit.studies.decay.record import DecayRecord
 from beamfit.table import json_of
 
-__all__ = [
-    "DecayChecks",
-    "LifetimeTrace",
-    "OneLifetime",
-    "check_decay",
-    "constant_a_test",
-    "log_linear",
-    "moving_lifetime",
-    "single_exponential",
-]
-
 FEWEST_IN_WINDOW = 5
 # Below 1e-12 a bias is rounding.
 BIAS_DIGITS = 12

@@ -12,8 +12,6 @@ from beamfit.studies.decay.pool import FEWEST_CYCLES, FEWEST_READINGS
 from beamfit.studies.decay.record import Conditions, DecayRecord
 from beamfit.studies.decay.segments import Event, Split, beam_readings, split_record
 
-__all__ = ["alike", "cut_at_refills", "find_cycles", "is_refilled", "joined"]
-
 # Standard deviations by which two levels must differ to be two: a false step costs no more than an
 # own current for the rest.
 THRESHOLD = 5.0

@@ -21,20 +21,6 @@ from beamfit.studies.decay.model import Solution, expanded, padded, solve_decay
 from beamfit.studies.decay.record import DecayRecord
 from beamfit.table import json_of
 
-__all__ = [
-    "Change",
-    "ConstantA",
-    "LifetimeLaw",
-    "PowerLaw",
-    "averaged",
-    "by_independent_noise",
-    "change_of_rate",
-    "constant_a",
-    "lifetime_law",
-    "power_law",
-    "quantity_errors",
-]
-
 REJECTED = 1e-3
 # Below this share of the current differences are those of the arithmetic, not of the beam.
 EXACT = 1e-12

@@ -15,8 +15,6 @@ from scipy.linalg import cho_solve, cholesky, solve_triangular
 
 from beamfit.greybox.fit import Fit
 
-__all__ = ["Discrepancy", "sized"]
-
 # Sizes that are weighed, as relative errors of a and of b.
 SIZES = tuple(0.005 * 2 ** (k / 2) for k in range(13))
 

@@ -32,16 +32,6 @@ from beamfit.studies.decay.outgassing import Outgassing, outgassing_of
 from beamfit.studies.decay.record import DecayRecord
 from beamfit.table import json_of
 
-__all__ = [
-    "BELIEVED",
-    "DETERMINED",
-    "NORMAL",
-    "SEPARABLE",
-    "UNITS",
-    "Evidence",
-    "Separability",
-]
-
 UNITS = {
     "a": "1/(mA s)",
     "b": "1/s",

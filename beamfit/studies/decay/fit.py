@@ -29,8 +29,6 @@ if TYPE_CHECKING:
     from beamfit.sampling.posterior import Posterior
     from beamfit.sampling.priors import Distribution
 
-__all__ = ["DecayFit", "bare", "fit_decay", "fit_decays"]
-
 FEWEST = 5
 # Records solved in one call; fewer are filled up, so that one number is compiled. A call takes as
 # many steps as its slowest record.

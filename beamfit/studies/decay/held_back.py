@@ -13,8 +13,6 @@ from beamfit.quantity import Quantity
 from beamfit.studies.decay.scales import SEPARABLE, ScaleFit, pulls, spread_of_scales, whitener
 from beamfit.table import json_of
 
-__all__ = ["HeldBack", "predict_held_back"]
-
 
 class HeldBack(NamedTuple):
     """A decay as the others predict it.

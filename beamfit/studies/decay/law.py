@@ -12,21 +12,6 @@ from jax import Array
 
 from beamfit.lifetime.decay import current, current_by_rate, mean_exponential
 
-__all__ = [
-    "DecayNumbers",
-    "Expansion",
-    "Moments",
-    "Physical",
-    "Shape",
-    "beam_current",
-    "bent_current",
-    "constant_shape",
-    "cumulative",
-    "monitored_current",
-    "physical",
-    "scaled_numbers",
-]
-
 Shape = Callable[[Array], Array]
 # The least current whose logarithm is taken, in units of the mean.
 LEAST = 1e-12

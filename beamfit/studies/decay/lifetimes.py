@@ -32,8 +32,6 @@ from beamfit.studies.decay.record import FEWEST_LIFETIMES, LifetimeTable
 from beamfit.studies.decay.verdict import TableEvidence, finding_of_table
 from beamfit.table import Table, json_of, labelled, plain_name
 
-__all__ = ["LifetimeFit", "fit_lifetimes"]
-
 # Points so many robust standard deviations off the law with a free exponent are outliers; no more
 # than a fifth of them.
 OUTLIER, MOST = 5.0, 0.2

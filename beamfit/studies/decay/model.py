@@ -28,16 +28,6 @@ from beamfit.studies.decay.law import (
 )
 from beamfit.studies.decay.record import DecayRecord
 
-__all__ = [
-    "Solution",
-    "decay_problem",
-    "expanded",
-    "padded",
-    "padded_size",
-    "solve_decay",
-    "solve_decays",
-]
-
 RECORD = "decay"
 # Width of a prior on the quadratic part, in units of the whole loss (whose own error counts in).
 # Physics allows 0 to 1, so 30 moves no value that the record determines (by 4e-5 of it where the

@@ -9,8 +9,6 @@ import numpy as np
 from beamfit.errors import InputError
 from beamfit.shown import shown
 
-__all__ = ["Monitor"]
-
 HOUR = 3600.0
 
 

@@ -37,8 +37,6 @@ from beamfit.studies.decay.study import Decay, Machine, operation_during
 from beamfit.studies.decay.summary import Summaries, loss_parts, summarise
 from beamfit.table import json_of
 
-__all__ = ["Box", "Certificate", "Network", "NetworkFit", "fit_loss_network"]
-
 OUTPUTS = ("log_a", "log_b")
 # Units of a, b and the lifetime.
 LOSSES = ("1/(mA s)", "1/s", "h")

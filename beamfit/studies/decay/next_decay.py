@@ -17,8 +17,6 @@ from beamfit.lifetime.ring import Operation
 from beamfit.studies.decay.scales import ScaleFit, pulls, whitener
 from beamfit.studies.decay.summary import Summaries, information_root, loss_parts
 
-__all__ = ["Candidate", "Proposal", "next_decays"]
-
 # So wide a prior on scales near 1 decides nothing, and keeps determinants finite.
 WIDE = 10.0
 READINGS = 64

@@ -16,8 +16,6 @@ from beamfit.quantity import Quantity, Status
 from beamfit.sampling.posterior import Posterior
 from beamfit.studies.decay.scales import ScaleFit, losses_of
 
-__all__ = ["BestPoint", "Limits", "best_operating_point"]
-
 GRID = 33
 
 

@@ -27,8 +27,6 @@ from beamfit.studies.decay.model import padded, solve_decay
 from beamfit.studies.decay.record import DecayRecord
 from beamfit.table import json_of
 
-__all__ = ["Outgassing", "outgassing_of"]
-
 # Time constants, over the span of the record, with which searches begin, and the longest believed.
 STARTS, LONGEST = (0.05, 0.2, 0.7), 1.0
 # The relaxing loss and its time constant are known to a third at least.

@@ -19,17 +19,6 @@ from beamfit.lifetime.decay import current_by_rate
 from beamfit.studies.decay.model import PRIOR_WIDTH
 from beamfit.studies.decay.record import DecayRecord
 
-__all__ = [
-    "FEWEST_CYCLES",
-    "FEWEST_READINGS",
-    "MOST",
-    "Cycles",
-    "Pool",
-    "averaged",
-    "cleaned",
-    "solved",
-]
-
 FEWEST_CYCLES, FEWEST_READINGS = 3, 3
 # Readings beyond which neighbours are averaged, in blocks within a cycle.
 MOST = 16384

@@ -38,8 +38,6 @@ from beamfit.studies.decay.record import DecayRecord
 from beamfit.studies.decay.segments import noise_of
 from beamfit.studies.decay.verdict import finding_of_cycles
 
-__all__ = ["cycle_lifetimes", "fit_cycles", "seen_through", "stands_alone"]
-
 # Parts of the record whose loss rates are compared, and points of a picture.
 PARTS, POINTS = 8, 60
 # Refills of so many standard deviations of the means beside them are none of them missed.

@@ -26,8 +26,6 @@ from beamfit.studies.decay.model import RECORD, decay_problem
 from beamfit.studies.decay.record import DecayRecord
 from beamfit.verdict import Finding
 
-__all__ = ["decay_target", "expected_current"]
-
 UNITS = {"i0": "mA", "a": "1/(mA s)", "b": "1/s"}
 SAMPLED = UNITS | {"log_memory": "1", "drift": "mA/s", "offset": "mA"}
 # The monitor is taken to be within so many of its stated errors.

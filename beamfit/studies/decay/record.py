@@ -18,8 +18,6 @@ if TYPE_CHECKING:
 
     from beamfit.studies.decay.monitor import Monitor
 
-__all__ = ["Conditions", "DecayRecord", "Fault", "LifetimeTable", "first_fault"]
-
 FEWEST_LIFETIMES = 4
 
 

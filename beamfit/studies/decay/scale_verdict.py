@@ -10,8 +10,6 @@ from beamfit.quantity import Quantity, Status
 from beamfit.statistics import POOR_FIT, chi2_probability
 from beamfit.verdict import Finding, judge
 
-__all__ = ["VOLTAGE", "ScaleEvidence", "finding_of_scales"]
-
 # The scale of the RF voltage, fitted where a prior says how well its reading is calibrated.
 VOLTAGE = "rf_voltage"
 

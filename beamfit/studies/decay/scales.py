@@ -31,17 +31,6 @@ from beamfit.verdict import Finding
 if TYPE_CHECKING:
     from beamfit.sampling.posterior import Posterior
 
-__all__ = [
-    "ScaleFit",
-    "fit_scales",
-    "losses_of",
-    "pulls",
-    "sample_scales",
-    "spread_of_scales",
-    "stacked_terms",
-    "whitener",
-]
-
 # A scale known to a third or worse cannot be told from a third more or less of another cause.
 SEPARABLE = 1 / 3
 PRESSURE_ERROR = 0.05

@@ -10,8 +10,6 @@ from scipy.ndimage import median_filter
 from beamfit.shown import shown
 from beamfit.studies.decay.record import DecayRecord
 
-__all__ = ["Event", "Split", "beam_readings", "noise_of", "split_record"]
-
 # Robust z-score at which a step or spike is an event: one false alarm in 1e20 Gaussian readings.
 THRESHOLD = 10.0
 # Readings below this share of the largest one near them are dropouts of the monitor.

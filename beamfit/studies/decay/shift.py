@@ -30,8 +30,6 @@ from beamfit.studies.decay.study import Decay, Machine, operation_during, settin
 from beamfit.studies.decay.summary import summarise
 from beamfit.table import json_of
 
-__all__ = ["Anomaly", "Shift", "budget_intervals", "find_anomaly", "study_shift"]
-
 # Chance of a false alarm in one call.
 FALSE_ALARM = 1e-3
 

@@ -27,17 +27,6 @@ from beamfit.studies.decay.systematics import Systematic, systematics
 from beamfit.studies.decay.thinning import thinned
 from beamfit.table import json_of
 
-__all__ = [
-    "Budget",
-    "Decay",
-    "Machine",
-    "RecordStudy",
-    "budget",
-    "operation_during",
-    "settings_json",
-    "study_record",
-]
-
 # A setting that moves by more than this share between two readings was changed by somebody.
 CHANGED = 0.01
 SETTINGS = ("rf_voltage", "scraper_y", "bunches")

@@ -15,8 +15,6 @@ from beamfit.studies.decay.model import padded_size
 from beamfit.studies.decay.study import Decay
 from beamfit.studies.decay.systematics import about_fit
 
-__all__ = ["Summaries", "loss_parts", "summarise"]
-
 
 class Summaries(NamedTuple):
     """Decays by their loss rates at the mean current; exact to second order about the fit.

@@ -16,8 +16,6 @@ from beamfit.studies.decay.model import expanded
 from beamfit.studies.decay.record import DecayRecord
 from beamfit.table import json_of
 
-__all__ = ["Systematic", "about_fit", "systematics"]
-
 # The size of each cause that the table assumes; those of the monitor in mA, and in proportion
 # below so many: a monitor of small currents is as good as that.
 PRESSURE, DRIFT, OFFSET, EXPONENT = 0.01, 0.01, 0.1, -0.1

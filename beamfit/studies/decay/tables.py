@@ -16,22 +16,6 @@ from beamfit.studies.decay.shift import Shift
 from beamfit.studies.decay.study import Decay, RecordStudy
 from beamfit.table import cell
 
-__all__ = [
-    "FEW",
-    "SYSTEMATIC",
-    "alike",
-    "budget_rows",
-    "check_rows",
-    "counted",
-    "decay_rows",
-    "event_rows",
-    "network_rows",
-    "overview",
-    "separability_rows",
-    "shift_rows",
-    "systematic_rows",
-]
-
 Rows = list[tuple[str, list[str]]]
 Row = tuple[str, Callable[[Decay], object]]
 MOST_EVENTS = 100

@@ -8,8 +8,6 @@ import numpy as np
 
 from beamfit.studies.decay.record import Conditions, DecayRecord
 
-__all__ = ["MOST_READINGS", "thinned"]
-
 # Readings beyond which neighbours are averaged.
 MOST_READINGS = 1 << 16
 # Robust standard deviations off the median of its block that a reading may lie.

@@ -21,8 +21,6 @@ from beamfit.studies.decay.study import Decay, Machine, RecordStudy
 from beamfit.studies.decay.summary import summarise
 from beamfit.table import Table, cell, json_of
 
-__all__ = ["Point", "Trend", "trend_of"]
-
 # Decays that say what is usual: the first so many, half of them if there are fewer.
 BASELINE, FEWEST = 20, 3
 # Mean range of two normal numbers, and the degrees of freedom of each moving range.

@@ -26,8 +26,6 @@ from beamfit.studies.decay.outgassing import Outgassing
 from beamfit.studies.decay.segments import noise_of
 from beamfit.verdict import Finding, judge
 
-__all__ = ["TableEvidence", "finding_of", "finding_of_cycles", "finding_of_table"]
-
 # Lifetimes, s, that stored beams seldom have, but times in a wrong unit often give.
 SHORTEST, LONGEST = 20.0, 3000 * HOUR
 # One-sided 95 %.

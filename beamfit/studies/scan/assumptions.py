@@ -10,8 +10,6 @@ from typing import NamedTuple
 from beamfit.errors import InputError, nearest
 from beamfit.shown import shown
 
-__all__ = ["SCENARIOS", "Anchor", "Assumptions", "Entry"]
-
 
 class Entry(NamedTuple):
     """A scenario as it is known before JAX is loaded: the module that has it, what it takes."""

@@ -23,8 +23,6 @@ from beamfit.studies.scan.assumptions import Assumptions
 from beamfit.studies.scan.model import UNIT, sigma_of
 from beamfit.studies.scan.signed_network import MOST
 
-__all__ = ["beam_box", "check_box", "limited_network"]
-
 SIGMA = ("sigma11", "sigma12", "sigma22")
 # The appendix's random start of a weight; it gives the network no straight line to begin with.
 START = 0.01

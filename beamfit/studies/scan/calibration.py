@@ -28,8 +28,6 @@ from beamfit.studies.scan.statement import (
     varied_magnets,
 )
 
-__all__ = ["SCENARIO", "WIDTH", "Kind", "Number", "numbers_of_magnets", "with_numbers"]
-
 # The report's bounds are 167.23 ± 20 for the slope and 43.17 ± 20 for the intercept (appendix C).
 WIDTH = 20.0 / 167.23
 

@@ -22,8 +22,6 @@ from beamfit.studies.scan.next_point import candidate_settings
 from beamfit.studies.scan.statement import varied_magnets
 from beamfit.studies.scan.transport import NetworkRows, Rows, rows_at
 
-__all__ = ["Candidate", "Considered", "candidate_rows", "further_options"]
-
 # Other energies to consider where none is named: what a linac can usually do.
 USUAL_ENERGIES = (0.8, 1.25)
 

@@ -27,8 +27,6 @@ from beamfit.studies.scan.fit import EmittanceFit
 from beamfit.studies.scan.information import by_plane, identified, information_of
 from beamfit.table import Table, json_of, text_of
 
-__all__ = ["CRITERIA", "Advice", "Option", "Step", "plan_measurements"]
-
 CRITERIA = ("emittance", "D")
 # A further point that sharpens the emittance by less than this is not worth its shift time.
 LEAST_GAIN = 0.01

@@ -35,8 +35,6 @@ if TYPE_CHECKING:
     from beamfit.sampling.posterior import Correlations, Posterior
     from beamfit.sampling.priors import Distribution
 
-__all__ = ["EmittanceFit", "fit_emittance", "scenario_of"]
-
 
 def fit_emittance(
     scan: QuadScan,

@@ -43,8 +43,6 @@ from beamfit.studies.scan.statement import (
 )
 from beamfit.studies.scan.transport import padded
 
-__all__ = ["SCENARIO", "NetworkStrength", "branch_of"]
-
 
 @partial(jax.tree_util.register_dataclass, data_fields=["network"], meta_fields=["unit"])
 @dataclass(frozen=True)

@@ -13,8 +13,6 @@ from beamfit.studies.scan.model import coefficients
 from beamfit.studies.scan.noise import DOUBTFUL, Noise
 from beamfit.studies.scan.results import Points
 
-__all__ = ["Influence", "influence_of"]
-
 # A point carries the answer if the emittance moves by so many of its errors without it.
 CARRIES = 2.0
 

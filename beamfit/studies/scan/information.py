@@ -15,8 +15,6 @@ from beamfit.studies.scan.fit import EmittanceFit
 from beamfit.studies.scan.model import emittance_parts, predict_sizes, sigma_of
 from beamfit.studies.scan.verdict import CLEAR
 
-__all__ = ["by_plane", "identified", "information_of", "linearised_at", "with_slope"]
-
 
 def by_plane(fit: EmittanceFit, known: Information) -> dict[str, float]:
     """Relative error of each plane's emittance."""

@@ -18,10 +18,8 @@ from beamfit.studies.scan.next_point import best_symmetric
 from beamfit.studies.scan.results import Identifiability, PlaneFit, Points, ScreenTwiss
 from beamfit.studies.scan.statement import Seen, asked_of
 from beamfit.studies.scan.transport import own_settings, own_units
-from beamfit.studies.scan.verdict import BEAM_RULES, LOST, judge
-from beamfit.verdict import Finding
-
-__all__ = ["SIGMA", "Answer", "judged_beam", "plane_fit", "units_of"]
+from beamfit.studies.scan.verdict import BEAM_RULES, LOST
+from beamfit.verdict import Finding, judge
 
 SIGMA = slice(4, 7)
 # Doubted points that a message names.

@@ -55,9 +55,6 @@ from beamfit.studies.scan.transport import (
 )
 from beamfit.studies.scan.verdict import LOST, Evidence, one_magnet, waist_bracketed
 
-__all__ = ["METHODS", "SCENARIO", "WEIGHTS", "next_measurement", "pulls", "see", "works_of"]
-
-
 # The residual: the report's ``error_linear`` or ``error_nonlinear``.
 METHODS = ("size_squared", "size")
 # Whose size errors are taken at.

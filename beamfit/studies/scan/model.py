@@ -29,22 +29,6 @@ from beamfit.optics.beamline import Beamline
 from beamfit.optics.calibration import scaled
 from beamfit.optics.particle import beta_gamma
 
-__all__ = [
-    "QUANTITIES",
-    "UNIT",
-    "Asked",
-    "asked_numbers",
-    "coefficients",
-    "emittance_parts",
-    "line_of",
-    "numbers_of",
-    "phase_coverage",
-    "predict_sizes",
-    "sigma_of",
-    "size_squared",
-    "spoken",
-]
-
 UNIT = 1e-4  # m and rad of a beam's numbers
 # What people quote of a plane, in this order everywhere, with units.
 QUANTITIES = {

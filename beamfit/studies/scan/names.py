@@ -7,8 +7,6 @@ from collections.abc import Mapping
 from beamfit.errors import nearest
 from beamfit.studies.scan.scans import QuadScan
 
-__all__ = ["check_names"]
-
 
 def check_names(
     scan: QuadScan,

@@ -10,8 +10,6 @@ import numpy as np
 from beamfit.greybox.design import Information, rows_of, scores
 from beamfit.studies.scan.results import Points
 
-__all__ = ["Candidate", "best_candidate", "best_symmetric", "candidate_settings", "plausible_sigma"]
-
 # Candidates reach half the scanned range beyond either end.
 REACH, COUNT = 0.5, 41
 # A setting below this share of the range is the rounding of zero.

@@ -11,18 +11,6 @@ from scipy.special import fdtrc
 from beamfit.statistics import POOR_FIT, chi2_probability
 from beamfit.studies.scan.scans import QuadScan
 
-__all__ = [
-    "DOUBTFUL",
-    "ENOUGH_POINTS",
-    "GUESS",
-    "GUESS_DOF",
-    "Noise",
-    "constant_noise",
-    "noise_of",
-    "outstanding",
-    "unlikely",
-]
-
 # Noise without errors in the file: a guess of 5 % of the size, worth two degrees of freedom, so
 # that a few accidentally small residuals are not taken for precision, nor equal sizes for none.
 GUESS, GUESS_DOF = 0.05, 2.0

@@ -33,8 +33,6 @@ from beamfit.studies.scan.results import PlaneFit
 from beamfit.studies.scan.statement import Scenario, Seen, asked_of
 from beamfit.verdict import Finding
 
-__all__ = ["beam_target", "expected_sizes"]
-
 CHOLESKY, SIGMA = ("l11", "l21", "l22"), ("sigma11", "sigma12", "sigma22")
 TWISS = ("emittance", "normalized_emittance", "beta", "alpha", "mismatch")
 PLACES = np.array([list(QUANTITIES).index(name) for name in TWISS])

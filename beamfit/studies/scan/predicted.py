@@ -19,8 +19,6 @@ from beamfit.studies.scan.transport import Rows, padded, rows_at, seen_line
 if TYPE_CHECKING:
     from beamfit.studies.scan.posterior import Scanned
 
-__all__ = ["Prediction", "correlations_of", "predicted_sizes"]
-
 NAMES = ("sigma11", "sigma12", "sigma22", "emittance", "beta", "alpha")
 
 

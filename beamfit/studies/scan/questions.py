@@ -12,8 +12,6 @@ from beamfit.optics.elements import Quadrupole
 from beamfit.optics.particle import rigidity
 from beamfit.studies.scan.scans import USUAL, QuadScan
 
-__all__ = ["check_gradients", "of_sizes", "questions"]
-
 # Gradients in T/m beyond which a magnet is a plasma lens at least, and beyond any lens.
 STRONG, IMPOSSIBLE = 500.0, 1e4
 

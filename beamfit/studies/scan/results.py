@@ -15,18 +15,6 @@ from beamfit.shown import shown
 from beamfit.status import Status
 from beamfit.table import Table, cell, json_of, labelled
 
-__all__ = [
-    "Identifiability",
-    "Parameter",
-    "PlaneFit",
-    "Points",
-    "ScreenTwiss",
-    "identifiability_rows",
-    "parameter_rows",
-    "point_rows",
-    "result_rows",
-]
-
 # A longer table of points is cut, and says so.
 MOST_ROWS = 500
 

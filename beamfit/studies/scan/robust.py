@@ -13,8 +13,6 @@ from beamfit.studies.scan.model import size_squared
 from beamfit.studies.scan.noise import Noise
 from beamfit.studies.scan.sigma import SigmaFit, error_at, fit_sizes
 
-__all__ = ["RobustFit", "doubts", "fit_robust"]
-
 # A point is an outlier with this probability before it is seen, and its error is then at least
 # this many times larger.
 FRACTION, WIDTH = 0.05, 10.0

@@ -21,17 +21,6 @@ from beamfit.table import Table
 if TYPE_CHECKING:
     from pandas import DataFrame
 
-__all__ = [
-    "POSSIBLE",
-    "PROJECTED",
-    "USUAL",
-    "PlaneRows",
-    "Profile",
-    "QuadScan",
-    "first_unusable",
-    "row_keys",
-]
-
 PLANES = ("x", "y")
 # What rows that look at no single slice of the beam say for one.
 PROJECTED = "projected"

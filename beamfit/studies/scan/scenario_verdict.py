@@ -10,8 +10,6 @@ from beamfit.status import Status
 from beamfit.studies.scan.verdict import CLEAR, few_words
 from beamfit.verdict import Finding
 
-__all__ = ["SCENARIO_RULES", "Unknowns"]
-
 
 class Unknowns(NamedTuple):
     """What tells whether sizes determine a beam when more than the beam is unknown.

@@ -38,16 +38,6 @@ from beamfit.studies.scan.sigma import error_at, fit_sizes, weighed_size
 from beamfit.studies.scan.statement import varied_magnets
 from beamfit.studies.scan.transport import Rows, padded
 
-__all__ = [
-    "Change",
-    "RangeRow",
-    "budget_rows",
-    "range_rows",
-    "range_sensitivity",
-    "systematics",
-]
-
-
 # Leaving out one of more points than this tells nothing.
 MOST_POINTS = 50
 # Nobody reads a budget of more causes than this, nor of smaller changes.

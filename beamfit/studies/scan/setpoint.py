@@ -44,8 +44,6 @@ from beamfit.studies.scan.wishes import (
     resolved,
 )
 
-__all__ = ["Beam", "Minimum", "PlaneBeam", "Setpoint", "Target", "find_setpoint"]
-
 # Starts of the search: enough for the minima that a few magnets have; no number fills the box of
 # many magnets, whose wishes can usually be met in many ways.
 STARTS, FEW, MANY = 256, 64, 8

@@ -15,17 +15,6 @@ from beamfit.studies.scan.wishes import SAME_ENERGY, Beam, Target
 from beamfit.table import Table, cell, json_of, text_of
 from beamfit.verdict import Finding, judge
 
-__all__ = [
-    "Evidence",
-    "Minimum",
-    "PlaneBeam",
-    "Setpoint",
-    "doubts_on",
-    "notes_on",
-    "reached_words",
-    "verdict_on",
-]
-
 # A wish is met within the usual error of a measured size, or of the emittance growth of a mismatch.
 MET = 0.02
 # What squares of a micrometre or a microradian, or BMAG - 1, come to by rounding.

@@ -18,17 +18,6 @@ from beamfit.greybox.descend import descend_one
 from beamfit.shown import shown
 from beamfit.studies.scan.model import coefficients, numbers_of, size_squared
 
-__all__ = [
-    "ClosedForm",
-    "SigmaFit",
-    "SizeData",
-    "closed_form",
-    "fit_sizes",
-    "solve_size",
-    "solve_size_squared",
-    "zero_emittance",
-]
-
 # A direction of σ is lost when its diagonal of R is this far below the largest.
 _RANK = 1e-10
 # How often weights are taken anew from the model, and how far its size may be from the measured.

@@ -13,8 +13,6 @@ from beamfit.greybox.problem import Free, Prior, Record
 from beamfit.studies.scan.assumptions import Assumptions
 from beamfit.studies.scan.transport import padded
 
-__all__ = ["MOST", "common_errors", "known_record", "signed_network", "weight_free"]
-
 # Bounds of the weights: the report's (appendix B).
 MOST = 10.0
 

@@ -20,8 +20,6 @@ from beamfit.studies.scan.scans import QuadScan
 from beamfit.studies.scan.sigma import fit_sizes
 from beamfit.table import Table, cell
 
-__all__ = ["MethodRow", "SizeMethods", "compare_size_methods", "measured_weights"]
-
 
 class MethodRow(NamedTuple):
     """The normalised emittance of one plane, for one way of taking the sizes.

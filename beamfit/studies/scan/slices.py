@@ -13,8 +13,6 @@ from beamfit.studies.scan.results import PlaneFit
 from beamfit.studies.scan.scans import PROJECTED, QuadScan
 from beamfit.table import Table, cell, text_of
 
-__all__ = ["SliceFits", "fit_slices"]
-
 HEADER = ("slice", "energy", "status", "normalised emittance", "beta at the start")
 HEADER += ("alpha at the start", "chi2/dof")
 

@@ -22,17 +22,6 @@ from beamfit.studies.scan.verdict import Evidence
 if TYPE_CHECKING:
     from beamfit.greybox.fit import Fit
 
-__all__ = [
-    "Scenario",
-    "Seen",
-    "Work",
-    "asked_of",
-    "beam_free",
-    "beam_numbers",
-    "size_record",
-    "varied_magnets",
-]
-
 
 class Work(NamedTuple):
     """One plane fitted in closed form through a line.

@@ -24,8 +24,6 @@ from beamfit.studies.scan.model import spoken
 from beamfit.studies.scan.results import Parameter
 from beamfit.studies.scan.statement import Scenario, Seen
 
-__all__ = ["Effects", "effects_of", "with_systematics"]
-
 # Free numbers end so many standard deviations of their prior away.
 REACH = 6.0
 # Units of the numbers that are one for all elements, and what they are where nobody says.

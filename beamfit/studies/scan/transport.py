@@ -30,24 +30,6 @@ from beamfit.optics.sections import Series
 from beamfit.studies.scan.model import line_of
 from beamfit.studies.scan.scans import QuadScan
 
-__all__ = [
-    "Look",
-    "NetworkRows",
-    "Rows",
-    "damping_of",
-    "look_through",
-    "names_of",
-    "own_settings",
-    "own_units",
-    "padded",
-    "rows_at",
-    "rows_line",
-    "scan_rows",
-    "scanned_line",
-    "seen_line",
-    "transfer_rows",
-]
-
 # Elements, times rows, whose matrices are held at once where each row has its own energy.
 MOST_AT_ONCE = 100_000
 

@@ -37,8 +37,6 @@ from beamfit.studies.scan.statement import (
 )
 from beamfit.studies.scan.transport import NetworkRows, padded, transfer_rows
 
-__all__ = ["SCENARIO", "Certificate", "Gain", "certificate_of", "network_rows"]
-
 CELLS = 32
 ELEMENTS = "ABCD"
 # The sharpness of det T = 1.

@@ -12,17 +12,6 @@ from beamfit.errors import InputError
 from beamfit.studies.scan.assumptions import Anchor
 from beamfit.studies.scan.wishes import Target
 
-__all__ = [
-    "anchor_of",
-    "bounds_of",
-    "energies_of",
-    "gains_of",
-    "goal_of",
-    "limits_of",
-    "priors_of",
-    "target_of",
-]
-
 PRIOR = "NAME=MEAN+-SD such as Q2.slope=167.23+-3.3446"
 BOUNDS = "NAME=LOWER:UPPER such as Q2.slope=147.23:187.23"
 GAINS = "NAME=LOWER:UPPER, one of them may be left out, such as dA_x/dQ2=:-0.0083"

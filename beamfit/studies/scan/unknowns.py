@@ -35,10 +35,8 @@ from beamfit.studies.scan.scenario_verdict import SCENARIO_RULES, Unknowns
 from beamfit.studies.scan.statement import Scenario, Seen, asked_of, size_record
 from beamfit.studies.scan.systematics import effects_of
 from beamfit.studies.scan.transport import Look
-from beamfit.studies.scan.verdict import cause_of, judge
-from beamfit.verdict import Finding
-
-__all__ = ["judged_scenario", "settled_fit"]
+from beamfit.studies.scan.verdict import cause_of
+from beamfit.verdict import Finding, judge
 
 # Ends of a search that are no answer.
 NO_ANSWER = (

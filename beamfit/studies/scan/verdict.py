@@ -11,19 +11,7 @@ import numpy as np
 from beamfit.statistics import POOR_FIT, one_sided_probability, reach_of
 from beamfit.status import Status
 from beamfit.studies.scan.influence import Influence
-from beamfit.verdict import Finding, judge
-
-__all__ = [
-    "BEAM_RULES",
-    "CLEAR",
-    "LOST",
-    "Evidence",
-    "cause_of",
-    "few_words",
-    "judge",
-    "one_magnet",
-    "waist_bracketed",
-]
+from beamfit.verdict import Finding
 
 # The emittance is determined if zero is this many standard errors away ...
 CLEAR = 4.0

@@ -14,8 +14,6 @@ from beamfit.errors import InputError, nearest
 if TYPE_CHECKING:
     from beamfit.optics.beamline import Beamline
 
-__all__ = ["KINDS", "SAME_ENERGY", "Beam", "Target", "checked_place", "common_energy", "resolved"]
-
 KINDS = ("size", "divergence", "match")
 # Energies that differ by less than this share are one: a magnet's setting is known no better.
 SAME_ENERGY = 1e-3
