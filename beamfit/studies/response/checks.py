@@ -22,7 +22,7 @@ from beamfit.studies.response.model import (
 from beamfit.studies.response.record import Run
 from beamfit.studies.response.starts import driven_by, unit_outputs
 
-__all__ = ["Checks", "HeldBack", "checks_of", "predict_held"]
+__all__ = ["Checks", "HeldBack", "checks_of", "predict_held", "slopes_of"]
 
 # Lags of the tests at most: of residuals, of inputs, and of what whitens.
 LAGS, PAST, ORDER = 20, 10, 8
@@ -99,13 +99,21 @@ def _percent(rest: np.ndarray, y: np.ndarray) -> float:
 
 
 def checks_of(
-    seen: Seen, residuals: tuple[np.ndarray, ...], fit: Fit, used: int, gain: float, delay: int
+    seen: Seen,
+    residuals: tuple[np.ndarray, ...],
+    slopes: Sequence[tuple[np.ndarray, np.ndarray]],
+    used: int,
+    gain: float | None,
+    delay: int,
 ) -> Checks:
-    """Test the residuals of every run together."""
+    """Test the residuals of every run together.
+
+    `slopes` has those of the output by the model's own numbers, and what a fuller model would add.
+    """
     y = np.concatenate([m - m.mean() for m in seen.measured])
     rest = np.concatenate(residuals)
     ahead = np.concatenate([_whitened(r, [_share(residuals)]) for r in residuals])
-    explained, chance = _explained(seen, residuals, fit, delay)
+    explained, chance = _explained(seen, residuals, slopes, delay)
     if rest.std() <= CLOSE * seen.size_y:  # what is left is rounding, or the network's own detail
         explained, chance = 0.0, 1.0
     return Checks(
@@ -115,7 +123,7 @@ def checks_of(
         _white(residuals),
         chance,
         explained,
-        gain if callable(fit.model["map"]) else None,
+        gain,
         _together(seen),
     )
 
@@ -173,7 +181,10 @@ def _white(residuals: tuple[np.ndarray, ...]) -> float:
 
 
 def _explained(
-    seen: Seen, residuals: tuple[np.ndarray, ...], fit: Fit, delay: int
+    seen: Seen,
+    residuals: tuple[np.ndarray, ...],
+    slopes: Sequence[tuple[np.ndarray, np.ndarray]],
+    delay: int,
 ) -> tuple[float, float]:
     """How much of the residuals a fuller model would explain, and its chance, all whitened alike.
 
@@ -186,14 +197,13 @@ def _explained(
     times = np.geomspace(apart, max(float(np.ptp(t)) for t in seen.time) / 4, SLOW)[:, None]
     paths = driven_by(seen, FIRST_ORDER)
     own, slow, quick, targets = [], [], [], []
-    for run, path, r in zip(seen.runs, paths, residuals, strict=True):
+    for run, path, r, (by_own, added) in zip(seen.runs, paths, residuals, slopes, strict=True):
         u = (np.asarray(run.u) - seen.mean_u) / np.where(seen.size_u > 0, seen.size_u, 1.0)
         index = np.asarray(run.index)
         past = [u[np.clip(index + k, 0, len(u) - 1)] for k in range(-PAST, delay)]
-        slopes = np.asarray(changed_by(fit.model, run, np.concatenate([u, u**2], axis=1)))
         slow.append(np.asarray(unit_outputs(path, times))[:, : u.shape[1]].reshape(-1, len(r)).T)
-        quick.append(np.concatenate([*past, slopes], axis=1))
-        own.append(fit.derive(predicted, run).slope)
+        quick.append(np.concatenate([*past, added], axis=1))
+        own.append(by_own)
         targets.append(r)
 
     def white(parts: list[np.ndarray]) -> np.ndarray:
@@ -223,6 +233,16 @@ def _basis(columns: np.ndarray, size: np.ndarray | None = None) -> np.ndarray:
     size = np.linalg.norm(columns, axis=0) if size is None else size
     found, values, _ = np.linalg.svd(columns / np.where(size > 0, size, 1.0), full_matrices=False)
     return found[:, values > 1e-6]
+
+
+def slopes_of(seen: Seen, fit: Fit) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Slopes of the output by the model's own numbers, and by parameters that change."""
+    found = []
+    for run in seen.runs:
+        u = (np.asarray(run.u) - seen.mean_u) / np.where(seen.size_u > 0, seen.size_u, 1.0)
+        added = changed_by(fit.model, run, np.concatenate([u, u**2], axis=1))
+        found.append((fit.derive(predicted, run).slope, np.asarray(added)))
+    return found
 
 
 def predict_held(run: Run, output: str, fit: Fit, physics: Physics, delay: int) -> HeldBack:

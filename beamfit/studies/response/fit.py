@@ -18,7 +18,7 @@ from beamfit.greybox.solve import solve
 from beamfit.quantity import Quantity
 from beamfit.shown import shown
 from beamfit.status import Status
-from beamfit.studies.response.checks import Checks, HeldBack, checks_of, predict_held
+from beamfit.studies.response.checks import Checks, HeldBack, checks_of, predict_held, slopes_of
 from beamfit.studies.response.curve import Curve, curves_of, quantities_of, told
 from beamfit.studies.response.model import CLOSE, Seen, driven, network_of, output_of, state
 from beamfit.studies.response.record import Run
@@ -225,9 +225,9 @@ def identify(
     checks = checks_of(
         seen,
         answer.residuals,
-        answer.fit,
+        slopes_of(seen, answer.fit),
         used_by(answer.fit),
-        plain.likelihood - answer.likelihood,
+        plain.likelihood - answer.likelihood if map == "network" else None,
         delay,
     )
     quantities = quantities_of(answer.fit, seen, physics) if map == "constant" else {}
