@@ -6,7 +6,7 @@ export OPENBLAS_NUM_THREADS := 1
 export OMP_NUM_THREADS := 1
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
-.PHONY: demo test calibrate coverage mutations bench lint clean
+.PHONY: demo test docs calibrate coverage mutations bench lint clean
 .DEFAULT_GOAL := demo
 
 .venv/runtime: pyproject.toml constraints.txt
@@ -28,6 +28,10 @@ demo: .venv/runtime
 
 test: .venv/test lint
 	$(BIN)/python -m pytest --quiet --numprocesses 2 --dist loadfile
+
+# The site, in build/site/index.html. Offline; warnings are errors; notebooks are executed.
+docs: .venv/test
+	$(BIN)/python -m sphinx -W --keep-going -q -b html docs build/site
 
 # Simulation-based calibration of the posteriors: minutes, so not part of `make test`.
 calibrate: .venv/test

@@ -23,7 +23,7 @@ from beamfit.greybox import tree
 class Root(NamedTuple):
     """What the inner solver found at one point.
 
-    ``defect`` is max |f(x, y)|; ``converged`` is 1 where it is within the tolerance, else 0.
+    ``defect`` is ``max |f(x, y)|``; ``converged`` is 1 where it is within the tolerance, else 0.
     """
 
     y: jax.Array
@@ -52,7 +52,7 @@ class Implicit:
     parameters : pytree, optional
         The numbers the equation holds; any of them can be free in a fit.
     tolerance : float
-        On max |equation|.
+        On ``max |equation|``.
     iterations : int
         Most Newton steps.
 

@@ -150,7 +150,7 @@ class BeamMatrix:
         Returns
         -------
         BeamMatrix
-            The beam after R; its emittance is |det R| times this one's, to the last digit.
+            The beam after R; its emittance is ``|det R|`` times this one's, to the last digit.
         """
         r = jnp.asarray(matrix)
         a, b, c, d = r[..., 0, 0], r[..., 0, 1], r[..., 1, 0], r[..., 1, 1]

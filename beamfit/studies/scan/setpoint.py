@@ -117,9 +117,9 @@ def find_setpoint(
     Notes
     -----
     The miss of a size is stated as a vector: with R the transfer matrix, σ = L Lᵀ the beam at the
-    start and v the first row of R L, the size is |v| and the miss (1 - target/|v|) v. Its square is
-    (size - target)², and where the target is out of reach the linear picture of v still has the
-    curvature that the picture of |v| lacks, so that Gauss-Newton comes to rest there too.
+    start and v the first row of R L, the size is ``|v|`` and the miss ``(1 - target/|v|) v``. Its
+    square is (size - target)², and where the target is out of reach the linear picture of v still
+    has the curvature that that of ``|v|`` lacks, so that Gauss-Newton comes to rest there too.
 
     The predicted beam has the error that the beam matrix gives it at fixed settings. The best
     setting I of a beam σ has ∂f/∂I(I, σ) = 0, so it moves by -(∂²f/∂I²)⁻¹ ∂²f/∂I∂σ dσ; that is its

@@ -1,0 +1,34 @@
+"""The documentation builds without a warning, has every public name, and needs nothing else."""
+
+import re
+import subprocess
+import sys
+
+import pytest
+
+import beamfit
+
+
+@pytest.fixture(scope="module")
+def site(root, tmp_path_factory):
+    """The site without its notebooks' answers, which `test_notebooks` looks at."""
+    place = tmp_path_factory.mktemp("site")
+    call = [sys.executable, "-m", "sphinx", "-W", "--keep-going", "-q", "-b", "html"]
+    call += ["-D", "nb_execution_mode=off", "-d", place / "trees", root / "docs", place / "html"]
+    done = subprocess.run(call, capture_output=True, text=True, cwd=root)
+    assert (done.returncode, done.stderr) == (0, "")
+    return place / "html"
+
+
+def test_nothing_is_fetched_from_elsewhere(site):
+    pages = [*site.rglob("*.html"), *site.rglob("*.css")]
+    assert len(pages) > 20
+    fetched = re.compile(r"""(?:<(?!a )[^>]+(?:src|href)=|url\()["']?(?:https?:)?//""")
+    for page in pages:
+        assert not fetched.search(page.read_text()), page
+
+
+def test_every_public_name_is_in_the_reference(site):
+    reference = (site / "api.html").read_text()
+    missing = [name for name in beamfit._HOME if f'id="beamfit.{name}"' not in reference]
+    assert missing == []
