@@ -14,6 +14,7 @@ from beamfit.errors import InputError
 from beamfit.particles import REST_ENERGY
 from beamfit.studies.scan.assumptions import SCENARIOS
 from beamfit.studies.scan.typed import anchor_of, bounds_of, gains_of, limits_of, priors_of
+from beamfit.writing import check_place
 
 __all__ = ["Sampling", "command_line", "options"]
 
@@ -23,17 +24,11 @@ def _parsed(read: Callable[[Any], Any]) -> Callable[..., Any]:
     return lambda context, parameter, value: None if value is None else read(value)
 
 
-def _check_place(path: str) -> None:
-    from beamfit.sampling.store import check_place
-
-    check_place(path)
-
-
 def _report(path: str) -> str:
     """Find out before anything is computed whether the report could be written."""
     if Path(path).suffix.lower() not in (".html", ".pdf"):
         raise InputError(f"report '{path}'", "a name ending in .html or .pdf")
-    _check_place(path)
+    check_place(path)
     return path
 
 
@@ -223,7 +218,7 @@ class Sampling(NamedTuple):
         if self.store is not None:
             if not self.wanted:
                 raise InputError("--store without --sample", "--sample, which fills the store")
-            _check_place(self.store)
+            check_place(self.store)
 
     def check_one(self, fits: int) -> None:
         """Refuse to keep the draws of several fits in one store."""

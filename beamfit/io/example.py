@@ -7,7 +7,7 @@ from os import PathLike
 from pathlib import Path
 
 from beamfit.errors import InputError
-from beamfit.io.files import write_atomically
+from beamfit.writing import write_atomically
 
 EXAMPLE_FILES = ("scan.csv", "lattice.toml", "decay.csv")
 

@@ -1,4 +1,4 @@
-"""Reading text safely, digests, and writing so that no file is ever half there."""
+"""Reading files safely, and digests of what was read."""
 
 from __future__ import annotations
 
@@ -6,11 +6,9 @@ import hashlib
 import io
 import os
 import stat
-import tempfile
 from collections.abc import Iterator
 from functools import lru_cache
 from os import PathLike
-from pathlib import Path
 from typing import Any
 
 from beamfit.errors import InputError
@@ -152,45 +150,3 @@ def digest(path: str | PathLike[str]) -> str:
     """SHA-256 of a file, as hexadecimal digits."""
     with _opened(path) as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()
-
-
-def write_atomically(path: str | PathLike[str], content: bytes) -> None:
-    """Write a file so that a reader sees the old one or the whole new one, never a part.
-
-    Parameters
-    ----------
-    path : str or path
-        Where to.
-    content : bytes
-        What.
-
-    Raises
-    ------
-    InputError
-        If the place cannot be written.
-
-    Examples
-    --------
-    >>> import tempfile, pathlib
-    >>> target = pathlib.Path(tempfile.mkdtemp()) / "note.txt"
-    >>> write_atomically(target, b"whole")
-    >>> target.read_bytes()
-    b'whole'
-    """
-    target = Path(path)
-    temporary = None
-    try:
-        handle, temporary = tempfile.mkstemp(dir=target.parent, prefix=f".{target.name}.")
-        with os.fdopen(handle, "wb") as stream:
-            stream.write(content)
-            stream.flush()
-            os.fsync(stream.fileno())
-        umask = os.umask(0)
-        os.umask(umask)
-        os.chmod(temporary, 0o666 & ~umask)
-        os.replace(temporary, target)
-    except OSError as error:
-        if temporary is not None and os.path.exists(temporary):
-            os.unlink(temporary)
-        found = f"a place that cannot be written ({error.strerror})"
-        raise InputError(found, "a writable path", path) from None

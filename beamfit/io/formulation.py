@@ -10,12 +10,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from beamfit.errors import InputError
-from beamfit.io.files import read_text, text_lines, write_atomically
+from beamfit.io.files import read_text, text_lines
 from beamfit.language.check import check_document
 from beamfit.language.document import Document
 from beamfit.language.parse import parse_document
 from beamfit.language.text import format_document
 from beamfit.language.xml import format_xml, parse_xml
+from beamfit.writing import write_atomically
 
 if TYPE_CHECKING:
     from beamfit.language.solution import Solution

@@ -5,8 +5,9 @@ from __future__ import annotations
 import os
 
 from beamfit.greybox.mlp import MLP
-from beamfit.io.files import read_text, write_atomically
+from beamfit.io.files import read_text
 from beamfit.language.network import format_network, parse_network
+from beamfit.writing import write_atomically
 
 
 def read_network(path: str | os.PathLike[str]) -> MLP:

@@ -12,8 +12,8 @@ from beamfit.errors import InputError
 from beamfit.greybox import problem
 from beamfit.greybox.problem import Problem
 from beamfit.greybox.traced import Table, traced
-from beamfit.io.files import write_atomically
 from beamfit.io.nl import OPCODES
+from beamfit.writing import write_atomically
 
 CODES = {name: code for code, name in reversed(OPCODES.items())}
 MANY = ("sum", "min", "max")

@@ -14,10 +14,11 @@ import numpy as np
 
 from beamfit import __version__
 from beamfit.errors import InputError
-from beamfit.io.files import read_text, write_atomically
+from beamfit.io.files import read_text
 from beamfit.studies.decay.fit import DecayFit
 from beamfit.studies.scan.fit import EmittanceFit, scenario_of
 from beamfit.studies.scan.known import see
+from beamfit.writing import write_atomically
 
 FORMAT = "beamfit-fit-1"
 HOW = "a file that beamfit.save_fit wrote"

@@ -9,7 +9,6 @@ from pathlib import Path
 from matplotlib import rc_context
 
 from beamfit.errors import InputError
-from beamfit.io.files import write_atomically
 from beamfit.language.solution import Solution
 from beamfit.report.control import control_page
 from beamfit.report.decays import decay_page, study_of
@@ -30,6 +29,7 @@ from beamfit.studies.response.loop import Loop
 from beamfit.studies.scan.fit import EmittanceFit
 from beamfit.studies.scan.size_methods import SizeMethods
 from beamfit.studies.scan.slices import SliceFits
+from beamfit.writing import write_atomically
 
 Reported = EmittanceFit | SliceFits | DecayFit | Solution | ResponseFit | Loop
 

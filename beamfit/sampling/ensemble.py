@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
+from contextlib import nullcontext
 from os import PathLike
 
 import numpy as np
@@ -19,6 +20,7 @@ from beamfit.sampling.store import FROM_PYTHON, Checkpoint, Provenance
 from beamfit.sampling.target import Target
 from beamfit.status import Status
 from beamfit.verdict import judge
+from beamfit.writing import alone
 
 # Steps between two looks at the chain; every decision falls at a multiple, so that a run that was
 # interrupted decides as the uninterrupted one did.
@@ -84,10 +86,21 @@ def draw(
     """
     walkers = walkers or max(FEWEST_WALKERS, 4 * len(target.names))
     _check_options(len(target.names), seed, target_ess, budget, walkers)
-    state = None
-    if store is not None:
-        disk.check_place(store)
-        state = disk.load(store, target, seed, walkers)
+    with nullcontext() if store is None else alone(store):
+        return _drawn(target, seed, target_ess, budget, walkers, store, provenance, progress)
+
+
+def _drawn(
+    target: Target,
+    seed: int,
+    target_ess: float,
+    budget: int,
+    walkers: int,
+    store: str | PathLike[str] | None,
+    provenance: Provenance,
+    progress: bool,
+) -> Posterior:
+    state = None if store is None else disk.load(store, target, seed, walkers)
     if target.open_directions:
         return _refused(target, seed, Status.unidentified, target.open_directions)
     start, random = None, np.random.RandomState(seed)

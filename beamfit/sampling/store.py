@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import hashlib
+import io
 import json
 import os
 import platform
+import re
 import time
 from collections.abc import Mapping
 from importlib.metadata import version
@@ -15,6 +18,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from beamfit.errors import InputError
+from beamfit.writing import write_atomically
 
 if TYPE_CHECKING:
     import h5py
@@ -22,7 +26,11 @@ if TYPE_CHECKING:
     from beamfit.sampling.target import Target
 
 # Another number for every change of what a store holds or of how a problem is told from another.
-KIND, FORMAT = "beamfit-posterior", "2"
+KIND, FORMAT = "beamfit-posterior", "3"
+# Bytes before the HDF5 file (its user block), which hold its digest.
+SEAL = 512
+# Steps whose stored density is computed again.
+RECOMPUTED = 8
 # Agreement of log densities of the same model, compiled by two versions.
 SAME = 1e-6
 PACKAGES = ("emcee", "h5py", "jax", "numpy", "scipy")
@@ -89,23 +97,6 @@ class Checkpoint(NamedTuple):
 def _moved(chain: np.ndarray) -> np.ndarray:
     """Whether each walker moved in each step, shape (steps - 1, walkers)."""
     return np.any(np.diff(chain, axis=0) != 0, axis=2)
-
-
-def check_place(path: str | PathLike[str]) -> None:
-    """Find out before anything is computed whether a store could be written.
-
-    Raises
-    ------
-    InputError
-        If the path is a folder's, or its folder does not exist or may not be written to.
-    """
-    folder = Path(path).parent
-    if Path(path).is_dir():
-        raise InputError("a folder", "the name of a file", path=path)
-    if not folder.is_dir():
-        raise InputError(f"no folder '{folder}'", "a folder that exists", path=path)
-    if not os.access(folder, os.W_OK):
-        raise InputError(f"folder '{folder}' that may not be written to", "another", path=path)
 
 
 def _contents(
@@ -190,27 +181,41 @@ def save(
     import h5py
 
     began = time.perf_counter()
-    path = Path(path)
-    # One name for all attempts: what a killed process left is overwritten, not collected.
-    beside = path.with_name(f".{path.name}.partial")
-    try:
-        with h5py.File(beside, "w") as file:
-            file.attrs["format"], file.attrs["problem"] = f"{KIND}-{FORMAT}", target.digest
-            for name, parts in _contents(target, state, provenance, summary).items():
-                group = file.create_group(name)
-                group.attrs.update(parts[0])
-                for key, values in parts[1].items():
-                    group.create_dataset(key, data=values)
-        with open(beside, "rb+") as stream:
-            os.fsync(stream.fileno())
-        os.replace(beside, path)
-    except OSError as error:
-        beside.unlink(missing_ok=True)
-        cause = error.strerror or "no room, or no permission"
-        raise InputError(
-            f"a store that cannot be written ({cause})", "a writable path", path=path
-        ) from None
+    # In memory: where a disk is full, the HDF5 library ends the process with a segmentation fault.
+    with h5py.File("store", "w", driver="core", backing_store=False) as file:
+        file.attrs["format"], file.attrs["problem"] = f"{KIND}-{FORMAT}", target.digest
+        for name, parts in _contents(target, state, provenance, summary).items():
+            group = file.create_group(name)
+            group.attrs.update(parts[0])
+            for key, values in parts[1].items():
+                group.create_dataset(key, data=values)
+        file.flush()
+        content = sealed(file.id.get_file_image())
+    write_atomically(path, content, f".{Path(path).name}.partial")
     return time.perf_counter() - began
+
+
+def sealed(content: bytes) -> bytes:
+    """An HDF5 file with its digest before it, so that a changed bit is known before it is opened.
+
+    HDF5 passes over what stands there (its user block), and so does whoever reads the file.
+    """
+    said = f"{KIND}-{FORMAT} sha256 {hashlib.sha256(content).hexdigest()}\n"
+    return said.encode().ljust(SEAL, b"\0") + content
+
+
+def _unsealed(content: bytes, path: str | PathLike[str]) -> bytes:
+    """The HDF5 file behind its digest, if that is what it says."""
+    body, told = content[SEAL:], re.match(rf"{KIND}-(\d{{1,9}}) ".encode(), content)
+    if content.startswith(b"\x89HDF"):
+        found = "an HDF5 file that beamfit did not write, or an earlier version did"
+    elif told and told[1].decode() != FORMAT:
+        found = f"a posterior store of format {told[1].decode()}, of another version of beamfit"
+    elif content != sealed(body):
+        found = "a file that is no store, is damaged, or was changed since"
+    else:
+        return body
+    raise InputError(found, f"a posterior store ({KIND}-{FORMAT}){REMEDY}", path=path)
 
 
 def load(path: str | PathLike[str], target: Target, seed: int, walkers: int) -> Checkpoint | None:
@@ -241,23 +246,16 @@ def load(path: str | PathLike[str], target: Target, seed: int, walkers: int) -> 
     import h5py
 
     try:
-        with h5py.File(path, "r") as file:
-            kind, _, number = str(file.attrs.get("format", "")).rpartition("-")
-            if kind != KIND:
-                found = "an HDF5 file that beamfit did not write"
-                raise InputError(found, f"a posterior store ({KIND}-{FORMAT}){REMEDY}", path=path)
-            if number != FORMAT:
-                found = f"a posterior store of format {number}, of another version of beamfit"
-                raise InputError(found, f"format {FORMAT}{REMEDY}", path=path)
+        body = _unsealed(Path(path).read_bytes(), path)
+        with h5py.File(io.BytesIO(body), "r") as file:
             state = _checkpoint(file)
             names = tuple(str(name) for name in file["mcmc"].attrs["names"])
             digest = file.attrs["problem"]
     except InputError:
         raise
     except (OSError, RuntimeError, ValueError, TypeError, KeyError, AttributeError):
-        raise InputError(
-            "a file that is not HDF5, or is damaged", f"a posterior store{REMEDY}", path=path
-        ) from None
+        found = "a store that cannot be read"
+        raise InputError(found, f"a posterior store{REMEDY}", path=path) from None
     difference = _difference(state, names, digest, target, seed, walkers)
     if difference is not None:
         raise InputError(difference[0], f"{difference[1]}{REMEDY}", path=path)
@@ -279,9 +277,9 @@ def _difference(
     if state.chain.shape[1] != walkers:
         return f"a chain of {state.chain.shape[1]} walkers", f"{walkers}"
     # Models are functions, which no digest can compare: their values at the walkers can be.
-    if len(state.chain):
-        now = target.log_probability(state.chain[-1])
-        if not np.allclose(now, state.log_prob[-1], rtol=SAME, atol=1e3 * SAME):
+    for step in range(len(state.chain) - 1, -1, -max(1, len(state.chain) // RECOMPUTED)):
+        now = target.log_probability(state.chain[step])
+        if not np.allclose(now, state.log_prob[step], rtol=SAME, atol=1e3 * SAME):
             return "the posterior of another model (other density)", "one of the present problem"
     return None
 

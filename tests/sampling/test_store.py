@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import json
 import os
+import resource
 import signal
 import subprocess
 import sys
@@ -20,7 +21,8 @@ from beamfit.errors import InputError
 from beamfit.sampling import ensemble
 from beamfit.sampling.ensemble import draw
 from beamfit.sampling.priors import Normal
-from beamfit.sampling.store import Provenance
+from beamfit.sampling.store import SEAL, Provenance, load, save, sealed
+from beamfit.writing import alone
 from tests.sampling.targets import banana, half_normal, target
 
 OPTIONS = {"seed": 5, "target_ess": 1e9, "budget": 700, "walkers": 16}
@@ -185,13 +187,13 @@ def store(tmp_path):
 def test_a_truncated_file_is_refused_and_left(store, share):
     whole = store.read_bytes()
     store.write_bytes(whole[: int(share * len(whole))])
-    assert "not HDF5, or is damaged" in refused(store)
+    assert "is damaged" in refused(store)
 
 
 def test_a_foreign_file_is_refused_and_left(tmp_path):
     path = tmp_path / "other.h5"
     path.write_text("Q2_A,size_x_um\n")
-    assert "not HDF5" in refused(path)
+    assert "is no store" in refused(path)
     with h5py.File(path, "w") as file:
         file["size_x_um"] = np.arange(3.0)
     assert "beamfit did not write" in refused(path)
@@ -242,13 +244,52 @@ def test_checkpoints_are_spaced_by_what_they_cost(tmp_path, monkeypatch):
 
 def test_stores_of_another_format_or_model_are_refused(store):
     """An old one by its number; one of another model by the density at its walkers."""
+    store.write_bytes(store.read_bytes().replace(b"posterior-3", b"posterior-4", 1))
+    assert "a posterior store of format 4" in refused(store)
+    store.write_bytes(store.read_bytes().replace(b"posterior-4", b"posterior-3", 1))
     with h5py.File(store, "a") as file:
-        file.attrs["format"] = "beamfit-posterior-1"
-    assert "a posterior store of format 1" in refused(store)
-    with h5py.File(store, "a") as file:
-        file.attrs["format"] = "beamfit-posterior-2"
-        file["mcmc/log_prob"][-1] += 0.1
+        half = len(file["mcmc/log_prob"]) // 2
+        file["mcmc/log_prob"][half - half // 4 : half] += 0.1
+    assert "was changed since" in refused(store)
+    store.write_bytes(sealed(store.read_bytes()[SEAL:]))
     assert "another model" in refused(store)
+
+
+def test_a_flipped_bit_anywhere_is_found_before_the_file_is_opened(store):
+    whole, random = store.read_bytes(), np.random.default_rng(2)
+    for place in [0, 40, SEAL - 1, SEAL, *random.integers(0, len(whole), 30)]:
+        damaged = bytearray(whole)
+        damaged[place] ^= 1 << int(random.integers(8))
+        store.write_bytes(damaged)
+        said = refused(store)
+        assert "is damaged" in said or "of format" in said
+
+
+def test_one_run_at_a_time_and_no_link_is_followed(store, tmp_path):
+    before = store.read_bytes()
+    with alone(store), pytest.raises(InputError, match="another run is writing"):
+        draw(target(half_normal), seed=1, target_ess=500, store=store)
+    victim = tmp_path / "victim"
+    victim.write_text("mine")
+    store.unlink()
+    (tmp_path / ".chain.h5.partial").symlink_to(victim)
+    draw(target(half_normal), seed=1, target_ess=500, store=store)
+    assert victim.read_text() == "mine"
+    assert store.read_bytes() == before
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["chain.h5", "victim"]
+
+
+def test_a_full_disk_leaves_the_old_store(store, tmp_path):
+    """A limit on the size of files stands for it: HDF5 itself ends in a segmentation fault."""
+    before, limits = store.read_bytes(), resource.getrlimit(resource.RLIMIT_FSIZE)
+    state = load(store, target(half_normal), 1, 64)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (len(before) // 2, limits[1]))
+    try:
+        with pytest.raises(InputError, match="cannot be written"):
+            save(store, target(half_normal), state, Provenance())
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert [path.read_bytes() for path in tmp_path.iterdir()] == [before]
 
 
 def test_a_store_does_not_know_names_of_functions(store):
