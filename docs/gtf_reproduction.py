@@ -23,7 +23,7 @@ from matplotlib.figure import FigureBase
 import beamfit
 from beamfit.greybox.fit import Fit
 from beamfit.greybox.solve import solve
-from beamfit.io.files import digest, write_atomically
+from beamfit.io.files import digest
 from beamfit.optics.beam import BeamMatrix
 from beamfit.optics.beamline import Beamline
 from beamfit.report.document import (
@@ -43,6 +43,7 @@ from beamfit.studies.scan.fit import EmittanceFit, fit_emittance
 from beamfit.studies.scan.known import see
 from beamfit.studies.scan.model import UNIT
 from beamfit.studies.scan.scans import QuadScan
+from beamfit.writing import write_atomically
 from beamfit.studies.scan.transport import transfer_rows
 from beamfit.studies.scan.transport_network import SCENARIO
 from beamfit.table import Table
