@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from functools import lru_cache
 
 # Units at the end of a header, as the columns' names have them.
 KNOWN = ("um", "mm", "m", "µm", "μm", "s", "min", "h", "d", "ms", "mA", "A", "uA", "µA", "μA")
 KNOWN += ("kV", "V", "MV", "Pa", "mbar", "Torr", "MeV", "kG", "T_per_m", "k1", "k1l")
+ENDS = tuple(f"_{unit}" for unit in KNOWN)
 # Other ways to write one; in capitals or small letters no other unit is meant by these.
 ALSO = {"T/m": "T_per_m", "1/m^2": "k1", "1/m2": "k1", "1/m²": "k1", "m^-2": "k1", "m-2": "k1"}
 ALSO |= {"m⁻²": "k1", "1/m": "k1l", "m^-1": "k1l", "mm rms": "mm", "um rms": "um", "micron": "um"}
@@ -27,6 +29,7 @@ def _unit(text: str) -> str | None:
     return text if text in KNOWN else ALSO.get(text)
 
 
+@lru_cache(maxsize=4096)  # a year's files have the headers of the first
 def spelled(header: str) -> str:
     """A header as ``name_unit``; as it stands where it has no unit.
 
@@ -39,7 +42,7 @@ def spelled(header: str) -> str:
         name, unit = found[1], next(part for part in found.groups()[1:] if part is not None)
         if (known := _unit(unit)) is not None:
             return re.sub(r"\s+", "_", f"{name.strip()}_{known}")
-    if any(header.endswith(f"_{unit}") for unit in KNOWN):
+    if header.endswith(ENDS):
         return header
     for unit, known in ALSO.items():
         if re.search(rf"[\s_]{re.escape(unit)}$", header):
@@ -49,7 +52,7 @@ def spelled(header: str) -> str:
 
 
 def _has_unit(header: str) -> bool:
-    return any(spelled(header).endswith(f"_{unit}") for unit in KNOWN)
+    return spelled(header).endswith(ENDS)
 
 
 def with_units(names: Sequence[str], cells: Sequence[str]) -> list[str] | None:
@@ -120,8 +123,8 @@ def uncommented(lines: Sequence[str]) -> list[str]:
     above = found[first - 1].strip() if first else ""
     if above.startswith("#"):
         cells, words = _words(found[first]), _words(above.lstrip("# "))
-        units = any(map(_has_unit, words)) and not any(map(is_number, words))
-        if units and len(words) == len(cells) and all(map(is_number, cells)):
+        numbers = len(words) == len(cells) and all(map(is_number, cells))
+        if numbers and any(map(_has_unit, words)) and not any(map(is_number, words)):
             found[first - 1] = above.lstrip("# ")
     return found
 
