@@ -134,12 +134,8 @@ def fit_emittance(
     ties = (gains or {}, anchor or Anchor(), hysteresis)
     told = Assumptions(priors or {}, bounds or {}, *ties, hidden, starts, seed)
     told.check_scenario(scenario, robust)
-    if len(scan.slices) > 1:
-        found = f"a scan of {len(scan.slices)} slices of the beam"
-        raise scan.unusable(found, "rows of one, as scan.of_slice(name) gives")
-    line = rows_line(scan) if line is None else line
-    _check_own(scan, line, scenario)
-    statement, scan = scenario_of(scenario), scan.of_particle(line.mass)
+    scan, line = prepared(scan, line, scenario)
+    statement = scenario_of(scenario)
     if told.systematics:
         from beamfit.studies.scan.systematics import with_systematics
 
@@ -158,6 +154,24 @@ def fit_emittance(
     identified = all(p.identifiability.determined for p in judged)
     left = statement.null_directions(seen, parameters, identified)
     return EmittanceFit(judged, scan, found, statement, told, seen, parameters, left, fit)
+
+
+def prepared(
+    scan: QuadScan, line: Beamline | None, scenario: str = "known"
+) -> tuple[QuadScan, Beamline]:
+    """A scan of one beam with total energies, and its line.
+
+    Raises
+    ------
+    InputError
+        If it is of several slices, or its matrices are both given and unknown.
+    """
+    if len(scan.slices) > 1:
+        found = f"a scan of {len(scan.slices)} slices of the beam"
+        raise scan.unusable(found, "rows of one, as scan.of_slice(name) gives")
+    line = rows_line(scan) if line is None else line
+    _check_own(scan, line, scenario)
+    return scan.of_particle(line.mass), line
 
 
 def _check_own(scan: QuadScan, line: Beamline, scenario: str) -> None:

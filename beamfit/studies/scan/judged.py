@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -192,22 +193,29 @@ def upper_limit(sigma: np.ndarray, covariance: np.ndarray, rests_on: float) -> f
     >>> upper_limit(np.array([1.0, 0.0, -1.0]), covariance, math.inf) is None
     True
     """
-    draws = np.random.default_rng(0)
     norm = np.sqrt(np.diag(covariance))
     if not (rests_on > 0 and np.isfinite(norm).all() and np.all(norm > 0)):
         return None
     # Half the root of the matrix of correlations: the numbers differ by orders of magnitude.
     values, vectors = np.linalg.eigh(covariance / np.outer(norm, norm))
     root = vectors * np.sqrt(np.maximum(values, 0.0))
-    z = draws.standard_normal((DRAWS, 3))
-    if math.isfinite(rests_on):
-        z /= np.sqrt(draws.chisquare(rests_on, (DRAWS, 1)) / rests_on)
+    z = _draws(float(rests_on))
     s11, s12, s22 = (sigma + (z @ root.T) * norm).T
     determinant = s11 * s22 - s12**2
     beams = determinant[(s11 > 0) & (determinant > 0)]
     if len(beams) < ENOUGH:
         return None
     return float(np.sqrt(np.quantile(beams, 0.95)))
+
+
+@lru_cache(maxsize=16)
+def _draws(rests_on: float) -> np.ndarray:
+    """Of the t distribution in three dimensions: the same ones for every scan."""
+    draws = np.random.default_rng(0)
+    z = draws.standard_normal((DRAWS, 3))
+    if math.isfinite(rests_on):
+        z /= np.sqrt(draws.chisquare(rests_on, (DRAWS, 1)) / rests_on)
+    return z
 
 
 def units_of(sigma: np.ndarray) -> list[float]:

@@ -89,6 +89,26 @@ def see(
     InputError
         If the line lacks a magnet or screen of the scan, or a plane was not measured.
     """
+    seen = unfitted(scan, line, planes, method, robust, weights)
+    # Noise that is inferred is fitted in two ways, by the same program.
+    if robust or not at_once or not all(noise.known for noise in seen.noises.values()):
+        look = jax.tree.map(np.asarray, look_through(seen.rows))
+        seen = seen._replace(look=look, works=works_of(seen, look, tuple(seen.noises)))
+        other = of_other_kind(seen)
+        return likelier(seen, works_of(other, look, tuple(other.noises)) if other else {})
+    look, found = _look_and_fit(seen.rows, sizes_of(seen), method, weights)
+    return fitted(seen._replace(look=jax.tree.map(np.asarray, look)), found)
+
+
+def unfitted(
+    scan: QuadScan,
+    line: Beamline,
+    planes: tuple[str, ...] | None = None,
+    method: str = METHODS[0],
+    robust: bool = False,
+    weights: str = WEIGHTS[0],
+) -> Seen:
+    """The scan and its line as `see` takes them, checked, without the look and the fits."""
     check_names(scan, *names_of(line))
     asked = planes or scan.planes
     for plane in asked:
@@ -97,32 +117,34 @@ def see(
     check_gradients(scan, scanned)
     rows = scan_rows(scan, scanned, method == METHODS[0])
     # A plane that is not asked for still testifies to the settings and the optics.
-    planes = tuple(dict.fromkeys((*asked, *scan.planes)))
-    noises = {plane: noise_of(scan, plane) for plane in planes}
-    seen = Seen(scan, line, scanned, asked, method, robust, weights, rows, noises, None, {})
-    # Noise that is inferred is fitted in two ways, by the same program.
-    if robust or not at_once or not all(noise.known for noise in noises.values()):
-        look = jax.tree.map(np.asarray, look_through(rows))
-        return _of_its_kind(seen._replace(look=look, works=works_of(seen, look, planes)))
-    sizes = _sizes(seen, {plane: noises[plane].error for plane in planes})
-    look, found = jax.tree.map(np.asarray, _look_and_fit(rows, sizes, method, weights))
-    works = {p: _work(seen, p, look, found, i) for i, p in enumerate(planes)}
-    return _of_its_kind(seen._replace(look=look, works=works))
+    noises = {plane: noise_of(scan, plane) for plane in dict.fromkeys((*asked, *scan.planes))}
+    return Seen(scan, line, scanned, asked, method, robust, weights, rows, noises, None, {})
 
 
-def _of_its_kind(seen: Seen) -> Seen:
-    """Where noise is inferred, fit with the same µm at every point too, and take the likelier."""
+def fitted(seen: Seen, found: ClosedForm) -> Seen:
+    """The same with the closed form of every plane that has a noise, in their order."""
+    found = jax.tree.map(np.asarray, found)
+    works = {p: _work(seen, p, seen.look, found, i) for i, p in enumerate(seen.noises)}
+    return seen._replace(works=works)
+
+
+def of_other_kind(seen: Seen) -> Seen | None:
+    """Where noise is inferred, the planes with the same µm at every point; None if there are none.
+
+    ``noises`` and ``works`` are of those planes alone.
+    """
     planes = [p for p, noise in seen.noises.items() if not noise.known]
     planes = [p for p in planes if len(seen.measured(p)) >= ENOUGH_POINTS]
-    if not planes:
-        return seen
     noises = {p: constant_noise(seen.works[p].points.size) for p in planes}
-    others = works_of(seen._replace(noises=seen.noises | noises), seen.look, tuple(planes))
-    likelier = [p for p in planes if _unlikely(others[p], 0.0) < _unlikely(seen.works[p], 1.0)]
-    return seen._replace(
-        noises=seen.noises | {p: noises[p] for p in likelier},
-        works=seen.works | {p: others[p] for p in likelier},
-    )
+    return seen._replace(noises=noises, works={}) if planes else None
+
+
+def likelier(seen: Seen, others: dict[str, Work]) -> Seen:
+    """Take of the two kinds of noise the likelier."""
+    better = [p for p in others if _unlikely(others[p], 0.0) < _unlikely(seen.works[p], 1.0)]
+    noises = {p: constant_noise(seen.works[p].points.size) for p in better}
+    works = {p: others[p] for p in better}
+    return seen._replace(noises=seen.noises | noises, works=seen.works | works)
 
 
 def _unlikely(work: Work, relative: float) -> float:
@@ -139,8 +161,8 @@ def works_of(seen: Seen, look: Look, planes: tuple[str, ...]) -> dict[str, Work]
     """Fit planes in closed form, given what is seen of them."""
     doubts = {plane: _doubt(seen, look, plane) if seen.robust else None for plane in planes}
     errors = {p: seen.noises[p].error if d is None else d.error for p, d in doubts.items()}
-    sizes = _sizes(seen, errors)
-    found = jax.tree.map(np.asarray, _fit(look, sizes, seen.method, seen.weights))
+    sizes = sizes_of(seen, errors)
+    found = jax.tree.map(np.asarray, fit_look(look, sizes, seen.method, seen.weights))
     return {p: _work(seen, p, look, found, i, doubts[p]) for i, p in enumerate(planes)}
 
 
@@ -161,7 +183,10 @@ class _Sizes(NamedTuple):
     design: np.ndarray
 
 
-def _sizes(seen: Seen, errors: dict[str, np.ndarray]) -> _Sizes:
+def sizes_of(seen: Seen, errors: dict[str, np.ndarray] | None = None) -> _Sizes:
+    """The planes that have an error; that of their noise unless given."""
+    if errors is None:
+        errors = {plane: noise.error for plane, noise in seen.noises.items()}
     shape = (2, len(seen.rows.energy))
     found = _Sizes(
         np.zeros(2, int),
@@ -182,7 +207,8 @@ def _sizes(seen: Seen, errors: dict[str, np.ndarray]) -> _Sizes:
 
 
 @partial(jax.jit, static_argnames=("method", "weights"))
-def _fit(look: Look, sizes: _Sizes, method: str, weights: str) -> ClosedForm:
+def fit_look(look: Look, sizes: _Sizes, method: str, weights: str) -> ClosedForm:
+    """Fit the planes of a look in closed form."""
     r11, r12, known, *places = (part[sizes.which] for part in look)
     rows = SizeData(r11, r12, known, sizes.size, sizes.error, sizes.relative)
     return closed_form(rows, sizes.factor, *places, sizes.design, method, weights)
@@ -191,7 +217,7 @@ def _fit(look: Look, sizes: _Sizes, method: str, weights: str) -> ClosedForm:
 @partial(jax.jit, static_argnames=("method", "weights"))
 def _look_and_fit(rows: Rows, sizes: _Sizes, method: str, weights: str) -> tuple[Look, ClosedForm]:
     look = look_through(rows)
-    return look, _fit(look, sizes, method, weights)
+    return look, fit_look(look, sizes, method, weights)
 
 
 def _work(

@@ -1,0 +1,127 @@
+"""Many scans of known transport in one call: those whose rows have one shape are one vmap."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from functools import partial
+from typing import Any
+
+import jax
+import numpy as np
+
+from beamfit.errors import InputError
+from beamfit.optics.beamline import Beamline
+from beamfit.studies.scan.assumptions import Assumptions
+from beamfit.studies.scan.fit import EmittanceFit, prepared, scenario_of
+from beamfit.studies.scan.judged import judged_beam
+from beamfit.studies.scan.known import (
+    METHODS,
+    fit_look,
+    fitted,
+    likelier,
+    of_other_kind,
+    sizes_of,
+    unfitted,
+)
+from beamfit.studies.scan.scans import QuadScan
+from beamfit.studies.scan.statement import Seen
+from beamfit.studies.scan.transport import look_through
+
+# How many a call is compiled for, and what bounds them: rows times the longest of their arrays.
+FEW, LANES, ROOM = 16, 256, 1 << 20
+
+
+def fit_many(
+    scans: Iterable[QuadScan], line: Beamline | None = None, weights: str = "model"
+) -> list[EmittanceFit | InputError]:
+    """Fit the emittance to each of many scans of one line: what `fit_emittance` gives of each.
+
+    Parameters
+    ----------
+    scans : iterable of QuadScan
+        The scans; hundreds at a time.
+    line : Beamline, optional
+        Their line; None where rows have matrices of their own.
+    weights : {"model", "measured"}
+        As for `beamfit.fit_emittance`.
+
+    Returns
+    -------
+    list of EmittanceFit or InputError
+        One a scan, in their order: its fit, or what is wrong with it.
+
+    Examples
+    --------
+    >>> from beamfit.optics.elements import Drift, Quadrupole, Screen
+    >>> line = Beamline((Quadrupole("Q", 0.1), Drift("D", 2.0), Screen("S")), 135.0)
+    >>> k1, sizes = [-1.0, 1.5, 4.0, 6.5, 9.0], np.array([3.4e-4, 1.9e-4, 0.9e-4, 1.9e-4, 3.4e-4])
+    >>> scans = [QuadScan({"Q": k1}, {"Q": "k1"}, {"x": f * sizes}) for f in (1.0, 2.0)]
+    >>> one, other = fit_many(scans, line)
+    >>> round(other.x.emittance.value / one.x.emittance.value, 9)
+    4.0
+    """
+    found: list[EmittanceFit | InputError | None] = []
+    begun: dict[int, Seen] = {}
+    for i, scan in enumerate(scans):
+        try:
+            own, through = prepared(scan, line)
+            begun[i] = unfitted(own, through, None, METHODS[0], False, weights)
+            found.append(None)
+        except InputError as error:
+            found.append(error)
+    for i, seen in zip(begun, _fitted(list(begun.values()), weights), strict=True):
+        own = (seen.scan, seen.line, scenario_of("known"), Assumptions())
+        found[i] = EmittanceFit(judged_beam(seen), *own, seen)
+    return found
+
+
+def _fitted(begun: Sequence[Seen], weights: str) -> list[Seen]:
+    """Look through the lines and fit, with inferred noise in two ways, as `see` does."""
+    looks = _together(look_through, [(seen.rows,) for seen in begun])
+    seen = [s._replace(look=look) for s, look in zip(begun, looks, strict=True)]
+    fit = partial(_planes, weights=weights)
+    seen = fit(seen)
+    others = {i: other for i, s in enumerate(seen) if (other := of_other_kind(s))}
+    for i, other in zip(others, fit(list(others.values())), strict=True):
+        seen[i] = likelier(seen[i], other.works)
+    return seen
+
+
+def _planes(seen: Sequence[Seen], weights: str) -> list[Seen]:
+    given = [(s.look, sizes_of(s)) for s in seen]
+    found = _together(fit_look, given, METHODS[0], weights)
+    return [fitted(s, own) for s, own in zip(seen, found, strict=True)]
+
+
+def _together(function: Callable[..., Any], given: Sequence[tuple], *static: str) -> list[Any]:
+    """What a function gives of each, as NumPy arrays; those of one shape are one call."""
+    found: list[Any] = [None] * len(given)
+    alike: dict[Any, list[tuple[int, list[Any]]]] = {}
+    for i, each in enumerate(given):
+        leaves, kind = jax.tree.flatten(each)
+        alike.setdefault((kind, *map(np.shape, leaves)), []).append((i, leaves))
+    for (kind, *shapes), members in alike.items():
+        largest = max(map(np.prod, shapes))
+        most = int(np.clip(ROOM // max(largest**2, 1), 1, LANES))
+        lanes = min(most, FEW if len(members) <= FEW else LANES)
+        for start in range(0, len(members), lanes):
+            own = members[start : start + lanes]
+            several = _called(function, kind, [leaves for _, leaves in own], lanes, static)
+            for lane, (i, _) in enumerate(own):
+                found[i] = jax.tree.map(lambda a, lane=lane: a[lane], several)
+    return found
+
+
+def _called(function: Callable[..., Any], kind: Any, rows: list, lanes: int, static: tuple) -> Any:
+    """One call; lanes to spare repeat the last."""
+    rows = [*rows, *rows[-1:] * (lanes - len(rows))]
+    columns = [np.stack(column) for column in zip(*rows, strict=True)]
+    return jax.tree.map(np.asarray, _mapped(columns, function, kind, static))
+
+
+@partial(jax.jit, static_argnums=(1, 2, 3))
+def _mapped(columns: list, function: Callable, kind: Any, static: tuple) -> Any:
+    def one(leaves: list) -> Any:
+        return function(*jax.tree.unflatten(kind, leaves), *static)
+
+    return jax.vmap(one)(columns)
