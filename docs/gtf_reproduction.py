@@ -43,10 +43,10 @@ from beamfit.studies.scan.fit import EmittanceFit, fit_emittance
 from beamfit.studies.scan.known import see
 from beamfit.studies.scan.model import UNIT
 from beamfit.studies.scan.scans import QuadScan
-from beamfit.writing import write_atomically
 from beamfit.studies.scan.transport import transfer_rows
 from beamfit.studies.scan.transport_network import SCENARIO
 from beamfit.table import Table
+from beamfit.writing import write_atomically
 
 ROOT = Path(__file__).resolve().parents[1]
 INPUTS = ("measurements/gtf_simulated.csv", "lattices/gtf.toml")

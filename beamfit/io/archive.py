@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import json
 import re
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from beamfit.errors import InputError
-from beamfit.io.files import digest, text_lines
+from beamfit.io.files import digest, read_json, text_lines
 from beamfit.io.table import HDF5, UNITS, Sheet, read_sheet
 
 if TYPE_CHECKING:
@@ -35,8 +34,8 @@ def archive_sheet(path: str | PathLike[str] | DataFrame, skip_bad: bool) -> Shee
 def _archive_json(path: str | PathLike[str]) -> Sheet:
     """Of the EPICS Archiver Appliance: one channel with its data."""
     expected = 'one channel of the EPICS Archiver Appliance: [{"meta": …, "data": [{"secs": …}]}]'
+    channels = read_json(path, "another JSON file", expected)
     try:
-        channels = json.loads("\n".join(text_lines(path)))
         if len(channels) != 1:
             raise InputError(f"{len(channels)} channels", "one: the beam current", path=path)
         meta, data = channels[0].get("meta", {}), channels[0]["data"]

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import hashlib
 import io
+import json
 import os
+import select
 import stat
 from collections.abc import Iterator
 from functools import lru_cache
 from os import PathLike
-from typing import Any
+from typing import Any, BinaryIO
 
 from beamfit.errors import InputError
 
@@ -27,29 +29,46 @@ SIGNATURES = {
 # ° ± ² ³ µ in the code pages of Windows, and what needs none.
 MARKS, ASCII = bytes([0xB0, 0xB1, 0xB2, 0xB3, 0xB5]), bytes(range(128))
 LARGEST_TEXT = 4_000_000
+LARGEST_JSON = 64_000_000
 LARGEST_PIPE = 256_000_000
+# Seconds after which a pipe that gives nothing is given up.
+SILENCE = 30.0
+# SHA-256 of what was last read whole, by path: a file may change after that.
+_READ: dict[str, str] = {}
 
 
 @lru_cache(maxsize=8)
-def _piped(path: str) -> bytes:
+def _piped(path: str, inode: int) -> bytes:
     """What a pipe gives: it can be read once, and is looked at several times."""
-    with open(path, "rb") as stream:
-        content = stream.read(LARGEST_PIPE + 1)
-    if len(content) > LARGEST_PIPE:
-        found = f"more than {LARGEST_PIPE // 1_000_000} MB from a pipe"
-        raise InputError(found, "a file, for so much", path=path)
-    return content
+    parts, size = [], 0
+    with open(os.open(path, os.O_RDONLY | os.O_NONBLOCK), "rb", buffering=0) as stream:
+        while select.select([stream], [], [], SILENCE)[0]:
+            if not (part := stream.read(1 << 20)):
+                return b"".join(parts)
+            parts.append(part)
+            size += len(part)
+            if size > LARGEST_PIPE:
+                found = f"more than {LARGEST_PIPE // 1_000_000} MB from a pipe"
+                raise InputError(found, "a file, for so much", path=path)
+    expected = "a program that writes into it, or a file"
+    raise InputError(f"a pipe that gives nothing for {SILENCE:.0f} s", expected, path=path)
 
 
-def _opened(path: str | PathLike[str]):
+def _opened(path: str | PathLike[str]) -> BinaryIO:
+    """A file or a pipe, open to be read; what else has a name may never end, or never begin."""
     try:
-        if stat.S_ISFIFO(os.stat(path).st_mode):
-            return io.BytesIO(_piped(os.fspath(path)))
+        about = os.stat(path)
+        if stat.S_ISFIFO(about.st_mode):
+            return io.BytesIO(_piped(os.fspath(path), about.st_ino))
+        if not stat.S_ISREG(about.st_mode) and not stat.S_ISDIR(about.st_mode):
+            raise InputError("a device or a socket", "a file or a pipe", path=path)
         return open(path, "rb")
     except FileNotFoundError:
         raise InputError("no such file", "a readable file", path=path) from None
     except IsADirectoryError:
         raise InputError("a directory", "a file", path=path) from None
+    except InputError:
+        raise
     except (OSError, ValueError) as error:  # a name with a zero byte is a ValueError
         cause = getattr(error, "strerror", None) or error
         raise InputError(f"a file that cannot be read ({cause})", "a readable file", path) from None
@@ -61,7 +80,7 @@ def text_lines(path: str | PathLike[str], seen: Any = None) -> Iterator[str]:
     Parameters
     ----------
     path : str or path
-        The file.
+        The file. Lines end with a line feed, a carriage return, or both.
     seen : hash object, optional
         Is fed what was read, so that a digest needs no second reading.
 
@@ -76,12 +95,9 @@ def text_lines(path: str | PathLike[str], seen: Any = None) -> Iterator[str]:
         If the file cannot be opened, is empty, is binary, is not UTF-8 (µ and ° of Windows and
         comments apart), or has a line longer than any text table has.
     """
-    number = 0
+    number, seen = 0, seen or hashlib.sha256()
     with _opened(path) as stream:
-        while raw := stream.readline(LONGEST_LINE + 1):
-            number += 1
-            if seen is not None:
-                seen.update(raw)
+        for number, raw in enumerate(_raw_lines(stream, seen), start=1):
             if number == 1:
                 _check_signature(raw, path)
             if b"\0" in raw:
@@ -92,6 +108,22 @@ def text_lines(path: str | PathLike[str], seen: Any = None) -> Iterator[str]:
             yield _decoded(raw, path, number).rstrip("\r\n")
     if number == 0:
         raise InputError("an empty file", "a file with content", path=path)
+    remember(path, seen)
+
+
+def _raw_lines(stream: BinaryIO, seen: Any) -> Iterator[bytes]:
+    """Lines with their ends; of one that is too long a part."""
+    left = b""
+    while block := stream.read(1 << 16):
+        seen.update(block)
+        lines = (left + block).splitlines(keepends=True)
+        # A carriage return at the end of a block may have its line feed in the next one.
+        left = b"" if lines[-1].endswith(b"\n") else lines.pop()
+        yield from lines
+        if len(left) > LONGEST_LINE:
+            break
+    if left:
+        yield left
 
 
 def _decoded(raw: bytes, path: str | PathLike[str], number: int) -> str:
@@ -143,10 +175,34 @@ def read_bytes(path: str | PathLike[str], most: int, expected: str) -> tuple[byt
         raise InputError("an empty file", "a file with content", path=path)
     if len(content) > most:
         raise InputError(f"more than {most // 1_000_000} MB", expected, path=path)
-    return content, hashlib.sha256(content).hexdigest()
+    return content, remember(path, hashlib.sha256(content))
+
+
+def read_json(path: str | PathLike[str], found: str, expected: str) -> Any:
+    """Read a JSON file.
+
+    Raises
+    ------
+    InputError
+        If it cannot be read; with ``found`` and ``expected`` if it does not parse or lies deeper
+        in itself than can be followed. An integer of hundreds of digits is infinite.
+    """
+    content, _ = read_bytes(path, LARGEST_JSON, expected)
+    try:
+        return json.loads(content, parse_int=lambda t: int(t) if len(t) < 300 else float(t))
+    except (ValueError, RecursionError):
+        raise InputError(found, expected, path=path) from None
+
+
+def remember(path: str | PathLike[str], seen: Any) -> str:
+    """Keep the digest of what was read of a file, and give it."""
+    found = _READ[os.path.abspath(path)] = seen.hexdigest()
+    return found
 
 
 def digest(path: str | PathLike[str]) -> str:
-    """SHA-256 of a file, as hexadecimal digits."""
+    """SHA-256, as hexadecimal digits: of what was last read of a file, else of what it holds."""
+    if (known := _READ.get(os.path.abspath(path))) is not None:
+        return known
     with _opened(path) as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()

@@ -11,6 +11,7 @@ import numpy as np
 
 from beamfit.errors import InputError
 from beamfit.io.files import read_text, text_lines
+from beamfit.io.numeric import check_length
 from beamfit.language.check import check_document
 from beamfit.language.document import Document
 from beamfit.language.parse import parse_document
@@ -20,6 +21,8 @@ from beamfit.writing import write_atomically
 
 if TYPE_CHECKING:
     from beamfit.language.solution import Solution
+
+MOST_NUMBERS = 4_000_000
 
 
 def read_formulation(path: str | PathLike[str]) -> Document:
@@ -121,6 +124,7 @@ def read_numbers(path: str | PathLike[str]) -> np.ndarray:
         if rows and len(row) != len(rows[0]):
             raise InputError(f"{len(row)} numbers", f"{len(rows[0])} as above", path, number)
         rows.append(row)
+        check_length(len(rows) * len(row), MOST_NUMBERS, path, number)
     if not rows:
         raise InputError("no numbers", "rows of numbers", path)
     return np.array(rows)

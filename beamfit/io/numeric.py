@@ -11,6 +11,9 @@ from os import PathLike
 
 import numpy as np
 
+from beamfit.errors import InputError
+from beamfit.io.files import remember
+
 # Bytes from which a file is worth it, and how many are read at a time.
 LARGE, BLOCK = 1_000_000, 1 << 23
 # What numbers and what stands between them are written with.
@@ -19,7 +22,7 @@ USUAL[list(b"0123456789+-.eE,;\t \r\n")] = True
 
 
 def numeric_rows(
-    path: str | PathLike[str], first: int, separator: str, columns: int, most: int | None = None
+    path: str | PathLike[str], first: int, separator: str, columns: int, most: int
 ) -> tuple[np.ndarray, str] | None:
     """Read the rows of a large file that holds nothing but finite numbers from a line on.
 
@@ -33,26 +36,31 @@ def numeric_rows(
         Between cells; a blank stands for any number of blanks.
     columns : int
         Cells of a row.
-    most : int, optional
+    most : int
         Most rows there may be.
 
     Returns
     -------
     (array, shape (columns, n), and str), or None
-        The values, and the digest of the file. None if the file is small, has more rows, or a
-        line is anything but so many finite numbers: whoever reads line by line says which.
+        The values, and the digest of the file. None if the file is small, or a line is anything
+        but so many finite numbers: whoever reads line by line says which.
+
+    Raises
+    ------
+    InputError
+        If there are more rows.
 
     Examples
     --------
     >>> import tempfile, pathlib
     >>> file = pathlib.Path(tempfile.mkdtemp()) / "a.csv"
     >>> _ = file.write_text("s,mA\\n" + "1.0,2.0\\n" * 200_000)
-    >>> numeric_rows(file, 2, ",", 2)[0].shape
+    >>> numeric_rows(file, 2, ",", 2, 10**6)[0].shape
     (2, 200000)
     """
     if os.path.getsize(path) < LARGE:
         return None
-    seen, parts = hashlib.sha256(), []
+    seen, parts, count = hashlib.sha256(), [], 0
     with open(path, "rb") as stream:
         for _ in range(first - 1):
             seen.update(stream.readline())
@@ -62,9 +70,16 @@ def numeric_rows(
             if rows is None:
                 return None
             parts.append(rows)
-            if most is not None and sum(part.shape[1] for part in parts) > most:
-                return None
-    return np.concatenate(parts, axis=1), seen.hexdigest()
+            count += rows.shape[1]
+            check_length(count, most, path, first + most)
+    return np.concatenate(parts, axis=1), remember(path, seen)
+
+
+def check_length(rows: int, most: int, path: str | PathLike[str], line: int | None = None) -> None:
+    """Refuse more rows than can be meant."""
+    if rows > most:
+        expected = "fewer: average what is repeated, or cut the file"
+        raise InputError(f"more than {most} rows", expected, path=path, line=line)
 
 
 def _blocks(stream) -> Iterator[bytes]:

@@ -6,13 +6,13 @@ import json
 import math
 from collections.abc import Mapping, Sequence
 from os import PathLike
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from beamfit import __version__
 from beamfit.errors import InputError
+from beamfit.io.files import read_json
 from beamfit.studies.scan.scans import PROJECTED
 from beamfit.studies.scan.wishes import Beam
 from beamfit.table import json_of
@@ -86,6 +86,7 @@ def read_fitted_beams(
     Examples
     --------
     >>> import tempfile
+    >>> from pathlib import Path
     >>> file = Path(tempfile.mkdtemp()) / "fit.json"
     >>> entry = {"plane": "x", "status": "converged", "message": "Good.", "covariance": None}
     >>> entry |= {f"sigma{k}": {"value": 1e-8, "error": None} for k in ("11", "12", "22")}
@@ -94,8 +95,8 @@ def read_fitted_beams(
     >>> beam.sigma.tolist(), beam.doubt
     ([1e-08, 1e-08, 1e-08], 'sigma11, sigma12, sigma22 have no error (converged: Good.)')
     """
+    document = read_json(path, "no fitted beams", HOW)
     try:
-        document = json.loads(Path(path).read_text())
         entries = [e for e in document["results"] if e.get("slice", PROJECTED) == PROJECTED]
         found = {entry["plane"]: _beam(entry, rest_energy) for entry in entries}
         told = all("line" in entry for entry in entries) or "inputs" not in document
@@ -105,9 +106,7 @@ def read_fitted_beams(
     except InputError as error:
         error.path = path
         raise
-    except OSError as error:
-        raise InputError(f"no readable file ({error.strerror})", HOW, path=path) from None
-    except (ValueError, KeyError, TypeError, AttributeError):
+    except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError):
         raise InputError("no fitted beams", HOW, path=path) from None
     if not found:
         raise InputError("no result of the whole beam in the file", HOW, path=path)

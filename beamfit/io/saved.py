@@ -14,13 +14,15 @@ import numpy as np
 
 from beamfit import __version__
 from beamfit.errors import InputError
-from beamfit.io.files import read_text
+from beamfit.io.files import read_json
 from beamfit.studies.decay.fit import DecayFit
 from beamfit.studies.scan.fit import EmittanceFit, scenario_of
 from beamfit.studies.scan.known import see
 from beamfit.writing import write_atomically
 
 FORMAT = "beamfit-fit-1"
+# What values of other kinds than a fit has may raise.
+UNREADABLE = (ArithmeticError, AttributeError, LookupError, RecursionError, TypeError, ValueError)
 HOW = "a file that beamfit.save_fit wrote"
 # What a file may hold, by name, and where it is defined. A file names these and nothing else.
 SCAN, DECAY, OPTICS = "beamfit.studies.scan", "beamfit.studies.decay", "beamfit.optics"
@@ -122,15 +124,13 @@ def load_fit(path: str | PathLike[str]) -> EmittanceFit | DecayFit:
     Traceback (most recent call last):
     beamfit.errors.InputError: fit.json: no such file; expected a readable file
     """
+    document = read_json(path, "no saved fit", HOW)
     try:
-        document = json.loads(read_text(path))
         known = document["format"] == FORMAT
         version = (
             f"format {str(document['format'])[:40]}, of beamfit {str(document['beamfit'])[:20]}"
         )
-    except (ValueError, KeyError, TypeError) as error:
-        if isinstance(error, InputError):
-            raise
+    except (KeyError, TypeError):
         raise InputError("no saved fit", HOW, path=path) from None
     if not known:
         expected = f"format {FORMAT}; load it with that version, or fit again"
@@ -140,7 +140,14 @@ def load_fit(path: str | PathLike[str]) -> EmittanceFit | DecayFit:
     except InputError as error:
         error.path = path
         raise
-    except (ValueError, KeyError, TypeError, AttributeError, IndexError, OverflowError) as error:
+    except (
+        ArithmeticError,
+        AttributeError,
+        LookupError,
+        RecursionError,
+        TypeError,
+        ValueError,
+    ) as error:
         found = f"a fit saved by beamfit {version.split()[-1]} that cannot be read here"
         raise InputError(f"{found} ({type(error).__name__})", HOW, path=path) from None
 
@@ -193,6 +200,14 @@ def _named(value: Any) -> str:
     return name
 
 
+def _type(said: str) -> np.dtype:
+    """The type of an array that a fit may hold: a number, or a short text."""
+    found = np.dtype(said)
+    if found.kind not in "biufU" or found.itemsize > 4000:
+        raise ValueError(said)
+    return found
+
+
 def _value(plain: Any) -> Any:
     """The value that `_plain` made this of."""
     if isinstance(plain, list):
@@ -205,7 +220,7 @@ def _value(plain: Any) -> Any:
         case "tuple":
             return tuple(_value(v) for v in plain["of"])
         case "array":
-            numbers = np.array([_value(v) for v in plain["of"]], np.dtype(plain["type"]))
+            numbers = np.array([_value(v) for v in plain["of"]], _type(plain["type"]))
             return numbers.reshape(plain["shape"])
         case "float":
             return float(plain["value"])

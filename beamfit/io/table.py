@@ -20,7 +20,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from beamfit.errors import InputError, nearest
-from beamfit.io.files import digest, text_lines
+from beamfit.io.files import text_lines
+from beamfit.io.hdf5 import hdf5_columns
 from beamfit.io.headers import (
     HEAD,
     header_at,
@@ -30,7 +31,7 @@ from beamfit.io.headers import (
     uncommented,
     with_units,
 )
-from beamfit.io.numeric import numeric_rows
+from beamfit.io.numeric import check_length, numeric_rows
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -47,6 +48,8 @@ UNITS: dict[str, dict[str, float]] = {
 }
 # Rows left out that a note names one by one.
 MOST_NAMED = 5
+# Rows of a file, and cells of one that is not all plain numbers: each is a text, 200 bytes.
+MOST_ROWS, MOST_WORDS = 12_000_000, 4_000_000
 HDF5 = {".h5", ".hdf5"}
 # How Excel says which separator a file has.
 SEPARATOR_LINE = re.compile(r"\s*\"?sep=.\"?\s*$", re.IGNORECASE)
@@ -281,7 +284,7 @@ def _known(header: str, quantities: Mapping[str, str], sheet: Sheet) -> Column |
 def read_sheet(
     path: str | PathLike[str] | DataFrame,
     example: str,
-    most: int | None = None,
+    most: int = MOST_ROWS,
     *,
     ragged: bool = False,
     names: Sequence[str] | None = None,
@@ -296,7 +299,7 @@ def read_sheet(
         header tells.
     example : str
         A header such as the file should have, for messages.
-    most : int, optional
+    most : int
         Most rows there may be.
     ragged : bool
         Whether rows that have not as many cells as the header are left out, and named in ``bad``.
@@ -334,7 +337,7 @@ def read_sheet(
 def _read_text(
     path: str | PathLike[str],
     example: str,
-    most: int | None,
+    most: int,
     ragged: bool,
     names: Sequence[str] | None,
 ) -> Sheet:
@@ -360,9 +363,7 @@ def _read_text(
             names, header = _cells(path, text, line), line
             _check_header(names, example, path, line)
         else:
-            cells = _without_blanks(_split(text, separator, path, line), len(names))
-            found, expected = f"{len(cells)} cells", f"{len(names)}, as in the header"
-            wrong = InputError(found, expected, path=path, line=line)
+            cells, wrong = _row(text, separator, path, line, len(names))
             whole = len(cells) == len(names)
             if whole and not rows and (units := with_units(names, cells)):
                 names = units
@@ -372,7 +373,8 @@ def _read_text(
                 return good
             (rows if whole else bad).append(cells if whole else wrong)
             lines += [line] * whole
-            _check_length(len(rows) + len(bad), most, path, line)
+            least = min(most, MOST_WORDS // max(1, len(names)))
+            check_length(len(rows) + len(bad), least, path, line)
             _raise_first(() if ragged else bad)
     if names is None:
         raise InputError("no header and no rows", f"a header line such as {example}", path=path)
@@ -387,7 +389,7 @@ def _good(
     line: int,
     separator: str,
     names: Sequence[str],
-    most: int | None,
+    most: int,
     comments: Sequence[str],
     header: int | None,
 ) -> Sheet | None:
@@ -399,12 +401,12 @@ def _good(
     return Sheet(path, tuple(names), list(found[0]), lines, header, tuple(comments), found[1])
 
 
-def _of_frame(frame: DataFrame, most: int | None) -> Sheet:
+def _of_frame(frame: DataFrame, most: int) -> Sheet:
     """The columns of a pandas data frame, whose name, if it has one, is in its ``attrs``."""
     name = str(frame.attrs.get("name", "frame"))
     if not all(isinstance(column, str) for column in frame.columns):
         raise InputError("columns without names", "names such as Q2_A and size_x_um", path=name)
-    _check_length(len(frame), most, name)
+    check_length(len(frame), most, name)
     blank = frame.isna()
     cells = [
         ["" if missing else v for v, missing in zip(values, blank[column], strict=True)]
@@ -455,15 +457,29 @@ def _cells(path: str | PathLike[str], text: str, line: int = 1) -> list[str]:
     return _without_blanks(_split(text, separator_of(text), path, line), 0)
 
 
+def _row(
+    text: str, separator: str, path: str | PathLike[str], line: int, count: int
+) -> tuple[list[str], InputError]:
+    """The cells of a row, and what is wrong with it if they are not so many."""
+    try:
+        cells = _without_blanks(_split(text, separator, path, line), count)
+    except InputError as error:
+        return [], error
+    expected = f"{count}, as in the header"
+    return cells, InputError(f"{len(cells)} cells", expected, path=path, line=line)
+
+
 def _split(text: str, separator: str, path: str | PathLike[str], line: int) -> list[str]:
     """The cells of one line."""
     if separator == " ":
-        return [word.strip('"') for word in WORD.findall(text)]
-    try:
-        cells = next(csv.reader([text], delimiter=separator, skipinitialspace=separator != "\t"))
-    except csv.Error:  # a carriage return within the line
-        expected = "line feeds: save the file as CSV (UTF-8) again"
-        raise InputError("line ends that are carriage returns", expected, path, line) from None
+        cells, open_end = WORD.findall(text), text.count('"') % 2
+        cells = [word.strip('"') for word in cells]
+    else:
+        reader = csv.reader([text, ""], delimiter=separator, skipinitialspace=separator != "\t")
+        cells, open_end = next(reader), reader.line_num > 1
+    if open_end:
+        expected = "each row on one line, and quotation marks in pairs"
+        raise InputError("a quotation mark that does not end in its line", expected, path, line)
     return [cell.strip() for cell in cells]
 
 
@@ -477,57 +493,15 @@ def _check_header(names: list[str], example: str, path: str | PathLike[str], lin
         raise InputError("numbers where the header should be", expected, path=path, line=line)
 
 
-def _check_length(
-    rows: int, most: int | None, path: str | PathLike[str], line: int | None = None
-) -> None:
-    if most is not None and rows > most:
-        expected = "fewer: average what is repeated, or cut the file"
-        raise InputError(f"more than {most} rows", expected, path=path, line=line)
-
-
-def _read_hdf5(path: str | PathLike[str], most: int | None) -> Sheet:
-    import h5py
-
-    sha256 = digest(path)  # says what is wrong with the path itself
-    try:
-        with h5py.File(path, "r") as store:
-            names = tuple(n for n in store if isinstance(store.get(n), h5py.Dataset))
-            cells = [_dataset(store[name], name, path, most) for name in names]
-            comments = tuple(f"{key}: {value}" for key, value in store.attrs.items())
-    except InputError:
-        raise
-    except (OSError, RuntimeError, ValueError, TypeError, KeyError):
-        found = "a file that is not HDF5, or is damaged"
-        raise InputError(found, "an HDF5 file; text is .csv", path) from None
-    if not names:
+def _read_hdf5(path: str | PathLike[str], most: int) -> Sheet:
+    columns, comments, sha256 = hdf5_columns(path, most, min(most, MOST_WORDS))
+    if not columns:
         raise InputError("no datasets", "one dataset a column", path=path)
-    lengths = sorted(len(column) for column in cells)
+    lengths = sorted(map(len, columns.values()))
     usual = max(lengths, key=lengths.count)
-    like = next(n for n, column in zip(names, cells, strict=True) if len(column) == usual)
-    for name, column in zip(names, cells, strict=True):
+    like = next(name for name, column in columns.items() if len(column) == usual)
+    for name, column in columns.items():
         if len(column) != usual:
             expected = f"{usual}, as in '{like}': datasets of equal lengths"
             raise InputError(f"{len(column)} readings", expected, path=path, column=name)
-    return Sheet(path, names, cells, None, None, comments, sha256)
-
-
-def _dataset(
-    data: Any, name: str, path: str | PathLike[str], most: int | None
-) -> list[str] | np.ndarray:
-    """The values of a dataset: texts or numbers."""
-    import h5py
-
-    found = None
-    if data.shape is None or data.ndim > 1:
-        found, expected = f"a dataset of shape {data.shape}", "a one-dimensional dataset"
-    elif h5py.check_string_dtype(data.dtype) is not None:
-        try:
-            return [str(v) for v in np.atleast_1d(data.asstr("utf-8")[()])]
-        except UnicodeDecodeError:
-            found, expected = "bytes that are not text", "UTF-8 text"
-    elif data.dtype.kind not in "iuf":
-        found, expected = f"values of type {data.dtype}", "numbers or text"
-    if found is not None:
-        raise InputError(found, expected, path=path, column=name)
-    _check_length(data.size, most, path)
-    return np.atleast_1d(data[()]).astype(float)
+    return Sheet(path, tuple(columns), list(columns.values()), None, None, comments, sha256)

@@ -14,6 +14,9 @@ from typing import Any, NamedTuple
 from beamfit.errors import InputError, nearest
 from beamfit.io.files import read_text
 
+# Parts of a key between dots.
+DEEPEST = 20
+DEEP = re.compile(rf"(?:[\w\"'-]+[ \t]*\.[ \t]*){{{DEEPEST}}}")
 REQUIRED: Any = object()
 TEXT, LIST, FLAG, TABLE, NUMBER = str, list, bool, dict, (int, float)
 NUMBERS = (int, float, list)
@@ -242,6 +245,9 @@ def read_toml(path: str | PathLike[str], what: str) -> Section:
     text = read_text(path, seen)
     lines = tuple(text.splitlines())
     try:
+        if deep := DEEP.search(text):  # which takes tomllib minutes
+            line = text.count("\n", 0, deep.start()) + 1
+            raise ValueError(f"a key of more than {DEEPEST} parts (at line {line})")
         return Section(path, lines, tomllib.loads(text), sha256=seen.hexdigest())
     except (ValueError, RecursionError) as error:  # integers too long, nesting too deep
         if re.search(r"^[^#=\n]*\bsize_[xy]_", text, re.MULTILINE):

@@ -3,7 +3,7 @@
 import h5py
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from beamfit.errors import InputError
@@ -98,6 +98,7 @@ def test_tfs_has_descriptors_types_and_quoted_names(tmp_path):
 
 
 @given(ROWS)
+@settings(max_examples=8)
 def test_hdf5_holds_the_same_numbers(tmp_path_factory, rows):
     path = tmp_path_factory.getbasetemp() / "same.h5"
     with h5py.File(path, "w") as store:
@@ -116,7 +117,8 @@ def test_hdf5_holds_the_same_numbers(tmp_path_factory, rows):
         (b"1;2\n3;4\n", 1, "numbers where the header should be"),
         (b"a,b\n1,2\n\x00\x01\n", 3, "binary"),
         (b"a,b\n1,2\n\xe9,3\n", 3, "UTF-8"),
-        (b"a,b\n1,2\r3,4\n", 2, "carriage returns"),
+        (b'a,b\n1,"2\n3",4\n', 2, "quotation mark that does not end"),
+        (b'* A B\n$ %le %le\n1 "2\n', 3, "quotation mark that does not end"),
         (b'format = "beamfit-lattice-1"\n[[element]]\n', 1, "a lattice"),
     ],
 )
