@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from scipy.integrate import solve_ivp
 
-from beamfit.io.files import write_atomically
+from beamfit.writing import write_atomically
 
 FED = 200.0
 APART = 0.5

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from beamfit.dynamics.response import FIRST_ORDER, simulate
-from beamfit.io.files import write_atomically
+from beamfit.writing import write_atomically
 
 SAMPLES, APART, DELAY = 800, 0.5, 2
 
