@@ -9,6 +9,7 @@ from beamfit.dynamics.response import FIRST_ORDER, SECOND_ORDER, simulate
 from beamfit.errors import InputError
 from beamfit.status import Status
 from beamfit.studies.response.fit import identify
+from beamfit.studies.response.noise import Noise, innovations
 from beamfit.studies.response.record import Run
 
 
@@ -52,18 +53,39 @@ def test_truths_lie_within_their_errors_as_often_as_they_should():
     assert np.all((rms > 0.7) & (rms < 1.35)), rms
 
 
-def test_noise_with_a_memory_is_in_the_errors():
+def walk_and_white(rng, n):
+    """One lag sees little of a drift under white noise: neighbours hardly resemble each other."""
+    return rng.normal(size=n) + 0.3 * np.cumsum(rng.normal(size=n))
+
+
+@pytest.mark.parametrize(
+    "noise_of",
+    [lambda rng, n: lfilter([1.0], [1.0, -0.8], rng.normal(size=n)), walk_and_white],
+    ids=["autoregressive", "random walk and white"],
+)
+def test_noise_with_a_memory_is_in_the_errors(noise_of):
     pulls = []
-    for seed in range(24):
+    for seed in range(16):
         clean = run_of(FIRST_ORDER, constant(3.0, 2.0), noise=0.0, seed=seed)
-        noise = np.random.default_rng(seed).normal(size=len(clean))
-        for k in range(1, len(noise)):
-            noise[k] += 0.8 * noise[k - 1]
-        level = clean.outputs["level"] + 0.1 * noise
+        noise = noise_of(np.random.default_rng([seed, 1]), len(clean))
+        level = clean.outputs["level"] + 0.3 * noise
         fit = identify(Run(clean.time, clean.inputs, {"level": level}), delay=0)
-        pulls.append((fit.quantities["K"].value - 2.0) / fit.quantities["K"].error)
+        found = (fit.quantities[name] for name in ("K", "tau"))
+        pulls.append([(q.value - v) / q.error for q, v in zip(found, (2.0, 3.0), strict=True)])
         assert fit.memory is not None
-    assert 0.6 < np.sqrt(np.mean(np.square(pulls))) < 1.5
+    rms = np.sqrt(np.mean(np.square(pulls), axis=0))
+    assert np.all((rms > 0.6) & (rms < 1.4)), rms
+
+
+def test_innovations_of_a_noise_are_those_of_its_covariance():
+    rng, noise = np.random.default_rng(0), Noise(3.0, 0.4)
+    time = np.cumsum(rng.uniform(0.1, 2.0, 30))
+    rows = rng.normal(size=(30, 2))
+    apart = np.abs(time[:, None] - time[None, :])
+    factor = np.linalg.cholesky(0.6 * np.exp(-apart / 3.0) + 0.4 * np.eye(30))
+    found, volume = innovations(jnp.asarray(rows), jnp.asarray(time), noise)
+    np.testing.assert_allclose(found, np.linalg.solve(factor, rows), atol=1e-12)
+    assert float(volume) == pytest.approx(np.log(np.diag(factor)).sum())
 
 
 @pytest.mark.parametrize("delay", [0, 3])
@@ -128,6 +150,25 @@ def test_a_part_of_the_response_that_the_model_lacks_is_no_noise_with_a_memory()
         Run(t, {"u": u, "v": v}, {"y": 3 * lag(fast, u) + lag(slow, v) + noise}),
     ):
         assert identify(run).status is Status.poor_fit
+
+
+@pytest.mark.parametrize("closed", [True, False])
+def test_inputs_that_were_set_from_the_output_are_named(closed):
+    """A PI controller at one set point: the gain would be -0.2 ± 0.02, its truth 2. And runs
+    with inputs of their own."""
+    kept = np.exp(-0.5 / 3.0)
+    for seed in range(2 if closed else 10):
+        rng = np.random.default_rng(seed)
+        drift = 0.05 * lfilter([1.0], [1.0, -0.9], rng.normal(size=200))
+        u, y, state, summed = steps(200, rng), np.zeros(200), 0.0, 0.0
+        for k in range(200):
+            y[k] = state + drift[k]
+            summed += 0.1 * (3.0 - y[k])
+            u[k] = 0.8 * (3.0 - y[k]) + summed if closed else u[k]
+            state = 2.0 * u[k] + (state - 2.0 * u[k]) * kept
+        fit = identify(Run(0.5 * np.arange(200), {"valve": u}, {"level": y}), delay=0)
+        assert ("feedback" in fit.message) == closed, (seed, fit.message)
+        assert not closed or fit.status is Status.poor_fit
 
 
 def test_inputs_that_move_together_have_no_gains_of_their_own():

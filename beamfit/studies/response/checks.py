@@ -24,8 +24,8 @@ from beamfit.studies.response.starts import driven_by, unit_outputs
 
 __all__ = ["Checks", "HeldBack", "checks_of", "predict_held", "slopes_of"]
 
-# Lags of the tests at most: of residuals, of inputs, and of what whitens.
-LAGS, PAST, ORDER = 20, 10, 8
+# Lags of the tests at most: of residuals, of inputs before and after, and of what whitens.
+LAGS, PAST, LATER, ORDER = 20, 10, 5, 8
 # Time constants of further paths that are looked for.
 SLOW = 5
 # Below this part of its variance that other inputs do not give an input's gain is not told apart.
@@ -50,6 +50,8 @@ class Checks(NamedTuple):
         much of the whitened residuals if they have no part in them (F).
     input_share : float
         The part of the whitened residuals' squares that these explain.
+    feedback_probability, feedback_share : float
+        The same for inputs of the same moment and later, which only a feedback would explain.
     against_constant : float or None
         By how much the Bayesian information criterion falls from constant parameters.
     together : tuple of str
@@ -62,6 +64,8 @@ class Checks(NamedTuple):
     white_probability: float
     input_probability: float
     input_share: float
+    feedback_probability: float
+    feedback_share: float
     against_constant: float | None
     together: tuple[str, ...] = ()
 
@@ -113,9 +117,9 @@ def checks_of(
     y = np.concatenate([m - m.mean() for m in seen.measured])
     rest = np.concatenate(residuals)
     ahead = np.concatenate([_whitened(r, [_share(residuals)]) for r in residuals])
-    explained, chance = _explained(seen, residuals, slopes, delay)
+    (explained, chance), (later, fed) = _explained(seen, residuals, slopes, delay)
     if rest.std() <= CLOSE * seen.size_y:  # what is left is rounding, or the network's own detail
-        explained, chance = 0.0, 1.0
+        explained, chance, later, fed = 0.0, 1.0, 0.0, 1.0
     return Checks(
         _percent(rest, y),
         _percent(ahead, y),
@@ -123,6 +127,8 @@ def checks_of(
         _white(residuals),
         chance,
         explained,
+        fed,
+        later,
         gain,
         _together(seen),
     )
@@ -185,8 +191,9 @@ def _explained(
     residuals: tuple[np.ndarray, ...],
     slopes: Sequence[tuple[np.ndarray, np.ndarray]],
     delay: int,
-) -> tuple[float, float]:
-    """How much of the residuals a fuller model would explain, and its chance, all whitened alike.
+) -> tuple[tuple[float, float], tuple[float, float]]:
+    """How much of the residuals a fuller model would explain, and its chance, all whitened alike;
+    and how much of what is left the inputs do that come after.
 
     A score test (Lagrange multipliers): columns are inputs before, those within the delay too,
     further paths of first order, and the slopes of the output by parameters that change with the
@@ -196,11 +203,13 @@ def _explained(
     apart = min(float(np.median(np.diff(t))) for t in seen.time)
     times = np.geomspace(apart, max(float(np.ptp(t)) for t in seen.time) / 4, SLOW)[:, None]
     paths = driven_by(seen, FIRST_ORDER)
-    own, slow, quick, targets = [], [], [], []
+    own, slow, quick, later, targets = [], [], [], [], []
     for run, path, r, (by_own, added) in zip(seen.runs, paths, residuals, slopes, strict=True):
         u = (np.asarray(run.u) - seen.mean_u) / np.where(seen.size_u > 0, seen.size_u, 1.0)
         index = np.asarray(run.index)
         past = [u[np.clip(index + k, 0, len(u) - 1)] for k in range(-PAST, delay)]
+        after = [u[np.clip(index + delay + k, 0, len(u) - 1)] for k in range(LATER)]
+        later.append(np.concatenate(after, axis=1))
         slow.append(np.asarray(unit_outputs(path, times))[:, : u.shape[1]].reshape(-1, len(r)).T)
         quick.append(np.concatenate([*past, added], axis=1))
         own.append(by_own)
@@ -214,7 +223,9 @@ def _explained(
     rest = rest - basis @ (basis.T @ rest)
     few, more = (_tested(rest, basis, white(columns)) for columns in (slow, quick))
     share, chance = min(few, more, key=lambda each: each[1])
-    return share, min(2.0 * chance, 1.0)
+    basis = _basis(np.hstack([white(columns) for columns in (own, slow, quick)]))
+    rest = rest - basis @ (basis.T @ rest)
+    return (share, min(2.0 * chance, 1.0)), _tested(rest, basis, white(later))
 
 
 def _tested(rest: np.ndarray, basis: np.ndarray, columns: np.ndarray) -> tuple[float, float]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from beamfit.dynamics.response import SECOND_ORDER, Physics
+from beamfit.greybox.correlated import Memory
 from beamfit.greybox.fit import Derived, Fit
 from beamfit.quantity import Quantity
 from beamfit.statistics import POOR_FIT
@@ -91,10 +92,12 @@ def _offset(model: Any, seen: Any) -> jax.Array:
     return model["offset"]
 
 
-def quantities_of(fit: Fit, seen: Seen, physics: Physics) -> dict[str, Quantity]:
+def quantities_of(
+    fit: Fit, errors: Memory | None, seen: Seen, physics: Physics
+) -> dict[str, Quantity]:
     """Constant parameters with errors, and the offset if it is free."""
     m = len(seen.inputs)
-    found = fit.derive(_constants, seen.runs[0])
+    found = _derived(fit, errors, _constants, seen.runs[0])
     names, units = list(physics.parameters(seen.inputs)), _units(physics, m)
     if physics is SECOND_ORDER and found.value[1] > 1.0:
         names, units = [*names, "tau1", "tau2"], [*units, TIME, TIME]
@@ -103,8 +106,18 @@ def quantities_of(fit: Fit, seen: Seen, physics: Physics) -> dict[str, Quantity]
         for i, (name, unit) in enumerate(zip(names, units, strict=True))
     }
     if any(v.name == "offset" for v in fit.variables):
-        said["offset"] = _quantity(fit.derive(_offset, seen.runs[0]), (), "output")
+        said["offset"] = _quantity(_derived(fit, errors, _offset, seen.runs[0]), (), "output")
     return said
+
+
+def _derived(fit: Fit, errors: Memory | None, function: Callable, data: Any) -> Derived:
+    """Numbers of a fit, with errors averaged over what is open of a noise with a memory."""
+    found = fit.derive(function, data)
+    if errors is None:
+        return found
+    slopes = found.slope.reshape(-1, found.slope.shape[-1])
+    known = errors.moments(slopes).error.reshape(found.value.shape)
+    return found._replace(error=np.where(np.isfinite(found.error), known, np.nan))
 
 
 def _quantity(found: Derived, i: Any, unit: str) -> Quantity:
@@ -137,7 +150,7 @@ def told(
     )
 
 
-def curves_of(fit: Fit, seen: Seen) -> tuple[Curve, ...]:
+def curves_of(fit: Fit, errors: Memory | None, seen: Seen) -> tuple[Curve, ...]:
     """Every parameter against every input."""
     physics, m = seen.runs[0].physics, len(seen.inputs)
     points = np.concatenate([np.asarray(run.point)[np.asarray(run.index)] for run in seen.runs])
@@ -148,7 +161,7 @@ def curves_of(fit: Fit, seen: Seen) -> tuple[Curve, ...]:
         grid[:, j] = at = np.linspace(low, high, POINTS)
         apart = np.abs(points[:, j][None, :] - at[:, None])
         visited = np.sum(apart <= NEAR * (high - low), axis=1) >= VISITS
-        found = fit.derive(curves, (seen.runs[0], jnp.asarray(grid)))
+        found = _derived(fit, errors, curves, (seen.runs[0], jnp.asarray(grid)))
         names = physics.parameters(seen.inputs)
         made += [
             Curve(names[i], name, unit, at, found.value[:, i], found.error[:, i], visited)

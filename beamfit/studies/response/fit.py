@@ -5,24 +5,24 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import jax.numpy as jnp
 import numpy as np
 
 from beamfit.dynamics.response import PHYSICS, Physics
 from beamfit.errors import InputError, nearest
-from beamfit.greybox.correlated import is_correlated
 from beamfit.greybox.fit import Fit
-from beamfit.greybox.solve import solve
 from beamfit.quantity import Quantity
 from beamfit.shown import shown
 from beamfit.status import Status
 from beamfit.studies.response.checks import Checks, HeldBack, checks_of, predict_held, slopes_of
 from beamfit.studies.response.curve import Curve, curves_of, quantities_of, told
-from beamfit.studies.response.model import CLOSE, Seen, driven, network_of, output_of, state
+from beamfit.studies.response.model import Seen, network_of, output_of
+from beamfit.studies.response.noise import Noise
 from beamfit.studies.response.record import Run
-from beamfit.studies.response.starts import Start, best_start
+from beamfit.studies.response.settle import settled, used_by
+from beamfit.studies.response.starts import latest, start_of
 from beamfit.studies.response.verdict import judged
 from beamfit.table import Table, json_of
 
@@ -32,13 +32,6 @@ if TYPE_CHECKING:
 __all__ = ["MAPS", "ResponseFit", "identify"]
 
 MAPS = ("constant", "network")
-# Longest delay that is tried, in samples and as a share of the run.
-LATEST, SHARE = 24, 0.1
-# A delay must raise the logarithm of the likelihood by so much over a shorter one.
-BETTER = 5.0
-# Steps of a round, after which the noise is taken from the residuals again; rounds at most, and
-# the gain in -2 ln L below which nothing is gained any more.
-STEPS, ROUNDS, GAINED = 100, 30, 0.05
 
 
 @shown
@@ -68,8 +61,8 @@ class ResponseFit:
         Parameters against the operating point, of a network.
     noise : tuple of float
         Rms residual of each run.
-    memory : tuple of float, or None
-        Correlation time of each run's noise, s; None where it has none.
+    memory : Noise or None
+        How the noise wanders; None where it does not.
     checks : Checks
         What the residuals say.
     held : tuple of HeldBack
@@ -88,7 +81,7 @@ class ResponseFit:
     quantities: dict[str, Quantity]
     curves: tuple[Curve, ...]
     noise: tuple[float, ...]
-    memory: tuple[float, ...] | None
+    memory: Noise | None
     checks: Checks
     held: tuple[HeldBack, ...] = ()
 
@@ -121,7 +114,7 @@ class ResponseFit:
             | {"records": [run.path or run.name for run in self.runs]}
             | {"delay_samples": self.delay, "parameters": self.quantities}
             | {"curves": [curve.to_json() for curve in self.curves]}
-            | {"noise_rms": list(self.noise), "noise_memory_s": self.memory}
+            | {"noise_rms": list(self.noise), "noise_memory": self.memory}
             | {"checks": self.checks._asdict(), "held_back": [h._asdict() for h in self.held]}
         )
 
@@ -215,13 +208,13 @@ def identify(
     shortest = min(len(run) for run in runs)
     if delay is not None and delay >= shortest - 1:
         raise InputError(f"a delay of {delay} samples", f"less than the {shortest} rows of a run")
-    given, (start, seen, delay) = delay, _start(runs, output, physics, delay, offset)
-    plain = _settled(seen, [(jnp.asarray(start.raw), start.first, (start.offset, offset))])
+    given, (start, seen, delay) = delay, start_of(runs, output, physics, delay, offset)
+    plain = settled(seen, [(jnp.asarray(start.raw), start.first, (start.offset, offset))])
     answer = plain
     if map == "network":
         raw, first, level = plain.start()
         nets = [network_of(seen, physics, np.asarray(raw), hidden, seed + k) for k in range(starts)]
-        answer = _settled(seen, [(net, first, level) for net in nets])
+        answer = settled(seen, [(net, first, level) for net in nets])
     checks = checks_of(
         seen,
         answer.residuals,
@@ -230,12 +223,14 @@ def identify(
         plain.likelihood - answer.likelihood if map == "network" else None,
         delay,
     )
-    quantities = quantities_of(answer.fit, seen, physics) if map == "constant" else {}
-    curves = curves_of(answer.fit, seen) if map == "network" else ()
+    quantities = (
+        quantities_of(answer.fit, answer.errors, seen, physics) if map == "constant" else {}
+    )
+    curves = curves_of(answer.fit, answer.errors, seen) if map == "network" else ()
     quantities, curves = told(quantities, curves, seen, checks)
     ahead = tuple(predict_held(each, output, answer.fit, physics, delay) for each in held)
     evidence = (answer.fit, answer.rests, checks, quantities, curves, ahead, map)
-    status, message = judged(*evidence, given is None and delay == _latest(runs) > 0)
+    status, message = judged(*evidence, given is None and delay == latest(runs) > 0)
     parts = (quantities, curves, answer.noise, answer.memory, checks, ahead)
     return ResponseFit(output, status, message, model, map, delay, runs, seen, answer.fit, *parts)
 
@@ -276,104 +271,3 @@ def _checked(runs: tuple[Run, ...], held: tuple[Run, ...], model: str, map: str)
 def _ordered(run: Run, first: Run) -> Run:
     """The run with its inputs in the order of the first: matrices have them by their place."""
     return replace(run, inputs={name: run.inputs[name] for name in first.inputs})
-
-
-def seen_of(runs: tuple[Run, ...], output: str, physics: Physics, delay: int) -> Seen:
-    """The runs as the model sees them."""
-    drives = tuple(driven(run, i, output, physics, delay) for i, run in enumerate(runs))
-    read = [np.isfinite(run.outputs[output]) for run in runs]
-    measured = tuple(run.outputs[output][k] for run, k in zip(runs, read, strict=True))
-    time = tuple(run.time[k] for run, k in zip(runs, read, strict=True))
-    u = np.concatenate([np.stack(list(run.inputs.values()), axis=1) for run in runs])
-    spread = float(np.concatenate(measured).std()) or 1.0
-    return Seen(tuple(runs[0].inputs), output, drives, measured, time, u.mean(0), u.std(0), spread)
-
-
-def _start(
-    runs: tuple[Run, ...], output: str, physics: Physics, delay: int | None, offset: bool
-) -> tuple[Start, Seen, int]:
-    """The best start, and the delay: the shortest of those that fit about as well as any."""
-    delays = range(_latest(runs) + 1) if delay is None else (delay,)
-    found = []
-    for late in delays:
-        seen = seen_of(runs, output, physics, late)
-        found.append((best_start(seen, offset), seen, late))
-    count = sum(map(len, found[0][1].measured))
-    least = min(start.squares for start, _, _ in found)
-    near = least * np.exp(2.0 * BETTER / count)
-    return next(each for each in found if each[0].squares <= near)
-
-
-def _latest(runs: tuple[Run, ...]) -> int:
-    return min(LATEST, int(SHARE * min(map(len, runs))))
-
-
-class Settled(NamedTuple):
-    """A fit whose noise is that of its own residuals.
-
-    `likelihood` is -2 ln L with the cost of the Bayesian information criterion, `rests` whether a
-    further round would gain nothing.
-    """
-
-    fit: Fit
-    residuals: tuple[np.ndarray, ...]
-    noise: tuple[float, ...]
-    memory: tuple[float, ...] | None
-    likelihood: float
-    rests: bool
-
-    def start(self) -> tuple[Any, np.ndarray, tuple[float, bool]]:
-        """Where a further search begins."""
-        model = self.fit.model
-        free = any(v.name == "offset" for v in self.fit.variables)
-        return model["map"], np.asarray(model["start"]), (float(model["offset"]), free)
-
-
-def _round(seen: Seen, begin: tuple, noise: Sequence[float], memory: Any = None) -> Settled:
-    """Fit with the noise that the residuals of the round before had."""
-    fit = solve(state(seen, *begin, noise, memory), iterations=STEPS)
-    pairs = zip(seen.runs, seen.measured, strict=True)
-    rest = tuple(y - np.asarray(output_of(fit.model, run)) for run, y in pairs)
-    found = tuple(max(float(r.std()), CLOSE * seen.size_y) for r in rest)
-    minus = sum(2.0 * len(r) * np.log(s) for r, s in zip(rest, found, strict=True))
-    cost = used_by(fit) * np.log(sum(map(len, rest)))
-    kept = None if memory is None else tuple(memory)
-    rests = fit.status not in (Status.not_finite, Status.not_converged)
-    return Settled(fit, rest, found, kept, float(minus + cost), rests)
-
-
-def _settled(seen: Seen, begins: Sequence[tuple]) -> Settled:
-    """Search from each start for a round, then from the best until nothing is gained.
-
-    The noise weighs against the priors of a network, so it is taken anew in every round.
-    """
-    wide = [0.1 * seen.size_y] * len(seen.runs)
-    tried = (_round(seen, begin, wide) for begin in begins)
-    found = min(tried, key=lambda each: each.likelihood)
-    for _ in range(ROUNDS):
-        before, found = found, _round(seen, found.start(), found.noise)
-        if abs(before.likelihood - found.likelihood) < GAINED + 1e-9 * abs(found.likelihood):
-            found = found._replace(rests=True)
-            break
-    if not any(is_correlated(r, used_by(found.fit)) and r.std() > CLOSE * seen.size_y
-               for r in found.residuals):  # fmt: skip
-        return found
-    memory = [_memory(r, t) for r, t in zip(found.residuals, seen.time, strict=True)]
-    white = found
-    for _ in range(3):
-        before, found = found, _round(seen, found.start(), white.noise, memory)
-        if found.rests or abs(before.likelihood - found.likelihood) < GAINED:
-            break
-    return found._replace(rests=white.rests)
-
-
-def used_by(fit: Fit) -> int:
-    """How many numbers the readings determined."""
-    return max(round(sum(group.count - group.dof for group in fit.groups)), 1)
-
-
-def _memory(rest: np.ndarray, time: np.ndarray) -> float:
-    """The correlation time of residuals from their neighbours, s."""
-    rest = rest - rest.mean()
-    share = float(rest[1:] @ rest[:-1]) / max(float(rest @ rest), 1e-300)
-    return float(np.median(np.diff(time)) / -np.log(np.clip(share, 1e-3, 0.999)))

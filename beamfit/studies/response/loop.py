@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from scipy.signal import lfilter
 
 from beamfit.errors import InputError, nearest
 from beamfit.shown import shown
@@ -294,10 +295,11 @@ def _noise(fit: ResponseFit, time: np.ndarray, seed: int) -> np.ndarray:
     new = np.random.default_rng(seed).normal(size=len(time))
     if fit.memory is None:
         return size * new
-    kept = float(np.exp(-(time[1] - time[0]) / np.mean(fit.memory)))
-    for k in range(1, len(new)):
-        new[k] = kept * new[k - 1] + np.sqrt(1.0 - kept**2) * new[k]
-    return size * new
+    # From 0 on: a part that wanders far in long times has not yet done so.
+    kept = float(np.exp(-(time[1] - time[0]) / fit.memory.time))
+    wander = lfilter([np.sqrt(1.0 - kept**2)], [1.0, -kept], new)
+    white = np.random.default_rng([seed, 1]).normal(size=len(time))
+    return size * (np.sqrt(1.0 - fit.memory.white) * wander + np.sqrt(fit.memory.white) * white)
 
 
 def _changes(

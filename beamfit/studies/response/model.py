@@ -14,6 +14,7 @@ from beamfit.dynamics.response import Physics, simulate
 from beamfit.greybox import tree
 from beamfit.greybox.mlp import MLP, Port, dense
 from beamfit.greybox.problem import Free, Prior, Problem, Record, padded_length
+from beamfit.studies.response.noise import Noise, innovations
 from beamfit.studies.response.record import Run
 
 __all__ = [
@@ -41,7 +42,7 @@ class Driven:
     """A run as the model sees it: operating points, inputs and steps, padded, and what was read.
 
     Shapes (samples, inputs), (samples, inputs), (samples,), (readings,); `run` is its number,
-    `memory` the correlation time of its noise, s.
+    `noise` that of its readings, if it has a memory.
     """
 
     physics: Physics
@@ -51,7 +52,7 @@ class Driven:
     time: Any
     index: Any
     run: Any
-    memory: Any
+    noise: Noise | None
 
 
 class Seen(NamedTuple):
@@ -80,7 +81,7 @@ def driven(run: Run, number: int, output: str, physics: Physics, delay: int) -> 
     dt = np.concatenate([np.diff(run.time), np.zeros(longer + 1)])
     index = np.flatnonzero(np.isfinite(run.outputs[output]))
     arrays = (jnp.asarray(v) for v in (late, late, dt, run.time[index] - run.time[0], index))
-    return Driven(physics, *arrays, jnp.asarray(number), jnp.asarray(1.0))
+    return Driven(physics, *arrays, jnp.asarray(number), None)
 
 
 def parameters_at(physics: Physics, of: Any, point: jax.Array, more: Any = 0.0) -> jax.Array:
@@ -121,8 +122,9 @@ def changed_by(model: Any, seen: Driven, scaled: jax.Array) -> jax.Array:
     return slopes.reshape(len(slopes), -1)
 
 
-def _apart(model: Any, seen: Driven) -> jax.Array:
-    return jnp.diff(seen.time) / seen.memory
+def _surprising(model: Any, seen: Driven) -> jax.Array:
+    """What the output adds to what the readings before foretell."""
+    return innovations(predicted(model, seen), seen.time, seen.noise)[0]
 
 
 def curves(model: Any, asked: tuple[Driven, Any]) -> jax.Array:
@@ -146,11 +148,11 @@ def network_of(seen: Seen, physics: Physics, raw: np.ndarray, hidden: int, seed:
 
 def state(
     seen: Seen,
-    of: Any,
+    by: Any,
     start: np.ndarray,
     offset: tuple[float, bool],
     noise: Sequence[float],
-    memory: Sequence[float] | None,
+    memory: Noise | None,
 ) -> Problem:
     """State the problem.
 
@@ -158,7 +160,7 @@ def state(
     ----------
     seen : Seen
         The runs.
-    of : array or map
+    by : array or map
         Raw numbers, or the map that gives them.
     start : array, shape (runs, free states)
         Unknown parts of the first states.
@@ -166,21 +168,21 @@ def state(
         Output at rest, and whether it is free.
     noise : sequence of float
         A guess at the noise of each run, which its residuals correct.
-    memory : sequence of float, optional
-        The correlation time of each run's noise, s.
+    memory : Noise, optional
+        How the noise wanders.
     """
     records = []
     for i, (run, y) in enumerate(zip(seen.runs, seen.measured, strict=True)):
         close = noise[i] <= CLOSE * seen.size_y * 1.001
-        said: dict[str, Any] = {"worth": np.inf if close else 1.0, "error": noise[i]}
+        worth, of = np.inf if close else 1.0, predicted
         if memory is not None:
-            run = replace(run, memory=jnp.asarray(float(memory[i])))
-            said["apart"] = _apart
-        records.append(Record(f"run {i + 1}", predicted, run, y, **said))
-    free = [Free("start", nuisance=True), Free("map", nuisance=callable(of))]
+            run, of = replace(run, noise=Noise(*map(jnp.asarray, memory))), _surprising
+            y = np.asarray(innovations(jnp.asarray(y), run.time, run.noise)[0])
+        records.append(Record(f"run {i + 1}", of, run, y, noise[i], worth=worth))
+    free = [Free("start", nuisance=True), Free("map", nuisance=callable(by))]
     free += [Free("offset")] if offset[1] else []
-    model = {"map": of, "start": start, "offset": offset[0]}
+    model = {"map": by, "start": start, "offset": offset[0]}
     priors = []
-    if isinstance(of, MLP):
+    if isinstance(by, MLP):
         priors = [Prior("map.weights", 0.0, WEIGHT), Prior("map.biases", 0.0, WEIGHT)]
     return Problem(model, free, records, priors)

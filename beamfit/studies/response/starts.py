@@ -16,10 +16,15 @@ import numpy as np
 from scipy.optimize import minimize
 
 from beamfit.dynamics.response import ARX, FIRST_ORDER, SECOND_ORDER, Physics, simulate
-from beamfit.studies.response.model import Driven, Seen
+from beamfit.studies.response.model import Driven, Seen, driven
+from beamfit.studies.response.record import Run
 
-__all__ = ["Start", "best_start", "driven_by", "unit_outputs"]
+__all__ = ["Start", "best_start", "driven_by", "latest", "seen_of", "start_of", "unit_outputs"]
 
+# Longest delay that is tried, in samples and as a share of the run.
+LATEST, SHARE = 24, 0.1
+# A delay must raise the logarithm of the likelihood by so much over a shorter one.
+BETTER = 5.0
 # Time constants of the grid, and dampings of a second order.
 TIMES, DAMPINGS = 16, (0.2, 0.6, 1.0, 2.0)
 
@@ -121,3 +126,34 @@ def _as_difference(seen: Seen, found: Start) -> Start:
         for s, r in zip(found.first, seen.runs, strict=True)
     ])  # fmt: skip
     return Start(np.asarray(raw), states, found.offset, found.squares)
+
+
+def seen_of(runs: tuple[Run, ...], output: str, physics: Physics, delay: int) -> Seen:
+    """The runs as the model sees them."""
+    drives = tuple(driven(run, i, output, physics, delay) for i, run in enumerate(runs))
+    read = [np.isfinite(run.outputs[output]) for run in runs]
+    measured = tuple(run.outputs[output][k] for run, k in zip(runs, read, strict=True))
+    time = tuple(run.time[k] for run, k in zip(runs, read, strict=True))
+    u = np.concatenate([np.stack(list(run.inputs.values()), axis=1) for run in runs])
+    spread = float(np.concatenate(measured).std()) or 1.0
+    return Seen(tuple(runs[0].inputs), output, drives, measured, time, u.mean(0), u.std(0), spread)
+
+
+def start_of(
+    runs: tuple[Run, ...], output: str, physics: Physics, delay: int | None, offset: bool
+) -> tuple[Start, Seen, int]:
+    """The best start, and the delay: the shortest of those that fit about as well as any."""
+    delays = range(latest(runs) + 1) if delay is None else (delay,)
+    found = []
+    for late in delays:
+        seen = seen_of(runs, output, physics, late)
+        found.append((best_start(seen, offset), seen, late))
+    count = sum(map(len, found[0][1].measured))
+    least = min(start.squares for start, _, _ in found)
+    near = least * np.exp(2.0 * BETTER / count)
+    return next(each for each in found if each[0].squares <= near)
+
+
+def latest(runs: tuple[Run, ...]) -> int:
+    """The longest delay that is tried."""
+    return min(LATEST, int(SHARE * min(map(len, runs))))

@@ -1,0 +1,117 @@
+"""Noise with a memory: a part that wanders with a correlation time, and a part without memory.
+
+One lag tells neither: white noise on top of a drift has neighbours that hardly resemble each other,
+and a drift all the same. Both parts are estimated together, and averaged over what stays open.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from beamfit.greybox.correlated import Memory, is_correlated, range_of
+from beamfit.greybox.covariance import CUT
+
+__all__ = ["Noise", "innovations", "noise_of", "remembers"]
+
+# Correlation times looked at, and variances of the part without memory, in those that the part
+# that wanders gets anew from one sample to the next.
+TIMES, WHITE = 16, (0.0, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0, 1000.0)
+# Means of so many neighbours are looked at: a slow drift hides under white noise.
+BLOCKS = (1, 4, 16)
+
+
+class Noise(NamedTuple):
+    """Correlation time of the part that wanders, s, and the share of variance without memory."""
+
+    time: float
+    white: float
+
+
+def remembers(rest: np.ndarray, parameters: int) -> bool:
+    """Whether residuals, or their means over some neighbours, are correlated."""
+    means = [rest[: len(rest) // k * k].reshape(-1, k).mean(axis=1) for k in BLOCKS]
+    return any(is_correlated(m, parameters) for m in means if len(m) > 2 * parameters)
+
+
+def innovations(rows: jax.Array, time: jax.Array, noise: Noise) -> tuple[jax.Array, jax.Array]:
+    """Rows less what those before foretell, over the error of that; and log sum of the errors.
+
+    The Kalman filter of an Ornstein-Uhlenbeck process read with white noise (A. C. Harvey,
+    Forecasting, structural time series models and the Kalman filter, 1989, section 3.4), O(n).
+    """
+    wander = 1.0 - noise.white
+    kept = jnp.exp(-jnp.diff(time, append=time[-1:]) / noise.time)
+
+    def on(carry, now):
+        mean, variance = carry
+        row, k = now
+        whole = variance + noise.white
+        surprise = row - mean
+        mean = k * (mean + variance / whole * surprise)
+        variance = k**2 * variance * noise.white / whole + wander * (1.0 - k**2)
+        return (mean, variance), (surprise / jnp.sqrt(whole), 0.5 * jnp.log(whole))
+
+    begin = jnp.zeros(rows.shape[1:]), jnp.asarray(wander)
+    _, (white, sizes) = jax.lax.scan(on, begin, (rows, kept))
+    return white, jnp.sum(sizes)
+
+
+@jax.jit
+def _triangle(rows: jax.Array, time: jax.Array, noise: Noise) -> tuple[jax.Array, jax.Array]:
+    white, volume = innovations(rows, time, noise)
+    return jnp.linalg.qr(white, mode="r"), volume
+
+
+def noise_of(
+    rows: Sequence[np.ndarray], time: Sequence[np.ndarray], known: np.ndarray
+) -> tuple[Memory, Noise, float]:
+    """The noise by what residuals say of it, all runs together, and its size in units of theirs.
+
+    `rows` hold the slopes of each run's residuals and, last, the residuals, in units of their
+    noise; `known` those of the priors. As `beamfit.greybox.correlated.memory_of`: restricted
+    likelihood, flat in the logarithms of the time and of the ratio of the two variances.
+    """
+    apart = min(float(np.median(np.diff(t))) for t in time)
+    ends = np.array([range_of(t) for t in time])
+    grid = [
+        Noise(each, ratio / (ratio + 1.0 / -np.expm1(-2.0 * apart / each)))
+        for each in np.geomspace(ends[:, 0].min(), ends[:, 1].max(), TIMES)
+        for ratio in WHITE
+    ]
+    count, p = sum(map(len, rows)), rows[0].shape[1] - 1
+    found = [_at(rows, time, known, noise, count + len(known)) for noise in grid]
+    logs, step, half, squares = (np.array(part) for part in zip(*found, strict=True))
+    weight = np.exp(logs - logs.max())
+    times = np.array([noise.time for noise in grid])
+    memory = Memory(weight / weight.sum(), times, step, half, squares, count + len(known) - p)
+    best = int(np.argmax(weight))
+    return memory, grid[best], float(np.sqrt(squares[best] / memory.dof))
+
+
+def _at(
+    rows: Sequence[np.ndarray],
+    time: Sequence[np.ndarray],
+    known: np.ndarray,
+    noise: Noise,
+    count: int,
+) -> tuple[float, np.ndarray, np.ndarray, float]:
+    """Log probability, step, half and squares for one noise."""
+    parts = [
+        _triangle(jnp.asarray(r), jnp.asarray(t), noise) for r, t in zip(rows, time, strict=True)
+    ]
+    whole = np.vstack([*(np.asarray(r) for r, _ in parts), known])
+    slopes, rest = whole[:, :-1], whole[:, -1]
+    length = np.linalg.norm(slopes, axis=0)
+    unit = 1.0 / np.where(length > 0, length, 1.0)
+    left, sizes, turned = np.linalg.svd(slopes * unit, full_matrices=False)
+    seen = sizes > CUT * sizes.max(initial=0.0)
+    half = unit[:, None] * np.where(seen, turned.T / np.where(seen, sizes, 1.0), 0.0)
+    along = np.where(seen, left.T @ rest, 0.0)
+    squares = max(float(rest @ rest - along @ along), 1e-300)
+    log = -sum(float(v) for _, v in parts) - np.sum(np.log((sizes / unit)[seen]))
+    return log - 0.5 * (count - seen.sum()) * np.log(squares), -half @ along, half, squares
