@@ -103,6 +103,20 @@ def _open(e: Evidence) -> Finding | None:
     return Finding(Status.unidentified, cause, remedy)
 
 
+def _fed_back(e: Evidence) -> Finding | None:
+    c = e.checks
+    if c.feedback_probability >= POOR_FIT:
+        return None
+    cause = (
+        f"Inputs of the same moment and later go with {100 * c.feedback_share:.0f} % of the noise "
+        f"(p = {c.feedback_probability:.1g}): they were set from the output (feedback). What noise "
+        "made the inputs do is then taken for a response, gains lean to the inverse of the "
+        "controller's, and no error contains it."
+    )
+    remedy = "Open the loop, or move inputs or set points by far more than the noise does."
+    return Finding(Status.poor_fit, cause, remedy)
+
+
 def _refuted(e: Evidence) -> Finding | None:
     c = e.checks
     if c.input_probability >= POOR_FIT:
@@ -145,4 +159,4 @@ def _good(e: Evidence) -> Finding:
     return Finding(Status.converged, cause)
 
 
-RULES = (_lost, _nothing, _joint, _open, _refuted, _worse, _good)
+RULES = (_lost, _nothing, _joint, _fed_back, _open, _refuted, _worse, _good)
