@@ -12,6 +12,11 @@ __all__ = ["InputError", "nearest"]
 # What no person wrote as a word: of a damaged file, say. Its beginning tells enough.
 ENDLESS = re.compile(r"(\S{60})\S{60,}")
 
+# Controls but for tab and line feed, letters that turn the direction, bytes that are not UTF-8.
+UNSHOWN = re.compile("[\0-\x08\x0b-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2069\ud800-\udfff]")
+# Of a whole message, for which a terminal has a few lines, and of a path in it: its end.
+LONGEST, LONGEST_PATH = 390, 120
+
 
 @dataclass(eq=False)
 class InputError(ValueError):
@@ -46,14 +51,51 @@ class InputError(ValueError):
     column: str | int | None = None
 
     def __str__(self) -> str:
-        place = "" if self.path is None else str(self.path)
+        path = "" if self.path is None else plain(str(self.path))
+        place = path if len(path) <= LONGEST_PATH else "..." + path[-LONGEST_PATH:]
         place += "" if self.line is None else f":{self.line}"
         named = isinstance(self.column, str)
         place += f":{self.column}" if place and self.column is not None and not named else ""
         place += ": " if place else ""
-        said = f"column '{self.column}': " if named else ""
-        said = ENDLESS.sub(r"\1...", f"{said}{self.found}; expected {self.expected}")
-        return " ".join(f"{place}{said}".split())
+        said = f"column '{short(self.column, LONGEST_PATH)}': " if named else ""
+        said, found, expected = (_worded(part) for part in (said, self.found, self.expected))
+        room = LONGEST - len(f"{place}{said} ; expected ")
+        found = short(found, max(room // 3, room - len(expected)))
+        expected = short(expected, room - len(found))
+        return " ".join(f"{place}{said} {found}; expected {expected}".split())
+
+
+def _worded(text: str) -> str:
+    return ENDLESS.sub(r"\1...", plain(" ".join(text.split())))
+
+
+def short(text: str, most: int) -> str:
+    """Leave out the middle of what is too long: an end often says what to do.
+
+    Examples
+    --------
+    >>> short("one of Q1, Q2, Q3, Q4, Q5, Q6 (did you mean Q2?)", 40)
+    'one of Q1, Q2,  ... 6 (did you mean Q2?)'
+    """
+    end = min(120, most // 2)
+    return text if len(text) <= most else f"{text[: most - end - 5]} ... {text[-end:].lstrip()}"
+
+
+def plain(text: str) -> str:
+    r"""Write what a terminal would obey or turn round, and bytes that are no text, as escapes.
+
+    Examples
+    --------
+    >>> print(plain("Q1\x1b[2J \udcff"))
+    Q1\x1b[2J \xff
+    """
+    return UNSHOWN.sub(_escaped, text)
+
+
+def _escaped(found: re.Match[str]) -> str:
+    code = ord(found[0])
+    code -= 0xDC00 if 0xDC80 <= code <= 0xDCFF else 0  # a byte of a name that is not UTF-8
+    return f"\\x{code:02x}" if code < 0x100 else f"\\u{code:04x}"
 
 
 def nearest(word: str, known: list[str]) -> str:

@@ -9,6 +9,7 @@ from enum import Enum
 from html import escape
 from typing import Any, NamedTuple
 
+from beamfit.errors import plain
 from beamfit.quantity import Quantity
 from beamfit.status import Status
 
@@ -102,7 +103,7 @@ def text_of(table: Table) -> str:
             for i, (c, w) in enumerate(zip(row, widths, strict=True))
         ]
         lines.append("  ".join(turned).rstrip())
-    return "\n".join(lines)
+    return plain("\n".join(lines))
 
 
 def html_of(table: Table) -> str:

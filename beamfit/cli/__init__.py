@@ -18,7 +18,7 @@ from beamfit.cli.identify import identify
 from beamfit.cli.lifetime import lifetime
 from beamfit.cli.setpoint import setpoint
 from beamfit.cli.solve import solve
-from beamfit.errors import InputError
+from beamfit.errors import LONGEST, InputError, plain, short
 
 __all__ = ["cli", "main"]
 
@@ -45,14 +45,14 @@ cli.add_command(control)
 
 def main() -> None:
     """Run the command line: exit 0 when answered, 2 with one line on unusable input."""
-    for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, io.TextIOWrapper):  # a terminal without µ shows a mark instead
-            stream.reconfigure(errors="replace")
+    _show_marks()
     try:
         status = cli.main(prog_name="beamfit", standalone_mode=False) or 0
         if sys.stdout is not None:  # None where it was closed before we began
             sys.stdout.flush()
         sys.exit(status)
+    except SystemExit as stop:  # with 1 where the reader, `head` say, has seen enough
+        sys.exit(0 if stop.code == 1 else stop.code)
     except click.exceptions.NoArgsIsHelpError as error:
         click.echo(error.format_message())
         sys.exit(0)
@@ -62,7 +62,7 @@ def main() -> None:
         sys.exit(130)
     except InputError as error:
         _fail(str(error))
-    except BrokenPipeError:  # the reader, `head` say, has seen enough
+    except BrokenPipeError:  # the same
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(0)
     except OSError as error:
@@ -70,7 +70,13 @@ def main() -> None:
         _fail(f"output that cannot be written ({error.strerror}); expected room for it")
 
 
+def _show_marks() -> None:
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):  # a terminal without µ shows a mark instead
+            stream.reconfigure(errors="replace")
+
+
 def _fail(message: str) -> None:
     """Say it on one line of standard error."""
-    click.echo("beamfit: " + " ".join(message.split()), err=True)
+    click.echo("beamfit: " + short(plain(" ".join(message.split())), LONGEST), err=True)
     sys.exit(2)

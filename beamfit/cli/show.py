@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from typing import Any
 
 from rich.console import Console
+from rich.segment import Segment
 from rich.table import Table as RichTable
 from rich.text import Text
 
+from beamfit.errors import plain
 from beamfit.quantity import Status
 from beamfit.sampling.posterior import Posterior
 from beamfit.table import Table
@@ -19,12 +22,23 @@ def _style(status: Status) -> str:
     return f"bold {status.colour}"
 
 
+class _Console(Console):
+    """Obeys nothing that a file says; where the reader has seen enough, the command says so."""
+
+    def render(self, *arguments: Any, **options: Any) -> Iterator[Segment]:
+        for each in super().render(*arguments, **options):
+            yield each if each.control else each._replace(text=plain(each.text))
+
+    def on_broken_pipe(self) -> None:
+        raise BrokenPipeError
+
+
 class Terminal:
     """Where a command answers."""
 
     def __init__(self) -> None:
         # Names are shown as they are: a bracket in one is not a style.
-        self.console = Console(highlight=False, markup=False)
+        self.console = _Console(highlight=False, markup=False)
 
     def line(self, text: str = "", style: str = "") -> None:
         """Say a line."""

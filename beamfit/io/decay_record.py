@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from os import PathLike
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -13,6 +12,7 @@ import numpy as np
 from beamfit.errors import InputError
 from beamfit.io.archive import archive_sheet
 from beamfit.io.dates import dates_in_order
+from beamfit.io.files import name_of
 from beamfit.io.headers import is_number
 from beamfit.io.offset import offset_of
 from beamfit.io.scan_columns import is_size
@@ -201,7 +201,7 @@ def _record(
         time=moment,
         current=beam,
         error=error,
-        name=Path(sheet.path).name,
+        name=name_of(sheet.path),
         start=float(moment[0]) if absolute else None,
         conditions=conditions,
         comments=sheet.comments,
@@ -365,7 +365,7 @@ def _lifetimes(sheet: Sheet, skip_bad: bool) -> LifetimeTable:
     values = {key: _positive(sheet, column) for key, column in wanted.items()}
     hours = {key: values[key] / 3600 for key in ("lifetime", "error") if key in values}
     said = {"comments": sheet.comments, "notes": left_out(sheet)}
-    return LifetimeTable(values["current"], **hours, name=Path(sheet.path).name, **said)
+    return LifetimeTable(values["current"], **hours, name=name_of(sheet.path), **said)
 
 
 def _positive(sheet: Sheet, column: Column) -> np.ndarray:

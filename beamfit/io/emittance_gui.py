@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from beamfit.errors import InputError, nearest
+from beamfit.io.files import name_of
 from beamfit.io.lattice import LatticeFile
 from beamfit.io.matlab import read_variable
 from beamfit.io.shots import scatter_of
@@ -172,7 +173,7 @@ def _read(source: _Fields, sha256: str) -> EmittanceGuiFile:
             error=error,
             shots=shots if error else None,
             profiles=_profiles(source.get("beam"), np.flatnonzero(used), k),
-            name=f"{Path(source.path).stem}, {name} sizes",
+            name=f"{Path(name_of(source.path)).stem}, {name} sizes",
         )
     return EmittanceGuiFile(scans, _stored(source, names), _lattice(source, sha256, several))
 
@@ -345,7 +346,7 @@ def _lattice(source: _Fields, sha256: str, several: bool) -> LatticeFile:
     return LatticeFile(
         path=source.path,
         sha256=sha256,
-        name=f"matrices of {Path(source.path).name}",
+        name=f"matrices of {name_of(source.path)}",
         energy=_energy(source),
         particle="electron",
         energy_spread=0.0,

@@ -11,9 +11,10 @@ import stat
 from collections.abc import Iterator
 from functools import lru_cache
 from os import PathLike
+from pathlib import Path
 from typing import Any, BinaryIO
 
-from beamfit.errors import InputError
+from beamfit.errors import InputError, plain
 
 # A text line of a scan or a lattice is short; a longer one is another kind of file.
 LONGEST_LINE = 100_000
@@ -198,6 +199,11 @@ def remember(path: str | PathLike[str], seen: Any) -> str:
     """Keep the digest of what was read of a file, and give it."""
     found = _READ[os.path.abspath(path)] = seen.hexdigest()
     return found
+
+
+def name_of(path: str | PathLike[str]) -> str:
+    """What a file is called, in letters that can be shown: names need not be UTF-8."""
+    return plain(Path(path).name)
 
 
 def digest(path: str | PathLike[str]) -> str:

@@ -58,7 +58,7 @@ def hdf5_columns(
         If the file is damaged or too large, or a dataset is no column, has its numbers in another
         file or is packed by a filter that HDF5 does not bring.
     """
-    from beamfit.errors import InputError
+    from beamfit.errors import InputError, plain
     from beamfit.io.files import read_bytes
 
     content, sha256 = read_bytes(path, LARGEST, "an HDF5 file of readings; fewer of them")
@@ -89,8 +89,10 @@ def hdf5_columns(
     columns: dict[str, Any] = {}
     start = 0
     for name, count, words in told["columns"]:
-        columns[name] = words if words is not None else np.frombuffer(numbers, float, count, start)
-        start += 0 if words is not None else 8 * count
+        if words is None:
+            words = np.frombuffer(numbers, float, count, start)
+            start += words.nbytes
+        columns[plain(name)] = words
     return columns, tuple(told["comments"]), sha256
 
 

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from beamfit.errors import InputError, nearest
+from beamfit.io.files import name_of
 from beamfit.io.gradient_table import gradient_table
 from beamfit.io.toml import FLAG, LIST, TABLE, TEXT, Key, Section, is_number, read_toml
 from beamfit.particles import ENERGY_KEYS, REST_ENERGY, expected_energy, total_energy
@@ -202,7 +203,7 @@ def read_toml_lattice(path: str | PathLike[str]) -> LatticeFile:
             if k in e
         },
         design=_design(top, [e["name"] for e in elements]),
-        **said | {"name": said["name"] or Path(path).stem},
+        **said | {"name": said["name"] or Path(name_of(path)).stem},
     )
 
 

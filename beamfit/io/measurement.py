@@ -12,6 +12,7 @@ import numpy as np
 
 from beamfit.errors import InputError
 from beamfit.io.emittance_gui import is_emittance_gui, read_emittance_gui
+from beamfit.io.files import name_of
 from beamfit.io.scan_columns import ENERGIES, SETTINGS, column_notes, scan_columns
 from beamfit.io.shots import average_shots
 from beamfit.io.table import UNITS, Column, Sheet, left_out, read_sheet
@@ -120,7 +121,7 @@ def _scan(
         slice=tuple(map(str, sheet[columns["slice"].header])) if "slice" in columns else None,
         transfer=own or None,
         error_source="the file",
-        name=Path(sheet.path).stem,
+        name=Path(name_of(sheet.path)).stem,
         path=sheet.path,
         sha256=sheet.sha256,
         provenance=sheet.comments,

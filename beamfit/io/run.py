@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import replace
 from os import PathLike
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from beamfit.errors import InputError, nearest
 from beamfit.io.dates import unix_time
+from beamfit.io.files import name_of
 from beamfit.io.table import Column, Sheet, columns_of, left_out, read_sheet
 from beamfit.studies.response.record import Run
 
@@ -89,7 +89,7 @@ def read_run(
         row = int(late[0]) + 1
         found = f"time {time[row]:.10g} s after {time[row - 1]:.10g} s"
         raise sheet.error(found, "times that increase", row, columns[TIME].header)
-    name = Path(sheet.path).name
+    name = name_of(sheet.path)
     said = {"provenance": sheet.comments, "notes": left_out(sheet), "sha256": sheet.sha256}
     return Run(time, u, y, name=name, path=str(sheet.path), **said)
 

@@ -15,7 +15,7 @@ from types import MappingProxyType
 from typing import Any
 
 from beamfit.errors import InputError, nearest
-from beamfit.io.files import read_text
+from beamfit.io.files import name_of, read_text
 from beamfit.io.lattice import LatticeFile
 from beamfit.io.sequence_elements import NOTHING_AT_ZERO, Source, element_tables
 from beamfit.particles import REST_ENERGY, expected_energy
@@ -115,7 +115,7 @@ def read_sequence(
         energy_spread=0.0,
         elements=tuple(elements),
         calibrations={e["name"]: units[e["type"]] for e in elements if e["type"] in units},
-        source=f"{name} of the {source.dialect} file {Path(path).name}",
+        source=f"{name} of the {source.dialect} file {name_of(path)}",
     )
 
 

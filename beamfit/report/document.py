@@ -15,6 +15,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure, FigureBase
 
 import beamfit
+from beamfit.errors import plain
 from beamfit.status import Status
 from beamfit.table import Table
 
@@ -109,7 +110,7 @@ def html_of(page: Page) -> bytes:
     )
     pictures = [{"alt": p.alt, "data": _svg(p)} for p in page.pictures]
     content = page._asdict() | {"pictures": pictures}
-    return environment.get_template("page.html.j2").render(**content).encode()
+    return plain(environment.get_template("page.html.j2").render(**content)).encode()
 
 
 def figure_of(picture: Picture) -> Figure:

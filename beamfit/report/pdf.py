@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.font_manager import FontProperties
 from matplotlib.textpath import text_to_path
 
+from beamfit.errors import plain
 from beamfit.report.document import Page, Picture
 from beamfit.table import Table
 
@@ -127,7 +128,7 @@ def width_of(words: str, size: float, weight: str = "normal") -> float:
 def wrapped(words: str, room: float, size: float, weight: str = "normal") -> list[str]:
     """Break a text into lines that fit into so many inches; within a word where that is longer."""
     lines = [""]
-    for word in words.split():
+    for word in plain(words).split():
         longer = f"{lines[-1]} {word}".strip()
         if width_of(longer, size, weight) <= room:
             lines[-1] = longer

@@ -80,6 +80,6 @@ def test_damaged_documents_are_read_or_refused(root):
             right += 1
         except InputError as error:
             refused.append(str(error))
-    assert not [said for said in refused if "\n" in said or len(said) > 1500]
+    assert not [said for said in refused if "\n" in said or len(said) > 391]
     assert 0.03 * COUNT < right < 0.9 * COUNT
     assert resident() - before < GROWTH
