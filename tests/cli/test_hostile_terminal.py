@@ -13,6 +13,7 @@ from beamfit.cli.show import Terminal
 from beamfit.errors import InputError, nearest
 
 COMMAND = [sys.executable, "-m", "beamfit"]
+BARE = {"PYTHONPATH": os.pathsep.join(sys.path)}
 EVIL = os.fsdecode(b"d\x1b[31m\xff.csv")
 
 
@@ -48,7 +49,7 @@ def test_a_message_is_a_few_lines_of_a_terminal(error):
 def test_ctrl_c_is_one_line(tmp_path):
     pipe = tmp_path / "decay.csv"
     os.mkfifo(pipe)
-    process = subprocess.Popen([*COMMAND, "lifetime", pipe], stderr=subprocess.PIPE, cwd=tmp_path)
+    process = subprocess.Popen([*COMMAND, "lifetime", pipe], stderr=subprocess.PIPE, env=BARE)
     with open(pipe, "wb"):  # which the command has opened now, and waits for
         process.send_signal(signal.SIGINT)
         said = process.communicate(timeout=60)[1]
@@ -67,14 +68,13 @@ def test_what_is_half_written_goes_with_the_process(tmp_path, monkeypatch, capfd
 
 def test_no_output_no_home_and_a_reader_that_leaves(root, tmp_path):
     """Descriptors closed before the start, an empty environment, and `| head -1`."""
-    bare = {"PYTHONPATH": os.pathsep.join(sys.path)}
     path = root / "measurements/aps_1999_decay.csv"
     shut = ["sh", "-c", f'exec {sys.executable} -m beamfit check "{path}" >&- 2>&-']
-    assert subprocess.run(shut, env=bare, cwd=tmp_path, check=False).returncode == 0
+    assert subprocess.run(shut, env=BARE, cwd=tmp_path, check=False).returncode == 0
     read, write = os.pipe()
     os.close(read)
     done = subprocess.run(
-        [*COMMAND, "check", path], env=bare, stdout=write, stderr=subprocess.PIPE, check=False
+        [*COMMAND, "check", path], env=BARE, stdout=write, stderr=subprocess.PIPE, check=False
     )
     os.close(write)
     assert (done.returncode, done.stderr) == (0, b"")
