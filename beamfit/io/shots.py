@@ -56,22 +56,10 @@ def average_shots(scan: QuadScan, *, marked: bool) -> QuadScan:
             given[plane] = np.sqrt(mean_square / shots)
     first = np.unique(group, return_index=True)[1]
     said = "the scatter of the shots (standard error of the mean)" if scatter else "the file"
-    return replace(
-        scan,
-        settings={n: v[first] for n, v in scan.settings.items()},
-        size=size,
-        error=scatter | given,
-        **{
-            name: None if (values := getattr(scan, name)) is None else values[first]
-            for name in ("energy", "resolution", "energy_spread")
-        },
-        screen=scan.screen and tuple(scan.screen[i] for i in first),
-        slice=scan.slice and tuple(scan.slice[i] for i in first),
-        transfer=scan.transfer and {p: r[first] for p, r in scan.transfer.items()},
-        # Errors that the file gives are not taken from these shots.
-        shots=None if given else np.bincount(group),
-        error_source=said if scatter or given else "none given",
-    )
+    # Errors that the file gives are not taken from these shots.
+    means = {"size": size, "error": scatter | given, "shots": None if given else np.bincount(group)}
+    said = said if scatter or given else "none given"
+    return replace(scan, **scan.columns_at(first) | means, error_source=said)
 
 
 def _means(values: np.ndarray, group: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -15,7 +15,6 @@ from beamfit.greybox.problem import Free, Prior, Problem
 from beamfit.greybox.tree import leaves
 from beamfit.optics.beamline import Beamline
 from beamfit.optics.calibration import CurrentPolynomial, SlopeIntercept
-from beamfit.quantity import Quantity
 from beamfit.status import Status
 from beamfit.studies.scan.assumptions import Assumptions
 from beamfit.studies.scan.results import Parameter
@@ -198,17 +197,7 @@ def _parameters(seen: Seen, told: Assumptions, fit: Fit) -> Iterator[Parameter]:
         edge = v.state in ("lower", "upper")
         known = settled and not edge and v.error == v.error
         status = Status.converged if known else Status.at_limit if edge else Status.unidentified
-        error, raw = (v.error, v.error_raw) if known else (None, None)
-        yield Parameter(
-            name=name,
-            value=Quantity(v.value, error, number.unit, raw),
-            status=status,
-            state=v.state,
-            lower=v.lower,
-            upper=v.upper,
-            prior=told.priors.get(name),
-            multiplier=v.reduced_gradient,
-        )
+        yield Parameter.of(name, v, number.unit, status, told.priors.get(name))
 
 
 def _null_directions(

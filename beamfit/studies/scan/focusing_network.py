@@ -241,16 +241,8 @@ def _parameters(seen: Seen, told: Assumptions, fit: Fit) -> Iterator[Parameter]:
 def _derived(name: str, found: Derived, i: int, settled: bool) -> Parameter:
     known = settled and bool(np.isfinite(found.error[i]))
     errors = (float(found.error[i]), float(found.error_raw[i])) if known else (None, None)
-    return Parameter(
-        name=name,
-        value=Quantity(float(found.value[i]), errors[0], "1/m^2", errors[1]),
-        status=Status.converged if known else Status.unidentified,
-        state="free",
-        lower=-np.inf,
-        upper=np.inf,
-        prior=None,
-        multiplier=0.0,
-    )
+    value = Quantity(float(found.value[i]), errors[0], "1/m^2", errors[1])
+    return Parameter(name, value, Status.converged if known else Status.unidentified)
 
 
 def _null_directions(

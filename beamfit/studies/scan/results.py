@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -14,6 +14,9 @@ from beamfit.quantity import Quantity, display_unit
 from beamfit.shown import shown
 from beamfit.status import Status
 from beamfit.table import Table, cell, json_of, labelled
+
+if TYPE_CHECKING:
+    from beamfit.greybox.fit import Variable
 
 # A longer table of points is cut, and says so.
 MOST_ROWS = 500
@@ -93,11 +96,25 @@ class Parameter(NamedTuple):
     name: str
     value: Quantity
     status: Status
-    state: str
-    lower: float
-    upper: float
-    prior: tuple[float, float] | None
-    multiplier: float
+    state: str = "free"
+    lower: float = -math.inf
+    upper: float = math.inf
+    prior: tuple[float, float] | None = None
+    multiplier: float = 0.0
+
+    @classmethod
+    def of(
+        cls,
+        name: str,
+        v: Variable,
+        unit: str,
+        status: Status,
+        prior: tuple[float, float] | None = None,
+    ) -> Parameter:
+        """A free number of a fit, with its error where the status says that it is known."""
+        errors = (v.error, v.error_raw) if status is Status.converged else (None, None)
+        value = Quantity(v.value, errors[0], unit, errors[1])
+        return cls(name, value, status, v.state, v.lower, v.upper, prior, v.reduced_gradient)
 
 
 @shown

@@ -5,10 +5,10 @@ Plain numpy, so that a bad file is reported before JAX is ever loaded.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from os import PathLike
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -28,6 +28,9 @@ PROJECTED = "projected"
 MOST_SHOWN = 20
 # Rms sizes in m that a beam can have, and that most have: outside a unit is wrong, or questioned.
 POSSIBLE, USUAL = (1e-8, 0.3), (1e-6, 2e-2)
+# What a scan has for each of its rows.
+EACH_ROW = ("settings", "size", "error", "energy", "screen", "resolution", "energy_spread")
+EACH_ROW += ("shots", "slice", "transfer")
 
 
 @shown
@@ -264,20 +267,21 @@ class QuadScan:
         """
         if plane not in self.size:
             raise self.unusable(f"no sizes in plane {plane}", f"a column size_{plane}_um")
-        keep = ~np.isnan(self.size[plane])
-        optional = (self.energy, self.resolution, self.energy_spread)
-        energy, resolution, spread = (None if v is None else v[keep] for v in optional)
-        return PlaneRows(
-            settings={name: values[keep] for name, values in self.settings.items()},
-            size=self.size[plane][keep],
-            error=self.error[plane][keep] if plane in self.error else None,
-            energy=energy,
-            screen=None
-            if self.screen is None
-            else tuple(s for s, k in zip(self.screen, keep, strict=True) if k),
-            resolution=resolution,
-            energy_spread=spread,
-        )
+        part = self.columns_at(np.flatnonzero(~np.isnan(self.size[plane])))
+        own = {"size": part["size"][plane], "error": part["error"].get(plane)}
+        return PlaneRows(**{name: (part | own)[name] for name in PlaneRows._fields})
+
+    def columns_at(self, rows: Sequence[int]) -> dict[str, Any]:
+        """What the scan has for each row, of some of them: arguments of `QuadScan` by name."""
+
+        def taken(values: Any) -> Any:
+            if isinstance(values, Mapping):
+                return {name: taken(v) for name, v in values.items()}
+            if values is None or isinstance(values, tuple):
+                return values and tuple(values[i] for i in rows)
+            return np.asarray(values)[rows]
+
+        return {name: taken(getattr(self, name)) for name in EACH_ROW}
 
     def of_slice(self, name: str) -> QuadScan:
         """The rows of one slice of the beam, in the planes it was measured in.
@@ -297,21 +301,13 @@ class QuadScan:
         if name not in self.slices:
             raise self.unusable(f"no slice '{name}'", nearest(name, list(self.slices)), "slice")
         at = [i for i, own in enumerate(self.slice) if own == name]
-        size = {p: v[at] for p, v in self.size.items() if not np.isnan(v[at]).all()}
-        arrays = {key: getattr(self, key) for key in ("energy", "resolution", "energy_spread")}
-        arrays |= {"shots": self.shots}
-        return replace(
-            self,
-            settings={n: v[at] for n, v in self.settings.items()},
-            size=size,
-            error={p: v[at] for p, v in self.error.items() if p in size},
-            **{key: None if v is None else np.asarray(v)[at] for key, v in arrays.items()},
-            screen=self.screen and tuple(self.screen[i] for i in at),
-            slice=(name,) * len(at),
-            transfer=self.transfer and {p: self.transfer[p][at] for p in size},
-            profiles=tuple(p._replace(row=at.index(p.row)) for p in self.profiles if p.row in at),
-            name=f"{self.name}, slice {name}" if name != PROJECTED else f"{self.name}, {name}",
-        )
+        part = self.columns_at(at)
+        seen = [p for p, v in part["size"].items() if not np.isnan(v).all()]
+        for key in ("size", "error", "transfer"):
+            part[key] = part[key] and {p: v for p, v in part[key].items() if p in seen}
+        profiles = tuple(p._replace(row=at.index(p.row)) for p in self.profiles if p.row in at)
+        word = "" if name == PROJECTED else "slice "
+        return replace(self, **part, profiles=profiles, name=f"{self.name}, {word}{name}")
 
     def of_particle(self, rest_energy: float) -> QuadScan:
         """The same scan with total energies, for a particle of a rest energy in MeV.

@@ -17,7 +17,6 @@ from beamfit.errors import InputError, nearest
 from beamfit.greybox.fit import Fit
 from beamfit.greybox.problem import Free, Prior, Problem
 from beamfit.optics.elements import Drift, Quadrupole, ThinLens
-from beamfit.quantity import Quantity
 from beamfit.status import Status
 from beamfit.studies.scan.assumptions import Assumptions
 from beamfit.studies.scan.model import spoken
@@ -124,18 +123,8 @@ def with_systematics(scenario: Scenario, told: Assumptions) -> Scenario:
         for term in _terms(seen, told):
             v = fit[term.path]
             known = v.state == "free" and math.isfinite(v.error)
-            yield Parameter(
-                name=term.name,
-                value=Quantity(
-                    v.value, v.error if known else None, term.unit, v.error_raw if known else None
-                ),
-                status=Status.converged if known else Status.at_limit,
-                state=v.state,
-                lower=v.lower,
-                upper=v.upper,
-                prior=(term.mean, term.sd),
-                multiplier=v.reduced_gradient,
-            )
+            status = Status.converged if known else Status.at_limit
+            yield Parameter.of(term.name, v, term.unit, status, (term.mean, term.sd))
 
     return replace(scenario, state=state, parameters=parameters, closed=False)
 

@@ -105,49 +105,28 @@ def _held(same: _Same, energy: float) -> Beamline:
     return same.line.held(energy)
 
 
-def rows_line(
-    scan: QuadScan, energy: float | None = None, mass: float = ELECTRON_MASS, start: str = "start"
-) -> Beamline:
-    """The line of rows that have matrices of their own: where these begin, and nothing else.
+def rows_line(scan: QuadScan) -> Beamline:
+    """The line of rows of electrons that have matrices of their own: where these begin, no more.
 
-    Parameters
-    ----------
-    scan : QuadScan
-        With ``transfer``.
-    energy : float, optional
-        Total energy in MeV; the mean of the rows' if None.
-    mass : float
-        Rest energy in MeV.
-    start : str
-        What to call the place where the matrices begin.
-
-    Returns
-    -------
-    Beamline
-        The rows' screens and the start, all in one place.
-
-    Raises
-    ------
-    InputError
-        If the rows have no matrices, or there is no energy.
+    The rows' screens and the start stand in one place. Rows without matrices or without an energy
+    are an `InputError`.
 
     Examples
     --------
     >>> rows = [[1.0, 0.0], [1.0, 1.0], [1.0, 2.0]]
-    >>> scan = QuadScan({}, {}, {"x": [1e-4, 2e-4, 3e-4]}, transfer={"x": rows})
-    >>> rows_line(scan, energy=100.0).screens
+    >>> sizes = {"x": [1e-4, 2e-4, 3e-4]}
+    >>> rows_line(QuadScan({}, {}, sizes, energy=[100.0] * 3, transfer={"x": rows})).screens
     ('start',)
     """
     if scan.transfer is None:
         expected = "a lattice, or columns r11_x, r12_x, ... of every row"
         raise scan.unusable("a scan without a line", expected)
-    scan = scan.of_particle(mass)
-    if energy is None and scan.energy is None:
+    if scan.energy is None:
         expected = "a column energy_MeV, --energy, or a line of that energy"
         raise scan.unusable("no beam energy", expected)
-    names = [name for name in dict.fromkeys(scan.screen or ()) if name != start]
-    own = float(np.mean(scan.energy)) if energy is None else energy
-    return Beamline(tuple(Screen(n) for n in (*names, start)), own, "rows", mass)
+    names = [name for name in dict.fromkeys(scan.screen or ()) if name != "start"]
+    energy = float(np.mean(scan.of_particle(ELECTRON_MASS).energy))
+    return Beamline(tuple(Screen(n) for n in (*names, "start")), energy, "rows", ELECTRON_MASS)
 
 
 @tree.node("plane", "places", "squared")
@@ -252,8 +231,8 @@ class NetworkRows:
         return through_screen(model.get("systematics", {}), r11, r12, self.known)
 
 
-def padded(values: Any, n: int | None = None) -> np.ndarray:
-    """Repeat the last row until there are as many as `padded_length` says, or n.
+def padded(values: Any) -> np.ndarray:
+    """Repeat the last row until there are as many as `padded_length` says.
 
     Examples
     --------
@@ -261,7 +240,7 @@ def padded(values: Any, n: int | None = None) -> np.ndarray:
     [1.0, 2.0, 2.0, 2.0, 2.0, 2.0, 2.0, 2.0]
     """
     values = np.asarray(values)
-    more = (padded_length(len(values)) if n is None else n) - len(values)
+    more = padded_length(len(values)) - len(values)
     return np.concatenate([values, np.repeat(values[-1:], more, axis=0)])
 
 
