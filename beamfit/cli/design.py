@@ -8,8 +8,7 @@ import click
 
 import beamfit
 from beamfit.cli.options import command_line, options
-from beamfit.io.inputs import read_inputs
-from beamfit.io.line import build_line
+from beamfit.io.line import build_line, read_inputs
 from beamfit.io.result import results_text
 from beamfit.studies.scan.assumptions import Assumptions
 from beamfit.studies.scan.typed import energies_of, goal_of

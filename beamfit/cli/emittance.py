@@ -9,8 +9,7 @@ import click
 import beamfit
 from beamfit.cli.options import Sampling, command_line, options
 from beamfit.errors import InputError
-from beamfit.io.inputs import read_inputs
-from beamfit.io.line import build_line
+from beamfit.io.line import build_line, read_inputs
 from beamfit.io.result import results_text
 from beamfit.io.systematics import read_systematics
 from beamfit.studies.scan.assumptions import Assumptions

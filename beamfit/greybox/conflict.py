@@ -1,11 +1,4 @@
-"""Which constraints cannot hold together, and the nearest point to keeping them all.
-
-Elastic relaxation: every constraint may give way, at the price of its violation squared. Where even
-the cheapest point pays, the deletion filter drops one constraint after the other and keeps dropped
-what the rest conflicts without; what is left is a set of which every part is needed
-(J. W. Chinneck, Feasibility and Infeasibility in Optimization, Springer 2008, sections 6.1 and
-6.2.1). The searches are local, so that the set is the smallest as far as they see.
-"""
+"""Constraints that cannot hold together, and those whose multipliers are not unique."""
 
 from __future__ import annotations
 
@@ -16,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from beamfit.greybox import problem
-from beamfit.greybox.assess import TOLERANCE, State
+from beamfit.greybox.assess import TOLERANCE, State, gradient_size, scale_of
 from beamfit.greybox.descend import descend_all
 from beamfit.greybox.problem import Problem
 
@@ -93,3 +86,101 @@ def _held(p: Problem, theta: np.ndarray) -> list[tuple[int, bool]]:
     loose = p.lower < p.upper
     sides = ((p.lower, True), (p.upper, False))
     return [(i, low) for edge, low in sides for i in np.flatnonzero((theta == edge) & loose)]
+
+
+# Gradients count as dependent below this singular value, at an optimum; at a point that is none,
+# where solvers creep towards a place without multipliers, below this one.
+DEPENDENT, NEARLY = 1e-8, 1e-2
+# A constraint has no slope where that is less than this share of how it changes within so much of
+# the numbers' sizes: a violation squared that a solver keeps below 1e-9 has a slope of 6e-5.
+SLOPELESS, NEAR, LOOKS = 1e-3, 0.3, 4
+# Of a combination, what is below this share of its largest part is none.
+PART = 1e-3
+
+
+class Dependence(NamedTuple):
+    """Names of what depends on one another where it holds, and of what has no slope there."""
+
+    names: tuple[str, ...]
+    slopeless: tuple[str, ...]
+
+
+def dependence(p: Problem, s: State, stationary: bool) -> Dependence | None:
+    """Find what is wrong with the limits that hold at a feasible point, if anything is.
+
+    Parameters
+    ----------
+    p : Problem
+        The problem.
+    s : State
+        The point.
+    stationary : bool
+        Whether the point has multipliers. If so they must be unique; if not, a combination of
+        gradients that all but vanishes tells why.
+
+    Returns
+    -------
+    Dependence or None
+    """
+    moving, unit = p.lower < p.upper, s.scale.unit
+    if not s.at.finite or not moving.any():
+        return None
+    gradients = np.vstack([np.diag(unit), s.at.jacobian * unit])[:, moving]
+    size = np.concatenate([unit, _changes(p, s)])
+    low, high = (
+        np.concatenate(pair) for pair in zip(s.bounds.reached, s.limits.reached, strict=True)
+    )
+    on = (low | high) & np.concatenate([moving, np.ones(len(s.limits.size), bool)])
+    if not on.any():
+        return None
+    # Of both signs what holds from both sides, and a multiplier that may become less.
+    equal = low & high
+    force = np.concatenate([s.found.bounds, s.found.constraints])
+    pull = np.concatenate([unit, np.linalg.norm(s.at.jacobian * unit, axis=1)])
+    strength = np.max(gradient_size(p, s.at, s.scale) * unit)
+    free = equal | (stationary & (np.abs(force) * pull > TOLERANCE * strength))
+    outward = np.where(low, 1.0, -1.0)[:, None] * gradients
+    length = np.linalg.norm(gradients, axis=1)
+    steep = length > SLOPELESS * size
+    rows = np.where(steep[:, None], outward / np.where(steep, length, 1.0)[:, None], 0.0)[on]
+    part = _combination(rows, free[on], DEPENDENT if stationary else NEARLY)
+    if part is None:
+        return None
+    names = np.array([*p.names, *p.constraint_names])
+    told = np.flatnonzero(on)[np.abs(part) > PART * np.max(np.abs(part))]
+    flat = told[~steep[told]]
+    return Dependence(tuple(names[told].tolist()), tuple(names[flat].tolist()))
+
+
+def _changes(p: Problem, s: State) -> np.ndarray:
+    """By how much each constraint changes along the numbers, from points around."""
+    unit = scale_of(p, s.theta, s.at).unit
+    steps = np.random.default_rng(0).normal(size=(LOOKS, len(unit))) * NEAR * unit
+    points = np.clip(s.theta + steps, p.lower, p.upper)
+    values = np.array([p.constraint_values(point) for point in points])
+    change = np.abs(values - s.at.constraints) / NEAR
+    return np.max(np.where(np.isfinite(change), change, 0.0), axis=0, initial=0.0)
+
+
+def _combination(rows: np.ndarray, free: np.ndarray, cut: float) -> np.ndarray | None:
+    """A combination of rows that vanishes, not negative where it is not free to be."""
+    left, sizes, _ = np.linalg.svd(rows, full_matrices=True)
+    none = left[:, int(np.sum(sizes > cut * max(1.0, np.max(sizes)))) :]
+    if not none.shape[1]:
+        return None
+    if free.all():
+        return none[:, 0]
+    if none.shape[1] == 1:
+        v = none[:, 0] * np.sign(none[np.argmax(np.abs(none[:, 0]) * ~free), 0])
+        return v if np.min(v[~free]) >= -PART * np.max(np.abs(v)) else None
+    from scipy.optimize import linprog
+
+    # Of several: the one with most that is not free; then one of what is free alone.
+    bound = [(-1.0, 1.0)] * none.shape[1]
+    found = linprog(-none[~free].sum(axis=0), -none[~free], np.zeros((~free).sum()), bounds=bound)
+    v = none @ found.x if found.status == 0 else np.zeros(len(rows))
+    if np.max(np.abs(v)) > PART:
+        return v
+    values, turned = np.linalg.svd(none[~free], full_matrices=True)[1:]
+    rest = turned[int(np.sum(values > cut)) :]
+    return none @ rest[0] if len(rest) else None

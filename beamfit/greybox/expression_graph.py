@@ -1,8 +1,4 @@
-"""Expressions as data, evaluated for many of one kind at once.
-
-A node is ``(head, arguments)``. Nodes whose heads are alike are computed together whatever
-expression they stand in, so that a sum of 100 000 terms of one form is a few array operations.
-"""
+"""Expressions as data, evaluated many at once, and JAX functions as expressions."""
 
 from __future__ import annotations
 
@@ -12,6 +8,8 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+
+from beamfit.errors import InputError
 
 
 class Node(NamedTuple):
@@ -114,3 +112,191 @@ def _step(kind: Any, nodes: list[Node], known: Callable[[int], int]) -> Callable
     function, count = FUNCTIONS[kind], len(nodes[0].arguments)
     columns = [plan([node.arguments[i] for node in nodes], known) for i in range(count)]
     return lambda x: 1.0 * function(*(column(x) for column in columns))
+
+
+SAME = {
+    "add": "plus", "add_any": "plus", "sub": "minus", "mul": "times", "div": "divide",
+    "neg": "negative", "pow": "power", "max": "max", "min": "min", "rem": "rem", "lt": "<",
+    "le": "<=", "eq": "=", "ge": ">=", "gt": ">", "ne": "!=", "and": "and", "or": "or",
+    "not": "not", "atan2": "atan2",
+} | {name: name for name in (
+    "exp", "log", "sin", "cos", "tan", "tanh", "sinh", "cosh", "asin", "acos", "atan", "asinh",
+    "acosh", "atanh", "sqrt", "abs", "floor", "ceil",
+)}  # fmt: skip
+MADE: dict[str, Callable[[Table, dict, list[int]], int]] = {
+    "integer_pow": lambda t, p, a: t.node("power", a[0], t.constant(p["y"])),
+    "square": lambda t, p, a: t.node("power", a[0], t.constant(2.0)),
+    "rsqrt": lambda t, p, a: t.node("power", a[0], t.constant(-0.5)),
+    "log1p": lambda t, p, a: t.node("log", t.node("plus", t.constant(1.0), a[0])),
+    "expm1": lambda t, p, a: t.node("minus", t.node("exp", a[0]), t.constant(1.0)),
+    "logistic": lambda t, p, a: t.node(
+        "divide",
+        t.constant(1.0),
+        t.node("plus", t.constant(1.0), t.node("exp", t.node("negative", a[0]))),
+    ),
+    "select_n": lambda t, p, a: t.node("if", a[0], a[2], a[1]),
+    "clamp": lambda t, p, a: t.node("max", a[0], t.node("min", a[1], a[2])),
+    "convert_element_type": lambda t, p, a: a[0],
+    "stop_gradient": lambda t, p, a: a[0],
+    "copy": lambda t, p, a: a[0],
+}
+# What only moves elements, and which of its arguments are moved (all where none is named).
+MOVED = dict.fromkeys(
+    ("reshape", "transpose", "broadcast_in_dim", "squeeze", "expand_dims", "slice", "rev", "split",
+     "dynamic_slice", "gather", "copy_p"), (0,)
+) | {"concatenate": (), "pad": (), "scatter": (0, 2), "dynamic_update_slice": (0, 1)}  # fmt: skip
+REDUCED = {"reduce_sum": "sum", "reduce_max": "max", "reduce_min": "min"}
+INSIDE = ("jaxpr", "call_jaxpr", "fun_jaxpr")
+
+
+class Places(NamedTuple):
+    """An array of places in the table."""
+
+    at: np.ndarray
+
+
+class Table:
+    """Nodes ``(head, places of arguments, value)``, arguments before what is made of them."""
+
+    def __init__(self):
+        self.nodes: list[tuple[str, tuple[int, ...], Any]] = []
+        self.known: dict[tuple, int] = {}
+
+    def put(self, *node: Any) -> int:
+        """The place of a node, made where it is new."""
+        if node not in self.known:
+            self.known[node] = len(self.nodes)
+            self.nodes.append(node)
+        return self.known[node]
+
+    def constant(self, value: Any) -> int:
+        """A number."""
+        return self.put("constant", (), float(value))
+
+    def node(self, head: str, *arguments: int) -> int:
+        """An operation; what adds nothing or multiplies by 1 or 0 is left out."""
+        values = [self.nodes[a][2] if self.nodes[a][0] == "constant" else None for a in arguments]
+        if head == "times" and 0.0 in values:
+            return self.constant(0.0)
+        for unit in {"plus": (0.0,), "times": (1.0,)}.get(head, ()):
+            if unit in values:
+                return arguments[1 - values.index(unit)]
+        return self.put(head, tuple(arguments), None)
+
+    def many(self, head: str, arguments: Sequence[int]) -> int:
+        """A sum, maximum or minimum of any number."""
+        some = [a for a in arguments if head != "sum" or self.nodes[a] != ("constant", (), 0.0)]
+        if len(some) > 1:
+            return self.put(head, tuple(some), None)
+        return some[0] if some else self.constant(0.0)
+
+
+def traced(function: Callable, n: int, table: Table) -> np.ndarray:
+    """Places of a function's values in a table, variables being ``("variable", (), i)``.
+
+    Parameters
+    ----------
+    function : callable
+        ``f(x)``, shape (n,) to any, in JAX.
+    n : int
+        How many variables.
+    table : Table
+        Takes the nodes.
+
+    Raises
+    ------
+    InputError
+        If an operation has no counterpart: loops, foreign code, sorting.
+    """
+    closed = jax.make_jaxpr(function)(np.zeros(n))
+    variables = Places(np.array([table.put("variable", (), i) for i in range(n)]))
+    (found,) = _walk(table, closed.jaxpr, closed.consts, [variables])
+    return _places(table, found).at
+
+
+def _places(table: Table, value: Any) -> Places:
+    if isinstance(value, Places):
+        return value
+    value = np.asarray(value)
+    at = [table.constant(v) for v in value.ravel()]
+    return Places(np.array(at, int).reshape(value.shape))
+
+
+def _walk(table: Table, jaxpr: Any, consts: Sequence[Any], arguments: Sequence[Any]) -> list[Any]:
+    known = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*consts, *arguments], strict=True))
+
+    def value(atom):
+        return atom.val if hasattr(atom, "val") else known[atom]
+
+    for step in jaxpr.eqns:
+        given = [value(atom) for atom in step.invars]
+        found = _done(table, step, given)
+        known.update(zip(step.outvars, found, strict=True))
+    return [value(atom) for atom in jaxpr.outvars]
+
+
+def _done(table: Table, step: Any, given: list[Any]) -> list[Any]:
+    """What one operation gives."""
+    name, params = step.primitive.name, step.params
+    inside = next((params[key] for key in INSIDE if key in params), None)
+    if inside is not None and name not in ("while", "scan", "cond"):
+        closed = hasattr(inside, "jaxpr")
+        return _walk(table, inside.jaxpr if closed else inside, inside.consts if closed else (),
+                     given)  # fmt: skip
+    if not any(isinstance(part, Places) for part in given):
+        found = step.primitive.bind(*given, **params)
+        return list(found) if step.primitive.multiple_results else [found]
+    if name == "select_n" and not isinstance(given[0], Places) and len(given) == 3:
+        cases = [_places(table, part).at for part in given[1:]]
+        return [Places(np.where(np.asarray(given[0]), cases[1], cases[0]))]
+    if name in MOVED:
+        every = MOVED[name] or range(len(given))
+        parts = [_places(table, v).at if i in every else v for i, v in enumerate(given)]
+        if any(isinstance(part, Places) for part in parts):
+            raise _refused(f"{name} at places that depend on the numbers")
+        found = step.primitive.bind(*map(np.asarray, parts), **params)
+        found = found if step.primitive.multiple_results else [found]
+        return [Places(np.asarray(part)) for part in found]
+    if name in REDUCED:
+        return [_along(table, REDUCED[name], given[0].at, params["axes"])]
+    if name == "dot_general":
+        return [_product(table, *given, params["dimension_numbers"])]
+    if name not in SAME and name not in MADE:
+        raise _refused(f"the operation '{name}'")
+    at = np.broadcast_arrays(*(_places(table, part).at for part in given))
+    make = MADE.get(name, lambda t, p, a: t.node(SAME[name], *a))
+    flat = [make(table, params, list(some)) for some in zip(*(a.ravel().tolist() for a in at),
+                                                            strict=True)]  # fmt: skip
+    return [Places(np.array(flat, int).reshape(at[0].shape))]
+
+
+def _along(table: Table, head: str, at: np.ndarray, axes: Sequence[int]) -> Places:
+    kept = [i for i in range(at.ndim) if i not in axes]
+    rows = np.transpose(at, (*kept, *axes)).reshape((*(at.shape[i] for i in kept), -1))
+    flat = [table.many(head, row) for row in rows.reshape(-1, rows.shape[-1]).tolist()]
+    return Places(np.array(flat, int).reshape(rows.shape[:-1]))
+
+
+def _product(table: Table, left: Any, right: Any, numbers: Any) -> Places:
+    """A product of matrices: batch axes first, then those of the left, then of the right."""
+    (of_left, of_right), (batch_left, batch_right) = numbers
+    a, b = _places(table, left).at, _places(table, right).at
+    a = np.moveaxis(a, [*batch_left, *of_left], [*range(len(batch_left)),
+                    *range(-len(of_left), 0)])  # fmt: skip
+    b = np.moveaxis(b, [*batch_right, *of_right], [*range(len(batch_right)),
+                    *range(-len(of_right), 0)])  # fmt: skip
+    batch, inner = a.shape[: len(batch_left)], a.shape[a.ndim - len(of_left) :]
+    rows, columns = (part.shape[len(batch) : part.ndim - len(inner)] for part in (a, b))
+    count = [int(np.prod(part)) for part in (batch, rows, columns, inner)]
+    a, b = a.reshape(count[0], count[1], count[3]), b.reshape(count[0], count[2], count[3])
+    flat = [
+        table.many("sum", [table.node("times", *pair) for pair in zip(u, v, strict=True)])
+        for some, others in zip(a.tolist(), b.tolist(), strict=True)
+        for u in some
+        for v in others
+    ]
+    return Places(np.array(flat, int).reshape((*batch, *rows, *columns)))
+
+
+def _refused(what: str) -> InputError:
+    return InputError(what, "operations on numbers that expressions can say; no loops, no sorting")

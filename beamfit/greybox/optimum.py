@@ -6,7 +6,7 @@ import numpy as np
 
 from beamfit.greybox import assess, curvature
 from beamfit.greybox.assess import TOLERANCE
-from beamfit.greybox.dependence import dependence
+from beamfit.greybox.conflict import dependence
 from beamfit.greybox.evidence import Evidence, listed
 from beamfit.greybox.problem import Problem
 from beamfit.status import Status

@@ -14,7 +14,7 @@ from beamfit.io.archive import archive_sheet
 from beamfit.io.dates import dates_in_order
 from beamfit.io.files import name_of
 from beamfit.io.headers import is_number
-from beamfit.io.offset import offset_of
+from beamfit.io.monitor import offset_of
 from beamfit.io.scan_columns import is_size
 from beamfit.io.table import UNITS, Column, Sheet, columns_of, left_out
 from beamfit.studies.decay.monitor import Monitor

@@ -10,8 +10,8 @@ import numpy as np
 
 from beamfit.errors import InputError
 from beamfit.greybox import problem
+from beamfit.greybox.expression_graph import Table, traced
 from beamfit.greybox.problem import Problem
-from beamfit.greybox.traced import Table, traced
 from beamfit.io.nl import OPCODES
 from beamfit.writing import write_atomically
 

@@ -11,8 +11,7 @@ import scipy.io
 import beamfit
 from beamfit.cli import main
 from beamfit.io.emittance_gui import read_emittance_gui
-from beamfit.io.inputs import read_inputs
-from beamfit.io.line import build_line
+from beamfit.io.line import build_line, read_inputs
 from beamfit.io.matlab import read_variable
 from beamfit.optics.elements import Drift, Quadrupole, Screen
 from beamfit.studies.scan.size_methods import compare_size_methods

@@ -5,7 +5,7 @@ import pytest
 
 from beamfit.errors import InputError
 from beamfit.io.decay_record import read_decay_record
-from beamfit.io.offset import offset_of
+from beamfit.io.monitor import offset_of
 from beamfit.studies.decay.fit import fit_decay
 
 

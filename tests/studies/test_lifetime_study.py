@@ -13,8 +13,7 @@ from beamfit.lifetime.bunch import rf_acceptance
 from beamfit.lifetime.decay import current
 from beamfit.lifetime.losses import SCALES, loss_coefficients, loss_terms, scaled_losses
 from beamfit.quantity import Status
-from beamfit.studies.decay.next_decay import Candidate, next_decays
-from beamfit.studies.decay.operating_point import Limits, best_operating_point
+from beamfit.studies.decay.next_decay import Candidate, Limits, best_operating_point, next_decays
 from beamfit.studies.decay.record import Conditions, DecayRecord
 from beamfit.studies.decay.scales import fit_scales, sample_scales
 from beamfit.studies.decay.shift import budget_intervals, find_anomaly

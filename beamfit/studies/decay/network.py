@@ -30,8 +30,15 @@ from beamfit.lifetime.losses import Terms, loss_terms, scaled_losses
 from beamfit.lifetime.ring import Operation
 from beamfit.quantity import Quantity
 from beamfit.shown import shown
-from beamfit.studies.decay.box import INPUTS, SIGNS, Box, Certificate, scaled
-from beamfit.studies.decay.discrepancy import Discrepancy, sized
+from beamfit.studies.decay.certainty import (
+    INPUTS,
+    SIGNS,
+    Box,
+    Certificate,
+    Discrepancy,
+    scaled,
+    sized,
+)
 from beamfit.studies.decay.scales import PRESSURE_ERROR, ScaleFit, stacked_terms
 from beamfit.studies.decay.study import Decay, Machine, operation_during
 from beamfit.studies.decay.summary import Summaries, loss_parts, summarise

@@ -1,4 +1,4 @@
-"""Which decay to record next: the one that tells most about the scales."""
+"""Which decay to record next, and where to run the ring, by the scales of many decays."""
 
 from __future__ import annotations
 
@@ -11,10 +11,13 @@ import numpy as np
 
 from beamfit.errors import InputError
 from beamfit.greybox.design import Information, scores
+from beamfit.lifetime.decay import HOUR
 from beamfit.lifetime.decay import current as decayed
-from beamfit.lifetime.losses import Terms, scaled_losses
+from beamfit.lifetime.losses import Terms, loss_terms, scaled_losses
 from beamfit.lifetime.ring import Operation
-from beamfit.studies.decay.scales import ScaleFit, pulls, whitener
+from beamfit.quantity import Quantity, Status
+from beamfit.sampling.posterior import Posterior
+from beamfit.studies.decay.scales import ScaleFit, losses_of, pulls, whitener
 from beamfit.studies.decay.summary import Summaries, information_root, loss_parts
 
 # So wide a prior on scales near 1 decides nothing, and keeps determinants finite.
@@ -132,3 +135,163 @@ def _known(fit: ScaleFit) -> Information:
 def _priors(fit: ScaleFit) -> list[np.ndarray]:
     problem = fit.fit.problem
     return [np.equal(problem.names, prior.name) / prior.sd for prior in problem.priors]
+
+
+GRID = 33
+
+
+class Limits(NamedTuple):
+    """Lowest and highest value allowed of each setting.
+
+    Attributes
+    ----------
+    rf_voltage : (float, float)
+        V.
+    scraper_y : (float, float)
+        Distance from the beam, m.
+    bunches : (float, float)
+        Number of bunches.
+    """
+
+    rf_voltage: tuple[float, float]
+    scraper_y: tuple[float, float]
+    bunches: tuple[float, float]
+
+
+class BestPoint(NamedTuple):
+    """The settings of the longest lifetime.
+
+    Attributes
+    ----------
+    rf_voltage : Quantity
+        V; its error is the spread of the best voltage over the posterior, at least the grid's.
+    scraper_y, bunches : float
+        m, and number: always the upper limits.
+    lifetime : Quantity
+        Lifetime there, h; NaN where the decays do not tell it.
+    usual : Quantity
+        Lifetime at the machine's usual settings, h; NaN where the decays do not tell it.
+    message : str
+        What limits it.
+    """
+
+    rf_voltage: Quantity
+    scraper_y: float
+    bunches: float
+    lifetime: Quantity
+    usual: Quantity
+    message: str
+
+    @property
+    def status(self) -> Status:
+        """`unidentified` where the decays do not tell the lifetime there."""
+        return Status.unidentified if self.lifetime.error is None else Status.converged
+
+
+def _over_voltages(fit: ScaleFit, operation: Operation, current: float, at: np.ndarray) -> Terms:
+    def one(voltage):
+        return loss_terms(fit.machine.ring, operation._replace(rf_voltage=voltage), current)
+
+    if fit.voltages is None:
+        return jax.lax.map(one, jnp.asarray(at))
+    shape = (at.size, fit.voltages.size)
+    found = jax.lax.map(one, jnp.asarray(np.outer(at, fit.voltages).ravel()))
+    parts = tuple(part.reshape(shape) for part in found.parts)
+    rest = [part.reshape(shape)[:, 0] for part in found[1:-1]]
+    return Terms(parts, *rest, jnp.broadcast_to(fit.voltages, shape))
+
+
+def _best(draws: np.ndarray, terms: Terms, at: np.ndarray) -> np.ndarray:
+    """Voltage of the smallest loss rate for each draw."""
+
+    def rate(scales):
+        a, b = scaled_losses(scales, terms)
+        return a * terms.current + b
+
+    return at[np.asarray(jnp.argmin(jax.vmap(rate)(jnp.asarray(draws)), axis=1))]
+
+
+def _lifetime(fit: ScaleFit, draws: np.ndarray, operation: Operation, current: float) -> Quantity:
+    terms = fit.terms_at(operation, current)
+    a, b = losses_of(draws, terms)
+    hours = np.asarray(1 / (a * current + b) / HOUR)
+
+    def rate(scales):
+        a, b = scaled_losses(scales, terms)
+        return a * current + b
+
+    if not fit.determines(rate):
+        return Quantity(float("nan"), None, "h")
+    return Quantity(float(hours.mean()), float(hours.std()), "h")
+
+
+def best_operating_point(
+    fit: ScaleFit, sample: Posterior, limits: Limits, current: float
+) -> BestPoint:
+    """Find the settings of the longest lifetime within limits.
+
+    Parameters
+    ----------
+    fit : ScaleFit
+        Fitted scales.
+    sample : Posterior
+        Their draws.
+    limits : Limits
+        What may be set.
+    current : float
+        Beam current to run at, mA.
+
+    Returns
+    -------
+    BestPoint
+        With the spread over the posterior.
+
+    Raises
+    ------
+    InputError
+        If a limit is empty, or no voltage within the limits stores a beam.
+
+    Notes
+    -----
+    More bunches and a wider scraper never shorten the lifetime (a_T falls with both bunch
+    population and length, the elastic cross section with the acceptance), so both sit at their
+    upper limits. The voltage has an inner optimum where the bucket outgrows the lattice's
+    acceptance: a grid, refined once around the best points of all draws.
+    """
+    for name, (low, high) in limits._asdict().items():
+        if not 0 < low <= high:
+            raise InputError(f"limits {low:g} to {high:g}", "0 < lower <= upper", column=name)
+    low, high = limits.rf_voltage
+    loss = float(fit.machine.ring.energy_loss)
+    if high <= loss:
+        expected = f"more than the loss of {loss:.6g} V a turn, or no beam is stored"
+        raise InputError(f"at most {high:.6g} V", expected, column="rf_voltage")
+    low = max(low, 1.01 * loss)
+    usual = fit.machine.operation
+    wide = usual._replace(scraper_y=limits.scraper_y[1], bunches=float(limits.bunches[1]))
+    draws = np.asarray(sample.draws)[:: max(1, len(sample.draws) // 2000)]
+    at = np.linspace(low, max(high, low), GRID)
+    found = _best(draws, _over_voltages(fit, wide, current, at), at)
+    step = at[1] - at[0]
+    at = np.linspace(max(low, found.min() - step), min(at[-1], found.max() + step), GRID)
+    found = _best(draws, _over_voltages(fit, wide, current, at), at)
+    step = at[1] - at[0]
+    error = float(np.hypot(found.std(), step / np.sqrt(12)))
+    best = float(np.median(found))
+    inside = low + step < best < high - step
+    reached = _lifetime(fit, draws, wide._replace(rf_voltage=best), current)
+    message = (
+        "The best RF voltage lies within its limits, where bucket and lattice acceptance meet."
+        if inside
+        else "The best RF voltage is at its limit: more range would help."
+    )
+    if reached.error is None:
+        message, inside = "The decays do not tell the lifetime at other settings: vary them.", False
+    return BestPoint(
+        rf_voltage=Quantity(best, error if inside else None, "V"),
+        scraper_y=limits.scraper_y[1],
+        bunches=limits.bunches[1],
+        lifetime=reached,
+        usual=_lifetime(fit, draws, usual, current),
+        message=message,
+    )

@@ -23,8 +23,14 @@ from beamfit.shown import shown
 from beamfit.studies.decay.fit import bare
 from beamfit.studies.decay.held_back import HeldBack, predict_held_back
 from beamfit.studies.decay.network import Network, NetworkFit, fit_loss_network
-from beamfit.studies.decay.next_decay import Candidate, Proposal, next_decays
-from beamfit.studies.decay.operating_point import BestPoint, Limits, best_operating_point
+from beamfit.studies.decay.next_decay import (
+    BestPoint,
+    Candidate,
+    Limits,
+    Proposal,
+    best_operating_point,
+    next_decays,
+)
 from beamfit.studies.decay.scales import ScaleFit, fit_scales, pulls, stacked_terms, whitener
 from beamfit.studies.decay.study import Decay, Machine, operation_during, settings_json
 from beamfit.studies.decay.summary import summarise

@@ -20,11 +20,13 @@ from beamfit.status import Status
 from beamfit.studies.scan.candidates import (
     Candidate,
     Considered,
+    by_plane,
     candidate_rows,
     further_options,
+    identified,
+    information_of,
 )
 from beamfit.studies.scan.fit import EmittanceFit
-from beamfit.studies.scan.information import by_plane, identified, information_of
 from beamfit.table import Table, json_of, text_of
 
 CRITERIA = ("emittance", "D")

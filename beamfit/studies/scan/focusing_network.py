@@ -26,13 +26,13 @@ from beamfit.greybox.problem import Problem, Record
 from beamfit.quantity import Quantity
 from beamfit.status import Status
 from beamfit.studies.scan.assumptions import Assumptions
-from beamfit.studies.scan.results import Parameter
-from beamfit.studies.scan.signed_network import (
+from beamfit.studies.scan.constrained_network import (
     common_errors,
     known_record,
     signed_network,
     weight_free,
 )
+from beamfit.studies.scan.results import Parameter
 from beamfit.studies.scan.statement import (
     Scenario,
     Seen,

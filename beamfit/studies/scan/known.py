@@ -14,7 +14,6 @@ from beamfit.optics.beamline import Beamline
 from beamfit.optics.calibration import SETTING_UNITS
 from beamfit.statistics import chi2_probability
 from beamfit.studies.scan.assumptions import Assumptions
-from beamfit.studies.scan.influence import Influence, influence_of
 from beamfit.studies.scan.model import coefficients, size_squared
 from beamfit.studies.scan.names import check_names
 from beamfit.studies.scan.next_point import (
@@ -30,9 +29,9 @@ from beamfit.studies.scan.noise import (
     noise_of,
     unlikely,
 )
+from beamfit.studies.scan.outliers import Influence, RobustFit, fit_robust, influence_of
 from beamfit.studies.scan.questions import check_gradients
 from beamfit.studies.scan.results import Points
-from beamfit.studies.scan.robust import RobustFit, fit_robust
 from beamfit.studies.scan.scans import QuadScan
 from beamfit.studies.scan.sigma import ClosedForm, SigmaFit, SizeData, closed_form
 from beamfit.studies.scan.statement import (

@@ -19,14 +19,16 @@ from beamfit.greybox.mlp import MLP, Port
 from beamfit.greybox.problem import Free, Problem, Record
 from beamfit.greybox.terms import Constraint
 from beamfit.studies.scan.assumptions import Assumptions
-from beamfit.studies.scan.boxed_network import beam_box, check_box, limited_network
-from beamfit.studies.scan.results import Parameter
-from beamfit.studies.scan.signed_network import (
+from beamfit.studies.scan.constrained_network import (
+    beam_box,
+    check_box,
     common_errors,
     known_record,
+    limited_network,
     signed_network,
     weight_free,
 )
+from beamfit.studies.scan.results import Parameter
 from beamfit.studies.scan.statement import (
     Scenario,
     Seen,

@@ -10,7 +10,7 @@ import numpy as np
 
 from beamfit.statistics import POOR_FIT, one_sided_probability, reach_of
 from beamfit.status import Status
-from beamfit.studies.scan.influence import Influence
+from beamfit.studies.scan.outliers import Influence
 from beamfit.verdict import Finding
 
 # The emittance is determined if zero is this many standard errors away ...
