@@ -12,11 +12,10 @@ import numpy as np
 from scipy.special import stdtr
 
 from beamfit.greybox.correlated import Memory, is_correlated, memory_of, whitened
-from beamfit.lifetime.decay import HOUR
 from beamfit.quantity import Quantity
 from beamfit.shown import shown
 from beamfit.status import Status
-from beamfit.studies.decay.law import Expansion, Physical, constant_shape
+from beamfit.studies.decay.law import Expansion, Physical, constant_shape, lifetime_of
 from beamfit.studies.decay.model import Solution, expanded, padded, solve_decay
 from beamfit.studies.decay.record import DecayRecord
 from beamfit.table import json_of
@@ -38,8 +37,8 @@ TIMES, FINER, BETTER = 40, 3, 15.0
 REST, REST_OF_TWO = 0.1, 1e-3
 # Two changes within so many readings are a step.
 STEP = 3.0
-# Currents at which a lifetime is offered.
-CURRENTS = 5
+# Currents at which a lifetime is offered, if the loss rate there is so many errors above zero.
+CURRENTS, CLEAR = 5, 3.0
 
 
 @shown
@@ -200,11 +199,8 @@ def lifetime_law(found: PowerLaw, correlated: bool) -> LifetimeLaw:
     errors = quantity_errors(slopes, about, record, correlated)
     for change in record.monitor_changes:
         errors = np.hypot(errors, slopes @ np.linalg.lstsq(about.rows, change, rcond=None)[0])
-    lifetimes = tuple(
-        Quantity(1 / rate / HOUR, error / rate**2 / HOUR, "h") if rate > 3 * error
-        else Quantity(math.nan, None, "h")
-        for rate, error in zip(rates, errors, strict=False)
-    )  # fmt: skip
+    pairs = zip(rates, errors, strict=False)
+    lifetimes = tuple(lifetime_of(rate, error, CLEAR) for rate, error in pairs)
     exponent = Quantity(float(values.exponent), float(errors[-1]), "1")
     return LifetimeLaw(tuple(map(float, x * mean)), lifetimes, exponent)
 
@@ -378,9 +374,5 @@ def _change(
         slopes = np.tile([0, 1 / span, (x - 1) / span] + [0.0] * at.size, (2, 1))
         slopes[0, 3 : 3 + k] = slopes[1, 3 : 4 + k] = 1.0
         rates, errors = here + slopes @ step, np.linalg.norm(slopes @ half, axis=1)
-        lifetimes = (
-            Quantity(1 / rate / HOUR, error / rate**2 / HOUR, "h")
-            for rate, error in zip(rates, errors, strict=True)
-        )
-        told = Change(float(at[k]), *lifetimes, left, told)
+        told = Change(float(at[k]), *map(lifetime_of, rates, errors), left, told)
     return told

@@ -40,6 +40,7 @@ UNITS = {
     "lifetime_end": "h",
     "lifetime_mean": "h",
 }
+ENDS = ("start", "end", "mean")
 # The share of a in the loss lies between 0 and 1: known to 0.2, the record tells pure Touschek
 # from pure gas at five standard deviations; known worse, a and b are one number.
 SEPARABLE = 0.2
@@ -88,8 +89,55 @@ class Separability:
         return json_of(vars(self))
 
 
+class Weighed:
+    """What is quoted of a decay, or of many cycles: values with errors, and what refutes them."""
+
+    values: Physical
+    errors: Physical
+    raw: Physical
+    reach: Physical
+    separability: Separability
+    change: Change | None = None
+    outgassing: Outgassing | None = None
+
+    def scaled(self, name: str) -> tuple[float, float]:
+        """A value and its error."""
+        return float(getattr(self.values, name)), float(getattr(self.errors, name))
+
+    def quantity(self, name: str, known: bool) -> Quantity:
+        """I0, a or b; without an error where it is not determined."""
+        value, error = self.scaled(name)
+        if not math.isfinite(value):
+            return Quantity(math.nan, None, UNITS[name])
+        if not known or not math.isfinite(error):
+            return Quantity(value, None, UNITS[name])
+        reach, raw = (float(getattr(part, name)) for part in (self.reach, self.raw))
+        return Quantity.reaching(value, error, UNITS[name], raw, reach)
+
+    def lifetime(self, name: str, known: bool) -> Quantity:
+        """Lifetime in hours from a loss rate; no error where the rate is not clear of zero."""
+        rate, error = self.scaled(name)
+        if not rate > 0:
+            return Quantity(math.nan, None, "h")
+        if not (known and error < DETERMINED * rate):
+            return Quantity(1 / rate / HOUR, None, "h")
+        reach, raw = (float(getattr(part, name)) for part in (self.reach, self.raw))
+        interval = tuple(1 / max(rate + sign * reach, 1e-300) / HOUR for sign in (1, -1))
+        error, raw = (part / rate**2 / HOUR for part in (error, raw))
+        return Quantity(1 / rate / HOUR, error, "h", raw, interval)
+
+    def quoted(self, known: bool = True) -> dict[str, Any]:
+        """What a `DecayFit` has of this, by its names."""
+        apart = known and self.separability.separable
+        same = ("chi2", "dof", "noise_inferred", "constant_a", "correlation_time", "lifetimes")
+        found = {name: self.quantity(name, apart) for name in "ab"}
+        found |= {f"lifetime_{at}": self.lifetime(f"rate_{at}", known) for at in ENDS}
+        found |= {name: getattr(self, name) for name in same}
+        return found | {"identifiability": self.separability}
+
+
 @dataclass(frozen=True, eq=False)
-class Evidence:
+class Evidence(Weighed):
     """What the rules look at: a record, what was found, and the size and memory of its noise.
 
     Parameters
@@ -212,31 +260,10 @@ class Evidence:
             max(1.0, size) if given else size, held, test, False,
         )  # fmt: skip
 
-    def scaled(self, name: str) -> tuple[float, float]:
-        """A value and its error."""
-        return float(getattr(self.values, name)), float(getattr(self.errors, name))
-
-    def quantity(self, name: str, known: bool) -> Quantity:
-        """I0, a or b; without an error where it is not determined."""
-        value, error = self.scaled(name)
-        if not math.isfinite(value):
-            return Quantity(math.nan, None, UNITS[name])
-        if not known or not math.isfinite(error):
-            return Quantity(value, None, UNITS[name])
-        reach, raw = (float(getattr(part, name)) for part in (self.reach, self.raw))
-        return Quantity.reaching(value, error, UNITS[name], raw, reach)
-
-    def lifetime(self, name: str, known: bool) -> Quantity:
-        """Lifetime in hours from a loss rate; no error where the rate is not clear of zero."""
-        rate, error = self.scaled(name)
-        if not rate > 0:
-            return Quantity(math.nan, None, "h")
-        if not (known and error < DETERMINED * rate):
-            return Quantity(1 / rate / HOUR, None, "h")
-        reach, raw = (float(getattr(part, name)) for part in (self.reach, self.raw))
-        interval = tuple(1 / max(rate + sign * reach, 1e-300) / HOUR for sign in (1, -1))
-        error, raw = (part / rate**2 / HOUR for part in (error, raw))
-        return Quantity(1 / rate / HOUR, error, "h", raw, interval)
+    @property
+    def noise_inferred(self) -> bool:
+        """Whether the residuals tell the noise."""
+        return self.record.error is None
 
     @property
     def inflation(self) -> float:

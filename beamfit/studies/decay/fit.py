@@ -375,28 +375,16 @@ def _judged(
         found = f"a current that rises, {first:.6g} to {last:.6g} mA"
         raise InputError(found, expected, path=record.name, column="current")
     known = bool(solution.converged)
-    apart = known and evidence.separability.separable
     finding = finding_of(evidence)
     return DecayFit(
         record=record.name,
         status=finding.status,
         message=finding.message,
         i0=evidence.quantity("i0", known),
-        a=evidence.quantity("a", apart),
-        b=evidence.quantity("b", apart),
-        lifetime_start=evidence.lifetime("rate_start", known),
-        lifetime_end=evidence.lifetime("rate_end", known),
-        lifetime_mean=evidence.lifetime("rate_mean", known),
+        **evidence.quoted(known),
         mean_current=float(record.current.mean()),
-        chi2=evidence.chi2,
-        dof=evidence.dof,
         rms_residual=float(np.sqrt(np.mean(evidence.residuals**2))),
-        noise_inferred=record.error is None,
         residuals=evidence.residuals,
-        identifiability=evidence.separability,
-        constant_a=evidence.constant_a,
-        correlation_time=evidence.correlation_time,
-        lifetimes=evidence.lifetimes,
         change=evidence.change if evidence.refuted and evidence.outgassing is None else None,
         outgassing=evidence.outgassing,
         readings=record,

@@ -8,8 +8,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from beamfit.lifetime.decay import HOUR
 from beamfit.quantity import Quantity
+from beamfit.studies.decay.law import lifetime_of
 from beamfit.studies.decay.scales import SEPARABLE, ScaleFit, pulls, spread_of_scales, whitener
 from beamfit.table import json_of
 
@@ -99,14 +99,9 @@ def predict_held_back(fit: ScaleFit) -> tuple[HeldBack, ...]:
         found.append(
             HeldBack(
                 name,
-                _lifetime(rate + off, spread),
-                _lifetime(rate, error),
+                lifetime_of(rate + off, spread),
+                lifetime_of(rate, error),
                 float(off / np.sqrt(whole[1, 1])),
             )
         )
     return tuple(found)
-
-
-def _lifetime(rate: float, error: float) -> Quantity:
-    """In hours."""
-    return Quantity(float(1 / rate / HOUR), float(error / rate**2 / HOUR), "h")

@@ -10,7 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from beamfit.lifetime.decay import current, current_by_rate, mean_exponential
+from beamfit.lifetime.decay import HOUR, current, current_by_rate, mean_exponential
+from beamfit.quantity import Quantity
 
 Shape = Callable[[Array], Array]
 # The least current whose logarithm is taken, in units of the mean.
@@ -81,6 +82,13 @@ class Expansion(NamedTuple):
         step = np.linalg.lstsq(self.rows[:, :3], change, rcond=None)[0]
         beside = np.linalg.lstsq(self.rows, change, rcond=None)[0]
         return Physical(*(self.slopes[:, :3] @ step))._replace(exponent=beside[3])
+
+
+def lifetime_of(rate: float, error: float, clear: float | None = None) -> Quantity:
+    """Lifetime, h, of a loss rate, 1/s; unknown of one not so many of its errors above zero."""
+    if clear is not None and not rate > clear * error:
+        return Quantity(math.nan, None, "h")
+    return Quantity(float(1 / rate / HOUR), float(error / rate**2 / HOUR), "h")
 
 
 def constant_shape(beam: Array) -> Array:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -16,13 +15,15 @@ from beamfit.greybox.descend import descend_one
 from beamfit.lifetime.decay import HOUR
 from beamfit.quantity import Quantity
 from beamfit.shown import shown
-from beamfit.studies.decay.departures import (
-    BETTER,
-    Change,
-    averaged,
-    quantity_errors,
+from beamfit.studies.decay.departures import BETTER, CLEAR, Change, averaged, quantity_errors
+from beamfit.studies.decay.law import (
+    NODES,
+    WEIGHTS,
+    Expansion,
+    constant_shape,
+    cumulative,
+    lifetime_of,
 )
-from beamfit.studies.decay.law import NODES, WEIGHTS, Expansion, constant_shape, cumulative
 from beamfit.studies.decay.model import padded, solve_decay
 from beamfit.studies.decay.record import DecayRecord
 from beamfit.table import json_of
@@ -183,11 +184,7 @@ def _quoted(record: DecayRecord, found: _Fitted) -> Outgassing:
     errors = quantity_errors(slopes, about, record, remembered)
     pairs = zip(values, errors, ("h", "1/(mA s)", "1/s", "1/s", "1/s"), strict=True)
     constant, own_a, own_b, *rates = (Quantity(float(v), float(e), u) for v, e, u in pairs)
-    before, after = (
-        Quantity(1 / r.value / HOUR, r.error / r.value**2 / HOUR, "h")
-        if r.value > 3 * r.error else Quantity(math.nan, None, "h")
-        for r in rates
-    )  # fmt: skip
+    before, after = (lifetime_of(rate.value, rate.error, CLEAR) for rate in rates)
     return Outgassing(constant, own_a, own_b, before, after, float(start * mean))
 
 

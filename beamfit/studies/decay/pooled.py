@@ -15,15 +15,16 @@ from beamfit.greybox.correlated import Memory, is_correlated, memory_of
 from beamfit.lifetime.decay import HOUR
 from beamfit.quantity import Quantity, Status
 from beamfit.studies.decay.departures import (
+    CLEAR,
     CURRENTS,
     REJECTED,
     ConstantA,
     LifetimeLaw,
     constant_a,
 )
-from beamfit.studies.decay.evidence import DETERMINED, NORMAL, SEPARABLE, UNITS, Separability
+from beamfit.studies.decay.evidence import NORMAL, SEPARABLE, Separability, Weighed
 from beamfit.studies.decay.fit import DecayFit
-from beamfit.studies.decay.law import Physical
+from beamfit.studies.decay.law import Physical, lifetime_of
 from beamfit.studies.decay.monitor import Monitor
 from beamfit.studies.decay.pool import (
     FEWEST_CYCLES,
@@ -41,7 +42,7 @@ from beamfit.studies.decay.verdict import finding_of_cycles
 # Parts of the record whose loss rates are compared, and points of a picture.
 PARTS, POINTS = 8, 60
 # Refills of so many standard deviations of the means beside them are none of them missed.
-CLEAR = 6.0
+SEEN = 6.0
 # Scatter, over the length squared, of the parabola t² beside its line, halved: the bend of a decay.
 BEND = 1 / 12 / math.sqrt(5)
 # Noise with a memory is taken for so many times what neighbouring readings scatter by.
@@ -80,7 +81,7 @@ def _memory(pool: Pool, numbers: int, known: float | None) -> Memory:
 
 
 @dataclass(frozen=True, eq=False)
-class PooledEvidence:
+class PooledEvidence(Weighed):
     """What the rules look at: a fit to cycles, values, errors, reaches, and the noise.
 
     Attributes are as of `Evidence`; `left_out` says what was not fitted.
@@ -96,8 +97,6 @@ class PooledEvidence:
     constant_a: ConstantA
     left_out: tuple[str, ...]
     monitor: Monitor | None = None
-
-    change = outgassing = None
 
     @classmethod
     def of(cls, pool: Pool, left_out: tuple[str, ...]) -> PooledEvidence:
@@ -124,10 +123,6 @@ class PooledEvidence:
         return constant_a(
             float(moved.shift[0]), float(moved.error[0]), float(moved.error[0]), moved.chance[0]
         )
-
-    def scaled(self, name: str) -> tuple[float, float]:
-        """A value and its error."""
-        return float(getattr(self.values, name)), float(getattr(self.errors, name))
 
     def with_monitor(self, monitor: Monitor) -> PooledEvidence:
         """With a stated stability in the errors, and in the test of a constant a."""
@@ -161,14 +156,18 @@ class PooledEvidence:
     @property
     def chi2(self) -> float:
         """In units of the errors, whitened; equal to `dof` where there are none."""
-        given = self.pool.cycles.error is not None
-        return float(self.held.squares[self.held.likely]) if given else float(self.dof)
+        if self.noise_inferred:
+            return float(self.dof)
+        return float(self.held.squares[self.held.likely])
 
     @property
-    def noise(self) -> float | None:
-        """What the readings scatter by, mA, where the file has no errors."""
-        if self.pool.cycles.error is not None:
-            return None
+    def noise_inferred(self) -> bool:
+        """Whether the residuals tell the noise."""
+        return self.pool.cycles.error is None
+
+    @property
+    def noise(self) -> float:
+        """What the readings scatter by, mA, or over their errors."""
         return self.pool.mean * math.sqrt(self.held.squares[self.held.likely] / self.dof)
 
     @property
@@ -213,7 +212,7 @@ class PooledEvidence:
         spread = np.linalg.norm(np.linalg.pinv(columns), axis=1) * math.sqrt(unit)
         rates = (pool.theta[0] + step[:count]) / pool.unit
         pairs = zip(rates, spread[:count] / pool.unit, strict=True)
-        return chance, [Quantity(1 / r / HOUR, e / r**2 / HOUR, "h") for r, e in pairs if r > 0]
+        return chance, [lifetime_of(rate, error) for rate, error in pairs if rate > 0]
 
     @property
     def changed(self) -> bool:
@@ -234,25 +233,11 @@ class PooledEvidence:
         found = _memory(pool, numbers, self.known).moments(
             slopes, float(pool.cycles.error is not None)
         )
-        lifetimes = tuple(
-            Quantity(1 / rate / HOUR, error / rate**2 / HOUR, "h") if rate > 3 * error
-            else Quantity(math.nan, None, "h")
-            for rate, error in zip(rates, found.error, strict=False)
-        )  # fmt: skip
+        pairs = zip(rates, found.error, strict=False)
+        lifetimes = tuple(lifetime_of(rate, error, CLEAR) for rate, error in pairs)
         error = float(found.error[-1]) if refuted else None
         exponent = Quantity(float(pool.theta[2]), error, "1")
         return LifetimeLaw(tuple(map(float, x * pool.mean)), lifetimes, exponent)
-
-    def lifetime(self, name: str) -> Quantity:
-        """Lifetime in hours from a loss rate; no error where the rate is not clear of zero."""
-        (rate, error), reach = self.scaled(name), float(getattr(self.reach, name))
-        if not rate > 0:
-            return Quantity(math.nan, None, "h")
-        if not error < DETERMINED * rate:
-            return Quantity(1 / rate / HOUR, None, "h")
-        interval = tuple(1 / max(rate + sign * reach, 1e-300) / HOUR for sign in (1, -1))
-        error, raw = (part / rate**2 / HOUR for part in (error, getattr(self.raw, name)))
-        return Quantity(1 / rate / HOUR, error, "h", float(raw), interval)
 
 
 def stands_alone(cycle: DecayRecord, fit: DecayFit) -> bool:
@@ -277,7 +262,7 @@ def seen_through(fit: DecayFit) -> DecayFit:
     record, memory = fit.readings, fit.identifiability.residual_correlation
     half = max(len(record) / fit.first.size / 2, 1.0)
     mean = (1 + memory) / (1 - memory) / half if memory else 1 / half
-    least = CLEAR * fit.rms_residual * math.sqrt(2 * min(mean, 1.0))
+    least = SEEN * fit.rms_residual * math.sqrt(2 * min(mean, 1.0))
     lasts = 2 * half * float(np.median(np.diff(record.time)))
     lifetime = fit.lifetime_mean.value
     lost = fit.mean_current * lasts / (lifetime * HOUR)
@@ -367,28 +352,16 @@ def fit_cycles(cycles: Sequence[DecayRecord], name: str = "cycles") -> DecayFit:
     if cycles[0].monitor is not None:
         evidence = evidence.with_monitor(cycles[0].monitor)
     finding = finding_of_cycles(evidence)
-    apart = evidence.separability.separable
-    a, b = (
-        Quantity.reaching(
-            value, error, UNITS[name], float(getattr(evidence.raw, name)),
-            float(getattr(evidence.reach, name)),
-        ) if apart else Quantity(value, None, UNITS[name])
-        for name, (value, error) in ((name, evidence.scaled(name)) for name in "ab")
-    )  # fmt: skip
-    weight = pool.weight
+    weight, (time, _, current, error, first) = pool.weight, pool.cycles
     return DecayFit(
-        record=name, status=finding.status, message=finding.message,
-        i0=Quantity(float(evidence.values.i0), None, "mA"), a=a, b=b,
-        lifetime_start=evidence.lifetime("rate_start"), lifetime_end=evidence.lifetime("rate_end"),
-        lifetime_mean=evidence.lifetime("rate_mean"), mean_current=pool.mean, chi2=evidence.chi2,
-        dof=evidence.dof,
+        record=name,
+        status=finding.status,
+        message=finding.message,
+        i0=evidence.quantity("i0", False),
+        **evidence.quoted(),
+        mean_current=pool.mean,
         rms_residual=pool.mean * float(np.sqrt(np.mean((pool.left[:, 3] / weight) ** 2))),
-        noise_inferred=pool.cycles.error is None, residuals=pool.mean * pool.residuals / weight,
-        identifiability=evidence.separability, constant_a=evidence.constant_a,
-        correlation_time=evidence.correlation_time, lifetimes=evidence.lifetimes,
-        readings=DecayRecord(
-            pool.cycles.time, pool.cycles.current, pool.cycles.error, name,
-            float(pool.cycles.time[0]),
-        ),
-        first=pool.cycles.first,
-    )  # fmt: skip
+        residuals=pool.mean * pool.residuals / weight,
+        readings=DecayRecord(time, current, error, name, float(time[0])),
+        first=first,
+    )

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from functools import partial
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 
 from beamfit.lifetime.decay import HOUR
-from beamfit.quantity import Quantity
 from beamfit.statistics import POOR_FIT, chi2_probability
 from beamfit.status import Status
 from beamfit.studies.decay.departures import Change, ConstantA, LifetimeLaw
@@ -19,7 +18,7 @@ from beamfit.studies.decay.evidence import (
     DETERMINED,
     SEPARABLE,
     Evidence,
-    Separability,
+    Weighed,
 )
 from beamfit.studies.decay.monitor import Monitor
 from beamfit.studies.decay.outgassing import Outgassing
@@ -38,20 +37,6 @@ WANDERS = 10.0
 MOVABLE = {"rf_voltage": ("RF voltage", 1e-3, "kV"), "scraper_y": ("scraper", 1e3, "mm")}
 MOVABLE |= {"bunches": ("number of bunches", 1.0, "in all")}
 SLOW = 0.01
-
-
-class Judged(Protocol):
-    """What rules look at that hold for records and for tables of lifetimes."""
-
-    constant_a: ConstantA
-    lifetimes: LifetimeLaw | None
-    change: Change | None
-    outgassing: Outgassing | None
-    changed: bool
-
-    def scaled(self, name: str) -> tuple[float, float]:
-        """A value and its error."""
-        ...
 
 
 class TableEvidence(NamedTuple):
@@ -73,22 +58,14 @@ class TableEvidence(NamedTuple):
     outgassing: Outgassing | None = None
     changed: bool = False
 
+    @property
+    def noise_inferred(self) -> bool:
+        """Whether the points tell the noise."""
+        return self.noise is not None
+
     def scaled(self, name: str) -> tuple[float, float]:
         """A value and its error."""
         return self.numbers[name]
-
-
-class CyclesEvidence(Judged, Protocol):
-    """What the rules look at of many cycles, besides."""
-
-    cycles: int
-    currents: tuple[float, float]
-    parts: tuple[float, list[Quantity]]
-    noise: float | None
-    left_out: tuple[str, ...]
-    separability: Separability
-    correlation_time: float | None
-    monitor: Monitor | None
 
 
 def _lost(e: Evidence) -> Finding | None:
@@ -115,7 +92,7 @@ def _stepped(e: Evidence) -> Finding | None:
     return Finding(Status.poor_fit, e.step) if e.step else None
 
 
-def _negative(name: str, cause: str, e: Judged) -> Finding | None:
+def _negative(name: str, cause: str, e: Weighed | TableEvidence) -> Finding | None:
     value, error = e.scaled(name)
     if not (value < -BELIEVED * error and value < 0):
         return None
@@ -130,14 +107,14 @@ NOT_GAS = (
 RISING = "the loss rate rises as the current falls: look for a changing vacuum or setting"
 
 
-def _explained(e: Judged) -> str | None:
+def _explained(e: Weighed | TableEvidence) -> str | None:
     """What explains a refuted law better than an exponent of the current, and the remedy."""
     if e.outgassing is not None:
         return f"{e.outgassing}. Fit what comes later, or give the pressure in a column"
     return None if e.change is None else f"{e.change}: cut the record there"
 
 
-def _refuted(e: Judged) -> Finding | None:
+def _refuted(e: Weighed | TableEvidence) -> Finding | None:
     """Data that refute constant a and b: what is quoted of them is not of this beam."""
     if e.constant_a.status is not Status.poor_fit and not e.changed:
         return None
@@ -175,7 +152,7 @@ def _improbable(e: Evidence) -> Finding | None:
     )
 
 
-def _determined(e: Judged) -> Finding:
+def _determined(e: Weighed | TableEvidence) -> Finding:
     """Each of the two by itself: one that is small is known to be so, but is not told from zero."""
     units = {"a": "1/(mA s)", "b": "1/s"}
     small = {name: e.scaled(name) for name in units}
@@ -213,8 +190,8 @@ def _narrow(e: TableEvidence) -> Finding | None:
     return Finding(Status.unidentified, f"{cause}currents")
 
 
-def _unlikely(e: TableEvidence | CyclesEvidence) -> Finding | None:
-    if e.noise is not None or chi2_probability(e.chi2, e.dof) >= POOR_FIT:
+def _unlikely(e: Weighed | TableEvidence) -> Finding | None:
+    if e.noise_inferred or chi2_probability(e.chi2, e.dof) >= POOR_FIT:
         return None
     return Finding(
         Status.poor_fit,
@@ -235,16 +212,18 @@ TABLE_RULES = (
 
 def finding_of_table(evidence: TableEvidence) -> Finding:
     """Status and sentences on a table of lifetimes."""
-    found = judge(evidence, TABLE_RULES)
-    said = [found.cause.rstrip(".")]
-    if evidence.noise is not None:
-        said.append(f"The table gives no errors; {evidence.noise:.3g} h rms is their scatter")
-    if evidence.outliers:
-        said.append(f"Left out as outliers: {', '.join(evidence.outliers)}")
-    return Finding(found.status, ". ".join(said) + ".")
+    scatter = f"The table gives no errors; {evidence.noise or 0.0:.3g} h rms is their scatter"
+    left_out = f"Left out as outliers: {', '.join(evidence.outliers)}"
+    said = [scatter] * evidence.noise_inferred + [left_out] * bool(evidence.outliers)
+    return _with_remarks(judge(evidence, TABLE_RULES), said)
 
 
-def _parts_differ(e: CyclesEvidence) -> Finding | None:
+def _with_remarks(found: Finding, said: Iterable[str | None]) -> Finding:
+    """A finding with what is remarkable besides, in sentences."""
+    return Finding(found.status, ". ".join([found.cause.rstrip("."), *filter(None, said)]) + ".")
+
+
+def _parts_differ(e: Weighed) -> Finding | None:
     chance, lifetimes = e.parts
     if not e.changed or not lifetimes:
         return None
@@ -257,7 +236,7 @@ def _parts_differ(e: CyclesEvidence) -> Finding | None:
     )
 
 
-def _one_current(e: CyclesEvidence) -> Finding | None:
+def _one_current(e: Weighed) -> Finding | None:
     share, error = e.scaled("share")
     if error < SEPARABLE:
         return None
@@ -269,7 +248,7 @@ def _one_current(e: CyclesEvidence) -> Finding | None:
     )
 
 
-def _rises(e: CyclesEvidence) -> Finding | None:
+def _rises(e: Weighed) -> Finding | None:
     rate, error = e.scaled("rate_mean")
     if rate > -BELIEVED * error:
         return None
@@ -290,24 +269,19 @@ CYCLE_RULES = (
 )
 
 
-def finding_of_cycles(evidence: CyclesEvidence) -> Finding:
+def finding_of_cycles(evidence: Weighed) -> Finding:
     """Status and sentences on many cycles fitted together."""
     found, (low, high) = judge(evidence, CYCLE_RULES), evidence.currents
-    said = [
-        f"One answer from {evidence.cycles} cycles between {low:.4g} and {high:.4g} mA",
-        found.cause.rstrip("."),
-    ]
-    if evidence.noise is not None:
-        noise = f"{evidence.noise:.3g} mA rms is inferred from the residuals"
-        said.append(f"The record gives no errors; {noise}")
-    said += [text for text in (_correlated(evidence), _odd_clock(evidence)) if text]
-    said += [] if evidence.monitor is None else [_stated(evidence.monitor)]
-    said += [text[0].upper() + text[1:] for text in evidence.left_out]
-    return Finding(found.status, ". ".join(said) + ".")
+    first = f"One answer from {evidence.cycles} cycles between {low:.4g} and {high:.4g} mA"
+    remarks = [remark(evidence) for remark in (_noise_inferred, _correlated, _odd_clock)]
+    monitor = None if evidence.monitor is None else _stated(evidence.monitor)
+    left_out = [text[0].upper() + text[1:] for text in evidence.left_out]
+    found = found._replace(cause=f"{first}. {found.cause}")
+    return _with_remarks(found, [*remarks, monitor, *left_out])
 
 
-def _noise_inferred(e: Evidence) -> str | None:
-    if e.record.error is not None:
+def _noise_inferred(e: Weighed) -> str | None:
+    if not e.noise_inferred:
         return None
     noise = f"{e.noise:.3g} mA rms is inferred from the residuals"
     return f"The record gives no errors; {noise}"
@@ -420,5 +394,4 @@ def finding_of(evidence: Evidence) -> Finding:
     found = judge(evidence, RULES)
     if found.status is Status.not_finite:
         return found
-    remarks = [said for remark in REMARKS if (said := remark(evidence))]
-    return Finding(found.status, ". ".join([found.cause, *remarks]) + ".")
+    return _with_remarks(found, (remark(evidence) for remark in REMARKS))
