@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from graphlib import CycleError, TopologicalSorter
 from itertools import pairwise
 from typing import NamedTuple
@@ -172,14 +173,7 @@ class MLP:
 
     def _gains(self, x: jax.Array) -> list[jax.Array]:
         """Values of the gains asked for."""
-        plain = MLP(
-            self.layers,
-            self.connections,
-            self.input_ports,
-            self.output_ports,
-            self.weights,
-            self.biases,
-        )
+        plain = replace(self, gains=())
         return [
             gain(plain, x, g.output, g.by) if g.kind == "local" else _certified(plain, g)
             for g in self.gains

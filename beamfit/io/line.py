@@ -153,12 +153,10 @@ def read_lattice(
     *,
     use: str | None = None,
     energy: float | None = None,
-    first: str | None = None,
-    last: str | None = None,
-    screen: str | None = None,
+    **part: str | None,
 ) -> LatticeFile:
     """Read and check a lattice file of any kind without building it; see `load_lattice`."""
-    return part_of(_whole(path, use, energy), first, last, screen)
+    return part_of(_whole(path, use, energy), **part)
 
 
 def _whole(path: str | PathLike[str], use: str | None, energy: float | None) -> LatticeFile:
@@ -178,12 +176,9 @@ def lattice_of(
     scan: QuadScan,
     path: str | None = None,
     *,
-    use: str | None = None,
     energy: float | None = None,
     particle: str | None = None,
-    first: str | None = None,
-    last: str | None = None,
-    screen: str | None = None,
+    **part: str | None,
 ) -> LatticeFile:
     """Read the lattice of a scan, or make that of rows which have matrices of their own.
 
@@ -193,8 +188,8 @@ def lattice_of(
         The scan.
     path : str, optional
         The lattice file; None where the rows have matrices.
-    use, energy, first, last, screen
-        As for `load_lattice`; the energy in MeV also of rows without a lattice.
+    energy, **part
+        Options of `load_lattice`; the energy in MeV also of rows without a lattice.
     particle : str, optional
         Of rows without a lattice, electrons if None.
 
@@ -215,11 +210,10 @@ def lattice_of(
             raise scan.unusable("a scan and no lattice", expected)
         if particle is not None:
             raise InputError("--particle with a lattice", "none: the lattice says it", path=path)
-        part = {"first": first, "last": last, "screen": screen}
-        file = read_lattice(path, use=use, energy=energy, **part)
+        file = read_lattice(path, energy=energy, **part)
         file.check_scan(scan)
         return file
-    if any(told is not None for told in (path, use, first, last, screen)):
+    if any(told is not None for told in (path, *part.values())):
         found = "rows with matrices of their own, and a lattice or a part of one"
         raise scan.unusable(found, "no --lattice, --use, --from, --to and --screen")
     return _rows_lattice(scan, energy, particle or "electron")
@@ -303,15 +297,10 @@ def read_inputs(
     scan: str,
     lattice: str | None = None,
     *,
-    use: str | None = None,
-    energy: float | None = None,
-    particle: str | None = None,
-    first: str | None = None,
-    last: str | None = None,
-    screen: str | None = None,
     ignore: Iterable[str] = (),
     skip_bad: bool = False,
     size_method: str | None = None,
+    **part: Any,
 ) -> Inputs:
     """Read a scan of any kind, and its lattice.
 
@@ -319,13 +308,14 @@ def read_inputs(
     ----------
     scan : str
         CSV, HDF5, or a file of emittance_gui (``.mat``).
-    lattice, use, energy, particle, first, last, screen
-        As for `beamfit.io.line.lattice_of`. A file of emittance_gui has its own matrices, which a
-        lattice replaces.
+    lattice : str, optional
+        As for `lattice_of`. A file of emittance_gui has its own matrices, which it replaces.
     ignore, skip_bad
         As for `beamfit.read_quad_scan`.
     size_method : str, optional
         Which sizes of a file of emittance_gui; RMS if None.
+    **part
+        Options of `lattice_of`.
 
     Returns
     -------
@@ -336,8 +326,6 @@ def read_inputs(
     InputError
         If a file cannot be used, the two do not fit together, or an option does not apply.
     """
-    part = {"use": use, "energy": energy, "particle": particle}
-    part |= {"first": first, "last": last, "screen": screen}
     if not is_emittance_gui(scan):
         if size_method is not None:
             expected = "none: only a .mat file of emittance_gui has several"

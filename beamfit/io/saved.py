@@ -24,35 +24,28 @@ FORMAT = "beamfit-fit-1"
 # What values of other kinds than a fit has may raise.
 UNREADABLE = (ArithmeticError, AttributeError, LookupError, RecursionError, TypeError, ValueError)
 HOW = "a file that beamfit.save_fit wrote"
-# What a file may hold, by name, and where it is defined. A file names these and nothing else.
+# What a file may hold, by where it is defined. A file names these and nothing else.
 SCAN, DECAY, OPTICS = "beamfit.studies.scan", "beamfit.studies.decay", "beamfit.optics"
-HOMES = {
-    "Quantity": "beamfit.quantity",
-    "Status": "beamfit.status",
-    **dict.fromkeys(("QuadScan", "Profile"), f"{SCAN}.scans"),
-    **dict.fromkeys(
-        ("PlaneFit", "Points", "Parameter", "ScreenTwiss", "Identifiability"), f"{SCAN}.results"
-    ),
-    **dict.fromkeys(("Anchor", "Assumptions", "Entry"), f"{SCAN}.assumptions"),
-    "NetworkStrength": f"{SCAN}.focusing_network",
-    **dict.fromkeys(("DecayRecord", "Conditions"), f"{DECAY}.record"),
-    "DecayFit": f"{DECAY}.fit",
-    "Monitor": f"{DECAY}.monitor",
-    "Separability": f"{DECAY}.evidence",
-    **dict.fromkeys(("ConstantA", "LifetimeLaw", "Change"), f"{DECAY}.departures"),
-    **dict.fromkeys(("Beamline", "Design"), f"{OPTICS}.beamline"),
-    **dict.fromkeys(
-        ("Drift", "Quadrupole", "ThinLens", "SectorDipole", "Marker", "Screen", "TransferMatrix"),
-        f"{OPTICS}.elements",
-    ),
-    **dict.fromkeys(("Section", "Series"), f"{OPTICS}.sections"),
-    **dict.fromkeys(
-        ("SlopeIntercept", "CurrentPolynomial", "CurrentTable", "Gradient"), f"{OPTICS}.calibration"
-    ),
-    **dict.fromkeys(
-        ("IntegratedGradient", "FocusingStrength", "IntegratedStrength"), f"{OPTICS}.calibration"
-    ),
+HELD = {
+    "beamfit.quantity": "Quantity",
+    "beamfit.status": "Status",
+    f"{SCAN}.scans": "QuadScan Profile",
+    f"{SCAN}.results": "PlaneFit Points Parameter ScreenTwiss Identifiability",
+    f"{SCAN}.assumptions": "Anchor Assumptions Entry",
+    f"{SCAN}.focusing_network": "NetworkStrength",
+    f"{DECAY}.record": "DecayRecord Conditions",
+    f"{DECAY}.fit": "DecayFit",
+    f"{DECAY}.monitor": "Monitor",
+    f"{DECAY}.evidence": "Separability",
+    f"{DECAY}.departures": "ConstantA LifetimeLaw Change",
+    f"{DECAY}.outgassing": "Outgassing",
+    f"{OPTICS}.beamline": "Beamline Design",
+    f"{OPTICS}.elements": "Drift Quadrupole ThinLens SectorDipole Marker Screen TransferMatrix",
+    f"{OPTICS}.sections": "Section Series",
+    f"{OPTICS}.calibration": "SlopeIntercept CurrentPolynomial CurrentTable Gradient "
+    "IntegratedGradient FocusingStrength IntegratedStrength",
 }
+HOMES = {name: home for home, names in HELD.items() for name in names.split()}
 OWN = ("planes", "scan", "told", "parameters", "null_directions")
 
 

@@ -11,6 +11,8 @@ import pytest
 import beamfit
 from beamfit.errors import InputError
 from beamfit.io.saved import HOMES
+from beamfit.studies.decay.fit import DecayFit
+from beamfit.studies.scan.results import PlaneFit
 from beamfit.table import json_of
 
 
@@ -139,3 +141,10 @@ def test_mutated_files_load_or_are_refused(every, tmp_path):
 def test_every_kind_of_value_is_where_the_list_says():
     for name, home in HOMES.items():
         assert getattr(import_module(home), name).__module__ == home
+
+
+@pytest.mark.parametrize("cls", [DecayFit, PlaneFit, beamfit.QuadScan, beamfit.DecayRecord])
+def test_whatever_a_fit_may_hold_can_be_kept(cls):
+    """A decay with a relaxing gas loss could not: that kind of value was not on the list."""
+    held = {name for kind in cls.__annotations__.values() for name in re.findall(r"[A-Z]\w+", kind)}
+    assert held - {"Mapping", "PathLike", "None"} <= HOMES.keys()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -61,14 +61,8 @@ def signed_network(
     start[first][lead] = way
     towards = np.where(out != 0, out, 1.0)
     start[last] += _straight(thresholds)[:, None] * towards
-    model = MLP(
-        net.layers,
-        net.connections,
-        net.input_ports,
-        net.output_ports,
-        start,
-        {"layer1": way * thresholds, "layer2": np.zeros(len(outputs))},
-    )
+    biases = {"layer1": way * thresholds, "layer2": np.zeros(len(outputs))}
+    model = replace(net, weights=start, biases=biases)
     bounds = {
         f"weights.{first}": _ends(np.broadcast_to(node[:, None], (len(inputs), hidden))),
         f"weights.{last}": _ends(np.broadcast_to(out, (hidden, len(outputs)))),
