@@ -8,6 +8,7 @@ from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from beamfit.errors import InputError, nearest
@@ -74,6 +75,15 @@ class Derived(NamedTuple):
 @partial(jax.jit, static_argnums=(0, 1))
 def _with_slope(function, chosen, model, theta, data):
     return with_slope(lambda t: function(tree.replace(model, chosen, t), data), theta)
+
+
+def value_and_slope(
+    p: Problem, function: Callable[[Any, Any], Any], theta: np.ndarray, data: Any = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """``function(model, data)`` of a problem, with its derivatives by the free numbers."""
+    core = p.core
+    value, slope = _with_slope(function, core.chosen, core.model, jnp.asarray(theta), data)
+    return np.asarray(value), np.asarray(slope)
 
 
 class Attempt(NamedTuple):
@@ -216,9 +226,7 @@ class Fit:
         >>> round(float(found.value), 9), round(float(found.error), 9)
         (2.0, 0.2)
         """
-        core = self.problem.core
-        found = _with_slope(function, core.chosen, core.model, self.theta, data)
-        value, slope = (np.asarray(part) for part in found)
+        value, slope = value_and_slope(self.problem, function, self.theta, data)
         usable = np.isfinite(value) & np.isfinite(slope).all(axis=-1)
         flat = np.where(usable[..., None], slope, 0.0)
         share = np.where(usable, self.spread.share(flat), 1.0)

@@ -125,15 +125,7 @@ def averaged(record: DecayRecord) -> DecayRecord:
     """A long record as the means of neighbouring readings: the curve is smooth between them."""
     if len(record) <= ENOUGH:
         return record
-    first = np.linspace(0, len(record), ENOUGH, endpoint=False).astype(int)
-    count = np.diff(first, append=len(record))
-    time, current = (
-        np.add.reduceat(values, first) / count for values in (record.time, record.current)
-    )
-    error = record.error
-    if error is not None:
-        error = np.sqrt(np.add.reduceat(error**2, first)) / count
-    return DecayRecord(time, current, error, record.name, monitor=record.monitor)
+    return DecayRecord(*record.blocks(ENOUGH), record.name, monitor=record.monitor)
 
 
 class PowerLaw(NamedTuple):

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 from beamfit.quantity import Quantity
 from beamfit.studies.decay.law import lifetime_of
-from beamfit.studies.decay.scales import SEPARABLE, ScaleFit, pulls, spread_of_scales, whitener
+from beamfit.studies.decay.scales import SEPARABLE, ScaleFit, spread_of_scales
 from beamfit.table import json_of
 
 
@@ -42,7 +40,6 @@ class HeldBack(NamedTuple):
 
 # A decay that leaves less than this of one to the others is known by nothing else.
 LEAST = 1e-6
-_slopes = jax.jit(jax.jacfwd(pulls))
 
 
 def predict_held_back(fit: ScaleFit) -> tuple[HeldBack, ...]:
@@ -77,10 +74,8 @@ def predict_held_back(fit: ScaleFit) -> tuple[HeldBack, ...]:
     >>> print(found[3].predicted, "predicted,", found[3].measured, "measured")
     9.83 ± 0.14 h predicted, 9.739034 ± 0.000099 h measured
     """
-    vector, terms, measured = jnp.asarray(fit.vector), fit.terms, fit.measured
-    weight = whitener(vector, terms, measured, fit.pressure_error)
-    left = np.asarray(pulls(vector, terms, measured, weight))
-    rows = np.asarray(_slopes(vector, terms, measured, weight))
+    measured = fit.measured
+    weight, left, rows = fit.about(fit.terms, measured)
     half = spread_of_scales(fit.fit).half
     found = []
     for k, name in enumerate(fit.names):
@@ -88,7 +83,7 @@ def predict_held_back(fit: ScaleFit) -> tuple[HeldBack, ...]:
         rest = np.eye(2) - own @ own.T
         if not np.any(root) or np.linalg.eigvalsh(rest)[0] < LEAST:
             continue
-        back = np.linalg.inv(np.asarray(weight[k]))
+        back = np.linalg.inv(weight[k])
         whole = back @ np.linalg.inv(rest) @ back.T * fit.error_scale**2
         off = (back @ np.linalg.solve(rest, left[k]))[1]
         reading = np.linalg.inv(root)[1]

@@ -41,7 +41,7 @@ from beamfit.studies.decay.certainty import (
 )
 from beamfit.studies.decay.scales import PRESSURE_ERROR, ScaleFit, stacked_terms
 from beamfit.studies.decay.study import Decay, Machine, operation_during
-from beamfit.studies.decay.summary import Summaries, loss_parts, summarise
+from beamfit.studies.decay.summary import Summaries, by_losses, loss_parts, summarise
 from beamfit.table import json_of
 
 OUTPUTS = ("log_a", "log_b")
@@ -247,8 +247,7 @@ def _statement(measured: Summaries, floor: float) -> tuple[np.ndarray, np.ndarra
     """
     quadratic, rate = np.abs(np.asarray(measured.parts)).T
     linear = np.maximum(np.abs(rate - quadratic), SMALLEST * rate)
-    zero = np.zeros_like(rate)
-    by = np.stack([np.stack([quadratic, zero], -1), np.stack([quadratic, linear], -1)], axis=1)
+    by = by_losses(quadratic, linear)
     own = np.asarray(measured.root) @ by * np.array([floor, PRESSURE_ERROR])
     root = np.linalg.cholesky(np.eye(2) + own @ np.swapaxes(own, 1, 2))
     weight = np.linalg.solve(root, np.asarray(measured.root))

@@ -17,7 +17,7 @@ from beamfit.lifetime.losses import Terms, loss_terms, scaled_losses
 from beamfit.lifetime.ring import Operation
 from beamfit.quantity import Quantity, Status
 from beamfit.sampling.posterior import Posterior
-from beamfit.studies.decay.scales import ScaleFit, losses_of, pulls, whitener
+from beamfit.studies.decay.scales import ScaleFit, losses_of
 from beamfit.studies.decay.summary import Summaries, information_root, loss_parts
 
 # So wide a prior on scales near 1 decides nothing, and keeps determinants finite.
@@ -64,9 +64,6 @@ class Proposal(NamedTuple):
     errors: np.ndarray
 
 
-_slopes = jax.jit(jax.jacfwd(pulls))
-
-
 def _rows(fit: ScaleFit, candidate: Candidate) -> np.ndarray:
     """What the candidate would measure by the scales, over its errors, shape (2, scales)."""
     scales = jnp.asarray(fit.vector)
@@ -79,13 +76,7 @@ def _rows(fit: ScaleFit, candidate: Candidate) -> np.ndarray:
     root = information_root(time, weight, candidate.current, parts, mean)
     one = Summaries(mean[None], parts[None], root[None])
     stacked = jax.tree.map(lambda part: jnp.asarray(part)[None], terms._replace(current=mean))
-    return _rows_of(fit, stacked, one)
-
-
-def _rows_of(fit: ScaleFit, terms: Terms, measured: Summaries) -> np.ndarray:
-    weight = whitener(fit.vector, terms, measured, fit.pressure_error)
-    slopes = _slopes(fit.vector, terms, measured, weight)
-    return np.asarray(slopes).reshape(-1, len(fit.vector))
+    return fit.about(stacked, one)[2].reshape(-1, len(scales))
 
 
 def next_decays(fit: ScaleFit, candidates: Sequence[Candidate]) -> tuple[Proposal, ...]:
@@ -127,7 +118,9 @@ def next_decays(fit: ScaleFit, candidates: Sequence[Candidate]) -> tuple[Proposa
 def _known(fit: ScaleFit) -> Information:
     """Information on the scales so far, with a wide prior where there is none."""
     one = np.eye(len(fit.vector))
-    rows = np.vstack([_rows_of(fit, fit.terms, fit.measured), *_priors(fit), one / WIDE])
+    rows = np.vstack(
+        [fit.about(fit.terms, fit.measured)[2].reshape(-1, len(one)), *_priors(fit), one / WIDE]
+    )
     free = np.full(len(one), np.inf)
     return Information(rows, np.ones(len(one)), one, free > 0, -free, free)
 

@@ -68,11 +68,7 @@ def averaged(cycles: Sequence[DecayRecord]) -> Cycles:
     for cycle in cycles:
         begin = cycle.start if known else begin
         blocks = min(len(cycle), max(FEWEST_READINGS, round(len(cycle) / fewer)))
-        first = np.linspace(0, len(cycle), blocks, endpoint=False).astype(int)
-        count = np.diff(first, append=len(cycle))
-        time, current = (np.add.reduceat(v, first) / count for v in (cycle.time, cycle.current))
-        error = cycle.error
-        error = None if error is None else np.sqrt(np.add.reduceat(error**2, first)) / count
+        time, current, error = cycle.blocks(blocks)
         parts.append((begin + time, time - time[0], current, error, place))
         place += blocks
         begin += 2 * cycle.span  # nobody said when: as if a cycle were missing in between

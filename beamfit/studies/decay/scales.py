@@ -16,7 +16,7 @@ from beamfit.errors import InputError, nearest
 from beamfit.greybox.covariance import Spread, spread_of
 from beamfit.greybox.fit import Fit
 from beamfit.greybox.posterior import Optimum, Statement, target_of
-from beamfit.greybox.problem import Free, Prior, Problem, Record, residual
+from beamfit.greybox.problem import Free, Prior, Problem, Record
 from beamfit.greybox.solve import solve
 from beamfit.lifetime.losses import SCALES, Terms, loss_terms, scaled_losses
 from beamfit.lifetime.ring import Operation
@@ -128,6 +128,13 @@ class ScaleFit:
         error = spread_of_scales(self.fit).error(np.asarray(jax.jacfwd(quantity)(vector)))
         return self.error_scale * error < SEPARABLE * size
 
+    def about(self, terms: Terms, measured: Summaries) -> tuple[np.ndarray, ...]:
+        """Of decays: their weights, their `pulls`, and the slopes of these by the scales."""
+        vector = jnp.asarray(self.vector)
+        weight = whitener(vector, terms, measured, self.pressure_error)
+        given = vector, terms, measured, weight
+        return tuple(map(np.asarray, (weight, pulls(*given), _by_scales(*given))))
+
     def __str__(self) -> str:
         rows = [f"{len(self.names)} decays: {self.status}. {self.message}"]
         rows += [f"  {name:15s} {scale}" for name, scale in self.scales.items()]
@@ -184,6 +191,9 @@ def pulls(scales: Array, terms: Terms, measured: Summaries, weight: Array) -> Ar
     """Model minus measurement in standard errors, shape (n, 2); `weight` is that of `whitener`."""
     off = _parts(scales, terms, jnp.ones_like(terms.current)) - measured.parts
     return jnp.einsum("nij,nj->ni", weight, off)
+
+
+_by_scales = jax.jit(jax.jacfwd(pulls))
 
 
 def _checked(priors: Mapping[str, tuple[float, float]]) -> list[Prior]:
@@ -279,9 +289,8 @@ def fit_scales(
 
 def spread_of_scales(found: Fit) -> Spread:
     """Of the scales without their bounds, which stand for nothing known."""
-    rows = np.asarray(_slopes(found.problem.core, found.theta))
     unbounded = np.full(found.theta.shape, np.inf)
-    return spread_of(rows, -unbounded, unbounded)
+    return spread_of(found.jacobian, -unbounded, unbounded)
 
 
 def _vector(model: Mapping[str, Array]) -> Array:
@@ -300,11 +309,6 @@ def _problem(
     free = [Free(name, 0.0, LARGEST) for name in SCALES]
     free += [] if voltages is None else [Free(VOLTAGE, voltages[0], voltages[-1])]
     return Problem(scales, free, [record], priors)
-
-
-@jax.jit
-def _slopes(core: Any, theta: Array) -> Array:
-    return jax.jacfwd(residual, 1)(core, theta)
 
 
 def _quantities(

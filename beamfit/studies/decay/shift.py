@@ -31,9 +31,9 @@ from beamfit.studies.decay.next_decay import (
     best_operating_point,
     next_decays,
 )
-from beamfit.studies.decay.scales import ScaleFit, fit_scales, pulls, stacked_terms, whitener
+from beamfit.studies.decay.scales import ScaleFit, fit_scales, stacked_terms
 from beamfit.studies.decay.study import Decay, Machine, operation_during, settings_json
-from beamfit.studies.decay.summary import summarise
+from beamfit.studies.decay.summary import by_losses, summarise
 from beamfit.table import json_of
 
 # Chance of a false alarm in one call.
@@ -85,18 +85,10 @@ class _Linear(NamedTuple):
 def _linearised(fit: ScaleFit, decays: Sequence[Decay]) -> _Linear:
     terms = stacked_terms(decays, fit.machine, fit.voltages)
     measured = summarise(tuple(decays))
-    scales = jnp.asarray(fit.vector)
-    weight = whitener(scales, terms, measured, fit.pressure_error)
-    off = np.asarray(pulls(scales, terms, measured, weight)).ravel()
-    by_scale = np.asarray(jax.jacfwd(pulls)(scales, terms, measured, weight)).reshape(
-        -1, scales.size
-    )
-    a, b = (np.asarray(part) for part in scaled_losses(scales, terms))
-    quadratic = a * np.asarray(terms.current)
-    zero = np.zeros_like(b)
-    # parts are (a I, a I + b)
-    change = np.stack([np.stack([quadratic, zero], -1), np.stack([quadratic, b], -1)], axis=1)
-    change = np.einsum("nij,njk->nik", np.asarray(weight), change).reshape(-1, 2)
+    weight, off, by_scale = fit.about(terms, measured)
+    off, by_scale = off.ravel(), by_scale.reshape(off.size, -1)
+    a, b = (np.asarray(part) for part in scaled_losses(jnp.asarray(fit.vector), terms))
+    change = (weight @ by_losses(a * np.asarray(terms.current), b)).reshape(-1, 2)
     known = np.where(np.isfinite(fit.covariance), fit.covariance, 0.0)
     covariance = fit.error_scale**2 * (np.eye(off.size) + by_scale @ known @ by_scale.T)
     return _Linear(-off, change, np.linalg.cholesky(covariance))

@@ -42,6 +42,12 @@ def loss_parts(a: Array, b: Array, mean_current: Array) -> Array:
     return jnp.stack([quadratic, quadratic + b], axis=-1)
 
 
+def by_losses(quadratic: np.ndarray, linear: np.ndarray) -> np.ndarray:
+    """Slopes of the two parts, a I and a I + b, by relative changes of a and b, shape (n, 2, 2)."""
+    rows = np.array([[quadratic, np.zeros_like(quadratic)], [quadratic, linear]])
+    return np.moveaxis(rows, -1, 0)
+
+
 @jax.jit
 def information_root(
     time: Array, weight: Array, i0: Array, parts: Array, mean_current: Array

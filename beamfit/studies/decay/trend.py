@@ -18,7 +18,7 @@ from beamfit.shown import shown
 from beamfit.studies.decay.alarm import Alarm, Reference, alarms_of, when
 from beamfit.studies.decay.fit import bare
 from beamfit.studies.decay.study import Decay, Machine, RecordStudy
-from beamfit.studies.decay.summary import summarise
+from beamfit.studies.decay.summary import by_losses, summarise
 from beamfit.table import Table, cell, json_of
 
 # Decays that say what is usual: the first so many, half of them if there are fewer.
@@ -301,9 +301,8 @@ def _reference(scaled: _Scaled) -> Reference | None:
     measured = summarise(tuple(scaled.decays))
     current, root = np.asarray(measured.current), np.asarray(measured.root)
     parts = np.asarray(measured.parts)
-    quadratic, zero = scaled.a * current, np.zeros_like(current)
-    rows = np.stack([np.stack([quadratic, zero], -1), np.stack([quadratic, scaled.b], -1)], axis=1)
-    weighted = np.einsum("nij,njk->nik", root, rows).reshape(-1, 2)
+    rows = by_losses(scaled.a * current, scaled.b)
+    weighted = (root @ rows).reshape(-1, 2)
     seen = np.einsum("nij,nj->ni", root, parts).ravel()
     size = np.linalg.norm(weighted, axis=0)
     found = np.linalg.lstsq(weighted / size, seen, rcond=None)[0] / size

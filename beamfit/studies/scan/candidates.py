@@ -4,17 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
-from functools import partial
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
 from beamfit.errors import InputError, nearest
-from beamfit.greybox import assess, tree
+from beamfit.greybox import assess
 from beamfit.greybox.covariance import MOST_SHARE
 from beamfit.greybox.design import Information
+from beamfit.greybox.fit import value_and_slope
 from beamfit.optics.beamline import Beamline
 from beamfit.optics.calibration import SETTING_UNITS
 from beamfit.optics.elements import Drift, Screen
@@ -64,14 +63,9 @@ def information_of(fit: EmittanceFit) -> Information:
     if fit.solved is not None and _determined(fit):
         edge = np.array([v.state in ("lower", "upper") for v in fit.fit.variables])
         held = held | (edge & p.nuisance)
-    planes = tuple(plane.plane for plane in fit.planes)
-    found = [
-        with_slope(_emittance, p.core, jnp.asarray(theta), _as_tree(plane)) for plane in planes
-    ]
     return Information(
         jacobian,
-        np.array([float(v[0]) for v, _ in found]),
-        np.array([np.asarray(s)[0] for _, s in found]),
+        *value_and_slope(p, _emittances, theta),
         ~p.nuisance & ~held,
         p.lower,
         p.upper,
@@ -97,24 +91,8 @@ def _determined(fit: EmittanceFit) -> bool:
     return all(plane.identifiability.determined for plane in fit.planes)
 
 
-@partial(jax.jit, static_argnums=0)
-def with_slope(function, core, theta, data):
-    """``function(model, data)`` as a flat vector, with its derivatives by the free numbers."""
-
-    def of_theta(t):
-        return jnp.ravel(function(tree.replace(core.model, core.chosen, t), data))
-
-    return of_theta(theta), jax.jacfwd(of_theta)(theta)
-
-
-def _as_tree(plane: str) -> dict:
-    """A plane's name as a tree, which JAX compiles for."""
-    return {plane: jnp.zeros(0)}
-
-
-def _emittance(model, plane):
-    (name,) = plane.keys()
-    return emittance_parts(sigma_of(model["beam"][name]))[:1]
+def _emittances(model, data):
+    return jnp.stack([emittance_parts(sigma_of(beam))[0] for beam in model["beam"].values()])
 
 
 # Other energies to consider where none is named: what a linac can usually do.
@@ -240,8 +218,7 @@ def _rows(
             data = _line_rows(fit, line, plane.plane, table, screen, energy)
         else:
             data = _network_rows(fit, plane.plane, table, screen)
-        both = with_slope(predict_sizes, problem.core, jnp.asarray(theta), data)
-        size, slope = map(np.asarray, both)
+        size, slope = value_and_slope(problem, predict_sizes, theta, data)
         found.append(slope / (max(float(relative), 1e-4) * size)[:, None])
     return np.array(found)
 
