@@ -15,8 +15,6 @@ from beamfit.language.network import with_weights
 from beamfit.language.scope import Array, Axes, IndexSet, Net, Scope, located, widened
 from beamfit.language.steps import Call, calls, gains_of
 
-__all__ = ["Arrays", "called", "defaults", "given_to"]
-
 Arrays = dict[str, jax.Array]
 
 

@@ -10,8 +10,6 @@ from beamfit.language import document as d
 from beamfit.language.expression import error_at
 from beamfit.language.order import checked
 
-__all__ = ["check_document", "check_problem"]
-
 
 def check_document(
     document: d.Document, shapes: Mapping[str, tuple[int, int]] | None = None

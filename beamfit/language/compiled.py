@@ -20,8 +20,6 @@ from beamfit.language.order import Group, Order, checked
 from beamfit.language.recurrence import scanned
 from beamfit.language.scope import Scope, Step, reads, widened
 
-__all__ = ["Program", "carry_out", "compile_mapping"]
-
 
 @dataclass(frozen=True, eq=False)
 class Program:

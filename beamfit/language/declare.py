@@ -24,8 +24,6 @@ from beamfit.language.scope import (
     widened,
 )
 
-__all__ = ["scope_of"]
-
 # Operations that one use of a function may cost, those of functions in it included.
 MOST_WORK = 20_000
 

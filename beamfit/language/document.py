@@ -7,29 +7,6 @@ from dataclasses import dataclass, field
 
 from beamfit.language.expression import PLACE, Elements, Expression, Iterator, Name, Place
 
-__all__ = [
-    "Assignment",
-    "Block",
-    "Call",
-    "DataTable",
-    "Declared",
-    "Document",
-    "Function",
-    "Goal",
-    "IndexedSet",
-    "Limit",
-    "Mapping",
-    "Network",
-    "Part",
-    "Problem",
-    "Real",
-    "Solver",
-    "Statement",
-    "Variable",
-    "Wire",
-]
-
-
 # ---- statements
 
 

@@ -14,8 +14,6 @@ from defusedxml.sax import parseString
 from beamfit.errors import InputError
 from beamfit.language.expression import Place, error_at
 
-__all__ = ["Node", "read_elements"]
-
 # Elements within each other, and lines that the beginning of one may take.
 MOST_DEEP, MOST_LINES = 40, 12
 NAME = re.compile(r"[^\W\d]\w*")

@@ -29,9 +29,6 @@ from beamfit.language.scope import (
     widened,
 )
 
-__all__ = ["HIDDEN", "Setting", "Value", "check_rank", "evaluate", "picked", "stored"]
-
-
 # Behind the names of iterators that a function's body does not see.
 HIDDEN = "'"
 

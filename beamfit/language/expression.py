@@ -8,27 +8,6 @@ from typing import NamedTuple
 
 from beamfit.errors import InputError
 
-__all__ = [
-    "NOWHERE",
-    "PLACE",
-    "REDUCTIONS",
-    "Application",
-    "Elements",
-    "Expression",
-    "Iterator",
-    "Name",
-    "Number",
-    "Operation",
-    "Place",
-    "Reduction",
-    "Whole",
-    "check_depth",
-    "children",
-    "error_at",
-    "iterators_text",
-    "text_of",
-]
-
 # Formulas are walked by recursion. Written by people they have ten levels.
 MOST_LEVELS = 120
 REDUCTIONS = ("sum", "prod", "min", "max", "mean")

@@ -13,8 +13,6 @@ from beamfit.language import expression as x
 from beamfit.language.scope import Read, Scope, Step, located, reads
 from beamfit.language.steps import sources, targets
 
-__all__ = ["Lagged", "Plan", "plan_of"]
-
 # Ways to choose a time index in each statement of a loop that are tried.
 MOST_TRIED = 64
 

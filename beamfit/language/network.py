@@ -21,15 +21,6 @@ from beamfit.greybox.mlp import MLP, Gain, Layer, Port, connection
 from beamfit.language import document as d
 from beamfit.language.expression import error_at
 
-__all__ = [
-    "format_network",
-    "network_from",
-    "network_of",
-    "parse_network",
-    "weights_of",
-    "with_weights",
-]
-
 _CLASS = "com.pav.pdas.model.mlp.MlpMapping"
 
 

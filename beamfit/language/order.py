@@ -30,8 +30,6 @@ from beamfit.language.scope import (
 )
 from beamfit.language.steps import Call, calls, gains_of, sources, targets, written
 
-__all__ = ["Group", "Order", "checked", "order_of"]
-
 NOBODY = -1
 # Names that the message of a loop shows.
 MOST_NAMED = 8

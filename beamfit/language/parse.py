@@ -18,8 +18,6 @@ from beamfit.language import expression as x
 from beamfit.language.expression import Place, error_at
 from beamfit.language.syntax import check_brackets, explained, short
 
-__all__ = ["parse_document", "parse_statements"]
-
 
 def parse_document(text: str) -> d.Document:
     """Read a document from its text form.

@@ -16,8 +16,6 @@ from beamfit.language.lags import Lagged, Plan
 from beamfit.language.scope import Array, Axes, IndexSet, Scope, Step, widened
 from beamfit.language.steps import sources
 
-__all__ = ["scanned"]
-
 ONE = IndexSet("", np.arange(1))
 Arrays = dict[str, jax.Array]
 

@@ -18,25 +18,6 @@ from beamfit.language import document as d
 from beamfit.language import expression as x
 from beamfit.language.expression import REDUCTIONS, Place, error_at
 
-__all__ = [
-    "CONSTANTS",
-    "FUNCTIONS",
-    "Array",
-    "Axes",
-    "IndexSet",
-    "Net",
-    "Read",
-    "Scope",
-    "Step",
-    "check_size",
-    "index_of",
-    "located",
-    "reads",
-    "set_of",
-    "whole_of",
-    "widened",
-]
-
 # Elements of a set, and combinations of indices one statement may run over.
 MOST_ELEMENTS, MOST_COMBINED = 2_000_000, 5_000_000
 CONSTANTS = {"pi": float(np.pi)}

@@ -24,8 +24,6 @@ from beamfit.statistics import reach_of
 from beamfit.status import Status
 from beamfit.table import Table, cell
 
-__all__ = ["Solution", "solve_document", "solve_problem"]
-
 # Draws of the same seeds that are tried until the start is finite.
 MOST_DRAWS = 100
 # Rows of a table on a terminal; JSON has all.

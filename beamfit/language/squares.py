@@ -7,8 +7,6 @@ from typing import NamedTuple
 from beamfit.language import document as d
 from beamfit.language import expression as x
 
-__all__ = ["Square", "squares_of"]
-
 
 class Square(NamedTuple):
     """A term of a sum of squares: weight times (body for all iterators) squared."""

@@ -18,8 +18,6 @@ from beamfit.language.compiled import Program, compile_mapping
 from beamfit.language.expression import error_at
 from beamfit.language.squares import Square, squares_of
 
-__all__ = ["Formulation", "at_start", "formulate", "starts_of"]
-
 
 @dataclass(frozen=True, eq=False)
 class Formulation:

@@ -10,8 +10,6 @@ from beamfit.language import expression as x
 from beamfit.language.expression import error_at
 from beamfit.language.scope import Axes, Net, Read, Scope, Step, located, widened
 
-__all__ = ["Call", "calls", "gains_of", "sources", "targets", "written"]
-
 
 class Call(NamedTuple):
     """A call with what it calls."""

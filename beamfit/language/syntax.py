@@ -12,8 +12,6 @@ from lark.exceptions import UnexpectedCharacters, UnexpectedInput, UnexpectedTok
 from beamfit.errors import InputError
 from beamfit.language.expression import Place, error_at
 
-__all__ = ["check_brackets", "explained", "short"]
-
 # Brackets open at once, and letters of an odd word that a message shows.
 MOST_OPEN, LONGEST = 60, 30
 BRACKET = re.compile(

@@ -12,8 +12,6 @@ from textwrap import indent, wrap
 from beamfit.language import document as d
 from beamfit.language.expression import iterators_text
 
-__all__ = ["format_document", "format_statements"]
-
 WIDTH = 96
 NAME = re.compile(r"[^\W\d]\w*")
 NUMBER = re.compile(r"[+-]?(\d+(\.\d*)?|\.\d+)([eE][+-]?\d+)?")

@@ -18,8 +18,6 @@ from beamfit.language.order import Group
 from beamfit.language.scope import Axes, IndexSet, Scope, Step
 from beamfit.language.steps import calls
 
-__all__ = ["cause_of"]
-
 
 class _FoundError(Exception):
     """Ends the walk at the first part that is not finite."""

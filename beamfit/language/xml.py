@@ -17,8 +17,6 @@ from beamfit.language.expression import Elements
 from beamfit.language.parse import parse_statements
 from beamfit.language.text import format_statements, number_text_or_inf
 
-__all__ = ["format_xml", "parse_xml"]
-
 MLP = "com.pav.pdas.model.mlp.MlpMapping"
 EXPRESSIONS = "com.pav.pdas.model.expression.ExpressionMapping"
 NLP = "com.pav.pdas.optimization.common.NLPProblem"

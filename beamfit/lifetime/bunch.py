@@ -12,21 +12,6 @@ from scipy import constants
 from beamfit.lifetime.ring import Operation, Ring
 from beamfit.lifetime.well import length_and_height
 
-__all__ = [
-    "Bunch",
-    "bunch_in_bucket",
-    "bunch_length",
-    "equal_bunches",
-    "lengthening",
-    "population",
-    "quantum_loss",
-    "quantum_rate",
-    "rf_acceptance",
-    "stored_bunch",
-    "synchrotron_tune",
-    "up_and_down",
-    "vertical_acceptance",
-]
 # The largest share of its momentum that an electron loses.
 MOST = 0.99
 

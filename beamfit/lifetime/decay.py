@@ -8,8 +8,6 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-__all__ = ["HOUR", "current", "current_by_rate", "lifetime", "mean_exponential"]
-
 HOUR = 3600.0
 # exp(-x) mean over [0, x]: below this the series is exact to rounding, above it the quotient is.
 SERIES_BELOW = 0.1

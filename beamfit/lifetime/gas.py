@@ -10,14 +10,6 @@ from scipy import constants
 from beamfit.lifetime.bunch import stored_bunch, up_and_down, vertical_acceptance
 from beamfit.lifetime.ring import ELECTRON_RADIUS, Gas, Operation, Ring
 
-__all__ = [
-    "bremsstrahlung_cross_section",
-    "bremsstrahlung_loss",
-    "elastic_cross_section",
-    "elastic_loss",
-    "gas_rate_coefficient",
-]
-
 
 def elastic_cross_section(
     charge: Array,

@@ -18,22 +18,6 @@ from beamfit.lifetime.ring import Operation, Ring, unstored
 from beamfit.lifetime.touschek import touschek_loss
 from beamfit.shown import shown
 
-__all__ = [
-    "LINEAR",
-    "MECHANISMS",
-    "QUADRATIC",
-    "SCALES",
-    "Losses",
-    "Mechanism",
-    "Terms",
-    "added",
-    "loss_coefficients",
-    "loss_terms",
-    "scaled_losses",
-    "scaled_parts",
-    "terms_of",
-]
-
 # Pa; a rise of the pressure over no pressure at all is taken over this.
 NO_PRESSURE = 1e-30
 

@@ -12,19 +12,6 @@ from scipy import constants
 from beamfit.particles import REST_ENERGY
 from beamfit.shown import shown
 
-__all__ = [
-    "ELECTRON_MASS_EV",
-    "ELECTRON_RADIUS",
-    "Gas",
-    "HarmonicCavity",
-    "MeasuredLength",
-    "Operation",
-    "Optics",
-    "Ring",
-    "gas_mixture",
-    "unstored",
-]
-
 ELECTRON_MASS_EV = 1e6 * REST_ENERGY["electron"]
 ELECTRON_RADIUS = constants.physical_constants["classical electron radius"][0]
 

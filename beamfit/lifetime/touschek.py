@@ -15,13 +15,6 @@ from scipy import constants
 from beamfit.lifetime.bunch import population, stored_bunch
 from beamfit.lifetime.ring import ELECTRON_RADIUS, Operation, Optics, Ring
 
-__all__ = [
-    "piwinski_rate",
-    "piwinski_shape",
-    "touschek_loss",
-    "touschek_shape",
-]
-
 
 def _spectrum(log_kappa: Array, floor: Array) -> Array:
     """Piwinski's integrand at t = tan²(kappa), without its exponential and Bessel function."""

@@ -8,8 +8,6 @@ from jax import Array
 
 from beamfit.lifetime.ring import HarmonicCavity, Ring
 
-__all__ = ["length_and_height"]
-
 # Where the density is computed: the main RF's bucket and a quarter more, in halves of its width,
 # fifty times closer at the bunch than on average.
 EVEN = np.linspace(-1.0, 1.0, 4097)

@@ -14,8 +14,6 @@ from jax.typing import ArrayLike
 
 from beamfit.shown import shown
 
-__all__ = ["array_module", "floats", "value"]
-
 C = TypeVar("C", bound=type)
 
 

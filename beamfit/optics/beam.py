@@ -15,8 +15,6 @@ from beamfit.optics.arrays import value
 from beamfit.optics.particle import ELECTRON_MASS, beta_gamma
 from beamfit.shown import shown
 
-__all__ = ["BeamMatrix", "Twiss"]
-
 
 @shown
 class Twiss(NamedTuple):

@@ -21,8 +21,6 @@ from beamfit.optics.sections import Section, Series, in_series
 from beamfit.shown import brief, shown
 from beamfit.table import Table
 
-__all__ = ["Beamline", "Design"]
-
 
 def _plain(value: Any) -> Any:
     """What a value is made of: names of classes, texts and numbers."""

@@ -15,20 +15,6 @@ from jax.typing import ArrayLike
 from beamfit.optics.arrays import array_module, value
 from beamfit.optics.particle import ELECTRON_MASS, rigidity
 
-__all__ = [
-    "SETTING_UNITS",
-    "Calibration",
-    "CurrentPolynomial",
-    "CurrentTable",
-    "FocusingStrength",
-    "Gradient",
-    "IntegratedGradient",
-    "IntegratedStrength",
-    "SlopeIntercept",
-    "scaled",
-]
-
-
 SETTING_UNITS = {"A": "A", "kG": "kG", "T_per_m": "T/m", "k1": "1/m²", "k1l": "1/m"}
 """How the unit of a setting is written for people."""
 

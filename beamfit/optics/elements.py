@@ -18,19 +18,6 @@ from beamfit.optics.calibration import Calibration, FocusingStrength, Integrated
 from beamfit.optics.focusing import focusing
 from beamfit.optics.particle import ELECTRON_MASS, beta_gamma
 
-__all__ = [
-    "IDENTITY",
-    "Drift",
-    "Element",
-    "Marker",
-    "Quadrupole",
-    "Screen",
-    "SectorDipole",
-    "ThinLens",
-    "TransferMatrix",
-    "hard_edge_slice",
-]
-
 _BY_K1, _BY_K1L = FocusingStrength(), IntegratedStrength()
 
 

@@ -15,8 +15,6 @@ from jax.typing import ArrayLike
 
 from beamfit.optics.arrays import array_module, floats
 
-__all__ = ["Focusing", "focusing"]
-
 # Below |k L²| = 0.5 the series is used; nine terms leave out less than 1e-18.
 _NEAR, _TERMS = 0.5, 9
 _SERIES = np.array(

@@ -6,8 +6,6 @@ from typing import Any
 
 from beamfit.particles import REST_ENERGY
 
-__all__ = ["ELECTRON_MASS", "PROTON_MASS", "beta_gamma", "rigidity"]
-
 # MeV
 ELECTRON_MASS = REST_ENERGY["electron"]
 PROTON_MASS = REST_ENERGY["proton"]

@@ -18,8 +18,6 @@ from jax.typing import ArrayLike
 from beamfit.optics.arrays import array_module, value
 from beamfit.optics.elements import IDENTITY, Marker, Screen, TransferMatrix
 
-__all__ = ["Section", "Series", "in_series"]
-
 
 @value("name")
 class Section:
