@@ -16,9 +16,14 @@ def decay():
     return fit_decay(beamfit.read_decay_record("measurements/aps_1999_decay.csv"))
 
 
-def test_write_report_with_a_posterior(tmp_path, decay):
+@pytest.fixture(scope="module")
+def posterior(decay):
+    return decay.sample(seed=1, target_ess=1000)
+
+
+def test_write_report_with_a_posterior(tmp_path, decay, posterior):
     page = tmp_path / "aps.html"
-    beamfit.write_report(page, decay, decay.sample(seed=1))
+    beamfit.write_report(page, decay, posterior)
     html = page.read_text()
     assert "posterior sampled" in html
     assert "current expected of aps_1999_decay.csv" in html
@@ -39,16 +44,16 @@ def test_a_posterior_that_was_not_sampled_says_why(tmp_path):
     assert "Correlations" not in html
 
 
-def test_pairs_are_drawn_with_every_number(decay):
+def test_pairs_are_drawn_with_every_number(posterior):
     from matplotlib.figure import Figure
 
     figure = Figure(layout="constrained")
-    draw_pairs(figure, decay.sample(seed=1), ("lifetime_mean", "a", "b"))
+    draw_pairs(figure, posterior, ("lifetime_mean", "a", "b"))
     shown = [axes for axes in figure.axes if axes.axison]
     assert len(shown) == 6
     labels = [axes.get_xlabel() for axes in figure.axes if axes.get_xlabel()]
     assert labels == ["lifetime mean\nh", "a\n1e-8 1/(mA s)", "b\n1e-7 1/s"]
-    a, b = (decay.sample(seed=1).values(name) for name in "ab")
+    a, b = (posterior.values(name) for name in "ab")
     dots = next(axes for axes in shown if axes.lines and len(axes.lines[0].get_xdata()) == 2000)
     np.testing.assert_allclose(dots.lines[0].get_xdata(), a[:2000] * 1e8)
     np.testing.assert_allclose(dots.lines[0].get_ydata(), b[:2000] * 1e7)

@@ -123,7 +123,7 @@ def test_the_core_solves_the_same_problem():
 
 def test_the_sampler_has_the_same_noise():
     fit = fit_decay(record(0.8, seed=9))
-    posterior = fit.sample(seed=1)
+    posterior = fit.sample(seed=1, budget=1000)  # 48 000 draws, of a memory of nine steps
     low, middle, high = np.percentile(posterior.values("a"), [15.9, 50, 84.1])
     assert (high - low) / 2 == pytest.approx(fit.a.error, rel=0.2)
     assert middle == pytest.approx(fit.a.value, abs=0.3 * fit.a.error)
