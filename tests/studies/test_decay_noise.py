@@ -130,7 +130,7 @@ def test_the_sampler_has_the_same_noise():
 
 
 def test_no_record_of_noise_says_more_than_that_its_loss_rate_is_zero():
-    """By the error of a slope, noise sqrt(12/n)/T: rates below zero by chance made 1e5 h and more."""
+    """Error of a slope: noise sqrt(12/n)/T. Rates below zero by chance made 1e5 h and more."""
     rng, count = np.random.default_rng(3), 200
     records = [
         DecayRecord(np.linspace(0, SPAN, count), 500 + 0.02 * rng.normal(size=count))
