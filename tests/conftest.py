@@ -48,6 +48,28 @@ def root():
 
 
 @pytest.fixture(scope="session")
+def browser(tmp_path_factory):
+    """A Chromium, or None where there is none (tests/report/test_in_browser.py says so)."""
+    from tests.report.browser import NAME, Chromium
+
+    one = Chromium(tmp_path_factory.mktemp("chromium")) if NAME else None
+    yield one
+    if one:
+        one.close()
+
+
+@pytest.fixture
+def well_shown(browser):
+    """Look at a page on a telephone, a screen and paper: what is wrong with it."""
+    from tests.report.browser import WIDTHS
+
+    def look(page, pictures):
+        return [f for w in WIDTHS if browser for f in browser.faults(page, w, pictures)]
+
+    return look
+
+
+@pytest.fixture(scope="session")
 def shared():
     """Reference numbers and measurements kept beside a checkout; not part of a clone."""
     folder = ROOT.parent / "shared"

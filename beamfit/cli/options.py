@@ -5,13 +5,13 @@ from __future__ import annotations
 import shlex
 import sys
 from collections.abc import Callable, Mapping
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import click
 
 from beamfit.errors import InputError
 from beamfit.particles import REST_ENERGY
+from beamfit.report import kind_of
 from beamfit.studies.scan.assumptions import SCENARIOS
 from beamfit.studies.scan.typed import anchor_of, bounds_of, gains_of, limits_of, priors_of
 from beamfit.writing import check_place
@@ -26,8 +26,7 @@ def _parsed(read: Callable[[Any], Any]) -> Callable[..., Any]:
 
 def _report(path: str) -> str:
     """Find out before anything is computed whether the report could be written."""
-    if Path(path).suffix.lower() not in (".html", ".pdf"):
-        raise InputError(f"report '{path}'", "a name ending in .html or .pdf")
+    kind_of(path)
     check_place(path)
     return path
 
@@ -168,9 +167,9 @@ SHARED: dict[str, Callable[..., Any]] = {
     ),
     "report": click.option(
         "--report",
-        metavar="FILE.html|FILE.pdf",
+        metavar="FILE.html|.pdf|.png|.svg",
         callback=_parsed(_report),
-        help="Write a report page.",
+        help="Write a report page, or (.png, .svg) its pictures one by one.",
     ),
     "sample": click.option(
         "--sample",

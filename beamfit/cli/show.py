@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from pathlib import Path
 from typing import Any
 
 from rich.console import Console
@@ -12,6 +13,7 @@ from rich.text import Text
 
 from beamfit.errors import plain
 from beamfit.quantity import Status
+from beamfit.report import PAGES, kind_of
 from beamfit.sampling.posterior import Posterior
 from beamfit.table import Table
 
@@ -84,4 +86,6 @@ class Terminal:
     def report(self, path: str | None) -> None:
         """Say where the report is, if there is one."""
         if path is not None:
-            self.line(f"Report written to {path}", style="bold")
+            several = f"Pictures written: {Path(path).stem}*{Path(path).suffix}"
+            page = f"Report written to {path}"
+            self.line(page if kind_of(path) in PAGES else several, style="bold")

@@ -19,6 +19,7 @@ from beamfit.report.document import (
     Page,
     Picture,
     Verdict,
+    from_head,
     legend_below,
     provenance,
     written,
@@ -135,7 +136,7 @@ def decay_page(
         pictures=_of_all(decays, shift, trend) + _pictures(studies),
         pictures_title="Records and fits",
         provenance=provenance(inputs or {}, [], command),
-        notes=tuple(note for study in studies for note in study.record.comments),
+        notes=from_head([note for study in studies for note in study.record.comments]),
     )
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import io
 import platform
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from datetime import UTC, datetime
 from importlib.metadata import version
 from typing import NamedTuple
@@ -83,6 +83,11 @@ def written() -> str:
     return "written " + datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")
 
 
+def from_head(lines: Sequence[str]) -> tuple[str, ...]:
+    """What the head of a file says, as the notes of a page."""
+    return ("From the head of the file:", *lines) if lines else ()
+
+
 def legend_below(figure: FigureBase, axes: Axes, columns: int) -> None:
     """Put the legend of some axes below their figure, in so many columns."""
     shown = axes.get_legend_handles_labels()
@@ -108,7 +113,9 @@ def html_of(page: Page) -> bytes:
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,
     )
-    pictures = [{"alt": p.alt, "data": _svg(p)} for p in page.pictures]
+    pictures = [
+        {"alt": p.alt, "data": base64.b64encode(drawn(p, "svg")).decode()} for p in page.pictures
+    ]
     content = page._asdict() | {"pictures": pictures}
     return plain(environment.get_template("page.html.j2").render(**content)).encode()
 
@@ -120,7 +127,8 @@ def figure_of(picture: Picture) -> Figure:
     return figure
 
 
-def _svg(picture: Picture) -> str:
+def drawn(picture: Picture, kind: str) -> bytes:
+    """A picture by itself as the bytes of a file, png or svg."""
     buffer = io.BytesIO()
-    figure_of(picture).savefig(buffer, format="svg")
-    return base64.b64encode(buffer.getvalue()).decode()
+    figure_of(picture).savefig(buffer, format=kind, dpi=200 if kind == "png" else "figure")
+    return buffer.getvalue()

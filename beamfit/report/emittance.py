@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping
 from functools import partial
 
-from beamfit.report.document import Page, Picture, Verdict, provenance, written
+from beamfit.report.document import Page, Picture, Verdict, from_head, provenance, written
 from beamfit.report.scan_pictures import (
     PROFILES_ABREAST,
     draw_ellipses,
@@ -87,7 +87,7 @@ def emittance_page(
         pictures=_pictures(fit),
         pictures_title="Scan and fit",
         provenance=provenance(inputs, [("errors of the sizes", source)], command),
-        notes=scan.provenance,
+        notes=from_head(scan.provenance),
     )
 
 

@@ -43,7 +43,7 @@ def formulation_page(
     if found.notes:
         tables.append(Table("About the document", [], [[note] for note in found.notes]))
     if found.made is not None:
-        text = format_document(found.made.document).splitlines()
+        text = format_document(found.made.document).replace("  ", "\xa0\xa0").splitlines()
         tables.append(Table("The document", [], [[line] for line in text if line]))
     drawn = list(_drawn(found))
     pictures = []
@@ -52,11 +52,14 @@ def formulation_page(
         pictures = [Picture("outputs by index", height, partial(draw_outputs, found=found))]
     goals = "maximised" if found.factor < 0 else "minimised"
     called = found.made.document.mapping.name if found.made else found.name
-    counts = f"{len(p.names)} variables, {len(p.constraint_names)} limits"
+    sizes = {"variable": len(p.names), "limit": len(p.constraint_names)}
+    counts = ", ".join(f"{n} {what}" + "s" * (n != 1) for what, n in sizes.items())
     return Page(
         title=f"Formulation {called}".strip(),
         subtitle=f"{counts}, {goals}; {written()}",
-        verdicts=[Verdict(found.status, found.headline, found.message)],
+        verdicts=[
+            Verdict(found.status, found.headline, found.message[:1].upper() + found.message[1:])
+        ],
         tables=tables,
         pictures=pictures,
         pictures_title="Outputs",

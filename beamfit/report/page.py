@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from os import PathLike
 from pathlib import Path
@@ -10,9 +11,10 @@ from matplotlib import rc_context
 
 from beamfit.errors import InputError
 from beamfit.language.solution import Solution
+from beamfit.report import kind_of
 from beamfit.report.control import control_page
 from beamfit.report.decays import decay_page, study_of
-from beamfit.report.document import STYLE, html_of
+from beamfit.report.document import STYLE, Picture, drawn, html_of
 from beamfit.report.emittance import emittance_page
 from beamfit.report.formulation import formulation_page
 from beamfit.report.pdf import pdf_of
@@ -50,7 +52,8 @@ def write_report(
     Parameters
     ----------
     path : str or path
-        Ends in ``.html`` (self-contained) or ``.pdf``. An existing file is replaced whole.
+        Ends in ``.html`` (self-contained) or ``.pdf``; in ``.png`` or ``.svg`` its pictures are
+        written one by one, the first under this name. An existing file is replaced whole.
     result : EmittanceFit, SliceFits, DecayFit, Solution, ResponseFit, Loop, or sequence
         The emittance of a scan or of the slices of a beam, the lifetime of a decay, a formulation
         solved, the response of a process, a simulated loop; or a sequence of RecordStudy (the
@@ -71,7 +74,7 @@ def write_report(
     Raises
     ------
     InputError
-        If the suffix is another one or the place cannot be written.
+        If the suffix is another one, there is no picture, or the place cannot be written.
 
     Examples
     --------
@@ -86,9 +89,7 @@ def write_report(
     >>> page.read_text().startswith("<!DOCTYPE html>")
     True
     """
-    suffix = Path(path).suffix.lower()
-    if suffix not in (".html", ".pdf"):
-        raise InputError(f"report '{path}'", "a name ending in .html or .pdf", path=path)
+    suffix = kind_of(path)
     with rc_context(STYLE):
         several = tuple(result) if isinstance(result, list | tuple) else (result,)
         sampled: list[Sampled] = []
@@ -109,8 +110,27 @@ def write_report(
                 page = decay_page(studies, command, inputs, shift, trend)
                 sampled = _of_decays(studies, posterior)
         page = with_posteriors(page, sampled)
-        content = html_of(page) if suffix == ".html" else pdf_of(page)
-    write_atomically(path, content)
+        match suffix:
+            case ".html":
+                made = {Path(path): html_of(page)}
+            case ".pdf":
+                made = {Path(path): pdf_of(page)}
+            case _:
+                made = _pictures(Path(path), page.pictures)
+    for place, content in made.items():
+        write_atomically(place, content)
+
+
+def _pictures(path: Path, pictures: Sequence[Picture]) -> dict[Path, bytes]:
+    """The first picture under the name itself, others with their number and what they show."""
+    if not pictures:
+        raise InputError(f"report '{path}' without a picture", "a name ending in .html or .pdf")
+    made = {}
+    for number, picture in enumerate(pictures, 1):
+        shows = re.sub(r"\W+", "-", picture.alt.lower())
+        place = path if number == 1 else path.with_stem(f"{path.stem}-{number}-{shows}")
+        made[place] = drawn(picture, path.suffix.lower().removeprefix("."))
+    return made
 
 
 def _of_decays(

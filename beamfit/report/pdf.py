@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import re
 from collections.abc import Sequence
 from typing import Any
 
@@ -128,8 +129,9 @@ def width_of(words: str, size: float, weight: str = "normal") -> float:
 def wrapped(words: str, room: float, size: float, weight: str = "normal") -> list[str]:
     """Break a text into lines that fit into so many inches; within a word where that is longer."""
     lines = [""]
-    for word in plain(words).split():
-        longer = f"{lines[-1]} {word}".strip()
+    # A blank that does not break is part of an indentation.
+    for word in re.split(r"\s+", plain(words), flags=re.ASCII):
+        longer = f"{lines[-1]} {word}" if lines[-1] else word
         if width_of(longer, size, weight) <= room:
             lines[-1] = longer
             continue

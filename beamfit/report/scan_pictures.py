@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from textwrap import fill
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -46,7 +47,8 @@ def draw_scan(figure: FigureBase, fit: EmittanceFit, plane: str) -> None:
         style = {"ms": 14, "mew": 2, "color": COLOUR[plane], "alpha": 0.6}
         above.plot(at, 1e6 * p.points.model, "_", label="fit", **style)
     above.legend(frameon=False, loc="best", fontsize=8)
-    above.set(title=f"{plane} plane: {words_of(p)}", ylabel="rms size, µm", ylim=(0.0, None))
+    title = f"{plane} plane: {words_of(p).removesuffix(' (statistics only)')}"
+    above.set(title=fill(title, 62), ylabel="rms size, µm", ylim=(0.0, None))
     _residuals(below, p)
 
 

@@ -8,7 +8,7 @@ from functools import partial
 import numpy as np
 from matplotlib.figure import FigureBase
 
-from beamfit.report.document import Page, Picture, Verdict, provenance, written
+from beamfit.report.document import Page, Picture, Verdict, from_head, provenance, written
 from beamfit.report.emittance import ERRORS
 from beamfit.report.scan_pictures import COLOUR, draw_scan, words_of
 from beamfit.status import Status
@@ -71,7 +71,7 @@ def slices_page(
         pictures=pictures,
         pictures_title="Slices, and the scan and fit of each",
         provenance=provenance(inputs, [("errors of the sizes", source)], command),
-        notes=scan.provenance,
+        notes=from_head(scan.provenance),
     )
 
 

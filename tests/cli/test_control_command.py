@@ -19,7 +19,7 @@ def record(tmp_path):
     return str(tmp_path / "run.csv")
 
 
-def test_a_loop_answers_in_json_and_on_a_page(run, record, tmp_path):
+def test_a_loop_answers_in_json_and_on_a_page(run, record, tmp_path, well_shown):
     page = tmp_path / "loop.html"
     said = ("--delay", 0, "--set", "level=2.5", "--set", "level=4@30", "--limit", "valve=0:3")
     said += ("--rate", "valve=0.5", "--limit", "level=:4.5", "--disturb", "level=-0.5@60")
@@ -34,6 +34,7 @@ def test_a_loop_answers_in_json_and_on_a_page(run, record, tmp_path):
     u = np.array(one["loop"]["inputs"])[:, 0]
     assert np.abs(np.diff(u)).max() <= 0.5 + 1e-12
     assert "SIMULATED" in page.read_text()
+    assert well_shown(page, 1) == []
     status, out, _ = run("control", record, *said)
     assert status == 0
     assert "disturbed by -0.5" in out

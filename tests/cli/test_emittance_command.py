@@ -153,7 +153,7 @@ SLICES = (
 )
 
 
-def test_slices_are_fitted_in_one_command(run, tmp_path):
+def test_slices_are_fitted_in_one_command(run, tmp_path, well_shown):
     page = tmp_path / "slices.html"
     status, out, err = run(*SLICES, "--report", page)
     assert (status, err) == (0, "")
@@ -161,6 +161,7 @@ def test_slices_are_fitted_in_one_command(run, tmp_path):
         assert f"\nslice {name}, x converged: " in out
     assert "Slices of gtf_slices_simulated, x plane" in out
     assert page.read_text().count("<img") == 7
+    assert well_shown(page, 7) == []
     status, out, err = run(*SLICES, "--json")
     assert (status, err) == (0, "")
     results = json.loads(out)["results"]

@@ -13,7 +13,7 @@ def table(*rows, head=HEAD):
     return head + "".join(rows)
 
 
-def test_json_has_the_contract_s_keys_and_the_page_is_written(run, tmp_path):
+def test_json_has_the_contract_s_keys_and_the_page_is_written(run, tmp_path, well_shown):
     page = tmp_path / "page.html"
     status, out, err = run("identify", RECORD, "--json", "--delay", 2, "--report", page)
     found = json.loads(out)
@@ -27,6 +27,7 @@ def test_json_has_the_contract_s_keys_and_the_page_is_written(run, tmp_path):
     assert set(one["parameters"]["tau"]) == {"value", "error", "error_raw", "unit", "interval_95"}
     assert one["delay_samples"] == 2
     assert "SIMULATED" in page.read_text()
+    assert well_shown(page, 2) == []
     assert "Try parameters that change" in one["message"]
 
 

@@ -118,13 +118,14 @@ def test_a_record_too_short_has_a_lifetime_and_null_errors_of_a_and_b(run, tmp_p
     assert found["value"] == pytest.approx(tau, abs=4 * found["error"])
 
 
-def test_tables_and_report(run, tmp_path):
+def test_tables_and_report(run, tmp_path, well_shown):
     report = tmp_path / "aps.html"
     status, out, err = run("lifetime", APS, "--ring", RING, "--report", report)
     assert (status, err) == (0, "")
     for words in ("converged", "lifetime at the mean current", "a, Touschek", "b, measured"):
         assert words in out
     assert report.read_text().startswith("<!DOCTYPE html>")
+    assert well_shown(report, 3) == []
 
 
 def test_help_has_examples(run):

@@ -42,7 +42,7 @@ def test_starts_are_drawn_again_from_the_same_seeds_until_they_are_finite(run, r
     assert "dx2 = -" in note
 
 
-def test_constraints_have_multipliers_and_a_page_is_written(run, tmp_path):
+def test_constraints_have_multipliers_and_a_page_is_written(run, tmp_path, well_shown):
     page = tmp_path / "page.html"
     text = """maximize area; variable a in [0, 9]; variable b in [0, 9]; constraint round <= 8;
               input a, b; output area, round; area = a*b; round = 2*a + 2*b;"""
@@ -52,7 +52,10 @@ def test_constraints_have_multipliers_and_a_page_is_written(run, tmp_path):
     (limit,) = found["constraints"]
     assert (limit["name"], limit["state"], limit["lower"]) == ("round", "upper", None)
     assert limit["multiplier"] == pytest.approx(1.0, rel=1e-4)  # d(area)/d(round) = round/8
-    assert "<title>" in page.read_text()
+    assert well_shown(page, 0) == []
+    status, out, err = run("solve", tmp_path / "field.bf", "--report", tmp_path / "field.png")
+    assert (status, out, err.count("\n")) == (2, "", 1)
+    assert "without a picture" in err
     assert len(found["starts"]) == 3
 
 

@@ -118,9 +118,19 @@ def test_names_are_shown_as_they_are(root, tmp_path):
 def test_other_suffixes_and_places_are_refused(fit, tmp_path):
     with pytest.raises(InputError, match=r"\.html or \.pdf"):
         beamfit.write_report(tmp_path / "otr2.docx", fit)
-    with pytest.raises(InputError, match="cannot be written"):
+    with pytest.raises(InputError, match="a folder that exists"):
         beamfit.write_report(tmp_path / "missing" / "otr2.html", fit)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_pictures_one_by_one(fit, tmp_path):
+    for suffix, begins in (("png", b"\x89PNG"), ("svg", b"<?xml")):
+        beamfit.write_report(tmp_path / f"otr2.{suffix}", fit)
+        names = ["otr2", "otr2-2-scan-of-the-y-plane", "otr2-3-phase-ellipses"]
+        made = sorted(tmp_path.glob(f"*.{suffix}"), key=lambda p: p.stem)
+        assert [p.stem for p in made] == names
+        assert all(p.read_bytes().startswith(begins) for p in made)
+    assert len({p.read_bytes() for p in tmp_path.iterdir()}) == 6
 
 
 def test_an_old_report_is_replaced_whole(fit, tmp_path):

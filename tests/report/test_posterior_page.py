@@ -21,7 +21,7 @@ def posterior(decay):
     return decay.sample(seed=1, target_ess=1000)
 
 
-def test_write_report_with_a_posterior(tmp_path, decay, posterior):
+def test_write_report_with_a_posterior(tmp_path, decay, posterior, well_shown):
     page = tmp_path / "aps.html"
     beamfit.write_report(page, decay, posterior)
     html = page.read_text()
@@ -29,6 +29,7 @@ def test_write_report_with_a_posterior(tmp_path, decay, posterior):
     assert "current expected of aps_1999_decay.csv" in html
     assert "a, 1e-8 1/(mA s)" in html
     assert html.count("<img") == 4
+    assert well_shown(page, 4) == []
     # a and b: nearly one number, shown with the digits that say how nearly.
     assert "-0.999" in html
 

@@ -97,7 +97,7 @@ def test_the_ring_takes_settings_and_current_out(machine):
         trend_of([*studies, study_record(DecayRecord(time, beam), machine)], machine)
 
 
-def test_the_command_and_its_page(tmp_path):
+def test_the_command_and_its_page(tmp_path, well_shown):
     from click.testing import CliRunner
 
     from beamfit.cli import cli
@@ -111,3 +111,4 @@ def test_the_command_and_its_page(tmp_path):
     assert "Course of the lifetime" in done.output
     assert "Alarm: b moved by" in " ".join(done.output.split())
     assert "course of the lifetime" in page.read_text()
+    assert well_shown(page, 3) == []
