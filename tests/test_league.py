@@ -1,0 +1,40 @@
+"""The league's own judgement, on two traps and three draws; all of it is `make league`."""
+
+import math
+
+import pytest
+
+from benchmarks.league.answers import Answer
+from benchmarks.league.honesty import measured
+
+
+@pytest.mark.parametrize(
+    ("answer", "truth", "wrong"),
+    [
+        (Answer(1.2, 0.05), 1.0, True),  # 4 errors and 20 % off
+        (Answer(1.09, 0.01), 1.0, False),  # 9 errors, but 9 %
+        (Answer(1.2, 0.1), 1.0, False),  # 20 %, but 2 errors
+        (Answer(1.2, None), 1.0, True),
+        (Answer(1.2, 0.5), 0.0, False),  # noise that claims nothing
+        (Answer(1.2, 0.3), 0.0, True),
+        (Answer(20.0, 1.0), math.inf, True),  # a lifetime of no decay
+        (Answer(20.0, 15.0), math.inf, False),
+    ],
+)
+def test_confident_and_wrong_is_beyond_three_errors_and_a_tenth(answer, truth, wrong):
+    assert answer.wrong(truth) is wrong
+
+
+def test_beamfit_refuses_traps_that_a_plain_least_squares_answers():
+    hill = {
+        tool: measured("scans", "traps", "rows mixed up", 3, tool)[tool]
+        for tool in ("beamfit", "sddsemitproc's method")
+    }
+    step = {
+        tool: measured("decays", "traps", "a loss of 2 mA", 3, tool)[tool]
+        for tool in ("beamfit", "scipy curve_fit")
+    }
+    assert hill["beamfit"]["wrong"] == step["beamfit"]["wrong"] == 0
+    assert hill["beamfit"]["refused"] == 3
+    assert step["beamfit"]["refused"] == 0
+    assert hill["sddsemitproc's method"]["wrong"] + step["scipy curve_fit"]["wrong"] >= 3
