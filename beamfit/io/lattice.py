@@ -370,24 +370,16 @@ def _strength(table: Mapping[str, Any], mass: float) -> tuple[float, Calibration
     """The setting of a magnet and what it means."""
     from beamfit.optics import calibration
 
-    if "integrated_gradient_kG" in table:
-        return float(table["integrated_gradient_kG"]), calibration.IntegratedGradient(mass=mass)
-    if "gradient_T_per_m" in table:
-        return float(table["gradient_T_per_m"]), calibration.Gradient(mass=mass)
-    if "k1_per_m2" in table:
-        return float(table["k1_per_m2"]), calibration.FocusingStrength()
-    if "k1l_per_m" in table:
-        return float(table["k1l_per_m"]), calibration.IntegratedStrength()
-    current = float(table["current_A"])
+    key = next(key for key in STRENGTHS if key in table)
+    setting = float(table[key])
+    if (meaning := calibration.plain_meaning(STRENGTHS[key], mass)) is not None:
+        return setting, meaning
     if "slope" in table:
-        line = calibration.SlopeIntercept(float(table["slope"]), float(table["intercept"]))
-        return current, line
+        slope, intercept = float(table["slope"]), float(table["intercept"])
+        return setting, calibration.SlopeIntercept(slope, intercept)
     if "gradient_table" in table:
         currents, gradients = zip(*table["gradient_table"], strict=True)
-        return current, calibration.CurrentTable(currents, gradients, mass=mass)
-    polynomial = calibration.CurrentPolynomial(
-        tuple(float(c) for c in table["gradient_polynomial_T_per_m"]),
-        signed_intercept=table.get("signed_intercept", False),
-        mass=mass,
-    )
-    return current, polynomial
+        return setting, calibration.CurrentTable(currents, gradients, mass=mass)
+    numbers = tuple(map(float, table["gradient_polynomial_T_per_m"]))
+    signed = table.get("signed_intercept", False)
+    return setting, calibration.CurrentPolynomial(numbers, signed_intercept=signed, mass=mass)

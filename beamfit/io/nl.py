@@ -221,14 +221,8 @@ def _limits(lines: _Lines) -> tuple[float, float]:
         raise lines.wrong("a complementarity", "bounds of kinds 0 to 4")
     if kind not in range(5) or len(ends) < {0: 2, 3: 0}.get(kind, 1):
         raise lines.wrong(f"bound of kind {kind:g}", "kinds 0 to 4 and their ends")
-    inf = np.inf
-    return {
-        0: lambda: (ends[0], ends[1]),
-        1: lambda: (-inf, ends[0]),
-        2: lambda: (ends[0], inf),
-        3: lambda: (-inf, inf),
-        4: lambda: (ends[0], ends[0]),
-    }[kind]()
+    low = ends[0] if kind in (0, 2, 4) else -np.inf
+    return low, ends[kind == 0] if kind in (0, 1, 4) else np.inf
 
 
 def _known(lines: _Lines, said: _Stated, index: int) -> Node:

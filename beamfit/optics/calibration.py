@@ -281,3 +281,19 @@ def scaled(calibration: Calibration, factor: ArrayLike) -> Calibration:
             calibration, coefficients=tuple(v * factor for v in calibration.coefficients)
         )
     return replace(calibration, scale=calibration.scale * factor)
+
+
+def plain_meaning(unit: str, mass: float) -> Calibration | None:
+    """What settings in a unit mean that is none of a current; None of amperes.
+
+    Examples
+    --------
+    >>> plain_meaning("kG", 0.511).unit, plain_meaning("A", 0.511)
+    ('kG', None)
+    """
+    return {
+        "kG": IntegratedGradient(mass=mass),
+        "T_per_m": Gradient(mass=mass),
+        "k1": FocusingStrength(),
+        "k1l": IntegratedStrength(),
+    }.get(unit)

@@ -295,28 +295,15 @@ class PlaneFit:
         """Give one entry of ``results`` in the JSON contract."""
         p, screen = self.points, self.screen
         names = ("emittance", "normalized_emittance", "beta", "alpha", "chi2", "dof")
-        names += (
-            "rms_residual",
-            "error_scale",
-            "noise",
-            "method",
-            "weights",
-            "mismatch",
-            "identifiability",
-        )
-        sigma = zip(("sigma11", "sigma12", "sigma22"), self.sigma, strict=True)
+        names += ("rms_residual", "error_scale", "noise", "method", "weights", "mismatch")
+        names += ("identifiability",)
         entry = {name: getattr(self, name) for name in ("plane", "status", "message", *names)}
+        entry |= zip(("sigma11", "sigma12", "sigma22"), self.sigma, strict=True)
+        entry["covariance"] = self.covariance if np.isfinite(self.covariance).all() else None
         points = {name: getattr(p, name) for name in ("settings", "units", "screen", "pull")}
         sizes = {f"{name}_m": getattr(p, name) for name in ("size", "error", "model")}
-        return json_of(
-            entry
-            | dict(sigma)
-            | {
-                "covariance": self.covariance if np.isfinite(self.covariance).all() else None,
-                "screen": screen,
-                "points": points | sizes | {"outlier_probability": p.outlier_probability},
-            }
-        )
+        points |= sizes | {"outlier_probability": p.outlier_probability}
+        return json_of(entry | {"screen": screen, "points": points})
 
 
 def result_rows(planes: tuple[PlaneFit, ...]) -> list[tuple[str, list[str]]]:

@@ -17,13 +17,7 @@ from jax.typing import ArrayLike
 from beamfit.greybox import tree
 from beamfit.greybox.problem import padded_length
 from beamfit.optics.beamline import Beamline
-from beamfit.optics.calibration import (
-    SETTING_UNITS,
-    FocusingStrength,
-    Gradient,
-    IntegratedGradient,
-    IntegratedStrength,
-)
+from beamfit.optics.calibration import SETTING_UNITS, IntegratedStrength, plain_meaning
 from beamfit.optics.elements import Marker, Screen, ThinLens, TransferMatrix
 from beamfit.optics.particle import ELECTRON_MASS, beta_gamma
 from beamfit.optics.sections import Series
@@ -83,16 +77,10 @@ def scanned_line(scan: QuadScan, line: Beamline) -> Beamline:
 @lru_cache(maxsize=64)
 def _with_meanings(same: _Same, units: tuple[tuple[str, str], ...]) -> Beamline:
     line = same.line
-    meanings = {
-        "kG": IntegratedGradient(mass=line.mass),
-        "T_per_m": Gradient(mass=line.mass),
-        "k1": FocusingStrength(),
-        "k1l": IntegratedStrength(),
-    }
     for member, unit in [(m, unit) for name, unit in units for m in line.members(name)]:
         magnet = line[member]
         if unit != magnet.calibration.unit:
-            meaning = meanings[unit]
+            meaning = plain_meaning(unit, line.mass)
             strength = magnet.calibration.k1l(magnet.setting, magnet.length, line.energy)
             # Every other meaning is proportional to its setting.
             setting = float(strength / meaning.k1l(1.0, magnet.length, line.energy))
