@@ -6,8 +6,11 @@ imports no JAX.
 
 from __future__ import annotations
 
+import hashlib
 import os
+import warnings
 from pathlib import Path
+from typing import Any
 
 __all__ = ["prepare_jax"]
 
@@ -20,13 +23,16 @@ KEEP = {
     "jax_persistent_cache_min_entry_size_bytes": (0, -1),
 }
 
+# Functions of JAX that read, pack and unpack what is kept.
+OWN = ("get_executable_and_time", "compress_executable", "decompress_executable")
+
 
 def prepare_jax() -> None:
     """Import JAX with 64 bits and a compile cache.
 
     The cache is ``$XDG_CACHE_HOME/beamfit`` (or ``~/.cache/beamfit``); where nobody can write
-    there, code is compiled anew. What the user has set, in the environment or in ``jax.config``,
-    stands. Calling it again does nothing.
+    there, or others can, code is compiled anew, as it is in the place of what is damaged. What the
+    user has set, in the environment or in ``jax.config``, stands. Calling it again does nothing.
 
     Examples
     --------
@@ -43,15 +49,56 @@ def prepare_jax() -> None:
         if name.upper() not in os.environ and getattr(jax.config, name) == usual:
             jax.config.update(name, ours)
     if FOLDER.upper() not in os.environ and jax.config.jax_compilation_cache_dir is None:
-        jax.config.update(FOLDER, _place())
+        place = _place()
+        jax.config.update(FOLDER, place)
+        if place is not None:
+            _seal(Path(place))
 
 
 def _place() -> str | None:
-    """The folder of the cache, or None where there can be none."""
+    """The folder of the cache, or None where there can be none: what lies in it is run."""
     try:
         home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
         folder = Path(home) / "beamfit"
-        folder.mkdir(parents=True, exist_ok=True)
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        about = folder.stat()
     except (OSError, RuntimeError):  # no place to write, or no home at all
         return None
+    if about.st_uid != os.getuid() or about.st_mode & 0o022:
+        said = f"{folder} belongs to others or can be written to by them, and is not used"
+        warnings.warn(f"{said}; chmod 700 and empty it", stacklevel=4)
+        return None
     return str(folder) if os.access(folder, os.W_OK) else None
+
+
+def _seal(folder: Path) -> None:
+    """Keep code with its digest, and have what is damaged compiled anew in silence.
+
+    JAX warns of it in every process and does not replace it. It has no public place for this; in
+    a version that has not these functions, nothing is done.
+    """
+    from jax._src import compilation_cache as kept
+
+    try:
+        read, pack, unpack = (getattr(kept, name) for name in OWN)
+    except AttributeError:
+        return
+
+    def packed(code: bytes) -> bytes:
+        content = pack(code)
+        return hashlib.sha256(content).digest() + content
+
+    def unpacked(content: bytes) -> bytes:
+        if hashlib.sha256(content[32:]).digest() != content[:32]:
+            raise ValueError("damaged")
+        return unpack(content[32:])
+
+    def found(key: str, *rest: Any) -> Any:
+        try:
+            return read(key, *rest)
+        except Exception:
+            (folder / f"{key}-cache").unlink(missing_ok=True)
+            return None, None
+
+    for name, own in zip(OWN, (found, packed, unpacked), strict=True):
+        setattr(kept, name, own)

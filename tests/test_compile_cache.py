@@ -7,6 +7,8 @@ import sys
 
 import pytest
 
+from beamfit import compile_cache
+
 # Says where code is kept and how often it was found there; runs one of the package's functions.
 SCRIPT = """
 import json, sys
@@ -44,6 +46,26 @@ def test_the_second_script_compiles_nothing(tmp_path):
     assert (hits, dtype) == (0, "float64")
     assert misses > 0
     assert run(XDG_CACHE_HOME=str(tmp_path))[1:3] == [misses, 0]
+    for path in (tmp_path / "beamfit").iterdir():  # damaged code is compiled anew in silence
+        content = bytearray(path.read_bytes())
+        content[len(content) // 2] ^= 4
+        path.write_bytes(content)
+    assert run(XDG_CACHE_HOME=str(tmp_path))[1:3] == [0, misses]
+    assert run(XDG_CACHE_HOME=str(tmp_path))[1:3] == [misses, 0]
+
+
+def test_a_folder_that_others_can_write_to_is_not_used(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    place = compile_cache._place()
+    assert place == str(tmp_path / "beamfit")
+    assert (tmp_path / "beamfit").stat().st_mode & 0o777 == 0o700
+    (tmp_path / "beamfit").chmod(0o777)
+    with pytest.warns(UserWarning, match="is not used; chmod 700"):
+        assert compile_cache._place() is None
+    (tmp_path / "beamfit").chmod(0o755)
+    monkeypatch.setattr(os, "getuid", lambda: 12345)
+    with pytest.warns(UserWarning, match="belongs to others"):
+        assert compile_cache._place() is None
 
 
 @pytest.mark.parametrize("home", ["/dev/null", "/proc/none"])
