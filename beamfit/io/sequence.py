@@ -17,6 +17,7 @@ from typing import Any
 from beamfit.errors import InputError, nearest
 from beamfit.io.files import name_of, read_text
 from beamfit.io.lattice import LatticeFile
+from beamfit.io.sequence_bounds import bound, check_count
 from beamfit.io.sequence_elements import NOTHING_AT_ZERO, Source, element_tables
 from beamfit.particles import REST_ENERGY, expected_energy
 
@@ -45,6 +46,8 @@ ALONE = re.compile(r"(LINE\s*=\s*\([^,()]*)\)", re.IGNORECASE)
 NO_MATTER = re.compile(r",\s*(?:[hv]?kick|k[23]s?)\s*:?=\s*[^,;]*", re.IGNORECASE)
 # MAD-X reads these words as it reads all others, in either spelling.
 REFERENCE = re.compile(r"(\bREFER\s*=\s*)\"?(CENTER|CENTRE|ENTRY|EXIT)\"?", re.IGNORECASE)
+# Where a statement did not parse, as pyAT says it.
+TOLD = re.compile(r"Line (\d+) (['\"])(.*?)\2, (.*)", re.DOTALL)
 ENERGIES = ("energy", "pc", "gamma", "beta", "brho")
 
 
@@ -151,6 +154,7 @@ def _parser(source: Source) -> Any:
         default = {k: v for k, v in parser["beam"].default_beam.items() if k != "energy"}
         parser["beam"].default_beam = MappingProxyType(default)
         parser["beam%"].pop("energy")
+    bound(parser)
     return parser
 
 
@@ -194,11 +198,13 @@ def _balanced(text: str) -> bool:
 
 def _unparsed(source: Source, error: Exception) -> InputError:
     """Say which statement did not parse; the parser tells where it ended, counted from 0."""
-    told = re.match(r"Line (\d+) (['\"])(.*?)\2, (.*)", str(error), re.DOTALL)
+    told = TOLD.match(str(error))
     if told is None:
         cause = str(error) or type(error).__name__
         return source.error(f"a file that does not parse ({_short(cause)})", _valid(source))
     number, _, text, cause = told.groups()
+    while inner := TOLD.match(cause):  # in a file that was called
+        cause = inner[4]
     return InputError(
         f"'{_short(text)}' does not parse ({_short(cause)})",
         _valid(source),
@@ -306,12 +312,14 @@ def _beam(parser: Any, source: Source, name: str, energy: float | None) -> tuple
     return particle, float(total)
 
 
-def _check_members(parser: Any, source: Source, members: Any, name: str) -> None:
+def _check_members(parser: Any, source: Source, members: Any, name: str, seen: set[int]) -> None:
     """Refuse what the parser would drop without a word: numbers in a LINE."""
     line = parser.env.get("line") or parser.env["LINE"]
     for member in members if isinstance(members, line) or type(members) in (tuple, list) else ():
         if isinstance(member, tuple | list):
-            _check_members(parser, source, member, name)
+            if id(member) not in seen:
+                seen.add(id(member))
+                _check_members(parser, source, member, name, seen)
         elif not hasattr(member, "expand"):
             found = getattr(member, "expr", member)
             raise source.error(f"'{name}' with {found!r} in it", "elements and lines", name)
@@ -319,11 +327,14 @@ def _check_members(parser: Any, source: Source, members: Any, name: str) -> None
 
 def _expanded(parser: Any, source: Source, name: str, key: str) -> list[Any]:
     """Return the elements of a line as pyAT's, in order."""
-    _check_members(parser, source, parser[f'"{key}"'], name)
     try:
+        check_count(parser, parser[f'"{key}"'])
+        _check_members(parser, source, parser[f'"{key}"'], name, set())
         with warnings.catch_warnings(record=True) as warned:
             warnings.simplefilter("always")
             elements = list(parser.expand(f'"{key}"'))
+    except InputError:
+        raise
     except Exception as error:
         quoted = re.findall(r"'([\w.:]+)'", str(error.args[0]) if error.args else "")
         waiting = {_key(p[1]) for p in parser.postponed if p[1]}

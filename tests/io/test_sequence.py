@@ -424,3 +424,35 @@ def test_a_part_of_a_line_with_a_marker_for_a_screen(written):
         ({"screen": "OTR", "last": "BPM"}, "cut away"),
     ):
         assert words in refused(path, **options)
+
+
+DOUBLED = "".join(f"L{k + 1}: line=(L{k},L{k});" for k in range(60))
+HOSTILE = {
+    "powers": ("a = 9^9^9^9;", "out of range"),
+    "powers that wait": ("a := 9^9^9^9; Q2: quadrupole, l=0.1, k1=a; LC: line=(Q2,B);", "of range"),
+    "copies": ("LC: line=(1000000000*Q1,B);", "more than 50000 elements"),
+    "lines that double": (f"L0: line=(Q1);{DOUBLED}LC: line=(L60,B);", "more than 50000 elements"),
+    "sums that double": ("a = (1,2);" + "a = a + a;" * 60, "more than 50000 elements"),
+    "a file that calls itself": ('call, file="a.madx";', "more than 50 files called"),
+    "a device": ('call, file="/dev/zero";', "a device"),
+}
+BASIS = "beam, energy=0.135; Q1: quadrupole, l=0.1, k1=1; B: monitor;\n"
+
+
+@pytest.mark.parametrize("case", HOSTILE)
+def test_what_stands_for_something_without_end(case, written):
+    text, said = HOSTILE[case]
+    assert said in refused(written("a.madx", f"{BASIS}{text}"), use="LC")
+
+
+def test_products_that_double_their_digits_are_no_whole_numbers(written):
+    text = f"{BASIS}a = 2^60;{'a = a*a;' * 60}LC: line=(Q1,B);"
+    assert len(read_lattice(written("a.madx", text)).elements) == 2
+
+
+def test_a_power_is_a_power_however_it_is_assigned(written):
+    """pyAT takes ^ after := for the exclusive or of bits: 2^3 was 1."""
+    read = [read_lattice(written("a.madx", MADX.replace("kq := 3.7", f"kq {sign} 2^3")))
+            for sign in ("=", ":=")]  # fmt: skip
+    assert read[0].elements == read[1].elements
+    assert 8.0 in read[1].elements[0].values()
