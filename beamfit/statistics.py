@@ -13,7 +13,9 @@ from beamfit.quantity import NORMAL_REACH
 __all__ = [
     "POOR_FIT",
     "Directions",
+    "baseline",
     "chi2_probability",
+    "control_limits",
     "one_sided_probability",
     "reach_of",
     "scaled_directions",
@@ -21,6 +23,12 @@ __all__ = [
 
 # A fit this unlikely to be noise alone is a poor fit: the contract of the JSON output.
 POOR_FIT = 1e-3
+# Points that say what is usual: the first so many, half of them if there are fewer.
+BASELINE, FEWEST = 20, 3
+# Mean range of two normal numbers, and the degrees of freedom of each moving range.
+RANGE, RANGE_DOF = 1.128, 0.62
+# One point in 370 of a normal distribution lies beyond 3 standard deviations to either side.
+BEYOND = 0.99865
 
 
 class Directions(NamedTuple):
@@ -155,3 +163,35 @@ def reach_of(dof: float) -> float:
     (4.3, 1.96)
     """
     return float(stdtrit(dof, 0.975)) if 0 < dof < math.inf else NORMAL_REACH
+
+
+def baseline(count: int) -> int:
+    """How many of some points, the first, say what is usual.
+
+    Examples
+    --------
+    >>> [baseline(n) for n in (4, 10, 1000)]
+    [3, 5, 20]
+    """
+    return min(BASELINE, max(count // 2, FEWEST))
+
+
+def control_limits(values: np.ndarray) -> tuple[float, float]:
+    """Mean of some points, and how far from it a further one lies in one case of 370.
+
+    Of an individuals chart (D. C. Montgomery, Introduction to Statistical Quality Control, 7th
+    ed., section 6.4): 3 standard deviations, these from the mean moving range over 1.128, which a
+    slow drift does not widen; Student's quantile, since they come from few points. Infinite for
+    fewer than three.
+
+    Examples
+    --------
+    >>> centre, limit = control_limits(np.array([1.0, 1.1, 0.9, 1.0, 1.1, 0.9] * 3))
+    >>> round(centre, 3), round(limit, 2)
+    (1.0, 0.48)
+    """
+    if values.size < FEWEST:
+        return float(values.mean()), math.inf
+    spread = float(np.abs(np.diff(values)).mean()) / RANGE
+    reach = stdtrit(RANGE_DOF * (values.size - 1), BEYOND) * math.sqrt(1 + 1 / values.size)
+    return float(values.mean()), float(reach) * spread

@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from os import PathLike
 from pathlib import Path
+from typing import BinaryIO
 
 from beamfit.errors import InputError
 
@@ -63,6 +64,13 @@ def write_atomically(path: str | PathLike[str], content: bytes, partial: str | N
     >>> target.read_bytes()
     b'whole'
     """
+    with replacing(path, partial) as stream:
+        stream.write(content)
+
+
+@contextmanager
+def replacing(path: str | PathLike[str], partial: str | None = None) -> Iterator[BinaryIO]:
+    """What is written here takes the place of a file when it is whole; as `write_atomically`."""
     check_place(path)
     target = Path(path)
     temporary = None
@@ -74,8 +82,8 @@ def write_atomically(path: str | PathLike[str], content: bytes, partial: str | N
             beside.unlink(missing_ok=True)
             handle, temporary = os.open(beside, FRESH, 0o600), str(beside)
         UNFINISHED.add(temporary)
-        with os.fdopen(handle, "wb") as stream:
-            stream.write(content)
+        with os.fdopen(handle, "w+b") as stream:
+            yield stream
             stream.flush()
             os.fsync(stream.fileno())
         umask = os.umask(0)

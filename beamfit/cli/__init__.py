@@ -9,6 +9,7 @@ import sys
 import click
 
 from beamfit import __version__
+from beamfit.cli.batch import batch
 from beamfit.cli.check import check
 from beamfit.cli.control import control
 from beamfit.cli.design import design
@@ -41,6 +42,7 @@ cli.add_command(check)
 cli.add_command(solve)
 cli.add_command(identify)
 cli.add_command(control)
+cli.add_command(batch)
 
 
 def main() -> None:

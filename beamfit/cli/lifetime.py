@@ -65,17 +65,7 @@ Examples:
     help="Follow the lifetime through all decays: current times lifetime with control limits, by "
     "the ring to one current and its usual settings if --ring is given; alarms where a or b moved.",
 )
-@click.option(
-    "--time",
-    metavar="COLUMN[:UNIT]",
-    help="Header of the time, a date or a number in s, min, h, d or ms.",
-)
-@click.option(
-    "--current",
-    metavar="COLUMN:UNIT",
-    help="Header of the beam current and its unit, mA, A or uA, after the last colon, such as "
-    "SR:DCCT:CURRENT:mA. With --time or --current other columns of unknown names are left aside.",
-)
+@options("time current")
 @click.option(
     "--offset",
     metavar="zero-beam|CURRENT",

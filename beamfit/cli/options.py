@@ -91,6 +91,18 @@ SHARED: dict[str, Callable[..., Any]] = {
         help="What is unknown besides the beam: nothing, R11 and R12, the magnets' calibration, "
         "or k1 as a function of the current.",
     ),
+    "time": click.option(
+        "--time",
+        metavar="COLUMN[:UNIT]",
+        help="Header of the time, a date or a number in s, min, h, d or ms.",
+    ),
+    "current": click.option(
+        "--current",
+        metavar="COLUMN:UNIT",
+        help="Header of the beam current and its unit, mA, A or uA, after the last colon, such "
+        "as SR:DCCT:CURRENT:mA. With --time or --current other columns of unknown names are left "
+        "aside.",
+    ),
     "prior": click.option(
         "--prior",
         "priors",

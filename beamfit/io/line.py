@@ -174,7 +174,7 @@ def _whole(path: str | PathLike[str], use: str | None, energy: float | None) -> 
 
 def lattice_of(
     scan: QuadScan,
-    path: str | None = None,
+    path: str | LatticeFile | None = None,
     *,
     energy: float | None = None,
     particle: str | None = None,
@@ -186,8 +186,8 @@ def lattice_of(
     ----------
     scan : QuadScan
         The scan.
-    path : str, optional
-        The lattice file; None where the rows have matrices.
+    path : str or LatticeFile, optional
+        The lattice, read already or not; None where the rows have matrices.
     energy, **part
         Options of `load_lattice`; the energy in MeV also of rows without a lattice.
     particle : str, optional
@@ -210,7 +210,8 @@ def lattice_of(
             raise scan.unusable("a scan and no lattice", expected)
         if particle is not None:
             raise InputError("--particle with a lattice", "none: the lattice says it", path=path)
-        file = read_lattice(path, energy=energy, **part)
+        read = isinstance(path, LatticeFile)
+        file = path if read else read_lattice(path, energy=energy, **part)
         file.check_scan(scan)
         return file
     if any(told is not None for told in (path, *part.values())):
@@ -295,7 +296,7 @@ class Inputs(NamedTuple):
 
 def read_inputs(
     scan: str,
-    lattice: str | None = None,
+    lattice: str | LatticeFile | None = None,
     *,
     ignore: Iterable[str] = (),
     skip_bad: bool = False,
@@ -308,7 +309,7 @@ def read_inputs(
     ----------
     scan : str
         CSV, HDF5, or a file of emittance_gui (``.mat``).
-    lattice : str, optional
+    lattice : str or LatticeFile, optional
         As for `lattice_of`. A file of emittance_gui has its own matrices, which it replaces.
     ignore, skip_bad
         As for `beamfit.read_quad_scan`.
@@ -350,6 +351,7 @@ def read_inputs(
 
 
 def _digests(
-    scan: str, measured: QuadScan, lattice: str | None, described: LatticeFile
+    scan: str, measured: QuadScan, lattice: str | LatticeFile | None, described: LatticeFile
 ) -> dict[str, str | None]:
-    return {scan: measured.sha256} | ({} if lattice is None else {lattice: described.sha256})
+    path = str(lattice.path) if isinstance(lattice, LatticeFile) else lattice
+    return {scan: measured.sha256} | ({} if path is None else {path: described.sha256})

@@ -52,7 +52,10 @@ class Picture(NamedTuple):
 
 
 class Page(NamedTuple):
-    """A report: verdicts first, then tables with the pictures after the first one."""
+    """A report: verdicts first, then tables with the pictures after the first one.
+
+    ``links`` are names and addresses of further pages.
+    """
 
     title: str
     subtitle: str
@@ -62,6 +65,7 @@ class Page(NamedTuple):
     pictures_title: str
     provenance: list[tuple[str, str]]
     notes: tuple[str, ...]
+    links: Sequence[tuple[str, str]] = ()
 
 
 def provenance(

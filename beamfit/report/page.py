@@ -14,7 +14,7 @@ from beamfit.language.solution import Solution
 from beamfit.report import kind_of
 from beamfit.report.control import control_page
 from beamfit.report.decays import decay_page, study_of
-from beamfit.report.document import STYLE, Picture, drawn, html_of
+from beamfit.report.document import STYLE, Page, Picture, drawn, html_of
 from beamfit.report.emittance import emittance_page
 from beamfit.report.formulation import formulation_page
 from beamfit.report.pdf import pdf_of
@@ -89,7 +89,7 @@ def write_report(
     >>> page.read_text().startswith("<!DOCTYPE html>")
     True
     """
-    suffix = kind_of(path)
+    kind_of(path)  # says so if it is none
     with rc_context(STYLE):
         several = tuple(result) if isinstance(result, list | tuple) else (result,)
         sampled: list[Sampled] = []
@@ -110,13 +110,18 @@ def write_report(
                 page = decay_page(studies, command, inputs, shift, trend)
                 sampled = _of_decays(studies, posterior)
         page = with_posteriors(page, sampled)
-        match suffix:
-            case ".html":
-                made = {Path(path): html_of(page)}
-            case ".pdf":
-                made = {Path(path): pdf_of(page)}
-            case _:
-                made = _pictures(Path(path), page.pictures)
+        write_page(path, page)
+
+
+def write_page(path: str | PathLike[str], page: Page) -> None:
+    """Write a page as the end of the name says; as `write_report`."""
+    match kind_of(path):
+        case ".html":
+            made = {Path(path): html_of(page)}
+        case ".pdf":
+            made = {Path(path): pdf_of(page)}
+        case _:
+            made = _pictures(Path(path), page.pictures)
     for place, content in made.items():
         write_atomically(place, content)
 

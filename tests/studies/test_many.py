@@ -51,7 +51,7 @@ def scans(root):
 
 
 def test_many_scans_together_are_each_alone(scans, line):
-    for together, scan in zip(fit_many(scans, line), scans, strict=True):
+    for together, scan in zip(fit_many((scan, line) for scan in scans), scans, strict=True):
         alone = beamfit.fit_emittance(scan, line)
         same(together.to_json(), alone.to_json())
         assert together.notes == alone.notes
@@ -59,7 +59,7 @@ def test_many_scans_together_are_each_alone(scans, line):
 
 def test_a_scan_of_another_magnet_stops_no_other(scans, line):
     wrong = replace(scans[0], settings={"Q9": scans[0].settings["Q525"]}, units={"Q9": "kG"})
-    found = fit_many([wrong, scans[0]], line)
+    found = fit_many([(wrong, line), (scans[0], line)])
     assert isinstance(found[0], beamfit.InputError)
     assert "Q9" in str(found[0])
     assert found[1].x.status.value == beamfit.fit_emittance(scans[0], line).x.status.value

@@ -8,25 +8,19 @@ from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.special import stdtrit
 
 from beamfit.errors import InputError
 from beamfit.lifetime.decay import HOUR
 from beamfit.lifetime.losses import loss_coefficients
 from beamfit.quantity import Quantity, Status
 from beamfit.shown import shown
+from beamfit.statistics import FEWEST, baseline, control_limits
 from beamfit.studies.decay.alarm import Alarm, Reference, alarms_of, when
 from beamfit.studies.decay.fit import bare
 from beamfit.studies.decay.study import Decay, Machine, RecordStudy
 from beamfit.studies.decay.summary import by_losses, summarise
 from beamfit.table import Table, cell, json_of
 
-# Decays that say what is usual: the first so many, half of them if there are fewer.
-BASELINE, FEWEST = 20, 3
-# Mean range of two normal numbers, and the degrees of freedom of each moving range.
-RANGE, RANGE_DOF = 1.128, 0.62
-# One point in 370 of a normal distribution lies beyond 3 standard deviations to either side.
-BEYOND = 0.99865
 # a and b wander by so much on an ordinary day.
 WANDER = 0.005
 DAY = 24 * HOUR
@@ -212,10 +206,10 @@ def trend_of(studies: Sequence[RecordStudy], machine: Machine | None = None) -> 
         raise InputError("no lifetime", expected, path=studies[0].record.name)
     current = float(np.median([decay.fit.mean_current for decay in decays]))
     scaled = _scaled(studies, decays, machine, current)
-    first = min(BASELINE, max(len(decays) // 2, FEWEST))
+    first = baseline(len(decays))
     usual = _reference(_first(scaled, first)) if len(decays) > first else None
     values = _normalised(scaled, current if machine else None)
-    centre, limit = _limits(np.array([value.value for value in values[:first]]))
+    centre, limit = control_limits(np.array([value.value for value in values[:first]]))
     points = tuple(
         _point(decay, time, a, b, value, usual, (centre, limit))
         for decay, time, a, b, value in zip(*scaled[:4], values, strict=True)
@@ -255,15 +249,6 @@ def _normalised(scaled: _Scaled, current: float | None) -> list[Quantity]:
         by = (current or decay.fit.mean_current) / factor
         values.append(Quantity(by * found.value, by * found.error, "mA h"))
     return values
-
-
-def _limits(values: np.ndarray) -> tuple[float, float]:
-    """Mean of the first points, and 3 standard deviations of a further one."""
-    if values.size < FEWEST:
-        return float(values.mean()), math.inf
-    spread = float(np.abs(np.diff(values)).mean()) / RANGE
-    reach = stdtrit(RANGE_DOF * (values.size - 1), BEYOND) * math.sqrt(1 + 1 / values.size)
-    return float(values.mean()), float(reach) * spread
 
 
 def _point(

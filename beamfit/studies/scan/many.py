@@ -32,16 +32,14 @@ FEW, LANES, ROOM = 16, 256, 1 << 20
 
 
 def fit_many(
-    scans: Iterable[QuadScan], line: Beamline | None = None, weights: str = "model"
+    scans: Iterable[tuple[QuadScan, Beamline]], weights: str = "model"
 ) -> list[EmittanceFit | InputError]:
-    """Fit the emittance to each of many scans of one line: what `fit_emittance` gives of each.
+    """Fit the emittance to each of many scans: what `fit_emittance` gives of each.
 
     Parameters
     ----------
-    scans : iterable of QuadScan
-        The scans; hundreds at a time.
-    line : Beamline, optional
-        Their line; None where rows have matrices of their own.
+    scans : iterable of (QuadScan, Beamline)
+        The scans with their lines; hundreds at a time.
     weights : {"model", "measured"}
         As for `beamfit.fit_emittance`.
 
@@ -56,15 +54,15 @@ def fit_many(
     >>> line = Beamline((Quadrupole("Q", 0.1), Drift("D", 2.0), Screen("S")), 135.0)
     >>> k1, sizes = [-1.0, 1.5, 4.0, 6.5, 9.0], np.array([3.4e-4, 1.9e-4, 0.9e-4, 1.9e-4, 3.4e-4])
     >>> scans = [QuadScan({"Q": k1}, {"Q": "k1"}, {"x": f * sizes}) for f in (1.0, 2.0)]
-    >>> one, other = fit_many(scans, line)
+    >>> one, other = fit_many((scan, line) for scan in scans)
     >>> round(other.x.emittance.value / one.x.emittance.value, 9)
     4.0
     """
     found: list[EmittanceFit | InputError | None] = []
     begun: dict[int, Seen] = {}
-    for i, scan in enumerate(scans):
+    for i, given in enumerate(scans):
         try:
-            own, through = prepared(scan, line)
+            own, through = prepared(*given)
             begun[i] = unfitted(own, through, None, METHODS[0], False, weights)
             found.append(None)
         except InputError as error:

@@ -1,0 +1,1 @@
+"""A year's files in, one row an answer out."""

@@ -1,0 +1,129 @@
+"""One row an answer: the columns of a table of answers, and the cells of one.
+
+A number keeps the name it has in JSON, with its unit at the end; its error, its error before
+scaling and the ends of its 95 % interval stand beside it. An empty cell is null.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from collections.abc import Iterable, Iterator, Mapping
+from typing import TYPE_CHECKING, Any
+
+from beamfit.quantity import Quantity
+from beamfit.studies.decay.evidence import UNITS
+from beamfit.studies.scan.model import QUANTITIES
+
+if TYPE_CHECKING:
+    from beamfit.studies.decay.study import RecordStudy
+    from beamfit.studies.scan.fit import EmittanceFit
+
+UNUSABLE = "unusable"
+# How a unit is written at the end of a name.
+WRITTEN = {"1": "", "m^2": "_m2", "m rad": "_m_rad", "rad^2": "_rad2", "1/s": "_per_s"}
+WRITTEN |= {"1/(mA s)": "_per_mA_s"}
+ENDS = ("", "_error", "_error_raw", "_low_95", "_high_95")
+# The file an answer is of, and what makes the same answer of the same file.
+KEY = ("file", "sha256", "lattice_sha256", "options", "beamfit")
+
+
+def named(name: str, unit: str, ends: Iterable[str] = ENDS) -> list[str]:
+    """The columns of a quantity.
+
+    Examples
+    --------
+    >>> named("beta", "m", ("", "_error"))
+    ['beta_m', 'beta_error_m']
+    """
+    return [f"{name}{end}{WRITTEN.get(unit, f'_{unit}')}" for end in ENDS if end in ends]
+
+
+def _every(quantities: Mapping[str, str]) -> list[str]:
+    return [column for item in quantities.items() for column in named(*item)]
+
+
+NUMBERS = {
+    "emittance": (
+        *_every(QUANTITIES),
+        *("rms_residual_m", "chi2", "dof", "error_scale", "determined", "waist_bracketed"),
+        *("zero_emittance_distance", "phase_coverage_deg", "condition"),
+        *(f"singular_value_{i}" for i in (1, 2, 3)),
+    ),
+    "lifetime": (
+        *_every(UNITS),
+        *("mean_current_mA", "rms_residual_mA", "chi2", "dof", "noise_inferred", "start_s"),
+        *("separable", "share", "share_error", "correlation", "residual_correlation"),
+        *("error_inflation", "cycles"),
+    ),
+}
+COLUMNS = {
+    "emittance": (
+        *(*KEY, "slice", "plane", "status", "message", *NUMBERS["emittance"]),
+        *("noise", "method", "weights", "undetermined", "next_measurement", "notes"),
+    ),
+    "lifetime": (*KEY, "record", "status", "message", *NUMBERS["lifetime"], "notes"),
+}
+
+
+def emittance_rows(fit: EmittanceFit) -> Iterator[dict[str, Any]]:
+    """A row a plane."""
+    notes = " ".join(fit.notes)
+    for p in fit.planes:
+        known = p.identifiability
+        quantities = p.quantities | ({} if p.mismatch is None else {"mismatch": p.mismatch})
+        row = _cells(quantities) | vars(known)
+        row |= {name: getattr(p, name) for name in ("plane", "status", "message", "chi2", "dof")}
+        row |= {name: getattr(p, name) for name in ("error_scale", "noise", "method", "weights")}
+        row |= {f"singular_value_{i}": v for i, v in enumerate(known.singular_values, start=1)}
+        row["zero_emittance_distance"] = known.zero_distance
+        row["phase_coverage_deg"] = known.phase_coverage
+        yield row | {"undetermined": "; ".join(known.undetermined), "notes": notes}
+
+
+def lifetime_rows(study: RecordStudy) -> Iterator[dict[str, Any]]:
+    """A row a decay, and one of cycles that were fitted together."""
+    notes = " ".join(study.record.notes)
+    for decay in study.answers:
+        yield decay_row(decay.fit.to_json()) | {"start_s": decay.offset, "notes": notes}
+
+
+def decay_row(entry: Mapping[str, Any]) -> dict[str, Any]:
+    """The row of an entry of ``results`` of `beamfit lifetime --json`."""
+    quantities = {k: v for k, v in entry.items() if isinstance(v, Mapping) and "unit" in v}
+    plain = {k: v for k, v in entry.items() if not isinstance(v, Mapping)}
+    return _cells(quantities) | plain | entry["identifiability"]
+
+
+def _cells(quantities: Mapping[str, Quantity | Mapping[str, Any]]) -> dict[str, Any]:
+    row = {}
+    for name, q in quantities.items():
+        found = q.to_json() if isinstance(q, Quantity) else q
+        low, high = found.get("interval_95") or (None, None)
+        values = (found["value"], found["error"], found.get("error_raw"), low, high)
+        row |= zip(named(name, found["unit"]), values, strict=True)
+    return row
+
+
+def lines(rows: Iterable[Mapping[str, Any]], columns: Iterable[str]) -> str:
+    """Rows as lines of CSV; a number can be read back to its last digit.
+
+    Examples
+    --------
+    >>> lines([{"a": 0.1, "b": "x,\\ny", "c": math.nan, "d": True}], "abcde")
+    '0.1,"x, y",,1,\\n'
+    """
+    text = io.StringIO()
+    wanted = tuple(columns)
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerows([_cell(row.get(name)) for name in wanted] for row in rows)
+    return text.getvalue()
+
+
+def _cell(value: Any) -> Any:
+    if isinstance(value, str):
+        return value if value.isprintable() else " ".join(value.split())
+    if isinstance(value, bool):
+        return int(value)
+    return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -1,0 +1,107 @@
+"""The course of a quantity through a batch, in the order of its files, with control limits."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+
+from beamfit.batch.columns import COLUMNS, named
+from beamfit.batch.run import Batch
+from beamfit.errors import InputError, nearest
+from beamfit.statistics import baseline, control_limits
+from beamfit.studies.decay.evidence import UNITS
+from beamfit.studies.scan.model import QUANTITIES
+
+# Of each kind: the quantities there are, and the one that is followed unless said.
+FOLLOWED = {
+    "emittance": (QUANTITIES, "normalized_emittance"),
+    "lifetime": (UNITS, "lifetime_mean"),
+}
+
+
+class Course(NamedTuple):
+    """A quantity through a batch.
+
+    Attributes
+    ----------
+    name, unit : str
+        Which, and its SI unit.
+    of : str
+        The plane, and the slice if there are any; empty for lifetimes.
+    files : list of str
+        The file of each point.
+    at : ndarray
+        Shape (n,): the place of that file in the batch, from 1.
+    value, error : ndarray
+        Shape (n,).
+    centre, limit : float
+        The usual value, and how far from it the control limits are.
+    """
+
+    name: str
+    unit: str
+    of: str
+    files: list[str]
+    at: np.ndarray
+    value: np.ndarray
+    error: np.ndarray
+    centre: float
+    limit: float
+
+    @property
+    def beyond(self) -> np.ndarray:
+        """Whether each point lies beyond the limits, and 3 of its own errors from the centre."""
+        return np.abs(self.value - self.centre) > np.maximum(self.limit, 3.0 * self.error)
+
+
+def courses_of(batch: Batch, name: str | None = None) -> list[Course]:
+    """Follow a quantity wherever the data determine it.
+
+    Parameters
+    ----------
+    batch : Batch
+        Files in the order in which they are followed.
+    name : str, optional
+        The normalised emittance or the mean lifetime unless said.
+
+    Returns
+    -------
+    list of Course
+        One a plane and slice; limits are `control_limits` of the first 20 points, or of half of
+        them.
+
+    Raises
+    ------
+    InputError
+        If there is no such quantity.
+    """
+    known, usual = FOLLOWED[batch.ledger.job.kind]
+    name = name or usual
+    if name not in known:
+        raise InputError(f"quantity '{name}'", nearest(name, list(known)))
+    points: dict[str, list[tuple[str, int, float, float]]] = {}
+    for at, (of, file, value, error) in _points(batch, named(name, known[name])):
+        points.setdefault(of, []).append((file, at, value, error))
+    found = []
+    for of, own in sorted(points.items()):
+        files, *numbers = zip(*own, strict=True)
+        at, value, error = map(np.array, numbers)
+        limits = control_limits(value[: baseline(len(value))])
+        found.append(Course(name, known[name], of, list(files), at, value, error, *limits))
+    return found
+
+
+def _points(
+    batch: Batch, columns: list[str]
+) -> Iterator[tuple[int, tuple[str, str, float, float]]]:
+    own = COLUMNS[batch.ledger.job.kind]
+    value, error = (own.index(column) for column in columns[:2])
+    words = [own.index(name) for name in ("slice", "plane") if name in own]
+    place = {file: i for i, file in enumerate(batch.files, start=1)}
+    for row in csv.reader(raw.decode() for raw in batch.ledger.rows(batch.files)):
+        if row[value] and row[error]:
+            of = " ".join(row[i] for i in words if row[i])
+            yield place[row[0]], (of, row[0], float(row[value]), float(row[error]))

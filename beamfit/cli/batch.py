@@ -1,0 +1,136 @@
+"""`beamfit batch`: a year's files in, one row an answer out."""
+
+from __future__ import annotations
+
+import sys
+import time
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from beamfit.cli.options import command_line, options
+from beamfit.errors import InputError
+
+if TYPE_CHECKING:
+    from beamfit.batch.run import Batch
+
+EXAMPLE = """\b
+Examples:
+  beamfit batch scans/ --kind emittance --lattice line.toml --out year.parquet --report year.html
+  beamfit batch fills/ --kind lifetime --out fills.csv --workers 2
+  beamfit batch scans/ --kind emittance --lattice line.toml --out year.h5 --scheduler tcp://host:8786
+"""
+# Reasons that are printed; all are in the table.
+NAMED = 10
+
+
+@click.command(epilog=EXAMPLE)
+@click.argument("path", nargs=-1, required=True)
+@click.option(
+    "--kind", type=click.Choice(["emittance", "lifetime"]), required=True, help="Of what."
+)
+@click.option(
+    "--out",
+    required=True,
+    metavar="FILE.parquet|FILE.h5|FILE.csv",
+    help="The table of answers. A run that was stopped goes on from FILE.parts.",
+)
+@click.option("--workers", type=click.IntRange(1), help="Processes on this machine (Dask).")
+@click.option("--scheduler", metavar="tcp://HOST:PORT", help="A Dask scheduler to join.")
+@click.option(
+    "--quantity", metavar="NAME", help="What the report follows, such as beta or lifetime_mean."
+)
+@options("ignore skip-bad weights maybe-lattice use from to screen energy particle time current")
+@options("report json")
+def batch(
+    path: tuple[str, ...],
+    kind: str,
+    out: str,
+    workers: int | None,
+    scheduler: str | None,
+    quantity: str | None,
+    weights: str,
+    lattice: str | None,
+    report: str | None,
+    as_json: bool,
+    **told: Any,
+) -> None:
+    """Answer for many scans or records, each as by itself, in one row an answer.
+
+    PATH is a file, or a folder of files. What cannot be used is a row of status "unusable" with its
+    reason, and stops nothing. Answers that stand in FILE.parts for the same file, lattice, options
+    and version are kept.
+    """
+    part = {n: told[n] for n in ("use", "energy", "particle", "first", "last", "screen")}
+    reading = {n: told[n] for n in ("ignore", "skip_bad", "time", "current")}
+    _check_kind(kind, {"lattice": lattice} | part, {n: told[n] for n in ("time", "current")})
+    from beamfit.batch.job import Job
+    from beamfit.batch.run import run_batch
+
+    job = Job(kind, lattice, part, reading, weights)
+    with _Progress(not as_json and sys.stderr.isatty()) as progress:
+        found = run_batch(path, out, job, workers=workers, scheduler=scheduler, progress=progress)
+    if report is not None:
+        from beamfit.batch.course import courses_of
+        from beamfit.report.batch import write_batch_report
+
+        write_batch_report(report, found, courses_of(found, quantity), command_line())
+    _answer(found, out, report, as_json)
+
+
+def _check_kind(kind: str, of_scans: dict[str, Any], of_records: dict[str, Any]) -> None:
+    wrong = of_records if kind == "emittance" else of_scans
+    for name, value in wrong.items():
+        if value is not None:
+            said = {"first": "from", "last": "to"}.get(name, name)
+            raise InputError(f"--{said} with --kind {kind}", "none: it is of the other kind")
+
+
+class _Progress:
+    """One line on a terminal: files, files a second, what is left."""
+
+    def __init__(self, shown: bool) -> None:
+        self.shown, self.began, self.first = shown, time.monotonic(), None
+
+    def __enter__(self) -> _Progress:
+        return self
+
+    def __call__(self, done: int, of: int) -> None:
+        self.first = done if self.first is None else self.first
+        rate = (done - self.first) / max(time.monotonic() - self.began, 1e-3)
+        left = f", {(of - done) / rate:.0f} s left" if rate else ""
+        if self.shown:
+            click.echo(f"\r{done} of {of} files, {rate:.0f}/s{left}\033[K", err=True, nl=False)
+
+    def __exit__(self, *_: object) -> None:
+        if self.shown:
+            click.echo("", err=True)
+
+
+def _answer(found: Batch, out: str, report: str | None, as_json: bool) -> None:
+    if as_json:
+        from beamfit.io.result import results_text
+
+        inputs = {
+            p: d for p, d in [(found.ledger.job.lattice, found.ledger.job.lattice_sha256)] if p
+        }
+        results = {"table": out, "files": len(found.files), "new": found.new}
+        results |= {"statuses": found.statuses, "unusable": found.refused}
+        click.echo(results_text([results], inputs, command_line()))
+        return
+    from beamfit.cli.show import Terminal
+    from beamfit.table import Table
+
+    terminal = Terminal()
+    before = len(found.files) - found.new
+    kept = f", {before} of them before" if before else ""
+    terminal.line(f"{len(found.files)} files answered{kept}: {out}", style="bold")
+    rows = [[name.replace("_", " "), str(n)] for name, n in found.statuses.items()]
+    terminal.table(Table("", ["status", "answers"], rows, numeric=True))
+    for reason in list(found.refused.values())[:NAMED]:
+        terminal.line(reason)
+    if len(found.refused) > NAMED:
+        terminal.line(
+            f"{len(found.refused) - NAMED} more files without an answer are in the table."
+        )
+    terminal.report(report)

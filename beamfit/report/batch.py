@@ -1,0 +1,166 @@
+"""The page of a batch: what came of its files, and the course of a quantity through them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from functools import partial
+from itertools import islice
+from os import PathLike
+from pathlib import Path
+from urllib.parse import quote
+
+import numpy as np
+from matplotlib import rc_context
+from matplotlib.figure import FigureBase
+
+from beamfit.batch.course import Course
+from beamfit.batch.run import Batch
+from beamfit.quantity import Quantity, display_unit
+from beamfit.report.document import (
+    BLUE,
+    MANY,
+    RED,
+    STYLE,
+    Page,
+    Picture,
+    Verdict,
+    legend_below,
+    provenance,
+    written,
+)
+from beamfit.report.page import write_page, write_report
+from beamfit.status import Status
+from beamfit.table import Table, plain_name
+
+# Points beyond the limits, and files without an answer, that are listed; the former have pages.
+LISTED = 40
+RULE = (
+    "Limits are those of an individuals chart: the mean of the first 20 points (half of them if "
+    "there are fewer) ± 3 standard deviations from their mean moving range, Student's quantile; a "
+    "point is beyond if it is also 3 of its own errors away. Noise alone puts one in 370 there."
+)
+
+
+def write_batch_report(
+    path: str | PathLike[str],
+    batch: Batch,
+    courses: Sequence[Course],
+    command: str | None = None,
+) -> None:
+    """Write the page of a batch, and single reports of the points beyond the limits.
+
+    Parameters
+    ----------
+    path : str or path
+        As for `write_report`. Single reports are written to a folder beside it, named
+        after it; at most 40.
+    batch : Batch
+        The batch.
+    courses : sequence of Course
+        From `beamfit.batch.course.courses_of`.
+    command : str, optional
+        The command that made it.
+
+    Raises
+    ------
+    InputError
+        If a place cannot be written.
+    """
+    target = Path(path)
+    beyond = dict.fromkeys(
+        file for c in courses for file, off in zip(c.files, c.beyond, strict=True) if off
+    )
+    folder = target.with_name(f"{target.stem}_reports")
+    links = []
+    for i, file in enumerate(islice(beyond, LISTED), start=1):
+        folder.mkdir(exist_ok=True)
+        single = folder / f"{i:02d}_{Path(file).stem}.html"
+        write_report(single, batch.ledger.job.fit(file))
+        links.append((file, quote(f"{folder.name}/{single.name}")))
+    with rc_context(STYLE):
+        write_page(target, _page(batch, courses, links, command))
+
+
+def _page(
+    batch: Batch, courses: Sequence[Course], links: list[tuple[str, str]], command: str | None
+) -> Page:
+    job = batch.ledger.job
+    answers = [[name.replace("_", " "), f"{n}"] for name, n in batch.statuses.items()]
+    tables = [Table("Answers", ["status", "answers"], answers, numeric=True)]
+    for c in courses:
+        rows = [
+            [file, str(Quantity(value, error, c.unit))]
+            for file, value, error, off in zip(c.files, c.value, c.error, c.beyond, strict=True)
+            if off
+        ]
+        more = f"the first {LISTED} of {len(rows)}" if len(rows) > LISTED else ""
+        title = f"Beyond the control limits: {_label(c)}"
+        tables += [Table(title, ["file", plain_name(c.name)], rows[:LISTED], more)] * bool(rows)
+    if batch.refused:
+        more = f"the first {LISTED} of {len(batch.refused)}; all are in the table of answers"
+        rows = [list(item) for item in islice(batch.refused.items(), LISTED)]
+        note = more if len(batch.refused) > LISTED else ""
+        tables.append(Table("Without an answer", ["file", "reason"], rows, note))
+    pictures = [
+        Picture(f"course of {_label(c)}", 2.8, partial(draw_course, course=c)) for c in courses
+    ]
+    inputs = {} if job.lattice is None else {job.lattice: job.lattice_sha256}
+    remarks = [("table", str(batch.ledger.out)), ("options", job.key[1])]
+    return Page(
+        title=f"{len(batch.files)} files: {job.kind}",
+        subtitle=written(),
+        verdicts=[_verdict(c) for c in courses],
+        tables=tables,
+        pictures=pictures,
+        pictures_title="Course, in the order of the files",
+        provenance=provenance(inputs, remarks, command),
+        notes=(),
+        links=links,
+    )
+
+
+def _label(c: Course) -> str:
+    return f"{plain_name(c.name)} {c.of}".strip()
+
+
+def _verdict(c: Course) -> Verdict:
+    beyond = int(c.beyond.sum())
+    status = Status.poor_fit if beyond else Status.converged
+    if not math.isfinite(c.limit):
+        return Verdict(
+            Status.unidentified, f"{_label(c)}: too few points to say what is usual", RULE
+        )
+    factor, unit = display_unit(abs(c.centre), c.unit)
+    usual = f"{c.centre / factor:.4g} ± {c.limit / factor:.2g} {unit}".strip()
+    said = f"{_label(c)}: usually {usual}; {beyond} of {len(c.value)} beyond"
+    return Verdict(status, said, RULE)
+
+
+def draw_course(figure: FigureBase, course: Course) -> None:
+    """Draw a quantity against the number of its file, with control limits.
+
+    Parameters
+    ----------
+    figure : Figure or SubFigure
+        Where to.
+    course : Course
+        What.
+    """
+    axes, beyond = figure.subplots(), course.beyond
+    factor, unit = display_unit(abs(course.centre), course.unit)
+    many = len(course.value) > MANY
+    for chosen, colour, name in ((~beyond, BLUE, "within"), (beyond, RED, "beyond")):
+        if chosen.any():
+            at, value, error = (
+                part[chosen] for part in (course.at, course.value / factor, course.error / factor)
+            )
+            bars = None if many else error
+            style = {"fmt": "o", "ms": 1.5 if many else 3.5, "lw": 0.8, "rasterized": many}
+            axes.errorbar(at, value, bars, color=colour, label=name, **style)
+    axes.axhline(course.centre / factor, color="0.6", lw=0.8)
+    if math.isfinite(course.limit):
+        ends = (course.centre + np.array([-1.0, 1.0]) * course.limit) / factor
+        axes.axhspan(*ends, color="0.92", zorder=0, label="control limits")
+    axes.set(title=_label(course), xlabel="file", ylabel=f"{plain_name(course.name)}, {unit}")
+    legend_below(figure, axes, 3)
