@@ -170,10 +170,14 @@ def _answers(
     if not tasks or (workers is None and scheduler is None):
         yield from ((task, job.answer(task)) for task in tasks)
         return
+    import dask
     from distributed import Client, LocalCluster
 
+    # A task that waits at a worker is held for its death, too.
+    one_each = {"distributed.scheduler.worker-saturation": 1.0}
     own = {"threads_per_worker": 1, "dashboard_address": None, "processes": True}
     with ExitStack() as stack:
+        stack.enter_context(dask.config.set(one_each))
         cluster = scheduler
         if workers is not None:
             cluster = stack.enter_context(LocalCluster(n_workers=workers, **own))
@@ -193,21 +197,23 @@ def _spread(
 ) -> Iterator[tuple[list[str], str]]:
     """Hand out tasks, some ahead of the workers, and give what comes back as it does.
 
-    A task that several workers died of is cut in two, until the file is alone that ends them.
+    A task that several workers died of is cut in two, until a file is alone; such files are tried
+    once more with nothing beside them, at the end.
     """
     from distributed import KilledWorker, wait
 
     given: dict[Any, list[str]] = {}
+    suspects: list[list[str]] = []
     waited = 0
 
-    def hand_out(few: Iterable[list[str]]) -> None:
+    def hand_out(few: Iterable[list[str]]) -> bool:
         given.update((client.submit(job.answer, task, pure=False), task) for task in few)
+        return bool(given)
 
     hand_out(islice(tasks, AHEAD * max(len(client.ncores()), 1)))
-    while given:
+    while given or hand_out([suspects.pop()] if suspects else []):
         try:
-            done = wait(list(given), PATIENCE, "FIRST_COMPLETED").done
-            future = next(iter(done))
+            future = next(iter(wait(list(given), PATIENCE, "FIRST_COMPLETED").done))
             text = future.result(PATIENCE)
         except TimeoutError:  # also where what was found died with its worker
             waited = waited + 1 if workers and len(client.ncores()) < workers else 0
@@ -218,8 +224,9 @@ def _spread(
         except KilledWorker:
             task = given.pop(future)
             half = len(task) // 2
-            if half:
-                hand_out([task[:half], task[half:]])
+            if half or given:
+                hand_out([task[:half], task[half:]] if half else [])
+                suspects += [] if half else [task]
                 continue
             text = job.refused(task[0], "ended the process that read it")
         else:

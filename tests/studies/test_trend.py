@@ -7,9 +7,10 @@ import pytest
 
 from beamfit.errors import InputError
 from beamfit.lifetime.losses import loss_coefficients
+from beamfit.statistics import control_limits
 from beamfit.studies.decay.record import Conditions, DecayRecord
 from beamfit.studies.decay.study import study_record
-from beamfit.studies.decay.trend import _limits, trend_of
+from beamfit.studies.decay.trend import trend_of
 from tests.studies.test_alarm import beam_after
 
 A, B, FILL, STEP = 3.7e-8, 9.26e-6, 8 * 3600.0, 60.0
@@ -65,11 +66,11 @@ def test_limits_are_those_of_an_individuals_chart():
     random, outside = np.random.default_rng(1), 0
     for _ in range(4000):
         *values, after = random.normal(size=11)
-        centre, limit = _limits(np.array(values))
+        centre, limit = control_limits(np.array(values))
         outside += abs(after - centre) > limit
     assert 2 <= outside <= 24
     # By hand: mean range 1, 1/1.128; a drift does not widen it, a step hardly.
-    assert _limits(np.arange(200.0))[1] == pytest.approx(3 / 1.128, rel=0.06)
+    assert control_limits(np.arange(200.0))[1] == pytest.approx(3 / 1.128, rel=0.06)
 
 
 def test_the_ring_takes_settings_and_current_out(machine):
