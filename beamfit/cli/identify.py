@@ -12,25 +12,30 @@ from beamfit.io.files import digest
 
 if TYPE_CHECKING:
     from beamfit.studies.response.fit import ResponseFit
+    from beamfit.studies.response.states import StatesFit
 
 __all__ = ["identify"]
+
+STATES = "state-space"
 
 EXAMPLE = """\b
 Examples:
   beamfit identify run.csv --model first-order
   beamfit identify monday.csv tuesday.csv --model second-order --map network --report process.html
   beamfit identify log.csv --input Valve --output Level --step 4 --hold-back friday.csv --json
+  beamfit identify tanks.csv --model state-space --order 3 --map network
 """
 
 
 @click.command(epilog=EXAMPLE)
 @click.argument("record", nargs=-1, required=True)
-@options("model map input output step delay no-offset")
+@options("model order map input output step delay no-offset")
 @click.option("--hold-back", multiple=True, metavar="RECORD", help="A run that is only predicted.")
 @options("hidden ignore skip-bad seed report json")
 def identify(
     record: tuple[str, ...],
     model: str,
+    order: int | None,
     map: str,
     inputs: tuple[str, ...],
     outputs: tuple[str, ...],
@@ -49,10 +54,13 @@ def identify(
 
     RECORD is a CSV or HDF5 file with time_s, inputs u_… that hold from row to row, and outputs y_…;
     several runs are identified together. Each output gives its parameters with errors (as curves of
-    the operating point with --map network), tests of the residuals, and a verdict.
+    the operating point with --map network), tests of the residuals, and a verdict; a state space is
+    one of all outputs, with its time constants and gains.
     """
     from beamfit.io.run import read_run  # numpy
 
+    if order is not None and model != STATES:
+        raise InputError(f"--order {order} with --model {model}", f"--model {STATES}")
     said = {"inputs": inputs, "outputs": outputs, "step": step}
     said |= {"ignore": ignore, "skip_bad": skip_bad}
     twice = [path for path in record if (*record, *hold_back).count(path) > 1]
@@ -61,13 +69,16 @@ def identify(
     runs = [read_run(path, **said) for path in record]
     held = [read_run(path, **said) for path in hold_back]
 
-    from beamfit.studies.response.fit import identify as fit_response  # JAX from here on
+    options = {"map": map, "offset": not no_offset, "hidden": hidden, "seed": seed, "held": held}
+    if model == STATES:
+        from beamfit.studies.response.linear import identify_states  # JAX from here on
 
-    options = {"delay": delay, "offset": not no_offset, "hidden": hidden, "seed": seed}
-    fits = [
-        fit_response(runs, model, map, output=name, held=held, **options)
-        for name in runs[0].outputs
-    ]
+        fits = [identify_states(runs, order, delay=delay or 0, **options)]
+    else:
+        from beamfit.studies.response.fit import identify as fit_response
+
+        options |= {"model": model, "delay": delay}
+        fits = [fit_response(runs, output=name, **options) for name in runs[0].outputs]
     digests = {path: digest(path) for path in (*record, *hold_back)}
     if report is not None:
         from beamfit.report.page import write_report
@@ -81,7 +92,7 @@ def identify(
     _show(fits, report)
 
 
-def _show(fits: list[ResponseFit], report: str | None) -> None:
+def _show(fits: list[ResponseFit | StatesFit], report: str | None) -> None:
     from beamfit.cli.show import Terminal
 
     terminal = Terminal()

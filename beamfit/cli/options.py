@@ -149,11 +149,17 @@ SHARED: dict[str, Callable[..., Any]] = {
     ),
     "model": click.option(
         "--model",
-        type=click.Choice(["first-order", "second-order", "arx"]),
+        type=click.Choice(["first-order", "second-order", "arx", "state-space"]),
         default="first-order",
         show_default=True,
-        help="tau y' + y = K u; T² y'' + 2 zeta T y' + y = K u; or y(k) = -a1 y(k-1) - a2 y(k-2) + "
-        "b1 u(k-1) + b2 u(k-2).",
+        help="tau y' + y = K u; T² y'' + 2 zeta T y' + y = K u; y(k) = -a1 y(k-1) - a2 y(k-2) + "
+        "b1 u(k-1) + b2 u(k-2); or x+ = A x + B u, y = C x + D u of all outputs together.",
+    ),
+    "order": click.option(
+        "--order",
+        type=click.IntRange(1, 50),
+        metavar="STATES",
+        help="State space: its states; found by an information criterion unless said.",
     ),
     "map": click.option(
         "--map",

@@ -15,6 +15,8 @@ __all__ = ["Matrices", "StateSpace", "contraction", "linear_outputs"]
 
 # Samples that `linear_outputs` takes at once.
 BLOCK = 32
+# Of the matrix exponential: it loses nothing (1e-12) up to 4000 time constants in a step.
+HALVINGS, TERMS = 16, 8
 
 
 class StateSpace(NamedTuple):
@@ -66,7 +68,7 @@ class StateSpace(NamedTuple):
         if self.affine:
             shift, matrix = rate(jnp.zeros_like(x)), jax.jacfwd(rate)(jnp.zeros_like(x))
             both = jnp.zeros((len(x) + 1,) * 2).at[:-1].set(jnp.column_stack([matrix, shift]))
-            return (jax.scipy.linalg.expm(both * dt) @ jnp.append(x, 1.0))[:-1]
+            return x + (_growth(both * dt) @ jnp.append(x, 1.0))[:-1]
         h = dt / self.parts
         for _ in range(self.parts):
             a = rate(x)
@@ -116,6 +118,15 @@ class StateSpace(NamedTuple):
     def read(self, p: Any, x: jax.Array, u: jax.Array) -> jax.Array:
         """Give the outputs at one sample, shape (k,)."""
         return jnp.atleast_1d(self.output(x, u, p(u) if callable(p) else p))
+
+
+def _growth(a: jax.Array) -> jax.Array:
+    """exp(a) - 1 by squaring a series: C. Moler, C. Van Loan, SIAM Review 45 (2003) 3, method 3."""
+    small = a / 2.0**HALVINGS
+    series = one = jnp.eye(len(a))
+    for k in range(TERMS, 1, -1):
+        series = one + small @ series / k
+    return jax.lax.scan(lambda e, _: (2.0 * e + e @ e, None), small @ series, length=HALVINGS)[0]
 
 
 class Matrices(NamedTuple):

@@ -28,6 +28,7 @@ from beamfit.studies.decay.study import RecordStudy
 from beamfit.studies.decay.trend import Trend
 from beamfit.studies.response.fit import ResponseFit
 from beamfit.studies.response.loop import Loop
+from beamfit.studies.response.states import StatesFit
 from beamfit.studies.scan.fit import EmittanceFit
 from beamfit.studies.scan.size_methods import SizeMethods
 from beamfit.studies.scan.slices import SliceFits
@@ -101,7 +102,7 @@ def write_report(
                 page = formulation_page(solution, command, inputs)
             case SliceFits() as slices:
                 page = slices_page(slices, command, inputs)
-            case ResponseFit():
+            case ResponseFit() | StatesFit():
                 page = response_page(several, command, inputs)
             case Loop() as loop:
                 page = control_page(loop, command, inputs)

@@ -10,6 +10,7 @@ from matplotlib.figure import FigureBase
 
 from beamfit.report.document import BLUE, RED, Page, Picture, Verdict, provenance, written
 from beamfit.studies.response.fit import ResponseFit
+from beamfit.studies.response.states import Part, StatesFit
 
 NOTES = (
     "Errors are one standard deviation. The model runs free from the start of each run: measured "
@@ -21,13 +22,15 @@ MOST, RUNS = 4000, 6
 
 
 def response_page(
-    fits: Sequence[ResponseFit], command: str | None, inputs: Mapping[str, str | None] | None
+    fits: Sequence[ResponseFit | StatesFit],
+    command: str | None,
+    inputs: Mapping[str, str | None] | None,
 ) -> Page:
     """Lay out the responses of some outputs."""
     first = fits[0]
     names = ", ".join(run.name for run in first.runs)
     digests = inputs or {run.path or run.name: run.sha256 or None for run in first.runs}
-    pictures = [picture for fit in fits for picture in _pictures(fit)]
+    pictures = [picture for fit in fits for part in fit.parts for picture in _pictures(part)]
     remarks = [("said in " + run.name, line) for run in first.runs for line in run.provenance]
     return Page(
         title=f"Response of {', '.join(fit.output for fit in fits)}",
@@ -41,7 +44,7 @@ def response_page(
     )
 
 
-def _pictures(fit: ResponseFit) -> list[Picture]:
+def _pictures(fit: ResponseFit | Part) -> list[Picture]:
     runs = range(min(len(fit.runs), RUNS))
     found = [
         Picture(f"{fit.output} measured and simulated in {fit.runs[i].name}", 4.2,
@@ -56,7 +59,7 @@ def _pictures(fit: ResponseFit) -> list[Picture]:
                             partial(_draw_correlations, fit))]  # fmt: skip
 
 
-def _draw_run(fit: ResponseFit, i: int, figure: FigureBase) -> None:
+def _draw_run(fit: ResponseFit | Part, i: int, figure: FigureBase) -> None:
     """Measured and simulated output, their difference, and the inputs."""
     run, time, y = fit.runs[i], fit.seen.time[i], fit.seen.measured[i]
     simulated = fit.fitted[i]
@@ -78,7 +81,7 @@ def _draw_run(fit: ResponseFit, i: int, figure: FigureBase) -> None:
         below.legend(frameon=False, fontsize=8, ncols=len(run.inputs))
 
 
-def _draw_curve(fit: ResponseFit, j: int, figure: FigureBase) -> None:
+def _draw_curve(fit: ResponseFit | Part, j: int, figure: FigureBase) -> None:
     """A parameter against the operating point, dashed where the runs never were."""
     c = fit.curves[j]
     axes = figure.subplots()
@@ -95,7 +98,7 @@ def _draw_curve(fit: ResponseFit, j: int, figure: FigureBase) -> None:
         axes.set_ylim(inside.min() - edge, inside.max() + edge)
 
 
-def _draw_correlations(fit: ResponseFit, figure: FigureBase) -> None:
+def _draw_correlations(fit: ResponseFit | Part, figure: FigureBase) -> None:
     """Correlation of residuals with themselves and with past inputs, with the 99 % band of none."""
     own, others = figure.subplots(1, 2)
     rest = [y - s for y, s in zip(fit.seen.measured, fit.fitted, strict=True)]

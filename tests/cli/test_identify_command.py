@@ -67,6 +67,17 @@ BAD = {
         ("--model", "arx"),
         ["unequal"],
     ),
+    "an order of no state space": (table(*ROWS), ("--order", "2"), ["--order 2", "state-space"]),
+    "more states than readings": (
+        table(*ROWS),
+        ("--model", "state-space", "--order", "9"),
+        ["order 9 with 20 readings", "1 to 1"],
+    ),
+    "uneven samples of a state space": (
+        table(*(f"{k * k},{(k // 5) % 2},{k}\n" for k in range(20))),
+        ("--model", "state-space"),
+        ["unequal"],
+    ),
     "empty": ("", (), ["empty"]),
     "no step": (table(*ROWS, head="note_c,u_valve,y_level\n"), ("--step", "-1"), ["--step", "0"]),
 }

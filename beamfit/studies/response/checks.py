@@ -22,7 +22,7 @@ from beamfit.studies.response.model import (
 from beamfit.studies.response.record import Run
 from beamfit.studies.response.starts import driven_by, unit_outputs
 
-__all__ = ["Checks", "HeldBack", "checks_of", "predict_held", "slopes_of"]
+__all__ = ["Checks", "HeldBack", "checks_of", "percent", "predict_held", "slopes_of"]
 
 # Lags of the tests at most: of residuals, of inputs before and after, and of what whitens.
 LAGS, PAST, LATER, ORDER = 20, 10, 5, 8
@@ -97,7 +97,8 @@ class HeldBack(NamedTuple):
         return [f"held back {self.name}", f"{self.free_run_percent:.2f} %, rms {self.rms:.3g}"]
 
 
-def _percent(rest: np.ndarray, y: np.ndarray) -> float:
+def percent(rest: np.ndarray, y: np.ndarray) -> float:
+    """How much of y is explained: 100 (1 - |rest| / |y - mean|)."""
     whole = float(np.linalg.norm(y - y.mean()))
     return 100.0 * (1.0 - float(np.linalg.norm(rest)) / whole) if whole > 0 else 0.0
 
@@ -121,8 +122,8 @@ def checks_of(
     if rest.std() <= CLOSE * seen.size_y:  # what is left is rounding, or the network's own detail
         explained, chance, later, fed = 0.0, 1.0, 0.0, 1.0
     return Checks(
-        _percent(rest, y),
-        _percent(ahead, y),
+        percent(rest, y),
+        percent(ahead, y),
         _chance(y, rest, used),
         _white(residuals),
         chance,
@@ -271,4 +272,4 @@ def predict_held(run: Run, output: str, fit: Fit, physics: Physics, delay: int) 
     target = y - base - float(fit.model["offset"])
     first = np.linalg.lstsq(moved, target, rcond=1e-10)[0]
     rest = target - moved @ first
-    return HeldBack(run.name, _percent(rest, y), float(rest.std()))
+    return HeldBack(run.name, percent(rest, y), float(rest.std()))

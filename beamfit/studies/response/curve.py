@@ -18,7 +18,18 @@ from beamfit.studies.response.checks import Checks
 from beamfit.studies.response.model import Seen, curves
 from beamfit.table import Table, cell, json_of
 
-__all__ = ["TIME", "Curve", "curves_of", "quantities_of", "told"]
+__all__ = [
+    "GAIN",
+    "PURE",
+    "TIME",
+    "WIDE",
+    "Curve",
+    "curves_of",
+    "derived",
+    "quantities_of",
+    "quantity",
+    "told",
+]
 
 # Points of a curve; it was visited where so many samples lie within a share of its range.
 POINTS, VISITS, NEAR = 41, 5, 0.05
@@ -97,20 +108,20 @@ def quantities_of(
 ) -> dict[str, Quantity]:
     """Constant parameters with errors, and the offset if it is free."""
     m = len(seen.inputs)
-    found = _derived(fit, errors, _constants, seen.runs[0])
+    found = derived(fit, errors, _constants, seen.runs[0])
     names, units = list(physics.parameters(seen.inputs)), _units(physics, m)
     if physics is SECOND_ORDER and found.value[1] > 1.0:
         names, units = [*names, "tau1", "tau2"], [*units, TIME, TIME]
     said = {
-        name: _quantity(found, i, unit)
+        name: quantity(found, i, unit)
         for i, (name, unit) in enumerate(zip(names, units, strict=True))
     }
     if any(v.name == "offset" for v in fit.variables):
-        said["offset"] = _quantity(_derived(fit, errors, _offset, seen.runs[0]), (), "output")
+        said["offset"] = quantity(derived(fit, errors, _offset, seen.runs[0]), (), "output")
     return said
 
 
-def _derived(fit: Fit, errors: Memory | None, function: Callable, data: Any) -> Derived:
+def derived(fit: Fit, errors: Memory | None, function: Callable, data: Any) -> Derived:
     """Numbers of a fit, with errors averaged over what is open of a noise with a memory."""
     found = fit.derive(function, data)
     if errors is None:
@@ -120,7 +131,8 @@ def _derived(fit: Fit, errors: Memory | None, function: Callable, data: Any) -> 
     return found._replace(error=np.where(np.isfinite(found.error), known, np.nan))
 
 
-def _quantity(found: Derived, i: Any, unit: str) -> Quantity:
+def quantity(found: Derived, i: Any, unit: str) -> Quantity:
+    """One of some numbers, without an error where the data do not determine it."""
     error, raw = (float(e[i]) for e in (found.error, found.error_raw))
     known = np.isfinite(error)
     return Quantity(float(found.value[i]), error if known else None, unit, raw if known else None)
@@ -161,7 +173,7 @@ def curves_of(fit: Fit, errors: Memory | None, seen: Seen) -> tuple[Curve, ...]:
         grid[:, j] = at = np.linspace(low, high, POINTS)
         apart = np.abs(points[:, j][None, :] - at[:, None])
         visited = np.sum(apart <= NEAR * (high - low), axis=1) >= VISITS
-        found = _derived(fit, errors, curves, (seen.runs[0], jnp.asarray(grid)))
+        found = derived(fit, errors, curves, (seen.runs[0], jnp.asarray(grid)))
         names = physics.parameters(seen.inputs)
         made += [
             Curve(names[i], name, unit, at, found.value[:, i], found.error[:, i], visited)

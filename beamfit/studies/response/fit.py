@@ -29,7 +29,14 @@ from beamfit.table import Table, json_of
 if TYPE_CHECKING:
     from beamfit.sampling.posterior import Posterior
 
-__all__ = ["MAPS", "ResponseFit", "identify"]
+__all__ = [
+    "MAPS",
+    "ResponseFit",
+    "check_inputs",
+    "check_runs",
+    "identify",
+    "ordered",
+]
 
 MAPS = ("constant", "network")
 
@@ -84,6 +91,11 @@ class ResponseFit:
     memory: Noise | None
     checks: Checks
     held: tuple[HeldBack, ...] = ()
+
+    @property
+    def parts(self) -> tuple[ResponseFit]:
+        """Itself: the outputs it has pictures of."""
+        return (self,)
 
     @property
     def headline(self) -> str:
@@ -203,7 +215,7 @@ def identify(
     """
     runs = (runs,) if isinstance(runs, Run) else tuple(runs)
     physics = _checked(runs, tuple(held), model, map)
-    runs, held = (tuple(_ordered(run, runs[0]) for run in each) for each in (runs, held))
+    runs, held = (tuple(ordered(run, runs[0]) for run in each) for each in (runs, held))
     output = _output(runs[0], output)
     shortest = min(len(run) for run in runs)
     if delay is not None and delay >= shortest - 1:
@@ -249,6 +261,13 @@ def _checked(runs: tuple[Run, ...], held: tuple[Run, ...], model: str, map: str)
         raise InputError(f"model '{model}'", nearest(model, list(PHYSICS)))
     if map not in MAPS:
         raise InputError(f"map '{map}'", nearest(map, list(MAPS)))
+    check_runs(runs, held, PHYSICS[model].even)
+    check_inputs(runs)
+    return PHYSICS[model]
+
+
+def check_runs(runs: tuple[Run, ...], held: tuple[Run, ...], even: bool) -> None:
+    """Refuse runs that do not fit together, `even` for those that need equal steps."""
     if not runs:
         raise InputError("no runs", "at least one")
     first = runs[0]
@@ -256,18 +275,22 @@ def _checked(runs: tuple[Run, ...], held: tuple[Run, ...], model: str, map: str)
         if set(run.inputs) != set(first.inputs) or set(run.outputs) != set(first.outputs):
             said = f"inputs {', '.join(run.inputs)} and outputs {', '.join(run.outputs)}"
             raise run.unusable(said, f"those of {first.name}: {first.headline.partition(', ')[2]}")
-        if PHYSICS[model].even and run.step is None:
+        if even and run.step is None:
             raise run.unusable("samples at unequal distances", "equal ones, or --model first-order")
-        if PHYSICS[model].even and not np.isclose(run.step, first.step, rtol=0.01):
+        if even and not np.isclose(run.step, first.step, rtol=0.01):
             expected = f"{first.step:.4g} s, as in {first.name}, or --model first-order"
             raise run.unusable(f"samples every {run.step:.4g} s", expected)
+
+
+def check_inputs(runs: tuple[Run, ...]) -> None:
+    """Refuse runs of which an input never changes."""
+    first = runs[0]
     for name in first.inputs:
         if all(np.ptp(run.inputs[name]) == 0 for run in runs):
             said = f"input {name} at {runs[0].inputs[name][0]:g} all the time"
             raise first.unusable(said, "an input that changes: a step at least")
-    return PHYSICS[model]
 
 
-def _ordered(run: Run, first: Run) -> Run:
+def ordered(run: Run, first: Run) -> Run:
     """The run with its inputs in the order of the first: matrices have them by their place."""
     return replace(run, inputs={name: run.inputs[name] for name in first.inputs})

@@ -68,13 +68,17 @@ def _triangle(rows: jax.Array, time: jax.Array, noise: Noise) -> tuple[jax.Array
 
 
 def noise_of(
-    rows: Sequence[np.ndarray], time: Sequence[np.ndarray], known: np.ndarray
+    rows: Sequence[np.ndarray],
+    time: Sequence[np.ndarray],
+    known: np.ndarray,
+    noise: Noise | None = None,
 ) -> tuple[Memory, Noise, float]:
     """The noise by what residuals say of it, all runs together, and its size in units of theirs.
 
     `rows` hold the slopes of each run's residuals and, last, the residuals, in units of their
-    noise; `known` those of the priors. As `beamfit.greybox.correlated.memory_of`: restricted
-    likelihood, flat in the logarithms of the time and of the ratio of the two variances.
+    noise; `known` those of the priors; `noise` is it if it is known. As
+    `beamfit.greybox.correlated.memory_of`: restricted likelihood, flat in the logarithms of the
+    time and of the ratio of the two variances.
     """
     apart = min(float(np.median(np.diff(t))) for t in time)
     ends = np.array([range_of(t) for t in time])
@@ -83,6 +87,7 @@ def noise_of(
         for each in np.geomspace(ends[:, 0].min(), ends[:, 1].max(), TIMES)
         for ratio in WHITE
     ]
+    grid = grid if noise is None else [noise]
     count, p = sum(map(len, rows)), rows[0].shape[1] - 1
     found = [_at(rows, time, known, noise, count + len(known)) for noise in grid]
     logs, step, half, squares = (np.array(part) for part in zip(*found, strict=True))

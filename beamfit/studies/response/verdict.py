@@ -15,7 +15,7 @@ from beamfit.studies.response.checks import Checks, HeldBack
 from beamfit.studies.response.curve import TIME, Curve
 from beamfit.verdict import Finding, judge
 
-__all__ = ["judged"]
+__all__ = ["Evidence", "judged", "judged_outputs"]
 
 # A curve of which less than this share has an error is not determined.
 HALF = 0.5
@@ -55,6 +55,19 @@ def judged(
         " The delay is the longest that was tried: say a longer one by --delay." if latest else ""
     )
     return found.status, found.message + late
+
+
+def judged_outputs(found: Mapping[str, Evidence]) -> tuple[Status, str]:
+    """Status and sentences of several outputs of one model: the gravest rule that any breaks."""
+    for rule in RULES:
+        said = {name: f for name, e in found.items() if (f := rule(e)) is not None}
+        texts = {f.message: [n for n in said if said[n].message == f.message]
+                 for f in said.values()}  # fmt: skip
+        if said:
+            each = (text if len(names) == len(found) else f"{', '.join(names)}: {text}"
+                    for text, names in texts.items())  # fmt: skip
+            return next(iter(said.values())).status, " ".join(each)
+    raise AssertionError("the last rule always finds something")
 
 
 def _rms(fit: Fit) -> list[float]:

@@ -1,0 +1,214 @@
+"""Linear state spaces, and ones with a network, of an order that the runs tell."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import product
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from beamfit.dynamics.states import linear_outputs
+from beamfit.errors import InputError, nearest
+from beamfit.greybox import tree
+from beamfit.greybox.problem import Free, Prior
+from beamfit.quantity import Quantity
+from beamfit.studies.response.curve import GAIN, PURE, TIME, WIDE, derived, quantity
+from beamfit.studies.response.fit import MAPS, check_inputs
+from beamfit.studies.response.model import WEIGHT
+from beamfit.studies.response.order import (
+    Tried,
+    count_of,
+    criterion,
+    free_of,
+    largest_order,
+    orders,
+)
+from beamfit.studies.response.realise import LINEAR, NETWORK, stripped
+from beamfit.studies.response.record import Run
+from beamfit.studies.response.shooting import Case, Course, Trained, remembering, trained
+from beamfit.studies.response.states import StatesFit, answer, case_of, checked
+
+__all__ = ["identify_states"]
+
+
+def identify_states(
+    runs: Run | Sequence[Run],
+    order: int | None = None,
+    map: str = "constant",
+    *,
+    delay: int = 0,
+    offset: bool = True,
+    hidden: int = 5,
+    starts: int = 2,
+    seed: int = 0,
+    held: Sequence[Run] = (),
+) -> StatesFit:
+    """Identify a state space of all outputs, x+ = A x + B u, y = C x + D u + offset.
+
+    Parameters
+    ----------
+    runs : Run or sequence of Run
+        Records with the same inputs and outputs at equal steps; readings may be missing.
+    order : int, optional
+        States. Found by the Bayesian information criterion if None: 1, 2, … until two further
+        ones are no better, 10 at most.
+    map : {"constant", "network"}
+        With ``"network"`` the next state has a network of state and inputs added.
+    delay : int
+        Samples by which the outputs follow late.
+    offset : bool
+        Whether the outputs at rest are free numbers; else they are 0 where the inputs are.
+    hidden, starts, seed : int
+        Hidden nodes of the network, starts of its training, seed of their weights.
+    held : sequence of Run
+        Runs that are only predicted.
+
+    Returns
+    -------
+    StatesFit
+        Time constants (tau, or T and zeta of a pair that oscillates), gains at rest K and
+        the outputs at the mean inputs; with a network they are those about the rest there. Of
+        ``to_json()`` ``matrices`` holds for inputs less ``input_mean``.
+
+    Raises
+    ------
+    InputError
+        If runs do not fit together, steps are unequal, an input never changes, or there are too
+        few readings for the order.
+
+    Notes
+    -----
+    Output error in a stable and minimal parametrisation (`beamfit.dynamics.states.contraction`),
+    from the best realisation of an order (`beamfit.studies.response.realise`). The criterion
+    counts readings that are independent, n (1 - r)/(1 + r) with r the correlation of neighbouring
+    residuals of the largest order tried. L. Ljung, System Identification (1999), chapters 4 and 16.
+
+    Examples
+    --------
+    >>> rng = np.random.default_rng(0)
+    >>> u, y = np.sign(rng.normal(size=200)), np.zeros(200)
+    >>> for k in range(199):
+    ...     y[k + 1] = 0.8 * y[k] + 0.4 * u[k]
+    >>> level = y + 0.05 * rng.normal(size=200)
+    >>> fit = identify_states(Run(np.arange(200.0), {"valve": u}, {"level": level}), 1)
+    >>> fit.status.value, abs(fit.quantities["tau1"].value + 1 / np.log(0.8)) < 0.2
+    ('converged', True)
+    """
+    if map not in MAPS:
+        raise InputError(f"map '{map}'", nearest(map, list(MAPS)))
+    runs, held = checked(runs, held, True)
+    check_inputs(runs)
+    case = case_of(runs, LINEAR, (), (), delay)
+    _check_order(case, runs, order or 1)
+    best, tried = orders(case, order, offset)
+    n, found, gain = best.order, best.found, None
+    if map == "network":
+        nets = _networks(best, hidden, range(seed, seed + starts))
+        free = [*free_of(case, n, n, offset, best.direct), Free("p.net", nuisance=True)]
+        case = case_of(runs, NETWORK, free, [Prior("p.net", 0.0, WEIGHT)], delay)
+        found = trained(case, nets)
+        gain = criterion([best.found])[0] - criterion([found])[0]
+    case = best.case if map == "constant" else case
+    found = remembering(case, found)
+    said, gains = _quantities(case, found, n, runs, offset)
+    more = {"delay_samples": delay, "tried": tried, "matrices": _matrices(case, found, n)}
+    judged = {"held": held, "map": map, "gain": gain, "delay": delay, "order": n}
+    return answer(case, found, runs, said, by_input=gains, more=more, **judged)
+
+
+def _check_order(case: Case, runs: Sequence[Run], order: int) -> None:
+    """Refuse orders with more numbers than readings allow."""
+    most = largest_order(case)
+    if not 1 <= order <= most:
+        expected = f"1 to {most}" if most >= 1 else "a longer run, or another --model"
+        raise runs[0].unusable(f"order {order} with {count_of(case)} readings", expected)
+
+
+def _networks(best: Tried, hidden: int, seeds: range) -> list[dict[str, Any]]:
+    """Models with networks of small random weights beside the linear part."""
+    model = stripped(best.found.fit.model, best.order)
+    p, (n, m) = model["p"], model["p"]["z"].shape
+    moved = LINEAR.matrices(p)._replace(c=jnp.eye(n), d=jnp.zeros((n, m)), offset=jnp.zeros(n))
+    run = jax.jit(lambda u, x0: linear_outputs(moved, u, x0)[0])
+    x = [np.asarray(run(LINEAR.scaled(p, c.u), model["start"][i]))
+         for i, c in enumerate(best.case.courses)]  # fmt: skip
+    sizes = {"sizes": np.concatenate(x).std(0)}
+    sizes["steps"] = np.concatenate([np.diff(each, axis=0) for each in x]).std(0)
+    found = []
+    for seed in seeds:
+        random = np.random.default_rng(seed)
+        net = {
+            "inside": random.normal(0, 1 / np.sqrt(n + m), (hidden, n + m)),
+            "bias": random.normal(0, 1, hidden),
+            "out": random.normal(0, 0.1 / np.sqrt(hidden), (n, hidden)),
+        }
+        found.append(model | {"p": p | sizes | {"net": net}})
+    return found
+
+
+@tree.node("order")
+class Asked:
+    """The states that a model uses, and a run."""
+
+    order: int
+    course: Course
+
+
+def _quoted(model: Any, asked: Asked) -> jax.Array:
+    """Of each pole tau, T, zeta, itself and its frequency; gains at rest, outputs at the mean."""
+    p, n, course = model["p"], asked.order, asked.course
+    a, b, c, d, offset = course.system.matrices(p)
+    a, b, c, units = a[:n, :n], b[:n], c[:, :n], p["units"]
+    poles = jnp.linalg.eigvals(a)
+    s = jnp.log(poles) / course.dt[0]
+    gains = d + c @ jnp.linalg.solve(jnp.eye(n) - a, b)
+    gains = units["y"][1][:, None] * gains / units["u"][1]
+    parts = [-1.0 / s.real, 1.0 / jnp.abs(s), -s.real / jnp.abs(s), poles.real, s.imag]
+    return jnp.concatenate([*parts, gains.ravel(), units["y"][0] + units["y"][1] * offset])
+
+
+def _quantities(
+    case: Case, found: Trained, n: int, runs: Sequence[Run], offset: bool
+) -> tuple[dict[str, Quantity], dict[str, list[str]]]:
+    """Time constants from the slowest, gains and levels; and the names of each input's gains."""
+    numbers = derived(found.fit, found.errors, _quoted, Asked(n, case.courses[0]))
+    step, said = float(case.courses[0].dt[0]), {}
+    inputs, outputs = list(runs[0].inputs), list(runs[0].outputs)
+    tau, time, zeta, pole, turn = np.arange(5 * n).reshape(5, n)
+    slow = [i for i in np.argsort(-numbers.value[time]) if numbers.value[turn[i]] >= 0.0]
+    for number, i in enumerate(slow, start=1):
+        around = numbers.value[turn[i]] * step
+        if around < 1e-9:
+            said[f"tau{number}"] = quantity(numbers, tau[i], TIME)
+        elif around > np.pi - 1e-9:  # on the negative axis: a sign from sample to sample
+            said[f"pole{number}"] = quantity(numbers, pole[i], PURE)
+        else:
+            said[f"T{number}"] = quantity(numbers, time[i], TIME)
+            said[f"zeta{number}"] = quantity(numbers, zeta[i], PURE)
+    said = {name: q.open() if q.unit == TIME and q.error is not None
+            and q.error > WIDE * abs(q.value) else q for name, q in said.items()}  # fmt: skip
+    gains: dict[str, list[str]] = {name: [] for name in inputs}
+    for i, (output, name) in enumerate(product(outputs, inputs), start=5 * n):
+        words = [output] * (len(outputs) > 1) + [name] * (len(inputs) > 1)
+        gains[name].append("_".join(["K", *words]))
+        said[gains[name][-1]] = quantity(numbers, i, GAIN)
+    for i, output in enumerate(outputs if offset else (), start=5 * n + len(inputs) * len(outputs)):
+        label = "level" if len(outputs) == 1 else f"level_{output}"
+        said[label] = quantity(numbers, i, "output")
+    return said, gains
+
+
+def _matrices(case: Case, found: Trained, n: int) -> dict[str, Any]:
+    """A, B, C, D in the units of the record, for inputs less their mean."""
+    p = found.fit.model["p"]
+    a, b, c, d, offset = map(np.asarray, case.courses[0].system.matrices(p))
+    (mean_u, size_u), (mean_y, size_y) = (np.asarray(p["units"][kind]) for kind in "uy")
+    by = size_y[:, None]
+    return {
+        "step_s": float(case.courses[0].dt[0]), "input_mean": mean_u, "A": a[:n, :n],
+        "B": b[:n] / size_u, "C": by * c[:, :n], "D": by * d / size_u,
+        "output_at_mean": mean_y + size_y * offset,
+    }  # fmt: skip

@@ -1,0 +1,146 @@
+"""Which order a linear state space has: fits of one after the other, and their criterion."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from beamfit.greybox.problem import Free
+from beamfit.studies.response.fit import used_by
+from beamfit.studies.response.realise import LINEAR, normal_form, padded, realisations
+from beamfit.studies.response.shooting import Case, Trained, rest_of, trained
+
+__all__ = ["Tried", "count_of", "criterion", "free_of", "largest_order", "orders"]
+
+# States of the programs that search: what an order does not need is held at 0, so that all orders
+# of a size are compiled once. The search ends after so many orders that are no better.
+SIZES, BEYOND = (4, 10), 2
+# Starts of an order that are searched from, of those that foretell best; readings a free number.
+BEGINS, EACH = 2, 3
+# Pole and weight in the output of a state that is added to an order, and not seen yet.
+NEW, FAINT = 0.6, 1e-3
+
+
+class Tried(NamedTuple):
+    """A fit of an order, with a direct path from inputs to outputs or without."""
+
+    order: int
+    direct: bool
+    case: Case
+    found: Trained
+
+
+def count_of(case: Case) -> int:
+    """How many readings there are."""
+    return sum(len(m) for s in case.seen for m in s.measured)
+
+
+def largest_order(case: Case) -> int:
+    """The largest order that leaves a few readings to each free number."""
+    k, m = len(case.seen), len(case.seen[0].inputs)
+    return int((count_of(case) / EACH - k * (m + 1)) / (m + k + len(case.courses)))
+
+
+def orders(case: Case, order: int | None, offset: bool) -> tuple[Tried, list[dict[str, Any]]]:
+    """Fit 1, 2, … states, or as many as asked for; give the best, and what was tried."""
+    tried: list[Tried] = []
+    for n in [order] if order else range(1, min(SIZES[-1], largest_order(case)) + 1):
+        tried.append(_tried(case, n, offset, tried[-1] if tried else None))
+        told = criterion([t.found for t in tried])
+        if n - tried[int(np.argmin(told))].order >= BEYOND:
+            break
+    full = tried[int(np.argmin(told))]
+    model = full.found.fit.model
+    p = model["p"] | {"d": 0.0 * model["p"]["d"]}
+    bounded = case._replace(free=free_of(case, full.order, len(p["z"]), offset, False))
+    plain = Tried(full.order, False, bounded, trained(bounded, [model | {"p": p}]))
+    tried.append(plain)
+    told = criterion([t.found for t in tried], tried[-2].found)
+    best = plain if told[-1] <= min(told[:-1]) else full
+    return best, [{"order": t.order, "direct": t.direct, "bic": v}
+                  for t, v in zip(tried, told, strict=True)]  # fmt: skip
+
+
+def criterion(found: Sequence[Trained], last: Trained | None = None) -> list[float]:
+    """The Bayesian information criterion of fits, with the independent readings of the last."""
+    last, worth = last or found[-1], []
+    for k in range(len(last.rest[0])):
+        rows = [row[k] for row in last.rest]
+        both = sum(float(r[1:] @ r[:-1]) for r in rows)
+        share = np.clip(both / max(sum(float(r @ r) for r in rows), 1e-300), 0.0, 0.999)
+        worth.append([len(r) * (1.0 - share) / (1.0 + share) for r in rows])
+    each = np.array(worth).T
+    cost = np.log(np.sum(each))
+    return [float(np.sum(2.0 * each * np.log(f.noise)) + used_by(f.fit) * cost) for f in found]
+
+
+def free_of(case: Case, order: int, size: int, offset: bool, direct: bool) -> tuple[Free, ...]:
+    """What is free of a model of so many states: what an order does not need is held at 0."""
+    k, m, runs = len(case.seen), len(case.seen[0].inputs), len(case.courses)
+    used = np.arange(size) < order
+    parts = {
+        "p.z": np.tile(used[:, None], (1, m)), "p.c": np.tile(used, (k, 1)),
+        "p.d": np.full((k, m), direct), "p.offset": np.full(k, offset),
+        "start": np.tile(used, (runs, 1)),
+    }  # fmt: skip
+    return tuple(Free(name, np.where(on, -np.inf, 0.0), np.where(on, np.inf, 0.0), nuisance=True)
+                 for name, on in parts.items())  # fmt: skip
+
+
+def _tried(case: Case, n: int, offset: bool, before: Tried | None) -> Tried:
+    """The fit of an order from its best realisations, and from the order before and one more."""
+    size = next((s for s in SIZES if s >= n), n)
+    bounded = case._replace(free=free_of(case, n, size, offset, True))
+    units, k, m = _units(case, offset), len(case.seen), len(case.seen[0].inputs)
+
+    def model(a, b, c, d, level, start):
+        around, c, to = normal_form(a, b, c)
+        p = {"z": np.zeros((n, m)), "around": around, "c": c, "d": d, "offset": level}
+        return padded({"p": p | {"units": units}, "start": start @ to.T}, size)
+
+    u, y = _scaled(case, units)
+    rest = np.zeros(k), np.zeros((len(y), n))
+    models = [model(*found, *rest) for found in realisations(u, y, n)]
+    models = sorted((each for each in models if np.isfinite(_missed(case, each))),
+                    key=lambda each: _missed(case, each))[:BEGINS]  # fmt: skip
+    if before is not None:
+        old, last = before.order, before.found.fit.model
+        a, b, c, d, level = map(np.asarray, LINEAR.matrices(last["p"]))
+        a = np.diag([*np.zeros(old), NEW]) + np.pad(a[:old, :old], ((0, 1), (0, 1)))
+        b, c = np.vstack([b[:old], np.ones(m)]), np.hstack([c[:, :old], np.full((k, 1), FAINT)])
+        start = np.pad(np.asarray(last["start"])[:, :old], ((0, 0), (0, 1)))
+        models.append(model(a, b, c, d, level, start))
+    if not models:  # runs too short for a regression
+        a = np.diag(NEW ** np.arange(1.0, n + 1))
+        models = [model(a, np.ones((n, m)), np.full((k, n), FAINT), np.zeros((k, m)), *rest)]
+    return Tried(n, True, bounded, trained(bounded, models))
+
+
+def _units(case: Case, offset: bool) -> dict[str, np.ndarray]:
+    """Mean and size of inputs and outputs; without an offset all is about 0."""
+    seen = case.seen[0]
+    y = np.array([np.mean(np.concatenate(s.measured)) for s in case.seen])
+    return {
+        "u": np.stack([offset * seen.mean_u, np.where(seen.size_u > 0, seen.size_u, 1.0)]),
+        "y": np.stack([offset * y, [s.size_y for s in case.seen]]),
+    }
+
+
+def _scaled(case: Case, units: dict[str, np.ndarray]) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    """Inputs and outputs of the runs in units, without padding; missing readings bridged."""
+    u, y = [], []
+    for i, run in enumerate(case.seen[0].runs):
+        count = int(np.count_nonzero(np.asarray(run.dt))) + 1
+        u.append((np.asarray(run.u)[:count] - units["u"][0]) / units["u"][1])
+        read = [np.interp(np.arange(count), np.asarray(s.runs[i].index), s.measured[i])
+                for s in case.seen]  # fmt: skip
+        y.append((np.stack(read, axis=1) - units["y"][0]) / units["y"][1])
+    return u, y
+
+
+def _missed(case: Case, model: Any) -> float:
+    """What a start leaves of the outputs, in units of their scatter."""
+    return sum(float(np.sum((r / s.size_y) ** 2)) for row in rest_of(case, model)
+               for r, s in zip(row, case.seen, strict=True))  # fmt: skip

@@ -1,0 +1,97 @@
+"""State spaces identified from SIMULATED runs: values within their errors, orders, verdicts."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.signal import cont2discrete, dlsim
+
+from beamfit.dynamics.states import StateSpace
+from beamfit.errors import InputError
+from beamfit.status import Status
+from beamfit.studies.response.linear import identify_states
+from beamfit.studies.response.record import Run
+from beamfit.studies.response.states import fit_states
+
+
+def steps(n, rng, every):
+    return np.repeat(rng.normal(size=n // every + 1), every)[:n]
+
+
+def near(fit, **truths):
+    for name, truth in truths.items():
+        q = fit.quantities[name]
+        assert abs(q.value - truth) < 4 * q.error, (name, q, truth)
+
+
+def test_a_user_s_equations_at_uneven_samples_with_readings_missing_in_two_runs():
+    rng = np.random.default_rng(1)
+
+    def flow(x, u, p):
+        lag, follow = p["tau"]
+        return jnp.stack([u[0] - x[0] / lag, (x[0] - x[1]) / follow + p["k"] * u[1]])
+
+    plant = StateSpace(flow, lambda x, u, p: x + p["o"])
+    truth = {"tau": np.array([3.0, 8.0]), "k": 0.7, "o": np.array([1.0, -2.0])}
+
+    def run_of(n, name, x0):
+        dt = rng.uniform(0.3, 1.5, n)
+        u = np.stack([steps(n, rng, 10), steps(n, rng, 7)], axis=1)
+        y = np.array(jax.jit(plant.run)(truth, jnp.asarray(u), jnp.asarray(dt), jnp.array(x0))[0])
+        y += rng.normal(size=y.shape) * [0.1, 0.3]
+        y[rng.random((n, 2)) < [0.2, 0.5]] = np.nan
+        time = np.concatenate([[0.0], np.cumsum(dt)[:-1]])
+        return Run(time, dict(zip("ab", u.T, strict=True)), dict(zip("lm", y.T, strict=True)), name)
+
+    runs = [run_of(120, "one", [0.0, 1.0]), run_of(70, "two", [2.0, -1.0])]
+    begin = {"tau": np.array([1.0, 1.0]), "k": 1.0, "o": np.zeros(2)}
+    fit = fit_states(runs, plant, begin, [0.0, 0.0], held=[run_of(60, "held", [1.0, 1.0])])
+    assert fit.status is Status.converged, fit.message
+    near(fit, **{"tau[0]": 3.0, "tau[1]": 8.0, "k": 0.7, "o[0]": 1.0, "o[1]": -2.0})
+    assert [len(y) for y in fit.fitted["l"]] == [np.isfinite(r.outputs["l"]).sum() for r in runs]
+    assert fit.held["m"][0].rms < 0.5
+
+
+def test_segments_find_a_chaotic_plant_from_where_the_free_run_goes_astray():
+    """E. Lorenz (1963), of which two states are read."""
+
+    def flow(x, u, p):
+        x, y, z = x
+        return jnp.stack([p["s"] * (y - x), x * (p["r"] - z) - y + u[0], x * y - p["b"] * z])
+
+    plant = StateSpace(flow, lambda x, u, p: x[jnp.array([0, 2])], parts=2)
+    rng, dt = np.random.default_rng(0), np.full(64, 0.06)
+    u, truth = rng.normal(size=(64, 1)), {"s": 10.0, "r": 28.0, "b": 8 / 3}
+    y = jax.jit(plant.run)(truth, jnp.asarray(u), jnp.asarray(dt), jnp.array([1.0, 1.0, 20.0]))[0]
+    y = y + 0.3 * rng.normal(size=y.shape)
+    run = Run(0.06 * np.arange(64), {"u": u[:, 0]}, {"x": y[:, 0], "z": y[:, 1]})
+    begin = {"s": 6.0, "r": 20.0, "b": 1.5}, [1.0, 1.0, 20.0]
+    alone = fit_states(run, plant, *begin, segments=1)
+    assert min(part.checks.free_run_percent for part in alone.parts) < 50.0
+    fit = fit_states(run, plant, *begin, segments=16)
+    assert fit.status is Status.converged, fit.message
+    near(fit, **truth)
+
+
+def test_poles_gains_and_the_order_of_two_inputs_and_outputs_are_found():
+    rng = np.random.default_rng(0)
+    b, c, d = rng.normal(size=(2, 2)), rng.normal(size=(2, 2)), np.zeros((2, 2))
+    a, b, c, d, _ = cont2discrete((np.array([[-0.1, 1.0], [-1.0, -0.1]]), b, c, d), 0.5)
+    u = np.stack([3.0 * steps(400, rng, 10) + 5.0, steps(400, rng, 7)], axis=1)
+    y = dlsim((a, b, c, d, 1.0), u)[1] * [1.0, 100.0] + [10.0, -300.0]
+    y += 0.05 * y.std(0) * rng.normal(size=y.shape)
+    y[rng.random(400) < 0.2, 1] = np.nan
+    run = Run(0.5 * np.arange(400), dict(zip("ab", u.T, strict=True)),
+              dict(zip("lm", y.T, strict=True)))  # fmt: skip
+    fit = identify_states(run)
+    assert (fit.status, fit.order) == (Status.converged, 2), fit.message
+    gains = c @ np.linalg.solve(np.eye(2) - a, b) * [[1.0], [100.0]]
+    near(fit, T1=1 / np.hypot(0.1, 1.0), zeta1=0.1 / np.hypot(0.1, 1.0))
+    near(fit, K_l_a=gains[0, 0], K_l_b=gains[0, 1], K_m_a=gains[1, 0], K_m_b=gains[1, 1])
+    found = fit.to_json()["matrices"]  # which stand for themselves
+    again = dlsim((*(np.array(found[k]) for k in "ABCD"), 1.0), u - found["input_mean"])[1]
+    rest = y - again - found["output_at_mean"]
+    late = rest[60:] - np.nanmean(rest[60:], 0)
+    assert np.all(np.nanstd(late, 0) < 0.2 * np.nanstd(y, 0))
+    with pytest.raises(InputError, match=r"order 60 with .* readings; expected 1 to"):
+        identify_states(run, 60)
