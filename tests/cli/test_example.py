@@ -68,6 +68,31 @@ def test_readme_shows_the_files_and_the_answer(run, tmp_path, root):
             assert " ".join(shown.split()) in said
 
 
+def test_the_tutorial_is_what_happens(run, tmp_path, root, monkeypatch):
+    text = (root / "docs/tutorial.md").read_text()
+    monkeypatch.chdir(tmp_path)
+    shown = [line for block in GROUP.findall(text) for line in block.splitlines(keepends=True)]
+    steps = re.split(r"^\$ ", "".join(shown), flags=re.MULTILINE)[1:]
+    for step in steps:
+        command, _, answer = step.partition("\n")
+        name, *arguments = command.split()
+        if name != "beamfit":
+            subprocess.run(command, shell=True, check=True)
+            continue
+        status, out, error = run(*arguments)
+        assert (status, error) == (0, ""), command
+        said = " ".join(out.split())
+        for part in answer.partition("import beamfit")[0].split("...\n"):
+            assert " ".join(part.split()) in said, command
+    assert len(steps) == 6
+    (script,) = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
+    capture = {}
+    exec(script, {"print": lambda *words: capture.setdefault("said", " ".join(map(str, words)))})
+    assert f"# {capture['said']}\n" in script
+    assert (tmp_path / "first/scan_y.png").is_file()
+    assert (tmp_path / "first/scan.html").is_file()
+
+
 def sizes_of(plane, current, emittance, beta, alpha):
     """Rms sizes in m behind the example's quadrupole and drift, written out anew."""
     momentum = np.sqrt(100.0**2 - 0.51099895**2)
