@@ -10,6 +10,7 @@ import csv
 import io
 import math
 from collections.abc import Iterable, Iterator, Mapping
+from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
 from beamfit.quantity import Quantity
@@ -29,15 +30,16 @@ ENDS = ("", "_error", "_error_raw", "_low_95", "_high_95")
 KEY = ("file", "sha256", "lattice_sha256", "options", "beamfit")
 
 
-def named(name: str, unit: str, ends: Iterable[str] = ENDS) -> list[str]:
+@lru_cache(maxsize=256)
+def named(name: str, unit: str, ends: tuple[str, ...] = ENDS) -> tuple[str, ...]:
     """The columns of a quantity.
 
     Examples
     --------
     >>> named("beta", "m", ("", "_error"))
-    ['beta_m', 'beta_error_m']
+    ('beta_m', 'beta_error_m')
     """
-    return [f"{name}{end}{WRITTEN.get(unit, f'_{unit}')}" for end in ENDS if end in ends]
+    return tuple(f"{name}{end}{WRITTEN.get(unit, f'_{unit}')}" for end in ends)
 
 
 def _every(quantities: Mapping[str, str]) -> list[str]:
@@ -122,8 +124,8 @@ def lines(rows: Iterable[Mapping[str, Any]], columns: Iterable[str]) -> str:
 
 
 def _cell(value: Any) -> Any:
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
     if isinstance(value, str):
         return value if value.isprintable() else " ".join(value.split())
-    if isinstance(value, bool):
-        return int(value)
-    return None if isinstance(value, float) and not math.isfinite(value) else value
+    return int(value) if isinstance(value, bool) else value

@@ -95,7 +95,7 @@ def courses_of(batch: Batch, name: str | None = None) -> list[Course]:
 
 
 def _points(
-    batch: Batch, columns: list[str]
+    batch: Batch, columns: tuple[str, ...]
 ) -> Iterator[tuple[int, tuple[str, str, float, float]]]:
     own = COLUMNS[batch.ledger.job.kind]
     value, error = (own.index(column) for column in columns[:2])

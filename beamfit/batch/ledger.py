@@ -15,7 +15,7 @@ import numpy as np
 from beamfit.batch.columns import COLUMNS, KEY, NUMBERS, UNUSABLE
 from beamfit.batch.job import Job
 from beamfit.errors import InputError
-from beamfit.io.files import digest
+from beamfit.io.files import digest_now
 from beamfit.writing import replacing, write_atomically
 
 # Rows that are turned from text into a table at a time.
@@ -64,7 +64,7 @@ class Ledger:
         """Whether the same was asked of the same file before."""
         place = self.places.get(file)
         try:
-            return place is not None and place.sha256 == digest(file)
+            return place is not None and place.sha256 == digest_now(file)
         except InputError:
             return False
 

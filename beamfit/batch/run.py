@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import CancelledError
@@ -176,6 +177,7 @@ def _answers(
     # A task that waits at a worker is held for its death, too.
     one_each = {"distributed.scheduler.worker-saturation": 1.0}
     own = {"threads_per_worker": 1, "dashboard_address": None, "processes": True}
+    own["silence_logs"] = logging.CRITICAL  # what a worker died of is told by its file
     with ExitStack() as stack:
         stack.enter_context(dask.config.set(one_each))
         cluster = scheduler

@@ -36,6 +36,7 @@ LARGEST_PIPE = 256_000_000
 SILENCE = 30.0
 # SHA-256 of what was last read whole, by path: a file may change after that.
 _READ: dict[str, str] = {}
+MOST_KEPT = 10_000
 
 
 @lru_cache(maxsize=8)
@@ -198,6 +199,8 @@ def read_json(path: str | PathLike[str], found: str, expected: str) -> Any:
 def remember(path: str | PathLike[str], seen: Any) -> str:
     """Keep the digest of what was read of a file, and give it."""
     found = _READ[os.path.abspath(path)] = seen.hexdigest()
+    if len(_READ) > MOST_KEPT:
+        del _READ[next(iter(_READ))]
     return found
 
 
@@ -210,5 +213,10 @@ def digest(path: str | PathLike[str]) -> str:
     """SHA-256, as hexadecimal digits: of what was last read of a file, else of what it holds."""
     if (known := _READ.get(os.path.abspath(path))) is not None:
         return known
+    return digest_now(path)
+
+
+def digest_now(path: str | PathLike[str]) -> str:
+    """SHA-256 of what a file holds at present."""
     with _opened(path) as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()

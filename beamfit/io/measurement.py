@@ -16,7 +16,7 @@ from beamfit.io.files import name_of
 from beamfit.io.scan_columns import ENERGIES, SETTINGS, column_notes, scan_columns
 from beamfit.io.shots import average_shots
 from beamfit.io.table import UNITS, Column, Sheet, left_out, read_sheet
-from beamfit.studies.scan.scans import POSSIBLE, USUAL, QuadScan, first_unusable
+from beamfit.studies.scan.scans import POSSIBLE, USUAL, QuadScan, first_unusable, middle
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -165,19 +165,19 @@ def _positive(sheet: Sheet, column: Column, what: str) -> np.ndarray:
 def _usual(values: Mapping[str, np.ndarray]) -> dict[str, float]:
     """The median size of each plane that has one, m."""
     sizes = {p: values[f"size_{p}"] for p in "xy" if f"size_{p}" in values}
-    return {p: float(np.nanmedian(v)) for p, v in sizes.items() if not np.isnan(v).all()}
+    return {p: middle(v) for p, v in sizes.items() if not np.isnan(v).all()}
 
 
 def _check_slipped(sheet: Sheet, columns: Mapping[str, Column], usual: Mapping[str, float]) -> None:
     """Refuse a size that is far larger than the others of its column and than most beams."""
-    for plane, middle in usual.items():
+    for plane, usually in usual.items():
         column = columns[f"size_{plane}"]
         size = _positive(sheet, column, "beam size")
-        slipped = np.nan_to_num(size) > max(USUAL[1], SLIPPED * middle)
+        slipped = np.nan_to_num(size) > max(USUAL[1], SLIPPED * usually)
         if slipped.any():
             row = int(np.argmax(slipped))
             found = f"{size[row] / column.factor:g} {column.unit}, where the others are around "
-            found += f"{middle / column.factor:.3g}"
+            found += f"{usually / column.factor:.3g}"
             raise sheet.error(found, "sizes in one unit", row, column.header)
 
 
@@ -195,7 +195,7 @@ def _check_sizes(
             raise _implausible(sheet, column, usual[plane] / column.factor)
         if error is not None:
             with np.errstate(over="ignore"):
-                ratio = float(np.nanmedian(values[f"size_{plane}_error"] / values[f"size_{plane}"]))
+                ratio = middle(values[f"size_{plane}_error"] / values[f"size_{plane}"])
             if not 1e-6 < ratio < 1.0:
                 found = f"errors that are {ratio:g} of the sizes"
                 raise sheet.error(found, "errors in the unit of the header", None, error.header)

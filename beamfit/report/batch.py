@@ -36,10 +36,12 @@ from beamfit.table import Table, plain_name
 # Points beyond the limits, and files without an answer, that are listed; the former have pages.
 LISTED = 40
 RULE = (
-    "Limits are those of an individuals chart: the mean of the first 20 points (half of them if "
-    "there are fewer) ± 3 standard deviations from their mean moving range, Student's quantile; a "
-    "point is beyond if it is also 3 of its own errors away. Noise alone puts one in 370 there."
+    "Control limits are those of an individuals chart: the mean of the first 20 points (half of "
+    "them if there are fewer) ± 3 standard deviations from their mean moving range, Student's "
+    "quantile; a point is beyond if it is also 3 of its own errors from the mean."
 )
+# How many points noise puts there.
+BY_CHANCE = 1 / 370
 
 
 def write_batch_report(
@@ -99,9 +101,9 @@ def _page(
         tables += [Table(title, ["file", plain_name(c.name)], rows[:LISTED], more)] * bool(rows)
     if batch.refused:
         more = f"the first {LISTED} of {len(batch.refused)}; all are in the table of answers"
-        rows = [list(item) for item in islice(batch.refused.items(), LISTED)]
+        rows = [[reason] for reason in islice(batch.refused.values(), LISTED)]
         note = more if len(batch.refused) > LISTED else ""
-        tables.append(Table("Without an answer", ["file", "reason"], rows, note))
+        tables.append(Table("Without an answer", ["file and reason"], rows, note))
     pictures = [
         Picture(f"course of {_label(c)}", 2.8, partial(draw_course, course=c)) for c in courses
     ]
@@ -115,7 +117,7 @@ def _page(
         pictures=pictures,
         pictures_title="Course, in the order of the files",
         provenance=provenance(inputs, remarks, command),
-        notes=(),
+        notes=(RULE,),
         links=links,
     )
 
@@ -125,16 +127,18 @@ def _label(c: Course) -> str:
 
 
 def _verdict(c: Course) -> Verdict:
-    beyond = int(c.beyond.sum())
+    beyond, points = int(c.beyond.sum()), len(c.value)
     status = Status.poor_fit if beyond else Status.converged
     if not math.isfinite(c.limit):
-        return Verdict(
-            Status.unidentified, f"{_label(c)}: too few points to say what is usual", RULE
-        )
+        few = f"{points} points are too few to say what is usual."
+        return Verdict(Status.unidentified, _label(c), few)
     factor, unit = display_unit(abs(c.centre), c.unit)
-    usual = f"{c.centre / factor:.4g} ± {c.limit / factor:.2g} {unit}".strip()
-    said = f"{_label(c)}: usually {usual}; {beyond} of {len(c.value)} beyond"
-    return Verdict(status, said, RULE)
+    usual = f"{c.centre / factor:.3g} ± {c.limit / factor:.2g} {unit}".strip()
+    message = f"{beyond} of {points} points lie beyond the control limits"
+    message += (
+        f"; noise alone puts {max(points * BY_CHANCE, 1):.0f} or so there." if beyond else "."
+    )
+    return Verdict(status, f"{_label(c)}: usually {usual}", message)
 
 
 def draw_course(figure: FigureBase, course: Course) -> None:

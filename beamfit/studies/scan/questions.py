@@ -10,7 +10,7 @@ from beamfit.optics.beamline import Beamline
 from beamfit.optics.calibration import CurrentTable
 from beamfit.optics.elements import Quadrupole
 from beamfit.optics.particle import rigidity
-from beamfit.studies.scan.scans import USUAL, QuadScan
+from beamfit.studies.scan.scans import USUAL, QuadScan, middle
 
 # Gradients in T/m beyond which a magnet is a plasma lens at least, and beyond any lens.
 STRONG, IMPOSSIBLE = 500.0, 1e4
@@ -74,11 +74,11 @@ def questions(scan: QuadScan, scanned: Beamline) -> tuple[str, ...]:
 def of_sizes(scan: QuadScan) -> Iterator[str]:
     """Ask about the sizes alone."""
     for plane, size in scan.size.items():
-        middle = float(np.nanmedian(size))
-        if not USUAL[0] <= middle <= USUAL[1]:
-            unusual = "large" if middle > USUAL[1] else "small"
+        usual = middle(size)
+        if not USUAL[0] <= usual <= USUAL[1]:
+            unusual = "large" if usual > USUAL[1] else "small"
             yield (
-                f"Sizes in {plane} around {1e3 * middle:.3g} mm are taken as they stand, but are "
+                f"Sizes in {plane} around {1e3 * usual:.3g} mm are taken as they stand, but are "
                 f"unusually {unusual}: is that the unit they are in?"
             )
 
