@@ -6,7 +6,7 @@ export OPENBLAS_NUM_THREADS := 1
 export OMP_NUM_THREADS := 1
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
-.PHONY: demo test docs calibrate coverage mutations bench lint clean
+.PHONY: demo test docs calibrate coverage soak bench lint clean
 .DEFAULT_GOAL := demo
 
 .venv/runtime: pyproject.toml constraints.txt
@@ -41,9 +41,9 @@ calibrate: .venv/test
 coverage: .venv/test
 	BEAMFIT_COVERAGE=500 $(BIN)/python -m pytest --quiet tests/studies/test_coverage.py tests/studies/test_systematics.py
 
-# Files with bytes changed, read or refused in one line: 3000 of each kind; 10 000 documents.
-mutations: .venv/test
-	BEAMFIT_MUTATIONS=9000 $(BIN)/python -m pytest --quiet tests/io/test_mutated_files.py
+# Damaged files, read or refused in one line: 10 000 of every kind, and 10 000 documents. Hours.
+soak: .venv/test
+	$(BIN)/python -m tests.soak 10000
 	BEAMFIT_DOCUMENTS=10000 $(BIN)/python -m pytest --quiet tests/language/test_mutated_documents.py
 
 lint: .venv/test

@@ -31,6 +31,10 @@ DISCRETE = 4
 DEEPEST = 200
 
 
+def _is_count(word: str) -> bool:
+    return word.isdecimal() and len(word) < 10
+
+
 class _Lines:
     """The lines of a file one after the other, and the errors of the last."""
 
@@ -66,7 +70,7 @@ class _Lines:
 
     def counts(self, number: int, expected: str) -> list[int]:
         words = self.next(expected)
-        if len(words) < number or not all(word.isdecimal() for word in words[:number]):
+        if len(words) < number or not all(map(_is_count, words[:number])):
             raise self.wrong(f"'{' '.join(words)}'", expected)
         return [int(word) for word in words[:number]]
 
@@ -111,8 +115,11 @@ def read_nl(path: str | PathLike[str]) -> Problem:
     said = _header(lines)
     while not lines.done:
         words = lines.next("a segment")
-        if words:
-            _segment(lines, said, words)
+        try:
+            if words:
+                _segment(lines, said, words)
+        except RecursionError:
+            raise lines.wrong("sums nested without end", f"at most {DEEPEST}") from None
     return _problem(Path(path), said)
 
 
@@ -140,9 +147,9 @@ def _segment(lines: _Lines, said: _Stated, words: list[str]) -> None:
         raise lines.wrong(what or f"'{words[0]}'", f"{known}; restate what this one says")
     read, size = SEGMENTS[kind]
     limit = size(said)
-    numbers = [*([rest] if limit else []), *(words[1:2] if kind == "S" else words[1:])]
-    if not all(word.isdecimal() for word in numbers) or (limit and int(rest) >= limit):
-        expected = f"{kind}, a number below {limit}" if limit else f"{kind} and numbers"
+    numbers = [*([] if limit is None else [rest]), *(words[1:2] if kind == "S" else words[1:])]
+    if not all(map(_is_count, numbers)) or (limit is not None and int(rest) >= limit):
+        expected = f"{kind} and numbers" if limit is None else f"{kind}, a number below {limit}"
         raise lines.wrong(f"'{' '.join(words)}'", expected)
     read(lines, said, kind, [int(word) for word in numbers] + [0])
 
@@ -244,9 +251,9 @@ def _expression(lines: _Lines, said: _Stated, depth: int = 0) -> Node:
             return constant(float(rest))
         except ValueError:
             raise lines.wrong(f"'{word}'", "a number") from None
-    if kind == "v" and rest.isdecimal():
+    if kind == "v" and _is_count(rest):
         return _known(lines, said, int(rest))
-    if kind != "o" or not rest.isdecimal() or int(rest) not in OPCODES:
+    if kind != "o" or not _is_count(rest) or int(rest) not in OPCODES:
         what = f"operation '{word}'" if kind in ("o", "f") else f"'{word}'"
         raise lines.wrong(what, "one of o0 to o58 that compute numbers, n or v")
     head = OPCODES[int(rest)]

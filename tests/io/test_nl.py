@@ -96,6 +96,9 @@ def test_a_file_written_by_hand(tmp_path):
         ("n2\n", "nx\n", "p.nl:27: 'nx'"),
         ("k1\n", "L0\n", "p.nl:37: a logical constraint"),
         ("1 0\n", "1\n", "p.nl:"),
+        (" 2 2 1 1 1", " 2 0 1 1 1", "p.nl:15: 'C0'"),
+        ("v2\n", f"v{'9' * 5000}\n", "p.nl:"),
+        ("o41\n", "o54\n2\n" * 2000, "sums nested without end"),
         ("G0 2\n0 2\n1 0\n", "G0 9\n0 2\n1 0\n", "p.nl:47: the end of the file"),
     ],
 )

@@ -1,6 +1,6 @@
 """Damaged documents are read or refused in one line: no traceback, no hang, no growth.
 
-`make mutations` reads 10 000; BEAMFIT_DOCUMENTS says how many. Each is parsed and checked, every
+`make soak` reads 10 000; BEAMFIT_DOCUMENTS says how many. Each is parsed and checked, every
 tenth of those that are right is compiled and evaluated too.
 """
 
