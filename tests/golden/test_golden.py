@@ -11,6 +11,7 @@ import os
 import re
 import subprocess
 import sys
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -63,13 +64,36 @@ ROUNDING = {
 }
 
 
-def said(arguments):
+# A command as text and then as JSON: what takes seconds is loaded once for both.
+BOTH = """
+import sys
+from beamfit.cli import main
+given = sys.argv
+for form in ([], ["--json"]):
+    sys.argv = given + form
+    try:
+        main()
+    except SystemExit as end:
+        print(f"\x1c{end.code}", end="\x1c", flush=True)
+"""
+
+
+def said(arguments, program="from beamfit.cli import main; main()"):
     """Status, output and error line of a command in a process of its own."""
-    call = [sys.executable, "-c", "from beamfit.cli import main; main()", *arguments.split()]
+    call = [sys.executable, "-c", program, *arguments.split()]
     done = subprocess.run(
         call, cwd=ROOT, capture_output=True, text=True, env=os.environ | {"COLUMNS": "100"}
     )
     return done.returncode, done.stdout, done.stderr
+
+
+@cache
+def both(name):
+    """What a command says as text and as JSON, where it answers."""
+    _, out, error = said(COMMANDS[name], BOTH)
+    text, status, found, other, rest = out.split("\x1c")
+    assert (status, other, rest) == ("0", "0", ""), error
+    return {"txt": text, "json": found}
 
 
 def split(text):
@@ -116,20 +140,16 @@ def same(found, expected, small):
 
 @pytest.mark.parametrize("name", COMMANDS)
 def test_text(name):
-    status, out, _ = said(COMMANDS[name])
-    words, numbers = split(out)
+    words, numbers = split(both(name)["txt"])
     expected, others = split((EXPECTED / f"{name}.txt").read_text())
-    assert status == 0
     assert words == expected
     assert alike(numbers, others, SHOWN)
 
 
 @pytest.mark.parametrize("name", COMMANDS)
 def test_json(name):
-    status, out, _ = said(COMMANDS[name] + " --json")
     expected = json.loads((EXPECTED / f"{name}.json").read_text())
-    assert status == 0
-    assert list(differences(json.loads(out), expected, name)) == []
+    assert list(differences(json.loads(both(name)["json"]), expected, name)) == []
 
 
 @pytest.mark.parametrize("name", REFUSED)
@@ -141,11 +161,9 @@ def test_refusal(name):
 
 def write(names):
     """Write what is said now as what is expected."""
-    for name, command in COMMANDS.items():
+    for name in COMMANDS:
         if not names or name in names:
-            for form, options in (("txt", ""), ("json", " --json")):
-                status, out, error = said(command + options)
-                assert status == 0, error
+            for form, out in both(name).items():
                 (EXPECTED / f"{name}.{form}").write_text(out)
     for name, command in REFUSED.items():
         if not names or name in names:
