@@ -291,16 +291,8 @@ def _unpacked(summary: Array, residuals: Array) -> Solution:
     correlation, squares, fall, done = leaves[3 * size :]
     # The exponent is only looked at, and may have no value.
     finite = np.isfinite(leaves[: size - 1]).all(axis=0)
-    return Solution(
-        values=values,
-        errors=errors,
-        drift=drift,
-        correlation=correlation,
-        residuals=np.asarray(residuals),
-        sum_squares=squares,
-        fall=fall,
-        converged=(done > 0) & finite,
-    )
+    residuals, converged = np.asarray(residuals), (done > 0) & finite
+    return Solution(values, errors, drift, correlation, residuals, squares, fall, converged)
 
 
 @partial(jax.jit, static_argnames="shape")

@@ -168,17 +168,9 @@ def _determined(e: Weighed | TableEvidence) -> Finding:
     return Finding(Status.converged, f"{clear}{limits}")
 
 
-RULES = (
-    _lost,
-    partial(_negative, "b", NOT_GAS),
-    partial(_negative, "a", RISING),
-    _within_noise,
-    _stepped,
-    _refuted,
-    _inseparable,
-    _improbable,
-    _determined,
-)
+NEGATIVE = (partial(_negative, "b", NOT_GAS), partial(_negative, "a", RISING))
+RULES = (_lost, *NEGATIVE, _within_noise, _stepped, _refuted)
+RULES += (_inseparable, _improbable, _determined)
 
 
 def _narrow(e: TableEvidence) -> Finding | None:
@@ -200,14 +192,7 @@ def _unlikely(e: Weighed | TableEvidence) -> Finding | None:
     )
 
 
-TABLE_RULES = (
-    partial(_negative, "b", NOT_GAS),
-    partial(_negative, "a", RISING),
-    _refuted,
-    _narrow,
-    _unlikely,
-    _determined,
-)
+TABLE_RULES = (*NEGATIVE, _refuted, _narrow, _unlikely, _determined)
 
 
 def finding_of_table(evidence: TableEvidence) -> Finding:
@@ -256,17 +241,8 @@ def _rises(e: Weighed) -> Finding | None:
     return Finding(Status.infeasible, cause)
 
 
-CYCLE_RULES = (
-    _rises,
-    partial(_negative, "b", NOT_GAS),
-    partial(_negative, "a", RISING),
-    _within_noise,
-    _parts_differ,
-    _refuted,
-    _one_current,
-    _unlikely,
-    _determined,
-)
+CYCLE_RULES = (_rises, *NEGATIVE, _within_noise, _parts_differ, _refuted)
+CYCLE_RULES += (_one_current, _unlikely, _determined)
 
 
 def finding_of_cycles(evidence: Weighed) -> Finding:
@@ -377,16 +353,8 @@ def _odd_clock(e: Evidence) -> str | None:
     )
 
 
-REMARKS = (
-    _moved,
-    _noise_inferred,
-    _cautious,
-    _correlated,
-    _wandering,
-    _quantised,
-    _drifting,
-    _odd_clock,
-)
+REMARKS = (_moved, _noise_inferred, _cautious, _correlated)
+REMARKS += (_wandering, _quantised, _drifting, _odd_clock)
 
 
 def finding_of(evidence: Evidence) -> Finding:

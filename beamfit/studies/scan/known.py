@@ -251,16 +251,9 @@ def _work(
         known=known,
     )
     points = points._replace(pull=pulls(points, seen.rows.squared))
-    covariance = fit.covariance * unit**2
-    return Work(
-        points=points,
-        fit=fit,
-        value=found.value[i],
-        error=found.error[i] * unit,
-        covariance=covariance,
-        scale=scale,
-        evidence=_evidence(fit, points, chi2, dof, noise, scale, unit),
-    )
+    error, covariance = found.error[i] * unit, fit.covariance * unit**2
+    evidence = _evidence(fit, points, chi2, dof, noise, scale, unit)
+    return Work(points, fit, found.value[i], error, covariance, scale, evidence)
 
 
 def pulls(p: Points, squared: bool) -> np.ndarray:

@@ -131,24 +131,19 @@ def solve_size_squared(data: SizeData, weights: str = "model") -> SigmaFit:
     scale = 0.5 / (size * error)
     target, design = (data.size**2 - data.known) * scale, data.design * scale[:, None]
     sigma, covariance, full_rank = _least_squares(design, target)
-    determinant = sigma[0] * sigma[2] - sigma[1] ** 2
-    gradient = jnp.stack([sigma[2], -2.0 * sigma[1], sigma[0]])
+    determinant, determinant_error = _determinant(sigma, covariance)
     degenerate, chi2_zero = zero_emittance(data.r11, data.r12, target, scale)
     positive = full_rank & (determinant > 0.0) & (sigma[0] > 0.0)
     best = jnp.where(positive, sigma, degenerate)
-    return SigmaFit(
-        sigma=best,
-        covariance=covariance,
-        chi2=jnp.sum((design @ best - target) ** 2),
-        determinant=determinant,
-        determinant_error=jnp.sqrt(gradient @ covariance @ gradient),
-        chi2_zero=chi2_zero,
-        full_rank=full_rank,
-        positive=positive,
-        converged=jnp.asarray(True),
-        error=error,
-        weighed=size,
-    )
+    chi2, rested = jnp.sum((design @ best - target) ** 2), jnp.asarray(True)
+    judged = determinant, determinant_error, chi2_zero, full_rank, positive, rested
+    return SigmaFit(best, covariance, chi2, *judged, error, size)
+
+
+def _determinant(sigma: Array, covariance: Array) -> tuple[Array, Array]:
+    """Of the beam matrix, with its error."""
+    gradient = jnp.stack([sigma[2], -2.0 * sigma[1], sigma[0]])
+    return sigma[0] * sigma[2] - sigma[1] ** 2, jnp.sqrt(gradient @ covariance @ gradient)
 
 
 def _weighed(data: SizeData, weights: str) -> tuple[Array, Array]:
@@ -196,13 +191,9 @@ def _inverse_triangle(r: Array) -> Array:
     a, b, c = r[0, 0], r[1, 1], r[2, 2]
     r01, r02, r12 = r[0, 1], r[0, 2], r[1, 2]
     zero = jnp.zeros_like(a)
-    return jnp.stack(
-        [
-            jnp.stack([1 / a, -r01 / (a * b), (r01 * r12 - r02 * b) / (a * b * c)]),
-            jnp.stack([zero, 1 / b, -r12 / (b * c)]),
-            jnp.stack([zero, zero, 1 / c]),
-        ]
-    )
+    first = [1 / a, -r01 / (a * b), (r01 * r12 - r02 * b) / (a * b * c)]
+    rows = first, [zero, 1 / b, -r12 / (b * c)], [zero, zero, 1 / c]
+    return jnp.stack([jnp.stack(row) for row in rows])
 
 
 def solve_size(data: SizeData, weights: str = "model") -> SigmaFit:
@@ -231,13 +222,8 @@ def solve_size(data: SizeData, weights: str = "model") -> SigmaFit:
     unit = jnp.sqrt(jnp.abs(start.sigma[jnp.array([0, 2])]))
 
     def sigma_of(p: Array) -> Array:
-        return jnp.stack(
-            [
-                (p[0] * unit[0]) ** 2,
-                p[0] * p[1] * unit[0] * unit[1],
-                (p[1] ** 2 + p[2] ** 2) * unit[1] ** 2,
-            ]
-        )
+        a, b, c = unit[0] ** 2, unit[0] * unit[1], unit[1] ** 2
+        return jnp.stack([p[0] ** 2 * a, p[0] * p[1] * b, (p[1] ** 2 + p[2] ** 2) * c])
 
     def residual(p: Array) -> Array:
         squared = jnp.maximum(design @ sigma_of(p) + data.known, 1e-30)
@@ -250,8 +236,7 @@ def solve_size(data: SizeData, weights: str = "model") -> SigmaFit:
     sigma = sigma_of(end.theta)
     model = jnp.sqrt(design @ sigma + data.known)
     _, covariance, full_rank = _least_squares(design * (0.5 * scale / model)[:, None], data.size)
-    determinant = sigma[0] * sigma[2] - sigma[1] ** 2
-    gradient = jnp.stack([sigma[2], -2.0 * sigma[1], sigma[0]])
+    determinant, determinant_error = _determinant(sigma, covariance)
     chi2 = 2.0 * end.cost
     linear = 0.5 / (start.weighed * start.error)
     target = (data.size**2 - data.known) * linear
@@ -262,7 +247,7 @@ def solve_size(data: SizeData, weights: str = "model") -> SigmaFit:
         covariance=covariance,
         chi2=chi2,
         determinant=determinant,
-        determinant_error=jnp.sqrt(gradient @ covariance @ gradient),
+        determinant_error=determinant_error,
         chi2_zero=jnp.maximum(chi2, jnp.minimum(flat_chi2, start.chi2_zero)),
         full_rank=full_rank,
         positive=start.positive & (determinant > 0.0),
