@@ -111,40 +111,25 @@ def _left_open(u: Unknowns) -> Finding | None:
     return Finding(Status.unidentified, said, f"Needed: {u.remedy}." if u.remedy else "")
 
 
-def _poor_in_scenario(u: Unknowns) -> Finding | None:
-    if u.probability is None or u.probability >= POOR_FIT:
-        return None
-    ratio = u.chi2 / u.dof
-    words = (
-        f"Poor fit: chi2/dof = {ratio:.2g}; the sizes' errors are scaled by {math.sqrt(ratio):.1f}."
-    )
-    return Finding(Status.poor_fit, f"{words} {_in_scenario(u)}")
-
-
-def _determined_in_scenario(u: Unknowns) -> Finding:
-    return Finding(Status.converged, _in_scenario(u))
-
-
-def _in_scenario(u: Unknowns) -> str:
-    return (
+def _determined(u: Unknowns) -> Finding:
+    said = (
         f"Determined in scenario {u.scenario}{u.tied}: zero emittance is {u.distance:.0f} standard "
         f"errors away{few_words(u.rests_on)}.{u.remark}"
     )
+    if u.probability is None or u.probability >= POOR_FIT:
+        return Finding(Status.converged, said)
+    ratio = u.chi2 / u.dof
+    poor = f"Poor fit: chi2/dof = {ratio:.2g}; the sizes' errors are scaled by"
+    return Finding(Status.poor_fit, f"{poor} {math.sqrt(ratio):.1f}. {said}")
 
 
 # Of sizes when more than the beam is unknown.
-SCENARIO_RULES = (
-    _refuted_by_sizes, _no_answer, _left_open, _poor_in_scenario, _determined_in_scenario
-)  # fmt: skip
+SCENARIO_RULES = (_refuted_by_sizes, _no_answer, _left_open, _determined)
 
 
 # Ends of a search that are no answer.
-NO_ANSWER = (
-    Status.not_finite,
-    Status.infeasible,
-    Status.not_converged,
-    Status.contradictory_bounds,
-)
+NO_ANSWER = (Status.not_finite, Status.infeasible, Status.not_converged)
+NO_ANSWER += (Status.contradictory_bounds,)
 # How often errors are taken anew at most, and what change of them no longer matters.
 ROUNDS, SAME = 3, 1e-2
 # The noise of a record whose fit was refused.
