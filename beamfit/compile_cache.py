@@ -12,8 +12,6 @@ import warnings
 from pathlib import Path
 from typing import Any
 
-__all__ = ["prepare_jax"]
-
 # JAX's own names; in the environment they have capitals. Everything is kept: a command compiles
 # hundreds of small functions in milliseconds each.
 FOLDER = "jax_compilation_cache_dir"

@@ -7,8 +7,6 @@ from dataclasses import dataclass
 from difflib import get_close_matches
 from os import PathLike
 
-__all__ = ["InputError", "nearest"]
-
 # What no person wrote as a word: of a damaged file, say. Its beginning tells enough.
 ENDLESS = re.compile(r"(\S{60})\S{60,}")
 

@@ -11,8 +11,6 @@ from beamfit.quantity import Quantity
 if TYPE_CHECKING:
     from pandas import DataFrame
 
-__all__ = ["frame_of", "quantity_frame"]
-
 
 def frame_of(columns: Mapping[str, Sequence[Any]], index: Sequence[str] = ()) -> DataFrame:
     """Make a data frame of columns, some of them its index.

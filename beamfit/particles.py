@@ -2,8 +2,6 @@
 
 from typing import Any
 
-__all__ = ["ENERGY_KEYS", "REST_ENERGY", "expected_energy", "total_energy"]
-
 REST_ENERGY = {"electron": 0.51099895069, "positron": 0.51099895069, "proton": 938.27208943}
 """MeV, CODATA 2022 (NIST)."""
 ENERGY_KEYS = {"energy_MeV": "total", "kinetic_energy_MeV": "kinetic", "momentum_MeV": "momentum"}

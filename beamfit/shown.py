@@ -11,8 +11,6 @@ from typing import Any, TypeVar
 from beamfit.quantity import Quantity
 from beamfit.table import Table, cell, html_of
 
-__all__ = ["brief", "shown"]
-
 C = TypeVar("C", bound=type)
 # Letters of a text that are shown within another value, and things of a collection.
 LONGEST, MOST = 60, 6

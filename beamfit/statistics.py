@@ -10,17 +10,6 @@ from scipy.special import chdtrc, fdtrc, ndtr, stdtr, stdtrit
 
 from beamfit.quantity import NORMAL_REACH
 
-__all__ = [
-    "POOR_FIT",
-    "Directions",
-    "baseline",
-    "chi2_probability",
-    "control_limits",
-    "one_sided_probability",
-    "reach_of",
-    "scaled_directions",
-]
-
 # A fit this unlikely to be noise alone is a poor fit: the contract of the JSON output.
 POOR_FIT = 1e-3
 # Points that say what is usual: the first so many, half of them if there are fewer.

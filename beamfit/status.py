@@ -2,8 +2,6 @@
 
 from enum import StrEnum
 
-__all__ = ["Status"]
-
 
 class Status(StrEnum):
     """How a fit or a search for an optimum ended, always with a sentence beside it.

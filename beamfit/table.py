@@ -13,8 +13,6 @@ from beamfit.errors import plain
 from beamfit.quantity import Quantity
 from beamfit.status import Status
 
-__all__ = ["Table", "cell", "html_of", "json_of", "labelled", "plain_name", "text_of"]
-
 
 class Table(NamedTuple):
     """Rows of cells under a heading; an empty header leaves the head row out.

@@ -7,8 +7,6 @@ from typing import NamedTuple, TypeVar
 
 from beamfit.status import Status
 
-__all__ = ["Finding", "Rule", "judge"]
-
 Evidence = TypeVar("Evidence")
 
 

@@ -21,8 +21,6 @@ from beamfit.cli.setpoint import setpoint
 from beamfit.cli.solve import solve
 from beamfit.errors import LONGEST, InputError, plain, short
 
-__all__ = ["cli", "main"]
-
 
 @click.group(
     context_settings={"help_option_names": ["-h", "--help"]},

@@ -13,8 +13,6 @@ from beamfit.io.result import results_text
 from beamfit.io.understood import Understood, understand, with_lattice
 from beamfit.table import text_of
 
-__all__ = ["check"]
-
 EXAMPLE = """\b
 Examples:
   beamfit check measurements/lcls_otr2.csv lattices/lcls_otr2.toml

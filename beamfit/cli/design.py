@@ -17,8 +17,6 @@ from beamfit.table import text_of
 if TYPE_CHECKING:
     from beamfit.studies.scan.design import Advice
 
-__all__ = ["design"]
-
 # What `read_inputs` takes besides the scan.
 GIVEN = ["lattice", "use", "first", "last", "screen", "energy", "ignore", "skip_bad"]
 EXAMPLE = """\b

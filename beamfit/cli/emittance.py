@@ -23,8 +23,6 @@ if TYPE_CHECKING:
     from beamfit.studies.scan.size_methods import SizeMethods
     from beamfit.studies.scan.slices import SliceFits
 
-__all__ = ["emittance"]
-
 # What `read_inputs` takes besides the scan.
 GIVEN = ["lattice", "use", "first", "last", "screen", "energy", "particle"]
 GIVEN += ["ignore", "skip_bad", "size_method"]

@@ -8,8 +8,6 @@ import click
 
 from beamfit.io.example import write_example
 
-__all__ = ["example"]
-
 EXAMPLE = """\b
 Examples:
   beamfit example first

@@ -23,8 +23,6 @@ if TYPE_CHECKING:
     from beamfit.studies.decay.study import Decay, Machine, RecordStudy
     from beamfit.studies.decay.trend import Trend
 
-__all__ = ["lifetime"]
-
 EXAMPLE = """\b
 Examples:
   beamfit lifetime measurements/aps_1999_decay.csv

@@ -22,8 +22,6 @@ if TYPE_CHECKING:
     from beamfit.io.lattice import LatticeFile
     from beamfit.studies.scan.setpoint_result import Setpoint
 
-__all__ = ["setpoint"]
-
 EXAMPLE = """\b
 Examples:
   beamfit setpoint --lattice lattices/gtf.toml \\

@@ -17,8 +17,6 @@ from beamfit.report import PAGES, kind_of
 from beamfit.sampling.posterior import Posterior
 from beamfit.table import Table
 
-__all__ = ["Terminal"]
-
 
 def _style(status: Status) -> str:
     return f"bold {status.colour}"

@@ -13,8 +13,6 @@ from beamfit.io.files import digest
 if TYPE_CHECKING:
     from beamfit.language.solution import Solution
 
-__all__ = ["solve"]
-
 EXAMPLE = """\b
 Examples:
   beamfit solve formulations/appendix_d.bf
