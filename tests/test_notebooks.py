@@ -41,6 +41,28 @@ def test_the_lifetime_study_runs(executed):
     assert "Alarm: b moved by +5" in text
 
 
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("emittance_lcls", ["x converged 0.703 ± 0.015 µm", "0.782 µm (+5.1 errors)"]),
+        ("greybox_from_scratch", ["free: rms off by 0.2", "rising: rms off by 0.0"]),
+    ],
+)
+def test_the_small_ones_run_here(root, monkeypatch, capsys, name, words):
+    import nbformat
+
+    notebook = nbformat.read(root / f"docs/notebooks/{name}.ipynb", as_version=4)
+    code = [cell for cell in notebook.cells if cell.cell_type == "code"]
+    assert all(cell.execution_count == number for number, cell in enumerate(code, 1))
+    monkeypatch.chdir(root / "docs/notebooks")
+    exec("\n".join(cell.source for cell in code).replace("%matplotlib inline", ""), {})
+    said = capsys.readouterr().out
+    shipped = "".join(o.get("text", "") for cell in code for o in cell.outputs)
+    for word in words:
+        assert word in said
+        assert word in shipped
+
+
 def test_it_is_shipped_as_it_runs_and_imports_the_package_alone(root):
     import nbformat
 
