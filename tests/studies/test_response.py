@@ -171,6 +171,32 @@ def test_inputs_that_were_set_from_the_output_are_named(closed):
         assert not closed or fit.status is Status.poor_fit
 
 
+def test_readings_that_show_no_output_are_left_out_and_named():
+    run = run_of(FIRST_ORDER, constant(3.0, 2.0), noise=0.05)
+    level = run.outputs["level"].copy()
+    limit = np.quantile(level, 0.8)
+    high = level > limit  # a sensor at its end
+    level[high] = limit
+    level[[30, 90, 131]] = [30.0, -5.0, 12.0]
+    fit = identify(Run(run.time, run.inputs, {"level": level}), delay=0)
+    assert [each.count for each in fit.left_out][1:] == [3]
+    assert 0.7 * high.sum() < fit.left_out[0].count <= high.sum()
+    assert "3 readings far off their neighbours (run, the first at 15 s)" in fit.message
+    for name, truth in (("tau", 3.0), ("K", 2.0)):
+        assert abs(fit.quantities[name].value - truth) < 4 * fit.quantities[name].error
+        assert fit.quantities[name].error < 0.05 * truth
+
+
+def test_a_higher_order_of_a_first_order_plant_says_what_is_determined():
+    run = run_of(FIRST_ORDER, constant(3.0, 2.0))
+    for model, words in (("arx", "a pole and a zero cancel"), ("second-order", "shorter lag")):
+        fit = identify(run, model, delay=0)
+        assert fit.status is Status.unidentified
+        assert words in fit.message
+        assert abs(fit.quantities["K"].value - 2.0) < 4 * fit.quantities["K"].error < 0.4
+        assert fit.quantities["a1" if model == "arx" else "T"].error is None
+
+
 def test_inputs_that_move_together_have_no_gains_of_their_own():
     run = run_of(FIRST_ORDER, constant(3.0, 2.0))
     other = run.inputs["valve"] + 1e-6 * np.random.default_rng(1).normal(size=len(run))

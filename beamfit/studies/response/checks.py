@@ -56,6 +56,8 @@ class Checks(NamedTuple):
         By how much the Bayesian information criterion falls from constant parameters.
     together : tuple of str
         Inputs that the others give but for a thousandth of their variance.
+    first_order : bool
+        Whether a first order does as well.
     """
 
     free_run_percent: float
@@ -68,6 +70,7 @@ class Checks(NamedTuple):
     feedback_share: float
     against_constant: float | None
     together: tuple[str, ...] = ()
+    first_order: bool = False
 
     def rows(self) -> list[list[str]]:
         """Label and value."""
@@ -119,13 +122,14 @@ def checks_of(
     rest = np.concatenate(residuals)
     ahead = np.concatenate([_whitened(r, [_share(residuals)]) for r in residuals])
     (explained, chance), (later, fed) = _explained(seen, residuals, slopes, delay)
+    white = _white(residuals)
     if rest.std() <= CLOSE * seen.size_y:  # what is left is rounding, or the network's own detail
-        explained, chance, later, fed = 0.0, 1.0, 0.0, 1.0
+        explained, chance, later, fed, white = 0.0, 1.0, 0.0, 1.0, 1.0
     return Checks(
         percent(rest, y),
         percent(ahead, y),
         _chance(y, rest, used),
-        _white(residuals),
+        white,
         chance,
         explained,
         fed,

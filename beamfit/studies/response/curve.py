@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from beamfit.dynamics.response import SECOND_ORDER, Physics
+from beamfit.dynamics.response import ARX, FIRST_ORDER, SECOND_ORDER, Physics
 from beamfit.greybox.correlated import Memory
 from beamfit.greybox.fit import Derived, Fit
 from beamfit.quantity import Quantity
@@ -92,6 +92,9 @@ def _units(physics: Physics, m: int) -> list[str]:
 
 def _constants(model: Any, seen: Any) -> jax.Array:
     p = curves(model, (seen, seen.point[:1]))[0]
+    if seen.physics is ARX:  # settled, y = K u
+        m = seen.u.shape[1]
+        return jnp.concatenate([p, (p[2 : 2 + m] + p[2 + m :]) / (1.0 + p[0] + p[1])])
     if seen.physics is not SECOND_ORDER:
         return p
     # Both lags of eq 8 where there are two: T (zeta ± sqrt(zeta² - 1)).
@@ -112,6 +115,8 @@ def quantities_of(
     names, units = list(physics.parameters(seen.inputs)), _units(physics, m)
     if physics is SECOND_ORDER and found.value[1] > 1.0:
         names, units = [*names, "tau1", "tau2"], [*units, TIME, TIME]
+    if physics is ARX:
+        names, units = [*names, *FIRST_ORDER.parameters(seen.inputs)[1:]], [*units, *[GAIN] * m]
     said = {
         name: quantity(found, i, unit)
         for i, (name, unit) in enumerate(zip(names, units, strict=True))
@@ -152,7 +157,9 @@ def told(
 
     def is_open(name: str, q: Quantity) -> bool:
         wide = q.unit == TIME and q.error is not None and q.error > WIDE * abs(q.value)
-        return nothing or wide or name in joint
+        # Of a higher order that is a first one: its gains and its longer lag are told.
+        more = checks.first_order and not name.startswith(("K", "offset", "tau1"))
+        return nothing or wide or more or name in joint
 
     known = {n: q.open() if is_open(n, q) else q for n, q in quantities.items()}
     blank = (nothing or c.parameter in joint for c in curves)

@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
-import jax.numpy as jnp
 import numpy as np
 
 from beamfit.dynamics.response import PHYSICS, Physics
@@ -18,11 +17,12 @@ from beamfit.shown import shown
 from beamfit.status import Status
 from beamfit.studies.response.checks import Checks, HeldBack, checks_of, predict_held, slopes_of
 from beamfit.studies.response.curve import Curve, curves_of, quantities_of, told
+from beamfit.studies.response.misread import Misread, sound
 from beamfit.studies.response.model import Seen, network_of, output_of
 from beamfit.studies.response.noise import Noise
 from beamfit.studies.response.record import Run
-from beamfit.studies.response.settle import settled, used_by
-from beamfit.studies.response.starts import latest, start_of
+from beamfit.studies.response.settle import begun, is_first_order, settled, used_by
+from beamfit.studies.response.starts import latest
 from beamfit.studies.response.verdict import judged
 from beamfit.table import Table, json_of
 
@@ -74,6 +74,8 @@ class ResponseFit:
         What the residuals say.
     held : tuple of HeldBack
         How runs are predicted that were not used.
+    left_out : tuple of Misread
+        Readings that show no output; they are missing from ``runs`` and ``seen``.
     """
 
     output: str
@@ -91,6 +93,7 @@ class ResponseFit:
     memory: Noise | None
     checks: Checks
     held: tuple[HeldBack, ...] = ()
+    left_out: tuple[Misread, ...] = ()
 
     @property
     def parts(self) -> tuple[ResponseFit]:
@@ -128,6 +131,7 @@ class ResponseFit:
             | {"curves": [curve.to_json() for curve in self.curves]}
             | {"noise_rms": list(self.noise), "noise_memory": self.memory}
             | {"checks": self.checks._asdict(), "held_back": [h._asdict() for h in self.held]}
+            | {"left_out": [each._asdict() for each in self.left_out]}
         )
 
     def sample(self, **options: Any) -> Posterior:
@@ -220,8 +224,11 @@ def identify(
     shortest = min(len(run) for run in runs)
     if delay is not None and delay >= shortest - 1:
         raise InputError(f"a delay of {delay} samples", f"less than the {shortest} rows of a run")
-    given, (start, seen, delay) = delay, start_of(runs, output, physics, delay, offset)
-    plain = settled(seen, [(jnp.asarray(start.raw), start.first, (start.offset, offset))])
+    given = delay
+    runs, left_out, found = sound(
+        runs, output, lambda these: begun(these, output, physics, given, offset)
+    )
+    seen, delay, plain = found
     answer = plain
     if map == "network":
         raw, first, level = plain.start()
@@ -235,6 +242,7 @@ def identify(
         plain.likelihood - answer.likelihood if map == "network" else None,
         delay,
     )
+    checks = checks._replace(first_order=map == "constant" and is_first_order(found, offset))
     quantities = (
         quantities_of(answer.fit, answer.errors, seen, physics) if map == "constant" else {}
     )
@@ -243,7 +251,8 @@ def identify(
     ahead = tuple(predict_held(each, output, answer.fit, physics, delay) for each in held)
     evidence = (answer.fit, answer.rests, checks, quantities, curves, ahead, map)
     status, message = judged(*evidence, given is None and delay == latest(runs) > 0)
-    parts = (quantities, curves, answer.noise, answer.memory, checks, ahead)
+    message = " ".join([message, *(f"Left out: {each}." for each in left_out)])
+    parts = (quantities, curves, answer.noise, answer.memory, checks, ahead, left_out)
     return ResponseFit(output, status, message, model, map, delay, runs, seen, answer.fit, *parts)
 
 

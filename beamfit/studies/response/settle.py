@@ -7,14 +7,17 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from beamfit.dynamics.response import FIRST_ORDER, Physics
 from beamfit.greybox.correlated import Memory
 from beamfit.greybox.fit import Fit
 from beamfit.greybox.solve import solve
 from beamfit.status import Status
 from beamfit.studies.response.model import CLOSE, Seen, output_of, predicted, state
 from beamfit.studies.response.noise import Noise, innovations, noise_of, remembers
+from beamfit.studies.response.record import Run
+from beamfit.studies.response.starts import best_start, driven_by, start_of
 
-__all__ = ["Settled", "settled", "used_by"]
+__all__ = ["Begun", "Settled", "begun", "is_first_order", "settled", "used_by"]
 
 # Steps of a round, after which the noise is taken from the residuals again; rounds at most, those
 # with a memory of the noise, and the gain in -2 ln L below which nothing is gained any more.
@@ -91,6 +94,31 @@ def settled(seen: Seen, begins: Sequence[tuple]) -> Settled:
         if abs(before.likelihood - found.likelihood) < GAINED:
             break
     return found._replace(rests=rests, errors=found.remembered(seen)[0])
+
+
+class Begun(NamedTuple):
+    """Runs as the model sees them, the delay, and the fit with constant parameters."""
+
+    seen: Seen
+    delay: int
+    plain: Settled
+
+
+def begun(
+    runs: tuple[Run, ...], output: str, physics: Physics, delay: int | None, offset: bool
+) -> Begun:
+    """Identify with constant parameters; the delay among candidates if None."""
+    start, seen, delay = start_of(runs, output, physics, delay, offset)
+    return Begun(seen, delay, settled(seen, [start.begin(offset)]))
+
+
+def is_first_order(found: Begun, offset: bool) -> bool:
+    """Whether a first order does as well as a higher one, by the Bayesian information criterion."""
+    if found.seen.runs[0].physics is FIRST_ORDER:
+        return False
+    lower = found.seen._replace(runs=driven_by(found.seen, FIRST_ORDER))
+    begin = best_start(lower, offset).begin(offset)
+    return settled(lower, [begin]).likelihood <= found.plain.likelihood
 
 
 def used_by(fit: Fit) -> int:

@@ -27,6 +27,8 @@ LATEST, SHARE = 24, 0.1
 BETTER = 5.0
 # Time constants of the grid, and dampings of a second order.
 TIMES, DAMPINGS = 16, (0.2, 0.6, 1.0, 2.0)
+# A second lag of which less than this is left after a sample is none.
+FORGOTTEN = 1e-4
 
 
 class Start(NamedTuple):
@@ -36,6 +38,10 @@ class Start(NamedTuple):
     first: np.ndarray
     offset: float
     squares: float
+
+    def begin(self, offset: bool) -> tuple[jax.Array, np.ndarray, tuple[float, bool]]:
+        """Where a search begins: raw numbers, first states, and offset with whether it is free."""
+        return jnp.asarray(self.raw), self.first, (self.offset, offset)
 
 
 def best_start(seen: Seen, offset: bool) -> Start:
@@ -120,9 +126,11 @@ def _as_difference(seen: Seen, found: Start) -> Start:
     b1 = once[:, 0]
     b2 = twice[:, 0] + a1 * b1 - b1
     raw = ARX.raw(jnp.asarray(np.concatenate([[a1, a2], b1, b2])), m)
-    # The sample before the first, by running the state backwards.
+    # The sample before the first, by running the state backwards; a lag far below a sample has
+    # forgotten it.
+    back = np.linalg.inv(rest) if a2 > FORGOTTEN else np.eye(2)
     states = np.stack([
-        [s[0], np.linalg.solve(rest, s - np.stack(once, axis=1) @ np.asarray(r.u[0]))[0]]
+        [s[0], (back @ (s - np.stack(once, axis=1) @ np.asarray(r.u[0])))[0]]
         for s, r in zip(found.first, seen.runs, strict=True)
     ])  # fmt: skip
     return Start(np.asarray(raw), states, found.offset, found.squares)

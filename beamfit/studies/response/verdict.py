@@ -100,6 +100,17 @@ def _joint(e: Evidence) -> Finding | None:
     return Finding(Status.unidentified, cause, "Move one at a time, or leave one out.")
 
 
+def _lower(e: Evidence) -> Finding | None:
+    if not e.checks.first_order:
+        return None
+    cause = "A first order explains the runs as well: "
+    if "a1" in e.quantities:
+        cause += "a pole and a zero cancel, so that a1, a2, b1 and b2 are not determined; K is."
+    else:
+        cause += "the shorter lag is not told from 0, so that T and zeta are not determined."
+    return Finding(Status.unidentified, cause, "Use --model first-order.")
+
+
 def _open(e: Evidence) -> Finding | None:
     left = {n: q.unit for n, q in e.quantities.items() if q.error is None}
     left |= {
@@ -172,4 +183,4 @@ def _good(e: Evidence) -> Finding:
     return Finding(Status.converged, cause)
 
 
-RULES = (_lost, _nothing, _joint, _fed_back, _open, _refuted, _worse, _good)
+RULES = (_lost, _nothing, _joint, _fed_back, _lower, _open, _refuted, _worse, _good)

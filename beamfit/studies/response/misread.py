@@ -1,0 +1,107 @@
+"""Readings that show no output: single ones far off, and a sensor that stands still."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+from scipy.ndimage import median_filter
+
+from beamfit.studies.response.model import CLOSE, output_of
+from beamfit.studies.response.record import LEAST, Run
+from beamfit.studies.response.settle import Begun
+from beamfit.studies.response.starts import seen_of
+
+__all__ = ["Misread", "sound"]
+
+# Single readings off by so many times the noise are wrong, up to this share of all: more are the
+# process's own. The noise is what a median over some neighbours leaves; where the model moves, a
+# reading may be off by so many of its steps. They are looked for so often, each time beside a
+# fit without those found before.
+FAR, MOST, AROUND, MOVES, ROUNDS = 10.0, 0.05, 7, 3.0, 3
+# Equal readings stand still from so many on, if the process moves away by so many times the noise.
+HELD, AWAY = 8, 3.0
+
+
+class Misread(NamedTuple):
+    """Readings of a run that are left out: how many, the first one's time, and what they are."""
+
+    run: str
+    count: int
+    since: float
+    what: str
+
+    def __str__(self) -> str:
+        return f"{self.count} {self.what} ({self.run}, the first at {self.since:.4g} s)"
+
+
+def sound(
+    runs: tuple[Run, ...], output: str, begin: Callable[[tuple[Run, ...]], Begun]
+) -> tuple[tuple[Run, ...], tuple[Misread, ...], Begun]:
+    """Runs without readings that show no output, what those were, and the fit of the others."""
+    found, left_out = begin(runs), []
+    trial, _ = _without(runs, output, [_still(y) for y, _ in _beside(runs, output, found)], "")
+    if trial is not None:  # the process may stand still as well: a fit without them tells
+        other = begin(trial)
+        masks = [_still(y, f, max(other.plain.noise)) for y, f in _beside(runs, output, other)]
+        trial, which = _without(
+            runs, output, masks, "readings that stand still while the process moves"
+        )
+        if trial is not None:
+            runs, left_out, found = trial, [*left_out, *which], begin(trial)
+    for _ in range(ROUNDS):
+        masks = [_lone(y, f, found.seen.size_y) for y, f in _beside(runs, output, found)]
+        trial, which = _without(runs, output, masks, "readings far off their neighbours")
+        if trial is None:
+            break
+        runs, left_out, found = trial, [*left_out, *which], begin(trial)
+    return runs, tuple(left_out), found
+
+
+def _beside(
+    runs: tuple[Run, ...], output: str, found: Begun
+) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Readings of each run, and the free-running output there."""
+    seen = seen_of(runs, output, found.seen.runs[0].physics, found.delay)
+    pairs = zip(seen.measured, seen.runs, strict=True)
+    return [(y, np.asarray(output_of(found.plain.fit.model, run))) for y, run in pairs]
+
+
+def _without(
+    runs: tuple[Run, ...], output: str, masks: Sequence[np.ndarray], what: str
+) -> tuple[tuple[Run, ...] | None, list[Misread]]:
+    """Runs without some readings, and which; None if there are none, or too few others."""
+    kept, found = [], []
+    for run, mask in zip(runs, masks, strict=True):
+        y = run.outputs[output].copy()
+        rows = np.flatnonzero(np.isfinite(y))[mask]
+        y[rows] = np.nan
+        if np.isfinite(y).sum() < max(LEAST, len(rows)):
+            return None, []
+        kept.append(replace(run, outputs={**run.outputs, output: y}))
+        if rows.size:
+            found.append(Misread(run.name, int(rows.size), float(run.time[rows[0]]), what))
+    return (tuple(kept) if found else None), found
+
+
+def _lone(y: np.ndarray, fitted: np.ndarray, size: float) -> np.ndarray:
+    """Which readings lie off by themselves, beyond the noise and what the model moves nearby."""
+    rest = y - fitted
+    off = np.abs(rest - median_filter(rest, AROUND, mode="nearest"))
+    noise = max(1.4826 * float(np.median(off)), CLOSE * size)
+    steps = np.abs(np.diff(fitted, prepend=fitted[0], append=fitted[-1]))
+    far = off > FAR * noise + MOVES * (steps[1:] + steps[:-1])
+    return far & (far.mean() <= MOST)
+
+
+def _still(y: np.ndarray, fitted: np.ndarray | None = None, noise: float = 0.0) -> np.ndarray:
+    """Which readings belong to many equal ones; of which a model says otherwise, if given."""
+    edges = np.flatnonzero(np.diff(y, prepend=np.nan, append=np.nan) != 0)
+    mask = np.zeros(len(y), bool)
+    for a, b in pairwise(edges):
+        off = np.inf if fitted is None else float(np.sqrt(np.mean((y[a:b] - fitted[a:b]) ** 2)))
+        mask[a:b] = b - a >= HELD and off > AWAY * noise
+    return mask
