@@ -30,7 +30,7 @@ LIMIT = "NAME=LOW:HIGH, one of them may be left out, such as level=:3"
 
 @click.command(epilog=EXAMPLE)
 @click.argument("record", nargs=-1, required=True)
-@options("model map input output step delay no-offset")
+@options("model map input output step delay no-offset gain")
 @click.option(
     "--set",
     "wishes",
@@ -57,6 +57,13 @@ LIMIT = "NAME=LOW:HIGH, one of them may be left out, such as level=:3"
     metavar="OUTPUT=VALUE[@SECONDS]",
     help="Added to an output in the simulation, from a time on.",
 )
+@click.option(
+    "--hard",
+    multiple=True,
+    metavar="OUTPUT=SHARE:LOAD",
+    help="Keep an output's limits for certain: with gains off by a share, such as 0.2, and with "
+    "disturbances up to a size.",
+)
 @click.option("--horizon", type=click.IntRange(2), metavar="STEPS", help="Of a plan.")
 @click.option(
     "--every",
@@ -82,10 +89,12 @@ def control(
     step: float | None,
     delay: int | None,
     no_offset: bool,
+    gains: dict[str, tuple[float, float]],
     wishes: tuple[str, ...],
     limit: tuple[str, ...],
     rate: tuple[str, ...],
     disturb: tuple[str, ...],
+    hard: tuple[str, ...],
     horizon: int | None,
     every: int | None,
     smooth: float,
@@ -119,6 +128,7 @@ def control(
     from beamfit.studies.response.loop import simulate_loop
 
     settings = {"delay": delay, "offset": not no_offset, "hidden": hidden, "seed": seed}
+    settings |= {"gains": gains}
     wished = [name for name in runs[0].outputs if name in {t[0] for t in targets} | set(limits)]
     fits = [identify(runs, model, map, output=name, **settings)
             for name in wished or runs[0].outputs]  # fmt: skip
@@ -127,6 +137,7 @@ def control(
         inputs={n: v for n, v in limits.items() if n in runs[0].inputs},
         rates=rates,
         outputs={n: v for n, v in limits.items() if n in runs[0].outputs},
+        hard=gains_of(hard, "hard", "OUTPUT=SHARE:LOAD such as level=0.2:0.5"),
         horizon=horizon,
         every=every,
         smooth=smooth,

@@ -29,7 +29,7 @@ Examples:
 
 @click.command(epilog=EXAMPLE)
 @click.argument("record", nargs=-1, required=True)
-@options("model order map input output step delay no-offset")
+@options("model order map input output step delay no-offset gain")
 @click.option("--hold-back", multiple=True, metavar="RECORD", help="A run that is only predicted.")
 @options("hidden ignore skip-bad seed report json")
 def identify(
@@ -42,6 +42,7 @@ def identify(
     step: float | None,
     delay: int | None,
     no_offset: bool,
+    gains: dict[str, tuple[float, float]],
     hidden: int,
     hold_back: tuple[str, ...],
     ignore: tuple[str, ...],
@@ -61,6 +62,8 @@ def identify(
 
     if order is not None and model != STATES:
         raise InputError(f"--order {order} with --model {model}", f"--model {STATES}")
+    if gains and model == STATES:
+        raise InputError(f"--gain with --model {STATES}", "another --model: its gains have no limits")
     said = {"inputs": inputs, "outputs": outputs, "step": step}
     said |= {"ignore": ignore, "skip_bad": skip_bad}
     twice = [path for path in record if (*record, *hold_back).count(path) > 1]
@@ -77,7 +80,7 @@ def identify(
     else:
         from beamfit.studies.response.fit import identify as fit_response
 
-        options |= {"model": model, "delay": delay}
+        options |= {"model": model, "delay": delay, "gains": gains}
         fits = [fit_response(runs, output=name, **options) for name in runs[0].outputs]
     digests = {path: digest(path) for path in (*record, *hold_back)}
     if report is not None:

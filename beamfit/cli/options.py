@@ -126,7 +126,8 @@ SHARED: dict[str, Callable[..., Any]] = {
         multiple=True,
         metavar="NAME=LOW:HIGH",
         callback=_parsed(gains_of),
-        help="Transport network: limits of a gain such as dA_x/dQ2=:-0.0083, in place of signs.",
+        help="Transport network: limits of a gain such as dA_x/dQ2=:-0.0083, in place of signs. "
+        "Responses: limits that a parameter keeps for certain, K=1:3 or dK/dvalve=0:.",
     ),
     "anchor": click.option(
         "--anchor",

@@ -1,5 +1,6 @@
 """Responses identified from SIMULATED runs: values, errors, verdicts, and what is refused."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -99,6 +100,20 @@ def test_the_delay_is_found(delay):
     assert abs(tau2.value - 2.0 * (1.5 - np.sqrt(1.25))) < 4 * tau2.error
 
 
+def test_a_delay_of_no_whole_number_of_samples_is_estimated():
+    """One and a half samples: whole ones say that the model lacks a part of the response."""
+    valve = np.repeat(steps(200, np.random.default_rng(0)), 2)
+    late = np.concatenate([np.repeat(valve[:1], 3), valve])[:400, None]
+    y = simulate(FIRST_ORDER, jnp.tile(jnp.array([3.0, 2.0]), (400, 1)), jnp.asarray(late),
+                 jnp.full(400, 0.25), jnp.zeros(1))  # fmt: skip
+    level = np.asarray(y)[::2] + 0.05 * np.random.default_rng(2).normal(size=200)
+    fit = identify(Run(0.5 * np.arange(200), {"valve": valve[::2]}, {"level": level}))
+    assert fit.status is Status.converged, fit.message
+    for name, truth in (("tau", 3.0), ("K", 2.0), ("delay", 0.75)):
+        assert abs(fit.quantities[name].value - truth) < 4 * fit.quantities[name].error
+    assert fit.quantities["delay"].error < 0.03
+
+
 def test_runs_of_several_lengths_gaps_and_uneven_samples_are_one_fit():
     rng = np.random.default_rng(2)
     law = constant(3.0, 2.0)
@@ -179,8 +194,8 @@ def test_readings_that_show_no_output_are_left_out_and_named():
     level[high] = limit
     level[[30, 90, 131]] = [30.0, -5.0, 12.0]
     fit = identify(Run(run.time, run.inputs, {"level": level}), delay=0)
-    assert [each.count for each in fit.left_out][1:] == [3]
-    assert 0.7 * high.sum() < fit.left_out[0].count <= high.sum()
+    assert fit.left_out[0].count == 3
+    assert 0.7 * high.sum() < fit.left_out[1].count <= high.sum()
     assert "3 readings far off their neighbours (run, the first at 15 s)" in fit.message
     for name, truth in (("tau", 3.0), ("K", 2.0)):
         assert abs(fit.quantities[name].value - truth) < 4 * fit.quantities[name].error
@@ -212,6 +227,23 @@ def test_a_delay_at_the_end_of_the_candidates_is_said():
     fit = identify(run_of(FIRST_ORDER, constant(3.0, 2.0), delay=22))
     assert fit.delay == 20
     assert "say a longer one by --delay" in fit.message
+
+
+def test_limits_of_parameters_hold_over_the_whole_range_of_the_runs():
+    run = run_of(FIRST_ORDER, constant(3.0, 2.0), 80)
+    fit = identify(run, delay=0, gains={"K": (-np.inf, 1.9)})
+    assert fit.quantities["K"].value == pytest.approx(1.9)
+    fit = identify(
+        run, map="network", delay=0, starts=1, hidden=2, gains={"dK/dvalve": (0.2, np.inf)}
+    )
+    assert "held by its limits: min dK/dvalve" in fit.message, fit.message
+    at = jnp.linspace(run.inputs["valve"].min(), run.inputs["valve"].max(), 2001)
+    net = fit.fit.model["map"]
+    slope = jax.vmap(jax.grad(lambda u: net(u[None])[1]))(at)
+    assert 0.2 <= float(slope.min()) < 0.3
+    for wrong, words in (({"Kay": (0, 1)}, "limit of 'Kay'"), ({"dtau/dvalve": (1, 2)}, "a sign")):
+        with pytest.raises(InputError, match=words):
+            identify(run, map="network", delay=0, starts=1, hidden=2, gains=wrong)
 
 
 def test_where_the_runs_never_were_a_curve_has_no_error():

@@ -18,6 +18,7 @@ from beamfit.studies.response.model import (
     driven,
     parameters_at,
     predicted,
+    steps_of,
 )
 from beamfit.studies.response.record import Run
 from beamfit.studies.response.starts import driven_by, unit_outputs
@@ -261,14 +262,14 @@ def slopes_of(seen: Seen, fit: Fit) -> list[tuple[np.ndarray, np.ndarray]]:
     return found
 
 
-def predict_held(run: Run, output: str, fit: Fit, physics: Physics, delay: int) -> HeldBack:
+def predict_held(run: Run, output: str, fit: Fit, physics: Physics, delay: float) -> HeldBack:
     """Predict a run that was held back; only the state at its start is estimated."""
     seen = driven(run, 0, output, physics, delay)
     p = parameters_at(physics, fit.model["map"], seen.point)
     y = run.outputs[output][np.asarray(seen.index)]
 
     def from_start(free: Any) -> np.ndarray:
-        return np.asarray(simulate(physics, p, seen.u, seen.dt, free)[seen.index])
+        return np.asarray(simulate(physics, p, seen.u, steps_of(fit.model, seen), free)[seen.index])
 
     zero = jnp.zeros(physics.free_states)
     base = from_start(zero)

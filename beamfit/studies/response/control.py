@@ -10,6 +10,7 @@ import numpy as np
 
 from beamfit.dynamics.response import ARX, PHYSICS
 from beamfit.errors import InputError, nearest
+from beamfit.studies.response.certain import certain_range
 from beamfit.studies.response.fit import ResponseFit
 from beamfit.studies.response.model import parameters_at, predicted
 from beamfit.studies.response.receding import Controller, Limits, Response
@@ -30,6 +31,7 @@ def controller(
     inputs: Mapping[str, tuple[float, float]] | None = None,
     rates: Mapping[str, float] | None = None,
     outputs: Mapping[str, tuple[float, float]] | None = None,
+    hard: Mapping[str, tuple[float, float]] | None = None,
     horizon: int | None = None,
     every: int | None = None,
     smooth: float = 0.1,
@@ -44,6 +46,10 @@ def controller(
         Limits. An input keeps to the range of the runs unless told: beyond it nothing is known.
     rates : mapping of str to float, optional
         Largest change of an input in a second.
+    hard : mapping of str to (float, float), optional
+        Outputs whose limits shall hold for certain: for processes whose gains are off by up to such
+        a share, whatever their time constants, and for disturbances up to such a size. The range
+        of the inputs is narrowed until that is so (`beamfit.studies.response.certain`).
     horizon : int, optional
         Steps of a plan; to where 5 % of a transient is left, 8 to 40 and the delay, if None.
     every : int, optional
@@ -59,7 +65,8 @@ def controller(
     Raises
     ------
     InputError
-        If a limit names nothing, is no range, or a number is not positive.
+        If a limit names nothing, is no range, or a number is not positive; if hard limits cannot be
+        certified of a model, or no inputs keep them.
 
     Notes
     -----
@@ -89,6 +96,10 @@ def controller(
     usual = {n: (v.min(), v.max()) for n, v in zip(names, values.T, strict=True)}
     low, high = _ranges(names, inputs or {}, usual)
     below, above = _ranges([fit.output for fit in fits], outputs or {}, {})
+    if hard:
+        ends = {r.name: (a + r.margin, b - r.margin)
+                for r, a, b in zip(responses, below, above, strict=True)}  # fmt: skip
+        low, high = certain_range(fits, hard, (low, high), ends)
     rate = step * np.array([_rates(names, rates or {}).get(name, np.inf) for name in names])
     sizes = np.where(seen.size_u > 0, seen.size_u, 1.0)
     limits = Limits(low, high, rate, below, above)
@@ -117,8 +128,10 @@ def _response(fit: ResponseFit, every: int, step: float) -> Response:
     band = float(np.sqrt(np.mean(known**2))) if known.size else 0.0
     # A level that wanders by `drift` a step under noise of 1: the filter's gain at rest
     # (R. E. Kalman 1960; scalar Riccati equation P² = q (P + 1), gain P/(P + 1)).
-    drift = DRIFT if fit.memory is None else 1.0
-    q = drift**2
+    q = DRIFT**2
+    if fit.memory is not None:  # of white noise, what the part that wanders gets anew in a step
+        wander = (1.0 - fit.memory.white) * -np.expm1(-2.0 * step / fit.memory.time)
+        q = max(q, wander / max(fit.memory.white, 1e-6))
     ahead = 0.5 * (q + np.sqrt(q**2 + 4.0 * q))
     model = fit.fit.model
     return Response(

@@ -106,8 +106,13 @@ def _offset(model: Any, seen: Any) -> jax.Array:
     return model["offset"]
 
 
+def _late(model: Any, of: tuple[Any, float]) -> jax.Array:
+    apart = jnp.median(jnp.diff(of[0].time))
+    return (of[1] + model["late"]) * apart
+
+
 def quantities_of(
-    fit: Fit, errors: Memory | None, seen: Seen, physics: Physics
+    fit: Fit, errors: Memory | None, seen: Seen, physics: Physics, delay: float
 ) -> dict[str, Quantity]:
     """Constant parameters with errors, and the offset if it is free."""
     m = len(seen.inputs)
@@ -121,8 +126,11 @@ def quantities_of(
         name: quantity(found, i, unit)
         for i, (name, unit) in enumerate(zip(names, units, strict=True))
     }
-    if any(v.name == "offset" for v in fit.variables):
+    free = {v.name for v in fit.variables}
+    if "offset" in free:
         said["offset"] = quantity(derived(fit, errors, _offset, seen.runs[0]), (), "output")
+    if "late" in free:
+        said["delay"] = quantity(derived(fit, errors, _late, (seen.runs[0], delay)), (), TIME)
     return said
 
 
@@ -158,7 +166,7 @@ def told(
     def is_open(name: str, q: Quantity) -> bool:
         wide = q.unit == TIME and q.error is not None and q.error > WIDE * abs(q.value)
         # Of a higher order that is a first one: its gains and its longer lag are told.
-        more = checks.first_order and not name.startswith(("K", "offset", "tau1"))
+        more = checks.first_order and not name.startswith(("K", "offset", "tau1", "delay"))
         return nothing or wide or more or name in joint
 
     known = {n: q.open() if is_open(n, q) else q for n, q in quantities.items()}

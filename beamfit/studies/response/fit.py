@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -17,11 +17,12 @@ from beamfit.shown import shown
 from beamfit.status import Status
 from beamfit.studies.response.checks import Checks, HeldBack, checks_of, predict_held, slopes_of
 from beamfit.studies.response.curve import Curve, curves_of, quantities_of, told
+from beamfit.studies.response.limits import limited
 from beamfit.studies.response.misread import Misread, sound
 from beamfit.studies.response.model import Seen, network_of, output_of
 from beamfit.studies.response.noise import Noise
 from beamfit.studies.response.record import Run
-from beamfit.studies.response.settle import begun, is_first_order, settled, used_by
+from beamfit.studies.response.settle import begun, is_first_order, settled, used_by, within
 from beamfit.studies.response.starts import latest
 from beamfit.studies.response.verdict import judged
 from beamfit.table import Table, json_of
@@ -54,7 +55,7 @@ class ResponseFit:
         How far to believe it; ``message`` says why and what to do.
     model, map : str
         The physics, and what gives its parameters.
-    delay : int
+    delay : float
         Samples by which the output follows the inputs late.
     runs : tuple of Run
         What it was identified from.
@@ -83,7 +84,7 @@ class ResponseFit:
     message: str
     model: str
     map: str
-    delay: int
+    delay: float
     runs: tuple[Run, ...]
     seen: Seen
     fit: Fit
@@ -115,7 +116,7 @@ class ResponseFit:
     def tables(self) -> tuple[Table, ...]:
         """All numbers, to be shown."""
         rows = [[name, str(q)] for name, q in self.quantities.items()]
-        rows += [["delay", f"{self.delay} samples"]]
+        rows += [["delay", f"{self.delay:.4g} samples"]]
         rows += self.checks.rows() + [each.row() for each in self.held]
         found = [Table(f"{self.output} ({self.model}, {self.map} parameters)", [], rows)]
         return (*found, *(curve.table() for curve in self.curves))
@@ -158,12 +159,13 @@ def identify(
     map: str = "constant",
     *,
     output: str | None = None,
-    delay: int | None = None,
+    delay: float | None = None,
     offset: bool = True,
     hidden: int = 5,
     starts: int = 3,
     seed: int = 0,
     held: Sequence[Run] = (),
+    gains: Mapping[str, tuple[float, float]] | None = None,
 ) -> ResponseFit:
     """Identify the response of an output to the inputs of some runs.
 
@@ -179,14 +181,19 @@ def identify(
         Whether parameters are numbers, or a network of the inputs at each moment.
     output : str, optional
         Which output, if the runs have several.
-    delay : int, optional
-        Samples by which the output follows late; found among candidates if None.
+    delay : float, optional
+        Samples by which the output follows late; found among candidates if None. What is no whole
+        number is estimated besides, with an error.
     offset : bool
         Whether the output at rest is a free number; else it is 0.
     hidden, starts, seed : int
         Hidden nodes of the network, starts of its training, seed of their weights.
     held : sequence of Run
         Runs that are only predicted.
+    gains : mapping of str to (float, float), optional
+        Limits of parameters and of their slopes by an input, such as {"K": (1.0, 3.0),
+        "dK/dvalve": (0.0, inf)}, which a network certainly keeps over the whole range of the runs;
+        of tau, T and zeta only signs of slopes.
 
     Returns
     -------
@@ -222,7 +229,7 @@ def identify(
     runs, held = (tuple(ordered(run, runs[0]) for run in each) for each in (runs, held))
     output = _output(runs[0], output)
     shortest = min(len(run) for run in runs)
-    if delay is not None and delay >= shortest - 1:
+    if delay is not None and not 0 <= delay < shortest - 1:
         raise InputError(f"a delay of {delay} samples", f"less than the {shortest} rows of a run")
     given = delay
     runs, left_out, found = sound(
@@ -234,17 +241,19 @@ def identify(
         raw, first, level = plain.start()
         nets = [network_of(seen, physics, np.asarray(raw), hidden, seed + k) for k in range(starts)]
         answer = settled(seen, [(net, first, level) for net in nets])
+    if gains:
+        answer = within(seen, answer, limited(gains, seen, physics, map == "network"))
     checks = checks_of(
         seen,
         answer.residuals,
         slopes_of(seen, answer.fit),
         used_by(answer.fit),
         plain.likelihood - answer.likelihood if map == "network" else None,
-        delay,
+        int(np.ceil(delay)) * (1 if delay % 1 == 0 else 2),  # in rows
     )
     checks = checks._replace(first_order=map == "constant" and is_first_order(found, offset))
     quantities = (
-        quantities_of(answer.fit, answer.errors, seen, physics) if map == "constant" else {}
+        quantities_of(answer.fit, answer.errors, seen, physics, delay) if map == "constant" else {}
     )
     curves = curves_of(answer.fit, answer.errors, seen) if map == "network" else ()
     quantities, curves = told(quantities, curves, seen, checks)
@@ -252,6 +261,7 @@ def identify(
     evidence = (answer.fit, answer.rests, checks, quantities, curves, ahead, map)
     status, message = judged(*evidence, given is None and delay == latest(runs) > 0)
     message = " ".join([message, *(f"Left out: {each}." for each in left_out)])
+    delay = delay if delay % 1 == 0 else delay + float(answer.fit.model["late"])
     parts = (quantities, curves, answer.noise, answer.memory, checks, ahead, left_out)
     return ResponseFit(output, status, message, model, map, delay, runs, seen, answer.fit, *parts)
 

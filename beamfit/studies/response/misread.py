@@ -43,21 +43,22 @@ def sound(
 ) -> tuple[tuple[Run, ...], tuple[Misread, ...], Begun]:
     """Runs without readings that show no output, what those were, and the fit of the others."""
     found, left_out = begin(runs), []
-    trial, _ = _without(runs, output, [_still(y) for y, _ in _beside(runs, output, found)], "")
-    if trial is not None:  # the process may stand still as well: a fit without them tells
-        other = begin(trial)
-        masks = [_still(y, f, max(other.plain.noise)) for y, f in _beside(runs, output, other)]
-        trial, which = _without(
-            runs, output, masks, "readings that stand still while the process moves"
-        )
-        if trial is not None:
-            runs, left_out, found = trial, [*left_out, *which], begin(trial)
     for _ in range(ROUNDS):
         masks = [_lone(y, f, found.seen.size_y) for y, f in _beside(runs, output, found)]
         trial, which = _without(runs, output, masks, "readings far off their neighbours")
         if trial is None:
             break
         runs, left_out, found = trial, [*left_out, *which], begin(trial)
+    trial, _ = _without(runs, output, [_still(y) for y in found.seen.measured], "")
+    if trial is not None:  # the process may stand still as well: a fit without them tells
+        other = begin(trial)
+        noise = 1.4826 * float(np.median(np.abs(np.concatenate(other.plain.residuals))))
+        masks = [_still(y, f, noise) for y, f in _beside(runs, output, other)]
+        trial, which = _without(
+            runs, output, masks, "readings that stand still as the process moves"
+        )
+        if trial is not None:
+            runs, left_out, found = trial, [*left_out, *which], begin(trial)
     return runs, tuple(left_out), found
 
 

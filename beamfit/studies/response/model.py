@@ -29,6 +29,7 @@ __all__ = [
     "parameters_at",
     "predicted",
     "state",
+    "steps_of",
 ]
 
 # A residual below this share of the output's scatter is the model's, and not fitted any closer.
@@ -42,7 +43,8 @@ class Driven:
     """A run as the model sees it: operating points, inputs and steps, padded, and what was read.
 
     Shapes (samples, inputs), (samples, inputs), (samples,), (readings,); `run` is its number,
-    `noise` that of its readings, if it has a memory.
+    `noise` that of its readings, if it has a memory; `held` by how much each step grows, s, for a
+    delay that is longer by a sample, where the delay is no whole number of them.
     """
 
     physics: Physics
@@ -53,6 +55,7 @@ class Driven:
     index: Any
     run: Any
     noise: Noise | None
+    held: Any
 
 
 class Seen(NamedTuple):
@@ -72,16 +75,31 @@ class Seen(NamedTuple):
     size_y: float
 
 
-def driven(run: Run, number: int, output: str, physics: Physics, delay: int) -> Driven:
-    """One run with its inputs `delay` samples late; before the first they are as the first."""
-    n, u = len(run), np.stack(list(run.inputs.values()), axis=1)
-    late = np.concatenate([np.repeat(u[:1], delay, axis=0), u])[:n]
-    longer = padded_length(n) - n
+def driven(run: Run, number: int, output: str, physics: Physics, delay: float) -> Driven:
+    """One run with its inputs `delay` samples late; before the first they are as the first.
+
+    A delay of no whole number of samples has two rows a sample, one for each input that it feels.
+    """
+    n, u, part = len(run), np.stack(list(run.inputs.values()), axis=1), delay % 1.0
+    whole = [np.concatenate([np.repeat(u[:1], k, axis=0), u])[:n]
+             for k in ((int(delay),) if part == 0.0 else (int(delay) + 1, int(delay)))]  # fmt: skip
+    late = np.stack(whole, axis=1).reshape(-1, u.shape[1])
+    longer = padded_length(len(late)) - len(late)
     late = np.concatenate([late, np.repeat(late[-1:], longer, axis=0)])
-    dt = np.concatenate([np.diff(run.time), np.zeros(longer + 1)])
-    index = np.flatnonzero(np.isfinite(run.outputs[output]))
-    arrays = (jnp.asarray(v) for v in (late, late, dt, run.time[index] - run.time[0], index))
-    return Driven(physics, *arrays, jnp.asarray(number), None)
+    apart = np.append(np.diff(run.time), 0.0)
+    shares, held = ([[1.0]], None) if part == 0.0 else ([[part], [1.0 - part]], [[1.0], [-1.0]])
+    dt, held = (None if s is None else np.append((s * apart).T.ravel(), np.zeros(longer))
+                for s in (shares, held))  # fmt: skip
+    rows = np.flatnonzero(np.isfinite(run.outputs[output]))
+    seen = (late, late, dt, run.time[rows] - run.time[0], rows * len(whole))
+    arrays = (jnp.asarray(v) for v in seen)
+    held = None if held is None else jnp.asarray(held)
+    return Driven(physics, *arrays, jnp.asarray(number), None, held)
+
+
+def steps_of(model: Any, seen: Driven) -> jax.Array:
+    """The distances of the rows, of which a delay that is estimated decides."""
+    return seen.dt if seen.held is None else seen.dt + model["late"] * seen.held
 
 
 def parameters_at(physics: Physics, of: Any, point: jax.Array, more: Any = 0.0) -> jax.Array:
@@ -97,7 +115,7 @@ def parameters_at(physics: Physics, of: Any, point: jax.Array, more: Any = 0.0) 
 def predicted(model: Any, seen: Driven) -> jax.Array:
     """The output where it was read, running free from the start of the run."""
     p = parameters_at(seen.physics, model["map"], seen.point)
-    y = simulate(seen.physics, p, seen.u, seen.dt, model["start"][seen.run])
+    y = simulate(seen.physics, p, seen.u, steps_of(model, seen), model["start"][seen.run])
     return model["offset"] + y[seen.index]
 
 
@@ -116,7 +134,7 @@ def changed_by(model: Any, seen: Driven, scaled: jax.Array) -> jax.Array:
 
     def output(more):
         p = parameters_at(seen.physics, model["map"], seen.point, scaled @ more.T)
-        return simulate(seen.physics, p, seen.u, seen.dt, start)[seen.index]
+        return simulate(seen.physics, p, seen.u, steps_of(model, seen), start)[seen.index]
 
     slopes = jax.jacfwd(output)(jnp.zeros((count, scaled.shape[1])))
     return slopes.reshape(len(slopes), -1)
@@ -153,6 +171,7 @@ def state(
     offset: tuple[float, bool],
     noise: Sequence[float],
     memory: Noise | None,
+    told: Any = None,
 ) -> Problem:
     """State the problem.
 
@@ -170,6 +189,8 @@ def state(
         A guess at the noise of each run, which its residuals correct.
     memory : Noise, optional
         How the noise wanders.
+    told : Limited, optional
+        Limits of the parameters (`beamfit.studies.response.limits`).
     """
     records = []
     for i, (run, y) in enumerate(zip(seen.runs, seen.measured, strict=True)):
@@ -179,10 +200,13 @@ def state(
             run, of = replace(run, noise=Noise(*map(jnp.asarray, memory))), _surprising
             y = np.asarray(innovations(jnp.asarray(y), run.time, run.noise)[0])
         records.append(Record(f"run {i + 1}", of, run, y, noise[i], worth=worth))
-    free = [Free("start", nuisance=True), Free("map", nuisance=callable(by))]
+    ends = {} if told is None or callable(by) else {"lower": told.lower, "upper": told.upper}
+    free = [Free("start", nuisance=True), Free("map", nuisance=callable(by), **ends)]
     free += [Free("offset")] if offset[1] else []
-    model = {"map": by, "start": start, "offset": offset[0]}
+    free += [] if seen.runs[0].held is None else [Free("late")]
+    model = {"map": by, "start": start, "offset": offset[0], "late": 0.0}
     priors = []
     if isinstance(by, MLP):
         priors = [Prior("map.weights", 0.0, WEIGHT), Prior("map.biases", 0.0, WEIGHT)]
-    return Problem(model, free, records, priors)
+    limits = told.constraints if told is not None and callable(by) else ()
+    return Problem(model, free, records, priors, limits)

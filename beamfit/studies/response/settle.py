@@ -12,6 +12,7 @@ from beamfit.greybox.correlated import Memory
 from beamfit.greybox.fit import Fit
 from beamfit.greybox.solve import solve
 from beamfit.status import Status
+from beamfit.studies.response.limits import Limited
 from beamfit.studies.response.model import CLOSE, Seen, output_of, predicted, state
 from beamfit.studies.response.noise import Noise, innovations, noise_of, remembers
 from beamfit.studies.response.record import Run
@@ -55,10 +56,14 @@ class Settled(NamedTuple):
 
 
 def _round(
-    seen: Seen, begin: tuple, noise: Sequence[float], memory: Noise | None = None
+    seen: Seen,
+    begin: tuple,
+    noise: Sequence[float],
+    memory: Noise | None = None,
+    told: Limited | None = None,
 ) -> Settled:
     """Fit with the noise that the residuals of the round before had."""
-    fit = solve(state(seen, *begin, noise, memory), iterations=STEPS)
+    fit = solve(state(seen, *begin, noise, memory, told), iterations=STEPS)
     pairs = zip(seen.runs, seen.measured, strict=True)
     rest = tuple(y - np.asarray(output_of(fit.model, run)) for run, y in pairs)
     found = tuple(max(float(r.std()), CLOSE * seen.size_y) for r in rest)
@@ -100,12 +105,12 @@ class Begun(NamedTuple):
     """Runs as the model sees them, the delay, and the fit with constant parameters."""
 
     seen: Seen
-    delay: int
+    delay: float
     plain: Settled
 
 
 def begun(
-    runs: tuple[Run, ...], output: str, physics: Physics, delay: int | None, offset: bool
+    runs: tuple[Run, ...], output: str, physics: Physics, delay: float | None, offset: bool
 ) -> Begun:
     """Identify with constant parameters; the delay among candidates if None."""
     start, seen, delay = start_of(runs, output, physics, delay, offset)
@@ -119,6 +124,22 @@ def is_first_order(found: Begun, offset: bool) -> bool:
     lower = found.seen._replace(runs=driven_by(found.seen, FIRST_ORDER))
     begin = best_start(lower, offset).begin(offset)
     return settled(lower, [begin]).likelihood <= found.plain.likelihood
+
+
+def within(seen: Seen, found: Settled, told: Limited) -> Settled:
+    """A fit brought within limits; as it is where it keeps them."""
+    problem = state(seen, *found.start(), found.noise, found.memory, told)
+    values = np.asarray(problem.constraint_values(problem.start))
+    kept = (values >= problem.constraint_lower) & (values <= problem.constraint_upper)
+    kept = np.append(kept, (problem.start >= problem.lower) & (problem.start <= problem.upper))
+    if kept.all():
+        return found
+    errors = found.errors
+    for _ in range(AGAIN):
+        before, found = found, _round(seen, found.start(), found.noise, found.memory, told)
+        if abs(before.likelihood - found.likelihood) < GAINED:
+            break
+    return found._replace(errors=errors)
 
 
 def used_by(fit: Fit) -> int:

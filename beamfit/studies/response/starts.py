@@ -23,8 +23,9 @@ __all__ = ["Start", "best_start", "driven_by", "latest", "seen_of", "start_of", 
 
 # Longest delay that is tried, in samples and as a share of the run.
 LATEST, SHARE = 24, 0.1
-# A delay must raise the logarithm of the likelihood by so much over a shorter one.
-BETTER = 5.0
+# A delay must raise the logarithm of the likelihood by so much over a shorter one; parts of a
+# sample that are tried besides.
+BETTER, PARTS = 5.0, (-0.75, -0.5, -0.25, 0.25, 0.5, 0.75)
 # Time constants of the grid, and dampings of a second order.
 TIMES, DAMPINGS = 16, (0.2, 0.6, 1.0, 2.0)
 # A second lag of which less than this is left after a sample is none.
@@ -136,7 +137,7 @@ def _as_difference(seen: Seen, found: Start) -> Start:
     return Start(np.asarray(raw), states, found.offset, found.squares)
 
 
-def seen_of(runs: tuple[Run, ...], output: str, physics: Physics, delay: int) -> Seen:
+def seen_of(runs: tuple[Run, ...], output: str, physics: Physics, delay: float) -> Seen:
     """The runs as the model sees them."""
     drives = tuple(driven(run, i, output, physics, delay) for i, run in enumerate(runs))
     read = [np.isfinite(run.outputs[output]) for run in runs]
@@ -148,18 +149,29 @@ def seen_of(runs: tuple[Run, ...], output: str, physics: Physics, delay: int) ->
 
 
 def start_of(
-    runs: tuple[Run, ...], output: str, physics: Physics, delay: int | None, offset: bool
-) -> tuple[Start, Seen, int]:
-    """The best start, and the delay: the shortest of those that fit about as well as any."""
-    delays = range(latest(runs) + 1) if delay is None else (delay,)
-    found = []
-    for late in delays:
+    runs: tuple[Run, ...], output: str, physics: Physics, delay: float | None, offset: bool
+) -> tuple[Start, Seen, float]:
+    """The best start, and the delay: the shortest of those that fit about as well as any.
+
+    A part of a sample must do as much better: only an input that moves within a sample tells it.
+    """
+
+    def at(late: float) -> tuple[Start, Seen, float]:
         seen = seen_of(runs, output, physics, late)
-        found.append((best_start(seen, offset), seen, late))
+        return best_start(seen, offset), seen, late
+
+    if delay is not None:
+        return at(delay)
+    found = [at(late) for late in range(latest(runs) + 1)]
     count = sum(map(len, found[0][1].measured))
-    least = min(start.squares for start, _, _ in found)
-    near = least * np.exp(2.0 * BETTER / count)
-    return next(each for each in found if each[0].squares <= near)
+    worth = np.exp(2.0 * BETTER / count)
+    near = worth * min(start.squares for start, _, _ in found)
+    whole = next(each for each in found if each[0].squares <= near)
+    if physics.even:
+        return whole
+    parts = [whole[2] + part for part in PARTS if 0 < whole[2] + part < max(latest(runs), 1)]
+    best = min((at(part) for part in parts), key=lambda each: each[0].squares)
+    return best if worth * best[0].squares < whole[0].squares else whole
 
 
 def latest(runs: tuple[Run, ...]) -> int:

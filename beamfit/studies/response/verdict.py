@@ -76,6 +76,8 @@ def _rms(fit: Fit) -> list[float]:
 
 
 def _lost(e: Evidence) -> Finding | None:
+    if e.fit.status is Status.infeasible:
+        return Finding(Status.infeasible, e.fit.message)
     if e.rests:
         return None
     lost = e.fit.status is Status.not_finite
@@ -174,6 +176,9 @@ def _good(e: Evidence) -> Finding:
     gains = [q for name, q in e.quantities.items() if name.startswith("K")]
     if gains and all(q.error is not None and abs(q.value) < 2 * q.error for q in gains):
         cause += " No gain is told from 0: what is seen is how the runs come to rest by themselves."
+    held = [c.name for c in e.fit.constraints if c.state in ("lower", "upper")]
+    if held:
+        cause += f" It is held by its limits: {', '.join(held[:3])}."
     gain = e.checks.against_constant
     if gain is not None and gain < 0:
         cause += " Constant parameters do as well (BIC): the operating point need not be in it."
