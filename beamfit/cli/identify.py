@@ -63,7 +63,7 @@ def identify(
     if order is not None and model != STATES:
         raise InputError(f"--order {order} with --model {model}", f"--model {STATES}")
     if gains and model == STATES:
-        raise InputError(f"--gain with --model {STATES}", "another --model: its gains have no limits")
+        raise InputError(f"--gain with --model {STATES}", "--model first-order or second-order")
     said = {"inputs": inputs, "outputs": outputs, "step": step}
     said |= {"ignore": ignore, "skip_bad": skip_bad}
     twice = [path for path in record if (*record, *hold_back).count(path) > 1]

@@ -10,6 +10,8 @@ from beamfit.dynamics.response import FIRST_ORDER, SECOND_ORDER, simulate
 from beamfit.errors import InputError
 from beamfit.status import Status
 from beamfit.studies.response.fit import identify
+from beamfit.studies.response.limits import limited
+from beamfit.studies.response.model import network_of
 from beamfit.studies.response.noise import Noise, innovations
 from beamfit.studies.response.record import Run
 
@@ -229,21 +231,24 @@ def test_a_delay_at_the_end_of_the_candidates_is_said():
     assert "say a longer one by --delay" in fit.message
 
 
-def test_limits_of_parameters_hold_over_the_whole_range_of_the_runs():
+def test_limits_of_parameters_are_kept_or_enclosed_over_the_whole_range_of_the_runs():
     run = run_of(FIRST_ORDER, constant(3.0, 2.0), 80)
     fit = identify(run, delay=0, gains={"K": (-np.inf, 1.9)})
     assert fit.quantities["K"].value == pytest.approx(1.9)
-    fit = identify(
-        run, map="network", delay=0, starts=1, hidden=2, gains={"dK/dvalve": (0.2, np.inf)}
-    )
-    assert "held by its limits: min dK/dvalve" in fit.message, fit.message
-    at = jnp.linspace(run.inputs["valve"].min(), run.inputs["valve"].max(), 2001)
-    net = fit.fit.model["map"]
-    slope = jax.vmap(jax.grad(lambda u: net(u[None])[1]))(at)
-    assert 0.2 <= float(slope.min()) < 0.3
+    net = network_of(fit.seen, FIRST_ORDER, np.array([1.0, 2.0]), 3, 1)
+    told = {"K": (1.0, 3.0), "dK/dvalve": (0.2, np.inf), "tau": (1.0, np.inf)}
+    found = limited(told, fit.seen, FIRST_ORDER, network=True)
+    ends = {c.name: np.asarray(c.function({"map": net}, c.data)) for c in found.constraints}
+    at = np.linspace(run.inputs["valve"].min(), run.inputs["valve"].max(), 2001)
+    log_tau, gain = np.asarray(jax.vmap(lambda u: net(u[None]))(jnp.asarray(at))).T
+    slope = np.gradient(gain, at)
+    for name, true in (("least K", gain.min()), ("min dK/dvalve", slope.min()),
+                       ("least tau", log_tau.min())):  # fmt: skip
+        assert ends[name].min() <= true + 1e-6 < ends[name].min() + 0.1 * np.ptp(gain)
+    assert ends["most K"].max() >= gain.max() > ends["most K"].max() - 0.1 * np.ptp(gain)
     for wrong, words in (({"Kay": (0, 1)}, "limit of 'Kay'"), ({"dtau/dvalve": (1, 2)}, "a sign")):
         with pytest.raises(InputError, match=words):
-            identify(run, map="network", delay=0, starts=1, hidden=2, gains=wrong)
+            limited(wrong, fit.seen, FIRST_ORDER, network=True)
 
 
 def test_where_the_runs_never_were_a_curve_has_no_error():
