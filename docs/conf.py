@@ -12,6 +12,7 @@ html_theme = "furo"
 html_title = f"beamfit {version}"
 html_copy_source = False
 html_show_copyright = False
+html_static_path, html_css_files = ["_static"], ["site.css"]
 html_extra_path = ["gtf_reproduction.html"]
 
 myst_heading_anchors = 4

@@ -19,7 +19,9 @@ def test_every_equation_has_a_function_and_a_test(root):
     names = re.findall(r"`(beamfit\.[\w.]+)`", text)
     assert len(names) > 25
     assert all(callable(found(n)) or type(found(n)).__module__.startswith("beamfit") for n in names)
-    files = re.findall(r"\b(?:tests|benchmarks|measurements)/[\w/]+\.py", text)
+    files = [f"tests/{name}.py" for name in re.findall(r"\w+/test_\w+", text)]
+    assert len(files) > 25
+    files += re.findall(r"(?:benchmarks|measurements)/\w+\.py", text)
     assert [f for f in files if not (root / f).is_file()] == []
     numbers = set()
     for said in re.findall(r"^\| (\d[^|]*)", text, re.MULTILINE):
