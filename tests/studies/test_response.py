@@ -80,6 +80,18 @@ def test_noise_with_a_memory_is_in_the_errors(noise_of):
     assert np.all((rms > 0.6) & (rms < 1.4)), rms
 
 
+def test_a_drift_that_is_as_slow_as_the_response_is_said_and_leaves_no_small_error():
+    """One step of a lag of 60 s in 100 s, on a random walk."""
+    rng, t = np.random.default_rng(5), 0.5 * np.arange(200)
+    drift = 0.05 * np.cumsum(rng.normal(size=200)) + 0.02 * rng.normal(size=200)
+    level = 2.0 * -np.expm1(-np.maximum(t - 20.0, 0.0) / 60.0) + drift
+    fit = identify(Run(t, {"valve": t > 19.9}, {"level": level}), delay=0)
+    assert fit.status is Status.unidentified
+    assert "wanders about as slowly" in fit.message
+    assert fit.quantities["tau"].error is None
+    assert fit.quantities["K"].error is None or fit.quantities["K"].error > 0.5
+
+
 def test_innovations_of_a_noise_are_those_of_its_covariance():
     rng, noise = np.random.default_rng(0), Noise(3.0, 0.4)
     time = np.cumsum(rng.uniform(0.1, 2.0, 30))

@@ -126,6 +126,9 @@ def _open(e: Evidence) -> Finding | None:
     remedy = "Move the inputs over more of their range."
     if TIME in left.values():
         remedy = "Sample faster around steps, and wait until the output settles."
+        if e.checks.white_probability < POOR_FIT:
+            cause += " The noise wanders about as slowly as the output responds."
+            remedy = "Repeat the steps, up and down, so that a drift does not look like a response."
     return Finding(Status.unidentified, cause, remedy)
 
 
