@@ -46,7 +46,7 @@ def identify_states(
     seed: int = 0,
     held: Sequence[Run] = (),
 ) -> StatesFit:
-    """Identify a state space of all outputs, x+ = A x + B u, y = C x + D u + offset.
+    """Identify a state space of all outputs, x+ = A x + B u + e, y = C x + D u + f.
 
     Parameters
     ----------
@@ -70,8 +70,8 @@ def identify_states(
     -------
     StatesFit
         Time constants (tau, or T and zeta of a pair that oscillates), gains at rest K and
-        the outputs at the mean inputs; with a network they are those about the rest there. Of
-        ``to_json()`` ``matrices`` holds for inputs less ``input_mean``.
+        the outputs at the mean inputs; with a network those about the rest there. In
+        ``to_json()`` ``matrices`` (e, f: offsets) are for inputs less ``input_mean``.
 
     Raises
     ------
@@ -107,7 +107,8 @@ def identify_states(
     n, found, gain = best.order, best.found, None
     if map == "network":
         nets = _networks(best, hidden, range(seed, seed + starts))
-        free = [*free_of(case, n, n, offset, best.direct), Free("p.net", nuisance=True)]
+        free = [f for f in free_of(case, n, n, offset, best.direct) if f.path != "start"]
+        free += [Free("start", nuisance=True), Free("p.net", nuisance=True)]
         case = case_of(runs, NETWORK, free, [Prior("p.net", 0.0, WEIGHT)], delay)
         found = trained(case, nets)
         gain = criterion([best.found])[0] - criterion([found])[0]
@@ -131,7 +132,7 @@ def _networks(best: Tried, hidden: int, seeds: range) -> list[dict[str, Any]]:
     """Models with networks of small random weights beside the linear part."""
     model = stripped(best.found.fit.model, best.order)
     p, (n, m) = model["p"], model["p"]["z"].shape
-    moved = LINEAR.matrices(p)._replace(c=jnp.eye(n), d=jnp.zeros((n, m)), offset=jnp.zeros(n))
+    moved = LINEAR.linear(p)._replace(c=jnp.eye(n), d=jnp.zeros((n, m)), offset=jnp.zeros(n))
     run = jax.jit(lambda u, x0: linear_outputs(moved, u, x0)[0])
     x = [np.asarray(run(LINEAR.scaled(p, c.u), model["start"][i]))
          for i, c in enumerate(best.case.courses)]  # fmt: skip
@@ -142,7 +143,6 @@ def _networks(best: Tried, hidden: int, seeds: range) -> list[dict[str, Any]]:
         random = np.random.default_rng(seed)
         net = {
             "inside": random.normal(0, 1 / np.sqrt(n + m), (hidden, n + m)),
-            "bias": random.normal(0, 1, hidden),
             "out": random.normal(0, 0.1 / np.sqrt(hidden), (n, hidden)),
         }
         found.append(model | {"p": p | sizes | {"net": net}})
@@ -160,14 +160,15 @@ class Asked:
 def _quoted(model: Any, asked: Asked) -> jax.Array:
     """Of each pole tau, T, zeta, itself and its frequency; gains at rest, outputs at the mean."""
     p, n, course = model["p"], asked.order, asked.course
-    a, b, c, d, offset = course.system.matrices(p)
+    a, b, c, d, _ = course.system.matrices(p)
     a, b, c, units = a[:n, :n], b[:n], c[:, :n], p["units"]
+    m, size = units["u"].shape[1], units["y"][1]
     poles = jnp.linalg.eigvals(a)
     s = jnp.log(poles) / course.dt[0]
-    gains = d + c @ jnp.linalg.solve(jnp.eye(n) - a, b)
-    gains = units["y"][1][:, None] * gains / units["u"][1]
+    gains = size[:, None] * (d + c @ jnp.linalg.solve(jnp.eye(n) - a, b))
     parts = [-1.0 / s.real, 1.0 / jnp.abs(s), -s.real / jnp.abs(s), poles.real, s.imag]
-    return jnp.concatenate([*parts, gains.ravel(), units["y"][0] + units["y"][1] * offset])
+    levels = (units["y"][0][:, None] + gains[:, m:]).ravel()
+    return jnp.concatenate([*parts, (gains[:, :m] / units["u"][1]).ravel(), levels])
 
 
 def _quantities(
@@ -204,11 +205,11 @@ def _quantities(
 def _matrices(case: Case, found: Trained, n: int) -> dict[str, Any]:
     """A, B, C, D in the units of the record, for inputs less their mean."""
     p = found.fit.model["p"]
-    a, b, c, d, offset = map(np.asarray, case.courses[0].system.matrices(p))
+    a, b, c, d, _ = map(np.asarray, case.courses[0].system.matrices(p))
     (mean_u, size_u), (mean_y, size_y) = (np.asarray(p["units"][kind]) for kind in "uy")
-    by = size_y[:, None]
+    by, m = size_y[:, None], len(mean_u)
     return {
         "step_s": float(case.courses[0].dt[0]), "input_mean": mean_u, "A": a[:n, :n],
-        "B": b[:n] / size_u, "C": by * c[:, :n], "D": by * d / size_u,
-        "output_at_mean": mean_y + size_y * offset,
+        "B": b[:n, :m] / size_u, "C": by * c[:, :n], "D": by * d[:, :m] / size_u,
+        "state_offset": b[:n, m:].sum(1), "output_offset": mean_y + size_y * d[:, m:].sum(1),
     }  # fmt: skip

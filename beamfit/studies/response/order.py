@@ -53,7 +53,7 @@ def orders(case: Case, order: int | None, offset: bool) -> tuple[Tried, list[dic
             break
     full = tried[int(np.argmin(told))]
     model = full.found.fit.model
-    p = model["p"] | {"d": 0.0 * model["p"]["d"]}
+    p = model["p"] | {"d": model["p"]["d"].at[:, : len(case.seen[0].inputs)].set(0.0)}
     bounded = case._replace(free=free_of(case, full.order, len(p["z"]), offset, False))
     plain = Tried(full.order, False, bounded, trained(bounded, [model | {"p": p}]))
     tried.append(plain)
@@ -79,12 +79,12 @@ def criterion(found: Sequence[Trained], last: Trained | None = None) -> list[flo
 def free_of(case: Case, order: int, size: int, offset: bool, direct: bool) -> tuple[Free, ...]:
     """What is free of a model of so many states: what an order does not need is held at 0."""
     k, m, runs = len(case.seen), len(case.seen[0].inputs), len(case.courses)
-    used = np.arange(size) < order
-    parts = {
-        "p.z": np.tile(used[:, None], (1, m)), "p.c": np.tile(used, (k, 1)),
-        "p.d": np.full((k, m), direct), "p.offset": np.full(k, offset),
-        "start": np.tile(used, (runs, 1)),
-    }  # fmt: skip
+    used, straight = np.arange(size) < order, np.full((k, m + offset), direct)
+    straight[:, m:] = True
+    start = np.tile(used, (runs, 1))
+    start[0] &= not offset  # where the first run begins, the offsets of a linear system say
+    parts = {"p.z": np.tile(used[:, None], (1, m + offset)), "p.c": np.tile(used, (k, 1))}
+    parts |= {"p.d": straight, "start": start}
     return tuple(Free(name, np.where(on, -np.inf, 0.0), np.where(on, np.inf, 0.0), nuisance=True)
                  for name, on in parts.items())  # fmt: skip
 
@@ -93,28 +93,28 @@ def _tried(case: Case, n: int, offset: bool, before: Tried | None) -> Tried:
     """The fit of an order from its best realisations, and from the order before and one more."""
     size = next((s for s in SIZES if s >= n), n)
     bounded = case._replace(free=free_of(case, n, size, offset, True))
-    units, k, m = _units(case, offset), len(case.seen), len(case.seen[0].inputs)
+    units, k = _units(case, offset), len(case.seen)
+    u, y = _scaled(case, units, offset)
+    m, rest = u[0].shape[1], np.zeros((len(y), n))
 
-    def model(a, b, c, d, level, start):
+    def model(a, b, c, d, start=rest):
         around, c, to = normal_form(a, b, c)
-        p = {"z": np.zeros((n, m)), "around": around, "c": c, "d": d, "offset": level}
-        return padded({"p": p | {"units": units}, "start": start @ to.T}, size)
+        p = {"z": np.zeros((n, m)), "around": around, "c": c, "d": d, "units": units}
+        return padded({"p": p, "start": start @ to.T}, size)
 
-    u, y = _scaled(case, units)
-    rest = np.zeros(k), np.zeros((len(y), n))
-    models = [model(*found, *rest) for found in realisations(u, y, n)]
+    models = [model(*found) for found in realisations(u, y, n)]
     models = sorted((each for each in models if np.isfinite(_missed(case, each))),
                     key=lambda each: _missed(case, each))[:BEGINS]  # fmt: skip
     if before is not None:
         old, last = before.order, before.found.fit.model
-        a, b, c, d, level = map(np.asarray, LINEAR.matrices(last["p"]))
+        a, b, c, d, _ = map(np.asarray, LINEAR.matrices(last["p"]))
         a = np.diag([*np.zeros(old), NEW]) + np.pad(a[:old, :old], ((0, 1), (0, 1)))
         b, c = np.vstack([b[:old], np.ones(m)]), np.hstack([c[:, :old], np.full((k, 1), FAINT)])
         start = np.pad(np.asarray(last["start"])[:, :old], ((0, 0), (0, 1)))
-        models.append(model(a, b, c, d, level, start))
+        models.append(model(a, b, c, d, start))
     if not models:  # runs too short for a regression
         a = np.diag(NEW ** np.arange(1.0, n + 1))
-        models = [model(a, np.ones((n, m)), np.full((k, n), FAINT), np.zeros((k, m)), *rest)]
+        models = [model(a, np.ones((n, m)), np.full((k, n), FAINT), np.zeros((k, m)))]
     return Tried(n, True, bounded, trained(bounded, models))
 
 
@@ -128,12 +128,15 @@ def _units(case: Case, offset: bool) -> dict[str, np.ndarray]:
     }
 
 
-def _scaled(case: Case, units: dict[str, np.ndarray]) -> tuple[list[np.ndarray], list[np.ndarray]]:
-    """Inputs and outputs of the runs in units, without padding; missing readings bridged."""
+def _scaled(
+    case: Case, units: dict[str, np.ndarray], offset: bool
+) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    """Inputs (with a 1) and outputs of the runs in units, unpadded; missing readings bridged."""
     u, y = [], []
     for i, run in enumerate(case.seen[0].runs):
         count = int(np.count_nonzero(np.asarray(run.dt))) + 1
-        u.append((np.asarray(run.u)[:count] - units["u"][0]) / units["u"][1])
+        each = (np.asarray(run.u)[:count] - units["u"][0]) / units["u"][1]
+        u.append(np.pad(each, ((0, 0), (0, int(offset))), constant_values=1.0))
         read = [np.interp(np.arange(count), np.asarray(s.runs[i].index), s.measured[i])
                 for s in case.seen]  # fmt: skip
         y.append((np.stack(read, axis=1) - units["y"][0]) / units["y"][1])

@@ -35,24 +35,28 @@ REST = 20
 
 
 class Linear:
-    """x+ = a x + b u, y = c x + d u + offset in units of the scatter, stable whatever its numbers.
+    """x+ = a x + b u, y = c x + d u in units of the scatter, stable whatever its numbers.
 
-    Of p: ``z`` and ``around`` (`beamfit.dynamics.states.contraction`), ``c``, ``d``, ``offset``,
-    and ``units``, pairs of mean and size of the inputs and the outputs.
+    Of p: ``z`` and ``around`` (`beamfit.dynamics.states.contraction`), ``c``, ``d``, and ``units``,
+    pairs of mean and size of the inputs and the outputs. A last input that is 1 stands for offsets:
+    of the outputs alone they would have no end where the process integrates.
     """
 
     def run(self, p: Any, u: Any, dt: Any, x0: Any) -> tuple[jax.Array, jax.Array]:
         """Outputs at the samples and the state after the last."""
-        y, last = linear_outputs(self.matrices(p), self.scaled(p, u), x0)
+        y, last = linear_outputs(self.linear(p), self.scaled(p, u), x0)
         return y * p["units"]["y"][1] + p["units"]["y"][0], last
 
     def scaled(self, p: Any, u: Any) -> jax.Array:
-        """Inputs in their units."""
-        return (u - p["units"]["u"][0]) / p["units"]["u"][1]
+        """Inputs in their units, and 1 if there are offsets."""
+        u = (u - p["units"]["u"][0]) / p["units"]["u"][1]
+        return jnp.pad(u, ((0, 0), (0, p["z"].shape[1] - u.shape[1])), constant_values=1.0)
 
-    def matrices(self, p: Any) -> Matrices:
-        """Of the system about its mean input."""
-        return Matrices(*contraction(p["z"], p["around"]), p["c"], p["d"], p["offset"])
+    def linear(self, p: Any) -> Matrices:
+        """Of the linear part."""
+        return Matrices(*contraction(p["z"], p["around"]), p["c"], p["d"], jnp.zeros(len(p["c"])))
+
+    matrices = linear
 
 
 class Network(Linear):
@@ -60,34 +64,33 @@ class Network(Linear):
 
     def run(self, p: Any, u: Any, dt: Any, x0: Any) -> tuple[jax.Array, jax.Array]:
         """Outputs at the samples and the state after the last."""
-        linear, u = Linear.matrices(self, p), self.scaled(p, u)
+        linear, u = self.linear(p), self.scaled(p, u)
         n, net = len(x0), p["net"]
-        drive, inside = u @ linear.b.T, u @ net["inside"][:, n:].T + net["bias"]
+        drive, inside = u @ linear.b.T, u @ net["inside"][:, n:].T
         by_state, out = net["inside"][:, :n] / p["sizes"], p["steps"][:, None] * net["out"]
 
         def step(x, now):
             return linear.a @ x + now[0] + out @ jnp.tanh(by_state @ x + now[1]), x
 
         last, x = jax.lax.scan(step, x0, (drive, inside))
-        y = x @ linear.c.T + u @ linear.d.T + linear.offset
+        y = x @ linear.c.T + u @ linear.d.T
         return y * p["units"]["y"][1] + p["units"]["y"][0], last
 
     def matrices(self, p: Any) -> Matrices:
         """Of the system about where it rests at its mean input."""
-        linear, (n, m) = Linear.matrices(self, p), p["z"].shape
-        net = p["net"]
+        linear, (n, m), net = self.linear(p), p["z"].shape, p["net"]
 
         def after(x, u):
-            inside = net["inside"] @ jnp.concatenate([x / p["sizes"], u]) + net["bias"]
+            inside = net["inside"] @ jnp.concatenate([x / p["sizes"], u])
             return linear.a @ x + linear.b @ u + p["steps"] * (net["out"] @ jnp.tanh(inside))
 
-        none = jnp.zeros(m)
-        x = jnp.zeros(n)
+        x, mean = jnp.zeros(n), jnp.zeros(m).at[p["units"]["u"].shape[1] :].set(1.0)
         for _ in range(REST):
-            slope = jnp.eye(n) - jax.jacfwd(after)(x, none)
-            x = x + jnp.linalg.solve(slope, after(x, none) - x)
-        a, b = jax.jacfwd(after, (0, 1))(x, none)
-        return linear._replace(a=a, b=b, offset=linear.offset + linear.c @ x)
+            slope = jnp.eye(n) - jax.jacfwd(after)(x, mean)
+            x = x + jnp.linalg.solve(slope, after(x, mean) - x)
+        a, b = jax.jacfwd(after, (0, 1))(x, mean)
+        shift = (x - a @ x - b @ mean)[:, None] * mean  # so that it rests there
+        return linear._replace(a=a, b=b + shift)
 
 
 LINEAR, NETWORK = Linear(), Network()
@@ -129,7 +132,7 @@ def realisations(
             continue
         a, b, c, d = found
         values, vectors = np.linalg.eig(a)
-        most = np.exp(-stride / (3.0 * longest))
+        most = np.exp(-stride / (1000.0 * longest))
         values = values * np.minimum(1.0, most / np.maximum(np.abs(values), 1e-12))
         if stride > 1:
             if np.any((np.abs(values.imag) < 1e-9) & (values.real <= 0)):
