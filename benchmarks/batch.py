@@ -18,6 +18,7 @@ import threading
 import time
 from collections import Counter
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -95,10 +96,23 @@ def clear(out: Path) -> None:
     shutil.rmtree(out.with_name(out.name + ".parts"), ignore_errors=True)
 
 
-def measured(folders: list[Path], out: Path, *more: str) -> tuple[float, dict[int, float]]:
-    """Seconds of a run from nothing, and the memory of its processes."""
+class Cost(NamedTuple):
+    """Wall and processor seconds of a run from nothing, and the largest process in MB."""
+
+    wall: float
+    processor: float
+    memory: float
+
+    def of(self, files: int) -> str:
+        return (
+            f"{self.wall:.0f} s ({files / self.wall:.0f} files/s), "
+            f"{self.processor:.0f} s of processor time, {self.memory:.0f} MB a process at most"
+        )
+
+
+def measured(folders: list[Path], out: Path, *more: str) -> Cost:
     clear(out)
-    began = time.perf_counter()
+    began, before = time.perf_counter(), os.times()
     run = start(folders, out, *more)
     watch = Watch(run.pid)
     watch.start()
@@ -106,7 +120,10 @@ def measured(folders: list[Path], out: Path, *more: str) -> tuple[float, dict[in
     watch.running = False
     if run.returncode:
         raise RuntimeError(said.decode())
-    return time.perf_counter() - began, watch.most
+    after = os.times()
+    spent = after.children_user + after.children_system
+    spent -= before.children_user + before.children_system
+    return Cost(time.perf_counter() - began, spent, max(watch.most.values()))
 
 
 def rows_of(out: Path) -> Counter:
@@ -157,16 +174,13 @@ def main(folder: Path, files: int) -> None:
     print(f"load {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores")
     sizes = [n for n in (100, 1_000, 10_000, 100_000) if n <= files]
     for n in sizes:
-        chosen = every[: n // 1000] or [*sorted(every[0].iterdir())[:n]]
-        one, memory = measured(chosen, out)
-        line = (
-            f"{n} files, one process: {one:.1f} s, {n / one:.0f}/s, {max(memory.values()):.0f} MB"
-        )
+        chosen = every[: n // 1000] or sorted(every[0].iterdir())[:n]
+        one = measured(chosen, out)
+        print(f"{n} files, one process: {one.of(n)}; load {os.getloadavg()[0]:.1f}", flush=True)
         if n >= 10_000:
-            two, several = measured(chosen, out, "--workers", "2")
-            line += f"; two workers {two:.1f} s, {n / two:.0f}/s, {one / two:.2f} times, "
-            line += f"{max(several.values()):.0f} MB the largest of {len(several)} processes"
-        print(line, flush=True)
+            two = measured(chosen, out, "--workers", "2")
+            ratio = one.wall / two.wall
+            print(f"{n} files, two workers: {two.of(n)}; {ratio:.2f} times as fast", flush=True)
     few = every[:10]
     measured(few, out)
     killed(few, out, rows_of(out), kills=6)

@@ -57,6 +57,26 @@ class Course(NamedTuple):
         return np.abs(self.value - self.centre) > np.maximum(self.limit, 3.0 * self.error)
 
 
+def followed(kind: str, name: str | None = None) -> tuple[str, str]:
+    """A quantity of a kind and its unit; the usual one unless said.
+
+    Raises
+    ------
+    InputError
+        If there is no such quantity.
+
+    Examples
+    --------
+    >>> followed("lifetime")
+    ('lifetime_mean', 'h')
+    """
+    known, usual = FOLLOWED[kind]
+    name = name or usual
+    if name not in known:
+        raise InputError(f"--quantity {name}", nearest(name, list(known)))
+    return name, known[name]
+
+
 def courses_of(batch: Batch, name: str | None = None) -> list[Course]:
     """Follow a quantity wherever the data determine it.
 
@@ -76,21 +96,18 @@ def courses_of(batch: Batch, name: str | None = None) -> list[Course]:
     Raises
     ------
     InputError
-        If there is no such quantity.
+        As `followed`.
     """
-    known, usual = FOLLOWED[batch.ledger.job.kind]
-    name = name or usual
-    if name not in known:
-        raise InputError(f"quantity '{name}'", nearest(name, list(known)))
+    name, unit = followed(batch.ledger.job.kind, name)
     points: dict[str, list[tuple[str, int, float, float]]] = {}
-    for at, (of, file, value, error) in _points(batch, named(name, known[name])):
+    for at, (of, file, value, error) in _points(batch, named(name, unit)):
         points.setdefault(of, []).append((file, at, value, error))
     found = []
     for of, own in sorted(points.items()):
         files, *numbers = zip(*own, strict=True)
         at, value, error = map(np.array, numbers)
         limits = control_limits(value[: baseline(len(value))])
-        found.append(Course(name, known[name], of, list(files), at, value, error, *limits))
+        found.append(Course(name, unit, of, list(files), at, value, error, *limits))
     return found
 
 

@@ -62,7 +62,7 @@ def files_of(paths: Iterable[str], kind: str) -> tuple[str, ...]:
     Raises
     ------
     InputError
-        If there are none.
+        If there are none. One that is missing beside others is answered as `unusable`.
     """
     found: dict[str, None] = {}
     for path in paths:
@@ -71,7 +71,7 @@ def files_of(paths: Iterable[str], kind: str) -> tuple[str, ...]:
             found |= dict.fromkeys(str(p) for p in inside if _is_input(p.relative_to(path)))
         else:
             found[path] = None
-    if not found:
+    if not any(Path(file).exists() for file in found):
         expected = f"files ending in {', '.join(SUFFIXES[kind])}"
         raise InputError("no files", expected, path=next(iter(paths), None))
     return tuple(found)

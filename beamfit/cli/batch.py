@@ -27,7 +27,10 @@ NAMED = 10
 @click.command(epilog=EXAMPLE)
 @click.argument("path", nargs=-1, required=True)
 @click.option(
-    "--kind", type=click.Choice(["emittance", "lifetime"]), required=True, help="Of what."
+    "--kind",
+    type=click.Choice(["emittance", "lifetime"]),
+    required=True,
+    help="What the files hold: quadrupole scans, or records of beam current.",
 )
 @click.option(
     "--out",
@@ -64,14 +67,15 @@ def batch(
     part = {n: told[n] for n in ("use", "energy", "particle", "first", "last", "screen")}
     reading = {n: told[n] for n in ("ignore", "skip_bad", "time", "current")}
     _check_kind(kind, {"lattice": lattice} | part, {n: told[n] for n in ("time", "current")})
+    from beamfit.batch.course import courses_of, followed
     from beamfit.batch.job import Job
     from beamfit.batch.run import run_batch
 
+    followed(kind, quantity)  # says so before hours of work if there is none
     job = Job(kind, lattice, part, reading, weights)
     with _Progress(not as_json and sys.stderr.isatty()) as progress:
         found = run_batch(path, out, job, workers=workers, scheduler=scheduler, progress=progress)
     if report is not None:
-        from beamfit.batch.course import courses_of
         from beamfit.report.batch import write_batch_report
 
         write_batch_report(report, found, courses_of(found, quantity), command_line())

@@ -170,6 +170,7 @@ def test_records_are_answered_too(root, tmp_path):
         (["--kind", "emittance", "--out", "a.txt"], "a name ending in .csv"),
         (["--kind", "emittance", "--workers", "2", "--scheduler", "tcp://a:1"], "one of them"),
         (["--kind", "emittance"], "no files"),
+        (["--kind", "lifetime", "--quantity", "lifetime_maen"], "did you mean lifetime_mean"),
     ],
 )
 def test_a_wrong_command_is_one_line(run, tmp_path, more, words):
