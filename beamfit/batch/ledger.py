@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import hashlib
 import io
+import sys
 from collections.abc import Iterable, Iterator
 from itertools import islice
 from pathlib import Path
@@ -87,7 +88,7 @@ class Ledger:
             if tuple(row[2 : len(KEY)]) == self.job.key:
                 before = found.get(row[0], Place(part, at, at, row[1], ()))
                 reason = row[status + 1] if row[status] == UNUSABLE else before.reason
-                statuses = (*before.statuses, row[status])
+                statuses = (*before.statuses, sys.intern(row[status]))
                 found[row[0]] = before._replace(end=end, statuses=statuses, reason=reason)
             at = end
         self.places |= found
