@@ -5,7 +5,8 @@ import math
 import pytest
 
 from benchmarks.league.answers import Answer
-from benchmarks.league.honesty import measured
+from benchmarks.league.honesty import drawn, measured
+from benchmarks.league.scan_tools import beamfit_fit
 
 
 @pytest.mark.parametrize(
@@ -38,3 +39,11 @@ def test_beamfit_refuses_traps_that_a_plain_least_squares_answers():
     assert hill["beamfit"]["refused"] == 3
     assert step["beamfit"]["refused"] == 0
     assert hill["sddsemitproc's method"]["wrong"] + step["scipy curve_fit"]["wrong"] >= 3
+
+
+def test_one_side_of_the_waist_is_not_answered_by_its_own_scatter():
+    """Draws the league found: 1.52 ± 0.09 and 1.50 ± 0.09 µm of a beam of 1 µm."""
+    for number in (28, 97):
+        fit = beamfit_fit(drawn("scans", "traps", "one side, 5 %, no errors", number)).x
+        assert fit.status == "unidentified"
+        assert "on one side of the waist" in fit.message

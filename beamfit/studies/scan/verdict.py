@@ -15,6 +15,9 @@ from beamfit.verdict import Finding
 
 # The emittance is determined if zero is this many standard errors away ...
 CLEAR = 4.0
+# ... and this many where the waist is not bracketed and residuals tell the noise: the few answers
+# of such a scan are else those that noise has made large and sure at once.
+EXTRAPOLATED = 7.0
 # ... and noise would lift it so far less often than this, counting the degrees of freedom.
 CHANCE = 2e-3
 # Sizes that miss every beam by this much, rms and relative, follow no beam.
@@ -184,6 +187,15 @@ def _near_zero(e: Evidence) -> str | None:
     return f"zero emittance lies only {e.distance:.1f} standard errors away" + _one_sided(e)
 
 
+def _extrapolated(e: Evidence) -> str | None:
+    if e.noise_known or e.bracketed is not False or e.distance >= EXTRAPOLATED:
+        return None
+    return (
+        f"zero emittance lies {e.distance:.1f} standard errors away by the scatter of sizes on one "
+        "side of the waist; scan over the waist, or give the errors of the sizes"
+    )
+
+
 def _by_chance(e: Evidence) -> str | None:
     if not e.chance > CHANCE:
         return None
@@ -197,7 +209,7 @@ def _by_chance(e: Evidence) -> str | None:
 # What keeps sizes from determining an emittance, gravest first.
 CAUSES: tuple[Callable[[Evidence], str | None], ...] = (
     _no_rank, _doubted, _too_few, _lost, _unanswered, _swamped, _not_positive, _near_zero,
-    _by_chance,
+    _extrapolated, _by_chance,
 )  # fmt: skip
 
 
