@@ -42,8 +42,7 @@ def test_beamfit_refuses_traps_that_a_plain_least_squares_answers():
 
 
 def test_one_side_of_the_waist_is_not_answered_by_its_own_scatter():
-    """Draws the league found: 1.52 ± 0.09 and 1.50 ± 0.09 µm of a beam of 1 µm."""
-    for number in (28, 97):
-        fit = beamfit_fit(drawn("scans", "traps", "one side, 5 %, no errors", number)).x
-        assert fit.status == "unidentified"
-        assert "on one side of the waist" in fit.message
+    """A draw the league found: 1.43 ± 0.13 µm of a beam of 1 µm, 4.4 errors from none."""
+    fit = beamfit_fit(drawn("scans", "traps", "one side, 5 %, no errors", 71)).x
+    assert fit.status == "unidentified"
+    assert "on one side of the waist" in fit.message

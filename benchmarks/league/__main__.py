@@ -14,43 +14,60 @@ def read() -> dict:
     return json.loads(RESULTS.read_text()) if RESULTS.exists() else {}
 
 
-def keep(results: dict) -> None:
-    """Written whole beside the old one, then renamed."""
-    partial = RESULTS.with_suffix(".partial")
-    partial.write_text(json.dumps(results, indent=1, ensure_ascii=False) + "\n")
+def merged(old: dict, new: dict) -> dict:
+    """`new` laid over `old`, level by level."""
+    both = {k: merged(old[k], v) if isinstance(v, dict) and k in old else v for k, v in new.items()}
+    return old | both
+
+
+def keep(found: dict) -> None:
+    """Add to the results; written whole beside the old ones, then renamed."""
+    partial = RESULTS.with_suffix(f".{os.getpid()}")
+    partial.write_text(json.dumps(merged(read(), found), indent=1, ensure_ascii=False) + "\n")
     os.replace(partial, RESULTS)
 
 
-def honesty(draws: int, only: str, case: str, show: bool) -> None:
-    from .honesty import FIELDS, KINDS, cases, measured
+def honesty(draws: int, asked: argparse.Namespace) -> None:
+    from .honesty import KINDS, cases, measured, says
 
-    for field in FIELDS:
-        for kind in KINDS:
-            for name in cases(field, kind):
-                if case not in name:
-                    continue
-                found = measured(field, kind, name, draws, only)
-                for tool, f in found.items():
-                    said = f"wrong {f['wrong']} {f['such_as']}, refused {f['refused']}"
-                    said += f" {f['refused_such_as']} of {f['draws']}, {f['ms']:.1f} ms"
-                    print(f"{field} {kind:6s} {name:45s} {tool:22s} {said}", flush=True)
-                if not show:
-                    results = read()
-                    part = results.setdefault("honesty", {}).setdefault(field, {})
-                    part.setdefault(kind, {}).setdefault(name, {}).update(found)
-                    keep(results)
+    for field in asked.field.split(","):
+        for kind, name in [(k, name) for k in KINDS for name in cases(field, k)]:
+            if asked.case not in name:
+                continue
+            found = measured(field, kind, name, draws, asked.tool)
+            for tool, f in found.items():
+                said = f"wrong {f['wrong']} {f['such_as']}, refused {f['refused']}"
+                said += f" {f['refused_such_as']} of {f['draws']}, {f['ms']:.1f} ms"
+                print(f"{field} {kind:6s} {name:45s} {tool:22s} {said}", flush=True)
+            case = {"tools": found}
+            if kind == "hidden":
+                case["says"] = says(field, name)
+                print(case["says"])
+            if not asked.show:
+                keep({"honesty": {field: {kind: {name: case}}}})
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.league", description=__doc__)
-    parser.add_argument("what", choices=("honesty", "speed", "page"))
+    parser.add_argument("what", choices=("honesty", "speed", "page"), nargs="*")
     parser.add_argument("--draws", type=int, default=1000)
+    parser.add_argument("--field", default="scans,decays")
     parser.add_argument("--tool", default="", help="this one alone")
     parser.add_argument("--case", default="", help="cases whose name holds this")
     parser.add_argument("--show", action="store_true", help="print, keep nothing")
     asked = parser.parse_args()
-    if asked.what == "honesty":
-        honesty(asked.draws, asked.tool, asked.case, asked.show)
+    what = asked.what or ["honesty", "speed", "page"]
+    if "honesty" in what:
+        honesty(asked.draws, asked)
+    if "speed" in what:
+        from .speed import measured
+
+        for work in measured(asked.case):
+            keep({"speed": work})
+    if "page" in what:
+        from .page import write
+
+        write(read())
 
 
 if __name__ == "__main__":

@@ -11,9 +11,11 @@ DEFINITION = """\
 A tool **answers** if it gives a finite value, says no warning (none in Python, no status or flag
 of its own that speaks against the answer), and the error it gives, if it gives any, is finite. An
 answer is **confident and wrong** if it lies more than 3 of its errors *and* more than 10 % from the
-truth; a tool that gives no error is wrong beyond 10 %. Where nothing is there (no beam, no decay),
-an emittance or a loss rate more than 3 errors from zero is wrong. A good case is
-**refused** if there is no answer, or one with an error that is larger than the value."""
+truth; a tool that gives no error is wrong beyond 10 %. Where a tool gives an interval of 95 %, as
+beamfit does (by Student's t where few residuals tell the noise), half of it over 1.96 is the error.
+Where nothing is there (no beam, no decay), an emittance or a loss rate more than 3 errors from zero
+is wrong. A good case is **refused** if there is no answer, or one with an error larger than the
+value."""
 FAR, SHARE = 3.0, 0.1
 
 
@@ -34,6 +36,12 @@ class Answer(NamedTuple):
     def useful(self) -> bool:
         """Whether it says anything."""
         return self.error is None or self.error < abs(self.value)
+
+
+def of_quantity(quantity: Any, scale: float = 1.0) -> Answer:
+    """beamfit's value with the error that its 95 % interval stands for."""
+    low, high = quantity.interval_95
+    return Answer(scale * quantity.value, scale * (high - low) / 2 / 1.96)
 
 
 Tool = Callable[[Any], dict[str, Answer]]

@@ -8,9 +8,12 @@ from scipy.optimize import curve_fit
 
 from beamfit.studies.decay.record import DecayRecord
 from beamfit.studies.decay.study import study_record
+from beamfit.studies.decay.systematics import systematics
 
-from .answers import Answer
+from .answers import Answer, ask, of_quantity
 from .decays import HOUR, Decay, closed
+
+__all__ = ["systematics"]
 
 
 def beamfit_fits(case: Decay) -> list:
@@ -19,7 +22,7 @@ def beamfit_fits(case: Decay) -> list:
     return [*(pooled.fit for pooled in study.pooled), *(one.fit for one in study.decays)]
 
 
-def by_beamfit(case: Decay) -> dict[str, Answer]:
+def told(case: Decay) -> dict[str, Answer]:
     """Every decay's answers; lifetimes stand beside `unidentified` (a and b), nothing else does."""
     found = {}
     for k, fit in enumerate(beamfit_fits(case)):
@@ -28,11 +31,15 @@ def by_beamfit(case: Decay) -> dict[str, Answer]:
         for name in ("a", "b"):
             quantity = getattr(fit, name)
             if fit.status == "converged" and quantity.error is not None:
-                found[f"{name} {k}"] = Answer(quantity.value, quantity.error)
+                found[f"{name} {k}"] = of_quantity(quantity)
         life = fit.lifetime_mean
         if life.error is not None:
-            found[f"lifetime {k} {fit.mean_current}"] = Answer(HOUR * life.value, HOUR * life.error)
+            found[f"lifetime {k} {fit.mean_current}"] = of_quantity(life, HOUR)
     return found
+
+
+def by_beamfit(cases: list[Decay]) -> list[dict[str, Answer]]:
+    return [ask(told, case) for case in cases]
 
 
 def rates(case: Decay, value: np.ndarray, covariance: np.ndarray) -> dict[str, Answer]:
@@ -88,7 +95,7 @@ def by_logarithm(case: Decay) -> dict[str, Answer]:
     return lifetime(float(case.current.mean()), -float(slope[0]), float(covariance[0, 0] ** 0.5))
 
 
-def by_emcee(case: Decay, walkers: int = 32, steps: int = 400) -> dict[str, Answer]:
+def by_emcee(case: Decay, walkers: int = 32, steps: int = 300) -> dict[str, Answer]:
     """A posterior by hand: white noise (of the file, else one more number), a and b from zero."""
     first = np.array(start(case))
     spread = case.error if case.error is not None else np.std(np.diff(case.current)) / 2**0.5
@@ -112,11 +119,11 @@ def by_emcee(case: Decay, walkers: int = 32, steps: int = 400) -> dict[str, Answ
     return rates(case, np.median(chain, 0), np.cov(chain.T))
 
 
-# Name: (tool, one of how many draws it is given).
+# Name: (tool, one of how many draws it is given); beamfit is given a list of them.
 TOOLS = {
     "beamfit": (by_beamfit, 1),
     "scipy curve_fit": (by_scipy, 1),
-    "lmfit": (by_lmfit, 4),
-    "emcee by hand": (by_emcee, 40),
+    "lmfit": (by_lmfit, 2),
+    "emcee by hand": (by_emcee, 10),
     "line through log I": (by_logarithm, 1),
 }

@@ -112,9 +112,13 @@ def bursts(i, t):
     )
 
 
-def step(change: float, rng, t, i):
-    """A refill (or a loss) of `change` mA somewhere in the middle."""
-    return i + change * (t > t[-1] * rng.uniform(0.3, 0.7))
+def stepped(rng: np.random.Generator, change: float, i0=200.0, a=5e-8, b=5e-6, n=400) -> Decay:
+    """A refill (or a loss) of `change` mA in the middle of six hours, then the same law."""
+    time = np.linspace(0, 6 * HOUR, n)
+    when = time[-1] * rng.uniform(0.3, 0.7)
+    again = closed(np.maximum(time - when, 0), closed(when, i0, a, b) + change, a, b)
+    beam = np.where(time < when, closed(time, i0, a, b), again) + 0.01 * rng.normal(size=n)
+    return Decay(time, beam, None, a, b)
 
 
 def spikes(rng, t, i):
@@ -198,8 +202,8 @@ TRAPS: dict[str, Callable[[np.random.Generator], Decay]] = {
     ),
     "RF voltage changed, not logged": partial(decay, law=voltage, know="b"),
     "three bursts of gas": partial(decay, law=bursts, know="a"),
-    "a refill of 0.5 mA": partial(decay, spoil=partial(step, 0.5)),
-    "a loss of 2 mA": partial(decay, spoil=partial(step, -2.0)),
+    "a refill of 0.5 mA": partial(stepped, change=0.5),
+    "a loss of 2 mA": partial(stepped, change=-2.0),
     "one reading in a hundred is anything": partial(decay, spoil=spikes),
     "one reading in a hundred is zero": partial(decay, spoil=zeros),
     "heavy tails": partial(decay, spoil=tails),

@@ -51,18 +51,40 @@ def measured(field: str, kind: str, name: str, draws: int, only: str = "") -> di
     for label, (tool, every) in FIELDS[field][1].TOOLS.items():
         if only and label != only:
             continue
-        count, begin = max(draws // every, 3), time.perf_counter()
-        wrong, refused = [], []
-        for number in range(count):
-            case = drawn(field, kind, name, number)
-            answers = ask(tool, case)
-            if is_wrong(case, answers):
-                wrong.append(number)
-            if refuses(answers):
-                refused.append(number)
-        seconds = (time.perf_counter() - begin) / count
+        given = [drawn(field, kind, name, k) for k in range(max(draws // every, 3))]
+        begin = time.perf_counter()
+        together = label == "beamfit"
+        answers = tool(given) if together else [ask(tool, case) for case in given]
+        seconds = (time.perf_counter() - begin) / len(given)
+        both = list(zip(given, answers, strict=True))
+        wrong = [k for k, (case, said) in enumerate(both) if is_wrong(case, said)]
+        refused = [k for k, (_, said) in enumerate(both) if refuses(said)]
         found[label] = {
-            "draws": count, "wrong": len(wrong), "refused": len(refused),
+            "draws": len(given), "wrong": len(wrong), "refused": len(refused),
             "such_as": wrong[:3], "refused_such_as": refused[:3], "ms": round(1e3 * seconds, 3),
         }  # fmt: skip
     return found
+
+
+def says(field: str, name: str) -> str:
+    """What beamfit says where the data show nothing: its budget's row, else its message."""
+    case = drawn(field, "hidden", name, 0)
+    _, cause, steps = FIELDS[field][0].HIDDEN[name]
+    if field == "scans":
+        fit = scan_tools.beamfit_fit(case)
+        error = fit.x.normalized_emittance.relative if fit.x.emittance.error else float("nan")
+        rows = [(c.cause, c.normalized_emittance) for c in scan_tools.systematics(fit, "x")]
+        told, what, message = f"statistics ±{100 * error:.1f} %", "emittance", fit.x.message
+    else:
+        fit = decay_tools.beamfit_fits(case)[0]
+        b = fit.b
+        told = (
+            f"b ±{100 * b.error / b.value:.1f} % by statistics" if b.error else "b not determined"
+        )
+        rows = [(c.cause, c.b / b.value) for c in decay_tools.systematics(fit)]
+        what, message = "b", fit.message
+    row = [(c, share) for c, share in rows if cause and cause in c]
+    if not row:
+        return f"it says: {message.split(': errors rest')[0][:300]}"
+    moved = f"{what} {100 * row[0][1]:+.1f} %, here {steps:g} times that"
+    return f"{told}; its budget has *{row[0][0]}*: {moved}"

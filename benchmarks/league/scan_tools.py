@@ -11,10 +11,13 @@ from scipy.optimize import curve_fit, minimize
 
 import beamfit
 from beamfit.optics.elements import Drift, Quadrupole, Screen
+from beamfit.studies.scan.many import fit_many
+from beamfit.studies.scan.sensitivity import systematics
 
-from .answers import Answer
+from .answers import Answer, of_quantity
 from .scans import Line, Scan
 
+__all__ = ["systematics"]
 MADE_UP = 0.015  # relative errors where the file has none: pyemittance's default
 
 
@@ -27,19 +30,24 @@ def beamfit_line(line: Line) -> beamfit.Beamline:
     return beamfit.Beamline((Quadrupole("Q", line.length), *parts, Screen("S")), line.energy)
 
 
-def beamfit_fit(scan: Scan):
+def beamfit_scan(scan: Scan) -> beamfit.QuadScan:
     error = {} if scan.error is None else {"x": scan.error}
-    measured = beamfit.QuadScan({"Q": scan.k1}, {"Q": "k1"}, {"x": scan.size}, error)
-    return beamfit.fit_emittance(measured, beamfit_line(scan.line))
+    return beamfit.QuadScan({"Q": scan.k1}, {"Q": "k1"}, {"x": scan.size}, error)
 
 
-def by_beamfit(scan: Scan) -> dict[str, Answer]:
-    """Any status but `converged` warns."""
-    fit = beamfit_fit(scan).x
-    found = fit.normalized_emittance
-    if fit.status != "converged" or found.error is None:
-        return {}
-    return {"emittance": Answer(found.value, found.error)}
+def beamfit_fit(scan: Scan) -> beamfit.EmittanceFit:
+    return beamfit.fit_emittance(beamfit_scan(scan), beamfit_line(scan.line))
+
+
+def by_beamfit(scans: list[Scan]) -> list[dict[str, Answer]]:
+    """All draws in one call. Any status but `converged` warns."""
+    fits = fit_many(map(beamfit_scan, scans), beamfit_line(scans[0].line))
+    return [{} if isinstance(fit, beamfit.InputError) else told(fit.x) for fit in fits]
+
+
+def told(fit) -> dict[str, Answer]:
+    sure = fit.status == "converged" and fit.normalized_emittance.error is not None
+    return {"emittance": of_quantity(fit.normalized_emittance)} if sure else {}
 
 
 def errors_of(scan: Scan) -> np.ndarray:
@@ -196,7 +204,7 @@ def by_sddsemitproc(scan: Scan, sets: int = 100) -> dict[str, Answer]:
     return {"emittance": Answer(float(found.mean()), float(found.std(ddof=1)))}
 
 
-def by_emcee(scan: Scan, walkers: int = 32, steps: int = 600) -> dict[str, Answer]:
+def by_emcee(scan: Scan, walkers: int = 32, steps: int = 300) -> dict[str, Answer]:
     """A posterior by hand: flat in log ε, log β and α; median and half of the 68 % interval."""
     design, size = squares(scan.rows), scan.size
     error = MADE_UP * size if scan.error is None else scan.error
@@ -225,14 +233,14 @@ def by_emcee(scan: Scan, walkers: int = 32, steps: int = 600) -> dict[str, Answe
     return {"emittance": Answer(value, value * (np.exp(high - middle) - np.exp(low - middle)) / 2)}
 
 
-# Name: (tool, one of how many draws it is given).
+# Name: (tool, one of how many draws it is given); beamfit is given all of them at once.
 TOOLS = {
     "beamfit": (by_beamfit, 1),
-    "pyemittance": (by_pyemittance, 1),
-    "scipy curve_fit": (by_scipy, 1),
-    "lmfit": (by_lmfit, 4),
-    "cheetah + curve_fit": (by_cheetah, 4),
-    "emcee by hand": (by_emcee, 20),
-    "lcls-tools' method": (by_lcls_tools, 4),
-    "sddsemitproc's method": (by_sddsemitproc, 1),
+    "pyemittance": (by_pyemittance, 2),
+    "scipy curve_fit": (by_scipy, 2),
+    "lmfit": (by_lmfit, 5),
+    "cheetah + curve_fit": (by_cheetah, 5),
+    "emcee by hand": (by_emcee, 40),
+    "lcls-tools' method": (by_lcls_tools, 10),
+    "sddsemitproc's method": (by_sddsemitproc, 2),
 }

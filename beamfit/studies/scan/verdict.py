@@ -17,7 +17,7 @@ from beamfit.verdict import Finding
 CLEAR = 4.0
 # ... and this many where the waist is not bracketed and residuals tell the noise: the few answers
 # of such a scan are else those that noise has made large and sure at once.
-EXTRAPOLATED = 7.0
+EXTRAPOLATED = 6.0
 # ... and noise would lift it so far less often than this, counting the degrees of freedom.
 CHANCE = 2e-3
 # Sizes that miss every beam by this much, rms and relative, follow no beam.
