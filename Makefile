@@ -6,7 +6,7 @@ export OPENBLAS_NUM_THREADS := 1
 export OMP_NUM_THREADS := 1
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
-.PHONY: demo test docs calibrate coverage soak bench lint clean
+.PHONY: demo test docs calibrate coverage soak bench league lint clean
 .DEFAULT_GOAL := demo
 
 .venv/runtime: pyproject.toml constraints.txt
@@ -20,6 +20,11 @@ export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
 .venv/bench: .venv/test
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[bench]'
+	touch $@
+
+# cheetah brings torch, of several GB where it is not installed yet.
+.venv/league: .venv/bench
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[league]'
 	touch $@
 
 demo: .venv/runtime
@@ -61,6 +66,11 @@ bench: .venv/bench
 	$(BIN)/python benchmarks/scenarios.py
 	$(BIN)/python benchmarks/response.py
 	$(BIN)/python benchmarks/control.py
+
+# beamfit beside every peer, honesty and speed: docs/league.md. Hours with 1000 draws; DRAWS=40 for a look.
+DRAWS ?= 1000
+league: .venv/league
+	$(BIN)/python -m benchmarks.league --draws $(DRAWS)
 
 clean:
 	rm -rf .venv demo dist build

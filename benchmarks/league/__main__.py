@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import re
 from pathlib import Path
 
 RESULTS = Path(__file__).with_name("results.json")
@@ -21,9 +22,10 @@ def merged(old: dict, new: dict) -> dict:
 
 
 def keep(found: dict) -> None:
-    """Add to the results; written whole beside the old ones, then renamed."""
+    """Add to the results, one line a tool; written whole beside the old ones, then renamed."""
     partial = RESULTS.with_suffix(f".{os.getpid()}")
-    partial.write_text(json.dumps(merged(read(), found), indent=1, ensure_ascii=False) + "\n")
+    text = json.dumps(merged(read(), found), indent=1, ensure_ascii=False)
+    partial.write_text(re.sub(r"\{[^{}]*\}", lambda m: " ".join(m[0].split()), text) + "\n")
     os.replace(partial, RESULTS)
 
 

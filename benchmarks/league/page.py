@@ -38,7 +38,6 @@ def table(head: list[str], rows: list[list[str]]) -> str:
 def share_of(cases: dict, what: str, emphasised: float) -> str:
     """One row a case, one column a tool; beyond the limit in bold."""
     tools = list(next(iter(cases.values()))["tools"])
-    draws = [next(iter(cases.values()))["tools"][tool]["draws"] for tool in tools]
     rows = []
     for name, case in cases.items():
         cells = []
@@ -47,8 +46,13 @@ def share_of(cases: dict, what: str, emphasised: float) -> str:
             said = percent(found[what], found["draws"])
             cells.append(f"**{said}**" if float(said) > emphasised else said)
         rows.append([name, *cells])
-    head = ["", *(f"{tool} ({count})" for tool, count in zip(tools, draws, strict=True))]
-    return table(head, rows)
+    return table(["", *(f"{tool} ({draws_of(cases, tool)})" for tool in tools)], rows)
+
+
+def draws_of(cases: dict, tool: str) -> str:
+    """How many draws, least and most where cases differ."""
+    counts = sorted({case["tools"][tool]["draws"] for case in cases.values()})
+    return str(counts[0]) if len(counts) == 1 else f"{counts[0]} to {counts[-1]}"
 
 
 def shares(cases: dict, tool: str, what: str) -> dict[str, float]:
@@ -84,6 +88,8 @@ def summary(field: dict) -> str:
 def honesty(results: dict) -> str:
     said = DEFINITION + "\n"
     for name, field in results.items():
+        if set(field) < {"good", "traps", "hidden"}:
+            continue
         said += f"\n### {TITLES[name]}\n\n{summary(field)}"
         said += "\n**Traps that the data can reveal**: confident and wrong, % (draws)\n\n"
         said += share_of(field["traps"], "wrong", MOST_WRONG)
