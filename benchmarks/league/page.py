@@ -88,8 +88,6 @@ def summary(field: dict) -> str:
 def honesty(results: dict) -> str:
     said = DEFINITION + "\n"
     for name, field in results.items():
-        if set(field) < {"good", "traps", "hidden"}:
-            continue
         said += f"\n### {TITLES[name]}\n\n{summary(field)}"
         said += "\n**Traps that the data can reveal**: confident and wrong, % (draws)\n\n"
         said += share_of(field["traps"], "wrong", MOST_WRONG)
@@ -98,6 +96,8 @@ def honesty(results: dict) -> str:
         )
         said += "\n**Good cases**: confident and wrong, %\n\n"
         said += share_of(field["good"], "wrong", MOST_WRONG)
+        if "hidden" not in field:
+            continue
         said += "\n**What the data cannot show**: confident and wrong, %, and what beamfit says\n\n"
         said += share_of(field["hidden"], "wrong", 100.0)
         said += "".join(f"\n- {n}: {c['says']}" for n, c in field["hidden"].items()) + "\n"

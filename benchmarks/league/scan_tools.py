@@ -42,7 +42,7 @@ def beamfit_fit(scan: Scan) -> beamfit.EmittanceFit:
 def by_beamfit(scans: list[Scan]) -> list[dict[str, Answer]]:
     """All draws in one call. Any status but `converged` warns, and so does an error."""
     try:
-        fits = fit_many(map(beamfit_scan, scans), beamfit_line(scans[0].line))
+        fits = fit_many([(beamfit_scan(scan), beamfit_line(scan.line)) for scan in scans])
     except beamfit.InputError:
         return [{} if len(scans) == 1 else by_beamfit([scan])[0] for scan in scans]
     return [{} if isinstance(fit, beamfit.InputError) else told(fit.x) for fit in fits]
