@@ -6,6 +6,7 @@ import math
 from pathlib import Path
 
 from .answers import DEFINITION
+from .honesty import KINDS, cases
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "league.md"
 MOST_WRONG, MOST_REFUSED = 1.0, 2.0  # percent
@@ -18,7 +19,8 @@ it again and writes this page. Cases and their noise are in `benchmarks/league/s
 optics, and scipy, lmfit and emcee the fits that one then writes oneself, as here. lcls-tools and
 elegant's sddsemitproc are not on PyPI: what is run is their method, written from its description.
 pyAT, MAD-X, xfields, CasADi, jax-sysid and do-mpc analyse no such measurement: they are in the
-tables of speed.
+tables of speed. Draws are in the heads of the tables: one wrong answer of 60 is 1.7 %; a case that
+is not in a table was not reached. In bold is what exceeds 1 % of wrong or 2 % of refused.
 
 ## Honesty
 
@@ -27,7 +29,8 @@ TITLES = {"scans": "Emittance from a quadrupole scan", "decays": "a, b and lifet
 
 
 def percent(count: int, draws: int) -> str:
-    return f"{100 * count / draws:.2g}" if count else "0"
+    share = 100 * count / draws
+    return f"{share:.0f}" if share > 10 else f"{share:.2g}"
 
 
 def table(head: list[str], rows: list[list[str]]) -> str:
@@ -76,7 +79,7 @@ def summary(field: dict) -> str:
         worst = max(wrong, key=wrong.get)
         rows.append([
             tool, f"{sum(w > MOST_WRONG for w in wrong.values())} of {len(wrong)}",
-            f"{sum(wrong.values()) / len(wrong):.2g} %", f"{wrong[worst]:.2g} % ({worst})",
+            f"{sum(wrong.values()) / len(wrong):.2g} %", f"{wrong[worst]:.0f} % ({worst})",
             f"{sum(r > MOST_REFUSED for r in refused)} of {len(refused)}", f"{max(refused):.2g} %",
             f"{max(off):.2g} %",
         ])  # fmt: skip
@@ -85,9 +88,15 @@ def summary(field: dict) -> str:
     return table(head, rows)
 
 
+def ordered(found: dict, names: dict) -> dict:
+    """As the cases stand in their module."""
+    return {name: found[name] for name in names if name in found}
+
+
 def honesty(results: dict) -> str:
     said = DEFINITION + "\n"
-    for name, field in results.items():
+    for name, found in results.items():
+        field = {kind: ordered(found[kind], cases(name, kind)) for kind in KINDS if kind in found}
         said += f"\n### {TITLES[name]}\n\n{summary(field)}"
         said += "\n**Traps that the data can reveal**: confident and wrong, % (draws)\n\n"
         said += share_of(field["traps"], "wrong", MOST_WRONG)
