@@ -59,6 +59,7 @@ def main() -> None:
     except click.ClickException as error:
         _fail(error.format_message())
     except click.exceptions.Abort:
+        click.echo("beamfit: interrupted", err=True)
         sys.exit(130)
     except InputError as error:
         _fail(str(error))
