@@ -2,7 +2,7 @@
 
 `make soak` runs it: `python -m tests.soak [COUNT [READER ...]]`. Each reader is given COUNT files
 with one to twenty things changed, in a process of its own. A traceback, a file that takes more
-than 10 s and a process of more than 1 GB are faults; the file is kept and the exit status is 1.
+than 11 s and a process of more than 1 GB are faults; the file is kept and the exit status is 1.
 """
 
 from __future__ import annotations
