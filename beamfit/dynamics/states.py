@@ -70,12 +70,15 @@ class StateSpace(NamedTuple):
             both = jnp.zeros((len(x) + 1,) * 2).at[:-1].set(jnp.column_stack([matrix, shift]))
             return x + (_growth(both * dt) @ jnp.append(x, 1.0))[:-1]
         h = dt / self.parts
-        for _ in range(self.parts):
+
+        def part(_, x):
             a = rate(x)
             b = rate(x + 0.5 * h * a)
             c = rate(x + 0.5 * h * b)
-            x = x + h / 6.0 * (a + 2.0 * b + 2.0 * c + rate(x + h * c))
-        return x
+            return x + h / 6.0 * (a + 2.0 * b + 2.0 * c + rate(x + h * c))
+
+        # A loop of one part is a loop inside the scan for nothing.
+        return part(0, x) if self.parts == 1 else jax.lax.fori_loop(0, self.parts, part, x)
 
     def run(
         self, p: Any, u: jax.Array, dt: jax.Array, x0: jax.Array
