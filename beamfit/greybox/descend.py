@@ -35,7 +35,7 @@ PINNED = 3
 # With a limit of time the clock is looked at after so many steps.
 SEGMENT = 50
 # Searches in a compiled call, where their Jacobians have no more than so many numbers.
-WIDTH, LARGE = 4, 2**16
+WIDTH, LARGE = 4, 2**15
 
 
 class Found(NamedTuple):
