@@ -103,7 +103,7 @@ class Quantity:
         error = self.error / factor
         places = 3 if error == 0 else 1 - math.floor(math.log10(error))
         if abs(value) < 1e-3 or max(abs(value), error) >= 1e5:
-            power = math.floor(math.log10(max(abs(value), error)))
+            power = math.floor(math.log10(max(abs(value), error) or 1.0))
             value, error, places = value / 10**power, error / 10**power, places + power
             return f"({value:.{max(places, 0)}f} ± {error:.{max(places, 0)}f})e{power:+03d}{end}"
         return f"{value:.{max(places, 0)}f} ± {error:.{max(places, 0)}f}{end}"
