@@ -11,12 +11,14 @@ from beamfit.errors import InputError
 from beamfit.io.files import digest
 
 if TYPE_CHECKING:
+    from beamfit.studies.fedbatch.fit import FedBatchFit
+    from beamfit.studies.fedbatch.titre import TitreFit
     from beamfit.studies.response.fit import ResponseFit
     from beamfit.studies.response.states import StatesFit
 
 __all__ = ["identify"]
 
-STATES = "state-space"
+STATES, FED_BATCH = "state-space", "fed-batch"
 
 EXAMPLE = """\b
 Examples:
@@ -24,6 +26,7 @@ Examples:
   beamfit identify monday.csv tuesday.csv --model second-order --map network --report process.html
   beamfit identify log.csv --input Valve --output Level --step 4 --hold-back friday.csv --json
   beamfit identify tanks.csv --model state-space --order 3 --map network
+  beamfit identify batch_1.csv batch_2.csv --model fed-batch --map network
 """
 
 
@@ -56,14 +59,18 @@ def identify(
     RECORD is a CSV or HDF5 file with time_s, inputs u_… that hold from row to row, and outputs y_…;
     several runs are identified together. Each output gives its parameters with errors (as curves of
     the operating point with --map network), tests of the residuals, and a verdict; a state space is
-    one of all outputs, with its time constants and gains.
+    one of all outputs, with its time constants and gains; a fed-batch process the rates of its
+    balances.
     """
     from beamfit.io.run import read_run  # numpy
 
     if order is not None and model != STATES:
         raise InputError(f"--order {order} with --model {model}", f"--model {STATES}")
-    if gains and model == STATES:
-        raise InputError(f"--gain with --model {STATES}", "--model first-order or second-order")
+    if gains and model in (STATES, FED_BATCH):
+        raise InputError(f"--gain with --model {model}", "--model first-order or second-order")
+    if model == FED_BATCH and (map != "network" or delay or no_offset):
+        expected = "--map network, without --delay or --no-offset: its rates are a network's"
+        raise InputError(f"--model {FED_BATCH}", expected)
     said = {"inputs": inputs, "outputs": outputs, "step": step}
     said |= {"ignore": ignore, "skip_bad": skip_bad}
     twice = [path for path in record if (*record, *hold_back).count(path) > 1]
@@ -77,6 +84,13 @@ def identify(
         from beamfit.studies.response.linear import identify_states  # JAX from here on
 
         fits = [identify_states(runs, order, delay=delay or 0, **options)]
+    elif model == FED_BATCH:
+        from beamfit.studies.fedbatch.fit import identify_batches
+        from beamfit.studies.fedbatch.titre import fit_titre
+
+        fits = [identify_batches(runs, held=held, hidden=hidden, seed=seed)]
+        if all("titre" in run.outputs for run in runs):
+            fits.append(fit_titre(fits[0], seed=seed))
     else:
         from beamfit.studies.response.fit import identify as fit_response
 
@@ -95,7 +109,7 @@ def identify(
     _show(fits, report)
 
 
-def _show(fits: list[ResponseFit | StatesFit], report: str | None) -> None:
+def _show(fits: list[ResponseFit | StatesFit | FedBatchFit | TitreFit], report: str | None) -> None:
     from beamfit.cli.show import Terminal
 
     terminal = Terminal()

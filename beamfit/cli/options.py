@@ -150,11 +150,12 @@ SHARED: dict[str, Callable[..., Any]] = {
     ),
     "model": click.option(
         "--model",
-        type=click.Choice(["first-order", "second-order", "arx", "state-space"]),
+        type=click.Choice(["first-order", "second-order", "arx", "state-space", "fed-batch"]),
         default="first-order",
         show_default=True,
         help="tau y' + y = K u; T² y'' + 2 zeta T y' + y = K u; y(k) = -a1 y(k-1) - a2 y(k-2) + "
-        "b1 u(k-1) + b2 u(k-2); or x+ = A x + B u, y = C x + D u of all outputs together.",
+        "b1 u(k-1) + b2 u(k-2); x+ = A x + B u, y = C x + D u of all outputs together; or mass "
+        "balances of biomass, substrate and volume with rates by a network.",
     ),
     "order": click.option(
         "--order",

@@ -5,13 +5,12 @@ Concentrations are in g/L, volumes in L, times in h; rates are per gram of bioma
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 
-__all__ = ["Flow", "balances", "rk4", "titre_of"]
+__all__ = ["Flow", "balances", "titre_of"]
 
 
 class Flow(NamedTuple):
@@ -60,21 +59,6 @@ def balances(x: jax.Array, rates: jax.Array, flow: Flow) -> jax.Array:
             flow.feed - flow.out,
         ]
     )
-
-
-def rk4(slope: Callable[[jax.Array], jax.Array], x: jax.Array, dt: jax.Array) -> jax.Array:
-    """One step of the classical Runge-Kutta method (W. Kutta 1901), of fourth order.
-
-    Examples
-    --------
-    >>> round(float(rk4(lambda x: -x, jnp.array(1.0), 0.1)), 7)
-    0.9048375
-    """
-    a = slope(x)
-    b = slope(x + 0.5 * dt * a)
-    c = slope(x + 0.5 * dt * b)
-    d = slope(x + dt * c)
-    return x + dt / 6.0 * (a + 2.0 * b + 2.0 * c + d)
 
 
 def titre_of(

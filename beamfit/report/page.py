@@ -16,6 +16,7 @@ from beamfit.report.control import control_page
 from beamfit.report.decays import decay_page, study_of
 from beamfit.report.document import STYLE, Page, Picture, drawn, html_of
 from beamfit.report.emittance import emittance_page
+from beamfit.report.fedbatch import fedbatch_page, feed_page
 from beamfit.report.formulation import formulation_page
 from beamfit.report.pdf import pdf_of
 from beamfit.report.posterior import Sampled, of_decay, of_scan, with_posteriors
@@ -26,6 +27,9 @@ from beamfit.studies.decay.fit import DecayFit
 from beamfit.studies.decay.shift import Shift
 from beamfit.studies.decay.study import RecordStudy
 from beamfit.studies.decay.trend import Trend
+from beamfit.studies.fedbatch.feed import FeedPlan
+from beamfit.studies.fedbatch.fit import FedBatchFit
+from beamfit.studies.fedbatch.titre import TitreFit
 from beamfit.studies.response.fit import ResponseFit
 from beamfit.studies.response.loop import Loop
 from beamfit.studies.response.states import StatesFit
@@ -34,7 +38,10 @@ from beamfit.studies.scan.size_methods import SizeMethods
 from beamfit.studies.scan.slices import SliceFits
 from beamfit.writing import write_atomically
 
-Reported = EmittanceFit | SliceFits | DecayFit | Solution | ResponseFit | Loop
+Reported = (
+    EmittanceFit | SliceFits | DecayFit | Solution | ResponseFit | Loop
+    | FedBatchFit | TitreFit | FeedPlan
+)  # fmt: skip
 
 
 def write_report(
@@ -58,7 +65,8 @@ def write_report(
     result : EmittanceFit, SliceFits, DecayFit, Solution, ResponseFit, Loop, or sequence
         The emittance of a scan or of the slices of a beam, the lifetime of a decay, a formulation
         solved, the response of a process, a simulated loop; or a sequence of RecordStudy (the
-        lifetimes of whole records) or of ResponseFit (several outputs).
+        lifetimes of whole records) or of ResponseFit (several outputs); the rates and the titre
+        of a fed-batch process, or its planned feed.
     posterior : Posterior or sequence of Posterior, optional
         What `sample` of the fit gave; of records one for each decay.
     command : str, optional
@@ -102,6 +110,10 @@ def write_report(
                 page = formulation_page(solution, command, inputs)
             case SliceFits() as slices:
                 page = slices_page(slices, command, inputs)
+            case FedBatchFit() | TitreFit():
+                page = fedbatch_page(several, command, inputs)
+            case FeedPlan() as plan:
+                page = feed_page(plan, command, inputs)
             case ResponseFit() | StatesFit():
                 page = response_page(several, command, inputs)
             case Loop() as loop:

@@ -52,7 +52,7 @@ def _pictures(fit: ResponseFit | Part) -> list[Picture]:
         for i in runs
     ]  # fmt: skip
     found += [
-        Picture(f"{c.parameter} against {c.input} with its band", 2.8, partial(_draw_curve, fit, j))
+        Picture(f"{c.parameter} against {c.input} with its band", 2.8, partial(draw_curve, fit, j))
         for j, c in enumerate(fit.curves)
     ]
     return [*found, Picture(f"Correlations of the residuals of {fit.output}", 2.8,
@@ -81,7 +81,7 @@ def _draw_run(fit: ResponseFit | Part, i: int, figure: FigureBase) -> None:
         below.legend(frameon=False, fontsize=8, ncols=len(run.inputs))
 
 
-def _draw_curve(fit: ResponseFit | Part, j: int, figure: FigureBase) -> None:
+def draw_curve(fit: ResponseFit | Part, j: int, figure: FigureBase) -> None:
     """A parameter against the operating point, dashed where the runs never were."""
     c = fit.curves[j]
     axes = figure.subplots()

@@ -78,6 +78,16 @@ BAD = {
         ("--model", "state-space"),
         ["unequal"],
     ),
+    "constant rates of a fed batch": (
+        table(*ROWS),
+        ("--model", "fed-batch"),
+        ["--model fed-batch", "--map network"],
+    ),
+    "no biomass of a fed batch": (
+        table(*ROWS),
+        ("--model", "fed-batch", "--map", "network"),
+        ["a.csv: no output biomass", "y_biomass"],
+    ),
     "empty": ("", (), ["empty"]),
     "no step": (table(*ROWS, head="note_c,u_valve,y_level\n"), ("--step", "-1"), ["--step", "0"]),
 }

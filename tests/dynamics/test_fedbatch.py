@@ -2,12 +2,12 @@
 
 import runpy
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from beamfit.dynamics.fedbatch import Flow, balances, rk4, titre_of
+from beamfit.dynamics.fedbatch import Flow, balances, titre_of
+from beamfit.dynamics.states import StateSpace
 
 
 @pytest.fixture(scope="module")
@@ -20,21 +20,17 @@ def test_balances_and_titre_follow_an_independent_integration(plant):
     feed, air = np.linspace(0.05, 0.2, steps), np.full(steps, 0.8)
     true = plant["plant"]((2.0, 5.0, 4.0, 0.3), feed, air, apart=0.1)
 
-    def slope(f):
-        def of(x):
-            return balances(x, jnp.stack(plant_rates(x[1])[:2]), Flow(f, plant["FED"], 0.0))
-
-        return of
-
     def plant_rates(s):
         growth = 0.30 * s / (1.0 + s + s**2 / 20.0) * 0.8 / 1.05
         made = (0.10 * growth + 0.004 * s / (1.0 + s)) / (1.0 + s / 8.0)
         return growth, growth / 0.5 + 0.03 * s / (1.0 + s), made
 
-    def step(x, f):
-        return rk4(slope(f), x, 0.1), x
+    def slope(x, u, _):
+        return balances(x, jnp.stack(plant_rates(x[1])[:2]), Flow(u[0], plant["FED"], 0.0))
 
-    _, x = jax.lax.scan(step, jnp.array([2.0, 5.0, 4.0]), jnp.asarray(feed))
+    begin = jnp.array([2.0, 5.0, 4.0])
+    space = StateSpace(slope, lambda x, u, p: x, parts=2)
+    x, _ = space.run(None, jnp.asarray(feed)[:, None], jnp.full(steps, 0.1), begin)
     np.testing.assert_allclose(x, true[:, :3], rtol=2e-6)
     made = plant_rates(x[:, 1])[2]
     both = jnp.stack([made, jnp.append(made[1:], 0.0)])

@@ -1,0 +1,109 @@
+"""The report of a fed-batch process: batches, rates, titre and planned feed (figs 31 to 36)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from functools import partial
+
+import numpy as np
+from matplotlib.figure import FigureBase
+
+from beamfit.report.document import BLUE, RED, Page, Picture, Verdict, provenance, written
+from beamfit.report.response import draw_curve
+from beamfit.studies.fedbatch.feed import Course, FeedPlan
+from beamfit.studies.fedbatch.fit import FedBatchFit
+from beamfit.studies.fedbatch.titre import Ranked, TitreFit
+
+__all__ = ["draw_batch", "draw_course", "draw_ranking", "fedbatch_page", "feed_page"]
+
+NOTES = (
+    "Errors and bands are one standard deviation. The balances run free from the start of each "
+    "batch; the noise of each output is taken from its residuals.",
+)
+UNITS = {"biomass": "g/L", "substrate": "g/L", "volume": "L", "titre": "g/L"}
+
+
+def fedbatch_page(
+    fits: Sequence[FedBatchFit | TitreFit],
+    command: str | None,
+    inputs: Mapping[str, str | None] | None,
+) -> Page:
+    """Lay out the rates, and the titre if it was fitted."""
+    rates = fits[0].rates if isinstance(fits[0], TitreFit) else fits[0]
+    digests = inputs or {run.path or run.name: run.sha256 or None for run in rates.runs}
+    remarks = [(f"said in {run.name}", line) for run in rates.runs for line in run.provenance]
+    pictures = [
+        Picture(f"Measured and predicted in {run.name}", 6.8, partial(draw_batch, fits[-1], i))
+        for i, run in enumerate(rates.runs)
+    ]
+    pictures += [
+        Picture(f"{c.parameter} by {c.input} with its band", 2.8, partial(draw_curve, rates, j))
+        for j, c in enumerate(rates.curves)
+    ]
+    return Page(
+        title="Fed-batch process",
+        subtitle=f"identified from {', '.join(run.name for run in rates.runs)}; {written()}",
+        verdicts=[Verdict(fit.status, fit.headline, fit.message) for fit in fits],
+        tables=[table for fit in fits for table in fit.tables()],
+        pictures=pictures,
+        pictures_title="Batches and rates",
+        provenance=provenance(digests, remarks, command),
+        notes=NOTES,
+    )
+
+
+def feed_page(plan: FeedPlan, command: str | None, inputs: Mapping[str, str | None] | None) -> Page:
+    """Lay out a planned feed."""
+    return Page(
+        title="Feed profile",
+        subtitle=f"planned on the identified process; {written()}",
+        verdicts=[Verdict(plan.status, plan.headline, plan.message)],
+        tables=list(plan.tables()),
+        pictures=[Picture("What comes of it", 6.8, partial(draw_course, plan.course))],
+        pictures_title="The plan",
+        provenance=provenance(inputs or {}, [], command),
+        notes=NOTES,
+    )
+
+
+def draw_batch(fit: FedBatchFit | TitreFit, i: int, figure: FigureBase) -> None:
+    """Measured and predicted outputs of a batch, and its inputs below."""
+    run = (fit.rates if isinstance(fit, TitreFit) else fit).runs[i]
+    names = list(UNITS)[: fit.courses[i].shape[1]]
+    hours = (run.time - run.time[0]) / 3600.0
+    axes = figure.subplots(len(names) + 1, 1, sharex=True)
+    for axis, name, predicted in zip(axes, names, fit.courses[i].T, strict=False):
+        axis.plot(hours, run.outputs[name], ".", color="0.6", markersize=4, label="measured")
+        axis.plot(hours, predicted, color=BLUE, label="predicted")
+        axis.set_ylabel(f"{name} ({UNITS[name]})")
+    axes[0].legend(frameon=False, fontsize=8)
+    axes[0].set_title(run.name)
+    for name, values in run.inputs.items():
+        if np.ptp(values) > 0:
+            axes[-1].step(hours, values, where="post", label=name)
+    axes[-1].legend(frameon=False, fontsize=8)
+    axes[-1].set_ylabel("inputs")
+    axes[-1].set_xlabel("time (h)")
+    figure.align_ylabels(axes)
+
+
+def draw_course(course: Course, figure: FigureBase) -> None:
+    """What comes of a feed profile, with bands, and the feed below."""
+    axes = figure.subplots(len(course.value) + 1, 1, sharex=True)
+    for axis, (name, value) in zip(axes, course.value.items(), strict=False):
+        axis.plot(course.time, value, color=BLUE)
+        error = course.error[name]
+        axis.fill_between(course.time, value - error, value + error, color=BLUE, alpha=0.25, lw=0)
+        axis.set_ylabel(f"{name} ({UNITS[name]})")
+    axes[-1].step(course.time, course.feed, where="post", color=RED)
+    axes[-1].set_ylabel("feed (L/h)")
+    axes[-1].set_xlabel("time (h)")
+    figure.align_ylabels(axes)
+
+
+def draw_ranking(ranked: Sequence[Ranked], figure: FigureBase) -> None:
+    """What an output hangs on, as correlations of normal variables of as much information."""
+    axes = figure.subplots()
+    order = list(reversed(ranked))
+    axes.barh([each.name for each in order], [each.correlation for each in order], color=BLUE)
+    axes.set_xlabel("nonlinear correlation, sqrt(1 - exp(-2 I))")

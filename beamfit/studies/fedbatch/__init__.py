@@ -1,0 +1,1 @@
+"""Fed-batch processes: mass balances whose rates are networks (report 3.5)."""
