@@ -13,9 +13,11 @@ import time
 from pathlib import Path
 
 import numpy as np
+from matplotlib.figure import Figure
 
 import beamfit
 from beamfit.io.run import read_run
+from beamfit.report.fedbatch import draw_ranking
 from beamfit.studies.fedbatch.feed import best_feed, predict
 from beamfit.studies.fedbatch.fit import identify_batches
 from beamfit.studies.fedbatch.titre import fit_titre, rank_inputs
@@ -48,7 +50,8 @@ def main() -> None:
     print(fit.headline, fit.message, fit.held, f"{time.process_time() - began:.0f} s", sep="\n")
     against_truth(fit, made["rates"])
     titre = fit_titre(fit)
-    print(titre.headline, *rank_inputs(fit), sep="\n")
+    ranked = rank_inputs(fit)
+    print(titre.headline, *ranked, sep="\n")
     hours = 0.5 * np.arange(81)
     pulsed = np.resize(runs[3].inputs["feed"], 81)
     steady = np.clip(0.015 * np.exp(0.09 * hours), 0.0, 0.2)
@@ -67,6 +70,10 @@ def main() -> None:
     print(f"{time.process_time() - began:.0f} s")
     for name, result in (("titre", titre), ("plan", plan)) if sys.argv[1:] else ():
         beamfit.write_report(Path(sys.argv[1]) / f"{name}.html", result)
+    if sys.argv[1:]:
+        figure = Figure(figsize=(6, 4), layout="constrained")
+        draw_ranking(ranked, figure)
+        figure.savefig(Path(sys.argv[1]) / "ranking.png", dpi=150)
 
 
 if __name__ == "__main__":
