@@ -38,6 +38,7 @@ def remembers(rest: np.ndarray, parameters: int) -> bool:
     return any(is_correlated(m, parameters) for m in means if len(m) > 2 * parameters)
 
 
+@jax.jit  # a scan that is called as it is would be compiled at every call
 def innovations(rows: jax.Array, time: jax.Array, noise: Noise) -> tuple[jax.Array, jax.Array]:
     """Rows less what those before foretell, over the error of that; and log sum of the errors.
 
