@@ -15,12 +15,12 @@ HEAD = """\
 
 beamfit and what else can be had, on the same SIMULATED data in the same run; `make league` measures
 it again and writes this page. Cases and their noise are in `benchmarks/league/scans.py` and
-`decays.py`, made without any of the tools. Of the peers pyemittance analyses scans; cheetah has the
-optics, and scipy, lmfit and emcee the fits that one then writes oneself, as here (emcee: 32 walkers,
+`decays.py`, made without the tools. Of the peers pyemittance analyses scans; cheetah has the
+optics, and scipy, lmfit and emcee the fits that one then writes oneself, as here (emcee: 32 walks,
 300 steps, no look at whether they have settled). lcls-tools and elegant's sddsemitproc are not on
 PyPI: what is run is their method, written from its description. pyAT, MAD-X, xfields, CasADi,
 jax-sysid and do-mpc analyse no such measurement: they are asked for speed alone. Draws are in the
-heads of the tables: one wrong answer of 60 is 1.7 %; what is not in a table was not reached. In bold
+heads of tables: one wrong answer of 60 is 1.7 %; what is not in a table was not reached. In bold
 is what exceeds 1 % of wrong or 2 % of refused.
 
 ## Honesty
