@@ -16,7 +16,7 @@ HEAD = """\
 beamfit and what else can be had, on the same SIMULATED data in the same run; `make league` measures
 it again and writes this page. Cases and their noise are in `benchmarks/league/scans.py` and
 `decays.py`, made without the tools. Of the peers pyemittance analyses scans; cheetah has the
-optics, and scipy, lmfit and emcee the fits that one then writes oneself, as here (emcee: 32 walks,
+optics, and scipy, lmfit and emcee the fits that one then writes oneself, as here (emcee: 32 chains,
 300 steps, no look at whether they have settled). lcls-tools and elegant's sddsemitproc are not on
 PyPI: what is run is their method, written from its description. pyAT, MAD-X, xfields, CasADi,
 jax-sysid and do-mpc analyse no such measurement: they are asked for speed alone. Draws are in the
