@@ -83,8 +83,8 @@ def identify_states(
     -----
     Output error in a stable and minimal parametrisation (`beamfit.dynamics.states.contraction`),
     from the best realisation of an order (`beamfit.studies.response.realise`). The criterion
-    counts readings that are independent, n (1 - r)/(1 + r) with r the correlation of neighbouring
-    residuals of the largest order tried. L. Ljung, System Identification (1999), chapters 4 and 16.
+    takes the noise, with its memory, of the largest order tried: a drift is no reason for a
+    further state. L. Ljung, System Identification (1999), chapters 4 and 16.
 
     Examples
     --------
@@ -111,7 +111,7 @@ def identify_states(
         free += [Free("start", nuisance=True), Free("p.net", nuisance=True)]
         case = case_of(runs, NETWORK, free, [Prior("p.net", 0.0, WEIGHT)], delay)
         found = trained(case, nets)
-        gain = criterion([best.found])[0] - criterion([found])[0]
+        gain = criterion(best.case, [best.found])[0] - criterion(case, [found])[0]
     case = best.case if map == "constant" else case
     found = remembering(case, found)
     said, gains = _quantities(case, found, n, runs, offset)

@@ -8,9 +8,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from beamfit.greybox.problem import Free
-from beamfit.studies.response.fit import used_by
+from beamfit.studies.response.model import CLOSE, Seen
+from beamfit.studies.response.noise import Noise, innovations, noise_of, remembers
 from beamfit.studies.response.realise import LINEAR, normal_form, padded, realisations
-from beamfit.studies.response.shooting import Case, Trained, rest_of, trained
+from beamfit.studies.response.settle import used_by
+from beamfit.studies.response.shooting import LONGEST, Case, Trained, rest_of, trained
 
 __all__ = ["Tried", "count_of", "criterion", "free_of", "largest_order", "orders"]
 
@@ -48,7 +50,7 @@ def orders(case: Case, order: int | None, offset: bool) -> tuple[Tried, list[dic
     tried: list[Tried] = []
     for n in [order] if order else range(1, min(SIZES[-1], largest_order(case)) + 1):
         tried.append(_tried(case, n, offset, tried[-1] if tried else None))
-        told = criterion([t.found for t in tried])
+        told = criterion(case, [t.found for t in tried])
         if n - tried[int(np.argmin(told))].order >= BEYOND:
             break
     full = tried[int(np.argmin(told))]
@@ -57,23 +59,41 @@ def orders(case: Case, order: int | None, offset: bool) -> tuple[Tried, list[dic
     bounded = case._replace(free=free_of(case, full.order, len(p["z"]), offset, False))
     plain = Tried(full.order, False, bounded, trained(bounded, [model | {"p": p}]))
     tried.append(plain)
-    told = criterion([t.found for t in tried], tried[-2].found)
+    told = criterion(case, [t.found for t in tried], tried[-2].found)
     best = plain if told[-1] <= min(told[:-1]) else full
     return best, [{"order": t.order, "direct": t.direct, "bic": v}
                   for t, v in zip(tried, told, strict=True)]  # fmt: skip
 
 
-def criterion(found: Sequence[Trained], last: Trained | None = None) -> list[float]:
-    """The Bayesian information criterion of fits, with the independent readings of the last."""
-    last, worth = last or found[-1], []
-    for k in range(len(last.rest[0])):
-        rows = [row[k] for row in last.rest]
-        both = sum(float(r[1:] @ r[:-1]) for r in rows)
-        share = np.clip(both / max(sum(float(r @ r) for r in rows), 1e-300), 0.0, 0.999)
-        worth.append([len(r) * (1.0 - share) / (1.0 + share) for r in rows])
-    each = np.array(worth).T
-    cost = np.log(np.sum(each))
-    return [float(np.sum(2.0 * each * np.log(f.noise)) + used_by(f.fit) * cost) for f in found]
+def criterion(case: Case, found: Sequence[Trained], last: Trained | None = None) -> list[float]:
+    """The Bayesian information criterion of fits under the noise, with its memory, of the last."""
+    noise, cost = _noise_of(case, last or found[-1]), np.log(count_of(case))
+    return [used_by(f.fit) * cost + sum(_minus(r, t, s.size_y, noise)
+            for r, t, s in _rows(case, f)) for f in found]  # fmt: skip
+
+
+def _rows(case: Case, found: Trained) -> list[tuple[np.ndarray, np.ndarray, Seen]]:
+    """What is left of the readings and their times, of each run and output."""
+    return [(rest, s.time[i], s)
+            for i, row in enumerate(found.rest)
+            for rest, s in zip(row, case.seen, strict=True)]  # fmt: skip
+
+
+def _noise_of(case: Case, found: Trained) -> Noise | None:
+    """The noise with a memory of residuals that have one; slopes are left out for speed."""
+    rows = _rows(case, found)
+    if not any(remembers(rest, used_by(found.fit)) for rest, _, _ in rows):
+        return None
+    scaled = [rest[:LONGEST, None] / max(float(rest.std()), CLOSE * s.size_y)
+              for rest, _, s in rows]  # fmt: skip
+    return noise_of(scaled, [time[:LONGEST] for _, time, _ in rows], np.zeros((0, 1)))[1]
+
+
+def _minus(rest: np.ndarray, time: np.ndarray, size_y: float, noise: Noise | None) -> float:
+    """-2 ln L of residuals, their size being their own."""
+    white, volume = (rest, 0.0) if noise is None else innovations(rest, time, noise)
+    size = max(float(np.std(white)), CLOSE * size_y)
+    return 2.0 * (len(rest) * np.log(size) + float(volume))
 
 
 def free_of(case: Case, order: int, size: int, offset: bool, direct: bool) -> tuple[Free, ...]:

@@ -42,8 +42,9 @@ STEPS, ROUNDS, AGAIN, EACH, GAINED = 25, 80, 3, 1e-4, 0.05
 CLOSING = (1.0, 0.1, 1e-2, 1e-3, 1e-4)
 # Time from the last reading of an output to the first of another, in lengths of the run.
 APART = 1e6
-# Readings of each output that tell the noise with a memory.
-LONGEST = 5000
+# Readings of each output that tell the noise with a memory; the share by which it may leave more of
+# the outputs than a fit without.
+LONGEST, WORSE = 5000, 1.5
 
 
 class System(Protocol):
@@ -244,6 +245,12 @@ def begun(case: Case, model: Any, noise: np.ndarray) -> Any:
     return solve(_problem(case, model, noise, None, np.zeros(0))).model
 
 
+def _squares(case: Case, found: Trained) -> float:
+    """What is left of the outputs, in units of their scatter."""
+    return sum(float(np.sum((r / s.size_y) ** 2)) for row in found.rest
+               for r, s in zip(row, case.seen, strict=True))  # fmt: skip
+
+
 def remembering(case: Case, white: Trained) -> Trained:
     """The fit again, its noise with a memory, where residuals are correlated."""
     rows = [(r, s) for row in white.rest for r, s in zip(row, case.seen, strict=True)]
@@ -256,7 +263,10 @@ def remembering(case: Case, white: Trained) -> Trained:
         before, found = found, _round(case, found.fit.model, size * found.noise, memory)
         if abs(before.likelihood - found.likelihood) < GAINED:
             break
+    if _squares(case, found) > WORSE * _squares(case, white):
+        # What the model lacks was taken for noise that wanders, and the response with it.
+        found = white
     errors = found.remembered(case)[0]
-    if max(len(r) for r, _ in rows) > LONGEST:
+    if found is not white and max(len(r) for r, _ in rows) > LONGEST:
         errors = found.remembered(case, found.memory)[0]
     return found._replace(rests=white.rests, errors=errors)
