@@ -1,15 +1,18 @@
 """State spaces identified from SIMULATED runs: values within their errors, orders, verdicts."""
 
+from types import SimpleNamespace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scipy.signal import cont2discrete, dlsim
+from scipy.signal import cont2discrete, dlsim, lfilter
 
 from beamfit.dynamics.states import StateSpace
 from beamfit.errors import InputError
 from beamfit.status import Status
 from beamfit.studies.response.linear import identify_states
+from beamfit.studies.response.order import criterion
 from beamfit.studies.response.record import Run
 from beamfit.studies.response.states import fit_states
 
@@ -98,18 +101,17 @@ def test_poles_gains_and_the_order_of_two_inputs_and_outputs_are_found():
         identify_states(run, 60)
 
 
-def test_what_a_linear_model_lacks_is_not_taken_for_noise_that_wanders():
-    """Two tanks that overflow; order 1 was 'unidentified' and explained -31 % of the level."""
-    rng, n, parts = np.random.default_rng(1), 500, 20
-    u = steps(n, rng, 12) * 1.4 + 3.5 + 0.3 * np.sin(np.arange(n) / 7)
-    levels, y = np.array([4.0, 4.0]), []
-    for pumped in u:
-        y.append(levels[1] + 0.02 * rng.normal())
-        for _ in range(parts):
-            out = 0.05 * np.sqrt(levels)
-            change = np.array([0.04 * pumped - out[0], out[0] - out[1]])
-            levels = np.clip(levels + 4.0 / parts * change, 0.0, 10.0)
-    fit = identify_states(Run(4.0 * np.arange(n), {"pump": u}, {"level": np.array(y)}))
-    assert fit.status is Status.poor_fit, fit.message
-    assert fit.order > 1
-    assert fit.parts[0].checks.free_run_percent > 50.0
+def test_an_order_is_worth_what_it_adds_to_what_readings_before_foretell():
+    """Three orders miss by as much; misses of the second are told from those before, mostly."""
+    n = 400
+    time = np.arange(n, dtype=float)
+    case = SimpleNamespace(seen=(SimpleNamespace(time=(time,), size_y=1.0, measured=(time,)),))
+
+    def missed(share, used):
+        rest = lfilter([1.0], [1.0, -share], np.random.default_rng(1).normal(size=n))
+        fit = SimpleNamespace(groups=[SimpleNamespace(count=n, dof=n - used)])
+        return SimpleNamespace(rest=((0.3 * rest / rest.std(),),), fit=fit)
+
+    rough, smooth, more = criterion(case, [missed(0.9, 3), missed(0.99, 6), missed(0.99, 7)])
+    assert smooth < rough - 100.0
+    assert more - smooth == pytest.approx(np.log(n))
