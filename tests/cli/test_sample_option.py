@@ -88,7 +88,7 @@ def test_a_store_of_something_else_is_left(tmp_path):
     store.write_bytes(b"not a store")
     done = run(*SCAN, "--sample", "--store", store)
     assert done.returncode == 2
-    assert "a file that is not HDF5, or is damaged" in done.stderr
+    assert "a file that is no store" in done.stderr
     assert store.read_bytes() == b"not a store"
 
 

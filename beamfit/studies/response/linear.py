@@ -94,7 +94,7 @@ def identify_states(
     ...     y[k + 1] = 0.8 * y[k] + 0.4 * u[k]
     >>> level = y + 0.05 * rng.normal(size=200)
     >>> fit = identify_states(Run(np.arange(200.0), {"valve": u}, {"level": level}), 1)
-    >>> fit.status.value, abs(fit.quantities["tau1"].value + 1 / np.log(0.8)) < 0.2
+    >>> fit.status.value, bool(abs(fit.quantities["tau1"].value + 1 / np.log(0.8)) < 0.2)
     ('converged', True)
     """
     if map not in MAPS:
