@@ -222,8 +222,8 @@ def solve_size(data: SizeData, weights: str = "model") -> SigmaFit:
     unit = jnp.sqrt(jnp.abs(start.sigma[jnp.array([0, 2])]))
 
     def sigma_of(p: Array) -> Array:
-        a, b, c = unit[0] ** 2, unit[0] * unit[1], unit[1] ** 2
-        return jnp.stack([p[0] ** 2 * a, p[0] * p[1] * b, (p[1] ** 2 + p[2] ** 2) * c])
+        a, b, c = p[0] * unit[0], p[1] * unit[1], p[2] * unit[1]
+        return jnp.stack([a**2, a * b, b**2 + c**2])
 
     def residual(p: Array) -> Array:
         squared = jnp.maximum(design @ sigma_of(p) + data.known, 1e-30)
