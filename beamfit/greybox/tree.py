@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from beamfit.errors import InputError, nearest
+from beamfit.nodes import registered
 
 C = TypeVar("C", bound=type)
 
@@ -18,9 +19,6 @@ C = TypeVar("C", bound=type)
 @dataclass_transform(frozen_default=True)
 def node(*static: str):
     """Make a class a frozen dataclass that JAX walks: `static` fields are structure, the rest data.
-
-    Unlike `jax.tree_util.register_dataclass`, rebuilding does not run ``__post_init__``, so a
-    class can check its input on construction and still hold traced arrays inside JAX.
 
     Parameters
     ----------
@@ -43,28 +41,7 @@ def node(*static: str):
     """
 
     def decorate(cls: C) -> C:
-        cls = dataclasses.dataclass(frozen=True, eq=False)(cls)
-        names = [f.name for f in dataclasses.fields(cls)]
-        data = [name for name in names if name not in static]
-
-        def flatten(value):
-            return [getattr(value, name) for name in data], tuple(
-                getattr(value, name) for name in static
-            )
-
-        def flatten_with_keys(value):
-            children, structure = flatten(value)
-            keys = (jax.tree_util.GetAttrKey(name) for name in data)
-            return list(zip(keys, children, strict=True)), structure
-
-        def unflatten(structure, children):
-            value = object.__new__(cls)
-            for name, part in zip([*static, *data], [*structure, *children], strict=True):
-                object.__setattr__(value, name, part)
-            return value
-
-        jax.tree_util.register_pytree_with_keys(cls, flatten_with_keys, unflatten, flatten)
-        return cls
+        return registered(dataclasses.dataclass(frozen=True, eq=False)(cls), static)
 
     return decorate
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any, TypeVar, dataclass_transform
 
 import jax
@@ -12,6 +12,7 @@ import numpy as np
 from jax import Array
 from jax.typing import ArrayLike
 
+from beamfit.nodes import registered
 from beamfit.shown import shown
 
 C = TypeVar("C", bound=type)
@@ -32,9 +33,7 @@ def value(*structure: str) -> Callable[[C], C]:
     """
 
     def make(cls: C) -> C:
-        cls = dataclass(frozen=True)(cls)
-        data = [f.name for f in fields(cls) if f.name not in structure]
-        return shown(jax.tree_util.register_dataclass(cls, data, list(structure)))
+        return shown(registered(dataclass(frozen=True)(cls), structure))
 
     return make
 

@@ -17,6 +17,7 @@ from beamfit.optics.calibration import (
     IntegratedGradient,
     IntegratedStrength,
     SlopeIntercept,
+    plain_meaning,
 )
 from beamfit.optics.elements import Drift, Marker, Quadrupole, Screen, SectorDipole, ThinLens
 from beamfit.optics.particle import beta_gamma, rigidity
@@ -222,3 +223,10 @@ def test_rigidity_of_known_particles():
     assert rigidity(energy) == pytest.approx(3.3356409519815204, rel=1e-12)
     rapidity = np.arccosh(135.0 / 0.51099895069)
     assert beta_gamma(135.0) == pytest.approx(np.sinh(rapidity), rel=1e-12)
+
+
+def test_meanings_of_a_setting_with_the_same_fields_are_not_one_program_s():
+    """Their structures were equal: now and then settings in T/m ran the program for kG."""
+    meanings = [plain_meaning(unit, 0.511) for unit in ("kG", "T_per_m", "k1", "k1l")]
+    structures = [jax.tree.structure(each) for each in meanings]
+    assert [[a == b for b in structures] for a in structures] == np.eye(4).astype(bool).tolist()

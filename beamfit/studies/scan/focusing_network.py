@@ -8,8 +8,6 @@ branch, so that rising and falling currents have curves of their own.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
-from functools import partial
 from typing import Any, ClassVar
 
 import jax
@@ -44,8 +42,7 @@ from beamfit.studies.scan.statement import (
 from beamfit.studies.scan.transport import padded
 
 
-@partial(jax.tree_util.register_dataclass, data_fields=["network"], meta_fields=["unit"])
-@dataclass(frozen=True)
+@tree.node("unit")
 class NetworkStrength:
     """A magnet whose strength is a network of its current: k1 = network(I, branch)/E.
 
