@@ -33,9 +33,9 @@ def registered(cls: C, static: Sequence[str]) -> C:
     data = [name for name in names if name not in static]
 
     def flatten(value):
-        return [getattr(value, name) for name in data], tuple(
-            getattr(value, name) for name in static
-        )
+        # A line has hundreds of elements: reading the dictionary is a third of the time.
+        own = vars(value)
+        return [own[name] for name in data], tuple([own[name] for name in static])
 
     def flatten_with_keys(value):
         children, structure = flatten(value)
