@@ -1,0 +1,325 @@
+"""Machine files: the variables of a control system that a scan or a watch uses, checked TOML."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+from beamfit.errors import InputError, nearest
+from beamfit.io.files import name_of
+from beamfit.io.lattice import LatticeFile
+from beamfit.io.line import read_lattice
+from beamfit.io.toml import LIST, TABLE, TEXT, Key, Section, is_number, read_toml
+
+FORMAT = "beamfit-machine-1"
+APPROACHES = ("either", "below", "above")
+# Units of settings as control systems write them.
+SPELLINGS = {
+    "A": {"a", "amp", "amps", "ampere", "amperes"},
+    "kG": {"kg"},
+    "T_per_m": {"t/m", "t_per_m", "tesla/m", "t.m-1", "t m^-1"},
+    "k1": {"1/m^2", "1/m2", "m^-2", "m-2", "1/m**2", "k1", "1/m²"},
+    "k1l": {"1/m", "m^-1", "m-1", "k1l"},
+}
+LENGTHS = {"um": 1e-6, "mm": 1e-3, "m": 1.0}
+PV, WAIT = Key(kind=TEXT), {"low": 0.0, "said": "a time above zero"}
+MAYBE = Key(kind=TEXT, default=None)
+POSITIVE = {"low": 0.0, "said": "a positive number"}
+MAGNET = {
+    "name": Key("name", kind=TEXT),
+    "set": Key("set", kind=TEXT),
+    "read": Key("read", kind=TEXT),
+    "unit": Key("unit", kind=TEXT),
+    "low": Key("low"),
+    "high": Key("high"),
+    "tolerance": Key("tolerance", **POSITIVE),
+    "settle_s": Key("settle", low=-1e-9, high=3600.0, said="a time of zero or more"),
+    "timeout_s": Key("timeout", default=60.0, **WAIT),
+    "approach": Key("approach", kind=TEXT, default="either"),
+    "approach_by": Key("approach_by", default=0.0, low=-1e-12, said="zero or more"),
+    "degauss": Key("degauss", kind=LIST, default=()),
+}
+SCREEN = {
+    "name": Key("name", kind=TEXT, default=None),
+    **{name: Key(name, kind=TEXT, default=None) for name in ("x", "y", "profile_x", "profile_y")},
+    "unit": Key("unit", kind=TEXT, default="um"),
+    "pixel_um": Key("pixel", 1e-6, default=None, **POSITIVE),
+    "shots": Key("shots", default=5, low=1.0, high=1001.0, said="2 to 1000 shots"),
+    "timeout_s": Key("timeout", default=10.0, **WAIT),
+}
+BEAM = {
+    "present": Key("present", kind=TEXT, default=None),
+    "present_above": Key("present_above", default=None),
+    "loss": Key("loss", kind=TEXT, default=None),
+    "loss_below": Key("loss_below", default=None),
+    "wait_s": Key("wait", default=60.0, **WAIT),
+}
+SCAN = {
+    "goal_percent": Key("goal", 1e-2, default=0.03, low=0.0, high=100.0, said="0 to 100 %"),
+    "points": Key("points", default=15, low=3.0, high=201.0, said="4 to 200 points"),
+    "first": Key("first", kind=LIST, default=()),
+}
+TOP = {
+    "format": PV,
+    "name": Key("name", kind=TEXT, default=""),
+    "lattice": Key("lattice", kind=TEXT, default=None),
+    "timeout_s": Key("timeout", default=5.0, **WAIT),
+    "magnet": Key(kind=LIST, default=()),
+    **{name: Key(kind=TABLE, default=None) for name in ("screen", "beam", "scan")},
+}
+
+
+@dataclass(frozen=True)
+class Magnet:
+    """A magnet of a machine file, in the unit of the lattice's settings.
+
+    Attributes
+    ----------
+    name, set, read, unit : str
+        Its name in the lattice, its variables, and the unit of both.
+    low, high, tolerance : float
+        Limits of what may be written, and how far the read-back may be off, either way.
+    settle, timeout : float
+        How long the read-back has to stay there, and after how long it is given up, s.
+    approach : {"either", "below", "above"}
+        From which side a setting is reached, by passing it by ``approach_by``.
+    degauss : tuple of float
+        Settings gone through before a scan.
+    """
+
+    name: str
+    set: str
+    read: str
+    unit: str
+    low: float
+    high: float
+    tolerance: float
+    settle: float
+    timeout: float = 60.0
+    approach: str = "either"
+    approach_by: float = 0.0
+    degauss: tuple[float, ...] = ()
+
+
+@dataclass(frozen=True)
+class Profiler:
+    """The screen of a machine file: variables of rms sizes, or of projections, by plane.
+
+    Attributes
+    ----------
+    name : str
+        Its name in the lattice.
+    sizes, profiles : mapping of str to str
+        Plane to variable; one of the two is empty.
+    unit : float
+        Of the sizes, m.
+    pixel : float or None
+        Of the projections, m.
+    shots : int
+        Of each setting.
+    timeout : float
+        How long a new time stamp is waited for, s.
+    """
+
+    name: str
+    sizes: dict[str, str]
+    profiles: dict[str, str]
+    unit: float
+    pixel: float | None
+    shots: int
+    timeout: float
+
+
+@dataclass(frozen=True)
+class Guard:
+    """What must hold for a shot to count: beam above, loss below. Limits are None without one."""
+
+    present: str | None = None
+    present_above: float | None = None
+    loss: str | None = None
+    loss_below: float | None = None
+    wait: float = 60.0
+
+
+@dataclass(frozen=True)
+class ScanMachine:
+    """What `beamfit scan` needs to know of a machine.
+
+    Attributes
+    ----------
+    name, path, sha256 : str
+        Of the machine and its file.
+    lattice : LatticeFile
+        The line.
+    magnets : tuple of Magnet
+        Those to be scanned.
+    screen : Profiler
+    guard : Guard
+    goal : float
+        Relative error of the emittances at which to stop.
+    points : int
+        Most settings.
+    first : tuple of float
+        Settings of the first magnet to begin with; chosen over its limits if empty.
+    timeout : float
+        Within which a variable has to answer, s.
+    """
+
+    name: str
+    path: str
+    sha256: str
+    lattice: LatticeFile
+    magnets: tuple[Magnet, ...]
+    screen: Profiler
+    guard: Guard
+    goal: float
+    points: int
+    first: tuple[float, ...]
+    timeout: float
+
+
+def read_scan_machine(path: str | PathLike[str]) -> ScanMachine:
+    """Read what a scan needs of a machine file, and its lattice.
+
+    Parameters
+    ----------
+    path : str or path
+        TOML, format "beamfit-machine-1" (docs/live.md); paths in it are beside it.
+
+    Returns
+    -------
+    ScanMachine
+
+    Raises
+    ------
+    InputError
+        If it cannot be used, naming line and key.
+    """
+    top = read_toml(path, "a machine")
+    if (found := top.table.get("format")) != FORMAT:
+        raise top.error(f"format {found!r}"[:80], f'format = "{FORMAT}"', "format")
+    said = top.values(TOP)
+    if said["lattice"] is None:
+        raise top.error("no lattice", 'lattice = "FILE"', "lattice")
+    lattice = read_lattice(Path(name_of(path)).parent / said.pop("lattice"))
+    if not top.table.get("magnet"):
+        raise top.error("no magnet to scan", "tables [[magnet]]", "magnet")
+    magnets = tuple(_magnet(section, lattice) for section in top.sections("magnet"))
+    if len({m.set for m in magnets}) < len(magnets):
+        raise top.error("a variable set by two magnets", "one [[magnet]] for each", "magnet")
+    wanted = top.section("scan")
+    plan = wanted.values(SCAN)
+    first = _numbers(wanted, "first", plan.pop("first"), magnets[0])
+    plan["points"] = _whole(wanted, "points", plan["points"])
+    screen, guard = _screen(top.section("screen"), lattice), _guard(top.section("beam"))
+    name = said.pop("name") or Path(name_of(path)).stem
+    return ScanMachine(
+        name, str(path), top.sha256, lattice, magnets, screen, guard, first=first, **plan, **said
+    )
+
+
+def unit_of(spelled: str) -> str | None:
+    """The unit of settings that a word means, None if it means none.
+
+    Examples
+    --------
+    >>> unit_of("T/m"), unit_of("Amps"), unit_of("furlong")
+    ('T_per_m', 'A', None)
+    """
+    word = spelled.strip().lower()
+    return next((unit for unit, words in SPELLINGS.items() if word in words), None)
+
+
+def _magnet(section: Section, lattice: LatticeFile) -> Magnet:
+    magnet = Magnet(**section.values(MAGNET))
+    if magnet.name not in lattice.calibrations:
+        expected = nearest(magnet.name, list(lattice.calibrations)) + f", of {lattice.path}"
+        raise section.error(f"no magnet '{magnet.name}'", expected, "name")
+    unit, wanted = unit_of(magnet.unit), lattice.calibrations[magnet.name]
+    if unit != wanted:
+        raise section.error(f"unit '{magnet.unit}'", f"{wanted}, as in the lattice", "unit")
+    if not (is_number(magnet.low) and is_number(magnet.high) and magnet.low < magnet.high):
+        found = f"limits {magnet.low:g} to {magnet.high:g}"
+        raise section.error(found, "low below high, both numbers", "low")
+    if not magnet.tolerance < 0.1 * (magnet.high - magnet.low):
+        expected = "less than a tenth of the range; is it in the unit of the settings?"
+        raise section.error(f"tolerance {magnet.tolerance:g}", expected, "tolerance")
+    if magnet.approach not in APPROACHES:
+        expected = nearest(magnet.approach, APPROACHES)
+        raise section.error(f"approach '{magnet.approach}'", expected, "approach")
+    if magnet.approach != "either" and not magnet.approach_by > 0:
+        expected = "how far beyond a setting to go first, in the unit of the settings"
+        raise section.error(f"approach from {magnet.approach}", expected, "approach_by")
+    degauss = _numbers(section, "degauss", magnet.degauss, magnet)
+    return replace(magnet, unit=wanted, degauss=degauss)
+
+
+def _numbers(section: Section, key: str, values: Any, magnet: Magnet) -> tuple[float, ...]:
+    """Settings that a magnet can have."""
+    for value in values:
+        if not is_number(value) or not magnet.low <= value <= magnet.high:
+            expected = f"numbers within {magnet.low:g} and {magnet.high:g}"
+            raise section.error(f"{value!r}"[:80], expected, key)
+    return tuple(map(float, values))
+
+
+def _whole(section: Section, key: str, value: float) -> int:
+    if value != int(value):
+        raise section.error(f"{value!r}", "a whole number", key)
+    return int(value)
+
+
+def _screen(section: Section, lattice: LatticeFile) -> Profiler:
+    said = section.values(SCREEN)
+    sizes, profiles = (
+        {plane: said[f"{kind}{plane}"] for plane in "xy" if said[f"{kind}{plane}"]}
+        for kind in ("", "profile_")
+    )
+    if bool(sizes) == bool(profiles):
+        found = "sizes and projections" if sizes else "no sizes"
+        raise section.error(found, "x and y, or profile_x and profile_y", "x")
+    if said["unit"] not in LENGTHS:
+        raise section.error(f"unit '{said['unit']}'", "um, mm or m", "unit")
+    if profiles and said["pixel"] is None:
+        raise section.error("projections without a scale", "pixel_um = ...", "pixel_um")
+    name = said["name"] or lattice.default_screen
+    if name not in lattice.places:
+        expected = nearest(str(name), lattice.places) + f", of {lattice.path}"
+        raise section.error(f"no screen '{name}'", expected, "name")
+    shots = _whole(section, "shots", said["shots"])
+    unit = LENGTHS[said["unit"]]
+    return Profiler(name, sizes, profiles, unit, said["pixel"], shots, said["timeout"])
+
+
+def _guard(section: Section) -> Guard:
+    guard = Guard(**section.values(BEAM))
+    for variable, limit in (("present", "present_above"), ("loss", "loss_below")):
+        name, value = getattr(guard, variable), getattr(guard, limit)
+        if (name is None) != (value is None) or (value is not None and math.isnan(value)):
+            key = limit if value is None else variable
+            raise section.error(f"{variable} and no {key}", f"both {variable} and {limit}", key)
+    return guard
+
+
+def moved(magnet: Magnet, value: float) -> float:
+    """A setting that may be written to a magnet, or none.
+
+    Raises
+    ------
+    InputError
+        If it is no number or lies outside the limits: nothing is ever written there.
+
+    Examples
+    --------
+    >>> moved(Magnet("Q", "Q:SET", "Q:READ", "A", -1.0, 1.0, 0.01, 0.1), 1.5)
+    Traceback (most recent call last):
+        ...
+    beamfit.errors.InputError: a setting of 1.5 for Q; expected within its limits, -1 to 1
+    """
+    if not magnet.low <= value <= magnet.high:
+        expected = f"within its limits, {magnet.low:g} to {magnet.high:g}"
+        raise InputError(f"a setting of {value:g} for {magnet.name}", expected)
+    return float(value)
