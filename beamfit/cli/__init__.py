@@ -17,6 +17,7 @@ from beamfit.cli.emittance import emittance
 from beamfit.cli.example import example
 from beamfit.cli.identify import identify
 from beamfit.cli.lifetime import lifetime
+from beamfit.cli.scan import scan
 from beamfit.cli.setpoint import setpoint
 from beamfit.cli.solve import solve
 from beamfit.errors import LONGEST, InputError, plain, short
@@ -41,6 +42,7 @@ cli.add_command(solve)
 cli.add_command(identify)
 cli.add_command(control)
 cli.add_command(batch)
+cli.add_command(scan)
 
 
 def main() -> None:

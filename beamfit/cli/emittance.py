@@ -123,9 +123,9 @@ def emittance(
         beamfit.write_report(report, fit, posterior, methods=methods, **about)
     if as_json:
         further = {} if posterior is None else {"posterior": posterior}
-        click.echo(results_text(_results(fit, methods), **about, **further))
+        click.echo(results_text(results_of(fit, methods), **about, **further))
     else:
-        _show(fit, posterior, report, methods)
+        answer(fit, posterior, report, methods)
 
 
 def _answer_slices(
@@ -135,7 +135,7 @@ def _answer_slices(
     if report is not None:
         beamfit.write_report(report, fits, **about)
     if as_json:
-        results = [entry for fit in fits for entry in _results(fit, ())]
+        results = [entry for fit in fits for entry in results_of(fit, ())]
         click.echo(results_text(results, **about))
         return
     from beamfit.cli.show import Terminal
@@ -165,7 +165,7 @@ def compared(
     return tuple(m for m in found if m.plane in planes)
 
 
-def _results(fit: EmittanceFit, methods: tuple[SizeMethods, ...]) -> list[dict[str, Any]]:
+def results_of(fit: EmittanceFit, methods: tuple[SizeMethods, ...]) -> list[dict[str, Any]]:
     """What a fit says, and what small errors of the line and parts of the scan would change."""
     if not fit.statement.closed:
         return fit.to_json()
@@ -181,7 +181,7 @@ def _results(fit: EmittanceFit, methods: tuple[SizeMethods, ...]) -> list[dict[s
     ]
 
 
-def _show(
+def answer(
     fit: EmittanceFit,
     posterior: Posterior | None,
     report: str | None,

@@ -9,9 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from beamfit.errors import InputError, nearest
-from beamfit.io.files import name_of
 from beamfit.io.lattice import LatticeFile
-from beamfit.io.line import read_lattice
+from beamfit.io.line import part_of, read_lattice
 from beamfit.io.toml import LIST, TABLE, TEXT, Key, Section, is_number, read_toml
 
 FORMAT = "beamfit-machine-1"
@@ -61,6 +60,7 @@ SCAN = {
     "goal_percent": Key("goal", 1e-2, default=0.03, low=0.0, high=100.0, said="0 to 100 %"),
     "points": Key("points", default=15, low=3.0, high=201.0, said="4 to 200 points"),
     "first": Key("first", kind=LIST, default=()),
+    "restore_s": Key("restore", default=60.0, **WAIT),
 }
 TOP = {
     "format": PV,
@@ -164,8 +164,9 @@ class ScanMachine:
         Most settings.
     first : tuple of float
         Settings of the first magnet to begin with; chosen over its limits if empty.
-    timeout : float
-        Within which a variable has to answer, s.
+    restore, timeout : float
+        For how long an IOC that does not answer is asked again to restore, and within which a
+        variable has to answer, s.
     """
 
     name: str
@@ -178,6 +179,7 @@ class ScanMachine:
     goal: float
     points: int
     first: tuple[float, ...]
+    restore: float
     timeout: float
 
 
@@ -204,7 +206,7 @@ def read_scan_machine(path: str | PathLike[str]) -> ScanMachine:
     said = top.values(TOP)
     if said["lattice"] is None:
         raise top.error("no lattice", 'lattice = "FILE"', "lattice")
-    lattice = read_lattice(Path(name_of(path)).parent / said.pop("lattice"))
+    lattice = read_lattice(Path(path).parent / said.pop("lattice"))
     if not top.table.get("magnet"):
         raise top.error("no magnet to scan", "tables [[magnet]]", "magnet")
     magnets = tuple(_magnet(section, lattice) for section in top.sections("magnet"))
@@ -215,7 +217,8 @@ def read_scan_machine(path: str | PathLike[str]) -> ScanMachine:
     first = _numbers(wanted, "first", plan.pop("first"), magnets[0])
     plan["points"] = _whole(wanted, "points", plan["points"])
     screen, guard = _screen(top.section("screen"), lattice), _guard(top.section("beam"))
-    name = said.pop("name") or Path(name_of(path)).stem
+    lattice = _seen_at(lattice, screen.name)
+    name = said.pop("name") or Path(path).stem
     return ScanMachine(
         name, str(path), top.sha256, lattice, magnets, screen, guard, first=first, **plan, **said
     )
@@ -292,6 +295,18 @@ def _screen(section: Section, lattice: LatticeFile) -> Profiler:
     shots = _whole(section, "shots", said["shots"])
     unit = LENGTHS[said["unit"]]
     return Profiler(name, sizes, profiles, unit, said["pixel"], shots, said["timeout"])
+
+
+def _seen_at(lattice: LatticeFile, screen: str) -> LatticeFile:
+    """A lattice with one screen: at the others nothing can be measured."""
+    cut = part_of(lattice, screen=screen)
+    elements = tuple(
+        {"type": "marker", "name": e["name"]}
+        if e["type"] == "screen" and e["name"] != screen
+        else e
+        for e in cut.elements
+    )
+    return replace(cut, elements=elements)
 
 
 def _guard(section: Section) -> Guard:

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-# Run as a program of its own.
-collect_ignore = ["ioc.py"]
+# Run as programs of their own.
+collect_ignore = ["ioc.py", "worker.py"]
 ROOT = Path(__file__).resolve().parents[2]
 
 

@@ -1,0 +1,247 @@
+"""`beamfit scan`: a machine in, a scan measured and a beam out; the magnets as they were."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from beamfit.cli.options import command_line, options
+from beamfit.errors import InputError, plain
+from beamfit.io.files import digest
+from beamfit.io.line import build_line, read_inputs
+from beamfit.io.machine import ScanMachine, read_scan_machine
+from beamfit.io.result import results_text
+from beamfit.status import Status
+from beamfit.studies.scan.typed import goal_of
+from beamfit.table import cell
+from beamfit.writing import check_place, write_atomically
+
+if TYPE_CHECKING:
+    from beamfit.live.scan import Outcome, Told
+    from beamfit.studies.scan.results import PlaneFit
+
+EXAMPLE = """\b
+Examples:
+  beamfit scan machine.toml --dry-run
+  beamfit scan machine.toml --goal 3% --out scan.csv --report scan.html
+  beamfit scan --recover machine.journal
+"""
+
+
+@click.command(epilog=EXAMPLE)
+@click.argument("machine", required=False)
+@click.option("--dry-run", is_flag=True, help="Check the machine, print the plan, move nothing.")
+@click.option(
+    "--recover",
+    metavar="JOURNAL",
+    help="Restore what a scan that was killed has left, and move nothing else.",
+)
+@click.option("--out", metavar="FILE.csv", help="The scan; NAME_DATE_TIME.csv unless said.")
+@click.option(
+    "--journal", metavar="FILE", help="Where what is to be restored stands; beside MACHINE unless."
+)
+@click.option("--goal", metavar="PERCENT", help="Emittance error to stop at.")
+@click.option("--points", type=click.IntRange(4, 200), help="Most settings.")
+@options("report json")
+def scan(
+    machine: str | None,
+    dry_run: bool,
+    recover: str | None,
+    out: str | None,
+    journal: str | None,
+    goal: str | None,
+    points: int | None,
+    report: str | None,
+    as_json: bool,
+) -> int:
+    """Scan a machine's quadrupoles and fit the emittance, choosing each setting by what it tells.
+
+    MACHINE is a TOML file (docs/live.md) that names the variables of the magnets and the screen,
+    and their limits. The magnets are put back whatever ends the scan. Needs beamfit[live].
+    """
+    if (machine is None) == (recover is None):
+        raise InputError("both or neither of MACHINE and --recover", "one of them")
+    say = _Lines(err=as_json)
+    if recover is not None:
+        return _recovered(recover, say, as_json)
+    wanted = {"goal": None if goal is None else goal_of(goal), "points": points}
+    told = replace(read_scan_machine(machine), **{k: v for k, v in wanted.items() if v})
+
+    from beamfit.live.channel import run
+    from beamfit.live.journal import journal_of
+
+    place = journal_of(told, journal)
+    if dry_run:
+        return run(_planned(told, place, as_json))
+    target = Path(out or time.strftime(f"{_word(told.name)}_%Y%m%d_%H%M%S.csv"))
+    for each in (target, place):
+        check_place(each)
+    if target.exists():
+        raise InputError("a file that exists", "another name; no scan is written over", target)
+    found = run(_scanned(told, place, target, say))
+    return _answered(found, told, target, report, as_json)
+
+
+class _Lines:
+    """What is said while a scan goes on: a line a point, with normalised emittances."""
+
+    def __init__(self, err: bool) -> None:
+        self.err, self.points = err, 0
+
+    def __call__(self, text: str) -> None:
+        click.echo(plain(text), err=self.err)
+
+    def told(self, now: Told) -> None:
+        """A new point with what is known after it, or what else is new."""
+        if len(now.points) == self.points:
+            self(now.news)
+            return
+        self.points = len(now.points)
+        last = now.points[-1]
+        at = ", ".join(f"{name} {value:.4g}" for name, value in last.settings.items())
+        sizes = ", ".join(f"{p} {1e6 * s.mean():.1f} um" for p, s in last.shots.items())
+        known = ", ".join(_known(p) for p in (now.fit.planes if now.fit else ()))
+        self(f"{self.points:3d}  {at:<12}  {sizes:<26}  {known}".rstrip())
+
+
+def _known(plane: PlaneFit) -> str:
+    """What is known of an emittance by now, in a few words."""
+    if plane.emittance.error is None:
+        return f"{plane.plane}: open"
+    sure = "" if plane.status is Status.converged else f" ({cell(plane.status)})"
+    return f"{plane.plane}: {plane.normalized_emittance}{sure}"
+
+
+async def _planned(machine: ScanMachine, journal: Path, as_json: bool) -> int:
+    """Check that the machine answers, and say what a scan would do."""
+    from beamfit.live.devices import connect
+    from beamfit.live.journal import named
+    from beamfit.live.next_setting import first_settings
+
+    at = await connect(machine)
+    before = [(m, await at.magnets[m.name].get()) for m in at.machine.magnets]
+    first = first_settings(at.machine)
+    plan = {
+        "magnets": [
+            {"name": m.name, "set": m.set, "read": m.read, "unit": m.unit, "low": m.low,
+             "high": m.high, "now": value, "approach": m.approach, "degauss": m.degauss}
+            for m, value in before
+        ],
+        "screen": machine.screen.name,
+        "shots": machine.screen.shots,
+        "first": first,
+        "goal": machine.goal,
+        "points": machine.points,
+        "journal": str(journal),
+        "amiss": await at.guard.amiss(),
+        "notes": at.notes,
+    }  # fmt: skip
+    if as_json:
+        click.echo(results_text([{"plan": plan}], _inputs(machine), command_line()))
+        return 0
+    for m, value in before:
+        click.echo(
+            f"{m.name}: {m.set} from {m.low:g} to {m.high:g} {m.unit}, read back by {m.read}, "
+            f"within {m.tolerance:g} for {m.settle:g} s; now {value:.6g}"
+        )
+    values = ", ".join(f"{value:.4g}" for value in first)
+    click.echo(f"First {machine.magnets[0].name} at {values}; then where it tells most.")
+    click.echo(
+        f"{machine.screen.shots} shots on {machine.screen.name} at each, at most {machine.points} "
+        f"settings, or until the emittances are known to {100 * machine.goal:.3g} %."
+    )
+    click.echo(f"At the end back to {named(before)}; until then that stands in {journal}.")
+    for line in (*at.notes, *([f"Now: {plan['amiss']}."] if plan["amiss"] else [])):
+        click.echo(plain(line))
+    click.echo("Nothing was moved.")
+    return 0
+
+
+async def _scanned(machine: ScanMachine, journal: Path, out: Path, say: _Lines) -> Outcome:
+    from beamfit.live.devices import connect
+    from beamfit.live.record import scan_text
+    from beamfit.live.scan import scan as measure
+
+    line = build_line(machine.lattice)
+    at = await connect(machine)
+    for note in at.notes:
+        say(note)
+    before = {name: await magnet.get() for name, magnet in at.magnets.items()}
+
+    def keep(points: Any) -> None:
+        write_atomically(out, scan_text(points, at.machine, before).encode())
+
+    return await measure(at, line, journal, keep=keep, tell=say.told)
+
+
+def _answered(
+    found: Outcome, machine: ScanMachine, out: Path, report: str | None, as_json: bool
+) -> int:
+    """Answer as `beamfit emittance` would for the file, and say how the scan ended."""
+    from beamfit.cli.emittance import answer, results_of
+
+    if found.problem is not None:
+        if not isinstance(found.problem, InputError):
+            raise found.problem
+        kept = f"; {len(found.points)} points are in {out}" if found.points else ""
+        raise InputError(f"{found.problem.found}{kept}; all is restored", found.problem.expected)
+    said = {"file": str(out), "points": len(found.points), "ended": found.reason, "restored": True}
+    status = 128 + found.signal if found.signal else 0
+    inputs = _inputs(machine) | ({str(out): digest(out)} if found.points else {})
+    results: list[Any] = []
+    if found.fit is not None:
+        measured, described, _, _ = read_inputs(str(out), machine.lattice)
+        from beamfit.studies.scan.fit import fit_emittance
+
+        fit = fit_emittance(measured, build_line(described))
+        if report is not None:
+            from beamfit.report.page import write_report
+
+            write_report(report, fit, command=command_line(), inputs=inputs)
+        if not as_json:
+            click.echo(f"The scan ended: {found.reason}. It is in {out}.\n")
+            answer(fit, None, report, ())
+        results = results_of(fit, ()) if as_json else []
+    elif not as_json:
+        where = f" It is in {out}." if found.points else ""
+        click.echo(f"The scan ended: {found.reason}; too few points for a fit.{where}")
+    if as_json:
+        click.echo(results_text(results, inputs, command_line(), scan=said))
+    return status
+
+
+def _recovered(journal: str, say: _Lines, as_json: bool) -> int:
+    from beamfit.live.channel import run
+    from beamfit.live.devices import supply_of
+    from beamfit.live.journal import named, read_journal
+    from beamfit.live.restore import restore
+    from beamfit.writing import alone
+
+    left = read_journal(journal)
+    found = digest(journal)
+
+    async def back() -> None:
+        magnets = {m.name: supply_of(m, left.timeout) for m, _ in left.before}
+        await restore(left, magnets)
+
+    with alone(journal):
+        run(back())
+    if as_json:
+        settings = {m.name: {"value": v, "unit": m.unit} for m, v in left.before}
+        click.echo(results_text([{"restored": settings}], {journal: found}, command_line()))
+    else:
+        say(f"Restored and read back: {named(left.before)}. {journal} is removed.")
+    return 0
+
+
+def _inputs(machine: ScanMachine) -> dict[str, str | None]:
+    return {machine.path: machine.sha256, str(machine.lattice.path): machine.lattice.sha256}
+
+
+def _word(name: str) -> str:
+    """A name that a file can have."""
+    return "".join(c if c.isalnum() else "_" for c in name)[:40]

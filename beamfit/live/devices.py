@@ -1,0 +1,279 @@
+"""What a scan moves and reads: magnets, a screen and a guard, as a scan asks of them, by EPICS."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import NamedTuple, Protocol
+
+import numpy as np
+
+from beamfit.errors import InputError, plain
+from beamfit.io.machine import Guard, Magnet, Profiler, ScanMachine, moved, unit_of
+from beamfit.live.channel import Channel, LostError, Reading, open_channel
+from beamfit.live.projection import rms_of
+
+# Of the time a read-back has to stay, between two looks at it; not shorter, not longer, s.
+LOOKS, SHORTEST, LONGEST = 8, 0.02, 0.25
+# Bad shots of a plane, over those wanted, after which there is no beam on the screen.
+BAD = 2
+
+
+class NotSettledError(InputError):
+    """A magnet whose read-back does not come to its setting, or does not stay there."""
+
+
+class NoSizesError(InputError):
+    """A screen that shows no new sizes, or none that are numbers."""
+
+
+class Device(Protocol):
+    """What can be moved: a magnet of any control system, or of a simulation."""
+
+    async def put(self, value: float) -> None:
+        """Begin to move it to a setting, and return when it says that it is there."""
+
+    async def get(self) -> float:
+        """Its setting, as `put` would restore it."""
+
+    async def settled(self, value: float) -> float:
+        """Wait until it has arrived and stays, and give what is read back.
+
+        Raises
+        ------
+        NotSettledError
+            If it does not.
+        """
+
+
+class Sizes(Protocol):
+    """What measures the beam at a setting."""
+
+    async def shots(self) -> Mapping[str, np.ndarray]:
+        """New shots, by plane: rms sizes, m.
+
+        Raises
+        ------
+        NoSizesError
+            If there are none.
+        """
+
+
+class Watchman(Protocol):
+    """What says whether there is beam, and none of it is lost."""
+
+    async def amiss(self) -> str:
+        """What is wrong, in words; "" if nothing is."""
+
+
+class Connected(NamedTuple):
+    """A machine at hand: magnets by name, screen, guard, and what was found besides."""
+
+    magnets: Mapping[str, Device]
+    screen: Sizes
+    guard: Watchman
+    machine: ScanMachine
+    notes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Supply:
+    """A magnet by EPICS: one variable to set it, one to read it back."""
+
+    magnet: Magnet
+    setting: Channel
+    readback: Channel
+
+    async def put(self, value: float) -> None:
+        """As `Device.put`; nothing outside the limits is ever written."""
+        await self.setting.put(moved(self.magnet, value))
+
+    async def get(self) -> float:
+        """As `Device.get`."""
+        return _sound(await self.setting.get(), self.magnet.set).value
+
+    async def settled(self, value: float) -> float:
+        """As `Device.settled`: the mean over the time for which it has to stay."""
+        magnet, clock = self.magnet, time.monotonic
+        began, seen, within = clock(), [], None
+        pause = min(max(magnet.settle / LOOKS, SHORTEST), LONGEST)
+        while True:
+            read = _sound(await self.readback.get(), magnet.read).value
+            if abs(read - value) <= magnet.tolerance:
+                within = clock() if within is None else within
+                seen.append(read)
+                if clock() - within >= magnet.settle:
+                    break
+            else:
+                within, seen = None, []
+            if clock() - began > magnet.timeout + magnet.settle:
+                raise NotSettledError(*_unsettled(magnet, value, read))
+            await asyncio.sleep(pause)
+        if abs(await self.get() - value) > magnet.tolerance:
+            found = f"{magnet.name} set by someone else while it was scanned"
+            raise NotSettledError(found, "nobody else who sets it")
+        return float(np.mean(seen))
+
+
+def _sound(reading: Reading, name: str) -> Reading:
+    if not reading.good:
+        found = f"'{plain(name)}' reads {reading.value} (severity {reading.severity})"
+        raise LostError(found, "a number without an INVALID alarm")
+    return reading
+
+
+def _unsettled(magnet: Magnet, value: float, read: float) -> tuple[str, str]:
+    """What a read-back does instead of arriving, and what to look at."""
+    found = (
+        f"{magnet.name} set to {value:.6g} {magnet.unit}, read back {read:.6g} after "
+        f"{magnet.timeout:g} s"
+    )
+    if abs(read + value) <= magnet.tolerance:
+        return found, f"the same sign; is the sign of '{magnet.read}' right?"
+    within = f"within {magnet.tolerance:g} for {magnet.settle:g} s"
+    return found, f"{within}; is the supply on, is '{magnet.read}' its read-back?"
+
+
+@dataclass(frozen=True)
+class ScreenShots:
+    """A screen by EPICS: rms sizes, or projections whose rms is taken, with new time stamps."""
+
+    profiler: Profiler
+    channels: Mapping[str, Channel]
+
+    async def shots(self) -> dict[str, np.ndarray]:
+        """As `Sizes.shots`; the planes at the same time."""
+        found = await asyncio.gather(*map(self._of_plane, self.channels))
+        return dict(zip(self.channels, found, strict=True))
+
+    async def _of_plane(self, plane: str) -> np.ndarray:
+        kept: list[float] = []
+        try:
+            await asyncio.wait_for(self._collect(self.channels[plane], kept), self._patience)
+        except TimeoutError:
+            found = f"{len(kept)} of {self.profiler.shots} new shots of {plane} in time"
+            expected = f"one at least every {self.profiler.timeout:g} s; are the time stamps new?"
+            raise NoSizesError(found, expected) from None
+        return np.array(kept)
+
+    @property
+    def _patience(self) -> float:
+        return self.profiler.timeout * (1 + self.profiler.shots / 4)
+
+    async def _collect(self, channel: Channel, kept: list[float]) -> None:
+        last, bad = (await channel.get()).time, 0
+        async for reading in channel.monitor():
+            if reading is None:
+                raise LostError(f"'{plain(channel.name)}' is gone", "an IOC that stays")
+            if reading.time <= last:
+                continue
+            last = reading.time
+            size = self._size(reading)
+            if size is None:
+                bad += 1
+            else:
+                kept.append(size)
+            if len(kept) == self.profiler.shots:
+                return
+            if bad > BAD * self.profiler.shots:
+                raise NoSizesError(f"{bad} shots without a size", "a beam that fits on the screen")
+
+    def _size(self, reading: Reading) -> float | None:
+        if not reading.good:
+            return None
+        if self.profiler.profiles:
+            return rms_of(np.atleast_1d(reading.value), self.profiler.pixel)
+        size = reading.value * self.profiler.unit
+        return float(size) if np.ndim(size) == 0 and size > 0 else None
+
+
+@dataclass(frozen=True)
+class BeamGuard:
+    """Beam-present and beam-loss variables by EPICS."""
+
+    guard: Guard
+    present: Channel | None
+    loss: Channel | None
+
+    async def amiss(self) -> str:
+        """As `Watchman.amiss`."""
+        if self.present is not None:
+            found = await self.present.get()
+            if not (found.good and found.value > self.guard.present_above):
+                return f"no beam ('{plain(self.guard.present)}' reads {found.value:g})"
+        if self.loss is not None:
+            found = await self.loss.get()
+            if not (found.good and found.value < self.guard.loss_below):
+                return f"beam loss ('{plain(self.guard.loss)}' reads {found.value:g})"
+        return ""
+
+
+async def connect(machine: ScanMachine) -> Connected:
+    """Connect to a machine, and check units, limits and that every variable answers.
+
+    Parameters
+    ----------
+    machine : ScanMachine
+        As read from its file.
+
+    Returns
+    -------
+    Connected
+        Limits are those of the file or the control system, whichever are tighter.
+
+    Raises
+    ------
+    InputError
+        If a variable does not answer, has another unit than the file says, a read-back does not
+        agree with its setting, or a magnet is outside the limits already.
+    """
+    notes: list[str] = []
+    magnets, supplies = [], {}
+    for magnet in machine.magnets:
+        magnet, said = await _checked(magnet, machine.timeout)
+        supplies[magnet.name] = supply_of(magnet, machine.timeout)
+        magnets.append(magnet)
+        notes += said
+        setting = moved(magnet, await supplies[magnet.name].get())
+        await supplies[magnet.name].settled(setting)
+    machine = replace(machine, magnets=tuple(magnets))
+    wanted, guard = machine.screen, machine.guard
+    names = wanted.sizes or wanted.profiles
+    screen = {plane: open_channel(name, machine.timeout) for plane, name in names.items()}
+    for channel in screen.values():
+        await channel.get()
+    watchmen = [
+        None if name is None else open_channel(name, machine.timeout)
+        for name in (guard.present, guard.loss)
+    ]
+    ready = BeamGuard(guard, *watchmen)
+    await ready.amiss()
+    return Connected(supplies, ScreenShots(wanted, screen), ready, machine, tuple(notes))
+
+
+def supply_of(magnet: Magnet, timeout: float) -> Supply:
+    """A magnet's variables; writing may take as long as the magnet needs to arrive."""
+    return Supply(
+        magnet, open_channel(magnet.set, magnet.timeout), open_channel(magnet.read, timeout)
+    )
+
+
+async def _checked(magnet: Magnet, timeout: float) -> tuple[Magnet, list[str]]:
+    """A magnet with the tighter limits, and what to say of them."""
+    for name in (magnet.set, magnet.read):
+        described = await open_channel(name, timeout).describe()
+        unit = unit_of(described.unit)
+        if described.unit and unit != magnet.unit:
+            found = f"'{plain(name)}' in '{plain(described.unit)}'"
+            raise InputError(found, f"{magnet.unit}, as the machine file says of {magnet.name}")
+        if name == magnet.set:
+            low, high = max(magnet.low, described.low), min(magnet.high, described.high)
+    if not low < high:
+        found = f"limits {described.low:g} to {described.high:g} of '{plain(magnet.set)}'"
+        raise InputError(found, f"some of {magnet.low:g} to {magnet.high:g}, of the machine file")
+    if (low, high) == (magnet.low, magnet.high):
+        return magnet, []
+    said = f"Limits of {magnet.name}: {low:g} to {high:g} {magnet.unit}, of the control system."
+    return replace(magnet, low=low, high=high), [said]

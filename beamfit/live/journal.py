@@ -1,0 +1,139 @@
+"""What a scan has to restore, on disk before anything is moved, until it is restored."""
+
+from __future__ import annotations
+
+import json
+import os
+import socket
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass, fields
+from datetime import UTC, datetime
+from os import PathLike
+from pathlib import Path
+
+from beamfit.errors import InputError
+from beamfit.io.files import read_json
+from beamfit.io.machine import Magnet, ScanMachine
+from beamfit.writing import write_atomically
+
+FORMAT = "beamfit-journal-1"
+
+
+@dataclass(frozen=True)
+class Journal:
+    """Magnets and the settings they had before a scan.
+
+    Attributes
+    ----------
+    path : Path
+        Where it is written.
+    machine : str
+        The machine file, for whoever finds the journal.
+    before : tuple of (Magnet, float)
+        Each magnet, with limits and variables of its own, and its setting.
+    timeout, patience : float
+        Within which a variable has to answer, and for how long it is asked again, s.
+    """
+
+    path: Path
+    machine: str
+    before: tuple[tuple[Magnet, float], ...]
+    timeout: float = 5.0
+    patience: float = 60.0
+
+    def write(self) -> None:
+        """Have it on disk, whole, its folder too.
+
+        Raises
+        ------
+        InputError
+            If the place cannot be written.
+        """
+        said = {
+            "format": FORMAT,
+            "what": "settings to restore: beamfit scan --recover THIS_FILE",
+            "machine": self.machine,
+            "written": datetime.now(UTC).isoformat(timespec="seconds"),
+            "by": f"process {os.getpid()} on {socket.gethostname()}",
+            "timeout": self.timeout,
+            "patience": self.patience,
+            "magnets": [{**asdict(magnet), "setting": value} for magnet, value in self.before],
+        }
+        write_atomically(self.path, (json.dumps(said, indent=2) + "\n").encode())
+        folder = os.open(self.path.parent, os.O_RDONLY)
+        try:
+            os.fsync(folder)
+        finally:
+            os.close(folder)
+
+    def done(self) -> None:
+        """Remove it: all is restored."""
+        self.path.unlink(missing_ok=True)
+
+
+def check_none_left(path: Path) -> None:
+    """Refuse to begin where an earlier scan has something to restore.
+
+    Raises
+    ------
+    InputError
+        Naming the journal.
+    """
+    if path.exists():
+        found = "what a scan before this one has not restored"
+        raise InputError(found, f"beamfit scan --recover {path} first", path=path)
+
+
+def read_journal(path: str | PathLike[str]) -> Journal:
+    """Read a journal.
+
+    Raises
+    ------
+    InputError
+        If the file is none.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> place = Path(tempfile.mkdtemp()) / "a.journal"
+    >>> magnet = Magnet("Q", "Q:SET", "Q:READ", "A", -1.0, 1.0, 0.01, 0.1)
+    >>> Journal(place, "machine.toml", ((magnet, 0.5),)).write()
+    >>> read_journal(place).before == ((magnet, 0.5),)
+    True
+    """
+    expected = f"a journal of beamfit scan, {FORMAT}"
+    found = read_json(path, "a file that is none", expected)
+    try:
+        if found["format"] != FORMAT:
+            raise KeyError
+        before = tuple(_magnet(dict(table)) for table in found["magnets"])
+        times = float(found["timeout"]), float(found["patience"])
+        return Journal(Path(path), str(found["machine"]), before, *times)
+    except (KeyError, TypeError, ValueError):
+        raise InputError("a file that is none", expected, path=path) from None
+
+
+def _magnet(table: dict[str, object]) -> tuple[Magnet, float]:
+    setting = float(table.pop("setting"))
+    table["degauss"] = tuple(table["degauss"])
+    known = {field.name for field in fields(Magnet)}
+    magnet = Magnet(**{name: value for name, value in table.items() if name in known})
+    if not magnet.low < magnet.high:
+        raise ValueError
+    return magnet, setting
+
+
+def journal_of(machine: ScanMachine, path: str | None) -> Path:
+    """Where the journal of a machine is, unless it is said: beside the machine's file."""
+    return Path(path or Path(machine.path).with_suffix(".journal")).absolute()
+
+
+def named(before: Iterable[tuple[Magnet, float]]) -> str:
+    """Magnets and their settings in words.
+
+    Examples
+    --------
+    >>> named([(Magnet("Q", "Q:SET", "Q:READ", "T_per_m", -1.0, 1.0, 0.01, 0.1), 0.5)])
+    'Q 0.5 T_per_m'
+    """
+    return ", ".join(f"{magnet.name} {value:.6g} {magnet.unit}" for magnet, value in before)

@@ -1,0 +1,203 @@
+"""Which setting to measure next, given the points so far: pure functions of what is known."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from beamfit.errors import InputError
+from beamfit.io.machine import ScanMachine
+from beamfit.optics.beamline import Beamline
+from beamfit.status import Status
+from beamfit.studies.scan.design import plan_measurements
+from beamfit.studies.scan.fit import EmittanceFit, fit_emittance
+from beamfit.studies.scan.scans import QuadScan
+
+# Where a scan begins, in parts of the range of its first magnet.
+BEGIN = (0.1, 0.37, 0.63, 0.9)
+# Points before which a goal is not taken for reached.
+FEWEST = 5
+
+
+class Point(NamedTuple):
+    """A setting as it was read back, the shots of each plane, m, and when, Unix time."""
+
+    settings: dict[str, float]
+    shots: dict[str, np.ndarray]
+    time: float
+
+
+class Next(NamedTuple):
+    """A setting to measure, and why it is chosen."""
+
+    settings: dict[str, float]
+    why: str
+
+
+def standard_errors(shots: Sequence[np.ndarray]) -> list[float]:
+    """Standard errors of the means of some shots; none where a setting has no scatter.
+
+    Examples
+    --------
+    >>> standard_errors([np.array([1.0, 3.0]), np.array([2.0, 2.0])])
+    []
+    """
+    found = [float(s.std(ddof=1) / np.sqrt(s.size)) if s.size > 1 else 0.0 for s in shots]
+    return found if min(found) > 0 else []
+
+
+def scan_of(points: Sequence[Point], machine: ScanMachine) -> QuadScan:
+    """The points as a scan: means of the shots, and their standard errors where they scatter.
+
+    Parameters
+    ----------
+    points : sequence of Point
+        At three different settings at least.
+    machine : ScanMachine
+        Whose magnets they are of.
+
+    Returns
+    -------
+    QuadScan
+
+    Raises
+    ------
+    InputError
+        If they are no scan yet.
+    """
+    settings = {m.name: np.array([p.settings[m.name] for p in points]) for m in machine.magnets}
+    shots = {plane: [p.shots[plane] for p in points] for plane in points[0].shots}
+    size = {plane: np.array([s.mean() for s in each]) for plane, each in shots.items()}
+    found = {plane: standard_errors(each) for plane, each in shots.items()}
+    error = {plane: np.array(each) for plane, each in found.items() if each}
+    count = np.array([min(map(len, p.shots.values())) for p in points])
+    units = {m.name: m.unit for m in machine.magnets}
+    return QuadScan(
+        settings, units, size, error, shots=count if error else None, name=machine.name,
+        screen=(machine.screen.name,) * len(points), error_source="the scatter of the shots",
+    )  # fmt: skip
+
+
+def fit_of(points: Sequence[Point], machine: ScanMachine, line: Beamline) -> EmittanceFit | None:
+    """The fit to the points, None as long as they are no scan."""
+    try:
+        return fit_emittance(scan_of(points, machine), line)
+    except InputError:
+        return None
+
+
+def warmed(machine: ScanMachine, line: Beamline) -> None:
+    """Have everything compiled that a scan needs, so that no magnet waits for it."""
+    magnet = machine.magnets[0]
+    middle = {m.name: 0.5 * (m.low + m.high) for m in machine.magnets}
+    rng = np.random.default_rng(0)
+    planes = machine.screen.sizes or machine.screen.profiles
+    for count in (4, 9):
+        points = [
+            Point(
+                middle | {magnet.name: value},
+                {p: 1e-4 * (1 + 0.02 * rng.standard_normal(3)) for p in planes},
+                0.0,
+            )
+            for value in np.linspace(magnet.low, magnet.high, count)
+        ]
+        fit = fit_of(points, machine, line)
+        next_setting(points, fit, (), machine, middle)
+
+
+def sharp(fit: EmittanceFit | None, points: Sequence[Point], goal: float) -> bool:
+    """Whether every emittance is trusted and known to a relative error.
+
+    Parameters
+    ----------
+    fit : EmittanceFit or None
+        To the points.
+    points : sequence of Point
+        Fewer than five are never enough: three numbers fit nearly anything else.
+    goal : float
+        Relative error.
+    """
+    if fit is None or len(points) < FEWEST:
+        return False
+    return all(
+        p.status is Status.converged
+        and p.emittance.error is not None
+        and p.emittance.error <= goal * p.emittance.value
+        for p in fit.planes
+    )
+
+
+def first_settings(machine: ScanMachine) -> tuple[float, ...]:
+    """Where a scan begins: as the machine file says, or over the range of its first magnet."""
+    first = machine.magnets[0]
+    return machine.first or tuple(first.low + p * (first.high - first.low) for p in BEGIN)
+
+
+def next_setting(
+    points: Sequence[Point],
+    fit: EmittanceFit | None,
+    barred: Sequence[Mapping[str, float]],
+    machine: ScanMachine,
+    before: Mapping[str, float],
+) -> Next | str:
+    """Choose the next setting, or say why there should be none.
+
+    Parameters
+    ----------
+    points : sequence of Point
+        What is measured.
+    fit : EmittanceFit or None
+        To the points.
+    barred : sequence of mapping
+        Settings at which nothing could be measured; nothing beyond them is chosen.
+    machine : ScanMachine
+        Limits, and settings to begin with.
+    before : mapping of str to float
+        Settings before the scan.
+
+    Returns
+    -------
+    Next or str
+        First settings over the range of the first magnet; then those of `plan_measurements`; the
+        middle of the largest gap as long as nothing can be fitted.
+    """
+    limits = {m.name: _within(m.name, m.low, m.high, barred, before) for m in machine.magnets}
+    first = machine.magnets[0]
+    low, high = limits[first.name]
+    begin = first_settings(machine)[len(points) + len(barred) :]
+    if begin and low <= begin[0] <= high:
+        return Next(_clipped(dict(before) | {first.name: begin[0]}, limits), "first settings")
+    if fit is not None:
+        advice = plan_measurements(fit, limits=limits, count=1)
+        if advice.steps:
+            wanted = advice.steps[0].candidate.settings
+            return Next(_clipped(dict(before) | wanted, limits), "where it tells most")
+        if len(points) >= FEWEST:
+            return advice.stop.removeprefix("Stop: ").rstrip(".")
+    gaps = np.sort([low, high, *(p.settings[first.name] for p in points)])
+    place = int(np.argmax(np.diff(gaps)))
+    middle = 0.5 * float(gaps[place] + gaps[place + 1])
+    return Next(_clipped(dict(before) | {first.name: middle}, limits), "the largest gap")
+
+
+def _within(
+    name: str, low: float, high: float, barred: Sequence[Mapping[str, float]],
+    before: Mapping[str, float],
+) -> tuple[float, float]:  # fmt: skip
+    """Limits drawn in, half way from a barred setting to where the magnet was."""
+    for settings in barred:
+        middle = 0.5 * (settings[name] + before[name])
+        if settings[name] > before[name]:
+            high = min(high, middle)
+        elif settings[name] < before[name]:
+            low = max(low, middle)
+    return low, high
+
+
+def _clipped(
+    settings: Mapping[str, float], limits: Mapping[str, tuple[float, float]]
+) -> dict[str, float]:
+    """Settings within the limits, of as many digits as a person would type."""
+    return {name: float(np.clip(float(f"{settings[name]:.6g}"), *limits[name])) for name in limits}

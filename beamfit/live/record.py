@@ -1,0 +1,65 @@
+"""The points of a scan as an ordinary scan file, with where they come from."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from datetime import UTC, datetime
+
+import beamfit
+from beamfit.io.machine import ScanMachine
+from beamfit.live.next_setting import Point, standard_errors
+
+
+def scan_text(points: Sequence[Point], machine: ScanMachine, before: Mapping[str, float]) -> str:
+    """Write the points as CSV that `beamfit.read_quad_scan` reads.
+
+    Parameters
+    ----------
+    points : sequence of Point
+        At least one.
+    machine : ScanMachine
+        Whose magnets and screen they are of.
+    before : mapping of str to float
+        Settings before the scan.
+
+    Returns
+    -------
+    str
+        Settings are those read back; sizes are means of the shots, in um, errors their standard
+        errors.
+    """
+    columns = {f"{m.name}_{m.unit}": [p.settings[m.name] for p in points] for m in machine.magnets}
+    for plane in points[0].shots:
+        shots = [1e6 * p.shots[plane] for p in points]
+        columns[f"size_{plane}_um"] = [s.mean() for s in shots]
+        if errors := standard_errors(shots):
+            columns[f"size_{plane}_error_um"] = errors
+    rows = [",".join([*columns, "shots", "screen", "time"])]
+    for point, *numbers in zip(points, *columns.values(), strict=True):
+        cells = [f"{number:.9g}" for number in numbers]
+        count = min(map(len, point.shots.values()))
+        rows.append(",".join([*cells, str(count), machine.screen.name, _written(point.time)]))
+    return "\n".join([*_head(machine, before), *rows]) + "\n"
+
+
+def _head(machine: ScanMachine, before: Mapping[str, float]) -> list[str]:
+    """What a reader of the file wants to know of how it was measured, as comments."""
+    screen = machine.screen
+    variables = ", ".join((screen.sizes or screen.profiles).values())
+    measured = "sizes" if screen.sizes else "Gaussian fits to projections"
+    return [
+        f"# {machine.name}: scan by beamfit {beamfit.__version__}, {_written(None)}",
+        f"# machine file {machine.path}, sha256 {machine.sha256}",
+        f"# lattice {machine.lattice.path}, sha256 {machine.lattice.sha256}",
+        *(
+            f"# {m.name}: set by {m.set}, read back by {m.read}; before the scan "
+            f"{before[m.name]:.9g} {m.unit}"
+            for m in machine.magnets
+        ),
+        f"# screen {screen.name}: {measured} from {variables}, {screen.shots} shots a setting",
+    ]
+
+
+def _written(time: float | None) -> str:
+    at = datetime.now(UTC) if time is None else datetime.fromtimestamp(time, UTC)
+    return at.isoformat(timespec="milliseconds" if time else "seconds")

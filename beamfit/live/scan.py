@@ -1,0 +1,239 @@
+"""A scan that chooses its settings: fitted after every point, ended by a goal, restored always."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import signal
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import NamedTuple
+
+from beamfit.errors import InputError
+from beamfit.io.machine import ScanMachine
+from beamfit.live.devices import Connected, NoSizesError
+from beamfit.live.journal import Journal, check_none_left, named
+from beamfit.live.next_setting import Next, Point, fit_of, next_setting, sharp, warmed
+from beamfit.live.restore import ended_by_signals, reach, restore
+from beamfit.optics.beamline import Beamline
+from beamfit.studies.scan.fit import EmittanceFit
+from beamfit.writing import alone
+
+# Settings in a row at which nothing can be measured, after which a scan ends.
+BARREN = 3
+# Seconds between two looks at whether the beam is back.
+LOOK = 0.2
+
+
+class Told(NamedTuple):
+    """How a scan stands: its points, the fit to them where there is one, and what is new."""
+
+    points: tuple[Point, ...]
+    fit: EmittanceFit | None
+    news: str
+
+
+class Outcome(NamedTuple):
+    """How a scan ended.
+
+    Attributes
+    ----------
+    points : tuple of Point
+        What was measured.
+    fit : EmittanceFit or None
+        The fit to them.
+    reason : str
+        Why it ended.
+    problem : Exception or None
+        What went wrong, if something did. The magnets are restored all the same.
+    signal : int
+        Number of the signal that ended it; 0 if none.
+    """
+
+    points: tuple[Point, ...]
+    fit: EmittanceFit | None
+    reason: str
+    problem: Exception | None = None
+    signal: int = 0
+
+
+@dataclass
+class _Running:
+    """What a scan has so far; the one thing that changes as it goes on."""
+
+    at: Connected
+    line: Beamline
+    before: Mapping[str, float]
+    keep: Callable[[Sequence[Point]], None]
+    tell: Callable[[Told], None]
+    points: list[Point] = field(default_factory=list)
+    barred: list[dict[str, float]] = field(default_factory=list)
+    fit: EmittanceFit | None = None
+    armed: bool = False
+
+    def say(self, news: str) -> None:
+        self.tell(Told(tuple(self.points), self.fit, news))
+
+
+async def scan(
+    at: Connected,
+    line: Beamline,
+    journal: Path,
+    *,
+    keep: Callable[[Sequence[Point]], None] = lambda points: None,
+    tell: Callable[[Told], None] = lambda told: None,
+) -> Outcome:
+    """Scan magnets until the emittances are known as well as is wanted, and put them back.
+
+    Parameters
+    ----------
+    at : Connected
+        The machine: magnets, screen and guard with the methods of `beamfit.live.devices`, and
+        what the machine file says.
+    line : Beamline
+        Its optics.
+    journal : Path
+        Where the settings to restore are written before anything moves.
+    keep : callable
+        Is given all points after each new one, to write them.
+    tell : callable
+        Is told how the scan stands.
+
+    Returns
+    -------
+    Outcome
+        Whatever ended it: goal, stop rule, signal or fault.
+
+    Raises
+    ------
+    NotRestoredError
+        If a magnet is not seen to be back; the journal stays then.
+    InputError
+        If nothing was begun: a journal is left from before, another scan has it, or it cannot be
+        written.
+
+    Examples
+    --------
+    See docs/live.md, where a simulation takes the place of a control system.
+    """
+    warmed(at.machine, line)
+    with alone(journal):
+        check_none_left(journal)
+        before = {m.name: await at.magnets[m.name].get() for m in at.machine.magnets}
+        saved = tuple((m, before[m.name]) for m in at.machine.magnets)
+        log = Journal(
+            journal, os.path.abspath(at.machine.path), saved, at.machine.timeout, at.machine.restore
+        )
+        run = _Running(at, line, before, keep, tell)
+        measuring = asyncio.ensure_future(_begun(run, log))
+        reason, problem = "", None
+        with ended_by_signals(measuring, run.say) as came:
+            try:
+                reason = await measuring
+            except asyncio.CancelledError:
+                if not came:  # whoever runs this one wants it to end: restored before it does
+                    await asyncio.shield(_back(run, log))
+                    raise
+                reason = f"stopped by {signal.Signals(came[0]).name}"
+            except Exception as error:  # of whatever kind: the magnets are put back first
+                problem, reason = error, str(error)
+            await _back(run, log)
+        return Outcome(tuple(run.points), run.fit, reason, problem, came[0] if came else 0)
+
+
+def _journal(path: Path, machine: ScanMachine, before: Mapping[str, float]) -> Journal:
+    settings = tuple((m, before[m.name]) for m in machine.magnets)
+    whose = os.path.abspath(machine.path)
+    return Journal(path, whose, settings, machine.timeout, machine.restore)
+
+
+async def _begun(run: _Running, log: Journal) -> str:
+    log.write()
+    run.armed = True  # from here on something may have moved
+    run.say(f"Restored at the end: {named(log.before)}. Until then it is in {log.path}")
+    return await _measured(run)
+
+
+async def _back(run: _Running, log: Journal) -> None:
+    """Restore what may have been moved."""
+    if run.armed:
+        await restore(log, run.at.magnets)
+        run.say(f"Restored and read back: {named(log.before)}")
+
+
+async def _measured(run: _Running) -> str:
+    """Measure setting after setting, and say why it ends."""
+    machine, barren = run.at.machine, 0
+    for magnet in machine.magnets:
+        for value in magnet.degauss:
+            await reach(magnet, run.at.magnets[magnet.name], value)
+    while len(run.points) < machine.points:
+        chosen = next_setting(run.points, run.fit, run.barred, machine, run.before)
+        if not isinstance(chosen, Next):
+            return chosen
+        point, why = await _point(run, chosen.settings)
+        if point is None:
+            run.barred.append(chosen.settings)
+            barren += 1
+            words = ", ".join(f"{name} {value:.6g}" for name, value in chosen.settings.items())
+            run.say(f"Left out: {words} ({why})")
+            if barren == BARREN:
+                raise NoSizesError(
+                    f"nothing measured at {BARREN} settings in a row, {why}", "sizes"
+                )
+            continue
+        barren = 0
+        run.points.append(point)
+        run.keep(run.points)
+        run.fit = fit_of(run.points, machine, run.line) or run.fit
+        run.say(chosen.why)
+        if sharp(run.fit, run.points, machine.goal):
+            return f"the goal of {100 * machine.goal:.3g} % is reached"
+    return f"all {machine.points} points are measured"
+
+
+async def _point(run: _Running, settings: Mapping[str, float]) -> tuple[Point | None, str]:
+    """Measure at a setting; None, and why, where that cannot be done.
+
+    Where the beam is lost the magnets go back until it has returned; once more is tried.
+    """
+    why = ""
+    for _ in range(2):
+        await _well(run, why)
+        reads = await _moved(run, settings)
+        try:
+            shots, why = await run.at.screen.shots(), ""
+        except NoSizesError as error:
+            shots, why = {}, error.found
+        wrong = await run.at.guard.amiss()
+        if not wrong:
+            return (Point(reads, dict(shots), time.time()) if shots else None), why
+        why = wrong
+        run.say(f"Paused: {wrong}")
+        await _moved(run, run.before)
+    return None, why
+
+
+async def _moved(run: _Running, settings: Mapping[str, float]) -> dict[str, float]:
+    magnets = [m for m in run.at.machine.magnets if m.name in settings]
+    return {m.name: await reach(m, run.at.magnets[m.name], settings[m.name]) for m in magnets}
+
+
+async def _well(run: _Running, why: str) -> None:
+    """Wait until there is beam and none is lost.
+
+    Raises
+    ------
+    InputError
+        If that takes too long.
+    """
+    until = time.monotonic() + run.at.machine.guard.wait
+    while wrong := await run.at.guard.amiss():
+        if time.monotonic() > until:
+            expected = f"it to be over within {run.at.machine.guard.wait:g} s"
+            raise InputError(f"{wrong}", expected)
+        await asyncio.sleep(LOOK)
+    if why:
+        run.say("Going on")
