@@ -90,22 +90,25 @@ class _Lines:
     """What is said while a scan goes on: a line a point, with normalised emittances."""
 
     def __init__(self, err: bool) -> None:
-        self.err, self.points = err, 0
+        self.err = err
 
     def __call__(self, text: str) -> None:
         click.echo(plain(text), err=self.err)
 
     def told(self, now: Told) -> None:
         """A new point with what is known after it, or what else is new."""
-        if len(now.points) == self.points:
+        from beamfit.live.next_setting import FEWEST
+
+        if not now.measured:
             self(now.news)
             return
-        self.points = len(now.points)
+        count, fit = len(now.points), now.fit
         last = now.points[-1]
         at = ", ".join(f"{name} {value:.4g}" for name, value in last.settings.items())
         sizes = ", ".join(f"{p} {1e6 * s.mean():.1f} um" for p, s in last.shots.items())
-        known = ", ".join(_known(p) for p in (now.fit.planes if now.fit else ()))
-        self(f"{self.points:3d}  {at:<12}  {sizes:<26}  {known}".rstrip())
+        planes = fit.planes if fit and count >= FEWEST else ()
+        known = ", ".join(map(_known, planes))
+        self(f"{count:3d}  {at:<12}  {sizes:<26}  {known}".rstrip())
 
 
 def _known(plane: PlaneFit) -> str:

@@ -28,11 +28,15 @@ LOOK = 0.2
 
 
 class Told(NamedTuple):
-    """How a scan stands: its points, the fit to them where there is one, and what is new."""
+    """How a scan stands: its points, the fit to them where there is one, and what is new.
+
+    ``measured`` says whether that is the last of the points; ``news`` is then why it was chosen.
+    """
 
     points: tuple[Point, ...]
     fit: EmittanceFit | None
     news: str
+    measured: bool = False
 
 
 class Outcome(NamedTuple):
@@ -73,8 +77,8 @@ class _Running:
     fit: EmittanceFit | None = None
     armed: bool = False
 
-    def say(self, news: str) -> None:
-        self.tell(Told(tuple(self.points), self.fit, news))
+    def say(self, news: str, measured: bool = False) -> None:
+        self.tell(Told(tuple(self.points), self.fit, news, measured))
 
 
 async def scan(
@@ -185,10 +189,10 @@ async def _measured(run: _Running) -> str:
                 )
             continue
         barren = 0
+        run.keep([*run.points, point])
         run.points.append(point)
-        run.keep(run.points)
         run.fit = fit_of(run.points, machine, run.line) or run.fit
-        run.say(chosen.why)
+        run.say(chosen.why, measured=True)
         if sharp(run.fit, run.points, machine.goal):
             return f"the goal of {100 * machine.goal:.3g} % is reached"
     return f"all {machine.points} points are measured"

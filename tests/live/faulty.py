@@ -65,7 +65,7 @@ wait_s = 1
 [scan]
 goal_percent = 0.5
 points = 7
-restore_s = 6
+restore_s = 20
 """
 LOW, HIGH = -5.5, 2.5
 SCREEN = ("NAN", "STALE", "DARK", "LOSSY")
@@ -163,7 +163,7 @@ class Injector:
         (self.folder / "machine.toml").write_text(text)
         out = self.folder / "scan.csv"
         out.unlink(missing_ok=True)
-        size = rng.randrange(1000, 1500) if fault == "disk" else None
+        size = rng.randrange(900, 1400) if fault == "disk" else None
         machine = str(self.folder / "machine.toml")
         self.worker.begin("scan", machine, "--out", str(out), file_size=size)
         self._wait_for_journal()
