@@ -496,16 +496,17 @@ def alarms_of(
         state, told = watched(reference, state, Reading(*row))
         raised = float(row[0]) if told.raised else raised
         if told.moved:
-            alarms.append(_alarm(raised, told, float(row[0])))
+            alarms.append(alarm_of(raised, told, float(row[0])))
             raised = None
     if raised is not None:
         change, error, _ = _change(state, np.int64(4))
         since = _since(reference, state, change)
-        alarms.append(_alarm(raised, Told(True, 4, change, error, since), None))
+        alarms.append(alarm_of(raised, Told(True, 4, change, error, since), None))
     return tuple(alarms)
 
 
-def _alarm(raised: float, told: Told, at: float | None) -> Alarm:
+def alarm_of(raised: float, told: Told, at: float | None) -> Alarm:
+    """What was told of an alarm, and when."""
     moved = NAMES[int(told.moved)]
     a, b = (
         Quantity(float(v), float(e), "1") if name in moved.split() else None

@@ -344,6 +344,11 @@ def fit_cycles(cycles: Sequence[DecayRecord], name: str = "cycles") -> DecayFit:
         if len(cycle) < FEWEST_READINGS:
             found, expected = f"{len(cycle)} readings", f"{FEWEST_READINGS} or more in a cycle"
             raise InputError(found, expected, path=cycle.name)
+    return fit_pieces(cycles, name)
+
+
+def fit_pieces(cycles: Sequence[DecayRecord], name: str) -> DecayFit:
+    """As `fit_cycles`, also of two, such as before and after a refill or a gap."""
     gathered = averaged(cycles)
     if np.any(np.diff(gathered.time) <= 0):
         raise InputError("a cycle before the end of the one before", "an order in time", path=name)

@@ -282,7 +282,7 @@ def _steps(record: DecayRecord, name: str) -> np.ndarray:
     return np.abs(np.diff(values)) > CHANGED * np.maximum(values[1:], values[:-1])
 
 
-def _at_settings(segment: DecayRecord, fewest: int = SHORTEST) -> list[DecayRecord]:
+def at_settings(segment: DecayRecord, fewest: int = SHORTEST) -> list[DecayRecord]:
     """Cut where somebody changed a setting."""
     moved = np.any([_steps(segment, name) for name in SETTINGS], axis=0)
     pieces = np.split(np.arange(len(segment)), np.flatnonzero(moved) + 1)
@@ -312,7 +312,7 @@ def _refilled(record: DecayRecord) -> Split:
     """The cycles of what is held by refills in a record, of all its settings, and the decays of
     the rest; no cycle if nothing is.
     """
-    sections = _at_settings(record)
+    sections = at_settings(record)
     found = [cut_at_refills(section) for section in sections]
     if not any(map(is_refilled, found)):
         return Split((), ())
@@ -334,7 +334,7 @@ def _decays(record: DecayRecord) -> tuple[list[DecayRecord], tuple[Event, ...]]:
     if len(record) < SHORTEST:
         return [record], ()
     split = split_record(record)
-    pieces = [piece for segment in split.segments for piece in _at_settings(segment)]
+    pieces = [piece for segment in split.segments for piece in at_settings(segment)]
     if not pieces:
         moving = [name for name in SETTINGS if _steps(record, name).any()]
         changes = f"changes of {', '.join(moving)} by more than {100 * CHANGED:g} %"

@@ -1,0 +1,504 @@
+"""A stored beam watched reading by reading: its lifetime over a sliding window, and what moved.
+
+Pure: a state and a step. Memory is that of the window, whatever the time and the rate of readings.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from beamfit.errors import InputError
+from beamfit.lifetime.decay import HOUR
+from beamfit.lifetime.losses import added, loss_coefficients, terms_of
+from beamfit.quantity import Quantity, Status
+from beamfit.studies.decay import alarm
+from beamfit.studies.decay.evidence import UNITS
+from beamfit.studies.decay.fit import bare
+from beamfit.studies.decay.record import PLAUSIBLE, Conditions, DecayRecord
+from beamfit.studies.decay.segments import DEAD, DROPOUT
+from beamfit.studies.decay.study import Budget, Machine, budget, operation_during
+from beamfit.studies.decay.trend import BEST_MONITOR, WANDER
+from beamfit.studies.decay.window import Row, Window, fit_window
+from beamfit.table import json_of
+
+CURRENT = "beam_current"
+# A window is kept as the means of readings over so many parts of it.
+ROWS = 4096
+# So many readings in a row, each older than the newest before them, are of a clock set back.
+LATE = 5
+# A reading off the others of its row by so many of their errors begins a new one: a refill.
+JUMP = 6.0
+# a and b so well known are the usual ones; errors half as large replace them before an alarm.
+KNOWN = 0.05
+# Where readings do not tell a from b, the ring's own shares of them are trusted to this.
+SHARES = 0.3
+# Settings, and the current, that moved by more than this share are given to the ring anew.
+MOVED = 0.01
+# What the ring is expected to lose follows its settings over so long, s, and steps at once.
+SMOOTH = 300.0
+# Events and points of the course that are kept.
+EVENTS, POINTS = 20, 360
+RULE = (
+    "raised where a change of a or b alone lowers chi² by 30: none false in 9e6 simulated readings "
+    "(benchmarks/alarm.py)"
+)
+
+
+class Plan(NamedTuple):
+    """How a beam is watched.
+
+    Attributes
+    ----------
+    name : str
+        Of the ring.
+    window, every : float
+        Length of the sliding window, and time from fit to fit, s.
+    machine : Machine or None
+        The ring, by which lifetimes are normalised and expected.
+    current : float or None
+        To which lifetimes are normalised, mA; without it that of the first fit.
+    """
+
+    name: str = "ring"
+    window: float = 7200.0
+    every: float = 10.0
+    machine: Machine | None = None
+    current: float | None = None
+
+
+class Counts(NamedTuple):
+    """Readings of all variables; those without a number, those that came late; gaps and steps."""
+
+    readings: int = 0
+    bad: int = 0
+    late: int = 0
+    gaps: int = 0
+    clock: int = 0
+
+
+class Point(NamedTuple):
+    """One fit, for a picture: time, s, lifetime and its error, h; NaN where it has none."""
+
+    time: float
+    lifetime: float
+    error: float
+
+
+class Answer(NamedTuple):
+    """What the window says.
+
+    Attributes
+    ----------
+    time, current : float
+        Of the last reading, s and mA.
+    window : Window
+        The fit.
+    status, message : Status, str
+        Of the fit, or why there is none.
+    lifetime, a, b, normalised : Quantity or None
+        At the mean current, h; 1/(mA s); 1/s; current times lifetime, mA h, by the ring at the
+        reference current and its usual settings. None where the readings do not determine it.
+    """
+
+    time: float
+    current: float
+    window: Window
+    status: Status
+    message: str
+    lifetime: Quantity | None = None
+    a: Quantity | None = None
+    b: Quantity | None = None
+    normalised: Quantity | None = None
+
+    def to_json(self) -> dict[str, Any]:
+        """Return it as `beamfit lifetime --json` does a decay, with what is normalised."""
+        unknown = {name: bare(None, unit) for name, unit in UNITS.items()}
+        fit = unknown if self.window.fit is None else self.window.fit.to_json()
+        named = {
+            "status": self.status,
+            "message": self.message,
+            "current": bare(self.current, "mA"),
+        }
+        more = {"normalised": self.normalised or bare(None, "mA h"), "decays": self.window.pieces}
+        return fit | json_of(named | more)
+
+
+class Terms(NamedTuple):
+    """A ring's terms, the settings they are for, and the a and b they make."""
+
+    place: np.ndarray
+    parts: tuple[Any, ...]
+    losses: np.ndarray
+
+
+class Alarmed(NamedTuple):
+    """The alarm at work: the usual loss, what the ring loses now and lost where that was found,
+    what is expected now over then, and since when an alarm is raised.
+    """
+
+    usual: alarm.Reference
+    state: alarm.State
+    ring: Terms | None = None
+    losses: np.ndarray | None = None
+    expected: tuple[float, float] = (1.0, 1.0)
+    raised: float | None = None
+
+
+class State(NamedTuple):
+    """What is remembered between readings.
+
+    Attributes
+    ----------
+    rows : tuple of Row
+        The window.
+    sums : tuple
+        Of the row that grows: readings, where it begins, sums of time since then and of current.
+    last, shift, interval : float or None
+        Time of the last reading, what is added to times since the clock was set back, and the
+        usual interval, s.
+    piece, dead, late : int, int, tuple
+        As of `Row`; readings without beam in a row; readings that came late, and the last of them.
+    settings : Conditions
+        Last ones read, in SI.
+    highest, noise, due : float
+        Current of the window and noise of a row, mA; when to fit, s.
+    counts, events, course, answer
+        What happened, with its time; what was found.
+    alarm : Alarmed or None
+        None until the usual loss is known.
+    alarms : tuple of Alarm
+        Within the window.
+    """
+
+    rows: tuple[Row, ...] = ()
+    sums: tuple[int, float, float, float] = (0, 0.0, 0.0, 0.0)
+    last: float | None = None
+    shift: float = 0.0
+    interval: float = 0.0
+    piece: int = 0
+    dead: int = 0
+    late: tuple[int, float] = (0, -math.inf)
+    settings: Conditions = Conditions(*[math.nan] * len(Conditions._fields))
+    highest: float = 0.0
+    noise: float = math.inf
+    due: float = -math.inf
+    counts: Counts = Counts()
+    events: tuple[tuple[float, str], ...] = ()
+    course: tuple[Point, ...] = ()
+    answer: Answer | None = None
+    alarm: Alarmed | None = None
+    alarms: tuple[alarm.Alarm, ...] = ()
+
+    @property
+    def alarmed(self) -> str:
+        """What moved: a name, "raised" where it is not told yet, "" where nothing did."""
+        if self.alarm is not None and self.alarm.raised is not None:
+            return "raised"
+        return self.alarms[-1].moved if self.alarms else ""
+
+    def said(self) -> str:
+        """The alarm in words."""
+        if self.alarm is None:
+            return "no usual loss yet: it needs a fit that tells a from b, or a ring"
+        if self.alarm.raised is not None:
+            raised = alarm.when(self.alarm.raised - self.shift, True)
+            return f"the loss moved, raised {raised}; what moved is told from the readings since"
+        return self.alarms[-1].said(True) if self.alarms else "nothing moved"
+
+
+def stepped(plan: Plan, state: State, variable: str, time: float, value: float) -> State:
+    """Take a reading of a variable.
+
+    Parameters
+    ----------
+    plan : Plan
+        What is watched, and how.
+    state : State
+        ``State()``, or that of the reading before.
+    variable : str
+        ``beam_current``, or a name in `Conditions`.
+    time : float
+        Its time stamp, Unix time in s.
+    value : float
+        In mA or SI; NaN where it is none.
+
+    Returns
+    -------
+    State
+        With a new answer where one is due.
+
+    Notes
+    -----
+    A reading that is no newer than the last is dropped, but five in a row that rise are of a clock
+    set back. A gap (ten usual intervals and a minute) and a step of the clock begin a new piece,
+    with a current of its own; so does a beam that was lost. Once an alarm has told what moved,
+    what was read before that is no longer of the window.
+
+    Examples
+    --------
+    >>> state, beam = State(), 500.0
+    >>> for time in range(0, 1201, 20):
+    ...     beam *= 1 - 20 * (3.7e-8 * beam + 9.3e-6)
+    ...     state = stepped(Plan(every=1200), state, "beam_current", 1.7e9 + time, beam)
+    >>> print(f"{state.answer.lifetime.value:.2f} h, {state.counts.late} late")
+    10.10 h, 0 late
+    """
+    state = _counted(state, readings=1)
+    if not (math.isfinite(value) and math.isfinite(time)):
+        return _counted(state, bad=1)
+    if variable != CURRENT:
+        low, high, _ = PLAUSIBLE[variable]
+        if not low <= value <= high:
+            return _counted(state, bad=1)
+        return state._replace(settings=state.settings._replace(**{variable: value}))
+    state = _current(plan, state, time, value)
+    return _answered(plan, state) if state.last >= state.due else state
+
+
+def _counted(state: State, **more: int) -> State:
+    counts = state.counts
+    return state._replace(
+        counts=counts._replace(**{name: getattr(counts, name) + n for name, n in more.items()})
+    )
+
+
+def noted(state: State, time: float, text: str) -> State:
+    """Keep what happened, for whoever looks."""
+    return state._replace(events=(*state.events[1 - EVENTS :], (time, text)))
+
+
+def _current(plan: Plan, state: State, time: float, value: float) -> State:
+    own, last = time + state.shift, state.last
+    if last is None:
+        return _placed(plan, state._replace(due=own + plan.every), own, value)
+    if own <= last:
+        return _behind(plan, state, time, value)
+    apart, usual = own - last, state.interval
+    if usual and apart > max(alarm.GAP * usual, alarm.MINUTE):
+        said = f"no reading for {apart:.0f} s, or the clock was set forward"
+        state = _counted(noted(_cut(plan, state), time, said), gaps=1)
+    interval = usual * (1.2 if apart > usual else 1 / 1.2) if usual else apart
+    return _placed(plan, state._replace(interval=interval, late=(0, -math.inf)), own, value)
+
+
+def _behind(plan: Plan, state: State, time: float, value: float) -> State:
+    """A reading no newer than the last."""
+    count, latest = state.late
+    count = count + 1 if time > latest else 1
+    if count < LATE:
+        return _counted(state._replace(late=(count, time)), late=1)
+    said = f"the clock was set back by {state.last - state.shift - time:.0f} s"
+    state = _counted(noted(_cut(plan, state), time, said), clock=1)
+    shift = state.last + max(state.interval, 1e-3) - time
+    return _current(plan, state._replace(shift=shift, late=(0, -math.inf)), time, value)
+
+
+def _cut(plan: Plan, state: State) -> State:
+    """What comes now has a current of its own."""
+    state = _closed(plan, state)
+    return state._replace(piece=state.piece + 1)
+
+
+def _placed(plan: Plan, state: State, own: float, value: float) -> State:
+    """A reading into its row, if there is a beam."""
+    state, time = state._replace(last=own), own - state.shift
+    if not value > DROPOUT * state.highest:
+        if state.dead + 1 == DEAD:
+            state = noted(_cut(plan, state), time, "the beam was lost")
+        return state._replace(dead=state.dead + 1)
+    if state.dead >= DEAD:
+        state = noted(state, time, "beam again")
+    count, begin, times, currents = state.sums
+    off = count and abs(value - currents / count) > JUMP * state.noise
+    if count and (off or own - begin >= plan.window / ROWS):
+        state = _closed(plan, state)
+        count, times, currents = 0, 0.0, 0.0
+    begin = begin if count else own
+    sums = (count + 1, begin, times + own - begin, currents + value)
+    return state._replace(sums=sums, dead=0, highest=max(state.highest, value))
+
+
+def _closed(plan: Plan, state: State) -> State:
+    """The row that grew is one of the window, and the alarm sees it."""
+    count, begin, times, currents = state.sums
+    if not count:
+        return state
+    row = Row(state.piece, begin + times / count, currents / count, state.settings)
+    state = state._replace(rows=(*state.rows, row), sums=(0, 0.0, 0.0, 0.0))
+    return state if state.alarm is None else _watched(plan, state, state.alarm, row)
+
+
+def _kept(state: State, begin: float) -> State:
+    """Rows from a time on."""
+    rows = state.rows
+    first = next((k for k, row in enumerate(rows) if row.time >= begin), len(rows))
+    return state._replace(rows=rows[first:])
+
+
+def _answered(plan: Plan, state: State) -> State:
+    """Fit the window, and learn what is usual."""
+    begin, shift = state.last - plan.window, state.shift
+    state = _kept(state, begin)
+    window = Window(None, None, 0, "no beam")
+    if state.dead < DEAD:
+        window = fit_window(state.rows, plan.name)
+    answer = _answer(plan, state, window)
+    found = answer.lifetime
+    point = Point(answer.time, *((found.value, found.error) if found else (math.nan, math.nan)))
+    course = tuple(p for p in state.course if p.time >= begin - shift)
+    if not course or point.time - course[-1].time >= plan.window / POINTS:
+        course = (*course, point)
+    current = plan.current or (window.fit and window.fit.mean_current)
+    learnt = None if window.fit is None else _learnt(plan._replace(current=current), state, window)
+    fit = window.fit
+    return state._replace(
+        answer=answer,
+        course=course,
+        due=state.last + plan.every,
+        alarm=learnt or state.alarm,
+        alarms=tuple(a for a in state.alarms if (a.told or a.time) >= begin - shift),
+        highest=max((row.current for row in state.rows), default=0.0),
+        noise=state.noise if fit is None else max(fit.rms_residual, BEST_MONITOR * answer.current),
+    )
+
+
+def _answer(plan: Plan, state: State, window: Window) -> Answer:
+    current = state.rows[-1].current if state.rows and state.dead < DEAD else 0.0
+    time, fit = state.last - state.shift, window.fit
+    if fit is None:
+        why = f"No lifetime: {window.why}."
+        return Answer(time, current, window, Status.unidentified, why)
+    known = [None if q.error is None else q for q in (fit.lifetime_mean, fit.a, fit.b)]
+    normalised, message = None, fit.message
+    try:
+        normalised = known[0] and _normalised(plan, window, known[0])
+    except InputError as error:
+        message += f" Not normalised: {error}."
+    return Answer(time, current, window, fit.status, message, *known, normalised)
+
+
+def _normalised(plan: Plan, window: Window, lifetime: Quantity) -> Quantity:
+    """Current times lifetime, mA h, as of `trend`."""
+    by = current = plan.current or window.fit.mean_current
+    if plan.machine is None:
+        by = window.fit.mean_current
+    else:
+        ring, operation = plan.machine
+        usual = loss_coefficients(ring, operation, current)
+        expected = budget(window.readings, plan.machine).lifetime * HOUR
+        by = current / expected / float(usual.a * current + usual.b)
+    return Quantity(by * lifetime.value, by * lifetime.error, "mA h")
+
+
+def _learnt(plan: Plan, state: State, window: Window) -> Alarmed | None:
+    """The usual loss where this fit is the first that tells it, or tells it twice as well."""
+    before, fit = state.alarm, window.fit
+    usual = None
+    if window.readings.gauge is not None:  # its a is without gas, its b of no moment
+        return None
+    if fit.status is Status.converged and min(fit.a.value, fit.b.value) > 0:
+        pair = (fit.a, fit.b) if None not in (fit.a.error, fit.b.error) else ()
+        usual = _reference(state, window, *pair) if pair else None
+    elif plan.machine is not None and fit.lifetime_mean.error is not None:
+        usual = _shared(plan, state, window)
+    if usual is None:
+        return None
+    error = math.sqrt(np.trace(usual.covariance))
+    if before is not None:
+        known = math.sqrt(np.trace(before.usual.covariance))
+        if before.raised is not None or state.alarms or not error < known / 2:
+            return None
+    if plan.machine is None:
+        return Alarmed(usual, alarm.started(usual))
+    ring = _terms(plan, None, state.settings, state.rows[-1].current)  # what the gauge shows now
+    return Alarmed(usual, alarm.started(usual), ring, ring.losses)
+
+
+def _reference(state: State, window: Window, a: Quantity, b: Quantity) -> alarm.Reference | None:
+    """The a and b of a fit, where both are well known."""
+    errors = np.array([a.relative, b.relative])
+    if not errors.max() < KNOWN:
+        return None
+    correlation = window.fit.identifiability.correlation or 0.0
+    covariance = np.outer(errors, errors) * [[1.0, correlation], [correlation, 1.0]]
+    return _usual(state, window.fit, a.value, b.value, covariance)
+
+
+def _shared(plan: Plan, state: State, window: Window) -> alarm.Reference | None:
+    """The loss rate of a fit, with the ring's shares of a and b; how it is shared may be off."""
+    lifetime = window.fit.lifetime_mean
+    if not lifetime.relative < KNOWN:
+        return None
+    try:
+        expected: Budget = budget(window.readings, plan.machine)
+    except InputError:
+        return None
+    by = expected.lifetime / lifetime.value
+    a, b = (by * float(part) for part in (expected.losses.a, expected.losses.b))
+    share = a * expected.current / (a * expected.current + b)
+    apart = SHARES * np.array([1 - share, -share])
+    covariance = np.outer(apart, apart) + lifetime.relative**2 * np.eye(2)
+    return _usual(state, window.fit, a, b, covariance)
+
+
+def _usual(
+    state: State, fit: Any, a: float, b: float, covariance: np.ndarray
+) -> alarm.Reference | None:
+    rows = fit.rms_residual * math.sqrt(len(fit.residuals) / fit.dof)
+    noise = max(rows, BEST_MONITOR * fit.mean_current)
+    apart = float(np.median(np.diff([row.time for row in state.rows])))
+    known = covariance + WANDER**2 * np.eye(2)
+    return alarm.Reference(a, b, noise, fit.correlation_time or 0.0, apart, known)
+
+
+def _terms(plan: Plan, before: Terms | None, settings: Conditions, current: float) -> Terms:
+    """What the ring loses at some settings; anew but for the pressure where they have moved."""
+    at = Conditions(*(None if math.isnan(value) else [value, value] for value in settings))
+    moment = DecayRecord([0.0, 1.0], [current, current * (1 - 1e-6)], conditions=at)
+    operation = operation_during(moment, plan.machine)
+    place = np.array([current, *settings._replace(pressure=0.0)])
+    parts = before and before.parts
+    if not parts or not np.allclose(place, before.place, rtol=MOVED, atol=0.0, equal_nan=True):
+        parts = terms_of(plan.machine.ring, operation, current)
+    else:
+        place = before.place
+    losses = added(parts, operation.pressure_base, operation.pressure_slope)
+    return Terms(place, parts, np.array([losses.a, losses.b], float))
+
+
+def _expected(plan: Plan, known: Alarmed, row: Row, apart: float) -> Alarmed:
+    """With what the ring loses now; the noise of a gauge would bend the course of the current."""
+    if known.ring is None:
+        return known
+    try:
+        ring = _terms(plan, known.ring, row.settings, row.current)
+    except InputError:  # settings at which the ring stores no beam are none
+        return known
+    new, old = ring.losses / known.losses, np.array(known.expected)
+    share = 1.0 if np.abs(new / old - 1).max() > alarm.SET else min(apart / SMOOTH, 1.0)
+    a, b = old + share * (new - old)
+    return known._replace(ring=ring, expected=(float(a), float(b)))
+
+
+def _watched(plan: Plan, state: State, known: Alarmed, row: Row) -> State:
+    """A row seen by the alarm."""
+    known = _expected(plan, known, row, row.time - state.rows[-2].time)
+    reading = alarm.Reading(row.time, row.current, *known.expected)
+    after, told = alarm.watched(known.usual, known.state, reading)
+    raised = row.time if told.raised else known.raised
+    state = state._replace(alarm=known._replace(state=after, raised=raised))
+    if told.raised:
+        state = noted(state, row.time - state.shift, "alarm: the loss moved")
+    if not told.moved:
+        return state
+    found = alarm.alarm_of(raised, told, row.time)
+    found = found._replace(
+        **{n: getattr(found, n) - state.shift for n in ("time", "since", "told")}
+    )
+    state = _kept(noted(state, found.told, f"alarm: {found.said(True)}"), float(told.since))
+    alarms = (*state.alarms, found)[-EVENTS:]
+    known = state.alarm._replace(raised=None)
+    return state._replace(alarm=known, alarms=alarms, due=-math.inf)  # fit the new loss now

@@ -1,0 +1,138 @@
+"""What a window of readings says: one a and one b of its last decays at one setting."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from beamfit.errors import InputError
+from beamfit.studies.decay.cycles import alike, cut_at_refills, joined
+from beamfit.studies.decay.fit import DecayFit, fit_decay
+from beamfit.studies.decay.pooled import fit_pieces, seen_through
+from beamfit.studies.decay.record import Conditions, DecayRecord
+from beamfit.studies.decay.study import SHORTEST, at_settings
+
+
+class Row(NamedTuple):
+    """The mean of some neighbouring readings.
+
+    Attributes
+    ----------
+    piece : int
+        Rises by one at every gap and step of the clock.
+    time, current : float
+        s and mA.
+    settings : Conditions
+        In SI; NaN of what has not been read yet.
+    """
+
+    piece: int
+    time: float
+    current: float
+    settings: Conditions
+
+
+class Window(NamedTuple):
+    """A fit to the last decays of a window.
+
+    Attributes
+    ----------
+    fit : DecayFit or None
+        One a, one b; None where nothing can be fitted.
+    readings : DecayRecord or None
+        Of those decays.
+    pieces : int
+        How many decays they are.
+    why : str
+        Why there is no fit.
+    """
+
+    fit: DecayFit | None
+    readings: DecayRecord | None
+    pieces: int
+    why: str = ""
+
+
+def fit_window(rows: Sequence[Row], name: str) -> Window:
+    """Cut a window at refills and changes of setting, and fit what is as it is now.
+
+    Parameters
+    ----------
+    rows : sequence of Row
+        In order of time.
+    name : str
+        What to call the result.
+
+    Returns
+    -------
+    Window
+        Decays at the settings of the last one together, each with a current of its own at its
+        start; a pressure that does not follow the current is a setting, too.
+
+    Examples
+    --------
+    >>> settings = Conditions(*[np.nan] * 5)
+    >>> rows = [Row(0, t, 500 * np.exp(-t / 36000), settings) for t in np.arange(0.0, 3600.0, 10.0)]
+    >>> found = fit_window(rows, "ring")
+    >>> found.pieces, f"{found.fit.lifetime_mean.value:.3f} h"
+    (1, '10.000 h')
+    """
+    decays = [
+        decay
+        for piece in _pieces(rows, name)
+        for section in at_settings(piece)
+        for decay in cut_at_refills(section).segments
+    ]
+    if not decays:
+        return Window(None, None, 0, f"fewer than {SHORTEST} readings in a row of a stored beam")
+    group = _at_last(decays)
+    one = group[0] if len(group) == 1 else joined(group, name)
+    if len(one) < SHORTEST:
+        return Window(None, one, len(group), f"{len(one)} readings since the last change")
+    try:
+        fit = _fitted(group, name)
+    except InputError as error:  # a current that rises
+        return Window(None, one, len(group), error.found)
+    return Window(fit, one, len(group))
+
+
+def _fitted(group: list[DecayRecord], name: str) -> DecayFit:
+    if len(group) == 1:
+        return fit_decay(replace(group[0], name=name))
+    fit = fit_pieces(group, name)
+    return seen_through(fit) if len(group) > 2 else fit
+
+
+def _pieces(rows: Sequence[Row], name: str) -> list[DecayRecord]:
+    """Records without gaps; before it was first read a setting is taken as it was then."""
+    if not rows:
+        return []
+    piece, time, current = np.array([row[:3] for row in rows]).T
+    settings = np.array([row.settings for row in rows])
+    known = [column[np.isfinite(column)] for column in settings.T]
+    filled = [
+        np.where(np.isfinite(column), column, seen[0]) if seen.size else None
+        for column, seen in zip(settings.T, known, strict=True)
+    ]
+    parts = np.split(np.arange(len(rows)), np.flatnonzero(np.diff(piece)) + 1)
+    return [
+        DecayRecord(
+            time[part], current[part], None, name, time[part[0]],
+            Conditions(*(None if column is None else column[part] for column in filled)),
+        )
+        for part in parts if part.size >= SHORTEST
+    ]  # fmt: skip
+
+
+def _at_last(decays: list[DecayRecord]) -> list[DecayRecord]:
+    """Those at the settings of the last, and its pressure if that does not follow the beam."""
+    compared = decays
+    if joined(decays, "").gauge is None:
+        compared = [replace(d, conditions=d.conditions._replace(pressure=None)) for d in decays]
+    starts = next(
+        {decay.start for decay in group} for group in alike(compared) if compared[-1] in group
+    )
+    return [decay for decay in decays if decay.start in starts]
