@@ -11,7 +11,8 @@ from beamfit.errors import InputError
 from beamfit.io.machine import ScanMachine
 from beamfit.optics.beamline import Beamline
 from beamfit.status import Status
-from beamfit.studies.scan.design import plan_measurements
+from beamfit.studies.scan.candidates import information_of
+from beamfit.studies.scan.design import best_steps
 from beamfit.studies.scan.fit import EmittanceFit, fit_emittance
 from beamfit.studies.scan.scans import QuadScan
 
@@ -160,8 +161,8 @@ def next_setting(
     Returns
     -------
     Next or str
-        First settings over the range of the first magnet; then those of `plan_measurements`; the
-        middle of the largest gap as long as nothing can be fitted.
+        First settings over the range of the first magnet; then those that tell most, by
+        `beamfit.studies.scan.design`; the middle of the largest gap where nothing can be fitted.
     """
     limits = {m.name: _within(m.name, m.low, m.high, barred, before) for m in machine.magnets}
     first = machine.magnets[0]
@@ -170,12 +171,12 @@ def next_setting(
     if begin and low <= begin[0] <= high:
         return Next(_clipped(dict(before) | {first.name: begin[0]}, limits), "first settings")
     if fit is not None:
-        advice = plan_measurements(fit, limits=limits, count=1)
-        if advice.steps:
-            wanted = advice.steps[0].candidate.settings
+        steps, stop = best_steps(fit, information_of(fit), limits)
+        if steps:
+            wanted = steps[0].candidate.settings
             return Next(_clipped(dict(before) | wanted, limits), "where it tells most")
         if len(points) >= FEWEST:
-            return advice.stop.removeprefix("Stop: ").rstrip(".")
+            return stop.removeprefix("Stop: ").rstrip(".")
     gaps = np.sort([low, high, *(p.settings[first.name] for p in points)])
     place = int(np.argmax(np.diff(gaps)))
     middle = 0.5 * float(gaps[place] + gaps[place + 1])

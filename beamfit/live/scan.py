@@ -184,9 +184,8 @@ async def _measured(run: _Running) -> str:
             words = ", ".join(f"{name} {value:.6g}" for name, value in chosen.settings.items())
             run.say(f"Left out: {words} ({why})")
             if barren == BARREN:
-                raise NoSizesError(
-                    f"nothing measured at {BARREN} settings in a row, {why}", "sizes"
-                )
+                found = f"no sizes at {BARREN} settings in a row ({why})"
+                raise NoSizesError(found, "a beam on the screen")
             continue
         barren = 0
         run.keep([*run.points, point])

@@ -7,7 +7,7 @@ the advice holds for calibrations and networks as well as for the beam alone.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -19,7 +19,6 @@ from beamfit.shown import shown
 from beamfit.status import Status
 from beamfit.studies.scan.candidates import (
     Candidate,
-    Considered,
     by_plane,
     candidate_rows,
     further_options,
@@ -215,8 +214,7 @@ def plan_measurements(
         raise InputError(f"{count} points to a goal of {goal}", "at least one, and a positive goal")
     _check_energies(energies, float(fit.line.mass))
     base = information_of(fit)
-    considered = candidate_rows(fit, limits, energies)
-    steps, stop = _steps(fit, base, considered, criterion, goal, count)
+    steps, stop = best_steps(fit, base, limits, criterion, goal, count, energies)
     options = () if identified(base) else tuple(_options(fit, base, energies))
     return Advice(
         fit.scenario,
@@ -230,15 +228,17 @@ def plan_measurements(
     )
 
 
-def _steps(
+def best_steps(
     fit: EmittanceFit,
     base: Information,
-    considered: Sequence[Considered],
-    criterion: str,
-    goal: float | None,
-    count: int,
+    limits: Mapping[str, tuple[float, float]] | None,
+    criterion: str = "emittance",
+    goal: float | None = None,
+    count: int = 1,
+    energies: tuple[float, ...] = (),
 ) -> tuple[tuple[Step, ...], str]:
     """The best measurement, the best after that, and why the list ends."""
+    considered = candidate_rows(fit, limits, energies)
     aim = "" if goal is None else f"goal of {100 * goal:.3g} %"
 
     def sharp(known: Information) -> bool:

@@ -1,0 +1,261 @@
+"""Scans that choose their settings: what they measure, where they stop, that all is put back."""
+
+import asyncio
+import json
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import beamfit
+from beamfit.errors import InputError
+from beamfit.io.line import build_line, read_inputs
+from beamfit.io.machine import read_scan_machine
+from beamfit.live.channel import LostError
+from beamfit.live.devices import NotSettledError
+from beamfit.live.journal import read_journal
+from beamfit.live.next_setting import Next, Point, fit_of, next_setting, sharp
+from beamfit.live.projection import rms_of
+from beamfit.live.record import scan_text
+from beamfit.live.restore import NotRestoredError, reach
+from beamfit.live.scan import scan
+from tests.live.faulty import Injector
+from tests.live.simulated import Simulated, connected, written
+
+
+def scanned(at, folder, **told):
+    line = build_line(at.machine.lattice)
+    return asyncio.run(scan(at, line, folder / "a.journal", **told))
+
+
+@pytest.fixture(scope="module")
+def done(tmp_path_factory):
+    """A scan to 3 %, all it wrote, and the device."""
+    folder, device, texts = tmp_path_factory.mktemp("scan"), Simulated(), []
+    at = connected(folder, device)
+    at = at._replace(machine=replace(at.machine, goal=0.03, points=20))
+    keep = lambda points: texts.append(scan_text(points, at.machine, {"Q1": -2.0}))  # noqa: E731
+    return scanned(at, folder, keep=keep), texts, device, at, folder
+
+
+def test_a_scan_stops_at_its_goal_and_restores(done):
+    found, _, device, at, folder = done
+    assert found.reason == "the goal of 3 % is reached"
+    assert 5 <= len(found.points) < 15
+    assert sharp(found.fit, found.points, 0.03)
+    assert device.setting == device.puts[-1] == -2.0
+    assert not (folder / "a.journal").exists()
+    # Only the fit before the last point was not good enough.
+    before = found.points[:-1]
+    assert not sharp(fit_of(before, at.machine, found.fit.line), before, 0.03)
+
+
+def test_the_file_is_an_ordinary_scan_with_the_same_fit(done):
+    found, texts, _, at, folder = done
+    path = folder / "scan.csv"
+    path.write_text(texts[-1])
+    assert len(texts) == len(found.points)  # written after every point
+    measured, described, _, _ = read_inputs(str(path), at.machine.lattice)
+    fit = beamfit.fit_emittance(measured, build_line(described))
+    for ours, theirs in zip(found.fit.planes, fit.planes, strict=True):
+        assert theirs.emittance.value == pytest.approx(ours.emittance.value, rel=1e-6)
+        assert theirs.emittance.error == pytest.approx(ours.emittance.error, rel=1e-4)
+    assert any("before the scan -2 T_per_m" in line for line in measured.provenance)
+    assert measured.shots.tolist() == [5] * len(found.points)
+
+
+def test_no_setting_is_outside_the_limits_or_beyond_what_cannot_be_measured(tmp_path):
+    device = Simulated(dark=(-9.0, -3.5))
+    at = connected(tmp_path, device)
+    found = scanned(at, tmp_path)
+    assert all(-5.5 <= value <= 2.5 for value in device.puts)
+    below = [value for value in device.puts if value < -3.5]
+    assert below == [pytest.approx(-4.7)]  # tried once, and never again
+    assert len(found.points) == 7
+
+
+def test_beam_loss_takes_the_magnet_back_before_going_on(tmp_path):
+    device, said = Simulated(lossy=(1.5, 9.0)), []
+    at = connected(tmp_path, device)
+    found = scanned(at, tmp_path, tell=lambda now: said.append(now.news))
+    assert "Paused: beam loss" in said
+    assert "Going on" in said
+    first = next(i for i, value in enumerate(device.puts) if value > 1.5)
+    assert device.puts[first + 1] == -2.0
+    assert sum(value > 1.5 for value in device.puts) == 2  # tried twice, then left out
+    assert all(point.settings["Q1"] < 1.5 for point in found.points)
+
+
+def test_nothing_to_see_ends_a_scan_with_all_restored(tmp_path):
+    device = Simulated(dark=(-9.0, 9.0))
+    found = scanned(connected(tmp_path, device), tmp_path)
+    assert "no sizes at 3 settings in a row (no spot)" in str(found.problem)
+    assert device.setting == -2.0
+
+
+def test_a_magnet_that_does_not_come_back_is_an_error_and_stays_in_the_journal(tmp_path):
+    class Stiff(Simulated):
+        async def settled(self, value):
+            if len(self.puts) > 2 and value == -2.0:
+                raise NotSettledError("Q1 set to -2, read back 0", "the same")
+            return value
+
+    with pytest.raises(NotRestoredError, match=r"Q1 -2 T_per_m not seen to be restored \(Q1 set"):
+        scanned(connected(tmp_path, Stiff()), tmp_path)
+    journal = read_journal(tmp_path / "a.journal")
+    assert [(m.name, value) for m, value in journal.before] == [("Q1", -2.0)]
+    with pytest.raises(InputError, match=r"has not restored; expected beamfit scan --recover"):
+        scanned(connected(tmp_path, Simulated()), tmp_path)
+
+
+def test_whatever_is_raised_all_is_restored(tmp_path):
+    class Breaking(Simulated):
+        async def shots(self):
+            if len(self.puts) == 3:
+                raise ZeroDivisionError
+            return await super().shots()
+
+    device = Breaking()
+    found = scanned(connected(tmp_path, device), tmp_path)
+    assert isinstance(found.problem, ZeroDivisionError)
+    assert device.setting == -2.0
+
+
+def test_who_cancels_a_scan_finds_all_restored(tmp_path):
+    device = Simulated()
+    at = connected(tmp_path, device)
+    line = build_line(at.machine.lattice)
+
+    tasks = []
+
+    async def cancelled():
+        tell = lambda now: tasks[0].cancel() if now.measured else None  # noqa: E731
+        tasks.append(asyncio.ensure_future(scan(at, line, tmp_path / "a.journal", tell=tell)))
+        with pytest.raises(asyncio.CancelledError):
+            await tasks[0]
+
+    asyncio.run(cancelled())
+    assert device.setting == -2.0
+    assert not (tmp_path / "a.journal").exists()
+
+
+@pytest.mark.parametrize(("side", "passed"), [("below", -0.4), ("above", None)])
+def test_a_setting_is_reached_from_its_side(tmp_path, side, passed):
+    text = f'approach = "{side}"\napproach_by = 0.4'
+    machine = read_scan_machine(written(tmp_path, more=text))
+    device = Simulated()
+    device.setting = 1.0
+    asyncio.run(reach(machine.magnets[0], device, 0.0))
+    assert device.puts == ([0.0] if passed is None else [passed, 0.0])
+    with pytest.raises(InputError, match="expected within its limits"):
+        asyncio.run(reach(machine.magnets[0], device, 2.6))
+    assert device.puts[-1] == 0.0
+
+
+def test_the_first_settings_are_those_of_the_file(tmp_path):
+    path = written(tmp_path, points=("points = 7", "points = 7\nfirst = [0.5, -1.5]"))
+    machine = read_scan_machine(path)
+    point = Point({"Q1": 0.5}, {"x": np.ones(3) * 1e-4}, 0.0)
+    assert next_setting([point], None, (), machine, {"Q1": 0.0}).settings == {"Q1": -1.5}
+    gap = next_setting([point] * 2, None, (), machine, {"Q1": 0.0})
+    assert isinstance(gap, Next)
+    assert gap.settings["Q1"] == pytest.approx(-2.5)  # between -5.5 and 0.5
+
+
+def test_a_projection_has_the_size_of_its_gaussian():
+    x = np.arange(300.0)
+    rng = np.random.default_rng(1)
+    spot = rng.poisson(400 * np.exp(-0.5 * ((x - 130.0) / 17.0) ** 2) + 50.0)
+    assert rms_of(spot, 5e-6) == pytest.approx(85e-6, rel=0.03)
+    assert rms_of(rng.poisson(np.full(300, 50.0)), 5e-6) is None
+    assert rms_of(400 * np.exp(-0.5 * ((x - 130.0) / 120.0) ** 2), 5e-6) is None  # too large
+
+
+BAD = [
+    (("low = -5.5", "low = 3.5"), r"machine.toml:\d+: column 'low': limits 3.5 to 2.5"),
+    (('unit = "T/m"', 'unit = "A"'), r"column 'unit': unit 'A'; expected T_per_m, as in the"),
+    (("tolerance = 0.01", "tolerance = 2"), r"column 'tolerance': tolerance 2; expected less"),
+    (('name = "Q1"', 'name = "Q2"'), r"column 'name': no magnet 'Q2'; expected .*Q1"),
+    (("points = 7", "points = 7.5"), r"column 'points': 7.5; expected a whole number"),
+    (("points = 7", "points = 7\nfirst = [9]"), r"'first': 9; expected numbers within -5.5 and"),
+    (("present_above = 0.1", ""), r"present and no present_above; expected both"),
+    (('lattice = "line.toml"', ""), r"no lattice; expected lattice = "),
+    (("settle_s", "setle_s"), r"column 'setle_s': an unknown key; expected .*settle_s"),
+    (('x = "SIM:SCREEN:X"', 'profile_x = "A"'), r"column 'x': sizes and projections; expected"),
+]
+
+
+@pytest.mark.parametrize(("change", "said"), BAD)
+def test_a_machine_file_is_checked_line_by_line(tmp_path, change, said):
+    with pytest.raises(InputError, match=said):
+        read_scan_machine(written(tmp_path, change=change))
+
+
+@pytest.fixture(scope="module")
+def injector(_ioc, tmp_path_factory):
+    one = Injector(_ioc, tmp_path_factory.mktemp("injector"))
+    yield one
+    one.worker.close()
+
+
+@pytest.mark.parametrize(
+    ("fault", "status", "said"),
+    [
+        ("limits", 0, r"The scan ended: (all 7 points|the goal).*x converged"),
+        ("SIGTERM", 143, "Restored and read back: Q1.*The scan ended: stopped by SIGTERM"),
+        ("SIGKILL", None, "Restored and read back: Q1 .* is removed"),
+        ("SIGN", 2, r"not seen to be restored \(Q1 set to .* expected beamfit scan --recover"),
+        ("NAN", 2, "no sizes at 3 settings in a row .* all is restored"),
+        ("IOC back", 2, "all is restored"),
+        ("disk", 2, r"cannot be written \(File too large\).* all is restored"),
+    ],
+)
+def test_a_scan_of_a_real_ioc_leaves_no_magnet_wrong(ioc, injector, fault, status, said):
+    fate = injector.scan(fault, seed=2)
+    assert fate.recovered
+    assert fate.restored or fate.journal
+    assert not fate.outside
+    if fate.status != 0 or fault == "limits":  # or else the fault came when all was measured
+        assert fate.status == status
+        assert re.search(said, fate.said, re.DOTALL), fate.said
+
+
+def test_a_dry_run_checks_and_moves_nothing(ioc, injector):
+    path = written(injector.folder, scheme="pva://")
+    injector.worker.begin("scan", str(path), "--dry-run", "--json")
+    status, said = injector.worker.end()
+    plan = json.loads(said)["results"][0]["plan"]
+    assert status == 0
+    assert plan["magnets"][0]["now"] == pytest.approx(injector.value("SIM:Q1:SET"))
+    assert plan["amiss"] == ""
+    assert ioc.puts("Q1") == []
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (("SIM:SCREEN:X", "SIM:NONE"), r"no answer from 'SIM:NONE' within 1 s"),
+        (("SIM:Q1:READ", "SIM:SCREEN:X"), r"'SIM:SCREEN:X' in 'um'; expected T_per_m"),
+        (("low = -5.5", "low = 2.0"), r"a setting of -2.5 for Q1; expected within its limits"),
+    ],
+)
+def test_what_does_not_fit_the_machine_is_refused_before_anything_moves(
+    ioc, injector, change, said
+):
+    injector.value("SIM:Q1:SET", -2.5)
+    ioc.log.write_text("")
+    path = written(injector.folder, change=change)
+    injector.worker.begin("scan", str(path), "--out", str(injector.folder / "none.csv"))
+    status, found = injector.worker.end()
+    assert status == 2
+    assert re.search(said, found)
+    assert ioc.puts("Q1") == []
+    assert not injector.journal.exists()
+
+
+def test_an_ioc_that_is_not_there_is_lost_and_said(ioc):
+    from beamfit.live.channel import open_channel, run
+
+    with pytest.raises(LostError):
+        run(open_channel("SIM:NOWHERE", 0.2).put(1.0))
