@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 EXAMPLE = """\b
 Examples:
   beamfit scan machine.toml --dry-run
-  beamfit scan machine.toml --goal 3% --out scan.csv --report scan.html
+  beamfit scan machine.toml --goal 3% --save scan.csv --report scan.html
   beamfit scan --recover machine.journal
 """
 
@@ -40,7 +40,7 @@ Examples:
     metavar="JOURNAL",
     help="Restore what a scan that was killed has left, and move nothing else.",
 )
-@click.option("--out", metavar="FILE.csv", help="The scan; NAME_DATE_TIME.csv unless said.")
+@click.option("--save", metavar="FILE.csv", help="The scan; NAME_DATE_TIME.csv unless said.")
 @click.option(
     "--journal", metavar="FILE", help="Where what is to be restored stands; beside MACHINE unless."
 )
@@ -51,7 +51,7 @@ def scan(
     machine: str | None,
     dry_run: bool,
     recover: str | None,
-    out: str | None,
+    save: str | None,
     journal: str | None,
     goal: str | None,
     points: int | None,
@@ -77,7 +77,7 @@ def scan(
     place = journal_of(told, journal)
     if dry_run:
         return run(_planned(told, place, as_json))
-    target = Path(out or time.strftime(f"{_word(told.name)}_%Y%m%d_%H%M%S.csv"))
+    target = Path(save or time.strftime(f"{_word(told.name)}_%Y%m%d_%H%M%S.csv"))
     for each in (target, place):
         check_place(each)
     if target.exists():

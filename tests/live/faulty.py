@@ -165,7 +165,7 @@ class Injector:
         out.unlink(missing_ok=True)
         size = rng.randrange(900, 1400) if fault == "disk" else None
         machine = str(self.folder / "machine.toml")
-        self.worker.begin("scan", machine, "--out", str(out), file_size=size)
+        self.worker.begin("scan", machine, "--save", str(out), file_size=size)
         self._wait_for_journal()
         time.sleep(rng.uniform(0.0, 1.5))
         self._strike(fault, rng)

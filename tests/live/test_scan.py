@@ -246,7 +246,7 @@ def test_what_does_not_fit_the_machine_is_refused_before_anything_moves(
     injector.value("SIM:Q1:SET", -2.5)
     ioc.log.write_text("")
     path = written(injector.folder, change=change)
-    injector.worker.begin("scan", str(path), "--out", str(injector.folder / "none.csv"))
+    injector.worker.begin("scan", str(path), "--save", str(injector.folder / "none.csv"))
     status, found = injector.worker.end()
     assert status == 2
     assert re.search(said, found)
