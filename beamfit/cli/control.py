@@ -16,7 +16,6 @@ from beamfit.studies.scan.typed import gains_of
 if TYPE_CHECKING:
     from beamfit.studies.response.loop import Loop
 
-__all__ = ["control"]
 
 EXAMPLE = """\b
 Examples:

@@ -16,7 +16,6 @@ if TYPE_CHECKING:
     from beamfit.studies.response.fit import ResponseFit
     from beamfit.studies.response.states import StatesFit
 
-__all__ = ["identify"]
 
 STATES, FED_BATCH = "state-space", "fed-batch"
 

@@ -16,8 +16,6 @@ from beamfit.studies.scan.assumptions import SCENARIOS
 from beamfit.studies.scan.typed import anchor_of, bounds_of, gains_of, limits_of, priors_of
 from beamfit.writing import check_place
 
-__all__ = ["Sampling", "command_line", "options"]
-
 
 def _parsed(read: Callable[[Any], Any]) -> Callable[..., Any]:
     """Have click give a command what a reader of the library makes of the text."""

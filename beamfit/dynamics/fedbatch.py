@@ -10,8 +10,6 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-__all__ = ["Flow", "balances", "titre_of"]
-
 
 class Flow(NamedTuple):
     """What runs in and out: feed and outflow in L/h, substrate in the feed in g/L."""

@@ -13,8 +13,6 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-__all__ = ["ARX", "FIRST_ORDER", "PHYSICS", "SECOND_ORDER", "Physics", "run_from", "simulate"]
-
 
 class Physics(NamedTuple):
     """A response of one output to m inputs.

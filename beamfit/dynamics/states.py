@@ -11,8 +11,6 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-__all__ = ["Matrices", "StateSpace", "contraction", "linear_outputs"]
-
 # Samples that `linear_outputs` takes at once.
 BLOCK = 32
 # Of the matrix exponential: it loses nothing (1e-12) up to 4000 time constants in a step.

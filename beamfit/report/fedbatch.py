@@ -14,8 +14,6 @@ from beamfit.studies.fedbatch.feed import Course, FeedPlan
 from beamfit.studies.fedbatch.fit import FedBatchFit
 from beamfit.studies.fedbatch.titre import Ranked, TitreFit
 
-__all__ = ["draw_batch", "draw_course", "draw_ranking", "fedbatch_page", "feed_page"]
-
 NOTES = (
     "Errors and bands are one standard deviation. The balances run free from the start of each "
     "batch; the noise of each output is taken from its residuals.",

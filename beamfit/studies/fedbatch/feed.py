@@ -20,8 +20,6 @@ from beamfit.studies.fedbatch.model import STATES, Batches, batches_of
 from beamfit.studies.fedbatch.titre import TITRE, TitreFit, predicted
 from beamfit.table import Table
 
-__all__ = ["Course", "FeedPlan", "best_feed", "predict"]
-
 OUTPUTS = (*STATES, TITRE)
 # Rows of a plan, and rounds in which its limits are held off by the errors it then has.
 ROWS, ROUNDS = 31, 3

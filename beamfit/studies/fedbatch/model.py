@@ -16,26 +16,6 @@ from beamfit.greybox.mlp import MLP, Port, dense
 from beamfit.greybox.problem import Free, Prior, Problem, Record
 from beamfit.studies.response.record import Run
 
-__all__ = [
-    "ABOVE",
-    "FLOWS",
-    "RATES",
-    "STATES",
-    "WEIGHT",
-    "Batches",
-    "Seen",
-    "batches_of",
-    "bounds_of",
-    "course",
-    "filled",
-    "known_at",
-    "network_of",
-    "padded",
-    "rates_at",
-    "seen_of",
-    "state",
-]
-
 STATES = ("biomass", "substrate", "volume")
 RATES = ("mu_b", "mu_s")
 # Inputs that are no operating point but flows: of liquid, and what it brings.

@@ -39,8 +39,6 @@ from beamfit.studies.fedbatch.verdict import RULES, Evidence, Noise
 from beamfit.table import Table, json_of
 from beamfit.verdict import judge
 
-__all__ = ["TITRE", "Ranked", "TitreFit", "fit_titre", "predicted", "rank_inputs"]
-
 TITRE = "titre"
 # What is free in the first stage and in this one; steps of both together from where each rests.
 STAGES, OWN, JOINT = ("rates", "start"), ("make", "begin"), 5

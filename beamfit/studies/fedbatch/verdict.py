@@ -14,8 +14,6 @@ from beamfit.studies.fedbatch.model import RATES, Seen
 from beamfit.studies.response.curve import Curve
 from beamfit.verdict import Finding
 
-__all__ = ["RULES", "Evidence", "Noise", "noise_of"]
-
 # Noise that goes with the value has this share of the largest as its floor.
 FLOOR = 0.05
 # Neighbouring residuals are alike beyond chance from so many standard errors on (p < 1e-3).

@@ -23,8 +23,6 @@ from beamfit.studies.response.model import (
 from beamfit.studies.response.record import Run
 from beamfit.studies.response.starts import driven_by, unit_outputs
 
-__all__ = ["Checks", "HeldBack", "checks_of", "percent", "predict_held", "slopes_of"]
-
 # Lags of the tests at most: of residuals, of inputs before and after, and of what whitens.
 LAGS, PAST, LATER, ORDER = 20, 10, 5, 8
 # Time constants of further paths that are looked for.

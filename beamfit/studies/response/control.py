@@ -15,8 +15,6 @@ from beamfit.studies.response.fit import ResponseFit
 from beamfit.studies.response.model import parameters_at, predicted
 from beamfit.studies.response.receding import Controller, Limits, Response
 
-__all__ = ["controller"]
-
 # A limit of an output is held off by so many standard deviations of noise and model together.
 MARGIN = 2.0
 # Steps of a horizon; it ends where so much of a transient is left.

@@ -18,19 +18,6 @@ from beamfit.studies.response.checks import Checks
 from beamfit.studies.response.model import Seen, curves
 from beamfit.table import Table, cell, json_of
 
-__all__ = [
-    "GAIN",
-    "PURE",
-    "TIME",
-    "WIDE",
-    "Curve",
-    "curves_of",
-    "derived",
-    "quantities_of",
-    "quantity",
-    "told",
-]
-
 # Points of a curve; it was visited where so many samples lie within a share of its range.
 POINTS, VISITS, NEAR = 41, 5, 0.05
 SHOWN = 9

@@ -30,14 +30,6 @@ from beamfit.table import Table, json_of
 if TYPE_CHECKING:
     from beamfit.sampling.posterior import Posterior
 
-__all__ = [
-    "MAPS",
-    "ResponseFit",
-    "check_inputs",
-    "check_runs",
-    "identify",
-    "ordered",
-]
 
 MAPS = ("constant", "network")
 

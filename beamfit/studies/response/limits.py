@@ -21,8 +21,6 @@ from beamfit.greybox.gains import certified_gain
 from beamfit.greybox.problem import Constraint
 from beamfit.studies.response.model import Seen
 
-__all__ = ["Limited", "cells_of", "limited"]
-
 # Cells of a range in all, along several inputs fewer each.
 CELLS = 32
 

@@ -31,8 +31,6 @@ from beamfit.studies.response.record import Run
 from beamfit.studies.response.shooting import Case, Course, Trained, remembering, trained
 from beamfit.studies.response.states import StatesFit, answer, case_of, checked
 
-__all__ = ["identify_states"]
-
 
 def identify_states(
     runs: Run | Sequence[Run],

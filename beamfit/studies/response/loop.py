@@ -20,8 +20,6 @@ from beamfit.studies.response.receding import Controller, advance, moved, settle
 from beamfit.table import Table, json_of
 from beamfit.verdict import Finding, judge
 
-__all__ = ["Change", "Loop", "Trace", "closed_loop", "simulate_loop"]
-
 # A change has settled within this share of itself, or the output's noise if that is more; at the
 # end an output is judged by the mean of the last share of its steps.
 SETTLED, LAST = 0.02, 0.2

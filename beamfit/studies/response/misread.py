@@ -15,8 +15,6 @@ from beamfit.studies.response.record import LEAST, Run
 from beamfit.studies.response.settle import Begun
 from beamfit.studies.response.starts import seen_of
 
-__all__ = ["Misread", "sound"]
-
 # Single readings off by so many times the noise are wrong, up to this share of all: more are the
 # process's own. The noise is what a median over some neighbours leaves; where the model moves, a
 # reading may be off by so many of its steps. They are looked for so often, each time beside a

@@ -17,21 +17,6 @@ from beamfit.greybox.problem import Free, Prior, Problem, Record, padded_length
 from beamfit.studies.response.noise import Noise, innovations
 from beamfit.studies.response.record import Run
 
-__all__ = [
-    "CLOSE",
-    "Driven",
-    "Seen",
-    "changed_by",
-    "curves",
-    "driven",
-    "network_of",
-    "output_of",
-    "parameters_at",
-    "predicted",
-    "state",
-    "steps_of",
-]
-
 # A residual below this share of the output's scatter is the model's, and not fitted any closer.
 CLOSE = 2e-4
 # Width of the prior on a network's weights, whose inputs and outputs are of size 1.

@@ -14,8 +14,6 @@ from beamfit.studies.response.realise import LINEAR, normal_form, padded, realis
 from beamfit.studies.response.settle import used_by
 from beamfit.studies.response.shooting import LONGEST, Case, Trained, rest_of, trained
 
-__all__ = ["Tried", "count_of", "criterion", "free_of", "largest_order", "orders"]
-
 # States of the programs that search: what an order does not need is held at 0, so that all orders
 # of a size are compiled once. The search ends after so many orders that are no better.
 SIZES, BEYOND = (4, 10), 2

@@ -15,17 +15,6 @@ from scipy.linalg import solve_discrete_lyapunov
 
 from beamfit.dynamics.states import Matrices, contraction, linear_outputs
 
-__all__ = [
-    "LINEAR",
-    "NETWORK",
-    "Linear",
-    "Network",
-    "normal_form",
-    "padded",
-    "realisations",
-    "stripped",
-]
-
 # Samples of past and future at most, and rows of the regression.
 HORIZON, ROWS = 20, 20_000
 # Steps that are left out in between, for what is slow; fewest rows that must remain.

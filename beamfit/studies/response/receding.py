@@ -20,18 +20,6 @@ from beamfit.errors import InputError
 from beamfit.greybox.quadratic import Quadratic, minimum
 from beamfit.studies.response.model import parameters_at
 
-__all__ = [
-    "Controller",
-    "Limits",
-    "Response",
-    "Said",
-    "State",
-    "advance",
-    "moved",
-    "settled",
-    "start",
-]
-
 # What breaking an output's limit costs, against squares of errors in units of its scatter: more
 # than any multiplier of a limit that can be kept, so that such a limit is kept exactly.
 PENALTY = 1e4

@@ -10,8 +10,6 @@ import numpy as np
 from beamfit.errors import InputError
 from beamfit.shown import shown
 
-__all__ = ["LEAST", "Run"]
-
 # Fewest readings of an output: fewer cannot tell a response from its start.
 LEAST = 8
 

@@ -19,8 +19,6 @@ from beamfit.dynamics.response import ARX, FIRST_ORDER, SECOND_ORDER, Physics, s
 from beamfit.studies.response.model import Driven, Seen, driven
 from beamfit.studies.response.record import Run
 
-__all__ = ["Start", "best_start", "driven_by", "latest", "seen_of", "start_of", "unit_outputs"]
-
 # Longest delay that is tried, in samples and as a share of the run.
 LATEST, SHARE = 24, 0.1
 # A delay must raise the logarithm of the likelihood by so much over a shorter one; parts of a

@@ -44,8 +44,6 @@ from beamfit.studies.response.starts import seen_of
 from beamfit.studies.response.verdict import Evidence, judged_outputs
 from beamfit.table import Table, json_of
 
-__all__ = ["Part", "StatesFit", "answer", "case_of", "checked", "fit_states"]
-
 # A free run that explains less of an output has gone astray: segments are tried.
 ASTRAY = 50.0
 SEGMENTS = 32

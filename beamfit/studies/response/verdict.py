@@ -15,8 +15,6 @@ from beamfit.studies.response.checks import Checks, HeldBack
 from beamfit.studies.response.curve import TIME, Curve
 from beamfit.verdict import Finding, judge
 
-__all__ = ["Evidence", "judged", "judged_outputs"]
-
 # A curve of which less than this share has an error is not determined.
 HALF = 0.5
 # Held-back runs are predicted where their residual is at most so many times that of the fit.
