@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -33,11 +33,11 @@ from beamfit.studies.fedbatch.model import (
 )
 from beamfit.studies.fedbatch.verdict import RULES, Evidence, Noise, noise_of
 from beamfit.studies.response.curve import Curve
+from beamfit.studies.response.fit import ordered
 from beamfit.studies.response.record import Run
+from beamfit.studies.response.settle import rounds
 from beamfit.table import Table, json_of
 from beamfit.verdict import judge
-
-__all__ = ["FedBatchFit", "check_names", "curves_of", "identify_batches", "settled"]
 
 # Steps of a round, after which the noise is taken from the residuals again; rounds at most, and
 # the gain in -2 ln L below which nothing is gained any more.
@@ -164,7 +164,7 @@ def identify_batches(
     runs = (runs,) if isinstance(runs, Run) else tuple(runs)
     for run in (*runs, *held):
         _check(run, runs[0])
-    runs, held = ([_ordered(run, runs[0]) for run in each] for each in (runs, held))
+    runs, held = ([ordered(run, runs[0]) for run in each] for each in (runs, held))
     own = [n for n in runs[0].inputs if n not in FLOWS]
     names = ("substrate", *own) if points is None else tuple(points)
     check_names(names, (*STATES, *runs[0].inputs), "rates")
@@ -193,10 +193,6 @@ def _check(run: Run, first: Run) -> None:
             raise run.unusable(f"{name} of {low:g}", "values above 0")
 
 
-def _ordered(run: Run, first: Run) -> Run:
-    return replace(run, inputs={name: run.inputs[name] for name in first.inputs})
-
-
 def check_names(names: Sequence[str], known: Sequence[str], what: str) -> None:
     """Refuse names that are neither states nor inputs."""
     for name in names:
@@ -221,6 +217,18 @@ def _first(seen: Seen, names: Sequence[str], hidden: int, seed: int) -> dict[str
 # ---- the search
 
 
+class _Searched(NamedTuple):
+    fit: Fit
+    model: Any
+    noise: list[Noise]
+    error: np.ndarray
+    likelihood: float
+
+
+def _errors(noise: Iterable[Noise], values: np.ndarray) -> np.ndarray:
+    return np.stack([each.errors(values[..., k]) for k, each in enumerate(noise)], axis=-1)
+
+
 def settled(
     seen: Seen,
     model: Any,
@@ -232,24 +240,22 @@ def settled(
 
     The third value tells whether the search rests.
     """
-    # Begun as a share of the values: where all errors are alike, small values are never looked at.
-    outputs, before = range(len(names)), np.inf
-    noise = [Noise(FIRST, True)] * len(names)
-    error = np.stack([noise[k].errors(seen.measured[..., k]) for k in outputs], axis=-1)
-    for _ in range(ROUNDS):
+
+    def search(model, error):
         fit = solve(stated(seen, model, error), iterations=STEPS)
         model = jax.tree_util.tree_map(np.asarray, fit.model)
         y = np.asarray(fitted(model, seen.batches))
         rest = seen.measured - y
-        noise = [noise_of(rest[..., k], y[..., k], seen.read[..., k]) for k in outputs]
-        error = np.stack([noise[k].errors(y[..., k]) for k in outputs], axis=-1)
+        noise = [noise_of(rest[..., k], y[..., k], seen.read[..., k]) for k in range(len(names))]
+        error = _errors(noise, y)
         minus = float(np.sum((rest / error)[seen.read] ** 2 + 2 * np.log(error[seen.read])))
-        rests = abs(before - minus) < GAINED
-        if rests or not np.isfinite(minus):
-            break
-        before = minus
-    rests |= fit.status is Status.converged
-    return fit, dict(zip(names, noise, strict=True)), rests
+        return _Searched(fit, model, noise, error, minus)
+
+    # Begun as a share of the values: where all errors are alike, small values are never looked at.
+    found = search(model, _errors([Noise(FIRST, True)] * len(names), seen.measured))
+    found, rests = rounds(found, lambda f: search(f.model, f.error), GAINED, ROUNDS - 1)
+    rests |= found.fit.status is Status.converged
+    return found.fit, dict(zip(names, found.noise, strict=True)), rests
 
 
 # ---- curves
@@ -288,7 +294,7 @@ def _held_back(run: Run, seen: Seen, fit: Fit, noise: dict[str, Noise]) -> float
     """Rms residual, over the noise, of a batch of which only the states at the start are fitted."""
     own, net = seen_of([run], seen.batches), fit.model["rates"]
     model = _first(own, net.inputs, 1, 0) | {"rates": net}
-    error = np.stack([n.errors(own.measured[..., k]) for k, n in enumerate(noise.values())], -1)
+    error = _errors(noise.values(), own.measured)
     stated = state(own, model, error)
     end = solve(Problem(stated.model, [Free("start", nuisance=True)], stated.records))
     rest = (np.asarray(course(end.model, own.batches)) - own.measured) / error

@@ -16,11 +16,11 @@ import numpy as np
 from beamfit.greybox.correlated import Memory, is_correlated, range_of
 from beamfit.greybox.covariance import CUT
 
-__all__ = ["Noise", "innovations", "noise_of", "remembers"]
-
 # Correlation times looked at, and variances of the part without memory, in those that the part
 # that wanders gets anew from one sample to the next.
 TIMES, WHITE = 16, (0.0, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0, 1000.0)
+# Noises that are looked at in one sweep through the readings.
+TOGETHER = 16
 # Means of so many neighbours are looked at: a slow drift hides under white noise.
 BLOCKS = (1, 4, 16)
 
@@ -63,9 +63,12 @@ def innovations(rows: jax.Array, time: jax.Array, noise: Noise) -> tuple[jax.Arr
 
 
 @jax.jit
-def _triangle(rows: jax.Array, time: jax.Array, noise: Noise) -> tuple[jax.Array, jax.Array]:
-    white, volume = innovations(rows, time, noise)
-    return jnp.linalg.qr(white, mode="r"), volume
+def _triangles(rows: jax.Array, time: jax.Array, grid: Noise) -> tuple[jax.Array, jax.Array]:
+    def of(noise):
+        white, volume = innovations(rows, time, noise)
+        return jnp.linalg.qr(white, mode="r"), volume
+
+    return jax.lax.map(of, grid, batch_size=TOGETHER)
 
 
 def noise_of(
@@ -90,8 +93,12 @@ def noise_of(
     ]
     grid = grid if noise is None else [noise]
     count, p = sum(map(len, rows)), rows[0].shape[1] - 1
-    found = [_at(rows, time, known, noise, count + len(known)) for noise in grid]
+    stacked = Noise(*(np.array(part) for part in zip(*grid, strict=True)))
+    white = [_triangles(r, t, stacked) for r, t in zip(rows, time, strict=True)]
+    triangles = [*(r for r, _ in white), np.tile(known, (len(grid), 1, 1))]
+    found = [_at(whole, count + len(known)) for whole in np.concatenate(triangles, axis=1)]
     logs, step, half, squares = (np.array(part) for part in zip(*found, strict=True))
+    logs -= sum(np.asarray(volume) for _, volume in white)
     weight = np.exp(logs - logs.max())
     times = np.array([noise.time for noise in grid])
     memory = Memory(weight / weight.sum(), times, step, half, squares, count + len(known) - p)
@@ -99,18 +106,8 @@ def noise_of(
     return memory, grid[best], float(np.sqrt(squares[best] / memory.dof))
 
 
-def _at(
-    rows: Sequence[np.ndarray],
-    time: Sequence[np.ndarray],
-    known: np.ndarray,
-    noise: Noise,
-    count: int,
-) -> tuple[float, np.ndarray, np.ndarray, float]:
-    """Log probability, step, half and squares for one noise."""
-    parts = [
-        _triangle(jnp.asarray(r), jnp.asarray(t), noise) for r, t in zip(rows, time, strict=True)
-    ]
-    whole = np.vstack([*(np.asarray(r) for r, _ in parts), known])
+def _at(whole: np.ndarray, count: int) -> tuple[float, np.ndarray, np.ndarray, float]:
+    """Log probability but for the noise's volume, step, half and squares for one noise."""
     slopes, rest = whole[:, :-1], whole[:, -1]
     length = np.linalg.norm(slopes, axis=0)
     unit = 1.0 / np.where(length > 0, length, 1.0)
@@ -119,5 +116,5 @@ def _at(
     half = unit[:, None] * np.where(seen, turned.T / np.where(seen, sizes, 1.0), 0.0)
     along = np.where(seen, left.T @ rest, 0.0)
     squares = max(float(rest @ rest - along @ along), 1e-300)
-    log = -sum(float(v) for _, v in parts) - np.sum(np.log((sizes / unit)[seen]))
+    log = -np.sum(np.log((sizes / unit)[seen]))
     return log - 0.5 * (count - seen.sum()) * np.log(squares), -half @ along, half, squares

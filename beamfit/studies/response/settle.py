@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,8 +17,6 @@ from beamfit.studies.response.model import CLOSE, Seen, output_of, predicted, st
 from beamfit.studies.response.noise import Noise, innovations, noise_of, remembers
 from beamfit.studies.response.record import Run
 from beamfit.studies.response.starts import best_start, driven_by, start_of
-
-__all__ = ["Begun", "Settled", "begun", "is_first_order", "settled", "used_by"]
 
 # Steps of a round, after which the noise is taken from the residuals again; rounds at most, those
 # with a memory of the noise, and the gain in -2 ln L below which nothing is gained any more.
@@ -76,6 +74,17 @@ def _round(
     return Settled(fit, rest, found, memory, None, float(minus), rests)
 
 
+def rounds(found: Any, again: Callable[[Any], Any], gained: float, most: int) -> tuple[Any, bool]:
+    """Search again from what was found, until nothing is gained; and whether that came to be."""
+    for _ in range(most):
+        if not np.isfinite(found.likelihood):
+            break
+        before, found = found, again(found)
+        if abs(before.likelihood - found.likelihood) < gained:
+            return found, True
+    return found, False
+
+
 def settled(seen: Seen, begins: Sequence[tuple]) -> Settled:
     """Search from each start for a round, then from the best until nothing is gained.
 
@@ -84,20 +93,18 @@ def settled(seen: Seen, begins: Sequence[tuple]) -> Settled:
     wide = [0.1 * seen.size_y] * len(seen.runs)
     tried = (_round(seen, begin, wide) for begin in begins)
     found = min(tried, key=lambda each: each.likelihood)
-    for _ in range(ROUNDS):
-        before, found = found, _round(seen, found.start(), found.noise)
-        if abs(before.likelihood - found.likelihood) < GAINED + 1e-9 * abs(found.likelihood):
-            found = found._replace(rests=True)
-            break
+    gained = GAINED + 1e-9 * abs(found.likelihood)
+    found, rests = rounds(found, lambda f: _round(seen, f.start(), f.noise), gained, ROUNDS)
+    rests |= found.rests
     if not any(remembers(r, used_by(found.fit)) and r.std() > CLOSE * seen.size_y
                for r in found.residuals):  # fmt: skip
-        return found
-    rests = found.rests
-    for _ in range(AGAIN):
+        return found._replace(rests=rests)
+
+    def again(found):
         _, memory, size = found.remembered(seen)
-        before, found = found, _round(seen, found.start(), size * np.array(found.noise), memory)
-        if abs(before.likelihood - found.likelihood) < GAINED:
-            break
+        return _round(seen, found.start(), size * np.array(found.noise), memory)
+
+    found, _ = rounds(found, again, GAINED, AGAIN)
     return found._replace(rests=rests, errors=found.remembered(seen)[0])
 
 
@@ -135,10 +142,9 @@ def within(seen: Seen, found: Settled, told: Limited) -> Settled:
     if kept.all():
         return found
     errors = found.errors
-    for _ in range(AGAIN):
-        before, found = found, _round(seen, found.start(), found.noise, found.memory, told)
-        if abs(before.likelihood - found.likelihood) < GAINED:
-            break
+    found, _ = rounds(
+        found, lambda f: _round(seen, f.start(), f.noise, f.memory, told), GAINED, AGAIN
+    )
     return found._replace(errors=errors)
 
 

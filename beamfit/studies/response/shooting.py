@@ -18,21 +18,7 @@ from beamfit.greybox.solve import solve
 from beamfit.status import Status
 from beamfit.studies.response.model import CLOSE, Seen
 from beamfit.studies.response.noise import Noise, innovations, noise_of, remembers
-from beamfit.studies.response.settle import used_by
-
-__all__ = [
-    "Case",
-    "Course",
-    "System",
-    "Trained",
-    "begun",
-    "closed",
-    "course_of",
-    "predicted",
-    "remembering",
-    "rest_of",
-    "trained",
-]
+from beamfit.studies.response.settle import rounds, used_by
 
 # Steps of a round, after which the noise is taken from the residuals again; rounds at most, those
 # with a memory of the noise, and the gain in -2 ln L, of a reading and in all, below which nothing
@@ -231,13 +217,8 @@ def trained(case: Case, models: Sequence[Any]) -> Trained:
     """Fit from each start for a round, then from the best until nothing is gained."""
     found = min((_round(case, m, _wide(case)) for m in models), key=lambda each: each.likelihood)
     enough = GAINED + EACH * sum(len(r) for row in found.rest for r in row)
-    for _ in range(ROUNDS):
-        if not np.isfinite(found.likelihood):
-            return found
-        before, found = found, _round(case, found.fit.model, found.noise)
-        if abs(before.likelihood - found.likelihood) < enough:
-            return found._replace(rests=True)
-    return found
+    found, rests = rounds(found, lambda f: _round(case, f.fit.model, f.noise), enough, ROUNDS)
+    return found._replace(rests=rests or found.rests)
 
 
 def begun(case: Case, model: Any, noise: np.ndarray) -> Any:
@@ -257,12 +238,12 @@ def remembering(case: Case, white: Trained) -> Trained:
     used = used_by(white.fit)
     if not any(remembers(r, used) and r.std() > CLOSE * s.size_y for r, s in rows):
         return white
-    found = white
-    for _ in range(AGAIN):
+
+    def again(found):
         _, memory, size = found.remembered(case)
-        before, found = found, _round(case, found.fit.model, size * found.noise, memory)
-        if abs(before.likelihood - found.likelihood) < GAINED:
-            break
+        return _round(case, found.fit.model, size * found.noise, memory)
+
+    found, _ = rounds(white, again, GAINED, AGAIN)
     if _squares(case, found) > WORSE * _squares(case, white):
         # What the model lacks was taken for noise that wanders, and the response with it.
         found = white
