@@ -175,7 +175,10 @@ def _answers(
     from distributed import Client, LocalCluster
 
     # A task that waits at a worker is held for its death, too.
-    one_each = {"distributed.scheduler.worker-saturation": 1.0}
+    one_each = {
+        "distributed.scheduler.worker-saturation": 1.0,
+        "distributed.worker.profile.enabled": False,  # which would look at each worker 100 times a second
+    }
     own = {"threads_per_worker": 1, "dashboard_address": None, "processes": True}
     own["silence_logs"] = logging.CRITICAL  # what a worker died of is told by its file
     with ExitStack() as stack:
