@@ -177,7 +177,7 @@ def _answers(
     # A task that waits at a worker is held for its death, too.
     one_each = {
         "distributed.scheduler.worker-saturation": 1.0,
-        "distributed.worker.profile.enabled": False,  # which would look at each worker 100 times a second
+        "distributed.worker.profile.enabled": False,  # 100 looks a second at each worker
     }
     own = {"threads_per_worker": 1, "dashboard_address": None, "processes": True}
     own["silence_logs"] = logging.CRITICAL  # what a worker died of is told by its file

@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from beamfit.errors import InputError
+from beamfit.greybox.problem import padded_length
 from beamfit.io.machine import ScanMachine
 from beamfit.optics.beamline import Beamline
 from beamfit.status import Status
@@ -95,7 +96,8 @@ def warmed(machine: ScanMachine, line: Beamline) -> None:
     middle = {m.name: 0.5 * (m.low + m.high) for m in machine.magnets}
     rng = np.random.default_rng(0)
     planes = machine.screen.sizes or machine.screen.profiles
-    for count in (4, 9):
+    # One number of points of each length that records are padded to.
+    for count in {padded_length(n): n for n in range(FEWEST - 1, machine.points + 1)}.values():
         points = [
             Point(
                 middle | {magnet.name: value},

@@ -15,12 +15,12 @@ import time
 import numpy as np
 from softioc import asyncio_dispatcher, builder, softioc
 
+from tests.live.truth import BEAM
+
 PREFIX, TICK = "SIM", 0.01
 # Quadrupole m, drift m, total energy MeV, limits T/m, T/m a second, start T/m.
 LENGTH, DRIFT, ENERGY, LIMIT, RATE, START = 0.108, 2.2094, 135.0, 8.0, 200.0, -2.5
 RIGIDITY = ENERGY / 299.792458
-# Emittance m, beta m, alpha at the entrance of the quadrupole, for x and y.
-BEAM = {"x": (2.7e-9, 8.0, -1.1), "y": (2.2e-9, 7.0, -0.7)}
 NOISE, SHOT = 0.02, 0.03  # of a size, and s between shots
 PIXEL, PIXELS = 12.0, 200  # um
 MAGNETS = ("Q1", "Q2")

@@ -54,5 +54,5 @@ class Simulated:
 
 def connected(folder, device, **changed):
     """The machine with a simulated device in the place of everything."""
-    machine = read_scan_machine(written(folder, **changed))
+    machine = read_scan_machine(written(folder, y=('y = "SIM:SCREEN:Y"\n', ""), **changed))
     return Connected({"Q1": device}, device, device, machine)

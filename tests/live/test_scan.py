@@ -259,3 +259,59 @@ def test_an_ioc_that_is_not_there_is_lost_and_said(ioc):
 
     with pytest.raises(LostError):
         run(open_channel("SIM:NOWHERE", 0.2).put(1.0))
+
+
+def test_nothing_is_compiled_between_the_points(tmp_path):
+    from jax import monitoring
+
+    compiled, device = [], Simulated()
+    at = connected(tmp_path, device)
+    at = at._replace(machine=replace(at.machine, goal=1e-4, points=20))
+
+    def heard(event, seconds, **about):
+        if "backend_compile" in event:
+            compiled.append(event)
+
+    counts = []
+    monitoring.register_event_duration_secs_listener(heard)
+    try:
+        scanned(at, tmp_path, tell=lambda now: counts.append(len(compiled)))
+    finally:
+        monitoring.unregister_event_duration_listener(heard)
+    assert len(counts) > 12
+    assert counts[0] == counts[-1]  # all that is compiled is so before anything moves
+
+
+def test_sizes_may_be_of_projections(ioc, injector):
+    from beamfit.live.channel import run
+    from beamfit.live.devices import connect
+
+    change = (
+        'x = "SIM:SCREEN:X"\ny = "SIM:SCREEN:Y"',
+        'profile_x = "SIM:SCREEN:PROFX"\nprofile_y = "pva://SIM:SCREEN:PROFY"\npixel_um = 12',
+    )
+    machine = read_scan_machine(written(injector.folder, change=change))
+    injector.value("SIM:Q1:SET", -1.0)
+
+    async def look():
+        at = await connect(machine)
+        return await at.screen.shots()
+
+    shots = run(look())
+    for plane, sizes in shots.items():
+        assert sizes.shape == (3,)
+        assert sizes.mean() == pytest.approx(ioc_size(plane, -1.0), rel=0.06)
+
+
+def ioc_size(plane, gradient):
+    """By the line, what the simulated injector computes by formulas of its own."""
+    from tests.live.truth import BEAM
+
+    line = beamfit.Beamline(
+        (beamfit.Quadrupole("Q1", 0.108), beamfit.Drift("D", 2.2094), beamfit.Screen("S")), 135.0
+    )
+    matrix = line.matrix({"Q1": gradient * 299.792458 / 135.0})
+    r11, r12 = (float(v) for v in np.asarray(getattr(matrix, plane))[0, :2])
+    emittance, beta, alpha = BEAM[plane]
+    squared = r11**2 * beta - 2 * r11 * r12 * alpha + r12**2 * (1 + alpha**2) / beta
+    return np.sqrt(emittance * squared)
