@@ -118,6 +118,8 @@ class Supply:
 
 
 def _sound(reading: Reading, name: str) -> Reading:
+    if np.ndim(reading.value):
+        raise LostError(f"'{plain(name)}' with {np.size(reading.value)} numbers", "one number")
     if not reading.good:
         found = f"'{plain(name)}' reads {reading.value} (severity {reading.severity})"
         raise LostError(found, "a number without an INVALID alarm")
@@ -178,7 +180,8 @@ class ScreenShots:
             if len(kept) == self.profiler.shots:
                 return
             if bad > BAD * self.profiler.shots:
-                raise NoSizesError(f"{bad} shots without a size", "a beam that fits on the screen")
+                found = f"{bad} shots of '{plain(channel.name)}' without a size"
+                raise NoSizesError(found, "a beam that fits on the screen")
 
     def _size(self, reading: Reading) -> float | None:
         if not reading.good:
@@ -201,12 +204,12 @@ class BeamGuard:
         """As `Watchman.amiss`."""
         if self.present is not None:
             found = await self.present.get()
-            if not (found.good and found.value > self.guard.present_above):
-                return f"no beam ('{plain(self.guard.present)}' reads {found.value:g})"
+            if not (found.good and np.all(found.value > self.guard.present_above)):
+                return f"no beam ('{plain(self.guard.present)}' reads {found.value})"
         if self.loss is not None:
             found = await self.loss.get()
-            if not (found.good and found.value < self.guard.loss_below):
-                return f"beam loss ('{plain(self.guard.loss)}' reads {found.value:g})"
+            if not (found.good and np.all(found.value < self.guard.loss_below)):
+                return f"beam loss ('{plain(self.guard.loss)}' reads {found.value})"
         return ""
 
 
