@@ -5,16 +5,20 @@ that names the defect or the rule behind it. They are written anew by
 ``python -m tests.golden.test_golden NAME …``.
 """
 
+import io
 import json
 import math
 import os
 import re
-import subprocess
 import sys
+from contextlib import chdir, redirect_stderr, redirect_stdout
 from functools import cache
 from pathlib import Path
+from unittest import mock
 
 import pytest
+
+from beamfit.cli import main
 
 ROOT = Path(__file__).resolve().parents[2]
 EXPECTED = Path(__file__).parent / "expected"
@@ -64,36 +68,27 @@ ROUNDING = {
 }
 
 
-# A command as text and then as JSON: what takes seconds is loaded once for both.
-BOTH = """
-import sys
-from beamfit.cli import main
-given = sys.argv
-for form in ([], ["--json"]):
-    sys.argv = given + form
-    try:
+def said(arguments):
+    """Status, output and error line of a command."""
+    out, error = io.StringIO(), io.StringIO()
+    with (
+        chdir(ROOT),
+        mock.patch.dict(os.environ, COLUMNS="100"),
+        mock.patch.object(sys, "argv", ["beamfit", *arguments.split()]),
+        redirect_stdout(out),
+        redirect_stderr(error),
+        pytest.raises(SystemExit) as stop,
+    ):
         main()
-    except SystemExit as end:
-        print(f"\x1c{end.code}", end="\x1c", flush=True)
-"""
-
-
-def said(arguments, program="from beamfit.cli import main; main()"):
-    """Status, output and error line of a command in a process of its own."""
-    call = [sys.executable, "-c", program, *arguments.split()]
-    done = subprocess.run(
-        call, cwd=ROOT, capture_output=True, text=True, env=os.environ | {"COLUMNS": "100"}
-    )
-    return done.returncode, done.stdout, done.stderr
+    return stop.value.code, out.getvalue(), error.getvalue()
 
 
 @cache
 def both(name):
     """What a command says as text and as JSON, where it answers."""
-    _, out, error = said(COMMANDS[name], BOTH)
-    text, status, found, other, rest = out.split("\x1c")
-    assert (status, other, rest) == ("0", "0", ""), error
-    return {"txt": text, "json": found}
+    answers = [said(COMMANDS[name] + form) for form in ("", " --json")]
+    assert [status for status, _, _ in answers] == [0, 0], answers
+    return dict(zip(("txt", "json"), (out for _, out, _ in answers), strict=True))
 
 
 def split(text):
