@@ -1,7 +1,9 @@
 """Fed-batch processes from SIMULATED batches: rates, titre, another feed and the best one."""
 
+import re
 import runpy
 import sys
+from unittest.mock import create_autospec
 
 import jax
 import jax.numpy as jnp
@@ -10,6 +12,9 @@ import pytest
 
 from beamfit.errors import InputError
 from beamfit.status import Status
+from beamfit.studies.fedbatch import feed as feeding
+from beamfit.studies.fedbatch import fit as rates_of
+from beamfit.studies.fedbatch import titre as titre_of
 from beamfit.studies.fedbatch.feed import best_feed, predict
 from beamfit.studies.fedbatch.fit import identify_batches
 from beamfit.studies.fedbatch.model import STATES, bounds_of, course, network_of, rates_at
@@ -120,6 +125,24 @@ def test_another_feed_is_predicted_with_its_length_and_the_best_keeps_its_limits
     assert true[-1, 2] < 6.0 + 1e-6
     steady = predict(titre, end, FED | {"feed": plan.course.feed.mean(), "air": 1.0}, start)
     assert steady.value["titre"][-1] < plan.course.value["titre"][-1]
+
+
+def test_the_page_s_block_runs(root, fit, titre, monkeypatch):
+    """Its three searches, which take a minute, are answered by those of this file."""
+    for module, name, answer in (
+        (rates_of, "identify_batches", fit),
+        (titre_of, "fit_titre", titre),
+        (feeding, "best_feed", None),
+    ):
+        known = create_autospec(getattr(module, name), return_value=answer)
+        monkeypatch.setattr(module, name, known)
+    monkeypatch.chdir(root)
+    page = (root / "docs/fedbatch.md").read_text()
+    (block,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    names = {}
+    exec(block, names)
+    assert [len(run) for run in names["runs"]] == [81, 69, 89, 77]
+    assert names["course"].value["titre"].shape == (81,)
 
 
 def test_what_a_titre_hangs_on_is_ranked(fit, monkeypatch):

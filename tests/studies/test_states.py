@@ -101,6 +101,31 @@ def test_poles_gains_and_the_order_of_two_inputs_and_outputs_are_found():
         identify_states(run, 60)
 
 
+def test_a_network_follows_what_no_linear_state_space_does():
+    """A state that saturates; the rest at the mean input and its slope there are iterated here."""
+
+    def after(x, u):
+        return 0.8 * x + 0.4 * np.tanh(u + x / 2)
+
+    def rest(u, x=0.0):
+        for _ in range(500):
+            x = after(x, u)
+        return x
+
+    rng = np.random.default_rng(4)
+    u, x = 2.0 * steps(160, rng, 6), np.zeros(160)
+    for k in range(159):
+        x[k + 1] = after(x[k], u[k])
+    level = x + 0.03 * rng.normal(size=160)
+    run = Run(np.arange(160.0), {"valve": u}, {"level": level})
+    fit = identify_states(run, 1, "network", hidden=2, starts=1)
+    assert fit.status is Status.converged, fit.message
+    assert fit.parts[0].checks.against_constant > 100.0
+    assert np.std(fit.fitted["level"][0] - x) < 0.015
+    mean = u.mean()
+    near(fit, level=rest(mean), K=(rest(mean + 1e-4) - rest(mean - 1e-4)) / 2e-4)
+
+
 def test_an_order_is_worth_what_it_adds_to_what_readings_before_foretell():
     """Three orders miss by as much; misses of the second are told from those before, mostly."""
     n = 400
