@@ -20,6 +20,7 @@ from beamfit.cli.lifetime import lifetime
 from beamfit.cli.scan import scan
 from beamfit.cli.setpoint import setpoint
 from beamfit.cli.solve import solve
+from beamfit.cli.watch import watch
 from beamfit.errors import LONGEST, InputError, plain, short
 
 
@@ -42,6 +43,7 @@ cli.add_command(solve)
 cli.add_command(identify)
 cli.add_command(control)
 cli.add_command(batch)
+cli.add_command(watch)
 cli.add_command(scan)
 
 

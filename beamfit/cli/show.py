@@ -22,6 +22,27 @@ def _style(status: Status) -> str:
     return f"bold {status.colour}"
 
 
+def laid_out(table: Table, statuses: Sequence[Status] = (), *, wrap: bool = True) -> RichTable:
+    """A table as rich has it."""
+    rich = RichTable(
+        title=table.title,
+        title_justify="left",
+        title_style="bold",
+        box=None,
+        pad_edge=False,
+        header_style="bold",
+    )
+    # A label cut short says nothing; a number may go on in the next line.
+    for i, name in enumerate(table.header):
+        side = "right" if table.numeric and i else "left"
+        rich.add_column(name, no_wrap=i == 0 or not wrap, overflow="fold", justify=side)
+    for number, (label, *cells) in enumerate(table.rows):
+        styles = [_style(s) for s in statuses] if number == 0 and statuses else [""] * len(cells)
+        shown = [Text(c, style=s) for c, s in zip(cells, styles, strict=True)]
+        rich.add_row(label, *shown)
+    return rich
+
+
 class _Console(Console):
     """Obeys nothing that a file says; where the reader has seen enough, the command says so."""
 
@@ -46,25 +67,7 @@ class Terminal:
 
     def table(self, table: Table, statuses: Sequence[Status] = (), *, wrap: bool = True) -> None:
         """Lay out a table; its first row has a colour where it is the results' statuses."""
-        rich = RichTable(
-            title=table.title,
-            title_justify="left",
-            title_style="bold",
-            box=None,
-            pad_edge=False,
-            header_style="bold",
-        )
-        # A label cut short says nothing; a number may go on in the next line.
-        for i, name in enumerate(table.header):
-            side = "right" if table.numeric and i else "left"
-            rich.add_column(name, no_wrap=i == 0 or not wrap, overflow="fold", justify=side)
-        for number, (label, *cells) in enumerate(table.rows):
-            styles = (
-                [_style(s) for s in statuses] if number == 0 and statuses else [""] * len(cells)
-            )
-            shown = [Text(c, style=s) for c, s in zip(cells, styles, strict=True)]
-            rich.add_row(label, *shown)
-        self.console.print(rich)
+        self.console.print(laid_out(table, statuses, wrap=wrap))
 
     def verdict(self, name: str, status: Status, message: str) -> None:
         """Say a verdict in its colour."""

@@ -68,7 +68,7 @@ TOP = {
     "lattice": Key("lattice", kind=TEXT, default=None),
     "timeout_s": Key("timeout", default=5.0, **WAIT),
     "magnet": Key(kind=LIST, default=()),
-    **{name: Key(kind=TABLE, default=None) for name in ("screen", "beam", "scan")},
+    **{name: Key(kind=TABLE, default=None) for name in ("screen", "beam", "scan", "ring", "watch")},
 }
 
 

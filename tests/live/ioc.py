@@ -79,9 +79,9 @@ class Ring:
     """A stored beam that decays in simulated time, SPEED seconds of it in one."""
 
     def __init__(self) -> None:
-        self.current = builder.aIn("RING:CURRENT", initial_value=300.0, EGU="mA", PREC=4)
-        self.pressure = builder.aIn("RING:PRESSURE", initial_value=1e-7, EGU="Pa", PREC=10)
-        self.rf = builder.aIn("RING:RF", initial_value=3200.0, EGU="kV", PREC=2)
+        self.current = builder.aIn("RING:CURRENT", initial_value=300.0, EGU="mA", PREC=4, TSE=-2)
+        self.pressure = builder.aIn("RING:PRESSURE", initial_value=1e-7, EGU="Pa", PREC=10, TSE=-2)
+        self.rf = builder.aIn("RING:RF", initial_value=3200.0, EGU="kV", PREC=2, TSE=-2)
         self.beam, self.now = 300.0, time.time()
         self.speed = builder.aOut("RING:SPEED", initial_value=1.0)
         # Factors of a and b that nobody sees, of the pressure, a step of the clock, a silence.

@@ -380,6 +380,13 @@ def _answer(plan: Plan, state: State, window: Window) -> Answer:
     return Answer(time, current, window, fit.status, message, *known, normalised)
 
 
+def nothing_yet(state: State) -> Answer:
+    """The answer before the first fit."""
+    why = "No lifetime: the watch ended before its first fit."
+    time = math.nan if state.last is None else state.last - state.shift
+    return Answer(time, math.nan, Window(None, None, 0), Status.unidentified, why)
+
+
 def _normalised(plan: Plan, window: Window, lifetime: Quantity) -> Quantity:
     """Current times lifetime, mA h, as of `trend`."""
     by = current = plan.current or window.fit.mean_current

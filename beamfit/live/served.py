@@ -1,0 +1,126 @@
+"""What a watch finds as variables of the control system: PV Access, nobody can write to them."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+from beamfit.errors import InputError
+from beamfit.live.watch import Told
+from beamfit.table import cell
+
+# Severities of EPICS.
+NONE, MINOR, MAJOR, INVALID = range(4)
+NUMBERS = {
+    "LIFETIME": ("lifetime", "h"), "A": ("a", "1/(mA s)"), "B": ("b", "1/s"),
+    "NORMALISED": ("normalised", "mA h"),
+}  # fmt: skip
+TEXTS = ("STATUS", "MESSAGE", "ALARM", "ALARM:TEXT")
+PLAIN = {"CURRENT": "mA", "SINCE": "s", "READINGS": ""}
+
+
+def values_of(told: Told) -> dict[str, tuple[Any, int]]:
+    """The value and the severity of each variable; NaN of what the readings do not determine.
+
+    Parameters
+    ----------
+    told : Told
+        What is known.
+
+    Returns
+    -------
+    dict of str to (value, int)
+        Names without the prefix.
+    """
+    state, answer = told.state, told.state.answer
+    old = NONE if told.sound and not told.lost else INVALID
+    found: dict[str, tuple[Any, int]] = {}
+    for name, (quantity, _) in NUMBERS.items():
+        known = getattr(answer, quantity, None)
+        low, high = (known and known.interval_95) or (math.nan, math.nan)
+        parts = {
+            "": known.value if known else math.nan, ":ERROR": known.error if known else math.nan,
+            ":LOW": low, ":HIGH": high,
+        }  # fmt: skip
+        severity = old if known else INVALID
+        found |= {name + part: (value, severity) for part, value in parts.items()}
+    moved = max(MAJOR if state.alarmed else NONE, old)
+    verdict = {"green": NONE, "yellow": MINOR, "red": MAJOR}[
+        answer.status.colour if answer else "red"
+    ]
+    since = state.alarms[-1].since if state.alarms else math.nan
+    current = state.rows[-1].current if state.rows else math.nan
+    return found | {
+        "CURRENT": (current, old if state.rows else INVALID),
+        "SINCE": (since, moved if state.alarms else INVALID),
+        "READINGS": (float(state.counts.readings), old),
+        "STATUS": (cell(answer.status) if answer else "", max(verdict, old)),
+        "MESSAGE": (told.headline[1], max(verdict, moved)),
+        "ALARM": (state.alarmed, moved),
+        "ALARM:TEXT": (state.said(), moved),
+    }
+
+
+@contextmanager
+def served(prefix: str, address: str) -> Iterator[Callable[[Told], None]]:
+    """Serve variables while the block lasts.
+
+    Parameters
+    ----------
+    prefix : str
+        Of their names.
+    address : str
+        Of the network interface that is listened on; 127.0.0.1 is this computer alone.
+
+    Yields
+    ------
+    callable
+        To be given what is known. The ports are those of EPICS_PVAS_SERVER_PORT and so on.
+
+    Raises
+    ------
+    InputError
+        If nobody can listen there, or p4p is not installed.
+    """
+    try:
+        from p4p.nt import NTScalar
+        from p4p.server import Server
+        from p4p.server.raw import SharedPV
+    except ImportError:
+        raise InputError("no package p4p, which serves", "pip install 'beamfit[live]'") from None
+
+    units = {
+        n + part: u for n, (_, u) in NUMBERS.items() for part in ("", ":ERROR", ":LOW", ":HIGH")
+    }
+    units |= PLAIN
+    kinds = {name: NTScalar("d", display=True) for name in units}
+    kinds |= {name: NTScalar("s") for name in TEXTS}
+    start = {n: {"value": math.nan, "display.units": u} for n, u in units.items()}
+    start |= {name: {"value": ""} for name in TEXTS}
+    variables = {name: SharedPV(nt=kinds[name], initial=start[name]) for name in kinds}
+
+    def show(told: Told) -> None:
+        state = told.state
+        time = state.last - state.shift if state.last else 0.0
+        for name, (value, severity) in values_of(told).items():
+            variables[name].post(value, timestamp=time, severity=severity)
+
+    ports = {
+        n: v for n, v in os.environ.items() if n.startswith("EPICS_PVA") and n.endswith("PORT")
+    }
+    here = {
+        "EPICS_PVAS_INTF_ADDR_LIST": address, "EPICS_PVAS_BEACON_ADDR_LIST": address,
+        "EPICS_PVAS_AUTO_BEACON_ADDR_LIST": "NO",
+    }  # fmt: skip
+    try:
+        server = Server(
+            [{prefix + n: pv for n, pv in variables.items()}], conf=ports | here, useenv=False
+        )
+    except (RuntimeError, ValueError) as error:
+        found = f"variables that cannot be served on {address} ({error})"
+        raise InputError(found, "an address of this computer after --bind") from None
+    with server:
+        yield show

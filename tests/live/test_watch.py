@@ -1,0 +1,227 @@
+"""`beamfit watch` beside a real IOC: lifetime, served variables, page, a restart, and no put."""
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+import urllib.error
+import urllib.request
+from types import SimpleNamespace
+
+import pytest
+
+from beamfit.cli import main
+from beamfit.errors import InputError
+from beamfit.io.watched import read_watch_machine
+from beamfit.live.channel import open_channel, run
+from tests.live.conftest import ROOT
+from tests.live.ioc import A, B
+from tests.report.browser import NAME
+
+MACHINE = """format = "beamfit-machine-1"
+name = "ring <b>&amp;</b>"
+timeout_s = 2
+[ring]
+beam_current_mA = "pva://SIM:RING:CURRENT"
+rf_voltage_kV = "SIM:RING:RF"
+pressure_Pa = "SIM:RING:PRESSURE"
+[watch]
+window_s = 3600
+interval_s = 300
+prefix = "WATCH:"
+"""
+
+
+def put(**values):
+    for name, value in values.items():
+        run(open_channel(f"SIM:RING:{name}").put(value))
+
+
+class Watching:
+    """The command in a process of its own, and what its page is told."""
+
+    def __init__(self, folder, ioc):
+        self.ioc = ioc
+        (folder / "ring.toml").write_text(MACHINE)
+        self.err = folder / "err.txt"
+        command = [sys.executable, "-m", "beamfit", "watch", "ring.toml", "--port", "0", "--json"]
+        told = {"cwd": folder, "env": {**os.environ, "PYTHONPATH": str(ROOT)}}
+        with self.err.open("w") as err:
+            streams = {"stdout": subprocess.PIPE, "stderr": err, "text": True}
+            self.process = subprocess.Popen(command, **streams, **told)
+        self.until(lambda: "; Ctrl-C" in self.err.read_text())
+        said = self.err.read_text()
+        self.url = said[said.index("http") :].partition(";")[0]
+
+    def until(self, there, wait=60):
+        end = time.monotonic() + wait
+        while not (found := there()):
+            assert self.process.poll() is None, self.err.read_text()
+            assert time.monotonic() < end, self.state()
+            time.sleep(0.2)
+        return found
+
+    def state(self, path="state"):
+        with urllib.request.urlopen(self.url + path, timeout=10) as answer:
+            return json.loads(answer.read())
+
+    def known(self, that=lambda told: told["quantities"]["a"]):
+        return self.until(lambda: (t := self.state()).get("sound") and that(t) and t)
+
+
+@pytest.fixture(scope="module")
+def watching(_ioc, tmp_path_factory):
+    _ioc.log.write_text("")
+    put(SPEED=100.0, REFILL=200.0)
+    one = Watching(tmp_path_factory.mktemp("watch"), _ioc)
+    yield one
+    one.process.kill()
+    one.process.communicate()
+
+
+def test_the_lifetime_and_both_losses_are_those_of_the_ring(watching):
+    told = watching.known()
+    assert told["status"] == "converged"
+    found = told["quantities"]
+    rate = A * told["mean_current"] + B
+    for name, truth in (("lifetime", 1 / rate / 3600), ("a", A), ("b", B)):
+        assert abs(found[name]["value"] - truth) < 5 * found[name]["error"], name
+    assert found["normalised"]["unit"] == "mA h"
+    assert (told["alarm"]["moved"], told["lost"], told["silent"]) == ("", [], None)
+
+
+def test_what_is_found_is_served_and_nobody_writes_it(watching):
+    async def read():
+        names = ("LIFETIME", "LIFETIME:ERROR", "A", "SINCE")
+        found = {n: await open_channel(f"pva://WATCH:{n}").get() for n in names}
+        unit = (await open_channel("pva://WATCH:LIFETIME").describe()).unit
+        with pytest.raises(InputError, match="refuses"):
+            await open_channel("pva://WATCH:LIFETIME").put(1.0)
+        return found, unit
+
+    watching.known()
+    found, unit = run(read())
+    told = watching.state()
+    assert unit == "h"
+    lifetime = told["quantities"]["lifetime"]
+    assert found["LIFETIME"].value == pytest.approx(lifetime["value"], rel=0.05)
+    assert abs(found["LIFETIME"].time - told["time"]) < 1000  # of the machine, not of this computer
+    assert found["LIFETIME"].good
+    assert not found["SINCE"].good  # nothing moved, and no number says when
+
+
+def request(url, head):
+    host, port = url[7:-1].split(":")
+    with socket.create_connection((host, int(port)), 5) as one:
+        one.sendall(head.encode())
+        return one.makefile("rb").readline().decode()
+
+
+def test_the_page_is_read_and_nothing_else(watching):
+    assert watching.url.startswith("http://127.0.0.1:")
+    for head, status in (
+        ("POST / HTTP/1.1\r\nHost: localhost\r\n\r\n", 405),
+        ("PUT /state HTTP/1.1\r\nHost: localhost\r\n\r\n", 405),
+        ("GET /../etc/passwd HTTP/1.1\r\nHost: localhost\r\n\r\n", 404),
+        ("GET / HTTP/1.1\r\nHost: elsewhere.example\r\n\r\n", 403),
+        ("GET / HTTP/1.1\r\n\r\n", 400),
+    ):
+        assert request(watching.url, head).split()[1] == str(status)
+    with urllib.request.urlopen(watching.url, timeout=5) as answer:
+        policy, page = answer.headers["Content-Security-Policy"], answer.read().decode()
+    assert "default-src 'none'" in policy
+    assert "unsafe" not in policy
+    assert "ring <b>" not in page
+
+
+SEEN = """({wide: document.documentElement.scrollWidth - document.documentElement.clientWidth,
+  ...Object.fromEntries([...document.querySelectorAll('[id]')].map(e => [e.id, e.textContent]))})"""
+
+
+@pytest.mark.skipif(NAME is None, reason="no Chromium here: apt-get install chromium")
+def test_the_page_shows_it_in_a_browser(watching, browser):
+    watching.known()
+    page = SimpleNamespace(as_uri=lambda: watching.url, name="watch")
+    for width in ("phone", "screen"):
+        faults = browser.faults(page, width, 0)
+        seen, end = {}, time.monotonic() + 20
+        while "converged" not in seen.get("headline", "") and time.monotonic() < end:
+            asked = {"expression": SEEN, "returnByValue": True}
+            seen = browser.ask("Runtime.evaluate", **asked)["result"]["value"]
+            time.sleep(0.1)
+        assert "±" in seen["tiles"]
+        assert seen["name"] == "ring <b>&amp;</b>"  # as text
+        assert seen["wide"] == 0
+        assert seen["lifetime"].count(":") >= 2  # times below the course
+        told = ("Runtime.exceptionThrown", "Runtime.consoleAPICalled", "Log.entryAdded")
+        assert faults + [e for e in browser.events if e["method"] in told] == []
+    browser.events.clear()
+    browser.ask("Page.navigate", url="about:blank")
+    while not any(e["method"] == "Page.loadEventFired" for e in browser.events):
+        browser.events.append(browser._message())
+
+
+def test_an_ioc_that_ends_is_said_and_followed_again(watching):
+    watching.ioc.kill()
+    gone = watching.until(lambda: (t := watching.state())["lost"] and t)
+    assert gone["headline"].startswith("No connection to ")
+    assert (gone["colour"], gone["sound"]) == ("red", True)
+    before = gone["counts"]["readings"]
+    watching.ioc.start()
+    put(SPEED=100.0)
+    # Its simulated time begins anew: a clock set back.
+    told = watching.known(lambda t: t["counts"]["readings"] > before + 100 and t["counts"]["clock"])
+    assert told["lost"] == []
+    assert any("again a connection" in text for _, text in told["events"])
+
+
+def test_at_the_end_there_is_one_object_and_nothing_was_written(watching):
+    watching.process.send_signal(signal.SIGINT)
+    out, _ = watching.process.communicate(timeout=30)
+    assert watching.process.returncode == 130
+    assert watching.err.read_text().endswith("beamfit: interrupted\n")
+    document = json.loads(out)
+    [result] = document["results"]
+    assert list(document["inputs"]) == ["ring.toml"]
+    assert result["record"] == "ring <b>&amp;</b>"
+    assert result["counts"]["readings"] > 100
+    assert {"a", "b", "i0", "lifetime_mean", "identifiability", "alarms"} <= set(result)
+    assert watching.ioc.log.read_text() == ""  # no magnet was written to
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("[ring]\nrf_voltage_kV = 'A'\n", "ring.toml:2: column 'beam_current_mA': no beam current"),
+        ("[ring]\nbeam_current_mA = 'A'\nbeam_current_A = 'B'\n", "one beam_current"),
+        ("[ring]\nbeam_current = 'A'\n", "did you mean beam_current"),
+        ("[ring]\nbeam_current_A = 'A'\nfile = 'r.toml'\n", "reference_current_mA"),
+        ("[ring]\nbeam_current_A = 'A'\n[watch]\nwindow_s = 60\ninterval_s = 30\n", "a third of"),
+    ],
+)
+def test_a_machine_file_that_cannot_be_watched_is_refused(tmp_path, text, said):
+    (tmp_path / "ring.toml").write_text(f'format = "beamfit-machine-1"\n{text}')
+    with pytest.raises(InputError) as refused:
+        read_watch_machine(tmp_path / "ring.toml")
+    assert said in str(refused.value)
+
+
+def test_another_unit_or_a_taken_port_is_one_line(ioc, tmp_path, monkeypatch, capsys):
+    def refusal(text, port):
+        (tmp_path / "ring.toml").write_text(text)
+        arguments = ["beamfit", "watch", str(tmp_path / "ring.toml"), "--port", str(port)]
+        monkeypatch.setattr(sys, "argv", arguments)
+        with pytest.raises(SystemExit) as stop:
+            main()
+        out, err = capsys.readouterr()
+        assert (stop.value.code, out, err.count("\n")) == (2, "", 1)
+        return err
+
+    said = refusal(MACHINE.replace("beam_current_mA", "beam_current_A"), 0)
+    assert "unit 'mA' of 'pva://SIM:RING:CURRENT'; expected A, as in the machine file" in said
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        assert f"port {port}" in refusal(MACHINE, port)
