@@ -22,8 +22,8 @@ from beamfit.table import cell, json_of
 STALE, INTERVALS = 10.0, 5.0
 # Readings are taken together every so often, and shown, s.
 TAKEN, SHOWN = 0.2, 1.0
-# Readings that wait for a fit to end, and points of a picture.
-WAITING, POINTS = 100_000, 300
+# Readings that wait for a fit to end.
+WAITING = 100_000
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,8 @@ class Told:
         if answer is None:
             left = max(0.0, state.due - state.last) if state.last else self.plan.every
             return "yellow", f"The first fit comes in {left:.0f} s"
-        return answer.status.colour, f"{cell(answer.status)}, nothing moved"
+        moved = "nothing moved" if state.alarm else "no alarm yet"
+        return answer.status.colour, f"{cell(answer.status)}, {moved}"
 
     def to_json(self) -> dict[str, Any]:
         """Return what the page shows."""
@@ -85,18 +86,9 @@ class Told:
                 "since": state.alarms[-1].since if state.alarms else None,
             },
             "lost": self.lost, "silent": self.silent, "window": self.plan.window,
-            "course": {
-                "current": _some([(r.time - state.shift, r.current) for r in state.rows]),
-                "lifetime": _some([tuple(point) for point in state.course]),
-            },
+            "course": [tuple(point) for point in state.course],
             "events": state.events[::-1], "counts": state.counts,
         })  # fmt: skip
-
-
-def _some(points: Sequence[Any]) -> Sequence[Any]:
-    """Every second, third, ... one, and the last."""
-    step = max(1, -(-len(points) // POINTS))
-    return points[::-1][::step][::-1]
 
 
 @dataclass

@@ -80,9 +80,10 @@ class Counts(NamedTuple):
 
 
 class Point(NamedTuple):
-    """One fit, for a picture: time, s, lifetime and its error, h; NaN where it has none."""
+    """One fit, for a picture: time, s, current, mA, lifetime and its error, h; NaN where none."""
 
     time: float
+    current: float
     lifetime: float
     error: float
 
@@ -347,7 +348,8 @@ def _answered(plan: Plan, state: State) -> State:
         window = fit_window(state.rows, plan.name)
     answer = _answer(plan, state, window)
     found = answer.lifetime
-    point = Point(answer.time, *((found.value, found.error) if found else (math.nan, math.nan)))
+    known = (found.value, found.error) if found else (math.nan, math.nan)
+    point = Point(answer.time, answer.current, *known)
     course = tuple(p for p in state.course if p.time >= begin - shift)
     if not course or point.time - course[-1].time >= plan.window / POINTS:
         course = (*course, point)
