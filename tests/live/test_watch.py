@@ -69,7 +69,7 @@ class Watching:
             return json.loads(answer.read())
 
     def known(self, that=lambda told: told["quantities"]["a"]):
-        return self.until(lambda: (t := self.state()).get("sound") and that(t) and t)
+        return self.until(lambda: (t := self.state()).get("sound") and that(t) and t, 150)
 
 
 @pytest.fixture(scope="module")
