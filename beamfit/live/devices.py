@@ -116,6 +116,12 @@ class Supply:
             raise NotSettledError(found, "nobody else who sets it")
         return float(np.mean(seen))
 
+    async def standing(self) -> float:
+        """Its setting, if that is within the limits and is what is read back."""
+        value = moved(self.magnet, await self.get())
+        await self.settled(value)
+        return value
+
 
 def _sound(reading: Reading, name: str) -> Reading:
     if np.ndim(reading.value):
@@ -147,24 +153,29 @@ class ScreenShots:
 
     async def shots(self) -> dict[str, np.ndarray]:
         """As `Sizes.shots`; the planes at the same time."""
+        found = await self.timed()
+        return {plane: np.array([size for _, size in each]) for plane, each in found.items()}
+
+    async def timed(self) -> dict[str, list[tuple[float, float]]]:
+        """As `shots`, each behind its time stamp."""
         found = await asyncio.gather(*map(self._of_plane, self.channels))
         return dict(zip(self.channels, found, strict=True))
 
-    async def _of_plane(self, plane: str) -> np.ndarray:
-        kept: list[float] = []
+    async def _of_plane(self, plane: str) -> list[tuple[float, float]]:
+        kept: list[tuple[float, float]] = []
         try:
             await asyncio.wait_for(self._collect(self.channels[plane], kept), self._patience)
         except TimeoutError:
             found = f"{len(kept)} of {self.profiler.shots} new shots of {plane} in time"
             expected = f"one at least every {self.profiler.timeout:g} s; are the time stamps new?"
             raise NoSizesError(found, expected) from None
-        return np.array(kept)
+        return kept
 
     @property
     def _patience(self) -> float:
         return self.profiler.timeout * (1 + self.profiler.shots / 4)
 
-    async def _collect(self, channel: Channel, kept: list[float]) -> None:
+    async def _collect(self, channel: Channel, kept: list[tuple[float, float]]) -> None:
         last, bad = (await channel.get()).time, 0
         async for reading in channel.monitor():
             if reading is None:
@@ -176,7 +187,7 @@ class ScreenShots:
             if size is None:
                 bad += 1
             else:
-                kept.append(size)
+                kept.append((last, size))
             if len(kept) == self.profiler.shots:
                 return
             if bad > BAD * self.profiler.shots:
@@ -235,12 +246,11 @@ async def connect(machine: ScanMachine) -> Connected:
     notes: list[str] = []
     magnets, supplies = [], {}
     for magnet in machine.magnets:
-        magnet, said = await _checked(magnet, machine.timeout)
-        supplies[magnet.name] = supply_of(magnet, machine.timeout)
-        magnets.append(magnet)
+        supply, said = await checked(supply_of(magnet, machine.timeout))
+        supplies[magnet.name] = supply
+        magnets.append(supply.magnet)
         notes += said
-        setting = moved(magnet, await supplies[magnet.name].get())
-        await supplies[magnet.name].settled(setting)
+        await supply.standing()
     machine = replace(machine, magnets=tuple(magnets))
     wanted, guard = machine.screen, machine.guard
     names = wanted.sizes or wanted.profiles
@@ -263,20 +273,25 @@ def supply_of(magnet: Magnet, timeout: float) -> Supply:
     )
 
 
-async def _checked(magnet: Magnet, timeout: float) -> tuple[Magnet, list[str]]:
-    """A magnet with the tighter limits, and what to say of them."""
-    for name in (magnet.set, magnet.read):
-        described = await open_channel(name, timeout).describe()
-        unit = unit_of(described.unit)
-        if described.unit and unit != magnet.unit:
-            found = f"'{plain(name)}' in '{plain(described.unit)}'"
-            raise InputError(found, f"{magnet.unit}, as the machine file says of {magnet.name}")
-        if name == magnet.set:
-            low, high = max(magnet.low, described.low), min(magnet.high, described.high)
+async def checked(supply: Supply) -> tuple[Supply, list[str]]:
+    """A magnet with the tighter limits, and what to say of them.
+
+    Raises
+    ------
+    InputError
+        If it has another unit or other limits than the file says.
+    """
+    magnet = supply.magnet
+    for channel in (supply.readback, supply.setting):
+        found = await channel.describe()
+        if found.unit and unit_of(found.unit) != magnet.unit:
+            said = f"'{plain(channel.name)}' in '{plain(found.unit)}'"
+            raise InputError(said, f"{magnet.unit}, as the machine file says of {magnet.name}")
+    low, high = max(magnet.low, found.low), min(magnet.high, found.high)
     if not low < high:
-        found = f"limits {described.low:g} to {described.high:g} of '{plain(magnet.set)}'"
+        found = f"limits {found.low:g} to {found.high:g} of '{plain(magnet.set)}'"
         raise InputError(found, f"some of {magnet.low:g} to {magnet.high:g}, of the machine file")
     if (low, high) == (magnet.low, magnet.high):
-        return magnet, []
+        return supply, []
     said = f"Limits of {magnet.name}: {low:g} to {high:g} {magnet.unit}, of the control system."
-    return replace(magnet, low=low, high=high), [said]
+    return replace(supply, magnet=replace(magnet, low=low, high=high)), [said]

@@ -6,14 +6,14 @@ import asyncio
 import os
 import signal
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Awaitable, Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple
 
 from beamfit.errors import InputError
-from beamfit.io.machine import ScanMachine
-from beamfit.live.devices import Connected, NoSizesError
+from beamfit.io.machine import Magnet, ScanMachine
+from beamfit.live.devices import Connected, Device, NoSizesError
 from beamfit.live.journal import Journal, check_none_left, named
 from beamfit.live.next_setting import Next, Point, fit_of, next_setting, sharp, warmed
 from beamfit.live.restore import ended_by_signals, reach, restore
@@ -64,8 +64,11 @@ class Outcome(NamedTuple):
 
 
 @dataclass
-class _Running:
-    """What a scan has so far; the one thing that changes as it goes on."""
+class Running:
+    """What a scan has so far; the one thing that changes as it goes on.
+
+    ``reach`` moves a magnet, ``sleep`` waits; a plan of bluesky does both by messages.
+    """
 
     at: Connected
     line: Beamline
@@ -76,8 +79,11 @@ class _Running:
     barred: list[dict[str, float]] = field(default_factory=list)
     fit: EmittanceFit | None = None
     armed: bool = False
+    reach: Callable[[Magnet, Device, float], Awaitable[float]] = reach
+    sleep: Callable[[float], Awaitable[None]] = asyncio.sleep
 
     def say(self, news: str, measured: bool = False) -> None:
+        """Tell how it stands."""
         self.tell(Told(tuple(self.points), self.fit, news, measured))
 
 
@@ -126,53 +132,52 @@ async def scan(
     with alone(journal):
         check_none_left(journal)
         before = {m.name: await at.magnets[m.name].get() for m in at.machine.magnets}
-        saved = tuple((m, before[m.name]) for m in at.machine.magnets)
-        log = Journal(
-            journal, os.path.abspath(at.machine.path), saved, at.machine.timeout, at.machine.restore
-        )
-        run = _Running(at, line, before, keep, tell)
-        measuring = asyncio.ensure_future(_begun(run, log))
+        log = journal_for(journal, at.machine, before)
+        run = Running(at, line, before, keep, tell)
+        measuring = asyncio.ensure_future(begun(run, log))
         reason, problem = "", None
         with ended_by_signals(measuring, run.say) as came:
             try:
                 reason = await measuring
             except asyncio.CancelledError:
                 if not came:  # whoever runs this one wants it to end: restored before it does
-                    await asyncio.shield(_back(run, log))
+                    await asyncio.shield(back(run, log))
                     raise
                 reason = f"stopped by {signal.Signals(came[0]).name}"
             except Exception as error:  # of whatever kind: the magnets are put back first
                 problem, reason = error, str(error)
-            await _back(run, log)
+            await back(run, log)
         return Outcome(tuple(run.points), run.fit, reason, problem, came[0] if came else 0)
 
 
-def _journal(path: Path, machine: ScanMachine, before: Mapping[str, float]) -> Journal:
+def journal_for(path: Path, machine: ScanMachine, before: Mapping[str, float]) -> Journal:
+    """The journal of a scan, not written yet."""
     settings = tuple((m, before[m.name]) for m in machine.magnets)
     whose = os.path.abspath(machine.path)
     return Journal(path, whose, settings, machine.timeout, machine.restore)
 
 
-async def _begun(run: _Running, log: Journal) -> str:
+async def begun(run: Running, log: Journal) -> str:
+    """Write the journal, measure, and say why that ended."""
     log.write()
     run.armed = True  # from here on something may have moved
     run.say(f"Restored at the end: {named(log.before)}. Until then it is in {log.path}")
     return await _measured(run)
 
 
-async def _back(run: _Running, log: Journal) -> None:
+async def back(run: Running, log: Journal) -> None:
     """Restore what may have been moved."""
     if run.armed:
         await restore(log, run.at.magnets)
         run.say(f"Restored and read back: {named(log.before)}")
 
 
-async def _measured(run: _Running) -> str:
+async def _measured(run: Running) -> str:
     """Measure setting after setting, and say why it ends."""
     machine, barren = run.at.machine, 0
     for magnet in machine.magnets:
         for value in magnet.degauss:
-            await reach(magnet, run.at.magnets[magnet.name], value)
+            await run.reach(magnet, run.at.magnets[magnet.name], value)
     while len(run.points) < machine.points:
         chosen = next_setting(run.points, run.fit, run.barred, machine, run.before)
         if not isinstance(chosen, Next):
@@ -197,7 +202,7 @@ async def _measured(run: _Running) -> str:
     return f"all {machine.points} points are measured"
 
 
-async def _point(run: _Running, settings: Mapping[str, float]) -> tuple[Point | None, str]:
+async def _point(run: Running, settings: Mapping[str, float]) -> tuple[Point | None, str]:
     """Measure at a setting; None, and why, where that cannot be done.
 
     Where the beam is lost the magnets go back until it has returned; once more is tried.
@@ -219,12 +224,12 @@ async def _point(run: _Running, settings: Mapping[str, float]) -> tuple[Point | 
     return None, why
 
 
-async def _moved(run: _Running, settings: Mapping[str, float]) -> dict[str, float]:
+async def _moved(run: Running, settings: Mapping[str, float]) -> dict[str, float]:
     magnets = [m for m in run.at.machine.magnets if m.name in settings]
-    return {m.name: await reach(m, run.at.magnets[m.name], settings[m.name]) for m in magnets}
+    return {m.name: await run.reach(m, run.at.magnets[m.name], settings[m.name]) for m in magnets}
 
 
-async def _well(run: _Running, why: str) -> None:
+async def _well(run: Running, why: str) -> None:
     """Wait until there is beam and none is lost.
 
     Raises
@@ -237,6 +242,6 @@ async def _well(run: _Running, why: str) -> None:
         if time.monotonic() > until:
             expected = f"it to be over within {run.at.machine.guard.wait:g} s"
             raise InputError(f"{wrong}", expected)
-        await asyncio.sleep(LOOK)
+        await run.sleep(LOOK)
     if why:
         run.say("Going on")
