@@ -26,6 +26,7 @@ from beamfit.greybox.solve import solve
 from beamfit.io.files import digest
 from beamfit.optics.beam import BeamMatrix
 from beamfit.optics.beamline import Beamline
+from beamfit.optics.rows import transfer_rows
 from beamfit.report.document import (
     BLUE,
     RED,
@@ -43,7 +44,6 @@ from beamfit.studies.scan.fit import EmittanceFit, fit_emittance
 from beamfit.studies.scan.known import see
 from beamfit.studies.scan.model import UNIT
 from beamfit.studies.scan.scans import QuadScan
-from beamfit.studies.scan.transport import transfer_rows
 from beamfit.studies.scan.transport_network import SCENARIO
 from beamfit.table import Table
 from beamfit.writing import write_atomically

@@ -7,11 +7,11 @@ from beamfit.studies.decay.alarm import (
     NAMES,
     Reading,
     Reference,
-    _tests,
     alarms_of,
     started,
     watched,
 )
+from beamfit.studies.decay.alarm_windows import falls_of
 
 # Ten hours at 500 mA, two thirds of the loss from a; 1 µA a second.
 USUAL = Reference(a=3.7e-8, b=9.26e-6, noise=1e-3)
@@ -55,7 +55,7 @@ def test_it_is_silent_while_nothing_moves(memory):
     assert raised == []
     # And it did look: the largest windows have seen what they should.
     assert state.age.max() == 699
-    assert max(part.max() for part in _tests(state)) > 3
+    assert max(part.max() for part in falls_of(state)) > 3
 
 
 @pytest.mark.parametrize(("which", "worse"), [("a", (1.1, 1.0)), ("b", (1.0, 1.1))])
@@ -167,7 +167,7 @@ def test_the_tests_are_those_of_generalised_least_squares():
         state, told = watched(usual, state, Reading(*row))
         assert not told.raised
     [begun] = np.flatnonzero(state.age[:-1] == state.age[:-1].max())[-1:]
-    for name, part, wanted in zip("ab2", _tests(state), expected, strict=True):
+    for name, part, wanted in zip("ab2", falls_of(state), expected, strict=True):
         assert part[begun] == pytest.approx(wanted, rel=5e-3), name
     assert expected[2] > 3
 

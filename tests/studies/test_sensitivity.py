@@ -9,13 +9,13 @@ import pytest
 
 import beamfit
 from beamfit.optics.elements import Drift, Quadrupole, Screen, SectorDipole
+from beamfit.optics.rows import transfer_rows
 from beamfit.studies.scan.sensitivity import (
     MOST_CAUSES,
     budget_rows,
     range_sensitivity,
     systematics,
 )
-from beamfit.studies.scan.transport import transfer_rows
 from tests.studies.conftest import scan_of
 
 

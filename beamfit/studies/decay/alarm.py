@@ -13,11 +13,17 @@ from typing import NamedTuple
 import numpy as np
 
 from beamfit.quantity import Quantity
+from beamfit.studies.decay.alarm_windows import (
+    LENGTHS,
+    MINUTE,
+    State,
+    change_since,
+    either,
+    falls_of,
+    set_off,
+    with_reading,
+)
 
-MINUTE = 60.0
-# Windows, s: four begin in turn in each length, so that one of nearly any age is at hand.
-LENGTHS = np.repeat([4.0, 8.0, 16.0, 32.0, 64.0, 128.0], 4) * MINUTE
-PHASES = LENGTHS * np.tile([0.0, 0.25, 0.5, 0.75], 6)
 # Fall of chi² that raises an alarm: 5.5 standard errors, for all windows of 1e6 readings.
 RAISED = 30.0
 # Twice the logarithm of 1000, by Wald's rule: one in a thousand is named wrongly.
@@ -33,8 +39,8 @@ SETTLE, GAP = 10.0, 10.0
 JUMP, SHARE = 6.0, 0.15
 # So does a setting, or a gauge, that moves what is expected by more: the two do not answer at once.
 SET = 0.02
-# Readings over which the noise is followed; before an alarm a and b may be off by this much.
-MEMORY, WIDE = 300.0, 0.3
+# Readings over which the noise is followed.
+MEMORY = 300.0
 # What an alarm is called before and after it is named.
 NAMES = ("", "a", "b", "a and b", "a or b")
 
@@ -83,52 +89,6 @@ class Reading(NamedTuple):
     current: float
     a_factor: float = 1.0
     b_factor: float = 1.0
-
-
-class State(NamedTuple):
-    """What is remembered between readings; arrays may have leading axes, of many beams at once.
-
-    Attributes
-    ----------
-    time, current, step, pace : array
-        Last reading, s and mA, seconds since the one before, and by how much ln I rose over the
-        expected in a second of them.
-    expected : array, shape (..., 2)
-        Its factors of a and b.
-    clock, hold : array
-        Seconds watched, and seconds still to wait after a step.
-    path : array, shape (..., 3)
-        Since the last cut: ln I over the expected, and its derivatives by relative changes of a, b.
-    noise : array
-        Variance of readings over that of the reference.
-    factor, covariance : array, shapes (..., 2), (..., 2, 2)
-        a and b over the reference's after earlier alarms, and their relative covariance.
-    age, weight, mean, product : array, shapes (..., w), (..., w), (..., w, 3), (..., w, 5)
-        Of each window and of what came since the alarm, in the last place: seconds, sum of
-        weights, means and central products of the path.
-    raised, excess, before : array
-        Seconds since an alarm was raised, NaN where none is; ln I over the expected at that moment,
-        and the age, s, of the window that showed it.
-    """
-
-    time: np.ndarray
-    current: np.ndarray
-    step: np.ndarray
-    pace: np.ndarray
-    expected: np.ndarray
-    clock: np.ndarray
-    hold: np.ndarray
-    path: np.ndarray
-    noise: np.ndarray
-    factor: np.ndarray
-    covariance: np.ndarray
-    age: np.ndarray
-    weight: np.ndarray
-    mean: np.ndarray
-    product: np.ndarray
-    raised: np.ndarray
-    excess: np.ndarray
-    before: np.ndarray
 
 
 class Told(NamedTuple):
@@ -223,14 +183,8 @@ def watched(reference: Reference, state: State, reading: Reading) -> tuple[State
     usable = np.isfinite(reading.current) & (np.nan_to_num(reading.current) > 0)
     reading = reading._replace(current=np.where(usable, reading.current, 1.0))
     after = _moved_on(reference, state, reading)
-    after = State(*(_where(usable, new, old) for new, old in zip(after, state, strict=True)))
+    after = State(*(either(usable, new, old) for new, old in zip(after, state, strict=True)))
     return _judged(reference, after, usable)
-
-
-def _where(chosen: np.ndarray, new: np.ndarray, old: np.ndarray) -> np.ndarray:
-    """One or the other, by the leading axes."""
-    shape = np.shape(chosen) + (1,) * (np.ndim(old) - np.ndim(chosen))
-    return np.where(np.reshape(chosen, shape), new, old)
 
 
 class _Step(NamedTuple):
@@ -282,7 +236,7 @@ def _moved_on(usual: Reference, state: State, reading: Reading) -> State:
     kept = np.where(begins, 0.0, memory)
     alone = (path - kept[..., None] * state.path) / (1 - kept)[..., None]
     weight = np.where(hold > 0, 0.0, (1 - kept) / ((1 + kept) * noise**2))
-    windows = _windows(
+    windows = with_reading(
         state, np.where(begins[..., None], 0.0, state.weight), alone, weight, between
     )
     known = going | cut
@@ -303,85 +257,14 @@ def _moved_on(usual: Reference, state: State, reading: Reading) -> State:
     )
 
 
-def _windows(
-    state: State, before: np.ndarray, path: np.ndarray, weight: np.ndarray, step: np.ndarray
-) -> dict[str, np.ndarray]:
-    """Weighted means and central products with one reading more (Welford); those due, anew.
-
-    Where the weight before is zero the piece begins, and its offset is free.
-    """
-    clock = state.clock[..., None]
-    turns = np.floor((clock - PHASES) / LENGTHS)
-    due = np.floor((clock + step[..., None] - PHASES) / LENGTHS) > turns
-    due = np.concatenate([due, np.zeros_like(clock, bool)], axis=-1)
-    before = np.where(due, 0.0, before)
-    total = before + weight[..., None]
-    share = np.where(total > 0, weight[..., None] / np.where(total > 0, total, 1.0), 0.0)
-    off = np.where((before > 0)[..., None], path[..., None, :] - state.mean, 0.0)
-    start = (before == 0)[..., None] & (weight > 0)[..., None, None]
-    mean = np.where(start, path[..., None, :], state.mean + share[..., None] * off)
-    y, u, v = np.moveaxis(off, -1, 0)
-    pairs = np.stack([u * u, u * v, v * v, u * y, v * y], axis=-1)
-    product = np.where(due[..., None], 0.0, state.product)
-    product = product + (share * before)[..., None] * pairs
-    age = np.where(due, 0.0, state.age) + step[..., None]
-    return {"age": age, "weight": total, "mean": mean, "product": product}
-
-
-def _tests(state: State) -> tuple[np.ndarray, ...]:
-    """Fall of chi² if a, if b, if both moved, in each window."""
-    uu, uv, vv, uy, vy = np.moveaxis(state.product, -1, 0)
-    covariance = state.covariance[..., None, :, :]
-    caa, cab, cbb = covariance[..., 0, 0], covariance[..., 0, 1], covariance[..., 1, 1]
-    # 1 + J C and its inverse times (J, s), written out: 2 by 2.
-    p, q = 1 + uu * caa + uv * cab, uu * cab + uv * cbb
-    r, t = uv * caa + vv * cab, 1 + uv * cab + vv * cbb
-    det = p * t - q * r
-    maa, mab, mbb = (t * uu - q * uv) / det, (t * uv - q * vv) / det, (p * vv - r * uv) / det
-    sa, sb = (t * uy - q * vy) / det, (p * vy - r * uy) / det
-    by_a = sa**2 / np.where(maa > 0, maa, np.inf)
-    by_b = sb**2 / np.where(mbb > 0, mbb, np.inf)
-    left = mbb - mab**2 / np.where(maa > 0, maa, np.inf)
-    rest = sb - sa * mab / np.where(maa > 0, maa, np.inf)
-    # Where the two are not told apart by rounding, both explain no more than one.
-    both = by_a + np.where(left > 1e-9 * mbb, rest**2 / np.where(left > 0, left, np.inf), 0.0)
-    return by_a, by_b, np.maximum(both, np.maximum(by_a, by_b))
-
-
-def _change(state: State, moved: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Relative changes since the alarm, of what moved alone, their errors, and the covariance.
-
-    Errors contain those of the reference.
-    """
-    uu, uv, vv, uy, vy = np.moveaxis(state.product[..., -1, :], -1, 0)
-    uu, vv = uu + WIDE**-2, vv + WIDE**-2
-    det = uu * vv - uv**2
-    rows = np.stack([np.stack([vv, -uv], -1), np.stack([-uv, uu], -1)], axis=-2)
-    covariance = rows / det[..., None, None]
-    both = np.stack([vv * uy - uv * vy, uu * vy - uv * uy], axis=-1) / det[..., None]
-    total = np.diagonal(covariance + state.covariance, axis1=-2, axis2=-1)
-    caa, cab, cbb = (state.covariance[..., i, j] for i, j in ((0, 0), (0, 1), (1, 1)))
-    a_error = 1 / uu + caa + 2 * uv / uu * cab + (uv / uu) ** 2 * cbb
-    b_error = 1 / vv + cbb + 2 * uv / vv * cab + (uv / vv) ** 2 * caa
-    zero = np.zeros_like(uy)
-    change, error = both, np.sqrt(total)
-    for which, value, square in (
-        (1, (uy / uu, zero), (a_error, zero)),
-        (2, (zero, vy / vv), (zero, b_error)),
-    ):
-        change = _where(moved == which, np.stack(value, -1), change)
-        error = _where(moved == which, np.sqrt(np.stack(square, -1)), error)
-    return change, error, covariance
-
-
 def _judged(usual: Reference, state: State, usable: np.ndarray) -> tuple[State, Told]:
-    by_a, by_b, both = _tests(state)
+    by_a, by_b, both = falls_of(state)
     quiet = np.isnan(state.raised)
     old = state.age[..., :-1] >= MINUTE
     seen = np.where(old, np.maximum(by_a, by_b)[..., :-1], 0.0)
     raised = quiet & usable & (seen.max(-1) > RAISED)
     if raised.any():
-        state = _raised(state, raised, np.argmax(seen, axis=-1))
+        state = set_off(state, raised, np.argmax(seen, axis=-1))
     gain_a, gain_b, gain = by_a[..., -1], by_b[..., -1], both[..., -1]
     most = np.maximum(gain_a, gain_b)
     apart = np.select(
@@ -393,24 +276,9 @@ def _judged(usual: Reference, state: State, usable: np.ndarray) -> tuple[State, 
     if not moved.any():
         nothing = np.zeros_like(state.factor)
         return state, Told(raised, moved, nothing, nothing, state.time)
-    change, error, covariance = _change(state, moved)
+    change, error, covariance = change_since(state, moved)
     told = Told(raised, moved, change, error, _since(usual, state, change))
     return _adopted(state, moved > 0, change, covariance), told
-
-
-def _raised(state: State, raised: np.ndarray, best: np.ndarray) -> State:
-    """An alarm begins: what comes from now on tells what moved."""
-    anew = raised[..., None] & (np.arange(LENGTHS.size + 1) == LENGTHS.size)
-    level = np.take_along_axis(state.mean[..., 0], best[..., None], -1)[..., 0]
-    age = np.take_along_axis(state.age, best[..., None], -1)[..., 0]
-    return state._replace(
-        age=np.where(anew, 0.0, state.age),
-        weight=np.where(anew, 0.0, state.weight),
-        product=np.where(anew[..., None], 0.0, state.product),
-        raised=np.where(raised, 0.0, state.raised),
-        excess=np.where(raised, state.path[..., 0] - level, state.excess),
-        before=np.where(raised, age, state.before),
-    )
 
 
 def _since(usual: Reference, state: State, change: np.ndarray) -> np.ndarray:
@@ -426,10 +294,10 @@ def _adopted(state: State, done: np.ndarray, change: np.ndarray, covariance: np.
     """Where an alarm is told, what was found is the usual loss from now on."""
     factor = state.factor * (1 + change)
     known = {"factor": factor, "covariance": state.covariance + covariance}
-    named = {name: _where(done, part, getattr(state, name)) for name, part in known.items()}
+    named = {name: either(done, part, getattr(state, name)) for name, part in known.items()}
     for name in ("age", "weight", "product"):
         before = getattr(state, name)
-        named[name] = _where(done, np.zeros_like(before), before)
+        named[name] = either(done, np.zeros_like(before), before)
     return state._replace(**named, raised=np.where(done, np.nan, state.raised))
 
 
@@ -499,7 +367,7 @@ def alarms_of(
             alarms.append(alarm_of(raised, told, float(row[0])))
             raised = None
     if raised is not None:
-        change, error, _ = _change(state, np.int64(4))
+        change, error, _ = change_since(state, np.int64(4))
         since = _since(reference, state, change)
         alarms.append(alarm_of(raised, Told(True, 4, change, error, since), None))
     return tuple(alarms)

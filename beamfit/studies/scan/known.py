@@ -12,6 +12,7 @@ import numpy as np
 from beamfit.greybox.problem import Problem
 from beamfit.optics.beamline import Beamline
 from beamfit.optics.calibration import SETTING_UNITS
+from beamfit.optics.rows import transfer_rows
 from beamfit.statistics import chi2_probability
 from beamfit.studies.scan.assumptions import Assumptions
 from beamfit.studies.scan.model import coefficients, size_squared
@@ -50,7 +51,6 @@ from beamfit.studies.scan.transport import (
     names_of,
     scan_rows,
     scanned_line,
-    transfer_rows,
 )
 from beamfit.studies.scan.verdict import LOST, Evidence, one_magnet, waist_bracketed
 

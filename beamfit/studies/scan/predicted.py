@@ -10,11 +10,12 @@ import jax
 import numpy as np
 
 from beamfit.errors import InputError, nearest
+from beamfit.optics.rows import seen_line
 from beamfit.sampling.posterior import Correlations
 from beamfit.shown import shown
 from beamfit.studies.scan.model import coefficients, emittance_parts, predict_sizes, size_squared
 from beamfit.studies.scan.results import PlaneFit
-from beamfit.studies.scan.transport import Rows, padded, rows_at, seen_line
+from beamfit.studies.scan.transport import Rows, padded, rows_at
 
 if TYPE_CHECKING:
     from beamfit.studies.scan.posterior import Scanned

@@ -18,6 +18,7 @@ from beamfit.greybox.bounds import over_cells
 from beamfit.greybox.mlp import MLP, Port
 from beamfit.greybox.problem import Free, Problem, Record
 from beamfit.greybox.terms import Constraint
+from beamfit.optics.rows import transfer_rows
 from beamfit.studies.scan.assumptions import Assumptions
 from beamfit.studies.scan.constrained_network import (
     beam_box,
@@ -37,7 +38,7 @@ from beamfit.studies.scan.statement import (
     size_record,
     varied_magnets,
 )
-from beamfit.studies.scan.transport import NetworkRows, padded, transfer_rows
+from beamfit.studies.scan.transport import NetworkRows, padded
 
 CELLS = 32
 ELEMENTS = "ABCD"
