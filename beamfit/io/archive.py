@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING
 
 from beamfit.errors import InputError
 from beamfit.io.files import digest, read_json, text_lines
-from beamfit.io.table import HDF5, UNITS, Sheet, read_sheet
+from beamfit.io.sheet import UNITS, Sheet
+from beamfit.io.table import HDF5, read_sheet
 
 if TYPE_CHECKING:
     from pandas import DataFrame

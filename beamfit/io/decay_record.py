@@ -16,7 +16,7 @@ from beamfit.io.files import name_of
 from beamfit.io.headers import is_number
 from beamfit.io.monitor import offset_of
 from beamfit.io.scan_columns import is_size
-from beamfit.io.table import UNITS, Column, Sheet, columns_of, left_out
+from beamfit.io.sheet import UNITS, Column, Sheet, columns_of, left_out
 from beamfit.studies.decay.monitor import Monitor
 from beamfit.studies.decay.record import Conditions, DecayRecord, LifetimeTable, first_fault
 

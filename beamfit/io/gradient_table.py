@@ -5,7 +5,8 @@ from __future__ import annotations
 from itertools import pairwise
 from pathlib import Path
 
-from beamfit.io.table import Sheet, columns_of, read_sheet
+from beamfit.io.sheet import Sheet, columns_of
+from beamfit.io.table import read_sheet
 from beamfit.io.toml import Section, is_number
 
 EXAMPLE = "current_A,gradient_T_per_m"

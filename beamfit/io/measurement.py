@@ -14,8 +14,9 @@ from beamfit.errors import InputError
 from beamfit.io.emittance_gui import is_emittance_gui, read_emittance_gui
 from beamfit.io.files import name_of
 from beamfit.io.scan_columns import ENERGIES, SETTINGS, column_notes, scan_columns
+from beamfit.io.sheet import UNITS, Column, Sheet, left_out
 from beamfit.io.shots import average_shots
-from beamfit.io.table import UNITS, Column, Sheet, left_out, read_sheet
+from beamfit.io.table import read_sheet
 from beamfit.studies.scan.scans import POSSIBLE, USUAL, QuadScan, first_unusable, middle
 
 if TYPE_CHECKING:

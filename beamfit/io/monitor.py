@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from beamfit.errors import InputError
-from beamfit.io.table import UNITS
+from beamfit.io.sheet import UNITS
 from beamfit.studies.decay.monitor import Monitor
 
 ZERO_BEAM = "zero-beam"

@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from beamfit.errors import nearest
-from beamfit.io.table import Sheet, read_sheet
+from beamfit.io.sheet import Sheet
+from beamfit.io.table import read_sheet
 
 if TYPE_CHECKING:
     from beamfit.lifetime.ring import Optics

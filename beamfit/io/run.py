@@ -12,7 +12,8 @@ import numpy as np
 from beamfit.errors import InputError, nearest
 from beamfit.io.dates import unix_time
 from beamfit.io.files import name_of
-from beamfit.io.table import Column, Sheet, columns_of, left_out, read_sheet
+from beamfit.io.sheet import Column, Sheet, columns_of, left_out
+from beamfit.io.table import read_sheet
 from beamfit.studies.response.record import Run
 
 if TYPE_CHECKING:

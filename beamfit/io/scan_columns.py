@@ -8,7 +8,7 @@ from collections.abc import Mapping
 
 from beamfit.errors import nearest
 from beamfit.io.headers import spelled
-from beamfit.io.table import UNITS, Column, Sheet, columns_of
+from beamfit.io.sheet import UNITS, Column, Sheet, columns_of
 from beamfit.particles import ENERGY_KEYS
 
 # How the energy of a row may be given, without its unit, and what that is.

@@ -11,7 +11,7 @@ from beamfit.errors import InputError, plain
 from beamfit.io.decay_record import QUANTITIES
 from beamfit.io.headers import spelled
 from beamfit.io.machine import FORMAT, POSITIVE, TOP
-from beamfit.io.table import UNITS
+from beamfit.io.sheet import UNITS
 from beamfit.io.toml import TEXT, Key, Section, read_toml
 from beamfit.studies.decay.record import Conditions
 

@@ -7,7 +7,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from beamfit.errors import InputError
-from beamfit.io.table import UNITS, Sheet, columns_of, read_sheet
+from beamfit.io.sheet import UNITS, Sheet, columns_of
+from beamfit.io.table import read_sheet
 
 EXAMPLE = "s_m,beta_x_m"
 NUMBERS = st.floats(allow_nan=False, allow_infinity=False)

@@ -1,0 +1,273 @@
+"""Named columns with the place of every value, and what their headers mean.
+
+A reader of scans, records or optics says which quantities its columns may hold; what can be wrong
+with a table as such is found and named here.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from fnmatch import fnmatchcase
+from os import PathLike
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from beamfit.errors import InputError, nearest
+from beamfit.io.headers import spelled
+
+UNITS: dict[str, dict[str, float]] = {
+    # quantity: unit at the end of a name -> factor to SI (a stored current: to mA)
+    "length": {"um": 1e-6, "mm": 1e-3, "m": 1.0, "µm": 1e-6, "μm": 1e-6},
+    "length or duration": {"mm": 1e-3, "m": 1.0, "ps": 299792458e-12},
+    "time": {"s": 1.0, "min": 60.0, "h": 3600.0, "d": 86400.0, "ms": 1e-3},
+    "current": {"mA": 1.0, "A": 1e3, "uA": 1e-3, "µA": 1e-3, "μA": 1e-3},
+    "voltage": {"kV": 1e3, "V": 1.0, "MV": 1e6},
+    "pressure": {"Pa": 1.0, "mbar": 100.0, "Torr": 101325 / 760},
+    "energy in MeV": {"MeV": 1.0},
+}
+# Rows left out that a note names one by one.
+MOST_NAMED = 5
+
+
+class Column(NamedTuple):
+    """What a header means: the quantity, the unit it is in, and the factor to SI."""
+
+    header: str
+    key: str
+    unit: str = ""
+    factor: float = 1.0
+
+
+@dataclass(frozen=True)
+class Sheet:
+    """The cells of a file, one sequence a column, and where each row stands.
+
+    Attributes
+    ----------
+    path : str or path
+        The file.
+    names : tuple of str
+        Headers, in the order of the file.
+    cells : sequence of sequences
+        Texts (or numbers, of HDF5) of each column.
+    lines : sequence of int or None
+        Line of each row; None for HDF5, whose rows are counted.
+    header : int or None
+        Line of the header.
+    comments : tuple of str
+        Comment lines, TFS descriptors, or attributes of an HDF5 file.
+    sha256 : str
+        Digest of the file.
+    bad : tuple of InputError
+        What is wrong with rows that were left out on request.
+    """
+
+    path: str | PathLike[str]
+    names: tuple[str, ...]
+    cells: Sequence[Sequence[Any]]
+    lines: Sequence[int] | None
+    header: int | None
+    comments: tuple[str, ...]
+    sha256: str = ""
+    bad: tuple[InputError, ...] = ()
+
+    def __len__(self) -> int:
+        return len(self.cells[0])
+
+    def __getitem__(self, name: str) -> Sequence[Any]:
+        return self.cells[self.names.index(name)]
+
+    def error(
+        self, found: str, expected: str, row: int | None = None, column: str | None = None
+    ) -> InputError:
+        """Make the error that names the file, and the row and column if there are any."""
+        if row is not None and self.lines is None:
+            return self.error(f"reading {row + 1}: {found}", expected, None, column)
+        line = None if row is None else self.lines[row]
+        return InputError(found, expected, path=self.path, line=line, column=column)
+
+    def header_error(self, found: str, expected: str, column: str | None = None) -> InputError:
+        """Make the error that names the header, and the column if it is one alone."""
+        return InputError(found, expected, path=self.path, line=self.header, column=column)
+
+    def without(self, patterns: Iterable[str]) -> Sheet:
+        """Leave out columns by name, in which * and ? stand for any letters.
+
+        Raises
+        ------
+        InputError
+            If no column has such a name, or none is left.
+        """
+        left = list(self.names)
+        for pattern in patterns:
+            if not any(fnmatchcase(name, pattern) for name in self.names):
+                raise self.header_error(
+                    f"no column '{pattern}'", nearest(pattern, list(self.names))
+                )
+            left = [name for name in left if not fnmatchcase(name, pattern)]
+        if not left:
+            raise self.header_error("no column that is not ignored", "a column to read")
+        cells = [self[name] for name in left]
+        return replace(self, names=tuple(left), cells=cells)
+
+    def rows(self, keep: Sequence[int]) -> Sheet:
+        """Some of the rows."""
+        lines = None if self.lines is None else [self.lines[row] for row in keep]
+        cells = [c[keep] if isinstance(c, np.ndarray) else [c[r] for r in keep] for c in self.cells]
+        return replace(self, cells=cells, lines=lines)
+
+    def good(self, check: Callable[[Sheet], object]) -> Sheet:
+        """Leave out the rows that a check of each row refuses, and keep what it said of them.
+
+        Raises
+        ------
+        InputError
+            If no row is left: the first that was wrong.
+        """
+        keep: list[int] = []
+        bad = list(self.bad)
+        waiting = [range(len(self))]
+        while waiting:
+            rows = waiting.pop()
+            try:
+                check(self.rows(rows))
+                keep += rows
+            except InputError as error:
+                if len(rows) == 1:
+                    found = re.sub(r"^reading 1:", f"reading {rows[0] + 1}:", error.found)
+                    bad.append(replace(error, found=found))
+                else:
+                    half = len(rows) // 2
+                    waiting += [rows[half:], rows[:half]]
+        if bad and not keep:
+            raise bad[0]
+        bad.sort(key=lambda error: error.line or 0)
+        return replace(self.rows(keep), bad=tuple(bad))
+
+    def numbers(
+        self,
+        name: str,
+        *,
+        blank: bool = False,
+        read: Callable[[Any], float] = float,
+        expected: str = "a number",
+    ) -> np.ndarray:
+        """Read a column of finite numbers.
+
+        Parameters
+        ----------
+        name : str
+            Its header.
+        blank : bool
+            Whether a cell may be blank; it is NaN then.
+        read : callable
+            From a cell to a number, or ValueError.
+        expected : str
+            What the cell should have been, for the message.
+
+        Raises
+        ------
+        InputError
+            Naming line and column of the first cell that is no number.
+        """
+        if isinstance(self[name], np.ndarray) and read is float and np.isfinite(self[name]).all():
+            return self[name].astype(float)
+        values = np.empty(len(self))
+        for row, cell in enumerate(self[name]):
+            try:
+                values[row] = np.nan if blank and cell == "" else read(cell)
+            except (ValueError, TypeError, OverflowError):
+                comma = " with a decimal point" if "," in str(cell) else ""
+                found = "an empty cell" if cell == "" else f"'{cell}'"
+                raise self.error(found, expected + comma, row, name) from None
+            if cell != "" and not np.isfinite(values[row]):
+                raise self.error(f"'{cell}'", "a finite number", row, name)
+        return values
+
+
+def columns_of(
+    sheet: Sheet,
+    quantities: Mapping[str, str],
+    other: Callable[[str], Column | None] = lambda header: None,
+) -> dict[str, Column]:
+    """Understand every header of a sheet.
+
+    Parameters
+    ----------
+    sheet : Sheet
+        The file.
+    quantities : mapping of str to str
+        Name of a column without its unit to the kind of unit it has, a key of `UNITS`; "" for a
+        pure number or a word.
+    other : callable
+        Understands further headers; gives None for those that nobody knows.
+
+    Returns
+    -------
+    dict of str to Column
+        By quantity.
+
+    Raises
+    ------
+    InputError
+        If a header or its unit is unknown, or a quantity stands twice.
+
+    Examples
+    --------
+    >>> sheet = Sheet("a.csv", ("size_x_mm",), [["0.1"]], [2], 1, ())
+    >>> columns_of(sheet, {"size_x": "length"})["size_x"].factor
+    0.001
+    """
+    found: dict[str, Column] = {}
+    for header in sheet.names:
+        said = spelled(header)
+        try:
+            column = _known(said, quantities, sheet) or other(said)
+        except InputError as error:
+            raise replace(error, column=header) from None
+        column = column and column._replace(header=header)
+        if column is None:
+            usual = [f"{q}_{next(iter(UNITS[k]))}" if k else q for q, k in quantities.items()]
+            raise sheet.header_error("an unknown column", nearest(header, usual), header)
+        if column.key in found:
+            twice = f"{column.key} also in column '{found[column.key].header}'"
+            expected = "one column for it, in one unit, and none twice"
+            raise sheet.header_error(twice, expected, header)
+        found[column.key] = column
+    return found
+
+
+def _known(header: str, quantities: Mapping[str, str], sheet: Sheet) -> Column | None:
+    """The column of a header NAME or NAME_UNIT."""
+    for whole in (header, header.lower()):
+        if quantities.get(whole) == "":
+            return Column(header, whole)
+    name, _, unit = header.rpartition("_")
+    if not (kind := quantities.get(name := name.lower())):
+        return None
+    units = UNITS[kind]
+    if unit not in units:
+        listed = ", ".join(u for u in units if u.isascii())
+        expected = f"one of {listed} at the end, such as {name}_{next(iter(units))}"
+        raise sheet.header_error(f"unknown unit '{unit}'", expected, header)
+    return Column(header, name, unit, units[unit])
+
+
+def left_out(sheet: Sheet) -> tuple[str, ...]:
+    """Count and name the rows that were left out, as a note."""
+    if not sheet.bad:
+        return ()
+    named = [
+        (f"line {e.line}, " if e.line else "")
+        + (f"column '{e.column}', " if e.column else "")
+        + e.found
+        for e in sheet.bad[:MOST_NAMED]
+    ]
+    more = len(sheet.bad) - len(named)
+    named += [f"{more} more"] if more else []
+    were = "was" if len(sheet.bad) == 1 else "were"
+    total = len(sheet) + len(sheet.bad)
+    return (f"{len(sheet.bad)} of {total} rows {were} left out: {'; '.join(named)}.",)
