@@ -2,7 +2,9 @@
 
 import math
 
+import numpy as np
 import pytest
+from scipy.stats import f
 
 from benchmarks.league.answers import Answer
 from benchmarks.league.honesty import drawn, measured
@@ -42,7 +44,26 @@ def test_beamfit_refuses_traps_that_a_plain_least_squares_answers():
 
 
 def test_one_side_of_the_waist_is_not_answered_by_its_own_scatter():
-    """A draw the league found: 1.43 ± 0.13 µm of a beam of 1 µm, 4.4 errors from none."""
-    fit = beamfit_fit(drawn("scans", "traps", "one side, 5 %, no errors", 71)).x
+    """A draw the league found: 1.52 ± 0.12 µm of a beam of 1 µm, 5.1 errors from none."""
+    fit = beamfit_fit(drawn("scans", "traps", "one side, 5 %, no errors", 28)).x
     assert fit.status == "unidentified"
     assert "on one side of the waist" in fit.message
+
+
+def test_two_wild_neighbours_are_found_where_each_hides_the_other():
+    """1.31 ± 0.09 µm of 1 µm; how likely, against fits of size² without each two of the points."""
+    fit = beamfit_fit(drawn("scans", "traps", "two outliers of ten, no errors", 92))
+    p = fit.x.points
+    rows = np.stack([p.r11**2, 2 * p.r11 * p.r12, p.r12**2], 1) / (p.weighed * p.error)[:, None]
+    squares = p.size**2 / (p.weighed * p.error)
+
+    def chi2(left_out=()):
+        kept = np.delete(np.arange(10), left_out)
+        return np.linalg.lstsq(rows[kept], squares[kept], rcond=None)[1][0]
+
+    least = min(chi2([i, i + 1]) for i in range(9))
+    chance = 9 * f.sf((chi2() / least - 1) * 5 / 2, 2, 5)
+    assert fit.x.status == "poor_fit"
+    assert "Q = 6.492 1/m² and Q = 7.477 1/m²" in fit.x.message
+    assert f"(probability {chance:.1g})" in fit.x.message
+    assert fit.x.emittance.value > 1.25e-6 / 264.2  # what it would have said

@@ -11,9 +11,10 @@ from scipy.special import fdtrc
 from beamfit.statistics import POOR_FIT, chi2_probability
 from beamfit.studies.scan.scans import QuadScan
 
-# Noise without errors in the file: a guess of 5 % of the size, worth two degrees of freedom, so
-# that a few accidentally small residuals are not taken for precision, nor equal sizes for none.
-GUESS, GUESS_DOF = 0.05, 2.0
+# Noise without errors in the file: a guess of 7 % of the size, worth 2.5 degrees of freedom, so
+# that a few accidentally small residuals are not taken for precision, nor equal sizes for none. A
+# guess of 5 % worth 2 left 2 % of scans of 5 and 6 points with 10 % of noise beyond 3 errors.
+GUESS, GUESS_DOF = 0.07, 2.5
 # A setting's own scatter counts beside this many degrees of freedom of all settings' together.
 POOL_DOF = 20.0
 # With fewer repeats in all, or points, nothing is told of their kind.

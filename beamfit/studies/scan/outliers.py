@@ -11,7 +11,7 @@ from scipy.special import expit, fdtrc
 
 from beamfit.statistics import POOR_FIT
 from beamfit.studies.scan.model import coefficients, size_squared
-from beamfit.studies.scan.noise import DOUBTFUL, Noise
+from beamfit.studies.scan.noise import DOUBTFUL, ENOUGH_POINTS, Noise
 from beamfit.studies.scan.results import Points
 from beamfit.studies.scan.sigma import SigmaFit, error_at, fit_sizes
 
@@ -25,11 +25,11 @@ class Influence(NamedTuple):
     Attributes
     ----------
     outlier : str
-        Where the one point lies without which the others agree; empty if there is no such point.
+        The one point, or two neighbours, without which the others agree; empty if there is none.
     without : float
         Probability of the others' χ², where errors are known.
     chance : float
-        How often noise puts some point so far from the others.
+        How often noise puts some point, or two neighbours, so far from the others.
     carrying : str
         Where the point lies without which the emittance moves most, if it moves far.
     shift : float
@@ -67,7 +67,8 @@ def influence_of(p: Points, noise: Noise, sigma: np.ndarray, error: float) -> In
     changes σ by -(AᵀA)⁻¹ a_i r_i/(1 - h_i) and χ² by -r_i²/(1 - h_i): R. D. Cook and S. Weisberg,
     Residuals and Influence in Regression (1982), eqs. 2.2.3 and 2.2.8. That χ² over the others'
     χ²/dof is distributed as F(1, dof) (the externally studentised residual); of n points the
-    largest is asked for, so its probability counts n times.
+    largest is asked for, so its probability counts n times. Two neighbours that are off to one
+    side hide each other; left out together they leave r_Kᵀ(1 - H_KK)⁻¹r_K less, F(2, dof - 2).
     """
     n = len(p.size)
     scale = 0.5 / (p.weighed * p.error)
@@ -83,16 +84,34 @@ def influence_of(p: Points, noise: Noise, sigma: np.ndarray, error: float) -> In
     without = noise.probability(float(rest[worst]), dof - 1)
     spoiled = noise.poor(chi2, dof) if noise.known else chance < POOR_FIT
     single = spoiled and (without is None or without > DOUBTFUL)
+    outlier = f"the point at {p.where(worst)}" if single else ""
+    if not (noise.known or single or n < ENOUGH_POINTS):
+        pair, rare = _neighbours(np.argsort(np.arctan2(p.r12, p.r11) % math.pi), q, left)
+        if rare < DOUBTFUL:
+            chance, outlier = rare, f"the points at {p.where(pair[0])} and {p.where(pair[1])}"
     shifts = _shifts(sigma, np.linalg.solve(r, q.T).T * (left / free)[:, None], error)
     most = int(np.argmax(np.where(np.isnan(shifts), np.inf, np.abs(shifts))))
     carries = not abs(shifts[most]) <= CARRIES and not (single and most == worst)
     return Influence(
-        outlier=p.where(worst) if single else "",
+        outlier=outlier,
         without=math.nan if without is None else without,
         chance=chance,
         carrying=p.where(most) if carries else "",
         shift=float(shifts[most]),
     )
+
+
+def _neighbours(
+    order: np.ndarray, q: np.ndarray, left: np.ndarray
+) -> tuple[tuple[int, int], float]:
+    """The two neighbours that lie farthest off, and how often noise puts some two there."""
+    i, j, dof = order[:-1], order[1:], len(left) - 5
+    a, b, c = (np.sum(q[k] * q[m], axis=1) for k, m in ((i, i), (j, j), (i, j)))
+    falls = left[i] ** 2 * (1 - b) + left[j] ** 2 * (1 - a) + 2 * left[i] * left[j] * c
+    falls /= np.maximum((1 - a) * (1 - b) - c**2, 1e-12)
+    most = int(np.argmax(falls))
+    ratio = falls[most] / max(float(left @ left) - falls[most], 1e-30) * dof / 2
+    return (int(i[most]), int(j[most])), min(len(i) * float(fdtrc(2, dof, ratio)), 1.0)
 
 
 def _shifts(sigma: np.ndarray, moves: np.ndarray, error: float) -> np.ndarray:

@@ -159,8 +159,8 @@ def _lost(e: Evidence) -> str | None:
         return None
     if e.influence.outlier:
         return (
-            f"the sizes follow no beam with the point at {e.influence.outlier}, and do without it; "
-            "measure it again, or give it little weight with --robust"
+            f"the sizes follow no beam with {e.influence.outlier}, and do without; measure again, "
+            "or fit with --robust"
         )
     return (
         f"the sizes follow no beam through this line, the best one misses them by "
@@ -246,7 +246,7 @@ def _poor(e: Evidence) -> Finding | None:
     blame = "Check how the sizes are taken from the profile, their errors, and the lattice."
     if e.influence.outlier:
         blame = (
-            f"Without the point at {e.influence.outlier} the rest fits (probability "
+            f"Without {e.influence.outlier} the rest fits (probability "
             f"{e.influence.without:.1g}): measure it again, or fit with --robust."
         )
     return Finding(
@@ -258,14 +258,14 @@ def _poor(e: Evidence) -> Finding | None:
 
 
 def _one_refutes(e: Evidence) -> Finding | None:
-    """Sizes without errors have no χ² to be poor by, but one of them can refute the others."""
+    """Sizes without errors have no χ² to be poor by, but one or two can refute the others."""
     if e.noise_known or not e.influence.outlier:
         return None
     return Finding(
         Status.poor_fit,
-        f"Poor fit: the point at {e.influence.outlier} lies farther from what the others say than "
-        f"their scatter allows (probability {e.influence.chance:.1g}) and spoils value and errors. "
-        f"Measure it again, or fit with --robust. {_clear(e)}.",
+        f"Poor fit: by their scatter the other points leave no room for {e.influence.outlier} "
+        f"(probability {e.influence.chance:.1g}), which spoils value and errors. Measure again, or "
+        f"fit with --robust. {_clear(e)}.",
     )
 
 
