@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 from scipy.stats import f
 
+from beamfit.studies.decay.systematics import about_fit
 from benchmarks.league.answers import Answer
+from benchmarks.league.decay_tools import beamfit_fits, told
 from benchmarks.league.honesty import drawn, measured
 from benchmarks.league.scan_tools import beamfit_fit
 
@@ -22,6 +24,8 @@ from benchmarks.league.scan_tools import beamfit_fit
         (Answer(1.2, 0.3), 0.0, True),
         (Answer(20.0, 1.0), math.inf, True),  # a lifetime of no decay
         (Answer(20.0, 15.0), math.inf, False),
+        (Answer(1.5, 0.01, 0.2), 1.0, False),  # its interval reaches down to the truth
+        (Answer(1.5, 0.01, 0.2), 2.0, True),
     ],
 )
 def test_confident_and_wrong_is_beyond_three_errors_and_a_tenth(answer, truth, wrong):
@@ -67,3 +71,24 @@ def test_two_wild_neighbours_are_found_where_each_hides_the_other():
     assert "Q = 6.492 1/m² and Q = 7.477 1/m²" in fit.x.message
     assert f"(probability {chance:.1g})" in fit.x.message
     assert fit.x.emittance.value > 1.25e-6 / 264.2  # what it would have said
+
+
+def test_b_is_not_claimed_where_the_bunch_may_lengthen_unseen():
+    """A third of a lifetime with a as I^-0.3: b comes out at 7.5e-6 ± 0.2 % 1/s, truth 5e-6."""
+    for name, asked in (
+        ("bunches lengthen, a third of a lifetime", True),
+        ("6 h, 400 readings", False),
+    ):
+        kind = "hidden" if asked else "good"
+        case = drawn("decays", kind, name, 3)
+        fit = beamfit_fits(case)[0]
+        about = about_fit(fit)  # of b for a bunch that lengthens as it can most
+        reach = about.moved(-about.rows[:, 3] / 3).b
+        low, high = fit.b.interval_95
+        assert fit.status == "converged"
+        assert ("which this record cannot tell" in fit.message) is asked
+        assert fit.b.value - low == pytest.approx(high - fit.b.value + asked * reach)
+        assert fit.b.error < 0.003 * fit.b.value
+        assert not any(
+            answer.wrong(case.b) for name, answer in told(case).items() if name[0] == "b"
+        )

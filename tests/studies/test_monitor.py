@@ -41,8 +41,12 @@ def test_errors_with_a_stated_stability_cover_the_truth():
         off = np.array([abs(q.value - value) / q.error for q in found])
         assert 0.60 < np.mean(off < 1) < 0.76, name
         assert 0.92 < np.mean(off < 1.96) < 0.98, name
-        inside = [q.interval_95[0] < value < q.interval_95[1] for q in found]
-        assert 0.92 < np.mean(inside) < 0.98, name
+        above, below = np.mean(
+            [[q.interval_95[0] > value, q.interval_95[1] < value] for q in found], 0
+        )
+        # A bunch that lengthens unseen would make a larger and b smaller: farther to that side.
+        assert 0.005 < above < 0.045 if name != "b" else above == 0, name
+        assert 0.005 < below < 0.045 if name != "a" else below == 0, name
     blind = np.array([abs(fit.b.value - B) / fit.b.error_raw for fit in fits])
     assert np.mean(blind < 1.96) < 0.5
 

@@ -17,6 +17,7 @@ from beamfit.shown import shown
 from beamfit.statistics import reach_of
 from beamfit.status import Status
 from beamfit.studies.decay.departures import (
+    FOUND,
     Change,
     ConstantA,
     LifetimeLaw,
@@ -55,6 +56,9 @@ NUMBERS = 3
 NORMAL = 1.96
 # Of so few readings the noise tells nothing of its memory.
 FEWEST = 12
+# The power by which a falls with the current for a bunch that lengthens as it can most, and the
+# share of b from which it matters that the record would not show it.
+LENGTHENING, MATTERS = -1 / 3, 0.1
 
 
 @shown
@@ -99,6 +103,7 @@ class Weighed:
     separability: Separability
     change: Change | None = None
     outgassing: Outgassing | None = None
+    bent: Physical | None = None
 
     def scaled(self, name: str) -> tuple[float, float]:
         """A value and its error."""
@@ -112,7 +117,12 @@ class Weighed:
         if not known or not math.isfinite(error):
             return Quantity(value, None, UNITS[name])
         reach, raw = (float(getattr(part, name)) for part in (self.reach, self.raw))
-        return Quantity.reaching(value, error, UNITS[name], raw, reach)
+        found = Quantity.reaching(value, error, UNITS[name], raw, reach)
+        if self.bent is None or name == "i0":
+            return found
+        bent = float(getattr(self.bent, name))
+        interval = value - reach - max(bent, 0.0), value + reach - min(bent, 0.0)
+        return replace(found, interval_95=interval)
 
     def lifetime(self, name: str, known: bool) -> Quantity:
         """Lifetime in hours from a loss rate; no error where the rate is not clear of zero."""
@@ -304,6 +314,19 @@ class Evidence(Weighed):
         if self.changed or self.constant_a.status is Status.poor_fit:
             return True
         return any(value < -BELIEVED * error for value, error in map(self.scaled, "ab"))
+
+    @cached_property
+    def bent(self) -> Physical | None:
+        """What bunches that lengthen with the current would have added to the values, where the
+        record would not show them and b moves by more than its error.
+        """
+        seen = FOUND * (self.constant_a.exponent.error or math.inf) < -LENGTHENING
+        if self.shape is not None or seen or self.refuted or not self.separability.separable:
+            return None
+        about = expanded(self.record, self.solution.values)
+        moved = about.moved(LENGTHENING * about.rows[:, NUMBERS])
+        least = max(MATTERS * abs(self.values.b), self.reach.b)
+        return moved if abs(moved.b) > least else None
 
     @cached_property
     def lifetimes(self) -> LifetimeLaw | None:

@@ -168,9 +168,18 @@ def _determined(e: Weighed | TableEvidence) -> Finding:
     return Finding(Status.converged, f"{clear}{limits}")
 
 
+def _by_length(e: Evidence) -> Finding | None:
+    """What rests on a bunch length that the record does not show to be constant."""
+    if e.bent is None:
+        return None
+    found = _determined(e)
+    said = "if the bunch length does not change with the current, which this record cannot tell"
+    return found._replace(cause=f"{found.cause}, {said}")
+
+
 NEGATIVE = (partial(_negative, "b", NOT_GAS), partial(_negative, "a", RISING))
 RULES = (_lost, *NEGATIVE, _within_noise, _stepped, _refuted)
-RULES += (_inseparable, _improbable, _determined)
+RULES += (_inseparable, _improbable, _by_length, _determined)
 
 
 def _narrow(e: TableEvidence) -> Finding | None:
