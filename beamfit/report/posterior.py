@@ -14,8 +14,9 @@ from matplotlib.ticker import MaxNLocator, NullLocator
 
 from beamfit.report.document import BLUE, MANY, Page, Picture, Verdict, legend_below
 from beamfit.report.scan_pictures import COLOUR, setting_axis
+from beamfit.sampling.intervals import Expected, in_unit
 from beamfit.sampling.likelihood import noise_words
-from beamfit.sampling.posterior import Expected, Posterior, in_unit
+from beamfit.sampling.posterior import Posterior
 from beamfit.studies.decay.fit import DecayFit
 from beamfit.studies.decay.posterior import expected_current
 from beamfit.studies.scan.fit import EmittanceFit

@@ -17,7 +17,8 @@ from beamfit.greybox.posterior import Optimum, Sampled, Statement, target_of
 from beamfit.greybox.problem import Free, Prior, Problem, Record
 from beamfit.lifetime.decay import HOUR, current
 from beamfit.quantity import Quantity
-from beamfit.sampling.posterior import Expected, Posterior
+from beamfit.sampling.intervals import Expected
+from beamfit.sampling.posterior import Posterior
 from beamfit.sampling.priors import Distribution
 from beamfit.sampling.target import Target
 from beamfit.status import Status

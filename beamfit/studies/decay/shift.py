@@ -18,7 +18,8 @@ from beamfit.lifetime.decay import HOUR
 from beamfit.lifetime.losses import MECHANISMS, scaled_losses, scaled_parts
 from beamfit.lifetime.ring import Operation
 from beamfit.quantity import Quantity, Status
-from beamfit.sampling.posterior import Interval, Posterior
+from beamfit.sampling.intervals import Interval
+from beamfit.sampling.posterior import Posterior
 from beamfit.shown import shown
 from beamfit.studies.decay.fit import bare
 from beamfit.studies.decay.held_back import HeldBack, predict_held_back

@@ -15,7 +15,8 @@ from beamfit.greybox.posterior import Optimum, Statement, predicted, target_of
 from beamfit.greybox.problem import Problem
 from beamfit.optics.beam import BeamMatrix
 from beamfit.quantity import Status
-from beamfit.sampling.posterior import Expected, Posterior
+from beamfit.sampling.intervals import Expected
+from beamfit.sampling.posterior import Posterior
 from beamfit.sampling.priors import Distribution
 from beamfit.sampling.target import Target
 from beamfit.studies.scan.assumptions import Assumptions

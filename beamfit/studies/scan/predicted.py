@@ -11,7 +11,7 @@ import numpy as np
 
 from beamfit.errors import InputError, nearest
 from beamfit.optics.rows import seen_line
-from beamfit.sampling.posterior import Correlations
+from beamfit.sampling.intervals import Correlations
 from beamfit.shown import shown
 from beamfit.studies.scan.model import coefficients, emittance_parts, predict_sizes, size_squared
 from beamfit.studies.scan.results import PlaneFit
