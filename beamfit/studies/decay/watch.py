@@ -165,7 +165,7 @@ class State(NamedTuple):
     settings : Conditions
         Last ones read, in SI.
     highest, noise, due : float
-        Current of the window and noise of a row, mA; when to fit, s.
+        Highest current of the window and noise of a reading, mA; when to fit, s.
     counts, events, course, answer
         What happened, with its time; what was found.
     alarm : Alarmed or None
@@ -328,7 +328,7 @@ def _closed(plan: Plan, state: State) -> State:
     if not count:
         return state
     row = Row(state.piece, begin + times / count, currents / count, state.settings)
-    state = state._replace(rows=(*state.rows, row), sums=(0, 0.0, 0.0, 0.0))
+    state = state._replace(rows=(*state.rows[1 - 2 * ROWS :], row), sums=(0, 0.0, 0.0, 0.0))
     return state if state.alarm is None else _watched(plan, state, state.alarm, row)
 
 
@@ -363,8 +363,14 @@ def _answered(plan: Plan, state: State) -> State:
         alarm=learnt or state.alarm,
         alarms=tuple(a for a in state.alarms if (a.told or a.time) >= begin - shift),
         highest=max((row.current for row in state.rows), default=0.0),
-        noise=state.noise if fit is None else max(fit.rms_residual, BEST_MONITOR * answer.current),
+        noise=state.noise if fit is None else _noise_of_one(plan, state, fit.rms_residual),
     )
+
+
+def _noise_of_one(plan: Plan, state: State, noise: float) -> float:
+    """Of a reading, from that of a row."""
+    readings = max(1.0, plan.window / ROWS / max(state.interval, 1e-6))
+    return max(noise * math.sqrt(readings), BEST_MONITOR * state.highest)
 
 
 def _answer(plan: Plan, state: State, window: Window) -> Answer:
