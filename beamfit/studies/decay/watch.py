@@ -8,19 +8,18 @@ from __future__ import annotations
 import math
 from typing import Any, NamedTuple
 
-import numpy as np
-
 from beamfit.errors import InputError
 from beamfit.lifetime.decay import HOUR
-from beamfit.lifetime.losses import added, loss_coefficients, terms_of
+from beamfit.lifetime.losses import loss_coefficients
 from beamfit.quantity import Quantity, Status
 from beamfit.studies.decay import alarm
 from beamfit.studies.decay.evidence import UNITS
 from beamfit.studies.decay.fit import bare
-from beamfit.studies.decay.record import PLAUSIBLE, Conditions, DecayRecord
+from beamfit.studies.decay.record import PLAUSIBLE, Conditions
 from beamfit.studies.decay.segments import DEAD, DROPOUT
-from beamfit.studies.decay.study import Budget, Machine, budget, operation_during
-from beamfit.studies.decay.trend import BEST_MONITOR, WANDER
+from beamfit.studies.decay.study import Machine, budget
+from beamfit.studies.decay.trend import BEST_MONITOR
+from beamfit.studies.decay.usual import Alarmed, followed, learnt
 from beamfit.studies.decay.window import Row, Window, fit_window
 from beamfit.table import json_of
 
@@ -29,16 +28,8 @@ CURRENT = "beam_current"
 ROWS = 4096
 # So many readings in a row, each older than the newest before them, are of a clock set back.
 LATE = 5
-# A reading off the others of its row by so many of their errors begins a new one: a refill.
+# A reading above the others of its row by so many of its errors begins a new one: a refill.
 JUMP = 6.0
-# a and b so well known are the usual ones; errors half as large replace them before an alarm.
-KNOWN = 0.05
-# Where readings do not tell a from b, the ring's own shares of them are trusted to this.
-SHARES = 0.3
-# Settings, and the current, that moved by more than this share are given to the ring anew.
-MOVED = 0.01
-# What the ring is expected to lose follows its settings over so long, s, and steps at once.
-SMOOTH = 300.0
 # Events and points of the course that are kept.
 EVENTS, POINTS = 20, 360
 RULE = (
@@ -125,27 +116,6 @@ class Answer(NamedTuple):
         }
         more = {"normalised": self.normalised or bare(None, "mA h"), "decays": self.window.pieces}
         return fit | json_of(named | more)
-
-
-class Terms(NamedTuple):
-    """A ring's terms, the settings they are for, and the a and b they make."""
-
-    place: np.ndarray
-    parts: tuple[Any, ...]
-    losses: np.ndarray
-
-
-class Alarmed(NamedTuple):
-    """The alarm at work: the usual loss, what the ring loses now and lost where that was found,
-    what is expected now over then, and since when an alarm is raised.
-    """
-
-    usual: alarm.Reference
-    state: alarm.State
-    ring: Terms | None = None
-    losses: np.ndarray | None = None
-    expected: tuple[float, float] = (1.0, 1.0)
-    raised: float | None = None
 
 
 class State(NamedTuple):
@@ -313,8 +283,8 @@ def _placed(plan: Plan, state: State, own: float, value: float) -> State:
     if state.dead >= DEAD:
         state = noted(state, time, "beam again")
     count, begin, times, currents = state.sums
-    off = count and abs(value - currents / count) > JUMP * state.noise
-    if count and (off or own - begin >= plan.window / ROWS):
+    refilled = count and value - currents / count > JUMP * state.noise
+    if count and (refilled or own - begin >= plan.window / ROWS):
         state = _closed(plan, state)
         count, times, currents = 0, 0.0, 0.0
     begin = begin if count else own
@@ -353,14 +323,13 @@ def _answered(plan: Plan, state: State) -> State:
     course = tuple(p for p in state.course if p.time >= begin - shift)
     if not course or point.time - course[-1].time >= plan.window / POINTS:
         course = (*course, point)
-    current = plan.current or (window.fit and window.fit.mean_current)
-    learnt = None if window.fit is None else _learnt(plan._replace(current=current), state, window)
     fit = window.fit
+    usual = None if state.alarms else learnt(state.alarm, window, state.rows, plan.machine)
     return state._replace(
         answer=answer,
         course=course,
         due=state.last + plan.every,
-        alarm=learnt or state.alarm,
+        alarm=usual or state.alarm,
         alarms=tuple(a for a in state.alarms if (a.told or a.time) >= begin - shift),
         highest=max((row.current for row in state.rows), default=0.0),
         noise=state.noise if fit is None else _noise_of_one(plan, state, fit.rms_residual),
@@ -408,99 +377,9 @@ def _normalised(plan: Plan, window: Window, lifetime: Quantity) -> Quantity:
     return Quantity(by * lifetime.value, by * lifetime.error, "mA h")
 
 
-def _learnt(plan: Plan, state: State, window: Window) -> Alarmed | None:
-    """The usual loss where this fit is the first that tells it, or tells it twice as well."""
-    before, fit = state.alarm, window.fit
-    usual = None
-    if window.readings.gauge is not None:  # its a is without gas, its b of no moment
-        return None
-    if fit.status is Status.converged and min(fit.a.value, fit.b.value) > 0:
-        pair = (fit.a, fit.b) if None not in (fit.a.error, fit.b.error) else ()
-        usual = _reference(state, window, *pair) if pair else None
-    elif plan.machine is not None and fit.lifetime_mean.error is not None:
-        usual = _shared(plan, state, window)
-    if usual is None:
-        return None
-    error = math.sqrt(np.trace(usual.covariance))
-    if before is not None:
-        known = math.sqrt(np.trace(before.usual.covariance))
-        if before.raised is not None or state.alarms or not error < known / 2:
-            return None
-    if plan.machine is None:
-        return Alarmed(usual, alarm.started(usual))
-    ring = _terms(plan, None, state.settings, state.rows[-1].current)  # what the gauge shows now
-    return Alarmed(usual, alarm.started(usual), ring, ring.losses)
-
-
-def _reference(state: State, window: Window, a: Quantity, b: Quantity) -> alarm.Reference | None:
-    """The a and b of a fit, where both are well known."""
-    errors = np.array([a.relative, b.relative])
-    if not errors.max() < KNOWN:
-        return None
-    correlation = window.fit.identifiability.correlation or 0.0
-    covariance = np.outer(errors, errors) * [[1.0, correlation], [correlation, 1.0]]
-    return _usual(state, window.fit, a.value, b.value, covariance)
-
-
-def _shared(plan: Plan, state: State, window: Window) -> alarm.Reference | None:
-    """The loss rate of a fit, with the ring's shares of a and b; how it is shared may be off."""
-    lifetime = window.fit.lifetime_mean
-    if not lifetime.relative < KNOWN:
-        return None
-    try:
-        expected: Budget = budget(window.readings, plan.machine)
-    except InputError:
-        return None
-    by = expected.lifetime / lifetime.value
-    a, b = (by * float(part) for part in (expected.losses.a, expected.losses.b))
-    share = a * expected.current / (a * expected.current + b)
-    apart = SHARES * np.array([1 - share, -share])
-    covariance = np.outer(apart, apart) + lifetime.relative**2 * np.eye(2)
-    return _usual(state, window.fit, a, b, covariance)
-
-
-def _usual(
-    state: State, fit: Any, a: float, b: float, covariance: np.ndarray
-) -> alarm.Reference | None:
-    rows = fit.rms_residual * math.sqrt(len(fit.residuals) / fit.dof)
-    noise = max(rows, BEST_MONITOR * fit.mean_current)
-    apart = float(np.median(np.diff([row.time for row in state.rows])))
-    known = covariance + WANDER**2 * np.eye(2)
-    return alarm.Reference(a, b, noise, fit.correlation_time or 0.0, apart, known)
-
-
-def _terms(plan: Plan, before: Terms | None, settings: Conditions, current: float) -> Terms:
-    """What the ring loses at some settings; anew but for the pressure where they have moved."""
-    at = Conditions(*(None if math.isnan(value) else [value, value] for value in settings))
-    moment = DecayRecord([0.0, 1.0], [current, current * (1 - 1e-6)], conditions=at)
-    operation = operation_during(moment, plan.machine)
-    place = np.array([current, *settings._replace(pressure=0.0)])
-    parts = before and before.parts
-    if not parts or not np.allclose(place, before.place, rtol=MOVED, atol=0.0, equal_nan=True):
-        parts = terms_of(plan.machine.ring, operation, current)
-    else:
-        place = before.place
-    losses = added(parts, operation.pressure_base, operation.pressure_slope)
-    return Terms(place, parts, np.array([losses.a, losses.b], float))
-
-
-def _expected(plan: Plan, known: Alarmed, row: Row, apart: float) -> Alarmed:
-    """With what the ring loses now; the noise of a gauge would bend the course of the current."""
-    if known.ring is None:
-        return known
-    try:
-        ring = _terms(plan, known.ring, row.settings, row.current)
-    except InputError:  # settings at which the ring stores no beam are none
-        return known
-    new, old = ring.losses / known.losses, np.array(known.expected)
-    share = 1.0 if np.abs(new / old - 1).max() > alarm.SET else min(apart / SMOOTH, 1.0)
-    a, b = old + share * (new - old)
-    return known._replace(ring=ring, expected=(float(a), float(b)))
-
-
 def _watched(plan: Plan, state: State, known: Alarmed, row: Row) -> State:
     """A row seen by the alarm."""
-    known = _expected(plan, known, row, row.time - state.rows[-2].time)
+    known = followed(known, row, row.time - state.rows[-2].time, plan.machine)
     reading = alarm.Reading(row.time, row.current, *known.expected)
     after, told = alarm.watched(known.usual, known.state, reading)
     raised = row.time if told.raised else known.raised
