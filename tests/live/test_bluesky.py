@@ -1,6 +1,7 @@
 """The scan as a plan of bluesky, its devices on a real IOC."""
 
 import asyncio
+import re
 import threading
 from collections.abc import Callable
 from dataclasses import replace
@@ -17,9 +18,10 @@ from ophyd_async.plan_stubs import ensure_connected
 from beamfit.errors import InputError
 from beamfit.io.line import build_line
 from beamfit.io.machine import ScanMachine, read_scan_machine
-from beamfit.live.bluesky import ScreenDevice, devices_of, emittance_scan
+from beamfit.live.bluesky import emittance_scan
 from beamfit.live.devices import NoSizesError
 from beamfit.live.journal import read_journal
+from beamfit.live.ophyd import ScreenDevice, devices_of
 from tests.live.faulty import Injector
 from tests.live.simulated import written
 
@@ -178,3 +180,24 @@ def test_another_unit_is_refused_when_a_magnet_is_connected(ioc, engine, tmp_pat
     machine = read_scan_machine(written(tmp_path, change=("SIM:Q1:READ", "SIM:SCREEN:X")))
     with pytest.raises(Exception, match="'SIM:SCREEN:X' in 'um'; expected T_per_m"):
         engine(ensure_connected(*devices_of(machine)[0].values()))
+
+
+def test_every_block_of_the_page_gives_what_stands_beside_it(ioc, root, tmp_path, monkeypatch):
+    page = (root / "docs/live_adapters.md").read_text()
+    files = re.findall(r"```toml\n(.*?)```", page, re.DOTALL)
+    for name, text in zip(("line.toml", "machine.toml"), files, strict=True):
+        (tmp_path / name).write_text(text)
+    monkeypatch.chdir(tmp_path)
+    engines, said = [], []
+
+    def made(**how):
+        engines.append(RunEngine(context_managers=[], **how))
+        return engines[-1]
+
+    monkeypatch.setattr("bluesky.RunEngine", made)
+    names = {"print": lambda *words: said.append(" ".join(map(str, words)))}
+    for block in re.findall(r"```python\n(.*?)```", page, re.DOTALL):
+        exec(block, names)
+    closed(*engines)
+    assert said == re.findall(r"^print\(.*\)  # (.*)$", page, re.MULTILINE)
+    assert len(said) == 5
