@@ -212,7 +212,8 @@ class Variable:
 
     async def _asked(self, answer: Awaitable[Any]) -> Any:
         try:
-            return await asyncio.wait_for(answer, self.timeout)
+            async with asyncio.timeout(self.timeout):  # wait_for of 3.11 may lose a cancel
+                return await answer
         except TimeoutError:
             found = f"no answer from '{plain(self.name)}' within {self.timeout:g} s"
             expected = "a variable within reach; is its IOC up, and EPICS_CA_ADDR_LIST right?"

@@ -164,7 +164,8 @@ class ScreenShots:
     async def _of_plane(self, plane: str) -> list[tuple[float, float]]:
         kept: list[tuple[float, float]] = []
         try:
-            await asyncio.wait_for(self._collect(self.channels[plane], kept), self._patience)
+            async with asyncio.timeout(self._patience):
+                await self._collect(self.channels[plane], kept)
         except TimeoutError:
             found = f"{len(kept)} of {self.profiler.shots} new shots of {plane} in time"
             expected = f"one at least every {self.profiler.timeout:g} s; are the time stamps new?"
