@@ -6,10 +6,13 @@ import numpy as np
 import pytest
 
 from beamfit.lifetime.losses import loss_coefficients
+from beamfit.studies.decay.usual import learnt
 from beamfit.studies.decay.watch import CURRENT, Plan, State, stepped
+from beamfit.studies.decay.window import Row, fit_window
 from tests.studies.test_alarm import beam_after
 
 A, B, NOISE, START = 3.7e-8, 9.26e-6, 5e-4, 1.7e9
+UNREAD = State().settings
 PLAN = Plan(window=3600.0, every=600.0)
 
 
@@ -86,14 +89,20 @@ def test_a_fast_monitor_needs_no_more_memory():
 
 
 def test_without_a_beam_there_is_no_lifetime():
-    state = watch(decay(1200))
+    state = watch(decay(2000))
     assert state.answer.lifetime.error < 0.01
-    state = watch(((1200.0 + 8 * k, 0.01 * (-1) ** k) for k in range(200)), state=state)
+    state = watch(((2000.0 + 8 * k, 0.01 * (-1) ** k) for k in range(200)), state=state)
     answer = state.answer.to_json()
     assert answer["message"] == "No lifetime: no beam."
     assert answer["status"] == "unidentified"
     assert {answer[name]["value"] for name in ("lifetime_mean", "a", "b", "normalised")} == {None}
     assert [text for _, text in state.events] == ["the beam was lost"]
+    # Two windows later it is back: nothing is left of the first.
+    state = watch(((time + 9200, beam) for time, beam in decay(800, seed=7)), state=state)
+    assert state.answer.lifetime.error < 0.01
+    assert state.rows[0].time >= START + 9200
+    assert state.alarm is not None
+    assert [text for _, text in state.events][-1] == "beam again"
 
 
 def test_a_pressure_that_the_gauge_shows_is_no_alarm_and_is_normalised(machine):
@@ -117,3 +126,24 @@ def test_a_pressure_that_the_gauge_shows_is_no_alarm_and_is_normalised(machine):
     (fresh, first), (gassy, second) = found
     assert gassy < 0.9 * fresh
     assert second == pytest.approx(first, rel=0.02)
+
+
+def test_under_top_up_the_ring_shares_the_loss_and_without_it_nothing_is_usual(machine):
+    """At one current readings tell the loss rate alone: 1.1 of what first principles say."""
+    loss = loss_coefficients(*machine, 500.0)
+    a, b = 1.1 * float(loss.a), 1.1 * float(loss.b)
+    time, beam, random, rows = np.arange(0.0, 3600.0, 4.0), 500.0, np.random.default_rng(6), []
+    for now in time:
+        beam = 500.0 if now % 120 == 0 else float(beam_after(beam, 4.0, a, b))
+        rows.append(Row(0, START + now, beam + NOISE * random.normal(), UNREAD))
+    window = fit_window(rows, "ring")
+    assert window.fit.status == "unidentified"
+    assert learnt(None, window, rows, None) is None
+    usual = learnt(None, window, rows, machine).usual
+    rate = a * 500 + b
+    assert usual.a * 500 + usual.b == pytest.approx(rate, rel=2e-3)
+    assert usual.a == pytest.approx(a, rel=2e-3)
+    share = a * 500 / rate
+    total, apart = np.array([share, 1 - share]), np.array([1.0, -1.0])
+    assert total @ usual.covariance @ total < 0.01**2
+    assert apart @ usual.covariance @ apart > 0.25**2

@@ -380,7 +380,8 @@ def alarm_of(raised: float, told: Told, at: float | None) -> Alarm:
         Quantity(float(v), float(e), "1") if name in moved.split() else None
         for name, v, e in zip("ab", told.change, told.error, strict=True)
     )
-    return Alarm(raised, float(told.since), at, moved, a, b)
+    # Time is not counted at refills: a change seems to begin late by them.
+    return Alarm(raised, min(float(told.since), raised), at, moved, a, b)
 
 
 def when(time: float, dated: bool) -> str:

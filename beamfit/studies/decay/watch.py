@@ -379,7 +379,8 @@ def _normalised(plan: Plan, window: Window, lifetime: Quantity) -> Quantity:
 
 def _watched(plan: Plan, state: State, known: Alarmed, row: Row) -> State:
     """A row seen by the alarm."""
-    known = followed(known, row, row.time - state.rows[-2].time, plan.machine)
+    apart = row.time - state.rows[-2].time if len(state.rows) > 1 else 0.0
+    known = followed(known, row, apart, plan.machine)
     reading = alarm.Reading(row.time, row.current, *known.expected)
     after, told = alarm.watched(known.usual, known.state, reading)
     raised = row.time if told.raised else known.raised
@@ -389,10 +390,10 @@ def _watched(plan: Plan, state: State, known: Alarmed, row: Row) -> State:
     if not told.moved:
         return state
     found = alarm.alarm_of(raised, told, row.time)
-    found = found._replace(
-        **{n: getattr(found, n) - state.shift for n in ("time", "since", "told")}
-    )
-    state = _kept(noted(state, found.told, f"alarm: {found.said(True)}"), float(told.since))
+    state = _kept(state, found.since)
+    shown = {n: getattr(found, n) - state.shift for n in ("time", "since", "told")}
+    found = found._replace(**shown)
+    state = noted(state, found.told, f"alarm: {found.said(True)}")
     alarms = (*state.alarms, found)[-EVENTS:]
     known = state.alarm._replace(raised=None)
     return state._replace(alarm=known, alarms=alarms, due=-math.inf)  # fit the new loss now
