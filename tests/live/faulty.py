@@ -146,7 +146,7 @@ class Injector:
 
         with Context("pva") as context:
             if put is not None:
-                context.put(name, put, timeout=5)
+                context.put(name, put, timeout=5, wait=True)
             return float(context.get(name, timeout=5))
 
     def scan(self, fault: str, seed: int, scheme: str = "") -> Fate:
