@@ -107,7 +107,8 @@ class Answer(NamedTuple):
 
     def to_json(self) -> dict[str, Any]:
         """Return it as `beamfit lifetime --json` does a decay, with what is normalised."""
-        unknown = {name: bare(None, unit) for name, unit in UNITS.items()}
+        unknown = dict.fromkeys(("chi2", "dof", "identifiability"))
+        unknown |= {name: bare(None, unit) for name, unit in UNITS.items()}
         fit = unknown if self.window.fit is None else self.window.fit.to_json()
         named = {
             "status": self.status,
@@ -338,8 +339,8 @@ def _answered(plan: Plan, state: State) -> State:
 
 def _noise_of_one(plan: Plan, state: State, noise: float) -> float:
     """Of a reading, from that of a row."""
-    readings = max(1.0, plan.window / ROWS / max(state.interval, 1e-6))
-    return max(noise * math.sqrt(readings), BEST_MONITOR * state.highest)
+    readings = plan.window / ROWS / max(state.interval, 1e-6)
+    return max(noise * math.sqrt(max(readings, 1.0)), BEST_MONITOR * state.highest)
 
 
 def _answer(plan: Plan, state: State, window: Window) -> Answer:
