@@ -89,6 +89,8 @@ class Page:
                 await writer.drain()
         except (OSError, TimeoutError, asyncio.IncompleteReadError, asyncio.LimitOverrunError):
             pass  # a reader that went, or is too slow
+        except asyncio.CancelledError:
+            pass  # the watch ends; streams of Python 3.11 tell of a task that says so itself
         finally:
             self.readers -= 1
             writer.close()

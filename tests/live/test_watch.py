@@ -179,10 +179,14 @@ def test_an_ioc_that_ends_is_said_and_followed_again(watching):
 
 
 def test_at_the_end_there_is_one_object_and_nothing_was_written(watching):
-    watching.process.send_signal(signal.SIGINT)
-    out, _ = watching.process.communicate(timeout=30)
+    with urllib.request.urlopen(watching.url + "events", timeout=30) as events:
+        assert events.readline().startswith(b"data: {")  # a page is open when it ends
+        watching.process.send_signal(signal.SIGINT)
+        out, _ = watching.process.communicate(timeout=30)
     assert watching.process.returncode == 130
-    assert watching.err.read_text().endswith("beamfit: interrupted\n")
+    said = watching.err.read_text()
+    assert said.endswith("beamfit: interrupted\n")
+    assert "Traceback" not in said
     document = json.loads(out)
     [result] = document["results"]
     assert list(document["inputs"]) == ["ring.toml"]
