@@ -127,10 +127,17 @@ class _Course:
             said = f"{'no' if gone else 'again a'} connection to {watched.variable}"
             self.state = noted(self.state, time.time(), said)
         self.lost[watched.variable] = gone
-        if watched.quantity == CURRENT and not gone:
-            now = time.monotonic()
-            self.apart += 0.1 * (now - self.arrived - self.apart)
-            self.arrived = now
+
+    async def follow(self, watched: Watched, channel: Channel) -> None:
+        """Have readings wait as they come; that fits take long is no silence of the current."""
+        async for reading in channel.monitor():
+            if watched.quantity == CURRENT and reading is not None:
+                now = time.monotonic()
+                self.apart += 0.1 * (now - self.arrived - self.apart)
+                self.arrived = now
+            if self.queue.full():
+                self.queue.get_nowait()
+            self.queue.put_nowait((watched, reading))
 
 
 def _stepped(plan: Plan, state: State, readings: Sequence[tuple[Watched, Reading]]) -> State:
@@ -192,7 +199,7 @@ async def watch(
     queue: asyncio.Queue[tuple[Watched, Reading | None]] = asyncio.Queue(WAITING)
     course = _Course(plan, queue)
     followers = [
-        asyncio.create_task(_follow(one, open_channel(one.variable, machine.timeout), queue))
+        asyncio.create_task(course.follow(one, open_channel(one.variable, machine.timeout)))
         for one in machine.variables
     ]
     begun, shown = time.monotonic(), -SHOWN
@@ -211,13 +218,6 @@ async def watch(
         for task in followers:
             task.cancel()
         await asyncio.gather(*followers, return_exceptions=True)
-
-
-async def _follow(watched: Watched, channel: Channel, queue: asyncio.Queue) -> None:
-    async for reading in channel.monitor():
-        if queue.full():
-            queue.get_nowait()
-        queue.put_nowait((watched, reading))
 
 
 @contextmanager
