@@ -19,8 +19,8 @@ from beamfit.greybox.covariance import CUT
 # Correlation times looked at, and variances of the part without memory, in those that the part
 # that wanders gets anew from one sample to the next.
 TIMES, WHITE = 16, (0.0, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0, 1000.0)
-# Noises that are looked at in one sweep through the readings.
-TOGETHER = 16
+# Numbers that one sweep through the readings holds, of as many noises as that makes.
+AT_ONCE = 2**20
 # Means of so many neighbours are looked at: a slow drift hides under white noise.
 BLOCKS = (1, 4, 16)
 
@@ -68,7 +68,7 @@ def _triangles(rows: jax.Array, time: jax.Array, grid: Noise) -> tuple[jax.Array
         white, volume = innovations(rows, time, noise)
         return jnp.linalg.qr(white, mode="r"), volume
 
-    return jax.lax.map(of, grid, batch_size=TOGETHER)
+    return jax.lax.map(of, grid, batch_size=max(1, AT_ONCE // rows.size))
 
 
 def noise_of(
