@@ -340,12 +340,16 @@ def test_a_certified_gain_holds_between_the_points():
 
 
 def test_appendix_b_reaches_an_optimum_from_random_starts():
-    """28 gains at points; a network of 22 weights. At least 19 of 20 starts end on an optimum."""
+    """28 gains at points; a network of 22 weights. Each of ten starts ends on an optimum.
+
+    Twenty are benchmarks/greybox.py; where one in ten fails, ten of ten tell it as 19 of 20 do.
+    """
     p = appendix_b(simulated_scan(1), point_constraints())
     assert len(p.constraint_names) == 28
     assert len(p.names) == 25
-    fit = solve(p, starts=20, seed=7)
-    assert sum(attempt.kkt.worst <= 1e-6 for attempt in fit.attempts) >= 19
+    fit = solve(p, starts=10, seed=7)
+    assert len(fit.attempts) == 10
+    assert all(attempt.kkt.worst <= 1e-6 for attempt in fit.attempts)
     # Any invertible change of (A, B) is taken up by sigma: the beam is not determined.
     assert fit.status == Status.unidentified
     assert np.isnan(fit["s11"].error)
