@@ -174,3 +174,29 @@ def test_zero_is_not_listed_as_its_rounding(known):
 def test_an_energy_that_no_electron_has_is_refused(known):
     with pytest.raises(InputError, match=r"of 0\.1 MeV"):
         plan_measurements(known, energies=(0.1,))
+
+
+def test_a_scan_that_ends_before_the_waist_is_told_the_point_that_closes_it():
+    """It said that no measurement would, above a list of those that do."""
+    line = beamfit.Beamline(
+        (beamfit.Quadrupole("Q", 0.108), beamfit.Drift("D", 2.2), beamfit.Screen("S")), 135.0
+    )
+    emittance, beta, alpha = 3e-9, 6.0, -1.0
+    noise = 1 + 0.05 * np.random.default_rng(1).standard_normal(7)
+
+    def size(setting):
+        r11, r12 = np.asarray(line.matrix({"Q": setting}).x)[0, :2]
+        squared = r11**2 * beta - 2 * r11 * r12 * alpha + r12**2 * (1 + alpha**2) / beta
+        return np.sqrt(emittance * squared)
+
+    def fitted(settings):
+        sizes = noise[: len(settings)] * [size(s) for s in settings]
+        scan = beamfit.QuadScan({"Q": settings}, {"Q": "k1"}, {"x": sizes}, {"x": 0.05 * sizes})
+        return beamfit.fit_emittance(scan, line)
+
+    before = np.linspace(-6.0, -1.0, 6)
+    advice = plan_measurements(fitted(before), limits={"Q": (-6.0, 10.0)}, count=2)
+    setting = advice.steps[0].candidate.settings["Q"]
+    assert not advice.identified
+    assert f"determined with one more point at Q = {setting:.2g}" in advice.message
+    assert fitted(np.append(before, setting)).planes[0].emittance.error is not None

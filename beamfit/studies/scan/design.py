@@ -95,6 +95,10 @@ class Advice:
             "The data do not determine the emittance."
         )  # fmt: skip
         good = [o for o in self.options if o.identified]
+        last = next((n for n, s in enumerate(self.steps, 1) if s.identified), 0)
+        if not self.identified and last:
+            more = "one more point" if last == 1 else f"{last} more points, the first"
+            return f"{first} It would be determined with {more} at {self.steps[0].candidate.words}."
         if not self.identified and good:
             best = min(good, key=lambda o: max(o.relative_error.values()))
             return f"{first} It would be determined with {best.words}."
@@ -128,9 +132,9 @@ class Advice:
         """Lay out the errors after each measurement, and what would identify an open scenario."""
         rows = [["what is measured", *_cells(self.now, self.identified)]]
         rows += [
-            [f"{number}. {step.candidate.words}", *_cells(step.relative_error, True)]
+            [f"{number}. {step.candidate.words}", *_cells(step.relative_error, step.identified)]
             for number, step in enumerate(self.steps, 1)
-            if step.identified
+            if self.steps[-1].identified
         ]
         if self.steps and not self.steps[-1].identified:
             words = f"{len(self.steps)} more points of the scan, at the best settings"
