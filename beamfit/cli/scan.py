@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -67,6 +68,8 @@ def scan(
         raise InputError("both or neither of MACHINE and --recover", "one of them")
     say = _Lines(err=as_json)
     if recover is not None:
+        if dry_run or save or journal or goal or points or report:
+            raise InputError("--recover with an option of a scan", "--recover JOURNAL alone")
         return _recovered(recover, say, as_json)
     wanted = {"goal": None if goal is None else goal_of(goal), "points": points}
     told = replace(read_scan_machine(machine), **{k: v for k, v in wanted.items() if v})
@@ -93,7 +96,11 @@ class _Lines:
         self.err = err
 
     def __call__(self, text: str) -> None:
-        click.echo(plain(text), err=self.err)
+        for err in dict.fromkeys((self.err, True)):
+            with suppress(OSError):  # nobody reads it any more, which ends no scan
+                click.echo(plain(text), err=err)
+                return
+            self.err = True
 
     def told(self, now: Told) -> None:
         """A new point with what is known after it, or what else is new."""
@@ -190,7 +197,7 @@ def _answered(
     if found.problem is not None:
         if not isinstance(found.problem, InputError):
             raise found.problem
-        kept = f"; {len(found.points)} points are in {out}" if found.points else ""
+        kept = f"; {len(found.points)} points are in {out}" if found.points and out.exists() else ""
         raise InputError(f"{found.problem.found}{kept}; all is restored", found.problem.expected)
     said = {"file": str(out), "points": len(found.points), "ended": found.reason, "restored": True}
     status = 128 + found.signal if found.signal else 0

@@ -210,14 +210,23 @@ def read_scan_machine(path: str | PathLike[str]) -> ScanMachine:
     if not top.table.get("magnet"):
         raise top.error("no magnet to scan", "tables [[magnet]]", "magnet")
     magnets = tuple(_magnet(section, lattice) for section in top.sections("magnet"))
-    if len({m.set for m in magnets}) < len(magnets):
-        raise top.error("a variable set by two magnets", "one [[magnet]] for each", "magnet")
+    for said_once in ({m.name for m in magnets}, {m.set.rpartition("://")[2] for m in magnets}):
+        if len(said_once) < len(magnets):
+            found = "a magnet or the variable that sets it twice"
+            raise top.error(found, "one [[magnet]] for each", "magnet")
     wanted = top.section("scan")
     plan = wanted.values(SCAN)
     first = _numbers(wanted, "first", plan.pop("first"), magnets[0])
     plan["points"] = _whole(wanted, "points", plan["points"])
     screen, guard = _screen(top.section("screen"), lattice), _guard(top.section("beam"))
     lattice = _seen_at(lattice, screen.name)
+    for magnet, section in zip(magnets, top.sections("magnet"), strict=True):
+        if magnet.name not in _before(lattice, screen.name):
+            found = f"{magnet.name} behind the screen {screen.name}"
+            raise section.error(found, "a magnet that the beam passes before it", "name")
+    for name in (screen.name, *(m.name for m in magnets)):
+        if not name.isprintable():
+            raise top.error(f"the name {name!r}", "one of letters that can be shown")
     name = said.pop("name") or Path(path).stem
     return ScanMachine(
         name, str(path), top.sha256, lattice, magnets, screen, guard, first=first, **plan, **said
@@ -307,6 +316,12 @@ def _seen_at(lattice: LatticeFile, screen: str) -> LatticeFile:
         for e in cut.elements
     )
     return replace(cut, elements=elements)
+
+
+def _before(lattice: LatticeFile, screen: str) -> set[str]:
+    """Elements and supplies before a screen."""
+    place = [e["name"] for e in lattice.elements].index(screen)
+    return {name for e in lattice.elements[:place] for name in (e["name"], e.get("supply"))}
 
 
 def _guard(section: Section) -> Guard:

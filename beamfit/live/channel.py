@@ -114,6 +114,8 @@ def open_channel(name: str, timeout: float = 5.0) -> Channel:
     kinds = {"": _channel_access, "ca": _channel_access, "pva": _pv_access}
     if scheme not in kinds:
         raise InputError(f"variable '{plain(name)}'", "a name, ca://NAME or pva://NAME")
+    if not rest.isprintable() or not rest.strip():
+        raise InputError(f"variable '{plain(name)}'", "a name of letters that can be shown")
     try:
         return Variable(rest, timeout, kinds[scheme]())
     except ImportError as error:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import re
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -11,7 +12,8 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from beamfit.errors import InputError, plain
-from beamfit.io.machine import Guard, Magnet, Profiler, ScanMachine, moved, unit_of
+from beamfit.io.headers import spelled
+from beamfit.io.machine import LENGTHS, Guard, Magnet, Profiler, ScanMachine, moved, unit_of
 from beamfit.live.channel import Channel, LostError, Reading, open_channel
 from beamfit.live.projection import rms_of
 
@@ -258,6 +260,7 @@ async def connect(machine: ScanMachine) -> Connected:
     screen = {plane: open_channel(name, machine.timeout) for plane, name in names.items()}
     for channel in screen.values():
         await channel.get()
+        notes += await _lengths(channel, wanted) if wanted.sizes else []
     watchmen = [
         None if name is None else open_channel(name, machine.timeout)
         for name in (guard.present, guard.loss)
@@ -265,6 +268,25 @@ async def connect(machine: ScanMachine) -> Connected:
     ready = BeamGuard(guard, *watchmen)
     await ready.amiss()
     return Connected(supplies, ScreenShots(wanted, screen), ready, machine, tuple(notes))
+
+
+async def _lengths(channel: Channel, profiler: Profiler) -> list[str]:
+    """What to say of the unit of some sizes.
+
+    Raises
+    ------
+    InputError
+        If it is another one than the machine file says.
+    """
+    given = (await channel.describe()).unit
+    found = LENGTHS.get(re.sub("[µμ]", "u", spelled(f"x [{given}]")[2:]))
+    if not given or found == profiler.unit:
+        return []
+    said = f"'{plain(channel.name)}' in '{plain(given)}'"
+    own = next(name for name, unit in LENGTHS.items() if unit == profiler.unit)
+    if found is None:
+        return [f"{said}, which is no unit of length here: taken as {own}."]
+    raise InputError(said, f"{own}, as the machine file says of the screen")
 
 
 def supply_of(magnet: Magnet, timeout: float) -> Supply:
@@ -294,5 +316,8 @@ async def checked(supply: Supply) -> tuple[Supply, list[str]]:
         raise InputError(found, f"some of {magnet.low:g} to {magnet.high:g}, of the machine file")
     if (low, high) == (magnet.low, magnet.high):
         return supply, []
+    if not magnet.tolerance < 0.1 * (high - low):  # or a journal would not be one
+        found = f"tolerance {magnet.tolerance:g} of {magnet.name} within {low:g} to {high:g}"
+        raise InputError(found, "less than a tenth of what the control system lets it move")
     said = f"Limits of {magnet.name}: {low:g} to {high:g} {magnet.unit}, of the control system."
     return replace(supply, magnet=replace(magnet, low=low, high=high)), [said]

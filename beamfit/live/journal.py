@@ -13,7 +13,8 @@ from pathlib import Path
 
 from beamfit.errors import InputError
 from beamfit.io.files import read_json
-from beamfit.io.machine import Magnet, ScanMachine
+from beamfit.io.machine import APPROACHES, Magnet, ScanMachine
+from beamfit.io.toml import is_number
 from beamfit.writing import write_atomically
 
 FORMAT = "beamfit-journal-1"
@@ -103,24 +104,36 @@ def read_journal(path: str | PathLike[str]) -> Journal:
     """
     expected = f"a journal of beamfit scan, {FORMAT}"
     found = read_json(path, "a file that is none", expected)
+    if not isinstance(found, dict) or found.get("format") != FORMAT:
+        raise InputError("a file that is none", expected, path=path)
     try:
-        if found["format"] != FORMAT:
-            raise KeyError
         before = tuple(_magnet(dict(table)) for table in found["magnets"])
-        times = float(found["timeout"]), float(found["patience"])
+        times = found["timeout"], found["patience"]
+        for named_once in ({m.name for m, _ in before}, {m.set for m, _ in before}):
+            _demand(0 < len(before) == len(named_once))
+        _demand(all(is_number(time) and time > 0 for time in times))
         return Journal(Path(path), str(found["machine"]), before, *times)
     except (KeyError, TypeError, ValueError):
-        raise InputError("a file that is none", expected, path=path) from None
+        expected = "it as the scan wrote it; put back by hand what can be read of it"
+        raise InputError("a journal that was changed or cut", expected, path=path) from None
 
 
 def _magnet(table: dict[str, object]) -> tuple[Magnet, float]:
-    setting = float(table.pop("setting"))
+    """Checked as a machine file is: a tolerance without end would call anything restored."""
+    setting = table.pop("setting")
     table["degauss"] = tuple(table["degauss"])
     known = {field.name for field in fields(Magnet)}
-    magnet = Magnet(**{name: value for name, value in table.items() if name in known})
-    if not magnet.low < magnet.high:
+    m = Magnet(**{name: value for name, value in table.items() if name in known})
+    numbers = (setting, m.low, m.high, m.tolerance, m.settle, m.timeout, m.approach_by)
+    _demand(all(isinstance(word, str) and word for word in (m.name, m.set, m.read, m.unit)))
+    _demand(all(map(is_number, numbers)) and m.approach in APPROACHES)
+    _demand(0 < m.tolerance < 0.1 * (m.high - m.low) and m.settle >= 0 and m.timeout > 0)
+    return m, float(setting)
+
+
+def _demand(holds: bool) -> None:
+    if not holds:
         raise ValueError
-    return magnet, setting
 
 
 def journal_of(machine: ScanMachine, path: str | None) -> Path:

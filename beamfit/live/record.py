@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import csv
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
+from io import StringIO
 
 import beamfit
+from beamfit.errors import plain
 from beamfit.io.machine import ScanMachine
 from beamfit.live.next_setting import Point, standard_errors
 
@@ -34,12 +37,15 @@ def scan_text(points: Sequence[Point], machine: ScanMachine, before: Mapping[str
         columns[f"size_{plane}_um"] = [s.mean() for s in shots]
         if errors := standard_errors(shots):
             columns[f"size_{plane}_error_um"] = errors
-    rows = [",".join([*columns, "shots", "screen", "time"])]
+    rows = [[*columns, "shots", "screen", "time"]]
     for point, *numbers in zip(points, *columns.values(), strict=True):
         cells = [f"{number:.9g}" for number in numbers]
         count = min(map(len, point.shots.values()))
-        rows.append(",".join([*cells, str(count), machine.screen.name, _written(point.time)]))
-    return "\n".join([*_head(machine, before), *rows]) + "\n"
+        rows.append([*cells, str(count), machine.screen.name, _written(point.time)])
+    table = StringIO()
+    csv.writer(table, lineterminator="\n").writerows(rows)
+    head = (plain(" ".join(line.split())) for line in _head(machine, before))
+    return "\n".join([*head, table.getvalue()])
 
 
 def _head(machine: ScanMachine, before: Mapping[str, float]) -> list[str]:

@@ -86,6 +86,8 @@ async def restore(journal: Journal, magnets: Mapping[str, Device]) -> None:
     settings = named((magnet, value) for magnet, value, _ in failed)
     found = f"{settings} not seen to be restored ({failed[0][2].found})"
     expected = f"beamfit scan --recover {journal.path}, or by hand"
+    with suppress(InputError, OSError):  # somebody may have removed it
+        journal.write()
     raise NotRestoredError(found, expected)
 
 

@@ -11,6 +11,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
+
 from beamfit.errors import InputError
 from beamfit.io.machine import Magnet, ScanMachine
 from beamfit.live.devices import Connected, Device, NoSizesError
@@ -216,12 +218,24 @@ async def _point(run: Running, settings: Mapping[str, float]) -> tuple[Point | N
         except NoSizesError as error:
             shots, why = {}, error.found
         wrong = await run.at.guard.amiss()
+        if not wrong and (plane := _stuck(run, reads, shots)):
+            return None, f"{plane} as before the magnets moved, to the last digit: is it stuck?"
         if not wrong:
             return (Point(reads, dict(shots), time.time()) if shots else None), why
         why = wrong
         run.say(f"Paused: {wrong}")
         await _moved(run, run.before)
     return None, why
+
+
+def _stuck(run: Running, reads: Mapping[str, float], shots: Mapping[str, np.ndarray]) -> str:
+    """A plane that still shows what it showed at the point before; a dead camera has no scatter."""
+    if not run.points or not shots:
+        return ""
+    last, magnets = run.points[-1], run.at.machine.magnets
+    if all(abs(reads[m.name] - last.settings[m.name]) <= m.tolerance for m in magnets):
+        return ""
+    return next((p for p, each in shots.items() if np.all(each == last.shots[p][-1])), "")
 
 
 async def _moved(run: Running, settings: Mapping[str, float]) -> dict[str, float]:

@@ -65,3 +65,9 @@ def test_a_size_that_is_none_is_no_good_reading(ioc):
 def test_another_protocol_is_refused():
     with pytest.raises(InputError, match="expected a name, ca://NAME or pva://NAME"):
         open_channel("tango://a/b/c")
+
+
+@pytest.mark.parametrize("name", ["", "pva://", "A\0", "ca://A\x1b[2J"])
+def test_a_name_that_none_can_have_is_refused(name):
+    with pytest.raises(InputError, match="expected a name of letters that can be shown"):
+        open_channel(name)

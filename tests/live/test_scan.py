@@ -9,12 +9,14 @@ import numpy as np
 import pytest
 
 import beamfit
+from beamfit.cli import cli
+from beamfit.cli.scan import _Lines
 from beamfit.errors import InputError
 from beamfit.io.line import build_line, read_inputs
 from beamfit.io.machine import read_scan_machine
 from beamfit.live.channel import LostError
 from beamfit.live.devices import NotSettledError
-from beamfit.live.journal import read_journal
+from beamfit.live.journal import Journal, read_journal
 from beamfit.live.next_setting import Next, Point, fit_of, next_setting, sharp
 from beamfit.live.projection import rms_of
 from beamfit.live.record import scan_text
@@ -98,6 +100,7 @@ def test_a_magnet_that_does_not_come_back_is_an_error_and_stays_in_the_journal(t
     class Stiff(Simulated):
         async def settled(self, value):
             if len(self.puts) > 2 and value == -2.0:
+                (tmp_path / "a.journal").unlink(missing_ok=True)  # and somebody removes it
                 raise NotSettledError("Q1 set to -2, read back 0", "the same")
             return value
 
@@ -107,6 +110,88 @@ def test_a_magnet_that_does_not_come_back_is_an_error_and_stays_in_the_journal(t
     assert [(m.name, value) for m, value in journal.before] == [("Q1", -2.0)]
     with pytest.raises(InputError, match=r"has not restored; expected beamfit scan --recover"):
         scanned(connected(tmp_path, Simulated()), tmp_path)
+
+
+DAMAGE = [
+    {"magnets": []},  # nothing to restore is not "restored"
+    {"tolerance": np.inf},  # would call any read-back restored
+    {"settle": np.nan},  # would wait for good
+    {"low": -np.inf},
+    {"set": 5},
+    {"patience": np.nan},
+]
+
+
+@pytest.mark.parametrize("damage", DAMAGE, ids=lambda damage: next(iter(damage)))
+def test_a_journal_that_was_changed_restores_nothing(tmp_path, damage):
+    path = tmp_path / "a.journal"
+    Journal(path, "m", ((read_scan_machine(written(tmp_path)).magnets[0], -1.0),)).write()
+    [(magnet, _)] = read_journal(path).before
+    assert magnet.tolerance == 0.01
+    said = json.loads(path.read_text())
+    (said if damage.keys() <= said.keys() else said["magnets"][0]).update(damage)
+    path.write_text(json.dumps(said))
+    with pytest.raises(InputError, match="a journal that was changed or cut; expected it as the"):
+        read_journal(path)
+
+
+def test_a_dry_run_recovers_nothing(tmp_path):
+    path = tmp_path / "a.journal"
+    Journal(path, "m", ((read_scan_machine(written(tmp_path)).magnets[0], -1.0),)).write()
+    with pytest.raises(InputError, match="expected --recover JOURNAL alone"):
+        cli.main(["scan", "--recover", str(path), "--dry-run"], standalone_mode=False)
+    assert path.exists()
+
+
+def test_a_camera_that_is_stuck_ends_the_scan(tmp_path):
+    class Stuck(Simulated):
+        async def shots(self):
+            found = await super().shots()
+            if len(self.puts) > 5:  # new time stamps, the same picture
+                found = {"x": np.full(5, self.last)}
+            self.last = found["x"][-1]
+            return found
+
+    said = []
+    found = scanned(connected(tmp_path, Stuck()), tmp_path, tell=lambda now: said.append(now.news))
+    assert len(found.points) == 5
+    assert "no sizes at 3 settings in a row (x as before the magnets moved" in str(found.problem)
+    assert sum(news.startswith("Left out") for news in said) == 3
+
+
+def test_a_reader_that_goes_ends_no_scan(monkeypatch, capsys):
+    class Gone:
+        encoding, errors = "utf-8", "strict"
+
+        def write(self, text):
+            raise BrokenPipeError
+
+        flush = write
+
+    say = _Lines(err=False)
+    say("one")
+    monkeypatch.setattr("sys.stdout", Gone())
+    say("two")
+    monkeypatch.setattr("sys.stderr", Gone())
+    say("three")
+    monkeypatch.undo()
+    assert capsys.readouterr() == ("one\n", "two\n")
+
+
+def test_odd_names_leave_the_file_a_scan(done):
+    found, _, _, at, folder = done
+    odd = 'Q,"1'
+    machine = replace(
+        at.machine, name="a\nQ1_A,size_x_um\x1b[2J",
+        magnets=(replace(at.machine.magnets[0], name=odd),),
+    )  # fmt: skip
+    points = [p._replace(settings={odd: p.settings["Q1"]}) for p in found.points]
+    path = folder / "odd.csv"
+    path.write_text(scan_text(points, machine, {odd: 0.0}))
+    scan = beamfit.read_quad_scan(path)
+    assert list(scan.settings) == [odd]
+    assert scan.settings[odd] == pytest.approx([p.settings["Q1"] for p in found.points])
+    assert "\x1b" not in path.read_text()
 
 
 def test_whatever_is_raised_all_is_restored(tmp_path):
@@ -172,6 +257,16 @@ def test_a_projection_has_the_size_of_its_gaussian():
     assert rms_of(400 * np.exp(-0.5 * ((x - 130.0) / 120.0) ** 2), 5e-6) is None  # too large
 
 
+SECOND = """[[magnet]]
+name = "Q1"
+set = "pva://SIM:Q2:SET"
+read = "SIM:Q2:READ"
+unit = "T/m"
+low = -1
+high = 1
+tolerance = 0.01
+settle_s = 0.1
+"""
 BAD = [
     (("low = -5.5", "low = 3.5"), r"machine.toml:\d+: column 'low': limits 3.5 to 2.5"),
     (('unit = "T/m"', 'unit = "A"'), r"column 'unit': unit 'A'; expected T_per_m, as in the"),
@@ -183,6 +278,7 @@ BAD = [
     (('lattice = "line.toml"', ""), r"no lattice; expected lattice = "),
     (("settle_s", "setle_s"), r"column 'setle_s': an unknown key; expected .*settle_s"),
     (('x = "SIM:SCREEN:X"', 'profile_x = "A"'), r"column 'x': sizes and projections; expected"),
+    (("[screen]", f"{SECOND}[screen]"), r"a magnet or the variable that sets it twice; expected"),
 ]
 
 
@@ -190,6 +286,16 @@ BAD = [
 def test_a_machine_file_is_checked_line_by_line(tmp_path, change, said):
     with pytest.raises(InputError, match=said):
         read_scan_machine(written(tmp_path, change=change))
+
+
+def test_a_magnet_behind_its_screen_is_refused(tmp_path):
+    path = written(tmp_path)
+    place = tmp_path / "line.toml"
+    screen = '[[element]]\ntype = "screen"\nname = "FIRST"\n'
+    place.write_text(place.read_text().replace("[[element]]", f"{screen}[[element]]", 1))
+    path.write_text(path.read_text().replace("[screen]", '[screen]\nname = "FIRST"'))
+    with pytest.raises(InputError, match="column 'name': Q1 behind the screen FIRST; expected"):
+        read_scan_machine(path)
 
 
 @pytest.fixture(scope="module")
@@ -237,6 +343,7 @@ def test_a_dry_run_checks_and_moves_nothing(ioc, injector):
     [
         (("SIM:SCREEN:X", "SIM:NONE"), r"no answer from 'SIM:NONE' within 1 s"),
         (("SIM:Q1:READ", "SIM:SCREEN:X"), r"'SIM:SCREEN:X' in 'um'; expected T_per_m"),
+        (("shots = 3", 'shots = 3\nunit = "mm"'), r"'SIM:SCREEN:X' in 'um'; expected mm"),
         (("low = -5.5", "low = 2.0"), r"a setting of -2.5 for Q1; expected within its limits"),
     ],
 )
