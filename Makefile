@@ -68,9 +68,11 @@ bench: .venv/bench
 	$(BIN)/python benchmarks/control.py
 
 # beamfit beside every peer, honesty and speed: docs/league.md. Hours with 1000 draws; DRAWS=40 for a look.
+# Each case by each tool is kept as it is done; `make league AGAIN=` goes on where one was stopped.
 DRAWS ?= 1000
+AGAIN ?= --again
 league: .venv/league
-	$(BIN)/python -m benchmarks.league --draws $(DRAWS)
+	$(BIN)/python -m benchmarks.league --draws $(DRAWS) $(AGAIN)
 
 clean:
 	rm -rf .venv demo dist build

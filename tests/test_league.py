@@ -34,11 +34,11 @@ def test_confident_and_wrong_is_beyond_three_errors_and_a_tenth(answer, truth, w
 
 def test_beamfit_refuses_traps_that_a_plain_least_squares_answers():
     hill = {
-        tool: measured("scans", "traps", "rows mixed up", 3, tool)[tool]
+        tool: measured("scans", "traps", "rows mixed up", 3, tool)
         for tool in ("beamfit", "sddsemitproc's method")
     }
     step = {
-        tool: measured("decays", "traps", "a loss of 2 mA", 3, tool)[tool]
+        tool: measured("decays", "traps", "a loss of 2 mA", 3, tool)
         for tool in ("beamfit", "scipy curve_fit")
     }
     assert hill["beamfit"]["wrong"] == step["beamfit"]["wrong"] == 0

@@ -29,24 +29,31 @@ def keep(found: dict) -> None:
     os.replace(partial, RESULTS)
 
 
-def honesty(draws: int, asked: argparse.Namespace) -> None:
-    from .honesty import KINDS, cases, measured, says
+def honesty(asked: argparse.Namespace) -> None:
+    """Every case by every tool, kept one by one: nothing kept of so many draws is done again."""
+    from .honesty import FIELDS, KINDS, cases, count, measured, says
 
     for field in asked.field.split(","):
         for kind, name in [(k, name) for k in KINDS for name in cases(field, k)]:
             if asked.case not in name:
                 continue
-            found = measured(field, kind, name, draws, asked.tool)
-            for tool, f in found.items():
+            known = {} if asked.show or asked.again else read()
+            for key in ("honesty", field, kind, name, "tools"):
+                known = known.get(key, {})
+            for tool in FIELDS[field][1].TOOLS:
+                done = known.get(tool, {}).get("draws", 0) >= count(field, tool, asked.draws)
+                if done or asked.tool not in ("", tool):
+                    continue
+                f = measured(field, kind, name, asked.draws, tool)
                 said = f"wrong {f['wrong']} {f['such_as']}, refused {f['refused']}"
                 said += f" {f['refused_such_as']} of {f['draws']}, {f['ms']:.1f} ms"
                 print(f"{field} {kind:6s} {name:45s} {tool:22s} {said}", flush=True)
-            case = {"tools": found}
-            if kind == "hidden":
-                case["says"] = says(field, name)
-                print(case["says"])
-            if not asked.show:
-                keep({"honesty": {field: {kind: {name: case}}}})
+                case = {"tools": {tool: f}}
+                if kind == "hidden" and tool == "beamfit":
+                    case["says"] = says(field, name)
+                    print(case["says"])
+                if not asked.show:
+                    keep({"honesty": {field: {kind: {name: case}}}})
 
 
 def main() -> None:
@@ -56,11 +63,12 @@ def main() -> None:
     parser.add_argument("--field", default="scans,decays")
     parser.add_argument("--tool", default="", help="this one alone")
     parser.add_argument("--case", default="", help="cases whose name holds this")
+    parser.add_argument("--again", action="store_true", help="also what is kept already")
     parser.add_argument("--show", action="store_true", help="print, keep nothing")
     asked = parser.parse_args()
     what = asked.what or ["honesty", "speed", "page"]
     if "honesty" in what:
-        honesty(asked.draws, asked)
+        honesty(asked)
     if "speed" in what:
         from .speed import measured
 

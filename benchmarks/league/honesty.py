@@ -45,25 +45,25 @@ def drawn(field: str, kind: str, name: str, number: int) -> Any:
     return cases(field, kind)[name](np.random.default_rng([zlib.crc32(name.encode()), number]))
 
 
-def measured(field: str, kind: str, name: str, draws: int, only: str = "") -> dict[str, dict]:
-    """Per tool: draws, and of them those confident and wrong, and refused, by number."""
-    found = {}
-    for label, (tool, every) in FIELDS[field][1].TOOLS.items():
-        if only and label != only:
-            continue
-        given = [drawn(field, kind, name, k) for k in range(max(draws // every, 3))]
-        begin = time.perf_counter()
-        together = label == "beamfit"
-        answers = tool(given) if together else [ask(tool, case) for case in given]
-        seconds = (time.perf_counter() - begin) / len(given)
-        both = list(zip(given, answers, strict=True))
-        wrong = [k for k, (case, said) in enumerate(both) if is_wrong(case, said)]
-        refused = [k for k, (_, said) in enumerate(both) if refuses(said)]
-        found[label] = {
-            "draws": len(given), "wrong": len(wrong), "refused": len(refused),
-            "such_as": wrong[:3], "refused_such_as": refused[:3], "ms": round(1e3 * seconds, 3),
-        }  # fmt: skip
-    return found
+def count(field: str, tool: str, draws: int) -> int:
+    """How many draws a tool is given where the cheapest are given so many."""
+    return max(draws // FIELDS[field][1].TOOLS[tool][1], 3)
+
+
+def measured(field: str, kind: str, name: str, draws: int, label: str) -> dict[str, Any]:
+    """Of a tool: draws, and of them those confident and wrong, and refused, by number."""
+    tool = FIELDS[field][1].TOOLS[label][0]
+    given = [drawn(field, kind, name, k) for k in range(count(field, label, draws))]
+    begin = time.perf_counter()
+    answers = tool(given) if label == "beamfit" else [ask(tool, case) for case in given]
+    seconds = (time.perf_counter() - begin) / len(given)
+    both = list(zip(given, answers, strict=True))
+    wrong = [k for k, (case, said) in enumerate(both) if is_wrong(case, said)]
+    refused = [k for k, (_, said) in enumerate(both) if refuses(said)]
+    return {
+        "draws": len(given), "wrong": len(wrong), "refused": len(refused),
+        "such_as": wrong[:3], "refused_such_as": refused[:3], "ms": round(1e3 * seconds, 3),
+    }  # fmt: skip
 
 
 def says(field: str, name: str) -> str:
@@ -87,4 +87,5 @@ def says(field: str, name: str) -> str:
     if not row:
         return f"it says: {message.split(': errors rest')[0][:300]}"
     moved = f"{what} {100 * row[0][1]:+.1f} %, here {steps:g} times that"
-    return f"{told}; its budget has *{row[0][0]}*: {moved}"
+    words = f"; it says: {message.split('. ')[0].rstrip('.')}" if field == "decays" else ""
+    return f"{told}; its budget has *{row[0][0]}*: {moved}{words}"

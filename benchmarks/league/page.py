@@ -20,8 +20,8 @@ optics, and scipy, lmfit and emcee the fits that one then writes oneself, as her
 300 steps, no look at whether they have settled). lcls-tools and elegant's sddsemitproc are not on
 PyPI: what is run is their method, written from its description. pyAT, MAD-X, xfields, CasADi,
 jax-sysid and do-mpc analyse no such measurement: they are asked for speed alone. Draws are in the
-heads of tables: one wrong answer of 60 is 1.7 %; what is not in a table was not reached. In bold
-is what exceeds 1 % of wrong or 2 % of refused.
+heads of tables, least and most: 1000 where time allowed; one wrong answer of 60 is 1.7 %. What is
+not in a table was not reached. In bold is what exceeds 1 % of wrong or 2 % of refused.
 
 ## Honesty
 
@@ -80,7 +80,7 @@ def summary(field: dict) -> str:
         worst = max(wrong, key=wrong.get)
         rows.append([
             tool, f"{sum(w > MOST_WRONG for w in wrong.values())} of {len(wrong)}",
-            f"{sum(wrong.values()) / len(wrong):.2g} %", f"{wrong[worst]:.0f} % ({worst})",
+            f"{sum(wrong.values()) / len(wrong):.2g} %", f"{wrong[worst]:.3g} % ({worst})",
             f"{sum(r > MOST_REFUSED for r in refused)} of {len(refused)}", f"{max(refused):.2g} %",
             f"{max(off):.3g} %",
         ])  # fmt: skip

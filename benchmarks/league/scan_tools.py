@@ -239,11 +239,11 @@ def by_emcee(scan: Scan, walkers: int = 32, steps: int = 300) -> dict[str, Answe
 # Name: (tool, one of how many draws it is given); beamfit is given all of them at once.
 TOOLS = {
     "beamfit": (by_beamfit, 1),
-    "pyemittance": (by_pyemittance, 2),
-    "scipy curve_fit": (by_scipy, 2),
+    "pyemittance": (by_pyemittance, 1),
+    "scipy curve_fit": (by_scipy, 1),
     "lmfit": (by_lmfit, 5),
-    "cheetah + curve_fit": (by_cheetah, 5),
+    "cheetah + curve_fit": (by_cheetah, 1),
     "emcee by hand": (by_emcee, 40),
     "lcls-tools' method": (by_lcls_tools, 10),
-    "sddsemitproc's method": (by_sddsemitproc, 2),
+    "sddsemitproc's method": (by_sddsemitproc, 1),
 }

@@ -56,7 +56,8 @@ class DecayFit:
     message : str
         One sentence or two of cause and remedy.
     i0, a, b : Quantity
-        Current at the first reading, mA, and the coefficients of dI/dt = -a I² - b I.
+        Current at the first reading, mA, and the coefficients of dI/dt = -a I² - b I. Where the
+        record would not show a bunch that lengthens, `interval_95` of a and b reaches to such ones.
     lifetime_start, lifetime_end, lifetime_mean : Quantity
         Lifetime 1/(a I + b) at the first and last reading and at the mean current, h.
     mean_current : float
