@@ -264,8 +264,8 @@ def _one_refutes(e: Evidence) -> Finding | None:
     return Finding(
         Status.poor_fit,
         f"Poor fit: by their scatter the other points leave no room for {e.influence.outlier} "
-        f"(probability {e.influence.chance:.1g}), which spoils value and errors. Measure again, or "
-        f"fit with --robust. {_clear(e)}.",
+        f"(probability {e.influence.chance:.1g}): value and errors are spoilt. Measure "
+        f"again, or fit with --robust. {_clear(e)}.",
     )
 
 
