@@ -31,6 +31,7 @@ from beamfit.table import Table, json_of, text_of
 CRITERIA = ("emittance", "D")
 # A further point that sharpens the emittance by less than this is not worth its shift time.
 LEAST_GAIN = 0.01
+PERHAPS = "In brackets: for the beam as it is best known, which the data do not determine."
 TIE = " Tie the network to first principles (--anchor first-principles=2%)."
 
 
@@ -95,10 +96,8 @@ class Advice:
             "The data do not determine the emittance."
         )  # fmt: skip
         good = [o for o in self.options if o.identified]
-        last = next((n for n, s in enumerate(self.steps, 1) if s.identified), 0)
-        if not self.identified and last:
-            more = "one more point" if last == 1 else f"{last} more points, the first"
-            return f"{first} It would be determined with {more} at {self.steps[0].candidate.words}."
+        if not self.identified and any(step.identified for step in self.steps):
+            return f"{first} Measure next at {self.steps[0].candidate.words}, then ask again."
         if not self.identified and good:
             best = min(good, key=lambda o: max(o.relative_error.values()))
             return f"{first} It would be determined with {best.words}."
@@ -132,14 +131,18 @@ class Advice:
         """Lay out the errors after each measurement, and what would identify an open scenario."""
         rows = [["what is measured", *_cells(self.now, self.identified)]]
         rows += [
-            [f"{number}. {step.candidate.words}", *_cells(step.relative_error, step.identified)]
+            [
+                f"{number}. {step.candidate.words}",
+                *_cells(step.relative_error, step.identified, perhaps=not self.identified),
+            ]
             for number, step in enumerate(self.steps, 1)
             if self.steps[-1].identified
         ]
         if self.steps and not self.steps[-1].identified:
             words = f"{len(self.steps)} more points of the scan, at the best settings"
             rows.append([words, *_cells(self.now, False)])
-        steps = Table("", ["after", *self.now], rows, numeric=True)
+        note = "" if self.identified or not self.steps else PERHAPS
+        steps = Table("", ["after", *self.now], rows, note, numeric=True)
         header = ["What would identify it", *(f"error {plane}" for plane in self.now), "identified"]
         rows = [
             [o.words, *_cells(o.relative_error, o.identified), "yes" if o.identified else "no"]
@@ -151,8 +154,9 @@ class Advice:
         return "\n\n".join([*map(text_of, self.tables()), f"{self.status}: {self.message}"])
 
 
-def _cells(error: Mapping[str, float], known: bool) -> list[str]:
-    return [f"{100 * e:.2f} %" if known else "not determined" for e in error.values()]
+def _cells(error: Mapping[str, float], known: bool, perhaps: bool = False) -> list[str]:
+    said = "({:.0f} %)" if perhaps else "{:.2f} %"
+    return [said.format(100 * e) if known else "not determined" for e in error.values()]
 
 
 def plan_measurements(
