@@ -78,7 +78,7 @@ async def _watched(
 ) -> tuple[Told, int]:
     """See that the variables answer, serve, and watch."""
     from beamfit.live.page import page
-    from beamfit.live.served import served
+    from beamfit.live.served import check_unserved, served
     from beamfit.live.watch import connect, watch
     from beamfit.studies.decay.study import Machine
     from beamfit.studies.decay.watch import Plan
@@ -90,6 +90,8 @@ async def _watched(
     say: Callable[[str], None] = lambda text: click.echo(plain(text), err=True)  # noqa: E731
     for note in await connect(machine):
         say(f"Note: {note}.")
+    if machine.prefix is not None:
+        await check_unserved(machine.prefix)
     async with AsyncExitStack() as stack:
         where, tell = await stack.enter_async_context(page(bind, port))
         sinks = [tell]

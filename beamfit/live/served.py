@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import math
 import os
+from asyncio import gather
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Any
 
-from beamfit.errors import InputError
+from beamfit.errors import InputError, plain
+from beamfit.live.channel import LostError, open_channel
 from beamfit.live.watch import Told
 from beamfit.table import cell
 
@@ -20,6 +22,11 @@ NUMBERS = {
 }  # fmt: skip
 TEXTS = ("STATUS", "MESSAGE", "ALARM", "ALARM:TEXT")
 PLAIN = {"CURRENT": "mA", "SINCE": "s", "READINGS": ""}
+UNITS = {
+    n + part: u for n, (_, u) in NUMBERS.items() for part in ("", ":ERROR", ":LOW", ":HIGH")
+} | PLAIN
+# Within which somebody else who serves a variable answers, s.
+ANSWERED = 1.0
 
 
 def values_of(told: Told) -> dict[str, tuple[Any, int]]:
@@ -64,6 +71,26 @@ def values_of(told: Told) -> dict[str, tuple[Any, int]]:
     }
 
 
+async def check_unserved(prefix: str) -> None:
+    """See that nobody serves such variables: clients would read from one or the other.
+
+    Raises
+    ------
+    InputError
+        If somebody does, the machine itself it may be.
+    """
+
+    async def answering(name: str) -> str:
+        with suppress(LostError):
+            await open_channel(f"pva://{prefix}{name}", ANSWERED).get()
+            return name
+        return ""
+
+    if found := next(filter(None, await gather(*map(answering, (*UNITS, *TEXTS)))), ""):
+        expected = "another prefix in the machine file; does a watch run already?"
+        raise InputError(f"'{plain(prefix + found)}', which somebody serves", expected)
+
+
 @contextmanager
 def served(prefix: str, address: str) -> Iterator[Callable[[Told], None]]:
     """Serve variables while the block lasts.
@@ -92,13 +119,9 @@ def served(prefix: str, address: str) -> Iterator[Callable[[Told], None]]:
     except ImportError:
         raise InputError("no package p4p, which serves", "pip install 'beamfit[live]'") from None
 
-    units = {
-        n + part: u for n, (_, u) in NUMBERS.items() for part in ("", ":ERROR", ":LOW", ":HIGH")
-    }
-    units |= PLAIN
-    kinds = {name: NTScalar("d", display=True) for name in units}
+    kinds = {name: NTScalar("d", display=True) for name in UNITS}
     kinds |= {name: NTScalar("s") for name in TEXTS}
-    start = {n: {"value": math.nan, "display.units": u} for n, u in units.items()}
+    start = {n: {"value": math.nan, "display.units": u} for n, u in UNITS.items()}
     start |= {name: {"value": ""} for name in TEXTS}
     variables = {name: SharedPV(nt=kinds[name], initial=start[name]) for name in kinds}
 

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from beamfit.io.watched import Watched, WatchMachine
-from beamfit.live.channel import Channel, Reading, open_channel
+from beamfit.live.channel import Channel, LostError, Reading, open_channel
 from beamfit.status import Status
 from beamfit.studies.decay.watch import CURRENT, RULE, Plan, State, noted, stepped
 from beamfit.table import cell, json_of
@@ -60,6 +60,8 @@ class Told:
             return "red", f"No connection to {', '.join(self.lost)}"
         if state.alarmed:
             return "red", f"Alarm: {state.said()}"
+        if answer is None and not state.last and state.counts.bad:
+            return "red", f"{state.counts.bad} readings without a number, none of a current"
         if answer is None:
             left = max(0.0, state.due - state.last) if state.last else self.plan.every
             return "yellow", f"The first fit comes in {left:.0f} s"
@@ -130,7 +132,13 @@ class _Course:
 
     async def follow(self, watched: Watched, channel: Channel) -> None:
         """Have readings wait as they come; that fits take long is no silence of the current."""
+        lost = False
         async for reading in channel.monitor():
+            lost = lost or reading is None
+            if lost and reading is not None:  # an IOC may come back with another unit
+                with suppress(LostError):
+                    watched.check((await channel.describe()).unit)
+                    lost = False
             if watched.quantity == CURRENT and reading is not None:
                 now = time.monotonic()
                 self.apart += 0.1 * (now - self.arrived - self.apart)

@@ -88,6 +88,21 @@ def test_a_fast_monitor_needs_no_more_memory():
     assert len(state.course) == 2
 
 
+def test_a_spike_of_the_monitor_hides_no_beam_and_an_impossible_reading_is_none():
+    readings = list(decay(700, every=4.0))
+    state = watch(readings[:60])
+    for time, current in ((240.0, 65535.0), (241.0, 1e308), (1e18, 400.0)):
+        state = stepped(PLAN, state, CURRENT, START + time, current)
+    state = watch(readings[61:], state=state)
+    assert (state.counts.bad, state.counts.late, state.piece) == (3, 0, 0)
+    found = state.answer.lifetime
+    rate = A * state.answer.window.fit.mean_current + B
+    assert found.value == pytest.approx(1 / rate / 3600, abs=4 * found.error)
+    # From nothing but noise a beam is believed all the same, once it stays.
+    empty = watch([(4.0 * k, 1e-3) for k in range(9)])
+    assert watch([(40.0 + time, beam) for time, beam in readings[:9]], state=empty).highest > 400
+
+
 def test_without_a_beam_there_is_no_lifetime():
     state = watch(decay(2000))
     assert state.answer.lifetime.error < 0.01

@@ -30,6 +30,8 @@ ROWS = 4096
 LATE = 5
 # A reading above the others of its row by so many of its errors begins a new one: a refill.
 JUMP = 6.0
+# Beyond what a ring stores, mA, or a clock shows, s, a reading is none.
+MOST, LATEST = (math.inf, 1e6), 1e11
 # Events and points of the course that are kept.
 EVENTS, POINTS = 20, 360
 RULE = (
@@ -131,18 +133,16 @@ class State(NamedTuple):
     last, shift, interval : float or None
         Time of the last reading, what is added to times since the clock was set back, and the
         usual interval, s.
-    piece, dead, late : int, int, tuple
-        As of `Row`; readings without beam in a row; readings that came late, and the last of them.
+    piece, dead, spikes, late : int, int, int, tuple
+        As of `Row`; readings in a row without beam or far too high, or late, and the last late one.
     settings : Conditions
         Last ones read, in SI.
     highest, noise, due : float
         Highest current of the window and noise of a reading, mA; when to fit, s.
     counts, events, course, answer
         What happened, with its time; what was found.
-    alarm : Alarmed or None
-        None until the usual loss is known.
-    alarms : tuple of Alarm
-        Within the window.
+    alarm, alarms : Alarmed or None, tuple of Alarm
+        None until the usual loss is known; those within the window.
     """
 
     rows: tuple[Row, ...] = ()
@@ -152,6 +152,7 @@ class State(NamedTuple):
     interval: float = 0.0
     piece: int = 0
     dead: int = 0
+    spikes: int = 0
     late: tuple[int, float] = (0, -math.inf)
     settings: Conditions = Conditions(*[math.nan] * len(Conditions._fields))
     highest: float = 0.0
@@ -219,7 +220,7 @@ def stepped(plan: Plan, state: State, variable: str, time: float, value: float) 
     10.10 h, 0 late
     """
     state = _counted(state, readings=1)
-    if not (math.isfinite(value) and math.isfinite(time)):
+    if not (abs(value) <= MOST[variable == CURRENT] and abs(time) < LATEST):
         return _counted(state, bad=1)
     if variable != CURRENT:
         low, high, _ = PLAUSIBLE[variable]
@@ -231,10 +232,8 @@ def stepped(plan: Plan, state: State, variable: str, time: float, value: float) 
 
 
 def _counted(state: State, **more: int) -> State:
-    counts = state.counts
-    return state._replace(
-        counts=counts._replace(**{name: getattr(counts, name) + n for name, n in more.items()})
-    )
+    counts = {name: getattr(state.counts, name) + n for name, n in more.items()}
+    return state._replace(counts=state.counts._replace(**counts))
 
 
 def noted(state: State, time: float, text: str) -> State:
@@ -283,6 +282,8 @@ def _placed(plan: Plan, state: State, own: float, value: float) -> State:
         return state._replace(dead=state.dead + 1)
     if state.dead >= DEAD:
         state = noted(state, time, "beam again")
+    if state.highest and DROPOUT * value > state.highest and state.spikes + 1 < DEAD:
+        return _counted(state._replace(spikes=state.spikes + 1), bad=1)
     count, begin, times, currents = state.sums
     refilled = count and value - currents / count > JUMP * state.noise
     if count and (refilled or own - begin >= plan.window / ROWS):
@@ -290,7 +291,7 @@ def _placed(plan: Plan, state: State, own: float, value: float) -> State:
         count, times, currents = 0, 0.0, 0.0
     begin = begin if count else own
     sums = (count + 1, begin, times + own - begin, currents + value)
-    return state._replace(sums=sums, dead=0, highest=max(state.highest, value))
+    return state._replace(sums=sums, dead=0, spikes=0, highest=max(state.highest, value))
 
 
 def _closed(plan: Plan, state: State) -> State:
@@ -314,9 +315,8 @@ def _answered(plan: Plan, state: State) -> State:
     """Fit the window, and learn what is usual."""
     begin, shift = state.last - plan.window, state.shift
     state = _kept(state, begin)
-    window = Window(None, None, 0, "no beam")
-    if state.dead < DEAD:
-        window = fit_window(state.rows, plan.name)
+    none = Window(None, None, 0, "no beam")
+    window = fit_window(state.rows, plan.name) if state.dead < DEAD else none
     answer = _answer(plan, state, window)
     found = answer.lifetime
     known = (found.value, found.error) if found else (math.nan, math.nan)
@@ -347,8 +347,7 @@ def _answer(plan: Plan, state: State, window: Window) -> Answer:
     current = state.rows[-1].current if state.rows and state.dead < DEAD else 0.0
     time, fit = state.last - state.shift, window.fit
     if fit is None:
-        why = f"No lifetime: {window.why}."
-        return Answer(time, current, window, Status.unidentified, why)
+        return Answer(time, current, window, Status.unidentified, f"No lifetime: {window.why}.")
     known = [None if q.error is None else q for q in (fit.lifetime_mean, fit.a, fit.b)]
     normalised, message = None, fit.message
     try:
