@@ -260,7 +260,7 @@ async def connect(machine: ScanMachine) -> Connected:
     screen = {plane: open_channel(name, machine.timeout) for plane, name in names.items()}
     for channel in screen.values():
         await channel.get()
-        notes += await _lengths(channel, wanted) if wanted.sizes else []
+        notes += await check_lengths(channel, wanted) if wanted.sizes else []
     watchmen = [
         None if name is None else open_channel(name, machine.timeout)
         for name in (guard.present, guard.loss)
@@ -270,7 +270,7 @@ async def connect(machine: ScanMachine) -> Connected:
     return Connected(supplies, ScreenShots(wanted, screen), ready, machine, tuple(notes))
 
 
-async def _lengths(channel: Channel, profiler: Profiler) -> list[str]:
+async def check_lengths(channel: Channel, profiler: Profiler) -> list[str]:
     """What to say of the unit of some sizes.
 
     Raises

@@ -15,7 +15,7 @@ from ophyd_async.epics.core import epics_signal_r, epics_signal_rw
 
 from beamfit.io.machine import Guard, Magnet, Profiler, ScanMachine, moved
 from beamfit.live.channel import INVALID, Described, Protocols, Reading, Variable, described
-from beamfit.live.devices import BeamGuard, ScreenShots, Supply, checked
+from beamfit.live.devices import BeamGuard, ScreenShots, Supply, check_lengths, checked
 from beamfit.live.restore import reach
 
 
@@ -131,6 +131,19 @@ class ScreenDevice(StandardReadable):
         self.guard = BeamGuard(guard, watched.get("present"), watched.get("loss"))
         self.taken: dict[str, tuple[float, float]] = {}
         super().__init__(profiler.name)
+
+    async def connect(self, mock: Any = False, **more: Any) -> None:
+        """Connect it, and check the unit of its sizes.
+
+        Raises
+        ------
+        InputError
+            If the control system has another unit of length than the file.
+        """
+        await super().connect(mock, **more)
+        if not mock and self.shots.profiler.sizes:
+            for channel in self.shots.channels.values():
+                await check_lengths(channel, self.shots.profiler)
 
     @AsyncStatus.wrap
     async def trigger(self) -> None:

@@ -176,10 +176,13 @@ def test_devices_read_what_the_variables_say_and_write_nothing_outside_the_limit
     assert second["timestamps"]["OTR-x"] > first["timestamps"]["OTR-x"]
 
 
-def test_another_unit_is_refused_when_a_magnet_is_connected(ioc, engine, tmp_path):
+def test_another_unit_is_refused_when_a_device_is_connected(ioc, engine, tmp_path):
     machine = read_scan_machine(written(tmp_path, change=("SIM:Q1:READ", "SIM:SCREEN:X")))
     with pytest.raises(Exception, match="'SIM:SCREEN:X' in 'um'; expected T_per_m"):
         engine(ensure_connected(*devices_of(machine)[0].values()))
+    machine = read_scan_machine(written(tmp_path, change=("shots = 3", 'shots = 3\nunit = "mm"')))
+    with pytest.raises(Exception, match="'SIM:SCREEN:X' in 'um'; expected mm"):
+        engine(ensure_connected(devices_of(machine)[1]))
 
 
 def test_every_block_of_the_page_gives_what_stands_beside_it(ioc, root, tmp_path, monkeypatch):
