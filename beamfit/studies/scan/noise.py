@@ -11,10 +11,12 @@ from scipy.special import fdtrc
 from beamfit.statistics import POOR_FIT, chi2_probability
 from beamfit.studies.scan.scans import QuadScan
 
-# Noise without errors in the file: a guess of 7 % of the size, worth 2.5 degrees of freedom, so
-# that a few accidentally small residuals are not taken for precision, nor equal sizes for none. A
-# guess of 5 % worth 2 left 2 % of scans of 5 and 6 points with 10 % of noise beyond 3 errors.
-GUESS, GUESS_DOF = 0.07, 2.5
+# Noise without errors in the file: a guess of 5 % of the size, worth two degrees of freedom, so
+# that a few accidentally small residuals are not taken for precision, nor equal sizes for none.
+GUESS, GUESS_DOF = 0.05, 2.0
+# With up to so many residuals left that leaves 2 % of scans with 10 % of noise beyond 3 errors: the
+# guess is 7 % there, worth 2.5, and the more of it is forgotten as their number squared.
+FEW, GUESS_OF_FEW, DOF_OF_FEW = 3, 0.07, 2.5
 # A setting's own scatter counts beside this many degrees of freedom of all settings' together.
 POOL_DOF = 20.0
 # With fewer repeats in all, or points, nothing is told of their kind.
@@ -31,7 +33,7 @@ class Noise(NamedTuple):
     Attributes
     ----------
     error : ndarray
-        Shape (n,), m, of the measured sizes; where not known `GUESS` of them.
+        Shape (n,), m, of the measured sizes; where not known `guess` of them.
     relative : float
         1 where errors are shares of the size, so that the fit takes them of the model's size; a
         size that noise made small would count for more otherwise. 0 where they are as they stand.
@@ -70,6 +72,21 @@ class Noise(NamedTuple):
         return dof if probability is not None and probability < DOUBTFUL else self.dof
 
 
+def guess(points: int) -> tuple[float, float]:
+    """The share of the size that noise is guessed at, and how many residuals that is worth.
+
+    Examples
+    --------
+    >>> [tuple(round(v, 3) for v in guess(n)) for n in (5, 6, 9, 30)]
+    [(0.07, 2.5), (0.07, 2.5), (0.057, 2.125), (0.05, 2.006)]
+    """
+    more = min(1.0, (FEW / max(points - 3, 1)) ** 2)
+    dof = GUESS_DOF + more * (DOF_OF_FEW - GUESS_DOF)
+    square = GUESS_DOF * GUESS**2
+    square += more * (DOF_OF_FEW * GUESS_OF_FEW**2 - square)
+    return float(np.sqrt(square / dof)), dof
+
+
 def noise_of(scan: QuadScan, plane: str) -> Noise:
     """The errors of the sizes of a plane, from its file, its shots, or a guess.
 
@@ -106,7 +123,8 @@ def noise_of(scan: QuadScan, plane: str) -> Noise:
     measured = ~np.isnan(scan.size[plane])
     size = scan.size[plane][measured]
     if plane not in scan.error:
-        return Noise(GUESS * size, 1.0, False, GUESS_DOF, "inferred from the residuals")
+        share, dof = guess(len(size))
+        return Noise(share * size, 1.0, False, dof, "inferred from the residuals")
     error = scan.error[plane][measured]
     freedom = None if scan.shots is None else np.asarray(scan.shots, float)[measured] - 1.0
     if freedom is not None and freedom.sum() > 0:
@@ -161,8 +179,9 @@ def outstanding(square: np.ndarray, degrees: np.ndarray) -> np.ndarray:
 
 def constant_noise(size: np.ndarray) -> Noise:
     """A guess at noise that is the same in µm at every point."""
-    error = np.full(len(size), GUESS * float(np.median(size)))
-    return Noise(error, 0.0, False, GUESS_DOF, "inferred from the residuals, the same in µm")
+    share, dof = guess(len(size))
+    error = np.full(len(size), share * float(np.median(size)))
+    return Noise(error, 0.0, False, dof, "inferred from the residuals, the same in µm")
 
 
 def unlikely(off: np.ndarray, shape: np.ndarray) -> float:
