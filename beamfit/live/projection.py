@@ -7,6 +7,9 @@ from scipy.optimize import curve_fit
 
 # Heights over the scatter of the background below which a projection shows no beam.
 SEEN = 5.0
+# A Gaussian is within 1 % of its height over 0.28 of its size: a top wider than this, and some
+# pixels, is cut off by the camera.
+FLAT, PIXELS = 0.6, 2
 # Share of the projection at either end that is background, to begin with.
 ENDS = 0.1
 
@@ -24,7 +27,7 @@ def rms_of(counts: np.ndarray, pixel: float) -> float | None:
     Returns
     -------
     float or None
-        m; None where there is no beam, or its spot does not fit on the screen.
+        m; None where there is no beam, its spot does not fit on the screen, or its top is cut off.
 
     Notes
     -----
@@ -55,7 +58,8 @@ def rms_of(counts: np.ndarray, pixel: float) -> float | None:
         return None
     size = abs(float(found[2]))
     inside = 0 < found[1] < n - 1 and found[0] > 0 and 0.3 < size < n / 4
-    return size * pixel if inside else None
+    flat = np.count_nonzero(counts - level > 0.99 * height) > PIXELS + FLAT * size
+    return size * pixel if inside and not flat else None
 
 
 def _gaussian(x: np.ndarray, height: float, middle: float, size: float, level: float) -> np.ndarray:

@@ -255,6 +255,11 @@ def test_a_projection_has_the_size_of_its_gaussian():
     assert rms_of(spot, 5e-6) == pytest.approx(85e-6, rel=0.03)
     assert rms_of(rng.poisson(np.full(300, 50.0)), 5e-6) is None
     assert rms_of(400 * np.exp(-0.5 * ((x - 130.0) / 120.0) ** 2), 5e-6) is None  # too large
+    for size in (6.0, 17.0, 40.0):
+        whole = 400 * np.exp(-0.5 * ((x - 130.0) / size) ** 2) + 50.0
+        assert rms_of(whole, 5e-6) == pytest.approx(5e-6 * size, rel=0.01)
+        assert rms_of(rng.poisson(whole), 5e-6) is not None
+        assert rms_of(np.minimum(whole, 0.85 * whole.max()), 5e-6) is None  # saturated
 
 
 SECOND = """[[magnet]]
