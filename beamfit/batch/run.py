@@ -178,6 +178,9 @@ def _answers(
     one_each = {
         "distributed.scheduler.worker-saturation": 1.0,
         "distributed.worker.profile.enabled": False,  # 100 looks a second at each worker
+        "distributed.admin.tick.interval": "1s",
+        "distributed.admin.system-monitor.interval": "10s",
+        "distributed.worker.memory.monitor-interval": "5s",
     }
     own = {"threads_per_worker": 1, "dashboard_address": None, "processes": True}
     own["silence_logs"] = logging.CRITICAL  # what a worker died of is told by its file
