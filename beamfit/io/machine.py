@@ -200,10 +200,7 @@ def read_scan_machine(path: str | PathLike[str]) -> ScanMachine:
     InputError
         If it cannot be used, naming line and key.
     """
-    top = read_toml(path, "a machine")
-    if (found := top.table.get("format")) != FORMAT:
-        raise top.error(f"format {found!r}"[:80], f'format = "{FORMAT}"', "format")
-    said = top.values(TOP)
+    top, said = read_machine(path)
     if said["lattice"] is None:
         raise top.error("no lattice", 'lattice = "FILE"', "lattice")
     lattice = read_lattice(Path(path).parent / said.pop("lattice"))
@@ -231,6 +228,14 @@ def read_scan_machine(path: str | PathLike[str]) -> ScanMachine:
     return ScanMachine(
         name, str(path), top.sha256, lattice, magnets, screen, guard, first=first, **plan, **said
     )
+
+
+def read_machine(path: str | PathLike[str]) -> tuple[Section, dict[str, Any]]:
+    """A machine file, and what stands at its top."""
+    top = read_toml(path, "a machine")
+    if (found := top.table.get("format")) != FORMAT:
+        raise top.error(f"format {found!r}"[:80], f'format = "{FORMAT}"', "format")
+    return top, top.values(TOP)
 
 
 def unit_of(spelled: str) -> str | None:

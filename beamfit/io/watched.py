@@ -10,9 +10,9 @@ from typing import NamedTuple
 from beamfit.errors import InputError, plain
 from beamfit.io.decay_record import QUANTITIES
 from beamfit.io.headers import spelled
-from beamfit.io.machine import FORMAT, POSITIVE, TOP
+from beamfit.io.machine import POSITIVE, read_machine
 from beamfit.io.sheet import UNITS
-from beamfit.io.toml import TEXT, Key, Section, read_toml
+from beamfit.io.toml import TEXT, Key, Section
 from beamfit.studies.decay.record import Conditions
 
 # Keys are named as the columns of a decay record are.
@@ -129,10 +129,7 @@ def read_watch_machine(path: str | PathLike[str]) -> WatchMachine:
     >>> read_watch_machine(file).variables[0].variable
     'pva://SR:CURRENT'
     """
-    top = read_toml(path, "a machine")
-    if (found := top.table.get("format")) != FORMAT:
-        raise top.error(f"format {found!r}"[:80], f'format = "{FORMAT}"', "format")
-    said = top.values(TOP)
+    top, said = read_machine(path)
     ring = top.section("ring")
     file = ring.values(RING)["file"]
     variables = _variables(ring)
