@@ -144,7 +144,8 @@ def systematics(fit: EmittanceFit, plane: str) -> list[Change]:
     energy = fit.seen.energy
     stiffer = 0.01 * energy**2 / (energy**2 - fit.line.mass**2)
     found = [Change(c, d, d + stiffer * (c == "energy +1 %")) for c, d in changes.items()]
-    return sorted(found, key=lambda change: -abs(change.normalized_emittance))
+    # What is zero but for rounding keeps its place.
+    return sorted(found, key=lambda change: -round(abs(change.normalized_emittance), 12))
 
 
 def _held(fit: EmittanceFit, magnet: str) -> str:
