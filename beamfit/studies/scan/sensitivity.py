@@ -40,6 +40,8 @@ from beamfit.studies.scan.transport import Rows, padded
 
 # Leaving out one of more points than this tells nothing.
 MOST_POINTS = 50
+# A relative change of an emittance below this is rounding.
+ROUNDING = 1e-12
 # Nobody reads a budget of more causes than this, nor of smaller changes.
 MOST_CAUSES, SMALLEST = 30, 5e-4
 # Steps of the budget: resolution and dispersion in m, and a momentum spread where none is stated.
@@ -143,9 +145,10 @@ def systematics(fit: EmittanceFit, plane: str) -> list[Change]:
     # ln βγ rises by E²/(E² - m²) for each relative step of the energy.
     energy = fit.seen.energy
     stiffer = 0.01 * energy**2 / (energy**2 - fit.line.mass**2)
-    found = [Change(c, d, d + stiffer * (c == "energy +1 %")) for c, d in changes.items()]
-    # What is zero but for rounding keeps its place.
-    return sorted(found, key=lambda change: -round(abs(change.normalized_emittance), 12))
+    # What is zero but for rounding is zero, and keeps its place.
+    whole = {cause: d if abs(d) > ROUNDING else 0.0 for cause, d in changes.items()}
+    found = [Change(c, d, d + stiffer * (c == "energy +1 %")) for c, d in whole.items()]
+    return sorted(found, key=lambda change: -abs(change.normalized_emittance))
 
 
 def _held(fit: EmittanceFit, magnet: str) -> str:
