@@ -198,7 +198,7 @@ def _answered(
         if not isinstance(found.problem, InputError):
             raise found.problem
         kept = f"; {len(found.points)} points are in {out}" if found.points and out.exists() else ""
-        raise InputError(f"{found.problem.found}{kept}; all is restored", found.problem.expected)
+        raise replace(found.problem, found=f"{found.problem.found}{kept}; all is restored")
     said = {"file": str(out), "points": len(found.points), "ended": found.reason, "restored": True}
     status = 128 + found.signal if found.signal else 0
     inputs = _inputs(machine) | ({str(out): digest(out)} if found.points else {})

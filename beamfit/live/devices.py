@@ -305,14 +305,15 @@ async def checked(supply: Supply) -> tuple[Supply, list[str]]:
         If it has another unit or other limits than the file says.
     """
     magnet = supply.magnet
-    for channel in (supply.readback, supply.setting):
-        found = await channel.describe()
-        if found.unit and unit_of(found.unit) != magnet.unit:
-            said = f"'{plain(channel.name)}' in '{plain(found.unit)}'"
+    setting = await supply.setting.describe()
+    readback = await supply.readback.describe()
+    for name, unit in ((supply.readback.name, readback.unit), (supply.setting.name, setting.unit)):
+        if unit and unit_of(unit) != magnet.unit:
+            said = f"'{plain(name)}' in '{plain(unit)}'"
             raise InputError(said, f"{magnet.unit}, as the machine file says of {magnet.name}")
-    low, high = max(magnet.low, found.low), min(magnet.high, found.high)
+    low, high = max(magnet.low, setting.low), min(magnet.high, setting.high)
     if not low < high:
-        found = f"limits {found.low:g} to {found.high:g} of '{plain(magnet.set)}'"
+        found = f"limits {setting.low:g} to {setting.high:g} of '{plain(magnet.set)}'"
         raise InputError(found, f"some of {magnet.low:g} to {magnet.high:g}, of the machine file")
     if (low, high) == (magnet.low, magnet.high):
         return supply, []

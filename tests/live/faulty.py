@@ -104,8 +104,8 @@ class Fate(NamedTuple):
 class Worker:
     """A process that runs commands; after its death there is a new one."""
 
-    def __init__(self, folder: Path) -> None:
-        self.folder, self.process = folder, None
+    def __init__(self) -> None:
+        self.process = None
 
     def begin(self, *arguments: str, file_size: int | None = None) -> None:
         if self.process is None or self.process.poll() is not None:
@@ -136,7 +136,7 @@ class Injector:
     """An IOC, a worker and the files of a machine."""
 
     def __init__(self, ioc: Ioc, folder: Path) -> None:
-        self.ioc, self.folder, self.worker = ioc, folder, Worker(folder)
+        self.ioc, self.folder, self.worker = ioc, folder, Worker()
         self.journal = folder / "machine.journal"
         (folder / "line.toml").write_text(LINE)
 

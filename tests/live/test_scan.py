@@ -319,7 +319,11 @@ def injector(_ioc, tmp_path_factory):
         ("SIGN", 2, r"not seen to be restored \(Q1 set to .* expected beamfit scan --recover"),
         ("NAN", 2, "no sizes at 3 settings in a row .* all is restored"),
         ("IOC back", 2, "all is restored"),
-        ("disk", 2, r"cannot be written \(File too large\).* all is restored"),
+        (
+            "disk",
+            2,
+            r"scan.csv: a place that cannot be written \(File too large\).* all is restored",
+        ),
     ],
 )
 def test_a_scan_of_a_real_ioc_leaves_no_magnet_wrong(ioc, injector, fault, status, said):
