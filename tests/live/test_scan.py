@@ -310,6 +310,9 @@ def injector(_ioc, tmp_path_factory):
     one.worker.close()
 
 
+FULL = r"scan.csv: a place that cannot be written \(File too large\).* all is restored"
+
+
 @pytest.mark.parametrize(
     ("fault", "status", "said"),
     [
