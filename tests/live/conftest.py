@@ -26,6 +26,7 @@ def private_ports():
     return {
         "EPICS_CA_ADDR_LIST": here, "EPICS_CA_AUTO_ADDR_LIST": "NO",
         "EPICS_CA_SERVER_PORT": access, "EPICS_CA_REPEATER_PORT": free_port(udp),
+        "EPICS_CA_MAX_SEARCH_PERIOD": "60",
         "EPICS_CAS_INTF_ADDR_LIST": here, "EPICS_CAS_BEACON_ADDR_LIST": here,
         "EPICS_PVA_ADDR_LIST": here, "EPICS_PVA_AUTO_ADDR_LIST": "NO",
         "EPICS_PVA_SERVER_PORT": pva, "EPICS_PVA_BROADCAST_PORT": search,
