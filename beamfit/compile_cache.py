@@ -55,14 +55,20 @@ def prepare_jax() -> None:
         if name.upper() not in os.environ and getattr(jax.config, name) == usual:
             jax.config.update(name, ours)
     if FOLDER.upper() not in os.environ and jax.config.jax_compilation_cache_dir is None:
-        place = _place()
+        place = own_folder()
         jax.config.update(FOLDER, place)
         if place is not None:
             _seal(Path(place))
 
 
-def _place() -> str | None:
-    """The folder of the cache, or None where there can be none: what lies in it is run."""
+def own_folder() -> str | None:
+    """This user's folder of beamfit, or None where there can be none: code in it is run.
+
+    Examples
+    --------
+    >>> own_folder() is None or own_folder().endswith("/beamfit")
+    True
+    """
     try:
         home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
         folder = Path(home) / "beamfit"

@@ -56,16 +56,16 @@ def test_the_second_script_compiles_nothing(tmp_path):
 
 def test_a_folder_that_others_can_write_to_is_not_used(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    place = compile_cache._place()
+    place = compile_cache.own_folder()
     assert place == str(tmp_path / "beamfit")
     assert (tmp_path / "beamfit").stat().st_mode & 0o777 == 0o700
     (tmp_path / "beamfit").chmod(0o777)
     with pytest.warns(UserWarning, match="is not used; chmod 700"):
-        assert compile_cache._place() is None
+        assert compile_cache.own_folder() is None
     (tmp_path / "beamfit").chmod(0o755)
     monkeypatch.setattr(os, "getuid", lambda: 12345)
     with pytest.warns(UserWarning, match="belongs to others"):
-        assert compile_cache._place() is None
+        assert compile_cache.own_folder() is None
 
 
 @pytest.mark.parametrize("home", ["/dev/null", "/proc/none"])

@@ -227,18 +227,18 @@ def _answered(
 def _recovered(journal: str, say: _Lines, as_json: bool) -> int:
     from beamfit.live.channel import run
     from beamfit.live.devices import supply_of
-    from beamfit.live.journal import named, read_journal
+    from beamfit.live.journal import alone_with, named, read_journal
     from beamfit.live.restore import restore
-    from beamfit.writing import alone
 
     left = read_journal(journal)
     found = digest(journal)
+    magnets = [m for m, _ in left.before]
 
     async def back() -> None:
-        magnets = {m.name: supply_of(m, left.timeout) for m, _ in left.before}
-        await restore(left, magnets)
+        supplies = {m.name: supply_of(m, left.timeout) for m in magnets}
+        await restore(left, supplies)
 
-    with alone(journal):
+    with alone_with(Path(journal), magnets):
         run(back())
     if as_json:
         settings = {m.name: {"value": v, "unit": m.unit} for m, v in left.before}

@@ -22,13 +22,12 @@ from bluesky.utils import FailedStatus, MsgGenerator
 import beamfit
 from beamfit.io.machine import Magnet, ScanMachine
 from beamfit.live.devices import Connected, Supply
-from beamfit.live.journal import Journal, check_none_left, journal_of
+from beamfit.live.journal import Journal, alone_with, check_none_left, journal_of
 from beamfit.live.next_setting import warmed
 from beamfit.live.ophyd import MagnetDevice, ScreenDevice
 from beamfit.live.scan import Outcome, Running, Told, back, begun, journal_for
 from beamfit.optics.beamline import Beamline
 from beamfit.studies.scan.fit import EmittanceFit
-from beamfit.writing import alone
 
 # What a fit's event says of each plane.
 QUOTED = ("emittance", "normalized_emittance", "beta", "alpha")
@@ -88,7 +87,7 @@ def emittance_scan(
     machine = replace(machine, magnets=tuple(s.magnet for s in supplies.values()))
     seen = _Messages({name: magnets[name] for name in supplies}, screen, machine.screen.shots)
     warmed(machine, line)
-    with alone(place := journal_of(machine, journal)):
+    with alone_with(place := journal_of(machine, journal), machine.magnets):
         check_none_left(place)
         before = {}
         for name, supply in supplies.items():

@@ -2,22 +2,27 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import socket
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass, fields
 from datetime import UTC, datetime
 from os import PathLike
 from pathlib import Path
 
-from beamfit.errors import InputError
+from beamfit.compile_cache import own_folder
+from beamfit.errors import InputError, plain
 from beamfit.io.files import read_json
 from beamfit.io.machine import APPROACHES, Magnet, ScanMachine
 from beamfit.io.toml import is_number
-from beamfit.writing import write_atomically
+from beamfit.writing import alone, write_atomically
 
 FORMAT = "beamfit-journal-1"
+# Ends of the names by which EPICS is told where variables are looked for.
+LOOKED_FOR = ("_ADDR_LIST", "_NAME_SERVERS", "_SERVER_PORT", "_BROADCAST_PORT")
 
 
 @dataclass(frozen=True)
@@ -83,6 +88,39 @@ def check_none_left(path: Path) -> None:
     if path.exists():
         found = "what a scan before this one has not restored"
         raise InputError(found, f"beamfit scan --recover {path} first", path=path)
+
+
+@contextmanager
+def alone_with(path: Path, magnets: Iterable[Magnet]) -> Iterator[None]:
+    """Keep other scans from a journal and from its magnets, in whatever file these are named.
+
+    The locks of magnets are in this user's folder of beamfit; without a home there are none.
+
+    Raises
+    ------
+    InputError
+        Naming the journal or the magnet that another scan has.
+    """
+    folder = own_folder()
+    with ExitStack() as stack:
+        stack.enter_context(alone(path))
+        for magnet in magnets if folder else ():
+            lock = Path(folder, f"magnet-{_found_as(magnet.set)}")
+            try:
+                stack.enter_context(alone(lock))
+            except InputError:
+                found = (
+                    f"magnet '{plain(magnet.name)}' ({plain(magnet.set)}), which another scan has"
+                )
+                raise InputError(found, "another magnet, or that scan's end") from None
+        yield
+
+
+def _found_as(variable: str) -> str:
+    """A word for a variable and where it is looked for: a simulation may have the same name."""
+    where = sorted(f"{k}={v}" for k, v in os.environ.items() if k.endswith(LOOKED_FOR))
+    said = "\n".join([variable.rpartition("://")[2], *where])
+    return hashlib.sha256(said.encode()).hexdigest()[:16]
 
 
 def read_journal(path: str | PathLike[str]) -> Journal:

@@ -16,12 +16,11 @@ import numpy as np
 from beamfit.errors import InputError
 from beamfit.io.machine import Magnet, ScanMachine
 from beamfit.live.devices import Connected, Device, NoSizesError
-from beamfit.live.journal import Journal, check_none_left, named
+from beamfit.live.journal import Journal, alone_with, check_none_left, named
 from beamfit.live.next_setting import Next, Point, fit_of, next_setting, sharp, warmed
 from beamfit.live.restore import ended_by_signals, reach, restore
 from beamfit.optics.beamline import Beamline
 from beamfit.studies.scan.fit import EmittanceFit
-from beamfit.writing import alone
 
 # Settings in a row at which nothing can be measured, after which a scan ends.
 BARREN = 3
@@ -123,15 +122,15 @@ async def scan(
     NotRestoredError
         If a magnet is not seen to be back; the journal stays then.
     InputError
-        If nothing was begun: a journal is left from before, another scan has it, or it cannot be
-        written.
+        If nothing was begun: a journal is left from before, another scan has it or a magnet, or
+        it cannot be written.
 
     Examples
     --------
     See docs/live.md, where a simulation takes the place of a control system.
     """
     warmed(at.machine, line)
-    with alone(journal):
+    with alone_with(journal, at.machine.magnets):
         check_none_left(journal)
         before = {m.name: await at.magnets[m.name].get() for m in at.machine.magnets}
         log = journal_for(journal, at.machine, before)

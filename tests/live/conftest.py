@@ -8,6 +8,8 @@ from pathlib import Path
 
 import pytest
 
+from beamfit.live import journal
+
 # Run as programs of their own.
 collect_ignore = ["ioc.py", "worker.py"]
 ROOT = Path(__file__).resolve().parents[2]
@@ -61,6 +63,12 @@ class Ioc:
         """Every value that was written to a magnet."""
         rows = map(str.split, self.log.read_text().splitlines())
         return [float(value) for _, name, value in rows if name == magnet]
+
+
+@pytest.fixture(autouse=True)
+def _locks_of_this_process(tmp_path_factory, monkeypatch):
+    """Tests of two processes may scan a simulated magnet of one name."""
+    monkeypatch.setattr(journal, "own_folder", lambda: str(tmp_path_factory.getbasetemp()))
 
 
 @pytest.fixture(scope="session")

@@ -16,7 +16,7 @@ from beamfit.io.line import build_line, read_inputs
 from beamfit.io.machine import read_scan_machine
 from beamfit.live.channel import LostError
 from beamfit.live.devices import NotSettledError
-from beamfit.live.journal import Journal, read_journal
+from beamfit.live.journal import Journal, alone_with, read_journal
 from beamfit.live.next_setting import Next, Point, fit_of, next_setting, sharp
 from beamfit.live.projection import rms_of
 from beamfit.live.record import scan_text
@@ -51,6 +51,21 @@ def test_a_scan_stops_at_its_goal_and_restores(done):
     # Only the fit before the last point was not good enough.
     before = found.points[:-1]
     assert not sharp(fit_of(before, at.machine, found.fit.line), before, 0.03)
+
+
+def test_a_magnet_is_of_one_scan_whatever_file_names_it(tmp_path):
+    device = Simulated()
+    at = connected(tmp_path, device)
+    [magnet] = at.machine.magnets
+    others = [replace(magnet, name="other", set=f"pva://{magnet.set}")]
+    with (
+        alone_with(tmp_path / "other.journal", others),
+        pytest.raises(InputError, match=f"magnet 'Q1' .{magnet.set}., which another scan has"),
+    ):
+        scanned(at, tmp_path)
+    assert device.puts == []
+    with alone_with(tmp_path / "a.journal", others):
+        pass  # both locks are free again
 
 
 def test_the_file_is_an_ordinary_scan_with_the_same_fit(done):
