@@ -7,8 +7,26 @@ from collections.abc import Sequence
 from functools import lru_cache
 
 # Units at the end of a header, as the columns' names have them.
-KNOWN = ("um", "mm", "m", "µm", "μm", "s", "min", "h", "d", "ms", "mA", "A", "uA", "µA", "μA")
-KNOWN += ("kV", "V", "MV", "Pa", "mbar", "Torr", "MeV", "kG", "T_per_m", "k1", "k1l")
+KNOWN = ("um", "mm", "m", "µm", "μm", "nm", "cm", "s", "min", "h", "d", "ms", "us", "µs", "ns")
+KNOWN += (
+    "mA",
+    "A",
+    "uA",
+    "µA",
+    "μA",
+    "nA",
+    "kV",
+    "V",
+    "MV",
+    "Pa",
+    "mbar",
+    "Torr",
+    "MeV",
+    "kG",
+    "T_per_m",
+    "k1",
+    "k1l",
+)
 ENDS = tuple(f"_{unit}" for unit in KNOWN)
 # Other ways to write one; in capitals or small letters no other unit is meant by these.
 ALSO = {"T/m": "T_per_m", "1/m^2": "k1", "1/m2": "k1", "1/m²": "k1", "m^-2": "k1", "m-2": "k1"}
@@ -21,6 +39,13 @@ ALSO |= {"mev": "MeV", "ma": "mA", "pa": "Pa", "PA": "Pa", "torr": "Torr", "TORR
 BRACKETS = re.compile(r"(.*?)[\s_]*(?:\[(.*?)\]|\((.*?)\)|\s/\s+(\S+))\s*")
 # Lines that are looked through for the header below a title.
 HEAD = 50
+# How a line begins that is a comment: of Python, MATLAB, C, SDDS.
+MARKS = ("#", "%", "//", "!")
+# Of a TFS file.
+TFS = ("@", "*", "$")
+# A table in a frame, as a logbook, a database or ROOT draws one.
+FRAMED = re.compile(r"\s*([|*])(.*)\1\s*")
+RULE = re.compile(r"\s*[-+=|*:]{3,}\s*")
 
 
 def _unit(text: str) -> str | None:
@@ -70,7 +95,7 @@ def with_units(names: Sequence[str], cells: Sequence[str]) -> list[str] | None:
     if not plain or not any(units):
         return None
     return [
-        name if u is None or _has_unit(name) else f"{name}_{u}"
+        name if u is None or _has_unit(name) else re.sub(r"\s+", "_", f"{name}_{u}")
         for name, u in zip(names, units, strict=True)
     ]
 
@@ -85,8 +110,26 @@ def _words(text: str) -> list[str]:
     return [word.strip(' "') for word in text.split(None if separator == " " else separator)]
 
 
+def unframed(text: str) -> str:
+    """A line of a table without its frame, tabs between the cells; nothing of a mere rule.
+
+    Examples
+    --------
+    >>> unframed("| 1 | 2.5 |"), unframed("|---|---|"), unframed("+---+---+"), unframed("1,2")
+    ('1\\t2.5', '', '', '1,2')
+    """
+    if RULE.fullmatch(text):
+        return ""
+    if (found := FRAMED.fullmatch(text)) is None:
+        return text
+    cells = [cell.strip() for cell in found[2].split(found[1])]
+    return "" if not any(cell.strip("-:= ") for cell in cells) else "\t".join(cells)
+
+
 def header_at(lines: Sequence[str]) -> int:
     """Which of some lines is the header: the first with two units, if only words stand above it.
+
+    Where none has units it is the first line, or the first that rows of as many cells follow.
 
     Examples
     --------
@@ -97,7 +140,7 @@ def header_at(lines: Sequence[str]) -> int:
     """
     first: int | None = None
     for i, text in enumerate(lines):
-        if not text.strip(",;\t ") or text.lstrip()[:1] in ("#", "@", "*", "$"):
+        if _is_aside(text):
             continue
         cells = _words(text)
         numbers = any(map(is_number, cells))
@@ -105,13 +148,36 @@ def header_at(lines: Sequence[str]) -> int:
             return i
         if first is None:
             first = i
-        elif numbers and len(cells) == len(_words(lines[first])):
+        elif numbers and _is_value(cells[0]) and len(cells) == len(_words(lines[first])):
             break
-    return 0 if first is None else first
+    if first is None or _has_rows(lines, first):
+        return first or 0
+    return next((i for i in range(first, len(lines)) if _has_rows(lines, i)), first)
+
+
+def _is_aside(text: str) -> bool:
+    """Whether a line is blank, a comment, or of the head of a TFS file."""
+    return not text.strip(",;\t ") or text.lstrip().startswith(MARKS + TFS)
+
+
+def _is_value(cell: str) -> bool:
+    """Whether a cell may be a number or a date."""
+    return cell.lstrip("+-.")[:1].isdigit()
+
+
+def _has_rows(lines: Sequence[str], i: int) -> bool:
+    """Whether rows of as many cells as a line of words has follow it, below its units perhaps."""
+    cells = _words(lines[i])
+    rows = [_words(text) for text in lines[i + 1 :] if not _is_aside(text)][:3]
+    if rows and len(rows[0]) == len(cells) and with_units(cells, rows[0]):
+        del rows[0]
+    alike = rows and all(len(row) == len(cells) and _is_value(row[0]) for row in rows[:2])
+    words = not _is_aside(lines[i]) and not any(map(_is_value, cells))
+    return bool(alike) and len(cells) > 1 and words
 
 
 def uncommented(lines: Sequence[str]) -> list[str]:
-    """Some lines, with the header that a # hides above the first numbers, as numpy.savetxt does.
+    """Some lines, with the header that a mark of comments hides above the first values.
 
     Examples
     --------
@@ -119,14 +185,23 @@ def uncommented(lines: Sequence[str]) -> list[str]:
     ['# noon', 'time_s,beam_current_mA', '0,1']
     """
     found = list(lines)
-    first = next((i for i, text in enumerate(found) if text.strip(" ,;\t")[:1] not in ("", "#")), 0)
+    rows = (i for i, t in enumerate(found) if t.strip(" ,;\t") and not t.lstrip().startswith(MARKS))
+    first = next(rows, 0)
     above = found[first - 1].strip() if first else ""
-    if above.startswith("#"):
-        cells, words = _words(found[first]), _words(above.lstrip("# "))
-        numbers = len(words) == len(cells) and all(map(is_number, cells))
-        if numbers and any(map(_has_unit, words)) and not any(map(is_number, words)):
-            found[first - 1] = above.lstrip("# ")
+    if above.startswith(MARKS):
+        said = bare(above)
+        cells, words = _words(found[first]), _words(said)
+        values = len(words) == len(cells) and all(map(_is_value, cells))
+        # Words between blanks may be a sentence.
+        named = any(map(_has_unit, words)) or separator_of(said) != " "
+        if values and named and not any(map(_is_value, words)):
+            found[first - 1] = said
     return found
+
+
+def bare(comment: str) -> str:
+    """A comment without its mark."""
+    return comment.strip().lstrip("".join(MARKS) + " ").rstrip()
 
 
 def is_number(text: object) -> bool:

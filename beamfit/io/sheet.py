@@ -20,10 +20,10 @@ from beamfit.io.headers import spelled
 
 UNITS: dict[str, dict[str, float]] = {
     # quantity: unit at the end of a name -> factor to SI (a stored current: to mA)
-    "length": {"um": 1e-6, "mm": 1e-3, "m": 1.0, "µm": 1e-6, "μm": 1e-6},
+    "length": {"um": 1e-6, "mm": 1e-3, "m": 1.0, "µm": 1e-6, "μm": 1e-6, "nm": 1e-9, "cm": 1e-2},
     "length or duration": {"mm": 1e-3, "m": 1.0, "ps": 299792458e-12},
-    "time": {"s": 1.0, "min": 60.0, "h": 3600.0, "d": 86400.0, "ms": 1e-3},
-    "current": {"mA": 1.0, "A": 1e3, "uA": 1e-3, "µA": 1e-3, "μA": 1e-3},
+    "time": {"s": 1.0, "min": 60.0, "h": 3600.0, "d": 86400.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9},
+    "current": {"mA": 1.0, "A": 1e3, "uA": 1e-3, "µA": 1e-3, "μA": 1e-3, "nA": 1e-6},
     "voltage": {"kV": 1e3, "V": 1.0, "MV": 1e6},
     "pressure": {"Pa": 1.0, "mbar": 100.0, "Torr": 101325 / 760},
     "energy in MeV": {"MeV": 1.0},
@@ -63,6 +63,8 @@ class Sheet:
         Digest of the file.
     bad : tuple of InputError
         What is wrong with rows that were left out on request.
+    notes : tuple of str
+        What was done to the cells.
     """
 
     path: str | PathLike[str]
@@ -73,6 +75,7 @@ class Sheet:
     comments: tuple[str, ...]
     sha256: str = ""
     bad: tuple[InputError, ...] = ()
+    notes: tuple[str, ...] = ()
 
     def __len__(self) -> int:
         return len(self.cells[0])
@@ -112,6 +115,16 @@ class Sheet:
             raise self.header_error("no column that is not ignored", "a column to read")
         cells = [self[name] for name in left]
         return replace(self, names=tuple(left), cells=cells)
+
+    def named(self) -> Sheet:
+        """Leave out columns without a name, such as the index that pandas writes."""
+        left = [i for i, name in enumerate(self.names) if name and not name.startswith("Unnamed:")]
+        if len(left) in (0, len(self.names)):
+            return self
+        names = tuple(self.names[i] for i in left)
+        note = "A column without a name was left aside."
+        cells = [self.cells[i] for i in left]
+        return replace(self, names=names, cells=cells, notes=(*self.notes, note))
 
     def rows(self, keep: Sequence[int]) -> Sheet:
         """Some of the rows."""
@@ -257,9 +270,9 @@ def _known(header: str, quantities: Mapping[str, str], sheet: Sheet) -> Column |
 
 
 def left_out(sheet: Sheet) -> tuple[str, ...]:
-    """Count and name the rows that were left out, as a note."""
+    """Say what was done to the cells, and count and name the rows that were left out, as notes."""
     if not sheet.bad:
-        return ()
+        return sheet.notes
     named = [
         (f"line {e.line}, " if e.line else "")
         + (f"column '{e.column}', " if e.column else "")
@@ -270,4 +283,4 @@ def left_out(sheet: Sheet) -> tuple[str, ...]:
     named += [f"{more} more"] if more else []
     were = "was" if len(sheet.bad) == 1 else "were"
     total = len(sheet) + len(sheet.bad)
-    return (f"{len(sheet.bad)} of {total} rows {were} left out: {'; '.join(named)}.",)
+    return (*sheet.notes, f"{len(sheet.bad)} of {total} rows {were} left out: {'; '.join(named)}.")

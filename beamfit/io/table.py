@@ -12,15 +12,19 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from beamfit.errors import InputError
+from beamfit.io.commas import with_points
 from beamfit.io.files import text_lines
 from beamfit.io.hdf5 import hdf5_columns
 from beamfit.io.headers import (
     HEAD,
+    MARKS,
+    bare,
     header_at,
     is_number,
     separator_of,
     spelled,
     uncommented,
+    unframed,
     with_units,
 )
 from beamfit.io.numeric import check_length, numeric_rows
@@ -100,14 +104,14 @@ def _read_text(
 ) -> Sheet:
     header, separator = None, "" if names is None else ","
     comments, rows, lines, bad, seen = [], [], [], [], hashlib.sha256()
-    source = text_lines(path, seen)
+    source = map(unframed, text_lines(path, seen))
     head = list(itertools.islice(source, HEAD))
     head = uncommented(head) if names is None else head
     title = header_at(head) if names is None else 0
     for line, text in enumerate(itertools.chain(head, source), start=1):
         start = text.strip()[:1]
-        if start == "#" or (start in TFS_LINES and (names is None or separator == " ")):
-            comments.append(text.strip().lstrip("# ").rstrip())
+        if text.lstrip().startswith(MARKS + TFS_LINES * (names is None or separator == " ")):
+            comments.append(bare(text))
         elif names is None and start == "*":  # of a TFS file
             separator, header = " ", line
             names = list(map(str.upper, _split(text, " ", path, line)[1:]))
@@ -136,9 +140,10 @@ def _read_text(
     if names is None:
         raise InputError("no header and no rows", f"a header line such as {example}", path=path)
     _raise_first(() if rows else bad)
+    rows, notes = with_points(rows, separator)
     cells = list(zip(*rows, strict=True)) if rows else [()] * len(names)
-    said = (tuple(comments), seen.hexdigest(), tuple(bad))
-    return Sheet(path, tuple(names), cells, lines, header, *said)
+    said = (tuple(comments), seen.hexdigest(), tuple(bad), notes)
+    return Sheet(path, tuple(names), cells, lines, header, *said).named()
 
 
 def _good(
@@ -187,7 +192,7 @@ def _without_blanks(cells: list[str], least: int) -> list[str]:
 
 def header_of(path: str | PathLike[str]) -> list[str]:
     """The header of a file of text, as `read_sheet` finds it; none of an empty one."""
-    head = uncommented(list(itertools.islice(text_lines(path), HEAD)))
+    head = uncommented([unframed(text) for text in itertools.islice(text_lines(path), HEAD)])
     at = header_at(head)
     return [spelled(name) for name in _cells(path, head[at], at + 1)]
 

@@ -102,12 +102,12 @@ SCANS = {
         changed(",0.3,74", ",300,74").replace(",0.5,96", ",500,96").replace(",0.3,57", ",300,57"),
         ["size_x_error_um", "errors"],
     ),
-    "decimal commas": (
-        GOOD.replace(",", ";").replace(".", ","),
+    "decimal commas beside points": (
+        GOOD.replace(",", ";").replace("111.4", "111,4"),
         [":2:", "'111,4'", "decimal point"],
     ),
     "decimal commas between tabs": (
-        GOOD.replace(",", "\t").replace(".", ","),
+        GOOD.replace(",", "\t").replace("111.4", "111,4"),
         [":2:", "'111,4'", "decimal point"],
     ),
     "commas after a header of semicolons": (

@@ -21,6 +21,9 @@ HEADS = {
     "a row of units": "Q525,size_x,size_x_error\nkG,um,um\n",
     "units in brackets": "Q525,size_x,size_x_error\n[kG],[µm],[µm]\n",
     "a title": "Scan of Q525 on Monday\n\nQ525_kG,size_x_um,size_x_error_um\n",
+    "comments of MATLAB": "% by me\nQ525_kG,size_x_um,size_x_error_um\n",
+    "hidden by MATLAB": "% by me\n%Q525_kG,size_x_um,size_x_error_um\n",
+    "names and numbers": "By,me\nEnergy,135\n\nQ525_kG,size_x_um,size_x_error_um\n",
     "several": "Date: 2024-03-01, night\nBy: A, B, C\nQ525_kG,size_x_um,size_x_error_um\n",
 }
 
@@ -76,3 +79,30 @@ def test_scans_and_records_in_each_others_place_are_told_so(tmp_path):
 def test_units_that_could_mean_another_are_left_as_they_stand():
     same = ("rf_voltage_mv", "Q_a", "Q552_mA2", "size_x", "SR:DCCT:CURRENT", "note_by hand")
     assert [spelled(header) for header in same] == list(same)
+
+
+FRAMES = {
+    "a logbook": "| Q525 [kG] | size_x [um] |\n|---|---:|\n| -4.2 | 111.4 |\n| -3 | 63 |\n"
+    "| 2 | 98 |\n",
+    "a database": "+---+---+\n| Q525_kG | size_x_um |\n+---+---+\n| -4.2 | 111.4 |\n| -3 | 63 |\n"
+    "| 2 | 98 |\n+---+---+\n",
+    "ROOT": "*****\n* note_row * Q525_kG * size_x_um *\n*****\n* 0 * -4.2 * 111.4 *\n"
+    "* 1 * -3 * 63 *\n* 2 * 2 * 98 *\n*****\n",
+    "an index without a name": ",Q525_kG,size_x_um\n0,-4.2,111.4\n1,-3,63\n2,2,98\n",
+}
+
+
+@pytest.mark.parametrize("frame", FRAMES)
+def test_a_table_in_a_frame_is_the_table(frame, tmp_path):
+    (tmp_path / "a.csv").write_text(FRAMES[frame])
+    scan = read_quad_scan(tmp_path / "a.csv")
+    assert scan.settings["Q525"].tolist() == [-4.2, -3, 2]
+    np.testing.assert_allclose(scan.size["x"], [111.4e-6, 63e-6, 98e-6])
+    assert understand(tmp_path / "a.csv").kind == "scan"
+
+
+def test_a_header_behind_a_mark_may_stand_above_dates(tmp_path):
+    rows = "".join(f"2024/03/01 12:00:0{s}.25\t{500 - s}\n" for s in range(4))
+    (tmp_path / "a.txt").write_text("# Data Browser\n#Time\tSR:I\n" + rows)
+    record = read_decay_record(tmp_path / "a.txt", time="Time", current="SR:I:mA")
+    assert record.current.tolist() == [500, 499, 498, 497]
