@@ -5,11 +5,29 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta, timezone
 from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
 
+DAY = 86400.0
 # Besides ISO 8601; days before months where both are numbers.
-FORMS = ("%d-%b-%Y %H:%M:%S", "%d.%m.%Y %H:%M:%S", "%Y/%m/%d %H:%M:%S")
+DAYS = (
+    "%Y-%m-%d",
+    "%d-%b-%Y",
+    "%d.%m.%Y",
+    "%Y/%m/%d",
+    "%d-%b-%y",
+    "%d %b %Y",
+    "%b %d, %Y",
+    "%a %d %b %Y",
+)
+FORMS = tuple(f"{day} {clock}" for day in DAYS for clock in ("%H:%M:%S", "%H:%M"))
+FORMS += ("%a %b %d %H:%M:%S %Y",)
+# A day and a month as numbers tell which is which where one of them is beyond 12.
+NUMBERS = re.compile(r"(\d{1,2})([/-])(\d{1,2})\2(\d{4})\b")
+NOON = re.compile(r"(.*\d) ?([AP])\.?M\.?", re.IGNORECASE)
+# Zones by the letters that clocks show and no list of zones has; those that mean two are left out.
+LETTERS = {"CEST": 2, "EEST": 3, "EDT": -4, "PDT": -7, "PST": -8, "JST": 9, "KST": 9}
+CLOCK = re.compile(r"(\d{1,2}):(\d{2})(?::(\d{2}(?:[.,]\d*)?))?")
 FRACTION = re.compile(r"[.,](\d+)$")
 ZONE = re.compile(r"^(.*\d) ?([A-Z][A-Za-z_]+(?:/[A-Za-z_]+)*)$")
 
@@ -20,7 +38,8 @@ def unix_time(text: str, *, fold: int = 0) -> float:
     Parameters
     ----------
     text : str
-        ISO 8601, 01-Mar-2024 12:00:00.5, 01.03.2024 12:00:00 or 2024/03/01 12:00:00.
+        ISO 8601, 01-Mar-2024 12:00:00.5, 01.03.2024 12:00:00, 2024/03/01 12:00, 13/03/2024
+        12:00:00, 03/13/2024 12:00:00 PM, Fri Mar 1 12:00:00 2024.
     fold : int, optional
         1 for the second of two moments that a zone calls by one time in autumn.
 
@@ -34,14 +53,19 @@ def unix_time(text: str, *, fold: int = 0) -> float:
     >>> unix_time("1970-01-01T01:00:00+01:00"), unix_time("01.01.1970 01:00:00.5 Europe/Berlin")
     (0.0, 0.5)
     """
-    whole, zone = text.strip(), UTC
-    if (match := ZONE.match(whole)) is not None:
+    whole, zone, later = text.strip(), UTC, timedelta()
+    if (match := NOON.fullmatch(whole)) is not None:
+        whole, hours = match[1], int(re.search(r"(\d+):", match[1])[1])
+        later = timedelta(hours=12 * ((match[2] in "Pp") - (hours == 12)))
+    elif (match := ZONE.match(whole)) is not None and match[2] in LETTERS:
+        whole, zone = match[1].strip(), timezone(timedelta(hours=LETTERS[match[2]]))
+    elif match is not None:
         whole = match[1].strip()
         try:
             zone = ZoneInfo(match[2])
         except (ZoneInfoNotFoundError, ValueError, OSError):
             raise ValueError(f"zone {match[2]}") from None
-    moment = _moment(whole)
+    moment = _moment(NUMBERS.sub(_day_first, whole, count=1)) + later
     return (moment if moment.tzinfo else moment.replace(tzinfo=zone, fold=fold)).timestamp()
 
 
@@ -54,18 +78,43 @@ def dates_in_order() -> Callable[[str], float]:
     >>> hours = [f"2024-10-27 {h}:30:00 Europe/Berlin" for h in ("01", "02", "02", "03")]
     >>> [(read(hour) - 1729985400) / 3600 for hour in hours]
     [0.0, 1.0, 2.0, 3.0]
+
+    Times of day without a date go on past midnight.
+
+    >>> read = dates_in_order()
+    >>> [read(clock) / 3600 for clock in ("22:00", "23:00:00", "01:00:00.0")]
+    [22.0, 23.0, 25.0]
     """
     latest = -math.inf
 
     def read(text: str) -> float:
         nonlocal latest
-        moment = unix_time(text)
-        if moment <= latest < (second := unix_time(text, fold=1)):
+        if (clock := CLOCK.fullmatch(str(text).strip())) is not None:
+            moment = _time_of_day(*clock.groups(default="0"))
+            moment += DAY * (max(latest - moment, 0.0) // DAY)
+            moment += DAY if moment < latest - DAY / 2 else 0.0
+        elif (moment := unix_time(text)) <= latest < (second := unix_time(text, fold=1)):
             moment = second
         latest = max(latest, moment)
         return moment
 
     return read
+
+
+def _time_of_day(hours: str, minutes: str, seconds: str) -> float:
+    found = int(hours), int(minutes), float(seconds.replace(",", "."))
+    if found[0] > 23 or found[1] > 59 or found[2] >= 61:
+        raise ValueError("no time of day")
+    return 3600.0 * found[0] + 60.0 * found[1] + found[2]
+
+
+def _day_first(found: re.Match[str]) -> str:
+    """A date of numbers as ISO 8601 has it; ValueError where day and month could be exchanged."""
+    first, _, second, year = found.groups()
+    day, month = (first, second) if int(first) > 12 else (second, first)
+    if int(day) <= 12:
+        raise ValueError(f"{found[0]} may be two days")
+    return f"{year}-{int(month):02d}-{int(day):02d}"
 
 
 def _moment(text: str) -> datetime:

@@ -11,28 +11,19 @@ import numpy as np
 
 from beamfit.errors import InputError
 from beamfit.io.archive import archive_sheet
-from beamfit.io.dates import dates_in_order
+from beamfit.io.dates import NUMBERS, dates_in_order
 from beamfit.io.files import name_of
-from beamfit.io.headers import is_number
+from beamfit.io.headers import is_number, spelled
 from beamfit.io.monitor import offset_of
+from beamfit.io.record_columns import DATE, dated, known, record_columns, taken_for_current
 from beamfit.io.scan_columns import is_size
-from beamfit.io.sheet import UNITS, Column, Sheet, columns_of, left_out
+from beamfit.io.sheet import Column, Sheet, columns_of, left_out
 from beamfit.studies.decay.monitor import Monitor
-from beamfit.studies.decay.record import Conditions, DecayRecord, LifetimeTable, first_fault
+from beamfit.studies.decay.record import Conditions, DecayRecord, Fault, LifetimeTable, first_fault
 
 if TYPE_CHECKING:
     from pandas import DataFrame
 
-QUANTITIES = {
-    "time": "time",
-    "beam_current": "current",
-    "beam_current_error": "current",
-    "rf_voltage": "voltage",
-    "scraper_y": "length",
-    "pressure": "pressure",
-    "bunches": "",
-    "bunch_length": "length or duration",
-}
 # Of a table of lifetimes.
 LIFETIMES = {
     "tau": "time",
@@ -41,18 +32,16 @@ LIFETIMES = {
     "lifetime_error": "time",
     "beam_current": "current",
 }
+INCREASE = "times that increase; --skip-bad leaves out rows whose time does not"
 # Columns left aside that a note names.
 MOST_ASIDE = 8
-# What a record calls them.
-CALLED = {"beam_current": "current", "beam_current_error": "error"}
-USED = {"time", "nanos", "current", "error", *Conditions._fields}
-DATE, NANOSECONDS = "a date", "ns"
 # Seconds beyond this many are counted from 1970, not from the start of a record (1973 or later);
 # beyond the other they lie after the year 5000, and are milliseconds.
 UNIX, LATEST = 1e8, 1e11
-# An archive's own columns: seconds since 1970 and nanoseconds, and what it says of each value.
-SECONDS = {"secs": "s", "seconds": "s", "epochseconds": "s"}
-NANOS = {"nanos", "nanoseconds"}
+# Times of day without a date lie on the first day.
+DAY = 86400.0
+FINER = ((1e14, "ms", "milliseconds"), (1e17, "us", "microseconds"))
+FINER += ((np.inf, "ns", "nanoseconds"),)
 
 
 def read_lifetime_input(
@@ -66,7 +55,9 @@ def read_lifetime_input(
 ) -> DecayRecord | LifetimeTable:
     """Read what `beamfit lifetime` takes, by its header: as one of the other two readers."""
     sheet = archive_sheet(path, skip_bad).without(ignore)
-    if time is None and any(name.startswith(("tau_", "lifetime_")) for name in sheet.names):
+    lifetimes = any(spelled(n).lower().startswith(("tau_", "lifetime_")) for n in sheet.names)
+    moments = any((c := known(sheet, name)) and c.key == "time" for name in sheet.names)
+    if time is None and lifetimes and not moments:
         return _lifetimes(sheet, skip_bad)
     return _record(sheet, time, current, skip_bad, offset)
 
@@ -164,7 +155,8 @@ def _record(
     if any(map(is_size, sheet.names)) and time is None and current is None:
         found, expected = "a column of beam sizes", "a record of beam current; `beamfit emittance`"
         raise sheet.header_error(found, f"{expected} reads scans")
-    columns = _columns(sheet, time, current)
+    sheet = dated(sheet) if time is None else sheet
+    columns = record_columns(sheet, time, current)
     for quantity, example in (("time", "time_s"), ("current", "beam_current_mA")):
         if quantity not in columns:
             option = f"'{example}' in the header, or --{quantity} COLUMN:UNIT"
@@ -172,9 +164,10 @@ def _record(
             raise sheet.header_error(found, option)
     if skip_bad:
         sheet = sheet.good(lambda rows: _check_alone(rows, columns, offset is None))
-    notes, moment = (), _moments(sheet, columns)
+    notes = taken_for_current(columns) if current is None else ()
+    moment = _moments(sheet, columns)
     if moment.size > 2 and moment[0] > moment[-1] and np.all(np.diff(moment) <= 0):
-        notes = ("The rows stand newest first, and were read in order of time.",)
+        notes += ("The rows stand newest first, and were read in order of time.",)
         sheet, moment = sheet.rows(list(range(len(sheet)))[::-1]), moment[::-1]
     if skip_bad:
         sheet, moment = _forward(sheet, columns, moment)
@@ -190,13 +183,8 @@ def _record(
     beam, error = values.pop("current"), values.pop("error", None)
     conditions = Conditions(**values)
     if (fault := first_fault(moment, beam, error, conditions)) is not None:
-        column = columns[fault.quantity]
-        row = int(np.flatnonzero(found.beam)[fault.row])
-        if column.unit == DATE:
-            before = int(np.flatnonzero(found.beam)[fault.row - 1])
-            raise _goes_back(sheet, columns, row, sheet[column.header][before])
-        raise sheet.error(fault.found, fault.expected, row, column.header)
-    absolute = columns["time"].unit == DATE or moment[0] > UNIX
+        raise _refused(sheet, columns, fault, np.flatnonzero(found.beam), np.median(beam) < 0)
+    absolute = moment[0] > UNIX or (columns["time"].unit == DATE and moment[0] > DAY)
     return DecayRecord(
         time=moment,
         current=beam,
@@ -213,87 +201,21 @@ def _record(
 def _left_aside(sheet: Sheet, columns: Mapping[str, Column]) -> tuple[str, ...]:
     """Name the columns of unknown names that were not read, as a note."""
     used = {column.header for column in columns.values()}
-    aside = [name for name in sheet.names if name not in used and not _known(sheet, name)]
+    aside = [name for name in sheet.names if name not in used and not known(sheet, name)]
     more = [f"{len(aside) - MOST_ASIDE} more"] if len(aside) > MOST_ASIDE else []
     return (f"Left aside: {', '.join(aside[:MOST_ASIDE] + more)}.",) if aside else ()
-
-
-def _columns(sheet: Sheet, time: str | None, current: str | None) -> dict[str, Column]:
-    """Every column of a record by what it is; those that were named come first."""
-    named = {}
-    if time is not None:
-        named["time"] = _named_time(sheet, time)
-    if current is not None:
-        named["current"] = _named_current(sheet, current)
-    left = [name for name in sheet.names if name not in {c.header for c in named.values()}]
-    if named:
-        left = [name for name in left if _known(sheet, name)]
-    rest = replace(sheet, names=tuple(left), cells=[sheet[name] for name in left])
-    try:
-        known = columns_of(rest, QUANTITIES, _archive_column)
-    except InputError as error:
-        options = "or name them with --time COLUMN and --current COLUMN:UNIT"
-        raise replace(error, expected=f"{error.expected}; {options}") from None
-    found = {CALLED.get(key, key): column for key, column in known.items()}
-    return {
-        key: column for key, column in found.items() if key in USED and key not in named
-    } | named
-
-
-def _archive_column(header: str) -> Column | None:
-    """Dates, and the columns of an archive."""
-    word, unit = header.lower(), header.removeprefix("val_")
-    if word == "time":
-        return Column(header, "time", DATE)
-    if word in SECONDS:
-        return Column(header, "time", "s")
-    if word in NANOS:
-        return Column(header, "nanos", NANOSECONDS)
-    if unit != header and unit in UNITS["current"]:
-        return Column(header, "current", unit, UNITS["current"][unit])
-    # What an archive says of its values, and values of which nobody said what they are.
-    return Column(header, header) if word in ("severity", "status", "val", "value") else None
-
-
-def _named_time(sheet: Sheet, text: str) -> Column:
-    if text in sheet.names:
-        known = _known(sheet, text)
-        if known is not None and known.key == "time":
-            return known
-        return Column(text, "time", "s" if is_number(next(iter(sheet[text]), "0")) else DATE)
-    header, _, unit = text.rpartition(":")
-    if header in sheet.names and unit in UNITS["time"]:
-        return Column(header, "time", unit, UNITS["time"][unit])
-    raise _no_such(sheet, header if unit in UNITS["time"] else text)
-
-
-def _known(sheet: Sheet, name: str) -> Column | None:
-    """What a header means by itself; None if nothing."""
-    alone = replace(sheet, names=(name,), cells=[sheet[name]])
-    try:
-        return next(iter(columns_of(alone, QUANTITIES, _archive_column).values()))
-    except InputError:
-        return None
-
-
-def _named_current(sheet: Sheet, text: str) -> Column:
-    header, _, unit = text.rpartition(":")
-    if header in sheet.names and unit in UNITS["current"]:
-        return Column(header, "current", unit, UNITS["current"][unit])
-    if text in sheet.names or header in sheet.names:
-        expected = f"its unit after the last colon, such as {text.removesuffix(':' + unit)}:mA"
-        raise sheet.header_error(f"--current {text} without a unit", expected)
-    raise _no_such(sheet, header or text)
-
-
-def _no_such(sheet: Sheet, name: str) -> InputError:
-    return sheet.header_error(f"no column '{name}'", f"one of {', '.join(sheet.names)}")
 
 
 def _values(sheet: Sheet, column: Column) -> np.ndarray:
     try:
         if column.unit == DATE:
             expected = "an ISO 8601 time, such as 2024-03-01T12:00:00+01:00"
+            first = str(next(iter(sheet[column.header]), ""))
+            if NUMBERS.match(first):
+                expected = "a date whose day and month cannot be exchanged, such as 2024-03-01"
+            elif is_number(first):
+                units = ", ".join(f"{column.header}_{unit}" for unit in ("s", "ms", "d"))
+                expected = f"a date, or the unit of the number in the header: {units}"
             return sheet.numbers(column.header, read=dates_in_order(), expected=expected)
         return sheet.numbers(column.header) * column.factor
     except InputError as error:
@@ -312,10 +234,23 @@ def _moments(sheet: Sheet, columns: Mapping[str, Column]) -> np.ndarray:
 def _goes_back(sheet: Sheet, columns: Mapping[str, Column], row: int, latest: object) -> InputError:
     """Of a row whose time is not after that of an earlier one."""
     column = columns["time"]
-    found, expected = f"time {sheet[column.header][row]} after {latest}", "times that increase"
+    found, expected = f"time {sheet[column.header][row]} after {latest}", INCREASE
     if column.unit == DATE:
         expected += "; local times that go back in autumn need their zone, such as Europe/Berlin"
     return sheet.error(found, expected, row, column.header)
+
+
+def _refused(
+    sheet: Sheet, columns: Mapping[str, Column], fault: Fault, rows: np.ndarray, negative: bool
+) -> InputError:
+    """What is wrong with a record, at its row of the file."""
+    column, row = columns[fault.quantity], int(rows[fault.row])
+    if column.unit == DATE and fault.row:
+        return _goes_back(sheet, columns, row, sheet[column.header][int(rows[fault.row - 1])])
+    expected = INCREASE if fault.quantity == "time" else fault.expected
+    if fault.quantity == "current" and negative:
+        expected = "the other sign: most readings are negative"
+    return sheet.error(fault.found, expected, row, column.header)
 
 
 def _check_alone(sheet: Sheet, columns: Mapping[str, Column], positive: bool) -> None:
@@ -343,10 +278,13 @@ def _forward(
 
 
 def _check_base(sheet: Sheet, column: Column, moment: np.ndarray) -> None:
-    if np.max(moment) > LATEST:
-        found = f"{np.max(moment):.6g} s, after the year 5000"
+    if (latest := np.max(moment)) > LATEST:
+        found = f"{latest:.6g} s, after the year 5000"
+        unit, long = next(said for most, *said in FINER if latest < most)
         name = column.header.removesuffix("_s")
-        expected = f"the unit of the time: of milliseconds {name}_ms, or --time {column.header}:ms"
+        expected = (
+            f"the unit of the time: of {long} {name}_{unit}, or --time {column.header}:{unit}"
+        )
         raise sheet.error(found, expected, int(np.argmax(moment)), column.header)
 
 

@@ -211,6 +211,7 @@ def _row(
     except InputError as error:
         return [], error
     expected = f"{count}, as in the header"
+    expected += "; what stands above it begins with #" if count == 1 else ""
     return cells, InputError(f"{len(cells)} cells", expected, path=path, line=line)
 
 

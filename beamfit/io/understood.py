@@ -24,8 +24,10 @@ from beamfit.io.facts import (
 from beamfit.io.files import digest
 from beamfit.io.line import FOREIGN, build_line, read_lattice
 from beamfit.io.measurement import read_quad_scan
+from beamfit.io.record_columns import is_current
 from beamfit.io.ring import read_ring
 from beamfit.io.run import read_run
+from beamfit.io.scan_columns import is_size
 from beamfit.io.table import HDF5, header_of, read_sheet
 from beamfit.io.toml import read_toml
 from beamfit.studies.scan.scans import QuadScan
@@ -183,7 +185,7 @@ def _kind(path: str | PathLike[str]) -> str:
         raise InputError(found, "the ring file (TOML) that names it under [optics] twiss", path)
     if {"u_", "y_"} <= {name[:2] for name in names}:
         return "run"
-    return "record" if "beam_current" in head.lower() else "scan"
+    return "record" if any(map(is_current, names)) and not any(map(is_size, names)) else "scan"
 
 
 def _questions(scan: QuadScan) -> tuple[str, ...]:

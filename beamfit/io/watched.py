@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import NamedTuple
 
 from beamfit.errors import InputError, plain
-from beamfit.io.decay_record import QUANTITIES
 from beamfit.io.headers import spelled
 from beamfit.io.machine import POSITIVE, read_machine
+from beamfit.io.record_columns import QUANTITIES
 from beamfit.io.sheet import UNITS
 from beamfit.io.toml import TEXT, Key, Section
 from beamfit.studies.decay.record import Conditions

@@ -1,0 +1,207 @@
+"""What the columns of a record of beam current mean, also of an archive's and of a logger's."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import replace
+
+from beamfit.errors import InputError
+from beamfit.io.headers import is_number, spelled
+from beamfit.io.sheet import UNITS, Column, Sheet, columns_of
+from beamfit.studies.decay.record import Conditions
+
+QUANTITIES = {
+    "time": "time",
+    "beam_current": "current",
+    "beam_current_error": "current",
+    "rf_voltage": "voltage",
+    "scraper_y": "length",
+    "pressure": "pressure",
+    "bunches": "",
+    "bunch_length": "length or duration",
+}
+# What a record calls them.
+CALLED = {"beam_current": "current", "beam_current_error": "error"}
+USED = {"time", "nanos", "current", "error", *Conditions._fields}
+DATE, NANOSECONDS = "a date", "ns"
+# What a column of dates is called, and those of a day and of the time of that day.
+MOMENTS = {"time", "timestamp", "time_stamp", "datetime", "date_time", "data_time", "date"}
+DAYS, CLOCKS = {"date", "day", "datum"}, {"time", "zeit", "uhrzeit"}
+CLOCK = re.compile(r"\d{1,2}:\d{2}(:\d{2}([.,]\d*)?)?( ?[AaPp][Mm])?")
+# An archive's own columns: seconds since 1970 and nanoseconds, and what it says of each value.
+SECONDS = {"secs": "s", "seconds": "s", "epochseconds": "s"}
+NANOS = {"nanos", "nanoseconds"}
+ASIDE = {"severity", "status", "val", "value"}
+# Words in a name with a unit of current that make it the beam's; in A, as magnets have, fewer do.
+MONITORS = {"ibeam", "dcct", "pct", "bct", "stored"}
+CURRENTS = MONITORS | {"current", "i", "strom", "strahlstrom", "courant"}
+OTHERS = {"error", "err", "std", "sd", "sigma", "rms", "set", "setpoint", "target", "nominal"}
+# A lifetime beside the current, as archives have it, is not read.
+LIFETIME = re.compile(r"(.*[\W_])?(life_?time|tau)([\W_].*)?", re.IGNORECASE)
+
+
+def record_columns(sheet: Sheet, time: str | None, current: str | None) -> dict[str, Column]:
+    """Every column of a record by what it is; those that were named come first.
+
+    Parameters
+    ----------
+    sheet : Sheet
+        The file.
+    time, current : str or None
+        Headers with their units after a last colon, as of `read_decay_record`.
+
+    Returns
+    -------
+    dict of str to Column
+        By quantity: ``time``, ``current``, ``error``, conditions.
+
+    Raises
+    ------
+    InputError
+        If a header is unknown or a quantity stands twice.
+
+    Examples
+    --------
+    >>> sheet = Sheet("a.csv", ("Time", "DCCT [mA]"), [["12:00"], ["1"]], [2], 1, ())
+    >>> {key: column.unit for key, column in record_columns(sheet, None, None).items()}
+    {'time': 'a date', 'current': 'mA'}
+    """
+    named = {}
+    if time is not None:
+        named["time"] = _named_time(sheet, time)
+    if current is not None:
+        named["current"] = _named_current(sheet, current)
+    left = [name for name in sheet.names if name not in {c.header for c in named.values()}]
+    if named:
+        left = [name for name in left if known(sheet, name)]
+    rest = replace(sheet, names=tuple(left), cells=[sheet[name] for name in left])
+    try:
+        found = columns_of(rest, QUANTITIES, _other(sheet))
+    except InputError as error:
+        raise replace(error, expected=f"{error.expected}; {_options(sheet)}") from None
+    called = {CALLED.get(key, key): column for key, column in found.items()}
+    return {
+        key: column for key, column in called.items() if key in USED and key not in named
+    } | named
+
+
+def known(sheet: Sheet, name: str) -> Column | None:
+    """What a header means by itself; None if nothing."""
+    alone = replace(sheet, names=(name,), cells=[sheet[name]])
+    try:
+        return next(iter(columns_of(alone, QUANTITIES, _other(sheet)).values()))
+    except InputError:
+        return None
+
+
+def is_current(header: str) -> bool:
+    """Whether a header names a beam's current.
+
+    Examples
+    --------
+    >>> [is_current(name) for name in ("beam_current_mA", "DCCT (A)", "Q2 current (A)", "SR:I")]
+    [True, True, False, False]
+    """
+    said = spelled(header)
+    return said.lower().startswith("beam_current") or _current(said) is not None
+
+
+def dated(sheet: Sheet) -> Sheet:
+    """One column of dates where days and times of day stand in two.
+
+    Examples
+    --------
+    >>> cells = [["2024-03-01"], ["12:00:05"], ["1"]]
+    >>> dated(Sheet("a.csv", ("Date", "Time", "I_mA"), cells, [2], 1, ()))["Time"]
+    ['2024-03-01 12:00:05']
+    """
+    said = {name.lower(): name for name in sheet.names}
+    day, clock = (next((said[n] for n in of if n in said), None) for of in (DAYS, CLOCKS))
+    if day is None or clock is None or not all(CLOCK.fullmatch(str(c)) for c in sheet[clock]):
+        return sheet
+    both = [f"{d} {c}" for d, c in zip(sheet[day], sheet[clock], strict=True)]
+    names = tuple("Time" if name == clock else name for name in sheet.names if name != day)
+    cells = [both if name == clock else sheet[name] for name in sheet.names if name != day]
+    return replace(sheet, names=names, cells=cells)
+
+
+def taken_for_current(columns: Mapping[str, Column]) -> tuple[str, ...]:
+    """Say which column was taken for the beam current, where its name leaves a choice."""
+    header = columns["current"].header
+    plain = spelled(header).lower().startswith(("beam_current", "val"))
+    return () if plain else (f"Column '{header}' is taken for the beam current.",)
+
+
+def _options(sheet: Sheet) -> str:
+    """How unknown columns are left aside, or the known ones named."""
+    found = [column for name in sheet.names if (column := known(sheet, name)) is not None]
+    current = [column for column in found if column.key == "beam_current"]
+    if len(current) == 1 and any(column.key == "time" for column in found):
+        said = f"{current[0].header}:{current[0].unit}"
+        return f"or --current '{said}', which leaves unknown columns aside"
+    return "or name them with --time COLUMN and --current COLUMN:UNIT"
+
+
+def _other(sheet: Sheet):
+    """Understand headers of archives, and looser ones of a current where none has its own."""
+    strict = any(spelled(name).lower().startswith("beam_current_") for name in sheet.names)
+    first = {name.lower(): next(iter(sheet[name]), "") for name in sheet.names}
+    # A number without a unit is no date, and is not to be taken for seconds.
+    moments = {"time"} | {name for name in MOMENTS & set(first) if not is_number(first[name])}
+
+    def understood(header: str) -> Column | None:
+        word, unit = header.lower(), header.removeprefix("val_")
+        if word in moments:
+            return Column(header, "time", DATE)
+        if word in SECONDS:
+            return Column(header, "time", "s")
+        if word in NANOS:
+            return Column(header, "nanos", NANOSECONDS)
+        if (short := re.fullmatch(r"t_(\w+)", header)) and short[1] in UNITS["time"]:
+            return Column(header, "time", short[1], UNITS["time"][short[1]])
+        if unit != header and unit in UNITS["current"]:
+            return Column(header, "current", unit, UNITS["current"][unit])
+        if word in ASIDE or LIFETIME.fullmatch(header):
+            return Column(header, header)
+        return None if strict else _current(header)
+
+    return understood
+
+
+def _current(header: str) -> Column | None:
+    """A beam current by a word in its name and its unit."""
+    name, _, unit = header.rpartition("_")
+    words = set(re.findall(r"[a-z]+", name.lower()))
+    wanted = MONITORS if unit == "A" else CURRENTS
+    if unit not in UNITS["current"] or not (words & wanted or words == {"beam"}) or words & OTHERS:
+        return None
+    return Column(header, "beam_current", unit, UNITS["current"][unit])
+
+
+def _named_time(sheet: Sheet, text: str) -> Column:
+    if text in sheet.names:
+        found = known(sheet, text)
+        if found is not None and found.key == "time" and found.unit != DATE:
+            return found
+        return Column(text, "time", "s" if is_number(next(iter(sheet[text]), "0")) else DATE)
+    header, _, unit = text.rpartition(":")
+    if header in sheet.names and unit in UNITS["time"]:
+        return Column(header, "time", unit, UNITS["time"][unit])
+    raise _no_such(sheet, header if unit in UNITS["time"] else text)
+
+
+def _named_current(sheet: Sheet, text: str) -> Column:
+    header, _, unit = text.rpartition(":")
+    if text in sheet.names:
+        header, (_, _, unit) = text, spelled(text).rpartition("_")
+    if header in sheet.names and unit in UNITS["current"]:
+        return Column(header, "current", unit, UNITS["current"][unit])
+    if header in sheet.names:
+        expected = f"its unit after the last colon, such as {header}:mA"
+        raise sheet.header_error(f"--current {text} without a unit", expected)
+    raise _no_such(sheet, header or text)
+
+
+def _no_such(sheet: Sheet, name: str) -> InputError:
+    return sheet.header_error(f"no column '{name}'", f"one of {', '.join(sheet.names)}")
