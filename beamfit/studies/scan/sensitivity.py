@@ -261,14 +261,10 @@ def _changes(rows: Rows, upright: Array, sigma: Array, size: Array, noise: _Weig
     series = [s for s in rows.line.elements if isinstance(s, Series)]
     parts = [jnp.zeros(_count(k)) for s in series for k in s.kinds]
     none, here = jnp.zeros(len(magnets) + 1), sigma / unit
-    seen = elements(none, parts, jnp.zeros(len(size)))
+    seen, back = jax.vjp(elements, none, parts, jnp.zeros(len(size)))
     by_sigma = jax.grad(lambda s: jnp.log(emittance_parts(s * unit)[0]))(here)
     weights = jnp.linalg.solve(jax.jacfwd(slope)(here, seen), by_sigma)
-
-    def moved_emittance(change: Array, parts: list[Array], more: Array) -> Array:
-        return -weights @ slope(here, elements(change, parts, more))
-
-    return jax.grad(moved_emittance, (0, 1, 2))(none, parts, jnp.zeros(len(size)))
+    return back(jax.grad(lambda seen: -weights @ slope(here, seen))(seen))
 
 
 def _count(kind: Element) -> int:
