@@ -15,7 +15,13 @@ from beamfit.greybox.correlated import Memory, is_correlated, memory_of, whitene
 from beamfit.quantity import Quantity
 from beamfit.shown import shown
 from beamfit.status import Status
-from beamfit.studies.decay.law import Expansion, Physical, constant_shape, lifetime_of
+from beamfit.studies.decay.law import (
+    Expansion,
+    Physical,
+    constant_shape,
+    lifetime_of,
+    power_rates,
+)
 from beamfit.studies.decay.model import Solution, expanded, padded, solve_decay
 from beamfit.studies.decay.record import DecayRecord
 from beamfit.table import json_of
@@ -75,24 +81,18 @@ class ConstantA:
         chance = math.erfc(abs(exponent.value) / whole / math.sqrt(2))
         return constant_a(exponent.value, whole, exponent.error_raw, chance)
 
-    def to_json(self) -> dict[str, Any]:
-        """Return the fields as JSON's types."""
-        return json_of(vars(self))
-
     def __str__(self) -> str:
         return f"{self.status}. {self.message}"
 
 
-def by_independent_noise(
-    record: DecayRecord, exponent: float, error: float, left: float
-) -> ConstantA:
-    """Judge an exponent estimated beside I0, a and b: its error for noise of size 1, and the mean
-    square that is left.
-    """
-    over = 1.0 if record.error is None else record.error
-    unit = max(left, float(np.mean((EXACT * record.current / over) ** 2)))
+def by_independent_noise(record: DecayRecord, solution: Solution) -> ConstantA:
+    """Judge the exponent estimated beside I0, a and b, whose error is for noise of size 1."""
+    exponent, error = float(solution.values.exponent), float(solution.errors.exponent)
+    over, dof = 1.0 if record.error is None else record.error, max(len(record) - 4, 1)
+    left = float(solution.sum_squares) - float(solution.fall)
+    unit = max(left / dof, float(np.mean((EXACT * record.current / over) ** 2)))
     whole = error * math.sqrt(unit if record.error is None else max(unit, 1.0))
-    chance = 2 * stdtr(max(len(record) - 4, 1), -abs(exponent) / whole)
+    chance = 2 * stdtr(dof, -abs(exponent) / whole)
     return constant_a(exponent, whole, error * math.sqrt(unit), chance)
 
 
@@ -128,20 +128,9 @@ def averaged(record: DecayRecord) -> DecayRecord:
     return DecayRecord(*record.blocks(ENOUGH), record.name, monitor=record.monitor)
 
 
-class PowerLaw(NamedTuple):
-    """A decay with a going as I^s: the readings it was fitted to, and what was found."""
-
-    record: DecayRecord
-    solution: Solution
-
-
-def power_law(record: DecayRecord, test: ConstantA) -> PowerLaw | None:
-    """The law with a free exponent, where a constant a is rejected and the search comes to rest."""
-    if test.status is not Status.poor_fit or record.gauge is not None:
-        return None
-    record = averaged(record)
-    found = solve_decay(*padded(record), free=np.ones(4), shape=constant_shape)
-    return PowerLaw(record, found) if found.converged else None
+def power_law(record: DecayRecord) -> Solution:
+    """The law with a free exponent: a going as I^s."""
+    return solve_decay(*padded(record), free=np.ones(4), shape=constant_shape)
 
 
 @shown
@@ -163,38 +152,37 @@ class LifetimeLaw:
     lifetime: tuple[Quantity, ...]
     exponent: Quantity
 
-    def to_json(self) -> dict[str, Any]:
-        """Return the fields as JSON's types."""
-        return json_of(vars(self))
+    @classmethod
+    def of(
+        cls, current: np.ndarray, rates: np.ndarray, errors: np.ndarray, exponent: Quantity
+    ) -> LifetimeLaw:
+        """The law of loss rates, 1/s, and their errors at some currents."""
+        lifetimes = (lifetime_of(*pair, CLEAR) for pair in zip(rates, errors, strict=True))
+        return cls(tuple(map(float, current)), tuple(lifetimes), exponent)
 
     def __str__(self) -> str:
         pairs = zip(self.current, self.lifetime, strict=True)
         return ", ".join(f"{lifetime} at {current:.4g} mA" for current, lifetime in pairs)
 
 
-def lifetime_law(found: PowerLaw, correlated: bool) -> LifetimeLaw:
-    """Lifetimes with their errors from a fitted power law.
-
-    The loss rate in one span is q x^(1 + s) + (p - q) of x = I/mean, with the search's numbers.
-    """
-    record, values = found.record, found.solution.values
-    mean, span = float(record.current.mean()), record.span
+def lifetime_law(record: DecayRecord, correlated: bool) -> LifetimeLaw | None:
+    """Lifetimes of the law with a free exponent; None where the search does not come to rest."""
+    record = averaged(record)
+    found = power_law(record)
+    if not found.converged:
+        return None
+    values, mean, span = found.values, float(record.current.mean()), record.span
     x = np.geomspace(record.current.min(), record.current.max(), CURRENTS) / mean
-    power = x ** (1 + values.exponent)
-    loss, quadratic = values.rate_mean * span, values.a * mean * span
-    rates = (quadratic * power + loss - quadratic) / span
-    slopes = np.stack(
-        [np.zeros_like(x), np.ones_like(x), power - 1, quadratic * power * np.log(x)], axis=1
-    )
+    numbers = values.rate_mean * span, values.a * mean * span, values.exponent
+    rates, slopes = power_rates(numbers, span, x)
+    # By the four numbers of the search, of which I0 moves no rate; the exponent stands last.
+    slopes = np.vstack([np.pad(slopes, ((0, 0), (1, 0))), np.eye(4)[3]])
     about = expanded(record, values, constant_shape, values.exponent)
-    slopes = np.vstack([slopes / span, np.eye(4)[3]])
     errors = quantity_errors(slopes, about, record, correlated)
     for change in record.monitor_changes:
         errors = np.hypot(errors, slopes @ np.linalg.lstsq(about.rows, change, rcond=None)[0])
-    pairs = zip(rates, errors, strict=False)
-    lifetimes = tuple(lifetime_of(rate, error, CLEAR) for rate, error in pairs)
     exponent = Quantity(float(values.exponent), float(errors[-1]), "1")
-    return LifetimeLaw(tuple(map(float, x * mean)), lifetimes, exponent)
+    return LifetimeLaw.of(x * mean, rates, errors[:-1], exponent)
 
 
 def quantity_errors(

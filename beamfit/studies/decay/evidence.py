@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 
@@ -25,13 +25,11 @@ from beamfit.studies.decay.departures import (
     change_of_rate,
     constant_a,
     lifetime_law,
-    power_law,
 )
 from beamfit.studies.decay.law import Expansion, Physical, Shape
 from beamfit.studies.decay.model import Solution, expanded
 from beamfit.studies.decay.outgassing import Outgassing, outgassing_of
 from beamfit.studies.decay.record import DecayRecord
-from beamfit.table import json_of
 
 UNITS = {
     "a": "1/(mA s)",
@@ -49,8 +47,6 @@ SEPARABLE = 0.2
 DETERMINED = 1 / 3
 # How many errors below zero an unphysical a or b, or a rising current, is believed.
 BELIEVED = 5.0
-# A change between neighbouring residuals of so many times their usual one is a step, not noise.
-STEP = 12.0
 NUMBERS = 3
 # Standard deviations that hold 95 % of a normal distribution.
 NORMAL = 1.96
@@ -88,19 +84,36 @@ class Separability:
     residual_correlation: float | None
     error_inflation: float
 
-    def to_json(self) -> dict[str, Any]:
-        """Return the fields as JSON's types."""
-        return json_of(vars(self))
-
 
 class Weighed:
-    """What is quoted of a decay, or of many cycles: values with errors, and what refutes them."""
+    """What is quoted of a decay, or of many cycles: values with errors, and what refutes them.
+
+    Attributes
+    ----------
+    values, errors, raw, reach : Physical
+        What is quoted; its standard deviations; those for errors as stated and independent; and
+        how far 95 % reach.
+    constant_a : ConstantA
+        Whether the readings contradict a constant a.
+    time : array, shape (n,)
+        Of the readings, s.
+    correlation : float
+        Of a and b.
+    inflation : float
+        By how much the memory of the noise enlarges errors.
+    correlation_time : float or None
+        Of the errors of the readings, s; None where they are independent.
+    """
 
     values: Physical
     errors: Physical
     raw: Physical
     reach: Physical
-    separability: Separability
+    constant_a: ConstantA
+    time: np.ndarray
+    correlation: float
+    inflation: float
+    correlation_time: float | None
     change: Change | None = None
     outgassing: Outgassing | None = None
     bent: Physical | None = None
@@ -136,6 +149,34 @@ class Weighed:
         error, raw = (part / rate**2 / HOUR for part in (error, raw))
         return Quantity(1 / rate / HOUR, error, "h", raw, interval)
 
+    @cached_property
+    def separability(self) -> Separability:
+        """Of a and b."""
+        share, error = self.scaled("share")
+        finite = math.isfinite(share) and math.isfinite(error)
+        length, usual = self.correlation_time, float(np.median(np.diff(self.time)))
+        return Separability(
+            separable=finite and error < SEPARABLE,
+            share=share if finite else None,
+            share_error=error if finite else None,
+            correlation=self.correlation if math.isfinite(self.correlation) else None,
+            residual_correlation=0.0 if length is None else math.exp(-usual / length),
+            error_inflation=self.inflation,
+        )
+
+    def widened(self, about: Expansion, changes: Sequence[np.ndarray]) -> Self:
+        """With what moves all readings together as a part of the errors; `changes` of the readings
+        are over their errors.
+        """
+        if not len(changes):
+            return self
+        moved = np.linalg.norm([about.moved(change) for change in changes], axis=0)
+        return replace(
+            self, errors=Physical(*np.hypot(self.errors, moved)),
+            reach=Physical(*np.hypot(self.reach, NORMAL * moved)),
+            constant_a=self.constant_a.widened(moved[-1]),
+        )  # fmt: skip
+
     def quoted(self, known: bool = True) -> dict[str, Any]:
         """What a `DecayFit` has of this, by its names."""
         apart = known and self.separability.separable
@@ -150,15 +191,14 @@ class Weighed:
 class Evidence(Weighed):
     """What the rules look at: a record, what was found, and the size and memory of its noise.
 
+    The rest is as of `Weighed`.
+
     Parameters
     ----------
     record : DecayRecord
         The readings.
     solution : Solution
         By plain least squares.
-    values, errors, raw, reach : Physical
-        What is quoted; its standard deviations; those for errors as stated and independent; and
-        how far 95 % reach.
     residuals : array, shape (n,)
         Model less reading, mA.
     chi2 : float
@@ -169,8 +209,6 @@ class Evidence(Weighed):
         What multiplies errors that were given (at least 1), or the noise in mA.
     memory : Memory or None
         What the record tells of the correlation time, where the errors are correlated.
-    constant_a : ConstantA
-        Whether the record contradicts a constant a.
     changed : bool
         Whether one change of the loss rate is what correlates the residuals.
     """
@@ -197,15 +235,9 @@ class Evidence(Weighed):
         """
         found = cls._by_noise(record, solution, shape)
         changes = record.monitor_changes
-        return found._with_monitor(changes) if changes and solution.converged else found
-
-    def _with_monitor(self, changes: Sequence[np.ndarray]) -> Evidence:
-        about = expanded(self.record, self.solution.values, self.shape)
-        moved = np.linalg.norm([about.moved(change) for change in changes], axis=0)
-        errors = Physical(*np.hypot(self.errors, moved))
-        reach = Physical(*np.hypot(self.reach, NORMAL * moved))
-        test = self.constant_a.widened(moved[-1])
-        return replace(self, errors=errors, reach=reach, constant_a=test)
+        if not (changes and solution.converged):
+            return found
+        return found.widened(expanded(record, solution.values, shape), changes)
 
     @classmethod
     def _by_noise(cls, record: DecayRecord, solution: Solution, shape: Shape | None) -> Evidence:
@@ -228,21 +260,16 @@ class Evidence(Weighed):
         shape: Shape | None,
         changed: bool = False,
     ) -> Evidence:
-        residuals = np.asarray(solution.residuals[: len(record)])
-        dof, squares = len(record) - NUMBERS, float(solution.sum_squares)
-        raw = math.sqrt(squares / dof) if record.error is None else 1.0
-        chi2 = float(dof) if record.error is None else squares
+        given, dof = record.error is not None, len(record) - NUMBERS
+        squares = float(solution.sum_squares)
+        chi2, raw = (squares, 1.0) if given else (float(dof), math.sqrt(squares / dof))
         noise = raw * max(1.0, math.sqrt(chi2 / dof))
-        far = reach_of(dof if record.error is None else math.inf)
         errors = _times(solution.errors, noise)
-        left = max(squares - float(solution.fall), 0.0) / max(dof - 1, 1)
-        exponent = float(solution.values.exponent), float(solution.errors.exponent)
-        found = by_independent_noise(record, *exponent, left)
-        reach = _times(errors, far)
-        raws = _times(solution.errors, raw)
         return cls(
-            record, solution, shape, _times(solution.values, 1.0), errors, raws, reach,
-            residuals, chi2, dof, noise, None, found, changed,
+            record, solution, shape, _times(solution.values, 1.0), errors,
+            _times(solution.errors, raw), _times(errors, reach_of(math.inf if given else dof)),
+            np.asarray(solution.residuals[: len(record)]), chi2, dof, noise, None,
+            by_independent_noise(record, solution), changed,
         )  # fmt: skip
 
     @classmethod
@@ -276,6 +303,16 @@ class Evidence(Weighed):
         return self.record.error is None
 
     @property
+    def time(self) -> np.ndarray:
+        """Of the readings, s."""
+        return self.record.time
+
+    @property
+    def correlation(self) -> float:
+        """Of a and b."""
+        return float(self.solution.correlation)
+
+    @property
     def inflation(self) -> float:
         """By how much the memory of the noise enlarges errors."""
         if self.memory is None:
@@ -291,22 +328,6 @@ class Evidence(Weighed):
     def correlation_time(self) -> float | None:
         """Of the errors, s; None where they are independent."""
         return None if self.memory is None else float(self.memory.time[self.memory.likely])
-
-    @cached_property
-    def separability(self) -> Separability:
-        """Of a and b."""
-        share, error = self.scaled("share")
-        finite = math.isfinite(share) and math.isfinite(error)
-        correlation, length = float(self.solution.correlation), self.correlation_time
-        usual = float(np.median(np.diff(self.record.time)))
-        return Separability(
-            separable=finite and error < SEPARABLE,
-            share=share if finite else None,
-            share_error=error if finite else None,
-            correlation=correlation if math.isfinite(correlation) else None,
-            residual_correlation=0.0 if length is None else math.exp(-usual / length),
-            error_inflation=self.inflation,
-        )
 
     @property
     def refuted(self) -> bool:
@@ -331,10 +352,11 @@ class Evidence(Weighed):
     @cached_property
     def lifetimes(self) -> LifetimeLaw | None:
         """The lifetime by current, where a constant a is refuted and it is the current's doing."""
-        found = None
-        if self.shape is None and self.outgassing is None:
-            found = power_law(self.record, self.constant_a)
-        return None if found is None else lifetime_law(found, self.memory is not None)
+        if self.constant_a.status is not Status.poor_fit or self.outgassing is not None:
+            return None
+        if self.shape is not None or self.record.gauge is not None:
+            return None
+        return lifetime_law(self.record, self.memory is not None)
 
     @cached_property
     def change(self) -> Change | None:
@@ -354,21 +376,6 @@ class Evidence(Weighed):
         """Straight drift of the monitor over the record, mA, that moves a value by its error."""
         moved = abs(float(getattr(self.solution.drift, name)))
         return float(getattr(self.errors, name)) / moved if moved > 0 else math.inf
-
-    @cached_property
-    def step(self) -> str | None:
-        """The sentence for a step or spike in the record, whether or not its errors are known."""
-        record, change = self.record, np.diff(self.residuals)
-        usual = 1.4826 * float(np.median(np.abs(change)))
-        floor = max(record.resolution or 0.0, 1e-12 * float(record.current.max()))
-        largest = int(np.argmax(np.abs(change)))
-        if abs(change[largest]) <= STEP * max(usual, floor):
-            return None
-        # Residuals are model minus reading, so a refill lowers them.
-        return (
-            f"The record has a step of {-change[largest]:+.4g} mA at "
-            f"{record.time[largest + 1]:.6g} s: cut it with split_record and fit the pieces"
-        )
 
 
 def _times(numbers: Physical, factor: float) -> Physical:

@@ -176,24 +176,27 @@ class DecayFit:
         return draw(decay_target(self, noise, outliers, priors), **options)
 
     @property
+    def quantities(self) -> dict[str, Quantity]:
+        """What is quoted, by name."""
+        return {name: getattr(self, name) for name in UNITS}
+
+    @property
     def headline(self) -> str:
         """The record, its status and its lifetime in a line."""
         return f"{self.record} {cell(self.status)}: mean lifetime {self.lifetime_mean}"
 
     def tables(self) -> tuple[Table, ...]:
         """The numbers, to be shown."""
-        rows = [(plain_name(name), [getattr(self, name)]) for name in UNITS]
+        rows = [(plain_name(name), [value]) for name, value in self.quantities.items()]
         rows.append(("chi2/dof", [f"{self.chi2:.4g}/{self.dof}"]))
         rows.append(("rms residual", [f"{self.rms_residual:.3g} mA"]))
         return (labelled(f"{self.record}: {cell(self.status)}", [], rows),)
 
     def __str__(self) -> str:
         rows = [f"{self.record}: {self.status}. {self.message}"]
-        rows += [f"  {name:15s} {getattr(self, name)}" for name in UNITS]
-        rows.append(
-            f"  chi²/dof {self.chi2:.4g}/{self.dof}, residual {self.rms_residual:.3g} mA rms"
-        )
-        return "\n".join(rows)
+        rows += [f"  {name:15s} {value}" for name, value in self.quantities.items()]
+        noise = f"residual {self.rms_residual:.3g} mA rms"
+        return "\n".join([*rows, f"  chi²/dof {self.chi2:.4g}/{self.dof}, {noise}"])
 
     def to_frame(self) -> DataFrame:
         """Give a pandas data frame of all numbers, one row a quantity.
@@ -205,33 +208,29 @@ class DecayFit:
         InputError
             If pandas is not installed.
         """
-        rows = {(self.record, name): getattr(self, name) for name in UNITS}
+        rows = {(self.record, name): value for name, value in self.quantities.items()}
         return quantity_frame(rows, ("record", "quantity"))
 
     def to_json(self) -> dict[str, Any]:
         """Return the result as one JSON object, as `beamfit lifetime --json` prints it."""
-        return {
+        found = {
             "record": self.record,
-            "status": self.status.value,
+            "status": self.status,
             "message": self.message,
-            **{name: getattr(self, name).to_json() for name in UNITS},
+            **self.quantities,
             "mean_current": bare(self.mean_current, "mA"),
             "chi2": self.chi2,
             "dof": self.dof,
             "rms_residual": bare(self.rms_residual, "mA"),
             "noise_inferred": self.noise_inferred,
-            "identifiability": self.identifiability.to_json(),
-            **json_of(
-                {
-                    "constant_a": self.constant_a,
-                    "correlation_time": bare(self.correlation_time, "s"),
-                    "lifetime_by_current": self.lifetimes,
-                    "change": self.change,
-                }
-                | ({} if self.outgassing is None else {"outgassing": self.outgassing})
-            ),
-            **({} if self.first is None else {"cycles": self.first.size}),
+            "identifiability": self.identifiability,
+            "constant_a": self.constant_a,
+            "correlation_time": bare(self.correlation_time, "s"),
+            "lifetime_by_current": self.lifetimes,
+            "change": self.change,
         }
+        found |= {} if self.outgassing is None else {"outgassing": self.outgassing}
+        return json_of(found if self.first is None else found | {"cycles": self.first.size})
 
 
 def fit_decay(

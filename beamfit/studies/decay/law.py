@@ -67,8 +67,8 @@ class Physical(NamedTuple):
 
 
 class Expansion(NamedTuple):
-    """A law about a solution: residuals over errors (n,), their slopes by the four scaled numbers
-    (n, 4), the last of them the exponent, and the slopes of `Physical` by the same (8, 4).
+    """A law about a solution: residuals over errors (n,), their slopes by p scaled numbers (n, p),
+    the last of them the exponent, and the slopes of `Physical` by the same (8, p).
     """
 
     residuals: np.ndarray
@@ -79,9 +79,9 @@ class Expansion(NamedTuple):
         """What a change of the readings, over their errors, does to the values by least squares;
         to an exponent beside the other numbers.
         """
-        step = np.linalg.lstsq(self.rows[:, :3], change, rcond=None)[0]
+        step = np.linalg.lstsq(self.rows[:, :-1], change, rcond=None)[0]
         beside = np.linalg.lstsq(self.rows, change, rcond=None)[0]
-        return Physical(*(self.slopes[:, :3] @ step))._replace(exponent=beside[3])
+        return Physical(*(self.slopes[:, :-1] @ step))._replace(exponent=beside[-1])
 
 
 def lifetime_of(rate: float, error: float, clear: float | None = None) -> Quantity:
@@ -89,6 +89,18 @@ def lifetime_of(rate: float, error: float, clear: float | None = None) -> Quanti
     if clear is not None and not rate > clear * error:
         return Quantity(math.nan, None, "h")
     return Quantity(float(1 / rate / HOUR), float(error / rate**2 / HOUR), "h")
+
+
+def power_rates(numbers: np.ndarray, unit: float, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Loss rates, 1/s, at currents x over the mean where a goes as a power of the current.
+
+    Numbers are the loss in the unit of time, s, at the mean current, its quadratic part, and the
+    exponent; with slopes by the three.
+    """
+    loss, quadratic, exponent = numbers
+    power = x ** (1 + exponent)
+    slopes = np.stack([np.ones_like(x), power - 1, quadratic * power * np.log(x)], axis=1)
+    return (quadratic * power + loss - quadratic) / unit, slopes / unit
 
 
 def constant_shape(beam: Array) -> Array:

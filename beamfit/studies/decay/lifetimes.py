@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
 import jax.numpy as jnp
@@ -12,7 +11,7 @@ import numpy as np
 from jax import Array
 from scipy.special import chdtrc, fdtrc
 
-from beamfit.greybox.fit import Fit
+from beamfit.greybox.fit import Derived, Fit
 from beamfit.greybox.problem import Free, Problem, Record, padded_length
 from beamfit.greybox.solve import solve
 from beamfit.lifetime.decay import HOUR
@@ -100,7 +99,6 @@ class LifetimeFit:
 
     def to_json(self) -> dict[str, Any]:
         """Return the result as `beamfit lifetime --json` prints it."""
-        found = self.share
         told = {
             "record": self.record,
             "status": self.status,
@@ -113,13 +111,13 @@ class LifetimeFit:
             "noise_inferred": self.readings.error is None,
             "identifiability": {
                 "separable": self.a.error is not None,
-                "share": found.value,
-                "share_error": found.error,
+                "share": self.share.value,
+                "share_error": self.share.error,
             },
             "constant_a": self.constant_a,
             "lifetime_by_current": self.lifetimes,
-            "outliers": list(self.outliers),
-            "notes": list(self.readings.notes),
+            "outliers": self.outliers,
+            "notes": self.readings.notes,
         }
         return json_of(told)
 
@@ -142,18 +140,13 @@ def _quoted(model: dict[str, Array], ends: Array) -> Array:
 
 def _solved(table: LifetimeTable, rows: np.ndarray, exponent: bool) -> Fit:
     """Fit in units of the mean current and the median lifetime; rows of weight 0 are padding."""
-    size = padded_length(len(table))
-    weight = np.pad(rows.astype(float), (0, size - len(table)))
-    usual = float(np.median(table.lifetime))
-    x, lifetime = (
-        np.pad(values, (0, size - len(table)), mode="edge")
-        for values in (table.current / table.current.mean(), table.lifetime / usual)
-    )
-    error = None
-    if table.error is not None:
-        error = np.pad(table.error / usual, (0, size - len(table)), mode="edge")
+    more, usual = (0, padded_length(len(table)) - len(table)), float(np.median(table.lifetime))
+    columns = [table.current / table.current.mean(), table.lifetime / usual]
+    columns += [] if table.error is None else [table.error / usual]
+    x, lifetime, *error = (np.pad(column, more, mode="edge") for column in columns)
     free = [Free("rate", 1e-3, 1e3), Free("share")] + [Free("exponent", -3.0, 3.0)] * exponent
-    record = Record(RECORD, _lifetimes, x, lifetime, error, weight)
+    weight = np.pad(rows.astype(float), more)
+    record = Record(RECORD, _lifetimes, x, lifetime, *(error or [None]), weight)
     return solve(Problem({"rate": 1.0, "share": 0.5, "exponent": 0.0}, free, [record]))
 
 
@@ -214,9 +207,9 @@ def fit_lifetimes(table: LifetimeTable) -> LifetimeFit:
     """
     left_out = _outliers(table)
     plain, power = (_solved(table, ~left_out, exponent) for exponent in (False, True))
-    mean, usual = float(table.current.mean()), float(np.median(table.lifetime)) * HOUR
     test, group = _tested(table, plain, power), plain.group(RECORD)
-    refuted = test.status is Status.poor_fit
+    given, refuted = table.error is not None, test.status is Status.poor_fit
+    mean, usual = float(table.current.mean()), float(np.median(table.lifetime)) * HOUR
     ends = np.array([table.current.max(), mean, table.current.min()]) / mean
     law, quoted = (fit.derive(_quoted, ends) for fit in (plain, power if refuted else plain))
     scale = {"a": usual * mean, "b": usual, "share": 1.0}
@@ -224,50 +217,47 @@ def fit_lifetimes(table: LifetimeTable) -> LifetimeFit:
         name: (float(value) / unit, max(float(error), EXACT) / unit)
         for (name, unit), value, error in zip(scale.items(), law.value, law.error, strict=False)
     }
-    raws = [float(law.error_raw[k]) / scale[name] for k, name in enumerate("ab")]
     evidence = TableEvidence(
         numbers, float(group.chi2), round(group.dof), test,
-        _by_current(table, power, usual) if refuted else None, _named(table, left_out),
-        None if table.error is not None else group.scale * usual / HOUR,
+        _by_current(table, power) if refuted else None, _named(table, left_out),
+        None if given else group.scale * usual / HOUR,
     )  # fmt: skip
-    finding = finding_of_table(evidence)
-    known = finding.status is not Status.unidentified
-    far = reach_of(evidence.dof if table.error is None else math.inf)
-    lifetime = partial(_lifetime, usual, far)
-    start, at_mean, end = map(lifetime, quoted.value[4:], quoted.error[4:])
-    a, b = (
-        Quantity.reaching(value, error, UNITS[name], raw, far * error)
-        if known
-        else Quantity(value, None, UNITS[name])
-        for (name, (value, error)), raw in zip(numbers.items(), raws, strict=False)
-    )
-    value, error = numbers["share"]
-    share = Quantity.reaching(value, error, "1", None, far * error)
+    finding, far = finding_of_table(evidence), _reach(table, plain)
+
+    def quantity(name: str, raw: float | None = None) -> Quantity:
+        value, error = numbers[name]
+        return Quantity.reaching(value, error, UNITS.get(name, "1"), raw, far * error)
+
+    a, b = (quantity(n, float(law.error_raw[k]) / scale[n]) for k, n in enumerate("ab"))
+    if finding.status is Status.unidentified:
+        a, b = a.open(), b.open()
     return LifetimeFit(
-        table.name, finding.status, finding.message, a, b, start, at_mean, end, mean,
-        evidence.chi2 if table.error is not None else float(evidence.dof), evidence.dof, test,
-        evidence.lifetimes, share,
-        tuple(map(int, np.flatnonzero(left_out))), table,
+        table.name, finding.status, finding.message, a, b, *_lifetimes_of(table, quoted, far),
+        mean, evidence.chi2 if given else float(evidence.dof), evidence.dof, test,
+        evidence.lifetimes, quantity("share"), tuple(map(int, np.flatnonzero(left_out))), table,
     )  # fmt: skip
 
 
-def _lifetime(usual: float, far: float, rate: float, error: float) -> Quantity:
-    lifetime = float(usual / HOUR / rate)
-    spread = float(lifetime * max(error / rate, EXACT))
-    return Quantity.reaching(lifetime, spread, "h", None, far * spread)
+def _reach(table: LifetimeTable, fit: Fit) -> float:
+    """Errors that 95 % of answers lie within."""
+    return reach_of(math.inf if table.error is not None else round(fit.group(RECORD).dof))
 
 
-def _by_current(table: LifetimeTable, power: Fit, usual: float) -> LifetimeLaw:
+def _lifetimes_of(table: LifetimeTable, found: Derived, far: float) -> list[Quantity]:
+    """Of what `_quoted` gives, by its rates."""
+    rate, error = found.value[4:], found.error[4:]
+    lifetime = float(np.median(table.lifetime)) / rate
+    pairs = zip(lifetime, lifetime * np.maximum(error / rate, EXACT), strict=True)
+    return [Quantity.reaching(float(v), float(e), "h", None, far * float(e)) for v, e in pairs]
+
+
+def _by_current(table: LifetimeTable, power: Fit) -> LifetimeLaw:
     current = np.geomspace(table.current.min(), table.current.max(), CURRENTS)
-    found = power.derive(_quoted, current / table.current.mean())
-    pairs = zip(found.value[4:], found.error[4:], strict=True)
-    group = power.group(RECORD)
-    far = reach_of(group.dof if table.error is None else math.inf)
+    found, far = power.derive(_quoted, current / table.current.mean()), _reach(table, power)
     value, error = float(found.value[3]), float(found.error[3])
     exponent = Quantity.reaching(value, error, "1", None, far * error)
-    return LifetimeLaw(
-        tuple(map(float, current)), tuple(_lifetime(usual, far, *pair) for pair in pairs), exponent
-    )
+    lifetimes = tuple(_lifetimes_of(table, found, far))
+    return LifetimeLaw(tuple(map(float, current)), lifetimes, exponent)
 
 
 def _named(table: LifetimeTable, which: np.ndarray) -> tuple[str, ...]:

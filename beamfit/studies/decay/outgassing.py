@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -15,18 +15,17 @@ from beamfit.greybox.descend import descend_one
 from beamfit.lifetime.decay import HOUR
 from beamfit.quantity import Quantity
 from beamfit.shown import shown
-from beamfit.studies.decay.departures import BETTER, CLEAR, Change, averaged, quantity_errors
-from beamfit.studies.decay.law import (
-    NODES,
-    WEIGHTS,
-    Expansion,
-    constant_shape,
-    cumulative,
-    lifetime_of,
+from beamfit.studies.decay.departures import (
+    BETTER,
+    CLEAR,
+    Change,
+    averaged,
+    power_law,
+    quantity_errors,
 )
+from beamfit.studies.decay.law import NODES, WEIGHTS, Expansion, cumulative, lifetime_of
 from beamfit.studies.decay.model import padded, solve_decay
 from beamfit.studies.decay.record import DecayRecord
-from beamfit.table import json_of
 
 # Time constants, over the span of the record, with which searches begin, and the longest believed.
 STARTS, LONGEST = (0.05, 0.2, 0.7), 1.0
@@ -57,10 +56,6 @@ class Outgassing(NamedTuple):
     before: Quantity
     after: Quantity
     current: float
-
-    def to_json(self) -> dict[str, Any]:
-        """Return the fields as JSON's types."""
-        return json_of(self._asdict())
 
     def __str__(self) -> str:
         return (
@@ -140,7 +135,7 @@ def outgassing_of(record: DecayRecord, change: Change | None) -> Outgassing | No
     with a number more than the exponent.
     """
     record = averaged(record)
-    power = solve_decay(*padded(record), free=np.ones(4), shape=constant_shape)
+    power = power_law(record)
     plain = _numbers(record)
     starts = np.array([[*plain, 0.1 * abs(plain[1] + plain[2]), at] for at in STARTS])
     found = _fitted("relaxing", record, starts)

@@ -15,16 +15,15 @@ from beamfit.greybox.correlated import Memory, is_correlated, memory_of
 from beamfit.lifetime.decay import HOUR
 from beamfit.quantity import Quantity, Status
 from beamfit.studies.decay.departures import (
-    CLEAR,
     CURRENTS,
     REJECTED,
     ConstantA,
     LifetimeLaw,
     constant_a,
 )
-from beamfit.studies.decay.evidence import NORMAL, SEPARABLE, Separability, Weighed
+from beamfit.studies.decay.evidence import SEPARABLE, Weighed
 from beamfit.studies.decay.fit import DecayFit
-from beamfit.studies.decay.law import Physical, lifetime_of
+from beamfit.studies.decay.law import Expansion, Physical, lifetime_of, power_rates
 from beamfit.studies.decay.monitor import Monitor
 from beamfit.studies.decay.pool import (
     FEWEST_CYCLES,
@@ -52,9 +51,9 @@ OWN = 3.0
 def _slopes(pool: Pool) -> tuple[Physical, np.ndarray]:
     """Physical values at the highest, lowest and mean current, and slopes by the three numbers."""
     loss, quadratic, exponent = pool.theta
-    ends = np.array([pool.cycles.current.max(), pool.cycles.current.min()]) / pool.mean
     unit, mean = pool.unit, pool.mean
-    rates, by = _rates(pool, ends)
+    ends = np.array([pool.cycles.current.max(), pool.cycles.current.min()]) / mean
+    rates, by = power_rates(pool.theta, unit, ends)
     values = Physical(
         i0=mean * float(np.mean(pool.level)), a=quadratic / mean / unit,
         b=(loss - quadratic) / unit, rate_start=rates[0], rate_end=rates[1], rate_mean=loss / unit,
@@ -65,14 +64,6 @@ def _slopes(pool: Pool) -> tuple[Physical, np.ndarray]:
         [-quadratic / loss**2, 1 / loss, 0], [0, 0, 1],
     ])  # fmt: skip
     return values, slopes
-
-
-def _rates(pool: Pool, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Loss rates, 1/s, at currents over the mean, and their slopes."""
-    loss, quadratic, exponent = pool.theta
-    power = x ** (1 + exponent)
-    slopes = np.stack([np.ones_like(x), power - 1, quadratic * power * np.log(x)], axis=1)
-    return (quadratic * power + loss - quadratic) / pool.unit, slopes / pool.unit
 
 
 def _memory(pool: Pool, numbers: int, known: float | None) -> Memory:
@@ -117,26 +108,18 @@ class PooledEvidence(Weighed):
 
     def tested(self) -> ConstantA:
         """Whether a constant a is refuted, by an exponent beside the other numbers."""
-        given = float(self.pool.cycles.error is not None)
-        power, slopes = _memory(self.pool, 3, self.known), np.eye(3)[2:]
-        moved = power.moments(slopes, given)
-        return constant_a(
-            float(moved.shift[0]), float(moved.error[0]), float(moved.error[0]), moved.chance[0]
-        )
+        power = _memory(self.pool, 3, self.known)
+        moved = power.moments(np.eye(3)[2:], float(not self.noise_inferred))
+        error = float(moved.error[0])
+        return constant_a(float(moved.shift[0]), error, error, moved.chance[0])
 
     def with_monitor(self, monitor: Monitor) -> PooledEvidence:
         """With a stated stability in the errors, and in the test of a constant a."""
-        pool, slopes, moved = self.pool, _slopes(self.pool)[1], np.zeros(len(Physical._fields))
-        for change in monitor.changes(pool.cycles.time - pool.cycles.time[0]).values():
-            every = pool.beside(np.column_stack([pool.rows, change * pool.weight / pool.mean]))
-            step = np.linalg.lstsq(every[:, :2], every[:, 3], rcond=None)[0]
-            beside = np.linalg.lstsq(every[:, :3], every[:, 3], rcond=None)[0]
-            moved = np.hypot(moved, np.append((slopes[:, :2] @ step)[:-1], beside[2]))
-        return replace(
-            self, monitor=monitor, errors=Physical(*np.hypot(self.errors, moved)),
-            reach=Physical(*np.hypot(self.reach, NORMAL * moved)),
-            constant_a=self.constant_a.widened(moved[-1]),
-        )  # fmt: skip
+        pool, scale = self.pool, self.pool.weight / self.pool.mean
+        changes = monitor.changes(self.time - self.time[0]).values()
+        rows = pool.beside(np.column_stack([pool.rows, *(scale * change for change in changes)]))
+        about = Expansion(pool.left[:, 3], rows[:, :3], _slopes(pool)[1])
+        return replace(self.widened(about, rows[:, 3:].T), monitor=monitor)
 
     @property
     def cycles(self) -> int:
@@ -175,21 +158,21 @@ class PooledEvidence(Weighed):
         """Of the errors, s; None where they are independent."""
         return None if self.known == 0 else float(self.held.time[self.held.likely])
 
-    @cached_property
-    def separability(self) -> Separability:
+    @property
+    def time(self) -> np.ndarray:
+        """Of the readings, s."""
+        return self.pool.cycles.time
+
+    @property
+    def correlation(self) -> float:
         """Of a and b."""
-        share, error = self.scaled("share")
-        length, usual = self.correlation_time, float(np.median(np.diff(self.pool.cycles.time)))
-        _, slopes = _slopes(self.pool)
-        a, b = slopes[1:3, :2] @ self.held.half[self.held.likely]
-        return Separability(
-            separable=bool(error < SEPARABLE),
-            share=share,
-            share_error=error,
-            correlation=float(a @ b / np.linalg.norm(a) / np.linalg.norm(b)),
-            residual_correlation=0.0 if length is None else math.exp(-usual / length),
-            error_inflation=max(1.0, self.errors.rate_mean / self.raw.rate_mean),
-        )
+        a, b = _slopes(self.pool)[1][1:3, :2] @ self.held.half[self.held.likely]
+        return float(a @ b / np.linalg.norm(a) / np.linalg.norm(b))
+
+    @property
+    def inflation(self) -> float:
+        """By how much the memory of the noise enlarges errors."""
+        return max(1.0, self.errors.rate_mean / self.raw.rate_mean)
 
     @cached_property
     def parts(self) -> tuple[float, list[Quantity]]:
@@ -225,19 +208,14 @@ class PooledEvidence(Weighed):
         if not self.separability.separable:
             return None
         refuted = self.constant_a.status is Status.poor_fit
-        pool = solved(self.pool.cycles, 3) if refuted else self.pool
-        numbers = 3 if refuted else 2
-        x = np.geomspace(pool.cycles.current.min(), pool.cycles.current.max(), CURRENTS) / pool.mean
-        rates, slopes = _rates(pool, x)
+        pool, numbers = (solved(self.pool.cycles, 3), 3) if refuted else (self.pool, 2)
+        x = np.geomspace(*self.currents, CURRENTS) / pool.mean
+        rates, slopes = power_rates(pool.theta, pool.unit, x)
         slopes = np.vstack([slopes, np.eye(3)[2]])[:, :numbers]
-        found = _memory(pool, numbers, self.known).moments(
-            slopes, float(pool.cycles.error is not None)
-        )
-        pairs = zip(rates, found.error, strict=False)
-        lifetimes = tuple(lifetime_of(rate, error, CLEAR) for rate, error in pairs)
-        error = float(found.error[-1]) if refuted else None
-        exponent = Quantity(float(pool.theta[2]), error, "1")
-        return LifetimeLaw(tuple(map(float, x * pool.mean)), lifetimes, exponent)
+        memory = _memory(pool, numbers, self.known)
+        errors = memory.moments(slopes, float(not self.noise_inferred)).error
+        exponent = Quantity(float(pool.theta[2]), float(errors[-1]) if refuted else None, "1")
+        return LifetimeLaw.of(x * pool.mean, rates, errors[:-1], exponent)
 
 
 def stands_alone(cycle: DecayRecord, fit: DecayFit) -> bool:

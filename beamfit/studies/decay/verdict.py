@@ -17,6 +17,7 @@ from beamfit.studies.decay.evidence import (
     BELIEVED,
     DETERMINED,
     SEPARABLE,
+    UNITS,
     Evidence,
     Weighed,
 )
@@ -29,6 +30,8 @@ from beamfit.verdict import Finding, judge
 SHORTEST, LONGEST = 20.0, 3000 * HOUR
 # One-sided 95 %.
 LIMIT = 1.645
+# A change between neighbouring residuals of so many times their usual one is a step, not noise.
+STEP = 12.0
 # Below this chi²/dof stated errors are said to be too large.
 CAUTIOUS = 0.25
 # Residuals so many times the scatter of neighbouring readings are not the monitor's noise.
@@ -89,7 +92,19 @@ def _within_noise(e: Evidence) -> Finding | None:
 
 
 def _stepped(e: Evidence) -> Finding | None:
-    return Finding(Status.poor_fit, e.step) if e.step else None
+    """A step or spike in the record, whether or not its errors are known."""
+    record, change = e.record, np.diff(e.residuals)
+    usual = 1.4826 * float(np.median(np.abs(change)))
+    floor = max(record.resolution or 0.0, 1e-12 * float(record.current.max()))
+    largest = int(np.argmax(np.abs(change)))
+    if abs(change[largest]) <= STEP * max(usual, floor):
+        return None
+    # Residuals are model minus reading, so a refill lowers them.
+    return Finding(
+        Status.poor_fit,
+        f"The record has a step of {-change[largest]:+.4g} mA at "
+        f"{record.time[largest + 1]:.6g} s: cut it with split_record and fit the pieces",
+    )
 
 
 def _negative(name: str, cause: str, e: Weighed | TableEvidence) -> Finding | None:
@@ -141,30 +156,28 @@ def _inseparable(e: Evidence) -> Finding | None:
     )
 
 
-def _improbable(e: Evidence) -> Finding | None:
-    chi2, dof = e.chi2, e.dof
-    if chi2_probability(chi2, dof) >= POOR_FIT:
+def _improbable(e: Weighed | TableEvidence, remedy: str = "") -> Finding | None:
+    if e.noise_inferred or chi2_probability(e.chi2, e.dof) >= POOR_FIT:
         return None
     return Finding(
         Status.poor_fit,
-        f"chi²/dof is {chi2 / dof:.3g}, improbable for this law and the stated errors, which "
-        "are enlarged to match: look for steps with split_record, or test constant_a_test",
+        f"chi²/dof is {e.chi2 / e.dof:.3g}, improbable for this law and the stated errors, which "
+        f"are enlarged to match{remedy}",
     )
 
 
 def _determined(e: Weighed | TableEvidence) -> Finding:
     """Each of the two by itself: one that is small is known to be so, but is not told from zero."""
-    units = {"a": "1/(mA s)", "b": "1/s"}
-    small = {name: e.scaled(name) for name in units}
-    small = {n: (v, error) for n, (v, error) in small.items() if not error < DETERMINED * v}
+    found = {name: e.scaled(name) for name in "ab"}
+    small = {n: (v, error) for n, (v, error) in found.items() if not error < DETERMINED * v}
     if not small:
         return Finding(Status.converged, "a and b are determined")
     limits = " and ".join(
-        f"{name} is not told from zero: it is below {max(v, 0) + LIMIT * error:.2g} {units[name]} "
+        f"{name} is not told from zero: it is below {max(v, 0) + LIMIT * error:.2g} {UNITS[name]} "
         "at 95 %"
         for name, (v, error) in small.items()
     )
-    clear = "".join(f"{name} is determined; " for name in units if name not in small)
+    clear = "".join(f"{name} is determined; " for name in found if name not in small)
     return Finding(Status.converged, f"{clear}{limits}")
 
 
@@ -178,8 +191,9 @@ def _by_length(e: Evidence) -> Finding | None:
 
 
 NEGATIVE = (partial(_negative, "b", NOT_GAS), partial(_negative, "a", RISING))
-RULES = (_lost, *NEGATIVE, _within_noise, _stepped, _refuted)
-RULES += (_inseparable, _improbable, _by_length, _determined)
+LOOK = ": look for steps with split_record, or test constant_a_test"
+RULES = (_lost, *NEGATIVE, _within_noise, _stepped, _refuted, _inseparable)
+RULES += (partial(_improbable, remedy=LOOK), _by_length, _determined)
 
 
 def _narrow(e: TableEvidence) -> Finding | None:
@@ -191,17 +205,7 @@ def _narrow(e: TableEvidence) -> Finding | None:
     return Finding(Status.unidentified, f"{cause}currents")
 
 
-def _unlikely(e: Weighed | TableEvidence) -> Finding | None:
-    if e.noise_inferred or chi2_probability(e.chi2, e.dof) >= POOR_FIT:
-        return None
-    return Finding(
-        Status.poor_fit,
-        f"chi²/dof is {e.chi2 / e.dof:.3g}, improbable for this law and the stated errors, which "
-        "are enlarged to match",
-    )
-
-
-TABLE_RULES = (*NEGATIVE, _refuted, _narrow, _unlikely, _determined)
+TABLE_RULES = (*NEGATIVE, _refuted, _narrow, _improbable, _determined)
 
 
 def finding_of_table(evidence: TableEvidence) -> Finding:
@@ -251,7 +255,7 @@ def _rises(e: Weighed) -> Finding | None:
 
 
 CYCLE_RULES = (_rises, *NEGATIVE, _within_noise, _parts_differ, _refuted)
-CYCLE_RULES += (_one_current, _unlikely, _determined)
+CYCLE_RULES += (_one_current, _improbable, _determined)
 
 
 def finding_of_cycles(evidence: Weighed) -> Finding:
