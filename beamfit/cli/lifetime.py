@@ -19,8 +19,9 @@ from beamfit.studies.decay.record import LifetimeTable
 if TYPE_CHECKING:
     from beamfit.cli.show import Terminal
     from beamfit.sampling.posterior import Posterior
+    from beamfit.studies.decay.budget import Machine
     from beamfit.studies.decay.shift import Shift
-    from beamfit.studies.decay.study import Decay, Machine, RecordStudy
+    from beamfit.studies.decay.study import Decay, RecordStudy
     from beamfit.studies.decay.trend import Trend
 
 EXAMPLE = """\b
@@ -193,7 +194,7 @@ def _check_study(study: bool, ring: str | None, network: str | None, priors: dic
 def _machine(path: str) -> Machine:
     ring, operation = beamfit.read_ring(path), beamfit.read_operation(path)
 
-    from beamfit.studies.decay.study import Machine
+    from beamfit.studies.decay.budget import Machine
 
     return Machine(ring, operation)
 

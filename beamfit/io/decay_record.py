@@ -18,8 +18,9 @@ from beamfit.io.monitor import offset_of
 from beamfit.io.record_columns import DATE, dated, known, record_columns, taken_for_current
 from beamfit.io.scan_columns import is_size
 from beamfit.io.sheet import Column, Sheet, columns_of, left_out
+from beamfit.studies.decay.conditions import Conditions, Fault, first_fault
 from beamfit.studies.decay.monitor import Monitor
-from beamfit.studies.decay.record import Conditions, DecayRecord, Fault, LifetimeTable, first_fault
+from beamfit.studies.decay.record import DecayRecord, LifetimeTable
 
 if TYPE_CHECKING:
     from pandas import DataFrame

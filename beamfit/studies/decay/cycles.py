@@ -8,9 +8,10 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from scipy.ndimage import maximum_filter1d
 
+from beamfit.studies.decay.conditions import Conditions
 from beamfit.studies.decay.pool import FEWEST_CYCLES, FEWEST_READINGS
-from beamfit.studies.decay.record import Conditions, DecayRecord
-from beamfit.studies.decay.segments import Event, Split, beam_readings, split_record
+from beamfit.studies.decay.record import DecayRecord
+from beamfit.studies.decay.segments import Event, Split, beam_readings, event_of, split_record
 
 # Standard deviations by which two levels must differ to be two: a false step costs no more than an
 # own current for the rest.
@@ -80,9 +81,11 @@ def find_cycles(record: DecayRecord) -> Split:
         usual = np.median(np.repeat(lengths, lengths)) if kept.size else 0  # of most readings
         fewest = max(FEWEST_READINGS, usual * SHORT)
         long = [piece for piece in pieces if piece.size >= fewest]
-        events += [_short(record, piece) for piece in pieces if 0 < piece.size < fewest]
+        short = [piece for piece in pieces if 0 < piece.size < fewest]
+        events += [event_of(record, "short", piece[0], piece[-1]) for piece in short]
         kept = np.concatenate(long or [kept[:0]])
-    level = _levelled(record.time[kept], record.current[kept], _begins(long))
+    begins = np.cumsum([0] + [piece.size for piece in long[:-1]])
+    level = _levelled(record.time[kept], record.current[kept], begins)
     place = np.cumsum(np.bincount(kept, minlength=len(record))) - 1
     for before, after in itertools.pairwise(long):
         ends = (level[place[side]] for side in (after[:NEAR], before[-NEAR:]))
@@ -113,15 +116,6 @@ def is_refilled(split: Split) -> bool:
     lost = sum(float(cycle.current[0] - cycle.current[-1]) for cycle in cycles)
     refills = [event.change for event in split.events if event.kind == "refill"]
     return len(refills) + 1 >= FEWEST_CYCLES and sum(refills) > RETURNED * max(lost, 0.0)
-
-
-def _short(record: DecayRecord, piece: np.ndarray) -> Event:
-    (begin, end), (first, last) = record.time[piece[[0, -1]]], record.current[piece[[0, -1]]]
-    return Event("short", float(begin), float(end - begin), float(last - first))
-
-
-def _begins(pieces: list[np.ndarray]) -> np.ndarray:
-    return np.cumsum([0] + [piece.size for piece in pieces[:-1]])
 
 
 def _grain(current: np.ndarray) -> float:
@@ -242,8 +236,7 @@ def alike(cycles: Sequence[DecayRecord]) -> list[list[DecayRecord]]:
     """Cycles by their settings and their pressure."""
     groups: list[tuple[np.ndarray, list[DecayRecord]]] = []
     for cycle in cycles:
-        medians = (0.0 if v is None else float(np.median(v)) for v in cycle.conditions)
-        at = np.array(list(medians))
+        at = np.array([0.0 if v is None else np.median(v) for v in cycle.conditions])
         for other, group in groups:
             if np.all(np.abs(at - other) <= SAME * np.maximum(at, other)):
                 group.append(cycle)

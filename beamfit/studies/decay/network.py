@@ -30,6 +30,7 @@ from beamfit.lifetime.losses import Terms, loss_terms, scaled_losses
 from beamfit.lifetime.ring import Operation
 from beamfit.quantity import Quantity
 from beamfit.shown import shown
+from beamfit.studies.decay.budget import Machine, operation_during
 from beamfit.studies.decay.certainty import (
     INPUTS,
     SIGNS,
@@ -40,7 +41,7 @@ from beamfit.studies.decay.certainty import (
     sized,
 )
 from beamfit.studies.decay.scales import PRESSURE_ERROR, ScaleFit, stacked_terms
-from beamfit.studies.decay.study import Decay, Machine, operation_during
+from beamfit.studies.decay.study import Decay
 from beamfit.studies.decay.summary import Summaries, by_losses, loss_parts, summarise
 from beamfit.table import json_of
 

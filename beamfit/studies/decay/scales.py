@@ -22,8 +22,9 @@ from beamfit.lifetime.losses import SCALES, Terms, loss_terms, scaled_losses
 from beamfit.lifetime.ring import Operation
 from beamfit.quantity import Quantity, Status
 from beamfit.shown import shown
+from beamfit.studies.decay.budget import Machine, operation_during
 from beamfit.studies.decay.scale_verdict import VOLTAGE, ScaleEvidence, finding_of_scales
-from beamfit.studies.decay.study import Decay, Machine, operation_during
+from beamfit.studies.decay.study import Decay
 from beamfit.studies.decay.summary import Summaries, loss_parts, summarise
 from beamfit.table import json_of
 from beamfit.verdict import Finding

@@ -143,11 +143,14 @@ def _runs(flags: np.ndarray) -> list[tuple[int, int]]:
     return list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))
 
 
-def _event(record: DecayRecord, kind: str, first: int, last: int, change_from: int) -> Event:
-    """An event from reading `first` to `last`, its change counted from another reading."""
-    time, current = record.time, record.current
-    change = current[last if change_from == first else first] - current[change_from]
-    return Event(kind, float(time[first]), float(time[last] - time[first]), float(change))
+def event_of(record: DecayRecord, kind: str, first: int, last: int, sudden: bool = False) -> Event:
+    """An event from reading `first` to `last`; the change of a sudden one is that at its begin."""
+    begin, end = (first - 1, first) if sudden and first else (first, last)
+    lasts, change = (
+        record.time[last] - record.time[first],
+        record.current[end] - record.current[begin],
+    )
+    return Event(kind, float(record.time[first]), float(lasts), float(change))
 
 
 def _noise(record: DecayRecord, kept: np.ndarray) -> float:
@@ -168,12 +171,12 @@ def beam_readings(record: DecayRecord, spikes: bool = True) -> tuple[np.ndarray,
         found["spike"][kept[lone]] = True
         kept = kept[~lone]
     events = [
-        _event(record, kind, first, end - 1, max(first - 1, 0))
+        event_of(record, kind, first, end - 1, sudden=True)
         for kind, flags in found.items()
         for first, end in _runs(flags)
     ]
     if end_of_beam < len(record):
-        events.append(_event(record, "loss", end_of_beam, len(record) - 1, end_of_beam - 1))
+        events.append(event_of(record, "loss", end_of_beam, len(record) - 1, sudden=True))
     return kept, events
 
 
@@ -235,25 +238,23 @@ def split_record(record: DecayRecord) -> Split:
     kept, events = beam_readings(record)
     if kept.size < FEWEST:
         return Split((), tuple(events))
-    steps = _steps(record.time[kept], record.current[kept], _noise(record, kept))
+    noise = _noise(record, kept)
+    steps = _steps(record.time[kept], record.current[kept], noise)
     for before in np.flatnonzero(steps):
         kind = "refill" if steps[before] > 0 else "loss"
         at = float(record.time[kept[before + 1]])
         events.append(Event(kind, at, 0.0, float(steps[before])))
     interval = np.diff(record.time)
     for before in np.flatnonzero(interval > GAP * np.median(interval)):
-        events.append(_event(record, "gap", before, before + 1, before))
-
-    pieces = np.split(kept, np.flatnonzero(steps) + 1)
-    scatter = _noise(record, kept)
-    ramps = [_ramp(record.current[piece], scatter) for piece in pieces]
-    for piece, cut in zip(pieces, ramps, strict=True):
-        events += [_event(record, "ramp", piece[0], piece[cut - 1], piece[0])] if cut else []
-    pieces = [piece[cut:] for piece, cut in zip(pieces, ramps, strict=True)]
-    long = [piece for piece in pieces if piece.size >= FEWEST]
-    for piece in pieces:
+        events.append(event_of(record, "gap", before, before + 1))
+    long = []
+    for piece in np.split(kept, np.flatnonzero(steps) + 1):
+        if cut := _ramp(record.current[piece], noise):
+            events.append(event_of(record, "ramp", piece[0], piece[cut - 1]))
         if piece.size < FEWEST:
-            events.append(_event(record, "short", piece[0], piece[-1], piece[0]))
+            events.append(event_of(record, "short", piece[0], piece[-1]))
+        else:
+            long.append(piece[cut:])
     names = [record.name if len(long) == 1 else f"{record.name}#{k + 1}" for k in range(len(long))]
     segments = tuple(record.select(rows, name) for rows, name in zip(long, names, strict=True))
     return Split(segments, tuple(sorted(events, key=lambda event: event.time)))

@@ -21,6 +21,7 @@ from beamfit.quantity import Quantity, Status
 from beamfit.sampling.intervals import Interval
 from beamfit.sampling.posterior import Posterior
 from beamfit.shown import shown
+from beamfit.studies.decay.budget import Machine, operation_during, settings_json
 from beamfit.studies.decay.fit import bare
 from beamfit.studies.decay.held_back import HeldBack, predict_held_back
 from beamfit.studies.decay.network import Network, NetworkFit, fit_loss_network
@@ -33,7 +34,7 @@ from beamfit.studies.decay.next_decay import (
     next_decays,
 )
 from beamfit.studies.decay.scales import ScaleFit, fit_scales, stacked_terms
-from beamfit.studies.decay.study import Decay, Machine, operation_during, settings_json
+from beamfit.studies.decay.study import Decay
 from beamfit.studies.decay.summary import by_losses, summarise
 from beamfit.table import json_of
 

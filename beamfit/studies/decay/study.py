@@ -5,17 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from beamfit.errors import InputError
-from beamfit.lifetime.bunch import stored_bunch
-from beamfit.lifetime.decay import HOUR
-from beamfit.lifetime.losses import MECHANISMS, Losses, loss_coefficients
-from beamfit.lifetime.ring import MeasuredLength, Operation, Ring, unstored
-from beamfit.quantity import Quantity
 from beamfit.shown import shown
+from beamfit.studies.decay.budget import Budget, Machine, budget
 from beamfit.studies.decay.checks import DecayChecks, check_decay
 from beamfit.studies.decay.cycles import alike, cut_at_refills, is_refilled, joined
 from beamfit.studies.decay.fit import FEWEST, DecayFit, fit_decay
@@ -32,175 +28,6 @@ CHANGED = 0.01
 SETTINGS = ("rf_voltage", "scraper_y", "bunches")
 # Decays shorter than this are pieces between two events.
 SHORTEST = 8
-
-
-@shown
-class Machine(NamedTuple):
-    """A ring and the settings and vacuum that hold where a record does not say otherwise."""
-
-    ring: Ring
-    operation: Operation
-
-
-class Budget(NamedTuple):
-    """Losses from first principles during a record.
-
-    Attributes
-    ----------
-    operation : Operation
-        The settings and the vacuum they were computed for.
-    losses : Losses
-        Coefficients by mechanism, 1/(mA s) and 1/s, as plain numbers.
-    current : float
-        Mean current of the record, mA.
-    bunch_length : float
-        Rms length of the bunches, m, computed or given.
-    emittances : tuple of float
-        Horizontal and vertical, m rad, as given: intrabeam scattering is not computed.
-    """
-
-    operation: Operation
-    losses: Losses
-    current: float
-    bunch_length: float
-    emittances: tuple[float, float]
-
-    @property
-    def rates(self) -> dict[str, float]:
-        """Loss rate at the mean current by cause, 1/h."""
-        rates = self.losses.rates(self.current)
-        return {m.label: HOUR * rates[m.name] for m in MECHANISMS}
-
-    @property
-    def lifetime(self) -> float:
-        """Lifetime at the mean current, h."""
-        return 1 / sum(self.rates.values())
-
-    def to_json(self) -> dict[str, Any]:
-        """Return the coefficients as quantities without errors, and the settings in SI."""
-        parts = {"a": self.losses.a, "b": self.losses.b}
-        units = dict.fromkeys(parts, "1/(mA s)") | {"b": "1/s"}
-        of_mechanisms = zip(self.losses._asdict().items(), self.losses.units, strict=True)
-        rows = {name: Quantity(value, None, unit) for (name, value), unit in of_mechanisms}
-        rows |= {name: Quantity(value, None, units[name]) for name, value in parts.items()}
-        rows["lifetime_mean"] = Quantity(self.lifetime, None, "h")
-        pressure = {
-            "pressure_base_Pa": float(self.operation.pressure_base),
-            "pressure_slope_Pa_per_mA": float(self.operation.pressure_slope),
-        }
-        return json_of(rows | {"operation": settings_json(self.operation) | pressure})
-
-
-def settings_json(operation: Operation) -> dict[str, float]:
-    """The settings of an operation, with their units."""
-    return {
-        "rf_voltage_V": float(operation.rf_voltage),
-        "scraper_y_m": float(operation.scraper_y),
-        "bunches": float(operation.bunches),
-    }
-
-
-def operation_during(record: DecayRecord, machine: Machine) -> Operation:
-    """Settings and vacuum during a record: its own where it gives them, else the machine's.
-
-    Parameters
-    ----------
-    record : DecayRecord
-        One decay.
-    machine : Machine
-        The ring and its usual operation.
-
-    Returns
-    -------
-    Operation
-        With medians over the record. A pressure reading scales the machine's base pressure and
-        its rise with current by one factor: a single decay spans too little current to tell the
-        two apart. One that does not follow the current enters the fit as it is, and stands here
-        by its mean.
-
-    Raises
-    ------
-    InputError
-        If the record's RF voltage stores no beam, or its scraper, bunches or pressure are zero.
-
-    Examples
-    --------
-    >>> from beamfit.io.ring import read_operation, read_ring
-    >>> from beamfit.studies.decay.record import Conditions
-    >>> path = "lattices/spear3_2003.toml"
-    >>> scan = Conditions(rf_voltage=[2.4e6, 2.4e6])
-    >>> record = DecayRecord([0, 60], [100, 99.9], conditions=scan)
-    >>> operation_during(record, Machine(read_ring(path), read_operation(path))).rf_voltage
-    2400000.0
-    """
-    usual = machine.operation
-    said = {
-        name: float(np.median(values))
-        for name, values in record.conditions._asdict().items()
-        if values is not None
-    }
-    for name, value in said.items():
-        if not value > 0:
-            raise InputError(f"{name} {value:g}", "above zero", path=record.name, column=name)
-    if "rf_voltage" in said:
-        usual = usual._replace(rf_voltage=said["rf_voltage"])
-        expected = unstored(usual, machine.ring.energy_loss, machine.ring.energy)
-        if expected is not None:
-            found = f"{said['rf_voltage'] / 1e3:.6g} kV"
-            raise InputError(found, expected, path=record.name, column="rf_voltage_kV")
-    if "bunch_length" in said:
-        length = np.array([said.pop("bunch_length")])
-        said["bunch_length"] = MeasuredLength(np.zeros(1), length, 0.0, usual.rf_voltage)
-    if "pressure" in said:
-        read = said.pop("pressure")
-        if record.gauge is not None:
-            # The fit has the gauge's own course: b is the gas at its mean, and a is without gas.
-            mean = record.integral(record.conditions.pressure)[-1] / record.span
-            return usual._replace(**said, pressure_base=mean, pressure_slope=0.0)
-        mean = usual.pressure_base + usual.pressure_slope * float(record.current.mean())
-        if not mean > 0:
-            usual, mean = usual._replace(pressure_base=1.0, pressure_slope=0.0), 1.0
-        said["pressure_base"] = usual.pressure_base * read / mean
-        said["pressure_slope"] = usual.pressure_slope * read / mean
-    return usual._replace(**said)
-
-
-def budget(record: DecayRecord, machine: Machine) -> Budget:
-    """Compute the losses during a record from first principles.
-
-    Parameters
-    ----------
-    record : DecayRecord
-        One decay.
-    machine : Machine
-        The ring and its usual operation.
-
-    Returns
-    -------
-    Budget
-        At the record's mean current.
-
-    Raises
-    ------
-    InputError
-        As for `operation_during`.
-
-    Examples
-    --------
-    >>> from beamfit.io.ring import read_operation, read_ring
-    >>> path = "lattices/spear3_2003.toml"
-    >>> machine = Machine(read_ring(path), read_operation(path))
-    >>> found = budget(DecayRecord([0, 60], [500.0, 499.9]), machine)
-    >>> print(f"{found.lifetime:.1f} h, Touschek alone {1 / found.rates['Touschek']:.1f} h")
-    18.4 h, Touschek alone 30.4 h
-    """
-    operation = operation_during(record, machine)
-    current = float(record.current.mean())
-    losses = loss_coefficients(machine.ring, operation, current)
-    ring, parts = machine.ring, Losses(*(float(part) for part in losses))
-    length = float(stored_bunch(ring, operation, current).length)
-    emittances = float(ring.emittance_x), float(ring.emittance_y)
-    return Budget(operation, parts, current, length, emittances)
 
 
 @dataclass(frozen=True, eq=False)
@@ -223,6 +50,13 @@ class Decay:
     offset: float
     fit: DecayFit
     budget: Budget | None
+
+    @classmethod
+    def of(
+        cls, segment: DecayRecord, offset: float, fit: DecayFit, machine: Machine | None
+    ) -> Decay:
+        """With the losses of a ring, if there is one."""
+        return cls(segment, offset, fit, None if machine is None else budget(segment, machine))
 
     @cached_property
     def checks(self) -> DecayChecks | None:
@@ -274,19 +108,17 @@ class RecordStudy:
         return self.pooled + self.decays
 
 
-def _steps(record: DecayRecord, name: str) -> np.ndarray:
-    """After which readings somebody changed a setting."""
-    values = getattr(record.conditions, name)
-    if values is None:
-        return np.zeros(len(record) - 1, bool)
-    return np.abs(np.diff(values)) > CHANGED * np.maximum(values[1:], values[:-1])
+def _steps(record: DecayRecord) -> dict[str, np.ndarray]:
+    """After which readings somebody changed each setting."""
+    given = {name: v for name, v in record.conditions.given.items() if name in SETTINGS}
+    return {n: np.abs(np.diff(v)) > CHANGED * np.maximum(v[1:], v[:-1]) for n, v in given.items()}
 
 
-def at_settings(segment: DecayRecord, fewest: int = SHORTEST) -> list[DecayRecord]:
+def at_settings(segment: DecayRecord) -> list[DecayRecord]:
     """Cut where somebody changed a setting."""
-    moved = np.any([_steps(segment, name) for name in SETTINGS], axis=0)
+    moved = np.any(list(_steps(segment).values()), axis=0)
     pieces = np.split(np.arange(len(segment)), np.flatnonzero(moved) + 1)
-    return [segment.select(rows) for rows in pieces if len(rows) >= fewest]
+    return [segment.select(rows) for rows in pieces if len(rows) >= SHORTEST]
 
 
 def _pooled(
@@ -302,8 +134,7 @@ def _pooled(
         called = name if many == 1 else f"{name}@{len(pooled) + 1}"
         fit = seen_through(fit_cycles(group, called))
         segment = joined(group, called)
-        losses = None if machine is None else budget(segment, machine)
-        pooled.append(Decay(segment, segment.start, fit, losses))
+        pooled.append(Decay.of(segment, segment.start, fit, machine))
         alone += [c for c in group if len(c) >= SHORTEST and stands_alone(c, fit)]
     return pooled, alone
 
@@ -324,11 +155,6 @@ def _refilled(record: DecayRecord) -> Split:
     return Split(tuple(c for split in found for c in split.segments), tuple(placed))
 
 
-def _numbered(pieces: Sequence[DecayRecord], name: str) -> list[DecayRecord]:
-    ordered = sorted(pieces, key=lambda piece: piece.start)
-    return [replace(piece, name=f"{name}#{k}") for k, piece in enumerate(ordered, 1)]
-
-
 def _decays(record: DecayRecord) -> tuple[list[DecayRecord], tuple[Event, ...]]:
     """Clean decays at constant settings, and the events."""
     if len(record) < SHORTEST:
@@ -336,14 +162,12 @@ def _decays(record: DecayRecord) -> tuple[list[DecayRecord], tuple[Event, ...]]:
     split = split_record(record)
     pieces = [piece for segment in split.segments for piece in at_settings(segment)]
     if not pieces:
-        moving = [name for name in SETTINGS if _steps(record, name).any()]
+        moving = [name for name, steps in _steps(record).items() if steps.any()]
         changes = f"changes of {', '.join(moving)} by more than {100 * CHANGED:g} %"
         kinds = ", ".join(sorted({event.kind for event in split.events})) or changes
         expected = f"at least {SHORTEST} readings in a row of a stored beam"
         expected += "; leave out a setting that only scatters with --ignore" if moving else ""
         raise InputError(f"no decay between {kinds}", expected, record.name, column="current")
-    if len(pieces) > 1:
-        pieces = _numbered(pieces, record.name)
     return pieces, split.events
 
 
@@ -388,8 +212,9 @@ def study_record(record: DecayRecord, machine: Machine | None = None) -> RecordS
     pooled, pieces = _pooled(cycles, record.name, machine)
     if not pooled:
         pieces, events = _decays(placed)
-    elif len(pieces) > 1:
-        pieces = _numbered(pieces, record.name)
+    if len(pieces) > 1:
+        ordered = sorted(pieces, key=lambda piece: piece.start)
+        pieces = [replace(piece, name=f"{record.name}#{k}") for k, piece in enumerate(ordered, 1)]
     decays, rising = [], []
     for piece in pieces:
         offset = piece.start
@@ -404,8 +229,7 @@ def study_record(record: DecayRecord, machine: Machine | None = None) -> RecordS
             change = float(segment.current[-1] - segment.current[0])
             rising.append(Event("slow refill", offset, segment.span, change))
             continue
-        losses = None if machine is None else budget(segment, machine)
-        decays.append(Decay(segment, offset, fit, losses))
+        decays.append(Decay.of(segment, offset, fit, machine))
     if not decays and not pooled:
         expected = "a decay between refills"
         raise InputError("a current that rises", expected, path=record.name, column="current")

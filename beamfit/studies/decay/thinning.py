@@ -6,7 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from beamfit.studies.decay.record import Conditions, DecayRecord
+from beamfit.studies.decay.conditions import Conditions
+from beamfit.studies.decay.record import DecayRecord
 
 # Readings beyond which neighbours are averaged.
 MOST_READINGS = 1 << 16
@@ -88,12 +89,12 @@ def thinned(record: DecayRecord) -> DecayRecord:
         return np.add.reduceat(values * kept, first) / count
 
     error = record.error
-    conditions = (None if v is None else mean(v) for v in record.conditions)
+    conditions = {name: mean(values) for name, values in record.conditions.given.items()}
     note = f"The means of {size} readings each were fitted, of {len(record)} in all."
     time = mean(record.time)
     return replace(
         record, time=time, current=mean(record.current),
         error=None if error is None else np.sqrt(mean(error**2) / count),
         start=None if record.start is None else record.start + float(time[0]),
-        conditions=Conditions(*conditions), notes=(*record.notes, note),
+        conditions=Conditions(**conditions), notes=(*record.notes, note),
     )  # fmt: skip

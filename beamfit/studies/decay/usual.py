@@ -12,8 +12,9 @@ from beamfit.errors import InputError
 from beamfit.lifetime.losses import added, terms_of
 from beamfit.quantity import Status
 from beamfit.studies.decay import alarm
-from beamfit.studies.decay.record import Conditions, DecayRecord
-from beamfit.studies.decay.study import Machine, budget, operation_during
+from beamfit.studies.decay.budget import Machine, budget, operation_during
+from beamfit.studies.decay.conditions import Conditions
+from beamfit.studies.decay.record import DecayRecord
 from beamfit.studies.decay.trend import BEST_MONITOR, WANDER
 from beamfit.studies.decay.window import Row, Window
 

@@ -13,11 +13,11 @@ from beamfit.lifetime.decay import HOUR
 from beamfit.lifetime.losses import loss_coefficients
 from beamfit.quantity import Quantity, Status
 from beamfit.studies.decay import alarm
+from beamfit.studies.decay.budget import Machine, budget
+from beamfit.studies.decay.conditions import PLAUSIBLE, Conditions
 from beamfit.studies.decay.evidence import UNITS
 from beamfit.studies.decay.fit import bare
-from beamfit.studies.decay.record import PLAUSIBLE, Conditions
 from beamfit.studies.decay.segments import DEAD, DROPOUT
-from beamfit.studies.decay.study import Machine, budget
 from beamfit.studies.decay.trend import BEST_MONITOR
 from beamfit.studies.decay.usual import Alarmed, followed, learnt
 from beamfit.studies.decay.window import Row, Window, fit_window

@@ -9,10 +9,11 @@ from typing import NamedTuple
 import numpy as np
 
 from beamfit.errors import InputError
+from beamfit.studies.decay.conditions import Conditions
 from beamfit.studies.decay.cycles import alike, cut_at_refills, joined
 from beamfit.studies.decay.fit import DecayFit, fit_decay
 from beamfit.studies.decay.pooled import fit_pieces, seen_through
-from beamfit.studies.decay.record import Conditions, DecayRecord
+from beamfit.studies.decay.record import DecayRecord
 from beamfit.studies.decay.study import SHORTEST, at_settings
 
 
