@@ -15,7 +15,7 @@ from beamfit.lifetime.losses import SCALES, loss_coefficients, loss_terms, scale
 from beamfit.quantity import Status
 from beamfit.studies.decay.next_decay import Candidate, Limits, best_operating_point, next_decays
 from beamfit.studies.decay.record import Conditions, DecayRecord
-from beamfit.studies.decay.scales import fit_scales, sample_scales
+from beamfit.studies.decay.scales import fit_scales
 from beamfit.studies.decay.shift import budget_intervals, find_anomaly
 from beamfit.studies.decay.study import study_record
 from beamfit.studies.decay.summary import summarise
@@ -30,7 +30,7 @@ def fit(decays, machine):
 
 @pytest.fixture(scope="module")
 def sample(fit):
-    return sample_scales(fit, seed=1)
+    return fit.sample(seed=1)
 
 
 def simulated(machine, number, change=(1.0, 1.0), first=0, seed=5):

@@ -12,7 +12,7 @@ from beamfit.quantity import Status
 from beamfit.studies.decay.budget import operation_during
 from beamfit.studies.decay.held_back import predict_held_back
 from beamfit.studies.decay.record import Conditions, DecayRecord
-from beamfit.studies.decay.scales import fit_scales, losses_of
+from beamfit.studies.decay.scales import fit_scales
 from beamfit.studies.decay.shift import study_shift
 from beamfit.studies.decay.study import study_record
 from beamfit.studies.decay.tables import shift_rows
@@ -73,10 +73,10 @@ def test_the_calibration_of_the_rf_voltage_is_found_and_told(machine):
     assert free.rf_voltage.error < 0.002
     assert abs(free.touschek.value - 1) < 3 * free.touschek.error
     at = free.terms_at(machine.operation._replace(rf_voltage=2e6), 300.0)
-    found = losses_of(free.vector[None], at)[0]
+    found = scaled_losses(free.vector, at)[0]
     there = machine.operation._replace(rf_voltage=TRUE * 2e6)
     truth = loss_coefficients(machine.ring, there, 300.0)
-    assert float(found[0]) == pytest.approx(float(truth.a), rel=2e-3)
+    assert float(found) == pytest.approx(float(truth.a), rel=2e-3)
     draws = free.sample(seed=1, target_ess=300).draws
     assert draws[:, 4].mean() == pytest.approx(free.rf_voltage.value, abs=free.rf_voltage.error)
 
@@ -110,7 +110,7 @@ def test_decays_held_back_lie_in_the_band_of_the_others(machine, decays):
     for k in (3, 20):
         others = fit_scales([*decays[:k], *decays[k + 1 :]], machine)
         there = operation_during(decays[k].segment, machine), decays[k].fit.mean_current
-        a, b = losses_of(others.vector[None], others.terms_at(*there))
-        hours = 1 / float(a[0] * there[1] + b[0]) / HOUR
+        a, b = scaled_losses(others.vector, others.terms_at(*there))
+        hours = 1 / float(a * there[1] + b) / HOUR
         assert found[k].predicted.value == pytest.approx(hours, rel=2e-3)
         assert found[k].measured.value == pytest.approx(decays[k].fit.lifetime_mean.value)

@@ -150,7 +150,7 @@ class Discrepancy(NamedTuple):
         return reach.T @ left, rest + total @ fit.covariance_raw @ total.T
 
 
-def sized(trial: Discrepancy, left: np.ndarray, fit: Fit) -> Discrepancy:
+def sized(trial: Discrepancy, fit: Fit, left: np.ndarray) -> Discrepancy:
     """The size by restricted likelihood: weights integrated out about a fit made with a trial size.
 
     `left` are the decays' residuals, in their errors.

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from beamfit.quantity import Quantity
 from beamfit.studies.decay.law import lifetime_of
 from beamfit.studies.decay.scales import SEPARABLE, ScaleFit, spread_of_scales
-from beamfit.table import json_of
 
 
 class HeldBack(NamedTuple):
@@ -32,10 +31,6 @@ class HeldBack(NamedTuple):
     predicted: Quantity
     measured: Quantity
     pull: float
-
-    def to_json(self) -> dict[str, Any]:
-        """Return the fields as JSON's types."""
-        return json_of(self._asdict())
 
 
 # A decay that leaves less than this of one to the others is known by nothing else.

@@ -133,7 +133,7 @@ class NetworkFit:
         terms = loss_terms(self.machine.ring, operation, current)
         at = _inputs(operation, current)[None]
         base = _base(self.scales, jax.tree.map(lambda part: part[None], terms))
-        logs = self.fit.derive(_at, (at, base))
+        logs = self.fit.derive(_logs, (at, base))
         mean, covariance = self.discrepancy.spread(at, logs.slope[0], self.left, self.fit)
         a, b = np.exp(logs.value[0])
         rate = a * current + b
@@ -175,18 +175,15 @@ def _inputs(operation: Operation, current: float) -> np.ndarray:
     return scaled(operation.rf_voltage, operation.scraper_y, pressure, operation.bunches)
 
 
-def _logs(model: Mapping[str, MLP], inputs: Array, base: Array) -> Array:
+def _logs(model: Mapping[str, MLP], data: tuple[Array, Array]) -> Array:
+    """ln a and ln b at settings and what is added to, shape (n, 2)."""
+    inputs, base = data
     return base + jax.vmap(model["map"].values)(inputs)
 
 
-def _at(model: Mapping[str, MLP], data: tuple[Array, Array]) -> Array:
-    """ln a and ln b at settings, shape (n, 2)."""
-    return _logs(model, *data)
-
-
 def _predict(model: Mapping[str, MLP], data: Data) -> Array:
-    inputs, base, current, weight = data
-    a, b = jnp.exp(_logs(model, inputs, base)).T
+    *at, current, weight = data
+    a, b = jnp.exp(_logs(model, at)).T
     return weight @ loss_parts(a, b, current).ravel()
 
 
@@ -325,11 +322,11 @@ def fit_loss_network(
     weight, rows = _statement(measured, floor)
     seen, base = weight @ np.asarray(measured.parts).ravel(), _base(scales, terms)
 
-    def fitted(model: MLP, wrong: Discrepancy, starts: int) -> tuple[Fit, np.ndarray]:
+    def fitted(wrong: Discrepancy) -> tuple[Fit, np.ndarray]:
         whiten = np.linalg.inv(wrong.root)
         data = (jnp.asarray(inputs), base, measured.current, jnp.asarray(whiten @ weight))
         problem = Problem(
-            model={"map": model},
+            model={"map": net},
             free=_free(net, single_maximum or corrected is not None),
             records=[Record("decays", _predict, data, jnp.asarray(whiten @ seen), error=1.0)],
             priors=[Prior("map", 0.0, width)],
@@ -337,13 +334,12 @@ def fit_loss_network(
         fit = solve(problem, starts=starts, seed=seed, iterations=300)
         return fit, seen - np.asarray(_predict(fit.model, (*data[:3], jnp.asarray(weight))))
 
-    mean = np.asarray(measured.current)
     pressure = 1e-9 * np.exp(inputs[:, INPUTS.index("pressure")])
-    vacuum = _line(mean, pressure)
+    vacuum = _line(np.asarray(measured.current), pressure)
     length = np.maximum(LENGTH * np.ptp(inputs, axis=0) / 2, SHORTEST)
     trial = Discrepancy((TRIAL, TRIAL), inputs, length, rows)
-    wrong = sized(trial, *reversed(fitted(net, trial, starts)))
-    fit, left = fitted(net, wrong, starts)
+    wrong = sized(trial, *fitted(trial))
+    fit, left = fitted(wrong)
     low, high = (inputs.min(0), inputs.max(0)) if box is None else box.corners()
     enclosed = over_cells(fit.model["map"], low, high, 2)
     gains = np.stack([np.min(enclosed.lower, axis=0), np.max(enclosed.upper, axis=0)], axis=-1)
@@ -374,7 +370,7 @@ def _maximum_seen(
         )
         rest = np.tile([scraper, pressure, bunches], (VOLTAGES, 1))
         inputs = jnp.asarray(np.column_stack([voltages, rest]))
-        a, b = np.exp(np.asarray(_logs(fit.model, inputs, _base(scales, terms)))).T
+        a, b = np.exp(np.asarray(_logs(fit.model, (inputs, _base(scales, terms))))).T
         turns = np.diff(np.sign(np.diff(a * current + b)))
         if np.count_nonzero(turns) > 1 or turns.min(initial=0) < 0:
             return "broken"

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
+from functools import partial
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
 
 from beamfit.errors import InputError
 from beamfit.greybox.design import Information, scores
@@ -17,12 +20,14 @@ from beamfit.lifetime.losses import Terms, loss_terms, scaled_losses
 from beamfit.lifetime.ring import Operation
 from beamfit.quantity import Quantity, Status
 from beamfit.sampling.posterior import Posterior
-from beamfit.studies.decay.scales import ScaleFit, losses_of
+from beamfit.studies.decay.scales import ScaleFit
 from beamfit.studies.decay.summary import Summaries, information_root, loss_parts
 
 # So wide a prior on scales near 1 decides nothing, and keeps determinants finite.
 WIDE = 10.0
 READINGS = 64
+# Voltages that are looked at, twice.
+GRID = 33
 
 
 class Candidate(NamedTuple):
@@ -117,20 +122,12 @@ def next_decays(fit: ScaleFit, candidates: Sequence[Candidate]) -> tuple[Proposa
 
 def _known(fit: ScaleFit) -> Information:
     """Information on the scales so far, with a wide prior where there is none."""
-    one = np.eye(len(fit.vector))
-    rows = np.vstack(
-        [fit.about(fit.terms, fit.measured)[2].reshape(-1, len(one)), *_priors(fit), one / WIDE]
-    )
+    one, problem = np.eye(len(fit.vector)), fit.fit.problem
+    measured = fit.about(fit.terms, fit.measured)[2].reshape(-1, len(one))
+    priors = [np.equal(problem.names, prior.name) / prior.sd for prior in problem.priors]
+    rows = np.vstack([measured, *priors, one / WIDE])
     free = np.full(len(one), np.inf)
     return Information(rows, np.ones(len(one)), one, free > 0, -free, free)
-
-
-def _priors(fit: ScaleFit) -> list[np.ndarray]:
-    problem = fit.fit.problem
-    return [np.equal(problem.names, prior.name) / prior.sd for prior in problem.priors]
-
-
-GRID = 33
 
 
 class Limits(NamedTuple):
@@ -194,27 +191,20 @@ def _over_voltages(fit: ScaleFit, operation: Operation, current: float, at: np.n
     return Terms(parts, *rest, jnp.broadcast_to(fit.voltages, shape))
 
 
-def _best(draws: np.ndarray, terms: Terms, at: np.ndarray) -> np.ndarray:
-    """Voltage of the smallest loss rate for each draw."""
-
-    def rate(scales):
-        a, b = scaled_losses(scales, terms)
-        return a * terms.current + b
-
-    return at[np.asarray(jnp.argmin(jax.vmap(rate)(jnp.asarray(draws)), axis=1))]
+def _rate(scales: Array, terms: Terms) -> Array:
+    """Loss rate at the mean current, 1/s."""
+    a, b = scaled_losses(scales, terms)
+    return a * terms.current + b
 
 
-def _lifetime(fit: ScaleFit, draws: np.ndarray, operation: Operation, current: float) -> Quantity:
+_rates = jax.vmap(_rate, (0, None))
+
+
+def _lifetime(fit: ScaleFit, draws: Array, operation: Operation, current: float) -> Quantity:
     terms = fit.terms_at(operation, current)
-    a, b = losses_of(draws, terms)
-    hours = np.asarray(1 / (a * current + b) / HOUR)
-
-    def rate(scales):
-        a, b = scaled_losses(scales, terms)
-        return a * current + b
-
-    if not fit.determines(rate):
-        return Quantity(float("nan"), None, "h")
+    if not fit.determines(partial(_rate, terms=terms)):
+        return Quantity(math.nan, None, "h")
+    hours = np.asarray(1 / _rates(draws, terms) / HOUR)
     return Quantity(float(hours.mean()), float(hours.std()), "h")
 
 
@@ -262,13 +252,13 @@ def best_operating_point(
     low = max(low, 1.01 * loss)
     usual = fit.machine.operation
     wide = usual._replace(scraper_y=limits.scraper_y[1], bunches=float(limits.bunches[1]))
-    draws = np.asarray(sample.draws)[:: max(1, len(sample.draws) // 2000)]
-    at = np.linspace(low, max(high, low), GRID)
-    found = _best(draws, _over_voltages(fit, wide, current, at), at)
-    step = at[1] - at[0]
-    at = np.linspace(max(low, found.min() - step), min(at[-1], found.max() + step), GRID)
-    found = _best(draws, _over_voltages(fit, wide, current, at), at)
-    step = at[1] - at[0]
+    draws = jnp.asarray(np.asarray(sample.draws)[:: max(1, len(sample.draws) // 2000)])
+    ends = low, max(high, low)
+    for _ in range(2):
+        at = np.linspace(*ends, GRID)
+        found = at[np.argmin(_rates(draws, _over_voltages(fit, wide, current, at)), axis=1)]
+        step = at[1] - at[0]
+        ends = max(low, found.min() - step), min(at[-1], found.max() + step)
     error = float(np.hypot(found.std(), step / np.sqrt(12)))
     best = float(np.median(found))
     inside = low + step < best < high - step

@@ -106,7 +106,7 @@ class ScaleFit:
     @property
     def error_scale(self) -> float:
         """sqrt(chi²/dof) where above 1."""
-        return math.sqrt(max(1.0, self.chi2 / self.dof)) if self.dof > 0 else 1.0
+        return error_scale(self.chi2, self.dof)
 
     def terms_at(self, operation: Operation, current: float) -> Terms:
         """First principles at a setting, for these scales."""
@@ -147,8 +147,35 @@ class ScaleFit:
         raise AttributeError(f"a ScaleFit has no '{name}'")
 
     def sample(self, seed: int = 0, **options: Any) -> Posterior:
-        """Draw the scales from their posterior: see `sample_scales`."""
-        return sample_scales(self, seed, **options)
+        """Draw the scales from their posterior.
+
+        Parameters
+        ----------
+        seed : int, optional
+            Of the random numbers.
+        **options
+            As of `beamfit.sampling.ensemble.draw`.
+
+        Returns
+        -------
+        Posterior
+            Of Touschek, bremsstrahlung, elastic, desorption, with the priors of the fit, otherwise
+            flat from 0 to 1000. The pressure errors are integrated out as in the fit.
+        """
+        from beamfit.sampling.ensemble import draw
+
+        study = (self.terms, self.measured, self.pressure_error, self.error_scale)
+        record = Record(RECORD, _pulls, study, np.zeros(self.measured.parts.shape), 1.0)
+        stated = Statement(
+            data=study,
+            log_volume=_log_volume,
+            units=dict.fromkeys(self.scales, "1"),
+            width=dict.fromkeys(SCALES, WIDTH),
+            priors_own=[name for name, scale in self.scales.items() if scale.error is None],
+        )
+        optimum = Optimum(self.vector, Finding(self.status, self.message), [1.0], [True])
+        problem = replace(self.fit.problem, records=[record])
+        return draw(target_of(problem, optimum, stated), seed=seed, **options)
 
     def to_json(self) -> dict[str, Any]:
         """Return the scales and the verdict as JSON's types."""
@@ -266,26 +293,34 @@ def fit_scales(
     known, voltages = _checked(priors), _voltages(decays, machine, priors.get(VOLTAGE))
     terms, measured = stacked_terms(decays, machine, voltages), summarise(tuple(decays))
     nothing = np.zeros(measured.parts.shape)
-    names = (*SCALES, VOLTAGE)[: None if VOLTAGE in priors else -1]
+    free = [Free(name, 0.0, LARGEST) for name in SCALES]
+    free += [] if voltages is None else [Free(VOLTAGE, voltages[0], voltages[-1])]
+    names = [each.name for each in free]
     vector = np.array([priors.get(name, (1.0, 0.0))[0] for name in names])
     for _ in range(5):  # the weight moves little with the scales: it settles in two or three
         weight = whitener(vector, terms, measured, pressure_error)
         record = Record(RECORD, _weighted, (terms, measured, weight), nothing, 1.0)
-        found = solve(_problem(dict(zip(names, vector, strict=True)), record, known, voltages))
+        found = solve(Problem(dict(zip(names, vector, strict=True)), free, [record], known))
         vector = found.theta
     seen = int(np.sum(np.any(np.asarray(measured.root) != 0, axis=-1)))
     spread, dof = spread_of_scales(found), seen - len(SCALES)
     blind = ~np.isfinite(spread.error(np.eye(vector.size)))
     covariance = np.where(np.outer(blind, blind), np.inf, spread.seen)
     chi2 = found.group(RECORD).chi2
-    scale = math.sqrt(max(1.0, chi2 / dof)) if dof > 0 else 1.0
-    scales = _quantities(dict(zip(names, vector, strict=True)), covariance, scale, priors)
+    values = zip(names, vector, np.sqrt(np.diag(covariance)), strict=True)
+    scale = error_scale(chi2, dof)
+    scales = {name: _scale(name, *told, scale, priors) for name, *told in values}
     ended = found.status not in (Status.not_converged, Status.not_finite)
     verdict = finding_of_scales(ScaleEvidence(scales, chi2, dof, ended, len(decays)))
     return ScaleFit(
         verdict.status, verdict.cause, scales, found, dof, covariance, pressure_error, machine,
         terms, measured, tuple(d.fit.record for d in decays),
     )  # fmt: skip
+
+
+def error_scale(chi2: float, dof: int) -> float:
+    """sqrt(chi²/dof) where above 1."""
+    return math.sqrt(max(1.0, chi2 / dof)) if dof > 0 else 1.0
 
 
 def spread_of_scales(found: Fit) -> Spread:
@@ -303,30 +338,16 @@ def _weighted(model: Mapping[str, Array], data: tuple[Terms, Summaries, Array]) 
     return pulls(_vector(model), *data)
 
 
-def _problem(
-    scales: dict[str, float], record: Record, priors: Sequence[Prior], voltages: np.ndarray | None
-) -> Problem:
-    """A factor for each of `SCALES`, the decays, and what is known beforehand."""
-    free = [Free(name, 0.0, LARGEST) for name in SCALES]
-    free += [] if voltages is None else [Free(VOLTAGE, voltages[0], voltages[-1])]
-    return Problem(scales, free, [record], priors)
-
-
-def _quantities(
-    scales: Mapping[str, float],
-    covariance: np.ndarray,
-    scale: float,
-    priors: Mapping[str, tuple[float, float]],
-) -> dict[str, Quantity]:
-    found = {}
-    for (name, value), raw in zip(scales.items(), np.sqrt(np.diag(covariance)), strict=True):
-        # Against 1 where the value is smaller: a mechanism found absent, 0.0 ± 0.1, is separable.
-        known = scale * raw < SEPARABLE * max(value, 1.0)
-        if name == VOLTAGE:
-            known = raw < (1 - NARROWED) * priors[name][1]
-        error = (scale * float(raw), "1", float(raw)) if known else (None, "1")
-        found[name] = Quantity(float(value), *error)
-    return found
+def _scale(
+    name: str, value: float, raw: float, scale: float, priors: Mapping[str, tuple[float, float]]
+) -> Quantity:
+    """A scale, without an error where the decays do not tell it."""
+    # Against 1 where the value is smaller: a mechanism found absent, 0.0 ± 0.1, is separable.
+    known = scale * raw < SEPARABLE * max(value, 1.0)
+    if name == VOLTAGE:
+        known = raw < (1 - NARROWED) * priors[name][1]
+    found = Quantity(float(value), scale * float(raw), "1", float(raw))
+    return found if known else found.open()
 
 
 # First principles, the decays, the relative error of pressure readings, the factor on errors.
@@ -349,43 +370,3 @@ def _log_volume(scales: Mapping[str, Array], study: Study) -> Array:
     volume = jnp.abs(jnp.linalg.det(_whitened(scales, study)[0]))
     known = jnp.abs(jnp.linalg.det(study[1].root)) > 0
     return jnp.sum(jnp.where(known, jnp.log(jnp.where(known, volume, 1.0)), 0.0))
-
-
-def sample_scales(fit: ScaleFit, seed: int = 0, **options: Any) -> Posterior:
-    """Draw scales from their posterior.
-
-    Parameters
-    ----------
-    fit : ScaleFit
-        Where to start, and the data.
-    seed : int, optional
-        Of the random numbers.
-    **options
-        As of `beamfit.sampling.ensemble.draw`.
-
-    Returns
-    -------
-    Posterior
-        Of Touschek, bremsstrahlung, elastic, desorption, with the priors of the fit, otherwise
-        flat from 0 to 1000. The pressure errors are integrated out as in the fit.
-    """
-    from beamfit.sampling.ensemble import draw
-
-    names = tuple(fit.scales)
-    study = (fit.terms, fit.measured, fit.pressure_error, fit.error_scale)
-    record = Record(RECORD, _pulls, study, np.zeros(fit.measured.parts.shape), 1.0)
-    problem = replace(fit.fit.problem, records=[record])
-    stated = Statement(
-        data=study,
-        log_volume=_log_volume,
-        units=dict.fromkeys(names, "1"),
-        width=dict.fromkeys(SCALES, WIDTH),
-        priors_own=[name for name, scale in fit.scales.items() if scale.error is None],
-    )
-    optimum = Optimum(fit.vector, Finding(fit.status, fit.message), [1.0], [True])
-    return draw(target_of(problem, optimum, stated), seed=seed, **options)
-
-
-def losses_of(draws: Array, terms: Terms) -> tuple[Array, Array]:
-    """Coefficients a and b of many draws at one setting, each of shape (n,)."""
-    return jax.vmap(scaled_losses, (0, None))(jnp.asarray(draws), terms)

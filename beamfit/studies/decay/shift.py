@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -40,6 +40,11 @@ from beamfit.table import json_of
 
 # Chance of a false alarm in one call.
 FALSE_ALARM = 1e-3
+CAUSES = {
+    "a": "the bunch or the momentum acceptance changed, or the beam-induced pressure",
+    "b": "a gas loss that the gauge does not see: a leak away from it, heavier gas, aperture",
+    "a and b": "gas with desorption, or an aperture, that gauge and settings do not show",
+}
 
 
 class Anomaly(NamedTuple):
@@ -70,21 +75,12 @@ class Anomaly(NamedTuple):
     probability: float
 
 
-class _Linear(NamedTuple):
-    """Readings minus model (2n,), slopes by relative changes of a and b (2n, 2), and the root
-    of their covariance, with the errors of scales and pressures in it."""
-
-    off: np.ndarray
-    change: np.ndarray
-    root: np.ndarray
-
-    def since(self, first: int) -> tuple[np.ndarray, np.ndarray]:
-        """Whitened readings and slopes if the change began with a decay."""
-        later = np.where(np.arange(len(self.off))[:, None] < 2 * first, 0.0, self.change)
-        return np.linalg.solve(self.root, self.off), np.linalg.solve(self.root, later)
-
-
-def _linearised(fit: ScaleFit, decays: Sequence[Decay]) -> _Linear:
+def _linearised(
+    fit: ScaleFit, decays: Sequence[Decay]
+) -> tuple[np.ndarray, Callable[[int], np.ndarray]]:
+    """Readings minus model (2n,), and their slopes (2n, 2) by relative changes of a and b from a
+    decay on; whitened, with the errors of scales and pressures.
+    """
     terms = stacked_terms(decays, fit.machine, fit.voltages)
     measured = summarise(tuple(decays))
     weight, off, by_scale = fit.about(terms, measured)
@@ -93,7 +89,8 @@ def _linearised(fit: ScaleFit, decays: Sequence[Decay]) -> _Linear:
     change = (weight @ by_losses(a * np.asarray(terms.current), b)).reshape(-1, 2)
     known = np.where(np.isfinite(fit.covariance), fit.covariance, 0.0)
     covariance = fit.error_scale**2 * (np.eye(off.size) + by_scale @ known @ by_scale.T)
-    return _Linear(-off, change, np.linalg.cholesky(covariance))
+    whiten = np.linalg.inv(np.linalg.cholesky(covariance))
+    return -whiten @ off, lambda first: whiten[:, 2 * first :] @ change[2 * first :]
 
 
 def _fitted(off: np.ndarray, change: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
@@ -133,8 +130,8 @@ def find_anomaly(fit: ScaleFit, decays: Sequence[Decay]) -> Anomaly:
     """
     if not decays:
         raise InputError("no decay", "one or more to compare with the model")
-    linear = _linearised(fit, decays)
-    trials = [_fitted(*linear.since(first)) for first in range(len(decays))]
+    off, since = _linearised(fit, decays)
+    trials = [_fitted(off, since(first)) for first in range(len(decays))]
     falls = np.array([fall for fall, _, _ in trials])
     best = int(np.argmax(falls))
     fall, found, covariance = trials[best]
@@ -144,23 +141,15 @@ def find_anomaly(fit: ScaleFit, decays: Sequence[Decay]) -> Anomaly:
     if chance > FALSE_ALARM:
         message = f"{len(decays)} decays follow the model (p = {chance:.2g})."
         return Anomaly(Status.converged, message, None, (), a, b, chance)
-    moved = _moved(*linear.since(best), fall)
+    moved, begun = _moved(off, since(best), fall), decays[best].fit.record
     names = " and ".join(moved)
-    since = decays[best].fit.record
-    causes = {
-        ("a",): "the bunch or the momentum acceptance changed, or the beam-induced pressure",
-        (
-            "b",
-        ): "a gas loss that the gauge does not see: a leak away from it, heavier gas, aperture",
-        ("a", "b"): "gas with desorption, or an aperture, that gauge and settings do not show",
-    }
     changes = ", ".join(
         f"{name} by {100 * q.value:+.3g} ± {100 * q.error:.2g} %"
         for name, q in (("a", a), ("b", b))
         if name in moved
     )
-    message = f"{names} moved since {since} ({changes}; p = {chance:.2g}): {causes[moved]}."
-    return Anomaly(Status.poor_fit, message, since, moved, a, b, chance)
+    message = f"{names} moved since {begun} ({changes}; p = {chance:.2g}): {CAUSES[names]}."
+    return Anomaly(Status.poor_fit, message, begun, moved, a, b, chance)
 
 
 def _moved(off: np.ndarray, change: np.ndarray, fall: float) -> tuple[str, ...]:
@@ -277,21 +266,19 @@ class Shift:
             | {"current_mA": p.candidate.current, "information": p.information}
             for p in self.proposals
         ]
-        best = self.best._asdict() | {"scraper_y": bare(self.best.scraper_y, "m")}
-        found = {} if self.network is None else {"network": self.network.to_json(self.current)}
-        return json_of(
-            {
-                "scales": self.fit,
-                "current": bare(self.current, "mA"),
-                "budget": self.budget,
-                "not_determined": self.untold,
-                "held_back": self.held_back,
-                "best": best,
-                "next": proposals,
-                "anomaly": self.anomaly,
-                **found,
-            }
-        )
+        found = {
+            "scales": self.fit,
+            "current": bare(self.current, "mA"),
+            "budget": self.budget,
+            "not_determined": self.untold,
+            "held_back": self.held_back,
+            "best": self.best._asdict() | {"scraper_y": bare(self.best.scraper_y, "m")},
+            "next": proposals,
+            "anomaly": self.anomaly,
+        }
+        if self.network is not None:
+            found["network"] = self.network.to_json(self.current)
+        return json_of(found)
 
 
 def study_shift(
@@ -330,7 +317,9 @@ def study_shift(
     sample = fit.sample(seed=seed)
     current = max(decay.fit.mean_current for decay in decays)
     settings = [operation_during(decay.segment, machine) for decay in decays]
-    limits = Limits(*(_range(settings, name) for name in Limits._fields))
+    seen = [[float(getattr(setting, name)) for setting in settings] for name in Limits._fields]
+    limits = Limits(*((min(values), max(values)) for values in seen))
+    corrected = fit if network is Network.correction else None
     return Shift(
         fit=fit,
         budget=budget_intervals(fit, sample, machine.operation, current),
@@ -339,18 +328,8 @@ def study_shift(
         best=best_operating_point(fit, sample, limits, current),
         proposals=next_decays(fit, _candidates(decays, machine, limits, current))[:3],
         anomaly=_anomaly(decays, machine, priors),
-        network=None if network is None else _network(decays, fit, network, seed),
+        network=network and fit_loss_network(decays, machine, corrected, seed=seed),
     )
-
-
-def _network(decays: Sequence[Decay], fit: ScaleFit, network: Network, seed: int) -> NetworkFit:
-    corrected = fit if network is Network.correction else None
-    return fit_loss_network(decays, fit.machine, corrected, seed=seed)
-
-
-def _range(settings: Sequence, name: str) -> tuple[float, float]:
-    values = [float(getattr(setting, name)) for setting in settings]
-    return min(values), max(values)
 
 
 def _candidates(

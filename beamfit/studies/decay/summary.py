@@ -64,11 +64,11 @@ def information_root(
     return jnp.linalg.qr(jacobian, mode="r")[1:, 1:]
 
 
-def _one(decay: Decay) -> tuple[float, np.ndarray, np.ndarray]:
-    segment, fit = decay.segment, decay.fit
+def _root(decay: Decay, parts: np.ndarray) -> np.ndarray:
+    """The information that a decay holds on its parts, as of `Summaries`."""
+    segment, fit, rows = decay.segment, decay.fit, len(decay.segment)
     if fit.first is not None:
-        return _together(fit)
-    rows = len(segment)
+        return _together(fit, parts[1])
     if fit.noise_inferred:
         # sqrt(sum/dof): the noise that the residuals show.
         error = np.full(rows, fit.rms_residual * np.sqrt(rows / fit.dof))
@@ -78,9 +78,8 @@ def _one(decay: Decay) -> tuple[float, np.ndarray, np.ndarray]:
     weight = 1 / (error * fit.identifiability.error_inflation)
     extra = (0, padded_size(rows) - rows)
     time, weight = np.pad(segment.time, extra, mode="edge"), np.pad(weight, extra)
-    parts = np.asarray(loss_parts(fit.a.value, fit.b.value, fit.mean_current))
     root = np.asarray(information_root(time, weight, fit.i0.value, parts, fit.mean_current))
-    return fit.mean_current, parts, _with_monitor(root, fit)
+    return _with_monitor(root, fit)
 
 
 def _with_monitor(root: np.ndarray, fit: DecayFit) -> np.ndarray:
@@ -95,13 +94,10 @@ def _with_monitor(root: np.ndarray, fit: DecayFit) -> np.ndarray:
     return np.linalg.qr(np.linalg.solve(whole, root), mode="r")
 
 
-def _together(fit: DecayFit) -> tuple[float, np.ndarray, np.ndarray]:
+def _together(fit: DecayFit, rate: float) -> np.ndarray:
     """Many cycles, of which the share of a and the lifetime are uncorrelated."""
-    parts = np.asarray(loss_parts(fit.a.value, fit.b.value, fit.mean_current))
-    error = parts[1] * (fit.lifetime_mean.relative or np.inf)
-    found = fit.identifiability.share_error
-    share = np.inf if found is None else found
-    return fit.mean_current, parts, np.diag([1 / (share * parts[1]), 1 / error])
+    share, error = fit.identifiability.share_error, fit.lifetime_mean.relative or np.inf
+    return np.diag(1 / (rate * np.array([np.inf if share is None else share, error])))
 
 
 def summarise(decays: tuple[Decay, ...]) -> Summaries:
@@ -137,9 +133,11 @@ def summarise(decays: tuple[Decay, ...]) -> Summaries:
     >>> print(f"{error / found.parts[0, 1]:.1e}, by the fit {fit.lifetime_mean.relative:.1e}")
     2.1e-06, by the fit 2.1e-06
     """
-    rows = []
-    for decay in decays:
+    current = np.array([decay.fit.mean_current for decay in decays])
+    parts, root = np.zeros((len(decays), 2)), np.zeros((len(decays), 2, 2))
+    for k, decay in enumerate(decays):
         fit = decay.fit
-        usable = np.isfinite(fit.a.value) and fit.rms_residual > 0
-        rows.append(_one(decay) if usable else (fit.mean_current, np.zeros(2), np.zeros((2, 2))))
-    return Summaries(*(jnp.asarray(np.array(column)) for column in zip(*rows, strict=True)))
+        if np.isfinite(fit.a.value) and fit.rms_residual > 0:
+            parts[k] = loss_parts(fit.a.value, fit.b.value, fit.mean_current)
+            root[k] = _root(decay, parts[k])
+    return Summaries(*map(jnp.asarray, (current, parts, root)))
