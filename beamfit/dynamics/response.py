@@ -13,6 +13,8 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
+from beamfit.dynamics.states import affine_course
+
 
 class Physics(NamedTuple):
     """A response of one output to m inputs.
@@ -195,18 +197,4 @@ def run_from(
     physics: Physics, p: jax.Array, u: jax.Array, dt: jax.Array, x0: jax.Array
 ) -> jax.Array:
     """Run a response as `simulate`, from a whole state at the first sample."""
-
-    def affine(p, u, dt):
-        def after(x):
-            moved = physics.advance(p, x, u, dt)
-            return moved, moved
-
-        return jax.jacfwd(after, has_aux=True)(jnp.zeros_like(x0))
-
-    def step(x, now):
-        matrix, shift = now
-        return jnp.sum(matrix * x, axis=1) + shift, x[0]
-
-    # A step is affine in the state: what does not hang on the state is computed for all samples
-    # at once, and the scan, forward and backward, is a product with a small matrix.
-    return jax.lax.scan(step, x0, jax.vmap(affine)(p, u, dt))[1]
+    return affine_course(lambda x, p, *now: physics.advance(p, x, *now), x0, p, u, dt)[1][:, 0]

@@ -99,19 +99,8 @@ class StateSpace(NamedTuple):
         tuple of jax.Array
             Outputs at the samples, shape (samples, k), and the state after the last one, (n,).
         """
-        if self.affine:  # what does not hang on the state is computed for all samples at once
-
-            def moved(u, dt):
-                def after(x):
-                    new = self.after(p, x, u, dt)
-                    return new, new
-
-                return jax.jacfwd(after, has_aux=True)(jnp.zeros_like(x0))
-
-            def step(x, now):
-                return now[0] @ x + now[1], x
-
-            last, x = jax.lax.scan(step, x0, jax.vmap(moved)(u, dt))
+        if self.affine:
+            last, x = affine_course(lambda x, *now: self.after(p, x, *now), x0, u, dt)
         else:
             last, x = jax.lax.scan(lambda x, now: (self.after(p, x, *now), x), x0, (u, dt))
         return jax.vmap(self.read, (None, 0, 0))(p, x, u), last
@@ -119,6 +108,29 @@ class StateSpace(NamedTuple):
     def read(self, p: Any, x: jax.Array, u: jax.Array) -> jax.Array:
         """Give the outputs at one sample, shape (k,)."""
         return jnp.atleast_1d(self.output(x, u, p(u) if callable(p) else p))
+
+
+def affine_course(
+    after: Callable[..., jax.Array], x0: jax.Array, *rows: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """The state after the last of some steps that are affine in it, and that before each.
+
+    ``after(x, *row)`` is a step. What does not hang on the state is computed for all samples at
+    once, and the scan, forward and backward, is a product with a small matrix.
+    """
+
+    def moved(*row):
+        def both(x):
+            new = after(x, *row)
+            return new, new
+
+        return jax.jacfwd(both, has_aux=True)(jnp.zeros_like(x0))
+
+    def step(x, now):
+        matrix, shift = now
+        return jnp.sum(matrix * x, axis=1) + shift, x
+
+    return jax.lax.scan(step, x0, jax.vmap(moved)(*rows))
 
 
 def _growth(a: jax.Array) -> jax.Array:

@@ -29,24 +29,23 @@ def _spectrum(log_kappa: Array, floor: Array) -> Array:
     ) * jnp.sqrt(1 + t)
 
 
+def _both(ring: Ring, optics: Optics) -> tuple[Array, ...]:
+    """Emittance, beta, alpha, dispersion and its slope at one point, (x, y) each."""
+    emittance = jnp.stack([ring.emittance_x, ring.emittance_y])
+    return emittance, *jnp.reshape(jnp.stack(optics[1:]), (4, 2))
+
+
 def _width_coefficients(ring: Ring, optics: Optics) -> tuple[Array, Array]:
     """B1 and B1² - B2² of Piwinski's equations 33 and 34, at one point of the ring."""
-    lorentz = ring.relativistic_gamma
-    speed2 = 1 - lorentz**-2
-    tilt_x = optics.alpha_x * optics.dispersion_x + optics.beta_x * optics.slope_x
-    tilt_y = optics.alpha_y * optics.dispersion_y + optics.beta_y * optics.slope_y
-    invariant_x = (optics.dispersion_x**2 + tilt_x**2) / (ring.emittance_x * optics.beta_x)
-    invariant_y = (optics.dispersion_y**2 + tilt_y**2) / (ring.emittance_y * optics.beta_y)
-    spread2 = 1 / (ring.energy_spread**-2 + invariant_x + invariant_y)
-    slow_x = tilt_x**2 * spread2 / (ring.emittance_x * optics.beta_x)
-    slow_y = tilt_y**2 * spread2 / (ring.emittance_y * optics.beta_y)
-    c_x = optics.beta_x / ring.emittance_x * (1 - slow_x)
-    c_y = optics.beta_y / ring.emittance_y * (1 - slow_y)
-    scale = speed2 * lorentz**2
-    coupled = spread2 * tilt_x * tilt_y / (ring.emittance_x * ring.emittance_y)
+    emittance, beta, alpha, dispersion, slope = _both(ring, optics)
+    tilt, size2 = alpha * dispersion + beta * slope, emittance * beta
+    spread2 = 1 / (ring.energy_spread**-2 + jnp.sum((dispersion**2 + tilt**2) / size2))
+    x, y = beta / emittance * (1 - tilt**2 * spread2 / size2)
+    coupled = spread2 * tilt[0] * tilt[1] / (emittance[0] * emittance[1])
+    scale = ring.relativistic_gamma**2 - 1
     # B1² - B2² from the product: the difference of two near-equal squares loses all digits
     # in a flat beam.
-    return (c_x + c_y) / (2 * scale), (c_x * c_y - coupled**2) / scale**2
+    return (x + y) / (2 * scale), (x * y - coupled**2) / scale**2
 
 
 def piwinski_shape(floor: Array, b1: Array, gap: Array, nodes: int = 64) -> Array:
@@ -94,11 +93,10 @@ def piwinski_shape(floor: Array, b1: Array, gap: Array, nodes: int = 64) -> Arra
 
 def _volume(ring: Ring, optics: Optics) -> Array:
     """sqrt(sigma_x² sigma_y² - sigma_delta⁴ D_x² D_y²): the bunch's transverse area, m²."""
-    spread_x = ring.energy_spread * optics.dispersion_x
-    spread_y = ring.energy_spread * optics.dispersion_y
-    size2_x = ring.emittance_x * optics.beta_x + spread_x**2
-    size2_y = ring.emittance_y * optics.beta_y + spread_y**2
-    return jnp.sqrt(size2_x * size2_y - (spread_x * spread_y) ** 2)
+    emittance, beta, _, dispersion, _ = _both(ring, optics)
+    spread = ring.energy_spread * dispersion
+    x, y = emittance * beta + spread**2
+    return jnp.sqrt(x * y - (spread[0] * spread[1]) ** 2)
 
 
 @partial(jax.jit, static_argnames="nodes")

@@ -187,20 +187,11 @@ def watched(reference: Reference, state: State, reading: Reading) -> tuple[State
     return _judged(reference, after, usable)
 
 
-class _Step(NamedTuple):
+def _step(usual: Reference, state: State, reading: Reading) -> tuple[np.ndarray, ...]:
     """From one reading to the next: seconds, whether the path goes on, and whether it was cut by
-    a step; how far ln I moved against the expected, with derivatives; noise and its memory."""
-
-    seconds: np.ndarray
-    going: np.ndarray
-    cut: np.ndarray
-    moved: np.ndarray
-    expected: np.ndarray
-    noise: np.ndarray
-    memory: np.ndarray
-
-
-def _step(usual: Reference, state: State, reading: Reading) -> _Step:
+    a step; how far ln I moved against the expected, with derivatives; what is expected of a and b;
+    noise and its memory.
+    """
     with np.errstate(invalid="ignore", divide="ignore"):
         seconds = np.asarray(reading.time - state.time)
         going = (seconds > 0) & (seconds <= max(GAP * usual.interval, MINUTE))
@@ -222,7 +213,7 @@ def _step(usual: Reference, state: State, reading: Reading) -> _Step:
         expected = np.stack(np.broadcast_arrays(reading.a_factor, reading.b_factor, noise)[:2], -1)
         level &= (np.abs(expected / state.expected - 1) <= SET).all(-1)
     moved = np.stack([excess, -a_part, -b_part], axis=-1)
-    return _Step(seconds, going & level, going & ~level, moved, expected, noise, memory)
+    return seconds, going & level, going & ~level, moved, expected, noise, memory
 
 
 def _moved_on(usual: Reference, state: State, reading: Reading) -> State:
@@ -292,13 +283,10 @@ def _since(usual: Reference, state: State, change: np.ndarray) -> np.ndarray:
 
 def _adopted(state: State, done: np.ndarray, change: np.ndarray, covariance: np.ndarray) -> State:
     """Where an alarm is told, what was found is the usual loss from now on."""
-    factor = state.factor * (1 + change)
-    known = {"factor": factor, "covariance": state.covariance + covariance}
-    named = {name: either(done, part, getattr(state, name)) for name, part in known.items()}
-    for name in ("age", "weight", "product"):
-        before = getattr(state, name)
-        named[name] = either(done, np.zeros_like(before), before)
-    return state._replace(**named, raised=np.where(done, np.nan, state.raised))
+    new = {name: np.zeros_like(getattr(state, name)) for name in ("age", "weight", "product")}
+    new["factor"], new["covariance"] = state.factor * (1 + change), state.covariance + covariance
+    new["raised"] = np.full_like(state.raised, np.nan)
+    return state._replace(**{n: either(done, v, getattr(state, n)) for n, v in new.items()})
 
 
 class Alarm(NamedTuple):

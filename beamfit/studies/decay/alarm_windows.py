@@ -126,15 +126,15 @@ def change_since(state: State, moved: np.ndarray) -> tuple[np.ndarray, np.ndarra
     caa, cab, cbb = (state.covariance[..., i, j] for i, j in ((0, 0), (0, 1), (1, 1)))
     a_error = 1 / uu + caa + 2 * uv / uu * cab + (uv / uu) ** 2 * cbb
     b_error = 1 / vv + cbb + 2 * uv / vv * cab + (uv / vv) ** 2 * caa
-    zero = np.zeros_like(uy)
-    change, error = both, np.sqrt(total)
-    for which, value, square in (
-        (1, (uy / uu, zero), (a_error, zero)),
-        (2, (zero, vy / vv), (zero, b_error)),
-    ):
-        change = either(moved == which, np.stack(value, -1), change)
-        error = either(moved == which, np.sqrt(np.stack(square, -1)), error)
-    return change, error, covariance
+
+    def told(a: np.ndarray, b: np.ndarray, whole: np.ndarray) -> np.ndarray:
+        """Of a alone, of b alone, or of both."""
+        zero = np.zeros_like(a)
+        rest = either(moved == 2, np.stack([zero, b], -1), whole)
+        return either(moved == 1, np.stack([a, zero], -1), rest)
+
+    change, square = told(uy / uu, vy / vv, both), told(a_error, b_error, total)
+    return change, np.sqrt(square), covariance
 
 
 def set_off(state: State, raised: np.ndarray, best: np.ndarray) -> State:

@@ -253,10 +253,6 @@ class DecayChecks:
     single_exponential: OneLifetime
     log_linear: OneLifetime | None
 
-    def to_json(self) -> dict[str, Any]:
-        """Return the fields as JSON's types."""
-        return json_of(vars(self))
-
 
 def check_decay(record: DecayRecord) -> DecayChecks | None:
     """Do every check of a decay.

@@ -237,7 +237,7 @@ class Evidence(Weighed):
         changes = record.monitor_changes
         if not (changes and solution.converged):
             return found
-        return found.widened(expanded(record, solution.values, shape), changes)
+        return found.widened(found.about, changes)
 
     @classmethod
     def _by_noise(cls, record: DecayRecord, solution: Solution, shape: Shape | None) -> Evidence:
@@ -337,6 +337,11 @@ class Evidence(Weighed):
         return any(value < -BELIEVED * error for value, error in map(self.scaled, "ab"))
 
     @cached_property
+    def about(self) -> Expansion:
+        """The law about the solution."""
+        return expanded(self.record, self.solution.values, self.shape)
+
+    @cached_property
     def bent(self) -> Physical | None:
         """What bunches that lengthen with the current would have added to the values, where the
         record would not show them and b moves by more than its error.
@@ -344,8 +349,7 @@ class Evidence(Weighed):
         seen = FOUND * (self.constant_a.exponent.error or math.inf) < -LENGTHENING
         if self.shape is not None or seen or self.refuted or not self.separability.separable:
             return None
-        about = expanded(self.record, self.solution.values)
-        moved = about.moved(LENGTHENING * about.rows[:, NUMBERS])
+        moved = self.about.moved(LENGTHENING * self.about.rows[:, NUMBERS])
         least = max(MATTERS * abs(self.values.b), self.reach.b)
         return moved if abs(moved.b) > least else None
 
@@ -361,9 +365,7 @@ class Evidence(Weighed):
     @cached_property
     def change(self) -> Change | None:
         """A change of the loss rate in the record that explains it better than an exponent."""
-        values = self.solution.values
-        found = expanded(self.record, values, self.shape)
-        return change_of_rate(self.record, found, values, self.memory)
+        return change_of_rate(self.record, self.about, self.solution.values, self.memory)
 
     @cached_property
     def outgassing(self) -> Outgassing | None:

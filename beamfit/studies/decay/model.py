@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from functools import lru_cache, partial
 from typing import NamedTuple
 
@@ -77,7 +78,8 @@ def _predicted(shape: Shape | None) -> Callable[[DecayNumbers, Moments], Array]:
     return partial(beam_current, shape=shape)
 
 
-def _apart(model: DecayNumbers, at: Moments) -> Array:
+def apart(model: DecayNumbers, at: Moments) -> Array:
+    """Time between neighbouring readings over the correlation time of their errors."""
     return jnp.diff(at.time) * jnp.exp(-model.log_memory)
 
 
@@ -113,10 +115,11 @@ def decay_problem(
     span, mean = record.span, float(record.current.mean())
     loss, quadratic = start[1] / span, start[2] / span
     numbers = DecayNumbers(start[0] * mean, quadratic / mean, loss - quadratic)
-    at, apart = Moments(record.time, mean, record.gauge), None
+    at = Moments(record.time, mean, record.gauge)
+    readings = Record(RECORD, _predicted(shape), at, record.current, record.error)
     if memory is not None:
-        numbers, apart = numbers._replace(log_memory=math.log(memory)), _apart
-    readings = Record(RECORD, _predicted(shape), at, record.current, record.error, apart=apart)
+        numbers = numbers._replace(log_memory=math.log(memory))
+        readings = replace(readings, apart=apart)
     priors = [] if shape else [Prior("a", 0.0, width / noise / span / mean)]
     return Problem(numbers, [Free("i0"), Free("a"), Free("b")], [readings], priors)
 

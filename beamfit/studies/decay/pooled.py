@@ -251,8 +251,7 @@ def seen_through(fit: DecayFit) -> DecayFit:
         f"{least:.2g} mA can be missed in this noise: the beam then seems to live longer than it "
         f"does. Average readings, or give the times of the refills by cutting the record there. "
     )
-    names = ("a", "b", "lifetime_start", "lifetime_end", "lifetime_mean")
-    bare = {name: getattr(fit, name).open() for name in names}
+    bare = {name: quantity.open() for name, quantity in fit.quantities.items()}
     return replace(fit, status=Status.unidentified, message=cause + fit.message, **bare)
 
 

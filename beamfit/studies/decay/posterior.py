@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -16,14 +16,12 @@ from beamfit.greybox.correlated import log_volume, range_of, whitened
 from beamfit.greybox.posterior import Optimum, Sampled, Statement, target_of
 from beamfit.greybox.problem import Free, Prior, Problem, Record
 from beamfit.lifetime.decay import HOUR, current
-from beamfit.quantity import Quantity
 from beamfit.sampling.intervals import Expected
 from beamfit.sampling.posterior import Posterior
 from beamfit.sampling.priors import Distribution
 from beamfit.sampling.target import Target
-from beamfit.status import Status
 from beamfit.studies.decay.law import DecayNumbers, Moments, monitored_current
-from beamfit.studies.decay.model import RECORD, decay_problem
+from beamfit.studies.decay.model import RECORD, apart, decay_problem
 from beamfit.studies.decay.record import DecayRecord
 from beamfit.verdict import Finding
 
@@ -34,22 +32,6 @@ WIDEST = 8.0
 LIFETIMES = {"lifetime_start": "h", "lifetime_mean": "h", "lifetime_end": "h"}
 
 
-class Fitted(Protocol):
-    """A fitted decay."""
-
-    status: Status
-    message: str
-    i0: Quantity
-    a: Quantity
-    b: Quantity
-    mean_current: float
-    chi2: float
-    dof: int
-    rms_residual: float
-    correlation_time: float | None
-    readings: DecayRecord | None
-
-
 def _lifetimes(numbers: DecayNumbers, at: tuple[Array, Array]) -> Array:
     """Lifetime at the first reading, at the mean current and at the last reading, h."""
     mean, last, _ = at
@@ -58,7 +40,7 @@ def _lifetimes(numbers: DecayNumbers, at: tuple[Array, Array]) -> Array:
 
 
 def decay_target(
-    fit: Fitted,
+    fit,
     noise: str | None = None,
     outliers: bool = False,
     priors: Mapping[str, Distribution] | None = None,
@@ -106,25 +88,27 @@ def decay_target(
     scale = fit.rms_residual * np.sqrt(len(record) / max(fit.dof, 1))
     if record.error is not None:
         scale = max(1.0, np.sqrt(fit.chi2 / max(fit.dof, 1)))
+    more = {}
     if fit.correlation_time is not None:
+        more["log_volume"] = _log_volume
         inferred = noise == "inferred" or (noise is None and (record.error is None or scale > 1))
         problem = _with_memory(problem, record, fit.correlation_time, inferred)
         theta = np.append(theta, np.log(fit.correlation_time))
     nothing = f"the readings show neither decay nor noise; {fit.message}".rstrip(".")
     seen = fit.rms_residual > 0 or record.error is not None
     # A prior on one of the two tells them apart, if anything does.
-    apart = fit.identifiability.separable or {"a", "b"} & set(priors or {})
+    told = fit.identifiability.separable or {"a", "b"} & set(priors or {})
     stated = Statement(
         derived=LIFETIMES,
         derive=_lifetimes,
-        log_volume=_no_volume if fit.correlation_time is None else _log_volume,
         data=(fit.mean_current, record.time[-1], problem.records[0].data),
         units=SAMPLED,
         lower=dict.fromkeys(UNITS, 0.0),
         width={"a": rate / fit.mean_current, "b": rate, "log_memory": 1.0, **monitor},
         noise_unit="mA",
-        priors_own=() if apart else ("a", "b"),
+        priors_own=() if told else ("a", "b"),
         nothing="" if seen else nothing,
+        **more,
     )
     verdict, given = Finding(fit.status, fit.message), [record.error is not None]
     optimum = Optimum(theta, verdict, [max(scale, 1e-12)], given)
@@ -186,23 +170,17 @@ def _log_size(model: DecayNumbers, data: Remembered) -> Array:
 
 
 def _new(model: DecayNumbers, data: Remembered) -> Array:
-    apart = jnp.diff(data.at.time) * jnp.exp(-model.log_memory)
     rows = (monitored_current(model, data.at) - data.measured) / data.error
-    return whitened(rows, apart) * jnp.exp(_log_size(model, data))
+    return whitened(rows, apart(model, data.at)) * jnp.exp(_log_size(model, data))
 
 
 def _log_volume(model: DecayNumbers, data: tuple[Array, Array, Remembered]) -> Array:
     remembered = data[2]
-    apart = jnp.diff(remembered.at.time) * jnp.exp(-model.log_memory)
-    count = remembered.measured.size
-    return log_volume(apart) + count * _log_size(model, remembered)
+    volume = log_volume(apart(model, remembered.at))
+    return volume + remembered.measured.size * _log_size(model, remembered)
 
 
-def _no_volume(model: DecayNumbers, data: tuple[Array, ...]) -> Array:
-    return jnp.zeros(())
-
-
-def _start(fit: Fitted, record: DecayRecord) -> tuple[np.ndarray, float]:
+def _start(fit, record: DecayRecord) -> tuple[np.ndarray, float]:
     """Where to begin, a and b not negative, and the whole loss rate at the mean current, 1/s."""
     mean = fit.mean_current
     rate = fit.a.value * mean + fit.b.value

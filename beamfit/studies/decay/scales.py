@@ -295,7 +295,7 @@ def fit_scales(
     nothing = np.zeros(measured.parts.shape)
     free = [Free(name, 0.0, LARGEST) for name in SCALES]
     free += [] if voltages is None else [Free(VOLTAGE, voltages[0], voltages[-1])]
-    names = [each.name for each in free]
+    names = (*SCALES, VOLTAGE)[: len(free)]
     vector = np.array([priors.get(name, (1.0, 0.0))[0] for name in names])
     for _ in range(5):  # the weight moves little with the scales: it settles in two or three
         weight = whitener(vector, terms, measured, pressure_error)

@@ -14,7 +14,7 @@ from beamfit.shown import shown
 from beamfit.studies.decay.budget import Budget, Machine, budget
 from beamfit.studies.decay.checks import DecayChecks, check_decay
 from beamfit.studies.decay.cycles import alike, cut_at_refills, is_refilled, joined
-from beamfit.studies.decay.fit import FEWEST, DecayFit, fit_decay
+from beamfit.studies.decay.fit import FEWEST, DecayFit, bare, fit_decay
 from beamfit.studies.decay.pool import FEWEST_CYCLES
 from beamfit.studies.decay.pooled import fit_cycles, seen_through, stands_alone
 from beamfit.studies.decay.record import DecayRecord
@@ -72,12 +72,11 @@ class Decay:
 
     def to_json(self) -> dict[str, Any]:
         """Give one entry of the ``results`` list of the JSON contract."""
-        start = {"value": self.offset, "error": None, "unit": "s"}
-        checks = {} if self.checks is None else self.checks.to_json()
-        shown = self.fit.to_json() | {"start": start} | checks
-        shown |= {"systematics": json_of(self.systematics)}
-        shown |= {"notes": list(self.segment.notes)} if self.segment.notes else {}
-        return shown if self.budget is None else shown | {"budget": self.budget.to_json()}
+        more = {"start": bare(self.offset, "s")} | (vars(self.checks) if self.checks else {})
+        more["systematics"] = self.systematics
+        more |= {"notes": self.segment.notes} if self.segment.notes else {}
+        more |= {} if self.budget is None else {"budget": self.budget}
+        return self.fit.to_json() | json_of(more)
 
 
 @shown

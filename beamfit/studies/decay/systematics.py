@@ -77,14 +77,8 @@ def systematics(fit: DecayFit) -> tuple[Systematic, ...]:
     >>> [f"{100 * row.a / fit.a.value:.2f} %" for row in systematics(fit)]
     ['-0.41 %', '0.03 %', '0.00 %', '-10.05 %']
     """
-    record = fit.readings
-    if (
-        record is None
-        or fit.first is not None
-        or fit.shaped
-        or fit.status is Status.infeasible
-        or fit.a.error is None
-    ):
+    record, another = fit.readings, fit.shaped or fit.first is not None
+    if record is None or another or fit.status is Status.infeasible or fit.a.error is None:
         return ()
     about = about_fit(fit)
     over = 1.0 if record.error is None else record.error
@@ -98,7 +92,12 @@ def systematics(fit: DecayFit) -> tuple[Systematic, ...]:
         f"a goes as I^{EXPONENT:g}, as of a bunch that lengthens": EXPONENT
         * (about.rows[:, 3] * over),
     }
-    return tuple(_shift(fit, about, cause, moved / over) for cause, moved in causes.items())
+    rate, found = fit.a.value * fit.mean_current + fit.b.value, []
+    for cause, change in causes.items():
+        moved = about.moved(change / over)
+        lifetime = -moved.rate_mean / rate**2 / HOUR
+        found.append(Systematic(cause, moved.a, moved.b, lifetime))
+    return tuple(found)
 
 
 def _monitor(record: DecayRecord, share: np.ndarray) -> dict[str, np.ndarray]:
@@ -115,16 +114,7 @@ def _monitor(record: DecayRecord, share: np.ndarray) -> dict[str, np.ndarray]:
 
 def about_fit(fit: DecayFit) -> Expansion:
     """The law about a fit of a constant a."""
-    a, b = fit.a.value, fit.b.value
+    a, b, unused = fit.a.value, fit.b.value, np.nan
     rate = a * fit.mean_current + b
-    unused = np.nan
-    share = a * fit.mean_current / rate
-    values = Physical(fit.i0.value, a, b, unused, unused, rate, share, 0.0)
+    values = Physical(fit.i0.value, a, b, unused, unused, rate, unused, unused)
     return expanded(fit.readings, values)
-
-
-def _shift(fit: DecayFit, about: Expansion, cause: str, moved: np.ndarray) -> Systematic:
-    """Project a change of the readings on the law."""
-    found = about.moved(moved)
-    rate = fit.a.value * fit.mean_current + fit.b.value
-    return Systematic(cause, found.a, found.b, -found.rate_mean / rate**2 / HOUR)

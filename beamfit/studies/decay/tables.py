@@ -16,7 +16,8 @@ from beamfit.studies.decay.shift import Shift
 from beamfit.studies.decay.study import Decay, RecordStudy
 from beamfit.table import cell
 
-Rows = list[tuple[str, list[str]]]
+# Label and values, as `beamfit.table.labelled` takes them.
+Rows = list[tuple[str, list[object]]]
 Row = tuple[str, Callable[[Decay], object]]
 MOST_EVENTS = 100
 # How many decays have every number shown; of more only the main ones, a row each.
@@ -37,7 +38,7 @@ NEGLIGIBLE = 1e-6
 
 
 def _laid_out(decays: Sequence[Decay], rows: Sequence[Row]) -> Rows:
-    return [(label, [cell(value(decay)) for decay in decays]) for label, value in rows]
+    return [(label, [value(decay) for decay in decays]) for label, value in rows]
 
 
 def _span(seconds: float) -> str:
@@ -244,7 +245,7 @@ def overview(decays: Sequence[Decay]) -> list[tuple[str, list[str], list[list[st
         labels = [label for label in wanted if label in every]
         if labels:
             header = ["decay", *(label.removeprefix("lifetime at the mean, ") for label in labels)]
-            columns = [every[label] for label in labels]
+            columns = [map(cell, every[label]) for label in labels]
             tables.append((title, header, [list(r) for r in zip(names, *columns, strict=True)]))
     return tables
 
@@ -259,19 +260,15 @@ def alike(decays: Sequence[Decay]) -> list[tuple[Status, str, str]]:
         well = fit.status is Status.converged
         words = re.sub(r"\d[\d.e+-]*", "#", fit.message) if well else fit.message
         found.setdefault((fit.status, words), []).append(fit)
-    return [(status, *_said(fits)) for (status, _), fits in found.items()]
-
-
-def _said(fits: Sequence[DecayFit]) -> tuple[str, str]:
-    """Whom a verdict is on, and its sentences."""
-    names, first = [fit.record for fit in fits], fits[0].message
-    if len({fit.message for fit in fits}) > 1:
-        first = f"{first.rstrip('.')} (numbers are the first's)."
-    return (names[0] if len(names) == 1 else _several(names)), first
-
-
-def _several(names: Sequence[str]) -> str:
-    return f"{len(names)} decays, {names[0]} to {names[-1]}"
+    told = []
+    for (status, _), fits in found.items():
+        who, said = fits[0].record, fits[0].message
+        if len(fits) > 1:
+            who = f"{len(fits)} decays, {who} to {fits[-1].record}"
+        if len({fit.message for fit in fits}) > 1:
+            said = f"{said.rstrip('.')} (numbers are the first's)."
+        told.append((status, who, said))
+    return told
 
 
 def counted(events: Sequence[Event]) -> str:
@@ -330,7 +327,7 @@ def shift_rows(shift: Shift) -> Rows:
         asked = proposal.candidate
         said = f"{asked.current:.4g} mA (information {proposal.information:.3g})"
         rows.append((f"next decay, choice {number}", f"{_setting(asked.operation)}, {said}"))
-    return [(label, [cell(value)]) for label, value in rows]
+    return [(label, [value]) for label, value in rows]
 
 
 def network_rows(shift: Shift) -> Rows:
@@ -348,4 +345,4 @@ def network_rows(shift: Shift) -> Rows:
         ("falls with scraper and bunches, rises with pressure", held.holds),
         ("single maximum of the lifetime in the RF voltage", held.single_maximum),
     ]
-    return [(label, [cell(value)]) for label, value in rows]
+    return [(label, [value]) for label, value in rows]

@@ -112,10 +112,8 @@ class Trend:
     def tables(self) -> tuple[Table, ...]:
         """Every lifetime, and every alarm."""
         header = ["decay", "from", "I, mA", "τ, h", "I τ, mA h", "a, %", "b, %", ""]
-        names = [point.record for point in self.points]
-        shared = (
-            names[0].partition("#")[0] if len({n.partition("#")[0] for n in names}) == 1 else ""
-        )
+        records = {point.record.partition("#")[0] for point in self.points}
+        shared = records.pop() if len(records) == 1 else ""
         rows = [
             [
                 point.record.removeprefix(shared) or shared,
@@ -159,7 +157,7 @@ def _percent(ratio: Quantity | None) -> str:
 class _Scaled(NamedTuple):
     """Decays in order of time, and a, b and lifetime of the ring at each over the reference's."""
 
-    decays: list[Decay]
+    decays: tuple[Decay, ...]
     time: np.ndarray
     a: np.ndarray
     b: np.ndarray
@@ -200,15 +198,21 @@ def trend_of(studies: Sequence[RecordStudy], machine: Machine | None = None) -> 
         raise InputError("times without a date", "dated records, to put them in order", path=name)
     dated = all(study.record.start is not None for study in studies)
     studies = sorted(studies, key=lambda study: study.record.start or 0.0)
-    decays = [decay for study in studies for decay in study.decays or study.pooled]
-    decays = [decay for decay in decays if decay.fit.lifetime_mean.error is not None]
-    if not decays:
+    placed = [
+        ((study.record.start or 0.0) + decay.offset, decay)
+        for study in studies
+        for decay in study.decays or study.pooled
+        if decay.fit.lifetime_mean.error is not None
+    ]
+    if not placed:
         expected = "one decay at least whose lifetime is determined"
         raise InputError("no lifetime", expected, path=studies[0].record.name)
+    times, decays = zip(*placed, strict=True)
     current = float(np.median([decay.fit.mean_current for decay in decays]))
-    scaled = _scaled(studies, decays, machine, current)
+    scaled = _Scaled(decays, np.array(times), *_by_ring(decays, machine, current))
     first = baseline(len(decays))
-    usual = _reference(_first(scaled, first)) if len(decays) > first else None
+    before = _Scaled(*(part[:first] for part in scaled))
+    usual = _reference(before) if len(decays) > first else None
     values = _normalised(scaled, current if machine else None)
     centre, limit = control_limits(np.array([value.value for value in values[:first]]))
     points = tuple(
@@ -222,24 +226,17 @@ def trend_of(studies: Sequence[RecordStudy], machine: Machine | None = None) -> 
     return replace(trend, **dict(zip(("status", "message"), _verdict(trend), strict=True)))
 
 
-def _scaled(
-    studies: Sequence[RecordStudy], decays: list[Decay], machine: Machine | None, current: float
-) -> _Scaled:
-    starts = {id(d): (s.record.start or 0.0) + d.offset for s in studies for d in s.answers}
-    time = np.array([starts[id(decay)] for decay in decays])
+def _by_ring(decays: Sequence[Decay], machine: Machine | None, current: float) -> np.ndarray:
+    """a, b and lifetime of the ring at each decay over those of the reference, (3, n)."""
     if machine is None:
-        return _Scaled(decays, time, *np.ones((3, len(decays))))
+        return np.ones((3, len(decays)))
     usual = loss_coefficients(machine.ring, machine.operation, current)
     rate = usual.a * current + usual.b
     rows = [
         (d.budget.losses.a / usual.a, d.budget.losses.b / usual.b, d.budget.lifetime * HOUR * rate)
         for d in decays
     ]
-    return _Scaled(decays, time, *np.array(rows, float).T)
-
-
-def _first(scaled: _Scaled, count: int) -> _Scaled:
-    return _Scaled(*(part[:count] for part in scaled))
+    return np.array(rows, float).T
 
 
 def _normalised(scaled: _Scaled, current: float | None) -> list[Quantity]:

@@ -306,9 +306,7 @@ def _closed(plan: Plan, state: State) -> State:
 
 def _kept(state: State, begin: float) -> State:
     """Rows from a time on."""
-    rows = state.rows
-    first = next((k for k, row in enumerate(rows) if row.time >= begin), len(rows))
-    return state._replace(rows=rows[first:])
+    return state._replace(rows=tuple(row for row in state.rows if row.time >= begin))
 
 
 def _answered(plan: Plan, state: State) -> State:
