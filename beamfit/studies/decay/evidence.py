@@ -118,18 +118,20 @@ class Weighed:
     outgassing: Outgassing | None = None
     bent: Physical | None = None
 
+    def told(self, name: str) -> tuple[float, ...]:
+        """A value, its error, that for errors as stated, and how far 95 % reach."""
+        parts = (self.values, self.errors, self.raw, self.reach)
+        return tuple(float(getattr(part, name)) for part in parts)
+
     def scaled(self, name: str) -> tuple[float, float]:
         """A value and its error."""
-        return float(getattr(self.values, name)), float(getattr(self.errors, name))
+        return self.told(name)[:2]
 
     def quantity(self, name: str, known: bool) -> Quantity:
         """I0, a or b; without an error where it is not determined."""
-        value, error = self.scaled(name)
-        if not math.isfinite(value):
-            return Quantity(math.nan, None, UNITS[name])
-        if not known or not math.isfinite(error):
+        value, error, raw, reach = self.told(name)
+        if not (known and math.isfinite(value) and math.isfinite(error)):
             return Quantity(value, None, UNITS[name])
-        reach, raw = (float(getattr(part, name)) for part in (self.reach, self.raw))
         found = Quantity.reaching(value, error, UNITS[name], raw, reach)
         if self.bent is None or name == "i0":
             return found
@@ -139,12 +141,11 @@ class Weighed:
 
     def lifetime(self, name: str, known: bool) -> Quantity:
         """Lifetime in hours from a loss rate; no error where the rate is not clear of zero."""
-        rate, error = self.scaled(name)
+        rate, error, raw, reach = self.told(name)
         if not rate > 0:
             return Quantity(math.nan, None, "h")
         if not (known and error < DETERMINED * rate):
             return Quantity(1 / rate / HOUR, None, "h")
-        reach, raw = (float(getattr(part, name)) for part in (self.reach, self.raw))
         interval = tuple(1 / max(rate + sign * reach, 1e-300) / HOUR for sign in (1, -1))
         error, raw = (part / rate**2 / HOUR for part in (error, raw))
         return Quantity(1 / rate / HOUR, error, "h", raw, interval)

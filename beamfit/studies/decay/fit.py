@@ -181,6 +181,11 @@ class DecayFit:
         return {name: getattr(self, name) for name in UNITS}
 
     @property
+    def noise(self) -> float:
+        """Standard deviation of a reading that the residuals show, mA."""
+        return self.rms_residual * math.sqrt(self.residuals.size / self.dof)
+
+    @property
     def headline(self) -> str:
         """The record, its status and its lifetime in a line."""
         return f"{self.record} {cell(self.status)}: mean lifetime {self.lifetime_mean}"

@@ -14,9 +14,8 @@ import numpy as np
 from jax import Array
 
 from beamfit.greybox.correlated import Levels, whitened
-from beamfit.greybox.problem import padded_length
 from beamfit.lifetime.decay import current_by_rate
-from beamfit.studies.decay.model import PRIOR_WIDTH
+from beamfit.studies.decay.model import PRIOR_WIDTH, padded_size
 from beamfit.studies.decay.record import DecayRecord
 
 FEWEST_CYCLES, FEWEST_READINGS = 3, 3
@@ -107,10 +106,12 @@ def _law(theta: Array, level: Array, since: Array, steps: int) -> tuple[Array, A
 @dataclass(frozen=True, eq=False)
 class Pool:
     """A law fitted to cycles: the numbers of the search, the level of each cycle over the mean
-    current, residuals over their errors and slopes of these; the unit of time, s.
+    current, residuals over their errors and slopes of these; the unit of time, s; `weight` is the
+    mean current over errors.
     """
 
     cycles: Cycles
+    weight: np.ndarray | float
     theta: np.ndarray
     level: np.ndarray
     residuals: np.ndarray
@@ -118,11 +119,6 @@ class Pool:
     levels: Levels
     mean: float
     unit: float
-
-    @property
-    def weight(self) -> np.ndarray | float:
-        """Mean current over errors."""
-        return 1.0 if self.cycles.error is None else self.mean / self.cycles.error
 
     def beside(self, columns: np.ndarray, apart: np.ndarray | None = None) -> np.ndarray:
         """Columns without what the levels explain, whitened."""
@@ -139,7 +135,7 @@ def _expanded(cycles: Cycles, theta: np.ndarray, level: np.ndarray, unit: float)
     mean, size = float(cycles.current.mean()), cycles.time.size
     loss = abs(theta[0]) * float(cycles.since.max()) / unit
     steps = int(min(2 ** math.ceil(math.log2(max(loss / LOSS_A_STEP, 1.0))), MOST_STEPS))
-    extra = (0, padded_length(max(size, 64)) - size)
+    extra = (0, padded_size(size) - size)
     of_each = np.pad(np.repeat(level, cycles.lengths), extra, mode="edge")
     model, slopes = _law(theta, of_each, np.pad(cycles.since, extra) / unit, steps)
     model, slopes = np.asarray(model)[:size], np.asarray(slopes)[:size]
@@ -147,7 +143,7 @@ def _expanded(cycles: Cycles, theta: np.ndarray, level: np.ndarray, unit: float)
     slopes = slopes * np.reshape(weight, (-1, 1))
     residuals = weight * (model - cycles.current / mean)
     levels = Levels(cycles.first, slopes[:, 0])
-    return Pool(cycles, theta, level, residuals, slopes[:, 1:], levels, mean, unit)
+    return Pool(cycles, weight, theta, level, residuals, slopes[:, 1:], levels, mean, unit)
 
 
 def solved(cycles: Cycles, numbers: int = 2) -> Pool:

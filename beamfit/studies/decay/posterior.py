@@ -85,9 +85,9 @@ def decay_target(
     problem, monitor = _with_monitor(problem, record)
     theta, rate = _start(fit, record)
     theta = np.append(theta, np.zeros(len(monitor)))
-    scale = fit.rms_residual * np.sqrt(len(record) / max(fit.dof, 1))
+    scale = fit.noise
     if record.error is not None:
-        scale = max(1.0, np.sqrt(fit.chi2 / max(fit.dof, 1)))
+        scale = max(1.0, np.sqrt(fit.chi2 / fit.dof))
     more = {}
     if fit.correlation_time is not None:
         more["log_volume"] = _log_volume

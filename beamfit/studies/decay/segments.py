@@ -113,15 +113,10 @@ def _dropouts(current: np.ndarray) -> tuple[np.ndarray, int]:
 def _saturated(current: np.ndarray) -> np.ndarray:
     """A run of identical largest readings, far longer than any other run of equal ones."""
     starts = np.flatnonzero(np.diff(current, prepend=np.nan) != 0)
-    lengths = np.diff(np.append(starts, current.size))
-    flagged = np.zeros(current.size, bool)
+    lengths = np.diff(starts, append=current.size)
     top = current[starts] == current.max()
-    others = lengths[~top]
-    usual = others.max() if others.size else current.size
-    for start, length in zip(starts[top], lengths[top], strict=True):
-        if length >= 5 and length > 5 * usual:
-            flagged[start : start + length] = True
-    return flagged
+    usual = current.size if top.all() else lengths[~top].max()
+    return np.repeat(top & (lengths >= 5) & (lengths > 5 * usual), lengths)
 
 
 def _flattened(time: np.ndarray, current: np.ndarray) -> np.ndarray:

@@ -70,8 +70,7 @@ def _root(decay: Decay, parts: np.ndarray) -> np.ndarray:
     if fit.first is not None:
         return _together(fit, parts[1])
     if fit.noise_inferred:
-        # sqrt(sum/dof): the noise that the residuals show.
-        error = np.full(rows, fit.rms_residual * np.sqrt(rows / fit.dof))
+        error = np.full(rows, fit.noise)
     else:
         pulls = fit.residuals / segment.error
         error = segment.error * max(1.0, np.sqrt(pulls @ pulls / fit.dof))

@@ -311,9 +311,9 @@ def shift_rows(shift: Shift) -> Rows:
         shown = f"{row.median:.4g} ({row.lower:.4g} to {row.upper:.4g}) {row.unit}"
         rows.append((f"{row.name} {at}", shown if row.separable else "not determined"))
     volts, error = best.rf_voltage.value / 1e3, best.rf_voltage.error
-    inside = Quantity(volts, None if error is None else error / 1e3, "kV")
+    limit = f"{volts:.6g} kV, at its limit"
     rows += [
-        ("best RF voltage", f"{volts:.6g} kV, at its limit" if error is None else inside),
+        ("best RF voltage", limit if error is None else Quantity(volts, error / 1e3, "kV")),
         ("best scraper and bunches", f"{1e3 * best.scraper_y:.4g} mm, {best.bunches:.6g}"),
         ("lifetime there", best.lifetime),
         ("lifetime at the usual settings", best.usual),

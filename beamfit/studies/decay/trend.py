@@ -302,9 +302,9 @@ def _reference(scaled: _Scaled) -> Reference | None:
 def _noise(decays: Sequence[Decay]) -> tuple[float, float, float]:
     """Noise of a reading, mA, its correlation time and the interval of readings, s."""
     fits = [decay.fit for decay in decays]
-    noise = np.median([fit.rms_residual * math.sqrt(len(fit.residuals) / fit.dof) for fit in fits])
     memory = np.median([fit.correlation_time or 0.0 for fit in fits])
-    noise = max(noise, BEST_MONITOR * np.median([fit.mean_current for fit in fits]))
+    least = BEST_MONITOR * np.median([fit.mean_current for fit in fits])
+    noise = max(np.median([fit.noise for fit in fits]), least)
     interval = np.median([np.median(np.diff(decay.segment.time)) for decay in decays])
     return float(noise), float(memory), float(interval)
 

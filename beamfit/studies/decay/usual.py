@@ -84,8 +84,7 @@ def learnt(
     covariance = covariance + WANDER**2 * np.eye(2)
     if before and not np.trace(covariance) < np.trace(before.usual.covariance) / 4:
         return None
-    noise = fit.rms_residual * math.sqrt(len(fit.residuals) / fit.dof)
-    noise = max(noise, BEST_MONITOR * fit.mean_current)
+    noise = max(fit.noise, BEST_MONITOR * fit.mean_current)
     apart = float(np.median(np.diff([row.time for row in rows])))
     usual = alarm.Reference(a, b, noise, fit.correlation_time or 0.0, apart, covariance)
     known = Alarmed(usual, alarm.started(usual))
