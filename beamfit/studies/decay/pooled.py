@@ -73,9 +73,8 @@ def _memory(pool: Pool, numbers: int, known: float | None) -> Memory:
 
 @dataclass(frozen=True, eq=False)
 class PooledEvidence(Weighed):
-    """What the rules look at: a fit to cycles, values, errors, reaches, and the noise.
-
-    Attributes are as of `Evidence`; `left_out` says what was not fitted.
+    """What the rules look at: a fit to cycles, and the memory of its noise, with that memory where
+    it is `known`; the rest is as of `Evidence`.
     """
 
     pool: Pool
@@ -86,11 +85,9 @@ class PooledEvidence(Weighed):
     raw: Physical
     reach: Physical
     constant_a: ConstantA
-    left_out: tuple[str, ...]
-    monitor: Monitor | None = None
 
     @classmethod
-    def of(cls, pool: Pool, left_out: tuple[str, ...]) -> PooledEvidence:
+    def of(cls, pool: Pool) -> PooledEvidence:
         """Weigh a fit, with the noise's memory where it has one."""
         given, parameters = float(pool.cycles.error is not None), pool.level.size + 2
         known = None if is_correlated(pool.left[:, 3], parameters) else 0.0
@@ -102,7 +99,7 @@ class PooledEvidence(Weighed):
         moved_values = Physical(*(np.array(values) + moved.shift))
         found = cls(
             pool, held, known, moved_values, Physical(*moved.error), Physical(*raw),
-            Physical(*moved.reach), constant_a(math.nan, math.inf, math.inf, math.nan), left_out,
+            Physical(*moved.reach), constant_a(math.nan, math.inf, math.inf, math.nan),
         )  # fmt: skip
         return replace(found, constant_a=found.tested()) if found.separability.separable else found
 
@@ -119,7 +116,7 @@ class PooledEvidence(Weighed):
         changes = monitor.changes(self.time - self.time[0]).values()
         rows = pool.beside(np.column_stack([pool.rows, *(scale * change for change in changes)]))
         about = Expansion(pool.left[:, 3], rows[:, :3], _slopes(pool)[1])
-        return replace(self.widened(about, rows[:, 3:].T), monitor=monitor)
+        return self.widened(about, rows[:, 3:].T)
 
     @property
     def cycles(self) -> int:
@@ -330,10 +327,10 @@ def fit_pieces(cycles: Sequence[DecayRecord], name: str) -> DecayFit:
     if np.any(np.diff(gathered.time) <= 0):
         raise InputError("a cycle before the end of the one before", "an order in time", path=name)
     pool, left_out = cleaned(gathered)
-    evidence = PooledEvidence.of(pool, left_out)
-    if cycles[0].monitor is not None:
-        evidence = evidence.with_monitor(cycles[0].monitor)
-    finding = finding_of_cycles(evidence)
+    evidence, monitor = PooledEvidence.of(pool), cycles[0].monitor
+    if monitor is not None:
+        evidence = evidence.with_monitor(monitor)
+    finding = finding_of_cycles(evidence, monitor, left_out)
     weight, (time, _, current, error, first) = pool.weight, pool.cycles
     return DecayFit(
         record=name,

@@ -154,16 +154,6 @@ def _percent(ratio: Quantity | None) -> str:
     return f"{100 * ratio.value:.2f}{error}"
 
 
-class _Scaled(NamedTuple):
-    """Decays in order of time, and a, b and lifetime of the ring at each over the reference's."""
-
-    decays: tuple[Decay, ...]
-    time: np.ndarray
-    a: np.ndarray
-    b: np.ndarray
-    lifetime: np.ndarray
-
-
 def trend_of(studies: Sequence[RecordStudy], machine: Machine | None = None) -> Trend:
     """Follow the lifetime through many decays.
 
@@ -209,18 +199,18 @@ def trend_of(studies: Sequence[RecordStudy], machine: Machine | None = None) -> 
         raise InputError("no lifetime", expected, path=studies[0].record.name)
     times, decays = zip(*placed, strict=True)
     current = float(np.median([decay.fit.mean_current for decay in decays]))
-    scaled = _Scaled(decays, np.array(times), *_by_ring(decays, machine, current))
+    a, b, lifetime = _by_ring(decays, machine, current)
     first = baseline(len(decays))
-    before = _Scaled(*(part[:first] for part in scaled))
-    usual = _reference(before) if len(decays) > first else None
-    values = _normalised(scaled, current if machine else None)
+    watched = len(decays) > first
+    usual = _reference(decays[:first], a[:first], b[:first]) if watched else None
+    values = _normalised(decays, lifetime, current if machine else None)
     centre, limit = control_limits(np.array([value.value for value in values[:first]]))
     points = tuple(
-        _point(decay, time, a, b, value, usual, (centre, limit))
-        for decay, time, a, b, value in zip(*scaled[:4], values, strict=True)
+        _point(*of_decay, usual, (centre, limit))
+        for of_decay in zip(decays, times, a, b, values, strict=True)
     )
-    drift = _drift(scaled.time, values, centre)
-    alarms = () if usual is None else _alarms(studies, scaled, first, usual)
+    drift = _drift(np.array(times), values, centre)
+    alarms = () if usual is None else _alarms(studies, usual, times[first:], a[first:], b[first:])
     found = (points, current, machine is not None, centre, limit, drift, usual, alarms, dated)
     trend = Trend(Status.converged, "", *found)
     return replace(trend, **dict(zip(("status", "message"), _verdict(trend), strict=True)))
@@ -239,10 +229,12 @@ def _by_ring(decays: Sequence[Decay], machine: Machine | None, current: float) -
     return np.array(rows, float).T
 
 
-def _normalised(scaled: _Scaled, current: float | None) -> list[Quantity]:
+def _normalised(
+    decays: Sequence[Decay], factors: np.ndarray, current: float | None
+) -> list[Quantity]:
     """Current times lifetime, mA h."""
     values = []
-    for decay, factor in zip(scaled.decays, scaled.lifetime, strict=True):
+    for decay, factor in zip(decays, factors, strict=True):
         found = decay.fit.lifetime_mean
         by = (current or decay.fit.mean_current) / factor
         values.append(Quantity(by * found.value, by * found.error, "mA h"))
@@ -275,16 +267,14 @@ def _drift(time: np.ndarray, values: Sequence[Quantity], centre: float) -> Quant
     return Quantity(float(slope), float(np.sqrt(covariance[0, 0])), "1")
 
 
-def _reference(scaled: _Scaled) -> Reference | None:
+def _reference(decays: Sequence[Decay], a: np.ndarray, b: np.ndarray) -> Reference | None:
     """Usual a and b of some decays, with their noise; None where they do not give both above zero.
 
     Least squares on what each decay says of a I and a I + b. How far the decays scatter about it
     is how far a and b are expected to wander.
     """
-    measured = summarise(tuple(scaled.decays))
-    current, root = np.asarray(measured.current), np.asarray(measured.root)
-    parts = np.asarray(measured.parts)
-    rows = by_losses(scaled.a * current, scaled.b)
+    current, parts, root = map(np.asarray, summarise(tuple(decays)))
+    rows = by_losses(a * current, b)
     weighted = (root @ rows).reshape(-1, 2)
     seen = np.einsum("nij,nj->ni", root, parts).ravel()
     size = np.linalg.norm(weighted, axis=0)
@@ -296,7 +286,7 @@ def _reference(scaled: _Scaled) -> Reference | None:
     off = parts[:, 1] / (rows @ found)[:, 1] - 1
     wander = math.sqrt(float(off @ off) / max(off.size - 2, 1))
     covariance = covariance + max(WANDER, wander) ** 2 * np.eye(2)
-    return Reference(*map(float, found), *_noise(scaled.decays), covariance)
+    return Reference(*map(float, found), *_noise(decays), covariance)
 
 
 def _noise(decays: Sequence[Decay]) -> tuple[float, float, float]:
@@ -310,18 +300,22 @@ def _noise(decays: Sequence[Decay]) -> tuple[float, float, float]:
 
 
 def _alarms(
-    studies: Sequence[RecordStudy], scaled: _Scaled, first: int, usual: Reference
+    studies: Sequence[RecordStudy],
+    usual: Reference,
+    times: Sequence[float],
+    a: np.ndarray,
+    b: np.ndarray,
 ) -> tuple[Alarm, ...]:
-    """Watch all readings from the decay after the first ones on."""
+    """Watch all readings from the first of some decays on; a and b are the ring's at each."""
     rows = [
         np.stack([(study.record.start or 0.0) + study.record.time, study.record.current], axis=-1)
         for study in studies
     ]
     rows = np.concatenate(rows)
-    rows = rows[rows[:, 0] >= scaled.time[first]]
+    rows = rows[rows[:, 0] >= times[0]]
     rows = rows[:: math.ceil(len(rows) / MOST)]
-    place = np.searchsorted(scaled.time, rows[:, 0], side="right") - 1
-    return alarms_of(usual, *rows.T, scaled.a[place], scaled.b[place])
+    place = np.searchsorted(times, rows[:, 0], side="right") - 1
+    return alarms_of(usual, *rows.T, a[place], b[place])
 
 
 def _verdict(trend: Trend) -> tuple[Status, str]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
 from typing import NamedTuple
 
@@ -258,15 +258,16 @@ CYCLE_RULES = (_rises, *NEGATIVE, _within_noise, _parts_differ, _refuted)
 CYCLE_RULES += (_one_current, _improbable, _determined)
 
 
-def finding_of_cycles(evidence: Weighed) -> Finding:
-    """Status and sentences on many cycles fitted together."""
+def finding_of_cycles(
+    evidence: Weighed, monitor: Monitor | None, left_out: Sequence[str]
+) -> Finding:
+    """Status and sentences on many cycles fitted together; `left_out` is what was not fitted."""
     found, (low, high) = judge(evidence, CYCLE_RULES), evidence.currents
     first = f"One answer from {evidence.cycles} cycles between {low:.4g} and {high:.4g} mA"
     remarks = [remark(evidence) for remark in (_noise_inferred, _correlated, _odd_clock)]
-    monitor = None if evidence.monitor is None else _stated(evidence.monitor)
-    left_out = [text[0].upper() + text[1:] for text in evidence.left_out]
-    found = found._replace(cause=f"{first}. {found.cause}")
-    return _with_remarks(found, [*remarks, monitor, *left_out])
+    remarks += [] if monitor is None else [_stated(monitor)]
+    remarks += [text[0].upper() + text[1:] for text in left_out]
+    return _with_remarks(found._replace(cause=f"{first}. {found.cause}"), remarks)
 
 
 def _noise_inferred(e: Weighed) -> str | None:
