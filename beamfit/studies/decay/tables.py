@@ -117,7 +117,7 @@ def separability_rows(decays: Sequence[Decay]) -> Rows:
 
 
 def _one_lifetime(decay: Decay, name: str) -> str | None:
-    found = None if decay.checks is None else getattr(decay.checks, name)
+    found = getattr(decay.checks, name, None)
     if found is None:
         return None
     known = math.isfinite(found.bias_start)

@@ -6,22 +6,17 @@ Pure: a state and a step. Memory is that of the window, whatever the time and th
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from beamfit.errors import InputError
-from beamfit.lifetime.decay import HOUR
-from beamfit.lifetime.losses import loss_coefficients
-from beamfit.quantity import Quantity, Status
+from beamfit.quantity import Status
 from beamfit.studies.decay import alarm
-from beamfit.studies.decay.budget import Machine, budget
+from beamfit.studies.decay.budget import Machine
 from beamfit.studies.decay.conditions import PLAUSIBLE, Conditions
-from beamfit.studies.decay.evidence import UNITS
-from beamfit.studies.decay.fit import bare
 from beamfit.studies.decay.segments import DEAD, DROPOUT
 from beamfit.studies.decay.trend import BEST_MONITOR
 from beamfit.studies.decay.usual import Alarmed, followed, learnt
-from beamfit.studies.decay.window import Row, Window, fit_window
-from beamfit.table import json_of
+from beamfit.studies.decay.window import Answer, Row, Window, fit_window, normalised
 
 CURRENT = "beam_current"
 # A window is kept as the means of readings over so many parts of it.
@@ -79,46 +74,6 @@ class Point(NamedTuple):
     current: float
     lifetime: float
     error: float
-
-
-class Answer(NamedTuple):
-    """What the window says.
-
-    Attributes
-    ----------
-    time, current : float
-        Of the last reading, s and mA.
-    window : Window
-        The fit.
-    status, message : Status, str
-        Of the fit, or why there is none.
-    lifetime, a, b, normalised : Quantity or None
-        At the mean current, h; 1/(mA s); 1/s; current times lifetime, mA h, by the ring at the
-        reference current and its usual settings. None where the readings do not determine it.
-    """
-
-    time: float
-    current: float
-    window: Window
-    status: Status
-    message: str
-    lifetime: Quantity | None = None
-    a: Quantity | None = None
-    b: Quantity | None = None
-    normalised: Quantity | None = None
-
-    def to_json(self) -> dict[str, Any]:
-        """Return it as `beamfit lifetime --json` does a decay, with what is normalised."""
-        unknown = dict.fromkeys(("chi2", "dof", "identifiability"))
-        unknown |= {name: bare(None, unit) for name, unit in UNITS.items()}
-        fit = unknown if self.window.fit is None else self.window.fit.to_json()
-        named = {
-            "status": self.status,
-            "message": self.message,
-            "current": bare(self.current, "mA"),
-        }
-        more = {"normalised": self.normalised or bare(None, "mA h"), "decays": self.window.pieces}
-        return fit | json_of(named | more)
 
 
 class State(NamedTuple):
@@ -347,12 +302,12 @@ def _answer(plan: Plan, state: State, window: Window) -> Answer:
     if fit is None:
         return Answer(time, current, window, Status.unidentified, f"No lifetime: {window.why}.")
     known = [None if q.error is None else q for q in (fit.lifetime_mean, fit.a, fit.b)]
-    normalised, message = None, fit.message
+    scaled, message = None, fit.message
     try:
-        normalised = known[0] and _normalised(plan, window, known[0])
+        scaled = normalised(window, plan.machine, plan.current)
     except InputError as error:
         message += f" Not normalised: {error}."
-    return Answer(time, current, window, fit.status, message, *known, normalised)
+    return Answer(time, current, window, fit.status, message, *known, scaled)
 
 
 def nothing_yet(state: State) -> Answer:
@@ -360,19 +315,6 @@ def nothing_yet(state: State) -> Answer:
     why = "No lifetime: the watch ended before its first fit."
     time = math.nan if state.last is None else state.last - state.shift
     return Answer(time, math.nan, Window(None, None, 0), Status.unidentified, why)
-
-
-def _normalised(plan: Plan, window: Window, lifetime: Quantity) -> Quantity:
-    """Current times lifetime, mA h, as of `trend`."""
-    by = current = plan.current or window.fit.mean_current
-    if plan.machine is None:
-        by = window.fit.mean_current
-    else:
-        ring, operation = plan.machine
-        usual = loss_coefficients(ring, operation, current)
-        expected = budget(window.readings, plan.machine).lifetime * HOUR
-        by = current / expected / float(usual.a * current + usual.b)
-    return Quantity(by * lifetime.value, by * lifetime.error, "mA h")
 
 
 def _watched(plan: Plan, state: State, known: Alarmed, row: Row) -> State:

@@ -4,17 +4,23 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from beamfit.errors import InputError
+from beamfit.lifetime.decay import HOUR
+from beamfit.lifetime.losses import loss_coefficients
+from beamfit.quantity import Quantity, Status
+from beamfit.studies.decay.budget import Machine, budget
 from beamfit.studies.decay.conditions import Conditions
 from beamfit.studies.decay.cycles import alike, cut_at_refills, joined
-from beamfit.studies.decay.fit import DecayFit, fit_decay
+from beamfit.studies.decay.evidence import UNITS
+from beamfit.studies.decay.fit import DecayFit, bare, fit_decay
 from beamfit.studies.decay.pooled import fit_pieces, seen_through
 from beamfit.studies.decay.record import DecayRecord
 from beamfit.studies.decay.study import SHORTEST, at_settings
+from beamfit.table import json_of
 
 
 class Row(NamedTuple):
@@ -55,6 +61,46 @@ class Window(NamedTuple):
     readings: DecayRecord | None
     pieces: int
     why: str = ""
+
+
+class Answer(NamedTuple):
+    """What the window says.
+
+    Attributes
+    ----------
+    time, current : float
+        Of the last reading, s and mA.
+    window : Window
+        The fit.
+    status, message : Status, str
+        Of the fit, or why there is none.
+    lifetime, a, b, normalised : Quantity or None
+        At the mean current, h; 1/(mA s); 1/s; current times lifetime, mA h, by the ring at the
+        reference current and its usual settings. None where the readings do not determine it.
+    """
+
+    time: float
+    current: float
+    window: Window
+    status: Status
+    message: str
+    lifetime: Quantity | None = None
+    a: Quantity | None = None
+    b: Quantity | None = None
+    normalised: Quantity | None = None
+
+    def to_json(self) -> dict[str, Any]:
+        """Return it as `beamfit lifetime --json` does a decay, with what is normalised."""
+        unknown = dict.fromkeys(("chi2", "dof", "identifiability"))
+        unknown |= {name: bare(None, unit) for name, unit in UNITS.items()}
+        fit = unknown if self.window.fit is None else self.window.fit.to_json()
+        named = {
+            "status": self.status,
+            "message": self.message,
+            "current": bare(self.current, "mA"),
+        }
+        more = {"normalised": self.normalised or bare(None, "mA h"), "decays": self.window.pieces}
+        return fit | json_of(named | more)
 
 
 def fit_window(rows: Sequence[Row], name: str) -> Window:
@@ -98,6 +144,27 @@ def fit_window(rows: Sequence[Row], name: str) -> Window:
     except InputError as error:  # a current that rises
         return Window(None, one, len(group), error.found)
     return Window(fit, one, len(group))
+
+
+def normalised(window: Window, machine: Machine | None, current: float | None) -> Quantity | None:
+    """Current times lifetime, mA h, as of `trend`; None where the readings do not tell it.
+
+    Raises
+    ------
+    InputError
+        If the ring stores no beam at the settings of the window.
+    """
+    lifetime, mean = window.fit.lifetime_mean, window.fit.mean_current
+    if lifetime.error is None:
+        return None
+    if machine is None:
+        by = mean
+    else:
+        current = current or mean
+        usual = loss_coefficients(machine.ring, machine.operation, current)
+        expected = budget(window.readings, machine).lifetime * HOUR
+        by = current / expected / float(usual.a * current + usual.b)
+    return Quantity(by * lifetime.value, by * lifetime.error, "mA h")
 
 
 def _fitted(group: list[DecayRecord], name: str) -> DecayFit:
