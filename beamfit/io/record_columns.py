@@ -9,7 +9,7 @@ from dataclasses import replace
 from beamfit.errors import InputError
 from beamfit.io.headers import is_number, spelled
 from beamfit.io.sheet import UNITS, Column, Sheet, columns_of
-from beamfit.studies.decay.record import Conditions
+from beamfit.studies.decay.conditions import Conditions
 
 QUANTITIES = {
     "time": "time",
