@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -14,6 +14,7 @@ from beamfit.quantity import Quantity
 from beamfit.shown import shown
 from beamfit.studies.decay.departures import ConstantA
 from beamfit.studies.decay.fit import DecayFit, bare, fit_decay
+from beamfit.studies.decay.law import lifetime_of
 from beamfit.studies.decay.model import padded, solve_decay
 from beamfit.studies.decay.record import DecayRecord
 from beamfit.table import json_of
@@ -56,22 +57,22 @@ class OneLifetime:
 
 
 def _one_lifetime(rate: float, error: float, residuals: np.ndarray, fit: DecayFit) -> OneLifetime:
-    bias = [
-        round(1 / rate / HOUR / quantity.value - 1, BIAS_DIGITS)
-        for quantity in (fit.lifetime_start, fit.lifetime_mean)
-    ]
-    spread = error / rate**2 / HOUR
-    lifetime = Quantity(1 / rate / HOUR, spread, "h", spread)
-    return OneLifetime(lifetime, float(np.sqrt(np.mean(residuals**2))), *bias)
+    found = lifetime_of(rate, error)
+    known = fit.lifetime_start.value, fit.lifetime_mean.value
+    bias = [round(found.value / value - 1, BIAS_DIGITS) for value in known]
+    rms = float(np.sqrt(np.mean(residuals**2)))
+    return OneLifetime(replace(found, error_raw=found.error), rms, *bias)
 
 
-def single_exponential(record: DecayRecord) -> OneLifetime:
+def single_exponential(record: DecayRecord, fit: DecayFit | None = None) -> OneLifetime:
     """Fit I0 exp(-t/tau), the law of report equation 41, for comparison.
 
     Parameters
     ----------
     record : DecayRecord
         One decay.
+    fit : DecayFit, optional
+        Of the record, where there is one.
 
     Returns
     -------
@@ -88,16 +89,18 @@ def single_exponential(record: DecayRecord) -> OneLifetime:
     scale = math.sqrt(float(found.sum_squares) / (len(record) - 2))
     scale = scale if record.error is None else max(1.0, scale)
     rate, error = float(found.values.b), float(found.errors.b) * scale
-    return _one_lifetime(rate, error, found.residuals[: len(record)], fit_decay(record))
+    return _one_lifetime(rate, error, found.residuals[: len(record)], fit or fit_decay(record))
 
 
-def log_linear(record: DecayRecord) -> OneLifetime:
+def log_linear(record: DecayRecord, fit: DecayFit | None = None) -> OneLifetime:
     """Fit a straight line to ln I, as control rooms do, for comparison.
 
     Parameters
     ----------
     record : DecayRecord
         One decay, all currents positive.
+    fit : DecayFit, optional
+        As for `single_exponential`.
 
     Returns
     -------
@@ -120,7 +123,8 @@ def log_linear(record: DecayRecord) -> OneLifetime:
     logs = np.log(record.current)
     (slope, level), covariance = np.polyfit(record.time, logs, 1, cov=True)
     residuals = np.exp(level + slope * record.time) - record.current
-    return _one_lifetime(-slope, math.sqrt(covariance[0, 0]), residuals, fit_decay(record))
+    fit = fit or fit_decay(record)
+    return _one_lifetime(-slope, math.sqrt(covariance[0, 0]), residuals, fit)
 
 
 @shown
@@ -254,13 +258,15 @@ class DecayChecks:
     log_linear: OneLifetime | None
 
 
-def check_decay(record: DecayRecord) -> DecayChecks | None:
+def check_decay(record: DecayRecord, fit: DecayFit | None = None) -> DecayChecks | None:
     """Do every check of a decay.
 
     Parameters
     ----------
     record : DecayRecord
         One decay.
+    fit : DecayFit, optional
+        As for `single_exponential`.
 
     Returns
     -------
@@ -276,7 +282,6 @@ def check_decay(record: DecayRecord) -> DecayChecks | None:
     """
     if np.ptp(record.current) == 0:
         return None
-    return DecayChecks(
-        single_exponential(record),
-        log_linear(record) if record.current.min() > 0 else None,
-    )
+    fit = fit or fit_decay(record)
+    line = log_linear(record, fit) if record.current.min() > 0 else None
+    return DecayChecks(single_exponential(record, fit), line)

@@ -373,7 +373,7 @@ class Evidence(Weighed):
         """A gas loss that relaxes, where that explains a refuted law better than all else."""
         if not self.refuted or self.shape is not None or self.record.gauge is not None:
             return None
-        return outgassing_of(self.record, self.change)
+        return outgassing_of(self.record, self.solution.values, self.change)
 
     def drift_of_one_error(self, name: str) -> float:
         """Straight drift of the monitor over the record, mA, that moves a value by its error."""

@@ -23,8 +23,15 @@ from beamfit.studies.decay.departures import (
     power_law,
     quantity_errors,
 )
-from beamfit.studies.decay.law import NODES, WEIGHTS, Expansion, cumulative, lifetime_of
-from beamfit.studies.decay.model import padded, solve_decay
+from beamfit.studies.decay.law import (
+    NODES,
+    WEIGHTS,
+    Expansion,
+    Physical,
+    cumulative,
+    lifetime_of,
+)
+from beamfit.studies.decay.model import padded
 from beamfit.studies.decay.record import DecayRecord
 
 # Time constants, over the span of the record, with which searches begin, and the longest believed.
@@ -125,9 +132,9 @@ def _fitted(kind: str, record: DecayRecord, starts: np.ndarray) -> _Fitted:
     return _Fitted(*(np.asarray(part) for part in (theta, residuals[:size], slopes[:size])))
 
 
-def outgassing_of(record: DecayRecord, change: Change | None) -> Outgassing | None:
+def outgassing_of(record: DecayRecord, plain: Physical, change: Change | None) -> Outgassing | None:
     """A relaxing gas loss, where it explains a record better than an exponent of the current and
-    than a change at one time.
+    than a change at one time; searched from the numbers of the plain law.
 
     Notes
     -----
@@ -136,24 +143,18 @@ def outgassing_of(record: DecayRecord, change: Change | None) -> Outgassing | No
     """
     record = averaged(record)
     power = power_law(record)
-    plain = _numbers(record)
-    starts = np.array([[*plain, 0.1 * abs(plain[1] + plain[2]), at] for at in STARTS])
+    mean, span = float(record.current.mean()), record.span
+    numbers = plain.i0 / mean, plain.a * mean * span, plain.b * span
+    starts = np.array([[*numbers, 0.1 * abs(plain.rate_mean) * span, at] for at in STARTS])
     found = _fitted("relaxing", record, starts)
     noise = _noise(record, found)
     rivals = [float(power.sum_squares) - BETTER * noise] if power.converged else []
     if change is not None:
-        begin = np.array([[*plain, 0.0, change.time / record.span]])
+        begin = np.array([[*numbers, 0.0, change.time / span]])
         rivals.append(_fitted("step", record, begin).squares)
     answer = _quoted(record, found)
     better = all(found.squares < rival for rival in rivals)
     return answer if better and found.theta[3] > 0 and _is_told(answer, record) else None
-
-
-def _numbers(record: DecayRecord) -> tuple[float, float, float]:
-    """I0, a and b of the plain law, in the search's units."""
-    mean, values = float(record.current.mean()), solve_decay(*padded(record)).values
-    a, b = values.a * mean * record.span, values.b * record.span
-    return float(values.i0 / mean), float(a), float(b)
 
 
 def _noise(record: DecayRecord, found: _Fitted) -> float:

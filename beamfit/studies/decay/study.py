@@ -63,7 +63,7 @@ class Decay:
         """What simpler analyses say of it, and whether a is constant; None if nothing decays, and
         for many cycles.
         """
-        return check_decay(self.segment) if self.fit.first is None else None
+        return check_decay(self.segment, self.fit) if self.fit.first is None else None
 
     @cached_property
     def systematics(self) -> tuple[Systematic, ...]:

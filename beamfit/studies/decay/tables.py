@@ -154,12 +154,10 @@ SYSTEMATIC = ["if the", "a", "b", "lifetime at the mean"]
 
 def check_rows(decays: Sequence[Decay]) -> Rows:
     """Label and one cell per decay for what simpler analyses say, and whether a is constant."""
-    rows = _laid_out(decays, CHECKS if any(decay.checks for decay in decays) else CHECKS[-1:])
-    if any(decay.fit.lifetimes for decay in decays):
-        rows += _laid_out(decays, LIFETIMES)
-    if all(decay.fit.outgassing for decay in decays):
-        rows += _laid_out(decays, OUTGASSING)
-    return rows
+    rows = CHECKS if any(decay.checks for decay in decays) else CHECKS[-1:]
+    rows += LIFETIMES if any(decay.fit.lifetimes for decay in decays) else ()
+    rows += OUTGASSING if all(decay.fit.outgassing for decay in decays) else ()
+    return _laid_out(decays, rows)
 
 
 def systematic_rows(decay: Decay) -> list[list[str]]:
