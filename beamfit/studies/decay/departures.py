@@ -252,7 +252,10 @@ def change_of_rate(
     """
     over = np.reshape(1.0 if record.error is None else record.error, (-1, 1))
     model = record.current + about.residuals * over[:, 0]
-    whiten = _whitener(record.time, memory)
+    apart = np.full(len(record) - 1, np.inf)
+    if memory is not None:
+        apart = np.diff(record.time) / memory.time[memory.likely]
+    whiten = partial(whitened, apart=apart, xp=np)
     rows = whiten(np.column_stack([about.rows, about.residuals]))
     basis = np.linalg.qr(rows[:, :3])[0]
     least = 1e-300 if record.error is None else 1.0
@@ -309,13 +312,6 @@ def _pairs(first: np.ndarray, second: np.ndarray, residual: np.ndarray) -> np.nd
     apart = 1 - along**2
     falls = (a**2 + b**2 - 2 * along * a * b) / np.where(apart > 1e-9, apart, np.inf)
     return np.where(apart > 1e-9, falls, 0.0)
-
-
-def _whitener(time: np.ndarray, memory: Memory | None) -> Callable[[np.ndarray], np.ndarray]:
-    if memory is None:
-        return np.asarray
-    apart = np.diff(time) / memory.time[memory.likely]
-    return partial(whitened, apart=apart, xp=np)
 
 
 def _falls(columns: np.ndarray, residual: np.ndarray) -> np.ndarray:
