@@ -68,6 +68,15 @@ class Node(NamedTuple):
             raise self.error(f"{key}='{self.given[key]}' in <{self.tag}>", said, key)
         return value
 
+    def numbers(self) -> tuple[float, ...]:
+        """The numbers of its text, with brackets around them or without."""
+        text = "".join(self.text).strip().removeprefix("[").removesuffix("]")
+        try:
+            return tuple(map(float, text.replace(",", " ").split()))
+        except ValueError as error:
+            found = f"{error} in <{self.tag}>"
+            raise self.error(found, "numbers separated by commas") from None
+
 
 class _Reader(ContentHandler):
     """Builds nodes; text is padded to the line and column where it stands in the file."""

@@ -14,11 +14,11 @@ from xml.etree import ElementTree as Plain
 import jax
 import jax.numpy as jnp
 import numpy as np
-from defusedxml import DefusedXmlException, ElementTree
 
 from beamfit.errors import InputError
 from beamfit.greybox.mlp import MLP, Gain, Layer, Port, connection
 from beamfit.language import document as d
+from beamfit.language.elements import Node, read_elements
 from beamfit.language.expression import error_at
 
 _CLASS = "com.pav.pdas.model.mlp.MlpMapping"
@@ -55,18 +55,16 @@ def parse_network(text: str, path: str | os.PathLike[str] | None = None) -> MLP:
     [6.5]
     """
     try:
-        root = ElementTree.fromstring(text)
-    except Plain.ParseError as error:
-        raise InputError(f"{error}", "well-formed XML", path, error.position[0]) from None
-    except DefusedXmlException as error:
-        raise InputError(f"{error}", "XML without entities or a document type", path) from None
-    try:
+        root = read_elements(text)
+        if root.tag != "mapping":
+            found = f"an element <{root.tag}>"
+            raise root.error(found, "<mapping>, a network's root element")
         return network_from(root)
     except InputError as error:
-        raise InputError(error.found, error.expected, path) from None
+        raise InputError(error.found, error.expected, path, error.line) from None
 
 
-def network_from(element: Plain.Element) -> MLP:
+def network_from(element: Node) -> MLP:
     """Read a network from its ``<mapping>`` element, as when it stands inside another document.
 
     A layer without a ``bias`` attribute has biases unless it is an identity: Appendix B's 22
@@ -75,7 +73,7 @@ def network_from(element: Plain.Element) -> MLP:
 
     Parameters
     ----------
-    element : xml.etree.ElementTree.Element
+    element : Node
         The element.
 
     Returns
@@ -87,35 +85,23 @@ def network_from(element: Plain.Element) -> MLP:
     InputError
         If a part is missing or does not fit.
     """
-    if element.tag != "mapping":
-        raise InputError(f"an element <{element.tag}>", "<mapping>, a network's root element")
-    layers = [_layer(e) for e in element.findall("layer")]
-    pairs = [(_need(e, "srcName"), _need(e, "dstName")) for e in element.findall("connection")]
+    layers = [_layer(e) for e in element.all("layer")]
+    pairs = [(e.need("srcName"), e.need("dstName")) for e in element.all("connection")]
     shapes = {layer.name: layer.size for layer in layers}
     biases, weights = {}, {}
-    for layer, e in zip(layers, element.findall("layer"), strict=True):
-        if layer.bias and _numbers(e) is not None:
-            biases[layer.name] = _numbers(e)
-    for (source, target), e in zip(pairs, element.findall("connection"), strict=True):
-        found = _numbers(e)
-        if found is None:
-            continue
-        wanted = (shapes.get(source, 0), shapes.get(target, 0))
-        if found.size != wanted[0] * wanted[1]:
-            raise InputError(
-                f"{found.size} weights from '{source}' to '{target}'",
-                f"{wanted[0]} x {wanted[1]}, one row for each source node",
-            )
-        weights[connection(source, target)] = found.reshape(wanted)
-    return MLP(
-        layers,
-        pairs,
-        _ports(element.findall("input")),
-        _ports(element.findall("output")),
-        weights,
-        biases,
-        [_gain(e) for e in element.findall("gain")],
-    )
+    for layer, e in zip(layers, element.all("layer"), strict=True):
+        if layer.bias and (found := e.numbers()):
+            biases[layer.name] = found
+    for (source, target), e in zip(pairs, element.all("connection"), strict=True):
+        if found := e.numbers():
+            wanted = (shapes.get(source, 0), shapes.get(target, 0))
+            if len(found) != wanted[0] * wanted[1]:
+                expected = f"{wanted[0]} x {wanted[1]}, one row for each source node"
+                raise e.error(f"{len(found)} weights from '{source}' to '{target}'", expected)
+            weights[connection(source, target)] = np.reshape(found, wanted)
+    inputs, outputs = (_ports(element.all(tag)) for tag in ("input", "output"))
+    gains = [_gain(e) for e in element.all("gain")]
+    return MLP(layers, pairs, inputs, outputs, weights, biases, gains)
 
 
 def format_network(net: MLP, name: str = "mlp") -> str:
@@ -172,10 +158,12 @@ def network_of(n: d.Network) -> MLP:
     InputError
         With its place, if a part is missing or does not fit.
     """
-    root = Plain.Element("mapping")
+    parts = []
     for part in n.parts:
-        e = Plain.SubElement(root, part.kind, dict(part.attributes))
-        e.text = None if part.values is None else ", ".join(map(repr, part.values))
+        given = dict(part.attributes)
+        text = [] if part.values is None else [", ".join(map(repr, part.values))]
+        parts.append(Node(part.kind, given, [], text, dict.fromkeys(["", *given], part.at)))
+    root = Node("mapping", {}, parts, [], {"": n.at})
     try:
         return network_from(root)
     except InputError as error:
@@ -206,66 +194,40 @@ def _numbers_of(net: MLP) -> tuple[dict[str, jax.Array], dict[str, jax.Array]]:
     return weights, {la.name: net.biases[la.name] for la in net.layers if la.bias}
 
 
-def _need(e: Plain.Element, key: str) -> str:
-    """An attribute that must be there."""
-    if key not in e.attrib:
-        raise InputError(f"<{e.tag} {' '.join(e.attrib.values())}>", f"an attribute {key}")
-    return e.attrib[key]
-
-
-def _number(e: Plain.Element, key: str, default: float, kind: type = float):
-    """A numeric attribute."""
-    try:
-        return kind(e.attrib.get(key, default))
-    except ValueError:
-        raise InputError(
-            f"{key}='{e.attrib[key]}' in <{e.tag}>", f"a number ({kind.__name__})"
-        ) from None
-
-
-def _numbers(e: Plain.Element) -> np.ndarray | None:
-    """The comma-separated numbers in an element; None where it is empty."""
-    words = (e.text or "").replace(",", " ").split()
-    try:
-        return np.array([float(word) for word in words]) if words else None
-    except ValueError as error:
-        raise InputError(f"{error} in <{e.tag}>", "numbers separated by commas") from None
-
-
-def _layer(e: Plain.Element) -> Layer:
-    """A layer's structure."""
-    kind = _need(e, "type")
-    bias = e.attrib.get("bias", "false" if kind == "identity" else "true").strip().lower()
+def _layer(e: Node) -> Layer:
+    """A layer from its element."""
+    kind = e.need("type")
+    bias = e.given.get("bias", "false" if kind == "identity" else "true").strip().lower()
     if bias not in ("true", "false"):
-        raise InputError(f"bias='{bias}' in <layer>", "true or false")
-    return Layer(_need(e, "name"), kind, _number(e, "size", 1, int), bias == "true")
+        raise e.error(f"bias='{bias}' in <layer>", "true or false", "bias")
+    return Layer(e.need("name"), kind, e.number("size", 1, int), bias == "true")
 
 
-def _ports(elements: list[Plain.Element]) -> list[Port]:
-    """Inputs or outputs; those without a node take the next of their layer."""
+def _ports(elements: list[Node]) -> list[Port]:
+    """Ports in the order of their elements; without ``node`` they take the nodes in turn."""
     used: Counter[str] = Counter()
     ports = []
     for e in elements:
-        layer = _need(e, "layer")
-        node = _number(e, "node", used[layer], int)
+        layer = e.need("layer")
+        node = e.number("node", used[layer], int)
         used[layer] = node + 1
         plain = {
-            field: _number(e, field, default)
+            field: e.number(field, default)
             for field, default in Port._field_defaults.items()
             if field != "node"
         }
-        ports.append(Port(_need(e, "name"), layer, node, **plain))
+        ports.append(Port(e.need("name"), layer, node, **plain))
     return ports
 
 
-def _gain(e: Plain.Element) -> Gain:
-    """A gain; its order says how many of da, db, dc are read."""
-    order = _number(e, "order", 1, int)
+def _gain(e: Node) -> Gain:
+    """A gain from its element."""
+    order = e.number("order", 1, int)
     if not 1 <= order <= 3:
-        raise InputError(f"order {order} of the gain '{e.attrib.get('name', '')}'", "1, 2 or 3")
-    by = tuple(_need(e, key) for key in ("da", "db", "dc")[:order])
-    kind = e.attrib.get("type", "local")
-    return Gain(_need(e, "name"), _need(e, "dy"), by, kind, _number(e, "cells", 64, int))
+        raise e.error(f"order {order} of the gain '{e.given.get('name', '')}'", "1, 2 or 3")
+    by = tuple(e.need(key) for key in ("da", "db", "dc")[:order])
+    kind = e.given.get("type", "local")
+    return Gain(e.need("name"), e.need("dy"), by, kind, e.number("cells", 64, int))
 
 
 def _text(values) -> str:

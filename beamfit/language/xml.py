@@ -168,17 +168,9 @@ def _declared(e: Node) -> d.Declared:
             dimensions.append(dim.number("size", 1, int))
     values = _one(e, "values")
     if values is not None:
-        return d.Declared(e.name(), tuple(dimensions), _values(values), e.at)
+        return d.Declared(e.name(), tuple(dimensions), values.numbers(), e.at)
     given = (e.number("value", 0.0),) if "value" in e.given else None
     return d.Declared(e.name(), tuple(dimensions), given, e.at)
-
-
-def _values(e: Node) -> tuple[float, ...]:
-    words = "".join(e.text).strip().removeprefix("[").removesuffix("]").replace(",", " ").split()
-    try:
-        return tuple(float(word) for word in words)
-    except ValueError as error:
-        raise e.error(f"{error} in <{e.tag}>", "numbers separated by commas") from None
 
 
 def _set(e: Node) -> d.IndexedSet:
@@ -203,7 +195,7 @@ def _network(node: Node) -> d.Network:
     for e in node.children:
         heads = ("srcName", "dstName") if e.tag == "connection" else ("name",)
         rest = [(k, v) for k, v in e.given.items() if k not in heads]
-        values = _values(e) if "".join(e.text).strip() else None
+        values = e.numbers() if "".join(e.text).strip() else None
         head = [(k, e.name(k)) for k in heads]
         parts.append(d.Part(e.tag, (*head, *rest), values, e.at))
     return d.Network(node.name(), tuple(parts), node.at)
