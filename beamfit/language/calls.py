@@ -55,7 +55,7 @@ def given_to(call: Call, s: Setting) -> Arrays:
     return given
 
 
-def _wired(s: Setting, array: Array, wires: list[d.Wire]) -> jax.Array:
+def _wired(s: Setting, array: Array, wires: list[d.Assignment]) -> jax.Array:
     """An input of what is called: one axis for each iterator of the call, then its dimensions."""
     count = len(s.axes)
     found = None

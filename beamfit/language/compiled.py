@@ -95,18 +95,19 @@ class Program:
             found.append(jnp.broadcast_to(value.array, (*lengths, *own)))
         return found
 
-    def _arrays(self, inputs, names: Iterable[str], constants: Arrays | None) -> Arrays:
-        """All arrays, of which those that some names hang on are computed."""
+    def begin(self, inputs: Mapping[str, jax.Array], constants: Arrays | None = None) -> Arrays:
+        """All arrays before the first step: what is given, and zeros where steps set something."""
         given = defaults(self.scope) | {n: jnp.asarray(v, float) for n, v in inputs.items()}
         constants = self.constants if constants is None else constants
         arrays = {n: jnp.asarray(v) for n, v in constants.items()} | given
         arrays |= {n: arrays[n].T for n in self.tables}
-        for name in self.order.owners:
-            arrays[name] = jnp.zeros(self.scope.arrays[name].shape)
-        wanted, _ = self.order.closure(names)
-        for group in self.order.groups:
-            if not wanted.isdisjoint(step.number for step in group.steps):
-                arrays |= carry_out(self.order, group, arrays)
+        return arrays | {n: jnp.zeros(self.scope.arrays[n].shape) for n in self.order.owners}
+
+    def _arrays(self, inputs, names: Iterable[str], constants: Arrays | None) -> Arrays:
+        """All arrays, of which those that some names hang on are computed."""
+        arrays = self.begin(inputs, constants)
+        for group in self.order.needed(names):
+            arrays |= carry_out(self.order, group, arrays)
         return arrays
 
     def as_map(self, outputs: Iterable[str] | None = None) -> Formula:

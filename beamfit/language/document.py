@@ -41,17 +41,10 @@ class Function:
 
 @dataclass(frozen=True)
 class Assignment:
-    """``y[k] = 2*x[k] foreach k in K;``"""
+    """``y[k] = 2*x[k] foreach k in K;``
 
-    target: Name
-    value: Expression
-    each: tuple[Iterator, ...] = ()
-    at: Place = field(**PLACE)
-
-
-@dataclass(frozen=True)
-class Wire:
-    """One association in a call: an input and its value, or a variable and an output."""
+    In a call: an input and its value, or a variable and an output.
+    """
 
     target: Name
     value: Expression
@@ -64,8 +57,8 @@ class Call:
     """``Transfer(I = I_2[k] :: A[k] = A_T) foreach k in K;``"""
 
     mapping: str
-    inputs: tuple[Wire, ...]
-    outputs: tuple[Wire, ...]
+    inputs: tuple[Assignment, ...]
+    outputs: tuple[Assignment, ...]
     each: tuple[Iterator, ...] = ()
     at: Place = field(**PLACE)
 

@@ -8,6 +8,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
+from functools import reduce
+from operator import add, mul, sub, truediv
 from typing import NamedTuple
 
 import jax
@@ -19,6 +21,7 @@ from beamfit.language import expression as x
 from beamfit.language.expression import error_at
 from beamfit.language.scope import (
     FUNCTIONS,
+    HIDDEN,
     Array,
     Axes,
     Scope,
@@ -28,9 +31,6 @@ from beamfit.language.scope import (
     whole_of,
     widened,
 )
-
-# Behind the names of iterators that a function's body does not see.
-HIDDEN = "'"
 
 
 class Value(NamedTuple):
@@ -67,6 +67,7 @@ MATRIX: dict[str, tuple[int, int, Callable]] = {
     "trace": (2, 0, lambda m: jnp.trace(m, axis1=-2, axis2=-1)),
     "norm": (1, 0, lambda v: jnp.sqrt(jnp.sum(v * v, axis=-1))),
 }
+OPERATORS = {"+": add, "-": sub, "*": mul, "/": truediv, "^": pow}
 FOLDS = {"sum": jnp.sum, "prod": jnp.prod, "min": jnp.min, "max": jnp.max, "mean": jnp.mean}
 
 
@@ -130,16 +131,7 @@ def _operated(e: x.Expression, symbol: str, parts: list[Value]) -> Value:
     if symbol == "@":
         return _product(e, *parts)
     (a, b), rank = _spread(parts, e)
-    match symbol:
-        case "+":
-            return Value(a + b, rank)
-        case "-":
-            return Value(a - b, rank)
-        case "*":
-            return Value(a * b, rank)
-        case "/":
-            return Value(a / b, rank)
-    return Value(a**b, rank)
+    return Value(OPERATORS[symbol](a, b), rank)
 
 
 def _product(e: x.Expression, a: Value, b: Value) -> Value:
@@ -180,11 +172,7 @@ def _applied(e: x.Application, s: Setting) -> Value:
         return _operated(e, "^", values)
     arrays, rank = _spread(values, e)
     if name in ("min", "max"):
-        fold = jnp.minimum if name == "min" else jnp.maximum
-        found = arrays[0]
-        for other in arrays[1:]:
-            found = fold(found, other)
-        return Value(found, rank)
+        return Value(reduce(jnp.minimum if name == "min" else jnp.maximum, arrays), rank)
     return Value(ELEMENTWISE[name](*arrays), rank)
 
 

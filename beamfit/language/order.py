@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from functools import cached_property
 from graphlib import TopologicalSorter
@@ -76,6 +76,11 @@ class Order:
             todo = {before for n in todo for before in self.needs[n]}
         direct = {name for name in names if name not in self.owners}
         return found, direct.union(*(self.given[n] for n in found))
+
+    def needed(self, names: Iterable[str]) -> Iterator[Group]:
+        """Groups that some names hang on, each after what it needs."""
+        wanted, _ = self.closure(names)
+        return (g for g in self.groups if not wanted.isdisjoint(step.number for step in g.steps))
 
 
 # ---- the order

@@ -179,11 +179,10 @@ class _Builder(Transformer):
     def wire(self, c):
         for part in (c[0], c[1]):
             x.check_depth(part)
-        return d.Wire(c[0], c[1], c[2] or (), _place(c))
+        return d.Assignment(c[0], c[1], c[2] or (), _place(c))
 
     def assignment(self, c):
-        w = self.wire(c)
-        return [d.Assignment(w.target, w.value, w.each, w.at)]
+        return [self.wire(c)]
 
     def wires(self, c):
         return tuple(w for w in c if w is not None)

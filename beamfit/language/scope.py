@@ -6,7 +6,7 @@ index is checked, and every statement's reach known, without JAX.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -20,6 +20,8 @@ from beamfit.language.expression import REDUCTIONS, Place, error_at
 
 # Elements of a set, and combinations of indices one statement may run over.
 MOST_ELEMENTS, MOST_COMBINED = 2_000_000, 5_000_000
+# Behind the names of iterators that a function's body does not see.
+HIDDEN = "'"
 CONSTANTS = {"pi": float(np.pi)}
 ONE = """sin cos tan asin acos atan sinh cosh tanh asinh acosh atanh exp log log10 sqrt abs sign erf
 sigmoid transpose inverse det trace norm sum"""
@@ -288,15 +290,20 @@ def whole_of(node: x.Name, array: Array) -> list[IndexSet]:
 def _outside(node, index, dim, axes, values, at) -> InputError:
     """Say which index lies outside its set, and when."""
     first = np.argwhere(np.atleast_1d(at) < 0)[0]
-    when = [
-        f"{name} = {s.elements[i]}"
-        for (name, s), i, n in zip(axes.items(), first, np.shape(at), strict=False)
-        if n > 1
-    ]
     value = np.atleast_1d(values)[tuple(first)]
     said = f"index {index} = {value}" if str(index) != str(value) else f"index {value}"
-    found = f"{said} in '{node}'" + (f" at {', '.join(when)}" if when else "")
+    found = f"{said} in '{node}'{said_at(axes, first, np.shape(at), ' at ')}"
     return error_at(index.at, found, f"an element of {dim}")
+
+
+def said_at(axes: Axes, at: Sequence[int], lengths: Sequence[int], word: str) -> str:
+    """Where iterators stand, behind a word; nothing where none of them matters."""
+    found = [
+        f"{name.rstrip(HIDDEN)} = {s.elements[i]}"
+        for (name, s), i, n in zip(axes.items(), at, lengths, strict=False)
+        if n > 1
+    ]
+    return f"{word}{', '.join(found)}" if found else ""
 
 
 # ---- what an expression reads, with every name checked

@@ -56,8 +56,6 @@ class Solution:
         What is minimised or maximised.
     fit : Fit
         What was found.
-    labels, limits : tuple of str
-        Names of the free numbers and of the limited ones.
     outputs : mapping of str to array
         Values at the answer.
     factor : float
@@ -72,8 +70,6 @@ class Solution:
 
     name: str
     fit: Fit
-    labels: tuple[str, ...]
-    limits: tuple[str, ...]
     outputs: Mapping[str, np.ndarray]
     factor: float = 1.0
     squares: bool = False
@@ -104,16 +100,13 @@ class Solution:
     def variables(self) -> list[Variable]:
         """Free numbers by their labels, with d(objective)/d(bound)."""
         return [
-            v._replace(name=name, reduced_gradient=self.factor * v.reduced_gradient)
-            for name, v in zip(self.labels, self.fit.variables, strict=True)
+            v._replace(reduced_gradient=self.factor * v.reduced_gradient)
+            for v in self.fit.variables
         ]
 
     def constraints(self) -> list[Limited]:
         """Limited outputs by their labels, with d(objective)/d(limit)."""
-        return [
-            c._replace(name=name, multiplier=self.factor * c.multiplier)
-            for name, c in zip(self.limits, self.fit.constraints, strict=True)
-        ]
+        return [c._replace(multiplier=self.factor * c.multiplier) for c in self.fit.constraints]
 
     def quantity(self, v: Variable) -> Quantity:
         """A free number with its error; its interval is that of Student's t."""
@@ -240,11 +233,10 @@ def solve_document(
         notes = notes if told else (*notes, f"Where it ended, {cause}.")
     if made.squares and math.isfinite(fit.scale):
         notes = (*notes, NOISE)
-    labels = made.problem.names, tuple(c.name for c in fit.constraints)
     asked = list(made.program.scope.outputs)
     outputs = {n: np.asarray(v) for n, v in made.program(fit.model, asked).items()}
     name = _goals(made.document)
-    return Solution(name, fit, *labels, outputs, made.factor, made.squares, notes, made)
+    return Solution(name, fit, outputs, made.factor, made.squares, notes, made)
 
 
 def solve_problem(problem: Problem, starts: int = 1) -> Solution:
@@ -256,8 +248,7 @@ def solve_problem(problem: Problem, starts: int = 1) -> Solution:
     goal = problem.objectives[0]
     notes = tuple(found.message for found in diagnose(problem))
     factor = -1.0 if goal.weight < 0 else 1.0
-    names = problem.names, tuple(c.name for c in fit.constraints)
-    return Solution(goal.name, fit, *names, {}, factor, notes=notes)
+    return Solution(goal.name, fit, {}, factor, notes=notes)
 
 
 def _started(made: Formulation) -> tuple[Formulation, tuple[str, ...]]:

@@ -149,7 +149,7 @@ def _free(document: d.Document, program: Program) -> tuple[list, dict[str, np.nd
                                     + [c.model for c in document.problem.limits])  # fmt: skip
     for v in document.problem.variables:
         shape = arrays[v.model].shape
-        model[v.model] = first_start(v, shape, model.get(v.model))
+        model[v.model] = next(_starts(v, shape, model.get(v.model)))
         names = _names(v, arrays[v.model])
         free.append(core.Free(v.model, v.lower, v.upper, v.random, labels=names))
         if v.model not in used:
@@ -158,12 +158,8 @@ def _free(document: d.Document, program: Program) -> tuple[list, dict[str, np.nd
     return free, model, tuple(notes)
 
 
-def first_start(v: d.Variable, shape: tuple[int, ...], given: np.ndarray | None) -> np.ndarray:
-    """Where a search starts: drawn with the seed, or the value, or the middle of the bounds."""
-    return next(_starts(v, shape, given))
-
-
 def _starts(v: d.Variable, shape, given) -> Iterator[np.ndarray]:
+    """Where searches start: drawn with the seed, or the value, or the middle of the bounds."""
     random = np.random.default_rng(v.seed)
     while v.random is not None:
         yield np.clip(random.uniform(*v.random, size=shape), v.lower, v.upper)

@@ -43,7 +43,9 @@ def calls(scope: Scope, call: d.Call) -> Call:
     return Call(call, callee)
 
 
-def gains_of(wire: d.Wire, callee: Scope | Net, label: str) -> tuple[x.Name, tuple[x.Name, ...]]:
+def gains_of(
+    wire: d.Assignment, callee: Scope | Net, label: str
+) -> tuple[x.Name, tuple[x.Name, ...]]:
     """The output behind a wire, and the inputs by which it is differentiated: `gain(y, x)`."""
     names = (wire.value,)
     if isinstance(wire.value, x.Application) and wire.value.function == "gain":

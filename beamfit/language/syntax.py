@@ -20,6 +20,7 @@ BRACKET = re.compile(
 STARTS = """minimize maximize variable constraint solver mapping table network input output
 parameter set real function foreach forall layer connection gain in random seed weight"""
 KEYWORDS = STARTS.split()
+CLOSING = {"(": ")", "[": "]", "{": "}"}
 SAID = {
     "NAME": "a name", "NUMBER": "a number", "SIGNED": "a number", "STRING": "a text in quotes",
     "ADD": "an operator", "MULTIPLY": "an operator", "POWER": "an operator", "SEMICOLON": "';'",
@@ -36,14 +37,13 @@ def check_brackets(text: str) -> None:
     for match in BRACKET.finditer(text):
         if match[1]:
             opened.append(match)
-        elif match[2] and opened and "([{".index(opened[-1][0]) == ")]}".index(match[0]):
+        elif match[2] and opened and CLOSING[opened[-1][0]] == match[0]:
             opened.pop()
         elif match[2]:
             wanted = "no such bracket"
             if opened:
-                line = _at(text, opened[-1].start()).line
-                closing = ")]}"["([{".index(opened[-1][0])]
-                wanted = f"'{closing}' for the '{opened[-1][0]}' in line {line}"
+                line, last = _at(text, opened[-1].start()).line, opened[-1][0]
+                wanted = f"'{CLOSING[last]}' for the '{last}' in line {line}"
             raise error_at(_at(text, match.start()), f"'{match[0]}'", wanted)
         elif match[3]:
             at = _at(text, match.start())
@@ -52,9 +52,8 @@ def check_brackets(text: str) -> None:
             found = f"more than {MOST_OPEN} brackets within each other"
             raise error_at(_at(text, match.start()), found, "fewer")
     if opened:
-        at = _at(text, opened[-1].start())
-        closing = ")]}"["([{".index(opened[-1][0])]
-        raise error_at(at, f"'{opened[-1][0]}' that is not closed", f"'{closing}' behind it")
+        at, last = _at(text, opened[-1].start()), opened[-1][0]
+        raise error_at(at, f"'{last}' that is not closed", f"'{CLOSING[last]}' behind it")
 
 
 def _at(text: str, position: int) -> Place:

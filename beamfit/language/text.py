@@ -176,7 +176,7 @@ def _each(each: Sequence) -> str:
     return f" foreach {iterators_text(tuple(each))}" if each else ""
 
 
-def _wires(wires: Sequence[d.Wire]) -> str:
+def _wires(wires: Sequence[d.Assignment]) -> str:
     return "; ".join(f"{w.target} = {w.value}{_each(w.each)}" for w in wires)
 
 

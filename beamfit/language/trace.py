@@ -5,17 +5,16 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from beamfit.language import document as d
 from beamfit.language import expression as x
-from beamfit.language.calls import Arrays, defaults, given_to
+from beamfit.language.calls import Arrays, given_to
 from beamfit.language.compiled import Program, carry_out
-from beamfit.language.evaluate import HIDDEN, Setting, Value, evaluate
+from beamfit.language.evaluate import Setting, Value, evaluate
 from beamfit.language.lags import Plan
 from beamfit.language.order import Group
-from beamfit.language.scope import Axes, IndexSet, Scope, Step
+from beamfit.language.scope import Axes, IndexSet, Scope, Step, said_at
 from beamfit.language.steps import calls
 
 
@@ -58,18 +57,11 @@ def cause_of(
     >>> cause_of(compile_mapping(parse_document(text).mapping), {"a": 2.5}, ["y"])
     'sqrt(a - k) is not a number for k = 3 (line 1, column 52): a - k = -0.5'
     """
-    given = defaults(program.scope) | {n: jnp.asarray(v, float) for n, v in inputs.items()}
-    arrays: Arrays = {n: jnp.asarray(v) for n, v in program.constants.items()} | given
-    arrays |= {n: arrays[n].T for n in program.tables}
+    arrays = program.begin(inputs)
     for name, value in arrays.items():
         if not np.all(np.isfinite(value)):
             return f"{inside}{name} is not finite"
-    for name in program.order.owners:
-        arrays[name] = jnp.zeros(program.scope.arrays[name].shape)
-    wanted, _ = program.order.closure(names)
-    for group in program.order.groups:
-        if wanted.isdisjoint(step.number for step in group.steps):
-            continue
+    for group in program.order.needed(names):
         try:
             changed = carry_out(program.order, group, arrays, _Watch(slopes))
         except _FoundError as found:
@@ -100,15 +92,9 @@ class _Watch:
         if not bad.any():
             return
         at = np.argwhere(bad)[0][: len(axes)]
-        when = [
-            f"{name.rstrip(HIDDEN)} = {s.elements[i]}"
-            for (name, s), i, n in zip(axes.items(), at, array.shape, strict=False)
-            if n > 1
-        ]
         what = "infinite" if np.any(np.isinf(array)) else "not a number"
         what = "zero and has an infinite derivative" if np.all(np.isfinite(array)) else what
-        index = f" for {', '.join(when)}" if when else ""
-        said = f"{e} is {what}{index} ({e.at})"
+        said = f"{e} is {what}{said_at(axes, at, array.shape, ' for ')} ({e.at})"
         inner = ", ".join(self._said(part, at) for part in x.children(e) if self._tells(part))
         raise _FoundError(said + (f": {inner}" if inner else ""))
 

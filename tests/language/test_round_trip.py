@@ -69,7 +69,7 @@ class Writer:
         return x.Name(self.word(), self.several(lambda: self.formula(1), 0, 2))
 
     def wire(self):
-        return d.Wire(self.target(), self.formula(2), self.each())
+        return d.Assignment(self.target(), self.formula(2), self.each())
 
     def wires(self):
         return self.several(self.wire, 0, 2)
