@@ -11,6 +11,7 @@ from scipy.signal import cont2discrete, dlsim, lfilter
 from beamfit.dynamics.states import StateSpace
 from beamfit.errors import InputError
 from beamfit.status import Status
+from beamfit.studies.response.case import Case
 from beamfit.studies.response.linear import identify_states
 from beamfit.studies.response.order import criterion
 from beamfit.studies.response.record import Run
@@ -130,7 +131,7 @@ def test_an_order_is_worth_what_it_adds_to_what_readings_before_foretell():
     """Three orders miss by as much; misses of the second are told from those before, mostly."""
     n = 400
     time = np.arange(n, dtype=float)
-    case = SimpleNamespace(seen=(SimpleNamespace(time=(time,), size_y=1.0, measured=(time,)),))
+    case = Case((SimpleNamespace(time=(time,), size_y=1.0, measured=(time,)),), (), (), ())
 
     def missed(share, used):
         rest = lfilter([1.0], [1.0, -share], np.random.default_rng(1).normal(size=n))

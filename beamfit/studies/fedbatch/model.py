@@ -13,7 +13,8 @@ from beamfit.dynamics.fedbatch import Flow, balances
 from beamfit.dynamics.states import StateSpace
 from beamfit.greybox import tree
 from beamfit.greybox.mlp import MLP, Port, dense
-from beamfit.greybox.problem import Free, Prior, Problem, Record
+from beamfit.greybox.problem import Free, Problem, Record
+from beamfit.studies.response.model import weight_priors
 from beamfit.studies.response.record import Run
 
 STATES = ("biomass", "substrate", "volume")
@@ -21,8 +22,6 @@ RATES = ("mu_b", "mu_s")
 # Inputs that are no operating point but flows: of liquid, and what it brings.
 FLOWS = ("feed", "feed_substrate", "outflow")
 HOUR = 3600.0
-# Width of the prior on a network's weights, whose inputs and outputs are of size 1.
-WEIGHT = 3.0
 # Rates reach so many times the largest that one of so many stretches of a batch shows.
 ABOVE, STRETCHES = 2.0, 8
 # Shares of the usual high substrate (a percentile): below the first consumption slows down; below
@@ -188,5 +187,4 @@ def state(seen: Seen, model: Any, noise: np.ndarray) -> Problem:
         worth=1.0,
     )  # fmt: skip
     free = [Free("rates", nuisance=True), Free("start", nuisance=True)]
-    priors = [Prior("rates.weights", 0.0, WEIGHT), Prior("rates.biases", 0.0, WEIGHT)]
-    return Problem(model, free, [record], priors)
+    return Problem(model, free, [record], weight_priors("rates"))

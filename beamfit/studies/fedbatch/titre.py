@@ -25,7 +25,6 @@ from beamfit.studies.fedbatch.model import (
     ABOVE,
     RATES,
     STATES,
-    WEIGHT,
     Batches,
     Seen,
     course,
@@ -36,6 +35,7 @@ from beamfit.studies.fedbatch.model import (
     rates_at,
 )
 from beamfit.studies.fedbatch.verdict import RULES, Evidence, Noise
+from beamfit.studies.response.model import weight_priors
 from beamfit.table import Table, json_of
 from beamfit.verdict import judge
 
@@ -207,8 +207,8 @@ def _state(seen: Seen, model: Any, error: np.ndarray, free: Sequence[str] = OWN)
     record = Record(
         TITRE, _titres, seen.batches, seen.measured, error=error, weight=seen.read * 1.0, worth=1.0
     )
-    priors = [Prior(f"make.{kind}", 0.0, WEIGHT) for kind in ("weights", "biases")]
-    priors += [Prior("first stage", 0.0, 1.0, _held)] if "rates" in free else []
+    held = [Prior("first stage", 0.0, 1.0, _held)] if "rates" in free else []
+    priors = [*weight_priors("make"), *held]
     return Problem(model, [Free(name, nuisance=True) for name in free], [record], priors)
 
 

@@ -140,8 +140,7 @@ def checks_of(
 
 def _together(seen: Seen) -> tuple[str, ...]:
     """Inputs whose gains cannot be told apart: their variance inflation is above a thousand."""
-    u = np.concatenate([np.asarray(r.u)[np.asarray(r.index)] for r in seen.runs])
-    u = (u - u.mean(0)) / np.where(seen.size_u > 0, seen.size_u, 1.0)
+    u = (seen.points - seen.points.mean(0)) / seen.wide
     found = []
     for i, name in enumerate(seen.inputs):
         one, others = u[:, i], np.delete(u, i, axis=1)
@@ -209,7 +208,7 @@ def _explained(
     paths = driven_by(seen, FIRST_ORDER)
     own, slow, quick, later, targets = [], [], [], [], []
     for run, path, r, (by_own, added) in zip(seen.runs, paths, residuals, slopes, strict=True):
-        u = (np.asarray(run.u) - seen.mean_u) / np.where(seen.size_u > 0, seen.size_u, 1.0)
+        u = seen.scaled(run.u)
         index = np.asarray(run.index)
         past = [u[np.clip(index + k, 0, len(u) - 1)] for k in range(-PAST, delay)]
         after = [u[np.clip(index + delay + k, 0, len(u) - 1)] for k in range(LATER)]
@@ -254,7 +253,7 @@ def slopes_of(seen: Seen, fit: Fit) -> list[tuple[np.ndarray, np.ndarray]]:
     """Slopes of the output by the model's own numbers, and by parameters that change."""
     found = []
     for run in seen.runs:
-        u = (np.asarray(run.u) - seen.mean_u) / np.where(seen.size_u > 0, seen.size_u, 1.0)
+        u = seen.scaled(run.u)
         added = changed_by(fit.model, run, np.concatenate([u, u**2], axis=1))
         found.append((fit.derive(predicted, run).slope, np.asarray(added)))
     return found
@@ -263,7 +262,7 @@ def slopes_of(seen: Seen, fit: Fit) -> list[tuple[np.ndarray, np.ndarray]]:
 def predict_held(run: Run, output: str, fit: Fit, physics: Physics, delay: float) -> HeldBack:
     """Predict a run that was held back; only the state at its start is estimated."""
     seen = driven(run, 0, output, physics, delay)
-    p = parameters_at(physics, fit.model["map"], seen.point)
+    p = parameters_at(physics, fit.model["map"], seen.u)
     y = run.outputs[output][np.asarray(seen.index)]
 
     def from_start(free: Any) -> np.ndarray:

@@ -99,15 +99,14 @@ def controller(
                 for r, a, b in zip(responses, below, above, strict=True)}  # fmt: skip
         low, high = certain_range(fits, hard, (low, high), ends)
     rate = step * np.array([_rates(names, rates or {}).get(name, np.inf) for name in names])
-    sizes = np.where(seen.size_u > 0, seen.size_u, 1.0)
     limits = Limits(low, high, rate, below, above)
-    return Controller(names, responses, step, sizes, limits, horizon, smooth)
+    return Controller(names, responses, step, seen.wide, limits, horizon, smooth)
 
 
 def _transient(fit: ResponseFit) -> float:
     """Samples until 5 % of a transient is left, at the usual operating points."""
     run, physics = fit.seen.runs[0], PHYSICS[fit.model]
-    points = run.point[:: max(1, len(run.point) // 50)]
+    points = run.u[:: max(1, len(run.u) // 50)]
     dt = float(np.median(np.diff(fit.runs[0].time)))
     state = physics.begin(jnp.zeros(physics.free_states), points[0])
 

@@ -78,7 +78,7 @@ def _units(physics: Physics, m: int) -> list[str]:
 
 
 def _constants(model: Any, seen: Any) -> jax.Array:
-    p = curves(model, (seen, seen.point[:1]))[0]
+    p = curves(model, (seen, seen.u[:1]))[0]
     if seen.physics is ARX:  # settled, y = K u
         m = seen.u.shape[1]
         return jnp.concatenate([p, (p[2 : 2 + m] + p[2 + m :]) / (1.0 + p[0] + p[1])])
@@ -167,8 +167,7 @@ def told(
 def curves_of(fit: Fit, errors: Memory | None, seen: Seen) -> tuple[Curve, ...]:
     """Every parameter against every input."""
     physics, m = seen.runs[0].physics, len(seen.inputs)
-    points = np.concatenate([np.asarray(run.point)[np.asarray(run.index)] for run in seen.runs])
-    made = []
+    points, made = seen.points, []
     for j, name in enumerate(seen.inputs):
         low, high = points[:, j].min(), points[:, j].max()
         grid = np.tile(seen.mean_u, (POINTS, 1))

@@ -15,6 +15,7 @@ from beamfit.greybox.fit import Fit
 from beamfit.quantity import Quantity
 from beamfit.shown import shown
 from beamfit.status import Status
+from beamfit.studies.response.case import used_by
 from beamfit.studies.response.checks import Checks, HeldBack, checks_of, predict_held, slopes_of
 from beamfit.studies.response.curve import Curve, curves_of, quantities_of, told
 from beamfit.studies.response.limits import limited
@@ -22,9 +23,9 @@ from beamfit.studies.response.misread import Misread, sound
 from beamfit.studies.response.model import Seen, network_of, output_of
 from beamfit.studies.response.noise import Noise
 from beamfit.studies.response.record import Run
-from beamfit.studies.response.settle import begun, is_first_order, settled, used_by, within
+from beamfit.studies.response.settle import begun, case_of, is_first_order, settled, within
 from beamfit.studies.response.starts import latest
-from beamfit.studies.response.verdict import judged
+from beamfit.studies.response.verdict import Evidence, judged, rms_of
 from beamfit.table import Table, json_of
 
 if TYPE_CHECKING:
@@ -32,6 +33,7 @@ if TYPE_CHECKING:
 
 
 MAPS = ("constant", "network")
+LATEST = "The delay is the longest that was tried: say a longer one by --delay."
 
 
 @shown
@@ -230,14 +232,16 @@ def identify(
     seen, delay, plain = found
     answer = plain
     if map == "network":
-        raw, first, level = plain.start()
-        nets = [network_of(seen, physics, np.asarray(raw), hidden, seed + k) for k in range(starts)]
-        answer = settled(seen, [(net, first, level) for net in nets])
+        first = plain.fit.model
+        raw = np.asarray(first["map"])
+        nets = (network_of(seen, physics, raw, hidden, seed + k) for k in range(starts))
+        answer = settled(case_of(seen, offset, True), [first | {"map": net} for net in nets])
     if gains:
-        answer = within(seen, answer, limited(gains, seen, physics, map == "network"))
+        limits = limited(gains, seen, physics, map == "network")
+        answer = within(case_of(seen, offset, map == "network", limits), answer)
     checks = checks_of(
         seen,
-        answer.residuals,
+        tuple(rest for (rest,) in answer.rest),
         slopes_of(seen, answer.fit),
         used_by(answer.fit),
         plain.likelihood - answer.likelihood if map == "network" else None,
@@ -251,10 +255,12 @@ def identify(
     quantities, curves = told(quantities, curves, seen, checks)
     ahead = tuple(predict_held(each, output, answer.fit, physics, delay) for each in held)
     evidence = (answer.fit, answer.rests, checks, quantities, curves, ahead, map)
-    status, message = judged(*evidence, given is None and delay == latest(runs) > 0)
-    message = " ".join([message, *(f"Left out: {each}." for each in left_out)])
+    status, message = judged({output: Evidence(*evidence, rms_of(answer.fit))})
+    late = [LATEST] if given is None and delay == latest(runs) > 0 else []
+    message = " ".join([message, *late, *(f"Left out: {each}." for each in left_out)])
     delay = delay if delay % 1 == 0 else delay + float(answer.fit.model["late"])
-    parts = (quantities, curves, answer.noise, answer.memory, checks, ahead, left_out)
+    noise = tuple(answer.noise[:, 0].tolist())
+    parts = (quantities, curves, noise, answer.memory, checks, ahead, left_out)
     return ResponseFit(output, status, message, model, map, delay, runs, seen, answer.fit, *parts)
 
 

@@ -68,8 +68,7 @@ def limited(
     slopes = {f"d{name}/d{by}": (name, by) for name in names for by in inputs}
     logs = {n for n, (_, gain) in zip(names, physics.units(len(inputs)), strict=True) if not gain}
     lower, upper = np.full(len(names), -np.inf), np.full(len(names), np.inf)
-    points = np.concatenate([np.asarray(run.point)[np.asarray(run.index)] for run in seen.runs])
-    box, found = (points.min(axis=0), points.max(axis=0)), []
+    box, found = (seen.points.min(axis=0), seen.points.max(axis=0)), []
     for what, (low, high) in told.items():
         if what not in (*names, *slopes):
             raise InputError(f"a limit of '{what}'", nearest(what, [*names, *slopes]))

@@ -15,6 +15,7 @@ from beamfit.errors import InputError, nearest
 from beamfit.greybox import tree
 from beamfit.greybox.problem import Free, Prior
 from beamfit.quantity import Quantity
+from beamfit.studies.response.case import Case, Settled
 from beamfit.studies.response.curve import GAIN, PURE, TIME, WIDE, derived, quantity
 from beamfit.studies.response.fit import MAPS, check_inputs
 from beamfit.studies.response.model import WEIGHT
@@ -28,7 +29,7 @@ from beamfit.studies.response.order import (
 )
 from beamfit.studies.response.realise import LINEAR, NETWORK, stripped
 from beamfit.studies.response.record import Run
-from beamfit.studies.response.shooting import Case, Course, Trained, remembering, trained
+from beamfit.studies.response.shooting import Course, remembering, trained
 from beamfit.studies.response.states import StatesFit, answer, case_of, checked
 
 
@@ -170,7 +171,7 @@ def _quoted(model: Any, asked: Asked) -> jax.Array:
 
 
 def _quantities(
-    case: Case, found: Trained, n: int, runs: Sequence[Run], offset: bool
+    case: Case, found: Settled, n: int, runs: Sequence[Run], offset: bool
 ) -> tuple[dict[str, Quantity], dict[str, list[str]]]:
     """Time constants from the slowest, gains and levels; and the names of each input's gains."""
     numbers = derived(found.fit, found.errors, _quoted, Asked(n, case.courses[0]))
@@ -200,7 +201,7 @@ def _quantities(
     return said, gains
 
 
-def _matrices(case: Case, found: Trained, n: int) -> dict[str, Any]:
+def _matrices(case: Case, found: Settled, n: int) -> dict[str, Any]:
     """A, B, C, D in the units of the record, for inputs less their mean."""
     p = found.fit.model["p"]
     a, b, c, d, _ = map(np.asarray, case.courses[0].system.matrices(p))

@@ -50,7 +50,8 @@ def sound(
     trial, _ = _without(runs, output, [_still(y) for y in found.seen.measured], "")
     if trial is not None:  # the process may stand still as well: a fit without them tells
         other = begin(trial)
-        noise = 1.4826 * float(np.median(np.abs(np.concatenate(other.plain.residuals))))
+        rest = np.concatenate([left for (left,) in other.plain.rest])
+        noise = 1.4826 * float(np.median(np.abs(rest)))
         masks = [_still(y, f, noise) for y, f in _beside(runs, output, other)]
         trial, which = _without(
             runs, output, masks, "readings that stand still as the process moves"

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any, NamedTuple
 
 import jax
@@ -13,8 +11,8 @@ import numpy as np
 from beamfit.dynamics.response import Physics, simulate
 from beamfit.greybox import tree
 from beamfit.greybox.mlp import MLP, Port, dense
-from beamfit.greybox.problem import Free, Prior, Problem, Record, padded_length
-from beamfit.studies.response.noise import Noise, innovations
+from beamfit.greybox.problem import Prior, padded_length
+from beamfit.studies.response.noise import Noise
 from beamfit.studies.response.record import Run
 
 # A residual below this share of the output's scatter is the model's, and not fitted any closer.
@@ -25,15 +23,14 @@ WEIGHT = 3.0
 
 @tree.node("physics")
 class Driven:
-    """A run as the model sees it: operating points, inputs and steps, padded, and what was read.
+    """A run as the model sees it: inputs, its operating points, and steps, padded; what was read.
 
-    Shapes (samples, inputs), (samples, inputs), (samples,), (readings,); `run` is its number,
+    Shapes (samples, inputs), (samples,), (readings,), (readings,); `run` is its number,
     `noise` that of its readings, if it has a memory; `held` by how much each step grows, s, for a
     delay that is longer by a sample, where the delay is no whole number of them.
     """
 
     physics: Physics
-    point: Any
     u: Any
     dt: Any
     time: Any
@@ -41,6 +38,12 @@ class Driven:
     run: Any
     noise: Noise | None
     held: Any
+
+    def predicted(self, model: Any) -> jax.Array:
+        """The output where it was read, running free from the start of the run."""
+        p = parameters_at(self.physics, model["map"], self.u)
+        y = simulate(self.physics, p, self.u, steps_of(model, self), model["start"][self.run])
+        return model["offset"] + y[self.index]
 
 
 class Seen(NamedTuple):
@@ -59,6 +62,20 @@ class Seen(NamedTuple):
     size_u: np.ndarray
     size_y: float
 
+    @property
+    def wide(self) -> np.ndarray:
+        """The scatter of the inputs, 1 where one does not change."""
+        return np.where(self.size_u > 0, self.size_u, 1.0)
+
+    @property
+    def points(self) -> np.ndarray:
+        """The inputs at all readings, shape (readings, inputs)."""
+        return np.concatenate([np.asarray(run.u)[np.asarray(run.index)] for run in self.runs])
+
+    def scaled(self, u: Any) -> np.ndarray:
+        """Inputs in units of their scatter."""
+        return (np.asarray(u) - self.mean_u) / self.wide
+
 
 def driven(run: Run, number: int, output: str, physics: Physics, delay: float) -> Driven:
     """One run with its inputs `delay` samples late; before the first they are as the first.
@@ -76,7 +93,7 @@ def driven(run: Run, number: int, output: str, physics: Physics, delay: float) -
     dt, held = (None if s is None else np.append((s * apart).T.ravel(), np.zeros(longer))
                 for s in (shares, held))  # fmt: skip
     rows = np.flatnonzero(np.isfinite(run.outputs[output]))
-    seen = (late, late, dt, run.time[rows] - run.time[0], rows * len(whole))
+    seen = (late, dt, run.time[rows] - run.time[0], rows * len(whole))
     arrays = (jnp.asarray(v) for v in seen)
     held = None if held is None else jnp.asarray(held)
     return Driven(physics, *arrays, jnp.asarray(number), None, held)
@@ -97,11 +114,9 @@ def parameters_at(physics: Physics, of: Any, point: jax.Array, more: Any = 0.0) 
     return jax.vmap(lambda q: physics.physical(q, m))(raw + more)
 
 
-def predicted(model: Any, seen: Driven) -> jax.Array:
-    """The output where it was read, running free from the start of the run."""
-    p = parameters_at(seen.physics, model["map"], seen.point)
-    y = simulate(seen.physics, p, seen.u, steps_of(model, seen), model["start"][seen.run])
-    return model["offset"] + y[seen.index]
+def predicted(model: Any, course: Any) -> jax.Array:
+    """What a model says of the readings of a run: a `Driven`, or another course."""
+    return course.predicted(model)
 
 
 output_of = jax.jit(predicted)
@@ -115,19 +130,14 @@ def changed_by(model: Any, seen: Driven, scaled: jax.Array) -> jax.Array:
     (samples, 2 m); the slopes are by S at 0, shape (readings, parameters * 2 m).
     """
     start = model["start"][seen.run]
-    count = parameters_at(seen.physics, model["map"], seen.point[:1]).shape[1]
+    count = parameters_at(seen.physics, model["map"], seen.u[:1]).shape[1]
 
     def output(more):
-        p = parameters_at(seen.physics, model["map"], seen.point, scaled @ more.T)
+        p = parameters_at(seen.physics, model["map"], seen.u, scaled @ more.T)
         return simulate(seen.physics, p, seen.u, steps_of(model, seen), start)[seen.index]
 
     slopes = jax.jacfwd(output)(jnp.zeros((count, scaled.shape[1])))
     return slopes.reshape(len(slopes), -1)
-
-
-def _surprising(model: Any, seen: Driven) -> jax.Array:
-    """What the output adds to what the readings before foretell."""
-    return innovations(predicted(model, seen), seen.time, seen.noise)[0]
 
 
 def curves(model: Any, asked: tuple[Driven, Any]) -> jax.Array:
@@ -136,10 +146,14 @@ def curves(model: Any, asked: tuple[Driven, Any]) -> jax.Array:
     return parameters_at(seen.physics, model["map"], point)
 
 
+def weight_priors(path: str) -> tuple[Prior, ...]:
+    """Priors on the numbers of a network."""
+    return tuple(Prior(f"{path}.{part}", 0.0, WEIGHT) for part in ("weights", "biases"))
+
+
 def network_of(seen: Seen, physics: Physics, raw: np.ndarray, hidden: int, seed: int) -> MLP:
     """A network that gives constant raw numbers everywhere but for small random weights."""
-    m = len(seen.inputs)
-    wide = np.where(seen.size_u > 0, seen.size_u, 1.0)
+    m, wide = len(seen.inputs), seen.wide
     ports = [Port(n, "", 0, float(s), float(b))
              for n, s, b in zip(seen.inputs, wide, seen.mean_u, strict=True)]  # fmt: skip
     gain = seen.size_y / float(np.min(wide))
@@ -147,51 +161,3 @@ def network_of(seen: Seen, physics: Physics, raw: np.ndarray, hidden: int, seed:
     names = physics.parameters(seen.inputs)
     outputs = [Port(n, "", 0, s, float(b)) for n, s, b in zip(names, sizes, raw, strict=True)]
     return dense(ports, outputs, [hidden], seed=seed, spread=0.3)
-
-
-def state(
-    seen: Seen,
-    by: Any,
-    start: np.ndarray,
-    offset: tuple[float, bool],
-    noise: Sequence[float],
-    memory: Noise | None,
-    told: Any = None,
-) -> Problem:
-    """State the problem.
-
-    Parameters
-    ----------
-    seen : Seen
-        The runs.
-    by : array or map
-        Raw numbers, or the map that gives them.
-    start : array, shape (runs, free states)
-        Unknown parts of the first states.
-    offset : (float, bool)
-        Output at rest, and whether it is free.
-    noise : sequence of float
-        A guess at the noise of each run, which its residuals correct.
-    memory : Noise, optional
-        How the noise wanders.
-    told : Limited, optional
-        Limits of the parameters (`beamfit.studies.response.limits`).
-    """
-    records = []
-    for i, (run, y) in enumerate(zip(seen.runs, seen.measured, strict=True)):
-        close = noise[i] <= CLOSE * seen.size_y * 1.001
-        worth, of = np.inf if close else 1.0, predicted
-        if memory is not None:
-            run, of = replace(run, noise=Noise(*map(jnp.asarray, memory))), _surprising
-            y = np.asarray(innovations(jnp.asarray(y), run.time, run.noise)[0])
-        records.append(Record(f"run {i + 1}", of, run, y, noise[i], worth=worth))
-    ends = {} if told is None or callable(by) else {"lower": told.lower, "upper": told.upper}
-    free = [Free("start", nuisance=True), Free("map", nuisance=callable(by), **ends)]
-    free += [Free("offset")] if offset[1] else []
-    free += [] if seen.runs[0].held is None else [Free("late")]
-    model = {"map": by, "start": start, "offset": offset[0], "late": 0.0}
-    priors = []
-    if isinstance(by, MLP):
-        priors = [Prior("map.weights", 0.0, WEIGHT), Prior("map.biases", 0.0, WEIGHT)]
-    limits = told.constraints if told is not None and callable(by) else ()
-    return Problem(model, free, records, priors, limits)

@@ -8,11 +8,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from beamfit.greybox.problem import Free
-from beamfit.studies.response.model import CLOSE, Seen
-from beamfit.studies.response.noise import Noise, innovations, noise_of, remembers
+from beamfit.studies.response.case import Case, Settled, information, used_by
+from beamfit.studies.response.model import CLOSE
+from beamfit.studies.response.noise import Noise, noise_of, remembers
 from beamfit.studies.response.realise import LINEAR, normal_form, padded, realisations
-from beamfit.studies.response.settle import used_by
-from beamfit.studies.response.shooting import LONGEST, Case, Trained, rest_of, trained
+from beamfit.studies.response.shooting import LONGEST, trained
 
 # States of the programs that search: what an order does not need is held at 0, so that all orders
 # of a size are compiled once. The search ends after so many orders that are no better.
@@ -29,7 +29,7 @@ class Tried(NamedTuple):
     order: int
     direct: bool
     case: Case
-    found: Trained
+    found: Settled
 
 
 def count_of(case: Case) -> int:
@@ -63,35 +63,20 @@ def orders(case: Case, order: int | None, offset: bool) -> tuple[Tried, list[dic
                   for t, v in zip(tried, told, strict=True)]  # fmt: skip
 
 
-def criterion(case: Case, found: Sequence[Trained], last: Trained | None = None) -> list[float]:
+def criterion(case: Case, found: Sequence[Settled], last: Settled | None = None) -> list[float]:
     """The Bayesian information criterion of fits under the noise, with its memory, of the last."""
-    noise, cost = _noise_of(case, last or found[-1]), np.log(count_of(case))
-    return [used_by(f.fit) * cost + sum(_minus(r, t, s.size_y, noise)
-            for r, t, s in _rows(case, f)) for f in found]  # fmt: skip
+    noise = _noise_of(case, last or found[-1])
+    return [information(case, each, noise) for each in found]
 
 
-def _rows(case: Case, found: Trained) -> list[tuple[np.ndarray, np.ndarray, Seen]]:
-    """What is left of the readings and their times, of each run and output."""
-    return [(rest, s.time[i], s)
-            for i, row in enumerate(found.rest)
-            for rest, s in zip(row, case.seen, strict=True)]  # fmt: skip
-
-
-def _noise_of(case: Case, found: Trained) -> Noise | None:
+def _noise_of(case: Case, found: Settled) -> Noise | None:
     """The noise with a memory of residuals that have one; slopes are left out for speed."""
-    rows = _rows(case, found)
+    rows = case.rows(found.rest)
     if not any(remembers(rest, used_by(found.fit)) for rest, _, _ in rows):
         return None
     scaled = [rest[:LONGEST, None] / max(float(rest.std()), CLOSE * s.size_y)
               for rest, _, s in rows]  # fmt: skip
     return noise_of(scaled, [time[:LONGEST] for _, time, _ in rows], np.zeros((0, 1)))[1]
-
-
-def _minus(rest: np.ndarray, time: np.ndarray, size_y: float, noise: Noise | None) -> float:
-    """-2 ln L of residuals, their size being their own."""
-    white, volume = (rest, 0.0) if noise is None else innovations(rest, time, noise)
-    size = max(float(np.std(white)), CLOSE * size_y)
-    return 2.0 * (len(rest) * np.log(size) + float(volume))
 
 
 def free_of(case: Case, order: int, size: int, offset: bool, direct: bool) -> tuple[Free, ...]:
@@ -121,8 +106,9 @@ def _tried(case: Case, n: int, offset: bool, before: Tried | None) -> Tried:
         return padded({"p": p, "start": start @ to.T}, size)
 
     models = [model(*found) for found in realisations(u, y, n)]
-    models = sorted((each for each in models if np.isfinite(_missed(case, each))),
-                    key=lambda each: _missed(case, each))[:BEGINS]  # fmt: skip
+    missed = [case.squares(case.rest(each)) for each in models]
+    best = [i for i in np.argsort(missed, kind="stable") if np.isfinite(missed[i])]
+    models = [models[i] for i in best[:BEGINS]]
     if before is not None:
         old, last = before.order, before.found.fit.model
         a, b, c, d, _ = map(np.asarray, LINEAR.matrices(last["p"]))
@@ -141,7 +127,7 @@ def _units(case: Case, offset: bool) -> dict[str, np.ndarray]:
     seen = case.seen[0]
     y = np.array([np.mean(np.concatenate(s.measured)) for s in case.seen])
     return {
-        "u": np.stack([offset * seen.mean_u, np.where(seen.size_u > 0, seen.size_u, 1.0)]),
+        "u": np.stack([offset * seen.mean_u, seen.wide]),
         "y": np.stack([offset * y, [s.size_y for s in case.seen]]),
     }
 
@@ -159,9 +145,3 @@ def _scaled(
                 for s in case.seen]  # fmt: skip
         y.append((np.stack(read, axis=1) - units["y"][0]) / units["y"][1])
     return u, y
-
-
-def _missed(case: Case, model: Any) -> float:
-    """What a start leaves of the outputs, in units of their scatter."""
-    return sum(float(np.sum((r / s.size_y) ** 2)) for row in rest_of(case, model)
-               for r, s in zip(row, case.seen, strict=True))  # fmt: skip

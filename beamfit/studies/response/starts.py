@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -38,9 +38,11 @@ class Start(NamedTuple):
     offset: float
     squares: float
 
-    def begin(self, offset: bool) -> tuple[jax.Array, np.ndarray, tuple[float, bool]]:
-        """Where a search begins: raw numbers, first states, and offset with whether it is free."""
-        return jnp.asarray(self.raw), self.first, (self.offset, offset)
+    @property
+    def model(self) -> dict[str, Any]:
+        """The model that a search begins with."""
+        raw = jnp.asarray(self.raw)
+        return {"map": raw, "start": self.first, "offset": self.offset, "late": 0.0}
 
 
 def best_start(seen: Seen, offset: bool) -> Start:

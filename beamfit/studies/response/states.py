@@ -22,26 +22,23 @@ from beamfit.quantity import Quantity
 from beamfit.shown import shown
 from beamfit.statistics import POOR_FIT
 from beamfit.status import Status
+from beamfit.studies.response.case import Case, Settled, used_by
 from beamfit.studies.response.checks import Checks, HeldBack, checks_of, percent
 from beamfit.studies.response.curve import quantity
 from beamfit.studies.response.fit import check_runs, ordered
-from beamfit.studies.response.model import WEIGHT, Seen
+from beamfit.studies.response.model import Seen, weight_priors
 from beamfit.studies.response.noise import Noise
 from beamfit.studies.response.record import Run
-from beamfit.studies.response.settle import used_by
 from beamfit.studies.response.shooting import (
-    Case,
     System,
-    Trained,
     begun,
     closed,
     course_of,
     remembering,
-    rest_of,
     trained,
 )
 from beamfit.studies.response.starts import seen_of
-from beamfit.studies.response.verdict import Evidence, judged_outputs
+from beamfit.studies.response.verdict import Evidence, judged
 from beamfit.table import Table, json_of
 
 # A free run that explains less of an output has gone astray: segments are tried.
@@ -228,7 +225,7 @@ def fit_states(
         names = [f"p.{leaf.path}".rstrip(".") for leaf in tree.leaves(parameters)]
         free = [Free(n, nuisance=any(n.startswith(f"{net}.") for net in nets)) for n in names]
     free = [*free, *([] if known else [Free("start", nuisance=True)])]
-    inside = [Prior(f"{net}.{part}", 0.0, WEIGHT) for net in nets for part in ("weights", "biases")]
+    inside = [prior for net in nets for prior in weight_priors(net)]
     case = case_of(runs, system, free, (*inside, *priors), 0)
     _check_outputs(case, model)
     found = None if segments is not None and segments > 1 else trained(case, [model])
@@ -277,7 +274,7 @@ def _check_outputs(case: Case, model: Any) -> None:
         raise InputError(found, f"{len(case.seen)} outputs and {model['start'][0].shape} states")
 
 
-def _numbers(found: Trained) -> Derived:
+def _numbers(found: Settled) -> Derived:
     """The free numbers with errors."""
     rows = [(v.value, v.error, v.error_raw) for v in found.fit.variables]
     value, error, raw = np.array(rows).T
@@ -287,7 +284,7 @@ def _numbers(found: Trained) -> Derived:
     return Derived(value, error, raw, np.zeros(len(value)), one)
 
 
-def _explained(case: Case, found: Trained) -> list[float]:
+def _explained(case: Case, found: Settled) -> list[float]:
     """Of each output, by the free run."""
     return [
         percent(
@@ -320,7 +317,7 @@ def _nodes(case: Case, model: Any, segments: int) -> tuple[np.ndarray, np.ndarra
 
 def answer(
     case: Case,
-    found: Trained,
+    found: Settled,
     runs: tuple[Run, ...],
     quantities: Mapping[str, Quantity],
     *,
@@ -354,11 +351,11 @@ def answer(
     evidence = {
         part.output: Evidence(
             found.fit, found.rests, part.checks, told, (), ahead[part.output], map,
-            float(np.sqrt(np.mean(found.noise[:, k] ** 2))), False,
+            float(np.sqrt(np.mean(found.noise[:, k] ** 2))),
         )
         for k, part in enumerate(parts)
     }  # fmt: skip
-    status, message = judged_outputs(evidence)
+    status, message = judged(evidence)
     order = order or found.fit.model["start"].shape[1]
     held_back = ahead if held else {}
     return StatesFit(
@@ -369,14 +366,13 @@ def answer(
 
 def _added(seen: Seen, i: int, fitted: np.ndarray) -> np.ndarray:
     """What a state space that is not linear would add first: products of output and inputs."""
-    u = np.asarray(seen.runs[i].u)[np.asarray(seen.runs[i].index)]
-    u = (u - seen.mean_u) / np.where(seen.size_u > 0, seen.size_u, 1.0)
+    u = seen.scaled(seen.runs[i].u)[np.asarray(seen.runs[i].index)]
     y = ((fitted - np.mean(fitted)) / seen.size_y)[:, None]
     return np.concatenate([y**2, y**3, u**2, u * y], axis=1)
 
 
 def _ahead(
-    case: Case, found: Trained, held: Sequence[Run], delay: int
+    case: Case, found: Settled, held: Sequence[Run], delay: int
 ) -> dict[str, tuple[HeldBack, ...]]:
     """Predict runs that were held back; only the state at their start is estimated."""
     ahead: dict[str, list[HeldBack]] = {name: [] for name in held[0].outputs} if held else {}
@@ -386,7 +382,7 @@ def _ahead(
         start = np.mean(np.asarray(model["start"]), axis=0)[None]
         model = model | {"start": start, "nodes": np.zeros((1, 0, start.shape[1]))}
         sizes = np.array([[np.sqrt(np.mean(found.noise[:, k] ** 2)) for k in range(len(one.seen))]])
-        (rest,) = rest_of(one, begun(one, model, sizes))
+        (rest,) = one.rest(begun(one, model, sizes))
         for s, r in zip(one.seen, rest, strict=True):
             ahead[s.output].append(
                 HeldBack(run.name, percent(r, s.measured[0] - s.measured[0].mean()), float(r.std()))

@@ -13,7 +13,7 @@ from beamfit.statistics import POOR_FIT
 from beamfit.status import Status
 from beamfit.studies.response.checks import Checks, HeldBack
 from beamfit.studies.response.curve import TIME, Curve
-from beamfit.verdict import Finding, judge
+from beamfit.verdict import Finding
 
 # A curve of which less than this share has an error is not determined.
 HALF = 0.5
@@ -32,30 +32,9 @@ class Evidence(NamedTuple):
     held: tuple[HeldBack, ...]
     map: str
     rms: float
-    latest: bool
 
 
-def judged(
-    fit: Fit,
-    rests: bool,
-    checks: Checks,
-    quantities: Mapping[str, Quantity],
-    curves: tuple[Curve, ...],
-    held: tuple[HeldBack, ...],
-    map: str,
-    latest: bool,
-) -> tuple[Status, str]:
-    """Status and sentences; `latest` if the delay is the longest that was tried."""
-    rms = float(np.sqrt(np.mean(np.square(_rms(fit)))))
-    e = Evidence(fit, rests, checks, quantities, curves, held, map, rms, latest)
-    found = judge(e, RULES)
-    late = (
-        " The delay is the longest that was tried: say a longer one by --delay." if latest else ""
-    )
-    return found.status, found.message + late
-
-
-def judged_outputs(found: Mapping[str, Evidence]) -> tuple[Status, str]:
+def judged(found: Mapping[str, Evidence]) -> tuple[Status, str]:
     """Status and sentences of several outputs of one model: the gravest rule that any breaks."""
     for rule in RULES:
         said = {name: f for name, e in found.items() if (f := rule(e)) is not None}
@@ -68,9 +47,11 @@ def judged_outputs(found: Mapping[str, Evidence]) -> tuple[Status, str]:
     raise AssertionError("the last rule always finds something")
 
 
-def _rms(fit: Fit) -> list[float]:
-    return [float(group.scale * np.mean(np.asarray(record.error)))
-            for group, record in zip(fit.groups, fit.problem.records, strict=True)]  # fmt: skip
+def rms_of(fit: Fit) -> float:
+    """The noise of all runs, as the fit weighs them."""
+    found = [float(group.scale * np.mean(np.asarray(record.error)))
+             for group, record in zip(fit.groups, fit.problem.records, strict=True)]  # fmt: skip
+    return float(np.sqrt(np.mean(np.square(found))))
 
 
 def _lost(e: Evidence) -> Finding | None:

@@ -1,0 +1,202 @@
+"""What is fitted to runs, and a search of it in rounds: residuals tell the noise of the next."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from beamfit.greybox.correlated import Memory
+from beamfit.greybox.fit import Fit
+from beamfit.greybox.problem import Constraint, Free, Prior, Problem, Record
+from beamfit.greybox.solve import solve
+from beamfit.status import Status
+from beamfit.studies.response.model import CLOSE, Seen, output_of, predicted
+from beamfit.studies.response.noise import Noise, innovations, noise_of, remembers
+
+# Rounds with a memory of the noise at most, and the gain in -2 ln L below which nothing is gained
+# any more.
+AGAIN, GAINED = 3, 0.05
+
+
+class Case(NamedTuple):
+    """What is to be fitted: each output as seen, each run, and what is free, known and limited.
+
+    A course is a run as its model sees it: `model.Driven` or `shooting.Course`.
+    """
+
+    seen: tuple[Seen, ...]
+    courses: tuple[Any, ...]
+    free: tuple[Free, ...]
+    priors: tuple[Prior, ...]
+    limits: tuple[Constraint, ...] = ()
+
+    @property
+    def wide(self) -> np.ndarray:
+        """A guess at the noise by run and output, before anything is known of it."""
+        return np.array([[0.1 * s.size_y for s in self.seen]] * len(self.courses))
+
+    def measured(self, i: int) -> np.ndarray:
+        """Readings of a run, one output after the other."""
+        return np.concatenate([s.measured[i] for s in self.seen])
+
+    def split(self, i: int, rows: np.ndarray) -> list[np.ndarray]:
+        """Rows of the readings of a run, by output."""
+        return np.split(rows, np.cumsum([len(s.measured[i]) for s in self.seen])[:-1])
+
+    def rest(self, model: Any) -> tuple[tuple[np.ndarray, ...], ...]:
+        """What a model leaves of the readings, by run and output."""
+        return tuple(
+            tuple(self.split(i, self.measured(i) - np.asarray(output_of(model, course))))
+            for i, course in enumerate(self.courses)
+        )
+
+    def rows(self, rest: Any) -> list[tuple[np.ndarray, np.ndarray, Seen]]:
+        """What is left of the readings and their times, of each run and output."""
+        pairs = ((i, zip(row, self.seen, strict=True)) for i, row in enumerate(rest))
+        return [(r, s.time[i], s) for i, row in pairs for r, s in row]
+
+    def squares(self, rest: Any) -> float:
+        """What is left of the outputs, in units of their scatter."""
+        return sum(float(np.sum((r / s.size_y) ** 2)) for r, _, s in self.rows(rest))
+
+
+class Settled(NamedTuple):
+    """A fit whose noise is that of its own residuals.
+
+    `rest` and `noise` by run and output; `memory` of a noise with one and `errors` that average
+    over what is open of it; `likelihood` is -2 ln L, for responses with the cost of the Bayesian
+    information criterion; `rests` whether a further round would gain nothing.
+    """
+
+    fit: Fit
+    rest: tuple[tuple[np.ndarray, ...], ...]
+    noise: np.ndarray
+    memory: Noise | None
+    errors: Memory | None
+    likelihood: float
+    rests: bool
+
+    def slopes(self, case: Case) -> list[np.ndarray]:
+        """Slopes of each run's outputs by the free numbers; 0 by those that are held."""
+        free = self.fit.problem.lower < self.fit.problem.upper
+        return [free * self.fit.derive(predicted, course).slope for course in case.courses]
+
+    def remembered(
+        self, case: Case, noise: Noise | None = None, most: int | None = None
+    ) -> tuple[Memory, Noise, float]:
+        """The noise with a memory that the residuals have, of so many of them at most."""
+        problem, size, rest = self.fit.problem, self.fit.problem.size, case.rows(self.rest)
+        own = [part for i, s in enumerate(self.slopes(case)) for part in case.split(i, s)]
+        parts = zip(own, rest, self.noise.ravel(), strict=True)
+        rows = [np.column_stack([slope, -r])[:most] / s for slope, (r, _, _), s in parts]
+        prior = np.asarray(problem.residual(self.fit.theta))[size:]
+        known = np.column_stack([self.fit.jacobian[size:], prior])
+        return noise_of(rows, [time[:most] for _, time, _ in rest], known, noise)
+
+
+def used_by(fit: Fit) -> int:
+    """How many numbers the readings determined."""
+    return max(round(sum(group.count - group.dof for group in fit.groups)), 1)
+
+
+def correlated(case: Case, found: Settled) -> bool:
+    """Whether the noise of an output, that is more than rounding, has a memory."""
+    used = used_by(found.fit)
+    return any(remembers(r, used) and r.std() > CLOSE * s.size_y
+               for r, _, s in case.rows(found.rest))  # fmt: skip
+
+
+def information(case: Case, found: Settled, noise: Noise | None) -> float:
+    """The Bayesian information criterion of a fit under a noise with a memory, or without."""
+    rows = case.rows(found.rest)
+    cost = used_by(found.fit) * np.log(sum(len(rest) for rest, _, _ in rows))
+    return float(cost + sum(_minus(r, t, s.size_y, noise) for r, t, s in rows))
+
+
+def _minus(rest: np.ndarray, time: np.ndarray, size_y: float, noise: Noise | None) -> float:
+    """-2 ln L of residuals, their size being their own."""
+    white, volume = (rest, 0.0) if noise is None else innovations(rest, time, noise)
+    size = max(float(np.std(white)), CLOSE * size_y)
+    return 2.0 * (len(rest) * np.log(size) + float(volume))
+
+
+def _with_gaps(model: Any, course: Any) -> jax.Array:
+    return jnp.concatenate(course.shot(model))
+
+
+def _surprising(model: Any, course: Any) -> jax.Array:
+    """What outputs add to what the readings before foretell."""
+    return innovations(predicted(model, course), course.time, course.noise)[0]
+
+
+def problem_of(
+    case: Case, model: Any, noise: np.ndarray, memory: Noise | None = None, gap: Any = ()
+) -> Problem:
+    """State it; `gap` is how far ends of segments may lie apart, shape (states,).
+
+    `noise` by run and output is a guess that the residuals correct, `memory` how it wanders.
+    """
+    records = []
+    cuts = model["nodes"].shape[1] if len(gap) else 0
+    for i, course in enumerate(case.courses):
+        y = case.measured(i)
+        error = np.concatenate([np.full(len(s.measured[i]), noise[i, k])
+                                for k, s in enumerate(case.seen)])  # fmt: skip
+        close = all(noise[i, k] <= CLOSE * s.size_y * 1.001 for k, s in enumerate(case.seen))
+        worth, predict = np.inf if close else 1.0, _with_gaps if cuts else predicted
+        if cuts:
+            y = np.concatenate([y, np.zeros(cuts * len(gap))])
+            error = np.concatenate([error, np.tile(gap, cuts)])
+        if memory is not None:
+            course, predict = replace(course, noise=Noise(*map(jnp.asarray, memory))), _surprising
+            y = np.asarray(innovations(jnp.asarray(y), course.time, course.noise)[0])
+        records.append(Record(f"run {i + 1}", predict, course, y, error, worth=worth))
+    free = [*case.free, *([Free("nodes", nuisance=True)] if cuts else [])]
+    return Problem(model, free, records, case.priors, case.limits)
+
+
+def searched(
+    case: Case,
+    model: Any,
+    noise: np.ndarray,
+    steps: int,
+    memory: Noise | None = None,
+    gap: Any = (),
+) -> Settled:
+    """Fit with the noise that the residuals of the round before had."""
+    fit = solve(problem_of(case, model, noise, memory, gap), iterations=steps)
+    rest = case.rest(fit.model)
+    found = np.array([[max(float(r.std()), CLOSE * s.size_y)
+                       for r, s in zip(row, case.seen, strict=True)] for row in rest])  # fmt: skip
+    rests = fit.status not in (Status.not_finite, Status.not_converged)
+    minus = sum(_minus(r, t, s.size_y, None) for r, t, s in case.rows(rest))
+    minus = minus if np.isfinite(found).all() else np.inf
+    return Settled(fit, rest, found, memory, None, minus, rests)
+
+
+def rounds(found: Any, again: Callable[[Any], Any], gained: float, most: int) -> tuple[Any, bool]:
+    """Search again from what was found, until nothing is gained; and whether that came to be."""
+    for _ in range(most):
+        if not np.isfinite(found.likelihood):
+            break
+        before, found = found, again(found)
+        if abs(before.likelihood - found.likelihood) < gained:
+            return found, True
+    return found, False
+
+
+def with_memory(
+    case: Case, white: Settled, search: Callable[..., Settled], most: int | None = None
+) -> Settled:
+    """The fit again, the noise of its residuals with a memory."""
+
+    def again(found: Settled) -> Settled:
+        _, memory, size = found.remembered(case, most=most)
+        return search(case, found.fit.model, size * found.noise, memory=memory)
+
+    return rounds(white, again, GAINED, AGAIN)[0]
