@@ -83,9 +83,8 @@ def relaxed(p: Problem, s: State, starts: Iterable[np.ndarray]) -> Conflict:
 
 def _held(p: Problem, theta: np.ndarray) -> list[tuple[int, bool]]:
     """Numbers on a bound, and whether it is the lower one; fixed ones apart."""
-    loose = p.lower < p.upper
     sides = ((p.lower, True), (p.upper, False))
-    return [(i, low) for edge, low in sides for i in np.flatnonzero((theta == edge) & loose)]
+    return [(i, low) for edge, low in sides for i in np.flatnonzero((theta == edge) & p.moving)]
 
 
 # Gradients count as dependent below this singular value, at an optimum; at a point that is none,
@@ -122,7 +121,7 @@ def dependence(p: Problem, s: State, stationary: bool) -> Dependence | None:
     -------
     Dependence or None
     """
-    moving, unit = p.lower < p.upper, s.scale.unit
+    moving, unit = p.moving, s.scale.unit
     if not s.at.finite or not moving.any():
         return None
     gradients = np.vstack([np.diag(unit), s.at.jacobian * unit])[:, moving]

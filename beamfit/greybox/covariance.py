@@ -99,9 +99,11 @@ def triangle(rows: np.ndarray) -> np.ndarray:
 
 
 def directions(
-    rows: np.ndarray, equations: np.ndarray | None = None, cut: float = CUT
+    rows: np.ndarray, equations: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Split the space of numbers into what rows see, in units of its error, and what they do not.
+
+    What is seen has a singular value above `CUT` of the largest, columns scaled to unit length.
 
     Parameters
     ----------
@@ -109,8 +111,6 @@ def directions(
         Shape (m, n), a Jacobian of residuals in units of their errors.
     equations : ndarray, optional
         Shape (e, n): directions must be orthogonal to these.
-    cut : float
-        On singular values relative to the largest, columns scaled to unit length.
 
     Returns
     -------
@@ -127,22 +127,22 @@ def directions(
     unit = 1.0 / np.where(length > 0, length, 1.0)
     tangent = np.eye(n)
     if equations is not None and len(equations):
-        # Rows of one size each: the rank of equations does not depend on their units.
-        scaled = equations * unit
-        size = np.linalg.norm(scaled, axis=1, keepdims=True)
-        tangent = null_space(scaled / np.where(size > 0, size, 1.0))
+        tangent = null_space(equations * unit)
     if not tangent.shape[1]:
         return np.zeros((n, 0)), np.zeros((n, 0)), unit
     _, sizes, turned = np.linalg.svd(rows * unit @ tangent, full_matrices=True)
     largest = np.max(sizes, initial=0.0)
-    rank = int(np.sum(sizes > cut * largest))
+    rank = int(np.sum(sizes > CUT * largest))
     along = unit[:, None] * (tangent @ turned.T)
     far = FAR / largest if largest > 0 else FAR
     return along[:, :rank] / sizes[:rank], along[:, rank:] * far, unit * far
 
 
 def null_space(rows: np.ndarray) -> np.ndarray:
-    """An orthonormal basis of what is orthogonal to a few rows of one size."""
+    """An orthonormal basis of what is orthogonal to a few rows."""
+    # Rows of one size each: the rank of equations does not depend on their units.
+    length = np.linalg.norm(rows, axis=1, keepdims=True)
+    rows = rows / np.where(length > 0, length, 1.0)
     _, sizes, turned = np.linalg.svd(rows, full_matrices=True)
     return turned[int(np.sum(sizes > CUT * np.max(sizes, initial=0.0))) :].T
 

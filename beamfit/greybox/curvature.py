@@ -101,7 +101,7 @@ def lower_beside(p: Problem, s: assess.State, lagrangian: Look) -> np.ndarray | 
     rows = triangle(s.at.residual_jacobian * unit) @ tangent
     weakest = tangent @ np.linalg.svd(rows, full_matrices=True)[2][-WEAKEST:].T * unit[:, None]
     low, high = s.bounds.reached
-    inward = np.flatnonzero((low ^ high) & ~p.nuisance & (p.lower < p.upper))[:AROUND]
+    inward = np.flatnonzero((low ^ high) & ~p.nuisance & p.moving)[:AROUND]
     pushes = [
         np.where(np.arange(len(unit)) == i, unit * (1.0 if low[i] else -1.0), 0) for i in inward
     ]
@@ -169,12 +169,5 @@ def _bend(p: Problem, s: assess.State) -> assess.Bend:
 def _tangent(p: Problem, s: assess.State) -> np.ndarray:
     """Directions, in the sizes of the numbers, that keep to the limits held by a force."""
     unit = s.scale.unit
-    size = assess.gradient_size(p, s.at, s.scale)
-    held = (p.lower == p.upper) | (np.abs(s.found.bounds) > assess.TOLERANCE * size)
-    equal = p.constraint_lower == p.constraint_upper
-    pulls = np.abs(s.found.constraints) * np.linalg.norm(s.at.jacobian / size, axis=1)
-    rows = np.vstack(
-        [np.eye(len(unit))[held], s.at.jacobian[equal | (pulls > assess.TOLERANCE)] * unit]
-    )
-    length = np.linalg.norm(rows, axis=1, keepdims=True)
-    return null_space(rows / np.where(length > 0, length, 1.0))
+    held, equations = assess.holding(p, s, assess.TOLERANCE)
+    return null_space(np.vstack([np.eye(len(unit))[held], equations * unit]))

@@ -66,6 +66,11 @@ class Walk(NamedTuple):
     promised: Array
 
     @property
+    def memory(self) -> tuple[Array, Array, Array, Array]:
+        """What a search needs to go on."""
+        return self.damping, self.growth, self.scale, self.steps
+
+    @property
     def found(self) -> Found:
         """The end of the search."""
         return Found(self.theta, 0.5 * self.residual @ self.residual, self.steps, self.rested)
@@ -257,73 +262,68 @@ class Lanes:
         self.p, self.call = p, p.compiled(_walks)
         k, n = points.shape
         self.width = WIDTH if n * p.size <= LARGE else 1
-        self.theta = np.array(points)
-        self.damping, self.growth = np.full(k, DAMPING), np.full(k, 2.0)
-        self.size, self.steps = np.zeros((k, n)), np.zeros(k, int)
-        self.done, self.rested = np.zeros(k, bool), np.zeros(k, bool)
-        rows = p.residual_count
-        self.residual, self.jacobian = np.full((k, rows), np.inf), np.zeros((k, rows, n))
+        nothing, no = np.zeros(k), np.zeros(k, bool)
+        self.at = Walk(
+            np.array(points), np.full((k, p.residual_count), np.inf),
+            np.zeros((k, p.residual_count, n)), np.zeros((k, n)), nothing + DAMPING, nothing + 2.0,
+            np.zeros(k, int), no, no.copy(), np.array(points), nothing,
+        )  # fmt: skip
+
+    @property
+    def done(self) -> np.ndarray:
+        """Which have come to rest, or cannot move."""
+        return self.at.rested | self.at.stuck
 
     def go(self, lanes: np.ndarray, limit: int, until: float | None) -> None:
         """Move some searches on to a number of steps, or until a moment on the clock."""
         reached = limit if until is None else 0
         while True:
-            reached = min(max(reached, int(np.min(self.steps[lanes])) + SEGMENT), limit)
+            reached = min(max(reached, int(np.min(self.at.steps[lanes])) + SEGMENT), limit)
             moving = lanes[~self.done[lanes]]
             for some in np.split(moving, range(self.width, len(moving), self.width)):
                 self._move(some, reached)
-            unfinished = ~self.done[lanes] & (self.steps[lanes] < limit)
+            unfinished = ~self.done[lanes] & (self.at.steps[lanes] < limit)
             if not unfinished.any() or (until is not None and time.perf_counter() >= until):
                 return
 
     def _move(self, some: np.ndarray, limit: int) -> None:
-        memory = (self.damping, self.growth, self.size, self.steps)
-        found = self._called(limit, self.theta[some], *(part[some] for part in memory))
-        *state, rested, stuck = found
-        names = ("theta", "residual", "jacobian", "size", "damping", "growth", "steps")
-        for name, part in zip(names, state, strict=True):
-            getattr(self, name)[some] = part
-        self.rested[some] = rested
-        self.done[some] = rested | stuck
+        found = self._called(limit, Walk(*(part[some] for part in self.at)))
+        for own, part in zip(self.at, found, strict=True):
+            own[some] = part
 
-    def _called(self, limit: int, *state: np.ndarray) -> list[np.ndarray]:
+    def _called(self, limit: int, at: Walk) -> Walk:
         """The call for no more searches than its width, filled up with the first of them."""
-        k = len(state[0])
-        every = [*state, np.full(k, limit)]
-        filled = [np.concatenate([v, np.repeat(v[:1], self.width - k, axis=0)]) for v in every]
+        k = len(at.theta)
+        every = at.theta, at.memory, np.full(k, limit)
+        fill = self.width - k
+        filled = jax.tree.map(lambda v: np.concatenate([v, np.repeat(v[:1], fill, axis=0)]), every)
         found = self.call(*filled, self.p.lower, self.p.upper)
-        return [np.asarray(part)[:k] for part in found]
+        return Walk(*(np.asarray(part)[:k] for part in found))
 
     @property
     def cost(self) -> np.ndarray:
         """Half the sum of squares of each; infinite where something is not finite."""
-        cost = 0.5 * np.sum(self.residual**2, axis=1)
+        cost = 0.5 * np.sum(self.at.residual**2, axis=1)
         return np.where(np.isfinite(cost), cost, np.inf)
 
     def look(self, points: np.ndarray) -> np.ndarray:
         """Cost at points, without moving."""
-        found = []
-        for part in np.split(points, range(self.width, len(points), self.width)):
-            k = len(part)
-            memory = np.full(k, DAMPING), np.full(k, 2.0), np.zeros_like(part), np.zeros(k, int)
-            found.append(0.5 * np.sum(self._called(0, part, *memory)[1] ** 2, axis=1))
-        return np.concatenate(found)
+        parts = np.split(points, range(self.width, len(points), self.width))
+        found = (self._called(0, Lanes(self.p, part).at).residual for part in parts)
+        return np.concatenate([0.5 * np.sum(residual**2, axis=1) for residual in found])
 
     def move(self, lane: int, point: np.ndarray) -> None:
         """Begin one search anew."""
-        self.theta[lane], self.size[lane] = point, 0.0
-        self.damping[lane], self.growth[lane] = DAMPING, 2.0
-        self.done[lane] = self.rested[lane] = False
+        self.at.theta[lane], self.at.scale[lane] = point, 0.0
+        self.at.damping[lane], self.at.growth[lane] = DAMPING, 2.0
+        self.at.rested[lane] = self.at.stuck[lane] = False
 
 
-def _walks(core, starts, damping, growth, size, steps, limit, lower, upper):
+def _walks(core, starts, memory, limit, lower, upper) -> Walk:
     """Searches from starts, each with its own memory and limit of steps."""
     residual = partial(problem_residual, core)
 
-    def one(theta, damping, growth, size, steps, limit):
-        memory = (damping, growth, size, steps)
-        s = walk(residual, theta, lower, upper, limit, memory=memory)
-        parts = (s.theta, s.residual, s.jacobian, s.scale, s.damping, s.growth)
-        return (*parts, s.steps, s.rested, s.stuck)
+    def one(theta, memory, limit):
+        return walk(residual, theta, lower, upper, limit, memory=memory)
 
-    return jax.vmap(one)(starts, damping, growth, size, steps, limit)
+    return jax.vmap(one)(starts, memory, limit)

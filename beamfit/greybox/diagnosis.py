@@ -142,13 +142,12 @@ def _rows(looks: list[assess.Slopes], which: Callable[[assess.Slopes], np.ndarra
 
 
 def _unused(p: Problem, looks: list[assess.Slopes]) -> Iterator[Ailment]:
-    moving = p.lower < p.upper
     used = np.any([_rows(looks, part).any(axis=0) for part in _EVERYTHING], axis=0)
-    names = tuple(np.array(p.names)[moving & ~used].tolist())
+    names = tuple(np.array(p.names)[p.moving & ~used].tolist())
     if names:
         said = f"nothing depends on {listed(names)}; fix or remove what is not needed."
         yield Ailment("unused", names, said)
-    idle = ~_rows(looks, lambda at: at.jacobian)[:, moving].any(axis=1)
+    idle = ~_rows(looks, lambda at: at.jacobian)[:, p.moving].any(axis=1)
     names = tuple(np.array(p.constraint_names)[idle].tolist())
     if names:
         said = f"{listed(names)} depends on no free number; free what it limits, or remove it."
@@ -166,13 +165,12 @@ def _undetermined(p: Problem, looks: list[assess.Slopes]) -> Iterator[Ailment]:
     """Numbers of which rows, priors and equations see fewer combinations than there are."""
     if p.objectives:
         return
-    equal = p.constraint_lower == p.constraint_upper
 
     def rows(at):
-        return np.vstack([at.residual_jacobian, at.jacobian[equal]])
+        return np.vstack([at.residual_jacobian, at.jacobian[p.equations]])
 
     on = _rows(looks, rows)
-    used = np.flatnonzero(on.any(axis=0) & (p.lower < p.upper))
+    used = np.flatnonzero(on.any(axis=0) & p.moving)
     loose = _open(_unmatched(on[:, used]), [rows(at)[:, used] for at in looks])
     names = tuple(np.array(p.names)[used][loose].tolist())
     if names:
@@ -211,11 +209,10 @@ def _open(loose: np.ndarray, looks: list[np.ndarray]) -> np.ndarray:
 
 def _dependent(p: Problem, looks: list[assess.Slopes]) -> Iterator[Ailment]:
     """Equations among which one follows from the others or contradicts them."""
-    equal = np.flatnonzero(p.constraint_lower == p.constraint_upper)
-    moving = p.lower < p.upper
+    equal = np.flatnonzero(p.equations)
 
     def columns(at):
-        return at.jacobian[equal][:, moving].T
+        return at.jacobian[equal][:, p.moving].T
 
     loose = _open(_unmatched(_rows(looks, columns)), list(map(columns, looks)))
     names = tuple(np.array(p.constraint_names)[equal][loose].tolist())

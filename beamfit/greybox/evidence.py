@@ -88,12 +88,7 @@ def known(p: Problem, s: State) -> Known:
     hangs on it are those of a number that the bound only limits. Weights that nobody asks for
     stay on their bounds.
     """
-    size = assess.gradient_size(p, s.at, s.scale)
-    fixed = p.lower == p.upper
-    held = fixed | (np.abs(s.found.bounds) > 1e-9 * size)
-    equal = p.constraint_lower == p.constraint_upper
-    pulls = np.abs(s.found.constraints) * np.linalg.norm(s.at.jacobian / size, axis=1)
-    equations = s.at.jacobian[equal | (pulls > 1e-9)]
+    held, equations = assess.holding(p, s, 1e-9)
     ends = np.cumsum([record.measured.size for record in p.records], dtype=int)
     blocks = [triangle(part) for part in np.split(s.at.residual_jacobian, ends)]
     half, unseen, _ = directions(np.vstack(blocks), np.vstack([np.eye(len(held))[held], equations]))
@@ -104,7 +99,7 @@ def known(p: Problem, s: State) -> Known:
         blocks[:-1],
         half,
     )
-    still = (np.isin(s.bounds.states(s.found.bounds), EDGES) & p.nuisance) | fixed
+    still = (np.isin(s.bounds.states(s.found.bounds), EDGES) & p.nuisance) | ~p.moving
 
     def spread(factors, still):
         parts = [block / f for block, f in zip(blocks, [*factors, 1.0], strict=True)]

@@ -16,11 +16,11 @@ from beamfit.greybox import tree
 from beamfit.greybox.assess import KKT, TOLERANCE
 from beamfit.greybox.covariance import MOST_SHARE, Group, Spread
 from beamfit.greybox.problem import Problem, with_slope
+from beamfit.greybox.stated import Optimum
 from beamfit.status import Status
 from beamfit.verdict import Finding
 
 if TYPE_CHECKING:
-    from beamfit.greybox.posterior import Optimum
     from beamfit.sampling.posterior import Posterior
     from beamfit.sampling.priors import Distribution
 
@@ -279,8 +279,6 @@ class Fit:
     @property
     def optimum(self) -> Optimum:
         """What the sampler needs to know of this fit."""
-        from beamfit.greybox.posterior import Optimum
-
         near = [a for a in self.attempts if a.kkt.worst <= TOLERANCE]
         return Optimum(
             self.theta,

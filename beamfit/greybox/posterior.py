@@ -16,11 +16,11 @@ from scipy.sparse.csgraph import connected_components
 from beamfit.errors import InputError
 from beamfit.greybox import tree
 from beamfit.greybox.problem import Core, Prior, Problem, with_slope
+from beamfit.greybox.stated import Optimum, Statement, unchanged
 from beamfit.sampling.likelihood import Group
 from beamfit.sampling.posterior import Posterior
 from beamfit.sampling.priors import Distribution, checked
 from beamfit.sampling.target import Law, Target, covariance_of, slopes_of
-from beamfit.verdict import Finding
 
 # A number that is an undetermined direction's in less than this share is not part of it.
 PART = 0.05
@@ -30,109 +30,6 @@ ELSEWHERE = (
     "The search met another optimum of nearly the same cost far from this one: the intervals are "
     "those about one of them."
 )
-
-
-class Optimum(NamedTuple):
-    """Where a search ended and what a fit says there.
-
-    Attributes
-    ----------
-    theta : array, shape (n,)
-        The problem's free numbers.
-    verdict : Finding
-        On the fit.
-    scales : sequence of float
-        Factor on the errors of each record that its residuals show; NaN where they show nothing.
-    given : sequence of bool
-        Whether each record came with errors.
-    undetermined : array, shape (n, k), optional
-        Directions that neither records nor priors see.
-    others : sequence of array
-        Further optima of nearly the same cost.
-    """
-
-    theta: np.ndarray
-    verdict: Finding
-    scales: Sequence[float]
-    given: Sequence[bool]
-    undetermined: np.ndarray | None = None
-    others: Sequence[np.ndarray] = ()
-
-
-def _same(model: Any) -> Any:
-    return model
-
-
-def _no_volume(model: Any, data: Any) -> jax.Array:
-    return jnp.zeros(())
-
-
-def _model_itself(model: Any, data: Any) -> Any:
-    return model
-
-
-class Statement(NamedTuple):
-    """What a study adds to its problem for the sampler; by default nothing.
-
-    The functions stand at the top of modules, so that they are compiled once.
-
-    Attributes
-    ----------
-    derived : mapping of str to str
-        Names and units of the numbers that `derive` gives.
-    derive : callable
-        ``derive(model, data)``, shape (len(derived),).
-    build : callable
-        ``build(model, data)``: what a user's functions of a draw are given.
-    data : pytree
-        Of these functions.
-    quoted, own : callable
-        A change of variables to those in which the prior is flat and which are sampled:
-        ``quoted(model)`` puts them in the place of the problem's own, ``own(model)`` is the inverse
-        and NaN outside its domain.
-    renamed : mapping of str to str
-        How users call numbers of the problem.
-    log_volume : callable
-        ``log_volume(model, data)``, added to the log density: of a prior that is flat in something
-        else than the sampled numbers.
-    units : mapping of str to str
-        Of sampled numbers.
-    lower, width : mapping of str to float
-        Lower bounds of sampled numbers instead of the problem's own, and how far from the optimum
-        each may be at most where the data do not say.
-    labels : mapping of str to str
-        What stands for a record before the names of its noise; by default nothing if there is one
-        record, else its name.
-    trusted : sequence of str
-        Records whose errors are right, whatever the residuals show: anchors of a model.
-    noise_unit : str
-        Of the errors of records that came without.
-    priors_own, hidden : sequence of str
-        Numbers that the prior decides, and those nobody asks for.
-    remark : str
-        A further sentence.
-    nothing : str
-        Why there is no posterior; empty where there is one.
-    """
-
-    derived: Mapping[str, str] = {}
-    derive: Callable[[Any, Any], jax.Array] = _model_itself
-    build: Callable[[Any, Any], Any] = _model_itself
-    data: Any = None
-    quoted: Callable[[Any], Any] = _same
-    own: Callable[[Any], Any] = _same
-    renamed: Mapping[str, str] = {}
-    log_volume: Callable[[Any, Any], jax.Array] = _no_volume
-    units: Mapping[str, str] = {}
-    lower: Mapping[str, float] = {}
-    width: Mapping[str, float] = {}
-    labels: Mapping[str, str] = {}
-    trusted: Sequence[str] = ()
-    noise_unit: str = "1"
-    priors_own: Sequence[str] = ()
-    hidden: Sequence[str] = ()
-    remark: str = ""
-    nothing: str = ""
 
 
 @tree.node()
@@ -229,7 +126,7 @@ def target_of(
     """
     _refuse_equations(problem)
     p, stated = problem, stated or Statement()
-    moving = np.flatnonzero(p.lower < p.upper)
+    moving = np.flatnonzero(p.moving)
     names = tuple(stated.renamed.get(p.names[i], p.names[i]) for i in moving)
     priors = checked(priors, names)
     lower, upper = _bounds(p, moving, stated)
@@ -310,9 +207,8 @@ def predicted(posterior: Posterior, name: str) -> Predicted:
 
 
 def _refuse_equations(p: Problem) -> None:
-    equations = p.constraint_lower == p.constraint_upper
-    if equations.any():
-        name = p.constraint_names[int(np.argmax(equations))]
+    if p.equations.any():
+        name = p.constraint_names[int(np.argmax(p.equations))]
         expected = "limits that differ: nothing that is drawn at random meets an equation"
         raise InputError(f"the equation '{name}'", expected)
 
@@ -326,7 +222,7 @@ def _bounds(p: Problem, moving: np.ndarray, stated: Statement) -> tuple[np.ndarr
 
 def _changed(p: Problem, stated: Statement, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The optimum in the numbers that are sampled, and their derivatives by the problem's own."""
-    if stated.quoted is _same:
+    if stated.quoted is unchanged:
         return np.array(theta), np.eye(len(theta))
     found, turn = _with_slope(stated.quoted, p.core, jnp.asarray(theta))
     return np.array(found), np.asarray(turn)

@@ -185,6 +185,16 @@ class Problem:
         return self._column("upper")
 
     @cached_property
+    def moving(self) -> np.ndarray:
+        """Whether each free number may move between its bounds."""
+        return self.lower < self.upper
+
+    @cached_property
+    def equations(self) -> np.ndarray:
+        """Whether each constraint element is an equation."""
+        return self.constraint_lower == self.constraint_upper
+
+    @cached_property
     def nuisance(self) -> np.ndarray:
         """Whether each free number is one nobody asks for."""
         return self._column("nuisance").astype(bool)

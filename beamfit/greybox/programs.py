@@ -129,25 +129,17 @@ def _slsqp(program: Program, x: np.ndarray, iterations: int, budget: Budget) -> 
     """Solve by scipy's sequential quadratic programming."""
     from scipy import optimize
 
-    sides = [(1.0, program.c_lower), (-1.0, program.c_upper)]
-    equal = program.c_lower == program.c_upper
-    rules = [
-        {
-            "type": "ineq",
-            "fun": lambda at, s=s, e=e, k=k: s * (program.values(at)[1] - e)[k],
-            "jac": lambda at, s=s, k=k: s * program.slopes(at)[1][k],
-        }
-        for s, e in sides
-        if (k := np.isfinite(e) & ~equal).any()
-    ]
-    if equal.any():
-        rules.append(
-            {
-                "type": "eq",
-                "fun": lambda at: (program.values(at)[1] - program.c_lower)[equal],
-                "jac": lambda at: program.slopes(at)[1][equal],
-            }
+    ends = program.c_lower, program.c_upper
+    equal = ends[0] == ends[1]
+    limits = [
+        optimize.NonlinearConstraint(
+            lambda at, k=k: program.values(at)[1][k],
+            *(end[k] for end in ends),
+            jac=lambda at, k=k: program.slopes(at)[1][k],
         )
+        for k in (equal, ~equal & np.isfinite(ends).any(axis=0))
+        if k.any()
+    ]
     last = [x]
 
     def in_time(at):
@@ -161,7 +153,7 @@ def _slsqp(program: Program, x: np.ndarray, iterations: int, budget: Budget) -> 
             x,
             jac=lambda at: program.slopes(at)[0],
             bounds=optimize.Bounds(program.lower, program.upper),
-            constraints=rules,
+            constraints=limits,
             method="SLSQP",
             callback=in_time,
             options={"maxiter": iterations, "ftol": 1e-15},

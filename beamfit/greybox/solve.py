@@ -269,28 +269,28 @@ def _lanes(p: Problem, points: np.ndarray, budget: Budget) -> tuple[list[State],
 
 def _go_on(p: Problem, lanes: Lanes, lane: int, limit: int, budget: Budget) -> None:
     """Polish one search until it rests, or has settled in a flat valley where it gains nothing."""
-    while not lanes.done[lane] and lanes.steps[lane] < limit and budget.left > 0:
+    while not lanes.done[lane] and lanes.at.steps[lane] < limit and budget.left > 0:
         before = lanes.cost[lane]
-        lanes.go(np.array([lane]), min(limit, int(lanes.steps[lane]) + STRETCH), budget.until)
+        lanes.go(np.array([lane]), min(limit, int(lanes.at.steps[lane]) + STRETCH), budget.until)
         gained = before - lanes.cost[lane]
         if gained < NOTHING * before and settled(p, _judged(p, lanes, lane)):
             return
 
 
 def _account(p: Problem, lanes: Lanes, lane: int, s: State | None) -> Attempt:
-    theta, name = lanes.theta[lane].copy(), "Levenberg-Marquardt"
+    theta, name = lanes.at.theta[lane].copy(), "Levenberg-Marquardt"
     if not np.isfinite(lanes.cost[lane]):
         lost = assess.KKT(np.inf, np.inf, np.inf)
-        return Attempt(name, theta, np.nan, lost, int(lanes.steps[lane]), "cost not finite")
-    said = "came to rest" if lanes.rested[lane] else "ran out of iterations"
+        return Attempt(name, theta, np.nan, lost, int(lanes.at.steps[lane]), "cost not finite")
+    said = "came to rest" if lanes.at.rested[lane] else "ran out of iterations"
     s = _judged(p, lanes, lane) if s is None else s
-    return Attempt(name, theta, float(s.at.cost), s.kkt, int(lanes.steps[lane]), said)
+    return Attempt(name, theta, float(s.at.cost), s.kkt, int(lanes.at.steps[lane]), said)
 
 
 def _judged(p: Problem, lanes: Lanes, lane: int) -> State:
     """One search's end."""
-    theta = lanes.theta[lane].copy()
-    at = assess.of_squares(lanes.residual[lane], lanes.jacobian[lane])
+    theta = lanes.at.theta[lane].copy()
+    at = assess.of_squares(lanes.at.residual[lane], lanes.at.jacobian[lane])
     return assess.state(p, theta, assess.scale_of(p, theta, at), at)
 
 
@@ -302,7 +302,7 @@ def _moved_off(p: Problem, lanes: Lanes, lane: int, budget: Budget) -> State:
         if point is None or budget.left <= 0:
             break
         lanes.move(lane, point)
-        _go_on(p, lanes, lane, int(lanes.steps[lane]) + budget.iterations, budget)
+        _go_on(p, lanes, lane, int(lanes.at.steps[lane]) + budget.iterations, budget)
         s = _judged(p, lanes, lane)
     return s
 
@@ -334,7 +334,7 @@ def _program(
     p: Problem, start: np.ndarray, at: assess.Slopes, budget: Budget, hessian: str
 ) -> tuple[State, Attempt]:
     """Search with the solvers for constraints, until one ends on an optimum."""
-    moving = np.flatnonzero(p.lower < p.upper)
+    moving = np.flatnonzero(p.moving)
     scale = assess.scale_of(p, start, at)
     # Squares say nothing of further objectives; foreign code may have first derivatives only.
     usable = {"none", hessian} if p.objectives else {"none", "gauss_newton", hessian}

@@ -89,15 +89,17 @@ def _variables(p: Problem, s: State, found: Known) -> tuple[Variable, ...]:
     nothing = (found.spread.share(one) >= MOST_SHARE) | found.held
     nothing |= any(group.unknown for group in found.groups)
     errors = (np.where(nothing, np.nan, part.error(one)) for part in (found.spread, found.raw))
-    edges = s.bounds.states(s.found.bounds).tolist()
-    columns = [part.tolist() for part in (s.theta, *errors, p.lower, p.upper)]
-    return tuple(map(Variable, p.names, *columns, edges, s.found.bounds.tolist()))
+    columns = (s.theta, *errors, p.lower, p.upper, s.bounds.states(s.found.bounds), s.found.bounds)
+    return _rows(Variable, p.names, *columns)
 
 
 def _constraints(p: Problem, s: State) -> tuple[Limited, ...]:
-    edges = s.limits.states(s.found.constraints).tolist()
-    columns = [part.tolist() for part in s.limits[:3]]
-    return tuple(map(Limited, p.constraint_names, *columns, edges, s.found.constraints.tolist()))
+    states = s.limits.states(s.found.constraints)
+    return _rows(Limited, p.constraint_names, *s.limits[:3], states, s.found.constraints)
+
+
+def _rows(kind: type, names: tuple[str, ...], *columns: np.ndarray) -> tuple:
+    return tuple(map(kind, names, *(column.tolist() for column in columns)))
 
 
 def refused(
@@ -112,14 +114,11 @@ def refused(
     theta = p.start if theta is None else theta
     n, nan, inf = len(theta), np.nan, np.inf
     lost = Spread(np.full((n, n), nan), np.eye(n), np.ones(n), np.zeros(n))
-    variables = tuple(
-        Variable(name, float(v), nan, nan, float(a), float(b), "free", nan)
-        for name, v, a, b in zip(p.names, theta, p.lower, p.upper, strict=True)
-    )
-    limits = zip(p.constraint_names, p.constraint_lower, p.constraint_upper, strict=True)
-    constraints = tuple(
-        Limited(name, nan, float(a), float(b), "free", nan) for name, a, b in limits
-    )
+    none, free = np.full(n, nan), np.full(n, "free")
+    variables = _rows(Variable, p.names, theta, none, none, p.lower, p.upper, free, none)
+    none = np.full(len(p.constraint_names), nan)
+    ends, free = (p.constraint_lower, p.constraint_upper), np.full(len(none), "free")
+    constraints = _rows(Limited, p.constraint_names, none, *ends, free, none)
     return Fit(
         p, theta, status, message, nan, nan, 0, (), assess.KKT(inf, inf, inf), variables,
         constraints, lost, lost, np.zeros((p.size, n)), np.eye(n), nan, attempts, seconds,

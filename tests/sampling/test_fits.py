@@ -13,9 +13,10 @@ from scipy import stats
 
 import beamfit
 from beamfit.errors import InputError
-from beamfit.greybox.posterior import Statement, target_of
+from beamfit.greybox.posterior import target_of
 from beamfit.greybox.problem import Constraint, Free, Prior, Problem, Record
 from beamfit.greybox.solve import solve
+from beamfit.greybox.stated import Statement
 from beamfit.lifetime.decay import current
 from beamfit.sampling.priors import Normal, Uniform
 from beamfit.status import Status

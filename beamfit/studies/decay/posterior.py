@@ -13,8 +13,9 @@ from jax import Array
 from beamfit.errors import InputError
 from beamfit.greybox import tree
 from beamfit.greybox.correlated import log_volume, range_of, whitened
-from beamfit.greybox.posterior import Optimum, Sampled, Statement, target_of
+from beamfit.greybox.posterior import Sampled, target_of
 from beamfit.greybox.problem import Free, Prior, Problem, Record
+from beamfit.greybox.stated import Optimum, Statement
 from beamfit.lifetime.decay import HOUR, current
 from beamfit.sampling.intervals import Expected
 from beamfit.sampling.posterior import Posterior

@@ -15,9 +15,10 @@ from jax import Array
 from beamfit.errors import InputError, nearest
 from beamfit.greybox.covariance import Spread, spread_of
 from beamfit.greybox.fit import Fit
-from beamfit.greybox.posterior import Optimum, Statement, target_of
+from beamfit.greybox.posterior import target_of
 from beamfit.greybox.problem import Free, Prior, Problem, Record
 from beamfit.greybox.solve import solve
+from beamfit.greybox.stated import Optimum, Statement
 from beamfit.lifetime.losses import SCALES, Terms, loss_terms, scaled_losses
 from beamfit.lifetime.ring import Operation
 from beamfit.quantity import Quantity, Status

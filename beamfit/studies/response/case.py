@@ -83,7 +83,7 @@ class Settled(NamedTuple):
 
     def slopes(self, case: Case) -> list[np.ndarray]:
         """Slopes of each run's outputs by the free numbers; 0 by those that are held."""
-        free = self.fit.problem.lower < self.fit.problem.upper
+        free = self.fit.problem.moving
         return [free * self.fit.derive(predicted, course).slope for course in case.courses]
 
     def remembered(

@@ -11,8 +11,9 @@ from jax import Array
 
 from beamfit.errors import InputError
 from beamfit.greybox.fit import Fit
-from beamfit.greybox.posterior import Optimum, Statement, predicted, target_of
+from beamfit.greybox.posterior import predicted, target_of
 from beamfit.greybox.problem import Problem
+from beamfit.greybox.stated import Optimum, Statement
 from beamfit.optics.beam import BeamMatrix
 from beamfit.quantity import Status
 from beamfit.sampling.intervals import Expected
