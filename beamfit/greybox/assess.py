@@ -108,6 +108,9 @@ class KKT(NamedTuple):
         return max(self)
 
 
+LOST = KKT(np.inf, np.inf, np.inf)
+
+
 class Bend(NamedTuple):
     """The second-order test: the lowest curvature, the direction down, the Newton step.
 
@@ -239,12 +242,12 @@ def state(p: Problem, theta: np.ndarray, scale: Scale, at: Slopes | None = None)
     limits = Limits(
         at.constraints, p.constraint_lower, p.constraint_upper, size_here, TOLERANCE * size_here
     )
+    none = Multipliers(np.zeros(len(theta)), np.zeros(len(at.constraints)))
+    s = State(theta, at, bounds, limits, none, LOST, scale)
     if not at.finite:
-        none = Multipliers(np.zeros(len(theta)), np.zeros(len(at.constraints)))
-        return State(theta, at, bounds, limits, none, KKT(np.inf, np.inf, np.inf), scale)
-    found = multipliers(at.gradient, at.jacobian, bounds, limits, size)
-    distance = residual(at.gradient, at.jacobian, bounds, limits, size, found, cost)
-    return State(theta, at, bounds, limits, found, distance, scale)
+        return s
+    s = s._replace(found=multipliers(at.gradient, at.jacobian, bounds, limits, size))
+    return s._replace(kkt=_distance(s, size, cost))
 
 
 def multipliers(
@@ -301,22 +304,14 @@ def multipliers(
     return Multipliers(found[:n], found[n:])
 
 
-def residual(
-    gradient: np.ndarray,
-    jacobian: np.ndarray,
-    bounds: Limits,
-    limits: Limits,
-    scale: np.ndarray,
-    found: Multipliers,
-    cost: float,
-) -> KKT:
+def _distance(s: State, scale: np.ndarray, cost: float) -> KKT:
     """Measure how far a point with multipliers is from an optimum, `cost` being a size of it."""
-    pull = np.reshape(jacobian, (-1, len(gradient)))
-    left = gradient - found.bounds - pull.T @ found.constraints
-    size = scale + np.abs(found.constraints) @ np.abs(pull)
-    parts = ((found.bounds, bounds), (found.constraints, limits))
+    at, found = s.at, s.found
+    left = at.gradient - found.bounds - at.jacobian.T @ found.constraints
+    size = scale + np.abs(found.constraints) @ np.abs(at.jacobian)
+    parts = ((found.bounds, s.bounds), (found.constraints, s.limits))
     products = [np.abs(y * part.distance(y)) for y, part in parts]
-    crossed = np.concatenate([bounds.violation, limits.violation, [0.0]])
+    crossed = np.concatenate([s.bounds.violation, s.limits.violation, [0.0]])
     return KKT(
         float(np.max(np.abs(left) / size, initial=0.0)),
         float(np.max(crossed)),

@@ -13,6 +13,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from beamfit.greybox.terms import Record
+
 # A quantity counts as determined while bounds carry less than this share of its variance.
 MOST_SHARE = 0.5
 # A direction is seen while its singular value is above this share of the largest.
@@ -203,9 +205,8 @@ def spread_of(
 
 
 def groups_of(
-    named: Sequence[tuple[str, bool, tuple[float, float]]],
+    records: Sequence[Record],
     residuals: Sequence[np.ndarray],
-    counts: Sequence[int],
     blocks: Sequence[np.ndarray],
     half: np.ndarray,
 ) -> tuple[Group, ...]:
@@ -213,13 +214,10 @@ def groups_of(
 
     Parameters
     ----------
-    named : sequence of (str, bool, (float, float))
-        Name of each record, whether its errors were given, and degrees of freedom and sum of
-        squares of a guess at its noise.
+    records : sequence of Record
+        Which values count, whether their errors were given, the guess at their noise.
     residuals : sequence of ndarray
         In units of their errors, zero where the weight is.
-    counts : sequence of int
-        Residuals of a weight above zero.
     blocks : sequence of ndarray
         `triangle` of each record's rows of the Jacobian.
     half : ndarray
@@ -236,15 +234,12 @@ def groups_of(
     inverse χ² prior, A. Gelman et al., Bayesian Data Analysis (3rd ed., 2013), section 2.6.
     """
     found, first = [], 0
-    for (name, given, before), r, count, block in zip(
-        named, residuals, counts, blocks, strict=True
-    ):
-        chi2 = float(r @ r)
+    for record, r, block in zip(records, residuals, blocks, strict=True):
+        chi2, count = float(r @ r), int(record.used.sum())
         dof = round(count - float(np.sum((block @ half) ** 2)), 9)
-        freedom, squares = before
+        freedom, squares = record.prior_noise
         scale = math.sqrt((squares + chi2) / (freedom + dof)) if dof > 0 else math.nan
+        scale = max(1.0, scale) if record.errors_given else scale
         rows = slice(first, first := first + len(r))
-        found.append(
-            Group(name, rows, given, chi2, count, dof, max(1.0, scale) if given else scale)
-        )
+        found.append(Group(record.name, rows, record.errors_given, chi2, count, dof, scale))
     return tuple(found)

@@ -89,8 +89,11 @@ def not_finite(p: Problem, theta: np.ndarray) -> list[Ailment]:
     """Rows that are NaN or infinite at a point, or whose derivative is, by name."""
     found = []
     for what, name, function in _parts(p):
-        value, slope = with_slope(lambda t, f=function: f(p, t), jnp.asarray(theta, float))
-        value, slope = np.asarray(value), np.asarray(slope)
+
+        def flat(t, function=function):
+            return jnp.ravel(function(tree.replace(p.core.model, p.core.chosen, t)))
+
+        value, slope = map(np.asarray, with_slope(flat, jnp.asarray(theta, float)))
         bad = np.flatnonzero(~np.isfinite(value))
         steep = np.argwhere(~np.isfinite(slope))
         if bad.size:
@@ -111,22 +114,14 @@ def not_finite(p: Problem, theta: np.ndarray) -> list[Ailment]:
     return found
 
 
-def _parts(p: Problem) -> Iterator[tuple[str, str, Callable[[Problem, jax.Array], Any]]]:
-    """Every function of the problem: what it is, its name, and it as a flat function of theta."""
-
-    def of(function):
-        def flat(p, t):
-            return jnp.ravel(function(tree.replace(p.core.model, p.core.chosen, t)))
-
-        return flat
-
-    for record in p.records:
-        yield "record", record.name, of(record.residual)
-    for prior in p.priors:
-        yield "prior", prior.name, of(prior.residual)
+def _parts(p: Problem) -> Iterator[tuple[str, str, Callable[[Any], jax.Array]]]:
+    """Every function of the model in the problem: what it is, its name, and it."""
+    for what, group in (("record", p.records), ("prior", p.priors)):
+        for part in group:
+            yield what, part.name, part.residual
     for what, group in (("objective", p.objectives), ("constraint", p.constraints)):
         for part in group:
-            yield what, part.name, of(lambda model, part=part: part.function(model, part.data))
+            yield what, part.name, lambda model, part=part: part.function(model, part.data)
 
 
 def _looks(p: Problem) -> list[assess.Slopes]:

@@ -92,13 +92,7 @@ def known(p: Problem, s: State) -> Known:
     ends = np.cumsum([record.measured.size for record in p.records], dtype=int)
     blocks = [triangle(part) for part in np.split(s.at.residual_jacobian, ends)]
     half, unseen, _ = directions(np.vstack(blocks), np.vstack([np.eye(len(held))[held], equations]))
-    groups = groups_of(
-        [(r.name, r.errors_given, r.prior_noise) for r in p.records],
-        np.split(s.at.residual, ends)[:-1],
-        [int(record.used.sum()) for record in p.records],
-        blocks[:-1],
-        half,
-    )
+    groups = groups_of(p.records, np.split(s.at.residual, ends)[:-1], blocks[:-1], half)
     still = (np.isin(s.bounds.states(s.found.bounds), EDGES) & p.nuisance) | ~p.moving
 
     def spread(factors, still):

@@ -140,8 +140,15 @@ class MLP:
 
     @property
     def order(self) -> tuple[Layer, ...]:
-        """The layers in an order of computation."""
-        return tuple(self.layers[i] for i in _order(self.layers, self.connections))
+        """The layers in an order of computation, sources before targets."""
+        named = {layer.name: layer for layer in self.layers}
+        before = {name: {a for a, b in self.connections if b == name} for name in named}
+        try:
+            return tuple(named[name] for name in TopologicalSorter(before).static_order())
+        except CycleError as error:
+            raise InputError(
+                f"a loop of connections {' -> '.join(error.args[1])}", "connections without loops"
+            ) from None
 
     def __call__(self, x: jax.Array) -> jax.Array:
         """Outputs and gains at one point."""
@@ -195,18 +202,6 @@ def _certified(net: MLP, asked: Gain) -> jax.Array:
     return jnp.max(bound.upper[:, row, column])
 
 
-def _order(layers, connections) -> list[int]:
-    """Positions of the layers, sources before targets."""
-    names = [layer.name for layer in layers]
-    before = {name: {a for a, b in connections if b == name} for name in names}
-    try:
-        return [names.index(name) for name in TopologicalSorter(before).static_order()]
-    except CycleError as error:
-        raise InputError(
-            f"a loop of connections {' -> '.join(error.args[1])}", "connections without loops"
-        ) from None
-
-
 def _check_layers(net: MLP) -> None:
     """Refuse unknown node functions, doubled names and connections that lead nowhere."""
     names = [layer.name for layer in net.layers]
@@ -223,7 +218,7 @@ def _check_layers(net: MLP) -> None:
         positions(pair, names, "layer")
         if net.connections.count(pair) > 1:
             raise InputError(f"two connections {connection(*pair)}", "each connection once")
-    _order(net.layers, net.connections)
+    _ = net.order  # which has no loop
 
 
 def _check_ports(net: MLP) -> None:

@@ -129,7 +129,9 @@ def target_of(
     moving = np.flatnonzero(p.moving)
     names = tuple(stated.renamed.get(p.names[i], p.names[i]) for i in moving)
     priors = checked(priors, names)
-    lower, upper = _bounds(p, moving, stated)
+    own = zip(names, p.lower[moving], strict=True)
+    lower = np.array([stated.lower.get(name, low) for name, low in own])
+    upper = p.upper[moving]
     theta, turn = _changed(p, stated, optimum.theta)
     law, with_priors = _law(stated.own, stated.log_volume, stated.derive, stated.build)
     data = _data(p, theta, moving, stated)
@@ -211,13 +213,6 @@ def _refuse_equations(p: Problem) -> None:
         name = p.constraint_names[int(np.argmax(p.equations))]
         expected = "limits that differ: nothing that is drawn at random meets an equation"
         raise InputError(f"the equation '{name}'", expected)
-
-
-def _bounds(p: Problem, moving: np.ndarray, stated: Statement) -> tuple[np.ndarray, np.ndarray]:
-    """Bounds of what is sampled."""
-    called = (stated.renamed.get(p.names[i], p.names[i]) for i in moving)
-    lower = zip(called, p.lower[moving], strict=True)
-    return np.array([stated.lower.get(name, low) for name, low in lower]), p.upper[moving]
 
 
 def _changed(p: Problem, stated: Statement, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

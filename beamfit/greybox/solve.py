@@ -21,6 +21,7 @@ from beamfit.greybox.programs import SOLVERS, Budget, scaled
 from beamfit.greybox.verdict import conclude, refused
 from beamfit.status import Status
 
+METHOD = "Levenberg-Marquardt"
 # Steps from many starts; what is left is for the polish of the cheapest ends.
 STEPS, POLISHED = 300, 4
 # A search whose cost falls by less than this share in so many steps gains nothing.
@@ -278,13 +279,12 @@ def _go_on(p: Problem, lanes: Lanes, lane: int, limit: int, budget: Budget) -> N
 
 
 def _account(p: Problem, lanes: Lanes, lane: int, s: State | None) -> Attempt:
-    theta, name = lanes.at.theta[lane].copy(), "Levenberg-Marquardt"
+    theta, steps = lanes.at.theta[lane].copy(), int(lanes.at.steps[lane])
     if not np.isfinite(lanes.cost[lane]):
-        lost = assess.KKT(np.inf, np.inf, np.inf)
-        return Attempt(name, theta, np.nan, lost, int(lanes.at.steps[lane]), "cost not finite")
+        return Attempt(METHOD, theta, np.nan, assess.LOST, steps, "cost not finite")
     said = "came to rest" if lanes.at.rested[lane] else "ran out of iterations"
     s = _judged(p, lanes, lane) if s is None else s
-    return Attempt(name, theta, float(s.at.cost), s.kkt, int(lanes.at.steps[lane]), said)
+    return Attempt(METHOD, theta, float(s.at.cost), s.kkt, steps, said)
 
 
 def _judged(p: Problem, lanes: Lanes, lane: int) -> State:
@@ -319,8 +319,7 @@ def _one_by_one(
             break
         at = assess.slopes(p, point)
         if not (np.isfinite(at.cost) and np.all(np.isfinite(at.constraints))):
-            lost = assess.KKT(np.inf, np.inf, np.inf)
-            attempts.append(Attempt("none", point, np.nan, lost, 0, "cost not finite"))
+            attempts.append(Attempt("none", point, np.nan, assess.LOST, 0, "cost not finite"))
             continue
         s, attempt = _program(p, point, at, budget, hessian)
         if p.objectives and outgrown(s):  # from there in the sizes it has there

@@ -112,7 +112,7 @@ def refused(
 ) -> Fit:
     """A fit without an answer: where it stopped, and nothing determined."""
     theta = p.start if theta is None else theta
-    n, nan, inf = len(theta), np.nan, np.inf
+    n, nan = len(theta), np.nan
     lost = Spread(np.full((n, n), nan), np.eye(n), np.ones(n), np.zeros(n))
     none, free = np.full(n, nan), np.full(n, "free")
     variables = _rows(Variable, p.names, theta, none, none, p.lower, p.upper, free, none)
@@ -120,7 +120,7 @@ def refused(
     ends, free = (p.constraint_lower, p.constraint_upper), np.full(len(none), "free")
     constraints = _rows(Limited, p.constraint_names, none, *ends, free, none)
     return Fit(
-        p, theta, status, message, nan, nan, 0, (), assess.KKT(inf, inf, inf), variables,
+        p, theta, status, message, nan, nan, 0, (), assess.LOST, variables,
         constraints, lost, lost, np.zeros((p.size, n)), np.eye(n), nan, attempts, seconds,
     )  # fmt: skip
 

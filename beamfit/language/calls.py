@@ -32,12 +32,11 @@ def called(statement: d.Call, s: Setting, inner: Callable[[str], Callable]) -> A
         function = jax.vmap(function, in_axes=({n: 0 if b else None for n, b in batched.items()},))
     found = function(flat)
     made: Arrays = {}
-    for wire, value in zip(call.statement.outputs, found, strict=True):
+    for wire, value, (output, _) in zip(call.statement.outputs, found, names, strict=True):
         own = value.shape[1:] if any(batched.values()) else value.shape
         head = lengths if any(batched.values()) else [1] * len(axes)
         whole = Value(value.reshape(*head, *own), len(own))
         own_axes, to = widened(s.scope, axes, wire.each), wire.target
-        output = gains_of(wire, call.callee, call.statement.mapping)[0]
         part = _output(s, whole, output, call.callee, own_axes, len(axes))
         check_rank(s.scope, to, s.scope.arrays[to.name], part, wire.value)
         array, old = s.scope.arrays[to.name], made.get(to.name, s.arrays[to.name])

@@ -195,12 +195,7 @@ class Variable:
         """As `Channel.monitor`."""
         queue: asyncio.Queue[Reading | None] = asyncio.Queue(WAITING)
 
-        def come(reading: Reading | None) -> None:
-            if queue.full():
-                queue.get_nowait()
-            queue.put_nowait(reading)
-
-        subscription = self.speech.follow(self.name, come)
+        subscription = self.speech.follow(self.name, lambda reading: kept(queue, reading))
         before = None
         try:
             while True:
@@ -223,6 +218,13 @@ class Variable:
         except self.speech.refusal as error:
             found = f"'{plain(self.name)}' refuses: {plain(str(error))[:150]}"
             raise LostError(found, "a variable that does what it is asked") from None
+
+
+def kept(queue: asyncio.Queue[T], one: T) -> None:
+    """Put one into a queue; where it is full, the oldest goes."""
+    if queue.full():
+        queue.get_nowait()
+    queue.put_nowait(one)
 
 
 def _reading(found: Any) -> Reading:

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from beamfit.io.watched import Watched, WatchMachine
-from beamfit.live.channel import Channel, LostError, Reading, open_channel
+from beamfit.live.channel import Channel, LostError, Reading, kept, open_channel
 from beamfit.status import Status
 from beamfit.studies.decay.watch import CURRENT, RULE, Plan, State, noted, stepped
 from beamfit.table import cell, json_of
@@ -143,9 +143,7 @@ class _Course:
                 now = time.monotonic()
                 self.apart += 0.1 * (now - self.arrived - self.apart)
                 self.arrived = now
-            if self.queue.full():
-                self.queue.get_nowait()
-            self.queue.put_nowait((watched, reading))
+            kept(self.queue, (watched, reading))
 
 
 def _stepped(plan: Plan, state: State, readings: Sequence[tuple[Watched, Reading]]) -> State:

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from beamfit.sampling.likelihood import FRACTION, Group, noise_words
+from beamfit.sampling.likelihood import FRACTION, noise_words
 from beamfit.sampling.target import Target
 from beamfit.status import Status
 from beamfit.table import plain_name
@@ -138,12 +138,10 @@ class Evidence(NamedTuple):
     """
 
     diagnostics: Diagnostics
-    names: tuple[str, ...]
+    target: Target
     target_ess: float
     budget: int
     held: tuple[str, ...]
-    fit: Finding
-    groups: tuple[Group, ...]
 
 
 def held_by_priors(target: Target, draws: np.ndarray) -> tuple[str, ...]:
@@ -184,7 +182,7 @@ def _never_settled(e: Evidence) -> Finding | None:
 def _walkers_disagree(e: Evidence) -> Finding | None:
     if e.diagnostics.settled:
         return None
-    worst = e.names[int(np.argmax(e.diagnostics.rhat / (1 + 1 / e.diagnostics.effective)))]
+    worst = e.target.names[int(np.argmax(e.diagnostics.rhat / (1 + 1 / e.diagnostics.effective)))]
     cause = f"The budget of {e.budget} steps ended before the walkers agreed"
     said = f"{cause} (slowest: {plain_name(worst)}): raise it, and distrust the intervals."
     return Finding(Status.not_converged, said)
@@ -209,15 +207,15 @@ def _priors_decide(e: Evidence) -> Finding | None:
 
 
 def _poor_model(e: Evidence) -> Finding | None:
-    forgiving = any(group.inferred or group.outliers for group in e.groups)
-    if e.fit.status is not Status.poor_fit or forgiving:
+    forgiving = any(group.inferred or group.outliers for group in e.target.groups)
+    if e.target.verdict.status is not Status.poor_fit or forgiving:
         return None
     cause = "The fit is poor, and with errors taken as known the intervals are too narrow:"
     return Finding(Status.poor_fit, f"{cause} mend the model, or infer the noise.")
 
 
 def _agreed(e: Evidence) -> Finding:
-    return Finding(Status.converged, f"The walkers agree; errors {noise_words(e.groups)}.")
+    return Finding(Status.converged, f"The walkers agree; errors {noise_words(e.target.groups)}.")
 
 
 RULES = (_never_settled, _walkers_disagree, _too_few_draws, _priors_decide, _poor_model, _agreed)

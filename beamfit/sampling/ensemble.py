@@ -87,41 +87,28 @@ def draw(
     walkers = walkers or max(FEWEST_WALKERS, 4 * len(target.names))
     _check_options(len(target.names), seed, target_ess, budget, walkers)
     with nullcontext() if store is None else alone(store):
-        return _drawn(target, seed, target_ess, budget, walkers, store, provenance, progress)
-
-
-def _drawn(
-    target: Target,
-    seed: int,
-    target_ess: float,
-    budget: int,
-    walkers: int,
-    store: str | PathLike[str] | None,
-    provenance: Provenance,
-    progress: bool,
-) -> Posterior:
-    state = None if store is None else disk.load(store, target, seed, walkers)
-    if target.open_directions:
-        return _refused(target, seed, Status.unidentified, target.open_directions)
-    start, random = None, np.random.RandomState(seed)
-    if state is None:
-        start = first_walkers(target, walkers, random)
-        if start is None:
-            said = "no point within the bounds and constraints was found; relax them"
-            return _refused(target, seed, Status.infeasible, said)
-        chain = np.zeros((0, *start.shape))
-        state = Checkpoint(chain, chain[..., 0], random.get_state(), 0.5, 0, False, seed)
-    stored, due, begun = len(state.chain), time.perf_counter(), state
-    with Watch(progress, target_ess) as watch:
-        for state, found in _blocks(target, begun, start, target_ess, budget):
-            watch.show(state, found)
-            if store is not None and time.perf_counter() >= due:
-                spent = disk.save(store, target, state, provenance)
-                stored, due = len(state.chain), time.perf_counter() + spent / WRITING
-    posterior = _concluded(target, state, target_ess, budget)
-    if store is not None and (stored < len(state.chain) or not disk.finished(store)):
-        disk.save(store, target, state, provenance, posterior.to_json())
-    return posterior
+        state = None if store is None else disk.load(store, target, seed, walkers)
+        if target.open_directions:
+            return _refused(target, seed, Status.unidentified, target.open_directions)
+        start, random = None, np.random.RandomState(seed)
+        if state is None:
+            start = first_walkers(target, walkers, random)
+            if start is None:
+                said = "no point within the bounds and constraints was found; relax them"
+                return _refused(target, seed, Status.infeasible, said)
+            chain = np.zeros((0, *start.shape))
+            state = Checkpoint(chain, chain[..., 0], random.get_state(), 0.5, 0, False, seed)
+        stored, due, begun = len(state.chain), time.perf_counter(), state
+        with Watch(progress, target_ess) as watch:
+            for state, found in _blocks(target, begun, start, target_ess, budget):
+                watch.show(state, found)
+                if store is not None and time.perf_counter() >= due:
+                    spent = disk.save(store, target, state, provenance)
+                    stored, due = len(state.chain), time.perf_counter() + spent / WRITING
+        posterior = _concluded(target, state, target_ess, budget)
+        if store is not None and (stored < len(state.chain) or not disk.finished(store)):
+            disk.save(store, target, state, provenance, posterior.to_json())
+        return posterior
 
 
 def _check_options(n: int, seed: int, target_ess: float, budget: int, walkers: int) -> None:
@@ -270,10 +257,7 @@ def _concluded(target: Target, state: Checkpoint, target_ess: float, budget: int
         held = held_by_priors(target, chain.reshape(-1, chain.shape[2]))
     held = tuple(dict.fromkeys((*target.priors_own, *held)))
     shown = tuple(name for name in held if name not in target.hidden)
-    verdict = judge(
-        Evidence(found, target.names, target_ess, budget, shown, target.verdict, target.groups),
-        RULES,
-    )
+    verdict = judge(Evidence(found, target, target_ess, budget, shown), RULES)
     sampled = (
         f"{np.min(found.effective):.0f} effective draws after {began} steps left out "
         f"(autocorrelation {np.max(found.autocorrelation):.1f} steps, "
