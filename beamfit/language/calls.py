@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -13,42 +14,43 @@ from beamfit.language import expression as x
 from beamfit.language.evaluate import Setting, Value, check_rank, evaluate, picked, stored
 from beamfit.language.network import with_weights
 from beamfit.language.scope import Array, Axes, IndexSet, Net, Scope, located, widened
-from beamfit.language.steps import Call, calls, gains_of
+from beamfit.language.steps import callee_of, gains_of
 
 Arrays = dict[str, jax.Array]
 
 
 def called(statement: d.Call, s: Setting, inner: Callable[[str], Callable]) -> Arrays:
     """The arrays that a call changes; `inner` gives a mapping inside by name as it is computed."""
-    call = calls(s.scope, statement)
+    callee = callee_of(s.scope, statement)
     axes = s.axes
-    given = given_to(call, s)
-    names = [gains_of(w, call.callee, call.statement.mapping) for w in call.statement.outputs]
+    given = given_to(statement, callee, s)
+    names = [gains_of(w, callee, statement.mapping) for w in statement.outputs]
     lengths = [len(one) for one in axes.values()]
     batched = {n: a.shape[: len(axes)] != (1,) * len(axes) for n, a in given.items()}
     flat = {n: _points(a, lengths, batched[n]) for n, a in given.items()}
-    function = _function(s, call, inner, names)
+    run = partial(_network, callee) if isinstance(callee, Net) else inner(statement.mapping)
+    function = _function(s, callee, run, names)
     if any(batched.values()):
         function = jax.vmap(function, in_axes=({n: 0 if b else None for n, b in batched.items()},))
     found = function(flat)
     made: Arrays = {}
-    for wire, value, (output, _) in zip(call.statement.outputs, found, names, strict=True):
+    for wire, value, (output, _) in zip(statement.outputs, found, names, strict=True):
         own = value.shape[1:] if any(batched.values()) else value.shape
         head = lengths if any(batched.values()) else [1] * len(axes)
         whole = Value(value.reshape(*head, *own), len(own))
         own_axes, to = widened(s.scope, axes, wire.each), wire.target
-        part = _output(s, whole, output, call.callee, own_axes, len(axes))
+        part = _output(s, whole, output, callee, own_axes, len(axes))
         check_rank(s.scope, to, s.scope.arrays[to.name], part, wire.value)
         array, old = s.scope.arrays[to.name], made.get(to.name, s.arrays[to.name])
         made[to.name] = stored(old, s.scope, array, to, own_axes, part, wire.value)
     return made
 
 
-def given_to(call: Call, s: Setting) -> Arrays:
+def given_to(statement: d.Call, callee: Scope | Net, s: Setting) -> Arrays:
     """What a call gives: one axis for each of its iterators, then the dimensions of the input."""
     given = {}
-    for name, array in call.callee.inputs.items():
-        wires = [w for w in call.statement.inputs if w.target.name == name]
+    for name, array in callee.inputs.items():
+        wires = [w for w in statement.inputs if w.target.name == name]
         if wires:
             given[name] = _wired(s, array, wires)
     return given
@@ -105,14 +107,12 @@ def _output(s: Setting, v: Value, output: x.Name, callee, axes: Axes, count: int
     return Value(picked(v.array, [*lead, *indices], len(axes) + whole), whole)
 
 
-def _function(s: Setting, call: Call, inner, wanted) -> Callable:
+def _function(s: Setting, callee: Scope | Net, run: Callable, wanted) -> Callable:
     """What is called as a function of its inputs, giving outputs and gains in order."""
-    names, callee = sorted({output.name for output, _ in wanted}), call.callee
+    names = sorted({output.name for output, _ in wanted})
 
     def outputs(given: Arrays) -> Arrays:
-        if isinstance(callee, Net):
-            return _network(callee, given)
-        return inner(call.statement.mapping)(given, names)
+        return run(given, names)
 
     def function(given: Arrays) -> tuple[jax.Array, ...]:
         plain = outputs(given) if any(not by for _, by in wanted) else {}
@@ -131,12 +131,13 @@ def defaults(callee: Scope | Net) -> Arrays:
     return {n: jnp.asarray(a.values, float).reshape(a.shape) for n, a in given.items()}
 
 
-def _network(callee: Net, given: Arrays) -> Arrays:
+def _network(callee: Net, given: Arrays, names: list[str]) -> Arrays:
     net = callee.mlp
     if "weights" in given:
         net = with_weights(net, given["weights"])
     found = net(jnp.stack([given[name] for name in net.inputs]))
-    return dict(zip(net.outputs, found, strict=True))
+    every = dict(zip(net.outputs, found, strict=True))
+    return {name: every[name] for name in names}
 
 
 def _gain(s: Setting, callee, outputs, given: Arrays, output: x.Name, by: tuple[x.Name, ...]):

@@ -28,7 +28,7 @@ from beamfit.language.scope import (
     whole_of,
     widened,
 )
-from beamfit.language.steps import Call, calls, gains_of, sources, targets, written
+from beamfit.language.steps import callee_of, gains_of, sources, targets, written
 
 NOBODY = -1
 # Names that the message of a loop shows.
@@ -109,7 +109,7 @@ def order_of(scope: Scope) -> Order:
     _check_work(scope)
     for step in scope.steps:
         if isinstance(step.what, d.Call):
-            _check_wires(scope, calls(scope, step.what), step)
+            _check_wires(scope, step, step.what)
         for node, axes in targets(scope, step):
             _own(scope, owners, step, written(scope, node, axes))
     needs: dict[int, set[int]] = {step.number: set() for step in scope.steps}
@@ -204,26 +204,27 @@ def _check_defined(array: Array, owners: dict[str, np.ndarray]) -> None:
         raise error_at(array.at, f"output '{name}' that no statement sets", f"{name} = ...;")
 
 
-def _check_wires(scope: Scope, call: Call, step: Step) -> None:
+def _check_wires(scope: Scope, step: Step, call: d.Call) -> None:
     """Check indices on the side of what is called, and that each input is given whole."""
+    callee = callee_of(scope, call)
     given: dict[str, np.ndarray] = {}
-    for wire in call.statement.inputs:
-        array = call.callee.inputs[wire.target.name]
+    for wire in call.inputs:
+        array = callee.inputs[wire.target.name]
         axes = widened(scope, {}, wire.each)
         found = Read(array, wire.target, axes, located(scope, wire.target, array, axes))
         given.setdefault(array.name, np.zeros(max(array.size, 1), bool))[found.flat] = True
     for name, hit in given.items():
-        array = call.callee.inputs[name]
+        array = callee.inputs[name]
         if not hit.all() and array.values is None:
             missing = array.element(int(np.argmin(hit)))
-            found = f"'{missing}' of {call.statement.mapping} is not given"
-            raise error_at(call.statement.at, found, f"all of {array.said}")
-    for wire in call.statement.outputs:
+            found = f"'{missing}' of {call.mapping} is not given"
+            raise error_at(call.at, found, f"all of {array.said}")
+    for wire in call.outputs:
         axes = widened(scope, step.axes, wire.each)
-        output, inputs = gains_of(wire, call.callee, call.statement.mapping)
-        located(scope, output, call.callee.outputs[output.name], axes)
+        output, inputs = gains_of(wire, callee, call.mapping)
+        located(scope, output, callee.outputs[output.name], axes)
         for e in inputs:
-            array = call.callee.inputs[e.name]
+            array = callee.inputs[e.name]
             if len(e.indices) != len(array.dims):
                 found = f"'{e}' in '{wire.value}'"
                 raise error_at(

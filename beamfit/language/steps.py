@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 from beamfit.errors import nearest
 from beamfit.language import document as d
 from beamfit.language import expression as x
@@ -11,14 +9,7 @@ from beamfit.language.expression import error_at
 from beamfit.language.scope import Axes, Net, Read, Scope, Step, located, widened
 
 
-class Call(NamedTuple):
-    """A call with what it calls."""
-
-    statement: d.Call
-    callee: Scope | Net
-
-
-def calls(scope: Scope, call: d.Call) -> Call:
+def callee_of(scope: Scope, call: d.Call) -> Scope | Net:
     """Find what a call calls, and check the names on both sides."""
     callee = scope.callees.get(call.mapping)
     if callee is None:
@@ -40,7 +31,7 @@ def calls(scope: Scope, call: d.Call) -> Call:
         raise error_at(call.at, f"a call of {call.mapping} without outputs", "outputs behind '::'")
     for wire in call.outputs:
         gains_of(wire, callee, call.mapping)
-    return Call(call, callee)
+    return callee
 
 
 def gains_of(

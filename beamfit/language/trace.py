@@ -15,7 +15,7 @@ from beamfit.language.evaluate import Setting, Value, evaluate
 from beamfit.language.lags import Plan
 from beamfit.language.order import Group
 from beamfit.language.scope import Axes, IndexSet, Scope, Step, said_at
-from beamfit.language.steps import calls
+from beamfit.language.steps import callee_of
 
 
 class _FoundError(Exception):
@@ -157,12 +157,12 @@ def _of_step(program: Program, step: Step, s: Setting) -> str | None:
 
 def _of_call(program: Program, step: Step, s: Setting, slopes: bool = False) -> str | None:
     """What is not finite in a mapping that is called, for the first point at which it is not."""
-    call = calls(s.scope, step.what)
-    if not isinstance(call.callee, Scope):
+    callee = callee_of(s.scope, step.what)
+    if not isinstance(callee, Scope):
         return None
     inner = Program(program.order.inner[step.what.mapping], {})
     try:
-        given = given_to(call, s)
+        given = given_to(step.what, callee, s)
     except _FoundError as found:
         return str(found)
     names = sorted({w.value.name for w in step.what.outputs if isinstance(w.value, x.Name)})

@@ -34,8 +34,7 @@ from beamfit.studies.fedbatch.model import (
 from beamfit.studies.fedbatch.verdict import RULES, Evidence, Noise, noise_of
 from beamfit.studies.response.case import rounds
 from beamfit.studies.response.curve import Curve
-from beamfit.studies.response.fit import ordered
-from beamfit.studies.response.record import Run
+from beamfit.studies.response.record import Run, ordered
 from beamfit.table import Table, json_of
 from beamfit.verdict import judge
 

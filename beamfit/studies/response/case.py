@@ -36,8 +36,8 @@ class Case(NamedTuple):
     limits: tuple[Constraint, ...] = ()
 
     @property
-    def wide(self) -> np.ndarray:
-        """A guess at the noise by run and output, before anything is known of it."""
+    def guess(self) -> np.ndarray:
+        """The noise by run and output, before anything is known of it."""
         return np.array([[0.1 * s.size_y for s in self.seen]] * len(self.courses))
 
     def measured(self, i: int) -> np.ndarray:

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from beamfit.dynamics.response import PHYSICS, Physics
+from beamfit.dynamics.response import PHYSICS
 from beamfit.errors import InputError, nearest
 from beamfit.greybox.fit import Fit
 from beamfit.quantity import Quantity
@@ -22,7 +22,7 @@ from beamfit.studies.response.limits import limited
 from beamfit.studies.response.misread import Misread, sound
 from beamfit.studies.response.model import Seen, network_of, output_of
 from beamfit.studies.response.noise import Noise
-from beamfit.studies.response.record import Run
+from beamfit.studies.response.record import Run, check_inputs, checked
 from beamfit.studies.response.settle import begun, case_of, is_first_order, settled, within
 from beamfit.studies.response.starts import latest
 from beamfit.studies.response.verdict import Evidence, judged, rms_of
@@ -218,9 +218,13 @@ def identify(
     >>> fit.status.value, fit.delay, abs(fit.quantities["tau"].value - 5.0) < 0.1
     ('converged', 0, True)
     """
-    runs = (runs,) if isinstance(runs, Run) else tuple(runs)
-    physics = _checked(runs, tuple(held), model, map)
-    runs, held = (tuple(ordered(run, runs[0]) for run in each) for each in (runs, held))
+    if model not in PHYSICS:
+        raise InputError(f"model '{model}'", nearest(model, list(PHYSICS)))
+    if map not in MAPS:
+        raise InputError(f"map '{map}'", nearest(map, list(MAPS)))
+    physics = PHYSICS[model]
+    runs, held = checked(runs, held, physics.even)
+    check_inputs(runs)
     output = _output(runs[0], output)
     shortest = min(len(run) for run in runs)
     if delay is not None and not 0 <= delay < shortest - 1:
@@ -271,43 +275,3 @@ def _output(run: Run, output: str | None) -> str:
     if output is None and len(names) > 1:
         raise InputError(f"{len(names)} outputs", f"one of {', '.join(names)}")
     return output or names[0]
-
-
-def _checked(runs: tuple[Run, ...], held: tuple[Run, ...], model: str, map: str) -> Physics:
-    if model not in PHYSICS:
-        raise InputError(f"model '{model}'", nearest(model, list(PHYSICS)))
-    if map not in MAPS:
-        raise InputError(f"map '{map}'", nearest(map, list(MAPS)))
-    check_runs(runs, held, PHYSICS[model].even)
-    check_inputs(runs)
-    return PHYSICS[model]
-
-
-def check_runs(runs: tuple[Run, ...], held: tuple[Run, ...], even: bool) -> None:
-    """Refuse runs that do not fit together, `even` for those that need equal steps."""
-    if not runs:
-        raise InputError("no runs", "at least one")
-    first = runs[0]
-    for run in (*runs, *held):
-        if set(run.inputs) != set(first.inputs) or set(run.outputs) != set(first.outputs):
-            said = f"inputs {', '.join(run.inputs)} and outputs {', '.join(run.outputs)}"
-            raise run.unusable(said, f"those of {first.name}: {first.headline.partition(', ')[2]}")
-        if even and run.step is None:
-            raise run.unusable("samples at unequal distances", "equal ones, or --model first-order")
-        if even and not np.isclose(run.step, first.step, rtol=0.01):
-            expected = f"{first.step:.4g} s, as in {first.name}, or --model first-order"
-            raise run.unusable(f"samples every {run.step:.4g} s", expected)
-
-
-def check_inputs(runs: tuple[Run, ...]) -> None:
-    """Refuse runs of which an input never changes."""
-    first = runs[0]
-    for name in first.inputs:
-        if all(np.ptp(run.inputs[name]) == 0 for run in runs):
-            said = f"input {name} at {runs[0].inputs[name][0]:g} all the time"
-            raise first.unusable(said, "an input that changes: a step at least")
-
-
-def ordered(run: Run, first: Run) -> Run:
-    """The run with its inputs in the order of the first: matrices have them by their place."""
-    return replace(run, inputs={name: run.inputs[name] for name in first.inputs})

@@ -17,7 +17,7 @@ from beamfit.greybox.problem import Free, Prior
 from beamfit.quantity import Quantity
 from beamfit.studies.response.case import Case, Settled
 from beamfit.studies.response.curve import GAIN, PURE, TIME, WIDE, derived, quantity
-from beamfit.studies.response.fit import MAPS, check_inputs
+from beamfit.studies.response.fit import MAPS
 from beamfit.studies.response.model import WEIGHT
 from beamfit.studies.response.order import (
     Tried,
@@ -28,9 +28,9 @@ from beamfit.studies.response.order import (
     orders,
 )
 from beamfit.studies.response.realise import LINEAR, NETWORK, stripped
-from beamfit.studies.response.record import Run
+from beamfit.studies.response.record import Run, check_inputs, checked
 from beamfit.studies.response.shooting import Course, remembering, trained
-from beamfit.studies.response.states import StatesFit, answer, case_of, checked
+from beamfit.studies.response.states import StatesFit, answer, case_of
 
 
 def identify_states(

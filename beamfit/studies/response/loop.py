@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -258,7 +258,7 @@ def simulate_loop(
     changes = tuple(_changes(control, fits, time, wanted, load, trace))
     loop = Loop(Status.converged, "", control, fits, time, wanted, trace, changes)
     found = judge(loop, RULES)
-    return Loop(found.status, found.message, control, fits, time, wanted, trace, changes)
+    return replace(loop, status=found.status, message=found.message)
 
 
 def _series(

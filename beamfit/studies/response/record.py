@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -103,3 +103,40 @@ class Run:
 
     def __str__(self) -> str:
         return self.headline
+
+
+def checked(
+    runs: Run | Sequence[Run], held: Sequence[Run], even: bool
+) -> tuple[tuple[Run, ...], tuple[Run, ...]]:
+    """Runs and those held back with their inputs in one order, as matrices have them.
+
+    Refuses what does not fit together; `even` for models that need equal steps.
+    """
+    runs, held = (runs,) if isinstance(runs, Run) else tuple(runs), tuple(held)
+    if not runs:
+        raise InputError("no runs", "at least one")
+    first = runs[0]
+    for run in (*runs, *held):
+        if set(run.inputs) != set(first.inputs) or set(run.outputs) != set(first.outputs):
+            said = f"inputs {', '.join(run.inputs)} and outputs {', '.join(run.outputs)}"
+            raise run.unusable(said, f"those of {first.name}: {first.headline.partition(', ')[2]}")
+        if even and run.step is None:
+            raise run.unusable("samples at unequal distances", "equal ones, or --model first-order")
+        if even and not np.isclose(run.step, first.step, rtol=0.01):
+            expected = f"{first.step:.4g} s, as in {first.name}, or --model first-order"
+            raise run.unusable(f"samples every {run.step:.4g} s", expected)
+    return tuple(tuple(ordered(run, first) for run in each) for each in (runs, held))
+
+
+def check_inputs(runs: tuple[Run, ...]) -> None:
+    """Refuse runs of which an input never changes."""
+    first = runs[0]
+    for name in first.inputs:
+        if all(np.ptp(run.inputs[name]) == 0 for run in runs):
+            said = f"input {name} at {runs[0].inputs[name][0]:g} all the time"
+            raise first.unusable(said, "an input that changes: a step at least")
+
+
+def ordered(run: Run, first: Run) -> Run:
+    """The run with its inputs in the order of the first: matrices have them by their place."""
+    return replace(run, inputs={name: run.inputs[name] for name in first.inputs})

@@ -52,7 +52,7 @@ def settled(case: Case, models: Sequence[Any]) -> Settled:
 
     The noise weighs against the priors of a network, so it is taken anew in every round.
     """
-    tried = (_round(case, model, case.wide) for model in models)
+    tried = (_round(case, model, case.guess) for model in models)
     found = min(tried, key=lambda each: each.likelihood)
     gained = GAINED + 1e-9 * abs(found.likelihood)
     found, rests = rounds(found, lambda f: _round(case, f.fit.model, f.noise), gained, ROUNDS)

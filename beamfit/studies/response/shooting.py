@@ -95,7 +95,7 @@ def closed(case: Case, model: Any, close: np.ndarray) -> Any:
 
     `close` (n,) is the states' scatter. H. Bock, multiple shooting, 1983.
     """
-    noise = case.wide
+    noise = case.guess
     for width in CLOSING:
         shot = _round(case, model, noise, gap=width * close)
         if not np.isfinite(shot.likelihood):
@@ -106,7 +106,7 @@ def closed(case: Case, model: Any, close: np.ndarray) -> Any:
 
 def trained(case: Case, models: Sequence[Any]) -> Settled:
     """Fit from each start for a round, then from the best until nothing is gained."""
-    found = min((_round(case, m, case.wide) for m in models), key=lambda each: each.likelihood)
+    found = min((_round(case, m, case.guess) for m in models), key=lambda each: each.likelihood)
     enough = GAINED + EACH * sum(len(r) for row in found.rest for r in row)
     found, rests = rounds(found, lambda f: _round(case, f.fit.model, f.noise), enough, ROUNDS)
     return found._replace(rests=rests or found.rests)

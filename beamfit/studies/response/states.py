@@ -25,10 +25,9 @@ from beamfit.status import Status
 from beamfit.studies.response.case import Case, Settled, used_by
 from beamfit.studies.response.checks import Checks, HeldBack, checks_of, percent
 from beamfit.studies.response.curve import quantity
-from beamfit.studies.response.fit import check_runs, ordered
 from beamfit.studies.response.model import Seen, weight_priors
 from beamfit.studies.response.noise import Noise
-from beamfit.studies.response.record import Run
+from beamfit.studies.response.record import Run, checked
 from beamfit.studies.response.shooting import (
     System,
     begun,
@@ -239,15 +238,6 @@ def fit_states(
             for i, name in enumerate(found.fit.problem.names)
             if name.startswith("p.") and not found.fit.problem.nuisance[i]}  # fmt: skip
     return answer(case, found, runs, said, held=held, map="network" if nets else "constant")
-
-
-def checked(
-    runs: Run | Sequence[Run], held: Sequence[Run], even: bool
-) -> tuple[tuple[Run, ...], tuple[Run, ...]]:
-    """The runs as tuples with their columns in one order; raises where they do not fit together."""
-    runs = (runs,) if isinstance(runs, Run) else tuple(runs)
-    check_runs(runs, tuple(held), even)
-    return tuple(tuple(ordered(run, runs[0]) for run in each) for each in (runs, held))
 
 
 def case_of(
