@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -40,6 +40,11 @@ class Case(NamedTuple):
         """The noise by run and output, before anything is known of it."""
         return np.array([[0.1 * s.size_y for s in self.seen]] * len(self.courses))
 
+    @property
+    def floor(self) -> np.ndarray:
+        """What is left of each output below which it is the model's."""
+        return np.array([CLOSE * s.size_y for s in self.seen])
+
     def measured(self, i: int) -> np.ndarray:
         """Readings of a run, one output after the other."""
         return np.concatenate([s.measured[i] for s in self.seen])
@@ -63,6 +68,42 @@ class Case(NamedTuple):
     def squares(self, rest: Any) -> float:
         """What is left of the outputs, in units of their scatter."""
         return sum(float(np.sum((r / s.size_y) ** 2)) for r, _, s in self.rows(rest))
+
+    def problem(
+        self, model: Any, noise: np.ndarray, memory: Noise | None = None, gap: Any = ()
+    ) -> Problem:
+        """State it; `gap` is how far ends of segments may lie apart, shape (states,).
+
+        `noise` by run and output is a guess that the residuals correct, `memory` how it wanders.
+        """
+        records = []
+        cuts = model["nodes"].shape[1] if len(gap) else 0
+        for i, course in enumerate(self.courses):
+            y, predict = self.measured(i), _with_gaps if cuts else predicted
+            error = np.repeat(noise[i], [len(s.measured[i]) for s in self.seen])
+            worth = np.inf if np.all(noise[i] <= 1.001 * self.floor) else 1.0
+            if cuts:
+                y = np.concatenate([y, np.zeros(cuts * len(gap))])
+                error = np.concatenate([error, np.tile(gap, cuts)])
+            if memory is not None:
+                course = replace(course, noise=Noise(*map(jnp.asarray, memory)))
+                y = np.asarray(innovations(jnp.asarray(y), course.time, course.noise)[0])
+                predict = _surprising
+            records.append(Record(f"run {i + 1}", predict, course, y, error, worth=worth))
+        free = [*self.free, *([Free("nodes", nuisance=True)] if cuts else [])]
+        return Problem(model, free, records, self.priors, self.limits)
+
+    def search(
+        self, model: Any, noise: np.ndarray, steps: int, memory: Noise | None = None, gap: Any = ()
+    ) -> Settled:
+        """Fit with the noise that the residuals of the round before had."""
+        fit = solve(self.problem(model, noise, memory, gap), iterations=steps)
+        rest = self.rest(fit.model)
+        found = np.maximum([[float(r.std()) for r in row] for row in rest], self.floor)
+        minus = sum(_minus(r, t, s.size_y, None) for r, t, s in self.rows(rest))
+        minus = minus if np.isfinite(found).all() else np.inf
+        rests = fit.status not in (Status.not_finite, Status.not_converged)
+        return Settled(fit, rest, found, memory, None, minus, rests)
 
 
 class Settled(NamedTuple):
@@ -98,17 +139,16 @@ class Settled(NamedTuple):
         known = np.column_stack([self.fit.jacobian[size:], prior])
         return noise_of(rows, [time[:most] for _, time, _ in rest], known, noise)
 
+    def correlated(self, case: Case) -> bool:
+        """Whether the noise of an output, that is more than rounding, has a memory."""
+        used = used_by(self.fit)
+        return any(remembers(r, used) and r.std() > CLOSE * s.size_y
+                   for r, _, s in case.rows(self.rest))  # fmt: skip
+
 
 def used_by(fit: Fit) -> int:
     """How many numbers the readings determined."""
     return max(round(sum(group.count - group.dof for group in fit.groups)), 1)
-
-
-def correlated(case: Case, found: Settled) -> bool:
-    """Whether the noise of an output, that is more than rounding, has a memory."""
-    used = used_by(found.fit)
-    return any(remembers(r, used) and r.std() > CLOSE * s.size_y
-               for r, _, s in case.rows(found.rest))  # fmt: skip
 
 
 def information(case: Case, found: Settled, noise: Noise | None) -> float:
@@ -134,51 +174,6 @@ def _surprising(model: Any, course: Any) -> jax.Array:
     return innovations(predicted(model, course), course.time, course.noise)[0]
 
 
-def problem_of(
-    case: Case, model: Any, noise: np.ndarray, memory: Noise | None = None, gap: Any = ()
-) -> Problem:
-    """State it; `gap` is how far ends of segments may lie apart, shape (states,).
-
-    `noise` by run and output is a guess that the residuals correct, `memory` how it wanders.
-    """
-    records = []
-    cuts = model["nodes"].shape[1] if len(gap) else 0
-    for i, course in enumerate(case.courses):
-        y = case.measured(i)
-        error = np.concatenate([np.full(len(s.measured[i]), noise[i, k])
-                                for k, s in enumerate(case.seen)])  # fmt: skip
-        close = all(noise[i, k] <= CLOSE * s.size_y * 1.001 for k, s in enumerate(case.seen))
-        worth, predict = np.inf if close else 1.0, _with_gaps if cuts else predicted
-        if cuts:
-            y = np.concatenate([y, np.zeros(cuts * len(gap))])
-            error = np.concatenate([error, np.tile(gap, cuts)])
-        if memory is not None:
-            course, predict = replace(course, noise=Noise(*map(jnp.asarray, memory))), _surprising
-            y = np.asarray(innovations(jnp.asarray(y), course.time, course.noise)[0])
-        records.append(Record(f"run {i + 1}", predict, course, y, error, worth=worth))
-    free = [*case.free, *([Free("nodes", nuisance=True)] if cuts else [])]
-    return Problem(model, free, records, case.priors, case.limits)
-
-
-def searched(
-    case: Case,
-    model: Any,
-    noise: np.ndarray,
-    steps: int,
-    memory: Noise | None = None,
-    gap: Any = (),
-) -> Settled:
-    """Fit with the noise that the residuals of the round before had."""
-    fit = solve(problem_of(case, model, noise, memory, gap), iterations=steps)
-    rest = case.rest(fit.model)
-    found = np.array([[max(float(r.std()), CLOSE * s.size_y)
-                       for r, s in zip(row, case.seen, strict=True)] for row in rest])  # fmt: skip
-    rests = fit.status not in (Status.not_finite, Status.not_converged)
-    minus = sum(_minus(r, t, s.size_y, None) for r, t, s in case.rows(rest))
-    minus = minus if np.isfinite(found).all() else np.inf
-    return Settled(fit, rest, found, memory, None, minus, rests)
-
-
 def rounds(found: Any, again: Callable[[Any], Any], gained: float, most: int) -> tuple[Any, bool]:
     """Search again from what was found, until nothing is gained; and whether that came to be."""
     for _ in range(most):
@@ -188,6 +183,20 @@ def rounds(found: Any, again: Callable[[Any], Any], gained: float, most: int) ->
         if abs(before.likelihood - found.likelihood) < gained:
             return found, True
     return found, False
+
+
+def settled(
+    case: Case,
+    models: Sequence[Any],
+    search: Callable[..., Settled],
+    gained: Callable[[Settled], float],
+    most: int,
+) -> Settled:
+    """Search from each start for a round, then from the best until nothing is gained."""
+    tried = (search(case, model, case.guess) for model in models)
+    found = min(tried, key=lambda each: each.likelihood)
+    found, rests = rounds(found, lambda f: search(case, f.fit.model, f.noise), gained(found), most)
+    return found._replace(rests=rests or found.rests)
 
 
 def with_memory(

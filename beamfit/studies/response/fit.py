@@ -23,7 +23,7 @@ from beamfit.studies.response.misread import Misread, sound
 from beamfit.studies.response.model import Seen, network_of, output_of
 from beamfit.studies.response.noise import Noise
 from beamfit.studies.response.record import Run, check_inputs, checked
-from beamfit.studies.response.settle import begun, case_of, is_first_order, settled, within
+from beamfit.studies.response.settle import begun, case_of, is_first_order, remembering, within
 from beamfit.studies.response.starts import latest
 from beamfit.studies.response.verdict import Evidence, judged, rms_of
 from beamfit.table import Table, json_of
@@ -239,7 +239,7 @@ def identify(
         first = plain.fit.model
         raw = np.asarray(first["map"])
         nets = (network_of(seen, physics, raw, hidden, seed + k) for k in range(starts))
-        answer = settled(case_of(seen, offset, True), [first | {"map": net} for net in nets])
+        answer = remembering(case_of(seen, offset, True), [first | {"map": net} for net in nets])
     if gains:
         limits = limited(gains, seen, physics, map == "network")
         answer = within(case_of(seen, offset, map == "network", limits), answer)

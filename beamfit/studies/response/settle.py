@@ -14,11 +14,9 @@ from beamfit.studies.response.case import (
     GAINED,
     Case,
     Settled,
-    correlated,
     information,
-    problem_of,
     rounds,
-    searched,
+    settled,
     with_memory,
 )
 from beamfit.studies.response.limits import Limited
@@ -43,21 +41,17 @@ def case_of(seen: Seen, offset: bool, network: bool = False, told: Limited | Non
 
 def _round(case: Case, model: Any, noise: np.ndarray, memory: Noise | None = None) -> Settled:
     """A search that pays for what it uses; the part of a sample in a delay begins anew."""
-    found = searched(case, model | {"late": 0.0}, noise, STEPS, memory)
+    found = case.search(model | {"late": 0.0}, noise, STEPS, memory)
     return found._replace(likelihood=information(case, found, memory))
 
 
-def settled(case: Case, models: Sequence[Any]) -> Settled:
-    """Search from each start for a round, then from the best until nothing is gained.
+def remembering(case: Case, models: Sequence[Any]) -> Settled:
+    """The best fit from some starts, its noise with a memory where residuals are correlated.
 
     The noise weighs against the priors of a network, so it is taken anew in every round.
     """
-    tried = (_round(case, model, case.guess) for model in models)
-    found = min(tried, key=lambda each: each.likelihood)
-    gained = GAINED + 1e-9 * abs(found.likelihood)
-    found, rests = rounds(found, lambda f: _round(case, f.fit.model, f.noise), gained, ROUNDS)
-    found = found._replace(rests=rests or found.rests)
-    if not correlated(case, found):
+    found = settled(case, models, _round, lambda f: GAINED + 1e-9 * abs(f.likelihood), ROUNDS)
+    if not found.correlated(case):
         return found
     again = with_memory(case, found, _round)
     return again._replace(rests=found.rests, errors=again.remembered(case)[0])
@@ -76,7 +70,7 @@ def begun(
 ) -> Begun:
     """Identify with constant parameters; the delay among candidates if None."""
     start, seen, delay = start_of(runs, output, physics, delay, offset)
-    return Begun(seen, delay, settled(case_of(seen, offset), [start.model]))
+    return Begun(seen, delay, remembering(case_of(seen, offset), [start.model]))
 
 
 def is_first_order(found: Begun, offset: bool) -> bool:
@@ -85,12 +79,12 @@ def is_first_order(found: Begun, offset: bool) -> bool:
         return False
     lower = found.seen._replace(runs=driven_by(found.seen, FIRST_ORDER))
     start = best_start(lower, offset)
-    return settled(case_of(lower, offset), [start.model]).likelihood <= found.plain.likelihood
+    return remembering(case_of(lower, offset), [start.model]).likelihood <= found.plain.likelihood
 
 
 def within(case: Case, found: Settled) -> Settled:
     """A fit brought within the limits of a case; as it is where it keeps them."""
-    problem = problem_of(case, found.fit.model | {"late": 0.0}, found.noise, found.memory)
+    problem = case.problem(found.fit.model | {"late": 0.0}, found.noise, found.memory)
     values = np.asarray(problem.constraint_values(problem.start))
     kept = (values >= problem.constraint_lower) & (values <= problem.constraint_upper)
     kept = np.append(kept, (problem.start >= problem.lower) & (problem.start <= problem.upper))

@@ -16,10 +16,7 @@ from beamfit.studies.response.case import (
     GAINED,
     Case,
     Settled,
-    correlated,
-    problem_of,
-    rounds,
-    searched,
+    settled,
     with_memory,
 )
 from beamfit.studies.response.model import Seen
@@ -87,7 +84,7 @@ def course_of(system: System, seen: Sequence[Seen], i: int) -> Course:
     return Course(system, run.u, run.dt, index, time, run.run, None)
 
 
-_round = partial(searched, steps=STEPS)
+_round = partial(Case.search, steps=STEPS)
 
 
 def closed(case: Case, model: Any, close: np.ndarray) -> Any:
@@ -106,20 +103,18 @@ def closed(case: Case, model: Any, close: np.ndarray) -> Any:
 
 def trained(case: Case, models: Sequence[Any]) -> Settled:
     """Fit from each start for a round, then from the best until nothing is gained."""
-    found = min((_round(case, m, case.guess) for m in models), key=lambda each: each.likelihood)
-    enough = GAINED + EACH * sum(len(r) for row in found.rest for r in row)
-    found, rests = rounds(found, lambda f: _round(case, f.fit.model, f.noise), enough, ROUNDS)
-    return found._replace(rests=rests or found.rests)
+    enough = GAINED + EACH * sum(len(each) for s in case.seen for each in s.measured)
+    return settled(case, models, _round, lambda found: enough, ROUNDS)
 
 
 def begun(case: Case, model: Any, noise: np.ndarray) -> Any:
     """The model with what is free fitted once: the first states of runs that were held back."""
-    return solve(problem_of(case, model, noise)).model
+    return solve(case.problem(model, noise)).model
 
 
 def remembering(case: Case, white: Settled) -> Settled:
     """The fit again, its noise with a memory, where residuals are correlated."""
-    if not correlated(case, white):
+    if not white.correlated(case):
         return white
     found = with_memory(case, white, _round, LONGEST)
     if case.squares(found.rest) > WORSE * case.squares(white.rest):
