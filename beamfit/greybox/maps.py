@@ -65,12 +65,13 @@ def positions(chosen: Sequence[str], names: Sequence[str], what: str = "name") -
     return [list(names).index(name) for name in chosen]
 
 
-def _distinct(names: Sequence[str], what: str) -> tuple[str, ...]:
-    """Give the names back as a tuple if each stands there once."""
-    names = tuple(names)
-    if len(set(names)) < len(names):
-        raise InputError(f"{what} {', '.join(names)}", "each name once")
-    return names
+def _named(m: Map) -> None:
+    """Have the names of a map as tuples; each may stand there once."""
+    for side in ("inputs", "outputs"):
+        names = tuple(getattr(m, side))
+        if len(set(names)) < len(names):
+            raise InputError(f"{side} {', '.join(names)}", "each name once")
+        object.__setattr__(m, side, names)
 
 
 @tree.node("inputs", "outputs")
@@ -112,8 +113,7 @@ class Affine:
                 f"a matrix of shape {matrix.shape} and an offset of shape {offset.shape}",
                 f"shapes {shape} and {shape[:1]}, one row for each output",
             )
-        object.__setattr__(self, "inputs", _distinct(self.inputs, "inputs"))
-        object.__setattr__(self, "outputs", _distinct(self.outputs, "outputs"))
+        _named(self)
         object.__setattr__(self, "matrix", matrix)
         object.__setattr__(self, "offset", offset)
 
@@ -149,8 +149,7 @@ class Formula:
     parameters: Any = None
 
     def __post_init__(self):
-        object.__setattr__(self, "inputs", _distinct(self.inputs, "inputs"))
-        object.__setattr__(self, "outputs", _distinct(self.outputs, "outputs"))
+        _named(self)
 
     def __call__(self, x: jax.Array) -> jax.Array:
         """Outputs at one point."""
@@ -278,8 +277,7 @@ class Foreign:
     hessian: Callable[[np.ndarray], np.ndarray] | None = None
 
     def __post_init__(self):
-        object.__setattr__(self, "inputs", _distinct(self.inputs, "inputs"))
-        object.__setattr__(self, "outputs", _distinct(self.outputs, "outputs"))
+        _named(self)
 
     def __call__(self, x: jax.Array) -> jax.Array:
         """Outputs at one point."""

@@ -30,13 +30,14 @@ def called(statement: d.Call, s: Setting, inner: Callable[[str], Callable]) -> A
     flat = {n: _points(a, lengths, batched[n]) for n, a in given.items()}
     run = partial(_network, callee) if isinstance(callee, Net) else inner(statement.mapping)
     function = _function(s, callee, run, names)
-    if any(batched.values()):
+    many = any(batched.values())
+    if many:
         function = jax.vmap(function, in_axes=({n: 0 if b else None for n, b in batched.items()},))
     found = function(flat)
     made: Arrays = {}
     for wire, value, (output, _) in zip(statement.outputs, found, names, strict=True):
-        own = value.shape[1:] if any(batched.values()) else value.shape
-        head = lengths if any(batched.values()) else [1] * len(axes)
+        own = value.shape[1:] if many else value.shape
+        head = lengths if many else [1] * len(axes)
         whole = Value(value.reshape(*head, *own), len(own))
         own_axes, to = widened(s.scope, axes, wire.each), wire.target
         part = _output(s, whole, output, callee, own_axes, len(axes))

@@ -55,13 +55,10 @@ def format_statements(statements: Sequence[d.Statement]) -> str:
 
 def number_text(value: float) -> str:
     """Write a number so that it reads back the same, whole ones without a point."""
-    if value == math.floor(value) and abs(value) < 1e15 and (value != 0 or not _negative(value)):
-        return str(int(value))
-    return repr(float(value))
-
-
-def _negative(value: float) -> bool:
-    return math.copysign(1.0, value) < 0
+    value = float(value)
+    signed = value == 0 and math.copysign(1.0, value) < 0
+    whole = value.is_integer() and abs(value) < 1e15 and not signed
+    return str(int(value)) if whole else repr(value)
 
 
 def _name(text: str) -> str:
@@ -73,12 +70,7 @@ def _word(text: str) -> str:
 
 
 def _pair(low: float, high: float) -> str:
-    return f"[{number_text_or_inf(low)}, {number_text_or_inf(high)}]"
-
-
-def number_text_or_inf(value: float) -> str:
-    """Write a number that may be infinite."""
-    return repr(value) if math.isinf(value) else number_text(value)
+    return f"[{number_text(low)}, {number_text(high)}]"
 
 
 def _problem(p: d.Problem | None) -> Iterable[str]:

@@ -15,7 +15,7 @@ from beamfit.language import document as d
 from beamfit.language.elements import Node, read_elements
 from beamfit.language.expression import Elements
 from beamfit.language.parse import parse_statements
-from beamfit.language.text import format_statements, number_text_or_inf
+from beamfit.language.text import format_statements, number_text
 
 MLP = "com.pav.pdas.model.mlp.MlpMapping"
 EXPRESSIONS = "com.pav.pdas.model.expression.ExpressionMapping"
@@ -238,9 +238,9 @@ def _problem_elements(p: d.Problem | None) -> list[Plain.Element]:
     for v in p.variables:
         given = _labelled(v)
         if v.value is not None:
-            given["value"] = number_text_or_inf(v.value)
+            given["value"] = number_text(v.value)
         if v.random is not None:
-            low, high = map(number_text_or_inf, v.random)
+            low, high = map(number_text, v.random)
             given |= {"useRandomInitial": "true", "randomLower": low, "randomUpper": high}
         if v.seed:
             given["randomSeed"] = str(v.seed)
@@ -248,7 +248,7 @@ def _problem_elements(p: d.Problem | None) -> list[Plain.Element]:
     for limit in p.limits:
         Plain.SubElement(e, "constraint", _labelled(limit))
     for goal in p.goals:
-        weight = {} if goal.weight == 1.0 else {"coefficient": number_text_or_inf(goal.weight)}
+        weight = {} if goal.weight == 1.0 else {"coefficient": number_text(goal.weight)}
         Plain.SubElement(e, "objective", _labelled(goal) | weight)
     return [e]
 
@@ -257,7 +257,7 @@ def _labelled(of: d.Variable | d.Limit | d.Goal) -> dict[str, str]:
     given = {"label": of.label, "modelVariable": of.model}
     for key, usual in (("lower", -math.inf), ("upper", math.inf)):
         if (value := getattr(of, key, usual)) != usual:
-            given[key] = number_text_or_inf(value)
+            given[key] = number_text(value)
     return given
 
 
@@ -288,11 +288,11 @@ def _declare(e: Plain.Element, of: d.Declared) -> None:
     if of.values is not None and (of.dimensions or len(of.values) != 1):
         Plain.SubElement(e, "values").text = _row(of.values)
     elif of.values is not None:
-        e.set("value", number_text_or_inf(of.values[0]))
+        e.set("value", number_text(of.values[0]))
 
 
 def _row(values: Sequence[float]) -> str:
-    return f"[{', '.join(map(number_text_or_inf, values))}]"
+    return f"[{', '.join(map(number_text, values))}]"
 
 
 def _network_element(n: d.Network) -> Plain.Element:
@@ -300,5 +300,5 @@ def _network_element(n: d.Network) -> Plain.Element:
     for part in n.parts:
         inner = Plain.SubElement(e, part.kind, dict(part.attributes))
         if part.values is not None:
-            inner.text = ", ".join(map(number_text_or_inf, part.values))
+            inner.text = ", ".join(map(number_text, part.values))
     return e
