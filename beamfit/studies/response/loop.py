@@ -255,8 +255,8 @@ def simulate_loop(
     noise = np.stack([_noise(fit, time, seed + i) for i, fit in enumerate(fits)], axis=1)
     run = jax.jit(partial(closed_loop, control))
     trace = Trace(*map(np.asarray, run(begin, wanted, noise, load)))
-    changes = tuple(_changes(control, fits, time, wanted, load, trace))
-    loop = Loop(Status.converged, "", control, fits, time, wanted, trace, changes)
+    loop = Loop(Status.converged, "", control, fits, time, wanted, trace, ())
+    loop = replace(loop, changes=tuple(_changes(loop, load)))
     found = judge(loop, RULES)
     return replace(loop, status=found.status, message=found.message)
 
@@ -300,20 +300,14 @@ def _noise(fit: ResponseFit, time: np.ndarray, seed: int) -> np.ndarray:
     return size * (np.sqrt(1.0 - fit.memory.white) * wander + np.sqrt(fit.memory.white) * white)
 
 
-def _changes(
-    control: Controller,
-    fits: Sequence[ResponseFit],
-    time: np.ndarray,
-    wanted: np.ndarray,
-    load: np.ndarray,
-    trace: Trace,
-) -> list[Change]:
+def _changes(loop: Loop, load: np.ndarray) -> list[Change]:
     """How each step of a target, or of a disturbance, is followed until the next one."""
+    time, wanted, trace = loop.time, loop.targets, loop.trace
     # A change of one output is felt by the others: all are followed until the next one of any.
     steps = np.diff(np.hstack([wanted, load]), axis=0, prepend=np.nan)
     every = np.flatnonzero((steps != 0).any(axis=1))
     found = []
-    for i, fit in enumerate(fits):
+    for i, fit in enumerate(loop.fits):
         aim = np.diff(wanted[:, i], prepend=trace.outputs[0, i])
         push = np.diff(load[:, i], prepend=0.0)
         begins = np.flatnonzero((aim != 0) | (push != 0))
@@ -324,7 +318,7 @@ def _changes(
             near = max(SETTLED * abs(step or push[k]), float(np.mean(fit.noise)))
             off = np.flatnonzero(np.abs(error) > near)
             after = int(off[-1]) + 1 if off.size else 0
-            settling = None if after >= len(error) else after * control.step
+            settling = None if after >= len(error) else after * loop.control.step
             over = max(0.0, float((error * np.sign(step)).max()) / abs(step)) if step else None
             left = float(error[-max(1, int(LAST * len(error))) :].mean())
             end_at = float(wanted[k, i])
@@ -363,10 +357,10 @@ def _short(loop: Loop) -> Finding | None:
         if change.settling is not None:
             continue
         i = [r.name for r in loop.control.responses].index(change.output)
-        margin = loop.control.responses[i].margin
-        low, high = loop.control.limits.below[i], loop.control.limits.above[i]
+        low, high = (ends[i] for ends in loop.control.held)
         off = f"{change.output} stays {abs(change.left):.3g} off {change.after:.4g}"
-        if not low + margin <= change.after <= high - margin:
+        if not low <= change.after <= high:
+            margin = loop.control.responses[i].margin
             cause = f"{off}: its limit is held off by {margin:.3g} for noise and model."
             return Finding(Status.at_limit, cause, "Wish for less, or identify with less noise.")
         ends = touched(loop)[-max(1, int(LAST * len(loop.time))) :].mean(axis=0) > 0.5

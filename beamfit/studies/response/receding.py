@@ -176,6 +176,12 @@ class Controller:
             return np.asarray(jax.jacfwd(lambda plan: outputs(self, state, plan))(self.rest))
 
     @property
+    def held(self) -> tuple[np.ndarray, np.ndarray]:
+        """Limits of the outputs less their margins."""
+        margin = np.array([r.margin for r in self.responses])
+        return self.limits.below + margin, self.limits.above - margin
+
+    @property
     def rest(self) -> np.ndarray:
         """A plan of nothing."""
         return np.zeros((self.horizon, len(self.inputs)))
@@ -269,8 +275,7 @@ def advance(
 
 def _excess(control: Controller, ahead: jax.Array) -> jax.Array:
     """How far outputs pass their limits less the margins."""
-    margin = np.array([r.margin for r in control.responses])
-    below, above = control.limits.below + margin, control.limits.above - margin
+    below, above = control.held
     return jnp.maximum(jnp.maximum(below - ahead, ahead - above), 0.0)
 
 
@@ -331,8 +336,7 @@ def _output_rows(
 ) -> tuple[jax.Array, jax.Array]:
     """Limits of outputs, less margins, those that there are."""
     many, rows, room = len(control.responses), [matrix[:0]], [base[:0]]
-    for i, r in enumerate(control.responses):
-        below, above = control.limits.below[i] + r.margin, control.limits.above[i] - r.margin
+    for i, (r, below, above) in enumerate(zip(control.responses, *control.held, strict=True)):
         for sign, limit in ((1.0, above), (-1.0, below)):
             if np.isfinite(limit):
                 rows.append(sign * matrix[i::many])
