@@ -45,7 +45,7 @@ def lagrangian_hessian(core, theta, sigma, y):
 
 
 def second_order(
-    p: Problem, s: assess.State, exact: bool, lagrangian: Look
+    p: Problem, s: assess.State, exact: bool
 ) -> tuple[assess.State, np.ndarray | None]:
     """The second-order test of a point that is an optimum to first order.
 
@@ -57,8 +57,6 @@ def second_order(
         The point.
     exact : bool
         Whether second derivatives may be asked for.
-    lagrangian : callable
-        ``lagrangian(points)``, with the point's multipliers.
 
     Returns
     -------
@@ -67,6 +65,11 @@ def second_order(
     array, shape (n,), or None
         Another point, from where to go on, if the cost falls beside this one.
     """
+
+    def lagrangian(points):
+        found = (p.compiled(problem.values)(point) for point in points)
+        return np.array([float(c) - s.found.constraints @ np.asarray(held) for c, held in found])
+
     if not (p.objectives and exact):
         point = lower_beside(p, s, lagrangian)
         return s._replace(bend=assess.Bend(None if point is None else point - s.theta)), point

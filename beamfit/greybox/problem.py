@@ -98,6 +98,11 @@ def constraints(core: Core, theta: jax.Array) -> jax.Array:
     return jnp.concatenate(parts) if parts else jnp.zeros(0)
 
 
+def values(core: Core, theta: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Cost and constraints."""
+    return cost(core, theta), constraints(core, theta)
+
+
 @dataclass(frozen=True, eq=False)
 class Problem:
     """A fit to be done.

@@ -37,7 +37,7 @@ class Program(NamedTuple):
 
     `values(x)` gives cost and constraints, `slopes(x)` the cost's gradient and the constraints'
     Jacobian, `hessian(x, sigma, y)` the Hessian of sigma * cost - y @ constraints.
-    `unit` is the size of x; `lagrangian(y)` gives a function of points in the problem's numbers.
+    `numbers(x)` are the problem's own, `point(theta)` is x of them.
     """
 
     values: Callable[[np.ndarray], tuple[float, np.ndarray]]
@@ -47,8 +47,8 @@ class Program(NamedTuple):
     upper: np.ndarray
     c_lower: np.ndarray
     c_upper: np.ndarray
-    unit: np.ndarray
-    lagrangian: Callable[[np.ndarray], Callable[[np.ndarray], np.ndarray]]
+    numbers: Callable[[np.ndarray], np.ndarray]
+    point: Callable[[np.ndarray], np.ndarray]
 
 
 class Proposal(NamedTuple):
@@ -183,22 +183,13 @@ SOLVERS: tuple[Stage, ...] = (
 """In the order of trying; what an interior point leaves short of its limits is sharpened."""
 
 
-def _values(core, theta):
-    return problem.cost(core, theta), problem.constraints(core, theta)
-
-
 def _tame(size: np.ndarray) -> np.ndarray:
     """Sizes near 1 are left alone: solvers' own steps and tolerances are made for those."""
     return np.where((size > 1e2) | (size < 1e-2), size, 1.0)
 
 
 def scaled(
-    p: Problem,
-    start: np.ndarray,
-    moving: np.ndarray,
-    at: assess.Slopes,
-    scale: assess.Scale,
-    hessian: str,
+    p: Problem, start: np.ndarray, at: assess.Slopes, scale: assess.Scale, hessian: str
 ) -> Program:
     """A problem for a solver: moving numbers, cost and constraints in their sizes.
 
@@ -208,8 +199,6 @@ def scaled(
         The problem.
     start : array, shape (n,)
         Holds the numbers that do not move.
-    moving : array of int
-        Which do.
     at : Slopes
         At the start.
     scale : Scale
@@ -222,6 +211,7 @@ def scaled(
     Program
         That remembers its last points.
     """
+    moving = np.flatnonzero(p.moving)
     unit, limit = _tame(scale.unit)[moving], _tame(scale.limit)
     steepest = max(np.max(np.abs(at.gradient * scale.unit)), 1e-300)
     # Squares are counted in their errors; a steep cost is flattened, as IPOPT does.
@@ -237,7 +227,7 @@ def scaled(
         return [np.asarray(part) for part in p.compiled(function)(full(np.frombuffer(x)))]
 
     def values(x):
-        cost, c = parts(_values, x.tobytes())
+        cost, c = parts(problem.values, x.tobytes())
         return flat * float(cost), c / limit
 
     def slopes(x):
@@ -253,13 +243,6 @@ def scaled(
         h = np.asarray(exact(full(x), sigma * flat, y / limit))
         return h[np.ix_(moving, moving)] * np.outer(unit, unit)
 
-    def lagrangian(y):
-        def at_points(points):
-            found = (p.compiled(_values)(point) for point in points)
-            return np.array([float(cost) - y @ np.asarray(c) for cost, c in found])
-
-        return at_points
-
     return Program(
         values,
         slopes,
@@ -268,6 +251,6 @@ def scaled(
         p.upper[moving] / unit,
         p.constraint_lower / limit,
         p.constraint_upper / limit,
-        unit,
-        lagrangian,
+        full,
+        lambda theta: theta[moving] / unit,
     )

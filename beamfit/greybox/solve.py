@@ -333,32 +333,25 @@ def _program(
     p: Problem, start: np.ndarray, at: assess.Slopes, budget: Budget, hessian: str
 ) -> tuple[State, Attempt]:
     """Search with the solvers for constraints, until one ends on an optimum."""
-    moving = np.flatnonzero(p.moving)
     scale = assess.scale_of(p, start, at)
     # Squares say nothing of further objectives; foreign code may have first derivatives only.
     usable = {"none", hessian} if p.objectives else {"none", "gauss_newton", hessian}
     exact = hessian == "exact"
     best, tried, steps, said = None, [], 0, ""
     for stage in (stage for stage in SOLVERS if stage.hessian in usable):
-        program = scaled(p, start, moving, at, scale, stage.hessian)
+        program = scaled(p, start, at, scale, stage.hessian)
         near = best is not None and best.kkt.feasibility <= TOLERANCE
         begin = best.theta if near else start
         if not near and stage.name in tried:
             continue
         for _ in range(1 + MOVES):
-            end = stage.solve(
-                program, begin[moving] / program.unit, min(stage.steps, budget.iterations), budget
-            )
-            theta = start.copy()
-            theta[moving] = end.x * program.unit
-            theta = np.clip(theta, p.lower, p.upper)
-            s = assess.state(p, theta, scale)
+            most = min(stage.steps, budget.iterations)
+            end = stage.solve(program, program.point(begin), most, budget)
+            s = assess.state(p, np.clip(program.numbers(end.x), p.lower, p.upper), scale)
             steps, said = steps + end.iterations, end.said
             point = None
             if s.kkt.worst <= TOLERANCE:
-                s, point = curvature.second_order(
-                    p, s, exact, program.lagrangian(s.found.constraints)
-                )
+                s, point = curvature.second_order(p, s, exact)
             if best is None or _best(p, [best, s]) == 1:
                 best = s
             if point is None or budget.left <= 0:

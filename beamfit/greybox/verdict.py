@@ -24,10 +24,7 @@ def _inner_failure(p: Problem, theta: np.ndarray) -> str | None:
     """What an implicit map inside the model says of its own convergence at the answer."""
     if not p.has_part(Implicit):
         return None
-    look = checkify.checkify(
-        jax.jit(lambda core, t: (problem.cost(core, t), problem.constraints(core, t))),
-        errors=checkify.user_checks,
-    )
+    look = checkify.checkify(jax.jit(problem.values), errors=checkify.user_checks)
     said = look(p.core, jnp.asarray(theta, float))[0].get()
     return None if said is None else said.removesuffix(" (`check` failed)")
 
