@@ -287,15 +287,14 @@ class Lanes:
                 return
 
     def _move(self, some: np.ndarray, limit: int) -> None:
-        found = self._called(limit, Walk(*(part[some] for part in self.at)))
-        for own, part in zip(self.at, found, strict=True):
+        begin = jax.tree.map(lambda part: part[some], (self.at.theta, self.at.memory))
+        for own, part in zip(self.at, self._called(limit, *begin), strict=True):
             own[some] = part
 
-    def _called(self, limit: int, at: Walk) -> Walk:
+    def _called(self, limit: int, theta: np.ndarray, memory: tuple[np.ndarray, ...]) -> Walk:
         """The call for no more searches than its width, filled up with the first of them."""
-        k = len(at.theta)
-        every = at.theta, at.memory, np.full(k, limit)
-        fill = self.width - k
+        k, fill = len(theta), self.width - len(theta)
+        every = theta, memory, np.full(k, limit)
         filled = jax.tree.map(lambda v: np.concatenate([v, np.repeat(v[:1], fill, axis=0)]), every)
         found = self.call(*filled, self.p.lower, self.p.upper)
         return Walk(*(np.asarray(part)[:k] for part in found))
@@ -309,7 +308,8 @@ class Lanes:
     def look(self, points: np.ndarray) -> np.ndarray:
         """Cost at points, without moving."""
         parts = np.split(points, range(self.width, len(points), self.width))
-        found = (self._called(0, Lanes(self.p, part).at).residual for part in parts)
+        fresh = (Lanes(self.p, part).at for part in parts)
+        found = [self._called(0, at.theta, at.memory).residual for at in fresh]
         return np.concatenate([0.5 * np.sum(residual**2, axis=1) for residual in found])
 
     def move(self, lane: int, point: np.ndarray) -> None:
