@@ -50,13 +50,10 @@ class Course(NamedTuple):
         above = np.flatnonzero(y >= titre)
         if not above.size or above[0] == 0:
             return Quantity(float("nan") if not above.size else float(self.time[0]), None, "h")
-        k = int(above[0])
-        slope = (y[k] - y[k - 1]) / (self.time[k] - self.time[k - 1])
-        share = (titre - y[k - 1]) / (y[k] - y[k - 1])
-        error = self.error[TITRE]
-        there = (1.0 - share) * error[k - 1] + share * error[k]
-        at = self.time[k - 1] + share * (self.time[k] - self.time[k - 1])
-        return Quantity(float(at), float(there / slope), "h")
+        near = slice(above[0] - 1, above[0] + 1)
+        (slope,) = np.diff(y[near]) / np.diff(self.time[near])
+        at, error = (np.interp(titre, y[near], of[near]) for of in (self.time, self.error[TITRE]))
+        return Quantity(float(at), float(error / slope), "h")
 
 
 def _ahead(model: Any, asked: tuple[Batches, Any]) -> Any:
@@ -109,7 +106,6 @@ def _one(
     if len(start) != len(OUTPUTS) or not min(start[0], start[2]) > 0 or min(start) < 0:
         raise InputError(f"a start of {start}", f"{', '.join(OUTPUTS)}, biomass and volume above 0")
     held = {n: np.broadcast_to(np.asarray(v, float), time.shape) for n, v in inputs.items()}
-    start = tuple(np.maximum(start, 1e-9))
     return batches_of([time], [held], like)
 
 
