@@ -96,10 +96,9 @@ class Losses(
     def rates(self, current: float) -> dict[str, Array]:
         """Loss rate of each mechanism at a current in mA, 1/s."""
         found = {m.name: 0.0 for m in MECHANISMS}
-        for m, part in zip(QUADRATIC, self, strict=False):
-            found[m.name] += part * current
-        for m, part in zip(LINEAR, self[len(QUADRATIC) :], strict=True):
-            found[m.name] += part
+        powers = (current,) * len(QUADRATIC) + (1.0,) * len(LINEAR)
+        for m, part, power in zip((*QUADRATIC, *LINEAR), self, powers, strict=True):
+            found[m.name] += part * power
         return found
 
 

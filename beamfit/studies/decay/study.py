@@ -14,7 +14,7 @@ from beamfit.shown import shown
 from beamfit.studies.decay.budget import Budget, Machine, budget
 from beamfit.studies.decay.checks import DecayChecks, check_decay
 from beamfit.studies.decay.cycles import alike, cut_at_refills, is_refilled, joined
-from beamfit.studies.decay.fit import FEWEST, DecayFit, bare, fit_decay
+from beamfit.studies.decay.fit import DecayFit, bare, fit_decay
 from beamfit.studies.decay.pool import FEWEST_CYCLES
 from beamfit.studies.decay.pooled import fit_cycles, seen_through, stands_alone
 from beamfit.studies.decay.record import DecayRecord
@@ -201,9 +201,6 @@ def study_record(record: DecayRecord, machine: Machine | None = None) -> RecordS
     >>> [f"{decay.fit.lifetime_mean.value:.3f} h" for decay in study.decays]
     ['10.000 h', '10.000 h']
     """
-    if len(record) < FEWEST:
-        expected = f"{FEWEST} or more for a decay"
-        raise InputError(f"{len(record)} readings", expected, path=record.name)
     record = thinned(record)
     # Segments move `start` with them: counted from zero it is their place in the record.
     placed = replace(record, start=0.0)
