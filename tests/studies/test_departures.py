@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp, trapezoid
 
+from beamfit.quantity import Status
 from beamfit.studies.decay.fit import fit_decay
 from beamfit.studies.decay.law import DecayNumbers, Moments, beam_current, bent_current
 from beamfit.studies.decay.record import Conditions, DecayRecord
@@ -287,3 +288,11 @@ def test_residuals_far_above_the_scatter_of_neighbours_are_said():
     assert said in fit_decay(noisy(time, beam, 3e-3)).message
     plain = integrated(lambda t, i: 2e-8 * i + 2e-6, 500, 300.0, 3 * HOUR)[1]
     assert said not in fit_decay(noisy(time, plain, 3e-3)).message
+
+
+def test_five_readings_are_an_answer_also_where_they_refute_the_law():
+    """A law with five numbers leaves none for the noise: nothing is divided by zero."""
+    time = np.arange(5) * 10.0
+    fit = fit_decay(DecayRecord(time, 100 - time / 100))
+    assert fit.status is Status.infeasible
+    assert fit.outgassing is None

@@ -270,8 +270,10 @@ def change_of_rate(
     by_power = _falls(power[:, None], residual)[0]
 
     def found(count: int) -> Change | None:
-        at, fall = _best(lambda times: beside_the_law(kinks(times)), residual, record.span, count)
         dof = len(record) - 3 - count
+        if dof < 1:
+            return None
+        at, fall = _best(lambda times: beside_the_law(kinks(times)), residual, record.span, count)
         unit = max((residual @ residual - fall) / dof, least)
         chance = TIMES**count * 2 * stdtr(dof, -math.sqrt(fall / unit))
         if chance > REJECTED or fall - by_power < count * BETTER * unit:

@@ -38,6 +38,8 @@ from beamfit.studies.decay.record import DecayRecord
 STARTS, LONGEST = (0.05, 0.2, 0.7), 1.0
 # The relaxing loss and its time constant are known to a third at least.
 TELLING = 1 / 3
+# I0, a, b, the relaxing loss and its time constant.
+NUMBERS = 5
 LEAST = 1e-3
 
 
@@ -141,6 +143,8 @@ def outgassing_of(record: DecayRecord, plain: Physical, change: Change | None) -
     Least squares on all three; by the likelihood of residuals as alike as those that are left, and
     with a number more than the exponent.
     """
+    if len(record) <= NUMBERS:  # nothing is left that tells the noise
+        return None
     record = averaged(record)
     power = power_law(record)
     mean, span = float(record.current.mean()), record.span
@@ -159,7 +163,7 @@ def outgassing_of(record: DecayRecord, plain: Physical, change: Change | None) -
 
 def _noise(record: DecayRecord, found: _Fitted) -> float:
     """The square of a residual, times how many neighbours say the same."""
-    unit = found.squares / (len(record) - found.theta.size)
+    unit = found.squares / (len(record) - NUMBERS)
     unit = unit if record.error is None else max(unit, 1.0)
     alike = float(found.residuals[1:] @ found.residuals[:-1]) / found.squares
     alike = min(max(alike, 0.0), 0.99)
@@ -176,7 +180,7 @@ def _quoted(record: DecayRecord, found: _Fitted) -> Outgassing:
         np.array([a, start, 1, 1, 0]) / span, np.array([a, start, 1, 0, 0]) / span,
     ])  # fmt: skip
     about = Expansion(found.residuals, found.rows, slopes)
-    remembered = is_correlated(found.residuals, found.theta.size)
+    remembered = is_correlated(found.residuals, NUMBERS)
     errors = quantity_errors(slopes, about, record, remembered)
     pairs = zip(values, errors, ("h", "1/(mA s)", "1/s", "1/s", "1/s"), strict=True)
     constant, own_a, own_b, *rates = (Quantity(float(v), float(e), u) for v, e, u in pairs)
