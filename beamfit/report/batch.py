@@ -10,7 +10,6 @@ from os import PathLike
 from pathlib import Path
 from urllib.parse import quote
 
-import numpy as np
 from matplotlib import rc_context
 from matplotlib.figure import FigureBase
 
@@ -18,16 +17,13 @@ from beamfit.batch.course import Course
 from beamfit.batch.run import Batch
 from beamfit.quantity import Quantity, display_unit
 from beamfit.report.document import (
-    BLUE,
     MANY,
-    RED,
     STYLE,
     Page,
     Picture,
     Verdict,
+    control_chart,
     legend_below,
-    provenance,
-    written,
 )
 from beamfit.report.page import write_page, write_report
 from beamfit.status import Status
@@ -81,12 +77,10 @@ def write_batch_report(
         write_report(single, batch.ledger.job.fit(file))
         links.append((file, quote(f"{folder.name}/{single.name}")))
     with rc_context(STYLE):
-        write_page(target, _page(batch, courses, links, command))
+        write_page(target, _page(batch, courses, links), command)
 
 
-def _page(
-    batch: Batch, courses: Sequence[Course], links: list[tuple[str, str]], command: str | None
-) -> Page:
+def _page(batch: Batch, courses: Sequence[Course], links: list[tuple[str, str]]) -> Page:
     job = batch.ledger.job
     answers = [[name.replace("_", " "), f"{n}"] for name, n in batch.statuses.items()]
     tables = [Table("Answers", ["status", "answers"], answers, numeric=True)]
@@ -107,17 +101,16 @@ def _page(
     pictures = [
         Picture(f"course of {_label(c)}", 2.8, partial(draw_course, course=c)) for c in courses
     ]
-    inputs = {} if job.lattice is None else {job.lattice: job.lattice_sha256}
-    remarks = [("table", str(batch.ledger.out)), ("options", job.key[1])]
     return Page(
         title=f"{len(batch.files)} files: {job.kind}",
-        subtitle=written(),
+        subtitle="",
         verdicts=[_verdict(c) for c in courses],
         tables=tables,
         pictures=pictures,
         pictures_title="Course, in the order of the files",
-        provenance=provenance(inputs, remarks, command),
         notes=(RULE,),
+        inputs={} if job.lattice is None else {job.lattice: job.lattice_sha256},
+        remarks=[("table", str(batch.ledger.out)), ("options", job.key[1])],
         links=links,
     )
 
@@ -151,20 +144,11 @@ def draw_course(figure: FigureBase, course: Course) -> None:
     course : Course
         What.
     """
-    axes, beyond = figure.subplots(), course.beyond
+    axes, many = figure.subplots(), len(course.value) > MANY
     factor, unit = display_unit(abs(course.centre), course.unit)
-    many = len(course.value) > MANY
-    for chosen, colour, name in ((~beyond, BLUE, "within"), (beyond, RED, "beyond")):
-        if chosen.any():
-            at, value, error = (
-                part[chosen] for part in (course.at, course.value / factor, course.error / factor)
-            )
-            bars = None if many else error
-            style = {"fmt": "o", "ms": 1.5 if many else 3.5, "lw": 0.8, "rasterized": many}
-            axes.errorbar(at, value, bars, color=colour, label=name, **style)
-    axes.axhline(course.centre / factor, color="0.6", lw=0.8)
-    if math.isfinite(course.limit):
-        ends = (course.centre + np.array([-1.0, 1.0]) * course.limit) / factor
-        axes.axhspan(*ends, color="0.92", zorder=0, label="control limits")
+    points = course.at, course.value / factor, None if many else course.error / factor
+    limits = course.centre / factor, course.limit / factor
+    style = {"ms": 1.5 if many else 3.5, "lw": 0.8, "rasterized": many}
+    control_chart(axes, points, course.beyond, limits, ("within", "beyond"), **style)
     axes.set(title=_label(course), xlabel="file", ylabel=f"{plain_name(course.name)}, {unit}")
     legend_below(figure, axes, 3)

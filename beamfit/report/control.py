@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from functools import partial
 
 import numpy as np
 from matplotlib.figure import FigureBase
 
-from beamfit.report.document import BLUE, RED, Page, Picture, Verdict, provenance, written
+from beamfit.report.document import BLUE, RED, Page, Picture, Verdict
+from beamfit.report.response import about_runs
 from beamfit.studies.response.loop import Loop
 
 NOTES = (
@@ -18,23 +18,19 @@ NOTES = (
 )
 
 
-def control_page(loop: Loop, command: str | None, inputs: Mapping[str, str | None] | None) -> Page:
+def control_page(loop: Loop) -> Page:
     """Lay out a loop."""
     runs = loop.fits[0].runs
-    digests = inputs or {run.path or run.name: run.sha256 or None for run in runs}
     tables = [*loop.tables(), *(table for fit in loop.fits for table in fit.tables()[:1])]
     return Page(
         title=f"Control of {', '.join(r.name for r in loop.control.responses)}",
-        subtitle=f"a loop simulated on models of {', '.join(r.name for r in runs)}; {written()}",
-        verdicts=[Verdict(loop.status, loop.headline, loop.message)]
-        + [Verdict(fit.status, fit.headline, fit.message) for fit in loop.fits],
+        subtitle=f"a loop simulated on models of {', '.join(r.name for r in runs)}",
+        verdicts=[Verdict.of(each) for each in (loop, *loop.fits)],
         tables=tables,
         pictures=[Picture("Outputs, targets and inputs of the loop", 5.0, partial(_draw, loop))],
         pictures_title="Closed loop",
-        provenance=provenance(
-            digests, [(f"said in {r.name}", line) for r in runs for line in r.provenance], command
-        ),
         notes=NOTES,
+        **about_runs(runs),
     )
 
 

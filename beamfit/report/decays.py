@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from itertools import cycle
 
@@ -21,31 +21,16 @@ from beamfit.report.document import (
     Verdict,
     from_head,
     legend_below,
-    provenance,
-    written,
 )
 from beamfit.report.network import network_pictures
 from beamfit.report.trend import trend_picture
 from beamfit.status import Status
+from beamfit.studies.decay import tables
 from beamfit.studies.decay.checks import moving_lifetime
 from beamfit.studies.decay.fit import DecayFit
 from beamfit.studies.decay.pooled import cycle_lifetimes
 from beamfit.studies.decay.shift import Shift
 from beamfit.studies.decay.study import Decay, RecordStudy
-from beamfit.studies.decay.tables import (
-    FEW,
-    SYSTEMATIC,
-    alike,
-    budget_rows,
-    check_rows,
-    decay_rows,
-    event_rows,
-    network_rows,
-    overview,
-    separability_rows,
-    shift_rows,
-    systematic_rows,
-)
 from beamfit.studies.decay.trend import Trend
 from beamfit.table import Table, labelled
 
@@ -75,11 +60,7 @@ ABREAST = 2
 
 
 def decay_page(
-    studies: Sequence[RecordStudy],
-    command: str | None,
-    inputs: Mapping[str, str | None] | None,
-    shift: Shift | None = None,
-    trend: Trend | None = None,
+    studies: Sequence[RecordStudy], shift: Shift | None = None, trend: Trend | None = None
 ) -> Page:
     """Lay out decay records.
 
@@ -87,10 +68,6 @@ def decay_page(
     ----------
     studies : sequence of RecordStudy
         At least one record.
-    command : str or None
-        The command that made it.
-    inputs : mapping of str to str, or None
-        Input files and their SHA-256.
     shift : Shift, optional
         The study of all decays together.
     trend : Trend, optional
@@ -101,22 +78,28 @@ def decay_page(
     Page
     """
     decays = [decay for study in studies for decay in study.decays]
-    tables = [] if shift is None else [labelled("All decays", ["value"], shift_rows(shift), SHIFT)]
+    listed = []
+    if shift is not None:
+        listed.append(labelled("All decays", ["value"], tables.shift_rows(shift), SHIFT))
     if shift is not None and shift.network is not None:
-        tables.append(labelled("A network of the losses", ["value"], network_rows(shift)))
-    tables += [] if trend is None else trend.tables()
+        listed.append(labelled("A network of the losses", ["value"], tables.network_rows(shift)))
+    listed += [] if trend is None else trend.tables()
     pooled = [decay for study in studies for decay in study.pooled]
-    tables += _side_by_side(pooled)
-    tables += _side_by_side(decays) if len(decays) <= FEW else _one_below_another(decays)
-    if len(decays) <= FEW:
-        tables += [
-            Table(f"What no residual of {d.fit.record} shows", SYSTEMATIC, systematic_rows(d))
+    listed += _side_by_side(pooled)
+    listed += _side_by_side(decays) if len(decays) <= tables.FEW else _one_below_another(decays)
+    if len(decays) <= tables.FEW:
+        listed += [
+            Table(
+                f"What no residual of {d.fit.record} shows",
+                tables.SYSTEMATIC,
+                tables.systematic_rows(d),
+            )
             for d in decays
             if d.systematics
         ]
     header = ["what", "at", "for", "change"]
-    tables += [
-        Table(f"Cut at or left out of {study.record.name}", header, event_rows(study))
+    listed += [
+        Table(f"Cut at or left out of {study.record.name}", header, tables.event_rows(study))
         for study in studies
         if study.events
     ]
@@ -127,15 +110,11 @@ def decay_page(
     count = ", ".join(f"{n} {what}" + "s" * (n > 1) for what, n in counts.items() if n)
     return Page(
         title=f"Beam lifetime of {title}",
-        subtitle=f"{count} in {hours:.3g} h of record; {written()}",
-        verdicts=_shift_verdicts(shift)
-        + _trend_verdicts(trend)
-        + [_verdict(d) for d in pooled]
-        + _verdicts(decays),
-        tables=tables,
+        subtitle=f"{count} in {hours:.3g} h of record",
+        verdicts=[*_together(shift, trend), *map(_verdict, pooled), *_verdicts(decays)],
+        tables=listed,
         pictures=_of_all(decays, shift, trend) + _pictures(studies),
         pictures_title="Records and fits",
-        provenance=provenance(inputs or {}, [], command),
         notes=from_head([note for study in studies for note in study.record.comments]),
     )
 
@@ -144,10 +123,10 @@ def _side_by_side(decays: Sequence[Decay]) -> list[Table]:
     """Every number of a few decays, one column each."""
     groups = [decays[k : k + ABREAST] for k in range(0, len(decays), ABREAST)]
     parts = [
-        ("Result", ERRORS, decay_rows),
-        ("What the records determine", "", separability_rows),
-        ("Simpler analyses, and whether a is constant", CHECKS, check_rows),
-        ("Losses from first principles", BUDGET, budget_rows),
+        ("Result", ERRORS, tables.decay_rows),
+        ("What the records determine", "", tables.separability_rows),
+        ("Simpler analyses, and whether a is constant", CHECKS, tables.check_rows),
+        ("Losses from first principles", BUDGET, tables.budget_rows),
     ]
     return [
         labelled(
@@ -163,15 +142,15 @@ def _one_below_another(decays: Sequence[Decay]) -> list[Table]:
     """The main numbers of many decays, one row each."""
     return [
         Table(title, header, rows, {"Result": ERRORS}.get(title, ""))
-        for title, header, rows in overview(decays)
+        for title, header, rows in tables.overview(decays)
     ]
 
 
 def _verdicts(decays: Sequence[Decay]) -> list[Verdict]:
     """One for each decay; of many decays one for each thing said."""
-    if len(decays) <= FEW:
+    if len(decays) <= tables.FEW:
         return [_verdict(decay) for decay in decays]
-    return [Verdict(status, who, message) for status, who, message in alike(decays)]
+    return [Verdict(status, who, message) for status, who, message in tables.alike(decays)]
 
 
 def _verdict(decay: Decay) -> Verdict:
@@ -181,23 +160,18 @@ def _verdict(decay: Decay) -> Verdict:
     return Verdict(fit.status, f"{fit.record}: {headline}", fit.message)
 
 
-def _shift_verdicts(shift: Shift | None) -> list[Verdict]:
-    if shift is None:
-        return []
-    fit, best, change = shift.fit, shift.best, shift.anomaly
-    said = [
-        Verdict(fit.status, f"{len(fit.names)} decays together", fit.message),
-        Verdict(best.status, f"best lifetime {best.lifetime}", best.message),
-    ]
-    if shift.untold:
-        said.append(Verdict(Status.unidentified, "loss budget", shift.untold))
-    if change is not None:
-        said.append(Verdict(change.status, "second half against the first", change.message))
-    return said
-
-
-def _trend_verdicts(trend: Trend | None) -> list[Verdict]:
-    return [] if trend is None else [Verdict(trend.status, "course of the lifetime", trend.message)]
+def _together(shift: Shift | None, trend: Trend | None) -> Iterator[Verdict]:
+    """What is said of all decays."""
+    if shift is not None:
+        fit, best, change = shift.fit, shift.best, shift.anomaly
+        yield Verdict(fit.status, f"{len(fit.names)} decays together", fit.message)
+        yield Verdict(best.status, f"best lifetime {best.lifetime}", best.message)
+        if shift.untold:
+            yield Verdict(Status.unidentified, "loss budget", shift.untold)
+        if change is not None:
+            yield Verdict(change.status, "second half against the first", change.message)
+    if trend is not None:
+        yield Verdict(trend.status, "course of the lifetime", trend.message)
 
 
 def study_of(result: DecayFit | RecordStudy) -> RecordStudy:

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import base64
 import io
+import math
 import platform
 from collections.abc import Callable, Mapping, Sequence
 from datetime import UTC, datetime
 from importlib.metadata import version
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jinja2
+import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure, FigureBase
 
@@ -42,6 +44,11 @@ class Verdict(NamedTuple):
     headline: str
     message: str
 
+    @classmethod
+    def of(cls, result: Any) -> Verdict:
+        """What a result says of itself."""
+        return cls(result.status, result.headline, result.message)
+
 
 class Picture(NamedTuple):
     """What a picture shows, its height in inches, and how to draw it into a figure."""
@@ -54,7 +61,8 @@ class Picture(NamedTuple):
 class Page(NamedTuple):
     """A report: verdicts first, then tables with the pictures after the first one.
 
-    ``links`` are names and addresses of further pages.
+    ``links`` are names and addresses of further pages. Files and their SHA-256 in ``inputs``, and
+    ``remarks`` on them, are part of the ``provenance`` when it is `written_now`.
     """
 
     title: str
@@ -63,13 +71,24 @@ class Page(NamedTuple):
     tables: list[Table]
     pictures: list[Picture]
     pictures_title: str
-    provenance: list[tuple[str, str]]
-    notes: tuple[str, ...]
+    notes: tuple[str, ...] = ()
+    inputs: Mapping[str, str | None] | None = None
+    remarks: Sequence[tuple[str, str]] = ()
+    provenance: Sequence[tuple[str, str]] = ()
     links: Sequence[tuple[str, str]] = ()
 
 
+def written_now(
+    page: Page, command: str | None = None, inputs: Mapping[str, str | None] | None = None
+) -> Page:
+    """Say on a page when it is written and where it comes from: its own inputs unless given."""
+    made = provenance(inputs or page.inputs or {}, page.remarks, command)
+    subtitle = "; ".join(filter(None, (page.subtitle, written())))
+    return page._replace(subtitle=subtitle, provenance=made)
+
+
 def provenance(
-    inputs: Mapping[str, str | None], remarks: list[tuple[str, str]], command: str | None
+    inputs: Mapping[str, str | None], remarks: Sequence[tuple[str, str]], command: str | None
 ) -> list[tuple[str, str]]:
     """List where a report comes from: input digests, remarks, versions, command."""
     packages = ", ".join(f"{n} {version(n)}" for n in ("jax", "numpy", "scipy", "matplotlib"))
@@ -90,6 +109,29 @@ def written() -> str:
 def from_head(lines: Sequence[str]) -> tuple[str, ...]:
     """What the head of a file says, as the notes of a page."""
     return ("From the head of the file:", *lines) if lines else ()
+
+
+def control_chart(
+    axes: Axes,
+    points: tuple[np.ndarray, np.ndarray, np.ndarray | None],
+    beyond: np.ndarray,
+    limits: tuple[float, float],
+    names: tuple[str, str],
+    **style: Any,
+) -> None:
+    """Draw points (at, value, error) that lie within and beyond limits (centre, reach), and these.
+
+    `names` are those of the two kinds of points; an infinite reach is none.
+    """
+    for chosen, colour, name in zip((~beyond, beyond), (BLUE, RED), names, strict=True):
+        if chosen.any():
+            shown = [None if part is None else part[chosen] for part in points]
+            axes.errorbar(*shown, fmt="o", color=colour, label=name, **style)
+    centre, reach = limits
+    axes.axhline(centre, color="0.6", lw=0.8)
+    if math.isfinite(reach):
+        ends = centre - reach, centre + reach
+        axes.axhspan(*ends, color="0.92", zorder=0, label="control limits")
 
 
 def legend_below(figure: FigureBase, axes: Axes, columns: int) -> None:

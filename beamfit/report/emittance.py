@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Sequence
 from functools import partial
+from typing import Any
 
-from beamfit.report.document import Page, Picture, Verdict, from_head, provenance, written
+from beamfit.report.document import Page, Picture, Verdict, from_head
 from beamfit.report.scan_pictures import (
     PROFILES_ABREAST,
     draw_ellipses,
@@ -22,6 +23,7 @@ from beamfit.studies.scan.results import (
     point_rows,
     result_rows,
 )
+from beamfit.studies.scan.scans import QuadScan
 from beamfit.studies.scan.sensitivity import budget_rows, range_rows
 from beamfit.studies.scan.size_methods import SizeMethods
 from beamfit.table import Table, labelled
@@ -39,22 +41,13 @@ METHODS = (
 )
 
 
-def emittance_page(
-    fit: EmittanceFit,
-    command: str | None,
-    inputs: Mapping[str, str | None] | None,
-    methods: tuple[SizeMethods, ...] = (),
-) -> Page:
+def emittance_page(fit: EmittanceFit, methods: tuple[SizeMethods, ...] = ()) -> Page:
     """Lay out an emittance fit.
 
     Parameters
     ----------
     fit : EmittanceFit
         The fit.
-    command : str or None
-        The command that made it.
-    inputs : mapping of str to str, or None
-        Input files and their SHA-256; the scan's own if None.
     methods : tuple of SizeMethods
         What other ways of taking the sizes say.
 
@@ -63,10 +56,7 @@ def emittance_page(
     Page
     """
     scan, line = fit.scan, fit.line
-    if inputs is None:
-        inputs = {str(scan.path): scan.sha256} if scan.path else {}
     names = [p.plane for p in fit.planes]
-    source = scan.error_source if scan.error else "none in the file; inferred"
     tables = [
         labelled("Result", names, result_rows(fit.planes), ERRORS),
         labelled("What the data determine", names, identifiability_rows(fit.planes)),
@@ -74,21 +64,33 @@ def emittance_page(
         *(Table(f"Points, {p.plane} plane", *point_rows(p), numeric=True) for p in fit.planes),
     ]
     tables += [way.table()._replace(note=METHODS) for way in methods]
-    if fit.notes:
-        tables.append(Table("About the input", [], [[note] for note in fit.notes]))
     energy = f"{float(line.energy):g} MeV"
     if not fit.statement.closed:
         energy += f", scenario {fit.scenario}"
     return Page(
         title=f"Emittance of {scan.name}",
-        subtitle=f"{len(scan)} settings on line {line.name}, {energy}; {written()}",
+        subtitle=f"{len(scan)} settings on line {line.name}, {energy}",
         verdicts=[Verdict(p.status, f"{p.plane}: {words_of(p)}", p.message) for p in fit.planes],
-        tables=tables,
+        tables=tables + about_input(fit.notes),
         pictures=_pictures(fit),
         pictures_title="Scan and fit",
-        provenance=provenance(inputs, [("errors of the sizes", source)], command),
-        notes=from_head(scan.provenance),
+        **about_scan(scan),
     )
+
+
+def about_input(notes: Sequence[str]) -> list[Table]:
+    """What is odd about a file, and what was done to its numbers."""
+    return [Table("About the input", [], [[note] for note in notes])] if notes else []
+
+
+def about_scan(scan: QuadScan) -> dict[str, Any]:
+    """The inputs of a page on a scan, remarks on them, and what the head of the file says."""
+    source = scan.error_source if scan.error else "none in the file; inferred"
+    return {
+        "inputs": {str(scan.path): scan.sha256} if scan.path else {},
+        "remarks": [("errors of the sizes", source)],
+        "notes": from_head(scan.provenance),
+    }
 
 
 def _budgets(fit: EmittanceFit, names: list[str]) -> list[Table]:

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from functools import partial
 
 import numpy as np
 from matplotlib.figure import FigureBase
 
-from beamfit.report.document import BLUE, RED, Page, Picture, Verdict, provenance, written
-from beamfit.report.response import draw_curve
+from beamfit.report.document import BLUE, RED, Page, Picture, Verdict
+from beamfit.report.response import about_runs, draw_curve
 from beamfit.studies.fedbatch.feed import Course, FeedPlan
 from beamfit.studies.fedbatch.fit import FedBatchFit
 from beamfit.studies.fedbatch.titre import Ranked, TitreFit
@@ -21,15 +21,9 @@ NOTES = (
 UNITS = {"biomass": "g/L", "substrate": "g/L", "volume": "L", "titre": "g/L"}
 
 
-def fedbatch_page(
-    fits: Sequence[FedBatchFit | TitreFit],
-    command: str | None,
-    inputs: Mapping[str, str | None] | None,
-) -> Page:
+def fedbatch_page(fits: Sequence[FedBatchFit | TitreFit]) -> Page:
     """Lay out the rates, and the titre if it was fitted."""
     rates = fits[0].rates if isinstance(fits[0], TitreFit) else fits[0]
-    digests = inputs or {run.path or run.name: run.sha256 or None for run in rates.runs}
-    remarks = [(f"said in {run.name}", line) for run in rates.runs for line in run.provenance]
     pictures = [
         Picture(f"Measured and predicted in {run.name}", 6.8, partial(draw_batch, fits[-1], i))
         for i, run in enumerate(rates.runs)
@@ -40,26 +34,25 @@ def fedbatch_page(
     ]
     return Page(
         title="Fed-batch process",
-        subtitle=f"identified from {', '.join(run.name for run in rates.runs)}; {written()}",
-        verdicts=[Verdict(fit.status, fit.headline, fit.message) for fit in fits],
+        subtitle=f"identified from {', '.join(run.name for run in rates.runs)}",
+        verdicts=[Verdict.of(fit) for fit in fits],
         tables=[table for fit in fits for table in fit.tables()],
         pictures=pictures,
         pictures_title="Batches and rates",
-        provenance=provenance(digests, remarks, command),
         notes=NOTES,
+        **about_runs(rates.runs),
     )
 
 
-def feed_page(plan: FeedPlan, command: str | None, inputs: Mapping[str, str | None] | None) -> Page:
+def feed_page(plan: FeedPlan) -> Page:
     """Lay out a planned feed."""
     return Page(
         title="Feed profile",
-        subtitle=f"planned on the identified process; {written()}",
-        verdicts=[Verdict(plan.status, plan.headline, plan.message)],
+        subtitle="planned on the identified process",
+        verdicts=[Verdict.of(plan)],
         tables=list(plan.tables()),
         pictures=[Picture("What comes of it", 6.8, partial(draw_course, plan.course))],
         pictures_title="The plan",
-        provenance=provenance(inputs or {}, [], command),
         notes=NOTES,
     )
 
@@ -80,8 +73,7 @@ def draw_batch(fit: FedBatchFit | TitreFit, i: int, figure: FigureBase) -> None:
         if np.ptp(values) > 0:
             axes[-1].step(hours, values, where="post", label=name)
     axes[-1].legend(frameon=False, fontsize=8)
-    axes[-1].set_ylabel("inputs")
-    axes[-1].set_xlabel("time (h)")
+    axes[-1].set(xlabel="time (h)", ylabel="inputs")
     figure.align_ylabels(axes)
 
 
@@ -94,8 +86,7 @@ def draw_course(course: Course, figure: FigureBase) -> None:
         axis.fill_between(course.time, value - error, value + error, color=BLUE, alpha=0.25, lw=0)
         axis.set_ylabel(f"{name} ({UNITS[name]})")
     axes[-1].step(course.time, course.feed, where="post", color=RED)
-    axes[-1].set_ylabel("feed (L/h)")
-    axes[-1].set_xlabel("time (h)")
+    axes[-1].set(xlabel="time (h)", ylabel="feed (L/h)")
     figure.align_ylabels(axes)
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from functools import partial
 from math import ceil
 
@@ -11,26 +10,20 @@ from matplotlib.figure import FigureBase
 
 from beamfit.language.solution import Solution
 from beamfit.language.text import format_document
-from beamfit.report.document import BLUE, Page, Picture, Verdict, provenance, written
+from beamfit.report.document import BLUE, Page, Picture, Verdict
 from beamfit.table import Table
 
 # Outputs that are drawn; the tables have all.
 MOST_DRAWN = 12
 
 
-def formulation_page(
-    found: Solution, command: str | None, inputs: Mapping[str, str | None] | None
-) -> Page:
+def formulation_page(found: Solution) -> Page:
     """Lay out a solution.
 
     Parameters
     ----------
     found : Solution
         From `beamfit.language.solution.solve_document`.
-    command : str or None
-        The command that made it.
-    inputs : mapping of str to str, or None
-        Input files and their SHA-256.
 
     Returns
     -------
@@ -56,15 +49,14 @@ def formulation_page(
     counts = ", ".join(f"{n} {what}" + "s" * (n != 1) for what, n in sizes.items())
     return Page(
         title=f"Formulation {called}".strip(),
-        subtitle=f"{counts}, {goals}; {written()}",
+        subtitle=f"{counts}, {goals}",
         verdicts=[
             Verdict(found.status, found.headline, found.message[:1].upper() + found.message[1:])
         ],
         tables=tables,
         pictures=pictures,
         pictures_title="Outputs",
-        provenance=provenance(inputs or {}, [("solver", found.solver)], command),
-        notes=(),
+        remarks=[("solver", found.solver)],
     )
 
 

@@ -14,7 +14,7 @@ from beamfit.language.solution import Solution
 from beamfit.report import kind_of
 from beamfit.report.control import control_page
 from beamfit.report.decays import decay_page, study_of
-from beamfit.report.document import STYLE, Page, Picture, drawn, html_of
+from beamfit.report.document import STYLE, Page, Picture, drawn, html_of, written_now
 from beamfit.report.emittance import emittance_page
 from beamfit.report.fedbatch import fedbatch_page, feed_page
 from beamfit.report.formulation import formulation_page
@@ -42,6 +42,15 @@ Reported = (
     EmittanceFit | SliceFits | DecayFit | Solution | ResponseFit | Loop
     | FedBatchFit | TitreFit | FeedPlan
 )  # fmt: skip
+# What lays out a result by itself, and what several beside one another.
+OF_ONE = {
+    Solution: formulation_page,
+    SliceFits: slices_page,
+    FeedPlan: feed_page,
+    Loop: control_page,
+}
+OF_SEVERAL = dict.fromkeys((ResponseFit, StatesFit), response_page)
+OF_SEVERAL |= dict.fromkeys((FedBatchFit, TitreFit), fedbatch_page)
 
 
 def write_report(
@@ -102,32 +111,29 @@ def write_report(
     with rc_context(STYLE):
         several = tuple(result) if isinstance(result, list | tuple) else (result,)
         sampled: list[Sampled] = []
-        match several[0]:
-            case EmittanceFit() as fit:
-                page = emittance_page(fit, command, inputs, methods)
-                sampled = [] if posterior is None else [of_scan(fit, posterior)]
-            case Solution() as solution:
-                page = formulation_page(solution, command, inputs)
-            case SliceFits() as slices:
-                page = slices_page(slices, command, inputs)
-            case FedBatchFit() | TitreFit():
-                page = fedbatch_page(several, command, inputs)
-            case FeedPlan() as plan:
-                page = feed_page(plan, command, inputs)
-            case ResponseFit() | StatesFit():
-                page = response_page(several, command, inputs)
-            case Loop() as loop:
-                page = control_page(loop, command, inputs)
-            case first:
-                studies = (study_of(first),) if isinstance(first, DecayFit) else several
-                page = decay_page(studies, command, inputs, shift, trend)
-                sampled = _of_decays(studies, posterior)
-        page = with_posteriors(page, sampled)
-        write_page(path, page)
+        first = several[0]
+        if isinstance(first, EmittanceFit):
+            page = emittance_page(first, methods)
+            sampled = [] if posterior is None else [of_scan(first, posterior)]
+        elif type(first) in OF_ONE:
+            page = OF_ONE[type(first)](first)
+        elif type(first) in OF_SEVERAL:
+            page = OF_SEVERAL[type(first)](several)
+        else:
+            studies = (study_of(first),) if isinstance(first, DecayFit) else several
+            page = decay_page(studies, shift, trend)
+            sampled = _of_decays(studies, posterior)
+        write_page(path, with_posteriors(page, sampled), command, inputs)
 
 
-def write_page(path: str | PathLike[str], page: Page) -> None:
+def write_page(
+    path: str | PathLike[str],
+    page: Page,
+    command: str | None = None,
+    inputs: Mapping[str, str | None] | None = None,
+) -> None:
     """Write a page as the end of the name says; as `write_report`."""
+    page = written_now(page, command, inputs)
     match kind_of(path):
         case ".html":
             made = {Path(path): html_of(page)}

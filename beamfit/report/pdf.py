@@ -54,11 +54,12 @@ class _Pages:
         if self.y - lines * LINE < MARGIN:
             self.new_page()
 
-    def text(self, words: str, *, x: float = 0.0, size: float = 9.5, **style: Any) -> None:
-        """Write one line at the present height without moving down."""
-        self.pages[-1].text(
-            (MARGIN + x) / WIDTH, self.y / HEIGHT, words, fontsize=size, va="top", **style
-        )
+    def text(
+        self, words: str, *, x: float = 0.0, below: float = 0.0, size: float = 9.5, **style: Any
+    ) -> None:
+        """Write one line, or so far below the present height, without moving down."""
+        place = (MARGIN + x) / WIDTH, (self.y - below) / HEIGHT
+        self.pages[-1].text(*place, words, fontsize=size, va="top", **style)
 
     def paragraph(
         self, words: str, size: float = 9.5, weight: str = "normal", step: float = 1.0, **style: Any
@@ -94,14 +95,13 @@ class _Pages:
     def _row(
         self, cells: list[list[str]], widths: np.ndarray, size: float, numeric: bool, head: bool
     ) -> None:
+        style = {"size": size, "weight": "bold" if head else "normal"}
         starts = np.concatenate([[0.0], np.cumsum(widths + GAP)])
         for i, lines in enumerate(cells):
             right = numeric and i > 0
             x, side = (starts[i] + widths[i], "right") if right else (starts[i], "left")
             for k, words in enumerate(lines):
-                self.y -= k * LINE
-                self.text(words, x=x, size=size, weight="bold" if head else "normal", ha=side)
-                self.y += k * LINE
+                self.text(words, x=x, below=k * LINE, ha=side, **style)
         self.y -= LINE * max(map(len, cells))
 
     def picture(self, picture: Picture) -> None:

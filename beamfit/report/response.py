@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from functools import partial
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import FigureBase
 
-from beamfit.report.document import BLUE, RED, Page, Picture, Verdict, provenance, written
+from beamfit.report.document import BLUE, RED, Page, Picture, Verdict
 from beamfit.studies.response.fit import ResponseFit
+from beamfit.studies.response.record import Run
 from beamfit.studies.response.states import Part, StatesFit
 
 NOTES = (
@@ -21,27 +23,27 @@ NOTES = (
 MOST, RUNS = 4000, 6
 
 
-def response_page(
-    fits: Sequence[ResponseFit | StatesFit],
-    command: str | None,
-    inputs: Mapping[str, str | None] | None,
-) -> Page:
+def response_page(fits: Sequence[ResponseFit | StatesFit]) -> Page:
     """Lay out the responses of some outputs."""
-    first = fits[0]
-    names = ", ".join(run.name for run in first.runs)
-    digests = inputs or {run.path or run.name: run.sha256 or None for run in first.runs}
-    pictures = [picture for fit in fits for part in fit.parts for picture in _pictures(part)]
-    remarks = [("said in " + run.name, line) for run in first.runs for line in run.provenance]
+    runs = fits[0].runs
     return Page(
         title=f"Response of {', '.join(fit.output for fit in fits)}",
-        subtitle=f"identified from {names}; {written()}",
-        verdicts=[Verdict(fit.status, fit.headline, fit.message) for fit in fits],
+        subtitle=f"identified from {', '.join(run.name for run in runs)}",
+        verdicts=[Verdict.of(fit) for fit in fits],
         tables=[table for fit in fits for table in fit.tables()],
-        pictures=pictures,
+        pictures=[picture for fit in fits for part in fit.parts for picture in _pictures(part)],
         pictures_title="Measured and simulated",
-        provenance=provenance(digests, remarks, command),
         notes=NOTES,
+        **about_runs(runs),
     )
+
+
+def about_runs(runs: Sequence[Run]) -> dict[str, Any]:
+    """The inputs of a page on some runs, and the remarks on them."""
+    return {
+        "inputs": {run.path or run.name: run.sha256 or None for run in runs},
+        "remarks": [(f"said in {run.name}", line) for run in runs for line in run.provenance],
+    }
 
 
 def _pictures(fit: ResponseFit | Part) -> list[Picture]:
@@ -67,16 +69,14 @@ def _draw_run(fit: ResponseFit | Part, i: int, figure: FigureBase) -> None:
     above, middle, below = figure.subplots(3, 1, sharex=True, height_ratios=(3, 1, 1))
     above.plot(time[thin], y[thin], ".", color="0.6", markersize=3, label="measured")
     above.plot(time[thin], simulated[thin], color=BLUE, label="simulated")
-    above.set_ylabel(fit.output)
-    above.set_title(run.name)
+    above.set(title=run.name, ylabel=fit.output)
     above.legend(frameon=False, loc="best", fontsize=8)
     middle.plot(time[thin], (y - simulated)[thin], ".", color=RED, markersize=2)
     middle.axhline(0.0, color="0.7", linewidth=0.8)
     middle.set_ylabel("difference")
     for name, values in run.inputs.items():
         below.step(run.time[thin], values[thin], where="post", label=name)
-    below.set_ylabel("inputs")
-    below.set_xlabel("time (s)")
+    below.set(xlabel="time (s)", ylabel="inputs")
     if len(run.inputs) > 1:
         below.legend(frameon=False, fontsize=8, ncols=len(run.inputs))
 
@@ -90,8 +90,8 @@ def draw_curve(fit: ResponseFit | Part, j: int, figure: FigureBase) -> None:
     axes.plot(c.at, np.where(c.visited, c.value, np.nan), color=BLUE)
     low, high = (np.where(known, c.value + s * c.error, np.nan) for s in (-1, 1))
     axes.fill_between(c.at, low, high, color=BLUE, alpha=0.25, linewidth=0)
-    axes.set_xlabel(c.input)
-    axes.set_ylabel(f"{c.parameter} ({c.unit})" if c.unit == "s" else c.parameter)
+    label = f"{c.parameter} ({c.unit})" if c.unit == "s" else c.parameter
+    axes.set(xlabel=c.input, ylabel=label)
     if c.visited.any():  # the band where data were; a wild end elsewhere is cut off
         inside = np.concatenate([low[known], high[known], c.value[c.visited]])
         edge = 0.15 * max(float(np.ptp(inside)), 1e-12)
@@ -113,7 +113,6 @@ def _draw_correlations(fit: ResponseFit | Part, figure: FigureBase) -> None:
         others.plot(lags, np.array(found) / size, "o-", markersize=3, label=name)
     for axes, what in ((own, "with themselves"), (others, "with past inputs")):
         axes.axhspan(-limit, limit, color="0.9", zorder=0)
-        axes.set_xlabel("samples later")
-        axes.set_title(f"Residuals {what}")
+        axes.set(title=f"Residuals {what}", xlabel="samples later")
     if len(fit.seen.inputs) > 1:
         others.legend(frameon=False, fontsize=8)

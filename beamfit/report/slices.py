@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from functools import partial
 
 import numpy as np
 from matplotlib.figure import FigureBase
 
-from beamfit.report.document import Page, Picture, Verdict, from_head, provenance, written
-from beamfit.report.emittance import ERRORS
+from beamfit.report.document import Page, Picture, Verdict
+from beamfit.report.emittance import ERRORS, about_input, about_scan
 from beamfit.report.scan_pictures import COLOUR, draw_scan, words_of
 from beamfit.status import Status
 from beamfit.studies.scan.results import identifiability_rows, point_rows, result_rows
@@ -25,27 +24,19 @@ FIXED = (
 )
 
 
-def slices_page(
-    fits: SliceFits, command: str | None, inputs: Mapping[str, str | None] | None
-) -> Page:
+def slices_page(fits: SliceFits) -> Page:
     """Lay out the fits of the slices of a beam.
 
     Parameters
     ----------
     fits : SliceFits
         From `fit_slices`.
-    command : str or None
-        The command that made it.
-    inputs : mapping of str to str, or None
-        Input files and their SHA-256; the scan's own if None.
 
     Returns
     -------
     Page
     """
     scan, line = fits.scan, fits.fits[0].line
-    if inputs is None:
-        inputs = {str(scan.path): scan.sha256} if scan.path else {}
     found = [(f"{fit.scan.slices[0]}, {p.plane}", fit, p) for fit in fits for p in fit.planes]
     names, planes = [name for name, _, _ in found], tuple(p for _, _, p in found)
     tables = [table._replace(note=FIXED) for table in fits.tables()]
@@ -53,25 +44,22 @@ def slices_page(
         labelled("All numbers", names, result_rows(planes), ERRORS),
         labelled("What the data determine", names, identifiability_rows(planes)),
         *(Table(f"Points of slice {n}", *point_rows(p), numeric=True) for n, _, p in found),
+        *about_input(fits.notes),
     ]
-    if fits.notes:
-        tables.append(Table("About the input", [], [[note] for note in fits.notes]))
     pictures = [Picture("emittance of each slice", 3.8, partial(draw_slices, fits=fits))]
     pictures += [
         Picture(f"scan of slice {name}", 4.6, partial(draw_scan, fit=fit, plane=p.plane))
         for name, fit, p in found[:MOST_SCANS]
     ]
-    source = scan.error_source if scan.error else "none in the file; inferred"
     return Page(
         title=f"Slice emittances of {scan.name}",
         subtitle=f"{len(scan)} rows of {len(fits)} slices on line {line.name}, "
-        f"{float(line.energy):g} MeV; {written()}",
+        f"{float(line.energy):g} MeV",
         verdicts=[Verdict(p.status, f"{name}: {words_of(p)}", p.message) for name, _, p in found],
         tables=tables,
         pictures=pictures,
         pictures_title="Slices, and the scan and fit of each",
-        provenance=provenance(inputs, [("errors of the sizes", source)], command),
-        notes=from_head(scan.provenance),
+        **about_scan(scan),
     )
 
 

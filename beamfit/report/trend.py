@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from functools import partial
 
 import numpy as np
@@ -10,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.dates import AutoDateLocator, ConciseDateFormatter
 from matplotlib.figure import FigureBase
 
-from beamfit.report.document import BLUE, RED, Picture
+from beamfit.report.document import BLUE, RED, Picture, control_chart
 from beamfit.studies.decay.trend import Trend
 
 RELATIVE = ("a", "b")
@@ -63,14 +62,9 @@ def _lifetimes(axes: Axes, trend: Trend, at: np.ndarray) -> None:
     value = np.array([point.normalised.value for point in trend.points])
     error = np.array([point.normalised.error for point in trend.points])
     beyond = np.array([point.beyond != 0 for point in trend.points])
-    for chosen, colour, name in ((~beyond, BLUE, "a decay"), (beyond, RED, "beyond the limits")):
-        if chosen.any():
-            part = at[chosen], value[chosen], error[chosen]
-            axes.errorbar(*part, fmt="o", ms=4, color=colour, label=name)
-    axes.axhline(trend.centre, color="0.6", lw=0.8)
-    if math.isfinite(trend.limit):
-        ends = trend.centre - trend.limit, trend.centre + trend.limit
-        axes.axhspan(*ends, color="0.92", zorder=0, label="control limits")
+    names = ("a decay", "beyond the limits")
+    limits = trend.centre, trend.limit
+    control_chart(axes, (at, value, error), beyond, limits, names, ms=4)
     if trend.alarms:
         axes.plot([], [], color=RED, lw=1.2, ls="--", label="a or b moved")
     axes.legend(frameon=False, fontsize="small", ncols=2)

@@ -15,6 +15,7 @@ import beamfit
 import beamfit.figures
 from beamfit.errors import InputError
 from beamfit.report.decays import decay_page, study_of
+from beamfit.report.document import written_now
 from beamfit.report.emittance import emittance_page
 from beamfit.report.pdf import HEIGHT, pages_of
 
@@ -86,7 +87,7 @@ def test_two_screens_are_told_apart(two):
 def test_what_is_not_determined_has_no_ellipse(noise, otr):
     with pytest.raises(InputError, match="without phase ellipses"):
         beamfit.figures.phase_space(noise)
-    assert not any("ellipse" in p.alt for p in emittance_page(noise, None, None).pictures)
+    assert not any("ellipse" in p.alt for p in emittance_page(noise).pictures)
     # One plane with β and α, the other without: one ellipse at each place.
     open_ = replace(otr.y, beta=replace(otr.y.beta, error=None, interval_95=None))
     half = replace(otr, planes=(otr.x, open_))
@@ -108,12 +109,12 @@ def test_matplotlib_is_loaded_when_something_is_drawn():
 
 def pages(request, name):
     if name == "decay":
-        return pages_of(decay_page((study_of(request.getfixturevalue("decay")),), None, None))
+        return pages_of(written_now(decay_page((study_of(request.getfixturevalue("decay")),))))
     fit = request.getfixturevalue(name)
     if name == "otr":  # names as long as people make them
         scan = replace(fit.scan, name="a_scan_with_a_name_" * 9, provenance=("W" * 300,))
         fit = replace(fit, scan=scan)
-    return pages_of(emittance_page(fit, "beamfit emittance " + "/a/long/path" * 30, None))
+    return pages_of(written_now(emittance_page(fit), "beamfit emittance " + "/a/long/path" * 30))
 
 
 @pytest.mark.parametrize("name", ["otr", "two", "noise", "decay"])
