@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from difflib import get_close_matches
 from os import PathLike
@@ -61,6 +63,24 @@ class InputError(ValueError):
         found = short(found, max(room // 3, room - len(expected)))
         expected = short(expected, room - len(found))
         return " ".join(f"{place}{said} {found}; expected {expected}".split())
+
+
+@contextmanager
+def located(path: str | PathLike[str] | None) -> Iterator[None]:
+    """Name a file in what is raised here by code that knows of none.
+
+    Examples
+    --------
+    >>> with located("scan.csv"):
+    ...     raise InputError("no rows", "at least three")
+    Traceback (most recent call last):
+    beamfit.errors.InputError: scan.csv: no rows; expected at least three
+    """
+    try:
+        yield
+    except InputError as error:
+        error.path = path if error.path is None else error.path
+        raise
 
 
 def _worded(text: str) -> str:

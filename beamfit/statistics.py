@@ -12,6 +12,8 @@ from beamfit.quantity import NORMAL_REACH
 
 # A fit this unlikely to be noise alone is a poor fit: the contract of the JSON output.
 POOR_FIT = 1e-3
+# One over the relative error from which on a direction counts as undetermined.
+OPEN = 3.0
 # Points that say what is usual: the first so many, half of them if there are fewer.
 BASELINE, FEWEST = 20, 3
 # Mean range of two normal numbers, and the degrees of freedom of each moving range.
@@ -30,7 +32,7 @@ class Directions(NamedTuple):
     condition : float
         Largest over smallest; infinite if the smallest is zero.
     undetermined : tuple of str
-        The directions whose relative error exceeds the limit, in words.
+        The directions whose relative error exceeds a third, in words.
     """
 
     singular_values: np.ndarray
@@ -38,9 +40,7 @@ class Directions(NamedTuple):
     undetermined: tuple[str, ...]
 
 
-def scaled_directions(
-    jacobian: np.ndarray, scale: np.ndarray, names: list[str], limit: float = 1 / 3
-) -> Directions:
+def scaled_directions(jacobian: np.ndarray, scale: np.ndarray, names: list[str]) -> Directions:
     """Decompose J · diag(scale): which combinations of parameters the residuals see.
 
     Parameters
@@ -51,8 +51,6 @@ def scaled_directions(
         Shape (parameters,): the size of each parameter, so that a unit step means 100 %.
     names : list of str
         Parameter names, for the words.
-    limit : float
-        A direction with a larger relative error counts as undetermined.
 
     Returns
     -------
@@ -77,7 +75,7 @@ def scaled_directions(
     _, values, rows = np.linalg.svd(scaled, full_matrices=scaled.shape[0] < scaled.shape[1])
     values = np.concatenate([values, np.zeros(len(names) - len(values))])
     smallest = values[-1] if values[-1] > 1e-13 * values[0] else 0.0
-    open_rows = [row for value, row in zip(values, rows, strict=True) if value * limit < 1.0]
+    open_rows = [row for value, row in zip(values, rows, strict=True) if value < OPEN]
     return Directions(
         singular_values=values,
         condition=float(values[0] / smallest) if smallest else np.inf,
@@ -94,7 +92,7 @@ def _in_words(row: np.ndarray, names: list[str]) -> str:
         sign = " - " if coefficient < 0 else " + "
         size = "" if round(abs(coefficient), 1) == 1.0 else f"{abs(coefficient):.1f} "
         words += f"{sign}{size}{name}"
-    return words.removeprefix(" + ").strip() if not words.startswith(" - ") else words.strip()
+    return words.removeprefix(" + ").strip()
 
 
 def chi2_probability(chi2: float, dof: float, error_dof: float = math.inf) -> float | None:

@@ -88,9 +88,7 @@ def cell(value: object) -> str:
 
 def text_of(table: Table) -> str:
     """Lay a table out for a terminal, columns aligned."""
-    rows = [list(row) for row in ([table.header] if table.header else [])] + [
-        list(row) for row in table.rows
-    ]
+    rows = [list(row) for row in (*([table.header] if table.header else []), *table.rows)]
     columns = max((len(row) for row in rows), default=0)
     rows = [row + [""] * (columns - len(row)) for row in rows]
     widths = [max(len(row[i]) for row in rows) for i in range(columns)]

@@ -33,18 +33,10 @@ def cli() -> None:
     """Beam emittance and lifetime from scans and decays, with errors you can defend."""
 
 
-cli.add_command(emittance)
-cli.add_command(lifetime)
-cli.add_command(setpoint)
-cli.add_command(design)
-cli.add_command(example)
-cli.add_command(check)
-cli.add_command(solve)
-cli.add_command(identify)
-cli.add_command(control)
-cli.add_command(batch)
-cli.add_command(watch)
-cli.add_command(scan)
+for command in (emittance, lifetime, setpoint, design, example, check):
+    cli.add_command(command)
+for command in (solve, identify, control, batch, watch, scan):
+    cli.add_command(command)
 
 
 def main() -> None:

@@ -8,11 +8,13 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from beamfit.cli.options import command_line, options
+from beamfit.cli.options import answered, command_line, option, options
 from beamfit.errors import InputError
+from beamfit.table import Table
 
 if TYPE_CHECKING:
     from beamfit.batch.run import Batch
+    from beamfit.cli.show import Terminal
 
 EXAMPLE = """\b
 Examples:
@@ -26,23 +28,20 @@ NAMED = 10
 
 @click.command(epilog=EXAMPLE)
 @click.argument("path", nargs=-1, required=True)
-@click.option(
+@option(
     "--kind",
-    type=click.Choice(["emittance", "lifetime"]),
+    "What the files hold: quadrupole scans, or records of beam current.",
+    choices=["emittance", "lifetime"],
     required=True,
-    help="What the files hold: quadrupole scans, or records of beam current.",
 )
-@click.option(
-    "--out",
+@option(
+    "--out FILE.parquet|FILE.h5|FILE.csv",
+    "The table of answers. A run that was stopped goes on from FILE.parts.",
     required=True,
-    metavar="FILE.parquet|FILE.h5|FILE.csv",
-    help="The table of answers. A run that was stopped goes on from FILE.parts.",
 )
-@click.option("--workers", type=click.IntRange(1), help="Processes on this machine (Dask).")
-@click.option("--scheduler", metavar="tcp://HOST:PORT", help="A Dask scheduler to join.")
-@click.option(
-    "--quantity", metavar="NAME", help="What the report follows, such as beta or lifetime_mean."
-)
+@option("--workers", "Processes on this machine (Dask).", type=click.IntRange(1))
+@option("--scheduler tcp://HOST:PORT", "A Dask scheduler to join.")
+@option("--quantity NAME", "What the report follows, such as beta or lifetime_mean.")
 @options("ignore skip-bad weights maybe-lattice use from to screen energy particle time current")
 @options("report json")
 def batch(
@@ -79,7 +78,10 @@ def batch(
         from beamfit.report.batch import write_batch_report
 
         write_batch_report(report, found, courses_of(found, quantity), command_line())
-    _answer(found, out, report, as_json)
+    inputs = {} if lattice is None else {lattice: job.lattice_sha256}
+    results = {"table": out, "files": len(found.files), "new": found.new}
+    results |= {"statuses": found.statuses, "unusable": found.refused}
+    answered(as_json, [results], inputs, lambda terminal: _show(terminal, found, out), report)
 
 
 def _check_kind(kind: str, of_scans: dict[str, Any], of_records: dict[str, Any]) -> None:
@@ -111,21 +113,7 @@ class _Progress:
             click.echo("", err=True)
 
 
-def _answer(found: Batch, out: str, report: str | None, as_json: bool) -> None:
-    if as_json:
-        from beamfit.io.result import results_text
-
-        inputs = {
-            p: d for p, d in [(found.ledger.job.lattice, found.ledger.job.lattice_sha256)] if p
-        }
-        results = {"table": out, "files": len(found.files), "new": found.new}
-        results |= {"statuses": found.statuses, "unusable": found.refused}
-        click.echo(results_text([results], inputs, command_line()))
-        return
-    from beamfit.cli.show import Terminal
-    from beamfit.table import Table
-
-    terminal = Terminal()
+def _show(terminal: Terminal, found: Batch, out: str) -> None:
     before = len(found.files) - found.new
     kept = f", {before} of them before" if before else ""
     terminal.line(f"{len(found.files)} files answered{kept}: {out}", style="bold")
@@ -133,8 +121,5 @@ def _answer(found: Batch, out: str, report: str | None, as_json: bool) -> None:
     terminal.table(Table("", ["status", "answers"], rows, numeric=True))
     for reason in list(found.refused.values())[:NAMED]:
         terminal.line(reason)
-    if len(found.refused) > NAMED:
-        terminal.line(
-            f"{len(found.refused) - NAMED} more files without an answer are in the table."
-        )
-    terminal.report(report)
+    if (more := len(found.refused) - NAMED) > 0:
+        terminal.line(f"{more} more files without an answer are in the table.")

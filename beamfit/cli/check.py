@@ -23,14 +23,7 @@ Examples:
 @click.command(epilog=EXAMPLE)
 @click.argument("files", nargs=-1, required=True, metavar="FILE...")
 @options("ignore skip-bad use energy json")
-def check(
-    files: tuple[str, ...],
-    ignore: tuple[str, ...],
-    skip_bad: bool,
-    use: str | None,
-    energy: float | None,
-    as_json: bool,
-) -> None:
+def check(files: tuple[str, ...], as_json: bool, **reading: Any) -> None:
     """Say what is understood of scans, lattices, records, rings, runs and formulations.
 
     Of each FILE the kind, the rows, the magnets and their units, the range of the sizes and where
@@ -42,8 +35,7 @@ def check(
     wrong: list[tuple[str, InputError]] = []
     for path in dict.fromkeys(files):
         try:
-            read = understand(path, ignore=ignore, skip_bad=skip_bad, use=use, energy=energy)
-            found.append(read)
+            found.append(understand(path, **reading))
         except InputError as error:
             wrong.append((path, error))
     lattices = [each for each in found if each.kind == "lattice"]

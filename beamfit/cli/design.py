@@ -7,14 +7,14 @@ from typing import TYPE_CHECKING, Any
 import click
 
 import beamfit
-from beamfit.cli.options import command_line, options
+from beamfit.cli.options import answered, option, options
 from beamfit.io.line import build_line, read_inputs
-from beamfit.io.result import results_text
 from beamfit.studies.scan.assumptions import Assumptions
 from beamfit.studies.scan.typed import energies_of, goal_of
 from beamfit.table import text_of
 
 if TYPE_CHECKING:
+    from beamfit.cli.show import Terminal
     from beamfit.studies.scan.design import Advice
 
 # What `read_inputs` takes besides the scan.
@@ -30,18 +30,15 @@ Examples:
 @options(
     "scan ignore skip-bad lattice use from to screen energy scenario prior bounds gain anchor vary"
 )
-@click.option(
-    "--energies", metavar="MEV,MEV", default="", help="Further energies the beam can be had at."
-)
-@click.option(
+@option("--energies MEV,MEV", "Further energies the beam can be had at.", default="")
+@option(
     "--criterion",
-    type=click.Choice(["emittance", "D"]),
+    "Make small the error of the emittance, or the volume of the error ellipsoid.",
+    choices=["emittance", "D"],
     default="emittance",
-    show_default=True,
-    help="Make small the error of the emittance, or the volume of the error ellipsoid.",
 )
-@click.option("--goal", metavar="PERCENT", help="Emittance error to stop at.")
-@click.option("--count", default=5, show_default=True, help="Most measurements.")
+@option("--goal PERCENT", "Emittance error to stop at.")
+@option("--count", "Most measurements.", default=5)
 @options("json")
 def design(
     scan: str,
@@ -62,7 +59,8 @@ def design(
     aim, others = None if goal is None else goal_of(goal), energies_of(energies)
     given = {name: told.pop(name) for name in GIVEN}
     Assumptions(**told).check_scenario(scenario)
-    measured, described, inputs, _ = read_inputs(scan, **given)
+    read = read_inputs(scan, **given)
+    measured, described, _ = read
     described.check_magnets(limits)
     described.check_energies(others)
 
@@ -71,16 +69,11 @@ def design(
     fit = beamfit.fit_emittance(measured, build_line(described), scenario=scenario, **told)
     wanted = {"criterion": criterion, "goal": aim, "count": count, "energies": others}
     advice = plan_measurements(fit, limits=limits or None, **wanted)
-    if as_json:
-        click.echo(results_text([advice], inputs, command_line()))
-    else:
-        _show(advice, f"{fit.scan.name} on {fit.line.name}")
+    title = f"{fit.scan.name} on {fit.line.name}"
+    answered(as_json, [advice], read.digests, lambda terminal: _show(terminal, advice, title))
 
 
-def _show(advice: Advice, title: str) -> None:
-    from beamfit.cli.show import Terminal
-
-    terminal = Terminal()
+def _show(terminal: Terminal, advice: Advice, title: str) -> None:
     terminal.line(f"{title}, scenario {advice.scenario}: error of the emittance", style="bold")
     click.echo("\n\n".join(map(text_of, advice.tables())))
     terminal.verdict("design", advice.status, advice.message)

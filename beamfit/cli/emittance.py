@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
 import click
 
 import beamfit
-from beamfit.cli.options import Sampling, command_line, options
+from beamfit.cli.options import Sampling, answered, option, options, reported
 from beamfit.errors import InputError
 from beamfit.io.line import build_line, read_inputs
-from beamfit.io.result import results_text
 from beamfit.io.systematics import read_systematics
 from beamfit.studies.scan.assumptions import Assumptions
+from beamfit.table import Table, labelled
 
 if TYPE_CHECKING:
     from beamfit.cli.show import Terminal
@@ -42,33 +43,29 @@ Examples:
 
 @click.command(epilog=EXAMPLE)
 @options("scan ignore skip-bad size-method maybe-lattice use from to screen energy particle")
-@click.option(
-    "--plane",
-    type=click.Choice(["x", "y", "both"]),
-    help="Which plane to fit; all that were measured by default.",
+@option(
+    "--plane", "Which plane to fit; all that were measured by default.", choices=["x", "y", "both"]
 )
-@click.option(
+@option(
     "--method",
-    type=click.Choice(["size-squared", "size"]),
+    "What the fit compares: size² (linear) or size.",
+    choices=["size-squared", "size"],
     default="size-squared",
-    show_default=True,
-    help="What the fit compares: size² (linear) or size.",
 )
-@click.option("--robust", is_flag=True, help="Give each point a probability of being an outlier.")
+@option("--robust", "Give each point a probability of being an outlier.", is_flag=True)
 @options("weights scenario prior bounds gain anchor")
-@click.option(
-    "--systematics",
-    "known",
-    metavar="FILE",
-    help="TOML file of what is known of screen, energy, drifts, magnets: part of the error then.",
+@option(
+    "--systematics FILE",
+    "TOML file of what is known of screen, energy, drifts, magnets: part of the error then.",
+    name="known",
 )
-@click.option(
+@option(
     "--hysteresis",
+    "Focusing network: branches of k1 for rising and falling currents, by the order of rows.",
     is_flag=True,
-    help="Focusing network: branches of k1 for rising and falling currents, by the order of rows.",
 )
 @options("hidden")
-@click.option("--starts", default=20, show_default=True, help="Networks: starts of the training.")
+@option("--starts", "Networks: starts of the training.", default=20)
 @options("sample store seed report json")
 def emittance(
     scan: str,
@@ -98,7 +95,8 @@ def emittance(
     if known is not None:
         told["priors"] = read_systematics(known) | told["priors"]
     Assumptions(**told).check_scenario(scenario)
-    measured, described, inputs, gui = read_inputs(scan, **given)
+    read = read_inputs(scan, **given)
+    measured, described, gui = read
     planes = {None: measured.planes, "both": ("x", "y")}.get(plane, (plane,))
     for each in planes:
         measured.rows(each)  # says so if it was not measured
@@ -110,37 +108,31 @@ def emittance(
     line = build_line(described)  # JAX from here on
     told |= {"planes": planes, "method": method.replace("-", "_"), "robust": robust}
     told |= {"weights": weights, "scenario": scenario}
-    about = {"command": command_line(), "inputs": inputs}
+    inputs = read.digests
     if len(measured.slices) > 1:
         from beamfit.studies.scan.slices import fit_slices
 
-        _answer_slices(fit_slices(measured, line, **told), about, report, as_json)
+        fits = fit_slices(measured, line, **told)
+        reported(report, fits, inputs)
+        results = (entry for fit in fits for entry in results_of(fit))
+        answered(as_json, results, inputs, lambda terminal: _show_slices(terminal, fits), report)
         return
     fit = beamfit.fit_emittance(measured, line, **told)
     methods = () if gui is None else compared(gui, line, planes)
     posterior = fit.sample(**sampling.arguments(inputs, quiet=as_json)) if sample else None
-    if report is not None:
-        beamfit.write_report(report, fit, posterior, methods=methods, **about)
-    if as_json:
-        further = {} if posterior is None else {"posterior": posterior}
-        click.echo(results_text(results_of(fit, methods), **about, **further))
-    else:
-        answer(fit, posterior, report, methods)
+    reported(report, fit, inputs, posterior=posterior, methods=methods)
+    answered(
+        as_json,
+        results_of(fit, methods),
+        inputs,
+        lambda terminal: show(terminal, fit, posterior, methods),
+        report,
+        posterior=posterior,
+    )
 
 
-def _answer_slices(
-    fits: SliceFits, about: dict[str, Any], report: str | None, as_json: bool
-) -> None:
-    """Answer with a row a slice, and what is said of each."""
-    if report is not None:
-        beamfit.write_report(report, fits, **about)
-    if as_json:
-        results = [entry for fit in fits for entry in results_of(fit, ())]
-        click.echo(results_text(results, **about))
-        return
-    from beamfit.cli.show import Terminal
-
-    terminal = Terminal()
+def _show_slices(terminal: Terminal, fits: SliceFits) -> None:
+    """Show a row a slice, and what is said of each."""
     terminal.line(f"{fits.scan.name} on {fits.fits[0].line.name}", style="bold")
     for fit in fits:
         for p in fit.planes:
@@ -152,7 +144,6 @@ def _answer_slices(
         terminal.table(table)
         terminal.line()
     _about_the_input(terminal, fits, ())
-    terminal.report(report)
 
 
 def compared(
@@ -165,37 +156,32 @@ def compared(
     return tuple(m for m in found if m.plane in planes)
 
 
-def results_of(fit: EmittanceFit, methods: tuple[SizeMethods, ...]) -> list[dict[str, Any]]:
+def results_of(
+    fit: EmittanceFit, methods: tuple[SizeMethods, ...] = ()
+) -> Iterator[dict[str, Any]]:
     """What a fit says, and what small errors of the line and parts of the scan would change."""
-    if not fit.statement.closed:
-        return fit.to_json()
-    ways = {m.plane: {"size_methods": m} for m in methods}
-
     from beamfit.studies.scan.sensitivity import range_sensitivity, systematics
 
-    return [
-        entry
-        | {"systematics": systematics(fit, p.plane), "range": range_sensitivity(p)}
-        | ways.get(p.plane, {})
-        for p, entry in zip(fit.planes, fit.to_json(), strict=True)
-    ]
+    ways = {m.plane: {"size_methods": m} for m in methods}
+    for p, entry in zip(fit.planes, fit.to_json(), strict=True):
+        if fit.statement.closed:
+            entry |= {"systematics": systematics(fit, p.plane), "range": range_sensitivity(p)}
+            entry |= ways.get(p.plane, {})
+        yield entry
 
 
-def answer(
+def show(
+    terminal: Terminal,
     fit: EmittanceFit,
-    posterior: Posterior | None,
-    report: str | None,
-    methods: tuple[SizeMethods, ...],
+    posterior: Posterior | None = None,
+    methods: tuple[SizeMethods, ...] = (),
 ) -> None:
     """Say the verdict first, then show tables and what the budget is."""
-    from beamfit.cli.show import Terminal
     from beamfit.studies.scan.results import parameter_rows, result_rows
     from beamfit.studies.scan.sensitivity import budget_rows, range_rows
-    from beamfit.table import Table, labelled
 
-    terminal, names = Terminal(), [p.plane for p in fit.planes]
+    names, statuses = [p.plane for p in fit.planes], [p.status for p in fit.planes]
     title = f"{fit.scan.name} on {fit.line.name}"
-    statuses = [p.status for p in fit.planes]
     terminal.line(title, style="bold")
     for p in fit.planes:
         terminal.answer(p.headline, p.status, p.message)
@@ -224,7 +210,6 @@ def answer(
     _about_the_input(terminal, fit, methods)
     if posterior is not None:
         terminal.posterior("Posterior", posterior)
-    terminal.report(report)
 
 
 def _about_the_input(

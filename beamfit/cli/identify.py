@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
-from beamfit.cli.options import command_line, options
+from beamfit.cli.options import answered, option, options, reported
 from beamfit.errors import InputError
 from beamfit.io.files import digest
+from beamfit.io.run import read_run
 
 if TYPE_CHECKING:
+    from beamfit.cli.show import Terminal
     from beamfit.studies.fedbatch.fit import FedBatchFit
     from beamfit.studies.fedbatch.titre import TitreFit
     from beamfit.studies.response.fit import ResponseFit
@@ -32,26 +34,22 @@ Examples:
 @click.command(epilog=EXAMPLE)
 @click.argument("record", nargs=-1, required=True)
 @options("model order map input output step delay no-offset gain")
-@click.option("--hold-back", multiple=True, metavar="RECORD", help="A run that is only predicted.")
+@option("--hold-back RECORD", "A run that is only predicted.", multiple=True)
 @options("hidden ignore skip-bad seed report json")
 def identify(
     record: tuple[str, ...],
     model: str,
     order: int | None,
     map: str,
-    inputs: tuple[str, ...],
-    outputs: tuple[str, ...],
-    step: float | None,
     delay: int | None,
     no_offset: bool,
     gains: dict[str, tuple[float, float]],
     hidden: int,
     hold_back: tuple[str, ...],
-    ignore: tuple[str, ...],
-    skip_bad: bool,
     seed: int,
     report: str | None,
     as_json: bool,
+    **reading: Any,
 ) -> None:
     """Identify how the outputs of a process respond to its inputs.
 
@@ -61,8 +59,6 @@ def identify(
     one of all outputs, with its time constants and gains; a fed-batch process the rates of its
     balances.
     """
-    from beamfit.io.run import read_run  # numpy
-
     if order is not None and model != STATES:
         raise InputError(f"--order {order} with --model {model}", f"--model {STATES}")
     if gains and model in (STATES, FED_BATCH):
@@ -70,13 +66,11 @@ def identify(
     if model == FED_BATCH and (map != "network" or delay or no_offset):
         expected = "--map network, without --delay or --no-offset: its rates are a network's"
         raise InputError(f"--model {FED_BATCH}", expected)
-    said = {"inputs": inputs, "outputs": outputs, "step": step}
-    said |= {"ignore": ignore, "skip_bad": skip_bad}
     twice = [path for path in record if (*record, *hold_back).count(path) > 1]
     if twice:
         raise InputError("a run given twice", "each run once", path=twice[0])
-    runs = [read_run(path, **said) for path in record]
-    held = [read_run(path, **said) for path in hold_back]
+    runs = [read_run(path, **reading) for path in record]
+    held = [read_run(path, **reading) for path in hold_back]
 
     options = {"map": map, "offset": not no_offset, "hidden": hidden, "seed": seed, "held": held}
     if model == STATES:
@@ -96,22 +90,11 @@ def identify(
         options |= {"model": model, "delay": delay, "gains": gains}
         fits = [fit_response(runs, output=name, **options) for name in runs[0].outputs]
     digests = {path: digest(path) for path in (*record, *hold_back)}
-    if report is not None:
-        from beamfit.report.page import write_report
-
-        write_report(report, fits, command=command_line(), inputs=digests)
-    if as_json:
-        from beamfit.io.result import results_text
-
-        click.echo(results_text([fit.to_json() for fit in fits], digests, command_line()))
-        return
-    _show(fits, report)
+    reported(report, fits, digests)
+    answered(as_json, fits, digests, lambda terminal: _show(terminal, fits), report)
 
 
-def _show(fits: list[ResponseFit | StatesFit | FedBatchFit | TitreFit], report: str | None) -> None:
-    from beamfit.cli.show import Terminal
-
-    terminal = Terminal()
+def _show(terminal: Terminal, fits: list[ResponseFit | StatesFit | FedBatchFit | TitreFit]) -> None:
     for run in fits[0].runs:
         terminal.line(run.headline, style="bold")
         for note in run.notes:
@@ -122,4 +105,3 @@ def _show(fits: list[ResponseFit | StatesFit | FedBatchFit | TitreFit], report: 
         for table in fit.tables():
             terminal.table(table)
             terminal.line()
-    terminal.report(report)

@@ -3,23 +3,23 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
 import beamfit
-from beamfit.cli.options import Sampling, command_line, options
+from beamfit.cli.options import Sampling, answered, option, options, reported
 from beamfit.errors import InputError
 from beamfit.io.decay_record import read_lifetime_input
 from beamfit.io.files import digest
 from beamfit.io.monitor import monitor_of
-from beamfit.io.result import results_text
 from beamfit.studies.decay.record import LifetimeTable
 
 if TYPE_CHECKING:
     from beamfit.cli.show import Terminal
     from beamfit.sampling.posterior import Posterior
     from beamfit.studies.decay.budget import Machine
+    from beamfit.studies.decay.lifetimes import LifetimeFit
     from beamfit.studies.decay.shift import Shift
     from beamfit.studies.decay.study import Decay, RecordStudy
     from beamfit.studies.decay.trend import Trend
@@ -41,46 +41,42 @@ Examples:
 
 @click.command(epilog=EXAMPLE)
 @click.argument("record", nargs=-1, required=True)
-@click.option(
-    "--ring",
-    metavar="FILE.toml",
-    help="Ring, for the loss budget from first principles beside the measured a and b.",
+@option(
+    "--ring FILE.toml",
+    "Ring, for the loss budget from first principles beside the measured a and b.",
 )
-@click.option(
+@option(
     "--study",
-    is_flag=True,
-    help="Fit the ring's loss mechanisms to all decays together: scales, loss budget with credible "
+    "Fit the ring's loss mechanisms to all decays together: scales, loss budget with credible "
     "intervals, best operating point, next decay, anomaly. Needs --ring.",
-)
-@click.option(
-    "--network",
-    type=click.Choice(["alone", "correction"]),
-    help="With --study: also fit a and b by a network that falls with bunches and scraper and "
-    "rises with pressure; alone, or as a factor on the fitted first principles.",
-)
-@click.option(
-    "--trend",
     is_flag=True,
-    help="Follow the lifetime through all decays: current times lifetime with control limits, by "
+)
+@option(
+    "--network",
+    "With --study: also fit a and b by a network that falls with bunches and scraper and "
+    "rises with pressure; alone, or as a factor on the fitted first principles.",
+    choices=["alone", "correction"],
+)
+@option(
+    "--trend",
+    "Follow the lifetime through all decays: current times lifetime with control limits, by "
     "the ring to one current and its usual settings if --ring is given; alarms where a or b moved.",
+    is_flag=True,
 )
 @options("time current")
-@click.option(
-    "--offset",
-    metavar="zero-beam|CURRENT",
-    help="What the current monitor reads without beam, taken off: a current such as 0.12mA, or "
+@option(
+    "--offset zero-beam|CURRENT",
+    "What the current monitor reads without beam, taken off: a current such as 0.12mA, or "
     "from the record's own readings before injection or after the dump.",
 )
-@click.option(
-    "--monitor-drift",
-    metavar="CURRENT/TIME",
-    help="How far the current monitor drifts (one standard deviation), such as 10uA/h; part of the "
+@option(
+    "--monitor-drift CURRENT/TIME",
+    "How far the current monitor drifts (one standard deviation), such as 10uA/h; part of the "
     "errors then.",
 )
-@click.option(
-    "--monitor-offset",
-    metavar="CURRENT",
-    help="How far it is off without beam (one standard deviation), such as 50uA.",
+@option(
+    "--monitor-offset CURRENT",
+    "How far it is off without beam (one standard deviation), such as 50uA.",
 )
 @options("prior ignore skip-bad sample store seed report json")
 def lifetime(
@@ -89,19 +85,15 @@ def lifetime(
     study: bool,
     network: str | None,
     trend: bool,
-    time: str | None,
-    current: str | None,
-    offset: str | None,
     monitor_drift: str | None,
     monitor_offset: str | None,
     priors: dict[str, tuple[float, float]] | None,
-    ignore: tuple[str, ...],
-    skip_bad: bool,
     sample: bool,
     store: str | None,
     seed: int,
     report: str | None,
     as_json: bool,
+    **reading: Any,
 ) -> None:
     """Fit the lifetime to decay records and say what they cannot tell.
 
@@ -115,10 +107,8 @@ def lifetime(
     sampling = Sampling(sample, store, seed)
     sampling.check()
     _check_study(study, ring, network, priors)
-    said = {"time": time, "current": current, "ignore": ignore, "skip_bad": skip_bad}
-    said |= {"offset": offset}
     monitor = monitor_of(monitor_drift, monitor_offset)
-    records = [read_lifetime_input(path, **said) for path in dict.fromkeys(record)]
+    records = [read_lifetime_input(path, **reading) for path in dict.fromkeys(record)]
     if len(records) < len(record):
         twice = next(path for path in record if record.count(path) > 1)
         raise InputError("a record given twice", "each record once", path=twice)
@@ -148,18 +138,17 @@ def lifetime(
         sampling.check_one(len(decays))
         drawn = sampling.arguments(inputs, quiet=as_json)
         posteriors = [decay.fit.sample(**drawn) for decay in decays]
-    if report is not None:
-        said = {"command": command_line(), "inputs": inputs, "shift": shift, "trend": course}
-        beamfit.write_report(report, studies, posteriors, **said)
-    if as_json:
-        results = [decay.to_json() for decay in decays]
-        for result, posterior in zip(results, posteriors or (), strict=False):
-            result["posterior"] = posterior
-        further = {"study": shift, "trend": course}
-        further = {name: found for name, found in further.items() if found is not None}
-        click.echo(results_text(results, inputs, command_line(), **further))
-    else:
-        _show(studies, posteriors, shift, course, report)
+    reported(report, studies, inputs, posterior=posteriors, shift=shift, trend=course)
+    more = [{"posterior": each} for each in posteriors] if posteriors else [{}] * len(decays)
+    answered(
+        as_json,
+        (decay.to_json() | further for decay, further in zip(decays, more, strict=True)),
+        inputs,
+        lambda terminal: _show(terminal, studies, posteriors, shift, course),
+        report,
+        study=shift,
+        trend=course,
+    )
 
 
 def _lifetimes(tables: list[LifetimeTable], inputs: dict[str, str], as_json: bool) -> None:
@@ -167,12 +156,10 @@ def _lifetimes(tables: list[LifetimeTable], inputs: dict[str, str], as_json: boo
     from beamfit.studies.decay.lifetimes import fit_lifetimes  # JAX from here on
 
     fits = [fit_lifetimes(table) for table in tables]
-    if as_json:
-        click.echo(results_text([fit.to_json() for fit in fits], inputs, command_line()))
-        return
-    from beamfit.cli.show import Terminal
+    answered(as_json, fits, inputs, lambda terminal: _show_lifetimes(terminal, fits))
 
-    terminal = Terminal()
+
+def _show_lifetimes(terminal: Terminal, fits: list[LifetimeFit]) -> None:
     for fit in fits:
         terminal.line(str(fit.readings), style="bold")
         terminal.table(fit.table(), [fit.status])
@@ -218,16 +205,13 @@ def _trend(studies: tuple[RecordStudy, ...], machine: Machine | None) -> Trend:
 
 
 def _show(
+    terminal: Terminal,
     studies: tuple[RecordStudy, ...],
     posteriors: list[Posterior] | None,
     shift: Shift | None,
     trend: Trend | None,
-    report: str | None,
 ) -> None:
     """Show every record, and what was drawn and found of all together."""
-    from beamfit.cli.show import Terminal
-
-    terminal = Terminal()
     for each in studies:
         _show_record(terminal, each)
     names = [decay.fit.record for study in studies for decay in study.answers]
@@ -239,42 +223,34 @@ def _show(
         for table in trend.tables():
             terminal.table(table, wrap=False)
         terminal.verdict("trend", trend.status, trend.message)
-    terminal.report(report)
 
 
 def _show_record(terminal: Terminal, study: RecordStudy) -> None:
     """Lay out a record: what was cut away, and every decay with its verdict and budget."""
-    from beamfit.studies.decay.tables import (
-        FEW,
-        SYSTEMATIC,
-        budget_rows,
-        check_rows,
-        counted,
-        decay_rows,
-        separability_rows,
-        systematic_rows,
-    )
+    from beamfit.studies.decay import tables
     from beamfit.table import Table, labelled
 
     terminal.line(str(study.record), style="bold")
     for note in study.record.notes:
         terminal.line(f"Note: {note}")
     if study.pooled:
-        terminal.line(f"Cut at or left out: {counted(study.events)}")
+        terminal.line(f"Cut at or left out: {tables.counted(study.events)}")
     elif study.events:
         said = "; ".join(str(event) for event in study.events[:8])
         left = len(study.events) - 8
         terminal.line(f"Cut at or left out: {said}" + (f"; {left} more" if left > 0 else ""))
-    many = len(study.decays) > FEW
+    many = len(study.decays) > tables.FEW
     for decay in study.pooled if many else study.answers:
         name, status = decay.fit.record, decay.fit.status
-        rows = decay_rows([decay]) + separability_rows([decay])[:2] + check_rows([decay])
+        rows = tables.decay_rows([decay]) + tables.separability_rows([decay])[:2]
+        rows += tables.check_rows([decay])
         terminal.answer(decay.fit.headline, status, decay.fit.message)
         terminal.line()
         terminal.table(labelled("", [name], rows), [status])
         if decay.systematics:
-            terminal.table(Table("\nWhat no residual shows", SYSTEMATIC, systematic_rows(decay)))
-        if losses := budget_rows([decay]):
+            unseen = tables.systematic_rows(decay)
+            terminal.table(Table("\nWhat no residual shows", tables.SYSTEMATIC, unseen))
+        if losses := tables.budget_rows([decay]):
             terminal.table(labelled("\nLosses from first principles", [name], losses))
         terminal.line()
     if many:
@@ -283,13 +259,13 @@ def _show_record(terminal: Terminal, study: RecordStudy) -> None:
 
 def _show_many(terminal: Terminal, study: RecordStudy) -> None:
     """One row a decay; the name of the record is above."""
-    from beamfit.studies.decay.tables import alike, overview
+    from beamfit.studies.decay import tables
     from beamfit.table import Table
 
-    for title, header, rows in overview(study.decays):
+    for title, header, rows in tables.overview(study.decays):
         cells = [[name.removeprefix(study.record.name), *found] for name, *found in rows]
         terminal.table(Table(f"\n{title}", header, cells))
-    for status, names, message in alike(study.decays):
+    for status, names, message in tables.alike(study.decays):
         terminal.verdict(names, status, message)
     terminal.line()
 
@@ -297,12 +273,12 @@ def _show_many(terminal: Terminal, study: RecordStudy) -> None:
 def _show_shift(terminal: Terminal, shift: Shift) -> None:
     """Lay out a study of many decays and its verdicts."""
     from beamfit.quantity import Status
-    from beamfit.studies.decay.tables import network_rows, shift_rows
+    from beamfit.studies.decay import tables
     from beamfit.table import labelled
 
     fit, count = shift.fit, len(shift.fit.names)
     names = ["1 decay" if count == 1 else f"{count} decays"]
-    table = labelled("First principles fitted to", names, shift_rows(shift))
+    table = labelled("First principles fitted to", names, tables.shift_rows(shift))
     terminal.table(table, [fit.status])
     terminal.verdict("all decays", fit.status, fit.message)
     if shift.untold:
@@ -312,7 +288,6 @@ def _show_shift(terminal: Terminal, shift: Shift) -> None:
         terminal.verdict("second half", shift.anomaly.status, shift.anomaly.message)
     if shift.network is not None:
         found = shift.network.fit
-        terminal.table(
-            labelled("A network of the losses", names, network_rows(shift)), [found.status]
-        )
+        table = labelled("A network of the losses", names, tables.network_rows(shift))
+        terminal.table(table, [found.status])
         terminal.verdict("network", found.status, found.message)

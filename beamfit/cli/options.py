@@ -1,20 +1,38 @@
-"""The options that several commands share, declared once, and what becomes of them."""
+"""What commands share: options, declared once, and how a command reports and answers."""
 
 from __future__ import annotations
 
 import shlex
 import sys
-from collections.abc import Callable, Mapping
-from typing import Any, NamedTuple
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import click
 
+import beamfit
 from beamfit.errors import InputError
+from beamfit.io.result import results_text
 from beamfit.particles import REST_ENERGY
 from beamfit.report import kind_of
 from beamfit.studies.scan.assumptions import SCENARIOS
 from beamfit.studies.scan.typed import anchor_of, bounds_of, gains_of, limits_of, priors_of
 from beamfit.writing import check_place
+
+if TYPE_CHECKING:
+    from beamfit.cli.show import Terminal
+
+
+def option(
+    spelled: str, said: str, name: str = "", choices: Sequence[str] = (), **further: Any
+) -> Callable[..., Any]:
+    """An option as it is typed, with what stands behind it, and what it means; defaults are shown.
+
+    `name` is that of the command's argument where it is another one than the option's.
+    """
+    flag, _, metavar = spelled.partition(" ")
+    further |= {"type": click.Choice(list(choices))} if choices else {}
+    further |= {"metavar": metavar or None, "show_default": bool(further.get("default"))}
+    return click.option(*filter(None, (flag, name)), help=said, **further)
 
 
 def _parsed(read: Callable[[Any], Any]) -> Callable[..., Any]:
@@ -32,182 +50,145 @@ def _report(path: str) -> str:
 LATTICE = "Lattice: TOML, MAD-X (.madx, .seq), MAD-8 (.mad8) or elegant (.lte)."
 SHARED: dict[str, Callable[..., Any]] = {
     "scan": click.argument("scan"),
-    "ignore": click.option(
-        "--ignore",
+    "ignore": option(
+        "--ignore COLUMN",
+        "A column of the scan to leave unread; * and ? stand for any letters.",
         multiple=True,
-        metavar="COLUMN",
-        help="A column of the scan to leave unread; * and ? stand for any letters.",
     ),
-    "skip-bad": click.option(
+    "skip-bad": option(
         "--skip-bad",
+        "Leave out rows of the scan with something wrong in them; they are counted and named.",
         is_flag=True,
-        help="Leave out rows of the scan with something wrong in them; they are counted and named.",
     ),
-    "lattice": click.option("--lattice", required=True, metavar="FILE", help=LATTICE),
-    "maybe-lattice": click.option("--lattice", metavar="FILE", help=LATTICE),
-    "size-method": click.option(
-        "--size-method",
-        metavar="NAME",
-        help="Which sizes of a .mat file of emittance_gui; RMS unless said.",
+    "lattice": option("--lattice FILE", LATTICE, required=True),
+    "maybe-lattice": option("--lattice FILE", LATTICE),
+    "size-method": option(
+        "--size-method NAME", "Which sizes of a .mat file of emittance_gui; RMS unless said."
     ),
-    "weights": click.option(
+    "weights": option(
         "--weights",
-        type=click.Choice(["model", "measured"]),
+        "Whose size the error of size squared is taken at; measured sizes bias the answer.",
+        choices=["model", "measured"],
         default="model",
-        show_default=True,
-        help="Whose size the error of size squared is taken at; measured sizes bias the answer.",
     ),
-    "particle": click.option(
+    "particle": option(
         "--particle",
-        type=click.Choice(list(REST_ENERGY)),
-        help="Of a scan without a lattice; electrons unless said.",
+        "Of a scan without a lattice; electrons unless said.",
+        choices=list(REST_ENERGY),
     ),
-    "use": click.option(
-        "--use", metavar="NAME", help="Line or sequence of a lattice with several."
+    "use": option("--use NAME", "Line or sequence of a lattice with several."),
+    "from": option("--from NAME", "Element with which the line begins.", name="first"),
+    "to": option("--to NAME", "Element with which the line ends.", name="last"),
+    "screen": option(
+        "--screen NAME",
+        "Screen or marker at which sizes are measured or wanted; the last screen unless said.",
     ),
-    "from": click.option(
-        "--from", "first", metavar="NAME", help="Element with which the line begins."
-    ),
-    "to": click.option("--to", "last", metavar="NAME", help="Element with which the line ends."),
-    "screen": click.option(
-        "--screen",
-        metavar="NAME",
-        help="Screen or marker at which sizes are measured or wanted; the last screen unless said.",
-    ),
-    "energy": click.option(
-        "--energy",
-        type=float,
-        metavar="MEV",
-        help="Total energy, instead of the lattice's own; elegant files and scans without a "
+    "energy": option(
+        "--energy MEV",
+        "Total energy, instead of the lattice's own; elegant files and scans without a "
         "lattice have none.",
+        type=float,
     ),
-    "scenario": click.option(
+    "scenario": option(
         "--scenario",
-        type=click.Choice(list(SCENARIOS)),
-        default="known",
-        show_default=True,
-        help="What is unknown besides the beam: nothing, R11 and R12, the magnets' calibration, "
+        "What is unknown besides the beam: nothing, R11 and R12, the magnets' calibration, "
         "or k1 as a function of the current.",
+        choices=list(SCENARIOS),
+        default="known",
     ),
-    "time": click.option(
-        "--time",
-        metavar="COLUMN[:UNIT]",
-        help="Header of the time, a date or a number in s, min, h, d or ms.",
+    "time": option(
+        "--time COLUMN[:UNIT]", "Header of the time, a date or a number in s, min, h, d or ms."
     ),
-    "current": click.option(
-        "--current",
-        metavar="COLUMN:UNIT",
-        help="Header of the beam current and its unit, mA, A or uA, after the last colon, such "
+    "current": option(
+        "--current COLUMN:UNIT",
+        "Header of the beam current and its unit, mA, A or uA, after the last colon, such "
         "as SR:DCCT:CURRENT:mA. With --time or --current other columns of unknown names are left "
         "aside.",
     ),
-    "prior": click.option(
-        "--prior",
-        "priors",
-        multiple=True,
-        metavar="NAME=MEAN+-SD",
-        callback=_parsed(priors_of),
-        help="What is known of a number: calibration, Q2.slope=167.23+-3.3446 (or ±); a study of "
+    "prior": option(
+        "--prior NAME=MEAN+-SD",
+        "What is known of a number: calibration, Q2.slope=167.23+-3.3446 (or ±); a study of "
         "lifetimes, its scales, and rf_voltage=1+-1% for the calibration of that reading.",
-    ),
-    "bounds": click.option(
-        "--bounds",
+        name="priors",
         multiple=True,
-        metavar="NAME=LOW:HIGH",
-        callback=_parsed(bounds_of),
-        help="Calibration: bounds of a number; ± 12 % of the slope unless given. Transport "
+        callback=_parsed(priors_of),
+    ),
+    "bounds": option(
+        "--bounds NAME=LOW:HIGH",
+        "Calibration: bounds of a number; ± 12 % of the slope unless given. Transport "
         "network: of the beam, x.sigma11=2e-8:3e-8 (SI), or of a setting the gains are held over.",
-    ),
-    "gain": click.option(
-        "--gain",
-        "gains",
         multiple=True,
-        metavar="NAME=LOW:HIGH",
-        callback=_parsed(gains_of),
-        help="Transport network: limits of a gain such as dA_x/dQ2=:-0.0083, in place of signs. "
+        callback=_parsed(bounds_of),
+    ),
+    "gain": option(
+        "--gain NAME=LOW:HIGH",
+        "Transport network: limits of a gain such as dA_x/dQ2=:-0.0083, in place of signs. "
         "Responses: limits that a parameter keeps for certain, K=1:3 or dK/dvalve=0:.",
-    ),
-    "anchor": click.option(
-        "--anchor",
+        name="gains",
         multiple=True,
-        metavar="ANCHOR",
-        callback=_parsed(anchor_of),
-        help="Networks: what ties them to the lattice: first-principles=2%, a setting such as "
+        callback=_parsed(gains_of),
+    ),
+    "anchor": option(
+        "--anchor ANCHOR",
+        "Networks: what ties them to the lattice: first-principles=2%, a setting such as "
         "Q2=0, or determinant.",
-    ),
-    "hidden": click.option(
-        "--hidden", default=5, show_default=True, help="Networks: hidden nodes."
-    ),
-    "vary": click.option(
-        "--vary",
-        "limits",
         multiple=True,
-        metavar="MAGNET=LOW:HIGH",
-        callback=_parsed(limits_of),
-        help="A magnet and its limits, in the unit of its calibration.",
+        callback=_parsed(anchor_of),
     ),
-    "model": click.option(
+    "hidden": option("--hidden", "Networks: hidden nodes.", default=5),
+    "vary": option(
+        "--vary MAGNET=LOW:HIGH",
+        "A magnet and its limits, in the unit of its calibration.",
+        name="limits",
+        multiple=True,
+        callback=_parsed(limits_of),
+    ),
+    "model": option(
         "--model",
-        type=click.Choice(["first-order", "second-order", "arx", "state-space", "fed-batch"]),
-        default="first-order",
-        show_default=True,
-        help="tau y' + y = K u; T² y'' + 2 zeta T y' + y = K u; y(k) = -a1 y(k-1) - a2 y(k-2) + "
+        "tau y' + y = K u; T² y'' + 2 zeta T y' + y = K u; y(k) = -a1 y(k-1) - a2 y(k-2) + "
         "b1 u(k-1) + b2 u(k-2); x+ = A x + B u, y = C x + D u of all outputs together; or mass "
         "balances of biomass, substrate and volume with rates by a network.",
+        choices=["first-order", "second-order", "arx", "state-space", "fed-batch"],
+        default="first-order",
     ),
-    "order": click.option(
-        "--order",
+    "order": option(
+        "--order STATES",
+        "State space: its states; found by an information criterion unless said.",
         type=click.IntRange(1, 50),
-        metavar="STATES",
-        help="State space: its states; found by an information criterion unless said.",
     ),
-    "map": click.option(
+    "map": option(
         "--map",
-        type=click.Choice(["constant", "network"]),
+        "Parameters are numbers, or change with the inputs by a network.",
+        choices=["constant", "network"],
         default="constant",
-        show_default=True,
-        help="Parameters are numbers, or change with the inputs by a network.",
     ),
-    "input": click.option(
-        "--input", "inputs", multiple=True, metavar="COLUMN", help="An input of any name."
-    ),
-    "output": click.option(
-        "--output", "outputs", multiple=True, metavar="COLUMN", help="An output of any name."
-    ),
-    "step": click.option(
-        "--step", type=float, metavar="SECONDS", help="Distance of rows without a time."
-    ),
-    "delay": click.option(
-        "--delay", type=click.IntRange(0), metavar="SAMPLES", help="Known delay; found unless said."
-    ),
-    "no-offset": click.option(
-        "--no-offset", is_flag=True, help="The output at rest is 0, and not estimated."
-    ),
-    "report": click.option(
-        "--report",
-        metavar="FILE.html|.pdf|.png|.svg",
+    "input": option("--input COLUMN", "An input of any name.", name="inputs", multiple=True),
+    "output": option("--output COLUMN", "An output of any name.", name="outputs", multiple=True),
+    "step": option("--step SECONDS", "Distance of rows without a time.", type=float),
+    "delay": option("--delay SAMPLES", "Known delay; found unless said.", type=click.IntRange(0)),
+    "no-offset": option("--no-offset", "The output at rest is 0, and not estimated.", is_flag=True),
+    "report": option(
+        "--report FILE.html|.pdf|.png|.svg",
+        "Write a report page, or (.png, .svg) its pictures one by one.",
         callback=_parsed(_report),
-        help="Write a report page, or (.png, .svg) its pictures one by one.",
     ),
-    "sample": click.option(
+    "sample": option(
         "--sample",
+        "Draw from the posterior: credible intervals, correlations, predictions.",
         is_flag=True,
-        help="Draw from the posterior: credible intervals, correlations, predictions.",
     ),
-    "store": click.option(
-        "--store",
-        metavar="FILE.h5",
-        help="Keep the draws of --sample (emcee's HDF5 layout); goes on from an earlier run.",
+    "store": option(
+        "--store FILE.h5",
+        "Keep the draws of --sample (emcee's HDF5 layout); goes on from an earlier run.",
     ),
-    "seed": click.option(
+    "seed": option(
         "--seed",
+        "Of all random numbers: draws, starts of networks.",
         type=click.IntRange(0, 2**32 - 1),
         default=1,
-        show_default=True,
-        help="Of all random numbers: draws, starts of networks.",
     ),
-    "json": click.option(
-        "--json", "as_json", is_flag=True, help="Print one JSON object and nothing else."
+    "json": option(
+        "--json", "Print one JSON object and nothing else.", name="as_json", is_flag=True
     ),
 }
 
@@ -254,6 +235,37 @@ class Sampling(NamedTuple):
             "provenance": source,
             "progress": not quiet,
         }
+
+
+def reported(
+    path: str | None, result: Any, inputs: Mapping[str, str | None], **further: Any
+) -> None:
+    """Write the report of a result, if one is wanted."""
+    if path is not None:
+        beamfit.write_report(path, result, command=command_line(), inputs=inputs, **further)
+
+
+def answered(
+    as_json: bool,
+    results: Iterable[Any],
+    inputs: Mapping[str, str | None],
+    show: Callable[[Terminal], None],
+    report: str | None = None,
+    **further: Any,
+) -> None:
+    """Print the one JSON object of a command, or have the answer shown, and where its report is.
+
+    Results are asked for if they are printed; what there is ``further`` is named beside them.
+    """
+    if as_json:
+        further = {name: found for name, found in further.items() if found is not None}
+        click.echo(results_text(list(results), inputs, command_line(), **further))
+        return
+    from beamfit.cli.show import Terminal  # rich
+
+    terminal = Terminal()
+    show(terminal)
+    terminal.report(report)
 
 
 def command_line() -> str:

@@ -5,12 +5,14 @@ from __future__ import annotations
 import time
 from contextlib import suppress
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from beamfit.cli.options import command_line, options
+import beamfit
+from beamfit.cli.options import answered, command_line, option, options, reported
 from beamfit.errors import InputError, plain
 from beamfit.io.files import digest
 from beamfit.io.line import build_line, read_inputs
@@ -35,18 +37,12 @@ Examples:
 
 @click.command(epilog=EXAMPLE)
 @click.argument("machine", required=False)
-@click.option("--dry-run", is_flag=True, help="Check the machine, print the plan, move nothing.")
-@click.option(
-    "--recover",
-    metavar="JOURNAL",
-    help="Restore what a scan that was killed has left, and move nothing else.",
-)
-@click.option("--save", metavar="FILE.csv", help="The scan; NAME_DATE_TIME.csv unless said.")
-@click.option(
-    "--journal", metavar="FILE", help="Where what is to be restored stands; beside MACHINE unless."
-)
-@click.option("--goal", metavar="PERCENT", help="Emittance error to stop at.")
-@click.option("--points", type=click.IntRange(4, 200), help="Most settings.")
+@option("--dry-run", "Check the machine, print the plan, move nothing.", is_flag=True)
+@option("--recover JOURNAL", "Restore what a scan that was killed has left, and move nothing else.")
+@option("--save FILE.csv", "The scan; NAME_DATE_TIME.csv unless said.")
+@option("--journal FILE", "Where what is to be restored stands; beside MACHINE unless.")
+@option("--goal PERCENT", "Emittance error to stop at.")
+@option("--points", "Most settings.", type=click.IntRange(4, 200))
 @options("report json")
 def scan(
     machine: str | None,
@@ -192,7 +188,7 @@ def _answered(
     found: Outcome, machine: ScanMachine, out: Path, report: str | None, as_json: bool
 ) -> int:
     """Answer as `beamfit emittance` would for the file, and say how the scan ended."""
-    from beamfit.cli.emittance import answer, results_of
+    from beamfit.cli.emittance import results_of, show
 
     if found.problem is not None:
         if not isinstance(found.problem, InputError):
@@ -200,28 +196,20 @@ def _answered(
         kept = f"; {len(found.points)} points are in {out}" if found.points and out.exists() else ""
         raise replace(found.problem, found=f"{found.problem.found}{kept}; all is restored")
     said = {"file": str(out), "points": len(found.points), "ended": found.reason, "restored": True}
-    status = 128 + found.signal if found.signal else 0
     inputs = _inputs(machine) | ({str(out): digest(out)} if found.points else {})
-    results: list[Any] = []
-    if found.fit is not None:
-        measured, described, _, _ = read_inputs(str(out), machine.lattice)
-        from beamfit.studies.scan.fit import fit_emittance
-
-        fit = fit_emittance(measured, build_line(described))
-        if report is not None:
-            from beamfit.report.page import write_report
-
-            write_report(report, fit, command=command_line(), inputs=inputs)
+    if found.fit is None:
+        few = f"The scan ended: {found.reason}; too few points for a fit."
+        few += f" It is in {out}." if found.points else ""
+        answered(as_json, [], inputs, lambda terminal: click.echo(few), scan=said)
+    else:
+        measured, described, _ = read_inputs(str(out), machine.lattice)
+        fit = beamfit.fit_emittance(measured, build_line(described))
+        reported(report, fit, inputs)
         if not as_json:
             click.echo(f"The scan ended: {found.reason}. It is in {out}.\n")
-            answer(fit, None, report, ())
-        results = results_of(fit, ()) if as_json else []
-    elif not as_json:
-        where = f" It is in {out}." if found.points else ""
-        click.echo(f"The scan ended: {found.reason}; too few points for a fit.{where}")
-    if as_json:
-        click.echo(results_text(results, inputs, command_line(), scan=said))
-    return status
+        shown = partial(show, fit=fit)
+        answered(as_json, results_of(fit), inputs, shown, report, scan=said)
+    return 128 + found.signal if found.signal else 0
 
 
 def _recovered(journal: str, say: _Lines, as_json: bool) -> int:

@@ -3,22 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 import numpy as np
 
 import beamfit
-from beamfit.cli.options import command_line, options
-from beamfit.errors import InputError
+from beamfit.cli.options import answered, option, options
+from beamfit.errors import InputError, located
 from beamfit.io.files import digest
 from beamfit.io.line import build_line, read_lattice
-from beamfit.io.result import read_fitted_beams, results_text
+from beamfit.io.result import read_fitted_beams
 from beamfit.studies.scan.typed import target_of
 from beamfit.studies.scan.wishes import Beam, Target, common_energy
 from beamfit.table import text_of
 
 if TYPE_CHECKING:
+    from beamfit.cli.show import Terminal
     from beamfit.io.lattice import LatticeFile
     from beamfit.studies.scan.setpoint_result import Setpoint
 
@@ -34,46 +35,32 @@ Examples:
 
 @click.command(epilog=EXAMPLE)
 @options("lattice use from to screen energy")
-@click.option(
-    "--sigma",
-    metavar="S11,S12,S22",
-    help="Beam matrix of the plane at the start, in m², m rad, rad².",
-)
-@click.option(
-    "--fit",
-    "fitted",
-    metavar="RESULT.json",
-    help="Output of beamfit emittance --json: the beam with its errors, at the scan's energy.",
+@option("--sigma S11,S12,S22", "Beam matrix of the plane at the start, in m², m rad, rad².")
+@option(
+    "--fit RESULT.json",
+    "Output of beamfit emittance --json: the beam with its errors, at the scan's energy.",
+    name="fitted",
 )
 @options("vary")
-@click.option(
-    "--target",
-    multiple=True,
-    metavar="WISH",
-    help="size=200um, divergence=140urad, match (to the lattice's design Twiss) or "
+@option(
+    "--target WISH",
+    "size=200um, divergence=140urad, match (to the lattice's design Twiss) or "
     "match=BETA_M:ALPHA; size_y and so on for a plane by name.",
+    multiple=True,
 )
-@click.option(
-    "--plane",
-    type=click.Choice(["x", "y"]),
-    default="x",
-    show_default=True,
-    help="Plane of --sigma and of targets that name none.",
+@option(
+    "--plane", "Plane of --sigma and of targets that name none.", choices=["x", "y"], default="x"
 )
 @options("json")
 def setpoint(
     lattice: str,
-    use: str | None,
-    first: str | None,
-    last: str | None,
-    energy: float | None,
     sigma: str | None,
     fitted: str | None,
     limits: dict[str, tuple[float, float]],
     target: tuple[str, ...],
     plane: str,
-    screen: str | None,
     as_json: bool,
+    **part: Any,
 ) -> None:
     """Find the magnet settings that bring the beam nearest to a wanted size and divergence.
 
@@ -85,16 +72,16 @@ def setpoint(
     if not limits:
         raise InputError("no --vary", "MAGNET=LOW:HIGH such as Q2=0:10")
     targets = [target_of(text, plane) for text in target]
-    described = read_lattice(lattice, use=use, energy=energy, first=first, last=last, screen=screen)
+    described = read_lattice(lattice, **part)
     described.check_magnets(limits)
-    beams = _given(sigma, plane) if fitted is None else _fitted(fitted, described, targets, energy)
-    line = build_line(described)  # JAX from here on
-    found = beamfit.find_setpoint(line, beams, limits, targets, screen=screen)
-    inputs = {lattice: described.sha256} | ({} if fitted is None else {fitted: digest(fitted)})
-    if as_json:
-        click.echo(results_text([found], inputs, command_line()))
+    if fitted is None:
+        beams = _given(sigma, plane)
     else:
-        _show(found)
+        beams = _fitted(fitted, described, targets, part["energy"])
+    line = build_line(described)  # JAX from here on
+    found = beamfit.find_setpoint(line, beams, limits, targets, screen=part["screen"])
+    inputs = {path: digest(path) for path in (lattice, fitted) if path is not None}
+    answered(as_json, [found], inputs, lambda terminal: _show(terminal, found))
 
 
 def _given(sigma: str | None, plane: str) -> dict[str, Beam]:
@@ -114,18 +101,12 @@ def _fitted(
     """Read --fit, and refuse before JAX is loaded what was measured at another energy."""
     beams = read_fitted_beams(path, lattice.rest_energy, lattice.sha256)
     asked_for = {t.plane for t in targets}
-    try:
+    with located(path):
         common_energy({p: beam for p, beam in beams.items() if p in asked_for}, energy)
-    except InputError as error:
-        error.path = path
-        raise
     return beams
 
 
-def _show(found: Setpoint) -> None:
-    from beamfit.cli.show import Terminal
-
-    terminal = Terminal()
+def _show(terminal: Terminal, found: Setpoint) -> None:
     click.echo("\n\n".join(map(text_of, found.tables())))
     terminal.verdict("set point", found.status, found.message)
     for note in found.notes:

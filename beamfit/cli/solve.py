@@ -6,11 +6,12 @@ from typing import TYPE_CHECKING
 
 import click
 
-from beamfit.cli.options import command_line, options
+from beamfit.cli.options import answered, option, options, reported
 from beamfit.errors import InputError
 from beamfit.io.files import digest
 
 if TYPE_CHECKING:
+    from beamfit.cli.show import Terminal
     from beamfit.language.solution import Solution
 
 EXAMPLE = """\b
@@ -23,18 +24,15 @@ Examples:
 
 @click.command(epilog=EXAMPLE)
 @click.argument("document")
-@click.option(
-    "--data",
+@option(
+    "--data NAME=FILE",
+    "File of a data table; the document's own, beside it, unless given.",
     multiple=True,
-    metavar="NAME=FILE",
-    help="File of a data table; the document's own, beside it, unless given.",
 )
-@click.option(
-    "--start",
+@option(
+    "--start seeds|N",
+    "One search from the document's seeds, or N: from there and from random numbers.",
     default="seeds",
-    show_default=True,
-    metavar="seeds|N",
-    help="One search from the document's seeds, or N: from there and from random numbers.",
 )
 @options("report json")
 def solve(
@@ -56,16 +54,8 @@ def solve(
         given[name.strip()] = file.strip()
     found, files = _solved(document, given, starts)
     inputs = {path: digest(path) for path in (document, *files)}
-    if report is not None:
-        from beamfit.report.page import write_report  # matplotlib from here on
-
-        write_report(report, found, command=command_line(), inputs=inputs)
-    if as_json:
-        from beamfit.io.result import results_text
-
-        click.echo(results_text([found], inputs, command_line()))
-    else:
-        _show(found, report)
+    reported(report, found, inputs)
+    answered(as_json, [found], inputs, lambda terminal: _show(terminal, found), report)
 
 
 def _solved(document: str, given: dict[str, str], starts: int) -> tuple[Solution, tuple[str, ...]]:
@@ -84,10 +74,7 @@ def _solved(document: str, given: dict[str, str], starts: int) -> tuple[Solution
     return solved_formulation(formulation, document, tables, starts), tuple(files.values())
 
 
-def _show(found: Solution, report: str | None) -> None:
-    from beamfit.cli.show import Terminal
-
-    terminal = Terminal()
+def _show(terminal: Terminal, found: Solution) -> None:
     for table in found.tables():
         terminal.table(table)
         terminal.line()
@@ -96,4 +83,3 @@ def _show(found: Solution, report: str | None) -> None:
     for note in found.notes:
         terminal.line(note)
     terminal.verdict(found.headline, found.status, found.message)
-    terminal.report(report)

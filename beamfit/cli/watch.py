@@ -10,10 +10,9 @@ from typing import TYPE_CHECKING, Any
 import click
 
 import beamfit
-from beamfit.cli.options import command_line, options
+from beamfit.cli.options import answered, option, options
 from beamfit.errors import plain
 from beamfit.io.files import digest
-from beamfit.io.result import results_text
 from beamfit.io.watched import WatchMachine, read_watch_machine
 from beamfit.table import Table, cell
 
@@ -30,21 +29,15 @@ Examples:
 
 @click.command(epilog=EXAMPLE)
 @click.argument("machine")
-@click.option("--seconds", type=click.FloatRange(0.0), help="How long; until Ctrl-C unless said.")
-@click.option(
-    "--port",
-    type=click.IntRange(0, 65535),
-    default=8050,
-    show_default=True,
-    help="Of the page; 0 for any that is free.",
+@option("--seconds", "How long; until Ctrl-C unless said.", type=click.FloatRange(0.0))
+@option(
+    "--port", "Of the page; 0 for any that is free.", type=click.IntRange(0, 65535), default=8050
 )
-@click.option(
-    "--bind",
-    metavar="ADDRESS",
-    default="127.0.0.1",
-    show_default=True,
-    help="Address to listen on; beyond this computer anybody there can read the page and the "
+@option(
+    "--bind ADDRESS",
+    "Address to listen on; beyond this computer anybody there can read the page and the "
     "served variables.",
+    default="127.0.0.1",
 )
 @options("json")
 def watch(machine: str, seconds: float | None, port: int, bind: str, as_json: bool) -> int:
@@ -59,15 +52,8 @@ def watch(machine: str, seconds: float | None, port: int, bind: str, as_json: bo
     from beamfit.live.channel import run
 
     last, number = run(_watched(told, seconds, bind, port, as_json))
-    inputs = {told.path: told.sha256} | (
-        {} if told.ring is None else {str(told.ring): digest(told.ring)}
-    )
-    if as_json:
-        click.echo(results_text(_results(last), inputs, command_line()))
-    else:
-        from beamfit.cli.show import Terminal
-
-        Terminal().table(_table(last))
+    inputs = {str(path): digest(path) for path in (told.path, told.ring) if path is not None}
+    answered(as_json, _results(last), inputs, lambda terminal: terminal.table(_table(last)))
     if number:
         click.echo("beamfit: interrupted", err=True)
     return 128 + number if number else 0

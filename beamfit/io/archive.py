@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from beamfit.errors import InputError
-from beamfit.io.files import digest, read_json, text_lines
+from beamfit.io.files import digest, laid_out, read_json, text_lines
 from beamfit.io.sheet import UNITS, Sheet
 from beamfit.io.table import HDF5, read_sheet
 
@@ -36,13 +36,11 @@ def _archive_json(path: str | PathLike[str]) -> Sheet:
     """Of the EPICS Archiver Appliance: one channel with its data."""
     expected = 'one channel of the EPICS Archiver Appliance: [{"meta": …, "data": [{"secs": …}]}]'
     channels = read_json(path, "another JSON file", expected)
-    try:
+    with laid_out(path, "another JSON file", expected):
         if len(channels) != 1:
-            raise InputError(f"{len(channels)} channels", "one: the beam current", path=path)
+            raise InputError(f"{len(channels)} channels", "one: the beam current")
         meta, data = channels[0].get("meta", {}), channels[0]["data"]
         rows = [[str(one["secs"]), str(one["nanos"]), str(one["val"])] for one in data]
-    except (ValueError, TypeError, KeyError, AttributeError):
-        raise InputError("another JSON file", expected, path=path) from None
     if not rows:
         raise InputError("no readings", "two or more", path=path)
     unit = meta.get("EGU", "") if isinstance(meta, dict) else ""

@@ -11,13 +11,12 @@ import numpy as np
 
 from beamfit.errors import InputError
 from beamfit.io.archive import archive_sheet
-from beamfit.io.dates import NUMBERS, dates_in_order
 from beamfit.io.files import name_of
-from beamfit.io.headers import is_number, spelled
+from beamfit.io.headers import spelled
 from beamfit.io.monitor import offset_of
-from beamfit.io.record_columns import DATE, dated, known, record_columns, taken_for_current
+from beamfit.io.record_columns import dated, known, record_columns, taken_for_current
 from beamfit.io.scan_columns import is_size
-from beamfit.io.sheet import Column, Sheet, columns_of, left_out
+from beamfit.io.sheet import DATE, Column, Sheet, columns_of, left_out
 from beamfit.studies.decay.conditions import Conditions, Fault, first_fault
 from beamfit.studies.decay.monitor import Monitor
 from beamfit.studies.decay.record import DecayRecord, LifetimeTable
@@ -209,16 +208,7 @@ def _left_aside(sheet: Sheet, columns: Mapping[str, Column]) -> tuple[str, ...]:
 
 def _values(sheet: Sheet, column: Column) -> np.ndarray:
     try:
-        if column.unit == DATE:
-            expected = "an ISO 8601 time, such as 2024-03-01T12:00:00+01:00"
-            first = str(next(iter(sheet[column.header]), ""))
-            if NUMBERS.match(first):
-                expected = "a date whose day and month cannot be exchanged, such as 2024-03-01"
-            elif is_number(first):
-                units = ", ".join(f"{column.header}_{unit}" for unit in ("s", "ms", "d"))
-                expected = f"a date, or the unit of the number in the header: {units}"
-            return sheet.numbers(column.header, read=dates_in_order(), expected=expected)
-        return sheet.numbers(column.header) * column.factor
+        return sheet.values(column)
     except InputError as error:
         if "," in error.found:
             raise
@@ -229,7 +219,7 @@ def _values(sheet: Sheet, column: Column) -> np.ndarray:
 def _moments(sheet: Sheet, columns: Mapping[str, Column]) -> np.ndarray:
     """Times of the rows, s."""
     moment = _values(sheet, columns["time"])
-    return moment + 1e-9 * _values(sheet, columns["nanos"]) if "nanos" in columns else moment
+    return moment + _values(sheet, columns["nanos"]) if "nanos" in columns else moment
 
 
 def _goes_back(sheet: Sheet, columns: Mapping[str, Column], row: int, latest: object) -> InputError:
@@ -258,10 +248,9 @@ def _check_alone(sheet: Sheet, columns: Mapping[str, Column], positive: bool) ->
     """Refuse a row that is wrong whatever the others are."""
     for key, column in columns.items():
         values = _values(sheet, column)
-        low = np.flatnonzero(values < 0)
-        if key == "current" and positive and low.size:
-            found = f"a negative current, {values[low[0]]:.6g} mA"
-            raise sheet.error(found, "zero or more", int(low[0]), column.header)
+        if key == "current" and positive:
+            found = "a negative current, {:.6g} mA"
+            sheet.refuse(column.header, values < 0, "zero or more", found, values)
 
 
 def _forward(
@@ -309,8 +298,6 @@ def _lifetimes(sheet: Sheet, skip_bad: bool) -> LifetimeTable:
 
 def _positive(sheet: Sheet, column: Column) -> np.ndarray:
     values = _values(sheet, column)
-    bad = np.flatnonzero(values <= 0)
-    if bad.size:
-        found = f"{values[bad[0]] / column.factor:.6g} {column.unit}"
-        raise sheet.error(found, "above zero", int(bad[0]), column.header)
+    found, written = f"{{:.6g}} {column.unit}", values / column.factor
+    sheet.refuse(column.header, values <= 0, "above zero", found, written)
     return values

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from beamfit.errors import InputError, nearest
-from beamfit.io.files import name_of
+from beamfit.io.files import digest, laid_out, name_of
 from beamfit.io.lattice import LatticeFile
 from beamfit.io.matlab import read_variable
 from beamfit.io.shots import scatter_of
@@ -93,16 +93,9 @@ def read_emittance_gui(path: str | PathLike[str]) -> EmittanceGuiFile:
     Traceback (most recent call last):
     beamfit.errors.InputError: orbit.csv: no such file; expected a readable file
     """
-    data, sha256 = read_variable(path, "data")
-    source = _Fields(path, data)
-    try:
-        return _read(source, sha256)
-    except InputError as error:
-        error.path = path
-        raise
-    except (TypeError, ValueError, IndexError, KeyError, AttributeError, OverflowError) as error:
-        found = f"a struct 'data' that is laid out otherwise ({type(error).__name__})"
-        raise InputError(found, EXPECTED, path) from None
+    source = _Fields(path, read_variable(path, "data"))
+    with laid_out(path, "a struct 'data' that is laid out otherwise", EXPECTED, named=True):
+        return _read(source)
 
 
 class _Fields:
@@ -154,16 +147,16 @@ def _texts(value: np.ndarray | None) -> list[str]:
     return [] if value is None else [_text(v) for v in value.ravel()]
 
 
-def _read(source: _Fields, sha256: str) -> EmittanceGuiFile:
-    several = _text(source.get("type")) == "multi"
+def _read(source: _Fields) -> EmittanceGuiFile:
     beams = _beams(source)
     n, _, methods = beams.shape
+    lattice = _lattice(source, n)
     used = np.ones(n, bool)
     for field in ("status", "use"):
         if source.get(field) is not None:
             used &= source.numbers(field, n) > 0
     names = [_method(beams[:, :, k], k) for k in range(methods)]
-    shared = _shared(source, np.flatnonzero(used), n, several) | {"sha256": sha256}
+    shared = _shared(source, np.flatnonzero(used), n, lattice)
     scans = {}
     for k, name in enumerate(names):
         sizes, error, shots = _sizes(beams[used, :, k])
@@ -175,7 +168,7 @@ def _read(source: _Fields, sha256: str) -> EmittanceGuiFile:
             profiles=_profiles(source.get("beam"), np.flatnonzero(used), k),
             name=f"{Path(name_of(source.path)).stem}, {name} sizes",
         )
-    return EmittanceGuiFile(scans, _stored(source, names), _lattice(source, sha256, several))
+    return EmittanceGuiFile(scans, _stored(source, names), lattice)
 
 
 def _beams(source: _Fields) -> np.ndarray:
@@ -191,7 +184,7 @@ def _beams(source: _Fields) -> np.ndarray:
     return beams if usual == 3 else beams[:, None, :]
 
 
-def _shared(source: _Fields, used: np.ndarray, n: int, several: bool) -> dict[str, Any]:
+def _shared(source: _Fields, used: np.ndarray, n: int, lattice: LatticeFile) -> dict[str, Any]:
     """What scans of all methods share: settings or monitors, matrices, provenance."""
     cells = source.need("rMatrix").ravel()
     if len(cells) != n:
@@ -203,12 +196,11 @@ def _shared(source: _Fields, used: np.ndarray, n: int, several: bool) -> dict[st
             raise source.error(f"matrix {i + 1} of shape {r.shape}", "rMatrix")
         matrices.append(r)
     r = np.array(matrices).reshape(-1, 6, 6)
-    monitors, magnet = _texts(source.get("name")), _text(source.get("quadName")) or "quadrupole"
     settings, units, screen = {}, {}, None
-    if several:
-        listed = monitors if len(monitors) == n else [f"monitor {i + 1}" for i in range(n)]
-        screen = tuple(listed[i] for i in used)
+    if _of_several(source):
+        screen = tuple(_monitors(source, n)[i] for i in used)
     else:
+        magnet = _text(source.get("quadName")) or "quadrupole"
         settings, units = {magnet: source.numbers("quadVal", n)[used]}, {magnet: "kG"}
     left = n - len(used)
     notes = [f"{left} of {n} settings failed or were taken out, by status and use."] if left else []
@@ -218,20 +210,34 @@ def _shared(source: _Fields, used: np.ndarray, n: int, several: bool) -> dict[st
         "settings": settings,
         "units": units,
         "screen": screen,
-        "energy": np.full(len(used), _energy(source)),
+        "energy": np.full(len(used), lattice.energy),
         "transfer": {"x": r[:, 0, [0, 1, 5]], "y": r[:, 2, [2, 3, 5]]},
         "path": source.path,
-        "provenance": tuple(_provenance(source, monitors)),
+        "sha256": lattice.sha256,
+        "provenance": tuple(_provenance(source)),
         "notes": tuple(notes),
         "error_source": "the scatter of the shots (standard error of the mean)",
     }
 
 
-def _provenance(source: _Fields, monitors: list[str]) -> list[str]:
+def _of_several(source: _Fields) -> bool:
+    """Whether several monitors saw one setting, and not one monitor several."""
+    return _text(source.get("type")) == "multi"
+
+
+def _monitors(source: _Fields, n: int) -> list[str]:
+    """The monitor of each of n sizes, or the one of all."""
+    named = _texts(source.get("name")) or [""]
+    if _of_several(source) and len(named) != n:
+        return [f"monitor {i + 1}" for i in range(n)]
+    return [name or "screen" for name in (named if _of_several(source) else named[:1])]
+
+
+def _provenance(source: _Fields) -> list[str]:
     said = [f"emittance_gui, {_text(source.get('type')) or 'scan'}"]
-    said += [f"{word} {name}" for word, name in
-             (("monitor", ", ".join(monitors)), ("quadrupole", _text(source.get("quadName"))))
-             if name]  # fmt: skip
+    for word, name in (("monitor", "name"), ("quadrupole", "quadName")):
+        if named := ", ".join(_texts(source.get(name))):
+            said.append(f"{word} {named}")
     if source.get("ts") is not None:
         days = source.number("ts", 0.0)
         if 366 < days < 1e6:  # MATLAB counts days from the year 0
@@ -319,22 +325,13 @@ def _stored(source: _Fields, methods: list[str]) -> dict[str, dict[str, Quantity
     }
 
 
-def _energy(source: _Fields) -> float:
-    """Total energy, MeV."""
+def _lattice(source: _Fields, n: int) -> LatticeFile:
+    """Energy, monitors and design Twiss parameters, as of a line."""
     energy = 1e3 * source.number("energy", USUAL_ENERGY)
     if not 1.0 < energy < 1e6:
         raise source.error(f"an energy of {1e-3 * energy:g} GeV", "energy")
-    return energy
-
-
-def _lattice(source: _Fields, sha256: str, several: bool) -> LatticeFile:
-    """Energy, monitors and design Twiss parameters, as of a line."""
-    monitors = _texts(source.get("name")) or ["screen"]
     # Of several monitors the matrices begin somewhere before; of one, at it.
-    places = [*dict.fromkeys(monitors), "start"] if several else monitors[:1]
-    n = source.need("rMatrix").size
-    if several and len(monitors) != n:
-        places = [*(f"monitor {i + 1}" for i in range(n)), "start"]
+    places = [*dict.fromkeys(_monitors(source, n)), *["start"] * _of_several(source)]
     design = None
     twiss = source.get("twiss0")
     if twiss is not None and twiss.shape == (3, 2) and twiss.dtype.kind in "iuf":
@@ -345,12 +342,10 @@ def _lattice(source: _Fields, sha256: str, several: bool) -> LatticeFile:
             }
     return LatticeFile(
         path=source.path,
-        sha256=sha256,
+        sha256=digest(source.path),
         name=f"matrices of {name_of(source.path)}",
-        energy=_energy(source),
+        energy=energy,
         particle="electron",
-        energy_spread=0.0,
-        elements=tuple({"type": "screen", "name": name or "screen"} for name in places),
-        calibrations={},
+        elements=tuple({"type": "screen", "name": name} for name in places),
         design=design,
     )

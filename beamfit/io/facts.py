@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Mapping
 from datetime import UTC, datetime
 from os import PathLike
 from typing import Any, NamedTuple
@@ -22,6 +23,7 @@ SAID = {"A": "A", "kG": "kG integrated gradient", "T_per_m": "T/m", "k1": "1/m²
 SAID |= {"k1l": "1/m (k1l)"}
 CONDITIONS = {"rf_voltage": "V", "scraper_y": "m", "pressure": "Pa", "bunches": ""}
 CONDITIONS |= {"bunch_length": "m"}
+INFERRED = "none: the noise is inferred from the residuals"
 # Magnets of a lattice that are told one by one.
 MOST_MAGNETS = 20
 
@@ -34,58 +36,61 @@ class Fact(NamedTuple):
     value: Any
 
 
-def _range(values: np.ndarray, unit: str = "") -> Fact:
-    """From the smallest to the largest, lengths in a unit of their size."""
+def _range(label: str, values: np.ndarray, unit: str = "", after: str = "", **more: Any) -> Fact:
+    """From the smallest to the largest, lengths in a unit of their size, and what is said more."""
     low, high = float(np.nanmin(values)), float(np.nanmax(values))
     factor, said = display_unit(max(abs(low), abs(high)), unit or "1")
     words = f"{low / factor:.6g}" if low == high else f"{low / factor:.4g} to {high / factor:.4g}"
-    return Fact("", f"{words} {said}".strip(), {"low": low, "high": high, "unit": unit or "1"})
+    value = {"low": low, "high": high, "unit": unit or "1"} | more
+    return Fact(label, f"{words} {SAID.get(said, said)}".strip() + after, value)
+
+
+def _counted(label: str, rows: Mapping[str, int]) -> Fact:
+    """How many rows there are of each."""
+    return Fact(label, ", ".join(f"{name} ({n} rows)" for name, n in rows.items()), dict(rows))
 
 
 def of_scan(scan: QuadScan) -> list[Fact]:
     """Rows, planes, magnets, sizes, energies of a scan."""
-    rows = {p: int(np.isfinite(scan.size[p]).sum()) for p in scan.planes}
-    counted = ", ".join(f"{p} ({n} rows)" for p, n in rows.items())
-    facts = [Fact("rows", str(len(scan)), len(scan)), Fact("planes", counted, rows)]
+    facts = [Fact("rows", str(len(scan)), len(scan))]
+    facts.append(_counted("planes", {p: int(np.isfinite(scan.size[p]).sum()) for p in scan.planes}))
     for name, values in scan.settings.items():
-        unit, distinct = scan.units[name], len(np.unique(values))
-        span = _range(values)
-        words = f"{span.words} {SAID[unit]}, {distinct} setting" + ("s" if distinct > 1 else "")
-        value = span.value | {"unit": unit, "settings": distinct}
-        facts.append(Fact(f"magnet {name}", words, value))
+        distinct = len(np.unique(values))
+        after = f", {distinct} setting" + ("s" if distinct > 1 else "")
+        facts.append(_range(f"magnet {name}", values, scan.units[name], after, settings=distinct))
     for p in scan.planes:
         facts += _of_plane(scan, p)
     if scan.transfer is not None:
         facts.append(Fact("matrices", "R11 and R12 of each row: no lattice is needed", True))
     if scan.energy is not None:
-        said = _range(scan.energy, "MeV")
-        kind = "momentum p c" if scan.energy_kind == "momentum" else f"{scan.energy_kind} energy"
-        value = said.value | {"kind": scan.energy_kind}
-        facts.append(Fact("energy", f"{said.words}, {kind}", value))
+        kind = scan.energy_kind
+        after = ", momentum p c" if kind == "momentum" else f", {kind} energy"
+        facts.append(_range("energy", scan.energy, "MeV", after, kind=kind))
     if scan.screen is not None:
-        counts = Counter(scan.screen)
-        words = ", ".join(f"{name} ({n} rows)" for name, n in counts.items())
-        facts.append(Fact("screens", words, dict(counts)))
+        facts.append(_counted("screens", Counter(scan.screen)))
     if scan.slice is not None:
-        words = ", ".join(f"{name} ({scan.slice.count(name)} rows)" for name in scan.slices)
-        facts.append(Fact("slices", words, {name: scan.slice.count(name) for name in scan.slices}))
+        facts.append(_counted("slices", {name: scan.slice.count(name) for name in scan.slices}))
     further = {"resolution": "m", "energy_spread": "", "shots": ""}
-    facts += [
-        _range(getattr(scan, key), unit)._replace(label=key.replace("_", " "))
-        for key, unit in further.items()
-        if getattr(scan, key) is not None
+    return facts + _known(scan, further)
+
+
+def _known(holder: Any, units: Mapping[str, str]) -> list[Fact]:
+    """The ranges of those columns that there are."""
+    known = {name: getattr(holder, name) for name in units}
+    return [
+        _range(name.replace("_", " "), values, units[name])
+        for name, values in known.items()
+        if values is not None
     ]
-    return facts
 
 
 def _of_plane(scan: QuadScan, plane: str) -> list[Fact]:
     """Range and column of the sizes of one plane, and where their errors are from."""
     key = f"size_{plane}"
-    said, column = _range(scan.size[plane], "m"), scan.columns.get(key, key)
-    size = Fact(f"size {plane}", f"{said.words}, column {column}", said.value | {"column": column})
+    column = scan.columns.get(key, key)
+    size = _range(f"size {plane}", scan.size[plane], "m", f", column {column}", column=column)
     if plane not in scan.error:
-        words = "none: the noise is inferred from the residuals"
-        return [size, Fact(f"errors {plane}", words, None)]
+        return [size, Fact(f"errors {plane}", INFERRED, None)]
     share = float(np.nanmedian(scan.error[plane] / scan.size[plane]))
     words = f"{100 * share:.2g} % of the size in the middle, from {scan.error_source}"
     value = {"median_relative": share, "source": scan.error_source}
@@ -151,8 +156,8 @@ def _of_lifetimes(table: LifetimeTable) -> list[Fact]:
     errors = "none: the scatter of the points" if table.error is None else "given"
     return [
         Fact("lifetimes", str(len(table)), len(table)),
-        _range(table.lifetime, "h")._replace(label="lifetime"),
-        _range(table.current, "mA")._replace(label="beam current"),
+        _range("lifetime", table.lifetime, "h"),
+        _range("beam current", table.current, "mA"),
         Fact("errors", errors, table.error is not None),
     ]
 
@@ -165,20 +170,16 @@ def of_record(record: DecayRecord | LifetimeTable) -> list[Fact]:
     words = f"{len(record)} over {hours:.3g} h"
     facts = [
         Fact("readings", words, {"count": len(record), "span_h": hours}),
-        _range(record.current, "mA")._replace(label="beam current"),
+        _range("beam current", record.current, "mA"),
     ]
-    errors = "none: the noise is inferred from the residuals"
-    given = None if record.error is None else _range(record.error, "mA")
-    facts.append(Fact("errors", errors if given is None else given.words, given and given.value))
+    if record.error is None:
+        facts.append(Fact("errors", INFERRED, None))
+    else:
+        facts.append(_range("errors", record.error, "mA"))
     if record.start is not None:
         began = datetime.fromtimestamp(record.start, UTC).isoformat(timespec="seconds")
         facts.append(Fact("began", began, began))
-    conditions = record.conditions._asdict()
-    facts += [
-        _range(values, CONDITIONS[name])._replace(label=name.replace("_", " "))
-        for name, values in conditions.items()
-        if values is not None
-    ]
+    facts += _known(record.conditions, CONDITIONS)
     from beamfit.studies.decay.segments import split_record  # scipy, for records alone
 
     split = split_record(record)
@@ -220,12 +221,11 @@ def of_run(run: Run) -> list[Fact]:
     value = {"count": len(run), "span_s": span, "step_s": run.step}
     facts = [Fact("rows", f"{len(run)} over {span:.4g} s, {step}", value)]
     for name, values in run.inputs.items():
-        facts.append(_range(values)._replace(label=f"input {name}"))
+        facts.append(_range(f"input {name}", values))
     for name, values in run.outputs.items():
-        found = _range(values)
         missing = int(np.isnan(values).sum())
-        words = found.words + (f", {missing} not read" if missing else "")
-        facts.append(Fact(f"output {name}", words, found.value | {"missing": missing}))
+        after = f", {missing} not read" if missing else ""
+        facts.append(_range(f"output {name}", values, after=after, missing=missing))
     return facts
 
 

@@ -9,6 +9,7 @@ import os
 import select
 import stat
 from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import lru_cache
 from os import PathLike
 from pathlib import Path
@@ -34,6 +35,8 @@ LARGEST_JSON = 64_000_000
 LARGEST_PIPE = 256_000_000
 # Seconds after which a pipe that gives nothing is given up.
 SILENCE = 30.0
+# What values of other kinds than a document has may raise.
+UNLIKE = (ArithmeticError, AttributeError, LookupError, RecursionError, TypeError, ValueError)
 # SHA-256 of what was last read whole, by path: a file may change after that.
 _READ: dict[str, str] = {}
 MOST_KEPT = 10_000
@@ -76,15 +79,13 @@ def _opened(path: str | PathLike[str]) -> BinaryIO:
         raise InputError(f"a file that cannot be read ({cause})", "a readable file", path) from None
 
 
-def text_lines(path: str | PathLike[str], seen: Any = None) -> Iterator[str]:
-    """Read a text file line by line in bounded memory.
+def text_lines(path: str | PathLike[str]) -> Iterator[str]:
+    """Read a text file line by line in bounded memory; `digest` needs no second reading then.
 
     Parameters
     ----------
     path : str or path
         The file. Lines end with a line feed, a carriage return, or both.
-    seen : hash object, optional
-        Is fed what was read, so that a digest needs no second reading.
 
     Yields
     ------
@@ -97,7 +98,7 @@ def text_lines(path: str | PathLike[str], seen: Any = None) -> Iterator[str]:
         If the file cannot be opened, is empty, is binary, is not UTF-8 (µ and ° of Windows and
         comments apart), or has a line longer than any text table has.
     """
-    number, seen = 0, seen or hashlib.sha256()
+    number, seen = 0, hashlib.sha256()
     with _opened(path) as stream:
         for number, raw in enumerate(_raw_lines(stream, seen), start=1):
             if number == 1:
@@ -145,7 +146,7 @@ def _check_signature(start: bytes, path: str | PathLike[str]) -> None:
             raise InputError(found, expected, path=path, line=1)
 
 
-def read_text(path: str | PathLike[str], seen: Any = None) -> str:
+def read_text(path: str | PathLike[str]) -> str:
     """Read a whole text file of modest size, such as a lattice.
 
     Raises
@@ -154,7 +155,7 @@ def read_text(path: str | PathLike[str], seen: Any = None) -> str:
         As `text_lines`, and if the file is larger than any lattice.
     """
     lines, size = [], 0
-    for line in text_lines(path, seen):
+    for line in text_lines(path):
         lines.append(line)
         size += len(line) + 1
         if size > LARGEST_TEXT:
@@ -163,8 +164,8 @@ def read_text(path: str | PathLike[str], seen: Any = None) -> str:
     return "\n".join(lines) + "\n"
 
 
-def read_bytes(path: str | PathLike[str], most: int, expected: str) -> tuple[bytes, str]:
-    """Read a whole file of up to ``most`` bytes, and give its SHA-256 too.
+def read_bytes(path: str | PathLike[str], most: int, expected: str) -> bytes:
+    """Read a whole file of up to ``most`` bytes.
 
     Raises
     ------
@@ -177,7 +178,8 @@ def read_bytes(path: str | PathLike[str], most: int, expected: str) -> tuple[byt
         raise InputError("an empty file", "a file with content", path=path)
     if len(content) > most:
         raise InputError(f"more than {most // 1_000_000} MB", expected, path=path)
-    return content, remember(path, hashlib.sha256(content))
+    remember(path, hashlib.sha256(content))
+    return content
 
 
 def read_json(path: str | PathLike[str], found: str, expected: str) -> Any:
@@ -189,19 +191,43 @@ def read_json(path: str | PathLike[str], found: str, expected: str) -> Any:
         If it cannot be read; with ``found`` and ``expected`` if it does not parse or lies deeper
         in itself than can be followed. An integer of hundreds of digits is infinite.
     """
-    content, _ = read_bytes(path, LARGEST_JSON, expected)
+    content = read_bytes(path, LARGEST_JSON, expected)
     try:
         return json.loads(content, parse_int=lambda t: int(t) if len(t) < 300 else float(t))
     except (ValueError, RecursionError):
         raise InputError(found, expected, path=path) from None
 
 
-def remember(path: str | PathLike[str], seen: Any) -> str:
-    """Keep the digest of what was read of a file, and give it."""
-    found = _READ[os.path.abspath(path)] = seen.hexdigest()
+@contextmanager
+def laid_out(
+    path: str | PathLike[str], found: str, expected: str, *, named: bool = False
+) -> Iterator[None]:
+    """Refuse a document whose values are of other kinds than those they are taken for here.
+
+    Parameters
+    ----------
+    path : str or path
+        Its file, which is named in every `InputError` from here.
+    found, expected : str
+        Of the error in the place of any other.
+    named : bool
+        Whether ``found`` ends with the name of that other error.
+    """
+    try:
+        yield
+    except InputError as error:
+        error.path = path  # what a value names is where it was from once
+        raise
+    except UNLIKE as error:
+        cause = f" ({type(error).__name__})" if named else ""
+        raise InputError(found + cause, expected, path) from None
+
+
+def remember(path: str | PathLike[str], seen: Any) -> None:
+    """Keep the digest of what was read of a file."""
+    _READ[os.path.abspath(path)] = seen.hexdigest()
     if len(_READ) > MOST_KEPT:
         del _READ[next(iter(_READ))]
-    return found
 
 
 def name_of(path: str | PathLike[str]) -> str:
@@ -211,9 +237,7 @@ def name_of(path: str | PathLike[str]) -> str:
 
 def digest(path: str | PathLike[str]) -> str:
     """SHA-256, as hexadecimal digits: of what was last read of a file, else of what it holds."""
-    if (known := _READ.get(os.path.abspath(path))) is not None:
-        return known
-    return digest_now(path)
+    return _READ.get(os.path.abspath(path)) or digest_now(path)
 
 
 def digest_now(path: str | PathLike[str]) -> str:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from beamfit.errors import InputError
+from beamfit.errors import InputError, located
 from beamfit.io.files import read_text, text_lines
 from beamfit.io.numeric import check_length
 from beamfit.language.check import check_document
@@ -51,11 +51,8 @@ def read_formulation(path: str | PathLike[str]) -> Document:
     'y'
     """
     text = read_text(path)
-    try:
+    with located(path):
         return parse_xml(text) if text.lstrip().startswith("<") else parse_document(text)
-    except InputError as error:
-        error.path = path
-        raise
 
 
 def write_formulation(path: str | PathLike[str], document: Document) -> None:
@@ -105,7 +102,7 @@ def read_numbers(path: str | PathLike[str]) -> np.ndarray:
         With file and line, if a line holds no numbers or another count of them.
     """
     rows: list[np.ndarray] = []
-    header = True
+    header = None
     for number, line in enumerate(text_lines(path), 1):
         words = line.replace(",", " ").replace(";", " ").split()
         if not words or words[0].startswith("#"):
@@ -113,11 +110,9 @@ def read_numbers(path: str | PathLike[str]) -> np.ndarray:
         try:
             row = np.array(words, float)
         except ValueError:
-            if not header:
+            if rows or header:
                 raise InputError(f"'{line.strip()}'", "numbers", path, number) from None
-            row = None
-        header = False
-        if row is None:
+            header = words
             continue
         if not np.all(np.isfinite(row)):
             raise InputError(f"'{line.strip()}'", "finite numbers", path, number)
@@ -202,11 +197,8 @@ def solved_formulation(
     InputError
         With file, line and column.
     """
-    try:
+    with located(path):
         check_document(document, {n: t.shape for n, t in (tables or {}).items()})
         from beamfit.language.solution import solve_document  # JAX from here on
 
         return solve_document(document, tables, starts)
-    except InputError as error:
-        error.path = path if error.path is None else error.path
-        raise

@@ -37,7 +37,7 @@ class _Refused(Exception):
 
 def hdf5_columns(
     path: str | PathLike[str], rows: int, texts: int
-) -> tuple[dict[str, Sequence[Any]], tuple[str, ...], str]:
+) -> tuple[dict[str, Sequence[Any]], tuple[str, ...]]:
     """Read the datasets at the top of an HDF5 file.
 
     Parameters
@@ -49,8 +49,8 @@ def hdf5_columns(
 
     Returns
     -------
-    dict of str to array or list of str, tuple of str, str
-        Values by name, attributes of the file, and its SHA-256.
+    dict of str to array or list of str, tuple of str
+        Values by name, and attributes of the file.
 
     Raises
     ------
@@ -61,7 +61,7 @@ def hdf5_columns(
     from beamfit.errors import InputError, plain
     from beamfit.io.files import read_bytes
 
-    content, sha256 = read_bytes(path, LARGEST, "an HDF5 file of readings; fewer of them")
+    content = read_bytes(path, LARGEST, "an HDF5 file of readings; fewer of them")
     command = [sys.executable, "-P", __file__, str(rows), str(texts)]
     # No filter from a folder of plugins; the package's own h5py, wherever that is.
     own = {"HDF5_PLUGIN_PRELOAD": "::", "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
@@ -93,7 +93,7 @@ def hdf5_columns(
             words = np.frombuffer(numbers, float, count, start)
             start += words.nbytes
         columns[plain(name)] = words
-    return columns, tuple(told["comments"]), sha256
+    return columns, tuple(told["comments"])
 
 
 def _told(content: bytes, rows: int, texts: int) -> tuple[dict[str, Any], list[np.ndarray]]:

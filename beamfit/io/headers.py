@@ -6,30 +6,26 @@ import re
 from collections.abc import Sequence
 from functools import lru_cache
 
+UNITS: dict[str, dict[str, float]] = {
+    # quantity: unit at the end of a name -> factor to SI (a stored current: to mA)
+    "length": {"um": 1e-6, "mm": 1e-3, "m": 1.0, "µm": 1e-6, "μm": 1e-6, "nm": 1e-9, "cm": 1e-2},
+    "length or duration": {"mm": 1e-3, "m": 1.0, "ps": 299792458e-12},
+    "time": {"s": 1.0, "min": 60.0, "h": 3600.0, "d": 86400.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9},
+    "current": {"mA": 1.0, "A": 1e3, "uA": 1e-3, "µA": 1e-3, "μA": 1e-3, "nA": 1e-6},
+    "voltage": {"kV": 1e3, "V": 1.0, "MV": 1e6},
+    "pressure": {"Pa": 1.0, "mbar": 100.0, "Torr": 101325 / 760},
+    "energy in MeV": {"MeV": 1.0},
+}
+# Of magnets, whose gradients have factors of their own.
+SETTINGS = ("A", "kG", "T_per_m", "k1", "k1l")
 # Units at the end of a header, as the columns' names have them.
-KNOWN = ("um", "mm", "m", "µm", "μm", "nm", "cm", "s", "min", "h", "d", "ms", "us", "µs", "ns")
-KNOWN += (
-    "mA",
-    "A",
-    "uA",
-    "µA",
-    "μA",
-    "nA",
-    "kV",
-    "V",
-    "MV",
-    "Pa",
-    "mbar",
-    "Torr",
-    "MeV",
-    "kG",
-    "T_per_m",
-    "k1",
-    "k1l",
-)
+KNOWN = {*SETTINGS, "µs", *(unit for units in UNITS.values() for unit in units)}
 ENDS = tuple(f"_{unit}" for unit in KNOWN)
-# Other ways to write one; in capitals or small letters no other unit is meant by these.
-ALSO = {"T/m": "T_per_m", "1/m^2": "k1", "1/m2": "k1", "1/m²": "k1", "m^-2": "k1", "m-2": "k1"}
+# Other ways to write one, those before others that they end with; in capitals or small letters no
+# other unit is meant by these.
+ALSO = {"T m^-1": "T_per_m", "T.m-1": "T_per_m", "tesla/m": "T_per_m", "1/m**2": "k1", "m-1": "k1l"}
+ALSO |= {"ampere": "A", "amperes": "A", "T/m": "T_per_m", "1/m^2": "k1", "1/m2": "k1"}
+ALSO |= {"1/m²": "k1", "m^-2": "k1", "m-2": "k1"}
 ALSO |= {"m⁻²": "k1", "1/m": "k1l", "m^-1": "k1l", "mm rms": "mm", "um rms": "um", "micron": "um"}
 ALSO |= {"microns": "um", "sec": "s", "hours": "h", "Amp": "A", "Amps": "A", "amp": "A"}
 ALSO |= {u: "um" for u in ("UM", "Um")} | {u: "mm" for u in ("MM", "Mm")} | {"M": "m"}
@@ -48,7 +44,7 @@ FRAMED = re.compile(r"\s*([|*])(.*)\1\s*")
 RULE = re.compile(r"\s*[-+=|*:]{3,}\s*")
 
 
-def _unit(text: str) -> str | None:
+def known_unit(text: str) -> str | None:
     """A unit as the names of columns have it; None if the text is none."""
     text = text.strip().strip("[]()").strip()
     return text if text in KNOWN else ALSO.get(text)
@@ -60,12 +56,12 @@ def spelled(header: str) -> str:
 
     Examples
     --------
-    >>> [spelled(h) for h in ("Q525 [T/m]", "size x (µm)", "Time / h", "SIZE_X_MM", "screen")]
-    ['Q525_T_per_m', 'size_x_µm', 'Time_h', 'SIZE_X_mm', 'screen']
+    >>> [spelled(h) for h in ("Q525 [T/m]", "size x (µm)", "Time / h", "SIZE_X_MM", "Q5 T m^-1")]
+    ['Q525_T_per_m', 'size_x_µm', 'Time_h', 'SIZE_X_mm', 'Q5_T_per_m']
     """
     if (found := BRACKETS.fullmatch(header)) and found[1]:
         name, unit = found[1], next(part for part in found.groups()[1:] if part is not None)
-        if (known := _unit(unit)) is not None:
+        if (known := known_unit(unit)) is not None:
             return re.sub(r"\s+", "_", f"{name.strip()}_{known}")
     if header.endswith(ENDS):
         return header
@@ -88,7 +84,7 @@ def with_units(names: Sequence[str], cells: Sequence[str]) -> list[str] | None:
     >>> with_units(["Q2", "size_x", "shot"], ["A", "[um]", ""])
     ['Q2_A', 'size_x_um', 'shot']
     """
-    units = [_unit(cell) for cell in cells]
+    units = [known_unit(cell) for cell in cells]
     plain = all(
         u is not None or cell in ("", "-", "1") for u, cell in zip(units, cells, strict=True)
     )

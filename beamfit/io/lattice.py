@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -86,7 +87,7 @@ TOP = {
     **dict.fromkeys(ENERGY_KEYS, OPTIONAL),
     "element": Key(kind=LIST),
     "name": Key("name", kind=TEXT, default=""),
-    "source": Key("source", kind=TEXT, default=""),
+    "source": Key(kind=TEXT, default=""),
     "particle": Key("particle", kind=TEXT, default="electron"),
     "energy_spread": Key(
         "energy_spread",
@@ -108,8 +109,6 @@ class LatticeFile:
     ----------
     elements : tuple of dict
         The element tables of the file, in order.
-    calibrations : dict of str to str
-        Magnet name to the unit of its setting.
     """
 
     path: str | PathLike[str]
@@ -117,11 +116,19 @@ class LatticeFile:
     name: str
     energy: float
     particle: str
-    energy_spread: float
     elements: tuple[Mapping[str, Any], ...]
-    calibrations: Mapping[str, str]
+    energy_spread: float = 0.0
     design: Mapping[str, Any] | None = None
-    source: str = ""
+
+    @cached_property
+    def calibrations(self) -> dict[str, str]:
+        """Magnet or supply to the unit of its setting."""
+        return {
+            e.get("supply", e["name"]): unit
+            for e in self.elements
+            for key, unit in _settings(e["type"])
+            if key in e
+        }
 
     @property
     def rest_energy(self) -> float:
@@ -196,12 +203,6 @@ def read_toml_lattice(path: str | PathLike[str]) -> LatticeFile:
         sha256=top.sha256,
         energy=energy,
         elements=elements,
-        calibrations={
-            e.get("supply", e["name"]): u
-            for e in elements
-            for k, u in _settings(e["type"])
-            if k in e
-        },
         design=_design(top, [e["name"] for e in elements]),
         **said | {"name": said["name"] or Path(name_of(path)).stem},
     )

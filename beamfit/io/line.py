@@ -106,7 +106,7 @@ def part_of(
     --------
     >>> kinds = ("marker", "drift", "screen", "marker")
     >>> elements = tuple({"type": k, "name": n, "length_m": 1.0} for k, n in zip(kinds, "ABCD"))
-    >>> whole = LatticeFile("a.toml", "", "a", 135.0, "electron", 0.0, elements, {})
+    >>> whole = LatticeFile("a.toml", "", "a", 135.0, "electron", elements)
     >>> part = part_of(whole, "B", "D", screen="D")
     >>> [e["name"] for e in part.elements], part.default_screen
     (['B', 'C', 'D'], 'D')
@@ -130,8 +130,7 @@ def part_of(
     if screen is not None and screen not in left:
         raise InputError(f"--screen {screen}, which is cut away", "a place within", file.path)
     design = file.design if file.design and file.design["at"] in left else None
-    calibrations = {name: unit for name, unit in file.calibrations.items() if name in left}
-    return replace(file, elements=elements, design=design, calibrations=calibrations)
+    return replace(file, elements=elements, design=design)
 
 
 def _with_screen(
@@ -236,9 +235,7 @@ def _rows_lattice(scan: QuadScan, energy: float | None, particle: str) -> Lattic
         name="matrices of the rows",
         energy=own,
         particle=particle,
-        energy_spread=0.0,
         elements=tuple({"type": "screen", "name": name} for name in (*names, START)),
-        calibrations={},
     )
 
 
@@ -247,8 +244,8 @@ def build_line(file: LatticeFile) -> Beamline:
 
     Examples
     --------
-    >>> lattice = LatticeFile("a.toml", "", "a", 135.0, "electron", 0.0,
-    ...                       ({"type": "drift", "name": "D", "length_m": 2.0},), {})
+    >>> lattice = LatticeFile("a.toml", "", "a", 135.0, "electron",
+    ...                       ({"type": "drift", "name": "D", "length_m": 2.0},))
     >>> build_line(lattice).length
     2.0
     """
@@ -282,16 +279,18 @@ class Inputs(NamedTuple):
         The scan.
     lattice : LatticeFile
         Its lattice; of rows with matrices of their own the place where these begin.
-    digests : dict of str to str
-        Input files and their SHA-256.
     gui : EmittanceGuiFile or None
         The file of emittance_gui, where the scan is one.
     """
 
     scan: QuadScan
     lattice: LatticeFile
-    digests: Mapping[str, str | None]
     gui: EmittanceGuiFile | None = None
+
+    @property
+    def digests(self) -> dict[str, str | None]:
+        """The files and their SHA-256."""
+        return {str(each.path): each.sha256 for each in (self.scan, self.lattice)}
 
 
 def read_inputs(
@@ -332,8 +331,7 @@ def read_inputs(
             expected = "none: only a .mat file of emittance_gui has several"
             raise InputError(f"--size-method {size_method}", expected, path=scan)
         measured = read_quad_scan(scan, ignore=ignore, skip_bad=skip_bad)
-        described = lattice_of(measured, lattice, **part)
-        return Inputs(measured, described, _digests(scan, measured, lattice, described))
+        return Inputs(measured, lattice_of(measured, lattice, **part))
     if skip_bad or tuple(ignore):
         expected = "none: failed settings are left out as the file marks them"
         raise InputError("--ignore or --skip-bad for a MATLAB file", expected, path=scan)
@@ -343,15 +341,7 @@ def read_inputs(
         if told := next((name for name, value in part.items() if value is not None), None):
             said = {"first": "from", "last": "to"}.get(told, told)
             raise InputError(f"--{said} for a MATLAB file", "none: the file says it", path=scan)
-        return Inputs(measured, gui.lattice, {scan: measured.sha256}, gui)
+        return Inputs(measured, gui.lattice, gui)
     note = "The lattice's matrices are used, and not those of the file."
     measured = replace(measured, transfer=None, energy=None, notes=(*measured.notes, note))
-    described = lattice_of(measured, lattice, **part)
-    return Inputs(measured, described, _digests(scan, measured, lattice, described))
-
-
-def _digests(
-    scan: str, measured: QuadScan, lattice: str | LatticeFile | None, described: LatticeFile
-) -> dict[str, str | None]:
-    path = str(lattice.path) if isinstance(lattice, LatticeFile) else lattice
-    return {scan: measured.sha256} | ({} if path is None else {path: described.sha256})
+    return Inputs(measured, lattice_of(measured, lattice, **part))

@@ -9,20 +9,16 @@ from pathlib import Path
 from typing import Any
 
 from beamfit.errors import InputError, nearest
+from beamfit.io.headers import ALSO, SETTINGS
 from beamfit.io.lattice import LatticeFile
 from beamfit.io.line import part_of, read_lattice
 from beamfit.io.toml import LIST, TABLE, TEXT, Key, Section, is_number, read_toml
 
 FORMAT = "beamfit-machine-1"
 APPROACHES = ("either", "below", "above")
-# Units of settings as control systems write them.
-SPELLINGS = {
-    "A": {"a", "amp", "amps", "ampere", "amperes"},
-    "kG": {"kg"},
-    "T_per_m": {"t/m", "t_per_m", "tesla/m", "t.m-1", "t m^-1"},
-    "k1": {"1/m^2", "1/m2", "m^-2", "m-2", "1/m**2", "k1", "1/m²"},
-    "k1l": {"1/m", "m^-1", "m-1", "k1l"},
-}
+# Units of settings as control systems write them, in capitals or small letters.
+SPELLINGS = {u.lower(): u for u in SETTINGS}
+SPELLINGS |= {word.lower(): unit for word, unit in ALSO.items() if unit in SETTINGS}
 LENGTHS = {"um": 1e-6, "mm": 1e-3, "m": 1.0}
 PV, WAIT = Key(kind=TEXT), {"low": 0.0, "said": "a time above zero"}
 MAYBE = Key(kind=TEXT, default=None)
@@ -238,7 +234,7 @@ def read_machine(path: str | PathLike[str]) -> tuple[Section, dict[str, Any]]:
     return top, top.values(TOP)
 
 
-def unit_of(spelled: str) -> str | None:
+def unit_of(word: str) -> str | None:
     """The unit of settings that a word means, None if it means none.
 
     Examples
@@ -246,8 +242,7 @@ def unit_of(spelled: str) -> str | None:
     >>> unit_of("T/m"), unit_of("Amps"), unit_of("furlong")
     ('T_per_m', 'A', None)
     """
-    word = spelled.strip().lower()
-    return next((unit for unit, words in SPELLINGS.items() if word in words), None)
+    return SPELLINGS.get(word.strip().lower())
 
 
 def _magnet(section: Section, lattice: LatticeFile) -> Magnet:

@@ -54,7 +54,7 @@ class _Element(NamedTuple):
     after: int
 
 
-def read_variable(path: str | PathLike[str], name: str) -> tuple[np.ndarray, str]:
+def read_variable(path: str | PathLike[str], name: str) -> np.ndarray:
     """Read one variable of a MATLAB file.
 
     Parameters
@@ -66,9 +66,8 @@ def read_variable(path: str | PathLike[str], name: str) -> tuple[np.ndarray, str
 
     Returns
     -------
-    tuple of ndarray and str
-        A struct is an array with fields, a cell an array of objects, a text an array of its
-        lines; and the file's SHA-256.
+    ndarray
+        A struct is an array with fields, a cell an array of objects, a text an array of its lines.
 
     Raises
     ------
@@ -80,10 +79,10 @@ def read_variable(path: str | PathLike[str], name: str) -> tuple[np.ndarray, str
     >>> import pathlib, scipy.io, tempfile
     >>> file = pathlib.Path(tempfile.mkdtemp()) / "a.mat"
     >>> scipy.io.savemat(file, {"data": {"energy": 0.135}})
-    >>> float(read_variable(file, "data")[0]["energy"][0, 0][0, 0])
+    >>> float(read_variable(file, "data")["energy"][0, 0][0, 0])
     0.135
     """
-    content, sha256 = read_bytes(path, LARGEST, SAVE)
+    content = read_bytes(path, LARGEST, SAVE)
     _check_version(content, path)
     try:
         found = _variable(content, name)
@@ -91,7 +90,7 @@ def read_variable(path: str | PathLike[str], name: str) -> tuple[np.ndarray, str
         raise InputError(f"a damaged MATLAB file ({error})"[:120], SAVE, path) from None
     if found is None:
         raise InputError(f"no variable '{name}'", f"a struct '{name}' of emittance_gui", path)
-    return found, sha256
+    return found
 
 
 def _check_version(content: bytes, path: str | PathLike[str]) -> None:

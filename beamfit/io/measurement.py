@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import replace
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from beamfit.errors import InputError
+from beamfit.errors import InputError, located
 from beamfit.io.emittance_gui import is_emittance_gui, read_emittance_gui
 from beamfit.io.files import name_of
-from beamfit.io.scan_columns import ENERGIES, SETTINGS, column_notes, scan_columns
+from beamfit.io.headers import SETTINGS
+from beamfit.io.scan_columns import ENERGIES, column_notes, scan_columns
 from beamfit.io.sheet import UNITS, Column, Sheet, left_out
 from beamfit.io.shots import average_shots
 from beamfit.io.table import read_sheet
@@ -87,10 +87,8 @@ def read_quad_scan(
         sheet = sheet.good(lambda rows: _check_slipped(rows, columns, usual))
     values = _values(sheet, columns)
     _check_sizes(sheet, columns, values)
-    try:
+    with located(sheet.path):
         scan = _scan(sheet, columns, values)
-    except InputError as error:
-        raise replace(error, path=sheet.path) from None
     return average_shots(scan, marked="shot" in columns)
 
 
@@ -143,19 +141,18 @@ def _values(sheet: Sheet, columns: Mapping[str, Column]) -> dict[str, np.ndarray
         if error in columns:
             values[error] = _positive(sheet, columns[error], "error")
             missing = np.isnan(values[error]) & ~np.isnan(values[size])
-            if missing.any():
-                expected, row = "an error for each size, or none at all", int(np.argmax(missing))
-                raise sheet.error("an empty cell", expected, row, columns[error].header)
+            expected = "an error for each size, or none at all"
+            sheet.refuse(columns[error].header, missing, expected, "an empty cell")
     values |= {key: _within(sheet, columns[key]) for key in RANGES if key in columns}
     _screens(sheet, columns.get("screen"))
     elements = [f"r{i}_{p}" for i in ELEMENTS for p in "xy"]
     plain = [c for key, c in columns.items() if c.unit in SETTINGS or key in elements]
-    return values | {c.key: sheet.numbers(c.header) for c in plain}
+    return values | {c.key: sheet.values(c) for c in plain}
 
 
 def _positive(sheet: Sheet, column: Column, what: str) -> np.ndarray:
     """Lengths in m; NaN where the cell is blank."""
-    values = sheet.numbers(column.header, blank=True) * column.factor
+    values = sheet.values(column, blank=True)
     if wrong := first_unusable(values, blank=True):
         cell = sheet[column.header][wrong[0]]
         expected = f"a positive {what} in {column.unit}"
@@ -175,11 +172,9 @@ def _check_slipped(sheet: Sheet, columns: Mapping[str, Column], usual: Mapping[s
         column = columns[f"size_{plane}"]
         size = _positive(sheet, column, "beam size")
         slipped = np.nan_to_num(size) > max(USUAL[1], SLIPPED * usually)
-        if slipped.any():
-            row = int(np.argmax(slipped))
-            found = f"{size[row] / column.factor:g} {column.unit}, where the others are around "
-            found += f"{usually / column.factor:.3g}"
-            raise sheet.error(found, "sizes in one unit", row, column.header)
+        found = f"{{:g}} {column.unit}, where the others are around {usually / column.factor:.3g}"
+        written = size / column.factor
+        sheet.refuse(column.header, slipped, "sizes in one unit", found, written)
 
 
 def _check_sizes(
@@ -216,11 +211,8 @@ def _implausible(sheet: Sheet, column: Column, written: float) -> InputError:
 def _within(sheet: Sheet, column: Column) -> np.ndarray:
     """A further quantity, within what it can be."""
     low, high, expected = RANGES[column.key]
-    values = sheet.numbers(column.header) * column.factor
-    wrong = (values <= low) | (values > high)
-    if wrong.any():
-        row = int(np.argmax(wrong))
-        raise sheet.error(f"'{sheet[column.header][row]}'", expected, row, column.header)
+    values = sheet.values(column)
+    sheet.refuse(column.header, (values <= low) | (values > high), expected)
     return values
 
 

@@ -23,7 +23,7 @@ USUAL[list(b"0123456789+-.eE,;\t \r\n")] = True
 
 def numeric_rows(
     path: str | PathLike[str], first: int, separator: str, columns: int, most: int
-) -> tuple[np.ndarray, str] | None:
+) -> np.ndarray | None:
     """Read the rows of a large file that holds nothing but finite numbers from a line on.
 
     Parameters
@@ -41,9 +41,9 @@ def numeric_rows(
 
     Returns
     -------
-    (array, shape (columns, n), and str), or None
-        The values, and the digest of the file. None if the file is small, or a line is anything
-        but so many finite numbers: whoever reads line by line says which.
+    array, shape (columns, n), or None
+        The values. None if the file is small, or a line is anything but so many finite numbers:
+        whoever reads line by line says which.
 
     Raises
     ------
@@ -55,7 +55,7 @@ def numeric_rows(
     >>> import tempfile, pathlib
     >>> file = pathlib.Path(tempfile.mkdtemp()) / "a.csv"
     >>> _ = file.write_text("s,mA\\n" + "1.0,2.0\\n" * 200_000)
-    >>> numeric_rows(file, 2, ",", 2, 10**6)[0].shape
+    >>> numeric_rows(file, 2, ",", 2, 10**6).shape
     (2, 200000)
     """
     if os.path.getsize(path) < LARGE:
@@ -72,7 +72,8 @@ def numeric_rows(
             parts.append(rows)
             count += rows.shape[1]
             check_length(count, most, path, first + most)
-    return np.concatenate(parts, axis=1), remember(path, seen)
+    remember(path, seen)
+    return np.concatenate(parts, axis=1)
 
 
 def check_length(rows: int, most: int, path: str | PathLike[str], line: int | None = None) -> None:

@@ -8,7 +8,7 @@ from dataclasses import replace
 
 from beamfit.errors import InputError
 from beamfit.io.headers import is_number, spelled
-from beamfit.io.sheet import UNITS, Column, Sheet, columns_of
+from beamfit.io.sheet import DATE, UNITS, Column, Sheet, columns_of
 from beamfit.studies.decay.conditions import Conditions
 
 QUANTITIES = {
@@ -24,7 +24,6 @@ QUANTITIES = {
 # What a record calls them.
 CALLED = {"beam_current": "current", "beam_current_error": "error"}
 USED = {"time", "nanos", "current", "error", *Conditions._fields}
-DATE, NANOSECONDS = "a date", "ns"
 # What a column of dates is called, and those of a day and of the time of that day.
 MOMENTS = {"time", "timestamp", "time_stamp", "datetime", "date_time", "data_time", "date"}
 DAYS, CLOCKS = {"date", "day", "datum"}, {"time", "zeit", "uhrzeit"}
@@ -67,17 +66,13 @@ def record_columns(sheet: Sheet, time: str | None, current: str | None) -> dict[
     >>> {key: column.unit for key, column in record_columns(sheet, None, None).items()}
     {'time': 'a date', 'current': 'mA'}
     """
-    named = {}
-    if time is not None:
-        named["time"] = _named_time(sheet, time)
-    if current is not None:
-        named["current"] = _named_current(sheet, current)
+    said = {"time": time, "current": current}
+    named = {key: _named(sheet, key, text) for key, text in said.items() if text is not None}
     left = [name for name in sheet.names if name not in {c.header for c in named.values()}]
     if named:
         left = [name for name in left if known(sheet, name)]
-    rest = replace(sheet, names=tuple(left), cells=[sheet[name] for name in left])
     try:
-        found = columns_of(rest, QUANTITIES, _other(sheet))
+        found = columns_of(sheet.only(left), QUANTITIES, _other(sheet))
     except InputError as error:
         raise replace(error, expected=f"{error.expected}; {_options(sheet)}") from None
     called = {CALLED.get(key, key): column for key, column in found.items()}
@@ -88,9 +83,8 @@ def record_columns(sheet: Sheet, time: str | None, current: str | None) -> dict[
 
 def known(sheet: Sheet, name: str) -> Column | None:
     """What a header means by itself; None if nothing."""
-    alone = replace(sheet, names=(name,), cells=[sheet[name]])
     try:
-        return next(iter(columns_of(alone, QUANTITIES, _other(sheet)).values()))
+        return next(iter(columns_of(sheet.only([name]), QUANTITIES, _other(sheet)).values()))
     except InputError:
         return None
 
@@ -157,7 +151,7 @@ def _other(sheet: Sheet):
         if word in SECONDS:
             return Column(header, "time", "s")
         if word in NANOS:
-            return Column(header, "nanos", NANOSECONDS)
+            return Column(header, "nanos", "ns", UNITS["time"]["ns"])
         if (short := re.fullmatch(r"t_(\w+)", header)) and short[1] in UNITS["time"]:
             return Column(header, "time", short[1], UNITS["time"][short[1]])
         if unit != header and unit in UNITS["current"]:
@@ -179,29 +173,19 @@ def _current(header: str) -> Column | None:
     return Column(header, "beam_current", unit, UNITS["current"][unit])
 
 
-def _named_time(sheet: Sheet, text: str) -> Column:
-    if text in sheet.names:
+def _named(sheet: Sheet, key: str, text: str) -> Column:
+    """The column that --time or --current names, with its unit after the last colon."""
+    header, _, unit = text.rpartition(":")
+    if text in sheet.names and key == "time":
         found = known(sheet, text)
         if found is not None and found.key == "time" and found.unit != DATE:
             return found
         return Column(text, "time", "s" if is_number(next(iter(sheet[text]), "0")) else DATE)
-    header, _, unit = text.rpartition(":")
-    if header in sheet.names and unit in UNITS["time"]:
-        return Column(header, "time", unit, UNITS["time"][unit])
-    raise _no_such(sheet, header if unit in UNITS["time"] else text)
-
-
-def _named_current(sheet: Sheet, text: str) -> Column:
-    header, _, unit = text.rpartition(":")
     if text in sheet.names:
         header, (_, _, unit) = text, spelled(text).rpartition("_")
-    if header in sheet.names and unit in UNITS["current"]:
-        return Column(header, "current", unit, UNITS["current"][unit])
-    if header in sheet.names:
+    if header in sheet.names and unit in UNITS[key]:
+        return Column(header, key, unit, UNITS[key][unit])
+    if header in sheet.names and key == "current":
         expected = f"its unit after the last colon, such as {header}:mA"
         raise sheet.header_error(f"--current {text} without a unit", expected)
-    raise _no_such(sheet, header or text)
-
-
-def _no_such(sheet: Sheet, name: str) -> InputError:
-    return sheet.header_error(f"no column '{name}'", f"one of {', '.join(sheet.names)}")
+    raise sheet.no_column(header if unit in UNITS[key] else text)

@@ -12,7 +12,7 @@ import numpy as np
 
 from beamfit import __version__
 from beamfit.errors import InputError
-from beamfit.io.files import read_json
+from beamfit.io.files import laid_out, read_json
 from beamfit.studies.scan.scans import PROJECTED
 from beamfit.studies.scan.wishes import Beam
 from beamfit.table import json_of
@@ -96,20 +96,15 @@ def read_fitted_beams(
     ([1e-08, 1e-08, 1e-08], 'sigma11, sigma12, sigma22 have no error (converged: Good.)')
     """
     document = read_json(path, "no fitted beams", HOW)
-    try:
+    with laid_out(path, "no fitted beams", HOW):
         entries = [e for e in document["results"] if e.get("slice", PROJECTED) == PROJECTED]
         found = {entry["plane"]: _beam(entry, rest_energy) for entry in entries}
         told = all("line" in entry for entry in entries) or "inputs" not in document
         if lattice is not None and not told and lattice not in document["inputs"].values():
             said = "a beam that was fitted with another lattice, or with another version of it"
             raise InputError(said, "a fit with this lattice")
-    except InputError as error:
-        error.path = path
-        raise
-    except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError):
-        raise InputError("no fitted beams", HOW, path=path) from None
-    if not found:
-        raise InputError("no result of the whole beam in the file", HOW, path=path)
+        if not found:
+            raise InputError("no result of the whole beam in the file", HOW)
     return found
 
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from beamfit.errors import InputError
-from beamfit.io.ring_tables import RANGES, read_along
+from beamfit.io.ring_tables import COLUMNS, RANGES, read_along
 from beamfit.io.toml import NUMBERS, REQUIRED, TABLE, TEXT, Key, Section, read_toml
 
 if TYPE_CHECKING:
@@ -63,21 +63,14 @@ ACCEPTANCE = {
 }
 
 
-def _optical(field: str, kind: str, default: Any = 0.0) -> Key:
-    low, high, said = RANGES[kind]
-    return Key(field, 1.0, default, low, high, said)
+def _optical(name: str) -> Key:
+    """An average of what a table along the ring has under the same name."""
+    field = name.removesuffix("_m").replace("dispersion_slope", "slope")
+    kind = name.split("_")[0]
+    return Key(field, 1.0, REQUIRED if kind == "beta" else 0.0, *RANGES[kind])
 
 
-OPTICS = {
-    "beta_x_m": _optical("beta_x", "beta", REQUIRED),
-    "beta_y_m": _optical("beta_y", "beta", REQUIRED),
-    "alpha_x": _optical("alpha_x", "alpha"),
-    "alpha_y": _optical("alpha_y", "alpha"),
-    "dispersion_x_m": _optical("dispersion_x", "dispersion"),
-    "dispersion_y_m": _optical("dispersion_y", "dispersion"),
-    "dispersion_slope_x": _optical("slope_x", "dispersion"),
-    "dispersion_slope_y": _optical("slope_y", "dispersion"),
-}
+OPTICS = {name: _optical(name) for name in COLUMNS if name != "s_m"}
 OPERATION = {
     "rf_voltage_kV": _within("rf_voltage", 1e-3, 1e8, 1e3),
     "bunches": Key("bunches", kind=NUMBERS, low=-1e-300, high=1e9, said=FILL),
@@ -253,11 +246,8 @@ def _length(section: Section, values: dict[str, Any]) -> MeasuredLength | None:
                 raise section.error(f"{key} without bunch_length_mm", LENGTHS, key)
         return None
     if "stretch" in values:
-        found, expected = (
-            "a bunch length beside a stretch",
-            "one of them: the length is taken as is",
-        )
-        raise section.error(found, expected, "bunch_length_mm")
+        expected = "one of them: the length is taken as is"
+        raise section.error("a bunch length beside a stretch", expected, "bunch_length_mm")
     current, length = (np.array(given[key], float, ndmin=1) for key in ("current", "length"))
     if current.shape != length.shape or (np.diff(current) <= 0).any():
         found = f"{length.size} lengths at {current.size} bunch currents"

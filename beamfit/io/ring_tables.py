@@ -147,9 +147,7 @@ def _column(sheet: Sheet, name: str) -> np.ndarray:
     else:
         low, high, expected = RANGES.get(name.split("_")[0], ANYWHERE)
         wrong = ~((low < values) & (values < high))
-    if wrong.any():
-        row = int(np.argmax(wrong))
-        raise sheet.error(f"{values[row]:g}", expected, row, header)
+    sheet.refuse(header, wrong, expected, "{:g}", values)
     return values
 
 

@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import replace
 from os import PathLike
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from beamfit.errors import InputError, nearest
-from beamfit.io.dates import unix_time
+from beamfit.errors import InputError
 from beamfit.io.files import name_of
-from beamfit.io.sheet import Column, Sheet, columns_of, left_out
+from beamfit.io.sheet import DATE, Column, Sheet, columns_of, left_out
 from beamfit.io.table import read_sheet
 from beamfit.studies.response.record import Run
 
@@ -20,7 +18,7 @@ if TYPE_CHECKING:
     from pandas import DataFrame
 
 MOST_ROWS = 2_000_000
-DATE, ASIDE, TIME = "a date", "aside", "time"
+ASIDE, TIME = "aside", "time"
 EXAMPLE = "time_s,u_valve,y_level"
 
 
@@ -82,9 +80,9 @@ def read_run(
         sheet = sheet.good(lambda rows: _values(rows, columns, kinds))
     time, u, y = _values(sheet, columns, kinds)
     if time is None:
-        time = float(step) * np.arange(len(sheet)) if step and step > 0 else None
-    if time is None:
-        raise InputError(f"--step {step}", "seconds between the rows, above 0")
+        if not step > 0:
+            raise InputError(f"--step {step}", "seconds between the rows, above 0")
+        time = float(step) * np.arange(len(sheet))
     late = np.flatnonzero(~(np.diff(time) > 0))
     if late.size:
         row = int(late[0]) + 1
@@ -101,13 +99,11 @@ def _columns(sheet: Sheet, named: dict[str, tuple[str, ...]]) -> dict[str, Colum
     for kind, names in named.items():
         for name in names:
             if name not in sheet.names:
-                raise sheet.header_error(f"no column '{name}'", nearest(name, list(sheet.names)))
+                raise sheet.no_column(name)
             found[name] = Column(name, f"{kind}_{name}")
     any_named = bool(found)
 
     def other(header: str) -> Column | None:
-        if header in found:
-            return found[header]
         if header.lower() == TIME:
             return Column(header, TIME, DATE)
         if header[:2] in ("u_", "y_") and len(header) > 2 and not any_named:
@@ -116,8 +112,7 @@ def _columns(sheet: Sheet, named: dict[str, tuple[str, ...]]) -> dict[str, Colum
         return Column(header, f"{ASIDE} {header}") if aside else None
 
     left = [n for n in sheet.names if n not in found]
-    rest = replace(sheet, names=tuple(left), cells=[sheet[n] for n in left])
-    known = columns_of(rest, {TIME: "time"}, other) if left else {}
+    known = columns_of(sheet.only(left), {TIME: "time"}, other)
     return {k: c for k, c in known.items() if not k.startswith(ASIDE)} | {
         c.key: c for c in found.values()
     }
@@ -126,14 +121,7 @@ def _columns(sheet: Sheet, named: dict[str, tuple[str, ...]]) -> dict[str, Colum
 def _values(
     sheet: Sheet, columns: dict[str, Column], kinds: dict[str, dict[str, Column]]
 ) -> tuple[np.ndarray | None, dict[str, np.ndarray], dict[str, np.ndarray]]:
-    time = None
-    if TIME in columns:
-        header, unit = columns[TIME].header, columns[TIME].unit
-        if unit == DATE:
-            expected = "an ISO 8601 time, such as 2024-03-01T12:00:00+01:00"
-            time = sheet.numbers(header, read=unix_time, expected=expected)
-        else:
-            time = sheet.numbers(header) * columns[TIME].factor
-    u = {name: sheet.numbers(c.header) for name, c in kinds["u"].items()}
-    y = {name: sheet.numbers(c.header, blank=True) for name, c in kinds["y"].items()}
+    time = sheet.values(columns[TIME]) if TIME in columns else None
+    u = {name: sheet.values(c) for name, c in kinds["u"].items()}
+    y = {name: sheet.values(c, blank=True) for name, c in kinds["y"].items()}
     return time, u, y

@@ -14,15 +14,13 @@ import numpy as np
 
 from beamfit import __version__
 from beamfit.errors import InputError
-from beamfit.io.files import read_json
+from beamfit.io.files import laid_out, read_json
 from beamfit.studies.decay.fit import DecayFit
 from beamfit.studies.scan.fit import EmittanceFit, scenario_of
 from beamfit.studies.scan.known import see
 from beamfit.writing import write_atomically
 
 FORMAT = "beamfit-fit-1"
-# What values of other kinds than a fit has may raise.
-UNREADABLE = (ArithmeticError, AttributeError, LookupError, RecursionError, TypeError, ValueError)
 HOW = "a file that beamfit.save_fit wrote"
 # What a file may hold, by where it is defined. A file names these and nothing else.
 SCAN, DECAY, OPTICS = "beamfit.studies.scan", "beamfit.studies.decay", "beamfit.optics"
@@ -119,31 +117,14 @@ def load_fit(path: str | PathLike[str]) -> EmittanceFit | DecayFit:
     beamfit.errors.InputError: fit.json: no such file; expected a readable file
     """
     document = read_json(path, "no saved fit", HOW)
-    try:
-        known = document["format"] == FORMAT
-        version = (
-            f"format {str(document['format'])[:40]}, of beamfit {str(document['beamfit'])[:20]}"
-        )
-    except (KeyError, TypeError):
-        raise InputError("no saved fit", HOW, path=path) from None
-    if not known:
+    with laid_out(path, "no saved fit", HOW):
+        form, version = document["format"], f"beamfit {str(document['beamfit'])[:20]}"
+    if form != FORMAT:
         expected = f"format {FORMAT}; load it with that version, or fit again"
-        raise InputError(version, expected, path=path)
-    try:
+        raise InputError(f"format {str(form)[:40]}, of {version}", expected, path=path)
+    found = f"a fit saved by {version} that cannot be read here"
+    with laid_out(path, found, HOW, named=True):
         return _fit(document["kind"], document["fit"])
-    except InputError as error:
-        error.path = path
-        raise
-    except (
-        ArithmeticError,
-        AttributeError,
-        LookupError,
-        RecursionError,
-        TypeError,
-        ValueError,
-    ) as error:
-        found = f"a fit saved by beamfit {version.split()[-1]} that cannot be read here"
-        raise InputError(f"{found} ({type(error).__name__})", HOW, path=path) from None
 
 
 def _fit(kind: str, content: Any) -> EmittanceFit | DecayFit:

@@ -7,7 +7,7 @@ import re
 from collections.abc import Mapping
 
 from beamfit.errors import nearest
-from beamfit.io.headers import spelled
+from beamfit.io.headers import SETTINGS, spelled
 from beamfit.io.sheet import UNITS, Column, Sheet, columns_of
 from beamfit.particles import ENERGY_KEYS
 
@@ -25,7 +25,6 @@ QUANTITIES = {
 }
 # What tells rows apart besides settings of magnets.
 SEEN = {"screen", "r11_x", "r11_y"}
-SETTINGS = ("A", "kG", "T_per_m", "k1", "k1l")
 CARRIED = re.compile(r"note_.*|date|time|timestamp|comments?|charge_[np]C", re.IGNORECASE)
 # Words for a width, and how many of it are one rms: a Gaussian's FWHM is sqrt(8 ln 2) rms.
 FWHM = 1.0 / math.sqrt(8.0 * math.log(2.0))
@@ -66,11 +65,8 @@ def scan_columns(sheet: Sheet) -> dict[str, Column]:
     (['setting Q', 'size_x'], 0.001)
     """
     if any(spelled(name).lower().startswith("beam_current") for name in sheet.names):
-        found, expected = (
-            "a record of beam current",
-            "a quadrupole scan; `beamfit lifetime` reads it",
-        )
-        raise sheet.header_error(found, expected)
+        expected = "a quadrupole scan; `beamfit lifetime` reads it"
+        raise sheet.header_error("a record of beam current", expected)
     columns = columns_of(sheet, QUANTITIES, lambda header: _other(header, sheet))
     if not {"size_x", "size_y"} & set(columns):
         missing = "a beam size column, such as size_x_um"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import io
 import re
 import unicodedata
@@ -15,7 +14,7 @@ from types import MappingProxyType
 from typing import Any
 
 from beamfit.errors import InputError, nearest
-from beamfit.io.files import name_of, read_text
+from beamfit.io.files import digest, read_text
 from beamfit.io.lattice import LatticeFile
 from beamfit.io.sequence_bounds import bound, check_count
 from beamfit.io.sequence_elements import NOTHING_AT_ZERO, Source, element_tables
@@ -86,13 +85,9 @@ def read_sequence(
     """
     suffix = Path(path).suffix.lower()
     if suffix == ".ele":
-        raise InputError(
-            "an elegant command file",
-            "the lattice file (.lte) that its &run_setup names",
-            path=path,
-        )
-    seen = hashlib.sha256()
-    source = Source(path, read_text(path, seen), DIALECTS[suffix])
+        expected = "the lattice file (.lte) that its &run_setup names"
+        raise InputError("an elegant command file", expected, path=path)
+    source = Source(path, read_text(path), DIALECTS[suffix])
     with _silence() as said:
         try:
             parser = _parser(source)
@@ -104,21 +99,17 @@ def read_sequence(
             elements = element_tables(expanded, _descriptions(parser), source)
         except InputError:
             raise
-        except Exception as error:  # expressions are evaluated late, wherever they are used
+        except Exception as error:  # whatever evaluating an expression may raise, also late
             raise _unparsed(source, error) from None
     if not elements:
         raise source.error(f"'{name}' without elements", "a line with magnets and a screen", name)
-    units = {"quadrupole": "k1", "thin_lens": "k1l"}
     return LatticeFile(
         path=path,
-        sha256=seen.hexdigest(),
+        sha256=digest(path),
         name=name,
         energy=total,
         particle=particle,
-        energy_spread=0.0,
         elements=tuple(elements),
-        calibrations={e["name"]: units[e["type"]] for e in elements if e["type"] in units},
-        source=f"{name} of the {source.dialect} file {name_of(path)}",
     )
 
 
@@ -176,10 +167,7 @@ def _parse(parser: Any, source: Source) -> None:
     parser._statement = checked
     parser._analyse = lambda key: None  # runs for ever on lines that hold one another
     parser.bases.append(Path(source.path).resolve().parent)  # where CALL looks
-    try:
-        parser.parse_lines(source.text.splitlines(keepends=True), final=False)
-    except Exception as error:  # whatever evaluating an expression may raise
-        raise _unparsed(source, error) from None
+    parser.parse_lines(source.text.splitlines(keepends=True), final=False)
 
 
 def _reference(found: re.Match[str]) -> str:
@@ -302,10 +290,9 @@ def _beam(parser: Any, source: Source, name: str, energy: float | None) -> tuple
     if particle not in REST_ENERGY:
         raise source.error(f"particle '{particle}'", nearest(particle, list(REST_ENERGY)))
     if total is None:
-        where = (
-            "--energy in MeV" if source.dialect == ELEGANT else "BEAM, ENERGY = or --energy in MeV"
-        )
-        raise source.error("no beam energy in the file", f"{where} (energy= from Python)")
+        where = "" if source.dialect == ELEGANT else "BEAM, ENERGY = or "
+        expected = f"{where}--energy in MeV (energy= from Python)"
+        raise source.error("no beam energy in the file", expected)
     if expected := expected_energy(total, particle):
         found = f"an energy of {total:g} MeV"
         raise source.error(found, f"{expected}; BEAM is in GeV, --energy in MeV")

@@ -118,6 +118,10 @@ class _Translation:
         self.name = element.FamName
         self.type = str(getattr(element, "origin", None) or type(element).__name__).upper()
         self.length = float(getattr(element, "Length", 0.0))
+        self.normal, self.skew = (
+            [*map(float, np.atleast_1d(getattr(element, f"Polynom{k}", []))), 0.0, 0.0]
+            for k in "BA"
+        )
 
     def table(self) -> dict[str, Any]:
         kind = type(self.element).__name__
@@ -132,7 +136,7 @@ class _Translation:
             return self.dipole()
         if kind == "ThinMultipole":
             return self.thin_multipole()
-        if any(self.polynom("PolynomB")[:2]) or any(self.polynom("PolynomA")[:2]):
+        if any(self.normal[:2]) or any(self.skew[:2]):
             raise self.refuse("with a dipole or quadrupole component of its own")
         return self.space()
 
@@ -149,9 +153,6 @@ class _Translation:
             return float(self.said.get(key, 0.0))
         except (TypeError, ValueError):
             return 0.0
-
-    def polynom(self, key: str) -> list[float]:
-        return [float(v) for v in np.atleast_1d(getattr(self.element, key, []))] + [0.0, 0.0]
 
     def check_unmodelled(self) -> None:
         for key, meaning in UNMODELLED.items():
@@ -189,21 +190,25 @@ class _Translation:
         return round(turns) % 4
 
     def quadrupole(self) -> dict[str, Any]:
-        k1 = self.polynom("PolynomB")[1]
-        if self.polynom("PolynomB")[0] or any(self.polynom("PolynomA")[:2]):
+        self.check_own()
+        self.check_length()
+        k1 = self.upright() * self.normal[1] + 0.0
+        return {"type": "quadrupole", "name": self.name, "length_m": self.length, "k1_per_m2": k1}
+
+    def check_own(self) -> None:
+        if self.normal[0] or any(self.skew[:2]):
             raise self.refuse("with a dipole or skew component of its own")
+
+    def check_length(self) -> None:
         if self.length <= 0.0:
             raise self.refuse(f"of length {self.length:g} m", "a length above zero")
-        sign = -1.0 if self.quarter_turns() % 2 else 1.0
-        return {
-            "type": "quadrupole",
-            "name": self.name,
-            "length_m": self.length,
-            "k1_per_m2": sign * k1 + 0.0,
-        }
+
+    def upright(self) -> float:
+        """The sign of a gradient: that of an element turned by 90° is the other one."""
+        return -1.0 if self.quarter_turns() % 2 else 1.0
 
     def dipole(self) -> dict[str, Any]:
-        k1, angle = self.polynom("PolynomB")[1], float(self.element.BendingAngle)
+        k1, angle = self.normal[1], float(self.element.BendingAngle)
         edges = [float(self.element.EntranceAngle), float(self.element.ExitAngle)]
         self.check_dipole(angle)
         turns = self.quarter_turns()
@@ -229,15 +234,14 @@ class _Translation:
         }
 
     def check_dipole(self, angle: float) -> None:
-        if any(self.polynom("PolynomA")[:2]):
+        if any(self.skew[:2]):
             raise self.refuse("with a skew component of its own")
         if self.type == "RBEN":
             raise self.refuse(
                 "(rectangular; pyAT and elegant read its length differently)",
                 "CSBEND or SBEN with the arc length and E1 = E2 = ANGLE/2",
             )
-        if self.length <= 0.0:
-            raise self.refuse(f"of length {self.length:g} m", "a length above zero")
+        self.check_length()
         k0 = self.number("k0")
         if k0 and abs(k0 * self.length - angle) > 1e-9:
             raise self.refuse(f"with a field (K0 = {k0:g}) that is not ANGLE/L")
@@ -254,10 +258,8 @@ class _Translation:
             )
 
     def thin_multipole(self) -> dict[str, Any]:
-        normal, skew = self.polynom("PolynomB"), self.polynom("PolynomA")
-        if normal[0] or skew[0] or skew[1]:
-            raise self.refuse("with a dipole or skew component of its own")
-        if not normal[1]:
+        self.check_own()
+        if not self.normal[1]:
             return {"type": "marker", "name": self.name}
-        sign = -1.0 if self.quarter_turns() % 2 else 1.0
-        return {"type": "thin_lens", "name": self.name, "k1l_per_m": sign * normal[1]}
+        k1l = self.upright() * self.normal[1]
+        return {"type": "thin_lens", "name": self.name, "k1l_per_m": k1l}

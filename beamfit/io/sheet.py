@@ -16,18 +16,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from beamfit.errors import InputError, nearest
-from beamfit.io.headers import spelled
+from beamfit.io.dates import NUMBERS, dates_in_order
+from beamfit.io.headers import UNITS, is_number, spelled
 
-UNITS: dict[str, dict[str, float]] = {
-    # quantity: unit at the end of a name -> factor to SI (a stored current: to mA)
-    "length": {"um": 1e-6, "mm": 1e-3, "m": 1.0, "µm": 1e-6, "μm": 1e-6, "nm": 1e-9, "cm": 1e-2},
-    "length or duration": {"mm": 1e-3, "m": 1.0, "ps": 299792458e-12},
-    "time": {"s": 1.0, "min": 60.0, "h": 3600.0, "d": 86400.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9},
-    "current": {"mA": 1.0, "A": 1e3, "uA": 1e-3, "µA": 1e-3, "μA": 1e-3, "nA": 1e-6},
-    "voltage": {"kV": 1e3, "V": 1.0, "MV": 1e6},
-    "pressure": {"Pa": 1.0, "mbar": 100.0, "Torr": 101325 / 760},
-    "energy in MeV": {"MeV": 1.0},
-}
+# The unit of a column of dates.
+DATE = "a date"
 # Rows left out that a note names one by one.
 MOST_NAMED = 5
 
@@ -96,6 +89,38 @@ class Sheet:
         """Make the error that names the header, and the column if it is one alone."""
         return InputError(found, expected, path=self.path, line=self.header, column=column)
 
+    def refuse(
+        self,
+        column: str,
+        wrong: np.ndarray,
+        expected: str,
+        found: str = "'{}'",
+        values: Sequence[Any] | None = None,
+    ) -> None:
+        """Raise the error of the first row that is wrong, if one is.
+
+        Parameters
+        ----------
+        column : str
+            Header of the column at fault.
+        wrong : array of bool
+            Row by row.
+        expected : str
+            What should stand there.
+        found : str
+            How to say what stands there, with {} in the place of the value.
+        values : sequence, optional
+            One a row; the cells unless said.
+        """
+        if wrong.any():
+            row = int(np.argmax(wrong))
+            said = (self[column] if values is None else values)[row]
+            raise self.error(found.format(said), expected, row, column)
+
+    def no_column(self, name: str) -> InputError:
+        """Make the error of a column that is not there."""
+        return self.header_error(f"no column '{name}'", nearest(name, list(self.names)))
+
     def without(self, patterns: Iterable[str]) -> Sheet:
         """Leave out columns by name, in which * and ? stand for any letters.
 
@@ -107,14 +132,15 @@ class Sheet:
         left = list(self.names)
         for pattern in patterns:
             if not any(fnmatchcase(name, pattern) for name in self.names):
-                raise self.header_error(
-                    f"no column '{pattern}'", nearest(pattern, list(self.names))
-                )
+                raise self.no_column(pattern)
             left = [name for name in left if not fnmatchcase(name, pattern)]
         if not left:
             raise self.header_error("no column that is not ignored", "a column to read")
-        cells = [self[name] for name in left]
-        return replace(self, names=tuple(left), cells=cells)
+        return self.only(left)
+
+    def only(self, names: Sequence[str]) -> Sheet:
+        """Some of the columns."""
+        return replace(self, names=tuple(names), cells=[self[name] for name in names])
 
     def named(self) -> Sheet:
         """Leave out columns without a name, such as the index that pandas writes."""
@@ -199,6 +225,19 @@ class Sheet:
             if cell != "" and not np.isfinite(values[row]):
                 raise self.error(f"'{cell}'", "a finite number", row, name)
         return values
+
+    def values(self, column: Column, *, blank: bool = False) -> np.ndarray:
+        """A column of finite numbers in SI, or of dates in s since 1970; as `numbers`."""
+        if column.unit == DATE:
+            expected = "an ISO 8601 time, such as 2024-03-01T12:00:00+01:00"
+            first = str(next(iter(self[column.header]), ""))
+            if NUMBERS.match(first):
+                expected = "a date whose day and month cannot be exchanged, such as 2024-03-01"
+            elif is_number(first):
+                units = ", ".join(f"{column.header}_{unit}" for unit in ("s", "ms", "d"))
+                expected = f"a date, or the unit of the number in the header: {units}"
+            return self.numbers(column.header, read=dates_in_order(), expected=expected)
+        return self.numbers(column.header, blank=blank) * column.factor
 
 
 def columns_of(

@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import csv
-import hashlib
 import itertools
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from beamfit.errors import InputError
 from beamfit.io.commas import with_points
-from beamfit.io.files import text_lines
+from beamfit.io.files import digest, text_lines
 from beamfit.io.hdf5 import hdf5_columns
 from beamfit.io.headers import (
     HEAD,
@@ -102,65 +101,62 @@ def _read_text(
     ragged: bool,
     names: Sequence[str] | None,
 ) -> Sheet:
-    header, separator = None, "" if names is None else ","
-    comments, rows, lines, bad, seen = [], [], [], [], hashlib.sha256()
-    source = map(unframed, text_lines(path, seen))
-    head = list(itertools.islice(source, HEAD))
-    head = uncommented(head) if names is None else head
-    title = header_at(head) if names is None else 0
-    for line, text in enumerate(itertools.chain(head, source), start=1):
-        start = text.strip()[:1]
-        if text.lstrip().startswith(MARKS + TFS_LINES * (names is None or separator == " ")):
+    comments, rows, lines, bad, columns, notes = [], [], [], [], None, ()
+    header, separator = None, ","
+    numbered = enumerate(map(unframed, text_lines(path)), start=1)
+    if names is None:
+        names, header, separator, numbered = _head(path, example, comments)
+    for line, text in numbered:
+        if text.lstrip().startswith(MARKS + TFS_LINES * (separator == " ")):
             comments.append(bare(text))
-        elif names is None and start == "*":  # of a TFS file
-            separator, header = " ", line
-            names = list(map(str.upper, _split(text, " ", path, line)[1:]))
-        elif not text.strip().strip(",;\t ") or (names is None and SEPARATOR_LINE.match(text)):
-            continue
-        elif names is None and line <= title:
-            comments.append(text.strip(",;\t "))
-        elif names is None:
-            separator = separator_of(text)
-            names, header = _cells(path, text, line), line
-            _check_header(names, example, path, line)
-        else:
+        elif text.strip().strip(",;\t "):
             cells, wrong = _row(text, separator, path, line, len(names))
             whole = len(cells) == len(names)
             if whole and not rows and (units := with_units(names, cells)):
                 names = units
                 continue
-            fresh = not rows and not bad
-            if fresh and (good := _good(path, line, separator, names, most, comments, header)):
-                return good
+            fresh = not (rows or bad or "time" in names)  # a column `time` has dates
+            columns = numeric_rows(path, line, separator, len(names), most) if fresh else None
+            if columns is not None:
+                lines = range(line, line + columns.shape[1])
+                break
             (rows if whole else bad).append(cells if whole else wrong)
             lines += [line] * whole
             least = min(most, MOST_WORDS // max(1, len(names)))
             check_length(len(rows) + len(bad), least, path, line)
-            _raise_first(() if ragged else bad)
-    if names is None:
-        raise InputError("no header and no rows", f"a header line such as {example}", path=path)
-    _raise_first(() if rows else bad)
-    rows, notes = with_points(rows, separator)
-    cells = list(zip(*rows, strict=True)) if rows else [()] * len(names)
-    said = (tuple(comments), seen.hexdigest(), tuple(bad), notes)
-    return Sheet(path, tuple(names), cells, lines, header, *said).named()
+            if bad and not ragged:
+                break
+    if bad and not (ragged and rows):
+        raise bad[0]
+    if columns is None:
+        rows, notes = with_points(rows, separator)
+        columns = zip(*rows, strict=True) if rows else [()] * len(names)
+    said = (tuple(comments), digest(path), tuple(bad), notes)
+    return Sheet(path, tuple(names), list(columns), lines, header, *said).named()
 
 
-def _good(
-    path: str | PathLike[str],
-    line: int,
-    separator: str,
-    names: Sequence[str],
-    most: int,
-    comments: Sequence[str],
-    header: int | None,
-) -> Sheet | None:
-    """The rest of a large file of good numbers; a column `time` has dates."""
-    found = None if "time" in names else numeric_rows(path, line, separator, len(names), most)
-    if found is None:
-        return None
-    lines = range(line, line + found[0].shape[1])
-    return Sheet(path, tuple(names), list(found[0]), lines, header, tuple(comments), found[1])
+def _head(
+    path: str | PathLike[str], example: str, comments: list[str]
+) -> tuple[list[str], int, str, Iterator[tuple[int, str]]]:
+    """Names of the columns, their line, what separates them, and the lines below, numbered."""
+    source = map(unframed, text_lines(path))
+    head = uncommented(list(itertools.islice(source, HEAD)))
+    title, numbered = header_at(head), enumerate(itertools.chain(head, source), start=1)
+    for line, text in numbered:
+        if text.lstrip().startswith(MARKS + TFS_LINES):
+            comments.append(bare(text))
+        elif text.lstrip().startswith("*"):  # of a TFS file
+            names = list(map(str.upper, _split(text, " ", path, line)[1:]))
+            return names, line, " ", numbered
+        elif not text.strip().strip(",;\t ") or SEPARATOR_LINE.match(text):
+            continue
+        elif line <= title:
+            comments.append(text.strip(",;\t "))
+        else:
+            names = _cells(path, text, line)
+            _check_header(names, example, path, line)
+            return names, line, separator_of(text), numbered
+    raise InputError("no header and no rows", f"a header line such as {example}", path=path)
 
 
 def _of_frame(frame: DataFrame, most: int) -> Sheet:
@@ -177,11 +173,6 @@ def _of_frame(frame: DataFrame, most: int) -> Sheet:
     if not cells:
         raise InputError("a frame without columns", "a column for each quantity", path=name)
     return Sheet(name, tuple(frame.columns), cells, None, None, ())
-
-
-def _raise_first(errors: Sequence[InputError]) -> None:
-    for error in errors:
-        raise error
 
 
 def _without_blanks(cells: list[str], least: int) -> list[str]:
@@ -240,7 +231,7 @@ def _check_header(names: list[str], example: str, path: str | PathLike[str], lin
 
 
 def _read_hdf5(path: str | PathLike[str], most: int) -> Sheet:
-    columns, comments, sha256 = hdf5_columns(path, most, min(most, MOST_WORDS))
+    columns, comments = hdf5_columns(path, most, min(most, MOST_WORDS))
     if not columns:
         raise InputError("no datasets", "one dataset a column", path=path)
     lengths = sorted(map(len, columns.values()))
@@ -250,4 +241,4 @@ def _read_hdf5(path: str | PathLike[str], most: int) -> Sheet:
         if len(column) != usual:
             expected = f"{usual}, as in '{like}': datasets of equal lengths"
             raise InputError(f"{len(column)} readings", expected, path=path, column=name)
-    return Sheet(path, tuple(columns), list(columns.values()), None, None, comments, sha256)
+    return Sheet(path, tuple(columns), list(columns.values()), None, None, comments, digest(path))

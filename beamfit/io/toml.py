@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import math
 import re
 import tomllib
@@ -12,7 +11,7 @@ from os import PathLike
 from typing import Any, NamedTuple
 
 from beamfit.errors import InputError, nearest
-from beamfit.io.files import read_text
+from beamfit.io.files import digest, read_text
 
 # Parts of a key between dots.
 DEEPEST = 20
@@ -241,14 +240,13 @@ def read_toml(path: str | PathLike[str], what: str) -> Section:
     >>> read_toml(file, "a lattice").values({"length_mm": Key("length", 1e-3)})
     {'length': 0.002}
     """
-    seen = hashlib.sha256()
-    text = read_text(path, seen)
+    text = read_text(path)
     lines = tuple(text.splitlines())
     try:
         if deep := DEEP.search(text):  # which takes tomllib minutes
             line = text.count("\n", 0, deep.start()) + 1
             raise ValueError(f"a key of more than {DEEPEST} parts (at line {line})")
-        return Section(path, lines, tomllib.loads(text), sha256=seen.hexdigest())
+        return Section(path, lines, tomllib.loads(text), sha256=digest(path))
     except (ValueError, RecursionError) as error:  # integers too long, nesting too deep
         if re.search(r"^[^#=\n]*\bsize_[xy]_", text, re.MULTILINE):
             expected = "the scan first and the lattice after --lattice; are they swapped?"

@@ -10,17 +10,10 @@ from pathlib import Path
 from typing import Any
 
 from beamfit.errors import InputError
+from beamfit.io import facts
 from beamfit.io.decay_record import read_lifetime_input
 from beamfit.io.emittance_gui import is_emittance_gui, read_emittance_gui
-from beamfit.io.facts import (
-    Fact,
-    of_formulation,
-    of_lattice,
-    of_record,
-    of_ring,
-    of_run,
-    of_scan,
-)
+from beamfit.io.facts import Fact
 from beamfit.io.files import digest
 from beamfit.io.line import FOREIGN, build_line, read_lattice
 from beamfit.io.measurement import read_quad_scan
@@ -68,13 +61,8 @@ class Understood:
     def to_json(self) -> dict[str, Any]:
         """Give one entry of ``results`` of ``beamfit check --json``."""
         contents = {fact.label.replace(" ", "_"): fact.value for fact in self.facts}
-        return {
-            "file": self.path,
-            "kind": self.kind,
-            "sha256": self.sha256,
-            "contents": contents,
-            "notes": list(self.notes),
-        }
+        said = {"file": self.path, "kind": self.kind, "sha256": self.sha256}
+        return said | {"contents": contents, "notes": list(self.notes)}
 
 
 def understand(
@@ -112,34 +100,33 @@ def understand(
     >>> found.kind, found.facts[0].words
     ('record', '27 over 8.81 h')
     """
-    kind = _kind(path)
+    kind, notes = _kind(path), ()
+    columns = {"ignore": ignore, "skip_bad": skip_bad}
     if kind == "scan":
         gui = read_emittance_gui(path) if is_emittance_gui(path) else None
-        content = (
-            read_quad_scan(path, ignore=ignore, skip_bad=skip_bad) if gui is None else gui.scan()
-        )
-        facts, notes = of_scan(content), (*content.notes, *_questions(content))
+        content = read_quad_scan(path, **columns) if gui is None else gui.scan()
+        told, notes = facts.of_scan(content), (*content.notes, *_questions(content))
         if gui is not None:
-            facts.append(Fact("size methods", ", ".join(gui.scans), list(gui.scans)))
+            told.append(Fact("size methods", ", ".join(gui.scans), list(gui.scans)))
     elif kind == "lattice":
         foreign = Path(path).suffix.lower() in FOREIGN
         content = read_lattice(path, use=use, energy=energy) if foreign else read_lattice(path)
-        facts, notes = of_lattice(content), ()
+        told = facts.of_lattice(content)
     elif kind == "record":
-        content = read_lifetime_input(path, ignore=ignore, skip_bad=skip_bad)
-        facts, notes = of_record(content), content.notes
+        content = read_lifetime_input(path, **columns)
+        told, notes = facts.of_record(content), content.notes
     elif kind == "run":
-        content = read_run(path, ignore=ignore, skip_bad=skip_bad)
-        facts, notes = of_run(content), content.notes
+        content = read_run(path, **columns)
+        told, notes = facts.of_run(content), content.notes
     elif kind == "formulation":
         from beamfit.io.formulation import read_formulation  # scipy
 
         content = read_formulation(path)
-        facts, notes = of_formulation(content), ()
+        told = facts.of_formulation(content)
     else:
         content = read_ring(path)
-        facts, notes = of_ring(path, content), ()
-    return Understood(str(path), kind, digest(path), tuple(facts), notes, content)
+        told = facts.of_ring(path, content)
+    return Understood(str(path), kind, digest(path), tuple(told), notes, content)
 
 
 def with_lattice(scan: Understood, lattice: Understood) -> Understood:

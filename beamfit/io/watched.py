@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from beamfit.errors import InputError, plain
-from beamfit.io.headers import spelled
+from beamfit.io.headers import known_unit
 from beamfit.io.machine import POSITIVE, read_machine
 from beamfit.io.record_columns import QUANTITIES
 from beamfit.io.sheet import UNITS
@@ -59,7 +59,7 @@ class Watched(NamedTuple):
         beamfit.errors.InputError: unit 'A' of 'SR:I'; expected mA, as in the machine file
         """
         known = UNITS_OF[self.quantity]
-        if not given or not self.unit or (found := spelled(f"x [{given}]")[2:]) == self.unit:
+        if not given or not self.unit or (found := known_unit(given)) == self.unit:
             return None
         if found in known and known[found] == self.factor:
             return None

@@ -158,7 +158,7 @@ def test_a_made_file_gives_the_beam_it_was_made_of(save):
 @pytest.mark.parametrize("compressed", [True, False])
 def test_both_ways_of_saving_and_what_scipy_reads(compressed, save):
     path = save(do_compression=compressed)
-    ours, theirs = read_variable(path, "data")[0], scipy.io.loadmat(path)["data"]
+    ours, theirs = read_variable(path, "data"), scipy.io.loadmat(path)["data"]
     assert ours.dtype.names == theirs.dtype.names
     for name in ("quadVal", "twiss", "energy", "status"):
         np.testing.assert_array_equal(ours[name][0, 0], theirs[name][0, 0])

@@ -73,7 +73,7 @@ def test_the_file_is_an_ordinary_scan_with_the_same_fit(done):
     path = folder / "scan.csv"
     path.write_text(texts[-1])
     assert len(texts) == len(found.points)  # written after every point
-    measured, described, _, _ = read_inputs(str(path), at.machine.lattice)
+    measured, described, _ = read_inputs(str(path), at.machine.lattice)
     fit = beamfit.fit_emittance(measured, build_line(described))
     for ours, theirs in zip(found.fit.planes, fit.planes, strict=True):
         assert theirs.emittance.value == pytest.approx(ours.emittance.value, rel=1e-6)
