@@ -119,7 +119,7 @@ def emittance(
         return
     fit = beamfit.fit_emittance(measured, line, **told)
     methods = () if gui is None else compared(gui, line, planes)
-    posterior = fit.sample(**sampling.arguments(inputs, quiet=as_json)) if sample else None
+    (posterior,) = sampling.drawn([fit], inputs, quiet=as_json)
     reported(report, fit, inputs, posterior=posterior, methods=methods)
     answered(
         as_json,

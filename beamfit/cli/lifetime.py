@@ -133,16 +133,15 @@ def lifetime(
     single = [decay for each in studies for decay in each.decays or each.pooled]
     shift = _shift(single, machine, network, priors) if study else None
     course = _trend(studies, machine) if trend else None
-    posteriors = None
-    if sample:
-        sampling.check_one(len(decays))
-        drawn = sampling.arguments(inputs, quiet=as_json)
-        posteriors = [decay.fit.sample(**drawn) for decay in decays]
+    drawn = sampling.drawn([decay.fit for decay in decays], inputs, quiet=as_json)
+    posteriors = drawn if sample else None
     reported(report, studies, inputs, posterior=posteriors, shift=shift, trend=course)
-    more = [{"posterior": each} for each in posteriors] if posteriors else [{}] * len(decays)
     answered(
         as_json,
-        (decay.to_json() | further for decay, further in zip(decays, more, strict=True)),
+        (
+            decay.to_json() | ({"posterior": posterior} if sample else {})
+            for decay, posterior in zip(decays, drawn, strict=True)
+        ),
         inputs,
         lambda terminal: _show(terminal, studies, posteriors, shift, course),
         report,

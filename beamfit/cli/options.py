@@ -20,6 +20,7 @@ from beamfit.writing import check_place
 
 if TYPE_CHECKING:
     from beamfit.cli.show import Terminal
+    from beamfit.sampling.posterior import Posterior
 
 
 def option(
@@ -218,23 +219,20 @@ class Sampling(NamedTuple):
                 raise InputError("--store without --sample", "--sample, which fills the store")
             check_place(self.store)
 
-    def check_one(self, fits: int) -> None:
-        """Refuse to keep the draws of several fits in one store."""
-        if self.store is not None and fits > 1:
-            found = f"--store for {fits} decays"
+    def drawn(
+        self, fits: Sequence[Any], inputs: Mapping[str, str | None], *, quiet: bool
+    ) -> list[Posterior | None]:
+        """The posterior of each fit; None of each where none is wanted."""
+        if not self.wanted:
+            return [None for _ in fits]
+        if self.store is not None and len(fits) > 1:
+            found = f"--store for {len(fits)} decays"
             raise InputError(found, "a record of one decay, or no --store")
-
-    def arguments(self, inputs: Mapping[str, str | None], *, quiet: bool) -> dict[str, Any]:
-        """Arguments for the `sample` of a fit."""
         from beamfit.sampling.store import Provenance
 
         source = Provenance(command_line(), dict(inputs))
-        return {
-            "seed": self.seed,
-            "store": self.store,
-            "provenance": source,
-            "progress": not quiet,
-        }
+        told = {"seed": self.seed, "store": self.store, "provenance": source}
+        return [fit.sample(**told, progress=not quiet) for fit in fits]
 
 
 def reported(

@@ -85,18 +85,7 @@ def decay_page(
         listed.append(labelled("A network of the losses", ["value"], tables.network_rows(shift)))
     listed += [] if trend is None else trend.tables()
     pooled = [decay for study in studies for decay in study.pooled]
-    listed += _side_by_side(pooled)
-    listed += _side_by_side(decays) if len(decays) <= tables.FEW else _one_below_another(decays)
-    if len(decays) <= tables.FEW:
-        listed += [
-            Table(
-                f"What no residual of {d.fit.record} shows",
-                tables.SYSTEMATIC,
-                tables.systematic_rows(d),
-            )
-            for d in decays
-            if d.systematics
-        ]
+    listed += _side_by_side(pooled) + _single(decays)
     header = ["what", "at", "for", "change"]
     listed += [
         Table(f"Cut at or left out of {study.record.name}", header, tables.event_rows(study))
@@ -138,12 +127,16 @@ def _side_by_side(decays: Sequence[Decay]) -> list[Table]:
     ]
 
 
-def _one_below_another(decays: Sequence[Decay]) -> list[Table]:
-    """The main numbers of many decays, one row each."""
-    return [
-        Table(title, header, rows, {"Result": ERRORS}.get(title, ""))
-        for title, header, rows in tables.overview(decays)
-    ]
+def _single(decays: Sequence[Decay]) -> list[Table]:
+    """Every number of a few decays; the main numbers of many, one row each."""
+    if len(decays) > tables.FEW:
+        many = tables.overview(decays)
+        return [Table(*each, note=ERRORS if each[0] == "Result" else "") for each in many]
+    listed = _side_by_side(decays)
+    for d in (d for d in decays if d.systematics):
+        title = f"What no residual of {d.fit.record} shows"
+        listed.append(Table(title, tables.SYSTEMATIC, tables.systematic_rows(d)))
+    return listed
 
 
 def _verdicts(decays: Sequence[Decay]) -> list[Verdict]:
