@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Iterator
+from itertools import chain
 from typing import NamedTuple
 
 import numpy as np
@@ -112,105 +113,68 @@ class Evidence(NamedTuple):
         return one_sided_probability(self.distance, self.rests_on)
 
 
-def _no_rank(e: Evidence) -> str | None:
-    if e.full_rank:
-        return None
-    return (
-        "the settings do not separate the three numbers of the beam matrix, as if the "
-        "scanned magnet were downstream of the screen or hardly moved"
-    )
-
-
-def _doubted(e: Evidence) -> str | None:
-    if not (e.robust and (e.dof < ROBUST_DOF or e.outliers > DOUBTED)):
-        return None
-    return (
-        f"the robust fit doubts {100 * e.outliers:.0f} % of the points and keeps {e.dof} "
-        "degrees of freedom, too few to tell outliers from noise; measure more settings"
-    )
-
-
-def _too_few(e: Evidence) -> str | None:
+def _no_beam(e: Evidence) -> Iterator[str]:
+    """Why the sizes tell nothing of a beam, gravest first."""
+    if not e.full_rank:
+        yield (
+            "the settings do not separate the three numbers of the beam matrix, as if the "
+            "scanned magnet were downstream of the screen or hardly moved"
+        )
+    if e.robust and (e.dof < ROBUST_DOF or e.outliers > DOUBTED):
+        yield (
+            f"the robust fit doubts {100 * e.outliers:.0f} % of the points and keeps {e.dof} "
+            "degrees of freedom, too few to tell outliers from noise; measure more settings"
+        )
     if not e.dof and (e.scanned or not e.noise_known):
-        return (
+        yield (
             "three points fit any three numbers exactly and leave nothing to judge them by; "
             "measure a fourth setting"
         )
     if e.dof == 1 and not e.noise_known:
-        return (
+        yield (
             "four points without errors leave one residual, which may be small by accident; "
             "measure a fifth setting or give the errors of the sizes"
         )
-    return None
-
-
-def _unanswered(e: Evidence) -> str | None:
-    if e.constant is None or e.constant < CONSTANT:
-        return None
-    return (
-        "the sizes do not answer the magnet, one size meets them all within their errors "
-        f"(probability {e.constant:.2g}); check that the magnet moved, that the screen shows the "
-        "beam, and scan further"
-    )
-
-
-def _lost(e: Evidence) -> str | None:
-    if not (e.misfit > LOST and (e.poor or not e.noise_known)):
-        return None
-    if e.influence.outlier:
-        return (
-            f"the sizes follow no beam with {e.influence.outlier}, and do without; measure again, "
-            "or fit with --robust"
+    if e.misfit > LOST and (e.poor or not e.noise_known):
+        outlier = e.influence.outlier
+        yield (
+            f"the sizes follow no beam with {outlier}, and do without; measure again, or fit with "
+            "--robust"
+            if outlier
+            else "the sizes follow no beam through this line, the best one misses them by "
+            f"{100 * e.misfit:.0f} % rms; check settings, units, energy and screen"
         )
-    return (
-        f"the sizes follow no beam through this line, the best one misses them by "
-        f"{100 * e.misfit:.0f} % rms; check settings, units, energy and screen"
-    )
+    if e.constant is not None and e.constant >= CONSTANT:
+        yield (
+            "the sizes do not answer the magnet, one size meets them all within their errors "
+            f"(probability {e.constant:.2g}); check that the magnet moved, that the screen shows "
+            "the beam, and scan further"
+        )
+    if e.swamped:
+        yield (
+            "resolution and dispersion alone are larger than a measured size; check "
+            "resolution_um and energy_spread"
+        )
 
 
-def _swamped(e: Evidence) -> str | None:
-    if not e.swamped:
-        return None
-    return (
-        "resolution and dispersion alone are larger than a measured size; check "
-        "resolution_um and energy_spread"
-    )
-
-
-def _not_positive(e: Evidence) -> str | None:
-    return None if e.positive else "no beam fits better than one of zero emittance" + _one_sided(e)
-
-
-def _near_zero(e: Evidence) -> str | None:
-    if e.distance >= CLEAR:
-        return None
-    return f"zero emittance lies only {e.distance:.1f} standard errors away" + _one_sided(e)
-
-
-def _extrapolated(e: Evidence) -> str | None:
-    if e.noise_known or e.bracketed is not False or e.distance >= EXTRAPOLATED:
-        return None
-    return (
-        f"zero emittance lies {e.distance:.1f} standard errors away by the scatter of sizes on one "
-        "side of the waist; scan over the waist, or give the errors of the sizes"
-    )
-
-
-def _by_chance(e: Evidence) -> str | None:
-    if not e.chance > CHANCE:
-        return None
-    return (
-        f"zero emittance lies {e.distance:.1f} standard errors away, but with errors that rest "
-        f"on {e.rests_on:.3g} degrees of freedom noise does that in {100 * e.chance:.2g} % of "
-        "scans; measure more settings"
-    )
-
-
-# What keeps sizes from determining an emittance, gravest first.
-CAUSES: tuple[Callable[[Evidence], str | None], ...] = (
-    _no_rank, _doubted, _too_few, _lost, _unanswered, _swamped, _not_positive, _near_zero,
-    _extrapolated, _by_chance,
-)  # fmt: skip
+def _perhaps_zero(e: Evidence) -> Iterator[str]:
+    """Why the emittance of the beam they tell of may be zero, gravest first."""
+    away = f"zero emittance lies {e.distance:.1f} standard errors away"
+    end = "; the smallest size is at the end of the scan" if e.smallest_at_end else ""
+    if not e.positive:
+        yield "no beam fits better than one of zero emittance" + end
+    if e.distance < CLEAR:
+        yield f"zero emittance lies only {e.distance:.1f} standard errors away{end}"
+    if not e.noise_known and e.bracketed is False and e.distance < EXTRAPOLATED:
+        yield (
+            f"{away} by the scatter of sizes on one side of the waist; scan over the waist, or "
+            "give the errors of the sizes"
+        )
+    if e.chance > CHANCE:
+        yield (
+            f"{away}, but with errors that rest on {e.rests_on:.3g} degrees of freedom noise does "
+            f"that in {100 * e.chance:.2g} % of scans; measure more settings"
+        )
 
 
 def cause_of(e: Evidence) -> str | None:
@@ -222,7 +186,7 @@ def cause_of(e: Evidence) -> str | None:
     >>> cause_of(good), cause_of(good._replace(zero_distance=3.5))
     (None, 'zero emittance lies only 3.5 standard errors away')
     """
-    return next((cause for rule in CAUSES if (cause := rule(e)) is not None), None)
+    return next(chain(_no_beam(e), _perhaps_zero(e)), None)
 
 
 def _undetermined(e: Evidence) -> Finding | None:
@@ -331,10 +295,6 @@ def few_words(rests_on: float) -> str:
         f"; errors rest on {rests_on:.3g} degrees of freedom: 95 % of answers lie within "
         f"{reach_of(rests_on):.1f} of them"
     )
-
-
-def _one_sided(e: Evidence) -> str:
-    return "; the smallest size is at the end of the scan" if e.smallest_at_end else ""
 
 
 def _number(value: float) -> str:
