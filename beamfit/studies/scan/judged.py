@@ -13,9 +13,8 @@ from beamfit.optics.beamline import Beamline
 from beamfit.quantity import Quantity
 from beamfit.statistics import reach_of, scaled_directions
 from beamfit.status import Status
-from beamfit.studies.scan.known import next_measurement
 from beamfit.studies.scan.model import QUANTITIES, coefficients, phase_coverage
-from beamfit.studies.scan.next_point import best_symmetric
+from beamfit.studies.scan.next_point import best_symmetric, next_measurement
 from beamfit.studies.scan.results import Identifiability, PlaneFit, Points, ScreenTwiss
 from beamfit.studies.scan.statement import Seen, asked_of
 from beamfit.studies.scan.transport import own_settings, own_units

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from functools import partial
+from types import MappingProxyType
 from typing import NamedTuple
 
 import jax
@@ -12,17 +14,10 @@ import numpy as np
 from beamfit.greybox.problem import Problem
 from beamfit.optics.beamline import Beamline
 from beamfit.optics.calibration import SETTING_UNITS
-from beamfit.optics.rows import transfer_rows
 from beamfit.statistics import chi2_probability
 from beamfit.studies.scan.assumptions import Assumptions
-from beamfit.studies.scan.model import coefficients, size_squared
+from beamfit.studies.scan.model import size_squared
 from beamfit.studies.scan.names import check_names
-from beamfit.studies.scan.next_point import (
-    best_candidate,
-    best_symmetric,
-    candidate_settings,
-    plausible_sigma,
-)
 from beamfit.studies.scan.noise import (
     ENOUGH_POINTS,
     Noise,
@@ -52,7 +47,7 @@ from beamfit.studies.scan.transport import (
     scan_rows,
     scanned_line,
 )
-from beamfit.studies.scan.verdict import LOST, Evidence, one_magnet, waist_bracketed
+from beamfit.studies.scan.verdict import Evidence, one_magnet, waist_bracketed
 
 # The residual: the report's ``error_linear`` or ``error_nonlinear``.
 METHODS = ("size_squared", "size")
@@ -90,13 +85,13 @@ def see(
     """
     seen = unfitted(scan, line, planes, method, robust, weights)
     # Noise that is inferred is fitted in two ways, by the same program.
-    if robust or not at_once or not all(noise.known for noise in seen.noises.values()):
-        look = jax.tree.map(np.asarray, look_through(seen.rows))
-        seen = seen._replace(look=look, works=works_of(seen, look, tuple(seen.noises)))
-        other = of_other_kind(seen)
-        return likelier(seen, works_of(other, look, tuple(other.noises)) if other else {})
-    look, found = _look_and_fit(seen.rows, sizes_of(seen), method, weights)
-    return fitted(seen._replace(look=jax.tree.map(np.asarray, look)), found)
+    if at_once and not robust and all(noise.known for noise in seen.noises.values()):
+        look, found = _look_and_fit(seen.rows, sizes_of(seen), method, weights)
+        return fitted(seen._replace(look=jax.tree.map(np.asarray, look)), found)
+    look = jax.tree.map(np.asarray, look_through(seen.rows))
+    seen = in_closed_form(seen._replace(look=look))
+    other = of_other_kind(seen)
+    return likelier(seen, in_closed_form(other)) if other else seen
 
 
 def unfitted(
@@ -120,10 +115,25 @@ def unfitted(
     return Seen(scan, line, scanned, asked, method, robust, weights, rows, noises, None, {})
 
 
-def fitted(seen: Seen, found: ClosedForm) -> Seen:
+def in_closed_form(seen: Seen) -> Seen:
+    """Fit every plane that has a noise, given what is seen of it."""
+    doubts = {plane: _doubt(seen, plane) for plane in seen.noises} if seen.robust else {}
+    sizes = sizes_of(seen, {plane: doubt.error for plane, doubt in doubts.items()})
+    return fitted(seen, fit_look(seen.look, sizes, seen.method, seen.weights), doubts)
+
+
+def _doubt(seen: Seen, plane: str) -> RobustFit:
+    at, i = seen.measured(plane), "xy".index(plane)
+    r11, r12, known = (part[i, at] for part in seen.look[:3])
+    return fit_robust(r11, r12, seen.scan.size[plane][at], seen.noises[plane], known, seen.weights)
+
+
+def fitted(
+    seen: Seen, found: ClosedForm, doubts: Mapping[str, RobustFit] = MappingProxyType({})
+) -> Seen:
     """The same with the closed form of every plane that has a noise, in their order."""
     found = jax.tree.map(np.asarray, found)
-    works = {p: _work(seen, p, seen.look, found, i) for i, p in enumerate(seen.noises)}
+    works = {p: _work(seen, p, found, i, doubts.get(p)) for i, p in enumerate(seen.noises)}
     return seen._replace(works=works)
 
 
@@ -138,37 +148,22 @@ def of_other_kind(seen: Seen) -> Seen | None:
     return seen._replace(noises=noises, works={}) if planes else None
 
 
-def likelier(seen: Seen, others: dict[str, Work]) -> Seen:
+def likelier(seen: Seen, other: Seen) -> Seen:
     """Take of the two kinds of noise the likelier."""
-    better = [p for p in others if _unlikely(others[p], 0.0) < _unlikely(seen.works[p], 1.0)]
-    noises = {p: constant_noise(seen.works[p].points.size) for p in better}
-    works = {p: others[p] for p in better}
+    better = [p for p in other.works if _unlikely(other, p) < _unlikely(seen, p)]
+    noises = {p: other.noises[p] for p in better}
+    works = {p: other.works[p] for p in better}
     return seen._replace(noises=seen.noises | noises, works=seen.works | works)
 
 
-def _unlikely(work: Work, relative: float) -> float:
+def _unlikely(seen: Seen, plane: str) -> float:
     """How unlikely the sizes are by a fit, points that it doubts left out."""
-    p = work.points
+    p = seen.works[plane].points
     kept = np.ones(len(p.size), bool)
     if p.outlier_probability is not None:
         kept = p.outlier_probability < 0.5
-    shape = p.weighed**relative
+    shape = p.weighed ** seen.noises[plane].relative
     return unlikely((p.size - p.model)[kept], shape[kept])
-
-
-def works_of(seen: Seen, look: Look, planes: tuple[str, ...]) -> dict[str, Work]:
-    """Fit planes in closed form, given what is seen of them."""
-    doubts = {plane: _doubt(seen, look, plane) if seen.robust else None for plane in planes}
-    errors = {p: seen.noises[p].error if d is None else d.error for p, d in doubts.items()}
-    sizes = sizes_of(seen, errors)
-    found = jax.tree.map(np.asarray, fit_look(look, sizes, seen.method, seen.weights))
-    return {p: _work(seen, p, look, found, i, doubts[p]) for i, p in enumerate(planes)}
-
-
-def _doubt(seen: Seen, look: Look, plane: str) -> RobustFit:
-    at, i = seen.measured(plane), "xy".index(plane)
-    r11, r12, known = (part[i, at] for part in look[:3])
-    return fit_robust(r11, r12, seen.scan.size[plane][at], seen.noises[plane], known, seen.weights)
 
 
 class _Sizes(NamedTuple):
@@ -182,10 +177,8 @@ class _Sizes(NamedTuple):
     design: np.ndarray
 
 
-def sizes_of(seen: Seen, errors: dict[str, np.ndarray] | None = None) -> _Sizes:
-    """The planes that have an error; that of their noise unless given."""
-    if errors is None:
-        errors = {plane: noise.error for plane, noise in seen.noises.items()}
+def sizes_of(seen: Seen, errors: Mapping[str, np.ndarray] = MappingProxyType({})) -> _Sizes:
+    """The planes that have a noise, with its errors unless others are given."""
     shape = (2, len(seen.rows.energy))
     found = _Sizes(
         np.zeros(2, int),
@@ -195,12 +188,13 @@ def sizes_of(seen: Seen, errors: dict[str, np.ndarray] | None = None) -> _Sizes:
         np.ones(2),
         np.ones((2, 2)),
     )
-    for i, (plane, error) in enumerate(errors.items()):
+    for i, (plane, noise) in enumerate(seen.noises.items()):
         own, at, asked = slice(i, None), seen.measured(plane), asked_of(seen, plane)
         found.which[own] = "xy".index(plane)
-        found.size[own, at], found.error[own, at] = seen.scan.size[plane][at], error
+        found.size[own, at] = seen.scan.size[plane][at]
+        found.error[own, at] = errors.get(plane, noise.error)
         found.error[own, len(seen.scan) :] = np.inf
-        found.relative[own] = seen.noises[plane].relative
+        found.relative[own] = noise.relative
         found.factor[own], found.design[own] = asked.factor, asked.design
     return found
 
@@ -219,15 +213,13 @@ def _look_and_fit(rows: Rows, sizes: _Sizes, method: str, weights: str) -> tuple
     return look, fit_look(look, sizes, method, weights)
 
 
-def _work(
-    seen: Seen, plane: str, look: Look, found: ClosedForm, i: int, doubt: RobustFit | None = None
-) -> Work:
+def _work(seen: Seen, plane: str, found: ClosedForm, i: int, doubt: RobustFit | None) -> Work:
     scan, at, noise = seen.scan, seen.measured(plane), seen.noises[plane]
     fit = SigmaFit(*(part[i] for part in found.fit))
     probability = None if doubt is None else doubt.outlier_probability
     lost = 0 if doubt is None else int(np.sum(probability > 0.5))
     size = scan.size[plane][at]
-    r11, r12, known = (part["xy".index(plane), at] for part in look[:3])
+    r11, r12, known = (part["xy".index(plane), at] for part in seen.look[:3])
     dof = max(len(size) - lost - 3, 0)
     unit, chi2 = 1.0, float(fit.chi2)
     if not noise.known:
@@ -307,54 +299,6 @@ def _constant(p: Points, noise: Noise) -> float:
     off = float(weight @ (p.size - mean) ** 2)
     dof = len(p.size) - 1
     return chi2_probability(off, dof, math.inf if noise.known else noise.dof + dof - 2)
-
-
-def next_measurement(seen: Seen, plane: str) -> str | None:
-    """Say which further setting would help most, if one can be named."""
-    work = seen.works[plane]
-    e, p = work.evidence, work.points
-    nothing_to_build_on = e.misfit > LOST or e.swamped or not e.full_rank
-    if seen.scan.transfer or nothing_to_build_on or not np.isfinite(work.covariance).all():
-        return None
-    covariance = work.covariance * work.scale**2
-    start = work.fit.sigma if e.positive else best_symmetric(p)
-    sigma = plausible_sigma(start, covariance)
-    if sigma is None:
-        return None
-    rows, screen = [], seen.rows.places[-1]
-    for name, table in candidate_settings(p.settings):
-        energy = np.full(len(table[name]), seen.energy)
-        matrices = transfer_rows(seen.scanned, table, energy, places=(screen,))
-        r = np.asarray(matrices.planes)[:, :, 0]
-        usable = _no_larger(seen, r, {plane: sigma})
-        own = np.stack(coefficients(*r[usable, "xy".index(plane), 0, :2].T), -1)
-        if usable.any():
-            rows.append((name, table[name][usable], own))
-    relative = max(float(np.median(p.error / p.size)) * work.scale, 1e-3)
-    found = best_candidate(sigma, covariance, relative, rows)
-    if found is None:
-        return None
-    values = p.settings[found.magnet]
-    inside = values.min() <= found.setting <= values.max()
-    held = [
-        f"{n} = {np.median(v):.3g} {p.units[n]}" for n, v in p.settings.items() if n != found.magnet
-    ]
-    others = f", with {', '.join(held)} at {screen}" if held else ""
-    return (
-        f"Measure next near {found.magnet} = {found.setting:.3g} {p.units[found.magnet]}, "
-        f"{'inside' if inside else 'beyond'} the scanned range{others}: of single points it would "
-        "sharpen the emittance most; then judge again."
-    )
-
-
-def _no_larger(seen: Seen, r: np.ndarray, sigmas: dict[str, np.ndarray]) -> np.ndarray:
-    """Settings at which no plane's size exceeds those that were measured: screens have edges."""
-    sigmas = {p: w.fit.sigma for p, w in seen.works.items() if w.evidence.positive} | sigmas
-    usable = np.ones(len(r), bool)
-    for plane, sigma in sigmas.items():
-        a, b = r[:, "xy".index(plane), 0, :2].T
-        usable &= size_squared(sigma, a, b) <= np.nanmax(seen.scan.size[plane]) ** 2
-    return usable
 
 
 def _state(seen: Seen, told: Assumptions) -> Problem:

@@ -81,7 +81,7 @@ def _fitted(begun: Sequence[Seen], weights: str) -> list[Seen]:
     seen = fit(seen)
     others = {i: other for i, s in enumerate(seen) if (other := of_other_kind(s))}
     for i, other in zip(others, fit(list(others.values())), strict=True):
-        seen[i] = likelier(seen[i], other.works)
+        seen[i] = likelier(seen[i], other)
     return seen
 
 

@@ -3,25 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import NamedTuple
 
 import numpy as np
 
 from beamfit.greybox.design import Information, rows_of, scores
+from beamfit.optics.rows import transfer_rows
+from beamfit.studies.scan.model import coefficients, size_squared
 from beamfit.studies.scan.results import Points
+from beamfit.studies.scan.statement import Seen
+from beamfit.studies.scan.verdict import LOST
 
 # Candidates reach half the scanned range beyond either end.
 REACH, COUNT = 0.5, 41
 # A setting below this share of the range is the rounding of zero.
 ROUNDING = 1e-9
-
-
-class Candidate(NamedTuple):
-    """A setting worth measuring, and the relative emittance error expected with it."""
-
-    magnet: str
-    setting: float
-    relative_error: float
 
 
 def candidate_settings(
@@ -93,46 +88,59 @@ def plausible_sigma(sigma: np.ndarray, covariance: np.ndarray) -> np.ndarray | N
     return moved if good else None
 
 
-def best_candidate(
-    sigma: np.ndarray,
-    covariance: np.ndarray,
-    relative: float,
-    rows: list[tuple[str, np.ndarray, np.ndarray]],
-) -> Candidate | None:
-    """Choose the setting that leaves the smallest emittance error.
-
-    Parameters
-    ----------
-    sigma : ndarray
-        Shape (3,), a positive definite beam near the fit.
-    covariance : ndarray
-        Shape (3, 3), of the scan so far, scaled.
-    relative : float
-        Relative size error a further point would have.
-    rows : list of (str, ndarray, ndarray)
-        Magnet, its candidate settings (m,), and the rows (R11², 2 R11 R12, R12²) (m, 3).
-
-    Returns
-    -------
-    Candidate or None
-            None without a candidate.
-
-    Examples
-    --------
-    >>> rows = [("Q", np.array([0.0, 1.0]), np.array([[1.0, 0, 0], [0, 0, 1.0]]))]
-    >>> best_candidate(np.array([1.0, 0, 1.0]), np.diag([1e-4, 1e-4, 1.0]), 0.02, rows).setting
-    1.0
-    """
-    emittance = np.sqrt(sigma[0] * sigma[2] - sigma[1] ** 2)
-    gradient = np.array([[sigma[2], -2.0 * sigma[1], sigma[0]]]) / (2.0 * emittance)
-    free = np.full(3, np.inf)
-    known = Information(
-        rows_of(covariance), np.array([emittance]), gradient, np.ones(3, bool), -free, free
+def next_measurement(seen: Seen, plane: str) -> str | None:
+    """Say which further setting would help most, if one can be named."""
+    work = seen.works[plane]
+    e, p = work.evidence, work.points
+    nothing_to_build_on = e.misfit > LOST or e.swamped or not e.full_rank
+    if seen.scan.transfer or nothing_to_build_on or not np.isfinite(work.covariance).all():
+        return None
+    covariance = work.covariance * work.scale**2
+    sigma = plausible_sigma(work.fit.sigma if e.positive else best_symmetric(p), covariance)
+    if sigma is None:
+        return None
+    relative = max(float(np.median(p.error / p.size)) * work.scale, 1e-3)
+    known, tried = _known(sigma, covariance), []
+    for name, table in candidate_settings(p.settings):
+        usable, r11, r12 = _usable(seen, plane, sigma, table)
+        rows = np.stack(coefficients(r11, r12), -1)
+        rows /= 2.0 * relative * np.maximum(size_squared(sigma, r11, r12), 1e-30)[:, None]
+        after = scores(known, rows[:, None, :])
+        tried += [(error, name, at) for error, at in zip(after, table[name][usable], strict=True)]
+    if not tried:
+        return None
+    _, magnet, setting = min(tried, key=lambda each: each[0])
+    values = p.settings[magnet]
+    inside = values.min() <= setting <= values.max()
+    held = [f"{n} = {np.median(v):.3g} {p.units[n]}" for n, v in p.settings.items() if n != magnet]
+    others = f", with {', '.join(held)} at {seen.rows.places[-1]}" if held else ""
+    return (
+        f"Measure next near {magnet} = {setting:.3g} {p.units[magnet]}, "
+        f"{'inside' if inside else 'beyond'} the scanned range{others}: of single points it would "
+        "sharpen the emittance most; then judge again."
     )
-    found = []
-    for name, settings, design in rows:
-        squared = np.maximum(design @ sigma, 1e-30)
-        errors = scores(known, (design / (2.0 * relative * squared)[:, None])[:, None, :])
-        best = int(np.argmin(errors))
-        found.append(Candidate(name, float(settings[best]), float(errors[best])))
-    return min(found, key=lambda c: c.relative_error, default=None)
+
+
+def _known(sigma: np.ndarray, covariance: np.ndarray) -> Information:
+    """What is known of the emittance of a beam."""
+    emittance = np.sqrt(sigma[0] * sigma[2] - sigma[1] ** 2)
+    slope = np.array([[sigma[2], -2.0 * sigma[1], sigma[0]]]) / (2.0 * emittance)
+    free = np.full(3, np.inf)
+    value, asked = np.array([emittance]), np.ones(3, bool)
+    return Information(rows_of(covariance), value, slope, asked, -free, free)
+
+
+def _usable(
+    seen: Seen, plane: str, sigma: np.ndarray, table: Mapping[str, np.ndarray]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Settings at which no plane's size exceeds those measured (screens have edges); R11, R12."""
+    energy = np.full(COUNT, seen.energy)
+    matrices = transfer_rows(seen.scanned, table, energy, places=seen.rows.places[-1:])
+    r11, r12 = np.moveaxis(np.asarray(matrices.planes)[:, :, 0, 0, :2], -1, 0)
+    sigmas = {p: w.fit.sigma for p, w in seen.works.items() if w.evidence.positive}
+    usable = np.ones(COUNT, bool)
+    for each, beam in (sigmas | {plane: sigma}).items():
+        i, largest = "xy".index(each), np.nanmax(seen.scan.size[each])
+        usable &= size_squared(beam, r11[:, i], r12[:, i]) <= largest**2
+    own = usable, "xy".index(plane)
+    return usable, r11[own], r12[own]

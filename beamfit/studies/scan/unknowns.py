@@ -22,7 +22,7 @@ from beamfit.statistics import POOR_FIT
 from beamfit.status import Status
 from beamfit.studies.scan.assumptions import Anchor, Assumptions
 from beamfit.studies.scan.judged import SIGMA, Answer, plane_fit, units_of
-from beamfit.studies.scan.known import pulls, works_of
+from beamfit.studies.scan.known import in_closed_form, pulls
 from beamfit.studies.scan.model import (
     QUANTITIES,
     Asked,
@@ -193,8 +193,9 @@ def _through(seen: Seen, fit: Fit) -> Found:
         for i in range(3):
             look[i] = look[i].copy()
             look[i]["xy".index(plane)] = found[i]
-    works = works_of(seen, Look(*look), seen.planes)
-    return Found(fit, seen._replace(works={**seen.works, **works}), elements)
+    noises = {plane: seen.noises[plane] for plane in seen.planes}
+    again = in_closed_form(seen._replace(look=Look(*look), noises=noises))
+    return Found(fit, seen._replace(works=seen.works | again.works), elements)
 
 
 def _size_records(seen: Seen, fit: Fit) -> list[Record]:
