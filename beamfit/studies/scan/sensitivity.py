@@ -7,11 +7,10 @@ each number of the line; the range table refits without some points.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterator
 from dataclasses import replace
-from functools import partial
-from itertools import groupby
-from typing import NamedTuple
+from itertools import islice
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -128,18 +127,17 @@ def systematics(fit: EmittanceFit, plane: str) -> list[Change]:
     follows = fit.seen.weights == WEIGHTS[0]
     noise = _Weighing(weighed, sharp, np.array(p.relative), np.array(float(follows)))
     sigma = np.array([q.value for q in result.sigma])
-    held = (*rows.settings, *rows.places)
-    stored = replace(rows, line=fit.seen.scanned.stored_by_kind(held))
-    magnets = tuple(rows.settings)
-    by_change, by_parts, by_known = _changes(
-        stored, np.array(plane == "y"), sigma, size, noise, magnets=magnets
-    )
-    *by_magnet, by_energy = np.asarray(by_change)
-    changes = {
-        f"{n} {_word(fit.seen.scanned, n)} +1 %" + _held(fit, n): 0.01 * float(d)
-        for n, d in zip(magnets, by_magnet, strict=True)
-    }
-    changes |= _of_parts(fit, result.screen.name, held, stored.line, by_parts)
+    line = fit.seen.scanned.stored_by_kind((*rows.settings, *rows.places))
+    # By a whole number there is no slope.
+    line = jax.tree.map(lambda v: v if np.ndim(v) else float(v), line)
+    upright = np.array(plane == "y")
+    by_line, by_energy, by_known = _slopes(replace(rows, line=line), upright, sigma, size, noise)
+    changes = {_magnet_cause(fit, name): 0.0 for name in rows.settings}
+    upstream = {e.name for e in fit.seen.scanned.upto(result.screen.name).elements}
+    for element, slope in _by_element(fit.seen.scanned, line, by_line):
+        cause, step = _cause(fit, element)
+        if cause and (cause in changes or element.name in upstream):
+            changes[cause] = changes.get(cause, 0.0) + step * float(slope)
     changes["energy +1 %"] = 0.01 * float(by_energy)
     changes |= _of_screen(fit, p, np.asarray(by_known)[keep])
     # ln βγ rises by E²/(E² - m²) for each relative step of the energy.
@@ -151,31 +149,38 @@ def systematics(fit: EmittanceFit, plane: str) -> list[Change]:
     return sorted(found, key=lambda change: -abs(change.normalized_emittance))
 
 
-def _held(fit: EmittanceFit, magnet: str) -> str:
-    return "" if magnet in varied_magnets(fit.scan) else ", not scanned"
-
-
-def _of_parts(
-    fit: EmittanceFit, screen: str, held: Iterable[str], stored: Beamline, by_parts: list[Array]
-) -> dict[str, float]:
-    """Changes by the elements that no row sets, those up to the last screen."""
-    held, found = frozenset(m for name in held for m in fit.seen.scanned.members(name)), {}
-    upstream = {e.name for e in fit.seen.scanned.upto(screen).elements}
-    left, runs = iter(by_parts), (e for e in stored.elements if isinstance(e, Series))
-    for kept, run in groupby(fit.seen.scanned.elements, lambda e: e.name in held):
-        elements = [] if kept else [e for e in run if not isinstance(e, Marker | Screen)]
-        if not elements:
+def _by_element(
+    line: Beamline, stored: Beamline, by_line: Beamline
+) -> Iterator[tuple[Element, float]]:
+    """Each element of a line with the slope by its small change, from those by all numbers."""
+    left = (e for e in line.elements if not isinstance(e, Marker | Screen))
+    for part, by_part in zip(stored.elements, by_line.elements, strict=True):
+        if isinstance(part, Marker | Screen):
             continue
-        series = next(runs)
+        kinds, by_kinds, order = (part,), (by_part,), np.zeros(1, int)
+        if isinstance(part, Series):
+            kinds, by_kinds, order = part.kinds, by_part.kinds, part.order
         # An element stands at `order` among those of all kinds, counted kind after kind.
-        by_kind = np.empty(len(elements), object)
-        by_kind[np.asarray(series.order)] = elements
-        slopes = [np.atleast_1d(np.asarray(next(left))) for _ in series.kinds]
-        for element, slope in zip(by_kind, np.concatenate(slopes), strict=True):
-            cause, step = _cause(fit, element)
-            if cause and element.name in upstream:
-                found[cause] = found.get(cause, 0.0) + step * float(slope)
-    return found
+        elements = np.empty(len(order), object)
+        elements[order] = list(islice(left, len(order)))
+        slopes = map(_of_kind, kinds, by_kinds)
+        yield from zip(elements, np.concatenate(list(slopes)), strict=True)
+
+
+def _of_kind(kind: Element, by_kind: Element) -> np.ndarray:
+    """Slopes by small changes of the elements of a kind: those of `_cause`, all linear."""
+    changed = kind
+    if isinstance(kind, Drift):
+        changed = replace(kind, length=kind.length + 1.0)
+    elif isinstance(kind, SectorDipole):
+        changed = replace(kind, angle=2.0 * kind.angle)
+    elif isinstance(kind, Quadrupole | ThinLens):
+        changed = replace(kind, calibration=scaled(kind.calibration, 2.0))
+    if changed is kind:
+        return np.zeros(1)
+    moved = jax.tree.map(np.subtract, changed, kind)
+    parts = zip(jax.tree.leaves(moved), jax.tree.leaves(by_kind), strict=True)
+    return np.atleast_1d(sum(np.asarray(by) * d for d, by in parts))
 
 
 def _cause(fit: EmittanceFit, element: Element) -> tuple[str, float]:
@@ -185,11 +190,18 @@ def _cause(fit: EmittanceFit, element: Element) -> tuple[str, float]:
     if isinstance(element, SectorDipole):
         return f"bend {element.name} angle +1 %", 0.01
     if isinstance(element, Quadrupole | ThinLens):
-        word, line = _word(fit.seen.scanned, element.name), fit.seen.scanned
         # What a supply does to its magnets is one cause.
-        name = next((s for s, members in line.supplies if element.name in members), element.name)
-        return f"{name} {word} +1 %, not scanned", 0.01
+        supplies = fit.seen.scanned.supplies
+        name = next((s for s, members in supplies if element.name in members), element.name)
+        return _magnet_cause(fit, name), 0.01
     return "", 0.0
+
+
+def _magnet_cause(fit: EmittanceFit, name: str) -> str:
+    calibration = fit.seen.scanned[name].calibration
+    word = "gradient" if calibration.unit in ("A", "kG", "T_per_m") else "strength"
+    word = "slope" if isinstance(calibration, SlopeIntercept) else word
+    return f"{name} {word} +1 %" + ", not scanned" * (name not in varied_magnets(fit.scan))
 
 
 def _of_screen(fit: EmittanceFit, p: Points, by_known: np.ndarray) -> dict[str, float]:
@@ -207,13 +219,6 @@ def _of_screen(fit: EmittanceFit, p: Points, by_known: np.ndarray) -> dict[str, 
     }
 
 
-def _word(line: Beamline, magnet: str) -> str:
-    calibration = line[magnet].calibration
-    if isinstance(calibration, SlopeIntercept):
-        return "slope"
-    return "gradient" if calibration.unit in ("A", "kG", "T_per_m") else "strength"
-
-
 class _Weighing(NamedTuple):
     """Sizes that weights are taken at, 1/error there, and whether each follows the model's size."""
 
@@ -223,9 +228,11 @@ class _Weighing(NamedTuple):
     follows: Array
 
 
-@partial(jax.jit, static_argnames="magnets")
-def _changes(rows: Rows, upright: Array, sigma: Array, size: Array, noise: _Weighing, *, magnets):
-    """Derivatives of ln ε of the fit by strengths and ln E, by parts, and by known size².
+@jax.jit
+def _slopes(
+    rows: Rows, upright: Array, sigma: Array, size: Array, noise: _Weighing
+) -> tuple[Beamline, Array, Array]:
+    """Derivatives of ln ε of the fit by all numbers of the line, by ln E, and by known size².
 
     At the answer the weighted residuals F(σ, rows) = Σ w ∂m²/∂σ (m² - size²) vanish, so dσ =
     -(∂F/∂σ)⁻¹ ∂F/∂rows: exact for either residual, without differentiating the solver, weights
@@ -234,16 +241,10 @@ def _changes(rows: Rows, upright: Array, sigma: Array, size: Array, noise: _Weig
     """
     unit = jnp.abs(sigma)
 
-    def elements(change: Array, parts: list[Array], more: Array) -> tuple[Array, ...]:
-        moved = _with_parts(rows.line, parts)
-        for i, name in enumerate(magnets):
-            for member in moved.members(name):
-                element = moved[member]
-                strength = scaled(element.calibration, 1.0 + change[i])
-                moved = moved.with_element(replace(element, calibration=strength))
-        energy = rows.energy * (1.0 + change[-1])
+    def elements(line: Beamline, factor: Array, more: Array) -> tuple[Array, ...]:
+        moved = replace(rows, line=line, energy=rows.energy * factor)
         # Both planes in one program, which is compiled once.
-        both = (replace(rows, line=moved, energy=energy, plane=p).elements({}) for p in "xy")
+        both = (replace(moved, plane=p).elements({}) for p in "xy")
         r11, r12, known = (jnp.where(upright, y, x) for x, y in zip(*both, strict=True))
         return r11, r12, known + more
 
@@ -258,40 +259,14 @@ def _changes(rows: Rows, upright: Array, sigma: Array, size: Array, noise: _Weig
         grown = error_at(at, noise.weighed, 1.0, noise.relative)
         return back((squared - size**2) * (noise.sharp / (at * grown)) ** 2)[0]
 
-    series = [s for s in rows.line.elements if isinstance(s, Series)]
-    parts = [jnp.zeros(_count(k)) for s in series for k in s.kinds]
-    none, here = jnp.zeros(len(magnets) + 1), sigma / unit
-    seen, back = jax.vjp(elements, none, parts, jnp.zeros(len(size)))
+    here, given = sigma / unit, (rows.line, jnp.ones(()), jnp.zeros(len(size)))
     by_sigma = jax.grad(lambda s: jnp.log(emittance_parts(s * unit)[0]))(here)
-    weights = jnp.linalg.solve(jax.jacfwd(slope)(here, seen), by_sigma)
-    return back(jax.grad(lambda seen: -weights @ slope(here, seen))(seen))
+    weights = jnp.linalg.solve(jax.jacfwd(slope)(here, elements(*given)), by_sigma)
 
+    def moved_emittance(*given: Any) -> Array:
+        return -weights @ slope(here, elements(*given))
 
-def _count(kind: Element) -> int:
-    """Elements of a kind that are stored together."""
-    return max((np.shape(v)[0] for v in jax.tree.leaves(kind) if np.ndim(v)), default=1)
-
-
-def _with_parts(line: Beamline, parts: list[Array]) -> Beamline:
-    """A line stored by kind with small changes of the numbers of `_cause`."""
-    left = iter(parts)
-    elements = []
-    for part in line.elements:
-        if isinstance(part, Series):
-            kinds = tuple(_changed(kind, next(left)) for kind in part.kinds)
-            part = replace(part, kinds=kinds)
-        elements.append(part)
-    return replace(line, elements=tuple(elements))
-
-
-def _changed(kind: Element, change: Array) -> Element:
-    if isinstance(kind, Drift):
-        return replace(kind, length=kind.length + change)
-    if isinstance(kind, SectorDipole):
-        return replace(kind, angle=kind.angle * (1.0 + change))
-    if isinstance(kind, Quadrupole | ThinLens):
-        return replace(kind, calibration=scaled(kind.calibration, 1.0 + change))
-    return kind
+    return jax.grad(moved_emittance, (0, 1, 2), allow_int=True)(*given)
 
 
 def range_sensitivity(plane: PlaneFit) -> list[RangeRow]:
