@@ -199,7 +199,7 @@ def show(
             terminal.table(Table("", [head, *names], cells), wrap=False)
             terminal.line()
     elif fit.parameters:
-        cells = [[name, *found] for name, found in parameter_rows(fit.parameters)]
+        cells = parameter_rows(fit.parameters)
         terminal.table(Table("", ["Fitted too", "value", "bounds", "prior", "state"], cells))
     for words in fit.null_directions:
         terminal.line(f"Left open: {words}.")

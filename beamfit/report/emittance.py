@@ -16,13 +16,9 @@ from beamfit.report.scan_pictures import (
     has_ellipses,
     words_of,
 )
+from beamfit.report.scan_tables import identifiability_rows, point_rows
 from beamfit.studies.scan.fit import EmittanceFit
-from beamfit.studies.scan.results import (
-    identifiability_rows,
-    parameter_rows,
-    point_rows,
-    result_rows,
-)
+from beamfit.studies.scan.results import parameter_rows, result_rows
 from beamfit.studies.scan.scans import QuadScan
 from beamfit.studies.scan.sensitivity import budget_rows, range_rows
 from beamfit.studies.scan.size_methods import SizeMethods
@@ -107,8 +103,7 @@ def _budgets(fit: EmittanceFit, names: list[str]) -> list[Table]:
 def _fitted_too(fit: EmittanceFit) -> list[Table]:
     """What a scenario fitted besides the beam, and what the data leave open."""
     header, parts = ["fitted too", "value", "bounds", "prior", "state"], []
-    rows = [[name, *cells] for name, cells in parameter_rows(fit.parameters)]
-    if rows:
+    if rows := parameter_rows(fit.parameters):
         # What ties a network to the lattice; a calibration has priors instead.
         anchor = f"Anchor: {fit.anchor}." if fit.statement.network else ""
         parts.append(Table(f"Scenario {fit.scenario}", header, rows, anchor))

@@ -10,8 +10,9 @@ from matplotlib.figure import FigureBase
 from beamfit.report.document import Page, Picture, Verdict
 from beamfit.report.emittance import ERRORS, about_input, about_scan
 from beamfit.report.scan_pictures import COLOUR, draw_scan, words_of
+from beamfit.report.scan_tables import identifiability_rows, point_rows
 from beamfit.status import Status
-from beamfit.studies.scan.results import identifiability_rows, point_rows, result_rows
+from beamfit.studies.scan.results import result_rows
 from beamfit.studies.scan.scans import PROJECTED
 from beamfit.studies.scan.slices import SliceFits
 from beamfit.table import Table, labelled

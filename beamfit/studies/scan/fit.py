@@ -6,7 +6,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from html import escape
-from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from beamfit.errors import InputError
@@ -15,17 +14,15 @@ from beamfit.greybox.problem import Problem
 from beamfit.optics.beamline import Beamline
 from beamfit.quantity import Quantity
 from beamfit.shown import shown
-from beamfit.status import Status
-from beamfit.studies.scan.assumptions import SCENARIOS, Anchor, Assumptions
+from beamfit.studies.scan.assumptions import Anchor, Assumptions
 from beamfit.studies.scan.judged import judged_beam
-from beamfit.studies.scan.known import METHODS, WEIGHTS, see
+from beamfit.studies.scan.known import METHODS, WEIGHTS, prepared, see
 from beamfit.studies.scan.model import line_of
 from beamfit.studies.scan.predicted import Prediction, correlations_of, predicted_sizes
 from beamfit.studies.scan.questions import questions
 from beamfit.studies.scan.results import Parameter, PlaneFit, parameter_rows, result_rows
 from beamfit.studies.scan.scans import QuadScan
-from beamfit.studies.scan.statement import Scenario, Seen
-from beamfit.studies.scan.transport import rows_line
+from beamfit.studies.scan.statement import Scenario, Seen, scenario_of
 from beamfit.table import Table, html_of, json_of, labelled, text_of
 
 if TYPE_CHECKING:
@@ -147,7 +144,7 @@ def fit_emittance(
 
     from beamfit.studies.scan.unknowns import judged_scenario, settled_fit  # loads the solvers
 
-    settled = settled_fit(seen, _solved(statement.state(seen, told), statement, told))
+    settled = settled_fit(seen, statement, told)
     fit, seen, _ = settled
     parameters = tuple(statement.parameters(seen, told, fit))
     found = line_of(fit.model, seen.scanned)
@@ -155,62 +152,6 @@ def fit_emittance(
     identified = all(p.identifiability.determined for p in judged)
     left = statement.null_directions(seen, parameters, identified)
     return EmittanceFit(judged, scan, found, statement, told, seen, parameters, left, fit)
-
-
-def prepared(
-    scan: QuadScan, line: Beamline | None, scenario: str = "known"
-) -> tuple[QuadScan, Beamline]:
-    """A scan of one beam with total energies, and its line.
-
-    Raises
-    ------
-    InputError
-        If it is of several slices, or its matrices are both given and unknown.
-    """
-    if len(scan.slices) > 1:
-        found = f"a scan of {len(scan.slices)} slices of the beam"
-        raise scan.unusable(found, "rows of one, as scan.of_slice(name) gives")
-    line = rows_line(scan) if line is None else line
-    _check_own(scan, line, scenario)
-    return scan.of_particle(line.mass), line
-
-
-def _check_own(scan: QuadScan, line: Beamline, scenario: str) -> None:
-    """Refuse to have the matrices of rows both given and unknown, or given twice."""
-    if scan.transfer is None:
-        return
-    if line.magnets or float(line.length) > 0.0:
-        raise scan.unusable("rows with matrices of their own and a line", "one of the two")
-    if scenario != "known":
-        expected = "scenario known, or settings and a lattice"
-        raise scan.unusable(f"scenario {scenario} for rows with matrices of their own", expected)
-
-
-def scenario_of(name: str) -> Scenario:
-    """The scenario of a name, from its module.
-
-    Examples
-    --------
-    >>> scenario_of("transport-network").whole_map
-    False
-    """
-    return import_module(f"beamfit.studies.scan.{SCENARIOS[name].module}").SCENARIO
-
-
-def _solved(problem: Problem, scenario: Scenario, told: Assumptions) -> Fit:
-    """Solve, a network from many starts, and so whatever one start may have led astray.
-
-    A beam of no emittance is a stationary point of every fit in its Cholesky factor, so a start
-    near it (the known-transport fit with a wrong calibration, say) may never leave it.
-    """
-    from beamfit.greybox.solve import solve
-
-    fit = solve(problem, told.starts if scenario.network else 1, told.seed)
-    flat = any(fit[f"beam.{plane}.l22"].state == "lower" for plane in problem.model["beam"])
-    lost = fit.status is not Status.converged and fit.chi2 > 2.0 * max(fit.dof, 1)
-    if (flat or lost) and not scenario.network:
-        fit = solve(problem, told.starts, told.seed)
-    return fit
 
 
 @shown
@@ -428,7 +369,8 @@ class EmittanceFit:
         line = {"name": self.line.name, "sha256": self.seen.line.digest}
         common = {"slice": self.scan.slices[0]} if self.scan.slices else {}
         common |= {"line": line} | ({"notes": list(self.notes)} if self.notes else {})
-        entries = [p.to_json() | {"energy": self._energy.to_json()} | common for p in self.planes]
+        energy = Quantity(self.seen.energy, None, "MeV").to_json()
+        entries = [p.to_json() | {"energy": energy} | common for p in self.planes]
         own = {
             "scenario": self.scenario,
             "anchor": self.anchor,
@@ -438,21 +380,17 @@ class EmittanceFit:
         return entries if self.statement.closed else [entry | own for entry in entries]
 
     @property
-    def _energy(self) -> Quantity:
-        """Mean total energy of the rows, MeV."""
-        return Quantity(self.seen.energy, None, "MeV")
-
-    def _table(self, title: str) -> Table:
-        return labelled(title, [p.plane for p in self.planes], result_rows(self.planes))
+    def _table(self) -> Table:
+        return labelled("", [p.plane for p in self.planes], result_rows(self.planes))
 
     def __str__(self) -> str:
         heading = f"{self.scan.name} on {self.line.name}, fit of {self.planes[0].method}"
         lines = [heading.replace("_", " "), ""]
         lines += [f"{p.headline}. {p.message}" for p in self.planes]
-        lines += ["", text_of(self._table(""))]
+        lines += ["", text_of(self._table)]
         lines += ["", *self.notes] if self.notes else []
         if not self.statement.closed:
-            rows = [[name, *cells] for name, cells in parameter_rows(self.parameters)]
+            rows = parameter_rows(self.parameters)
             lines += ["", f"scenario {self.scenario}, anchor: {self.anchor}"]
             lines += [text_of(Table("", [], rows))] if rows else []
             lines += [f"Left open: {words}." for words in self.null_directions]
@@ -461,4 +399,4 @@ class EmittanceFit:
     def _repr_html_(self) -> str:
         said = (f"<p><b>{escape(p.headline)}.</b> {escape(p.message)}</p>" for p in self.planes)
         more = (f"<p>{escape(note)}</p>" for note in self.notes)
-        return "".join((*said, html_of(self._table("")), *more))
+        return "".join((*said, html_of(self._table), *more))

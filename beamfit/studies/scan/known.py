@@ -9,14 +9,16 @@ from types import MappingProxyType
 from typing import NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
+from jax import Array
 
 from beamfit.greybox.problem import Problem
 from beamfit.optics.beamline import Beamline
 from beamfit.optics.calibration import SETTING_UNITS
 from beamfit.statistics import chi2_probability
 from beamfit.studies.scan.assumptions import Assumptions
-from beamfit.studies.scan.model import size_squared
+from beamfit.studies.scan.model import numbers_of, size_squared
 from beamfit.studies.scan.names import check_names
 from beamfit.studies.scan.noise import (
     ENOUGH_POINTS,
@@ -29,7 +31,7 @@ from beamfit.studies.scan.outliers import Influence, RobustFit, fit_robust, infl
 from beamfit.studies.scan.questions import check_gradients
 from beamfit.studies.scan.results import Points
 from beamfit.studies.scan.scans import QuadScan
-from beamfit.studies.scan.sigma import ClosedForm, SigmaFit, SizeData, closed_form
+from beamfit.studies.scan.sigma import SOLVE, SigmaFit, SizeData
 from beamfit.studies.scan.statement import (
     Scenario,
     Seen,
@@ -44,6 +46,7 @@ from beamfit.studies.scan.transport import (
     Rows,
     look_through,
     names_of,
+    rows_line,
     scan_rows,
     scanned_line,
 )
@@ -92,6 +95,35 @@ def see(
     seen = in_closed_form(seen._replace(look=look))
     other = of_other_kind(seen)
     return likelier(seen, in_closed_form(other)) if other else seen
+
+
+def prepared(
+    scan: QuadScan, line: Beamline | None, scenario: str = "known"
+) -> tuple[QuadScan, Beamline]:
+    """A scan of one beam with total energies, and its line.
+
+    Raises
+    ------
+    InputError
+        If it is of several slices, or its matrices are both given and unknown.
+    """
+    if len(scan.slices) > 1:
+        found = f"a scan of {len(scan.slices)} slices of the beam"
+        raise scan.unusable(found, "rows of one, as scan.of_slice(name) gives")
+    line = rows_line(scan) if line is None else line
+    _check_own(scan, line, scenario)
+    return scan.of_particle(line.mass), line
+
+
+def _check_own(scan: QuadScan, line: Beamline, scenario: str) -> None:
+    """Refuse to have the matrices of rows both given and unknown, or given twice."""
+    if scan.transfer is None:
+        return
+    if line.magnets or float(line.length) > 0.0:
+        raise scan.unusable("rows with matrices of their own and a line", "one of the two")
+    if scenario != "known":
+        expected = "scenario known, or settings and a lattice"
+        raise scan.unusable(f"scenario {scenario} for rows with matrices of their own", expected)
 
 
 def unfitted(
@@ -166,8 +198,16 @@ def _unlikely(seen: Seen, plane: str) -> float:
     return unlikely((p.size - p.model)[kept], shape[kept])
 
 
+class ClosedForm(NamedTuple):
+    """Planes in closed form: the fit, `numbers_of` it, and their errors, not scaled."""
+
+    fit: SigmaFit
+    value: Array
+    error: Array
+
+
 class _Sizes(NamedTuple):
-    """What `closed_form` needs besides the look; where one plane was measured, it is both."""
+    """What `fit_look` needs besides the look; where one plane was measured, it is both."""
 
     which: np.ndarray
     size: np.ndarray
@@ -201,10 +241,24 @@ def sizes_of(seen: Seen, errors: Mapping[str, np.ndarray] = MappingProxyType({})
 
 @partial(jax.jit, static_argnames=("method", "weights"))
 def fit_look(look: Look, sizes: _Sizes, method: str, weights: str) -> ClosedForm:
-    """Fit the planes of a look in closed form."""
+    """Fit the planes of a look, and carry σ and its covariance to everything people quote.
+
+    Errors are those of linear propagation, sqrt(∇f C ∇f).
+    """
     r11, r12, known, *places = (part[sizes.which] for part in look)
+
+    def one(plane: SizeData, *at: Array) -> ClosedForm:
+        fit = SOLVE[method](plane, weights)
+
+        def numbers(sigma: Array) -> Array:
+            return numbers_of(sigma, *at)
+
+        slope = jax.jacfwd(numbers)(fit.sigma)
+        error = jnp.sqrt(jnp.sum((slope @ fit.covariance) * slope, axis=1))
+        return ClosedForm(fit, numbers(fit.sigma), error)
+
     rows = SizeData(r11, r12, known, sizes.size, sizes.error, sizes.relative)
-    return closed_form(rows, sizes.factor, *places, sizes.design, method, weights)
+    return jax.vmap(one)(rows, sizes.factor, *places, sizes.design)
 
 
 @partial(jax.jit, static_argnames=("method", "weights"))

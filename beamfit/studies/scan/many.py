@@ -12,7 +12,7 @@ import numpy as np
 from beamfit.errors import InputError
 from beamfit.optics.beamline import Beamline
 from beamfit.studies.scan.assumptions import Assumptions
-from beamfit.studies.scan.fit import EmittanceFit, prepared, scenario_of
+from beamfit.studies.scan.fit import EmittanceFit
 from beamfit.studies.scan.judged import judged_beam
 from beamfit.studies.scan.known import (
     METHODS,
@@ -20,11 +20,12 @@ from beamfit.studies.scan.known import (
     fitted,
     likelier,
     of_other_kind,
+    prepared,
     sizes_of,
     unfitted,
 )
 from beamfit.studies.scan.scans import QuadScan
-from beamfit.studies.scan.statement import Seen
+from beamfit.studies.scan.statement import Seen, scenario_of
 from beamfit.studies.scan.transport import look_through
 
 # How many a call is compiled for, and what bounds them: rows times the longest of their arrays.

@@ -18,9 +18,6 @@ from beamfit.table import Table, cell, json_of, labelled
 if TYPE_CHECKING:
     from beamfit.greybox.fit import Variable
 
-# A longer table of points is cut, and says so.
-MOST_ROWS = 500
-
 
 @shown
 class Points(NamedTuple):
@@ -345,7 +342,7 @@ def result_rows(planes: tuple[PlaneFit, ...]) -> list[tuple[str, list[str]]]:
         ("rms residual", lambda p: f"{p.rms_residual.value * 1e6:.3g} µm"),
         ("errors", _noise),
         ("waist bracketed", lambda p: p.identifiability.waist_bracketed),
-        ("phase seen", lambda p: _degrees(p.identifiability.phase_coverage)),
+        ("phase seen", lambda p: degrees(p.identifiability.phase_coverage)),
         ("zero emittance at", lambda p: f"{p.identifiability.zero_distance:.1f} sigma"),
     ]
     return [(label, [cell(value(p)) for p in planes]) for label, value in rows]
@@ -378,30 +375,12 @@ def _noise(p: PlaneFit) -> str:
     return p.noise if p.error_scale == 1.0 else f"{p.noise}, scaled by {p.error_scale:.2f}"
 
 
-def _degrees(value: float | None) -> str:
+def degrees(value: float | None) -> str:
+    """Write how much of a half turn of betatron phase was seen."""
     return "-" if value is None else f"{value:.0f}° of 180°"
 
 
-def identifiability_rows(
-    planes: tuple[PlaneFit, ...],
-) -> list[tuple[str, list[str]]]:
-    """Label and one cell per plane for what the data determine."""
-    rows: list[tuple[str, Callable[[PlaneFit], object]]] = [
-        ("emittance", lambda p: "determined" if p.identifiability.determined else "not determined"),
-        ("left open", lambda p: ", ".join(p.identifiability.undetermined) or "nothing"),
-        (
-            "singular values",
-            lambda p: ", ".join(f"{v:.3g}" for v in p.identifiability.singular_values),
-        ),
-        ("condition", lambda p: _condition(p.identifiability.condition)),
-        ("zero emittance at", lambda p: f"{p.identifiability.zero_distance:.1f} standard errors"),
-        ("waist bracketed", lambda p: p.identifiability.waist_bracketed),
-        ("betatron phase seen", lambda p: _degrees(p.identifiability.phase_coverage)),
-    ]
-    return [(label, [cell(value(p)) for p in planes]) for label, value in rows]
-
-
-def parameter_rows(parameters: tuple[Parameter, ...]) -> list[tuple[str, list[str]]]:
+def parameter_rows(parameters: tuple[Parameter, ...]) -> list[list[str]]:
     """Name, value, bounds, prior and state of every number fitted besides the beam."""
     rows = []
     for p in parameters:
@@ -410,43 +389,5 @@ def parameter_rows(parameters: tuple[Parameter, ...]) -> list[tuple[str, list[st
         value = cell(p.value).replace("(not determined)", "(open)")
         prior = f"{p.prior[0]:.6g} ± {p.prior[1]:.3g}" if p.prior else "-"
         limits = f"{p.lower:.6g} to {p.upper:.6g}" if bounded else "-"
-        rows.append((p.name, [value, limits, prior, said]))
+        rows.append([p.name, value, limits, prior, said])
     return rows
-
-
-def _condition(value: float | None) -> str:
-    return "infinite" if value is None else f"{value:.3g}"
-
-
-def point_rows(plane: PlaneFit) -> tuple[list[str], list[list[str]]]:
-    """Header and rows of the point-by-point table of one plane.
-
-    Parameters
-    ----------
-    plane : PlaneFit
-        The plane.
-
-    Returns
-    -------
-    tuple
-        Column names, and one list of cells a point.
-    """
-    p = plane.points
-    header = [*(f"{n} {p.units[n]}" for n in p.settings), "size µm", "error µm", "fit µm", "pull"]
-    screens = len(set(p.screen)) > 1
-    header = (["screen"] if screens else []) + header
-    if p.outlier_probability is not None:
-        header.append("P(outlier)")
-    rows = []
-    for i in range(min(len(p.size), MOST_ROWS)):
-        cells = [p.screen[i]] if screens else []
-        cells += [f"{values[i]:.5g}" for values in p.settings.values()]
-        cells += [f"{1e6 * v[i]:.2f}" for v in (p.size, p.error, p.model)]
-        cells.append(f"{p.pull[i]:+.2f}")
-        if p.outlier_probability is not None:
-            cells.append(f"{p.outlier_probability[i]:.2f}")
-        rows.append(cells)
-    left = len(p.size) - len(rows)
-    if left > 0:
-        rows.append([f"{left} more"] + [""] * (len(header) - 1))
-    return header, rows

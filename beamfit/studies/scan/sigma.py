@@ -16,7 +16,7 @@ from jax.typing import ArrayLike
 
 from beamfit.greybox.descend import descend_one
 from beamfit.shown import shown
-from beamfit.studies.scan.model import coefficients, numbers_of, size_squared
+from beamfit.studies.scan.model import coefficients, size_squared
 
 # A direction of σ is lost when its diagonal of R is this far below the largest.
 _RANK = 1e-10
@@ -370,51 +370,3 @@ def zero_emittance(r11: Array, r12: Array, target: Array, scale: Array) -> tuple
     w = jnp.sin(angle) / rest
     v1, v2 = jnp.cos(angle) / jnp.sqrt(g11) - w * g12 / g11, w
     return length * jnp.stack([v1**2, v1 * v2, v2**2]), chi2
-
-
-class ClosedForm(NamedTuple):
-    """A plane in closed form: the fit, `numbers_of` it, and their errors, not scaled."""
-
-    fit: SigmaFit
-    value: Array
-    error: Array
-
-
-@partial(jax.jit, static_argnames=("method", "weights"))
-def closed_form(
-    sizes: SizeData,
-    factor: Array,
-    to_screen: Array,
-    to_design: Array,
-    design: Array,
-    method: str = "size_squared",
-    weights: str = "model",
-) -> ClosedForm:
-    """Fit planes and carry σ and its covariance to everything people quote.
-
-    Parameters
-    ----------
-    sizes : SizeData
-        Arrays of shape (planes, n).
-    factor, to_screen, to_design, design
-        As for `numbers_of`, with a leading axis of planes.
-    method, weights : str
-        As for `fit_sizes`.
-
-    Returns
-    -------
-    ClosedForm
-        With that leading axis. Errors are those of linear propagation, sqrt(∇f C ∇f).
-    """
-
-    def one(plane: SizeData, *at: Array) -> ClosedForm:
-        fit = SOLVE[method](plane, weights)
-
-        def numbers(sigma: Array) -> Array:
-            return numbers_of(sigma, *at)
-
-        slope = jax.jacfwd(numbers)(fit.sigma)
-        error = jnp.sqrt(jnp.sum((slope @ fit.covariance) * slope, axis=1))
-        return ClosedForm(fit, numbers(fit.sigma), error)
-
-    return jax.vmap(one)(sizes, factor, to_screen, to_design, design)

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
+from importlib import import_module
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from beamfit.greybox.problem import Free, Problem, Record
 from beamfit.optics.beamline import Beamline
-from beamfit.studies.scan.assumptions import Assumptions
+from beamfit.studies.scan.assumptions import SCENARIOS, Assumptions
 from beamfit.studies.scan.model import UNIT, Asked, predict_sizes
 from beamfit.studies.scan.noise import Noise
 from beamfit.studies.scan.results import Parameter, Points
@@ -149,6 +150,17 @@ class Scenario:
     closed: bool = False
     network: bool = False
     whole_map: bool = True
+
+
+def scenario_of(name: str) -> Scenario:
+    """The scenario of a name, from its module.
+
+    Examples
+    --------
+    >>> scenario_of("transport-network").whole_map
+    False
+    """
+    return import_module(f"beamfit.studies.scan.{SCENARIOS[name].module}").SCENARIO
 
 
 def varied_magnets(scan: QuadScan) -> tuple[str, ...]:

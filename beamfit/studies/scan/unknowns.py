@@ -15,7 +15,7 @@ from jax import Array
 from beamfit.greybox import tree
 from beamfit.greybox.covariance import Group
 from beamfit.greybox.fit import Derived, Fit
-from beamfit.greybox.problem import Record
+from beamfit.greybox.problem import Problem, Record
 from beamfit.greybox.solve import solve
 from beamfit.optics.beamline import Beamline
 from beamfit.statistics import POOR_FIT
@@ -155,12 +155,13 @@ class Found(NamedTuple):
     elements: np.ndarray
 
 
-def settled_fit(seen: Seen, fit: Fit) -> Found:
-    """Solve again with errors taken at the fitted sizes, until these change no more.
+def settled_fit(seen: Seen, scenario: Scenario, told: Assumptions) -> Found:
+    """Solve, and again with errors taken at the fitted sizes, until these change no more.
 
     Where the line was wrong, so were the sizes that known transport weighed by, the noise it saw in
     its residuals, and the points it doubted.
     """
+    fit = _solved(scenario.state(seen, told), scenario, told)
     found = _through(seen, fit)
     for _ in range(ROUNDS):
         records = tuple(_renewed(record, found) for record in fit.problem.records)
@@ -175,6 +176,20 @@ def settled_fit(seen: Seen, fit: Fit) -> Found:
         fit = replace(again, attempts=(*fit.attempts, *again.attempts), message=said)
         found = _through(seen, fit)
     return found
+
+
+def _solved(problem: Problem, scenario: Scenario, told: Assumptions) -> Fit:
+    """Solve, a network from many starts, and so whatever one start may have led astray.
+
+    A beam of no emittance is a stationary point of every fit in its Cholesky factor, so a start
+    near it (the known-transport fit with a wrong calibration, say) may never leave it.
+    """
+    fit = solve(problem, told.starts if scenario.network else 1, told.seed)
+    flat = any(fit[f"beam.{plane}.l22"].state == "lower" for plane in problem.model["beam"])
+    lost = fit.status is not Status.converged and fit.chi2 > 2.0 * max(fit.dof, 1)
+    if (flat or lost) and not scenario.network:
+        fit = solve(problem, told.starts, told.seed)
+    return fit
 
 
 def _renewed(record: Record, found: Found) -> Record:
