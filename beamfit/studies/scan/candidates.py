@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
+from itertools import product
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -21,7 +22,7 @@ from beamfit.studies.scan.calibration import Kind, numbers_of_magnets
 from beamfit.studies.scan.fit import EmittanceFit
 from beamfit.studies.scan.model import emittance_parts, predict_sizes, sigma_of, spoken
 from beamfit.studies.scan.next_point import candidate_settings
-from beamfit.studies.scan.statement import varied_magnets
+from beamfit.studies.scan.statement import size_records, varied_magnets
 from beamfit.studies.scan.transport import NetworkRows, Rows, rows_at
 from beamfit.studies.scan.verdict import CLEAR
 
@@ -143,14 +144,15 @@ def candidate_rows(
     """
     own, screens, found = fit.seen.energy, _screens(fit), []
     for name, table in candidate_settings(fit.scan.settings, _checked(fit, limits)):
-        count = len(table[name])
-        for screen in screens:
-            for energy in (own, *energies):
-                rows = _rows(fit, fit.seen.scanned, table, screen, np.full(count, energy))
-                found += [
-                    Considered(_named(fit, table, i, screen, energy, own, screens), rows[:, i])
-                    for i in range(count)
-                ]
+        points = [{n: float(v[i]) for n, v in table.items()} for i in range(len(table[name]))]
+        for screen, energy in product(screens, (own, *energies)):
+            rows = _rows(fit, fit.seen.scanned, table, screen, np.full(len(points), energy))
+            there = f" on {screen}" if len(screens) > 1 else ""
+            there += f" at {energy:g} MeV" if energy != own else ""
+            for i, settings in enumerate(points):
+                words = _in_words(fit, settings) + there
+                candidate = Candidate(settings, screen, float(energy), words)
+                found.append(Considered(candidate, rows[:, i]))
     return found
 
 
@@ -176,15 +178,20 @@ def _checked(fit: EmittanceFit, limits):
 
 def _screens(fit: EmittanceFit) -> tuple[str, ...]:
     """Screens to measure at: all of the line, downstream of a scanned magnet."""
-    measured = fit.scan.screen or (fit.seen.scanned.screens[-1],)
+    measured = fit.seen.rows.places
     if not fit.statement.whole_map:  # another screen has another network
-        return tuple(dict.fromkeys(measured))
-    names = [e.name for e in fit.seen.scanned.elements]
-    line = fit.seen.scanned
-    magnets = [m for name in varied_magnets(fit.scan) for m in line.members(name)]
-    first = min(map(names.index, magnets), default=-1)
-    later = [s for s in fit.seen.scanned.screens if names.index(s) > first]
+        return measured
+    names, magnets = _along(fit)
+    later = [s for s in fit.seen.scanned.screens if names.index(s) > min(magnets)]
     return tuple(dict.fromkeys((*measured, *later)))
+
+
+def _along(fit: EmittanceFit) -> tuple[list[str], list[int]]:
+    """Names along the line, and where in them the scanned magnets stand."""
+    line = fit.seen.scanned
+    names = [e.name for e in line.elements]
+    magnets = [m for name in varied_magnets(fit.scan) for m in line.members(name)]
+    return names, [names.index(m) for m in magnets] or [-1]
 
 
 def _in_words(fit: EmittanceFit, settings: Mapping[str, float]) -> str:
@@ -192,14 +199,6 @@ def _in_words(fit: EmittanceFit, settings: Mapping[str, float]) -> str:
     line = fit.seen.scanned
     units = {n: SETTING_UNITS[line[n].calibration.unit] for n in settings}
     return ", ".join(f"{n} = {v:.4g} {units[n]}" for n, v in settings.items())
-
-
-def _named(fit, table, i, screen, energy, own, screens) -> Candidate:
-    settings = {n: float(v[i]) for n, v in table.items()}
-    words = _in_words(fit, settings)
-    words += f" on {screen}" if len(screens) > 1 else ""
-    words += f" at {energy:g} MeV" if energy != own else ""
-    return Candidate(settings, screen, float(energy), words)
 
 
 def _rows(
@@ -223,15 +222,10 @@ def _rows(
     return np.array(found)
 
 
-def _measured(fit: EmittanceFit, plane: str) -> Rows | NetworkRows:
-    """The rows of a plane that were measured."""
-    sizes = (r.data for r in fit.problem.records if r.predict is predict_sizes)
-    return next(rows for rows in sizes if rows.plane == plane)
-
-
 def _line_rows(fit, line, plane, table, screen, energy) -> Rows:
     count = len(energy)
-    shapes = {n: np.ndim(v) for n, v in _measured(fit, plane).settings.items()}
+    measured = size_records(fit.problem)[plane].data
+    shapes = {n: np.ndim(v) for n, v in measured.settings.items()}
     # Where a magnet has branches, a further point is measured on the rising one.
     settings = {
         n: jnp.stack([v, jnp.ones(count)], -1) if shapes.get(n) == 2 else jnp.asarray(v)
@@ -243,7 +237,7 @@ def _line_rows(fit, line, plane, table, screen, energy) -> Rows:
 
 
 def _network_rows(fit, plane, table, screen) -> NetworkRows:
-    measured, seen = _measured(fit, plane), fit.seen
+    measured, seen = size_records(fit.problem)[plane].data, fit.seen
     place = seen.rows.places.index(screen)
     which = next(i for i in seen.measured(plane) if seen.rows.which[i] == place)
     count = len(next(iter(table.values())))
@@ -292,11 +286,10 @@ def further_options(
             yield f"one size on {words} ({at})", rows[:, best]
             yield f"the same scan on {words}", rows.reshape(-1, rows.shape[-1])
         for factor in energies or tuple(own * f for f in USUAL_ENERGIES):
-            screen = (fit.scan.screen or (fit.seen.scanned.screens[-1],))[-1]
+            screen = (fit.scan.screen or fit.seen.rows.places)[-1]
             rows = _rows(fit, fit.seen.scanned, table, screen, np.full(len(fit.scan), factor))
             yield f"the same scan at {factor:.4g} MeV", rows.reshape(-1, rows.shape[-1])
-    for words, rows in _priors(fit):
-        yield words, rows
+    yield from _priors(fit)
 
 
 def _worst(after: Information) -> float:
@@ -306,21 +299,18 @@ def _worst(after: Information) -> float:
 
 def _other_screens(fit: EmittanceFit) -> list[tuple[Beamline, str, str]]:
     """Screens that were not used, or else places for one in the drifts after the magnets."""
-    used = set(fit.scan.screen or (fit.seen.scanned.screens[-1],))
-    unused = [s for s in _screens(fit) if s not in used]
+    line = fit.seen.scanned
+    unused = [s for s in _screens(fit) if s not in fit.seen.rows.places]
     if unused:
-        return [(fit.seen.scanned, s, f"screen {s}") for s in unused]
-    names = [e.name for e in fit.seen.scanned.elements]
-    magnets = [m for n in varied_magnets(fit.scan) for m in fit.seen.scanned.members(n)]
-    last = max(map(names.index, magnets), default=-1)
+        return [(line, s, f"screen {s}") for s in unused]
+    _, magnets = _along(fit)
     found = []
-    for i, element in enumerate(fit.seen.scanned.elements):
-        if i > last and isinstance(element, Drift) and element.length > 0.3:
+    for i, element in enumerate(line.elements):
+        if i > max(magnets) and isinstance(element, Drift) and element.length > 0.3:
             half = replace(element, length=0.5 * element.length)
-            parts = (half, Screen("NEW"), half)
-            elements = (*fit.seen.scanned.elements[:i], *parts, *fit.seen.scanned.elements[i + 1 :])
+            elements = (*line.elements[:i], half, Screen("NEW"), half, *line.elements[i + 1 :])
             words = f"a new screen in the middle of {element.name}"
-            found.append((replace(fit.seen.scanned, elements=elements), "NEW", words))
+            found.append((replace(line, elements=elements), "NEW", words))
     return found
 
 

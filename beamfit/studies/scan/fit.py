@@ -144,11 +144,10 @@ def fit_emittance(
 
     from beamfit.studies.scan.unknowns import judged_scenario, settled_fit  # loads the solvers
 
-    settled = settled_fit(seen, statement, told)
-    fit, seen, _ = settled
+    fit, seen = settled_fit(seen, statement, told)
     parameters = tuple(statement.parameters(seen, told, fit))
     found = line_of(fit.model, seen.scanned)
-    judged = judged_scenario(settled, found, statement, told, parameters)
+    judged = judged_scenario(fit, seen, found, statement, told, parameters)
     identified = all(p.identifiability.determined for p in judged)
     left = statement.null_directions(seen, parameters, identified)
     return EmittanceFit(judged, scan, found, statement, told, seen, parameters, left, fit)

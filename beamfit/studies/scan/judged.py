@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from functools import lru_cache
+from itertools import zip_longest
 from typing import NamedTuple
 
 import numpy as np
 
 from beamfit.optics.beamline import Beamline
 from beamfit.quantity import Quantity
-from beamfit.statistics import reach_of, scaled_directions
+from beamfit.statistics import Directions, reach_of, scaled_directions
 from beamfit.status import Status
 from beamfit.studies.scan.model import QUANTITIES, coefficients, phase_coverage
 from beamfit.studies.scan.next_point import best_symmetric, next_measurement
@@ -46,40 +46,27 @@ class Answer(NamedTuple):
     limits: tuple[float | None, float | None]
     distance: float
     points: Points
-    jacobian: np.ndarray
-    units: np.ndarray
-    names: list[str]
+    directions: Directions
     advice: str | None = None
     holds: str = "statistics only"
 
 
-def _quantity(value: float, error: float, raw: float, unit: str, reach: float) -> Quantity:
+def _quantity(
+    value: float, error: float, raw: float, unit: str, limit: float | None, reach: float
+) -> Quantity:
+    """A number with its error; of one that is not determined what it cannot exceed, if known."""
     value, error = float(value), float(error)
     if not math.isfinite(error):
-        return Quantity(value, None, unit)
+        return Quantity(value, None, unit, None, None if limit is None else (0.0, limit))
     return Quantity.reaching(value, error, unit, float(raw), reach * error)
-
-
-def _limited(q: Quantity, limit: float | None) -> Quantity:
-    """A quantity that is not determined but cannot exceed a limit."""
-    if q.error is not None or limit is None:
-        return q
-    return replace(q, interval_95=(0.0, limit))
 
 
 def plane_fit(seen: Seen, line: Beamline, plane: str, a: Answer) -> PlaneFit:
     """The result of a plane: errors only for what the data determine."""
-    numbers = [
-        _quantity(*each, reach_of(a.rests_on))
-        for each in zip(a.value, a.error, a.raw, QUANTITIES.values(), strict=True)
-    ]
-    numbers[:2] = [_limited(q, limit) for q, limit in zip(numbers[:2], a.limits, strict=True)]
+    columns = a.value, a.error, a.raw, QUANTITIES.values(), a.limits
+    numbers = [_quantity(*each, reach_of(a.rests_on)) for each in zip_longest(*columns)]
     emittance, normalized, beta, alpha, s11, s12, s22, *screen, mismatch = numbers
     place, p, e = seen.rows.places[-1], a.points, seen.works[plane].evidence
-    found = scaled_directions(a.jacobian, a.units, a.names)
-    left = found.undetermined
-    if not a.determined and "emittance" not in left:
-        left = (*left, "emittance")
     return PlaneFit(
         plane=plane,
         status=a.finding.status,
@@ -101,12 +88,12 @@ def plane_fit(seen: Seen, line: Beamline, plane: str, a: Answer) -> PlaneFit:
         weights=seen.weights,
         identifiability=Identifiability(
             determined=a.determined,
-            singular_values=tuple(float(v) for v in found.singular_values),
-            condition=found.condition if math.isfinite(found.condition) else None,
+            singular_values=tuple(float(v) for v in a.directions.singular_values),
+            condition=a.directions.condition if math.isfinite(a.directions.condition) else None,
             waist_bracketed=e.bracketed,
             phase_coverage=phase_coverage(p.r11, p.r12, float(a.value[2]), float(a.value[3])),
             zero_distance=a.distance,
-            undetermined=left,
+            undetermined=(*a.directions.undetermined, *["emittance"] * (not a.determined)),
             next_measurement=a.advice,
         ),
         points=p,
@@ -133,7 +120,6 @@ def _beam_answer(seen: Seen, plane: str) -> Answer:
     shown = np.isfinite(w.error) & np.where(LINEAR, linear, determined)
     value = w.value if e.positive else np.where(np.arange(len(w.value)) < 2, 0.0, w.value)
     raw = np.where(shown, w.error, np.nan)
-    sigma = w.fit.sigma
     with np.errstate(divide="ignore", invalid="ignore"):
         scale = 2.0 * p.weighed * p.error * w.scale
         jacobian = np.stack(coefficients(p.r11, p.r12), -1) / scale[:, None]
@@ -151,9 +137,9 @@ def _beam_answer(seen: Seen, plane: str) -> Answer:
         limits=(None, None) if determined else _limits(seen, plane),
         distance=e.distance,
         points=p,
-        jacobian=jacobian,
-        units=np.array(units_of(sigma)),
-        names=list(QUANTITIES)[SIGMA],
+        directions=scaled_directions(
+            jacobian, np.array(units_of(w.fit.sigma)), list(QUANTITIES)[SIGMA]
+        ),
         advice=advice,
     )
 

@@ -27,12 +27,11 @@ from beamfit.studies.scan.model import (
     UNIT,
     Asked,
     asked_numbers,
-    predict_sizes,
     sigma_of,
     spoken,
 )
 from beamfit.studies.scan.results import PlaneFit
-from beamfit.studies.scan.statement import Scenario, Seen, asked_of
+from beamfit.studies.scan.statement import Scenario, Seen, asked_in, factor_of
 from beamfit.verdict import Finding
 
 CHOLESKY, SIGMA = ("l11", "l21", "l22"), ("sigma11", "sigma12", "sigma22")
@@ -156,14 +155,11 @@ def _optimum(
     """Where to begin: the fit, or else the priors; a little off zero emittance, an edge."""
     begin = {}
     for p in chosen:
-        s11, s12, s22 = (q.value / UNIT**2 for q in p.sigma)
+        sigma = [q.value for q in p.sigma]
         if not np.isfinite(p.covariance).all() and p in given:
-            means = (priors[f"{p.plane}.{name}"].mean() for name in SIGMA)
-            s11, s12, s22 = (mean / UNIT**2 for mean in means)
-        l11 = np.sqrt(max(s11, 1e-6))
-        l22 = np.sqrt(max(s22 - (s12 / l11) ** 2, 1e-4 * max(s22, 1e-6)))
-        numbers = zip(CHOLESKY, (l11, s12 / l11, l22), strict=True)
-        begin |= {f"beam.{p.plane}.{name}": value for name, value in numbers}
+            sigma = [priors[f"{p.plane}.{name}"].mean() for name in SIGMA]
+        numbers = factor_of(sigma, 1e-4)
+        begin |= {f"beam.{p.plane}.{name}": value for name, value in numbers.items()}
     theta = np.array([begin[name] for name in names])
     worst = max(chosen, key=lambda p: p.status is Status.poor_fit)
     scales, known = [p.error_scale for p in chosen], [p.chi2 is not None for p in chosen]
@@ -174,10 +170,6 @@ def _stated(
     problem: Problem, fit: Scanned, kept: Sequence[PlaneFit], asked: Sequence[PlaneFit]
 ) -> Statement:
     chosen = kept or asked
-    rows = {r.data.plane: r.data for r in problem.records if r.predict is predict_sizes}
-    whole = fit.statement.whole_map
-    lines = {plane: r.line if whole else None for plane, r in rows.items()}
-    places = [asked_of(fit.seen, p.plane, whole, lines[p.plane]) for p in chosen]
     shown = {(p.plane, name): getattr(p, name) for p in chosen for name in TWISS}
     lost = ", ".join(f"{p.plane} plane" for p in asked if p not in kept)
     sigmas = [f"{p.plane}.{name}" for p in chosen for name in SIGMA]
@@ -189,7 +181,7 @@ def _stated(
         derived={f"{plane}.{name}": QUANTITIES[name] for plane, name in shown},
         derive=_twiss,
         build=_beams,
-        data=places,
+        data=asked_in(problem, fit.seen, [p.plane for p in chosen], fit.statement.whole_map),
         quoted=_quoted,
         own=_own,
         renamed=renamed | dict(zip(own, sigmas, strict=True)),

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+import math
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from importlib import import_module
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -203,16 +204,31 @@ def size_record(seen: Seen, plane: str, rows: Any) -> Record:
     return Record(f"size {plane}", predict_sizes, rows, size, error, weight, worth, guess)
 
 
+def size_records(problem: Problem) -> dict[str, Record]:
+    """Those of a problem's records that have the sizes of a plane, by its name."""
+    return {r.data.plane: r for r in problem.records if r.predict is predict_sizes}
+
+
+def asked_in(
+    problem: Problem, seen: Seen, planes: Iterable[str], whole_map: bool
+) -> tuple[Asked, ...]:
+    """Where the beams of planes are asked for, through the lines that a problem has."""
+    records = size_records(problem)
+    lines = {plane: records[plane].data.line if whole_map else None for plane in planes}
+    return tuple(asked_of(seen, plane, whole_map, line) for plane, line in lines.items())
+
+
 def beam_numbers(seen: Seen) -> dict[str, dict[str, float]]:
     """Cholesky factors to start from: the known-transport fit, kept off zero emittance."""
-    found = {}
-    for plane in seen.planes:
-        s11, s12, s22 = (float(v) / UNIT**2 for v in seen.works[plane].fit.sigma)
-        l11 = np.sqrt(max(s11, 1e-6))
-        l21 = s12 / l11
-        l22 = np.sqrt(max(s22 - l21**2, 0.0025 * max(s22, 1e-6)))
-        found[plane] = {"l11": l11, "l21": l21, "l22": l22}
-    return found
+    return {plane: factor_of(seen.works[plane].fit.sigma, 0.0025) for plane in seen.planes}
+
+
+def factor_of(sigma: Sequence[float], least: float) -> dict[str, float]:
+    """The numbers of a beam from its σ in SI, with no less than this share of σ22 off the line."""
+    s11, s12, s22 = (float(v) / UNIT**2 for v in sigma)
+    l11 = math.sqrt(max(s11, 1e-6))
+    l21 = s12 / l11
+    return {"l11": l11, "l21": l21, "l22": math.sqrt(max(s22 - l21**2, least * max(s22, 1e-6)))}
 
 
 def beam_free(beams: Mapping[str, Mapping[str, float]]) -> list[Free]:

@@ -15,10 +15,10 @@ from jax import Array
 from beamfit.greybox import tree
 from beamfit.greybox.covariance import Group
 from beamfit.greybox.fit import Derived, Fit
-from beamfit.greybox.problem import Problem, Record
+from beamfit.greybox.problem import Problem
 from beamfit.greybox.solve import solve
 from beamfit.optics.beamline import Beamline
-from beamfit.statistics import POOR_FIT
+from beamfit.statistics import POOR_FIT, scaled_directions
 from beamfit.status import Status
 from beamfit.studies.scan.assumptions import Anchor, Assumptions
 from beamfit.studies.scan.judged import SIGMA, Answer, plane_fit, units_of
@@ -27,12 +27,11 @@ from beamfit.studies.scan.model import (
     QUANTITIES,
     Asked,
     asked_numbers,
-    predict_sizes,
     size_squared,
     spoken,
 )
 from beamfit.studies.scan.results import Parameter, PlaneFit, Points
-from beamfit.studies.scan.statement import Scenario, Seen, asked_of, size_record
+from beamfit.studies.scan.statement import Scenario, Seen, asked_in, size_record, size_records
 from beamfit.studies.scan.systematics import effects_of
 from beamfit.studies.scan.transport import Look
 from beamfit.studies.scan.verdict import CLEAR, cause_of, few_words
@@ -54,10 +53,10 @@ class Unknowns(NamedTuple):
         Whether the error of the emittance rests on data and priors, not on bounds.
     distance : float
         Standard errors between det σ and zero.
-    chi2, dof : float
-        Of the plane's own sizes.
+    group : Group
+        The noise of the plane's own sizes.
     probability : float or None
-        Of that χ².
+        Of their χ².
     rests_on : float
         Degrees of freedom of the errors as scaled.
     edges, remedy, remark : str
@@ -70,8 +69,7 @@ class Unknowns(NamedTuple):
     ending: Finding | None
     on_data: bool
     distance: float
-    chi2: float
-    dof: float
+    group: Group
     probability: float | None
     rests_on: float
     edges: str
@@ -118,7 +116,7 @@ def _determined(u: Unknowns) -> Finding:
     )
     if u.probability is None or u.probability >= POOR_FIT:
         return Finding(Status.converged, said)
-    ratio = u.chi2 / u.dof
+    ratio = u.group.chi2 / u.group.dof
     poor = f"Poor fit: chi2/dof = {ratio:.2g}; the sizes' errors are scaled by"
     return Finding(Status.poor_fit, f"{poor} {math.sqrt(ratio):.1f}. {said}")
 
@@ -147,35 +145,27 @@ def _elements(model: Mapping[str, Any], rows: tuple[Any, ...]) -> Array:
     return jnp.stack([jnp.stack(each.elements(model)) for each in rows])
 
 
-class Found(NamedTuple):
-    """A scenario's fit and, of the line as it found it, each plane fitted in closed form."""
-
-    fit: Fit
-    seen: Seen
-    elements: np.ndarray
-
-
-def settled_fit(seen: Seen, scenario: Scenario, told: Assumptions) -> Found:
+def settled_fit(seen: Seen, scenario: Scenario, told: Assumptions) -> tuple[Fit, Seen]:
     """Solve, and again with errors taken at the fitted sizes, until these change no more.
 
     Where the line was wrong, so were the sizes that known transport weighed by, the noise it saw in
-    its residuals, and the points it doubted.
+    its residuals, and the points it doubted. What is seen in the end is closed forms through the
+    line as found.
     """
     fit = _solved(scenario.state(seen, told), scenario, told)
     found = _through(seen, fit)
     for _ in range(ROUNDS):
-        records = tuple(_renewed(record, found) for record in fit.problem.records)
-        if all(
-            new is old or np.allclose(new.error, old.error, rtol=SAME)
-            for new, old in zip(records, fit.problem.records, strict=True)
-        ):
+        old = size_records(fit.problem)
+        new = {r.name: size_record(found, plane, r.data) for plane, r in old.items()}
+        if all(np.allclose(new[r.name].error, r.error, rtol=SAME) for r in old.values()):
             break
+        records = tuple(new.get(r.name, r) for r in fit.problem.records)
         again = solve(replace(fit.problem, model=fit.model, records=records))
         # The search is the first one; the few steps from its end are told with it.
         said = fit.message if again.status is fit.status else again.message
         fit = replace(again, attempts=(*fit.attempts, *again.attempts), message=said)
         found = _through(seen, fit)
-    return found
+    return fit, found
 
 
 def _solved(problem: Problem, scenario: Scenario, told: Assumptions) -> Fit:
@@ -192,35 +182,20 @@ def _solved(problem: Problem, scenario: Scenario, told: Assumptions) -> Fit:
     return fit
 
 
-def _renewed(record: Record, found: Found) -> Record:
-    """The sizes of a plane with their errors as the last closed form took them."""
-    if record.predict is not predict_sizes:
-        return record
-    return size_record(found.seen, record.data.plane, record.data)
-
-
-def _through(seen: Seen, fit: Fit) -> Found:
-    """See the scan through the line as a fit found it."""
-    rows = tuple(record.data for record in _size_records(seen, fit))
-    elements = np.asarray(_elements(fit.model, rows))
-    look = list(seen.look)
-    for plane, found in zip(seen.planes, elements, strict=True):
-        for i in range(3):
-            look[i] = look[i].copy()
-            look[i]["xy".index(plane)] = found[i]
+def _through(seen: Seen, fit: Fit) -> Seen:
+    """See the scan through the line as a fit found it: each plane fitted in closed form."""
+    records = size_records(fit.problem)
+    elements = np.asarray(_elements(fit.model, tuple(records[p].data for p in seen.planes)))
+    look = np.array(seen.look[:3])
+    look[:, ["xy".index(plane) for plane in seen.planes]] = np.swapaxes(elements, 0, 1)
     noises = {plane: seen.noises[plane] for plane in seen.planes}
-    again = in_closed_form(seen._replace(look=Look(*look), noises=noises))
-    return Found(fit, seen._replace(works=seen.works | again.works), elements)
-
-
-def _size_records(seen: Seen, fit: Fit) -> list[Record]:
-    """The records of sizes, in the order of the planes."""
-    records = {r.data.plane: r for r in fit.problem.records if r.predict is predict_sizes}
-    return [records[plane] for plane in seen.planes]
+    again = in_closed_form(seen._replace(look=Look(*look, *seen.look[3:]), noises=noises))
+    return seen._replace(works=seen.works | again.works)
 
 
 def judged_scenario(
-    found: Found,
+    fit: Fit,
+    seen: Seen,
     line: Beamline,
     scenario: Scenario,
     told: Assumptions,
@@ -232,32 +207,26 @@ def judged_scenario(
     So each plane must be determined by the rules of known transport too, with the line as the
     scenario found it.
     """
-    fit, seen, elements = found
-    records = _size_records(seen, fit)
-    whole = scenario.whole_map
-    asked = tuple(
-        asked_of(seen, r.data.plane, whole, r.data.line if whole else None) for r in records
-    )
-    derived = fit.derive(_numbers, asked)
+    records = size_records(fit.problem)
+    derived = fit.derive(_numbers, asked_in(fit.problem, seen, seen.planes, scenario.whole_map))
     jacobian, beams = _loose_jacobian(fit), []
-    for i, (plane, record) in enumerate(zip(seen.planes, records, strict=True)):
+    for i, plane in enumerate(seen.planes):
         own = Derived(*(part[i] for part in derived))
-        points = _points_at(seen, plane, own.value[SIGMA], *elements[i])
-        group = next((g for g in fit.groups if g.name == record.name), NOTHING)
+        group = next((g for g in fit.groups if g.name == records[plane].name), NOTHING)
         unknowns = _unknowns(seen, plane, scenario, told, fit, parameters, own, group)
-        answer = _scenario_answer(fit, own, group, unknowns, points, jacobian)
+        points = _points_at(seen, plane, own.value[SIGMA])
+        answer = _scenario_answer(fit, own, unknowns, points, jacobian)
         if told.systematics:
             answer = answer._replace(holds="statistics, systematics")
         beams.append(plane_fit(seen, line, plane, answer))
     return tuple(beams)
 
 
-def _points_at(seen: Seen, plane: str, sigma: np.ndarray, *elements: np.ndarray) -> Points:
+def _points_at(seen: Seen, plane: str, sigma: np.ndarray) -> Points:
     """The points of the closed form, with this fit's model."""
-    r11, r12, known = (part[seen.measured(plane)] for part in elements)
-    model = np.sqrt(np.maximum(size_squared(sigma, r11, r12, known), 0.0))
-    points = seen.works[plane].points._replace(model=model)
-    return points._replace(pull=pulls(points, seen.rows.squared))
+    p = seen.works[plane].points
+    p = p._replace(model=np.sqrt(np.maximum(size_squared(sigma, p.r11, p.r12, p.known), 0.0)))
+    return p._replace(pull=pulls(p, seen.rows.squared))
 
 
 def _unknowns(
@@ -270,8 +239,8 @@ def _unknowns(
     own: Derived,
     group: Group,
 ) -> Unknowns:
-    evidence, noise = seen.works[plane].evidence, seen.noises[plane]
-    tied, error = told.anchor.words, float(fit.spread.error(np.nan_to_num(own.slope[0])))
+    noise, tied = seen.noises[plane], told.anchor.words
+    error = float(fit.spread.error(np.nan_to_num(own.slope[0])))
     held = _held(fit) is not None
     distance = float(own.value[0]) / (2.0 * error) if error > 0 and not held else 0.0
     edges = "".join(
@@ -280,36 +249,36 @@ def _unknowns(
         for p in parameters
         if p.status is Status.at_limit
     )
-    left = [p.name for p in parameters if p.status is not Status.converged]
-    priors = [p.name for p in parameters if p.prior is not None]
-    remark = ""
-    if left:
-        remark = f" {', '.join(left)} not determined: what depends on it has no error"
-        remark += f"{scenario.aside}."
-    if not parameters and not scenario.network:
-        remark += " Nothing is free besides the beam, so this is the fit with known transport."
-    if priors:
-        remark += f" Rests on the prior of {', '.join(priors)}."
     effects = effects_of(fit, told, float(own.value[1]), np.nan_to_num(own.slope[1]))
     rests_on = noise.rests_on(group.chi2, group.dof)
-    if effects is not None:
-        remark += effects.words
-        rests_on *= effects.beyond_statistics**2
     return Unknowns(
         scenario=scenario.name,
         tied=f" with {tied}" if told.anchor != Anchor() else "",
-        cause=cause_of(evidence),
+        cause=cause_of(seen.works[plane].evidence),
         ending=_ending(scenario, told, fit),
         on_data=bool(np.isfinite(own.error[0])),
         distance=distance if math.isfinite(distance) else 0.0,
-        chi2=group.chi2,
-        dof=group.dof,
+        group=group,
         probability=noise.probability(group.chi2, group.dof),
-        rests_on=rests_on,
+        rests_on=rests_on * (effects.beyond_statistics**2 if effects else 1.0),
         edges=edges,
         remedy=scenario.remedy(seen, told),
-        remark=remark,
+        remark=_remark(scenario, parameters) + (effects.words if effects else ""),
     )
+
+
+def _remark(scenario: Scenario, parameters: tuple[Parameter, ...]) -> str:
+    """What is open besides the beam, and what it rests on."""
+    left = ", ".join(p.name for p in parameters if p.status is not Status.converged)
+    priors = ", ".join(p.name for p in parameters if p.prior is not None)
+    said = ""
+    if left:
+        said += f" {left} not determined: what depends on it has no error{scenario.aside}."
+    if not parameters and not scenario.network:
+        said += " Nothing is free besides the beam, so this is the fit with known transport."
+    if priors:
+        said += f" Rests on the prior of {priors}."
+    return said
 
 
 def _ending(scenario: Scenario, told: Assumptions, fit: Fit) -> Finding | None:
@@ -343,9 +312,9 @@ def _held(fit: Fit) -> Finding | None:
 
 
 def _scenario_answer(
-    fit: Fit, own: Derived, group: Group, u: Unknowns, points: Points, jacobian: np.ndarray
+    fit: Fit, own: Derived, u: Unknowns, points: Points, jacobian: np.ndarray
 ) -> Answer:
-    p, theta = fit.problem, fit.theta
+    p, theta, group = fit.problem, fit.theta, u.group
     determined = u.clear and u.ending is None and u.cause is None
     error = np.where(determined, own.error, np.nan)
     sigma, slopes = own.value[SIGMA], np.nan_to_num(own.slope[SIGMA])
@@ -357,6 +326,7 @@ def _scenario_answer(
     ]
     asked = np.vstack([slopes, np.eye(len(theta))[further]])
     units = np.array([*units_of(sigma), *(abs(theta[i]) or 1.0 for i in further)])
+    names = [*list(QUANTITIES)[SIGMA], *(spoken(p.names[i]) for i in further)]
     known = np.isfinite(error[SIGMA]).all()
     return Answer(
         finding=judge(u, SCENARIO_RULES),
@@ -372,9 +342,7 @@ def _scenario_answer(
         limits=(None, None),
         distance=u.distance,
         points=points,
-        jacobian=_marginal(jacobian, asked, units),
-        units=np.ones(len(units)),
-        names=[*list(QUANTITIES)[SIGMA], *(spoken(p.names[i]) for i in further)],
+        directions=scaled_directions(_marginal(jacobian, asked, units), np.ones(len(units)), names),
     )
 
 
