@@ -12,24 +12,24 @@ from beamfit.shown import shown
 
 
 class Entry(NamedTuple):
-    """A scenario as it is known before JAX is loaded: the module that has it, what it takes."""
+    """A scenario as it is known before JAX is loaded: the module that has it, what it takes.
+
+    ``map_free`` is that of a network of R11 and R12: such a map can be asked for a determinant,
+    gains and a box, and has no use for priors on beam and line.
+    """
 
     module: str
     robust: bool = False
     numbers: bool = False
-    line: bool = True
     anchor: bool = False
-    determinant: bool = False
     branches: bool = False
-    box: bool = False
+    map_free: bool = False
 
 
 # A further scenario is a module with a `SCENARIO` and a line here.
 SCENARIOS = {
     "known": Entry("known", robust=True),
-    "transport-network": Entry(
-        "transport_network", line=False, anchor=True, determinant=True, box=True
-    ),
+    "transport-network": Entry("transport_network", anchor=True, map_free=True),
     "calibration": Entry("calibration", robust=True, numbers=True),
     "focusing-network": Entry("focusing_network", anchor=True, branches=True),
 }
@@ -206,31 +206,24 @@ class Assumptions:
         entry = SCENARIOS[scenario]
         named = [*self.calibrations, *self.bounds]
         beyond = [name for name in self.systematics if name not in ON_SCREEN]
-        if beyond and not entry.line:
+        if beyond and entry.map_free:
             expected = f"{' or '.join(ON_SCREEN)}: R11 and R12 are free in it already"
             raise InputError(f"a prior on {beyond[0]} with scenario {scenario}", expected)
-        takes = entry.numbers or (entry.box and not self.calibrations)
+        takes = entry.numbers or (entry.map_free and not self.calibrations)
         if named and not takes:
             raise InputError(
                 f"a prior or bounds on {named[0]} with scenario {scenario}",
                 f"scenario {_taking('numbers')}, whose calibration numbers are free",
             )
-        refused = {
-            "anchor": self.anchor != Anchor(),
-            "determinant": self.anchor.determinant,
-            "branches": self.hysteresis,
-            "box": bool(self.gains),
-        }
-        words = {
-            "anchor": "an anchor",
-            "determinant": "anchor determinant",
-            "branches": "hysteresis",
-            "box": "limits of gains",
-        }
         if robust and not entry.robust:
-            raise InputError(
-                f"a robust fit in scenario {scenario}", f"scenario {_taking('robust')}"
-            )
-        for what, asked in refused.items():
+            expected = f"scenario {_taking('robust')}"
+            raise InputError(f"a robust fit in scenario {scenario}", expected)
+        refused = (
+            ("an anchor", self.anchor != Anchor(), "anchor"),
+            ("anchor determinant", self.anchor.determinant, "map_free"),
+            ("hysteresis", self.hysteresis, "branches"),
+            ("limits of gains", self.gains, "map_free"),
+        )
+        for words, asked, what in refused:
             if asked and not getattr(entry, what):
-                raise InputError(f"{words[what]} with scenario {scenario}", _taking(what))
+                raise InputError(f"{words} with scenario {scenario}", _taking(what))

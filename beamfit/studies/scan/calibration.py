@@ -18,14 +18,7 @@ from beamfit.optics.calibration import CurrentPolynomial, SlopeIntercept
 from beamfit.status import Status
 from beamfit.studies.scan.assumptions import Assumptions
 from beamfit.studies.scan.results import Parameter
-from beamfit.studies.scan.statement import (
-    Scenario,
-    Seen,
-    beam_free,
-    beam_numbers,
-    size_record,
-    varied_magnets,
-)
+from beamfit.studies.scan.statement import Scenario, Seen, beam_problem, varied_magnets
 
 # The report's bounds are 167.23 ± 20 for the slope and 43.17 ± 20 for the intercept (appendix C).
 WIDTH = 20.0 / 167.23
@@ -175,10 +168,9 @@ def _free_numbers(seen: Seen, told: Assumptions) -> dict[str, Number]:
 
 def _state(seen: Seen, told: Assumptions) -> Problem:
     """Beams and calibrations free, all planes together."""
-    numbers, beams = _free_numbers(seen, told), beam_numbers(seen)
+    numbers = _free_numbers(seen, told)
     magnets = {n.magnet: seen.scanned[n.magnet].calibration for n in numbers.values()}
-    seen = seen.keeping(magnets)
-    free, priors = beam_free(beams), []
+    free, priors = [], []
     for name, number in numbers.items():
         low, high = number.value - number.reach, number.value + number.reach
         if name in told.priors:
@@ -186,8 +178,8 @@ def _state(seen: Seen, told: Assumptions) -> Problem:
             low, high = min(low, mean - 6 * sd), max(high, mean + 6 * sd)
             priors.append(Prior(f"magnets.{name}", mean, sd))
         free.append(Free(f"magnets.{name}", *told.bounds.get(name, (low, high))))
-    records = [size_record(seen, plane, seen.of_plane(plane)) for plane in seen.planes]
-    return Problem({"beam": beams, "magnets": magnets}, free, records, priors)
+    seen = seen.keeping(magnets)
+    return beam_problem(seen, model={"magnets": magnets}, free=free, priors=priors)
 
 
 def _parameters(seen: Seen, told: Assumptions, fit: Fit) -> Iterator[Parameter]:

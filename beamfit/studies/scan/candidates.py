@@ -16,14 +16,14 @@ from beamfit.greybox.covariance import MOST_SHARE
 from beamfit.greybox.design import Information
 from beamfit.greybox.fit import value_and_slope
 from beamfit.optics.beamline import Beamline
-from beamfit.optics.calibration import SETTING_UNITS
 from beamfit.optics.elements import Drift, Screen
 from beamfit.studies.scan.calibration import Kind, numbers_of_magnets
 from beamfit.studies.scan.fit import EmittanceFit
 from beamfit.studies.scan.model import emittance_parts, predict_sizes, sigma_of, spoken
 from beamfit.studies.scan.next_point import candidate_settings
+from beamfit.studies.scan.results import in_words
 from beamfit.studies.scan.statement import size_records, varied_magnets
-from beamfit.studies.scan.transport import NetworkRows, Rows, rows_at
+from beamfit.studies.scan.transport import NetworkRows, Rows, rows_at, setting_units
 from beamfit.studies.scan.verdict import CLEAR
 
 
@@ -196,9 +196,7 @@ def _along(fit: EmittanceFit) -> tuple[list[str], list[int]]:
 
 def _in_words(fit: EmittanceFit, settings: Mapping[str, float]) -> str:
     """Settings with the units of the scan."""
-    line = fit.seen.scanned
-    units = {n: SETTING_UNITS[line[n].calibration.unit] for n in settings}
-    return ", ".join(f"{n} = {v:.4g} {units[n]}" for n, v in settings.items())
+    return in_words(settings, setting_units(fit.seen.scanned, settings))
 
 
 def _rows(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -13,10 +13,11 @@ from scipy.optimize import nnls
 from beamfit.errors import InputError, nearest
 from beamfit.greybox.gains import certified_gain
 from beamfit.greybox.mlp import MLP, Port, dense
-from beamfit.greybox.problem import Free, Prior, Record
+from beamfit.greybox.problem import Free, Prior, Problem, Record
 from beamfit.greybox.terms import Constraint
 from beamfit.studies.scan.assumptions import Assumptions
 from beamfit.studies.scan.model import UNIT, sigma_of
+from beamfit.studies.scan.statement import Seen, beam_problem
 from beamfit.studies.scan.transport import padded
 
 # Bounds of the weights: the report's (appendix B).
@@ -103,23 +104,31 @@ def weight_free(path: str, bounds: dict[str, tuple[np.ndarray, np.ndarray]]) -> 
     return [Free(f"{path}.{k}", a, b, (-1.5, 1.5), nuisance=True) for k, (a, b) in bounds.items()]
 
 
-def common_errors(
-    told: Assumptions, names: Iterable[str]
-) -> tuple[dict[str, dict[str, float]], list[Free], list[Prior]]:
-    """The error that all settings share: part of a model, its free numbers, and their priors.
+def network_problem(
+    seen: Seen,
+    told: Assumptions,
+    inputs: Sequence[str],
+    common: Iterable[str],
+    rows: Mapping[str, Any],
+    part: Mapping[str, Any],
+    weights: Iterable[Free],
+    records: Iterable[Record],
+    limits: Iterable[Constraint] = (),
+) -> Problem:
+    """Beams and networks, a part of the model, with the error that all settings share.
 
     A wrong energy or slope moves every setting alike, and does not average out over them. How much
-    of a deviation is common nobody knows, so it may be all of it.
+    of a deviation is `common` to each of these nobody knows, so it may be all of it.
     """
-    names, sd = list(names), told.anchor.deviation
-    if sd is None:
-        return {}, [], []
-    free = [Free(f"anchor.{name}", -0.9, nuisance=True) for name in names]
-    return (
-        {"anchor": dict.fromkeys(names, 0.0)},
-        free,
-        [Prior(f"anchor.{name}", 0.0, sd) for name in names],
-    )
+    for name in (name for place in told.anchor.at for name in place):
+        if name not in inputs:
+            raise InputError(f"an anchor at '{name}'", f"a scanned magnet: {', '.join(inputs)}")
+    sd = told.anchor.deviation
+    shared = {} if sd is None else {"anchor": dict.fromkeys(common, 0.0)}
+    names = [f"anchor.{name}" for name in shared.get("anchor", ())]
+    free = [*weights, *(Free(name, -0.9, nuisance=True) for name in names)]
+    priors = [Prior(name, 0.0, sd) for name in names]
+    return beam_problem(seen, rows, {**part, **shared}, free, records, priors, limits)
 
 
 def known_record(
@@ -127,12 +136,10 @@ def known_record(
 ) -> Record:
     """What first principles say of a network beforehand, padded; ``data`` is padded already."""
     values = np.asarray(values, float)
-    sd, weight = np.broadcast_to(sd, values.shape), np.ones(len(values))
     full = padded(values)
-    rows = np.zeros(len(full))
-    rows[: len(values)] = weight
-    weight = np.broadcast_to(rows.reshape(-1, *[1] * (values.ndim - 1)), full.shape)
-    return Record(name, predict, data, full, padded(sd), weight)
+    weight = np.zeros(full.shape)
+    weight[: len(values)] = 1.0
+    return Record(name, predict, data, full, padded(np.broadcast_to(sd, values.shape)), weight)
 
 
 SIGMA = ("sigma11", "sigma12", "sigma22")

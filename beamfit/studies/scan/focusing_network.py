@@ -25,20 +25,13 @@ from beamfit.quantity import Quantity
 from beamfit.status import Status
 from beamfit.studies.scan.assumptions import Assumptions
 from beamfit.studies.scan.constrained_network import (
-    common_errors,
     known_record,
+    network_problem,
     signed_network,
     weight_free,
 )
 from beamfit.studies.scan.results import Parameter
-from beamfit.studies.scan.statement import (
-    Scenario,
-    Seen,
-    beam_free,
-    beam_numbers,
-    size_record,
-    varied_magnets,
-)
+from beamfit.studies.scan.statement import Scenario, Seen, varied_magnets
 from beamfit.studies.scan.transport import padded
 
 
@@ -145,26 +138,20 @@ def _state(seen: Seen, told: Assumptions) -> Problem:
         found = f"a network of k1 for '{several[0]}', which feeds several magnets"
         raise InputError(found, "a scan of magnets on supplies of their own")
     branches = _branches(seen, varied) if told.hysteresis else {}
-    for name in (name for place in told.anchor.at for name in place):
-        if name not in varied:
-            raise InputError(f"an anchor at '{name}'", f"a scanned magnet: {', '.join(varied)}")
-    strengths, records = {}, []
-    beams = beam_numbers(seen)
-    free = beam_free(beams)
+    strengths, weights, records = {}, [], []
     for name in varied:
         if not seen.scanned[name].length:
             raise InputError(f"a network of k1 for '{name}', which has no length", "a quadrupole")
         strengths[name], bounds = _strength(seen, name, told, name in branches)
-        free += weight_free(f"magnets.{name}.network", bounds)
+        weights += weight_free(f"magnets.{name}.network", bounds)
         records += _anchors(seen, name, told, name in branches)
     settings = seen.rows.settings | {
         name: np.stack([seen.rows.settings[name], padded(branch)], -1)
         for name, branch in branches.items()
     }
-    sizes = [size_record(seen, plane, seen.of_plane(plane, settings)) for plane in seen.planes]
-    common, further, priors = common_errors(told, varied)
-    model = {"beam": beams, "magnets": strengths} | common
-    return Problem(model, [*free, *further], [*sizes, *records], priors)
+    rows = {plane: seen.of_plane(plane, settings) for plane in seen.planes}
+    part = {"magnets": strengths}
+    return network_problem(seen, told, varied, varied, rows, part, weights, records)
 
 
 def _branches(seen: Seen, varied: tuple[str, ...]) -> dict[str, np.ndarray]:

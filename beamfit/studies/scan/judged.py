@@ -14,10 +14,10 @@ from beamfit.quantity import Quantity
 from beamfit.statistics import Directions, reach_of, scaled_directions
 from beamfit.status import Status
 from beamfit.studies.scan.model import QUANTITIES, coefficients, phase_coverage
-from beamfit.studies.scan.next_point import best_symmetric, next_measurement
+from beamfit.studies.scan.next_point import next_measurement
 from beamfit.studies.scan.results import Identifiability, PlaneFit, Points, ScreenTwiss
 from beamfit.studies.scan.statement import Seen, asked_of
-from beamfit.studies.scan.transport import own_settings, own_units
+from beamfit.studies.scan.transport import setting_units
 from beamfit.studies.scan.verdict import BEAM_RULES, LOST
 from beamfit.verdict import Finding, judge
 
@@ -67,6 +67,7 @@ def plane_fit(seen: Seen, line: Beamline, plane: str, a: Answer) -> PlaneFit:
     numbers = [_quantity(*each, reach_of(a.rests_on)) for each in zip_longest(*columns)]
     emittance, normalized, beta, alpha, s11, s12, s22, *screen, mismatch = numbers
     place, p, e = seen.rows.places[-1], a.points, seen.works[plane].evidence
+    own = {name: float(line[name].setting) for name in line.upto(place).magnets}
     return PlaneFit(
         plane=plane,
         status=a.finding.status,
@@ -76,7 +77,7 @@ def plane_fit(seen: Seen, line: Beamline, plane: str, a: Answer) -> PlaneFit:
         beta=beta,
         alpha=alpha,
         sigma=(s11, s12, s22),
-        screen=ScreenTwiss(place, own_settings(line, place), own_units(line, place), *screen),
+        screen=ScreenTwiss(place, own, setting_units(line, own), *screen),
         mismatch=None if getattr(seen.line.design, plane, None) is None else mismatch,
         chi2=a.chi2 if e.noise_known else None,
         dof=a.dof,
@@ -150,7 +151,7 @@ def _limits(seen: Seen, plane: str) -> tuple[float | None, float | None]:
     e = w.evidence
     if not e.full_rank or e.misfit > LOST or e.swamped or (e.dof == 0 and not e.noise_known):
         return None, None
-    start = w.fit.sigma if e.positive else best_symmetric(w.points)
+    start = w.fit.sigma if e.positive else w.fit.symmetric
     limit = upper_limit(start, w.covariance * w.scale**2, e.rests_on)
     return limit, None if limit is None else limit * float(asked_of(seen, plane).factor)
 

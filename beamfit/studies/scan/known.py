@@ -32,15 +32,7 @@ from beamfit.studies.scan.questions import check_gradients
 from beamfit.studies.scan.results import Points
 from beamfit.studies.scan.scans import QuadScan
 from beamfit.studies.scan.sigma import SOLVE, SigmaFit, SizeData
-from beamfit.studies.scan.statement import (
-    Scenario,
-    Seen,
-    Work,
-    asked_of,
-    beam_free,
-    beam_numbers,
-    size_record,
-)
+from beamfit.studies.scan.statement import Scenario, Seen, Work, asked_of, beam_problem
 from beamfit.studies.scan.transport import (
     Look,
     Rows,
@@ -357,9 +349,7 @@ def _constant(p: Points, noise: Noise) -> float:
 
 def _state(seen: Seen, told: Assumptions) -> Problem:
     """The closed form as a problem, starting from its answer, for those who want more than that."""
-    beams = beam_numbers(seen)
-    records = [size_record(seen, plane, seen.of_plane(plane)) for plane in seen.planes]
-    return Problem({"beam": beams}, beam_free(beams), records)
+    return beam_problem(seen)
 
 
 SCENARIO = Scenario("known", _state, closed=True)

@@ -9,7 +9,6 @@ import numpy as np
 from beamfit.greybox.design import Information, rows_of, scores
 from beamfit.optics.rows import transfer_rows
 from beamfit.studies.scan.model import coefficients, size_squared
-from beamfit.studies.scan.results import Points
 from beamfit.studies.scan.statement import Seen
 from beamfit.studies.scan.verdict import LOST
 
@@ -55,16 +54,6 @@ def candidate_settings(
     return found
 
 
-def best_symmetric(points: Points) -> np.ndarray:
-    """The least-squares matrix with no regard to its sign, shape (3,)."""
-    weight = 1.0 / (2.0 * points.weighed * points.error)
-    r11, r12 = points.r11, points.r12
-    design = np.stack([r11**2, 2 * r11 * r12, r12**2], -1) * weight[:, None]
-    norm = np.linalg.norm(design, axis=0)
-    target = (points.size**2 - points.known) * weight
-    return np.linalg.lstsq(design / norm, target, rcond=None)[0] / norm
-
-
 def plausible_sigma(sigma: np.ndarray, covariance: np.ndarray) -> np.ndarray | None:
     """Find a beam near the fit with a positive emittance, to predict sizes with.
 
@@ -96,7 +85,8 @@ def next_measurement(seen: Seen, plane: str) -> str | None:
     if seen.scan.transfer or nothing_to_build_on or not np.isfinite(work.covariance).all():
         return None
     covariance = work.covariance * work.scale**2
-    sigma = plausible_sigma(work.fit.sigma if e.positive else best_symmetric(p), covariance)
+    start = work.fit.sigma if e.positive else work.fit.symmetric
+    sigma = plausible_sigma(start, covariance)
     if sigma is None:
         return None
     relative = max(float(np.median(p.error / p.size)) * work.scale, 1e-3)

@@ -8,7 +8,7 @@ import numpy as np
 
 from beamfit.optics.beamline import Beamline
 from beamfit.optics.calibration import CurrentTable
-from beamfit.optics.elements import Quadrupole
+from beamfit.optics.elements import Element, Quadrupole
 from beamfit.optics.particle import rigidity
 from beamfit.studies.scan.scans import USUAL, QuadScan, middle
 
@@ -16,16 +16,22 @@ from beamfit.studies.scan.scans import USUAL, QuadScan, middle
 STRONG, IMPOSSIBLE = 500.0, 1e4
 
 
+def scanned_magnets(scan: QuadScan, scanned: Beamline) -> Iterator[tuple[str, np.ndarray, Element]]:
+    """Name and settings of each scanned magnet, and of a supply each magnet on it."""
+    for name, settings in () if scan.transfer else scan.settings.items():
+        for member in scanned.members(name):
+            yield name, settings, scanned[member]
+
+
 def gradients(scan: QuadScan, scanned: Beamline) -> dict[str, float]:
     """The largest gradient in T/m of each scanned quadrupole that has a length."""
     energy = float(scanned.energy) if scan.energy is None else scan.energy
     found = {}
-    for name, settings in () if scan.transfer else scan.settings.items():
-        for magnet in (scanned[member] for member in scanned.members(name)):
-            if isinstance(magnet, Quadrupole):
-                k1 = np.asarray(magnet.k1(settings, energy))
-                largest = float(np.abs(k1 * rigidity(energy, scanned.mass)).max())
-                found[name] = max(found.get(name, 0.0), largest)
+    for name, settings, magnet in scanned_magnets(scan, scanned):
+        if isinstance(magnet, Quadrupole):
+            k1 = np.asarray(magnet.k1(settings, energy))
+            largest = float(np.abs(k1 * rigidity(energy, scanned.mass)).max())
+            found[name] = max(found.get(name, 0.0), largest)
     return found
 
 
@@ -94,16 +100,15 @@ def _of_gradients(scan: QuadScan, scanned: Beamline) -> Iterator[str]:
 
 def _of_tables(scan: QuadScan, scanned: Beamline) -> Iterator[str]:
     """Ask about currents beyond those at which a magnet was measured."""
-    for name, settings in () if scan.transfer else scan.settings.items():
-        for magnet in (scanned[member] for member in scanned.members(name)):
-            table = getattr(magnet, "calibration", None)
-            if not isinstance(table, CurrentTable):
-                continue
-            low, high = table.currents[0], table.currents[-1]
-            beyond = int(np.sum((settings < low) | (settings > high)))
-            if beyond:
-                yield (
-                    f"{beyond} of {len(settings)} currents of {name} lie beyond the measured "
-                    f"{low:g} to {high:g} A of {magnet.name}, whose gradient goes on in a straight "
-                    "line there: are they in A?"
-                )
+    for name, settings, magnet in scanned_magnets(scan, scanned):
+        table = getattr(magnet, "calibration", None)
+        if not isinstance(table, CurrentTable):
+            continue
+        low, high = table.currents[0], table.currents[-1]
+        beyond = int(np.sum((settings < low) | (settings > high)))
+        if beyond:
+            yield (
+                f"{beyond} of {len(settings)} currents of {name} lie beyond the measured "
+                f"{low:g} to {high:g} A of {magnet.name}, whose gradient goes on in a straight "
+                "line there: are they in A?"
+            )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -17,6 +17,17 @@ from beamfit.table import Table, cell, json_of, labelled
 
 if TYPE_CHECKING:
     from beamfit.greybox.fit import Variable
+
+
+def in_words(settings: Mapping[str, float], units: Mapping[str, str], digits: int = 4) -> str:
+    """Write settings of magnets with their units.
+
+    Examples
+    --------
+    >>> in_words({"Q1": 1.5, "Q2": -2.0}, {"Q1": "A", "Q2": "kG"})
+    'Q1 = 1.5 A, Q2 = -2 kG'
+    """
+    return ", ".join(f"{n} = {v:.{digits}g} {units[n]}" for n, v in settings.items())
 
 
 @shown
@@ -318,7 +329,7 @@ def result_rows(planes: tuple[PlaneFit, ...]) -> list[tuple[str, list[str]]]:
     """
     at = f"at {planes[0].screen.name}"
     there = planes[0].screen
-    own = ", ".join(f"{n} = {v:.4g} {there.units[n]}" for n, v in there.settings.items()) or "-"
+    own = in_words(there.settings, there.units) or "-"
     rows: list[tuple[str, Callable[[PlaneFit], object]]] = [
         ("status", lambda p: p.status),
         ("normalised emittance", lambda p: p.normalized_emittance),

@@ -5,8 +5,10 @@ Plain numpy, so that a bad file is reported before JAX is ever loaded.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import compress
 from os import PathLike
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -35,24 +37,10 @@ EACH_ROW += ("shots", "slice", "transfer")
 
 @shown
 class PlaneRows(NamedTuple):
-    """The rows of a scan in which one plane was measured.
+    """What a `QuadScan` has of the rows in which one plane was measured, each of shape (n,).
 
-    Attributes
-    ----------
-    settings : dict of str to ndarray
-        Magnet name to settings, each of shape (n,).
-    size : ndarray
-        Rms beam size in m, shape (n,).
-    error : ndarray or None
-        Its standard error in m, shape (n,); None where the file has none.
-    energy : ndarray or None
-        Total energy in MeV, shape (n,).
-    screen : tuple of str or None
-        The screen of each row.
-    resolution : ndarray or None
-        Point-spread rms in m, shape (n,).
-    energy_spread : ndarray or None
-        Relative momentum spread, shape (n,).
+    ``error``, ``energy``, ``screen``, ``resolution`` and ``energy_spread`` are None where it has
+    none.
     """
 
     settings: dict[str, np.ndarray]
@@ -390,12 +378,9 @@ class QuadScan:
                 )
 
     def _check_three_settings(self, plane: str) -> None:
-        measured = ~np.isnan(self.size[plane])
         distinct = "settings" if self.settings or self.transfer else "screens"
-        keys = {key for key, one in zip(row_keys(self), measured, strict=True) if one}
-        own = self.slice or ("",) * len(self)
-        for name in dict.fromkeys(n for n, one in zip(own, measured, strict=True) if one) or ("",):
-            number = sum(key[0] == name for key in keys)
+        keys = dict.fromkeys(compress(row_keys(self), ~np.isnan(self.size[plane])))
+        for name, number in (Counter(key[0] for key in keys) or {"": 0}).items():
             if number < 3:
                 of = f" of slice {name}" if name else ""
                 raise self.unusable(

@@ -22,7 +22,6 @@ from beamfit.greybox.fit import Fit, Variable
 from beamfit.greybox.problem import Free, Problem, Record, padded_length, residual
 from beamfit.greybox.solve import search, solve
 from beamfit.optics.beamline import Beamline
-from beamfit.optics.calibration import SETTING_UNITS
 from beamfit.quantity import Quantity
 from beamfit.studies.scan.calibration import with_numbers
 from beamfit.studies.scan.setpoint_result import (
@@ -35,6 +34,7 @@ from beamfit.studies.scan.setpoint_result import (
     reached_words,
     verdict_on,
 )
+from beamfit.studies.scan.transport import setting_units
 from beamfit.studies.scan.wishes import (
     KINDS,
     Beam,
@@ -145,7 +145,7 @@ def find_setpoint(
     short = carrying.condensed((*vary, screen), carrying.energy)
     wanted = _wanted(short, used, vary, targets)
     minima, fit = _search(_stated(wanted), seed)
-    units = {name: SETTING_UNITS[line[name].calibration.unit] for name in vary}
+    units = setting_units(line, vary)
     listed = [Minimum(_settings(wanted, theta), value) for theta, value in minima]
     predicted = _predicted(wanted, used, fit.theta)
     misses = _relative_misses(wanted, targets, fit.theta)

@@ -11,6 +11,7 @@ import numpy as np
 from beamfit.quantity import Quantity
 from beamfit.shown import shown
 from beamfit.status import Status
+from beamfit.studies.scan.results import in_words
 from beamfit.studies.scan.wishes import SAME_ENERGY, Beam, Target
 from beamfit.table import Table, cell, json_of, text_of
 from beamfit.verdict import Finding, judge
@@ -106,7 +107,7 @@ class Setpoint:
     @property
     def headline(self) -> str:
         """The settings found, in a line."""
-        return f"{cell(self.status)}: {_listed(self.best.settings, self.units, 4)}"
+        return f"{cell(self.status)}: {in_words(self.best.settings, self.units)}"
 
     def to_json(self) -> dict[str, Any]:
         """Give the entry of ``results`` of the JSON contract; size and so on of the first plane."""
@@ -142,7 +143,7 @@ class Setpoint:
         title = f"Best settings of {self.line} for the beam at {self.screen}"
         best = Table(title, ["", "setting", "± from the beam"], rows)
         others = [
-            [f"  {_listed(m.settings, self.units, 5)}: objective {m.objective:.6g}"]
+            [f"  {in_words(m.settings, self.units, 5)}: objective {m.objective:.6g}"]
             for m in self.others[:5]
         ]
         return (best, Table("Other minima", [], others)) if others else (best,)
@@ -243,7 +244,7 @@ def verdict_on(
     best, other = minima[:2]
     alike = other.objective - best.objective < 1e-6 * (1.0 + best.objective)
     lead = "Other settings do as well, such as" if alike else "The next local minimum is"
-    at = _listed(other.settings, units, 4)
+    at = in_words(other.settings, units)
     return found.status, f"{found.message} {lead} {at} (objective {other.objective:.6g})."
 
 
@@ -293,10 +294,6 @@ def doubts_on(beams: Mapping[str, Beam]) -> dict[str, str]:
         for plane, beam in beams.items()
         if beam.doubt is not None
     }
-
-
-def _listed(settings: Mapping[str, float], units: Mapping[str, str], digits: int) -> str:
-    return ", ".join(f"{n} = {v:.{digits}g} {units[n]}" for n, v in settings.items())
 
 
 def _micro(target: Target, got: Quantity) -> str:

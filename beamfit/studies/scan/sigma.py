@@ -89,6 +89,8 @@ class SigmaFit(NamedTuple):
         Shape (n,): errors of the sizes as the weights took them, m.
     weighed : Array
         Shape (n,): the sizes that the errors of size² were taken at, m.
+    symmetric : Array
+        Shape (3,): the best symmetric matrix, positive or not, where ``full_rank``.
     """
 
     sigma: Array
@@ -102,6 +104,7 @@ class SigmaFit(NamedTuple):
     converged: Array
     error: Array
     weighed: Array
+    symmetric: Array
 
 
 def solve_size_squared(data: SizeData, weights: str = "model") -> SigmaFit:
@@ -137,7 +140,7 @@ def solve_size_squared(data: SizeData, weights: str = "model") -> SigmaFit:
     best = jnp.where(positive, sigma, degenerate)
     chi2, rested = jnp.sum((design @ best - target) ** 2), jnp.asarray(True)
     judged = determinant, determinant_error, chi2_zero, full_rank, positive, rested
-    return SigmaFit(best, covariance, chi2, *judged, error, size)
+    return SigmaFit(best, covariance, chi2, *judged, error, size, sigma)
 
 
 def _determinant(sigma: Array, covariance: Array) -> tuple[Array, Array]:

@@ -6,11 +6,13 @@ import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from importlib import import_module
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from beamfit.greybox.problem import Free, Problem, Record
+from beamfit.greybox.problem import Free, Prior, Problem, Record
+from beamfit.greybox.terms import Constraint
 from beamfit.optics.beamline import Beamline
 from beamfit.studies.scan.assumptions import SCENARIOS, Assumptions
 from beamfit.studies.scan.model import UNIT, Asked, predict_sizes
@@ -245,3 +247,19 @@ def beam_free(beams: Mapping[str, Mapping[str, float]]) -> list[Free]:
             low = -np.inf if name == "l21" else 1e-6
             free.append(Free(f"beam.{plane}.{name}", low, np.inf, reach[name]))
     return free
+
+
+def beam_problem(
+    seen: Seen,
+    rows: Mapping[str, Any] | None = None,
+    model: Mapping[str, Any] = MappingProxyType({}),
+    free: Iterable[Free] = (),
+    records: Iterable[Record] = (),
+    priors: Iterable[Prior] = (),
+    constraints: Iterable[Constraint] = (),
+) -> Problem:
+    """The beams and the sizes of their rows, by plane, with what else a scenario has."""
+    beams, rows = beam_numbers(seen), rows or {p: seen.of_plane(p) for p in seen.planes}
+    sizes = [size_record(seen, plane, own) for plane, own in rows.items()]
+    free, records = [*beam_free(beams), *free], [*sizes, *records]
+    return Problem({"beam": beams, **model}, free, records, [*priors], [*constraints])

@@ -368,11 +368,6 @@ def look_through(rows: Rows) -> Look:
     )
 
 
-def own_settings(line: Beamline, screen: str) -> dict[str, float]:
-    """The lattice's own setting of every magnet up to a screen."""
-    return {name: float(line[name].setting) for name in line.upto(screen).magnets}
-
-
-def own_units(line: Beamline, screen: str) -> dict[str, str]:
-    """The units of `own_settings`."""
-    return {n: SETTING_UNITS[line[n].calibration.unit] for n in line.upto(screen).magnets}
+def setting_units(line: Beamline, magnets: Iterable[str]) -> dict[str, str]:
+    """The units of the settings of magnets, as they are written for people."""
+    return {n: SETTING_UNITS[line[n].calibration.unit] for n in magnets}

@@ -13,7 +13,6 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
-from beamfit.errors import InputError
 from beamfit.greybox.bounds import over_cells
 from beamfit.greybox.mlp import MLP, Port
 from beamfit.greybox.problem import Free, Problem, Record
@@ -23,21 +22,14 @@ from beamfit.studies.scan.assumptions import Assumptions
 from beamfit.studies.scan.constrained_network import (
     beam_box,
     check_box,
-    common_errors,
     known_record,
     limited_network,
+    network_problem,
     signed_network,
     weight_free,
 )
 from beamfit.studies.scan.results import Parameter
-from beamfit.studies.scan.statement import (
-    Scenario,
-    Seen,
-    beam_free,
-    beam_numbers,
-    size_record,
-    varied_magnets,
-)
+from beamfit.studies.scan.statement import Scenario, Seen, varied_magnets
 from beamfit.studies.scan.transport import NetworkRows, padded
 
 CELLS = 32
@@ -171,19 +163,13 @@ def _columns(seen: Seen, lay: _Layout, plane: str, which: np.ndarray) -> np.ndar
 def _state(seen: Seen, told: Assumptions) -> Problem:
     """Beams, and one network for A and B of every plane and screen."""
     lay = _layout(seen, told)
-    for name in (name for place in told.anchor.at for name in place):
-        if name not in lay.names:
-            raise InputError(f"an anchor at '{name}'", f"a scanned magnet: {', '.join(lay.names)}")
     check_box(told, lay.names, _names(seen, lay), seen.planes)
     net, weights, limits = _limited(seen, lay, told) if told.gains else _signed(seen, lay, told)
     limits += beam_box(told, seen.planes)
-    beams, records = beam_numbers(seen), []
-    for plane in seen.planes:
-        rows = network_rows(seen, lay, plane)
-        records += [size_record(seen, plane, rows), *_anchors(seen, lay, told, rows)]
-    common, further, priors = common_errors(told, seen.planes)
-    free = [*beam_free(beams), *weights, *further]
-    return Problem({"beam": beams, "map": net} | common, free, records, priors, limits)
+    rows = {plane: network_rows(seen, lay, plane) for plane in seen.planes}
+    anchors = [record for own in rows.values() for record in _anchors(seen, lay, told, own)]
+    part = {"map": net}
+    return network_problem(seen, told, lay.names, seen.planes, rows, part, weights, anchors, limits)
 
 
 def _signed(seen: Seen, lay: _Layout, told: Assumptions) -> tuple[MLP, list[Free], list]:
