@@ -165,8 +165,8 @@ def test_bad_wishes_are_named(known, options, words):
 def test_zero_is_not_listed_as_its_rounding(known):
     """linspace(-1.7, 1.7, 41) misses zero by 2.2e-16."""
     limits = {"Q2": (-1.7, 1.7)}
-    found = candidate_rows(known, limits, ())
-    settings = [c.candidate.settings["Q2"] for c in found]
+    candidates, _ = candidate_rows(known, limits, ())
+    settings = [c.settings["Q2"] for c in candidates]
     assert 0.0 in settings
     assert min(abs(s) for s in settings if s) > 1e-3
 

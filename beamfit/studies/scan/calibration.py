@@ -185,11 +185,8 @@ def _state(seen: Seen, told: Assumptions) -> Problem:
 def _parameters(seen: Seen, told: Assumptions, fit: Fit) -> Iterator[Parameter]:
     settled = fit.status is not Status.not_converged
     for name, number in _free_numbers(seen, told).items():
-        v = fit[f"magnets.{name}"]
-        edge = v.state in ("lower", "upper")
-        known = settled and not edge and v.error == v.error
-        status = Status.converged if known else Status.at_limit if edge else Status.unidentified
-        yield Parameter.of(name, v, number.unit, status, told.priors.get(name))
+        v, prior = fit[f"magnets.{name}"], told.priors.get(name)
+        yield Parameter.of(name, v, number.unit, prior, settled)
 
 
 def _null_directions(

@@ -109,18 +109,11 @@ class Candidate(NamedTuple):
     words: str
 
 
-class Considered(NamedTuple):
-    """A candidate with its rows of the Jacobian, one a plane."""
-
-    candidate: Candidate
-    rows: np.ndarray
-
-
 def candidate_rows(
     fit: EmittanceFit,
     limits: Mapping[str, tuple[float, float]] | None,
     energies: tuple[float, ...],
-) -> list[Considered]:
+) -> tuple[list[Candidate], np.ndarray]:
     """List single further measurements with their rows of the Jacobian.
 
     Parameters
@@ -134,26 +127,26 @@ def candidate_rows(
 
     Returns
     -------
-    list of Considered
-        At every screen of the line, and every energy.
+    list of Candidate and ndarray
+        At every screen of the line, and every energy; rows of shape (candidates, planes, n).
 
     Raises
     ------
     InputError
         If limits name no magnet of the line, or are reversed.
     """
-    own, screens, found = fit.seen.energy, _screens(fit), []
+    own, screens, found, rows = fit.seen.energy, _screens(fit), [], []
     for name, table in candidate_settings(fit.scan.settings, _checked(fit, limits)):
         points = [{n: float(v[i]) for n, v in table.items()} for i in range(len(table[name]))]
         for screen, energy in product(screens, (own, *energies)):
-            rows = _rows(fit, fit.seen.scanned, table, screen, np.full(len(points), energy))
+            every = _rows(fit, fit.seen.scanned, table, screen, np.full(len(points), energy))
+            rows += list(every.swapaxes(0, 1))
             there = f" on {screen}" if len(screens) > 1 else ""
             there += f" at {energy:g} MeV" if energy != own else ""
-            for i, settings in enumerate(points):
+            for settings in points:
                 words = _in_words(fit, settings) + there
-                candidate = Candidate(settings, screen, float(energy), words)
-                found.append(Considered(candidate, rows[:, i]))
-    return found
+                found.append(Candidate(settings, screen, float(energy), words))
+    return found, np.array(rows)
 
 
 def _checked(fit: EmittanceFit, limits):

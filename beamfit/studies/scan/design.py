@@ -11,8 +11,6 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-import numpy as np
-
 from beamfit.errors import InputError
 from beamfit.greybox.design import Information, greedy
 from beamfit.shown import shown
@@ -204,6 +202,7 @@ def plan_measurements(
 
     Examples
     --------
+    >>> import numpy as np
     >>> from beamfit.optics.beamline import Beamline
     >>> from beamfit.optics.elements import Drift, Quadrupole, Screen
     >>> from beamfit.studies.scan.fit import fit_emittance
@@ -246,14 +245,14 @@ def best_steps(
     energies: tuple[float, ...] = (),
 ) -> tuple[tuple[Step, ...], str]:
     """The best measurement, the best after that, and why the list ends."""
-    considered = candidate_rows(fit, limits, energies)
+    candidates, rows = candidate_rows(fit, limits, energies)
     aim = "" if goal is None else f"goal of {100 * goal:.3g} %"
 
     def sharp(known: Information) -> bool:
         return goal is not None and identified(known) and known.relative_error.max() <= goal
 
     now, steps = base, []
-    for choice in greedy(base, np.array([c.rows for c in considered]), criterion == "D"):
+    for choice in greedy(base, rows, criterion == "D"):
         if len(steps) == count:
             break
         if sharp(now):
@@ -265,8 +264,7 @@ def best_steps(
                 "measurement."
             )
         now = choice.known
-        found = considered[choice.index].candidate
-        steps.append(Step(found, by_plane(fit, now), identified(now)))
+        steps.append(Step(candidates[choice.index], by_plane(fit, now), identified(now)))
     if sharp(now):
         return tuple(steps), f"Stop after these: the {aim} is reached."
     if goal is not None and identified(now):

@@ -229,23 +229,18 @@ def _derived(name: str, found: Derived, i: int, settled: bool) -> Parameter:
     return Parameter(name, value, Status.converged if known else Status.unidentified)
 
 
-def _null_directions(
-    seen: Seen, parameters: tuple[Parameter, ...], identified: bool
-) -> tuple[str, ...]:
-    said = (
-        "at each setting k1 is free to take up what the beam leaves: another beam with another "
-        "curve k1(I) gives the same sizes"
-    )
-    return () if identified else (said,)
-
-
-def _remedy(seen: Seen, told: Assumptions) -> str:
-    return (
+OPEN = (
+    "at each setting k1 is free to take up what the beam leaves: another beam with another curve "
+    "k1(I) gives the same sizes"
+)
+SCENARIO = Scenario(
+    "focusing-network",
+    _state,
+    _parameters,
+    null_directions=lambda _seen, _parameters, identified: () if identified else (OPEN,),
+    remedy=lambda _seen, _told: (
         "sizes at a second screen, or an anchor to the lattice's calibration "
         "(--anchor first-principles=2%)"
-    )
-
-
-SCENARIO = Scenario(
-    "focusing-network", _state, _parameters, _null_directions, _remedy, network=True
+    ),
+    network=True,
 )

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from types import MappingProxyType
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -27,7 +27,7 @@ from beamfit.studies.scan.noise import (
     noise_of,
     unlikely,
 )
-from beamfit.studies.scan.outliers import Influence, RobustFit, fit_robust, influence_of
+from beamfit.studies.scan.outliers import Doubted, Influence, fit_robust, influence_of
 from beamfit.studies.scan.questions import check_gradients
 from beamfit.studies.scan.results import Points
 from beamfit.studies.scan.scans import QuadScan
@@ -48,6 +48,8 @@ from beamfit.studies.scan.verdict import Evidence, one_magnet, waist_bracketed
 METHODS = ("size_squared", "size")
 # Whose size errors are taken at.
 WEIGHTS = ("model", "measured")
+# What a plain fit doubts.
+NONE: Mapping[str, Doubted] = MappingProxyType({})
 
 
 def see(
@@ -81,12 +83,10 @@ def see(
     seen = unfitted(scan, line, planes, method, robust, weights)
     # Noise that is inferred is fitted in two ways, by the same program.
     if at_once and not robust and all(noise.known for noise in seen.noises.values()):
-        look, found = _look_and_fit(seen.rows, sizes_of(seen), method, weights)
-        return fitted(seen._replace(look=jax.tree.map(np.asarray, look)), found)
-    look = jax.tree.map(np.asarray, look_through(seen.rows))
-    seen = in_closed_form(seen._replace(look=look))
-    other = of_other_kind(seen)
-    return likelier(seen, in_closed_form(other)) if other else seen
+        given = [(seen.rows, sizes_of(seen))]
+        [(look, found)] = one_by_one(_look_and_fit, given, method, weights)
+        return fitted(seen._replace(look=look), found)
+    return looked_through([seen])[0]
 
 
 def prepared(
@@ -139,24 +139,40 @@ def unfitted(
     return Seen(scan, line, scanned, asked, method, robust, weights, rows, noises, None, {})
 
 
-def in_closed_form(seen: Seen) -> Seen:
-    """Fit every plane that has a noise, given what is seen of it."""
-    doubts = {plane: _doubt(seen, plane) for plane in seen.noises} if seen.robust else {}
-    sizes = sizes_of(seen, {plane: doubt.error for plane, doubt in doubts.items()})
-    return fitted(seen, fit_look(seen.look, sizes, seen.method, seen.weights), doubts)
+def one_by_one(function: Callable[..., Any], given: Iterable[tuple], *static: str) -> list[Any]:
+    """What a compiled function gives of each, as NumPy arrays."""
+    return [jax.tree.map(np.asarray, function(*each, *static)) for each in given]
 
 
-def _doubt(seen: Seen, plane: str) -> RobustFit:
+def looked_through(begun: Sequence[Seen], together: Callable = one_by_one) -> list[Seen]:
+    """Look at scans through their lines and fit them, those of inferred noise in two ways."""
+    looks = together(look_through, [(seen.rows,) for seen in begun])
+    begun = [seen._replace(look=look) for seen, look in zip(begun, looks, strict=True)]
+    every = in_closed_form(begun, together)
+    others = {i: other for i, seen in enumerate(every) if (other := of_other_kind(seen))}
+    for i, other in zip(others, in_closed_form(list(others.values()), together), strict=True):
+        every[i] = likelier(every[i], other)
+    return every
+
+
+def in_closed_form(begun: Sequence[Seen], together: Callable = one_by_one) -> list[Seen]:
+    """Fit every plane that has a noise, given what is seen of it; all in the same way."""
+    if not begun:
+        return []
+    doubts = [{p: _doubt(seen, p) for p in seen.noises} if seen.robust else {} for seen in begun]
+    given = [(seen.look, sizes_of(seen, doubt)) for seen, doubt in zip(begun, doubts, strict=True)]
+    found = together(fit_look, given, begun[0].method, begun[0].weights)
+    return list(map(fitted, begun, found, doubts))
+
+
+def _doubt(seen: Seen, plane: str) -> Doubted:
     at, i = seen.measured(plane), "xy".index(plane)
     r11, r12, known = (part[i, at] for part in seen.look[:3])
     return fit_robust(r11, r12, seen.scan.size[plane][at], seen.noises[plane], known, seen.weights)
 
 
-def fitted(
-    seen: Seen, found: ClosedForm, doubts: Mapping[str, RobustFit] = MappingProxyType({})
-) -> Seen:
+def fitted(seen: Seen, found: ClosedForm, doubts: Mapping[str, Doubted] = NONE) -> Seen:
     """The same with the closed form of every plane that has a noise, in their order."""
-    found = jax.tree.map(np.asarray, found)
     works = {p: _work(seen, p, found, i, doubts.get(p)) for i, p in enumerate(seen.noises)}
     return seen._replace(works=works)
 
@@ -209,8 +225,8 @@ class _Sizes(NamedTuple):
     design: np.ndarray
 
 
-def sizes_of(seen: Seen, errors: Mapping[str, np.ndarray] = MappingProxyType({})) -> _Sizes:
-    """The planes that have a noise, with its errors unless others are given."""
+def sizes_of(seen: Seen, doubts: Mapping[str, Doubted] = NONE) -> _Sizes:
+    """The planes that have a noise, with its errors, or those of a robust fit."""
     shape = (2, len(seen.rows.energy))
     found = _Sizes(
         np.zeros(2, int),
@@ -224,7 +240,7 @@ def sizes_of(seen: Seen, errors: Mapping[str, np.ndarray] = MappingProxyType({})
         own, at, asked = slice(i, None), seen.measured(plane), asked_of(seen, plane)
         found.which[own] = "xy".index(plane)
         found.size[own, at] = seen.scan.size[plane][at]
-        found.error[own, at] = errors.get(plane, noise.error)
+        found.error[own, at] = doubts.get(plane, noise).error
         found.error[own, len(seen.scan) :] = np.inf
         found.relative[own] = noise.relative
         found.factor[own], found.design[own] = asked.factor, asked.design
@@ -259,7 +275,7 @@ def _look_and_fit(rows: Rows, sizes: _Sizes, method: str, weights: str) -> tuple
     return look, fit_look(look, sizes, method, weights)
 
 
-def _work(seen: Seen, plane: str, found: ClosedForm, i: int, doubt: RobustFit | None) -> Work:
+def _work(seen: Seen, plane: str, found: ClosedForm, i: int, doubt: Doubted | None) -> Work:
     scan, at, noise = seen.scan, seen.measured(plane), seen.noises[plane]
     fit = SigmaFit(*(part[i] for part in found.fit))
     probability = None if doubt is None else doubt.outlier_probability

@@ -14,19 +14,9 @@ from beamfit.optics.beamline import Beamline
 from beamfit.studies.scan.assumptions import Assumptions
 from beamfit.studies.scan.fit import EmittanceFit
 from beamfit.studies.scan.judged import judged_beam
-from beamfit.studies.scan.known import (
-    METHODS,
-    fit_look,
-    fitted,
-    likelier,
-    of_other_kind,
-    prepared,
-    sizes_of,
-    unfitted,
-)
+from beamfit.studies.scan.known import looked_through, prepared, unfitted
 from beamfit.studies.scan.scans import QuadScan
 from beamfit.studies.scan.statement import Seen, scenario_of
-from beamfit.studies.scan.transport import look_through
 
 # How many a call is compiled for, and what bounds them: rows times the longest of their arrays.
 FEW, LANES, ROOM = 16, 256, 1 << 20
@@ -64,32 +54,14 @@ def fit_many(
     for i, given in enumerate(scans):
         try:
             own, through = prepared(*given)
-            begun[i] = unfitted(own, through, None, METHODS[0], False, weights)
+            begun[i] = unfitted(own, through, weights=weights)
             found.append(None)
         except InputError as error:
             found.append(error)
-    for i, seen in zip(begun, _fitted(list(begun.values()), weights), strict=True):
+    for i, seen in zip(begun, looked_through(list(begun.values()), _together), strict=True):
         own = (seen.scan, seen.line, scenario_of("known"), Assumptions())
         found[i] = EmittanceFit(judged_beam(seen), *own, seen)
     return found
-
-
-def _fitted(begun: Sequence[Seen], weights: str) -> list[Seen]:
-    """Look through the lines and fit, with inferred noise in two ways, as `see` does."""
-    looks = _together(look_through, [(seen.rows,) for seen in begun])
-    seen = [s._replace(look=look) for s, look in zip(begun, looks, strict=True)]
-    fit = partial(_planes, weights=weights)
-    seen = fit(seen)
-    others = {i: other for i, s in enumerate(seen) if (other := of_other_kind(s))}
-    for i, other in zip(others, fit(list(others.values())), strict=True):
-        seen[i] = likelier(seen[i], other)
-    return seen
-
-
-def _planes(seen: Sequence[Seen], weights: str) -> list[Seen]:
-    given = [(s.look, sizes_of(s)) for s in seen]
-    found = _together(fit_look, given, METHODS[0], weights)
-    return [fitted(s, own) for s, own in zip(seen, found, strict=True)]
 
 
 def _together(function: Callable[..., Any], given: Sequence[tuple], *static: str) -> list[Any]:

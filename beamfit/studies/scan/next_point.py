@@ -9,6 +9,7 @@ import numpy as np
 from beamfit.greybox.design import Information, rows_of, scores
 from beamfit.optics.rows import transfer_rows
 from beamfit.studies.scan.model import coefficients, size_squared
+from beamfit.studies.scan.results import in_words
 from beamfit.studies.scan.statement import Seen
 from beamfit.studies.scan.verdict import LOST
 
@@ -102,8 +103,8 @@ def next_measurement(seen: Seen, plane: str) -> str | None:
     _, magnet, setting = min(tried, key=lambda each: each[0])
     values = p.settings[magnet]
     inside = values.min() <= setting <= values.max()
-    held = [f"{n} = {np.median(v):.3g} {p.units[n]}" for n, v in p.settings.items() if n != magnet]
-    others = f", with {', '.join(held)} at {seen.rows.places[-1]}" if held else ""
+    held = {name: np.median(v) for name, v in p.settings.items() if name != magnet}
+    others = f", with {in_words(held, p.units, 3)} at {seen.rows.places[-1]}" if held else ""
     return (
         f"Measure next near {magnet} = {setting:.3g} {p.units[magnet]}, "
         f"{'inside' if inside else 'beyond'} the scanned range{others}: of single points it would "

@@ -13,7 +13,7 @@ from beamfit.statistics import POOR_FIT
 from beamfit.studies.scan.model import coefficients, size_squared
 from beamfit.studies.scan.noise import DOUBTFUL, ENOUGH_POINTS, Noise
 from beamfit.studies.scan.results import Points
-from beamfit.studies.scan.sigma import SigmaFit, error_at, fit_sizes
+from beamfit.studies.scan.sigma import error_at, fit_sizes
 
 # A point carries the answer if the emittance moves by so many of its errors without it.
 CARRIES = 2.0
@@ -131,20 +131,12 @@ FRACTION, WIDTH = 0.05, 10.0
 TRIPLES, ROWS, STEPS = 500, 2_000_000, 2
 
 
-class RobustFit(NamedTuple):
-    """A weighted fit and what it thinks of each point.
+class Doubted(NamedTuple):
+    """What a robust fit thinks of each point, arrays of shape (n,).
 
-    Attributes
-    ----------
-    fit : SigmaFit
-        With each point's error widened as far as it is thought an outlier.
-    outlier_probability : ndarray
-        Shape (n,).
-    error : ndarray
-        The widened errors, m.
+    ``error`` is that of the sizes in m, widened as far as each is thought an outlier.
     """
 
-    fit: SigmaFit
     outlier_probability: np.ndarray
     error: np.ndarray
 
@@ -179,7 +171,7 @@ def fit_robust(
     noise: Noise,
     known: np.ndarray,
     weights: str = "model",
-) -> RobustFit:
+) -> Doubted:
     """Fit size² with a mixture of good points and outliers.
 
     Parameters
@@ -194,7 +186,7 @@ def fit_robust(
 
     Returns
     -------
-    RobustFit
+    Doubted
         The maximum of the mixture likelihood nearest the start.
 
     Notes
@@ -218,31 +210,28 @@ def fit_robust(
     """
     n = len(size)
 
-    def fitted(widening: np.ndarray) -> tuple[SigmaFit, np.ndarray]:
-        """Fits with errors widened, and how many unwidened errors each point is off."""
+    def off_by(widening: np.ndarray) -> np.ndarray:
+        """How many unwidened errors each point is off a fit with errors widened."""
         options = {"relative": noise.relative, "weights": weights}
         fit = fit_sizes(r11, r12, size, noise.error * widening, known, **options)
         model = size_squared(np.moveaxis(fit.sigma, -1, 0)[..., None], r11, r12, known)
         error = error_at(np.asarray(fit.weighed), size, noise.error, noise.relative)
-        return fit, (model - size**2) / (2.0 * np.asarray(fit.weighed) * error)
+        return (model - size**2) / (2.0 * np.asarray(fit.weighed) * error)
 
-    pull, factor = _least_trimmed(fitted, np.lexsort((r12, r11, size))), 1.0
+    pull, factor = _least_trimmed(off_by, np.lexsort((r12, r11, size))), 1.0
     if not noise.known:
         factor = 1.4826 * np.median(np.abs(pull)) * np.sqrt(n / max(n - 3, 1))
         factor = max(factor, 1e-9)  # points that fit exactly have no noise to scale by
     width = WIDTH
     for _ in range(200):
         probability, width, widening = doubts(pull / factor, width)
-        fit, moved = fitted(widening)
-        settled = np.max(np.abs(moved - pull)) < 1e-9 * max(1.0, np.max(np.abs(pull)))
-        pull = moved
-        if settled:
+        last, pull = pull, off_by(widening)
+        if np.max(np.abs(pull - last)) < 1e-9 * max(1.0, np.max(np.abs(last))):
             break
-    fit = fit._replace(converged=np.bool_(settled))
-    return RobustFit(fit, probability, noise.error * widening)
+    return Doubted(probability, noise.error * widening)
 
 
-def _least_trimmed(fitted, order: np.ndarray) -> np.ndarray:
+def _least_trimmed(off_by, order: np.ndarray) -> np.ndarray:
     """Residuals of the fit that meets its better half of the points best."""
     n = len(order)
     half, most = (n + 4) // 2, max(min(TRIPLES, ROWS // n), 1)
@@ -255,11 +244,11 @@ def _least_trimmed(fitted, order: np.ndarray) -> np.ndarray:
     kept[np.arange(len(chosen))[:, None], order[chosen]] = True
     kept[-1] = True  # the fit of all points
     for _ in range(STEPS + 1):
-        off = np.abs(fitted(np.where(kept, 1.0, np.inf))[1])
+        off = np.abs(off_by(np.where(kept, 1.0, np.inf)))
         off = np.where(np.isfinite(off), off, np.inf)
         best = np.argsort(off, axis=1, kind="stable")[:, :half]
         kept = np.zeros_like(kept)
         np.put_along_axis(kept, best, True, axis=1)
     trimmed = np.sum(np.take_along_axis(off, best, 1) ** 2, axis=1)
     winner = kept[np.argmin(trimmed)]
-    return fitted(np.where(winner, 1.0, np.inf))[1]
+    return off_by(np.where(winner, 1.0, np.inf))

@@ -116,12 +116,14 @@ class Parameter(NamedTuple):
         name: str,
         v: Variable,
         unit: str,
-        status: Status,
         prior: tuple[float, float] | None = None,
+        settled: bool = True,
     ) -> Parameter:
-        """A free number of a fit, with its error where the status says that it is known."""
-        errors = (v.error, v.error_raw) if status is Status.converged else (None, None)
-        value = Quantity(v.value, errors[0], unit, errors[1])
+        """A free number of a fit, with its error where a fit that settled determines it."""
+        status = Status.unidentified if v.state == "free" else Status.at_limit
+        value = Quantity(v.value, None, unit)
+        if settled and v.state == "free" and math.isfinite(v.error):
+            status, value = Status.converged, Quantity(v.value, v.error, unit, v.error_raw)
         return cls(name, value, status, v.state, v.lower, v.upper, prior, v.reduced_gradient)
 
 
@@ -315,18 +317,7 @@ class PlaneFit:
 
 
 def result_rows(planes: tuple[PlaneFit, ...]) -> list[tuple[str, list[str]]]:
-    """Label and one cell per plane, for every number a result has.
-
-    Parameters
-    ----------
-    planes : tuple of PlaneFit
-        The planes of a fit.
-
-    Returns
-    -------
-    list of (str, list of str)
-        Rows in the order they are read.
-    """
+    """Label and one cell per plane of every number a result has, in the order they are read."""
     at = f"at {planes[0].screen.name}"
     there = planes[0].screen
     own = in_words(there.settings, there.units) or "-"

@@ -130,6 +130,11 @@ def solve_size_squared(data: SizeData, weights: str = "model") -> SigmaFit:
     that noise made small counts for more, which makes σ small by 3 r² to 7 r² for a relative
     noise r, however many points there are; the model's size has no part in the noise.
     """
+    return _linear(data, weights)[0]
+
+
+def _linear(data: SizeData, weights: str) -> tuple[SigmaFit, Array]:
+    """The linear fit, and the best beam of no emittance."""
     size, error = _weighed(data, weights)
     scale = 0.5 / (size * error)
     target, design = (data.size**2 - data.known) * scale, data.design * scale[:, None]
@@ -140,7 +145,7 @@ def solve_size_squared(data: SizeData, weights: str = "model") -> SigmaFit:
     best = jnp.where(positive, sigma, degenerate)
     chi2, rested = jnp.sum((design @ best - target) ** 2), jnp.asarray(True)
     judged = determinant, determinant_error, chi2_zero, full_rank, positive, rested
-    return SigmaFit(best, covariance, chi2, *judged, error, size, sigma)
+    return SigmaFit(best, covariance, chi2, *judged, error, size, sigma), degenerate
 
 
 def _determinant(sigma: Array, covariance: Array) -> tuple[Array, Array]:
@@ -219,7 +224,7 @@ def solve_size(data: SizeData, weights: str = "model") -> SigmaFit:
     Residual (model - size)/error (Appendices A and C of the report), on the Cholesky factor of σ
     in units of its start, so that every iterate has a size.
     """
-    start = solve_size_squared(data, weights)
+    start, degenerate = _linear(data, weights)
     scale = 1.0 / start.error
     design = data.design
     unit = jnp.sqrt(jnp.abs(start.sigma[jnp.array([0, 2])]))
@@ -241,9 +246,7 @@ def solve_size(data: SizeData, weights: str = "model") -> SigmaFit:
     _, covariance, full_rank = _least_squares(design * (0.5 * scale / model)[:, None], data.size)
     determinant, determinant_error = _determinant(sigma, covariance)
     chi2 = 2.0 * end.cost
-    linear = 0.5 / (start.weighed * start.error)
-    target = (data.size**2 - data.known) * linear
-    flat = jnp.sqrt(design @ zero_emittance(data.r11, data.r12, target, linear)[0] + data.known)
+    flat = jnp.sqrt(design @ degenerate + data.known)
     flat_chi2 = jnp.sum(((flat - data.size) * scale) ** 2)
     return start._replace(
         sigma=sigma,

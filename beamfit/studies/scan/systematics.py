@@ -17,7 +17,6 @@ from beamfit.errors import InputError, nearest
 from beamfit.greybox.fit import Fit
 from beamfit.greybox.problem import Free, Prior, Problem
 from beamfit.optics.elements import Drift, Quadrupole, ThinLens
-from beamfit.status import Status
 from beamfit.studies.scan.assumptions import Assumptions
 from beamfit.studies.scan.model import spoken
 from beamfit.studies.scan.results import Parameter
@@ -121,10 +120,8 @@ def with_systematics(scenario: Scenario, told: Assumptions) -> Scenario:
     def parameters(seen: Seen, told: Assumptions, fit: Fit) -> Iterator[Parameter]:
         yield from scenario.parameters(seen, told, fit)
         for term in _terms(seen, told):
-            v = fit[term.path]
-            known = v.state == "free" and math.isfinite(v.error)
-            status = Status.converged if known else Status.at_limit
-            yield Parameter.of(term.name, v, term.unit, status, (term.mean, term.sd))
+            prior = term.mean, term.sd
+            yield Parameter.of(term.name, fit[term.path], term.unit, prior)
 
     return replace(scenario, state=state, parameters=parameters, closed=False)
 

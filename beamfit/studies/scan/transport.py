@@ -152,19 +152,16 @@ class Rows:
 
     def elements(self, model: Mapping[str, Any]) -> tuple[Array, Array, Array]:
         """R11, R12, damped, and known size² (m²) of every row, shape (n,), by the model's line."""
-        found, plane = model.get("systematics", {}), "xy".index(self.plane)
-        if self.given is not None:
-            return self.known(self.given[plane], found)
-        energy = self.energy * found.get("energy", 1.0)
-        line = line_of(model, self.line)
-        every = transfer_rows(line, self.settings, energy, self.places).planes
-        return self.seen(every[:, plane], found)
+        found, r = model.get("systematics", {}), self.given
+        if r is None:
+            energy = self.energy * found.get("energy", 1.0)
+            line = line_of(model, self.line)
+            r = self.at_screens(transfer_rows(line, self.settings, energy, self.places).planes)
+        return self.known(r["xy".index(self.plane)], found)
 
-    def seen(
-        self, matrices: Array, found: Mapping[str, Any] = MappingProxyType({})
-    ) -> tuple[Array, Array, Array]:
-        """R11, R12 and known size² from one plane's matrices, shape (n, places, 3, 3)."""
-        return self.known(matrices[jnp.arange(len(self.energy)), self.which, 0], found)
+    def at_screens(self, planes: Array) -> Array:
+        """R11, R12 and R16 of both planes as `given`, from matrices (n, 2, places, 3, 3)."""
+        return jnp.moveaxis(planes[jnp.arange(len(self.energy)), :, self.which, 0], 1, 0)
 
     def known(
         self, r: Array, found: Mapping[str, Any] = MappingProxyType({})
@@ -355,11 +352,8 @@ def look_through(rows: Rows) -> Look:
     settings = {n: jnp.append(v, line[n].setting) for n, v in rows.settings.items()}
     energy = jnp.append(rows.energy, line.energy)
     every = transfer_rows(line, settings, energy, places).planes
-    if rows.given is None:
-        seen = [rows.seen(every[:-1, plane]) for plane in (0, 1)]
-    else:
-        seen = [rows.known(r) for r in rows.given]
-    own = every[-1]
+    given = rows.at_screens(every[:-1]) if rows.given is None else rows.given
+    seen, own = [rows.known(r) for r in given], every[-1]
     at = places.index(line.design.at) if line.design else 0
     return Look(
         *(jnp.stack(part) for part in zip(*seen, strict=True)),

@@ -28,7 +28,6 @@ from beamfit.studies.scan.constrained_network import (
     signed_network,
     weight_free,
 )
-from beamfit.studies.scan.results import Parameter
 from beamfit.studies.scan.statement import Scenario, Seen, varied_magnets
 from beamfit.studies.scan.transport import NetworkRows, padded
 
@@ -84,14 +83,13 @@ class _Layout(NamedTuple):
 
 
 def _layout(seen: Seen, told: Assumptions) -> _Layout:
-    scan, varied = seen.scan, varied_magnets(seen.scan)
-    columns = [scan.settings[name] for name in varied]
+    scan = seen.scan
+    columns = {name: scan.settings[name] for name in varied_magnets(scan)}
     with_energy = scan.energy is not None and np.ptp(scan.energy) > 0
-    names = (*varied, "energy") if with_energy else varied
-    columns += [scan.energy] if with_energy else []
-    low, high = _box(seen, told, dict(zip(names, columns, strict=True)))
-    elements = 4 if told.anchor.determinant else 2
-    return _Layout(names, np.stack(columns, -1), with_energy, elements, low, high)
+    columns |= {"energy": scan.energy} if with_energy else {}
+    low, high = _box(seen, told, columns)
+    elements, values = 4 if told.anchor.determinant else 2, np.stack([*columns.values()], -1)
+    return _Layout(tuple(columns), values, with_energy, elements, low, high)
 
 
 def _box(seen: Seen, told: Assumptions, columns: dict[str, np.ndarray]) -> np.ndarray:
@@ -109,16 +107,13 @@ def _box(seen: Seen, told: Assumptions, columns: dict[str, np.ndarray]) -> np.nd
 
 def _first_principles(seen: Seen, lay: _Layout, points: np.ndarray) -> np.ndarray:
     """A, B, C, D of the line, shape (points, planes, places, 4)."""
-    n, full = len(points), padded(points)
+    full = padded(points)
+    columns = dict(zip(lay.names, full.T, strict=True))
+    energy = columns.pop("energy") if lay.with_energy else np.full(len(full), seen.energy)
     settings = {k: np.full(len(full), np.median(v)) for k, v in seen.scan.settings.items()}
-    energy = np.full(len(full), seen.energy)
-    columns = list(full.T)
-    if lay.with_energy:
-        energy = columns.pop()
-    settings |= dict(zip(lay.names, columns, strict=False))
-    every = np.asarray(transfer_rows(seen.scanned, settings, energy, seen.rows.places).planes)
-    r = every[:n, ["xy".index(p) for p in seen.planes]]
-    return np.stack([r[..., 0, 0], r[..., 0, 1], r[..., 1, 0], r[..., 1, 1]], -1)
+    every = transfer_rows(seen.scanned, settings | columns, energy, seen.rows.places).planes
+    r = np.asarray(every)[: len(points), ["xy".index(p) for p in seen.planes], :, :2, :2]
+    return r.reshape(*r.shape[:3], 4)
 
 
 def _grid(lay: _Layout) -> np.ndarray:
@@ -249,32 +244,20 @@ def _determinant(model, rows: NetworkRows) -> jax.Array:
     return a * d - b * c
 
 
-def _null_directions(
-    seen: Seen, parameters: tuple[Parameter, ...], identified: bool
-) -> tuple[str, ...]:
-    gauge = (
-        "[A B] -> [A B] G with sigma -> G^-1 sigma G^-T leaves every size as it is, for any "
-        "invertible 2 x 2 matrix G (four directions; the emittance goes as 1/det G)"
-    )
-    pointwise = (
-        "at each setting one size is measured for two numbers A and B: what one gives the other "
-        "can take"
-    )
-    return () if identified else (gauge, pointwise)
-
-
-def _remedy(seen: Seen, told: Assumptions) -> str:
-    return (
-        "an anchor to first principles at every setting (--anchor first-principles=2%); T known at "
-        "single settings or det T = 1 with C and D free do not suffice"
-    )
-
-
+OPEN = (
+    "[A B] -> [A B] G with sigma -> G^-1 sigma G^-T leaves every size as it is, for any "
+    "invertible 2 x 2 matrix G (four directions; the emittance goes as 1/det G)",
+    "at each setting one size is measured for two numbers A and B: what one gives the other can "
+    "take",
+)
 SCENARIO = Scenario(
     "transport-network",
     _state,
-    null_directions=_null_directions,
-    remedy=_remedy,
+    null_directions=lambda _seen, _parameters, identified: () if identified else OPEN,
+    remedy=lambda _seen, _told: (
+        "an anchor to first principles at every setting (--anchor first-principles=2%); T known at "
+        "single settings or det T = 1 with C and D free do not suffice"
+    ),
     network=True,
     whole_map=False,
 )

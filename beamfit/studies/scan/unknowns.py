@@ -189,7 +189,8 @@ def _through(seen: Seen, fit: Fit) -> Seen:
     look = np.array(seen.look[:3])
     look[:, ["xy".index(plane) for plane in seen.planes]] = np.swapaxes(elements, 0, 1)
     noises = {plane: seen.noises[plane] for plane in seen.planes}
-    again = in_closed_form(seen._replace(look=Look(*look, *seen.look[3:]), noises=noises))
+    look = Look(*look, *seen.look[3:])
+    [again] = in_closed_form([seen._replace(look=look, noises=noises)])
     return seen._replace(works=seen.works | again.works)
 
 
