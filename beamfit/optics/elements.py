@@ -337,7 +337,7 @@ class Marker:
 
 
 @value("name")
-class Screen:
+class Screen(Marker):
     """A place where the beam size is measured.
 
     Parameters
@@ -353,14 +353,7 @@ class Screen:
     5e-06
     """
 
-    name: str
     resolution: ArrayLike = 0.0
-    length: ClassVar[float] = 0.0
-    setting: ClassVar[None] = None
-
-    def matrix(self, setting: ArrayLike | None = None, energy: ArrayLike = 1.0) -> TransferMatrix:
-        """Return the identity in both planes."""
-        return IDENTITY
 
 
 Element = Drift | Quadrupole | ThinLens | SectorDipole | Marker | Screen

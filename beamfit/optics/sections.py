@@ -16,7 +16,7 @@ from jax import Array
 from jax.typing import ArrayLike
 
 from beamfit.optics.arrays import array_module, value
-from beamfit.optics.elements import IDENTITY, Marker, Screen, TransferMatrix
+from beamfit.optics.elements import IDENTITY, Marker, TransferMatrix
 
 
 @value("name")
@@ -103,7 +103,7 @@ def in_series(elements: Iterable[Any], settings: Mapping[str, ArrayLike] | None 
     stay apart from those it need not see.
     """
     settings, groups, length = settings or {}, {}, 0.0
-    elements = [e for e in elements if not isinstance(e, Marker | Screen)]
+    elements = [e for e in elements if not isinstance(e, Marker)]
     for i, element in enumerate(elements):
         length = length + element.length
         bare = replace(element, name="")

@@ -128,17 +128,13 @@ class Advice:
     def tables(self) -> tuple[Table, ...]:
         """Lay out the errors after each measurement, and what would identify an open scenario."""
         rows = [["what is measured", *_cells(self.now, self.identified)]]
-        rows += [
-            [
-                f"{number}. {step.candidate.words}",
-                *_cells(step.relative_error, step.identified, perhaps=not self.identified),
-            ]
-            for number, step in enumerate(self.steps, 1)
-            if self.steps[-1].identified
-        ]
         if self.steps and not self.steps[-1].identified:
             words = f"{len(self.steps)} more points of the scan, at the best settings"
             rows.append([words, *_cells(self.now, False)])
+        else:
+            for number, step in enumerate(self.steps, 1):
+                cells = _cells(step.relative_error, step.identified, perhaps=not self.identified)
+                rows.append([f"{number}. {step.candidate.words}", *cells])
         note = "" if self.identified or not self.steps else PERHAPS
         steps = Table("", ["after", *self.now], rows, note, numeric=True)
         header = ["What would identify it", *(f"error {plane}" for plane in self.now), "identified"]

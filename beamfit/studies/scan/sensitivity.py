@@ -24,7 +24,6 @@ from beamfit.optics.elements import (
     Element,
     Marker,
     Quadrupole,
-    Screen,
     SectorDipole,
     ThinLens,
 )
@@ -153,9 +152,9 @@ def _by_element(
     line: Beamline, stored: Beamline, by_line: Beamline
 ) -> Iterator[tuple[Element, float]]:
     """Each element of a line with the slope by its small change, from those by all numbers."""
-    left = (e for e in line.elements if not isinstance(e, Marker | Screen))
+    left = (e for e in line.elements if not isinstance(e, Marker))
     for part, by_part in zip(stored.elements, by_line.elements, strict=True):
-        if isinstance(part, Marker | Screen):
+        if isinstance(part, Marker):
             continue
         kinds, by_kinds, order = (part,), (by_part,), np.zeros(1, int)
         if isinstance(part, Series):
@@ -292,19 +291,13 @@ def range_sensitivity(plane: PlaneFit) -> list[RangeRow]:
     near = p.size <= 2.0 * p.size.min()
     if 4 <= near.sum() < n:
         rows.append(("only sizes within 2 x the smallest", near))
-    emittance = [_without(plane, ~k) for _, k in rows]
-    factor = (
-        plane.normalized_emittance.value / plane.emittance.value if plane.emittance.value else 0
-    )
-    error = plane.emittance.error
-    return [
-        RangeRow(
-            name,
-            float(e * factor),
-            float((e - plane.emittance.value) / error) if error else float("nan"),
-        )
-        for (name, _), e in zip(rows, emittance, strict=True)
-    ]
+    whole, found = plane.emittance, []
+    factor = plane.normalized_emittance.value / whole.value if whole.value else 0.0
+    for name, kept in rows:
+        rest = _without(plane, ~kept)
+        shift = (rest - whole.value) / whole.error if whole.error else math.nan
+        found.append(RangeRow(name, rest * factor, shift))
+    return found
 
 
 def _without(plane: PlaneFit, left_out: np.ndarray) -> float:
@@ -333,21 +326,15 @@ def budget_rows(fit: EmittanceFit) -> list[tuple[str, list[str]]]:
 
     Those below 0.05 % share one line.
     """
-    columns = [{c.cause: c for c in systematics(fit, p.plane)} for p in fit.planes]
-    largest: dict[str, float] = {}
-    for change in (c for column in columns for c in column.values()):
-        size = abs(change.normalized_emittance)
-        largest[change.cause] = max(size, largest.get(change.cause, 0.0))
+    columns = [
+        {c.cause: c.normalized_emittance for c in systematics(fit, p.plane)} for p in fit.planes
+    ]
+    causes = dict.fromkeys(cause for column in columns for cause in column)
+    largest = {cause: max(abs(c.get(cause, 0.0)) for c in columns) for cause in causes}
     ranked = sorted(largest, key=largest.__getitem__, reverse=True)
     shown = [cause for cause in ranked if largest[cause] >= SMALLEST][:MOST_CAUSES]
     rows = [
-        (
-            cause,
-            [
-                f"{100 * column[cause].normalized_emittance:+.2f} %" if cause in column else "-"
-                for column in columns
-            ],
-        )
+        (cause, [f"{100 * c[cause]:+.2f} %" if cause in c else "-" for c in columns])
         for cause in shown
     ]
     if others := ranked[len(shown) :]:

@@ -193,13 +193,12 @@ def size_record(seen: Seen, plane: str, rows: Any) -> Record:
     Rows without a size have weight 0, and so has padding. Errors nobody gave are a guess.
     """
     work, noise, at = seen.works[plane], seen.noises[plane], seen.measured(plane)
-    weight, columns = np.zeros(len(padded(seen.scan.size[plane]))), []
-    weight[at] = 1.0
     points, guess = work.points, float(work.fit.error[at[0]] / work.points.error[0])
-    for values in (points.size, points.error, points.weighed):
-        columns.append(np.full(len(weight), 1e6 * values[0]))
-        columns[-1][at] = 1e6 * values
-    size, error, weighed = columns
+    columns = 1e6 * np.stack([points.size, points.error, points.weighed])
+    weight = np.zeros(len(padded(seen.scan.size[plane])))
+    every = np.repeat(columns[:, :1], len(weight), axis=1)
+    weight[at], every[:, at] = 1.0, columns
+    size, error, weighed = every
     if rows.squared:
         size, error = size**2, 2.0 * weighed * error
     worth = np.inf if noise.known else noise.dof

@@ -33,7 +33,7 @@ def names_of(line: Beamline) -> tuple[dict[str, str], list[str], str | None, flo
     ({}, ['S'], 'S', 0.51099895069)
     """
     units = {n: line[n].calibration.unit for n in line.magnets}
-    places = [e.name for e in line.elements if isinstance(e, Screen | Marker)]
+    places = [e.name for e in line.elements if isinstance(e, Marker)]
     return units, places, line.screens[-1] if line.screens else None, line.mass
 
 
@@ -61,17 +61,17 @@ def scanned_line(scan: QuadScan, line: Beamline) -> Beamline:
                 f"a column {name}_k1l (inverse focal length, 1/m) or {name}_kG",
                 name,
             )
-    line = _with_meanings(Same(line), tuple(scan.units.items()))
-    if scan.slice is None:
-        return line
-    energies = np.unique(line.energy if scan.energy is None else scan.energy)
-    # The mean of equal numbers may be another one in its last digit.
-    energy = energies[0] if len(energies) == 1 else np.mean(scan.energy)
-    return _held(Same(line), float(energy))
+    energy = None
+    if scan.slice is not None:
+        energies = np.unique(line.energy if scan.energy is None else scan.energy)
+        # The mean of equal numbers may be another one in its last digit.
+        energy = float(energies[0] if len(energies) == 1 else np.mean(scan.energy))
+    return _as_scanned(Same(line), tuple(scan.units.items()), energy)
 
 
 @lru_cache(maxsize=64)
-def _with_meanings(same: Same, units: tuple[tuple[str, str], ...]) -> Beamline:
+def _as_scanned(same: Same, units: tuple[tuple[str, str], ...], energy: float | None) -> Beamline:
+    """The line with other units of its settings, and held for another beam if one is told."""
     line = same.line
     for member, unit in [(m, unit) for name, unit in units for m in line.members(name)]:
         magnet = line[member]
@@ -81,12 +81,7 @@ def _with_meanings(same: Same, units: tuple[tuple[str, str], ...]) -> Beamline:
             # Every other meaning is proportional to its setting.
             setting = float(strength / meaning.k1l(1.0, magnet.length, line.energy))
             line = line.with_element(replace(magnet, calibration=meaning, setting=setting))
-    return line
-
-
-@lru_cache(maxsize=64)
-def _held(same: Same, energy: float) -> Beamline:
-    return same.line.held(energy)
+    return line if energy is None else line.held(energy)
 
 
 def rows_line(scan: QuadScan) -> Beamline:

@@ -12,7 +12,6 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from beamfit.greybox import tree
 from beamfit.greybox.covariance import Group
 from beamfit.greybox.fit import Derived, Fit
 from beamfit.greybox.problem import Problem
@@ -319,12 +318,8 @@ def _scenario_answer(
     determined = u.clear and u.ending is None and u.cause is None
     error = np.where(determined, own.error, np.nan)
     sigma, slopes = own.value[SIGMA], np.nan_to_num(own.slope[SIGMA])
-    beam = {leaf.path for leaf in tree.find_leaves(p.core.model, "beam")}
-    further = [
-        i
-        for i, name in enumerate(p.names)
-        if name not in beam and not p.nuisance[i] and p.lower[i] < p.upper[i]
-    ]
+    loose = ~p.nuisance & (p.lower < p.upper)
+    further = [i for i in np.flatnonzero(loose) if not p.names[i].startswith("beam.")]
     asked = np.vstack([slopes, np.eye(len(theta))[further]])
     units = np.array([*units_of(sigma), *(abs(theta[i]) or 1.0 for i in further)])
     names = [*list(QUANTITIES)[SIGMA], *(spoken(p.names[i]) for i in further)]
