@@ -13,20 +13,12 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from beamfit.greybox.problem import Problem
 from beamfit.optics.beamline import Beamline
 from beamfit.optics.calibration import SETTING_UNITS
 from beamfit.statistics import chi2_probability
-from beamfit.studies.scan.assumptions import Assumptions
 from beamfit.studies.scan.model import numbers_of, size_squared
 from beamfit.studies.scan.names import check_names
-from beamfit.studies.scan.noise import (
-    ENOUGH_POINTS,
-    Noise,
-    constant_noise,
-    noise_of,
-    unlikely,
-)
+from beamfit.studies.scan.noise import ENOUGH_POINTS, Noise, constant_noise, noise_of, unlikely
 from beamfit.studies.scan.outliers import Doubted, Influence, fit_robust, influence_of
 from beamfit.studies.scan.questions import check_gradients
 from beamfit.studies.scan.results import Points
@@ -363,9 +355,5 @@ def _constant(p: Points, noise: Noise) -> float:
     return chi2_probability(off, dof, math.inf if noise.known else noise.dof + dof - 2)
 
 
-def _state(seen: Seen, told: Assumptions) -> Problem:
-    """The closed form as a problem, starting from its answer, for those who want more than that."""
-    return beam_problem(seen)
-
-
-SCENARIO = Scenario("known", _state, closed=True)
+# The closed form as a problem, starting from its answer, for those who want more than that.
+SCENARIO = Scenario("known", lambda seen, _told: beam_problem(seen), closed=True)

@@ -127,13 +127,11 @@ def systematics(fit: EmittanceFit, plane: str) -> list[Change]:
     noise = _Weighing(weighed, sharp, np.array(p.relative), np.array(float(follows)))
     sigma = np.array([q.value for q in result.sigma])
     line = fit.seen.scanned.stored_by_kind((*rows.settings, *rows.places))
-    # By a whole number there is no slope.
-    line = jax.tree.map(lambda v: v if np.ndim(v) else float(v), line)
     upright = np.array(plane == "y")
-    by_line, by_energy, by_known = _slopes(replace(rows, line=line), upright, sigma, size, noise)
+    by_parts, by_energy, by_known = _slopes(replace(rows, line=line), upright, sigma, size, noise)
     changes = {_magnet_cause(fit, name): 0.0 for name in rows.settings}
     upstream = {e.name for e in fit.seen.scanned.upto(result.screen.name).elements}
-    for element, slope in _by_element(fit.seen.scanned, line, by_line):
+    for element, slope in _by_element(fit.seen.scanned, line, by_parts):
         cause, step = _cause(fit, element)
         if cause and (cause in changes or element.name in upstream):
             changes[cause] = changes.get(cause, 0.0) + step * float(slope)
@@ -149,37 +147,39 @@ def systematics(fit: EmittanceFit, plane: str) -> list[Change]:
 
 
 def _by_element(
-    line: Beamline, stored: Beamline, by_line: Beamline
+    line: Beamline, stored: Beamline, by_parts: list[Array]
 ) -> Iterator[tuple[Element, float]]:
-    """Each element of a line with the slope by its small change, from those by all numbers."""
-    left = (e for e in line.elements if not isinstance(e, Marker))
-    for part, by_part in zip(stored.elements, by_line.elements, strict=True):
-        if isinstance(part, Marker):
-            continue
-        kinds, by_kinds, order = (part,), (by_part,), np.zeros(1, int)
+    """Each element of a line, but for mere places, with the slope by its small change."""
+    left, slopes = (e for e in line.elements if not isinstance(e, Marker)), iter(by_parts)
+    for part in stored.elements:
         if isinstance(part, Series):
-            kinds, by_kinds, order = part.kinds, by_part.kinds, part.order
-        # An element stands at `order` among those of all kinds, counted kind after kind.
-        elements = np.empty(len(order), object)
-        elements[order] = list(islice(left, len(order)))
-        slopes = map(_of_kind, kinds, by_kinds)
-        yield from zip(elements, np.concatenate(list(slopes)), strict=True)
+            # An element stands at `order` among those of all kinds, counted kind after kind.
+            elements = np.empty(len(part.order), object)
+            elements[part.order] = list(islice(left, len(part.order)))
+            each = np.concatenate([np.atleast_1d(next(slopes)) for _ in part.kinds])
+            yield from zip(elements, each, strict=True)
+        elif not isinstance(part, Marker):
+            yield next(left), next(slopes)
 
 
-def _of_kind(kind: Element, by_kind: Element) -> np.ndarray:
-    """Slopes by small changes of the elements of a kind: those of `_cause`, all linear."""
-    changed = kind
-    if isinstance(kind, Drift):
-        changed = replace(kind, length=kind.length + 1.0)
-    elif isinstance(kind, SectorDipole):
-        changed = replace(kind, angle=2.0 * kind.angle)
-    elif isinstance(kind, Quadrupole | ThinLens):
-        changed = replace(kind, calibration=scaled(kind.calibration, 2.0))
-    if changed is kind:
-        return np.zeros(1)
-    moved = jax.tree.map(np.subtract, changed, kind)
-    parts = zip(jax.tree.leaves(moved), jax.tree.leaves(by_kind), strict=True)
-    return np.atleast_1d(sum(np.asarray(by) * d for d, by in parts))
+def _moved(line: Beamline, changes: Iterator[Array]) -> Beamline:
+    """A line stored by kind with small changes, those of `_cause`, of all but mere places."""
+
+    def changed(part: Element | Series) -> Element | Series:
+        if isinstance(part, Marker):
+            return part
+        if isinstance(part, Series):
+            return replace(part, kinds=tuple(map(changed, part.kinds)))
+        change = next(changes)
+        if isinstance(part, Drift):
+            return replace(part, length=part.length + change)
+        if isinstance(part, SectorDipole):
+            return replace(part, angle=part.angle * (1.0 + change))
+        if isinstance(part, Quadrupole | ThinLens):
+            return replace(part, calibration=scaled(part.calibration, 1.0 + change))
+        return part
+
+    return replace(line, elements=tuple(map(changed, line.elements)))
 
 
 def _cause(fit: EmittanceFit, element: Element) -> tuple[str, float]:
@@ -230,8 +230,8 @@ class _Weighing(NamedTuple):
 @jax.jit
 def _slopes(
     rows: Rows, upright: Array, sigma: Array, size: Array, noise: _Weighing
-) -> tuple[Beamline, Array, Array]:
-    """Derivatives of ln ε of the fit by all numbers of the line, by ln E, and by known size².
+) -> tuple[list[Array], Array, Array]:
+    """Derivatives of ln ε of the fit by the parts of the line, by ln E, and by known size².
 
     At the answer the weighted residuals F(σ, rows) = Σ w ∂m²/∂σ (m² - size²) vanish, so dσ =
     -(∂F/∂σ)⁻¹ ∂F/∂rows: exact for either residual, without differentiating the solver, weights
@@ -240,7 +240,8 @@ def _slopes(
     """
     unit = jnp.abs(sigma)
 
-    def elements(line: Beamline, factor: Array, more: Array) -> tuple[Array, ...]:
+    def elements(changes: list[Array], factor: Array, more: Array) -> tuple[Array, ...]:
+        line = _moved(rows.line, iter(changes))
         moved = replace(rows, line=line, energy=rows.energy * factor)
         # Both planes in one program, which is compiled once.
         both = (replace(moved, plane=p).elements({}) for p in "xy")
@@ -258,14 +259,21 @@ def _slopes(
         grown = error_at(at, noise.weighed, 1.0, noise.relative)
         return back((squared - size**2) * (noise.sharp / (at * grown)) ** 2)[0]
 
-    here, given = sigma / unit, (rows.line, jnp.ones(()), jnp.zeros(len(size)))
+    kinds = (k for e in rows.line.elements for k in (e.kinds if isinstance(e, Series) else (e,)))
+    still = [jnp.zeros(_shape(kind)) for kind in kinds if not isinstance(kind, Marker)]
+    here, given = sigma / unit, (still, jnp.ones(()), jnp.zeros(len(size)))
     by_sigma = jax.grad(lambda s: jnp.log(emittance_parts(s * unit)[0]))(here)
     weights = jnp.linalg.solve(jax.jacfwd(slope)(here, elements(*given)), by_sigma)
 
     def moved_emittance(*given: Any) -> Array:
         return -weights @ slope(here, elements(*given))
 
-    return jax.grad(moved_emittance, (0, 1, 2), allow_int=True)(*given)
+    return jax.grad(moved_emittance, (0, 1, 2))(*given)
+
+
+def _shape(kind: Element) -> tuple[int, ...]:
+    """Of the numbers of elements that are stored together; () of one that stands alone."""
+    return max(map(np.shape, jax.tree.leaves(kind)), key=len, default=())
 
 
 def range_sensitivity(plane: PlaneFit) -> list[RangeRow]:

@@ -311,13 +311,12 @@ def fit_sizes(
     """
     solve = SOLVE[method]
     given = (r11, r12, known, size, error, relative)
-    shape = jnp.broadcast_shapes(*(jnp.shape(v) for v in given))
-    arrays = [jnp.broadcast_to(jnp.asarray(v, float), shape) for v in given]
+    arrays = jnp.broadcast_arrays(*(jnp.asarray(v, float) for v in given))
 
     def one(*columns: Array) -> SigmaFit:
         return solve(SizeData(*columns), weights)
 
-    for _ in shape[:-1]:
+    for _ in arrays[0].shape[:-1]:
         one = jax.vmap(one)
     return one(*arrays)
 
