@@ -359,3 +359,17 @@ def test_rows_of_different_energy_share_the_normalised_emittance(otr2, mass):
     assert fit.chi2 == pytest.approx(0.0, abs=1e-6)
     assert fit.normalized_emittance.value == pytest.approx(1e-6, rel=1e-9)
     assert fit.emittance.value == pytest.approx(1e-6 / beta_gamma(mean, line.mass), rel=1e-9)
+
+
+def test_a_plane_takes_no_size_from_rows_in_which_the_other_alone_was_measured():
+    """With x in the first rows and y in the last, y was fitted to the first sizes of x as well."""
+    line = Beamline((Quadrupole("Q", 0.1), Drift("D", 2.0), Screen("S")), 135.0)
+    k1, beam = np.linspace(-8.0, 12.0, 12), BeamMatrix.from_twiss(2e-9, 5.0, 0.0)
+    matrices = [line.matrix({"Q": k}) for k in k1]
+    sizes = {p: np.array([beam.transport(getattr(r, p)).l11 for r in matrices]) for p in "xy"}
+    sizes["x"][8:], sizes["y"][:4] = np.nan, np.nan
+    errors = {p: 0.02 * size for p, size in sizes.items()}
+    fit = beamfit.fit_emittance(beamfit.QuadScan({"Q": k1}, {"Q": "k1"}, sizes, errors), line)
+    for plane in fit.planes:
+        assert plane.emittance.value == pytest.approx(2e-9, rel=1e-6)
+        assert plane.chi2 < 1e-9

@@ -219,24 +219,18 @@ class _Sizes(NamedTuple):
 
 def sizes_of(seen: Seen, doubts: Mapping[str, Doubted] = NONE) -> _Sizes:
     """The planes that have a noise, with its errors, or those of a robust fit."""
-    shape = (2, len(seen.rows.energy))
-    found = _Sizes(
-        np.zeros(2, int),
-        np.full(shape, 1e-4),
-        np.full(shape, np.inf),
-        np.zeros(2),
-        np.ones(2),
-        np.ones((2, 2)),
-    )
-    for i, (plane, noise) in enumerate(seen.noises.items()):
-        own, at, asked = slice(i, None), seen.measured(plane), asked_of(seen, plane)
-        found.which[own] = "xy".index(plane)
-        found.size[own, at] = seen.scan.size[plane][at]
-        found.error[own, at] = doubts.get(plane, noise).error
-        found.error[own, len(seen.scan) :] = np.inf
-        found.relative[own] = noise.relative
-        found.factor[own], found.design[own] = asked.factor, asked.design
-    return found
+    noises = seen.noises.items()
+    planes = [_sizes(seen, plane, doubts.get(plane, noise).error) for plane, noise in noises]
+    return _Sizes(*map(np.stack, zip(planes[0], planes[-1], strict=True)))
+
+
+def _sizes(seen: Seen, plane: str, errors: np.ndarray) -> _Sizes:
+    """One plane; the error of a row that has no size of it, as of padding, is infinite."""
+    at, asked, count = seen.measured(plane), asked_of(seen, plane), len(seen.rows.energy)
+    size, error = np.full(count, 1e-4), np.full(count, np.inf)
+    size[at], error[at] = seen.scan.size[plane][at], errors
+    relative, own = seen.noises[plane].relative, "xy".index(plane)
+    return _Sizes(own, size, error, relative, asked.factor, asked.design)
 
 
 @partial(jax.jit, static_argnames=("method", "weights"))
