@@ -10,7 +10,7 @@ import math
 from collections.abc import Iterator
 from dataclasses import replace
 from itertools import islice
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -261,14 +261,11 @@ def _slopes(
 
     kinds = (k for e in rows.line.elements for k in (e.kinds if isinstance(e, Series) else (e,)))
     still = [jnp.zeros(_shape(kind)) for kind in kinds if not isinstance(kind, Marker)]
-    here, given = sigma / unit, (still, jnp.ones(()), jnp.zeros(len(size)))
+    here = sigma / unit
+    seen, back = jax.vjp(elements, still, jnp.ones(()), jnp.zeros(len(size)))
     by_sigma = jax.grad(lambda s: jnp.log(emittance_parts(s * unit)[0]))(here)
-    weights = jnp.linalg.solve(jax.jacfwd(slope)(here, elements(*given)), by_sigma)
-
-    def moved_emittance(*given: Any) -> Array:
-        return -weights @ slope(here, elements(*given))
-
-    return jax.grad(moved_emittance, (0, 1, 2))(*given)
+    weights = jnp.linalg.solve(jax.jacfwd(slope)(here, seen), by_sigma)
+    return back(jax.grad(lambda seen: -weights @ slope(here, seen))(seen))
 
 
 def _shape(kind: Element) -> tuple[int, ...]:
