@@ -123,10 +123,9 @@ def fit_emittance(
     >>> fit.x.status.value, f"{fit.x.emittance.value * 1e9:.4f} nm"
     ('converged', '2.0000 nm')
     """
-    if method not in METHODS:
-        raise InputError(f"method '{method}'", "size_squared or size")
-    if weights not in WEIGHTS:
-        raise InputError(f"weights '{weights}'", " or ".join(WEIGHTS))
+    for name, given, known in (("method", method, METHODS), ("weights", weights, WEIGHTS)):
+        if given not in known:
+            raise InputError(f"{name} '{given}'", " or ".join(known))
     if robust and method != METHODS[0]:
         raise InputError("a robust fit of size", 'method "size_squared" with robust')
     ties = (gains or {}, anchor or Anchor(), hysteresis)
@@ -156,9 +155,7 @@ def fit_emittance(
 @shown
 @dataclass(frozen=True, eq=False)
 class EmittanceFit:
-    """A fitted scan: one `PlaneFit` a plane, with the scan and the line it came from.
-
-    Prints as a table; in a notebook it shows as one.
+    """A fitted scan, printed as a table: one `PlaneFit` a plane, with the scan and its line.
 
     Attributes
     ----------
