@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 from beamfit.errors import InputError
 from beamfit.io.files import digest, laid_out, read_json, text_lines
+from beamfit.io.json_table import json_sheet
 from beamfit.io.sheet import UNITS, Sheet
 from beamfit.io.table import HDF5, read_sheet
 
@@ -32,13 +33,22 @@ def archive_sheet(path: str | PathLike[str] | DataFrame, skip_bad: bool) -> Shee
     return read_sheet(path, example, ragged=skip_bad)
 
 
+def _is_archive(channels: object) -> bool:
+    """Whether a JSON file holds channels with their data, and not columns."""
+    lists = isinstance(channels, list)
+    return lists and all(not isinstance(c, dict) or {"meta", "data"} & set(c) for c in channels)
+
+
 def _archive_json(path: str | PathLike[str]) -> Sheet:
     """Of the EPICS Archiver Appliance: one channel with its data."""
     expected = 'one channel of the EPICS Archiver Appliance: [{"meta": …, "data": [{"secs": …}]}]'
     channels = read_json(path, "another JSON file", expected)
+    if not _is_archive(channels):
+        return json_sheet(path, channels)
     with laid_out(path, "another JSON file", expected):
         if len(channels) != 1:
-            raise InputError(f"{len(channels)} channels", "one: the beam current")
+            expected = "one, of the beam current: a file for each"
+            raise InputError(f"{len(channels)} channels", expected)
         meta, data = channels[0].get("meta", {}), channels[0]["data"]
         rows = [[str(one["secs"]), str(one["nanos"]), str(one["val"])] for one in data]
     if not rows:

@@ -19,11 +19,15 @@ from beamfit.errors import InputError, plain
 
 # A text line of a scan or a lattice is short; a longer one is another kind of file.
 LONGEST_LINE = 100_000
+MATLAB = "a MATLAB file", "a text table; writetable(table(time_s, beam_current_mA), 'a.csv')"
 # How files begin that are given for text, what they are, and what to do.
 SIGNATURES = {
     b"\x89HDF": ("an HDF5 file", "a text file; an HDF5 scan is named .h5"),
     b"PK\x03\x04": ("a spreadsheet or an archive", "a text file; save it as CSV (UTF-8)"),
     b"\xd0\xcf\x11\xe0": ("a spreadsheet", "a text file; save it as CSV (UTF-8)"),
+    b"MATLAB 5.0 MAT-file": MATLAB,
+    b"MATLAB 7.3 MAT-file": MATLAB,
+    b"SDDS": ("an SDDS file", "a text table; sdds2spreadsheet writes one, with units in its names"),
     b"\x1f\x8b": ("a compressed file", "a text file; unpack it first"),
     b"\xff\xfe": ("UTF-16 text", "UTF-8 text; save it as CSV (UTF-8)"),
     b"\xfe\xff": ("UTF-16 text", "UTF-8 text; save it as CSV (UTF-8)"),
@@ -137,7 +141,8 @@ def _decoded(raw: bytes, path: str | PathLike[str], number: int) -> str:
     # Windows writes µ, ° and the like in one byte; in a comment any letter may be so.
     if raw.lstrip().startswith(b"#") or not raw.translate(None, MARKS + ASCII):
         return raw.decode("cp1252", errors="replace")
-    raise InputError("bytes that are not text", "UTF-8 text", path, number)
+    expected = "UTF-8 text; save it as CSV (UTF-8)"
+    raise InputError("bytes that are not text", expected, path, number)
 
 
 def _check_signature(start: bytes, path: str | PathLike[str]) -> None:

@@ -102,7 +102,8 @@ def _told(content: bytes, rows: int, texts: int) -> tuple[dict[str, Any], list[n
 
     try:
         with h5py.File(io.BytesIO(content), "r") as store:
-            columns = {name: _column(store, name, rows, texts) for name in _names(store)}
+            place = _place(store)
+            columns = {name: _column(place, name, rows, texts) for name in _names(place)}
             said = [f"{key}: {value}"[:LONGEST_COMMENT] for key, value in store.attrs.items()]
     except _Refused as error:
         return {"refused": error.args}, []
@@ -112,6 +113,16 @@ def _told(content: bytes, rows: int, texts: int) -> tuple[dict[str, Any], list[n
     header = [(name, len(column), words[name]) for name, column in columns.items()]
     numbers = [column for column in columns.values() if not isinstance(column, list)]
     return {"columns": header, "comments": said}, numbers
+
+
+def _place(store: Any) -> Any:
+    """Where the datasets are: at the top, or in its only group."""
+    import h5py
+
+    only = next(iter(store)) if len(store) == 1 else None
+    if only is None or not isinstance(store.get(only, getlink=True), h5py.HardLink):
+        return store
+    return store[only] if store.get(only, getclass=True) is h5py.Group else store
 
 
 def _names(store: Any) -> list[str]:
@@ -140,7 +151,7 @@ def _column(store: Any, name: str, rows: int, texts: int) -> list[str] | np.ndar
     if not filters <= FILTERS:
         said = "gzip, lzf, shuffle, fletcher32 or none"
         raise _Refused(f"a filter of number {min(filters - FILTERS)}", said, name)
-    if data.shape is None or data.ndim > 1:
+    if data.shape is None or data.size != max(data.shape, default=1):
         raise _Refused(f"a dataset of shape {data.shape}", "a one-dimensional dataset", name)
     if not is_text and data.dtype.kind not in "iuf":
         raise _Refused(f"values of type {data.dtype}", "numbers or text", name)
@@ -148,9 +159,9 @@ def _column(store: Any, name: str, rows: int, texts: int) -> list[str] | np.ndar
         expected = "fewer: average what is repeated, or cut the file"
         raise _Refused(f"more than {most} rows", expected, name)
     if not is_text:
-        return np.atleast_1d(data[()]).astype(float)
+        return np.ravel(data[()]).astype(float)
     try:
-        return [str(value) for value in np.atleast_1d(data.asstr("utf-8")[()])]
+        return [str(value) for value in np.ravel(data.asstr("utf-8")[()])]
     except UnicodeDecodeError:
         raise _Refused("bytes that are not text", "UTF-8 text", name) from None
 

@@ -16,6 +16,7 @@ UNITS: dict[str, dict[str, float]] = {
     "pressure": {"Pa": 1.0, "mbar": 100.0, "Torr": 101325 / 760},
     "energy in MeV": {"MeV": 1.0},
 }
+UNITS["length or share"] = UNITS["length"] | {"%": 0.01}
 # Of magnets, whose gradients have factors of their own.
 SETTINGS = ("A", "kG", "T_per_m", "k1", "k1l")
 # Units at the end of a header, as the columns' names have them.
@@ -28,6 +29,7 @@ ALSO |= {"ampere": "A", "amperes": "A", "T/m": "T_per_m", "1/m^2": "k1", "1/m2":
 ALSO |= {"1/m²": "k1", "m^-2": "k1", "m-2": "k1"}
 ALSO |= {"m⁻²": "k1", "1/m": "k1l", "m^-1": "k1l", "mm rms": "mm", "um rms": "um", "micron": "um"}
 ALSO |= {"microns": "um", "sec": "s", "hours": "h", "Amp": "A", "Amps": "A", "amp": "A"}
+ALSO |= {"percent": "%"}
 ALSO |= {u: "um" for u in ("UM", "Um")} | {u: "mm" for u in ("MM", "Mm")} | {"M": "m"}
 ALSO |= {"KG": "kG", "kg": "kG", "T_PER_M": "T_per_m", "K1": "k1", "K1L": "k1l", "MEV": "MeV"}
 ALSO |= {"mev": "MeV", "ma": "mA", "pa": "Pa", "PA": "Pa", "torr": "Torr", "TORR": "Torr"}

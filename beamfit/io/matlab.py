@@ -38,7 +38,9 @@ STORED = {
 TEXTS = {1: "utf-8", 2: "utf-8", 4: "utf-16", 16: "utf-8", 17: "utf-16", 18: "utf-32"}
 # Bytes of a file, of what it holds unpacked, arrays in it, and how deep they may lie.
 LARGEST, UNPACKED, MOST_ARRAYS, DEEPEST = 256_000_000, 512_000_000, 500_000, 20
-SAVE = "a MATLAB file of version 5 to 7: save(name, 'data', '-v7')"
+SAVE = (
+    "a MATLAB file of version 5 to 7: save(name, 'data', '-v7'), or columns as CSV, by writetable"
+)
 
 
 class _Damaged(Exception):
@@ -89,7 +91,8 @@ def read_variable(path: str | PathLike[str], name: str) -> np.ndarray:
     except (_Damaged, struct.error, zlib.error, ValueError, OverflowError, MemoryError) as error:
         raise InputError(f"a damaged MATLAB file ({error})"[:120], SAVE, path) from None
     if found is None:
-        raise InputError(f"no variable '{name}'", f"a struct '{name}' of emittance_gui", path)
+        expected = f"a struct '{name}' of emittance_gui; other variables as CSV, by writetable"
+        raise InputError(f"no variable '{name}'", expected, path)
     return found
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from dataclasses import replace
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -13,7 +14,7 @@ from beamfit.errors import InputError, located
 from beamfit.io.emittance_gui import is_emittance_gui, read_emittance_gui
 from beamfit.io.files import name_of
 from beamfit.io.headers import SETTINGS
-from beamfit.io.scan_columns import ENERGIES, column_notes, scan_columns
+from beamfit.io.scan_columns import ENERGIES, PERCENT, column_notes, comment_notes, scan_columns
 from beamfit.io.sheet import UNITS, Column, Sheet, left_out
 from beamfit.io.shots import average_shots
 from beamfit.io.table import read_sheet
@@ -85,8 +86,13 @@ def read_quad_scan(
         sheet = sheet.good(lambda rows: _values(rows, columns))
         usual = _usual(_values(sheet, columns))
         sheet = sheet.good(lambda rows: _check_slipped(rows, columns, usual))
-    values = _values(sheet, columns)
-    _check_sizes(sheet, columns, values)
+    try:
+        values = _values(sheet, columns)
+        _check_sizes(sheet, columns, values)
+    except InputError as error:
+        skip = error.line is not None and not skip_bad and "--ignore" not in error.expected
+        more = "; --skip-bad leaves such rows out" if skip else ""
+        raise replace(error, expected=error.expected + more) from None
     with located(sheet.path):
         scan = _scan(sheet, columns, values)
     return average_shots(scan, marked="shot" in columns)
@@ -124,7 +130,7 @@ def _scan(
         path=sheet.path,
         sha256=sheet.sha256,
         provenance=sheet.comments,
-        notes=(*column_notes(columns), *left_out(sheet)),
+        notes=(*column_notes(columns), *comment_notes(columns, sheet.comments), *left_out(sheet)),
         columns={name: c.header for name, c in magnets.items()}
         | headers
         | {header: header for header in headers.values()},
@@ -140,14 +146,25 @@ def _values(sheet: Sheet, columns: Mapping[str, Column]) -> dict[str, np.ndarray
             values[size] = _positive(sheet, columns[size], "beam size")
         if error in columns:
             values[error] = _positive(sheet, columns[error], "error")
+            if columns[error].unit == PERCENT:
+                values[error] = values[error] * values[size]
             missing = np.isnan(values[error]) & ~np.isnan(values[size])
             expected = "an error for each size, or none at all"
             sheet.refuse(columns[error].header, missing, expected, "an empty cell")
+            _check_absent(sheet, columns[size], values[size], values[error])
     values |= {key: _within(sheet, columns[key]) for key in RANGES if key in columns}
     _screens(sheet, columns.get("screen"))
     elements = [f"r{i}_{p}" for i in ELEMENTS for p in "xy"]
     plain = [c for key, c in columns.items() if c.unit in SETTINGS or key in elements]
     return values | {c.key: sheet.values(c) for c in plain}
+
+
+def _check_absent(sheet: Sheet, column: Column, size: np.ndarray, error: np.ndarray) -> None:
+    """Refuse a size that says NaN and has an error: it was measured, or it was not."""
+    for row in np.flatnonzero(np.isnan(size) & ~np.isnan(error)):
+        if (cell := sheet[column.header][row]) != "":
+            expected = "a finite number, or no error beside it"
+            raise sheet.error(f"'{cell}'", expected, int(row), column.header)
 
 
 def _positive(sheet: Sheet, column: Column, what: str) -> np.ndarray:
@@ -156,6 +173,10 @@ def _positive(sheet: Sheet, column: Column, what: str) -> np.ndarray:
     if wrong := first_unusable(values, blank=True):
         cell = sheet[column.header][wrong[0]]
         expected = f"a positive {what} in {column.unit}"
+        if what == "error" and not np.any(values > 0):
+            expected += (
+                f"; --ignore '{column.header}' leaves them unread, and the noise is inferred"
+            )
         raise sheet.error(f"'{cell}'", expected, wrong[0], column.header)
     return values
 

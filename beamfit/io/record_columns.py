@@ -28,13 +28,17 @@ USED = {"time", "nanos", "current", "error", *Conditions._fields}
 MOMENTS = {"time", "timestamp", "time_stamp", "datetime", "date_time", "data_time", "date"}
 DAYS, CLOCKS = {"date", "day", "datum"}, {"time", "zeit", "uhrzeit"}
 CLOCK = re.compile(r"\d{1,2}:\d{2}(:\d{2}([.,]\d*)?)?( ?[AaPp][Mm])?")
+# What a time with a unit is called besides time.
+CLOCKED = {"t", "timestamp", "time_stamp", "epoch", "elapsed", "elapsed_time", "unix_time", "zeit"}
 # An archive's own columns: seconds since 1970 and nanoseconds, and what it says of each value.
 SECONDS = {"secs": "s", "seconds": "s", "epochseconds": "s"}
 NANOS = {"nanos", "nanoseconds"}
 ASIDE = {"severity", "status", "val", "value"}
-# Words in a name with a unit of current that make it the beam's; in A, as magnets have, fewer do.
+# Words in a name with a unit of current that make it the beam's; in A, as magnets have, fewer do
+# beside other words.
 MONITORS = {"ibeam", "dcct", "pct", "bct", "stored"}
 CURRENTS = MONITORS | {"current", "i", "strom", "strahlstrom", "courant"}
+RINGS = {"sr", "ring", "ler", "her", "total", "average", "mean"}
 OTHERS = {"error", "err", "std", "sd", "sigma", "rms", "set", "setpoint", "target", "nominal"}
 # A lifetime beside the current, as archives have it, is not read.
 LIFETIME = re.compile(r"(.*[\W_])?(life_?time|tau)([\W_].*)?", re.IGNORECASE)
@@ -94,7 +98,7 @@ def is_current(header: str) -> bool:
 
     Examples
     --------
-    >>> [is_current(name) for name in ("beam_current_mA", "DCCT (A)", "Q2 current (A)", "SR:I")]
+    >>> [is_current(name) for name in ("beam_current_mA", "I (A)", "Q2 current (A)", "SR:I")]
     [True, True, False, False]
     """
     said = spelled(header)
@@ -152,8 +156,9 @@ def _other(sheet: Sheet):
             return Column(header, "time", "s")
         if word in NANOS:
             return Column(header, "nanos", "ns", UNITS["time"]["ns"])
-        if (short := re.fullmatch(r"t_(\w+)", header)) and short[1] in UNITS["time"]:
-            return Column(header, "time", short[1], UNITS["time"][short[1]])
+        name, _, ending = header.rpartition("_")
+        if name.lower() in CLOCKED and ending in UNITS["time"]:
+            return Column(header, "time", ending, UNITS["time"][ending])
         if unit != header and unit in UNITS["current"]:
             return Column(header, "current", unit, UNITS["current"][unit])
         if word in ASIDE or LIFETIME.fullmatch(header):
@@ -167,7 +172,7 @@ def _current(header: str) -> Column | None:
     """A beam current by a word in its name and its unit."""
     name, _, unit = header.rpartition("_")
     words = set(re.findall(r"[a-z]+", name.lower()))
-    wanted = MONITORS if unit == "A" else CURRENTS
+    wanted = MONITORS if unit == "A" and words - CURRENTS - RINGS else CURRENTS
     if unit not in UNITS["current"] or not (words & wanted or words == {"beam"}) or words & OTHERS:
         return None
     return Column(header, "beam_current", unit, UNITS["current"][unit])

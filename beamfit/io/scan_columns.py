@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
 
-from beamfit.errors import nearest
+from beamfit.errors import InputError, nearest, short
 from beamfit.io.headers import SETTINGS, spelled
 from beamfit.io.sheet import UNITS, Column, Sheet, columns_of
 from beamfit.particles import ENERGY_KEYS
@@ -14,7 +15,8 @@ from beamfit.particles import ENERGY_KEYS
 # How the energy of a row may be given, without its unit, and what that is.
 ENERGIES = {key.removesuffix("_MeV"): kind for key, kind in ENERGY_KEYS.items()}
 QUANTITIES = {
-    **dict.fromkeys(("size_x", "size_x_error", "size_y", "size_y_error"), "length"),
+    **dict.fromkeys(("size_x", "size_y"), "length"),
+    **dict.fromkeys(("size_x_error", "size_y_error"), "length or share"),
     "resolution": "length",
     **dict.fromkeys(ENERGIES, "energy in MeV"),
     "energy_spread": "",
@@ -25,16 +27,35 @@ QUANTITIES = {
 }
 # What tells rows apart besides settings of magnets.
 SEEN = {"screen", "r11_x", "r11_y"}
-CARRIED = re.compile(r"note_.*|date|time|timestamp|comments?|charge_[np]C", re.IGNORECASE)
+CARRIED = re.compile(
+    r"note_.*|date|time|timestamp|comments?|charge[ _]?[\[(]?[np]C[\])]?", re.IGNORECASE
+)
 # Words for a width, and how many of it are one rms: a Gaussian's FWHM is sqrt(8 ln 2) rms.
 FWHM = 1.0 / math.sqrt(8.0 * math.log(2.0))
-WIDTHS = {"size": 1.0, "sigma": 1.0, "sig": 1.0, "rms": 1.0, "fwhm": FWHM}
-ERRORS = {"error", "err", "std", "sd"}
+WIDTHS = {"size": 1.0, "sigma": 1.0, "sig": 1.0, "s": 1.0, "rms": 1.0, "fwhm": FWHM}
+ERRORS = {"error", "err", "std", "sd", "d", "delta", "uncertainty", "unc"}
+PERCENT = "%"
+PLANES = {"x": "x", "horizontal": "x", "hor": "x", "h": "x"}
+PLANES |= {"y": "y", "vertical": "y", "vert": "y", "ver": "y", "v": "y"}
+# Words that change nothing.
+IDLE = {"beam", "spot", "fit", "gauss", "gaussian"}
+# Several sigma as one width: 4sigma, D4Sigma (ISO 11146), 2 rms.
+SEVERAL = re.compile(r"(?:^|(?<=_))d?([2-6])_?(?=(?:sigma|sig|rms)(?:_|$))", re.IGNORECASE)
+# What control systems put behind the name of a magnet; its unit says what it is set to.
+ATTRIBUTE = re.compile(
+    r"[ _:./](bact|bdes|bctrl|bcon|iact|ides|current|gradient|k1l?|gl|bdl|setpoint|readback)$",
+    re.IGNORECASE,
+)
+# Of a comment that says something of sizes which a header may not say.
+WIDER = re.compile(r"fwhm|full[ -]width|\b[2-6][ -]?(sigma|σ|rms)|pixel|\bpx\b", re.IGNORECASE)
+SHOTS = {"n_shots": "shots", "nshots": "shots"}
 # Elements of the matrix from where the beam is asked for to the row's screen, m and 1.
 ELEMENT = re.compile(r"r(1[126])(?:_([xy]))?(?:_m)?|r(3[346])(?:_m)?", re.IGNORECASE)
 OF_Y = {"33": "11", "34": "12", "36": "16"}
 # A plane and a width written as one word, as in xrms and sigmax.
-ONE_WORD = re.compile(r"([xy])(size|sigma|sig|rms|fwhm)|(size|sigma|sig|rms|fwhm)([xy])")
+ONE_WORD = re.compile(
+    r"(x|y|hor|ver)(size|sigma|sig|rms|fwhm)|(size|sigma|sig|s|rms|fwhm)(x|y|hor|ver)"
+)
 
 
 def scan_columns(sheet: Sheet) -> dict[str, Column]:
@@ -67,7 +88,7 @@ def scan_columns(sheet: Sheet) -> dict[str, Column]:
     if any(spelled(name).lower().startswith("beam_current") for name in sheet.names):
         expected = "a quadrupole scan; `beamfit lifetime` reads it"
         raise sheet.header_error("a record of beam current", expected)
-    columns = columns_of(sheet, QUANTITIES, lambda header: _other(header, sheet))
+    columns = _understood(sheet)
     if not {"size_x", "size_y"} & set(columns):
         missing = "a beam size column, such as size_x_um"
     elif not (any(c.unit in SETTINGS for c in columns.values()) or SEEN & set(columns)):
@@ -87,6 +108,27 @@ def scan_columns(sheet: Sheet) -> dict[str, Column]:
     return columns
 
 
+def _understood(sheet: Sheet) -> dict[str, Column]:
+    """Every column; all that are not understood are named at once."""
+    try:
+        return columns_of(sheet, QUANTITIES, lambda header: _other(header, sheet))
+    except InputError as error:
+        unknown = [name for name in sheet.names if not _is_known(name, sheet)]
+        if len(unknown) < 2 or error.column not in unknown:
+            raise
+        ignored = " ".join(f"--ignore '{name}'" for name in unknown)
+        expected = "a magnet with its unit, a size such as size_x_um, or to leave them unread: "
+        raise replace(error, expected=expected + ignored) from None
+
+
+def _is_known(name: str, sheet: Sheet) -> bool:
+    alone = replace(sheet, names=(name,), cells=[sheet[name]])
+    try:
+        return bool(columns_of(alone, QUANTITIES, lambda header: _other(header, sheet)))
+    except InputError:
+        return False
+
+
 def _check_error(sheet: Sheet, columns: Mapping[str, Column], plane: str) -> None:
     """Check that an error column has its size column, and is of the same width."""
     size, error = columns.get(f"size_{plane}"), columns.get(f"size_{plane}_error")
@@ -95,8 +137,9 @@ def _check_error(sheet: Sheet, columns: Mapping[str, Column], plane: str) -> Non
     if size is None:
         found = f"{error.header} without sizes in {plane}"
         raise sheet.header_error(found, f"a column size_{plane}_um", error.header)
-    if _is_fwhm(size) != _is_fwhm(error):
-        found = f"an error beside '{size.header}' of which only one is a FWHM"
+    if error.unit != PERCENT and not math.isclose(_rms(size), _rms(error)):
+        word = "a FWHM" if FWHM in (_rms(size), _rms(error)) else "several sigma"
+        found = f"an error beside '{size.header}' of which only one is {word}"
         raise sheet.header_error(found, "sizes and errors of one width", error.header)
 
 
@@ -113,6 +156,8 @@ def _other(header: str, sheet: Sheet) -> Column:
     """A size under another name, a magnet's setting, or a column that is carried along unread."""
     if CARRIED.fullmatch(header):
         return Column(header, header)
+    if header.lower() in SHOTS:
+        return Column(header, SHOTS[header.lower()])
     if (column := _size(header)) is not None:
         return column
     if (named := ELEMENT.fullmatch(header)) is not None:
@@ -120,19 +165,31 @@ def _other(header: str, sheet: Sheet) -> Column:
         return Column(header, f"r{OF_Y[of_y]}_y" if of_y else f"r{of_x}_{plane or 'x'}")
     unit = next((u for u in SETTINGS if header.endswith(f"_{u}")), "")
     name = header.removesuffix(f"_{unit}") if unit else ""
+    while (bare := ATTRIBUTE.sub("", name)) != name:
+        name = bare
     if name and not re.match(r"(size|sigma|rms|fwhm)_[xy](_|$)", name):
         return Column(header, f"setting {name}", unit)
     usual = [f"{q}_um" for q in QUANTITIES if q.startswith("size")]
     usual += ["resolution_um", *ENERGY_KEYS, "energy_spread"]
     usual += ["shot", "shots", "screen", "slice"]
-    before, _, last = header.rpartition("_")
     raise sheet.header_error(
-        f"unknown unit '{last}'" if before else "a name without a unit",
+        _not_understood(header),
         "a magnet with _A, _kG, _T_per_m or _k1 at the end, "
         + nearest(header, usual)
         + "; --ignore a column, or begin its name with note_, to leave it unread",
         header,
     )
+
+
+def _not_understood(header: str) -> str:
+    """What it is about a header that nobody knows."""
+    bracket = re.search(r"[\[(]([^\[\]()]*)[\])]\s*$", header)
+    before, _, last = header.rpartition("_")
+    if bracket is not None:
+        return f"unknown unit '{bracket[1]}'"
+    if before and last in UNITS["length"]:
+        return f"'{before}', which is no size of a plane that is known"
+    return f"unknown unit '{last}'" if before else "a name without a unit"
 
 
 def is_size(header: str) -> bool:
@@ -144,36 +201,70 @@ def is_size(header: str) -> bool:
 def _size(header: str) -> Column | None:
     """The column of a size or its error: a width, a plane, a unit, in any sensible order.
 
-    ``sigma_x_mm``, ``x_rms_um``, ``rms_x_err_mm``, ``fwhm_y_um_std``; None if it is no size.
+    ``sigma_x_mm``, ``x_rms_um``, ``rms_x_err_mm``, ``fwhm_y_um_std``, ``sigma_x_err_%``,
+    ``D4Sigma_x_mm``; None if it is no size.
     """
-    words = header.split("_")
-    place = next((i for i in (-1, -2) if len(words) > 1 and words[i] in UNITS["length"]), None)
+    # A control system names the screen, its channel the size.
+    plain = re.split("[:/]", header)[-1].replace("σ", "sigma").replace("Δ", "d_")
+    several = SEVERAL.search(plain)
+    words = SEVERAL.sub("", plain).split("_")
+    units = UNITS["length or share"]
+    place = next((i for i in (-1, -2) if len(words) > 1 and words[i] in units), None)
     if place is None:
         return None
     unit = words.pop(place)
     said = []
-    for word in map(str.lower, words):
+    for word in filter(None, map(str.lower, words)):
         both = ONE_WORD.fullmatch(word)
         said += [part for part in both.groups() if part] if both else [word]
-    planes, widths, errors = ([w for w in said if w in of] for of in ("xy", WIDTHS, ERRORS))
-    known = len(planes) + len(widths) + len(errors) == len(said) - said.count("beam")
+    planes, widths, errors = ([w for w in said if w in of] for of in (PLANES, WIDTHS, ERRORS))
+    known = len(planes) + len(widths) + len(errors) == len(said) - sum(map(said.count, IDLE))
     # "rms_size", "size_fwhm" are one width said in full; a sigma of a size may be its error.
     one = len(widths) == 1 or sorted(widths) in (["rms", "size"], ["fwhm", "size"])
     if not (known and one and len(planes) == 1 and len(errors) <= 1):
         return None
-    rms = FWHM if "fwhm" in widths else 1.0
-    key = f"size_{planes[0]}" + ("_error" if errors else "")
-    return Column(header, key, unit, UNITS["length"][unit] * rms)
+    if unit == PERCENT and not errors:
+        return None
+    rms = FWHM if "fwhm" in widths else 1.0 / int(several[1]) if several else 1.0
+    key = f"size_{PLANES[planes[0]]}" + ("_error" if errors else "")
+    return Column(header, key, unit, units[unit] * (rms if unit != PERCENT else 1.0))
 
 
-def _is_fwhm(column: Column) -> bool:
-    return column.factor != UNITS["length"][column.unit]
+def _rms(column: Column) -> float:
+    """How many rms sizes one of a column's is."""
+    return column.factor / UNITS["length"][column.unit]
 
 
 def column_notes(columns: Mapping[str, Column]) -> list[str]:
     """Say which sizes were made of others, in sentences."""
-    made = [c.header for key, c in columns.items() if key in ("size_x", "size_y") and _is_fwhm(c)]
-    if not made:
+    made: dict[float, list[str]] = {}
+    for column in (columns[key] for key in ("size_x", "size_y") if key in columns):
+        made.setdefault(round(1 / _rms(column), 4), []).append(column.header)
+    return [
+        f"Sizes are FWHM/2.3548 of {' and '.join(headers)}, which is their rms for a Gaussian "
+        "profile only."
+        if share == round(1 / FWHM, 4)
+        else f"Sizes are a share of 1/{share:g} of {' and '.join(headers)}."
+        for share, headers in made.items()
+        if share != 1.0
+    ]
+
+
+def comment_notes(columns: Mapping[str, Column], comments: Iterable[str]) -> list[str]:
+    """Ask about a comment that speaks of another width than the headers of rms sizes.
+
+    Examples
+    --------
+    >>> size = Column("size_x_um", "size_x", "um", 1e-6)
+    >>> comment_notes({"size_x": size}, ["sizes: FWHM"])[0][:54]
+    "A comment says 'sizes: FWHM', and the sizes are taken "
+    """
+    said = next((text for text in comments if WIDER.search(text)), None)
+    sizes = [columns[key] for key in ("size_x", "size_y") if key in columns]
+    if said is None or any(_rms(column) != 1.0 for column in sizes):
         return []
-    listed = " and ".join(made)
-    return [f"Sizes are FWHM/2.3548 of {listed}, which is their rms for a Gaussian profile only."]
+    named = " and ".join(column.header for column in sizes)
+    return [
+        f"A comment says '{short(said, 80)}', and the sizes are taken for rms: if they are not, "
+        f"say so in the header of {named}, such as fwhm_x_{sizes[0].unit}."
+    ]

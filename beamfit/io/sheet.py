@@ -21,6 +21,8 @@ from beamfit.io.headers import UNITS, is_number, spelled
 
 # The unit of a column of dates.
 DATE = "a date"
+# What programs write where there is no number.
+BLANK = {"", "nan", "na", "n/a", "#n/a", "null"}
 # Rows left out that a note names one by one.
 MOST_NAMED = 5
 
@@ -201,7 +203,7 @@ class Sheet:
         name : str
             Its header.
         blank : bool
-            Whether a cell may be blank; it is NaN then.
+            Whether a cell may be blank, or say NaN in a text; it is NaN then.
         read : callable
             From a cell to a number, or ValueError.
         expected : str
@@ -216,13 +218,16 @@ class Sheet:
             return self[name].astype(float)
         values = np.empty(len(self))
         for row, cell in enumerate(self[name]):
+            if blank and isinstance(cell, str) and cell.lower() in BLANK:
+                values[row] = np.nan
+                continue
             try:
-                values[row] = np.nan if blank and cell == "" else read(cell)
+                values[row] = read(cell)
             except (ValueError, TypeError, OverflowError):
                 comma = " with a decimal point" if "," in str(cell) else ""
                 found = "an empty cell" if cell == "" else f"'{cell}'"
                 raise self.error(found, expected + comma, row, name) from None
-            if cell != "" and not np.isfinite(values[row]):
+            if not np.isfinite(values[row]):
                 raise self.error(f"'{cell}'", "a finite number", row, name)
         return values
 

@@ -26,6 +26,7 @@ from beamfit.io.headers import (
     unframed,
     with_units,
 )
+from beamfit.io.json_table import json_sheet
 from beamfit.io.numeric import check_length, numeric_rows
 from beamfit.io.sheet import Sheet
 
@@ -89,8 +90,12 @@ def read_sheet(
     """
     if hasattr(path, "itertuples"):
         return _of_frame(path, most)
-    if Path(path).suffix.lower() in HDF5:
+    if (suffix := Path(path).suffix.lower()) in HDF5:
         return _read_hdf5(path, most)
+    if suffix == ".json":
+        sheet = json_sheet(path)
+        check_length(len(sheet), most, path)
+        return sheet
     return _read_text(path, example, most, ragged, names)
 
 
@@ -233,7 +238,8 @@ def _check_header(names: list[str], example: str, path: str | PathLike[str], lin
 def _read_hdf5(path: str | PathLike[str], most: int) -> Sheet:
     columns, comments = hdf5_columns(path, most, min(most, MOST_WORDS))
     if not columns:
-        raise InputError("no datasets", "one dataset a column", path=path)
+        expected = "one dataset a column, at the top of the file"
+        raise InputError("no datasets", expected, path=path)
     lengths = sorted(map(len, columns.values()))
     usual = max(lengths, key=lengths.count)
     like = next(name for name, column in columns.items() if len(column) == usual)

@@ -11,6 +11,7 @@ from typing import Any
 
 from beamfit.errors import InputError
 from beamfit.io import facts
+from beamfit.io.archive import archive_sheet
 from beamfit.io.decay_record import read_lifetime_input
 from beamfit.io.emittance_gui import is_emittance_gui, read_emittance_gui
 from beamfit.io.facts import Fact
@@ -21,7 +22,7 @@ from beamfit.io.record_columns import is_current
 from beamfit.io.ring import read_ring
 from beamfit.io.run import read_run
 from beamfit.io.scan_columns import is_size
-from beamfit.io.table import HDF5, header_of, read_sheet
+from beamfit.io.table import HDF5, header_of
 from beamfit.io.toml import read_toml
 from beamfit.studies.scan.scans import QuadScan
 from beamfit.table import Table
@@ -158,10 +159,8 @@ def _kind(path: str | PathLike[str]) -> str:
         return "ring" if "ring" in tables and "element" not in tables else "lattice"
     if suffix in (".bf", ".xml"):
         return "formulation"
-    if suffix == ".json":
-        return "record"
-    if suffix in HDF5:
-        names = read_sheet(path, "Q2_A,size_x_um").names
+    if suffix in {*HDF5, ".json"}:
+        names = archive_sheet(path, False).names
     elif is_emittance_gui(path):
         return "scan"
     else:
@@ -172,7 +171,9 @@ def _kind(path: str | PathLike[str]) -> str:
         raise InputError(found, "the ring file (TOML) that names it under [optics] twiss", path)
     if {"u_", "y_"} <= {name[:2] for name in names}:
         return "run"
-    return "record" if any(map(is_current, names)) and not any(map(is_size, names)) else "scan"
+    archived = {"secs", "nanos"} <= set(names)
+    current = any(map(is_current, names)) and not any(map(is_size, names))
+    return "record" if archived or current else "scan"
 
 
 def _questions(scan: QuadScan) -> tuple[str, ...]:

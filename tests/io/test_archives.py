@@ -9,6 +9,8 @@ import pytest
 
 from beamfit.errors import InputError
 from beamfit.io.decay_record import read_decay_record, read_lifetime_input, read_lifetimes
+from beamfit.io.measurement import read_quad_scan
+from beamfit.io.understood import understand
 from beamfit.studies.decay.record import LifetimeTable
 
 START = 1709290800.25  # 2024-03-01T11:00:00.25 UTC
@@ -228,3 +230,53 @@ def test_a_reading_left_out_is_counted_as_it_stands(tmp_path):
     assert "reading 3: 'NaN'" in read_decay_record(path, skip_bad=True).notes[0]
     with pytest.raises(InputError, match=r"'NaN'; .*--skip-bad leaves such rows out"):
         read_decay_record(path)
+
+
+ROWS = {
+    "columns": {"time_s": TIMES, "beam_current_mA": CURRENT},
+    "rows": [{"time_s": t, "beam_current_mA": v} for t, v in zip(TIMES, CURRENT, strict=True)],
+    "pandas": {
+        "time_s": {str(i): t for i, t in enumerate(TIMES)},
+        "beam_current_mA": {str(i): v for i, v in enumerate(CURRENT)},
+    },
+}
+
+
+@pytest.mark.parametrize("form", ROWS)
+def test_json_of_scripts(form, tmp_path):
+    (tmp_path / "a.json").write_text(json.dumps(ROWS[form]))
+    assert read_decay_record(tmp_path / "a.json").current.tolist() == CURRENT
+    assert understand(tmp_path / "a.json").kind == "record"
+
+
+def test_json_of_a_scan_and_of_nothing(tmp_path):
+    columns = {"Q_A": [0, 1, 2, 3], "size_x_um": [90.0, 60.0, 95.0, 99.0]}
+    columns["size_y_um"] = [None, 70, 80, 90]
+    (tmp_path / "a.json").write_text(json.dumps(columns))
+    assert len(read_quad_scan(tmp_path / "a.json").rows("y").size) == 3
+    assert understand(tmp_path / "a.json").kind == "scan"
+    for wrong in ({"Q_A": [0, 1], "size_x_um": [1]}, {"Q_A": 1}, [], 3, "text"):
+        (tmp_path / "a.json").write_text(json.dumps(wrong))
+        with pytest.raises(InputError, match="another JSON file"):
+            read_quad_scan(tmp_path / "a.json")
+
+
+@pytest.mark.parametrize("group", ["", "run/"])
+@pytest.mark.parametrize("shape", [(-1,), (-1, 1), (1, -1)])
+def test_hdf5_of_columns_in_a_group_and_as_matrices(group, shape, tmp_path):
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file[group + "time_s"] = np.reshape(TIMES, shape)
+        file[group + "beam_current_mA"] = np.reshape(CURRENT, shape)
+    assert read_decay_record(tmp_path / "a.h5").current.tolist() == CURRENT
+
+
+def test_files_of_other_programs_say_how_to_write_a_table(tmp_path):
+    two = [{"meta": {}, "data": []}] * 2
+    for name, content, words in (
+        ("a.sdds", b"SDDS1\n&column name=Time, type=double, &end\n", "sdds2spreadsheet"),
+        ("a.dat", b"MATLAB 5.0 MAT-file, Platform: GLNXA64", "writetable"),
+        ("a.json", json.dumps(two).encode(), "a file for each"),
+    ):
+        (tmp_path / name).write_bytes(content)
+        with pytest.raises(InputError, match=words):
+            read_decay_record(tmp_path / name)

@@ -19,13 +19,21 @@ def write(folder, header, *columns):
 
 @pytest.mark.parametrize(
     "name",
-    ["current_mA", "I (mA)", "DCCT [mA]", "SR:DCCT:CURRENT [mA]", "stored_current_mA", "Beam [mA]"],
+    [
+        "current_mA",
+        "I (mA)",
+        "Current (A)",
+        "DCCT [mA]",
+        "SR:DCCT:CURRENT [mA]",
+        "stored_current_mA",
+        "Beam [mA]",
+    ],
 )
-@pytest.mark.parametrize("time", ["time_s", "t [s]", "Time / s"])
+@pytest.mark.parametrize("time", ["time_s", "t [s]", "Time / s", "Epoch (s)"])
 def test_a_current_by_its_word_and_unit(name, time, tmp_path):
     path = write(tmp_path, f"{time},{name}", range(4), CURRENT)
     record = read_decay_record(path)
-    assert record.current.tolist() == CURRENT
+    np.testing.assert_allclose(record.current, np.multiply(CURRENT, 1e3 if "(A)" in name else 1))
     assert record.notes == (f"Column '{name}' is taken for the beam current.",)
     assert understand(path).kind == "record"
 
@@ -66,6 +74,7 @@ TIMES = {
     "of the clock": ("time", ["23:59:58", "23:59:59.0", "00:00:01"]),
     "months first": ("time", [f"02/29/2024 12:00:{s:02d}" for s in (0, 1, 3)]),
     "days first": ("time", ["29/02/2024 12:00:00", "29-02-2024 12:00:01", "29.02.2024 12:00:03"]),
+    "a short year": ("time", [f"01.03.24 12:00:{s:02d}" for s in (0, 1, 3)]),
     "noon": ("time", ["13/3/2024 11:59:58 AM", "13/3/2024 11:59:59 AM", "13/3/2024 12:00:01 PM"]),
     "the C library": ("timestamp", [f"Fri Mar  1 12:00:{s:02d} 2024" for s in (0, 1, 3)]),
     "summer": ("Datetime", [f"2024-07-01 12:00:{s:02d} CEST" for s in (0, 1, 3)]),

@@ -43,12 +43,21 @@ NAMES = [
     "beam_size_x_um",
     "Sigma_X_um",
     "size_x_rms_µm",
+    "σx [µm]",
+    "sx (um)",
+    "Horizontal beam size (um)",
+    "sigma_h_um",
+    "sigma_x_fit_um",
+    "x_rms_nm",
+    "sigma_x_cm",
 ]
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_names_of_a_size(name, read):
-    scan = read(table(["Q_A", name, "size_x_error_um"]))
+    factor = {"nm": 1e3, "cm": 1e-4}.get(name[-2:], 1.0)
+    rows = [(q, factor * s, e) for q, s, e in ROWS]
+    scan = read(table(["Q_A", name, "size_x_error_um"], rows))
     np.testing.assert_allclose(scan.size["x"], METRES, rtol=1e-14)
     assert scan.columns["size_x"] == name
     assert scan.notes == ()
@@ -214,3 +223,53 @@ def test_large_and_small_beams_are_taken_as_they_stand(read):
         factor = 1e-3 if "mm" in header else 1e-6
         scan = read(table(["Q_A", header], rows))
         np.testing.assert_allclose(scan.size["x"], [factor * s for _, s in rows])
+
+
+@pytest.mark.parametrize("name", ["4sigma_x_um", "4 sigma x [um]", "D4Sigma_x_um", "x_4rms_um"])
+def test_several_sigma_are_said_to_be_several(name, read):
+    scan = read(table(["Q_A", name, "4sigma_x_err_um"], [(q, 4 * s, 4 * e) for q, s, e in ROWS]))
+    np.testing.assert_allclose(scan.size["x"], METRES)
+    np.testing.assert_allclose(scan.error["x"], [1.5e-6, 0.5e-6, 1e-6])
+    assert scan.notes == (f"Sizes are a share of 1/4 of {name}.",)
+    with pytest.raises(InputError, match="several sigma"):
+        read(table(["Q_A", name, "size_x_error_um"]))
+
+
+@pytest.mark.parametrize("name", ["size_x_error_%", "sigma_x err (%)", "d sigma_x [percent]"])
+def test_errors_in_percent_are_of_the_size(name, read):
+    scan = read(table(["Q_A", "fwhm_x_um", name], [(q, s, 2.0) for q, s, _ in ROWS]))
+    np.testing.assert_allclose(scan.error["x"], 0.02 * scan.size["x"], rtol=1e-14)
+
+
+@pytest.mark.parametrize(
+    "name", ["Q:5:BACT [A]", "Q:5 Current (A)", "Q:5.BDES_A", "Q:5 current setpoint [A]"]
+)
+def test_a_magnet_is_called_by_its_name_alone(name, read):
+    assert read(table([name, "size_x_um", "note_"])).units == {"Q:5": "A"}
+    with pytest.raises(InputError, match="also in column"):
+        read(table([name, "Q:5_A", "size_x_um"]))
+
+
+def test_all_columns_that_nobody_knows_are_named_at_once(read):
+    with pytest.raises(InputError, match="--ignore 'mean_x_mm' --ignore 'ICT'"):
+        read("Q_A,size_x_um,mean_x_mm,ICT\n0,1,2,3\n")
+
+
+def test_a_size_that_says_nan_was_not_measured(read):
+    scan = read("Q_A,size_x_um,size_y_um\n0,90,NaN\n0,nan,80\n1,60,70\n2,95,N/A\n3,99,60\n")
+    assert (len(scan.rows("x").size), len(scan.rows("y").size)) == (4, 3)
+    with pytest.raises(InputError, match="no error beside it; --skip-bad"):
+        read("Q_A,size_x_um,size_x_error_um\n0,90,1\n1,nan,1\n2,60,1\n3,90,1\n")
+
+
+def test_a_comment_that_speaks_of_another_width_is_asked_about(read):
+    text = "# all widths are FWHM\n" + table(["Q_A", "size_x_um", "note_"])
+    (note,) = read(text).notes
+    assert "'all widths are FWHM'" in note
+    assert "fwhm_x_um" in note
+    assert "all widths" not in "".join(read(text.replace("size", "fwhm")).notes)
+
+
+def test_errors_that_are_all_zero_are_to_be_left_unread(read):
+    with pytest.raises(InputError, match="--ignore 'size_x_error_um'"):
+        read(table(["Q_A", "size_x_um", "size_x_error_um"], [(q, s, 0) for q, s, _ in ROWS]))

@@ -237,3 +237,19 @@ def test_a_current_that_rises_is_no_decay():
     study = study_record(DecayRecord(time, 100 + time / 100 + noise))
     assert [decay.fit.status for decay in study.answers] == ["infeasible"]
     assert "The current rises" in study.answers[0].fit.message
+
+
+def test_refills_of_many_readings_are_cut_and_drifts_are_not():
+    for ramp in (60.0, 300.0):  # s
+        phase = TIME % 2000
+        low = 100 * np.exp(-(2000 - ramp) / 36000)
+        fill = np.where(phase < ramp, low + (100 - low) * phase / ramp, decay(phase - ramp))
+        split = split_record(DecayRecord(TIME, fill))
+        assert kinds(split) == ["ramp"] * 3
+        assert [part.current[0] > 99 for part in split.segments] == [True] * 3
+        for part in split.segments:
+            assert np.polyfit(part.time, np.log(part.current), 1)[0] == pytest.approx(
+                -1 / 36000, 1e-2
+            )
+    drift = decay(TIME) * (1 + 0.02 * np.sin(TIME / 500))
+    assert kinds(split_record(DecayRecord(TIME, drift))) == []

@@ -21,6 +21,11 @@ FEWEST = 8
 # Readings whose means are looked at for a ramp at the head, the share of its rise by which a fall
 # ends it, and by how much it exceeds any later rise.
 SMOOTH, FALL, RISE = 5, 0.1, 3.0
+# A refill of many readings rises by so many standard deviations, this share of the current, and so
+# many times faster than the record usually falls: a drift of the monitor does none of these.
+REFILL, SHARE, FASTER = 30.0, 0.01, 4.0
+# Readings that are looked through for one at first.
+BLOCK = 4096
 # A gap is this many usual sampling intervals.
 GAP = 10.0
 
@@ -184,6 +189,13 @@ def _steps(time: np.ndarray, current: np.ndarray, noise: float) -> np.ndarray:
     return np.where(np.abs(excess) > allowed, change, 0.0)
 
 
+def _highest(smooth: np.ndarray, low: float, noise: float) -> int:
+    """Where a rise from a low current ends: it falls again by more than noise and a tenth of it."""
+    top = np.maximum.accumulate(smooth)
+    falls = np.flatnonzero(top - smooth > np.maximum(5 * noise, FALL * (top - low)))
+    return int(np.argmax(smooth[: falls[0] if falls.size else None]))
+
+
 def _ramp(current: np.ndarray, noise: float) -> int:
     """How many readings at the head of a piece are of injection: the current still rises, by more
     than noise and three times more than anywhere later. Half as many again are cut, where a ramp
@@ -192,15 +204,42 @@ def _ramp(current: np.ndarray, noise: float) -> int:
     if current.size < 3 * FEWEST:
         return 0
     smooth = np.convolve(current, np.full(SMOOTH, 1 / SMOOTH), "valid")
-    top = np.maximum.accumulate(smooth)
-    falls = np.flatnonzero(top - smooth > np.maximum(5 * noise, FALL * (top - smooth[0])))
-    highest = int(np.argmax(smooth[: falls[0] if falls.size else None]))
+    highest = _highest(smooth, smooth[0], noise)
     after = smooth[highest:]
     later = float(np.max(after - np.minimum.accumulate(after)))
     if smooth[highest] - smooth[0] <= max(6 * noise, RISE * later):
         return 0
     cut = int(1.5 * (highest + SMOOTH // 2)) + 1
     return cut if current.size - cut >= FEWEST else 0
+
+
+def _refills(time: np.ndarray, current: np.ndarray, noise: float) -> list[int]:
+    """Where refills of many readings begin: their ramps are then at the heads of pieces."""
+    if current.size < 3 * FEWEST:
+        return []
+    smooth = np.convolve(current, np.full(SMOOTH, 1 / SMOOTH), "valid")
+    usual = np.median(np.abs(np.diff(smooth) / np.diff(time[: smooth.size])))
+    found, start, width = [], 0, BLOCK
+    while start < smooth.size:
+        block = smooth[start : start + width]
+        lowest = np.minimum.accumulate(block)
+        rises = np.flatnonzero(block - lowest > np.maximum(REFILL * noise, SHARE * np.abs(lowest)))
+        if not rises.size and start + width >= smooth.size:
+            break
+        if not rises.size:
+            width *= 2
+            continue
+        top = rises[0]
+        begin = np.flatnonzero(block[:top] == lowest[top])[-1]
+        lasted = time[start + top] - time[start + begin]
+        if block[top] - block[begin] <= FASTER * usual * lasted:
+            break  # a drift of the monitor, which has no end to be seen
+        highest = _highest(block[top:], block[begin], noise)
+        at = start + int(begin) + SMOOTH // 2 + 1
+        if at - (found[-1] if found else 0) >= FEWEST:  # else the ramp is at the head already
+            found.append(at)
+        start, width = start + int(top) + max(highest, 1), BLOCK
+    return found
 
 
 def split_record(record: DecayRecord) -> Split:
@@ -218,7 +257,8 @@ def split_record(record: DecayRecord) -> Split:
 
     Notes
     -----
-    A step must exceed ten robust standard deviations of the changes between readings, so slow
+    A step must exceed ten robust standard deviations of the changes between readings; a refill of
+    many readings must rise by 30 and by 1 %, four times faster than the record falls: other slow
     or noisy changes stay in. A gap alone does not end a decay; a step across it does.
 
     Examples
@@ -243,7 +283,13 @@ def split_record(record: DecayRecord) -> Split:
     for before in np.flatnonzero(interval > GAP * np.median(interval)):
         events.append(event_of(record, "gap", before, before + 1))
     long = []
-    for piece in np.split(kept, np.flatnonzero(steps) + 1):
+    between = np.split(kept, np.flatnonzero(steps) + 1)
+    parts = [
+        part
+        for piece in between
+        for part in np.split(piece, _refills(record.time[piece], record.current[piece], noise))
+    ]
+    for piece in parts:
         if cut := _ramp(record.current[piece], noise):
             events.append(event_of(record, "ramp", piece[0], piece[cut - 1]))
         if piece.size < FEWEST:

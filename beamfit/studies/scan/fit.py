@@ -19,7 +19,7 @@ from beamfit.studies.scan.judged import judged_beam
 from beamfit.studies.scan.known import METHODS, WEIGHTS, prepared, see
 from beamfit.studies.scan.model import line_of
 from beamfit.studies.scan.predicted import Prediction, correlations_of, predicted_sizes
-from beamfit.studies.scan.questions import questions
+from beamfit.studies.scan.questions import of_emittances, questions
 from beamfit.studies.scan.results import Parameter, PlaneFit, parameter_rows, result_rows
 from beamfit.studies.scan.scans import QuadScan
 from beamfit.studies.scan.statement import Scenario, Seen, scenario_of
@@ -216,7 +216,8 @@ class EmittanceFit:
         """What was done to the numbers of the file, and what is odd about them, in sentences."""
         measured = self.seen.weights == "measured"
         own = ("Errors of size squared are taken at the measured sizes, on request.",) * measured
-        return (*self.scan.notes, *questions(self.scan, self.seen.scanned), *own)
+        asked = (*questions(self.scan, self.seen.scanned), *of_emittances(self.planes))
+        return (*self.scan.notes, *asked, *own)
 
     @property
     def anchor(self) -> str:

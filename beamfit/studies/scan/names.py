@@ -43,9 +43,9 @@ def check_names(
     """
     for name, unit in () if scan.transfer else scan.units.items():
         if name not in calibrations:
-            raise scan.unusable(
-                f"no magnet '{name}' in the lattice", nearest(name, list(calibrations)), name
-            )
+            expected = f"{nearest(name, list(calibrations))} before the unit _{unit}; --ignore "
+            expected += "leaves the column unread"
+            raise scan.unusable(f"no magnet '{name}' in the lattice", expected, name)
         if unit == "A" and calibrations[name] != "A":
             raise scan.unusable(
                 f"currents for '{name}', which the lattice gives no current calibration",

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
+from typing import Any
 
 import numpy as np
 
@@ -14,6 +15,8 @@ from beamfit.studies.scan.scans import USUAL, QuadScan, middle
 
 # Gradients in T/m beyond which a magnet is a plasma lens at least, and beyond any lens.
 STRONG, IMPOSSIBLE = 500.0, 1e4
+# Normalised emittances in m below those of accelerators: sizes in mm that are called µm give 1e-12.
+TINY = 1e-9
 
 
 def scanned_magnets(scan: QuadScan, scanned: Beamline) -> Iterator[tuple[str, np.ndarray, Element]]:
@@ -86,6 +89,17 @@ def of_sizes(scan: QuadScan) -> Iterator[str]:
             yield (
                 f"Sizes in {plane} around {1e3 * usual:.3g} mm are taken as they stand, but are "
                 f"unusually {unusual}: is that the unit they are in?"
+            )
+
+
+def of_emittances(planes: Iterable[Any]) -> Iterator[str]:
+    """Ask about planes whose emittance is determined and smaller than an accelerator's."""
+    for plane in planes:
+        found = plane.normalized_emittance
+        if found.error is not None and 0.0 < found.value < TINY:
+            yield (
+                f"A normalised emittance of {found.value:.2g} m in {plane.plane} is less "
+                "than accelerators have: are sizes, settings and energy in their units?"
             )
 
 
