@@ -191,6 +191,13 @@ def test_other_json_is_refused_in_a_line(tmp_path, text):
         read_decay_record(path)
 
 
+def test_several_channels_of_an_archive_are_told_as_such(tmp_path):
+    path = tmp_path / "export.json"
+    path.write_text(json.dumps(2 * archive("mA")))
+    with pytest.raises(InputError, match=r"export\.json: 2 channels; expected one: the beam curr"):
+        read_decay_record(path)
+
+
 def test_a_table_of_lifetimes(tmp_path):
     path = tmp_path / "lifetimes.csv"
     rows = "1,20,1\n2,15,1\n3,12,0.5\n4,10,1\n"

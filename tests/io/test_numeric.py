@@ -18,6 +18,7 @@ GOOD = {
     "blanks": "time_s beam_current_mA\n 0  1e2\n1 99.5 \n",
     "semicolons": "time_s;beam_current_mA\n0; 100\n+1 ;.995E2\n",
     "comments first": "# a\n\n" + HEAD + "0,100\n1,99\n",
+    "an index without a name": ",time_s,beam_current_mA\n0,0,100\n1,1,99\n",
     "units below": "time,beam_current\ns,mA\n0,100\n1,99\n",
 }
 OTHER = {

@@ -115,6 +115,17 @@ def test_other_files_and_formats_are_refused_in_words(every, tmp_path):
         beamfit.load_fit(file)
 
 
+def test_a_scan_within_that_cannot_be_is_told_of_the_file(every, tmp_path):
+    file = tmp_path / "a.json"
+    beamfit.save_fit(file, every["planes"])
+    content = json.loads(file.read_text())
+    content["fit"]["scan"]["with"]["size"] = {"is": "dict", "of": []}
+    file.write_text(json.dumps(content))
+    with pytest.raises(InputError, match="no beam sizes") as told:
+        beamfit.load_fit(file)
+    assert told.value.path == file
+
+
 def words_of(file):
     """Why a file is refused, if it is."""
     try:
