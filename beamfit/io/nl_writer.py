@@ -173,6 +173,6 @@ def _number(value: float) -> str:
 def _bound(low: float, high: float) -> str:
     if low == high:
         return f"4 {_number(low)}"
-    kinds = {(True, True): 0, (False, True): 1, (True, False): 2, (False, False): 3}
     ends = [_number(v) for v in (low, high) if np.isfinite(v)]
-    return " ".join([str(kinds[bool(np.isfinite(low)), bool(np.isfinite(high))]), *ends])
+    kind = int(not np.isfinite(low)) + 2 * int(not np.isfinite(high))  # 3: neither end
+    return " ".join([str(kind), *ends])

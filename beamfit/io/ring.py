@@ -316,10 +316,7 @@ def ring_from_pyat(
         lengths[points] / lengths.sum(),
         *data.beta.T,
         *data.alpha.T,
-        data.dispersion[:, 0],
-        data.dispersion[:, 2],
-        data.dispersion[:, 1],
-        data.dispersion[:, 3],
+        *data.dispersion.T[[0, 2, 1, 3]],  # both dispersions before both slopes
     )
     return Ring(
         energy=lattice.energy,
