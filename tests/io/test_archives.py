@@ -194,7 +194,9 @@ def test_other_json_is_refused_in_a_line(tmp_path, text):
 def test_several_channels_of_an_archive_are_told_as_such(tmp_path):
     path = tmp_path / "export.json"
     path.write_text(json.dumps(2 * archive("mA")))
-    with pytest.raises(InputError, match=r"export\.json: 2 channels; expected one: the beam curr"):
+    with pytest.raises(
+        InputError, match=r"export\.json: 2 channels; expected one, of the beam curr"
+    ):
         read_decay_record(path)
 
 
