@@ -114,7 +114,10 @@ def _understood(sheet: Sheet) -> dict[str, Column]:
         return columns_of(sheet, QUANTITIES, lambda header: _other(header, sheet))
     except InputError as error:
         unknown = [name for name in sheet.names if not _is_known(name, sheet)]
-        if len(unknown) < 2 or error.column not in unknown:
+        if error.column not in unknown:
+            expected = f"{error.expected}; --ignore '{error.column}' leaves this one unread"
+            raise replace(error, expected=expected) from None
+        if len(unknown) < 2:
             raise
         ignored = " ".join(f"--ignore '{name}'" for name in unknown)
         expected = "a magnet with its unit, a size such as size_x_um, or to leave them unread: "
