@@ -169,17 +169,17 @@ def beam_box(told: Assumptions, planes: Sequence[str]) -> list[Constraint]:
 
 
 def limited_network(
-    inputs: Sequence[Port], outputs: Sequence[str], told: Assumptions, cells: int
+    inputs: Sequence[str], box: np.ndarray, outputs: Sequence[str], told: Assumptions, cells: int
 ) -> tuple[MLP, list[Free], list[Constraint]]:
-    """The network of Appendix B: no scales, weights within ± 10, gains within their limits."""
-    low, high = ([getattr(p, end) for p in inputs] for end in ("lower", "upper"))
-    net = dense(inputs, outputs, [told.hidden], seed=told.seed, spread=START)
+    """The network of Appendix B: no scales, weights within ± 10, gains limited in a box (2, n)."""
+    low, high = box.tolist()
+    ports = [Port(n, "", lower=a, upper=b) for n, a, b in zip(inputs, low, high, strict=True)]
+    net = dense(ports, outputs, [told.hidden], seed=told.seed, spread=START)
     free = [Free("map", -MOST, MOST, (-START, START), nuisance=True)]
     limits = []
     for name, (least, most) in told.gains.items():
         output, by = _parts(name)
-        box = (low, high)
-        limits += certified_gain("map", output, by, box, cells, lower=least, upper=most)
+        limits += certified_gain("map", output, by, (low, high), cells, lower=least, upper=most)
     return net, free, limits
 
 

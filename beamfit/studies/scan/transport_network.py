@@ -16,7 +16,6 @@ import numpy as np
 from beamfit.greybox.bounds import over_cells
 from beamfit.greybox.mlp import MLP, Port
 from beamfit.greybox.problem import Free, Problem, Record
-from beamfit.greybox.terms import Constraint
 from beamfit.optics.rows import transfer_rows
 from beamfit.studies.scan.assumptions import Assumptions
 from beamfit.studies.scan.constrained_network import (
@@ -67,14 +66,13 @@ class Certificate(NamedTuple):
 
 
 class _Layout(NamedTuple):
-    """Inputs of the network with their columns, whether the last is the energy, elements of T."""
+    """Inputs of the network, their columns and box, if the last is the energy; elements of T."""
 
     names: tuple[str, ...]
     columns: np.ndarray
     with_energy: bool
     elements: int
-    low: np.ndarray
-    high: np.ndarray
+    box: np.ndarray
 
     @property
     def cells(self) -> int:
@@ -87,9 +85,8 @@ def _layout(seen: Seen, told: Assumptions) -> _Layout:
     columns = {name: scan.settings[name] for name in varied_magnets(scan)}
     with_energy = scan.energy is not None and np.ptp(scan.energy) > 0
     columns |= {"energy": scan.energy} if with_energy else {}
-    low, high = _box(seen, told, columns)
     elements, values = 4 if told.anchor.determinant else 2, np.stack([*columns.values()], -1)
-    return _Layout(tuple(columns), values, with_energy, elements, low, high)
+    return _Layout(tuple(columns), values, with_energy, elements, _box(seen, told, columns))
 
 
 def _box(seen: Seen, told: Assumptions, columns: dict[str, np.ndarray]) -> np.ndarray:
@@ -119,13 +116,13 @@ def _first_principles(seen: Seen, lay: _Layout, points: np.ndarray) -> np.ndarra
 def _grid(lay: _Layout) -> np.ndarray:
     """Points that fill the box, its edges included."""
     number = max(3, round(600 ** (1 / len(lay.names))))
-    axes = [np.linspace(a, b, number) for a, b in zip(lay.low, lay.high, strict=True)]
+    axes = [np.linspace(a, b, number) for a, b in zip(*lay.box, strict=True)]
     return np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, len(axes))
 
 
 def _signs(seen: Seen, lay: _Layout, grid: np.ndarray) -> np.ndarray:
     """Signs of the gains of A and B by first principles, shape (outputs, inputs); 0 if mixed."""
-    half = 0.5 * (lay.high - lay.low)
+    half = 0.5 * (lay.box[1] - lay.box[0])
     found = np.zeros((len(seen.planes) * len(seen.rows.places) * lay.elements, len(half)))
     # Nothing is asked of the gains by the energy, nor of C and D.
     for i in range(len(half) - lay.with_energy):
@@ -158,8 +155,12 @@ def _columns(seen: Seen, lay: _Layout, plane: str, which: np.ndarray) -> np.ndar
 def _state(seen: Seen, told: Assumptions) -> Problem:
     """Beams, and one network for A and B of every plane and screen."""
     lay = _layout(seen, told)
-    check_box(told, lay.names, _names(seen, lay), seen.planes)
-    net, weights, limits = _limited(seen, lay, told) if told.gains else _signed(seen, lay, told)
+    outputs = _names(seen, lay)
+    check_box(told, lay.names, outputs, seen.planes)
+    if told.gains:
+        net, weights, limits = limited_network(lay.names, lay.box, outputs, told, lay.cells)
+    else:
+        (net, weights), limits = _signed(seen, lay, told), []
     limits += beam_box(told, seen.planes)
     rows = {plane: network_rows(seen, lay, plane) for plane in seen.planes}
     anchors = [record for own in rows.values() for record in _anchors(seen, lay, told, own)]
@@ -167,29 +168,20 @@ def _state(seen: Seen, told: Assumptions) -> Problem:
     return network_problem(seen, told, lay.names, seen.planes, rows, part, weights, anchors, limits)
 
 
-def _signed(seen: Seen, lay: _Layout, told: Assumptions) -> tuple[MLP, list[Free], list]:
+def _signed(seen: Seen, lay: _Layout, told: Assumptions) -> tuple[MLP, list[Free]]:
     """A network scaled to its box, whose gains have the signs of first principles."""
     grid = _grid(lay)
     first = _first_principles(seen, lay, grid)[..., : lay.elements].reshape(len(grid), -1)
     inputs = [
         Port(n, "", 0, (b - a) / 2, (b + a) / 2)
-        for n, a, b in zip(lay.names, lay.low, lay.high, strict=True)
+        for n, a, b in zip(lay.names, *lay.box, strict=True)
     ]
     outputs = [
         Port(name, "", 0, np.ptp(v) / 2 or 1.0, (v.max() + v.min()) / 2)
         for name, v in zip(_names(seen, lay), first.T, strict=True)
     ]
     net, bounds = signed_network(inputs, outputs, _signs(seen, lay, grid), told.hidden, told.seed)
-    return net, weight_free("map", bounds), []
-
-
-def _limited(
-    seen: Seen, lay: _Layout, told: Assumptions
-) -> tuple[MLP, list[Free], list[Constraint]]:
-    """A network whose gains have the limits that were given."""
-    ends = zip(lay.names, lay.low, lay.high, strict=True)
-    inputs = [Port(n, "", lower=float(a), upper=float(b)) for n, a, b in ends]
-    return limited_network(inputs, _names(seen, lay), told, lay.cells)
+    return net, weight_free("map", bounds)
 
 
 def _names(seen: Seen, lay: _Layout) -> list[str]:
@@ -220,7 +212,7 @@ def _anchors(seen: Seen, lay: _Layout, told: Assumptions, rows: NetworkRows) -> 
         name = f"anchor {plane}"
         yield known(name, points, which, own[:, :2], sd, predict=_less_common, elements=2)
     for place in anchor.at:
-        middle = 0.5 * (lay.low + lay.high)
+        middle = 0.5 * (lay.box[0] + lay.box[1])
         point = np.array([[place.get(n, m) for n, m in zip(lay.names, middle, strict=True)]])
         here = _first_principles(seen, lay, point)[0, i, :, : lay.elements]
         inputs, screens = np.repeat(point, places, axis=0), np.arange(places)
