@@ -8,9 +8,11 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from scipy.linalg import cho_solve_banded, cholesky_banded
+from scipy.linalg.lapack import dtbtrs
 from scipy.special import stdtr
 
 # Correlation of neighbouring residuals, in standard errors of that of independent ones, from which
@@ -18,6 +20,11 @@ from scipy.special import stdtr
 SEEN = 2.0
 # Correlation times looked at: from this share of the usual interval to so many times the record.
 SHORTEST, LONGEST, TIMES = 0.3, 5.0, 40
+# Variances of a part without memory that are looked at beside, in those that the part with a
+# memory gets anew from one reading to the next; correlation times are fewer then.
+WHITE, FEWER = (0.0, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0, 1000.0), 20
+# Means of so many neighbours are looked at: a slow drift hides under white noise.
+BLOCKS = (1, 4, 16)
 
 
 def whitened(rows, apart, xp=jnp):
@@ -71,6 +78,78 @@ def is_correlated(residuals: np.ndarray, parameters: int) -> bool:
         return False
     found = float(residuals[1:] @ residuals[:-1]) / squares + parameters / count
     return bool(found > SEEN / np.sqrt(count))
+
+
+def remembers(residuals: np.ndarray, parameters: int) -> bool:
+    """Whether residuals, or their means over some neighbours, are correlated.
+
+    Examples
+    --------
+    >>> slow = 0.3 * np.sin(np.arange(400) / 60) + np.random.default_rng(0).normal(size=400)
+    >>> is_correlated(slow, 0), remembers(slow, 0)
+    (False, True)
+    """
+    means = [residuals[: len(residuals) // k * k].reshape(-1, k).mean(axis=1) for k in BLOCKS]
+    return any(is_correlated(m, parameters) for m in means if len(m) > 2 * parameters)
+
+
+class Noise(NamedTuple):
+    """Correlation time of the part that wanders, and the share of variance without memory."""
+
+    time: float
+    white: float = 0.0
+
+
+@jax.jit  # a scan that is called as it is would be compiled at every call
+def innovations(rows: jax.Array, time: jax.Array, noise: Noise) -> tuple[jax.Array, jax.Array]:
+    """Rows less what those before foretell, over the error of that; and log sum of the errors.
+
+    The Kalman filter of an Ornstein-Uhlenbeck process read with white noise (A. C. Harvey,
+    Forecasting, structural time series models and the Kalman filter, 1989, section 3.4), O(n).
+    """
+    wander = 1.0 - noise.white
+    kept = jnp.exp(-jnp.diff(time, append=time[-1:]) / noise.time)
+
+    def on(carry, now):
+        mean, variance = carry
+        row, k = now
+        whole = variance + noise.white
+        surprise = row - mean
+        mean = k * (mean + variance / whole * surprise)
+        variance = k**2 * variance * noise.white / whole + wander * (1.0 - k**2)
+        return (mean, variance), (surprise / jnp.sqrt(whole), 0.5 * jnp.log(whole))
+
+    begin = jnp.zeros(rows.shape[1:]), jnp.asarray(wander)
+    _, (white, sizes) = jax.lax.scan(on, begin, (rows, kept))
+    return white, jnp.sum(sizes)
+
+
+def whitened_of_both(
+    rows: np.ndarray, interval: np.ndarray, noise: Noise
+) -> tuple[np.ndarray, float]:
+    """Rows as those with independent errors of the same size, and the log of the volume.
+
+    With W of `whitened`, the covariance of both parts of the noise is that of W⁻¹ T W⁻ᵀ with
+    T = (1 - white) 1 + white W Wᵀ, of three diagonals: its Cholesky factor ends the work, in O(n).
+
+    Examples
+    --------
+    >>> both, volume = whitened_of_both(np.array([1.0, 2.0]), np.array([1.0]), Noise(1.0, 1.0))
+    >>> both.round(9).tolist(), round(volume, 9) + 0.0
+    ([1.0, 2.0], 0.0)
+    """
+    apart = interval / noise.time
+    rows, volume = whitened(rows, apart, np), float(log_volume(apart, np))
+    if not noise.white:
+        return rows, volume
+    kept, new = np.exp(-apart), np.sqrt(-np.expm1(-2 * apart))
+    own, before = np.append(1.0, 1.0 / new), np.append(0.0, -kept / new)
+    matrix = np.zeros((2, len(rows)))
+    matrix[0] = 1.0 - noise.white + noise.white * (own**2 + before**2)
+    matrix[1, :-1] = noise.white * before[1:] * own[:-1]
+    factor = cholesky_banded(matrix, lower=True)
+    solved = dtbtrs(factor, rows.reshape(len(rows), -1), uplo="L")[0]
+    return solved.reshape(rows.shape), volume - float(np.sum(np.log(factor[0])))
 
 
 class Levels(NamedTuple):
@@ -131,8 +210,8 @@ class Memory(NamedTuple):
     ----------
     weight : array, shape (g,)
         Probability of each correlation time.
-    time : array, shape (g,)
-        The correlation times.
+    time, white : array, shape (g,)
+        The correlation times, and the shares of variance without memory.
     step : array, shape (g, p)
         Generalised least-squares step of the numbers at each.
     half : array, shape (g, p, p)
@@ -145,6 +224,7 @@ class Memory(NamedTuple):
 
     weight: np.ndarray
     time: np.ndarray
+    white: np.ndarray
     step: np.ndarray
     half: np.ndarray
     squares: np.ndarray
@@ -152,8 +232,14 @@ class Memory(NamedTuple):
 
     @property
     def likely(self) -> int:
-        """Index of the median correlation time."""
-        return int(np.searchsorted(np.cumsum(self.weight), 0.5))
+        """Index of the median correlation time, and of the share that is likeliest with it."""
+        median = self.time[np.searchsorted(np.cumsum(self.weight), 0.5)]
+        return int(np.argmax(np.where(self.time == median, self.weight, -1.0)))
+
+    @property
+    def noise(self) -> Noise:
+        """That."""
+        return Noise(float(self.time[self.likely]), float(self.white[self.likely]))
 
     @property
     def mean_step(self) -> np.ndarray:
@@ -230,8 +316,10 @@ def memory_of(
     residuals integrated over the numbers (flat) and over the size of the errors (flat in its
     logarithm): the restricted likelihood of D. A. Harville, Biometrika 61 (1974) 383, which the
     fitted numbers do not bias, times a prior flat in the logarithm of the correlation time, from
-    0.3 usual intervals to five times the record. Near the upper end the errors are a random walk,
-    whose level nothing tells, but whose slope and bend the rows still do.
+    0.3 usual intervals to five times the record. Without levels a part of the noise may be white: a
+    monitor that drifts, read by a noisy converter, would pass for a short memory otherwise, and its
+    errors come out several times too small; the ratio of both is averaged over, too. Near the upper
+    end the errors are a random walk: nothing tells its level, but slope and bend the rows do tell.
 
     Examples
     --------
@@ -245,27 +333,41 @@ def memory_of(
     """
     count, p = slopes.shape
     rows, interval = np.column_stack([slopes, residuals]), np.diff(time)
-    times = np.geomspace(*range_of(time), TIMES) if known is None else np.array([known])
+    grid = _grid(time, alone=levels is not None) if known is None else [Noise(known)]
     with np.errstate(divide="ignore"):
-        found = [_at(rows, interval / each, levels) for each in times]
+        found = [_at(rows, interval, each, levels) for each in grid]
     count -= 0 if levels is None else levels.first.size
     logs, step, half, squares = (np.array(part) for part in zip(*found, strict=True))
     weight = np.exp(logs - logs.max())
-    return Memory(weight / weight.sum(), times, step, half, squares, count - p)
+    times, white = np.array(grid).T
+    return Memory(weight / weight.sum(), times, white, step, half, squares, count - p)
+
+
+def _grid(time: np.ndarray, alone: bool) -> list[Noise]:
+    """Noises that are looked at: with a memory `alone`, or a part without one beside."""
+    if alone:
+        return [Noise(each) for each in np.geomspace(*range_of(time), TIMES)]
+    new = -np.expm1(-2.0 * np.median(np.diff(time)) / np.geomspace(*range_of(time), FEWER))
+    return [
+        Noise(float(each), float(ratio * fresh / (1.0 + ratio * fresh)))
+        for each, fresh in zip(np.geomspace(*range_of(time), FEWER), new, strict=True)
+        for ratio in WHITE
+    ]
 
 
 def _at(
-    rows: np.ndarray, apart: np.ndarray, levels: Levels | None
+    rows: np.ndarray, interval: np.ndarray, noise: Noise, levels: Levels | None
 ) -> tuple[float, np.ndarray, np.ndarray, float]:
-    """Log probability, step, half and squares at one correlation time."""
-    white, volume, count = whitened(rows, apart, np), 0.0, len(rows)
+    """Log probability, step, half and squares for one noise."""
+    count, beside = len(rows), 0.0
+    white, volume = whitened_of_both(rows, interval, noise)
     if levels is not None:
-        white, volume = levels.left(white, apart)
+        white, beside = levels.left(white, interval / noise.time)
         count -= levels.first.size
     factor = np.linalg.qr(white, mode="r")
     p = rows.shape[1] - 1
     half = np.linalg.inv(factor[:p, :p])
     squares = max(float(factor[p, p] ** 2), 1e-300)
-    log = log_volume(apart, np) - volume - np.sum(np.log(np.abs(np.diag(factor)[:p])))
+    log = volume - beside - np.sum(np.log(np.abs(np.diag(factor)[:p])))
     log -= 0.5 * (count - p) * np.log(squares)
     return log, -half @ factor[:p, p], half, squares

@@ -5,13 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.special import stdtr
 
-from beamfit.greybox.correlated import Memory, is_correlated, memory_of, whitened
+from beamfit.greybox.correlated import Memory, memory_of, remembers, whitened_of_both
 from beamfit.quantity import Quantity
 from beamfit.shown import shown
 from beamfit.status import Status
@@ -225,8 +224,8 @@ class Change(NamedTuple):
         """Whether it leaves independent noise, or hardly anything, of correlated residuals."""
         rest = float(self.left @ self.left) / float(residuals @ residuals)
         if self.then is None:
-            return rest < REST or not is_correlated(self.left, 5)
-        return rest < REST_OF_TWO or not is_correlated(self.left, 7)
+            return rest < REST or not remembers(self.left, 5)
+        return rest < REST_OF_TWO or not remembers(self.left, 7)
 
     def to_json(self) -> dict[str, Any]:
         """Return the time and the two lifetimes as JSON's types, and of a second change too."""
@@ -252,10 +251,11 @@ def change_of_rate(
     """
     over = np.reshape(1.0 if record.error is None else record.error, (-1, 1))
     model = record.current + about.residuals * over[:, 0]
-    apart = np.full(len(record) - 1, np.inf)
-    if memory is not None:
-        apart = np.diff(record.time) / memory.time[memory.likely]
-    whiten = partial(whitened, apart=apart, xp=np)
+    interval = np.diff(record.time)
+
+    def whiten(rows: np.ndarray) -> np.ndarray:
+        return rows if memory is None else whitened_of_both(rows, interval, memory.noise)[0]
+
     rows = whiten(np.column_stack([about.rows, about.residuals]))
     basis = np.linalg.qr(rows[:, :3])[0]
     least = 1e-300 if record.error is None else 1.0

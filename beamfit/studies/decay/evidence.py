@@ -10,7 +10,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from beamfit.greybox.correlated import Memory, is_correlated, memory_of
+from beamfit.greybox.correlated import Memory, memory_of, remembers
 from beamfit.lifetime.decay import HOUR
 from beamfit.quantity import Quantity
 from beamfit.shown import shown
@@ -102,7 +102,7 @@ class Weighed:
     inflation : float
         By how much the memory of the noise enlarges errors.
     correlation_time : float or None
-        Of the errors of the readings, s; None where they are independent.
+        Of the part of the errors that has one, s; None where they are independent.
     """
 
     values: Physical
@@ -155,13 +155,15 @@ class Weighed:
         """Of a and b."""
         share, error = self.scaled("share")
         finite = math.isfinite(share) and math.isfinite(error)
-        length, usual = self.correlation_time, float(np.median(np.diff(self.time)))
+        usual, alike = float(np.median(np.diff(self.time))), 0.0
+        if self.memory is not None:
+            alike = (1.0 - self.memory.noise.white) * math.exp(-usual / self.memory.noise.time)
         return Separability(
             separable=finite and error < SEPARABLE,
             share=share if finite else None,
             share_error=error if finite else None,
             correlation=self.correlation if math.isfinite(self.correlation) else None,
-            residual_correlation=0.0 if length is None else math.exp(-usual / length),
+            residual_correlation=alike,
             error_inflation=self.inflation,
         )
 
@@ -244,9 +246,9 @@ class Evidence(Weighed):
     def _by_noise(cls, record: DecayRecord, solution: Solution, shape: Shape | None) -> Evidence:
         residuals = np.asarray(solution.residuals[: len(record)])
         over = residuals if record.error is None else residuals / record.error
-        if bool(solution.converged) and len(record) >= FEWEST and is_correlated(over, NUMBERS):
+        if bool(solution.converged) and len(record) >= FEWEST and remembers(over, NUMBERS):
             found = expanded(record, solution.values, shape)
-            if is_correlated(_left(found.rows, found.residuals), NUMBERS + 1):
+            if remembers(_left(found.rows, found.residuals), NUMBERS + 1):
                 change = change_of_rate(record, found, solution.values, None)
                 if change is not None and change.is_the_cause(found.residuals):
                     return cls._independent(record, solution, shape, changed=True)
@@ -327,8 +329,8 @@ class Evidence(Weighed):
 
     @property
     def correlation_time(self) -> float | None:
-        """Of the errors, s; None where they are independent."""
-        return None if self.memory is None else float(self.memory.time[self.memory.likely])
+        """Of the part of the errors that has one, s; None where they are independent."""
+        return None if self.memory is None else self.memory.noise.time
 
     @property
     def refuted(self) -> bool:

@@ -78,7 +78,7 @@ class DecayFit:
     constant_a : ConstantA or None
         Whether the record contradicts a constant a; None where nothing decays.
     correlation_time : float or None
-        Of the errors of the readings, s; None where they are independent.
+        Of the part of the errors that has one, s; None where they are independent.
     lifetimes : LifetimeLaw or None
         The lifetime by current, where a constant a is refuted.
     change : Change or None
@@ -184,6 +184,12 @@ class DecayFit:
     def noise(self) -> float:
         """Standard deviation of a reading that the residuals show, mA."""
         return self.rms_residual * math.sqrt(self.residuals.size / self.dof)
+
+    @property
+    def memory(self) -> float:
+        """Correlation time of noise that has such neighbours and no white part, s; 0 for none."""
+        alike = self.identifiability.residual_correlation
+        return -float(np.median(np.diff(self.readings.time))) / math.log(alike) if alike else 0.0
 
     @property
     def headline(self) -> str:

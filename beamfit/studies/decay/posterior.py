@@ -12,7 +12,7 @@ from jax import Array
 
 from beamfit.errors import InputError
 from beamfit.greybox import tree
-from beamfit.greybox.correlated import log_volume, range_of, whitened
+from beamfit.greybox.correlated import Noise, innovations, log_volume, range_of, whitened
 from beamfit.greybox.posterior import Sampled, target_of
 from beamfit.greybox.problem import Free, Prior, Problem, Record
 from beamfit.greybox.stated import Optimum, Statement
@@ -27,7 +27,9 @@ from beamfit.studies.decay.record import DecayRecord
 from beamfit.verdict import Finding
 
 UNITS = {"i0": "mA", "a": "1/(mA s)", "b": "1/s"}
-SAMPLED = UNITS | {"log_memory": "1", "drift": "mA/s", "offset": "mA"}
+SAMPLED = UNITS | {"log_memory": "1", "white": "1", "drift": "mA/s", "offset": "mA"}
+# A share of the noise below which it is rounding.
+ROUNDING = 1e-9
 # The monitor is taken to be within so many of its stated errors.
 WIDEST = 8.0
 LIFETIMES = {"lifetime_start": "h", "lifetime_mean": "h", "lifetime_end": "h"}
@@ -93,8 +95,10 @@ def decay_target(
     if fit.correlation_time is not None:
         more["log_volume"] = _log_volume
         inferred = noise == "inferred" or (noise is None and (record.error is None or scale > 1))
-        problem = _with_memory(problem, record, fit.correlation_time, inferred)
-        theta = np.append(theta, np.log(fit.correlation_time))
+        remembered = _noise_of(fit)
+        problem = _with_memory(problem, record, remembered, inferred)
+        theta = np.append(theta, np.log(remembered.time))
+        theta = np.append(theta, remembered.white) if remembered.white else theta
     nothing = f"the readings show neither decay nor noise; {fit.message}".rstrip(".")
     seen = fit.rms_residual > 0 or record.error is not None
     # A prior on one of the two tells them apart, if anything does.
@@ -105,7 +109,7 @@ def decay_target(
         data=(fit.mean_current, record.time[-1], problem.records[0].data),
         units=SAMPLED,
         lower=dict.fromkeys(UNITS, 0.0),
-        width={"a": rate / fit.mean_current, "b": rate, "log_memory": 1.0, **monitor},
+        width={"a": rate / fit.mean_current, "b": rate, "log_memory": 1.0, "white": 0.1, **monitor},
         noise_unit="mA",
         priors_own=() if told else ("a", "b"),
         nothing="" if seen else nothing,
@@ -132,8 +136,9 @@ def _with_monitor(problem: Problem, record: DecayRecord) -> tuple[Problem, dict[
 
 
 class Remembered(NamedTuple):
-    """What whitened residuals need: when, what was read, its error, the usual interval, and the
-    logarithm of the memory at which the size of the noise is quoted, or NaN where it is known.
+    """What whitened residuals need: when, what was read, its error, the usual interval, the
+    logarithm of what was new in it by the fitted noise, or NaN where the errors are known, and the
+    fitted share without a memory, None where there is none.
     """
 
     at: Moments
@@ -141,9 +146,17 @@ class Remembered(NamedTuple):
     error: Array
     usual: Array
     quoted: Array
+    white: Array | None
 
 
-def _with_memory(problem: Problem, record: DecayRecord, memory: float, inferred: bool) -> Problem:
+def _noise_of(fit) -> Noise:
+    """Correlation time of a fit's errors, and the share without, by how neighbours are alike."""
+    usual = np.median(np.diff(fit.readings.time)) / fit.correlation_time
+    white = 1.0 - fit.identifiability.residual_correlation * np.exp(usual)
+    return Noise(fit.correlation_time, float(white) if white > ROUNDING else 0.0)
+
+
+def _with_memory(problem: Problem, record: DecayRecord, noise: Noise, inferred: bool) -> Problem:
     """The problem with the correlation time free, and residuals of independent errors.
 
     An unknown noise is sampled by what is new in a usual interval, which a record tells well
@@ -151,33 +164,45 @@ def _with_memory(problem: Problem, record: DecayRecord, memory: float, inferred:
     """
     readings = problem.records[0]
     error = np.ones(1) if record.error is None else record.error
-    usual, quoted = np.median(np.diff(record.time)), np.log(memory) if inferred else np.nan
-    data = Remembered(readings.data, readings.measured, error, usual, quoted)
+    usual, white = np.median(np.diff(record.time)), noise.white or None
+    quoted = _log_new(usual, np.log(noise.time), noise.white) if inferred else np.nan
+    data = Remembered(readings.data, readings.measured, error, usual, quoted, white)
     own = Record(RECORD, _new, data, np.zeros(len(record)), None if record.error is None else 1.0)
     lower, upper = np.log([range_of(record.time)[0], record.span])
     free = [*problem.free, Free("log_memory", lower, upper)]
+    free += [Free("white", 0.0, 1.0)] if noise.white else []
     return replace(problem, free=free, records=[own])
+
+
+def _log_new(usual: Array, log_memory: Array, white: Array) -> Array:
+    """Logarithm of the share of the noise that is new in a usual interval."""
+    return 0.5 * jnp.log(white - (1.0 - white) * jnp.expm1(-2 * usual * jnp.exp(-log_memory)))
 
 
 def _log_size(model: DecayNumbers, data: Remembered) -> Array:
     """Logarithm of what whitened residuals are multiplied by."""
+    known, new = jnp.isnan(data.quoted), _log_new(data.usual, model.log_memory, model.white)
+    return jnp.where(known, 0.0, new - jnp.where(known, new, data.quoted))
 
-    def log_new(log_memory: Array) -> Array:
-        return 0.5 * jnp.log(-jnp.expm1(-2 * data.usual * jnp.exp(-log_memory)))
 
-    known = jnp.isnan(data.quoted)
-    reference = jnp.where(known, model.log_memory, data.quoted)
-    return jnp.where(known, 0.0, log_new(model.log_memory) - log_new(reference))
+def _whitened(model: DecayNumbers, data: Remembered) -> tuple[Array, Array]:
+    """Residuals as independent ones of the same size, and what that adds to the log density."""
+    rows = (monitored_current(model, data.at) - data.measured) / data.error
+    if data.white is None:
+        between = apart(model, data.at)
+        return whitened(rows, between), log_volume(between)
+    noise = Noise(jnp.exp(model.log_memory), model.white)
+    white, sizes = innovations(rows, jnp.asarray(data.at.time), noise)
+    return white, -sizes
 
 
 def _new(model: DecayNumbers, data: Remembered) -> Array:
-    rows = (monitored_current(model, data.at) - data.measured) / data.error
-    return whitened(rows, apart(model, data.at)) * jnp.exp(_log_size(model, data))
+    return _whitened(model, data)[0] * jnp.exp(_log_size(model, data))
 
 
 def _log_volume(model: DecayNumbers, data: tuple[Array, Array, Remembered]) -> Array:
     remembered = data[2]
-    volume = log_volume(apart(model, remembered.at))
+    volume = _whitened(model, remembered)[1]
     return volume + remembered.measured.size * _log_size(model, remembered)
 
 

@@ -292,7 +292,7 @@ def _reference(decays: Sequence[Decay], a: np.ndarray, b: np.ndarray) -> Referen
 def _noise(decays: Sequence[Decay]) -> tuple[float, float, float]:
     """Noise of a reading, mA, its correlation time and the interval of readings, s."""
     fits = [decay.fit for decay in decays]
-    memory = np.median([fit.correlation_time or 0.0 for fit in fits])
+    memory = np.median([fit.memory for fit in fits])
     least = BEST_MONITOR * np.median([fit.mean_current for fit in fits])
     noise = max(np.median([fit.noise for fit in fits]), least)
     interval = np.median([np.median(np.diff(decay.segment.time)) for decay in decays])

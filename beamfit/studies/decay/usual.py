@@ -86,7 +86,7 @@ def learnt(
         return None
     noise = max(fit.noise, BEST_MONITOR * fit.mean_current)
     apart = float(np.median(np.diff([row.time for row in rows])))
-    usual = alarm.Reference(a, b, noise, fit.correlation_time or 0.0, apart, covariance)
+    usual = alarm.Reference(a, b, noise, fit.memory, apart, covariance)
     known = Alarmed(usual, alarm.started(usual))
     if machine is None:
         return known

@@ -10,13 +10,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from beamfit.greybox.correlated import Memory
+from beamfit.greybox.correlated import Memory, Noise, innovations, remembers
 from beamfit.greybox.fit import Fit
 from beamfit.greybox.problem import Constraint, Free, Prior, Problem, Record
 from beamfit.greybox.solve import solve
 from beamfit.status import Status
 from beamfit.studies.response.model import CLOSE, Seen, output_of, predicted
-from beamfit.studies.response.noise import Noise, innovations, noise_of, remembers
+from beamfit.studies.response.noise import noise_of
 
 # Rounds with a memory of the noise at most, and the gain in -2 ln L below which nothing is gained
 # any more.

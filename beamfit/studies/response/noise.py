@@ -7,59 +7,18 @@ and a drift all the same. Both parts are estimated together, and averaged over w
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from beamfit.greybox.correlated import Memory, is_correlated, range_of
+from beamfit.greybox.correlated import WHITE, Memory, Noise, innovations, range_of
 from beamfit.greybox.covariance import CUT
 
-# Correlation times looked at, and variances of the part without memory, in those that the part
-# that wanders gets anew from one sample to the next.
-TIMES, WHITE = 16, (0.0, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0, 1000.0)
+# Correlation times looked at.
+TIMES = 16
 # Numbers that one sweep through the readings holds, of as many noises as that makes.
 AT_ONCE = 2**20
-# Means of so many neighbours are looked at: a slow drift hides under white noise.
-BLOCKS = (1, 4, 16)
-
-
-class Noise(NamedTuple):
-    """Correlation time of the part that wanders, s, and the share of variance without memory."""
-
-    time: float
-    white: float
-
-
-def remembers(rest: np.ndarray, parameters: int) -> bool:
-    """Whether residuals, or their means over some neighbours, are correlated."""
-    means = [rest[: len(rest) // k * k].reshape(-1, k).mean(axis=1) for k in BLOCKS]
-    return any(is_correlated(m, parameters) for m in means if len(m) > 2 * parameters)
-
-
-@jax.jit  # a scan that is called as it is would be compiled at every call
-def innovations(rows: jax.Array, time: jax.Array, noise: Noise) -> tuple[jax.Array, jax.Array]:
-    """Rows less what those before foretell, over the error of that; and log sum of the errors.
-
-    The Kalman filter of an Ornstein-Uhlenbeck process read with white noise (A. C. Harvey,
-    Forecasting, structural time series models and the Kalman filter, 1989, section 3.4), O(n).
-    """
-    wander = 1.0 - noise.white
-    kept = jnp.exp(-jnp.diff(time, append=time[-1:]) / noise.time)
-
-    def on(carry, now):
-        mean, variance = carry
-        row, k = now
-        whole = variance + noise.white
-        surprise = row - mean
-        mean = k * (mean + variance / whole * surprise)
-        variance = k**2 * variance * noise.white / whole + wander * (1.0 - k**2)
-        return (mean, variance), (surprise / jnp.sqrt(whole), 0.5 * jnp.log(whole))
-
-    begin = jnp.zeros(rows.shape[1:]), jnp.asarray(wander)
-    _, (white, sizes) = jax.lax.scan(on, begin, (rows, kept))
-    return white, jnp.sum(sizes)
 
 
 @jax.jit
@@ -100,8 +59,8 @@ def noise_of(
     logs, step, half, squares = (np.array(part) for part in zip(*found, strict=True))
     logs -= sum(np.asarray(volume) for _, volume in white)
     weight = np.exp(logs - logs.max())
-    times = np.array([noise.time for noise in grid])
-    memory = Memory(weight / weight.sum(), times, step, half, squares, count + len(known) - p)
+    weight, dof = weight / weight.sum(), count + len(known) - p
+    memory = Memory(weight, *stacked, step, half, squares, dof)
     best = int(np.argmax(weight))
     return memory, grid[best], float(np.sqrt(squares[best] / memory.dof))
 

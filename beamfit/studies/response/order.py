@@ -7,10 +7,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from beamfit.greybox.correlated import Noise, remembers
 from beamfit.greybox.problem import Free
 from beamfit.studies.response.case import Case, Settled, information, used_by
 from beamfit.studies.response.model import CLOSE
-from beamfit.studies.response.noise import Noise, noise_of, remembers
+from beamfit.studies.response.noise import noise_of
 from beamfit.studies.response.realise import LINEAR, normal_form, padded, realisations
 from beamfit.studies.response.shooting import LONGEST, trained
 
