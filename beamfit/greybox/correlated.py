@@ -22,7 +22,7 @@ SEEN = 2.0
 SHORTEST, LONGEST, TIMES = 0.3, 5.0, 40
 # Variances of a part without memory that are looked at beside, in those that the part with a
 # memory gets anew from one reading to the next; correlation times are fewer then.
-WHITE, FEWER = (0.0, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0, 1000.0), 20
+WHITE, FEWER = (0.0, 1.0, 10.0, 100.0, 1000.0), 20
 # Means of so many neighbours are looked at: a slow drift hides under white noise.
 BLOCKS = (1, 4, 16)
 
@@ -318,7 +318,8 @@ def memory_of(
     fitted numbers do not bias, times a prior flat in the logarithm of the correlation time, from
     0.3 usual intervals to five times the record. Without levels a part of the noise may be white: a
     monitor that drifts, read by a noisy converter, would pass for a short memory otherwise, and its
-    errors come out several times too small; the ratio of both is averaged over, too. Near the upper
+    errors come out several times too small; the ratio of both is averaged over, too, at even
+    odds that there is one. Near the upper
     end the errors are a random walk: nothing tells its level, but slope and bend the rows do tell.
 
     Examples
@@ -338,8 +339,9 @@ def memory_of(
         found = [_at(rows, interval, each, levels) for each in grid]
     count -= 0 if levels is None else levels.first.size
     logs, step, half, squares = (np.array(part) for part in zip(*found, strict=True))
-    weight = np.exp(logs - logs.max())
     times, white = np.array(grid).T
+    # Even odds for a white part.
+    weight = np.exp(logs - logs.max()) * np.where(white == 0, 1.0, 1.0 / (len(WHITE) - 1))
     return Memory(weight / weight.sum(), times, white, step, half, squares, count - p)
 
 

@@ -161,6 +161,13 @@ def wander(rng, t, i):
     return i + 0.5 * np.cumsum(rng.normal(size=len(i))) / len(i) ** 0.5
 
 
+def drift(rng, t, i):
+    """Under white noise, as large, drifts that last an eighth of the record."""
+    kept = math.exp(-8 / len(i))
+    new = rng.normal(size=len(i)) * np.append(1.0, np.full(len(i) - 1, (1 - kept**2) ** 0.5))
+    return i + 0.02 * (lfilter([1.0], [1.0, -kept], new) + rng.normal(size=len(i)))
+
+
 def offset(rng, t, i):
     return i + 2.0
 
@@ -213,6 +220,7 @@ TRAPS: dict[str, Callable[[np.random.Generator], Decay]] = {
     "steps of 2 mA": partial(decay, noise=0.001, spoil=coarse),
     "monitor ends at 95 %": partial(decay, spoil=clipped),
     "monitor walks by 0.5 mA": partial(decay, spoil=wander),
+    "monitor drifts under white noise": partial(decay, noise=0.001, spoil=drift),
 }
 
 HIDDEN: dict[str, tuple[Callable[[np.random.Generator], Decay], str, float]] = {

@@ -59,7 +59,7 @@ def test_each_noise_is_generalised_least_squares_by_dense_matrices(uneven):
     slopes = np.column_stack([np.ones(40), uneven])
     residuals = rng.normal(size=40)
     found = memory_of(slopes, residuals, uneven)
-    for k in (0, 17, 60, 100, 159):
+    for k in (0, 17, 40, 63, 99):
         weight = np.linalg.inv(both(uneven, Noise(found.time[k], found.white[k])))
         information = slopes.T @ weight @ slopes
         step = -np.linalg.solve(information, slopes.T @ weight @ residuals)

@@ -103,6 +103,8 @@ class Weighed:
         By how much the memory of the noise enlarges errors.
     correlation_time : float or None
         Of the part of the errors that has one, s; None where they are independent.
+    white : float
+        The share of their variance that has none.
     """
 
     values: Physical
@@ -114,6 +116,7 @@ class Weighed:
     correlation: float
     inflation: float
     correlation_time: float | None
+    white: float
     change: Change | None = None
     outgassing: Outgassing | None = None
     bent: Physical | None = None
@@ -155,9 +158,8 @@ class Weighed:
         """Of a and b."""
         share, error = self.scaled("share")
         finite = math.isfinite(share) and math.isfinite(error)
-        usual, alike = float(np.median(np.diff(self.time))), 0.0
-        if self.memory is not None:
-            alike = (1.0 - self.memory.noise.white) * math.exp(-usual / self.memory.noise.time)
+        length, usual = self.correlation_time, float(np.median(np.diff(self.time)))
+        alike = 0.0 if length is None else (1.0 - self.white) * math.exp(-usual / length)
         return Separability(
             separable=finite and error < SEPARABLE,
             share=share if finite else None,
@@ -331,6 +333,11 @@ class Evidence(Weighed):
     def correlation_time(self) -> float | None:
         """Of the part of the errors that has one, s; None where they are independent."""
         return None if self.memory is None else self.memory.noise.time
+
+    @property
+    def white(self) -> float:
+        """The share of their variance that has none."""
+        return 0.0 if self.memory is None else self.memory.noise.white
 
     @property
     def refuted(self) -> bool:

@@ -151,6 +151,11 @@ class PooledEvidence(Weighed):
         return self.pool.mean * math.sqrt(self.held.squares[self.held.likely] / self.dof)
 
     @property
+    def white(self) -> float:
+        """No part of the noise of cycles is white beside one with a memory."""
+        return 0.0
+
+    @property
     def correlation_time(self) -> float | None:
         """Of the errors, s; None where they are independent."""
         return None if self.known == 0 else float(self.held.time[self.held.likely])

@@ -12,11 +12,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from beamfit.greybox.correlated import WHITE, Memory, Noise, innovations, range_of
+from beamfit.greybox.correlated import Memory, Noise, innovations, range_of
 from beamfit.greybox.covariance import CUT
 
-# Correlation times looked at.
-TIMES = 16
+# Correlation times looked at, and variances of the part without memory, in those that the part
+# that wanders gets anew from one sample to the next.
+TIMES, WHITE = 16, (0.0, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0, 1000.0)
 # Numbers that one sweep through the readings holds, of as many noises as that makes.
 AT_ONCE = 2**20
 
