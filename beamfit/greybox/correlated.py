@@ -24,7 +24,7 @@ SHORTEST, LONGEST, TIMES = 0.3, 5.0, 40
 # memory gets anew from one reading to the next; correlation times are fewer then.
 WHITE, FEWER = (0.0, 1.0, 10.0, 100.0, 1000.0), 20
 # Means of so many neighbours are looked at: a slow drift hides under white noise.
-BLOCKS = (1, 4, 16)
+BLOCKS = (4, 16)
 
 
 def whitened(rows, apart, xp=jnp):
@@ -63,7 +63,7 @@ def log_volume(apart, xp=jnp):
     return -0.5 * xp.sum(xp.log(-xp.expm1(-2 * apart)))
 
 
-def is_correlated(residuals: np.ndarray, parameters: int) -> bool:
+def is_correlated(residuals: np.ndarray, parameters: int, seen: float = SEEN) -> bool:
     """Whether residuals lie closer to their neighbours than independent ones would.
 
     The mean correlation of residuals of independent errors is -parameters/n.
@@ -77,11 +77,11 @@ def is_correlated(residuals: np.ndarray, parameters: int) -> bool:
     if squares == 0:
         return False
     found = float(residuals[1:] @ residuals[:-1]) / squares + parameters / count
-    return bool(found > SEEN / np.sqrt(count))
+    return bool(found > seen / np.sqrt(count))
 
 
-def remembers(residuals: np.ndarray, parameters: int) -> bool:
-    """Whether residuals, or their means over some neighbours, are correlated.
+def remembers(residuals: np.ndarray, parameters: int, slow: float = SEEN) -> bool:
+    """Whether residuals, or their means over some neighbours, are correlated, these by `slow`.
 
     Examples
     --------
@@ -89,8 +89,10 @@ def remembers(residuals: np.ndarray, parameters: int) -> bool:
     >>> is_correlated(slow, 0), remembers(slow, 0)
     (False, True)
     """
+    if is_correlated(residuals, parameters):
+        return True
     means = [residuals[: len(residuals) // k * k].reshape(-1, k).mean(axis=1) for k in BLOCKS]
-    return any(is_correlated(m, parameters) for m in means if len(m) > 2 * parameters)
+    return any(is_correlated(m, parameters, slow) for m in means if len(m) > 2 * parameters)
 
 
 class Noise(NamedTuple):

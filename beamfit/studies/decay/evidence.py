@@ -50,6 +50,8 @@ BELIEVED = 5.0
 NUMBERS = 3
 # Standard deviations that hold 95 % of a normal distribution.
 NORMAL = 1.96
+# A drift under white noise counts from so many standard errors on: it enlarges errors much.
+SLOW = 3.0
 # Of so few readings the noise tells nothing of its memory.
 FEWEST = 12
 # The power by which a falls with the current for a bunch that lengthens as it can most, and the
@@ -248,9 +250,9 @@ class Evidence(Weighed):
     def _by_noise(cls, record: DecayRecord, solution: Solution, shape: Shape | None) -> Evidence:
         residuals = np.asarray(solution.residuals[: len(record)])
         over = residuals if record.error is None else residuals / record.error
-        if bool(solution.converged) and len(record) >= FEWEST and remembers(over, NUMBERS):
+        if bool(solution.converged) and len(record) >= FEWEST and remembers(over, NUMBERS, SLOW):
             found = expanded(record, solution.values, shape)
-            if remembers(_left(found.rows, found.residuals), NUMBERS + 1):
+            if remembers(_left(found.rows, found.residuals), NUMBERS + 1, SLOW):
                 change = change_of_rate(record, found, solution.values, None)
                 if change is not None and change.is_the_cause(found.residuals):
                     return cls._independent(record, solution, shape, changed=True)
@@ -287,9 +289,10 @@ class Evidence(Weighed):
         power = free.moments(found.slopes, float(given))
         held = memory_of(found.rows[:, :NUMBERS], found.residuals, record.time)
         moved = held.moments(found.slopes[:, :NUMBERS], float(given))
-        likely = held.likely
-        size = math.sqrt(held.squares[likely] / held.dof)
         after = found.residuals + found.rows[:, :NUMBERS] @ held.mean_step
+        # How far a drift gets in the end says nothing of the errors that were stated.
+        squares = float(after @ after) if held.noise.white else held.squares[held.likely]
+        size = math.sqrt(squares / held.dof)
         raw = 1.0 if given else math.sqrt(float(solution.sum_squares) / held.dof)
         raw_exponent = float(solution.errors.exponent) * raw
         test = constant_a(power.shift[-1], power.error[-1], raw_exponent, power.chance[-1])
@@ -298,7 +301,7 @@ class Evidence(Weighed):
             Physical(*(np.array(solution.values) + moved.shift)),
             Physical(*moved.error), _times(solution.errors, raw), Physical(*moved.reach),
             after * (record.error if given else 1.0),
-            held.squares[likely] if given else float(held.dof), held.dof,
+            squares if given else float(held.dof), held.dof,
             max(1.0, size) if given else size, held, test, False,
         )  # fmt: skip
 
