@@ -242,9 +242,7 @@ class Evidence(Weighed):
         """
         found = cls._by_noise(record, solution, shape)
         changes = record.monitor_changes
-        if not (changes and solution.converged):
-            return found
-        return found.widened(found.about, changes)
+        return found.widened(found.about, changes) if changes and solution.converged else found
 
     @classmethod
     def _by_noise(cls, record: DecayRecord, solution: Solution, shape: Shape | None) -> Evidence:
@@ -284,11 +282,10 @@ class Evidence(Weighed):
         cls, record: DecayRecord, solution: Solution, shape: Shape | None, found: Expansion
     ) -> Evidence:
         """Generalised least squares about the solution, the exponent free and held."""
-        given = record.error is not None
-        free = memory_of(found.rows, found.residuals, record.time)
-        power = free.moments(found.slopes, float(given))
+        given = float(record.error is not None)
+        power = memory_of(found.rows, found.residuals, record.time).moments(found.slopes, given)
         held = memory_of(found.rows[:, :NUMBERS], found.residuals, record.time)
-        moved = held.moments(found.slopes[:, :NUMBERS], float(given))
+        moved = held.moments(found.slopes[:, :NUMBERS], given)
         after = found.residuals + found.rows[:, :NUMBERS] @ held.mean_step
         # How far a drift gets in the end says nothing of the errors that were stated.
         squares = float(after @ after) if held.noise.white else held.squares[held.likely]
@@ -325,8 +322,8 @@ class Evidence(Weighed):
         """By how much the memory of the noise enlarges errors."""
         if self.memory is None:
             return 1.0
-        plain = math.sqrt(float(self.solution.sum_squares) / self.dof)
-        plain = plain if self.record.error is None else max(1.0, plain)
+        least, plain = float(not self.noise_inferred), float(self.solution.sum_squares) / self.dof
+        plain = max(least, math.sqrt(plain))
         return max(
             getattr(self.errors, name) / getattr(self.solution.errors, name) / plain
             for name in ("rate_mean", "share")

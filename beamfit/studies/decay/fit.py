@@ -186,12 +186,6 @@ class DecayFit:
         return self.rms_residual * math.sqrt(self.residuals.size / self.dof)
 
     @property
-    def memory(self) -> float:
-        """Correlation time of noise that has such neighbours and no white part, s; 0 for none."""
-        alike = self.identifiability.residual_correlation
-        return -float(np.median(np.diff(self.readings.time))) / math.log(alike) if alike else 0.0
-
-    @property
     def headline(self) -> str:
         """The record, its status and its lifetime in a line."""
         return f"{self.record} {cell(self.status)}: mean lifetime {self.lifetime_mean}"

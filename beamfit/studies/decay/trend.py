@@ -17,7 +17,7 @@ from beamfit.shown import shown
 from beamfit.statistics import FEWEST, baseline, control_limits
 from beamfit.studies.decay.alarm import Alarm, Reference, alarms_of, when
 from beamfit.studies.decay.budget import Machine
-from beamfit.studies.decay.fit import bare
+from beamfit.studies.decay.fit import DecayFit, bare
 from beamfit.studies.decay.study import Decay, RecordStudy
 from beamfit.studies.decay.summary import by_losses, summarise
 from beamfit.table import Table, cell, json_of
@@ -289,10 +289,16 @@ def _reference(decays: Sequence[Decay], a: np.ndarray, b: np.ndarray) -> Referen
     return Reference(*map(float, found), *_noise(decays), covariance)
 
 
+def alike_over(fit: DecayFit) -> float:
+    """Correlation time of noise with a fit's neighbours and no white part, s; 0 for none."""
+    alike = fit.identifiability.residual_correlation
+    return -float(np.median(np.diff(fit.readings.time))) / math.log(alike) if alike else 0.0
+
+
 def _noise(decays: Sequence[Decay]) -> tuple[float, float, float]:
     """Noise of a reading, mA, its correlation time and the interval of readings, s."""
     fits = [decay.fit for decay in decays]
-    memory = np.median([fit.memory for fit in fits])
+    memory = np.median([alike_over(fit) for fit in fits])
     least = BEST_MONITOR * np.median([fit.mean_current for fit in fits])
     noise = max(np.median([fit.noise for fit in fits]), least)
     interval = np.median([np.median(np.diff(decay.segment.time)) for decay in decays])

@@ -15,7 +15,7 @@ from beamfit.studies.decay import alarm
 from beamfit.studies.decay.budget import Machine, budget, operation_during
 from beamfit.studies.decay.conditions import Conditions
 from beamfit.studies.decay.record import DecayRecord
-from beamfit.studies.decay.trend import BEST_MONITOR, WANDER
+from beamfit.studies.decay.trend import BEST_MONITOR, WANDER, alike_over
 from beamfit.studies.decay.window import Row, Window
 
 # a and b so well known are the usual ones; errors half as large replace them before an alarm.
@@ -86,7 +86,7 @@ def learnt(
         return None
     noise = max(fit.noise, BEST_MONITOR * fit.mean_current)
     apart = float(np.median(np.diff([row.time for row in rows])))
-    usual = alarm.Reference(a, b, noise, fit.memory, apart, covariance)
+    usual = alarm.Reference(a, b, noise, alike_over(fit), apart, covariance)
     known = Alarmed(usual, alarm.started(usual))
     if machine is None:
         return known
