@@ -6,6 +6,7 @@ more. Whitening takes off each error what the one before foretells, in O(n).
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax
@@ -320,9 +321,9 @@ def memory_of(
     fitted numbers do not bias, times a prior flat in the logarithm of the correlation time, from
     0.3 usual intervals to five times the record. Without levels a part of the noise may be white: a
     monitor that drifts, read by a noisy converter, would pass for a short memory otherwise, and its
-    errors come out several times too small; the ratio of both is averaged over, too, at even
-    odds that there is one. Near the upper
-    end the errors are a random walk: nothing tells its level, but slope and bend the rows do tell.
+    errors come out several times too small; the ratio of both is averaged over, too, at even odds
+    that there is one. Near the upper end the errors are a random walk: nothing tells its level, but
+    slope and bend the rows do tell.
 
     Examples
     --------
@@ -336,7 +337,9 @@ def memory_of(
     """
     count, p = slopes.shape
     rows, interval = np.column_stack([slopes, residuals]), np.diff(time)
-    grid = _grid(time, alone=levels is not None) if known is None else [Noise(known)]
+    looked_at = (FEWER, WHITE) if levels is None else (TIMES,)
+    usual = float(np.median(interval))
+    grid = noises(range_of(time), usual, *looked_at) if known is None else [Noise(known)]
     with np.errstate(divide="ignore"):
         found = [_at(rows, interval, each, levels) for each in grid]
     count -= 0 if levels is None else levels.first.size
@@ -347,15 +350,21 @@ def memory_of(
     return Memory(weight / weight.sum(), times, white, step, half, squares, count - p)
 
 
-def _grid(time: np.ndarray, alone: bool) -> list[Noise]:
-    """Noises that are looked at: with a memory `alone`, or a part without one beside."""
-    if alone:
-        return [Noise(each) for each in np.geomspace(*range_of(time), TIMES)]
-    new = -np.expm1(-2.0 * np.median(np.diff(time)) / np.geomspace(*range_of(time), FEWER))
+def noises(
+    ends: tuple[float, float], usual: float, count: int, ratios: Sequence[float] = (0.0,)
+) -> list[Noise]:
+    """Noises that are looked at: correlation times between two, and with each the ratios of the
+    white variance to what the part with a memory gets anew in a usual interval.
+
+    Examples
+    --------
+    >>> noises((1.0, 4.0), 1.0, 3)
+    [Noise(time=1.0, white=0.0), Noise(time=2.0, white=0.0), Noise(time=4.0, white=0.0)]
+    """
     return [
-        Noise(float(each), float(ratio * fresh / (1.0 + ratio * fresh)))
-        for each, fresh in zip(np.geomspace(*range_of(time), FEWER), new, strict=True)
-        for ratio in WHITE
+        Noise(float(each), float(ratio / (ratio + 1.0 / -np.expm1(-2.0 * usual / each))))
+        for each in np.geomspace(*ends, count)
+        for ratio in ratios
     ]
 
 

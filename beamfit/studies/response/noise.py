@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from beamfit.greybox.correlated import Memory, Noise, innovations, range_of
+from beamfit.greybox.correlated import Memory, Noise, innovations, noises, range_of
 from beamfit.greybox.covariance import CUT
 
 # Correlation times looked at, and variances of the part without memory, in those that the part
@@ -46,11 +46,7 @@ def noise_of(
     """
     apart = min(float(np.median(np.diff(t))) for t in time)
     ends = np.array([range_of(t) for t in time])
-    grid = [
-        Noise(each, ratio / (ratio + 1.0 / -np.expm1(-2.0 * apart / each)))
-        for each in np.geomspace(ends[:, 0].min(), ends[:, 1].max(), TIMES)
-        for ratio in WHITE
-    ]
+    grid = noises((ends[:, 0].min(), ends[:, 1].max()), apart, TIMES, WHITE)
     grid = grid if noise is None else [noise]
     count, p = sum(map(len, rows)), rows[0].shape[1] - 1
     stacked = Noise(*(np.array(part) for part in zip(*grid, strict=True)))
