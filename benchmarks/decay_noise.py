@@ -2,8 +2,10 @@
 
 SIMULATED decays of 8 h with noise that is autoregressive of first order. Printed: percent of
 truths within 1 and within 1.96 quoted errors, and within the 95 % interval, for a, b and three
-lifetimes, of the records that give an answer. With --top-up the same for the lifetime at the mean
-current of ten hours of top-up at 500 mA and 10.01 h, in cycles of three minutes, from the record.
+lifetimes, of the records that give an answer; with --white there is white noise as large beside
+it, as of a monitor that drifts and is read with noise. With --top-up the same for the lifetime at
+the mean current of ten hours of top-up at 500 mA and 10.01 h, in cycles of three minutes, from the
+record.
 """
 
 from __future__ import annotations
@@ -44,15 +46,14 @@ def truths(time: np.ndarray) -> np.ndarray:
 
 
 def simulated(
-    count: int, correlation: float, trials: int, noise: float = 0.02, seed: int = 0
+    count: int, correlation: float, trials: int, white: float = 0.0, seed: int = 0
 ) -> list[DecayRecord]:
-    """Records that differ in their noise alone."""
+    """Records that differ in their noise alone, 20 µA and so many times that of white noise."""
     rng = np.random.default_rng([seed, count, int(1000 * correlation)])
-    time = np.linspace(0, SPAN, count)
-    return [
-        DecayRecord(time, law(time) + noise * autoregressive(rng, count, correlation))
-        for _ in range(trials)
-    ]
+    time, noise = np.linspace(0, SPAN, count), 0.02
+    off = [autoregressive(rng, count, correlation) for _ in range(trials)]
+    off = [part + white * rng.normal(size=count) for part in off] if white else off
+    return [DecayRecord(time, law(time) + noise * part) for part in off]
 
 
 def cover(fits: list[DecayFit], time: np.ndarray) -> np.ndarray:
@@ -101,6 +102,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--trials", type=int, default=300)
     parser.add_argument("--counts", type=int, nargs="+", default=[100, 1000, 10_000])
+    parser.add_argument("--white", action="store_true")
     parser.add_argument("--top-up", action="store_true")
     asked = parser.parse_args()
     if asked.top_up:
@@ -110,7 +112,8 @@ def main() -> None:
     for count in asked.counts:
         time = np.linspace(0, SPAN, count)
         for correlation in (0.0, 0.1, 0.3, 0.6, 0.9, 0.95, 0.97):
-            fits = list(fit_decays(simulated(count, correlation, asked.trials)))
+            given = simulated(count, correlation, asked.trials, float(asked.white))
+            fits = list(fit_decays(given))
             answered = np.mean([fit.status == "converged" for fit in fits])
             shares = 100 * cover(fits, time)
             cells = [f"{one:.0f} / {two:.0f} / {three:.0f}" for one, two, three in shares.T]

@@ -10,7 +10,9 @@ from scipy.signal import lfilter
 from beamfit.greybox.solve import solve
 from beamfit.studies.decay.evidence import Evidence
 from beamfit.studies.decay.fit import fit_decay, fit_decays
+from beamfit.studies.decay.law import DecayNumbers
 from beamfit.studies.decay.model import decay_problem, padded, solve_decay
+from beamfit.studies.decay.posterior import _noise_of, _with_memory
 from beamfit.studies.decay.record import DecayRecord
 
 HOUR, SPAN = 3600.0, 8 * 3600.0
@@ -140,3 +142,17 @@ def test_no_record_of_noise_says_more_than_that_its_loss_rate_is_zero():
     said = [re.search(r"above ([\d.e+]+) h at 95 %", f.message) for f in fit_decays(records)]
     assert len(said) == 20
     assert max(float(found[1]) for found in said) < 1.3 * limit
+
+
+def test_beside_white_noise_the_sampled_noise_is_the_scatter_of_the_residuals():
+    """How far the drift wanders in the end no record shows: it would be quoted twice too large."""
+    time, rng = np.linspace(0, SPAN, 400), np.random.default_rng(5)
+    off = 0.02 * (autoregressive(rng, 400, 0.98) + rng.normal(size=400))
+    fit = fit_decay(DecayRecord(time, law(time) + off))
+    noise = _noise_of(fit)
+    assert noise.white > 0
+    [readings] = _with_memory(decay_problem(fit.readings), fit, noise, True).records
+    found = (fit.i0.value, fit.a.value, fit.b.value)
+    numbers = DecayNumbers(*found, log_memory=np.log(noise.time), white=noise.white)
+    size = float(np.sqrt(np.mean(np.square(readings.predict(numbers, readings.data)))))
+    assert size == pytest.approx(fit.noise, rel=0.05)

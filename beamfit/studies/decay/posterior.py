@@ -12,7 +12,14 @@ from jax import Array
 
 from beamfit.errors import InputError
 from beamfit.greybox import tree
-from beamfit.greybox.correlated import Noise, innovations, log_volume, range_of, whitened
+from beamfit.greybox.correlated import (
+    Noise,
+    innovations,
+    log_volume,
+    range_of,
+    whitened,
+    whitened_of_both,
+)
 from beamfit.greybox.posterior import Sampled, target_of
 from beamfit.greybox.problem import Free, Prior, Problem, Record
 from beamfit.greybox.stated import Optimum, Statement
@@ -96,7 +103,7 @@ def decay_target(
         more["log_volume"] = _log_volume
         inferred = noise == "inferred" or (noise is None and (record.error is None or scale > 1))
         remembered = _noise_of(fit)
-        problem = _with_memory(problem, record, remembered, inferred)
+        problem = _with_memory(problem, fit, remembered, inferred)
         theta = np.append(theta, np.log(remembered.time))
         theta = np.append(theta, remembered.white) if remembered.white else theta
     nothing = f"the readings show neither decay nor noise; {fit.message}".rstrip(".")
@@ -156,16 +163,21 @@ def _noise_of(fit) -> Noise:
     return Noise(fit.correlation_time, float(white) if white > ROUNDING else 0.0)
 
 
-def _with_memory(problem: Problem, record: DecayRecord, noise: Noise, inferred: bool) -> Problem:
+def _with_memory(problem: Problem, fit, noise: Noise, inferred: bool) -> Problem:
     """The problem with the correlation time free, and residuals of independent errors.
 
     An unknown noise is sampled by what is new in a usual interval, which a record tells well
-    whatever the memory, and quoted as the whole noise at the fitted memory.
+    whatever the memory, and quoted as the whole noise at the fitted memory; beside a white part,
+    where the record does not show how far the rest wanders, as the scatter of the residuals.
     """
-    readings = problem.records[0]
+    readings, record = problem.records[0], fit.readings
     error = np.ones(1) if record.error is None else record.error
     usual, white = np.median(np.diff(record.time)), noise.white or None
     quoted = _log_new(usual, np.log(noise.time), noise.white) if inferred else np.nan
+    if noise.white:
+        over = fit.residuals / error
+        new, _ = whitened_of_both(over, np.diff(record.time), noise)
+        quoted += 0.5 * np.log((new @ new) / (over @ over))
     data = Remembered(readings.data, readings.measured, error, usual, quoted, white)
     own = Record(RECORD, _new, data, np.zeros(len(record)), None if record.error is None else 1.0)
     lower, upper = np.log([range_of(record.time)[0], record.span])
