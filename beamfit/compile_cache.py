@@ -26,6 +26,10 @@ KEEP = {
 # a flag it does not know: only where it was tried.
 QUICK, TRIED = "xla_cpu_use_fusion_emitters", "0.10."
 
+# For `jax.jit` of a program that runs a few times on small arrays, where it is no slower: it is
+# compiled in half the time. No other compiled function can call such a one.
+SELDOM = {"xla_backend_optimization_level": 0}
+
 # Functions of JAX that read, pack and unpack what is kept.
 OWN = ("get_executable_and_time", "compress_executable", "decompress_executable")
 

@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from beamfit.compile_cache import SELDOM
 from beamfit.errors import InputError, nearest
 from beamfit.greybox import tree
 from beamfit.greybox.assess import KKT, TOLERANCE
@@ -72,7 +73,7 @@ class Derived(NamedTuple):
     slope: np.ndarray
 
 
-@partial(jax.jit, static_argnums=(0, 1))
+@partial(jax.jit, static_argnums=(0, 1), compiler_options=SELDOM)
 def _with_slope(function, chosen, model, theta, data):
     return with_slope(lambda t: function(tree.replace(model, chosen, t), data), theta)
 

@@ -20,6 +20,8 @@ from beamfit.optics.sections import Series
 
 # Elements, times rows, whose matrices are held at once where each row has its own energy.
 MOST_AT_ONCE = 100_000
+# Numbers of a calibration that the line is differentiated by directly; a network has more.
+MOST_DIRECT = 3
 
 
 def transfer_rows(
@@ -118,6 +120,8 @@ def _rows(
     line: Beamline, settings: dict[str, Array], energy: Array, places: tuple[str, ...]
 ) -> TransferMatrix:
     bare, members = line, [(m, name) for name in settings for m in line.members(name)]
+    weights = [np.size(v) for m, _ in members for v in jax.tree.leaves(line[m].calibration)]
+    through = _by_strengths if sum(weights) > MOST_DIRECT * len(members) else _from_strengths
     for m, _ in members:
         bare = bare.with_element(replace(line[m], calibration=IntegratedStrength(), setting=0.0))
 
@@ -128,8 +132,6 @@ def _rows(
             m: jnp.asarray(line[m].calibration.k1l(setting[name], line[m].length, at), float)
             for m, name in members
         }
-        # Of monitors alone nothing is set, and there is nothing to differentiate by.
-        through = _by_strengths if strengths else _from_strengths
         return through(places, strengths, bare, at)
 
     rows = (settings, None if jnp.ndim(energy) == 0 else energy)

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from beamfit.compile_cache import SELDOM
 from beamfit.optics.beamline import Beamline
 from beamfit.optics.calibration import SETTING_UNITS
 from beamfit.statistics import chi2_probability
@@ -132,8 +133,13 @@ def unfitted(
 
 
 def one_by_one(function: Callable[..., Any], given: Iterable[tuple], *static: str) -> list[Any]:
-    """What a compiled function gives of each, as NumPy arrays."""
-    return [jax.tree.map(np.asarray, function(*each, *static)) for each in given]
+    """What a function gives of each, as NumPy arrays."""
+    return [jax.tree.map(np.asarray, _compiled(function, each, static)) for each in given]
+
+
+@partial(jax.jit, static_argnums=(0, 2), compiler_options=SELDOM)
+def _compiled(function: Callable[..., Any], given: tuple, static: tuple[str, ...]) -> Any:
+    return function(*given, *static)
 
 
 def looked_through(begun: Sequence[Seen], together: Callable = one_by_one) -> list[Seen]:
@@ -233,7 +239,6 @@ def _sizes(seen: Seen, plane: str, errors: np.ndarray) -> _Sizes:
     return _Sizes(own, size, error, relative, asked.factor, asked.design)
 
 
-@partial(jax.jit, static_argnames=("method", "weights"))
 def fit_look(look: Look, sizes: _Sizes, method: str, weights: str) -> ClosedForm:
     """Fit the planes of a look, and carry σ and its covariance to everything people quote.
 
@@ -255,7 +260,6 @@ def fit_look(look: Look, sizes: _Sizes, method: str, weights: str) -> ClosedForm
     return jax.vmap(one)(rows, sizes.factor, *places, sizes.design)
 
 
-@partial(jax.jit, static_argnames=("method", "weights"))
 def _look_and_fit(rows: Rows, sizes: _Sizes, method: str, weights: str) -> tuple[Look, ClosedForm]:
     look = look_through(rows)
     return look, fit_look(look, sizes, method, weights)

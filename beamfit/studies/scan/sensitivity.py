@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import replace
+from functools import partial
 from itertools import islice
 from typing import NamedTuple
 
@@ -17,6 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from beamfit.compile_cache import SELDOM
 from beamfit.optics.beamline import Beamline
 from beamfit.optics.calibration import SlopeIntercept, scaled
 from beamfit.optics.elements import (
@@ -227,7 +229,7 @@ class _Weighing(NamedTuple):
     follows: Array
 
 
-@jax.jit
+@partial(jax.jit, compiler_options=SELDOM)
 def _slopes(
     rows: Rows, upright: Array, sigma: Array, size: Array, noise: _Weighing
 ) -> tuple[list[Array], Array, Array]:
@@ -241,11 +243,9 @@ def _slopes(
     unit = jnp.abs(sigma)
 
     def elements(changes: list[Array], factor: Array, more: Array) -> tuple[Array, ...]:
-        line = _moved(rows.line, iter(changes))
-        moved = replace(rows, line=line, energy=rows.energy * factor)
-        # Both planes in one program, which is compiled once.
-        both = (replace(moved, plane=p).elements({}) for p in "xy")
-        r11, r12, known = (jnp.where(upright, y, x) for x, y in zip(*both, strict=True))
+        x, y = rows.both(_moved(rows.line, iter(changes)), rows.energy * factor)
+        # Either plane in one program, which is compiled once.
+        r11, r12, known = rows.known(jnp.where(upright, y, x))
         return r11, r12, known + more
 
     def slope(relative: Array, seen: tuple[Array, ...]) -> Array:

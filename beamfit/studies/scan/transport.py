@@ -147,12 +147,15 @@ class Rows:
 
     def elements(self, model: Mapping[str, Any]) -> tuple[Array, Array, Array]:
         """R11, R12, damped, and known size² (m²) of every row, shape (n,), by the model's line."""
-        found, r = model.get("systematics", {}), self.given
-        if r is None:
-            energy = self.energy * found.get("energy", 1.0)
-            line = line_of(model, self.line)
-            r = self.at_screens(transfer_rows(line, self.settings, energy, self.places).planes)
+        found = model.get("systematics", {})
+        r = self.both(line_of(model, self.line), self.energy * found.get("energy", 1.0))
         return self.known(r["xy".index(self.plane)], found)
+
+    def both(self, line: Beamline, energy: Array) -> Array:
+        """R11, R12 and R16 of both planes, shape (2, n, 3), by a line, unless they are given."""
+        if self.given is not None:
+            return self.given
+        return self.at_screens(transfer_rows(line, self.settings, energy, self.places).planes)
 
     def at_screens(self, planes: Array) -> Array:
         """R11, R12 and R16 of both planes as `given`, from matrices (n, 2, places, 3, 3)."""
@@ -337,7 +340,6 @@ class Look(NamedTuple):
     to_design: Array
 
 
-@jax.jit
 def look_through(rows: Rows) -> Look:
     """Carry the rows of a scan to their screens, in both planes and one pass."""
     line = rows.line

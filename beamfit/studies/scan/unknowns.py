@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -12,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from beamfit.compile_cache import SELDOM
 from beamfit.greybox.covariance import Group
 from beamfit.greybox.fit import Derived, Fit
 from beamfit.greybox.problem import Problem
@@ -138,7 +140,7 @@ def _numbers(model: Mapping[str, Any], asked: tuple[Asked, ...]) -> Array:
     return jnp.stack([asked_numbers(model, each) for each in asked])
 
 
-@jax.jit
+@partial(jax.jit, compiler_options=SELDOM)
 def _elements(model: Mapping[str, Any], rows: tuple[Any, ...]) -> Array:
     """R11, R12 and known size² of each plane's rows."""
     return jnp.stack([jnp.stack(each.elements(model)) for each in rows])
