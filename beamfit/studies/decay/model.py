@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from beamfit.compile_cache import SELDOM
 from beamfit.greybox.descend import descend_one
 from beamfit.greybox.problem import Free, Prior, Problem, Record, padded_length
 from beamfit.studies.decay.law import (
@@ -298,7 +299,7 @@ def _unpacked(summary: Array, residuals: Array) -> Solution:
     return Solution(values, errors, drift, correlation, residuals, squares, fall, converged)
 
 
-@partial(jax.jit, static_argnames="shape")
+@partial(jax.jit, static_argnames="shape", compiler_options=SELDOM)
 def _expansion(rows: Array, theta: Array, shape: Shape | None) -> tuple[Array, ...]:
     readings = _scaled(rows)
     shape = _in_units(shape, readings.unit[1])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import jax
@@ -14,6 +15,7 @@ from jax import Array
 from scipy.linalg import block_diag
 from scipy.stats import qmc
 
+from beamfit.compile_cache import SELDOM
 from beamfit.errors import InputError
 from beamfit.greybox import tree
 from beamfit.greybox.assess import TOLERANCE
@@ -273,7 +275,7 @@ def _search(stated: Problem, seed: int) -> tuple[list[tuple[np.ndarray, float]],
     return minima, fit
 
 
-@jax.jit
+@partial(jax.jit, compiler_options=SELDOM)
 def _numbers(wanted: _Wanted, theta: Array) -> tuple[Array, Array]:
     """Size, divergence, β and α of each plane, shape (planes, 4), and their slopes by σ."""
 
@@ -286,7 +288,7 @@ def _numbers(wanted: _Wanted, theta: Array) -> tuple[Array, Array]:
     return of_sigma(wanted.sigma), jax.jacfwd(of_sigma)(wanted.sigma)
 
 
-@jax.jit
+@partial(jax.jit, compiler_options=SELDOM)
 def _curvature(wanted: _Wanted, theta: Array) -> Array:
     """Second derivatives of the objective by settings and σ together."""
     size = len(wanted.names)
