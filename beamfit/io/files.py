@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 import hashlib
 import io
 import json
@@ -29,9 +30,9 @@ SIGNATURES = {
     b"MATLAB 7.3 MAT-file": MATLAB,
     b"SDDS": ("an SDDS file", "a text table; sdds2spreadsheet writes one, with units in its names"),
     b"\x1f\x8b": ("a compressed file", "a text file; unpack it first"),
-    b"\xff\xfe": ("UTF-16 text", "UTF-8 text; save it as CSV (UTF-8)"),
-    b"\xfe\xff": ("UTF-16 text", "UTF-8 text; save it as CSV (UTF-8)"),
 }
+# How text of two bytes a letter begins, such as Excel's "Unicode text".
+UTF16 = codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE
 # ° ± ² ³ µ in the code pages of Windows, and what needs none.
 MARKS, ASCII = bytes([0xB0, 0xB1, 0xB2, 0xB3, 0xB5]), bytes(range(128))
 LARGEST_TEXT = 4_000_000
@@ -99,8 +100,8 @@ def text_lines(path: str | PathLike[str]) -> Iterator[str]:
     Raises
     ------
     InputError
-        If the file cannot be opened, is empty, is binary, is not UTF-8 (µ and ° of Windows and
-        comments apart), or has a line longer than any text table has.
+        If the file cannot be opened, is empty, is binary, is neither UTF-8 (µ and ° of Windows and
+        comments apart) nor UTF-16 with its mark, or has a line longer than any text table has.
     """
     number, seen = 0, hashlib.sha256()
     with _opened(path) as stream:
@@ -121,16 +122,27 @@ def text_lines(path: str | PathLike[str]) -> Iterator[str]:
 def _raw_lines(stream: BinaryIO, seen: Any) -> Iterator[bytes]:
     """Lines with their ends; of one that is too long a part."""
     left = b""
-    while block := stream.read(1 << 16):
-        seen.update(block)
+    for block in _blocks(stream, seen):
         lines = (left + block).splitlines(keepends=True)
         # A carriage return at the end of a block may have its line feed in the next one.
-        left = b"" if lines[-1].endswith(b"\n") else lines.pop()
+        left = b"" if not lines or lines[-1].endswith(b"\n") else lines.pop()
         yield from lines
         if len(left) > LONGEST_LINE:
             break
     if left:
         yield left
+
+
+def _blocks(stream: BinaryIO, seen: Any) -> Iterator[bytes]:
+    """What a file holds, part by part; of UTF-16 as UTF-8, where what is no letter is no number."""
+    block = stream.read(1 << 16)
+    wide = block.startswith(UTF16)
+    decoder = codecs.getincrementaldecoder("utf-16")("replace")
+    while block:
+        seen.update(block)
+        yield decoder.decode(block).encode() if wide else block
+        block = stream.read(1 << 16)
+    yield decoder.decode(b"", final=True).encode()
 
 
 def _decoded(raw: bytes, path: str | PathLike[str], number: int) -> str:

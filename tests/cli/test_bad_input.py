@@ -139,7 +139,7 @@ SCANS = {
     "a lattice": (LATTICE, ["lattice", "scan"]),
     "binary": (b"\x00\x01\x02\xff" * 100, [":1:", "binary"]),
     "Latin-1": (changed("Q525", "Qé25").encode("latin-1"), [":1:", "UTF-8"]),
-    "UTF-16": (GOOD.encode("utf-16"), [":1:", "UTF-16", "UTF-8"]),
+    "UTF-16 cut off": (GOOD.encode("utf-16")[:-3], [":6:", "size_y_error_um", "a number"]),
     "a spreadsheet": (b"PK\x03\x04" + bytes(100), ["spreadsheet", "CSV"]),
     "one endless line": ("1," * 200_000, ["characters"]),
 }

@@ -1,5 +1,7 @@
 """The one reader of columns: however a file is laid out, it is the same table, or a place named."""
 
+import hashlib
+
 import h5py
 import numpy as np
 import pytest
@@ -19,9 +21,13 @@ ROWS = st.integers(1, 4).flatmap(
 )
 BETWEEN = st.lists(st.sampled_from(["", "  ", "# noon", "#", " # 1,2;3", ",,", ";"]), max_size=3)
 
+# As editors and spreadsheets save text: Excel's "Unicode text" is UTF-16.
+CODES = ["utf-8", "utf-8-sig", "utf-16-le", "utf-16-be"]
 
-def fill(path, lines, end="\n", start=b""):
-    path.write_bytes(start + end.join(lines).encode())
+
+def fill(path, lines, end="\n", code="utf-8"):
+    start = "\ufeff" if code.endswith("e") else ""  # the other codes write the mark themselves
+    path.write_bytes((start + end.join(lines)).encode(code))
     return read_sheet(path, EXAMPLE)
 
 
@@ -37,7 +43,7 @@ def test_separators_comments_blanks_and_quotes_change_nothing(tmp_path_factory, 
         places.append(len(lines))
     path = tmp_path_factory.getbasetemp() / "laid_out.csv"
     end = data.draw(st.sampled_from(["\n", "\r\n"]))
-    sheet = fill(path, lines, end, data.draw(st.sampled_from([b"", b"\xef\xbb\xbf"])))
+    sheet = fill(path, lines, end, data.draw(st.sampled_from(CODES)))
     assert list(sheet.names) == names
     assert (sheet.header, sheet.lines) == (places[0], places[1:])
     found = np.transpose([sheet.numbers(name) for name in names])
@@ -143,3 +149,13 @@ def test_units_are_those_of_the_quantity():
     sheet = Sheet("a.csv", ("presure_Pa",), [["1"]], [2], 1, ())
     with pytest.raises(InputError, match=r"did you mean pressure_Pa\?"):
         columns_of(sheet, {"pressure": "pressure"})
+
+
+def test_the_unicode_text_of_excel_is_read_with_its_commas_and_its_own_digest(tmp_path):
+    file = tmp_path / "a.txt"
+    text = "Größe\tsize x [µm]\r\n" + "".join(f"{k}\t{k},5\r\n" for k in range(30_000))
+    file.write_bytes(text.encode("utf-16"))
+    sheet = read_sheet(file, EXAMPLE)
+    assert sheet.names == ("Größe", "size x [µm]")
+    assert sheet.numbers("size x [µm]").tolist() == [k + 0.5 for k in range(30_000)]
+    assert sheet.sha256 == hashlib.sha256(file.read_bytes()).hexdigest()
