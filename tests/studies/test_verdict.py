@@ -1,6 +1,7 @@
 """The verdict: noise and one-sided scans must never come out as an answer."""
 
 import re
+from dataclasses import replace
 
 import jax
 import numpy as np
@@ -224,3 +225,15 @@ def test_phase_of_a_drift_from_a_waist():
     """Phase advance of a drift s from a waist β*: arctan(s/β*)."""
     r11, r12 = np.ones(3), np.array([0.0, 1.0, 2.0])
     assert phase_coverage(r11, r12, 2.0, 0.0) == pytest.approx(45.0)
+
+
+@pytest.mark.parametrize(("factor", "words"), [(1e-3, "less than any"), (600.0, "more than any")])
+def test_an_emittance_that_only_a_wrong_unit_explains_is_not_given(gtf, factor, words, root):
+    scan = beamfit.read_quad_scan(root / "measurements/gtf_simulated.csv")
+    size, error = ({p: factor * v for p, v in of.items()} for of in (scan.size, scan.error))
+    fit = beamfit.fit_emittance(replace(scan, size=size, error=error), gtf).x
+    assert fit.status is Status.unidentified
+    assert f"{words} accelerator has" in fit.message
+    assert "the units of 'size_x_um'" in fit.message
+    assert {q.error for q in fit.quantities.values()} == {None}
+    assert np.isnan(fit.covariance).all()

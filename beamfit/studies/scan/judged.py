@@ -26,6 +26,9 @@ SIGMA = slice(4, 7)
 MOST_NAMED = 5
 # Draws for an upper limit, and how many of them must be beams.
 DRAWS, ENOUGH = 20_000, 100
+# Normalised emittances in m beyond which only a wrong unit leads: rings and linacs have 1e-9 and
+# more, muons before cooling 2e-2; sizes a thousand times off are a million in this.
+LEAST, MOST = 1e-10, 0.1
 # What the three numbers of size² alone tell: σ, and the size at the screen.
 LINEAR = np.isin(list(QUANTITIES), ("sigma11", "sigma12", "sigma22", "screen_size"))
 
@@ -63,6 +66,7 @@ def _quantity(
 
 def plane_fit(seen: Seen, line: Beamline, plane: str, a: Answer) -> PlaneFit:
     """The result of a plane: errors only for what the data determine."""
+    a = _held(a, seen.scan.columns.get(f"size_{plane}", f"size_{plane}"))
     columns = a.value, a.error, a.raw, QUANTITIES.values(), a.limits
     numbers = [_quantity(*each, reach_of(a.rests_on)) for each in zip_longest(*columns)]
     emittance, normalized, beta, alpha, s11, s12, s22, *screen, mismatch = numbers
@@ -99,6 +103,28 @@ def plane_fit(seen: Seen, line: Beamline, plane: str, a: Answer) -> PlaneFit:
         ),
         points=p,
         holds=a.holds,
+    )
+
+
+def _held(a: Answer, sizes: str) -> Answer:
+    """An answer, or one without errors where it is of a size that only a wrong unit explains."""
+    if not a.determined or LEAST <= (found := a.value[1]) <= MOST:
+        return a
+    cause = (
+        f"Not determined: a normalised emittance of {found:.2g} m is "
+        f"{'less' if found < LEAST else 'more'} than any accelerator has."
+    )
+    remedy = (
+        f"Check the units of '{sizes}', the settings and the energy: sizes in mm under a header "
+        "that says um make it a million times less."
+    )
+    none = np.full(len(a.value), np.nan)
+    return a._replace(
+        finding=Finding(Status.unidentified, cause, remedy),
+        determined=False,
+        error=none,
+        raw=none,
+        covariance=np.full_like(a.covariance, np.nan),
     )
 
 
