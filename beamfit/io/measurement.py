@@ -14,7 +14,8 @@ from beamfit.errors import InputError, located
 from beamfit.io.emittance_gui import is_emittance_gui, read_emittance_gui
 from beamfit.io.files import name_of
 from beamfit.io.headers import SETTINGS
-from beamfit.io.scan_columns import ENERGIES, PERCENT, column_notes, comment_notes, scan_columns
+from beamfit.io.scan_columns import ENERGIES, PERCENT, column_notes, scan_columns
+from beamfit.io.scan_comments import comment_notes
 from beamfit.io.sheet import UNITS, Column, Sheet, left_out
 from beamfit.io.shots import average_shots
 from beamfit.io.table import read_sheet
@@ -130,7 +131,7 @@ def _scan(
         path=sheet.path,
         sha256=sheet.sha256,
         provenance=sheet.comments,
-        notes=(*column_notes(columns), *comment_notes(columns, sheet.comments), *left_out(sheet)),
+        notes=(*column_notes(columns), *comment_notes(sheet, columns), *left_out(sheet)),
         columns={name: c.header for name, c in magnets.items()}
         | headers
         | {header: header for header in headers.values()},

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 
-from beamfit.errors import InputError, nearest, short
+from beamfit.errors import InputError, nearest
 from beamfit.io.headers import SETTINGS, spelled
 from beamfit.io.sheet import UNITS, Column, Sheet, columns_of
 from beamfit.particles import ENERGY_KEYS
@@ -46,8 +46,6 @@ ATTRIBUTE = re.compile(
     r"[ _:./](bact|bdes|bctrl|bcon|iact|ides|current|gradient|k1l?|gl|bdl|setpoint|readback)$",
     re.IGNORECASE,
 )
-# Of a comment that says something of sizes which a header may not say.
-WIDER = re.compile(r"fwhm|full[ -]width|\b[2-6][ -]?(sigma|σ|rms)|pixel|\bpx\b", re.IGNORECASE)
 SHOTS = {"n_shots": "shots", "nshots": "shots"}
 # Elements of the matrix from where the beam is asked for to the row's screen, m and 1.
 ELEMENT = re.compile(r"r(1[126])(?:_([xy]))?(?:_m)?|r(3[346])(?:_m)?", re.IGNORECASE)
@@ -140,8 +138,8 @@ def _check_error(sheet: Sheet, columns: Mapping[str, Column], plane: str) -> Non
     if size is None:
         found = f"{error.header} without sizes in {plane}"
         raise sheet.header_error(found, f"a column size_{plane}_um", error.header)
-    if error.unit != PERCENT and not math.isclose(_rms(size), _rms(error)):
-        word = "a FWHM" if FWHM in (_rms(size), _rms(error)) else "several sigma"
+    if error.unit != PERCENT and not math.isclose(rms_of(size), rms_of(error)):
+        word = "a FWHM" if FWHM in (rms_of(size), rms_of(error)) else "several sigma"
         found = f"an error beside '{size.header}' of which only one is {word}"
         raise sheet.header_error(found, "sizes and errors of one width", error.header)
 
@@ -233,7 +231,7 @@ def _size(header: str) -> Column | None:
     return Column(header, key, unit, units[unit] * (rms if unit != PERCENT else 1.0))
 
 
-def _rms(column: Column) -> float:
+def rms_of(column: Column) -> float:
     """How many rms sizes one of a column's is."""
     return column.factor / UNITS["length"][column.unit]
 
@@ -242,7 +240,7 @@ def column_notes(columns: Mapping[str, Column]) -> list[str]:
     """Say which sizes were made of others, in sentences."""
     made: dict[float, list[str]] = {}
     for column in (columns[key] for key in ("size_x", "size_y") if key in columns):
-        made.setdefault(round(1 / _rms(column), 4), []).append(column.header)
+        made.setdefault(round(1 / rms_of(column), 4), []).append(column.header)
     return [
         f"Sizes are FWHM/2.3548 of {' and '.join(headers)}, which is their rms for a Gaussian "
         "profile only."
@@ -250,24 +248,4 @@ def column_notes(columns: Mapping[str, Column]) -> list[str]:
         else f"Sizes are a share of 1/{share:g} of {' and '.join(headers)}."
         for share, headers in made.items()
         if share != 1.0
-    ]
-
-
-def comment_notes(columns: Mapping[str, Column], comments: Iterable[str]) -> list[str]:
-    """Ask about a comment that speaks of another width than the headers of rms sizes.
-
-    Examples
-    --------
-    >>> size = Column("size_x_um", "size_x", "um", 1e-6)
-    >>> comment_notes({"size_x": size}, ["sizes: FWHM"])[0][:54]
-    "A comment says 'sizes: FWHM', and the sizes are taken "
-    """
-    said = next((text for text in comments if WIDER.search(text)), None)
-    sizes = [columns[key] for key in ("size_x", "size_y") if key in columns]
-    if said is None or any(_rms(column) != 1.0 for column in sizes):
-        return []
-    named = " and ".join(column.header for column in sizes)
-    return [
-        f"A comment says '{short(said, 80)}', and the sizes are taken for rms: if they are not, "
-        f"say so in the header of {named}, such as fwhm_x_{sizes[0].unit}."
     ]
