@@ -33,6 +33,8 @@ ALSO |= {"percent": "%"}
 ALSO |= {u: "um" for u in ("UM", "Um")} | {u: "mm" for u in ("MM", "Mm")} | {"M": "m"}
 ALSO |= {"KG": "kG", "kg": "kG", "T_PER_M": "T_per_m", "K1": "k1", "K1L": "k1l", "MEV": "MeV"}
 ALSO |= {"mev": "MeV", "ma": "mA", "pa": "Pa", "PA": "Pa", "torr": "Torr", "TORR": "Torr"}
+# A number and what stands behind it.
+NUMBER = re.compile(r"([-+]?(?:\d+[.,]?\d*|[.,]\d+)(?:[eE][-+]?\d+)?)\s*([^\W\d_].*|[%\[(].*)")
 # A name, and its unit in brackets or behind a stroke between blanks.
 BRACKETS = re.compile(r"(.*?)[\s_]*(?:\[(.*?)\]|\((.*?)\)|\s/\s+(\S+))\s*")
 # Lines that are looked through for the header below a title.
@@ -50,6 +52,18 @@ def known_unit(text: str) -> str | None:
     """A unit as the names of columns have it; None if the text is none."""
     text = text.strip().strip("[]()").strip()
     return text if text in KNOWN else ALSO.get(text)
+
+
+def unit_of(cell: str) -> str | None:
+    """The unit behind the number of a cell, as the names of columns have it.
+
+    Examples
+    --------
+    >>> unit_of("627 µm"), unit_of("1.5A"), unit_of("1e-3"), unit_of("OTR2")
+    ('um', 'A', None, None)
+    """
+    found = None if cell[-1:].isdigit() else NUMBER.fullmatch(cell)
+    return known_unit(re.sub("[µμ]", "u", found[2])) if found else None
 
 
 @lru_cache(maxsize=4096)  # a year's files have the headers of the first
@@ -74,8 +88,13 @@ def spelled(header: str) -> str:
     return "_".join(words) if len(words) > 1 and words[-1] in KNOWN else header
 
 
+def unit_at_end(name: str) -> str | None:
+    """The unit that a name as `spelled` ends with; None if it has none."""
+    return max((u for u in KNOWN if name.endswith(f"_{u}")), key=len, default=None)
+
+
 def _has_unit(header: str) -> bool:
-    return spelled(header).endswith(ENDS)
+    return unit_at_end(spelled(header)) is not None
 
 
 def with_units(names: Sequence[str], cells: Sequence[str]) -> list[str] | None:
@@ -141,7 +160,7 @@ def header_at(lines: Sequence[str]) -> int:
         if _is_aside(text):
             continue
         cells = _words(text)
-        numbers = any(map(is_number, cells))
+        numbers = any(is_number(cell) or unit_of(cell) for cell in cells)
         if not numbers and sum(map(_has_unit, cells)) > 1:
             return i
         if first is None:

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from beamfit.errors import InputError
+from beamfit.io.cell_units import without_units
 from beamfit.io.commas import with_points
 from beamfit.io.files import digest, text_lines
 from beamfit.io.hdf5 import hdf5_columns
@@ -134,6 +135,7 @@ def _read_text(
     if bad and not (ragged and rows):
         raise bad[0]
     if columns is None:
+        names, rows = without_units(names, rows, path, lines)
         rows, notes = with_points(rows, separator)
         columns = zip(*rows, strict=True) if rows else [()] * len(names)
     said = (tuple(comments), digest(path), tuple(bad), notes)
