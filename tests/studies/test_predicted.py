@@ -1,11 +1,14 @@
 """Sizes at other settings and correlations of a fit, against repeated simulated scans."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 import beamfit
 from beamfit.errors import InputError
 from beamfit.optics.elements import Drift
+from beamfit.studies.scan.design import plan_measurements
 
 EMITTANCE, BETA, ALPHA, K1 = 2e-9, 6.0, 0.5, np.linspace(-2.0, 12.0, 9)
 OTHER = np.array([-3.0, 1.1, 5.0, 13.0])
@@ -104,3 +107,21 @@ def test_what_cannot_be_asked_is_said(line, root):
     )  # fmt: skip
     with pytest.raises(InputError, match="the measured rows alone"):
         beamfit.fit_emittance(rows).predict({})
+
+
+def test_a_scans_own_resolution_and_spread_hold_for_further_rows_on_its_screen(line):
+    """In `predict` as in `design`; other screens keep what the line says of them."""
+    plain = scan_of(np.random.default_rng(1), 1e-2)
+    wide = {"x": np.hypot(plain.size["x"], 40e-6)}
+    told = replace(plain, size=wide, resolution=np.full(K1.size, 40e-6))
+    of_scan = beamfit.fit_emittance(told, line)
+    of_line = beamfit.fit_emittance(
+        replace(told, resolution=None), line.with_element(beamfit.Screen("B", 40e-6))
+    )
+    for screen in ("A", "B"):
+        both = [fit.predict({"Q": OTHER}, screen=screen).size for fit in (of_scan, of_line)]
+        np.testing.assert_allclose(*both, rtol=1e-9)
+    steps = [plan_measurements(fit, count=2).steps for fit in (of_scan, of_line)]
+    for one, other in zip(*steps, strict=True):
+        assert one.candidate == other.candidate
+        assert one.relative_error == pytest.approx(other.relative_error, rel=1e-9)

@@ -222,8 +222,7 @@ def _line_rows(fit, line, plane, table, screen, energy) -> Rows:
         n: jnp.stack([v, jnp.ones(count)], -1) if shapes.get(n) == 2 else jnp.asarray(v)
         for n, v in table.items()
     }
-    resolution = getattr(line[screen], "resolution", 0.0)
-    known = line.energy_spread, resolution, fit.seen.energy
+    known = fit.seen.known_at(line, screen)
     return rows_at(line, plane, screen, settings, np.asarray(energy), *known)
 
 

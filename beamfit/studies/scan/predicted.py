@@ -98,15 +98,8 @@ def _rows(
     keep = dict.fromkeys((*given, *model.get("magnets", {})))
     table = {name: padded(given.get(name, np.full(n, float(line[name].setting)))) for name in keep}
     energy = padded(np.full(n, seen.energy))
-    resolution = getattr(line[place], "resolution", 0.0)
-    if seen.scan.resolution is not None:
-        resolution = np.median(seen.scan.resolution)
-    spread = line.energy_spread
-    if seen.scan.energy_spread is not None:
-        spread = np.median(seen.scan.energy_spread)
-    known = float(spread), float(resolution), seen.energy
     seen_by = seen_line(line, tuple(keep), energy, (place,))
-    return rows_at(seen_by, plane, place, table, energy, *known)
+    return rows_at(seen_by, plane, place, table, energy, *seen.known_at(line, place))
 
 
 def correlations_of(p: PlaneFit) -> Correlations:

@@ -112,6 +112,20 @@ class Seen(NamedTuple):
         """Indices of the rows in which a plane was measured."""
         return np.flatnonzero(~np.isnan(self.scan.size[plane]))
 
+    def known_at(self, line: Beamline, place: str) -> tuple[float, float, float]:
+        """Energy spread, resolution (m) and energy (MeV) of a further row on a screen of a line.
+
+        What the scan itself says, in the middle of its rows (of the resolution those on that
+        screen), goes before the line.
+        """
+        scan = self.scan
+        spread = line.energy_spread if scan.energy_spread is None else np.median(scan.energy_spread)
+        screens = scan.screen or self.rows.places[-1:] * len(scan)
+        resolution = getattr(line[place], "resolution", 0.0)
+        if scan.resolution is not None and place in screens:
+            resolution = np.median(scan.resolution[np.array(screens) == place])
+        return float(spread), float(resolution), self.energy
+
     @property
     def energy(self) -> float:
         """Mean total energy of the rows, MeV: that of the beam that is asked for."""
