@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from os import PathLike
 
 from beamfit.errors import InputError
-from beamfit.io.headers import NUMBER, is_number, spelled, unit_at_end, unit_of
+from beamfit.io.headers import NUMBER, is_number, spelled, unit_at_end, unit_behind
 
 # Columns of words, of which one may look so: a screen 2A.
 WORDS = re.compile(r"(screen|slice|note|comment|remark).*", re.IGNORECASE)
@@ -45,8 +45,8 @@ def without_units(
     names, changed = list(names), None
     for i, name in enumerate(names):
         own = unit_at_end(re.sub("[µμ]", "u", spelled(name)))
-        unit = own or unit_of(next((row[i] for row in rows if row[i]), ""))
-        said = [unit_of(row[i]) for row in rows] if unit and not WORDS.match(name) else ()
+        unit = own or unit_behind(next((row[i] for row in rows if row[i]), ""))
+        said = [unit_behind(row[i]) for row in rows] if unit and not WORDS.match(name) else ()
         if unit is None or unit not in said:
             continue
         changed = changed or [list(row) for row in rows]

@@ -54,12 +54,12 @@ def known_unit(text: str) -> str | None:
     return text if text in KNOWN else ALSO.get(text)
 
 
-def unit_of(cell: str) -> str | None:
+def unit_behind(cell: str) -> str | None:
     """The unit behind the number of a cell, as the names of columns have it.
 
     Examples
     --------
-    >>> unit_of("627 µm"), unit_of("1.5A"), unit_of("1e-3"), unit_of("OTR2")
+    >>> unit_behind("627 µm"), unit_behind("1.5A"), unit_behind("1e-3"), unit_behind("OTR2")
     ('um', 'A', None, None)
     """
     found = None if cell[-1:].isdigit() else NUMBER.fullmatch(cell)
@@ -160,7 +160,7 @@ def header_at(lines: Sequence[str]) -> int:
         if _is_aside(text):
             continue
         cells = _words(text)
-        numbers = any(is_number(cell) or unit_of(cell) for cell in cells)
+        numbers = any(is_number(cell) or unit_behind(cell) for cell in cells)
         if not numbers and sum(map(_has_unit, cells)) > 1:
             return i
         if first is None:

@@ -17,7 +17,7 @@ import numpy as np
 
 from beamfit.errors import InputError, nearest
 from beamfit.io.dates import NUMBERS, dates_in_order
-from beamfit.io.headers import UNITS, is_number, spelled, unit_of
+from beamfit.io.headers import UNITS, is_number, spelled, unit_behind
 
 # The unit of a column of dates.
 DATE = "a date"
@@ -225,7 +225,7 @@ class Sheet:
                 values[row] = read(cell)
             except (ValueError, TypeError, OverflowError):
                 comma = " with a decimal point" if "," in str(cell) else ""
-                more = " in the unit of the column" if unit_of(str(cell)) else comma
+                more = " in the unit of the column" if unit_behind(str(cell)) else comma
                 found = "an empty cell" if cell == "" else f"'{cell}'"
                 raise self.error(found, expected + more, row, name) from None
             if not np.isfinite(values[row]):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import re
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -12,7 +11,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from beamfit.errors import InputError, plain
-from beamfit.io.headers import spelled
+from beamfit.io.headers import UNITS, known_unit
 from beamfit.io.machine import LENGTHS, Guard, Magnet, Profiler, ScanMachine, moved, unit_of
 from beamfit.live.channel import Channel, LostError, Reading, open_channel
 from beamfit.live.projection import rms_of
@@ -279,7 +278,7 @@ async def check_lengths(channel: Channel, profiler: Profiler) -> list[str]:
         If it is another one than the machine file says.
     """
     given = (await channel.describe()).unit
-    found = LENGTHS.get(re.sub("[µμ]", "u", spelled(f"x [{given}]")[2:]))
+    found = UNITS["length"].get(known_unit(given) or "")
     if not given or found == profiler.unit:
         return []
     said = f"'{plain(channel.name)}' in '{plain(given)}'"
