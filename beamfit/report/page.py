@@ -6,51 +6,37 @@ import re
 from collections.abc import Mapping, Sequence
 from os import PathLike
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from matplotlib import rc_context
 
 from beamfit.errors import InputError
-from beamfit.language.solution import Solution
 from beamfit.report import kind_of
-from beamfit.report.control import control_page
-from beamfit.report.decays import decay_page, study_of
 from beamfit.report.document import STYLE, Page, Picture, drawn, html_of, written_now
 from beamfit.report.emittance import emittance_page
-from beamfit.report.fedbatch import fedbatch_page, feed_page
-from beamfit.report.formulation import formulation_page
-from beamfit.report.pdf import pdf_of
 from beamfit.report.posterior import Sampled, of_decay, of_scan, with_posteriors
-from beamfit.report.response import response_page
-from beamfit.report.slices import slices_page
 from beamfit.sampling.posterior import Posterior
 from beamfit.studies.decay.fit import DecayFit
-from beamfit.studies.decay.shift import Shift
 from beamfit.studies.decay.study import RecordStudy
-from beamfit.studies.decay.trend import Trend
-from beamfit.studies.fedbatch.feed import FeedPlan
-from beamfit.studies.fedbatch.fit import FedBatchFit
-from beamfit.studies.fedbatch.titre import TitreFit
-from beamfit.studies.response.fit import ResponseFit
-from beamfit.studies.response.loop import Loop
-from beamfit.studies.response.states import StatesFit
 from beamfit.studies.scan.fit import EmittanceFit
-from beamfit.studies.scan.size_methods import SizeMethods
-from beamfit.studies.scan.slices import SliceFits
 from beamfit.writing import write_atomically
 
-Reported = (
-    EmittanceFit | SliceFits | DecayFit | Solution | ResponseFit | Loop
-    | FedBatchFit | TitreFit | FeedPlan
-)  # fmt: skip
-# What lays out a result by itself, and what several beside one another.
-OF_ONE = {
-    Solution: formulation_page,
-    SliceFits: slices_page,
-    FeedPlan: feed_page,
-    Loop: control_page,
-}
-OF_SEVERAL = dict.fromkeys((ResponseFit, StatesFit), response_page)
-OF_SEVERAL |= dict.fromkeys((FedBatchFit, TitreFit), fedbatch_page)
+if TYPE_CHECKING:
+    from beamfit.language.solution import Solution
+    from beamfit.studies.decay.shift import Shift
+    from beamfit.studies.decay.trend import Trend
+    from beamfit.studies.fedbatch.feed import FeedPlan
+    from beamfit.studies.fedbatch.fit import FedBatchFit
+    from beamfit.studies.fedbatch.titre import TitreFit
+    from beamfit.studies.response.fit import ResponseFit
+    from beamfit.studies.response.loop import Loop
+    from beamfit.studies.scan.size_methods import SizeMethods
+    from beamfit.studies.scan.slices import SliceFits
+
+    Reported = (
+        EmittanceFit | SliceFits | DecayFit | Solution | ResponseFit | Loop
+        | FedBatchFit | TitreFit | FeedPlan
+    )  # fmt: skip
 
 
 def write_report(
@@ -115,14 +101,16 @@ def write_report(
         if isinstance(first, EmittanceFit):
             page = emittance_page(first, methods)
             sampled = [] if posterior is None else [of_scan(first, posterior)]
-        elif type(first) in OF_ONE:
-            page = OF_ONE[type(first)](first)
-        elif type(first) in OF_SEVERAL:
-            page = OF_SEVERAL[type(first)](several)
-        else:
+        elif isinstance(first, DecayFit | RecordStudy):
+            from beamfit.report.decays import decay_page, study_of
+
             studies = (study_of(first),) if isinstance(first, DecayFit) else several
             page = decay_page(studies, shift, trend)
             sampled = _of_decays(studies, posterior)
+        else:
+            from beamfit.report.kinds import page_of
+
+            page = page_of(several)
         write_page(path, with_posteriors(page, sampled), command, inputs)
 
 
@@ -138,6 +126,8 @@ def write_page(
         case ".html":
             made = {Path(path): html_of(page)}
         case ".pdf":
+            from beamfit.report.pdf import pdf_of
+
             made = {Path(path): pdf_of(page)}
         case _:
             made = _pictures(Path(path), page.pictures)

@@ -1,0 +1,37 @@
+"""What lays out a result that is neither of a scan nor of decays; imports every study."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from beamfit.language.solution import Solution
+from beamfit.report.control import control_page
+from beamfit.report.document import Page
+from beamfit.report.fedbatch import fedbatch_page, feed_page
+from beamfit.report.formulation import formulation_page
+from beamfit.report.response import response_page
+from beamfit.report.slices import slices_page
+from beamfit.studies.fedbatch.feed import FeedPlan
+from beamfit.studies.fedbatch.fit import FedBatchFit
+from beamfit.studies.fedbatch.titre import TitreFit
+from beamfit.studies.response.fit import ResponseFit
+from beamfit.studies.response.loop import Loop
+from beamfit.studies.response.states import StatesFit
+from beamfit.studies.scan.slices import SliceFits
+
+# A result by itself, and several beside one another.
+OF_ONE = {
+    Solution: formulation_page,
+    SliceFits: slices_page,
+    FeedPlan: feed_page,
+    Loop: control_page,
+}
+OF_SEVERAL = dict.fromkeys((ResponseFit, StatesFit), response_page)
+OF_SEVERAL |= dict.fromkeys((FedBatchFit, TitreFit), fedbatch_page)
+
+
+def page_of(several: Sequence[Any]) -> Page:
+    """The page of such a result, or of several."""
+    kind = type(several[0])
+    return OF_ONE[kind](several[0]) if kind in OF_ONE else OF_SEVERAL[kind](several)
