@@ -14,6 +14,8 @@ from beamfit.studies.decay.law import DecayNumbers
 from beamfit.studies.decay.model import decay_problem, padded, solve_decay
 from beamfit.studies.decay.posterior import _noise_of, _with_memory
 from beamfit.studies.decay.record import DecayRecord
+from beamfit.studies.decay.study import study_record
+from beamfit.studies.decay.tables import separability_rows
 
 HOUR, SPAN = 3600.0, 8 * 3600.0
 I0, A, B = 500.0, 4e-8, 2e-6
@@ -92,6 +94,22 @@ def test_the_message_says_so_and_json_carries_it():
     }  # fmt: skip
     low, high = document["a"]["interval_95"]
     assert (high - low) / 2 >= 1.9 * fit.a.error
+
+
+def test_how_much_the_memory_enlarges_is_only_said_of_what_is_determined():
+    """Of a record without a decay it was the ratio of two shares of nothing: 5471 times."""
+    time, noise = np.linspace(0, SPAN, 200), autoregressive(np.random.default_rng(0), 200, 0.6)
+    flat = DecayRecord(time, I0 + 0.02 * noise)
+    fit = fit_decay(flat)
+    assert fit.identifiability.error_inflation is None
+    assert "times those of independent" not in fit.message
+    assert "which the errors contain." in fit.message
+    rows = dict(separability_rows(study_record(flat).decays))
+    assert rows["errors enlarged for that"] == ["-"]
+    # What a study weighs the record by: a mean of such readings is twice as uncertain.
+    assert fit.inflation == pytest.approx(np.sqrt(1.6 / 0.4), rel=0.15)
+    found = fit_decay(record(0.6, seed=1))
+    assert found.identifiability.error_inflation == found.inflation > 1.5
 
 
 def test_stated_errors_are_the_least():

@@ -75,8 +75,9 @@ class Separability:
         Correlation of a and b; near -1 on every record, also where both are well determined.
     residual_correlation : float or None
         Correlation of the errors of neighbouring readings; zero where none is seen.
-    error_inflation : float
-        By how much that makes the errors larger than independent readings would; they contain it.
+    error_inflation : float or None
+        By how much that makes the errors, which contain it, larger than independent readings
+        would; None where the lifetime is not determined.
     """
 
     separable: bool
@@ -84,7 +85,7 @@ class Separability:
     share_error: float | None
     correlation: float | None
     residual_correlation: float | None
-    error_inflation: float
+    error_inflation: float | None
 
 
 class Weighed:
@@ -155,6 +156,12 @@ class Weighed:
         error, raw = (part / rate**2 / HOUR for part in (error, raw))
         return Quantity(1 / rate / HOUR, error, "h", raw, interval)
 
+    @property
+    def determined(self) -> bool:
+        """Whether the loss rate at the mean current is clear of zero."""
+        rate, error = self.scaled("rate_mean")
+        return error < DETERMINED * rate
+
     @cached_property
     def separability(self) -> Separability:
         """Of a and b."""
@@ -168,7 +175,7 @@ class Weighed:
             share_error=error if finite else None,
             correlation=self.correlation if math.isfinite(self.correlation) else None,
             residual_correlation=alike,
-            error_inflation=self.inflation,
+            error_inflation=self.inflation if length is None or self.determined else None,
         )
 
     def widened(self, about: Expansion, changes: Sequence[np.ndarray]) -> Self:
@@ -187,7 +194,8 @@ class Weighed:
     def quoted(self, known: bool = True) -> dict[str, Any]:
         """What a `DecayFit` has of this, by its names."""
         apart = known and self.separability.separable
-        same = ("chi2", "dof", "noise_inferred", "constant_a", "correlation_time", "lifetimes")
+        same = ("chi2", "dof", "noise_inferred", "constant_a", "lifetimes")
+        same += ("correlation_time", "inflation")
         found = {name: self.quantity(name, apart) for name in "ab"}
         found |= {f"lifetime_{at}": self.lifetime(f"rate_{at}", known) for at in ENDS}
         found |= {name: getattr(self, name) for name in same}
@@ -250,7 +258,7 @@ class Evidence(Weighed):
         over = residuals if record.error is None else residuals / record.error
         if bool(solution.converged) and len(record) >= FEWEST and remembers(over, NUMBERS, SLOW):
             found = expanded(record, solution.values, shape)
-            if remembers(_left(found.rows, found.residuals), NUMBERS + 1, SLOW):
+            if remembers(found.left, NUMBERS + 1, SLOW):
                 change = change_of_rate(record, found, solution.values, None)
                 if change is not None and change.is_the_cause(found.residuals):
                     return cls._independent(record, solution, shape, changed=True)
@@ -322,12 +330,12 @@ class Evidence(Weighed):
         """By how much the memory of the noise enlarges errors."""
         if self.memory is None:
             return 1.0
-        least, plain = float(not self.noise_inferred), float(self.solution.sum_squares) / self.dof
-        plain = max(least, math.sqrt(plain))
-        return max(
-            getattr(self.errors, name) / getattr(self.solution.errors, name) / plain
-            for name in ("rate_mean", "share")
-        )
+        plain = math.sqrt(float(self.solution.sum_squares) / self.dof)
+        plain = plain if self.noise_inferred else max(plain, 1.0)
+        # Of a loss rate that is not clear of zero the share of a says nothing.
+        names = ("rate_mean", "share")[: 1 + self.determined]
+        enlarged, before = self.errors, self.solution.errors
+        return max(getattr(enlarged, n) / getattr(before, n) for n in names) / plain
 
     @property
     def correlation_time(self) -> float | None:
@@ -392,8 +400,3 @@ class Evidence(Weighed):
 
 def _times(numbers: Physical, factor: float) -> Physical:
     return Physical(*(float(number) * factor for number in numbers))
-
-
-def _left(rows: np.ndarray, residuals: np.ndarray) -> np.ndarray:
-    """Residuals after the exponent took its part, which is no noise."""
-    return residuals + rows @ np.linalg.lstsq(rows, -residuals, rcond=None)[0]

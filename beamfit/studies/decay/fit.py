@@ -79,6 +79,8 @@ class DecayFit:
         Whether the record contradicts a constant a; None where nothing decays.
     correlation_time : float or None
         Of the part of the errors that has one, s; None where they are independent.
+    inflation : float
+        By how much the memory of the noise enlarges the error of the loss rate, determined or not.
     lifetimes : LifetimeLaw or None
         The lifetime by current, where a constant a is refuted.
     change : Change or None
@@ -118,6 +120,7 @@ class DecayFit:
     identifiability: Separability
     constant_a: ConstantA | None = None
     correlation_time: float | None = None
+    inflation: float = 1.0
     lifetimes: LifetimeLaw | None = None
     change: Change | None = None
     outgassing: Outgassing | None = None

@@ -76,6 +76,12 @@ class Expansion(NamedTuple):
     rows: np.ndarray
     slopes: np.ndarray
 
+    @property
+    def left(self) -> np.ndarray:
+        """Residuals after all numbers, the exponent too, took their part, which is no noise."""
+        step = np.linalg.lstsq(self.rows, self.residuals, rcond=None)[0]
+        return self.residuals - self.rows @ step
+
     def moved(self, change: np.ndarray) -> Physical:
         """What a change of the readings, over their errors, does to the values by least squares;
         to an exponent beside the other numbers.

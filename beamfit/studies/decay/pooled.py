@@ -224,7 +224,7 @@ def stands_alone(cycle: DecayRecord, fit: DecayFit) -> bool:
     """Whether a cycle by itself would tell a from b, by the bend of its decay and the noise that
     all cycles show; where one law does not hold for all, that of its neighbouring readings.
     """
-    noise = fit.rms_residual * fit.identifiability.error_inflation
+    noise = fit.rms_residual * fit.inflation
     if fit.status is Status.poor_fit:
         noise = min(noise, OWN * noise_of(cycle.time, cycle.current))
     loss = cycle.span / HOUR / fit.lifetime_mean.value

@@ -74,7 +74,7 @@ def _root(decay: Decay, parts: np.ndarray) -> np.ndarray:
     else:
         pulls = fit.residuals / segment.error
         error = segment.error * max(1.0, np.sqrt(pulls @ pulls / fit.dof))
-    weight = 1 / (error * fit.identifiability.error_inflation)
+    weight = 1 / (error * fit.inflation)
     extra = (0, padded_size(rows) - rows)
     time, weight = np.pad(segment.time, extra, mode="edge"), np.pad(weight, extra)
     root = np.asarray(information_root(time, weight, fit.i0.value, parts, fit.mean_current))

@@ -90,8 +90,8 @@ def decay_rows(decays: Sequence[Decay]) -> Rows:
     return _laid_out(decays, CYCLES if together else RESULT)
 
 
-def _number(value: float | None, form: str) -> str:
-    return "-" if value is None else f"{value:{form}}"
+def _number(value: float | None, form: str, unit: str = "") -> str:
+    return "-" if value is None else f"{value:{form}}{unit}"
 
 
 def _share(decay: Decay) -> Quantity | None:
@@ -107,7 +107,10 @@ APART: tuple[Row, ...] = (
         "neighbouring residuals",
         lambda d: _number(d.fit.identifiability.residual_correlation, ".2f"),
     ),
-    ("errors enlarged for that", lambda d: f"{d.fit.identifiability.error_inflation:.1f} times"),
+    (
+        "errors enlarged for that",
+        lambda d: _number(d.fit.identifiability.error_inflation, ".1f", " times"),
+    ),
 )
 
 

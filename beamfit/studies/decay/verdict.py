@@ -281,10 +281,11 @@ def _correlated(e: Evidence) -> str | None:
     found, length = e.separability, e.correlation_time
     if length is None:
         return None
+    times = found.error_inflation
+    than = f": they are {times:.1f} times those of independent readings" if times else ""
     return (
         f"Neighbouring residuals are correlated ({found.residual_correlation:.2f}, over "
-        f"{length:.3g} s), which the errors contain: they are {found.error_inflation:.1f} times "
-        "those of independent readings"
+        f"{length:.3g} s), which the errors contain{than}"
     )
 
 
