@@ -9,10 +9,10 @@ from beamfit.greybox.correlated import (
     Noise,
     is_correlated,
     log_volume,
-    memory_of,
     whitened,
     whitened_of_both,
 )
+from beamfit.greybox.memory import memory_of
 from beamfit.greybox.problem import Free, Problem, Record
 from beamfit.greybox.solve import solve
 

@@ -10,7 +10,8 @@ from typing import Any, Self
 
 import numpy as np
 
-from beamfit.greybox.correlated import Memory, memory_of, remembers
+from beamfit.greybox.correlated import remembers
+from beamfit.greybox.memory import Memory, remembered
 from beamfit.lifetime.decay import HOUR
 from beamfit.quantity import Quantity
 from beamfit.shown import shown
@@ -267,11 +268,7 @@ class Evidence(Weighed):
 
     @classmethod
     def _independent(
-        cls,
-        record: DecayRecord,
-        solution: Solution,
-        shape: Shape | None,
-        changed: bool = False,
+        cls, record: DecayRecord, solution: Solution, shape: Shape | None, changed: bool = False
     ) -> Evidence:
         given, dof = record.error is not None, len(record) - NUMBERS
         squares = float(solution.sum_squares)
@@ -291,8 +288,8 @@ class Evidence(Weighed):
     ) -> Evidence:
         """Generalised least squares about the solution, the exponent free and held."""
         given = float(record.error is not None)
-        power = memory_of(found.rows, found.residuals, record.time).moments(found.slopes, given)
-        held = memory_of(found.rows[:, :NUMBERS], found.residuals, record.time)
+        seen = remembered(found.rows, found.residuals, record.time)
+        power, held = seen.memory().moments(found.slopes, given), seen.memory(NUMBERS)
         moved = held.moments(found.slopes[:, :NUMBERS], given)
         after = found.residuals + found.rows[:, :NUMBERS] @ held.mean_step
         # How far a drift gets in the end says nothing of the errors that were stated.

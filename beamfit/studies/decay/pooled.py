@@ -11,7 +11,8 @@ import numpy as np
 from scipy.special import fdtrc
 
 from beamfit.errors import InputError
-from beamfit.greybox.correlated import Memory, is_correlated, memory_of
+from beamfit.greybox.correlated import is_correlated
+from beamfit.greybox.memory import Memory, Whitened, remembered
 from beamfit.lifetime.decay import HOUR
 from beamfit.quantity import Quantity, Status
 from beamfit.studies.decay.departures import (
@@ -66,19 +67,19 @@ def _slopes(pool: Pool) -> tuple[Physical, np.ndarray]:
     return values, slopes
 
 
-def _memory(pool: Pool, numbers: int, known: float | None) -> Memory:
-    rows, time = pool.rows[:, :numbers], pool.cycles.time
-    return memory_of(rows, pool.residuals, time, pool.levels, known)
+def _whitened(pool: Pool, known: float | None) -> Whitened:
+    return remembered(pool.rows, pool.residuals, pool.cycles.time, pool.levels, known)
 
 
 @dataclass(frozen=True, eq=False)
 class PooledEvidence(Weighed):
-    """What the rules look at: a fit to cycles, and the memory of its noise, with that memory where
-    it is `known`; the rest is as of `Evidence`.
+    """What the rules look at: a fit to cycles, and the memory of its noise, the exponent `held` or
+    free in the `power` law, and 0 where it is `known` to be none; the rest is as of `Evidence`.
     """
 
     pool: Pool
     held: Memory
+    power: Memory
     known: float | None
     values: Physical
     errors: Physical
@@ -91,22 +92,22 @@ class PooledEvidence(Weighed):
         """Weigh a fit, with the noise's memory where it has one."""
         given, parameters = float(pool.cycles.error is not None), pool.level.size + 2
         known = None if is_correlated(pool.left[:, 3], parameters) else 0.0
-        held, plain = _memory(pool, 2, known), _memory(pool, 2, 0.0)
+        seen = _whitened(pool, known)
+        held, plain = seen.memory(2), _whitened(pool, 0.0).memory(2)
         values, slopes = _slopes(pool)
         moved = held.moments(slopes[:, :2], given)
         raw = np.linalg.norm(slopes[:, :2] @ plain.half[0], axis=1)
         raw = raw if given else raw * math.sqrt(plain.squares[0] / plain.dof)
         moved_values = Physical(*(np.array(values) + moved.shift))
         found = cls(
-            pool, held, known, moved_values, Physical(*moved.error), Physical(*raw),
+            pool, held, seen.memory(), known, moved_values, Physical(*moved.error), Physical(*raw),
             Physical(*moved.reach), constant_a(math.nan, math.inf, math.inf, math.nan),
         )  # fmt: skip
         return replace(found, constant_a=found.tested()) if found.separability.separable else found
 
     def tested(self) -> ConstantA:
         """Whether a constant a is refuted, by an exponent beside the other numbers."""
-        power = _memory(self.pool, 3, self.known)
-        moved = power.moments(np.eye(3)[2:], float(not self.noise_inferred))
+        moved = self.power.moments(np.eye(3)[2:], float(not self.noise_inferred))
         error = float(moved.error[0])
         return constant_a(float(moved.shift[0]), error, error, moved.chance[0])
 
@@ -214,7 +215,7 @@ class PooledEvidence(Weighed):
         x = np.geomspace(*self.currents, CURRENTS) / pool.mean
         rates, slopes = power_rates(pool.theta, pool.unit, x)
         slopes = np.vstack([slopes, np.eye(3)[2]])[:, :numbers]
-        memory = _memory(pool, numbers, self.known)
+        memory = _whitened(pool, self.known).memory(3) if refuted else self.held
         errors = memory.moments(slopes, float(not self.noise_inferred)).error
         exponent = Quantity(float(pool.theta[2]), float(errors[-1]) if refuted else None, "1")
         return LifetimeLaw.of(x * pool.mean, rates, errors[:-1], exponent)

@@ -16,10 +16,10 @@ from beamfit.greybox.correlated import (
     Noise,
     innovations,
     log_volume,
-    range_of,
     whitened,
     whitened_of_both,
 )
+from beamfit.greybox.memory import range_of
 from beamfit.greybox.posterior import Sampled, target_of
 from beamfit.greybox.problem import Free, Prior, Problem, Record
 from beamfit.greybox.stated import Optimum, Statement
@@ -77,7 +77,7 @@ def decay_target(
     Notes
     -----
     Errors that are correlated are so in the likelihood, and the correlation time is sampled too,
-    flat in its logarithm as in `beamfit.greybox.correlated.memory_of` but only up to the length of
+    flat in its logarithm as in `beamfit.greybox.memory.memory_of` but only up to the length of
     the record: in a longer memory i0 loses its hold, and a walk its way, for nothing of a and b.
 
     Where the record does not tell a from b, the two bounds a ≥ 0 and b ≥ 0 make the posterior a

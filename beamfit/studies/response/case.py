@@ -10,8 +10,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from beamfit.greybox.correlated import Memory, Noise, innovations, remembers
+from beamfit.greybox.correlated import Noise, innovations, remembers
 from beamfit.greybox.fit import Fit
+from beamfit.greybox.memory import Memory
 from beamfit.greybox.problem import Constraint, Free, Prior, Problem, Record
 from beamfit.greybox.solve import solve
 from beamfit.status import Status

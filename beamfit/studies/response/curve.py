@@ -10,8 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from beamfit.dynamics.response import ARX, FIRST_ORDER, SECOND_ORDER, Physics
-from beamfit.greybox.correlated import Memory
 from beamfit.greybox.fit import Derived, Fit
+from beamfit.greybox.memory import Memory
 from beamfit.quantity import Quantity
 from beamfit.statistics import POOR_FIT
 from beamfit.studies.response.checks import Checks

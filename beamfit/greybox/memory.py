@@ -1,0 +1,282 @@
+"""Which noise with a memory is likely: what rows say of it, and quantities averaged over that.
+
+The memory is not known either: each noise that is looked at whitens the rows once, and what is left
+of them says how likely it is and what the numbers are with it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import groupby
+from typing import NamedTuple
+
+import numpy as np
+from scipy.special import stdtr
+
+from beamfit.greybox.correlated import Levels, Noise, log_volume, white_beside, whitened
+from beamfit.greybox.covariance import CUT
+
+# Correlation times looked at: from this share of the usual interval to so many times the record.
+SHORTEST, LONGEST, TIMES = 0.3, 5.0, 40
+# Variances of a part without memory that are looked at beside, in those that the part with a
+# memory gets anew from one reading to the next; correlation times are fewer then.
+WHITE, FEWER = (0.0, 1.0, 10.0, 100.0, 1000.0), 20
+
+
+class Moments(NamedTuple):
+    """Quantities that are linear in the numbers: how far each moves from where the rows were
+    taken, its error (68 % lie within), the reach within which 95 % lie, and the chance of a
+    larger distance from zero movement if that is the truth.
+    """
+
+    shift: np.ndarray
+    error: np.ndarray
+    reach: np.ndarray
+    chance: np.ndarray
+
+
+class Memory(NamedTuple):
+    """What rows of slopes and residuals say of the noise.
+
+    Attributes
+    ----------
+    weight : array, shape (g,)
+        Probability of each noise.
+    time, white : array, shape (g,)
+        The correlation times, and the shares of variance without memory.
+    step : array, shape (g, p)
+        Generalised least-squares step of the numbers at each.
+    half : array, shape (g, p, p)
+        half @ half.T is the covariance of the numbers for errors of size 1.
+    squares : array, shape (g,)
+        Sum of squares of the whitened residuals after the step.
+    dof : int
+        Values less numbers.
+    """
+
+    weight: np.ndarray
+    time: np.ndarray
+    white: np.ndarray
+    step: np.ndarray
+    half: np.ndarray
+    squares: np.ndarray
+    dof: int
+
+    @property
+    def likely(self) -> int:
+        """Index of the median correlation time, and of the share that is likeliest with it."""
+        median = self.time[np.searchsorted(np.cumsum(self.weight), 0.5)]
+        return int(np.argmax(np.where(self.time == median, self.weight, -1.0)))
+
+    @property
+    def noise(self) -> Noise:
+        """That."""
+        return Noise(float(self.time[self.likely]), float(self.white[self.likely]))
+
+    @property
+    def mean_step(self) -> np.ndarray:
+        """The step, averaged over noises."""
+        return self.weight @ self.step
+
+    def moments(self, slopes: np.ndarray, least: float = 0.0) -> Moments:
+        """Quantities by their slopes, shape (q, p), averaged over noises.
+
+        `least` is the least size of the errors: 1 where they were given and rows are in their
+        unit.
+        """
+        centre = self.step @ slopes.T
+        size = np.maximum(np.sqrt(self.squares / self.dof), least)
+        spread = np.linalg.norm(np.einsum("qp,gpr->gqr", slopes, self.half), axis=2)
+        spread = np.maximum(spread * size[:, None], 1e-300)
+        shift = self.weight @ centre
+
+        def within(reach: np.ndarray) -> np.ndarray:
+            ends = [(shift + sign * reach - centre) / spread for sign in (1, -1)]
+            return self.weight @ (stdtr(self.dof, ends[0]) - stdtr(self.dof, ends[1]))
+
+        reaches = [_inverted(within, np.max(np.abs(centre - shift) + spread, 0), p)
+                   for p in (0.6827, 0.95)]  # fmt: skip
+        chance = self.weight @ (2 * stdtr(self.dof, -np.abs(centre) / spread))
+        return Moments(shift, *reaches, chance)
+
+
+def _inverted(within, scale: np.ndarray, probability: float) -> np.ndarray:
+    """By bisection: the reach within which so much lies."""
+    low, high = np.zeros_like(scale), 100.0 * scale
+    for _ in range(50):
+        middle = 0.5 * (low + high)
+        less = within(middle) < probability
+        low, high = np.where(less, middle, low), np.where(less, high, middle)
+    return 0.5 * (low + high)
+
+
+class Whitened(NamedTuple):
+    """Slopes and, last, residuals, whitened by each noise that is looked at.
+
+    Attributes
+    ----------
+    noise : Noise of array, shape (g,)
+        What is looked at.
+    triangle : array, shape (g, m, p + 1)
+        With the same sums of squares and products as the whitened rows.
+    volume : array, shape (g,)
+        Logarithm of the normalisation of the noise's density.
+    count : int
+        Values, less what was eliminated.
+    """
+
+    noise: Noise
+    triangle: np.ndarray
+    volume: np.ndarray
+    count: int
+
+    def memory(self, numbers: int | None = None) -> Memory:
+        """What the rows say of the noise, the first `numbers` being free and others held.
+
+        Directions that the rows do not see, by a share of `CUT`, are left where they are.
+        """
+        slopes, rest = self.triangle[..., :-1][..., :numbers], self.triangle[..., -1:]
+        length = np.linalg.norm(slopes, axis=1)
+        unit = 1.0 / np.where(length > 0, length, 1.0)
+        left, sizes, turned = np.linalg.svd(slopes * unit[:, None], full_matrices=False)
+        seen = sizes > CUT * sizes[:, :1]
+        inverse = np.where(seen, 1.0 / np.where(seen, sizes, 1.0), 0.0)
+        half = unit[..., None] * np.swapaxes(turned, 1, 2) * inverse[:, None]
+        along = np.where(seen[..., None], np.swapaxes(left, 1, 2) @ rest, 0.0)
+        squares = np.maximum(np.sum((rest - left @ along) ** 2, axis=(1, 2)), 1e-300)
+        logs = self.volume + np.sum(np.log(np.where(seen, unit * inverse, 1.0)), axis=1)
+        logs -= 0.5 * (self.count - seen.sum(axis=1)) * np.log(squares)
+        weight = np.exp(logs - logs.max())
+        alone = self.noise.white == 0
+        if not alone.all():  # even odds for a white part
+            weight *= np.where(alone, alone.size / alone.sum() - 1.0, 1.0)
+        dof = self.count - slopes.shape[2]
+        step = -(half @ along)[..., 0]
+        return Memory(weight / weight.sum(), *self.noise, step, half, squares, dof)
+
+
+def whitened_by_each(
+    grid: Sequence[Noise],
+    runs: Sequence[tuple[np.ndarray, np.ndarray]],
+    known: np.ndarray | None = None,
+    levels: Levels | None = None,
+) -> Whitened:
+    """Whiten runs, each of rows and times, by each noise; all of them have the same.
+
+    `known` are rows of priors, in units of the noise; `levels` are eliminated, of a single run.
+    """
+    parts = [_triangles(grid, rows, np.diff(time), levels) for rows, time in runs]
+    triangles, volume = [triangle for triangle, _ in parts], sum(volume for _, volume in parts)
+    count = sum(len(rows) for rows, _ in runs)
+    count -= 0 if levels is None else levels.first.size
+    if known is not None:
+        triangles, count = [*triangles, np.tile(known, (len(grid), 1, 1))], count + len(known)
+    return Whitened(Noise(*np.array(grid).T), np.concatenate(triangles, axis=1), volume, count)
+
+
+def _triangles(
+    grid: Sequence[Noise], rows: np.ndarray, interval: np.ndarray, levels: Levels | None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Of one run, and the volumes; what depends on the correlation time alone is done once."""
+    triangles, volumes = [], []
+    for time, alike in groupby(grid, key=lambda noise: noise.time):
+        with np.errstate(divide="ignore"):
+            apart = interval / time
+        begun, volume = whitened(rows, apart, np), float(log_volume(apart, np))
+        for noise in alike:
+            row, beside = white_beside(begun, apart, noise.white) if noise.white else (begun, 0.0)
+            if levels is not None:
+                row, lost = levels.left(row, apart)
+                beside -= lost
+            triangles.append(np.linalg.qr(row, mode="r"))
+            volumes.append(volume + beside)
+    return np.array(triangles), np.array(volumes)
+
+
+def range_of(time: np.ndarray) -> tuple[float, float]:
+    """Correlation times that readings at these times can tell from none and from a random walk."""
+    usual = float(np.median(np.diff(time)))
+    return SHORTEST * usual, LONGEST * float(time[-1] - time[0])
+
+
+def noises(
+    ends: tuple[float, float], usual: float, count: int, ratios: Sequence[float] = (0.0,)
+) -> list[Noise]:
+    """Noises that are looked at: correlation times between two, and with each the ratios of the
+    white variance to what the part with a memory gets anew in a usual interval.
+
+    Examples
+    --------
+    >>> noises((1.0, 4.0), 1.0, 3)
+    [Noise(time=1.0, white=0.0), Noise(time=2.0, white=0.0), Noise(time=4.0, white=0.0)]
+    """
+    return [
+        Noise(float(each), float(ratio / (ratio + 1.0 / -np.expm1(-2.0 * usual / each))))
+        for each in np.geomspace(*ends, count)
+        for ratio in ratios
+    ]
+
+
+def remembered(
+    slopes: np.ndarray,
+    residuals: np.ndarray,
+    time: np.ndarray,
+    levels: Levels | None = None,
+    known: float | None = None,
+) -> Whitened:
+    """Rows of one record whitened by what its noise may be, as of `memory_of`."""
+    looked_at = (FEWER, WHITE) if levels is None else (TIMES,)
+    usual = float(np.median(np.diff(time)))
+    grid = noises(range_of(time), usual, *looked_at) if known is None else [Noise(known)]
+    return whitened_by_each(grid, [(np.column_stack([slopes, residuals]), time)], levels=levels)
+
+
+def memory_of(
+    slopes: np.ndarray,
+    residuals: np.ndarray,
+    time: np.ndarray,
+    levels: Levels | None = None,
+    known: float | None = None,
+) -> Memory:
+    """Least squares with correlated errors, averaged over what the residuals leave open of them.
+
+    Parameters
+    ----------
+    slopes : array, shape (n, p)
+        Derivatives of the residuals by the numbers, in units of the errors.
+    residuals : array, shape (n,)
+        Model less reading, in the same units.
+    time : array, shape (n,)
+        When each was taken, increasing.
+    levels : Levels, optional
+        Further numbers, one a block, that are eliminated.
+    known : float, optional
+        The correlation time; 0 for independent errors. Otherwise it is averaged over.
+
+    Returns
+    -------
+    Memory
+
+    Notes
+    -----
+    At each correlation time generalised least squares; its probability is the density of the
+    residuals integrated over the numbers (flat) and over the size of the errors (flat in its
+    logarithm): the restricted likelihood of D. A. Harville, Biometrika 61 (1974) 383, which the
+    fitted numbers do not bias, times a prior flat in the logarithm of the correlation time, from
+    0.3 usual intervals to five times the record. Without levels a part of the noise may be white: a
+    monitor that drifts, read by a noisy converter, would pass for a short memory otherwise, and its
+    errors come out several times too small; the ratio of both is averaged over, too, at even odds
+    that there is one. Near the upper end the errors are a random walk: nothing tells its level, but
+    slope and bend the rows do tell.
+
+    Examples
+    --------
+    >>> noise = np.random.default_rng(3).normal(size=300)
+    >>> walk = np.zeros(300)
+    >>> for k in range(1, 300):
+    ...     walk[k] = 0.8 * walk[k - 1] + 0.6 * noise[k]
+    >>> found = memory_of(np.ones((300, 1)), walk - 5.0, np.arange(300.0))
+    >>> print(f"{found.mean_step[0]:.1f}, {np.exp(-1 / found.time[found.likely]):.1f}")
+    4.9, 0.8
+    """
+    return remembered(slopes, residuals, time, levels, known).memory()
