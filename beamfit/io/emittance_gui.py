@@ -15,7 +15,7 @@ import numpy as np
 from beamfit.errors import InputError, nearest
 from beamfit.io.files import digest, laid_out, name_of
 from beamfit.io.lattice import LatticeFile
-from beamfit.io.matlab import read_variable
+from beamfit.io.matlab import read_variable, read_vectors
 from beamfit.io.shots import scatter_of
 from beamfit.quantity import Quantity
 from beamfit.studies.scan.scans import Profile, QuadScan
@@ -26,6 +26,7 @@ USUAL_ENERGY = 0.135
 USUAL_METHOD = "RMS"
 # Where the sizes stand in `stats`, µm.
 SIZE = {"x": 2, "y": 3}
+MATLAB, VARIABLE = ".mat", "data"
 EXPECTED = "a file saved by emittance_gui"
 
 
@@ -64,8 +65,8 @@ class EmittanceGuiFile:
 
 
 def is_emittance_gui(path: str | PathLike[str]) -> bool:
-    """Whether a file is one by its name."""
-    return Path(path).suffix.lower() == ".mat"
+    """Whether a file is one: of MATLAB by its name, and no table of vectors."""
+    return Path(path).suffix.lower() == MATLAB and not read_vectors(path, VARIABLE)
 
 
 def read_emittance_gui(path: str | PathLike[str]) -> EmittanceGuiFile:
@@ -93,7 +94,7 @@ def read_emittance_gui(path: str | PathLike[str]) -> EmittanceGuiFile:
     Traceback (most recent call last):
     beamfit.errors.InputError: orbit.csv: no such file; expected a readable file
     """
-    source = _Fields(path, read_variable(path, "data"))
+    source = _Fields(path, read_variable(path, VARIABLE))
     with laid_out(path, "a struct 'data' that is laid out otherwise", EXPECTED, named=True):
         return _read(source)
 

@@ -78,7 +78,7 @@ def spelled(header: str) -> str:
     if (found := BRACKETS.fullmatch(header)) and found[1]:
         name, unit = found[1], next(part for part in found.groups()[1:] if part is not None)
         if (known := known_unit(unit)) is not None:
-            return re.sub(r"\s+", "_", f"{name.strip()}_{known}")
+            return re.sub(r"\s+", "_", f"{name.strip().removesuffix(f'_{known}')}_{known}")
     if header.endswith(ENDS):
         return header
     for unit, known in ALSO.items():

@@ -10,6 +10,7 @@ import math
 import struct
 import zlib
 from collections.abc import Iterator
+from contextlib import contextmanager
 from os import PathLike
 from typing import NamedTuple
 
@@ -84,16 +85,56 @@ def read_variable(path: str | PathLike[str], name: str) -> np.ndarray:
     >>> float(read_variable(file, "data")["energy"][0, 0][0, 0])
     0.135
     """
-    content = read_bytes(path, LARGEST, SAVE)
-    _check_version(content, path)
-    try:
-        found = _variable(content, name)
-    except (_Damaged, struct.error, zlib.error, ValueError, OverflowError, MemoryError) as error:
-        raise InputError(f"a damaged MATLAB file ({error})"[:120], SAVE, path) from None
-    if found is None:
-        expected = f"a struct '{name}' of emittance_gui; other variables as CSV, by writetable"
-        raise InputError(f"no variable '{name}'", expected, path)
+    with _whole(path):
+        for reader, element in _variables(path):
+            if reader.name(element) == name.encode():
+                return reader.value(element)
+    expected = f"a struct '{name}' of emittance_gui, or vectors Q2_A, size_x_um, one a column"
+    raise InputError(f"no variable '{name}'", expected, path)
+
+
+def read_vectors(path: str | PathLike[str], without: str = "") -> dict[str, np.ndarray]:
+    """Read the variables of a MATLAB file that are vectors of numbers, of two or more each.
+
+    Parameters
+    ----------
+    path : str or path
+        As of `read_variable`.
+    without : str
+        A variable beside which there are none.
+
+    Returns
+    -------
+    dict of str to ndarray
+        By name; empty if there is the other variable.
+
+    Raises
+    ------
+    InputError
+        As `read_variable`.
+    """
+    found = {}
+    with _whole(path):
+        for reader, element in _variables(path):
+            name = reader.name(element)
+            if name and name == without.encode():
+                return {}
+            if reader.kind(element) in NUMBERS:
+                value = reader.value(element)
+                if value.size == max(value.shape, default=0) > 1:
+                    found[name.decode("ascii", "replace")] = value.ravel().astype(float)
     return found
+
+
+@contextmanager
+def _whole(path: str | PathLike[str]) -> Iterator[None]:
+    """Refuse a file that claims what cannot be."""
+    try:
+        yield
+    except (_Damaged, struct.error, zlib.error, ValueError, OverflowError, MemoryError) as error:
+        if isinstance(error, InputError):
+            raise
+        raise InputError(f"a damaged MATLAB file ({error})"[:120], SAVE, path) from None
 
 
 def _check_version(content: bytes, path: str | PathLike[str]) -> None:
@@ -103,8 +144,10 @@ def _check_version(content: bytes, path: str | PathLike[str]) -> None:
         raise InputError("no MATLAB file of version 5 to 7", SAVE, path)
 
 
-def _variable(content: bytes, name: str) -> np.ndarray | None:
-    """The value of a variable; None if there is none."""
+def _variables(path: str | PathLike[str]) -> Iterator[tuple[_Reader, _Element]]:
+    """The variables of a file, one after the other, and what reads each."""
+    content = read_bytes(path, LARGEST, SAVE)
+    _check_version(content, path)
     order = "<" if content[126:128] == b"IM" else ">"
     start, left = HEADER, UNPACKED
     while start + 8 <= len(content):
@@ -116,10 +159,7 @@ def _variable(content: bytes, name: str) -> np.ndarray | None:
             left -= len(buffer)
             element = _element(buffer, 0, len(buffer), order)
         if element.kind == MATRIX:
-            reader = _Reader(buffer, order)
-            if reader.name(element) == name.encode():
-                return reader.value(element)
-    return None
+            yield _Reader(buffer, order), element
 
 
 def _unpacked(packed: bytes, most: int) -> bytes:
@@ -170,6 +210,11 @@ class _Reader:
         if name is None:
             raise _Damaged("an array without a name")
         return self.buffer[name.start : name.end]
+
+    def kind(self, matrix: _Element) -> int | None:
+        """The class of an array; None of an empty one, and of complex numbers."""
+        flags = next(map(self.integers, self.parts(matrix)), ())
+        return None if not flags or flags[0] & COMPLEX else flags[0] & 0xFF
 
     def value(self, matrix: _Element, depth: int = 0) -> np.ndarray:
         """The array of an element."""

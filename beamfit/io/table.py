@@ -1,4 +1,4 @@
-"""Sheets of named columns from CSV, TFS and HDF5 files, and data frames."""
+"""Sheets of named columns from text, HDF5 and MATLAB files, and data frames."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from beamfit.errors import InputError
+from beamfit.io import labview, sdds
 from beamfit.io.cell_units import without_units
 from beamfit.io.commas import with_points
 from beamfit.io.files import digest, text_lines
@@ -28,6 +29,7 @@ from beamfit.io.headers import (
     with_units,
 )
 from beamfit.io.json_table import json_sheet
+from beamfit.io.matlab import read_vectors
 from beamfit.io.numeric import check_length, numeric_rows
 from beamfit.io.sheet import Sheet
 
@@ -37,6 +39,9 @@ if TYPE_CHECKING:
 # Rows of a file, and cells of one that is not all plain numbers: each is a text, 200 bytes.
 MOST_ROWS, MOST_WORDS = 12_000_000, 4_000_000
 HDF5 = {".h5", ".hdf5"}
+BINARY = {*HDF5, ".mat"}
+# Text with a header of another program's, by how it begins.
+FOREIGN = {sdds.SIGNATURE: sdds.sdds_head, labview.SIGNATURE: labview.labview_head}
 # How Excel says which separator a file has.
 SEPARATOR_LINE = re.compile(r"\s*\"?sep=.\"?\s*$", re.IGNORECASE)
 TFS_LINES = ("@", "$")
@@ -51,14 +56,14 @@ def read_sheet(
     ragged: bool = False,
     names: Sequence[str] | None = None,
 ) -> Sheet:
-    """Read the columns of a CSV, TFS or HDF5 file.
+    """Read the columns of a CSV, TFS, SDDS, LabVIEW, HDF5 or MATLAB file.
 
     Parameters
     ----------
     path : str, path or pandas.DataFrame
         A frame with such columns, or the file; HDF5 if its name ends in .h5 or .hdf5, with one
-        dataset a column. Columns of text are separated by commas, semicolons, tabs or blanks: the
-        header tells.
+        dataset a column; MATLAB if it ends in .mat, with one vector a column. Columns of text are
+        separated by commas, semicolons, tabs or blanks: the header tells.
     example : str
         A header such as the file should have, for messages.
     most : int
@@ -91,8 +96,8 @@ def read_sheet(
     """
     if hasattr(path, "itertuples"):
         return _of_frame(path, most)
-    if (suffix := Path(path).suffix.lower()) in HDF5:
-        return _read_hdf5(path, most)
+    if (suffix := Path(path).suffix.lower()) in BINARY:
+        return _binary(path, suffix, most)
     if suffix == ".json":
         sheet = json_sheet(path)
         check_length(len(sheet), most, path)
@@ -146,7 +151,13 @@ def _head(
     path: str | PathLike[str], example: str, comments: list[str]
 ) -> tuple[list[str], int, str, Iterator[tuple[int, str]]]:
     """Names of the columns, their line, what separates them, and the lines below, numbered."""
-    source = map(unframed, text_lines(path))
+    raw = text_lines(path)
+    first = next(raw, "")
+    whole = itertools.chain([first], raw)
+    for signature, read in FOREIGN.items():
+        if first.startswith(signature):
+            return read(path, enumerate(whole, start=1), comments)
+    source = map(unframed, whole)
     head = uncommented(list(itertools.islice(source, HEAD)))
     title, numbered = header_at(head), enumerate(itertools.chain(head, source), start=1)
     for line, text in numbered:
@@ -189,10 +200,8 @@ def _without_blanks(cells: list[str], least: int) -> list[str]:
 
 
 def header_of(path: str | PathLike[str]) -> list[str]:
-    """The header of a file of text, as `read_sheet` finds it; none of an empty one."""
-    head = uncommented([unframed(text) for text in itertools.islice(text_lines(path), HEAD)])
-    at = header_at(head)
-    return [spelled(name) for name in _cells(path, head[at], at + 1)]
+    """The header of a file of text, as `read_sheet` finds it."""
+    return [spelled(name) for name in _head(path, "Q2_A,size_x_um", [])[0]]
 
 
 def _cells(path: str | PathLike[str], text: str, line: int = 1) -> list[str]:
@@ -237,8 +246,13 @@ def _check_header(names: list[str], example: str, path: str | PathLike[str], lin
         raise InputError("numbers where the header should be", expected, path=path, line=line)
 
 
-def _read_hdf5(path: str | PathLike[str], most: int) -> Sheet:
-    columns, comments = hdf5_columns(path, most, min(most, MOST_WORDS))
+def _binary(path: str | PathLike[str], suffix: str, most: int) -> Sheet:
+    """The datasets of an HDF5 file, or the vectors of a MATLAB file."""
+    comments: tuple[str, ...] = ()
+    if suffix in HDF5:
+        columns, comments = hdf5_columns(path, most, min(most, MOST_WORDS))
+    else:
+        columns = read_vectors(path)
     if not columns:
         expected = "one dataset a column, at the top of the file"
         raise InputError("no datasets", expected, path=path)

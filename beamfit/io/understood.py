@@ -22,7 +22,7 @@ from beamfit.io.record_columns import is_current
 from beamfit.io.ring import read_ring
 from beamfit.io.run import read_run
 from beamfit.io.scan_columns import is_size
-from beamfit.io.table import HDF5, header_of
+from beamfit.io.table import BINARY, header_of
 from beamfit.io.toml import read_toml
 from beamfit.studies.scan.scans import QuadScan
 from beamfit.table import Table
@@ -159,12 +159,10 @@ def _kind(path: str | PathLike[str]) -> str:
         return "ring" if "ring" in tables and "element" not in tables else "lattice"
     if suffix in (".bf", ".xml"):
         return "formulation"
-    if suffix in {*HDF5, ".json"}:
-        names = archive_sheet(path, False).names
-    elif is_emittance_gui(path):
+    if is_emittance_gui(path):
         return "scan"
-    else:
-        names = header_of(path)
+    tabled = suffix in {*BINARY, ".json"}
+    names = archive_sheet(path, False).names if tabled else header_of(path)
     head = ",".join(names)
     if re.search(r"\bbeta_x_m\b|\bBETX\b", head):
         found = "the optics of a ring"

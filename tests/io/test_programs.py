@@ -1,0 +1,150 @@
+"""Files of other programs, each on the one reader of columns: SDDS, LabVIEW, vectors of MATLAB."""
+
+import random
+
+import numpy as np
+import pytest
+import scipy.io
+
+from beamfit.errors import InputError
+from beamfit.io.decay_record import read_decay_record
+from beamfit.io.measurement import read_quad_scan
+from beamfit.io.table import read_sheet
+from beamfit.io.understood import understand
+from tests.io.test_mutated_files import mutated
+
+ROWS = [(-4.2, 111.4, 1.1), (-3.2, 63.4, 0.3), (-2.6, 53.6, 0.3), (-2.1, 56.7, 0.5)]
+PAGE = "".join(f"{q} {x} {e} OTR2\n" for q, x, e in ROWS)
+SDDS = f"""SDDS1
+!# little-endian
+&description text="a \\"scan\\" of Q525", contents="a & b" &end
+&parameter name=Energy, units=MeV, type=double, &end
+&parameter name=By, type=string, fixed_value="me, at noon" &end
+&column name=Q525, units=kG, type=double,
+   description="integrated gradient" &end
+&column name=size_x, units=um, symbol="$gs$r$bx$n", type=double &end
+&column name=size_x_error_um, units=um, type=double &end &column name=screen, type=string &end
+&data mode=ascii, no_row_counts=0 &end
+! page 1
+135.0
+4
+{PAGE}"""
+LVM = """LabVIEW Measurement
+Writer_Version\t2
+Separator\tTab
+Decimal_Separator\t.
+Multi_Headings\tNo
+X_Columns\tOne
+Date\t2024/03/01
+***End_of_Header***\t
+\t
+Channels\t2\t\t
+Y_Unit_Label\tmA\tVolts\t
+X_Dimension\tTime\tTime\t
+***End_of_Header***\t\t\t
+X_Value\tDCCT\tnote\tComment
+0.000000\t201.500000\t1\t
+60.000000\t201.400000\t1
+120.000000\t201.300000\t1
+"""
+
+
+def read(path, content, reader=read_quad_scan):
+    path.write_text(content, newline="")
+    return reader(path)
+
+
+def of_lines(path, content):
+    return read(path, content, lambda file: read_decay_record(file, ignore=["note"]))
+
+
+@pytest.mark.parametrize("uncounted", [False, True])
+@pytest.mark.parametrize("end", ["\n", "\r\n"])
+def test_sdds(uncounted, end, tmp_path):
+    text = SDDS.replace("\n4\n", "\n").replace("counts=0", "counts=1") if uncounted else SDDS
+    scan = read(tmp_path / "a.sdds", text.replace("\n", end))
+    assert scan.units == {"Q525": "kG"}
+    np.testing.assert_allclose(scan.settings["Q525"], [q for q, _, _ in ROWS])
+    np.testing.assert_allclose(scan.size["x"], [1e-6 * x for _, x, _ in ROWS])
+    np.testing.assert_allclose(scan.error["x"], [1e-6 * e for _, _, e in ROWS])
+    assert scan.screen == ("OTR2",) * 4
+    assert scan.provenance == ("Energy: 135.0 MeV", "By: me, at noon")
+    assert understand(tmp_path / "a.sdds").kind == "scan"
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("mode=ascii", "mode=binary", r"a\.sdds:10: a binary SDDS file.*sddsconvert -ascii"),
+        ("&column name=Q", "&array name=z &end &column name=Q", r":6: an SDDS file with &array"),
+        ("no_row_counts=0", "lines_per_row=2", ":10: .*sdds2spreadsheet"),
+        ("\n4\n", "\n5\n", "4 rows; expected 5, as the page says"),
+        ("\n4\n", "\n3\n", ":17: a second page; expected one; sddscombine -merge"),
+        ("\n4\n", "\nfour\n", ":13: 'four'; expected how many rows"),
+        ("53.6", "x", ":16: column 'size_x .um.': 'x'"),
+        ("53.6 0.3", "53.6", ":16: 3 cells; expected 4"),
+        ("&data", "&dat", "without &data"),
+    ],
+)
+def test_sdds_that_is_no_table(old, new, words, tmp_path):
+    with pytest.raises(InputError, match=words):
+        read(tmp_path / "a.sdds", SDDS.replace(old, new))
+
+
+@pytest.mark.parametrize(
+    ("old", "new"), [("\t", "\t"), (".", ","), ("Separator\tTab", "Separator\tComma")]
+)
+def test_labview(old, new, tmp_path):
+    text = LVM.replace(old, new)
+    record = of_lines(tmp_path / "a.lvm", text.replace("\t", ",") if "Comma" in new else text)
+    assert record.time.tolist() == [0, 60, 120]
+    assert record.current.tolist() == [201.5, 201.4, 201.3]
+    assert "Date: 2024/03/01" in record.comments
+    assert understand(tmp_path / "a.lvm", ignore=["note"]).kind == "record"
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("X_Columns\tOne", "X_Columns\tNo", r"a\.lvm:14: X_Columns.*One column only"),
+        ("***End_of_Header***\t\t\t", "", "a LabVIEW header that does not end"),
+        ("201.4", "Inf", ":16: column 'DCCT .mA.': 'Inf"),
+    ],
+)
+def test_labview_that_is_no_table(old, new, words, tmp_path):
+    with pytest.raises(InputError, match=words):
+        of_lines(tmp_path / "a.lvm", LVM.replace(old, new))
+
+
+def test_vectors_of_matlab(tmp_path):
+    q, x, e = np.transpose(ROWS)
+    path, columns = tmp_path / "a.mat", {"Q525_kG": q, "size_x_um": x, "size_x_error_um": e}
+    for orient in ("row", "column"):
+        more = {"operator": "me", "energy": 135.0, "image": np.eye(3), "note": {"a": 1}}
+        scipy.io.savemat(path, columns | more, oned_as=orient, do_compression=orient == "row")
+        scan = read_quad_scan(path)
+        np.testing.assert_array_equal(scan.settings["Q525"], q)
+        np.testing.assert_allclose(scan.error["x"], 1e-6 * e)
+        assert understand(path).kind == "scan"
+    scipy.io.savemat(path, {"time_s": np.arange(4), "beam_current_mA": 200.0 - np.arange(4)})
+    assert read_decay_record(path).current.tolist() == [200, 199, 198, 197]
+    assert understand(path).kind == "record"
+    scipy.io.savemat(path, columns | {"size_x_um": x[1:]})
+    with pytest.raises(InputError, match="column 'size_x_um': 3 readings; expected 4"):
+        read_quad_scan(path)
+    scipy.io.savemat(path, {"energy": 135.0})
+    with pytest.raises(InputError, match="vectors Q2_A, size_x_um"):
+        read_quad_scan(path)
+
+
+@pytest.mark.parametrize("content", [SDDS, LVM], ids=["SDDS", "LabVIEW"])
+def test_damaged_files_are_read_or_refused_in_one_line(content, tmp_path):
+    rng, refused, path = random.Random(6), [], tmp_path / "a.txt"
+    for _ in range(300):
+        path.write_bytes(mutated(content.encode(), rng))
+        try:
+            read_sheet(path, "Q2_A,size_x_um")
+        except InputError as error:
+            refused.append(str(error))
+    assert 30 < len(refused) < 300
+    assert not any("\n" in said for said in refused)
