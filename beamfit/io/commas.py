@@ -7,7 +7,8 @@ from collections.abc import Sequence
 
 from beamfit.io.headers import is_number
 
-COMMA = re.compile(r"[-+]?\d+,\d+([eE][-+]?\d+)?")
+COMMA = re.compile(r"[-+]?(\d+|\d{1,3}(?:[.'’\xa0\u202f]\d{3})+),\d+([eEdD][-+]?\d+)?")
+POINTS = str.maketrans({",": "."} | dict.fromkeys(".'’\xa0\u202f"))
 # What could also be thousands; a spreadsheet puts semicolons between cells only where the comma is
 # the decimal one, but tabs everywhere.
 THOUSANDS = re.compile(r"[-+]?[1-9]\d{0,2},\d{3}")
@@ -45,7 +46,7 @@ def with_points(
     unclear = separator == "\t" and all(map(THOUSANDS.fullmatch, commas))
     if len(commas) < FEWEST or points or unclear:
         return rows, ()
-    changed = [[c.replace(",", ".") if COMMA.fullmatch(c) else c for c in row] for row in rows]
+    changed = [[c.translate(POINTS) if COMMA.fullmatch(c) else c for c in row] for row in rows]
     return changed, (
-        f"Numbers have a decimal comma: '{commas[0]}' is {commas[0].replace(',', '.')}.",
+        f"Numbers have a decimal comma: '{commas[0]}' is {commas[0].translate(POINTS)}.",
     )

@@ -35,6 +35,10 @@ ALSO |= {"KG": "kG", "kg": "kG", "T_PER_M": "T_per_m", "K1": "k1", "K1L": "k1l",
 ALSO |= {"mev": "MeV", "ma": "mA", "pa": "Pa", "PA": "Pa", "torr": "Torr", "TORR": "Torr"}
 # A number and what stands behind it.
 NUMBER = re.compile(r"([-+]?(?:\d+[.,]?\d*|[.,]\d+)(?:[eE][-+]?\d+)?)\s*([^\W\d_].*|[%\[(].*)")
+# Thousands with something between them that can be nothing else, and an exponent of Fortran.
+GROUPED = re.compile(r"[-+]?\d{1,3}(?:(?:,\d{3})+\.\d*|(?:['’\xa0\u202f]\d{3})+(?:\.\d*)?)")
+BETWEEN = dict.fromkeys(map(ord, ",'’\xa0\u202f"))
+FORTRAN = re.compile(r"([\d.])[dD]([-+]?\d+)$")
 # A name, and its unit in brackets or behind a stroke between blanks.
 BRACKETS = re.compile(r"(.*?)[\s_]*(?:\[(.*?)\]|\((.*?)\)|\s/\s+(\S+))\s*")
 # Lines that are looked through for the header below a title.
@@ -91,6 +95,12 @@ def spelled(header: str) -> str:
 def unit_at_end(name: str) -> str | None:
     """The unit that a name as `spelled` ends with; None if it has none."""
     return max((u for u in KNOWN if name.endswith(f"_{u}")), key=len, default=None)
+
+
+def is_header(cells: Sequence[str]) -> bool:
+    """Whether some cells are names of columns: two or more with units, and no number among them."""
+    values = any(is_number(cell) or unit_behind(cell) for cell in cells)
+    return not values and sum(map(_has_unit, cells)) > 1
 
 
 def _has_unit(header: str) -> bool:
@@ -160,12 +170,15 @@ def header_at(lines: Sequence[str]) -> int:
         if _is_aside(text):
             continue
         cells = _words(text)
-        numbers = any(is_number(cell) or unit_behind(cell) for cell in cells)
-        if not numbers and sum(map(_has_unit, cells)) > 1:
+        if is_header(cells):
             return i
         if first is None:
             first = i
-        elif numbers and _is_value(cells[0]) and len(cells) == len(_words(lines[first])):
+        elif (
+            any(map(is_number, cells))
+            and is_value(cells[0])
+            and len(cells) == len(_words(lines[first]))
+        ):
             break
     if first is None or _has_rows(lines, first):
         return first or 0
@@ -177,7 +190,7 @@ def _is_aside(text: str) -> bool:
     return not text.strip(",;\t ") or text.lstrip().startswith(MARKS + TFS)
 
 
-def _is_value(cell: str) -> bool:
+def is_value(cell: str) -> bool:
     """Whether a cell may be a number or a date."""
     return cell.lstrip("+-.")[:1].isdigit()
 
@@ -188,8 +201,8 @@ def _has_rows(lines: Sequence[str], i: int) -> bool:
     rows = [_words(text) for text in lines[i + 1 :] if not _is_aside(text)][:3]
     if rows and len(rows[0]) == len(cells) and with_units(cells, rows[0]):
         del rows[0]
-    alike = rows and all(len(row) == len(cells) and _is_value(row[0]) for row in rows[:2])
-    words = not _is_aside(lines[i]) and not any(map(_is_value, cells))
+    alike = rows and all(len(row) == len(cells) and is_value(row[0]) for row in rows[:2])
+    words = not _is_aside(lines[i]) and not any(map(is_value, cells))
     return bool(alike) and len(cells) > 1 and words
 
 
@@ -208,10 +221,10 @@ def uncommented(lines: Sequence[str]) -> list[str]:
     if above.startswith(MARKS):
         said = bare(above)
         cells, words = _words(found[first]), _words(said)
-        values = len(words) == len(cells) and all(map(_is_value, cells))
+        values = len(words) == len(cells) and all(map(is_value, cells))
         # Words between blanks may be a sentence.
         named = any(map(_has_unit, words)) or separator_of(said) != " "
-        if values and named and not any(map(_is_value, words)):
+        if values and named and not any(map(is_value, words)):
             found[first - 1] = said
     return found
 
@@ -221,10 +234,31 @@ def bare(comment: str) -> str:
     return comment.strip().lstrip("".join(MARKS) + " ").rstrip()
 
 
+def number(cell: object) -> float:
+    """The number of a cell, also as Fortran and spreadsheets write it where that means one thing.
+
+    Raises
+    ------
+    ValueError
+        If it is none: 5,125 could be 5125.
+
+    Examples
+    --------
+    >>> [number(cell) for cell in ("5.125D-04", "−5", "5,125.0", "5'125")]
+    [0.0005125, -5.0, 5125.0, 5125.0]
+    """
+    try:
+        return float(cell)
+    except ValueError:
+        text = cell.replace("−", "-")
+        text = text.translate(BETWEEN) if GROUPED.fullmatch(text) else text
+        return float(FORTRAN.sub(r"\1e\2", text))
+
+
 def is_number(text: object) -> bool:
     """Whether a cell is a number."""
     try:
-        float(text)
+        number(text)
     except ValueError:
         return False
     return True

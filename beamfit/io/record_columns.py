@@ -25,19 +25,22 @@ QUANTITIES = {
 CALLED = {"beam_current": "current", "beam_current_error": "error"}
 USED = {"time", "nanos", "current", "error", *Conditions._fields}
 # What a column of dates is called, and those of a day and of the time of that day.
-MOMENTS = {"time", "timestamp", "time_stamp", "datetime", "date_time", "data_time", "date"}
-DAYS, CLOCKS = {"date", "day", "datum"}, {"time", "zeit", "uhrzeit"}
+MOMENTS = {"time", "timestamp", "time_stamp", "datetime", "date_time", "data_time", "date", "zeit"}
+DAYS, CLOCKS = {"date", "day", "datum", "data"}, {"time", "zeit", "uhrzeit", "heure", "ora"}
+# Behind its name: the zone that is meant where none stands.
+UTC = re.compile(r"[ _]?[\[(]?(utc|gmt)[\])]?$")
 CLOCK = re.compile(r"\d{1,2}:\d{2}(:\d{2}([.,]\d*)?)?( ?[AaPp][Mm])?")
 # What a time with a unit is called besides time.
 CLOCKED = {"t", "timestamp", "time_stamp", "epoch", "elapsed", "elapsed_time", "unix_time", "zeit"}
+CLOCKED |= {"tempo", "temps"}
 # An archive's own columns: seconds since 1970 and nanoseconds, and what it says of each value.
-SECONDS = {"secs": "s", "seconds": "s", "epochseconds": "s"}
+SECONDS = {"secs": "s", "seconds": "s", "epochseconds": "s", "epoch": "s"}
 NANOS = {"nanos", "nanoseconds"}
-ASIDE = {"severity", "status", "val", "value"}
+ASIDE = {"severity", "status", "val", "value", "index", "no", "no.", "nr", "row"}
 # Words in a name with a unit of current that make it the beam's; in A, as magnets have, fewer do
 # beside other words.
 MONITORS = {"ibeam", "dcct", "pct", "bct", "stored"}
-CURRENTS = MONITORS | {"current", "i", "strom", "strahlstrom", "courant"}
+CURRENTS = MONITORS | {"current", "i", "strom", "strahlstrom", "courant", "corrente"}
 RINGS = {"sr", "ring", "ler", "her", "total", "average", "mean"}
 OTHERS = {"error", "err", "std", "sd", "sigma", "rms", "set", "setpoint", "target", "nominal"}
 # A lifetime beside the current, as archives have it, is not read.
@@ -144,13 +147,13 @@ def _options(sheet: Sheet) -> str:
 def _other(sheet: Sheet):
     """Understand headers of archives, and looser ones of a current where none has its own."""
     strict = any(spelled(name).lower().startswith("beam_current_") for name in sheet.names)
-    first = {name.lower(): next(iter(sheet[name]), "") for name in sheet.names}
+    first = {UTC.sub("", name.lower()): next(iter(sheet[name]), "") for name in sheet.names}
     # A number without a unit is no date, and is not to be taken for seconds.
     moments = {"time"} | {name for name in MOMENTS & set(first) if not is_number(first[name])}
 
     def understood(header: str) -> Column | None:
         word, unit = header.lower(), header.removeprefix("val_")
-        if word in moments:
+        if UTC.sub("", word) in moments:
             return Column(header, "time", DATE)
         if word in SECONDS:
             return Column(header, "time", "s")

@@ -28,12 +28,27 @@ QUANTITIES = {
 # What tells rows apart besides settings of magnets.
 SEEN = {"screen", "r11_x", "r11_y"}
 CARRIED = re.compile(
-    r"note_.*|date|time|timestamp|comments?|charge[ _]?[\[(]?[np]C[\])]?", re.IGNORECASE
+    r"note_.*|comments?|charge[ _]?[\[(]?[np]C[\])]?|index|n[or]\.?|point|row|seq"
+    r"|(date|(date[ _]?|elapsed[ _]?)?time([ _]?stamp)?|t|zeit|datum|uhrzeit|heure)(_(h|m?s|min))?",
+    re.IGNORECASE,
 )
 # Words for a width, and how many of it are one rms: a Gaussian's FWHM is sqrt(8 ln 2) rms.
 FWHM = 1.0 / math.sqrt(8.0 * math.log(2.0))
-WIDTHS = {"size": 1.0, "sigma": 1.0, "sig": 1.0, "s": 1.0, "rms": 1.0, "fwhm": FWHM}
-ERRORS = {"error", "err", "std", "sd", "d", "delta", "uncertainty", "unc"}
+WIDTHS = dict.fromkeys(("größe", "strahlgröße", "taille", "dimensione"), 1.0)
+WIDTHS |= {"size": 1.0, "sigma": 1.0, "sig": 1.0, "s": 1.0, "rms": 1.0, "fwhm": FWHM}
+ERRORS = {
+    "error",
+    "err",
+    "std",
+    "sd",
+    "d",
+    "delta",
+    "uncertainty",
+    "unc",
+    "fehler",
+    "erreur",
+    "errore",
+}
 PERCENT = "%"
 PLANES = {"x": "x", "horizontal": "x", "hor": "x", "h": "x"}
 PLANES |= {"y": "y", "vertical": "y", "vert": "y", "ver": "y", "v": "y"}
@@ -41,9 +56,10 @@ PLANES |= {"y": "y", "vertical": "y", "vert": "y", "ver": "y", "v": "y"}
 IDLE = {"beam", "spot", "fit", "gauss", "gaussian"}
 # Several sigma as one width: 4sigma, D4Sigma (ISO 11146), 2 rms.
 SEVERAL = re.compile(r"(?:^|(?<=_))d?([2-6])_?(?=(?:sigma|sig|rms)(?:_|$))", re.IGNORECASE)
-# What control systems put behind the name of a magnet; its unit says what it is set to.
+# What control systems and people put around the name of a magnet; its unit says what it is set to.
 ATTRIBUTE = re.compile(
-    r"[ _:./](bact|bdes|bctrl|bcon|iact|ides|current|gradient|k1l?|gl|bdl|setpoint|readback)$",
+    r"[ _:./](bact|bdes|bctrl|bcon|iact|ides|current|gradient|k1l?|gl|bdl|setpoint|readback)$"
+    r"|[ _-]strom$|^(current|strom|courant|corrente)[ _]",
     re.IGNORECASE,
 )
 SHOTS = {"n_shots": "shots", "nshots": "shots"}
@@ -113,10 +129,17 @@ def _understood(sheet: Sheet) -> dict[str, Column]:
     except InputError as error:
         unknown = [name for name in sheet.names if not _is_known(name, sheet)]
         if error.column not in unknown:
-            expected = f"{error.expected}; --ignore '{error.column}' leaves this one unread"
+            one = sheet.names.count(error.column) == 1  # more would all be left unread
+            more = f"; --ignore '{error.column}' leaves this one unread" if one else ""
+            expected = error.expected + more
             raise replace(error, expected=expected) from None
         if len(unknown) < 2:
             raise
+        if "plane" in map(str.lower, unknown):
+            expected = (
+                "a column for each plane, size_x_um and size_y_um, and a row for each setting"
+            )
+            raise sheet.header_error("rows of two planes", expected, error.column) from None
         ignored = " ".join(f"--ignore '{name}'" for name in unknown)
         expected = "a magnet with its unit, a size such as size_x_um, or to leave them unread: "
         raise replace(error, expected=expected + ignored) from None
@@ -188,7 +211,7 @@ def _not_understood(header: str) -> str:
     before, _, last = header.rpartition("_")
     if bracket is not None:
         return f"unknown unit '{bracket[1]}'"
-    if before and last in UNITS["length"]:
+    if before and last in UNITS["length or share"]:
         return f"'{before}', which is no size of a plane that is known"
     return f"unknown unit '{last}'" if before else "a name without a unit"
 

@@ -17,12 +17,13 @@ import numpy as np
 
 from beamfit.errors import InputError, nearest
 from beamfit.io.dates import NUMBERS, dates_in_order
-from beamfit.io.headers import UNITS, is_number, spelled, unit_behind
+from beamfit.io.headers import UNITS, is_number, number, spelled, unit_behind
 
 # The unit of a column of dates.
 DATE = "a date"
 # What programs write where there is no number.
-BLANK = {"", "nan", "na", "n/a", "#n/a", "null"}
+BLANK = {"", "nan", "-nan", "na", "n/a", "n.a.", "#n/a", "<na>", "null", "none", "-", "--", "---"}
+BLANK |= {"nan(ind)", "-nan(ind)", "1.#qnan", "-1.#ind", "1.#ind", "#num!", "#value!"}
 # Rows left out that a note names one by one.
 MOST_NAMED = 5
 
@@ -193,7 +194,7 @@ class Sheet:
         name: str,
         *,
         blank: bool = False,
-        read: Callable[[Any], float] = float,
+        read: Callable[[Any], float] = number,
         expected: str = "a number",
     ) -> np.ndarray:
         """Read a column of finite numbers.
@@ -214,7 +215,7 @@ class Sheet:
         InputError
             Naming line and column of the first cell that is no number.
         """
-        if isinstance(self[name], np.ndarray) and read is float and np.isfinite(self[name]).all():
+        if isinstance(self[name], np.ndarray) and read is number and np.isfinite(self[name]).all():
             return self[name].astype(float)
         values = np.empty(len(self))
         for row, cell in enumerate(self[name]):
@@ -226,6 +227,8 @@ class Sheet:
             except (ValueError, TypeError, OverflowError):
                 comma = " with a decimal point" if "," in str(cell) else ""
                 more = " in the unit of the column" if unit_behind(str(cell)) else comma
+                if re.search(r"\d\s*(±|\+/?-)", str(cell)):
+                    more = ", and its error in a column of its own"
                 found = "an empty cell" if cell == "" else f"'{cell}'"
                 raise self.error(found, expected + more, row, name) from None
             if not np.isfinite(values[row]):
@@ -293,6 +296,9 @@ def columns_of(
         if column.key in found:
             twice = f"{column.key} also in column '{found[column.key].header}'"
             expected = "one column for it, in one unit, and none twice"
+            if header == found[column.key].header:
+                twice = f"{column.key} in {sheet.names.count(header)} columns of one name"
+                expected = "a row for each shot, or names that differ"
             raise sheet.header_error(twice, expected, header)
         found[column.key] = column
     return found

@@ -6,6 +6,7 @@ import csv
 import itertools
 import re
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -21,7 +22,9 @@ from beamfit.io.headers import (
     MARKS,
     bare,
     header_at,
+    is_header,
     is_number,
+    is_value,
     separator_of,
     spelled,
     uncommented,
@@ -53,7 +56,7 @@ def read_sheet(
     example: str,
     most: int = MOST_ROWS,
     *,
-    ragged: bool = False,
+    ragged: bool | None = None,
     names: Sequence[str] | None = None,
 ) -> Sheet:
     """Read the columns of a CSV, TFS, SDDS, LabVIEW, HDF5 or MATLAB file.
@@ -68,8 +71,9 @@ def read_sheet(
         A header such as the file should have, for messages.
     most : int
         Most rows there may be.
-    ragged : bool
-        Whether rows that have not as many cells as the header are left out, and named in ``bad``.
+    ragged : bool, optional
+        Whether rows that have not as many cells as the header are left out, and named in ``bad``;
+        None where nobody can ask for it.
     names : sequence of str, optional
         The header of a file that has none and is separated by commas.
 
@@ -109,7 +113,7 @@ def _read_text(
     path: str | PathLike[str],
     example: str,
     most: int,
-    ragged: bool,
+    ragged: bool | None,
     names: Sequence[str] | None,
 ) -> Sheet:
     comments, rows, lines, bad, columns, notes = [], [], [], [], None, ()
@@ -117,14 +121,16 @@ def _read_text(
     numbered = enumerate(map(unframed, text_lines(path)), start=1)
     if names is None:
         names, header, separator, numbered = _head(path, example, comments)
+    title = list(names)
     for line, text in numbered:
         if text.lstrip().startswith(MARKS + TFS_LINES * (separator == " ")):
             comments.append(bare(text))
         elif text.strip().strip(",;\t "):
             cells, wrong = _row(text, separator, path, line, len(names))
             whole = len(cells) == len(names)
-            if whole and not rows and (units := with_units(names, cells)):
-                names = units
+            units = with_units(names, cells) if whole and not rows else None
+            names = units or names
+            if units or (rows and _is_again(cells, title, path, line)):
                 continue
             fresh = not (rows or bad or "time" in names)  # a column `time` has dates
             columns = numeric_rows(path, line, separator, len(names), most) if fresh else None
@@ -138,7 +144,8 @@ def _read_text(
             if bad and not ragged:
                 break
     if bad and not (ragged and rows):
-        raise bad[0]
+        more = "; --skip-bad leaves such rows out" if ragged is False else ""
+        raise replace(bad[0], expected=bad[0].expected + more)
     if columns is None:
         names, rows = without_units(names, rows, path, lines)
         rows, notes = with_points(rows, separator)
@@ -200,8 +207,13 @@ def _without_blanks(cells: list[str], least: int) -> list[str]:
 
 
 def header_of(path: str | PathLike[str]) -> list[str]:
-    """The header of a file of text, as `read_sheet` finds it."""
-    return [spelled(name) for name in _head(path, "Q2_A,size_x_um", [])[0]]
+    """The header of a file of text, as `read_sheet` finds it, with units that stand below."""
+    names, _, separator, numbered = _head(path, "Q2_A,size_x_um", [])
+    line, text = next((one for one in numbered if one[1].strip()), (0, ""))
+    cells = _row(text, separator, path, line, len(names))[0]
+    if len(cells) == len(names):
+        names = with_units(names, cells) or without_units(names, [cells], path, [line])[0]
+    return [spelled(name) for name in names]
 
 
 def _cells(path: str | PathLike[str], text: str, line: int = 1) -> list[str]:
@@ -220,6 +232,16 @@ def _row(
     expected = f"{count}, as in the header"
     expected += "; what stands above it begins with #" if count == 1 else ""
     return cells, InputError(f"{len(cells)} cells", expected, path=path, line=line)
+
+
+def _is_again(cells: list[str], title: list[str], path: str | PathLike[str], line: int) -> bool:
+    """Whether a row is the header once more, as of files put together; another one is refused."""
+    if not cells or is_value(cells[0]) or not (cells == title or is_header(cells)):
+        return False
+    if cells != title:
+        expected = "one table a file: columns beside one another, or a file for each"
+        raise InputError(f"a second header, {', '.join(cells)}", expected, path, line)
+    return True
 
 
 def _split(text: str, separator: str, path: str | PathLike[str], line: int) -> list[str]:
@@ -244,6 +266,9 @@ def _check_header(names: list[str], example: str, path: str | PathLike[str], lin
     if all(map(is_number, names)):
         expected = f"a header line such as {example}"
         raise InputError("numbers where the header should be", expected, path=path, line=line)
+    if len(names) > 3 and all(map(is_number, names[1:])):
+        expected = f"columns below a header such as {example}, a row for each setting"
+        raise InputError("a table on its side", expected, path=path, line=line)
 
 
 def _binary(path: str | PathLike[str], suffix: str, most: int) -> Sheet:
