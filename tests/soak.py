@@ -43,6 +43,7 @@ from beamfit.io.ring import read_ring
 from beamfit.io.ring_tables import read_twiss
 from beamfit.io.run import read_run
 from beamfit.io.saved import load_fit, save_fit
+from beamfit.io.table import read_sheet
 from beamfit.language.check import check_document
 from beamfit.language.network import format_network
 from beamfit.sampling.ensemble import draw
@@ -51,6 +52,7 @@ from tests.conftest import ROOT
 from tests.io.test_emittance_gui import gui_data
 from tests.io.test_mutated_files import CSV, mutated
 from tests.io.test_nl import BY_HAND
+from tests.io.test_programs import LVM, SDDS
 from tests.io.test_sequence import ELEGANT, MAD8, MADX
 from tests.sampling.targets import half_normal, target
 
@@ -91,6 +93,7 @@ def readers(folder: Path, with_store: bool) -> dict[str, Reader]:
     archive = [{"secs": 1_700_000_000 + k, "nanos": 0, "val": 100 - 0.01 * k} for k in range(20)]
     exported = json.dumps([{"meta": {"EGU": "mA"}, "data": archive}]).encode()
     scipy.io.savemat(folder / "scan.mat", {"data": gui_data()}, do_compression=False)
+    scipy.io.savemat(folder / "vectors.mat", settings, do_compression=False)
     save_fit(folder / "fit.json", beamfit.fit_decay(beamfit.DecayRecord(hours, current)))
     entry = {"plane": "x", "status": "converged", "message": "Good.", "covariance": None}
     entry |= {f"sigma{k}": {"value": 1e-8, "error": 1e-10} for k in ("11", "12", "22")}
@@ -119,6 +122,9 @@ def readers(folder: Path, with_store: bool) -> dict[str, Reader]:
         "scan .csv --skip-bad": Reader(".csv", scan, lambda p: read_quad_scan(p, skip_bad=True)),
         "scan .h5": Reader(".h5", [stored(folder, "s.h5", **settings)], read_quad_scan),
         "scan .mat": Reader(".mat", [(folder / "scan.mat").read_bytes()], read_emittance_gui),
+        "vectors .mat": Reader(".mat", [(folder / "vectors.mat").read_bytes()], read_quad_scan),
+        "SDDS": Reader(".sdds", [SDDS.encode(), SDDS.encode("utf-16")], read_quad_scan),
+        "LabVIEW": Reader(".lvm", [LVM.encode()], lambda p: read_sheet(p, "time_s,I_mA")),
         "decay .csv": Reader(".csv", decay, beamfit.io.decay_record.read_lifetime_input),
         "decay .csv --skip-bad": Reader(
             ".csv", decay[:2], lambda p: beamfit.read_decay_record(p, skip_bad=True)
