@@ -297,7 +297,7 @@ def columns_of(
             twice = f"{column.key} also in column '{found[column.key].header}'"
             expected = "one column for it, in one unit, and none twice"
             if header == found[column.key].header:
-                twice = f"{column.key} in {sheet.names.count(header)} columns of one name"
+                twice = f"{column.key} twice or more under one name"
                 expected = "a row for each shot, or names that differ"
             raise sheet.header_error(twice, expected, header)
         found[column.key] = column

@@ -60,7 +60,11 @@ REFUSED = {
     "two tables": ("Q1_A,size_x_um", [*POINTS, "Q1_A,size_y_um", *POINTS], ":6: a second header"),
     "a summary": ("Q1_A,size_x_um", [*POINTS, "4 points"], ":6: 1 cells; .*--skip-bad"),
     "on its side": ("I_A,-4,-3,-1", ["size_x_um,11,6,10"], ":1: a table on its side"),
-    "shots in a row": ("Q1_A,size_x_um,size_x_um", ["0,1,2"], "in 2 columns of one .* each shot"),
+    "shots in a row": (
+        "Q1_A,size_x_um,size_x_um",
+        ["0,1,2"],
+        "size_x twice or more under one name.* each shot",
+    ),
     "planes in rows": ("plane,Q1_A,size_um", ["x,0,1", "y,0,1"], "a column for each plane"),
 }
 
