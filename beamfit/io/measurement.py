@@ -72,12 +72,12 @@ def read_quad_scan(
     --------
     >>> import tempfile, pathlib
     >>> file = pathlib.Path(tempfile.mkdtemp()) / "scan.csv"
-    >>> _ = file.write_text("Q2_A,size_x_um\\n0,200\\n1,120\\n2,180\\n3,none\\n")
+    >>> _ = file.write_text("Q2_A,size_x_um\\n0,200\\n1,120\\n2,180\\n3,lost\\n")
     >>> scan = read_quad_scan(file, skip_bad=True)
     >>> scan.rows("x").size.round(9).tolist()
     [0.0002, 0.00012, 0.00018]
     >>> scan.notes
-    ("1 of 4 rows was left out: line 5, column 'size_x_um', 'none'.",)
+    ("1 of 4 rows was left out: line 5, column 'size_x_um', 'lost'.",)
     """
     if isinstance(path, str | PathLike) and is_emittance_gui(path):
         return read_emittance_gui(path).scan()
