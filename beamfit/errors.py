@@ -66,8 +66,8 @@ class InputError(ValueError):
 
 
 @contextmanager
-def located(path: str | PathLike[str] | None) -> Iterator[None]:
-    """Name a file in what is raised here by code that knows of none.
+def located(path: str | PathLike[str] | None, line: int | None = None) -> Iterator[None]:
+    """Name a file, and a line, in what is raised here by code that knows of none.
 
     Examples
     --------
@@ -80,6 +80,7 @@ def located(path: str | PathLike[str] | None) -> Iterator[None]:
         yield
     except InputError as error:
         error.path = path if error.path is None else error.path
+        error.line = line if error.line is None else error.line
         raise
 
 

@@ -6,6 +6,8 @@ import re
 from collections.abc import Sequence
 from functools import lru_cache
 
+from beamfit.errors import InputError
+
 UNITS: dict[str, dict[str, float]] = {
     # quantity: unit at the end of a name -> factor to SI (a stored current: to mA)
     "length": {"um": 1e-6, "mm": 1e-3, "m": 1.0, "µm": 1e-6, "μm": 1e-6, "nm": 1e-9, "cm": 1e-2},
@@ -107,24 +109,44 @@ def _has_unit(header: str) -> bool:
     return unit_at_end(spelled(header)) is not None
 
 
+def units_below(cells: Sequence[str]) -> list[str | None] | None:
+    """The units of a row of nothing else; None if it is no such row.
+
+    Examples
+    --------
+    >>> units_below(["A", "[um]", ""]), units_below(["A", "5"])
+    (['A', 'um', None], None)
+    """
+    units = [known_unit(cell) for cell in cells]
+    plain = all(
+        u is not None or cell in ("", "-", "1") for u, cell in zip(units, cells, strict=True)
+    )
+    return units if plain and any(units) else None
+
+
 def with_units(names: Sequence[str], cells: Sequence[str]) -> list[str] | None:
     """Names with the units of a row of units below them; None if the row is none.
+
+    Raises
+    ------
+    InputError
+        If a name has another unit already.
 
     Examples
     --------
     >>> with_units(["Q2", "size_x", "shot"], ["A", "[um]", ""])
     ['Q2_A', 'size_x_um', 'shot']
     """
-    units = [known_unit(cell) for cell in cells]
-    plain = all(
-        u is not None or cell in ("", "-", "1") for u, cell in zip(units, cells, strict=True)
-    )
-    if not plain or not any(units):
+    if (units := units_below(cells)) is None:
         return None
-    return [
-        name if u is None or _has_unit(name) else re.sub(r"\s+", "_", f"{name}_{u}")
-        for name, u in zip(names, units, strict=True)
-    ]
+    found = []
+    for name, unit in zip(names, units, strict=True):
+        own = unit_at_end(spelled(name))
+        if own and unit and re.sub("[µμ]", "u", own) != re.sub("[µμ]", "u", unit):
+            expected = "one unit, in the header or below it"
+            raise InputError(f"'{unit}' below a header in {own}", expected, column=name)
+        found.append(name if own or unit is None else re.sub(r"\s+", "_", f"{name}_{unit}"))
+    return found
 
 
 def separator_of(header: str) -> str:
@@ -199,7 +221,7 @@ def _has_rows(lines: Sequence[str], i: int) -> bool:
     """Whether rows of as many cells as a line of words has follow it, below its units perhaps."""
     cells = _words(lines[i])
     rows = [_words(text) for text in lines[i + 1 :] if not _is_aside(text)][:3]
-    if rows and len(rows[0]) == len(cells) and with_units(cells, rows[0]):
+    if rows and units_below(rows[0]):
         del rows[0]
     alike = rows and all(len(row) == len(cells) and is_value(row[0]) for row in rows[:2])
     words = not _is_aside(lines[i]) and not any(map(is_value, cells))

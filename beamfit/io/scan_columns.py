@@ -58,8 +58,8 @@ IDLE = {"beam", "spot", "fit", "gauss", "gaussian"}
 SEVERAL = re.compile(r"(?:^|(?<=_))d?([2-6])_?(?=(?:sigma|sig|rms)(?:_|$))", re.IGNORECASE)
 # What control systems and people put around the name of a magnet; its unit says what it is set to.
 ATTRIBUTE = re.compile(
-    r"[ _:./](bact|bdes|bctrl|bcon|iact|ides|current|gradient|k1l?|gl|bdl|setpoint|readback)$"
-    r"|[ _-]strom$|^(current|strom|courant|corrente)[ _]",
+    r"[ _:./](bact|bdes|bctrl|bcon|iact|ides|current|gradient|k1l?|gl|bdl)$"
+    r"|[ _:./](setpoint|readback|set|rbv?)$|[ _-]strom$|^(current|strom|courant|corrente)[ _]",
     re.IGNORECASE,
 )
 SHOTS = {"n_shots": "shots", "nshots": "shots"}

@@ -11,7 +11,7 @@ from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from beamfit.errors import InputError
+from beamfit.errors import InputError, located
 from beamfit.io import labview, sdds
 from beamfit.io.cell_units import without_units
 from beamfit.io.commas import with_points
@@ -128,7 +128,8 @@ def _read_text(
         elif text.strip().strip(",;\t "):
             cells, wrong = _row(text, separator, path, line, len(names))
             whole = len(cells) == len(names)
-            units = with_units(names, cells) if whole and not rows else None
+            with located(path, line):
+                units = with_units(names, cells) if whole and not rows else None
             names = units or names
             if units or (rows and _is_again(cells, title, path, line)):
                 continue

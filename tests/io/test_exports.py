@@ -65,6 +65,7 @@ REFUSED = {
         ["0,1,2"],
         "size_x twice or more under one name.* each shot",
     ),
+    "another unit below": ("Q1_A,size_x_um", ["A,mm", "0,1"], ":2: column 'size_x_um': 'mm' below"),
     "planes in rows": ("plane,Q1_A,size_um", ["x,0,1", "y,0,1"], "a column for each plane"),
 }
 
@@ -75,6 +76,14 @@ def test_what_could_mean_two_things_says_what_to_do(case, tmp_path):
     with pytest.raises(InputError, match=words) as error:
         read_quad_scan(written(tmp_path / "a.csv", header, rows))
     assert "leaves this one unread" not in str(error.value)
+
+
+def test_of_a_setting_and_its_reading_one_is_left_out(tmp_path):
+    rows = [f"{q},{q + 0.01:.2f},{x}" for q, x in zip(Q, X, strict=True)]
+    path = written(tmp_path / "a.csv", "Q1_set_A,Q1_rb_A,size_x_um", rows)
+    with pytest.raises(InputError, match="--ignore 'Q1_rb_A' leaves this one unread"):
+        read_quad_scan(path)
+    assert read_quad_scan(path, ignore=["*_rb_A"]).settings["Q1"].tolist() == Q
 
 
 DAY = "01.03.2024"
