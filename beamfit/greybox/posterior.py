@@ -169,6 +169,7 @@ def target_of(
         hidden=(*(names[i] for i in np.flatnonzero(p.nuisance[moving])), *stated.hidden),
         group_of=group_of,
         block_of=block_of,
+        along=stated.along,
     )
 
 

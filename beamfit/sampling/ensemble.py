@@ -220,7 +220,8 @@ def _half_round(state: Checkpoint) -> slice:
 
 def _proposal(target: Target, state: Checkpoint) -> Proposal:
     """How to leap: about the fit at first, then as fitted to the walkers of half a round."""
-    first = about(target.covariance, target.widening, target.blocks, 5.0)
+    along = target.names.index(target.along) if target.along else -1
+    first = about(target.covariance, target.widening, target.blocks, 5.0, along)
     recent = state.chain[_half_round(state)]
     return fitted(recent.reshape(-1, recent.shape[2]), first) if state.began else first
 

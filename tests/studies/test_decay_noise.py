@@ -12,7 +12,7 @@ from beamfit.studies.decay.evidence import Evidence
 from beamfit.studies.decay.fit import fit_decay, fit_decays
 from beamfit.studies.decay.law import DecayNumbers
 from beamfit.studies.decay.model import decay_problem, padded, solve_decay
-from beamfit.studies.decay.posterior import _noise_of, _with_memory
+from beamfit.studies.decay.posterior import _noise_of, _with_memory, log_wander
 from beamfit.studies.decay.record import DecayRecord
 from beamfit.studies.decay.study import study_record
 from beamfit.studies.decay.tables import separability_rows
@@ -149,6 +149,20 @@ def test_the_sampler_has_the_same_noise():
     assert middle == pytest.approx(fit.a.value, abs=0.3 * fit.a.error)
 
 
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_drift_under_white_noise_is_sampled_to_the_end(seed):
+    """I0 spreads with the drift, which spreads with its memory: leaps of one shape took 25 times
+    as many steps, and the budget went by.
+    """
+    time, rng = np.linspace(0, SPAN, 200), np.random.default_rng(seed)
+    off = 0.02 * (autoregressive(rng, 200, 0.97) + rng.normal(size=200))
+    fit = fit_decay(DecayRecord(time, law(time) + off))
+    posterior = fit.sample(seed=1, budget=2500)
+    assert "log_wander" in posterior.names
+    assert posterior.status == "converged"
+    assert max(posterior.diagnostics.autocorrelation) < 8
+
+
 def test_no_record_of_noise_says_more_than_that_its_loss_rate_is_zero():
     """Error of a slope: noise sqrt(12/n)/T. Rates below zero by chance made 1e5 h and more."""
     rng, count = np.random.default_rng(3), 200
@@ -171,6 +185,8 @@ def test_beside_white_noise_the_sampled_noise_is_the_scatter_of_the_residuals():
     assert noise.white > 0
     [readings] = _with_memory(decay_problem(fit.readings), fit, noise, True).records
     found = (fit.i0.value, fit.a.value, fit.b.value)
-    numbers = DecayNumbers(*found, log_memory=np.log(noise.time), white=noise.white)
+    numbers = DecayNumbers(
+        *found, log_memory=np.log(noise.time), log_wander=log_wander(noise, fit.readings)
+    )
     size = float(np.sqrt(np.mean(np.square(readings.predict(numbers, readings.data)))))
     assert size == pytest.approx(fit.noise, rel=0.05)

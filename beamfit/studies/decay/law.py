@@ -25,8 +25,9 @@ class DecayNumbers(NamedTuple):
     """Current at the first reading, mA, and a, 1/(mA s), and b, 1/s, of dI/dt = -a I² - b I.
 
     `exponent` is the power of the current by which a departs from its known dependence,
-    `log_memory` the logarithm of the correlation time of the readings' errors, s, and `white` the
-    share of their variance without a memory; `drift`, mA/s, and `offset`, mA, are the monitor's.
+    `log_memory` the logarithm of the correlation time of the readings' errors, s, and `log_wander`
+    that of the variance that they get anew in a usual interval over that of their white part;
+    `drift`, mA/s, and `offset`, mA, are the monitor's.
     """
 
     i0: Array
@@ -34,7 +35,7 @@ class DecayNumbers(NamedTuple):
     b: Array
     exponent: Array = 0.0
     log_memory: Array = 0.0
-    white: Array = 0.0
+    log_wander: Array = 0.0
     drift: Array = 0.0
     offset: Array = 0.0
 

@@ -34,9 +34,12 @@ from beamfit.studies.decay.record import DecayRecord
 from beamfit.verdict import Finding
 
 UNITS = {"i0": "mA", "a": "1/(mA s)", "b": "1/s"}
-SAMPLED = UNITS | {"log_memory": "1", "white": "1", "drift": "mA/s", "offset": "mA"}
+SAMPLED = UNITS | {"log_memory": "1", "log_wander": "1", "drift": "mA/s", "offset": "mA"}
 # A share of the noise below which it is rounding.
 ROUNDING = 1e-9
+# Variances that noise with a memory gets anew in a usual interval, over that of the white part,
+# beyond which one of the two would not be seen.
+LEAST_NEW, MOST_NEW = 1e-4, 10.0
 # The monitor is taken to be within so many of its stated errors.
 WIDEST = 8.0
 LIFETIMES = {"lifetime_start": "h", "lifetime_mean": "h", "lifetime_end": "h"}
@@ -79,6 +82,8 @@ def decay_target(
     Errors that are correlated are so in the likelihood, and the correlation time is sampled too,
     flat in its logarithm as in `beamfit.greybox.memory.memory_of` but only up to the length of
     the record: in a longer memory i0 loses its hold, and a walk its way, for nothing of a and b.
+    The white part beside, where there is one, is sampled by the variance that the rest gets anew
+    over the white, flat in its logarithm: the record tells that whatever the correlation time.
 
     Where the record does not tell a from b, the two bounds a ≥ 0 and b ≥ 0 make the posterior a
     line across all shares of a in the loss. The lifetime at the mean current is then as well
@@ -105,7 +110,8 @@ def decay_target(
         remembered = _noise_of(fit)
         problem = _with_memory(problem, fit, remembered, inferred)
         theta = np.append(theta, np.log(remembered.time))
-        theta = np.append(theta, remembered.white) if remembered.white else theta
+        theta = np.append(theta, log_wander(remembered, record)) if remembered.white else theta
+        more["along"] = "log_memory"
     nothing = f"the readings show neither decay nor noise; {fit.message}".rstrip(".")
     seen = fit.rms_residual > 0 or record.error is not None
     # A prior on one of the two tells them apart, if anything does.
@@ -116,7 +122,13 @@ def decay_target(
         data=(fit.mean_current, record.time[-1], problem.records[0].data),
         units=SAMPLED,
         lower=dict.fromkeys(UNITS, 0.0),
-        width={"a": rate / fit.mean_current, "b": rate, "log_memory": 1.0, "white": 0.1, **monitor},
+        width={
+            "a": rate / fit.mean_current,
+            "b": rate,
+            "log_memory": 1.0,
+            "log_wander": 1.0,
+            **monitor,
+        },
         noise_unit="mA",
         priors_own=() if told else ("a", "b"),
         nothing="" if seen else nothing,
@@ -173,7 +185,8 @@ def _with_memory(problem: Problem, fit, noise: Noise, inferred: bool) -> Problem
     readings, record = problem.records[0], fit.readings
     error = np.ones(1) if record.error is None else record.error
     usual, white = np.median(np.diff(record.time)), noise.white or None
-    quoted = _log_new(usual, np.log(noise.time), noise.white) if inferred else np.nan
+    fresh = noise.white - (1.0 - noise.white) * np.expm1(-2 * usual / noise.time)
+    quoted = 0.5 * np.log(fresh) if inferred else np.nan
     if noise.white:
         over = fit.residuals / error
         new, _ = whitened_of_both(over, np.diff(record.time), noise)
@@ -182,18 +195,27 @@ def _with_memory(problem: Problem, fit, noise: Noise, inferred: bool) -> Problem
     own = Record(RECORD, _new, data, np.zeros(len(record)), None if record.error is None else 1.0)
     lower, upper = np.log([range_of(record.time)[0], record.span])
     free = [*problem.free, Free("log_memory", lower, upper)]
-    free += [Free("white", 0.0, 1.0)] if noise.white else []
+    if noise.white:
+        free += [Free("log_wander", np.log(LEAST_NEW), np.log(MOST_NEW))]
     return replace(problem, free=free, records=[own])
 
 
-def _log_new(usual: Array, log_memory: Array, white: Array) -> Array:
-    """Logarithm of the share of the noise that is new in a usual interval."""
-    return 0.5 * jnp.log(white - (1.0 - white) * jnp.expm1(-2 * usual * jnp.exp(-log_memory)))
+def log_wander(noise: Noise, record: DecayRecord) -> float:
+    """Logarithm of the variance that is new in a usual interval over that of the white part."""
+    new = (1.0 - noise.white) * -np.expm1(-2 * np.median(np.diff(record.time)) / noise.time)
+    return float(np.log(np.clip(new / noise.white, LEAST_NEW, MOST_NEW)))
+
+
+def _parts(model: DecayNumbers, data: Remembered) -> tuple[Array, Array]:
+    """Variances of the white part and of the rest, over what the rest gets anew."""
+    white = 0.0 if data.white is None else jnp.exp(-model.log_wander)
+    return white, -1.0 / jnp.expm1(-2 * data.usual * jnp.exp(-model.log_memory))
 
 
 def _log_size(model: DecayNumbers, data: Remembered) -> Array:
     """Logarithm of what whitened residuals are multiplied by."""
-    known, new = jnp.isnan(data.quoted), _log_new(data.usual, model.log_memory, model.white)
+    white, rest = _parts(model, data)
+    known, new = jnp.isnan(data.quoted), 0.5 * jnp.log((white + 1.0) / (white + rest))
     return jnp.where(known, 0.0, new - jnp.where(known, new, data.quoted))
 
 
@@ -203,7 +225,8 @@ def _whitened(model: DecayNumbers, data: Remembered) -> tuple[Array, Array]:
     if data.white is None:
         between = apart(model, data.at)
         return whitened(rows, between), log_volume(between)
-    noise = Noise(jnp.exp(model.log_memory), model.white)
+    white, rest = _parts(model, data)
+    noise = Noise(jnp.exp(model.log_memory), white / (white + rest))
     white, sizes = innovations(rows, jnp.asarray(data.at.time), noise)
     return white, -sizes
 
