@@ -43,6 +43,7 @@ BETWEEN = dict.fromkeys(map(ord, ",'’\xa0\u202f"))
 FORTRAN = re.compile(r"([\d.])[dD]([-+]?\d+)$")
 # A name, and its unit in brackets or behind a stroke between blanks.
 BRACKETS = re.compile(r"(.*?)[\s_]*(?:\[(.*?)\]|\((.*?)\)|\s/\s+(\S+))\s*")
+APART = re.compile(r"([^/,]+?)(?:/|, ?| in )([^/,\s]+)")  # I/A, "I, A", I in A
 # Lines that are looked through for the header below a title.
 HEAD = 50
 # How a line begins that is a comment: of Python, MATLAB, C, SDDS.
@@ -80,6 +81,8 @@ def spelled(header: str) -> str:
     --------
     >>> [spelled(h) for h in ("Q525 [T/m]", "size x (µm)", "Time / h", "SIZE_X_MM", "Q5 T m^-1")]
     ['Q525_T_per_m', 'size_x_µm', 'Time_h', 'SIZE_X_mm', 'Q5_T_per_m']
+    >>> [spelled(h) for h in ("I/A", "size x, um", "size x in um", "Q1_T/m", "sr/dcct/A")]
+    ['I_A', 'size_x_um', 'size_x_um', 'Q1_T_per_m', 'sr/dcct/A']
     """
     if (found := BRACKETS.fullmatch(header)) and found[1]:
         name, unit = found[1], next(part for part in found.groups()[1:] if part is not None)
@@ -90,6 +93,8 @@ def spelled(header: str) -> str:
     for unit, known in ALSO.items():
         if re.search(rf"[\s_]{re.escape(unit)}$", header):
             return re.sub(r"\s+", "_", header[: -len(unit) - 1]) + f"_{known}"
+    if (found := APART.fullmatch(header)) and known_unit(found[2]):
+        return re.sub(r"\s+", "_", f"{found[1]}_{known_unit(found[2])}")
     words = header.split()
     return "_".join(words) if len(words) > 1 and words[-1] in KNOWN else header
 

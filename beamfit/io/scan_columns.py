@@ -36,19 +36,8 @@ CARRIED = re.compile(
 FWHM = 1.0 / math.sqrt(8.0 * math.log(2.0))
 WIDTHS = dict.fromkeys(("größe", "strahlgröße", "taille", "dimensione"), 1.0)
 WIDTHS |= {"size": 1.0, "sigma": 1.0, "sig": 1.0, "s": 1.0, "rms": 1.0, "fwhm": FWHM}
-ERRORS = {
-    "error",
-    "err",
-    "std",
-    "sd",
-    "d",
-    "delta",
-    "uncertainty",
-    "unc",
-    "fehler",
-    "erreur",
-    "errore",
-}
+ERRORS = {"error", "err", "std", "sd", "d", "delta", "uncertainty", "unc"}
+ERRORS |= {"fehler", "erreur", "errore"}
 PERCENT = "%"
 PLANES = {"x": "x", "horizontal": "x", "hor": "x", "h": "x"}
 PLANES |= {"y": "y", "vertical": "y", "vert": "y", "ver": "y", "v": "y"}
@@ -58,7 +47,7 @@ IDLE = {"beam", "spot", "fit", "gauss", "gaussian"}
 SEVERAL = re.compile(r"(?:^|(?<=_))d?([2-6])_?(?=(?:sigma|sig|rms)(?:_|$))", re.IGNORECASE)
 # What control systems and people put around the name of a magnet; its unit says what it is set to.
 ATTRIBUTE = re.compile(
-    r"[ _:./](bact|bdes|bctrl|bcon|iact|ides|current|gradient|k1l?|gl|bdl)$"
+    r"[ _:./](bact|bdes|bctrl|bcon|iact|ides|current|gradient|k1l?|kl|gl|bdl)$"
     r"|[ _:./](setpoint|readback|set|rbv?)$|[ _-]strom$|^(current|strom|courant|corrente)[ _]",
     re.IGNORECASE,
 )
@@ -209,6 +198,8 @@ def _not_understood(header: str) -> str:
     """What it is about a header that nobody knows."""
     bracket = re.search(r"[\[(]([^\[\]()]*)[\])]\s*$", header)
     before, _, last = header.rpartition("_")
+    if _size(f"{header}_um") is not None:
+        return "a size without a unit"
     if bracket is not None:
         return f"unknown unit '{bracket[1]}'"
     if before and last in UNITS["length or share"]:

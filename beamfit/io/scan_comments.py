@@ -24,6 +24,8 @@ STATED = re.compile(
     rf"|^\W*(?P<full_first>(?:{FULL}))(?: beam| spot)? (?:sizes?|widths?)\W*$",
     re.IGNORECASE,
 )
+# "units: A, mm" is no statement of the sizes alone.
+LISTED = re.compile(r"\bunits?\b.*?\b(mm|microns?|[uµμ]m|cm)\b", re.IGNORECASE)
 # What makes a comment tell of another matter, or of what was done already.
 UNSURE = re.compile(
     r"\b(not|no|never|from|convert\w*|divided|before|was|were|once|if|or)\b|[/*]|\?", re.IGNORECASE
@@ -62,6 +64,13 @@ def comment_notes(sheet: Sheet, columns: Mapping[str, Column]) -> list[str]:
     for text in sheet.comments:
         if not UNSURE.search(text) and (stated := STATED.search(text)):
             _check(sheet, sizes, text, stated)
+    for text in sheet.comments:
+        told = LISTED.search(text)
+        if told and all(_factor(told[1]) != UNITS["length"][column.unit] for column in sizes):
+            return [
+                f"A comment says '{short(text, 80)}', and the sizes are taken in {sizes[0].unit}, "
+                f"as the header {sizes[0].header} says: is that so?"
+            ]
     said = next((text for text in sheet.comments if WIDER.search(text)), None)
     if said is None or any(rms_of(column) != 1.0 for column in sizes):
         return []
@@ -72,12 +81,16 @@ def comment_notes(sheet: Sheet, columns: Mapping[str, Column]) -> list[str]:
     ]
 
 
+def _factor(unit: str) -> float | None:
+    return UNITS["length"].get(known_unit(unit) or "")
+
+
 def _check(sheet: Sheet, sizes: list[Column], text: str, stated: re.Match[str]) -> None:
     """Refuse a statement that is true of none of the sizes."""
     unit, several = stated["unit"], stated["several"]
     if unit:
         known = known_unit(unit)
-        true = [c for c in sizes if known and UNITS["length"][known] == UNITS["length"][c.unit]]
+        true = [c for c in sizes if _factor(unit) == UNITS["length"][c.unit]]
         mend = f"rename the column {sizes[0].key}_{known}" if known else "give lengths, in um"
     else:
         share = 1.0 if stated["rms"] else 1 / int(several) if several else FWHM

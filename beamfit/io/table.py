@@ -232,6 +232,8 @@ def _row(
         return [], error
     expected = f"{count}, as in the header"
     expected += "; what stands above it begins with #" if count == 1 else ""
+    apart = {",": "commas", ";": "semicolons", "\t": "tabs", " ": "blanks"}[separator]
+    expected += f", with {apart} between them" if len(cells) == 1 < count else ""
     return cells, InputError(f"{len(cells)} cells", expected, path=path, line=line)
 
 

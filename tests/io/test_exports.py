@@ -29,6 +29,9 @@ SCANS = {
     "elapsed": ("time_s,Q1_A,size_x_um", [f"{10 * i},{row}" for i, row in enumerate(POINTS)]),
     "dates": ("Zeit,Q1_A,size_x_um", [f"01.03.2024 12:0{i},{r}" for i, r in enumerate(POINTS)]),
     "put together": ("Q1_A,size_x_um", [*POINTS[:2], "Q1_A,size_x_um", *POINTS[2:]]),
+    "ISO 80000": ("Q1/A,size_x/um", POINTS),
+    "in words": ("Q1 in A,size x in µm", POINTS),
+    "with commas": ('"Q1, A","size x, um"', POINTS),
     "unit twice": ("Q1_A [A],size_x_um [um]", POINTS),
 }
 
@@ -59,6 +62,8 @@ REFUSED = {
     "errors behind": ("Q1_A,size_x_um", ["-4,11 ± 2", "-3,9 +- 1"], ":2: .*a column of its own"),
     "two tables": ("Q1_A,size_x_um", [*POINTS, "Q1_A,size_y_um", *POINTS], ":6: a second header"),
     "a summary": ("Q1_A,size_x_um", [*POINTS, "4 points"], ":6: 1 cells; .*--skip-bad"),
+    "other separators": ("Q1_A;size_x_um", POINTS, ":2: 1 cells; expected 2, .*with semicolons"),
+    "no unit": ("Q1_A,size_x", POINTS, ":1: column 'size_x': a size without a unit"),
     "on its side": ("I_A,-4,-3,-1", ["size_x_um,11,6,10"], ":1: a table on its side"),
     "shots in a row": (
         "Q1_A,size_x_um,size_x_um",

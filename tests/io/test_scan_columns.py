@@ -270,6 +270,9 @@ def test_a_comment_that_speaks_of_another_width_is_asked_about(read):
         assert f"'{said}'" in note
         assert "fwhm_x_um" in note
         assert said not in "".join(read(text.replace("size_x", "fwhm_x")).notes)
+    (note,) = read("# units: A, mm\n" + table(["Q_A", "size_x_um", "note_"])).notes
+    assert "'units: A, mm', and the sizes are taken in um" in note
+    assert not read("# units: A, µm\n" + table(["Q_A", "size_x_um", "note_"])).notes
 
 
 # What is stated of all sizes -> the header under which it would be true.
