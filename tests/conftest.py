@@ -39,17 +39,22 @@ def resident():
     return int(pages.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 2**20
 
 
-@pytest.fixture(scope="module", autouse=True)
-def _programs_of_one_module():
-    yield
-    if resident() > MOST_MEMORY:
-        import jax
+class _Programs:
+    """Drops programs after the last test of a module, of the examples in beamfit, too."""
 
-        jax.clear_caches()
-        gc.collect()
-        # What is freed is given back, or every module after this one would drop its programs too.
-        if trim := getattr(ctypes.CDLL(None), "malloc_trim", None):
-            trim(0)
+    def pytest_runtest_teardown(self, item, nextitem):
+        if (nextitem is None or nextitem.path != item.path) and resident() > MOST_MEMORY:
+            import jax
+
+            jax.clear_caches()
+            gc.collect()
+            # What is freed is given back, or every module after this one would drop its own, too.
+            if trim := getattr(ctypes.CDLL(None), "malloc_trim", None):
+                trim(0)
+
+
+def pytest_configure(config):
+    config.pluginmanager.register(_Programs())
 
 
 @pytest.fixture(scope="session")
