@@ -31,10 +31,10 @@ from beamfit.optics.elements import (
 )
 from beamfit.optics.sections import Series
 from beamfit.studies.scan.fit import EmittanceFit
-from beamfit.studies.scan.known import WEIGHTS
+from beamfit.studies.scan.known import WEIGHTS, one_by_one
 from beamfit.studies.scan.model import emittance_parts, size_squared
 from beamfit.studies.scan.results import PlaneFit, Points
-from beamfit.studies.scan.sigma import error_at, fit_sizes, weighed_size
+from beamfit.studies.scan.sigma import SOLVE, SigmaFit, SizeData, error_at, weighed_size
 from beamfit.studies.scan.statement import varied_magnets
 from beamfit.studies.scan.transport import Rows, padded
 
@@ -309,12 +309,15 @@ def _without(plane: PlaneFit, left_out: np.ndarray) -> float:
     """The emittance without some points; NaN where the rest has none."""
     p = plane.points
     error = error_at(p.size, p.weighed, p.error, p.relative)
-    rows = (p.r11, p.r12, p.size, np.where(left_out, np.inf, error), p.known)
-    full = [padded(v) for v in rows]
-    full[3][len(p.size) :] = np.inf
+    full = [padded(v) for v in (p.r11, p.r12, p.known, p.size, np.where(left_out, np.inf, error))]
+    full[-1][len(p.size) :] = np.inf
     # One at a time: a batch of another shape would be compiled for this table alone.
-    fit = fit_sizes(*full, method=plane.method, relative=p.relative, weights=plane.weights)
+    [fit] = one_by_one(_fitted, [(SizeData(*full, p.relative),)], plane.method, plane.weights)
     return math.sqrt(fit.determinant) if fit.positive else math.nan
+
+
+def _fitted(data: SizeData, method: str, weights: str) -> SigmaFit:
+    return SOLVE[method](data, weights)
 
 
 def _place(points: Points, i: int) -> str:
