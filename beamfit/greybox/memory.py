@@ -130,6 +130,11 @@ class Whitened(NamedTuple):
     volume: np.ndarray
     count: int
 
+    def least(self, numbers: int | None = None) -> float:
+        """-2 ln L by the likeliest noise, up to a constant."""
+        squares = self.memory(numbers).squares
+        return float(np.min(self.count * np.log(squares / self.count) - 2.0 * self.volume))
+
     def memory(self, numbers: int | None = None) -> Memory:
         """What the rows say of the noise, the first `numbers` being free and others held.
 

@@ -36,7 +36,8 @@ FOUND = 4.57
 # Readings from which a search with an exponent learns all that it can.
 ENOUGH = 1024
 # Times looked at for a change of the loss rate, how often about the best of them, and how much more
-# of chi² it must explain than an exponent does: it has a number more, chosen among many.
+# of chi² it must explain than an exponent, and of -2 ln L than noise with a memory does: it has a
+# number more, chosen among many.
 TIMES, FINER, BETTER = 40, 3, 15.0
 # A change that leaves less of the squares is no noise that looks like one; two of them must leave
 # far less, since slow noise looks like two more often.
@@ -221,12 +222,16 @@ class Change(NamedTuple):
     left: np.ndarray
     then: Change | None = None
 
-    def is_the_cause(self, residuals: np.ndarray) -> bool:
-        """Whether it leaves independent noise, or hardly anything, of correlated residuals."""
-        rest = float(self.left @ self.left) / float(residuals @ residuals)
-        if self.then is None:
-            return rest < REST or not remembers(self.left, 5)
-        return rest < REST_OF_TWO or not remembers(self.left, 7)
+    def is_the_cause(self, residuals: np.ndarray, alike: float = math.inf) -> bool:
+        """Whether it leaves hardly anything of correlated residuals, or independent noise that is
+        by far likelier than noise with a memory, of which `alike` is -2 ln L.
+        """
+        count, few = (1, REST) if self.then is None else (2, REST_OF_TWO)
+        rest, size = float(self.left @ self.left), self.left.size
+        if rest < few * float(residuals @ residuals):
+            return True
+        likelier = size * math.log(rest / size) < alike - count * BETTER
+        return likelier and not remembers(self.left, 3 + 2 * count)
 
     def to_json(self) -> dict[str, Any]:
         """Return the time and the two lifetimes as JSON's types, and of a second change too."""

@@ -11,7 +11,7 @@ from typing import Any, Self
 import numpy as np
 
 from beamfit.greybox.correlated import remembers
-from beamfit.greybox.memory import Memory, remembered
+from beamfit.greybox.memory import Memory, Whitened, remembered
 from beamfit.lifetime.decay import HOUR
 from beamfit.quantity import Quantity
 from beamfit.shown import shown
@@ -195,11 +195,10 @@ class Weighed:
     def quoted(self, known: bool = True) -> dict[str, Any]:
         """What a `DecayFit` has of this, by its names."""
         apart = known and self.separability.separable
-        same = ("chi2", "dof", "noise_inferred", "constant_a", "lifetimes")
-        same += ("correlation_time", "inflation")
+        same = ("chi2", "dof", "noise_inferred", "constant_a", "correlation_time", "lifetimes")
         found = {name: self.quantity(name, apart) for name in "ab"}
         found |= {f"lifetime_{at}": self.lifetime(f"rate_{at}", known) for at in ENDS}
-        found |= {name: getattr(self, name) for name in same}
+        found |= {name: getattr(self, name) for name in (*same, "inflation")}
         return found | {"identifiability": self.separability}
 
 
@@ -260,10 +259,11 @@ class Evidence(Weighed):
         if bool(solution.converged) and len(record) >= FEWEST and remembers(over, NUMBERS, SLOW):
             found = expanded(record, solution.values, shape)
             if remembers(found.left, NUMBERS + 1, SLOW):
+                seen = remembered(found.rows, found.residuals, record.time)
                 change = change_of_rate(record, found, solution.values, None)
-                if change is not None and change.is_the_cause(found.residuals):
+                if change and change.is_the_cause(found.residuals, seen.least(NUMBERS)):
                     return cls._independent(record, solution, shape, changed=True)
-                return cls._with_memory(record, solution, shape, found)
+                return cls._with_memory(record, solution, shape, found, seen)
         return cls._independent(record, solution, shape)
 
     @classmethod
@@ -284,11 +284,11 @@ class Evidence(Weighed):
 
     @classmethod
     def _with_memory(
-        cls, record: DecayRecord, solution: Solution, shape: Shape | None, found: Expansion
-    ) -> Evidence:
+        cls, record: DecayRecord, solution: Solution, shape: Shape | None, found: Expansion,
+        seen: Whitened,
+    ) -> Evidence:  # fmt: skip
         """Generalised least squares about the solution, the exponent free and held."""
         given = float(record.error is not None)
-        seen = remembered(found.rows, found.residuals, record.time)
         power, held = seen.memory().moments(found.slopes, given), seen.memory(NUMBERS)
         moved = held.moments(found.slopes[:, :NUMBERS], given)
         after = found.residuals + found.rows[:, :NUMBERS] @ held.mean_step
