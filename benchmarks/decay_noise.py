@@ -68,7 +68,9 @@ def cover(fits: list[DecayFit], time: np.ndarray) -> np.ndarray:
     return np.array(found).T
 
 
-def top_up(readings: int, correlation: float, noise: float, seed: int) -> tuple[float, bool, float]:
+def top_up(
+    readings: int, correlation: float, noise: float, seed: int, white: float = 0.0
+) -> tuple[float, bool, float]:
     """Pull of the pooled lifetime, whether its interval holds the truth, and its relative error."""
     rng = np.random.default_rng([seed, readings, int(1000 * correlation)])
     a, cycle, cycles = 3.3e-8, 180.0, 200
@@ -78,18 +80,19 @@ def top_up(readings: int, correlation: float, noise: float, seed: int) -> tuple[
     since, start = time - cycle * number, I0 * (1 + 5e-4 * rng.normal(size=cycles))[number]
     beam = start * np.exp(-b * since) / (1 + a / b * start * -np.expm1(-b * since))
     beam = beam + noise * autoregressive(rng, time.size, correlation)
+    beam = beam + white * noise * rng.normal(size=time.size) if white else beam
     fit = study_record(DecayRecord(time, beam)).pooled[0].fit
     found, true = fit.lifetime_mean, 1 / (a * fit.mean_current + b) / HOUR
     inside = found.interval_95[0] <= true <= found.interval_95[1]
     return (found.value - true) / found.error, inside, found.relative
 
 
-def of_top_up(trials: int) -> Table:
+def of_top_up(trials: int, white: float) -> Table:
     table = Table("readings a cycle", "correlation", "noise", "within 1 / 1.96 / interval", "error")
     for readings in (3, 18, 180):
-        for correlation in (0.0, 0.6, 0.95):
+        for correlation in (0.9, 0.97, 0.99) if white else (0.0, 0.6, 0.95):
             for noise in (0.001, 0.05):
-                found = [top_up(readings, correlation, noise, seed) for seed in range(trials)]
+                found = [top_up(readings, correlation, noise, k, white) for k in range(trials)]
                 pulls, inside, error = map(np.array, zip(*found, strict=True))
                 shares = [np.mean(abs(pulls) < 1), np.mean(abs(pulls) < 1.96), inside.mean()]
                 cells = " / ".join(f"{100 * share:.0f}" for share in shares)
@@ -106,7 +109,7 @@ def main() -> None:
     parser.add_argument("--top-up", action="store_true")
     asked = parser.parse_args()
     if asked.top_up:
-        Console(width=140).print(of_top_up(asked.trials))
+        Console(width=140).print(of_top_up(asked.trials, float(asked.white)))
         return
     table = Table("readings", "correlation", "answered", *NAMES)
     for count in asked.counts:
