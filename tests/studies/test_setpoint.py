@@ -1,6 +1,7 @@
 """Set points: Appendix D, a dense search, exact derivatives, a match."""
 
 import json
+from itertools import combinations
 
 import jax.numpy as jnp
 import numpy as np
@@ -8,6 +9,9 @@ import pytest
 
 from beamfit.errors import InputError
 from beamfit.optics.beam import BeamMatrix
+from beamfit.optics.beamline import Beamline
+from beamfit.optics.elements import Drift, Quadrupole, Screen
+from beamfit.optics.particle import PROTON_MASS
 from beamfit.studies.scan.setpoint import Beam, Target, find_setpoint
 
 # Appendix D, in SI.
@@ -52,6 +56,19 @@ def test_a_limit_is_kept_and_said(gtf):
     assert (found.status.value, found.limits) == ("at_limit", ("Q2",))
     assert "Q2 at a limit" in found.message
     assert found.setting_error == {"Q2": None}
+
+
+def test_a_minimum_on_a_limit_is_listed_once():
+    """Searches end beside the limit until they are sharpened: it was named as its own rival."""
+    quads = Quadrupole("QF", 0.25, 2.1), Drift("D1", 0.5), Quadrupole("QD", 0.25, -2.1)
+    line = Beamline((*quads, Drift("D2", 3.0), Screen("W")), energy=1098.27, mass=PROTON_MASS)
+    beam = Beam(np.array([2.913e-6, -2.463e-7, 1.046e-7]))
+    limits = {"QF": (0.0, 5.25), "QD": (-5.25, 0.0)}
+    found = find_setpoint(line, {"x": beam}, limits, [Target("match", "x", (5.0, 0.0))])
+    assert found.best.settings["QD"] == 0.0
+    listed = [list(each.settings.values()) for each in (found.best, *found.others)]
+    gaps = [np.ptp([one, other], axis=0).max() for one, other in combinations(listed, 2)]
+    assert all(gap > 1e-2 for gap in gaps)
 
 
 def test_the_errors_are_those_of_moved_beams(gtf):

@@ -267,12 +267,17 @@ def _search(stated: Problem, seed: int) -> tuple[list[tuple[np.ndarray, float]],
     for i in order[found.rested[order]]:
         if len(minima) == MOST_MINIMA:
             break
-        if all(np.abs(ends[i] - theta).max() > 2.0 * SAME for theta, _ in minima):
+        if _apart(ends[i], minima):
             _, end = search(stated, ends[i], STEPS)
-            # Where a search got stuck is no minimum.
-            if end.kkt.worst <= TOLERANCE:
+            # Where a search got stuck is no minimum, and one that it only now reaches may be known.
+            if end.kkt.worst <= TOLERANCE and _apart(end.theta, minima):
                 minima.append((end.theta, 2.0 * end.cost))
     return minima, fit
+
+
+def _apart(theta: np.ndarray, minima: Sequence[tuple[np.ndarray, float]]) -> bool:
+    """Whether settings are none of those found."""
+    return all(np.abs(theta - known).max() > 2.0 * SAME for known, _ in minima)
 
 
 @partial(jax.jit, compiler_options=SELDOM)
