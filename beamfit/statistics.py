@@ -16,6 +16,8 @@ POOR_FIT = 1e-3
 OPEN = 3.0
 # Points that say what is usual: the first so many, half of them if there are fewer.
 BASELINE, FEWEST = 20, 3
+# Below so many degrees of freedom Student's distribution is told in words.
+MANY = 8
 # Mean range of two normal numbers, and the degrees of freedom of each moving range.
 RANGE, RANGE_DOF = 1.128, 0.62
 # One point in 370 of a normal distribution lies beyond 3 standard deviations to either side.
@@ -150,6 +152,22 @@ def reach_of(dof: float) -> float:
     (4.3, 1.96)
     """
     return float(stdtrit(dof, 0.975)) if 0 < dof < math.inf else NORMAL_REACH
+
+
+def few_words(rests_on: float) -> str:
+    """Say how far errors reach that rest on few degrees of freedom.
+
+    Examples
+    --------
+    >>> few_words(2.0)
+    '; errors rest on 2 degrees of freedom: 95 % of answers lie within 4.3 of them'
+    """
+    if not 0 < rests_on < MANY:
+        return ""
+    return (
+        f"; errors rest on {rests_on:.3g} degrees of freedom: 95 % of answers lie within "
+        f"{reach_of(rests_on):.1f} of them"
+    )
 
 
 def baseline(count: int) -> int:

@@ -16,7 +16,7 @@ from beamfit.studies.decay.checks import (
     moving_lifetime,
     single_exponential,
 )
-from beamfit.studies.decay.fit import fit_decay, fit_decays
+from beamfit.studies.decay.fit import DecayFit, fit_decay, fit_decays
 from beamfit.studies.decay.model import padded, solve_decay
 from beamfit.studies.decay.record import DecayRecord
 
@@ -324,3 +324,21 @@ def test_averaging_neighbours_costs_the_law_nothing(monkeypatch):
     for quantity, value in zip(fit.lifetimes.lifetime, true, strict=True):
         assert abs(quantity.value - value) < 4 * quantity.error
         assert quantity.relative < 1e-3
+
+
+def few_readings(seed: int, count: int = 5) -> DecayFit:
+    """A decay of 10 h over 20 minutes, seen to 1 mA, without errors."""
+    time = np.linspace(0.0, 1200.0, count)
+    noise = np.random.default_rng(seed).standard_normal(count)
+    return fit_decay(DecayRecord(time, 200.0 * np.exp(-time / 36000.0) + noise))
+
+
+def test_few_residuals_do_not_refute_a_law():
+    """Of 5 noisy readings 7 % had a step, a rejected constant a (p = 1e-10) or a negative a."""
+    found = [few_readings(seed).status for seed in range(60)]
+    assert found.count(Status.unidentified) >= 59
+
+
+def test_few_residuals_are_said_to_tell_the_noise_badly():
+    assert "95 % of answers lie within 4.3 of them" in few_readings(1).message
+    assert "degrees of freedom" not in few_readings(1, 20).message

@@ -91,6 +91,8 @@ def by_independent_noise(record: DecayRecord, solution: Solution) -> ConstantA:
     exponent, error = float(solution.values.exponent), float(solution.errors.exponent)
     over, dof = 1.0 if record.error is None else record.error, max(len(record) - 4, 1)
     left = float(solution.sum_squares) - float(solution.fall)
+    if left <= 0.0:  # what a straight line from here promises is more than there is
+        left = float(power_law(record).sum_squares)
     unit = max(left / dof, float(np.mean((EXACT * record.current / over) ** 2)))
     whole = error * math.sqrt(unit if record.error is None else max(unit, 1.0))
     chance = 2 * stdtr(dof, -abs(exponent) / whole)

@@ -134,6 +134,11 @@ class Weighed:
         """A value and its error."""
         return self.told(name)[:2]
 
+    def sure(self, name: str) -> tuple[float, float]:
+        """A value, and the error of a normal number that reaches as far: few residuals count."""
+        value, *_, reach = self.told(name)
+        return value, reach / NORMAL
+
     def quantity(self, name: str, known: bool) -> Quantity:
         """I0, a or b; without an error where it is not determined."""
         value, error, raw, reach = self.told(name)
@@ -151,7 +156,7 @@ class Weighed:
         rate, error, raw, reach = self.told(name)
         if not rate > 0:
             return Quantity(math.nan, None, "h")
-        if not (known and error < DETERMINED * rate):
+        if not (known and reach / NORMAL < DETERMINED * rate):
             return Quantity(1 / rate / HOUR, None, "h")
         interval = tuple(1 / max(rate + sign * reach, 1e-300) / HOUR for sign in (1, -1))
         error, raw = (part / rate**2 / HOUR for part in (error, raw))
@@ -160,7 +165,7 @@ class Weighed:
     @property
     def determined(self) -> bool:
         """Whether the loss rate at the mean current is clear of zero."""
-        rate, error = self.scaled("rate_mean")
+        rate, error = self.sure("rate_mean")
         return error < DETERMINED * rate
 
     @cached_property
@@ -171,7 +176,7 @@ class Weighed:
         length, usual = self.correlation_time, float(np.median(np.diff(self.time)))
         alike = 0.0 if length is None else (1.0 - self.white) * math.exp(-usual / length)
         return Separability(
-            separable=finite and error < SEPARABLE,
+            separable=finite and self.sure("share")[1] < SEPARABLE,
             share=share if finite else None,
             share_error=error if finite else None,
             correlation=self.correlation if math.isfinite(self.correlation) else None,
@@ -180,9 +185,7 @@ class Weighed:
         )
 
     def widened(self, about: Expansion, changes: Sequence[np.ndarray]) -> Self:
-        """With what moves all readings together as a part of the errors; `changes` of the readings
-        are over their errors.
-        """
+        """With what moves all readings together, over their errors, as a part of the errors."""
         if not len(changes):
             return self
         moved = np.linalg.norm([about.moved(change) for change in changes], axis=0)
@@ -349,7 +352,7 @@ class Evidence(Weighed):
         """Whether the record contradicts constant a and b, or shows values that no beam has."""
         if self.changed or self.constant_a.status is Status.poor_fit:
             return True
-        return any(value < -BELIEVED * error for value, error in map(self.scaled, "ab"))
+        return any(value < -BELIEVED * error for value, error in map(self.sure, "ab"))
 
     @cached_property
     def about(self) -> Expansion:
@@ -358,9 +361,7 @@ class Evidence(Weighed):
 
     @cached_property
     def bent(self) -> Physical | None:
-        """What bunches that lengthen with the current would have added to the values, where the
-        record would not show them and b moves by more than its error.
-        """
+        """What unseen bunches that lengthen with the current would have added, beyond b's error."""
         seen = FOUND * (self.constant_a.exponent.error or math.inf) < -LENGTHENING
         if self.shape is not None or seen or self.refuted or not self.separability.separable:
             return None
@@ -371,9 +372,8 @@ class Evidence(Weighed):
     @cached_property
     def lifetimes(self) -> LifetimeLaw | None:
         """The lifetime by current, where a constant a is refuted and it is the current's doing."""
-        if self.constant_a.status is not Status.poor_fit or self.outgassing is not None:
-            return None
-        if self.shape is not None or self.record.gauge is not None:
+        plain = self.shape is None and self.record.gauge is None
+        if not plain or self.constant_a.status is not Status.poor_fit or self.outgassing:
             return None
         return lifetime_law(self.record, self.memory is not None)
 

@@ -376,7 +376,7 @@ def _judged(
 ) -> DecayFit:
     """Turn a solution into quantities, a status and its sentence."""
     evidence = Evidence.of(record, solution, shape)
-    rate, error = evidence.scaled("rate_mean")
+    rate, error = evidence.sure("rate_mean")
     if rate < -BELIEVED * error:
         first, last = record.current[0], record.current[-1]
         expected = "a decay; cut out refills with split_record"

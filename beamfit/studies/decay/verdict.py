@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from beamfit.lifetime.decay import HOUR
-from beamfit.statistics import POOR_FIT, chi2_probability
+from beamfit.statistics import MANY, POOR_FIT, chi2_probability, few_words
 from beamfit.status import Status
 from beamfit.studies.decay.departures import Change, ConstantA, LifetimeLaw
 from beamfit.studies.decay.evidence import (
@@ -70,6 +70,8 @@ class TableEvidence(NamedTuple):
         """A value and its error."""
         return self.numbers[name]
 
+    sure = scaled
+
 
 def _lost(e: Evidence) -> Finding | None:
     if bool(e.solution.converged):
@@ -79,7 +81,7 @@ def _lost(e: Evidence) -> Finding | None:
 
 
 def _within_noise(e: Evidence) -> Finding | None:
-    rate, error = e.scaled("rate_mean")
+    rate, error = e.sure("rate_mean")
     if e.separability.separable or error <= DETERMINED * abs(rate):
         return None
     # A rate below zero by chance is no reason for a longer lifetime than that of a rate of zero.
@@ -94,6 +96,9 @@ def _within_noise(e: Evidence) -> Finding | None:
 def _stepped(e: Evidence) -> Finding | None:
     """A step or spike in the record, whether or not its errors are known."""
     record, change = e.record, np.diff(e.residuals)
+    # Of fewer residuals the middle one is small by chance in several records of a hundred.
+    if e.noise_inferred and e.dof < MANY:
+        return None
     usual = 1.4826 * float(np.median(np.abs(change)))
     floor = max(record.resolution or 0.0, 1e-12 * float(record.current.max()))
     largest = int(np.argmax(np.abs(change)))
@@ -108,10 +113,10 @@ def _stepped(e: Evidence) -> Finding | None:
 
 
 def _negative(name: str, cause: str, e: Weighed | TableEvidence) -> Finding | None:
-    value, error = e.scaled(name)
+    value, error = e.sure(name)
     if not (value < -BELIEVED * error and value < 0):
         return None
-    cause = _explained(e) or cause
+    cause, (_, error) = _explained(e) or cause, e.scaled(name)
     return Finding(Status.infeasible, f"{name} is negative by {-value / error:.1f} errors; {cause}")
 
 
@@ -168,7 +173,7 @@ def _improbable(e: Weighed | TableEvidence, remedy: str = "") -> Finding | None:
 
 def _determined(e: Weighed | TableEvidence) -> Finding:
     """Each of the two by itself: one that is small is known to be so, but is not told from zero."""
-    found = {name: e.scaled(name) for name in "ab"}
+    found = {name: e.sure(name) for name in "ab"}
     small = {n: (v, error) for n, (v, error) in found.items() if not error < DETERMINED * v}
     if not small:
         return Finding(Status.converged, "a and b are determined")
@@ -247,7 +252,7 @@ def _one_current(e: Weighed) -> Finding | None:
 
 
 def _rises(e: Weighed) -> Finding | None:
-    rate, error = e.scaled("rate_mean")
+    rate, error = e.sure("rate_mean")
     if rate > -BELIEVED * error:
         return None
     cause = "The current rises, by injection or a drift of the monitor: this is no decay"
@@ -275,6 +280,12 @@ def _noise_inferred(e: Weighed) -> str | None:
         return None
     noise = f"{e.noise:.3g} mA rms is inferred from the residuals"
     return f"The record gives no errors; {noise}"
+
+
+def _few(e: Evidence) -> str | None:
+    """How far errors reach that few residuals tell."""
+    said = few_words(e.dof) if e.noise_inferred and e.memory is None else ""
+    return said.removeprefix("; ").capitalize() or None
 
 
 def _correlated(e: Evidence) -> str | None:
@@ -368,7 +379,7 @@ def _odd_clock(e: Evidence) -> str | None:
     )
 
 
-REMARKS = (_moved, _noise_inferred, _cautious, _correlated)
+REMARKS = (_moved, _noise_inferred, _few, _cautious, _correlated)
 REMARKS += (_wandering, _quantised, _drifting, _odd_clock)
 
 

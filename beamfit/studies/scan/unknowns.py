@@ -19,7 +19,7 @@ from beamfit.greybox.fit import Derived, Fit
 from beamfit.greybox.problem import Problem
 from beamfit.greybox.solve import solve
 from beamfit.optics.beamline import Beamline
-from beamfit.statistics import POOR_FIT, scaled_directions
+from beamfit.statistics import POOR_FIT, few_words, scaled_directions
 from beamfit.status import Status
 from beamfit.studies.scan.assumptions import Anchor, Assumptions
 from beamfit.studies.scan.judged import SIGMA, Answer, plane_fit, units_of
@@ -35,7 +35,7 @@ from beamfit.studies.scan.results import Parameter, PlaneFit, Points
 from beamfit.studies.scan.statement import Scenario, Seen, asked_in, size_record, size_records
 from beamfit.studies.scan.systematics import effects_of
 from beamfit.studies.scan.transport import Look
-from beamfit.studies.scan.verdict import CLEAR, cause_of, few_words
+from beamfit.studies.scan.verdict import CLEAR, cause_of
 from beamfit.verdict import Finding, judge
 
 

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from beamfit.statistics import POOR_FIT, one_sided_probability, reach_of
+from beamfit.statistics import POOR_FIT, few_words, one_sided_probability
 from beamfit.status import Status
 from beamfit.studies.scan.outliers import Influence
 from beamfit.verdict import Finding
@@ -25,8 +25,6 @@ CHANCE = 2e-3
 LOST = 0.15
 # A robust fit must keep this many degrees of freedom, and may doubt this share of the points.
 ROBUST_DOF, DOUBTED = 4, 0.2
-# Below so many degrees of freedom Student's distribution is told in words.
-MANY = 8
 # Sizes answer a magnet if a constant size is less likely than this.
 CONSTANT = 0.01
 # Above this probability of χ² the errors are overstated.
@@ -278,22 +276,6 @@ def _carried(e: Evidence) -> str:
     return (
         f"; it rests on the point at {point}: without it the emittance is {abs(shift):.1f} errors "
         f"{more}"
-    )
-
-
-def few_words(rests_on: float) -> str:
-    """Say how far errors reach that rest on few degrees of freedom.
-
-    Examples
-    --------
-    >>> few_words(2.0)
-    '; errors rest on 2 degrees of freedom: 95 % of answers lie within 4.3 of them'
-    """
-    if not 0 < rests_on < MANY:
-        return ""
-    return (
-        f"; errors rest on {rests_on:.3g} degrees of freedom: 95 % of answers lie within "
-        f"{reach_of(rests_on):.1f} of them"
     )
 
 
