@@ -13,7 +13,7 @@ from beamfit.errors import InputError
 from beamfit.io.archive import archive_sheet
 from beamfit.io.files import name_of
 from beamfit.io.headers import spelled
-from beamfit.io.monitor import offset_of
+from beamfit.io.monitor import FEWEST, offset_of
 from beamfit.io.record_columns import dated, known, record_columns, taken_for_current
 from beamfit.io.scan_columns import is_size
 from beamfit.io.sheet import DATE, Column, Sheet, columns_of, left_out
@@ -162,9 +162,10 @@ def _record(
             option = f"'{example}' in the header, or --{quantity} COLUMN:UNIT"
             found = f"no column of {quantity} among {', '.join(sheet.names)}"
             raise sheet.header_error(found, option)
-    if skip_bad:
-        sheet = sheet.good(lambda rows: _check_alone(rows, columns, offset is None))
     notes = taken_for_current(columns) if current is None else ()
+    if skip_bad:
+        whole, sheet = sheet, sheet.good(lambda rows: _check_alone(rows, columns, offset is None))
+        notes += _below_zero(whole, columns) if offset is None else ()
     moment = _moments(sheet, columns)
     if moment.size > 2 and moment[0] > moment[-1] and np.all(np.diff(moment) <= 0):
         notes += ("The rows stand newest first, and were read in order of time.",)
@@ -251,6 +252,21 @@ def _check_alone(sheet: Sheet, columns: Mapping[str, Column], positive: bool) ->
         if key == "current" and positive:
             found = "a negative current, {:.6g} mA"
             sheet.refuse(column.header, values < 0, "zero or more", found, values)
+
+
+def _below_zero(sheet: Sheet, columns: Mapping[str, Column]) -> tuple[str, ...]:
+    """What readings below zero, which are left out, say of those that stay, as a note."""
+    values = _values(
+        sheet.good(lambda rows: _check_alone(rows, columns, False)), columns["current"]
+    )
+    below = values[values < 0]
+    if below.size < FEWEST:
+        return ()
+    return (
+        f"{below.size} readings are below zero, {np.median(below):.3g} mA in the middle: what the "
+        "monitor reads without beam is in the others too, and of noise about zero half is left. "
+        "Take it off with --offset zero-beam instead.",
+    )
 
 
 def _forward(
