@@ -42,6 +42,8 @@ class Quantity:
     (-1.96, 1.96)
     >>> print(Quantity(4.1e-8, None, "m"))
     41 nm (not determined)
+    >>> print(Quantity(-1e-9, 2.0, "MeV/m²"))
+    0.0 ± 2.0 MeV/m²
     """
 
     value: float
@@ -101,12 +103,13 @@ class Quantity:
         if self.error is None or not math.isfinite(self.error):
             return f"{value:.3g}{end} (not determined)"
         error = self.error / factor
-        places = 3 if error == 0 else 1 - math.floor(math.log10(error))
+        places, power = 3 if error == 0 else 1 - math.floor(math.log10(error)), 0
         if abs(value) < 1e-3 or max(abs(value), error) >= 1e5:
             power = math.floor(math.log10(max(abs(value), error) or 1.0))
             value, error, places = value / 10**power, error / 10**power, places + power
-            return f"({value:.{max(places, 0)}f} ± {error:.{max(places, 0)}f})e{power:+03d}{end}"
-        return f"{value:.{max(places, 0)}f} ± {error:.{max(places, 0)}f}{end}"
+        value, digits = round(value, max(places, 0)) + 0.0, f".{max(places, 0)}f"  # no -0.0
+        said = f"{value:{digits}} ± {error:{digits}}"
+        return f"({said})e{power:+03d}{end}" if power else f"{said}{end}"
 
     def __repr__(self) -> str:
         return f"<Quantity {self}>"

@@ -103,9 +103,10 @@ def of_lattice(file: LatticeFile) -> list[Fact]:
     length = sum(map(_length, file.elements))
     listed = ", ".join(f"{n} {kind.replace('_', ' ')}" for kind, n in kinds.items())
     energy = {"value": file.energy, "unit": "MeV", "particle": file.particle}
+    plural = "" if file.particle.endswith("-") else "s"
     facts = [
         Fact("name", file.name, file.name),
-        Fact("energy", f"{file.energy:.6g} MeV total, {file.particle}s", energy),
+        Fact("energy", f"{file.energy:.6g} MeV total, {file.particle}{plural}", energy),
         Fact("elements", listed, dict(kinds)),
         Fact("length", f"{length:.6g} m", length),
     ]

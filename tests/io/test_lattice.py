@@ -383,7 +383,7 @@ def test_gradient_tables_that_cannot_be_used(quadrupole, words, tmp_path):
         read_lattice(in_lattice(tmp_path, quadrupole))
 
 
-@pytest.mark.parametrize("particle", ["electron", "proton"])
+@pytest.mark.parametrize("particle", ["electron", "proton", "H-", "deuteron"])
 def test_momentum_and_kinetic_energy_of_the_lattice(particle, tmp_path):
     rest = REST_ENERGY[particle]
     total = rest + 70.0
