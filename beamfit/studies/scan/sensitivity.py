@@ -42,6 +42,8 @@ from beamfit.studies.scan.transport import Rows, padded
 MOST_POINTS = 50
 # A relative change of an emittance below this is rounding.
 ROUNDING = 1e-12
+# From this share of rest energy on, total and kinetic energy are told apart.
+SLOW = 0.1
 # Nobody reads a budget of more causes than this, nor of smaller changes.
 MOST_CAUSES, SMALLEST = 30, 5e-4
 # Steps of the budget: resolution and dispersion in m, and a momentum spread where none is stated.
@@ -137,15 +139,22 @@ def systematics(fit: EmittanceFit, plane: str) -> list[Change]:
         cause, step = _cause(fit, element)
         if cause and (cause in changes or element.name in upstream):
             changes[cause] = changes.get(cause, 0.0) + step * float(slope)
-    changes["energy +1 %"] = 0.01 * float(by_energy)
+    energy, mass = fit.seen.energy, fit.line.mass
+    changes[of_energy := _energy_cause(energy, mass)] = 0.01 * float(by_energy)
     changes |= _of_screen(fit, p, np.asarray(by_known)[keep])
     # ln βγ rises by E²/(E² - m²) for each relative step of the energy.
-    energy = fit.seen.energy
-    stiffer = 0.01 * energy**2 / (energy**2 - fit.line.mass**2)
+    stiffer = 0.01 * energy**2 / (energy**2 - mass**2)
     # What is zero but for rounding is zero, and keeps its place.
     whole = {cause: d if abs(d) > ROUNDING else 0.0 for cause, d in changes.items()}
-    found = [Change(c, d, d + stiffer * (c == "energy +1 %")) for c, d in whole.items()]
+    found = [Change(c, d, d + stiffer * (c == of_energy)) for c, d in whole.items()]
     return sorted(found, key=lambda change: -abs(change.normalized_emittance))
+
+
+def _energy_cause(energy: float, mass: float) -> str:
+    """A step of the energy in words: of slow particles whose energies are called kinetic, both."""
+    if mass < SLOW * energy:
+        return "energy +1 %"
+    return f"total energy +1 % (kinetic +{energy / (energy - mass):.2g} %)"
 
 
 def _by_element(
