@@ -21,14 +21,13 @@ KEEP = {
     "jax_persistent_cache_min_entry_size_bytes": (0, -1),
 }
 
-# XLA's older way to emit fused loops and LLVM's lowest level of optimisation compile in a third of
-# the time, and what they make is as quick but for thousands of searches in one call, 15 % slower
-# (docs/design.md). XLA ends a process that names a flag it does not know: only where it was tried.
-QUICK = {"xla_cpu_use_fusion_emitters": "false", "xla_backend_optimization_level": "1"}
-TRIED = "0.10."
+# XLA's older way to emit fused loops compiles in half the time, and what it makes is as quick but
+# for thousands of searches in one call, 15 % slower (docs/design.md). XLA ends a process that names
+# a flag it does not know: only where it was tried.
+QUICK, TRIED = "xla_cpu_use_fusion_emitters", "0.10."
 
-# For `jax.jit` of a program that runs a few times on small arrays, where no optimisation at all is
-# no slower: it is compiled in half the time. No other compiled function can call such a one.
+# For `jax.jit` of a program that runs a few times on small arrays, where it is no slower: it is
+# compiled in half the time. No other compiled function can call such a one.
 SELDOM = {"xla_backend_optimization_level": 0}
 
 # Functions of JAX that read, pack and unpack what is kept.
@@ -52,9 +51,8 @@ def prepare_jax() -> None:
     import jax
 
     flags = os.environ.get("XLA_FLAGS", "")
-    own = [f"--{name}={value}" for name, value in QUICK.items() if name not in flags]
-    if jax.__version__.startswith(TRIED) and own:
-        os.environ["XLA_FLAGS"] = " ".join([*flags.split(), *own])
+    if jax.__version__.startswith(TRIED) and QUICK not in flags:
+        os.environ["XLA_FLAGS"] = f"{flags} --{QUICK}=false".strip()
     # Emittances are differences of products of order 1e-8: single precision has no digits left.
     jax.config.update("jax_enable_x64", True)
     for name, (usual, ours) in KEEP.items():
