@@ -26,9 +26,9 @@ settings.register_profile("beamfit", deadline=None, max_examples=40, derandomize
 settings.load_profile("beamfit")
 
 ROOT = Path(__file__).resolve().parents[1]
-# JAX keeps every program it compiled; past this many MB they are dropped between two modules.
+# JAX keeps every program it compiled; past this many MB they are dropped between two tests.
 # Those that are needed again come from the cache on disk.
-MOST_MEMORY = 1200
+MOST_MEMORY = 1400
 
 
 def resident():
@@ -40,15 +40,15 @@ def resident():
 
 
 class _Programs:
-    """Drops programs after the last test of a module, of the examples in beamfit, too."""
+    """Drops programs between two tests; as a fixture it would not see the examples in beamfit."""
 
-    def pytest_runtest_teardown(self, item, nextitem):
-        if (nextitem is None or nextitem.path != item.path) and resident() > MOST_MEMORY:
+    def pytest_runtest_teardown(self):
+        if resident() > MOST_MEMORY:
             import jax
 
             jax.clear_caches()
             gc.collect()
-            # What is freed is given back, or every module after this one would drop its own, too.
+            # What is freed is given back, or every test after this one would drop its own, too.
             if trim := getattr(ctypes.CDLL(None), "malloc_trim", None):
                 trim(0)
 
