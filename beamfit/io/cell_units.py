@@ -7,7 +7,15 @@ from collections.abc import Sequence
 from os import PathLike
 
 from beamfit.errors import InputError
-from beamfit.io.headers import NUMBER, is_number, spelled, unit_at_end, unit_behind
+from beamfit.io.headers import (
+    NUMBER,
+    is_number,
+    named,
+    plain_unit,
+    spelled,
+    unit_at_end,
+    unit_behind,
+)
 
 # Columns of words, of which one may look so: a screen 2A.
 WORDS = re.compile(r"(screen|slice|note|comment|remark).*", re.IGNORECASE)
@@ -44,13 +52,13 @@ def without_units(
     """
     names, changed = list(names), None
     for i, name in enumerate(names):
-        own = unit_at_end(re.sub("[µμ]", "u", spelled(name)))
+        own = unit_at_end(plain_unit(spelled(name)))
         unit = own or unit_behind(next((row[i] for row in rows if row[i]), ""))
         said = [unit_behind(row[i]) for row in rows] if unit and not WORDS.match(name) else ()
         if unit is None or unit not in said:
             continue
         changed = changed or [list(row) for row in rows]
-        names[i] = name if own else re.sub(r"\s+", "_", f"{name}_{unit}")
+        names[i] = name if own else named(name, unit)
         for row, its, line in zip(changed, said, lines, strict=True):
             if its == unit:
                 row[i] = NUMBER.fullmatch(row[i])[1]

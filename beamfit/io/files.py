@@ -44,6 +44,8 @@ UNLIKE = (ArithmeticError, AttributeError, LookupError, RecursionError, TypeErro
 # SHA-256 of what was last read whole, by path: a file may change after that.
 _READ: dict[str, str] = {}
 MOST_KEPT = 10_000
+# Lines of a file, each with its number.
+Numbered = Iterator[tuple[int, str]]
 
 
 @lru_cache(maxsize=8)

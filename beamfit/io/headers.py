@@ -61,6 +61,16 @@ def known_unit(text: str) -> str | None:
     return text if text in KNOWN else ALSO.get(text)
 
 
+def plain_unit(text: str) -> str:
+    """A unit, or a name that ends with one, with u for either letter µ."""
+    return re.sub("[µμ]", "u", text)
+
+
+def named(name: str, unit: str) -> str:
+    """The name of a column with its unit behind it, without blanks."""
+    return re.sub(r"\s+", "_", f"{name}_{unit}")
+
+
 def unit_behind(cell: str) -> str | None:
     """The unit behind the number of a cell, as the names of columns have it.
 
@@ -70,7 +80,7 @@ def unit_behind(cell: str) -> str | None:
     ('um', 'A', None, None)
     """
     found = None if cell[-1:].isdigit() else NUMBER.fullmatch(cell)
-    return known_unit(re.sub("[µμ]", "u", found[2])) if found else None
+    return known_unit(plain_unit(found[2])) if found else None
 
 
 @lru_cache(maxsize=4096)  # a year's files have the headers of the first
@@ -87,14 +97,14 @@ def spelled(header: str) -> str:
     if (found := BRACKETS.fullmatch(header)) and found[1]:
         name, unit = found[1], next(part for part in found.groups()[1:] if part is not None)
         if (known := known_unit(unit)) is not None:
-            return re.sub(r"\s+", "_", f"{name.strip().removesuffix(f'_{known}')}_{known}")
+            return named(name.strip().removesuffix(f"_{known}"), known)
     if header.endswith(ENDS):
         return header
     for unit, known in ALSO.items():
         if re.search(rf"[\s_]{re.escape(unit)}$", header):
-            return re.sub(r"\s+", "_", header[: -len(unit) - 1]) + f"_{known}"
-    if (found := APART.fullmatch(header)) and known_unit(found[2]):
-        return re.sub(r"\s+", "_", f"{found[1]}_{known_unit(found[2])}")
+            return named(header[: -len(unit) - 1], known)
+    if (found := APART.fullmatch(header)) and (known := known_unit(found[2])):
+        return named(found[1], known)
     words = header.split()
     return "_".join(words) if len(words) > 1 and words[-1] in KNOWN else header
 
@@ -147,10 +157,10 @@ def with_units(names: Sequence[str], cells: Sequence[str]) -> list[str] | None:
     found = []
     for name, unit in zip(names, units, strict=True):
         own = unit_at_end(spelled(name))
-        if own and unit and re.sub("[µμ]", "u", own) != re.sub("[µμ]", "u", unit):
+        if own and unit and plain_unit(own) != plain_unit(unit):
             expected = "one unit, in the header or below it"
             raise InputError(f"'{unit}' below a header in {own}", expected, column=name)
-        found.append(name if own or unit is None else re.sub(r"\s+", "_", f"{name}_{unit}"))
+        found.append(name if own or unit is None else named(name, unit))
     return found
 
 

@@ -8,17 +8,17 @@ file, one for the channels, each up to ***End_of_Header***; the names of the col
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from os import PathLike
 
 from beamfit.errors import InputError
+from beamfit.io.files import Numbered
 from beamfit.io.headers import known_unit
 
 SIGNATURE = "LabVIEW Measurement"
 END = "***End_of_Header***"
 # Lines that both blocks may have.
 LONGEST = 500
-Numbered = Iterator[tuple[int, str]]
 
 
 def labview_head(

@@ -8,12 +8,11 @@ Postprocessors", PAC 1995, and the SDDS manual of the APS (ops.aps.anl.gov/manua
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
 from itertools import islice, takewhile
 from os import PathLike
 
 from beamfit.errors import InputError
-from beamfit.io.files import LONGEST_LINE
+from beamfit.io.files import LONGEST_LINE, Numbered
 
 SIGNATURE = "SDDS"
 COMMAND = re.compile(r"\s*&(\w+)\b((?:\"(?:\\.|[^\"\\])*\"|[^\"])*?)&end", re.DOTALL)
@@ -23,7 +22,6 @@ SHIFTS = {"$a": "^", "$b": "", "$n": "", "$e": ""}
 # Lines that a header may have.
 LONGEST = 5000
 TABLE = "columns, a row a line; sdds2spreadsheet writes such a table"
-Numbered = Iterator[tuple[int, str]]
 
 
 def sdds_head(

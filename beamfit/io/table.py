@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import itertools
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from os import PathLike
 from pathlib import Path
@@ -15,7 +15,7 @@ from beamfit.errors import InputError, located
 from beamfit.io import labview, sdds
 from beamfit.io.cell_units import without_units
 from beamfit.io.commas import with_points
-from beamfit.io.files import digest, text_lines
+from beamfit.io.files import Numbered, digest, text_lines
 from beamfit.io.hdf5 import hdf5_columns
 from beamfit.io.headers import (
     HEAD,
@@ -127,9 +127,7 @@ def _read_text(
             comments.append(bare(text))
         elif text.strip().strip(",;\t "):
             cells, wrong = _row(text, separator, path, line, len(names))
-            whole = len(cells) == len(names)
-            with located(path, line):
-                units = with_units(names, cells) if whole and not rows else None
+            units = None if rows or wrong else _units_below(names, cells, path, line)
             names = units or names
             if units or (rows and _is_again(cells, title, path, line)):
                 continue
@@ -138,8 +136,8 @@ def _read_text(
             if columns is not None:
                 lines = range(line, line + columns.shape[1])
                 break
-            (rows if whole else bad).append(cells if whole else wrong)
-            lines += [line] * whole
+            (bad if wrong else rows).append(wrong or cells)
+            lines += [] if wrong else [line]
             least = min(most, MOST_WORDS // max(1, len(names)))
             check_length(len(rows) + len(bad), least, path, line)
             if bad and not ragged:
@@ -157,7 +155,7 @@ def _read_text(
 
 def _head(
     path: str | PathLike[str], example: str, comments: list[str]
-) -> tuple[list[str], int, str, Iterator[tuple[int, str]]]:
+) -> tuple[list[str], int, str, Numbered]:
     """Names of the columns, their line, what separates them, and the lines below, numbered."""
     raw = text_lines(path)
     first = next(raw, "")
@@ -211,9 +209,11 @@ def header_of(path: str | PathLike[str]) -> list[str]:
     """The header of a file of text, as `read_sheet` finds it, with units that stand below."""
     names, _, separator, numbered = _head(path, "Q2_A,size_x_um", [])
     line, text = next((one for one in numbered if one[1].strip()), (0, ""))
-    cells = _row(text, separator, path, line, len(names))[0]
-    if len(cells) == len(names):
-        names = with_units(names, cells) or without_units(names, [cells], path, [line])[0]
+    cells, wrong = _row(text, separator, path, line, len(names))
+    if wrong is None:
+        names = (
+            _units_below(names, cells, path, line) or without_units(names, [cells], path, [line])[0]
+        )
     return [spelled(name) for name in names]
 
 
@@ -224,17 +224,26 @@ def _cells(path: str | PathLike[str], text: str, line: int = 1) -> list[str]:
 
 def _row(
     text: str, separator: str, path: str | PathLike[str], line: int, count: int
-) -> tuple[list[str], InputError]:
+) -> tuple[list[str], InputError | None]:
     """The cells of a row, and what is wrong with it if they are not so many."""
     try:
         cells = _without_blanks(_split(text, separator, path, line), count)
     except InputError as error:
         return [], error
+    if len(cells) == count:
+        return cells, None
     expected = f"{count}, as in the header"
     expected += "; what stands above it begins with #" if count == 1 else ""
     apart = {",": "commas", ";": "semicolons", "\t": "tabs", " ": "blanks"}[separator]
     expected += f", with {apart} between them" if len(cells) == 1 < count else ""
     return cells, InputError(f"{len(cells)} cells", expected, path=path, line=line)
+
+
+def _units_below(
+    names: list[str], cells: list[str], path: str | PathLike[str], line: int
+) -> list[str] | None:
+    with located(path, line):
+        return with_units(names, cells)
 
 
 def _is_again(cells: list[str], title: list[str], path: str | PathLike[str], line: int) -> bool:
