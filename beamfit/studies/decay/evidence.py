@@ -156,17 +156,16 @@ class Weighed:
         rate, error, raw, reach = self.told(name)
         if not rate > 0:
             return Quantity(math.nan, None, "h")
-        if not (known and reach / NORMAL < DETERMINED * rate):
+        if not (known and self.is_clear(name)):
             return Quantity(1 / rate / HOUR, None, "h")
         interval = tuple(1 / max(rate + sign * reach, 1e-300) / HOUR for sign in (1, -1))
         error, raw = (part / rate**2 / HOUR for part in (error, raw))
         return Quantity(1 / rate / HOUR, error, "h", raw, interval)
 
-    @property
-    def determined(self) -> bool:
-        """Whether the loss rate at the mean current is clear of zero."""
-        rate, error = self.sure("rate_mean")
-        return error < DETERMINED * rate
+    def is_clear(self, name: str) -> bool:
+        """Whether a value is clear of zero."""
+        value, error = self.sure(name)
+        return error < DETERMINED * value
 
     @cached_property
     def separability(self) -> Separability:
@@ -174,6 +173,7 @@ class Weighed:
         share, error = self.scaled("share")
         finite = math.isfinite(share) and math.isfinite(error)
         length, usual = self.correlation_time, float(np.median(np.diff(self.time)))
+        told = length is None or self.is_clear("rate_mean")
         alike = 0.0 if length is None else (1.0 - self.white) * math.exp(-usual / length)
         return Separability(
             separable=finite and self.sure("share")[1] < SEPARABLE,
@@ -181,7 +181,7 @@ class Weighed:
             share_error=error if finite else None,
             correlation=self.correlation if math.isfinite(self.correlation) else None,
             residual_correlation=alike,
-            error_inflation=self.inflation if length is None or self.determined else None,
+            error_inflation=self.inflation if told else None,
         )
 
     def widened(self, about: Expansion, changes: Sequence[np.ndarray]) -> Self:
@@ -333,7 +333,7 @@ class Evidence(Weighed):
         plain = math.sqrt(float(self.solution.sum_squares) / self.dof)
         plain = plain if self.noise_inferred else max(plain, 1.0)
         # Of a loss rate that is not clear of zero the share of a says nothing.
-        names = ("rate_mean", "share")[: 1 + self.determined]
+        names = ("rate_mean", "share")[: 1 + self.is_clear("rate_mean")]
         enlarged, before = self.errors, self.solution.errors
         return max(getattr(enlarged, n) / getattr(before, n) for n in names) / plain
 

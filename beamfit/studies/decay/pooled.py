@@ -93,7 +93,8 @@ class PooledEvidence(Weighed):
         given, parameters = float(pool.cycles.error is not None), pool.level.size + 2
         known = None if is_correlated(pool.left[:, 3], parameters) else 0.0
         seen = _whitened(pool, known)
-        held, plain = seen.memory(2), _whitened(pool, 0.0).memory(2)
+        held = seen.memory(2)
+        plain = held if known == 0.0 else _whitened(pool, 0.0).memory(2)
         values, slopes = _slopes(pool)
         moved = held.moments(slopes[:, :2], given)
         raw = np.linalg.norm(slopes[:, :2] @ plain.half[0], axis=1)
@@ -215,7 +216,7 @@ class PooledEvidence(Weighed):
         x = np.geomspace(*self.currents, CURRENTS) / pool.mean
         rates, slopes = power_rates(pool.theta, pool.unit, x)
         slopes = np.vstack([slopes, np.eye(3)[2]])[:, :numbers]
-        memory = _whitened(pool, self.known).memory(3) if refuted else self.held
+        memory = _whitened(pool, self.known).memory() if refuted else self.held
         errors = memory.moments(slopes, float(not self.noise_inferred)).error
         exponent = Quantity(float(pool.theta[2]), float(errors[-1]) if refuted else None, "1")
         return LifetimeLaw.of(x * pool.mean, rates, errors[:-1], exponent)
