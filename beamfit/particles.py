@@ -3,7 +3,7 @@
 from typing import Any
 
 REST_ENERGY = {"electron": 0.51099895069, "positron": 0.51099895069, "proton": 938.27208943}
-REST_ENERGY |= {"antiproton": 938.27208943, "H-": 939.294073, "deuteron": 1875.612945}
+REST_ENERGY |= {"antiproton": REST_ENERGY["proton"], "H-": 939.294073, "deuteron": 1875.612945}
 """MeV, CODATA 2022 (NIST), all of one charge; H- is a proton and two electrons, less 14.35 eV."""
 ENERGY_KEYS = {"energy_MeV": "total", "kinetic_energy_MeV": "kinetic", "momentum_MeV": "momentum"}
 """How files say the energy of a beam, and what that is; a momentum is p c."""
