@@ -268,7 +268,10 @@ def _groups(
         kind = noise or ("inferred" if scale > 1 or not given else "known")
         if trusted or (given and not scale > 0):
             kind = "known"
-        groups.append(Group(label, kind, outliers and not trusted, record.prior_noise))
+        if record.name in stated.averaged:
+            kind = "averaged"
+        doubted = outliers and not trusted and kind != "averaged"
+        groups.append(Group(label, kind, doubted, record.prior_noise))
     return tuple(groups) or (Group("", noise or "known", outliers),)
 
 

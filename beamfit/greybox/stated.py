@@ -86,6 +86,9 @@ class Statement(NamedTuple):
     labels : mapping of str to str
         What stands for a record before the names of its noise; by default nothing if there is one
         record, else its name.
+    averaged : sequence of str
+        Records whose noise `log_volume` averages over, so that their residuals count only for the
+        first shape of the proposals.
     trusted : sequence of str
         Records whose errors are right, whatever the residuals show: anchors of a model.
     noise_unit : str
@@ -111,6 +114,7 @@ class Statement(NamedTuple):
     width: Mapping[str, float] = {}
     along: str = ""
     labels: Mapping[str, str] = {}
+    averaged: Sequence[str] = ()
     trusted: Sequence[str] = ()
     noise_unit: str = "1"
     priors_own: Sequence[str] = ()

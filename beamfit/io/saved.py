@@ -20,13 +20,14 @@ from beamfit.studies.scan.fit import EmittanceFit, scenario_of
 from beamfit.studies.scan.known import see
 from beamfit.writing import write_atomically
 
-FORMAT = "beamfit-fit-1"
+FORMAT = "beamfit-fit-2"
 HOW = "a file that beamfit.save_fit wrote"
 # What a file may hold, by where it is defined. A file names these and nothing else.
 SCAN, DECAY, OPTICS = "beamfit.studies.scan", "beamfit.studies.decay", "beamfit.optics"
 HELD = {
     "beamfit.quantity": "Quantity",
     "beamfit.status": "Status",
+    "beamfit.noise.model": "Noise Lognormal",
     f"{SCAN}.scans": "QuadScan Profile",
     f"{SCAN}.results": "PlaneFit Points Parameter ScreenTwiss Identifiability",
     f"{SCAN}.assumptions": "Anchor Assumptions Entry",
@@ -46,6 +47,7 @@ HELD = {
 }
 HOMES = {name: home for home, names in HELD.items() for name in names.split()}
 OWN = ("planes", "scan", "told", "parameters", "null_directions")
+HOW_SEEN = ("method", "noise", "weights")
 
 
 def save_fit(path: str | PathLike[str], fit: EmittanceFit | DecayFit) -> None:
@@ -83,7 +85,7 @@ def save_fit(path: str | PathLike[str], fit: EmittanceFit | DecayFit) -> None:
     elif fit.statement.closed:
         content = {name: _plain(getattr(fit, name)) for name in OWN}
         content["line"] = _plain(fit.seen.line)
-        content |= {name: getattr(fit.seen, name) for name in ("method", "robust", "weights")}
+        content |= {name: _plain(getattr(fit.seen, name)) for name in HOW_SEEN}
     else:
         found = f"a fit of scenario {fit.scenario}"
         raise InputError(found, "a fit of scenario known, or of a decay", path=path)
@@ -135,8 +137,7 @@ def _fit(kind: str, content: Any) -> EmittanceFit | DecayFit:
     own = {name: _value(content[name]) for name in OWN}
     line, statement = _value(content["line"]), scenario_of("known")
     planes = tuple(p.plane for p in own["planes"])
-    how = (planes, content["method"], content["robust"], content["weights"])
-    seen = see(own["scan"], line, *how, at_once=True)
+    seen = see(own["scan"], line, planes, *(_value(content[name]) for name in HOW_SEEN))
     return EmittanceFit(
         own.pop("planes"), own.pop("scan"), line, statement, own.pop("told"), seen, **own
     )

@@ -26,11 +26,11 @@ def average_shots(scan: QuadScan, *, marked: bool) -> QuadScan:
     Returns
     -------
     QuadScan
-        One row a setting. The error is the standard error of the mean, s/√n with n - 1 in s, and
-        ``shots`` says of how many, so that the fit can even out what few shots say by chance.
-        With fewer than three repeats in all the errors of the file stand, or there are none and
-        the fit infers them. Rows that are not said to be shots, and differ at one setting far
-        more than at the others, stay as they are.
+        One row a setting, with ``shot_size``, the shots themselves, for the fit. The error is the
+        standard error of the mean, s/√n with n - 1 in s, and ``shots`` says of how many. With
+        fewer than three repeats in all the errors of the file stand, or there are none and the fit
+        infers them. Rows that are not said to be shots, and differ at one setting far more than at
+        the others, stay as they are.
 
     Examples
     --------
@@ -55,11 +55,23 @@ def average_shots(scan: QuadScan, *, marked: bool) -> QuadScan:
             shots, mean_square = _means(scan.error[plane] ** 2, group)
             given[plane] = np.sqrt(mean_square / shots)
     first = np.unique(group, return_index=True)[1]
+    single = {p: _table_of(values, group) for p, values in scan.size.items() if p in scatter}
     said = "the scatter of the shots (standard error of the mean)" if scatter else "the file"
     # Errors that the file gives are not taken from these shots.
     means = {"size": size, "error": scatter | given, "shots": None if given else np.bincount(group)}
+    means["shot_size"] = single
     said = said if scatter or given else "none given"
     return replace(scan, **scan.columns_at(first) | means, error_source=said)
+
+
+def _table_of(values: np.ndarray, group: np.ndarray) -> np.ndarray:
+    """The shots of each setting in a row, NaN where it has fewer."""
+    order = np.argsort(group, kind="stable")
+    counts = np.bincount(group)
+    place = np.arange(len(group)) - np.repeat(np.cumsum(counts) - counts, counts)
+    table = np.full((len(counts), counts.max()), np.nan)
+    table[group[order], place] = values[order]
+    return table
 
 
 def _means(values: np.ndarray, group: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -81,10 +93,27 @@ def scatter_of(size: np.ndarray, group: np.ndarray) -> tuple[np.ndarray, np.ndar
 def _alike(size: np.ndarray, group: np.ndarray) -> bool:
     """Whether repeats scatter as if by one relative noise: the largest against all others by F."""
     from beamfit.statistics import POOR_FIT  # scipy, which most scans are read without
-    from beamfit.studies.scan.noise import outstanding
 
     mean, degrees, square = scatter_of(size, group)
-    return bool(outstanding(square / mean**2, degrees).min() > POOR_FIT)
+    return bool(_outstanding(square / mean**2, degrees).min() > POOR_FIT)
+
+
+def _outstanding(square: np.ndarray, degrees: np.ndarray) -> np.ndarray:
+    """How likely some setting scatters so much more than all others, by the F test of each.
+
+    Examples
+    --------
+    >>> _outstanding(np.array([4.0, 4.0, 400.0]), np.array([4.0, 4.0, 4.0])).round(4).tolist()
+    [1.0, 1.0, 0.0]
+    """
+    from scipy.special import fdtrc
+
+    others, rest = degrees.sum() - degrees, square.sum() - square
+    tested = (degrees > 0) & (others >= ENOUGH_DEGREES)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ratio = np.nan_to_num((square / degrees) / (rest / others), nan=1.0)
+    chance = np.where(tested, fdtrc(np.maximum(degrees, 1), np.maximum(others, 1), ratio), 1.0)
+    return np.minimum(chance * max(int(tested.sum()), 1), 1.0)
 
 
 def _shot_means(size: np.ndarray, group: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:

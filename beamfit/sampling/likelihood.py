@@ -17,6 +17,7 @@ LOG_NOISE, FRACTION = "log_noise", "outlier_fraction"
 NARROWEST, WIDEST = 3.0, 1e5
 # The noise is sought within a factor e^10 of where the fit saw it.
 NOISE_REACH = 10.0
+WORDS = {"known": "as stated", "inferred": "inferred from the residuals", "averaged": "averaged over"}
 
 
 class Own(NamedTuple):
@@ -38,7 +39,8 @@ class Group(NamedTuple):
         Of the group, before the names of its numbers; empty where there is one group only.
     noise : str
         ``known``: the errors are right. ``inferred``: they are right up to a common factor, whose
-        logarithm is free with a flat prior.
+        logarithm is free with a flat prior. ``averaged``: the law's own prior has their likelihood,
+        averaged over the noise, and the residuals count nowhere.
     outliers : bool
         Whether an unknown fraction of the points, flat from 0 to 1/2, are outliers.
     guess : (float, float)
@@ -69,7 +71,7 @@ class Group(NamedTuple):
         InputError
             If the noise is neither known nor inferred.
         """
-        if self.noise not in ("known", "inferred"):
+        if self.noise not in ("known", "inferred", "averaged"):
             raise InputError(f"noise '{self.noise}'", "known or inferred")
         at = math.log(max(factor, 1e-300))
         noise = Own(self.prefix + LOG_NOISE, at - NOISE_REACH, at + NOISE_REACH, at, 0.1)
@@ -86,7 +88,7 @@ def noise_words(groups: Sequence[Group]) -> str:
     'x inferred from the residuals; y as stated'
     """
     said = [
-        ("inferred from the residuals" if group.inferred else "as stated")
+        WORDS[group.noise]
         + (", with outliers" if group.outliers else "")
         for group in groups
     ]
@@ -126,6 +128,8 @@ def outlier_density(residual: Array) -> Array:
 
 
 def _of_group(residual: Array, counts: Array, group: Group, extra: list[Array]) -> Array:
+    if group.noise == "averaged":
+        return jnp.zeros(())
     log_scale = extra.pop(0) if group.inferred else 0.0
     scaled = residual * jnp.exp(-log_scale)
     each = -0.5 * scaled**2

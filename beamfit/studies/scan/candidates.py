@@ -24,7 +24,10 @@ from beamfit.studies.scan.next_point import candidate_settings
 from beamfit.studies.scan.results import in_words
 from beamfit.studies.scan.statement import size_records, varied_magnets
 from beamfit.studies.scan.transport import NetworkRows, Rows, rows_at, setting_units
-from beamfit.studies.scan.verdict import CLEAR
+from beamfit.studies.scan.verdict import USEFUL
+
+# The error of ln ε whose 95 % interval spans the factor within which an emittance is of use.
+NARROW = float(np.log(USEFUL)) / 3.92
 
 
 def by_plane(fit: EmittanceFit, known: Information) -> dict[str, float]:
@@ -34,8 +37,8 @@ def by_plane(fit: EmittanceFit, known: Information) -> dict[str, float]:
 
 
 def identified(known: Information) -> bool:
-    """Whether every emittance rests on data and priors and is clear of zero."""
-    clear = known.relative_error.max() <= 1.0 / (2.0 * CLEAR)
+    """Whether every emittance rests on data and priors, within a factor that is of use."""
+    clear = known.relative_error.max() <= NARROW
     return bool(clear and (known.share < MOST_SHARE).all())
 
 
@@ -53,13 +56,6 @@ def information_of(fit: EmittanceFit) -> Information:
     """
     p, theta = fit.problem, linearised_at(fit)
     jacobian = assess.slopes(p, theta).residual_jacobian
-    # Errors as the fit scaled them: a fit that misses its sizes learns less from the next one.
-    scale = {plane.plane: plane.error_scale for plane in fit.planes}
-    sizes = [scale[r.data.plane] if r.predict is predict_sizes else 1.0 for r in p.records]
-    rows = np.ones(len(jacobian))
-    counts = [r.measured.size for r in p.records]
-    rows[: sum(counts)] = np.repeat(sizes, counts)
-    jacobian = jacobian / rows[:, None]
     held = p.lower == p.upper
     if fit.solved is not None and _determined(fit):
         edge = np.array([v.state in ("lower", "upper") for v in fit.fit.variables])
@@ -203,7 +199,7 @@ def _rows(
     problem, theta = fit.problem, linearised_at(fit)
     found = []
     for plane in fit.planes:
-        relative = np.median(plane.points.error / plane.points.size) * plane.error_scale
+        relative = np.median(plane.points.error / plane.points.size)
         if fit.statement.whole_map:
             data = _line_rows(fit, line, plane.plane, table, screen, energy)
         else:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from html import escape
 from typing import TYPE_CHECKING, Any
@@ -11,12 +11,12 @@ from typing import TYPE_CHECKING, Any
 from beamfit.errors import InputError
 from beamfit.frames import quantity_frame
 from beamfit.greybox.problem import Problem
+from beamfit.noise.model import ROBUST, Noise
 from beamfit.optics.beamline import Beamline
 from beamfit.quantity import Quantity
 from beamfit.shown import shown
 from beamfit.studies.scan.assumptions import Anchor, Assumptions
-from beamfit.studies.scan.judged import judged_beam
-from beamfit.studies.scan.known import METHODS, WEIGHTS, prepared, see
+from beamfit.studies.scan.known import METHODS, WEIGHTS, judged_beam, prepared, see
 from beamfit.studies.scan.model import line_of
 from beamfit.studies.scan.predicted import Prediction, correlations_of, predicted_sizes
 from beamfit.studies.scan.questions import of_emittances, questions
@@ -41,6 +41,7 @@ def fit_emittance(
     planes: tuple[str, ...] | None = None,
     method: str = "size_squared",
     robust: bool = False,
+    noise: Noise | None = None,
     weights: str = "model",
     scenario: str = "known",
     priors: Mapping[str, tuple[float, float]] | None = None,
@@ -66,7 +67,10 @@ def fit_emittance(
     method : {"size_squared", "size"}
         The residual: the report's ``error_linear`` or ``error_nonlinear``.
     robust : bool
-        Give each point a probability of being an outlier (with "size_squared").
+        Expect bad readings: one in ten, and up to a third of them, where the usual prior is 3 %
+        and a fifth.
+    noise : Noise, optional
+        Priors of the noise of sizes; `beamfit.Noise()` if None.
     weights : {"model", "measured"}
         Whose size the errors of size² are taken at. That of the model has no part in the noise;
         with the measured one, as older programs have it, the emittance comes out too small, by
@@ -105,9 +109,9 @@ def fit_emittance(
     Notes
     -----
     One beam matrix at the start is common to all rows. Where their energies differ it is that of
-    the mean energy, and scales with 1/βγ: the normalised emittance is common. Errors are those of
-    the linear theory of least squares, propagated to ε, β, α by their gradients; see
-    docs/emittance.md.
+    the mean energy, and scales with 1/βγ: the normalised emittance is common. Values are those
+    that fit best; errors are half of the central 68 % of the posterior, the noise averaged over;
+    see docs/emittance.md and docs/verdict.md.
 
     Examples
     --------
@@ -126,18 +130,17 @@ def fit_emittance(
     for name, given, known in (("method", method, METHODS), ("weights", weights, WEIGHTS)):
         if given not in known:
             raise InputError(f"{name} '{given}'", " or ".join(known))
-    if robust and method != METHODS[0]:
-        raise InputError("a robust fit of size", 'method "size_squared" with robust')
     ties = (gains or {}, anchor or Anchor(), hysteresis)
     told = Assumptions(priors or {}, bounds or {}, *ties, hidden, starts, seed)
-    told.check_scenario(scenario, robust)
+    told.check_scenario(scenario)
+    noise = replace(noise or Noise(), **ROBUST) if robust else noise
     scan, line = prepared(scan, line, scenario)
     statement = scenario_of(scenario)
     if told.systematics:
         from beamfit.studies.scan.systematics import with_systematics
 
         statement = with_systematics(statement, told)
-    seen = see(scan, line, planes, method, robust, weights, at_once=statement.closed)
+    seen = see(scan, line, planes, method, noise, weights)
     if statement.closed:
         return EmittanceFit(judged_beam(seen), scan, line, statement, told, seen)
 
@@ -262,19 +265,17 @@ class EmittanceFit:
         self,
         planes: tuple[str, ...] | None = None,
         *,
-        noise: str | None = None,
-        outliers: bool | None = None,
         priors: Mapping[str, Distribution] | None = None,
         **options: Any,
     ) -> Posterior:
-        """Draw σ of the planes from its posterior, flat over positive definite matrices.
+        """Draw σ of the planes from the posterior that the fit quotes.
 
         Parameters
         ----------
         planes : tuple of str, optional
             Which; all that were fitted if None.
-        noise, outliers, priors
-            As `beamfit.studies.scan.posterior.beam_target`, with priors on ``x.sigma11`` and so
+        priors
+            As `beamfit.studies.scan.posterior.beam_target`, on ``x.sigma11`` and so
             on; in a scenario also on the further names of its ``problem``.
         **options
             ``seed, target_ess, budget, walkers, store, provenance, progress`` of
@@ -294,7 +295,7 @@ class EmittanceFit:
         from beamfit.sampling.ensemble import draw
         from beamfit.studies.scan.posterior import beam_target
 
-        return draw(beam_target(self, planes, noise, outliers, priors), **options)
+        return draw(beam_target(self, planes, priors), **options)
 
     def predict(
         self, settings: Mapping[str, Any], plane: str | None = None, *, screen: str | None = None

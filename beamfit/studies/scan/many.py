@@ -10,11 +10,11 @@ import jax
 import numpy as np
 
 from beamfit.errors import InputError
+from beamfit.noise.model import Noise
 from beamfit.optics.beamline import Beamline
 from beamfit.studies.scan.assumptions import Assumptions
 from beamfit.studies.scan.fit import EmittanceFit
-from beamfit.studies.scan.judged import judged_beam
-from beamfit.studies.scan.known import looked_through, prepared, unfitted
+from beamfit.studies.scan.known import judged_beam, looked_through, prepared, unfitted
 from beamfit.studies.scan.scans import QuadScan
 from beamfit.studies.scan.statement import Seen, scenario_of
 
@@ -23,7 +23,7 @@ FEW, LANES, ROOM = 16, 256, 1 << 20
 
 
 def fit_many(
-    scans: Iterable[tuple[QuadScan, Beamline]], weights: str = "model"
+    scans: Iterable[tuple[QuadScan, Beamline]], weights: str = "model", noise: Noise | None = None
 ) -> list[EmittanceFit | InputError]:
     """Fit the emittance to each of many scans: what `fit_emittance` gives of each.
 
@@ -31,7 +31,7 @@ def fit_many(
     ----------
     scans : iterable of (QuadScan, Beamline)
         The scans with their lines; hundreds at a time.
-    weights : {"model", "measured"}
+    weights, noise
         As for `beamfit.fit_emittance`.
 
     Returns
@@ -54,7 +54,7 @@ def fit_many(
     for i, given in enumerate(scans):
         try:
             own, through = prepared(*given)
-            begun[i] = unfitted(own, through, weights=weights)
+            begun[i] = unfitted(own, through, noise=noise, weights=weights)
             found.append(None)
         except InputError as error:
             found.append(error)

@@ -149,9 +149,10 @@ def emittance_parts(sigma: ArrayLike) -> Array:
     >>> emittance_parts(jnp.array([2.0, -1.0, 1.0])).tolist()
     [1.0, 2.0, 1.0]
     """
-    s11, s12, s22 = jnp.asarray(sigma)
-    emittance = jnp.sqrt(s11 * s22 - s12**2)
-    return jnp.stack([emittance, s11 / emittance, -s12 / emittance])
+    s11, s12, s22 = sigma
+    emittance = (s11 * s22 - s12**2) ** 0.5
+    xp = np if isinstance(emittance, np.ndarray | np.generic) else jnp
+    return xp.stack([emittance, s11 / emittance, -s12 / emittance])
 
 
 def numbers_of(
@@ -162,7 +163,7 @@ def numbers_of(
     Parameters
     ----------
     sigma : Array
-        Shape (3,), at the start.
+        Shape (3,), or (3, d) of d beams, at the start; NumPy's or JAX's.
     factor : float
         βγ.
     to_screen, to_design : Array
@@ -173,7 +174,7 @@ def numbers_of(
 
     Returns
     -------
-    Array, shape (11,)
+    Array, shape (11,) or (11, d)
 
     Examples
     --------
@@ -188,7 +189,8 @@ def numbers_of(
     # BMAG = Tr(σ σ_d⁻¹) ε_d/(2 ε), M. Sands, SLAC-AP-85 (1991).
     mismatch = 0.5 * (gamma_d * d11 + 2.0 * design[1] * d12 + design[0] * d22) / emittance
     start = (emittance, factor * emittance, beta, alpha, *sigma)
-    return jnp.stack([*start, s11 / emittance, -s12 / emittance, jnp.sqrt(s11), mismatch])
+    xp = np if isinstance(emittance, np.ndarray | np.generic) else jnp
+    return xp.stack([*start, s11 / emittance, -s12 / emittance, s11**0.5, mismatch])
 
 
 def _carried(matrix: Array, sigma: Array) -> tuple[Array, Array, Array]:
@@ -219,18 +221,21 @@ class Asked:
         return beta_gamma(self.energy, self.line.mass)
 
 
-def asked_numbers(model: Mapping[str, Any], asked: Asked) -> Array:
-    """`numbers_of` a model's beam, through the line as the model has it."""
+def asked_places(model: Mapping[str, Any], asked: Asked) -> tuple[Any, Any, Any, Any]:
+    """βγ, matrices to the screen and the design's place, and the design, of a model's line."""
     to_screen = to_design = jnp.full((2, 2), jnp.nan)
     if asked.screen is not None:
         place = asked.place or asked.screen
         places = tuple(dict.fromkeys((asked.screen, place)))
         found = line_of(model, asked.line).matrices(places)
         to_screen, to_design = (getattr(found[at], asked.plane) for at in (asked.screen, place))
-    sigma = sigma_of(model["beam"][asked.plane])
     energy = asked.energy * model.get("systematics", {}).get("energy", 1.0)
-    asked = replace(asked, energy=energy)
-    return numbers_of(sigma, asked.factor, to_screen, to_design, asked.design)
+    return replace(asked, energy=energy).factor, to_screen, to_design, asked.design
+
+
+def asked_numbers(model: Mapping[str, Any], asked: Asked) -> Array:
+    """`numbers_of` a model's beam, through the line as the model has it."""
+    return numbers_of(sigma_of(model["beam"][asked.plane]), *asked_places(model, asked))
 
 
 def phase_coverage(r11: np.ndarray, r12: np.ndarray, beta: float, alpha: float) -> float | None:

@@ -6,12 +6,10 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from beamfit.greybox.design import Information, rows_of, scores
 from beamfit.optics.rows import transfer_rows
-from beamfit.studies.scan.model import coefficients, size_squared
+from beamfit.studies.scan.model import size_squared
 from beamfit.studies.scan.results import in_words
 from beamfit.studies.scan.statement import Seen
-from beamfit.studies.scan.verdict import LOST
 
 # Candidates reach half the scanned range beyond either end.
 REACH, COUNT = 0.5, 41
@@ -55,49 +53,30 @@ def candidate_settings(
     return found
 
 
-def plausible_sigma(sigma: np.ndarray, covariance: np.ndarray) -> np.ndarray | None:
-    """Find a beam near the fit with a positive emittance, to predict sizes with.
-
-    Where the best matrix has det σ below its standard error it is moved along the direction
-    that raises det most for its χ², until it has that much; None if that fails.
-
-    Examples
-    --------
-    >>> plausible_sigma(np.array([1.0, 0.0, 0.0]), 1e-4 * np.eye(3)).round(2).tolist()
-    [1.0, 0.0, 0.01]
-    """
-    gradient = np.array([sigma[2], -2.0 * sigma[1], sigma[0]])
-    determinant = sigma[0] * sigma[2] - sigma[1] ** 2
-    error = float(np.sqrt(max(gradient @ covariance @ gradient, 0.0)))
-    if not error > 0.0:
-        return None
-    if determinant > error:
-        return sigma
-    moved = sigma + covariance @ gradient / error * (1.0 - determinant / error)
-    good = moved[0] > 0 and moved[0] * moved[2] > moved[1] ** 2
-    return moved if good else None
-
-
 def next_measurement(seen: Seen, plane: str) -> str | None:
-    """Say which further setting would help most, if one can be named."""
+    """Say which further setting would help most, if one can be named.
+
+    Every draw of the posterior predicts a size at every setting. A further size of the scan's own
+    error takes cov(ln ε, size)²/(var(size) + error²) off the variance of ln ε (the regression of
+    one on the other; C. E. Rasmussen and C. K. I. Williams (2006), eq. A.6).
+    """
     work = seen.works[plane]
-    e, p = work.evidence, work.points
-    nothing_to_build_on = e.misfit > LOST or e.swamped or not e.full_rank
-    if seen.scan.transfer or nothing_to_build_on or not np.isfinite(work.covariance).all():
+    p, post = work.points, work.posterior
+    if seen.scan.transfer or not post.seen:
         return None
-    covariance = work.covariance * work.scale**2
-    start = work.fit.sigma if e.positive else work.fit.symmetric
-    sigma = plausible_sigma(start, covariance)
-    if sigma is None:
-        return None
-    relative = max(float(np.median(p.error / p.size)) * work.scale, 1e-3)
-    known, tried = _known(sigma, covariance), []
+    kept = post.weight > 0.0
+    sigma, weight = post.sigma[kept].T, post.weight[kept]
+    log = 0.5 * np.log(np.maximum(sigma[0] * sigma[2] - sigma[1] ** 2, 1e-300))
+    log = log - weight @ log
+    relative, tried = float(np.median(p.error / p.size)), []
     for name, table in candidate_settings(p.settings):
-        usable, r11, r12 = _usable(seen, plane, sigma, table)
-        rows = np.stack(coefficients(r11, r12), -1)
-        rows /= 2.0 * relative * np.maximum(size_squared(sigma, r11, r12), 1e-30)[:, None]
-        after = scores(known, rows[:, None, :])
-        tried += [(error, name, at) for error, at in zip(after, table[name][usable], strict=True)]
+        usable, r11, r12 = _usable(seen, plane, post.best, table)
+        size = np.sqrt(size_squared(sigma, r11[:, None], r12[:, None]))
+        middle = size @ weight
+        off = size - middle[:, None]
+        noise = off**2 @ weight + (relative * middle) ** 2
+        gain = ((off * log) @ weight) ** 2 / noise
+        tried += [(-each, name, at) for each, at in zip(gain, table[name][usable], strict=True)]
     if not tried:
         return None
     _, magnet, setting = min(tried, key=lambda each: each[0])
@@ -107,18 +86,9 @@ def next_measurement(seen: Seen, plane: str) -> str | None:
     others = f", with {in_words(held, p.units, 3)} at {seen.rows.places[-1]}" if held else ""
     return (
         f"Measure next near {magnet} = {setting:.3g} {p.units[magnet]}, "
-        f"{'inside' if inside else 'beyond'} the scanned range{others}: of single points it would "
-        "sharpen the emittance most; then judge again."
+        f"{'inside' if inside else 'beyond'} the scanned range{others}: this single point reduces "
+        "the error most."
     )
-
-
-def _known(sigma: np.ndarray, covariance: np.ndarray) -> Information:
-    """What is known of the emittance of a beam."""
-    emittance = np.sqrt(sigma[0] * sigma[2] - sigma[1] ** 2)
-    slope = np.array([[sigma[2], -2.0 * sigma[1], sigma[0]]]) / (2.0 * emittance)
-    free = np.full(3, np.inf)
-    value, asked = np.array([emittance]), np.ones(3, bool)
-    return Information(rows_of(covariance), value, slope, asked, -free, free)
 
 
 def _usable(
@@ -128,7 +98,7 @@ def _usable(
     energy = np.full(COUNT, seen.energy)
     matrices = transfer_rows(seen.scanned, table, energy, places=seen.rows.places[-1:])
     r11, r12 = np.moveaxis(np.asarray(matrices.planes)[:, :, 0, 0, :2], -1, 0)
-    sigmas = {p: w.fit.sigma for p, w in seen.works.items() if w.evidence.positive}
+    sigmas = {p: w.posterior.best for p, w in seen.works.items()}
     usable = np.ones(COUNT, bool)
     for each, beam in (sigmas | {plane: sigma}).items():
         i, largest = "xy".index(each), np.nanmax(seen.scan.size[each])

@@ -1,19 +1,22 @@
-"""The posterior of a scan: σ of each plane, flat over all that are positive definite."""
+"""The posterior of a scan for the sampler: that of the fit, the noise averaged over."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
 from beamfit.errors import InputError
+from beamfit.greybox import tree
 from beamfit.greybox.fit import Fit
 from beamfit.greybox.posterior import predicted, target_of
 from beamfit.greybox.problem import Problem
 from beamfit.greybox.stated import Optimum, Statement
+from beamfit.noise.model import Lognormal, Noise
+from beamfit.noise.sizes import Kind, averaged, log_likelihood
 from beamfit.optics.beam import BeamMatrix
 from beamfit.quantity import Status
 from beamfit.sampling.intervals import Expected
@@ -21,17 +24,18 @@ from beamfit.sampling.posterior import Posterior
 from beamfit.sampling.priors import Distribution
 from beamfit.sampling.target import Target
 from beamfit.studies.scan.assumptions import Assumptions
-from beamfit.studies.scan.known import see
+from beamfit.studies.scan.beam_draws import BRIGHT
 from beamfit.studies.scan.model import (
     QUANTITIES,
     UNIT,
     Asked,
     asked_numbers,
     sigma_of,
+    size_squared,
     spoken,
 )
 from beamfit.studies.scan.results import PlaneFit
-from beamfit.studies.scan.statement import Scenario, Seen, asked_in, factor_of
+from beamfit.studies.scan.statement import Scenario, Seen, asked_in, factor_of, size_records
 from beamfit.verdict import Finding
 
 CHOLESKY, SIGMA = ("l11", "l21", "l22"), ("sigma11", "sigma12", "sigma22")
@@ -67,23 +71,100 @@ def _own(model: Mapping[str, Any]) -> dict[str, Any]:
     return {**model, "beam": beams}
 
 
-def _beams(model: Mapping[str, Any], asked: Any) -> dict[str, Any]:
+@tree.node("power", "special", "chance", "log_weight", "prior")
+class AveragedNoise:
+    """One kind of noise of a plane with its nodes, in units of the mean size."""
+
+    power: int
+    special: float
+    chance: float
+    log_weight: float
+    prior: tuple[float, float]
+    floor: Any
+    unit: Any
+    scale: Any
+    log_scale_weight: Any
+
+    @property
+    def kind(self) -> Kind:
+        """The same as the likelihood takes it."""
+        named = (self.power, self.floor, self.unit, Lognormal(*self.prior))
+        return Kind(*named, self.special, self.chance, self.log_weight)
+
+
+@tree.node("plane", "noise")
+class Sizes:
+    """The sizes of a plane for its likelihood: where its rows are, what was measured, its noise."""
+
+    plane: str
+    noise: Noise
+    rows: Any
+    used: Any
+    size: Any
+    unit: Any
+    trace: Any
+    kinds: tuple[AveragedNoise, ...]
+
+    def log_density(self, model: Mapping[str, Any]) -> Array:
+        """Log likelihood of the sizes, the noise averaged over, with the prior of the beam."""
+        sigma = sigma_of(model["beam"][self.plane])
+        squared = size_squared(sigma, *(v[self.used] for v in self.rows.elements(model)))
+        found = jnp.sqrt(jnp.maximum(squared, 1e-300))[None] / self.unit
+        off, parts = self.size[None] - found, []
+        for each in self.kinds:
+            log = log_likelihood(off, found, each.kind, each.scale, self.noise)[0]
+            parts.append(averaged(log, each.log_scale_weight) + each.log_weight)
+        bright = jnp.log(jnp.maximum(self.trace @ sigma, 1e-300))
+        prior = -3.0 * bright - 0.5 * (bright / BRIGHT) ** 2
+        return averaged(jnp.stack(parts), 0.0) + prior
+
+
+class Told(NamedTuple):
+    """Data of the functions of a scan's statement."""
+
+    asked: tuple[Asked, ...]
+    sizes: tuple[Sizes, ...]
+
+
+def _log_volume(model: Mapping[str, Any], told: Told) -> Array:
+    """The density of the sizes, whose noise is averaged over, and the prior of the beams."""
+    return sum((each.log_density(model) for each in told.sizes), jnp.zeros(()))
+
+
+def _sizes_of(problem: Problem, seen: Seen, planes: Sequence[str]) -> tuple[Sizes, ...]:
+    """What the likelihood needs of each plane."""
+    records, found = size_records(problem), []
+    for plane in planes:
+        work = seen.works[plane]
+        post = work.posterior
+        kinds = [
+            AveragedNoise(
+                k.power, k.special, k.chance, k.log_weight, tuple(k.prior), k.floor, k.unit,
+                nodes.scale, nodes.log_weight,
+            )
+            for k, nodes in zip(post.kinds, post.scales, strict=True)
+        ]  # fmt: skip
+        at, size = seen.measured(plane), work.sizes.size / post.unit
+        own = (records[plane].data, at, size, post.unit, post.trace, tuple(kinds))
+        found.append(Sizes(plane, seen.noise, *own))
+    return tuple(found)
+
+
+def _beams(model: Mapping[str, Any], told: Told) -> dict[str, Any]:
     """The beam matrix of each plane, and the model, for functions of the user's."""
     parts = model["beam"].items()
     beams = {p: BeamMatrix(*(UNIT * beam[name] for name in CHOLESKY)) for p, beam in parts}
     return {**beams, "model": model}
 
 
-def _twiss(model: Mapping[str, Any], asked: Sequence[Asked]) -> Array:
+def _twiss(model: Mapping[str, Any], told: Told) -> Array:
     """Emittance, normalised emittance, β, α at the start and mismatch, plane after plane."""
-    return jnp.concatenate([asked_numbers(model, plane)[PLACES] for plane in asked])
+    return jnp.concatenate([asked_numbers(model, plane)[PLACES] for plane in told.asked])
 
 
 def beam_target(
     fit: Scanned,
     planes: Sequence[str] | None = None,
-    noise: str | None = None,
-    outliers: bool | None = None,
     priors: Mapping[str, Distribution] | None = None,
 ) -> Target:
     """State the posterior of a fitted scan.
@@ -94,9 +175,9 @@ def beam_target(
         The fit.
     planes : sequence of str, optional
         Which; all that were fitted if None.
-    noise, outliers, priors
-        As of `beamfit.greybox.posterior.target_of`; priors on ``x.sigma11`` and so on. A robust
-        fit is sampled with outliers by default, and with the errors that were stated.
+    priors
+        As of `beamfit.greybox.posterior.target_of`; on ``x.sigma11`` and so on, in addition to the
+        fit's own.
 
     Returns
     -------
@@ -110,8 +191,7 @@ def beam_target(
 
     Notes
     -----
-    The likelihood compares what the fit compared, size² or size, so that its maximum is the fit.
-    Where transport is known, a plane whose scan does not determine σ11, σ12 and σ22 has no
+    Likelihood and prior are those of the fit: noise averaged over, bad readings included. Where transport is known, a plane whose scan does not determine σ11, σ12 and σ22 has no
     posterior unless priors on all three give it one; it is left out and named.
     """
     asked = _asked(fit, planes)
@@ -120,17 +200,13 @@ def beam_target(
     else:
         given = [p for p in asked if all(f"{p.plane}.{name}" in (priors or {}) for name in SIGMA)]
         kept = [p for p in asked if np.isfinite(p.covariance).all() or p in given]
-        names, seen = tuple(p.plane for p in kept or asked), fit.seen
-        if seen.robust:  # a mixture does its own doubting
-            seen = see(seen.scan, seen.line, names, seen.method)
-        problem = fit.statement.state(seen._replace(planes=names), fit.told)
+        names = tuple(p.plane for p in kept or asked)
+        problem = fit.statement.state(fit.seen._replace(planes=names), fit.told)
         optimum = _optimum(problem.names, kept or asked, given, priors or {})
     return target_of(
         problem,
         optimum,
         _stated(problem, fit, kept, asked),
-        noise=noise,
-        outliers=fit.seen.robust if outliers is None else outliers,
         priors=priors,
     )
 
@@ -162,8 +238,7 @@ def _optimum(
         begin |= {f"beam.{p.plane}.{name}": value for name, value in numbers.items()}
     theta = np.array([begin[name] for name in names])
     worst = max(chosen, key=lambda p: p.status is Status.poor_fit)
-    scales, known = [p.error_scale for p in chosen], [p.chi2 is not None for p in chosen]
-    return Optimum(theta, Finding(worst.status, worst.message), scales, known)
+    return Optimum(theta, Finding(worst.status, worst.message), [1.0] * len(chosen), [True] * len(chosen))
 
 
 def _stated(
@@ -181,7 +256,12 @@ def _stated(
         derived={f"{plane}.{name}": QUANTITIES[name] for plane, name in shown},
         derive=_twiss,
         build=_beams,
-        data=asked_in(problem, fit.seen, [p.plane for p in chosen], fit.statement.whole_map),
+        data=Told(
+            asked_in(problem, fit.seen, planes := [p.plane for p in chosen], fit.statement.whole_map),
+            _sizes_of(problem, fit.seen, planes),
+        ),
+        log_volume=_log_volume,
+        averaged=[f"size {plane}" for plane in planes],
         quoted=_quoted,
         own=_own,
         renamed=renamed | dict(zip(own, sigmas, strict=True)),

@@ -7,13 +7,15 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from beamfit.errors import InputError, nearest
 from beamfit.optics.rows import seen_line
 from beamfit.sampling.intervals import Correlations
 from beamfit.shown import shown
-from beamfit.studies.scan.model import coefficients, emittance_parts, predict_sizes, size_squared
+from beamfit.studies.scan.comparison import PlanePosterior, weighted_quantiles
+from beamfit.studies.scan.model import emittance_parts, predict_sizes, size_squared
 from beamfit.studies.scan.results import PlaneFit
 from beamfit.studies.scan.transport import Rows, padded, rows_at
 
@@ -71,13 +73,23 @@ def predicted_sizes(
         r11, r12, known = (np.asarray(part)[:n] for part in rows.elements({}))
         sigma = np.array([q.value for q in p.sigma])
         size = np.sqrt(np.maximum(size_squared(sigma, r11, r12, known), 0.0))
-        slope = np.stack(coefficients(r11, r12), axis=-1)
-        variance = np.einsum("ij,jk,ik->i", slope, p.covariance, slope)
-        error = p.error_scale * np.sqrt(variance) / (2.0 * np.maximum(size, 1e-12))
+        error = _spread(fit.seen.works[plane].posterior, r11, r12, known)
+        error = np.where(np.isfinite(p.covariance).all(), error, np.nan)
     else:
         found = fit.solved.derive(predict_sizes, rows)
         size, error = 1e-6 * found.value[:n], 1e-6 * found.error[:n]
     return Prediction(plane, rows.places[0], given, size, error)
+
+
+def _spread(
+    post: PlanePosterior, r11: np.ndarray, r12: np.ndarray, known: np.ndarray
+) -> np.ndarray:
+    """Half of the central 68 % of the sizes that the posterior predicts."""
+    kept = post.weight > 0.0
+    sigma, weight = post.sigma[kept].T, post.weight[kept]
+    sizes = np.sqrt(size_squared(sigma, r11[:, None], r12[:, None], known[:, None]))
+    ends = [weighted_quantiles(row, weight, (0.1587, 0.8413)) for row in sizes]
+    return 0.5 * np.diff(ends, axis=1)[:, 0]
 
 
 def _rows(
@@ -110,7 +122,7 @@ def correlations_of(p: PlaneFit) -> Correlations:
     sigma = np.array([q.value for q in p.sigma])
     if not np.isfinite(p.covariance).all() or not p.emittance.value > 0:
         return Correlations(NAMES, np.full((6, 6), np.nan))
-    slope = np.concatenate([np.eye(3), np.asarray(jax.jacobian(emittance_parts)(sigma))])
+    slope = np.concatenate([np.eye(3), np.asarray(jax.jacobian(emittance_parts)(jnp.asarray(sigma)))])
     covariance = slope @ p.covariance @ slope.T
     error = np.sqrt(np.diagonal(covariance))
     return Correlations(NAMES, covariance / np.outer(error, error))

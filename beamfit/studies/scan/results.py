@@ -50,8 +50,8 @@ class Points(NamedTuple):
         1 where errors grow with that size, 0 where they are as they stand.
     pull : ndarray
         Residual of the fitted quantity over its error as used.
-    outlier_probability : ndarray or None
-        From the robust fit.
+    outlier_probability : ndarray
+        Probability that each reading is bad.
     r11, r12 : ndarray
         Transfer-matrix elements from the start to the screen (R12 in m).
     known : ndarray
@@ -67,7 +67,7 @@ class Points(NamedTuple):
     weighed: np.ndarray
     relative: float
     pull: np.ndarray
-    outlier_probability: np.ndarray | None
+    outlier_probability: np.ndarray
     r11: np.ndarray
     r12: np.ndarray
     known: np.ndarray
@@ -170,8 +170,8 @@ class Identifiability:
         Whether sizes rise on both sides of the smallest; None for a scan of several magnets.
     phase_coverage : float or None
         Betatron phase over which the scan looked at the beam, degrees of 180.
-    zero_distance : float
-        Standard errors (sqrt of Δχ² over its scale) between the fit and a beam of no emittance.
+    probability : dict of str to float
+        Of a beam, and of what else the sizes may be.
     undetermined : tuple of str
         What the data leave open, in words.
     next_measurement : str or None
@@ -179,11 +179,11 @@ class Identifiability:
     """
 
     determined: bool
+    probability: dict[str, float]
     singular_values: tuple[float, ...]
     condition: float | None
     waist_bracketed: bool | None
     phase_coverage: float | None
-    zero_distance: float
     undetermined: tuple[str, ...]
     next_measurement: str | None
 
@@ -195,7 +195,7 @@ class Identifiability:
             "condition": self.condition,
             "waist_bracketed": self.waist_bracketed,
             "phase_coverage_deg": self.phase_coverage,
-            "zero_emittance_distance": self.zero_distance,
+            "probability": self.probability,
             "undetermined": list(self.undetermined),
             "next_measurement": self.next_measurement,
         }
@@ -231,7 +231,7 @@ class PlaneFit:
     covariance : ndarray
         Shape (3, 3), of σ11, σ12, σ22, unscaled (``error_raw``); NaN if not determined.
     error_scale : float
-        The factor on errors: sqrt(χ²/dof) where that exceeds 1.
+        The emittance's error over the one by the stated errors alone.
     noise : str
         Where the errors came from, in words.
     method, weights : str
@@ -281,7 +281,7 @@ class PlaneFit:
         status = cell(self.status)
         if self.status is Status.unidentified:
             limit = self.normalized_emittance.interval_95
-            known = f": normalised emittance {_interval(self)}, 95 % sure" if limit else ""
+            known = f": normalised emittance {_interval(self)} (95 %)" if limit else ""
             return f"{self.plane} {status}{known}"
         holds = "" if self.emittance.error is None else f" ({self.holds})"
         return f"{self.plane} {status}: normalised emittance {self.normalized_emittance}{holds}"
@@ -324,8 +324,8 @@ def result_rows(planes: tuple[PlaneFit, ...]) -> list[tuple[str, list[str]]]:
     rows: list[tuple[str, Callable[[PlaneFit], object]]] = [
         ("status", lambda p: p.status),
         ("normalised emittance", lambda p: p.normalized_emittance),
-        ("  95 % of answers", _interval),
-        ("  its error holds", lambda p: p.holds if p.emittance.error is not None else "-"),
+        ("  95 % interval", _interval),
+        ("  error includes", lambda p: p.holds if p.emittance.error is not None else "-"),
         ("geometric emittance", lambda p: p.emittance),
         ("beta at the start", lambda p: p.beta),
         ("alpha at the start", lambda p: p.alpha),
@@ -342,10 +342,10 @@ def result_rows(planes: tuple[PlaneFit, ...]) -> list[tuple[str, list[str]]]:
     rows += [
         ("chi2/dof", _chi2),
         ("rms residual", lambda p: f"{p.rms_residual.value * 1e6:.3g} µm"),
-        ("errors", _noise),
+        ("errors", lambda p: p.noise),
         ("waist bracketed", lambda p: p.identifiability.waist_bracketed),
-        ("phase seen", lambda p: degrees(p.identifiability.phase_coverage)),
-        ("zero emittance at", lambda p: f"{p.identifiability.zero_distance:.1f} sigma"),
+        ("phase advance covered", lambda p: degrees(p.identifiability.phase_coverage)),
+        ("P(beam)", lambda p: f"{p.identifiability.probability['beam']:.4f}"),
     ]
     return [(label, [cell(value(p)) for p in planes]) for label, value in rows]
 
@@ -357,7 +357,8 @@ def _interval(p: PlaneFit) -> str:
     low, high = q.interval_95
     factor, unit = display_unit(abs(high), q.unit)
     if q.error is None:
-        return f"below {high / factor:.3g} {unit}"
+        begin = f"{low / factor:.3g} to" if low > 0 else "below"
+        return f"{begin} {high / factor:.3g} {unit}"
     places = max(1 - math.floor(math.log10(0.5 * (high - low) / factor)), 0)
     return f"{low / factor:.{places}f} to {high / factor:.{places}f} {unit}"
 
@@ -366,15 +367,6 @@ def _chi2(p: PlaneFit) -> str:
     if p.chi2 is None or not p.dof:
         return f"not testable ({p.dof} dof)"
     return f"{p.chi2:.2f}/{p.dof} = {p.chi2 / p.dof:.2f}"
-
-
-def _noise(p: PlaneFit) -> str:
-    if p.chi2 is None:
-        error = p.points.error
-        if not p.points.relative and p.weights == "model":
-            return f"inferred, {1e6 * float(np.median(error)):.2g} µm"
-        return f"inferred, {100 * float((error / p.points.weighed).mean()):.2g} % of size"
-    return p.noise if p.error_scale == 1.0 else f"{p.noise}, scaled by {p.error_scale:.2f}"
 
 
 def degrees(value: float | None) -> str:

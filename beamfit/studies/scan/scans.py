@@ -32,7 +32,7 @@ MOST_SHOWN = 20
 POSSIBLE, USUAL = (1e-8, 0.3), (1e-6, 2e-2)
 # What a scan has for each of its rows.
 EACH_ROW = ("settings", "size", "error", "energy", "screen", "resolution", "energy_spread")
-EACH_ROW += ("shots", "slice", "transfer")
+EACH_ROW += ("shots", "shot_size", "slice", "transfer")
 
 
 @shown
@@ -136,6 +136,10 @@ class QuadScan:
         Point-spread rms in m and relative momentum spread of each row.
     shots : array, optional
         How many shots each row is the mean of.
+    shot_size : mapping of str to array, optional
+        Plane to the sizes of single shots in m, shape (n, m), NaN where a row has fewer than m.
+        The fit takes these, each with a probability of showing no beam, in the place of means and
+        errors.
     slice : sequence of str, optional
         Slice of the beam each row looks at, "projected" (or blank) for all of it: see `of_slice`.
         Magnets then stay as they are for the line's energy, whatever the energy of a row.
@@ -178,6 +182,7 @@ class QuadScan:
     resolution: np.ndarray | None = None
     energy_spread: np.ndarray | None = None
     shots: np.ndarray | None = None
+    shot_size: Mapping[str, np.ndarray] = field(default_factory=dict)
     slice: tuple[str, ...] | None = None
     transfer: Mapping[str, np.ndarray] | None = None
     profiles: tuple[Profile, ...] = ()
@@ -190,7 +195,7 @@ class QuadScan:
     columns: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        for key in ("settings", "size", "error"):
+        for key in ("settings", "size", "error", "shot_size"):
             arrays = {k: np.asarray(v, float) for k, v in getattr(self, key).items()}
             object.__setattr__(self, key, arrays)
         for key in ("energy", "resolution", "energy_spread"):
@@ -305,7 +310,7 @@ class QuadScan:
         at = [i for i, own in enumerate(self.slice) if own == name]
         part = self.columns_at(at)
         seen = [p for p, v in part["size"].items() if not np.isnan(v).all()]
-        for key in ("size", "error", "transfer"):
+        for key in ("size", "error", "shot_size", "transfer"):
             part[key] = part[key] and {p: v for p, v in part[key].items() if p in seen}
         profiles = tuple(p._replace(row=at.index(p.row)) for p in self.profiles if p.row in at)
         word = "" if name == PROJECTED else "slice "
@@ -340,6 +345,7 @@ class QuadScan:
         lengths = {k: len(v) for k, v in self.settings.items()}
         lengths |= {f"size_{p}": len(v) for p, v in self.size.items()}
         lengths |= {f"size_{p}_error": len(v) for p, v in self.error.items()}
+        lengths |= {f"shots of {p}": len(v) for p, v in self.shot_size.items()}
         lengths |= {"slice": len(self.slice)} if self.slice is not None else {}
         lengths |= {f"R in {p}": len(v) for p, v in (self.transfer or {}).items()}
         if len(set(lengths.values())) != 1:

@@ -31,12 +31,12 @@ from beamfit.optics.elements import (
 )
 from beamfit.optics.sections import Series
 from beamfit.studies.scan.fit import EmittanceFit
-from beamfit.studies.scan.known import WEIGHTS, one_by_one
-from beamfit.studies.scan.model import emittance_parts, size_squared
+from beamfit.studies.scan.known import WEIGHTS
+from beamfit.studies.scan.model import coefficients, emittance_parts, size_squared
 from beamfit.studies.scan.results import PlaneFit, Points
-from beamfit.studies.scan.sigma import SOLVE, SigmaFit, SizeData, error_at, weighed_size
+from beamfit.studies.scan.sigma import error_at, weighed_size
 from beamfit.studies.scan.statement import varied_magnets
-from beamfit.studies.scan.transport import Rows, padded
+from beamfit.studies.scan.transport import Rows
 
 # Leaving out one of more points than this tells nothing.
 MOST_POINTS = 50
@@ -315,18 +315,14 @@ def range_sensitivity(plane: PlaneFit) -> list[RangeRow]:
 
 
 def _without(plane: PlaneFit, left_out: np.ndarray) -> float:
-    """The emittance without some points; NaN where the rest has none."""
+    """The emittance without some points, at the weights of the fit; NaN where the rest has none."""
     p = plane.points
-    error = error_at(p.size, p.weighed, p.error, p.relative)
-    full = [padded(v) for v in (p.r11, p.r12, p.known, p.size, np.where(left_out, np.inf, error))]
-    full[-1][len(p.size) :] = np.inf
-    # One at a time: a batch of another shape would be compiled for this table alone.
-    [fit] = one_by_one(_fitted, [(SizeData(*full, p.relative),)], plane.method, plane.weights)
-    return math.sqrt(fit.determinant) if fit.positive else math.nan
-
-
-def _fitted(data: SizeData, method: str, weights: str) -> SigmaFit:
-    return SOLVE[method](data, weights)
+    scale = np.where(left_out, 0.0, 0.5 / (p.weighed * p.error))
+    rows = np.stack(coefficients(p.r11, p.r12), -1) * scale[:, None]
+    norm = np.linalg.norm(rows, axis=0)
+    sigma = np.linalg.lstsq(rows / norm, (p.size**2 - p.known) * scale, rcond=None)[0] / norm
+    determinant = sigma[0] * sigma[2] - sigma[1] ** 2
+    return math.sqrt(determinant) if sigma[0] > 0 and determinant > 0 else math.nan
 
 
 def _place(points: Points, i: int) -> str:

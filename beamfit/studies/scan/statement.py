@@ -13,46 +13,38 @@ import numpy as np
 
 from beamfit.greybox.problem import Free, Prior, Problem, Record
 from beamfit.greybox.terms import Constraint
+from beamfit.noise.model import Noise
 from beamfit.optics.beamline import Beamline
 from beamfit.studies.scan.assumptions import SCENARIOS, Assumptions
+from beamfit.studies.scan.comparison import PlanePosterior, PlaneSizes
 from beamfit.studies.scan.model import UNIT, Asked, predict_sizes
-from beamfit.studies.scan.noise import Noise
 from beamfit.studies.scan.results import Parameter, Points
 from beamfit.studies.scan.scans import QuadScan
-from beamfit.studies.scan.sigma import SigmaFit
 from beamfit.studies.scan.transport import Look, Rows, padded, scan_rows
-from beamfit.studies.scan.verdict import Evidence
 
 if TYPE_CHECKING:
     from beamfit.greybox.fit import Fit
 
 
 class Work(NamedTuple):
-    """One plane fitted in closed form through a line.
+    """One plane seen through a line: its sizes, their posterior, and the points as fitted.
 
     Attributes
     ----------
+    sizes : PlaneSizes
+        What was measured.
+    posterior : PlanePosterior
+        What it says of the beam.
     points : Points
-        Point by point, with the errors as used.
-    fit : SigmaFit
-        As fitted, errors as they were put in.
-    value, error : ndarray
-        `numbers_of` the plane, shape (11,), and their errors for the noise as used, not scaled.
-    covariance : ndarray
-        Shape (3, 3), of σ, likewise.
-    scale : float
-        sqrt(χ²/dof) where that exceeds 1.
-    evidence : Evidence
-        For the verdict.
+        Point by point, with the errors found.
+    shot_words : str
+        Shots that show no beam, in a sentence.
     """
 
+    sizes: PlaneSizes
+    posterior: PlanePosterior
     points: Points
-    fit: SigmaFit
-    value: np.ndarray
-    error: np.ndarray
-    covariance: np.ndarray
-    scale: float
-    evidence: Evidence
+    shot_words: str = ""
 
 
 class Seen(NamedTuple):
@@ -68,14 +60,12 @@ class Seen(NamedTuple):
         Those that are asked for.
     method : str
         "size_squared" or "size".
-    robust : bool
-        Whether points may be doubted.
     weights : str
         "model" or "measured": whose size the errors are taken at.
     rows : Rows
         The scan's rows through that line, padded; what no row changes is multiplied out.
-    noises : dict of str to Noise
-        Of every plane that was measured.
+    noise : Noise
+        Priors of the noise of sizes.
     look : Look
         The same, with every magnet as the lattice has it; NumPy arrays.
     works : dict of str to Work
@@ -89,10 +79,9 @@ class Seen(NamedTuple):
     scanned: Beamline
     planes: tuple[str, ...]
     method: str
-    robust: bool
     weights: str
     rows: Rows
-    noises: dict[str, Noise]
+    noise: Noise
     look: Look
     works: dict[str, Work]
     kept: tuple[str, ...] = ()
@@ -202,12 +191,11 @@ def asked_of(seen: Seen, plane: str, whole_map: bool = True, line: Beamline | No
 
 
 def size_record(seen: Seen, plane: str, rows: Any) -> Record:
-    """The measured sizes of a plane, in µm² or µm, with the errors the known-transport fit used.
+    """The measured sizes of a plane, in µm² or µm, with the errors that the posterior found.
 
-    Rows without a size have weight 0, and so has padding. Errors nobody gave are a guess.
+    Rows without a size have weight 0, and so has padding.
     """
-    work, noise, at = seen.works[plane], seen.noises[plane], seen.measured(plane)
-    points, guess = work.points, float(work.fit.error[at[0]] / work.points.error[0])
+    points, at = seen.works[plane].points, seen.measured(plane)
     columns = 1e6 * np.stack([points.size, points.error, points.weighed])
     weight = np.zeros(len(padded(seen.scan.size[plane])))
     every = np.repeat(columns[:, :1], len(weight), axis=1)
@@ -215,8 +203,7 @@ def size_record(seen: Seen, plane: str, rows: Any) -> Record:
     size, error, weighed = every
     if rows.squared:
         size, error = size**2, 2.0 * weighed * error
-    worth = np.inf if noise.known else noise.dof
-    return Record(f"size {plane}", predict_sizes, rows, size, error, weight, worth, guess)
+    return Record(f"size {plane}", predict_sizes, rows, size, error, weight)
 
 
 def size_records(problem: Problem) -> dict[str, Record]:
@@ -235,7 +222,7 @@ def asked_in(
 
 def beam_numbers(seen: Seen) -> dict[str, dict[str, float]]:
     """Cholesky factors to start from: the known-transport fit, kept off zero emittance."""
-    return {plane: factor_of(seen.works[plane].fit.sigma, 0.0025) for plane in seen.planes}
+    return {plane: factor_of(seen.works[plane].posterior.best, 0.0025) for plane in seen.planes}
 
 
 def factor_of(sigma: Sequence[float], least: float) -> dict[str, float]:

@@ -1,286 +1,248 @@
-"""Whether a scan determines the emittance: evidence, and rules that each have their sentence."""
+"""Whether sizes determine an emittance: what the comparison of models says, in sentences."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from itertools import chain
 from typing import NamedTuple
 
 import numpy as np
 
-from beamfit.statistics import POOR_FIT, few_words, one_sided_probability
 from beamfit.status import Status
-from beamfit.studies.scan.outliers import Influence
+from beamfit.studies.scan.comparison import BEAM, FLAT
+from beamfit.studies.scan.results import Points
 from beamfit.verdict import Finding
 
-# The emittance is determined if zero is this many standard errors away ...
-CLEAR = 4.0
-# ... and this many where the waist is not bracketed and residuals tell the noise: the few answers
-# of such a scan are else those that noise has made large and sure at once.
-EXTRAPOLATED = 6.0
-# ... and noise would lift it so far less often than this, counting the degrees of freedom.
-CHANCE = 2e-3
-# Sizes that miss every beam by this much, rms and relative, follow no beam.
-LOST = 0.15
-# A robust fit must keep this many degrees of freedom, and may doubt this share of the points.
-ROBUST_DOF, DOUBTED = 4, 0.2
-# Sizes answer a magnet if a constant size is less likely than this.
-CONSTANT = 0.01
-# Above this probability of χ² the errors are overstated.
-OVERSTATED = 0.999
+# A beam is sure with this probability: one answer in a hundred may be another thing.
+SURE = 0.99
+# An emittance is of use where its 95 % interval spans less than this factor.
+USEFUL = 2.5
+# A point carries the answer if the emittance moves by so many errors without it; the interval
+# reaches to where it goes if that is farther than any noise would move it.
+CARRIES, MOVES = 2.0, 3.0
+# Points that a sentence names.
+MOST_NAMED = 5
+# What to check where a rival explains the sizes.
+REMEDIES = {
+    FLAT: "The smallest sizes decide: measure over the waist, and check resolution_um.",
+    "one constant size": (
+        "Check that the magnet moved and that the screen shows the beam, and scan further."
+    ),
+    "sizes at random": "Check settings, units, energy and screen, or measure more settings.",
+    "sizes that drift": "Check that the beam was stable while the scan was taken.",
+    "a smooth curve that is no beam's": (
+        "Check the line, the settings' units, and how sizes are taken from the profile "
+        "(saturation, background, cut edges)."
+    ),
+}
 
 
 class Evidence(NamedTuple):
-    """What tells whether sizes determine a beam when the line is known.
+    """What a verdict on one plane rests on.
 
     Attributes
     ----------
-    full_rank, positive, converged : bool
-        As in `SigmaFit`.
-    chi2 : float
-        χ² for the errors as used.
-    dof : int
-        Points less three.
-    noise_known : bool
-        Whether the errors were given, not inferred from these residuals.
-    probability : float or None
-        Of a χ² at least this large; None where there is nothing to judge it by.
-    rests_on : float
-        Degrees of freedom of the errors as scaled; infinite for errors that were given.
-    influence : Influence
-        What single points do to the answer.
-    constant : float or None
-        Probability that noise alone makes the sizes differ, if one magnet was scanned.
-    determinant_distance : float
-        det σ over its scaled standard error.
-    zero_distance : float
-        sqrt of (χ² of the best beam of no emittance - χ²), scaled.
-    misfit : float
-        Rms relative miss of the sizes, corrected for the three fitted numbers.
+    probability : dict of str to float
+        Of a beam and its rivals.
+    seen : bool
+        Whether the settings separate the three numbers of the beam.
+    points : int
+        How many there are.
+    moved, errors : bool
+        Whether a magnet was, and whether errors were stated.
+    low, high : float
+        Central 95 % of the normalised emittance, m; infinite where other unknowns leave it open.
     bracketed : bool or None
         Whether the waist is.
-    smallest_at_end : bool
-        Whether the smallest size is the first or last setting of the scan.
-    swamped : bool
-        Whether dispersion and resolution alone exceed a measured size.
-    outliers : float
-        Share of the points the robust fit thinks bad; 0 for a plain fit.
-    robust : bool
-        Whether the fit was robust: its noise then rests on its own judgement.
-    scanned : bool
-        Whether a magnet was moved; sizes at several monitors are all there is otherwise.
-    advice : str or None
-        What to measure, for the remedy.
+    ending : Finding or None
+        How a search ended, where that was no answer.
+    scenario : str
+        What is free besides the beam, in words; empty where nothing is.
+    opened : str
+        What leaves the emittance open in a scenario, in words.
+    remedy : str
+        What would close it.
     """
 
-    full_rank: bool
-    positive: bool
-    converged: bool
-    chi2: float
-    dof: int
-    noise_known: bool
-    probability: float | None
-    rests_on: float
-    determinant_distance: float
-    zero_distance: float
-    misfit: float
+    probability: dict[str, float]
+    seen: bool
+    points: int
+    moved: bool
+    errors: bool
+    low: float
+    high: float
     bracketed: bool | None
-    smallest_at_end: bool = False
-    swamped: bool = False
-    outliers: float = 0.0
-    robust: bool = False
-    influence: Influence = Influence()
-    constant: float | None = None
-    scanned: bool = True
-    advice: str | None = None
+    ending: Finding | None = None
+    scenario: str = ""
+    opened: str = ""
+    remedy: str = ""
 
     @property
-    def distance(self) -> float:
-        """Standard errors from zero emittance, the lesser of both."""
-        return min(self.determinant_distance, self.zero_distance)
+    def cause(self) -> str:
+        """The likeliest model."""
+        return max(self.probability, key=self.probability.__getitem__)
 
     @property
-    def poor(self) -> bool:
-        """Whether given errors make the residuals improbable."""
-        return self.probability is not None and self.probability < POOR_FIT
+    def untested(self) -> bool:
+        """Whether three monitors give three numbers, and nothing is left to compare."""
+        return self.points == 3 and not self.moved and self.errors
 
     @property
-    def chance(self) -> float:
-        """How often noise alone comes this far from zero emittance."""
-        return one_sided_probability(self.distance, self.rests_on)
-
-
-def _no_beam(e: Evidence) -> Iterator[str]:
-    """Why the sizes tell nothing of a beam, gravest first."""
-    if not e.full_rank:
-        yield (
-            "the settings do not separate the three numbers of the beam matrix, as if the "
-            "scanned magnet were downstream of the screen or hardly moved"
-        )
-    if e.robust and (e.dof < ROBUST_DOF or e.outliers > DOUBTED):
-        yield (
-            f"the robust fit doubts {100 * e.outliers:.0f} % of the points and keeps {e.dof} "
-            "degrees of freedom, too few to tell outliers from noise; measure more settings"
-        )
-    if not e.dof and (e.scanned or not e.noise_known):
-        yield (
-            "three points fit any three numbers exactly and leave nothing to judge them by; "
-            "measure a fourth setting"
-        )
-    if e.dof == 1 and not e.noise_known:
-        yield (
-            "four points without errors leave one residual, which may be small by accident; "
-            "measure a fifth setting or give the errors of the sizes"
-        )
-    if e.misfit > LOST and (e.poor or not e.noise_known):
-        outlier = e.influence.outlier
-        yield (
-            f"the sizes follow no beam with {outlier}, and do without; measure again, or fit with "
-            "--robust"
-            if outlier
-            else "the sizes follow no beam through this line, the best one misses them by "
-            f"{100 * e.misfit:.0f} % rms; check settings, units, energy and screen"
-        )
-    if e.constant is not None and e.constant >= CONSTANT:
-        yield (
-            "the sizes do not answer the magnet, one size meets them all within their errors "
-            f"(probability {e.constant:.2g}); check that the magnet moved, that the screen shows "
-            "the beam, and scan further"
-        )
-    if e.swamped:
-        yield (
-            "resolution and dispersion alone are larger than a measured size; check "
-            "resolution_um and energy_spread"
+    def of_a_beam(self) -> bool:
+        """Whether the sizes are a beam's, of an emittance or none."""
+        return self.seen and (
+            self.untested or self.probability[BEAM] + self.probability[FLAT] > SURE
         )
 
-
-def _perhaps_zero(e: Evidence) -> Iterator[str]:
-    """Why the emittance of the beam they tell of may be zero, gravest first."""
-    away = f"zero emittance lies {e.distance:.1f} standard errors away"
-    end = "; the smallest size is at the end of the scan" if e.smallest_at_end else ""
-    if not e.positive:
-        yield "no beam fits better than one of zero emittance" + end
-    if e.distance < CLEAR:
-        yield f"zero emittance lies only {e.distance:.1f} standard errors away{end}"
-    if not e.noise_known and e.bracketed is False and e.distance < EXTRAPOLATED:
-        yield (
-            f"{away} by the scatter of sizes on one side of the waist; scan over the waist, or "
-            "give the errors of the sizes"
-        )
-    if e.chance > CHANCE:
-        yield (
-            f"{away}, but with errors that rest on {e.rests_on:.3g} degrees of freedom noise does "
-            f"that in {100 * e.chance:.2g} % of scans; measure more settings"
-        )
+    @property
+    def determined(self) -> bool:
+        """Whether they are a beam's and say its emittance."""
+        sure = self.untested or self.probability[BEAM] > SURE
+        narrow = 0.0 < self.low and self.high < USEFUL * self.low
+        return self.of_a_beam and sure and narrow and not self.opened and self.ending is None
 
 
-def cause_of(e: Evidence) -> str | None:
-    """Name what keeps the emittance from being determined; None if nothing does.
+def verdict(e: Evidence, remarks: str = "", advice: str = "") -> Finding:
+    """Say whether a plane's sizes determine its emittance.
+
+    Parameters
+    ----------
+    e : Evidence
+        Of the plane.
+    remarks : str
+        Further sentences on noise and points.
+    advice : str
+        What to measure next.
 
     Examples
     --------
-    >>> good = Evidence(True, True, True, 11.0, 11, True, 0.44, math.inf, 31.0, 30.0, 0.02, True)
-    >>> cause_of(good), cause_of(good._replace(zero_distance=3.5))
-    (None, 'zero emittance lies only 3.5 standard errors away')
+    >>> probability = {"beam": 0.999, "beam of no emittance": 0.001}
+    >>> e = Evidence(probability, True, 9, True, True, 0.9e-6, 1.1e-6, True)
+    >>> verdict(e).status.value, verdict(e._replace(high=4e-6)).status.value
+    ('converged', 'unidentified')
     """
-    return next(chain(_no_beam(e), _perhaps_zero(e)), None)
+    if e.ending is not None and (e.of_a_beam or e.ending.status is not Status.not_converged):
+        return e.ending
+    if e.determined:
+        return Finding(Status.converged, f"{_determined(e)} {remarks}".strip())
+    status = Status.unidentified
+    if e.cause.startswith("a smooth curve") and e.probability[e.cause] > SURE:
+        status = Status.poor_fit
+    where = f" in scenario {e.scenario}" if e.scenario else ""
+    said = f"Not determined{where}: {_open(e)}."
+    help_ = [advice or (REMEDIES.get(e.cause, "") if not e.of_a_beam and e.seen else "")]
+    help_ += [f"Needed: {e.remedy}."] if e.remedy and e.of_a_beam else []
+    return Finding(status, f"{said} {remarks}".strip(), " ".join(filter(None, help_)))
 
 
-def _undetermined(e: Evidence) -> Finding | None:
-    cause = cause_of(e)
-    if cause is None:
-        return None
-    return Finding(Status.unidentified, f"Not determined: {cause}.", e.advice or "")
-
-
-def _unsettled(e: Evidence) -> Finding | None:
-    if e.converged:
-        return None
-    said = "The iteration did not settle; use the plain fit of size squared, which needs none."
-    return Finding(Status.not_converged, said)
-
-
-def _poor(e: Evidence) -> Finding | None:
-    if not e.poor:
-        return None
-    ratio = e.chi2 / e.dof
-    blame = "Check how the sizes are taken from the profile, their errors, and the lattice."
-    if e.influence.outlier:
-        blame = (
-            f"Without {e.influence.outlier} the rest fits (probability "
-            f"{e.influence.without:.1g}): measure it again, or fit with --robust."
+def _determined(e: Evidence) -> str:
+    where = f" in scenario {e.scenario}" if e.scenario else ""
+    if e.untested:
+        return (
+            f"Determined{where}, but not testable: three monitors give three numbers exactly, and "
+            "nothing is left to test line and stated errors by."
         )
-    return Finding(
-        Status.poor_fit,
-        f"Poor fit: chi2/dof = {_number(ratio)} (probability {e.probability:.1g}); the "
-        f"sizes miss the model by {math.sqrt(ratio):.1f} times their errors, and all "
-        f"errors are scaled by that. {blame} {_clear(e)}{_carried(e)}.",
+    waist = {None: "", True: ", the waist is bracketed", False: ", the waist is not bracketed"}
+    return f"Determined{where}: {_sure(e.probability[BEAM])}{waist[e.bracketed]}."
+
+
+def _sure(probability: float) -> str:
+    return "the sizes are those of a beam with " + (
+        "P > 0.9999" if probability > 0.9999 else f"P = {probability:.4f}"
     )
 
 
-def _one_refutes(e: Evidence) -> Finding | None:
-    """Sizes without errors have no χ² to be poor by, but one or two can refute the others."""
-    if e.noise_known or not e.influence.outlier:
-        return None
-    return Finding(
-        Status.poor_fit,
-        f"Poor fit: by their scatter the other points leave no room for {e.influence.outlier} "
-        f"(probability {e.influence.chance:.1g}): value and errors are spoilt. Measure "
-        f"again, or fit with --robust. {_clear(e)}.",
-    )
-
-
-def _determined(e: Evidence) -> Finding:
-    words = _clear(e) + few_words(e.rests_on) + _carried(e)
-    if not e.dof:
-        words += (
-            "; not testable: three monitors give three numbers exactly, and nothing is left to "
-            "test line and stated errors by, from which the error here is propagated"
+def _open(e: Evidence) -> str:
+    """Why the emittance is not determined."""
+    if not e.seen:
+        return (
+            "the settings do not separate the three numbers of the beam matrix, as if the "
+            "scanned magnet were downstream of the screen or hardly moved"
         )
-    if e.noise_known and e.chi2 > e.dof > 0:
-        words += f"; errors are scaled by sqrt(chi2/dof) = {math.sqrt(e.chi2 / e.dof):.2f}"
-    if e.noise_known and e.probability is not None and e.probability > OVERSTATED:
-        words += (
-            f"; chi2/dof = {_number(e.chi2 / e.dof)} is less than noise of the stated errors "
-            f"leaves (probability {1 - e.probability:.1g}): they seem overstated, and so is the "
-            "error here"
+    if e.points == 3 and not e.untested:
+        return (
+            "three points fit any three numbers exactly and leave nothing to judge them by; "
+            "measure a fourth setting"
         )
-    return Finding(Status.converged, words + ".")
+    if not e.of_a_beam:
+        rival = e.cause
+        if rival in (BEAM, FLAT):
+            rest = {k: v for k, v in e.probability.items() if k not in (BEAM, FLAT)}
+            rival = max(rest, key=rest.__getitem__)
+            return (
+                f"these sizes may be a beam's (P = {e.probability[BEAM]:.2g}), or else {rival} "
+                f"(P = {rest[rival]:.2g})"
+            )
+        return f"the sizes look like {rival} (P = {e.probability[rival]:.2g}), not like a beam's"
+    if e.opened:
+        return e.opened
+    if e.probability[BEAM] <= SURE:
+        return f"a beam of no emittance explains the sizes, too (P = {e.probability[FLAT]:.2g})"
+    if not e.low > 0.0:
+        return "the 95 % interval of the emittance begins at zero"
+    factor = e.high / e.low
+    said = f"{factor:.2g}" if factor < 100 else "more than 100"
+    return f"the 95 % interval of the emittance spans a factor {said}"
 
 
-# Of sizes whose line is known; on simulated noise and one-sided scans measured in docs/verdict.md.
-BEAM_RULES = (_undetermined, _unsettled, _poor, _one_refutes, _determined)
+def noise_remark(noise: str, scale: np.ndarray) -> str:
+    """Say what the noise turned out to be, where that differs from what was stated.
+
+    Parameters
+    ----------
+    noise : {"stated", "share", "shots", "none"}
+        What was known of it.
+    scale : ndarray
+        Median and central 68 % of its scale.
+
+    Examples
+    --------
+    >>> noise_remark("stated", np.array([2.0, 1.6, 2.5]))
+    'Stated errors are too small by a factor 2 (1.6 to 2.5), which the error includes.'
+    """
+    middle, low, high = scale
+    if noise in ("stated", "share"):
+        if low > 1.05:
+            return (
+                f"Stated errors are too small by a factor {middle:.2g} ({low:.2g} to {high:.2g}), "
+                "which the error includes."
+            )
+        if high < 0.95:
+            return f"Stated errors seem too large: the sizes scatter by {middle:.2g} of them."
+    if noise == "shots" and middle > 0.005:
+        return (
+            f"Settings scatter by {100 * middle:.2g} % ({100 * low:.2g} to {100 * high:.2g} %) of "
+            "the size beyond their shots, which the error includes."
+        )
+    return ""
 
 
-def _clear(e: Evidence) -> str:
-    waist = {
-        None: "",
-        True: " and the waist is bracketed",
-        False: ", though the waist is not bracketed",
-    }
-    return (
-        f"The scan determines the emittance: zero is {_number(e.distance)} standard errors away"
-        + waist[e.bracketed]
-    )
+def point_remarks(p: Points, carrying: str, shift: float) -> Iterator[str]:
+    """Name bad readings, and the point that carries the answer.
 
-
-def _carried(e: Evidence) -> str:
-    """Say of a point that decides the answer what the others say."""
-    point, shift = e.influence.carrying, e.influence.shift
-    if not point:
-        return ""
-    if math.isnan(shift):
-        return f"; it rests on the point at {point}, without which the rest determines none"
-    more = "larger" if shift > 0 else "smaller"
-    return (
-        f"; it rests on the point at {point}: without it the emittance is {abs(shift):.1f} errors "
-        f"{more}"
-    )
-
-
-def _number(value: float) -> str:
-    return f"{value:.2g}" if value < 10 else f"{value:.0f}"
+    Parameters
+    ----------
+    p : Points
+        With the probability of each that it is bad.
+    carrying, shift : str and float
+        The point without which the emittance moves most, and how far, in errors; NaN where the
+        others give none.
+    """
+    bad = np.flatnonzero(p.outlier_probability > 0.5)
+    if len(bad):
+        places = [p.where(i) for i in bad[:MOST_NAMED]]
+        places += [f"{len(bad) - MOST_NAMED} more"] * (len(bad) > MOST_NAMED)
+        verb = "readings are" if len(bad) > 1 else "reading is"
+        yield f"{len(bad)} of {len(p.size)} {verb} bad more likely than not: {'; '.join(places)}."
+    if carrying and math.isnan(shift):
+        yield f"It rests on the point at {carrying}: without it there is no answer."
+    elif carrying:
+        more = "larger" if shift > 0 else "smaller"
+        reach = ", to which the interval reaches" if abs(shift) > MOVES else ""
+        yield (
+            f"It rests on the point at {carrying}: without it the emittance is "
+            f"{abs(shift):.1f} errors {more}{reach}."
+        )
 
 
 def one_magnet(settings: dict[str, np.ndarray], screens: tuple[str, ...]) -> np.ndarray | None:

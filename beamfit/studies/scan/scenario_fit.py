@@ -1,4 +1,4 @@
-"""The judgement of a scenario's fit, in which more than the beam is unknown, and its rules."""
+"""The fit of a scenario, in which more than the beam is unknown, and the answer of each plane."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -19,112 +19,24 @@ from beamfit.greybox.fit import Derived, Fit
 from beamfit.greybox.problem import Problem
 from beamfit.greybox.solve import solve
 from beamfit.optics.beamline import Beamline
-from beamfit.statistics import POOR_FIT, few_words, scaled_directions
+from beamfit.statistics import Directions, scaled_directions
 from beamfit.status import Status
+from beamfit.studies.scan.answer import SIGMA, Beside, Places, plane_answer, units_of
 from beamfit.studies.scan.assumptions import Anchor, Assumptions
-from beamfit.studies.scan.judged import SIGMA, Answer, plane_fit, units_of
-from beamfit.studies.scan.known import in_closed_form, pulls
+from beamfit.studies.scan.known import pulls, with_posteriors
 from beamfit.studies.scan.model import (
     QUANTITIES,
     Asked,
     asked_numbers,
+    asked_places,
     size_squared,
     spoken,
 )
 from beamfit.studies.scan.results import Parameter, PlaneFit, Points
-from beamfit.studies.scan.statement import Scenario, Seen, asked_in, size_record, size_records
+from beamfit.studies.scan.statement import Scenario, Seen, Work, asked_in, size_record, size_records
 from beamfit.studies.scan.systematics import effects_of
 from beamfit.studies.scan.transport import Look
-from beamfit.studies.scan.verdict import CLEAR, cause_of
-from beamfit.verdict import Finding, judge
-
-
-class Unknowns(NamedTuple):
-    """What tells whether sizes determine a beam when more than the beam is unknown.
-
-    Attributes
-    ----------
-    scenario, tied : str
-        Its name, and what ties it to first principles, in words.
-    cause : str or None
-        What keeps sizes from determining a beam even if the line were as found (`cause_of`).
-    ending : Finding or None
-        How the search ended, where that was no answer.
-    on_data : bool
-        Whether the error of the emittance rests on data and priors, not on bounds.
-    distance : float
-        Standard errors between det σ and zero.
-    group : Group
-        The noise of the plane's own sizes.
-    probability : float or None
-        Of their χ².
-    rests_on : float
-        Degrees of freedom of the errors as scaled.
-    edges, remedy, remark : str
-        Numbers that end on bounds; what is needed; what else is open or rests on priors.
-    """
-
-    scenario: str
-    tied: str
-    cause: str | None
-    ending: Finding | None
-    on_data: bool
-    distance: float
-    group: Group
-    probability: float | None
-    rests_on: float
-    edges: str
-    remedy: str
-    remark: str
-
-    @property
-    def clear(self) -> bool:
-        """Whether the emittance is known and clearly not zero."""
-        return self.on_data and self.distance >= CLEAR
-
-
-def _refuted_by_sizes(u: Unknowns) -> Finding | None:
-    """Priors and anchors can make a covariance finite where the sizes are noise or too few."""
-    if not u.clear or u.ending is not None or u.cause is None:
-        return None
-    said = f"Not determined in scenario {u.scenario}: {u.cause}."
-    return Finding(Status.unidentified, said)
-
-
-def _no_answer(u: Unknowns) -> Finding | None:
-    """What the data do not determine has no optimum to settle in: that comes first."""
-    if u.ending is None or (not u.clear and u.ending.status is Status.not_converged):
-        return None
-    return u.ending
-
-
-def _left_open(u: Unknowns) -> Finding | None:
-    if u.clear and u.ending is None:
-        return None
-    why = (
-        f"zero emittance lies only {u.distance:.1f} standard errors away"
-        if u.on_data
-        else "its value is decided by bounds and starting point, not by the data"
-    )
-    said = f"Not determined in scenario {u.scenario}{u.tied}: {why}{u.edges}."
-    return Finding(Status.unidentified, said, f"Needed: {u.remedy}." if u.remedy else "")
-
-
-def _determined(u: Unknowns) -> Finding:
-    said = (
-        f"Determined in scenario {u.scenario}{u.tied}: zero emittance is {u.distance:.0f} standard "
-        f"errors away{few_words(u.rests_on)}.{u.remark}"
-    )
-    if u.probability is None or u.probability >= POOR_FIT:
-        return Finding(Status.converged, said)
-    ratio = u.group.chi2 / u.group.dof
-    poor = f"Poor fit: chi2/dof = {ratio:.2g}; the sizes' errors are scaled by"
-    return Finding(Status.poor_fit, f"{poor} {math.sqrt(ratio):.1f}. {said}")
-
-
-# Of sizes when more than the beam is unknown.
-SCENARIO_RULES = (_refuted_by_sizes, _no_answer, _left_open, _determined)
-
+from beamfit.verdict import Finding
 
 # Ends of a search that are no answer.
 NO_ANSWER = (Status.not_finite, Status.infeasible, Status.not_converged)
@@ -150,7 +62,7 @@ def settled_fit(seen: Seen, scenario: Scenario, told: Assumptions) -> tuple[Fit,
     """Solve, and again with errors taken at the fitted sizes, until these change no more.
 
     Where the line was wrong, so were the sizes that known transport weighed by, the noise it saw in
-    its residuals, and the points it doubted. What is seen in the end is closed forms through the
+    its residuals, and the points it doubted. What is seen in the end is the posterior through the
     line as found.
     """
     fit = _solved(scenario.state(seen, told), scenario, told)
@@ -189,10 +101,7 @@ def _through(seen: Seen, fit: Fit) -> Seen:
     elements = np.asarray(_elements(fit.model, tuple(records[p].data for p in seen.planes)))
     look = np.array(seen.look[:3])
     look[:, ["xy".index(plane) for plane in seen.planes]] = np.swapaxes(elements, 0, 1)
-    noises = {plane: seen.noises[plane] for plane in seen.planes}
-    look = Look(*look, *seen.look[3:])
-    [again] = in_closed_form([seen._replace(look=look, noises=noises)])
-    return seen._replace(works=seen.works | again.works)
+    return with_posteriors([seen._replace(look=Look(*look, *seen.look[3:]))])[0]
 
 
 def judged_scenario(
@@ -203,70 +112,88 @@ def judged_scenario(
     told: Assumptions,
     parameters: tuple[Parameter, ...],
 ) -> tuple[PlaneFit, ...]:
-    """Judge each plane of a scenario's fit.
+    """Answer for each plane of a scenario's fit.
 
-    Priors and anchors can make a covariance finite where the sizes are noise or too few to judge.
-    So each plane must be determined by the rules of known transport too, with the line as the
-    scenario found it.
+    The posterior is that of the beam through the line as found, spread by what the other unknowns
+    leave open.
     """
     records = size_records(fit.problem)
-    derived = fit.derive(_numbers, asked_in(fit.problem, seen, seen.planes, scenario.whole_map))
-    jacobian, beams = _loose_jacobian(fit), []
+    asked = asked_in(fit.problem, seen, seen.planes, scenario.whole_map)
+    derived, jacobian = fit.derive(_numbers, asked), _loose_jacobian(fit)
+    places, beams = _places(fit.model, asked), []
     for i, plane in enumerate(seen.planes):
         own = Derived(*(part[i] for part in derived))
         group = next((g for g in fit.groups if g.name == records[plane].name), NOTHING)
-        unknowns = _unknowns(seen, plane, scenario, told, fit, parameters, own, group)
-        points = _points_at(seen, plane, own.value[SIGMA])
-        answer = _scenario_answer(fit, own, unknowns, points, jacobian)
-        if told.systematics:
-            answer = answer._replace(holds="statistics, systematics")
-        beams.append(plane_fit(seen, line, plane, answer))
+        beside = _beside(fit, seen, plane, scenario, told, parameters, own, group.dof, jacobian)
+        work = seen.works[plane]
+        points = _points_at(work, own.value[SIGMA], seen.rows.squared)
+        now = seen._replace(works=seen.works | {plane: work._replace(points=points)})
+        at = Places(*map(np.asarray, places[i]))
+        beams.append(plane_answer(now, line, plane, at, beside))
     return tuple(beams)
 
 
-def _points_at(seen: Seen, plane: str, sigma: np.ndarray) -> Points:
-    """The points of the closed form, with this fit's model."""
-    p = seen.works[plane].points
+@partial(jax.jit, compiler_options=SELDOM)
+def _places(model: Mapping[str, Any], asked: tuple[Asked, ...]) -> list[tuple[Any, ...]]:
+    """βγ, matrices and design of each plane, through the line as the model has it."""
+    return [asked_places(model, each) for each in asked]
+
+
+def _points_at(work: Work, sigma: np.ndarray, squared: bool) -> Points:
+    """The points as seen, with this fit's model."""
+    p = work.points
     p = p._replace(model=np.sqrt(np.maximum(size_squared(sigma, p.r11, p.r12, p.known), 0.0)))
-    return p._replace(pull=pulls(p, seen.rows.squared))
+    return p._replace(pull=pulls(p, squared))
 
 
-def _unknowns(
+def _beside(
+    fit: Fit,
     seen: Seen,
     plane: str,
     scenario: Scenario,
     told: Assumptions,
-    fit: Fit,
     parameters: tuple[Parameter, ...],
     own: Derived,
-    group: Group,
-) -> Unknowns:
-    noise, tied = seen.noises[plane], told.anchor.words
-    error = float(fit.spread.error(np.nan_to_num(own.slope[0])))
-    held = _held(fit) is not None
-    distance = float(own.value[0]) / (2.0 * error) if error > 0 and not held else 0.0
+    dof: float,
+    jacobian: np.ndarray,
+) -> Beside:
+    """What the fit adds to the posterior of the beam."""
+    on_data = bool(np.isfinite(own.error[0])) and _held(fit) is None
+    effects = effects_of(fit, told, float(own.value[1]), np.nan_to_num(own.slope[1]))
     edges = "".join(
         f"; {p.name} ends at its {p.state} bound {p.value.value:.6g} "
         f"(d(chi2/2)/d(bound) = {p.multiplier:.2g})"
         for p in parameters
         if p.status is Status.at_limit
     )
-    effects = effects_of(fit, told, float(own.value[1]), np.nan_to_num(own.slope[1]))
-    rests_on = noise.rests_on(group.chi2, group.dof)
-    return Unknowns(
-        scenario=scenario.name,
-        tied=f" with {tied}" if told.anchor != Anchor() else "",
-        cause=cause_of(seen.works[plane].evidence),
+    opened = "its value is decided by bounds and starting point, not by the data" + edges
+    slopes = np.nan_to_num(own.slope[SIGMA])
+    return Beside(
+        value=own.value,
+        spread=_further_spread(fit, plane, own, jacobian),
+        raw=own.error_raw,
+        covariance=slopes @ fit.covariance @ slopes.T,
+        directions=_directions(fit, own.value[SIGMA], slopes, jacobian),
+        dof=dof,
         ending=_ending(scenario, told, fit),
-        on_data=bool(np.isfinite(own.error[0])),
-        distance=distance if math.isfinite(distance) else 0.0,
-        group=group,
-        probability=noise.probability(group.chi2, group.dof),
-        rests_on=rests_on * (effects.beyond_statistics**2 if effects else 1.0),
-        edges=edges,
+        opened="" if on_data else opened,
         remedy=scenario.remedy(seen, told),
-        remark=_remark(scenario, parameters) + (effects.words if effects else ""),
+        remark=(_remark(scenario, parameters) + (effects.words if effects else "")).strip(),
+        scenario=scenario.name + (f" with {told.anchor.words}" if told.anchor != Anchor() else ""),
+        holds="statistics, systematics" if told.systematics else "statistics only",
     )
+
+
+def _further_spread(fit: Fit, plane: str, own: Derived, jacobian: np.ndarray) -> np.ndarray:
+    """Standard deviation that the other unknowns add to each number of a plane, shape (11,).
+
+    The variance of all free numbers together less that of the beam's own with the others held.
+    """
+    at = [i for i, name in enumerate(fit.problem.names) if name.startswith(f"beam.{plane}.")]
+    alone = np.linalg.pinv(jacobian[:, at])
+    held = np.sum((np.nan_to_num(own.slope)[:, at] @ alone) ** 2, axis=1)
+    whole = np.nan_to_num(own.error, nan=np.inf) ** 2
+    return np.sqrt(np.maximum(whole - held, 0.0))
 
 
 def _remark(scenario: Scenario, parameters: tuple[Parameter, ...]) -> str:
@@ -313,35 +240,17 @@ def _held(fit: Fit) -> Finding | None:
     )
 
 
-def _scenario_answer(
-    fit: Fit, own: Derived, u: Unknowns, points: Points, jacobian: np.ndarray
-) -> Answer:
-    p, theta, group = fit.problem, fit.theta, u.group
-    determined = u.clear and u.ending is None and u.cause is None
-    error = np.where(determined, own.error, np.nan)
-    sigma, slopes = own.value[SIGMA], np.nan_to_num(own.slope[SIGMA])
+def _directions(
+    fit: Fit, sigma: np.ndarray, slopes: np.ndarray, jacobian: np.ndarray
+) -> Directions:
+    """What the data leave open of σ and of the other numbers that are asked for."""
+    p, theta = fit.problem, fit.theta
     loose = ~p.nuisance & (p.lower < p.upper)
     further = [i for i in np.flatnonzero(loose) if not p.names[i].startswith("beam.")]
     asked = np.vstack([slopes, np.eye(len(theta))[further]])
     units = np.array([*units_of(sigma), *(abs(theta[i]) or 1.0 for i in further)])
     names = [*list(QUANTITIES)[SIGMA], *(spoken(p.names[i]) for i in further)]
-    known = np.isfinite(error[SIGMA]).all()
-    return Answer(
-        finding=judge(u, SCENARIO_RULES),
-        determined=determined,
-        value=own.value,
-        error=error,
-        raw=own.error_raw,
-        covariance=slopes @ fit.covariance_raw @ slopes.T if known else np.full((3, 3), np.nan),
-        chi2=group.chi2,
-        dof=round(group.dof),
-        scale=group.scale if group.scale > 0 and _held(fit) is None else 1.0,
-        rests_on=u.rests_on,
-        limits=(None, None),
-        distance=u.distance,
-        points=points,
-        directions=scaled_directions(_marginal(jacobian, asked, units), np.ones(len(units)), names),
-    )
+    return scaled_directions(_marginal(jacobian, asked, units), np.ones(len(units)), names)
 
 
 def _loose_jacobian(fit: Fit) -> np.ndarray:

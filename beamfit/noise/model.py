@@ -1,0 +1,100 @@
+"""What is known of the noise of beam sizes before they are seen: priors, each with its reason."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from beamfit.errors import InputError
+
+LN_2PI = math.log(2.0 * math.pi)
+
+
+class Lognormal(NamedTuple):
+    """A positive number known within a factor: its middle, and the standard deviation of its ln."""
+
+    middle: float
+    spread: float
+
+    def log_density(self, log: np.ndarray) -> np.ndarray:
+        """Log density in ln of the number, at values of that ln, any shape."""
+        pull = (log - math.log(self.middle)) / self.spread
+        return -0.5 * pull**2 - math.log(self.spread) - 0.5 * LN_2PI
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Priors on the noise of measured beam sizes; every answer is averaged over them.
+
+    Parameters
+    ----------
+    right : float
+        Probability that stated errors are right. Most are; a third to a half of the real scans
+        with stated errors scatter more (docs/verdict.md).
+    factor : Lognormal
+        Where they are not, the factor by which they are off. Real errors are often half of the
+        truth, since shots do not show what differs from setting to setting.
+    unstated : Lognormal
+        Noise that nobody stated, as a share of the size. Screens and wires reach 1 to 20 %.
+    share : float
+        Probability that such noise is a share of the size, and not the same number of µm at every
+        setting. A few points do not tell which.
+    even : float
+        Probability that settings scatter no more than their shots say.
+    scatter : Lognormal
+        What settings scatter beyond their shots, as a share of the size: 4 to 5 % in LCLS scans
+        whose shots say 1 % (docs/verdict.md).
+    bad : float
+        Probability that a reading is bad: a shot that missed, a wrong cell.
+    width : float
+        How many times wider bad readings scatter.
+    most : int
+        At most one reading of so many is bad: bad is an exception, not a law.
+    bad_shot : float
+        Probability that a single shot shows something else than the beam.
+    source : str
+        Where these numbers are from.
+
+    Raises
+    ------
+    InputError
+        If a probability is not between 0 and 1, or a number that must be positive is not.
+
+    Examples
+    --------
+    >>> Noise().right, Noise(bad=0.1).bad
+    (0.6, 0.1)
+    """
+
+    right: float = 0.6
+    factor: Lognormal = Lognormal(1.5, 0.8)
+    unstated: Lognormal = Lognormal(0.05, 1.0)
+    share: float = 0.5
+    even: float = 0.05
+    scatter: Lognormal = Lognormal(0.05, 0.7)
+    bad: float = 0.03
+    width: float = 12.0
+    most: int = 5
+    bad_shot: float = 0.02
+    source: str = "beamfit's own, from published scans (docs/verdict.md)"
+
+    def __post_init__(self) -> None:
+        for name in ("right", "share", "even", "bad", "bad_shot"):
+            if not 0.0 < getattr(self, name) < 1.0:
+                found = f"noise prior {name} = {getattr(self, name):g}"
+                raise InputError(found, "a probability between 0 and 1")
+        for name in ("factor", "unstated", "scatter"):
+            values = Lognormal(*map(float, getattr(self, name)))
+            if not all(math.isfinite(v) and v > 0 for v in values):
+                raise InputError(f"noise prior {name} = {tuple(values)}", "two positive numbers")
+            object.__setattr__(self, name, values)
+        if not (self.width > 1 and self.most >= 2):
+            found = f"noise prior width = {self.width:g}, most = {self.most:g}"
+            raise InputError(found, "a width above 1, and at most every second reading bad")
+
+
+# Scans in which a point in ten may be bad, up to a third of them: what --robust asks for.
+ROBUST = {"bad": 0.1, "most": 3}

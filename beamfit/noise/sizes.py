@@ -1,0 +1,187 @@
+"""The likelihood of beam sizes under noise whose kind and size are not certain.
+
+One-plane functions of NumPy or JAX arrays; leading axes are planes and draws.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from beamfit.noise.model import LN_2PI, Lognormal, Noise
+
+# Nodes over the scale of the noise, and how far below its peak the likelihood still counts.
+NODES, DEEP = 12, 12.0
+# Standard deviations of the prior that nodes begin with.
+REACH = 4.5
+
+
+class Kind(NamedTuple):
+    """One kind of noise: a point's standard deviation is (floor² + (s unit)²)^½ model^power.
+
+    Attributes
+    ----------
+    power : int
+        1 where the noise is a share of the size, 0 where it is the same at every size.
+    floor, unit : array
+        Shape (..., n): what is there in any case, and what the scale s multiplies.
+    prior : Lognormal
+        Of s.
+    special, chance : float
+        A value that s has with this probability: 1 where stated errors are right.
+    log_weight : float
+        Log prior probability of the kind.
+    """
+
+    power: int
+    floor: Any
+    unit: Any
+    prior: Lognormal
+    special: float
+    chance: float
+    log_weight: float
+
+
+class Scales(NamedTuple):
+    """Nodes over the scale of a noise, shape (..., k), with the logs of their prior weights."""
+
+    scale: Any
+    log_weight: Any
+
+
+def kinds_of(
+    noise: Noise,
+    size: np.ndarray,
+    error: np.ndarray | None,
+    floor: np.ndarray | None = None,
+) -> tuple[Kind, ...]:
+    """Kinds of noise that sizes may have.
+
+    Parameters
+    ----------
+    noise : Noise
+        The priors.
+    size : ndarray
+        Shape (..., n), measured.
+    error : ndarray or None
+        Shape (..., n), stated.
+    floor : ndarray, optional
+        Shape (..., n): standard errors of means of shots, beyond which settings scatter.
+
+    Returns
+    -------
+    tuple of Kind
+        Of sizes without errors a share and the same everywhere; else one.
+    """
+    zero = np.zeros_like(size)
+    if floor is not None:
+        return (Kind(0, floor, size, noise.scatter, 0.0, noise.even, 0.0),)
+    if error is None:
+        middle = np.median(size, axis=-1, keepdims=True) * np.ones_like(size)
+        share, same = math.log(noise.share), math.log1p(-noise.share)
+        return (
+            Kind(1, zero, zero + 1.0, noise.unstated, 1.0, 0.0, share),
+            Kind(0, zero, middle, noise.unstated, 1.0, 0.0, same),
+        )
+    share = error / size
+    alike = bool(np.all(np.ptp(share, axis=-1) <= 0.01 * share.mean(-1)))
+    unit = share if alike else error
+    return (Kind(int(alike), zero, unit, noise.factor, 1.0, noise.right, 0.0),)
+
+
+def scales_between(kind: Kind, low: np.ndarray, high: np.ndarray) -> Scales:
+    """Nodes between two logs of the scale, shape (...,), and the special value before them."""
+    step = (high - low) / (NODES - 1)
+    log = low[..., None] + step[..., None] * np.arange(NODES)
+    weight = math.log1p(-kind.chance) + kind.prior.log_density(log) + np.log(step)[..., None]
+    if not kind.chance:
+        return Scales(np.exp(log), weight)
+    first = np.ones_like(log[..., :1])
+    scale = np.concatenate([kind.special * first, np.exp(log)], axis=-1)
+    return Scales(scale, np.concatenate([math.log(kind.chance) * first, weight], axis=-1))
+
+
+def wide_scales(kind: Kind, lead: tuple[int, ...]) -> Scales:
+    """Nodes over all of the prior, for planes of leading shape ``lead``."""
+    middle, far = math.log(kind.prior.middle), REACH * kind.prior.spread
+    return scales_between(kind, np.full(lead, middle - far), np.full(lead, middle + far))
+
+
+def narrowed(kind: Kind, scales: Scales, log_posterior: np.ndarray) -> Scales:
+    """New nodes where the log posterior of the present ones, shape (..., k), counts."""
+    skip = int(kind.chance > 0)
+    log = np.log(scales.scale[..., skip:])
+    step = log[..., 1] - log[..., 0]
+    here = log_posterior[..., skip:]
+    counts = here > here.max(-1, keepdims=True) - DEEP
+    low = np.where(counts, log, np.inf).min(-1) - step
+    high = np.where(counts, log, -np.inf).max(-1) + step
+    return scales_between(kind, low, high)
+
+
+def variance_of(kind: Kind, scale: Any) -> Any:
+    """Variance over model^(2 power) of every point at every scale, shape (..., k, n)."""
+    grown = scale[..., :, None] * kind.unit[..., None, :]
+    return kind.floor[..., None, :] ** 2 + grown**2
+
+
+def squared_pulls(off: Any, model: Any, kind: Kind, scale: Any) -> Any:
+    """(size - model)² over the variance: shape (..., d, k, n) of d draws at k scales."""
+    z = off / model if kind.power else off
+    return z[..., :, None, :] ** 2 / variance_of(kind, scale)[..., None, :, :]
+
+
+def log_likelihood(off: Any, model: Any, kind: Kind, scale: Any, noise: Noise) -> Any:
+    """Log likelihood of sizes at every scale of a noise, bad readings averaged over.
+
+    Parameters
+    ----------
+    off, model : array
+        Shape (..., d, n): measured less predicted sizes, and the predicted ones, of d draws.
+    kind : Kind
+        With arrays of shape (..., n).
+    scale : array
+        Shape (..., k).
+    noise : Noise
+        Of bad readings.
+
+    Returns
+    -------
+    array, shape (..., d, k)
+
+    Notes
+    -----
+    A reading is good with probability 1 - f or else scatters W times as wide (the good-and-bad-data
+    model of D. W. Hogg, J. Bovy and D. Lang, arXiv:1008.4686 (2010), eq. 17, with a width that
+    goes with the noise). Of n readings only the n//most worst can be bad.
+    """
+    xp = off.__array_namespace__()
+    n = off.shape[-1]
+    z2 = squared_pulls(off, model, kind, scale)
+    spread = 0.5 * xp.sum(xp.log(variance_of(kind, scale)), axis=-1)
+    found = -0.5 * xp.sum(z2, axis=-1) - spread[..., None, :] - 0.5 * n * LN_2PI
+    if kind.power:
+        found = found - xp.sum(xp.log(model), axis=-1)[..., None]
+    many = n // noise.most
+    if not many:
+        return found
+    worst = xp.max(z2, axis=-1)[..., None] if many == 1 else xp.sort(z2, axis=-1)[..., n - many :]
+    odds = log_odds(worst, noise)
+    return found + n * math.log1p(-noise.bad) + xp.sum(xp.logaddexp(0.0 * odds, odds), axis=-1)
+
+
+def log_odds(squared_pull: Any, noise: Noise) -> Any:
+    """Log odds that a reading is bad, from its squared pull."""
+    before = math.log(noise.bad / (1.0 - noise.bad) / noise.width)
+    return before + 0.5 * squared_pull * (1.0 - noise.width**-2)
+
+
+def averaged(log: Any, log_weight: Any) -> Any:
+    """Log of the average over the last axis."""
+    xp = log.__array_namespace__()
+    sum_of = log + log_weight
+    top = xp.max(sum_of, axis=-1, keepdims=True)
+    top = xp.where(xp.isfinite(top), top, 0.0)
+    return xp.log(xp.sum(xp.exp(sum_of - top), axis=-1)) + top[..., 0]

@@ -1,0 +1,328 @@
+"""From the posterior of a plane to its result: the one way of every scenario."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from scipy.special import ndtri
+
+from beamfit.optics.beamline import Beamline
+from beamfit.quantity import Quantity
+from beamfit.statistics import Directions, scaled_directions
+from beamfit.status import Status
+from beamfit.studies.scan.comparison import PlanePosterior, weighted_quantiles
+from beamfit.studies.scan.model import QUANTITIES, coefficients, numbers_of, phase_coverage
+from beamfit.studies.scan.next_point import next_measurement
+from beamfit.studies.scan.results import Identifiability, PlaneFit, Points, ScreenTwiss
+from beamfit.studies.scan.statement import Seen, asked_of
+from beamfit.studies.scan.transport import setting_units
+from beamfit.studies.scan.verdict import (
+    CARRIES,
+    MOVES,
+    Evidence,
+    noise_remark,
+    point_remarks,
+    verdict,
+    waist_bracketed,
+)
+from beamfit.verdict import Finding
+
+SIGMA = slice(4, 7)
+# Normalised emittances in m beyond which only a wrong unit leads: rings and linacs have 1e-9 and
+# more, muons before cooling 2e-2; sizes a thousand times off are a million in this.
+LEAST, MOST = 1e-10, 0.1
+# What a beam of unknown emittance may have all the same: σ, and the size at the screen.
+LINEAR = np.isin(list(QUANTITIES), ("sigma11", "sigma12", "sigma22", "screen_size"))
+# Numbers of either sign; the others are positive, and spread by a factor.
+SIGNED = np.isin(list(QUANTITIES), ("alpha", "sigma12", "screen_alpha"))
+AT = (0.025, 0.1587, 0.5, 0.8413, 0.975)
+
+
+class Places(NamedTuple):
+    """Where the numbers of a beam are asked for: βγ, matrices to the screen and the design."""
+
+    factor: float
+    to_screen: np.ndarray
+    to_design: np.ndarray
+    design: np.ndarray
+
+
+class Beside(NamedTuple):
+    """What a scenario adds to the answer of a plane, whose line is known otherwise.
+
+    Attributes
+    ----------
+    value, spread, raw : ndarray
+        Shape (11,), in the order of `QUANTITIES`: best values, standard deviations that the other
+        unknowns add to those of known transport, and errors by the stated errors alone.
+    covariance : ndarray
+        Shape (3, 3), of σ11, σ12, σ22.
+    directions : Directions
+        What the data leave open.
+    dof : float
+        Degrees of freedom of the plane's sizes.
+    ending, opened, remedy, remark, scenario
+        As of `Evidence`, and a further sentence.
+    holds : str
+        What the error includes.
+    """
+
+    value: np.ndarray
+    spread: np.ndarray
+    raw: np.ndarray
+    covariance: np.ndarray
+    directions: Directions
+    dof: float
+    ending: Finding | None
+    opened: str
+    remedy: str
+    remark: str
+    scenario: str
+    holds: str
+
+
+class Influence(NamedTuple):
+    """The point without which the emittance moves most: where it lies, by how many errors."""
+
+    place: str = ""
+    shift: float = 0.0
+    without: float = math.nan
+
+
+def plane_answer(seen: Seen, line: Beamline, plane: str, places: Places, b: Beside | None) -> PlaneFit:
+    """Answer for one plane.
+
+    Parameters
+    ----------
+    seen : Seen
+        The scan through its line, as found.
+    line : Beamline
+        The line as found.
+    plane : str
+        "x" or "y".
+    places : Places
+        Where the beam is asked for.
+    b : Beside or None
+        What a scenario adds.
+
+    Returns
+    -------
+    PlaneFit
+        Errors only for what the data determine: half of the central 68 % of the posterior.
+    """
+    work = seen.works[plane]
+    post, p = work.posterior, work.points
+    given = places.factor, places.to_screen, places.to_design, places.design
+    quantiles = _quantiles(post.sigma, post.weight, given, None if b is None else b.spread)
+    value = numbers_of(post.best, *given) if b is None else b.value
+    half = 0.5 * (quantiles[3] - quantiles[1])
+    low, high = quantiles[0], quantiles[4]
+    carrying = _influence(p, post.best, half[0]) if post.positive and len(p.size) > 4 else Influence()
+    if abs(carrying.shift) > MOVES:
+        low, high, half = _reaching(low, high, half, value, carrying.without)
+    e = _evidence(seen, plane, low[1], high[1], b)
+    determined = e.determined
+    noise = work.sizes.likeness[1]
+    remarks = [noise_remark(noise, post.scale), work.shot_words]
+    remarks += point_remarks(p, carrying.place, carrying.shift) if e.of_a_beam else []
+    remarks += [b.remark] if b is not None and determined else []
+    advice = None if determined or not e.of_a_beam or b is not None else next_measurement(seen, plane)
+    finding = verdict(e, " ".join(filter(None, remarks)), advice or "")
+    finding, determined = _possible(finding, determined, value[1], _column(seen, plane))
+    known = determined | (LINEAR & e.of_a_beam & (b is None))
+    raw = _raw(post, given) if b is None else b.raw
+    scale = float(half[0] / raw[0]) if determined and np.isfinite(raw[0]) and raw[0] > 0 else 1.0
+    limits = e.of_a_beam and not e.opened and e.ending is None
+    numbers = [
+        _quantity(value[i], half[i], raw[i], unit, (low[i], high[i]), bool(known[i]), limits)
+        for i, unit in enumerate(QUANTITIES.values())
+    ]
+    covariance = post.covariance if b is None else b.covariance
+    directions = _directions(p, post) if b is None else b.directions
+    emittance, normalized, beta, alpha, s11, s12, s22, *screen, mismatch = numbers
+    place = seen.rows.places[-1]
+    own = {name: float(line[name].setting) for name in line.upto(place).magnets}
+    return PlaneFit(
+        plane=plane,
+        status=finding.status,
+        message=finding.message,
+        emittance=emittance,
+        normalized_emittance=normalized,
+        beta=beta,
+        alpha=alpha,
+        sigma=(s11, s12, s22),
+        screen=ScreenTwiss(place, own, setting_units(line, own), *screen),
+        mismatch=None if getattr(seen.line.design, plane, None) is None else mismatch,
+        chi2=post.chi2 if math.isfinite(post.chi2) else None,
+        dof=round(b.dof) if b is not None else max(len(p.size) - 3, 0),
+        rms_residual=Quantity(float(np.sqrt(np.mean((p.size - p.model) ** 2))), None, "m"),
+        covariance=covariance / scale**2 if known[SIGMA].all() else np.full((3, 3), np.nan),
+        error_scale=scale,
+        noise=noise_words(noise, post.scale, post.relative, p),
+        method=seen.method,
+        weights=seen.weights,
+        identifiability=Identifiability(
+            determined=determined,
+            probability=post.probability,
+            singular_values=tuple(float(v) for v in directions.singular_values),
+            condition=directions.condition if math.isfinite(directions.condition) else None,
+            waist_bracketed=e.bracketed,
+            phase_coverage=phase_coverage(p.r11, p.r12, float(value[2]), float(value[3])),
+            undetermined=(*directions.undetermined, *["emittance"] * (not determined)),
+            next_measurement=advice,
+        ),
+        points=p,
+        holds="statistics only" if b is None else b.holds,
+    )
+
+
+def _column(seen: Seen, plane: str) -> str:
+    return seen.scan.columns.get(f"size_{plane}", f"size_{plane}")
+
+
+def _quantiles(
+    sigma: np.ndarray, weight: np.ndarray, given: tuple, spread: np.ndarray | None
+) -> np.ndarray:
+    """Quantiles `AT` of every number, shape (5, 11)."""
+    kept = weight > 0.0
+    sigma, weight = sigma[kept], weight[kept]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        numbers = numbers_of(sigma.T, *given)
+    if spread is not None:
+        # Even steps of a normal distribution, in an order that has nothing to do with the draws'.
+        z = ndtri((0.5 + np.arange(len(weight)) * 0.6180339887498949) % 1.0)
+        with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
+            middle = np.abs(numbers @ (weight / weight.sum()))
+            grown = numbers * np.exp(z * np.minimum(spread / middle, 50.0)[:, None])
+            numbers = np.where(SIGNED[:, None], numbers + z * spread[:, None], grown)
+    return np.array([weighted_quantiles(row, weight, AT) for row in numbers]).T
+
+
+def _reaching(
+    low: np.ndarray, high: np.ndarray, half: np.ndarray, value: np.ndarray, without: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Intervals that reach to the emittance without the point that carries it."""
+    shift = without - value[0]
+    if not math.isfinite(shift):
+        return low, high, half
+    reach = np.array([shift, shift * value[1] / value[0]])
+    low, high, half = low.copy(), high.copy(), half.copy()
+    low[:2] = np.minimum(low[:2], value[:2] + reach)
+    high[:2] = np.maximum(high[:2], value[:2] + reach)
+    # Two answers, one of which is right: half of what lies between them.
+    half[:2] = np.maximum(half[:2], 0.5 * np.abs(reach))
+    return low, high, half
+
+
+def _evidence(seen: Seen, plane: str, low: float, high: float, b: Beside | None) -> Evidence:
+    work = seen.works[plane]
+    p, post = work.points, work.posterior
+    found = Evidence(
+        probability=post.probability,
+        seen=post.seen,
+        points=len(p.size),
+        moved=work.sizes.moved,
+        errors=work.sizes.error is not None,
+        low=float(low),
+        high=float(high),
+        bracketed=waist_bracketed(p.settings, p.screen, p.size, p.error),
+    )
+    if b is None:
+        return found
+    return found._replace(ending=b.ending, scenario=b.scenario, opened=b.opened, remedy=b.remedy)
+
+
+def _possible(
+    finding: Finding, determined: bool, emittance: float, sizes: str
+) -> tuple[Finding, bool]:
+    """A finding, or that the emittance is one that only a wrong unit explains."""
+    if not determined or LEAST <= emittance <= MOST:
+        return finding, determined
+    cause = (
+        f"Not determined: a normalised emittance of {emittance:.2g} m is "
+        f"{'less' if emittance < LEAST else 'more'} than any accelerator has."
+    )
+    remedy = (
+        f"Check the units of '{sizes}', the settings and the energy: sizes in mm under a header "
+        "that says um make it a million times less."
+    )
+    return Finding(Status.unidentified, cause, remedy), False
+
+
+def _quantity(
+    value: float, half: float, raw: float, unit: str, interval: tuple[float, float], known: bool,
+    limits: bool,
+) -> Quantity:  # fmt: skip
+    """A number with its error; of one that is not determined its interval, if the model holds."""
+    value, low, high = float(value), float(interval[0]), float(interval[1])
+    if not (math.isfinite(low) and math.isfinite(high)):
+        return Quantity(value, None, unit)
+    if not known:
+        return Quantity(value, None, unit, None, (low, high) if limits else None)
+    raw = float(raw)
+    return Quantity(value, float(half), unit, raw if math.isfinite(raw) else None, (low, high))
+
+
+def _raw(post: PlanePosterior, given: tuple) -> np.ndarray:
+    """Errors by the stated errors alone: sqrt(∇f C ∇f), derivatives by complex steps."""
+    if not np.isfinite(post.stated).all():
+        return np.full(len(QUANTITIES), np.nan)
+    unit = np.sqrt(np.diag(post.stated))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        steps = np.array(post.best, complex)[:, None] + 1e-20j * np.diag(unit)
+        slope = numbers_of(steps, *given).imag / 1e-20 / unit
+        return np.sqrt(np.sum((slope @ post.stated) * slope, axis=1))
+
+
+def _directions(p: Points, post: PlanePosterior) -> Directions:
+    """What the sizes leave open of σ."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        jacobian = np.stack(coefficients(p.r11, p.r12), -1) / (2.0 * p.weighed * p.error)[:, None]
+    return scaled_directions(jacobian, np.array(units_of(post.best)), list(QUANTITIES)[SIGMA])
+
+
+def units_of(sigma: np.ndarray) -> list[float]:
+    """A change of σ11, σ12 and σ22 by 100 %."""
+    return [float(sigma[0]), math.sqrt(max(float(sigma[0] * sigma[2]), 0.0)), float(sigma[2])]
+
+
+def _influence(p: Points, sigma: np.ndarray, error: float) -> Influence:
+    """Leave out each point in turn, at the weights of the fit.
+
+    Notes
+    -----
+    Of weighted rows a_i with residuals r_i and leverages h_i = a_iᵀ(AᵀA)⁻¹a_i, leaving out row i
+    changes σ by -(AᵀA)⁻¹ a_i r_i/(1 - h_i): R. D. Cook and S. Weisberg, Residuals and Influence in
+    Regression (1982), eq. 2.2.3.
+    """
+    scale = 0.5 / (p.weighed * p.error)
+    rows = np.stack(coefficients(p.r11, p.r12), -1) * scale[:, None]
+    left = (p.size**2 - p.known) * scale - rows @ sigma
+    norm = np.linalg.norm(rows, axis=0)
+    q, r = np.linalg.qr(rows / norm)
+    free = np.maximum(1.0 - np.sum(q**2, axis=1), 1e-12)
+    moves = np.linalg.solve(r, q.T).T * (left / free)[:, None] / norm
+    s11, s12, s22 = (sigma - moves).T
+    determinant = np.where((s11 > 0) & (s22 > 0), s11 * s22 - s12**2, np.nan)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        without = np.sqrt(determinant)
+        shifts = (without - math.sqrt(sigma[0] * sigma[2] - sigma[1] ** 2)) / error
+    # A reading that is bad already has no part in the answer.
+    shifts = np.where(p.outlier_probability > 0.5, 0.0, shifts)
+    most = int(np.argmax(np.where(np.isnan(shifts), np.inf, np.abs(shifts))))
+    if abs(shifts[most]) <= CARRIES:
+        return Influence()
+    return Influence(p.where(most), float(shifts[most]), float(without[most]))
+
+
+def noise_words(noise: str, scale: np.ndarray, relative: float, p: Points) -> str:
+    """Where the errors are from, in a few words."""
+    if noise == "shots":
+        return f"of the shots, settings ± {100 * scale[0]:.2g} % beyond"
+    if noise != "none":
+        return "given" if scale[1] <= 1.05 else f"given, × {scale[0]:.2f}"
+    if relative < 0.5:
+        return f"inferred, {1e6 * float(np.median(p.error)):.2g} µm"
+    return f"inferred, {100 * float((p.error / p.weighed).mean()):.2g} % of size"

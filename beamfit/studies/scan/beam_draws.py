@@ -1,0 +1,324 @@
+"""Draws from the posterior of a beam matrix, the noise averaged over: importance sampling.
+
+Arrays of planes: shapes begin with the planes, n is the number of points, d that of draws.
+"""
+
+from __future__ import annotations
+
+import math
+from functools import lru_cache
+from itertools import combinations
+from typing import NamedTuple
+
+import numpy as np
+from scipy.special import chdtri, gammaln, ndtri
+
+from beamfit.noise.model import LN_2PI, Noise
+from beamfit.noise.sizes import (
+    Kind,
+    Scales,
+    averaged,
+    log_likelihood,
+    narrowed,
+    wide_scales,
+)
+
+# Draws of a plane, and degrees of freedom of the Student distributions they are drawn from.
+DRAWS, TAIL = 512, 4.0
+# Proposals are so much wider than the linear theory, and their shares flattened by this power.
+WIDER, FLATTER, PARTS = 1.3, 0.5, 24
+# Rounds in which weights are taken anew from the model, within this factor of the measured size.
+ROUNDS, FURTHEST = 6, 3.0
+# Every two points are left out of up to so many; of more, the worst one after the other.
+PAIRS = 24
+# A direction of the beam is lost below this share of the best seen one.
+RANK = 1e-12
+# Standard deviation of ln of the beam's mean square over the scan: anything near the sizes.
+BRIGHT = 1.0
+
+
+class Coordinates(NamedTuple):
+    """Coordinates in which the scan looks at the beam evenly, in units of the mean size.
+
+    Attributes
+    ----------
+    w : ndarray
+        Shape (..., n, 2): rows of R11 and R12 in them.
+    back : ndarray
+        Shape (..., 2, 2): σ = back σ_w backᵀ, in m and rad.
+    size, known : ndarray
+        Shape (..., n): sizes, and size² that is not due to the beam, in units of the mean size.
+    unit : ndarray
+        Shape (...,): the mean size, m.
+    seen : ndarray of bool
+        Shape (...,): whether the settings separate the numbers of the beam at all.
+    """
+
+    w: np.ndarray
+    back: np.ndarray
+    size: np.ndarray
+    known: np.ndarray
+    unit: np.ndarray
+    seen: np.ndarray
+
+    @property
+    def rows(self) -> np.ndarray:
+        """Derivatives of size² by T, T p_1 and T p_2, shape (..., n, 3)."""
+        a, b = self.w[..., 0], self.w[..., 1]
+        return 0.5 * np.stack([a**2 + b**2, a**2 - b**2, 2.0 * a * b], -1)
+
+    def sigma(self, x: np.ndarray) -> np.ndarray:
+        """σ11, σ12, σ22 in SI of T, T p_1, T p_2, shape (..., d, 3)."""
+        s = 0.5 * np.stack([x[..., 0] + x[..., 1], x[..., 2], x[..., 0] - x[..., 1]], -1)
+        (a, b), (c, d) = np.moveaxis(self.back, (-2, -1), (0, 1))[..., None]
+        s11, s12, s22 = np.moveaxis(s, -1, 0)
+        found = (
+            a * a * s11 + 2.0 * a * b * s12 + b * b * s22,
+            a * c * s11 + (a * d + b * c) * s12 + b * d * s22,
+            c * c * s11 + 2.0 * c * d * s12 + d * d * s22,
+        )
+        return np.stack(found, -1) * self.unit[..., None, None] ** 2
+
+
+def coordinates(
+    r11: np.ndarray, r12: np.ndarray, size: np.ndarray, known: np.ndarray
+) -> Coordinates:
+    """Turn to coordinates in which the scan looks evenly; all arrays of shape (..., n)."""
+    unit = np.exp(np.log(size).mean(-1))
+    size, known = size / unit[..., None], known / unit[..., None] ** 2
+    # R12 is a length: the columns are scaled to one size before they are turned.
+    u = np.stack([r11, r12], -1)
+    norm = np.sqrt((u**2).mean(-2, keepdims=True))
+    norm = np.where(norm > 0, norm, 1.0)
+    v = u / norm / size[..., None]
+    values, vectors = np.linalg.eigh(np.swapaxes(v, -1, -2) @ v / size.shape[-1])
+    seen = values[..., 0] > RANK * values[..., 1]
+    values = np.where(seen[..., None], values, np.maximum(values, 1.0))
+    turn = vectors / np.sqrt(values)[..., None, :]
+    back = turn / np.swapaxes(norm, -1, -2)
+    return Coordinates((u / norm) @ turn, back, size, known, unit, seen)
+
+
+class BeamDraws(NamedTuple):
+    """Draws of the beam of a plane under one kind of noise.
+
+    Attributes
+    ----------
+    x : ndarray
+        Shape (..., d, 3): T, T p_1, T p_2.
+    log_weight : ndarray
+        Shape (..., d): their sum is the evidence; -inf where no beam is.
+    scales : Scales
+        The nodes that the noise was averaged over.
+    best, best_log : ndarray
+        Shape (..., 3) and (...): the likeliest of the fits without some points.
+    """
+
+    x: np.ndarray
+    log_weight: np.ndarray
+    scales: Scales
+    best: np.ndarray
+    best_log: np.ndarray
+
+
+def draw_beams(c: Coordinates, kind: Kind, noise: Noise) -> BeamDraws:
+    """Draw beams from their posterior.
+
+    Parameters
+    ----------
+    c : Coordinates
+        The scan, in its own coordinates.
+    kind : Kind
+        In the same units.
+    noise : Noise
+        Priors of bad readings.
+
+    Returns
+    -------
+    BeamDraws
+
+    Notes
+    -----
+    σ = T/2 (1 + p·(Z, X)) is positive definite for |p| < 1; the prior is flat in p and lognormal in
+    T. Proposals are Student distributions about the fits of all points, and of those without one
+    or two; each draw has the weight of its posterior over the density of the mixture (importance
+    sampling; A. B. Owen and Y. Zhou, J. Am. Stat. Assoc. 95, 135 (2000), sect. 4).
+    """
+    centre, root = fits(c, kind, noise)
+    scales = wide_scales(kind, c.unit.shape)
+    for _ in range(2):
+        at_centres = _log_likelihood(centre, c, kind, scales.scale, noise)
+        scales = narrowed(kind, scales, np.logaddexp.reduce(
+            at_centres + scales.log_weight[..., None, :], axis=-2))
+    found = averaged(_log_likelihood(centre, c, kind, scales.scale, noise),
+                     scales.log_weight[..., None, :])
+    found = np.where(np.isfinite(found), found, -np.inf)
+    top = np.argsort(found, axis=-1)[..., -PARTS:]
+    share = np.exp(FLATTER * (np.take_along_axis(found, top, -1) - found.max(-1, keepdims=True)))
+    share /= share.sum(-1, keepdims=True)
+    centre = np.take_along_axis(centre, top[..., None], -2)
+    root = np.take_along_axis(root, top[..., None, None], -3)
+    x, log_density = student_mixture(centre, root, share)
+    each = averaged(_log_likelihood(x, c, kind, scales.scale, noise), scales.log_weight[..., None, :])
+    weight = each + log_prior(x) - log_density - math.log(DRAWS) + kind.log_weight
+    weight = np.where(np.isnan(weight), -np.inf, weight)
+    return BeamDraws(x, weight, scales, centre[..., -1, :], found.max(-1) + kind.log_weight)
+
+
+def log_prior(x: np.ndarray) -> np.ndarray:
+    """Log prior density of T, T p_1, T p_2, shape (..., 3) to (...); -inf where no beam is."""
+    t = np.maximum(x[..., 0], 1e-300)
+    inside = (x[..., 0] > 0) & (x[..., 1] ** 2 + x[..., 2] ** 2 < t**2)
+    bright = -0.5 * (np.log(t) / BRIGHT) ** 2 - math.log(BRIGHT) - 0.5 * LN_2PI
+    return np.where(inside, bright - math.log(math.pi) - 3.0 * np.log(t), -np.inf)
+
+
+def model_sizes(x: np.ndarray, c: Coordinates) -> np.ndarray:
+    """Predicted sizes, shape (..., d, n), in units of the mean size."""
+    return np.sqrt(np.maximum(x @ np.swapaxes(c.rows, -1, -2) + c.known[..., None, :], 1e-12))
+
+
+def _log_likelihood(
+    x: np.ndarray, c: Coordinates, kind: Kind, scale: np.ndarray, noise: Noise
+) -> np.ndarray:
+    model = model_sizes(x, c)
+    return log_likelihood(c.size[..., None, :] - model, model, kind, scale, noise)
+
+
+def left_out(n: int, noise: Noise) -> np.ndarray:
+    """Which of n points each fit has: all, all but one, all but two; shape (fits, n)."""
+    most = min(n // noise.most, 2 if n <= PAIRS else 1)
+    chosen = [s for k in range(1 + most) for s in combinations(range(n), k)]
+    kept = np.ones((len(chosen), n))
+    for row, points in zip(kept, chosen, strict=True):
+        row[list(points)] = 0.0
+    return kept
+
+
+def fits(c: Coordinates, kind: Kind, noise: Noise) -> tuple[np.ndarray, np.ndarray]:
+    """Fits of size² with all points and without some: centres and roots of their covariances.
+
+    Returns
+    -------
+    tuple of ndarray
+        Shape (..., m, 3) and (..., m, 3, 3).
+    """
+    n = c.size.shape[-1]
+    kept = np.broadcast_to(left_out(n, noise), (*c.unit.shape, *left_out(n, noise).shape))
+    found = [_fitted(c, kind, deviation, kept) for deviation in _deviations(kind, c)]
+    if n > 2 * noise.most:
+        found += [_greedy(c, kind, deviation, noise) for deviation in _deviations(kind, c)]
+    return tuple(np.concatenate(part, axis) for part, axis in zip(zip(*found), (-2, -3)))
+
+
+def _deviations(kind: Kind, c: Coordinates) -> list[np.ndarray]:
+    """Deviations of points to weigh them by: as stated, and with the usual scatter beside."""
+    if kind.special == 0.0 and kind.chance:
+        return [kind.floor, np.hypot(kind.floor, kind.prior.middle * kind.unit)]
+    return [(1.0 if kind.chance else kind.prior.middle) * kind.unit]
+
+
+def _fitted(
+    c: Coordinates, kind: Kind, deviation: np.ndarray, kept: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    rows, target = c.rows[..., None, :, :], (c.size**2 - c.known)[..., None, :]
+    size = c.size[..., None, :]
+    model = np.broadcast_to(size, kept.shape)
+    for _ in range(ROUNDS):
+        weight = kept / (2.0 * model * deviation[..., None, :] * model**kind.power) ** 2
+        normal = np.swapaxes(rows * weight[..., None], -1, -2) @ rows
+        normal = normal + _little(normal)
+        x = np.linalg.solve(normal, np.swapaxes(rows, -1, -2) @ (weight * target)[..., None])[..., 0]
+        squared = (rows @ x[..., None])[..., 0] + c.known[..., None, :]
+        model = np.sqrt(np.clip(squared, (size / FURTHEST) ** 2, (size * FURTHEST) ** 2))
+    chi2 = (weight * (target - (rows @ x[..., None])[..., 0]) ** 2).sum(-1)
+    dof = np.maximum(kept.sum(-1) - 3.0, 0.0)
+    if kind.chance:
+        factor = np.maximum(1.0, chi2 / np.maximum(dof, 1.0))
+    else:
+        factor = (2.0 + chi2) / (2.0 + dof)
+    root = np.linalg.cholesky(np.linalg.inv(normal)) * np.sqrt(factor)[..., None, None]
+    return _inside(x), WIDER * root
+
+
+def _little(normal: np.ndarray) -> np.ndarray:
+    """What keeps a normal matrix of points that say nothing of a direction from being singular."""
+    trace = np.trace(normal, axis1=-2, axis2=-1)[..., None, None]
+    return 1e-9 * np.maximum(trace, 1e-30) * np.eye(3)
+
+
+def _greedy(
+    c: Coordinates, kind: Kind, deviation: np.ndarray, noise: Noise
+) -> tuple[np.ndarray, np.ndarray]:
+    """Fits that leave out the worst point of the one before, up to a share of them."""
+    n = c.size.shape[-1]
+    kept, found = np.ones((*c.unit.shape, 1, n)), []
+    for _ in range(n // noise.most):
+        centre, _ = _fitted(c, kind, deviation, kept)
+        model = model_sizes(centre, c)
+        pull = np.abs(c.size[..., None, :] - model) / deviation[..., None, :] / model**kind.power
+        worst = np.argmax(np.where(kept > 0, pull, -1.0), axis=-1)
+        kept = kept.copy()
+        np.put_along_axis(kept, worst[..., None], 0.0, axis=-1)
+        found.append(_fitted(c, kind, deviation, kept))
+    return tuple(np.concatenate(part, axis) for part, axis in zip(zip(*found), (-2, -3)))
+
+
+def _inside(x: np.ndarray) -> np.ndarray:
+    """The nearest beam of nearly no emittance in the place of what is no beam."""
+    t, p = x[..., 0], np.hypot(x[..., 1], x[..., 2])
+    edge = (t <= 0.05) | (p > 0.98 * t)
+    length = np.maximum(t, 0.3)
+    turned = 0.97 * x[..., 1:] / np.maximum(p, 1e-12)[..., None] * length[..., None]
+    return np.where(edge[..., None], np.concatenate([length[..., None], turned], -1), x)
+
+
+@lru_cache(maxsize=8)
+def _even_points(dim: int) -> tuple[np.ndarray, np.ndarray]:
+    """Points that fill a cube evenly, as those of a Student distribution, and a cut of [0, 1).
+
+    An additive recurrence with the generalised golden ratio g, g^(d+1) = g + 1, stepped by 1/g^k:
+    H. Niederreiter, Random Number Generation and Quasi-Monte Carlo Methods (1992), sect. 3.
+    """
+    count = dim + 2
+    g = 2.0
+    for _ in range(60):
+        g = (1.0 + g) ** (1.0 / (count + 1.0))
+    step = g ** -(1.0 + np.arange(count))
+    cube = (0.5 + np.arange(1, DRAWS + 1)[:, None] * step) % 1.0
+    cube = np.clip(cube, 1e-9, 1.0 - 1e-9)
+    chi2 = chdtri(TAIL, cube[:, dim])
+    return ndtri(cube[:, :dim]) / np.sqrt(chi2 / TAIL)[:, None], cube[:, -1]
+
+
+def student_mixture(
+    centre: np.ndarray, root: np.ndarray, share: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Draws from a mixture of Student distributions, and their log density.
+
+    Parameters
+    ----------
+    centre, root, share : ndarray
+        Shape (..., m, dim), (..., m, dim, dim), lower triangles, and (..., m).
+
+    Returns
+    -------
+    tuple of ndarray
+        Shape (..., d, dim) and (..., d).
+    """
+    dim = centre.shape[-1]
+    z, cut = _even_points(dim)
+    part = (cut[:, None] > np.cumsum(share, -1)[..., None, :]).sum(-1)
+    part = np.minimum(part, share.shape[-1] - 1)
+    own = np.take_along_axis(root, part[..., None, None], -3)
+    x = np.take_along_axis(centre, part[..., None], -2) + (own @ z[..., None])[..., 0]
+    inverse = np.linalg.inv(root)
+    # (x - centre) of every part at once: L⁻¹x - L⁻¹centre.
+    far = x[..., None, :, :] @ np.swapaxes(inverse, -1, -2)
+    far = far - (inverse @ centre[..., None])[..., None, :, 0]
+    determinant = np.log(np.abs(np.diagonal(root, axis1=-2, axis2=-1))).sum(-1)
+    log = -0.5 * (TAIL + dim) * np.log1p((far**2).sum(-1) / TAIL) - determinant[..., None]
+    with np.errstate(divide="ignore"):
+        log = np.logaddexp.reduce(log + np.log(share)[..., None], axis=-2)
+    constant = gammaln(0.5 * (TAIL + dim)) - gammaln(0.5 * TAIL)
+    return x, log + constant - 0.5 * dim * math.log(TAIL * math.pi)
