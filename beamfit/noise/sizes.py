@@ -128,9 +128,13 @@ def variance_of(kind: Kind, scale: Any) -> Any:
 
 
 def squared_pulls(off: Any, model: Any, kind: Kind, scale: Any) -> Any:
-    """(size - model)² over the variance: shape (..., d, k, n) of d draws at k scales."""
+    """(size - model)² over the variance, points first: shape (n, ..., d, k), d draws, k scales."""
+    xp = off.__array_namespace__()
     z = off / model if kind.power else off
-    return z[..., :, None, :] ** 2 / variance_of(kind, scale)[..., None, :, :]
+    precision = 1.0 / variance_of(kind, scale)
+    # Stacked, not turned: sums over points then run along memory.
+    squared = xp.stack([z[..., i, None] ** 2 for i in range(z.shape[-1])])
+    return squared * xp.stack([precision[..., None, :, i] for i in range(z.shape[-1])])
 
 
 def log_likelihood(off: Any, model: Any, kind: Kind, scale: Any, noise: Noise) -> Any:
@@ -155,21 +159,34 @@ def log_likelihood(off: Any, model: Any, kind: Kind, scale: Any, noise: Noise) -
     -----
     A reading is good with probability 1 - f or else scatters W times as wide (the good-and-bad-data
     model of D. W. Hogg, J. Bovy and D. Lang, arXiv:1008.4686 (2010), eq. 17, with a width that
-    goes with the noise). Of n readings only the n//most worst can be bad.
+    goes with the noise). Of few readings only the n//most worst can be bad; of 3 most and more the
+    prior itself keeps them few.
     """
     xp = off.__array_namespace__()
     n = off.shape[-1]
     z2 = squared_pulls(off, model, kind, scale)
     spread = 0.5 * xp.sum(xp.log(variance_of(kind, scale)), axis=-1)
-    found = -0.5 * xp.sum(z2, axis=-1) - spread[..., None, :] - 0.5 * n * LN_2PI
+    found = -0.5 * xp.sum(z2, axis=0) - spread[..., None, :] - 0.5 * n * LN_2PI
     if kind.power:
         found = found - xp.sum(xp.log(model), axis=-1)[..., None]
     many = n // noise.most
     if not many:
         return found
-    worst = xp.max(z2, axis=-1)[..., None] if many == 1 else xp.sort(z2, axis=-1)[..., n - many :]
-    odds = log_odds(worst, noise)
-    return found + n * math.log1p(-noise.bad) + xp.sum(xp.logaddexp(0.0 * odds, odds), axis=-1)
+    odds = log_odds(_worst(z2, many), noise)
+    # ln(1 + e^odds) without overflow.
+    doubt = xp.log1p(xp.exp(xp.minimum(odds, 500.0))) + xp.maximum(odds - 500.0, 0.0)
+    return found + n * math.log1p(-noise.bad) + xp.sum(doubt, axis=0)
+
+
+def _worst(z2: Any, many: int) -> Any:
+    """The one or two largest along the first axis; all where more are asked for."""
+    xp = z2.__array_namespace__()
+    if many > 2:
+        return z2
+    first = xp.max(z2, axis=0)
+    if many == 1:
+        return first[None]
+    return xp.stack([first, xp.max(xp.where(z2 < first, z2, 0.0), axis=0)])
 
 
 def log_odds(squared_pull: Any, noise: Noise) -> Any:

@@ -24,7 +24,7 @@ from beamfit.noise.sizes import (
 )
 
 # Draws of a plane, and degrees of freedom of the Student distributions they are drawn from.
-DRAWS, TAIL = 512, 4.0
+DRAWS, TAIL = 1024, 4.0
 # Proposals are so much wider than the linear theory, and their shares flattened by this power.
 WIDER, FLATTER, PARTS = 1.3, 0.5, 24
 # Rounds in which weights are taken anew from the model, within this factor of the measured size.
@@ -319,6 +319,8 @@ def student_mixture(
     determinant = np.log(np.abs(np.diagonal(root, axis1=-2, axis2=-1))).sum(-1)
     log = -0.5 * (TAIL + dim) * np.log1p((far**2).sum(-1) / TAIL) - determinant[..., None]
     with np.errstate(divide="ignore"):
-        log = np.logaddexp.reduce(log + np.log(share)[..., None], axis=-2)
+        log = log + np.log(share)[..., None]
+        top = log.max(-2, keepdims=True)
+        log = np.log(np.exp(log - top).sum(-2)) + top[..., 0, :]
     constant = gammaln(0.5 * (TAIL + dim)) - gammaln(0.5 * TAIL)
     return x, log + constant - 0.5 * dim * math.log(TAIL * math.pi)

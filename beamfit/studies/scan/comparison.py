@@ -289,11 +289,12 @@ def _expected(
     off, model = (c.size - model)[:, None, :], model[:, None, :]
     log = log_likelihood(off, model, kind, scales.scale, noise)[:, 0] + scales.log_weight
     share = np.exp(log - np.logaddexp.reduce(log, axis=-1)[:, None])[..., None]
-    z2 = squared_pulls(off, model, kind, scales.scale)[:, 0]
+    z2 = np.moveaxis(squared_pulls(off, model, kind, scales.scale)[..., 0, :], 0, -1)
     n = off.shape[-1]
     bad = np.zeros_like(z2)
     if many := n // noise.most:
-        worst = z2 >= np.sort(z2, axis=-1)[..., n - many : n - many + 1]
+        least = np.sort(z2, axis=-1)[..., n - many : n - many + 1] if many < 3 else 0.0
+        worst = z2 >= least
         bad = np.where(worst, 1.0 / (1.0 + np.exp(-log_odds(z2, noise))), 0.0)
     each = (1.0 - bad * (1.0 - noise.width**-2)) / variance_of(kind, scales.scale)
     return (share * each).sum(1) / model[:, 0] ** (2 * kind.power), (share * bad).sum(1)
