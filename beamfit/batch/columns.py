@@ -79,7 +79,7 @@ def emittance_rows(fit: EmittanceFit) -> Iterator[dict[str, Any]]:
         row |= {name: getattr(p, name) for name in ("plane", "status", "message", "chi2", "dof")}
         row |= {name: getattr(p, name) for name in ("error_scale", "noise", "method", "weights")}
         row |= {f"singular_value_{i}": v for i, v in enumerate(known.singular_values, start=1)}
-        row["zero_emittance_distance"] = known.zero_distance
+        row["beam_probability"] = known.probability["beam"]
         row["phase_coverage_deg"] = known.phase_coverage
         yield row | {"undetermined": "; ".join(known.undetermined), "notes": notes}
 

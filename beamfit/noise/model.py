@@ -24,6 +24,19 @@ class Lognormal(NamedTuple):
         pull = (log - math.log(self.middle)) / self.spread
         return -0.5 * pull**2 - math.log(self.spread) - 0.5 * LN_2PI
 
+    def log_probability_above(self, least: float) -> float:
+        """Log probability that the number exceeds some value.
+
+        Examples
+        --------
+        >>> round(Lognormal(1.0, 0.5).log_probability_above(1.0), 6)
+        -0.693147
+        """
+        if not least > 0.0:
+            return 0.0
+        pull = (math.log(least) - math.log(self.middle)) / self.spread
+        return math.log(0.5 * math.erfc(pull / math.sqrt(2.0)))
+
 
 @dataclass(frozen=True)
 class Noise:
@@ -35,8 +48,8 @@ class Noise:
         Probability that stated errors are right. Most are; a third to a half of the real scans
         with stated errors scatter more (docs/verdict.md).
     factor : Lognormal
-        Where they are not, the factor by which they are off. Real errors are often half of the
-        truth, since shots do not show what differs from setting to setting.
+        Where they are not, the factor, above 1, by which they are too small. Real errors are often
+        half of the truth, since shots do not show what differs from setting to setting.
     unstated : Lognormal
         Noise that nobody stated, as a share of the size. Screens and wires reach 1 to 20 %.
     share : float

@@ -31,6 +31,9 @@ class Kind(NamedTuple):
         Of s.
     special, chance : float
         A value that s has with this probability: 1 where stated errors are right.
+    least : float
+        s is no less than this: stated errors are right or too small, since an error that seems too
+        large may hold what these points do not show.
     log_weight : float
         Log prior probability of the kind.
     """
@@ -41,6 +44,7 @@ class Kind(NamedTuple):
     prior: Lognormal
     special: float
     chance: float
+    least: float
     log_weight: float
 
 
@@ -77,25 +81,31 @@ def kinds_of(
     """
     zero = np.zeros_like(size)
     if floor is not None:
-        return (Kind(0, floor, size, noise.scatter, 0.0, noise.even, 0.0),)
+        return (Kind(0, floor, size, noise.scatter, 0.0, noise.even, 0.0, 0.0),)
     if error is None:
         middle = np.median(size, axis=-1, keepdims=True) * np.ones_like(size)
         share, same = math.log(noise.share), math.log1p(-noise.share)
         return (
-            Kind(1, zero, zero + 1.0, noise.unstated, 1.0, 0.0, share),
-            Kind(0, zero, middle, noise.unstated, 1.0, 0.0, same),
+            Kind(1, zero, zero + 1.0, noise.unstated, 1.0, 0.0, 0.0, share),
+            Kind(0, zero, middle, noise.unstated, 1.0, 0.0, 0.0, same),
         )
     share = error / size
     alike = bool(np.all(np.ptp(share, axis=-1) <= 0.01 * share.mean(-1)))
     unit = share if alike else error
-    return (Kind(int(alike), zero, unit, noise.factor, 1.0, noise.right, 0.0),)
+    return (Kind(int(alike), zero, unit, noise.factor, 1.0, noise.right, 1.0, 0.0),)
 
 
 def scales_between(kind: Kind, low: np.ndarray, high: np.ndarray) -> Scales:
     """Nodes between two logs of the scale, shape (...,), and the special value before them."""
+    if kind.least:
+        low = np.maximum(low, math.log(kind.least))
+        high = np.maximum(high, low + 0.01)
     step = (high - low) / (NODES - 1)
     log = low[..., None] + step[..., None] * np.arange(NODES)
-    weight = math.log1p(-kind.chance) + kind.prior.log_density(log) + np.log(step)[..., None]
+    whole = math.log1p(-kind.chance) - kind.prior.log_probability_above(kind.least)
+    weight = whole + kind.prior.log_density(log) + np.log(step)[..., None]
+    # The trapezoidal rule.
+    weight = weight - math.log(2.0) * np.isin(np.arange(NODES), (0, NODES - 1))
     if not kind.chance:
         return Scales(np.exp(log), weight)
     first = np.ones_like(log[..., :1])

@@ -24,9 +24,9 @@ def identifiability_rows(
             lambda p: ", ".join(f"{v:.3g}" for v in p.identifiability.singular_values),
         ),
         ("condition", lambda p: _condition(p.identifiability.condition)),
-        ("zero emittance at", lambda p: f"{p.identifiability.zero_distance:.1f} standard errors"),
+        ("probability of a beam", lambda p: f"{p.identifiability.probability['beam']:.4f}"),
         ("waist bracketed", lambda p: p.identifiability.waist_bracketed),
-        ("betatron phase seen", lambda p: degrees(p.identifiability.phase_coverage)),
+        ("phase advance covered", lambda p: degrees(p.identifiability.phase_coverage)),
     ]
     return [(label, [cell(value(p)) for p in planes]) for label, value in rows]
 
@@ -54,8 +54,8 @@ def point_rows(plane: PlaneFit) -> tuple[list[str], list[list[str]]]:
     for name, size in (("size", p.size), ("error", p.error), ("fit", p.model)):
         columns[f"{name} µm"] = map("{:.2f}".format, 1e6 * size)
     columns["pull"] = map("{:+.2f}".format, p.pull)
-    if p.outlier_probability is not None:
-        columns["P(outlier)"] = map("{:.2f}".format, p.outlier_probability)
+    if (p.outlier_probability > 0.05).any():
+        columns["P(bad)"] = map("{:.2f}".format, p.outlier_probability)
     rows = [list(row) for row in islice(zip(*columns.values(), strict=True), MOST_ROWS)]
     left = len(p.size) - len(rows)
     if left > 0:

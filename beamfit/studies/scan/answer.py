@@ -10,7 +10,7 @@ from scipy.special import ndtri
 
 from beamfit.optics.beamline import Beamline
 from beamfit.quantity import Quantity
-from beamfit.statistics import Directions, scaled_directions
+from beamfit.statistics import Directions, chi2_probability, scaled_directions
 from beamfit.status import Status
 from beamfit.studies.scan.comparison import PlanePosterior, weighted_quantiles
 from beamfit.studies.scan.model import QUANTITIES, coefficients, numbers_of, phase_coverage
@@ -125,12 +125,14 @@ def plane_answer(seen: Seen, line: Beamline, plane: str, places: Places, b: Besi
     e = _evidence(seen, plane, low[1], high[1], b)
     determined = e.determined
     noise = work.sizes.likeness[1]
-    remarks = [noise_remark(noise, post.scale), work.shot_words]
+    dof = max(len(p.size) - 3, 0)
+    remarks = [noise_remark(noise, post.scale, chi2_probability(post.chi2, dof)), work.shot_words]
     remarks += point_remarks(p, carrying.place, carrying.shift) if e.of_a_beam else []
     remarks += [b.remark] if b is not None and determined else []
     advice = None if determined or not e.of_a_beam or b is not None else next_measurement(seen, plane)
     finding = verdict(e, " ".join(filter(None, remarks)), advice or "")
-    finding, determined = _possible(finding, determined, value[1], _column(seen, plane))
+    if determined and (other := _impossible(value[1], _column(seen, plane))):
+        finding, determined, e = other, False, e._replace(seen=False)
     known = determined | (LINEAR & e.of_a_beam & (b is None))
     raw = _raw(post, given) if b is None else b.raw
     scale = float(half[0] / raw[0]) if determined and np.isfinite(raw[0]) and raw[0] > 0 else 1.0
@@ -139,7 +141,8 @@ def plane_answer(seen: Seen, line: Beamline, plane: str, places: Places, b: Besi
         _quantity(value[i], half[i], raw[i], unit, (low[i], high[i]), bool(known[i]), limits)
         for i, unit in enumerate(QUANTITIES.values())
     ]
-    covariance = post.covariance if b is None else b.covariance
+    covariance = post.stated if np.isfinite(post.stated).all() else post.covariance
+    covariance = covariance if b is None else b.covariance / scale**2
     directions = _directions(p, post) if b is None else b.directions
     emittance, normalized, beta, alpha, s11, s12, s22, *screen, mismatch = numbers
     place = seen.rows.places[-1]
@@ -156,9 +159,9 @@ def plane_answer(seen: Seen, line: Beamline, plane: str, places: Places, b: Besi
         screen=ScreenTwiss(place, own, setting_units(line, own), *screen),
         mismatch=None if getattr(seen.line.design, plane, None) is None else mismatch,
         chi2=post.chi2 if math.isfinite(post.chi2) else None,
-        dof=round(b.dof) if b is not None else max(len(p.size) - 3, 0),
+        dof=round(b.dof) if b is not None else dof,
         rms_residual=Quantity(float(np.sqrt(np.mean((p.size - p.model) ** 2))), None, "m"),
-        covariance=covariance / scale**2 if known[SIGMA].all() else np.full((3, 3), np.nan),
+        covariance=covariance if known[SIGMA].all() else np.full((3, 3), np.nan),
         error_scale=scale,
         noise=noise_words(noise, post.scale, post.relative, p),
         method=seen.method,
@@ -234,12 +237,10 @@ def _evidence(seen: Seen, plane: str, low: float, high: float, b: Beside | None)
     return found._replace(ending=b.ending, scenario=b.scenario, opened=b.opened, remedy=b.remedy)
 
 
-def _possible(
-    finding: Finding, determined: bool, emittance: float, sizes: str
-) -> tuple[Finding, bool]:
-    """A finding, or that the emittance is one that only a wrong unit explains."""
-    if not determined or LEAST <= emittance <= MOST:
-        return finding, determined
+def _impossible(emittance: float, sizes: str) -> Finding | None:
+    """The finding on an emittance that only a wrong unit explains; None of a possible one."""
+    if LEAST <= emittance <= MOST:
+        return None
     cause = (
         f"Not determined: a normalised emittance of {emittance:.2g} m is "
         f"{'less' if emittance < LEAST else 'more'} than any accelerator has."
@@ -248,7 +249,7 @@ def _possible(
         f"Check the units of '{sizes}', the settings and the energy: sizes in mm under a header "
         "that says um make it a million times less."
     )
-    return Finding(Status.unidentified, cause, remedy), False
+    return Finding(Status.unidentified, cause, remedy)
 
 
 def _quantity(

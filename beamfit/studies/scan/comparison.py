@@ -42,7 +42,7 @@ BEAM, FLAT = "beam", "beam of no emittance"
 # Of rows that moved no magnet only a beam and sizes at random are possible.
 UNMOVED = {BEAM: 0.9, FLAT: 0.05, "sizes at random": 0.05}
 # Planes that are looked at in one call, and rounds of the best fit and when it rests.
-TOGETHER, ROUNDS, REST = 64, 60, 1e-10
+TOGETHER, ROUNDS, REST = 64, 100, 1e-12
 
 
 class PlaneSizes(NamedTuple):
@@ -256,6 +256,7 @@ def _best(
     top = np.array([d.best_log for d in draws]) + np.log(np.maximum(of_kind, 1e-300))
     first = np.argmax(top, axis=0)
     x = np.array([d.best for d in draws])[first, np.arange(len(first))]
+    rests = np.zeros(len(x), bool)
     for _ in range(ROUNDS):
         model = _model(x, c)
         parts = [
@@ -271,7 +272,10 @@ def _best(
         last = x
         right = (np.swapaxes(design, -1, -2) @ ((target - c.known) * scale)[..., None])
         x = np.linalg.solve(normal + 1e-14 * trace * np.eye(3), right)[..., 0]
-        if np.all(np.abs(x - last).max(-1) < REST * np.abs(x).max(-1)):
+        # A plane that rests stays, whatever the others do.
+        x = np.where(rests[:, None], last, x)
+        rests |= np.abs(x - last).max(-1) < REST * np.abs(x).max(-1)
+        if rests.all():
             break
     bad = sum(w[:, None] * b for w, (_, b) in zip(of_kind, parts, strict=True))
     return _Best(x, normal, _model(x, c), precision, bad)

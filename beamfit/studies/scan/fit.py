@@ -144,7 +144,7 @@ def fit_emittance(
     if statement.closed:
         return EmittanceFit(judged_beam(seen), scan, line, statement, told, seen)
 
-    from beamfit.studies.scan.unknowns import judged_scenario, settled_fit  # loads the solvers
+    from beamfit.studies.scan.scenario_fit import judged_scenario, settled_fit  # loads the solvers
 
     fit, seen = settled_fit(seen, statement, told)
     parameters = tuple(statement.parameters(seen, told, fit))

@@ -71,13 +71,14 @@ def _own(model: Mapping[str, Any]) -> dict[str, Any]:
     return {**model, "beam": beams}
 
 
-@tree.node("power", "special", "chance", "log_weight", "prior")
+@tree.node("power", "special", "chance", "least", "log_weight", "prior")
 class AveragedNoise:
     """One kind of noise of a plane with its nodes, in units of the mean size."""
 
     power: int
     special: float
     chance: float
+    least: float
     log_weight: float
     prior: tuple[float, float]
     floor: Any
@@ -89,7 +90,7 @@ class AveragedNoise:
     def kind(self) -> Kind:
         """The same as the likelihood takes it."""
         named = (self.power, self.floor, self.unit, Lognormal(*self.prior))
-        return Kind(*named, self.special, self.chance, self.log_weight)
+        return Kind(*named, self.special, self.chance, self.least, self.log_weight)
 
 
 @tree.node("plane", "noise")
@@ -139,7 +140,7 @@ def _sizes_of(problem: Problem, seen: Seen, planes: Sequence[str]) -> tuple[Size
         post = work.posterior
         kinds = [
             AveragedNoise(
-                k.power, k.special, k.chance, k.log_weight, tuple(k.prior), k.floor, k.unit,
+                k.power, k.special, k.chance, k.least, k.log_weight, tuple(k.prior), k.floor, k.unit,
                 nodes.scale, nodes.log_weight,
             )
             for k, nodes in zip(post.kinds, post.scales, strict=True)

@@ -41,7 +41,9 @@ def flat_beam(c: Coordinates, kind: Kind, noise: Noise) -> np.ndarray:
     rows = (w / deviation[..., None])[..., None, :, :] * side[..., None]
     normal = np.swapaxes(rows, -1, -2) @ rows
     right = np.swapaxes(rows, -1, -2) @ (target / deviation)[..., None, :, None]
-    v = np.linalg.solve(normal + 1e-12 * np.eye(2) * np.trace(normal, axis1=-2, axis2=-1)[..., None, None], right)
+    trace = np.trace(normal, axis1=-2, axis2=-1)[..., None, None]
+    normal = normal + 1e-9 * np.maximum(trace, 1e-30) * np.eye(2)
+    v = np.linalg.solve(normal, right)
     off = (rows @ v)[..., 0] - (target / deviation)[..., None, :]
     chi2 = (off**2).sum(-1)
     best = np.argmin(chi2, axis=-1)[..., None]

@@ -20,6 +20,8 @@ USEFUL = 2.5
 # A point carries the answer if the emittance moves by so many errors without it; the interval
 # reaches to where it goes if that is farther than any noise would move it.
 CARRIES, MOVES = 2.0, 3.0
+# Above this probability of χ² stated errors are called too large.
+OVERSTATED = 0.999
 # Points that a sentence names.
 MOST_NAMED = 5
 # What to check where a rival explains the sizes.
@@ -90,9 +92,9 @@ class Evidence(NamedTuple):
     @property
     def of_a_beam(self) -> bool:
         """Whether the sizes are a beam's, of an emittance or none."""
-        return self.seen and (
-            self.untested or self.probability[BEAM] + self.probability[FLAT] > SURE
-        )
+        if not self.seen or self.points <= 3:
+            return self.seen and self.untested
+        return self.probability[BEAM] + self.probability[FLAT] > SURE
 
     @property
     def determined(self) -> bool:
@@ -185,7 +187,7 @@ def _open(e: Evidence) -> str:
     return f"the 95 % interval of the emittance spans a factor {said}"
 
 
-def noise_remark(noise: str, scale: np.ndarray) -> str:
+def noise_remark(noise: str, scale: np.ndarray, probability: float | None = None) -> str:
     """Say what the noise turned out to be, where that differs from what was stated.
 
     Parameters
@@ -194,6 +196,8 @@ def noise_remark(noise: str, scale: np.ndarray) -> str:
         What was known of it.
     scale : ndarray
         Median and central 68 % of its scale.
+    probability : float, optional
+        Of a χ² at least as large as that of the stated errors.
 
     Examples
     --------
@@ -207,8 +211,11 @@ def noise_remark(noise: str, scale: np.ndarray) -> str:
                 f"Stated errors are too small by a factor {middle:.2g} ({low:.2g} to {high:.2g}), "
                 "which the error includes."
             )
-        if high < 0.95:
-            return f"Stated errors seem too large: the sizes scatter by {middle:.2g} of them."
+        if probability is not None and probability > OVERSTATED:
+            return (
+                "Stated errors seem too large, and so is the error here: the sizes scatter less "
+                f"(probability {1.0 - probability:.1g})."
+            )
     if noise == "shots" and middle > 0.005:
         return (
             f"Settings scatter by {100 * middle:.2g} % ({100 * low:.2g} to {100 * high:.2g} %) of "
