@@ -14,6 +14,9 @@ from beamfit.io.decay_record import read_lifetime_input
 from beamfit.io.files import digest
 from beamfit.io.lattice import LatticeFile
 from beamfit.io.line import Inputs, build_line, read_inputs, read_lattice
+from beamfit.io.noise import read_noise
+from beamfit.noise.learn import Learned, learn_noise
+from beamfit.noise.model import Noise
 from beamfit.studies.decay.record import LifetimeTable
 
 if TYPE_CHECKING:
@@ -62,6 +65,7 @@ class Job:
     reading: Mapping[str, Any] = field(default_factory=dict)
     weights: str = "model"
     lattice_sha256: str = ""
+    noise: str | None = None
     version: str = beamfit.__version__
 
     def __post_init__(self) -> None:
@@ -76,6 +80,7 @@ class Job:
     def key(self) -> tuple[str, str, str]:
         """What besides the file makes an answer: lattice, options, version."""
         said = {**self.part, **self.reading, "weights": self.weights}
+        said |= {} if self.noise is None else {"noise": digest(self.noise)}
         words = (f"{k}={' '.join(v) if isinstance(v, tuple) else v}" for k, v in said.items())
         return self.lattice_sha256, ", ".join(words), self.version
 
@@ -123,7 +128,26 @@ class Job:
 
         found = self.read(file)
         fit = fit_slices if len(found.scan.slices) > 1 else beamfit.fit_emittance
-        return fit(found.scan, self.line_of(found), weights=self.weights)
+        return fit(found.scan, self.line_of(found), weights=self.weights, noise=self._priors)
+
+    @property
+    def _priors(self) -> Noise:
+        return Noise() if self.noise is None else read_noise(self.noise)
+
+    def learned_noise(self, files: Sequence[str]) -> Learned:
+        """Learn the noise of all scans that are surely a beam's.
+
+        Raises
+        ------
+        InputError
+            If there are fewer than five planes of a kind.
+        """
+        from beamfit.studies.scan.many import noise_samples
+
+        read = (found for file in files if isinstance(found := _tried(self.read, file), Inputs))
+        pairs = [(found.scan, self.line_of(found)) for found in read if len(found.scan.slices) < 2]
+        source = f"learned from {len(pairs)} scans by beamfit {self.version}"
+        return learn_noise(list(noise_samples(pairs, self._priors)), self._priors, source)
 
     def _emittances(self, files: Iterable[str]) -> Iterator[dict[str, Any]]:
         from beamfit.studies.scan.many import fit_many
@@ -138,7 +162,7 @@ class Job:
                 parts += [(i, (each, line)) for each in own]
         fits: list[list[Any]] = [[] for _ in read]
         for (i, (scan, _)), fit in zip(
-            parts, fit_many((p for _, p in parts), self.weights), strict=True
+            parts, fit_many((p for _, p in parts), self.weights, self._priors), strict=True
         ):
             fits[i].append((scan.slices[0] if scan.slice else "", fit))
         for file, found, own in zip(files, read, fits, strict=True):

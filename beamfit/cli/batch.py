@@ -11,6 +11,7 @@ import click
 from beamfit.cli.options import answered, command_line, option, options
 from beamfit.errors import InputError
 from beamfit.table import Table
+from beamfit.writing import check_place
 
 if TYPE_CHECKING:
     from beamfit.batch.run import Batch
@@ -42,7 +43,14 @@ NAMED = 10
 @option("--workers", "Processes on this machine (Dask).", type=click.IntRange(1))
 @option("--scheduler tcp://HOST:PORT", "A Dask scheduler to join.")
 @option("--quantity NAME", "What the report follows, such as beta or lifetime_mean.")
-@options("ignore skip-bad weights maybe-lattice use from to screen energy particle time current")
+@option(
+    "--learn-noise FILE.toml",
+    "Learn the noise of these scans, with its error, and write it for --noise.",
+    name="learned",
+)
+@options(
+    "ignore skip-bad noise weights maybe-lattice use from to screen energy particle time current"
+)
 @options("report json")
 def batch(
     path: tuple[str, ...],
@@ -51,6 +59,8 @@ def batch(
     workers: int | None,
     scheduler: str | None,
     quantity: str | None,
+    learned: str | None,
+    noise: str | None,
     weights: str,
     lattice: str | None,
     report: str | None,
@@ -65,15 +75,25 @@ def batch(
     """
     part = {n: told[n] for n in ("use", "energy", "particle", "first", "last", "screen")}
     reading = {n: told[n] for n in ("ignore", "skip_bad", "time", "current")}
-    _check_kind(kind, {"lattice": lattice} | part, {n: told[n] for n in ("time", "current")})
+    _check_kind(
+        kind,
+        {"lattice": lattice, "noise": noise, "learn-noise": learned} | part,
+        {n: told[n] for n in ("time", "current")},
+    )
     from beamfit.batch.course import courses_of, followed
     from beamfit.batch.job import Job
     from beamfit.batch.run import run_batch
 
     followed(kind, quantity)  # says so before hours of work if there is none
-    job = Job(kind, lattice, part, reading, weights)
+    if learned is not None:
+        check_place(learned)
+    job = Job(kind, lattice, part, reading, weights, noise=noise)
     with _Progress(not as_json and sys.stderr.isatty()) as progress:
         found = run_batch(path, out, job, workers=workers, scheduler=scheduler, progress=progress)
+    if learned is not None:
+        from beamfit.io.noise import write_noise
+
+        write_noise(learned, job.learned_noise(found.files))
     if report is not None:
         from beamfit.report.batch import write_batch_report
 

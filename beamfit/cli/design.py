@@ -9,6 +9,7 @@ import click
 import beamfit
 from beamfit.cli.options import answered, option, options
 from beamfit.io.line import build_line, read_inputs
+from beamfit.io.noise import read_noise
 from beamfit.studies.scan.assumptions import Assumptions
 from beamfit.studies.scan.typed import energies_of, goal_of
 from beamfit.table import text_of
@@ -28,7 +29,8 @@ Examples:
 
 @click.command(epilog=EXAMPLE)
 @options(
-    "scan ignore skip-bad lattice use from to screen energy scenario prior bounds gain anchor vary"
+    "scan ignore skip-bad lattice use from to screen energy noise scenario prior bounds gain "
+    "anchor vary"
 )
 @option("--energies MEV,MEV", "Further energies the beam can be had at.", default="")
 @option(
@@ -42,6 +44,7 @@ Examples:
 @options("json")
 def design(
     scan: str,
+    noise: str | None,
     scenario: str,
     limits: dict[str, tuple[float, float]],
     energies: str,
@@ -59,6 +62,7 @@ def design(
     aim, others = None if goal is None else goal_of(goal), energies_of(energies)
     given = {name: told.pop(name) for name in GIVEN}
     Assumptions(**told).check_scenario(scenario)
+    told["noise"] = None if noise is None else read_noise(noise)
     read = read_inputs(scan, **given)
     measured, described, _ = read
     described.check_magnets(limits)

@@ -11,6 +11,7 @@ import beamfit
 from beamfit.cli.options import Sampling, answered, option, options, reported
 from beamfit.errors import InputError
 from beamfit.io.line import build_line, read_inputs
+from beamfit.io.noise import read_noise
 from beamfit.io.systematics import read_systematics
 from beamfit.studies.scan.assumptions import Assumptions
 from beamfit.table import Table, labelled
@@ -52,8 +53,12 @@ Examples:
     choices=["size-squared", "size"],
     default="size-squared",
 )
-@option("--robust", "Give each point a probability of being an outlier.", is_flag=True)
-@options("weights scenario prior bounds gain anchor")
+@option(
+    "--robust",
+    "Expect more bad readings: one in ten and up to a third, instead of 3 % and up to a fifth.",
+    is_flag=True,
+)
+@options("noise weights scenario prior bounds gain anchor")
 @option(
     "--systematics FILE",
     "TOML file of what is known of screen, energy, drifts, magnets: part of the error then.",
@@ -72,6 +77,7 @@ def emittance(
     plane: str | None,
     method: str,
     robust: bool,
+    noise: str | None,
     weights: str,
     scenario: str,
     known: str | None,
@@ -95,6 +101,7 @@ def emittance(
     if known is not None:
         told["priors"] = read_systematics(known) | told["priors"]
     Assumptions(**told).check_scenario(scenario)
+    own = None if noise is None else read_noise(noise)
     read = read_inputs(scan, **given)
     measured, described, gui = read
     planes = {None: measured.planes, "both": ("x", "y")}.get(plane, (plane,))
@@ -108,6 +115,7 @@ def emittance(
     line = build_line(described)  # JAX from here on
     told |= {"planes": planes, "method": method.replace("-", "_"), "robust": robust}
     told |= {"weights": weights, "scenario": scenario}
+    told |= {"noise": own}
     inputs = read.digests
     if len(measured.slices) > 1:
         from beamfit.studies.scan.slices import fit_slices

@@ -66,6 +66,11 @@ SHARED: dict[str, Callable[..., Any]] = {
     "size-method": option(
         "--size-method NAME", "Which sizes of a .mat file of emittance_gui; RMS unless said."
     ),
+    "noise": option(
+        "--noise FILE",
+        "TOML file of the laboratory's own priors on the noise of sizes; `beamfit batch "
+        "--learn-noise` writes one.",
+    ),
     "weights": option(
         "--weights",
         "Whose size the error of size squared is taken at; measured sizes bias the answer.",

@@ -17,7 +17,11 @@ LOG_NOISE, FRACTION = "log_noise", "outlier_fraction"
 NARROWEST, WIDEST = 3.0, 1e5
 # The noise is sought within a factor e^10 of where the fit saw it.
 NOISE_REACH = 10.0
-WORDS = {"known": "as stated", "inferred": "inferred from the residuals", "averaged": "averaged over"}
+WORDS = {
+    "known": "as stated",
+    "inferred": "inferred from the residuals",
+    "averaged": "averaged over",
+}
 
 
 class Own(NamedTuple):
@@ -87,11 +91,7 @@ def noise_words(groups: Sequence[Group]) -> str:
     >>> noise_words((Group("x", "inferred"), Group("y")))
     'x inferred from the residuals; y as stated'
     """
-    said = [
-        WORDS[group.noise]
-        + (", with outliers" if group.outliers else "")
-        for group in groups
-    ]
+    said = [WORDS[group.noise] + (", with outliers" if group.outliers else "") for group in groups]
     if len(set(said)) == 1:
         return said[0]
     return "; ".join(f"{g.label} {words}" for g, words in zip(groups, said, strict=True))

@@ -16,7 +16,7 @@ from beamfit.studies.scan.comparison import PlanePosterior, weighted_quantiles
 from beamfit.studies.scan.model import QUANTITIES, coefficients, numbers_of, phase_coverage
 from beamfit.studies.scan.next_point import next_measurement
 from beamfit.studies.scan.results import Identifiability, PlaneFit, Points, ScreenTwiss
-from beamfit.studies.scan.statement import Seen, asked_of
+from beamfit.studies.scan.statement import Seen
 from beamfit.studies.scan.transport import setting_units
 from beamfit.studies.scan.verdict import (
     CARRIES,
@@ -91,7 +91,9 @@ class Influence(NamedTuple):
     without: float = math.nan
 
 
-def plane_answer(seen: Seen, line: Beamline, plane: str, places: Places, b: Beside | None) -> PlaneFit:
+def plane_answer(
+    seen: Seen, line: Beamline, plane: str, places: Places, b: Beside | None
+) -> PlaneFit:
     """Answer for one plane.
 
     Parameters
@@ -119,7 +121,9 @@ def plane_answer(seen: Seen, line: Beamline, plane: str, places: Places, b: Besi
     value = numbers_of(post.best, *given) if b is None else b.value
     half = 0.5 * (quantiles[3] - quantiles[1])
     low, high = quantiles[0], quantiles[4]
-    carrying = _influence(p, post.best, half[0]) if post.positive and len(p.size) > 4 else Influence()
+    carrying = (
+        _influence(p, post.best, half[0]) if post.positive and len(p.size) > 4 else Influence()
+    )
     if abs(carrying.shift) > MOVES:
         low, high, half = _reaching(low, high, half, value, carrying.without)
     e = _evidence(seen, plane, low[1], high[1], b)
@@ -129,7 +133,9 @@ def plane_answer(seen: Seen, line: Beamline, plane: str, places: Places, b: Besi
     remarks = [noise_remark(noise, post.scale, chi2_probability(post.chi2, dof)), work.shot_words]
     remarks += point_remarks(p, carrying.place, carrying.shift) if e.of_a_beam else []
     remarks += [b.remark] if b is not None and determined else []
-    advice = None if determined or not e.of_a_beam or b is not None else next_measurement(seen, plane)
+    advice = (
+        None if determined or not e.of_a_beam or b is not None else next_measurement(seen, plane)
+    )
     finding = verdict(e, " ".join(filter(None, remarks)), advice or "")
     if determined and (other := _impossible(value[1], _column(seen, plane))):
         finding, determined, e = other, False, e._replace(seen=False)

@@ -110,6 +110,8 @@ class BeamDraws(NamedTuple):
         Shape (..., d): their sum is the evidence; -inf where no beam is.
     scales : Scales
         The nodes that the noise was averaged over.
+    by_scale : ndarray
+        Shape (..., k): log evidence of a beam at every node.
     best, best_log : ndarray
         Shape (..., 3) and (...): the likeliest of the fits without some points.
     """
@@ -117,6 +119,7 @@ class BeamDraws(NamedTuple):
     x: np.ndarray
     log_weight: np.ndarray
     scales: Scales
+    by_scale: np.ndarray
     best: np.ndarray
     best_log: np.ndarray
 
@@ -148,10 +151,12 @@ def draw_beams(c: Coordinates, kind: Kind, noise: Noise) -> BeamDraws:
     scales = wide_scales(kind, c.unit.shape)
     for _ in range(2):
         at_centres = _log_likelihood(centre, c, kind, scales.scale, noise)
-        scales = narrowed(kind, scales, np.logaddexp.reduce(
-            at_centres + scales.log_weight[..., None, :], axis=-2))
-    found = averaged(_log_likelihood(centre, c, kind, scales.scale, noise),
-                     scales.log_weight[..., None, :])
+        scales = narrowed(
+            kind, scales, np.logaddexp.reduce(at_centres + scales.log_weight[..., None, :], axis=-2)
+        )
+    found = averaged(
+        _log_likelihood(centre, c, kind, scales.scale, noise), scales.log_weight[..., None, :]
+    )
     found = np.where(np.isfinite(found), found, -np.inf)
     top = np.argsort(found, axis=-1)[..., -PARTS:]
     share = np.exp(FLATTER * (np.take_along_axis(found, top, -1) - found.max(-1, keepdims=True)))
@@ -159,10 +164,14 @@ def draw_beams(c: Coordinates, kind: Kind, noise: Noise) -> BeamDraws:
     centre = np.take_along_axis(centre, top[..., None], -2)
     root = np.take_along_axis(root, top[..., None, None], -3)
     x, log_density = student_mixture(centre, root, share)
-    each = averaged(_log_likelihood(x, c, kind, scales.scale, noise), scales.log_weight[..., None, :])
-    weight = each + log_prior(x) - log_density - math.log(DRAWS) + kind.log_weight
+    each = _log_likelihood(x, c, kind, scales.scale, noise)
+    drawn = log_prior(x) - log_density - math.log(DRAWS)
+    weight = averaged(each, scales.log_weight[..., None, :]) + drawn + kind.log_weight
     weight = np.where(np.isnan(weight), -np.inf, weight)
-    return BeamDraws(x, weight, scales, centre[..., -1, :], found.max(-1) + kind.log_weight)
+    by_scale = averaged(np.swapaxes(each, -1, -2), drawn[..., None, :])
+    return BeamDraws(
+        x, weight, scales, by_scale, centre[..., -1, :], found.max(-1) + kind.log_weight
+    )
 
 
 def log_prior(x: np.ndarray) -> np.ndarray:
@@ -228,7 +237,9 @@ def _fitted(
         weight = kept / (2.0 * model * deviation[..., None, :] * model**kind.power) ** 2
         normal = np.swapaxes(rows * weight[..., None], -1, -2) @ rows
         normal = normal + _little(normal)
-        x = np.linalg.solve(normal, np.swapaxes(rows, -1, -2) @ (weight * target)[..., None])[..., 0]
+        x = np.linalg.solve(normal, np.swapaxes(rows, -1, -2) @ (weight * target)[..., None])[
+            ..., 0
+        ]
         squared = (rows @ x[..., None])[..., 0] + c.known[..., None, :]
         model = np.sqrt(np.clip(squared, (size / FURTHEST) ** 2, (size * FURTHEST) ** 2))
     chi2 = (weight * (target - (rows @ x[..., None])[..., 0]) ** 2).sum(-1)

@@ -109,6 +109,8 @@ class PlanePosterior(NamedTuple):
         Whether the settings separate the numbers of the beam.
     kinds, scales : tuple
         Kinds of noise and their nodes, in units of ``unit``.
+    by_scale : tuple of ndarray
+        Log evidence of a beam at every node of each kind.
     unit : float
         The mean size, m.
     trace : ndarray
@@ -131,6 +133,7 @@ class PlanePosterior(NamedTuple):
     seen: bool
     kinds: tuple[Kind, ...]
     scales: tuple[Scales, ...]
+    by_scale: tuple[np.ndarray, ...]
     unit: float
     trace: np.ndarray
 
@@ -176,7 +179,9 @@ def compare(
     for members in alike.values():
         for start in range(0, len(members), TOGETHER):
             own = members[start : start + TOGETHER]
-            for i, posterior in zip(own, _compared([planes[i] for i in own], noise, method, weights), strict=True):
+            for i, posterior in zip(
+                own, _compared([planes[i] for i in own], noise, method, weights), strict=True
+            ):
                 found[i] = posterior
     return found
 
@@ -200,7 +205,9 @@ def _stacked(planes: Sequence[PlaneSizes], noise: Noise) -> _Stack:
     return _Stack(c, np.stack([r11, r12], -1), kinds)
 
 
-def _compared(planes: Sequence[PlaneSizes], noise: Noise, method: str, weights: str) -> list[PlanePosterior]:
+def _compared(
+    planes: Sequence[PlaneSizes], noise: Noise, method: str, weights: str
+) -> list[PlanePosterior]:
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         s = _stacked(planes, noise)
         draws = [draw_beams(s.c, kind, noise) for kind in s.kinds]
@@ -245,7 +252,12 @@ class _Best(NamedTuple):
 
 
 def _best(
-    s: _Stack, draws: Sequence[BeamDraws], of_kind: np.ndarray, noise: Noise, method: str, weights: str
+    s: _Stack,
+    draws: Sequence[BeamDraws],
+    of_kind: np.ndarray,
+    noise: Noise,
+    method: str,
+    weights: str,
 ) -> _Best:
     """Find where the likelihood, averaged over the noise, is largest.
 
@@ -260,17 +272,20 @@ def _best(
     for _ in range(ROUNDS):
         model = _model(x, c)
         parts = [
-            _expected(model, c, kind, d.scales, noise) for kind, d in zip(s.kinds, draws, strict=True)
+            _expected(model, c, kind, d.scales, noise)
+            for kind, d in zip(s.kinds, draws, strict=True)
         ]
         precision = sum(w[:, None] * p for w, (p, _) in zip(of_kind, parts, strict=True))
         at = model if weights == "model" else c.size
-        target = c.size**2 if method == "size_squared" else model**2 + 2.0 * model * (c.size - model)
+        target = (
+            c.size**2 if method == "size_squared" else model**2 + 2.0 * model * (c.size - model)
+        )
         scale = np.sqrt(precision) / (2.0 * (at if method == "size_squared" else model))
         design = rows * scale[..., None]
         normal = np.swapaxes(design, -1, -2) @ design
         trace = np.trace(normal, axis1=-2, axis2=-1)[:, None, None]
         last = x
-        right = (np.swapaxes(design, -1, -2) @ ((target - c.known) * scale)[..., None])
+        right = np.swapaxes(design, -1, -2) @ ((target - c.known) * scale)[..., None]
         x = np.linalg.solve(normal + 1e-14 * trace * np.eye(3), right)[..., 0]
         # A plane that rests stays, whatever the others do.
         x = np.where(rests[:, None], last, x)
@@ -331,7 +346,9 @@ def _posterior(
         probability=dict(zip(MODELS, map(float, probability), strict=True)),
         sigma=sigma,
         weight=weight,
-        best=found if positive else np.maximum(weight, 0.0) @ np.where(weight[:, None] > 0, sigma, 0.0),
+        best=found
+        if positive
+        else np.maximum(weight, 0.0) @ np.where(weight[:, None] > 0, sigma, 0.0),
         positive=positive,
         covariance=_covariance(rows / error[:, None]) if c.seen else none,
         stated=stated,
@@ -344,6 +361,7 @@ def _posterior(
         seen=bool(c.seen),
         kinds=tuple(k._replace(floor=k.floor[i], unit=k.unit[i]) for k in s.kinds),
         scales=tuple(Scales(*(part[i] for part in d.scales)) for d in draws),
+        by_scale=tuple(d.by_scale[i] for d in draws),
         unit=unit,
         trace=np.array([trace[0, 0], 2.0 * trace[0, 1], trace[1, 1]]),
     )

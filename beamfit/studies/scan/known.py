@@ -161,7 +161,9 @@ def plane_sizes(seen: Seen, plane: str) -> tuple[PlaneSizes, ShotMeans | None]:
         if freedom.sum() > 0:
             square = error**2 * (freedom + 1.0) * freedom
             error = np.sqrt(evened(square, freedom, size) / (freedom + 1.0))
-    of_shots = shots is not None or (error is not None and bool(scan.shots is not None and (scan.shots > 1).any()))
+    of_shots = shots is not None or (
+        error is not None and bool(scan.shots is not None and (scan.shots > 1).any())
+    )
     screens = {seen.rows.places[j] for j in seen.rows.which[at]}
     moved = any(np.ptp(v[at]) > 0 for v in scan.settings.values()) or len(screens) < 3
     return PlaneSizes(r11, r12, known, size, error, of_shots, moved), shots

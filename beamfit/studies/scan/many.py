@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import suppress
 from functools import partial
 from typing import Any
 
@@ -10,13 +11,16 @@ import jax
 import numpy as np
 
 from beamfit.errors import InputError
+from beamfit.noise.learn import Sample
 from beamfit.noise.model import Noise
 from beamfit.optics.beamline import Beamline
 from beamfit.studies.scan.assumptions import Assumptions
+from beamfit.studies.scan.comparison import BEAM
 from beamfit.studies.scan.fit import EmittanceFit
 from beamfit.studies.scan.known import judged_beam, looked_through, prepared, unfitted
 from beamfit.studies.scan.scans import QuadScan
 from beamfit.studies.scan.statement import Seen, scenario_of
+from beamfit.studies.scan.verdict import SURE
 
 # How many a call is compiled for, and what bounds them: rows times the longest of their arrays.
 FEW, LANES, ROOM = 16, 256, 1 << 20
@@ -62,6 +66,29 @@ def fit_many(
         own = (seen.scan, seen.line, scenario_of("known"), Assumptions())
         found[i] = EmittanceFit(judged_beam(seen), *own, seen)
     return found
+
+
+def noise_samples(scans: Iterable[tuple[QuadScan, Beamline]], noise: Noise) -> Iterator[Sample]:
+    """What the planes of many scans that are surely a beam's say of the scale of their noise.
+
+    Parameters
+    ----------
+    scans : iterable of (QuadScan, Beamline)
+        Scans that cannot be used are passed over.
+    noise : Noise
+        The priors to look at them with.
+    """
+    begun = []
+    for given in scans:
+        with suppress(InputError):
+            begun.append(unfitted(*prepared(*given), noise=noise))
+    for seen in looked_through(begun, _together):
+        for work in seen.works.values():
+            post = work.posterior
+            if len(work.sizes.size) > 3 and post.probability[BEAM] > SURE:
+                word = work.sizes.likeness[1]
+                word = "stated" if word == "share" else word
+                yield Sample(word, post.kinds, post.scales, post.by_scale)
 
 
 def _together(function: Callable[..., Any], given: Sequence[tuple], *static: str) -> list[Any]:

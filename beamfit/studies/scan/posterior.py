@@ -239,7 +239,9 @@ def _optimum(
         begin |= {f"beam.{p.plane}.{name}": value for name, value in numbers.items()}
     theta = np.array([begin[name] for name in names])
     worst = max(chosen, key=lambda p: p.status is Status.poor_fit)
-    return Optimum(theta, Finding(worst.status, worst.message), [1.0] * len(chosen), [True] * len(chosen))
+    return Optimum(
+        theta, Finding(worst.status, worst.message), [1.0] * len(chosen), [True] * len(chosen)
+    )
 
 
 def _stated(
@@ -258,7 +260,9 @@ def _stated(
         derive=_twiss,
         build=_beams,
         data=Told(
-            asked_in(problem, fit.seen, planes := [p.plane for p in chosen], fit.statement.whole_map),
+            asked_in(
+                problem, fit.seen, planes := [p.plane for p in chosen], fit.statement.whole_map
+            ),
             _sizes_of(problem, fit.seen, planes),
         ),
         log_volume=_log_volume,

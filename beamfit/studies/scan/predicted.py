@@ -122,7 +122,9 @@ def correlations_of(p: PlaneFit) -> Correlations:
     sigma = np.array([q.value for q in p.sigma])
     if not np.isfinite(p.covariance).all() or not p.emittance.value > 0:
         return Correlations(NAMES, np.full((6, 6), np.nan))
-    slope = np.concatenate([np.eye(3), np.asarray(jax.jacobian(emittance_parts)(jnp.asarray(sigma)))])
+    slope = np.concatenate(
+        [np.eye(3), np.asarray(jax.jacobian(emittance_parts)(jnp.asarray(sigma)))]
+    )
     covariance = slope @ p.covariance @ slope.T
     error = np.sqrt(np.diagonal(covariance))
     return Correlations(NAMES, covariance / np.outer(error, error))

@@ -9,8 +9,16 @@ from typing import NamedTuple
 import numpy as np
 
 from beamfit.noise.model import LN_2PI, Noise
-from beamfit.noise.sizes import Kind, Scales, averaged, log_likelihood, narrowed, variance_of, wide_scales
-from beamfit.studies.scan.beam_draws import BRIGHT, Coordinates, student_mixture, WIDER, DRAWS
+from beamfit.noise.sizes import (
+    Kind,
+    Scales,
+    averaged,
+    log_likelihood,
+    narrowed,
+    variance_of,
+    wide_scales,
+)
+from beamfit.studies.scan.beam_draws import BRIGHT, DRAWS, WIDER, Coordinates, student_mixture
 
 # Steps of ln size of sizes at random or in a drift; bends of a curve as shares of the mean size,
 # and over which share of the scan it bends.
@@ -33,7 +41,9 @@ def flat_beam(c: Coordinates, kind: Kind, noise: Noise) -> np.ndarray:
     order = np.argsort(np.arctan2(w[..., 1], w[..., 0]), axis=-1)
     w = np.take_along_axis(w, order[..., None], -2)
     size, known = (np.take_along_axis(v, order, -1) for v in (c.size, c.known))
-    kind = kind._replace(**{name: np.take_along_axis(getattr(kind, name), order, -1) for name in ("floor", "unit")})
+    kind = kind._replace(
+        **{name: np.take_along_axis(getattr(kind, name), order, -1) for name in ("floor", "unit")}
+    )
     target = np.sqrt(np.maximum(size**2 - known, 0.0))
     scale = kind.special or kind.prior.middle
     deviation = np.hypot(kind.floor, scale * kind.unit) * (size if kind.power else 1.0)
@@ -124,7 +134,9 @@ def curve_evidences(u: np.ndarray, c: Coordinates, kind: Kind, noise: Noise) -> 
     for _ in range(2):
         here = log_likelihood(off, off, flat, scales.scale, noise)
         scales = narrowed(flat, scales, np.logaddexp.reduce(here, axis=-2) + scales.log_weight)
-    here = averaged(log_likelihood(off, off, flat, scales.scale, noise), scales.log_weight[..., None, :])
+    here = averaged(
+        log_likelihood(off, off, flat, scales.scale, noise), scales.log_weight[..., None, :]
+    )
     prior = -0.5 * (mu / LEVEL) ** 2 - 0.5 * LN_2PI - math.log(LEVEL)
     constant = averaged(here + prior, np.log(8.0 / 64 * spread))
     wide = wide_scales(flat, c.unit.shape)
@@ -144,7 +156,9 @@ def _process(
     """Log evidence of a Gaussian process about a constant, amplitudes and noise averaged over."""
     n = x.shape[-1]
     root = np.sqrt(variance)
-    values, vectors = np.linalg.eigh(kernel[..., None, :, :] / root[..., :, None] / root[..., None, :])
+    values, vectors = np.linalg.eigh(
+        kernel[..., None, :, :] / root[..., :, None] / root[..., None, :]
+    )
     turned = np.swapaxes(vectors, -1, -2)
     q = (turned @ (x[..., None, :] / root)[..., None])[..., None, :, 0]
     one = (turned @ (LEVEL / root)[..., None])[..., None, :, 0]

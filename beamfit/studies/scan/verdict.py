@@ -100,7 +100,7 @@ class Evidence(NamedTuple):
     def determined(self) -> bool:
         """Whether they are a beam's and say its emittance."""
         sure = self.untested or self.probability[BEAM] > SURE
-        narrow = 0.0 < self.low and self.high < USEFUL * self.low
+        narrow = self.low > 0.0 and self.high < USEFUL * self.low
         return self.of_a_beam and sure and narrow and not self.opened and self.ending is None
 
 

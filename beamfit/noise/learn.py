@@ -1,0 +1,160 @@
+"""The noise of a laboratory's sizes, learned from an archive of scans."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+from scipy.optimize import minimize
+
+from beamfit.errors import InputError
+from beamfit.noise.model import Lognormal, Noise
+from beamfit.noise.sizes import Kind, Scales, averaged
+
+# With fewer planes nothing is learned of a prior.
+FEWEST = 5
+# Standard deviations of what is learned about beamfit's own priors: of the ln of a middle, of the
+# ln of a spread, of the logit of a probability. A few scans move them little.
+MIDDLE, SPREAD, LOGIT = 1.5, 0.5, 2.0
+# The step of the second differences that the errors are taken from.
+STEP = 0.05
+PRIORS = {
+    "shots": ("scatter", "even"),
+    "stated": ("factor", "right"),
+    "none": ("unstated", "share"),
+}
+
+
+class Sample(NamedTuple):
+    """What one plane says of the scale of its noise.
+
+    Attributes
+    ----------
+    noise : str
+        "shots", "stated" or "none": which prior it tells of.
+    kinds : tuple of Kind
+        Kinds of noise, one but for "none".
+    scales : tuple of Scales
+        Their nodes.
+    log_evidence : tuple of ndarray
+        Log evidence of the beam at every node, shape (k,).
+    """
+
+    noise: str
+    kinds: tuple[Kind, ...]
+    scales: tuple[Scales, ...]
+    log_evidence: tuple[np.ndarray, ...]
+
+
+class Learned(NamedTuple):
+    """Priors that were learned, their errors in words by name, and of how many planes."""
+
+    noise: Noise
+    errors: dict[str, str]
+    planes: dict[str, int]
+
+
+def learn_noise(samples: Sequence[Sample], noise: Noise, source: str) -> Learned:
+    """Learn the priors of the noise from many planes whose sizes are a beam's.
+
+    Parameters
+    ----------
+    samples : sequence of Sample
+        One a plane.
+    noise : Noise
+        The priors they were looked at with.
+    source : str
+        Where the scans are from.
+
+    Returns
+    -------
+    Learned
+        Priors of which at least five planes tell something; others are as they were.
+
+    Raises
+    ------
+    InputError
+        If no prior has five planes.
+
+    Notes
+    -----
+    Empirical Bayes: the evidence of all planes, each averaged over its own noise by the prior, is
+    made as large as possible in the numbers of that prior (A. Gelman et al., Bayesian Data
+    Analysis, 3rd ed. (2013), sect. 5.3); errors are from its second differences. The present prior
+    is divided out at the nodes.
+    """
+    found, errors, planes = noise, {}, {}
+    for kind, (scale, chance) in PRIORS.items():
+        own = [s for s in samples if s.noise == kind]
+        planes[kind] = len(own)
+        if len(own) < FEWEST:
+            continue
+        values, spread = _learned(own, getattr(noise, scale), getattr(noise, chance), kind)
+        middle, width, probability = _numbers(values)
+        found = replace(found, **{scale: Lognormal(middle, width), chance: probability})
+        errors[scale] = (
+            f"± [{middle * spread[0]:.2g}, {width * spread[1]:.2g}], from {len(own)} planes"
+        )
+        errors[chance] = f"± {probability * (1 - probability) * spread[2]:.2g}"
+    if not errors:
+        counts = ", ".join(f"{n} of {kind}" for kind, n in planes.items())
+        raise InputError(f"{counts} planes whose sizes are surely a beam's", f"{FEWEST} of a kind")
+    return Learned(replace(found, source=source), errors, planes)
+
+
+def _numbers(values: np.ndarray) -> tuple[float, float, float]:
+    """Middle, spread and probability from ln, ln and logit."""
+    return math.exp(values[0]), math.exp(values[1]), 1.0 / (1.0 + math.exp(-values[2]))
+
+
+def _learned(
+    samples: Sequence[Sample], prior: Lognormal, chance: float, kind: str
+) -> tuple[np.ndarray, np.ndarray]:
+    start = np.array(
+        [math.log(prior.middle), math.log(prior.spread), math.log(chance / (1 - chance))]
+    )
+    width = np.array([MIDDLE, SPREAD, LOGIT])
+
+    def cost(values: np.ndarray) -> float:
+        middle, spread, probability = _numbers(values)
+        new = Lognormal(middle, spread)
+        each = [_log_evidence(s, new, probability, prior, chance, kind) for s in samples]
+        return 0.5 * float(np.sum(((values - start) / width) ** 2)) - float(np.sum(each))
+
+    best = minimize(cost, start, method="Nelder-Mead", options={"xatol": 1e-3, "fatol": 1e-4}).x
+    return best, np.sqrt(np.diag(np.linalg.inv(_second_differences(cost, best))))
+
+
+def _second_differences(cost, at: np.ndarray) -> np.ndarray:
+    steps = STEP * np.eye(len(at))
+    return np.array([
+        [
+            (cost(at + a + b) - cost(at + a - b) - cost(at - a + b) + cost(at - a - b)) / 4 / STEP**2
+            for b in steps
+        ]
+        for a in steps
+    ])  # fmt: skip
+
+
+def _log_evidence(
+    s: Sample, new: Lognormal, probability: float, prior: Lognormal, chance: float, kind: str
+) -> float:
+    """Log evidence of a plane under other priors than those of its nodes."""
+    parts = []
+    for own, scales, evidence in zip(s.kinds, s.scales, s.log_evidence, strict=True):
+        skip = int(own.chance > 0)
+        log = np.log(scales.scale[skip:])
+        ratio = new.log_density(log) - prior.log_density(log)
+        ratio -= new.log_probability_above(own.least) - prior.log_probability_above(own.least)
+        if kind == "none":
+            share = probability if own.power else 1.0 - probability
+            parts.append(averaged(evidence + scales.log_weight + ratio, 0.0) + math.log(share))
+            continue
+        ratio += math.log1p(-probability) - math.log1p(-chance)
+        first = [math.log(probability) - math.log(chance)]
+        weight = scales.log_weight + np.concatenate([first, ratio])
+        parts.append(averaged(evidence + weight, 0.0))
+    return float(np.logaddexp.reduce(parts))
