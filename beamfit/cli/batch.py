@@ -48,9 +48,8 @@ NAMED = 10
     "Learn the noise of these scans, with its error, and write it for --noise.",
     name="learned",
 )
-@options(
-    "ignore skip-bad noise weights maybe-lattice use from to screen energy particle time current"
-)
+@options("ignore skip-bad noise weights maybe-lattice use from to screen energy particle")
+@options("time current")
 @options("report json")
 def batch(
     path: tuple[str, ...],

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -128,15 +128,14 @@ def _learned(
     return best, np.sqrt(np.diag(np.linalg.inv(_second_differences(cost, best))))
 
 
-def _second_differences(cost, at: np.ndarray) -> np.ndarray:
+def _second_differences(cost: Callable[[np.ndarray], float], at: np.ndarray) -> np.ndarray:
     steps = STEP * np.eye(len(at))
-    return np.array([
-        [
-            (cost(at + a + b) - cost(at + a - b) - cost(at - a + b) + cost(at - a - b)) / 4 / STEP**2
-            for b in steps
-        ]
-        for a in steps
-    ])  # fmt: skip
+
+    def across(a: np.ndarray, b: np.ndarray) -> float:
+        four = cost(at + a + b) - cost(at + a - b) - cost(at - a + b) + cost(at - a - b)
+        return four / (4.0 * STEP**2)
+
+    return np.array([[across(a, b) for b in steps] for a in steps])
 
 
 def _log_evidence(

@@ -38,6 +38,9 @@ class Lognormal(NamedTuple):
         return math.log(0.5 * math.erfc(pull / math.sqrt(2.0)))
 
 
+FACTOR, UNSTATED, SCATTER = Lognormal(1.5, 0.8), Lognormal(0.08, 0.8), Lognormal(0.05, 0.7)
+
+
 @dataclass(frozen=True)
 class Noise:
     """Priors on the noise of measured beam sizes; every answer is averaged over them.
@@ -51,7 +54,8 @@ class Noise:
         Where they are not, the factor, above 1, by which they are too small. Real errors are often
         half of the truth, since shots do not show what differs from setting to setting.
     unstated : Lognormal
-        Noise that nobody stated, as a share of the size. Screens and wires reach 1 to 20 %.
+        Noise that nobody stated, as a share of the size: a reading has the jitter of its shot
+        beside the 4 to 5 % that settings scatter, from 2 % for good wires to 40 % for bad screens.
     share : float
         Probability that such noise is a share of the size, and not the same number of µm at every
         setting. A few points do not tell which.
@@ -63,7 +67,8 @@ class Noise:
     bad : float
         Probability that a reading is bad: a shot that missed, a wrong cell.
     width : float
-        How many times wider bad readings scatter.
+        How many times wider bad readings scatter than good ones, or than most points do where a
+        point's own stated error is less.
     most : int
         At most one reading of so many is bad: bad is an exception, not a law.
     bad_shot : float
@@ -83,11 +88,11 @@ class Noise:
     """
 
     right: float = 0.6
-    factor: Lognormal = Lognormal(1.5, 0.8)
-    unstated: Lognormal = Lognormal(0.05, 1.0)
+    factor: Lognormal = FACTOR
+    unstated: Lognormal = UNSTATED
     share: float = 0.5
     even: float = 0.05
-    scatter: Lognormal = Lognormal(0.05, 0.7)
+    scatter: Lognormal = SCATTER
     bad: float = 0.03
     width: float = 12.0
     most: int = 5

@@ -27,6 +27,9 @@ class Kind(NamedTuple):
         1 where the noise is a share of the size, 0 where it is the same at every size.
     floor, unit : array
         Shape (..., n): what is there in any case, and what the scale s multiplies.
+    usual : array
+        Shape (..., n): deviations of most points over a point's own, at least 1: a wrong cell may
+        have a wrong error, too.
     prior : Lognormal
         Of s.
     special, chance : float
@@ -41,6 +44,7 @@ class Kind(NamedTuple):
     power: int
     floor: Any
     unit: Any
+    usual: Any
     prior: Lognormal
     special: float
     chance: float
@@ -79,20 +83,21 @@ def kinds_of(
     tuple of Kind
         Of sizes without errors a share and the same everywhere; else one.
     """
-    zero = np.zeros_like(size)
+    zero, one = np.zeros_like(size), np.ones_like(size)
     if floor is not None:
-        return (Kind(0, floor, size, noise.scatter, 0.0, noise.even, 0.0, 0.0),)
+        return (Kind(0, floor, size, one, noise.scatter, 0.0, noise.even, 0.0, 0.0),)
     if error is None:
         middle = np.median(size, axis=-1, keepdims=True) * np.ones_like(size)
         share, same = math.log(noise.share), math.log1p(-noise.share)
         return (
-            Kind(1, zero, zero + 1.0, noise.unstated, 1.0, 0.0, 0.0, share),
-            Kind(0, zero, middle, noise.unstated, 1.0, 0.0, 0.0, same),
+            Kind(1, zero, one, one, noise.unstated, 1.0, 0.0, 0.0, share),
+            Kind(0, zero, middle, one, noise.unstated, 1.0, 0.0, 0.0, same),
         )
     share = error / size
     alike = bool(np.all(np.ptp(share, axis=-1) <= 0.01 * share.mean(-1)))
     unit = share if alike else error
-    return (Kind(int(alike), zero, unit, noise.factor, 1.0, noise.right, 1.0, 0.0),)
+    usual = np.maximum(np.median(share, axis=-1, keepdims=True) / share, 1.0)
+    return (Kind(int(alike), zero, unit, usual, noise.factor, 1.0, noise.right, 1.0, 0.0),)
 
 
 def scales_between(kind: Kind, low: np.ndarray, high: np.ndarray) -> Scales:
@@ -182,27 +187,29 @@ def log_likelihood(off: Any, model: Any, kind: Kind, scale: Any, noise: Noise) -
     many = n // noise.most
     if not many:
         return found
-    odds = log_odds(_worst(z2, many), noise)
+    odds = _worst(log_odds(z2, kind, noise), many)
     # ln(1 + e^odds) without overflow.
     doubt = xp.log1p(xp.exp(xp.minimum(odds, 500.0))) + xp.maximum(odds - 500.0, 0.0)
     return found + n * math.log1p(-noise.bad) + xp.sum(doubt, axis=0)
 
 
-def _worst(z2: Any, many: int) -> Any:
+def _worst(odds: Any, many: int) -> Any:
     """The one or two largest along the first axis; all where more are asked for."""
-    xp = z2.__array_namespace__()
+    xp = odds.__array_namespace__()
     if many > 2:
-        return z2
-    first = xp.max(z2, axis=0)
+        return odds
+    first = xp.max(odds, axis=0)
     if many == 1:
         return first[None]
-    return xp.stack([first, xp.max(xp.where(z2 < first, z2, 0.0), axis=0)])
+    return xp.stack([first, xp.max(xp.where(odds < first, odds, -xp.inf), axis=0)])
 
 
-def log_odds(squared_pull: Any, noise: Noise) -> Any:
-    """Log odds that a reading is bad, from its squared pull."""
-    before = math.log(noise.bad / (1.0 - noise.bad) / noise.width)
-    return before + 0.5 * squared_pull * (1.0 - noise.width**-2)
+def log_odds(squared_pull: Any, kind: Kind, noise: Noise) -> Any:
+    """Log odds that a reading is bad, from its squared pull, points first as `squared_pulls`."""
+    xp = squared_pull.__array_namespace__()
+    width = noise.width * xp.moveaxis(kind.usual, -1, 0)[..., None, None]
+    before = math.log(noise.bad / (1.0 - noise.bad)) - xp.log(width)
+    return before + 0.5 * squared_pull * (1.0 - width**-2)
 
 
 def averaged(log: Any, log_weight: Any) -> Any:

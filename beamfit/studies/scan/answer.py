@@ -12,7 +12,7 @@ from beamfit.optics.beamline import Beamline
 from beamfit.quantity import Quantity
 from beamfit.statistics import Directions, chi2_probability, scaled_directions
 from beamfit.status import Status
-from beamfit.studies.scan.comparison import PlanePosterior, weighted_quantiles
+from beamfit.studies.scan.comparison import BEAM, FLAT, PlanePosterior, weighted_quantiles
 from beamfit.studies.scan.model import QUANTITIES, coefficients, numbers_of, phase_coverage
 from beamfit.studies.scan.next_point import next_measurement
 from beamfit.studies.scan.results import Identifiability, PlaneFit, Points, ScreenTwiss
@@ -117,13 +117,14 @@ def plane_answer(
     work = seen.works[plane]
     post, p = work.posterior, work.points
     given = places.factor, places.to_screen, places.to_design, places.design
-    quantiles = _quantiles(post.sigma, post.weight, given, None if b is None else b.spread)
+    flat = post.probability[FLAT] / max(post.probability[BEAM] + post.probability[FLAT], 1e-300)
+    spread = None if b is None else b.spread
+    quantiles = _quantiles(post.sigma, post.weight, given, spread, flat)
     value = numbers_of(post.best, *given) if b is None else b.value
     half = 0.5 * (quantiles[3] - quantiles[1])
     low, high = quantiles[0], quantiles[4]
-    carrying = (
-        _influence(p, post.best, half[0]) if post.positive and len(p.size) > 4 else Influence()
-    )
+    alone = post.positive and len(p.size) > 3
+    carrying = _influence(p, post.best, half[0]) if alone else Influence()
     if abs(carrying.shift) > MOVES:
         low, high, half = _reaching(low, high, half, value, carrying.without)
     e = _evidence(seen, plane, low[1], high[1], b)
@@ -133,9 +134,8 @@ def plane_answer(
     remarks = [noise_remark(noise, post.scale, chi2_probability(post.chi2, dof)), work.shot_words]
     remarks += point_remarks(p, carrying.place, carrying.shift) if e.of_a_beam else []
     remarks += [b.remark] if b is not None and determined else []
-    advice = (
-        None if determined or not e.of_a_beam or b is not None else next_measurement(seen, plane)
-    )
+    advised = e.of_a_beam and not determined and b is None
+    advice = next_measurement(seen, plane) if advised else None
     finding = verdict(e, " ".join(filter(None, remarks)), advice or "")
     if determined and (other := _impossible(value[1], _column(seen, plane))):
         finding, determined, e = other, False, e._replace(seen=False)
@@ -192,9 +192,9 @@ def _column(seen: Seen, plane: str) -> str:
 
 
 def _quantiles(
-    sigma: np.ndarray, weight: np.ndarray, given: tuple, spread: np.ndarray | None
+    sigma: np.ndarray, weight: np.ndarray, given: tuple, spread: np.ndarray | None, flat: float
 ) -> np.ndarray:
-    """Quantiles `AT` of every number, shape (5, 11)."""
+    """Quantiles `AT` of every number, shape (5, 11); of emittances with the share ``flat`` at 0."""
     kept = weight > 0.0
     sigma, weight = sigma[kept], weight[kept]
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -206,7 +206,12 @@ def _quantiles(
             middle = np.abs(numbers @ (weight / weight.sum()))
             grown = numbers * np.exp(z * np.minimum(spread / middle, 50.0)[:, None])
             numbers = np.where(SIGNED[:, None], numbers + z * spread[:, None], grown)
-    return np.array([weighted_quantiles(row, weight, AT) for row in numbers]).T
+    found = np.array([weighted_quantiles(row, weight, AT) for row in numbers]).T
+    at = np.array(AT)
+    within = np.maximum((at - flat) / (1.0 - flat), 0.0) if flat < 1.0 else 0.0 * at
+    for i in (0, 1):
+        found[:, i] = np.where(at > flat, weighted_quantiles(numbers[i], weight, within), 0.0)
+    return found
 
 
 def _reaching(

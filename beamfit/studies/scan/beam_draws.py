@@ -217,7 +217,13 @@ def fits(c: Coordinates, kind: Kind, noise: Noise) -> tuple[np.ndarray, np.ndarr
     found = [_fitted(c, kind, deviation, kept) for deviation in _deviations(kind, c)]
     if n > 2 * noise.most:
         found += [_greedy(c, kind, deviation, noise) for deviation in _deviations(kind, c)]
-    return tuple(np.concatenate(part, axis) for part, axis in zip(zip(*found), (-2, -3)))
+    return _joined(found)
+
+
+def _joined(found: list[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
+    """Centres and roots of several sets of fits as one."""
+    centres, roots = zip(*found, strict=True)
+    return np.concatenate(centres, -2), np.concatenate(roots, -3)
 
 
 def _deviations(kind: Kind, c: Coordinates) -> list[np.ndarray]:
@@ -272,7 +278,7 @@ def _greedy(
         kept = kept.copy()
         np.put_along_axis(kept, worst[..., None], 0.0, axis=-1)
         found.append(_fitted(c, kind, deviation, kept))
-    return tuple(np.concatenate(part, axis) for part, axis in zip(zip(*found), (-2, -3)))
+    return _joined(found)
 
 
 def _inside(x: np.ndarray) -> np.ndarray:

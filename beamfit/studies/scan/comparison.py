@@ -227,7 +227,7 @@ def _compared(
 
 
 def _evidences(s: _Stack, i: int, draws: BeamDraws, noise: Noise) -> np.ndarray:
-    """Log evidences of all models under one kind of noise, densities of ln size, (planes, models)."""
+    """Log evidences of all models under one kind of noise, as densities of ln size."""
     kind = s.kinds[i]
     beam = averaged(draws.log_weight, 0.0)
     # Noise in proportion to the size would vanish where such a beam does.
@@ -276,11 +276,11 @@ def _best(
             for kind, d in zip(s.kinds, draws, strict=True)
         ]
         precision = sum(w[:, None] * p for w, (p, _) in zip(of_kind, parts, strict=True))
-        at = model if weights == "model" else c.size
-        target = (
-            c.size**2 if method == "size_squared" else model**2 + 2.0 * model * (c.size - model)
-        )
-        scale = np.sqrt(precision) / (2.0 * (at if method == "size_squared" else model))
+        if method == "size_squared":
+            target, at = c.size**2, model if weights == "model" else c.size
+        else:  # size² that is as far from the model's as the size is, in first order
+            target, at = model**2 + 2.0 * model * (c.size - model), model
+        scale = np.sqrt(precision) / (2.0 * at)
         design = rows * scale[..., None]
         normal = np.swapaxes(design, -1, -2) @ design
         trace = np.trace(normal, axis1=-2, axis2=-1)[:, None, None]
@@ -308,14 +308,15 @@ def _expected(
     off, model = (c.size - model)[:, None, :], model[:, None, :]
     log = log_likelihood(off, model, kind, scales.scale, noise)[:, 0] + scales.log_weight
     share = np.exp(log - np.logaddexp.reduce(log, axis=-1)[:, None])[..., None]
-    z2 = np.moveaxis(squared_pulls(off, model, kind, scales.scale)[..., 0, :], 0, -1)
+    z2 = squared_pulls(off, model, kind, scales.scale)
+    odds = np.moveaxis(log_odds(z2, kind, noise)[..., 0, :], 0, -1)
     n = off.shape[-1]
-    bad = np.zeros_like(z2)
+    bad = np.zeros_like(odds)
     if many := n // noise.most:
-        least = np.sort(z2, axis=-1)[..., n - many : n - many + 1] if many < 3 else 0.0
-        worst = z2 >= least
-        bad = np.where(worst, 1.0 / (1.0 + np.exp(-log_odds(z2, noise))), 0.0)
-    each = (1.0 - bad * (1.0 - noise.width**-2)) / variance_of(kind, scales.scale)
+        least = np.sort(odds, axis=-1)[..., n - many : n - many + 1] if many < 3 else -np.inf
+        bad = np.where(odds >= least, 1.0 / (1.0 + np.exp(-odds)), 0.0)
+    wide = (noise.width * kind.usual[:, None, :]) ** -2
+    each = (1.0 - bad * (1.0 - wide)) / variance_of(kind, scales.scale)
     return (share * each).sum(1) / model[:, 0] ** (2 * kind.power), (share * bad).sum(1)
 
 
@@ -359,12 +360,17 @@ def _posterior(
         relative=float(sum(w * k.power for w, k in zip(of_kind, s.kinds, strict=True))),
         chi2=chi2,
         seen=bool(c.seen),
-        kinds=tuple(k._replace(floor=k.floor[i], unit=k.unit[i]) for k in s.kinds),
+        kinds=tuple(_of_plane(k, i) for k in s.kinds),
         scales=tuple(Scales(*(part[i] for part in d.scales)) for d in draws),
         by_scale=tuple(d.by_scale[i] for d in draws),
         unit=unit,
         trace=np.array([trace[0, 0], 2.0 * trace[0, 1], trace[1, 1]]),
     )
+
+
+def _of_plane(kind: Kind, i: int) -> Kind:
+    """A kind of noise of one plane of many."""
+    return kind._replace(floor=kind.floor[i], unit=kind.unit[i], usual=kind.usual[i])
 
 
 def _covariance(rows: np.ndarray) -> np.ndarray:
@@ -380,7 +386,7 @@ def _scale_of(
 ) -> np.ndarray:
     """Median and central 68 % of the scale of the likelier kind of noise, at the best fit."""
     k = int(np.argmax(of_kind))
-    kind = s.kinds[k]._replace(floor=s.kinds[k].floor[i], unit=s.kinds[k].unit[i])
+    kind = _of_plane(s.kinds[k], i)
     own = Scales(*(part[i] for part in draws[k].scales))
     size, model = s.c.size[i][None], best.model[i][None]
     log = log_likelihood(size - model, model, kind, own.scale, noise)[0] + own.log_weight

@@ -161,9 +161,8 @@ def plane_sizes(seen: Seen, plane: str) -> tuple[PlaneSizes, ShotMeans | None]:
         if freedom.sum() > 0:
             square = error**2 * (freedom + 1.0) * freedom
             error = np.sqrt(evened(square, freedom, size) / (freedom + 1.0))
-    of_shots = shots is not None or (
-        error is not None and bool(scan.shots is not None and (scan.shots > 1).any())
-    )
+    counted = scan.shots is not None and bool((np.asarray(scan.shots) > 1).any())
+    of_shots = shots is not None or (error is not None and counted)
     screens = {seen.rows.places[j] for j in seen.rows.which[at]}
     moved = any(np.ptp(v[at]) > 0 for v in scan.settings.values()) or len(screens) < 3
     return PlaneSizes(r11, r12, known, size, error, of_shots, moved), shots
@@ -209,8 +208,9 @@ def _shot_words(p: Points, shots: ShotMeans | None) -> str:
     count = int((~np.isnan(shots.bad)).sum())
     places = [f"shot {j + 1} at {p.where(i)}" for i, j in lost[:MOST_NAMED]]
     places += [f"{len(lost) - MOST_NAMED} more"] * (len(lost) > MOST_NAMED)
-    verb = "shots do" if len(lost) > 1 else "shot does"
-    return f"{len(lost)} of {count} {verb} not show the beam and {'are' if len(lost) > 1 else 'is'} left out: {'; '.join(places)}."
+    verb, left = ("shots do", "are") if len(lost) > 1 else ("shot does", "is")
+    said = f"{len(lost)} of {count} {verb} not show the beam and {left} left out"
+    return f"{said}: {'; '.join(places)}."
 
 
 def judged_beam(seen: Seen) -> tuple[PlaneFit, ...]:

@@ -83,13 +83,14 @@ class AveragedNoise:
     prior: tuple[float, float]
     floor: Any
     unit: Any
+    usual: Any
     scale: Any
     log_scale_weight: Any
 
     @property
     def kind(self) -> Kind:
         """The same as the likelihood takes it."""
-        named = (self.power, self.floor, self.unit, Lognormal(*self.prior))
+        named = (self.power, self.floor, self.unit, self.usual, Lognormal(*self.prior))
         return Kind(*named, self.special, self.chance, self.least, self.log_weight)
 
 
@@ -140,8 +141,8 @@ def _sizes_of(problem: Problem, seen: Seen, planes: Sequence[str]) -> tuple[Size
         post = work.posterior
         kinds = [
             AveragedNoise(
-                k.power, k.special, k.chance, k.least, k.log_weight, tuple(k.prior), k.floor, k.unit,
-                nodes.scale, nodes.log_weight,
+                k.power, k.special, k.chance, k.least, k.log_weight, tuple(k.prior), k.floor,
+                k.unit, k.usual, nodes.scale, nodes.log_weight,
             )
             for k, nodes in zip(post.kinds, post.scales, strict=True)
         ]  # fmt: skip
@@ -192,7 +193,8 @@ def beam_target(
 
     Notes
     -----
-    Likelihood and prior are those of the fit: noise averaged over, bad readings included. Where transport is known, a plane whose scan does not determine σ11, σ12 and σ22 has no
+    Likelihood and prior are those of the fit: noise averaged over, bad readings included.
+    Where transport is known, a plane whose scan does not determine σ11, σ12 and σ22 has no
     posterior unless priors on all three give it one; it is left out and named.
     """
     asked = _asked(fit, planes)

@@ -15,7 +15,7 @@ from beamfit.optics.rows import seen_line
 from beamfit.sampling.intervals import Correlations
 from beamfit.shown import shown
 from beamfit.studies.scan.comparison import PlanePosterior, weighted_quantiles
-from beamfit.studies.scan.model import emittance_parts, predict_sizes, size_squared
+from beamfit.studies.scan.model import coefficients, emittance_parts, predict_sizes, size_squared
 from beamfit.studies.scan.results import PlaneFit
 from beamfit.studies.scan.transport import Rows, padded, rows_at
 
@@ -77,7 +77,16 @@ def predicted_sizes(
         error = np.where(np.isfinite(p.covariance).all(), error, np.nan)
     else:
         found = fit.solved.derive(predict_sizes, rows)
-        size, error = 1e-6 * found.value[:n], 1e-6 * found.error[:n]
+        size, whole = 1e-6 * found.value[:n], 1e-6 * found.error[:n]
+        r11, r12, known = (np.asarray(part)[:n] for part in rows.elements(fit.solved.model))
+        post = fit.seen.works[plane].posterior
+        slope = np.stack(coefficients(r11, r12), -1) / (2.0 * size[:, None])
+        held = np.einsum("ij,jk,ik->i", slope, post.covariance, slope)
+        # What the other unknowns add in linear theory, beside the posterior of the beam.
+        further = np.sqrt(np.maximum(whole**2 - held, 0.0))
+        error = np.where(
+            np.isfinite(whole), np.hypot(_spread(post, r11, r12, known), further), whole
+        )
     return Prediction(plane, rows.places[0], given, size, error)
 
 

@@ -41,9 +41,8 @@ def flat_beam(c: Coordinates, kind: Kind, noise: Noise) -> np.ndarray:
     order = np.argsort(np.arctan2(w[..., 1], w[..., 0]), axis=-1)
     w = np.take_along_axis(w, order[..., None], -2)
     size, known = (np.take_along_axis(v, order, -1) for v in (c.size, c.known))
-    kind = kind._replace(
-        **{name: np.take_along_axis(getattr(kind, name), order, -1) for name in ("floor", "unit")}
-    )
+    own = (np.take_along_axis(v, order, -1) for v in (kind.floor, kind.unit, kind.usual))
+    kind = kind._replace(**dict(zip(("floor", "unit", "usual"), own, strict=True)))
     target = np.sqrt(np.maximum(size**2 - known, 0.0))
     scale = kind.special or kind.prior.middle
     deviation = np.hypot(kind.floor, scale * kind.unit) * (size if kind.power else 1.0)
