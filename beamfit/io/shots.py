@@ -59,7 +59,9 @@ def average_shots(scan: QuadScan, *, marked: bool) -> QuadScan:
     # Errors that the file gives are not taken from these shots.
     means = {"size": size, "error": scatter | given, "shots": None if given else np.bincount(group)}
     said = said if scatter or given else "none given"
-    return replace(scan, **scan.columns_at(first) | means, error_source=said)
+    profiles = tuple(p._replace(row=int(group[p.row])) for p in scan.profiles)
+    means |= {"error_source": said, "profiles": profiles}
+    return replace(scan, **scan.columns_at(first) | means)
 
 
 def _means(values: np.ndarray, group: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
