@@ -160,7 +160,7 @@ def compared(
     """What the size methods of a file of emittance_gui say of some planes."""
     from beamfit.studies.scan.size_methods import compare_size_methods
 
-    found = compare_size_methods(gui.scans, line, gui.stored)
+    found = compare_size_methods(gui.scans, line, gui.stored, gui.means)
     return tuple(m for m in found if m.plane in planes)
 
 

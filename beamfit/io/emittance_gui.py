@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
 from datetime import datetime, timedelta
 from os import PathLike
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -16,16 +16,23 @@ from beamfit.errors import InputError, nearest
 from beamfit.io.files import digest, laid_out, name_of
 from beamfit.io.lattice import LatticeFile
 from beamfit.io.matlab import read_variable, read_vectors
-from beamfit.io.shots import scatter_of
+from beamfit.io.shots import average_shots
 from beamfit.quantity import Quantity
-from beamfit.studies.scan.scans import Profile, QuadScan
+from beamfit.studies.scan.scans import POSSIBLE, Profile, QuadScan
 
 # GeV, of files that have none; the electron's is the only particle there.
 USUAL_ENERGY = 0.135
 # The size method that answers unless another is asked for.
 USUAL_METHOD = "RMS"
-# Where the sizes stand in `stats`, µm.
-SIZE = {"x": 2, "y": 3}
+# Places in `stats`: sizes in µm, and the sum of the counts.
+SIZE, SUM = {"x": 2, "y": 3}, 5
+# A shot with less of the usual light than this shows no beam: light follows the charge, and a pulse
+# of a tenth of the charge is not the beam whose emittance is asked for. Missed pulses have 1e-3.
+LEAST_LIGHT = 0.1
+# Relative: a mean that differs by more is another one, and not rounded otherwise.
+ROUNDED = 1e-6
+# A beam matrix has three numbers; of shots and sizes that are odd so many are named.
+FEWEST, MOST_NAMED = 3, 4
 MATLAB, VARIABLE = ".mat", "data"
 EXPECTED = "a file saved by emittance_gui"
 
@@ -37,16 +44,23 @@ class EmittanceGuiFile:
     Attributes
     ----------
     scans : dict of str to QuadScan
-        One for each way of taking the sizes from the profiles, with the rows' own matrices.
+        Size method to the scan that its shots give, with the rows' own matrices.
+    means : dict of str to QuadScan
+        Size method to the scan by the file's own mean sizes and their standard errors, from which
+        its emittances were computed.
     stored : dict of str to dict of str to Quantity
         Method and plane to the normalised emittance that the program found, m.
     lattice : LatticeFile
         The energy, the monitor, and the design Twiss parameters where the matrices begin.
+    left_out : dict of str to str
+        Size methods that give no scan, and why.
     """
 
     scans: Mapping[str, QuadScan]
+    means: Mapping[str, QuadScan]
     stored: Mapping[str, Mapping[str, Quantity]]
     lattice: LatticeFile
+    left_out: Mapping[str, str] = field(default_factory=dict)
 
     def scan(self, method: str | None = None) -> QuadScan:
         """The scan of a size method: "RMS" or, where there is none, the first.
@@ -54,10 +68,15 @@ class EmittanceGuiFile:
         Raises
         ------
         InputError
-            If there is no such method.
+            If there is no such method, or it gives no scan.
         """
         names = list(self.scans)
         wanted = (USUAL_METHOD if USUAL_METHOD in names else names[0]) if method is None else method
+        if wanted in self.left_out:
+            expected = f"a size method with three settings or more: {', '.join(names)}"
+            raise InputError(
+                f"{wanted} sizes with {self.left_out[wanted]}", expected, self.lattice.path
+            )
         if wanted not in self.scans:
             found = f"no size method '{wanted}'"
             raise InputError(found, nearest(wanted, names), self.lattice.path)
@@ -80,13 +99,15 @@ def read_emittance_gui(path: str | PathLike[str]) -> EmittanceGuiFile:
     Returns
     -------
     EmittanceGuiFile
-        Errors of the sizes are standard errors over the shots. Settings that failed or were taken
-        out (``status``, ``use``) are left out and counted in the notes of each scan.
+        Errors of the sizes are standard errors over the shots. The notes of each scan name what
+        was left out: settings that failed, were taken out (``status``, ``use``) or never taken,
+        shots without beam or size, and planes and methods that then have too few settings.
 
     Raises
     ------
     InputError
-        If it is another file, is damaged, or lacks sizes or matrices.
+        If it is another file, is damaged, lacks sizes or matrices, or no size method has three
+        settings.
 
     Examples
     --------
@@ -150,26 +171,33 @@ def _texts(value: np.ndarray | None) -> list[str]:
 
 def _read(source: _Fields) -> EmittanceGuiFile:
     beams = _beams(source)
-    n, _, methods = beams.shape
-    lattice = _lattice(source, n)
-    used = np.ones(n, bool)
-    for field in ("status", "use"):
-        if source.get(field) is not None:
-            used &= source.numbers(field, n) > 0
-    names = [_method(beams[:, :, k], k) for k in range(methods)]
-    shared = _shared(source, np.flatnonzero(used), n, lattice)
-    scans = {}
+    used, n = _used(source, len(beams))
+    beams, lattice = beams[used], _lattice(source, n)
+    settings, dark = _settings(source, used, n, lattice), _without_beam(source, beams)
+    notes = [*settings.notes]
+    if dark.any():
+        named = _shots(dark, settings.labels)
+        notes.append(f"Left out for less than a tenth of the usual light, so no beam: {named}.")
+    scans, means, left_out = {}, {}, {}
+    names = [_method(beams[:, :, k], k) for k in range(beams.shape[2])]
     for k, name in enumerate(names):
-        sizes, error, shots = _sizes(beams[used, :, k])
-        scans[name] = QuadScan(
-            **shared,
-            size=sizes,
-            error=error,
-            shots=shots if error else None,
-            profiles=_profiles(source.get("beam"), np.flatnonzero(used), k),
-            name=f"{Path(name_of(source.path)).stem}, {name} sizes",
-        )
-    return EmittanceGuiFile(scans, _stored(source, names), lattice)
+        each = {p: np.where(dark, np.nan, _sizes(beams[:, :, k], p)) for p in SIZE}
+        own, error = (_own(source, part, used, k) for part in ("beam", "beamStd"))
+        called = f"{Path(name_of(source.path)).stem}, {name} sizes"
+        if (mean := _scan(settings, own, error, called)) is not None:
+            means[name] = replace(mean, error_source="the file")
+        alone = error if beams.shape[1] == 1 else {}
+        profiles = _profiles(source.get("beam"), used, k)
+        if (scan := _scan(settings, each, alone, called, profiles)) is None:
+            left_out[name] = _counted(each, settings.labels)
+            continue
+        said = (*notes, *_notes(each, dark, own, settings.labels))
+        scans[name] = replace(average_shots(scan, marked=True), notes=said)
+    if not scans:
+        raise source.error(f"sizes with {next(iter(left_out.values()))}", "beamList")
+    gone = tuple(f"No {name} sizes: {why}." for name, why in left_out.items())
+    scans = {name: replace(scan, notes=scan.notes + gone) for name, scan in scans.items()}
+    return EmittanceGuiFile(scans, means, _stored(source, names), lattice, left_out)
 
 
 def _beams(source: _Fields) -> np.ndarray:
@@ -185,40 +213,74 @@ def _beams(source: _Fields) -> np.ndarray:
     return beams if usual == 3 else beams[:, None, :]
 
 
-def _shared(source: _Fields, used: np.ndarray, n: int, lattice: LatticeFile) -> dict[str, Any]:
-    """What scans of all methods share: settings or monitors, matrices, provenance."""
+def _used(source: _Fields, taken: int) -> tuple[np.ndarray, int]:
+    """Numbers of the settings that were taken and count, and how many there were to be."""
+    word = "monitors" if _of_several(source) else "settings"
+    marks = [f for f in ("status", "use") if source.get(f) is not None]
+    n = max(taken, *(source.get(f).size for f in marks), 0)
+    used = np.arange(n) < taken
+    for mark in marks:
+        used &= source.numbers(mark, n) > 0
+    if used.sum() < FEWEST:
+        found = f"{used.sum()} of {n} {word} taken and in use"
+        raise InputError(found, "at least three: the beam matrix has three numbers", source.path)
+    return np.flatnonzero(used), n
+
+
+class _Settings(NamedTuple):
+    """Settings, or monitors, that count: columns of a `QuadScan` with a row each, and their names.
+
+    ``about`` is what a `QuadScan` has but once.
+    """
+
+    columns: dict[str, Any]
+    labels: list[str]
+    about: dict[str, Any]
+    notes: tuple[str, ...]
+
+    def rows(self, at: np.ndarray) -> dict[str, Any]:
+        """The columns for rows of these numbers."""
+
+        def taken(values: Any) -> Any:
+            if isinstance(values, dict):
+                return {name: v[at] for name, v in values.items()}
+            return tuple(values[i] for i in at) if isinstance(values, list) else values[at]
+
+        return {name: taken(values) for name, values in self.columns.items()} | self.about
+
+
+def _settings(source: _Fields, used: np.ndarray, n: int, lattice: LatticeFile) -> _Settings:
     cells = source.need("rMatrix").ravel()
-    if len(cells) != n:
+    if len(cells) <= used.max():
         raise source.error(f"{len(cells)} matrices for {n} settings", "rMatrix")
-    matrices = []
-    for i in used:
-        r = np.asarray(cells[i], float)
+    matrices = [np.asarray(cells[i], float) for i in used]
+    for i, r in zip(used, matrices, strict=True):
         if r.shape != (6, 6) or not np.isfinite(r).all():
             raise source.error(f"matrix {i + 1} of shape {r.shape}", "rMatrix")
-        matrices.append(r)
-    r = np.array(matrices).reshape(-1, 6, 6)
-    settings, units, screen = {}, {}, None
-    if _of_several(source):
-        screen = tuple(_monitors(source, n)[i] for i in used)
-    else:
-        magnet = _text(source.get("quadName")) or "quadrupole"
-        settings, units = {magnet: source.numbers("quadVal", n)[used]}, {magnet: "kG"}
-    left = n - len(used)
-    notes = [f"{left} of {n} settings failed or were taken out, by status and use."] if left else []
-    if source.get("energy") is None:
-        notes.append(f"The file has no energy; {1e3 * USUAL_ENERGY:g} MeV is taken, as there.")
-    return {
-        "settings": settings,
-        "units": units,
-        "screen": screen,
+    r = np.array(matrices)
+    columns: dict[str, Any] = {
+        "settings": {},
         "energy": np.full(len(used), lattice.energy),
         "transfer": {"x": r[:, 0, [0, 1, 5]], "y": r[:, 2, [2, 3, 5]]},
+    }
+    if _of_several(source):
+        names = _monitors(source, n)
+        labels = columns["screen"] = [names[i] for i in used]
+    else:
+        magnet = _text(source.get("quadName")) or "quadrupole"
+        columns["settings"] = {magnet: source.numbers("quadVal", n)[used]}
+        labels = [f"{kg:.5g} kG" for kg in columns["settings"][magnet]]
+    left = n - len(used)
+    notes = [f"{left} of {n} settings failed or were not taken or used (status, use)."] * (left > 0)
+    if source.get("energy") is None:
+        notes.append(f"The file has no energy; {1e3 * USUAL_ENERGY:g} MeV is taken, as there.")
+    about = {
+        "units": dict.fromkeys(columns["settings"], "kG"),
         "path": source.path,
         "sha256": lattice.sha256,
         "provenance": tuple(_provenance(source)),
-        "notes": tuple(notes),
-        "error_source": "the scatter of the shots (standard error of the mean)",
     }
+    return _Settings(columns, labels, about, tuple(notes))
 
 
 def _of_several(source: _Fields) -> bool:
@@ -255,38 +317,116 @@ def _method(beams: np.ndarray, k: int) -> str:
     return next((name for name in named if name), f"method {k + 1}")
 
 
-def _stats(beams: np.ndarray, plane: str) -> np.ndarray:
-    """Sizes in m of settings and shots; NaN for shots that failed."""
+def _stat(beams: np.ndarray, place: int) -> np.ndarray:
+    """One of the numbers in `stats` of each record, NaN where it is missing or not finite."""
     found = np.full(beams.shape, np.nan)
-    for place, stats in np.ndenumerate(beams["stats"]):
+    for at, stats in np.ndenumerate(beams["stats"]):
         values = np.asarray(stats)
-        if values.dtype.kind in "iuf" and values.size > SIZE[plane]:
-            size = 1e-6 * float(values.ravel()[SIZE[plane]])
-            found[place] = size if 0.0 < size < math.inf else np.nan
+        if values.dtype.kind in "iuf" and values.size > place:
+            value = float(values.ravel()[place])
+            found[at] = value if math.isfinite(value) else np.nan
     return found
 
 
-def _sizes(
-    beams: np.ndarray,
-) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray], np.ndarray]:
-    """Mean sizes of the planes, their standard errors, both in m, and how many shots they rest on.
+def _sizes(beams: np.ndarray, plane: str) -> np.ndarray:
+    """Sizes in m; NaN where there is none that a beam can have."""
+    size = 1e-6 * _stat(beams, SIZE[plane])
+    return np.where((size >= POSSIBLE[0]) & (size <= POSSIBLE[1]), size, np.nan)
 
-    The error is s/√n of the shots, s with n - 1; a plane has none where a setting has no scatter.
+
+def _without_beam(source: _Fields, beams: np.ndarray) -> np.ndarray:
+    """Mark the shots, by setting, that show no beam: far less light than is usual.
+
+    The light is the median over size methods. Monitors differ, and have a usual light each.
     """
-    sizes, errors, shots = {}, {}, np.zeros(len(beams), int)
-    for plane in SIZE:
-        each = _stats(beams, plane)
-        group = np.repeat(np.arange(len(beams)), each.shape[1])
-        mean, degrees, square = scatter_of(each.ravel(), group)
-        measured = ~np.isnan(mean)
-        if not measured.any():
+    light = np.median(np.nan_to_num(_stat(beams, SUM)), axis=2)
+    usual = np.median(light, axis=1, keepdims=True) if _of_several(source) else np.median(light)
+    return light < LEAST_LIGHT * usual
+
+
+def _own(source: _Fields, field: str, used: np.ndarray, k: int) -> dict[str, np.ndarray]:
+    """Mean sizes of a method in m, or their standard errors, as the file has them: shape (n, 1)."""
+    beams = source.get(field)
+    if beams is None or "stats" not in (beams.dtype.names or ()) or beams.ndim != 2:
+        return {}
+    if len(beams) <= used.max() or k >= beams.shape[1]:
+        return {}
+    if field == "beam":
+        return {p: _sizes(beams[used, k, None], p) for p in SIZE}
+    return {p: 1e-6 * _stat(beams[used, k, None], SIZE[p]) for p in SIZE}
+
+
+def _scan(
+    settings: _Settings,
+    sizes: Mapping[str, np.ndarray],
+    errors: Mapping[str, np.ndarray],
+    name: str,
+    profiles: Iterable[Profile] = (),
+) -> QuadScan | None:
+    """The scan of sizes by setting and shot, a row each; None if no plane has enough settings.
+
+    A plane has errors where each of its sizes has one.
+    """
+    kept = {p: v for p, v in sizes.items() if _distinct(v, settings.labels) >= FEWEST}
+    if not kept:
+        return None
+    at = np.flatnonzero(~np.isnan(list(kept.values())).all(axis=0))
+    size = {p: v.ravel()[at] for p, v in kept.items()}
+    error = {p: errors[p].ravel()[at] for p in kept if p in errors}
+    error = {p: v for p, v in error.items() if (v[~np.isnan(size[p])] > 0.0).all()}
+    own = at // next(iter(kept.values())).shape[1]
+    seen = tuple(
+        p._replace(row=int(np.argmax(own == p.row)))
+        for p in profiles
+        if p.row in own and p.plane in kept
+    )
+    return QuadScan(**settings.rows(own), size=size, error=error, name=name, profiles=seen)
+
+
+def _distinct(sizes: np.ndarray, labels: list[str]) -> int:
+    """How many settings have a size."""
+    return len({labels[i] for i in np.flatnonzero(~np.isnan(sizes).all(axis=1))})
+
+
+def _counted(sizes: Mapping[str, np.ndarray], labels: list[str]) -> str:
+    """What is too few of a method."""
+    return " and ".join(f"{_distinct(v, labels)} settings in {p}" for p, v in sizes.items())
+
+
+def _shots(marked: np.ndarray, labels: list[str]) -> str:
+    """Shots in words, by number and setting."""
+    return _first([f"shot {j + 1} at {labels[i]}" for i, j in np.argwhere(marked)])
+
+
+def _first(found: list[str]) -> str:
+    more = len(found) - MOST_NAMED
+    return ", ".join(found[:MOST_NAMED]) + f" and {more} more" * (more > 0)
+
+
+def _notes(
+    sizes: Mapping[str, np.ndarray],
+    dark: np.ndarray,
+    own: Mapping[str, np.ndarray],
+    labels: list[str],
+) -> Iterator[str]:
+    """What is odd about the sizes of one method, by setting and shot."""
+    lost: dict[str, list[str]] = {}
+    for plane, each in sizes.items():
+        if named := _shots(np.isnan(each) & ~dark, labels):
+            lost.setdefault(named, []).append(plane)
+    for named, planes in lost.items():
+        yield f"Left out in {' and '.join(planes)}, without a size a beam can have: {named}."
+    for plane, each in sizes.items():
+        if (n := _distinct(each, labels)) < FEWEST:
+            yield f"Left out: plane {plane}, with sizes at {n} of {len(labels)} settings."
             continue
-        sizes[plane] = mean
-        shots = np.maximum(shots, np.where(measured, degrees + 1, 0).astype(int))
-        error = np.sqrt(square / np.maximum(degrees, 1) / (degrees + 1))
-        if (error[measured] > 0.0).all():
-            errors[plane] = np.where(measured, error, np.nan)
-    return sizes, errors, shots
+        number = np.maximum((~np.isnan(each)).sum(axis=1), 1)
+        mean = np.nansum(each, axis=1) / number
+        said = own[plane][:, 0] if plane in own else np.full(len(mean), np.nan)
+        other = np.flatnonzero((np.abs(said - mean) > ROUNDED * said) & (mean > 0.0))
+        places = [f"{1e6 * said[i]:.4g} for {1e6 * mean[i]:.4g} µm at {labels[i]}" for i in other]
+        if places:
+            yield f"The file's means in {plane} are not those of these shots: {_first(places)}."
 
 
 def _profiles(beam: np.ndarray | None, used: np.ndarray, k: int) -> tuple[Profile, ...]:
@@ -306,7 +446,7 @@ def _profiles(beam: np.ndarray | None, used: np.ndarray, k: int) -> tuple[Profil
 
 
 def _stored(source: _Fields, methods: list[str]) -> dict[str, dict[str, Quantity]]:
-    """The program's own normalised emittances and their errors, m."""
+    """The program's own normalised emittances and their errors, m; 0 there means no beam found."""
     values, errors = source.get("twiss"), source.get("twissstd")
     if values is None or errors is None:
         return {}
@@ -320,7 +460,7 @@ def _stored(source: _Fields, methods: list[str]) -> dict[str, dict[str, Quantity
         name: {
             plane: Quantity(float(values[0, p, k]), float(errors[0, p, k]), "m")
             for p, plane in enumerate(SIZE)
-            if np.isfinite([values[0, p, k], errors[0, p, k]]).all()
+            if np.isfinite([values[0, p, k], errors[0, p, k]]).all() and values[0, p, k] > 0.0
         }
         for k, name in enumerate(methods)
     }

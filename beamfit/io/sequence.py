@@ -1,4 +1,4 @@
-"""Lines of MAD-X, MAD-8 and elegant files, read with pyAT's parsers."""
+"""Lines of MAD-X, MAD-8 and elegant files; the last two are read with pyAT's parsers."""
 
 from __future__ import annotations
 
@@ -16,8 +16,9 @@ from typing import Any
 from beamfit.errors import InputError, nearest
 from beamfit.io.files import digest, read_text
 from beamfit.io.lattice import LatticeFile
+from beamfit.io.madx_lines import read_madx
 from beamfit.io.sequence_bounds import bound, check_count
-from beamfit.io.sequence_elements import NOTHING_AT_ZERO, Source, element_tables
+from beamfit.io.sequence_elements import NOTHING_AT_ZERO, Source, element_tables, pyat_element
 from beamfit.particles import REST_ENERGY, expected_energy
 
 MADX, MAD8, ELEGANT = "MAD-X", "MAD-8", "elegant"
@@ -87,16 +88,19 @@ def read_sequence(
     if suffix == ".ele":
         expected = "the lattice file (.lte) that its &run_setup names"
         raise InputError("an elegant command file", expected, path=path)
+    if DIALECTS[suffix] == MADX:
+        return read_madx(path, use=use, energy=energy)
     source = Source(path, read_text(path), DIALECTS[suffix])
-    with _silence() as said:
+    with _silence() as printed:
         try:
             parser = _parser(source)
             _parse(parser, source)
-            _check_ignored(said.getvalue(), source)
+            _check_ignored(printed.getvalue(), source)
             name, key = _chosen(parser, source, use)
             particle, total = _beam(parser, source, name, energy)
             expanded = _expanded(parser, source, name, key)
-            elements = element_tables(expanded, _descriptions(parser), source)
+            said = _descriptions(parser)
+            elements = element_tables([pyat_element(e, said, source) for e in expanded])
         except InputError:
             raise
         except Exception as error:  # whatever evaluating an expression may raise, also late
@@ -130,7 +134,7 @@ def _parser(source: Source) -> Any:
         raise source.error(
             f"a {source.dialect} file, which needs pyAT to read", "pip install 'beamfit[lattice]'"
         ) from None
-    kinds = {MADX: at.MadxParser, MAD8: at.Mad8Parser, ELEGANT: at.ElegantParser}
+    kinds = {MAD8: at.Mad8Parser, ELEGANT: at.ElegantParser}
     parser = kinds[source.dialect]()
     env = dict(parser.env)
     for like, names in (ALSO_ELEGANT if source.dialect == ELEGANT else ALSO_MAD).items():

@@ -9,7 +9,7 @@ import math
 import re
 from collections import Counter
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from os import PathLike
 from typing import Any
 
@@ -35,7 +35,7 @@ UNMODELLED = {
     "kill_ent_fringe": "an edge switched off",
     "kill_exi_fringe": "an edge switched off",
 }
-# Elements of MAD-X that are nothing where some parameter is zero; pyAT does not know them.
+# Elements of MAD that are nothing where some parameter is zero; pyAT does not know them.
 NOTHING_AT_ZERO = {
     "srotation": ("angle",),
     "xrotation": ("angle",),
@@ -71,19 +71,94 @@ class Source:
         return InputError(found, expected, path=self.path, line=line)
 
 
-def element_tables(
-    elements: Iterable[Any], described: Mapping[str, Any], source: Source
-) -> list[dict[str, Any]]:
-    """Translate a line.
+@dataclass(frozen=True)
+class Element:
+    """An element of a line as its file has it.
+
+    Attributes
+    ----------
+    name, type : str
+        As in the file, the type in capitals.
+    kind : str
+        "screen", "marker", "quadrupole", "dipole", "thin" or "space".
+    length : float
+        m.
+    normal, skew : tuple of float
+        Dipole and quadrupole component, 1/m and 1/m², integrated in a thin element.
+    angle : float
+        Of a bend, rad.
+    edges : tuple of float
+        Its pole faces, rad, from those of a sector.
+    said : mapping
+        All parameters of the file that mean something.
+    place : tuple of path and int, or None
+        File and line that define it.
+    """
+
+    name: str
+    type: str
+    kind: str
+    length: float
+    normal: tuple[float, ...] = (0.0, 0.0)
+    skew: tuple[float, ...] = (0.0, 0.0)
+    angle: float = 0.0
+    edges: tuple[float, ...] = (0.0, 0.0)
+    said: Mapping[str, Any] = field(default_factory=dict)
+    place: tuple[str | PathLike[str] | None, int | None] = (None, None)
+    dialect: str = "MAD-X"
+
+
+# What pyAT makes of elements, by its classes.
+PYAT_KINDS = {
+    "Monitor": "screen",
+    "Quadrupole": "quadrupole",
+    "Dipole": "dipole",
+    "ThinMultipole": "thin",
+}
+
+
+def pyat_element(element: Any, described: Mapping[str, Any], source: Source) -> Element:
+    """An element of a line that pyAT has read.
 
     Parameters
     ----------
-    elements : iterable of at.Element
-        The expanded line.
+    element : at.Element
+        The element.
     described : mapping of str to mapping
         What the file says of each element: the parameters pyAT may have dropped.
     source : Source
-        The file, for messages.
+        The file.
+    """
+    name, kind = element.FamName, type(element).__name__
+    said = described.get(name, {})
+    own = str(getattr(element, "origin", None) or kind).upper()
+    normal, skew = (
+        (*map(float, np.atleast_1d(getattr(element, f"Polynom{k}", []))), 0.0, 0.0) for k in "BA"
+    )
+    angle = float(getattr(element, "BendingAngle", 0.0))
+    edges = [float(getattr(element, f"{k}Angle", 0.0)) for k in ("Entrance", "Exit")]
+    if own == "RBEND" and angle < 0.0:
+        # pyAT adds |angle|/2 to the edges of an RBEND. MAD adds angle/2, so that the faces stay
+        # parallel whichever way it bends.
+        edges = [e + angle for e in edges]
+    marker = kind == "Marker" and own in ("MARKER", "MARK", "WATCH")
+    return Element(
+        name,
+        own,
+        "marker" if marker else PYAT_KINDS.get(kind, "space"),
+        float(getattr(element, "Length", 0.0)),
+        normal,
+        skew,
+        angle,
+        tuple(edges),
+        said,
+        (source.path, source.line_of(name)),
+        source.dialect,
+    )
+
+
+def element_tables(elements: Iterable[Element]) -> list[dict[str, Any]]:
+    """Translate a line.
 
     Returns
     -------
@@ -96,8 +171,7 @@ def element_tables(
     InputError
         If an element does what beamfit does not model; it names element, type and file.
     """
-    elements = list(elements)
-    tables = [_Translation(e, described.get(e.FamName, {}), source).table() for e in elements]
+    tables = [_Translation(e).table() for e in elements]
     places = Counter(t["name"] for t in tables if t["type"] in ("marker", "screen"))
     seen: Counter[str] = Counter()
     for table in tables:
@@ -111,40 +185,30 @@ def element_tables(
 
 
 class _Translation:
-    """One element and what the file says of it."""
+    """One element as a table."""
 
-    def __init__(self, element: Any, said: Mapping[str, Any], source: Source) -> None:
-        self.element, self.said, self.source = element, said, source
-        self.name = element.FamName
-        self.type = str(getattr(element, "origin", None) or type(element).__name__).upper()
-        self.length = float(getattr(element, "Length", 0.0))
-        self.normal, self.skew = (
-            [*map(float, np.atleast_1d(getattr(element, f"Polynom{k}", []))), 0.0, 0.0]
-            for k in "BA"
-        )
+    def __init__(self, element: Element) -> None:
+        self.element, self.said, self.name = element, element.said, element.name
+        self.type, self.length = element.type, element.length
+        self.normal, self.skew = element.normal, element.skew
 
     def table(self) -> dict[str, Any]:
-        kind = type(self.element).__name__
-        if kind == "Monitor":
-            return {"type": "screen", "name": self.name}
-        if kind == "Marker" and self.type in ("MARKER", "MARK", "WATCH"):
-            return {"type": "marker", "name": self.name}
+        kind = self.element.kind
+        if kind in ("screen", "marker"):
+            return {"type": kind, "name": self.name}
         self.check_unmodelled()
-        if kind == "Quadrupole":
-            return self.quadrupole()
-        if kind == "Dipole":
-            return self.dipole()
-        if kind == "ThinMultipole":
-            return self.thin_multipole()
+        own = {"quadrupole": self.quadrupole, "dipole": self.dipole, "thin": self.thin_multipole}
+        if kind in own:
+            return own[kind]()
         if any(self.normal[:2]) or any(self.skew[:2]):
             raise self.refuse("with a dipole or quadrupole component of its own")
         return self.space()
 
     def refuse(self, what: str, expected: str = "") -> InputError:
-        return self.source.error(
+        return InputError(
             f"element '{self.name}' of type '{self.type}' {what}, which beamfit does not model",
             expected or "a line without it: cut the line after it, or set it to zero",
-            self.name,
+            *self.element.place,
         )
 
     def number(self, key: str) -> float:
@@ -164,7 +228,7 @@ class _Translation:
         for key in EDGES:
             if key in self.said and self.number(key) == 0.0:
                 raise self.refuse(f"with an edge switched off ({key.upper()} = 0)")
-        if type(self.element).__name__ == "ThinMultipole":
+        if self.element.kind == "thin":
             return
         for key in ("knl", "ksl"):
             values = self.said.get(key, ())
@@ -208,18 +272,13 @@ class _Translation:
         return -1.0 if self.quarter_turns() % 2 else 1.0
 
     def dipole(self) -> dict[str, Any]:
-        k1, angle = self.normal[1], float(self.element.BendingAngle)
-        edges = [float(self.element.EntranceAngle), float(self.element.ExitAngle)]
+        k1, angle, edges = self.normal[1], self.element.angle, self.element.edges
         self.check_dipole(angle)
         turns = self.quarter_turns()
         k1 = -k1 if turns % 2 else k1
         if angle == 0.0:
             straight = {"type": "quadrupole", "k1_per_m2": k1} if k1 else {"type": "drift"}
             return {"name": self.name, "length_m": self.length} | straight
-        if self.type == "RBEND" and angle < 0.0:
-            # pyAT adds |angle|/2 to the edges of an RBEND. MAD-X adds angle/2, so that the
-            # faces stay parallel whichever way it bends.
-            edges = [e + angle for e in edges]
         if turns in (2, 3):  # bends the other way; the edges are counted with the bend
             angle, edges = -angle, [-e for e in edges]
         return {
@@ -246,7 +305,7 @@ class _Translation:
         if k0 and abs(k0 * self.length - angle) > 1e-9:
             raise self.refuse(f"with a field (K0 = {k0:g}) that is not ANGLE/L")
         # elegant takes FINT = 0.5 where the file has none, MAD takes 0.
-        usual = 0.5 if self.source.dialect == "elegant" else 0.0
+        usual = 0.5 if self.element.dialect == "elegant" else 0.0
         integrals = [self.number(k) for k in ("fint", "fintx", "fint1", "fint2")]
         if "fint" not in self.said:
             integrals.append(usual)

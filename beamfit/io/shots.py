@@ -61,7 +61,9 @@ def average_shots(scan: QuadScan, *, marked: bool) -> QuadScan:
     means = {"size": size, "error": scatter | given, "shots": None if given else np.bincount(group)}
     means["shot_size"] = single
     said = said if scatter or given else "none given"
-    return replace(scan, **scan.columns_at(first) | means, error_source=said)
+    profiles = tuple(p._replace(row=int(group[p.row])) for p in scan.profiles)
+    means |= {"error_source": said, "profiles": profiles}
+    return replace(scan, **scan.columns_at(first) | means)
 
 
 def _table_of(values: np.ndarray, group: np.ndarray) -> np.ndarray:

@@ -18,6 +18,18 @@ from beamfit.studies.scan.size_methods import compare_size_methods
 
 METHODS = ["Gaussian", "RMS", "RMS floor"]
 WIDER = {"Gaussian": 1.0, "RMS": 1.1, "RMS floor": 1.05}
+# How many emittances each of the files has stored: it has none where its own fit found no beam.
+GUI_FILES = {
+    "541-2022-01-23-014733": 9,
+    "541-2022-01-25-055404": 14,
+    "571-2020-06-21-165108": 14,
+    "571-2021-02-11-193249": 12,
+    "571-2021-02-18-124043": 14,
+    "571-2021-02-18-124301": 14,
+    "571-2021-05-01-175521": 14,
+    "571-2021-06-01-163449": 14,
+    "571-2021-06-08-173424": 14,
+}
 KG = np.array([-4.2, -3.6, -3.1, -2.6, -2.1, -1.6, -1.0])
 LINE = beamfit.Beamline(
     (Quadrupole("Q", 0.108, -2.9, beamfit.optics.calibration.IntegratedGradient()),
@@ -74,6 +86,16 @@ def gui_data(noise=0.01, shots=5, sigma=(3.4e-9, 2e-10, 2.1e-9), **changed):
             found[place] = tuple(value[name] for name, _ in kinds)
         return found
 
+    def of_shots(statistic):
+        found = np.empty((len(KG), len(METHODS)), object)
+        for i, k in np.ndindex(found.shape):
+            each = np.array([beam["stats"] for beam in beams[i, :, k]])
+            found[i, k] = beams[i, 0, k] | {"stats": statistic(each)}
+        return structs(found)
+
+    def standard_error(each):
+        return each.std(axis=0, ddof=1 if len(each) > 1 else 0) / np.sqrt(len(each))
+
     transfer = np.empty((1, len(cells)), object)
     transfer[0] = cells
     data = {
@@ -84,7 +106,8 @@ def gui_data(noise=0.01, shots=5, sigma=(3.4e-9, 2e-10, 2.1e-9), **changed):
         "status": np.ones((len(KG), 1), np.uint8),
         "use": np.ones((len(KG), 1), np.uint8),
         "ts": 737963.3606896,
-        "beam": structs(beams[:, 0]),
+        "beam": of_shots(lambda each: each.mean(axis=0)),
+        "beamStd": of_shots(standard_error),
         "beamList": structs(beams),
         "charge": 0.25,
         "rMatrix": transfer,
@@ -110,7 +133,7 @@ def test_the_real_file_gives_its_own_fourteen_emittances(real):
     """To four digits, and their errors to one per cent, by the file's own method."""
     gui = read_emittance_gui(real)
     assert len(gui.scans) == 7
-    found = compare_size_methods(gui.scans, build_line(gui.lattice), gui.stored)
+    found = compare_size_methods(gui.scans, build_line(gui.lattice), gui.stored, gui.means)
     rows = [row for plane in found for row in plane.rows]
     assert len(rows) == 14
     for row in rows:
@@ -121,6 +144,44 @@ def test_the_real_file_gives_its_own_fourteen_emittances(real):
         values = [row.emittance.value for row in plane.rows]
         assert low < min(values) < max(values) < high
         assert plane.covering.error > np.std(values, ddof=1)
+
+
+@pytest.mark.parametrize("name", GUI_FILES)
+def test_every_stored_emittance_follows_from_the_means_of_its_file(name, shared):
+    gui = read_emittance_gui(shared / "data/lcls_gui" / f"Emittance-scan-OTRS_IN20_{name}.mat")
+    found = compare_size_methods(gui.scans, build_line(gui.lattice), gui.stored, gui.means)
+    rows = [row for plane in found for row in plane.rows]
+    stored = [row for row in rows if row.stored]
+    assert len(rows) == 14
+    assert len(stored) == GUI_FILES[name] == sum(map(len, gui.stored.values()))
+    for row in stored:
+        assert row.measured_weights.value == pytest.approx(row.stored.value, rel=2e-5)
+    for row in rows:  # where the file has none, there is none
+        assert row.stored or np.isnan(row.measured_weights.value)
+
+
+def test_missed_pulses_are_left_out_and_named(shared):
+    """Shots with a thousandth of the light, which the program left out of its own means too."""
+    gui = read_emittance_gui(
+        shared / "data/lcls_gui/Emittance-scan-OTRS_IN20_541-2022-01-25-055404.mat"
+    )
+    scan = gui.scan()
+    assert scan.shots.tolist() == [5, 4, 5, 5]
+    assert 1e6 * scan.size["y"][1] == pytest.approx(np.mean([60.7, 61.3, 60.4, 61.3]), abs=0.05)
+    [note] = scan.notes
+    assert "shot 4 at -1.6667 kG" in note
+    for plane in "xy":
+        np.testing.assert_allclose(scan.size[plane], gui.means["RMS"].size[plane], rtol=1e-12)
+        np.testing.assert_allclose(scan.error[plane], gui.means["RMS"].error[plane], rtol=1e-9)
+    fit = beamfit.fit_emittance(scan, build_line(gui.lattice))
+    assert 1e6 * fit.y.normalized_emittance.value == pytest.approx(0.757, rel=0.02)
+
+
+def test_a_scan_that_was_stopped_early(shared, monkeypatch, capsys):
+    path = shared / "data/lcls_gui/Emittance-scan-OTRS_IN20_571-2021-02-18-181634.mat"
+    code, out, err = run(monkeypatch, capsys, path)
+    assert (code, out) == (2, "")
+    assert "1 of 6 settings taken and in use; expected at least three" in err
 
 
 def test_weights_of_measured_sizes_are_an_option_that_is_named(real):
@@ -182,7 +243,80 @@ def test_settings_and_shots_that_failed_are_left_out(save):
     each = [data["beamList"][0, j, 1]["stats"][2] for j in (0, 2, 3, 4)]
     assert scan.size["x"][0] == pytest.approx(1e-6 * np.mean(each))
     assert scan.error["x"][0] == pytest.approx(1e-6 * np.std(each, ddof=1) / 2)
-    assert scan.notes == ("1 of 7 settings failed or were taken out, by status and use.",)
+    taken_out, lost, *means = scan.notes
+    assert taken_out == "1 of 7 settings failed or were not taken or used (status, use)."
+    assert lost.endswith(
+        "in x and y, without a size a beam can have: shot 2 at -4.2 kG, shot 1 at -2.6 kG."
+    )
+    for note, plane in zip(means, "xy", strict=True):
+        assert note.startswith(f"The file's means in {plane} are not those of these shots")
+
+
+def test_what_is_absurd_does_not_spoil_the_rest(save):
+    data = gui_data()
+    shots = data["beamList"]
+    at = METHODS.index("Gaussian")
+    shots[1, 2, at]["stats"][2] = 1e7  # 10 m
+    for i, j in np.ndindex(5, 5):
+        shots[i, j, at]["stats"][3] = -1.0  # leaves two settings in y
+        shots[i, j, METHODS.index("RMS floor")]["stats"][2:4] = np.nan
+    gui = read_emittance_gui(save(beamList=shots))
+    assert list(gui.scans) == ["Gaussian", "RMS"]
+    assert (gui.scans["Gaussian"].planes, gui.scan().planes) == (("x",), ("x", "y"))
+    assert gui.scans["Gaussian"].shots.tolist() == [5, 4, 5, 5, 5, 5, 5]
+    said = " ".join(gui.scans["Gaussian"].notes)
+    for words in ("shot 3 at -3.6 kG", "plane y, with sizes at 2 of 7", "No RMS floor sizes"):
+        assert words in said
+    clean = read_emittance_gui(save())
+    np.testing.assert_array_equal(gui.scan().size["x"], clean.scan().size["x"])
+    with pytest.raises(beamfit.InputError, match="RMS floor sizes with 2 settings in x"):
+        gui.scan("RMS floor")
+    x, y = compare_size_methods(gui.scans, build_line(gui.lattice), gui.stored, gui.means)
+    assert [len(x.rows), len(y.rows)] == [2, 1]
+
+
+def test_settings_that_were_not_taken(save):
+    data = gui_data()
+    status = (np.arange(len(KG)) < 5).astype(np.uint8)[:, None]
+    short = {k: data[k][:5] for k in ("beam", "beamStd", "beamList")}
+    gui = read_emittance_gui(save(status=status, rMatrix=data["rMatrix"][:, :5], **short))
+    assert gui.scan().settings["QUAD:TEST:1"].tolist() == KG[:5].tolist()
+    assert gui.scan().notes[0].startswith("2 of 7 settings")
+
+
+def test_a_shot_without_light_is_none_of_the_beam(save):
+    data = gui_data()
+    for k in range(len(METHODS)):
+        data["beamList"][2, 3, k]["stats"][[2, 3, 5]] = 300.0, 20.0, 12.0
+    scan = read_emittance_gui(save(beamList=data["beamList"])).scan()
+    assert scan.shots.tolist() == [5, 5, 4, 5, 5, 5, 5]
+    assert scan.notes[0].endswith("so no beam: shot 4 at -3.1 kG.")
+    assert "means in x are not those" in scan.notes[1]  # the made file has the mean of all five
+
+
+def test_a_file_of_single_shots_has_the_errors_it_states(save):
+    data = gui_data()
+    gui = read_emittance_gui(save(beamList=None))
+    assert gui.scan().error["x"][2] == pytest.approx(1e-6 * data["beamStd"][2, 1]["stats"][2])
+    without = read_emittance_gui(save(beamList=None, beamStd=None)).scan()
+    assert without.error == {}
+    assert without.error_source == "none given"
+
+
+def test_four_wires(save, monkeypatch, capsys):
+    """A wire is shot once; its name stands in a cell, its matrix begins at the start."""
+    names, four = np.empty((1, 4), object), [0, 2, 4, 6]
+    names[0] = [f"WIRE:{i}" for i in range(4)]
+    data = gui_data()
+    part = {k: data[k][four] for k in ("beam", "beamStd", "status", "use")}
+    part |= {"beamList": data["beamList"][four][:, :1], "rMatrix": data["rMatrix"][:, four]}
+    path = save(type="multi", name=names, quadName=None, quadVal=None, **part)
+    gui = read_emittance_gui(path)
+    assert gui.scan().screen == tuple(names[0])
+    assert len(gui.scan().error["x"]) == 4
+    code, out, err = run(monkeypatch, capsys, path)
+    assert (code, err) == (0, "")
+    assert "in x, µm, by size method" in out
 
 
 def test_several_monitors(save):
@@ -250,8 +384,8 @@ WRONG = {
     "settings in words": ({"quadVal": "many"}, "quadVal"),
     "energy in MeV": ({"energy": 135000.0}, "energy"),
     "slices": ({"beamList": gui_data()["beamList"][..., None].repeat(2, -1)}, "slices"),
-    "nothing used": ({"use": np.zeros((7, 1))}, "no beam sizes"),
-    "two settings used": ({"use": np.array([1, 1, 0, 0, 0, 0, 0])}, "2 distinct"),
+    "nothing used": ({"use": np.zeros((7, 1))}, "0 of 7 settings"),
+    "two settings used": ({"use": np.array([1, 1, 0, 0, 0, 0, 0])}, "2 of 7 settings"),
 }
 
 

@@ -284,9 +284,9 @@ def test_which_line(written):
         ("a.madx", "x = 3;\n", "no LINE"),
         ("a.madx", "beam, energy=1; lc: line=(lc);", "lc"),
         ("a.lte", "C: CHARGE, TOTAL=1e-9\nLC: LINE=(C)", "without elements"),
-        ("a.madx", "beam, energy=1; d: drift, l=1; lc: line=(d, pi);", "3.14159"),
+        ("a.madx", "beam, energy=1; d: drift, l=1; lc: line=(d, pi);", "'pi' in a LINE"),
         ("a.madx", "beam, energy=1; k := 3**; lc: line=(k);", "'3**'"),
-        ("a.madx", "beam, energy=k; k := 3**; d: drift, l=1; lc: line=(d);", "BEAM"),
+        ("a.madx", "beam, energy=k; k := 3; d: drift, l=1; lc: line=(d);", "BEAM"),
         ("a.madx", MADX.replace("at=0.5", "at=0.1"), "overlap"),
         ("a.madx", "call, file='nowhere.madx';\n", "nowhere.madx"),
         ("a.ele", "&run_setup\n lattice = line.lte\n&end\n", "command file"),
@@ -323,8 +323,9 @@ def test_called_files_are_found_beside_the_file(written):
 
 def test_without_pyat(written, monkeypatch):
     monkeypatch.setitem(sys.modules, "at", None)
-    path = written("line.madx", MADX)
+    path = written("line.lte", ELEGANT)
     assert "pip install 'beamfit[lattice]'" in refused(path)
+    assert read_lattice(written("line.madx", MADX)).name == "LC"  # which beamfit reads itself
 
 
 @given(
@@ -428,11 +429,14 @@ def test_a_part_of_a_line_with_a_marker_for_a_screen(written):
 
 DOUBLED = "".join(f"L{k + 1}: line=(L{k},L{k});" for k in range(60))
 HOSTILE = {
-    "powers": ("a = 9^9^9^9;", "out of range"),
+    "powers": ("a = 9^9^9^9; Q2: quadrupole, l=0.1, k1=a; LC: line=(Q2,B);", "out of range"),
     "powers that wait": ("a := 9^9^9^9; Q2: quadrupole, l=0.1, k1=a; LC: line=(Q2,B);", "of range"),
     "copies": ("LC: line=(1000000000*Q1,B);", "more than 50000 elements"),
     "lines that double": (f"L0: line=(Q1);{DOUBLED}LC: line=(L60,B);", "more than 50000 elements"),
-    "sums that double": ("a = (1,2);" + "a = a + a;" * 60, "more than 50000 elements"),
+    "a list for a number": ("a = (1,2);" + "a = a + a;" * 60, "'(' without ')'"),
+    "parentheses": (f"a = {'(' * 5000}1{')' * 5000};Q1->k1=a;LC: line=(Q1,B);", "recursion"),
+    "names in a ring": ("a := b; b := a; Q1->k1 = a; LC: line=(Q1,B);", "defined by itself"),
+    "comments": ("/*\n" * 100_000 + "LC: line=(Q1,B);", "no LINE"),
     "a file that calls itself": ('call, file="a.madx";', "more than 50 files called"),
     "a device": ('call, file="/dev/zero";', "a device"),
 }

@@ -222,3 +222,19 @@ def test_advice_where_no_magnet_moved_needs_limits():
     own = wire_scan(WIRES, 0.005, transfer=seen_from(fodo(), WIRES), energy=np.full(5, 135.0))
     with pytest.raises(InputError, match="a lattice"):
         plan_measurements(beamfit.fit_emittance(own), limits={"Q0": (5.0, 9.0)})
+
+
+def test_a_transport_network_needs_something_that_changes():
+    with pytest.raises(
+        InputError, match="no magnet and no energy changes; expected scenario known"
+    ):
+        beamfit.fit_emittance(wire_scan(WIRES[:4]), fodo(), scenario="transport-network")
+
+
+def test_one_number_holds_for_all_rows():
+    for name in ("shots", "energy", "resolution", "energy_spread"):
+        scan = wire_scan(WIRES, **{name: 5})
+        assert getattr(scan, name).tolist() == [5] * len(WIRES)
+    for name, wrong in (("shots", 0), ("shots", [5, 5]), ("energy", "135 MeV"), ("energy", [1.0])):
+        with pytest.raises(InputError, match=f"column '{name}'"):
+            wire_scan(WIRES, **{name: wrong})

@@ -126,15 +126,15 @@ class QuadScan:
         Plane ("x", "y") to rms sizes in m, shape (n,); NaN where a row has none.
     error : mapping of str to array, optional
         Plane to standard errors in m. A plane left out has no errors: the fit infers them.
-    energy : array, optional
-        Energy of each row in MeV; the lattice's if None.
+    energy : array or float, optional
+        Energy of each row in MeV, or of all; the lattice's if None.
     energy_kind : {"total", "kinetic", "momentum"}
         What that is; a momentum is p c.
     screen : sequence of str, optional
         Screen of each row; the lattice's only one if None.
-    resolution, energy_spread : array, optional
-        Point-spread rms in m and relative momentum spread of each row.
-    shots : array, optional
+    resolution, energy_spread : array or float, optional
+        Point-spread rms in m and relative momentum spread of each row, or of all.
+    shots : array or int, optional
         How many shots each row is the mean of.
     shot_size : mapping of str to array, optional
         Plane to the sizes of single shots in m, shape (n, m), NaN where a row has fewer than m.
@@ -198,15 +198,15 @@ class QuadScan:
         for key in ("settings", "size", "error", "shot_size"):
             arrays = {k: np.asarray(v, float) for k, v in getattr(self, key).items()}
             object.__setattr__(self, key, arrays)
-        for key in ("energy", "resolution", "energy_spread"):
-            if getattr(self, key) is not None:
-                object.__setattr__(self, key, np.asarray(getattr(self, key), float))
         if self.slice is not None:
             names = tuple(str(name).strip() or PROJECTED for name in self.slice)
             object.__setattr__(self, "slice", names)
         if self.transfer is not None:
             object.__setattr__(self, "transfer", self._whole_transfer(self.transfer))
         self._check_shapes()
+        for key in ("energy", "resolution", "energy_spread", "shots"):
+            if getattr(self, key) is not None:
+                object.__setattr__(self, key, self._column(key))
         self._check_values()
         for plane in self.planes:
             self._check_three_settings(plane)
@@ -350,6 +350,19 @@ class QuadScan:
         lengths |= {f"R in {p}": len(v) for p, v in (self.transfer or {}).items()}
         if len(set(lengths.values())) != 1:
             raise self.unusable(f"lengths {lengths}", "one length for all columns")
+
+    def _column(self, key: str) -> np.ndarray:
+        """Numbers of each row; one number holds for all."""
+        given = np.asarray(getattr(self, key))
+        n = len(self)
+        if given.dtype.kind not in "iuf" or given.shape not in ((), (n,)):
+            found = f"{key} of shape {given.shape}" if given.dtype.kind in "iuf" else f"{given}"
+            raise self.unusable(found, f"a number for each of {n} rows, or one for all", key)
+        if key != "shots":
+            given = given.astype(float)
+        elif not (given >= 1).all():
+            raise self.unusable(f"{given.min():g} shots", "one or more for each row", key)
+        return np.full(n, given) if given.ndim == 0 else given
 
     def _whole_transfer(self, given: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
         """R11, R12 and R16 of each row and plane, shape (n, 3)."""

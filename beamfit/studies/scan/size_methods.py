@@ -10,11 +10,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from beamfit.optics.beamline import Beamline
-from beamfit.optics.particle import beta_gamma
+from beamfit.optics.particle import ELECTRON_MASS, beta_gamma
 from beamfit.quantity import Quantity
 from beamfit.statistics import reach_of
 from beamfit.status import Status
-from beamfit.studies.scan.fit import EmittanceFit, fit_emittance
+from beamfit.studies.scan.fit import fit_emittance
 from beamfit.studies.scan.model import emittance_parts
 from beamfit.studies.scan.scans import QuadScan
 from beamfit.studies.scan.sigma import fit_sizes
@@ -30,8 +30,9 @@ class MethodRow(NamedTuple):
         How the sizes were taken from the profiles.
     stored : Quantity or None
         What the file says.
-    measured_weights : Quantity
-        The same, computed here by the file's own method; see `measured_weights`.
+    measured_weights : Quantity or None
+        The same, computed here by the file's own method from its own mean sizes; see
+        `measured_weights`. None where the file has none.
     emittance : Quantity
         What `beamfit.fit_emittance` says; without an error where the sizes do not determine it.
     status : Status
@@ -40,7 +41,7 @@ class MethodRow(NamedTuple):
 
     method: str
     stored: Quantity | None
-    measured_weights: Quantity
+    measured_weights: Quantity | None
     emittance: Quantity
     status: Status
 
@@ -94,6 +95,7 @@ def compare_size_methods(
     scans: Mapping[str, QuadScan],
     line: Beamline,
     stored: Mapping[str, Mapping[str, Quantity]] | None = None,
+    means: Mapping[str, QuadScan] | None = None,
 ) -> tuple[SizeMethods, ...]:
     """Fit every way of taking the sizes of a scan.
 
@@ -105,6 +107,9 @@ def compare_size_methods(
         The line.
     stored : mapping of str to mapping of str to Quantity, optional
         Method and plane to the normalised emittance that a file says.
+    means : mapping of str to QuadScan, optional
+        Method to the mean sizes and errors from which the file computed it, with the rows' own
+        matrices.
 
     Returns
     -------
@@ -130,21 +135,23 @@ def compare_size_methods(
     for plane in planes:
         rows = []
         for method, fit in fits.items():
-            p = fit[plane]
+            if plane not in fit.scan.planes:
+                continue
+            p, mean = fit[plane], (means or {}).get(method)
             said = (stored or {}).get(method, {}).get(plane)
-            own = measured_weights(fit, plane)
+            own = measured_weights(mean, plane) if mean and plane in mean.planes else None
             rows.append(MethodRow(method, said, own, p.normalized_emittance, p.status))
         found.append(SizeMethods(plane, tuple(rows), _covering(rows)))
     return tuple(found)
 
 
-def measured_weights(fit: EmittanceFit, plane: str) -> Quantity:
-    """The normalised emittance by weights of the measured sizes, as emittance_gui computes it.
+def measured_weights(scan: QuadScan, plane: str) -> Quantity:
+    """Compute the normalised emittance by weights of the measured sizes, as emittance_gui does.
 
     Parameters
     ----------
-    fit : EmittanceFit
-        A fit, for the scan and its matrices.
+    scan : QuadScan
+        Mean sizes of electrons, with errors, total energies and matrices of the rows' own.
     plane : str
         "x" or "y".
 
@@ -157,15 +164,25 @@ def measured_weights(fit: EmittanceFit, plane: str) -> Quantity:
     -----
     Linear least squares of size² with weights 1/(2 size error) of the measured sizes; the error is
     that of linear propagation times sqrt(χ²/dof), also where that is below 1. The stored numbers of
-    ../shared/data/lcls_otr2/test_scan2.mat are these, with βγ = E/mc².
+    ../shared/data/lcls_otr2/test_scan2.mat and of the files in ../shared/data/lcls_gui are these,
+    with βγ = E/mc².
+
+    Examples
+    --------
+    >>> drift = [[1.0, 0.0], [1.0, 1.0], [1.0, 2.0]]  # behind a waist of 0.1 mm and 0.1 mrad
+    >>> sizes = {"x": 1e-4 * np.sqrt([1.0, 2.0, 5.0])}
+    >>> scan = QuadScan({}, {}, sizes, energy=[135.0] * 3, transfer={"x": drift})
+    >>> print(measured_weights(scan, "x"))
+    2.64 µm (not determined)
     """
-    p, at = fit[plane].points, fit.seen.measured(plane)
-    size = fit.scan.size[plane][at]
-    error = fit.scan.error.get(plane, fit.scan.size[plane])[at]
-    found, dof = fit_sizes(p.r11, p.r12, size, error, p.known, weights="measured"), len(size) - 3
+    at = ~np.isnan(scan.size[plane])
+    size = scan.size[plane][at]
+    error = scan.error[plane][at] if plane in scan.error else size
+    r11, r12 = scan.transfer[plane][at, :2].T
+    found, dof = fit_sizes(r11, r12, size, error, weights="measured"), len(size) - 3
     if not (bool(found.positive) and bool(found.full_rank)):
         return Quantity(math.nan, None, "m")
-    factor = beta_gamma(fit.seen.energy, float(fit.line.mass))
+    factor = beta_gamma(float(scan.energy.mean()), ELECTRON_MASS)
     value = factor * float(emittance_parts(found.sigma)[0])
     if dof < 1:
         return Quantity(value, None, "m")

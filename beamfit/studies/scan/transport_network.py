@@ -85,6 +85,9 @@ def _layout(seen: Seen, told: Assumptions) -> _Layout:
     columns = {name: scan.settings[name] for name in varied_magnets(scan)}
     with_energy = scan.energy is not None and np.ptp(scan.energy) > 0
     columns |= {"energy": scan.energy} if with_energy else {}
+    if not columns:
+        found = "a transport network for a scan in which no magnet and no energy changes"
+        raise scan.unusable(found, "scenario known: the network maps settings to R11 and R12")
     elements, values = 4 if told.anchor.determinant else 2, np.stack([*columns.values()], -1)
     return _Layout(tuple(columns), values, with_energy, elements, _box(seen, told, columns))
 
