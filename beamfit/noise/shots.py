@@ -28,11 +28,14 @@ class ShotMeans(NamedTuple):
         Shape (n,), m: mean of the shots that show the beam, and its standard error.
     bad : ndarray
         Shape (n, m): probability that a shot shows something else; NaN where there is none.
+    scatter : float
+        Median scatter of single shots, as a share of the size.
     """
 
     size: np.ndarray
     error: np.ndarray
     bad: np.ndarray
+    scatter: float
 
 
 def means_of(shots: np.ndarray, noise: Noise = Noise()) -> ShotMeans | None:  # noqa: B008
@@ -86,7 +89,8 @@ def means_of(shots: np.ndarray, noise: Noise = Noise()) -> ShotMeans | None:  # 
     count = np.maximum(good.sum(1), 0.5)
     doubtful = (good * (there - good) * (value - mean[:, None]) ** 2).sum(1) / count**2
     error = np.sqrt(deviation**2 / count + doubtful)
-    return ShotMeans(mean, error, np.where(there, 1.0 - good, np.nan))
+    bad = np.where(there, 1.0 - good, np.nan)
+    return ShotMeans(mean, error, bad, float(np.median(deviation / mean)))
 
 
 def _first_scatter(shots: np.ndarray, middle: np.ndarray) -> np.ndarray:

@@ -19,7 +19,7 @@ from beamfit.studies.scan.assumptions import Anchor, Assumptions
 from beamfit.studies.scan.known import METHODS, WEIGHTS, judged_beam, prepared, see
 from beamfit.studies.scan.model import line_of
 from beamfit.studies.scan.predicted import Prediction, correlations_of, predicted_sizes
-from beamfit.studies.scan.questions import of_emittances, questions
+from beamfit.studies.scan.questions import of_emittances, of_priors, questions
 from beamfit.studies.scan.results import Parameter, PlaneFit, parameter_rows, result_rows
 from beamfit.studies.scan.scans import QuadScan
 from beamfit.studies.scan.statement import Scenario, Seen, scenario_of
@@ -219,7 +219,11 @@ class EmittanceFit:
         """What was done to the numbers of the file, and what is odd about them, in sentences."""
         measured = self.seen.weights == "measured"
         own = ("Errors of size squared are taken at the measured sizes, on request.",) * measured
-        asked = (*questions(self.scan, self.seen.scanned), *of_emittances(self.planes))
+        asked = (
+            *questions(self.scan, self.seen.scanned),
+            *of_priors(self.told.priors, self.seen.scanned),
+            *of_emittances(self.planes),
+        )
         return (*self.scan.notes, *asked, *own)
 
     @property

@@ -36,6 +36,8 @@ METHODS = ("size_squared", "size")
 WEIGHTS = ("model", "measured")
 # Shots that a sentence names.
 MOST_NAMED = 4
+# A share of the size from which on the scatter of shots is the beam's more than the screen's.
+UNSTEADY = 0.1
 
 
 def see(
@@ -203,14 +205,20 @@ def _shot_words(p: Points, shots: ShotMeans | None) -> str:
     if shots is None:
         return ""
     lost = np.argwhere(np.nan_to_num(shots.bad) > 0.99)
+    unsteady = ""
+    if shots.scatter > UNSTEADY:
+        unsteady = (
+            f"Shots of one setting scatter by {100 * shots.scatter:.2g} %: the beam changes from "
+            "shot to shot, and this is that of the mean sizes."
+        )
     if not len(lost):
-        return ""
+        return unsteady
     count = int((~np.isnan(shots.bad)).sum())
     places = [f"shot {j + 1} at {p.where(i)}" for i, j in lost[:MOST_NAMED]]
     places += [f"{len(lost) - MOST_NAMED} more"] * (len(lost) > MOST_NAMED)
-    verb, left = ("shots do", "are") if len(lost) > 1 else ("shot does", "is")
-    said = f"{len(lost)} of {count} {verb} not show the beam and {left} left out"
-    return f"{said}: {'; '.join(places)}."
+    are = "are" if len(lost) > 1 else "is"
+    said = f"{len(lost)} of {count} shots {are} left out, no beam there: {'; '.join(places)}."
+    return f"{said} {unsteady}".strip()
 
 
 def judged_beam(seen: Seen) -> tuple[PlaneFit, ...]:

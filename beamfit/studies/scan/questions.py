@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -17,6 +17,8 @@ from beamfit.studies.scan.scans import USUAL, QuadScan, middle
 STRONG, IMPOSSIBLE = 500.0, 1e4
 # Normalised emittances in m below those of accelerators: sizes in mm that are called µm give 1e-12.
 TINY = 1e-9
+# A prior further than this from what the line says is asked about.
+FAR = 0.2
 
 
 def scanned_magnets(scan: QuadScan, scanned: Beamline) -> Iterator[tuple[str, np.ndarray, Element]]:
@@ -100,6 +102,24 @@ def of_emittances(planes: Iterable[Any]) -> Iterator[str]:
             yield (
                 f"A normalised emittance of {found.value:.2g} m in {plane.plane} is less "
                 "than accelerators have: are sizes, settings and energy in their units?"
+            )
+
+
+def of_priors(priors: Mapping[str, tuple[float | None, float]], scanned: Beamline) -> Iterator[str]:
+    """Ask about priors on elements whose mean is far from what the line says."""
+    for name, (mean, _) in priors.items():
+        element, _, what = name.rpartition(".")
+        if mean is None or not element or element not in {e.name for e in scanned.elements}:
+            continue
+        part = scanned[element]
+        own = getattr(part, "length", None) if what == "length" else None
+        own = getattr(getattr(part, "calibration", None), what, own)
+        if own is None or what == "gradient" or not float(own):
+            continue
+        if abs(mean / float(own) - 1.0) > FAR:
+            yield (
+                f"The prior {name} = {mean:g} is more than 20 % from the line's {float(own):g}: is "
+                "it in the line's unit?"
             )
 
 

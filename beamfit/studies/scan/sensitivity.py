@@ -25,9 +25,7 @@ from beamfit.optics.elements import (
     Drift,
     Element,
     Marker,
-    Quadrupole,
     SectorDipole,
-    ThinLens,
 )
 from beamfit.optics.sections import Series
 from beamfit.studies.scan.fit import EmittanceFit
@@ -48,6 +46,8 @@ SLOW = 0.1
 MOST_CAUSES, SMALLEST = 30, 5e-4
 # Steps of the budget: resolution and dispersion in m, and a momentum spread where none is stated.
 RESOLUTION, DISPERSION, SPREAD = 10e-6, 0.01, 1e-3
+# What saturation, space charge or a pedestal add to every size², told at the smallest size.
+AT_WAIST = 0.05
 
 
 class Change(NamedTuple):
@@ -102,7 +102,8 @@ def systematics(fit: EmittanceFit, plane: str) -> list[Change]:
         The largest change first; empty where the emittance is not determined. For +1 % of each
         magnet, scanned or not, of the angle of each bend, of the energy and of the screen's scale;
         for +1 cm of each drift; for 10 µm of resolution and 1 cm of dispersion of the incoming beam
-        (of the line's momentum spread, or 0.1 % where it has none) that were not thought of. First
+        (of the line's momentum spread, or 0.1 % where it has none) that were not thought of; for
+        what saturation, space charge or a pedestal add to size² at the waist. First
         order: exact derivatives (through transport, and through the minimum by the implicit
         function theorem) times the step.
 
@@ -118,7 +119,7 @@ def systematics(fit: EmittanceFit, plane: str) -> list[Change]:
     ...     line.matrix({"Q": k}).x).l11) for k in k1]
     >>> fit = fit_emittance(QuadScan({"Q": k1}, {"Q": "k1"}, {"x": sizes}), line)
     >>> [c.cause for c in systematics(fit, "x")][:2]
-    ['resolution of 10 µm more', 'screen scale +1 %']
+    ['smallest size 5 % too large (saturation, space charge)', 'screen resolution 10 µm larger']
     """
     result = fit[plane]
     if result.emittance.error is None:
@@ -186,7 +187,7 @@ def _moved(line: Beamline, changes: Iterator[Array]) -> Beamline:
             return replace(part, length=part.length + change)
         if isinstance(part, SectorDipole):
             return replace(part, angle=part.angle * (1.0 + change))
-        if isinstance(part, Quadrupole | ThinLens):
+        if hasattr(part, "calibration"):
             return replace(part, calibration=scaled(part.calibration, 1.0 + change))
         return part
 
@@ -199,7 +200,7 @@ def _cause(fit: EmittanceFit, element: Element) -> tuple[str, float]:
         return f"drift {element.name} +1 cm", 0.01
     if isinstance(element, SectorDipole):
         return f"bend {element.name} angle +1 %", 0.01
-    if isinstance(element, Quadrupole | ThinLens):
+    if hasattr(element, "calibration"):
         # What a supply does to its magnets is one cause.
         supplies = fit.seen.scanned.supplies
         name = next((s for s, members in supplies if element.name in members), element.name)
@@ -222,10 +223,14 @@ def _of_screen(fit: EmittanceFit, p: Points, by_known: np.ndarray) -> dict[str, 
     # A scale on sizes is one on what is known of them and on σ, whose emittance goes with it.
     scale = 2.0 * (1.0 - float(by_known @ p.known))
     dispersed = float(by_known @ (p.r11 * DISPERSION * spread) ** 2)
+    smallest = float(np.min(p.size))
     return {
         "screen scale +1 %": 0.01 * scale,
-        "resolution of 10 µm more": float(by_known.sum()) * RESOLUTION**2,
-        f"dispersion of 1 cm more (spread {100 * spread:.2g} %)": dispersed,
+        "smallest size 5 % too large (saturation, space charge)": float(by_known.sum())
+        * ((1.0 + AT_WAIST) ** 2 - 1.0)
+        * smallest**2,
+        "screen resolution 10 µm larger": float(by_known.sum()) * RESOLUTION**2,
+        f"dispersion 1 cm larger (spread {100 * spread:.2g} %)": dispersed,
     }
 
 

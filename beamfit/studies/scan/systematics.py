@@ -33,6 +33,8 @@ UNITS = {
     "dispersion": ("m", 0.0),
     "dispersion_slope": ("1", 0.0),
 }
+# How far the mean of a relative prior may be from what line and scan say.
+NEAR = (0.8, 1.25)
 POSITIVE = ("size_scale", "resolution", "wire", "energy")
 
 
@@ -156,6 +158,12 @@ def _term(seen: Seen, name: str, mean: float | None, sd: float) -> Term:
             expected = "energy_spread in the lattice or the scan"
             raise InputError(f"a prior on {name} without a momentum spread", expected)
     mean = own if mean is None else mean
+    if name == "energy" and not NEAR[0] <= mean <= NEAR[1]:
+        # 135+-1 is an energy in MeV, where a share of the line's is meant.
+        mean, sd = mean / seen.energy, sd / seen.energy
+    if unit == "1" and own == 1.0 and not NEAR[0] <= mean <= NEAR[1]:
+        expected = f"{name}=1+-0.02: relative to what line and scan say, within 20 %"
+        raise InputError(f"a prior {name} = {mean:.4g} ± {sd:.3g}", expected)
     low = mean - REACH * sd
     return Term(name, path, mean, sd, max(low, 0.0) if positive else low, mean + REACH * sd, unit)
 
