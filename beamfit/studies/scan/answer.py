@@ -54,9 +54,9 @@ class Beside(NamedTuple):
 
     Attributes
     ----------
-    value, spread, raw : ndarray
-        Shape (11,), in the order of `QUANTITIES`: best values, standard deviations that the other
-        unknowns add to those of known transport, and errors by the stated errors alone.
+    value, spread : ndarray
+        Shape (11,), in the order of `QUANTITIES`: best values, and standard deviations that the
+        other unknowns add to those of known transport.
     covariance : ndarray
         Shape (3, 3), of σ11, σ12, σ22.
     directions : Directions
@@ -71,7 +71,6 @@ class Beside(NamedTuple):
 
     value: np.ndarray
     spread: np.ndarray
-    raw: np.ndarray
     covariance: np.ndarray
     directions: Directions
     dof: float
@@ -89,6 +88,30 @@ class Influence(NamedTuple):
     place: str = ""
     shift: float = 0.0
     without: float = math.nan
+
+
+class Numbers(NamedTuple):
+    """Numbers of a plane in the order of `QUANTITIES`, each of shape (11,)."""
+
+    value: np.ndarray
+    half: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+    raw: np.ndarray
+
+    def quantities(self, known: np.ndarray, limits: bool) -> list[Quantity]:
+        """Quantities with errors where they are known, else with intervals if the model holds."""
+        rows = zip(*self, QUANTITIES.values(), known, strict=True)
+        return [_quantity(*row, limits) for row in rows]
+
+
+class Judged(NamedTuple):
+    """A finding, whether the emittance is determined, and what to measure next."""
+
+    finding: Finding
+    determined: bool
+    of_a_beam: bool
+    advice: str | None
 
 
 def plane_answer(
@@ -114,49 +137,21 @@ def plane_answer(
     PlaneFit
         Errors only for what the data determine: half of the central 68 % of the posterior.
     """
-    work = seen.works[plane]
-    post, p = work.posterior, work.points
-    given = places.factor, places.to_screen, places.to_design, places.design
-    flat = post.probability[FLAT] / max(post.probability[BEAM] + post.probability[FLAT], 1e-300)
-    spread = None if b is None else b.spread
-    quantiles = _quantiles(post.sigma, post.weight, given, spread, flat)
-    value = numbers_of(post.best, *given) if b is None else b.value
-    half = 0.5 * (quantiles[3] - quantiles[1])
-    low, high = quantiles[0], quantiles[4]
-    alone = post.positive and len(p.size) > 3
-    carrying = _influence(p, post.best, half[0]) if alone else Influence()
-    if abs(carrying.shift) > MOVES:
-        low, high, half = _reaching(low, high, half, value, carrying.without)
-    e = _evidence(seen, plane, low[1], high[1], b)
-    determined = e.determined
-    noise = work.sizes.likeness[1]
-    dof = max(len(p.size) - 3, 0)
-    remarks = [noise_remark(noise, post.scale, chi2_probability(post.chi2, dof)), work.shot_words]
-    remarks += point_remarks(p, carrying.place, carrying.shift) if e.of_a_beam else []
-    remarks += [b.remark] if b is not None and determined else []
-    advised = e.of_a_beam and not determined and b is None
-    advice = next_measurement(seen, plane) if advised else None
-    finding = verdict(e, " ".join(filter(None, remarks)), advice or "")
-    if determined and (other := _impossible(value[1], _column(seen, plane))):
-        finding, determined, e = other, False, e._replace(seen=False)
-    known = determined | (LINEAR & e.of_a_beam & (b is None))
-    raw = _raw(post, given) if b is None else b.raw
-    scale = float(half[0] / raw[0]) if determined and np.isfinite(raw[0]) and raw[0] > 0 else 1.0
-    limits = e.of_a_beam and not e.opened and e.ending is None
-    numbers = [
-        _quantity(value[i], half[i], raw[i], unit, (low[i], high[i]), bool(known[i]), limits)
-        for i, unit in enumerate(QUANTITIES.values())
-    ]
-    covariance = post.stated if np.isfinite(post.stated).all() else post.covariance
-    covariance = covariance if b is None else b.covariance / scale**2
-    directions = _directions(p, post) if b is None else b.directions
-    emittance, normalized, beta, alpha, s11, s12, s22, *screen, mismatch = numbers
+    post, p = seen.works[plane].posterior, seen.works[plane].points
+    n, carrying = _numbers(post, p, places, b)
+    e = _evidence(seen, plane, n.low[1], n.high[1], b)
+    j = _judged(seen, plane, e, b, carrying, float(n.value[1]))
+    known = j.determined | (LINEAR & j.of_a_beam & (b is None))
+    emittance, normalized, beta, alpha, s11, s12, s22, *screen, mismatch = n.quantities(
+        known, j.of_a_beam and not e.opened and e.ending is None
+    )
+    scale = _scale(n) if j.determined else 1.0
     place = seen.rows.places[-1]
     own = {name: float(line[name].setting) for name in line.upto(place).magnets}
     return PlaneFit(
         plane=plane,
-        status=finding.status,
-        message=finding.message,
+        status=j.finding.status,
+        message=j.finding.message,
         emittance=emittance,
         normalized_emittance=normalized,
         beta=beta,
@@ -165,30 +160,88 @@ def plane_answer(
         screen=ScreenTwiss(place, own, setting_units(line, own), *screen),
         mismatch=None if getattr(seen.line.design, plane, None) is None else mismatch,
         chi2=post.chi2 if math.isfinite(post.chi2) else None,
-        dof=round(b.dof) if b is not None else dof,
+        dof=max(len(p.size) - 3, 0) if b is None else round(b.dof),
         rms_residual=Quantity(float(np.sqrt(np.mean((p.size - p.model) ** 2))), None, "m"),
-        covariance=covariance if known[SIGMA].all() else np.full((3, 3), np.nan),
+        covariance=_covariance(post, b, scale, bool(known[SIGMA].all())),
         error_scale=scale,
-        noise=noise_words(noise, post.scale, post.relative, p),
+        noise=noise_words(seen.works[plane].sizes.likeness[1], post.scale, post.relative, p),
         method=seen.method,
         weights=seen.weights,
-        identifiability=Identifiability(
-            determined=determined,
-            probability=post.probability,
-            singular_values=tuple(float(v) for v in directions.singular_values),
-            condition=directions.condition if math.isfinite(directions.condition) else None,
-            waist_bracketed=e.bracketed,
-            phase_coverage=phase_coverage(p.r11, p.r12, float(value[2]), float(value[3])),
-            undetermined=(*directions.undetermined, *["emittance"] * (not determined)),
-            next_measurement=advice,
-        ),
+        identifiability=_identifiability(post, p, n, e, j, b),
         points=p,
         holds="statistics only" if b is None else b.holds,
     )
 
 
-def _column(seen: Seen, plane: str) -> str:
-    return seen.scan.columns.get(f"size_{plane}", f"size_{plane}")
+def _numbers(
+    post: PlanePosterior, p: Points, places: Places, b: Beside | None
+) -> tuple[Numbers, Influence]:
+    """The numbers of a plane, and the point that carries them."""
+    flat = post.probability[FLAT] / max(post.probability[BEAM] + post.probability[FLAT], 1e-300)
+    spread = None if b is None else b.spread
+    quantiles = _quantiles(post.sigma, post.weight, tuple(places), spread, flat)
+    value = numbers_of(post.best, *places) if b is None else b.value
+    half = 0.5 * (quantiles[3] - quantiles[1])
+    low, high = quantiles[0], quantiles[4]
+    alone = post.positive and len(p.size) > 3
+    carrying = _influence(p, post.best, half[0]) if alone else Influence()
+    if abs(carrying.shift) > MOVES:
+        low, high, half = _reaching(low, high, half, value, carrying.without)
+    raw = _raw(post, tuple(places))
+    raw = raw if b is None else np.hypot(raw, b.spread)
+    return Numbers(value, half, low, high, raw), carrying
+
+
+def _judged(
+    seen: Seen, plane: str, e: Evidence, b: Beside | None, carrying: Influence, emittance: float
+) -> Judged:
+    """The verdict on a plane."""
+    work = seen.works[plane]
+    post, p = work.posterior, work.points
+    column = seen.scan.columns.get(f"size_{plane}", f"size_{plane}")
+    if e.determined and (other := _impossible(emittance, column)):
+        return Judged(other, False, False, None)
+    remarks = [work.shot_words]
+    if e.of_a_beam:
+        likely = chi2_probability(post.chi2, max(len(p.size) - 3, 0))
+        remarks.insert(0, noise_remark(work.sizes.likeness[1], post.scale, likely))
+        remarks += point_remarks(p, carrying.place, carrying.shift)
+    if b is not None and e.determined:
+        remarks.append(b.remark)
+    advised = e.of_a_beam and not e.determined and b is None
+    advice = next_measurement(seen, plane) if advised else None
+    finding = verdict(e, " ".join(filter(None, remarks)), advice or "")
+    return Judged(finding, e.determined, e.of_a_beam, advice)
+
+
+def _scale(n: Numbers) -> float:
+    """The error of the emittance over that by the stated errors alone; 1 without."""
+    return float(n.half[0] / n.raw[0]) if np.isfinite(n.raw[0]) and n.raw[0] > 0 else 1.0
+
+
+def _covariance(post: PlanePosterior, b: Beside | None, scale: float, known: bool) -> np.ndarray:
+    """Covariance of σ over the square of ``scale``; NaN where σ is not known."""
+    if not known:
+        return np.full((3, 3), np.nan)
+    if b is not None:
+        return b.covariance / scale**2
+    return post.stated if np.isfinite(post.stated).all() else post.covariance
+
+
+def _identifiability(
+    post: PlanePosterior, p: Points, n: Numbers, e: Evidence, j: Judged, b: Beside | None
+) -> Identifiability:
+    directions = _directions(p, post) if b is None else b.directions
+    return Identifiability(
+        determined=j.determined,
+        probability=post.probability,
+        singular_values=tuple(float(v) for v in directions.singular_values),
+        condition=directions.condition if math.isfinite(directions.condition) else None,
+        waist_bracketed=e.bracketed,
+        phase_coverage=phase_coverage(p.r11, p.r12, float(n.value[2]), float(n.value[3])),
+        undetermined=(*directions.undetermined, *["emittance"] * (not j.determined)),
+        next_measurement=j.advice,
+    )
 
 
 def _quantiles(
@@ -204,14 +257,15 @@ def _quantiles(
         z = ndtri((0.5 + np.arange(len(weight)) * 0.6180339887498949) % 1.0)
         with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
             middle = np.abs(numbers @ (weight / weight.sum()))
-            grown = numbers * np.exp(z * np.minimum(spread / middle, 50.0)[:, None])
+            grown = numbers * np.exp(z * (spread / middle)[:, None])
             numbers = np.where(SIGNED[:, None], numbers + z * spread[:, None], grown)
+            numbers = np.where(np.isfinite(spread)[:, None], numbers, 0.0)
     found = np.array([weighted_quantiles(row, weight, AT) for row in numbers]).T
     at = np.array(AT)
     within = np.maximum((at - flat) / (1.0 - flat), 0.0) if flat < 1.0 else 0.0 * at
     for i in (0, 1):
         found[:, i] = np.where(at > flat, weighted_quantiles(numbers[i], weight, within), 0.0)
-    return found
+    return found if spread is None else np.where(np.isfinite(spread), found, np.nan)
 
 
 def _reaching(
@@ -264,11 +318,11 @@ def _impossible(emittance: float, sizes: str) -> Finding | None:
 
 
 def _quantity(
-    value: float, half: float, raw: float, unit: str, interval: tuple[float, float], known: bool,
+    value: float, half: float, low: float, high: float, raw: float, unit: str, known: bool,
     limits: bool,
 ) -> Quantity:  # fmt: skip
     """A number with its error; of one that is not determined its interval, if the model holds."""
-    value, low, high = float(value), float(interval[0]), float(interval[1])
+    value, low, high = float(value), float(low), float(high)
     if not (math.isfinite(low) and math.isfinite(high)):
         return Quantity(value, None, unit)
     if not known:

@@ -171,7 +171,6 @@ def _beside(
     return Beside(
         value=own.value,
         spread=_further_spread(fit, plane, own, jacobian),
-        raw=own.error_raw,
         covariance=slopes @ fit.covariance @ slopes.T,
         directions=_directions(fit, own.value[SIGMA], slopes, jacobian),
         dof=dof,

@@ -239,8 +239,9 @@ def point_remarks(p: Points, carrying: str, shift: float) -> Iterator[str]:
     if len(bad):
         places = [p.where(i) for i in bad[:MOST_NAMED]]
         places += [f"{len(bad) - MOST_NAMED} more"] * (len(bad) > MOST_NAMED)
-        verb = "readings are" if len(bad) > 1 else "reading is"
-        yield f"{len(bad)} of {len(p.size)} {verb} bad more likely than not: {'; '.join(places)}."
+        verb = "are" if len(bad) > 1 else "is"
+        said = f"{len(bad)} of {len(p.size)} readings {verb} probably bad"
+        yield f"{said}: {'; '.join(places)}."
     if carrying and math.isnan(shift):
         yield f"It rests on the point at {carrying}: without it there is no answer."
     elif carrying:
