@@ -51,7 +51,7 @@ def standard_errors(shots: Sequence[np.ndarray]) -> list[float]:
 
 
 def scan_of(points: Sequence[Point], machine: ScanMachine) -> QuadScan:
-    """The points as a scan: means of the shots, and their standard errors where they scatter.
+    """The points as a scan, with the shots themselves where they scatter.
 
     Parameters
     ----------
@@ -75,11 +75,21 @@ def scan_of(points: Sequence[Point], machine: ScanMachine) -> QuadScan:
     found = {plane: standard_errors(each) for plane, each in shots.items()}
     error = {plane: np.array(each) for plane, each in found.items() if each}
     count = np.array([min(map(len, p.shots.values())) for p in points])
+    single = {plane: _padded(shots[plane]) for plane in error}
     units = {m.name: m.unit for m in machine.magnets}
     return QuadScan(
         settings, units, size, error, shots=count if error else None, name=machine.name,
-        screen=(machine.screen.name,) * len(points), error_source="the scatter of the shots",
+        shot_size=single, screen=(machine.screen.name,) * len(points),
+        error_source="the scatter of the shots",
     )  # fmt: skip
+
+
+def _padded(shots: Sequence[np.ndarray]) -> np.ndarray:
+    """Shots of all settings in one table, NaN where there are fewer."""
+    table = np.full((len(shots), max(map(len, shots))), np.nan)
+    for row, own in zip(table, shots, strict=True):
+        row[: len(own)] = own
+    return table
 
 
 def fit_of(points: Sequence[Point], machine: ScanMachine, line: Beamline) -> EmittanceFit | None:

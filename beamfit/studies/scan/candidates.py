@@ -36,10 +36,10 @@ def by_plane(fit: EmittanceFit, known: Information) -> dict[str, float]:
     return dict(zip((p.plane for p in fit.planes), error, strict=True))
 
 
-def identified(known: Information) -> bool:
-    """Whether every emittance rests on data and priors, within a factor that is of use."""
-    clear = known.relative_error.max() <= NARROW
-    return bool(clear and (known.share < MOST_SHARE).all())
+def determined_by(fit: EmittanceFit, known: Information) -> dict[str, bool]:
+    """Whether each plane's emittance rests on data and priors, within a factor that is of use."""
+    clear = (known.relative_error <= NARROW) & (known.share < MOST_SHARE)
+    return dict(zip((p.plane for p in fit.planes), map(bool, clear), strict=True))
 
 
 def information_of(fit: EmittanceFit) -> Information:

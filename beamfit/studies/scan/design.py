@@ -19,8 +19,8 @@ from beamfit.studies.scan.candidates import (
     Candidate,
     by_plane,
     candidate_rows,
+    determined_by,
     further_options,
-    identified,
     information_of,
 )
 from beamfit.studies.scan.fit import EmittanceFit
@@ -38,7 +38,12 @@ class Step(NamedTuple):
 
     candidate: Candidate
     relative_error: dict[str, float]
-    identified: bool
+    determined: dict[str, bool]
+
+    @property
+    def identified(self) -> bool:
+        """Whether every plane is determined then."""
+        return all(self.determined.values())
 
 
 class Option(NamedTuple):
@@ -47,7 +52,12 @@ class Option(NamedTuple):
     words: str
     relative_error: dict[str, float]
     share_on_bounds: float
-    identified: bool
+    determined: dict[str, bool]
+
+    @property
+    def identified(self) -> bool:
+        """Whether every plane is determined then."""
+        return all(self.determined.values())
 
 
 @shown
@@ -59,8 +69,8 @@ class Advice:
     ----------
     scenario, criterion : str
         For which unknowns, and what is made small.
-    identified : bool
-        Whether the data so far determine the emittance of every plane.
+    determined : dict of str to bool
+        Whether the data so far determine the emittance of each plane.
     now : dict of str to float
         Relative emittance error of each plane so far; what bounds decide is not counted.
     steps : tuple of Step
@@ -75,12 +85,17 @@ class Advice:
 
     scenario: str
     criterion: str
-    identified: bool
+    determined: dict[str, bool]
     now: dict[str, float]
     steps: tuple[Step, ...]
     stop: str
     options: tuple[Option, ...]
     tie: str = ""
+
+    @property
+    def identified(self) -> bool:
+        """Whether the data so far determine the emittance of every plane."""
+        return all(self.determined.values())
 
     @property
     def headline(self) -> str:
@@ -90,9 +105,11 @@ class Advice:
     @property
     def message(self) -> str:
         """The advice in two sentences."""
-        first = "The data determine the emittance." if self.identified else (
-            "The data do not determine the emittance."
-        )  # fmt: skip
+        known = [plane for plane, sure in self.determined.items() if sure]
+        left = [plane for plane in self.determined if plane not in known]
+        first = f"The data determine the emittance in {known[0]}, not in {left[0]}." if (
+            known and left
+        ) else f"The data {'do not ' * bool(left)}determine the emittance."  # fmt: skip
         good = [o for o in self.options if o.identified]
         if not self.identified and any(step.identified for step in self.steps):
             return f"{first} Measure next at {self.steps[0].candidate.words}, then ask again."
@@ -119,27 +136,29 @@ class Advice:
             "message": self.message,
             "relative_error": self.now,
             "next": [s.candidate._asdict() | {"relative_error": s.relative_error,
-                     "identified": s.identified} for s in self.steps],
+                     "determined": s.determined, "identified": s.identified} for s in self.steps],
+            "determined": self.determined,
             "stop": self.stop,
-            "options": self.options,
+            "options": [o._asdict() | {"identified": o.identified} for o in self.options],
         }  # fmt: skip
         return json_of(found)
 
     def tables(self) -> tuple[Table, ...]:
         """Lay out the errors after each measurement, and what would identify an open scenario."""
-        rows = [["what is measured", *_cells(self.now, self.identified)]]
+        rows = [["what is measured", *_cells(self.now, self.determined)]]
         if self.steps and not self.steps[-1].identified:
             words = f"{len(self.steps)} more points of the scan, at the best settings"
-            rows.append([words, *_cells(self.now, False)])
+            last = self.steps[-1]
+            rows.append([words, *_cells(last.relative_error, last.determined)])
         else:
             for number, step in enumerate(self.steps, 1):
-                cells = _cells(step.relative_error, step.identified, perhaps=not self.identified)
+                cells = _cells(step.relative_error, step.determined, self.determined)
                 rows.append([f"{number}. {step.candidate.words}", *cells])
         note = "" if self.identified or not self.steps else PERHAPS
         steps = Table("", ["after", *self.now], rows, note, numeric=True)
         header = ["What would identify it", *(f"error {plane}" for plane in self.now), "identified"]
         rows = [
-            [o.words, *_cells(o.relative_error, o.identified), "yes" if o.identified else "no"]
+            [o.words, *_cells(o.relative_error, o.determined), "yes" if o.identified else "no"]
             for o in self.options
         ]
         return (steps, Table("", header, rows)) if rows else (steps,)
@@ -148,9 +167,15 @@ class Advice:
         return "\n\n".join([*map(text_of, self.tables()), f"{self.status}: {self.message}"])
 
 
-def _cells(error: Mapping[str, float], known: bool, perhaps: bool = False) -> list[str]:
-    said = "({:.0f} %)" if perhaps else "{:.2f} %"
-    return [said.format(100 * e) if known else "not determined" for e in error.values()]
+def _cells(
+    error: Mapping[str, float], known: Mapping[str, bool], sure: Mapping[str, bool] | None = None
+) -> list[str]:
+    """Errors of each plane; in brackets where only a further measurement would make it known."""
+    cells = {}
+    for plane, e in error.items():
+        said = "{:.2f} %" if sure is None or sure[plane] else "({:.0f} %)"
+        cells[plane] = said.format(100 * e) if known[plane] else "not determined"
+    return list(cells.values())
 
 
 def plan_measurements(
@@ -218,11 +243,13 @@ def plan_measurements(
     _check_energies(energies, float(fit.line.mass))
     base = information_of(fit)
     steps, stop = best_steps(fit, base, limits, criterion, goal, count, energies)
-    options = () if identified(base) else tuple(_options(fit, base, energies))
+    # What is known so far is what the posterior of the fit says.
+    now = {p.plane: p.identifiability.determined for p in fit.planes}
+    options = () if all(now.values()) else tuple(_options(fit, base, energies))
     return Advice(
         fit.scenario,
         criterion,
-        identified(base),
+        now,
         by_plane(fit, base),
         steps,
         stop,
@@ -244,6 +271,9 @@ def best_steps(
     candidates, rows = candidate_rows(fit, limits, energies)
     aim = "" if goal is None else f"goal of {100 * goal:.3g} %"
 
+    def identified(known: Information) -> bool:
+        return all(determined_by(fit, known).values())
+
     def sharp(known: Information) -> bool:
         return goal is not None and identified(known) and known.relative_error.max() <= goal
 
@@ -260,7 +290,8 @@ def best_steps(
                 "measurement."
             )
         now = choice.known
-        steps.append(Step(candidates[choice.index], by_plane(fit, now), identified(now)))
+        after = by_plane(fit, now), determined_by(fit, now)
+        steps.append(Step(candidates[choice.index], *after))
     if sharp(now):
         return tuple(steps), f"Stop after these: the {aim} is reached."
     if goal is not None and identified(now):
@@ -272,7 +303,8 @@ def _options(fit: EmittanceFit, base: Information, energies: tuple[float, ...]) 
     """What each kind of further measurement would make of the emittance."""
     for words, rows in further_options(fit, base, energies):
         after = base.with_rows(rows)
-        yield Option(words, by_plane(fit, after), float(after.share.max()), identified(after))
+        found = float(after.share.max()), determined_by(fit, after)
+        yield Option(words, by_plane(fit, after), *found)
 
 
 def _check_energies(energies: tuple[float, ...], rest: float) -> None:
