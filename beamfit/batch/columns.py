@@ -50,7 +50,7 @@ NUMBERS = {
     "emittance": (
         *_every(QUANTITIES),
         *("rms_residual_m", "chi2", "dof", "error_scale", "determined", "waist_bracketed"),
-        *("zero_emittance_distance", "phase_coverage_deg", "condition"),
+        *("beam_probability", "phase_coverage_deg", "condition"),
         *(f"singular_value_{i}" for i in (1, 2, 3)),
     ),
     "lifetime": (
