@@ -45,26 +45,34 @@ def unstated_scales(noise):
     return lognormal_grid(noise.unstated)
 
 
-def log_readings(off, deviation, noise):
-    """Log density of readings of shape (..., n), each good or bad, the worst n//most at best bad."""
+def usual_over_own(size, error):
+    """How much larger most points' errors are than a point's own: what a wrong cell may be off."""
+    share = error / size
+    by_share, by_error = np.median(share) / share, np.median(error) / error
+    return np.maximum(np.maximum(by_share, by_error), 1.0)
+
+
+def log_readings(off, deviation, noise, usual=1.0):
+    """Log density of readings of shape (..., n), each good or bad, the n//most likeliest bad."""
     n = off.shape[-1]
     good = norm.logpdf(off, 0.0, deviation)
     many = n // noise.most
     if not many:
         return good.sum(-1)
-    wide = norm.logpdf(off, 0.0, noise.width * deviation)
+    wide = norm.logpdf(off, 0.0, noise.width * usual * deviation)
     either = np.logaddexp(math.log(1.0 - noise.bad) + good, math.log(noise.bad) + wide)
     sure = math.log(1.0 - noise.bad) + good
     if many >= 3:
         return either.sum(-1)
-    rank = np.argsort(np.argsort(-np.abs(off / deviation), axis=-1), axis=-1)
+    rank = np.argsort(np.argsort(good - wide, axis=-1), axis=-1)
     return np.where(rank < many, either, sure).sum(-1)
 
 
 def log_stated(size, model, error, noise):
     """Sizes with stated errors, that are right or all too small by one factor."""
+    usual = usual_over_own(size, error)
     parts = [
-        math.log(w) + log_readings(size - model, s * error, noise)
+        math.log(w) + log_readings(size - model, s * error, noise, usual)
         for s, w in zip(*stated_scales(noise), strict=True)
         if w > 0.0
     ]
@@ -73,8 +81,9 @@ def log_stated(size, model, error, noise):
 
 def log_share(size, model, share, noise):
     """The same of errors that are one share of the size, and so of the beam's own."""
+    usual = usual_over_own(size, share * size)
     parts = [
-        math.log(w) + log_readings(size - model, s * share * model, noise)
+        math.log(w) + log_readings(size - model, s * share * model, noise, usual)
         for s, w in zip(*stated_scales(noise), strict=True)
         if w > 0.0
     ]
