@@ -96,7 +96,11 @@ def kinds_of(
     share = error / size
     alike = bool(np.all(np.ptp(share, axis=-1) <= 0.01 * share.mean(-1)))
     unit = share if alike else error
-    usual = np.maximum(np.median(share, axis=-1, keepdims=True) / share, 1.0)
+    usual = np.maximum(
+        np.median(share, axis=-1, keepdims=True) / share,
+        np.median(error, axis=-1, keepdims=True) / error,
+    )
+    usual = np.maximum(usual, 1.0)
     return (Kind(int(alike), zero, unit, usual, noise.factor, 1.0, noise.right, 1.0, 0.0),)
 
 

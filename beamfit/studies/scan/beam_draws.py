@@ -123,6 +123,13 @@ class BeamDraws(NamedTuple):
     best: np.ndarray
     best_log: np.ndarray
 
+    @property
+    def scale_weight(self) -> np.ndarray:
+        """Posterior probability of every node, shape (..., k)."""
+        log = np.nan_to_num(self.by_scale + self.scales.log_weight, nan=-1e300, neginf=-1e300)
+        weight = np.exp(log - log.max(-1, keepdims=True))
+        return weight / weight.sum(-1, keepdims=True)
+
 
 def draw_beams(c: Coordinates, kind: Kind, noise: Noise) -> BeamDraws:
     """Draw beams from their posterior.
@@ -142,9 +149,10 @@ def draw_beams(c: Coordinates, kind: Kind, noise: Noise) -> BeamDraws:
 
     Notes
     -----
-    σ = T/2 (1 + p·(Z, X)) is positive definite for |p| < 1; the prior is flat in p and lognormal in
-    T. Proposals are Student distributions about the fits of all points, and of those without one
-    or two; each draw has the weight of its posterior over the density of the mixture (importance
+    σ = T/2 (1 + p·(Z, X)) is positive definite for |p| < 1; the prior is lognormal in T and flat
+    in the emittance that T allows, T/2 (1 - |p|²)^½, and in the direction of p. Proposals
+    are Student distributions about the fits of all points, and of those without one or two; each
+    draw has the weight of its posterior over the density of the mixture (importance
     sampling; A. B. Owen and Y. Zhou, J. Am. Stat. Assoc. 95, 135 (2000), sect. 4).
     """
     centre, root = fits(c, kind, noise)
@@ -177,9 +185,12 @@ def draw_beams(c: Coordinates, kind: Kind, noise: Noise) -> BeamDraws:
 def log_prior(x: np.ndarray) -> np.ndarray:
     """Log prior density of T, T p_1, T p_2, shape (..., 3) to (...); -inf where no beam is."""
     t = np.maximum(x[..., 0], 1e-300)
-    inside = (x[..., 0] > 0) & (x[..., 1] ** 2 + x[..., 2] ** 2 < t**2)
+    left = 1.0 - (x[..., 1] ** 2 + x[..., 2] ** 2) / t**2
+    inside = (x[..., 0] > 0) & (left > 0)
     bright = -0.5 * (np.log(t) / BRIGHT) ** 2 - math.log(BRIGHT) - 0.5 * LN_2PI
-    return np.where(inside, bright - math.log(math.pi) - 3.0 * np.log(t), -np.inf)
+    # |p|² = 1 - ε²/ε_max² at the same T: flat in ε, and in the direction of p.
+    flat = -math.log(2.0 * math.pi) - 0.5 * np.log(np.maximum(left, 1e-300))
+    return np.where(inside, bright + flat - 3.0 * np.log(t), -np.inf)
 
 
 def model_sizes(x: np.ndarray, c: Coordinates) -> np.ndarray:

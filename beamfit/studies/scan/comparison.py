@@ -14,7 +14,6 @@ from beamfit.noise.sizes import (
     Scales,
     averaged,
     kinds_of,
-    log_likelihood,
     log_odds,
     squared_pulls,
     variance_of,
@@ -259,10 +258,11 @@ def _best(
     method: str,
     weights: str,
 ) -> _Best:
-    """Find where the likelihood, averaged over the noise, is largest.
+    """Find the weighted least squares at the expected precision of every point.
 
-    By expectation and maximisation (A. P. Dempster, N. M. Laird and D. B. Rubin, J. R. Stat. Soc. B
-    39, 1 (1977)): weights of points are their expected precisions at the last fit.
+    How large the noise is comes from its posterior, which of the points are bad from the last fit
+    (expectation and maximisation; A. P. Dempster, N. M. Laird and D. B. Rubin, J. R. Stat. Soc. B
+    39, 1 (1977)).
     """
     c, rows = s.c, s.c.rows
     top = np.array([d.best_log for d in draws]) + np.log(np.maximum(of_kind, 1e-300))
@@ -272,8 +272,7 @@ def _best(
     for _ in range(ROUNDS):
         model = _model(x, c)
         parts = [
-            _expected(model, c, kind, d.scales, noise)
-            for kind, d in zip(s.kinds, draws, strict=True)
+            _expected(model, c, kind, d, noise) for kind, d in zip(s.kinds, draws, strict=True)
         ]
         precision = sum(w[:, None] * p for w, (p, _) in zip(of_kind, parts, strict=True))
         if method == "size_squared":
@@ -302,13 +301,12 @@ def _model(x: np.ndarray, c: Coordinates) -> np.ndarray:
 
 
 def _expected(
-    model: np.ndarray, c: Coordinates, kind: Kind, scales: Scales, noise: Noise
+    model: np.ndarray, c: Coordinates, kind: Kind, draws: BeamDraws, noise: Noise
 ) -> tuple[np.ndarray, np.ndarray]:
     """Expected precision of each point's size, and probability that it is bad, (planes, n)."""
     off, model = (c.size - model)[:, None, :], model[:, None, :]
-    log = log_likelihood(off, model, kind, scales.scale, noise)[:, 0] + scales.log_weight
-    share = np.exp(log - np.logaddexp.reduce(log, axis=-1)[:, None])[..., None]
-    z2 = squared_pulls(off, model, kind, scales.scale)
+    scale, share = draws.scales.scale, draws.scale_weight[..., None]
+    z2 = squared_pulls(off, model, kind, scale)
     odds = np.moveaxis(log_odds(z2, kind, noise)[..., 0, :], 0, -1)
     n = off.shape[-1]
     bad = np.zeros_like(odds)
@@ -316,7 +314,7 @@ def _expected(
         least = np.sort(odds, axis=-1)[..., n - many : n - many + 1] if many < 3 else -np.inf
         bad = np.where(odds >= least, 1.0 / (1.0 + np.exp(-odds)), 0.0)
     wide = (noise.width * kind.usual[:, None, :]) ** -2
-    each = (1.0 - bad * (1.0 - wide)) / variance_of(kind, scales.scale)
+    each = (1.0 - bad * (1.0 - wide)) / variance_of(kind, scale)
     return (share * each).sum(1) / model[:, 0] ** (2 * kind.power), (share * bad).sum(1)
 
 
@@ -356,7 +354,7 @@ def _posterior(
         model=model,
         error=error,
         bad=best.bad[i],
-        scale=_scale_of(s, i, draws, of_kind, best, noise),
+        scale=_scale_of(i, draws, of_kind),
         relative=float(sum(w * k.power for w, k in zip(of_kind, s.kinds, strict=True))),
         chi2=chi2,
         seen=bool(c.seen),
@@ -381,16 +379,10 @@ def _covariance(rows: np.ndarray) -> np.ndarray:
     return half @ half.T
 
 
-def _scale_of(
-    s: _Stack, i: int, draws: Sequence[BeamDraws], of_kind: np.ndarray, best: _Best, noise: Noise
-) -> np.ndarray:
-    """Median and central 68 % of the scale of the likelier kind of noise, at the best fit."""
-    k = int(np.argmax(of_kind))
-    kind = _of_plane(s.kinds[k], i)
-    own = Scales(*(part[i] for part in draws[k].scales))
-    size, model = s.c.size[i][None], best.model[i][None]
-    log = log_likelihood(size - model, model, kind, own.scale, noise)[0] + own.log_weight
-    return weighted_quantiles(own.scale, np.exp(log - log.max()), (0.5, 0.1587, 0.8413))
+def _scale_of(i: int, draws: Sequence[BeamDraws], of_kind: np.ndarray) -> np.ndarray:
+    """Median and central 68 % of the scale of the likelier kind of noise."""
+    own = draws[int(np.argmax(of_kind))]
+    return weighted_quantiles(own.scales.scale[i], own.scale_weight[i], (0.5, 0.1587, 0.8413))
 
 
 def weighted_quantiles(values: np.ndarray, weight: np.ndarray, at: Sequence[float]) -> np.ndarray:

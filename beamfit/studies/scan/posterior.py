@@ -117,7 +117,8 @@ class Sizes:
             log = log_likelihood(off, found, each.kind, each.scale, self.noise)[0]
             parts.append(averaged(log, each.log_scale_weight) + each.log_weight)
         bright = jnp.log(jnp.maximum(self.trace @ sigma, 1e-300))
-        prior = -3.0 * bright - 0.5 * (bright / BRIGHT) ** 2
+        determinant = jnp.maximum(sigma[0] * sigma[2] - sigma[1] ** 2, 1e-300)
+        prior = -2.0 * bright - 0.5 * (bright / BRIGHT) ** 2 - 0.5 * jnp.log(determinant)
         return averaged(jnp.stack(parts), 0.0) + prior
 
 
