@@ -7,9 +7,13 @@ likelihoods are products over readings. Nothing here is taken from the package b
 import math
 
 import numpy as np
-from scipy.stats import multivariate_normal, norm
+from scipy.stats import multivariate_t, norm
 
-GRID = 200
+GRID = 120
+
+
+def log_normal(off, deviation):
+    return -0.5 * (off / deviation) ** 2 - np.log(deviation) - 0.5 * math.log(2.0 * math.pi)
 
 
 def log_sum(log, axis=-1):
@@ -55,11 +59,11 @@ def usual_over_own(size, error):
 def log_readings(off, deviation, noise, usual=1.0):
     """Log density of readings of shape (..., n), each good or bad, the n//most likeliest bad."""
     n = off.shape[-1]
-    good = norm.logpdf(off, 0.0, deviation)
+    good = log_normal(off, deviation)
     many = n // noise.most
     if not many:
         return good.sum(-1)
-    wide = norm.logpdf(off, 0.0, noise.width * usual * deviation)
+    wide = log_normal(off, noise.width * usual * deviation)
     either = np.logaddexp(math.log(1.0 - noise.bad) + good, math.log(noise.bad) + wide)
     sure = math.log(1.0 - noise.bad) + good
     if many >= 3:
@@ -100,17 +104,20 @@ def log_of_shots(size, model, floor, noise):
     return log_sum(np.array(parts), 0)
 
 
+def log_same(size, model, noise, share=False):
+    """Sizes without errors, whose noise is the same everywhere, or else a share of the beam's."""
+    unit = model if share else np.median(size)
+    parts = [
+        math.log(w) + log_readings(size - model, s * unit, noise)
+        for s, w in zip(*unstated_scales(noise), strict=True)
+        if w > 0.0
+    ]
+    return math.log(noise.share if share else 1.0 - noise.share) + log_sum(np.array(parts), 0)
+
+
 def log_unstated(size, model, noise):
-    """Sizes without errors: noise that is a share of the size, or the same everywhere."""
-    middle, kinds = np.median(size), []
-    for share, chance in ((True, noise.share), (False, 1.0 - noise.share)):
-        parts = [
-            math.log(w) + log_readings(size - model, s * (model if share else middle), noise)
-            for s, w in zip(*unstated_scales(noise), strict=True)
-            if w > 0.0
-        ]
-        kinds.append(math.log(chance) + log_sum(np.array(parts), 0))
-    return np.logaddexp(*kinds)
+    """Sizes without errors: noise of either kind."""
+    return np.logaddexp(log_same(size, model, noise), log_same(size, model, noise, share=True))
 
 
 def log_process(x, kernels, deviation, weight):
@@ -120,10 +127,89 @@ def log_process(x, kernels, deviation, weight):
     the noise.
     """
     n, found = len(x), []
+    noise = np.einsum("kn,nm->knm", deviation**2, np.eye(n))
     for kernel in kernels:
-        for sd, w in zip(deviation, weight, strict=True):
-            if w > 1e-12:
-                covariance = kernel + np.diag(sd**2) + 1.0
-                here = multivariate_normal.logpdf(x, np.zeros(n), covariance, allow_singular=True)
-                found.append(math.log(w / len(kernels)) + here)
-    return log_sum(np.array(found))
+        covariance = kernel + noise + 1.0
+        _, log_determinant = np.linalg.slogdet(covariance)
+        pull = np.linalg.solve(covariance, np.broadcast_to(x[:, None], (len(noise), n, 1)))[..., 0]
+        log = -0.5 * (pull @ x + log_determinant + n * math.log(2.0 * math.pi))
+        found.append(log + np.log(np.maximum(weight, 1e-300) / len(kernels)))
+    return log_sum(np.concatenate(found))
+
+
+def log_prior(rows, size, known, sigma):
+    """Of beams, shape (d, 3): any direction alike, the mean square over the scan within a factor e.
+
+    The mean of what the beam adds to size² over size² itself is T; σ in its own coordinates has
+    three numbers of which T is one, so that even directions have the density 1/T³.
+    """
+    t = (sigma @ rows.T / size**2).mean(-1)
+    beam = (t > 0) & (sigma[:, 0] > 0) & (sigma[:, 0] * sigma[:, 2] > sigma[:, 1] ** 2)
+    log = np.log(np.where(beam, t, 1.0))
+    return np.where(beam, -3.0 * log - 0.5 * log**2, -np.inf)
+
+
+def weighted_beams(rows, size, known, log_likelihood, centre, covariance, number=30_000, seed=1):
+    """Beams and their weights in the posterior: drawn widely about a centre, and weighed.
+
+    ``rows`` (n, 3) give size² - ``known`` of σ; ``log_likelihood`` takes models of shape (d, n).
+    """
+    root, wide = np.linalg.cholesky(covariance), multivariate_t(np.zeros(3), np.eye(3), df=4)
+    z = wide.rvs(number, random_state=np.random.default_rng(seed))
+    sigma = centre + z @ root.T
+    squared = np.maximum(sigma @ rows.T + known, 1e-30)
+    prior = log_prior(rows, size, known, sigma)
+    log = log_likelihood(np.sqrt(squared)) + prior - wide.logpdf(z)
+    weight = np.exp(log - log.max())
+    return sigma, weight / weight.sum()
+
+
+def quantiles(values, weight, at):
+    order = np.argsort(values)
+    heap = np.cumsum(weight[order]) - 0.5 * weight[order]
+    return np.interp(at, heap, values[order])
+
+
+def coordinates_of(rows2, size):
+    """A turn A of phase space after which the scan looks evenly: the mean of w wᵀ/size² is 1."""
+    metric = np.einsum("ni,nj,n->ij", rows2, rows2, 1.0 / size**2) / len(size)
+    return np.linalg.inv(np.linalg.cholesky(metric)).T
+
+
+def log_evidence_of_beam(rows, size, known, log_likelihood, centre, covariance, turn, **options):
+    """Of sizes as densities of their logarithms, the prior normalised; by the same draws."""
+    number = options.get("number", 30_000)
+    root, wide = np.linalg.cholesky(covariance), multivariate_t(np.zeros(3), np.eye(3), df=4)
+    z = wide.rvs(number, random_state=np.random.default_rng(options.get("seed", 1)))
+    sigma = centre + z @ root.T
+    squared = np.maximum(sigma @ rows.T + known, 1e-30)
+    prior = log_prior(rows, size, known, sigma) - math.log(math.pi) - 0.5 * math.log(2 * math.pi)
+    # From T, T p to σ in its own coordinates, and from these by A σ Aᵀ to those of the line.
+    prior += math.log(4.0) - 3.0 * math.log(abs(np.linalg.det(turn)))
+    drawn = wide.logpdf(z) - math.log(abs(np.linalg.det(root)))
+    log = log_likelihood(np.sqrt(squared)) + prior - drawn
+    return log_sum(log) - math.log(number) + np.log(size).sum()
+
+
+def log_evidence_of_flat_beam(rows2, size, known, log_likelihood, turn, side=240):
+    """A line in phase space, by sums over its direction and the logarithm of its length²."""
+    angle = (np.arange(side) + 0.5) * math.pi / side
+    level = np.linspace(-4.0, 3.0, side)
+    weight = norm.pdf(level)
+    v = np.stack([np.cos(angle), np.sin(angle)], -1)[:, None] * np.exp(0.5 * level)[:, None]
+    seen = (v.reshape(-1, 2) @ (rows2 @ turn).T) ** 2
+    model = np.sqrt(np.maximum(seen + known, 1e-8 * size.mean() ** 2))
+    log = log_likelihood(model).reshape(side, side) + np.log(weight / weight.sum())
+    return log_sum(log.ravel()) - math.log(side) + np.log(size).sum()
+
+
+def log_evidence_of_constant(size, deviation, weight, noise, usual):
+    """One size for all, known to a factor e: sums over it and over the noise, in ln size."""
+    x = np.log(size / np.exp(np.log(size).mean()))
+    level, step = np.linspace(-1.5, 1.5, 3001, retstep=True)
+    parts = [
+        math.log(w) + log_readings(x - level[:, None], sd, noise, usual)
+        for sd, w in zip(deviation, weight, strict=True)
+        if w > 1e-12
+    ]
+    return log_sum(log_sum(np.array(parts), 0) + norm.logpdf(level)) + math.log(step)

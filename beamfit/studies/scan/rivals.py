@@ -72,7 +72,9 @@ def flat_beam(c: Coordinates, kind: Kind, noise: Noise) -> np.ndarray:
         scales = narrowed(kind, scales, each(v, scales.scale)[..., 0, :] + scales.log_weight)
     x, log_density = student_mixture(v, root, np.ones((*v.shape[:-2], 1)))
     t = np.maximum((x**2).sum(-1), 1e-300)
-    prior = -np.log(math.pi * t) - 0.5 * LN_2PI - math.log(BRIGHT) - 0.5 * (np.log(t) / BRIGHT) ** 2
+    # v and -v are one beam: twice the density of the whole plane.
+    bright = -0.5 * LN_2PI - math.log(BRIGHT) - 0.5 * (np.log(t) / BRIGHT) ** 2
+    prior = bright - np.log(0.5 * math.pi * t)
     found = averaged(each(x, scales.scale), scales.log_weight[..., None, :])
     found = found + prior - log_density - math.log(DRAWS)
     return averaged(found, 0.0) + kind.log_weight
