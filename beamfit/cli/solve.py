@@ -18,7 +18,6 @@ EXAMPLE = """\b
 Examples:
   beamfit solve formulations/appendix_d.bf
   beamfit solve formulations/appendix_a.xml --data d=formulations/fitdata_simulated.csv --start 20
-  beamfit solve model.nl --start 20 --json
 """
 
 
@@ -38,7 +37,7 @@ Examples:
 def solve(
     document: str, data: tuple[str, ...], start: str, report: str | None, as_json: bool
 ) -> None:
-    """Solve a formulation: a constrained problem as text (.bf), the report's XML, or AMPL's .nl.
+    """Solve a formulation: a constrained problem as text (.bf) or the report's XML.
 
     Variables come with bounds, states and reduced gradients, constraints with multipliers; errors
     where the objective is a sum of squares.
@@ -59,14 +58,7 @@ def solve(
 
 
 def _solved(document: str, given: dict[str, str], starts: int) -> tuple[Solution, tuple[str, ...]]:
-    """The solution of a document or a ``.nl`` file, and the files of its data."""
-    if document.lower().endswith(".nl"):
-        if given:
-            raise InputError("--data for a .nl file", "none: it holds its numbers", path=document)
-        from beamfit.io.nl import read_nl
-        from beamfit.language.solution import solve_problem
-
-        return solve_problem(read_nl(document), starts), ()
+    """The solution of a document, and the files of its data."""
     from beamfit.io.formulation import read_formulation, read_tables, solved_formulation
 
     formulation = read_formulation(document)
@@ -78,7 +70,7 @@ def _show(terminal: Terminal, found: Solution) -> None:
     for table in found.tables():
         terminal.table(table)
         terminal.line()
-    asked = found.made.document.solver if found.made else None
+    asked = found.made.document.solver
     terminal.line(f"Solver: {found.solver}" + (f" (asked for: {asked.name})" if asked else ""))
     for note in found.notes:
         terminal.line(note)

@@ -13,7 +13,6 @@ import numpy as np
 from beamfit.greybox.assess import slopes
 from beamfit.greybox.diagnosis import diagnose
 from beamfit.greybox.fit import Fit, Limited, Variable
-from beamfit.greybox.problem import Problem
 from beamfit.greybox.solve import solve
 from beamfit.language import document as d
 from beamfit.language.statement import Formulation, at_start, formulate, starts_of
@@ -64,17 +63,17 @@ class Solution:
         Whether the objective is a sum of squares, so that there are errors.
     notes : tuple of str
         What was made of the document, its starts and its solver parameters.
-    made : Formulation or None
-        The document and its problem; None of a problem in another form.
+    made : Formulation
+        The document and its problem.
     """
 
     name: str
     fit: Fit
     outputs: Mapping[str, np.ndarray]
-    factor: float = 1.0
-    squares: bool = False
-    notes: tuple[str, ...] = ()
-    made: Formulation | None = None
+    factor: float
+    squares: bool
+    notes: tuple[str, ...]
+    made: Formulation
 
     @property
     def status(self) -> Status:
@@ -237,18 +236,6 @@ def solve_document(
     outputs = {n: np.asarray(v) for n, v in made.program(fit.model, asked).items()}
     name = _goals(made.document)
     return Solution(name, fit, outputs, made.factor, made.squares, notes, made)
-
-
-def solve_problem(problem: Problem, starts: int = 1) -> Solution:
-    """Solve a problem that came without a document, such as one of `beamfit.io.nl.read_nl`.
-
-    Its first objective's weight tells whether it is to be maximised.
-    """
-    fit = solve(problem, starts=starts)
-    goal = problem.objectives[0]
-    notes = tuple(found.message for found in diagnose(problem))
-    factor = -1.0 if goal.weight < 0 else 1.0
-    return Solution(goal.name, fit, {}, factor, notes=notes)
 
 
 def _started(made: Formulation) -> tuple[Formulation, tuple[str, ...]]:

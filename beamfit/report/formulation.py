@@ -35,16 +35,15 @@ def formulation_page(found: Solution) -> Page:
     tables = [t._replace(title=name) for name, t in zip(titles, found.tables(), strict=True)]
     if found.notes:
         tables.append(Table("About the document", [], [[note] for note in found.notes]))
-    if found.made is not None:
-        text = format_document(found.made.document).replace("  ", "\xa0\xa0").splitlines()
-        tables.append(Table("The document", [], [[line] for line in text if line]))
+    text = format_document(found.made.document).replace("  ", "\xa0\xa0").splitlines()
+    tables.append(Table("The document", [], [[line] for line in text if line]))
     drawn = list(_drawn(found))
     pictures = []
     if drawn:
         height = 0.6 + 1.7 * ceil(len(drawn) / 2)
         pictures = [Picture("outputs by index", height, partial(draw_outputs, found=found))]
     goals = "maximised" if found.factor < 0 else "minimised"
-    called = found.made.document.mapping.name if found.made else found.name
+    called = found.made.document.mapping.name
     sizes = {"variable": len(p.names), "limit": len(p.constraint_names)}
     counts = ", ".join(f"{n} {what}" + "s" * (n != 1) for what, n in sizes.items())
     return Page(
@@ -62,7 +61,7 @@ def formulation_page(found: Solution) -> Page:
 
 def _drawn(found: Solution):
     """Outputs with one dimension: name, elements of its set, values."""
-    arrays = found.made.program.scope.outputs if found.made else {}
+    arrays = found.made.program.scope.outputs
     lines = [(n, arrays[n].dims[0], v) for n, v in found.outputs.items() if v.ndim == 1]
     return lines[:MOST_DRAWN]
 

@@ -96,23 +96,3 @@ def test_tables_of_other_sizes_are_refused(run, tmp_path):
     assert (status, "short.csv: 2 x 2 numbers; expected 14 x 23" in error) == (2, True)
     status, _, error = run("solve", "formulations/appendix_a.bf", "--data", "q=x.csv")
     assert (status, "a table of it: d" in error) == (2, True)
-
-
-def test_a_problem_of_ampl_is_solved_with_its_names(run, tmp_path):
-    """Maximize 3x + 2y - x² - y² with x + y <= 2; by hand (1.25, 0.75) and a multiplier of 0.5."""
-    lines = "g3 1 1 0\n 2 1 1 0 0\n 0 1\n 0 0\n 0 2 0\n 0 0 0 1\n 0 0 0 0 0\n 2 2\n 0 0\n 0 0 0 0 0"
-    lines += "\nC0\nn0\nO0 1\no16\no0\no5\nv0\nn2\no5\nv1\nn2\nr\n1 2\nb\n3\n3\nk1\n1\n"
-    lines += "J0 2\n0 1\n1 1\nG0 2\n0 3\n1 2\n"
-    (tmp_path / "m.nl").write_text(lines)
-    (tmp_path / "m.col").write_text("coil\nfield\n")
-    (tmp_path / "m.row").write_text("budget\n")
-    _, found = result(run, tmp_path / "m.nl", "--report", tmp_path / "m.html")
-    assert (found["status"], found["direction"]) == ("optimal", "maximize")
-    assert found["objective"] == pytest.approx(3 * 1.25 + 1.5 - 1.25**2 - 0.75**2)
-    assert [v["name"] for v in found["variables"]] == ["coil", "field"]
-    assert [v["value"]["value"] for v in found["variables"]] == pytest.approx([1.25, 0.75])
-    assert found["constraints"][0]["name"] == "budget"
-    assert abs(found["constraints"][0]["multiplier"]) == pytest.approx(0.5)
-    assert "budget" in (tmp_path / "m.html").read_text()
-    status, out, error = run("solve", tmp_path / "m.nl", "--data", "d=x.csv")
-    assert (status, out, error.count("\n")) == (2, "", 1)
