@@ -26,12 +26,17 @@ from beamfit.greybox.problem import residual as problem_residual
 DAMPING = 1e-3
 # On the length of a step relative to the numbers, both in units of the Jacobian's columns.
 TOLERANCE = 1e-13
+# The damping falls by this factor at most in one step.
+EASED = 1e-4
 # Beyond this no step however short lowers the cost.
 STUCK = 1e30
 # What a step promises is below rounding under this share of the sum of squares.
 ROUNDING = 1e-16
-# Rounds of pinning in a step; what the last one pushes out is clipped.
+# Most rounds of pinning in a step; what the last one pushes out is clipped.
 PINNED = 3
+# Where a step gains what it promised to within a share, the damping falls by so many times the
+# share: near a solution steps become undamped, and converge as fast as Gauss-Newton's.
+TRUSTED = 10.0
 # With a limit of time the clock is looked at after so many steps.
 SEGMENT = 50
 # Searches in a compiled call, where their Jacobians have no more than so many numbers.
@@ -200,7 +205,10 @@ def _advance(residual, lower: Array, upper: Array, tolerance: float, s: Walk) ->
     gained = 0.5 * (s.residual - r) @ (s.residual + r)
     ratio = jnp.where(finite & (s.promised > 0), gained / s.promised, -1.0)
     good = first | (ratio > 1e-4)
-    eased = s.damping * jnp.maximum(1 / 3, 1 - (2 * jnp.minimum(ratio, 1.0) - 1) ** 3)
+    eased = s.damping * jnp.minimum(
+        jnp.maximum(1 / 3, 1 - (2 * jnp.minimum(ratio, 1.0) - 1) ** 3),
+        jnp.maximum(TRUSTED * jnp.abs(1 - ratio), EASED),
+    )
     kept = partial(jnp.where, good)
     theta, r, j = kept(s.trial, s.theta), kept(r, s.residual), kept(j, s.jacobian)
     scale = jnp.maximum(s.scale, jnp.linalg.norm(j, axis=0))
@@ -232,9 +240,13 @@ def _next(theta, residual, jacobian, scale, damping, lower, upper) -> Array:
     g = triangle.T @ reduced
     pinned = ((low >= 0) & (g > 0)) | ((high <= 0) & (g < 0)) | (lower >= upper)
 
-    def pin(_, state):
+    def unfinished(state):
+        pinned, _, before, rounds = state
+        return (rounds == 0) | ((rounds < PINNED) & jnp.any(pinned != before))
+
+    def pin(state):
         # A pinned number stands alone in its row; the others are solved beside it.
-        pinned, held = state
+        pinned, held, _, rounds = state
         at = jnp.where(pinned, held, 0.0)
         loose = jnp.where(pinned, 0.0, triangle)
         left = jnp.vstack([loose, jnp.diag(jnp.where(pinned, 1.0, jnp.sqrt(damping)))])
@@ -242,9 +254,10 @@ def _next(theta, residual, jacobian, scale, damping, lower, upper) -> Array:
         r = jnp.linalg.qr(jnp.column_stack([left, right]), mode="r")
         tried = jax.scipy.linalg.solve_triangular(r[:n, :n], r[:n, n])
         clipped = jnp.clip(tried, low, high)
-        return pinned | (clipped != tried), clipped
+        return pinned | (clipped != tried), clipped, pinned, rounds + 1
 
-    _, held = jax.lax.fori_loop(0, PINNED, pin, (pinned, jnp.zeros_like(g)))
+    begin = (pinned, jnp.zeros_like(g), pinned, jnp.asarray(0))
+    held = jax.lax.while_loop(unfinished, pin, begin)[1]
     inside = jnp.clip(theta + held / unit, lower, upper)
     # Exactly on a bound, or the number is not known to be there.
     found = jnp.where(held <= low, lower, jnp.where(held >= high, upper, inside))
