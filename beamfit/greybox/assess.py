@@ -14,8 +14,10 @@ from typing import NamedTuple
 
 import jax
 import numpy as np
+from scipy import sparse
 
 from beamfit.greybox import problem
+from beamfit.greybox.factors import Rows, lengths
 from beamfit.greybox.problem import Problem
 
 TOLERANCE = 1e-6  # within which a limit counts as reached and a point as an optimum
@@ -30,7 +32,7 @@ class Slopes(NamedTuple):
     """Everything of first order at a point."""
 
     residual: np.ndarray
-    residual_jacobian: np.ndarray
+    residual_jacobian: Rows
     cost: float
     gradient: np.ndarray
     constraints: np.ndarray
@@ -39,7 +41,8 @@ class Slopes(NamedTuple):
     @property
     def finite(self) -> bool:
         """Whether everything is."""
-        return all(np.all(np.isfinite(part)) for part in self)
+        parts = (part.data if sparse.issparse(part) else part for part in self)
+        return all(np.all(np.isfinite(part)) for part in parts)
 
 
 class Scale(NamedTuple):
@@ -154,13 +157,13 @@ def slopes(p: Problem, theta: np.ndarray) -> Slopes:
     return Slopes(*(np.asarray(part) for part in parts))
 
 
-def of_squares(residual: np.ndarray, jacobian: np.ndarray) -> Slopes:
+def of_squares(residual: np.ndarray, jacobian: Rows) -> Slopes:
     """The slopes of a problem of squares alone, from residuals and Jacobian."""
     none = np.zeros(0)
     cost = 0.5 * residual @ residual
     with np.errstate(invalid="ignore"):
         gradient = jacobian.T @ residual
-    return Slopes(residual, jacobian, cost, gradient, none, none.reshape(0, len(jacobian.T)))
+    return Slopes(residual, jacobian, cost, gradient, none, none.reshape(0, jacobian.shape[1]))
 
 
 def scale_of(p: Problem, start: np.ndarray, at: Slopes) -> Scale:
@@ -171,7 +174,7 @@ def scale_of(p: Problem, start: np.ndarray, at: Slopes) -> Scale:
     the change along the numbers; a further objective as its change along them.
     """
     width = p.upper - p.lower
-    length, pull = np.linalg.norm(at.residual_jacobian, axis=0), np.abs(at.gradient)
+    length, pull = lengths(at.residual_jacobian), np.abs(at.gradient)
     unit = np.maximum(np.abs(start), np.where(np.isfinite(width), 0.1 * width, 0.0))
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         for other in (1.0 / length, abs(at.cost) / pull):
@@ -194,7 +197,7 @@ def gradient_size(p: Problem, at: Slopes, scale: Scale) -> np.ndarray:
     objectives, the scale of the cost.
     """
     size = max(np.linalg.norm(at.residual), p.least_residual)
-    found = np.linalg.norm(at.residual_jacobian, axis=0) * size
+    found = lengths(at.residual_jacobian) * size
     if p.objectives:
         found = found + scale.cost / scale.unit
     largest = np.max(found * scale.unit, initial=0.0)

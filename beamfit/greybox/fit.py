@@ -15,7 +15,8 @@ from beamfit.compile_cache import SELDOM
 from beamfit.errors import InputError, nearest
 from beamfit.greybox import tree
 from beamfit.greybox.assess import KKT, TOLERANCE
-from beamfit.greybox.covariance import MOST_SHARE, Group, Spread
+from beamfit.greybox.covariance import MOST_SHARE, FactoredSpread, Group, Spread
+from beamfit.greybox.factors import Rows
 from beamfit.greybox.problem import Problem, with_slope
 from beamfit.greybox.stated import Optimum
 from beamfit.status import Status
@@ -126,7 +127,8 @@ class Fit:
         Errors in linear approximation along the active limits, bounds counted as information:
         each record's residuals divided by the scale of its group, or by 1 where errors were given.
     jacobian : array, shape (m, n)
-        Derivatives of the residuals, in units of their errors, priors last.
+        Derivatives of the residuals, in units of their errors, priors last; sparse where the
+        problem is, of many numbers.
     undetermined : array, shape (n, k)
         Directions in theta that the residuals do not see.
     scale : float
@@ -148,9 +150,9 @@ class Fit:
     kkt: KKT
     variables: tuple[Variable, ...]
     constraints: tuple[Limited, ...]
-    spread: Spread
-    spread_raw: Spread
-    jacobian: np.ndarray
+    spread: Spread | FactoredSpread
+    spread_raw: Spread | FactoredSpread
+    jacobian: Rows
     undetermined: np.ndarray
     scale: float
     attempts: tuple[Attempt, ...]

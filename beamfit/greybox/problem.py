@@ -19,6 +19,7 @@ import numpy as np
 
 from beamfit.errors import InputError
 from beamfit.greybox import tree
+from beamfit.greybox.sparsity import Pattern, pattern_of
 from beamfit.greybox.terms import Constraint, Free, Objective, Prior, Record
 
 # Records are padded to powers of two from here on.
@@ -259,6 +260,11 @@ class Problem:
     def residual_count(self) -> int:
         """How many residuals there are, those of priors included."""
         return self.size + sum(_shape_of(p.residual, self.core.model)[0] for p in self.priors)
+
+    @cached_property
+    def pattern(self) -> Pattern | None:
+        """Places of the residuals' Jacobian that may differ from zero; None where it is dense."""
+        return pattern_of(partial(residual, self.core), self.start)
 
     @cached_property
     def least_residual(self) -> float:

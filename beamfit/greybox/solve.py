@@ -11,7 +11,7 @@ from beamfit.errors import InputError
 from beamfit.greybox import assess, curvature
 from beamfit.greybox.assess import TOLERANCE, State
 from beamfit.greybox.conflict import relaxed
-from beamfit.greybox.descend import Lanes
+from beamfit.greybox.descend import Lanes, lanes_of
 from beamfit.greybox.diagnosis import contradictory, not_finite
 from beamfit.greybox.evidence import Search, settled
 from beamfit.greybox.fit import Attempt, Fit
@@ -253,7 +253,7 @@ def _together(
 
 def _lanes(p: Problem, points: np.ndarray, budget: Budget) -> tuple[list[State], list[Attempt]]:
     k = len(points)
-    lanes = Lanes(p, points)
+    lanes = lanes_of(p, points)
     lanes.go(np.arange(k), min(STEPS, budget.iterations), budget.until)
     cost = lanes.cost[:k]
     found: dict[int, State] = {}

@@ -82,10 +82,9 @@ def conclude(p: Problem, s: State, search: Search, seconds: float) -> Fit:
 
 
 def _variables(p: Problem, s: State, found: Known) -> tuple[Variable, ...]:
-    one = np.eye(len(s.theta))
-    nothing = (found.spread.share(one) >= MOST_SHARE) | found.held
+    nothing = (found.spread.shares >= MOST_SHARE) | found.held
     nothing |= any(group.unknown for group in found.groups)
-    errors = (np.where(nothing, np.nan, part.error(one)) for part in (found.spread, found.raw))
+    errors = (np.where(nothing, np.nan, part.errors) for part in (found.spread, found.raw))
     columns = (s.theta, *errors, p.lower, p.upper, s.bounds.states(s.found.bounds), s.found.bounds)
     return _rows(Variable, p.names, *columns)
 
