@@ -90,10 +90,12 @@ def walk(
     iterations: Any,
     tolerance: float = TOLERANCE,
     memory: tuple[Any, Any, Any, Any] = (DAMPING, 2.0, 0.0, 0),
+    moves: Any = True,
 ) -> Walk:
     """Search until it rests, is stuck or has taken so many steps, refused ones too.
 
-    `memory` has damping, growth, column lengths and steps of an earlier walk to go on from.
+    `memory` has damping, growth, column lengths and steps of an earlier walk to go on from. A walk
+    that does not move only looks at its start.
     """
     theta = jnp.clip(start, lower, upper)
     shape = jax.eval_shape(residual, theta)
@@ -109,7 +111,8 @@ def walk(
     def go_on(s: Walk) -> Array:
         return ~s.rested & ~s.stuck & (s.steps < more)
 
-    last = jax.lax.while_loop(go_on, partial(_advance, residual, lower, upper, tolerance), first)
+    advance = partial(_advance, residual, lower, upper, tolerance, moves)
+    last = jax.lax.while_loop(go_on, advance, first)
     return last._replace(steps=last.steps + steps)
 
 
@@ -198,7 +201,7 @@ def descend_all(
     return jax.vmap(one)(jnp.asarray(starts, float))
 
 
-def _advance(residual, lower: Array, upper: Array, tolerance: float, s: Walk) -> Walk:
+def _advance(residual, lower: Array, upper: Array, tolerance: float, moves, s: Walk) -> Walk:
     """Look at the point tried, take or refuse it, and find the next one."""
     first = s.steps < 0
     r, j = with_slope(residual, s.trial)
@@ -211,7 +214,8 @@ def _advance(residual, lower: Array, upper: Array, tolerance: float, s: Walk) ->
     theta, r, j = kept(s.trial, s.theta), kept(r, s.residual), kept(j, s.jacobian)
     scale = jnp.maximum(s.scale, jnp.linalg.norm(j, axis=0))
     damping = jnp.where(first, s.damping, kept(eased, s.damping * s.growth))
-    trial = _next(theta, r, j, scale, damping, lower, upper)
+    at = (theta, r, j, scale, damping, lower, upper)
+    trial = _next(*at) if moves is True else jax.lax.cond(moves, _next, lambda *at: at[0], *at)
     change = trial - theta
     promised = -(r @ (j @ change)) - 0.5 * jnp.sum((j @ change) ** 2)
     small = jnp.linalg.norm(scale * change) <= tolerance * jnp.linalg.norm(scale * theta)
@@ -452,9 +456,9 @@ def _swept(core, theta, seeds):
 
 def _walks(core, starts, memory, limit, lower, upper) -> Walk:
     """Searches from starts, each with its own memory and limit of steps."""
-    residual = partial(problem_residual, core)
+    residual, moves = partial(problem_residual, core), jnp.any(limit > 0)
 
     def one(theta, memory, limit):
-        return walk(residual, theta, lower, upper, limit, memory=memory)
+        return walk(residual, theta, lower, upper, limit, memory=memory, moves=moves)
 
     return jax.vmap(one)(starts, memory, limit)
