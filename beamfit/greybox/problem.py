@@ -259,7 +259,7 @@ class Problem:
     @cached_property
     def residual_count(self) -> int:
         """How many residuals there are, those of priors included."""
-        return self.size + sum(_shape_of(p.residual, self.core.model)[0] for p in self.priors)
+        return self.size + sum(shape_of(p.residual, self.core.model)[0] for p in self.priors)
 
     @cached_property
     def pattern(self) -> Pattern | None:
@@ -341,7 +341,7 @@ class Problem:
     @cached_property
     def _constraint_shapes(self) -> list[tuple[Constraint, tuple[int, ...]]]:
         """Each constraint with the shape of its values."""
-        return [(c, _shape_of(c.function, self.core.model, c.data)) for c in self.constraints]
+        return [(c, shape_of(c.function, self.core.model, c.data)) for c in self.constraints]
 
     def _limits(self, what: str) -> np.ndarray:
         """One limit of every constraint, spread over its elements."""
@@ -360,7 +360,7 @@ class Problem:
 _GROUPS = ("records", "priors", "constraints", "objectives")
 
 
-def _shape_of(function: Callable, *arguments: Any) -> tuple[int, ...]:
+def shape_of(function: Callable, *arguments: Any) -> tuple[int, ...]:
     """Shape of what a function gives, traced once for each structure and shape of arguments."""
     leaves, structure = jax.tree_util.tree_flatten(arguments)
     kinds = tuple((np.shape(leaf), getattr(leaf, "dtype", np.dtype(float))) for leaf in leaves)
@@ -376,7 +376,7 @@ def _traced_shape(function, structure, kinds) -> tuple[int, ...]:
 def _check_shapes(problem: Problem) -> None:
     """Refuse predictions, priors and limits whose shapes do not fit, before anything runs."""
     for record in problem.records:
-        found = _shape_of(record.predict, problem.core.model, record.data)
+        found = shape_of(record.predict, problem.core.model, record.data)
         if found != record.measured.shape:
             raise InputError(
                 f"a prediction of shape {found} for record '{record.name}'",

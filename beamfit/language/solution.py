@@ -5,16 +5,21 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import islice
 from typing import Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
+from beamfit.compile_cache import SELDOM
 from beamfit.greybox.assess import slopes
 from beamfit.greybox.diagnosis import diagnose
 from beamfit.greybox.fit import Fit, Limited, Variable
 from beamfit.greybox.solve import solve
 from beamfit.language import document as d
+from beamfit.language.compiled import Program
 from beamfit.language.statement import Formulation, at_start, formulate, starts_of
 from beamfit.language.trace import cause_of
 from beamfit.quantity import Quantity
@@ -232,10 +237,19 @@ def solve_document(
         notes = notes if told else (*notes, f"Where it ended, {cause}.")
     if made.squares and math.isfinite(fit.scale):
         notes = (*notes, NOISE)
-    asked = list(made.program.scope.outputs)
-    outputs = {n: np.asarray(v) for n, v in made.program(fit.model, asked).items()}
+    asked = tuple(made.program.scope.outputs)
+    constants = {n: jnp.asarray(v) for n, v in made.program.constants.items()}
+    found = _values(made.program, asked, fit.model, constants)
+    outputs = dict(zip(asked, map(np.asarray, found), strict=True))
     name = _goals(made.document)
     return Solution(name, fit, outputs, made.factor, made.squares, notes, made)
+
+
+@partial(jax.jit, static_argnums=(0, 1), compiler_options=SELDOM)
+def _values(program: Program, names: tuple[str, ...], given, constants) -> list[jax.Array]:
+    """Arrays of a program, compiled once for its order."""
+    found = program(given, names, constants)
+    return [found[name] for name in names]
 
 
 def _started(made: Formulation) -> tuple[Formulation, tuple[str, ...]]:

@@ -109,7 +109,7 @@ def formulate(document: d.Document, tables: Mapping[str, np.ndarray] | None = No
     for name, weight in weights.items():
         if least:
             predict = _Residuals(program, tuple(parts[name]))
-            length = jax.eval_shape(predict, model, constants).shape
+            length = core.shape_of(predict, model, constants)
             records.append(core.Record(name, predict, constants, np.zeros(length)))
         else:
             objectives.append(core.Objective(name, _Output(program, name), constants, weight))
