@@ -20,7 +20,6 @@ from beamfit.greybox import problem
 from beamfit.greybox.factors import Rows, lengths
 from beamfit.greybox.problem import Problem
 
-TOLERANCE = 1e-6  # within which a limit counts as reached and a point as an optimum
 # A bound is reached, too, where moving onto it changes the cost by less than this share.
 CLOSE = 1e-8
 # What is limited counts as no larger than this many times its size at the end: a start at which it
@@ -137,7 +136,18 @@ class State(NamedTuple):
     found: Multipliers
     kkt: KKT
     scale: Scale
+    tolerance: float
     bend: Bend | None = None
+
+    @property
+    def feasible(self) -> bool:
+        """Whether all limits hold."""
+        return self.kkt.feasibility <= self.tolerance
+
+    @property
+    def optimal(self) -> bool:
+        """Whether it is an optimum to first order."""
+        return self.kkt.worst <= self.tolerance
 
 
 def first_order(core, theta):
@@ -234,19 +244,19 @@ def state(p: Problem, theta: np.ndarray, scale: Scale, at: Slopes | None = None)
     at = slopes(p, theta) if at is None else at
     size = gradient_size(p, at, scale) if at.finite else 1.0 / scale.unit
     cost = scale.cost if p.objectives else max(float(at.cost), 0.5 * p.least_residual**2)
-    near = TOLERANCE * np.minimum(np.maximum(np.abs(theta), np.abs(p.start)), p.upper - p.lower)
+    near = p.tolerance * np.minimum(np.maximum(np.abs(theta), np.abs(p.start)), p.upper - p.lower)
     with np.errstate(divide="ignore", invalid="ignore"):
         # Where the gradient pushes to a bound that is as good as reached.
-        pushed = np.abs(at.gradient) > TOLERANCE * size
+        pushed = np.abs(at.gradient) > p.tolerance * size
         near = np.where(pushed, np.maximum(near, CLOSE * cost / np.abs(at.gradient)), near)
     near = np.where(np.isfinite(near), near, 0.0)
     bounds = Limits(theta, p.lower, p.upper, scale.unit, near)
     size_here = np.fmin(scale.limit, GROWN * scale_of(p, theta, at).limit)
     limits = Limits(
-        at.constraints, p.constraint_lower, p.constraint_upper, size_here, TOLERANCE * size_here
+        at.constraints, p.constraint_lower, p.constraint_upper, size_here, p.tolerance * size_here
     )
     none = Multipliers(np.zeros(len(theta)), np.zeros(len(at.constraints)))
-    s = State(theta, at, bounds, limits, none, LOST, scale)
+    s = State(theta, at, bounds, limits, none, LOST, scale, p.tolerance)
     if not at.finite:
         return s
     s = s._replace(found=multipliers(at.gradient, at.jacobian, bounds, limits, size))

@@ -130,7 +130,7 @@ def lower_beside(p: Problem, s: assess.State, lagrangian: Look) -> np.ndarray | 
 def _weakest(p: Problem, s: assess.State) -> np.ndarray:
     """The weakest directions of squares that keep to the limits held by a force."""
     unit = s.scale.unit
-    held, equations = assess.holding(p, s, assess.TOLERANCE)
+    held, equations = assess.holding(p, s, p.tolerance)
     if len(unit) > FEW and not len(equations):
         found = np.zeros((len(unit), min(WEAKEST, int(np.sum(~held)))))
         rows = in_units(s.at.residual_jacobian, 1 / unit)[:, ~held]
@@ -180,11 +180,11 @@ def _bend(p: Problem, s: assess.State) -> assess.Bend:
     clear = values[0] < -PLAIN * max(largest, 1.0) and np.all(
         np.abs(NEAR * down) < np.minimum(s.theta - p.lower, p.upper - s.theta)
     )
-    return assess.Bend(down, float(newton), not steep.all() or largest < assess.TOLERANCE, clear)
+    return assess.Bend(down, float(newton), not steep.all() or largest < p.tolerance, clear)
 
 
 def _tangent(p: Problem, s: assess.State) -> np.ndarray:
     """Directions, in the sizes of the numbers, that keep to the limits held by a force."""
     unit = s.scale.unit
-    held, equations = assess.holding(p, s, assess.TOLERANCE)
+    held, equations = assess.holding(p, s, p.tolerance)
     return null_space(np.vstack([np.eye(len(unit))[held], equations * unit]))

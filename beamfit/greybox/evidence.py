@@ -9,7 +9,7 @@ import numpy as np
 from scipy import sparse
 
 from beamfit.greybox import assess
-from beamfit.greybox.assess import TOLERANCE, State
+from beamfit.greybox.assess import State
 from beamfit.greybox.conflict import Conflict
 from beamfit.greybox.covariance import (
     MOST_SHARE,
@@ -130,7 +130,7 @@ def settled(p: Problem, s: State) -> bool:
     scatter says where no errors were given, is below `SETTLED`. Networks have flat valleys in which
     a strict optimum is never reached and nothing changes any more.
     """
-    if p.objectives or not s.at.finite or s.kkt.feasibility > TOLERANCE:
+    if p.objectives or not s.at.finite or not s.feasible:
         return False
     found = known(p, s)
     weight = np.ones(len(s.at.residual))

@@ -14,7 +14,7 @@ import numpy as np
 from beamfit.compile_cache import SELDOM
 from beamfit.errors import InputError, nearest
 from beamfit.greybox import tree
-from beamfit.greybox.assess import KKT, TOLERANCE
+from beamfit.greybox.assess import KKT
 from beamfit.greybox.covariance import MOST_SHARE, FactoredSpread, Group, Spread
 from beamfit.greybox.factors import Rows
 from beamfit.greybox.problem import Problem, with_slope
@@ -137,6 +137,8 @@ class Fit:
         Every start; the best one is the answer.
     seconds : float
         Time taken, compilation included.
+    about : tuple of str
+        Names of the numbers and constraints that the verdict speaks of.
     """
 
     problem: Problem
@@ -157,6 +159,7 @@ class Fit:
     scale: float
     attempts: tuple[Attempt, ...]
     seconds: float
+    about: tuple[str, ...] = ()
 
     @property
     def model(self) -> Any:
@@ -282,7 +285,7 @@ class Fit:
     @property
     def optimum(self) -> Optimum:
         """What the sampler needs to know of this fit."""
-        near = [a for a in self.attempts if a.kkt.worst <= TOLERANCE]
+        near = [a for a in self.attempts if a.kkt.worst <= self.problem.tolerance]
         return Optimum(
             self.theta,
             Finding(self.status, self.message),

@@ -22,6 +22,8 @@ from beamfit.greybox import tree
 from beamfit.greybox.sparsity import Pattern, pattern_of
 from beamfit.greybox.terms import Constraint, Free, Objective, Prior, Record
 
+# Within which a limit counts as reached and a point as an optimum.
+TOLERANCE = 1e-6
 # Records are padded to powers of two from here on.
 SHORTEST = 8
 
@@ -119,6 +121,8 @@ class Problem:
     priors : sequence of Prior
     constraints : sequence of Constraint
     objectives : sequence of Objective
+    tolerance : float
+        Within which a limit counts as reached and a point as an optimum, in the problem's sizes.
 
     Raises
     ------
@@ -145,6 +149,7 @@ class Problem:
     priors: Sequence[Prior] = ()
     constraints: Sequence[Constraint] = ()
     objectives: Sequence[Objective] = ()
+    tolerance: float = TOLERANCE
     core: Core = field(init=False, repr=False)
 
     def __post_init__(self):

@@ -9,7 +9,7 @@ from jax.experimental import checkify
 
 from beamfit import verdict
 from beamfit.greybox import assess, optimum, problem
-from beamfit.greybox.assess import TOLERANCE, State
+from beamfit.greybox.assess import State
 from beamfit.greybox.covariance import MOST_SHARE, Spread
 from beamfit.greybox.equations import Implicit
 from beamfit.greybox.evidence import EDGES, Evidence, Known, Search, known, listed, settled
@@ -70,14 +70,14 @@ def conclude(p: Problem, s: State, search: Search, seconds: float) -> Fit:
     # What has no errors cannot speak for or against the model.
     silent = [group for group in found.groups if not group.errors_given]
     spoken = chi2 - sum(g.chi2 for g in silent), dof - sum(g.dof for g in silent)
-    rest = s.kkt.worst > TOLERANCE and settled(p, s)
+    rest = not s.optimal and settled(p, s)
     evidence = Evidence(p, s, search, rest, variables, constraints, found.blind, *spoken)
     finding = verdict.judge(evidence, RULES if p.has_data else WITHOUT_DATA)
     message = " ".join([finding.message, *_remarks(evidence)])
     return Fit(
         p, s.theta, finding.status, message, float(s.at.cost), chi2, dof, found.groups, s.kkt,
         variables, constraints, found.spread, found.raw, s.at.residual_jacobian, found.unseen,
-        float(scale), search.attempts, seconds,
+        float(scale), search.attempts, seconds, finding.about,
     )  # fmt: skip
 
 
@@ -196,7 +196,7 @@ def _remarks(e: Evidence) -> list[str]:
         said.append(f"{search.moved} of {count} starts moved onto their bounds.")
     if search.cut:
         said.append(f"The limit of {search.seconds:g} s cut the search.")
-    lost = e.problem.has_data and e.state.kkt.worst > TOLERANCE and not e.settled
-    if lost and e.state.kkt.feasibility <= TOLERANCE and (found := optimum.degenerate(e)):
+    lost = e.problem.has_data and not e.state.optimal and not e.settled
+    if lost and e.state.feasible and (found := optimum.degenerate(e)):
         said.append(found.message)
     return said

@@ -8,6 +8,7 @@ from math import ceil
 import numpy as np
 from matplotlib.figure import FigureBase
 
+from beamfit.language.computed import Computed
 from beamfit.language.solution import Solution
 from beamfit.language.text import format_document
 from beamfit.report.document import BLUE, Page, Picture, Verdict
@@ -31,7 +32,7 @@ def formulation_page(found: Solution) -> Page:
     """
     p = found.fit.problem
     titles = ["Variables", *["Constraints"] * bool(found.fit.constraints)]
-    titles += ["Outputs"] * bool(found.outputs)
+    titles += ["Outputs"] * bool(found.outputs) + ["Gains"] * bool(found.gains)
     tables = [t._replace(title=name) for name, t in zip(titles, found.tables(), strict=True)]
     if found.notes:
         tables.append(Table("About the document", [], [[note] for note in found.notes]))
@@ -56,6 +57,21 @@ def formulation_page(found: Solution) -> Page:
         pictures=pictures,
         pictures_title="Outputs",
         remarks=[("solver", found.solver)],
+    )
+
+
+def computed_page(found: Computed) -> Page:
+    """Lay out a mapping computed."""
+    titles = ["Outputs"] + ["Gains"] * bool(found.gains)
+    tables = [t._replace(title=name) for name, t in zip(titles, found.tables(), strict=True)]
+    counts = f"{len(found.outputs)} outputs"
+    return Page(
+        title=f"Mapping {found.name}".strip(),
+        subtitle=counts,
+        verdicts=[],
+        tables=tables,
+        pictures=[],
+        pictures_title="",
     )
 
 
