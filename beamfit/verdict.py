@@ -11,11 +11,15 @@ Evidence = TypeVar("Evidence")
 
 
 class Finding(NamedTuple):
-    """What a rule found: a status, the cause in words, and what to do about it."""
+    """What a rule found: a status, the cause in words, and what to do about it.
+
+    `about` names what the finding speaks of.
+    """
 
     status: Status
     cause: str
     remedy: str = ""
+    about: tuple[str, ...] = ()
 
     @property
     def message(self) -> str:

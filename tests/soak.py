@@ -37,7 +37,6 @@ from beamfit.io.formulation import read_formulation, read_numbers
 from beamfit.io.line import read_lattice
 from beamfit.io.measurement import read_quad_scan
 from beamfit.io.network import read_network
-from beamfit.io.nl import read_nl
 from beamfit.io.result import read_fitted_beams
 from beamfit.io.ring import read_ring
 from beamfit.io.ring_tables import read_twiss
@@ -51,7 +50,6 @@ from beamfit.sampling.store import load
 from tests.conftest import ROOT
 from tests.io.test_emittance_gui import gui_data
 from tests.io.test_mutated_files import CSV, mutated
-from tests.io.test_nl import BY_HAND
 from tests.io.test_programs import LVM, SDDS
 from tests.io.test_sequence import ELEGANT, MAD8, MADX
 from tests.sampling.targets import half_normal, target
@@ -145,7 +143,6 @@ def readers(folder: Path, with_store: bool) -> dict[str, Reader]:
         "elegant": Reader(".lte", [ELEGANT.encode()], lambda p: read_lattice(p, energy=135.0)),
         "formulation .bf": Reader(".bf", text, documents),
         "formulation .xml": Reader(".xml", xml, documents),
-        "problem .nl": Reader(".nl", [BY_HAND.encode()], read_nl),
         "network .xml": Reader(".xml", [network], read_network),
         "numbers": Reader(".csv", [of("formulations/fitdata_simulated.csv")], read_numbers),
         "kept fit": Reader(".json", [(folder / "fit.json").read_bytes()], load_fit),

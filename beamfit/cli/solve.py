@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+import math
+import re
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -12,14 +14,19 @@ from beamfit.io.files import digest
 
 if TYPE_CHECKING:
     from beamfit.cli.show import Terminal
+    from beamfit.language.computed import Computed
     from beamfit.language.solution import Solution
 
 EXAMPLE = """\b
 Examples:
   beamfit solve formulations/appendix_d.bf
   beamfit solve formulations/appendix_a.xml --data d=formulations/fitdata_simulated.csv --start 20
-  beamfit solve model.nl --start 20 --json
+  beamfit solve formulations/figure_3.xml --set x1=0.5 --set x2=2 --set x3=1 --set x4=1 \\
+      --gain dy5/dx4
 """
+# As `beamfit.greybox.solve.solve` calls them; told here so that help needs no JAX.
+SOLVERS = ["levenberg-marquardt", "filtersqp", "ipopt", "slsqp"]
+COUNT = re.compile(r"[1-9]\d{0,5}")
 
 
 @click.command(epilog=EXAMPLE)
@@ -30,55 +37,93 @@ Examples:
     multiple=True,
 )
 @option(
+    "--set NAME=NUMBERS",
+    "Value of an input: one number, or all of an array with commas, row by row. Of a variable it "
+    "is where the search starts.",
+    "values",
+    multiple=True,
+)
+@option(
+    "--gain dY/dX", "Derivatives of an output by an input, printed too.", "gains", multiple=True
+)
+@option(
     "--start seeds|N",
     "One search from the document's seeds, or N: from there and from random numbers.",
     default="seeds",
 )
+@option("--solver", "The solver to use; by default all that suit, in turn.", choices=SOLVERS)
+@option("--tolerance X", "Within which a limit is reached and a point an optimum.", type=float)
+@option("--seconds S", "Limit of time of the search, compilation included.", type=float)
 @options("report json")
 def solve(
-    document: str, data: tuple[str, ...], start: str, report: str | None, as_json: bool
+    document: str,
+    data: tuple[str, ...],
+    values: tuple[str, ...],
+    gains: tuple[str, ...],
+    start: str,
+    report: str | None,
+    as_json: bool,
+    **told: Any,
 ) -> None:
-    """Solve a formulation: a constrained problem as text (.bf), the report's XML, or AMPL's .nl.
+    """Solve a formulation: a constrained problem as text (.bf) or the report's XML.
 
     Variables come with bounds, states and reduced gradients, constraints with multipliers; errors
-    where the objective is a sum of squares.
+    where the objective is a sum of squares. A mapping without an objective is computed.
     """
-    starts = 1 if start == "seeds" else int(start) if start.isdigit() and len(start) < 7 else 0
-    if starts < 1:
+    if start != "seeds" and not COUNT.fullmatch(start):
         raise InputError(f"--start '{start}'", "seeds, or a number of starts from 1 to 999999")
-    given = {}
-    for text in data:
-        name, equals, file = text.partition("=")
-        if not (name and equals and file) or name in given:
-            raise InputError(f"--data '{text}'", "NAME=FILE, each name once")
-        given[name.strip()] = file.strip()
-    found, files = _solved(document, given, starts)
+    for name in ("tolerance", "seconds"):
+        if told[name] is not None and not 0 < told[name] < math.inf:
+            raise InputError(f"--{name} {told[name]:g}", "a number above 0")
+    tables = _pairs("data", data, "FILE")
+    numbers = {name: _numbers(name, text) for name, text in _pairs("set", values, "NUMBER").items()}
+    starts = 1 if start == "seeds" else int(start)
+    found, files = _solved(document, tables, starts, numbers, gains, told)
     inputs = {path: digest(path) for path in (document, *files)}
     reported(report, found, inputs)
     answered(as_json, [found], inputs, lambda terminal: _show(terminal, found), report)
 
 
-def _solved(document: str, given: dict[str, str], starts: int) -> tuple[Solution, tuple[str, ...]]:
-    """The solution of a document or a ``.nl`` file, and the files of its data."""
-    if document.lower().endswith(".nl"):
-        if given:
-            raise InputError("--data for a .nl file", "none: it holds its numbers", path=document)
-        from beamfit.io.nl import read_nl
-        from beamfit.language.solution import solve_problem
+def _pairs(option: str, texts: tuple[str, ...], what: str) -> dict[str, str]:
+    """Names and what stands behind their =."""
+    given: dict[str, str] = {}
+    for text in texts:
+        name, equals, value = (part.strip() for part in text.partition("="))
+        if not (name and equals and value) or name in given:
+            raise InputError(f"--{option} '{text}'", f"NAME={what}, each name once")
+        given[name] = value
+    return given
 
-        return solve_problem(read_nl(document), starts), ()
+
+def _numbers(name: str, text: str) -> list[float]:
+    try:
+        found = [float(word) for word in text.split(",")]
+    except ValueError:
+        found = []
+    if not found or not all(map(math.isfinite, found)):
+        raise InputError(f"--set {name}={text}", "a number, or numbers with commas between them")
+    return found
+
+
+def _solved(document, given, starts, values, gains, told) -> tuple[Any, tuple[str, ...]]:
+    """The solution of a document, and the files of its data."""
     from beamfit.io.formulation import read_formulation, read_tables, solved_formulation
 
     formulation = read_formulation(document)
     tables, files = read_tables(formulation, document, given)
-    return solved_formulation(formulation, document, tables, starts), tuple(files.values())
+    found = solved_formulation(formulation, document, tables, starts, values, gains, **told)
+    return found, tuple(files.values())
 
 
-def _show(terminal: Terminal, found: Solution) -> None:
+def _show(terminal: Terminal, found: Solution | Computed) -> None:
     for table in found.tables():
         terminal.table(table)
         terminal.line()
-    asked = found.made.document.solver if found.made else None
+    from beamfit.language.solution import Solution
+
+    if not isinstance(found, Solution):
+        return
+    asked = found.made.document.solver
     terminal.line(f"Solver: {found.solver}" + (f" (asked for: {asked.name})" if asked else ""))
     for note in found.notes:
         terminal.line(note)

@@ -14,11 +14,12 @@ from typing import NamedTuple
 
 import jax
 import numpy as np
+from scipy import sparse
 
 from beamfit.greybox import problem
+from beamfit.greybox.factors import Rows, lengths
 from beamfit.greybox.problem import Problem
 
-TOLERANCE = 1e-6  # within which a limit counts as reached and a point as an optimum
 # A bound is reached, too, where moving onto it changes the cost by less than this share.
 CLOSE = 1e-8
 # What is limited counts as no larger than this many times its size at the end: a start at which it
@@ -30,7 +31,7 @@ class Slopes(NamedTuple):
     """Everything of first order at a point."""
 
     residual: np.ndarray
-    residual_jacobian: np.ndarray
+    residual_jacobian: Rows
     cost: float
     gradient: np.ndarray
     constraints: np.ndarray
@@ -39,7 +40,8 @@ class Slopes(NamedTuple):
     @property
     def finite(self) -> bool:
         """Whether everything is."""
-        return all(np.all(np.isfinite(part)) for part in self)
+        parts = (part.data if sparse.issparse(part) else part for part in self)
+        return all(np.all(np.isfinite(part)) for part in parts)
 
 
 class Scale(NamedTuple):
@@ -134,7 +136,18 @@ class State(NamedTuple):
     found: Multipliers
     kkt: KKT
     scale: Scale
+    tolerance: float
     bend: Bend | None = None
+
+    @property
+    def feasible(self) -> bool:
+        """Whether all limits hold."""
+        return self.kkt.feasibility <= self.tolerance
+
+    @property
+    def optimal(self) -> bool:
+        """Whether it is an optimum to first order."""
+        return self.kkt.worst <= self.tolerance
 
 
 def first_order(core, theta):
@@ -154,13 +167,13 @@ def slopes(p: Problem, theta: np.ndarray) -> Slopes:
     return Slopes(*(np.asarray(part) for part in parts))
 
 
-def of_squares(residual: np.ndarray, jacobian: np.ndarray) -> Slopes:
+def of_squares(residual: np.ndarray, jacobian: Rows) -> Slopes:
     """The slopes of a problem of squares alone, from residuals and Jacobian."""
     none = np.zeros(0)
     cost = 0.5 * residual @ residual
     with np.errstate(invalid="ignore"):
         gradient = jacobian.T @ residual
-    return Slopes(residual, jacobian, cost, gradient, none, none.reshape(0, len(jacobian.T)))
+    return Slopes(residual, jacobian, cost, gradient, none, none.reshape(0, jacobian.shape[1]))
 
 
 def scale_of(p: Problem, start: np.ndarray, at: Slopes) -> Scale:
@@ -171,7 +184,7 @@ def scale_of(p: Problem, start: np.ndarray, at: Slopes) -> Scale:
     the change along the numbers; a further objective as its change along them.
     """
     width = p.upper - p.lower
-    length, pull = np.linalg.norm(at.residual_jacobian, axis=0), np.abs(at.gradient)
+    length, pull = lengths(at.residual_jacobian), np.abs(at.gradient)
     unit = np.maximum(np.abs(start), np.where(np.isfinite(width), 0.1 * width, 0.0))
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         for other in (1.0 / length, abs(at.cost) / pull):
@@ -194,7 +207,7 @@ def gradient_size(p: Problem, at: Slopes, scale: Scale) -> np.ndarray:
     objectives, the scale of the cost.
     """
     size = max(np.linalg.norm(at.residual), p.least_residual)
-    found = np.linalg.norm(at.residual_jacobian, axis=0) * size
+    found = lengths(at.residual_jacobian) * size
     if p.objectives:
         found = found + scale.cost / scale.unit
     largest = np.max(found * scale.unit, initial=0.0)
@@ -231,19 +244,19 @@ def state(p: Problem, theta: np.ndarray, scale: Scale, at: Slopes | None = None)
     at = slopes(p, theta) if at is None else at
     size = gradient_size(p, at, scale) if at.finite else 1.0 / scale.unit
     cost = scale.cost if p.objectives else max(float(at.cost), 0.5 * p.least_residual**2)
-    near = TOLERANCE * np.minimum(np.maximum(np.abs(theta), np.abs(p.start)), p.upper - p.lower)
+    near = p.tolerance * np.minimum(np.maximum(np.abs(theta), np.abs(p.start)), p.upper - p.lower)
     with np.errstate(divide="ignore", invalid="ignore"):
         # Where the gradient pushes to a bound that is as good as reached.
-        pushed = np.abs(at.gradient) > TOLERANCE * size
+        pushed = np.abs(at.gradient) > p.tolerance * size
         near = np.where(pushed, np.maximum(near, CLOSE * cost / np.abs(at.gradient)), near)
     near = np.where(np.isfinite(near), near, 0.0)
     bounds = Limits(theta, p.lower, p.upper, scale.unit, near)
     size_here = np.fmin(scale.limit, GROWN * scale_of(p, theta, at).limit)
     limits = Limits(
-        at.constraints, p.constraint_lower, p.constraint_upper, size_here, TOLERANCE * size_here
+        at.constraints, p.constraint_lower, p.constraint_upper, size_here, p.tolerance * size_here
     )
     none = Multipliers(np.zeros(len(theta)), np.zeros(len(at.constraints)))
-    s = State(theta, at, bounds, limits, none, LOST, scale)
+    s = State(theta, at, bounds, limits, none, LOST, scale, p.tolerance)
     if not at.finite:
         return s
     s = s._replace(found=multipliers(at.gradient, at.jacobian, bounds, limits, size))

@@ -9,17 +9,26 @@ import jax.numpy as jnp
 import numpy as np
 
 from beamfit.greybox import problem
-from beamfit.greybox.assess import TOLERANCE, State, gradient_size, scale_of
+from beamfit.greybox.assess import State, gradient_size, scale_of
 from beamfit.greybox.descend import descend_all
 from beamfit.greybox.problem import Problem
 
 
 class Conflict(NamedTuple):
-    """The point nearest to all constraints, and names of those that conflict, if any do."""
+    """The point nearest to all constraints, and names of those that conflict, if any do.
+
+    `bounds` says which bounds take part, `numbers` names the numbers they bound.
+    """
 
     theta: np.ndarray
     constraints: tuple[str, ...]
-    bounds: tuple[str, ...]
+    bounds: tuple[str, ...] = ()
+    numbers: tuple[str, ...] = ()
+
+    @property
+    def about(self) -> tuple[str, ...]:
+        """Names of everything that takes part."""
+        return (*self.constraints, *self.numbers)
 
     @property
     def feasible(self) -> bool:
@@ -60,25 +69,26 @@ def relaxed(p: Problem, s: State, starts: Iterable[np.ndarray]) -> Conflict:
         return theta, np.asarray(excess(data, theta))
 
     theta, over = least(np.ones(len(s.limits.size)), p.lower, p.upper)
-    if not np.max(over) > TOLERANCE:
-        return Conflict(theta, (), ())
-    weight = (over > TOLERANCE).astype(float)
+    if not np.max(over) > p.tolerance:
+        return Conflict(theta, ())
+    weight = (over > p.tolerance).astype(float)
     for i in np.flatnonzero(weight):
         without = weight * (np.arange(len(weight)) != i)
-        if np.max(least(without, p.lower, p.upper)[1]) > TOLERANCE:
+        if np.max(least(without, p.lower, p.upper)[1]) > p.tolerance:
             weight = without
     low, high = np.array(p.lower), np.array(p.upper)
     nearest = least(weight, low, high)[0]
-    needed = []
+    needed, numbers = [], []
     for i, at_low in _held(p, nearest):
         freed = [edge.copy() for edge in (low, high)]
         freed[0 if at_low else 1][i] = -np.inf if at_low else np.inf
-        if np.max(least(weight, *freed)[1]) > TOLERANCE:
+        if np.max(least(weight, *freed)[1]) > p.tolerance:
             low, high = freed
         else:
+            numbers.append(p.names[i])
             needed.append(f"{p.names[i]} {'>=' if at_low else '<='} {nearest[i]:.4g}")
     names = np.array(p.constraint_names)[weight > 0]
-    return Conflict(theta, tuple(names.tolist()), tuple(needed))
+    return Conflict(theta, tuple(names.tolist()), tuple(needed), tuple(numbers))
 
 
 def _held(p: Problem, theta: np.ndarray) -> list[tuple[int, bool]]:
@@ -137,7 +147,7 @@ def dependence(p: Problem, s: State, stationary: bool) -> Dependence | None:
     force = np.concatenate([s.found.bounds, s.found.constraints])
     pull = np.concatenate([unit, np.linalg.norm(s.at.jacobian * unit, axis=1)])
     strength = np.max(gradient_size(p, s.at, s.scale) * unit)
-    free = equal | (stationary & (np.abs(force) * pull > TOLERANCE * strength))
+    free = equal | (stationary & (np.abs(force) * pull > p.tolerance * strength))
     outward = np.where(low, 1.0, -1.0)[:, None] * gradients
     length = np.linalg.norm(gradients, axis=1)
     steep = length > SLOPELESS * size

@@ -9,10 +9,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
+from scipy import sparse
 
+from beamfit.greybox.factors import FEW, Factor, Rows, in_units, lengths, with_diagonal
 from beamfit.greybox.terms import Record
 
 # A quantity counts as determined while bounds carry less than this share of its variance.
@@ -23,6 +26,9 @@ CUT = 1e-10
 PART = 1e-6
 # The standard deviation, in units of the best known direction, of one that nothing limits.
 FAR = 1e12
+# Of many numbers the normal equations tell errors while the least eigenvalue, columns having unit
+# length, is above this share of the largest: to 1e-6 and better.
+SAFE = 1e-10
 # The noise of data that a model meets exactly, which must not be zero.
 EXACT = 1e-30
 
@@ -77,10 +83,32 @@ class Spread(NamedTuple):
         """Covariance, huge along open directions: for designs, which add information."""
         return self.seen + self.open @ self.open.T
 
+    @property
+    def rank(self) -> int:
+        """How many directions are seen."""
+        return self.half.shape[1]
+
+    @property
+    def errors(self) -> np.ndarray:
+        """Standard error of each number."""
+        return self.error(np.eye(len(self.half)))
+
+    @property
+    def shares(self) -> np.ndarray:
+        """`share` of each number."""
+        return self.share(np.eye(len(self.half)))
+
+    def trace(self, rows: np.ndarray) -> float:
+        """Trace of these rows' part of the hat matrix J (JᵀJ)⁻¹ Jᵀ."""
+        return float(np.sum((rows @ self.half) ** 2))
+
+    def size(self, gradient: np.ndarray) -> np.ndarray:
+        """Standard error along the directions that are seen."""
+        return np.linalg.norm(gradient @ self.half, axis=-1)
+
     def error(self, gradient: np.ndarray) -> np.ndarray:
         """Standard error of quantities by their gradients, shape (..., n) to (...)."""
-        size = np.linalg.norm(gradient @ self.half, axis=-1)
-        return np.where(self._open(gradient), np.inf, size)
+        return np.where(self._open(gradient), np.inf, self.size(gradient))
 
     def share(self, gradient: np.ndarray) -> np.ndarray:
         """Share of each quantity's variance that rests on bounds or on nothing, from 0 to 1."""
@@ -95,9 +123,93 @@ class Spread(NamedTuple):
         return moved > PART * (np.abs(gradient) @ self.reach)
 
 
-def triangle(rows: np.ndarray) -> np.ndarray:
-    """The triangle R of rows = Q R where there are more rows than columns: RᵀR = rowsᵀrows."""
-    return np.linalg.qr(rows, mode="r") if rows.shape[0] > rows.shape[1] else rows
+class FactoredSpread:
+    """A `Spread` of many numbers without an open direction, from factors of the information.
+
+    `loose` are the numbers that move, `unit` the lengths of their columns, `factor` is of the
+    information in those units.
+    """
+
+    def __init__(self, loose: np.ndarray, unit: np.ndarray, factor: Factor, from_bounds):
+        self.loose, self.unit, self.factor, self.from_bounds = loose, unit, factor, from_bounds
+        self.rank = int(loose.sum())
+        self.open = np.zeros((len(loose), 0))
+
+    @property
+    def safe(self) -> bool:
+        """Whether all directions are seen, so clearly that normal equations tell their errors.
+
+        The trace of the inverse is not below 1 over the least eigenvalue.
+        """
+        own = self.factor.inverse.diagonal()
+        largest = np.max(np.asarray(abs(self.factor.matrix).sum(axis=0)), initial=0.0)
+        return bool(np.all(own > 0) and np.sum(own) * largest < 1 / SAFE)
+
+    @cached_property
+    def seen(self) -> np.ndarray:
+        """Covariance, shape (n, n)."""
+        found = np.zeros((len(self.loose),) * 2)
+        half = self.factor.solve(np.diag(1.0 / self.unit)) / self.unit[:, None]
+        found[np.ix_(self.loose, self.loose)] = half
+        return found
+
+    @property
+    def covariance(self) -> np.ndarray:
+        """The same: no direction is open."""
+        return self.seen
+
+    @cached_property
+    def errors(self) -> np.ndarray:
+        """Standard error of each number."""
+        return self._spread(np.sqrt(self.factor.inverse.diagonal()) / self.unit)
+
+    @cached_property
+    def shares(self) -> np.ndarray:
+        """Share of each number's variance that rests on bounds."""
+        bounds = self.from_bounds[self.loose] / self.unit**2
+        if not bounds.any():
+            return np.zeros(len(self.loose))
+        return self._spread(self.factor.loss(bounds) / self.factor.inverse.diagonal())
+
+    def _spread(self, values: np.ndarray) -> np.ndarray:
+        found = np.zeros(len(self.loose))
+        found[self.loose] = values
+        return found
+
+    def trace(self, rows: Rows) -> float:
+        """Trace of these rows' part of the hat matrix."""
+        part = in_units(rows[:, self.loose], self.unit)
+        if sparse.issparse(part):
+            return float((part.T @ part).multiply(self.factor.inverse).sum())
+        return float(np.sum((part @ self.factor.inverse) * part))
+
+    def _along(self, gradient: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        flat = np.reshape(gradient, (-1, len(self.loose)))[:, self.loose] / self.unit
+        return flat, self.factor.solve(flat.T).T
+
+    def size(self, gradient: np.ndarray) -> np.ndarray:
+        """Standard error of quantities by their gradients, shape (..., n) to (...)."""
+        flat, along = self._along(gradient)
+        return np.sqrt(np.sum(flat * along, axis=-1)).reshape(np.shape(gradient)[:-1])
+
+    def error(self, gradient: np.ndarray) -> np.ndarray:
+        """The same."""
+        return self.size(gradient)
+
+    def share(self, gradient: np.ndarray) -> np.ndarray:
+        """Share of each quantity's variance that rests on bounds."""
+        flat, along = self._along(gradient)
+        whole = np.sum(flat * along, axis=-1)
+        part = along**2 @ (self.from_bounds[self.loose] / self.unit**2)
+        share = part / np.where(whole > 0, whole, 1.0)
+        return share.reshape(np.shape(gradient)[:-1])
+
+
+def triangle(rows: Rows) -> Rows:
+    """The triangle R of rows = Q R where that is smaller, RᵀR = rowsᵀrows; many numbers stay."""
+    if rows.shape[0] <= rows.shape[1] or rows.shape[1] > FEW:
+        return rows
+    return np.linalg.qr(rows, mode="r")
 
 
 def directions(
@@ -124,7 +236,8 @@ def directions(
         How far each number can move along one of those.
     """
     n = rows.shape[1]
-    rows = triangle(rows)
+    if rows.shape[0] > n:
+        rows = np.linalg.qr(rows, mode="r")
     length = np.linalg.norm(rows, axis=0)
     unit = 1.0 / np.where(length > 0, length, 1.0)
     tangent = np.eye(n)
@@ -150,13 +263,13 @@ def null_space(rows: np.ndarray) -> np.ndarray:
 
 
 def spread_of(
-    jacobian: np.ndarray,
+    jacobian: Rows,
     lower: np.ndarray,
     upper: np.ndarray,
     held: np.ndarray | None = None,
     with_prior: np.ndarray | None = None,
     equations: np.ndarray | None = None,
-) -> Spread:
+) -> Spread | FactoredSpread:
     """Spread of numbers from the Jacobian of residuals, bounds counted as information.
 
     Parameters
@@ -175,6 +288,7 @@ def spread_of(
     Returns
     -------
     Spread
+        A `FactoredSpread` of more than `FEW` numbers that are all seen clearly.
 
     Notes
     -----
@@ -196,6 +310,12 @@ def spread_of(
         usable &= ~with_prior
     loose = np.ones(n, bool) if held is None else ~held
     information = np.where(usable & loose, 3.0 / np.where(usable, width, 1.0) ** 2, 0.0)
+    if n > FEW and (equations is None or not len(equations)):
+        known = _factored(jacobian, information, loose)
+        if known is not None:
+            return known
+    if sparse.issparse(jacobian):
+        jacobian = jacobian.toarray()
     rows = np.vstack([triangle(jacobian), np.diag(np.sqrt(information))])[:, loose]
     found = directions(rows, None if equations is None else equations[:, loose])
     whole = [np.zeros((n, *part.shape[1:])) for part in found]
@@ -204,11 +324,26 @@ def spread_of(
     return Spread(*whole, information)
 
 
+def _factored(jacobian: Rows, information: np.ndarray, loose: np.ndarray) -> FactoredSpread | None:
+    """Spread by normal equations, if they are safe."""
+    rows = jacobian[:, loose]
+    unit = np.sqrt(lengths(rows) ** 2 + information[loose])
+    if not np.all(unit > 0):
+        return None
+    rows = in_units(rows, unit)
+    normal = with_diagonal(rows.T @ rows, information[loose] / unit**2)
+    try:
+        found = FactoredSpread(loose, unit, Factor(normal), information)
+    except np.linalg.LinAlgError:
+        return None
+    return found if found.safe else None
+
+
 def groups_of(
     records: Sequence[Record],
     residuals: Sequence[np.ndarray],
     blocks: Sequence[np.ndarray],
-    half: np.ndarray,
+    seen: Spread | FactoredSpread,
 ) -> tuple[Group, ...]:
     """Chi-square, degrees of freedom and noise of each record.
 
@@ -220,9 +355,8 @@ def groups_of(
         In units of their errors, zero where the weight is.
     blocks : sequence of ndarray
         `triangle` of each record's rows of the Jacobian.
-    half : ndarray
-        Of the directions that all rows together see: the trace of a block's part of the hat
-        matrix J (JᵀJ)⁻¹ Jᵀ is the sum of squares of block @ half.
+    seen : Spread
+        Of the directions that all rows together see.
 
     Returns
     -------
@@ -236,7 +370,7 @@ def groups_of(
     found, first = [], 0
     for record, r, block in zip(records, residuals, blocks, strict=True):
         chi2, count = float(r @ r), int(record.used.sum())
-        dof = round(count - float(np.sum((block @ half) ** 2)), 9)
+        dof = round(count - seen.trace(block), 9)
         freedom, squares = record.prior_noise
         scale = math.sqrt((squares + chi2) / (freedom + dof)) if dof > 0 else math.nan
         scale = max(1.0, scale) if record.errors_given else scale

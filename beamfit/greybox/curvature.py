@@ -14,6 +14,7 @@ import numpy as np
 
 from beamfit.greybox import assess, problem
 from beamfit.greybox.covariance import null_space, triangle
+from beamfit.greybox.factors import FEW, in_units, weakest
 from beamfit.greybox.problem import Problem
 
 # A Newton step of a further objective longer than this, in the sizes of the numbers, is no end.
@@ -98,17 +99,15 @@ def lower_beside(p: Problem, s: assess.State, lagrangian: Look) -> np.ndarray | 
     The squares' own curvature never does; what their residuals bend shows first where that is
     weakest. Numbers at a bound are tried inward, whatever the force that holds them.
     """
-    tangent, unit = _tangent(p, s), s.scale.unit
-    if not tangent.shape[1]:
+    unit, weak = s.scale.unit, _weakest(p, s)
+    if not weak.shape[1]:
         return None
-    rows = triangle(s.at.residual_jacobian * unit) @ tangent
-    weakest = tangent @ np.linalg.svd(rows, full_matrices=True)[2][-WEAKEST:].T * unit[:, None]
     low, high = s.bounds.reached
     inward = np.flatnonzero((low ^ high) & ~p.nuisance & p.moving)[:AROUND]
     pushes = [
         np.where(np.arange(len(unit)) == i, unit * (1.0 if low[i] else -1.0), 0) for i in inward
     ]
-    sides = [(w, -w) for w in weakest.T]
+    sides = [(w, -w) for w in weak.T]
     every = [s.theta, *(np.clip(s.theta + NEAR * d, p.lower, p.upper)
                         for d in (*(d for pair in sides for d in pair), *pushes))]  # fmt: skip
     cost = lagrangian(np.array(every))
@@ -126,6 +125,21 @@ def lower_beside(p: Problem, s: assess.State, lagrangian: Look) -> np.ndarray | 
         if NEAR * abs(s.at.gradient[inward[i]]) * unit[inward[i]] > LOST * max(cost[0], -change):
             return every[1 + 2 * len(sides) + i]
     return None
+
+
+def _weakest(p: Problem, s: assess.State) -> np.ndarray:
+    """The weakest directions of squares that keep to the limits held by a force."""
+    unit = s.scale.unit
+    held, equations = assess.holding(p, s, p.tolerance)
+    if len(unit) > FEW and not len(equations):
+        found = np.zeros((len(unit), min(WEAKEST, int(np.sum(~held)))))
+        rows = in_units(s.at.residual_jacobian, 1 / unit)[:, ~held]
+        found[~held] = weakest(rows, found.shape[1])
+    else:
+        tangent = _tangent(p, s)
+        rows = triangle(s.at.residual_jacobian * unit) @ tangent
+        found = tangent @ np.linalg.svd(rows, full_matrices=True)[2][-WEAKEST:].T
+    return found * unit[:, None]
 
 
 def _along(
@@ -166,11 +180,11 @@ def _bend(p: Problem, s: assess.State) -> assess.Bend:
     clear = values[0] < -PLAIN * max(largest, 1.0) and np.all(
         np.abs(NEAR * down) < np.minimum(s.theta - p.lower, p.upper - s.theta)
     )
-    return assess.Bend(down, float(newton), not steep.all() or largest < assess.TOLERANCE, clear)
+    return assess.Bend(down, float(newton), not steep.all() or largest < p.tolerance, clear)
 
 
 def _tangent(p: Problem, s: assess.State) -> np.ndarray:
     """Directions, in the sizes of the numbers, that keep to the limits held by a force."""
     unit = s.scale.unit
-    held, equations = assess.holding(p, s, assess.TOLERANCE)
+    held, equations = assess.holding(p, s, p.tolerance)
     return null_space(np.vstack([np.eye(len(unit))[held], equations * unit]))

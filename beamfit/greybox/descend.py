@@ -20,18 +20,24 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from beamfit.greybox.factors import FEW, RIDGE, Factor, Rows, in_units, lengths, with_diagonal
 from beamfit.greybox.problem import Problem, with_slope
 from beamfit.greybox.problem import residual as problem_residual
 
 DAMPING = 1e-3
 # On the length of a step relative to the numbers, both in units of the Jacobian's columns.
 TOLERANCE = 1e-13
+# The damping falls by this factor at most in one step.
+EASED = 1e-4
 # Beyond this no step however short lowers the cost.
 STUCK = 1e30
 # What a step promises is below rounding under this share of the sum of squares.
 ROUNDING = 1e-16
-# Rounds of pinning in a step; what the last one pushes out is clipped.
+# Most rounds of pinning in a step; what the last one pushes out is clipped.
 PINNED = 3
+# Where a step gains what it promised to within a share, the damping falls by so many times the
+# share: near a solution steps become undamped, and converge as fast as Gauss-Newton's.
+TRUSTED = 10.0
 # With a limit of time the clock is looked at after so many steps.
 SEGMENT = 50
 # Searches in a compiled call, where their Jacobians have no more than so many numbers.
@@ -84,10 +90,12 @@ def walk(
     iterations: Any,
     tolerance: float = TOLERANCE,
     memory: tuple[Any, Any, Any, Any] = (DAMPING, 2.0, 0.0, 0),
+    moves: Any = True,
 ) -> Walk:
     """Search until it rests, is stuck or has taken so many steps, refused ones too.
 
-    `memory` has damping, growth, column lengths and steps of an earlier walk to go on from.
+    `memory` has damping, growth, column lengths and steps of an earlier walk to go on from. A walk
+    that does not move only looks at its start.
     """
     theta = jnp.clip(start, lower, upper)
     shape = jax.eval_shape(residual, theta)
@@ -103,7 +111,8 @@ def walk(
     def go_on(s: Walk) -> Array:
         return ~s.rested & ~s.stuck & (s.steps < more)
 
-    last = jax.lax.while_loop(go_on, partial(_advance, residual, lower, upper, tolerance), first)
+    advance = partial(_advance, residual, lower, upper, tolerance, moves)
+    last = jax.lax.while_loop(go_on, advance, first)
     return last._replace(steps=last.steps + steps)
 
 
@@ -192,7 +201,7 @@ def descend_all(
     return jax.vmap(one)(jnp.asarray(starts, float))
 
 
-def _advance(residual, lower: Array, upper: Array, tolerance: float, s: Walk) -> Walk:
+def _advance(residual, lower: Array, upper: Array, tolerance: float, moves, s: Walk) -> Walk:
     """Look at the point tried, take or refuse it, and find the next one."""
     first = s.steps < 0
     r, j = with_slope(residual, s.trial)
@@ -200,12 +209,13 @@ def _advance(residual, lower: Array, upper: Array, tolerance: float, s: Walk) ->
     gained = 0.5 * (s.residual - r) @ (s.residual + r)
     ratio = jnp.where(finite & (s.promised > 0), gained / s.promised, -1.0)
     good = first | (ratio > 1e-4)
-    eased = s.damping * jnp.maximum(1 / 3, 1 - (2 * jnp.minimum(ratio, 1.0) - 1) ** 3)
+    eased = s.damping * _easing(ratio)
     kept = partial(jnp.where, good)
     theta, r, j = kept(s.trial, s.theta), kept(r, s.residual), kept(j, s.jacobian)
     scale = jnp.maximum(s.scale, jnp.linalg.norm(j, axis=0))
     damping = jnp.where(first, s.damping, kept(eased, s.damping * s.growth))
-    trial = _next(theta, r, j, scale, damping, lower, upper)
+    at = (theta, r, j, scale, damping, lower, upper)
+    trial = _next(*at) if moves is True else jax.lax.cond(moves, _next, lambda *at: at[0], *at)
     change = trial - theta
     promised = -(r @ (j @ change)) - 0.5 * jnp.sum((j @ change) ** 2)
     small = jnp.linalg.norm(scale * change) <= tolerance * jnp.linalg.norm(scale * theta)
@@ -215,6 +225,12 @@ def _advance(residual, lower: Array, upper: Array, tolerance: float, s: Walk) ->
         theta, r, j, scale, damping, kept(jnp.where(first, s.growth, 2.0), 2.0 * s.growth),
         s.steps + 1, small | nothing, (damping > STUCK) | (first & ~finite), trial, promised,
     )  # fmt: skip
+
+
+def _easing(ratio: Any) -> Any:
+    """By how much the damping changes after a step that gained that share of its promise."""
+    nielsen = jnp.maximum(1 / 3, 1 - (2 * jnp.minimum(ratio, 1.0) - 1) ** 3)
+    return jnp.minimum(nielsen, jnp.maximum(TRUSTED * jnp.abs(1 - ratio), EASED))
 
 
 def _next(theta, residual, jacobian, scale, damping, lower, upper) -> Array:
@@ -232,9 +248,13 @@ def _next(theta, residual, jacobian, scale, damping, lower, upper) -> Array:
     g = triangle.T @ reduced
     pinned = ((low >= 0) & (g > 0)) | ((high <= 0) & (g < 0)) | (lower >= upper)
 
-    def pin(_, state):
+    def unfinished(state):
+        pinned, _, before, rounds = state
+        return (rounds == 0) | ((rounds < PINNED) & jnp.any(pinned != before))
+
+    def pin(state):
         # A pinned number stands alone in its row; the others are solved beside it.
-        pinned, held = state
+        pinned, held, _, rounds = state
         at = jnp.where(pinned, held, 0.0)
         loose = jnp.where(pinned, 0.0, triangle)
         left = jnp.vstack([loose, jnp.diag(jnp.where(pinned, 1.0, jnp.sqrt(damping)))])
@@ -242,9 +262,10 @@ def _next(theta, residual, jacobian, scale, damping, lower, upper) -> Array:
         r = jnp.linalg.qr(jnp.column_stack([left, right]), mode="r")
         tried = jax.scipy.linalg.solve_triangular(r[:n, :n], r[:n, n])
         clipped = jnp.clip(tried, low, high)
-        return pinned | (clipped != tried), clipped
+        return pinned | (clipped != tried), clipped, pinned, rounds + 1
 
-    _, held = jax.lax.fori_loop(0, PINNED, pin, (pinned, jnp.zeros_like(g)))
+    begin = (pinned, jnp.zeros_like(g), pinned, jnp.asarray(0))
+    held = jax.lax.while_loop(unfinished, pin, begin)[1]
     inside = jnp.clip(theta + held / unit, lower, upper)
     # Exactly on a bound, or the number is not known to be there.
     found = jnp.where(held <= low, lower, jnp.where(held >= high, upper, inside))
@@ -319,11 +340,125 @@ class Lanes:
         self.at.rested[lane] = self.at.stuck[lane] = False
 
 
+class ManyLanes(Lanes):
+    """The same for many free numbers, one search after the other outside JAX.
+
+    Steps solve normal equations, sparse where the problem is, and are corrected by the residual
+    that they leave (corrected seminormal equations: Å. Björck, Linear Algebra Appl. 88/89 (1987)
+    31).
+    """
+
+    def __init__(self, p: Problem, points: np.ndarray):
+        self.p, self.width = p, 1
+        k, n = points.shape
+        nothing, no = np.zeros(k), np.zeros(k, bool)
+        self.at = Walk(
+            np.array(points), np.full((k, p.residual_count), np.inf), np.empty(k, object),
+            np.zeros((k, n)), nothing + DAMPING, nothing + 2.0, np.zeros(k, int), no, no.copy(),
+            np.array(points), nothing,
+        )  # fmt: skip
+
+    def look(self, points: np.ndarray) -> np.ndarray:
+        """Cost at points, without moving."""
+        look = self.p.compiled(problem_residual)
+        found = (np.asarray(look(point)) for point in points)
+        return np.array([0.5 * residual @ residual for residual in found])
+
+    def slopes(self, theta: np.ndarray) -> tuple[np.ndarray, Rows]:
+        """Residuals and their Jacobian, in as few sweeps as its pattern allows."""
+        pattern = self.p.pattern
+        if pattern is not None:
+            r, swept = map(np.asarray, self.p.compiled(_swept)(theta, pattern.seeds))
+            found = pattern.matrix(swept)
+            if pattern.holds(found, swept):
+                return r, found
+        r, found = self.p.compiled(_sloped)(theta)
+        return np.asarray(r), np.asarray(found)
+
+    def _move(self, some: np.ndarray, limit: int) -> None:
+        for lane in some:
+            memory = tuple(part[lane] for part in self.at.memory)
+            walked = self._walk(self.at.theta[lane], memory, limit)
+            for own, part in zip(self.at, walked, strict=True):
+                own[lane] = part
+
+    def _walk(self, theta: np.ndarray, memory: tuple[Any, ...], limit: int) -> Walk:
+        """`walk`, looking at one point tried after the other."""
+        p, (damping, growth, scale, steps), rested = self.p, memory, False
+        theta = np.clip(theta, p.lower, p.upper)
+        r, j = self.slopes(theta)
+        while not (stuck := damping > STUCK or not np.isfinite(r.sum() + j.sum())):
+            scale = np.maximum(scale, lengths(j))
+            try:
+                trial = _next_of_many(theta, r, j, scale, damping, p.lower, p.upper)
+            except np.linalg.LinAlgError:
+                damping, growth, steps = max(damping, RIDGE) * growth, 2.0 * growth, steps + 1
+                continue
+            change = trial - theta
+            moved = j @ change
+            promised = -(r @ moved) - 0.5 * moved @ moved
+            rested = np.linalg.norm(scale * change) <= TOLERANCE * np.linalg.norm(scale * theta)
+            if rested or steps >= limit:
+                break
+            new, slope = self.slopes(trial)
+            steps += 1
+            ratio = 0.5 * (r - new) @ (r + new) / promised if promised > 0 else -1.0
+            if ratio > 1e-4 and np.isfinite(slope.sum()):
+                theta, r, j = trial, new, slope
+                damping, growth = damping * float(_easing(ratio)), 2.0
+            elif 0 <= promised <= ROUNDING * (r @ r):
+                rested = True
+                break
+            else:
+                damping, growth = damping * growth, 2.0 * growth
+        return Walk(theta, r, j, scale, damping, growth, steps, rested, stuck, theta, 0.0)
+
+
+def _next_of_many(theta, residual, jacobian, scale, damping, lower, upper) -> np.ndarray:
+    """`_next`, by normal equations of the numbers that are not pinned."""
+    unit = np.where(scale > 0, scale, 1.0)
+    low, high = (lower - theta) * unit, (upper - theta) * unit
+    rows = in_units(jacobian, unit)
+    normal, g = rows.T @ rows, rows.T @ residual
+    pinned = ((low >= 0) & (g > 0)) | ((high <= 0) & (g < 0)) | (lower >= upper)
+    held, more = np.zeros(len(theta)), max(damping, RIDGE)
+    for _ in range(PINNED):
+        loose, held = np.flatnonzero(~pinned), np.where(pinned, held, 0.0)
+        part = normal if len(loose) == len(theta) else normal[loose][:, loose]
+        factor = Factor(with_diagonal(part, more))
+        for _ in range(2):  # the second corrects the rounding of the first
+            left = rows.T @ (residual + rows @ held) + damping * held
+            held[loose] -= factor.solve(left[loose])
+        clipped = np.clip(held, low, high)
+        more_pinned = pinned | (clipped != held)
+        held, done, pinned = clipped, np.array_equal(pinned, more_pinned), more_pinned
+        if done:
+            break
+    inside = np.clip(theta + held / unit, lower, upper)
+    return np.where(held <= low, lower, np.where(held >= high, upper, inside))
+
+
+def lanes_of(p: Problem, points: np.ndarray) -> Lanes:
+    """Searches from points, by the method for as many free numbers as there are."""
+    return (Lanes if len(p.start) <= FEW else ManyLanes)(p, points)
+
+
+def _sloped(core, theta):
+    """Residuals and their Jacobian."""
+    return with_slope(partial(problem_residual, core), theta)
+
+
+def _swept(core, theta, seeds):
+    """Residuals, and the products of their Jacobian with some directions."""
+    r, along = jax.linearize(partial(problem_residual, core), theta)
+    return r, jax.vmap(along)(seeds)
+
+
 def _walks(core, starts, memory, limit, lower, upper) -> Walk:
     """Searches from starts, each with its own memory and limit of steps."""
-    residual = partial(problem_residual, core)
+    residual, moves = partial(problem_residual, core), jnp.any(limit > 0)
 
     def one(theta, memory, limit):
-        return walk(residual, theta, lower, upper, limit, memory=memory)
+        return walk(residual, theta, lower, upper, limit, memory=memory, moves=moves)
 
     return jax.vmap(one)(starts, memory, limit)

@@ -62,9 +62,12 @@ def diagnose(p: Problem) -> tuple[Ailment, ...]:
     unused ('c',)
     undetermined ('a', 'b')
     """
-    ailing = (*contradictory(p), *not_finite(p, np.clip(p.start, p.lower, p.upper)))
-    if ailing:
-        return ailing
+    start = np.clip(p.start, p.lower, p.upper)
+    if wrong := contradictory(p):
+        return tuple(wrong)
+    # Part by part only what is known to be wrong: that is traced anew each time.
+    if not assess.slopes(p, start).finite and (wrong := not_finite(p, start)):
+        return tuple(wrong)
     looks = [at for at in _looks(p) if at.finite]
     if not looks:  # a slope is not finite anywhere near: nothing to read off
         return ()

@@ -6,19 +6,21 @@ from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
+from scipy import sparse
 
 from beamfit.greybox import assess
-from beamfit.greybox.assess import TOLERANCE, State
+from beamfit.greybox.assess import State
 from beamfit.greybox.conflict import Conflict
 from beamfit.greybox.covariance import (
     MOST_SHARE,
+    FactoredSpread,
     Group,
     Spread,
-    directions,
     groups_of,
     spread_of,
     triangle,
 )
+from beamfit.greybox.factors import Rows
 from beamfit.greybox.fit import Attempt, Limited, Variable
 from beamfit.greybox.problem import Problem
 
@@ -59,8 +61,8 @@ class Known(NamedTuple):
     """
 
     groups: tuple[Group, ...]
-    spread: Spread
-    raw: Spread
+    spread: Spread | FactoredSpread
+    raw: Spread | FactoredSpread
     unseen: np.ndarray
     rank: int
     blind: np.ndarray
@@ -90,23 +92,35 @@ def known(p: Problem, s: State) -> Known:
     """
     held, equations = assess.holding(p, s, 1e-9)
     ends = np.cumsum([record.measured.size for record in p.records], dtype=int)
-    blocks = [triangle(part) for part in np.split(s.at.residual_jacobian, ends)]
-    half, unseen, _ = directions(np.vstack(blocks), np.vstack([np.eye(len(held))[held], equations]))
-    groups = groups_of(p.records, np.split(s.at.residual, ends)[:-1], blocks[:-1], half)
+    parts = zip([0, *ends], [*ends, None], strict=True)
+    blocks = [triangle(s.at.residual_jacobian[first:last]) for first, last in parts]
+    nowhere = np.full(len(held), np.inf)
+    seen = spread_of(_stacked(blocks), -nowhere, nowhere, held, None, equations)
+    groups = groups_of(p.records, np.split(s.at.residual, ends)[:-1], blocks[:-1], seen)
     still = (np.isin(s.bounds.states(s.found.bounds), EDGES) & p.nuisance) | ~p.moving
 
     def spread(factors, still):
         parts = [block / f for block, f in zip(blocks, [*factors, 1.0], strict=True)]
-        return spread_of(np.vstack(parts), p.lower, p.upper, still, p.with_prior, equations)
+        return spread_of(_stacked(parts), p.lower, p.upper, still, p.with_prior, equations)
 
     factors = [group.factor for group in groups]
-    scaled = spread(factors, still)
+    limited = np.isfinite(p.upper - p.lower) & p.moving & ~p.with_prior
+    if np.array_equal(still, held) and not limited.any() and all(f == 1.0 for f in factors):
+        scaled = seen
+    else:
+        scaled = spread(factors, still)
     plain = [1.0 if group.errors_given else group.factor for group in groups]
     raw = scaled if plain == factors else spread(plain, still)
     given_bounds = scaled if np.array_equal(still, held) else spread(factors, held)
-    blind = (given_bounds.share(np.eye(len(held))) >= MOST_SHARE) & ~held
-    unseen = unseen / np.where((n := np.linalg.norm(unseen, axis=0)) > 0, n, 1.0)
-    return Known(groups, scaled, raw, unseen, half.shape[1], blind, held)
+    blind = (given_bounds.shares >= MOST_SHARE) & ~held
+    unseen = seen.open / np.where((n := np.linalg.norm(seen.open, axis=0)) > 0, n, 1.0)
+    return Known(groups, scaled, raw, unseen, seen.rank, blind, held)
+
+
+def _stacked(blocks: list[Rows]) -> Rows:
+    if any(map(sparse.issparse, blocks)):
+        return sparse.csr_array(sparse.vstack(blocks))
+    return np.vstack(blocks)
 
 
 def settled(p: Problem, s: State) -> bool:
@@ -116,7 +130,7 @@ def settled(p: Problem, s: State) -> bool:
     scatter says where no errors were given, is below `SETTLED`. Networks have flat valleys in which
     a strict optimum is never reached and nothing changes any more.
     """
-    if p.objectives or not s.at.finite or s.kkt.feasibility > TOLERANCE:
+    if p.objectives or not s.at.finite or not s.feasible:
         return False
     found = known(p, s)
     weight = np.ones(len(s.at.residual))
@@ -125,7 +139,7 @@ def settled(p: Problem, s: State) -> bool:
     pull = s.at.residual_jacobian.T @ (weight * s.at.residual)
     outward = np.where(s.bounds.reached[0], pull > 0, s.bounds.reached[1] & (pull < 0))
     pull = np.where(outward | found.held, 0.0, pull)
-    return bool(np.sum((pull @ found.raw.half) ** 2) < SETTLED)
+    return bool(found.raw.size(pull) ** 2 < SETTLED)
 
 
 def listed(names: Iterable[str]) -> str:

@@ -14,8 +14,9 @@ import numpy as np
 from beamfit.compile_cache import SELDOM
 from beamfit.errors import InputError, nearest
 from beamfit.greybox import tree
-from beamfit.greybox.assess import KKT, TOLERANCE
-from beamfit.greybox.covariance import MOST_SHARE, Group, Spread
+from beamfit.greybox.assess import KKT
+from beamfit.greybox.covariance import MOST_SHARE, FactoredSpread, Group, Spread
+from beamfit.greybox.factors import Rows
 from beamfit.greybox.problem import Problem, with_slope
 from beamfit.greybox.stated import Optimum
 from beamfit.status import Status
@@ -126,7 +127,8 @@ class Fit:
         Errors in linear approximation along the active limits, bounds counted as information:
         each record's residuals divided by the scale of its group, or by 1 where errors were given.
     jacobian : array, shape (m, n)
-        Derivatives of the residuals, in units of their errors, priors last.
+        Derivatives of the residuals, in units of their errors, priors last; sparse where the
+        problem is, of many numbers.
     undetermined : array, shape (n, k)
         Directions in theta that the residuals do not see.
     scale : float
@@ -135,6 +137,8 @@ class Fit:
         Every start; the best one is the answer.
     seconds : float
         Time taken, compilation included.
+    about : tuple of str
+        Names of the numbers and constraints that the verdict speaks of.
     """
 
     problem: Problem
@@ -148,13 +152,14 @@ class Fit:
     kkt: KKT
     variables: tuple[Variable, ...]
     constraints: tuple[Limited, ...]
-    spread: Spread
-    spread_raw: Spread
-    jacobian: np.ndarray
+    spread: Spread | FactoredSpread
+    spread_raw: Spread | FactoredSpread
+    jacobian: Rows
     undetermined: np.ndarray
     scale: float
     attempts: tuple[Attempt, ...]
     seconds: float
+    about: tuple[str, ...] = ()
 
     @property
     def model(self) -> Any:
@@ -280,7 +285,7 @@ class Fit:
     @property
     def optimum(self) -> Optimum:
         """What the sampler needs to know of this fit."""
-        near = [a for a in self.attempts if a.kkt.worst <= TOLERANCE]
+        near = [a for a in self.attempts if a.kkt.worst <= self.problem.tolerance]
         return Optimum(
             self.theta,
             Finding(self.status, self.message),

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 
 from beamfit.greybox import assess, curvature
-from beamfit.greybox.assess import TOLERANCE
 from beamfit.greybox.conflict import dependence
 from beamfit.greybox.evidence import Evidence, listed
 from beamfit.greybox.problem import Problem
@@ -29,26 +28,27 @@ LOOKS, REACHES = 24, (0.1, 1.0, 10.0)
 
 def crossed(e: Evidence) -> Finding | None:
     """Say which limits cannot be kept together."""
-    if e.state.kkt.feasibility <= TOLERANCE:
+    if e.state.feasible:
         return None
-    place = " bounds: outside;"
+    place, about = " bounds: outside;", ()
     if e.constraints:
         worst = e.constraints[int(np.argmax(e.state.limits.violation))]
         place = (
             f" '{worst.name}' ends at {worst.value:.4g}, outside"
             f" [{worst.lower:.4g}, {worst.upper:.4g}];"
         )
+        about = (worst.name,)
     remedy = "relax it, free more numbers, or start elsewhere."
     conflict = e.search.conflict
     if conflict is not None and not conflict.feasible:
-        one = len(conflict.constraints) == 1
+        one, about = len(conflict.constraints) == 1, conflict.about
         place += f" {listed(map(repr, conflict.constraints))} cannot hold"
         place += "" if one and not conflict.bounds else " together" if not one else ""
         place += f" within {listed(conflict.bounds)}" if conflict.bounds else ""
         place += ";" if one and not conflict.bounds else ", without any one of them it can;"
         remedy = f"relax {'it' if one else 'one of them'}, free more numbers, or start elsewhere."
     cause = f"no point within all constraints was found from {e.search.words}:{place}"
-    return Finding(Status.infeasible, cause, remedy)
+    return Finding(Status.infeasible, cause, remedy, about)
 
 
 def endless(e: Evidence) -> Finding | None:
@@ -59,7 +59,8 @@ def endless(e: Evidence) -> Finding | None:
     along = f" as {listed(np.array(e.problem.names)[far])} grows" if far.any() else ""
     remedy = "bound the free numbers, or check the sign of the objective."
     cause = f"the cost falls without end{along} (down to {cost:.3g});"
-    return Finding(Status.unbounded, cause, remedy)
+    about = tuple(np.array(e.problem.names)[far].tolist())
+    return Finding(Status.unbounded, cause, remedy, about)
 
 
 def outgrown(s: assess.State) -> bool:
@@ -76,7 +77,7 @@ def _far(s: assess.State) -> np.ndarray:
 def degenerate(e: Evidence) -> Finding | None:
     """Say that multipliers are not unique, or that there are none."""
     s = e.state
-    found = dependence(e.problem, s, s.kkt.worst <= TOLERANCE)
+    found = dependence(e.problem, s, s.optimal)
     if found is None:
         return None
     names = listed(map(repr, found.names))
@@ -88,32 +89,35 @@ def degenerate(e: Evidence) -> Finding | None:
             f"multiplier and solvers stop anywhere along it{_gap(e)};",
             "state what it is made of one by one, g <= 0 in the place of "
             "sum(max(g, 0)^2) <= 0 or g^2 <= 0.",
+            found.slopeless,
         )
     one = "its gradient vanishes" if len(found.names) == 1 else "their gradients are dependent"
-    if s.kkt.worst <= TOLERANCE:
+    if s.optimal:
         return Finding(
             Status.degenerate,
             f"an optimum, but where {names} hold {one}, so that multipliers are not unique;",
             "leave out what the others imply, or read their multipliers together.",
+            found.names,
         )
     return Finding(
         Status.degenerate,
         f"where {names} hold {one} (no constraint qualification), so that the best point has "
         f"no multipliers{_gap(e)};",
         "state them so that their gradients differ.",
+        found.names,
     )
 
 
 def _gap(e: Evidence) -> str:
     """How far the point is from an optimum of first order, where it is none."""
     worst = e.state.kkt.worst
-    return f" (KKT residual {worst:.1e})" if worst > TOLERANCE else ""
+    return f" (KKT residual {worst:.1e})" if not e.state.optimal else ""
 
 
 def saddle(e: Evidence) -> Finding | None:
     """Say that the cost falls on both sides of a stationary point."""
     bend = e.state.bend
-    if e.state.kkt.worst > TOLERANCE or bend is None or bend.direction is None:
+    if not e.state.optimal or bend is None or bend.direction is None:
         return None
     part = np.abs(bend.direction / e.state.scale.unit)
     along = np.array(e.problem.names)[part > 0.3 * np.max(part)]
@@ -125,7 +129,7 @@ def restless(e: Evidence) -> Finding | None:
     """Say that the search ended short of an optimum."""
     bend, steps = e.state.bend, sum(a.iterations for a in e.search.attempts)
     why = None
-    if e.state.kkt.worst > TOLERANCE and not e.settled:
+    if not e.state.optimal and not e.settled:
         why = f"KKT residual {e.state.kkt.worst:.1e}"
     elif bend is not None and bend.direction is not None:
         why = "the cost still bends down there"
@@ -141,7 +145,7 @@ def restless(e: Evidence) -> Finding | None:
 def others(e: Evidence) -> list[tuple[float, int]]:
     """Costs of other optima on which starts ended, and of how many."""
     least = ALIKE * max(e.state.scale.cost, abs(e.state.at.cost))
-    ends = sorted(a.cost for a in e.search.attempts if a.kkt.worst <= TOLERANCE)
+    ends = sorted(a.cost for a in e.search.attempts if a.kkt.worst <= e.problem.tolerance)
     seen: list[tuple[float, int]] = []
     for cost in (c for c in ends if c - e.state.at.cost > least):
         if seen and cost - seen[-1][0] <= least:
@@ -181,7 +185,7 @@ def optimal(e: Evidence) -> Finding:
 def _agreed(e: Evidence) -> int:
     """How many starts ended on the answer."""
     least = ALIKE * max(e.state.scale.cost, abs(e.state.at.cost))
-    ends = (a for a in e.search.attempts if a.kkt.worst <= TOLERANCE)
+    ends = (a for a in e.search.attempts if a.kkt.worst <= e.problem.tolerance)
     return sum(abs(a.cost - e.state.at.cost) <= least for a in ends)
 
 

@@ -19,8 +19,11 @@ import numpy as np
 
 from beamfit.errors import InputError
 from beamfit.greybox import tree
+from beamfit.greybox.sparsity import Pattern, pattern_of
 from beamfit.greybox.terms import Constraint, Free, Objective, Prior, Record
 
+# Within which a limit counts as reached and a point as an optimum.
+TOLERANCE = 1e-6
 # Records are padded to powers of two from here on.
 SHORTEST = 8
 
@@ -118,6 +121,8 @@ class Problem:
     priors : sequence of Prior
     constraints : sequence of Constraint
     objectives : sequence of Objective
+    tolerance : float
+        Within which a limit counts as reached and a point as an optimum, in the problem's sizes.
 
     Raises
     ------
@@ -144,6 +149,7 @@ class Problem:
     priors: Sequence[Prior] = ()
     constraints: Sequence[Constraint] = ()
     objectives: Sequence[Objective] = ()
+    tolerance: float = TOLERANCE
     core: Core = field(init=False, repr=False)
 
     def __post_init__(self):
@@ -258,7 +264,12 @@ class Problem:
     @cached_property
     def residual_count(self) -> int:
         """How many residuals there are, those of priors included."""
-        return self.size + sum(_shape_of(p.residual, self.core.model)[0] for p in self.priors)
+        return self.size + sum(shape_of(p.residual, self.core.model)[0] for p in self.priors)
+
+    @cached_property
+    def pattern(self) -> Pattern | None:
+        """Places of the residuals' Jacobian that may differ from zero; None where it is dense."""
+        return pattern_of(partial(residual, self.core), self.start)
 
     @cached_property
     def least_residual(self) -> float:
@@ -335,7 +346,7 @@ class Problem:
     @cached_property
     def _constraint_shapes(self) -> list[tuple[Constraint, tuple[int, ...]]]:
         """Each constraint with the shape of its values."""
-        return [(c, _shape_of(c.function, self.core.model, c.data)) for c in self.constraints]
+        return [(c, shape_of(c.function, self.core.model, c.data)) for c in self.constraints]
 
     def _limits(self, what: str) -> np.ndarray:
         """One limit of every constraint, spread over its elements."""
@@ -354,7 +365,7 @@ class Problem:
 _GROUPS = ("records", "priors", "constraints", "objectives")
 
 
-def _shape_of(function: Callable, *arguments: Any) -> tuple[int, ...]:
+def shape_of(function: Callable, *arguments: Any) -> tuple[int, ...]:
     """Shape of what a function gives, traced once for each structure and shape of arguments."""
     leaves, structure = jax.tree_util.tree_flatten(arguments)
     kinds = tuple((np.shape(leaf), getattr(leaf, "dtype", np.dtype(float))) for leaf in leaves)
@@ -370,7 +381,7 @@ def _traced_shape(function, structure, kinds) -> tuple[int, ...]:
 def _check_shapes(problem: Problem) -> None:
     """Refuse predictions, priors and limits whose shapes do not fit, before anything runs."""
     for record in problem.records:
-        found = _shape_of(record.predict, problem.core.model, record.data)
+        found = shape_of(record.predict, problem.core.model, record.data)
         if found != record.measured.shape:
             raise InputError(
                 f"a prediction of shape {found} for record '{record.name}'",

@@ -17,10 +17,15 @@ from beamfit.greybox.problem import Problem
 
 
 class Budget(NamedTuple):
-    """How long a search may go on: steps from one start, and a moment on the clock or None."""
+    """How long a search may go on: steps from one start, and a moment on the clock or None.
+
+    `solver` is the one asked for, if any, `tolerance` that of the problem.
+    """
 
     iterations: int
     until: float | None
+    solver: str | None = None
+    tolerance: float = problem.TOLERANCE
 
     @property
     def left(self) -> float:
@@ -69,8 +74,8 @@ def _uno(preset: str) -> Callable[[Program, np.ndarray, int], Proposal]:
         solver.set_preset(preset)
         solver.set_option("logger", "SILENT")
         solver.set_option("max_iterations", iterations)
-        solver.set_option("primal_tolerance", 1e-9)
-        solver.set_option("dual_tolerance", 1e-8)
+        solver.set_option("primal_tolerance", min(1e-9, 1e-3 * budget.tolerance))
+        solver.set_option("dual_tolerance", min(1e-8, 1e-2 * budget.tolerance))
         solver.set_option("time_limit", float(min(120.0, max(budget.left, 0.01))))
         found = solver.optimize(_uno_model(unopy, program, x))
         # Uno reports an infeasible problem as an optimisation status of success.
@@ -164,21 +169,25 @@ def _slsqp(program: Program, x: np.ndarray, iterations: int, budget: Budget) -> 
 
 
 class Stage(NamedTuple):
-    """A solver, the Hessian it wants (gauss_newton, exact or none), and its steps in one go."""
+    """A solver, the name it is asked for by, the Hessian it wants, and its steps in one go.
+
+    The Hessian is gauss_newton, exact or none.
+    """
 
     name: str
+    preset: str
     hessian: str
     steps: int
     solve: Callable[[Program, np.ndarray, int, Budget], Proposal]
 
 
-_SHARP = Stage("Uno filtersqp", "exact", 300, _uno("filtersqp"))
+_SHARP = Stage("Uno filtersqp", "filtersqp", "exact", 300, _uno("filtersqp"))
 SOLVERS: tuple[Stage, ...] = (
-    Stage("Uno filtersqp with Gauss-Newton", "gauss_newton", 3000, _uno("filtersqp")),
+    Stage("Uno filtersqp with Gauss-Newton", "filtersqp", "gauss_newton", 3000, _uno("filtersqp")),
     _SHARP,
-    Stage("Uno ipopt", "exact", 1000, _uno("ipopt")),
+    Stage("Uno ipopt", "ipopt", "exact", 1000, _uno("ipopt")),
     _SHARP,
-    Stage("scipy SLSQP", "none", 300, _slsqp),
+    Stage("scipy SLSQP", "slsqp", "none", 300, _slsqp),
 )
 """In the order of trying; what an interior point leaves short of its limits is sharpened."""
 

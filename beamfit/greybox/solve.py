@@ -9,9 +9,9 @@ import numpy as np
 
 from beamfit.errors import InputError
 from beamfit.greybox import assess, curvature
-from beamfit.greybox.assess import TOLERANCE, State
+from beamfit.greybox.assess import State
 from beamfit.greybox.conflict import relaxed
-from beamfit.greybox.descend import Lanes
+from beamfit.greybox.descend import Lanes, lanes_of
 from beamfit.greybox.diagnosis import contradictory, not_finite
 from beamfit.greybox.evidence import Search, settled
 from beamfit.greybox.fit import Attempt, Fit
@@ -21,7 +21,7 @@ from beamfit.greybox.programs import SOLVERS, Budget, scaled
 from beamfit.greybox.verdict import conclude, refused
 from beamfit.status import Status
 
-METHOD = "Levenberg-Marquardt"
+METHOD, SQUARES = "Levenberg-Marquardt", "levenberg-marquardt"
 # Steps from many starts; what is left is for the polish of the cheapest ends.
 STEPS, POLISHED = 300, 4
 # A search whose cost falls by less than this share in so many steps gains nothing.
@@ -42,6 +42,7 @@ def solve(
     hessian: str = "exact",
     progress: bool = False,
     seconds: float | None = None,
+    solver: str | None = None,
 ) -> Fit:
     """Minimise the cost of a problem within its bounds and constraints.
 
@@ -69,7 +70,11 @@ def solve(
     progress : bool
         Show a progress bar over the starts on standard error.
     seconds : float, optional
-        For all starts and stages together, looked at between them and compilation apart.
+        For all starts and stages together, compilation included: looked at between them, so that
+        what is being compiled is finished first.
+    solver : {"levenberg-marquardt", "filtersqp", "ipopt", "slsqp"}, optional
+        The one to use, in the place of all that suit the problem in turn. The first is for least
+        squares within bounds.
 
     Returns
     -------
@@ -93,6 +98,8 @@ def solve(
     """
     began = time.perf_counter()
     _check(starts, iterations, hessian, seconds)
+    squares = not (p.constraints or p.objectives)
+    _check_solver(solver, squares)
     wrong = contradictory(p)
     if wrong:
         spent = time.perf_counter() - began
@@ -100,8 +107,9 @@ def solve(
     drawn = _drawn(p, starts, seed)
     points = np.clip(drawn, p.lower, p.upper)
     moved = int(np.sum(np.any(points != drawn, axis=1)))
-    budget = Budget(iterations, None if seconds is None else began + seconds)
-    if p.constraints or p.objectives:
+    until = None if seconds is None else began + seconds
+    budget = Budget(iterations, until, solver, p.tolerance)
+    if not squares or solver not in (None, SQUARES):
         found, attempts = _one_by_one(p, _bar(points, progress), budget, hessian)
     else:
         found, attempts = _together(p, points, budget, progress)
@@ -115,7 +123,7 @@ def solve(
         said = traced[0].message if traced else said
         return refused(p, Status.not_finite, said, spent, None, attempts)
     best, conflict = found[_best(p, found)], None
-    if best.kkt.feasibility > TOLERANCE and p.constraints and best.at.finite and budget.left > 0:
+    if not best.feasible and p.constraints and best.at.finite and budget.left > 0:
         conflict = relaxed(p, best, starting_points(p, ELASTIC, seed))
         if conflict.feasible:
             more, again = _one_by_one(p, conflict.theta[None], budget, hessian)
@@ -133,6 +141,12 @@ def _check(starts: int, iterations: int, hessian: str, seconds: float | None) ->
         raise InputError(f"{starts} starts of {iterations} iterations", "at least one of each")
     if seconds is not None and not seconds > 0:
         raise InputError(f"{seconds} seconds", "a time above 0, or none")
+
+
+def _check_solver(solver: str | None, squares: bool) -> None:
+    known = [SQUARES] * squares + list(dict.fromkeys(stage.preset for stage in SOLVERS))
+    if solver is not None and solver not in known:
+        raise InputError(f"solver '{solver}' for this problem", f"one of {', '.join(known)}")
 
 
 def _bar(points: np.ndarray, progress: bool) -> Iterable:
@@ -181,7 +195,7 @@ def _drawn(p: Problem, number: int, seed: int) -> np.ndarray:
 def _good(s: State) -> bool:
     """Whether a point is an optimum, to second order."""
     bent = s.bend is not None and (s.bend.direction is not None or s.bend.newton > curvature.STEP)
-    return s.kkt.worst <= TOLERANCE and not bent
+    return s.optimal and not bent
 
 
 def _best(p: Problem, found: list[State]) -> int:
@@ -193,16 +207,16 @@ def _best(p: Problem, found: list[State]) -> int:
     """
 
     def rank(s: State) -> tuple:
-        feasible = s.kkt.feasibility <= TOLERANCE
+        feasible = s.feasible
         saved = np.abs(s.found.constraints) @ (s.limits.violation * s.limits.size)
         return (not feasible, s.at.cost + saved if feasible else s.kkt.feasibility)
 
     order = sorted(range(len(found)), key=lambda i: rank(found[i]))
     first = found[order[0]]
-    if first.kkt.feasibility > TOLERANCE:
+    if not first.feasible:
         return order[0]
     # The first start is the problem's own; one far out may lie where all costs are tiny.
-    near = TOLERANCE * found[0].scale.cost if p.objectives else 0.5 * p.least_residual**2
+    near = p.tolerance * found[0].scale.cost if p.objectives else 0.5 * p.least_residual**2
     alike = [i for i in order if rank(found[i]) <= (False, rank(first)[1] + near)]
     return next((i for i in alike if _rests(p, found[i])), order[0])
 
@@ -228,7 +242,7 @@ def search(
     tuple of State and Attempt
         The end point, judged, and the account of it.
     """
-    start, budget = np.asarray(start, float), Budget(iterations, None)
+    start, budget = np.asarray(start, float), Budget(iterations, None, None, p.tolerance)
     if p.constraints or p.objectives:
         return _program(p, start, assess.slopes(p, start), budget, hessian)
     found, attempts = _together(p, start[None], budget, False)
@@ -253,7 +267,7 @@ def _together(
 
 def _lanes(p: Problem, points: np.ndarray, budget: Budget) -> tuple[list[State], list[Attempt]]:
     k = len(points)
-    lanes = Lanes(p, points)
+    lanes = lanes_of(p, points)
     lanes.go(np.arange(k), min(STEPS, budget.iterations), budget.until)
     cost = lanes.cost[:k]
     found: dict[int, State] = {}
@@ -336,11 +350,12 @@ def _program(
     scale = assess.scale_of(p, start, at)
     # Squares say nothing of further objectives; foreign code may have first derivatives only.
     usable = {"none", hessian} if p.objectives else {"none", "gauss_newton", hessian}
+    stages = [s for s in SOLVERS if s.hessian in usable and budget.solver in (None, s.preset)]
     exact = hessian == "exact"
     best, tried, steps, said = None, [], 0, ""
-    for stage in (stage for stage in SOLVERS if stage.hessian in usable):
+    for stage in stages:
         program = scaled(p, start, at, scale, stage.hessian)
-        near = best is not None and best.kkt.feasibility <= TOLERANCE
+        near = best is not None and best.feasible
         begin = best.theta if near else start
         if not near and stage.name in tried:
             continue
@@ -350,7 +365,7 @@ def _program(
             s = assess.state(p, np.clip(program.numbers(end.x), p.lower, p.upper), scale)
             steps, said = steps + end.iterations, end.said
             point = None
-            if s.kkt.worst <= TOLERANCE:
+            if s.optimal:
                 s, point = curvature.second_order(p, s, exact)
             if best is None or _best(p, [best, s]) == 1:
                 best = s

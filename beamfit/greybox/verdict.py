@@ -9,7 +9,7 @@ from jax.experimental import checkify
 
 from beamfit import verdict
 from beamfit.greybox import assess, optimum, problem
-from beamfit.greybox.assess import TOLERANCE, State
+from beamfit.greybox.assess import State
 from beamfit.greybox.covariance import MOST_SHARE, Spread
 from beamfit.greybox.equations import Implicit
 from beamfit.greybox.evidence import EDGES, Evidence, Known, Search, known, listed, settled
@@ -70,22 +70,21 @@ def conclude(p: Problem, s: State, search: Search, seconds: float) -> Fit:
     # What has no errors cannot speak for or against the model.
     silent = [group for group in found.groups if not group.errors_given]
     spoken = chi2 - sum(g.chi2 for g in silent), dof - sum(g.dof for g in silent)
-    rest = s.kkt.worst > TOLERANCE and settled(p, s)
+    rest = not s.optimal and settled(p, s)
     evidence = Evidence(p, s, search, rest, variables, constraints, found.blind, *spoken)
     finding = verdict.judge(evidence, RULES if p.has_data else WITHOUT_DATA)
     message = " ".join([finding.message, *_remarks(evidence)])
     return Fit(
         p, s.theta, finding.status, message, float(s.at.cost), chi2, dof, found.groups, s.kkt,
         variables, constraints, found.spread, found.raw, s.at.residual_jacobian, found.unseen,
-        float(scale), search.attempts, seconds,
+        float(scale), search.attempts, seconds, finding.about,
     )  # fmt: skip
 
 
 def _variables(p: Problem, s: State, found: Known) -> tuple[Variable, ...]:
-    one = np.eye(len(s.theta))
-    nothing = (found.spread.share(one) >= MOST_SHARE) | found.held
+    nothing = (found.spread.shares >= MOST_SHARE) | found.held
     nothing |= any(group.unknown for group in found.groups)
-    errors = (np.where(nothing, np.nan, part.error(one)) for part in (found.spread, found.raw))
+    errors = (np.where(nothing, np.nan, part.errors) for part in (found.spread, found.raw))
     columns = (s.theta, *errors, p.lower, p.upper, s.bounds.states(s.found.bounds), s.found.bounds)
     return _rows(Variable, p.names, *columns)
 
@@ -197,7 +196,7 @@ def _remarks(e: Evidence) -> list[str]:
         said.append(f"{search.moved} of {count} starts moved onto their bounds.")
     if search.cut:
         said.append(f"The limit of {search.seconds:g} s cut the search.")
-    lost = e.problem.has_data and e.state.kkt.worst > TOLERANCE and not e.settled
-    if lost and e.state.kkt.feasibility <= TOLERANCE and (found := optimum.degenerate(e)):
+    lost = e.problem.has_data and not e.state.optimal and not e.settled
+    if lost and e.state.feasible and (found := optimum.degenerate(e)):
         said.append(found.message)
     return said

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -20,6 +20,7 @@ from beamfit.language.xml import format_xml, parse_xml
 from beamfit.writing import write_atomically
 
 if TYPE_CHECKING:
+    from beamfit.language.computed import Computed
     from beamfit.language.solution import Solution
 
 MOST_NUMBERS = 4_000_000
@@ -178,19 +179,24 @@ def solved_formulation(
     path: str | PathLike[str],
     tables: Mapping[str, np.ndarray] | None = None,
     starts: int = 1,
-) -> Solution:
-    """Solve a document; what is wrong with it is said with its file.
+    values: Mapping[str, Sequence[float]] | None = None,
+    gains: Iterable[str] = (),
+    **options: Any,
+) -> Solution | Computed:
+    """Solve a document, or compute its mapping if it has no objective.
+
+    What is wrong with it is said with its file.
 
     Parameters
     ----------
-    document, tables, starts
+    document, tables, starts, values, gains, **options
         As for `beamfit.language.solution.solve_document`.
     path : str or path
         The file of the document.
 
     Returns
     -------
-    Solution
+    Solution or Computed
 
     Raises
     ------
@@ -198,7 +204,11 @@ def solved_formulation(
         With file, line and column.
     """
     with located(path):
-        check_document(document, {n: t.shape for n, t in (tables or {}).items()})
-        from beamfit.language.solution import solve_document  # JAX from here on
+        check_document(document, {n: t.shape for n, t in (tables or {}).items()}, values or ())
+        if document.problem is None:
+            from beamfit.language.computed import compute_document  # JAX from here on
 
-        return solve_document(document, tables, starts)
+            return compute_document(document, tables, values, gains)
+        from beamfit.language.solution import solve_document
+
+        return solve_document(document, tables, starts, values, gains, **options)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 
 from beamfit.errors import nearest
 from beamfit.language import document as d
@@ -12,7 +12,9 @@ from beamfit.language.order import checked
 
 
 def check_document(
-    document: d.Document, shapes: Mapping[str, tuple[int, int]] | None = None
+    document: d.Document,
+    shapes: Mapping[str, tuple[int, int]] | None = None,
+    given: Iterable[str] = (),
 ) -> None:
     """Check the names, indices and order of a document, its variables and their bounds.
 
@@ -22,6 +24,8 @@ def check_document(
         From a file.
     shapes : mapping of str to (int, int), optional
         Rows and columns of its tables, where they have been read.
+    given : iterable of str, optional
+        Inputs whose values come from elsewhere.
 
     Raises
     ------
@@ -30,10 +34,10 @@ def check_document(
     """
     checked(document.mapping, shapes)
     if document.problem is not None:
-        check_problem(document)
+        check_problem(document, given)
 
 
-def check_problem(document: d.Document) -> None:
+def check_problem(document: d.Document, given: Iterable[str] = ()) -> None:
     """Refuse names that the mapping has not, bounds that contradict, and inputs without a value."""
     p, m = document.problem, document.mapping
     faces = (p.variables, m.inputs, "input"), ((*p.goals, *p.limits), m.outputs, "output")
@@ -44,10 +48,10 @@ def check_problem(document: d.Document) -> None:
                 found = f"no {what} '{one.model}' in the mapping"
                 raise error_at(one.at, found, nearest(one.model, known))
     _check_variables(p)
-    names = [v.model for v in p.variables]
+    names = [*(v.model for v in p.variables), *given]
     for one in m.inputs:
         if one.values is None and one.name not in names:
-            expected = f"variable {one.name};, or input {one.name} = VALUE;"
+            expected = f"variable {one.name};, input {one.name} = VALUE;, or --set {one.name}=VALUE"
             raise error_at(one.at, f"input '{one.name}' without a value", expected)
 
 

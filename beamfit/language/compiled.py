@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import cached_property, lru_cache, partial
 
 import jax
 import jax.numpy as jnp
@@ -26,11 +26,17 @@ class Program:
     """A mapping that can be computed.
 
     `constants` are tables, their columns first, and parameters; they are arguments, so that code
-    does not hang on them.
+    does not hang on them: programs of one order are equal, whatever is in their tables.
     """
 
     order: Order
     tables: Mapping[str, np.ndarray]
+
+    def __hash__(self) -> int:
+        return id(self.order)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Program) and self.order is other.order
 
     @property
     def scope(self) -> Scope:
@@ -160,9 +166,15 @@ def compile_mapping(mapping: d.Mapping, tables: Mapping[str, np.ndarray] | None 
         raise error_at(missing[0].at, f"no data for table '{missing[0].name}'",
                        f"--data {missing[0].name}=FILE")  # fmt: skip
     program = Program(checked(mapping, {n: np.shape(t) for n, t in tables.items()}), tables)
+    _traced(program)
+    return program
+
+
+@lru_cache(maxsize=64)
+def _traced(program: Program) -> None:
+    """Trace every formula, which finds what is wrong with its shapes."""
     shapes = {n: jax.ShapeDtypeStruct(a.shape, float) for n, a in program.scope.inputs.items()}
     jax.eval_shape(lambda given: program(given, list(program.order.owners)), shapes)
-    return program
 
 
 # ---- running

@@ -16,11 +16,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from beamfit.greybox.expression_graph import FUNCTIONS as ELEMENTARY
 from beamfit.language import expression as x
 from beamfit.language.expression import error_at
 from beamfit.language.scope import (
-    FUNCTIONS,
     HIDDEN,
     Array,
     Axes,
@@ -56,7 +54,10 @@ class Setting:
 
 
 ELEMENTWISE: dict[str, Callable] = {
-    **{name: function for name, function in ELEMENTARY.items() if name in FUNCTIONS},
+    "sin": jnp.sin, "cos": jnp.cos, "tan": jnp.tan, "asin": jnp.arcsin, "acos": jnp.arccos,
+    "atan": jnp.arctan, "sinh": jnp.sinh, "cosh": jnp.cosh, "tanh": jnp.tanh,
+    "asinh": jnp.arcsinh, "acosh": jnp.arccosh, "atanh": jnp.arctanh, "exp": jnp.exp,
+    "log": jnp.log, "log10": jnp.log10, "sqrt": jnp.sqrt, "abs": jnp.abs, "atan2": jnp.arctan2,
     "sign": jnp.sign, "erf": jax.scipy.special.erf, "sigmoid": jax.nn.sigmoid,
 }  # fmt: skip
 MATRIX: dict[str, tuple[int, int, Callable]] = {

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, lru_cache
 from graphlib import TopologicalSorter
 from typing import NamedTuple
 
@@ -285,6 +285,26 @@ def _cycle(start: int, needs: dict[int, set[int]], members: set[int]) -> list[in
     return []
 
 
+class _Same(NamedTuple):
+    """A mapping as itself: an equal one may stand at other lines."""
+
+    mapping: d.Mapping
+
+    def __hash__(self) -> int:
+        return id(self.mapping)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Same) and self.mapping is other.mapping
+
+
 def checked(mapping: d.Mapping, shapes=None) -> Order:
-    """Names, indices and order of a mapping, checked without computing anything."""
-    return order_of(scope_of(mapping, shapes))
+    """Names, indices and order of a mapping, checked without computing anything.
+
+    Kept for the mappings seen last: what is compiled for one order serves when it is solved again.
+    """
+    return _ordered(_Same(mapping), tuple(sorted((shapes or {}).items())))
+
+
+@lru_cache(maxsize=64)
+def _ordered(same: _Same, shapes: tuple[tuple[str, tuple[int, ...]], ...]) -> Order:
+    return order_of(scope_of(same.mapping, dict(shapes)))

@@ -19,6 +19,7 @@ from beamfit.language.expression import Place, error_at
 from beamfit.language.syntax import check_brackets, explained, short
 
 
+@lru_cache(maxsize=64)
 def parse_document(text: str) -> d.Document:
     """Read a document from its text form.
 

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from itertools import islice
 from typing import Any
 
@@ -13,9 +13,10 @@ import numpy as np
 from beamfit.greybox.assess import slopes
 from beamfit.greybox.diagnosis import diagnose
 from beamfit.greybox.fit import Fit, Limited, Variable
-from beamfit.greybox.problem import Problem
+from beamfit.greybox.problem import TOLERANCE
 from beamfit.greybox.solve import solve
 from beamfit.language import document as d
+from beamfit.language.computed import MOST_ROWS, gain_tables, gains_at, outputs_at
 from beamfit.language.statement import Formulation, at_start, formulate, starts_of
 from beamfit.language.trace import cause_of
 from beamfit.quantity import Quantity
@@ -26,8 +27,6 @@ from beamfit.table import Table, cell
 
 # Draws of the same seeds that are tried until the start is finite.
 MOST_DRAWS = 100
-# Rows of a table on a terminal; JSON has all.
-MOST_ROWS = 40
 # Solver parameters that mean something here: how they are told to `solve`.
 TOLD = {
     "major iterations limit": "iterations",
@@ -41,8 +40,6 @@ NOISE = (
 # Kinds of ailments that are found with their place in the document.
 TOLD_ELSEWHERE = {"contradictory_bounds", "not_finite", "unused"}
 TOLERANCES = {"major feasibility tolerance", "major optimality tolerance"}
-# At which a point counts as an optimum here (`beamfit.greybox.assess.TOLERANCE`).
-JUDGED = 1e-6
 
 
 @shown
@@ -56,25 +53,26 @@ class Solution:
         What is minimised or maximised.
     fit : Fit
         What was found.
-    outputs : mapping of str to array
-        Values at the answer.
+    outputs, gains : mapping of str to array
+        Values at the answer, and the derivatives that were asked for.
     factor : float
         Objective over cost: negative where it is maximised.
     squares : bool
         Whether the objective is a sum of squares, so that there are errors.
     notes : tuple of str
         What was made of the document, its starts and its solver parameters.
-    made : Formulation or None
-        The document and its problem; None of a problem in another form.
+    made : Formulation
+        The document and its problem.
     """
 
     name: str
     fit: Fit
     outputs: Mapping[str, np.ndarray]
-    factor: float = 1.0
-    squares: bool = False
-    notes: tuple[str, ...] = ()
-    made: Formulation | None = None
+    gains: Mapping[str, np.ndarray]
+    factor: float
+    squares: bool
+    notes: tuple[str, ...]
+    made: Formulation
 
     @property
     def status(self) -> Status:
@@ -128,11 +126,11 @@ class Solution:
             tables.append(_table("constraint", rows, _limited, False, "multiplier"))
         values = [[n, f"{v:.8g}" if v.ndim == 0 else _range(v)] for n, v in self.outputs.items()]
         tables += [Table("", ["output", "value"], values, numeric=True)] if values else []
-        return tables
+        return tables + gain_tables(self.made.program.scope, self.gains)
 
     def _row(self, v: Variable) -> list[str]:
         error = ["-" if not math.isfinite(v.error) else f"{v.error:.2g}"] * self.squares
-        return [v.name, f"{v.value:.8g}", *error, *_ends(v), v.state, f"{v.reduced_gradient:.3g}"]
+        return [v.name, f"{v.value:.8g}", *error, *_ends(v), v.state, f"{v.reduced_gradient + 0.0:.3g}"]
 
     def _variable(self, v: Variable) -> dict[str, Any]:
         kept = ("name", "lower", "upper", "state", "reduced_gradient")
@@ -153,6 +151,7 @@ class Solution:
             "variables": [self._variable(v) for v in self.variables()],
             "constraints": self.constraints(),
             "outputs": self.outputs,
+            "gains": self.gains,
             "starts": [
                 {"objective": self.factor * a.cost, "solver": a.solver, "said": a.said}
                 for a in self.fit.attempts
@@ -175,7 +174,7 @@ def _ends(row: Variable | Limited) -> list[str]:
 
 
 def _limited(c: Limited) -> list[str]:
-    return [c.name, f"{c.value:.8g}", *_ends(c), c.state, f"{c.multiplier:.3g}"]
+    return [c.name, f"{c.value:.8g}", *_ends(c), c.state, f"{c.multiplier + 0.0:.3g}"]
 
 
 def _table(name: str, rows: Sequence, row_of, errors: bool, last="reduced gradient") -> Table:
@@ -190,7 +189,12 @@ def _table(name: str, rows: Sequence, row_of, errors: bool, last="reduced gradie
 
 
 def solve_document(
-    document: d.Document, tables: Mapping[str, np.ndarray] | None = None, starts: int = 1
+    document: d.Document,
+    tables: Mapping[str, np.ndarray] | None = None,
+    starts: int = 1,
+    values: Mapping[str, Sequence[float]] | None = None,
+    gains: Iterable[str] = (),
+    **options: Any,
 ) -> Solution:
     """Solve the problem of a document.
 
@@ -203,6 +207,13 @@ def solve_document(
     starts : int
         How many searches: the first from the numbers drawn with the seeds of the document (or given
         in it), the others from numbers drawn within the random ranges or the bounds.
+    values : mapping of str to sequence of float, optional
+        Values of inputs, and starts of variables, in the place of the document's.
+    gains : iterable of str, optional
+        Derivatives to compute at the answer, written ``dy/dx``.
+    **options
+        `solver`, `seconds` and `iterations` of `beamfit.greybox.solve.solve`, and `tolerance` of
+        the problem, in the place of the document's solver parameters; None leaves those.
 
     Returns
     -------
@@ -223,32 +234,21 @@ def solve_document(
     >>> print(found.headline, found.variables()[0].state)
     y = 1, optimal upper
     """
-    made, notes = _started(formulate(document, tables))
+    made, notes = _started(formulate(document, tables, values))
     told, warnings = _told(document.solver)
-    fit = solve(made.problem, starts=starts, **told)
-    notes = (*made.notes, *notes, *_ailments(made), *warnings)
+    told |= {name: value for name, value in options.items() if value is not None}
+    problem = replace(made.problem, tolerance=told.pop("tolerance", TOLERANCE))
+    fit = solve(problem, starts=starts, **told)
+    notes = (*made.notes, *notes, *_ailments(made), *warnings, *_places(made, fit))
     if fit.status is Status.not_finite:
         cause = _cause(made, fit.model)
         told = cause is None or any(cause in note for note in notes)
         notes = notes if told else (*notes, f"Where it ended, {cause}.")
     if made.squares and math.isfinite(fit.scale):
         notes = (*notes, NOISE)
-    asked = list(made.program.scope.outputs)
-    outputs = {n: np.asarray(v) for n, v in made.program(fit.model, asked).items()}
+    outputs, gained = outputs_at(made.program, fit.model), gains_at(made.program, fit.model, gains)
     name = _goals(made.document)
-    return Solution(name, fit, outputs, made.factor, made.squares, notes, made)
-
-
-def solve_problem(problem: Problem, starts: int = 1) -> Solution:
-    """Solve a problem that came without a document, such as one of `beamfit.io.nl.read_nl`.
-
-    Its first objective's weight tells whether it is to be maximised.
-    """
-    fit = solve(problem, starts=starts)
-    goal = problem.objectives[0]
-    notes = tuple(found.message for found in diagnose(problem))
-    factor = -1.0 if goal.weight < 0 else 1.0
-    return Solution(goal.name, fit, {}, factor, notes=notes)
+    return Solution(name, fit, outputs, gained, made.factor, made.squares, notes, made)
 
 
 def _started(made: Formulation) -> tuple[Formulation, tuple[str, ...]]:
@@ -276,7 +276,22 @@ def _cause(made: Formulation, model: Mapping[str, np.ndarray]) -> str | None:
 
 def _ailments(made: Formulation) -> list[str]:
     """What the problem suffers from, but for what is told already with its place."""
-    return [found.message for found in diagnose(made.problem) if found.kind not in TOLD_ELSEWHERE]
+    found = (one for one in diagnose(made.problem) if one.kind not in TOLD_ELSEWHERE)
+    return [f"{one.message[:-1]} ({_where(made, one.names)})." for one in found]
+
+
+def _where(made: Formulation, names: Iterable[str]) -> str:
+    """The places in the document of numbers and limits, '' if there are none."""
+    problem = made.document.problem
+    labels = {one.label: one.at for one in (*problem.variables, *problem.limits)}
+    told = dict.fromkeys(name.partition("[")[0] for name in names)
+    return ", ".join(f"'{name}' at {labels[name]}" for name in told if name in labels)
+
+
+def _places(made: Formulation, fit: Fit) -> list[str]:
+    """Where what the verdict is about stands in the document."""
+    places = _where(made, fit.about)
+    return [f"The verdict is about {places}."] if places else []
 
 
 def _told(solver: d.Solver | None) -> tuple[dict[str, Any], list[str]]:
@@ -292,10 +307,10 @@ def _told(solver: d.Solver | None) -> tuple[dict[str, Any], list[str]]:
         if key in TOLD and number > 0:
             told[TOLD[key]] = int(number) if TOLD[key] == "iterations" else number
         elif key in TOLERANCES and number > 0:
-            tight += [f"{name} = {value}"] if number < JUDGED else []
+            tight.append(number)
         else:
             unused.append(name)
     said = [f"Solver parameters without a meaning here: {', '.join(unused)}."] if unused else []
     if tight:
-        said.append(f"{', '.join(tight)}: judged at {JUDGED:g} all the same.")
+        told["tolerance"] = min(tight)
     return told, said

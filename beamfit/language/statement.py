@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -15,6 +15,7 @@ from beamfit.greybox import problem as core
 from beamfit.language import document as d
 from beamfit.language.check import check_problem
 from beamfit.language.compiled import Program, compile_mapping
+from beamfit.language.computed import values_of
 from beamfit.language.expression import error_at
 from beamfit.language.squares import Square, squares_of
 
@@ -62,7 +63,11 @@ class _Output:
         return self.program(model, [self.name], constants)[self.name]
 
 
-def formulate(document: d.Document, tables: Mapping[str, np.ndarray] | None = None) -> Formulation:
+def formulate(
+    document: d.Document,
+    tables: Mapping[str, np.ndarray] | None = None,
+    values: Mapping[str, Sequence[float]] | None = None,
+) -> Formulation:
     """State the problem of a document.
 
     An objective that is a sum of squares over a set becomes a record of residuals without errors,
@@ -74,6 +79,9 @@ def formulate(document: d.Document, tables: Mapping[str, np.ndarray] | None = No
         With a problem.
     tables : mapping of str to array, optional
         Its data tables by name, shape (rows, columns).
+    values : mapping of str to sequence of float, optional
+        Values of inputs in the place of the document's: one number, or all in C order. Of a
+        variable it is where the search starts.
 
     Returns
     -------
@@ -97,19 +105,22 @@ def formulate(document: d.Document, tables: Mapping[str, np.ndarray] | None = No
     if p is None or not p.goals:
         at = p.variables[0].at if p and p.variables else document.mapping.at
         raise error_at(at, "a document without an objective", "minimize NAME; or maximize NAME;")
-    check_problem(document)
+    values = values or {}
+    check_problem(document, values)
+    document = _begun(document, values)
     weights = {goal.model: goal.weight * (-1 if p.maximize else 1) for goal in p.goals}
     parts = {name: squares_of(document.mapping, name, weight) for name, weight in weights.items()}
     # A few squares by themselves are a wish, not data: errors would mean nothing.
     least = all(parts.values()) and any(s.each for part in parts.values() for s in part)
     program = compile_mapping(document.mapping, tables)
     free, model, notes = _free(document, program)
+    model |= values_of(program.scope, values)
     constants = {n: jnp.asarray(v) for n, v in program.constants.items()}
     records, objectives = [], []
     for name, weight in weights.items():
         if least:
             predict = _Residuals(program, tuple(parts[name]))
-            length = jax.eval_shape(predict, model, constants).shape
+            length = core.shape_of(predict, model, constants)
             records.append(core.Record(name, predict, constants, np.zeros(length)))
         else:
             objectives.append(core.Objective(name, _Output(program, name), constants, weight))
@@ -128,6 +139,17 @@ def formulate(document: d.Document, tables: Mapping[str, np.ndarray] | None = No
     sign = -1.0 if p.maximize else 1.0
     notes += tuple(_unqualified(document))
     return Formulation(document, program, problem, least, 2.0 if least else sign, notes)
+
+
+def _begun(document: d.Document, values: Mapping[str, Sequence[float]]) -> d.Document:
+    """The document with what is given of its variables as their start."""
+    if values.keys().isdisjoint(v.model for v in document.problem.variables):
+        return document
+    variables = tuple(
+        replace(v, random=None, value=values[v.model][0]) if v.model in values else v
+        for v in document.problem.variables
+    )
+    return replace(document, problem=replace(document.problem, variables=variables))
 
 
 # ---- variables
@@ -151,11 +173,26 @@ def _free(document: d.Document, program: Program) -> tuple[list, dict[str, np.nd
         shape = arrays[v.model].shape
         model[v.model] = next(_starts(v, shape, model.get(v.model)))
         names = _names(v, arrays[v.model])
+        notes += _outside(v, arrays[v.model].values)
         free.append(core.Free(v.model, v.lower, v.upper, v.random, labels=names))
         if v.model not in used:
             notes.append(f"At {v.at}: nothing asked for hangs on the variable '{v.label}', "
                          "which stays where it starts.")  # fmt: skip
     return free, model, tuple(notes)
+
+
+def _outside(v: d.Variable, given: Sequence[float] | None) -> list[str]:
+    """What there is to say of a start outside the bounds."""
+    begin = v.random or ((v.value,) if v.value is not None else given or (v.lower, v.upper))
+    wrong = next((x for x in begin if not v.lower <= x <= v.upper), None)
+    if wrong is None:
+        return []
+    low, high = v.random or (wrong, wrong)
+    what = f"random starts in [{low:g}, {high:g}]" if v.random else f"start {wrong:g}"
+    return [
+        f"At {v.at}: '{v.label}' has the {what} outside its bounds [{v.lower:g}, {v.upper:g}]; the "
+        "search begins on the bound. State a start within them, or widen them."
+    ]
 
 
 def _starts(v: d.Variable, shape, given) -> Iterator[np.ndarray]:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from functools import lru_cache
 from xml.etree import ElementTree as Plain
 
 from beamfit.errors import nearest
@@ -31,6 +32,7 @@ KNOWN = {
 }  # fmt: skip
 
 
+@lru_cache(maxsize=64)
 def parse_xml(text: str) -> d.Document:
     """Read a document from its XML form.
 

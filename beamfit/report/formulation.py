@@ -8,6 +8,7 @@ from math import ceil
 import numpy as np
 from matplotlib.figure import FigureBase
 
+from beamfit.language.computed import Computed
 from beamfit.language.solution import Solution
 from beamfit.language.text import format_document
 from beamfit.report.document import BLUE, Page, Picture, Verdict
@@ -31,20 +32,19 @@ def formulation_page(found: Solution) -> Page:
     """
     p = found.fit.problem
     titles = ["Variables", *["Constraints"] * bool(found.fit.constraints)]
-    titles += ["Outputs"] * bool(found.outputs)
+    titles += ["Outputs"] * bool(found.outputs) + ["Gains"] * bool(found.gains)
     tables = [t._replace(title=name) for name, t in zip(titles, found.tables(), strict=True)]
     if found.notes:
         tables.append(Table("About the document", [], [[note] for note in found.notes]))
-    if found.made is not None:
-        text = format_document(found.made.document).replace("  ", "\xa0\xa0").splitlines()
-        tables.append(Table("The document", [], [[line] for line in text if line]))
+    text = format_document(found.made.document).replace("  ", "\xa0\xa0").splitlines()
+    tables.append(Table("The document", [], [[line] for line in text if line]))
     drawn = list(_drawn(found))
     pictures = []
     if drawn:
         height = 0.6 + 1.7 * ceil(len(drawn) / 2)
         pictures = [Picture("outputs by index", height, partial(draw_outputs, found=found))]
     goals = "maximised" if found.factor < 0 else "minimised"
-    called = found.made.document.mapping.name if found.made else found.name
+    called = found.made.document.mapping.name
     sizes = {"variable": len(p.names), "limit": len(p.constraint_names)}
     counts = ", ".join(f"{n} {what}" + "s" * (n != 1) for what, n in sizes.items())
     return Page(
@@ -60,9 +60,24 @@ def formulation_page(found: Solution) -> Page:
     )
 
 
+def computed_page(found: Computed) -> Page:
+    """Lay out a mapping computed."""
+    titles = ["Outputs"] + ["Gains"] * bool(found.gains)
+    tables = [t._replace(title=name) for name, t in zip(titles, found.tables(), strict=True)]
+    counts = f"{len(found.outputs)} outputs"
+    return Page(
+        title=f"Mapping {found.name}".strip(),
+        subtitle=counts,
+        verdicts=[],
+        tables=tables,
+        pictures=[],
+        pictures_title="",
+    )
+
+
 def _drawn(found: Solution):
     """Outputs with one dimension: name, elements of its set, values."""
-    arrays = found.made.program.scope.outputs if found.made else {}
+    arrays = found.made.program.scope.outputs
     lines = [(n, arrays[n].dims[0], v) for n, v in found.outputs.items() if v.ndim == 1]
     return lines[:MOST_DRAWN]
 

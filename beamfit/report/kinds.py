@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+from beamfit.language.computed import Computed
 from beamfit.language.solution import Solution
 from beamfit.report.control import control_page
 from beamfit.report.document import Page
 from beamfit.report.fedbatch import fedbatch_page, feed_page
-from beamfit.report.formulation import formulation_page
+from beamfit.report.formulation import computed_page, formulation_page
 from beamfit.report.response import response_page
 from beamfit.report.slices import slices_page
 from beamfit.studies.fedbatch.feed import FeedPlan
@@ -23,6 +24,7 @@ from beamfit.studies.scan.slices import SliceFits
 # A result by itself, and several beside one another.
 OF_ONE = {
     Solution: formulation_page,
+    Computed: computed_page,
     SliceFits: slices_page,
     FeedPlan: feed_page,
     Loop: control_page,

@@ -71,7 +71,7 @@ def test_constraints_have_multipliers_and_a_page_is_written(run, tmp_path, well_
             "<mapping><output name='y'/><expressions>\n y = sinn(2);</expressions></mapping>",
             ":2:6:",
         ),
-        ("output y; y = 2;", "a document without an objective"),
+        ("variable x; input x; output y; y = x;", ":1:10: a document without an objective"),
         ('table t = "no.csv"; output y; minimize y; y = t[1, 1];', ":1:7: table 't'"),
     ],
 )
@@ -98,21 +98,97 @@ def test_tables_of_other_sizes_are_refused(run, tmp_path):
     assert (status, "a table of it: d" in error) == (2, True)
 
 
-def test_a_problem_of_ampl_is_solved_with_its_names(run, tmp_path):
-    """Maximize 3x + 2y - x² - y² with x + y <= 2; by hand (1.25, 0.75) and a multiplier of 0.5."""
-    lines = "g3 1 1 0\n 2 1 1 0 0\n 0 1\n 0 0\n 0 2 0\n 0 0 0 1\n 0 0 0 0 0\n 2 2\n 0 0\n 0 0 0 0 0"
-    lines += "\nC0\nn0\nO0 1\no16\no0\no5\nv0\nn2\no5\nv1\nn2\nr\n1 2\nb\n3\n3\nk1\n1\n"
-    lines += "J0 2\n0 1\n1 1\nG0 2\n0 3\n1 2\n"
-    (tmp_path / "m.nl").write_text(lines)
-    (tmp_path / "m.col").write_text("coil\nfield\n")
-    (tmp_path / "m.row").write_text("budget\n")
-    _, found = result(run, tmp_path / "m.nl", "--report", tmp_path / "m.html")
-    assert (found["status"], found["direction"]) == ("optimal", "maximize")
-    assert found["objective"] == pytest.approx(3 * 1.25 + 1.5 - 1.25**2 - 0.75**2)
-    assert [v["name"] for v in found["variables"]] == ["coil", "field"]
-    assert [v["value"]["value"] for v in found["variables"]] == pytest.approx([1.25, 0.75])
-    assert found["constraints"][0]["name"] == "budget"
-    assert abs(found["constraints"][0]["multiplier"]) == pytest.approx(0.5)
-    assert "budget" in (tmp_path / "m.html").read_text()
-    status, out, error = run("solve", tmp_path / "m.nl", "--data", "d=x.csv")
-    assert (status, out, error.count("\n")) == (2, "", 1)
+def test_a_mapping_is_computed_at_given_inputs_with_the_gains_asked_for(run, tmp_path, well_shown):
+    """Figure 3 of the report, by hand: y4 sums rows of x4, y5 weighs them by sums of 2 x3."""
+    given = ["--set", "x1=0.5", "--set", "x2=2", "--set", "x3=1", "--gain", "dy5/dx4"]
+    given += ["--set", "x4=" + ",".join(map(str, range(1, 13)))]
+    _, found = result(run, "formulations/figure_3.xml", *given)
+    assert found["outputs"]["y1"] == [2.5] * 10
+    assert found["outputs"]["y4"] == [10, 26, 42]
+    assert found["outputs"]["y5"] == 8 * (10 + 26 + 42)
+    assert found["gains"] == {"dy5/dx4": [[8.0] * 4] * 3}
+    page = tmp_path / "page.html"
+    status, out, _ = run("solve", "formulations/figure_3.xml", *given, "--report", page)
+    assert (status, "dy5/dx4[2, 3]" in out) == (0, True)
+    assert well_shown(page, 0) == []
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        (["--set", "x1=1"], ":7:16: input 'x2[10]' without a value; expected --set x2=NUMBER"),
+        (["--set", "x9=1"], "an input of the document: one of x1"),
+        (["--set", "x1=1,2"], "2 numbers in --set x1=...; expected one, or 10 for x1[I]"),
+        (["--set", "x1=one"], "--set x1=one; expected a number"),
+        (["--set", "x1=1", "--set", "x1=2"], "each name once"),
+        (["--seconds", "0"], "--seconds 0; expected a number above 0"),
+        (["--solver", "snopt"], "'snopt'"),
+    ],
+)
+def test_what_is_given_to_a_mapping_is_checked(run, given, said):
+    status, out, error = run("solve", "formulations/figure_3.xml", *given)
+    assert (status, out, error.count("\n"), said in error) == (2, "", 1, True)
+
+
+def test_gains_solver_and_tolerance_at_an_answer(run, tmp_path):
+    """d/dx of x^4 at the minimum of x^4 - 4x, x = 1, from a start that is given."""
+    text = "minimize y; variable x in [0, 3]; input x, c = 4; output y, z; y = x^4 - c*x; z = x^4;"
+    (tmp_path / "quartic.bf").write_text(text)
+    asked = ["--gain", "dz/dx", "--solver", "ipopt", "--tolerance", "1e-9", "--set", "x=2.5"]
+    _, found = result(run, tmp_path / "quartic.bf", *asked)
+    assert (found["solver"], found["kkt_residual"] < 1e-9) == ("Uno ipopt", True)
+    assert found["gains"]["dz/dx"] == pytest.approx(4.0, rel=1e-8)
+    _, found = result(run, tmp_path / "quartic.bf", "--set", "c=32", "--seconds", "100")
+    assert found["variables"][0]["value"]["value"] == pytest.approx(2.0, rel=1e-7)
+    status, _, error = run("solve", tmp_path / "quartic.bf", "--solver", "levenberg-marquardt")
+    assert (status, "one of filtersqp, ipopt, slsqp" in error) == (2, True)
+    status, _, error = run("solve", tmp_path / "quartic.bf", "--gain", "dz/dq")
+    assert (status, "an input of the document: one of x, c" in error) == (2, True)
+
+
+@pytest.mark.parametrize(
+    ("text", "status", "places"),
+    [
+        ("minimize y;\nvariable x in [0, 1];\nconstraint low >= 3;\ninput x;\noutput y, low;\n"
+         "y = x^2;\nlow = x + 1;", "infeasible",
+         ["'low' at line 3, column 12", "'x' at line 2, column 10"]),
+        ("minimize y;\nvariable x;\ninput x;\noutput y;\ny = -x;", "unbounded",
+         ["'x' at line 2, column 10"]),
+        ("minimize y;\nvariable x;\nvariable z;\nconstraint a = 1;\nconstraint b = 2;\n"
+         "input x, z;\noutput y, a, b;\ny = z^2 + x^2;\na = x + z;\nb = 2*x + 2*z;", "degenerate",
+         ["not independent; remove what follows from others ('a' at line 4, column 12, 'b' at"]),
+        ("minimize y;\nvariable x = 7 in [0, 1];\ninput x;\noutput y;\ny = (x - 1/2)^2;", "optimal",
+         ["At line 2, column 10: 'x' has the start 7 outside its bounds [0, 1]"]),
+        ("minimize y;\nvariable x in [0, 1] random [5, 9] seed 1;\ninput x;\noutput y;\n"
+         "y = (x - 1/2)^2;", "optimal",
+         ["'x' has the random starts in [5, 9] outside its bounds"]),
+    ],
+)  # fmt: skip
+def test_findings_of_the_solver_name_lines(run, tmp_path, text, status, places):
+    (tmp_path / "m.bf").write_text(text)
+    _, found = result(run, tmp_path / "m.bf")
+    assert found["status"] == status
+    notes = " ".join(found["notes"])
+    assert all(place in notes for place in places)
+
+
+def test_a_document_solved_again_compiles_nothing(root, tmp_path, caplog):
+    """Neither the document read again nor another value of an input is traced again."""
+    import jax
+
+    from beamfit.io.formulation import read_formulation, solved_formulation
+
+    path = tmp_path / "again.bf"
+    path.write_text((root / "formulations/appendix_d.bf").read_text() + "# solved again")
+
+    def solved(**given):
+        caplog.clear()
+        with jax.log_compiles():
+            found = solved_formulation(read_formulation(path), path, **given)
+        return found.objective, "Compiling" in caplog.text
+
+    first, compiled = solved()
+    assert compiled
+    assert solved() == (first, False)
+    other, compiled = solved(values={"dx_desired": [150.0]})
+    assert (other != first, compiled) == (True, False)

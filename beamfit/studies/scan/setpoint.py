@@ -18,10 +18,16 @@ from scipy.stats import qmc
 from beamfit.compile_cache import SELDOM
 from beamfit.errors import InputError
 from beamfit.greybox import tree
-from beamfit.greybox.assess import TOLERANCE
 from beamfit.greybox.descend import Found, descend_all
 from beamfit.greybox.fit import Fit, Variable
-from beamfit.greybox.problem import Free, Problem, Record, padded_length, residual
+from beamfit.greybox.problem import (
+    TOLERANCE,
+    Free,
+    Problem,
+    Record,
+    padded_length,
+    residual,
+)
 from beamfit.greybox.solve import search, solve
 from beamfit.optics.beamline import Beamline
 from beamfit.quantity import Quantity
