@@ -58,6 +58,13 @@ def _noise(decay: Decay) -> str:
     return "inferred from the residuals" if decay.fit.noise_inferred else "as given"
 
 
+def _interval(found: Quantity) -> str | None:
+    if found.interval_95 is None:
+        return None
+    low, high = found.interval_95
+    return f"{low:.4g} to {high:.4g} {found.unit}"
+
+
 RESULT: tuple[Row, ...] = (
     ("status", lambda d: d.fit.status),
     ("readings", lambda d: f"{len(d.segment)} over {_span(d.segment.span)}"),
@@ -67,6 +74,10 @@ RESULT: tuple[Row, ...] = (
     ("lifetime at the end", lambda d: d.fit.lifetime_end),
     ("a", lambda d: d.fit.a),
     ("b", lambda d: d.fit.b),
+    ("95 % interval of a", lambda d: _interval(d.fit.a)),
+    ("95 % interval of b", lambda d: _interval(d.fit.b)),
+    ("a if a and b are constant", lambda d: d.fit.if_constant("a")),
+    ("b if a and b are constant", lambda d: d.fit.if_constant("b")),
     ("chi2/dof", _chi2),
     ("rms residual", lambda d: f"{d.fit.rms_residual:.3g} mA"),
     ("errors", _noise),
@@ -80,7 +91,8 @@ CYCLES: tuple[Row, ...] = (
     ("lifetime at the mean current", lambda d: d.fit.lifetime_mean),
     ("lifetime at the highest current", lambda d: d.fit.lifetime_start),
     ("lifetime at the lowest current", lambda d: d.fit.lifetime_end),
-    *RESULT[-5:],
+    *RESULT[6:10],
+    *RESULT[-3:],
 )
 
 

@@ -1,0 +1,1 @@
+"""Noise of measurements: stated priors, averaged over."""
