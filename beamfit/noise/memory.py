@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy.signal import fftconvolve
-from scipy.special import gammaln, logsumexp
+from scipy.special import logsumexp
 
 from beamfit.noise.correlated import log_volume, white_beside, whitened
 
@@ -157,7 +157,9 @@ class Products(NamedTuple):
         return (self.known + squares) / max(self.known + self.count - numbers, 1.0)
 
     def stated_odds(self, squares: np.ndarray, numbers: int) -> float:
-        """Log odds that stated errors are right (within 25 %) against any size of the noise.
+        """Log odds that stated errors are right against any size of the noise.
+
+        Each noise has the size that is stated, or one flat in its logarithm.
 
         Parameters
         ----------
@@ -168,9 +170,6 @@ class Products(NamedTuple):
         """
         dof = max(self.count - numbers, 1)
         size = np.linspace(-WRONG, WRONG, SIZES)  # of its logarithm
-        usual = 0.5 * STATED * np.log(STATED / 2) - gammaln(STATED / 2) + np.log(2.0)
-        right = usual - STATED * size - 0.5 * STATED * np.exp(-2 * size)
         log = -dof * size - 0.5 * squares[:, None] * np.exp(-2 * size)
         log = logsumexp(self.log_prior[:, None] + log, axis=0)
-        step = size[1] - size[0]
-        return float(logsumexp(log + right) + np.log(step) - (logsumexp(log) - np.log(SIZES)))
+        return float(log[SIZES // 2] - logsumexp(log) + np.log(SIZES))

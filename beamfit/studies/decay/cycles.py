@@ -45,6 +45,10 @@ NARROW = 0.02
 # Noise over the height of a sawtooth that is looked at, and the logarithm of the likelihood ratio
 # from which readings are of one: 1 in 1000 at even odds.
 NOISES, EVEN = (0.01, 0.03, 0.1, 0.2), math.log(1000.0)
+# Refills of top-up come every 3 min, within a factor 3, those of fills hours apart; lifetimes are
+# 15 h within a factor 3, the rest within seconds to years:
+# middle, s, width of the logarithm, and its whole range.
+PERIOD, LIFETIME = (180.0, 1.2, 12.0), (15 * 3600.0, 1.2, 17.0)
 # Readings beyond which the scatter of their mean is followed no farther.
 LONG = 4096
 
@@ -139,6 +143,47 @@ def is_sawtooth(residuals: np.ndarray) -> bool:
         inside = np.subtract(*map(ndtr, ends)) / width
         best = max(best, float(np.sum(np.log(np.maximum(inside, 1e-300)))))
     return best - normal > EVEN
+
+
+def unresolved(usual: float, interval: float, lifetime: float) -> float:
+    """Probability that refills faster than a record is read look like slower ones.
+
+    Parameters
+    ----------
+    usual : float
+        Readings from one refill that is seen to the next.
+    interval : float
+        Time between readings, s.
+    lifetime : float
+        Of the cycles as they look, s.
+
+    Notes
+    -----
+    A sawtooth that is read every interval looks the same for all its periods that differ by whole
+    phases: of those shorter than two intervals one in usual² has so many readings a cycle. Both
+    kinds are weighed by priors of the period of refills and of the lifetime.
+
+    Examples
+    --------
+    >>> found = [unresolved(18, 10.0, 36000.0), unresolved(10, 600.0, 4e6)]
+    >>> f"{found[0]:.3f}, {found[1]:.2f}"
+    '0.002, 0.98'
+    """
+    lost = usual * interval / lifetime
+
+    def chance(period: np.ndarray) -> np.ndarray:
+        return _prior(period, *PERIOD) * _prior(period / lost, *LIFETIME)
+
+    fast = np.geomspace(1e-3 * interval, 2 * interval, 200)
+    others = float(np.trapezoid(chance(fast), np.log(fast))) / usual**2
+    same = float(chance(np.array(usual * interval))) / usual
+    return others / max(others + same, 1e-300)
+
+
+def _prior(value: np.ndarray, middle: float, width: float, wide: float) -> np.ndarray:
+    """Density in the logarithm: normal about the middle, a fifth of it flat over a wide range."""
+    normal = np.exp(-0.5 * (np.log(value / middle) / width) ** 2) / math.sqrt(2 * math.pi) / width
+    return 0.8 * normal + 0.2 / wide
 
 
 def _grain(current: np.ndarray) -> float:
@@ -293,6 +338,12 @@ def _placed(total: np.ndarray, steps: np.ndarray) -> np.ndarray:
         after = (total[high] - total[at]) / (high - at)
         ends[k] = at[np.argmax((before - after) ** 2 * (at - low) * (high - at))]
     return np.unique(ends[1:-1])
+
+
+def usual_cycle(cycles: Sequence[DecayRecord]) -> tuple[float, float]:
+    """Median number of readings of cycles, and time between them, s."""
+    count = float(np.median([len(cycle) for cycle in cycles]))
+    return count, float(np.median([cycle.span / (len(cycle) - 1) for cycle in cycles]))
 
 
 def alike(cycles: Sequence[DecayRecord]) -> list[list[DecayRecord]]:

@@ -246,9 +246,9 @@ class DecayFit:
             "correlation_time": bare(self.correlation_time, "s"),
             "lifetime_by_current": self.lifetimes,
             "change": self.change,
-            "if_a_and_b_are_constant": dict(self.exact) or None,
-            "free_law": self.free_law,
         }
+        if self.free_law is not None:
+            found |= {"if_a_and_b_are_constant": dict(self.exact), "free_law": self.free_law}
         found |= {} if self.outgassing is None else {"outgassing": self.outgassing}
         return json_of(found if self.first is None else found | {"cycles": self.first.size})
 

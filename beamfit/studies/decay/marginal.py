@@ -25,9 +25,9 @@ from beamfit.quantity import Quantity
 from beamfit.studies.decay.law import Physical
 from beamfit.studies.decay.record import DecayRecord
 
-# Standard deviations of the exponent below and above zero. Bunches lengthen with the current, in the
-# potential well by x³ - x ∝ I (`beamfit.lifetime.bunch`), so that a goes as I^0 to I^-1/3; that they
-# shorten, or the vacuum follows the current, is seldom. A twentieth of the prior is flat.
+# Standard deviations of the exponent below and above zero. Bunches lengthen with the current, in
+# the potential well by x³ - x ∝ I (`beamfit.lifetime.bunch`), so that a goes as I^0 to I^-1/3; that
+# they shorten, or the vacuum follows the current, is seldom. A twentieth of the prior is flat.
 BELOW, ABOVE, ODD = 0.3, 0.2, 0.05
 LEAST, MOST = -0.9, 2.0
 # Standard deviation of the change of b in one record: pressures of stored beams are read to 10 %.

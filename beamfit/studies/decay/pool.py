@@ -222,10 +222,14 @@ def _trimmed(pool: Pool) -> tuple[Pool, list[str]]:
             keep[ends[long]] &= not far[side]
         pool, cut = solved(pool.cycles.kept(keep)), cut + far
     said = []
-    for side, why in enumerate(("fresh beam decays faster" if 2 * high >= cut[0] else WITHIN, WITHIN)):
+    for side, why in enumerate(
+        ("fresh beam decays faster" if 2 * high >= cut[0] else WITHIN, WITHIN)
+    ):
         if cut[side]:
             which = f"{('first', 'last')[side]} {cut[side]}"
-            of_each = "reading of each cycle was" if cut[side] == 1 else "readings of each cycle were"
+            of_each = (
+                "reading of each cycle was" if cut[side] == 1 else "readings of each cycle were"
+            )
             said.append(f"the {which} {of_each} left out: {why}")
     return pool, said
 

@@ -15,6 +15,7 @@ from beamfit.greybox.memory import Memory, Whitened, remembered
 from beamfit.lifetime.decay import HOUR
 from beamfit.noise.correlated import is_correlated
 from beamfit.quantity import Quantity, Status
+from beamfit.studies.decay.cycles import unresolved
 from beamfit.studies.decay.departures import (
     CURRENTS,
     REJECTED,
@@ -47,9 +48,8 @@ SEEN = 6.0
 BEND = 1 / 12 / math.sqrt(5)
 # Noise with a memory is taken for so many times what neighbouring readings scatter by.
 OWN = 3.0
-# Readings a cycle below which a slow archive may show a few of many refills: a sawtooth that is read
-# less than twice a period looks like one with another period.
-RESOLVED = 6
+# Probability of refills faster than the record is read from which cycles tell no lifetime.
+UNSURE = 0.05
 
 
 def _slopes(pool: Pool) -> tuple[Physical, np.ndarray]:
@@ -237,18 +237,20 @@ def stands_alone(cycle: DecayRecord, fit: DecayFit) -> bool:
     return noise * math.sqrt(max(len(cycle) / MOST, 1.0)) < SEPARABLE * bend
 
 
-def seen_through(fit: DecayFit, usual: float) -> DecayFit:
+def seen_through(fit: DecayFit, usual: float, interval: float) -> DecayFit:
     """A fit to cycles that were found, without errors where refills may have been missed: then the
-    beam seems to live longer than it does. `usual` is how many readings a cycle has.
+    beam seems to live longer than it does. `usual` is how many readings
+    a cycle has, one each `interval`.
 
     The refill that holds the current gives back what a cycle loses. It is told from the noise by
     the means of half a cycle before and after.
     """
-    if usual < RESOLVED:
+    lifetime = fit.lifetime_mean.value * HOUR
+    if lifetime > 0 and unresolved(usual, interval, lifetime) > UNSURE:
         cause = (
-            f"The beam is held by refills that the record may not resolve: {usual:.3g} readings lie "
-            f"between those that were found, and others may lie between readings. Record {RESOLVED} "
-            "or more from refill to refill. "
+            "The beam is held by refills that the record may not resolve: of those that were found "
+            f"the next comes after {usual:.3g} readings, but faster ones look the same when read "
+            f"every {interval:.3g} s. Record more readings from refill to refill. "
         )
         return _opened(fit, cause)
     record, memory = fit.readings, fit.identifiability.residual_correlation
@@ -270,9 +272,7 @@ def seen_through(fit: DecayFit, usual: float) -> DecayFit:
 
 def _opened(fit: DecayFit, cause: str) -> DecayFit:
     bare = {name: quantity.open() for name, quantity in fit.quantities.items()}
-    return replace(
-        fit, status=Status.unidentified, message=cause + fit.message, exact=bare, **bare
-    )
+    return replace(fit, status=Status.unidentified, message=cause + fit.message, exact=bare, **bare)
 
 
 def cycle_lifetimes(fit: DecayFit) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -13,7 +13,7 @@ from beamfit.errors import InputError
 from beamfit.shown import shown
 from beamfit.studies.decay.budget import Budget, Machine, budget
 from beamfit.studies.decay.checks import DecayChecks, check_decay
-from beamfit.studies.decay.cycles import alike, cut_at_refills, is_refilled, joined
+from beamfit.studies.decay.cycles import alike, cut_at_refills, is_refilled, joined, usual_cycle
 from beamfit.studies.decay.fit import DecayFit, bare, fit_decay
 from beamfit.studies.decay.marginal import Law
 from beamfit.studies.decay.pool import FEWEST_CYCLES
@@ -132,8 +132,7 @@ def _pooled(
             alone += [cycle for cycle in group if len(cycle) >= SHORTEST]
             continue
         called = name if many == 1 else f"{name}@{len(pooled) + 1}"
-        usual = float(np.median([len(cycle) for cycle in group]))
-        fit = seen_through(fit_cycles(group, called), usual)
+        fit = seen_through(fit_cycles(group, called), *usual_cycle(group))
         segment = joined(group, called)
         pooled.append(Decay.of(segment, segment.start, fit, machine))
         alone += [c for c in group if len(c) >= SHORTEST and stands_alone(c, fit)]

@@ -76,14 +76,16 @@ RESULT: tuple[Row, ...] = (
     ("b", lambda d: d.fit.b),
     ("95 % interval of a", lambda d: _interval(d.fit.a)),
     ("95 % interval of b", lambda d: _interval(d.fit.b)),
-    ("a if a and b are constant", lambda d: d.fit.if_constant("a")),
-    ("b if a and b are constant", lambda d: d.fit.if_constant("b")),
     ("chi2/dof", _chi2),
     ("rms residual", lambda d: f"{d.fit.rms_residual:.3g} mA"),
     ("errors", _noise),
 )
 
 
+EXACT: tuple[Row, ...] = (
+    ("a if a and b are constant", lambda d: d.fit.if_constant("a")),
+    ("b if a and b are constant", lambda d: d.fit.if_constant("b")),
+)
 CYCLES: tuple[Row, ...] = (
     ("status", lambda d: d.fit.status),
     ("cycles", lambda d: f"{d.fit.first.size} at {d.fit.mean_current:.5g} mA"),
@@ -99,7 +101,9 @@ CYCLES: tuple[Row, ...] = (
 def decay_rows(decays: Sequence[Decay]) -> Rows:
     """Label and one cell per decay, for every number a fit has."""
     together = all(decay.fit.first is not None for decay in decays)
-    return _laid_out(decays, CYCLES if together else RESULT)
+    free = any(decay.fit.free_law for decay in decays)
+    rows = CYCLES if together else (*RESULT[:-3], *EXACT * free, *RESULT[-3:])
+    return _laid_out(decays, rows)
 
 
 def _number(value: float | None, form: str, unit: str = "") -> str:
@@ -180,9 +184,13 @@ def systematic_rows(decay: Decay) -> list[list[str]]:
     fit = decay.fit
     values = fit.a.value, fit.b.value, fit.lifetime_mean.value
     return [
-        [cause, *(f"{100 * moved / value:+.2g} %" for moved, value in zip(by, values, strict=True))]
+        [cause, *(_percent(moved / value) for moved, value in zip(by, values, strict=True))]
         for cause, *by in decay.systematics
     ]
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:+.0f} %" if abs(share) > 1 - 1e-9 else f"{100 * share:+.2g} %"
 
 
 def _part(kind: str, mechanism: Mechanism) -> Row:

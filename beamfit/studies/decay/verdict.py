@@ -232,12 +232,12 @@ def _freely(e: Evidence) -> Finding | None:
         drift = "" if e.free.drift is None else f" and b drifts by {e.free.drift} of itself"
         found = f"A constant a is rejected (p = {max(e.constant_a.p_value, 1e-300):.2g}): it goes "
         found += f"as I^({e.free.exponent}){drift}, which the errors contain"
-        return Finding(Status.converged, f"{told[0].upper()}{told[1:]}. {found}")
+        return Finding(Status.converged, f"{told}. {found}")
     open_ = "an exponent of a" if e.free.drift is None else "an exponent of a and a drift of b"
     exact = {name: e.quantity(name, True) for name in "ab"}
     return Finding(
         Status.converged,
-        f"{told[0].upper()}{told[1:]}, with {open_} left open. If a and b are constant, a is "
+        f"{told}, with {open_} left open. If a and b are constant, a is "
         f"{exact['a']} and b is {exact['b']}",
     )
 

@@ -14,7 +14,7 @@ from beamfit.lifetime.losses import loss_coefficients
 from beamfit.quantity import Quantity, Status
 from beamfit.studies.decay.budget import Machine, budget
 from beamfit.studies.decay.conditions import Conditions
-from beamfit.studies.decay.cycles import alike, cut_at_refills, joined
+from beamfit.studies.decay.cycles import alike, cut_at_refills, joined, usual_cycle
 from beamfit.studies.decay.evidence import UNITS
 from beamfit.studies.decay.fit import DecayFit, bare, fit_decay
 from beamfit.studies.decay.marginal import Law
@@ -172,8 +172,7 @@ def _fitted(group: list[DecayRecord], name: str) -> DecayFit:
     if len(group) == 1:
         return fit_decay(replace(group[0], name=name), law=Law.constant)
     fit = fit_pieces(group, name)
-    usual = float(np.median([len(piece) for piece in group]))
-    return seen_through(fit, usual) if len(group) > 2 else fit
+    return seen_through(fit, *usual_cycle(group)) if len(group) > 2 else fit
 
 
 def _pieces(rows: Sequence[Row], name: str) -> list[DecayRecord]:
