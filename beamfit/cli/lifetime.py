@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 EXAMPLE = """\b
 Examples:
   beamfit lifetime measurements/aps_1999_decay.csv
+  beamfit lifetime measurements/aps_1999_decay.csv --law constant
   beamfit lifetime measurements/aps_1999_decay.csv --monitor-drift 5uA/h
   beamfit lifetime measurements/aps_1999_decay.csv --sample --report aps.html
   beamfit lifetime fill1.csv fill2.h5 --ring lattices/spear3_2003.toml
@@ -63,6 +64,13 @@ Examples:
     "the ring to one current and its usual settings if --ring is given; alarms where a or b moved.",
     is_flag=True,
 )
+@option(
+    "--law free|constant",
+    "Whether a may go as a power of the current and b drift in a record, which errors then "
+    "contain; with --ring both are constant.",
+    choices=["free", "constant"],
+    default="free",
+)
 @options("time current")
 @option(
     "--offset zero-beam|CURRENT",
@@ -85,6 +93,7 @@ def lifetime(
     study: bool,
     network: str | None,
     trend: bool,
+    law: str,
     monitor_drift: str | None,
     monitor_offset: str | None,
     priors: dict[str, tuple[float, float]] | None,
@@ -128,7 +137,7 @@ def lifetime(
 
     if monitor is not None:
         records = [replace(each, monitor=monitor.beside(each.monitor)) for each in records]
-    studies = tuple(study_record(each, machine) for each in records)
+    studies = tuple(study_record(each, machine, law) for each in records)
     decays = [decay for each in studies for decay in each.answers]
     single = [decay for each in studies for decay in each.decays or each.pooled]
     shift = _shift(single, machine, network, priors) if study else None

@@ -13,8 +13,8 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import stdtr
 
-from beamfit.greybox.correlated import Levels, Noise, log_volume, white_beside, whitened
 from beamfit.greybox.covariance import CUT
+from beamfit.noise.correlated import Levels, Noise, log_volume, white_beside, whitened
 
 # Correlation times looked at: from this share of the usual interval to so many times the record.
 SHORTEST, LONGEST, TIMES = 0.3, 5.0, 40

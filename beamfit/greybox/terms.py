@@ -11,7 +11,7 @@ import numpy as np
 
 from beamfit.errors import InputError
 from beamfit.greybox import tree
-from beamfit.greybox.correlated import log_volume, whitened
+from beamfit.noise.correlated import log_volume, whitened
 
 
 class Free(NamedTuple):
@@ -71,7 +71,7 @@ class Record:
     apart : callable, optional
         ``apart(model, data)``, shape (values - 1,), for errors with a memory: the time between
         neighbouring values over the correlation time of their errors. Residuals are then those of
-        independent errors (`beamfit.greybox.correlated.whitened`). A sampler may vary the
+        independent errors (`beamfit.noise.correlated.whitened`). A sampler may vary the
         correlation time; a search takes it as fixed. Such a record has no padding.
 
     Raises

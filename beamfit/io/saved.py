@@ -39,6 +39,7 @@ HELD = {
     f"{DECAY}.evidence": "Separability",
     f"{DECAY}.departures": "ConstantA LifetimeLaw Change",
     f"{DECAY}.outgassing": "Outgassing",
+    f"{DECAY}.marginal": "FreeLaw Span",
     f"{OPTICS}.beamline": "Beamline Design",
     f"{OPTICS}.elements": "Drift Quadrupole ThinLens SectorDipole Marker Screen TransferMatrix",
     f"{OPTICS}.sections": "Section Series",

@@ -204,8 +204,9 @@ def draw_record(figure: FigureBase, study: RecordStudy) -> None:
         above.plot(at, decay.segment.current, **dots(color=BLUE, zorder=2))
         grid = np.linspace(0, decay.segment.span, 200)
         fit = decay.fit
-        if np.isfinite(fit.a.value):
-            law = np.asarray(current(grid, fit.i0.value, fit.a.value, fit.b.value))
+        i0, a, b = (fit.if_constant(name).value for name in ("i0", "a", "b"))
+        if np.isfinite(a):
+            law = np.asarray(current(grid, i0, a, b))
             above.plot((decay.offset + grid) / scale, law, color=RED, lw=1.3, zorder=3)
         below.plot(at, fit.residuals, **dots(color=BLUE))
     above.plot([], [], "o", color=BLUE, ms=5, label="readings")
@@ -254,10 +255,11 @@ def draw_lifetime(figure: FigureBase, study: RecordStudy) -> None:
     for decay in study.decays:
         tops.append(_momentary(axes, decay, scale))
         fit = decay.fit
-        if np.isfinite(fit.a.value):
+        i0, a, b = (fit.if_constant(name).value for name in ("i0", "a", "b"))
+        if np.isfinite(a):
             grid = np.linspace(0, decay.segment.span, 100)
-            level = current(grid, fit.i0.value, fit.a.value, fit.b.value)
-            rate = np.asarray(fit.a.value * level + fit.b.value) * HOUR
+            level = current(grid, i0, a, b)
+            rate = np.asarray(a * level + b) * HOUR
             # A rate of zero or less is no lifetime: leave a hole in the curve.
             inverse = 1 / np.where(rate > 0, rate, np.nan)
             axes.plot((decay.offset + grid) / scale, inverse, color=RED, lw=1.5, zorder=3)

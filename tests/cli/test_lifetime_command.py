@@ -245,7 +245,9 @@ def test_the_command_takes_a_stability(run, root):
     assert (status, err) == (0, "")
     [result] = json.loads(out)["results"]
     plain = beamfit.fit_decay(beamfit.read_decay_record(root / APS))
-    assert result["b"]["error"] > 1.1 * plain.b.error
+    exact = result["if_a_and_b_are_constant"]["b"]
+    assert exact["error"] > 1.1 * plain.exact["b"].error
+    assert result["b"]["error"] > plain.b.error
     assert result["b"]["error_raw"] == pytest.approx(plain.b.error_raw)
     assert "drifts by 5 µA/h" in result["message"]
     status, out, err = run("lifetime", APS, "--monitor-drift", "5uA")
@@ -301,7 +303,8 @@ def test_a_lengthening_bunch_is_not_taken_for_gas(run, tmp_path):
     checked = result["constant_a"]
     assert checked["status"] == "poor_fit"
     assert checked["exponent"]["value"] == pytest.approx(-0.2, abs=4 * checked["exponent"]["error"])
-    _, shown, _ = run("lifetime", str(path))
+    assert result["b"]["interval_95"][0] < 1e-8
+    _, shown, _ = run("lifetime", str(path), "--law", "constant")
     assert "not a gas loss" in " ".join(shown.split())
 
 

@@ -6,8 +6,8 @@ from scipy.optimize import least_squares
 from scipy.signal import lfilter
 
 from beamfit.errors import InputError
-from beamfit.greybox.correlated import Levels
 from beamfit.greybox.memory import memory_of
+from beamfit.noise.correlated import Levels
 from beamfit.studies.decay.cycles import find_cycles, is_refilled
 from beamfit.studies.decay.pooled import fit_cycles
 from beamfit.studies.decay.record import Conditions, DecayRecord

@@ -1,5 +1,6 @@
 import json
 from collections import Counter
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +21,8 @@ from beamfit.studies.decay.fit import DecayFit, fit_decay, fit_decays
 from beamfit.studies.decay.model import padded, solve_decay
 from beamfit.studies.decay.record import DecayRecord
 
+constant_fit = partial(fit_decay, law="constant")
+constant_fits = partial(fit_decays, law="constant")
 APS = Path("../shared/data/aps_decay/aps_1999-02-11_9h_decay.csv")
 CONTRACT = (
     "record, status, message, a, b, i0, lifetime_start, lifetime_end, lifetime_mean, "
@@ -43,7 +46,7 @@ def simulated(span, noise=1e-3, i0=500.0, a=4e-8, b=2e-6, rows=500, seed=1, stat
 def test_the_aps_decay():
     time, measured = np.loadtxt(APS, delimiter=",", skiprows=1).T
     record = DecayRecord(time, measured)
-    fit = fit_decay(record)
+    fit = constant_fit(record)
     assert fit.status == "converged"
     # By plain least squares 6.996e-8 and 7.17e-7; block bootstrap gives a an error of 1.2e-9.
     plain = solve_decay(*padded(record)).values
@@ -121,10 +124,10 @@ def test_a_record_shorter_than_its_noise_allows():
 
 
 def test_errors_in_the_file_are_tested_by_chi2_and_enlarged():
-    honest = fit_decay(simulated(8 * HOUR, stated=1e-3))
+    honest = constant_fit(simulated(8 * HOUR, stated=1e-3))
     assert honest.status == "converged"
     assert honest.a.error == pytest.approx(honest.a.error_raw * max(1, (honest.chi2 / 497) ** 0.5))
-    bold = fit_decay(simulated(8 * HOUR, stated=1e-4))
+    bold = constant_fit(simulated(8 * HOUR, stated=1e-4))
     assert bold.status == "poor_fit"
     assert bold.chi2 / bold.dof == pytest.approx(100, rel=0.2)
     assert bold.a.error == pytest.approx(bold.a.error_raw * (bold.chi2 / bold.dof) ** 0.5)
@@ -132,18 +135,18 @@ def test_errors_in_the_file_are_tested_by_chi2_and_enlarged():
 
 
 def test_errors_missing_from_the_file_are_inferred_and_said_so():
-    fit = fit_decay(simulated(8 * HOUR))
+    fit = constant_fit(simulated(8 * HOUR))
     assert fit.noise_inferred
     assert "inferred from the residuals" in fit.message
     assert fit.chi2 == fit.dof
     assert fit.a.error == fit.a.error_raw
-    stated = fit_decay(simulated(8 * HOUR, stated=1e-3))
+    stated = constant_fit(simulated(8 * HOUR, stated=1e-3))
     assert fit.a.error == pytest.approx(stated.a.error_raw, rel=0.1)
 
 
 def test_the_stated_errors_cover_the_truth():
     records = [simulated(4 * HOUR, noise=0.02, seed=seed) for seed in range(256)]
-    fits = fit_decays(records)
+    fits = constant_fits(records)
     beams = law(np.array([0, 4 * HOUR]), 500.0, 4e-8, 2e-6)
     mean = np.mean(law(records[0].time, 500.0, 4e-8, 2e-6))
     true = {"a": 4e-8, "b": 2e-6, "i0": 500.0} | {
@@ -211,9 +214,13 @@ def lengthening_record():
 
 def test_a_varying_a_is_found_and_its_false_gas_term_undone():
     record = lengthening_record()
-    plain = fit_decay(record)
+    plain = fit_decay(record, law="constant")
     assert plain.status == "poor_fit"
     assert plain.b.value > 2e-7 + 20 * plain.b.error
+    free = fit_decay(record)
+    assert free.status == "converged"
+    assert free.b.interval_95[0] < 2e-7 < free.b.interval_95[1]
+    assert abs(free.free_law.exponent.value + 0.25) < 2 * free.free_law.exponent.error
     verdict = constant_a_test(record)
     assert verdict.status == "poor_fit"
     assert abs(verdict.exponent.value + 0.25) < 4 * verdict.exponent.error
@@ -310,9 +317,9 @@ def test_averaging_neighbours_costs_the_law_nothing(monkeypatch):
     exact = current_by_rate(time, 500.0, lambda i: 4e-8 * (i / 500) ** -0.2 * i)
     noise = 0.02 * np.random.default_rng(4).normal(size=time.size)
     record = DecayRecord(time, np.asarray(exact) + noise)
-    fit = fit_decay(record)
+    fit = constant_fit(record)
     monkeypatch.setattr(departures, "ENOUGH", 10_000)
-    plain = fit_decay(record)
+    plain = constant_fit(record)
     averaged, whole = fit.lifetimes.exponent, plain.lifetimes.exponent
     assert averaged.value == pytest.approx(whole.value, abs=whole.error)
     assert averaged.error == pytest.approx(whole.error, rel=0.15)

@@ -2,6 +2,7 @@
 
 import json
 import re
+from functools import partial
 
 import numpy as np
 import pytest
@@ -17,6 +18,8 @@ from beamfit.studies.decay.record import DecayRecord
 from beamfit.studies.decay.study import study_record
 from beamfit.studies.decay.tables import separability_rows
 
+constant_fit = partial(fit_decay, law="constant")
+constant_fits = partial(fit_decays, law="constant")
 HOUR, SPAN = 3600.0, 8 * 3600.0
 I0, A, B = 500.0, 4e-8, 2e-6
 
@@ -38,7 +41,7 @@ def record(correlation, count=200, noise=0.02, seed=0, stated=None):
 
 @pytest.mark.parametrize("correlation", [0.6, 0.95])
 def test_correlated_noise_is_covered(correlation):
-    fits = fit_decays([record(correlation, seed=seed) for seed in range(60)])
+    fits = constant_fits([record(correlation, seed=seed) for seed in range(60)])
     assert all(fit.status == "converged" for fit in fits)
     beam = law(np.linspace(0, SPAN, 200))
     true = {"a": A, "b": B, "lifetime_mean": 1 / (A * beam.mean() + B) / HOUR}
@@ -53,7 +56,7 @@ def test_correlated_noise_is_covered(correlation):
 def test_independent_noise_gives_plain_least_squares():
     for seed in range(5):
         plain = record(0.0, seed=seed)
-        fit, solution = fit_decay(plain), solve_decay(*padded(plain))
+        fit, solution = constant_fit(plain), solve_decay(*padded(plain))
         assert fit.a.value == solution.values.a
         size = (solution.sum_squares / 197) ** 0.5
         assert fit.a.error == pytest.approx(solution.errors.a * size, rel=1e-12)
@@ -122,19 +125,19 @@ def test_stated_errors_are_the_least():
 
 def test_a_drift_that_moves_a_value_by_its_error_does_so():
     plain = record(0.0, seed=7)
-    fit = fit_decay(plain)
+    fit = constant_fit(plain)
     assert "stability is not stated" in fit.message
     evidence = Evidence.of(plain, solve_decay(*padded(plain)))
     drift = evidence.drift_of_one_error("b")
     assert f"{drift:.2g} mA" in fit.message
     drifted = DecayRecord(plain.time, plain.current + drift * plain.time / SPAN)
-    moved = abs(fit_decay(drifted).b.value - fit.b.value)
+    moved = abs(constant_fit(drifted).b.value - fit.b.value)
     assert moved == pytest.approx(fit.b.error, rel=0.02)
 
 
 def test_the_core_solves_the_same_problem():
     noisy = record(0.9, seed=8, stated=0.02)
-    fit = fit_decay(noisy)
+    fit = constant_fit(noisy)
     core = solve(decay_problem(noisy, memory=fit.correlation_time))
     assert core["a"].value == pytest.approx(fit.a.value, abs=0.2 * fit.a.error)
     assert core["a"].error == pytest.approx(fit.a.error, rel=0.3)
@@ -142,7 +145,7 @@ def test_the_core_solves_the_same_problem():
 
 
 def test_the_sampler_has_the_same_noise():
-    fit = fit_decay(record(0.8, seed=9))
+    fit = constant_fit(record(0.8, seed=9))
     posterior = fit.sample(seed=1, budget=1000)  # 48 000 draws, of a memory of nine steps
     low, middle, high = np.percentile(posterior.values("a"), [15.9, 50, 84.1])
     assert (high - low) / 2 == pytest.approx(fit.a.error, rel=0.2)

@@ -1,5 +1,7 @@
 """Records that refute constant a and b, and what no residual shows. All are simulated."""
 
+from functools import partial
+
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp, trapezoid
@@ -10,6 +12,7 @@ from beamfit.studies.decay.law import DecayNumbers, Moments, beam_current, bent_
 from beamfit.studies.decay.record import Conditions, DecayRecord
 from beamfit.studies.decay.systematics import systematics
 
+constant_fit = partial(fit_decay, law="constant")
 HOUR, SPAN = 3600.0, 8 * 3600.0
 A, B = 4e-8, 2e-6
 
@@ -52,7 +55,7 @@ def test_the_bend_is_the_derivative_of_the_integrated_law():
 @pytest.mark.parametrize("slope", [-0.39, -0.27])
 def test_laws_of_the_iota_kind_are_refuted(slope):
     time, beam = integrated(lambda t, i: (i / 2.0) ** -slope / 600.0, 400, 2.0, 3000.0)
-    fit = fit_decay(noisy(time, beam, 2e-4))
+    fit = fit_decay(noisy(time, beam, 2e-4), law="constant")
     assert fit.status in ("poor_fit", "infeasible")
     true = 600.0 * (np.array(fit.lifetimes.current) / 2.0) ** slope / HOUR
     found = np.array([q.value for q in fit.lifetimes.lifetime])
@@ -61,7 +64,11 @@ def test_laws_of_the_iota_kind_are_refuted(slope):
 
 def test_a_lengthening_bunch_is_refuted_and_its_lifetime_offered():
     time, beam = integrated(lambda t, i: A * (i / 500) ** -0.1 * i + B)
-    fit = fit_decay(noisy(time, beam))
+    free = fit_decay(noisy(time, beam))
+    assert free.status == "converged"
+    assert "A constant a is rejected" in free.message
+    assert free.exact["a"].error < 0.1 * free.a.error
+    fit = fit_decay(noisy(time, beam), law="constant")
     assert fit.status == "poor_fit"
     assert "A constant a is rejected" in fit.message
     assert "lifetime by current" in fit.message
@@ -171,9 +178,13 @@ def test_an_impossible_bend_is_said_before_a_length_is_asked_for():
 
 def test_each_of_a_and_b_is_judged_by_itself():
     time, beam = integrated(lambda t, i: A * i + 1e-10)
-    fit = fit_decay(noisy(time, beam, 0.05))
+    fit = fit_decay(noisy(time, beam, 0.05), law="constant")
     assert fit.status == "converged"
     assert "a is determined; b is not told from zero" in fit.message
+    free = fit_decay(noisy(time, beam, 0.05))
+    assert "b is compatible with zero: it is below" in free.message
+    assert free.b.interval_95[0] == 0.0
+    assert free.b.interval_95[1] > 1e-10
 
 
 def test_the_power_of_the_test_is_stated():
@@ -228,8 +239,14 @@ def test_a_gauge_of_few_digits_that_follows_the_current_changes_nothing():
 def test_systematics_are_what_refits_say():
     time, beam = integrated(lambda t, i: A * i + B)
     record = noisy(time, beam, 1e-3)
-    fit = fit_decay(record)
-    vacuum, drift, offset, bunch = systematics(fit)
+    fit = constant_fit(record)
+    vacuum, drift, offset, bunch, follows = systematics(fit)
+    # Half of the pressure that follows the current: b loses it to a, and the curve is the same.
+    assert follows.a == pytest.approx(-follows.b / fit.mean_current)
+    assert follows.b == pytest.approx(-fit.b.value)
+    assert follows.lifetime_mean == 0
+    contained = systematics(fit_decay(record))
+    assert [row.cause for row in contained] == [row.cause for row in (drift, offset, follows)]
 
     def at(found):
         a, b = found.a.value, found.b.value
@@ -242,7 +259,7 @@ def test_systematics_are_what_refits_say():
         bunch: integrated(lambda t, i: A * (i / fit.mean_current) ** -0.1 * i + B)[1] - beam,
     }
     for row, change in causes.items():
-        moved = fit_decay(DecayRecord(time, record.current + change))
+        moved = constant_fit(DecayRecord(time, record.current + change))
         for name in ("a", "b", "lifetime_mean"):
             shift = at(moved)[name] - at(fit)[name]
             small = 0.02 * getattr(fit, name).error
@@ -253,9 +270,9 @@ def test_systematics_are_what_refits_say():
 
 def test_a_monitor_of_small_currents_is_off_in_proportion():
     time, beam = integrated(lambda t, i: A * i + B, 300)
-    large = systematics(fit_decay(noisy(time, beam, 1e-3)))
+    large = systematics(constant_fit(noisy(time, beam, 1e-3)))
     # The same decay as of 10 µA: a is larger by as much as the current is smaller.
-    small = systematics(fit_decay(DecayRecord(time, noisy(time, beam, 1e-3).current * 2e-5)))
+    small = systematics(constant_fit(DecayRecord(time, noisy(time, beam, 1e-3).current * 2e-5)))
     assert "0.0001 mA too much" in small[2].cause
     for few, many in zip(small, large, strict=True):
         scale = 50.0 if "monitor" in few.cause else 1.0  # 1 % of 10 µA against 0.02 % of 500 mA

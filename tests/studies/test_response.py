@@ -8,7 +8,7 @@ from scipy.signal import lfilter
 
 from beamfit.dynamics.response import FIRST_ORDER, SECOND_ORDER, simulate
 from beamfit.errors import InputError
-from beamfit.greybox.correlated import Noise, innovations
+from beamfit.noise.correlated import Noise, innovations
 from beamfit.status import Status
 from beamfit.studies.response.fit import identify
 from beamfit.studies.response.limits import limited

@@ -15,6 +15,7 @@ from beamfit.shown import shown
 from beamfit.studies.decay.departures import ConstantA
 from beamfit.studies.decay.fit import DecayFit, bare, fit_decay
 from beamfit.studies.decay.law import lifetime_of
+from beamfit.studies.decay.marginal import Law
 from beamfit.studies.decay.model import padded, solve_decay
 from beamfit.studies.decay.record import DecayRecord
 from beamfit.table import json_of
@@ -89,7 +90,9 @@ def single_exponential(record: DecayRecord, fit: DecayFit | None = None) -> OneL
     scale = math.sqrt(float(found.sum_squares) / (len(record) - 2))
     scale = scale if record.error is None else max(1.0, scale)
     rate, error = float(found.values.b), float(found.errors.b) * scale
-    return _one_lifetime(rate, error, found.residuals[: len(record)], fit or fit_decay(record))
+    return _one_lifetime(
+        rate, error, found.residuals[: len(record)], fit or fit_decay(record, law=Law.constant)
+    )
 
 
 def log_linear(record: DecayRecord, fit: DecayFit | None = None) -> OneLifetime:
@@ -123,7 +126,7 @@ def log_linear(record: DecayRecord, fit: DecayFit | None = None) -> OneLifetime:
     logs = np.log(record.current)
     (slope, level), covariance = np.polyfit(record.time, logs, 1, cov=True)
     residuals = np.exp(level + slope * record.time) - record.current
-    fit = fit or fit_decay(record)
+    fit = fit or fit_decay(record, law=Law.constant)
     return _one_lifetime(-slope, math.sqrt(covariance[0, 0]), residuals, fit)
 
 
@@ -225,7 +228,7 @@ def constant_a_test(record: DecayRecord) -> ConstantA:
     constant a then leaves a remainder that the fit takes for a gas term: repeat the fit with
     the bunch's own law, `fit_decay(record, shape=...)`. The exponent is estimated beside I0, a and
     b in linear approximation about a constant a, and its error contains the noise's memory
-    (`beamfit.greybox.correlated`): the score test.
+    (`beamfit.noise.correlated`): the score test.
 
     Examples
     --------
@@ -236,7 +239,7 @@ def constant_a_test(record: DecayRecord) -> ConstantA:
     >>> print(constant_a_test(record).status)
     converged
     """
-    found = fit_decay(record).constant_a
+    found = fit_decay(record, law=Law.constant).constant_a
     if found is None:
         raise InputError("readings that are all equal", "a decay", path=record.name)
     return found
@@ -282,6 +285,6 @@ def check_decay(record: DecayRecord, fit: DecayFit | None = None) -> DecayChecks
     """
     if np.ptp(record.current) == 0:
         return None
-    fit = fit or fit_decay(record)
+    fit = fit or fit_decay(record, law=Law.constant)
     line = log_linear(record, fit) if record.current.min() > 0 else None
     return DecayChecks(single_exponential(record, fit), line)

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Callable, Sequence
 
 import numpy as np
 from scipy.ndimage import maximum_filter1d
+from scipy.special import ndtr
 
 from beamfit.studies.decay.conditions import Conditions
 from beamfit.studies.decay.pool import FEWEST_CYCLES, FEWEST_READINGS
@@ -18,6 +20,8 @@ from beamfit.studies.decay.segments import Event, Split, beam_readings, event_of
 THRESHOLD = 5.0
 # Least step in units of the last digit of the readings.
 DIGITS = 1.5
+# Readings in which steps are sought at once, and of them those that the next stretch has, too.
+STRETCH, OVERLAP = 1 << 16, 1 << 12
 # Readings on either side whose means are compared, and the fewest places that tell their scatter.
 WINDOWS, PLACES = (1, 2, 4, 8, 16, 32, 64), 20
 # In so many windows the usual difference, which the decay makes, is taken off.
@@ -38,6 +42,13 @@ RETURNED = 0.5
 SAME = 0.02
 # Currents so alike that a and b do as one number.
 NARROW = 0.02
+# Noise over the height of a sawtooth that is looked at, and the logarithm of the likelihood ratio
+# from which readings are of one: 1 in 1000 at even odds.
+NOISES, EVEN = (0.01, 0.03, 0.1, 0.2), math.log(1000.0)
+# Refills of top-up come every 3 min, within a factor 3, those of fills hours apart; lifetimes are
+# 15 h within a factor 3, the rest within seconds to years:
+# middle, s, width of the logarithm, and its whole range.
+PERIOD, LIFETIME = (180.0, 1.2, 12.0), (15 * 3600.0, 1.2, 17.0)
 # Readings beyond which the scatter of their mean is followed no farther.
 LONG = 4096
 
@@ -84,12 +95,7 @@ def find_cycles(record: DecayRecord) -> Split:
         short = [piece for piece in pieces if 0 < piece.size < fewest]
         events += [event_of(record, "short", piece[0], piece[-1]) for piece in short]
         kept = np.concatenate(long or [kept[:0]])
-    begins = np.cumsum([0] + [piece.size for piece in long[:-1]])
-    level = _levelled(record.time[kept], record.current[kept], begins)
-    place = np.cumsum(np.bincount(kept, minlength=len(record))) - 1
-    for before, after in itertools.pairwise(long):
-        ends = (level[place[side]] for side in (after[:NEAR], before[-NEAR:]))
-        change = float(np.subtract(*map(np.median, ends)))
+    for after, change in zip(long[1:], _changes_between(record, long), strict=True):
         kind, at = "refill" if change > 0 else "loss", float(record.time[after[0]])
         events.append(Event(kind, at, 0.0, change))
     cycles = (record.select(piece, f"{record.name}#{k}") for k, piece in enumerate(long, 1))
@@ -118,6 +124,68 @@ def is_refilled(split: Split) -> bool:
     return len(refills) + 1 >= FEWEST_CYCLES and sum(refills) > RETURNED * max(lost, 0.0)
 
 
+def is_sawtooth(residuals: np.ndarray) -> bool:
+    """Whether readings lie evenly between two currents, as of refills that an archive is too slow
+    to resolve, and not about one: by the likelihood of an even distribution with normal noise.
+
+    Examples
+    --------
+    >>> random = np.random.default_rng(1)
+    >>> is_sawtooth(random.uniform(size=200)), is_sawtooth(random.normal(size=200))
+    (True, False)
+    """
+    off = residuals - residuals.mean()
+    normal = -off.size * (math.log(max(off.std(), 1e-300)) + 0.5 * math.log(2 * math.pi * math.e))
+    best = -math.inf
+    for share in NOISES:
+        width = math.sqrt(12) * off.std() / math.sqrt(1 + 12 * share**2)
+        ends = ((off + sign * width / 2) / (share * width) for sign in (1, -1))
+        inside = np.subtract(*map(ndtr, ends)) / width
+        best = max(best, float(np.sum(np.log(np.maximum(inside, 1e-300)))))
+    return best - normal > EVEN
+
+
+def unresolved(usual: float, interval: float, lifetime: float) -> float:
+    """Probability that refills faster than a record is read look like slower ones.
+
+    Parameters
+    ----------
+    usual : float
+        Readings from one refill that is seen to the next.
+    interval : float
+        Time between readings, s.
+    lifetime : float
+        Of the cycles as they look, s.
+
+    Notes
+    -----
+    A sawtooth that is read every interval looks the same for all its periods that differ by whole
+    phases: of those shorter than two intervals one in usual² has so many readings a cycle. Both
+    kinds are weighed by priors of the period of refills and of the lifetime.
+
+    Examples
+    --------
+    >>> found = [unresolved(18, 10.0, 36000.0), unresolved(10, 600.0, 4e6)]
+    >>> f"{found[0]:.3f}, {found[1]:.2f}"
+    '0.002, 0.98'
+    """
+    lost = usual * interval / lifetime
+
+    def chance(period: np.ndarray) -> np.ndarray:
+        return _prior(period, *PERIOD) * _prior(period / lost, *LIFETIME)
+
+    fast = np.geomspace(1e-3 * interval, 2 * interval, 200)
+    others = float(np.trapezoid(chance(fast), np.log(fast))) / usual**2
+    same = float(chance(np.array(usual * interval))) / usual
+    return others / max(others + same, 1e-300)
+
+
+def _prior(value: np.ndarray, middle: float, width: float, wide: float) -> np.ndarray:
+    """Density in the logarithm: normal about the middle, a fifth of it flat over a wide range."""
+    normal = np.exp(-0.5 * (np.log(value / middle) / width) ** 2) / math.sqrt(2 * math.pi) / width
+    return 0.8 * normal + 0.2 / wide
+
+
 def _grain(current: np.ndarray) -> float:
     """The last digit of the readings, mA."""
     levels = np.unique(current)
@@ -139,8 +207,37 @@ def _levelled(time: np.ndarray, current: np.ndarray, first: np.ndarray) -> np.nd
     return current - columns @ loss
 
 
+def _changes_between(record: DecayRecord, pieces: Sequence[np.ndarray]) -> list[float]:
+    """By how much the current changes from each piece to the next, mA, the loss put back; by one
+    law for some pieces together.
+    """
+    ends, found = np.cumsum([piece.size for piece in pieces]) // STRETCH, []
+    for batch in np.split(np.arange(len(pieces)), np.flatnonzero(np.diff(ends)) + 1):
+        some = [pieces[k] for k in batch] + list(pieces[batch[-1] + 1 : batch[-1] + 2])
+        rows, first = np.concatenate(some), np.cumsum([0] + [piece.size for piece in some[:-1]])
+        level = _levelled(record.time[rows], record.current[rows], first)
+        for begin, middle, end in zip(first, first[1:], [*first[2:], rows.size], strict=False):
+            before = level[max(begin, middle - NEAR) : middle]
+            after = level[middle : min(end, middle + NEAR)]
+            found.append(float(np.median(after) - np.median(before)))
+    return found
+
+
 def _steps(time: np.ndarray, current: np.ndarray, grain: float) -> np.ndarray:
-    """Indices of the first readings after a step, in order."""
+    """Indices of the first readings after a step, in order; of a long record by stretches of it,
+    each of which tells the steps that are not near its ends.
+    """
+    found = []
+    for start in range(0, max(current.size - OVERLAP, 1), STRETCH - OVERLAP):
+        stop = min(start + STRETCH, current.size)
+        steps = start + _steps_of(time[start:stop], current[start:stop], grain)
+        low = start + OVERLAP // 2 if start else 0
+        high = stop - OVERLAP // 2 if stop < current.size else stop
+        found.append(steps[(steps >= low) & (steps < high)])
+    return np.concatenate(found)
+
+
+def _steps_of(time: np.ndarray, current: np.ndarray, grain: float) -> np.ndarray:
     if current.size < PLACES:
         return np.zeros(0, int)
     found = np.zeros(current.size, bool)
@@ -213,10 +310,21 @@ def _changes(total: np.ndarray, found: np.ndarray, window: int) -> tuple[np.ndar
     steps = np.append(0, np.cumsum(found))
     free = steps[place + window] == steps[place - window + 1]
     change = (total[place + window] - 2 * total[place] + total[place - window]) / window
-    for block in np.array_split(np.arange(place.size), max(1, place.size // (BLOCK * window))):
-        known = change[block][free[block]]
-        change[block] -= np.median(known) if known.size else 0.0
-    return free, change
+    return free, change - _usual(np.where(free, change, np.nan), BLOCK * window)
+
+
+def _usual(values: np.ndarray, size: int) -> np.ndarray:
+    """The median of each block of about this size, for each value; 0 where none is finite."""
+    if not values.size:
+        return values
+    blocks = max(1, values.size // size)
+    size = -(-values.size // blocks)
+    padded = np.append(values, np.full(blocks * size - values.size, np.nan)).reshape(blocks, size)
+    ordered = np.sort(padded, axis=1)  # what is not finite comes last
+    count = np.isfinite(ordered).sum(axis=1)[:, None]
+    middle = np.concatenate([np.maximum(count - 1, 0) // 2, count // 2], axis=1)
+    found = np.take_along_axis(ordered, np.minimum(middle, size - 1), axis=1).mean(axis=1)
+    return np.repeat(np.where(count[:, 0] > 0, found, 0.0), size)[: values.size]
 
 
 def _placed(total: np.ndarray, steps: np.ndarray) -> np.ndarray:
@@ -230,6 +338,12 @@ def _placed(total: np.ndarray, steps: np.ndarray) -> np.ndarray:
         after = (total[high] - total[at]) / (high - at)
         ends[k] = at[np.argmax((before - after) ** 2 * (at - low) * (high - at))]
     return np.unique(ends[1:-1])
+
+
+def usual_cycle(cycles: Sequence[DecayRecord]) -> tuple[float, float]:
+    """Median number of readings of cycles, and time between them, s."""
+    count = float(np.median([len(cycle) for cycle in cycles]))
+    return count, float(np.median([cycle.span / (len(cycle) - 1) for cycle in cycles]))
 
 
 def alike(cycles: Sequence[DecayRecord]) -> list[list[DecayRecord]]:

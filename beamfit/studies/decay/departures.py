@@ -10,8 +10,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.special import stdtr
 
-from beamfit.greybox.correlated import remembers, whitened_of_both
 from beamfit.greybox.memory import Memory, memory_of
+from beamfit.noise.correlated import remembers, whitened_of_both
 from beamfit.quantity import Quantity
 from beamfit.shown import shown
 from beamfit.status import Status

@@ -10,15 +10,15 @@ from typing import Any, Self
 
 import numpy as np
 
-from beamfit.greybox.correlated import remembers
 from beamfit.greybox.memory import Memory, Whitened, remembered
 from beamfit.lifetime.decay import HOUR
+from beamfit.noise.correlated import remembers
+from beamfit.noise.memory import Products
 from beamfit.quantity import Quantity
 from beamfit.shown import shown
 from beamfit.statistics import reach_of
 from beamfit.status import Status
 from beamfit.studies.decay.departures import (
-    FOUND,
     Change,
     ConstantA,
     LifetimeLaw,
@@ -28,6 +28,7 @@ from beamfit.studies.decay.departures import (
     lifetime_law,
 )
 from beamfit.studies.decay.law import Expansion, Physical, Shape
+from beamfit.studies.decay.marginal import FreeLaw, Law, free_law
 from beamfit.studies.decay.model import Solution, expanded
 from beamfit.studies.decay.outgassing import Outgassing, outgassing_of
 from beamfit.studies.decay.record import DecayRecord
@@ -55,9 +56,8 @@ NORMAL = 1.96
 SLOW = 3.0
 # Of so few readings the noise tells nothing of its memory.
 FEWEST = 12
-# The power by which a falls with the current for a bunch that lengthens as it can most, and the
-# share of b from which it matters that the record would not show it.
-LENGTHENING, MATTERS = -1 / 3, 0.1
+# An exponent as of no bunch length refutes the free law, too, if that is likelier than not.
+LIKELIER = 0.5
 
 
 @shown
@@ -123,7 +123,7 @@ class Weighed:
     white: float
     change: Change | None = None
     outgassing: Outgassing | None = None
-    bent: Physical | None = None
+    free: FreeLaw | None = None
 
     def told(self, name: str) -> tuple[float, ...]:
         """A value, its error, that for errors as stated, and how far 95 % reach."""
@@ -144,12 +144,7 @@ class Weighed:
         value, error, raw, reach = self.told(name)
         if not (known and math.isfinite(value) and math.isfinite(error)):
             return Quantity(value, None, UNITS[name])
-        found = Quantity.reaching(value, error, UNITS[name], raw, reach)
-        if self.bent is None or name == "i0":
-            return found
-        bent = float(getattr(self.bent, name))
-        interval = value - reach - max(bent, 0.0), value + reach - min(bent, 0.0)
-        return replace(found, interval_95=interval)
+        return Quantity.reaching(value, error, UNITS[name], raw, reach)
 
     def lifetime(self, name: str, known: bool) -> Quantity:
         """Lifetime in hours from a loss rate; no error where the rate is not clear of zero."""
@@ -166,6 +161,10 @@ class Weighed:
         """Whether a value is clear of zero."""
         value, error = self.sure(name)
         return error < DETERMINED * value
+
+    def widely(self, name: str, exact: Quantity) -> Quantity:
+        """A quantity where the law is free; here it is not."""
+        return exact
 
     @cached_property
     def separability(self) -> Separability:
@@ -199,8 +198,11 @@ class Weighed:
         """What a `DecayFit` has of this, by its names."""
         apart = known and self.separability.separable
         same = ("chi2", "dof", "noise_inferred", "constant_a", "correlation_time", "lifetimes")
-        found = {name: self.quantity(name, apart) for name in "ab"}
-        found |= {f"lifetime_{at}": self.lifetime(f"rate_{at}", known) for at in ENDS}
+        exact = {"i0": self.quantity("i0", known)}
+        exact |= {name: self.quantity(name, apart) for name in "ab"}
+        exact |= {f"lifetime_{at}": self.lifetime(f"rate_{at}", known) for at in ENDS}
+        found = {name: self.widely(name, quantity) for name, quantity in exact.items()}
+        found |= {"exact": exact, "free_law": self.free}
         found |= {name: getattr(self, name) for name in (*same, "inflation")}
         return found | {"identifiability": self.separability}
 
@@ -245,13 +247,17 @@ class Evidence(Weighed):
     memory: Memory | None
     constant_a: ConstantA
     changed: bool
+    law: Law = Law.constant
 
     @classmethod
-    def of(cls, record: DecayRecord, solution: Solution, shape: Shape | None = None) -> Evidence:
+    def of(
+        cls, record: DecayRecord, solution: Solution, shape: Shape | None = None,
+        law: Law = Law.constant,
+    ) -> Evidence:  # fmt: skip
         """Weigh a solution; without errors the weights were 1/mA, and residuals are the noise.
         What is stated of the monitor's stability is part of the errors.
         """
-        found = cls._by_noise(record, solution, shape)
+        found = replace(cls._by_noise(record, solution, shape), law=law)
         changes = record.monitor_changes
         return found.widened(found.about, changes) if changes and solution.converged else found
 
@@ -360,14 +366,50 @@ class Evidence(Weighed):
         return expanded(self.record, self.solution.values, self.shape)
 
     @cached_property
-    def bent(self) -> Physical | None:
-        """What unseen bunches that lengthen with the current would have added, beyond b's error."""
-        seen = FOUND * (self.constant_a.exponent.error or math.inf) < -LENGTHENING
-        if self.shape is not None or seen or self.refuted or not self.separability.separable:
+    def free(self) -> FreeLaw | None:
+        """What the record tells where its law is free; None where the law is known, something
+        else than the law explains the record better, or the decay is within its noise.
+        """
+        known = self.law is Law.constant or self.shape is not None
+        if known or not self.is_clear("rate_mean") or self.explained:
             return None
-        moved = self.about.moved(LENGTHENING * self.about.rows[:, NUMBERS])
-        least = max(MATTERS * abs(self.values.b), self.reach.b)
-        return moved if abs(moved.b) > least else None
+        found = free_law(self.record, self.values)
+        return None if found is None or found.odd > LIKELIER else found
+
+    @property
+    def explained(self) -> bool:
+        """Whether a change in time explains a refuted law better than a power of the current."""
+        return self.refuted and (self.outgassing is not None or self.change is not None)
+
+    @cached_property
+    def stated_odds(self) -> float:
+        """Log odds that the stated errors are right, whatever memory the noise has."""
+        columns = np.column_stack([self.about.residuals, self.about.rows])
+        products = Products.of(columns, self.record.time, stated=True)
+        rest, rows = products.matrix[:, :1, 1:], products.matrix[:, 1:, 1:]
+        step = np.linalg.solve(rows, np.swapaxes(rest, 1, 2))
+        squares = products.matrix[:, 0, 0] - (rest @ step)[:, 0, 0]
+        return products.stated_odds(np.maximum(squares, 0.0), rows.shape[1])
+
+    def widely(self, name: str, exact: Quantity) -> Quantity:
+        """A quantity with the exponent and the drift of b that the record leaves open.
+
+        The value is that of constant a and b where they are likelier, else the median. What is not
+        determined keeps its interval.
+        """
+        if self.free is None or not math.isfinite(exact.value):
+            return exact
+        span = self.free.spans[name]
+        value = exact.value if self.free.constant > LIKELIER else span.median
+        value = float(np.clip(value, *span.interval))
+        moved = 0.0
+        if self.record.monitor_changes:
+            at = name.replace("lifetime", "rate")
+            by = [float(getattr(self.about.moved(c), at)) for c in self.record.monitor_changes]
+            moved = math.hypot(*by) * (HOUR * value**2 if at != name else 1.0)
+        error, interval = span.beside(value, moved)
+        error = None if exact.error is None else error
+        return Quantity(value, error, exact.unit, exact.error_raw, interval)
 
     @cached_property
     def lifetimes(self) -> LifetimeLaw | None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import jax
@@ -16,6 +16,7 @@ from beamfit.quantity import Quantity, Status
 from beamfit.shown import shown
 from beamfit.studies.decay.departures import Change, ConstantA, LifetimeLaw
 from beamfit.studies.decay.evidence import BELIEVED, UNITS, Evidence, Separability
+from beamfit.studies.decay.marginal import FreeLaw, Law
 from beamfit.studies.decay.model import Solution, padded, padded_size, solve_decay, solve_decays
 from beamfit.studies.decay.monitor import Monitor
 from beamfit.studies.decay.outgassing import Outgassing
@@ -56,8 +57,7 @@ class DecayFit:
     message : str
         One sentence or two of cause and remedy.
     i0, a, b : Quantity
-        Current at the first reading, mA, and the coefficients of dI/dt = -a I² - b I. Where the
-        record would not show a bunch that lengthens, `interval_95` of a and b reaches to such ones.
+        Current at the first reading, mA, and the coefficients of dI/dt = -a I² - b I.
     lifetime_start, lifetime_end, lifetime_mean : Quantity
         Lifetime 1/(a I + b) at the first and last reading and at the mean current, h.
     mean_current : float
@@ -93,6 +93,10 @@ class DecayFit:
         Whether a was given a dependence on the current.
     first : array of int, optional
         Where each cycle begins, of a fit to many cycles.
+    exact : mapping of str to Quantity
+        The same quantities if a and b are constant.
+    free_law : FreeLaw or None
+        The exponent of a and the drift of b that the errors contain; None where the law is known.
 
     Examples
     --------
@@ -127,6 +131,8 @@ class DecayFit:
     readings: DecayRecord | None = None
     shaped: bool = False
     first: np.ndarray | None = None
+    exact: Mapping[str, Quantity] = field(default_factory=dict)
+    free_law: FreeLaw | None = None
 
     def sample(
         self,
@@ -177,6 +183,10 @@ class DecayFit:
             expected = "one decay; the errors of cycles fitted together are those of the fit"
             raise InputError("samples of many cycles", expected, path=self.record)
         return draw(decay_target(self, noise, outliers, priors), **options)
+
+    def if_constant(self, name: str) -> Quantity:
+        """A quantity of the law with constant a and b, as the curve through the readings has it."""
+        return self.exact.get(name, getattr(self, name))
 
     @property
     def quantities(self) -> dict[str, Quantity]:
@@ -237,6 +247,8 @@ class DecayFit:
             "lifetime_by_current": self.lifetimes,
             "change": self.change,
         }
+        if self.free_law is not None:
+            found |= {"if_a_and_b_are_constant": dict(self.exact), "free_law": self.free_law}
         found |= {} if self.outgassing is None else {"outgassing": self.outgassing}
         return json_of(found if self.first is None else found | {"cycles": self.first.size})
 
@@ -245,6 +257,7 @@ def fit_decay(
     record: DecayRecord,
     shape: Callable[[Any], Any] | None = None,
     monitor: Monitor | None = None,
+    law: Law | str = Law.free,
 ) -> DecayFit:
     """Fit the decay law to one decay.
 
@@ -259,6 +272,10 @@ def fit_decay(
     monitor : Monitor, optional
         Stability of the current monitor, instead of what the record says of it; the errors contain
         it.
+    law : {"free", "constant"}
+        Whether a may depend on the current by a power and b drift in the record, with the priors
+        of `beamfit.studies.decay.marginal`, which the errors then contain; or both are constant.
+        With a `shape` the law is known.
 
     Returns
     -------
@@ -273,8 +290,9 @@ def fit_decay(
 
     Notes
     -----
-    Least squares with report equation 44, or with equation 42 if `shape` is given. Errors are
-    those of the linearised problem.
+    Least squares with report equation 44, or with equation 42 if `shape` is given. With constant
+    a and b errors are those of the linearised problem, else those of the posterior of
+    `beamfit.studies.decay.marginal.free_law`.
 
     Examples
     --------
@@ -282,22 +300,25 @@ def fit_decay(
     >>> from beamfit.lifetime.decay import current
     >>> t = np.linspace(0, 8 * 3600, 1000)
     >>> noise = 1e-3 * np.random.default_rng(1).normal(size=t.size)
-    >>> fit = fit_decay(DecayRecord(t, np.array(current(t, 500.0, 2e-8, 1e-6)) + noise))
+    >>> record = DecayRecord(t, np.array(current(t, 500.0, 2e-8, 1e-6)) + noise)
+    >>> fit = fit_decay(record, law="constant")
     >>> print(fit.status, fit.lifetime_mean)
     converged 28.704763 ± 0.000026 h
     """
     record = record if monitor is None else replace(record, monitor=monitor)
     if _says_nothing(record):
         return _constant(record)
-    return _judged(record, solve_decay(*padded(record), shape=shape), shape)
+    return _judged(record, solve_decay(*padded(record), shape=shape), shape, Law(law))
 
 
-def fit_decays(records: Sequence[DecayRecord]) -> tuple[DecayFit, ...]:
+def fit_decays(records: Sequence[DecayRecord], law: Law | str = Law.free) -> tuple[DecayFit, ...]:
     """Fit many decays; records of similar length are solved together.
 
     Parameters
     ----------
     records : sequence of DecayRecord
+        As for `fit_decay`.
+    law : {"free", "constant"}
         As for `fit_decay`.
 
     Returns
@@ -335,7 +356,7 @@ def fit_decays(records: Sequence[DecayRecord]) -> tuple[DecayFit, ...]:
             solutions = solve_decays(*stacked)
             for row, k in enumerate(chosen):
                 one = jax.tree.map(lambda leaf, r=row: leaf[r], solutions)
-                fits[k] = _judged(records[k], one)
+                fits[k] = _judged(records[k], one, law=Law(law))
     return tuple(fits[k] for k in range(len(records)))
 
 
@@ -372,10 +393,11 @@ def _constant(record: DecayRecord) -> DecayFit:
 
 
 def _judged(
-    record: DecayRecord, solution: Solution, shape: Callable[[Any], Any] | None = None
-) -> DecayFit:
+    record: DecayRecord, solution: Solution, shape: Callable[[Any], Any] | None = None,
+    law: Law = Law.constant,
+) -> DecayFit:  # fmt: skip
     """Turn a solution into quantities, a status and its sentence."""
-    evidence = Evidence.of(record, solution, shape)
+    evidence = Evidence.of(record, solution, shape, law)
     rate, error = evidence.sure("rate_mean")
     if rate < -BELIEVED * error:
         first, last = record.current[0], record.current[-1]
@@ -388,7 +410,6 @@ def _judged(
         record=record.name,
         status=finding.status,
         message=finding.message,
-        i0=evidence.quantity("i0", known),
         **evidence.quoted(known),
         mean_current=float(record.current.mean()),
         rms_residual=float(np.sqrt(np.mean(evidence.residuals**2))),

@@ -34,6 +34,8 @@ from beamfit.table import Table, json_of, labelled, plain_name
 # Points so many robust standard deviations off the law with a free exponent are outliers; no more
 # than a fifth of them.
 OUTLIER, MOST = 5.0, 0.2
+# Prior probability that a point of a table is a bad one.
+BAD = 0.03
 RECORD = "lifetimes"
 
 
@@ -154,15 +156,43 @@ def _outliers(table: LifetimeTable) -> np.ndarray:
     """Which points lie off every smooth law, the farthest first, one at a time."""
     kept = np.ones(len(table), bool)
     for _ in range(int(MOST * len(table))):
-        found = _solved(table, kept, exponent=bool(kept.sum() > FEWEST_LIFETIMES))
+        bends = bool(kept.sum() > FEWEST_LIFETIMES)
+        found = _solved(table, kept, exponent=bends)
         pulls = np.asarray(found.problem.residual(found.theta))[: len(table)]
         scatter = 1.4826 * np.median(np.abs(pulls[kept]))
         scatter = scatter if table.error is None else max(1.0, scatter)
         worst = int(np.argmax(np.abs(pulls)))
         if abs(pulls[worst]) <= OUTLIER * scatter:
+            worst = _bends_alone(table, kept, pulls) if bends else None
+        if worst is None:
             break
         kept[worst] = False
     return ~kept
+
+
+def _bends_alone(table: LifetimeTable, kept: np.ndarray, power: np.ndarray) -> int | None:
+    """The point that lies off the constant law of the others, if that law without it is likelier
+    than an exponent with it (`power` has its residuals), as where it stands at an end.
+
+    By residuals of each point from the others (R. D. Cook and S. Weisberg, Residuals and influence
+    in regression, 1982, eq. 2.2.8), in the loss rates, which are linear in the current.
+    """
+    rows = np.flatnonzero(kept)
+    current, lifetime = table.current[rows], table.lifetime[rows]
+    given, count = table.error is not None, rows.size
+    error = table.error[rows] if given else np.full(count, np.median(lifetime))
+    columns = np.column_stack([current / current.mean(), np.ones(count)])
+    basis = np.linalg.qr(columns * (lifetime**2 / error)[:, None])[0]
+    rates = lifetime / error
+    left, free = rates - basis @ (basis.T @ rates), 1 - np.sum(basis**2, axis=1)
+    falls = left**2 / np.maximum(free, 1e-12)
+    whole, worst = float(left @ left), int(np.argmax(falls))
+    rest, dof = max(whole - falls[worst], 1e-300), count - 3
+    unit = 1.0 if given else rest / dof
+    with_power = max(float(power[rows] @ power[rows]), 1e-300)
+    better = with_power - rest if given else dof * math.log(with_power / rest)
+    likelier = better > 2 * math.log(count / BAD)
+    return int(rows[worst]) if falls[worst] > OUTLIER**2 * unit and likelier else None
 
 
 def _tested(table: LifetimeTable, plain: Fit, power: Fit) -> ConstantA:

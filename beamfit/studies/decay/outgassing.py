@@ -10,9 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from beamfit.greybox.correlated import is_correlated
 from beamfit.greybox.descend import descend_one
 from beamfit.lifetime.decay import HOUR
+from beamfit.noise.correlated import is_correlated
 from beamfit.quantity import Quantity
 from beamfit.shown import shown
 from beamfit.studies.decay.departures import (

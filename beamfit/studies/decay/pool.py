@@ -13,8 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from beamfit.greybox.correlated import Levels, whitened
 from beamfit.lifetime.decay import current_by_rate
+from beamfit.noise.correlated import Levels, whitened
 from beamfit.studies.decay.model import PRIOR_WIDTH, padded_size
 from beamfit.studies.decay.record import DecayRecord
 
@@ -25,6 +25,9 @@ MOST = 16384
 LOSS_A_STEP, MOST_STEPS = 0.05, 64
 # Robust standard deviations off which a reading or a cycle is left out; at most this share of them.
 OUTLIER, SHARE = 7.0, 0.2
+# Errors of the mean by which readings at the edges of cycles lie off the law where they are of an
+# injection: what stays below moves the lifetime by no more than its error.
+EDGE, WITHIN = 2.5, "they lie within injections"
 SEARCH = 30
 
 
@@ -192,27 +195,48 @@ def _far(values: np.ndarray) -> np.ndarray:
     return far if spread > 0 and far.mean() <= SHARE else np.zeros(values.size, bool)
 
 
-def _head(pool: Pool) -> bool:
-    """Whether the first readings of all cycles lie above the law: fresh beam that decays faster."""
-    first = pool.cycles.first[pool.cycles.lengths > 3 * FEWEST_READINGS]
-    off = -pool.left[first, 3]
-    if off.size < FEWEST_CYCLES:
-        return False
-    scatter = 1.4826 * np.median(np.abs(pool.left[:, 3])) / math.sqrt(off.size)
-    return bool(np.median(off) > OUTLIER * max(scatter, 1e-300))
+def _edges(pool: Pool) -> np.ndarray:
+    """How far the first and the last readings of all cycles lie above the law, in errors of their
+    mean: fresh beam decays faster, and a reading within an injection lies below.
+    """
+    first, lengths = pool.cycles.first, pool.cycles.lengths
+    long = lengths > 3 * FEWEST_READINGS
+    ends = np.array([first[long], (first + lengths - 1)[long]])
+    if ends.shape[1] < FEWEST_CYCLES:
+        return np.zeros(2)
+    scatter = max(1.4826 * float(np.median(np.abs(pool.left[:, 3]))), 1e-300)
+    off = np.clip(-pool.left[ends, 3] / scatter, -OUTLIER, OUTLIER)
+    return off.mean(axis=1) * math.sqrt(ends.shape[1])
+
+
+def _trimmed(pool: Pool) -> tuple[Pool, list[str]]:
+    """The fit without readings at the edges of cycles that are not of the decay."""
+    cut, high = np.zeros(2, int), 0
+    most = int(np.median(pool.cycles.lengths)) // 3
+    while cut.max() < most and np.any(far := np.abs(edges := _edges(pool)) > EDGE):
+        high += int(edges[0] > EDGE)
+        keep = np.ones(pool.cycles.time.size, bool)
+        first, lengths = pool.cycles.first, pool.cycles.lengths
+        long = lengths > 3 * FEWEST_READINGS
+        for side, ends in enumerate((first, first + lengths - 1)):
+            keep[ends[long]] &= not far[side]
+        pool, cut = solved(pool.cycles.kept(keep)), cut + far
+    said = []
+    for side, why in enumerate(
+        ("fresh beam decays faster" if 2 * high >= cut[0] else WITHIN, WITHIN)
+    ):
+        if cut[side]:
+            which = f"{('first', 'last')[side]} {cut[side]}"
+            of_each = (
+                "reading of each cycle was" if cut[side] == 1 else "readings of each cycle were"
+            )
+            said.append(f"the {which} {of_each} left out: {why}")
+    return pool, said
 
 
 def cleaned(cycles: Cycles) -> tuple[Pool, tuple[str, ...]]:
-    """The fit without readings, heads of cycles and cycles that are not of the decay."""
-    said, heads, pool = [], 0, solved(cycles)
-    most = int(np.median(cycles.lengths)) // 3
-    while heads < most and _head(pool):
-        keep = np.ones(pool.cycles.time.size, bool)
-        keep[pool.cycles.first[pool.cycles.lengths > 3 * FEWEST_READINGS]] = False
-        pool, heads = solved(pool.cycles.kept(keep)), heads + 1
-    if heads:
-        readings = "reading of each cycle was" if heads == 1 else "readings of each cycle were"
-        said.append(f"the first {heads} {readings} left out: fresh beam decays faster")
+    """The fit without readings, edges of cycles and cycles that are not of the decay."""
+    pool, said = _trimmed(solved(cycles))
     departure, error = _per_cycle(pool)
     cut = np.repeat(_far(departure / error), pool.cycles.lengths)
     if cut.any():

@@ -11,10 +11,11 @@ import numpy as np
 from scipy.special import fdtrc
 
 from beamfit.errors import InputError
-from beamfit.greybox.correlated import is_correlated
 from beamfit.greybox.memory import Memory, Whitened, remembered
 from beamfit.lifetime.decay import HOUR
+from beamfit.noise.correlated import is_correlated
 from beamfit.quantity import Quantity, Status
+from beamfit.studies.decay.cycles import unresolved
 from beamfit.studies.decay.departures import (
     CURRENTS,
     REJECTED,
@@ -47,6 +48,8 @@ SEEN = 6.0
 BEND = 1 / 12 / math.sqrt(5)
 # Noise with a memory is taken for so many times what neighbouring readings scatter by.
 OWN = 3.0
+# Probability of refills faster than the record is read from which cycles tell no lifetime.
+UNSURE = 0.05
 
 
 def _slopes(pool: Pool) -> tuple[Physical, np.ndarray]:
@@ -234,13 +237,22 @@ def stands_alone(cycle: DecayRecord, fit: DecayFit) -> bool:
     return noise * math.sqrt(max(len(cycle) / MOST, 1.0)) < SEPARABLE * bend
 
 
-def seen_through(fit: DecayFit) -> DecayFit:
+def seen_through(fit: DecayFit, usual: float, interval: float) -> DecayFit:
     """A fit to cycles that were found, without errors where refills may have been missed: then the
-    beam seems to live longer than it does.
+    beam seems to live longer than it does. `usual` is how many readings
+    a cycle has, one each `interval`.
 
     The refill that holds the current gives back what a cycle loses. It is told from the noise by
     the means of half a cycle before and after.
     """
+    lifetime = fit.lifetime_mean.value * HOUR
+    if lifetime > 0 and unresolved(usual, interval, lifetime) > UNSURE:
+        cause = (
+            "The beam is held by refills that the record may not resolve: of those that were found "
+            f"the next comes after {usual:.3g} readings, but faster ones look the same when read "
+            f"every {interval:.3g} s. Record more readings from refill to refill. "
+        )
+        return _opened(fit, cause)
     record, memory = fit.readings, fit.identifiability.residual_correlation
     half = max(len(record) / fit.first.size / 2, 1.0)
     mean = (1 + memory) / (1 - memory) / half if memory else 1 / half
@@ -255,8 +267,12 @@ def seen_through(fit: DecayFit) -> DecayFit:
         f"{least:.2g} mA can be missed in this noise: the beam then seems to live longer than it "
         f"does. Average readings, or give the times of the refills by cutting the record there. "
     )
+    return _opened(fit, cause)
+
+
+def _opened(fit: DecayFit, cause: str) -> DecayFit:
     bare = {name: quantity.open() for name, quantity in fit.quantities.items()}
-    return replace(fit, status=Status.unidentified, message=cause + fit.message, **bare)
+    return replace(fit, status=Status.unidentified, message=cause + fit.message, exact=bare, **bare)
 
 
 def cycle_lifetimes(fit: DecayFit) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -308,7 +324,7 @@ def fit_cycles(cycles: Sequence[DecayRecord], name: str = "cycles") -> DecayFit:
     Notes
     -----
     Least squares; the currents at the starts are eliminated, so that time and memory grow with the
-    readings alone. Noise with a memory goes on from cycle to cycle (`beamfit.greybox.correlated`).
+    readings alone. Noise with a memory goes on from cycle to cycle (`beamfit.noise.correlated`).
     Readings, cycles and heads of cycles that lie far off are left out and counted.
 
     Examples
@@ -343,8 +359,7 @@ def fit_pieces(cycles: Sequence[DecayRecord], name: str) -> DecayFit:
         record=name,
         status=finding.status,
         message=finding.message,
-        i0=evidence.quantity("i0", False),
-        **evidence.quoted(),
+        **evidence.quoted() | {"i0": evidence.quantity("i0", False)},
         mean_current=pool.mean,
         rms_residual=pool.mean * float(np.sqrt(np.mean((pool.left[:, 3] / weight) ** 2))),
         residuals=pool.mean * pool.residuals / weight,

@@ -12,18 +12,18 @@ from jax import Array
 
 from beamfit.errors import InputError
 from beamfit.greybox import tree
-from beamfit.greybox.correlated import (
+from beamfit.greybox.memory import range_of
+from beamfit.greybox.posterior import Sampled, target_of
+from beamfit.greybox.problem import Free, Prior, Problem, Record
+from beamfit.greybox.stated import Optimum, Statement
+from beamfit.lifetime.decay import HOUR, current
+from beamfit.noise.correlated import (
     Noise,
     innovations,
     log_volume,
     whitened,
     whitened_of_both,
 )
-from beamfit.greybox.memory import range_of
-from beamfit.greybox.posterior import Sampled, target_of
-from beamfit.greybox.problem import Free, Prior, Problem, Record
-from beamfit.greybox.stated import Optimum, Statement
-from beamfit.lifetime.decay import HOUR, current
 from beamfit.sampling.intervals import Expected
 from beamfit.sampling.posterior import Posterior
 from beamfit.sampling.priors import Distribution
@@ -244,10 +244,11 @@ def _log_volume(model: DecayNumbers, data: tuple[Array, Array, Remembered]) -> A
 def _start(fit, record: DecayRecord) -> tuple[np.ndarray, float]:
     """Where to begin, a and b not negative, and the whole loss rate at the mean current, 1/s."""
     mean = fit.mean_current
-    rate = fit.a.value * mean + fit.b.value
+    a, b = fit.if_constant("a").value, fit.if_constant("b").value
+    rate = a * mean + b
     if not (np.isfinite(rate) and rate > 0):
         rate = 1.0 / max(record.span, 1.0)
-    share = np.clip(np.nan_to_num(fit.a.value * mean / rate, nan=0.5), 0.0, 1.0)
+    share = np.clip(np.nan_to_num(a * mean / rate, nan=0.5), 0.0, 1.0)
     return np.array([fit.i0.value, share * rate / mean, (1.0 - share) * rate]), rate
 
 

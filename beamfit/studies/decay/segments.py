@@ -14,8 +14,6 @@ from beamfit.studies.decay.record import DecayRecord
 THRESHOLD = 10.0
 # Readings below this share of the largest one near them are dropouts of the monitor.
 DROPOUT = 0.02
-# So many dead readings at most may stand before the beam is seen.
-DEAD = 5
 WINDOW = 9
 FEWEST = 8
 # Readings whose means are looked at for a ramp at the head, the share of its rise by which a fall
@@ -101,18 +99,28 @@ def noise_of(time: np.ndarray, current: np.ndarray) -> float:
 def _dropouts(current: np.ndarray) -> tuple[np.ndarray, int]:
     """Readings near zero although the beam comes back, and where it is gone for good."""
     flagged = np.zeros(current.size, bool)
-    # A few dead readings before the beam is seen have no reading before them to compare with.
-    first = int(np.argmax(current > DROPOUT * np.median(current)))
-    if first <= DEAD and np.median(current) > 0:
-        flagged[:first] = True
+    # Readings before the beam is seen have no reading before them to compare with.
+    beam = np.median(current[current > 0]) if np.any(current > 0) else 0.0
+    flagged[: int(np.argmax(current > DROPOUT * beam))] = True
     for start in np.flatnonzero(current[1:] < DROPOUT * current[:-1]) + 1:
         if flagged[start]:
             continue
-        back = np.flatnonzero(current[start:] >= DROPOUT * current[start - 1])
-        if not back.size:
+        back = _first_above(current, start, DROPOUT * current[start - 1])
+        if back == current.size:
             return flagged, int(start)
-        flagged[start : start + back[0]] = True
+        flagged[start:back] = True
     return flagged, current.size
+
+
+def _first_above(current: np.ndarray, start: int, least: float) -> int:
+    """The first reading from one on that is as large as this; their number if none is."""
+    width = BLOCK
+    while start < current.size:
+        above = np.flatnonzero(current[start : start + width] >= least)
+        if above.size:
+            return int(start + above[0])
+        start, width = start + width, 2 * width
+    return current.size
 
 
 def _saturated(current: np.ndarray) -> np.ndarray:

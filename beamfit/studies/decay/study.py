@@ -13,14 +13,15 @@ from beamfit.errors import InputError
 from beamfit.shown import shown
 from beamfit.studies.decay.budget import Budget, Machine, budget
 from beamfit.studies.decay.checks import DecayChecks, check_decay
-from beamfit.studies.decay.cycles import alike, cut_at_refills, is_refilled, joined
+from beamfit.studies.decay.cycles import alike, cut_at_refills, is_refilled, joined, usual_cycle
 from beamfit.studies.decay.fit import DecayFit, bare, fit_decay
+from beamfit.studies.decay.marginal import Law
 from beamfit.studies.decay.pool import FEWEST_CYCLES
 from beamfit.studies.decay.pooled import fit_cycles, seen_through, stands_alone
 from beamfit.studies.decay.record import DecayRecord
 from beamfit.studies.decay.segments import Event, Split, split_record
 from beamfit.studies.decay.systematics import Systematic, systematics
-from beamfit.studies.decay.thinning import thinned
+from beamfit.studies.decay.thinning import thinned, without_repeats
 from beamfit.table import json_of
 
 # A setting that moves by more than this share between two readings was changed by somebody.
@@ -131,7 +132,7 @@ def _pooled(
             alone += [cycle for cycle in group if len(cycle) >= SHORTEST]
             continue
         called = name if many == 1 else f"{name}@{len(pooled) + 1}"
-        fit = seen_through(fit_cycles(group, called))
+        fit = seen_through(fit_cycles(group, called), *usual_cycle(group))
         segment = joined(group, called)
         pooled.append(Decay.of(segment, segment.start, fit, machine))
         alone += [c for c in group if len(c) >= SHORTEST and stands_alone(c, fit)]
@@ -170,7 +171,9 @@ def _decays(record: DecayRecord) -> tuple[list[DecayRecord], tuple[Event, ...]]:
     return pieces, split.events
 
 
-def study_record(record: DecayRecord, machine: Machine | None = None) -> RecordStudy:
+def study_record(
+    record: DecayRecord, machine: Machine | None = None, law: Law | str = Law.free
+) -> RecordStudy:
     """Cut a record into decays, fit each, and say what first principles expect.
 
     Parameters
@@ -179,7 +182,9 @@ def study_record(record: DecayRecord, machine: Machine | None = None) -> RecordS
         Any record: one decay, fills with refills between them, or top-up. It is also cut where
         RF voltage, scraper or bunches change by more than 1 %.
     machine : Machine, optional
-        Ring and usual operation, for the loss budget.
+        Ring and usual operation, for the loss budget; with them a and b are constant.
+    law : {"free", "constant"}
+        As for `fit_decay`.
 
     Returns
     -------
@@ -201,7 +206,7 @@ def study_record(record: DecayRecord, machine: Machine | None = None) -> RecordS
     >>> [f"{decay.fit.lifetime_mean.value:.3f} h" for decay in study.decays]
     ['10.000 h', '10.000 h']
     """
-    record = thinned(record)
+    record = without_repeats(record)
     # Segments move `start` with them: counted from zero it is their place in the record.
     placed = replace(record, start=0.0)
     cycles, events = _refilled(placed)
@@ -215,9 +220,9 @@ def study_record(record: DecayRecord, machine: Machine | None = None) -> RecordS
     for piece in pieces:
         offset = piece.start
         start = None if record.start is None else record.start + offset
-        segment = replace(piece, start=start)
+        segment = thinned(replace(piece, start=start))
         try:
-            fit = fit_decay(segment)
+            fit = fit_decay(segment, law=law if machine is None else Law.constant)
         except InputError:
             # A record that does nothing but rise is an error; a slow refill within one is not.
             if len(pieces) == 1 and not pooled:
@@ -229,7 +234,9 @@ def study_record(record: DecayRecord, machine: Machine | None = None) -> RecordS
     if not decays and not pooled:
         expected = "a decay between refills"
         raise InputError("a current that rises", expected, path=record.name, column="current")
+    shown = thinned(record)
+    shown = replace(shown, notes=record.notes) if pooled else shown
     return RecordStudy(
-        record, tuple(decays), tuple(sorted((*events, *rising), key=lambda event: event.time)),
+        shown, tuple(decays), tuple(sorted((*events, *rising), key=lambda event: event.time)),
         tuple(pooled),
     )  # fmt: skip

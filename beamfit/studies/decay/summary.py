@@ -125,7 +125,8 @@ def summarise(decays: tuple[Decay, ...]) -> Summaries:
     >>> from beamfit.studies.decay.study import study_record
     >>> t = np.linspace(0, 36000, 100)
     >>> noise = 1e-3 * np.random.default_rng(1).normal(size=100)
-    >>> study = study_record(DecayRecord(t, np.array(current(t, 500.0, 2e-8, 1e-6)) + noise))
+    >>> record = DecayRecord(t, np.array(current(t, 500.0, 2e-8, 1e-6)) + noise)
+    >>> study = study_record(record, law="constant")
     >>> found = summarise(study.decays)
     >>> fit = study.decays[0].fit
     >>> error = 1 / abs(found.root[0, 1, 1])  # of the loss rate, a I being free
@@ -136,7 +137,8 @@ def summarise(decays: tuple[Decay, ...]) -> Summaries:
     parts, root = np.zeros((len(decays), 2)), np.zeros((len(decays), 2, 2))
     for k, decay in enumerate(decays):
         fit = decay.fit
-        if np.isfinite(fit.a.value) and fit.rms_residual > 0:
-            parts[k] = loss_parts(fit.a.value, fit.b.value, fit.mean_current)
+        a, b = fit.if_constant("a").value, fit.if_constant("b").value
+        if np.isfinite(a) and fit.rms_residual > 0:
+            parts[k] = loss_parts(a, b, fit.mean_current)
             root[k] = _root(decay, parts[k])
     return Summaries(*map(jnp.asarray, (current, parts, root)))

@@ -58,6 +58,13 @@ def _noise(decay: Decay) -> str:
     return "inferred from the residuals" if decay.fit.noise_inferred else "as given"
 
 
+def _interval(found: Quantity) -> str | None:
+    if found.interval_95 is None:
+        return None
+    low, high = found.interval_95
+    return f"{low:.4g} to {high:.4g} {found.unit}"
+
+
 RESULT: tuple[Row, ...] = (
     ("status", lambda d: d.fit.status),
     ("readings", lambda d: f"{len(d.segment)} over {_span(d.segment.span)}"),
@@ -67,12 +74,18 @@ RESULT: tuple[Row, ...] = (
     ("lifetime at the end", lambda d: d.fit.lifetime_end),
     ("a", lambda d: d.fit.a),
     ("b", lambda d: d.fit.b),
+    ("95 % interval of a", lambda d: _interval(d.fit.a)),
+    ("95 % interval of b", lambda d: _interval(d.fit.b)),
     ("chi2/dof", _chi2),
     ("rms residual", lambda d: f"{d.fit.rms_residual:.3g} mA"),
     ("errors", _noise),
 )
 
 
+EXACT: tuple[Row, ...] = (
+    ("a if a and b are constant", lambda d: d.fit.if_constant("a")),
+    ("b if a and b are constant", lambda d: d.fit.if_constant("b")),
+)
 CYCLES: tuple[Row, ...] = (
     ("status", lambda d: d.fit.status),
     ("cycles", lambda d: f"{d.fit.first.size} at {d.fit.mean_current:.5g} mA"),
@@ -80,14 +93,17 @@ CYCLES: tuple[Row, ...] = (
     ("lifetime at the mean current", lambda d: d.fit.lifetime_mean),
     ("lifetime at the highest current", lambda d: d.fit.lifetime_start),
     ("lifetime at the lowest current", lambda d: d.fit.lifetime_end),
-    *RESULT[-5:],
+    *RESULT[6:10],
+    *RESULT[-3:],
 )
 
 
 def decay_rows(decays: Sequence[Decay]) -> Rows:
     """Label and one cell per decay, for every number a fit has."""
     together = all(decay.fit.first is not None for decay in decays)
-    return _laid_out(decays, CYCLES if together else RESULT)
+    free = any(decay.fit.free_law for decay in decays)
+    rows = CYCLES if together else (*RESULT[:-3], *EXACT * free, *RESULT[-3:])
+    return _laid_out(decays, rows)
 
 
 def _number(value: float | None, form: str, unit: str = "") -> str:
@@ -168,9 +184,13 @@ def systematic_rows(decay: Decay) -> list[list[str]]:
     fit = decay.fit
     values = fit.a.value, fit.b.value, fit.lifetime_mean.value
     return [
-        [cause, *(f"{100 * moved / value:+.2g} %" for moved, value in zip(by, values, strict=True))]
+        [cause, *(_percent(moved / value) for moved, value in zip(by, values, strict=True))]
         for cause, *by in decay.systematics
     ]
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:+.0f} %" if abs(share) > 1 - 1e-9 else f"{100 * share:+.2g} %"
 
 
 def _part(kind: str, mechanism: Mechanism) -> Row:

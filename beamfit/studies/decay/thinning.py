@@ -19,7 +19,7 @@ OUTLIER = 10.0
 EQUAL, DIGITS, STANDS, FEWEST = 0.95, 3.0, 5, 8
 
 
-def _fresh(record: DecayRecord) -> DecayRecord:
+def without_repeats(record: DecayRecord) -> DecayRecord:
     """Leave out readings that repeat the one before where the monitor is slower than its archive:
     they are late, and a curve through them lies half a step too high.
     """
@@ -45,12 +45,12 @@ def _fresh(record: DecayRecord) -> DecayRecord:
 
 
 def thinned(record: DecayRecord) -> DecayRecord:
-    """Leave out repeats of a slow monitor, and average neighbours in equal blocks, up to 65536.
+    """Average neighbours of a long decay in equal blocks, up to 65536.
 
     Parameters
     ----------
     record : DecayRecord
-        Any record. A short one is given back.
+        One decay: means across a refill are of neither side. A short one is given back.
 
     Returns
     -------
@@ -70,7 +70,6 @@ def thinned(record: DecayRecord) -> DecayRecord:
     >>> thinned(DecayRecord(t, 500 - t / 1e4)).notes
     ('The means of 4 readings each were fitted, of 200000 in all.',)
     """
-    record = _fresh(record)
     size = -(-len(record) // MOST_READINGS)
     if size == 1:
         return record

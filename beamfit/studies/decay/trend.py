@@ -252,7 +252,7 @@ def _point(
     if usual is not None and fit.status is not Status.poor_fit:
         relative = [
             None if q.error is None else Quantity(q.value / by, q.error / by, "1")
-            for q, by in ((fit.a, usual.a * a), (fit.b, usual.b * b))
+            for q, by in ((fit.if_constant("a"), usual.a * a), (fit.if_constant("b"), usual.b * b))
         ]
     return Point(fit.record, time, fit.mean_current, fit.lifetime_mean, value, *relative, beyond)
 

@@ -12,6 +12,7 @@ import numpy as np
 from beamfit.lifetime.decay import HOUR
 from beamfit.statistics import MANY, POOR_FIT, chi2_probability, few_words
 from beamfit.status import Status
+from beamfit.studies.decay.cycles import is_sawtooth
 from beamfit.studies.decay.departures import Change, ConstantA, LifetimeLaw
 from beamfit.studies.decay.evidence import (
     BELIEVED,
@@ -34,6 +35,11 @@ LIMIT = 1.645
 STEP = 12.0
 # Below this chi²/dof stated errors are said to be too large.
 CAUTIOUS = 0.25
+# A share of a so many errors outside 0 to 1 is of no longer record.
+OUTSIDE = 3.0
+# An interval that begins below this share of its end begins at zero; one whose ends differ by more
+# than this factor determines no value.
+LEAST_SHARE, USEFUL = 5e-3, 2.5
 # Residuals so many times the scatter of neighbouring readings are not the monitor's noise.
 WANDERS = 10.0
 # Settings that are said to have gone from one value to another, by more than this share.
@@ -60,6 +66,7 @@ class TableEvidence(NamedTuple):
     change: Change | None = None
     outgassing: Outgassing | None = None
     changed: bool = False
+    free: None = None
 
     @property
     def noise_inferred(self) -> bool:
@@ -84,12 +91,19 @@ def _within_noise(e: Evidence) -> Finding | None:
     rate, error = e.sure("rate_mean")
     if e.separability.separable or error <= DETERMINED * abs(rate):
         return None
+    if isinstance(e, Evidence) and e.record.resolution is None and is_sawtooth(e.residuals):
+        return Finding(
+            Status.unidentified,
+            "The beam is held by refills that the record does not resolve: its readings lie evenly "
+            "between two currents, and tell nothing of the lifetime; record several readings "
+            "between refills",
+        )
     # A rate below zero by chance is no reason for a longer lifetime than that of a rate of zero.
     limit = 1 / (max(rate, 0.0) + LIMIT * error) / HOUR
     return Finding(
         Status.unidentified,
-        f"The decay is within its noise: the lifetime is above {limit:.3g} h at 95 %; record "
-        "longer or with less noise",
+        f"The decay is within its noise: the lifetime is above {limit:.3g} h at 95 %, unless "
+        "refills held the beam; record longer or with less noise",
     )
 
 
@@ -114,7 +128,7 @@ def _stepped(e: Evidence) -> Finding | None:
 
 def _negative(name: str, cause: str, e: Weighed | TableEvidence) -> Finding | None:
     value, error = e.sure(name)
-    if not (value < -BELIEVED * error and value < 0):
+    if not (value < -BELIEVED * error and value < 0) or e.free is not None:
         return None
     cause, (_, error) = _explained(e) or cause, e.scaled(name)
     return Finding(Status.infeasible, f"{name} is negative by {-value / error:.1f} errors; {cause}")
@@ -136,7 +150,7 @@ def _explained(e: Weighed | TableEvidence) -> str | None:
 
 def _refuted(e: Weighed | TableEvidence) -> Finding | None:
     """Data that refute constant a and b: what is quoted of them is not of this beam."""
-    if e.constant_a.status is not Status.poor_fit and not e.changed:
+    if (e.constant_a.status is not Status.poor_fit and not e.changed) or e.free is not None:
         return None
     offered = "" if e.lifetimes is None else f". Use the lifetime by current: {e.lifetimes}"
     if (explained := _explained(e)) is not None:
@@ -151,6 +165,8 @@ def _inseparable(e: Evidence) -> Finding | None:
     if found.share_error is None:
         cause = "a and b are not separable on this record: record longer"
         return Finding(Status.unidentified, cause)
+    if (beyond := max(-found.share, found.share - 1.0) / found.share_error) > OUTSIDE:
+        return _beyond(e, beyond)
     # The bend of the decay grows with the square of the span.
     longer = (found.share_error / SEPARABLE) ** 0.5
     return Finding(
@@ -161,8 +177,29 @@ def _inseparable(e: Evidence) -> Finding | None:
     )
 
 
+def _beyond(e: Evidence, errors: float) -> Finding:
+    """A share of a that no loss has: the record departs from the law in time."""
+    found = e.separability
+    cause = (
+        f"The share of a in the loss is {found.share:.2g} ± {found.share_error:.2g}, {errors:.1f} "
+        "errors outside 0 to 1: a longer record does not help. "
+    )
+    if e.change is not None:
+        return Finding(Status.unidentified, f"{cause}Likely {e.change}: cut the record there")
+    drift = abs(min(-found.share, 1.0 - found.share, key=abs)) / found.share_error
+    drift *= e.drift_of_one_error("share")
+    return Finding(
+        Status.unidentified,
+        f"{cause}The loss rate changes in the record, or the monitor drifts: by {drift:.2g} mA "
+        "over the record that would be all of it",
+    )
+
+
 def _improbable(e: Weighed | TableEvidence, remedy: str = "") -> Finding | None:
     if e.noise_inferred or chi2_probability(e.chi2, e.dof) >= POOR_FIT:
+        return None
+    # Errors that are right may have a memory: by the evidence of all noises together.
+    if isinstance(e, Evidence) and e.stated_odds > math.log(POOR_FIT):
         return None
     return Finding(
         Status.poor_fit,
@@ -186,19 +223,44 @@ def _determined(e: Weighed | TableEvidence) -> Finding:
     return Finding(Status.converged, f"{clear}{limits}")
 
 
-def _by_length(e: Evidence) -> Finding | None:
-    """What rests on a bunch length that the record does not show to be constant."""
-    if e.bent is None:
+def _freely(e: Evidence) -> Finding | None:
+    """Both with the exponent and the drift of b that the record leaves open."""
+    if e.free is None:
         return None
-    found = _determined(e)
-    said = "if the bunch length does not change with the current, which this record cannot tell"
-    return found._replace(cause=f"{found.cause}, {said}")
+    told = "; ".join(filter(None, (_clear(e), *(_extent(e, name) for name in "ab"))))
+    if e.constant_a.status is Status.poor_fit:
+        drift = "" if e.free.drift is None else f" and b drifts by {e.free.drift} of itself"
+        found = f"A constant a is rejected (p = {max(e.constant_a.p_value, 1e-300):.2g}): it goes "
+        found += f"as I^({e.free.exponent}){drift}, which the errors contain"
+        return Finding(Status.converged, f"{told}. {found}")
+    open_ = "an exponent of a" if e.free.drift is None else "an exponent of a and a drift of b"
+    exact = {name: e.quantity(name, True) for name in "ab"}
+    return Finding(
+        Status.converged,
+        f"{told}, with {open_} left open. If a and b are constant, a is "
+        f"{exact['a']} and b is {exact['b']}",
+    )
+
+
+def _clear(e: Evidence) -> str:
+    clear = [name for name in "ab" if _extent(e, name) is None]
+    return f"{' and '.join(clear)} {'are' if clear[1:] else 'is'} determined" if clear else ""
+
+
+def _extent(e: Evidence, name: str) -> str | None:
+    """An interval too wide for a value, or a limit."""
+    low, high = e.free.spans[name].interval
+    if low <= LEAST_SHARE * high:
+        return f"{name} is compatible with zero: it is below {high:.2g} {UNITS[name]} at 95 %"
+    if high <= USEFUL * low:
+        return None
+    return f"{name} lies between {low:.2g} and {high:.2g} {UNITS[name]} at 95 %"
 
 
 NEGATIVE = (partial(_negative, "b", NOT_GAS), partial(_negative, "a", RISING))
 LOOK = ": look for steps with split_record, or test constant_a_test"
 RULES = (_lost, *NEGATIVE, _within_noise, _stepped, _refuted, _inseparable)
-RULES += (partial(_improbable, remedy=LOOK), _by_length, _determined)
+RULES += (partial(_improbable, remedy=LOOK), _freely, _determined)
 
 
 def _narrow(e: TableEvidence) -> Finding | None:

@@ -13,12 +13,14 @@ from beamfit.quantity import Status
 from beamfit.studies.decay import alarm
 from beamfit.studies.decay.budget import Machine
 from beamfit.studies.decay.conditions import PLAUSIBLE, Conditions
-from beamfit.studies.decay.segments import DEAD, DROPOUT
+from beamfit.studies.decay.segments import DROPOUT
 from beamfit.studies.decay.trend import BEST_MONITOR
 from beamfit.studies.decay.usual import Alarmed, followed, learnt
 from beamfit.studies.decay.window import Answer, Row, Window, fit_window, normalised
 
 CURRENT = "beam_current"
+# Dead readings in a row from which the beam is gone.
+DEAD = 5
 # A window is kept as the means of readings over so many parts of it.
 ROWS = 4096
 # So many readings in a row, each older than the newest before them, are of a clock set back.

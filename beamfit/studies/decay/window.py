@@ -14,9 +14,10 @@ from beamfit.lifetime.losses import loss_coefficients
 from beamfit.quantity import Quantity, Status
 from beamfit.studies.decay.budget import Machine, budget
 from beamfit.studies.decay.conditions import Conditions
-from beamfit.studies.decay.cycles import alike, cut_at_refills, joined
+from beamfit.studies.decay.cycles import alike, cut_at_refills, joined, usual_cycle
 from beamfit.studies.decay.evidence import UNITS
 from beamfit.studies.decay.fit import DecayFit, bare, fit_decay
+from beamfit.studies.decay.marginal import Law
 from beamfit.studies.decay.pooled import fit_pieces, seen_through
 from beamfit.studies.decay.record import DecayRecord
 from beamfit.studies.decay.study import SHORTEST, at_settings
@@ -169,9 +170,9 @@ def normalised(window: Window, machine: Machine | None, current: float | None) -
 
 def _fitted(group: list[DecayRecord], name: str) -> DecayFit:
     if len(group) == 1:
-        return fit_decay(replace(group[0], name=name))
+        return fit_decay(replace(group[0], name=name), law=Law.constant)
     fit = fit_pieces(group, name)
-    return seen_through(fit) if len(group) > 2 else fit
+    return seen_through(fit, *usual_cycle(group)) if len(group) > 2 else fit
 
 
 def _pieces(rows: Sequence[Row], name: str) -> list[DecayRecord]:

@@ -10,11 +10,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from beamfit.greybox.correlated import Noise, innovations, remembers
 from beamfit.greybox.fit import Fit
 from beamfit.greybox.memory import Memory
 from beamfit.greybox.problem import Constraint, Free, Prior, Problem, Record
 from beamfit.greybox.solve import solve
+from beamfit.noise.correlated import Noise, innovations, remembers
 from beamfit.status import Status
 from beamfit.studies.response.model import CLOSE, Seen, output_of, predicted
 from beamfit.studies.response.noise import noise_of

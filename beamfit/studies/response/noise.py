@@ -10,8 +10,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from beamfit.greybox.correlated import Noise
 from beamfit.greybox.memory import Memory, noises, range_of, whitened_by_each
+from beamfit.noise.correlated import Noise
 
 # Correlation times looked at, and variances of the part without memory, in those that the part
 # that wanders gets anew from one sample to the next.

@@ -7,8 +7,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from beamfit.greybox.correlated import Noise, remembers
 from beamfit.greybox.problem import Free
+from beamfit.noise.correlated import Noise, remembers
 from beamfit.studies.response.case import Case, Settled, information, used_by
 from beamfit.studies.response.model import CLOSE
 from beamfit.studies.response.noise import noise_of

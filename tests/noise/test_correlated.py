@@ -5,16 +5,16 @@ from scipy.linalg import cholesky, solve_triangular
 from scipy.signal import lfilter
 from scipy.stats import multivariate_normal
 
-from beamfit.greybox.correlated import (
+from beamfit.greybox.memory import memory_of
+from beamfit.greybox.problem import Free, Problem, Record
+from beamfit.greybox.solve import solve
+from beamfit.noise.correlated import (
     Noise,
     is_correlated,
     log_volume,
     whitened,
     whitened_of_both,
 )
-from beamfit.greybox.memory import memory_of
-from beamfit.greybox.problem import Free, Problem, Record
-from beamfit.greybox.solve import solve
 
 
 @pytest.fixture

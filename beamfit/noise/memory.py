@@ -1,0 +1,175 @@
+"""Noise of a series of readings that may have a memory: white, correlated, 1/f; none is chosen.
+
+Each noise of a list with prior probabilities whitens the same columns once. Their products are all
+that a fit needs later, however many readings there are.
+"""
+
+from __future__ import annotations
+
+from itertools import groupby
+from typing import NamedTuple
+
+import numpy as np
+from scipy.signal import fftconvolve
+from scipy.special import logsumexp
+
+from beamfit.noise.correlated import log_volume, white_beside, whitened
+
+# Prior probabilities of white noise and of noise with one correlation time; 1/f noise has the rest.
+# Readings are white unless something slow moves the monitor, and amplifiers have 1/f noise.
+WHITE, CORRELATED = 0.5, 0.35
+# Correlation times, from this share of the interval between readings to so many records, and the
+# shares of the variance that are white beside: flat in the logarithm of both.
+SHORTEST, LONGEST, TIMES = 0.5, 3.0, 9
+SHARES = (0.0, 0.5, 0.9, 0.99)
+# Spectra 1/f^power. P. Dutta and P. M. Horn, Rev. Mod. Phys. 53 (1981) 497: 1/f noise of devices
+# has powers of 0.8 to 1.4; beyond 1 it is as a random walk, which `CORRELATED` has.
+POWERS = (0.4, 0.7, 1.0)
+# Stated errors are worth so many readings that tell the size of the noise: right within 25 %.
+STATED = 8.0
+# The rival to stated errors is a size flat in its logarithm, a factor 30 to either side.
+WRONG, SIZES = np.log(30.0), 121
+
+
+class Kind(NamedTuple):
+    """A noise: its prior probability, correlation time, white share, and power of 1/f."""
+
+    chance: float
+    time: float = 0.0
+    white: float = 1.0
+    power: float = 0.0
+
+
+def kinds_of(time: np.ndarray) -> list[Kind]:
+    """List the noises that readings at these times may have.
+
+    Examples
+    --------
+    >>> found = kinds_of(np.arange(100.0))
+    >>> len(found), round(sum(kind.chance for kind in found), 9)
+    (40, 1.0)
+    """
+    usual, span = float(np.median(np.diff(time))), float(time[-1] - time[0])
+    times = np.geomspace(SHORTEST * usual, LONGEST * span, TIMES)
+    each = CORRELATED / TIMES / len(SHARES)
+    memory = [Kind(each, float(t), white) for t in times for white in SHARES]
+    flicker = (1.0 - WHITE - CORRELATED) / len(POWERS)
+    return [Kind(WHITE), *(Kind(flicker, power=power) for power in POWERS), *memory]
+
+
+def without_flicker(rows: np.ndarray, power: float) -> np.ndarray:
+    """Whiten rows of readings in even time whose noise has the spectrum 1/f^power.
+
+    Fractional differences (1 - B)^(power/2): J. R. M. Hosking, Biometrika 68 (1981) 165, eq. 2.2.
+
+    Examples
+    --------
+    >>> without_flicker(np.array([[1.0], [2.0], [4.0]]), 2.0).ravel().round(9).tolist()
+    [1.0, 1.0, 2.0]
+    """
+    j = np.arange(1, len(rows))
+    weights = np.append(1.0, np.cumprod((j - 1 - power / 2) / j))
+    return fftconvolve(rows, weights[:, None], axes=0)[: len(rows)]
+
+
+def _whitened(kinds: list[Kind], rows: np.ndarray, time: np.ndarray):
+    """Yield the rows whitened by each noise, in order, with the log of the volume."""
+    interval = np.diff(time)
+    for length, alike in groupby(kinds, key=lambda kind: kind.time):
+        if length:
+            apart = interval / length
+            begun, volume = whitened(rows, apart, np), float(log_volume(apart, np))
+        for kind in alike:
+            if not length:
+                yield (without_flicker(rows, kind.power) if kind.power else rows), 0.0
+            elif not kind.white:
+                yield begun, volume
+            else:
+                both, more = white_beside(begun, apart, kind.white)
+                yield both, volume + more
+
+
+class Products(NamedTuple):
+    """Sums of products of columns, whitened by each of k noises.
+
+    Attributes
+    ----------
+    kinds : list of Kind
+        The noises.
+    log_prior : array, shape (k,)
+        Logarithms of their prior probability and the volume of their density.
+    matrix : array, shape (k, m, m)
+        Products of the m columns.
+    count : int
+        Readings.
+    known : float
+        Readings that stated errors are worth; 0 where none are stated.
+    """
+
+    kinds: list[Kind]
+    log_prior: np.ndarray
+    matrix: np.ndarray
+    count: int
+    known: float
+
+    @classmethod
+    def of(cls, columns: np.ndarray, time: np.ndarray, stated: bool) -> Products:
+        """Whiten columns, shape (n, m), of readings at increasing times, shape (n,).
+
+        Columns are in units of the stated errors where there are any.
+
+        Examples
+        --------
+        >>> rows = np.random.default_rng(1).normal(size=(200, 1))
+        >>> found = Products.of(rows, np.arange(200.0), stated=True)
+        >>> found.matrix.shape, found.kinds[int(np.argmax(found.log_likelihood()))].white
+        ((40, 1, 1), 1.0)
+        """
+        kinds = kinds_of(time)
+        parts = list(_whitened(kinds, columns, time))
+        logs = np.array([np.log(k.chance) + v for k, (_, v) in zip(kinds, parts, strict=True)])
+        matrix = np.array([rows.T @ rows for rows, _ in parts])
+        return cls(kinds, logs, matrix, len(columns), STATED if stated else 0.0)
+
+    def likeliest(self, least: float, squares: np.ndarray) -> Products:
+        """Keep the noises whose probability by sums of squares, shape (k,), is no less than this
+        share of all.
+        """
+        logs = self.log_prior + self.log_size(squares)
+        kept = logs - logsumexp(logs) >= np.log(least)
+        kinds = [kind for kind, keep in zip(self.kinds, kept, strict=True) if keep]
+        return self._replace(kinds=kinds, log_prior=self.log_prior[kept], matrix=self.matrix[kept])
+
+    def log_size(self, squares: np.ndarray) -> np.ndarray:
+        """Log likelihood of sums of squares, the size of the noise integrated over.
+
+        A size flat in its logarithm where no errors are stated, else an inverse χ² prior with
+        `known` degrees of freedom about 1.
+        """
+        return -0.5 * (self.count + self.known) * np.log(self.known + squares)
+
+    def log_likelihood(self) -> np.ndarray:
+        """The same of the first column by itself, with the prior, by noise."""
+        return self.log_prior + self.log_size(self.matrix[:, 0, 0])
+
+    def variance(self, squares: np.ndarray, numbers: int) -> np.ndarray:
+        """Mean variance of a reading where so many numbers were fitted."""
+        return (self.known + squares) / max(self.known + self.count - numbers, 1.0)
+
+    def stated_odds(self, squares: np.ndarray, numbers: int) -> float:
+        """Log odds that stated errors are right against any size of the noise.
+
+        Each noise has the size that is stated, or one flat in its logarithm.
+
+        Parameters
+        ----------
+        squares : array, shape (k,)
+            Sum of squares of what is left after the fit, by noise, in stated errors.
+        numbers : int
+            How many were fitted.
+        """
+        dof = max(self.count - numbers, 1)
+        size = np.linspace(-WRONG, WRONG, SIZES)  # of its logarithm
+        log = -dof * size - 0.5 * squares[:, None] * np.exp(-2 * size)
+        log = logsumexp(self.log_prior[:, None] + log, axis=0)
+        return float(log[SIZES // 2] - logsumexp(log) + np.log(SIZES))

@@ -1,0 +1,168 @@
+"""Lifetimes of families of simulated decays: how often the 95 % interval holds the truth.
+
+Every record is drawn anew: share of a, length, noise and readings, within
+the ranges of `decay` and `top_up`. Truths are integrated by scipy, not by the package.
+
+    python benchmarks/decay_families.py --trials 200
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+from scipy.integrate import solve_ivp
+from scipy.signal import lfilter
+from scipy.stats import beta
+
+from beamfit.errors import InputError
+from beamfit.lifetime.decay import HOUR
+from beamfit.quantity import Quantity
+from beamfit.studies.decay.fit import DecayFit
+from beamfit.studies.decay.record import DecayRecord
+from beamfit.studies.decay.study import study_record
+
+LIFETIME, START = 10.0 * HOUR, 300.0
+
+
+class Case(NamedTuple):
+    """A record with the true a at the mean current, 1/(mA s), and lifetime there, h."""
+
+    record: DecayRecord
+    a: float
+    lifetime: float
+
+
+class Decay(NamedTuple):
+    """The law of a family: exponent of a, drift of b over the record, and how the noise goes."""
+
+    exponent: float = 0.0
+    drift: float = 0.0
+    noise: str = "white"
+    stated: float | None = None
+
+
+def noise_of(kind: str, count: int, random: np.random.Generator) -> np.ndarray:
+    """Noise of variance 1."""
+    if kind == "white":
+        return random.normal(size=count)
+    if kind == "correlated":
+        kept = random.uniform(0.6, 0.98)
+        rows = random.normal(size=count + 1000)
+        return lfilter([np.sqrt(1 - kept**2)], [1, -kept], rows)[-count:]
+    j = np.arange(1, 4 * count)
+    found = np.convolve(random.normal(size=4 * count), np.append(1, np.cumprod((j - 0.5) / j)))
+    return found[3 * count : 4 * count] / found[3 * count : 4 * count].std()
+
+
+def decay(law: Decay, random: np.random.Generator) -> Case:
+    """One decay of a family."""
+    share, span = random.uniform(0.15, 0.85), LIFETIME * random.uniform(0.5, 2.0)
+    count, noise = int(random.integers(100, 1000)), START * 10 ** random.uniform(-3.5, -2.5)
+    a, b = share / LIFETIME / START, (1 - share) / LIFETIME
+    time = np.linspace(0.0, span, count)
+
+    def slope(t: float, i: np.ndarray) -> np.ndarray:
+        return -(a * (i / START) ** law.exponent * i + b * (1 + law.drift * (t / span - 0.5))) * i
+
+    beam = solve_ivp(slope, (0.0, span), [START], t_eval=time, rtol=1e-10, atol=1e-9).y[0]
+    current = beam + noise * noise_of(law.noise, count, random)
+    error = None if law.stated is None else np.full(count, noise * law.stated)
+    record, mean = DecayRecord(time, current, error), float(current.mean())
+    at = float(np.interp(-mean, -beam, time)) / span - 0.5
+    own = a * (mean / START) ** law.exponent
+    return Case(record, own, 1 / (own * mean + b * (1 + law.drift * at)) / HOUR)
+
+
+def top_up(
+    random: np.random.Generator, interval: float, count: int, within: float = 0.0, shots: int = 1
+) -> Case:
+    """Top-up, refilled to one current; refills last `within` s, the last of many shots is small."""
+    period, noise = random.uniform(120.0, 300.0), START * 10 ** random.uniform(-4.5, -3.8)
+    time, parts = np.arange(count) * interval, np.linspace(1.0, 1.0 if shots == 1 else 0.2, shots)
+    begins = np.arange(random.uniform(0.3, 1.0) * period, time[-1] + period, period)
+    at, level = [0.0], [START]
+    for begin in begins:
+        lost = START - level[-1] * np.exp(-(begin - at[-1]) / LIFETIME)
+        for k, part in enumerate(parts):
+            for step in range(1, 11 if within else 2):
+                when = begin + within * (k + step / 10) / shots
+                before = level[-1] * np.exp(-(when - at[-1]) / LIFETIME)
+                at.append(when)
+                level.append(before + part / parts.sum() * lost / (10 if within else 1))
+    place = np.searchsorted(at, time, side="right") - 1
+    beam = np.array(level)[place] * np.exp(-(time - np.array(at)[place]) / LIFETIME)
+    record = DecayRecord(time, beam + noise * random.normal(size=count))
+    return Case(record, np.nan, LIFETIME / HOUR)
+
+
+FAMILIES: dict[str, Callable[[np.random.Generator], Case]] = {
+    "constant a and b": lambda r: decay(Decay(), r),
+    "errors stated": lambda r: decay(Decay(stated=1.0), r),
+    "a as I^-1/3": lambda r: decay(Decay(exponent=-1 / 3), r),
+    "a as I^0.3": lambda r: decay(Decay(exponent=0.3), r),
+    "b rises by 10 %": lambda r: decay(Decay(drift=0.1), r),
+    "b falls by 10 %": lambda r: decay(Decay(drift=-0.1), r),
+    "correlated, 0.6-0.98": lambda r: decay(Decay(noise="correlated"), r),
+    "correlated, errors stated": lambda r: decay(Decay(noise="correlated", stated=1.0), r),
+    "1/f": lambda r: decay(Decay(noise="1/f"), r),
+    "top-up, 1 s, 1e5 readings": lambda r: top_up(r, 1.0, 100_000),
+    "top-up, readings within refills": lambda r: top_up(r, 10.0, 3000, within=4.0),
+    "top-up, shots, the last small": lambda r: top_up(r, 2.0, 3000, within=12.0, shots=4),
+    "archive slower than refills": lambda r: top_up(r, r.uniform(310.0, 2000.0), 500),
+}
+
+
+def holds(found: Quantity, truth: float) -> bool | None:
+    """Whether the 95 % interval holds the truth; None where nothing is answered."""
+    if found.error is None or not np.isfinite(truth):
+        return None
+    return bool(found.interval_95[0] <= truth <= found.interval_95[1])
+
+
+def share(found: list[bool | None]) -> str:
+    """Percent of the answers that hold the truth, with binomial limits of 95 %, and answered."""
+    answers = [one for one in found if one is not None]
+    if not answers:
+        return "-"
+    good, count = sum(answers), len(answers)
+    low = beta.ppf(0.025, good, count - good + 1) if good else 0.0
+    high = beta.ppf(0.975, good + 1, count - good) if good < count else 1.0
+    answered = 100 * count / len(found)
+    return f"{100 * good / count:.0f} ({100 * low:.0f}-{100 * high:.0f}) of {answered:.0f}"
+
+
+def fitted(case: Case, law: str) -> DecayFit | None:
+    """The first answer of the record, or None where it is refused."""
+    try:
+        return study_record(case.record, law=law).answers[0].fit
+    except InputError:
+        return None
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--trials", type=int, default=200)
+    parser.add_argument("--family", choices=FAMILIES, action="append")
+    parser.add_argument("--law", choices=["free", "constant"], default="free")
+    chosen = parser.parse_args()
+    print("| family | a, % in 95 % of % answered | lifetime | a beyond 4 errors | error of a "
+          "| poor_fit |\n|---|---|---|---|---|---|")  # fmt: skip
+    for number, name in enumerate(chosen.family or FAMILIES):
+        random = np.random.default_rng([number, chosen.trials])
+        cases = [FAMILIES[name](random) for _ in range(chosen.trials)]
+        pairs = [(case, fit) for case in cases if (fit := fitted(case, chosen.law))]
+        told = [(c, f) for c, f in pairs if f.a.error is not None and np.isfinite(c.a)]
+        far = sum(abs(f.a.value - c.a) > 4 * f.a.error for c, f in told)
+        error = np.median([f.a.error / c.a for c, f in told]) if told else np.nan
+        a, lifetime = ([holds(f.a, c.a) for c, f in pairs],
+                       [holds(f.lifetime_mean, c.lifetime) for c, f in pairs])  # fmt: skip
+        poor = sum(f.status in ("poor_fit", "infeasible") for _, f in pairs) / len(cases)
+        print(f"| {name} | {share(a)} | {share(lifetime)} | {far} | {100 * error:.0f} % "
+              f"| {100 * poor:.0f} % |", flush=True)  # fmt: skip
+
+
+if __name__ == "__main__":
+    main()
