@@ -98,13 +98,13 @@ def test_another_value_is_refused_in_words(every, tmp_path):
 
 def test_other_files_and_formats_are_refused_in_words(every, tmp_path):
     file = tmp_path / "a.json"
-    for text in ("{}", "[1]", "no json", '{"format": "beamfit-fit-1"}', "null"):
+    for text in ("{}", "[1]", "no json", '{"format": "beamfit-fit-2"}', "null"):
         file.write_text(text)
         with pytest.raises(InputError, match=r"a\.json: no saved fit"):
             beamfit.load_fit(file)
     beamfit.save_fit(file, every["decay"])
     whole = file.read_text()
-    file.write_text(whole.replace("beamfit-fit-1", "beamfit-fit-7"))
+    file.write_text(whole.replace("beamfit-fit-2", "beamfit-fit-7"))
     with pytest.raises(InputError, match=r"format beamfit-fit-7, of beamfit .*expected format"):
         beamfit.load_fit(file)
     file.write_text(whole.replace('"DecayRecord"', '"Popen"'))

@@ -137,16 +137,20 @@ def log_process(x, kernels, deviation, weight):
     return log_sum(np.concatenate(found))
 
 
-def log_prior(rows, size, known, sigma):
-    """Of beams, shape (d, 3): any direction alike, the mean square over the scan within a factor e.
+def log_prior(rows, size, sigma):
+    """Of beams, shape (d, 3): any emittance alike that the mean square over the scan leaves room for.
 
-    The mean of what the beam adds to size² over size² itself is T; σ in its own coordinates has
-    three numbers of which T is one, so that even directions have the density 1/T³.
+    The mean of what the beam adds to size² over size² itself is T = tr(M σ), known within a factor
+    e; given T the emittance is at most T/2 det(M)^-½. In the coordinates in which M is 1, σ has
+    three numbers T, T p, and an even emittance is a density 1/(2π ε/ε_max) of p.
     """
-    t = (sigma @ rows.T / size**2).mean(-1)
-    beam = (t > 0) & (sigma[:, 0] > 0) & (sigma[:, 0] * sigma[:, 2] > sigma[:, 1] ** 2)
+    m11, m12, m22 = (rows / [1.0, 2.0, 1.0] / size[:, None] ** 2).mean(0)
+    t = sigma @ [m11, 2.0 * m12, m22]
+    left = 4.0 * (sigma[:, 0] * sigma[:, 2] - sigma[:, 1] ** 2) * (m11 * m22 - m12**2) / t**2
+    beam = (t > 0) & (sigma[:, 0] > 0) & (left > 0)
     log = np.log(np.where(beam, t, 1.0))
-    return np.where(beam, -3.0 * log - 0.5 * log**2, -np.inf)
+    even = -math.log(2.0 * math.pi) - 0.5 * np.log(np.where(beam, left, 1.0))
+    return np.where(beam, norm.logpdf(log) + even - 3.0 * log, -np.inf)
 
 
 def weighted_beams(rows, size, known, log_likelihood, centre, covariance, number=30_000, seed=1):
@@ -158,7 +162,7 @@ def weighted_beams(rows, size, known, log_likelihood, centre, covariance, number
     z = wide.rvs(number, random_state=np.random.default_rng(seed))
     sigma = centre + z @ root.T
     squared = np.maximum(sigma @ rows.T + known, 1e-30)
-    prior = log_prior(rows, size, known, sigma)
+    prior = log_prior(rows, size, sigma)
     log = log_likelihood(np.sqrt(squared)) + prior - wide.logpdf(z)
     weight = np.exp(log - log.max())
     return sigma, weight / weight.sum()
@@ -183,7 +187,7 @@ def log_evidence_of_beam(rows, size, known, log_likelihood, centre, covariance, 
     z = wide.rvs(number, random_state=np.random.default_rng(options.get("seed", 1)))
     sigma = centre + z @ root.T
     squared = np.maximum(sigma @ rows.T + known, 1e-30)
-    prior = log_prior(rows, size, known, sigma) - math.log(math.pi) - 0.5 * math.log(2 * math.pi)
+    prior = log_prior(rows, size, sigma)
     # From T, T p to σ in its own coordinates, and from these by A σ Aᵀ to those of the line.
     prior += math.log(4.0) - 3.0 * math.log(abs(np.linalg.det(turn)))
     drawn = wide.logpdf(z) - math.log(abs(np.linalg.det(root)))
