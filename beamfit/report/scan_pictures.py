@@ -126,16 +126,16 @@ def _curves(axes: Axes, fit: EmittanceFit, p: PlaneFit, magnet: str) -> None:
 
 
 def _points(axes: Axes, p: PlaneFit, at: np.ndarray) -> None:
-    """Measured points; what the robust fit doubts is drawn hollow."""
+    """Measured points; those that are probably bad are drawn hollow."""
     error, size = np.nan_to_num(1e6 * p.points.error), 1e6 * p.points.size
     doubt = p.points.outlier_probability
-    doubted = np.zeros(len(at), bool) if doubt is None else doubt >= 0.5
+    doubted = doubt >= 0.5
     screens = _screens(p)
     for rows, colour, marker, screen in screens:
         name = "measured" if len(screens) == 1 else f"measured at {screen}"
         for keep, face, label in (
             (rows & ~doubted, colour, name),
-            (rows & doubted, "white", "doubted"),
+            (rows & doubted, "white", "probably bad"),
         ):
             if keep.any():
                 style = {"fmt": marker, "ms": 5, "capsize": 3, "color": colour, "mfc": face}

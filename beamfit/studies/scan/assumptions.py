@@ -19,7 +19,6 @@ class Entry(NamedTuple):
     """
 
     module: str
-    robust: bool = False
     numbers: bool = False
     anchor: bool = False
     branches: bool = False
@@ -28,9 +27,9 @@ class Entry(NamedTuple):
 
 # A further scenario is a module with a `SCENARIO` and a line here.
 SCENARIOS = {
-    "known": Entry("known", robust=True),
+    "known": Entry("known"),
     "transport-network": Entry("transport_network", anchor=True, map_free=True),
-    "calibration": Entry("calibration", robust=True, numbers=True),
+    "calibration": Entry("calibration", numbers=True),
     "focusing-network": Entry("focusing_network", anchor=True, branches=True),
 }
 
@@ -193,7 +192,7 @@ class Assumptions:
         """The priors on calibrations."""
         return {name: prior for name, prior in self.priors.items() if not is_systematic(name)}
 
-    def check_scenario(self, scenario: str, robust: bool = False) -> None:
+    def check_scenario(self, scenario: str) -> None:
         """Refuse an unknown scenario, and what a scenario has no use for.
 
         Raises
@@ -215,9 +214,6 @@ class Assumptions:
                 f"a prior or bounds on {named[0]} with scenario {scenario}",
                 f"scenario {_taking('numbers')}, whose calibration numbers are free",
             )
-        if robust and not entry.robust:
-            expected = f"scenario {_taking('robust')}"
-            raise InputError(f"a robust fit in scenario {scenario}", expected)
         refused = (
             ("an anchor", self.anchor != Anchor(), "anchor"),
             ("anchor determinant", self.anchor.determinant, "map_free"),
