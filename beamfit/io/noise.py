@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from os import PathLike
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from beamfit.errors import InputError
 from beamfit.io.toml import LIST, NUMBER, TEXT, Key, is_number, read_toml
-from beamfit.noise.learn import Learned
 from beamfit.noise.model import Noise
 from beamfit.writing import write_atomically
+
+if TYPE_CHECKING:
+    from beamfit.noise.learn import Learned
 
 FORMAT = "beamfit-noise-1"
 # Key of the file: its unit and meaning, and whether it is a list of middle and spread.

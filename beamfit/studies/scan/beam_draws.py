@@ -25,6 +25,8 @@ from beamfit.noise.sizes import (
 
 # Draws of a plane, and degrees of freedom of the Student distributions they are drawn from.
 DRAWS, TAIL = 1024, 4.0
+# Draws from the prior among them, so that no weight is large by luck where the sizes say little.
+DEFENSIVE = 128
 # Proposals are so much wider than the linear theory, and their shares flattened by this power.
 WIDER, FLATTER, PARTS = 1.3, 0.5, 24
 # Rounds in which weights are taken anew from the model, within this factor of the measured size.
@@ -171,7 +173,10 @@ def draw_beams(c: Coordinates, kind: Kind, noise: Noise) -> BeamDraws:
     share /= share.sum(-1, keepdims=True)
     centre = np.take_along_axis(centre, top[..., None], -2)
     root = np.take_along_axis(root, top[..., None, None], -3)
-    x, log_density = student_mixture(centre, root, share)
+    x, log_density = student_mixture(centre, root, share, _prior_points())
+    # Draws from the prior among them bound every weight.
+    part = DEFENSIVE / DRAWS
+    log_density = np.logaddexp(math.log1p(-part) + log_density, math.log(part) + log_prior(x))
     each = _log_likelihood(x, c, kind, scales.scale, noise)
     drawn = log_prior(x) - log_density - math.log(DRAWS)
     weight = averaged(each, scales.log_weight[..., None, :]) + drawn + kind.log_weight
@@ -184,7 +189,7 @@ def draw_beams(c: Coordinates, kind: Kind, noise: Noise) -> BeamDraws:
 
 def log_prior(x: np.ndarray) -> np.ndarray:
     """Log prior density of T, T p_1, T p_2, shape (..., 3) to (...); -inf where no beam is."""
-    t = np.maximum(x[..., 0], 1e-300)
+    t = np.maximum(x[..., 0], 1e-100)
     left = 1.0 - (x[..., 1] ** 2 + x[..., 2] ** 2) / t**2
     inside = (x[..., 0] > 0) & (left > 0)
     bright = -0.5 * (np.log(t) / BRIGHT) ** 2 - math.log(BRIGHT) - 0.5 * LN_2PI
@@ -320,7 +325,7 @@ def _even_points(dim: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def student_mixture(
-    centre: np.ndarray, root: np.ndarray, share: np.ndarray
+    centre: np.ndarray, root: np.ndarray, share: np.ndarray, further: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
     """Draws from a mixture of Student distributions, and their log density.
 
@@ -328,18 +333,29 @@ def student_mixture(
     ----------
     centre, root, share : ndarray
         Shape (..., m, dim), (..., m, dim, dim), lower triangles, and (..., m).
+    further : ndarray, optional
+        Shape (k, dim): points in the place of the last k draws.
 
     Returns
     -------
     tuple of ndarray
         Shape (..., d, dim) and (..., d).
     """
-    dim = centre.shape[-1]
-    z, cut = _even_points(dim)
+    z, cut = _even_points(centre.shape[-1])
     part = (cut[:, None] > np.cumsum(share, -1)[..., None, :]).sum(-1)
     part = np.minimum(part, share.shape[-1] - 1)
     own = np.take_along_axis(root, part[..., None, None], -3)
     x = np.take_along_axis(centre, part[..., None], -2) + (own @ z[..., None])[..., 0]
+    if further is not None:
+        x[..., -len(further) :, :] = further
+    return x, _student_density(x, centre, root, share)
+
+
+def _student_density(
+    x: np.ndarray, centre: np.ndarray, root: np.ndarray, share: np.ndarray
+) -> np.ndarray:
+    """Log density of a mixture of Student distributions at points, shape (..., d)."""
+    dim = centre.shape[-1]
     inverse = np.linalg.inv(root)
     # (x - centre) of every part at once: L⁻¹x - L⁻¹centre.
     far = x[..., None, :, :] @ np.swapaxes(inverse, -1, -2)
@@ -348,7 +364,17 @@ def student_mixture(
     log = -0.5 * (TAIL + dim) * np.log1p((far**2).sum(-1) / TAIL) - determinant[..., None]
     with np.errstate(divide="ignore"):
         log = log + np.log(share)[..., None]
-        top = log.max(-2, keepdims=True)
-        log = np.log(np.exp(log - top).sum(-2)) + top[..., 0, :]
+    top = log.max(-2, keepdims=True)
+    log = np.log(np.exp(log - top).sum(-2)) + top[..., 0, :]
     constant = gammaln(0.5 * (TAIL + dim)) - gammaln(0.5 * TAIL)
-    return x, log + constant - 0.5 * dim * math.log(TAIL * math.pi)
+    return log + constant - 0.5 * dim * math.log(TAIL * math.pi)
+
+
+@lru_cache(maxsize=1)
+def _prior_points() -> np.ndarray:
+    """Even draws from the prior, shape (DEFENSIVE, 3), in coordinates where all planes share it."""
+    steps = 0.5 + np.arange(DEFENSIVE)[:, None] * np.array([0.8191725, 0.6710436, 0.5497005])
+    bright, flat, turn = (steps % 1.0).T
+    t, p = np.exp(BRIGHT * ndtri(bright)), np.sqrt(1.0 - flat**2)
+    angle = 2.0 * math.pi * turn
+    return np.stack([t, t * p * np.cos(angle), t * p * np.sin(angle)], -1)
