@@ -150,10 +150,14 @@ def squared_pulls(off: Any, model: Any, kind: Kind, scale: Any) -> Any:
     """(size - model)² over the variance, points first: shape (n, ..., d, k), d draws, k scales."""
     xp = off.__array_namespace__()
     z = off / model if kind.power else off
-    precision = 1.0 / variance_of(kind, scale)
-    # Stacked, not turned: sums over points then run along memory.
-    squared = xp.stack([z[..., i, None] ** 2 for i in range(z.shape[-1])])
-    return squared * xp.stack([precision[..., None, :, i] for i in range(z.shape[-1])])
+    squared = _points_first(z**2, xp)[..., None]
+    return squared * _points_first(1.0 / variance_of(kind, scale), xp)[..., None, :]
+
+
+def _points_first(values: Any, xp: Any) -> Any:
+    """The last axis first, laid out anew, so that sums over points run along memory."""
+    turned = xp.moveaxis(values, -1, 0)
+    return xp.reshape(xp.reshape(turned, (-1,)), turned.shape)
 
 
 def log_likelihood(off: Any, model: Any, kind: Kind, scale: Any, noise: Noise) -> Any:

@@ -25,14 +25,18 @@ from beamfit.noise.sizes import (
 
 # Draws of a plane, and degrees of freedom of the Student distributions they are drawn from.
 DRAWS, TAIL = 1024, 4.0
-# Draws from the prior among them, so that no weight is large by luck where the sizes say little.
-DEFENSIVE = 128
+# One draw in so many is from the prior: no weight is large by luck where the sizes say little.
+DEFENSIVE = 8
 # Proposals are so much wider than the linear theory, and their shares flattened by this power.
 WIDER, FLATTER, PARTS = 1.3, 0.5, 24
 # Rounds in which weights are taken anew from the model, within this factor of the measured size.
 ROUNDS, FURTHEST = 6, 3.0
-# Every two points are left out of up to so many; of more, the worst one after the other.
-PAIRS = 24
+# Every two points are left out of up to so many, every one of up to so many more; of any number the
+# worst ones in so many steps.
+PAIRS, SINGLES, STEPS = 24, 50, 12
+# Numbers that one draw of many points may have, with all draws of few: memory and time.
+ROOM, FEWEST = 500_000, 128
+BLOCK = 10_000_000
 # A direction of the beam is lost below this share of the best seen one.
 RANK = 1e-12
 # Standard deviation of ln of the beam's mean square over the scan: anything near the sizes.
@@ -173,12 +177,13 @@ def draw_beams(c: Coordinates, kind: Kind, noise: Noise) -> BeamDraws:
     share /= share.sum(-1, keepdims=True)
     centre = np.take_along_axis(centre, top[..., None], -2)
     root = np.take_along_axis(root, top[..., None, None], -3)
-    x, log_density = student_mixture(centre, root, share, _prior_points())
+    count = int(np.clip(ROOM // c.size.shape[-1], FEWEST, DRAWS))
+    x, log_density = student_mixture(centre, root, share, count, _prior_points(count))
     # Draws from the prior among them bound every weight.
-    part = DEFENSIVE / DRAWS
+    part = 1.0 / DEFENSIVE
     log_density = np.logaddexp(math.log1p(-part) + log_density, math.log(part) + log_prior(x))
     each = _log_likelihood(x, c, kind, scales.scale, noise)
-    drawn = log_prior(x) - log_density - math.log(DRAWS)
+    drawn = log_prior(x) - log_density - math.log(count)
     weight = averaged(each, scales.log_weight[..., None, :]) + drawn + kind.log_weight
     weight = np.where(np.isnan(weight), -np.inf, weight)
     by_scale = averaged(np.swapaxes(each, -1, -2), drawn[..., None, :])
@@ -206,13 +211,18 @@ def model_sizes(x: np.ndarray, c: Coordinates) -> np.ndarray:
 def _log_likelihood(
     x: np.ndarray, c: Coordinates, kind: Kind, scale: np.ndarray, noise: Noise
 ) -> np.ndarray:
-    model = model_sizes(x, c)
-    return log_likelihood(c.size[..., None, :] - model, model, kind, scale, noise)
+    """Log likelihood of beams x, shape (..., d, k), in blocks of draws that memory holds."""
+    step = max(1, int(BLOCK / (scale.size * c.size.shape[-1])))
+    parts = []
+    for start in range(0, x.shape[-2], step):
+        model = model_sizes(x[..., start : start + step, :], c)
+        parts.append(log_likelihood(c.size[..., None, :] - model, model, kind, scale, noise))
+    return np.concatenate(parts, axis=-2)
 
 
 def left_out(n: int, noise: Noise) -> np.ndarray:
     """Which of n points each fit has: all, all but one, all but two; shape (fits, n)."""
-    most = min(n // noise.most, 2 if n <= PAIRS else 1)
+    most = min(n // noise.most, (n <= PAIRS) + (n <= SINGLES))
     chosen = [s for k in range(1 + most) for s in combinations(range(n), k)]
     kept = np.ones((len(chosen), n))
     for row, points in zip(kept, chosen, strict=True):
@@ -285,14 +295,15 @@ def _greedy(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Fits that leave out the worst point of the one before, up to a share of them."""
     n = c.size.shape[-1]
-    kept, found = np.ones((*c.unit.shape, 1, n)), []
-    for _ in range(n // noise.most):
+    kept, found, most = np.ones((*c.unit.shape, 1, n)), [], n // noise.most
+    steps = min(most, STEPS)
+    for _ in range(steps):
         centre, _ = _fitted(c, kind, deviation, kept)
         model = model_sizes(centre, c)
         pull = np.abs(c.size[..., None, :] - model) / deviation[..., None, :] / model**kind.power
-        worst = np.argmax(np.where(kept > 0, pull, -1.0), axis=-1)
+        worst = np.argsort(np.where(kept > 0, pull, -1.0), axis=-1)[..., -(most // steps) :]
         kept = kept.copy()
-        np.put_along_axis(kept, worst[..., None], 0.0, axis=-1)
+        np.put_along_axis(kept, worst, 0.0, axis=-1)
         found.append(_fitted(c, kind, deviation, kept))
     return _joined(found)
 
@@ -307,7 +318,7 @@ def _inside(x: np.ndarray) -> np.ndarray:
 
 
 @lru_cache(maxsize=8)
-def _even_points(dim: int) -> tuple[np.ndarray, np.ndarray]:
+def _even_points(dim: int, number: int) -> tuple[np.ndarray, np.ndarray]:
     """Points that fill a cube evenly, as those of a Student distribution, and a cut of [0, 1).
 
     An additive recurrence with the generalised golden ratio g, g^(d+1) = g + 1, stepped by 1/g^k:
@@ -318,14 +329,18 @@ def _even_points(dim: int) -> tuple[np.ndarray, np.ndarray]:
     for _ in range(60):
         g = (1.0 + g) ** (1.0 / (count + 1.0))
     step = g ** -(1.0 + np.arange(count))
-    cube = (0.5 + np.arange(1, DRAWS + 1)[:, None] * step) % 1.0
+    cube = (0.5 + np.arange(1, number + 1)[:, None] * step) % 1.0
     cube = np.clip(cube, 1e-9, 1.0 - 1e-9)
     chi2 = chdtri(TAIL, cube[:, dim])
     return ndtri(cube[:, :dim]) / np.sqrt(chi2 / TAIL)[:, None], cube[:, -1]
 
 
 def student_mixture(
-    centre: np.ndarray, root: np.ndarray, share: np.ndarray, further: np.ndarray | None = None
+    centre: np.ndarray,
+    root: np.ndarray,
+    share: np.ndarray,
+    number: int = DRAWS,
+    further: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Draws from a mixture of Student distributions, and their log density.
 
@@ -333,6 +348,8 @@ def student_mixture(
     ----------
     centre, root, share : ndarray
         Shape (..., m, dim), (..., m, dim, dim), lower triangles, and (..., m).
+    number : int
+        Of draws, d.
     further : ndarray, optional
         Shape (k, dim): points in the place of the last k draws.
 
@@ -341,7 +358,7 @@ def student_mixture(
     tuple of ndarray
         Shape (..., d, dim) and (..., d).
     """
-    z, cut = _even_points(centre.shape[-1])
+    z, cut = _even_points(centre.shape[-1], number)
     part = (cut[:, None] > np.cumsum(share, -1)[..., None, :]).sum(-1)
     part = np.minimum(part, share.shape[-1] - 1)
     own = np.take_along_axis(root, part[..., None, None], -3)
@@ -370,10 +387,12 @@ def _student_density(
     return log + constant - 0.5 * dim * math.log(TAIL * math.pi)
 
 
-@lru_cache(maxsize=1)
-def _prior_points() -> np.ndarray:
-    """Even draws from the prior, shape (DEFENSIVE, 3), in coordinates where all planes share it."""
-    steps = 0.5 + np.arange(DEFENSIVE)[:, None] * np.array([0.8191725, 0.6710436, 0.5497005])
+@lru_cache(maxsize=8)
+def _prior_points(number: int) -> np.ndarray:
+    """Even draws from the prior of T, T p_1, T p_2, one for every `DEFENSIVE` draws."""
+    steps = 0.5 + np.arange(number // DEFENSIVE)[:, None] * np.array(
+        [0.8191725, 0.6710436, 0.5497005]
+    )
     bright, flat, turn = (steps % 1.0).T
     t, p = np.exp(BRIGHT * ndtri(bright)), np.sqrt(1.0 - flat**2)
     angle = 2.0 * math.pi * turn

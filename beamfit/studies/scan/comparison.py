@@ -40,6 +40,8 @@ MODELS = {
 BEAM, FLAT = "beam", "beam of no emittance"
 # Of rows that moved no magnet only a beam and sizes at random are possible.
 UNMOVED = {BEAM: 0.9, FLAT: 0.05, "sizes at random": 0.05}
+# Models are told apart by at most so many points, evenly among all: the beam by every one.
+COMPARED = 100
 # Planes that are looked at in one call, and rounds of the best fit and when it rests.
 TOGETHER, ROUNDS, REST = 64, 100, 1e-12
 
@@ -68,6 +70,13 @@ class PlaneSizes(NamedTuple):
     error: np.ndarray | None
     of_shots: bool
     moved: bool
+
+    def thinned(self, number: int) -> PlaneSizes:
+        """So many points, evenly among all."""
+        at = np.linspace(0, len(self.size) - 1, number).astype(int)
+        error = None if self.error is None else self.error[at]
+        rows = self.r11[at], self.r12[at], self.known[at], self.size[at]
+        return PlaneSizes(*rows, error, self.of_shots, self.moved)
 
     @property
     def likeness(self) -> tuple:
@@ -210,7 +219,11 @@ def _compared(
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         s = _stacked(planes, noise)
         draws = [draw_beams(s.c, kind, noise) for kind in s.kinds]
-        evidence = np.array([_evidences(s, i, d, noise) for i, d in enumerate(draws)])
+        few, own = s, draws
+        if s.c.size.shape[-1] > COMPARED:
+            few = _stacked([p.thinned(COMPARED) for p in planes], noise)
+            own = [draw_beams(few.c, kind, noise) for kind in few.kinds]
+        evidence = np.array([_evidences(few, i, d, noise) for i, d in enumerate(own)])
         of_kind = np.logaddexp.reduce(evidence, axis=-1)
         of_kind = np.exp(of_kind - np.logaddexp.reduce(of_kind, axis=0))
         best = _best(s, draws, of_kind, noise, method, weights)
