@@ -205,7 +205,7 @@ def _judged(
     if e.of_a_beam:
         likely = chi2_probability(post.chi2, max(len(p.size) - 3, 0))
         remarks.insert(0, noise_remark(work.sizes.likeness[1], post.scale, likely))
-        remarks += point_remarks(p, carrying.place, carrying.shift)
+        remarks += point_remarks(p, *(("", 0.0) if e.opened else carrying[:2]))
     if b is not None and e.determined:
         remarks.append(b.remark)
     advised = e.of_a_beam and not e.determined and b is None

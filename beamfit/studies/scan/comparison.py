@@ -43,7 +43,7 @@ UNMOVED = {BEAM: 0.9, FLAT: 0.05, "sizes at random": 0.05}
 # Models are told apart by at most so many points, evenly among all: the beam by every one.
 COMPARED = 100
 # Planes that are looked at in one call, and rounds of the best fit and when it rests.
-TOGETHER, ROUNDS, REST = 64, 100, 1e-12
+TOGETHER, ROUNDS, REST = 64, 40, 1e-11
 
 
 class PlaneSizes(NamedTuple):

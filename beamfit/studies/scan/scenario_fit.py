@@ -65,7 +65,7 @@ def settled_fit(seen: Seen, scenario: Scenario, told: Assumptions) -> tuple[Fit,
     its residuals, and the points it doubted. What is seen in the end is the posterior through the
     line as found.
     """
-    fit = _solved(scenario.state(seen, told), scenario, told)
+    fit = _solved(scenario.state(_as_stated(seen), told), scenario, told)
     found = _through(seen, fit)
     for _ in range(ROUNDS):
         old = size_records(fit.problem)
@@ -79,6 +79,18 @@ def settled_fit(seen: Seen, scenario: Scenario, told: Assumptions) -> tuple[Fit,
         fit = replace(again, attempts=(*fit.attempts, *again.attempts), message=said)
         found = _through(seen, fit)
     return fit, found
+
+
+def _as_stated(seen: Seen) -> Seen:
+    """The scan with the errors that were stated, where they were.
+
+    What a line misses as it is, a scenario is to explain: it is no noise yet.
+    """
+    works = {}
+    for plane, work in seen.works.items():
+        error = work.points.error if work.sizes.error is None else work.sizes.error
+        works[plane] = work._replace(points=work.points._replace(error=error))
+    return seen._replace(works=works)
 
 
 def _solved(problem: Problem, scenario: Scenario, told: Assumptions) -> Fit:
