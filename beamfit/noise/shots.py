@@ -89,6 +89,13 @@ def means_of(shots: np.ndarray, noise: Noise = Noise()) -> ShotMeans | None:  # 
     count = np.maximum(good.sum(1), 0.5)
     doubtful = (good * (there - good) * (value - mean[:, None]) ** 2).sum(1) / count**2
     error = np.sqrt(deviation**2 / count + doubtful)
+    # Shots of which none is like another: some are bad, and nothing says which.
+    torn = good.sum(1) < 1.0
+    number = there.sum(1)
+    own = (value * there).sum(1) / number
+    apart = np.sqrt((there * (value - own[:, None]) ** 2).sum(1) / number)
+    mean, error = np.where(torn, own, mean), np.where(torn, np.maximum(apart, deviation), error)
+    good = np.where(torn[:, None], 0.5 * there, good)
     bad = np.where(there, 1.0 - good, np.nan)
     return ShotMeans(mean, error, bad, float(np.median(deviation / mean)))
 

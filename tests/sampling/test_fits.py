@@ -174,12 +174,12 @@ def test_known_transport_is_a_calibration_that_is_known():
     """The same density of σ, whichever scenario states it."""
     scan = beamfit.read_quad_scan("measurements/gtf_simulated.csv")
     line = beamfit.load_lattice("lattices/gtf.toml")
-    known = beam_target(beamfit.fit_emittance(scan, line), noise="known")
+    known = beam_target(beamfit.fit_emittance(scan, line))
     magnet = line["Q2"].calibration
     values = {f"Q2.{name}": float(getattr(magnet, name)) for name in ("slope", "intercept")}
     priors = {name: (value, 1e-6 * abs(value)) for name, value in values.items()}
     told = beamfit.fit_emittance(scan, line, scenario="calibration", priors=priors)
-    free = beam_target(told, noise="known")
+    free = beam_target(told)
     assert set(free.names) == {*known.names, *values}
     spread = np.sqrt(np.diag(known.covariance))
     draws = known.mode + spread * np.random.default_rng(1).normal(size=(6, 3))
@@ -205,14 +205,22 @@ def beam(otr2):
 
 
 def test_a_real_scan(otr2, beam):
-    """Medians agree with the fit; two degrees of freedom make Student's wide tails."""
+    """One posterior: medians, errors and 95 % are those that the fit quotes."""
     assert beam.status is Status.converged
     for plane in "xy":
         fit = otr2[plane].normalized_emittance
         found = beam.interval(f"{plane}.normalized_emittance")
-        assert found.median == pytest.approx(fit.value, abs=0.2 * fit.error)
-        # t with 2 degrees of freedom holds 68.3 % within 1.32 scale units.
-        assert 0.5 * (found.upper - found.lower) == pytest.approx(1.32 * fit.error, rel=0.12)
+        assert found.median == pytest.approx(fit.value, abs=0.4 * fit.error)
+        half, (low, high) = 0.5 * (found.upper - found.lower), fit.interval_95
+        ends = beam.quantiles(f"{plane}.normalized_emittance", (0.025, 0.975))
+        if "to which the interval reaches" in otr2[plane].message:
+            # The one point that y rests on: the fit says so, and quotes more than the draws show.
+            assert fit.error > half
+            assert low <= ends[0] + 0.2 * half
+            assert high >= ends[1] - 0.2 * half
+        else:
+            assert half == pytest.approx(fit.error, rel=0.12)
+            np.testing.assert_allclose(ends, (low, high), atol=0.3 * fit.error)
     sigma = beam.draws
     assert (sigma[:, 0] * sigma[:, 2] > sigma[:, 1] ** 2).all()
     emittance = np.sqrt(sigma[:, 0] * sigma[:, 2] - sigma[:, 1] ** 2)
@@ -221,12 +229,15 @@ def test_a_real_scan(otr2, beam):
     assert sizes.mean() == pytest.approx(np.sqrt(otr2.y.sigma[0].value), rel=0.02)
 
 
-def test_noise_known_gives_the_unscaled_errors(otr2):
-    fit = beamfit.fit_emittance(replace(otr2.scan, shots=None), otr2.line)
-    found = fit.sample(("x",), noise="known", seed=1, target_ess=8000)
-    assert found.status is Status.poor_fit
-    assert "too narrow" in found.message
+def test_sure_errors_give_the_errors_as_stated():
+    """Priors that leave stated errors no doubt: the width is that of linear theory."""
+    scan = beamfit.read_quad_scan("measurements/gtf_simulated.csv")
+    line = beamfit.load_lattice("lattices/gtf.toml")
+    fit = beamfit.fit_emittance(scan, line, noise=beamfit.Noise(right=1 - 1e-9, most=99))
+    found = fit.sample(("x",), seed=1, target_ess=8000)
+    assert found.status is Status.converged
     raw = fit.x.normalized_emittance.error_raw
+    assert fit.x.normalized_emittance.error == pytest.approx(raw, rel=0.05)
     assert found["x.normalized_emittance"].error == pytest.approx(raw, rel=0.05)
     assert found.names == ("x.sigma11", "x.sigma12", "x.sigma22")
 
@@ -248,7 +259,7 @@ def test_a_scan_that_determines_nothing_is_not_sampled():
         "x.sigma12": Uniform(-2e-8, 3e-8),
         "x.sigma22": Uniform(0.3e-8, 2e-8),
     }
-    boxed = fit.sample(priors=box, noise="known", seed=1)
+    boxed = fit.sample(priors=box, seed=1)
     assert boxed.chain.size
     assert boxed.status is Status.unidentified
     assert "x.emittance" in boxed.held
