@@ -1,0 +1,68 @@
+"""Means of shots, of which some may show no beam."""
+
+import numpy as np
+import pytest
+
+from beamfit.noise.model import Noise
+from beamfit.noise.shots import evened, means_of
+
+
+def shots_of(n=9, m=5, relative=0.02, seed=0):
+    rng = np.random.default_rng(seed)
+    true = np.linspace(0.6, 2.0, n)
+    return true, true[:, None] * (1 + relative * rng.normal(size=(n, m)))
+
+
+def test_good_shots_have_their_means_and_standard_errors():
+    """Of 40 shots each the scatter is known to a few percent; a share of the size at each."""
+    true, shots = shots_of(m=40)
+    found = means_of(shots, Noise())
+    np.testing.assert_allclose(found.size, shots.mean(1), rtol=3e-3)
+    np.testing.assert_allclose(found.error, 0.02 * true / np.sqrt(40), rtol=0.2)
+    assert (found.bad > 0.5).sum() <= 2
+
+
+@pytest.mark.parametrize("value", [0.0, 3.9, 1e-3])
+def test_a_shot_that_shows_no_beam_is_found_and_left_out(value):
+    _, shots = shots_of()
+    spoilt = shots.copy()
+    spoilt[4, 1] = value
+    found, clean = means_of(spoilt, Noise()), means_of(shots, Noise())
+    assert found.bad[4, 1] > 0.99
+    others = np.delete(found.bad.ravel(), 4 * 5 + 1)
+    assert others.max() < 0.9
+    assert found.size[4] == pytest.approx(np.delete(shots[4], 1).mean(), rel=0.01)
+    np.testing.assert_allclose(np.delete(found.size, 4), np.delete(clean.size, 4), rtol=2e-3)
+
+
+def test_two_shots_that_differ_are_both_doubted_and_widen_the_error():
+    """One of two is bad, and nothing says which: the mean is as uncertain as they differ."""
+    _, shots = shots_of(m=2)
+    spoilt = shots.copy()
+    spoilt[3, 0] *= 1.5
+    found = means_of(spoilt, Noise())
+    assert found.error[3] > 0.3 * abs(spoilt[3, 0] - spoilt[3, 1])
+
+
+def test_shots_that_are_missing_count_nowhere():
+    _, shots = shots_of()
+    short = shots.copy()
+    short[2, 3:] = np.nan
+    found = means_of(short, Noise())
+    assert np.isnan(found.bad[2, 3:]).all()
+    assert found.size[2] == pytest.approx(shots[2, :3].mean(), rel=0.01)
+    assert found.error[2] > 1.15 * found.error[1] * found.size[2] / found.size[1]
+
+
+def test_too_few_repeats_say_nothing():
+    _, shots = shots_of(n=2, m=2)
+    assert means_of(shots, Noise()) is None
+    assert means_of(np.repeat(np.arange(1.0, 5.0)[:, None], 3, axis=1), Noise()) is None
+
+
+def test_scatter_is_evened_out_towards_that_of_all_settings():
+    """Twenty degrees of freedom of all stand beside a setting's own four."""
+    freedom, size = np.full(5, 4.0), np.ones(5)
+    square = np.array([4.0, 4.0, 4.0, 4.0, 16.0])
+    pooled = square.sum() / freedom.sum()
+    np.testing.assert_allclose(evened(square, freedom, size), (20 * pooled + square) / 24.0)
