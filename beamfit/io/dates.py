@@ -29,6 +29,8 @@ NOON = re.compile(r"(.*\d) ?([AP])\.?M\.?", re.IGNORECASE)
 # Zones by the letters that clocks show and no list of zones has; those that mean two are left out.
 LETTERS = {"CEST": 2, "EEST": 3, "EDT": -4, "PDT": -7, "PST": -8, "JST": 9, "KST": 9}
 CLOCK = re.compile(r"(\d{1,2}):(\d{2})(?::(\d{2}(?:[.,]\d*)?))?")
+# What may be hours and minutes of a night, or minutes and seconds from a start.
+HOUR_OR_MINUTE = re.compile(r"0?0:\d{2}")
 FRACTION = re.compile(r"[.,](\d+)$")
 ZONE = re.compile(r"^(.*\d) ?([A-Z][A-Za-z_]+(?:/[A-Za-z_]+)*)$")
 
@@ -91,6 +93,8 @@ def dates_in_order() -> Callable[[str], float]:
     def read(text: str) -> float:
         nonlocal latest
         if (clock := CLOCK.fullmatch(str(text).strip())) is not None:
+            if latest == -math.inf and HOUR_OR_MINUTE.fullmatch(clock[0]):
+                raise ValueError("hours and minutes, or minutes and seconds")
             moment = _time_of_day(*clock.groups(default="0"))
             moment += DAY * (max(latest - moment, 0.0) // DAY)
             moment += DAY if moment < latest - DAY / 2 else 0.0

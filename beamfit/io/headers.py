@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from functools import lru_cache
 
 from beamfit.errors import InputError
+from beamfit.studies.scan.scans import SETTINGS
 
 UNITS: dict[str, dict[str, float]] = {
     # quantity: unit at the end of a name -> factor to SI (a stored current: to mA)
@@ -19,8 +20,6 @@ UNITS: dict[str, dict[str, float]] = {
     "energy in MeV": {"MeV": 1.0},
 }
 UNITS["length or share"] = UNITS["length"] | {"%": 0.01}
-# Of magnets, whose gradients have factors of their own.
-SETTINGS = ("A", "kG", "T_per_m", "k1", "k1l")
 # Units at the end of a header, as the columns' names have them.
 KNOWN = {*SETTINGS, "µs", *(unit for units in UNITS.values() for unit in units)}
 ENDS = tuple(f"_{unit}" for unit in KNOWN)
@@ -284,6 +283,8 @@ def number(cell: object) -> float:
     >>> [number(cell) for cell in ("5.125D-04", "−5", "5,125.0", "5'125")]
     [0.0005125, -5.0, 5125.0, 5125.0]
     """
+    if isinstance(cell, str) and "_" in cell:  # which Python takes for nothing between digits
+        raise ValueError("an underscore")
     try:
         return float(cell)
     except ValueError:

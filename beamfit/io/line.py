@@ -8,7 +8,7 @@ from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from beamfit.errors import InputError, nearest
+from beamfit.errors import InputError, expect, nearest
 from beamfit.io.emittance_gui import EmittanceGuiFile, is_emittance_gui, read_emittance_gui
 from beamfit.io.lattice import LatticeFile, element_of, read_toml_lattice
 from beamfit.io.measurement import read_quad_scan
@@ -159,6 +159,7 @@ def read_lattice(
 
 
 def _whole(path: str | PathLike[str], use: str | None, energy: float | None) -> LatticeFile:
+    expect(path, str | PathLike, "'line.toml'")
     if Path(path).suffix.lower() in FOREIGN:
         from beamfit.io.sequence import read_sequence
 

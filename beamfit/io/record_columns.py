@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 from beamfit.errors import InputError
-from beamfit.io.headers import is_number, spelled
+from beamfit.io.headers import is_number, spelled, unit_at_end
 from beamfit.io.sheet import DATE, UNITS, Column, Sheet, columns_of
 from beamfit.studies.decay.conditions import Conditions
 
@@ -41,8 +41,9 @@ ASIDE = {"severity", "status", "val", "value", "index", "no", "no.", "nr", "row"
 # beside other words.
 MONITORS = {"ibeam", "dcct", "pct", "bct", "stored"}
 CURRENTS = MONITORS | {"current", "i", "strom", "strahlstrom", "courant", "corrente"}
-RINGS = {"sr", "ring", "ler", "her", "total", "average", "mean"}
+RINGS = {"sr", "ring", "ler", "her", "total", "average", "mean", "beam", "storage"}
 OTHERS = {"error", "err", "std", "sd", "sigma", "rms", "set", "setpoint", "target", "nominal"}
+OTHERS |= {"bunch", "injected", "log"}
 # A lifetime beside the current, as archives have it, is not read.
 LIFETIME = re.compile(r"(.*[\W_])?(life_?time|tau)([\W_].*)?", re.IGNORECASE)
 
@@ -175,8 +176,10 @@ def _current(header: str) -> Column | None:
     """A beam current by a word in its name and its unit."""
     name, _, unit = header.rpartition("_")
     words = set(re.findall(r"[a-z]+", name.lower()))
-    wanted = MONITORS if unit == "A" and words - CURRENTS - RINGS else CURRENTS
-    if unit not in UNITS["current"] or not (words & wanted or words == {"beam"}) or words & OTHERS:
+    # A monitor's name says it; a mere current may be a pump's, a bunch's or a magnet's.
+    wanted = MONITORS if words - CURRENTS - RINGS else CURRENTS | {"beam"}
+    other = words & OTHERS or unit_at_end(name) in UNITS["current"]
+    if unit not in UNITS["current"] or not words & wanted or other:
         return None
     return Column(header, "beam_current", unit, UNITS["current"][unit])
 

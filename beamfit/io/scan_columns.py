@@ -55,6 +55,12 @@ SHOTS = {"n_shots": "shots", "nshots": "shots"}
 # Elements of the matrix from where the beam is asked for to the row's screen, m and 1.
 ELEMENT = re.compile(r"r(1[126])(?:_([xy]))?(?:_m)?|r(3[346])(?:_m)?", re.IGNORECASE)
 OF_Y = {"33": "11", "34": "12", "36": "16"}
+# What a coupled beam has besides two sizes.
+COUPLED = re.compile(
+    r"(?:(?:cov|corr?|sigma|sig|size|rms|rho|s)[ _]?)?[<(\[]?(?:xy|x_y)[>)\]]?"
+    r"(?:_(?:err|error|std))?(?:[ _\[(].*)?|(?:tilt|theta|beam_tilt|tilt_angle)(?:[ _\[(].*)?",
+    re.IGNORECASE,
+)
 # A plane and a width written as one word, as in xrms and sigmax.
 ONE_WORD = re.compile(
     r"(x|y|hor|ver)(size|sigma|sig|rms|fwhm)|(size|sigma|sig|s|rms|fwhm)(x|y|hor|ver)"
@@ -176,6 +182,9 @@ def _other(header: str, sheet: Sheet) -> Column:
     if (named := ELEMENT.fullmatch(header)) is not None:
         of_x, plane, of_y = named.groups()
         return Column(header, f"r{OF_Y[of_y]}_y" if of_y else f"r{of_x}_{plane or 'x'}")
+    if COUPLED.fullmatch(header) is not None:
+        found = "the correlation of x and y, or a tilt: coupled beams are not fitted"
+        raise sheet.header_error(found, f"two planes; --ignore '{header}' fits them alone", header)
     unit = next((u for u in SETTINGS if header.endswith(f"_{u}")), "")
     name = header.removesuffix(f"_{unit}") if unit else ""
     while (bare := ATTRIBUTE.sub("", name)) != name:

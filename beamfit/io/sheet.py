@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from beamfit.errors import InputError, nearest
-from beamfit.io.dates import NUMBERS, dates_in_order
+from beamfit.io.dates import HOUR_OR_MINUTE, NUMBERS, dates_in_order
 from beamfit.io.headers import UNITS, is_number, number, spelled, unit_behind
 
 # The unit of a column of dates.
@@ -240,6 +240,8 @@ class Sheet:
         if column.unit == DATE:
             expected = "an ISO 8601 time, such as 2024-03-01T12:00:00+01:00"
             first = str(next(iter(self[column.header]), ""))
+            if HOUR_OR_MINUTE.fullmatch(first):
+                expected = "00:00:00: are these hours and minutes, or minutes and seconds?"
             if NUMBERS.match(first):
                 expected = "a date whose day and month cannot be exchanged, such as 2024-03-01"
             elif is_number(first):

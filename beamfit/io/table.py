@@ -11,7 +11,7 @@ from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from beamfit.errors import InputError, located
+from beamfit.errors import InputError, expect, located
 from beamfit.io import labview, sdds
 from beamfit.io.cell_units import without_units
 from beamfit.io.commas import with_points
@@ -100,6 +100,7 @@ def read_sheet(
     """
     if hasattr(path, "itertuples"):
         return _of_frame(path, most)
+    expect(path, str | PathLike, "'scan.csv', or a pandas frame")
     if (suffix := Path(path).suffix.lower()) in BINARY:
         return _binary(path, suffix, most)
     if suffix == ".json":
