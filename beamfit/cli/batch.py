@@ -42,7 +42,9 @@ NAMED = 10
 @option("--workers", "Processes on this machine (Dask).", type=click.IntRange(1))
 @option("--scheduler tcp://HOST:PORT", "A Dask scheduler to join.")
 @option("--quantity NAME", "What the report follows, such as beta or lifetime_mean.")
-@options("ignore skip-bad weights maybe-lattice use from to screen energy particle time current")
+@options(
+    "columns ignore skip-bad weights maybe-lattice use from to screen energy particle time current"
+)
 @options("report json")
 def batch(
     path: tuple[str, ...],
@@ -64,7 +66,7 @@ def batch(
     and version are kept.
     """
     part = {n: told[n] for n in ("use", "energy", "particle", "first", "last", "screen")}
-    reading = {n: told[n] for n in ("ignore", "skip_bad", "time", "current")}
+    reading = {n: told[n] for n in ("columns", "ignore", "skip_bad", "time", "current")}
     _check_kind(kind, {"lattice": lattice} | part, {n: told[n] for n in ("time", "current")})
     from beamfit.batch.course import courses_of, followed
     from beamfit.batch.job import Job

@@ -78,7 +78,7 @@ Examples:
     "--monitor-offset CURRENT",
     "How far it is off without beam (one standard deviation), such as 50uA.",
 )
-@options("prior ignore skip-bad sample store seed report json")
+@options("prior columns ignore skip-bad sample store seed report json")
 def lifetime(
     record: tuple[str, ...],
     ring: str | None,

@@ -11,12 +11,13 @@ import numpy as np
 
 from beamfit.errors import InputError
 from beamfit.io.archive import archive_sheet
+from beamfit.io.columns import Columns, arranged, layout_of
 from beamfit.io.files import name_of
 from beamfit.io.headers import spelled
 from beamfit.io.monitor import FEWEST, offset_of
 from beamfit.io.record_columns import dated, known, record_columns, taken_for_current
 from beamfit.io.scan_columns import is_size
-from beamfit.io.sheet import DATE, Column, Sheet, columns_of, left_out
+from beamfit.io.sheet import DATE, Column, Sheet, columns_of, left_aside, left_out
 from beamfit.studies.decay.conditions import Conditions, Fault, first_fault
 from beamfit.studies.decay.monitor import Monitor
 from beamfit.studies.decay.record import DecayRecord, LifetimeTable
@@ -33,8 +34,6 @@ LIFETIMES = {
     "beam_current": "current",
 }
 INCREASE = "times that increase; --skip-bad leaves out rows whose time does not"
-# Columns left aside that a note names.
-MOST_ASIDE = 8
 # Seconds beyond this many are counted from 1970, not from the start of a record (1973 or later);
 # beyond the other they lie after the year 5000, and are milliseconds.
 UNIX, LATEST = 1e8, 1e11
@@ -47,6 +46,7 @@ FINER += ((np.inf, "ns", "nanoseconds"),)
 def read_lifetime_input(
     path: str | PathLike[str] | DataFrame,
     *,
+    columns: Columns = None,
     time: str | None = None,
     current: str | None = None,
     ignore: Iterable[str] = (),
@@ -54,7 +54,7 @@ def read_lifetime_input(
     offset: str | None = None,
 ) -> DecayRecord | LifetimeTable:
     """Read what `beamfit lifetime` takes, by its header: as one of the other two readers."""
-    sheet = archive_sheet(path, skip_bad).without(ignore)
+    sheet = _sheet(path, columns, ignore, skip_bad)
     lifetimes = any(spelled(n).lower().startswith(("tau_", "lifetime_")) for n in sheet.names)
     moments = any((c := known(sheet, name)) and c.key == "time" for name in sheet.names)
     if time is None and lifetimes and not moments:
@@ -63,7 +63,11 @@ def read_lifetime_input(
 
 
 def read_lifetimes(
-    path: str | PathLike[str] | DataFrame, *, ignore: Iterable[str] = (), skip_bad: bool = False
+    path: str | PathLike[str] | DataFrame,
+    *,
+    columns: Columns = None,
+    ignore: Iterable[str] = (),
+    skip_bad: bool = False,
 ) -> LifetimeTable:
     """Read lifetimes measured at several currents.
 
@@ -72,7 +76,7 @@ def read_lifetimes(
     path : str, path or pandas.DataFrame
         A frame, CSV or HDF5 with `tau_h` (or `lifetime_h`; also _min, _s) and `beam_current_mA`;
         optionally `tau_error_h`.
-    ignore, skip_bad
+    columns, ignore, skip_bad
         As for `read_decay_record`.
 
     Returns
@@ -92,12 +96,21 @@ def read_lifetimes(
     >>> print(read_lifetimes(file))
     lifetimes.csv: 4 lifetimes at 100 to 400 mA
     """
-    return _lifetimes(archive_sheet(path, skip_bad).without(ignore), skip_bad)
+    return _lifetimes(_sheet(path, columns, ignore, skip_bad), skip_bad)
+
+
+def _sheet(
+    path: str | PathLike[str] | DataFrame, columns: Columns, ignore: Iterable[str], skip_bad: bool
+) -> Sheet:
+    layout = layout_of(columns)
+    sheet = archive_sheet(path, skip_bad, layout.header or None)
+    return arranged(sheet.without(ignore), layout)
 
 
 def read_decay_record(
     path: str | PathLike[str] | DataFrame,
     *,
+    columns: Columns = None,
     time: str | None = None,
     current: str | None = None,
     ignore: Iterable[str] = (),
@@ -115,6 +128,9 @@ def read_decay_record(
         `beam_current_mA` (or `_A`, `_uA`); optionally `beam_current_error_mA`, `rf_voltage_kV`,
         `scraper_y_mm`, `pressure_Pa` (_mbar, _Torr), `bunches`, `bunch_length_mm` (_ps).
         Lines that begin with `#` and HDF5 attributes are kept as comments.
+    columns : str, path, mapping or Layout, optional
+        What columns are whose headers do not say it: ``{"PV 12": "beam_current_mA"}``, or as
+        `beamfit.io.columns.layout_of` reads it. Other columns of unknown names are left aside.
     time : str, optional
         Header of the time, with its unit after a last colon unless it is seconds or a date.
     current : str, optional
@@ -146,7 +162,7 @@ def read_decay_record(
     >>> print(read_decay_record("measurements/aps_1999_decay.csv"))
     aps_1999_decay.csv: 27 readings over 8.81 h, 101.999 to 81.464 mA
     """
-    return _record(archive_sheet(path, skip_bad).without(ignore), time, current, skip_bad, offset)
+    return _record(_sheet(path, columns, ignore, skip_bad), time, current, skip_bad, offset)
 
 
 def _record(
@@ -201,10 +217,10 @@ def _record(
 
 def _left_aside(sheet: Sheet, columns: Mapping[str, Column]) -> tuple[str, ...]:
     """Name the columns of unknown names that were not read, as a note."""
-    used = {column.header for column in columns.values()}
-    aside = [name for name in sheet.names if name not in used and not known(sheet, name)]
-    more = [f"{len(aside) - MOST_ASIDE} more"] if len(aside) > MOST_ASIDE else []
-    return (f"Left aside: {', '.join(aside[:MOST_ASIDE] + more)}.",) if aside else ()
+    if sheet.arranged:
+        return left_aside(sheet, columns)
+    unknown = [name for name in sheet.names if not known(sheet, name)]
+    return left_aside(replace(sheet.only(unknown), arranged=True), columns) if unknown else ()
 
 
 def _values(sheet: Sheet, column: Column) -> np.ndarray:

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 from beamfit.errors import InputError
+from beamfit.io.dates import DAY_FIRST, dates_in_order
 from beamfit.io.headers import is_number, spelled, unit_at_end
 from beamfit.io.sheet import DATE, UNITS, Column, Sheet, columns_of
 from beamfit.studies.decay.conditions import Conditions
@@ -92,7 +93,8 @@ def record_columns(sheet: Sheet, time: str | None, current: str | None) -> dict[
 def known(sheet: Sheet, name: str) -> Column | None:
     """What a header means by itself; None if nothing."""
     try:
-        return next(iter(columns_of(sheet.only([name]), QUANTITIES, _other(sheet)).values()))
+        found = columns_of(sheet.only([name]), QUANTITIES, _other(sheet))
+        return next(iter(found.values()), None)
     except InputError:
         return None
 
@@ -107,6 +109,22 @@ def is_current(header: str) -> bool:
     """
     said = spelled(header)
     return said.lower().startswith("beam_current") or _current(said) is not None
+
+
+def likely_name(header: str, cell: object) -> str | None:
+    """The name that a header may mean, by a word in it or by a first cell that is a date.
+
+    Examples
+    --------
+    >>> likely_name("When", "2024-03-01 12:00:00"), likely_name("Current", "200.1")
+    ('time', 'beam_current_mA')
+    """
+    try:
+        dates_in_order(DAY_FIRST)(str(cell))
+    except ValueError:
+        words = set(re.findall(r"[a-z]+", header.lower()))
+        return "beam_current_mA" if words & (CURRENTS | {"beam"}) and not words & OTHERS else None
+    return "time"
 
 
 def dated(sheet: Sheet) -> Sheet:

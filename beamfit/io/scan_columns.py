@@ -51,6 +51,8 @@ ATTRIBUTE = re.compile(
     r"|[ _:./](setpoint|readback|set|rbv?)$|[ _-]strom$|^(current|strom|courant|corrente)[ _]",
     re.IGNORECASE,
 )
+# An error that is a deviation of shots by its name.
+DEVIATION = re.compile(r"(?:^|[_\W])(std|sd|stdev)(?:[_\W]|$)", re.IGNORECASE)
 SHOTS = {"n_shots": "shots", "nshots": "shots"}
 # Elements of the matrix from where the beam is asked for to the row's screen, m and 1.
 ELEMENT = re.compile(r"r(1[126])(?:_([xy]))?(?:_m)?|r(3[346])(?:_m)?", re.IGNORECASE)
@@ -122,7 +124,7 @@ def _understood(sheet: Sheet) -> dict[str, Column]:
     try:
         return columns_of(sheet, QUANTITIES, lambda header: _other(header, sheet))
     except InputError as error:
-        unknown = [name for name in sheet.names if not _is_known(name, sheet)]
+        unknown = [name for name in sheet.names if not is_known(name, sheet)]
         if error.column not in unknown:
             one = sheet.names.count(error.column) == 1  # more would all be left unread
             more = f"; --ignore '{error.column}' leaves this one unread" if one else ""
@@ -136,11 +138,13 @@ def _understood(sheet: Sheet) -> dict[str, Column]:
             )
             raise sheet.header_error("rows of two planes", expected, error.column) from None
         ignored = " ".join(f"--ignore '{name}'" for name in unknown)
-        expected = "a magnet with its unit, a size such as size_x_um, or to leave them unread: "
+        expected = "a magnet with its unit, a size such as size_x_um, --columns (`beamfit check` "
+        expected += "proposes a layout), or to leave them unread: "
         raise replace(error, expected=expected + ignored) from None
 
 
-def _is_known(name: str, sheet: Sheet) -> bool:
+def is_known(name: str, sheet: Sheet) -> bool:
+    """Whether a header means something in a scan."""
     alone = replace(sheet, names=(name,), cells=[sheet[name]])
     try:
         return bool(columns_of(alone, QUANTITIES, lambda header: _other(header, sheet)))
@@ -198,9 +202,23 @@ def _other(header: str, sheet: Sheet) -> Column:
         _not_understood(header),
         "a magnet with _A, _kG, _T_per_m or _k1 at the end, "
         + nearest(header, usual)
-        + "; --ignore a column, or begin its name with note_, to leave it unread",
+        + f"; --columns '{header}=NAME' says what it is, --ignore leaves it unread",
         header,
     )
+
+
+def likely_name(header: str) -> str | None:
+    """The name that a header without a unit may mean, in a usual unit.
+
+    Examples
+    --------
+    >>> [likely_name(header) for header in ("xrms", "QUAD:525:BACT", "foo")]
+    ['size_x_um', 'QUAD_525_kG', None]
+    """
+    if (size := _size(f"{header}_um")) is not None:
+        return f"{size.key}_um"
+    bare = ATTRIBUTE.sub("", header)
+    return f"{re.sub(r'[^A-Za-z0-9.]+', '_', bare)}_kG" if bare != header else None
 
 
 def _not_understood(header: str) -> str:
@@ -259,6 +277,19 @@ def rms_of(column: Column) -> float:
     return column.factor / UNITS["length"][column.unit]
 
 
+def is_scatter(columns: Mapping[str, Column], plane: str) -> bool:
+    """Whether an error is the deviation of the shots, and not yet that of their mean.
+
+    Examples
+    --------
+    >>> of = {"shots": Column("n", "shots"), "size_x_error": Column("x_rms_std_um", "", "um")}
+    >>> is_scatter(of, "x"), is_scatter(of, "y")
+    (True, False)
+    """
+    error = columns.get(f"size_{plane}_error")
+    return "shots" in columns and error is not None and bool(DEVIATION.search(error.header))
+
+
 def column_notes(columns: Mapping[str, Column]) -> list[str]:
     """Say which sizes were made of others, in sentences."""
     made: dict[float, list[str]] = {}
@@ -271,4 +302,9 @@ def column_notes(columns: Mapping[str, Column]) -> list[str]:
         else f"Sizes are a share of 1/{share:g} of {' and '.join(headers)}."
         for share, headers in made.items()
         if share != 1.0
+    ] + [
+        f"'{columns[f'size_{p}_error'].header}' beside '{columns['shots'].header}' is taken for "
+        "the deviation of the shots: the errors are it over the root of their number."
+        for p in "xy"
+        if is_scatter(columns, p)
     ]

@@ -47,6 +47,8 @@ BINARY = {*HDF5, ".mat"}
 FOREIGN = {sdds.SIGNATURE: sdds.sdds_head, labview.SIGNATURE: labview.labview_head}
 # How Excel says which separator a file has.
 SEPARATOR_LINE = re.compile(r"\s*\"?sep=.\"?\s*$", re.IGNORECASE)
+# In the names of a file without a header: cells that are not read.
+REST = "*"
 TFS_LINES = ("@", "$")
 WORD = re.compile(r'"[^"]*"|\S+')
 
@@ -75,7 +77,7 @@ def read_sheet(
         Whether rows that have not as many cells as the header are left out, and named in ``bad``;
         None where nobody can ask for it.
     names : sequence of str, optional
-        The header of a file that has none and is separated by commas.
+        The header of a file that has none; "*" at its end stands for further cells, unread.
 
     Returns
     -------
@@ -122,12 +124,17 @@ def _read_text(
     numbered = enumerate(map(unframed, text_lines(path)), start=1)
     if names is None:
         names, header, separator, numbered = _head(path, example, comments)
+    else:
+        head = list(itertools.islice(numbered, 1))
+        separator = separator_of(next((text for _, text in head), ","))
+        numbered = itertools.chain(head, numbered)
+    names, rest = [name for name in names if name != REST], REST in names
     title = list(names)
     for line, text in numbered:
         if text.lstrip().startswith(MARKS + TFS_LINES * (separator == " ")):
             comments.append(bare(text))
         elif text.strip().strip(",;\t "):
-            cells, wrong = _row(text, separator, path, line, len(names))
+            cells, wrong = _row(text, separator, path, line, len(names), rest)
             units = None if rows or wrong else _units_below(names, cells, path, line)
             names = units or names
             if units or (rows and _is_again(cells, title, path, line)):
@@ -224,11 +231,17 @@ def _cells(path: str | PathLike[str], text: str, line: int = 1) -> list[str]:
 
 
 def _row(
-    text: str, separator: str, path: str | PathLike[str], line: int, count: int
+    text: str,
+    separator: str,
+    path: str | PathLike[str],
+    line: int,
+    count: int,
+    rest: bool = False,
 ) -> tuple[list[str], InputError | None]:
-    """The cells of a row, and what is wrong with it if they are not so many."""
+    """The cells of a row, and what is wrong with it if they are not so many; or the first ones."""
     try:
         cells = _without_blanks(_split(text, separator, path, line), count)
+        cells = cells[:count] if rest else cells
     except InputError as error:
         return [], error
     if len(cells) == count:
