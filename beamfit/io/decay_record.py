@@ -35,8 +35,8 @@ LIFETIMES = {
 }
 INCREASE = "times that increase; --skip-bad leaves out rows whose time does not"
 # Seconds beyond this many are counted from 1970, not from the start of a record (1973 or later);
-# beyond the other they lie after the year 5000, and are milliseconds.
-UNIX, LATEST = 1e8, 1e11
+# beyond the others after 2050, of another origin, or after the year 5000, and are milliseconds.
+UNIX, LATEST, MILLISECONDS = 1e8, 2.5e9, 1e11
 # Times of day without a date lie on the first day.
 DAY = 86400.0
 FINER = ((1e14, "ms", "milliseconds"), (1e17, "us", "microseconds"))
@@ -300,7 +300,15 @@ def _forward(
 
 
 def _check_base(sheet: Sheet, column: Column, moment: np.ndarray) -> None:
-    if (latest := np.max(moment)) > LATEST:
+    latest = np.max(moment)
+    if LATEST < latest < MILLISECONDS:
+        found = f"{latest:.6g} s since 1970, after the year 2050"
+        expected = (
+            "a date, or time from the start of the record: LabVIEW counts seconds from 1904, "
+        )
+        expected += "Excel days from 1899, MATLAB days from the year 0"
+        raise sheet.error(found, expected, int(np.argmax(moment)), column.header)
+    if latest >= MILLISECONDS:
         found = f"{latest:.6g} s, after the year 5000"
         unit, long = next(said for most, *said in FINER if latest < most)
         name = column.header.removesuffix("_s")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
 from os import PathLike
 from pathlib import Path
@@ -29,6 +29,8 @@ if TYPE_CHECKING:
 MOST_ROWS = 100_000
 # A size this many times the usual one of its column, and larger than most beams, has slipped.
 SLIPPED = 100.0
+# Relative: nobody has measured a beam's size better, while mm and µm are 1e-3 apart.
+SMALLEST = 1e-4
 # Of the matrix of a plane, where rows have their own.
 ELEMENTS = (11, 12, 16)
 # Further quantities: from (open), to, and how to say it.
@@ -148,6 +150,7 @@ def _scan(
         notes=(
             *column_notes(columns),
             *comment_notes(sheet, columns),
+            *_tiny_errors(values),
             *left_aside(sheet, columns),
             *left_out(sheet),
         ),
@@ -240,6 +243,18 @@ def _check_sizes(
                 found = f"errors that are {ratio:g} of the sizes"
                 raise sheet.error(found, "errors in the unit of the header", None, error.header)
     _check_slipped(sheet, columns, usual)
+
+
+def _tiny_errors(values: Mapping[str, np.ndarray]) -> Iterator[str]:
+    """Ask about errors that are smaller than any measurement's, as of sizes in another unit."""
+    for plane in "xy":
+        if f"size_{plane}_error" in values:
+            ratio = middle(values[f"size_{plane}_error"] / values[f"size_{plane}"])
+            if ratio < SMALLEST:
+                yield (
+                    f"Errors in {plane} are {ratio:.1g} of the sizes: are both in the units of "
+                    "their headers?"
+                )
 
 
 def _implausible(sheet: Sheet, column: Column, written: float) -> InputError:
