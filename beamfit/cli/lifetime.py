@@ -35,7 +35,7 @@ Examples:
   beamfit lifetime shift.csv --ring ring.toml --study --prior rf_voltage=1+-1%
   beamfit lifetime shift.csv --ring ring.toml --study --network correction
   beamfit lifetime week*.csv --trend --report weeks.html
-  beamfit lifetime export.csv --time Time --current SR:DCCT:CURRENT:mA --skip-bad
+  beamfit lifetime export.csv --columns 'SR:DCCT:CURRENT=beam_current_mA' --skip-bad
 """
 
 
@@ -63,7 +63,6 @@ Examples:
     "the ring to one current and its usual settings if --ring is given; alarms where a or b moved.",
     is_flag=True,
 )
-@options("time current")
 @option(
     "--offset zero-beam|CURRENT",
     "What the current monitor reads without beam, taken off: a current such as 0.12mA, or "

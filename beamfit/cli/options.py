@@ -105,15 +105,6 @@ SHARED: dict[str, Callable[..., Any]] = {
         choices=list(SCENARIOS),
         default="known",
     ),
-    "time": option(
-        "--time COLUMN[:UNIT]", "Header of the time, a date or a number in s, min, h, d or ms."
-    ),
-    "current": option(
-        "--current COLUMN:UNIT",
-        "Header of the beam current and its unit, mA, A or uA, after the last colon, such "
-        "as SR:DCCT:CURRENT:mA. With --time or --current other columns of unknown names are left "
-        "aside.",
-    ),
     "prior": option(
         "--prior NAME=MEAN+-SD",
         "What is known of a number: calibration, Q2.slope=167.23+-3.3446 (or ±); a study of "

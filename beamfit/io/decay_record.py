@@ -47,8 +47,6 @@ def read_lifetime_input(
     path: str | PathLike[str] | DataFrame,
     *,
     columns: Columns = None,
-    time: str | None = None,
-    current: str | None = None,
     ignore: Iterable[str] = (),
     skip_bad: bool = False,
     offset: str | None = None,
@@ -57,9 +55,9 @@ def read_lifetime_input(
     sheet = _sheet(path, columns, ignore, skip_bad)
     lifetimes = any(spelled(n).lower().startswith(("tau_", "lifetime_")) for n in sheet.names)
     moments = any((c := known(sheet, name)) and c.key == "time" for name in sheet.names)
-    if time is None and lifetimes and not moments:
+    if lifetimes and not moments:
         return _lifetimes(sheet, skip_bad)
-    return _record(sheet, time, current, skip_bad, offset)
+    return _record(sheet, skip_bad, offset)
 
 
 def read_lifetimes(
@@ -111,8 +109,6 @@ def read_decay_record(
     path: str | PathLike[str] | DataFrame,
     *,
     columns: Columns = None,
-    time: str | None = None,
-    current: str | None = None,
     ignore: Iterable[str] = (),
     skip_bad: bool = False,
     offset: str | None = None,
@@ -131,11 +127,6 @@ def read_decay_record(
     columns : str, path, mapping or Layout, optional
         What columns are whose headers do not say it: ``{"PV 12": "beam_current_mA"}``, or as
         `beamfit.io.columns.layout_of` reads it. Other columns of unknown names are left aside.
-    time : str, optional
-        Header of the time, with its unit after a last colon unless it is seconds or a date.
-    current : str, optional
-        Header of the current, with its unit after the last colon: ``SR:DCCT:CURRENT:mA``. With
-        `time` or `current` given, columns of unknown names are left aside.
     ignore : iterable of str, optional
         Columns to leave unread; * and ? stand for any letters.
     skip_bad : bool, optional
@@ -162,23 +153,21 @@ def read_decay_record(
     >>> print(read_decay_record("measurements/aps_1999_decay.csv"))
     aps_1999_decay.csv: 27 readings over 8.81 h, 101.999 to 81.464 mA
     """
-    return _record(_sheet(path, columns, ignore, skip_bad), time, current, skip_bad, offset)
+    return _record(_sheet(path, columns, ignore, skip_bad), skip_bad, offset)
 
 
-def _record(
-    sheet: Sheet, time: str | None, current: str | None, skip_bad: bool, offset: str | None
-) -> DecayRecord:
-    if any(map(is_size, sheet.names)) and time is None and current is None:
+def _record(sheet: Sheet, skip_bad: bool, offset: str | None) -> DecayRecord:
+    if any(map(is_size, sheet.names)) and not sheet.arranged:
         found, expected = "a column of beam sizes", "a record of beam current; `beamfit emittance`"
         raise sheet.header_error(found, f"{expected} reads scans")
-    sheet = dated(sheet) if time is None else sheet
-    columns = record_columns(sheet, time, current)
+    sheet = dated(sheet)
+    columns = record_columns(sheet)
     for quantity, example in (("time", "time_s"), ("current", "beam_current_mA")):
         if quantity not in columns:
-            option = f"'{example}' in the header, or --{quantity} COLUMN:UNIT"
+            option = f"'{example}' in the header, or --columns 'HEADER={example}'"
             found = f"no column of {quantity} among {', '.join(sheet.names)}"
             raise sheet.header_error(found, option)
-    notes = taken_for_current(columns) if current is None else ()
+    notes = taken_for_current(columns)
     if skip_bad:
         whole, sheet = sheet, sheet.good(lambda rows: _check_alone(rows, columns, offset is None))
         notes += _below_zero(whole, columns) if offset is None else ()
@@ -311,10 +300,8 @@ def _check_base(sheet: Sheet, column: Column, moment: np.ndarray) -> None:
     if latest >= MILLISECONDS:
         found = f"{latest:.6g} s, after the year 5000"
         unit, long = next(said for most, *said in FINER if latest < most)
-        name = column.header.removesuffix("_s")
-        expected = (
-            f"the unit of the time: of {long} {name}_{unit}, or --time {column.header}:{unit}"
-        )
+        header = sheet.called.get(column.header, column.header)
+        expected = f"the unit of the time: of {long} --columns '{header}=time_{unit}'"
         raise sheet.error(found, expected, int(np.argmax(moment)), column.header)
 
 

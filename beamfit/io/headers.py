@@ -49,9 +49,6 @@ HEAD = 50
 MARKS = ("#", "%", "//", "!")
 # Of a TFS file.
 TFS = ("@", "*", "$")
-# A table in a frame, as a logbook, a database or ROOT draws one.
-FRAMED = re.compile(r"\s*([|*])(.*)\1\s*")
-RULE = re.compile(r"\s*[-+=|*:]{3,}\s*")
 
 
 def known_unit(text: str) -> str | None:
@@ -171,22 +168,6 @@ def separator_of(header: str) -> str:
 def _words(text: str) -> list[str]:
     separator = separator_of(text)
     return [word.strip(' "') for word in text.split(None if separator == " " else separator)]
-
-
-def unframed(text: str) -> str:
-    """A line of a table without its frame, tabs between the cells; nothing of a mere rule.
-
-    Examples
-    --------
-    >>> unframed("| 1 | 2.5 |"), unframed("|---|---|"), unframed("+---+---+"), unframed("1,2")
-    ('1\\t2.5', '', '', '1,2')
-    """
-    if RULE.fullmatch(text):
-        return ""
-    if (found := FRAMED.fullmatch(text)) is None:
-        return text
-    cells = [cell.strip() for cell in found[2].split(found[1])]
-    return "" if not any(cell.strip("-:= ") for cell in cells) else "\t".join(cells)
 
 
 def header_at(lines: Sequence[str]) -> int:

@@ -29,15 +29,13 @@ QUANTITIES = {
 SEEN = {"screen", "r11_x", "r11_y"}
 CARRIED = re.compile(
     r"note_.*|comments?|charge[ _]?[\[(]?[np]C[\])]?|index|n[or]\.?|point|row|seq"
-    r"|(date|(date[ _]?|elapsed[ _]?)?time([ _]?stamp)?|t|zeit|datum|uhrzeit|heure)(_(h|m?s|min))?",
+    r"|(date|(date[ _]?|elapsed[ _]?)?time([ _]?stamp)?|t)(_(h|m?s|min))?",
     re.IGNORECASE,
 )
 # Words for a width, and how many of it are one rms: a Gaussian's FWHM is sqrt(8 ln 2) rms.
 FWHM = 1.0 / math.sqrt(8.0 * math.log(2.0))
-WIDTHS = dict.fromkeys(("größe", "strahlgröße", "taille", "dimensione"), 1.0)
-WIDTHS |= {"size": 1.0, "sigma": 1.0, "sig": 1.0, "s": 1.0, "rms": 1.0, "fwhm": FWHM}
+WIDTHS = {"size": 1.0, "sigma": 1.0, "sig": 1.0, "s": 1.0, "rms": 1.0, "fwhm": FWHM}
 ERRORS = {"error", "err", "std", "sd", "d", "delta", "uncertainty", "unc"}
-ERRORS |= {"fehler", "erreur", "errore"}
 PERCENT = "%"
 PLANES = {"x": "x", "horizontal": "x", "hor": "x", "h": "x"}
 PLANES |= {"y": "y", "vertical": "y", "vert": "y", "ver": "y", "v": "y"}
@@ -48,7 +46,7 @@ SEVERAL = re.compile(r"(?:^|(?<=_))d?([2-6])_?(?=(?:sigma|sig|rms)(?:_|$))", re.
 # What control systems and people put around the name of a magnet; its unit says what it is set to.
 ATTRIBUTE = re.compile(
     r"[ _:./](bact|bdes|bctrl|bcon|iact|ides|current|gradient|k1l?|kl|gl|bdl)$"
-    r"|[ _:./](setpoint|readback|set|rbv?)$|[ _-]strom$|^(current|strom|courant|corrente)[ _]",
+    r"|[ _:./](setpoint|readback|set|rbv?)$|^current[ _]",
     re.IGNORECASE,
 )
 # An error that is a deviation of shots by its name.

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from beamfit.errors import InputError, expect, located
-from beamfit.io import labview, sdds
+from beamfit.io import sdds
 from beamfit.io.cell_units import without_units
 from beamfit.io.commas import with_points
 from beamfit.io.files import Numbered, digest, text_lines
@@ -28,7 +28,6 @@ from beamfit.io.headers import (
     separator_of,
     spelled,
     uncommented,
-    unframed,
     with_units,
 )
 from beamfit.io.json_table import json_sheet
@@ -44,7 +43,7 @@ MOST_ROWS, MOST_WORDS = 12_000_000, 4_000_000
 HDF5 = {".h5", ".hdf5"}
 BINARY = {*HDF5, ".mat"}
 # Text with a header of another program's, by how it begins.
-FOREIGN = {sdds.SIGNATURE: sdds.sdds_head, labview.SIGNATURE: labview.labview_head}
+FOREIGN = {sdds.SIGNATURE: sdds.sdds_head}
 # How Excel says which separator a file has.
 SEPARATOR_LINE = re.compile(r"\s*\"?sep=.\"?\s*$", re.IGNORECASE)
 # In the names of a file without a header: cells that are not read.
@@ -61,7 +60,7 @@ def read_sheet(
     ragged: bool | None = None,
     names: Sequence[str] | None = None,
 ) -> Sheet:
-    """Read the columns of a CSV, TFS, SDDS, LabVIEW, HDF5 or MATLAB file.
+    """Read the columns of a CSV, TFS, SDDS, HDF5 or MATLAB file.
 
     Parameters
     ----------
@@ -121,7 +120,7 @@ def _read_text(
 ) -> Sheet:
     comments, rows, lines, bad, columns, notes = [], [], [], [], None, ()
     header, separator = None, ","
-    numbered = enumerate(map(unframed, text_lines(path)), start=1)
+    numbered = enumerate(text_lines(path), start=1)
     if names is None:
         names, header, separator, numbered = _head(path, example, comments)
     else:
@@ -171,9 +170,8 @@ def _head(
     for signature, read in FOREIGN.items():
         if first.startswith(signature):
             return read(path, enumerate(whole, start=1), comments)
-    source = map(unframed, whole)
-    head = uncommented(list(itertools.islice(source, HEAD)))
-    title, numbered = header_at(head), enumerate(itertools.chain(head, source), start=1)
+    head = uncommented(list(itertools.islice(whole, HEAD)))
+    title, numbered = header_at(head), enumerate(itertools.chain(head, whole), start=1)
     for line, text in numbered:
         if text.lstrip().startswith(MARKS + TFS_LINES):
             comments.append(bare(text))
