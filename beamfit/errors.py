@@ -8,6 +8,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from difflib import get_close_matches
 from os import PathLike
+from typing import Any
 
 # What no person wrote as a word: of a damaged file, say. Its beginning tells enough.
 ENDLESS = re.compile(r"(\S{60})\S{60,}")
@@ -98,6 +99,25 @@ def short(text: str, most: int) -> str:
     """
     end = min(120, most // 2)
     return text if len(text) <= most else f"{text[: most - end - 5]} ... {text[-end:].lstrip()}"
+
+
+def expect(value: object, kind: Any, instead: str) -> None:
+    """Refuse a value of another type where one of beamfit's own is meant.
+
+    Examples
+    --------
+    >>> expect("scan.csv", dict, "read_quad_scan(path)")
+    Traceback (most recent call last):
+    beamfit.errors.InputError: a str, 'scan.csv'; expected a dict, such as read_quad_scan(path)
+    """
+    if not isinstance(value, kind):
+        said = f", '{value}'" if isinstance(value, str | PathLike) else ""
+        found, expected = (_article(getattr(k, "__name__", "path")) for k in (type(value), kind))
+        raise InputError(found + said, f"{expected}, such as {instead}")
+
+
+def _article(name: str) -> str:
+    return f"{'an' if name[0] in 'AEIOaeio' else 'a'} {name}"
 
 
 def plain(text: str) -> str:

@@ -42,7 +42,6 @@ from beamfit.io.ring import read_ring
 from beamfit.io.ring_tables import read_twiss
 from beamfit.io.run import read_run
 from beamfit.io.saved import load_fit, save_fit
-from beamfit.io.table import read_sheet
 from beamfit.language.check import check_document
 from beamfit.language.network import format_network
 from beamfit.sampling.ensemble import draw
@@ -50,7 +49,7 @@ from beamfit.sampling.store import load
 from tests.conftest import ROOT
 from tests.io.test_emittance_gui import gui_data
 from tests.io.test_mutated_files import CSV, mutated
-from tests.io.test_programs import LVM, SDDS
+from tests.io.test_programs import SDDS
 from tests.io.test_sequence import ELEGANT, MAD8, MADX
 from tests.sampling.targets import half_normal, target
 
@@ -122,7 +121,6 @@ def readers(folder: Path, with_store: bool) -> dict[str, Reader]:
         "scan .mat": Reader(".mat", [(folder / "scan.mat").read_bytes()], read_emittance_gui),
         "vectors .mat": Reader(".mat", [(folder / "vectors.mat").read_bytes()], read_quad_scan),
         "SDDS": Reader(".sdds", [SDDS.encode(), SDDS.encode("utf-16")], read_quad_scan),
-        "LabVIEW": Reader(".lvm", [LVM.encode()], lambda p: read_sheet(p, "time_s,I_mA")),
         "decay .csv": Reader(".csv", decay, beamfit.io.decay_record.read_lifetime_input),
         "decay .csv --skip-bad": Reader(
             ".csv", decay[:2], lambda p: beamfit.read_decay_record(p, skip_bad=True)

@@ -49,7 +49,7 @@ class Job:
     part : mapping
         ``use, energy, particle, first, last, screen`` of `beamfit.io.line.read_inputs`.
     reading : mapping
-        How files are read: ``ignore, skip_bad``, and ``time, current`` of records.
+        How files are read: ``columns, ignore, skip_bad``.
     weights : {"model", "measured"}
         As for `beamfit.fit_emittance`.
 
@@ -105,10 +105,9 @@ class Job:
 
     def read(self, file: str) -> Inputs:
         """A scan and its lattice."""
-        ways = {k: v for k, v in self.reading.items() if k in ("ignore", "skip_bad")}
         if self.lattice is None:
-            return read_inputs(file, **self.part, **ways)
-        return read_inputs(file, self._line().file, **ways)
+            return read_inputs(file, **self.part, **self.reading)
+        return read_inputs(file, self._line().file, **self.reading)
 
     def _line(self) -> _Lattice:
         return _lattice(self.lattice, self.lattice_sha256, tuple(self.part.items()))

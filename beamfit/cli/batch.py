@@ -48,8 +48,7 @@ NAMED = 10
     "Learn the noise of these scans, with its error, and write it for --noise.",
     name="learned",
 )
-@options("ignore skip-bad noise weights maybe-lattice use from to screen energy particle")
-@options("time current")
+@options("columns ignore skip-bad noise weights maybe-lattice use from to screen energy particle")
 @options("report json")
 def batch(
     path: tuple[str, ...],
@@ -73,12 +72,8 @@ def batch(
     and version are kept.
     """
     part = {n: told[n] for n in ("use", "energy", "particle", "first", "last", "screen")}
-    reading = {n: told[n] for n in ("ignore", "skip_bad", "time", "current")}
-    _check_kind(
-        kind,
-        {"lattice": lattice, "noise": noise, "learn-noise": learned} | part,
-        {n: told[n] for n in ("time", "current")},
-    )
+    reading = {n: told[n] for n in ("columns", "ignore", "skip_bad")}
+    _check_kind(kind, {"lattice": lattice, "noise": noise, "learn-noise": learned} | part)
     from beamfit.batch.course import courses_of, followed
     from beamfit.batch.job import Job
     from beamfit.batch.run import run_batch
@@ -103,10 +98,9 @@ def batch(
     answered(as_json, [results], inputs, lambda terminal: _show(terminal, found, out), report)
 
 
-def _check_kind(kind: str, of_scans: dict[str, Any], of_records: dict[str, Any]) -> None:
-    wrong = of_records if kind == "emittance" else of_scans
-    for name, value in wrong.items():
-        if value is not None:
+def _check_kind(kind: str, of_scans: dict[str, Any]) -> None:
+    for name, value in of_scans.items():
+        if value is not None and kind != "emittance":
             said = {"first": "from", "last": "to"}.get(name, name)
             raise InputError(f"--{said} with --kind {kind}", "none: it is of the other kind")
 

@@ -9,8 +9,9 @@ import click
 
 from beamfit.cli.options import command_line, options
 from beamfit.errors import InputError
+from beamfit.io.columns import Layout
 from beamfit.io.result import results_text
-from beamfit.io.understood import Understood, understand, with_lattice
+from beamfit.io.understood import Understood, proposed_layout, understand, with_lattice
 from beamfit.table import text_of
 
 EXAMPLE = """\b
@@ -22,22 +23,24 @@ Examples:
 
 @click.command(epilog=EXAMPLE)
 @click.argument("files", nargs=-1, required=True, metavar="FILE...")
-@options("ignore skip-bad use energy json")
+@options("columns ignore skip-bad use energy json")
 def check(files: tuple[str, ...], as_json: bool, **reading: Any) -> None:
     """Say what is understood of scans, lattices, records, rings, runs and formulations.
 
     Of each FILE the kind, the rows, the magnets and their units, the range of the sizes and where
     their errors are from, the energy, and what is odd about it; of a scan also whether each lattice
     given beside it has what it names. All files are gone through; one that cannot be used gives
-    its line, and exit status 2.
+    its line, and exit status 2; where columns are not understood, a layout for them is proposed.
     """
     found: list[Understood] = []
     wrong: list[tuple[str, InputError]] = []
+    layouts: list[str] = []
     for path in dict.fromkeys(files):
         try:
             found.append(understand(path, **reading))
         except InputError as error:
             wrong.append((path, error))
+            layouts += filter(None, [_proposed(path, reading["columns"])])
     lattices = [each for each in found if each.kind == "lattice"]
     found = [_on_all(each, lattices) if each.kind == "scan" else each for each in found]
     if as_json:
@@ -47,9 +50,19 @@ def check(files: tuple[str, ...], as_json: bool, **reading: Any) -> None:
         click.echo(results_text(said, inputs, command_line()))
     else:
         _show(found)
+        for layout in layouts:
+            click.echo(f"# Complete and save as layout.toml, for --columns layout.toml\n{layout}\n")
     for _, error in wrong:
         click.echo(f"beamfit: {error}", err=True)
     sys.exit(2 if wrong else 0)
+
+
+def _proposed(path: str, columns: Layout | None) -> str | None:
+    """A layout for what is not understood of a file; None where that is no matter of columns."""
+    try:
+        return proposed_layout(path, columns)
+    except InputError:
+        return None
 
 
 def _on_all(scan: Understood, lattices: list[Understood]) -> Understood:

@@ -60,7 +60,7 @@ LIMIT = "NAME=LOW:HIGH, one of them may be left out, such as level=:3"
 @option("--every SAMPLES", "Of the runs to a step of the controller.", type=click.IntRange(1))
 @option("--smooth", "Cost of input changes against errors.", type=float, default=0.1)
 @option("--for SECONDS", "Time simulated.", name="duration", type=float)
-@options("hidden ignore skip-bad seed report json")
+@options("hidden columns ignore skip-bad seed report json")
 def control(
     record: tuple[str, ...],
     model: str,
@@ -85,7 +85,7 @@ def control(
     """
     targets, loads = _steps(wishes, "set"), _steps(disturb, "disturb")
     limits, rates = gains_of(limit, "limit", LIMIT), _rates(rate)
-    reading = {n: told[n] for n in ("inputs", "outputs", "step", "ignore", "skip_bad")}
+    reading = {n: told[n] for n in ("columns", "inputs", "outputs", "step", "ignore", "skip_bad")}
     runs = [read_run(path, **reading) for path in record]
     inputs, outputs = list(runs[0].inputs), list(runs[0].outputs)
     _check("limit", limits, inputs + outputs)

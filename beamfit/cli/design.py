@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from beamfit.studies.scan.design import Advice
 
 # What `read_inputs` takes besides the scan.
-GIVEN = ["lattice", "use", "first", "last", "screen", "energy", "ignore", "skip_bad"]
+GIVEN = ["lattice", "use", "first", "last", "screen", "energy", "columns", "ignore", "skip_bad"]
 EXAMPLE = """\b
 Examples:
   beamfit design scan.csv --lattice line.toml --vary Q2=0:5 --goal 0.8%
@@ -29,7 +29,7 @@ Examples:
 
 @click.command(epilog=EXAMPLE)
 @options(
-    "scan ignore skip-bad lattice use from to screen energy noise scenario prior bounds gain "
+    "scan columns ignore skip-bad lattice use from to screen energy noise scenario prior bounds gain "
     "anchor vary"
 )
 @option("--energies MEV,MEV", "Further energies the beam can be had at.", default="")

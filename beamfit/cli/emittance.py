@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 # What `read_inputs` takes besides the scan.
 GIVEN = ["lattice", "use", "first", "last", "screen", "energy", "particle"]
-GIVEN += ["ignore", "skip_bad", "size_method"]
+GIVEN += ["columns", "ignore", "skip_bad", "size_method"]
 EXAMPLE = """\b
 Examples:
   beamfit emittance measurements/lcls_otr2.csv --lattice lattices/lcls_otr2.toml
@@ -43,7 +43,9 @@ Examples:
 
 
 @click.command(epilog=EXAMPLE)
-@options("scan ignore skip-bad size-method maybe-lattice use from to screen energy particle")
+@options(
+    "scan columns ignore skip-bad size-method maybe-lattice use from to screen energy particle"
+)
 @option(
     "--plane", "Which plane to fit; all that were measured by default.", choices=["x", "y", "both"]
 )

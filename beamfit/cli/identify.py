@@ -35,7 +35,7 @@ Examples:
 @click.argument("record", nargs=-1, required=True)
 @options("model order map input output step delay no-offset gain")
 @option("--hold-back RECORD", "A run that is only predicted.", multiple=True)
-@options("hidden ignore skip-bad seed report json")
+@options("hidden columns ignore skip-bad seed report json")
 def identify(
     record: tuple[str, ...],
     model: str,

@@ -36,7 +36,7 @@ Examples:
   beamfit lifetime shift.csv --ring ring.toml --study --prior rf_voltage=1+-1%
   beamfit lifetime shift.csv --ring ring.toml --study --network correction
   beamfit lifetime week*.csv --trend --report weeks.html
-  beamfit lifetime export.csv --time Time --current SR:DCCT:CURRENT:mA --skip-bad
+  beamfit lifetime export.csv --columns 'SR:DCCT:CURRENT=beam_current_mA' --skip-bad
 """
 
 
@@ -71,7 +71,6 @@ Examples:
     choices=["free", "constant"],
     default="free",
 )
-@options("time current")
 @option(
     "--offset zero-beam|CURRENT",
     "What the current monitor reads without beam, taken off: a current such as 0.12mA, or "
@@ -86,7 +85,7 @@ Examples:
     "--monitor-offset CURRENT",
     "How far it is off without beam (one standard deviation), such as 50uA.",
 )
-@options("prior ignore skip-bad sample store seed report json")
+@options("prior columns ignore skip-bad sample store seed report json")
 def lifetime(
     record: tuple[str, ...],
     ring: str | None,

@@ -11,6 +11,7 @@ import click
 
 import beamfit
 from beamfit.errors import InputError
+from beamfit.io.columns import layout_of
 from beamfit.io.result import results_text
 from beamfit.particles import REST_ENERGY
 from beamfit.report import kind_of
@@ -51,6 +52,13 @@ def _report(path: str) -> str:
 LATTICE = "Lattice: TOML, MAD-X (.madx, .seq), MAD-8 (.mad8) or elegant (.lte)."
 SHARED: dict[str, Callable[..., Any]] = {
     "scan": click.argument("scan"),
+    "columns": option(
+        "--columns HEADER=NAME,...|LAYOUT.toml",
+        "What columns are whose headers do not say it, such as 'xrms=size_x_um, "
+        "QUAD:BACT=Q525_kG'; or a layout that keeps it; or day-month-year, for dates of numbers. "
+        "Other columns of unknown names are left aside.",
+        callback=_parsed(layout_of),
+    ),
     "ignore": option(
         "--ignore COLUMN",
         "A column of the scan to leave unread; * and ? stand for any letters.",
@@ -101,15 +109,6 @@ SHARED: dict[str, Callable[..., Any]] = {
         "or k1 as a function of the current.",
         choices=list(SCENARIOS),
         default="known",
-    ),
-    "time": option(
-        "--time COLUMN[:UNIT]", "Header of the time, a date or a number in s, min, h, d or ms."
-    ),
-    "current": option(
-        "--current COLUMN:UNIT",
-        "Header of the beam current and its unit, mA, A or uA, after the last colon, such "
-        "as SR:DCCT:CURRENT:mA. With --time or --current other columns of unknown names are left "
-        "aside.",
     ),
     "prior": option(
         "--prior NAME=MEAN+-SD",

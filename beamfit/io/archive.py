@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -19,9 +20,13 @@ if TYPE_CHECKING:
 ARCHIVE = ("secs", "val", "severity", "status", "nanos")
 
 
-def archive_sheet(path: str | PathLike[str] | DataFrame, skip_bad: bool) -> Sheet:
-    """The columns of a file, an archive's by their own names."""
+def archive_sheet(
+    path: str | PathLike[str] | DataFrame, skip_bad: bool, names: Sequence[str] | None = None
+) -> Sheet:
+    """The columns of a file, an archive's by their own names, or by those of a file without."""
     example = "time_s,beam_current_mA"
+    if names is not None:
+        return read_sheet(path, example, ragged=skip_bad, names=names)
     if not isinstance(path, (str, PathLike)):
         return read_sheet(path, example)
     if Path(path).suffix.lower() == ".json":

@@ -9,6 +9,8 @@ from datetime import UTC, datetime, timedelta, timezone
 from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
 
 DAY = 86400.0
+# Orders of dates in which day and month are numbers.
+DAY_FIRST, MONTH_FIRST = "day-month-year", "month-day-year"
 # Besides ISO 8601; days before months where both are numbers.
 DAYS = (
     "%Y-%m-%d",
@@ -29,11 +31,13 @@ NOON = re.compile(r"(.*\d) ?([AP])\.?M\.?", re.IGNORECASE)
 # Zones by the letters that clocks show and no list of zones has; those that mean two are left out.
 LETTERS = {"CEST": 2, "EEST": 3, "EDT": -4, "PDT": -7, "PST": -8, "JST": 9, "KST": 9}
 CLOCK = re.compile(r"(\d{1,2}):(\d{2})(?::(\d{2}(?:[.,]\d*)?))?")
+# What may be hours and minutes of a night, or minutes and seconds from a start.
+HOUR_OR_MINUTE = re.compile(r"0?0:\d{2}")
 FRACTION = re.compile(r"[.,](\d+)$")
 ZONE = re.compile(r"^(.*\d) ?([A-Z][A-Za-z_]+(?:/[A-Za-z_]+)*)$")
 
 
-def unix_time(text: str, *, fold: int = 0) -> float:
+def unix_time(text: str, *, fold: int = 0, order: str = "") -> float:
     """Seconds since 1970 of a date: UTC unless an offset or the name of a zone stands behind it.
 
     Parameters
@@ -43,6 +47,8 @@ def unix_time(text: str, *, fold: int = 0) -> float:
         12:00:00, 03/13/2024 12:00:00 PM, Fri Mar 1 12:00:00 2024.
     fold : int, optional
         1 for the second of two moments that a zone calls by one time in autumn.
+    order : {"", "day-month-year", "month-day-year"}
+        Of a date of numbers that may be read both ways.
 
     Raises
     ------
@@ -66,11 +72,11 @@ def unix_time(text: str, *, fold: int = 0) -> float:
             zone = ZoneInfo(match[2])
         except (ZoneInfoNotFoundError, ValueError, OSError):
             raise ValueError(f"zone {match[2]}") from None
-    moment = _moment(NUMBERS.sub(_day_first, whole, count=1)) + later
+    moment = _moment(NUMBERS.sub(lambda found: _in_order(found, order), whole, count=1)) + later
     return (moment if moment.tzinfo else moment.replace(tzinfo=zone, fold=fold)).timestamp()
 
 
-def dates_in_order() -> Callable[[str], float]:
+def dates_in_order(order: str = "") -> Callable[[str], float]:
     """Make a `unix_time` for dates in order, which tell the second of two equal hours in autumn.
 
     Examples
@@ -91,11 +97,14 @@ def dates_in_order() -> Callable[[str], float]:
     def read(text: str) -> float:
         nonlocal latest
         if (clock := CLOCK.fullmatch(str(text).strip())) is not None:
+            if latest == -math.inf and HOUR_OR_MINUTE.fullmatch(clock[0]):
+                raise ValueError("hours and minutes, or minutes and seconds")
             moment = _time_of_day(*clock.groups(default="0"))
             moment += DAY * (max(latest - moment, 0.0) // DAY)
             moment += DAY if moment < latest - DAY / 2 else 0.0
-        elif (moment := unix_time(text)) <= latest < (second := unix_time(text, fold=1)):
-            moment = second
+        elif (moment := unix_time(text, order=order)) <= latest:
+            second = unix_time(text, fold=1, order=order)
+            moment = second if latest < second else moment
         latest = max(latest, moment)
         return moment
 
@@ -109,11 +118,12 @@ def _time_of_day(hours: str, minutes: str, seconds: str) -> float:
     return 3600.0 * found[0] + 60.0 * found[1] + found[2]
 
 
-def _day_first(found: re.Match[str]) -> str:
+def _in_order(found: re.Match[str], order: str) -> str:
     """A date of numbers as ISO 8601 has it; ValueError where day and month could be exchanged."""
     first, _, second, year = found.groups()
-    day, month = (first, second) if int(first) > 12 else (second, first)
-    if int(day) <= 12:
+    day_first = order == DAY_FIRST if order else int(first) > 12
+    day, month = (first, second) if day_first else (second, first)
+    if int(day) <= 12 and not order:
         raise ValueError(f"{found[0]} may be two days")
     return f"{year}-{int(month):02d}-{int(day):02d}"
 

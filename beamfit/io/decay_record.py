@@ -11,12 +11,13 @@ import numpy as np
 
 from beamfit.errors import InputError
 from beamfit.io.archive import archive_sheet
+from beamfit.io.columns import Columns, arranged, layout_of
 from beamfit.io.files import name_of
 from beamfit.io.headers import spelled
 from beamfit.io.monitor import FEWEST, offset_of
 from beamfit.io.record_columns import dated, known, record_columns, taken_for_current
 from beamfit.io.scan_columns import is_size
-from beamfit.io.sheet import DATE, Column, Sheet, columns_of, left_out
+from beamfit.io.sheet import DATE, Column, Sheet, columns_of, left_aside, left_out
 from beamfit.studies.decay.conditions import Conditions, Fault, first_fault
 from beamfit.studies.decay.monitor import Monitor
 from beamfit.studies.decay.record import DecayRecord, LifetimeTable
@@ -33,11 +34,9 @@ LIFETIMES = {
     "beam_current": "current",
 }
 INCREASE = "times that increase; --skip-bad leaves out rows whose time does not"
-# Columns left aside that a note names.
-MOST_ASIDE = 8
 # Seconds beyond this many are counted from 1970, not from the start of a record (1973 or later);
-# beyond the other they lie after the year 5000, and are milliseconds.
-UNIX, LATEST = 1e8, 1e11
+# beyond the others after 2050, of another origin, or after the year 5000, and are milliseconds.
+UNIX, LATEST, MILLISECONDS = 1e8, 2.5e9, 1e11
 # Times of day without a date lie on the first day.
 DAY = 86400.0
 FINER = ((1e14, "ms", "milliseconds"), (1e17, "us", "microseconds"))
@@ -47,23 +46,26 @@ FINER += ((np.inf, "ns", "nanoseconds"),)
 def read_lifetime_input(
     path: str | PathLike[str] | DataFrame,
     *,
-    time: str | None = None,
-    current: str | None = None,
+    columns: Columns = None,
     ignore: Iterable[str] = (),
     skip_bad: bool = False,
     offset: str | None = None,
 ) -> DecayRecord | LifetimeTable:
     """Read what `beamfit lifetime` takes, by its header: as one of the other two readers."""
-    sheet = archive_sheet(path, skip_bad).without(ignore)
+    sheet = _sheet(path, columns, ignore, skip_bad)
     lifetimes = any(spelled(n).lower().startswith(("tau_", "lifetime_")) for n in sheet.names)
     moments = any((c := known(sheet, name)) and c.key == "time" for name in sheet.names)
-    if time is None and lifetimes and not moments:
+    if lifetimes and not moments:
         return _lifetimes(sheet, skip_bad)
-    return _record(sheet, time, current, skip_bad, offset)
+    return _record(sheet, skip_bad, offset)
 
 
 def read_lifetimes(
-    path: str | PathLike[str] | DataFrame, *, ignore: Iterable[str] = (), skip_bad: bool = False
+    path: str | PathLike[str] | DataFrame,
+    *,
+    columns: Columns = None,
+    ignore: Iterable[str] = (),
+    skip_bad: bool = False,
 ) -> LifetimeTable:
     """Read lifetimes measured at several currents.
 
@@ -72,7 +74,7 @@ def read_lifetimes(
     path : str, path or pandas.DataFrame
         A frame, CSV or HDF5 with `tau_h` (or `lifetime_h`; also _min, _s) and `beam_current_mA`;
         optionally `tau_error_h`.
-    ignore, skip_bad
+    columns, ignore, skip_bad
         As for `read_decay_record`.
 
     Returns
@@ -92,14 +94,21 @@ def read_lifetimes(
     >>> print(read_lifetimes(file))
     lifetimes.csv: 4 lifetimes at 100 to 400 mA
     """
-    return _lifetimes(archive_sheet(path, skip_bad).without(ignore), skip_bad)
+    return _lifetimes(_sheet(path, columns, ignore, skip_bad), skip_bad)
+
+
+def _sheet(
+    path: str | PathLike[str] | DataFrame, columns: Columns, ignore: Iterable[str], skip_bad: bool
+) -> Sheet:
+    layout = layout_of(columns)
+    sheet = archive_sheet(path, skip_bad, layout.header or None)
+    return arranged(sheet.without(ignore), layout)
 
 
 def read_decay_record(
     path: str | PathLike[str] | DataFrame,
     *,
-    time: str | None = None,
-    current: str | None = None,
+    columns: Columns = None,
     ignore: Iterable[str] = (),
     skip_bad: bool = False,
     offset: str | None = None,
@@ -115,11 +124,9 @@ def read_decay_record(
         `beam_current_mA` (or `_A`, `_uA`); optionally `beam_current_error_mA`, `rf_voltage_kV`,
         `scraper_y_mm`, `pressure_Pa` (_mbar, _Torr), `bunches`, `bunch_length_mm` (_ps).
         Lines that begin with `#` and HDF5 attributes are kept as comments.
-    time : str, optional
-        Header of the time, with its unit after a last colon unless it is seconds or a date.
-    current : str, optional
-        Header of the current, with its unit after the last colon: ``SR:DCCT:CURRENT:mA``. With
-        `time` or `current` given, columns of unknown names are left aside.
+    columns : str, path, mapping or Layout, optional
+        What columns are whose headers do not say it: ``{"PV 12": "beam_current_mA"}``, or as
+        `beamfit.io.columns.layout_of` reads it. Other columns of unknown names are left aside.
     ignore : iterable of str, optional
         Columns to leave unread; * and ? stand for any letters.
     skip_bad : bool, optional
@@ -146,23 +153,21 @@ def read_decay_record(
     >>> print(read_decay_record("measurements/aps_1999_decay.csv"))
     aps_1999_decay.csv: 27 readings over 8.81 h, 101.999 to 81.464 mA
     """
-    return _record(archive_sheet(path, skip_bad).without(ignore), time, current, skip_bad, offset)
+    return _record(_sheet(path, columns, ignore, skip_bad), skip_bad, offset)
 
 
-def _record(
-    sheet: Sheet, time: str | None, current: str | None, skip_bad: bool, offset: str | None
-) -> DecayRecord:
-    if any(map(is_size, sheet.names)) and time is None and current is None:
+def _record(sheet: Sheet, skip_bad: bool, offset: str | None) -> DecayRecord:
+    if any(map(is_size, sheet.names)) and not sheet.arranged:
         found, expected = "a column of beam sizes", "a record of beam current; `beamfit emittance`"
         raise sheet.header_error(found, f"{expected} reads scans")
-    sheet = dated(sheet) if time is None else sheet
-    columns = record_columns(sheet, time, current)
+    sheet = dated(sheet)
+    columns = record_columns(sheet)
     for quantity, example in (("time", "time_s"), ("current", "beam_current_mA")):
         if quantity not in columns:
-            option = f"'{example}' in the header, or --{quantity} COLUMN:UNIT"
+            option = f"'{example}' in the header, or --columns 'HEADER={example}'"
             found = f"no column of {quantity} among {', '.join(sheet.names)}"
             raise sheet.header_error(found, option)
-    notes = taken_for_current(columns) if current is None else ()
+    notes = taken_for_current(columns)
     if skip_bad:
         whole, sheet = sheet, sheet.good(lambda rows: _check_alone(rows, columns, offset is None))
         notes += _below_zero(whole, columns) if offset is None else ()
@@ -201,10 +206,10 @@ def _record(
 
 def _left_aside(sheet: Sheet, columns: Mapping[str, Column]) -> tuple[str, ...]:
     """Name the columns of unknown names that were not read, as a note."""
-    used = {column.header for column in columns.values()}
-    aside = [name for name in sheet.names if name not in used and not known(sheet, name)]
-    more = [f"{len(aside) - MOST_ASIDE} more"] if len(aside) > MOST_ASIDE else []
-    return (f"Left aside: {', '.join(aside[:MOST_ASIDE] + more)}.",) if aside else ()
+    if sheet.arranged:
+        return left_aside(sheet, columns)
+    unknown = [name for name in sheet.names if not known(sheet, name)]
+    return left_aside(replace(sheet.only(unknown), arranged=True), columns) if unknown else ()
 
 
 def _values(sheet: Sheet, column: Column) -> np.ndarray:
@@ -284,13 +289,19 @@ def _forward(
 
 
 def _check_base(sheet: Sheet, column: Column, moment: np.ndarray) -> None:
-    if (latest := np.max(moment)) > LATEST:
+    latest = np.max(moment)
+    if LATEST < latest < MILLISECONDS:
+        found = f"{latest:.6g} s since 1970, after the year 2050"
+        expected = (
+            "a date, or time from the start of the record: LabVIEW counts seconds from 1904, "
+        )
+        expected += "Excel days from 1899, MATLAB days from the year 0"
+        raise sheet.error(found, expected, int(np.argmax(moment)), column.header)
+    if latest >= MILLISECONDS:
         found = f"{latest:.6g} s, after the year 5000"
         unit, long = next(said for most, *said in FINER if latest < most)
-        name = column.header.removesuffix("_s")
-        expected = (
-            f"the unit of the time: of {long} {name}_{unit}, or --time {column.header}:{unit}"
-        )
+        header = sheet.called.get(column.header, column.header)
+        expected = f"the unit of the time: of {long} --columns '{header}=time_{unit}'"
         raise sheet.error(found, expected, int(np.argmax(moment)), column.header)
 
 

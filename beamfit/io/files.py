@@ -28,6 +28,7 @@ SIGNATURES = {
     b"\xd0\xcf\x11\xe0": ("a spreadsheet", "a text file; save it as CSV (UTF-8)"),
     b"MATLAB 5.0 MAT-file": MATLAB,
     b"MATLAB 7.3 MAT-file": MATLAB,
+    b"LabVIEW Measurement": ("a LabVIEW file", "a text table: export it as CSV"),
     b"\x1f\x8b": ("a compressed file", "a text file; unpack it first"),
 }
 # How text of two bytes a letter begins, such as Excel's "Unicode text".

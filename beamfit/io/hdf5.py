@@ -88,12 +88,28 @@ def hdf5_columns(
         raise InputError(found, expected, path=path, column=column)
     columns: dict[str, Any] = {}
     start = 0
-    for name, count, words in told["columns"]:
+    for name, count, words, unit in told["columns"]:
         if words is None:
             words = np.frombuffer(numbers, float, count, start)
             start += words.nbytes
-        columns[plain(name)] = words
+        columns[_with_unit(plain(name), unit, path)] = words
     return columns, tuple(told["comments"])
+
+
+def _with_unit(name: str, unit: str, path: str | PathLike[str]) -> str:
+    """A dataset's name with the unit of its attribute, which may not say another."""
+    from beamfit.errors import InputError
+    from beamfit.io.headers import known_unit, named, plain_unit, spelled, unit_at_end
+
+    if unit.strip() in ("", "1", "none", "dimensionless"):
+        return name
+    own, known = unit_at_end(spelled(name)), known_unit(unit)
+    if own is None:
+        return named(name, known or unit)
+    if known is None or plain_unit(known) != plain_unit(own):
+        expected = f"one unit, {own} or the attribute's"
+        raise InputError(f"the attribute units = '{unit}'", expected, path, column=name)
+    return name
 
 
 def _told(content: bytes, rows: int, texts: int) -> tuple[dict[str, Any], list[np.ndarray]]:
@@ -104,13 +120,14 @@ def _told(content: bytes, rows: int, texts: int) -> tuple[dict[str, Any], list[n
         with h5py.File(io.BytesIO(content), "r") as store:
             place = _place(store)
             columns = {name: _column(place, name, rows, texts) for name in _names(place)}
+            units = {name: _unit(place[name], name) for name in columns}
             said = [f"{key}: {value}"[:LONGEST_COMMENT] for key, value in store.attrs.items()]
     except _Refused as error:
         return {"refused": error.args}, []
     except Exception:  # whatever the library makes of changed bits
         return {"refused": (*DAMAGED, None)}, []
     words = {n: c if isinstance(c, list) else None for n, c in columns.items()}
-    header = [(name, len(column), words[name]) for name, column in columns.items()]
+    header = [(name, len(column), words[name], units[name]) for name, column in columns.items()]
     numbers = [column for column in columns.values() if not isinstance(column, list)]
     return {"columns": header, "comments": said}, numbers
 
@@ -164,6 +181,16 @@ def _column(store: Any, name: str, rows: int, texts: int) -> list[str] | np.ndar
         return [str(value) for value in np.ravel(data.asstr("utf-8")[()])]
     except UnicodeDecodeError:
         raise _Refused("bytes that are not text", "UTF-8 text", name) from None
+
+
+def _unit(data: Any, name: str) -> str:
+    """The unit that the attributes of a dataset say; numbers that wait for a factor are refused."""
+    said = {str(key).lower(): value for key, value in data.attrs.items()}
+    for key, usual in (("scale_factor", 1.0), ("add_offset", 0.0)):
+        if key in said and not np.all(np.asarray(said[key]) == usual):
+            raise _Refused(f"the attribute {key} = {said[key]}", "numbers that contain it", name)
+    unit = next((said[key] for key in ("units", "unit", "egu") if key in said), "")
+    return str(unit.decode("utf-8", "replace") if isinstance(unit, bytes) else unit)[:40]
 
 
 def answer(content: bytes, rows: int, texts: int, stream: BinaryIO) -> None:

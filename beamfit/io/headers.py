@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from functools import lru_cache
 
 from beamfit.errors import InputError
+from beamfit.studies.scan.scans import SETTINGS
 
 UNITS: dict[str, dict[str, float]] = {
     # quantity: unit at the end of a name -> factor to SI (a stored current: to mA)
@@ -19,8 +20,6 @@ UNITS: dict[str, dict[str, float]] = {
     "energy in MeV": {"MeV": 1.0},
 }
 UNITS["length or share"] = UNITS["length"] | {"%": 0.01}
-# Of magnets, whose gradients have factors of their own.
-SETTINGS = ("A", "kG", "T_per_m", "k1", "k1l")
 # Units at the end of a header, as the columns' names have them.
 KNOWN = {*SETTINGS, "µs", *(unit for units in UNITS.values() for unit in units)}
 ENDS = tuple(f"_{unit}" for unit in KNOWN)
@@ -50,9 +49,6 @@ HEAD = 50
 MARKS = ("#", "%", "//", "!")
 # Of a TFS file.
 TFS = ("@", "*", "$")
-# A table in a frame, as a logbook, a database or ROOT draws one.
-FRAMED = re.compile(r"\s*([|*])(.*)\1\s*")
-RULE = re.compile(r"\s*[-+=|*:]{3,}\s*")
 
 
 def known_unit(text: str) -> str | None:
@@ -174,22 +170,6 @@ def _words(text: str) -> list[str]:
     return [word.strip(' "') for word in text.split(None if separator == " " else separator)]
 
 
-def unframed(text: str) -> str:
-    """A line of a table without its frame, tabs between the cells; nothing of a mere rule.
-
-    Examples
-    --------
-    >>> unframed("| 1 | 2.5 |"), unframed("|---|---|"), unframed("+---+---+"), unframed("1,2")
-    ('1\\t2.5', '', '', '1,2')
-    """
-    if RULE.fullmatch(text):
-        return ""
-    if (found := FRAMED.fullmatch(text)) is None:
-        return text
-    cells = [cell.strip() for cell in found[2].split(found[1])]
-    return "" if not any(cell.strip("-:= ") for cell in cells) else "\t".join(cells)
-
-
 def header_at(lines: Sequence[str]) -> int:
     """Which of some lines is the header: the first with two units, if only words stand above it.
 
@@ -284,6 +264,8 @@ def number(cell: object) -> float:
     >>> [number(cell) for cell in ("5.125D-04", "−5", "5,125.0", "5'125")]
     [0.0005125, -5.0, 5125.0, 5125.0]
     """
+    if isinstance(cell, str) and "_" in cell:  # which Python takes for nothing between digits
+        raise ValueError("an underscore")
     try:
         return float(cell)
     except ValueError:

@@ -8,7 +8,8 @@ from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from beamfit.errors import InputError, nearest
+from beamfit.errors import InputError, expect, nearest
+from beamfit.io.columns import Columns
 from beamfit.io.emittance_gui import EmittanceGuiFile, is_emittance_gui, read_emittance_gui
 from beamfit.io.lattice import LatticeFile, element_of, read_toml_lattice
 from beamfit.io.measurement import read_quad_scan
@@ -159,6 +160,7 @@ def read_lattice(
 
 
 def _whole(path: str | PathLike[str], use: str | None, energy: float | None) -> LatticeFile:
+    expect(path, str | PathLike, "'line.toml'")
     if Path(path).suffix.lower() in FOREIGN:
         from beamfit.io.sequence import read_sequence
 
@@ -297,6 +299,7 @@ def read_inputs(
     scan: str,
     lattice: str | LatticeFile | None = None,
     *,
+    columns: Columns = None,
     ignore: Iterable[str] = (),
     skip_bad: bool = False,
     size_method: str | None = None,
@@ -310,7 +313,7 @@ def read_inputs(
         CSV, HDF5, or a file of emittance_gui (``.mat``).
     lattice : str or LatticeFile, optional
         As for `lattice_of`. A file of emittance_gui has its own matrices, which it replaces.
-    ignore, skip_bad
+    columns, ignore, skip_bad
         As for `beamfit.read_quad_scan`.
     size_method : str, optional
         Which sizes of a file of emittance_gui; RMS if None.
@@ -330,11 +333,11 @@ def read_inputs(
         if size_method is not None:
             expected = "none: only a .mat file of emittance_gui has several"
             raise InputError(f"--size-method {size_method}", expected, path=scan)
-        measured = read_quad_scan(scan, ignore=ignore, skip_bad=skip_bad)
+        measured = read_quad_scan(scan, columns=columns, ignore=ignore, skip_bad=skip_bad)
         return Inputs(measured, lattice_of(measured, lattice, **part))
-    if skip_bad or tuple(ignore):
-        expected = "none: failed settings are left out as the file marks them"
-        raise InputError("--ignore or --skip-bad for a MATLAB file", expected, path=scan)
+    if skip_bad or tuple(ignore) or columns is not None:
+        expected = "none: the file says its columns, and marks failed settings"
+        raise InputError("--columns, --ignore or --skip-bad for a MATLAB file", expected, path=scan)
     gui = read_emittance_gui(scan)
     measured = gui.scan(size_method)
     if lattice is None:

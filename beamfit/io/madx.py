@@ -25,7 +25,7 @@ PART = re.compile(r"\"[^\"]*\"|'[^'\n]*'|[;{}]")
 # Heads of statements that end with their block, and not with a semicolon.
 BLOCK = re.compile(r"(if|elseif|else|while)\b|[\w.$]+\s*(\([^)]*\))?\s*:\s*macro\b", re.I)
 ASSIGNMENT = re.compile(
-    rf"(?:(const|real|int|shared)\s+)?({NAME})\s*(:?=)\s*(.+)", re.I | re.DOTALL
+    rf"(?:((?:real|int)\s+const|const|real|int)\s+)?({NAME})\s*(:?=)\s*(.+)", re.I | re.DOTALL
 )
 ARROW = re.compile(rf"({NAME})->({NAME})\s*:?=\s*(.+)", re.I | re.DOTALL)
 LABEL = re.compile(rf"[\"']?({NAME})[\"']?\s*(\([^)]*\))?\s*:\s*({NAME})\s*(.*)", re.I | re.DOTALL)
@@ -37,6 +37,13 @@ HARMLESS = words(
     "eprint esave fill getorbit help ibs observe plot print printf putorbit readmytable "
     "readtable run save savebeta select set setplot show sodd start survey sxfwrite system "
     "tabstring title touschek track twiss usekick usemonitor value write "
+)
+# Parameters that change no matrix of a line without bends in thin elements.
+NO_MATTER = words(
+    "at from type apertype aperture aper_offset aper_tol aper_vx aper_vy slot_id assembly_id "
+    "mech_sep v_pos magnet model method nst exact kmax kmin calib polarity lrad comments kick "
+    "hkick vkick k2 k2s k3 k3s h1 h2 thick fringe bend_fringe freq lag harmon n_bessel shunt "
+    "tfill betrf pg sinkick sinpeak sintune sinphase file_td ramp1 ramp2 ramp3 ramp4 e1 e2"
 )
 # Definitions of what is no element.
 HARMLESS_CLASSES = ("beta0", "macro")
@@ -165,9 +172,13 @@ class Interpreter:
         self._open: Definition | None = None
         self._taken: bool | None = None  # whether a branch of the last IF was, if one may follow
         self._calls, self._ended = 0, False
+        self._main: str | PathLike[str] | None = None
 
-    def run(self, text: str, path: str | PathLike[str], line: int = 1) -> None:
-        """Carry out the statements of a text."""
+    def run(
+        self, text: str, path: str | PathLike[str], line: int = 1, *, block: bool = False
+    ) -> None:
+        """Carry out the statements of a file, or of a block of one."""
+        self._main = path if self._main is None else self._main
         for statement in statements(text, path, line):
             if self._ended:
                 return
@@ -176,9 +187,10 @@ class Interpreter:
             if statement.block is not None:
                 self._block(statement, word, taken)
             elif word == "return":
-                if self._calls == 0:
+                if block:
                     raise statement.error()
-                return
+                if path != self._main:  # there MAD-X passes over it
+                    return
             else:
                 self._one(statement)
 
@@ -251,7 +263,7 @@ class Interpreter:
             if not holds and not taken:
                 holds = self._holds(statement, statement.text[len(word) :].strip())
             if holds and not taken:
-                self.run(statement.block, statement.path, statement.line)
+                self.run(statement.block, statement.path, statement.line, block=True)
             self._taken = None if word == "else" else bool(taken or holds)
         elif word == "while":
             raise statement.error()
@@ -353,7 +365,7 @@ class Interpreter:
             raise statement.error(
                 f"'{name}', which nothing defines before it", nearest(name, known)
             )
-        if further := [key for key in given if key not in ("at", "from")]:
+        if further := [key for key in given if key not in NO_MATTER]:
             found = f"'{further[0]}' where an element is placed, which MAD-X passes over"
             raise statement.error(found, "AT and FROM; give it where the element is defined")
         self._open.placed.append((name, given))

@@ -12,7 +12,7 @@ from typing import NamedTuple
 from beamfit.errors import InputError, nearest
 from beamfit.io.files import digest, read_text
 from beamfit.io.lattice import LatticeFile
-from beamfit.io.madx import Definition, Interpreter, Parameter, word_of
+from beamfit.io.madx import NO_MATTER, Definition, Interpreter, Parameter, word_of
 from beamfit.io.madx_values import NAME, words
 from beamfit.io.sequence_elements import NOTHING_AT_ZERO, Element, element_tables
 from beamfit.particles import REST_ENERGY, expected_energy
@@ -27,13 +27,6 @@ SCREENS = words("monitor hmonitor vmonitor imonitor blmonitor slmonitor instrume
 SPACES = words(
     "drift kicker hkicker vkicker tkicker sextupole octupole collimator ecollimator rcollimator "
     "solenoid rfcavity elseparator placeholder"
-)
-# Parameters that change no matrix of a line without bends in thin elements.
-NO_MATTER = words(
-    "at from type apertype aperture aper_offset aper_tol aper_vx aper_vy slot_id assembly_id "
-    "mech_sep v_pos magnet model method nst exact kmax kmin calib polarity lrad comments kick "
-    "hkick vkick k2 k2s k3 k3s h1 h2 thick fringe bend_fringe freq lag harmon n_bessel shunt "
-    "tfill betrf pg sinkick sinpeak sintune sinphase file_td ramp1 ramp2 ramp3 ramp4 e1 e2"
 )
 MEANT = words(
     "l k0 k1 angle tilt knl ksl k1s k0s ktap hgap fint fintx ks ksi volt ex ey ex_l ey_l "

@@ -50,6 +50,7 @@ CONSTANTS = {
     "erad": 2.8179403262e-15,
     "prad": 1.5346982671888944e-18,
     "amu0": 1.2566370614359173e-06,
+    "version": 50902.0,
 }
 FUNCTIONS: dict[str, Callable[[float], float]] = {
     name: getattr(math, name)
@@ -107,14 +108,14 @@ class Values:
             return  # as MAD-X does
         self._check(text)
         value: float | str | ValueError = text
-        if not later:
+        if not later or "const" in kind:
             try:
                 value = self.of(text)
             except ValueError as error:
                 value = error
-        if kind == "int" and isinstance(value, float):
+        if "int" in kind and isinstance(value, float):
             value = float(math.trunc(value))
-        if kind == "const":
+        if "const" in kind:
             self._fixed.add(name)
         self._said[name] = value
         self.changed()

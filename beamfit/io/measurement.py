@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
 from os import PathLike
 from pathlib import Path
@@ -11,12 +11,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from beamfit.errors import InputError, located
+from beamfit.io.columns import Columns, arranged, layout_of
 from beamfit.io.emittance_gui import is_emittance_gui, read_emittance_gui
 from beamfit.io.files import name_of
 from beamfit.io.headers import SETTINGS
-from beamfit.io.scan_columns import ENERGIES, PERCENT, column_notes, scan_columns
+from beamfit.io.scan_columns import ENERGIES, PERCENT, column_notes, is_scatter, scan_columns
 from beamfit.io.scan_comments import comment_notes
-from beamfit.io.sheet import UNITS, Column, Sheet, left_out
+from beamfit.io.sheet import UNITS, Column, Sheet, left_aside, left_out
 from beamfit.io.shots import average_shots
 from beamfit.io.table import read_sheet
 from beamfit.studies.scan.scans import POSSIBLE, USUAL, QuadScan, first_unusable, middle
@@ -28,6 +29,8 @@ if TYPE_CHECKING:
 MOST_ROWS = 100_000
 # A size this many times the usual one of its column, and larger than most beams, has slipped.
 SLIPPED = 100.0
+# Relative: nobody has measured a beam's size better, while mm and µm are 1e-3 apart.
+SMALLEST = 1e-4
 # Of the matrix of a plane, where rows have their own.
 ELEMENTS = (11, 12, 16)
 # Further quantities: from (open), to, and how to say it.
@@ -42,7 +45,11 @@ RANGES = {
 
 
 def read_quad_scan(
-    path: str | PathLike[str] | DataFrame, *, ignore: Iterable[str] = (), skip_bad: bool = False
+    path: str | PathLike[str] | DataFrame,
+    *,
+    columns: Columns = None,
+    ignore: Iterable[str] = (),
+    skip_bad: bool = False,
 ) -> QuadScan:
     """Read a quadrupole scan.
 
@@ -53,6 +60,9 @@ def read_quad_scan(
         (``.h5``, ``.hdf5``) with one dataset a column under the same names; or a file of
         emittance_gui (``.mat``), of which these are the RMS sizes (see
         `beamfit.io.emittance_gui.read_emittance_gui`).
+    columns : str, path, mapping or Layout, optional
+        What columns are whose headers do not say it: ``{"xrms": "size_x_um"}``, or as
+        `beamfit.io.columns.layout_of` reads it. Other columns of unknown names are left aside.
     ignore : iterable of str
         Columns to leave unread; * and ? stand for any letters.
     skip_bad : bool
@@ -80,8 +90,14 @@ def read_quad_scan(
     ("1 of 4 rows was left out: line 5, column 'size_x_um', 'lost'.",)
     """
     if isinstance(path, str | PathLike) and is_emittance_gui(path):
+        if columns is not None:
+            raise InputError("--columns for a file of emittance_gui", "none: it says them", path)
         return read_emittance_gui(path).scan()
-    sheet = read_sheet(path, "Q2_A,size_x_um", MOST_ROWS, ragged=skip_bad).without(ignore)
+    layout = layout_of(columns)
+    sheet = read_sheet(
+        path, "Q2_A,size_x_um", MOST_ROWS, ragged=skip_bad, names=layout.header or None
+    )
+    sheet = arranged(sheet.without(ignore), layout)
     columns = scan_columns(sheet)
     if skip_bad:
         sheet = sheet.good(lambda rows: _values(rows, columns))
@@ -106,7 +122,7 @@ def _scan(
     magnets = {k.removeprefix("setting "): c for k, c in columns.items() if c.unit in SETTINGS}
     energies = [(values[key], kind) for key, kind in ENERGIES.items() if key in values]
     energy, kind = energies[0] if energies else (None, "total")
-    headers = {key: c.header for key, c in columns.items()}
+    headers = {key: sheet.called.get(c.header, c.header) for key, c in columns.items()}
     planes = [p for p in "xy" if f"size_{p}" in values]
     own = {
         p: np.stack([values.get(f"r{i}_{p}", np.zeros(len(sheet))) for i in ELEMENTS], axis=-1)
@@ -131,8 +147,14 @@ def _scan(
         path=sheet.path,
         sha256=sheet.sha256,
         provenance=sheet.comments,
-        notes=(*column_notes(columns), *comment_notes(sheet, columns), *left_out(sheet)),
-        columns={name: c.header for name, c in magnets.items()}
+        notes=(
+            *column_notes(columns),
+            *comment_notes(sheet, columns),
+            *_tiny_errors(values),
+            *left_aside(sheet, columns),
+            *left_out(sheet),
+        ),
+        columns={name: headers[c.key] for name, c in magnets.items()}
         | headers
         | {header: header for header in headers.values()},
     )
@@ -154,6 +176,9 @@ def _values(sheet: Sheet, columns: Mapping[str, Column]) -> dict[str, np.ndarray
             sheet.refuse(columns[error].header, missing, expected, "an empty cell")
             _check_absent(sheet, columns[size], values[size], values[error])
     values |= {key: _within(sheet, columns[key]) for key in RANGES if key in columns}
+    for plane in "xy":
+        if is_scatter(columns, plane):
+            values[f"size_{plane}_error"] /= np.sqrt(values["shots"])
     _screens(sheet, columns.get("screen"))
     elements = [f"r{i}_{p}" for i in ELEMENTS for p in "xy"]
     plain = [c for key, c in columns.items() if c.unit in SETTINGS or key in elements]
@@ -218,6 +243,18 @@ def _check_sizes(
                 found = f"errors that are {ratio:g} of the sizes"
                 raise sheet.error(found, "errors in the unit of the header", None, error.header)
     _check_slipped(sheet, columns, usual)
+
+
+def _tiny_errors(values: Mapping[str, np.ndarray]) -> Iterator[str]:
+    """Ask about errors that are smaller than any measurement's, as of sizes in another unit."""
+    for plane in "xy":
+        if f"size_{plane}_error" in values:
+            ratio = middle(values[f"size_{plane}_error"] / values[f"size_{plane}"])
+            if ratio < SMALLEST:
+                yield (
+                    f"Errors in {plane} are {ratio:.1g} of the sizes: are both in the units of "
+                    "their headers?"
+                )
 
 
 def _implausible(sheet: Sheet, column: Column, written: float) -> InputError:

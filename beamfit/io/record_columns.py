@@ -7,7 +7,8 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 from beamfit.errors import InputError
-from beamfit.io.headers import is_number, spelled
+from beamfit.io.dates import DAY_FIRST, dates_in_order
+from beamfit.io.headers import is_number, spelled, unit_at_end
 from beamfit.io.sheet import DATE, UNITS, Column, Sheet, columns_of
 from beamfit.studies.decay.conditions import Conditions
 
@@ -25,14 +26,13 @@ QUANTITIES = {
 CALLED = {"beam_current": "current", "beam_current_error": "error"}
 USED = {"time", "nanos", "current", "error", *Conditions._fields}
 # What a column of dates is called, and those of a day and of the time of that day.
-MOMENTS = {"time", "timestamp", "time_stamp", "datetime", "date_time", "data_time", "date", "zeit"}
-DAYS, CLOCKS = {"date", "day", "datum", "data"}, {"time", "zeit", "uhrzeit", "heure", "ora"}
+MOMENTS = {"time", "timestamp", "time_stamp", "datetime", "date_time", "data_time", "date"}
+DAYS, CLOCKS = {"date", "day"}, {"time"}
 # Behind its name: the zone that is meant where none stands.
 UTC = re.compile(r"[ _]?[\[(]?(utc|gmt)[\])]?$")
 CLOCK = re.compile(r"\d{1,2}:\d{2}(:\d{2}([.,]\d*)?)?( ?[AaPp][Mm])?")
 # What a time with a unit is called besides time.
-CLOCKED = {"t", "timestamp", "time_stamp", "epoch", "elapsed", "elapsed_time", "unix_time", "zeit"}
-CLOCKED |= {"tempo", "temps"}
+CLOCKED = {"t", "timestamp", "time_stamp", "epoch", "elapsed", "elapsed_time", "unix_time"}
 # An archive's own columns: seconds since 1970 and nanoseconds, and what it says of each value.
 SECONDS = {"secs": "s", "seconds": "s", "epochseconds": "s", "epoch": "s"}
 NANOS = {"nanos", "nanoseconds"}
@@ -40,22 +40,21 @@ ASIDE = {"severity", "status", "val", "value", "index", "no", "no.", "nr", "row"
 # Words in a name with a unit of current that make it the beam's; in A, as magnets have, fewer do
 # beside other words.
 MONITORS = {"ibeam", "dcct", "pct", "bct", "stored"}
-CURRENTS = MONITORS | {"current", "i", "strom", "strahlstrom", "courant", "corrente"}
-RINGS = {"sr", "ring", "ler", "her", "total", "average", "mean"}
+CURRENTS = MONITORS | {"current", "i"}
+RINGS = {"sr", "ring", "ler", "her", "total", "average", "mean", "beam", "storage"}
 OTHERS = {"error", "err", "std", "sd", "sigma", "rms", "set", "setpoint", "target", "nominal"}
+OTHERS |= {"bunch", "injected", "log"}
 # A lifetime beside the current, as archives have it, is not read.
 LIFETIME = re.compile(r"(.*[\W_])?(life_?time|tau)([\W_].*)?", re.IGNORECASE)
 
 
-def record_columns(sheet: Sheet, time: str | None, current: str | None) -> dict[str, Column]:
-    """Every column of a record by what it is; those that were named come first.
+def record_columns(sheet: Sheet) -> dict[str, Column]:
+    """Every column of a record by what it is.
 
     Parameters
     ----------
     sheet : Sheet
         The file.
-    time, current : str or None
-        Headers with their units after a last colon, as of `read_decay_record`.
 
     Returns
     -------
@@ -70,28 +69,23 @@ def record_columns(sheet: Sheet, time: str | None, current: str | None) -> dict[
     Examples
     --------
     >>> sheet = Sheet("a.csv", ("Time", "DCCT [mA]"), [["12:00"], ["1"]], [2], 1, ())
-    >>> {key: column.unit for key, column in record_columns(sheet, None, None).items()}
+    >>> {key: column.unit for key, column in record_columns(sheet).items()}
     {'time': 'a date', 'current': 'mA'}
     """
-    said = {"time": time, "current": current}
-    named = {key: _named(sheet, key, text) for key, text in said.items() if text is not None}
-    left = [name for name in sheet.names if name not in {c.header for c in named.values()}]
-    if named:
-        left = [name for name in left if known(sheet, name)]
     try:
-        found = columns_of(sheet.only(left), QUANTITIES, _other(sheet))
+        found = columns_of(sheet, QUANTITIES, _other(sheet))
     except InputError as error:
-        raise replace(error, expected=f"{error.expected}; {_options(sheet)}") from None
+        more = f"; --columns '{error.column}=NAME' says what it is, --ignore leaves it unread"
+        raise replace(error, expected=error.expected + more) from None
     called = {CALLED.get(key, key): column for key, column in found.items()}
-    return {
-        key: column for key, column in called.items() if key in USED and key not in named
-    } | named
+    return {key: column for key, column in called.items() if key in USED}
 
 
 def known(sheet: Sheet, name: str) -> Column | None:
     """What a header means by itself; None if nothing."""
     try:
-        return next(iter(columns_of(sheet.only([name]), QUANTITIES, _other(sheet)).values()))
+        found = columns_of(sheet.only([name]), QUANTITIES, _other(sheet))
+        return next(iter(found.values()), None)
     except InputError:
         return None
 
@@ -106,6 +100,22 @@ def is_current(header: str) -> bool:
     """
     said = spelled(header)
     return said.lower().startswith("beam_current") or _current(said) is not None
+
+
+def likely_name(header: str, cell: object) -> str | None:
+    """The name that a header may mean, by a word in it or by a first cell that is a date.
+
+    Examples
+    --------
+    >>> likely_name("When", "2024-03-01 12:00:00"), likely_name("Current", "200.1")
+    ('time', 'beam_current_mA')
+    """
+    try:
+        dates_in_order(DAY_FIRST)(str(cell))
+    except ValueError:
+        words = set(re.findall(r"[a-z]+", header.lower()))
+        return "beam_current_mA" if words & (CURRENTS | {"beam"}) and not words & OTHERS else None
+    return "time"
 
 
 def dated(sheet: Sheet) -> Sheet:
@@ -132,16 +142,6 @@ def taken_for_current(columns: Mapping[str, Column]) -> tuple[str, ...]:
     header = columns["current"].header
     plain = spelled(header).lower().startswith(("beam_current", "val"))
     return () if plain else (f"Column '{header}' is taken for the beam current.",)
-
-
-def _options(sheet: Sheet) -> str:
-    """How unknown columns are left aside, or the known ones named."""
-    found = [column for name in sheet.names if (column := known(sheet, name)) is not None]
-    current = [column for column in found if column.key == "beam_current"]
-    if len(current) == 1 and any(column.key == "time" for column in found):
-        said = f"{current[0].header}:{current[0].unit}"
-        return f"or --current '{said}', which leaves unknown columns aside"
-    return "or name them with --time COLUMN and --current COLUMN:UNIT"
 
 
 def _other(sheet: Sheet):
@@ -175,25 +175,9 @@ def _current(header: str) -> Column | None:
     """A beam current by a word in its name and its unit."""
     name, _, unit = header.rpartition("_")
     words = set(re.findall(r"[a-z]+", name.lower()))
-    wanted = MONITORS if unit == "A" and words - CURRENTS - RINGS else CURRENTS
-    if unit not in UNITS["current"] or not (words & wanted or words == {"beam"}) or words & OTHERS:
+    # A monitor's name says it; a mere current may be a pump's, a bunch's or a magnet's.
+    wanted = MONITORS if words - CURRENTS - RINGS else CURRENTS | {"beam"}
+    other = words & OTHERS or unit_at_end(name) in UNITS["current"]
+    if unit not in UNITS["current"] or not words & wanted or other:
         return None
     return Column(header, "beam_current", unit, UNITS["current"][unit])
-
-
-def _named(sheet: Sheet, key: str, text: str) -> Column:
-    """The column that --time or --current names, with its unit after the last colon."""
-    header, _, unit = text.rpartition(":")
-    if text in sheet.names and key == "time":
-        found = known(sheet, text)
-        if found is not None and found.key == "time" and found.unit != DATE:
-            return found
-        return Column(text, "time", "s" if is_number(next(iter(sheet[text]), "0")) else DATE)
-    if text in sheet.names:
-        header, (_, _, unit) = text, spelled(text).rpartition("_")
-    if header in sheet.names and unit in UNITS[key]:
-        return Column(header, key, unit, UNITS[key][unit])
-    if header in sheet.names and key == "current":
-        expected = f"its unit after the last colon, such as {header}:mA"
-        raise sheet.header_error(f"--current {text} without a unit", expected)
-    raise sheet.no_column(header if unit in UNITS[key] else text)

@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from beamfit.errors import InputError
+from beamfit.io.columns import Columns, arranged, layout_of
 from beamfit.io.files import name_of
-from beamfit.io.sheet import DATE, Column, Sheet, columns_of, left_out
+from beamfit.io.sheet import DATE, Column, Sheet, columns_of, left_aside, left_out
 from beamfit.io.table import read_sheet
 from beamfit.studies.response.record import Run
 
@@ -25,6 +26,7 @@ EXAMPLE = "time_s,u_valve,y_level"
 def read_run(
     path: str | PathLike[str] | DataFrame,
     *,
+    columns: Columns = None,
     inputs: Iterable[str] = (),
     outputs: Iterable[str] = (),
     step: float | None = None,
@@ -38,6 +40,9 @@ def read_run(
     path : str, path or pandas.DataFrame
         A frame, CSV or HDF5 with ``time_s`` (_min, _h, _ms; or ``time`` with dates), inputs ``u_…``
         and outputs ``y_…``. A blank output was not read.
+    columns : str, path, mapping or Layout, optional
+        What columns are: ``{"valve position": "u_valve"}``, or as `beamfit.io.columns.layout_of`
+        reads it. Other columns of unknown names are left aside.
     inputs, outputs : iterable of str
         Columns of other names that are inputs or outputs; what is not named is then left aside.
     step : float, optional
@@ -66,7 +71,9 @@ def read_run(
     >>> print(read_run(file))
     run.csv: 10 rows over 9 s, inputs valve, outputs level
     """
-    sheet = read_sheet(path, EXAMPLE, MOST_ROWS, ragged=skip_bad).without(ignore)
+    layout = layout_of(columns)
+    sheet = read_sheet(path, EXAMPLE, MOST_ROWS, ragged=skip_bad, names=layout.header or None)
+    sheet = arranged(sheet.without(ignore), layout)
     named = {"u": tuple(inputs), "y": tuple(outputs)}
     columns = _columns(sheet, named)
     if TIME not in columns and step is None:
@@ -88,8 +95,12 @@ def read_run(
         row = int(late[0]) + 1
         found = f"time {time[row]:.10g} s after {time[row - 1]:.10g} s"
         raise sheet.error(found, "times that increase", row, columns[TIME].header)
-    name = name_of(sheet.path)
-    said = {"provenance": sheet.comments, "notes": left_out(sheet), "sha256": sheet.sha256}
+    name, aside = name_of(sheet.path), left_aside(sheet, columns)
+    said = {
+        "provenance": sheet.comments,
+        "notes": (*aside, *left_out(sheet)),
+        "sha256": sheet.sha256,
+    }
     return Run(time, u, y, name=name, path=str(sheet.path), **said)
 
 

@@ -29,15 +29,13 @@ QUANTITIES = {
 SEEN = {"screen", "r11_x", "r11_y"}
 CARRIED = re.compile(
     r"note_.*|comments?|charge[ _]?[\[(]?[np]C[\])]?|index|n[or]\.?|point|row|seq"
-    r"|(date|(date[ _]?|elapsed[ _]?)?time([ _]?stamp)?|t|zeit|datum|uhrzeit|heure)(_(h|m?s|min))?",
+    r"|(date|(date[ _]?|elapsed[ _]?)?time([ _]?stamp)?|t)(_(h|m?s|min))?",
     re.IGNORECASE,
 )
 # Words for a width, and how many of it are one rms: a Gaussian's FWHM is sqrt(8 ln 2) rms.
 FWHM = 1.0 / math.sqrt(8.0 * math.log(2.0))
-WIDTHS = dict.fromkeys(("größe", "strahlgröße", "taille", "dimensione"), 1.0)
-WIDTHS |= {"size": 1.0, "sigma": 1.0, "sig": 1.0, "s": 1.0, "rms": 1.0, "fwhm": FWHM}
+WIDTHS = {"size": 1.0, "sigma": 1.0, "sig": 1.0, "s": 1.0, "rms": 1.0, "fwhm": FWHM}
 ERRORS = {"error", "err", "std", "sd", "d", "delta", "uncertainty", "unc"}
-ERRORS |= {"fehler", "erreur", "errore"}
 PERCENT = "%"
 PLANES = {"x": "x", "horizontal": "x", "hor": "x", "h": "x"}
 PLANES |= {"y": "y", "vertical": "y", "vert": "y", "ver": "y", "v": "y"}
@@ -48,13 +46,21 @@ SEVERAL = re.compile(r"(?:^|(?<=_))d?([2-6])_?(?=(?:sigma|sig|rms)(?:_|$))", re.
 # What control systems and people put around the name of a magnet; its unit says what it is set to.
 ATTRIBUTE = re.compile(
     r"[ _:./](bact|bdes|bctrl|bcon|iact|ides|current|gradient|k1l?|kl|gl|bdl)$"
-    r"|[ _:./](setpoint|readback|set|rbv?)$|[ _-]strom$|^(current|strom|courant|corrente)[ _]",
+    r"|[ _:./](setpoint|readback|set|rbv?)$|^current[ _]",
     re.IGNORECASE,
 )
+# An error that is a deviation of shots by its name.
+DEVIATION = re.compile(r"(?:^|[_\W])(std|sd|stdev)(?:[_\W]|$)", re.IGNORECASE)
 SHOTS = {"n_shots": "shots", "nshots": "shots"}
 # Elements of the matrix from where the beam is asked for to the row's screen, m and 1.
 ELEMENT = re.compile(r"r(1[126])(?:_([xy]))?(?:_m)?|r(3[346])(?:_m)?", re.IGNORECASE)
 OF_Y = {"33": "11", "34": "12", "36": "16"}
+# What a coupled beam has besides two sizes.
+COUPLED = re.compile(
+    r"(?:(?:cov|corr?|sigma|sig|size|rms|rho|s)[ _]?)?[<(\[]?(?:xy|x_y)[>)\]]?"
+    r"(?:_(?:err|error|std))?(?:[ _\[(].*)?|(?:tilt|theta|beam_tilt|tilt_angle)(?:[ _\[(].*)?",
+    re.IGNORECASE,
+)
 # A plane and a width written as one word, as in xrms and sigmax.
 ONE_WORD = re.compile(
     r"(x|y|hor|ver)(size|sigma|sig|rms|fwhm)|(size|sigma|sig|s|rms|fwhm)(x|y|hor|ver)"
@@ -116,7 +122,7 @@ def _understood(sheet: Sheet) -> dict[str, Column]:
     try:
         return columns_of(sheet, QUANTITIES, lambda header: _other(header, sheet))
     except InputError as error:
-        unknown = [name for name in sheet.names if not _is_known(name, sheet)]
+        unknown = [name for name in sheet.names if not is_known(name, sheet)]
         if error.column not in unknown:
             one = sheet.names.count(error.column) == 1  # more would all be left unread
             more = f"; --ignore '{error.column}' leaves this one unread" if one else ""
@@ -130,11 +136,13 @@ def _understood(sheet: Sheet) -> dict[str, Column]:
             )
             raise sheet.header_error("rows of two planes", expected, error.column) from None
         ignored = " ".join(f"--ignore '{name}'" for name in unknown)
-        expected = "a magnet with its unit, a size such as size_x_um, or to leave them unread: "
+        expected = "a magnet with its unit, a size such as size_x_um, --columns (`beamfit check` "
+        expected += "proposes a layout), or to leave them unread: "
         raise replace(error, expected=expected + ignored) from None
 
 
-def _is_known(name: str, sheet: Sheet) -> bool:
+def is_known(name: str, sheet: Sheet) -> bool:
+    """Whether a header means something in a scan."""
     alone = replace(sheet, names=(name,), cells=[sheet[name]])
     try:
         return bool(columns_of(alone, QUANTITIES, lambda header: _other(header, sheet)))
@@ -176,6 +184,9 @@ def _other(header: str, sheet: Sheet) -> Column:
     if (named := ELEMENT.fullmatch(header)) is not None:
         of_x, plane, of_y = named.groups()
         return Column(header, f"r{OF_Y[of_y]}_y" if of_y else f"r{of_x}_{plane or 'x'}")
+    if COUPLED.fullmatch(header) is not None:
+        found = "the correlation of x and y, or a tilt: coupled beams are not fitted"
+        raise sheet.header_error(found, f"two planes; --ignore '{header}' fits them alone", header)
     unit = next((u for u in SETTINGS if header.endswith(f"_{u}")), "")
     name = header.removesuffix(f"_{unit}") if unit else ""
     while (bare := ATTRIBUTE.sub("", name)) != name:
@@ -189,9 +200,23 @@ def _other(header: str, sheet: Sheet) -> Column:
         _not_understood(header),
         "a magnet with _A, _kG, _T_per_m or _k1 at the end, "
         + nearest(header, usual)
-        + "; --ignore a column, or begin its name with note_, to leave it unread",
+        + f"; --columns '{header}=NAME' says what it is, --ignore leaves it unread",
         header,
     )
+
+
+def likely_name(header: str) -> str | None:
+    """The name that a header without a unit may mean, in a usual unit.
+
+    Examples
+    --------
+    >>> [likely_name(header) for header in ("xrms", "QUAD:525:BACT", "foo")]
+    ['size_x_um', 'QUAD_525_kG', None]
+    """
+    if (size := _size(f"{header}_um")) is not None:
+        return f"{size.key}_um"
+    bare = ATTRIBUTE.sub("", header)
+    return f"{re.sub(r'[^A-Za-z0-9.]+', '_', bare)}_kG" if bare != header else None
 
 
 def _not_understood(header: str) -> str:
@@ -250,6 +275,19 @@ def rms_of(column: Column) -> float:
     return column.factor / UNITS["length"][column.unit]
 
 
+def is_scatter(columns: Mapping[str, Column], plane: str) -> bool:
+    """Whether an error is the deviation of the shots, and not yet that of their mean.
+
+    Examples
+    --------
+    >>> of = {"shots": Column("n", "shots"), "size_x_error": Column("x_rms_std_um", "", "um")}
+    >>> is_scatter(of, "x"), is_scatter(of, "y")
+    (True, False)
+    """
+    error = columns.get(f"size_{plane}_error")
+    return "shots" in columns and error is not None and bool(DEVIATION.search(error.header))
+
+
 def column_notes(columns: Mapping[str, Column]) -> list[str]:
     """Say which sizes were made of others, in sentences."""
     made: dict[float, list[str]] = {}
@@ -262,4 +300,9 @@ def column_notes(columns: Mapping[str, Column]) -> list[str]:
         else f"Sizes are a share of 1/{share:g} of {' and '.join(headers)}."
         for share, headers in made.items()
         if share != 1.0
+    ] + [
+        f"'{columns[f'size_{p}_error'].header}' beside '{columns['shots'].header}' is taken for "
+        "the deviation of the shots: the errors are it over the root of their number."
+        for p in "xy"
+        if is_scatter(columns, p)
     ]

@@ -13,7 +13,7 @@ from beamfit.io.scan_columns import FWHM, rms_of
 from beamfit.io.sheet import UNITS, Column, Sheet
 
 # What may be a width other than the rms, or no length; what a comment may be asked about.
-FULL = r"fwhm|full[ -]widths?|halbwertsbreiten?|largeurs? à mi-hauteur"
+FULL = r"fwhm|full[ -]widths?"
 WIDER = re.compile(rf"{FULL}|\b[2-6][ -]?(sigma|σ|rms)|\b1/e|pixel|\bpx\b", re.IGNORECASE)
 # "all sizes are given in mm", "FWHM beam widths": a statement of what every size is.
 BEFORE = r"(?:^|[.;,:])(?:\s|\b(?:all|beam|both|rms|spot|the|transverse)\b)*\b(?:sizes?|widths?)\b"

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from fnmatch import fnmatchcase
 from os import PathLike
 from typing import Any, NamedTuple
@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from beamfit.errors import InputError, nearest
-from beamfit.io.dates import NUMBERS, dates_in_order
+from beamfit.io.dates import HOUR_OR_MINUTE, NUMBERS, dates_in_order
 from beamfit.io.headers import UNITS, is_number, number, spelled, unit_behind
 
 # The unit of a column of dates.
@@ -24,8 +24,8 @@ DATE = "a date"
 # What programs write where there is no number.
 BLANK = {"", "nan", "-nan", "na", "n/a", "n.a.", "#n/a", "<na>", "null", "none", "-", "--", "---"}
 BLANK |= {"nan(ind)", "-nan(ind)", "1.#qnan", "-1.#ind", "1.#ind", "#num!", "#value!"}
-# Rows left out that a note names one by one.
-MOST_NAMED = 5
+# Rows left out, and columns left aside, that a note names one by one.
+MOST_NAMED, MOST_ASIDE = 5, 8
 
 
 class Column(NamedTuple):
@@ -61,6 +61,12 @@ class Sheet:
         What is wrong with rows that were left out on request.
     notes : tuple of str
         What was done to the cells.
+    called : mapping of str to str
+        Name to the header of the file, where a layout says what a column is.
+    order : str
+        Of dates whose day and month are numbers, where a layout says it.
+    arranged : bool
+        Whether there is a layout: columns that nobody knows are then left aside.
     """
 
     path: str | PathLike[str]
@@ -72,6 +78,9 @@ class Sheet:
     sha256: str = ""
     bad: tuple[InputError, ...] = ()
     notes: tuple[str, ...] = ()
+    called: Mapping[str, str] = field(default_factory=dict)
+    order: str = ""
+    arranged: bool = False
 
     def __len__(self) -> int:
         return len(self.cells[0])
@@ -86,10 +95,14 @@ class Sheet:
         if row is not None and self.lines is None:
             return self.error(f"reading {row + 1}: {found}", expected, None, column)
         line = None if row is None else self.lines[row]
+        column = self.called.get(column, column)
         return InputError(found, expected, path=self.path, line=line, column=column)
 
     def header_error(self, found: str, expected: str, column: str | None = None) -> InputError:
         """Make the error that names the header, and the column if it is one alone."""
+        if column in self.called:
+            expected = f"{expected}; --columns says that it is {column}"
+            column = self.called[column]
         return InputError(found, expected, path=self.path, line=self.header, column=column)
 
     def refuse(
@@ -240,12 +253,16 @@ class Sheet:
         if column.unit == DATE:
             expected = "an ISO 8601 time, such as 2024-03-01T12:00:00+01:00"
             first = str(next(iter(self[column.header]), ""))
+            if HOUR_OR_MINUTE.fullmatch(first):
+                expected = "00:00:00: are these hours and minutes, or minutes and seconds?"
             if NUMBERS.match(first):
-                expected = "a date whose day and month cannot be exchanged, such as 2024-03-01"
+                expected = "a date whose day and month cannot be exchanged, such as 2024-03-01, "
+                expected += "or --columns day-month-year (or month-day-year)"
             elif is_number(first):
                 units = ", ".join(f"{column.header}_{unit}" for unit in ("s", "ms", "d"))
                 expected = f"a date, or the unit of the number in the header: {units}"
-            return self.numbers(column.header, read=dates_in_order(), expected=expected)
+            read = dates_in_order(self.order)
+            return self.numbers(column.header, read=read, expected=expected)
         return self.numbers(column.header, blank=blank) * column.factor
 
 
@@ -283,18 +300,24 @@ def columns_of(
     0.001
     """
     found: dict[str, Column] = {}
-    for header in sheet.names:
+    for header in sorted(sheet.names, key=lambda name: name not in sheet.called):
+        aside = sheet.arranged and header not in sheet.called
         said = spelled(header)
         try:
             column = _known(said, quantities, sheet) or other(said)
         except InputError as error:
-            raise replace(error, column=header) from None
+            if aside:
+                continue
+            raise replace(error, column=sheet.called.get(header, header)) from None
         column = column and column._replace(header=header)
+        if aside and (column is None or column.key in found):
+            continue
         if column is None:
             usual = [f"{q}_{next(iter(UNITS[k]))}" if k else q for q, k in quantities.items()]
             raise sheet.header_error("an unknown column", nearest(header, usual), header)
         if column.key in found:
-            twice = f"{column.key} also in column '{found[column.key].header}'"
+            first = found[column.key].header
+            twice = f"{column.key} also in column '{sheet.called.get(first, first)}'"
             expected = "one column for it, in one unit, and none twice"
             if header == found[column.key].header:
                 twice = f"{column.key} twice or more under one name"
@@ -318,6 +341,14 @@ def _known(header: str, quantities: Mapping[str, str], sheet: Sheet) -> Column |
         expected = f"one of {listed} at the end, such as {name}_{next(iter(units))}"
         raise sheet.header_error(f"unknown unit '{unit}'", expected, header)
     return Column(header, name, unit, units[unit])
+
+
+def left_aside(sheet: Sheet, columns: Mapping[str, Column]) -> tuple[str, ...]:
+    """Name the columns that a layout and beamfit do not know, and that were not read, as a note."""
+    used = {column.header for column in columns.values()}
+    aside = [name for name in sheet.names if name not in used] if sheet.arranged else []
+    more = [f"{len(aside) - MOST_ASIDE} more"] if len(aside) > MOST_ASIDE else []
+    return (f"Left aside: {', '.join(aside[:MOST_ASIDE] + more)}.",) if aside else ()
 
 
 def left_out(sheet: Sheet) -> tuple[str, ...]:

@@ -11,8 +11,8 @@ from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from beamfit.errors import InputError, located
-from beamfit.io import labview, sdds
+from beamfit.errors import InputError, expect, located
+from beamfit.io import sdds
 from beamfit.io.cell_units import without_units
 from beamfit.io.commas import with_points
 from beamfit.io.files import Numbered, digest, text_lines
@@ -28,7 +28,6 @@ from beamfit.io.headers import (
     separator_of,
     spelled,
     uncommented,
-    unframed,
     with_units,
 )
 from beamfit.io.json_table import json_sheet
@@ -44,9 +43,11 @@ MOST_ROWS, MOST_WORDS = 12_000_000, 4_000_000
 HDF5 = {".h5", ".hdf5"}
 BINARY = {*HDF5, ".mat"}
 # Text with a header of another program's, by how it begins.
-FOREIGN = {sdds.SIGNATURE: sdds.sdds_head, labview.SIGNATURE: labview.labview_head}
+FOREIGN = {sdds.SIGNATURE: sdds.sdds_head}
 # How Excel says which separator a file has.
 SEPARATOR_LINE = re.compile(r"\s*\"?sep=.\"?\s*$", re.IGNORECASE)
+# In the names of a file without a header: cells that are not read.
+REST = "*"
 TFS_LINES = ("@", "$")
 WORD = re.compile(r'"[^"]*"|\S+')
 
@@ -59,7 +60,7 @@ def read_sheet(
     ragged: bool | None = None,
     names: Sequence[str] | None = None,
 ) -> Sheet:
-    """Read the columns of a CSV, TFS, SDDS, LabVIEW, HDF5 or MATLAB file.
+    """Read the columns of a CSV, TFS, SDDS, HDF5 or MATLAB file.
 
     Parameters
     ----------
@@ -75,7 +76,7 @@ def read_sheet(
         Whether rows that have not as many cells as the header are left out, and named in ``bad``;
         None where nobody can ask for it.
     names : sequence of str, optional
-        The header of a file that has none and is separated by commas.
+        The header of a file that has none; "*" at its end stands for further cells, unread.
 
     Returns
     -------
@@ -100,6 +101,7 @@ def read_sheet(
     """
     if hasattr(path, "itertuples"):
         return _of_frame(path, most)
+    expect(path, str | PathLike, "'scan.csv', or a pandas frame")
     if (suffix := Path(path).suffix.lower()) in BINARY:
         return _binary(path, suffix, most)
     if suffix == ".json":
@@ -118,15 +120,20 @@ def _read_text(
 ) -> Sheet:
     comments, rows, lines, bad, columns, notes = [], [], [], [], None, ()
     header, separator = None, ","
-    numbered = enumerate(map(unframed, text_lines(path)), start=1)
+    numbered = enumerate(text_lines(path), start=1)
     if names is None:
         names, header, separator, numbered = _head(path, example, comments)
+    else:
+        head = list(itertools.islice(numbered, 1))
+        separator = separator_of(next((text for _, text in head), ","))
+        numbered = itertools.chain(head, numbered)
+    names, rest = [name for name in names if name != REST], REST in names
     title = list(names)
     for line, text in numbered:
         if text.lstrip().startswith(MARKS + TFS_LINES * (separator == " ")):
             comments.append(bare(text))
         elif text.strip().strip(",;\t "):
-            cells, wrong = _row(text, separator, path, line, len(names))
+            cells, wrong = _row(text, separator, path, line, len(names), rest)
             units = None if rows or wrong else _units_below(names, cells, path, line)
             names = units or names
             if units or (rows and _is_again(cells, title, path, line)):
@@ -163,9 +170,8 @@ def _head(
     for signature, read in FOREIGN.items():
         if first.startswith(signature):
             return read(path, enumerate(whole, start=1), comments)
-    source = map(unframed, whole)
-    head = uncommented(list(itertools.islice(source, HEAD)))
-    title, numbered = header_at(head), enumerate(itertools.chain(head, source), start=1)
+    head = uncommented(list(itertools.islice(whole, HEAD)))
+    title, numbered = header_at(head), enumerate(itertools.chain(head, whole), start=1)
     for line, text in numbered:
         if text.lstrip().startswith(MARKS + TFS_LINES):
             comments.append(bare(text))
@@ -223,11 +229,17 @@ def _cells(path: str | PathLike[str], text: str, line: int = 1) -> list[str]:
 
 
 def _row(
-    text: str, separator: str, path: str | PathLike[str], line: int, count: int
+    text: str,
+    separator: str,
+    path: str | PathLike[str],
+    line: int,
+    count: int,
+    rest: bool = False,
 ) -> tuple[list[str], InputError | None]:
-    """The cells of a row, and what is wrong with it if they are not so many."""
+    """The cells of a row, and what is wrong with it if they are not so many; or the first ones."""
     try:
         cells = _without_blanks(_split(text, separator, path, line), count)
+        cells = cells[:count] if rest else cells
     except InputError as error:
         return [], error
     if len(cells) == count:

@@ -16,6 +16,8 @@ from beamfit.io.files import digest, read_text
 # Parts of a key between dots.
 DEEPEST = 20
 DEEP = re.compile(rf"(?:[\w\"'-]+[ \t]*\.[ \t]*){{{DEEPEST}}}")
+# A whole number that no other program reads, and whose decimal digits Python does not write.
+LONG = re.compile(r"\b0[xob][0-9A-Fa-f_]{250,}")
 REQUIRED: Any = object()
 TEXT, LIST, FLAG, TABLE, NUMBER = str, list, bool, dict, (int, float)
 NUMBERS = (int, float, list)
@@ -246,6 +248,9 @@ def read_toml(path: str | PathLike[str], what: str) -> Section:
         if deep := DEEP.search(text):  # which takes tomllib minutes
             line = text.count("\n", 0, deep.start()) + 1
             raise ValueError(f"a key of more than {DEEPEST} parts (at line {line})")
+        if long := LONG.search(text):
+            line = text.count("\n", 0, long.start()) + 1
+            raise ValueError(f"an integer of {len(long[0]) - 2} digits (at line {line})")
         return Section(path, lines, tomllib.loads(text), sha256=digest(path))
     except (ValueError, RecursionError) as error:  # integers too long, nesting too deep
         if re.search(r"^[^#=\n]*\bsize_[xy]_", text, re.MULTILINE):

@@ -12,16 +12,19 @@ from typing import Any
 from beamfit.errors import InputError
 from beamfit.io import facts
 from beamfit.io.archive import archive_sheet
+from beamfit.io.columns import Columns, Layout, arranged, layout_of, proposal
 from beamfit.io.decay_record import read_lifetime_input
 from beamfit.io.emittance_gui import is_emittance_gui, read_emittance_gui
 from beamfit.io.facts import Fact
 from beamfit.io.files import digest
 from beamfit.io.line import FOREIGN, build_line, read_lattice
 from beamfit.io.measurement import read_quad_scan
-from beamfit.io.record_columns import is_current
+from beamfit.io.record_columns import is_current, known
+from beamfit.io.record_columns import likely_name as record_name
 from beamfit.io.ring import read_ring
 from beamfit.io.run import read_run
-from beamfit.io.scan_columns import is_size
+from beamfit.io.scan_columns import is_known, is_size
+from beamfit.io.scan_columns import likely_name as scan_name
 from beamfit.io.table import BINARY, header_of
 from beamfit.io.toml import read_toml
 from beamfit.studies.scan.scans import QuadScan
@@ -69,6 +72,7 @@ class Understood:
 def understand(
     path: str | PathLike[str],
     *,
+    columns: Columns = None,
     ignore: Sequence[str] = (),
     skip_bad: bool = False,
     use: str | None = None,
@@ -80,8 +84,8 @@ def understand(
     ----------
     path : str or path
         A scan, a lattice, a record of beam current, a ring, a run of a process, or a formulation.
-    ignore, skip_bad
-        Of a scan, as for `read_quad_scan`.
+    columns, ignore, skip_bad
+        Of a scan, a record or a run, as for `read_quad_scan`.
     use, energy
         Of a MAD-X or elegant file, as for `load_lattice`.
 
@@ -101,11 +105,12 @@ def understand(
     >>> found.kind, found.facts[0].words
     ('record', '27 over 8.81 h')
     """
-    kind, notes = _kind(path), ()
-    columns = {"ignore": ignore, "skip_bad": skip_bad}
+    layout = layout_of(columns)
+    kind, notes = _kind(path, layout), ()
+    reading = {"columns": layout or None, "ignore": ignore, "skip_bad": skip_bad}
     if kind == "scan":
         gui = read_emittance_gui(path) if is_emittance_gui(path) else None
-        content = read_quad_scan(path, **columns) if gui is None else gui.scan()
+        content = read_quad_scan(path, **reading) if gui is None else gui.scan()
         told, notes = facts.of_scan(content), (*content.notes, *_questions(content))
         if gui is not None:
             told.append(Fact("size methods", ", ".join(gui.scans), list(gui.scans)))
@@ -114,10 +119,10 @@ def understand(
         content = read_lattice(path, use=use, energy=energy) if foreign else read_lattice(path)
         told = facts.of_lattice(content)
     elif kind == "record":
-        content = read_lifetime_input(path, **columns)
+        content = read_lifetime_input(path, **reading)
         told, notes = facts.of_record(content), content.notes
     elif kind == "run":
-        content = read_run(path, **columns)
+        content = read_run(path, **reading)
         told, notes = facts.of_run(content), content.notes
     elif kind == "formulation":
         from beamfit.io.formulation import read_formulation  # scipy
@@ -128,6 +133,21 @@ def understand(
         content = read_ring(path)
         told = facts.of_ring(path, content)
     return Understood(str(path), kind, digest(path), tuple(told), notes, content)
+
+
+def proposed_layout(path: str | PathLike[str], columns: Columns = None) -> str | None:
+    """Write a layout for the columns of a table that nobody knows; None where there are none."""
+    layout = layout_of(columns)
+    if _kind(path, layout) not in ("scan", "record") or is_emittance_gui(path):
+        return None
+    sheet = arranged(archive_sheet(path, True, layout.header or None), layout)
+    unknown = {
+        name: (scan_name(name) or record_name(name, cell), cell)
+        for name, cells in zip(sheet.names, sheet.cells, strict=True)
+        if not (is_known(name, sheet) or known(sheet, name))
+        for cell in [next(iter(cells), "")]
+    }
+    return proposal(unknown) if unknown else None
 
 
 def with_lattice(scan: Understood, lattice: Understood) -> Understood:
@@ -149,7 +169,7 @@ def with_lattice(scan: Understood, lattice: Understood) -> Understood:
     return replace(scan, facts=(*scan.facts, fact), notes=notes)
 
 
-def _kind(path: str | PathLike[str]) -> str:
+def _kind(path: str | PathLike[str], layout: Layout) -> str:
     """What a file is, by its name and its head."""
     suffix = Path(path).suffix.lower()
     if suffix in FOREIGN:
@@ -162,7 +182,9 @@ def _kind(path: str | PathLike[str]) -> str:
     if is_emittance_gui(path):
         return "scan"
     tabled = suffix in {*BINARY, ".json"}
-    names = archive_sheet(path, False).names if tabled else header_of(path)
+    names = archive_sheet(path, False).names if tabled else layout.header or header_of(path)
+    called = layout.called(names, path)
+    names = [called.get(name, name) for name in names]
     head = ",".join(names)
     if re.search(r"\bbeta_x_m\b|\bBETX\b", head):
         found = "the optics of a ring"

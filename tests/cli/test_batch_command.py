@@ -166,7 +166,7 @@ def test_records_are_answered_too(root, tmp_path):
     ("more", "words"),
     [
         (["--kind", "lifetime", "--lattice", "a.toml"], "--lattice with --kind lifetime"),
-        (["--kind", "emittance", "--time", "t"], "--time with --kind emittance"),
+        (["--kind", "emittance", "--columns", "t"], "--columns t; expected HEADER=NAME"),
         (["--kind", "emittance", "--out", "a.txt"], "a name ending in .csv"),
         (["--kind", "emittance", "--workers", "2", "--scheduler", "tcp://a:1"], "one of them"),
         (["--kind", "emittance"], "no files"),

@@ -406,7 +406,7 @@ def test_columns_of_an_archive_are_named_on_request(run, tmp_path):
     rows = [f"{t},{i / 1000:.9f},0.2" for t, i in zip(time, decay(time), strict=True)]
     rows.insert(7, "270,Disconnected,0.2")
     path.write_text("\n".join(["Seconds,SR:DCCT:CURRENT,SR:TUNE", *rows]) + "\n")
-    named = ("--time", "Seconds", "--current", "SR:DCCT:CURRENT:A")
+    named = ("--columns", "Seconds=time_s, SR:DCCT:CURRENT=beam_current_A")
     status, out, err = run("lifetime", str(path), *named)
     assert (status, out) == (2, "")
     assert err.count("\n") == 1

@@ -48,29 +48,29 @@ EXPORTS = {
         {},
     ),
     "matlab": (table("Date,I", dates("%d-%b-%Y %H:%M:%S.%f"), CURRENT),
-               {"time": "Date", "current": "I:mA"}),
+               {"Date": "time", "I": "beam_current_mA"}),
     "german": (table("Zeit;Strom", dates("%d.%m.%Y %H:%M:%S.%f"), CURRENT, ";"),
-               {"time": "Zeit", "current": "Strom:mA"}),
+               {"Zeit": "time", "Strom": "beam_current_mA"}),
     "slashes": (table(f"Timestamp,{PV}", dates("%Y/%m/%d %H:%M:%S.%f"), CURRENT),
-                {"time": "Timestamp", "current": f"{PV}:mA"}),
+                {"Timestamp": "time", PV: "beam_current_mA"}),
     "newest first": (table("time_s,beam_current_mA", SECONDS[::-1], CURRENT[::-1]), {}),
     "numpy.savetxt": ("# noon\n" + table("# time_s,beam_current_mA", SECONDS, CURRENT, " "), {}),
-    "process variable": (table(f"time_s,{PV}", SECONDS, AMPERE), {"current": f"{PV}:A"}),
+    "process variable": (table(f"time_s,{PV}", SECONDS, AMPERE), {PV: "beam_current_A"}),
     "archiver, no header": (
         "".join(f"{int(START + t)},{v},0,0,{round((START + t) % 1 * 1e9)}\n"
                 for t, v in zip(TIMES, CURRENT, strict=True)),
-        {"current": "val:mA"},
+        {"val": "beam_current_mA"},
     ),
     "archiver, with header": (
         "secs,nanos,val,severity,status\n"
         + "".join(f"{int(START + t)},{round((START + t) % 1 * 1e9)},{v},0,0\n"
                   for t, v in zip(TIMES, CURRENT, strict=True)),
-        {"current": "val:mA"},
+        {"val": "beam_current_mA"},
     ),
     "further columns": (
         "time_s,beam_current_mA,SR:TUNE:X,operator\n"
         + "".join(f"{t},{v},0.22,A. N.\n" for t, v in zip(SECONDS, CURRENT, strict=True)),
-        {"time": "time_s"},
+        {"time_s": "time_s"},
     ),
     "a byte-order mark": ("\ufeff" + table("time_s,beam_current_mA", SECONDS, CURRENT), {}),
 }  # fmt: skip
@@ -84,10 +84,10 @@ def check(record):
 
 @pytest.mark.parametrize("name", EXPORTS)
 def test_an_export_is_read(tmp_path, name):
-    text, options = EXPORTS[name]
+    text, columns = EXPORTS[name]
     path = tmp_path / "export.csv"
     path.write_text(text, encoding="utf-8")
-    check(read_decay_record(path, **options))
+    check(read_decay_record(path, columns=columns or None))
 
 
 def archive(unit):
@@ -105,16 +105,19 @@ def test_json_of_the_archiver_appliance(tmp_path):
     check(record)
     assert f"name: {PV}" in record.comments
     path.write_text(json.dumps(archive("")))
-    with pytest.raises(InputError, match=r"no column of current.*--current COLUMN:UNIT"):
+    with pytest.raises(
+        InputError, match=r"no column of current.*--columns 'HEADER=beam_current_mA'"
+    ):
         read_decay_record(path)
-    check(read_decay_record(path, current="val:mA"))
+    check(read_decay_record(path, columns="val=beam_current_mA"))
 
 
 def test_hdf5_of_process_variables(tmp_path):
     path = tmp_path / "export.h5"
     with h5py.File(path, "w") as file:
         file["timestamp"], file[PV] = START + np.array(TIMES), CURRENT
-    check(read_decay_record(path, time="timestamp", current=f"{PV}:mA"))
+    columns = {"timestamp": "time_s", PV: "beam_current_mA"}
+    check(read_decay_record(path, columns=columns))
 
 
 @pytest.mark.parametrize(
@@ -160,18 +163,18 @@ def test_milliseconds_called_seconds_are_questioned(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("options", "words"),
+    ("columns", "words"),
     [
-        ({"current": PV}, "without a unit; expected its unit after the last colon"),
-        ({"current": "SR:DCCT:mA"}, f"no column 'SR:DCCT'; expected one of time_s, {PV}"),
-        ({"time": "when", "current": f"{PV}:mA"}, "no column 'when'"),
+        ({PV: "beam_current"}, f"column '{PV}': .*says that it is beam_current"),
+        ({"SR:DCCT": "beam_current_mA"}, f"no column 'SR:DCCT'; expected one of time_s, {PV}"),
+        ({"when": "time", PV: "beam_current_mA"}, "no column 'when'"),
     ],
 )
-def test_a_wrong_name_is_answered_with_those_there_are(tmp_path, options, words):
+def test_a_wrong_name_is_answered_with_those_there_are(tmp_path, columns, words):
     path = tmp_path / "export.csv"
     path.write_text(table(f"time_s,{PV}", SECONDS, CURRENT))
     with pytest.raises(InputError, match=words):
-        read_decay_record(path, **options)
+        read_decay_record(path, columns=columns)
 
 
 def test_an_unknown_zone_is_no_date(tmp_path):

@@ -81,7 +81,7 @@ def test_hdf5_is_the_same_record(tmp_path):
         ("time_s,beam_current_mA\n0,500\n1,499\n2,0.498\n3,0.497\n", 4, "beam_current_mA", "1000"),
         ("time_s,beam_current_mA,beam_current_error_mA\n0,5,1\n1,4,0\n", 3, None, "an error of 0"),
         ("time_s,beam_current_mA,pressure_Pa\n0,5,1e-8\n1,4,0\n", 3, "pressure_Pa", "--ignore"),
-        ("Timestamp,I\n0,5\n1,4\n", 1, "Timestamp", "or name them with --time COLUMN"),
+        ("Timestamp,I\n0,5\n1,4\n", 1, "Timestamp", "--columns 'Timestamp=NAME'"),
         ("time_s,beam_current_mA\n0,5\n", None, None, "1 readings"),
         ("# only words\n", None, None, "no header"),
     ],

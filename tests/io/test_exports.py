@@ -13,10 +13,10 @@ COMMAS = ["-4,0;1.115,5", "-3,0;600,25", "-1,0;104,0", "0,0;2.180,0"]
 POINTS = [f"{q},{x}" for q, x in zip(Q, X, strict=True)]
 # Header and rows of one scan, as laboratories write it.
 SCANS = {
-    "Elettra": ("Corrente Q1 [A];Dimensione x [um]", COMMAS),
-    "PSI": ("Strom Q1 [A];Strahlgröße x [µm]", [row.replace(".", "'") for row in COMMAS]),
-    "DESY": ("Q1-Strom [A];sigma_x [µm]", [row.replace(".", "\u202f") for row in COMMAS]),
-    "SOLEIL": ("Courant Q1 (A);Taille x (µm)", [row.replace(".", "\xa0") for row in COMMAS]),
+    "Elettra": ("Q1 [A];size x [um]", COMMAS),
+    "PSI": ("Q1 [A];size x [µm]", [row.replace(".", "'") for row in COMMAS]),
+    "DESY": ("Q1_A;sigma_x [µm]", [row.replace(".", "\u202f") for row in COMMAS]),
+    "SOLEIL": ("Q1 (A);rms x (µm)", [row.replace(".", "\xa0") for row in COMMAS]),
     "thousands": (
         "Q1_A,size_x_um",
         [f'{q},"{x:,.2f}"'.replace("-", "−") for q, x in zip(Q, X, strict=True)],
@@ -27,7 +27,7 @@ SCANS = {
     ),
     "index": ("index,Q1_A,size_x_um", [f"{i},{row}" for i, row in enumerate(POINTS)]),
     "elapsed": ("time_s,Q1_A,size_x_um", [f"{10 * i},{row}" for i, row in enumerate(POINTS)]),
-    "dates": ("Zeit,Q1_A,size_x_um", [f"01.03.2024 12:0{i},{r}" for i, r in enumerate(POINTS)]),
+    "dates": ("time,Q1_A,size_x_um", [f"01.03.2024 12:0{i},{r}" for i, r in enumerate(POINTS)]),
     "put together": ("Q1_A,size_x_um", [*POINTS[:2], "Q1_A,size_x_um", *POINTS[2:]]),
     "ISO 80000": ("Q1/A,size_x/um", POINTS),
     "in words": ("Q1 in A,size x in µm", POINTS),
@@ -94,15 +94,31 @@ def test_of_a_setting_and_its_reading_one_is_left_out(tmp_path):
 DAY = "01.03.2024"
 # Header and rows of one record: three readings, a minute apart.
 RECORDS = {
-    "a German clock": ("Zeit;Strom [mA]", [f"{DAY} 12:0{k}:00;{200 - k},5" for k in range(3)]),
-    "a French one": ("Date;Heure;Courant (mA)", [f"{DAY};12:0{k};{200 - k},5" for k in range(3)]),
-    "Italian": ("Tempo [s];Corrente [mA]", [f"{60 * k},0;{200 - k},5" for k in range(3)]),
+    "a German clock": ("Time;I [mA]", [f"{DAY} 12:0{k}:00;{200 - k},5" for k in range(3)]),
+    "a French one": ("Date;Time;I (mA)", [f"{DAY};12:0{k};{200 - k},5" for k in range(3)]),
+    "Italian": ("t [s];current [mA]", [f"{60 * k},0;{200 - k},5" for k in range(3)]),
     "the epoch": ("epoch,current_mA", [f"{1709294400 + 60 * k},{200.5 - k}" for k in range(3)]),
     "a zone": ("Time (UTC),I [mA]", [f"2024-03-01 12:0{k}Z,{200.5 - k}" for k in range(3)]),
     "an index": ("No,time_s,beam_current_mA", [f"{k},{60 * k},{200.5 - k}" for k in range(3)]),
     "units below": ("Time\tCurrent", ["[s]\t[mA]", *[f"{60 * k}\t{200.5 - k}" for k in range(3)]]),
     "units behind": ("time;current", [f"{60 * k} s;{200 - k},5 mA" for k in range(3)]),
 }
+
+
+WORDS = ["Zeit;Strom [mA]", "Heure;Courant (mA)", "Tempo [s];Corrente [mA]"]
+
+
+@pytest.mark.parametrize("header", WORDS)
+def test_words_of_other_languages_are_said_by_columns(header, tmp_path):
+    rows = [f"{DAY} 12:0{k}:00;{200 - k},5" for k in range(3)]
+    if "[s]" in header:
+        rows = [f"{60 * k};{200 - k},5" for k in range(3)]
+    path = written(tmp_path / "a.csv", header, rows)
+    with pytest.raises(InputError, match="--columns"):
+        read_decay_record(path)
+    time, current = header.split(";")
+    names = {time: "time_s" if "[s]" in header else "time", current: "beam_current_mA"}
+    assert read_decay_record(path, columns=names).current.tolist() == [200.5, 199.5, 198.5]
 
 
 @pytest.mark.parametrize("style", RECORDS)

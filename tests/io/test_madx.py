@@ -92,6 +92,11 @@ READ = {
     + SEQUENCE,
     "const, real, int": "const @j = {3}; @j = 7; real @a = 2; int @c = 7/2; @q1, k1 = @j+@a+@c;"
     + SEQUENCE,
+    "real const": "real const @j := {3}+@k; int const @c = 7/2; @j = 9; @k = 7; @q1, k1 := @j+@c;"
+    + SEQUENCE,
+    "version": "if (version > 50000) {{@q1->k1 = {3};}}" + SEQUENCE,
+    "slots": SEQUENCE.replace("at=0.5", "at=0.5, slot_id=7, mech_sep=0.194, aperture={{1, 2}}"),
+    "return in the file itself": SEQUENCE + "return; @q1->k1 = {3};",
     "comments": "/* @q1->k1 = 7; */ // @q1->k1 = 8;\n! @q1->k1 = 9; it's\n" + SEQUENCE,
     "capitals and blanks": "@Q1 , K1\n = {3} ;" + SEQUENCE.upper().replace("=0.5", " = 0.5"),
     "title and others": "title, 'a; b ! c'; value, @k; select, flag=twiss, column=s; "
@@ -120,6 +125,7 @@ REFUSED = {
     "defaults of a class": "~quadrupole, k1=3;" + SEQUENCE,
     "two signs": "~@q1->k1 = 2*-3;" + SEQUENCE,
     "blanks around an arrow": SEQUENCE + "~@q1 -> k1 = 3;",
+    "const real": "~const real @j = 2; @q1->k1 = @j;" + SEQUENCE,
     "undefined": "~@q1->k1 = @nobody;" + SEQUENCE,
     "a table": "@j = table(summ, q1);~@q1->k1 = @j;" + SEQUENCE,
     "solenoid": "~@e: solenoid, l=0.1, ks=0.3; @lc: line = (@q1, @e);",

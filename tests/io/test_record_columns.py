@@ -31,9 +31,11 @@ def write(folder, header, *columns):
 )
 @pytest.mark.parametrize("time", ["time_s", "t [s]", "Time / s", "Epoch (s)"])
 def test_a_current_by_its_word_and_unit(name, time, tmp_path):
-    path = write(tmp_path, f"{time},{name}", range(4), CURRENT)
+    path = write(
+        tmp_path, f"{time},{name}", range(4), np.divide(CURRENT, 1e3 if "(A)" in name else 1)
+    )
     record = read_decay_record(path)
-    np.testing.assert_allclose(record.current, np.multiply(CURRENT, 1e3 if "(A)" in name else 1))
+    np.testing.assert_allclose(record.current, CURRENT)
     assert record.notes == (f"Column '{name}' is taken for the beam current.",)
     assert understand(path).kind == "record"
 
@@ -44,7 +46,7 @@ def test_a_current_by_its_word_and_unit(name, time, tmp_path):
         ("time_s,Q2_current_A", "Q2_current_A"),  # in A that of a magnet
         ("time_s,I_set_mA", "I_set_mA"),
         ("time_s,DCCT1_mA,DCCT2_mA", "also in column"),
-        ("time_s,beam_current_mA,I_mA", "--current 'beam_current_mA:mA'"),
+        ("time_s,beam_current_mA,I_mA", "--ignore leaves it unread"),
         ("timestamp,DCCT_mA", "timestamp"),  # a number of what?
     ],
 )
@@ -60,9 +62,9 @@ def test_a_lifetime_beside_the_current_is_not_read(tmp_path):
     assert read_decay_record(path).current.tolist() == CURRENT
 
 
-def test_the_unit_in_the_header_is_enough_for_the_option(tmp_path):
+def test_a_unit_in_the_header_is_said_once_more(tmp_path):
     path = write(tmp_path, "Zeit,Wert [A]", ["2024-03-01 12:00", "2024-03-01 12:01"], [0.2, 0.1])
-    record = read_decay_record(path, time="Zeit", current="Wert [A]")
+    record = read_decay_record(path, columns="Zeit=time, Wert [A]=beam_current_A")
     np.testing.assert_allclose(record.current, [200, 100])
 
 

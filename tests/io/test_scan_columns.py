@@ -93,7 +93,7 @@ def test_a_fwhm_is_that_of_a_gaussian(unit, read):
         (["Q_A", "fwhm_x_um", "size_x_error_um"], "FWHM"),
         (["Q_A", "size_x_um", "fwhm_x_error_um"], "FWHM"),
         (["Q_A", "size_x_sigma_um", "note_"], "size_x_um"),
-        (["Q_A", "sigma_xy_um", "note_"], "size_x_um"),
+        (["Q_A", "sigma_xy_um", "note_"], "coupled"),
         (["Q_A", "size_x_um", "sigma_x_mm"], "twice"),
         (["Q_T_per_m", "Q_A", "size_x_mm"], "twice"),
         (["Q_A", "size_x_um", "pressure_mbar"], "--ignore"),

@@ -8,6 +8,8 @@ import numpy as np
 
 from beamfit.shown import shown
 
+# mA. The ISR of CERN stored 57 A of protons, more than any ring before or since.
+MOST_CURRENT = 1e5
 # Beyond these a column is in another unit than its name says: RF voltages up to LEP's 3.6 GV, a
 # scraper from 0.1 mm, a vacuum in which a beam can be stored.
 PLAUSIBLE = {
@@ -138,6 +140,9 @@ def first_fault(
     if (row := _first(current < 0)) is not None:
         found = f"a negative current, {current[row]:.6g} mA"
         return Fault(row, "current", found, NOT_NEGATIVE)
+    if (row := _first(current > MOST_CURRENT)) is not None:
+        found = f"a current of {1e-3 * current[row]:.6g} A, more than any ring has stored"
+        return Fault(row, "current", found, "mA: are these readings in mA or µA?")
     if error is not None and (row := _first(error <= 0)) is not None:
         return Fault(row, "error", f"an error of {error[row]:.6g} mA", "a positive one")
     if (fault := _odd_setting(conditions)) is not None:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import jax
 import numpy as np
 
-from beamfit.errors import InputError
+from beamfit.errors import InputError, expect
 from beamfit.frames import quantity_frame
 from beamfit.quantity import Quantity, Status
 from beamfit.shown import shown
@@ -305,6 +305,7 @@ def fit_decay(
     >>> print(fit.status, fit.lifetime_mean)
     converged 28.704763 ± 0.000026 h
     """
+    expect(record, DecayRecord, "beamfit.read_decay_record(path)")
     record = record if monitor is None else replace(record, monitor=monitor)
     if _says_nothing(record):
         return _constant(record)

@@ -11,6 +11,7 @@ import numpy as np
 from jax import Array
 from scipy.special import chdtrc, fdtrc
 
+from beamfit.errors import expect
 from beamfit.greybox.fit import Derived, Fit
 from beamfit.greybox.problem import Free, Problem, Record, padded_length
 from beamfit.greybox.solve import solve
@@ -235,6 +236,7 @@ def fit_lifetimes(table: LifetimeTable) -> LifetimeFit:
     >>> fit.status.value, f"{fit.a.value * 3600:.4e}"
     ('converged', '1.0000e-04')
     """
+    expect(table, LifetimeTable, "read_lifetimes(path)")
     left_out = _outliers(table)
     plain, power = (_solved(table, ~left_out, exponent) for exponent in (False, True))
     test, group = _tested(table, plain, power), plain.group(RECORD)

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.ndimage import median_filter
 
+from beamfit.errors import expect
 from beamfit.shown import shown
 from beamfit.studies.decay.record import DecayRecord
 
@@ -278,6 +279,7 @@ def split_record(record: DecayRecord) -> Split:
     >>> len(split.segments), str(split.events[0])
     (2, 'refill at 2000 s (+5.378 mA)')
     """
+    expect(record, DecayRecord, "beamfit.read_decay_record(path)")
     kept, events = beam_readings(record)
     if kept.size < FEWEST:
         return Split((), tuple(events))

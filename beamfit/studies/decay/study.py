@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from beamfit.errors import InputError
+from beamfit.errors import InputError, expect
 from beamfit.shown import shown
 from beamfit.studies.decay.budget import Budget, Machine, budget
 from beamfit.studies.decay.checks import DecayChecks, check_decay
@@ -206,6 +206,7 @@ def study_record(
     >>> [f"{decay.fit.lifetime_mean.value:.3f} h" for decay in study.decays]
     ['10.000 h', '10.000 h']
     """
+    expect(record, DecayRecord, "beamfit.read_decay_record(path)")
     record = without_repeats(record)
     # Segments move `start` with them: counted from zero it is their place in the record.
     placed = replace(record, start=0.0)

@@ -8,7 +8,7 @@ from functools import cached_property
 from html import escape
 from typing import TYPE_CHECKING, Any
 
-from beamfit.errors import InputError
+from beamfit.errors import InputError, expect
 from beamfit.frames import quantity_frame
 from beamfit.greybox.problem import Problem
 from beamfit.noise.model import ROBUST, Noise
@@ -127,6 +127,9 @@ def fit_emittance(
     >>> fit.x.status.value, f"{fit.x.emittance.value * 1e9:.4f} nm"
     ('converged', '2.0000 nm')
     """
+    expect(scan, QuadScan, "beamfit.read_quad_scan(path)")
+    if line is not None:
+        expect(line, Beamline, "beamfit.load_lattice(path)")
     for name, given, known in (("method", method, METHODS), ("weights", weights, WEIGHTS)):
         if given not in known:
             raise InputError(f"{name} '{given}'", " or ".join(known))
@@ -253,7 +256,10 @@ class EmittanceFit:
         return self.stated if self.solved is None else self.solved.problem
 
     def __getitem__(self, plane: str) -> PlaneFit:
-        return {p.plane: p for p in self.planes}[plane]
+        found = {p.plane: p for p in self.planes}
+        if plane not in found:
+            raise self.scan.unusable(f"no fit of plane '{plane}'", " or ".join(found))
+        return found[plane]
 
     @property
     def x(self) -> PlaneFit:

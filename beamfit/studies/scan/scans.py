@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from beamfit.errors import InputError, nearest
+from beamfit.errors import InputError, expect, nearest
 from beamfit.frames import frame_of
 from beamfit.particles import ENERGY_KEYS, total_energy
 from beamfit.shown import shown
@@ -24,6 +24,8 @@ if TYPE_CHECKING:
     from pandas import DataFrame
 
 PLANES = ("x", "y")
+# Units of settings: current, integrated gradient, gradient, focusing strength, 1/focal length.
+SETTINGS = ("A", "kG", "T_per_m", "k1", "k1l")
 # What rows that look at no single slice of the beam say for one.
 PROJECTED = "projected"
 # Rows of a scan that a notebook shows.
@@ -196,14 +198,21 @@ class QuadScan:
 
     def __post_init__(self) -> None:
         for key in ("settings", "size", "error", "shot_size"):
-            arrays = {k: np.asarray(v, float) for k, v in getattr(self, key).items()}
+            expect(
+                getattr(self, key), Mapping, f'{{"{"Q1" if key == "settings" else "x"}": values}}'
+            )
+            arrays = {k: self._numbers(v, k) for k, v in getattr(self, key).items()}
             object.__setattr__(self, key, arrays)
+        for key in ("screen", "slice"):
+            if isinstance(getattr(self, key), str):
+                raise self.unusable(f"{key} = '{getattr(self, key)}'", "a name for each row", key)
         if self.slice is not None:
             names = tuple(str(name).strip() or PROJECTED for name in self.slice)
             object.__setattr__(self, "slice", names)
         if self.transfer is not None:
             object.__setattr__(self, "transfer", self._whole_transfer(self.transfer))
         self._check_shapes()
+        self._check_units()
         for key in ("energy", "resolution", "energy_spread", "shots"):
             if getattr(self, key) is not None:
                 object.__setattr__(self, key, self._column(key))
@@ -336,6 +345,17 @@ class QuadScan:
         column = None if key is None else self.columns.get(key, key)
         return InputError(found, expected, path=self.path, column=column)
 
+    def _check_units(self) -> None:
+        expect(self.units, Mapping, '{"Q1": "kG"}')
+        for name in self.settings:
+            unit = self.units.get(name)
+            if unit not in SETTINGS:
+                found = f"'{name}' in the unit {unit!r}" if unit else f"no unit for '{name}'"
+                raise self.unusable(found, f"units of {nearest(str(unit), list(SETTINGS))}", name)
+        if self.energy_kind not in ENERGY_KEYS.values():
+            expected = nearest(str(self.energy_kind), list(ENERGY_KEYS.values()))
+            raise self.unusable(f"energy_kind '{self.energy_kind}'", expected, "energy")
+
     def _check_shapes(self) -> None:
         if not self.settings and self.screen is None and self.transfer is None:
             expected = "a column such as Q2_A, Q2_kG or Q2_k1, or several screens"
@@ -350,6 +370,15 @@ class QuadScan:
         lengths |= {f"R in {p}": len(v) for p, v in (self.transfer or {}).items()}
         if len(set(lengths.values())) != 1:
             raise self.unusable(f"lengths {lengths}", "one length for all columns")
+
+    def _numbers(self, values: object, key: str) -> np.ndarray:
+        try:
+            found = np.asarray(values, float)
+        except (TypeError, ValueError):
+            found = np.zeros(())
+        if found.ndim != 1:
+            raise self.unusable(f"{values!r}"[:60], "an array of numbers, one a row", key)
+        return found
 
     def _column(self, key: str) -> np.ndarray:
         """Numbers of each row; one number holds for all."""
