@@ -8,8 +8,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from beamfit.greybox import assess
-from beamfit.greybox.problem import Problem, compiled_at
+from beamfit.greybox.problem import Problem, compiled_at, sloped
 
 # Made-up settings at which a direction must still change nothing, and how far off they are.
 TRIALS, OFF = 4, 0.3
@@ -103,7 +102,7 @@ def _still(p: Problem, theta: np.ndarray, unseen: np.ndarray) -> np.ndarray:
             for r in p.core.records
         )
         core = dataclasses.replace(p.core, records=records)
-        jacobian = np.asarray(compiled_at(assess.first_order, core)(theta)[1])
+        jacobian = np.asarray(compiled_at(sloped, core)(theta)[1])
         usable = np.all(np.isfinite(jacobian), axis=1)
         terms = np.linalg.norm(jacobian[usable] * size, axis=1, keepdims=True)
         rows.append(jacobian[usable] / np.where(terms > 0, terms, 1.0))

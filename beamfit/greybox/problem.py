@@ -109,6 +109,11 @@ def with_slope(function: Callable[[jax.Array], jax.Array], theta: jax.Array):
     return value, slope
 
 
+def sloped(core: Core, theta: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Residuals and their Jacobian."""
+    return with_slope(partial(residual, core), theta)
+
+
 @jax.jit
 def constraints(core: Core, theta: jax.Array) -> jax.Array:
     """Values of every constraint as one vector."""
