@@ -249,7 +249,8 @@ def _product(operands: list, dimensions, shape: tuple[int, ...], n: int) -> Sets
         if not isinstance(v, Sets):
             continue
         b, far, k = np.nonzero(other)
-        if len(b) * places.shape[1] > 1e7:
+        links = len(b) * places.shape[1]
+        if links > max(FULL * rows.shape[0] * v.rows.shape[0], 100 * n):
             raise _Dense
         source = places[b, :, k]
         to = target[b, :, far] if side == 1 else target[b, far, :]
