@@ -64,13 +64,12 @@ def _at(text: str, position: int) -> Place:
 
 def explained(error: UnexpectedInput, text: str) -> InputError:
     """Say where the text stops making sense, what stands there, and what could."""
-    at = Place(error.line, error.column)
+    at, odd_at = Place(error.line, error.column), error.pos_in_stream or 0
+    if odd_at and DECIMAL.match(text, odd_at - 1):
+        return error_at(at, f"',' behind '{text[odd_at - 1]}'", "a point before decimals")
     if isinstance(error, UnexpectedCharacters):
         expected = _choices(error.allowed or ())
         odd = text[error.pos_in_stream]
-        if DECIMAL.match(text, error.pos_in_stream - 1):
-            found = f"',' behind '{text[error.pos_in_stream - 1]}'"
-            return error_at(at, found, "a point before decimals")
         return error_at(at, f"{odd!r}", expected)
     if not isinstance(error, UnexpectedToken):
         return error_at(at, "text that ends too early", "the rest of a statement")
