@@ -13,7 +13,6 @@ import sys
 import time
 
 import casadi
-import jax.numpy as jnp
 import numpy as np
 from rich.console import Console
 from rich.table import Table

@@ -215,11 +215,11 @@ def gradient_size(p: Problem, at: Slopes, scale: Scale) -> np.ndarray:
 
 
 def holding(p: Problem, s: State, least: float) -> tuple[np.ndarray, np.ndarray]:
-    """Numbers that do not move and gradients of constraints that hold, by forces above a share."""
+    """Numbers that do not move and constraints that hold, by forces above a share."""
     size = gradient_size(p, s.at, s.scale)
     held = ~p.moving | (np.abs(s.found.bounds) > least * size)
     pulls = np.abs(s.found.constraints) * np.linalg.norm(s.at.jacobian / size, axis=1)
-    return held, s.at.jacobian[p.equations | (pulls > least)]
+    return held, p.equations | (pulls > least)
 
 
 def state(p: Problem, theta: np.ndarray, scale: Scale, at: Slopes | None = None) -> State:

@@ -32,6 +32,9 @@ LOST = 1e3
 # directions of squares, or at random or inward from bounds.
 NEAR, WEAKEST, AROUND = 1e-3, 2, 4
 
+# Newton steps that bring a point back onto constraints, and how near they count as met.
+RESTORED, CLOSE = 10, 1e-10
+
 # Lagrangian at points, shape (k, n) to (k,).
 Look = Callable[[np.ndarray], np.ndarray]
 
@@ -130,8 +133,8 @@ def lower_beside(p: Problem, s: assess.State, lagrangian: Look) -> np.ndarray | 
 def _weakest(p: Problem, s: assess.State) -> np.ndarray:
     """The weakest directions of squares that keep to the limits held by a force."""
     unit = s.scale.unit
-    held, equations = assess.holding(p, s, p.tolerance)
-    if len(unit) > FEW and not len(equations):
+    held, on = assess.holding(p, s, p.tolerance)
+    if len(unit) > FEW and not on.any():
         found = np.zeros((len(unit), min(WEAKEST, int(np.sum(~held)))))
         rows = in_units(s.at.residual_jacobian, 1 / unit)[:, ~held]
         found[~held] = weakest(rows, found.shape[1])
@@ -151,6 +154,9 @@ def _along(
     """The best of some points along a direction, None if none is better by what counts."""
     steps = [sign * step for step in (NEAR, 10 * NEAR, 100 * NEAR, 0.5) for sign in (1.0, -1.0)]
     points = [s.theta, *(np.clip(s.theta + t * direction, p.lower, p.upper) for t in steps)]
+    if p.constraints:
+        restored = (_restored(p, s, point) for point in points[1:])
+        points = [s.theta, *(point for point in restored if point is not None)]
     cost = lagrangian(np.array(points))
     cost = np.where(np.isfinite(cost), cost, np.inf)
     best = int(np.argmin(cost))
@@ -158,6 +164,28 @@ def _along(
     noise = 1.0 if p.errors_known or not p.records else 2 * s.at.cost / count
     counts = 1e-9 * s.scale.cost if p.objectives else max(1e-3 * noise, 1e-6 * s.at.cost)
     return points[best] if cost[0] - cost[best] > counts else None
+
+
+def _restored(p: Problem, s: assess.State, point: np.ndarray) -> np.ndarray | None:
+    """A point moved onto the constraints that hold at another one, and inside all; None if not.
+
+    Beside curved constraints a straight step leaves them, and a cost that is lower there is no
+    lower cost: along a ridge of equal costs it would be taken for a way down.
+    """
+    held, on = assess.holding(p, s, p.tolerance)
+    unit = np.where(held, 0.0, s.scale.unit)
+    for _ in range(RESTORED):
+        at = assess.slopes(p, point)
+        if not at.finite:
+            return None
+        inside = np.clip(at.constraints, p.constraint_lower, p.constraint_upper)
+        gap = at.constraints - np.where(on, s.at.constraints, inside)
+        if np.all(np.abs(gap) <= CLOSE * s.limits.size):
+            return point
+        left = gap != 0
+        step = np.linalg.lstsq(at.jacobian[left] * unit, gap[left], rcond=None)[0]
+        point = np.clip(point - unit * step, p.lower, p.upper)
+    return None
 
 
 def _bend(p: Problem, s: assess.State) -> assess.Bend:
@@ -186,5 +214,5 @@ def _bend(p: Problem, s: assess.State) -> assess.Bend:
 def _tangent(p: Problem, s: assess.State) -> np.ndarray:
     """Directions, in the sizes of the numbers, that keep to the limits held by a force."""
     unit = s.scale.unit
-    held, equations = assess.holding(p, s, p.tolerance)
-    return null_space(np.vstack([np.eye(len(unit))[held], equations * unit]))
+    held, on = assess.holding(p, s, p.tolerance)
+    return null_space(np.vstack([np.eye(len(unit))[held], s.at.jacobian[on] * unit]))

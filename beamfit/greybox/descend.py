@@ -21,7 +21,7 @@ import numpy as np
 from jax import Array
 
 from beamfit.greybox.factors import FEW, RIDGE, Factor, Rows, in_units, lengths, with_diagonal
-from beamfit.greybox.problem import Problem, with_slope
+from beamfit.greybox.problem import Problem, sloped, with_slope
 from beamfit.greybox.problem import residual as problem_residual
 
 DAMPING = 1e-3
@@ -372,7 +372,7 @@ class ManyLanes(Lanes):
             found = pattern.matrix(swept)
             if pattern.holds(found, swept):
                 return r, found
-        r, found = self.p.compiled(_sloped)(theta)
+        r, found = self.p.compiled(sloped)(theta)
         return np.asarray(r), np.asarray(found)
 
     def _move(self, some: np.ndarray, limit: int) -> None:
@@ -441,11 +441,6 @@ def _next_of_many(theta, residual, jacobian, scale, damping, lower, upper) -> np
 def lanes_of(p: Problem, points: np.ndarray) -> Lanes:
     """Searches from points, by the method for as many free numbers as there are."""
     return (Lanes if len(p.start) <= FEW else ManyLanes)(p, points)
-
-
-def _sloped(core, theta):
-    """Residuals and their Jacobian."""
-    return with_slope(partial(problem_residual, core), theta)
 
 
 def _swept(core, theta, seeds):

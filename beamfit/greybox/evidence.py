@@ -70,7 +70,10 @@ class Known(NamedTuple):
 
 
 class Evidence(NamedTuple):
-    """What a verdict rests on; `chi2` and `dof` are of what has errors."""
+    """What a verdict rests on; `chi2` and `dof` are of what has errors.
+
+    `unseen` (n, k) are the directions that residuals do not see.
+    """
 
     problem: Problem
     state: State
@@ -79,6 +82,7 @@ class Evidence(NamedTuple):
     variables: tuple[Variable, ...]
     constraints: tuple[Limited, ...]
     blind: np.ndarray
+    unseen: np.ndarray
     chi2: float
     dof: float
 
@@ -90,7 +94,8 @@ def known(p: Problem, s: State) -> Known:
     hangs on it are those of a number that the bound only limits. Weights that nobody asks for
     stay on their bounds.
     """
-    held, equations = assess.holding(p, s, 1e-9)
+    held, on = assess.holding(p, s, 1e-9)
+    equations = s.at.jacobian[on]
     ends = np.cumsum([record.measured.size for record in p.records], dtype=int)
     parts = zip([0, *ends], [*ends, None], strict=True)
     blocks = [triangle(s.at.residual_jacobian[first:last]) for first, last in parts]

@@ -7,7 +7,7 @@ import numpy as np
 from beamfit.greybox import assess, curvature
 from beamfit.greybox.conflict import dependence
 from beamfit.greybox.evidence import Evidence, listed
-from beamfit.greybox.problem import Problem
+from beamfit.greybox.proof import convex
 from beamfit.status import Status
 from beamfit.verdict import Finding
 
@@ -16,14 +16,8 @@ ENDLESS = -1e15
 # A number runs away beyond this many of its sizes; a pole is where the cost's slope in a number's
 # size is that much larger than the cost.
 AWAY = 1e6
-# From this many starts that agree on one optimum it is taken for the only one: the number of optima
-# expected then is below 1.5 (C. G. E. Boender & A. H. G. Rinnooy Kan, Mathematical Programming 37
-# (1987) 59: w (N - 1)/(N - w - 2) for w seen from N starts).
-AGREED = 7
 # Costs of one optimum differ by less than this share, starts ending more or less near to it.
 ALIKE = 1e-4
-# Points at which a cost is looked at for being convex, and how far off in the sizes of numbers.
-LOOKS, REACHES = 24, (0.1, 1.0, 10.0)
 
 
 def crossed(e: Evidence) -> Finding | None:
@@ -165,20 +159,20 @@ def local(e: Evidence) -> Finding | None:
             f"the lowest of {1 + len(seen)} local optima reached from {e.search.words}, at a cost "
             f"of {e.state.at.cost:.6g} {worst}; others at {listed(costs)}.",
         )
-    if _agreed(e) >= AGREED or (e.search.exact and _convex(e.problem, e.state)):
+    if e.search.exact and convex(e.problem):
         return None
-    return Finding(
-        Status.local_optimum,
-        f"an optimum of its neighbourhood was reached from {e.search.words} {worst};",
-        f"whether another is lower only more starts tell ({AGREED} or more).",
-    )
+    starts, agreed = len(e.search.attempts), _agreed(e)
+    told = f"a local optimum, the best of {starts} starts, of which {agreed} ended on it {worst};"
+    if starts == 1:
+        told = f"a local optimum was reached from 1 start {worst};"
+    remedy = "it is not proved to be the lowest, and more starts search further."
+    return Finding(Status.local_optimum, told, remedy)
 
 
 def optimal(e: Evidence) -> Finding:
-    """Say what makes it the optimum."""
-    agreed, words = _agreed(e), e.search.words
-    why = f"{agreed} of {words} ended on it" if agreed >= AGREED else "the problem is convex there"
-    cause = f"the optimum was reached: {why} (KKT residual {e.state.kkt.worst:.1e})."
+    """Say that it is the optimum, and why."""
+    worst = e.state.kkt.worst
+    cause = f"the optimum was reached: the problem is convex (KKT residual {worst:.1e})."
     return Finding(Status.optimal, cause)
 
 
@@ -187,37 +181,3 @@ def _agreed(e: Evidence) -> int:
     least = ALIKE * max(e.state.scale.cost, abs(e.state.at.cost))
     ends = (a for a in e.search.attempts if a.kkt.worst <= e.problem.tolerance)
     return sum(abs(a.cost - e.state.at.cost) <= least for a in ends)
-
-
-def _convex(p: Problem, s: assess.State) -> bool:
-    """Whether constraints are linear and the cost bends up, at points all over the bounds."""
-    random, unit = np.random.default_rng(0), s.scale.unit
-    ends = np.isfinite(p.lower) & np.isfinite(p.upper)
-    low, width = np.where(ends, p.lower, 0.0), np.where(ends, p.upper - p.lower, 0.0)
-    points = [s.theta]
-    for i in range(LOOKS):
-        around = s.theta + REACHES[i % len(REACHES)] * unit * random.normal(size=len(unit))
-        inside = np.where(ends & (i % 2 == 0), low + random.uniform(size=len(unit)) * width, around)
-        points.append(np.clip(inside, p.lower, p.upper))
-    for point in points:
-        at = assess.slopes(p, point)
-        change = (at.jacobian - s.at.jacobian) * unit / s.limits.size[:, None]
-        if not _above(s, s.theta, s.at, point, at) or not _above(s, point, at, s.theta, s.at):
-            return False
-        h = p.compiled(curvature.lagrangian_hessian)(point, 1.0, np.zeros(len(s.limits.size)))
-        h = np.asarray(h) * np.outer(unit, unit)
-        if not (np.all(np.abs(change) <= 1e-9) and np.all(np.isfinite(h))):
-            return False
-        bends = np.linalg.eigvalsh(h)
-        if bends[0] < -1e-9 * max(bends[-1], 0.0) - 1e-12 * s.scale.cost:
-            return False
-    return True
-
-
-def _above(
-    s: assess.State, here: np.ndarray, at: assess.Slopes, there: np.ndarray, then: assess.Slopes
-) -> bool:
-    """Whether the cost there is not below the tangent here: kinks and jumps have no curvature."""
-    rise = at.gradient @ (there - here)
-    rounding = 1e-9 * (abs(at.cost) + abs(then.cost) + abs(rise)) + 1e-12 * s.scale.cost
-    return bool(then.cost - at.cost - rise >= -rounding)

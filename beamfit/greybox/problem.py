@@ -16,6 +16,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.extend.core import ClosedJaxpr
 
 from beamfit.errors import InputError
 from beamfit.greybox import tree
@@ -57,6 +58,21 @@ def _compiled(function: Callable, structure: jax.tree_util.PyTreeDef) -> Callabl
     return jax.jit(lambda leaves, *rest: function(structure.unflatten(leaves), *rest))
 
 
+def compiled_at(function: Callable, core: Core) -> Callable:
+    """A function of (core, theta, ...) as a compiled function of (theta, ...) at any core."""
+    leaves, structure = jax.tree_util.tree_flatten(core)
+    return partial(_compiled(function, structure), [jnp.asarray(leaf) for leaf in leaves])
+
+
+@lru_cache(maxsize=256)
+def _program(function, structure, kinds, n) -> ClosedJaxpr:
+    """The operations of a function of (core, theta)."""
+    leaves = [jax.ShapeDtypeStruct(*kind) for kind in kinds]
+    return jax.make_jaxpr(lambda *flat: function(structure.unflatten(flat[:-1]), flat[-1]))(
+        *leaves, jax.ShapeDtypeStruct((n,), float)
+    )
+
+
 def _model_at(core: Core, theta: jax.Array) -> Any:
     return tree.replace(core.model, core.chosen, theta)
 
@@ -91,6 +107,11 @@ def with_slope(function: Callable[[jax.Array], jax.Array], theta: jax.Array):
 
     slope, value = jax.jacfwd(twice, has_aux=True)(theta)
     return value, slope
+
+
+def sloped(core: Core, theta: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Residuals and their Jacobian."""
+    return with_slope(partial(residual, core), theta)
 
 
 @jax.jit
@@ -269,7 +290,7 @@ class Problem:
     @cached_property
     def pattern(self) -> Pattern | None:
         """Places of the residuals' Jacobian that may differ from zero; None where it is dense."""
-        return pattern_of(partial(residual, self.core), self.start)
+        return pattern_of(*self.program(residual), len(self.start))
 
     @cached_property
     def least_residual(self) -> float:
@@ -295,6 +316,15 @@ class Problem:
         """
         leaves, structure = self._flat
         return partial(_compiled(function, structure), leaves)
+
+    def program(self, function: Callable) -> tuple[ClosedJaxpr, list[jax.Array]]:
+        """The program of a function of (core, theta), and its arguments before theta.
+
+        Traced once for each structure of problem, with its data as arguments.
+        """
+        leaves, structure = self._flat
+        kinds = tuple((leaf.shape, leaf.dtype) for leaf in leaves)
+        return _program(function, structure, kinds, len(self.start)), leaves
 
     @cached_property
     def _flat(self) -> tuple[list[jax.Array], jax.tree_util.PyTreeDef]:

@@ -10,7 +10,7 @@ one sweep (A. R. Curtis, M. J. D. Powell & J. K. Reid, J. Inst. Math. Appl. 13 (
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
@@ -19,8 +19,10 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
+from jax.extend.core import ClosedJaxpr
 from scipy import sparse
+
+from beamfit.greybox.follow import MOVES, followed, moves
 
 # Operations whose elements each depend on the elements at the same place.
 ELEMENTWISE = frozenset(
@@ -29,12 +31,6 @@ ELEMENTWISE = frozenset(
     min mul neg optimization_barrier pow reduce_precision rem rsqrt select_n sin sinh sqrt square
     stop_gradient sub tan tanh xlog1py xlogy""".split()  # noqa: SIM905
 )
-# Operations that move elements, with the places of operands that say where to.
-MOVES = dict.fromkeys(
-    """broadcast_in_dim concatenate expand_dims pad reshape rev slice split squeeze stack tile
-    transpose unstack""".split(),  # noqa: SIM905
-    0,
-) | {"dynamic_slice": 1, "gather": 1, "dynamic_update_slice": 2}
 REDUCTIONS = {"reduce_sum", "reduce_max", "reduce_min", "reduce_prod"}
 # A probe may differ by this share of its terms.
 PROBE = 1e-9
@@ -87,15 +83,17 @@ class Pattern:
         return sparse.csr_array((values, self.columns, self.indptr), shape=self.shape)
 
 
-def pattern_of(function: Callable[[jax.Array], jax.Array], at: np.ndarray) -> Pattern | None:
+def pattern_of(program: ClosedJaxpr, given: Sequence[Any], n: int) -> Pattern | None:
     """Find the pattern of a function's Jacobian; None where it is of no use.
 
     Parameters
     ----------
-    function : callable
-        From shape (n,) to shape (m,), in JAX.
-    at : array, shape (n,)
-        Any point: only its shape counts.
+    program : ClosedJaxpr
+        The function, whose last argument is an array of shape (n,), and its result (m,).
+    given : sequence of array
+        Its other arguments.
+    n : int
+        How many numbers there are.
 
     Returns
     -------
@@ -104,14 +102,13 @@ def pattern_of(function: Callable[[jax.Array], jax.Array], at: np.ndarray) -> Pa
     Examples
     --------
     >>> import beamfit.greybox
-    >>> found = pattern_of(lambda x: x[1:] * x[:-1], np.zeros(9))
+    >>> found = pattern_of(jax.make_jaxpr(lambda x: x[1:] * x[:-1])(np.zeros(9)), [], 9)
     >>> found.columns.tolist()[:6], found.colours.tolist()[:4]
     ([0, 1, 1, 2, 2, 3], [0, 1, 0, 1])
     """
-    program = jax.make_jaxpr(function)(jnp.asarray(at))
-    each = Sets(at.shape, sparse.eye_array(at.size, dtype=bool, format="csr"))
+    each = Sets((n,), sparse.eye_array(n, dtype=bool, format="csr"))
     try:
-        (found,) = _walk(program.jaxpr, program.consts, [each])
+        (found,) = followed(program, [*given, each], _capped_sets, Sets)
     except _Dense:
         return None
     if not isinstance(found, Sets):
@@ -121,7 +118,7 @@ def pattern_of(function: Callable[[jax.Array], jax.Array], at: np.ndarray) -> Pa
     if rows.nnz > FULL * rows.shape[0] * rows.shape[1]:
         return None
     colours = _colours(rows)
-    if colours.max(initial=0) >= FULL * at.size:
+    if colours.max(initial=0) >= FULL * n:
         return None
     return Pattern(rows.shape, rows.indptr, rows.indices, colours)
 
@@ -142,36 +139,8 @@ def _colours(rows: sparse.csr_array) -> np.ndarray:
     return np.array(found, int)
 
 
-def _walk(program: Jaxpr, constants: list, arguments: list) -> list:
-    """Values of a program's results: arrays where they do not depend on the numbers, else sets."""
-    known: dict[Any, Any] = dict(zip(program.constvars, constants, strict=True))
-    known |= dict(zip(program.invars, arguments, strict=True))
-
-    def value(atom):
-        return atom.val if isinstance(atom, Literal) else known[atom]
-
-    for step in program.eqns:
-        operands = [value(atom) for atom in step.invars]
-        known |= dict(zip(step.outvars, _results(step, operands), strict=True))
-    return [value(atom) for atom in program.outvars]
-
-
-def _results(step, operands: list) -> list:
-    inner = _inner(step.params)
-    if inner is not None and step.primitive.name not in ("scan", "while", "cond"):
-        return _walk(inner.jaxpr, inner.consts, operands)
-    if not any(isinstance(v, Sets) for v in operands):
-        found = step.primitive.bind(*operands, **step.params)
-        return list(found) if step.primitive.multiple_results else [found]
+def _capped_sets(step, operands: list) -> list[Sets]:
     return [_capped(s) for s in _sets(step, operands)]
-
-
-def _inner(params: dict[str, Any]) -> ClosedJaxpr | None:
-    """The program that an operation calls once with its operands."""
-    for name in ("jaxpr", "call_jaxpr", "fun_jaxpr"):
-        if isinstance(found := params.get(name), ClosedJaxpr):
-            return found
-    return None
 
 
 def _capped(s: Sets) -> Sets:
@@ -189,7 +158,7 @@ def _sets(step, operands: list) -> list[Sets]:
     depends = [v for v in operands if isinstance(v, Sets)]
     if name in ELEMENTWISE and all(v.shape == shapes[0] for v in depends):
         return [Sets(shapes[0], sum((v.rows for v in depends[1:]), depends[0].rows))]
-    if name in MOVES and not any(isinstance(v, Sets) for v in _where_to(name, operands)):
+    if moves(step, operands, Sets):
         return _moved(step, operands, shapes, n)
     if name in REDUCTIONS:
         kept = [1 if i in step.params["axes"] else k for i, k in enumerate(numbers.shape)]
@@ -207,12 +176,6 @@ def _sets(step, operands: list) -> list[Sets]:
 
 def _none(shape: tuple[int, ...], n: int) -> sparse.csr_array:
     return sparse.csr_array((int(np.prod(shape)), n), dtype=bool)
-
-
-def _where_to(name: str, operands: list) -> list:
-    """Operands that say where elements go."""
-    first = MOVES[name]
-    return operands[first:] if first else []
 
 
 def _moved(step, operands: list, shapes: list, n: int) -> list[Sets]:
@@ -286,7 +249,8 @@ def _product(operands: list, dimensions, shape: tuple[int, ...], n: int) -> Sets
         if not isinstance(v, Sets):
             continue
         b, far, k = np.nonzero(other)
-        if len(b) * places.shape[1] > 1e7:
+        links = len(b) * places.shape[1]
+        if links > max(FULL * rows.shape[0] * v.rows.shape[0], 100 * n):
             raise _Dense
         source = places[b, :, k]
         to = target[b, :, far] if side == 1 else target[b, far, :]

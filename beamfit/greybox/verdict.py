@@ -14,6 +14,7 @@ from beamfit.greybox.covariance import MOST_SHARE, Spread
 from beamfit.greybox.equations import Implicit
 from beamfit.greybox.evidence import EDGES, Evidence, Known, Search, known, listed, settled
 from beamfit.greybox.fit import Attempt, Fit, Limited, Variable
+from beamfit.greybox.gauge import Gauge, gauges
 from beamfit.greybox.problem import Problem
 from beamfit.statistics import POOR_FIT, chi2_probability
 from beamfit.status import Status
@@ -71,7 +72,8 @@ def conclude(p: Problem, s: State, search: Search, seconds: float) -> Fit:
     silent = [group for group in found.groups if not group.errors_given]
     spoken = chi2 - sum(g.chi2 for g in silent), dof - sum(g.dof for g in silent)
     rest = not s.optimal and settled(p, s)
-    evidence = Evidence(p, s, search, rest, variables, constraints, found.blind, *spoken)
+    seen = (found.blind, found.unseen)
+    evidence = Evidence(p, s, search, rest, variables, constraints, *seen, *spoken)
     finding = verdict.judge(evidence, RULES if p.has_data else WITHOUT_DATA)
     message = " ".join([finding.message, *_remarks(evidence)])
     return Fit(
@@ -126,8 +128,28 @@ def _undetermined(e: Evidence) -> Finding | None:
     open_ones = e.blind & ~e.problem.nuisance
     if not open_ones.any():
         return None
-    cause = f"the data do not determine {listed(np.array(e.problem.names)[open_ones])};"
-    return Finding(Status.unidentified, cause, "add data of another kind, a prior, or fix it.")
+    names = np.array(e.problem.names)[open_ones]
+    found = gauges(e.problem, e.state.theta, e.unseen)
+    tied = [g for g in found if set(names.tolist()) & set(g.names)]
+    if tied:
+        return _together(tied)
+    cause = f"the data do not determine {listed(names)};"
+    remedy = "add data of another kind, a prior, or fix it."
+    return Finding(Status.unidentified, cause, remedy, tuple(names.tolist()))
+
+
+def _together(found: list[Gauge]) -> Finding:
+    """Say which numbers move together whatever the data."""
+    said = []
+    for g in found:
+        parts = [f"{n} {c:+.3g} %" for n, c in zip(g.names, g.changes, strict=True)]
+        along = f" ({', '.join(parts[:4])})" if g.free == 1 else ""
+        said.append(f"{listed(g.names)} move together{along}")
+    cause = f"{'; '.join(said)}: no prediction changes, whatever the data, a freedom of the model;"
+    count = sum(g.free for g in found)
+    few = "one of them" if count == 1 else f"{count} of them"
+    names = tuple(name for g in found for name in g.names)
+    return Finding(Status.unidentified, cause, f"fix {few}, or give a prior.", names)
 
 
 def _poor(e: Evidence) -> Finding | None:

@@ -132,6 +132,18 @@ class _Reader(ContentHandler):
         self.open[-1].text.append(content)
 
 
+def _ill_formed(said: str, at: Place, reader: _Reader) -> tuple[str, str]:
+    """What is wrong with a text that is no XML, and what was expected."""
+    line = reader.lines[at.line - 1] if at.line <= len(reader.lines) else ""
+    closing = re.search(r"</\s*([^\s>]*)", line[max(0, at.column - 3) :])
+    inner = reader.open[-1]
+    if said == "mismatched tag" and closing and len(reader.open) > 1:
+        found = f"</{closing[1]}> where <{inner.tag}> of line {inner.places[''].line} is open"
+        return found, f"</{inner.tag}>, or <{closing[1]}> in line {inner.places[''].line}"
+    remedy = "well-formed XML: values in quotes, < written as &lt;, & as &amp;"
+    return f"{said} in <{inner.tag}>" if inner.tag else said, remedy
+
+
 def read_elements(text: str) -> Node:
     """Read the root element of a text.
 
@@ -145,7 +157,7 @@ def read_elements(text: str) -> Node:
         parseString(text.encode(), reader, forbid_dtd=True)
     except SAXParseException as error:
         at = Place(error.getLineNumber(), error.getColumnNumber() + 1)
-        raise error_at(at, error.getMessage(), "well-formed XML") from None
+        raise error_at(at, *_ill_formed(error.getMessage(), at, reader)) from None
     except DefusedXmlException as error:
         raise InputError(f"{error}", "XML without entities or a document type") from None
     except InputError:

@@ -130,14 +130,8 @@ class Solution:
 
     def _row(self, v: Variable) -> list[str]:
         error = ["-" if not math.isfinite(v.error) else f"{v.error:.2g}"] * self.squares
-        return [
-            v.name,
-            f"{v.value:.8g}",
-            *error,
-            *_ends(v),
-            v.state,
-            f"{v.reduced_gradient + 0.0:.3g}",
-        ]
+        slope = f"{v.reduced_gradient + 0.0:.3g}"
+        return [v.name, f"{v.value:.8g}", *error, *_ends(v), v.state, slope]
 
     def _variable(self, v: Variable) -> dict[str, Any]:
         kept = ("name", "lower", "upper", "state", "reduced_gradient")

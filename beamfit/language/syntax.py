@@ -17,6 +17,7 @@ MOST_OPEN, LONGEST = 60, 30
 BRACKET = re.compile(
     r"#[^\n]*|//[^\n]*|/\*.*?\*/|\"(?:\\.|[^\"\\\n])*\"|([(\[{])|([)\]}])|(/\*)", re.DOTALL
 )
+DECIMAL = re.compile(r"\d,\d")
 STARTS = """minimize maximize variable constraint solver mapping table network input output
 parameter set real function foreach forall layer connection gain in random seed weight"""
 KEYWORDS = STARTS.split()
@@ -63,7 +64,9 @@ def _at(text: str, position: int) -> Place:
 
 def explained(error: UnexpectedInput, text: str) -> InputError:
     """Say where the text stops making sense, what stands there, and what could."""
-    at = Place(error.line, error.column)
+    at, odd_at = Place(error.line, error.column), error.pos_in_stream or 0
+    if odd_at and DECIMAL.match(text, odd_at - 1):
+        return error_at(at, f"',' behind '{text[odd_at - 1]}'", "a point before decimals")
     if isinstance(error, UnexpectedCharacters):
         expected = _choices(error.allowed or ())
         odd = text[error.pos_in_stream]
@@ -81,9 +84,24 @@ def explained(error: UnexpectedInput, text: str) -> InputError:
     if error.token.type == "$END":
         at = Place(before.end_line, before.end_column) if before is not None else at
         return error_at(at, "the end of the text", _choices(accepted))
-    if word == "*" and before == "*":
-        return error_at(Place(before.line, before.column), "'**'", "'^' for powers")
-    return error_at(at, f"'{short(word)}'", _choices(accepted))
+    known = _habit(before, error.token, accepted, text) if before is not None else None
+    return known or error_at(at, f"'{short(word)}'", _choices(accepted))
+
+
+def _habit(before: Token, token: Token, accepted: set[str], text: str) -> InputError | None:
+    """What other languages write otherwise: powers, assignments, products."""
+    at, here = Place(before.line, before.column), Place(token.line, token.column)
+    behind = text[token.end_pos : token.end_pos + 1]
+    if token == "*" and before == "*":
+        return error_at(at, "'**'", "'^' for powers")
+    if token == "=" and before == "=":
+        return error_at(at, "'=='", "'=' between a name and its value")
+    if token == ":" and behind == "=" and "EQUAL" in accepted:
+        return error_at(here, "':='", "'=' between a name and its value")
+    if "MULTIPLY" in accepted and token.type in ("NAME", "NUMBER"):
+        found = f"'{short(token)}' behind '{short(before)}'"
+        return error_at(here, found, "an operator between them, such as *, or ';'")
+    return None
 
 
 def _misspelt(before: Token | None, token: Token, accepted: set[str]) -> InputError | None:

@@ -10,10 +10,16 @@ from beamfit.greybox import covariance, curvature, descend, sparsity
 from beamfit.greybox.factors import Factor, weakest
 from beamfit.greybox.problem import Free, Prior, Problem, Record
 from beamfit.greybox.solve import solve
-from beamfit.greybox.sparsity import pattern_of
+from beamfit.greybox.sparsity import pattern_of as pattern_of_program
 from beamfit.status import Status
 
 N = 12
+
+
+def pattern_of(function, at):
+    return pattern_of_program(jax.make_jaxpr(function)(at), [], len(at))
+
+
 DIFFERENCES = np.diff(np.eye(N), axis=0)
 
 FUNCTIONS = {

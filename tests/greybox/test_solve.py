@@ -195,7 +195,7 @@ SENTENCES = {
     Status.infeasible: "no point within all constraints",
     Status.not_finite: "not finite at the start",
     Status.unbounded: "falls without end",
-    Status.unidentified: "do not determine a, b;",
+    Status.unidentified: "a, b move together (a +1 %, b -1 %)",
     Status.poor_fit: "degrees of freedom",
     Status.not_converged: "the equation of y was left",
 }

@@ -122,6 +122,51 @@ def test_the_plan_is_that_of_another_solver():
     assert float(u[0]) == pytest.approx(found.x[0], abs=1e-4)
 
 
+def changing_lag(u):
+    """Raw numbers, log tau and K, of a lag and a gain that change with the input."""
+    inner = jnp.tanh(jnp.array([1.3, -0.6]) * u[0] + jnp.array([-0.9, 1.1]))
+    return jnp.array([[0.5, -0.3], [0.3, -0.4]]) @ inner + jnp.array([0.7, 1.3])
+
+
+@pytest.mark.parametrize("above", [1.2, 1.8, 2.1])
+def test_plans_of_a_process_that_changes_are_the_best_where_a_limit_binds(above):
+    """Each plan of a loop beside SLSQP's of the whole horizon, from that plan and from the last."""
+    n, process = 10, response(FIRST_ORDER, None, of=changing_lag, margin=0.0)
+    control = made(process, horizon=n, above=above + 0.5)
+    state = control.begin([0.4])
+
+    def ahead(plan, x):
+        p = jax.vmap(lambda u: FIRST_ORDER.physical(changing_lag(u), 1))(plan[:, None])
+        felt = jnp.concatenate([plan, plan[-1:]])[:, None]
+        p = jnp.concatenate([p, p[-1:]])
+        return simulate(FIRST_ORDER, p, felt, jnp.full(n + 1, 0.5), x)[1:]
+
+    def cost(plan, x, last):
+        return jnp.sum((ahead(plan, x) - above - 0.3) ** 2) + 0.1 * jnp.sum(
+            jnp.diff(plan, prepend=last) ** 2
+        )
+
+    values = jax.jit(ahead), jax.jit(jax.jacfwd(ahead)), jax.jit(jax.value_and_grad(cost))
+    last = 0.4
+    for _ in range(8):
+        x = state.x[0]
+        begin, rest = np.asarray(state.plan[:, 0]), (x, last)
+        state, u, said = control(state, [float(x[0]) + 0.5], [above + 0.8])
+        plan = np.asarray(said.inputs[:, 0])
+        rates = {"type": "ineq", "fun": lambda v, w=last: 0.3 - np.abs(np.diff(v, prepend=w))}
+        tight = {"type": "ineq", "fun": lambda v, x=x: above - np.asarray(values[0](v, x)),
+                 "jac": lambda v, x=x: -np.asarray(values[1](v, x))}  # fmt: skip
+        ends = [
+            minimize(values[2], at, rest, jac=True, method="SLSQP", bounds=[(0, 2)] * n,
+                     constraints=[rates, tight], options={"ftol": 1e-12, "maxiter": 300})
+            for at in (begin, plan)
+        ]  # fmt: skip
+        best = min(float(end.fun) for end in ends if end.success)
+        assert float(values[0](plan, x).max()) < above + 1e-6
+        assert float(values[2](plan, *rest)[0]) < best * 1.001
+        last = float(u[0])
+
+
 def test_two_outputs_meet_their_targets_by_two_inputs_and_parameters_that_change():
     def changing(u):
         return jnp.array([jnp.log(1.0 + 0.5 * jnp.tanh(u[0])), 1.0 + 0.3 * u[0], 0.3])

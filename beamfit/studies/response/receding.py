@@ -286,7 +286,13 @@ def _better(control: Controller, state: State, target: jax.Array, plan: jax.Arra
         return _planned(control, state, target, plan, jnp.asarray(slope))
     slope = jax.jacfwd(lambda each: outputs(control, state, each))(plan)
     way = _planned(control, state, target, plan, slope) - plan
+    # Second-order correction (J. Nocedal & S. Wright, Numerical Optimization, 2006, section 18.3):
+    # else a full step passes a limit by the square of its length, and only shares of it are taken.
+    bent = outputs(control, state, plan + way) - outputs(control, state, plan)
+    bent = bent - jnp.tensordot(slope, way, 2)
+    corrected = _planned(control, state, target, plan, slope, bent)
     tried = plan + jnp.array(SHARES)[:, None, None] * way
+    tried = jnp.concatenate([corrected[None], tried])
     cost = jax.vmap(lambda each: _cost(control, state, target, each))(tried)
     return tried[jnp.argmin(jnp.where(jnp.isfinite(cost), cost, jnp.inf))]
 
@@ -300,9 +306,17 @@ def _cost(control: Controller, state: State, target: jax.Array, plan: jax.Array)
 
 
 def _planned(
-    control: Controller, state: State, target: jax.Array, plan: jax.Array, slope: jax.Array
+    control: Controller,
+    state: State,
+    target: jax.Array,
+    plan: jax.Array,
+    slope: jax.Array,
+    bent: Any = 0.0,
 ) -> jax.Array:
-    """The best plan of a process that is linear; inputs and outputs in units of their scatter."""
+    """The best plan of a process that is linear; inputs and outputs in units of their scatter.
+
+    `bent` is added to the outputs that limits are held against.
+    """
     size, n = np.array([r.size for r in control.responses]), control.rest.size
     wide = np.tile(control.sizes, control.horizon)
     matrix = (slope / size[:, None, None] * control.sizes).reshape(-1, n)
@@ -313,6 +327,7 @@ def _planned(
     hessian = 2.0 * (matrix.T @ matrix + control.smooth * change.T @ change)
     gradient = 2.0 * (matrix.T @ error - control.smooth * change.T @ last)
     base = error + jnp.tile(target / size, control.horizon)
+    base = base + jnp.ravel((bent + jnp.zeros((control.horizon, len(size)))) / size)
     hard, soft = _input_rows(control, change, last), _output_rows(control, matrix, base)
     rows, room = (jnp.concatenate(each) for each in zip(hard, soft, strict=True))
     cost = np.repeat([np.inf, PENALTY], [len(hard[1]), len(soft[1])])

@@ -197,12 +197,14 @@ class QuadScan:
     columns: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        for key in ("settings", "size", "error", "shot_size"):
+        for key in ("settings", "size", "error"):
             expect(
                 getattr(self, key), Mapping, f'{{"{"Q1" if key == "settings" else "x"}": values}}'
             )
             arrays = {k: self._numbers(v, k) for k, v in getattr(self, key).items()}
             object.__setattr__(self, key, arrays)
+        shots = {k: np.asarray(v, float) for k, v in self.shot_size.items()}
+        object.__setattr__(self, "shot_size", shots)
         for key in ("screen", "slice"):
             if isinstance(getattr(self, key), str):
                 raise self.unusable(f"{key} = '{getattr(self, key)}'", "a name for each row", key)

@@ -1,0 +1,165 @@
+"""Proofs that a problem is convex, so that its optimum is the only one.
+
+By the rules of composition of convex functions, followed through the program of cost and
+constraints (M. Grant, S. Boyd & Y. Ye, in Global Optimization, L. Liberti & N. Maculan eds.,
+Springer 2006, 155), or because a cost is quadratic and its Hessian, which is then the same
+everywhere, has no negative eigenvalue. What no rule covers is not proved.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from beamfit.greybox import problem
+from beamfit.greybox.follow import followed, moves
+from beamfit.greybox.problem import Problem
+
+# Linear operations on elements.
+SUMS = {
+    "reduce_sum",
+    "cumsum",
+    "convert_element_type",
+    "copy",
+    "add",
+    "add_any",
+    "reduce_precision",
+}
+# Operations that are linear where an operand that says which or where to is known.
+PLACES = {"select_n": 0, "scatter": 1, "scatter-add": 1}
+# Functions of one affine or convex argument that are convex and do not fall, likewise for concave.
+RISING_CONVEX, RISING_CONCAVE = {"exp", "exp2", "expm1"}, {"log", "log1p", "sqrt"}
+# A Hessian's eigenvalue below zero by less than this share of the largest is rounding.
+ROUNDING = 1e-12
+
+
+class _Unknown(Exception):
+    """No rule covers an operation."""
+
+
+class Curve(NamedTuple):
+    """How every element of an array depends on the numbers.
+
+    `sign` is 0 if it is affine, 1 convex, -1 concave, None if it is not known; `degree` is that of
+    a polynomial, infinite if it is none.
+    """
+
+    sign: int | None
+    degree: float
+
+
+def convex(p: Problem) -> bool:
+    """Whether a problem is proved to be convex: a convex cost within a convex set."""
+    cost = _curve(p, problem.cost)
+    if cost is None or not (_upward(cost) or (cost.degree <= 2 and _positive(p))):
+        return False
+    if not p.constraints:
+        return True
+    limits = _curve(p, problem.constraints)
+    if limits is None:
+        return False
+    below, above = np.isfinite(p.constraint_lower).any(), np.isfinite(p.constraint_upper).any()
+    return bool(
+        limits.sign == 0
+        or limits.degree <= 1
+        or (limits.sign == 1 and not below)
+        or (limits.sign == -1 and not above)
+    )
+
+
+def _upward(curve: Curve) -> bool:
+    return curve.sign in (0, 1)
+
+
+def _positive(p: Problem) -> bool:
+    """Whether the Hessian of a quadratic cost has no negative eigenvalue."""
+    h = np.asarray(p.compiled(_hessian)(p.start))
+    if not np.all(np.isfinite(h)):
+        return False
+    values = np.linalg.eigvalsh(h)
+    return bool(values[0] >= -ROUNDING * len(h) * max(values[-1], 0.0))
+
+
+def _hessian(core, theta):
+    return jax.hessian(problem.cost, 1)(core, theta)
+
+
+def _curve(p: Problem, function) -> Curve | None:
+    """How a function of (core, theta) depends on theta; None if it is not known."""
+    program, given = p.program(function)
+    try:
+        (found,) = followed(program, [*given, Curve(0, 1.0)], _rule, Curve)
+    except _Unknown:
+        return None
+    return found if isinstance(found, Curve) else Curve(0, 0.0)
+
+
+def _rule(step, operands: list[Any]) -> list[Curve]:
+    found = _of_step(step, operands)
+    if found.sign is None and not np.isfinite(found.degree):
+        raise _Unknown
+    return [found] * len(step.outvars)
+
+
+def _of_step(step, operands: list[Any]) -> Curve:
+    name = step.primitive.name
+    numbers = [v for v in operands if isinstance(v, Curve)]
+    first, degree = numbers[0], max(v.degree for v in numbers)
+    if name in SUMS or moves(step, operands, Curve):
+        return Curve(_common([v.sign for v in numbers]), degree)
+    place = PLACES.get(name)
+    if place is not None and not isinstance(operands[place], Curve):
+        return Curve(_common([v.sign for v in numbers]), degree)
+    if name == "neg":
+        return Curve(_times(first.sign, -1), degree)
+    if name == "sub":
+        signs = [v.sign if i == 0 else _times(v.sign, -1)
+                 for i, v in enumerate(operands) if isinstance(v, Curve)]  # fmt: skip
+        return Curve(_common(signs), degree)
+    if name in ("mul", "dot_general") or (name == "div" and not isinstance(operands[1], Curve)):
+        return _product(step, operands, numbers)
+    if name in ("square", "integer_pow"):
+        power = 2 if name == "square" else step.params["y"]
+        return _power(first, power)
+    return Curve(_composed(name, numbers), np.inf)
+
+
+def _product(step, operands: list[Any], numbers: list[Curve]) -> Curve:
+    if len(numbers) == 2:
+        same = step.invars[0] is step.invars[1]
+        return Curve(1 if same and numbers[0].sign == 0 else None, sum(v.degree for v in numbers))
+    factor = np.asarray(next(v for v in operands if not isinstance(v, Curve)))
+    sign = 1 if np.all(factor >= 0) else -1 if np.all(factor <= 0) else None
+    known = numbers[0].sign
+    return Curve(0 if known == 0 else _times(known, sign), numbers[0].degree)
+
+
+def _power(v: Curve, power: int) -> Curve:
+    if power < 0:
+        return Curve(None, np.inf)
+    if power <= 1:
+        return Curve(v.sign if power else 0, v.degree * power)
+    return Curve(1 if v.sign == 0 and power % 2 == 0 else None, v.degree * power)
+
+
+def _composed(name: str, numbers: list[Curve]) -> int | None:
+    signs = {v.sign for v in numbers}
+    if name in RISING_CONVEX | {"max", "reduce_max"} and signs <= {0, 1}:
+        return 1
+    if name in RISING_CONCAVE | {"min", "reduce_min"} and signs <= {0, -1}:
+        return -1
+    if name in ("abs", "cosh") and signs == {0}:
+        return 1
+    return None
+
+
+def _common(signs: list[int | None]) -> int | None:
+    """Of a sum: that of all its terms, affine ones apart."""
+    bent = {sign for sign in signs if sign != 0}
+    return 0 if not bent else bent.pop() if len(bent) == 1 else None
+
+
+def _times(sign: int | None, factor: int | None) -> int | None:
+    return 0 if sign == 0 else None if sign is None or factor is None else sign * factor
