@@ -196,6 +196,20 @@ def test_an_archive_slower_than_the_refills_has_no_limit(interval):
         assert found.lifetime_mean.interval_95 is None
 
 
+@pytest.mark.parametrize("hours", [0.3, 0.8])
+def test_a_staircase_of_digits_is_fitted_at_its_edges(hours):
+    off = []
+    for seed in range(8):
+        time = np.linspace(0.0, hours * HOUR, 1000 + 13 * seed)
+        beam = I0 * np.exp(-time / 36000.0)
+        [decay] = study_record(DecayRecord(time, np.round(beam, 1))).decays
+        lifetime = decay.fit.lifetime_mean
+        off.append((lifetime.value - 10.0) / lifetime.error)
+        assert "edges between them were fitted" in decay.segment.notes[-1]
+        assert lifetime.relative < 1e-3
+    assert np.max(np.abs(off)) < 3.5
+
+
 def test_zeros_before_the_beam_are_no_decay():
     one = record(1)
     dark = np.append(np.zeros(40), one.current)

@@ -21,7 +21,7 @@ from beamfit.studies.decay.pooled import fit_cycles, seen_through, stands_alone
 from beamfit.studies.decay.record import DecayRecord
 from beamfit.studies.decay.segments import Event, Split, split_record
 from beamfit.studies.decay.systematics import Systematic, systematics
-from beamfit.studies.decay.thinning import thinned, without_repeats
+from beamfit.studies.decay.thinning import on_edges, thinned, without_repeats
 from beamfit.table import json_of
 
 # A setting that moves by more than this share between two readings was changed by somebody.
@@ -220,7 +220,7 @@ def study_record(
     for piece in pieces:
         offset = piece.start
         start = None if record.start is None else record.start + offset
-        segment = thinned(replace(piece, start=start))
+        segment = thinned(on_edges(replace(piece, start=start)))
         try:
             fit = fit_decay(segment, law=law)
         except InputError:
