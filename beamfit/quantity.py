@@ -11,6 +11,7 @@ __all__ = ["Quantity", "Status", "display_unit"]
 
 # 95 % of a normal distribution lie within so many standard deviations.
 NORMAL_REACH = 1.96
+MINUTE = 1 / 60  # h
 _PREFIXES = ((1.0, ""), (1e-3, "m"), (1e-6, "µ"), (1e-9, "n"), (1e-12, "p"))
 
 
@@ -124,7 +125,8 @@ class Quantity:
 
 
 def display_unit(size: float, unit: str) -> tuple[float, str]:
-    """Choose nm, µm, mm for lengths of a size; leave other units alone.
+    """Choose nm, µm, mm for lengths of a size, and s for times below a minute in hours; leave other
+    units alone.
 
     Parameters
     ----------
@@ -142,7 +144,11 @@ def display_unit(size: float, unit: str) -> tuple[float, str]:
     --------
     >>> display_unit(7e-7, "m")
     (1e-06, 'µm')
+    >>> print(Quantity(0.005, 0.0001, "h"))
+    18.00 ± 0.36 s
     """
+    if unit == "h" and 0 < size < MINUTE:
+        return 1 / 3600, "s"
     if unit != "m" or size == 0:
         return 1.0, "" if unit == "1" else unit
     factor, prefix = next((p for p in _PREFIXES if size >= 0.1 * p[0]), _PREFIXES[-1])

@@ -221,9 +221,10 @@ def _show(
     """Show every record, and what was drawn and found of all together."""
     for each in studies:
         _show_record(terminal, each)
-    names = [decay.fit.record for study in studies for decay in study.answers]
-    for name, posterior in zip(names, posteriors or (), strict=False):
-        terminal.posterior(f"Posterior of {name}", posterior)
+    fits = [decay.fit for study in studies for decay in study.answers]
+    for fit, posterior in zip(fits, posteriors or (), strict=False):
+        held = "" if fit.free_law is None else ", a and b constant"
+        terminal.posterior(f"Posterior of {fit.record}{held}", posterior)
     if shift is not None:
         _show_shift(terminal, shift)
     if trend is not None:

@@ -20,11 +20,13 @@ from beamfit.noise.correlated import log_volume, white_beside, whitened
 WHITE, CORRELATED = 0.5, 0.35
 # Correlation times, from this share of the interval between readings to so many records, and the
 # shares of the variance that are white beside: flat in the logarithm of both.
-SHORTEST, LONGEST, TIMES = 0.5, 3.0, 9
+SHORTEST, LONGEST, TIMES = 0.5, 3.0, 17
 SHARES = (0.0, 0.5, 0.9, 0.99)
 # Spectra 1/f^power. P. Dutta and P. M. Horn, Rev. Mod. Phys. 53 (1981) 497: 1/f noise of devices
 # has powers of 0.8 to 1.4; beyond 1 it is as a random walk, which `CORRELATED` has.
 POWERS = (0.4, 0.7, 1.0)
+# A verdict on the size of the noise needs correlation times as close as this many.
+CLOSE = 49
 # Stated errors are worth so many readings that tell the size of the noise: right within 25 %.
 STATED = 8.0
 # The rival to stated errors is a size flat in its logarithm, a factor 30 to either side.
@@ -40,18 +42,18 @@ class Kind(NamedTuple):
     power: float = 0.0
 
 
-def kinds_of(time: np.ndarray) -> list[Kind]:
-    """List the noises that readings at these times may have.
+def kinds_of(time: np.ndarray, count: int = TIMES) -> list[Kind]:
+    """List the noises that readings at these times may have, with so many correlation times.
 
     Examples
     --------
     >>> found = kinds_of(np.arange(100.0))
     >>> len(found), round(sum(kind.chance for kind in found), 9)
-    (40, 1.0)
+    (72, 1.0)
     """
     usual, span = float(np.median(np.diff(time))), float(time[-1] - time[0])
-    times = np.geomspace(SHORTEST * usual, LONGEST * span, TIMES)
-    each = CORRELATED / TIMES / len(SHARES)
+    times = np.geomspace(SHORTEST * usual, LONGEST * span, count)
+    each = CORRELATED / count / len(SHARES)
     memory = [Kind(each, float(t), white) for t in times for white in SHARES]
     flicker = (1.0 - WHITE - CORRELATED) / len(POWERS)
     return [Kind(WHITE), *(Kind(flicker, power=power) for power in POWERS), *memory]
@@ -113,30 +115,29 @@ class Products(NamedTuple):
     known: float
 
     @classmethod
-    def of(cls, columns: np.ndarray, time: np.ndarray, stated: bool) -> Products:
+    def of(
+        cls, columns: np.ndarray, time: np.ndarray, stated: bool, times: int = TIMES
+    ) -> Products:
         """Whiten columns, shape (n, m), of readings at increasing times, shape (n,).
 
-        Columns are in units of the stated errors where there are any.
+        Columns are in units of the stated errors where there are any; `times` is how many
+        correlation times are looked at.
 
         Examples
         --------
         >>> rows = np.random.default_rng(1).normal(size=(200, 1))
         >>> found = Products.of(rows, np.arange(200.0), stated=True)
         >>> found.matrix.shape, found.kinds[int(np.argmax(found.log_likelihood()))].white
-        ((40, 1, 1), 1.0)
+        ((72, 1, 1), 1.0)
         """
-        kinds = kinds_of(time)
+        kinds = kinds_of(time, times)
         parts = list(_whitened(kinds, columns, time))
         logs = np.array([np.log(k.chance) + v for k, (_, v) in zip(kinds, parts, strict=True)])
         matrix = np.array([rows.T @ rows for rows, _ in parts])
         return cls(kinds, logs, matrix, len(columns), STATED if stated else 0.0)
 
-    def likeliest(self, least: float, squares: np.ndarray) -> Products:
-        """Keep the noises whose probability by sums of squares, shape (k,), is no less than this
-        share of all.
-        """
-        logs = self.log_prior + self.log_size(squares)
-        kept = logs - logsumexp(logs) >= np.log(least)
+    def some(self, kept: np.ndarray) -> Products:
+        """Keep some of the noises."""
         kinds = [kind for kind, keep in zip(self.kinds, kept, strict=True) if keep]
         return self._replace(kinds=kinds, log_prior=self.log_prior[kept], matrix=self.matrix[kept])
 

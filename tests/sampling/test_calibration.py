@@ -171,7 +171,9 @@ def test_the_posterior_begins_at_the_fit(gtf):
     sigma = np.array([q.value for q in fit.x.sigma])
     np.testing.assert_allclose(stated.mode, sigma, rtol=1e-3)
     rows = np.stack([p.r11**2, 2 * p.r11 * p.r12, p.r12**2], -1)
-    near = stated.mode * (1 + 0.01 * np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 1], [-1, 0, 1]]))
+    near = stated.mode * (
+        1 + 0.01 * np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 1], [-1, 0, 1]])
+    )
     found = stated.log_probability(near)
     model = np.sqrt(near @ rows.T + p.known)
     log = ref.log_stated(p.size, model, scan.error["x"], beamfit.Noise())

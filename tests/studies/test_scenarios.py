@@ -334,7 +334,9 @@ def test_every_result_has_a_problem_to_sample(scan, gtf, with_prior, anchored):
     known = beamfit.fit_emittance(scan, gtf)
     problem = known.problem
     # By the errors found, at which the sizes of the closed form are stated.
-    off = (known.x.points.size - known.x.points.model) * (known.x.points.size + known.x.points.model)
+    off = (known.x.points.size - known.x.points.model) * (
+        known.x.points.size + known.x.points.model
+    )
     pulls = off / (2.0 * known.x.points.weighed * known.x.points.error)
     assert 2 * float(problem.cost(problem.start)) == pytest.approx(float(pulls @ pulls), rel=1e-9)
     for fit in (with_prior, anchored):

@@ -13,7 +13,7 @@ import numpy as np
 from beamfit.greybox.memory import Memory, Whitened, remembered
 from beamfit.lifetime.decay import HOUR
 from beamfit.noise.correlated import remembers
-from beamfit.noise.memory import Products
+from beamfit.noise.memory import CLOSE, Products
 from beamfit.quantity import Quantity
 from beamfit.shown import shown
 from beamfit.statistics import reach_of
@@ -385,7 +385,7 @@ class Evidence(Weighed):
     def stated_odds(self) -> float:
         """Log odds that the stated errors are right, whatever memory the noise has."""
         columns = np.column_stack([self.about.residuals, self.about.rows])
-        products = Products.of(columns, self.record.time, stated=True)
+        products = Products.of(columns, self.record.time, stated=True, times=CLOSE)
         rest, rows = products.matrix[:, :1, 1:], products.matrix[:, 1:, 1:]
         step = np.linalg.solve(rows, np.swapaxes(rest, 1, 2))
         squares = products.matrix[:, 0, 0] - (rest @ step)[:, 0, 0]

@@ -144,6 +144,8 @@ class DecayFit:
     ) -> Posterior:
         """Draw I0, a and b from their posterior, flat above zero; lifetimes are derived.
 
+        a and b are constant in it, as in `exact`, also where the errors of the fit contain more.
+
         Parameters
         ----------
         noise : {"known", "inferred"}, optional

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -171,29 +171,44 @@ def _outliers(table: LifetimeTable) -> np.ndarray:
     return ~kept
 
 
-def _bends_alone(table: LifetimeTable, kept: np.ndarray, power: np.ndarray) -> int | None:
-    """The point that lies off the constant law of the others, if that law without it is likelier
-    than an exponent with it (`power` has its residuals), as where it stands at an end.
+class _Off(NamedTuple):
+    """The point farthest off the constant law of the others, by so many errors squared, and the sum
+    of squares without it.
+    """
 
-    By residuals of each point from the others (R. D. Cook and S. Weisberg, Residuals and influence
-    in regression, 1982, eq. 2.2.8), in the loss rates, which are linear in the current.
+    point: int
+    squared: float
+    rest: float
+
+
+def _farthest_off(table: LifetimeTable, kept: np.ndarray) -> _Off:
+    """By residuals of each point from the others (R. D. Cook and S. Weisberg, Residuals and
+    influence in regression, 1982, eq. 2.2.8), in the loss rates, which are linear in the current.
     """
     rows = np.flatnonzero(kept)
-    current, lifetime = table.current[rows], table.lifetime[rows]
-    given, count = table.error is not None, rows.size
-    error = table.error[rows] if given else np.full(count, np.median(lifetime))
-    columns = np.column_stack([current / current.mean(), np.ones(count)])
+    current, lifetime, given = table.current[rows], table.lifetime[rows], table.error is not None
+    error = table.error[rows] if given else np.full(rows.size, np.median(lifetime))
+    columns = np.column_stack([current / current.mean(), np.ones(rows.size)])
     basis = np.linalg.qr(columns * (lifetime**2 / error)[:, None])[0]
     rates = lifetime / error
     left, free = rates - basis @ (basis.T @ rates), 1 - np.sum(basis**2, axis=1)
     falls = left**2 / np.maximum(free, 1e-12)
-    whole, worst = float(left @ left), int(np.argmax(falls))
-    rest, dof = max(whole - falls[worst], 1e-300), count - 3
-    unit = 1.0 if given else rest / dof
-    with_power = max(float(power[rows] @ power[rows]), 1e-300)
-    better = with_power - rest if given else dof * math.log(with_power / rest)
+    worst = int(np.argmax(falls))
+    rest = max(float(left @ left - falls[worst]), 1e-300)
+    unit = 1.0 if given else rest / max(rows.size - 3, 1)
+    return _Off(int(rows[worst]), float(falls[worst]) / unit, rest)
+
+
+def _bends_alone(table: LifetimeTable, kept: np.ndarray, power: np.ndarray) -> int | None:
+    """The point that lies off the constant law of the others, if that law without it is likelier
+    than an exponent with it (`power` has its residuals), as where it stands at an end.
+    """
+    off, count = _farthest_off(table, kept), int(kept.sum())
+    squares = max(float(power[kept] @ power[kept]), 1e-300)
+    given = table.error is not None
+    better = squares - off.rest if given else (count - 3) * math.log(squares / off.rest)
     likelier = better > 2 * math.log(count / BAD)
-    return int(rows[worst]) if falls[worst] > OUTLIER**2 * unit and likelier else None
+    return off.point if off.squared > OUTLIER**2 and likelier else None
 
 
 def _tested(table: LifetimeTable, plain: Fit, power: Fit) -> ConstantA:
@@ -255,6 +270,12 @@ def fit_lifetimes(table: LifetimeTable) -> LifetimeFit:
         None if given else group.scale * usual / HOUR,
     )  # fmt: skip
     finding, far = finding_of_table(evidence), _reach(table, plain)
+    off = _farthest_off(table, ~left_out)
+    if off.squared > OUTLIER**2:
+        [named] = _named(table, np.arange(len(table)) == off.point)
+        more = f"{named[0].upper()}{named[1:]} lies {math.sqrt(off.squared):.2g} errors off the"
+        more += " constant law of the others: measure it again"
+        finding = finding._replace(cause=f"{finding.message} {more}.")
 
     def quantity(name: str, raw: float | None = None) -> Quantity:
         value, error = numbers[name]

@@ -177,6 +177,10 @@ class Seen:
         products = Products.of(rows, time, error is not None)
         return cls(products, start, origin, gas, ends, record.gauge is None)
 
+    def of_noises(self, kept: np.ndarray) -> Seen:
+        """The same with some of the noises."""
+        return replace(self, products=self.products.some(kept))
+
     def left(self, numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Sums of squares (k, m) by noise and set of numbers, and products with node columns."""
         away = Numbers.of(numbers).currents(self.gas) - self.origin
@@ -263,13 +267,14 @@ def _searched(seen: Seen, numbers: np.ndarray, free: list[int]) -> Peaks:
     return _expanded(seen, numbers, free)
 
 
-def _by_exponent(seen: Seen, free: list[int]) -> Peaks:
-    """Expansions at exponents that hold the posterior, found in ever narrower ranges."""
+def _by_exponent(seen: Seen, free: list[int]) -> tuple[Seen, Peaks]:
+    """Expansions at exponents and by noises that hold the posterior, in ever narrower ranges."""
     low, high, numbers = LEAST, MOST, np.tile(seen.start, (1, EXPONENTS))
     for _ in range(RANGES):
         power = np.linspace(low, high, EXPONENTS)
         numbers = np.vstack([numbers[:3], power, numbers[4]])
         found = _searched(seen, numbers, free)
+        seen = seen.of_noises(found.log.max(axis=1) > found.log.max() - FAR)
         whole = logsumexp(found.log, axis=0)
         held = np.flatnonzero(whole > whole.max() - FAR)
         ends = max(held[0] - 1, 0), min(held[-1] + 1, EXPONENTS - 1)
@@ -278,7 +283,7 @@ def _by_exponent(seen: Seen, free: list[int]) -> Peaks:
         low, high = power[ends[0]], power[ends[1]]
         at = np.linspace(low, high, EXPONENTS)
         numbers = np.array([np.interp(at, power, row) for row in found.numbers])
-    return found
+    return seen, _expanded(seen, found.numbers, free)
 
 
 class Draws(NamedTuple):
@@ -293,7 +298,7 @@ class Draws(NamedTuple):
 def drawn(seen: Seen, free: list[int]) -> Draws:
     """Draw the free numbers from their posterior; more of them where they are worth too few."""
     if 3 in free:
-        peaks = _by_exponent(seen, free[:3] + free[4:])
+        seen, peaks = _by_exponent(seen, free[:3] + free[4:])
     else:
         peaks = _searched(seen, seen.start, free)
     found = _drawn(seen, peaks, DRAWS[0])

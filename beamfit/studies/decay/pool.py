@@ -28,6 +28,8 @@ OUTLIER, SHARE = 7.0, 0.2
 # Errors of the mean by which readings at the edges of cycles lie off the law where they are of an
 # injection: what stays below moves the lifetime by no more than its error.
 EDGE, WITHIN = 2.5, "they lie within injections"
+# Readings from the edge inwards that tell whether the edge lies off.
+NEXT = 9
 SEARCH = 30
 
 
@@ -196,17 +198,20 @@ def _far(values: np.ndarray) -> np.ndarray:
 
 
 def _edges(pool: Pool) -> np.ndarray:
-    """How far the first and the last readings of all cycles lie above the law, in errors of their
-    mean: fresh beam decays faster, and a reading within an injection lies below.
+    """How far the first and the last readings of all cycles lie above the law, beside those next to
+    them, in errors: fresh beam decays faster, and a reading within an injection lies below.
     """
     first, lengths = pool.cycles.first, pool.cycles.lengths
-    long = lengths > 3 * FEWEST_READINGS
+    long = lengths > NEXT
     ends = np.array([first[long], (first + lengths - 1)[long]])
     if ends.shape[1] < FEWEST_CYCLES:
         return np.zeros(2)
-    scatter = max(1.4826 * float(np.median(np.abs(pool.left[:, 3]))), 1e-300)
-    off = np.clip(-pool.left[ends, 3] / scatter, -OUTLIER, OUTLIER)
-    return off.mean(axis=1) * math.sqrt(ends.shape[1])
+    off = -pool.left[:, 3]
+    scatter = max(1.4826 * float(np.median(np.abs(off))), 1e-300)
+    inward = np.array([[1], [-1]])[..., None] * np.arange(1, NEXT)
+    beside = off[ends] - off[ends[..., None] + inward].mean(axis=2)
+    beside = np.clip(beside / scatter, -OUTLIER, OUTLIER)
+    return beside.mean(axis=1) * math.sqrt(ends.shape[1] / (1 + 1 / (NEXT - 1)))
 
 
 def _trimmed(pool: Pool) -> tuple[Pool, list[str]]:
@@ -217,7 +222,7 @@ def _trimmed(pool: Pool) -> tuple[Pool, list[str]]:
         high += int(edges[0] > EDGE)
         keep = np.ones(pool.cycles.time.size, bool)
         first, lengths = pool.cycles.first, pool.cycles.lengths
-        long = lengths > 3 * FEWEST_READINGS
+        long = lengths > NEXT
         for side, ends in enumerate((first, first + lengths - 1)):
             keep[ends[long]] &= not far[side]
         pool, cut = solved(pool.cycles.kept(keep)), cut + far
@@ -236,7 +241,7 @@ def _trimmed(pool: Pool) -> tuple[Pool, list[str]]:
 
 def cleaned(cycles: Cycles) -> tuple[Pool, tuple[str, ...]]:
     """The fit without readings, edges of cycles and cycles that are not of the decay."""
-    pool, said = _trimmed(solved(cycles))
+    said, pool = [], solved(cycles)
     departure, error = _per_cycle(pool)
     cut = np.repeat(_far(departure / error), pool.cycles.lengths)
     if cut.any():
@@ -245,6 +250,8 @@ def cleaned(cycles: Cycles) -> tuple[Pool, tuple[str, ...]]:
         left = before - pool.cycles.first.size
         were = "cycle was" if left == 1 else "cycles were"
         said.append(f"{left} {were} left out, whose loss rate lies far off the others'")
+    pool, edges = _trimmed(pool)
+    said = edges + said
     if (lone := _far(pool.left[:, 3])).any():
         said.append(f"{int(lone.sum())} readings were left out as outliers")
         pool = solved(pool.cycles.kept(~lone))

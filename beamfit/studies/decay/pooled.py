@@ -23,9 +23,10 @@ from beamfit.studies.decay.departures import (
     LifetimeLaw,
     constant_a,
 )
-from beamfit.studies.decay.evidence import SEPARABLE, Weighed
+from beamfit.studies.decay.evidence import NORMAL, SEPARABLE, Weighed
 from beamfit.studies.decay.fit import DecayFit
 from beamfit.studies.decay.law import Expansion, Physical, lifetime_of, power_rates
+from beamfit.studies.decay.marginal import BELOW, Law
 from beamfit.studies.decay.monitor import Monitor
 from beamfit.studies.decay.pool import (
     FEWEST_CYCLES,
@@ -89,9 +90,10 @@ class PooledEvidence(Weighed):
     raw: Physical
     reach: Physical
     constant_a: ConstantA
+    law: Law = Law.constant
 
     @classmethod
-    def of(cls, pool: Pool) -> PooledEvidence:
+    def of(cls, pool: Pool, law: Law = Law.constant) -> PooledEvidence:
         """Weigh a fit, with the noise's memory where it has one."""
         given, parameters = float(pool.cycles.error is not None), pool.level.size + 2
         known = None if is_correlated(pool.left[:, 3], parameters) else 0.0
@@ -105,9 +107,37 @@ class PooledEvidence(Weighed):
         moved_values = Physical(*(np.array(values) + moved.shift))
         found = cls(
             pool, held, seen.memory(), known, moved_values, Physical(*moved.error), Physical(*raw),
-            Physical(*moved.reach), constant_a(math.nan, math.inf, math.inf, math.nan),
+            Physical(*moved.reach), constant_a(math.nan, math.inf, math.inf, math.nan), law,
         )  # fmt: skip
         return replace(found, constant_a=found.tested()) if found.separability.separable else found
+
+    @cached_property
+    def bending(self) -> Physical | None:
+        """How far an exponent of a within its prior moves the values, beside what the cycles tell
+        of it; None where the law is known, or a and b are one number.
+
+        The exponent is normal, `BELOW` wide to either side, and its error beside the other numbers
+        is combined with that.
+        """
+        if self.law is Law.constant or not self.separability.separable:
+            return None
+        seen = self.power.moments(np.eye(3)[2:], float(not self.noise_inferred)).error[0]
+        size = 1 / math.hypot(1 / BELOW, 1 / seen)
+        rows = self.pool.left[:, :3]
+        step = np.linalg.lstsq(rows[:, :2], -size * rows[:, 2], rcond=None)[0]
+        return Physical(*np.abs(_slopes(self.pool)[1] @ np.append(step, size)))
+
+    def widely(self, name: str, exact: Quantity) -> Quantity:
+        """A quantity with an exponent of a that the cycles leave open."""
+        if self.bending is None or exact.error is None or self.refuted:
+            return exact
+        moved = float(getattr(self.bending, name.replace("lifetime", "rate")))
+        moved *= HOUR * exact.value**2 if name.startswith("lifetime") else 1.0
+        reaches = (np.hypot(exact.value - exact.interval_95[0], NORMAL * moved),
+                   np.hypot(exact.interval_95[1] - exact.value, NORMAL * moved))  # fmt: skip
+        interval = exact.value - float(reaches[0]), exact.value + float(reaches[1])
+        error = math.hypot(exact.error, moved)
+        return Quantity(exact.value, error, exact.unit, exact.error_raw, interval)
 
     def tested(self) -> ConstantA:
         """Whether a constant a is refuted, by an exponent beside the other numbers."""
@@ -209,6 +239,11 @@ class PooledEvidence(Weighed):
         """Whether the loss rate is not the same all along the record."""
         return self.parts[0] < REJECTED
 
+    @property
+    def refuted(self) -> bool:
+        """Whether the cycles contradict one constant a and b."""
+        return self.changed or self.constant_a.status is Status.poor_fit
+
     @cached_property
     def lifetimes(self) -> LifetimeLaw | None:
         """The lifetime by current, where the currents are wide enough apart to tell."""
@@ -296,7 +331,9 @@ def cycle_lifetimes(fit: DecayFit) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return at[seen], 1 / rate[seen] / HOUR, (error / rate**2)[seen] / HOUR
 
 
-def fit_cycles(cycles: Sequence[DecayRecord], name: str = "cycles") -> DecayFit:
+def fit_cycles(
+    cycles: Sequence[DecayRecord], name: str = "cycles", law: Law | str = Law.free
+) -> DecayFit:
     """Fit one a and one b to many cycles, as of top-up, each with an own current at its start.
 
     Parameters
@@ -306,6 +343,8 @@ def fit_cycles(cycles: Sequence[DecayRecord], name: str = "cycles") -> DecayFit:
         `start`, where all have it, says how far apart they lie.
     name : str, optional
         What to call them together.
+    law : {"free", "constant"}
+        Whether a may go as a power of the current, which errors of a and b then contain.
 
     Returns
     -------
@@ -341,16 +380,16 @@ def fit_cycles(cycles: Sequence[DecayRecord], name: str = "cycles") -> DecayFit:
         if len(cycle) < FEWEST_READINGS:
             found, expected = f"{len(cycle)} readings", f"{FEWEST_READINGS} or more in a cycle"
             raise InputError(found, expected, path=cycle.name)
-    return fit_pieces(cycles, name)
+    return fit_pieces(cycles, name, Law(law))
 
 
-def fit_pieces(cycles: Sequence[DecayRecord], name: str) -> DecayFit:
+def fit_pieces(cycles: Sequence[DecayRecord], name: str, law: Law = Law.constant) -> DecayFit:
     """As `fit_cycles`, also of two, such as before and after a refill or a gap."""
     gathered = averaged(cycles)
     if np.any(np.diff(gathered.time) <= 0):
         raise InputError("a cycle before the end of the one before", "an order in time", path=name)
     pool, left_out = cleaned(gathered)
-    evidence, monitor = PooledEvidence.of(pool), cycles[0].monitor
+    evidence, monitor = PooledEvidence.of(pool, law), cycles[0].monitor
     if monitor is not None:
         evidence = evidence.with_monitor(monitor)
     finding = finding_of_cycles(evidence, monitor, left_out)

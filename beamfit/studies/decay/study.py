@@ -21,7 +21,7 @@ from beamfit.studies.decay.pooled import fit_cycles, seen_through, stands_alone
 from beamfit.studies.decay.record import DecayRecord
 from beamfit.studies.decay.segments import Event, Split, split_record
 from beamfit.studies.decay.systematics import Systematic, systematics
-from beamfit.studies.decay.thinning import thinned, without_repeats
+from beamfit.studies.decay.thinning import on_edges, thinned, without_repeats
 from beamfit.table import json_of
 
 # A setting that moves by more than this share between two readings was changed by somebody.
@@ -122,7 +122,7 @@ def at_settings(segment: DecayRecord) -> list[DecayRecord]:
 
 
 def _pooled(
-    cycles: Sequence[DecayRecord], name: str, machine: Machine | None
+    cycles: Sequence[DecayRecord], name: str, machine: Machine | None, law: Law
 ) -> tuple[list[Decay], list[DecayRecord]]:
     """Cycles at the same settings together, and those of them that also stand alone."""
     groups, pooled, alone = alike(cycles), [], []
@@ -132,7 +132,7 @@ def _pooled(
             alone += [cycle for cycle in group if len(cycle) >= SHORTEST]
             continue
         called = name if many == 1 else f"{name}@{len(pooled) + 1}"
-        fit = seen_through(fit_cycles(group, called), *usual_cycle(group))
+        fit = seen_through(fit_cycles(group, called, law), *usual_cycle(group))
         segment = joined(group, called)
         pooled.append(Decay.of(segment, segment.start, fit, machine))
         alone += [c for c in group if len(c) >= SHORTEST and stands_alone(c, fit)]
@@ -207,11 +207,11 @@ def study_record(
     ['10.000 h', '10.000 h']
     """
     expect(record, DecayRecord, "beamfit.read_decay_record(path)")
-    record = without_repeats(record)
+    record, law = without_repeats(record), Law(law) if machine is None else Law.constant
     # Segments move `start` with them: counted from zero it is their place in the record.
     placed = replace(record, start=0.0)
     cycles, events = _refilled(placed)
-    pooled, pieces = _pooled(cycles, record.name, machine)
+    pooled, pieces = _pooled(cycles, record.name, machine, law)
     if not pooled:
         pieces, events = _decays(placed)
     if len(pieces) > 1:
@@ -221,9 +221,9 @@ def study_record(
     for piece in pieces:
         offset = piece.start
         start = None if record.start is None else record.start + offset
-        segment = thinned(replace(piece, start=start))
+        segment = thinned(on_edges(replace(piece, start=start)))
         try:
-            fit = fit_decay(segment, law=law if machine is None else Law.constant)
+            fit = fit_decay(segment, law=law)
         except InputError:
             # A record that does nothing but rise is an error; a slow refill within one is not.
             if len(pieces) == 1 and not pooled:

@@ -104,7 +104,7 @@ def systematics(fit: DecayFit) -> tuple[Systematic, ...]:
         lifetime = -moved.rate_mean / rate**2 / HOUR
         found.append(Systematic(cause, moved.a, moved.b, lifetime))
     gas = max(b, 0.0) * FOLLOWING / (1 - FOLLOWING)
-    said = f"{100 * FOLLOWING:g} % of the gas pressure follows the current (part of a then)"
+    said = f"{100 * FOLLOWING:g} % of the pressure follows the current"
     return (*found, Systematic(said, gas / fit.mean_current, -gas, 0.0))
 
 

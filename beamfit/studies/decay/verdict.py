@@ -223,6 +223,17 @@ def _determined(e: Weighed | TableEvidence) -> Finding:
     return Finding(Status.converged, f"{clear}{limits}")
 
 
+def _bending(e: Weighed) -> Finding | None:
+    """Cycles whose a and b contain an exponent of a."""
+    if e.bending is None:
+        return None
+    exact = " and ".join(f"{name} is {e.quantity(name, True)}" for name in "ab")
+    found = _determined(e)
+    return found._replace(
+        cause=f"{found.cause}, with an exponent of a left open. If a is constant, {exact}"
+    )
+
+
 def _freely(e: Evidence) -> Finding | None:
     """Both with the exponent and the drift of b that the record leaves open."""
     if e.free is None:
@@ -322,7 +333,7 @@ def _rises(e: Weighed) -> Finding | None:
 
 
 CYCLE_RULES = (_rises, *NEGATIVE, _within_noise, _parts_differ, _refuted)
-CYCLE_RULES += (_one_current, _improbable, _determined)
+CYCLE_RULES += (_one_current, _improbable, _bending, _determined)
 
 
 def finding_of_cycles(
