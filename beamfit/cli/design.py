@@ -29,8 +29,8 @@ Examples:
 
 @click.command(epilog=EXAMPLE)
 @options(
-    "scan columns ignore skip-bad lattice use from to screen energy noise scenario prior bounds gain "
-    "anchor vary"
+    "scan columns ignore skip-bad lattice use from to screen energy noise scenario prior bounds "
+    "gain anchor vary"
 )
 @option("--energies MEV,MEV", "Further energies the beam can be had at.", default="")
 @option(

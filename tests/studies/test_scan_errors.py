@@ -11,7 +11,6 @@ import beamfit
 from beamfit.optics.beam import BeamMatrix
 from beamfit.optics.particle import beta_gamma
 from beamfit.quantity import Status
-
 from tests.studies.conftest import TABLE_2, design, scan_of
 
 BEAM = BeamMatrix.from_twiss(1e-6 / 264.1865, 5.5, 5.3)
