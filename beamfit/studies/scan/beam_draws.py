@@ -172,7 +172,10 @@ def draw_beams(c: Coordinates, kind: Kind, noise: Noise) -> BeamDraws:
         _log_likelihood(centre, c, kind, scales.scale, noise), scales.log_weight[..., None, :]
     )
     found = np.where(np.isfinite(found), found, -np.inf)
-    top = np.argsort(found, axis=-1)[..., -PARTS:]
+    # In their own order: which of two equals is the better, rounding would decide.
+    top = np.sort(np.argsort(found, axis=-1)[..., -PARTS:], axis=-1)
+    first = np.argmax(found, axis=-1)[..., None, None]
+    likeliest = np.take_along_axis(centre, first, -2)[..., 0, :]
     share = np.exp(FLATTER * (np.take_along_axis(found, top, -1) - found.max(-1, keepdims=True)))
     share /= share.sum(-1, keepdims=True)
     centre = np.take_along_axis(centre, top[..., None], -2)
@@ -187,9 +190,8 @@ def draw_beams(c: Coordinates, kind: Kind, noise: Noise) -> BeamDraws:
     weight = averaged(each, scales.log_weight[..., None, :]) + drawn + kind.log_weight
     weight = np.where(np.isnan(weight), -np.inf, weight)
     by_scale = averaged(np.swapaxes(each, -1, -2), drawn[..., None, :])
-    return BeamDraws(
-        x, weight, scales, by_scale, centre[..., -1, :], found.max(-1) + kind.log_weight
-    )
+    top_log = found.max(-1) + kind.log_weight
+    return BeamDraws(x, weight, scales, by_scale, likeliest, top_log)
 
 
 def log_prior(x: np.ndarray) -> np.ndarray:
