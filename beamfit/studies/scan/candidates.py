@@ -56,6 +56,8 @@ def information_of(fit: EmittanceFit) -> Information:
     """
     p, theta = fit.problem, linearised_at(fit)
     jacobian = assess.slopes(p, theta).residual_jacobian
+    if fit.solved is None:
+        jacobian = jacobian / _beyond_linear(fit)[:, None]
     held = p.lower == p.upper
     if fit.solved is not None and _determined(fit):
         edge = np.array([v.state in ("lower", "upper") for v in fit.fit.variables])
@@ -69,6 +71,21 @@ def information_of(fit: EmittanceFit) -> Information:
         held,
         np.isin(np.array(p.names), [prior.name for prior in p.priors]),
     )
+
+
+def _beyond_linear(fit: EmittanceFit) -> np.ndarray:
+    """The error that a fit quotes over that of linear theory, for each row of known transport."""
+    factors = []
+    for record in fit.problem.records:
+        plane = fit[record.data.plane]
+        post, factor = fit.seen.works[plane.plane].posterior, 1.0
+        if plane.emittance.error is not None:
+            s11, s12, s22 = post.best
+            slope = np.array([s22, -2.0 * s12, s11]) / (2.0 * np.sqrt(s11 * s22 - s12**2))
+            linear = float(np.sqrt(slope @ post.covariance @ slope))
+            factor = plane.emittance.error / linear
+        factors.append(np.full(record.measured.size, factor))
+    return np.concatenate(factors)
 
 
 def linearised_at(fit: EmittanceFit) -> np.ndarray:
