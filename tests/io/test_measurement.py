@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 
 from beamfit.errors import InputError
 from beamfit.io.measurement import read_quad_scan
+from beamfit.noise.shots import evened
 
 PLAIN = "Q_kG,size_x_um,size_x_error_um\n-4,111.5,1.5\n-3,60,0.5\n-1,104,1\n"
 
@@ -140,10 +141,10 @@ def test_shots_even_out_over_the_settings(read):
     relative, freedom = own / [102, 50, 81] * np.sqrt([2, 2, 3]), np.array([1, 1, 2])
     together = freedom @ relative**2 / freedom.sum()
     shrunken = np.sqrt((20 * together + freedom * relative**2) / (20 + freedom))
-    noise = noise_of(scan, "x")
-    expected = 1e-6 * shrunken * [102, 50, 81] / np.sqrt([2, 2, 3])
-    np.testing.assert_allclose(noise.error, expected, rtol=1e-12)
-    assert noise.dof == 4
+    expected = 1e-12 * (shrunken * [102, 50, 81]) ** 2
+    found = evened(scan.error["x"] ** 2 * [2, 2, 3] * freedom, 1.0 * freedom, scan.size["x"])
+    np.testing.assert_allclose(found, expected, rtol=1e-12)
+    np.testing.assert_allclose(scan.shot_size["x"][0, :2], [100e-6, 104e-6])
 
 
 def test_repeats_that_differ_far_more_than_others_are_not_averaged(read):
@@ -170,11 +171,10 @@ def test_errors_of_the_file_are_no_scatter_of_two_shots(read):
     """One setting of five was met twice: its errors are averaged, and worth what was stated."""
     rows = ["0,1,200,4", "1,1,150,3", "1,2,152,3", "2,1,100,2", "3,1,140,3", "4,1,190,4"]
     scan = read("\n".join(["Q_A,shot,size_x_um,size_x_error_um", *rows]))
-    noise = noise_of(scan, "x")
-    assert noise.dof == np.inf
-    assert noise.words == "given"
     stated = 1e-6 * np.array([4, 3 / np.sqrt(2), 2, 3, 4])
-    np.testing.assert_allclose(noise.error, stated, rtol=1e-12)
+    np.testing.assert_allclose(scan.error["x"], stated, rtol=1e-12)
+    assert scan.shots is None
+    assert "x" not in scan.shot_size
 
 
 def test_shots_of_another_screen_or_energy_are_not_averaged(read):

@@ -9,7 +9,7 @@ import math
 import numpy as np
 from scipy.stats import multivariate_t, norm
 
-GRID = 120
+GRID = 80
 
 
 def log_normal(off, deviation):
@@ -138,7 +138,7 @@ def log_process(x, kernels, deviation, weight):
 
 
 def log_prior(rows, size, sigma):
-    """Of beams, shape (d, 3): any emittance alike that the mean square over the scan leaves room for.
+    """Of beams, shape (d, 3): even in the emittance, as far as the mean square leaves it room.
 
     The mean of what the beam adds to size² over size² itself is T = tr(M σ), known within a factor
     e; given T the emittance is at most T/2 det(M)^-½. In the coordinates in which M is 1, σ has
@@ -153,7 +153,7 @@ def log_prior(rows, size, sigma):
     return np.where(beam, norm.logpdf(log) + even - 3.0 * log, -np.inf)
 
 
-def weighted_beams(rows, size, known, log_likelihood, centre, covariance, number=30_000, seed=1):
+def weighted_beams(rows, size, known, log_likelihood, centre, covariance, number=16_000, seed=1):
     """Beams and their weights in the posterior: drawn widely about a centre, and weighed.
 
     ``rows`` (n, 3) give size² - ``known`` of σ; ``log_likelihood`` takes models of shape (d, n).
@@ -195,7 +195,7 @@ def log_evidence_of_beam(rows, size, known, log_likelihood, centre, covariance, 
     return log_sum(log) - math.log(number) + np.log(size).sum()
 
 
-def log_evidence_of_flat_beam(rows2, size, known, log_likelihood, turn, side=240):
+def log_evidence_of_flat_beam(rows2, size, known, log_likelihood, turn, side=100):
     """A line in phase space, by sums over its direction and the logarithm of its length²."""
     angle = (np.arange(side) + 0.5) * math.pi / side
     level = np.linspace(-4.0, 3.0, side)
@@ -210,7 +210,7 @@ def log_evidence_of_flat_beam(rows2, size, known, log_likelihood, turn, side=240
 def log_evidence_of_constant(size, deviation, weight, noise, usual):
     """One size for all, known to a factor e: sums over it and over the noise, in ln size."""
     x = np.log(size / np.exp(np.log(size).mean()))
-    level, step = np.linspace(-1.5, 1.5, 3001, retstep=True)
+    level, step = np.linspace(-1.5, 1.5, 601, retstep=True)
     parts = [
         math.log(w) + log_readings(x - level[:, None], sd, noise, usual)
         for sd, w in zip(deviation, weight, strict=True)

@@ -67,8 +67,9 @@ def median(fit):
     return weighted_quantiles(own, post.weight[post.weight > 0], (0.5,))[0]
 
 
-@pytest.mark.parametrize("n", CURRENTS)
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize(
+    ("kind", "n"), [("stated", 5), ("share", 9), ("shots", 9), ("none", 5)]
+)
 def test_it_is_the_one_written_out(gtf, scan_of_kind, kind, n):
     """Ends of the intervals of the emittance, the draws and the reference each with its scatter."""
     fit = beamfit.fit_emittance(scan_of_kind(kind, n), gtf)
@@ -83,7 +84,7 @@ def test_it_is_the_one_written_out(gtf, scan_of_kind, kind, n):
     assert abs(q.value - middle) < half  # the best fit, of the same posterior
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", ["stated", "none"])
 def test_the_sampler_draws_from_it(gtf, scan_of_kind, kind):
     """Median and 95 % of emcee to 0.1 errors."""
     fit = beamfit.fit_emittance(scan_of_kind(kind, 9), gtf)
@@ -119,7 +120,7 @@ def brute_probabilities(fit, kind, noise):
     post = fit.seen.works["x"].posterior
     log = likelihood(kind, size, error, noise)
     drawn = rows, size, p.known, log, post.best, covariance, turn
-    beam = ref.log_evidence_of_beam(*drawn, number=15_000)
+    beam = ref.log_evidence_of_beam(*drawn, number=5000)
     # Noise that is a share of the size would vanish where such a beam does: of what was measured.
     own = {"share": "stated", "none": "same"}.get(kind, kind)
     log = likelihood(own, size, error, noise)

@@ -98,7 +98,7 @@ def test_size_fit_is_where_scipy_finds_the_largest_likelihood(gtf, gtf_sizes):
 @pytest.mark.parametrize("method", ["size_squared", "size"])
 def test_with_stated_errors_and_no_bad_reading_it_is_weighted_least_squares(gtf, gtf_sizes, method):
     """No reading may be bad; one factor for all errors moves nothing."""
-    currents, rows, sizes = gtf_sizes
+    currents, _, sizes = gtf_sizes
     size = sizes * (1.0 + 0.005 * np.resize([1.0, -1.0, -1.0, 1.0], 14))
     error = 0.02 * sizes
     scan = beamfit.QuadScan({"Q2": currents}, {"Q2": "A"}, {"x": size}, {"x": error})

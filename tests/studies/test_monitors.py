@@ -184,7 +184,10 @@ def test_three_monitors_give_values_and_say_that_nothing_tests_them():
     step = 1e-5 * size
     slopes = [(emittance(size + d) - emittance(size - d)) / (2 * d.sum()) for d in np.diag(step)]
     assert fit.emittance.value == pytest.approx(emittance(size), rel=1e-9)
-    assert fit.emittance.error == pytest.approx(np.hypot.reduce(slopes * error), rel=1e-6)
+    linear = np.hypot.reduce(slopes * error)
+    assert fit.emittance.error_raw == pytest.approx(linear, rel=1e-6)
+    # Nothing tests the errors, which may be too small: by their prior, and so the error is larger.
+    assert linear < fit.emittance.error < 2.0 * linear
 
 
 def test_three_monitors_without_errors_and_three_settings_of_a_magnet_are_refused():

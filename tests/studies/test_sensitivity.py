@@ -36,8 +36,9 @@ def test_budget_is_the_slope_of_a_refit(gtf, gtf_sizes, method):
         "drift D2 +1 cm",
         "energy +1 %",
         "screen scale +1 %",
-        "resolution of 10 µm more",
-        "dispersion of 1 cm more (spread 0.1 %)",
+        "screen resolution 10 µm larger",
+        "dispersion 1 cm larger (spread 0.1 %)",
+        "smallest size 5 % too large (saturation, space charge)",
     }
     sizes_of = [abs(c.normalized_emittance) for c in changes.values()]
     assert sizes_of == sorted(sizes_of, reverse=True)
@@ -113,13 +114,17 @@ def test_the_screen_in_the_budget_is_the_slope_of_a_refit(gtf, gtf_sizes, weight
     added = 1e-13  # m²
     ends = [gtf.with_element(Screen("SCREEN", float(np.sqrt(4e-10 + s)))) for s in (added, -added)]
     slope = (emittance(scan, ends[0]) - emittance(scan, ends[1])) / (2 * added)
-    assert changes["resolution of 10 µm more"] == pytest.approx(1e-10 * slope, rel=1e-5)
+    assert changes["screen resolution 10 µm larger"] == pytest.approx(1e-10 * slope, rel=1e-5)
+    # What makes the smallest size 5 % too large is in every size², as a resolution is.
+    waist = changes["smallest size 5 % too large (saturation, space charge)"]
+    at_waist = (1.05**2 - 1.0) * scan.size["x"].min() ** 2
+    assert waist == pytest.approx(at_waist * slope, rel=1e-5)
     p = fit.x.points
     more = (p.r11 * 0.01 * 1e-3) ** 2
     h = 1e-3
     rows = [replace(scan, resolution=np.sqrt(4e-10 + s * more)) for s in (h, -h)]
     slope = (emittance(rows[0], blurred) - emittance(rows[1], blurred)) / (2 * h)
-    cause = "dispersion of 1 cm more (spread 0.1 %)"
+    cause = "dispersion 1 cm larger (spread 0.1 %)"
     assert changes[cause] == pytest.approx(slope, rel=1e-5)
 
 
@@ -170,39 +175,51 @@ def test_range_rows_are_refits_without_the_point(gtf, gtf_sizes):
     rows = range_sensitivity(fit.x)
     assert len(rows) == 15  # each of 14 left out, and the near half
     keep = np.arange(14) != 4
-    less = beamfit.QuadScan(
+    # At the errors and weights of the fit, by hand.
+    p = fit.x.points
+    design = np.stack([p.r11**2, 2 * p.r11 * p.r12, p.r12**2], -1)
+    scale = 1 / (2 * p.weighed * p.error)
+    s11, s12, s22 = np.linalg.lstsq(
+        (design * scale[:, None])[keep] * 1e-8, (p.size**2 * scale)[keep], rcond=None
+    )[0] * 1e-8  # fmt: skip
+    less = np.sqrt(s11 * s22 - s12**2)
+    x = fit.x
+    assert rows[4].left_out == "without Q2 = 1.2 A"
+    assert rows[4].normalized_emittance == pytest.approx(
+        less * x.normalized_emittance.value / x.emittance.value, rel=1e-8
+    )
+    assert rows[4].shift == pytest.approx((less - x.emittance.value) / x.emittance.error, rel=1e-5)
+    # A fit that never saw it differs by what it finds of the noise, which is little.
+    rest = beamfit.QuadScan(
         {"Q2": currents[keep]},
         {"Q2": "A"},
         {"x": scan.size["x"][keep]},
         {"x": scan.error["x"][keep]},
     )
-    expected = beamfit.fit_emittance(less, gtf).x
-    assert rows[4].left_out == "without Q2 = 1.2 A"
-    assert rows[4].normalized_emittance == pytest.approx(
-        expected.normalized_emittance.value, rel=1e-9
-    )
-    assert rows[4].shift == pytest.approx(
-        (expected.emittance.value - fit.x.emittance.value) / fit.x.emittance.error, rel=1e-6
-    )
+    other = beamfit.fit_emittance(rest, gtf).x.emittance
+    assert abs(less - other.value) < 0.1 * other.error
 
 
-def test_an_outlier_gets_a_probability_not_a_cut(gtf, gtf_sizes):
+@pytest.mark.parametrize("robust", [False, True])
+def test_an_outlier_gets_a_probability_not_a_cut(gtf, gtf_sizes, robust):
+    """With the usual prior of bad readings as with the wider one of a robust fit."""
     currents, _, sizes = gtf_sizes
     scan = scan_of("Q2", "A", currents, sizes, seed=8)
     spoilt = scan.size["x"].copy()
     spoilt[3] *= 1.4
     bad = beamfit.QuadScan({"Q2": currents}, {"Q2": "A"}, {"x": spoilt}, scan.error)
     truth = beamfit.fit_emittance(scan, gtf).x.emittance
-    plain = beamfit.fit_emittance(bad, gtf).x
-    robust = beamfit.fit_emittance(bad, gtf, robust=True).x
-    probability = robust.points.outlier_probability
+    fit = beamfit.fit_emittance(bad, gtf, robust=robust).x
+    probability = fit.points.outlier_probability
     assert probability[3] > 0.99
-    assert np.delete(probability, 3).max() < 0.2
-    assert abs(robust.emittance.value - truth.value) < truth.error
-    assert abs(plain.emittance.value - truth.value) > 2 * truth.error
-    assert plain.emittance.error > 3 * robust.emittance.error
-    assert robust.dof == 10
-    assert "1 of 14 points" in robust.message
+    assert np.delete(probability, 3).max() < 0.3
+    assert abs(fit.emittance.value - truth.value) < truth.error
+    assert fit.emittance.error < 2.0 * truth.error
+    # Least squares that take it as good are off by more than two errors.
+    p = fit.points
+    taken = beamfit.fit_sizes(p.r11, p.r12, spoilt, scan.error["x"])
+    assert abs(np.sqrt(float(taken.determinant)) - truth.value) > 2 * truth.error
+    assert "1 of 14 readings" in fit.message
 
 
 def test_an_outlier_is_found_without_errors_too(gtf, gtf_sizes):
