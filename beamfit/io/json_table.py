@@ -47,7 +47,7 @@ def _scan_of(path: str | PathLike[str], content: dict[str, Any]) -> dict[str, li
 
 
 def _part(values: Any, i: int) -> Any:
-    """What a list, or an object by number, has for one plane."""
+    """One plane's part of a list, or of an object by number."""
     return values.get(str(i)) if isinstance(values, dict) else values[i]
 
 
