@@ -1,4 +1,4 @@
-"""What the columns of a file are, as a person says it: --columns, and layouts that keep it."""
+"""Columns of a file as a person names them: --columns, and layouts that keep the names."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ KEYS = {
 
 @dataclass(frozen=True)
 class Layout:
-    """What the columns of a file are: believed as it stands, and nothing is guessed against it.
+    """The meaning of a file's columns: believed as it stands, and nothing is guessed against it.
 
     Attributes
     ----------

@@ -39,7 +39,7 @@ EXPECTED = "a file saved by emittance_gui"
 
 @dataclass(frozen=True)
 class EmittanceGuiFile:
-    """What such a file holds.
+    """Contents of a file of emittance_gui.
 
     Attributes
     ----------
@@ -84,7 +84,7 @@ class EmittanceGuiFile:
 
 
 def is_emittance_gui(path: str | PathLike[str]) -> bool:
-    """Whether a file is one: of MATLAB by its name, and no table of vectors."""
+    """Tell a file of emittance_gui from others: MATLAB's by its name, and no table of vectors."""
     return Path(path).suffix.lower() == MATLAB and not read_vectors(path, VARIABLE)
 
 
@@ -284,7 +284,7 @@ def _settings(source: _Fields, used: np.ndarray, n: int, lattice: LatticeFile) -
 
 
 def _of_several(source: _Fields) -> bool:
-    """Whether several monitors saw one setting, and not one monitor several."""
+    """Tell a file of several monitors at one setting from a scan."""
     return _text(source.get("type")) == "multi"
 
 
@@ -384,12 +384,12 @@ def _scan(
 
 
 def _distinct(sizes: np.ndarray, labels: list[str]) -> int:
-    """How many settings have a size."""
+    """Count the settings that have a size."""
     return len({labels[i] for i in np.flatnonzero(~np.isnan(sizes).all(axis=1))})
 
 
 def _counted(sizes: Mapping[str, np.ndarray], labels: list[str]) -> str:
-    """What is too few of a method."""
+    """Say how many settings each plane of a method has."""
     return " and ".join(f"{_distinct(v, labels)} settings in {p}" for p, v in sizes.items())
 
 
@@ -409,7 +409,7 @@ def _notes(
     own: Mapping[str, np.ndarray],
     labels: list[str],
 ) -> Iterator[str]:
-    """What is odd about the sizes of one method, by setting and shot."""
+    """Name what was left out of the sizes of one method, and means that differ."""
     lost: dict[str, list[str]] = {}
     for plane, each in sizes.items():
         if named := _shots(np.isnan(each) & ~dark, labels):

@@ -12,7 +12,7 @@ from typing import NamedTuple
 from beamfit.errors import InputError, nearest
 from beamfit.io.files import digest, read_text
 from beamfit.io.lattice import LatticeFile
-from beamfit.io.madx import NO_MATTER, Definition, Interpreter, Parameter, word_of
+from beamfit.io.madx import NO_MATTER, Attribute, Definition, Interpreter, word_of
 from beamfit.io.madx_values import NAME, words
 from beamfit.io.sequence_elements import NOTHING_AT_ZERO, Element, element_tables
 from beamfit.particles import REST_ENERGY, expected_energy
@@ -323,7 +323,7 @@ def _several(value: float | tuple[float, ...]) -> tuple[float, ...]:
     return value if isinstance(value, tuple) else (value,)
 
 
-def _single(program: Interpreter, parameter: Parameter) -> float:
+def _single(program: Interpreter, parameter: Attribute) -> float:
     value = program.number(parameter)
     if isinstance(value, tuple):
         raise InputError("several numbers", "one", parameter.path, parameter.line)
@@ -357,7 +357,7 @@ def _beam(
     return particle, float(total)
 
 
-def _of_beam(program: Interpreter, parameter: Parameter) -> float:
+def _of_beam(program: Interpreter, parameter: Attribute) -> float:
     try:
         return _single(program, parameter)
     except InputError as error:
@@ -365,7 +365,7 @@ def _of_beam(program: Interpreter, parameter: Parameter) -> float:
         raise InputError(found, "a number", parameter.path, parameter.line) from None
 
 
-def _particle(beam: dict[str, Parameter], program: Interpreter, path: str | PathLike[str]) -> str:
+def _particle(beam: dict[str, Attribute], program: Interpreter, path: str | PathLike[str]) -> str:
     """The particle of a BEAM by its name, which goes before, or by its mass and charge.
 
     MAD-X passes over a mass and a charge beside a name that it knows; one that contradicts is

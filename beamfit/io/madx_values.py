@@ -219,7 +219,7 @@ class Values:
 
 
 def compared(values: Values, text: str) -> bool:
-    """Whether the condition of an IF holds: comparisons joined by && and ||.
+    """Evaluate the condition of an IF: comparisons joined by && and ||.
 
     Examples
     --------

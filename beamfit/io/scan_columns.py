@@ -142,7 +142,7 @@ def _understood(sheet: Sheet) -> dict[str, Column]:
 
 
 def is_known(name: str, sheet: Sheet) -> bool:
-    """Whether a header means something in a scan."""
+    """Tell a header that means something in a scan from others."""
     alone = replace(sheet, names=(name,), cells=[sheet[name]])
     try:
         return bool(columns_of(alone, QUANTITIES, lambda header: _other(header, sheet)))
@@ -276,7 +276,7 @@ def rms_of(column: Column) -> float:
 
 
 def is_scatter(columns: Mapping[str, Column], plane: str) -> bool:
-    """Whether an error is the deviation of the shots, and not yet that of their mean.
+    """Tell an error that is the deviation of the shots from that of their mean.
 
     Examples
     --------

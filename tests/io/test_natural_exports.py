@@ -131,6 +131,52 @@ SCANS = {
 }  # fmt: skip
 
 
+def planes(names):
+    """Each plane with settings of its own, in m."""
+    lists = {"x": slice(None), "y": slice(1, 4)}
+    return {
+        name.format(p): [factor * v for v in SCAN[key.format(p)][lists[p]]]
+        for name, key, factor in names
+        for p in "xy"
+    }
+
+
+def test_the_planes_of_pyemittance_have_settings_of_their_own(tmp_path):
+    names = [
+        ("quadvals{}", "quad", 1),
+        ("beamsizes{}", "{}", 1e-6),
+        ("beamsizeserr{}", "d{}", 1e-6),
+    ]
+    content = {"nemitx": 4.8e-08, "total_points_measured": None} | planes(names)
+    (tmp_path / "a.json").write_text(json.dumps(content))
+    scan = read_quad_scan(tmp_path / "a.json", columns="quadvals=Q525_kG")
+    for plane, part in (("x", slice(None)), ("y", slice(1, 4))):
+        rows = scan.rows(plane)
+        np.testing.assert_allclose(rows.settings["Q525"], SCAN["quad"][part])
+        np.testing.assert_allclose(1e6 * rows.size, SCAN[plane][part])
+        np.testing.assert_allclose(1e6 * rows.error, SCAN[f"d{plane}"][part])
+    with pytest.raises(InputError, match="--columns 'quadvals=NAME'"):
+        read_quad_scan(tmp_path / "a.json")
+
+
+@pytest.mark.parametrize("by_number", [False, True])
+def test_the_result_of_lcls_tools(by_number, tmp_path):
+    lists = [("quadrupole_pv_values", "quad", 1), ("rms_beamsizes", "{}", 1e-6)]
+    content = {
+        name: [[factor * v for v in SCAN[key.format(p)]] for p in "xy"]
+        for name, key, factor in lists
+    }
+    if by_number:
+        content = {k: {str(i): part for i, part in enumerate(v)} for k, v in content.items()}
+    (tmp_path / "a.json").write_text(json.dumps(content | {"emittance": [1.0, 2.0], "info": {}}))
+    scan = read_quad_scan(tmp_path / "a.json", columns="quadrupole_pv_values=Q525_kG")
+    for plane in "xy":
+        np.testing.assert_allclose(1e6 * scan.rows(plane).size, SCAN[plane])
+    (tmp_path / "b.json").write_text(json.dumps(content | {"rms_beamsizes": 3}))
+    with pytest.raises(InputError, match="another JSON file"):
+        read_quad_scan(tmp_path / "b.json", columns="quadrupole_pv_values=Q525_kG")
+
+
 @pytest.mark.parametrize("export", SCANS)
 def test_one_scan_as_programs_export_it(export, tmp_path):
     name, write, columns = SCANS[export]
