@@ -208,7 +208,11 @@ def _advance(residual, lower: Array, upper: Array, tolerance: float, moves, s: W
     finite = jnp.all(jnp.isfinite(r)) & jnp.all(jnp.isfinite(j))
     gained = 0.5 * (s.residual - r) @ (s.residual + r)
     ratio = jnp.where(finite & (s.promised > 0), gained / s.promised, -1.0)
-    good = first | (ratio > 1e-4)
+    # A step that promises less than rounding cannot be judged: it is taken, as the last one.
+    last = (
+        ~first & finite & (s.promised >= 0) & (s.promised <= ROUNDING * (s.residual @ s.residual))
+    )
+    good = first | (ratio > 1e-4) | last
     eased = s.damping * _easing(ratio)
     kept = partial(jnp.where, good)
     theta, r, j = kept(s.trial, s.theta), kept(r, s.residual), kept(j, s.jacobian)
@@ -219,11 +223,9 @@ def _advance(residual, lower: Array, upper: Array, tolerance: float, moves, s: W
     change = trial - theta
     promised = -(r @ (j @ change)) - 0.5 * jnp.sum((j @ change) ** 2)
     small = jnp.linalg.norm(scale * change) <= tolerance * jnp.linalg.norm(scale * theta)
-    # Of a refused step, what was promised is below rounding.
-    nothing = ~good & (s.promised >= 0) & (s.promised <= ROUNDING * (r @ r))
     return Walk(
         theta, r, j, scale, damping, kept(jnp.where(first, s.growth, 2.0), 2.0 * s.growth),
-        s.steps + 1, small | nothing, (damping > STUCK) | (first & ~finite), trial, promised,
+        s.steps + 1, small | last, (damping > STUCK) | (first & ~finite), trial, promised,
     )  # fmt: skip
 
 
@@ -403,12 +405,13 @@ class ManyLanes(Lanes):
             new, slope = self.slopes(trial)
             steps += 1
             ratio = 0.5 * (r - new) @ (r + new) / promised if promised > 0 else -1.0
+            rested = bool(0 <= promised <= ROUNDING * (r @ r)) and np.isfinite(slope.sum())
+            if rested:
+                theta, r, j = trial, new, slope
+                break
             if ratio > 1e-4 and np.isfinite(slope.sum()):
                 theta, r, j = trial, new, slope
                 damping, growth = damping * float(_easing(ratio)), 2.0
-            elif 0 <= promised <= ROUNDING * (r @ r):
-                rested = True
-                break
             else:
                 damping, growth = damping * growth, 2.0 * growth
         return Walk(theta, r, j, scale, damping, growth, steps, rested, stuck, theta, 0.0)
