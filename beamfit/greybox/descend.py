@@ -35,8 +35,8 @@ STUCK = 1e30
 ROUNDING = 1e-16
 # Most rounds of pinning in a step; what the last one pushes out is clipped.
 PINNED = 3
-# Where a step gains what it promised to within a share, the damping falls by so many times the
-# share: near a solution steps become undamped, and converge as fast as Gauss-Newton's.
+# Where a step of many numbers gains what it promised to within a share, the damping falls by so
+# many times the share.
 TRUSTED = 10.0
 # With a limit of time the clock is looked at after so many steps.
 SEGMENT = 50
@@ -209,7 +209,7 @@ def _advance(residual, lower: Array, upper: Array, tolerance: float, moves, s: W
     gained = 0.5 * (s.residual - r) @ (s.residual + r)
     ratio = jnp.where(finite & (s.promised > 0), gained / s.promised, -1.0)
     good = first | (ratio > 1e-4)
-    eased = s.damping * _easing(ratio)
+    eased = s.damping * jnp.maximum(1 / 3, 1 - (2 * jnp.minimum(ratio, 1.0) - 1) ** 3)
     kept = partial(jnp.where, good)
     theta, r, j = kept(s.trial, s.theta), kept(r, s.residual), kept(j, s.jacobian)
     scale = jnp.maximum(s.scale, jnp.linalg.norm(j, axis=0))
@@ -227,10 +227,15 @@ def _advance(residual, lower: Array, upper: Array, tolerance: float, moves, s: W
     )  # fmt: skip
 
 
-def _easing(ratio: Any) -> Any:
-    """By how much the damping changes after a step that gained that share of its promise."""
-    nielsen = jnp.maximum(1 / 3, 1 - (2 * jnp.minimum(ratio, 1.0) - 1) ** 3)
-    return jnp.minimum(nielsen, jnp.maximum(TRUSTED * jnp.abs(1 - ratio), EASED))
+def _easing(ratio: float) -> float:
+    """By how much the damping falls after a step that gained that share of its promise.
+
+    Nielsen's rule, and faster where a step gains what it promised: then steps become undamped and
+    converge as fast as Gauss-Newton's. Few numbers keep to Nielsen's rule: in the flat valleys of
+    networks every second step would be refused.
+    """
+    nielsen = max(1 / 3, 1 - (2 * min(ratio, 1.0) - 1) ** 3)
+    return min(nielsen, max(TRUSTED * abs(1 - ratio), EASED))
 
 
 def _next(theta, residual, jacobian, scale, damping, lower, upper) -> Array:
@@ -403,12 +408,14 @@ class ManyLanes(Lanes):
             new, slope = self.slopes(trial)
             steps += 1
             ratio = 0.5 * (r - new) @ (r + new) / promised if promised > 0 else -1.0
+            # What promises less than rounding cannot be judged: it is taken, as the last step.
+            rested = bool(0 <= promised <= ROUNDING * (r @ r)) and np.isfinite(slope.sum())
+            if rested:
+                theta, r, j = trial, new, slope
+                break
             if ratio > 1e-4 and np.isfinite(slope.sum()):
                 theta, r, j = trial, new, slope
-                damping, growth = damping * float(_easing(ratio)), 2.0
-            elif 0 <= promised <= ROUNDING * (r @ r):
-                rested = True
-                break
+                damping, growth = damping * _easing(ratio), 2.0
             else:
                 damping, growth = damping * growth, 2.0 * growth
         return Walk(theta, r, j, scale, damping, growth, steps, rested, stuck, theta, 0.0)
