@@ -67,9 +67,7 @@ def median(fit):
     return weighted_quantiles(own, post.weight[post.weight > 0], (0.5,))[0]
 
 
-@pytest.mark.parametrize(
-    ("kind", "n"), [("stated", 5), ("share", 9), ("shots", 9), ("none", 5)]
-)
+@pytest.mark.parametrize(("kind", "n"), [("stated", 5), ("share", 9), ("shots", 9), ("none", 5)])
 def test_it_is_the_one_written_out(gtf, scan_of_kind, kind, n):
     """Ends of the intervals of the emittance, the draws and the reference each with its scatter."""
     fit = beamfit.fit_emittance(scan_of_kind(kind, n), gtf)
