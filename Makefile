@@ -60,6 +60,7 @@ bench: .venv/bench
 	$(BIN)/python benchmarks/emittance.py
 	$(BIN)/python benchmarks/lifetime.py
 	$(BIN)/python benchmarks/greybox.py 20 0
+	$(BIN)/python benchmarks/size.py
 	$(BIN)/python benchmarks/language.py
 	$(BIN)/python benchmarks/optimisation.py 20
 	$(BIN)/python benchmarks/sampling.py
