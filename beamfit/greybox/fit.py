@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from scipy.sparse import issparse
 
 from beamfit.compile_cache import SELDOM
 from beamfit.errors import InputError, nearest
@@ -165,6 +166,11 @@ class Fit:
     def model(self) -> Any:
         """The model with the fitted numbers."""
         return self.problem.model_at(self.theta)
+
+    @property
+    def dense_jacobian(self) -> np.ndarray:
+        """The Jacobian as an array, shape (m, n); a copy."""
+        return self.jacobian.toarray() if issparse(self.jacobian) else np.array(self.jacobian)
 
     @property
     def covariance(self) -> np.ndarray:

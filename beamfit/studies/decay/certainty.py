@@ -143,7 +143,7 @@ class Discrepancy(NamedTuple):
         """
         root = self.root
         reach = cho_solve((root, True), self.rows @ self.kernel(at).T)
-        jacobian = root @ fit.jacobian[: left.size]
+        jacobian = root @ fit.dense_jacobian[: left.size]
         total = slopes - reach.T @ jacobian
         own = Discrepancy(self.size, at, self.length, self.rows).kernel(at)
         rest = own - reach.T @ self.rows @ self.kernel(at).T
@@ -156,7 +156,7 @@ def sized(trial: Discrepancy, fit: Fit, left: np.ndarray) -> Discrepancy:
     `left` are the decays' residuals, in their errors.
     """
     free = [k for k, variable in enumerate(fit.variables) if variable.state == "free"]
-    jacobian = fit.jacobian[:, free]
+    jacobian = fit.dense_jacobian[:, free]
     seen, known = trial.root @ jacobian[: left.size], jacobian[left.size :]
     start = fit.theta[free]
 

@@ -149,7 +149,7 @@ def fit_titre(
 def _known(fit: Fit) -> dict[str, Any]:
     """The first stage's numbers and the root of their information."""
     (group,) = fit.groups
-    rows = np.array(fit.jacobian)
+    rows = fit.dense_jacobian
     rows[group.rows] /= group.factor
     root = triangle(rows)
     return {"known": root, "found": root @ fit.theta}

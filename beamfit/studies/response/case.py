@@ -137,7 +137,7 @@ class Settled(NamedTuple):
         parts = zip(own, rest, self.noise.ravel(), strict=True)
         rows = [np.column_stack([slope, -r])[:most] / s for slope, (r, _, _), s in parts]
         prior = np.asarray(problem.residual(self.fit.theta))[size:]
-        known = np.column_stack([self.fit.jacobian[size:], prior])
+        known = np.column_stack([self.fit.dense_jacobian[size:], prior])
         return noise_of(rows, [time[:most] for _, time, _ in rest], known, noise)
 
     def correlated(self, case: Case) -> bool:

@@ -12,7 +12,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from scipy.sparse import issparse
 
 from beamfit.compile_cache import SELDOM
 from beamfit.greybox.covariance import Group
@@ -268,8 +267,7 @@ def _directions(
 def _loose_jacobian(fit: Fit) -> np.ndarray:
     """Residuals by free numbers, errors as scaled, without weights that bounds hold."""
     p = fit.problem
-    # Of more than 200 free numbers it is sparse.
-    rows = fit.jacobian.toarray() if issparse(fit.jacobian) else fit.jacobian.copy()
+    rows = fit.dense_jacobian
     for group in fit.groups:
         rows[group.rows] /= group.factor
     edge = np.array([v.state in ("lower", "upper") for v in fit.variables])
