@@ -22,7 +22,7 @@ Examples:
   beamfit solve formulations/appendix_d.bf
   beamfit solve formulations/appendix_a.xml --data d=formulations/fitdata_simulated.csv --start 20
   beamfit solve formulations/figure_3.xml --set x1=0.5 --set x2=2 --set x3=1 --set x4=1 \\
-      --gain dy5/dx4
+      --derivative dy5/dx4
 """
 # As `beamfit.greybox.solve.solve` calls them; told here so that help needs no JAX.
 SOLVERS = ["levenberg-marquardt", "filtersqp", "ipopt", "slsqp"]
@@ -44,7 +44,10 @@ COUNT = re.compile(r"[1-9]\d{0,5}")
     multiple=True,
 )
 @option(
-    "--gain dY/dX", "Derivatives of an output by an input, printed too.", "gains", multiple=True
+    "--derivative dY/dX",
+    "A gain to print too: the derivative of an output by an input.",
+    "derivatives",
+    multiple=True,
 )
 @option(
     "--start seeds|N",
@@ -59,7 +62,7 @@ def solve(
     document: str,
     data: tuple[str, ...],
     values: tuple[str, ...],
-    gains: tuple[str, ...],
+    derivatives: tuple[str, ...],
     start: str,
     report: str | None,
     as_json: bool,
@@ -78,7 +81,7 @@ def solve(
     tables = _pairs("data", data, "FILE")
     numbers = {name: _numbers(name, text) for name, text in _pairs("set", values, "NUMBER").items()}
     starts = 1 if start == "seeds" else int(start)
-    found, files = _solved(document, tables, starts, numbers, gains, told)
+    found, files = _solved(document, tables, starts, numbers, derivatives, told)
     inputs = {path: digest(path) for path in (document, *files)}
     reported(report, found, inputs)
     answered(as_json, [found], inputs, lambda terminal: _show(terminal, found), report)

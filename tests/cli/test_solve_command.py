@@ -100,7 +100,7 @@ def test_tables_of_other_sizes_are_refused(run, tmp_path):
 
 def test_a_mapping_is_computed_at_given_inputs_with_the_gains_asked_for(run, tmp_path, well_shown):
     """Figure 3 of the report, by hand: y4 sums rows of x4, y5 weighs them by sums of 2 x3."""
-    given = ["--set", "x1=0.5", "--set", "x2=2", "--set", "x3=1", "--gain", "dy5/dx4"]
+    given = ["--set", "x1=0.5", "--set", "x2=2", "--set", "x3=1", "--derivative", "dy5/dx4"]
     given += ["--set", "x4=" + ",".join(map(str, range(1, 13)))]
     _, found = result(run, "formulations/figure_3.xml", *given)
     assert found["outputs"]["y1"] == [2.5] * 10
@@ -134,7 +134,7 @@ def test_gains_solver_and_tolerance_at_an_answer(run, tmp_path):
     """d/dx of x^4 at the minimum of x^4 - 4x, x = 1, from a start that is given."""
     text = "minimize y; variable x in [0, 3]; input x, c = 4; output y, z; y = x^4 - c*x; z = x^4;"
     (tmp_path / "quartic.bf").write_text(text)
-    asked = ["--gain", "dz/dx", "--solver", "ipopt", "--tolerance", "1e-9", "--set", "x=2.5"]
+    asked = ["--derivative", "dz/dx", "--solver", "ipopt", "--tolerance", "1e-9", "--set", "x=2.5"]
     _, found = result(run, tmp_path / "quartic.bf", *asked)
     assert (found["solver"], found["kkt_residual"] < 1e-9) == ("Uno ipopt", True)
     assert found["gains"]["dz/dx"] == pytest.approx(4.0, rel=1e-8)
@@ -142,7 +142,7 @@ def test_gains_solver_and_tolerance_at_an_answer(run, tmp_path):
     assert found["variables"][0]["value"]["value"] == pytest.approx(2.0, rel=1e-7)
     status, _, error = run("solve", tmp_path / "quartic.bf", "--solver", "levenberg-marquardt")
     assert (status, "one of filtersqp, ipopt, slsqp" in error) == (2, True)
-    status, _, error = run("solve", tmp_path / "quartic.bf", "--gain", "dz/dq")
+    status, _, error = run("solve", tmp_path / "quartic.bf", "--derivative", "dz/dq")
     assert (status, "an input of the document: one of x, c" in error) == (2, True)
 
 

@@ -283,7 +283,7 @@ def decay(a, b, span, number=200, sd=0.01, seed=3):
 
 def test_a_decay_at_the_bound_of_b():
     """Pure Touschek: b's posterior is a normal distribution cut at zero."""
-    fit = fit_decay(decay(2e-8, 0.0, 2 * 3600.0))
+    fit = fit_decay(decay(2e-8, 0.0, 2 * 3600.0), law="constant")
     found = fit.sample(seed=1, noise="known", target_ess=8000)
     b = found.values("b")
     assert b.min() >= 0
@@ -306,7 +306,9 @@ def test_a_and_b_not_separable_are_the_bounds_and_the_lifetime_is_not():
 
 
 def test_the_real_decay():
-    fit = fit_decay(beamfit.read_decay_record("measurements/aps_1999_decay.csv"))
+    """Draws are of the constant law, as `law="constant"` is."""
+    record = beamfit.read_decay_record("measurements/aps_1999_decay.csv")
+    fit = fit_decay(record, law="constant")
     found = fit.sample(seed=1)
     assert found.status is Status.converged
     for name in ("a", "b", "lifetime_mean"):
