@@ -56,7 +56,9 @@ COUNT = re.compile(r"[1-9]\d{0,5}")
 )
 @option("--solver", "The solver to use; by default all that suit, in turn.", choices=SOLVERS)
 @option("--tolerance X", "Within which a limit is reached and a point an optimum.", type=float)
-@option("--seconds S", "Limit of time of the search, compilation included.", type=float)
+@option(
+    "--within S", "Seconds at most: limit of time of the search, compilation included.", type=float
+)
 @options("report json")
 def solve(
     document: str,
@@ -75,9 +77,10 @@ def solve(
     """
     if start != "seeds" and not COUNT.fullmatch(start):
         raise InputError(f"--start '{start}'", "seeds, or a number of starts from 1 to 999999")
-    for name in ("tolerance", "seconds"):
+    for name in ("tolerance", "within"):
         if told[name] is not None and not 0 < told[name] < math.inf:
             raise InputError(f"--{name} {told[name]:g}", "a number above 0")
+    told["seconds"] = told.pop("within")
     tables = _pairs("data", data, "FILE")
     numbers = {name: _numbers(name, text) for name, text in _pairs("set", values, "NUMBER").items()}
     starts = 1 if start == "seeds" else int(start)

@@ -97,7 +97,7 @@ def parts_of(gain: str) -> tuple[str, str]:
     """
     found = GAIN.fullmatch(gain)
     if not found:
-        raise InputError(f"--gain '{gain}'", "dOUTPUT/dINPUT, such as dy/dx")
+        raise InputError(f"--derivative '{gain}'", "dOUTPUT/dINPUT, such as dy/dx")
     return found[1], found[2]
 
 
@@ -160,7 +160,7 @@ def gains_at(
         for name, face, what in ((output, scope.outputs, "output"), (by, scope.inputs, "input")):
             if name not in face:
                 expected = f"an {what} of the document: {nearest(name, list(face))}"
-                raise InputError(f"'{name}' in --gain {gain}", expected)
+                raise InputError(f"'{name}' in --derivative {gain}", expected)
         key = f"d{output}/d{by}"
         found[key] = np.asarray(_gain(program, output, by, given, _constants(program)))
     return found

@@ -121,7 +121,7 @@ def test_a_mapping_is_computed_at_given_inputs_with_the_gains_asked_for(run, tmp
         (["--set", "x1=1,2"], "2 numbers in --set x1=...; expected one, or 10 for x1[I]"),
         (["--set", "x1=one"], "--set x1=one; expected a number"),
         (["--set", "x1=1", "--set", "x1=2"], "each name once"),
-        (["--seconds", "0"], "--seconds 0; expected a number above 0"),
+        (["--within", "0"], "--within 0; expected a number above 0"),
         (["--solver", "snopt"], "'snopt'"),
     ],
 )
@@ -138,7 +138,7 @@ def test_gains_solver_and_tolerance_at_an_answer(run, tmp_path):
     _, found = result(run, tmp_path / "quartic.bf", *asked)
     assert (found["solver"], found["kkt_residual"] < 1e-9) == ("Uno ipopt", True)
     assert found["gains"]["dz/dx"] == pytest.approx(4.0, rel=1e-8)
-    _, found = result(run, tmp_path / "quartic.bf", "--set", "c=32", "--seconds", "100")
+    _, found = result(run, tmp_path / "quartic.bf", "--set", "c=32", "--within", "100")
     assert found["variables"][0]["value"]["value"] == pytest.approx(2.0, rel=1e-7)
     status, _, error = run("solve", tmp_path / "quartic.bf", "--solver", "levenberg-marquardt")
     assert (status, "one of filtersqp, ipopt, slsqp" in error) == (2, True)
