@@ -24,12 +24,12 @@ class Quantity:
     value : float
         In SI.
     error : float or None
-        One standard deviation, scaled by sqrt(χ²/dof) where that exceeds 1; None where the
-        data do not determine the value.
+        Half of the central 68 % of what the data leave open; None where they do not determine
+        the value.
     unit : str
         SI unit, "1" for a pure number.
     error_raw : float or None
-        The error before that scaling.
+        The error by the stated errors of the data alone.
     interval_95 : tuple of float, or None
         What holds the truth in 95 % of cases. Left out, it is the value ± 1.96 errors, as of a
         normal distribution; None without an error. A value that the data do not determine may

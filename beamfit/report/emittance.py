@@ -28,7 +28,7 @@ from beamfit.table import Table, labelled
 MOST_PROFILES = 12
 
 ERRORS = (
-    "Errors are one standard deviation, scaled by sqrt(χ²/dof) where that exceeds 1. "
+    "Errors are half of the central 68 % of the posterior, the noise averaged over. "
     "“Not determined” means the data put no error on the value; it is not to be quoted."
 )
 METHODS = (
