@@ -10,7 +10,7 @@ from itertools import groupby
 from typing import NamedTuple
 
 import numpy as np
-from scipy.signal import fftconvolve
+from scipy.fft import irfft, next_fast_len, rfft
 from scipy.special import logsumexp
 
 from beamfit.noise.correlated import log_volume, white_beside, whitened
@@ -71,7 +71,9 @@ def without_flicker(rows: np.ndarray, power: float) -> np.ndarray:
     """
     j = np.arange(1, len(rows))
     weights = np.append(1.0, np.cumprod((j - 1 - power / 2) / j))
-    return fftconvolve(rows, weights[:, None], axes=0)[: len(rows)]
+    size = next_fast_len(2 * len(rows), real=True)
+    found = irfft(rfft(rows, size, axis=0) * rfft(weights, size)[:, None], size, axis=0)
+    return found[: len(rows)]
 
 
 def _whitened(kinds: list[Kind], rows: np.ndarray, time: np.ndarray):

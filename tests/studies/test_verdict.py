@@ -3,7 +3,6 @@
 import re
 from dataclasses import replace
 
-import jax
 import numpy as np
 import pytest
 from hypothesis import given
@@ -12,7 +11,6 @@ from hypothesis import strategies as st
 import beamfit
 from beamfit.quantity import Status
 from beamfit.studies.scan.model import phase_coverage
-from beamfit.studies.scan.sigma import zero_emittance
 from beamfit.studies.scan.verdict import waist_bracketed
 from tests.studies.conftest import TABLE_2, design, scan_of
 
@@ -170,36 +168,6 @@ def test_a_perfect_determined_scan_is_believed(gtf, gtf_sizes):
     assert fit.identifiability.probability["beam"] > 0.9999
     assert sum(fit.identifiability.probability.values()) == pytest.approx(1.0, abs=1e-12)
     assert fit.identifiability.next_measurement is None
-
-
-def brute_zero(r11, r12, size, error):
-    """The best beam of no emittance by a fine scan of both its numbers."""
-    best = np.inf
-    for angle in np.linspace(0, np.pi, 40_001):
-        row = (r11 * np.cos(angle) + r12 * np.sin(angle)) ** 2 / (2 * size * error)
-        target = size / (2 * error)
-        length = max(row @ target / (row @ row), 0.0)
-        best = min(best, ((target - length * row) ** 2).sum())
-    return best
-
-
-@pytest.mark.parametrize("seed", range(4))
-def test_zero_emittance_is_the_global_minimum(seed):
-    rng = np.random.default_rng(seed)
-    r11, r12 = rng.normal(size=8), 2 + rng.normal(size=8)
-    size = np.abs(1e-4 * rng.uniform(0.5, 2.0, 8))
-    error = 0.05 * size
-    sigma, chi2 = map(
-        np.asarray, jax.jit(zero_emittance)(r11, r12, size / (2 * error), 1 / (2 * size * error))
-    )
-    assert float(chi2) == pytest.approx(brute_zero(r11, r12, size, error), rel=1e-5)
-    assert float(sigma[0] * sigma[2] - sigma[1] ** 2) == pytest.approx(
-        0.0, abs=1e-12 * float(sigma[0] * sigma[2])
-    )
-    design = np.stack([r11**2, 2 * r11 * r12, r12**2], 1) / (2 * size * error)[:, None]
-    assert float(chi2) == pytest.approx(
-        ((design @ sigma - size / (2 * error)) ** 2).sum(), rel=1e-9
-    )
 
 
 @given(st.integers(0, 10_000))
