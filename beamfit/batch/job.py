@@ -52,6 +52,8 @@ class Job:
         How files are read: ``columns, ignore, skip_bad``.
     weights : {"model", "measured"}
         As for `beamfit.fit_emittance`.
+    noise : str, optional
+        File of priors on the noise of sizes; beamfit's own without.
 
     Raises
     ------
