@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import product
 from typing import NamedTuple
@@ -20,7 +20,17 @@ from beamfit.optics.elements import Drift, Screen
 from beamfit.studies.scan.calibration import Kind, numbers_of_magnets
 from beamfit.studies.scan.fit import EmittanceFit
 from beamfit.studies.scan.model import emittance_parts, predict_sizes, sigma_of, spoken
-from beamfit.studies.scan.next_point import candidate_settings
+from beamfit.studies.scan.next_point import (
+    Further,
+    Predict,
+    beam_information,
+    beam_sizes,
+    candidate_settings,
+    elements_at,
+    on_screen,
+    relative_error,
+    simulated,
+)
 from beamfit.studies.scan.results import in_words
 from beamfit.studies.scan.statement import size_records, varied_magnets
 from beamfit.studies.scan.transport import NetworkRows, Rows, rows_at, setting_units
@@ -28,6 +38,19 @@ from beamfit.studies.scan.verdict import USEFUL
 
 # The error of ln ε whose 95 % interval spans the factor within which an emittance is of use.
 NARROW = float(np.log(USEFUL)) / 3.92
+
+
+class Candidate(NamedTuple):
+    """A further measurement: settings of the magnets, screen, and energy in MeV."""
+
+    settings: dict[str, float]
+    screen: str
+    energy: float
+    words: str
+
+
+# Which planes are determined, by what is known and by what is measured further.
+Judge = Callable[[Information, Sequence[Candidate]], dict[str, bool]]
 
 
 def by_plane(fit: EmittanceFit, known: Information) -> dict[str, float]:
@@ -42,8 +65,37 @@ def determined_by(fit: EmittanceFit, known: Information) -> dict[str, bool]:
     return dict(zip((p.plane for p in fit.planes), map(bool, clear), strict=True))
 
 
+def judge_of(fit: EmittanceFit) -> Judge:
+    """How to tell which planes would be determined after further measurements.
+
+    Of known transport they are simulated, and compared with the rivals as a scan is; in a scenario
+    linear theory says.
+    """
+    if fit.solved is not None:
+        return lambda known, _: determined_by(fit, known)
+    seen, now = fit.seen, {p.plane: p.identifiability.determined for p in fit.planes}
+
+    def judge(_: Information, further: Sequence[Candidate]) -> dict[str, bool]:
+        if not further or all(now.values()):
+            return now
+        rows = []
+        for c in further:
+            table = {name: np.array([v]) for name, v in c.settings.items()}
+            rows.append(elements_at(seen, seen.scanned, table, c.screen, np.array([c.energy])))
+        every = np.concatenate(rows, axis=-1)
+        own = {plane: every["xy".index(plane)] for plane in now}
+        return {plane: sure or simulated(seen, plane, *own[plane]) for plane, sure in now.items()}
+
+    return judge
+
+
+def planes_of(fit: EmittanceFit) -> list[str]:
+    """The planes that were fitted."""
+    return [p.plane for p in fit.planes]
+
+
 def information_of(fit: EmittanceFit) -> Information:
-    """Gather the information of a fit in any scenario.
+    """Gather the information of a fit: of known transport from the draws, else by linear theory.
 
     Parameters
     ----------
@@ -54,16 +106,16 @@ def information_of(fit: EmittanceFit) -> Information:
     -------
     Information
     """
-    p, theta = fit.problem, linearised_at(fit)
-    jacobian = assess.slopes(p, theta).residual_jacobian
     if fit.solved is None:
-        jacobian = jacobian / _beyond_linear(fit)[:, None]
+        quoted = [p.emittance.error and p.emittance.relative for p in fit.planes]
+        return beam_information(fit.seen, planes_of(fit), [q or np.nan for q in quoted])
+    p, theta = fit.problem, linearised_at(fit)
     held = p.lower == p.upper
-    if fit.solved is not None and _determined(fit):
+    if _determined(fit):
         edge = np.array([v.state in ("lower", "upper") for v in fit.fit.variables])
         held = held | (edge & p.nuisance)
     return Information(
-        jacobian,
+        assess.slopes(p, theta).residual_jacobian,
         *value_and_slope(p, _emittances, theta),
         ~p.nuisance & ~held,
         p.lower,
@@ -73,29 +125,12 @@ def information_of(fit: EmittanceFit) -> Information:
     )
 
 
-def _beyond_linear(fit: EmittanceFit) -> np.ndarray:
-    """The error that a fit quotes over that of linear theory, for each row of known transport."""
-    factors = []
-    for record in fit.problem.records:
-        plane = fit[record.data.plane]
-        post, factor = fit.seen.works[plane.plane].posterior, 1.0
-        if plane.emittance.error is not None:
-            s11, s12, s22 = post.best
-            slope = np.array([s22, -2.0 * s12, s11]) / (2.0 * np.sqrt(s11 * s22 - s12**2))
-            linear = float(np.sqrt(slope @ post.covariance @ slope))
-            factor = plane.emittance.error / linear
-        factors.append(np.full(record.measured.size, factor))
-    return np.concatenate(factors)
-
-
 def linearised_at(fit: EmittanceFit) -> np.ndarray:
     """Where to take derivatives: at the answer, or at first principles where there is none.
 
     Numbers that the data do not determine end anywhere; what a measurement would tell is then
     asked of the line and the beam one started from.
     """
-    if fit.solved is None:
-        return fit.problem.start
     if _determined(fit):
         return fit.fit.theta
     return np.clip(fit.stated.start, fit.stated.lower, fit.stated.upper)
@@ -111,15 +146,6 @@ def _emittances(model, data):
 
 # Other energies to consider where none is named: what a linac can usually do.
 USUAL_ENERGIES = (0.8, 1.25)
-
-
-class Candidate(NamedTuple):
-    """A further measurement: settings of the magnets, screen, and energy in MeV."""
-
-    settings: dict[str, float]
-    screen: str
-    energy: float
-    words: str
 
 
 def candidate_rows(
@@ -148,17 +174,22 @@ def candidate_rows(
     InputError
         If limits name no magnet of the line, or are reversed.
     """
-    own, screens, found, rows = fit.seen.energy, _screens(fit), [], []
-    for name, table in candidate_settings(fit.scan.settings, _checked(fit, limits)):
-        points = [{n: float(v[i]) for n, v in table.items()} for i in range(len(table[name]))]
-        for screen, energy in product(screens, (own, *energies)):
-            every = _rows(fit, fit.seen.scanned, table, screen, np.full(len(points), energy))
-            rows += list(every.swapaxes(0, 1))
-            there = f" on {screen}" if len(screens) > 1 else ""
-            there += f" at {energy:g} MeV" if energy != own else ""
-            for settings in points:
-                words = _in_words(fit, settings) + there
-                found.append(Candidate(settings, screen, float(energy), words))
+    seen, screens, found, rows = fit.seen, _screens(fit), [], []
+    predict = _predicted(fit)
+    for _, table in candidate_settings(fit.scan.settings, _checked(fit, limits)):
+        rows_of_table = zip(*table.values(), strict=True)
+        points = [dict(zip(table, map(float, row), strict=True)) for row in rows_of_table]
+        for screen, energy in product(screens, (seen.energy, *energies)):
+            further = predict(seen.scanned, table, screen, np.full(len(points), energy))
+            usable = np.ones(len(points), bool)
+            if limits is None and (there := on_screen(seen, planes_of(fit), further.size)).any():
+                usable = there
+            rows += list(further.rows.swapaxes(0, 1)[usable])
+            where = f" on {screen}" if len(screens) > 1 else ""
+            where += f" at {energy:g} MeV" if energy != seen.energy else ""
+            for i in np.flatnonzero(usable):
+                words = _in_words(fit, points[i]) + where
+                found.append(Candidate(points[i], screen, float(energy), words))
     return found, np.array(rows)
 
 
@@ -205,25 +236,25 @@ def _in_words(fit: EmittanceFit, settings: Mapping[str, float]) -> str:
     return in_words(settings, setting_units(fit.seen.scanned, settings))
 
 
-def _rows(
-    fit: EmittanceFit,
-    line: Beamline,
-    table: Mapping[str, np.ndarray],
-    screen: str,
-    energy: np.ndarray,
-) -> np.ndarray:
-    """Derivatives of sizes by the free numbers over their errors, shape (planes, m, n)."""
+def _predicted(fit: EmittanceFit) -> Predict:
+    """How a fit predicts further sizes: by the draws of the beams, or by its derivatives."""
+    if fit.solved is None:
+        return beam_sizes(fit.seen, planes_of(fit))
     problem, theta = fit.problem, linearised_at(fit)
-    found = []
-    for plane in fit.planes:
-        relative = np.median(plane.points.error / plane.points.size)
-        if fit.statement.whole_map:
-            data = _line_rows(fit, line, plane.plane, table, screen, energy)
-        else:
-            data = _network_rows(fit, plane.plane, table, screen)
-        size, slope = value_and_slope(problem, predict_sizes, theta, data)
-        found.append(slope / (max(float(relative), 1e-4) * size)[:, None])
-    return np.array(found)
+
+    def predict(line, table, screen, energy) -> Further:
+        sizes, rows = [], []
+        for plane in planes_of(fit):
+            if fit.statement.whole_map:
+                data = _line_rows(fit, line, plane, table, screen, energy)
+            else:
+                data = _network_rows(fit, plane, table, screen)
+            size, slope = value_and_slope(problem, predict_sizes, theta, data)
+            rows.append(slope / (relative_error(fit.seen, plane) * size)[:, None])
+            sizes.append(1e-6 * size)
+        return Further(np.array(sizes), np.array(rows))
+
+    return predict
 
 
 def _line_rows(fit, line, plane, table, screen, energy) -> Rows:
@@ -282,15 +313,16 @@ def further_options(
     own = fit.seen.energy
     energy = np.full(len(fit.scan), own) if fit.scan.energy is None else fit.scan.energy
     if fit.statement.whole_map:
+        predict = _predicted(fit)
         for line, screen, words in _other_screens(fit):
-            rows = _rows(fit, line, table, screen, energy)
+            rows = predict(line, table, screen, energy).rows
             best = min(range(rows.shape[1]), key=lambda i: _worst(base.with_rows(rows[:, i])))
             at = _in_words(fit, {n: float(v[best]) for n, v in table.items()})
             yield f"one size on {words} ({at})", rows[:, best]
             yield f"the same scan on {words}", rows.reshape(-1, rows.shape[-1])
         for factor in energies or tuple(own * f for f in USUAL_ENERGIES):
             screen = (fit.scan.screen or fit.seen.rows.places)[-1]
-            rows = _rows(fit, fit.seen.scanned, table, screen, np.full(len(fit.scan), factor))
+            rows = predict(fit.seen.scanned, table, screen, np.full(len(fit.scan), factor)).rows
             yield f"the same scan at {factor:.4g} MeV", rows.reshape(-1, rows.shape[-1])
     yield from _priors(fit)
 

@@ -22,6 +22,7 @@ from beamfit.studies.scan.candidates import (
     determined_by,
     further_options,
     information_of,
+    judge_of,
 )
 from beamfit.studies.scan.fit import EmittanceFit
 from beamfit.table import Table, json_of, text_of
@@ -270,31 +271,29 @@ def best_steps(
     """The best measurement, the best after that, and why the list ends."""
     candidates, rows = candidate_rows(fit, limits, energies)
     aim = "" if goal is None else f"goal of {100 * goal:.3g} %"
+    judge, now, steps = judge_of(fit), base, []
+    sure = judge(base, ())
 
-    def identified(known: Information) -> bool:
-        return all(determined_by(fit, known).values())
+    def sharp() -> bool:
+        return goal is not None and all(sure.values()) and now.relative_error.max() <= goal
 
-    def sharp(known: Information) -> bool:
-        return goal is not None and identified(known) and known.relative_error.max() <= goal
-
-    now, steps = base, []
     for choice in greedy(base, rows, criterion == "D"):
         if len(steps) == count:
             break
-        if sharp(now):
+        if sharp():
             return tuple(steps), f"Stop: the {aim} is reached."
-        if identified(now) and criterion == "emittance" and choice.gain < LEAST_GAIN:
+        if all(sure.values()) and criterion == "emittance" and choice.gain < LEAST_GAIN:
             return tuple(steps), (
                 "Stop: the best further point sharpens the emittance by "
                 f"{100 * max(choice.gain, 0):.1g} %; repeat the scan instead, or improve the size "
                 "measurement."
             )
-        now = choice.known
-        after = by_plane(fit, now), determined_by(fit, now)
-        steps.append(Step(candidates[choice.index], *after))
-    if sharp(now):
+        now, candidate = choice.known, candidates[choice.index]
+        sure = judge(now, [*(s.candidate for s in steps), candidate])
+        steps.append(Step(candidate, by_plane(fit, now), sure))
+    if sharp():
         return tuple(steps), f"Stop after these: the {aim} is reached."
-    if goal is not None and identified(now):
+    if goal is not None and all(sure.values()):
         return tuple(steps), f"The {aim} needs more than these {count}."
     return tuple(steps), f"Listed are the best {count}."
 
