@@ -57,7 +57,7 @@ Examples:
 )
 @option(
     "--robust",
-    "Expect more bad readings: one in ten and up to a third, instead of 3 % and up to a fifth.",
+    "Expect more bad readings: one in ten and up to a third, instead of 3 % and up to a quarter.",
     is_flag=True,
 )
 @options("noise weights scenario prior bounds gain anchor")

@@ -38,7 +38,7 @@ class Lognormal(NamedTuple):
         return math.log(0.5 * math.erfc(pull / math.sqrt(2.0)))
 
 
-FACTOR, UNSTATED, SCATTER = Lognormal(1.5, 0.8), Lognormal(0.08, 0.8), Lognormal(0.05, 0.7)
+FACTOR, UNSTATED, SCATTER = Lognormal(1.5, 0.8), Lognormal(0.1, 0.6), Lognormal(0.05, 0.7)
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,7 @@ class Noise:
         half of the truth, since shots do not show what differs from setting to setting.
     unstated : Lognormal
         Noise that nobody stated, as a share of the size: a reading has the jitter of its shot
-        beside the 4 to 5 % that settings scatter, from 2 % for good wires to 40 % for bad screens.
+        beside the 4 to 5 % that settings scatter, from 3 % for good wires to 30 % for bad screens.
     share : float
         Probability that such noise is a share of the size, and not the same number of µm at every
         setting. A few points do not tell which.
@@ -95,7 +95,7 @@ class Noise:
     scatter: Lognormal = SCATTER
     bad: float = 0.03
     width: float = 12.0
-    most: int = 5
+    most: int = 4
     bad_shot: float = 0.02
     source: str = "beamfit's own, from published scans (docs/verdict.md)"
 

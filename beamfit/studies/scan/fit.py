@@ -68,7 +68,7 @@ def fit_emittance(
         The residual: the report's ``error_linear`` or ``error_nonlinear``.
     robust : bool
         Expect bad readings: one in ten, and up to a third of them, where the usual prior is 3 %
-        and a fifth.
+        and a quarter.
     noise : Noise, optional
         Priors of the noise of sizes; `beamfit.Noise()` if None.
     weights : {"model", "measured"}
