@@ -57,7 +57,7 @@ Examples:
 )
 @option(
     "--robust",
-    "Expect more bad readings: one in ten and up to a third, instead of 3 % and up to a quarter.",
+    "Expect more bad readings: one in ten, instead of 3 %.",
     is_flag=True,
 )
 @options("noise weights scenario prior bounds gain anchor")

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 FORMAT = "beamfit-noise-1"
 # Key of the file: its unit and meaning, and whether it is a list of middle and spread.
 PAIRS = ("factor", "unstated", "scatter")
-SINGLE = ("right", "share", "even", "bad", "width", "most", "bad_shot")
+SINGLE = ("right", "share", "even", "bad", "width", "bad_shot")
 
 
 def read_noise(path: str | PathLike[str]) -> Noise:

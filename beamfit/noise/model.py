@@ -69,8 +69,6 @@ class Noise:
     width : float
         How many times wider bad readings scatter than good ones, or than most points do where a
         point's own stated error is less.
-    most : int
-        At most one reading of so many is bad: bad is an exception, not a law.
     bad_shot : float
         Probability that a single shot shows something else than the beam.
     source : str
@@ -95,7 +93,6 @@ class Noise:
     scatter: Lognormal = SCATTER
     bad: float = 0.03
     width: float = 12.0
-    most: int = 4
     bad_shot: float = 0.02
     source: str = "beamfit's own, from published scans (docs/verdict.md)"
 
@@ -109,10 +106,9 @@ class Noise:
             if not all(math.isfinite(v) and v > 0 for v in values):
                 raise InputError(f"noise prior {name} = {tuple(values)}", "two positive numbers")
             object.__setattr__(self, name, values)
-        if not (self.width > 1 and self.most >= 2):
-            found = f"noise prior width = {self.width:g}, most = {self.most:g}"
-            raise InputError(found, "a width above 1, and at most every second reading bad")
+        if not self.width > 1:
+            raise InputError(f"noise prior width = {self.width:g}", "a width above 1")
 
 
-# Scans in which a point in ten may be bad, up to a third of them: what --robust asks for.
-ROBUST = {"bad": 0.1, "most": 3}
+# The share of bad readings that --robust expects.
+ROBUST = 0.1

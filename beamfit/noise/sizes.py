@@ -182,8 +182,7 @@ def log_likelihood(off: Any, model: Any, kind: Kind, scale: Any, noise: Noise) -
     -----
     A reading is good with probability 1 - f or else scatters W times as wide (the good-and-bad-data
     model of D. W. Hogg, J. Bovy and D. Lang, arXiv:1008.4686 (2010), eq. 17, with a width that
-    goes with the noise). Of few readings only the n//most worst can be bad; of 3 most and more the
-    prior itself keeps them few.
+    goes with the noise).
     """
     xp = off.__array_namespace__()
     n = off.shape[-1]
@@ -192,27 +191,10 @@ def log_likelihood(off: Any, model: Any, kind: Kind, scale: Any, noise: Noise) -
     found = -0.5 * xp.sum(z2, axis=0) - spread[..., None, :] - 0.5 * n * LN_2PI
     if kind.power:
         found = found - xp.sum(xp.log(model), axis=-1)[..., None]
-    many = n // noise.most
-    if not many:
-        return found
-    odds = _worst(log_odds(z2, kind, noise), many)
+    odds = log_odds(z2, kind, noise)
     # ln(1 + e^odds) without overflow.
-    doubt = xp.log1p(xp.exp(xp.minimum(odds, 500.0))) + xp.maximum(odds - 500.0, 0.0)
+    doubt = xp.log(1.0 + xp.exp(xp.minimum(odds, 500.0))) + xp.maximum(odds - 500.0, 0.0)
     return found + n * math.log1p(-noise.bad) + xp.sum(doubt, axis=0)
-
-
-def _worst(odds: Any, many: int) -> Any:
-    """The one or two largest along the first axis; all where more are asked for."""
-    xp = odds.__array_namespace__()
-    if many > 2:
-        return odds
-    first = xp.max(odds, axis=0)
-    if many == 1:
-        return first[None]
-    # By its place, not by its value: a compiler may round the same number twice.
-    place = xp.reshape(xp.arange(odds.shape[0]), (-1,) + (1,) * (odds.ndim - 1))
-    others = xp.where(place == xp.argmax(odds, axis=0), -xp.inf, odds)
-    return xp.stack([first, xp.max(others, axis=0)])
 
 
 def log_odds(squared_pull: Any, kind: Kind, noise: Noise) -> Any:

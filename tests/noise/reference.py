@@ -57,19 +57,11 @@ def usual_over_own(size, error):
 
 
 def log_readings(off, deviation, noise, usual=1.0):
-    """Log density of readings of shape (..., n), each good or bad, the n//most likeliest bad."""
-    n = off.shape[-1]
+    """Log density of readings of shape (..., n), each good or bad."""
     good = log_normal(off, deviation)
-    many = n // noise.most
-    if not many:
-        return good.sum(-1)
     wide = log_normal(off, noise.width * usual * deviation)
     either = np.logaddexp(math.log(1.0 - noise.bad) + good, math.log(noise.bad) + wide)
-    sure = math.log(1.0 - noise.bad) + good
-    if many >= 3:
-        return either.sum(-1)
-    rank = np.argsort(np.argsort(good - wide, axis=-1), axis=-1)
-    return np.where(rank < many, either, sure).sum(-1)
+    return either.sum(-1)
 
 
 def log_stated(size, model, error, noise):

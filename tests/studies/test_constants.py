@@ -46,5 +46,5 @@ def test_the_priors_of_the_page_are_those_of_the_code():
         row = next(row for row in rows if name[:12] in row)
         assert f"{probability:g}".lstrip("0") in row
     assert f"about {noise.factor.middle:g}, ln ± .{10 * noise.factor.spread:g}" in text
-    assert f"about {100 * noise.unstated.middle:g} %, ln ± .8" in text
+    assert f"about {100 * noise.unstated.middle:g} %, ln ± .{10 * noise.unstated.spread:g}" in text
     assert f"about {100 * noise.scatter.middle:g} % of the size, ln ± .7" in text

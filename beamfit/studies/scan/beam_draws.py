@@ -11,7 +11,7 @@ from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
-from scipy.special import chdtri, gammaln, ndtri
+from scipy.special import fdtri, gammaln, ndtri
 
 from beamfit.noise.model import LN_2PI, Noise
 from beamfit.noise.sizes import (
@@ -24,16 +24,16 @@ from beamfit.noise.sizes import (
 )
 
 # Draws of a plane, and degrees of freedom of the Student distributions they are drawn from.
-DRAWS, TAIL = 1024, 4.0
+DRAWS, TAIL = 1536, 4.0
 # One draw in so many is from the prior: no weight is large by luck where the sizes say little.
 DEFENSIVE = 8
 # Proposals are so much wider than the linear theory, and their shares flattened by this power.
 WIDER, FLATTER, PARTS = 1.3, 0.5, 24
 # Rounds in which weights are taken anew from the model, within this factor of the measured size.
 ROUNDS, FURTHEST = 6, 3.0
-# Every two points are left out of up to so many, every one of up to so many more; of any number the
-# worst ones in so many steps.
-PAIRS, SINGLES, STEPS = 24, 50, 12
+# Fits leave out every two of up to so many points, every one of up to so many more, and of any
+# number the worst ones up to this share in so many steps.
+PAIRS, SINGLES, WORST, STEPS = 24, 50, 0.25, 12
 # Numbers that one draw of many points may have, with all draws of few: memory and time.
 ROOM, FEWEST = 500_000, 128
 BLOCK = 10_000_000
@@ -161,7 +161,7 @@ def draw_beams(c: Coordinates, kind: Kind, noise: Noise) -> BeamDraws:
     draw has the weight of its posterior over the density of the mixture (importance
     sampling; A. B. Owen and Y. Zhou, J. Am. Stat. Assoc. 95, 135 (2000), sect. 4).
     """
-    centre, root = fits(c, kind, noise)
+    centre, root = fits(c, kind)
     scales = wide_scales(kind, c.unit.shape)
     for _ in range(2):
         at_centres = _log_likelihood(centre, c, kind, scales.scale, noise)
@@ -222,9 +222,9 @@ def _log_likelihood(
     return np.concatenate(parts, axis=-2)
 
 
-def left_out(n: int, noise: Noise) -> np.ndarray:
+def left_out(n: int) -> np.ndarray:
     """Which of n points each fit has: all, all but one, all but two; shape (fits, n)."""
-    most = min(n // noise.most, (n <= PAIRS) + (n <= SINGLES))
+    most = min(max(n - 3, 0), (n <= PAIRS) + (n <= SINGLES))
     chosen = [s for k in range(1 + most) for s in combinations(range(n), k)]
     kept = np.ones((len(chosen), n))
     for row, points in zip(kept, chosen, strict=True):
@@ -232,7 +232,7 @@ def left_out(n: int, noise: Noise) -> np.ndarray:
     return kept
 
 
-def fits(c: Coordinates, kind: Kind, noise: Noise) -> tuple[np.ndarray, np.ndarray]:
+def fits(c: Coordinates, kind: Kind) -> tuple[np.ndarray, np.ndarray]:
     """Fits of size² with all points and without some: centres and roots of their covariances.
 
     Returns
@@ -241,10 +241,10 @@ def fits(c: Coordinates, kind: Kind, noise: Noise) -> tuple[np.ndarray, np.ndarr
         Shape (..., m, 3) and (..., m, 3, 3).
     """
     n = c.size.shape[-1]
-    kept = np.broadcast_to(left_out(n, noise), (*c.unit.shape, *left_out(n, noise).shape))
+    kept = np.broadcast_to(left_out(n), (*c.unit.shape, *left_out(n).shape))
     found = [_fitted(c, kind, deviation, kept) for deviation in _deviations(kind, c)]
-    if n > 2 * noise.most:
-        found += [_greedy(c, kind, deviation, noise) for deviation in _deviations(kind, c)]
+    if WORST * n > 2:
+        found += [_greedy(c, kind, deviation) for deviation in _deviations(kind, c)]
     return _joined(found)
 
 
@@ -292,12 +292,10 @@ def _little(normal: np.ndarray) -> np.ndarray:
     return 1e-9 * np.maximum(trace, 1e-30) * np.eye(3)
 
 
-def _greedy(
-    c: Coordinates, kind: Kind, deviation: np.ndarray, noise: Noise
-) -> tuple[np.ndarray, np.ndarray]:
+def _greedy(c: Coordinates, kind: Kind, deviation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Fits that leave out the worst point of the one before, up to a share of them."""
     n = c.size.shape[-1]
-    kept, found, most = np.ones((*c.unit.shape, 1, n)), [], n // noise.most
+    kept, found, most = np.ones((*c.unit.shape, 1, n)), [], int(WORST * n)
     steps = min(most, STEPS)
     for _ in range(steps):
         centre, _ = _fitted(c, kind, deviation, kept)
@@ -319,22 +317,34 @@ def _inside(x: np.ndarray) -> np.ndarray:
     return np.where(edge[..., None], np.concatenate([length[..., None], turned], -1), x)
 
 
+def _even_cube(dim: int, number: int) -> np.ndarray:
+    """Points that fill a cube evenly, shape (number, dim): radical inverses in the first primes.
+
+    J. H. Halton, Numer. Math. 2, 84 (1960), eq. 1.
+    """
+    columns = []
+    for base in (2, 3, 5, 7)[:dim]:
+        left, unit, inverse = np.arange(1, number + 1), 1.0, np.zeros(number)
+        while left.any():
+            unit /= base
+            inverse += unit * (left % base)
+            left = left // base
+        columns.append(inverse)
+    return np.stack(columns, -1)
+
+
 @lru_cache(maxsize=8)
 def _even_points(dim: int, number: int) -> tuple[np.ndarray, np.ndarray]:
-    """Points that fill a cube evenly, as those of a Student distribution, and a cut of [0, 1).
+    """Even points of a Student distribution in two or three dimensions, and a cut of [0, 1).
 
-    An additive recurrence with the generalised golden ratio g, g^(d+1) = g + 1, stepped by 1/g^k:
-    H. Niederreiter, Random Number Generation and Quasi-Monte Carlo Methods (1992), sect. 3.
+    The square of its radius over the dimension has an F distribution, its direction is uniform.
     """
-    count = dim + 2
-    g = 2.0
-    for _ in range(60):
-        g = (1.0 + g) ** (1.0 / (count + 1.0))
-    step = g ** -(1.0 + np.arange(count))
-    cube = (0.5 + np.arange(1, number + 1)[:, None] * step) % 1.0
-    cube = np.clip(cube, 1e-9, 1.0 - 1e-9)
-    chi2 = chdtri(TAIL, cube[:, dim])
-    return ndtri(cube[:, :dim]) / np.sqrt(chi2 / TAIL)[:, None], cube[:, -1]
+    cube = _even_cube(dim + 1, number)
+    radius, turn = np.sqrt(dim * fdtri(dim, TAIL, cube[:, 0])), 2.0 * math.pi * cube[:, 1]
+    height = np.zeros(number) if dim == 2 else 2.0 * cube[:, 2] - 1.0
+    ring = np.sqrt(1.0 - height**2)
+    direction = np.stack([ring * np.cos(turn), ring * np.sin(turn), height], -1)
+    return radius[:, None] * direction[:, :dim], cube[:, -1]
 
 
 def student_mixture(
@@ -392,10 +402,7 @@ def _student_density(
 @lru_cache(maxsize=8)
 def _prior_points(number: int) -> np.ndarray:
     """Even draws from the prior of T, T p_1, T p_2, one for every `DEFENSIVE` draws."""
-    steps = 0.5 + np.arange(number // DEFENSIVE)[:, None] * np.array(
-        [0.8191725, 0.6710436, 0.5497005]
-    )
-    bright, flat, turn = (steps % 1.0).T
+    bright, flat, turn = _even_cube(3, number // DEFENSIVE).T
     t, p = np.exp(BRIGHT * ndtri(bright)), np.sqrt(1.0 - flat**2)
     angle = 2.0 * math.pi * turn
     return np.stack([t, t * p * np.cos(angle), t * p * np.sin(angle)], -1)

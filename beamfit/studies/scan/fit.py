@@ -67,8 +67,7 @@ def fit_emittance(
     method : {"size_squared", "size"}
         The residual: the report's ``error_linear`` or ``error_nonlinear``.
     robust : bool
-        Expect bad readings: one in ten, and up to a third of them, where the usual prior is 3 %
-        and a quarter.
+        Expect bad readings: one in ten, where the usual prior is 3 %.
     noise : Noise, optional
         Priors of the noise of sizes; `beamfit.Noise()` if None.
     weights : {"model", "measured"}
@@ -136,7 +135,7 @@ def fit_emittance(
     ties = (gains or {}, anchor or Anchor(), hysteresis)
     told = Assumptions(priors or {}, bounds or {}, *ties, hidden, starts, seed)
     told.check_scenario(scenario)
-    noise = replace(noise or Noise(), **ROBUST) if robust else noise
+    noise = replace(noise or Noise(), bad=ROBUST) if robust else noise
     scan, line = prepared(scan, line, scenario)
     statement = scenario_of(scenario)
     if told.systematics:

@@ -18,7 +18,7 @@ from beamfit.noise.sizes import (
     variance_of,
     wide_scales,
 )
-from beamfit.studies.scan.beam_draws import BRIGHT, DRAWS, WIDER, Coordinates, student_mixture
+from beamfit.studies.scan.beam_draws import BRIGHT, WIDER, Coordinates, student_mixture
 
 # Steps of ln size of sizes at random or in a drift; bends of a curve as shares of the mean size,
 # and over which share of the scan it bends.
@@ -26,6 +26,8 @@ STEPS = np.geomspace(0.05, 1.0, 6)
 BENDS, LENGTHS = np.array([0.2, 0.4, 0.7, 1.2]), (0.25, 0.5)
 # Standard deviation of ln of a constant size.
 LEVEL = 1.0
+# Draws of a beam of no emittance, of which the evidence alone is wanted.
+FEW = 256
 
 
 def flat_beam(c: Coordinates, kind: Kind, noise: Noise) -> np.ndarray:
@@ -70,13 +72,13 @@ def flat_beam(c: Coordinates, kind: Kind, noise: Noise) -> np.ndarray:
 
     for _ in range(2):
         scales = narrowed(kind, scales, each(v, scales.scale)[..., 0, :] + scales.log_weight)
-    x, log_density = student_mixture(v, root, np.ones((*v.shape[:-2], 1)))
+    x, log_density = student_mixture(v, root, np.ones((*v.shape[:-2], 1)), FEW)
     t = np.maximum((x**2).sum(-1), 1e-300)
     # v and -v are one beam: twice the density of the whole plane.
     bright = -0.5 * LN_2PI - math.log(BRIGHT) - 0.5 * (np.log(t) / BRIGHT) ** 2
     prior = bright - np.log(0.5 * math.pi * t)
     found = averaged(each(x, scales.scale), scales.log_weight[..., None, :])
-    found = found + prior - log_density - math.log(DRAWS)
+    found = found + prior - log_density - math.log(FEW)
     return averaged(found, 0.0) + kind.log_weight
 
 
