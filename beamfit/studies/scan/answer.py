@@ -140,7 +140,7 @@ def plane_answer(
     post, p = seen.works[plane].posterior, seen.works[plane].points
     n, carrying = _numbers(post, p, places, b)
     e = _evidence(seen, plane, n.low[1], n.high[1], b)
-    j = _judged(seen, plane, e, b, carrying, float(n.value[1]))
+    j = _judged(seen, plane, e, b, carrying, n.value)
     known = j.determined | (LINEAR & j.of_a_beam & (b is None))
     emittance, normalized, beta, alpha, s11, s12, s22, *screen, mismatch = n.quantities(
         known, j.of_a_beam and not e.opened and e.ending is None
@@ -193,19 +193,21 @@ def _numbers(
 
 
 def _judged(
-    seen: Seen, plane: str, e: Evidence, b: Beside | None, carrying: Influence, emittance: float
+    seen: Seen, plane: str, e: Evidence, b: Beside | None, carrying: Influence, value: np.ndarray
 ) -> Judged:
     """The verdict on a plane."""
     work = seen.works[plane]
     post, p = work.posterior, work.points
     column = seen.scan.columns.get(f"size_{plane}", f"size_{plane}")
-    if e.determined and (other := _impossible(emittance, column)):
+    if e.determined and (other := _impossible(float(value[1]), column)):
         return Judged(other, False, False, None)
     remarks = [work.shot_words]
     if e.of_a_beam:
         likely = chi2_probability(post.chi2, max(len(p.size) - 3, 0))
         remarks.insert(0, noise_remark(work.sizes.likeness[1], post.scale, likely))
-        remarks += point_remarks(p, *(("", 0.0) if e.opened else carrying[:2]))
+        without = carrying.without * value[1] / value[0]
+        place = "" if e.opened else carrying.place
+        remarks += point_remarks(p, place, float(without), abs(carrying.shift) > MOVES)
     if b is not None and e.determined:
         remarks.append(b.remark)
     advised = e.of_a_beam and not e.determined and b is None

@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from beamfit.quantity import display_unit
 from beamfit.status import Status
 from beamfit.studies.scan.comparison import BEAM, FLAT
 from beamfit.studies.scan.results import Points
@@ -224,16 +225,20 @@ def noise_remark(noise: str, scale: np.ndarray, probability: float | None = None
     return ""
 
 
-def point_remarks(p: Points, carrying: str, shift: float) -> Iterator[str]:
+def point_remarks(
+    p: Points, carrying: str = "", without: float = math.nan, reached: bool = False
+) -> Iterator[str]:
     """Name bad readings, and the point that carries the answer.
 
     Parameters
     ----------
     p : Points
         With the probability of each that it is bad.
-    carrying, shift : str and float
-        The point without which the emittance moves most, and how far, in errors; NaN where the
-        others give none.
+    carrying, without : str and float
+        The point without which the emittance moves most, and what it is then, normalised, m; NaN
+        where the others give none.
+    reached : bool
+        Whether the interval was widened to hold that.
     """
     bad = np.flatnonzero(p.outlier_probability > 0.5)
     if len(bad):
@@ -242,14 +247,14 @@ def point_remarks(p: Points, carrying: str, shift: float) -> Iterator[str]:
         verb = "are" if len(bad) > 1 else "is"
         said = f"{len(bad)} of {len(p.size)} readings {verb} probably bad"
         yield f"{said}: {'; '.join(places)}."
-    if carrying and math.isnan(shift):
+    if carrying and math.isnan(without):
         yield f"It rests on the point at {carrying}: without it there is no answer."
     elif carrying:
-        more = "larger" if shift > 0 else "smaller"
-        reach = ", to which the interval reaches" if abs(shift) > MOVES else ""
+        factor, unit = display_unit(without, "m")
+        reach = ", to which the interval reaches" * reached
         yield (
-            f"It rests on the point at {carrying}: without it the emittance is "
-            f"{abs(shift):.1f} errors {more}{reach}."
+            f"It rests on the point at {carrying}: without it the normalised emittance is "
+            f"{without / factor:.3g} {unit}{reach}."
         )
 
 
