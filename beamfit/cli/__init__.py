@@ -24,7 +24,18 @@ from beamfit.cli.watch import watch
 from beamfit.errors import LONGEST, InputError, plain, short
 
 
+class _Commands(click.Group):
+    """Commands whose descriptions are listed whole."""
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Write a paragraph a command."""
+        rows = [(name, self.commands[name].get_short_help_str(500)) for name in self.commands]
+        with formatter.section("Commands"):
+            formatter.write_dl(rows)
+
+
 @click.group(
+    cls=_Commands,
     context_settings={"help_option_names": ["-h", "--help"]},
     epilog="Example: beamfit emittance scan.csv --lattice line.toml --report scan.html",
 )

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from beamfit.cli.options import answered, command_line, option, options
+from beamfit.cli.options import Command, answered, command_line, option, options
 from beamfit.errors import InputError
 from beamfit.table import Table
 from beamfit.writing import check_place
@@ -27,7 +27,7 @@ Examples:
 NAMED = 10
 
 
-@click.command(epilog=EXAMPLE)
+@click.command(cls=Command, epilog=EXAMPLE)
 @click.argument("path", nargs=-1, required=True)
 @option(
     "--kind",

@@ -7,7 +7,7 @@ from typing import Any
 
 import click
 
-from beamfit.cli.options import command_line, options
+from beamfit.cli.options import Command, command_line, options
 from beamfit.errors import InputError
 from beamfit.io.columns import Layout
 from beamfit.io.result import results_text
@@ -21,7 +21,7 @@ Examples:
 """
 
 
-@click.command(epilog=EXAMPLE)
+@click.command(cls=Command, epilog=EXAMPLE)
 @click.argument("files", nargs=-1, required=True, metavar="FILE...")
 @options("columns ignore skip-bad use energy json")
 def check(files: tuple[str, ...], as_json: bool, **reading: Any) -> None:

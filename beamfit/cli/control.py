@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from beamfit.cli.options import answered, option, options, reported
+from beamfit.cli.options import Command, answered, option, options, reported
 from beamfit.errors import InputError, nearest
 from beamfit.io.files import digest
 from beamfit.io.run import read_run
@@ -29,9 +29,9 @@ WISH = "OUTPUT=VALUE or OUTPUT=VALUE@SECONDS such as level=2.5@60"
 LIMIT = "NAME=LOW:HIGH, one of them may be left out, such as level=:3"
 
 
-@click.command(epilog=EXAMPLE)
+@click.command(cls=Command, epilog=EXAMPLE)
 @click.argument("record", nargs=-1, required=True)
-@options("model map input output step delay no-offset gain")
+@options("model map input output step delay no-offset response-gain")
 @option(
     "--set OUTPUT=VALUE[@SECONDS]",
     "What an output shall be, from a time on.",
@@ -41,7 +41,7 @@ LIMIT = "NAME=LOW:HIGH, one of them may be left out, such as level=:3"
 )
 @option(
     "--limit NAME=LOW:HIGH",
-    "Of an input, the range of the runs unless said, or of an output.",
+    "Of an input (default: the range of the runs) or of an output.",
     multiple=True,
 )
 @option("--rate INPUT=PER_SECOND", "Largest change of an input in a second.", multiple=True)

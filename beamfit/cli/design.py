@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 import beamfit
-from beamfit.cli.options import answered, option, options
+from beamfit.cli.options import Command, answered, option, options
 from beamfit.io.line import build_line, read_inputs
 from beamfit.io.noise import read_noise
 from beamfit.studies.scan.assumptions import Assumptions
@@ -27,7 +27,7 @@ Examples:
 """
 
 
-@click.command(epilog=EXAMPLE)
+@click.command(cls=Command, epilog=EXAMPLE)
 @options(
     "scan columns ignore skip-bad lattice use from to screen energy noise scenario prior bounds "
     "gain anchor vary"
@@ -79,5 +79,6 @@ def design(
 
 def _show(terminal: Terminal, advice: Advice, title: str) -> None:
     terminal.line(f"{title}, scenario {advice.scenario}: error of the emittance", style="bold")
-    click.echo("\n\n".join(map(text_of, advice.tables())))
     terminal.verdict("design", advice.status, advice.message)
+    terminal.line()
+    click.echo("\n\n".join(map(text_of, advice.tables())))

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 import beamfit
-from beamfit.cli.options import Sampling, answered, option, options, reported
+from beamfit.cli.options import Command, Sampling, answered, option, options, reported
 from beamfit.errors import InputError
 from beamfit.io.line import build_line, read_inputs
 from beamfit.io.noise import read_noise
@@ -42,7 +42,7 @@ Examples:
 """
 
 
-@click.command(epilog=EXAMPLE)
+@click.command(cls=Command, epilog=EXAMPLE)
 @options(
     "scan columns ignore skip-bad size-method maybe-lattice use from to screen energy particle"
 )
@@ -73,7 +73,7 @@ Examples:
 )
 @options("hidden")
 @option("--starts", "Networks: starts of the training.", default=20)
-@options("sample store seed report json")
+@options("sample store seed report full json")
 def emittance(
     scan: str,
     plane: str | None,
@@ -86,6 +86,7 @@ def emittance(
     sample: bool,
     store: str | None,
     report: str | None,
+    full: bool,
     as_json: bool,
     **told: Any,
 ) -> None:
@@ -137,6 +138,7 @@ def emittance(
         inputs,
         lambda terminal: show(terminal, fit, posterior, methods),
         report,
+        full,
         posterior=posterior,
     )
 
@@ -186,18 +188,27 @@ def show(
     posterior: Posterior | None = None,
     methods: tuple[SizeMethods, ...] = (),
 ) -> None:
-    """Say the verdict first, then show tables and what the budget is."""
-    from beamfit.studies.scan.results import parameter_rows, result_rows
-    from beamfit.studies.scan.sensitivity import budget_rows, range_rows
-
-    names, statuses = [p.plane for p in fit.planes], [p.status for p in fit.planes]
-    title = f"{fit.scan.name} on {fit.line.name}"
-    terminal.line(title, style="bold")
+    """Say the verdict first, then show what is quoted, or all tables."""
+    terminal.line(f"{fit.scan.name} on {fit.line.name}", style="bold")
     for p in fit.planes:
         terminal.answer(p.headline, p.status, p.message)
     for note in fit.notes:  # what is odd about the file belongs to the answer
         terminal.line(note)
     terminal.line()
+    if terminal.full:
+        _show_fully(terminal, fit, methods)
+    else:
+        _show_briefly(terminal, fit)
+    if posterior is not None:
+        terminal.posterior("Posterior", posterior)
+
+
+def _show_fully(terminal: Terminal, fit: EmittanceFit, methods: tuple[SizeMethods, ...]) -> None:
+    """Show every number, the systematics budget and the range of the scan."""
+    from beamfit.studies.scan.results import parameter_rows, result_rows
+    from beamfit.studies.scan.sensitivity import budget_rows, range_rows
+
+    names, statuses = [p.plane for p in fit.planes], [p.status for p in fit.planes]
     terminal.table(labelled("", names, result_rows(fit.planes)), statuses)
     terminal.line()
     if fit.statement.closed:
@@ -209,17 +220,35 @@ def show(
             terminal.table(Table("", [head, *names], cells), wrap=False)
             terminal.line()
     elif fit.parameters:
-        cells = parameter_rows(fit.parameters)
-        terminal.table(Table("", ["Fitted too", "value", "bounds", "prior", "state"], cells))
+        header = ["Other fitted parameters", "value", "bounds", "prior", "state"]
+        terminal.table(Table("", header, parameter_rows(fit.parameters)))
     for words in fit.null_directions:
-        terminal.line(f"Left open: {words}.")
+        terminal.line(f"Not determined: {words}.")
     if fit.statement.network:
         terminal.line(f"Anchor: {fit.anchor}.", style="dim")
     if not fit.statement.closed:
         terminal.line()
     _about_the_input(terminal, fit, methods)
-    if posterior is not None:
-        terminal.posterior("Posterior", posterior)
+
+
+def _show_briefly(terminal: Terminal, fit: EmittanceFit) -> None:
+    """Show what is quoted, the largest systematic of each plane, and where the rest is."""
+    from beamfit.studies.scan.results import quoted_rows
+    from beamfit.studies.scan.sensitivity import systematics
+
+    if rows := quoted_rows(fit.planes):
+        terminal.table(labelled("", [p.plane for p in fit.planes], rows), wrap=False)
+    largest: dict[str, list[str]] = {}
+    for p in fit.planes if fit.statement.closed else ():
+        for change in systematics(fit, p.plane)[:1]:
+            said = f"{p.plane} {100 * change.normalized_emittance:+.1f} %"
+            largest.setdefault(change.cause, []).append(said)
+    if largest:
+        said = "; ".join(f"{cause}: {', '.join(parts)}" for cause, parts in largest.items())
+        terminal.line(f"Largest systematic, not in the error: {said}.")
+    for words in fit.null_directions:
+        terminal.line(f"Not determined: {words}.")
+    terminal.line("All tables: --full. A page with pictures: --report FILE.html.", style="dim")
 
 
 def _about_the_input(

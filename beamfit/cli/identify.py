@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from beamfit.cli.options import answered, option, options, reported
+from beamfit.cli.options import Command, answered, option, options, reported
 from beamfit.errors import InputError
 from beamfit.io.files import digest
 from beamfit.io.run import read_run
@@ -31,9 +31,9 @@ Examples:
 """
 
 
-@click.command(epilog=EXAMPLE)
+@click.command(cls=Command, epilog=EXAMPLE)
 @click.argument("record", nargs=-1, required=True)
-@options("model order map input output step delay no-offset gain")
+@options("model order map input output step delay no-offset response-gain")
 @option("--hold-back RECORD", "A run that is only predicted.", multiple=True)
 @options("hidden columns ignore skip-bad seed report json")
 def identify(

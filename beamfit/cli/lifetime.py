@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 import beamfit
-from beamfit.cli.options import Sampling, answered, option, options, reported
+from beamfit.cli.options import Command, Sampling, answered, option, options, reported
 from beamfit.errors import InputError
 from beamfit.io.decay_record import read_lifetime_input
 from beamfit.io.files import digest
@@ -40,7 +40,7 @@ Examples:
 """
 
 
-@click.command(epilog=EXAMPLE)
+@click.command(cls=Command, epilog=EXAMPLE)
 @click.argument("record", nargs=-1, required=True)
 @option(
     "--ring FILE.toml",
@@ -85,7 +85,7 @@ Examples:
     "--monitor-offset CURRENT",
     "How far it is off without beam (one standard deviation), such as 50uA.",
 )
-@options("prior columns ignore skip-bad sample store seed report json")
+@options("scale-prior columns ignore skip-bad sample store seed report full json")
 def lifetime(
     record: tuple[str, ...],
     ring: str | None,
@@ -100,6 +100,7 @@ def lifetime(
     store: str | None,
     seed: int,
     report: str | None,
+    full: bool,
     as_json: bool,
     **reading: Any,
 ) -> None:
@@ -153,6 +154,7 @@ def lifetime(
         inputs,
         lambda terminal: _show(terminal, studies, posteriors, shift, course),
         report,
+        full,
         study=shift,
         trend=course,
     )
@@ -169,8 +171,9 @@ def _lifetimes(tables: list[LifetimeTable], inputs: dict[str, str], as_json: boo
 def _show_lifetimes(terminal: Terminal, fits: list[LifetimeFit]) -> None:
     for fit in fits:
         terminal.line(str(fit.readings), style="bold")
-        terminal.table(fit.table(), [fit.status])
         terminal.verdict(fit.record, fit.status, fit.message)
+        terminal.line()
+        terminal.table(fit.table(), [fit.status])
         for note in fit.readings.notes:
             terminal.line(f"Note: {note}")
         terminal.line()
@@ -219,6 +222,11 @@ def _show(
     trend: Trend | None,
 ) -> None:
     """Show every record, and what was drawn and found of all together."""
+    if shift is not None:
+        _say_shift(terminal, shift)
+    if trend is not None:
+        terminal.verdict("trend", trend.status, trend.message)
+        terminal.line()
     for each in studies:
         _show_record(terminal, each)
     fits = [decay.fit for study in studies for decay in study.answers]
@@ -230,7 +238,8 @@ def _show(
     if trend is not None:
         for table in trend.tables():
             terminal.table(table, wrap=False)
-        terminal.verdict("trend", trend.status, trend.message)
+    if not terminal.full:
+        terminal.line("All tables: --full. A page with pictures: --report FILE.html.", style="dim")
 
 
 def _show_record(terminal: Terminal, study: RecordStudy) -> None:
@@ -250,10 +259,13 @@ def _show_record(terminal: Terminal, study: RecordStudy) -> None:
     many = len(study.decays) > tables.FEW
     for decay in study.pooled if many else study.answers:
         name, status = decay.fit.record, decay.fit.status
-        rows = tables.decay_rows([decay]) + tables.separability_rows([decay])[:2]
-        rows += tables.check_rows([decay])
         terminal.answer(decay.fit.headline, status, decay.fit.message)
         terminal.line()
+        if not terminal.full:
+            terminal.table(labelled("", [name], tables.quoted_rows([decay])), wrap=False)
+            continue
+        rows = tables.decay_rows([decay]) + tables.separability_rows([decay])[:2]
+        rows += tables.check_rows([decay])
         terminal.table(labelled("", [name], rows), [status])
         if decay.systematics:
             unseen = tables.systematic_rows(decay)
@@ -278,9 +290,23 @@ def _show_many(terminal: Terminal, study: RecordStudy) -> None:
     terminal.line()
 
 
-def _show_shift(terminal: Terminal, shift: Shift) -> None:
-    """Lay out a study of many decays and its verdicts."""
+def _say_shift(terminal: Terminal, shift: Shift) -> None:
+    """Say the verdicts of a study of many decays."""
     from beamfit.quantity import Status
+
+    terminal.verdict("all decays", shift.fit.status, shift.fit.message)
+    if shift.untold:
+        terminal.verdict("loss budget", Status.unidentified, shift.untold)
+    terminal.verdict("operating point", shift.best.status, shift.best.message)
+    if shift.anomaly is not None:
+        terminal.verdict("second half", shift.anomaly.status, shift.anomaly.message)
+    if shift.network is not None:
+        terminal.verdict("network", shift.network.fit.status, shift.network.fit.message)
+    terminal.line()
+
+
+def _show_shift(terminal: Terminal, shift: Shift) -> None:
+    """Lay out a study of many decays."""
     from beamfit.studies.decay import tables
     from beamfit.table import labelled
 
@@ -288,14 +314,6 @@ def _show_shift(terminal: Terminal, shift: Shift) -> None:
     names = ["1 decay" if count == 1 else f"{count} decays"]
     table = labelled("First principles fitted to", names, tables.shift_rows(shift))
     terminal.table(table, [fit.status])
-    terminal.verdict("all decays", fit.status, fit.message)
-    if shift.untold:
-        terminal.verdict("loss budget", Status.unidentified, shift.untold)
-    terminal.verdict("operating point", shift.best.status, shift.best.message)
-    if shift.anomaly is not None:
-        terminal.verdict("second half", shift.anomaly.status, shift.anomaly.message)
     if shift.network is not None:
-        found = shift.network.fit
         table = labelled("A network of the losses", names, tables.network_rows(shift))
-        terminal.table(table, [found.status])
-        terminal.verdict("network", found.status, found.message)
+        terminal.table(table, [shift.network.fit.status])

@@ -24,14 +24,45 @@ if TYPE_CHECKING:
     from beamfit.sampling.posterior import Posterior
 
 
+class _Option(click.Option):
+    """An option that is listed under a heading of the help text."""
+
+    def __init__(self, *names: Any, heading: str = "", **further: Any) -> None:
+        super().__init__(*names, **further)
+        self.heading = heading
+
+
+class Command(click.Command):
+    """A command whose help lists options under headings, in the order in which these come."""
+
+    def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Write a section for every heading."""
+        sections: dict[str, list[tuple[str, str]]] = {}
+        for each in self.get_params(ctx):
+            record = each.get_help_record(ctx)
+            if record is not None and isinstance(each, click.Option):
+                heading = getattr(each, "heading", "Output")
+                sections.setdefault(heading or "Options", []).append(record)
+        for heading, rows in sorted(sections.items(), key=lambda section: section[0] == "Output"):
+            with formatter.section(heading):
+                formatter.write_dl(rows)
+
+
 def option(
-    spelled: str, said: str, name: str = "", choices: Sequence[str] = (), **further: Any
+    spelled: str,
+    said: str,
+    name: str = "",
+    choices: Sequence[str] = (),
+    heading: str = "",
+    **further: Any,
 ) -> Callable[..., Any]:
     """An option as it is typed, with what stands behind it, and what it means; defaults are shown.
 
-    `name` is that of the command's argument where it is another one than the option's.
+    `name` is that of the command's argument where it is another one than the option's, `heading`
+    what the help text lists it under.
     """
     flag, _, metavar = spelled.partition(" ")
+    further |= {"cls": _Option, "heading": heading or HEADINGS.get(flag, "")}
     further |= {"type": click.Choice(list(choices))} if choices else {}
     further |= {"metavar": metavar or None, "show_default": bool(further.get("default"))}
     return click.option(*filter(None, (flag, name)), help=said, **further)
@@ -49,6 +80,17 @@ def _report(path: str) -> str:
     return path
 
 
+# What the help text lists shared options under.
+HEADINGS = {
+    **dict.fromkeys(("--columns", "--ignore", "--skip-bad", "--size-method"), "What is read"),
+    **dict.fromkeys(("--lattice", "--use", "--from", "--to", "--screen", "--energy"), "The line"),
+    **dict.fromkeys(("--particle", "--ring"), "The line"),
+    **dict.fromkeys(("--noise", "--robust", "--weights", "--method"), "Noise and residual"),
+    **dict.fromkeys(("--scenario", "--prior", "--bounds", "--gain", "--anchor"), "What is unknown"),
+    **dict.fromkeys(("--hidden", "--starts", "--hysteresis", "--systematics"), "What is unknown"),
+    **dict.fromkeys(("--sample", "--store", "--seed"), "Posterior"),
+    **dict.fromkeys(("--report", "--full", "--json"), "Output"),
+}
 LATTICE = "Lattice: TOML, MAD-X (.madx, .seq), MAD-8 (.mad8) or elegant (.lte)."
 SHARED: dict[str, Callable[..., Any]] = {
     "scan": click.argument("scan"),
@@ -56,7 +98,7 @@ SHARED: dict[str, Callable[..., Any]] = {
         "--columns HEADER=NAME,...|LAYOUT.toml",
         "What columns are whose headers do not say it, such as 'xrms=size_x_um, "
         "QUAD:BACT=Q525_kG'; or a layout that keeps it; or day-month-year, for dates of numbers. "
-        "Other columns of unknown names are left aside.",
+        "Other columns of unknown names are ignored.",
         callback=_parsed(layout_of),
     ),
     "ignore": option(
@@ -72,7 +114,7 @@ SHARED: dict[str, Callable[..., Any]] = {
     "lattice": option("--lattice FILE", LATTICE, required=True),
     "maybe-lattice": option("--lattice FILE", LATTICE),
     "size-method": option(
-        "--size-method NAME", "Which sizes of a .mat file of emittance_gui; RMS unless said."
+        "--size-method NAME", "Which sizes of a .mat file of emittance_gui; default: RMS."
     ),
     "noise": option(
         "--noise FILE",
@@ -87,7 +129,7 @@ SHARED: dict[str, Callable[..., Any]] = {
     ),
     "particle": option(
         "--particle",
-        "Of a scan without a lattice; electrons unless said.",
+        "Of a scan without a lattice; default: electron.",
         choices=list(REST_ENERGY),
     ),
     "use": option("--use NAME", "Line or sequence of a lattice with several."),
@@ -95,7 +137,7 @@ SHARED: dict[str, Callable[..., Any]] = {
     "to": option("--to NAME", "Element with which the line ends.", name="last"),
     "screen": option(
         "--screen NAME",
-        "Screen or marker at which sizes are measured or wanted; the last screen unless said.",
+        "Screen or marker at which sizes are measured or wanted; default: the last screen.",
     ),
     "energy": option(
         "--energy MEV",
@@ -112,23 +154,37 @@ SHARED: dict[str, Callable[..., Any]] = {
     ),
     "prior": option(
         "--prior NAME=MEAN+-SD",
-        "What is known of a number: calibration, Q2.slope=167.23+-3.3446 (or ±); a study of "
-        "lifetimes, its scales, and rf_voltage=1+-1% for the calibration of that reading.",
+        "What is known of a number: of a calibration, Q2.slope=167.23+-3.3446 (or ±); of screen, "
+        "beam and line, size_scale=1+-2%.",
+        name="priors",
+        multiple=True,
+        callback=_parsed(priors_of),
+    ),
+    "scale-prior": option(
+        "--prior NAME=MEAN+-SD",
+        "With --study: what is known of a scale, or rf_voltage=1+-1% for the calibration of that "
+        "reading.",
         name="priors",
         multiple=True,
         callback=_parsed(priors_of),
     ),
     "bounds": option(
         "--bounds NAME=LOW:HIGH",
-        "Calibration: bounds of a number; ± 12 % of the slope unless given. Transport "
+        "Calibration: bounds of a number; default: ± 12 % of the slope. Transport "
         "network: of the beam, x.sigma11=2e-8:3e-8 (SI), or of a setting the gains are held over.",
         multiple=True,
         callback=_parsed(bounds_of),
     ),
     "gain": option(
         "--gain NAME=LOW:HIGH",
-        "Transport network: limits of a gain such as dA_x/dQ2=:-0.0083, in place of signs. "
-        "Responses: limits that a parameter keeps for certain, K=1:3 or dK/dvalve=0:.",
+        "Transport network: limits of a gain such as dA_x/dQ2=:-0.0083, in place of signs.",
+        name="gains",
+        multiple=True,
+        callback=_parsed(gains_of),
+    ),
+    "response-gain": option(
+        "--gain NAME=LOW:HIGH",
+        "Limits that a parameter keeps for certain, K=1:3 or dK/dvalve=0:.",
         name="gains",
         multiple=True,
         callback=_parsed(gains_of),
@@ -158,7 +214,7 @@ SHARED: dict[str, Callable[..., Any]] = {
     ),
     "order": option(
         "--order STATES",
-        "State space: its states; found by an information criterion unless said.",
+        "State space: its states; default: found by an information criterion.",
         type=click.IntRange(1, 50),
     ),
     "map": option(
@@ -170,7 +226,7 @@ SHARED: dict[str, Callable[..., Any]] = {
     "input": option("--input COLUMN", "An input of any name.", name="inputs", multiple=True),
     "output": option("--output COLUMN", "An output of any name.", name="outputs", multiple=True),
     "step": option("--step SECONDS", "Distance of rows without a time.", type=float),
-    "delay": option("--delay SAMPLES", "Known delay; found unless said.", type=click.IntRange(0)),
+    "delay": option("--delay SAMPLES", "Known delay; default: found.", type=click.IntRange(0)),
     "no-offset": option("--no-offset", "The output at rest is 0, and not estimated.", is_flag=True),
     "report": option(
         "--report FILE.html|.pdf|.png|.svg",
@@ -192,6 +248,7 @@ SHARED: dict[str, Callable[..., Any]] = {
         type=click.IntRange(0, 2**32 - 1),
         default=1,
     ),
+    "full": option("--full", "Show every table, not the first screen alone.", is_flag=True),
     "json": option(
         "--json", "Print one JSON object and nothing else.", name="as_json", is_flag=True
     ),
@@ -253,6 +310,7 @@ def answered(
     inputs: Mapping[str, str | None],
     show: Callable[[Terminal], None],
     report: str | None = None,
+    full: bool = True,
     **further: Any,
 ) -> None:
     """Print the one JSON object of a command, or have the answer shown, and where its report is.
@@ -265,7 +323,7 @@ def answered(
         return
     from beamfit.cli.show import Terminal  # rich
 
-    terminal = Terminal()
+    terminal = Terminal(full)
     show(terminal)
     terminal.report(report)
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 import beamfit
-from beamfit.cli.options import answered, command_line, option, options, reported
+from beamfit.cli.options import Command, answered, command_line, option, options, reported
 from beamfit.errors import InputError, plain
 from beamfit.io.files import digest
 from beamfit.io.line import build_line, read_inputs
@@ -35,11 +35,11 @@ Examples:
 """
 
 
-@click.command(epilog=EXAMPLE)
+@click.command(cls=Command, epilog=EXAMPLE)
 @click.argument("machine", required=False)
 @option("--dry-run", "Check the machine, print the plan, move nothing.", is_flag=True)
 @option("--recover JOURNAL", "Restore what a scan that was killed has left, and move nothing else.")
-@option("--save FILE.csv", "The scan; NAME_DATE_TIME.csv unless said.")
+@option("--save FILE.csv", "The scan; default: NAME_DATE_TIME.csv.")
 @option("--journal FILE", "Where what is to be restored stands; beside MACHINE unless.")
 @option("--goal PERCENT", "Emittance error to stop at.")
 @option("--points", "Most settings.", type=click.IntRange(4, 200))

@@ -9,7 +9,7 @@ import click
 import numpy as np
 
 import beamfit
-from beamfit.cli.options import answered, option, options
+from beamfit.cli.options import Command, answered, option, options
 from beamfit.errors import InputError, located
 from beamfit.io.files import digest
 from beamfit.io.line import build_line, read_lattice
@@ -33,7 +33,7 @@ Examples:
 """
 
 
-@click.command(epilog=EXAMPLE)
+@click.command(cls=Command, epilog=EXAMPLE)
 @options("lattice use from to screen energy")
 @option("--sigma S11,S12,S22", "Beam matrix of the plane at the start, in m², m rad, rad².")
 @option(
@@ -107,9 +107,10 @@ def _fitted(
 
 
 def _show(terminal: Terminal, found: Setpoint) -> None:
-    click.echo("\n\n".join(map(text_of, found.tables())))
     terminal.verdict("set point", found.status, found.message)
     for note in found.notes:
         terminal.line(note)
     for warning in found.doubts.values():
         terminal.line(warning, style="bold red")
+    terminal.line()
+    click.echo("\n\n".join(map(text_of, found.tables())))

@@ -55,9 +55,10 @@ class _Console(Console):
 
 
 class Terminal:
-    """Where a command answers."""
+    """Where a command answers: all of it, or what fits the first screen."""
 
-    def __init__(self) -> None:
+    def __init__(self, full: bool = True) -> None:
+        self.full = full
         # Names are shown as they are: a bracket in one is not a style.
         self.console = _Console(highlight=False, markup=False)
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from beamfit.cli.options import answered, option, options, reported
+from beamfit.cli.options import Command, answered, option, options, reported
 from beamfit.errors import InputError
 from beamfit.io.files import digest
 
@@ -29,11 +29,11 @@ SOLVERS = ["levenberg-marquardt", "filtersqp", "ipopt", "slsqp"]
 COUNT = re.compile(r"[1-9]\d{0,5}")
 
 
-@click.command(epilog=EXAMPLE)
+@click.command(cls=Command, epilog=EXAMPLE)
 @click.argument("document")
 @option(
     "--data NAME=FILE",
-    "File of a data table; the document's own, beside it, unless given.",
+    "File of a data table; the document's own, beside it by default.",
     multiple=True,
 )
 @option(
@@ -122,15 +122,15 @@ def _solved(document, given, starts, values, gains, told) -> tuple[Any, tuple[st
 
 
 def _show(terminal: Terminal, found: Solution | Computed) -> None:
+    from beamfit.language.solution import Solution
+
+    if isinstance(found, Solution):
+        terminal.verdict(found.headline, found.status, found.message)
+        asked = found.made.document.solver
+        terminal.line(f"Solver: {found.solver}" + (f" (asked for: {asked.name})" if asked else ""))
+        for note in found.notes:
+            terminal.line(note)
+        terminal.line()
     for table in found.tables():
         terminal.table(table)
         terminal.line()
-    from beamfit.language.solution import Solution
-
-    if not isinstance(found, Solution):
-        return
-    asked = found.made.document.solver
-    terminal.line(f"Solver: {found.solver}" + (f" (asked for: {asked.name})" if asked else ""))
-    for note in found.notes:
-        terminal.line(note)
-    terminal.verdict(found.headline, found.status, found.message)

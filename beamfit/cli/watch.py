@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 import beamfit
-from beamfit.cli.options import answered, option, options
+from beamfit.cli.options import Command, answered, option, options
 from beamfit.errors import plain
 from beamfit.io.files import digest
 from beamfit.io.watched import WatchMachine, read_watch_machine
@@ -27,9 +27,9 @@ Examples:
 """
 
 
-@click.command(epilog=EXAMPLE)
+@click.command(cls=Command, epilog=EXAMPLE)
 @click.argument("machine")
-@option("--seconds", "How long; until Ctrl-C unless said.", type=click.FloatRange(0.0))
+@option("--seconds", "How long; default: until Ctrl-C.", type=click.FloatRange(0.0))
 @option(
     "--port", "Of the page; 0 for any that is free.", type=click.IntRange(0, 65535), default=8050
 )

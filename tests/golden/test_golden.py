@@ -48,6 +48,8 @@ COMMANDS = {
     "setpoint": f"setpoint {GTF} --sigma 2.6367971e-8,1.5738242e-8,1.4354411e-8 --vary Q2=0:10 "
     "--target size=200um --target divergence=140urad",
 }
+# What the first screen says of some of them.
+FIRST = ("lcls", "noise", "one_sided", "aps")
 REFUSED = {
     "bad_size": f"emittance {DATA}/negative_size.csv {GTF}",
     "bad_lattice": "emittance measurements/gtf_simulated.csv --lattice lattices/lcls_otr2.toml",
@@ -86,9 +88,18 @@ def said(arguments):
 @cache
 def both(name):
     """What a command says as text and as JSON, where it answers."""
-    answers = [said(COMMANDS[name] + form) for form in ("", " --json")]
+    command = COMMANDS[name]
+    whole = " --full" * command.startswith(("emittance", "lifetime"))
+    answers = [said(command + form) for form in (whole, " --json")]
     assert [status for status, _, _ in answers] == [0, 0], answers
     return dict(zip(("txt", "json"), (out for _, out, _ in answers), strict=True))
+
+
+def said_at_first(name):
+    """What the first screen says."""
+    status, out, _ = said(COMMANDS[name])
+    assert status == 0
+    return out
 
 
 def split(text):
@@ -141,6 +152,17 @@ def test_text(name):
     assert alike(numbers, others, SHOWN)
 
 
+@pytest.mark.parametrize("name", FIRST)
+def test_first_screen(name):
+    """At most 24 lines, the verdict before the numbers."""
+    text = said_at_first(name)
+    words, numbers = split(text)
+    expected, others = split((EXPECTED / f"{name}_first.txt").read_text())
+    assert words == expected
+    assert alike(numbers, others, SHOWN)
+    assert text.count("\n") <= 24
+
+
 @pytest.mark.parametrize("name", COMMANDS)
 def test_json(name):
     expected = json.loads((EXPECTED / f"{name}.json").read_text())
@@ -160,6 +182,9 @@ def write(names):
         if not names or name in names:
             for form, out in both(name).items():
                 (EXPECTED / f"{name}.{form}").write_text(out)
+    for name in FIRST:
+        if not names or name in names:
+            (EXPECTED / f"{name}_first.txt").write_text(said_at_first(name))
     for name, command in REFUSED.items():
         if not names or name in names:
             (EXPECTED / f"{name}.txt").write_text(said(command)[2])

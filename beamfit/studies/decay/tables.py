@@ -106,6 +106,15 @@ def decay_rows(decays: Sequence[Decay]) -> Rows:
     return _laid_out(decays, rows)
 
 
+# Rows of `decay_rows` that people look at second: they stand in the sentence, or say how it was had.
+SECOND = ("status", "readings", "rms residual", "errors")
+
+
+def quoted_rows(decays: Sequence[Decay]) -> Rows:
+    """The rows of `decay_rows` that people quote."""
+    return [row for row in decay_rows(decays) if row[0] not in SECOND]
+
+
 def _number(value: float | None, form: str, unit: str = "") -> str:
     return "-" if value is None else f"{value:{form}}{unit}"
 

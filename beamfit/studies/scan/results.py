@@ -19,6 +19,10 @@ if TYPE_CHECKING:
     from beamfit.greybox.fit import Variable
 
 
+# What a cell says of a number that the data leave open, and of one that is not there.
+OPEN, NOTHING = "(not determined)", ("-", "")
+
+
 def in_words(settings: Mapping[str, float], units: Mapping[str, str], digits: int = 4) -> str:
     """Write settings of magnets with their units.
 
@@ -348,6 +352,18 @@ def result_rows(planes: tuple[PlaneFit, ...]) -> list[tuple[str, list[str]]]:
         ("P(beam)", lambda p: f"{p.identifiability.probability['beam']:.4f}"),
     ]
     return [(label, [cell(value(p)) for p in planes]) for label, value in rows]
+
+
+def quoted_rows(planes: tuple[PlaneFit, ...]) -> list[tuple[str, list[str]]]:
+    """The rows of `result_rows` that people quote, without what no plane determines."""
+    at = f"at {planes[0].screen.name}"
+    quoted = ["normalised emittance", "  95 % interval", "beta at the start", "alpha at the start"]
+    quoted += [f"size {at}", "mismatch BMAG", "chi2/dof"]
+    rows = [(label, cells) for label, cells in result_rows(planes) if label in quoted]
+    rows = [row for row in rows if not all(c in NOTHING or OPEN in c for c in row[1])]
+    if rows and rows[0][0] == "  95 % interval":
+        rows[0] = ("normalised emittance, 95 % interval", rows[0][1])
+    return rows
 
 
 def _interval(p: PlaneFit) -> str:
