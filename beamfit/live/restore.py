@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import math
 import signal
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -46,19 +47,23 @@ async def reach(magnet: Magnet, device: Device, value: float) -> float:
     InputError
         If the setting is outside the limits (nothing is written then), or is not reached.
     """
-    value, by = moved(magnet, value), magnet.approach_by
-    present = await device.get()
-    if magnet.approach == "below" and present > value:
-        await _passed(device, max(value - by, magnet.low))
-    if magnet.approach == "above" and present < value:
-        await _passed(device, min(value + by, magnet.high))
+    value = moved(magnet, value)
+    return await _sent(magnet, device, value, await device.get())
+
+
+async def _sent(magnet: Magnet, device: Device, value: float, present: float) -> float:
+    """Move a magnet from a setting to another; from NaN it passes by, whichever side it is on."""
+    by = magnet.approach_by
+    if magnet.approach == "below" and not present <= value:
+        await _put(device, max(value - by, magnet.low))
+    if magnet.approach == "above" and not present >= value:
+        await _put(device, min(value + by, magnet.high))
+    return await _put(device, value)
+
+
+async def _put(device: Device, value: float) -> float:
     await device.put(value)
     return await device.settled(value)
-
-
-async def _passed(device: Device, value: float) -> None:
-    await device.put(value)
-    await device.settled(value)
 
 
 async def restore(journal: Journal, magnets: Mapping[str, Device]) -> None:
@@ -97,7 +102,7 @@ async def _restored(
     attempts = 0
     while True:
         try:
-            await reach(magnet, device, value)
+            await _put_back(magnet, device, value)
             return None
         except LostError as error:
             if time.monotonic() > until:
@@ -109,6 +114,14 @@ async def _restored(
         except InputError as error:
             return error
         await asyncio.sleep(PAUSE)
+
+
+async def _put_back(magnet: Magnet, device: Device, value: float) -> None:
+    """Move a magnet back, also where its set point is undefined: an IOC may return like that."""
+    present = math.nan
+    with suppress(LostError):
+        present = await device.get()
+    await _sent(magnet, device, moved(magnet, value), present)
 
 
 @contextmanager

@@ -44,8 +44,8 @@ class Ioc:
         self.log = folder / "puts.txt"
         self.process = None
 
-    def start(self):
-        command = [sys.executable, "-m", "tests.live.ioc", str(self.log)]
+    def start(self, *how):
+        command = [sys.executable, "-m", "tests.live.ioc", str(self.log), *how]
         self.log.touch()
         self.process = subprocess.Popen(
             command, cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True

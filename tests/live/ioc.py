@@ -1,8 +1,9 @@
-"""A real IOC with a simulated injector and a simulated ring: `python -m tests.live.ioc LOG`.
+"""A real IOC with a simulated injector and ring: `python -m tests.live.ioc LOG [undefined]`.
 
 SIMULATED. Served by Channel Access and PV Access on the ports of the environment. Every value
 written to a magnet is appended to LOG, before anything else is done with it. Faults are variables
-(SIM:FAULT:*). The optics are a thick quadrupole and a drift in numpy, no code of beamfit.
+(SIM:FAULT:*). With "undefined" set points are so (UDF, INVALID), as of an IOC that was restarted
+without autosave. The optics are a thick quadrupole and a drift in numpy, no code of beamfit.
 """
 
 from __future__ import annotations
@@ -46,13 +47,14 @@ def size(plane: str, gradient: float) -> float:
 class Magnet:
     """A power supply that ramps; its read-back may be at fault, it never is."""
 
-    def __init__(self, name: str, log: str) -> None:
+    def __init__(self, name: str, log: str, undefined: bool = False) -> None:
         self.name, self.log, self.true, self.wanted, self.shown = name, log, START, START, START
         self.drifted = 0.0
-        limits = {"DRVL": -LIMIT, "DRVH": LIMIT, "LOPR": -LIMIT, "HOPR": LIMIT}
+        how = {"DRVL": -LIMIT, "DRVH": LIMIT, "LOPR": -LIMIT, "HOPR": LIMIT}
+        how |= {} if undefined else {"initial_value": START}
         self.set = builder.aOut(
-            f"{name}:SET", initial_value=START, on_update=self.put, EGU="T/m", PREC=5,
-            always_update=True, blocking=True, **limits,
+            f"{name}:SET", on_update=self.put, EGU="T/m", PREC=5,
+            always_update=True, blocking=True, **how,
         )  # fmt: skip
         self.read = builder.aIn(f"{name}:READ", initial_value=START, EGU="T/m", PREC=5)
         self.truth = builder.aIn(f"{name}:TRUE", initial_value=START, EGU="T/m", PREC=6)
@@ -141,7 +143,7 @@ if __name__ == "__main__":
     dispatcher = asyncio_dispatcher.AsyncioDispatcher()
     builder.SetDeviceName(PREFIX)
     faults = {name: builder.aOut(f"FAULT:{name}", initial_value=0.0) for name in FAULTS}
-    magnets = [Magnet(name, sys.argv[1]) for name in MAGNETS]
+    magnets = [Magnet(name, *sys.argv[1:]) for name in MAGNETS]
     sizes = {p: builder.aIn(f"SCREEN:{p.upper()}", EGU="um", PREC=3) for p in BEAM}
     profiles = {p: builder.WaveformIn(f"SCREEN:PROF{p.upper()}", length=PIXELS) for p in BEAM}
     present = builder.aIn("BEAM", initial_value=0.25, EGU="nC", PREC=3)

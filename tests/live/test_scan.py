@@ -20,7 +20,7 @@ from beamfit.live.journal import Journal, alone_with, read_journal
 from beamfit.live.next_setting import Next, Point, fit_of, next_setting, sharp
 from beamfit.live.projection import rms_of
 from beamfit.live.record import scan_text
-from beamfit.live.restore import NotRestoredError, reach
+from beamfit.live.restore import NotRestoredError, reach, restore
 from beamfit.live.scan import scan
 from tests.live.faulty import Injector
 from tests.live.simulated import Simulated, connected, written
@@ -240,6 +240,26 @@ def test_who_cancels_a_scan_finds_all_restored(tmp_path):
     assert not (tmp_path / "a.journal").exists()
 
 
+@pytest.mark.parametrize(
+    ("side", "puts"), [("either", [0.0]), ("below", [-0.4, 0.0]), ("above", [0.4, 0.0])]
+)
+def test_an_undefined_set_point_is_put_back_from_its_side(tmp_path, side, puts):
+    class Undefined(Simulated):
+        async def get(self):
+            raise LostError("'Q1' reads 0.0 (severity 3)", "a number without an INVALID alarm")
+
+    machine = read_scan_machine(written(tmp_path, more=f'approach = "{side}"\napproach_by = 0.4'))
+    journal = Journal(tmp_path / "a.journal", "m", ((machine.magnets[0], 0.0),), patience=1e-9)
+    journal.write()
+    device = Undefined()
+    asyncio.run(restore(journal, {"Q1": device}))
+    assert device.puts == puts
+    assert not journal.path.exists()
+    with pytest.raises(LostError):  # a scan moves nothing from where it does not know it to be
+        asyncio.run(reach(machine.magnets[0], device, 1.0))
+    assert device.puts == puts
+
+
 @pytest.mark.parametrize(("side", "passed"), [("below", -0.4), ("above", None)])
 def test_a_setting_is_reached_from_its_side(tmp_path, side, passed):
     text = f'approach = "{side}"\napproach_by = 0.4'
@@ -337,6 +357,8 @@ FULL = r"scan.csv: a place that cannot be written \(File too large\).* all is re
         ("SIGN", 2, r"not seen to be restored \(Q1 set to .* expected beamfit scan --recover"),
         ("NAN", 2, "no sizes at 3 settings in a row .* all is restored"),
         ("IOC back", 2, "all is restored"),
+        ("IOC back undefined", 2, "all is restored"),
+        ("SIGKILL, IOC back undefined", None, "Restored and read back: Q1 .* is removed"),
         (
             "disk",
             2,
