@@ -236,7 +236,7 @@ def _reading(found: Any) -> Reading:
     return Reading(value, float(found.timestamp), int(found.severity))
 
 
-def described(unit: object, low: float, high: float) -> Described:
+def _described(unit: object, low: float, high: float) -> Described:
     """Limits that are equal, as EPICS writes where there are none, are none."""
     low, high = (float(low), float(high)) if low < high else (-math.inf, math.inf)
     return Described(str(unit or "").strip(), low, high)
@@ -252,7 +252,7 @@ def _channel_access() -> Protocols:
     async def describe(name: str) -> Described:
         found = await aioca.caget(name, format=aioca.FORMAT_CTRL, timeout=None)
         ends = (getattr(found, f"{end}_ctrl_limit", 0.0) for end in ("lower", "upper"))
-        return described(getattr(found, "units", ""), *ends)
+        return _described(getattr(found, "units", ""), *ends)
 
     def follow(name: str, come: Callable[[Reading | None], None]) -> Any:
         return aioca.camonitor(
@@ -281,7 +281,7 @@ def _pv_access() -> Protocols:
     async def describe(name: str) -> Described:
         found = (await here().get(name)).raw
         ends = (found.get(f"control.limit{end}", 0.0) for end in ("Low", "High"))
-        return described(found.get("display.units", ""), *ends)
+        return _described(found.get("display.units", ""), *ends)
 
     def follow(name: str, come: Callable[[Reading | None], None]) -> Any:
         async def arrived(found: Any) -> None:

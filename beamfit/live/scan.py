@@ -14,8 +14,8 @@ from typing import NamedTuple
 import numpy as np
 
 from beamfit.errors import InputError
-from beamfit.io.machine import Magnet, ScanMachine
-from beamfit.live.devices import Connected, Device, NoSizesError
+from beamfit.io.machine import ScanMachine
+from beamfit.live.devices import Connected, NoSizesError
 from beamfit.live.journal import Journal, alone_with, check_none_left, named
 from beamfit.live.next_setting import Next, Point, fit_of, next_setting, sharp, warmed
 from beamfit.live.restore import ended_by_signals, reach, restore
@@ -66,22 +66,18 @@ class Outcome(NamedTuple):
 
 @dataclass
 class Running:
-    """What a scan has so far; the one thing that changes as it goes on.
-
-    ``reach`` moves a magnet, ``sleep`` waits; a plan of bluesky does both by messages.
-    """
+    """What a scan has so far; the one thing that changes as it goes on."""
 
     at: Connected
     line: Beamline
     before: Mapping[str, float]
     keep: Callable[[Sequence[Point]], None]
     tell: Callable[[Told], None]
+    ready: Callable[[], Awaitable[None]]
     points: list[Point] = field(default_factory=list)
     barred: list[dict[str, float]] = field(default_factory=list)
     fit: EmittanceFit | None = None
     armed: bool = False
-    reach: Callable[[Magnet, Device, float], Awaitable[float]] = reach
-    sleep: Callable[[float], Awaitable[None]] = asyncio.sleep
 
     def say(self, news: str, measured: bool = False) -> None:
         """Tell how it stands."""
@@ -95,6 +91,7 @@ async def scan(
     *,
     keep: Callable[[Sequence[Point]], None] = lambda points: None,
     tell: Callable[[Told], None] = lambda told: None,
+    ready: Callable[[], Awaitable[None]] = lambda: asyncio.sleep(0),
 ) -> Outcome:
     """Scan magnets until the emittances are known as well as is wanted, and put them back.
 
@@ -111,6 +108,8 @@ async def scan(
         Is given all points after each new one, to write them.
     tell : callable
         Is told how the scan stands.
+    ready : callable
+        Is awaited before each setting: the scan stands still as long as that takes.
 
     Returns
     -------
@@ -133,32 +132,32 @@ async def scan(
     with alone_with(journal, at.machine.magnets):
         check_none_left(journal)
         before = {m.name: await at.magnets[m.name].get() for m in at.machine.magnets}
-        log = journal_for(journal, at.machine, before)
-        run = Running(at, line, before, keep, tell)
-        measuring = asyncio.ensure_future(begun(run, log))
+        log = _journal_for(journal, at.machine, before)
+        run = Running(at, line, before, keep, tell, ready)
+        measuring = asyncio.ensure_future(_begun(run, log))
         reason, problem = "", None
         with ended_by_signals(measuring, run.say) as came:
             try:
                 reason = await measuring
             except asyncio.CancelledError:
                 if not came:  # whoever runs this one wants it to end: restored before it does
-                    await asyncio.shield(back(run, log))
+                    await asyncio.shield(_back(run, log))
                     raise
                 reason = f"stopped by {signal.Signals(came[0]).name}"
             except Exception as error:  # of whatever kind: the magnets are put back first
                 problem, reason = error, str(error)
-            await back(run, log)
+            await _back(run, log)
         return Outcome(tuple(run.points), run.fit, reason, problem, came[0] if came else 0)
 
 
-def journal_for(path: Path, machine: ScanMachine, before: Mapping[str, float]) -> Journal:
+def _journal_for(path: Path, machine: ScanMachine, before: Mapping[str, float]) -> Journal:
     """The journal of a scan, not written yet."""
     settings = tuple((m, before[m.name]) for m in machine.magnets)
     whose = os.path.abspath(machine.path)
     return Journal(path, whose, settings, machine.timeout, machine.restore)
 
 
-async def begun(run: Running, log: Journal) -> str:
+async def _begun(run: Running, log: Journal) -> str:
     """Write the journal, measure, and say why that ended."""
     log.write()
     run.armed = True  # from here on something may have moved
@@ -166,7 +165,7 @@ async def begun(run: Running, log: Journal) -> str:
     return await _measured(run)
 
 
-async def back(run: Running, log: Journal) -> None:
+async def _back(run: Running, log: Journal) -> None:
     """Restore what may have been moved."""
     if run.armed:
         await restore(log, run.at.magnets)
@@ -178,8 +177,9 @@ async def _measured(run: Running) -> str:
     machine, barren = run.at.machine, 0
     for magnet in machine.magnets:
         for value in magnet.degauss:
-            await run.reach(magnet, run.at.magnets[magnet.name], value)
+            await reach(magnet, run.at.magnets[magnet.name], value)
     while len(run.points) < machine.points:
+        await run.ready()
         chosen = next_setting(run.points, run.fit, run.barred, machine, run.before)
         if not isinstance(chosen, Next):
             return chosen
@@ -239,7 +239,7 @@ def _stuck(run: Running, reads: Mapping[str, float], shots: Mapping[str, np.ndar
 
 async def _moved(run: Running, settings: Mapping[str, float]) -> dict[str, float]:
     magnets = [m for m in run.at.machine.magnets if m.name in settings]
-    return {m.name: await run.reach(m, run.at.magnets[m.name], settings[m.name]) for m in magnets}
+    return {m.name: await reach(m, run.at.magnets[m.name], settings[m.name]) for m in magnets}
 
 
 async def _well(run: Running, why: str) -> None:
@@ -255,6 +255,6 @@ async def _well(run: Running, why: str) -> None:
         if time.monotonic() > until:
             expected = f"it to be over within {run.at.machine.guard.wait:g} s"
             raise InputError(f"{wrong}", expected)
-        await run.sleep(LOOK)
+        await asyncio.sleep(LOOK)
     if why:
         run.say("Going on")
