@@ -11,7 +11,8 @@ from __future__ import annotations
 import asyncio
 import sys
 import tempfile
-from collections.abc import Mapping
+from collections.abc import AsyncIterator, Mapping
+from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import NamedTuple
 
@@ -20,7 +21,7 @@ import numpy as np
 import beamfit
 from beamfit.io.line import build_line
 from beamfit.io.machine import ScanMachine, read_scan_machine
-from beamfit.live.devices import Connected
+from beamfit.live.devices import Connected, Left, Shots
 from beamfit.live.next_setting import Point, fit_of, sharp
 from beamfit.live.scan import scan
 
@@ -89,12 +90,20 @@ class Simulated:
     async def settled(self, value: float) -> float:
         return self.setting
 
-    async def shots(self) -> dict[str, np.ndarray]:
+    async def shots(self) -> Shots:
         sizes = self.beam.sizes(self.setting)
-        return {p: s * (1 + NOISE * self.rng.standard_normal(SHOTS)) for p, s in sizes.items()}
+        noise = {p: 1 + NOISE * self.rng.standard_normal(SHOTS) for p in sizes}
+        return Shots({p: s * noise[p] for p, s in sizes.items()}, 0.0)
 
     async def amiss(self) -> str:
         return ""
+
+    @asynccontextmanager
+    async def followed(self, value: float | None = None) -> AsyncIterator[Left]:
+        async def left(time: float) -> str:
+            return ""
+
+        yield left
 
 
 def a_beam(rng: np.random.Generator, line: beamfit.Beamline) -> Beam:
@@ -133,7 +142,7 @@ def uniform(machine: ScanMachine, beam: Beam, seed: int, goal: float) -> int:
         device, points = Simulated(beam, np.random.default_rng(seed + count)), []
         for setting in np.linspace(magnet.low, magnet.high, count):
             device.setting = float(setting)
-            points.append(Point({"Q": device.setting}, asyncio.run(device.shots()), 0.0))
+            points.append(Point({"Q": device.setting}, *asyncio.run(device.shots())))
         if sharp(fit_of(points, machine, beam.line), points, goal):
             return count
     return 10 * MOST

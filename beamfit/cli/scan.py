@@ -7,6 +7,7 @@ from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from statistics import median
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -108,7 +109,7 @@ class _Lines:
         count, fit = len(now.points), now.fit
         last = now.points[-1]
         at = ", ".join(f"{name} {value:.4g}" for name, value in last.settings.items())
-        sizes = ", ".join(f"{p} {1e6 * s.mean():.1f} um" for p, s in last.shots.items())
+        sizes = ", ".join(f"{p} {1e6 * median(s):.1f} um" for p, s in last.shots.items())
         planes = fit.planes if fit and count >= FEWEST else ()
         known = ", ".join(map(_known, planes))
         self(f"{count:3d}  {at:<12}  {sizes:<26}  {known}".rstrip())

@@ -1,4 +1,4 @@
-"""The scan of a machine as a plan of bluesky: the loop of `beamfit.live.scan`, told as documents."""
+"""The scan of a machine as a plan of bluesky: the one loop, told as documents."""
 
 from __future__ import annotations
 

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import Mapping
+from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
+from contextlib import AbstractAsyncContextManager, AsyncExitStack, asynccontextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -18,6 +20,9 @@ from beamfit.live.projection import rms_of
 
 # Of the time a read-back has to stay, between two looks at it; not shorter, not longer, s.
 LOOKS, SHORTEST, LONGEST = 8, 0.02, 0.25
+# Seconds for which a reading of the beam as new as the last shot is waited for: a variable that
+# does not change may send none. Seconds for the first reading of a variable that is followed.
+AFTER, FIRST = 1.0, 5.0
 # Bad shots of a plane, over those wanted, after which there is no beam on the screen.
 BAD = 2
 
@@ -28,6 +33,17 @@ class NotSettledError(InputError):
 
 class NoSizesError(InputError):
     """A screen that shows no new sizes, or none that are numbers."""
+
+
+class Shots(NamedTuple):
+    """New shots: rms sizes by plane, m, and the time stamp of the last one, Unix time in s."""
+
+    sizes: Mapping[str, np.ndarray]
+    time: float
+
+
+# Asked with the time stamp of the last shot: how something left what it had to be, "" if it stayed.
+Left = Callable[[float], Awaitable[str]]
 
 
 class Device(Protocol):
@@ -48,12 +64,15 @@ class Device(Protocol):
             If it does not.
         """
 
+    def followed(self, value: float) -> AbstractAsyncContextManager[Left]:
+        """Follow it while the block lasts, and say in the end how it left a setting."""
+
 
 class Sizes(Protocol):
     """What measures the beam at a setting."""
 
-    async def shots(self) -> Mapping[str, np.ndarray]:
-        """New shots, by plane: rms sizes, m.
+    async def shots(self) -> Shots:
+        """Take new shots.
 
         Raises
         ------
@@ -67,6 +86,9 @@ class Watchman(Protocol):
 
     async def amiss(self) -> str:
         """What is wrong, in words; "" if nothing is."""
+
+    def followed(self) -> AbstractAsyncContextManager[Left]:
+        """Follow the beam while the block lasts, and say in the end how it was lost."""
 
 
 class Connected(NamedTuple):
@@ -118,6 +140,20 @@ class Supply:
             raise NotSettledError(found, "nobody else who sets it")
         return float(np.mean(seen))
 
+    def followed(self, value: float) -> AbstractAsyncContextManager[Left]:
+        """As `Device.followed`: by set point and read-back."""
+        magnet = self.magnet
+
+        def wrong(name: str, found: Reading) -> str:
+            if found.good and np.all(np.abs(found.value - value) <= magnet.tolerance):
+                return ""
+            return f"{magnet.name} left {value:.6g} {magnet.unit}, '{plain(name)}' {found.value}"
+
+        return followed(
+            (self.setting, partial(wrong, magnet.set), 0.0),
+            (self.readback, partial(wrong, magnet.read), magnet.settle),
+        )
+
     async def standing(self) -> float:
         """Its setting, if that is within the limits and is what is read back."""
         value = moved(self.magnet, await self.get())
@@ -153,15 +189,12 @@ class ScreenShots:
     profiler: Profiler
     channels: Mapping[str, Channel]
 
-    async def shots(self) -> dict[str, np.ndarray]:
+    async def shots(self) -> Shots:
         """As `Sizes.shots`; the planes at the same time."""
-        found = await self.timed()
-        return {plane: np.array([size for _, size in each]) for plane, each in found.items()}
-
-    async def timed(self) -> dict[str, list[tuple[float, float]]]:
-        """As `shots`, each behind its time stamp."""
         found = await asyncio.gather(*map(self._of_plane, self.channels))
-        return dict(zip(self.channels, found, strict=True))
+        each = dict(zip(self.channels, map(np.array, found), strict=True))
+        sizes = {plane: shots[:, 1] for plane, shots in each.items()}
+        return Shots(sizes, max(shots[-1, 0] for shots in each.values()))
 
     async def _of_plane(self, plane: str) -> list[tuple[float, float]]:
         kept: list[tuple[float, float]] = []
@@ -216,15 +249,100 @@ class BeamGuard:
 
     async def amiss(self) -> str:
         """As `Watchman.amiss`."""
-        if self.present is not None:
-            found = await self.present.get()
-            if not (found.good and np.all(found.value > self.guard.present_above)):
-                return f"no beam ('{plain(self.guard.present)}' reads {found.value})"
-        if self.loss is not None:
-            found = await self.loss.get()
-            if not (found.good and np.all(found.value < self.guard.loss_below)):
-                return f"beam loss ('{plain(self.guard.loss)}' reads {found.value})"
+        for channel, wrong, _ in self._each:
+            if said := wrong(await channel.get()):
+                return said
         return ""
+
+    def followed(self) -> AbstractAsyncContextManager[Left]:
+        """As `Watchman.followed`."""
+        return followed(*self._each)
+
+    @property
+    def _each(self) -> list[tuple[Channel, Callable[[Reading], str], float]]:
+        each = ((self.present, self._no_beam), (self.loss, self._loss))
+        return [(channel, wrong, AFTER) for channel, wrong in each if channel is not None]
+
+    def _no_beam(self, found: Reading) -> str:
+        there = found.good and np.all(found.value > self.guard.present_above)
+        return "" if there else f"no beam ('{plain(self.guard.present)}' reads {found.value})"
+
+    def _loss(self, found: Reading) -> str:
+        small = found.good and np.all(found.value < self.guard.loss_below)
+        return "" if small else f"beam loss ('{plain(self.guard.loss)}' reads {found.value})"
+
+
+@asynccontextmanager
+async def followed(
+    *each: tuple[Channel, Callable[[Reading], str], float],
+) -> AsyncIterator[Left]:
+    """Follow variables while the block lasts.
+
+    Parameters
+    ----------
+    each : tuple of (Channel, callable, float)
+        A variable, what is wrong with a reading of it in words, and how long at most, in s, a
+        reading as new as the last shot is waited for in the end.
+
+    Yields
+    ------
+    callable
+        Says what was wrong first, asked with the time stamp of the last shot.
+
+    Raises
+    ------
+    LostError
+        If one does not answer.
+    """
+    async with AsyncExitStack() as stack:
+        all_left = [await stack.enter_async_context(_followed(*one)) for one in each]
+
+        async def left(last: float) -> str:
+            return next(filter(None, [await one(last) for one in all_left]), "")
+
+        yield left
+
+
+@asynccontextmanager
+async def _followed(
+    channel: Channel, wrong: Callable[[Reading], str], patience: float
+) -> AsyncIterator[Left]:
+    said: list[str] = []
+    begun = asyncio.Event()
+
+    async def follow() -> None:
+        async for reading in channel.monitor():
+            words = f"'{plain(channel.name)}' is gone" if reading is None else wrong(reading)
+            said.extend([words] * bool(words))
+            begun.set()
+
+    async def left(last: float) -> str:
+        until = time.monotonic() + patience
+        while not said:  # an answer comes behind whatever the monitor sent before it
+            reading = await channel.get()
+            if words := wrong(reading):
+                return words
+            if reading.time >= last or time.monotonic() >= until:
+                break
+            await asyncio.sleep(SHORTEST)
+        return "".join(said[:1])
+
+    task = asyncio.create_task(follow())
+    try:
+        await _in_time(begun, channel)
+        yield left
+    finally:
+        task.cancel()
+        await asyncio.gather(task, return_exceptions=True)
+
+
+async def _in_time(begun: asyncio.Event, channel: Channel) -> None:
+    try:
+        async with asyncio.timeout(FIRST):
+            await begun.wait()
+    except TimeoutError:
+        found = f"no reading of '{plain(channel.name)}' within {FIRST:g} s"
+        raise LostError(found, "a variable that can be followed") from None
 
 
 async def connect(machine: ScanMachine) -> Connected:

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import csv
+import math
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from io import StringIO
+from itertools import zip_longest
 
 import beamfit
 from beamfit.errors import plain
 from beamfit.io.machine import ScanMachine
-from beamfit.live.next_setting import Point, standard_errors
+from beamfit.live.next_setting import Point
 
 
 def scan_text(points: Sequence[Point], machine: ScanMachine, before: Mapping[str, float]) -> str:
@@ -28,20 +30,17 @@ def scan_text(points: Sequence[Point], machine: ScanMachine, before: Mapping[str
     Returns
     -------
     str
-        Settings are those read back; sizes are means of the shots, in um, errors their standard
-        errors.
+        A row a shot: sizes in um, settings those read back. A shot that lies off makes no mean.
     """
-    columns = {f"{m.name}_{m.unit}": [p.settings[m.name] for p in points] for m in machine.magnets}
-    for plane in points[0].shots:
-        shots = [1e6 * p.shots[plane] for p in points]
-        columns[f"size_{plane}_um"] = [s.mean() for s in shots]
-        if errors := standard_errors(shots):
-            columns[f"size_{plane}_error_um"] = errors
-    rows = [[*columns, "shots", "screen", "time"]]
-    for point, *numbers in zip(points, *columns.values(), strict=True):
-        cells = [f"{number:.9g}" for number in numbers]
-        count = min(map(len, point.shots.values()))
-        rows.append([*cells, str(count), machine.screen.name, _written(point.time)])
+    planes = list(points[0].shots)
+    names = [f"{m.name}_{m.unit}" for m in machine.magnets] + [f"size_{p}_um" for p in planes]
+    rows = [[*names, "shot", "screen", "time"]]
+    for point in points:
+        settings = [point.settings[m.name] for m in machine.magnets]
+        last = [machine.screen.name, _written(point.time)]
+        sizes = zip_longest(*(1e6 * point.shots[plane] for plane in planes), fillvalue=math.nan)
+        for number, shot in enumerate(sizes, 1):
+            rows.append([*(f"{value:.9g}" for value in (*settings, *shot)), str(number), *last])
     table = StringIO()
     csv.writer(table, lineterminator="\n").writerows(rows)
     head = (plain(" ".join(line.split())) for line in _head(machine, before))

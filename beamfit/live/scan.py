@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import asyncio
+import math
 import os
 import signal
 import time
 from collections.abc import Awaitable, Callable, Mapping, Sequence
+from contextlib import AsyncExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple
@@ -15,7 +17,7 @@ import numpy as np
 
 from beamfit.errors import InputError
 from beamfit.io.machine import ScanMachine
-from beamfit.live.devices import Connected, NoSizesError
+from beamfit.live.devices import Connected, NoSizesError, Shots
 from beamfit.live.journal import Journal, alone_with, check_none_left, named
 from beamfit.live.next_setting import Next, Point, fit_of, next_setting, sharp, warmed
 from beamfit.live.restore import ended_by_signals, reach, restore
@@ -206,25 +208,45 @@ async def _measured(run: Running) -> str:
 async def _point(run: Running, settings: Mapping[str, float]) -> tuple[Point | None, str]:
     """Measure at a setting; None, and why, where that cannot be done.
 
-    Where the beam is lost the magnets go back until it has returned; once more is tried.
+    Once more is tried where a magnet left it or the beam was lost during the shots; for a lost beam
+    the magnets go back until it has returned.
     """
-    why = ""
+    lost = left = ""
     for _ in range(2):
-        await _well(run, why)
+        await _well(run, lost)
         reads = await _moved(run, settings)
-        try:
-            shots, why = await run.at.screen.shots(), ""
-        except NoSizesError as error:
-            shots, why = {}, error.found
-        wrong = await run.at.guard.amiss()
-        if not wrong and (plane := _stuck(run, reads, shots)):
+        shots, none, lost, left = await _taken(run, settings)
+        if lost:
+            run.say(f"Paused: {lost}")
+            await _moved(run, run.before)
+        elif left:
+            run.say(f"Measured again: {left}")
+        elif shots is None:
+            return None, none
+        elif plane := _stuck(run, reads, shots.sizes):
             return None, f"{plane} as before the magnets moved, to the last digit: is it stuck?"
-        if not wrong:
-            return (Point(reads, dict(shots), time.time()) if shots else None), why
-        why = wrong
-        run.say(f"Paused: {wrong}")
-        await _moved(run, run.before)
-    return None, why
+        else:
+            return Point(reads, dict(shots.sizes), shots.time), ""
+    return None, lost or left
+
+
+async def _taken(run: Running, settings: Mapping[str, float]) -> tuple[Shots | None, str, str, str]:
+    """Shots at a setting, else why there are none; how the beam was lost, how a magnet moved.
+
+    Magnets and beam are followed from before the first shot to the time stamp of the last one.
+    """
+    async with AsyncExitStack() as stack:
+        devices = [run.at.magnets[name].followed(value) for name, value in settings.items()]
+        magnets = [await stack.enter_async_context(one) for one in devices]
+        beam = await stack.enter_async_context(run.at.guard.followed())
+        shots, none, last = None, "", -math.inf
+        try:
+            shots = await run.at.screen.shots()
+            last = shots.time
+        except NoSizesError as error:
+            none = error.found
+        lost = await beam(last)
+        return shots, none, lost, "; ".join(filter(None, [await one(last) for one in magnets]))
 
 
 def _stuck(run: Running, reads: Mapping[str, float], shots: Mapping[str, np.ndarray]) -> str:
@@ -242,7 +264,7 @@ async def _moved(run: Running, settings: Mapping[str, float]) -> dict[str, float
     return {m.name: await reach(m, run.at.magnets[m.name], settings[m.name]) for m in magnets}
 
 
-async def _well(run: Running, why: str) -> None:
+async def _well(run: Running, lost: str) -> None:
     """Wait until there is beam and none is lost.
 
     Raises
@@ -256,5 +278,5 @@ async def _well(run: Running, why: str) -> None:
             expected = f"it to be over within {run.at.machine.guard.wait:g} s"
             raise InputError(f"{wrong}", expected)
         await asyncio.sleep(LOOK)
-    if why:
+    if lost:
         run.say("Going on")

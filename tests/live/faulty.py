@@ -69,8 +69,8 @@ points = 7
 restore_s = 20
 """
 LOW, HIGH = -5.5, 2.5
-SCREEN = ("NAN", "STALE", "DARK", "LOSSY")
-READBACK = ("STUCK", "DRIFT", "SIGN", "DEAF")
+SCREEN = ("NAN", "STALE", "DARK", "LOSSY", "DIM")
+READBACK = ("STUCK", "DRIFT", "SIGN", "DEAF", "TRIP")
 SIGNALS = ("SIGINT", "SIGTERM", "SIGHUP", "SIGKILL")
 UNDEFINED = ("IOC back undefined", "SIGKILL, IOC back undefined")
 KINDS = (*SIGNALS, *READBACK, *SCREEN, "dark for a while", "IOC back", *UNDEFINED, "IOC gone")

@@ -26,6 +26,7 @@ NOISE, SHOT = 0.02, 0.03  # of a size, and s between shots
 PIXEL, PIXELS = 12.0, 200  # um
 MAGNETS = ("Q1", "Q2")
 FAULTS = ("STUCK", "DRIFT", "SIGN", "NAN", "STALE", "DEAF", "DARK", "LOSSY", "SLOW")
+FAULTS += ("TRIP", "DIM")  # a supply off by so much; a screen that shows sizes of no beam
 # Of the ring: a 1/(mA s), b 1/s at a pressure of 1e-7 Pa, monitor noise mA, s between readings.
 A, B, MONITOR, READ = 2.5e-7, 8.0e-6, 0.002, 0.05
 
@@ -69,7 +70,8 @@ class Magnet:
 
     def step(self) -> None:
         far = RATE * TICK * (0.01 if on("SLOW") else 1.0)
-        self.true += float(np.clip(self.wanted - self.true, -far, far))
+        wanted = self.wanted + (faults["TRIP"].get() if self is magnets[0] else 0.0)
+        self.true += float(np.clip(wanted - self.true, -far, far))
         self.drifted = self.drifted + 0.02 if on("DRIFT") else 0.0
         if not on("STUCK"):
             self.shown = (-1 if on("SIGN") else 1) * self.true + self.drifted
@@ -129,12 +131,13 @@ def shots() -> None:
     now = time.time()
     for plane, record in sizes.items():
         rms = size(plane, magnets[0].true) * (1 + NOISE * rng.standard_normal())
-        rms = np.nan if on("NAN") or on("DARK") else rms
+        rms = np.nan if on("NAN") or on("DARK") else 9e-4 if on("DIM") else rms
+        rms *= 1.5 if on("LOSSY") else 1.0
         record.set(1e6 * rms, timestamp=now)
         place = PIXEL * (np.arange(PIXELS) - PIXELS / 2) * 1e-6
         counts = 1e3 * np.exp(-0.5 * (place / rms) ** 2) if np.isfinite(rms) else 0 * place
         profiles[plane].set(rng.poisson(counts + 20.0).astype(float), timestamp=now)
-    present.set(0.0 if on("DARK") else 0.25, timestamp=now)
+    present.set(0.0 if on("DARK") or on("DIM") else 0.25, timestamp=now)
     loss.set(5.0 if on("LOSSY") else 0.1, timestamp=now)
 
 

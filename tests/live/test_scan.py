@@ -3,6 +3,7 @@
 import asyncio
 import json
 import re
+from contextlib import asynccontextmanager
 from dataclasses import replace
 
 import numpy as np
@@ -13,9 +14,10 @@ from beamfit.cli import cli
 from beamfit.cli.scan import _Lines
 from beamfit.errors import InputError
 from beamfit.io.line import build_line, read_inputs
-from beamfit.io.machine import read_scan_machine
-from beamfit.live.channel import LostError
-from beamfit.live.devices import NotSettledError
+from beamfit.io.machine import Guard, read_scan_machine
+from beamfit.live import devices
+from beamfit.live.channel import LostError, Reading
+from beamfit.live.devices import BeamGuard, NotSettledError, Supply
 from beamfit.live.journal import Journal, alone_with, read_journal
 from beamfit.live.next_setting import Next, Point, fit_of, next_setting, sharp
 from beamfit.live.projection import rms_of
@@ -24,6 +26,7 @@ from beamfit.live.restore import NotRestoredError, reach, restore
 from beamfit.live.scan import scan
 from tests.live.faulty import Injector
 from tests.live.simulated import Simulated, connected, written
+from tests.live.struck import struck
 
 
 def scanned(at, folder, **told):
@@ -104,6 +107,101 @@ def test_beam_loss_takes_the_magnet_back_before_going_on(tmp_path):
     assert all(point.settings["Q1"] < 1.5 for point in found.points)
 
 
+class Restless(Simulated):
+    """A magnet that leaves a setting during the shots there, the first time or every time."""
+
+    def __init__(self, always=False):
+        super().__init__()
+        self.restless, self.always = [], always
+
+    @asynccontextmanager
+    async def followed(self, value=None):
+        leaves = value is not None and value > 0 and (self.always or value not in self.restless)
+        self.restless += [value] * leaves
+
+        async def left(time):
+            return "Q1 left it" if leaves else ""
+
+        yield left
+
+
+@pytest.mark.parametrize("always", [False, True])
+def test_a_point_during_which_a_magnet_left_is_measured_again_or_dropped_in_words(tmp_path, always):
+    device, said = Restless(always), []
+    found = scanned(connected(tmp_path, device), tmp_path, tell=lambda now: said.append(now.news))
+    assert "Measured again: Q1 left it" in said
+    assert any(news.endswith("(Q1 left it)") for news in said) is always
+    settings = [point.settings["Q1"] for point in found.points]
+    assert (max(settings) > 0) is not always
+    assert device.setting == -2.0
+
+
+class Feed:
+    """A variable whose readings are given: some while it is followed, the last when it is asked."""
+
+    name = "FEED"
+
+    def __init__(self, *readings):
+        self.readings = [Reading(value, time) for value, time in readings]
+
+    async def monitor(self):
+        for reading in self.readings:
+            yield reading
+
+    async def get(self):
+        return self.readings[-1]
+
+
+@pytest.mark.parametrize(
+    ("readings", "words"),
+    [
+        ([(1.0, 0.0), (1.005, 5.0)], ""),
+        ([(1.0, 0.0), (1.2, 1.0), (1.0, 5.0)], "Q1 left 1 T_per_m, 'SIM:Q1:READ' 1.2"),
+        ([(1.0, 0.0), (np.nan, 1.0), (1.0, 5.0)], "Q1 left 1 T_per_m, 'SIM:Q1:READ' nan"),
+        ([(1.0, 0.0), (1.0, 3.0)], ""),  # none as new as the last shot: it does not change
+    ],
+)
+def test_a_read_back_is_followed_to_the_last_shot(tmp_path, readings, words):
+    [magnet] = read_scan_machine(written(tmp_path)).magnets
+    supply = Supply(magnet, Feed((1.0, 0.0)), Feed(*readings))
+
+    async def shots():
+        async with supply.followed(1.0) as left:
+            return await left(4.0)
+
+    assert asyncio.run(shots()) == words
+
+
+def test_beam_is_followed_to_the_last_shot_and_a_silent_variable_is_lost(monkeypatch):
+    guard = Guard("PRESENT", 0.1, "LOSS", 1.0)
+    there, lost = Feed((0.25, 4.0)), Feed((0.1, 0.0), (5.0, 1.0), (0.1, 4.0))
+
+    async def shots(*channels):
+        async with BeamGuard(guard, *channels).followed() as left:
+            return await left(4.0)
+
+    assert asyncio.run(shots(there, lost)) == "beam loss ('LOSS' reads 5.0)"
+    assert asyncio.run(shots(there, None)) == ""
+    assert asyncio.run(shots(None, None)) == ""
+    monkeypatch.setattr(devices, "FIRST", 0.01)
+    with pytest.raises(LostError, match="no reading of 'FEED' within"):
+        asyncio.run(shots(Feed(), None))
+
+
+def test_one_outlying_shot_makes_no_mean(done):
+    found, _, _, at, folder = done
+    last = found.points[-1]
+    shots = np.where(np.arange(5) == 2, 3, 1) * last.shots["x"]
+    points = [*found.points[:-1], last._replace(shots={"x": shots})]
+    path = folder / "outlier.csv"
+    path.write_text(scan_text(points, at.machine, {"Q1": 0.0}))
+    scan = beamfit.read_quad_scan(path)
+    assert 1e6 * scan.shot_size["x"][-1] == pytest.approx(1e6 * points[-1].shots["x"])
+    off = fit_of(points, at.machine, found.fit.line).planes[0].emittance
+    true = found.fit.planes[0].emittance
+    assert abs(off.value - true.value) < 2 * true.error
+
+
 def test_nothing_to_see_ends_a_scan_with_all_restored(tmp_path):
     device = Simulated(dark=(-9.0, 9.0))
     found = scanned(connected(tmp_path, device), tmp_path)
@@ -163,8 +261,8 @@ def test_a_camera_that_is_stuck_ends_the_scan(tmp_path):
         async def shots(self):
             found = await super().shots()
             if len(self.puts) > 5:  # new time stamps, the same picture
-                found = {"x": np.full(5, self.last)}
-            self.last = found["x"][-1]
+                found = found._replace(sizes={"x": np.full(5, self.last)})
+            self.last = found.sizes["x"][-1]
             return found
 
     said = []
@@ -376,6 +474,13 @@ def test_a_scan_of_a_real_ioc_leaves_no_magnet_wrong(ioc, injector, fault, statu
         assert re.search(said, fate.said, re.DOTALL), fate.said
 
 
+def test_no_row_of_a_scan_that_is_struck_lies(ioc, injector):
+    said, far, strikes = struck(injector, seed=3)
+    assert strikes > 0
+    assert "The scan ended" in said
+    assert max(far) < 6
+
+
 def test_a_dry_run_checks_and_moves_nothing(ioc, injector):
     path = written(injector.folder, scheme="pva://")
     injector.worker.begin("scan", str(path), "--dry-run", "--json")
@@ -454,7 +559,7 @@ def test_sizes_may_be_of_projections(ioc, injector):
         return await at.screen.shots()
 
     shots = run(look())
-    for plane, sizes in shots.items():
+    for plane, sizes in shots.sizes.items():
         assert sizes.shape == (3,)
         assert sizes.mean() == pytest.approx(ioc_size(plane, -1.0), rel=0.06)
 
