@@ -9,8 +9,9 @@ import numpy as np
 
 from beamfit.errors import InputError
 from beamfit.greybox.problem import padded_length
-from beamfit.io.machine import ScanMachine
+from beamfit.io.machine import Magnet, ScanMachine
 from beamfit.optics.beamline import Beamline
+from beamfit.statistics import POOR_FIT, chi2_probability
 from beamfit.status import Status
 from beamfit.studies.scan.candidates import information_of
 from beamfit.studies.scan.design import best_steps
@@ -19,8 +20,10 @@ from beamfit.studies.scan.scans import QuadScan
 
 # Where a scan begins, in parts of the range of its first magnet.
 BEGIN = (0.1, 0.37, 0.63, 0.9)
-# Points before which a goal is not taken for reached.
-FEWEST = 5
+# Points that each magnet is moved for, before those that tell most are taken.
+FEW = 2
+# Points before which a goal is not taken for reached: three numbers meet five sizes too easily.
+FEWEST = 6
 
 
 class Point(NamedTuple):
@@ -128,7 +131,7 @@ def sharp(fit: EmittanceFit | None, points: Sequence[Point], goal: float) -> boo
     fit : EmittanceFit or None
         To the points.
     points : sequence of Point
-        Fewer than five are never enough: three numbers fit nearly anything else.
+        Fewer than six are never enough.
     goal : float
         Relative error.
     """
@@ -140,6 +143,22 @@ def sharp(fit: EmittanceFit | None, points: Sequence[Point], goal: float) -> boo
         and p.emittance.error <= goal * p.emittance.value
         for p in fit.planes
     )
+
+
+def doubt(fit: EmittanceFit | None, points: Sequence[Point]) -> str:
+    """Sizes that miss the line by far more than their shots scatter, in words; "" if none do.
+
+    The errors of the fit hold it as a scatter of the settings, which real magnets have; a line that
+    is wrong shows in the same way, and there no error holds.
+    """
+    planes = [p for p in (fit.planes if fit else ()) if p.chi2 is not None]
+    chi2, dof = sum(p.chi2 for p in planes), sum(p.dof for p in planes)
+    freedom = sum(point.shots[p.plane].size - 1 for p in planes for point in points)
+    chance = chi2_probability(chi2, dof, max(freedom, 1))
+    if chance is None or chance >= POOR_FIT:
+        return ""
+    found = f"χ² {chi2:.0f} with {dof} degrees of freedom"
+    return f"the sizes miss this line by more than their shots scatter ({found}): is it right?"
 
 
 def first_settings(machine: ScanMachine) -> tuple[float, ...]:
@@ -174,7 +193,9 @@ def next_setting(
     -------
     Next or str
         First settings over the range of the first magnet; then those that tell most, by
-        `beamfit.studies.scan.design`; the middle of the largest gap where nothing can be fitted.
+        `beamfit.studies.scan.design`: of magnets that fewer than two points moved where there are
+        some, since a wrong line shows there alone. The middle of the largest gap where nothing can
+        be fitted.
     """
     limits = {m.name: _within(m.name, m.low, m.high, barred, before) for m in machine.magnets}
     first = machine.magnets[0]
@@ -183,7 +204,7 @@ def next_setting(
     if begin and low <= begin[0] <= high:
         return Next(_clipped(dict(before) | {first.name: begin[0]}, limits), "first settings")
     if fit is not None:
-        steps, stop = best_steps(fit, information_of(fit), limits)
+        steps, stop = best_steps(fit, information_of(fit), _fresh(points, machine, limits))
         if steps:
             wanted = steps[0].candidate.settings
             return Next(_clipped(dict(before) | wanted, limits), "where it tells most")
@@ -193,6 +214,19 @@ def next_setting(
     place = int(np.argmax(np.diff(gaps)))
     middle = 0.5 * float(gaps[place] + gaps[place + 1])
     return Next(_clipped(dict(before) | {first.name: middle}, limits), "the largest gap")
+
+
+def _fresh(
+    points: Sequence[Point], machine: ScanMachine, limits: Mapping[str, tuple[float, float]]
+) -> Mapping[str, tuple[float, float]]:
+    """Limits of the magnets that fewer than two points have moved, else those of all."""
+
+    def fresh(magnet: Magnet) -> bool:
+        settings = [p.settings[magnet.name] for p in points]
+        usual = float(np.median(settings))
+        return sum(abs(value - usual) > 2 * magnet.tolerance for value in settings) < FEW
+
+    return {m.name: limits[m.name] for m in machine.magnets if fresh(m)} or limits
 
 
 def _within(

@@ -19,7 +19,7 @@ from beamfit.errors import InputError
 from beamfit.io.machine import ScanMachine
 from beamfit.live.devices import Connected, NoSizesError, Shots
 from beamfit.live.journal import Journal, alone_with, check_none_left, named
-from beamfit.live.next_setting import Next, Point, fit_of, next_setting, sharp, warmed
+from beamfit.live.next_setting import Next, Point, doubt, fit_of, next_setting, sharp, warmed
 from beamfit.live.restore import ended_by_signals, reach, restore
 from beamfit.optics.beamline import Beamline
 from beamfit.studies.scan.fit import EmittanceFit
@@ -164,7 +164,8 @@ async def _begun(run: Running, log: Journal) -> str:
     log.write()
     run.armed = True  # from here on something may have moved
     run.say(f"Restored at the end: {named(log.before)}. Until then it is in {log.path}")
-    return await _measured(run)
+    reason, doubted = await _measured(run), doubt(run.fit, run.points)
+    return f"{reason}, but {doubted}" if doubted else reason
 
 
 async def _back(run: Running, log: Journal) -> None:
