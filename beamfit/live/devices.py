@@ -15,7 +15,7 @@ import numpy as np
 from beamfit.errors import InputError, plain
 from beamfit.io.headers import UNITS, known_unit
 from beamfit.io.machine import LENGTHS, Guard, Magnet, Profiler, ScanMachine, moved, unit_of
-from beamfit.live.channel import Channel, LostError, Reading, open_channel
+from beamfit.live.channel import Channel, LostError, Reading, SilentError, open_channel
 from beamfit.live.projection import rms_of
 
 # Of the time a read-back has to stay, between two looks at it; not shorter, not longer, s.
@@ -111,7 +111,14 @@ class Supply:
 
     async def put(self, value: float) -> None:
         """As `Device.put`; nothing outside the limits is ever written."""
-        await self.setting.put(moved(self.magnet, value))
+        magnet = self.magnet
+        try:
+            await self.setting.put(moved(magnet, value))
+        except SilentError:
+            await self.setting.get()  # or its IOC is what does not answer
+            found = f"{magnet.name} not at {value:.6g} {magnet.unit} within {magnet.timeout:g} s"
+            expected = "a supply that is on; its IOC answers, but does not say that it is done"
+            raise NotSettledError(found, expected) from None
 
     async def get(self) -> float:
         """As `Device.get`."""
@@ -179,7 +186,8 @@ def _unsettled(magnet: Magnet, value: float, read: float) -> tuple[str, str]:
     if abs(read + value) <= magnet.tolerance:
         return found, f"the same sign; is the sign of '{magnet.read}' right?"
     within = f"within {magnet.tolerance:g} for {magnet.settle:g} s"
-    return found, f"{within}; is the supply on, is '{magnet.read}' its read-back?"
+    said = "its IOC answers: is the supply on"
+    return found, f"{within}; {said}, is '{magnet.read}' its read-back?"
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ from beamfit.errors import InputError
 from beamfit.io.line import build_line, read_inputs
 from beamfit.io.machine import Guard, read_scan_machine
 from beamfit.live import devices
-from beamfit.live.channel import LostError, Reading
+from beamfit.live.channel import LostError, Reading, SilentError
 from beamfit.live.devices import BeamGuard, NotSettledError, Supply
 from beamfit.live.journal import Journal, alone_with, read_journal
 from beamfit.live.next_setting import Next, Point, doubt, fit_of, next_setting, sharp
@@ -566,6 +566,23 @@ def test_an_ioc_that_is_not_there_is_lost_and_said(ioc):
 
     with pytest.raises(LostError):
         run(open_channel("SIM:NOWHERE", 0.2).put(1.0))
+
+
+@pytest.mark.parametrize("answers", [True, False])
+def test_a_timeout_names_the_supply_or_the_ioc(tmp_path, answers):
+    class Waits(Feed):
+        async def put(self, value):
+            raise SilentError("no answer from 'SIM:Q1:SET' within 1.5 s", "its IOC")
+
+        async def get(self):
+            if not answers:
+                raise SilentError("no answer from 'SIM:Q1:SET' within 1.5 s", "its IOC")
+            return await super().get()
+
+    [magnet] = read_scan_machine(written(tmp_path)).magnets
+    said = "expected a supply that is on; its IOC answers" if answers else "'SIM:Q1:SET' within"
+    with pytest.raises(NotSettledError if answers else SilentError, match=said):
+        asyncio.run(Supply(magnet, Waits((0.0, 1.0)), Feed((0.0, 1.0))).put(1.0))
 
 
 def test_nothing_is_compiled_between_the_points(tmp_path):
