@@ -22,7 +22,7 @@ import beamfit
 from beamfit.io.line import build_line
 from beamfit.io.machine import ScanMachine, read_scan_machine
 from beamfit.live.devices import Connected, Left, Shots
-from beamfit.live.next_setting import FEWEST, Point, fit_of, sharp
+from beamfit.live.points import FEWEST, Point, fit_of, sharp
 from beamfit.live.scan import scan
 
 NOISE, SHOTS, MOST = 0.03, 5, 60

@@ -72,7 +72,7 @@ def scan(
     told = replace(read_scan_machine(machine), **{k: v for k, v in wanted.items() if v})
 
     from beamfit.live.channel import run
-    from beamfit.live.journal import journal_of
+    from beamfit.live.restore import journal_of
 
     place = journal_of(told, journal)
     if dry_run:
@@ -101,7 +101,7 @@ class _Lines:
 
     def told(self, now: Told) -> None:
         """A new point with what is known after it, or what else is new."""
-        from beamfit.live.next_setting import FEWEST
+        from beamfit.live.points import FEWEST
 
         if not now.measured:
             self(now.news)
@@ -126,8 +126,8 @@ def _known(plane: PlaneFit) -> str:
 async def _planned(machine: ScanMachine, journal: Path, as_json: bool) -> int:
     """Check that the machine answers, and say what a scan would do."""
     from beamfit.live.devices import connect
-    from beamfit.live.journal import named
-    from beamfit.live.next_setting import first_settings
+    from beamfit.live.points import first_settings
+    from beamfit.live.restore import named
 
     at = await connect(machine)
     before = [(m, await at.magnets[m.name].get()) for m in at.machine.magnets]
@@ -170,7 +170,7 @@ async def _planned(machine: ScanMachine, journal: Path, as_json: bool) -> int:
 
 async def _scanned(machine: ScanMachine, journal: Path, out: Path, say: _Lines) -> Outcome:
     from beamfit.live.devices import connect
-    from beamfit.live.record import scan_text
+    from beamfit.live.points import scan_text
     from beamfit.live.scan import scan as measure
 
     line = build_line(machine.lattice)
@@ -216,8 +216,7 @@ def _answered(
 def _recovered(journal: str, say: _Lines, as_json: bool) -> int:
     from beamfit.live.channel import run
     from beamfit.live.devices import supply_of
-    from beamfit.live.journal import alone_with, named, read_journal
-    from beamfit.live.restore import restore
+    from beamfit.live.restore import alone_with, named, read_journal, restore
 
     left = read_journal(journal)
     found = digest(journal)

@@ -16,8 +16,8 @@ from bluesky.utils import FailedStatus, MsgGenerator
 import beamfit
 from beamfit.io.machine import ScanMachine
 from beamfit.live.devices import connect
-from beamfit.live.journal import journal_of
-from beamfit.live.next_setting import Point
+from beamfit.live.points import Point
+from beamfit.live.restore import journal_of
 from beamfit.live.scan import Outcome, Told, scan
 from beamfit.optics.beamline import Beamline
 from beamfit.studies.scan.fit import EmittanceFit

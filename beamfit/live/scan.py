@@ -18,9 +18,16 @@ import numpy as np
 from beamfit.errors import InputError
 from beamfit.io.machine import ScanMachine
 from beamfit.live.devices import Connected, NoSizesError, Shots
-from beamfit.live.journal import Journal, alone_with, check_none_left, named
-from beamfit.live.next_setting import Next, Point, doubt, fit_of, next_setting, sharp, warmed
-from beamfit.live.restore import ended_by_signals, reach, restore
+from beamfit.live.points import Next, Point, doubt, fit_of, next_setting, sharp, warmed
+from beamfit.live.restore import (
+    Journal,
+    alone_with,
+    check_none_left,
+    ended_by_signals,
+    named,
+    reach,
+    restore,
+)
 from beamfit.optics.beamline import Beamline
 from beamfit.studies.scan.fit import EmittanceFit
 

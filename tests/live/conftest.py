@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from beamfit.live import journal
+from beamfit.live import restore
 
 # Run as programs of their own.
 collect_ignore = ["ioc.py", "worker.py"]
@@ -68,7 +68,7 @@ class Ioc:
 @pytest.fixture(autouse=True)
 def _locks_of_this_process(tmp_path_factory, monkeypatch):
     """Tests of two processes may scan a simulated magnet of one name."""
-    monkeypatch.setattr(journal, "own_folder", lambda: str(tmp_path_factory.getbasetemp()))
+    monkeypatch.setattr(restore, "own_folder", lambda: str(tmp_path_factory.getbasetemp()))
 
 
 @pytest.fixture(scope="session")
