@@ -79,7 +79,7 @@ def stored(folder: Path, name: str, **columns: object) -> bytes:
         store.attrs["number"] = 3
         for key, values in columns.items():
             one = store.create_dataset(key, data=values, compression="gzip", chunks=True)
-            one.attrs["unit"] = key.rpartition("_")[2]
+            one.attrs["unit"] = key.rpartition("_")[2] if "_" in key else ""
     return (folder / name).read_bytes()
 
 

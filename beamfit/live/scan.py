@@ -7,11 +7,11 @@ import math
 import os
 import signal
 import time
-from collections.abc import Awaitable, Callable, Mapping, Sequence
+from collections.abc import Awaitable, Callable, Coroutine, Mapping, Sequence
 from contextlib import AsyncExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -150,12 +150,12 @@ async def scan(
                 reason = await measuring
             except asyncio.CancelledError:
                 if not came:  # whoever runs this one wants it to end: restored before it does
-                    await asyncio.shield(_back(run, log))
+                    await _to_the_end(_back(run, log))
                     raise
                 reason = f"stopped by {signal.Signals(came[0]).name}"
             except Exception as error:  # of whatever kind: the magnets are put back first
                 problem, reason = error, str(error)
-            await _back(run, log)
+            await _to_the_end(_back(run, log))
         return Outcome(tuple(run.points), run.fit, reason, problem, came[0] if came else 0)
 
 
@@ -173,6 +173,19 @@ async def _begun(run: Running, log: Journal) -> str:
     run.say(f"Restored at the end: {named(log.before)}. Until then it is in {log.path}")
     reason, doubted = await _measured(run), doubt(run.fit, run.points)
     return f"{reason}, but {doubted}" if doubted else reason
+
+
+async def _to_the_end(work: Coroutine[Any, Any, None]) -> None:
+    """Wait until something is done, whoever cancels that; be cancelled only then."""
+    task, cancelled = asyncio.ensure_future(work), None
+    while not task.done():
+        try:
+            await asyncio.shield(task)
+        except asyncio.CancelledError as error:
+            cancelled = error
+    task.result()
+    if cancelled is not None:
+        raise cancelled
 
 
 async def _back(run: Running, log: Journal) -> None:

@@ -335,6 +335,30 @@ def test_who_cancels_a_scan_finds_all_restored(tmp_path):
     assert not (tmp_path / "a.journal").exists()
 
 
+def test_who_cancels_while_all_is_restored_waits_for_that(tmp_path):
+    class Slow(Simulated):
+        async def put(self, value):
+            if len(self.puts) > 2 and value == -2.0:
+                for _ in range(3):
+                    tasks[0].cancel()
+                    await asyncio.sleep(0)
+            await super().put(value)
+
+    device, tasks = Slow(), []
+    at = connected(tmp_path, device)
+    at = at._replace(machine=replace(at.machine, points=3, first=(-1.0, 0.0, 1.0)))
+    line = build_line(at.machine.lattice)
+
+    async def cancelled():
+        tasks.append(asyncio.ensure_future(scan(at, line, tmp_path / "a.journal")))
+        with pytest.raises(asyncio.CancelledError):
+            await tasks[0]
+
+    asyncio.run(cancelled())
+    assert device.setting == -2.0
+    assert not (tmp_path / "a.journal").exists()
+
+
 @pytest.mark.parametrize(
     ("side", "puts"), [("either", [0.0]), ("below", [-0.4, 0.0]), ("above", [0.4, 0.0])]
 )
