@@ -74,7 +74,7 @@ def scanned(machine: ScanMachine, line, true, seed: int) -> tuple[bool, bool]:
         found = asyncio.run(
             scan(Connected(magnets, *[magnets["Q"]] * 2, machine), line, Path(folder) / "journal")
         )
-    said = "miss this line" in found.reason
+    said = bool(found.doubt)
     said |= any(p.status != "converged" or p.emittance.error is None for p in found.fit.planes)
     return said, not said and max(map(abs, pulls(found.fit, beam))) > 6
 

@@ -196,7 +196,13 @@ def _answered(
             raise found.problem
         kept = f"; {len(found.points)} points are in {out}" if found.points and out.exists() else ""
         raise replace(found.problem, found=f"{found.problem.found}{kept}; all is restored")
-    said = {"file": str(out), "points": len(found.points), "ended": found.reason, "restored": True}
+    said = {
+        "file": str(out),
+        "points": len(found.points),
+        "ended": found.reason,
+        "doubt": found.doubt,
+        "restored": True,
+    }
     inputs = _inputs(machine) | ({str(out): digest(out)} if found.points else {})
     if found.fit is None:
         few = f"The scan ended: {found.reason}; too few points for a fit."
@@ -207,7 +213,9 @@ def _answered(
         fit = beamfit.fit_emittance(measured, build_line(described))
         reported(report, fit, inputs)
         if not as_json:
-            click.echo(f"The scan ended: {found.reason}. It is in {out}.\n")
+            click.echo(
+                f"The scan ended: {found.reason}. It is in {out}. {found.doubt}".rstrip() + "\n"
+            )
         shown = partial(show, fit=fit)
         answered(as_json, results_of(fit), inputs, shown, report, scan=said)
     return 128 + found.signal if found.signal else 0

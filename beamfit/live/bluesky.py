@@ -95,7 +95,7 @@ def emittance_scan(
             raise found.problem
         if found.fit is not None:
             yield from _event("fit", _quoted(found.fit), time.time())
-        yield from bps.close_run("success", found.reason)
+        yield from bps.close_run("success", f"{found.reason}. {found.doubt}".removesuffix(". "))
         return found
 
     def closed(error: Exception) -> MsgGenerator[None]:

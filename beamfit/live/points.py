@@ -164,7 +164,7 @@ def doubt(fit: EmittanceFit | None, points: Sequence[Point]) -> str:
     if chance is None or chance >= POOR_FIT:
         return ""
     found = f"χ² {chi2:.0f} with {dof} degrees of freedom"
-    return f"the sizes miss this line by more than their shots scatter ({found}): is it right?"
+    return f"The sizes miss this line by more than their shots scatter ({found}): is it right?"
 
 
 def first_settings(machine: ScanMachine) -> tuple[float, ...]:

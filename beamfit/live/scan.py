@@ -64,6 +64,8 @@ class Outcome(NamedTuple):
         What went wrong, if something did. The magnets are restored all the same.
     signal : int
         Number of the signal that ended it; 0 if none.
+    doubt : str
+        Why the line may be wrong, in words; "" where the sizes follow it.
     """
 
     points: tuple[Point, ...]
@@ -71,6 +73,7 @@ class Outcome(NamedTuple):
     reason: str
     problem: Exception | None = None
     signal: int = 0
+    doubt: str = ""
 
 
 @dataclass
@@ -156,7 +159,8 @@ async def scan(
             except Exception as error:  # of whatever kind: the magnets are put back first
                 problem, reason = error, str(error)
             await _to_the_end(_back(run, log))
-        return Outcome(tuple(run.points), run.fit, reason, problem, came[0] if came else 0)
+        number, doubted = came[0] if came else 0, doubt(run.fit, run.points)
+        return Outcome(tuple(run.points), run.fit, reason, problem, number, doubted)
 
 
 def _journal_for(path: Path, machine: ScanMachine, before: Mapping[str, float]) -> Journal:
@@ -171,8 +175,7 @@ async def _begun(run: Running, log: Journal) -> str:
     log.write()
     run.armed = True  # from here on something may have moved
     run.say(f"Restored at the end: {named(log.before)}. Until then it is in {log.path}")
-    reason, doubted = await _measured(run), doubt(run.fit, run.points)
-    return f"{reason}, but {doubted}" if doubted else reason
+    return await _measured(run)
 
 
 async def _to_the_end(work: Coroutine[Any, Any, None]) -> None:

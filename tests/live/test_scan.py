@@ -46,6 +46,7 @@ def test_a_scan_stops_at_its_goal_and_restores(done):
     assert found.reason == "the goal of 3 % is reached"
     assert 6 <= len(found.points) < 15
     assert sharp(found.fit, found.points, 0.03)
+    assert found.doubt == ""
     assert device.setting == device.puts[-1] == -2.0
     assert not (folder / "a.journal").exists()
     # Only the fit before the last point was not good enough.
@@ -443,7 +444,7 @@ def test_each_magnet_is_moved_and_a_line_that_is_wrong_is_doubted(tmp_path):
     points = points_of(build_line(two_magnets(tmp_path, 3.0).lattice), settings)
     said = doubt(fit_of(points, machine, line), points)
     assert re.fullmatch(
-        r"the sizes miss this line .* \(χ² \d+ with 3 degrees .*: is it right\?", said
+        r"The sizes miss this line .* \(χ² \d+ with 3 degrees .*: is it right\?", said
     )
     assert doubt(None, []) == ""
 
