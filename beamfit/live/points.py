@@ -26,8 +26,9 @@ from beamfit.studies.scan.scans import QuadScan
 
 # Where a scan begins, in parts of the range of its first magnet.
 BEGIN = (0.1, 0.37, 0.63, 0.9)
-# Points that each magnet is moved for, before those that tell most are taken.
-FEW = 2
+# Points that each further magnet is moved for at least: a beam has three numbers, so that each
+# magnet by itself tells all of it. Where they disagree the line is wrong.
+FEW = 3
 # Points before which a goal is not taken for reached: three numbers meet five sizes too easily.
 FEWEST = 6
 
@@ -199,7 +200,7 @@ def next_setting(
     -------
     Next or str
         First settings over the range of the first magnet; then those that tell most, by
-        `beamfit.studies.scan.design`: of magnets that fewer than two points moved where there are
+        `beamfit.studies.scan.design`: of magnets that fewer than three points moved where there are
         some, since a wrong line shows there alone. The middle of the largest gap where nothing can
         be fitted.
     """
@@ -210,7 +211,9 @@ def next_setting(
     if begin and low <= begin[0] <= high:
         return Next(_clipped(dict(before) | {first.name: begin[0]}, limits), "first settings")
     if fit is not None:
-        steps, stop = best_steps(fit, information_of(fit), _fresh(points, machine, limits))
+        new = {name: limits[name] for name in fresh(points, machine)}
+        aim = "D" if new else "emittance"  # of a new magnet whatever it gains
+        steps, stop = best_steps(fit, information_of(fit), new or limits, aim)
         if steps:
             wanted = steps[0].candidate.settings
             return Next(_clipped(dict(before) | wanted, limits), "where it tells most")
@@ -222,17 +225,23 @@ def next_setting(
     return Next(_clipped(dict(before) | {first.name: middle}, limits), "the largest gap")
 
 
-def _fresh(
-    points: Sequence[Point], machine: ScanMachine, limits: Mapping[str, tuple[float, float]]
-) -> Mapping[str, tuple[float, float]]:
-    """Limits of the magnets that fewer than two points have moved, else those of all."""
+def fresh(points: Sequence[Point], machine: ScanMachine) -> list[str]:
+    """Magnets that fewer than three points have moved.
 
-    def fresh(magnet: Magnet) -> bool:
+    Parameters
+    ----------
+    points : sequence of Point
+        What is measured, at least one.
+    machine : ScanMachine
+        Whose magnets they are of.
+    """
+
+    def moved(magnet: Magnet) -> int:
         settings = [p.settings[magnet.name] for p in points]
         usual = float(np.median(settings))
-        return sum(abs(value - usual) > 2 * magnet.tolerance for value in settings) < FEW
+        return sum(abs(value - usual) > 2 * magnet.tolerance for value in settings)
 
-    return {m.name: limits[m.name] for m in machine.magnets if fresh(m)} or limits
+    return [m.name for m in machine.magnets[1:] if moved(m) < FEW]
 
 
 def _within(

@@ -18,7 +18,7 @@ import numpy as np
 from beamfit.errors import InputError
 from beamfit.io.machine import ScanMachine
 from beamfit.live.devices import Connected, NoSizesError, Shots
-from beamfit.live.points import Next, Point, doubt, fit_of, next_setting, sharp, warmed
+from beamfit.live.points import Next, Point, doubt, fit_of, fresh, next_setting, sharp, warmed
 from beamfit.live.restore import (
     Journal,
     alone_with,
@@ -224,7 +224,7 @@ async def _measured(run: Running) -> str:
         run.points.append(point)
         run.fit = fit_of(run.points, machine, run.line) or run.fit
         run.say(chosen.why, measured=True)
-        if sharp(run.fit, run.points, machine.goal):
+        if sharp(run.fit, run.points, machine.goal) and not fresh(run.points, machine):
             return f"the goal of {100 * machine.goal:.3g} % is reached"
     return f"all {machine.points} points are measured"
 

@@ -18,7 +18,17 @@ from beamfit.io.machine import Guard, read_scan_machine
 from beamfit.live import devices
 from beamfit.live.channel import LostError, Reading, SilentError
 from beamfit.live.devices import BeamGuard, NotSettledError, Supply, rms_of
-from beamfit.live.points import Next, Point, doubt, fit_of, next_setting, scan_text, sharp
+from beamfit.live.points import (
+    Next,
+    Point,
+    doubt,
+    fit_of,
+    fresh,
+    next_setting,
+    scan_text,
+    sharp,
+    warmed,
+)
 from beamfit.live.restore import Journal, NotRestoredError, alone_with, reach, read_journal, restore
 from beamfit.live.scan import scan
 from tests.live.faulty import LINE, Injector
@@ -434,17 +444,19 @@ def test_each_magnet_is_moved_and_a_line_that_is_wrong_is_doubted(tmp_path):
     line = build_line(machine.lattice)
     before = {"Q1": -1.0, "Q2": 0.5}
     settings = [before | {"Q1": value} for value in (-5.0, -3.0, -1.0, 1.0)]
-    for _ in range(2):  # the second magnet, which no setting has moved yet, twice
+    for _ in range(3):  # the second magnet, which no setting has moved yet
         points = points_of(line, settings)
+        assert fresh(points, machine) == ["Q2"]
         chosen = next_setting(points, fit_of(points, machine, line), (), machine, before)
         assert chosen.settings["Q2"] != before["Q2"]
         settings.append(chosen.settings)
     points = points_of(line, settings)
+    assert fresh(points, machine) == []
     assert doubt(fit_of(points, machine, line), points) == ""
     points = points_of(build_line(two_magnets(tmp_path, 3.0).lattice), settings)
     said = doubt(fit_of(points, machine, line), points)
     assert re.fullmatch(
-        r"The sizes miss this line .* \(χ² \d+ with 3 degrees .*: is it right\?", said
+        r"The sizes miss this line .* \(χ² \d+ with 4 degrees .*: is it right\?", said
     )
     assert doubt(None, []) == ""
 
@@ -625,6 +637,33 @@ def test_nothing_is_compiled_between_the_points(tmp_path):
         monitoring.unregister_event_duration_listener(heard)
     assert len(counts) > 12
     assert counts[0] == counts[-1]  # all that is compiled is so before anything moves
+
+
+def test_nothing_is_compiled_between_the_points_of_two_magnets(tmp_path):
+    from jax import monitoring
+
+    machine, compiled = two_magnets(tmp_path, 2.2), []
+    line, before = build_line(machine.lattice), {"Q1": -1.0, "Q2": 0.5}
+    settings = [before | {"Q1": value} for value in (-5.0, -3.0, -1.0, 1.0)]
+    points_of(line, settings)
+    warmed(machine, line)
+
+    def heard(event, seconds, **about):
+        if "backend_compile" in event:
+            compiled.append(event)
+
+    monitoring.register_event_duration_secs_listener(heard)
+    try:
+        while len(settings) < 9:
+            points = points_of(line, settings)
+            chosen = next_setting(points, fit_of(points, machine, line), (), machine, before)
+            if not isinstance(chosen, Next):
+                break
+            settings.append(chosen.settings)
+    finally:
+        monitoring.unregister_event_duration_listener(heard)
+    assert len(settings) >= 8
+    assert compiled == []
 
 
 def test_sizes_may_be_of_projections(ioc, injector):
