@@ -15,8 +15,11 @@ def _stopped(number: int, frame: Any) -> None:
     for path in tuple(getattr(writing, "UNFINISHED", ())):
         with suppress(OSError):
             os.unlink(path)
+    screen = 2
+    with suppress(AttributeError, OSError, ValueError):  # live, it is not where libraries print
+        screen = sys.stderr.fileno()
     with suppress(OSError):
-        os.write(2, (SHOW_CURSOR if os.isatty(2) else b"") + b"beamfit: interrupted\n")
+        os.write(screen, (SHOW_CURSOR if os.isatty(screen) else b"") + b"beamfit: interrupted\n")
     os._exit(128 + number)
 
 

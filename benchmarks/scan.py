@@ -11,7 +11,8 @@ from __future__ import annotations
 import asyncio
 import sys
 import tempfile
-from collections.abc import Mapping
+from collections.abc import AsyncIterator, Mapping
+from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import NamedTuple
 
@@ -20,8 +21,8 @@ import numpy as np
 import beamfit
 from beamfit.io.line import build_line
 from beamfit.io.machine import ScanMachine, read_scan_machine
-from beamfit.live.devices import Connected
-from beamfit.live.next_setting import Point, fit_of, sharp
+from beamfit.live.devices import Connected, Left, Shots
+from beamfit.live.points import FEWEST, Point, fit_of, sharp
 from beamfit.live.scan import scan
 
 NOISE, SHOTS, MOST = 0.03, 5, 60
@@ -63,8 +64,8 @@ class Beam(NamedTuple):
     planes: Mapping[str, tuple[float, float, float]]
     line: beamfit.Beamline
 
-    def sizes(self, setting: float) -> dict[str, float]:
-        matrix = self.line.matrix({"Q": setting})
+    def sizes(self, settings: Mapping[str, float]) -> dict[str, float]:
+        matrix = self.line.matrix(settings)
         found = {}
         for plane, (emittance, beta, alpha) in self.planes.items():
             r11, r12 = (float(v) for v in np.asarray(getattr(matrix, plane))[0, :2])
@@ -80,6 +81,10 @@ class Simulated:
     def __init__(self, beam: Beam, rng: np.random.Generator) -> None:
         self.beam, self.rng, self.setting = beam, rng, 0.0
 
+    @property
+    def settings(self) -> Mapping[str, float]:
+        return {"Q": self.setting}
+
     async def put(self, value: float) -> None:
         self.setting = value
 
@@ -89,12 +94,20 @@ class Simulated:
     async def settled(self, value: float) -> float:
         return self.setting
 
-    async def shots(self) -> dict[str, np.ndarray]:
-        sizes = self.beam.sizes(self.setting)
-        return {p: s * (1 + NOISE * self.rng.standard_normal(SHOTS)) for p, s in sizes.items()}
+    async def shots(self) -> Shots:
+        sizes = self.beam.sizes(self.settings)
+        noise = {p: 1 + NOISE * self.rng.standard_normal(SHOTS) for p in sizes}
+        return Shots({p: s * noise[p] for p, s in sizes.items()}, 0.0)
 
     async def amiss(self) -> str:
         return ""
+
+    @asynccontextmanager
+    async def followed(self, value: float | None = None) -> AsyncIterator[Left]:
+        async def left(time: float) -> str:
+            return ""
+
+        yield left
 
 
 def a_beam(rng: np.random.Generator, line: beamfit.Beamline) -> Beam:
@@ -129,11 +142,11 @@ def chosen(
 def uniform(machine: ScanMachine, beam: Beam, seed: int, goal: float) -> int:
     """The fewest equally spaced settings whose scan reaches the goal."""
     magnet = machine.magnets[0]
-    for count in range(5, 10 * MOST):
+    for count in range(FEWEST, 10 * MOST):
         device, points = Simulated(beam, np.random.default_rng(seed + count)), []
         for setting in np.linspace(magnet.low, magnet.high, count):
             device.setting = float(setting)
-            points.append(Point({"Q": device.setting}, asyncio.run(device.shots()), 0.0))
+            points.append(Point({"Q": device.setting}, *asyncio.run(device.shots())))
         if sharp(fit_of(points, machine, beam.line), points, goal):
             return count
     return 10 * MOST

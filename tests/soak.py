@@ -32,9 +32,11 @@ import beamfit.io.decay_record
 from beamfit.errors import InputError
 from beamfit.greybox.mlp import dense
 from beamfit.io import hdf5
+from beamfit.io.columns import SHIPPED, layout_of
 from beamfit.io.emittance_gui import read_emittance_gui
 from beamfit.io.formulation import read_formulation, read_numbers
 from beamfit.io.line import read_lattice
+from beamfit.io.machine import read_scan_machine
 from beamfit.io.measurement import read_quad_scan
 from beamfit.io.network import read_network
 from beamfit.io.result import read_fitted_beams
@@ -51,6 +53,7 @@ from tests.io.test_emittance_gui import gui_data
 from tests.io.test_mutated_files import CSV, mutated
 from tests.io.test_programs import SDDS
 from tests.io.test_sequence import ELEGANT, MAD8, MADX
+from tests.live.faulty import LINE, MACHINE
 from tests.sampling.targets import half_normal, target
 
 # Seconds, megabytes and letters.
@@ -73,8 +76,10 @@ class Reader(NamedTuple):
 def stored(folder: Path, name: str, **columns: object) -> bytes:
     with h5py.File(folder / name, "w") as store:
         store.attrs["note"] = "of a soak"
+        store.attrs["number"] = 3
         for key, values in columns.items():
-            store.create_dataset(key, data=values, compression="gzip", chunks=True)
+            one = store.create_dataset(key, data=values, compression="gzip", chunks=True)
+            one.attrs["unit"] = key.rpartition("_")[2] if "_" in key else ""
     return (folder / name).read_bytes()
 
 
@@ -109,6 +114,9 @@ def readers(folder: Path, with_store: bool) -> dict[str, Reader]:
     store = [path.read_bytes() for path in folder.glob("store.h5")]
     lattice = [of("lattices/gtf_two_screens.toml"), of("lattices/lcls_otr2.toml")]
     scan = [CSV.encode(), of("measurements/lcls_otr2.csv")]
+    layouts = [path.read_bytes() for path in sorted(SHIPPED.glob("*.toml"))]
+    (folder / "line.toml").write_text(LINE)
+    machine = MACHINE.format(scheme="", more="degauss = [-5.0, 2.0]")
     decay = [of("measurements/aps_1999_decay.csv"), DATES.encode(), LIFETIMES.encode()]
 
     def documents(path: Path) -> None:
@@ -133,6 +141,8 @@ def readers(folder: Path, with_store: bool) -> dict[str, Reader]:
         "archive .json": Reader(".json", [exported], beamfit.read_decay_record),
         "run .csv": Reader(".csv", [of("measurements/valve_level_simulated.csv")[:4000]], read_run),
         "lattice .toml": Reader(".toml", lattice, read_lattice),
+        "layout .toml": Reader(".toml", layouts, layout_of),
+        "machine .toml": Reader(".toml", [machine.encode()], read_scan_machine),
         "ring .toml": Reader(".toml", [of("lattices/spear3_2003.toml")], read_ring),
         "optics .csv": Reader(".csv", [ring], lambda p: read_twiss(p, 234.144)),
         "optics .tfs": Reader(".tfs", [twiss], lambda p: read_twiss(p, 10.0)),

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import io
+import logging
 import os
 import sys
+import warnings
 
 import click
 
@@ -53,6 +55,7 @@ for command in (solve, identify, control, batch, watch, scan):
 def main() -> None:
     """Run the command line: exit 0 when answered, 2 with one line on unusable input."""
     _show_marks()
+    _hush_libraries()
     try:
         status = cli.main(prog_name="beamfit", standalone_mode=False) or 0
         if sys.stdout is not None:  # None where it was closed before we began
@@ -76,6 +79,18 @@ def main() -> None:
     except OSError as error:
         sys.stdout = None  # what is left in its buffer has nowhere to go
         _fail(f"output that cannot be written ({error.strerror}); expected room for it")
+
+
+def _hush_libraries() -> None:
+    """Keep what libraries warn of off the screen, here and in processes that are begun from here.
+
+    What is wrong with input or answer is beamfit's to say; ``python -W`` shows all.
+    """
+    logging.getLogger().addHandler(logging.NullHandler())
+    if not sys.warnoptions:
+        warnings.simplefilter("ignore")
+        warnings.filterwarnings("default", message=".*chmod 700")  # beamfit's own
+        os.environ.setdefault("PYTHONWARNINGS", "ignore")
 
 
 def _show_marks() -> None:

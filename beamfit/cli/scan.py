@@ -7,6 +7,7 @@ from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from statistics import median
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -71,7 +72,7 @@ def scan(
     told = replace(read_scan_machine(machine), **{k: v for k, v in wanted.items() if v})
 
     from beamfit.live.channel import run
-    from beamfit.live.journal import journal_of
+    from beamfit.live.restore import journal_of
 
     place = journal_of(told, journal)
     if dry_run:
@@ -100,7 +101,7 @@ class _Lines:
 
     def told(self, now: Told) -> None:
         """A new point with what is known after it, or what else is new."""
-        from beamfit.live.next_setting import FEWEST
+        from beamfit.live.points import FEWEST
 
         if not now.measured:
             self(now.news)
@@ -108,7 +109,7 @@ class _Lines:
         count, fit = len(now.points), now.fit
         last = now.points[-1]
         at = ", ".join(f"{name} {value:.4g}" for name, value in last.settings.items())
-        sizes = ", ".join(f"{p} {1e6 * s.mean():.1f} um" for p, s in last.shots.items())
+        sizes = ", ".join(f"{p} {1e6 * median(s):.1f} um" for p, s in last.shots.items())
         planes = fit.planes if fit and count >= FEWEST else ()
         known = ", ".join(map(_known, planes))
         self(f"{count:3d}  {at:<12}  {sizes:<26}  {known}".rstrip())
@@ -125,8 +126,8 @@ def _known(plane: PlaneFit) -> str:
 async def _planned(machine: ScanMachine, journal: Path, as_json: bool) -> int:
     """Check that the machine answers, and say what a scan would do."""
     from beamfit.live.devices import connect
-    from beamfit.live.journal import named
-    from beamfit.live.next_setting import first_settings
+    from beamfit.live.points import first_settings
+    from beamfit.live.restore import named
 
     at = await connect(machine)
     before = [(m, await at.magnets[m.name].get()) for m in at.machine.magnets]
@@ -169,7 +170,7 @@ async def _planned(machine: ScanMachine, journal: Path, as_json: bool) -> int:
 
 async def _scanned(machine: ScanMachine, journal: Path, out: Path, say: _Lines) -> Outcome:
     from beamfit.live.devices import connect
-    from beamfit.live.record import scan_text
+    from beamfit.live.points import scan_text
     from beamfit.live.scan import scan as measure
 
     line = build_line(machine.lattice)
@@ -195,7 +196,13 @@ def _answered(
             raise found.problem
         kept = f"; {len(found.points)} points are in {out}" if found.points and out.exists() else ""
         raise replace(found.problem, found=f"{found.problem.found}{kept}; all is restored")
-    said = {"file": str(out), "points": len(found.points), "ended": found.reason, "restored": True}
+    said = {
+        "file": str(out),
+        "points": len(found.points),
+        "ended": found.reason,
+        "doubt": found.doubt,
+        "restored": True,
+    }
     inputs = _inputs(machine) | ({str(out): digest(out)} if found.points else {})
     if found.fit is None:
         few = f"The scan ended: {found.reason}; too few points for a fit."
@@ -206,7 +213,9 @@ def _answered(
         fit = beamfit.fit_emittance(measured, build_line(described))
         reported(report, fit, inputs)
         if not as_json:
-            click.echo(f"The scan ended: {found.reason}. It is in {out}.\n")
+            click.echo(
+                f"The scan ended: {found.reason}. It is in {out}. {found.doubt}".rstrip() + "\n"
+            )
         shown = partial(show, fit=fit)
         answered(as_json, results_of(fit), inputs, shown, report, scan=said)
     return 128 + found.signal if found.signal else 0
@@ -215,8 +224,7 @@ def _answered(
 def _recovered(journal: str, say: _Lines, as_json: bool) -> int:
     from beamfit.live.channel import run
     from beamfit.live.devices import supply_of
-    from beamfit.live.journal import alone_with, named, read_journal
-    from beamfit.live.restore import restore
+    from beamfit.live.restore import alone_with, named, read_journal, restore
 
     left = read_journal(journal)
     found = digest(journal)

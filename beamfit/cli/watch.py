@@ -127,6 +127,7 @@ def _table(told: Told) -> Table:
     rows = [
         ("now", told.headline[1]),
         ("last reading", f"{_clock(state.last - state.shift)} UTC" if state.last else "-"),
+        ("newest fitted", "-" if told.age is None else f"{told.age:.0f} s ago"),
         ("current", f"{state.rows[-1].current:.6g} mA" if state.rows else "-"),
         ("lifetime", cell(answer and answer.lifetime)),
         ("at", f"{fit.mean_current:.4g} mA, the mean of the window" if fit else "-"),

@@ -18,6 +18,7 @@ import numpy as np
 from beamfit.errors import InputError, nearest
 from beamfit.io.files import name_of
 from beamfit.io.gradient_table import gradient_table
+from beamfit.io.sequence_bounds import MOST
 from beamfit.io.toml import FLAG, LIST, TABLE, TEXT, Key, Section, is_number, read_toml
 from beamfit.particles import ENERGY_KEYS, REST_ENERGY, expected_energy, total_energy
 from beamfit.studies.scan.names import check_names
@@ -192,6 +193,8 @@ def read_toml_lattice(path: str | PathLike[str]) -> LatticeFile:
         known = nearest(said["particle"], list(REST_ENERGY))
         raise top.error(f"particle '{said['particle']}'", known, "particle")
     energy = _energy(top, said["particle"])
+    if len(top.table["element"]) > MOST:
+        raise top.error(f"more than {MOST} elements", "a line that a machine has", "element")
     sections = top.sections("element")
     elements = tuple(_element(section, i) for i, section in enumerate(sections, 1))
     _check_unique(elements, sections)

@@ -8,7 +8,7 @@ from os import PathLike
 from pathlib import Path
 from typing import Any
 
-from beamfit.errors import InputError, nearest
+from beamfit.errors import InputError, nearest, plain
 from beamfit.io.headers import ALSO, SETTINGS
 from beamfit.io.lattice import LatticeFile
 from beamfit.io.line import part_of, read_lattice
@@ -220,7 +220,7 @@ def read_scan_machine(path: str | PathLike[str]) -> ScanMachine:
     for name in (screen.name, *(m.name for m in magnets)):
         if not name.isprintable():
             raise top.error(f"the name {name!r}", "one of letters that can be shown")
-    name = said.pop("name") or Path(path).stem
+    name = plain(said.pop("name") or Path(path).stem)
     return ScanMachine(
         name, str(path), top.sha256, lattice, magnets, screen, guard, first=first, **plan, **said
     )

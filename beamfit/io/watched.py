@@ -141,7 +141,7 @@ def read_watch_machine(path: str | PathLike[str]) -> WatchMachine:
     if watch["interval"] > watch["window"] / 3:
         found = f"interval {watch['interval']:g} s in a window of {watch['window']:g} s"
         raise section.error(found, "a third of the window, or less", "interval_s")
-    name = said["name"] or Path(path).stem
+    name = plain(said["name"] or Path(path).stem)
     beside = None if file is None else Path(path).parent / file
     return WatchMachine(
         name, str(path), top.sha256, variables, beside, timeout=said["timeout"], **watch

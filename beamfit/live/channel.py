@@ -9,9 +9,10 @@ from __future__ import annotations
 
 import asyncio
 import math
+import os
 import sys
-from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine
-from contextlib import suppress
+from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine, Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, NamedTuple, Protocol, TypeVar
@@ -65,6 +66,10 @@ class Described(NamedTuple):
 
 class LostError(InputError):
     """A variable that does not answer, or refuses what is written to it."""
+
+
+class SilentError(LostError):
+    """A variable that does not answer in time."""
 
 
 class Channel(Protocol):
@@ -150,7 +155,28 @@ def run(work: Coroutine[Any, Any, T]) -> T:
         finally:
             _closed()
 
-    return asyncio.run(closed_after())
+    with _own_screen():
+        return asyncio.run(closed_after())
+
+
+@contextmanager
+def _own_screen() -> Iterator[None]:
+    """Leave standard error to what Python says: EPICS's libraries print there by themselves."""
+    before, kept = sys.stderr, os.dup(2)
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    with open(os.dup(kept), "w", 1, "utf-8", "backslashreplace") as screen:
+        with suppress(AttributeError, OSError, ValueError):  # a stream of somebody's own stays
+            if before.fileno() == 2:
+                before.flush()
+                sys.stderr = screen
+        os.dup2(nowhere, 2)
+        os.close(nowhere)
+        try:
+            yield
+        finally:
+            sys.stderr = before
+            os.dup2(kept, 2)
+            os.close(kept)
 
 
 def _closed() -> None:
@@ -214,7 +240,7 @@ class Variable:
         except TimeoutError:
             found = f"no answer from '{plain(self.name)}' within {self.timeout:g} s"
             expected = "a variable within reach; is its IOC up, and EPICS_CA_ADDR_LIST right?"
-            raise LostError(found, expected) from None
+            raise SilentError(found, expected) from None
         except self.speech.refusal as error:
             found = f"'{plain(self.name)}' refuses: {plain(str(error))[:150]}"
             raise LostError(found, "a variable that does what it is asked") from None
@@ -236,7 +262,7 @@ def _reading(found: Any) -> Reading:
     return Reading(value, float(found.timestamp), int(found.severity))
 
 
-def described(unit: object, low: float, high: float) -> Described:
+def _described(unit: object, low: float, high: float) -> Described:
     """Limits that are equal, as EPICS writes where there are none, are none."""
     low, high = (float(low), float(high)) if low < high else (-math.inf, math.inf)
     return Described(str(unit or "").strip(), low, high)
@@ -252,7 +278,7 @@ def _channel_access() -> Protocols:
     async def describe(name: str) -> Described:
         found = await aioca.caget(name, format=aioca.FORMAT_CTRL, timeout=None)
         ends = (getattr(found, f"{end}_ctrl_limit", 0.0) for end in ("lower", "upper"))
-        return described(getattr(found, "units", ""), *ends)
+        return _described(getattr(found, "units", ""), *ends)
 
     def follow(name: str, come: Callable[[Reading | None], None]) -> Any:
         return aioca.camonitor(
@@ -281,7 +307,7 @@ def _pv_access() -> Protocols:
     async def describe(name: str) -> Described:
         found = (await here().get(name)).raw
         ends = (found.get(f"control.limit{end}", 0.0) for end in ("Low", "High"))
-        return described(found.get("display.units", ""), *ends)
+        return _described(found.get("display.units", ""), *ends)
 
     def follow(name: str, come: Callable[[Reading | None], None]) -> Any:
         async def arrived(found: Any) -> None:

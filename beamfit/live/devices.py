@@ -4,22 +4,34 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import Mapping
+from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
+from contextlib import AbstractAsyncContextManager, AsyncExitStack, asynccontextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import NamedTuple, Protocol
 
 import numpy as np
+from scipy.optimize import curve_fit
 
 from beamfit.errors import InputError, plain
 from beamfit.io.headers import UNITS, known_unit
 from beamfit.io.machine import LENGTHS, Guard, Magnet, Profiler, ScanMachine, moved, unit_of
-from beamfit.live.channel import Channel, LostError, Reading, open_channel
-from beamfit.live.projection import rms_of
+from beamfit.live.channel import Channel, LostError, Reading, SilentError, open_channel
 
 # Of the time a read-back has to stay, between two looks at it; not shorter, not longer, s.
 LOOKS, SHORTEST, LONGEST = 8, 0.02, 0.25
+# Seconds for which a reading of the beam as new as the last shot is waited for: a variable that
+# does not change may send none. Seconds for the first reading of a variable that is followed.
+AFTER, FIRST = 1.0, 5.0
 # Bad shots of a plane, over those wanted, after which there is no beam on the screen.
 BAD = 2
+# Heights over the scatter of the background below which a projection shows no beam.
+SEEN = 5.0
+# A Gaussian is within 1 % of its height over 0.28 of its size: a top wider than this, and some
+# pixels, is cut off by the camera.
+FLAT, PIXELS = 0.6, 2
+# Share of the projection at either end that is background, to begin with.
+ENDS = 0.1
 
 
 class NotSettledError(InputError):
@@ -28,6 +40,17 @@ class NotSettledError(InputError):
 
 class NoSizesError(InputError):
     """A screen that shows no new sizes, or none that are numbers."""
+
+
+class Shots(NamedTuple):
+    """New shots: rms sizes by plane, m, and the time stamp of the last one, Unix time in s."""
+
+    sizes: Mapping[str, np.ndarray]
+    time: float
+
+
+# Asked with the time stamp of the last shot: how something left what it had to be, "" if it stayed.
+Left = Callable[[float], Awaitable[str]]
 
 
 class Device(Protocol):
@@ -48,12 +71,15 @@ class Device(Protocol):
             If it does not.
         """
 
+    def followed(self, value: float) -> AbstractAsyncContextManager[Left]:
+        """Follow it while the block lasts, and say in the end how it left a setting."""
+
 
 class Sizes(Protocol):
     """What measures the beam at a setting."""
 
-    async def shots(self) -> Mapping[str, np.ndarray]:
-        """New shots, by plane: rms sizes, m.
+    async def shots(self) -> Shots:
+        """Take new shots.
 
         Raises
         ------
@@ -67,6 +93,9 @@ class Watchman(Protocol):
 
     async def amiss(self) -> str:
         """What is wrong, in words; "" if nothing is."""
+
+    def followed(self) -> AbstractAsyncContextManager[Left]:
+        """Follow the beam while the block lasts, and say in the end how it was lost."""
 
 
 class Connected(NamedTuple):
@@ -89,7 +118,14 @@ class Supply:
 
     async def put(self, value: float) -> None:
         """As `Device.put`; nothing outside the limits is ever written."""
-        await self.setting.put(moved(self.magnet, value))
+        magnet = self.magnet
+        try:
+            await self.setting.put(moved(magnet, value))
+        except SilentError:
+            await self.setting.get()  # or its IOC is what does not answer
+            found = f"{magnet.name} not at {value:.6g} {magnet.unit} within {magnet.timeout:g} s"
+            expected = "a supply that is on; its IOC answers, but does not say that it is done"
+            raise NotSettledError(found, expected) from None
 
     async def get(self) -> float:
         """As `Device.get`."""
@@ -112,10 +148,25 @@ class Supply:
             if clock() - began > magnet.timeout + magnet.settle:
                 raise NotSettledError(*_unsettled(magnet, value, read))
             await asyncio.sleep(pause)
-        if abs(await self.get() - value) > magnet.tolerance:
+        # Its alarm may outlive the write that defined it: the number and the read-back count.
+        if not np.all(np.abs((await self.setting.get()).value - value) <= magnet.tolerance):
             found = f"{magnet.name} set by someone else while it was scanned"
             raise NotSettledError(found, "nobody else who sets it")
         return float(np.mean(seen))
+
+    def followed(self, value: float) -> AbstractAsyncContextManager[Left]:
+        """As `Device.followed`: by set point and read-back."""
+        magnet = self.magnet
+
+        def wrong(name: str, found: Reading) -> str:
+            if found.good and np.all(np.abs(found.value - value) <= magnet.tolerance):
+                return ""
+            return f"{magnet.name} left {value:.6g} {magnet.unit}, '{plain(name)}' {found.value}"
+
+        return followed(
+            (self.setting, partial(wrong, magnet.set), 0.0),
+            (self.readback, partial(wrong, magnet.read), magnet.settle),
+        )
 
     async def standing(self) -> float:
         """Its setting, if that is within the limits and is what is read back."""
@@ -142,7 +193,8 @@ def _unsettled(magnet: Magnet, value: float, read: float) -> tuple[str, str]:
     if abs(read + value) <= magnet.tolerance:
         return found, f"the same sign; is the sign of '{magnet.read}' right?"
     within = f"within {magnet.tolerance:g} for {magnet.settle:g} s"
-    return found, f"{within}; is the supply on, is '{magnet.read}' its read-back?"
+    said = "its IOC answers: is the supply on"
+    return found, f"{within}; {said}, is '{magnet.read}' its read-back?"
 
 
 @dataclass(frozen=True)
@@ -152,15 +204,12 @@ class ScreenShots:
     profiler: Profiler
     channels: Mapping[str, Channel]
 
-    async def shots(self) -> dict[str, np.ndarray]:
+    async def shots(self) -> Shots:
         """As `Sizes.shots`; the planes at the same time."""
-        found = await self.timed()
-        return {plane: np.array([size for _, size in each]) for plane, each in found.items()}
-
-    async def timed(self) -> dict[str, list[tuple[float, float]]]:
-        """As `shots`, each behind its time stamp."""
         found = await asyncio.gather(*map(self._of_plane, self.channels))
-        return dict(zip(self.channels, found, strict=True))
+        each = dict(zip(self.channels, map(np.array, found), strict=True))
+        sizes = {plane: shots[:, 1] for plane, shots in each.items()}
+        return Shots(sizes, max(shots[-1, 0] for shots in each.values()))
 
     async def _of_plane(self, plane: str) -> list[tuple[float, float]]:
         kept: list[tuple[float, float]] = []
@@ -215,15 +264,100 @@ class BeamGuard:
 
     async def amiss(self) -> str:
         """As `Watchman.amiss`."""
-        if self.present is not None:
-            found = await self.present.get()
-            if not (found.good and np.all(found.value > self.guard.present_above)):
-                return f"no beam ('{plain(self.guard.present)}' reads {found.value})"
-        if self.loss is not None:
-            found = await self.loss.get()
-            if not (found.good and np.all(found.value < self.guard.loss_below)):
-                return f"beam loss ('{plain(self.guard.loss)}' reads {found.value})"
+        for channel, wrong, _ in self._each:
+            if said := wrong(await channel.get()):
+                return said
         return ""
+
+    def followed(self) -> AbstractAsyncContextManager[Left]:
+        """As `Watchman.followed`."""
+        return followed(*self._each)
+
+    @property
+    def _each(self) -> list[tuple[Channel, Callable[[Reading], str], float]]:
+        each = ((self.present, self._no_beam), (self.loss, self._loss))
+        return [(channel, wrong, AFTER) for channel, wrong in each if channel is not None]
+
+    def _no_beam(self, found: Reading) -> str:
+        there = found.good and np.all(found.value > self.guard.present_above)
+        return "" if there else f"no beam ('{plain(self.guard.present)}' reads {found.value})"
+
+    def _loss(self, found: Reading) -> str:
+        small = found.good and np.all(found.value < self.guard.loss_below)
+        return "" if small else f"beam loss ('{plain(self.guard.loss)}' reads {found.value})"
+
+
+@asynccontextmanager
+async def followed(
+    *each: tuple[Channel, Callable[[Reading], str], float],
+) -> AsyncIterator[Left]:
+    """Follow variables while the block lasts.
+
+    Parameters
+    ----------
+    each : tuple of (Channel, callable, float)
+        A variable, what is wrong with a reading of it in words, and how long at most, in s, a
+        reading as new as the last shot is waited for in the end.
+
+    Yields
+    ------
+    callable
+        Says what was wrong first, asked with the time stamp of the last shot.
+
+    Raises
+    ------
+    LostError
+        If one does not answer.
+    """
+    async with AsyncExitStack() as stack:
+        all_left = [await stack.enter_async_context(_followed(*one)) for one in each]
+
+        async def left(last: float) -> str:
+            return next(filter(None, [await one(last) for one in all_left]), "")
+
+        yield left
+
+
+@asynccontextmanager
+async def _followed(
+    channel: Channel, wrong: Callable[[Reading], str], patience: float
+) -> AsyncIterator[Left]:
+    said: list[str] = []
+    begun = asyncio.Event()
+
+    async def follow() -> None:
+        async for reading in channel.monitor():
+            words = f"'{plain(channel.name)}' is gone" if reading is None else wrong(reading)
+            said.extend([words] * bool(words))
+            begun.set()
+
+    async def left(last: float) -> str:
+        until = time.monotonic() + patience
+        while not said:  # an answer comes behind whatever the monitor sent before it
+            reading = await channel.get()
+            if words := wrong(reading):
+                return words
+            if reading.time >= last or time.monotonic() >= until:
+                break
+            await asyncio.sleep(SHORTEST)
+        return "".join(said[:1])
+
+    task = asyncio.create_task(follow())
+    try:
+        await _in_time(begun, channel)
+        yield left
+    finally:
+        task.cancel()
+        await asyncio.gather(task, return_exceptions=True)
+
+
+async def _in_time(begun: asyncio.Event, channel: Channel) -> None:
+    try:
+        async with asyncio.timeout(FIRST):
+            await begun.wait()
+    except TimeoutError:
+        found = f"no reading of '{plain(channel.name)}' within {FIRST:g} s"
+        raise LostError(found, "a variable that can be followed") from None
 
 
 async def connect(machine: ScanMachine) -> Connected:
@@ -321,3 +455,55 @@ async def checked(supply: Supply) -> tuple[Supply, list[str]]:
         raise InputError(found, "less than a tenth of what the control system lets it move")
     said = f"Limits of {magnet.name}: {low:g} to {high:g} {magnet.unit}, of the control system."
     return replace(supply, magnet=replace(magnet, low=low, high=high)), [said]
+
+
+def rms_of(counts: np.ndarray, pixel: float) -> float | None:
+    """Rms size of a projection: that of a Gaussian on a level background.
+
+    Parameters
+    ----------
+    counts : ndarray
+        Shape (n,), the projection.
+    pixel : float
+        Size of a pixel at the screen, m.
+
+    Returns
+    -------
+    float or None
+        m; None where there is no beam, its spot does not fit on the screen, or its top is cut off.
+
+    Notes
+    -----
+    Least squares of h exp(-(x - x0)²/(2 s²)) + c, the size most laboratories quote; moments depend
+    on where the background is cut.
+
+    Examples
+    --------
+    >>> x = np.arange(200.0)
+    >>> round(1e6 * rms_of(900 * np.exp(-0.5 * ((x - 90) / 12) ** 2) + 20, 10e-6), 3)
+    120.0
+    """
+    n = counts.size
+    if n < 8 or not np.isfinite(counts).all():
+        return None
+    place, few = np.arange(n, dtype=float), max(int(ENDS * n), 2)
+    ends = np.concatenate([counts[:few], counts[-few:]])
+    level, scatter = float(np.median(ends)), float(np.std(ends))
+    height = float(counts.max() - level)
+    if height <= SEEN * scatter or height <= 0:
+        return None
+    above = counts - level > 0.5 * height
+    width = max(above.sum() / 2.355, 1.0)
+    start = (height, float(place[above].mean()), width, level)
+    try:
+        found, _ = curve_fit(_gaussian, place, counts, start, maxfev=400)
+    except RuntimeError:  # which has no minimum within 400 steps
+        return None
+    size = abs(float(found[2]))
+    inside = 0 < found[1] < n - 1 and found[0] > 0 and 0.3 < size < n / 4
+    flat = np.count_nonzero(counts - level > 0.99 * height) > PIXELS + FLAT * size
+    return size * pixel if inside and not flat else None
+
+
+def _gaussian(x: np.ndarray, height: float, middle: float, size: float, level: float) -> np.ndarray:
+    return height * np.exp(-0.5 * ((x - middle) / size) ** 2) + level

@@ -1,23 +1,203 @@
-"""Magnets moved to a setting from the side that is asked for, and put back whatever happens."""
+"""What a scan has to restore: on disk before anything moves, put back whatever happens."""
 
 from __future__ import annotations
 
 import asyncio
+import hashlib
+import json
+import math
+import os
 import signal
+import socket
 import time
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import asdict, dataclass, fields
+from datetime import UTC, datetime
+from os import PathLike
+from pathlib import Path
 
-from beamfit.errors import InputError
-from beamfit.io.machine import Magnet, moved
+from beamfit.compile_cache import own_folder
+from beamfit.errors import InputError, plain
+from beamfit.io.files import read_json
+from beamfit.io.machine import APPROACHES, Magnet, ScanMachine, moved
+from beamfit.io.toml import is_number
 from beamfit.live.channel import LostError
 from beamfit.live.devices import Device, NotSettledError
-from beamfit.live.journal import Journal, named
+from beamfit.writing import alone, write_atomically
 
+FORMAT = "beamfit-journal-1"
+# Ends of the names by which EPICS is told where variables are looked for.
+LOOKED_FOR = ("_ADDR_LIST", "_NAME_SERVERS", "_SERVER_PORT", "_BROADCAST_PORT")
 # Signals that end a scan; what they find is restored.
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 # Seconds between two attempts to reach an IOC, and attempts to settle a magnet.
 PAUSE, ATTEMPTS = 0.5, 2
+
+
+@dataclass(frozen=True)
+class Journal:
+    """Magnets and the settings they had before a scan.
+
+    Attributes
+    ----------
+    path : Path
+        Where it is written.
+    machine : str
+        The machine file, for whoever finds the journal.
+    before : tuple of (Magnet, float)
+        Each magnet, with limits and variables of its own, and its setting.
+    timeout, patience : float
+        Within which a variable has to answer, and for how long it is asked again, s.
+    """
+
+    path: Path
+    machine: str
+    before: tuple[tuple[Magnet, float], ...]
+    timeout: float = 5.0
+    patience: float = 60.0
+
+    def write(self) -> None:
+        """Have it on disk, whole, its folder too.
+
+        Raises
+        ------
+        InputError
+            If the place cannot be written.
+        """
+        said = {
+            "format": FORMAT,
+            "what": "settings to restore: beamfit scan --recover THIS_FILE",
+            "machine": self.machine,
+            "written": datetime.now(UTC).isoformat(timespec="seconds"),
+            "by": f"process {os.getpid()} on {socket.gethostname()}",
+            "timeout": self.timeout,
+            "patience": self.patience,
+            "magnets": [{**asdict(magnet), "setting": value} for magnet, value in self.before],
+        }
+        write_atomically(self.path, (json.dumps(said, indent=2) + "\n").encode())
+        folder = os.open(self.path.parent, os.O_RDONLY)
+        try:
+            os.fsync(folder)
+        finally:
+            os.close(folder)
+
+    def done(self) -> None:
+        """Remove it: all is restored."""
+        self.path.unlink(missing_ok=True)
+
+
+def check_none_left(path: Path) -> None:
+    """Refuse to begin where an earlier scan has something to restore.
+
+    Raises
+    ------
+    InputError
+        Naming the journal.
+    """
+    if path.exists():
+        found = "what a scan before this one has not restored"
+        raise InputError(found, f"beamfit scan --recover {path} first", path=path)
+
+
+@contextmanager
+def alone_with(path: Path, magnets: Iterable[Magnet]) -> Iterator[None]:
+    """Keep other scans from a journal and from its magnets, in whatever file these are named.
+
+    The locks of magnets are in this user's folder of beamfit; without a home there are none.
+
+    Raises
+    ------
+    InputError
+        Naming the journal or the magnet that another scan has.
+    """
+    folder = own_folder()
+    with ExitStack() as stack:
+        stack.enter_context(alone(path))
+        for magnet in magnets if folder else ():
+            lock = Path(folder, f"magnet-{_found_as(magnet.set)}")
+            try:
+                stack.enter_context(alone(lock))
+            except InputError:
+                found = (
+                    f"magnet '{plain(magnet.name)}' ({plain(magnet.set)}), which another scan has"
+                )
+                raise InputError(found, "another magnet, or that scan's end") from None
+        yield
+
+
+def _found_as(variable: str) -> str:
+    """A word for a variable and where it is looked for: a simulation may have the same name."""
+    where = sorted(f"{k}={v}" for k, v in os.environ.items() if k.endswith(LOOKED_FOR))
+    said = "\n".join([variable.rpartition("://")[2], *where])
+    return hashlib.sha256(said.encode()).hexdigest()[:16]
+
+
+def read_journal(path: str | PathLike[str]) -> Journal:
+    """Read a journal.
+
+    Raises
+    ------
+    InputError
+        If the file is none.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> place = Path(tempfile.mkdtemp()) / "a.journal"
+    >>> magnet = Magnet("Q", "Q:SET", "Q:READ", "A", -1.0, 1.0, 0.01, 0.1)
+    >>> Journal(place, "machine.toml", ((magnet, 0.5),)).write()
+    >>> read_journal(place).before == ((magnet, 0.5),)
+    True
+    """
+    expected = f"a journal of beamfit scan, {FORMAT}"
+    found = read_json(path, "a file that is none", expected)
+    if not isinstance(found, dict) or found.get("format") != FORMAT:
+        raise InputError("a file that is none", expected, path=path)
+    try:
+        before = tuple(_magnet(dict(table)) for table in found["magnets"])
+        times = found["timeout"], found["patience"]
+        for named_once in ({m.name for m, _ in before}, {m.set for m, _ in before}):
+            _demand(0 < len(before) == len(named_once))
+        _demand(all(is_number(time) and time > 0 for time in times))
+        return Journal(Path(path), str(found["machine"]), before, *times)
+    except (KeyError, TypeError, ValueError):
+        expected = "it as the scan wrote it; put back by hand what can be read of it"
+        raise InputError("a journal that was changed or cut", expected, path=path) from None
+
+
+def _magnet(table: dict[str, object]) -> tuple[Magnet, float]:
+    """Checked as a machine file is: a tolerance without end would call anything restored."""
+    setting = table.pop("setting")
+    table["degauss"] = tuple(table["degauss"])
+    known = {field.name for field in fields(Magnet)}
+    m = Magnet(**{name: value for name, value in table.items() if name in known})
+    numbers = (setting, m.low, m.high, m.tolerance, m.settle, m.timeout, m.approach_by)
+    _demand(all(isinstance(word, str) and word for word in (m.name, m.set, m.read, m.unit)))
+    _demand(all(map(is_number, numbers)) and m.approach in APPROACHES)
+    _demand(0 < m.tolerance < 0.1 * (m.high - m.low) and m.settle >= 0 and m.timeout > 0)
+    return m, float(setting)
+
+
+def _demand(holds: bool) -> None:
+    if not holds:
+        raise ValueError
+
+
+def journal_of(machine: ScanMachine, path: str | None) -> Path:
+    """Where the journal of a machine is, unless it is said: beside the machine's file."""
+    return Path(path or Path(machine.path).with_suffix(".journal")).absolute()
+
+
+def named(before: Iterable[tuple[Magnet, float]]) -> str:
+    """Magnets and their settings in words.
+
+    Examples
+    --------
+    >>> named([(Magnet("Q", "Q:SET", "Q:READ", "T_per_m", -1.0, 1.0, 0.01, 0.1), 0.5)])
+    'Q 0.5 T_per_m'
+    """
+    return ", ".join(f"{magnet.name} {value:.6g} {magnet.unit}" for magnet, value in before)
 
 
 class NotRestoredError(InputError):
@@ -46,19 +226,23 @@ async def reach(magnet: Magnet, device: Device, value: float) -> float:
     InputError
         If the setting is outside the limits (nothing is written then), or is not reached.
     """
-    value, by = moved(magnet, value), magnet.approach_by
-    present = await device.get()
-    if magnet.approach == "below" and present > value:
-        await _passed(device, max(value - by, magnet.low))
-    if magnet.approach == "above" and present < value:
-        await _passed(device, min(value + by, magnet.high))
+    value = moved(magnet, value)
+    return await _sent(magnet, device, value, await device.get())
+
+
+async def _sent(magnet: Magnet, device: Device, value: float, present: float) -> float:
+    """Move a magnet from a setting to another; from NaN it passes by, whichever side it is on."""
+    by = magnet.approach_by
+    if magnet.approach == "below" and not present <= value:
+        await _put(device, max(value - by, magnet.low))
+    if magnet.approach == "above" and not present >= value:
+        await _put(device, min(value + by, magnet.high))
+    return await _put(device, value)
+
+
+async def _put(device: Device, value: float) -> float:
     await device.put(value)
     return await device.settled(value)
-
-
-async def _passed(device: Device, value: float) -> None:
-    await device.put(value)
-    await device.settled(value)
 
 
 async def restore(journal: Journal, magnets: Mapping[str, Device]) -> None:
@@ -97,7 +281,7 @@ async def _restored(
     attempts = 0
     while True:
         try:
-            await reach(magnet, device, value)
+            await _put_back(magnet, device, value)
             return None
         except LostError as error:
             if time.monotonic() > until:
@@ -109,6 +293,14 @@ async def _restored(
         except InputError as error:
             return error
         await asyncio.sleep(PAUSE)
+
+
+async def _put_back(magnet: Magnet, device: Device, value: float) -> None:
+    """Move a magnet back, also where its set point is undefined: an IOC may return like that."""
+    present = math.nan
+    with suppress(LostError):
+        present = await device.get()
+    await _sent(magnet, device, moved(magnet, value), present)
 
 
 @contextmanager

@@ -3,22 +3,31 @@
 from __future__ import annotations
 
 import asyncio
+import math
 import os
 import signal
 import time
-from collections.abc import Awaitable, Callable, Mapping, Sequence
+from collections.abc import Awaitable, Callable, Coroutine, Mapping, Sequence
+from contextlib import AsyncExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from beamfit.errors import InputError
-from beamfit.io.machine import Magnet, ScanMachine
-from beamfit.live.devices import Connected, Device, NoSizesError
-from beamfit.live.journal import Journal, alone_with, check_none_left, named
-from beamfit.live.next_setting import Next, Point, fit_of, next_setting, sharp, warmed
-from beamfit.live.restore import ended_by_signals, reach, restore
+from beamfit.io.machine import ScanMachine
+from beamfit.live.devices import Connected, NoSizesError, Shots
+from beamfit.live.points import Next, Point, doubt, fit_of, fresh, next_setting, sharp, warmed
+from beamfit.live.restore import (
+    Journal,
+    alone_with,
+    check_none_left,
+    ended_by_signals,
+    named,
+    reach,
+    restore,
+)
 from beamfit.optics.beamline import Beamline
 from beamfit.studies.scan.fit import EmittanceFit
 
@@ -55,6 +64,8 @@ class Outcome(NamedTuple):
         What went wrong, if something did. The magnets are restored all the same.
     signal : int
         Number of the signal that ended it; 0 if none.
+    doubt : str
+        Why the line may be wrong, in words; "" where the sizes follow it.
     """
 
     points: tuple[Point, ...]
@@ -62,26 +73,23 @@ class Outcome(NamedTuple):
     reason: str
     problem: Exception | None = None
     signal: int = 0
+    doubt: str = ""
 
 
 @dataclass
 class Running:
-    """What a scan has so far; the one thing that changes as it goes on.
-
-    ``reach`` moves a magnet, ``sleep`` waits; a plan of bluesky does both by messages.
-    """
+    """What a scan has so far; the one thing that changes as it goes on."""
 
     at: Connected
     line: Beamline
     before: Mapping[str, float]
     keep: Callable[[Sequence[Point]], None]
     tell: Callable[[Told], None]
+    ready: Callable[[], Awaitable[None]]
     points: list[Point] = field(default_factory=list)
     barred: list[dict[str, float]] = field(default_factory=list)
     fit: EmittanceFit | None = None
     armed: bool = False
-    reach: Callable[[Magnet, Device, float], Awaitable[float]] = reach
-    sleep: Callable[[float], Awaitable[None]] = asyncio.sleep
 
     def say(self, news: str, measured: bool = False) -> None:
         """Tell how it stands."""
@@ -95,6 +103,7 @@ async def scan(
     *,
     keep: Callable[[Sequence[Point]], None] = lambda points: None,
     tell: Callable[[Told], None] = lambda told: None,
+    ready: Callable[[], Awaitable[None]] = lambda: asyncio.sleep(0),
 ) -> Outcome:
     """Scan magnets until the emittances are known as well as is wanted, and put them back.
 
@@ -111,6 +120,8 @@ async def scan(
         Is given all points after each new one, to write them.
     tell : callable
         Is told how the scan stands.
+    ready : callable
+        Is awaited before each setting: the scan stands still as long as that takes.
 
     Returns
     -------
@@ -133,32 +144,33 @@ async def scan(
     with alone_with(journal, at.machine.magnets):
         check_none_left(journal)
         before = {m.name: await at.magnets[m.name].get() for m in at.machine.magnets}
-        log = journal_for(journal, at.machine, before)
-        run = Running(at, line, before, keep, tell)
-        measuring = asyncio.ensure_future(begun(run, log))
+        log = _journal_for(journal, at.machine, before)
+        run = Running(at, line, before, keep, tell, ready)
+        measuring = asyncio.ensure_future(_begun(run, log))
         reason, problem = "", None
         with ended_by_signals(measuring, run.say) as came:
             try:
                 reason = await measuring
             except asyncio.CancelledError:
                 if not came:  # whoever runs this one wants it to end: restored before it does
-                    await asyncio.shield(back(run, log))
+                    await _to_the_end(_back(run, log))
                     raise
                 reason = f"stopped by {signal.Signals(came[0]).name}"
             except Exception as error:  # of whatever kind: the magnets are put back first
                 problem, reason = error, str(error)
-            await back(run, log)
-        return Outcome(tuple(run.points), run.fit, reason, problem, came[0] if came else 0)
+            await _to_the_end(_back(run, log))
+        number, doubted = came[0] if came else 0, doubt(run.fit, run.points)
+        return Outcome(tuple(run.points), run.fit, reason, problem, number, doubted)
 
 
-def journal_for(path: Path, machine: ScanMachine, before: Mapping[str, float]) -> Journal:
+def _journal_for(path: Path, machine: ScanMachine, before: Mapping[str, float]) -> Journal:
     """The journal of a scan, not written yet."""
     settings = tuple((m, before[m.name]) for m in machine.magnets)
     whose = os.path.abspath(machine.path)
     return Journal(path, whose, settings, machine.timeout, machine.restore)
 
 
-async def begun(run: Running, log: Journal) -> str:
+async def _begun(run: Running, log: Journal) -> str:
     """Write the journal, measure, and say why that ended."""
     log.write()
     run.armed = True  # from here on something may have moved
@@ -166,7 +178,20 @@ async def begun(run: Running, log: Journal) -> str:
     return await _measured(run)
 
 
-async def back(run: Running, log: Journal) -> None:
+async def _to_the_end(work: Coroutine[Any, Any, None]) -> None:
+    """Wait until something is done, whoever cancels that; be cancelled only then."""
+    task, cancelled = asyncio.ensure_future(work), None
+    while not task.done():
+        try:
+            await asyncio.shield(task)
+        except asyncio.CancelledError as error:
+            cancelled = error
+    task.result()
+    if cancelled is not None:
+        raise cancelled
+
+
+async def _back(run: Running, log: Journal) -> None:
     """Restore what may have been moved."""
     if run.armed:
         await restore(log, run.at.magnets)
@@ -178,8 +203,9 @@ async def _measured(run: Running) -> str:
     machine, barren = run.at.machine, 0
     for magnet in machine.magnets:
         for value in magnet.degauss:
-            await run.reach(magnet, run.at.magnets[magnet.name], value)
+            await reach(magnet, run.at.magnets[magnet.name], value)
     while len(run.points) < machine.points:
+        await run.ready()
         chosen = next_setting(run.points, run.fit, run.barred, machine, run.before)
         if not isinstance(chosen, Next):
             return chosen
@@ -198,7 +224,7 @@ async def _measured(run: Running) -> str:
         run.points.append(point)
         run.fit = fit_of(run.points, machine, run.line) or run.fit
         run.say(chosen.why, measured=True)
-        if sharp(run.fit, run.points, machine.goal):
+        if sharp(run.fit, run.points, machine.goal) and not fresh(run.points, machine):
             return f"the goal of {100 * machine.goal:.3g} % is reached"
     return f"all {machine.points} points are measured"
 
@@ -206,25 +232,45 @@ async def _measured(run: Running) -> str:
 async def _point(run: Running, settings: Mapping[str, float]) -> tuple[Point | None, str]:
     """Measure at a setting; None, and why, where that cannot be done.
 
-    Where the beam is lost the magnets go back until it has returned; once more is tried.
+    Once more is tried where a magnet left it or the beam was lost during the shots; for a lost beam
+    the magnets go back until it has returned.
     """
-    why = ""
+    lost = left = ""
     for _ in range(2):
-        await _well(run, why)
+        await _well(run, lost)
         reads = await _moved(run, settings)
-        try:
-            shots, why = await run.at.screen.shots(), ""
-        except NoSizesError as error:
-            shots, why = {}, error.found
-        wrong = await run.at.guard.amiss()
-        if not wrong and (plane := _stuck(run, reads, shots)):
+        shots, none, lost, left = await _taken(run, settings)
+        if lost:
+            run.say(f"Paused: {lost}")
+            await _moved(run, run.before)
+        elif left:
+            run.say(f"Measured again: {left}")
+        elif shots is None:
+            return None, none
+        elif plane := _stuck(run, reads, shots.sizes):
             return None, f"{plane} as before the magnets moved, to the last digit: is it stuck?"
-        if not wrong:
-            return (Point(reads, dict(shots), time.time()) if shots else None), why
-        why = wrong
-        run.say(f"Paused: {wrong}")
-        await _moved(run, run.before)
-    return None, why
+        else:
+            return Point(reads, dict(shots.sizes), shots.time), ""
+    return None, lost or left
+
+
+async def _taken(run: Running, settings: Mapping[str, float]) -> tuple[Shots | None, str, str, str]:
+    """Shots at a setting, else why there are none; how the beam was lost, how a magnet moved.
+
+    Magnets and beam are followed from before the first shot to the time stamp of the last one.
+    """
+    async with AsyncExitStack() as stack:
+        devices = [run.at.magnets[name].followed(value) for name, value in settings.items()]
+        magnets = [await stack.enter_async_context(one) for one in devices]
+        beam = await stack.enter_async_context(run.at.guard.followed())
+        shots, none, last = None, "", -math.inf
+        try:
+            shots = await run.at.screen.shots()
+            last = shots.time
+        except NoSizesError as error:
+            none = error.found
+        lost = await beam(last)
+        return shots, none, lost, "; ".join(filter(None, [await one(last) for one in magnets]))
 
 
 def _stuck(run: Running, reads: Mapping[str, float], shots: Mapping[str, np.ndarray]) -> str:
@@ -239,10 +285,10 @@ def _stuck(run: Running, reads: Mapping[str, float], shots: Mapping[str, np.ndar
 
 async def _moved(run: Running, settings: Mapping[str, float]) -> dict[str, float]:
     magnets = [m for m in run.at.machine.magnets if m.name in settings]
-    return {m.name: await run.reach(m, run.at.magnets[m.name], settings[m.name]) for m in magnets}
+    return {m.name: await reach(m, run.at.magnets[m.name], settings[m.name]) for m in magnets}
 
 
-async def _well(run: Running, why: str) -> None:
+async def _well(run: Running, lost: str) -> None:
     """Wait until there is beam and none is lost.
 
     Raises
@@ -255,6 +301,6 @@ async def _well(run: Running, why: str) -> None:
         if time.monotonic() > until:
             expected = f"it to be over within {run.at.machine.guard.wait:g} s"
             raise InputError(f"{wrong}", expected)
-        await run.sleep(LOOK)
-    if why:
+        await asyncio.sleep(LOOK)
+    if lost:
         run.say("Going on")

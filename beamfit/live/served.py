@@ -21,7 +21,7 @@ NUMBERS = {
     "NORMALISED": ("normalised", "mA h"),
 }  # fmt: skip
 TEXTS = ("STATUS", "MESSAGE", "ALARM", "ALARM:TEXT")
-PLAIN = {"CURRENT": "mA", "SINCE": "s", "READINGS": ""}
+PLAIN = {"CURRENT": "mA", "SINCE": "s", "AGE": "s", "READINGS": ""}
 UNITS = {
     n + part: u for n, (_, u) in NUMBERS.items() for part in ("", ":ERROR", ":LOW", ":HIGH")
 } | PLAIN
@@ -63,6 +63,7 @@ def values_of(told: Told) -> dict[str, tuple[Any, int]]:
     return found | {
         "CURRENT": (current, old if state.rows else INVALID),
         "SINCE": (since, moved if state.alarms else INVALID),
+        "AGE": (math.nan if told.age is None else told.age, old),
         "READINGS": (float(state.counts.readings), old),
         "STATUS": (cell(answer.status) if answer else "", max(verdict, old)),
         "MESSAGE": (told.headline[1], max(verdict, moved)),

@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -38,17 +38,23 @@ class Told:
         Variables that do not answer.
     silent : float or None
         For how long there has been no reading of the current, s; None while there are.
+    age : float or None
+        How long ago the newest reading that is fitted came, s; None before the first fit.
+    old : bool
+        Whether that is longer than fits are apart, and readings may be silent.
     """
 
     plan: Plan
     state: State
     lost: tuple[str, ...] = ()
     silent: float | None = None
+    age: float | None = None
+    old: bool = False
 
     @property
     def sound(self) -> bool:
         """Whether the numbers are of now."""
-        return self.silent is None and self.state.answer is not None
+        return self.silent is None and not self.old and self.state.answer is not None
 
     @property
     def headline(self) -> tuple[str, str]:
@@ -56,6 +62,8 @@ class Told:
         state, answer = self.state, self.state.answer
         if self.silent is not None:
             return "red", f"No reading of the current for {self.silent:.0f} s: all below is old"
+        if self.old:
+            return "red", f"The newest reading fitted is {self.age:.0f} s old: fits fall behind"
         if self.lost:
             return "red", f"No connection to {', '.join(self.lost)}"
         if state.alarmed:
@@ -87,10 +95,18 @@ class Told:
                 "moved": state.alarmed, "text": state.said(), "rule": RULE,
                 "since": state.alarms[-1].since if state.alarms else None,
             },
-            "lost": self.lost, "silent": self.silent, "window": self.plan.window,
+            "lost": self.lost, "silent": self.silent, "age": self.age, "window": self.plan.window,
             "course": [tuple(point) for point in state.course],
             "events": state.events[::-1], "counts": state.counts,
         })  # fmt: skip
+
+
+class Arrived(NamedTuple):
+    """A reading of a variable, None where its connection was lost, and when it came, s."""
+
+    watched: Watched
+    reading: Reading | None
+    at: float
 
 
 @dataclass
@@ -98,30 +114,33 @@ class _Course:
     """A watch that goes on."""
 
     plan: Plan
-    queue: asyncio.Queue[tuple[Watched, Reading | None]]
+    queue: asyncio.Queue[Arrived]
     state: State = field(default_factory=State)
     lost: dict[str, bool] = field(default_factory=dict)
     arrived: float = field(default_factory=time.monotonic)
     apart: float = 0.0
+    fitted: float | None = None
 
     def told(self) -> Told:
         """What is known now."""
-        silent = time.monotonic() - self.arrived
-        still = silent <= max(STALE, INTERVALS * self.apart)
+        now, patience = time.monotonic(), max(STALE, INTERVALS * self.apart)
+        silent = now - self.arrived if now - self.arrived > patience else None
+        age = None if self.fitted is None else now - self.fitted
+        old = age is not None and age > self.plan.every + patience
         lost = tuple(name for name, gone in self.lost.items() if gone)
-        return Told(self.plan, self.state, lost, None if still else silent)
+        return Told(self.plan, self.state, lost, silent, age, old)
 
     async def take(self) -> None:
         """All readings that wait; a fit leaves the page and the served variables alive."""
-        batch: list[tuple[Watched, Reading | None]] = []
+        batch: list[Arrived] = []
         with suppress(TimeoutError):
             batch.append(await asyncio.wait_for(self.queue.get(), TAKEN))
         while not self.queue.empty():
             batch.append(self.queue.get_nowait())
-        for watched, reading in batch:
-            self._seen(watched, reading)
-        readings = [(watched, reading) for watched, reading in batch if reading is not None]
-        self.state = await asyncio.to_thread(_stepped, self.plan, self.state, readings)
+        for one in batch:
+            self._seen(one.watched, one.reading)
+        self.state, fitted = await asyncio.to_thread(_stepped, self.plan, self.state, batch)
+        self.fitted = fitted or self.fitted
 
     def _seen(self, watched: Watched, reading: Reading | None) -> None:
         gone = reading is None
@@ -139,19 +158,24 @@ class _Course:
                 with suppress(LostError):
                     watched.check((await channel.describe()).unit)
                     lost = False
+            now = time.monotonic()
             if watched.quantity == CURRENT and reading is not None:
-                now = time.monotonic()
                 self.apart += 0.1 * (now - self.arrived - self.apart)
                 self.arrived = now
-            kept(self.queue, (watched, reading))
+            kept(self.queue, Arrived(watched, reading, now))
 
 
-def _stepped(plan: Plan, state: State, readings: Sequence[tuple[Watched, Reading]]) -> State:
-    for watched, reading in readings:
+def _stepped(plan: Plan, state: State, batch: Sequence[Arrived]) -> tuple[State, float | None]:
+    """The state after some readings, and when the newest that was fitted came."""
+    fitted = None
+    for watched, reading, arrived in batch:
+        if reading is None:
+            continue
         scalar = reading.good and np.ndim(reading.value) == 0
         value = watched.factor * float(reading.value) if scalar else float("nan")
-        state = stepped(plan, state, watched.quantity, reading.time, value)
-    return state
+        before, state = state, stepped(plan, state, watched.quantity, reading.time, value)
+        fitted = fitted if state.answer is before.answer else arrived
+    return state, fitted
 
 
 async def connect(machine: WatchMachine) -> list[str]:
@@ -202,7 +226,7 @@ async def watch(
     Told, int
         What is known at the end, and the signal that ended it, 0 for none.
     """
-    queue: asyncio.Queue[tuple[Watched, Reading | None]] = asyncio.Queue(WAITING)
+    queue: asyncio.Queue[Arrived] = asyncio.Queue(WAITING)
     course = _Course(plan, queue)
     followers = [
         asyncio.create_task(course.follow(one, open_channel(one.variable, machine.timeout)))

@@ -72,3 +72,19 @@ def test_a_script_checks_names_and_writes_the_document(root):
     assert list(document) == ["beamfit", "command", "inputs", "results", "more"]
     assert document["results"][0]["size"]["error"] is None
     assert [len(sha256) for sha256 in document["inputs"].values()] == [64, 64]
+
+
+@pytest.mark.parametrize(("flags", "shown"), [([], False), (["-W", "default"], True)])
+def test_warnings_of_libraries_are_not_shown_unless_asked_for(flags, shown):
+    work = """import logging, sys, warnings
+from beamfit.cli import main
+sys.argv = ["beamfit", "--version"]
+try: main()
+except SystemExit: pass
+logging.getLogger("library").warning("a library's log")
+warnings.warn("a library's warning")"""
+    done = subprocess.run(
+        [sys.executable, *flags, "-c", work], capture_output=True, text=True, check=True
+    )
+    assert ("a library's warning" in done.stderr) is shown
+    assert "a library's log" not in done.stderr

@@ -104,13 +104,17 @@ def write_scan(tmp_path, header, cell):
     return path
 
 
-@pytest.mark.parametrize("digits", ["f" * 4000, "7" * 300])
+@pytest.mark.parametrize(
+    "digits", ["x" + "f" * 5000, "x" + "7" * 300, "o" + "7" * 5000, "b" + "1" * 5000]
+)
 @pytest.mark.parametrize("key", ["energy_MeV", "k1_per_m2"])
 def test_integers_without_end_have_their_line(key, digits, root, tmp_path):
     text = (root / "lattices/lcls_otr2.toml").read_text().replace("energy_MeV = 135.0", "")
     path = tmp_path / "line.toml"
-    path.write_text(f"# a line\n{key} = 0x{digits}\n{text}")
-    with pytest.raises(InputError, match=rf"line\.toml:2: .*an integer of {len(digits)} digits"):
+    path.write_text(f"# a line\n{key} = 0{digits}\n{text}")
+    with pytest.raises(
+        InputError, match=rf"line\.toml:2: .*an integer of {len(digits) - 1} digits"
+    ):
         beamfit.load_lattice(path)
 
 

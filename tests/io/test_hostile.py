@@ -141,3 +141,11 @@ def test_toml_of_great_depth_and_long_numbers(tmp_path):
         assert "TOML that does not parse" in refused(lambda p: read_toml(p, "a lattice"), path)
     path.write_text('format = "beamfit-lattice-1"\nenergy_MeV = ' + "9" * 400)
     assert "energy_MeV" in refused(beamfit.load_lattice, path)
+
+
+def test_a_lattice_of_more_elements_than_any_machine_is_refused(tmp_path):
+    path = tmp_path / "line.toml"
+    head = 'format = "beamfit-lattice-1"\nenergy_MeV = 135.0\n'
+    path.write_text(head + "element = [" + "{ type = 'drift' },\n" * 50_001 + "]\n")
+    with pytest.raises(InputError, match=r"line\.toml:3: .*'element': more than 50000 elements"):
+        beamfit.load_lattice(path)

@@ -51,6 +51,8 @@ TOKENS += [
     b"\xc3\xa9",
     b"!",
 ]
+# Whole numbers of 5000 digits, which Python reads at once and does not write in decimal digits.
+TOKENS += [b"0x" + b"f" * 5000, b"0o" + b"7" * 5000, b"0b" + b"1" * 5000, b"9" * 5000]
 CSV = (
     "# a scan\nQ525_kG,energy_MeV,screen,size_x_um,size_x_error_um,fwhm_y_um,fwhm_y_err_um,note_\n"
     + "".join(

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from beamfit.live import journal
+from beamfit.live import restore
 
 # Run as programs of their own.
 collect_ignore = ["ioc.py", "worker.py"]
@@ -44,8 +44,8 @@ class Ioc:
         self.log = folder / "puts.txt"
         self.process = None
 
-    def start(self):
-        command = [sys.executable, "-m", "tests.live.ioc", str(self.log)]
+    def start(self, *how):
+        command = [sys.executable, "-m", "tests.live.ioc", str(self.log), *how]
         self.log.touch()
         self.process = subprocess.Popen(
             command, cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
@@ -68,7 +68,7 @@ class Ioc:
 @pytest.fixture(autouse=True)
 def _locks_of_this_process(tmp_path_factory, monkeypatch):
     """Tests of two processes may scan a simulated magnet of one name."""
-    monkeypatch.setattr(journal, "own_folder", lambda: str(tmp_path_factory.getbasetemp()))
+    monkeypatch.setattr(restore, "own_folder", lambda: str(tmp_path_factory.getbasetemp()))
 
 
 @pytest.fixture(scope="session")

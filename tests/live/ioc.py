@@ -1,8 +1,9 @@
-"""A real IOC with a simulated injector and a simulated ring: `python -m tests.live.ioc LOG`.
+"""A real IOC with a simulated injector and ring: `python -m tests.live.ioc LOG [undefined]`.
 
 SIMULATED. Served by Channel Access and PV Access on the ports of the environment. Every value
 written to a magnet is appended to LOG, before anything else is done with it. Faults are variables
-(SIM:FAULT:*). The optics are a thick quadrupole and a drift in numpy, no code of beamfit.
+(SIM:FAULT:*). With "undefined" set points are so (UDF, INVALID), as of an IOC that was restarted
+without autosave. The optics are a thick quadrupole and a drift in numpy, no code of beamfit.
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ NOISE, SHOT = 0.02, 0.03  # of a size, and s between shots
 PIXEL, PIXELS = 12.0, 200  # um
 MAGNETS = ("Q1", "Q2")
 FAULTS = ("STUCK", "DRIFT", "SIGN", "NAN", "STALE", "DEAF", "DARK", "LOSSY", "SLOW")
+FAULTS += ("TRIP", "DIM")  # a supply off by so much; a screen that shows sizes of no beam
 # Of the ring: a 1/(mA s), b 1/s at a pressure of 1e-7 Pa, monitor noise mA, s between readings.
 A, B, MONITOR, READ = 2.5e-7, 8.0e-6, 0.002, 0.05
 
@@ -46,13 +48,14 @@ def size(plane: str, gradient: float) -> float:
 class Magnet:
     """A power supply that ramps; its read-back may be at fault, it never is."""
 
-    def __init__(self, name: str, log: str) -> None:
+    def __init__(self, name: str, log: str, undefined: bool = False) -> None:
         self.name, self.log, self.true, self.wanted, self.shown = name, log, START, START, START
         self.drifted = 0.0
-        limits = {"DRVL": -LIMIT, "DRVH": LIMIT, "LOPR": -LIMIT, "HOPR": LIMIT}
+        how = {"DRVL": -LIMIT, "DRVH": LIMIT, "LOPR": -LIMIT, "HOPR": LIMIT}
+        how |= {} if undefined else {"initial_value": START}
         self.set = builder.aOut(
-            f"{name}:SET", initial_value=START, on_update=self.put, EGU="T/m", PREC=5,
-            always_update=True, blocking=True, **limits,
+            f"{name}:SET", on_update=self.put, EGU="T/m", PREC=5,
+            always_update=True, blocking=True, **how,
         )  # fmt: skip
         self.read = builder.aIn(f"{name}:READ", initial_value=START, EGU="T/m", PREC=5)
         self.truth = builder.aIn(f"{name}:TRUE", initial_value=START, EGU="T/m", PREC=6)
@@ -67,7 +70,8 @@ class Magnet:
 
     def step(self) -> None:
         far = RATE * TICK * (0.01 if on("SLOW") else 1.0)
-        self.true += float(np.clip(self.wanted - self.true, -far, far))
+        wanted = self.wanted + (faults["TRIP"].get() if self is magnets[0] else 0.0)
+        self.true += float(np.clip(wanted - self.true, -far, far))
         self.drifted = self.drifted + 0.02 if on("DRIFT") else 0.0
         if not on("STUCK"):
             self.shown = (-1 if on("SIGN") else 1) * self.true + self.drifted
@@ -127,12 +131,13 @@ def shots() -> None:
     now = time.time()
     for plane, record in sizes.items():
         rms = size(plane, magnets[0].true) * (1 + NOISE * rng.standard_normal())
-        rms = np.nan if on("NAN") or on("DARK") else rms
+        rms = np.nan if on("NAN") or on("DARK") else 9e-4 if on("DIM") else rms
+        rms *= 1.5 if on("LOSSY") else 1.0
         record.set(1e6 * rms, timestamp=now)
         place = PIXEL * (np.arange(PIXELS) - PIXELS / 2) * 1e-6
         counts = 1e3 * np.exp(-0.5 * (place / rms) ** 2) if np.isfinite(rms) else 0 * place
         profiles[plane].set(rng.poisson(counts + 20.0).astype(float), timestamp=now)
-    present.set(0.0 if on("DARK") else 0.25, timestamp=now)
+    present.set(0.0 if on("DARK") or on("DIM") else 0.25, timestamp=now)
     loss.set(5.0 if on("LOSSY") else 0.1, timestamp=now)
 
 
@@ -141,7 +146,7 @@ if __name__ == "__main__":
     dispatcher = asyncio_dispatcher.AsyncioDispatcher()
     builder.SetDeviceName(PREFIX)
     faults = {name: builder.aOut(f"FAULT:{name}", initial_value=0.0) for name in FAULTS}
-    magnets = [Magnet(name, sys.argv[1]) for name in MAGNETS]
+    magnets = [Magnet(name, *sys.argv[1:]) for name in MAGNETS]
     sizes = {p: builder.aIn(f"SCREEN:{p.upper()}", EGU="um", PREC=3) for p in BEAM}
     profiles = {p: builder.WaveformIn(f"SCREEN:PROF{p.upper()}", length=PIXELS) for p in BEAM}
     present = builder.aIn("BEAM", initial_value=0.25, EGU="nC", PREC=3)

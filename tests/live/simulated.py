@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from contextlib import asynccontextmanager
+
 import numpy as np
 
 from beamfit.io.machine import read_scan_machine
-from beamfit.live.devices import Connected, NoSizesError
+from beamfit.live.devices import Connected, NoSizesError, Shots
 from tests.live.faulty import LINE, MACHINE
 
 
@@ -45,7 +47,14 @@ class Simulated:
         if self.dark[0] < self.setting < self.dark[1]:
             raise NoSizesError("no spot", "one")
         size = np.sqrt((40e-6) ** 2 + (90e-6 * (self.setting - 1.0)) ** 2)
-        return {"x": size * (1 + 0.02 * self.rng.standard_normal(5))}
+        return Shots({"x": size * (1 + 0.02 * self.rng.standard_normal(5))}, 1.7e9)
+
+    @asynccontextmanager
+    async def followed(self, value=None):
+        async def left(time):
+            return await self.amiss() if value is None else ""
+
+        yield left
 
     async def amiss(self):
         self.looks += 1

@@ -1,16 +1,23 @@
-"""Which setting to measure next, given the points so far: pure functions of what is known."""
+"""The points of a scan: the fit to them, the setting to measure next, and the file they make."""
 
 from __future__ import annotations
 
+import csv
+import math
 from collections.abc import Mapping, Sequence
+from datetime import UTC, datetime
+from io import StringIO
+from itertools import zip_longest
 from typing import NamedTuple
 
 import numpy as np
 
-from beamfit.errors import InputError
+import beamfit
+from beamfit.errors import InputError, plain
 from beamfit.greybox.problem import padded_length
-from beamfit.io.machine import ScanMachine
+from beamfit.io.machine import Magnet, ScanMachine
 from beamfit.optics.beamline import Beamline
+from beamfit.statistics import POOR_FIT, chi2_probability
 from beamfit.status import Status
 from beamfit.studies.scan.candidates import information_of
 from beamfit.studies.scan.design import best_steps
@@ -19,8 +26,11 @@ from beamfit.studies.scan.scans import QuadScan
 
 # Where a scan begins, in parts of the range of its first magnet.
 BEGIN = (0.1, 0.37, 0.63, 0.9)
-# Points before which a goal is not taken for reached.
-FEWEST = 5
+# Points that each further magnet is moved for at least: a beam has three numbers, so that each
+# magnet by itself tells all of it. Where they disagree the line is wrong.
+FEW = 3
+# Points before which a goal is not taken for reached: three numbers meet five sizes too easily.
+FEWEST = 6
 
 
 class Point(NamedTuple):
@@ -128,7 +138,7 @@ def sharp(fit: EmittanceFit | None, points: Sequence[Point], goal: float) -> boo
     fit : EmittanceFit or None
         To the points.
     points : sequence of Point
-        Fewer than five are never enough: three numbers fit nearly anything else.
+        Fewer than six are never enough.
     goal : float
         Relative error.
     """
@@ -140,6 +150,22 @@ def sharp(fit: EmittanceFit | None, points: Sequence[Point], goal: float) -> boo
         and p.emittance.error <= goal * p.emittance.value
         for p in fit.planes
     )
+
+
+def doubt(fit: EmittanceFit | None, points: Sequence[Point]) -> str:
+    """Sizes that miss the line by far more than their shots scatter, in words; "" if none do.
+
+    The errors of the fit hold it as a scatter of the settings, which real magnets have; a line that
+    is wrong shows in the same way, and there no error holds.
+    """
+    planes = [p for p in (fit.planes if fit else ()) if p.chi2 is not None]
+    chi2, dof = sum(p.chi2 for p in planes), sum(p.dof for p in planes)
+    freedom = sum(point.shots[p.plane].size - 1 for p in planes for point in points)
+    chance = chi2_probability(chi2, dof, max(freedom, 1))
+    if chance is None or chance >= POOR_FIT:
+        return ""
+    found = f"χ² {chi2:.0f} with {dof} degrees of freedom"
+    return f"The sizes miss this line by more than their shots scatter ({found}): is it right?"
 
 
 def first_settings(machine: ScanMachine) -> tuple[float, ...]:
@@ -174,7 +200,9 @@ def next_setting(
     -------
     Next or str
         First settings over the range of the first magnet; then those that tell most, by
-        `beamfit.studies.scan.design`; the middle of the largest gap where nothing can be fitted.
+        `beamfit.studies.scan.design`: of magnets that fewer than three points moved where there are
+        some, since a wrong line shows there alone. The middle of the largest gap where nothing can
+        be fitted.
     """
     limits = {m.name: _within(m.name, m.low, m.high, barred, before) for m in machine.magnets}
     first = machine.magnets[0]
@@ -183,7 +211,9 @@ def next_setting(
     if begin and low <= begin[0] <= high:
         return Next(_clipped(dict(before) | {first.name: begin[0]}, limits), "first settings")
     if fit is not None:
-        steps, stop = best_steps(fit, information_of(fit), limits)
+        new = {name: limits[name] for name in fresh(points, machine)}
+        aim = "D" if new else "emittance"  # of a new magnet whatever it gains
+        steps, stop = best_steps(fit, information_of(fit), new or limits, aim)
         if steps:
             wanted = steps[0].candidate.settings
             return Next(_clipped(dict(before) | wanted, limits), "where it tells most")
@@ -193,6 +223,25 @@ def next_setting(
     place = int(np.argmax(np.diff(gaps)))
     middle = 0.5 * float(gaps[place] + gaps[place + 1])
     return Next(_clipped(dict(before) | {first.name: middle}, limits), "the largest gap")
+
+
+def fresh(points: Sequence[Point], machine: ScanMachine) -> list[str]:
+    """Magnets that fewer than three points have moved.
+
+    Parameters
+    ----------
+    points : sequence of Point
+        What is measured, at least one.
+    machine : ScanMachine
+        Whose magnets they are of.
+    """
+
+    def moved(magnet: Magnet) -> int:
+        settings = [p.settings[magnet.name] for p in points]
+        usual = float(np.median(settings))
+        return sum(abs(value - usual) > 2 * magnet.tolerance for value in settings)
+
+    return [m.name for m in machine.magnets[1:] if moved(m) < FEW]
 
 
 def _within(
@@ -214,3 +263,58 @@ def _clipped(
 ) -> dict[str, float]:
     """Settings within the limits, of as many digits as a person would type."""
     return {name: float(np.clip(float(f"{settings[name]:.6g}"), *limits[name])) for name in limits}
+
+
+def scan_text(points: Sequence[Point], machine: ScanMachine, before: Mapping[str, float]) -> str:
+    """Write the points as CSV that `beamfit.read_quad_scan` reads.
+
+    Parameters
+    ----------
+    points : sequence of Point
+        At least one.
+    machine : ScanMachine
+        Whose magnets and screen they are of.
+    before : mapping of str to float
+        Settings before the scan.
+
+    Returns
+    -------
+    str
+        A row a shot: sizes in um, settings those read back. A shot that lies off makes no mean.
+    """
+    planes = list(points[0].shots)
+    names = [f"{m.name}_{m.unit}" for m in machine.magnets] + [f"size_{p}_um" for p in planes]
+    rows = [[*names, "shot", "screen", "time"]]
+    for point in points:
+        settings = [point.settings[m.name] for m in machine.magnets]
+        last = [machine.screen.name, _written(point.time)]
+        sizes = zip_longest(*(1e6 * point.shots[plane] for plane in planes), fillvalue=math.nan)
+        for number, shot in enumerate(sizes, 1):
+            rows.append([*(f"{value:.9g}" for value in (*settings, *shot)), str(number), *last])
+    table = StringIO()
+    csv.writer(table, lineterminator="\n").writerows(rows)
+    head = (plain(" ".join(line.split())) for line in _head(machine, before))
+    return "\n".join([*head, table.getvalue()])
+
+
+def _head(machine: ScanMachine, before: Mapping[str, float]) -> list[str]:
+    """What a reader of the file wants to know of how it was measured, as comments."""
+    screen = machine.screen
+    variables = ", ".join((screen.sizes or screen.profiles).values())
+    measured = "sizes" if screen.sizes else "Gaussian fits to projections"
+    return [
+        f"# {machine.name}: scan by beamfit {beamfit.__version__}, {_written(None)}",
+        f"# machine file {machine.path}, sha256 {machine.sha256}",
+        f"# lattice {machine.lattice.path}, sha256 {machine.lattice.sha256}",
+        *(
+            f"# {m.name}: set by {m.set}, read back by {m.read}; before the scan "
+            f"{before[m.name]:.9g} {m.unit}"
+            for m in machine.magnets
+        ),
+        f"# screen {screen.name}: {measured} from {variables}, {screen.shots} shots a setting",
+    ]
+
+
+def _written(time: float | None) -> str:
+    at = datetime.now(UTC) if time is None else datetime.fromtimestamp(time, UTC)
+    return at.isoformat(timespec="milliseconds" if time else "seconds")
