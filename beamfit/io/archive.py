@@ -12,7 +12,7 @@ from beamfit.errors import InputError
 from beamfit.io.files import digest, laid_out, read_json, text_lines
 from beamfit.io.json_table import json_sheet
 from beamfit.io.sheet import UNITS, Sheet
-from beamfit.io.table import BINARY, read_sheet
+from beamfit.io.table import is_binary, read_sheet
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -31,7 +31,7 @@ def archive_sheet(
         return read_sheet(path, example)
     if Path(path).suffix.lower() == ".json":
         return _archive_json(path)
-    lines = () if Path(path).suffix.lower() in BINARY else text_lines(path)
+    lines = () if is_binary(path) else text_lines(path)
     head = next((text for text in lines if text.strip()), "")
     if re.fullmatch(r"\d{9,11}(,[^,]+){4}\s*", head):
         return read_sheet(path, ",".join(ARCHIVE), ragged=skip_bad, names=ARCHIVE)

@@ -12,11 +12,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from beamfit.errors import InputError, expect, located
-from beamfit.io import sdds
+from beamfit.io.binary import hdf5_columns, is_sdds, matlab_variables, sdds_columns
 from beamfit.io.cell_units import without_units
 from beamfit.io.commas import with_points
 from beamfit.io.files import Numbered, digest, text_lines
-from beamfit.io.hdf5 import hdf5_columns
 from beamfit.io.headers import (
     HEAD,
     MARKS,
@@ -31,7 +30,6 @@ from beamfit.io.headers import (
     with_units,
 )
 from beamfit.io.json_table import json_sheet
-from beamfit.io.matlab import read_vectors
 from beamfit.io.numeric import check_length, numeric_rows
 from beamfit.io.sheet import Sheet
 
@@ -41,9 +39,8 @@ if TYPE_CHECKING:
 # Rows of a file, and cells of one that is not all plain numbers: each is a text, 200 bytes.
 MOST_ROWS, MOST_WORDS = 12_000_000, 4_000_000
 HDF5 = {".h5", ".hdf5"}
-BINARY = {*HDF5, ".mat"}
-# Text with a header of another program's, by how it begins.
-FOREIGN = {sdds.SIGNATURE: sdds.sdds_head}
+MATLAB = ".mat"
+BINARY = {*HDF5, MATLAB}
 # How Excel says which separator a file has.
 SEPARATOR_LINE = re.compile(r"\s*\"?sep=.\"?\s*$", re.IGNORECASE)
 # In the names of a file without a header: cells that are not read.
@@ -102,9 +99,9 @@ def read_sheet(
     if hasattr(path, "itertuples"):
         return _of_frame(path, most)
     expect(path, str | PathLike, "'scan.csv', or a pandas frame")
-    if (suffix := Path(path).suffix.lower()) in BINARY:
-        return _binary(path, suffix, most)
-    if suffix == ".json":
+    if is_binary(path):
+        return _binary(path, most)
+    if Path(path).suffix.lower() == ".json":
         sheet = json_sheet(path)
         check_length(len(sheet), most, path)
         return sheet
@@ -164,12 +161,7 @@ def _head(
     path: str | PathLike[str], example: str, comments: list[str]
 ) -> tuple[list[str], int, str, Numbered]:
     """Names of the columns, their line, what separates them, and the lines below, numbered."""
-    raw = text_lines(path)
-    first = next(raw, "")
-    whole = itertools.chain([first], raw)
-    for signature, read in FOREIGN.items():
-        if first.startswith(signature):
-            return read(path, enumerate(whole, start=1), comments)
+    whole = text_lines(path)
     head = uncommented(list(itertools.islice(whole, HEAD)))
     title, numbered = header_at(head), enumerate(itertools.chain(head, whole), start=1)
     for line, text in numbered:
@@ -295,13 +287,19 @@ def _check_header(names: list[str], example: str, path: str | PathLike[str], lin
         raise InputError("a table on its side", expected, path=path, line=line)
 
 
-def _binary(path: str | PathLike[str], suffix: str, most: int) -> Sheet:
-    """The datasets of an HDF5 file, or the vectors of a MATLAB file."""
-    comments: tuple[str, ...] = ()
-    if suffix in HDF5:
-        columns, comments = hdf5_columns(path, most, min(most, MOST_WORDS))
+def is_binary(path: str | PathLike[str]) -> bool:
+    """Tell a file that a library reads: HDF5 and MATLAB by the name, SDDS by how it begins."""
+    return Path(path).suffix.lower() in BINARY or is_sdds(path)
+
+
+def _binary(path: str | PathLike[str], most: int) -> Sheet:
+    """Datasets of an HDF5 file, vectors of a MATLAB file, columns of an SDDS file."""
+    suffix, comments = Path(path).suffix.lower(), ()
+    if suffix == MATLAB:
+        columns = matlab_variables(path)
     else:
-        columns = read_vectors(path)
+        read = hdf5_columns if suffix in HDF5 else sdds_columns
+        columns, comments = read(path, most, min(most, MOST_WORDS))
     if not columns:
         expected = "one dataset a column, at the top of the file"
         raise InputError("no datasets", expected, path=path)

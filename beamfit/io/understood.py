@@ -25,7 +25,7 @@ from beamfit.io.ring import read_ring
 from beamfit.io.run import read_run
 from beamfit.io.scan_columns import is_known, is_size
 from beamfit.io.scan_columns import likely_name as scan_name
-from beamfit.io.table import BINARY, header_of
+from beamfit.io.table import header_of, is_binary
 from beamfit.io.toml import read_toml
 from beamfit.studies.scan.scans import QuadScan
 from beamfit.table import Table
@@ -181,7 +181,7 @@ def _kind(path: str | PathLike[str], layout: Layout) -> str:
         return "formulation"
     if is_emittance_gui(path):
         return "scan"
-    tabled = suffix in {*BINARY, ".json"}
+    tabled = suffix == ".json" or is_binary(path)
     names = archive_sheet(path, False).names if tabled else layout.header or header_of(path)
     called = layout.called(names, path)
     names = [called.get(name, name) for name in names]
