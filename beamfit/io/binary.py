@@ -16,7 +16,7 @@ import numpy as np
 
 from beamfit.errors import InputError, plain
 from beamfit.io.files import digest_now, first_bytes, read_bytes
-from beamfit.io.headers import known_unit, named, plain_unit, spelled, unit_at_end
+from beamfit.io.headers import SETTINGS, known_unit, named, plain_unit, spelled, unit_at_end
 from beamfit.io.isolated import LARGEST, isolated
 
 # Filters that are part of every HDF5 library: deflate, shuffle, fletcher32, and h5py's own lzf.
@@ -36,6 +36,8 @@ NUMBERS = {
     *(f"{u}int{n}" for u in ("", "u") for n in (8, 16, 32, 64)),
 }
 SDDS = b"SDDS"
+# How the name of a magnet's setting ends; m/s.
+SETTING_ENDS, LIGHT = tuple(f"_{unit}" for unit in SETTINGS), 299792458.0
 # What ends an exponent or an index in a unit, and what begins one: 1/m$a2$n.
 SHIFTS = {"$a": "^", "$b": "", "$n": "", "$e": ""}
 # Values by name, the unit that the file says of each, and its comments.
@@ -97,11 +99,49 @@ def hdf5_content(content: bytes, rows: int, texts: int) -> Columns:
     import h5py
 
     with h5py.File(io.BytesIO(content), "r") as store:
+        if "openPMD" in store.attrs:
+            return _openpmd(store, rows), {}, []
         place = _place(store)
         columns = {name: _column(place, name, rows, texts) for name in _names(place)}
         units = {name: _unit(place[name], name) for name in columns}
         said = [f"{key}: {value}"[:LONGEST_COMMENT] for key, value in store.attrs.items()]
     return columns, units, said
+
+
+def _openpmd(store: Any, rows: int) -> dict[str, Sequence[Any]]:
+    """A row for each group of particles: rms sizes, mean momentum, settings in attributes."""
+    beams: list[Any] = []
+    store.visititems(lambda _, held: beams.append(held) if _is_beam(held) else None)
+    lines = [_beam_row(beam, rows) for beam in beams]
+    return {name: [row.get(name, "") for row in lines] for name in (lines[0] if lines else ())}
+
+
+def _is_beam(held: Any) -> bool:
+    return hasattr(held, "keys") and {"position", "momentum"} <= set(held)
+
+
+def _beam_row(beam: Any, rows: int) -> dict[str, Any]:
+    place, momentum = beam["position"], [_record(beam["momentum"], k, rows) for k in "xyz"]
+    weight = _record(beam, "weight", rows) if "weight" in beam else np.ones(1)
+    said = {**beam.parent.attrs, **beam.attrs}
+    row = {name: float(v) for name, v in said.items() if name.endswith(SETTING_ENDS)}
+    if (name := said.get("latticeElementName")) is not None or not row:
+        row["screen"] = name.decode() if isinstance(name, bytes) else name or beam.parent.name[1:]
+    for plane in "xy":
+        values, shares = np.broadcast_arrays(_record(place, plane, rows), weight)
+        middle = np.average(values, weights=shares)
+        row[f"size_{plane}_m"] = math.sqrt(np.average((values - middle) ** 2, weights=shares))
+    row["momentum_MeV"] = float(np.mean(np.linalg.norm(np.broadcast_arrays(*momentum), axis=0)))
+    row["momentum_MeV"] *= LIGHT / 1.602176634e-13
+    return row
+
+
+def _record(group: Any, name: str, rows: int) -> np.ndarray:
+    """The numbers of an openPMD record in SI; one that is the same for all has it as attribute."""
+    record = group[name]
+    constant = hasattr(record, "keys")
+    values = record.attrs["value"] if constant else _column(group, name, rows, 0)
+    return np.atleast_1d(np.asarray(values, float)) * float(record.attrs.get("unitSI", 1.0))
 
 
 def _place(store: Any) -> Any:
