@@ -30,15 +30,12 @@ from beamfit.errors import InputError
 from beamfit.greybox.mlp import dense
 from beamfit.io import isolated
 from beamfit.io.emittance_gui import read_emittance_gui
-from beamfit.io.formulation import read_formulation, read_numbers
+from beamfit.io.formulation import read_formulation, read_network, read_numbers
 from beamfit.io.line import read_lattice
-from beamfit.io.measurement import read_quad_scan
-from beamfit.io.network import read_network
-from beamfit.io.result import read_fitted_beams
-from beamfit.io.ring import read_ring
-from beamfit.io.ring_tables import read_twiss
+from beamfit.io.result import load_fit, read_fitted_beams, save_fit
+from beamfit.io.ring import read_ring, read_twiss
 from beamfit.io.run import read_run
-from beamfit.io.saved import load_fit, save_fit
+from beamfit.io.scan import read_quad_scan
 from beamfit.language.check import check_document
 from beamfit.language.network import format_network
 from beamfit.sampling.ensemble import draw

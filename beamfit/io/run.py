@@ -9,9 +9,18 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from beamfit.errors import InputError
-from beamfit.io.columns import Columns, arranged, layout_of
+from beamfit.io.columns import (
+    DATE,
+    Column,
+    Columns,
+    Sheet,
+    arranged,
+    columns_of,
+    layout_of,
+    left_aside,
+    left_out,
+)
 from beamfit.io.files import name_of
-from beamfit.io.sheet import DATE, Column, Sheet, columns_of, left_aside, left_out
 from beamfit.io.table import read_sheet
 from beamfit.studies.response.record import Run
 

@@ -1,4 +1,4 @@
-"""Sheets of named columns from text, HDF5 and MATLAB files, and data frames."""
+"""Sheets of named columns from text, JSON, HDF5, MATLAB and SDDS files, and data frames."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from collections.abc import Sequence
 from dataclasses import replace
 from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from beamfit.errors import InputError, expect, located
 from beamfit.io.binary import hdf5_columns, is_sdds, matlab_variables, sdds_columns
-from beamfit.io.cell_units import without_units
-from beamfit.io.commas import with_points
-from beamfit.io.files import Numbered, digest, text_lines
+from beamfit.io.cells import check_length, numeric_rows, with_points, without_units
+from beamfit.io.columns import UNITS, Sheet
+from beamfit.io.files import Numbered, digest, laid_out, read_json, text_lines
 from beamfit.io.headers import (
     HEAD,
     MARKS,
@@ -29,9 +29,6 @@ from beamfit.io.headers import (
     uncommented,
     with_units,
 )
-from beamfit.io.json_table import json_sheet
-from beamfit.io.numeric import check_length, numeric_rows
-from beamfit.io.sheet import Sheet
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -311,3 +308,138 @@ def _binary(path: str | PathLike[str], most: int) -> Sheet:
             expected = f"{usual}, as in '{like}': datasets of equal lengths"
             raise InputError(f"{len(column)} readings", expected, path=path, column=name)
     return Sheet(path, tuple(columns), list(columns.values()), None, None, comments, digest(path))
+
+
+EXPECTED = 'columns of equal lengths, {"name": [...]}, or one object a row, [{"name": ...}]'
+
+
+# Scans as PyEmittance saves them (pyemittance_data_….json), and lcls-tools and slac-measurements
+# (QuadScanEmittanceResult): each plane's own settings and sizes in m. The setting's unit is the
+# magnet's own, and only a person knows it: --columns 'quadvals=Q525_kG'.
+BY_LETTER = {"setting": "quadvals{}", "size": "beamsizes{}", "error": "beamsizeserr{}"}
+BY_ORDER = {"setting": "quadrupole_pv_values", "size": "rms_beamsizes"}
+
+
+def _planes(content: dict[str, Any]) -> dict[str, list[Any]] | None:
+    """Columns of a scan whose planes were measured at settings of their own; None if it is none."""
+    if {BY_LETTER["setting"].format("x"), BY_LETTER["size"].format("x")} <= set(content):
+        parts = [{k: content.get(n.format(p)) for k, n in BY_LETTER.items()} for p in "xy"]
+    elif set(BY_ORDER.values()) <= set(content):
+        parts = [{k: _part(content[n], i) for k, n in BY_ORDER.items()} for i in range(2)]
+    else:
+        return None
+    name = (BY_LETTER if "beamsizesx" in content else BY_ORDER)["setting"].format("")
+    columns: dict[str, list[Any]] = {name: []}
+    for plane, part in zip("xy", parts, strict=True):
+        settings = part.pop("setting") or []
+        start = len(columns[name])
+        columns[name] += settings
+        for kind, values in part.items():
+            if values:
+                column = f"size_{plane}_m" if kind == "size" else f"size_{plane}_error_m"
+                columns[column] = [None] * start + list(values)
+    length = len(columns[name])
+    return {n: values + [None] * (length - len(values)) for n, values in columns.items()}
+
+
+def _scan_of(path: str | PathLike[str], content: dict[str, Any]) -> dict[str, list[Any]] | None:
+    with laid_out(path, "another JSON file", EXPECTED):
+        return _planes(content)
+
+
+def _part(values: Any, i: int) -> Any:
+    """One plane's part of a list, or of an object by number."""
+    return values.get(str(i)) if isinstance(values, dict) else values[i]
+
+
+def json_sheet(path: str | PathLike[str], content: Any = None) -> Sheet:
+    """The columns of a JSON file.
+
+    Parameters
+    ----------
+    path : str or path
+        The file: an object of lists, or of objects by row as pandas has it, or a list of rows.
+    content : optional
+        What it says, if that was read.
+
+    Returns
+    -------
+    Sheet
+        With a text a cell; null is a blank one.
+
+    Raises
+    ------
+    InputError
+        If it is anything else.
+
+    Examples
+    --------
+    >>> import tempfile, pathlib
+    >>> file = pathlib.Path(tempfile.mkdtemp()) / "a.json"
+    >>> _ = file.write_text('{"time_s": [0, 60], "beam_current_mA": [200.5, null]}')
+    >>> json_sheet(file)["beam_current_mA"]
+    ['200.5', '']
+    """
+    content = read_json(path, "another JSON file", EXPECTED) if content is None else content
+    if isinstance(content, list) and all(isinstance(row, dict) for row in content):
+        names = dict.fromkeys(name for row in content for name in row)
+        columns = {name: [row.get(name) for row in content] for name in names}
+    elif isinstance(content, dict) and (columns := _scan_of(path, content)) is not None:
+        pass
+    elif isinstance(content, dict):
+        columns = {n: list(c.values()) if isinstance(c, dict) else c for n, c in content.items()}
+    else:
+        columns = {}
+    whole = all(isinstance(column, list) for column in columns.values())
+    if not columns or not whole or len({len(column) for column in columns.values()}) > 1:
+        raise InputError("another JSON file", EXPECTED, path=path)
+    cells = [["" if v is None else str(v).strip() for v in column] for column in columns.values()]
+    return Sheet(path, tuple(columns), cells, None, None, (), digest(path))
+
+
+ARCHIVE = ("secs", "val", "severity", "status", "nanos")
+
+
+def archive_sheet(
+    path: str | PathLike[str] | DataFrame, skip_bad: bool, names: Sequence[str] | None = None
+) -> Sheet:
+    """The columns of a file, an archive's by their own names, or by those of a file without."""
+    example = "time_s,beam_current_mA"
+    if names is not None:
+        return read_sheet(path, example, ragged=skip_bad, names=names)
+    if not isinstance(path, (str, PathLike)):
+        return read_sheet(path, example)
+    if Path(path).suffix.lower() == ".json":
+        return _archive_json(path)
+    lines = () if is_binary(path) else text_lines(path)
+    head = next((text for text in lines if text.strip()), "")
+    if re.fullmatch(r"\d{9,11}(,[^,]+){4}\s*", head):
+        return read_sheet(path, ",".join(ARCHIVE), ragged=skip_bad, names=ARCHIVE)
+    return read_sheet(path, example, ragged=skip_bad)
+
+
+def _is_archive(channels: object) -> bool:
+    """Whether a JSON file holds channels with their data, and not columns."""
+    lists = isinstance(channels, list)
+    return lists and all(not isinstance(c, dict) or {"meta", "data"} & set(c) for c in channels)
+
+
+def _archive_json(path: str | PathLike[str]) -> Sheet:
+    """Of the EPICS Archiver Appliance: one channel with its data."""
+    expected = 'one channel of the EPICS Archiver Appliance: [{"meta": …, "data": [{"secs": …}]}]'
+    channels = read_json(path, "another JSON file", expected)
+    if not _is_archive(channels):
+        return json_sheet(path, channels)
+    with laid_out(path, "another JSON file", expected):
+        if len(channels) != 1:
+            expected = "one, of the beam current: a file for each"
+            raise InputError(f"{len(channels)} channels", expected)
+        meta, data = channels[0].get("meta", {}), channels[0]["data"]
+        rows = [[str(one["secs"]), str(one["nanos"]), str(one["val"])] for one in data]
+    if not rows:
+        raise InputError("no readings", "two or more", path=path)
+    unit = meta.get("EGU", "") if isinstance(meta, dict) else ""
+    called = f"val_{unit}" if unit in UNITS["current"] else "val"
+    said = tuple(f"{key}: {value}" for key, value in meta.items()) if meta else ()
+    cells = list(zip(*rows, strict=True))
+    return Sheet(path, ("secs", "nanos", called), cells, None, None, said, digest(path))

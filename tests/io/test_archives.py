@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from beamfit.errors import InputError
+from beamfit.io.check import understand
 from beamfit.io.decay_record import read_decay_record, read_lifetime_input, read_lifetimes
-from beamfit.io.measurement import read_quad_scan
-from beamfit.io.understood import understand
+from beamfit.io.scan import read_quad_scan
 from beamfit.studies.decay.record import LifetimeTable
 
 START = 1709290800.25  # 2024-03-01T11:00:00.25 UTC

@@ -12,12 +12,10 @@ import pytest
 import beamfit
 from beamfit.errors import InputError
 from beamfit.io import files, isolated
-from beamfit.io.archive import archive_sheet
 from beamfit.io.binary import hdf5_content
 from beamfit.io.files import digest, read_json
-from beamfit.io.result import read_fitted_beams
-from beamfit.io.saved import load_fit
-from beamfit.io.table import read_sheet
+from beamfit.io.result import load_fit, read_fitted_beams
+from beamfit.io.table import archive_sheet, read_sheet
 from beamfit.io.toml import read_toml
 
 DECAY = "time_s,beam_current_mA\n0,100\n60,99\n120,98\n"

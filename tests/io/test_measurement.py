@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from beamfit.errors import InputError
-from beamfit.io.measurement import read_quad_scan
+from beamfit.io.scan import read_quad_scan
 from beamfit.noise.shots import evened
 from tests.io.forked import in_forks  # noqa: F401
 

@@ -15,7 +15,7 @@ import scipy.io
 
 from beamfit.errors import InputError
 from beamfit.io.decay_record import read_decay_record
-from beamfit.io.measurement import read_quad_scan
+from beamfit.io.scan import read_quad_scan
 from tests.io.forked import in_forks  # noqa: F401
 
 pandas = pytest.importorskip("pandas")

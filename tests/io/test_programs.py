@@ -9,10 +9,10 @@ import pytest
 import scipy.io
 
 from beamfit.errors import InputError
+from beamfit.io.check import understand
 from beamfit.io.decay_record import read_decay_record
-from beamfit.io.measurement import read_quad_scan
+from beamfit.io.scan import read_quad_scan
 from beamfit.io.table import read_sheet
-from beamfit.io.understood import understand
 from tests.io.forked import in_forks  # noqa: F401
 from tests.io.test_mutated_files import mutated
 

@@ -11,13 +11,27 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from beamfit.errors import InputError, located
-from beamfit.io.columns import Columns, arranged, layout_of
+from beamfit.io.columns import (
+    UNITS,
+    Column,
+    Columns,
+    Sheet,
+    arranged,
+    layout_of,
+    left_aside,
+    left_out,
+)
 from beamfit.io.emittance_gui import is_emittance_gui, read_emittance_gui
 from beamfit.io.files import name_of
 from beamfit.io.headers import SETTINGS
-from beamfit.io.scan_columns import ENERGIES, PERCENT, column_notes, is_scatter, scan_columns
-from beamfit.io.scan_comments import comment_notes
-from beamfit.io.sheet import UNITS, Column, Sheet, left_aside, left_out
+from beamfit.io.scan_columns import (
+    ENERGIES,
+    PERCENT,
+    column_notes,
+    comment_notes,
+    is_scatter,
+    scan_columns,
+)
 from beamfit.io.shots import average_shots
 from beamfit.io.table import read_sheet
 from beamfit.studies.scan.scans import POSSIBLE, USUAL, QuadScan, first_unusable, middle
