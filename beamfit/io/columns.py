@@ -371,13 +371,13 @@ FORMAT = "beamfit-layout-1"
 # Layouts that come with the package, by name.
 SHIPPED = Path(__file__).with_name("layouts")
 ORDERS = (DAY_FIRST, MONTH_FIRST)
+NAMES = "a list of names in quotes"
 EXAMPLE = "'xrms=size_x_um, QUAD:BACT=Q525_kG', or a layout (.toml)"
 KEYS = {
-    "format": Key(kind=TEXT),
     "columns": Key("columns", kind=TABLE, default={}),
-    "ignore": Key("ignore", kind=LIST, default=[]),
-    "dates": Key("dates", kind=TEXT, default=""),
-    "header": Key("header", kind=LIST, default=[]),
+    "ignore": Key("ignore", kind=LIST, default=[], said=NAMES, each=str),
+    "dates": Key("dates", kind=TEXT, default="", among=ORDERS),
+    "header": Key("header", kind=LIST, default=[], said=NAMES, each=str),
 }
 
 
@@ -511,15 +511,8 @@ def _item(item: str) -> Layout:
 
 
 def _read(path: str | PathLike[str]) -> Layout:
-    section = read_toml(path, "a layout")
+    section = read_toml(path, "a layout", FORMAT)
     said = section.values(KEYS)
-    if section.table["format"] != FORMAT:
-        raise section.error(f"'{section.table['format']}'", f'format = "{FORMAT}"', "format")
-    for key in ("ignore", "header"):
-        if not all(isinstance(value, str) for value in said[key]):
-            raise section.error(f"{key} = {said[key]}", "a list of names in quotes", key)
-    if said["dates"] not in ("", *ORDERS):
-        raise section.error(f"'{said['dates']}'", nearest(said["dates"], list(ORDERS)), "dates")
     for header, name in said["columns"].items():
         if not (isinstance(name, str) and name.strip()):
             expected = 'the name that beamfit has for it, such as "size_x_um"'

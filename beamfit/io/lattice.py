@@ -20,7 +20,7 @@ from beamfit.errors import InputError, nearest
 from beamfit.io.columns import Sheet, columns_of
 from beamfit.io.files import name_of
 from beamfit.io.table import read_sheet
-from beamfit.io.toml import FLAG, LIST, TABLE, TEXT, Key, Section, is_number, read_toml
+from beamfit.io.toml import FLAG, LIST, NUMBER, TABLE, TEXT, Key, Section, is_number, read_toml
 from beamfit.particles import ENERGY_KEYS, REST_ENERGY, expected_energy, total_energy
 from beamfit.studies.scan.names import check_names
 from beamfit.studies.scan.scans import QuadScan
@@ -41,6 +41,7 @@ STRENGTHS = {
 LINE, POLYNOMIAL = {"slope", "intercept"}, {"gradient_polynomial_T_per_m"}
 TABLE_KEYS = ("gradient_table", "gradient_table_file")
 CALIBRATIONS = (LINE, POLYNOMIAL, *({key} for key in TABLE_KEYS))
+POWERS = "at least two numbers c0, c1, ... in T/m, T/(m A), ..."
 NAME, OPTIONAL = Key(kind=TEXT), Key(default=None)
 LENGTH = Key(low=0.0, said="a positive number")
 EDGE = Key(default=0.0, low=-90.0, high=90.0, said="an angle below 90 degrees")
@@ -52,7 +53,7 @@ ELEMENTS: dict[str, dict[str, Key]] = {
         **dict.fromkeys(("current_A", "integrated_gradient_kG"), OPTIONAL),
         **dict.fromkeys(("gradient_T_per_m", "k1_per_m2"), OPTIONAL),
         **dict.fromkeys(("slope", "intercept"), OPTIONAL),
-        "gradient_polynomial_T_per_m": Key(kind=LIST, default=None),
+        "gradient_polynomial_T_per_m": Key(kind=LIST, default=None, said=POWERS, each=NUMBER),
         "signed_intercept": Key(kind=FLAG, default=False),
         "gradient_table": Key(kind=LIST, default=None),
         "gradient_table_file": Key(kind=TEXT, default=None),
@@ -68,7 +69,7 @@ ELEMENTS: dict[str, dict[str, Key]] = {
         "name": NAME,
         "radius_m": Key(low=0.0, said="a positive number; a negative angle bends the other way"),
         "angle_deg": Key(low=-360.0, high=360.0, said="an angle below 360 degrees"),
-        "bend_plane": NAME,
+        "bend_plane": Key(kind=TEXT, among=("x", "y")),
         "entrance_edge_deg": EDGE,
         "exit_edge_deg": EDGE,
         "energy_offset": Key(
@@ -85,12 +86,11 @@ ELEMENTS: dict[str, dict[str, Key]] = {
     },
 }
 TOP = {
-    "format": NAME,
     **dict.fromkeys(ENERGY_KEYS, OPTIONAL),
     "element": Key(kind=LIST),
     "name": Key("name", kind=TEXT, default=""),
     "source": Key(kind=TEXT, default=""),
-    "particle": Key("particle", kind=TEXT, default="electron"),
+    "particle": Key("particle", kind=TEXT, default="electron", among=tuple(REST_ENERGY)),
     "energy_spread": Key(
         "energy_spread",
         default=0.0,
@@ -186,13 +186,8 @@ def read_toml_lattice(path: str | PathLike[str]) -> LatticeFile:
     InputError
         If it cannot be used, naming the line of the key.
     """
-    top = read_toml(path, "a lattice")
-    if (found := top.table.get("format")) != FORMAT:
-        raise top.error(f"format {found!r}"[:80], f'format = "{FORMAT}"', "format")
+    top = read_toml(path, "a lattice", FORMAT)
     said = top.values(TOP)
-    if said["particle"] not in REST_ENERGY:
-        known = nearest(said["particle"], list(REST_ENERGY))
-        raise top.error(f"particle '{said['particle']}'", known, "particle")
     energy = _energy(top, said["particle"])
     sections = top.sections("element")
     elements = tuple(_element(section, i) for i, section in enumerate(sections, 1))
@@ -238,9 +233,6 @@ def _element(section: Section, number: int) -> Mapping[str, Any]:
     section.values(ELEMENTS[kind] | {"type": NAME})
     if settings := _settings(kind):
         _check_strength(section, section.one_of(key for key, _ in settings))
-    if "bend_plane" in section.table and section.table["bend_plane"] not in ("x", "y"):
-        found = f"bend_plane '{section.table['bend_plane']}'"
-        raise section.error(found, "x or y", "bend_plane")
     if section.table.get("angle_deg") == 0:
         raise section.error("a dipole that does not bend", "a drift", "angle_deg")
     table = {"name": f"{kind}{number}"} | section.table
@@ -264,10 +256,8 @@ def _check_strength(section: Section, setting: str) -> None:
         expected = "both slope and intercept, gradient_polynomial_T_per_m, or one gradient table"
         raise section.error(found, expected, setting)
     for key in given & POLYNOMIAL:
-        numbers = section.table[key]
-        if len(numbers) < 2 or not all(map(is_number, numbers)):
-            expected = "at least two numbers c0, c1, ... in T/m, T/(m A), ..."
-            raise section.error(f"{numbers!r}"[:80], expected, key)
+        if len(numbers := section.table[key]) < 2:
+            raise section.error(f"{numbers!r}"[:80], POWERS, key)
 
 
 def _check_unique(elements: tuple[Mapping[str, Any], ...], sections: list[Section]) -> None:

@@ -36,14 +36,14 @@ MAGNET = {
     "tolerance": Key("tolerance", **POSITIVE),
     "settle_s": Key("settle", low=-1e-9, high=3600.0, said="a time of zero or more"),
     "timeout_s": Key("timeout", default=60.0, **WAIT),
-    "approach": Key("approach", kind=TEXT, default="either"),
+    "approach": Key("approach", kind=TEXT, default="either", among=APPROACHES),
     "approach_by": Key("approach_by", default=0.0, low=-1e-12, said="zero or more"),
     "degauss": Key("degauss", kind=LIST, default=()),
 }
 SCREEN = {
     "name": Key("name", kind=TEXT, default=None),
     **{name: Key(name, kind=TEXT, default=None) for name in ("x", "y", "profile_x", "profile_y")},
-    "unit": Key("unit", kind=TEXT, default="um"),
+    "unit": Key("unit", kind=TEXT, default="um", among=tuple(LENGTHS)),
     "pixel_um": Key("pixel", 1e-6, default=None, **POSITIVE),
     "shots": Key("shots", default=5, low=1.0, high=1001.0, said="2 to 1000 shots"),
     "timeout_s": Key("timeout", default=10.0, **WAIT),
@@ -62,7 +62,6 @@ SCAN = {
     "restore_s": Key("restore", default=60.0, **WAIT),
 }
 TOP = {
-    "format": PV,
     "name": Key("name", kind=TEXT, default=""),
     "lattice": Key("lattice", kind=TEXT, default=None),
     "timeout_s": Key("timeout", default=5.0, **WAIT),
@@ -231,9 +230,7 @@ def read_scan_machine(path: str | PathLike[str]) -> ScanMachine:
 
 def read_machine(path: str | PathLike[str]) -> tuple[Section, dict[str, Any]]:
     """A machine file, and what stands at its top."""
-    top = read_toml(path, "a machine")
-    if (found := top.table.get("format")) != FORMAT:
-        raise top.error(f"format {found!r}"[:80], f'format = "{FORMAT}"', "format")
+    top = read_toml(path, "a machine", FORMAT)
     return top, top.values(TOP)
 
 
@@ -262,9 +259,6 @@ def _magnet(section: Section, lattice: LatticeFile) -> Magnet:
     if not magnet.tolerance < 0.1 * (magnet.high - magnet.low):
         expected = "less than a tenth of the range; is it in the unit of the settings?"
         raise section.error(f"tolerance {magnet.tolerance:g}", expected, "tolerance")
-    if magnet.approach not in APPROACHES:
-        expected = nearest(magnet.approach, APPROACHES)
-        raise section.error(f"approach '{magnet.approach}'", expected, "approach")
     if magnet.approach != "either" and not magnet.approach_by > 0:
         expected = "how far beyond a setting to go first, in the unit of the settings"
         raise section.error(f"approach from {magnet.approach}", expected, "approach_by")
@@ -296,8 +290,6 @@ def _screen(section: Section, lattice: LatticeFile) -> Profiler:
     if bool(sizes) == bool(profiles):
         found = "sizes and projections" if sizes else "no sizes"
         raise section.error(found, "x and y, or profile_x and profile_y", "x")
-    if said["unit"] not in LENGTHS:
-        raise section.error(f"unit '{said['unit']}'", "um, mm or m", "unit")
     if profiles and said["pixel"] is None:
         raise section.error("projections without a scale", "pixel_um = ...", "pixel_um")
     name = said["name"] or lattice.default_screen
