@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from os import PathLike
@@ -112,33 +112,41 @@ def understand(
     ('record', '27 over 8.81 h')
     """
     layout = layout_of(columns)
-    kind, notes = _kind(path, layout), ()
+    kind = _kind(path, layout)
     reading = {"columns": layout or None, "ignore": ignore, "skip_bad": skip_bad}
+    parts = {"use": use, "energy": energy} if Path(path).suffix.lower() in FOREIGN else {}
+    read, told = {
+        "scan": (_scan_of, of_scan),
+        "lattice": (lambda path, **_: read_lattice(path, **parts), of_lattice),
+        "record": (read_lifetime_input, of_record),
+        "run": (read_run, of_run),
+        "ring": (lambda path, **_: read_ring(path), lambda ring: of_ring(path, ring)),
+        "formulation": (_formulation_of, of_formulation),
+    }[kind]
+    content = read(path, **reading)
+    facts, notes = told(content), tuple(getattr(content, "notes", ()))
     if kind == "scan":
-        gui = read_emittance_gui(path) if is_emittance_gui(path) else None
-        content = read_quad_scan(path, **reading) if gui is None else gui.scan()
-        told, notes = of_scan(content), (*content.notes, *_questions(content))
-        if gui is not None:
-            told.append(Fact("size methods", ", ".join(gui.scans), list(gui.scans)))
-    elif kind == "lattice":
-        foreign = Path(path).suffix.lower() in FOREIGN
-        content = read_lattice(path, use=use, energy=energy) if foreign else read_lattice(path)
-        told = of_lattice(content)
-    elif kind == "record":
-        content = read_lifetime_input(path, **reading)
-        told, notes = of_record(content), content.notes
-    elif kind == "run":
-        content = read_run(path, **reading)
-        told, notes = of_run(content), content.notes
-    elif kind == "formulation":
-        from beamfit.io.formulation import read_formulation  # scipy
+        from beamfit.studies.scan.questions import of_sizes
 
-        content = read_formulation(path)
-        told = of_formulation(content)
-    else:
-        content = read_ring(path)
-        told = of_ring(path, content)
-    return Understood(str(path), kind, digest(path), tuple(told), notes, content)
+        notes += tuple(of_sizes(content))
+        if is_emittance_gui(path):
+            methods = list(read_emittance_gui(path).scans)
+            facts.append(Fact("size methods", ", ".join(methods), methods))
+    return Understood(str(path), kind, digest(path), tuple(facts), notes, content)
+
+
+def _scan_of(path: str | PathLike[str], **reading: Any) -> QuadScan:
+    return (
+        read_emittance_gui(path).scan()
+        if is_emittance_gui(path)
+        else read_quad_scan(path, **reading)
+    )
+
+
+def _formulation_of(path: str | PathLike[str], **_: Any) -> Document:
+    from beamfit.io.formulation import read_formulation  # scipy
+
+    return read_formulation(path)
 
 
 def proposed_layout(path: str | PathLike[str], columns: Columns = None) -> str | None:
@@ -202,16 +210,8 @@ def _kind(path: str | PathLike[str], layout: Layout) -> str:
     return "record" if archived or current else "scan"
 
 
-def _questions(scan: QuadScan) -> tuple[str, ...]:
-    from beamfit.studies.scan.questions import of_sizes
-
-    return tuple(of_sizes(scan))
-
-
 SAID = {"A": "A", "kG": "kG integrated gradient", "T_per_m": "T/m", "k1": "1/m² (k1)"}
 SAID |= {"k1l": "1/m (k1l)"}
-CONDITIONS = {"rf_voltage": "V", "scraper_y": "m", "pressure": "Pa", "bunches": ""}
-CONDITIONS |= {"bunch_length": "m"}
 INFERRED = "none: the noise is inferred from the residuals"
 # Magnets of a lattice that are told one by one.
 MOST_MAGNETS = 20
@@ -225,6 +225,11 @@ class Fact(NamedTuple):
     value: Any
 
 
+def _ranges(columns: Iterable[tuple[str, np.ndarray | None, str]]) -> list[Fact]:
+    """From the smallest to the largest of each column that there is."""
+    return [_range(label, values, unit) for label, values, unit in columns if values is not None]
+
+
 def _range(label: str, values: np.ndarray, unit: str = "", after: str = "", **more: Any) -> Fact:
     """From the smallest to the largest, lengths in a unit of their size, and what is said more."""
     low, high = float(np.nanmin(values)), float(np.nanmax(values))
@@ -234,9 +239,9 @@ def _range(label: str, values: np.ndarray, unit: str = "", after: str = "", **mo
     return Fact(label, f"{words} {SAID.get(said, said)}".strip() + after, value)
 
 
-def _counted(label: str, rows: Mapping[str, int]) -> Fact:
-    """How many rows there are of each."""
-    return Fact(label, ", ".join(f"{name} ({n} rows)" for name, n in rows.items()), dict(rows))
+def _counted(label: str, rows: Mapping[str, int], form: str = "{0} ({1} rows)") -> Fact:
+    """How many there are of each."""
+    return Fact(label, ", ".join(form.format(name, n) for name, n in rows.items()), dict(rows))
 
 
 def of_scan(scan: QuadScan) -> list[Fact]:
@@ -245,54 +250,36 @@ def of_scan(scan: QuadScan) -> list[Fact]:
     facts.append(_counted("planes", {p: int(np.isfinite(scan.size[p]).sum()) for p in scan.planes}))
     for name, values in scan.settings.items():
         distinct = len(np.unique(values))
-        after = f", {distinct} setting" + ("s" if distinct > 1 else "")
+        after = f", {distinct} setting" + "s" * (distinct > 1)
         facts.append(_range(f"magnet {name}", values, scan.units[name], after, settings=distinct))
-    for p in scan.planes:
-        facts += _of_plane(scan, p)
+    for plane in scan.planes:
+        column = scan.columns.get(key := f"size_{plane}", key)
+        sizes = scan.size[plane]
+        facts.append(_range(f"size {plane}", sizes, "m", f", column {column}", column=column))
+        words, value = INFERRED, None
+        if plane in scan.error:
+            share = float(np.nanmedian(scan.error[plane] / sizes))
+            words = f"{100 * share:.2g} % of the size in the middle, from {scan.error_source}"
+            value = {"median_relative": share, "source": scan.error_source}
+        facts.append(Fact(f"errors {plane}", words, value))
     if scan.transfer is not None:
         facts.append(Fact("matrices", "R11 and R12 of each row: no lattice is needed", True))
-    if scan.energy is not None:
-        kind = scan.energy_kind
+    if (kind := scan.energy_kind) and scan.energy is not None:
         after = ", momentum p c" if kind == "momentum" else f", {kind} energy"
         facts.append(_range("energy", scan.energy, "MeV", after, kind=kind))
-    if scan.screen is not None:
-        facts.append(_counted("screens", Counter(scan.screen)))
-    if scan.slice is not None:
-        facts.append(_counted("slices", {name: scan.slice.count(name) for name in scan.slices}))
-    further = {"resolution": "m", "energy_spread": "", "shots": ""}
-    return facts + _known(scan, further)
-
-
-def _known(holder: Any, units: Mapping[str, str]) -> list[Fact]:
-    """The ranges of those columns that there are."""
-    known = {name: getattr(holder, name) for name in units}
-    return [
-        _range(name.replace("_", " "), values, units[name])
-        for name, values in known.items()
-        if values is not None
-    ]
-
-
-def _of_plane(scan: QuadScan, plane: str) -> list[Fact]:
-    """Range and column of the sizes of one plane, and where their errors are from."""
-    key = f"size_{plane}"
-    column = scan.columns.get(key, key)
-    size = _range(f"size {plane}", scan.size[plane], "m", f", column {column}", column=column)
-    if plane not in scan.error:
-        return [size, Fact(f"errors {plane}", INFERRED, None)]
-    share = float(np.nanmedian(scan.error[plane] / scan.size[plane]))
-    words = f"{100 * share:.2g} % of the size in the middle, from {scan.error_source}"
-    value = {"median_relative": share, "source": scan.error_source}
-    return [size, Fact(f"errors {plane}", words, value)]
+    for label, names in (("screens", scan.screen), ("slices", scan.slice)):
+        facts += [] if names is None else [_counted(label, Counter(names))]
+    further = ("resolution", "m"), ("energy_spread", ""), ("shots", "")
+    return facts + _ranges((n.replace("_", " "), getattr(scan, n), unit) for n, unit in further)
 
 
 def of_lattice(file: LatticeFile) -> list[Fact]:
     """Energy, elements, magnets and screens of a lattice."""
-    kinds = Counter(element["type"] for element in file.elements)
     length = sum(map(_length, file.elements))
-    listed = ", ".join(f"{n} {kind.replace('_', ' ')}" for kind, n in kinds.items())
     energy = {"value": file.energy, "unit": "MeV", "particle": file.particle}
     plural = "" if file.particle.endswith("-") else "s"
+    kinds = Counter(element["type"] for element in file.elements)
+    listed = ", ".join(f"{n} {kind.replace('_', ' ')}" for kind, n in kinds.items())
     facts = [
         Fact("name", file.name, file.name),
         Fact("energy", f"{file.energy:.6g} MeV total, {file.particle}{plural}", energy),
@@ -305,8 +292,7 @@ def of_lattice(file: LatticeFile) -> list[Fact]:
     if (more := len(magnets) - MOST_MAGNETS) > 0:
         facts.append(Fact("further magnets", f"{more}, set as these", more))
     screens = [e["name"] for e in file.elements if e["type"] == "screen"]
-    words = ", ".join(screens) or "none: sizes need one"
-    facts.append(Fact("screens", words, screens))
+    facts.append(Fact("screens", ", ".join(screens) or "none: sizes need one", screens))
     if file.energy_spread:
         facts.append(Fact("energy spread", f"{file.energy_spread:.3g}", file.energy_spread))
     if file.design is not None:
@@ -314,7 +300,7 @@ def of_lattice(file: LatticeFile) -> list[Fact]:
     return facts
 
 
-def _magnet(element: Any, unit: str) -> Fact:
+def _magnet(element: Mapping[str, Any], unit: str) -> Fact:
     """What a magnet is set to where no scan says, and how a current becomes a gradient."""
     key = next(key for key, its in STRENGTHS.items() if its == unit and key in element)
     words = f"{element[key]:g} {SAID[unit]}"
@@ -335,50 +321,38 @@ def _short(value: Any) -> str:
     return f"{value:g}" if isinstance(value, int | float) else str(value)
 
 
-def _length(element: Any) -> float:
+def _length(element: Mapping[str, Any]) -> float:
     """Length of an element along the beam, m."""
     if element["type"] == "sector_dipole":
         return abs(element["radius_m"] * np.radians(element["angle_deg"]))
     return float(element.get("length_m", 0.0))
 
 
-def _of_lifetimes(table: LifetimeTable) -> list[Fact]:
-    errors = "none: the scatter of the points" if table.error is None else "given"
-    return [
-        Fact("lifetimes", str(len(table)), len(table)),
-        _range("lifetime", table.lifetime, "h"),
-        _range("beam current", table.current, "mA"),
-        Fact("errors", errors, table.error is not None),
-    ]
-
-
 def of_record(record: DecayRecord | LifetimeTable) -> list[Fact]:
     """Readings, currents and conditions of a record, and the decays in it."""
     if isinstance(record, LifetimeTable):
-        return _of_lifetimes(record)
+        errors = "none: the scatter of the points" if record.error is None else "given"
+        columns = ("lifetime", record.lifetime, "h"), ("beam current", record.current, "mA")
+        facts = [Fact("lifetimes", str(len(record)), len(record)), *_ranges(columns)]
+        return [*facts, Fact("errors", errors, record.error is not None)]
+    from beamfit.studies.decay.segments import split_record  # scipy, for records alone
+
     hours = record.span / 3600
-    words = f"{len(record)} over {hours:.3g} h"
-    facts = [
-        Fact("readings", words, {"count": len(record), "span_h": hours}),
-        _range("beam current", record.current, "mA"),
-    ]
+    value = {"count": len(record), "span_h": hours}
+    facts = [Fact("readings", f"{len(record)} over {hours:.3g} h", value)]
+    facts += _ranges([("beam current", record.current, "mA"), ("errors", record.error, "mA")])
     if record.error is None:
         facts.append(Fact("errors", INFERRED, None))
-    else:
-        facts.append(_range("errors", record.error, "mA"))
     if record.start is not None:
         began = datetime.fromtimestamp(record.start, UTC).isoformat(timespec="seconds")
         facts.append(Fact("began", began, began))
-    facts += _known(record.conditions, CONDITIONS)
-    from beamfit.studies.decay.segments import split_record  # scipy, for records alone
-
+    units = dict(zip(record.conditions._fields, ("V", "m", "Pa", "", "m"), strict=True))
+    columns = record.conditions._asdict().items()
+    facts += _ranges((name.replace("_", " "), values, units[name]) for name, values in columns)
     split = split_record(record)
-    kinds = Counter(event.kind for event in split.events)
-    cut = ", ".join(f"{n} × {kind}" for kind, n in kinds.items()) or "nothing cut away"
-    count = len(split.segments)
-    value = {"count": count, "events": dict(kinds)}
-    facts.append(Fact("decays", f"{count} ({cut})", value))
-    return facts
+    kinds, count = Counter(event.kind for event in split.events), len(split.segments)
+    cut = _counted("", kinds, "{1} × {0}").words or "nothing cut away"
+    return [*facts, Fact("decays", f"{count} ({cut})", {"count": count, "events": dict(kinds)})]
 
 
 def of_ring(path: str | PathLike[str], ring: Any) -> list[Fact]:
@@ -410,8 +384,7 @@ def of_run(run: Run) -> list[Fact]:
     step = "at unequal distances" if run.step is None else f"every {run.step:.4g} s"
     value = {"count": len(run), "span_s": span, "step_s": run.step}
     facts = [Fact("rows", f"{len(run)} over {span:.4g} s, {step}", value)]
-    for name, values in run.inputs.items():
-        facts.append(_range(f"input {name}", values))
+    facts += [_range(f"input {name}", values) for name, values in run.inputs.items()]
     for name, values in run.outputs.items():
         missing = int(np.isnan(values).sum())
         after = f", {missing} not read" if missing else ""
@@ -421,12 +394,13 @@ def of_run(run: Run) -> list[Fact]:
 
 def of_formulation(document: Document) -> list[Fact]:
     """What is free, limited and best in a formulation, and what goes in and out."""
+    mapping, problem = document.mapping, document.problem
     said = {
-        "inputs": [part.name for part in document.mapping.inputs],
-        "outputs": [part.name for part in document.mapping.outputs],
+        "inputs": [part.name for part in mapping.inputs],
+        "outputs": [part.name for part in mapping.outputs],
     }
-    if (problem := document.problem) is not None:
-        said["variables"] = [v.label for v in problem.variables]
-        said["constraints"] = [c.label for c in problem.limits]
-        said["objectives"] = [goal.label for goal in problem.goals]
+    if problem is not None:
+        lists = {"variables": problem.variables, "constraints": problem.limits}
+        lists["objectives"] = problem.goals
+        said |= {label: [one.label for one in these] for label, these in lists.items()}
     return [Fact(label, ", ".join(names) or "none", names) for label, names in said.items()]
