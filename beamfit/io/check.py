@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from beamfit.errors import InputError
-from beamfit.io.columns import Columns, Layout, arranged, layout_of, proposal
+from beamfit.io.columns import Columns, Layout, layout_of, proposal
 from beamfit.io.decay_record import read_lifetime_input
 from beamfit.io.emittance_gui import is_emittance_gui, read_emittance_gui
 from beamfit.io.files import digest
@@ -27,7 +27,7 @@ from beamfit.io.run import read_run
 from beamfit.io.scan import read_quad_scan
 from beamfit.io.scan_columns import is_known, is_size
 from beamfit.io.scan_columns import likely_name as scan_name
-from beamfit.io.table import archive_sheet, header_of, is_binary
+from beamfit.io.table import header_of, is_binary, read_columns, read_sheet
 from beamfit.io.toml import read_toml
 from beamfit.language.document import Document
 from beamfit.quantity import display_unit
@@ -154,7 +154,7 @@ def proposed_layout(path: str | PathLike[str], columns: Columns = None) -> str |
     layout = layout_of(columns)
     if _kind(path, layout) not in ("scan", "record") or is_emittance_gui(path):
         return None
-    sheet = arranged(archive_sheet(path, True, layout.header or None), layout)
+    sheet = read_columns(path, "", layout, skip_bad=True)
     unknown = {
         name: (scan_name(name) or record_name(name, cell), cell)
         for name, cells in zip(sheet.names, sheet.cells, strict=True)
@@ -196,7 +196,7 @@ def _kind(path: str | PathLike[str], layout: Layout) -> str:
     if is_emittance_gui(path):
         return "scan"
     tabled = suffix == ".json" or is_binary(path)
-    names = archive_sheet(path, False).names if tabled else layout.header or header_of(path)
+    names = read_sheet(path, "").names if tabled else layout.header or header_of(path)
     called = layout.called(names, path)
     names = [called.get(name, name) for name in names]
     head = ",".join(names)

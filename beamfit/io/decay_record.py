@@ -17,9 +17,7 @@ from beamfit.io.columns import (
     Column,
     Columns,
     Sheet,
-    arranged,
     columns_of,
-    layout_of,
     left_aside,
     left_out,
 )
@@ -27,7 +25,7 @@ from beamfit.io.files import name_of
 from beamfit.io.headers import spelled
 from beamfit.io.record_columns import dated, known, record_columns, taken_for_current
 from beamfit.io.scan_columns import is_size
-from beamfit.io.table import archive_sheet
+from beamfit.io.table import read_columns
 from beamfit.studies.decay.conditions import Conditions, Fault, first_fault
 from beamfit.studies.decay.monitor import Monitor
 from beamfit.studies.decay.record import DecayRecord, LifetimeTable
@@ -35,6 +33,7 @@ from beamfit.studies.decay.record import DecayRecord, LifetimeTable
 if TYPE_CHECKING:
     from pandas import DataFrame
 
+EXAMPLE = "time_s,beam_current_mA"
 # Of a table of lifetimes.
 LIFETIMES = {
     "tau": "time",
@@ -62,7 +61,7 @@ def read_lifetime_input(
     offset: str | None = None,
 ) -> DecayRecord | LifetimeTable:
     """Read what `beamfit lifetime` takes, by its header: as one of the other two readers."""
-    sheet = _sheet(path, columns, ignore, skip_bad)
+    sheet = read_columns(path, EXAMPLE, columns, ignore, skip_bad)
     lifetimes = any(spelled(n).lower().startswith(("tau_", "lifetime_")) for n in sheet.names)
     moments = any((c := known(sheet, name)) and c.key == "time" for name in sheet.names)
     if lifetimes and not moments:
@@ -104,15 +103,7 @@ def read_lifetimes(
     >>> print(read_lifetimes(file))
     lifetimes.csv: 4 lifetimes at 100 to 400 mA
     """
-    return _lifetimes(_sheet(path, columns, ignore, skip_bad), skip_bad)
-
-
-def _sheet(
-    path: str | PathLike[str] | DataFrame, columns: Columns, ignore: Iterable[str], skip_bad: bool
-) -> Sheet:
-    layout = layout_of(columns)
-    sheet = archive_sheet(path, skip_bad, layout.header or None)
-    return arranged(sheet.without(ignore), layout)
+    return _lifetimes(read_columns(path, EXAMPLE, columns, ignore, skip_bad), skip_bad)
 
 
 def read_decay_record(
@@ -163,7 +154,7 @@ def read_decay_record(
     >>> print(read_decay_record("measurements/aps_1999_decay.csv"))
     aps_1999_decay.csv: 27 readings over 8.81 h, 101.999 to 81.464 mA
     """
-    return _record(_sheet(path, columns, ignore, skip_bad), skip_bad, offset)
+    return _record(read_columns(path, EXAMPLE, columns, ignore, skip_bad), skip_bad, offset)
 
 
 def _record(sheet: Sheet, skip_bad: bool, offset: str | None) -> DecayRecord:

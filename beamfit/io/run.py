@@ -14,14 +14,12 @@ from beamfit.io.columns import (
     Column,
     Columns,
     Sheet,
-    arranged,
     columns_of,
-    layout_of,
     left_aside,
     left_out,
 )
 from beamfit.io.files import name_of
-from beamfit.io.table import read_sheet
+from beamfit.io.table import read_columns
 from beamfit.studies.response.record import Run
 
 if TYPE_CHECKING:
@@ -80,9 +78,7 @@ def read_run(
     >>> print(read_run(file))
     run.csv: 10 rows over 9 s, inputs valve, outputs level
     """
-    layout = layout_of(columns)
-    sheet = read_sheet(path, EXAMPLE, MOST_ROWS, ragged=skip_bad, names=layout.header or None)
-    sheet = arranged(sheet.without(ignore), layout)
+    sheet = read_columns(path, EXAMPLE, columns, ignore, skip_bad, MOST_ROWS)
     named = {"u": tuple(inputs), "y": tuple(outputs)}
     columns = _columns(sheet, named)
     if TIME not in columns and step is None:

@@ -16,8 +16,6 @@ from beamfit.io.columns import (
     Column,
     Columns,
     Sheet,
-    arranged,
-    layout_of,
     left_aside,
     left_out,
 )
@@ -33,7 +31,7 @@ from beamfit.io.scan_columns import (
     scan_columns,
 )
 from beamfit.io.shots import average_shots
-from beamfit.io.table import read_sheet
+from beamfit.io.table import read_columns
 from beamfit.studies.scan.scans import POSSIBLE, USUAL, QuadScan, first_unusable, middle
 
 if TYPE_CHECKING:
@@ -107,11 +105,7 @@ def read_quad_scan(
         if columns is not None:
             raise InputError("--columns for a file of emittance_gui", "none: it says them", path)
         return read_emittance_gui(path).scan()
-    layout = layout_of(columns)
-    sheet = read_sheet(
-        path, "Q2_A,size_x_um", MOST_ROWS, ragged=skip_bad, names=layout.header or None
-    )
-    sheet = arranged(sheet.without(ignore), layout)
+    sheet = read_columns(path, "Q2_A,size_x_um", columns, ignore, skip_bad, MOST_ROWS)
     columns = scan_columns(sheet)
     if skip_bad:
         sheet = sheet.good(lambda rows: _values(rows, columns))

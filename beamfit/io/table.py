@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import itertools
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from os import PathLike
 from pathlib import Path
@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 from beamfit.errors import InputError, expect, located
 from beamfit.io.binary import hdf5_columns, is_sdds, matlab_variables, sdds_columns
 from beamfit.io.cells import check_length, numeric_rows, with_points, without_units
-from beamfit.io.columns import UNITS, Sheet
+from beamfit.io.columns import UNITS, Columns, Sheet, arranged, layout_of
 from beamfit.io.files import Numbered, digest, laid_out, read_json, text_lines
 from beamfit.io.headers import (
     HEAD,
@@ -43,7 +43,46 @@ SEPARATOR_LINE = re.compile(r"\s*\"?sep=.\"?\s*$", re.IGNORECASE)
 # In the names of a file without a header: cells that are not read.
 REST = "*"
 TFS_LINES = ("@", "$")
+# A file of the EPICS Archiver Appliance without a header begins so, and has these columns.
+ARCHIVER = re.compile(r"\d{9,11}(,[^,]+){4}\s*")
+ARCHIVED = ["secs", "val", "severity", "status", "nanos"]
+JSON = "another JSON file"
+EXPECTED = (
+    'columns of equal lengths, {"name": [...]}, one object a row, [{"name": ...}], or one channel '
+    'of the EPICS Archiver Appliance, [{"meta": …, "data": [{"secs": …}]}]'
+)
 WORD = re.compile(r'"[^"]*"|\S+')
+
+
+def read_columns(
+    path: str | PathLike[str] | DataFrame,
+    example: str,
+    columns: Columns = None,
+    ignore: Iterable[str] = (),
+    skip_bad: bool = False,
+    most: int = MOST_ROWS,
+) -> Sheet:
+    """Read the columns of a file under the names that a person says.
+
+    Parameters
+    ----------
+    path, example, most
+        As for `read_sheet`.
+    columns : str, path, mapping or Layout, optional
+        As `beamfit.io.columns.layout_of` reads it.
+    ignore : iterable of str
+        Columns to leave unread; * and ? stand for any letters.
+    skip_bad : bool
+        Leave out rows that have not as many cells as the header.
+
+    Raises
+    ------
+    InputError
+        As `read_sheet`, and of what is said of columns.
+    """
+    layout = layout_of(columns)
+    sheet = read_sheet(path, example, most, ragged=skip_bad, names=layout.header or None)
+    return arranged(sheet.without(ignore), layout)
 
 
 def read_sheet(
@@ -99,9 +138,7 @@ def read_sheet(
     if is_binary(path):
         return _binary(path, most)
     if Path(path).suffix.lower() == ".json":
-        sheet = json_sheet(path)
-        check_length(len(sheet), most, path)
-        return sheet
+        return _of_json(path, most)
     return _read_text(path, example, most, ragged, names)
 
 
@@ -156,11 +193,14 @@ def _read_text(
 
 def _head(
     path: str | PathLike[str], example: str, comments: list[str]
-) -> tuple[list[str], int, str, Numbered]:
+) -> tuple[list[str], int | None, str, Numbered]:
     """Names of the columns, their line, what separates them, and the lines below, numbered."""
     whole = text_lines(path)
     head = uncommented(list(itertools.islice(whole, HEAD)))
     title, numbered = header_at(head), enumerate(itertools.chain(head, whole), start=1)
+    first = next((text for text in head if text.strip()), "")
+    if ARCHIVER.fullmatch(first):
+        return ARCHIVED, None, ",", numbered
     for line, text in numbered:
         if text.lstrip().startswith(MARKS + TFS_LINES):
             comments.append(bare(text))
@@ -310,136 +350,69 @@ def _binary(path: str | PathLike[str], most: int) -> Sheet:
     return Sheet(path, tuple(columns), list(columns.values()), None, None, comments, digest(path))
 
 
-EXPECTED = 'columns of equal lengths, {"name": [...]}, or one object a row, [{"name": ...}]'
+def _of_json(path: str | PathLike[str], most: int) -> Sheet:
+    """An object of lists (of objects by row as pandas has it), a list of rows, or a channel."""
+    content, said = read_json(path, JSON, EXPECTED), ()
+    with laid_out(path, JSON, EXPECTED):
+        if isinstance(content, dict):
+            columns = _planes(content) or {
+                n: list(c.values()) if isinstance(c, dict) else c for n, c in content.items()
+            }
+        elif content and all({"meta", "data"} & set(row) for row in content):
+            columns, said = _channel(content)
+        else:
+            names = dict.fromkeys(name for row in content for name in row)
+            columns = {name: [row.get(name) for row in content] for name in names}
+        if {type(column) for column in columns.values()} != {list}:
+            raise ValueError
+        cells = [["" if v is None else str(v).strip() for v in c] for c in columns.values()]
+        if len({*map(len, cells)}) > 1:
+            raise ValueError
+    check_length(len(cells[0]), most, path)
+    return Sheet(path, tuple(columns), cells, None, None, said, digest(path))
 
 
-# Scans as PyEmittance saves them (pyemittance_data_….json), and lcls-tools and slac-measurements
-# (QuadScanEmittanceResult): each plane's own settings and sizes in m. The setting's unit is the
-# magnet's own, and only a person knows it: --columns 'quadvals=Q525_kG'.
-BY_LETTER = {"setting": "quadvals{}", "size": "beamsizes{}", "error": "beamsizeserr{}"}
-BY_ORDER = {"setting": "quadrupole_pv_values", "size": "rms_beamsizes"}
+def _channel(content: list[Any]) -> tuple[dict[str, list[Any]], tuple[str, ...]]:
+    """Columns of one channel of the EPICS Archiver Appliance, and what it says of it."""
+    if len(content) != 1:
+        expected = "one, of the beam current: a file for each"
+        raise InputError(f"{len(content)} channels", expected)
+    meta, data = content[0].get("meta") or {}, content[0]["data"]
+    if not data:
+        raise InputError("no readings", "two or more")
+    columns = {key: [one[key] for one in data] for key in ("secs", "nanos", "val")}
+    if (unit := meta.get("EGU")) in UNITS["current"]:
+        columns[f"val_{unit}"] = columns.pop("val")
+    return columns, tuple(f"{key}: {value}" for key, value in meta.items())
 
 
 def _planes(content: dict[str, Any]) -> dict[str, list[Any]] | None:
-    """Columns of a scan whose planes were measured at settings of their own; None if it is none."""
-    if {BY_LETTER["setting"].format("x"), BY_LETTER["size"].format("x")} <= set(content):
-        parts = [{k: content.get(n.format(p)) for k, n in BY_LETTER.items()} for p in "xy"]
-    elif set(BY_ORDER.values()) <= set(content):
-        parts = [{k: _part(content[n], i) for k, n in BY_ORDER.items()} for i in range(2)]
-    else:
+    """Columns of a scan whose planes were measured at settings of their own; None if it is none.
+
+    Scans as PyEmittance saves them (pyemittance_data_….json), and lcls-tools and slac-measurements
+    (QuadScanEmittanceResult), sizes in m. The setting's unit is the magnet's own, and only a person
+    knows it: --columns 'quadvals=Q525_kG'.
+    """
+    by_letter = {"quadvalsx", "beamsizesx"} <= set(content)
+    if not by_letter and not {"quadrupole_pv_values", "rms_beamsizes"} <= set(content):
         return None
-    name = (BY_LETTER if "beamsizesx" in content else BY_ORDER)["setting"].format("")
-    columns: dict[str, list[Any]] = {name: []}
-    for plane, part in zip("xy", parts, strict=True):
-        settings = part.pop("setting") or []
-        start = len(columns[name])
-        columns[name] += settings
-        for kind, values in part.items():
-            if values:
-                column = f"size_{plane}_m" if kind == "size" else f"size_{plane}_error_m"
-                columns[column] = [None] * start + list(values)
-    length = len(columns[name])
+    names = ("quadvals", "beamsizes", "beamsizeserr")
+    names = names if by_letter else ("quadrupole_pv_values", "rms_beamsizes")
+    columns: dict[str, list[Any]] = {names[0]: []}
+    for i, plane in enumerate("xy"):
+        settings, *values = (
+            content.get(f"{name}{plane}") if by_letter else _part(content[name], i)
+            for name in names
+        )
+        start = len(columns[names[0]])
+        columns[names[0]] += settings or []
+        for kind, numbers in zip(("", "_error"), values, strict=False):
+            if numbers:
+                columns[f"size_{plane}{kind}_m"] = [None] * start + list(numbers)
+    length = len(columns[names[0]])
     return {n: values + [None] * (length - len(values)) for n, values in columns.items()}
-
-
-def _scan_of(path: str | PathLike[str], content: dict[str, Any]) -> dict[str, list[Any]] | None:
-    with laid_out(path, "another JSON file", EXPECTED):
-        return _planes(content)
 
 
 def _part(values: Any, i: int) -> Any:
     """One plane's part of a list, or of an object by number."""
     return values.get(str(i)) if isinstance(values, dict) else values[i]
-
-
-def json_sheet(path: str | PathLike[str], content: Any = None) -> Sheet:
-    """The columns of a JSON file.
-
-    Parameters
-    ----------
-    path : str or path
-        The file: an object of lists, or of objects by row as pandas has it, or a list of rows.
-    content : optional
-        What it says, if that was read.
-
-    Returns
-    -------
-    Sheet
-        With a text a cell; null is a blank one.
-
-    Raises
-    ------
-    InputError
-        If it is anything else.
-
-    Examples
-    --------
-    >>> import tempfile, pathlib
-    >>> file = pathlib.Path(tempfile.mkdtemp()) / "a.json"
-    >>> _ = file.write_text('{"time_s": [0, 60], "beam_current_mA": [200.5, null]}')
-    >>> json_sheet(file)["beam_current_mA"]
-    ['200.5', '']
-    """
-    content = read_json(path, "another JSON file", EXPECTED) if content is None else content
-    if isinstance(content, list) and all(isinstance(row, dict) for row in content):
-        names = dict.fromkeys(name for row in content for name in row)
-        columns = {name: [row.get(name) for row in content] for name in names}
-    elif isinstance(content, dict) and (columns := _scan_of(path, content)) is not None:
-        pass
-    elif isinstance(content, dict):
-        columns = {n: list(c.values()) if isinstance(c, dict) else c for n, c in content.items()}
-    else:
-        columns = {}
-    whole = all(isinstance(column, list) for column in columns.values())
-    if not columns or not whole or len({len(column) for column in columns.values()}) > 1:
-        raise InputError("another JSON file", EXPECTED, path=path)
-    cells = [["" if v is None else str(v).strip() for v in column] for column in columns.values()]
-    return Sheet(path, tuple(columns), cells, None, None, (), digest(path))
-
-
-ARCHIVE = ("secs", "val", "severity", "status", "nanos")
-
-
-def archive_sheet(
-    path: str | PathLike[str] | DataFrame, skip_bad: bool, names: Sequence[str] | None = None
-) -> Sheet:
-    """The columns of a file, an archive's by their own names, or by those of a file without."""
-    example = "time_s,beam_current_mA"
-    if names is not None:
-        return read_sheet(path, example, ragged=skip_bad, names=names)
-    if not isinstance(path, (str, PathLike)):
-        return read_sheet(path, example)
-    if Path(path).suffix.lower() == ".json":
-        return _archive_json(path)
-    lines = () if is_binary(path) else text_lines(path)
-    head = next((text for text in lines if text.strip()), "")
-    if re.fullmatch(r"\d{9,11}(,[^,]+){4}\s*", head):
-        return read_sheet(path, ",".join(ARCHIVE), ragged=skip_bad, names=ARCHIVE)
-    return read_sheet(path, example, ragged=skip_bad)
-
-
-def _is_archive(channels: object) -> bool:
-    """Whether a JSON file holds channels with their data, and not columns."""
-    lists = isinstance(channels, list)
-    return lists and all(not isinstance(c, dict) or {"meta", "data"} & set(c) for c in channels)
-
-
-def _archive_json(path: str | PathLike[str]) -> Sheet:
-    """Of the EPICS Archiver Appliance: one channel with its data."""
-    expected = 'one channel of the EPICS Archiver Appliance: [{"meta": …, "data": [{"secs": …}]}]'
-    channels = read_json(path, "another JSON file", expected)
-    if not _is_archive(channels):
-        return json_sheet(path, channels)
-    with laid_out(path, "another JSON file", expected):
-        if len(channels) != 1:
-            expected = "one, of the beam current: a file for each"
-            raise InputError(f"{len(channels)} channels", expected)
-        meta, data = channels[0].get("meta", {}), channels[0]["data"]
-        rows = [[str(one["secs"]), str(one["nanos"]), str(one["val"])] for one in data]
-    if not rows:
-        raise InputError("no readings", "two or more", path=path)
-    unit = meta.get("EGU", "") if isinstance(meta, dict) else ""
-    called = f"val_{unit}" if unit in UNITS["current"] else "val"
-    said = tuple(f"{key}: {value}" for key, value in meta.items()) if meta else ()
-    cells = list(zip(*rows, strict=True))
-    return Sheet(path, ("secs", "nanos", called), cells, None, None, said, digest(path))

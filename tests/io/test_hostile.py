@@ -15,7 +15,7 @@ from beamfit.io import files, isolated
 from beamfit.io.binary import hdf5_content
 from beamfit.io.files import digest, read_json
 from beamfit.io.result import load_fit, read_fitted_beams
-from beamfit.io.table import archive_sheet, read_sheet
+from beamfit.io.table import read_sheet
 from beamfit.io.toml import read_toml
 
 DECAY = "time_s,beam_current_mA\n0,100\n60,99\n120,98\n"
@@ -127,7 +127,7 @@ def test_json_of_great_depth_and_long_numbers(content, tmp_path):
     for read in (
         load_fit,
         lambda p: read_fitted_beams(p, 0.511),
-        lambda p: archive_sheet(p, False),
+        lambda p: read_sheet(p, ""),
     ):
         assert str(path) in refused(read, path)
     path.write_text("9" * 400)
