@@ -96,7 +96,7 @@ def read_emittance_gui(path: str | PathLike[str]) -> EmittanceGuiFile:
     Parameters
     ----------
     path : str or path
-        A MATLAB file (version 5 to 7) with a struct ``data``; docs/files.md names its fields.
+        A MATLAB file (version 5 to 7) with a struct ``data``; docs/files_reference.md names its fields.
 
     Returns
     -------
