@@ -8,10 +8,8 @@ than 11 s and a process of more than 1 GB are faults; the file is kept and the e
 from __future__ import annotations
 
 import json
-import os
 import random
 import resource
-import select
 import signal
 import subprocess
 import sys
@@ -20,7 +18,6 @@ import time
 import warnings
 from collections.abc import Callable
 from pathlib import Path
-from types import SimpleNamespace
 from typing import NamedTuple
 
 import h5py
@@ -31,24 +28,22 @@ import beamfit
 import beamfit.io.decay_record
 from beamfit.errors import InputError
 from beamfit.greybox.mlp import dense
-from beamfit.io import hdf5
+from beamfit.io import isolated
 from beamfit.io.columns import SHIPPED, layout_of
 from beamfit.io.emittance_gui import read_emittance_gui
-from beamfit.io.formulation import read_formulation, read_numbers
+from beamfit.io.formulation import read_formulation, read_network, read_numbers
 from beamfit.io.line import read_lattice
 from beamfit.io.machine import read_scan_machine
-from beamfit.io.measurement import read_quad_scan
-from beamfit.io.network import read_network
-from beamfit.io.result import read_fitted_beams
-from beamfit.io.ring import read_ring
-from beamfit.io.ring_tables import read_twiss
+from beamfit.io.result import load_fit, read_fitted_beams, save_fit
+from beamfit.io.ring import read_ring, read_twiss
 from beamfit.io.run import read_run
-from beamfit.io.saved import load_fit, save_fit
+from beamfit.io.scan import read_quad_scan
 from beamfit.language.check import check_document
 from beamfit.language.network import format_network
 from beamfit.sampling.ensemble import draw
 from beamfit.sampling.store import load
 from tests.conftest import ROOT
+from tests.io.forked import ENDED, SUBPROCESS
 from tests.io.test_emittance_gui import gui_data
 from tests.io.test_mutated_files import CSV, mutated
 from tests.io.test_programs import SDDS
@@ -128,7 +123,7 @@ def readers(folder: Path, with_store: bool) -> dict[str, Reader]:
         "scan .h5": Reader(".h5", [stored(folder, "s.h5", **settings)], read_quad_scan),
         "scan .mat": Reader(".mat", [(folder / "scan.mat").read_bytes()], read_emittance_gui),
         "vectors .mat": Reader(".mat", [(folder / "vectors.mat").read_bytes()], read_quad_scan),
-        "SDDS": Reader(".sdds", [SDDS.encode(), SDDS.encode("utf-16")], read_quad_scan),
+        "SDDS": Reader(".sdds", [SDDS.encode()], read_quad_scan),
         "decay .csv": Reader(".csv", decay, beamfit.io.decay_record.read_lifetime_input),
         "decay .csv --skip-bad": Reader(
             ".csv", decay[:2], lambda p: beamfit.read_decay_record(p, skip_bad=True)
@@ -159,44 +154,10 @@ def readers(folder: Path, with_store: bool) -> dict[str, Reader]:
     }
 
 
-def forked(
-    command: list[str], *, input: bytes, timeout: float, **_: object
-) -> subprocess.CompletedProcess[bytes]:
-    """In the place of `subprocess.run`: the same work and bounds in a fork, for a fiftieth."""
-    ours, theirs = os.pipe()
-    child = os.fork()
-    if child == 0:
-        try:
-            with open(theirs, "wb") as stream:
-                hdf5.answer(input, int(command[-2]), int(command[-1]), stream)
-        finally:
-            os._exit(0)
-    os.close(theirs)
-    parts, until = [], time.monotonic() + timeout
-    with open(ours, "rb", buffering=0) as stream:
-        while select.select([stream], [], [], max(0.0, until - time.monotonic()))[0]:
-            if not (part := stream.read(1 << 20)):
-                break
-            parts.append(part)
-        else:
-            os.kill(child, signal.SIGKILL)
-    _, status = os.waitpid(child, 0)
-    if os.WIFSIGNALED(status) and os.WTERMSIG(status) == signal.SIGKILL:
-        ENDED["library never ended"] = ENDED.get("library never ended", 0) + 1
-        raise subprocess.TimeoutExpired(command, timeout)
-    if os.WIFSIGNALED(status):
-        ENDED["library crashed"] = ENDED.get("library crashed", 0) + 1
-        raise subprocess.CalledProcessError(-1, command)
-    return subprocess.CompletedProcess(command, 0, b"".join(parts))
-
-
-ENDED: dict[str, int] = {}
-
-
 def soaked(name: str, count: int) -> dict[str, object]:
     """Have one reader read so many damaged files, in this process."""
     warnings.simplefilter("ignore")
-    hdf5.subprocess = SimpleNamespace(**vars(subprocess) | {"run": forked})
+    isolated.subprocess = SUBPROCESS
     said = {"read": 0, "refused": 0, "slowest": 0.0, "faults": []}
     with tempfile.TemporaryDirectory() as place:
         reader = readers(Path(place), name == STORE)[name]

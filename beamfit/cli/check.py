@@ -9,9 +9,9 @@ import click
 
 from beamfit.cli.options import Command, command_line, options
 from beamfit.errors import InputError
+from beamfit.io.check import Understood, proposed_layout, understand, with_lattice
 from beamfit.io.columns import Layout
 from beamfit.io.result import results_text
-from beamfit.io.understood import Understood, proposed_layout, understand, with_lattice
 from beamfit.table import text_of
 
 EXAMPLE = """\b

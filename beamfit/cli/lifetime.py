@@ -10,9 +10,8 @@ import click
 import beamfit
 from beamfit.cli.options import Command, Sampling, answered, option, options, reported
 from beamfit.errors import InputError
-from beamfit.io.decay_record import read_lifetime_input
+from beamfit.io.decay_record import monitor_of, read_lifetime_input
 from beamfit.io.files import digest
-from beamfit.io.monitor import monitor_of
 from beamfit.studies.decay.record import LifetimeTable
 
 if TYPE_CHECKING:

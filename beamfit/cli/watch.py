@@ -13,7 +13,7 @@ import beamfit
 from beamfit.cli.options import Command, answered, option, options
 from beamfit.errors import plain
 from beamfit.io.files import digest
-from beamfit.io.watched import WatchMachine, read_watch_machine
+from beamfit.io.machine import WatchMachine, read_watch_machine
 from beamfit.table import Table, cell
 
 if TYPE_CHECKING:

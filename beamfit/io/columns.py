@@ -1,32 +1,383 @@
-"""Columns of a file as a person names them: --columns, and layouts that keep the names."""
+"""Named columns with the place of every value, what their headers mean, and --columns."""
 
 from __future__ import annotations
 
 import csv
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+import re
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from fnmatch import fnmatchcase
 from os import PathLike
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
+
+import numpy as np
 
 from beamfit.errors import InputError, nearest
-from beamfit.io.dates import DAY_FIRST, MONTH_FIRST
-from beamfit.io.headers import spelled, unit_at_end
-from beamfit.io.sheet import Sheet
+from beamfit.io.cells import DAY_FIRST, HOUR_OR_MINUTE, MONTH_FIRST, NUMBERS, dates_in_order
+from beamfit.io.headers import UNITS, is_number, number, spelled, unit_at_end, unit_behind
 from beamfit.io.toml import LIST, TABLE, TEXT, Key, read_toml
+
+# The unit of a column of dates.
+DATE = "a date"
+# What programs write where there is no number.
+BLANK = {"", "nan", "-nan", "na", "n/a", "n.a.", "#n/a", "<na>", "null", "none", "-", "--", "---"}
+BLANK |= {"nan(ind)", "-nan(ind)", "1.#qnan", "-1.#ind", "1.#ind", "#num!", "#value!"}
+# Rows left out, and columns left aside, that a note names one by one.
+MOST_NAMED, MOST_ASIDE = 5, 8
+
+
+class Column(NamedTuple):
+    """What a header means: the quantity, the unit it is in, and the factor to SI."""
+
+    header: str
+    key: str
+    unit: str = ""
+    factor: float = 1.0
+
+
+@dataclass(frozen=True)
+class Sheet:
+    """The cells of a file, one sequence a column, and where each row stands.
+
+    Attributes
+    ----------
+    path : str or path
+        The file.
+    names : tuple of str
+        Headers, in the order of the file.
+    cells : sequence of sequences
+        Texts (or numbers, of HDF5) of each column.
+    lines : sequence of int or None
+        Line of each row; None for HDF5, whose rows are counted.
+    header : int or None
+        Line of the header.
+    comments : tuple of str
+        Comment lines, TFS descriptors, or attributes of an HDF5 file.
+    sha256 : str
+        Digest of the file.
+    bad : tuple of InputError
+        What is wrong with rows that were left out on request.
+    notes : tuple of str
+        What was done to the cells.
+    called : mapping of str to str
+        Name to the header of the file, where a layout says what a column is.
+    order : str
+        Of dates whose day and month are numbers, where a layout says it.
+    arranged : bool
+        Whether there is a layout: columns that nobody knows are then left aside.
+    """
+
+    path: str | PathLike[str]
+    names: tuple[str, ...]
+    cells: Sequence[Sequence[Any]]
+    lines: Sequence[int] | None
+    header: int | None
+    comments: tuple[str, ...]
+    sha256: str = ""
+    bad: tuple[InputError, ...] = ()
+    notes: tuple[str, ...] = ()
+    called: Mapping[str, str] = field(default_factory=dict)
+    order: str = ""
+    arranged: bool = False
+
+    def __len__(self) -> int:
+        return len(self.cells[0])
+
+    def __getitem__(self, name: str) -> Sequence[Any]:
+        return self.cells[self.names.index(name)]
+
+    def error(
+        self, found: str, expected: str, row: int | None = None, column: str | None = None
+    ) -> InputError:
+        """Make the error that names the file, and the row and column if there are any."""
+        if row is not None and self.lines is None:
+            return self.error(f"reading {row + 1}: {found}", expected, None, column)
+        line = None if row is None else self.lines[row]
+        column = self.called.get(column, column)
+        return InputError(found, expected, path=self.path, line=line, column=column)
+
+    def header_error(self, found: str, expected: str, column: str | None = None) -> InputError:
+        """Make the error that names the header, and the column if it is one alone."""
+        if column in self.called:
+            expected = f"{expected}; --columns says that it is {column}"
+            column = self.called[column]
+        return InputError(found, expected, path=self.path, line=self.header, column=column)
+
+    def refuse(
+        self,
+        column: str,
+        wrong: np.ndarray,
+        expected: str,
+        found: str = "'{}'",
+        values: Sequence[Any] | None = None,
+    ) -> None:
+        """Raise the error of the first row that is wrong, if one is.
+
+        Parameters
+        ----------
+        column : str
+            Header of the column at fault.
+        wrong : array of bool
+            Row by row.
+        expected : str
+            What should stand there.
+        found : str
+            How to say what stands there, with {} in the place of the value.
+        values : sequence, optional
+            One a row; the cells unless said.
+        """
+        if wrong.any():
+            row = int(np.argmax(wrong))
+            said = (self[column] if values is None else values)[row]
+            raise self.error(found.format(said), expected, row, column)
+
+    def no_column(self, name: str) -> InputError:
+        """Make the error of a column that is not there."""
+        return self.header_error(f"no column '{name}'", nearest(name, list(self.names)))
+
+    def without(self, patterns: Iterable[str]) -> Sheet:
+        """Leave out columns by name, in which * and ? stand for any letters.
+
+        Raises
+        ------
+        InputError
+            If no column has such a name, or none is left.
+        """
+        left = list(self.names)
+        for pattern in patterns:
+            if not any(fnmatchcase(name, pattern) for name in self.names):
+                raise self.no_column(pattern)
+            left = [name for name in left if not fnmatchcase(name, pattern)]
+        if not left:
+            raise self.header_error("no column that is not ignored", "a column to read")
+        return self.only(left)
+
+    def only(self, names: Sequence[str]) -> Sheet:
+        """Some of the columns."""
+        return replace(self, names=tuple(names), cells=[self[name] for name in names])
+
+    def named(self) -> Sheet:
+        """Leave out columns without a name, such as the index that pandas writes."""
+        left = [i for i, name in enumerate(self.names) if name and not name.startswith("Unnamed:")]
+        if len(left) in (0, len(self.names)):
+            return self
+        names = tuple(self.names[i] for i in left)
+        note = "A column without a name was left aside."
+        cells = [self.cells[i] for i in left]
+        return replace(self, names=names, cells=cells, notes=(*self.notes, note))
+
+    def rows(self, keep: Sequence[int]) -> Sheet:
+        """Some of the rows."""
+        lines = None if self.lines is None else [self.lines[row] for row in keep]
+        cells = [c[keep] if isinstance(c, np.ndarray) else [c[r] for r in keep] for c in self.cells]
+        return replace(self, cells=cells, lines=lines)
+
+    def good(self, check: Callable[[Sheet], object]) -> Sheet:
+        """Leave out the rows that a check of each row refuses, and keep what it said of them.
+
+        Raises
+        ------
+        InputError
+            If no row is left: the first that was wrong.
+        """
+        keep: list[int] = []
+        bad = list(self.bad)
+        waiting = [range(len(self))]
+        while waiting:
+            rows = waiting.pop()
+            try:
+                check(self.rows(rows))
+                keep += rows
+            except InputError as error:
+                if len(rows) == 1:
+                    found = re.sub(r"^reading 1:", f"reading {rows[0] + 1}:", error.found)
+                    bad.append(replace(error, found=found))
+                else:
+                    half = len(rows) // 2
+                    waiting += [rows[half:], rows[:half]]
+        if bad and not keep:
+            raise bad[0]
+        bad.sort(key=lambda error: error.line or 0)
+        return replace(self.rows(keep), bad=tuple(bad))
+
+    def numbers(
+        self,
+        name: str,
+        *,
+        blank: bool = False,
+        read: Callable[[Any], float] = number,
+        expected: str = "a number",
+    ) -> np.ndarray:
+        """Read a column of finite numbers.
+
+        Parameters
+        ----------
+        name : str
+            Its header.
+        blank : bool
+            Whether a cell may be blank, or say NaN in a text; it is NaN then.
+        read : callable
+            From a cell to a number, or ValueError.
+        expected : str
+            What the cell should have been, for the message.
+
+        Raises
+        ------
+        InputError
+            Naming line and column of the first cell that is no number.
+        """
+        if isinstance(self[name], np.ndarray) and read is number and np.isfinite(self[name]).all():
+            return self[name].astype(float)
+        values = np.empty(len(self))
+        for row, cell in enumerate(self[name]):
+            if blank and isinstance(cell, str) and cell.lower() in BLANK:
+                values[row] = np.nan
+                continue
+            try:
+                values[row] = read(cell)
+            except (ValueError, TypeError, OverflowError):
+                comma = " with a decimal point" if "," in str(cell) else ""
+                more = " in the unit of the column" if unit_behind(str(cell)) else comma
+                if re.search(r"\d\s*(±|\+/?-)", str(cell)):
+                    more = ", and its error in a column of its own"
+                found = "an empty cell" if cell == "" else f"'{cell}'"
+                raise self.error(found, expected + more, row, name) from None
+            if not np.isfinite(values[row]):
+                raise self.error(f"'{cell}'", "a finite number", row, name)
+        return values
+
+    def values(self, column: Column, *, blank: bool = False) -> np.ndarray:
+        """A column of finite numbers in SI, or of dates in s since 1970; as `numbers`."""
+        if column.unit == DATE:
+            expected = "an ISO 8601 time, such as 2024-03-01T12:00:00+01:00"
+            first = str(next(iter(self[column.header]), ""))
+            if HOUR_OR_MINUTE.fullmatch(first):
+                expected = "00:00:00: are these hours and minutes, or minutes and seconds?"
+            if NUMBERS.match(first):
+                expected = "a date whose day and month cannot be exchanged, such as 2024-03-01, "
+                expected += "or --columns day-month-year (or month-day-year)"
+            elif is_number(first):
+                units = ", ".join(f"{column.header}_{unit}" for unit in ("s", "ms", "d"))
+                expected = f"a date, or the unit of the number in the header: {units}"
+            read = dates_in_order(self.order)
+            return self.numbers(column.header, read=read, expected=expected)
+        return self.numbers(column.header, blank=blank) * column.factor
+
+
+def columns_of(
+    sheet: Sheet,
+    quantities: Mapping[str, str],
+    other: Callable[[str], Column | None] = lambda header: None,
+) -> dict[str, Column]:
+    """Understand every header of a sheet.
+
+    Parameters
+    ----------
+    sheet : Sheet
+        The file.
+    quantities : mapping of str to str
+        Name of a column without its unit to the kind of unit it has, a key of `UNITS`; "" for a
+        pure number or a word.
+    other : callable
+        Understands further headers; gives None for those that nobody knows.
+
+    Returns
+    -------
+    dict of str to Column
+        By quantity.
+
+    Raises
+    ------
+    InputError
+        If a header or its unit is unknown, or a quantity stands twice.
+
+    Examples
+    --------
+    >>> sheet = Sheet("a.csv", ("size_x_mm",), [["0.1"]], [2], 1, ())
+    >>> columns_of(sheet, {"size_x": "length"})["size_x"].factor
+    0.001
+    """
+    found: dict[str, Column] = {}
+    for header in sorted(sheet.names, key=lambda name: name not in sheet.called):
+        aside = sheet.arranged and header not in sheet.called
+        said = spelled(header)
+        try:
+            column = _known(said, quantities, sheet) or other(said)
+        except InputError as error:
+            if aside:
+                continue
+            raise replace(error, column=sheet.called.get(header, header)) from None
+        column = column and column._replace(header=header)
+        if aside and (column is None or column.key in found):
+            continue
+        if column is None:
+            usual = [f"{q}_{next(iter(UNITS[k]))}" if k else q for q, k in quantities.items()]
+            raise sheet.header_error("an unknown column", nearest(header, usual), header)
+        if column.key in found:
+            first = found[column.key].header
+            twice = f"{column.key} also in column '{sheet.called.get(first, first)}'"
+            expected = "one column for it, in one unit, and none twice"
+            if header == found[column.key].header:
+                twice = f"{column.key} twice or more under one name"
+                expected = "a row for each shot, or names that differ"
+            raise sheet.header_error(twice, expected, header)
+        found[column.key] = column
+    return found
+
+
+def _known(header: str, quantities: Mapping[str, str], sheet: Sheet) -> Column | None:
+    """The column of a header NAME or NAME_UNIT."""
+    for whole in (header, header.lower()):
+        if quantities.get(whole) == "":
+            return Column(header, whole)
+    name, _, unit = header.rpartition("_")
+    if not (kind := quantities.get(name := name.lower())):
+        return None
+    units = UNITS[kind]
+    if unit not in units:
+        listed = ", ".join(u for u in units if u.isascii())
+        expected = f"one of {listed} at the end, such as {name}_{next(iter(units))}"
+        raise sheet.header_error(f"unknown unit '{unit}'", expected, header)
+    return Column(header, name, unit, units[unit])
+
+
+def left_aside(sheet: Sheet, columns: Mapping[str, Column]) -> tuple[str, ...]:
+    """Name the columns that a layout and beamfit do not know, and that were not read, as a note."""
+    used = {column.header for column in columns.values()}
+    aside = [name for name in sheet.names if name not in used] if sheet.arranged else []
+    more = [f"{len(aside) - MOST_ASIDE} more"] if len(aside) > MOST_ASIDE else []
+    return (f"Left aside: {', '.join(aside[:MOST_ASIDE] + more)}.",) if aside else ()
+
+
+def left_out(sheet: Sheet) -> tuple[str, ...]:
+    """Say what was done to the cells, and count and name the rows that were left out, as notes."""
+    if not sheet.bad:
+        return sheet.notes
+    named = [
+        (f"line {e.line}, " if e.line else "")
+        + (f"column '{e.column}', " if e.column else "")
+        + e.found
+        for e in sheet.bad[:MOST_NAMED]
+    ]
+    more = len(sheet.bad) - len(named)
+    named += [f"{more} more"] if more else []
+    were = "was" if len(sheet.bad) == 1 else "were"
+    total = len(sheet) + len(sheet.bad)
+    return (*sheet.notes, f"{len(sheet.bad)} of {total} rows {were} left out: {'; '.join(named)}.")
+
 
 FORMAT = "beamfit-layout-1"
 # Layouts that come with the package, by name.
 SHIPPED = Path(__file__).with_name("layouts")
 ORDERS = (DAY_FIRST, MONTH_FIRST)
+NAMES = "a list of names in quotes"
 EXAMPLE = "'xrms=size_x_um, QUAD:BACT=Q525_kG', or a layout (.toml)"
 KEYS = {
-    "format": Key(kind=TEXT),
     "columns": Key("columns", kind=TABLE, default={}),
-    "ignore": Key("ignore", kind=LIST, default=[]),
-    "dates": Key("dates", kind=TEXT, default=""),
-    "header": Key("header", kind=LIST, default=[]),
+    "ignore": Key("ignore", kind=LIST, default=[], said=NAMES, each=str),
+    "dates": Key("dates", kind=TEXT, default="", among=ORDERS),
+    "header": Key("header", kind=LIST, default=[], said=NAMES, each=str),
 }
 
 
@@ -160,15 +511,8 @@ def _item(item: str) -> Layout:
 
 
 def _read(path: str | PathLike[str]) -> Layout:
-    section = read_toml(path, "a layout")
+    section = read_toml(path, "a layout", FORMAT)
     said = section.values(KEYS)
-    if section.table["format"] != FORMAT:
-        raise section.error(f"'{section.table['format']}'", f'format = "{FORMAT}"', "format")
-    for key in ("ignore", "header"):
-        if not all(isinstance(value, str) for value in said[key]):
-            raise section.error(f"{key} = {said[key]}", "a list of names in quotes", key)
-    if said["dates"] not in ("", *ORDERS):
-        raise section.error(f"'{said['dates']}'", nearest(said["dates"], list(ORDERS)), "dates")
     for header, name in said["columns"].items():
         if not (isinstance(name, str) and name.strip()):
             expected = 'the name that beamfit has for it, such as "size_x_um"'

@@ -13,9 +13,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from beamfit.errors import InputError, nearest
+from beamfit.io.binary import matlab_variables
 from beamfit.io.files import digest, laid_out, name_of
 from beamfit.io.lattice import LatticeFile
-from beamfit.io.matlab import read_variable, read_vectors
 from beamfit.io.shots import average_shots
 from beamfit.quantity import Quantity
 from beamfit.studies.scan.scans import POSSIBLE, Profile, QuadScan
@@ -85,7 +85,9 @@ class EmittanceGuiFile:
 
 def is_emittance_gui(path: str | PathLike[str]) -> bool:
     """Tell a file of emittance_gui from others: MATLAB's by its name, and no table of vectors."""
-    return Path(path).suffix.lower() == MATLAB and not read_vectors(path, VARIABLE)
+    if Path(path).suffix.lower() != MATLAB:
+        return False
+    return set(matlab_variables(path, VARIABLE)) <= {VARIABLE}
 
 
 def read_emittance_gui(path: str | PathLike[str]) -> EmittanceGuiFile:
@@ -94,7 +96,7 @@ def read_emittance_gui(path: str | PathLike[str]) -> EmittanceGuiFile:
     Parameters
     ----------
     path : str or path
-        A MATLAB file (version 5 to 7) with a struct ``data``; docs/files.md names its fields.
+        A MATLAB file (version 5 to 7) with a struct ``data``; its fields: docs/files_reference.md.
 
     Returns
     -------
@@ -115,7 +117,12 @@ def read_emittance_gui(path: str | PathLike[str]) -> EmittanceGuiFile:
     Traceback (most recent call last):
     beamfit.errors.InputError: orbit.csv: no such file; expected a readable file
     """
-    source = _Fields(path, read_variable(path, VARIABLE))
+    if VARIABLE not in (found := matlab_variables(path, VARIABLE)):
+        expected = (
+            f"a struct '{VARIABLE}' of emittance_gui, or vectors Q2_A, size_x_um, one a column"
+        )
+        raise InputError(f"no variable '{VARIABLE}'", expected, path)
+    source = _Fields(path, found[VARIABLE])
     with laid_out(path, "a struct 'data' that is laid out otherwise", EXPECTED, named=True):
         return _read(source)
 

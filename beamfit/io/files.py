@@ -201,6 +201,12 @@ def read_bytes(path: str | PathLike[str], most: int, expected: str) -> bytes:
     return content
 
 
+def first_bytes(path: str | PathLike[str], count: int) -> bytes:
+    """Read how a file begins."""
+    with _opened(path) as stream:
+        return stream.read(count)
+
+
 def read_json(path: str | PathLike[str], found: str, expected: str) -> Any:
     """Read a JSON file.
 

@@ -1,7 +1,8 @@
-"""Formulations and the tables of numbers they use, from files."""
+"""Formulations, the tables of numbers they use, and networks, from files."""
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable, Mapping, Sequence
 from os import PathLike
 from pathlib import Path
@@ -10,10 +11,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from beamfit.errors import InputError, located
+from beamfit.greybox.mlp import MLP
+from beamfit.io.cells import check_length
 from beamfit.io.files import read_text, text_lines
-from beamfit.io.numeric import check_length
 from beamfit.language.check import check_document
 from beamfit.language.document import Document
+from beamfit.language.network import format_network, parse_network
 from beamfit.language.parse import parse_document
 from beamfit.language.text import format_document
 from beamfit.language.xml import format_xml, parse_xml
@@ -212,3 +215,36 @@ def solved_formulation(
         from beamfit.language.solution import solve_document
 
         return solve_document(document, tables, starts, values, gains, **options)
+
+
+def read_network(path: str | os.PathLike[str]) -> MLP:
+    """Read a network from a file.
+
+    Parameters
+    ----------
+    path : path
+        An XML file in UTF-8.
+
+    Returns
+    -------
+    MLP
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read or is not a network.
+    """
+    return parse_network(read_text(path), path)
+
+
+def write_network(path: str | os.PathLike[str], net: MLP) -> None:
+    """Write a network to a file, whole or not at all.
+
+    Parameters
+    ----------
+    path : path
+        Replaced if it exists.
+    net : MLP
+        The network.
+    """
+    write_atomically(path, format_network(net).encode())

@@ -9,6 +9,7 @@ import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,10 +17,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from beamfit.errors import InputError, nearest
+from beamfit.io.columns import Sheet, columns_of
 from beamfit.io.files import name_of
-from beamfit.io.gradient_table import gradient_table
-from beamfit.io.sequence_bounds import MOST
-from beamfit.io.toml import FLAG, LIST, TABLE, TEXT, Key, Section, is_number, read_toml
+from beamfit.io.table import read_sheet
+from beamfit.io.toml import FLAG, LIST, NUMBER, TABLE, TEXT, Key, Section, is_number, read_toml
 from beamfit.particles import ENERGY_KEYS, REST_ENERGY, expected_energy, total_energy
 from beamfit.studies.scan.names import check_names
 from beamfit.studies.scan.scans import QuadScan
@@ -28,6 +29,8 @@ if TYPE_CHECKING:
     from beamfit.optics.calibration import Calibration
     from beamfit.optics.elements import Element
 
+# A line has no more elements: what claims more is a mistake, or wants to fill the memory.
+MOST = 50_000
 FORMAT = "beamfit-lattice-1"
 # Settings a magnet may be given, one of them; the key says the unit.
 STRENGTHS = {
@@ -40,6 +43,7 @@ STRENGTHS = {
 LINE, POLYNOMIAL = {"slope", "intercept"}, {"gradient_polynomial_T_per_m"}
 TABLE_KEYS = ("gradient_table", "gradient_table_file")
 CALIBRATIONS = (LINE, POLYNOMIAL, *({key} for key in TABLE_KEYS))
+POWERS = "at least two numbers c0, c1, ... in T/m, T/(m A), ..."
 NAME, OPTIONAL = Key(kind=TEXT), Key(default=None)
 LENGTH = Key(low=0.0, said="a positive number")
 EDGE = Key(default=0.0, low=-90.0, high=90.0, said="an angle below 90 degrees")
@@ -51,7 +55,7 @@ ELEMENTS: dict[str, dict[str, Key]] = {
         **dict.fromkeys(("current_A", "integrated_gradient_kG"), OPTIONAL),
         **dict.fromkeys(("gradient_T_per_m", "k1_per_m2"), OPTIONAL),
         **dict.fromkeys(("slope", "intercept"), OPTIONAL),
-        "gradient_polynomial_T_per_m": Key(kind=LIST, default=None),
+        "gradient_polynomial_T_per_m": Key(kind=LIST, default=None, said=POWERS, each=NUMBER),
         "signed_intercept": Key(kind=FLAG, default=False),
         "gradient_table": Key(kind=LIST, default=None),
         "gradient_table_file": Key(kind=TEXT, default=None),
@@ -67,7 +71,7 @@ ELEMENTS: dict[str, dict[str, Key]] = {
         "name": NAME,
         "radius_m": Key(low=0.0, said="a positive number; a negative angle bends the other way"),
         "angle_deg": Key(low=-360.0, high=360.0, said="an angle below 360 degrees"),
-        "bend_plane": NAME,
+        "bend_plane": Key(kind=TEXT, among=("x", "y")),
         "entrance_edge_deg": EDGE,
         "exit_edge_deg": EDGE,
         "energy_offset": Key(
@@ -84,12 +88,11 @@ ELEMENTS: dict[str, dict[str, Key]] = {
     },
 }
 TOP = {
-    "format": NAME,
     **dict.fromkeys(ENERGY_KEYS, OPTIONAL),
     "element": Key(kind=LIST),
     "name": Key("name", kind=TEXT, default=""),
     "source": Key(kind=TEXT, default=""),
-    "particle": Key("particle", kind=TEXT, default="electron"),
+    "particle": Key("particle", kind=TEXT, default="electron", among=tuple(REST_ENERGY)),
     "energy_spread": Key(
         "energy_spread",
         default=0.0,
@@ -185,13 +188,8 @@ def read_toml_lattice(path: str | PathLike[str]) -> LatticeFile:
     InputError
         If it cannot be used, naming the line of the key.
     """
-    top = read_toml(path, "a lattice")
-    if (found := top.table.get("format")) != FORMAT:
-        raise top.error(f"format {found!r}"[:80], f'format = "{FORMAT}"', "format")
+    top = read_toml(path, "a lattice", FORMAT)
     said = top.values(TOP)
-    if said["particle"] not in REST_ENERGY:
-        known = nearest(said["particle"], list(REST_ENERGY))
-        raise top.error(f"particle '{said['particle']}'", known, "particle")
     energy = _energy(top, said["particle"])
     if len(top.table["element"]) > MOST:
         raise top.error(f"more than {MOST} elements", "a line that a machine has", "element")
@@ -239,9 +237,6 @@ def _element(section: Section, number: int) -> Mapping[str, Any]:
     section.values(ELEMENTS[kind] | {"type": NAME})
     if settings := _settings(kind):
         _check_strength(section, section.one_of(key for key, _ in settings))
-    if "bend_plane" in section.table and section.table["bend_plane"] not in ("x", "y"):
-        found = f"bend_plane '{section.table['bend_plane']}'"
-        raise section.error(found, "x or y", "bend_plane")
     if section.table.get("angle_deg") == 0:
         raise section.error("a dipole that does not bend", "a drift", "angle_deg")
     table = {"name": f"{kind}{number}"} | section.table
@@ -265,10 +260,8 @@ def _check_strength(section: Section, setting: str) -> None:
         expected = "both slope and intercept, gradient_polynomial_T_per_m, or one gradient table"
         raise section.error(found, expected, setting)
     for key in given & POLYNOMIAL:
-        numbers = section.table[key]
-        if len(numbers) < 2 or not all(map(is_number, numbers)):
-            expected = "at least two numbers c0, c1, ... in T/m, T/(m A), ..."
-            raise section.error(f"{numbers!r}"[:80], expected, key)
+        if len(numbers := section.table[key]) < 2:
+            raise section.error(f"{numbers!r}"[:80], POWERS, key)
 
 
 def _check_unique(elements: tuple[Mapping[str, Any], ...], sections: list[Section]) -> None:
@@ -387,3 +380,66 @@ def _strength(table: Mapping[str, Any], mass: float) -> tuple[float, Calibration
     numbers = tuple(map(float, table["gradient_polynomial_T_per_m"]))
     signed = table.get("signed_intercept", False)
     return setting, calibration.CurrentPolynomial(numbers, signed_intercept=signed, mass=mass)
+
+
+EXAMPLE = "current_A,gradient_T_per_m"
+# Columns of the gradient, and what makes them T/m in a magnet of some length in m.
+GRADIENTS = {
+    "gradient_T_per_m": lambda length: 1.0,
+    "integrated_gradient_T": lambda length: 1.0 / length,
+    "integrated_gradient_kG": lambda length: 0.1 / length,
+}
+# More points than any measurement of a magnet.
+MOST_ROWS = 10_000
+
+
+def gradient_table(section: Section, key: str, length: float) -> list[tuple[float, float]]:
+    """Read the current in A and the gradient in T/m of a quadrupole, by rising current.
+
+    Parameters
+    ----------
+    section : Section
+        The quadrupole's table of the lattice.
+    key : {"gradient_table", "gradient_table_file"}
+        Pairs [A, T/m] in the lattice, or the name of a CSV file, from the lattice's folder.
+    length : float
+        Of the magnet, m.
+
+    Returns
+    -------
+    list of (float, float)
+
+    Raises
+    ------
+    InputError
+        If there are fewer than two points, a current stands twice, or something is no number.
+    """
+    said = section.table[key]
+    if key == "gradient_table":
+        pairs = [p for p in said if isinstance(p, list) and len(p) == 2 and all(map(is_number, p))]
+        if len(pairs) < len(said):
+            wrong = next(p for p in said if p not in pairs)
+            raise section.error(f"{wrong!r}"[:80], "pairs [current in A, gradient in T/m]", key)
+        points = [(float(current), float(gradient)) for current, gradient in pairs]
+    else:
+        points = _points(read_sheet(Path(section.path).parent / said, EXAMPLE, MOST_ROWS), length)
+    currents = sorted(current for current, _ in points)
+    twice = next((a for a, b in pairwise(currents) if a == b), None)
+    if len(points) < 2 or twice is not None:
+        found = f"{twice:g} A twice" if twice is not None else f"{len(points)} points"
+        expected = "two or more points of different currents, one of each"
+        raise section.error(f"a gradient table with {found}", expected, key)
+    return sorted(points)
+
+
+def _points(sheet: Sheet, length: float) -> list[tuple[float, float]]:
+    """The points of a file."""
+    columns = columns_of(sheet, dict.fromkeys(("current_A", *GRADIENTS), ""))
+    given = [name for name in GRADIENTS if name in columns]
+    if "current_A" not in columns or len(given) != 1:
+        found = "columns " + ", ".join(sheet.names)
+        expected = "current_A and one of " + ", ".join(GRADIENTS)
+        raise sheet.header_error(found, expected)
+    factor = GRADIENTS[given[0]](length)
+    gradients = factor * sheet.numbers(given[0])
+    return list(zip(sheet.numbers("current_A").tolist(), gradients.tolist(), strict=True))

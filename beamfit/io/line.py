@@ -12,7 +12,7 @@ from beamfit.errors import InputError, expect, nearest
 from beamfit.io.columns import Columns
 from beamfit.io.emittance_gui import EmittanceGuiFile, is_emittance_gui, read_emittance_gui
 from beamfit.io.lattice import LatticeFile, element_of, read_toml_lattice
-from beamfit.io.measurement import read_quad_scan
+from beamfit.io.scan import read_quad_scan
 from beamfit.particles import REST_ENERGY, expected_energy
 from beamfit.studies.scan.scans import QuadScan
 

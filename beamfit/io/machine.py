@@ -1,4 +1,4 @@
-"""Machine files: the variables of a control system that a scan or a watch uses, checked TOML."""
+"""Machine files: the variables of a control system for a scan or a watch, checked TOML."""
 
 from __future__ import annotations
 
@@ -6,13 +6,16 @@ import math
 from dataclasses import dataclass, replace
 from os import PathLike
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from beamfit.errors import InputError, nearest, plain
-from beamfit.io.headers import ALSO, SETTINGS
+from beamfit.io.columns import UNITS
+from beamfit.io.headers import ALSO, SETTINGS, known_unit
 from beamfit.io.lattice import LatticeFile
 from beamfit.io.line import part_of, read_lattice
+from beamfit.io.record_columns import QUANTITIES
 from beamfit.io.toml import LIST, TABLE, TEXT, Key, Section, is_number, read_toml
+from beamfit.studies.decay.conditions import Conditions
 
 FORMAT = "beamfit-machine-1"
 APPROACHES = ("either", "below", "above")
@@ -33,14 +36,14 @@ MAGNET = {
     "tolerance": Key("tolerance", **POSITIVE),
     "settle_s": Key("settle", low=-1e-9, high=3600.0, said="a time of zero or more"),
     "timeout_s": Key("timeout", default=60.0, **WAIT),
-    "approach": Key("approach", kind=TEXT, default="either"),
+    "approach": Key("approach", kind=TEXT, default="either", among=APPROACHES),
     "approach_by": Key("approach_by", default=0.0, low=-1e-12, said="zero or more"),
     "degauss": Key("degauss", kind=LIST, default=()),
 }
 SCREEN = {
     "name": Key("name", kind=TEXT, default=None),
     **{name: Key(name, kind=TEXT, default=None) for name in ("x", "y", "profile_x", "profile_y")},
-    "unit": Key("unit", kind=TEXT, default="um"),
+    "unit": Key("unit", kind=TEXT, default="um", among=tuple(LENGTHS)),
     "pixel_um": Key("pixel", 1e-6, default=None, **POSITIVE),
     "shots": Key("shots", default=5, low=1.0, high=1001.0, said="2 to 1000 shots"),
     "timeout_s": Key("timeout", default=10.0, **WAIT),
@@ -59,7 +62,6 @@ SCAN = {
     "restore_s": Key("restore", default=60.0, **WAIT),
 }
 TOP = {
-    "format": PV,
     "name": Key("name", kind=TEXT, default=""),
     "lattice": Key("lattice", kind=TEXT, default=None),
     "timeout_s": Key("timeout", default=5.0, **WAIT),
@@ -228,9 +230,7 @@ def read_scan_machine(path: str | PathLike[str]) -> ScanMachine:
 
 def read_machine(path: str | PathLike[str]) -> tuple[Section, dict[str, Any]]:
     """A machine file, and what stands at its top."""
-    top = read_toml(path, "a machine")
-    if (found := top.table.get("format")) != FORMAT:
-        raise top.error(f"format {found!r}"[:80], f'format = "{FORMAT}"', "format")
+    top = read_toml(path, "a machine", FORMAT)
     return top, top.values(TOP)
 
 
@@ -259,9 +259,6 @@ def _magnet(section: Section, lattice: LatticeFile) -> Magnet:
     if not magnet.tolerance < 0.1 * (magnet.high - magnet.low):
         expected = "less than a tenth of the range; is it in the unit of the settings?"
         raise section.error(f"tolerance {magnet.tolerance:g}", expected, "tolerance")
-    if magnet.approach not in APPROACHES:
-        expected = nearest(magnet.approach, APPROACHES)
-        raise section.error(f"approach '{magnet.approach}'", expected, "approach")
     if magnet.approach != "either" and not magnet.approach_by > 0:
         expected = "how far beyond a setting to go first, in the unit of the settings"
         raise section.error(f"approach from {magnet.approach}", expected, "approach_by")
@@ -293,8 +290,6 @@ def _screen(section: Section, lattice: LatticeFile) -> Profiler:
     if bool(sizes) == bool(profiles):
         found = "sizes and projections" if sizes else "no sizes"
         raise section.error(found, "x and y, or profile_x and profile_y", "x")
-    if said["unit"] not in LENGTHS:
-        raise section.error(f"unit '{said['unit']}'", "um, mm or m", "unit")
     if profiles and said["pixel"] is None:
         raise section.error("projections without a scale", "pixel_um = ...", "pixel_um")
     name = said["name"] or lattice.default_screen
@@ -353,3 +348,150 @@ def moved(magnet: Magnet, value: float) -> float:
         expected = f"within its limits, {magnet.low:g} to {magnet.high:g}"
         raise InputError(f"a setting of {value:g} for {magnet.name}", expected)
     return float(value)
+
+
+# Keys are named as the columns of a decay record are.
+NAMES = ("beam_current", *Conditions._fields)
+UNITS_OF = {name: UNITS.get(QUANTITIES[name], {"": 1.0}) for name in NAMES}
+KEYS = {
+    f"{name}_{unit}".rstrip("_"): (name, unit, factor)
+    for name, units in UNITS_OF.items()
+    for unit, factor in units.items()
+}
+RING = {"file": Key("file", kind=TEXT, default=None)} | {
+    key: Key(key, kind=TEXT, default=None) for key in KEYS
+}
+LONG = "a time of 60 s to a week"
+WATCH = {
+    "window_s": Key("window", default=7200.0, low=59.9, high=604801.0, said=LONG),
+    "interval_s": Key("interval", default=10.0, low=0.99, high=3601.0, said="1 s to an hour"),
+    "reference_current_mA": Key("current", default=None, **POSITIVE),
+    "prefix": Key("prefix", kind=TEXT, default=None),
+}
+
+
+class Watched(NamedTuple):
+    """A variable that is watched: what it is, its name in the control system, its unit to SI."""
+
+    quantity: str
+    variable: str
+    unit: str
+    factor: float
+
+    def check(self, given: str) -> str | None:
+        """Compare with the unit that the control system gives; a note if nobody knows that one.
+
+        Raises
+        ------
+        InputError
+            If it is another one.
+
+        Examples
+        --------
+        >>> Watched("beam_current", "SR:I", "mA", 1.0).check("A")
+        Traceback (most recent call last):
+            ...
+        beamfit.errors.InputError: unit 'A' of 'SR:I'; expected mA, as in the machine file
+        """
+        known = UNITS_OF[self.quantity]
+        if not given or not self.unit or (found := known_unit(given)) == self.unit:
+            return None
+        if found in known and known[found] == self.factor:
+            return None
+        said = f"unit '{plain(given)}' of '{plain(self.variable)}'"
+        if found in known:
+            raise InputError(said, f"{self.unit}, as in the machine file")
+        return f"{said} is not understood: taken as {self.unit}"
+
+
+@dataclass(frozen=True)
+class WatchMachine:
+    """What `beamfit watch` needs to know of a machine.
+
+    Attributes
+    ----------
+    name, path, sha256 : str
+        Of the machine and its file.
+    variables : tuple of Watched
+        The current first.
+    ring : Path or None
+        The ring's own file.
+    window, interval : float
+        Of the sliding window, and from fit to fit, s.
+    current : float or None
+        Reference current, mA; never None with a ring.
+    prefix : str or None
+        Of the variables that are served; None serves none.
+    timeout : float
+        Within which a variable has to answer, s.
+    """
+
+    name: str
+    path: str
+    sha256: str
+    variables: tuple[Watched, ...]
+    ring: Path | None
+    window: float
+    interval: float
+    current: float | None
+    prefix: str | None
+    timeout: float
+
+
+def read_watch_machine(path: str | PathLike[str]) -> WatchMachine:
+    """Read what a watch needs of a machine file.
+
+    Parameters
+    ----------
+    path : str or path
+        TOML, format "beamfit-machine-1" (docs/live.md); paths in it are beside it.
+
+    Returns
+    -------
+    WatchMachine
+
+    Raises
+    ------
+    InputError
+        If it cannot be used, naming line and key.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> file = Path(tempfile.mkdtemp()) / "ring.toml"
+    >>> text = 'format = "beamfit-machine-1"\\n[ring]\\nbeam_current_mA = "pva://SR:CURRENT"\\n'
+    >>> _ = file.write_text(text)
+    >>> read_watch_machine(file).variables[0].variable
+    'pva://SR:CURRENT'
+    """
+    top, said = read_machine(path)
+    ring = top.section("ring")
+    file = ring.values(RING)["file"]
+    variables = _variables(ring)
+    section = top.section("watch")
+    watch = section.values(WATCH)
+    if file is not None and watch["current"] is None:
+        expected = "reference_current_mA = ..., to which the ring scales lifetimes"
+        raise section.error("a ring file without it", expected, "reference_current_mA")
+    if watch["interval"] > watch["window"] / 3:
+        found = f"interval {watch['interval']:g} s in a window of {watch['window']:g} s"
+        raise section.error(found, "a third of the window, or less", "interval_s")
+    name = plain(said["name"] or Path(path).stem)
+    beside = None if file is None else Path(path).parent / file
+    return WatchMachine(
+        name, str(path), top.sha256, variables, beside, timeout=said["timeout"], **watch
+    )
+
+
+def _variables(ring: Section) -> tuple[Watched, ...]:
+    """The current, and the others by what they are."""
+    given = {key: name for key, name in ring.table.items() if key in KEYS}
+    found = [Watched(KEYS[key][0], text, *KEYS[key][1:]) for key, text in given.items()]
+    for one in found:
+        twice = [key for key in given if KEYS[key][0] == one.quantity]
+        if len(twice) > 1:
+            raise ring.error(f"{' and '.join(twice)}", f"one {one.quantity}", twice[1])
+    if not any(one.quantity == NAMES[0] for one in found):
+        expected = 'beam_current_mA = "VARIABLE", or _A or _uA, in [ring]'
+        raise ring.error("no beam current", expected, "beam_current_mA")
+    return tuple(sorted(found, key=lambda one: NAMES.index(one.quantity)))

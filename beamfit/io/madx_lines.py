@@ -11,14 +11,12 @@ from typing import NamedTuple
 
 from beamfit.errors import InputError, nearest
 from beamfit.io.files import digest, read_text
-from beamfit.io.lattice import LatticeFile
+from beamfit.io.lattice import MOST, LatticeFile
 from beamfit.io.madx import NO_MATTER, Attribute, Definition, Interpreter, word_of
 from beamfit.io.madx_values import NAME, words
 from beamfit.io.sequence_elements import NOTHING_AT_ZERO, Element, element_tables
 from beamfit.particles import REST_ENERGY, expected_energy
 
-# Elements of a line.
-MOST = 50_000
 # Gaps and overlaps in m that MAD-X takes for none.
 TINY = 1e-6
 # Half lengths from an element's reference point to its centre.

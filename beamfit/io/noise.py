@@ -46,16 +46,10 @@ def read_noise(path: str | PathLike[str]) -> Noise:
     >>> read_noise(file).scatter.middle
     0.03
     """
-    top = read_toml(path, "priors of noise")
+    top = read_toml(path, "priors of noise", FORMAT, needed=False)
     schema = {name: Key(default=None, kind=NUMBER) for name in SINGLE}
     schema |= {name: Key(default=None, kind=LIST) for name in PAIRS}
-    schema |= {
-        "source": Key(default=str(path), kind=TEXT),
-        "format": Key(default=FORMAT, kind=TEXT),
-    }
-    top.values(schema)
-    if top.table.get("format", FORMAT) != FORMAT:
-        raise top.error(f"format '{top.table['format']}'", f'format = "{FORMAT}"', "format")
+    top.values(schema | {"source": Key(default=str(path), kind=TEXT)})
     told: dict[str, Any] = {"source": top.table.get("source", str(path))}
     for name in (*SINGLE, *PAIRS):
         if name not in top.table:

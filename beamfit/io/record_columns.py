@@ -7,9 +7,9 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 from beamfit.errors import InputError
-from beamfit.io.dates import DAY_FIRST, dates_in_order
+from beamfit.io.cells import DAY_FIRST, dates_in_order
+from beamfit.io.columns import DATE, UNITS, Column, Sheet, columns_of
 from beamfit.io.headers import is_number, spelled, unit_at_end
-from beamfit.io.sheet import DATE, UNITS, Column, Sheet, columns_of
 from beamfit.studies.decay.conditions import Conditions
 
 QUANTITIES = {

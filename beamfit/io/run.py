@@ -9,10 +9,17 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from beamfit.errors import InputError
-from beamfit.io.columns import Columns, arranged, layout_of
+from beamfit.io.columns import (
+    DATE,
+    Column,
+    Columns,
+    Sheet,
+    columns_of,
+    left_aside,
+    left_out,
+)
 from beamfit.io.files import name_of
-from beamfit.io.sheet import DATE, Column, Sheet, columns_of, left_aside, left_out
-from beamfit.io.table import read_sheet
+from beamfit.io.table import read_columns
 from beamfit.studies.response.record import Run
 
 if TYPE_CHECKING:
@@ -71,9 +78,7 @@ def read_run(
     >>> print(read_run(file))
     run.csv: 10 rows over 9 s, inputs valve, outputs level
     """
-    layout = layout_of(columns)
-    sheet = read_sheet(path, EXAMPLE, MOST_ROWS, ragged=skip_bad, names=layout.header or None)
-    sheet = arranged(sheet.without(ignore), layout)
+    sheet = read_columns(path, EXAMPLE, columns, ignore, skip_bad, MOST_ROWS)
     named = {"u": tuple(inputs), "y": tuple(outputs)}
     columns = _columns(sheet, named)
     if TIME not in columns and step is None:

@@ -1,4 +1,4 @@
-"""Lines of MAD-X, MAD-8 and elegant files; the last two are read with pyAT's parsers."""
+"""Lines of MAD-X, MAD-8 and elegant files; pyAT's parsers read the last two, in a process apart."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import unicodedata
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
+from importlib.util import find_spec
 from os import PathLike
 from pathlib import Path
 from types import MappingProxyType
@@ -15,9 +16,9 @@ from typing import Any
 
 from beamfit.errors import InputError, nearest
 from beamfit.io.files import digest, read_text
+from beamfit.io.isolated import isolated
 from beamfit.io.lattice import LatticeFile
 from beamfit.io.madx_lines import read_madx
-from beamfit.io.sequence_bounds import bound, check_count
 from beamfit.io.sequence_elements import NOTHING_AT_ZERO, Source, element_tables, pyat_element
 from beamfit.particles import REST_ENERGY, expected_energy
 
@@ -91,6 +92,25 @@ def read_sequence(
     if DIALECTS[suffix] == MADX:
         return read_madx(path, use=use, energy=energy)
     source = Source(path, read_text(path), DIALECTS[suffix])
+    if find_spec("at") is None:
+        found = f"a {source.dialect} file, which needs pyAT to read"
+        raise source.error(found, "pip install 'beamfit[lattice]'")
+    name, particle, total, elements = isolated(
+        "pyAT", path, _valid(source), pyat_line, source, use, energy
+    )
+    return LatticeFile(path, digest(path), name, total, particle, tuple(elements))
+
+
+def pyat_line(
+    source: Source, use: str | None, energy: float | None
+) -> tuple[str, str, float, list[dict[str, Any]]]:
+    """Read a line with pyAT; called in a process of its own.
+
+    Returns
+    -------
+    tuple
+        Its name, the particle, its total energy in MeV and the tables of its elements.
+    """
     with _silence() as printed:
         try:
             parser = _parser(source)
@@ -107,14 +127,7 @@ def read_sequence(
             raise _unparsed(source, error) from None
     if not elements:
         raise source.error(f"'{name}' without elements", "a line with magnets and a screen", name)
-    return LatticeFile(
-        path=path,
-        sha256=digest(path),
-        name=name,
-        energy=total,
-        particle=particle,
-        elements=tuple(elements),
-    )
+    return name, particle, total, elements
 
 
 @contextmanager
@@ -128,12 +141,8 @@ def _silence() -> Iterator[io.StringIO]:
 
 def _parser(source: Source) -> Any:
     """Make pyAT's parser of the file's dialect, with the element types it lacks."""
-    try:
-        import at
-    except ImportError:
-        raise source.error(
-            f"a {source.dialect} file, which needs pyAT to read", "pip install 'beamfit[lattice]'"
-        ) from None
+    import at
+
     kinds = {MAD8: at.Mad8Parser, ELEGANT: at.ElegantParser}
     parser = kinds[source.dialect]()
     env = dict(parser.env)
@@ -149,7 +158,6 @@ def _parser(source: Source) -> Any:
         default = {k: v for k, v in parser["beam"].default_beam.items() if k != "energy"}
         parser["beam"].default_beam = MappingProxyType(default)
         parser["beam%"].pop("energy")
-    bound(parser)
     return parser
 
 
@@ -162,7 +170,8 @@ def _parse(parser: Any, source: Source) -> None:
         if not _balanced(text):  # on which the parser would never end
             raise ValueError("parentheses that do not match")
         if source.dialect != ELEGANT:
-            text = REFERENCE.sub(_reference, NO_MATTER.sub("", text))
+            # pyAT takes 2^3 behind := for the bits of 1.
+            text = REFERENCE.sub(_reference, NO_MATTER.sub("", text)).replace("^", "**")
         if source.dialect == ELEGANT:
             parser.rpn.stack.clear()  # a "% 3.7 sto k" leaves its number there
             text = ALONE.sub(r"\1,)", text)
@@ -172,6 +181,8 @@ def _parse(parser: Any, source: Source) -> None:
     parser._analyse = lambda key: None  # runs for ever on lines that hold one another
     parser.bases.append(Path(source.path).resolve().parent)  # where CALL looks
     parser.parse_lines(source.text.splitlines(keepends=True), final=False)
+    if any(str(said[2]).lower() == "call" for said in parser.postponed):
+        raise source.error("a CALL that pyAT does not carry out", "one file with all in it")
 
 
 def _reference(found: re.Match[str]) -> str:
@@ -319,7 +330,6 @@ def _check_members(parser: Any, source: Source, members: Any, name: str, seen: s
 def _expanded(parser: Any, source: Source, name: str, key: str) -> list[Any]:
     """Return the elements of a line as pyAT's, in order."""
     try:
-        check_count(parser, parser[f'"{key}"'])
         _check_members(parser, source, parser[f'"{key}"'], name, set())
         with warnings.catch_warnings(record=True) as warned:
             warnings.simplefilter("always")

@@ -6,7 +6,7 @@ import math
 from os import PathLike
 from typing import Any
 
-from beamfit.io.toml import NUMBERS, TABLE, TEXT, Key, Section, is_number, read_toml
+from beamfit.io.toml import NUMBERS, TABLE, Key, Section, is_number, read_toml
 
 FORMAT = "beamfit-systematics-1"
 # Key of the file: the number's name, and the SI value of one unit.
@@ -52,12 +52,10 @@ def read_systematics(path: str | PathLike[str]) -> dict[str, tuple[float | None,
     >>> read_systematics(file)
     {'energy': (None, 0.02), 'dispersion': (0.1, 0.02), 'Q.gradient': (None, 0.01)}
     """
-    top = read_toml(path, "systematics")
+    top = read_toml(path, "systematics", FORMAT, needed=False)
     schema = {name: Key(default=None, kind=NUMBERS) for name in TERMS}
     schema |= {name: Key(kind=TABLE, default=None) for name in TABLES}
-    top.values(schema | {"format": Key(kind=TEXT, default=FORMAT)})
-    if top.table.get("format", FORMAT) != FORMAT:
-        raise top.error(f"format '{top.table['format']}'", f'format = "{FORMAT}"', "format")
+    top.values(schema)
     found = {
         name: _prior(top, key, factor) for key, (name, factor) in TERMS.items() if key in top.table
     }

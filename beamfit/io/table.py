@@ -1,22 +1,21 @@
-"""Sheets of named columns from text, HDF5 and MATLAB files, and data frames."""
+"""Sheets of named columns from text, JSON, HDF5, MATLAB and SDDS files, and data frames."""
 
 from __future__ import annotations
 
 import csv
 import itertools
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from beamfit.errors import InputError, expect, located
-from beamfit.io import sdds
-from beamfit.io.cell_units import without_units
-from beamfit.io.commas import with_points
-from beamfit.io.files import Numbered, digest, text_lines
-from beamfit.io.hdf5 import hdf5_columns
+from beamfit.io.binary import hdf5_columns, is_sdds, matlab_variables, sdds_columns
+from beamfit.io.cells import check_length, numeric_rows, with_points, without_units
+from beamfit.io.columns import UNITS, Columns, Sheet, arranged, layout_of
+from beamfit.io.files import Numbered, digest, laid_out, read_json, text_lines
 from beamfit.io.headers import (
     HEAD,
     MARKS,
@@ -30,10 +29,6 @@ from beamfit.io.headers import (
     uncommented,
     with_units,
 )
-from beamfit.io.json_table import json_sheet
-from beamfit.io.matlab import read_vectors
-from beamfit.io.numeric import check_length, numeric_rows
-from beamfit.io.sheet import Sheet
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -41,15 +36,53 @@ if TYPE_CHECKING:
 # Rows of a file, and cells of one that is not all plain numbers: each is a text, 200 bytes.
 MOST_ROWS, MOST_WORDS = 12_000_000, 4_000_000
 HDF5 = {".h5", ".hdf5"}
-BINARY = {*HDF5, ".mat"}
-# Text with a header of another program's, by how it begins.
-FOREIGN = {sdds.SIGNATURE: sdds.sdds_head}
+MATLAB = ".mat"
+BINARY = {*HDF5, MATLAB}
 # How Excel says which separator a file has.
 SEPARATOR_LINE = re.compile(r"\s*\"?sep=.\"?\s*$", re.IGNORECASE)
 # In the names of a file without a header: cells that are not read.
 REST = "*"
 TFS_LINES = ("@", "$")
+# A file of the EPICS Archiver Appliance without a header begins so, and has these columns.
+ARCHIVER = re.compile(r"\d{9,11}(,[^,]+){4}\s*")
+ARCHIVED = ["secs", "val", "severity", "status", "nanos"]
+JSON = "another JSON file"
+EXPECTED = (
+    'columns of equal lengths, {"name": [...]}, one object a row, [{"name": ...}], or one channel '
+    'of the EPICS Archiver Appliance, [{"meta": …, "data": [{"secs": …}]}]'
+)
 WORD = re.compile(r'"[^"]*"|\S+')
+
+
+def read_columns(
+    path: str | PathLike[str] | DataFrame,
+    example: str,
+    columns: Columns = None,
+    ignore: Iterable[str] = (),
+    skip_bad: bool = False,
+    most: int = MOST_ROWS,
+) -> Sheet:
+    """Read the columns of a file under the names that a person says.
+
+    Parameters
+    ----------
+    path, example, most
+        As for `read_sheet`.
+    columns : str, path, mapping or Layout, optional
+        As `beamfit.io.columns.layout_of` reads it.
+    ignore : iterable of str
+        Columns to leave unread; * and ? stand for any letters.
+    skip_bad : bool
+        Leave out rows that have not as many cells as the header.
+
+    Raises
+    ------
+    InputError
+        As `read_sheet`, and of what is said of columns.
+    """
+    layout = layout_of(columns)
+    sheet = read_sheet(path, example, most, ragged=skip_bad, names=layout.header or None)
+    return arranged(sheet.without(ignore), layout)
 
 
 def read_sheet(
@@ -102,12 +135,10 @@ def read_sheet(
     if hasattr(path, "itertuples"):
         return _of_frame(path, most)
     expect(path, str | PathLike, "'scan.csv', or a pandas frame")
-    if (suffix := Path(path).suffix.lower()) in BINARY:
-        return _binary(path, suffix, most)
-    if suffix == ".json":
-        sheet = json_sheet(path)
-        check_length(len(sheet), most, path)
-        return sheet
+    if is_binary(path):
+        return _binary(path, most)
+    if Path(path).suffix.lower() == ".json":
+        return _of_json(path, most)
     return _read_text(path, example, most, ragged, names)
 
 
@@ -162,16 +193,14 @@ def _read_text(
 
 def _head(
     path: str | PathLike[str], example: str, comments: list[str]
-) -> tuple[list[str], int, str, Numbered]:
+) -> tuple[list[str], int | None, str, Numbered]:
     """Names of the columns, their line, what separates them, and the lines below, numbered."""
-    raw = text_lines(path)
-    first = next(raw, "")
-    whole = itertools.chain([first], raw)
-    for signature, read in FOREIGN.items():
-        if first.startswith(signature):
-            return read(path, enumerate(whole, start=1), comments)
+    whole = text_lines(path)
     head = uncommented(list(itertools.islice(whole, HEAD)))
     title, numbered = header_at(head), enumerate(itertools.chain(head, whole), start=1)
+    first = next((text for text in head if text.strip()), "")
+    if ARCHIVER.fullmatch(first):
+        return ARCHIVED, None, ",", numbered
     for line, text in numbered:
         if text.lstrip().startswith(MARKS + TFS_LINES):
             comments.append(bare(text))
@@ -295,13 +324,19 @@ def _check_header(names: list[str], example: str, path: str | PathLike[str], lin
         raise InputError("a table on its side", expected, path=path, line=line)
 
 
-def _binary(path: str | PathLike[str], suffix: str, most: int) -> Sheet:
-    """The datasets of an HDF5 file, or the vectors of a MATLAB file."""
-    comments: tuple[str, ...] = ()
-    if suffix in HDF5:
-        columns, comments = hdf5_columns(path, most, min(most, MOST_WORDS))
+def is_binary(path: str | PathLike[str]) -> bool:
+    """Tell a file that a library reads: HDF5 and MATLAB by the name, SDDS by how it begins."""
+    return Path(path).suffix.lower() in BINARY or is_sdds(path)
+
+
+def _binary(path: str | PathLike[str], most: int) -> Sheet:
+    """Datasets of an HDF5 file, vectors of a MATLAB file, columns of an SDDS file."""
+    suffix, comments = Path(path).suffix.lower(), ()
+    if suffix == MATLAB:
+        columns = matlab_variables(path)
     else:
-        columns = read_vectors(path)
+        read = hdf5_columns if suffix in HDF5 else sdds_columns
+        columns, comments = read(path, most, min(most, MOST_WORDS))
     if not columns:
         expected = "one dataset a column, at the top of the file"
         raise InputError("no datasets", expected, path=path)
@@ -313,3 +348,71 @@ def _binary(path: str | PathLike[str], suffix: str, most: int) -> Sheet:
             expected = f"{usual}, as in '{like}': datasets of equal lengths"
             raise InputError(f"{len(column)} readings", expected, path=path, column=name)
     return Sheet(path, tuple(columns), list(columns.values()), None, None, comments, digest(path))
+
+
+def _of_json(path: str | PathLike[str], most: int) -> Sheet:
+    """An object of lists (of objects by row as pandas has it), a list of rows, or a channel."""
+    content, said = read_json(path, JSON, EXPECTED), ()
+    with laid_out(path, JSON, EXPECTED):
+        if isinstance(content, dict):
+            columns = _planes(content) or {
+                n: list(c.values()) if isinstance(c, dict) else c for n, c in content.items()
+            }
+        elif content and all({"meta", "data"} & set(row) for row in content):
+            columns, said = _channel(content)
+        else:
+            names = dict.fromkeys(name for row in content for name in row)
+            columns = {name: [row.get(name) for row in content] for name in names}
+        if {type(column) for column in columns.values()} != {list}:
+            raise ValueError
+        cells = [["" if v is None else str(v).strip() for v in c] for c in columns.values()]
+        if len({*map(len, cells)}) > 1:
+            raise ValueError
+    check_length(len(cells[0]), most, path)
+    return Sheet(path, tuple(columns), cells, None, None, said, digest(path))
+
+
+def _channel(content: list[Any]) -> tuple[dict[str, list[Any]], tuple[str, ...]]:
+    """Columns of one channel of the EPICS Archiver Appliance, and what it says of it."""
+    if len(content) != 1:
+        expected = "one, of the beam current: a file for each"
+        raise InputError(f"{len(content)} channels", expected)
+    meta, data = content[0].get("meta") or {}, content[0]["data"]
+    if not data:
+        raise InputError("no readings", "two or more")
+    columns = {key: [one[key] for one in data] for key in ("secs", "nanos", "val")}
+    if (unit := meta.get("EGU")) in UNITS["current"]:
+        columns[f"val_{unit}"] = columns.pop("val")
+    return columns, tuple(f"{key}: {value}" for key, value in meta.items())
+
+
+def _planes(content: dict[str, Any]) -> dict[str, list[Any]] | None:
+    """Columns of a scan whose planes were measured at settings of their own; None if it is none.
+
+    Scans as PyEmittance saves them (pyemittance_data_….json), and lcls-tools and slac-measurements
+    (QuadScanEmittanceResult), sizes in m. The setting's unit is the magnet's own, and only a person
+    knows it: --columns 'quadvals=Q525_kG'.
+    """
+    by_letter = {"quadvalsx", "beamsizesx"} <= set(content)
+    if not by_letter and not {"quadrupole_pv_values", "rms_beamsizes"} <= set(content):
+        return None
+    names = ("quadvals", "beamsizes", "beamsizeserr")
+    names = names if by_letter else ("quadrupole_pv_values", "rms_beamsizes")
+    columns: dict[str, list[Any]] = {names[0]: []}
+    for i, plane in enumerate("xy"):
+        settings, *values = (
+            content.get(f"{name}{plane}") if by_letter else _part(content[name], i)
+            for name in names
+        )
+        start = len(columns[names[0]])
+        columns[names[0]] += settings or []
+        for kind, numbers in zip(("", "_error"), values, strict=False):
+            if numbers:
+                columns[f"size_{plane}{kind}_m"] = [None] * start + list(numbers)
+    length = len(columns[names[0]])
+    return {n: values + [None] * (length - len(values)) for n, values in columns.items()}
+
+
+def _part(values: Any, i: int) -> Any:
+    """One plane's part of a list, or of an object by number."""
+    return values.get(str(i)) if isinstance(values, dict) else values[i]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 import tomllib
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from os import PathLike
 from typing import Any, NamedTuple
@@ -18,6 +18,8 @@ DEEPEST = 20
 DEEP = re.compile(rf"(?:[\w\"'-]+[ \t]*\.[ \t]*){{{DEEPEST}}}")
 # A whole number that no other program reads, and whose decimal digits Python does not write.
 LONG = re.compile(r"\b0[xob][0-9A-Fa-f_]{250,}")
+# Words of which all are named, and not the nearest.
+MOST_LISTED = 3
 REQUIRED: Any = object()
 TEXT, LIST, FLAG, TABLE, NUMBER = str, list, bool, dict, (int, float)
 NUMBERS = (int, float, list)
@@ -49,6 +51,10 @@ class Key(NamedTuple):
         That range in words.
     kind : type
         Of the value.
+    among : sequence of str
+        Words of which a text is one.
+    each : type
+        Of the values of a list.
     """
 
     field: str = ""
@@ -58,6 +64,8 @@ class Key(NamedTuple):
     high: float = math.inf
     said: str = ""
     kind: Any = NUMBER
+    among: Sequence[str] = ()
+    each: Any = object
 
     def amiss(self, value: object) -> str | None:
         """Say what should stand there instead of a value, or None if the value is good.
@@ -70,16 +78,24 @@ class Key(NamedTuple):
         usual = KINDS[self.kind]
         if not isinstance(value, self.kind) or (isinstance(value, bool) and self.kind is not FLAG):
             return usual
-        if self.kind is TEXT and not value.strip():
-            return "a name"
+        if self.kind is TEXT:
+            known = not self.among or value in self.among
+            return None if known and value.strip() else self._words(value)
+        if self.kind is LIST and not all(map(self._fits, value)):
+            return self.said
         if self.kind not in (NUMBER, NUMBERS) or value == self.default:
-            return None
-        if self.kind is NUMBERS and not self.said:  # checked by who asked for it
             return None
         numbers = value if isinstance(value, list) else [value]
         if not numbers or not all(map(is_number, numbers)):
             return usual
         return None if all(self.low < number < self.high for number in numbers) else self.said
+
+    def _words(self, value: str) -> str:
+        few = " or ".join(self.among) or "a name"
+        return nearest(value, list(self.among)) if len(self.among) > MOST_LISTED else few
+
+    def _fits(self, value: object) -> bool:
+        return is_number(value) if self.each is NUMBER else isinstance(value, self.each)
 
     def in_si(self, value: Any) -> Any:
         """A good value in SI; what is neither number nor list of numbers as it is."""
@@ -214,7 +230,9 @@ class Section:
         return given[0]
 
 
-def read_toml(path: str | PathLike[str], what: str) -> Section:
+def read_toml(
+    path: str | PathLike[str], what: str, form: str = "", *, needed: bool = True
+) -> Section:
     """Read a TOML file.
 
     Parameters
@@ -223,16 +241,20 @@ def read_toml(path: str | PathLike[str], what: str) -> Section:
         The file.
     what : str
         What it should be, such as "a lattice".
+    form : str, optional
+        What its key ``format`` says.
+    needed : bool
+        Whether it has to say that.
 
     Returns
     -------
     Section
-        Its top level.
+        Its top level, without the format.
 
     Raises
     ------
     InputError
-        If it cannot be read or does not parse, with the line.
+        If it cannot be read or does not parse, with the line, or has another format.
 
     Examples
     --------
@@ -251,7 +273,7 @@ def read_toml(path: str | PathLike[str], what: str) -> Section:
         if long := LONG.search(text):
             line = text.count("\n", 0, long.start()) + 1
             raise ValueError(f"an integer of {len(long[0]) - 2} digits (at line {line})")
-        return Section(path, lines, tomllib.loads(text), sha256=digest(path))
+        table = tomllib.loads(text)
     except (ValueError, RecursionError) as error:  # integers too long, nesting too deep
         if re.search(r"^[^#=\n]*\bsize_[xy]_", text, re.MULTILINE):
             expected = "the scan first and the lattice after --lattice; are they swapped?"
@@ -260,3 +282,7 @@ def read_toml(path: str | PathLike[str], what: str) -> Section:
         line = int(told[1]) if told else len(lines)
         found = "TOML that does not parse ({})".format(re.sub(r"\s*\(at .*\)", "", str(error)))
         raise InputError(found, f"{what} file in TOML", path, line) from None
+    top = Section(path, lines, table, sha256=digest(path))
+    if form and (found := table.pop("format", None if needed else form)) != form:
+        raise top.error(f"format {found!r}"[:80], f'format = "{form}"', "format")
+    return top

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from beamfit.io.watched import Watched, WatchMachine
+from beamfit.io.machine import Watched, WatchMachine
 from beamfit.live.channel import Channel, LostError, Reading, kept, open_channel
 from beamfit.status import Status
 from beamfit.studies.decay.watch import CURRENT, RULE, Plan, State, noted, stepped

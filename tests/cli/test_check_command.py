@@ -6,7 +6,7 @@ import h5py
 import numpy as np
 import pytest
 
-from beamfit.io.understood import understand, with_lattice
+from beamfit.io.check import understand, with_lattice
 
 SCAN = """Q2_A,fwhm_x_mm,size_y_um,size_y_error_um,energy_MeV,screen
 0,0.2,200,4,30,PRE

@@ -10,7 +10,7 @@ from beamfit.errors import InputError
 from beamfit.greybox.activations import KINDS, Range, range_of
 from beamfit.greybox.gains import monotone_signs
 from beamfit.greybox.mlp import MLP, Gain, Layer, Port, dense
-from beamfit.io.network import read_network, write_network
+from beamfit.io.formulation import read_network, write_network
 from beamfit.language.network import format_network, parse_network
 
 # The report's own example (3.1.3), put together from its fragments; weights are its numbers

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from beamfit.errors import InputError
+from beamfit.io.check import understand
 from beamfit.io.decay_record import read_decay_record, read_lifetime_input, read_lifetimes
-from beamfit.io.measurement import read_quad_scan
-from beamfit.io.understood import understand
+from beamfit.io.scan import read_quad_scan
 from beamfit.studies.decay.record import LifetimeTable
 
 START = 1709290800.25  # 2024-03-01T11:00:00.25 UTC
@@ -285,11 +285,6 @@ def test_hdf5_of_columns_in_a_group_and_as_matrices(group, shape, tmp_path):
 def test_files_of_other_programs_say_how_to_write_a_table(tmp_path):
     two = [{"meta": {}, "data": []}] * 2
     for name, content, words in (
-        (
-            "a.sdds",
-            b"SDDS1\n&column name=Time, type=double, &end\n&data mode=binary &end\n",
-            "ascii",
-        ),
         ("a.dat", b"MATLAB 5.0 MAT-file, Platform: GLNXA64", "writetable"),
         ("a.json", json.dumps(two).encode(), "a file for each"),
     ):

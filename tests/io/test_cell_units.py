@@ -3,7 +3,7 @@
 import pytest
 
 from beamfit.errors import InputError
-from beamfit.io.measurement import read_quad_scan
+from beamfit.io.scan import read_quad_scan
 
 SIZES = ["111.5 um", "60.5 µm", "72.5um", "104 um"]
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from beamfit.errors import InputError
-from beamfit.io.measurement import read_quad_scan
+from beamfit.io.scan import read_quad_scan
 
 HEAD = "Q1_A,size_x_mm,size_x_error_mm\n"
 ROWS = "-2.5,0.1114,0.0011\n-1.5,0.0634,0.0003\n0,0.0536,0.0003\n1.5,0.0567,0.0005\n"

@@ -10,9 +10,9 @@ import scipy.io
 
 import beamfit
 from beamfit.cli import main
+from beamfit.io.binary import matlab_variables
 from beamfit.io.emittance_gui import read_emittance_gui
 from beamfit.io.line import build_line, read_inputs
-from beamfit.io.matlab import read_variable
 from beamfit.optics.elements import Drift, Quadrupole, Screen
 from beamfit.studies.scan.size_methods import compare_size_methods
 
@@ -219,7 +219,7 @@ def test_a_made_file_gives_the_beam_it_was_made_of(save):
 @pytest.mark.parametrize("compressed", [True, False])
 def test_both_ways_of_saving_and_what_scipy_reads(compressed, save):
     path = save(do_compression=compressed)
-    ours, theirs = read_variable(path, "data"), scipy.io.loadmat(path)["data"]
+    ours, theirs = matlab_variables(path, "data")["data"], scipy.io.loadmat(path)["data"]
     assert ours.dtype.names == theirs.dtype.names
     for name in ("quadVal", "twiss", "energy", "status"):
         np.testing.assert_array_equal(ours[name][0, 0], theirs[name][0, 0])
@@ -416,7 +416,7 @@ def test_files_that_are_something_else(tmp_path, monkeypatch, capsys, save):
         (other, "no variable 'data'"),
         (plain, "no struct"),
         (newer, "version 7.3"),
-        (bomb, "when unpacked"),
+        (bomb, "is damaged"),
         (tmp_path / "none.mat", "no such file"),
     ):
         code, _, err = run(monkeypatch, capsys, path)

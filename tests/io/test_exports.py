@@ -3,10 +3,10 @@
 import pytest
 
 from beamfit.errors import InputError
+from beamfit.io.check import understand
+from beamfit.io.columns import BLANK
 from beamfit.io.decay_record import read_decay_record
-from beamfit.io.measurement import read_quad_scan
-from beamfit.io.sheet import BLANK
-from beamfit.io.understood import understand
+from beamfit.io.scan import read_quad_scan
 
 Q, X = [-4.0, -3.0, -1.0, 0.0], [1115.5, 600.25, 104.0, 2180.0]
 COMMAS = ["-4,0;1.115,5", "-3,0;600,25", "-1,0;104,0", "0,0;2.180,0"]

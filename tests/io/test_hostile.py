@@ -11,11 +11,10 @@ import pytest
 
 import beamfit
 from beamfit.errors import InputError
-from beamfit.io import files, hdf5
-from beamfit.io.archive import archive_sheet
+from beamfit.io import files, isolated
+from beamfit.io.binary import hdf5_content
 from beamfit.io.files import digest, read_json
-from beamfit.io.result import read_fitted_beams
-from beamfit.io.saved import load_fit
+from beamfit.io.result import load_fit, read_fitted_beams
 from beamfit.io.table import read_sheet
 from beamfit.io.toml import read_toml
 
@@ -102,8 +101,9 @@ def test_hdf5_files_that_lead_elsewhere_or_claim_too_much(tmp_path, monkeypatch)
         with h5py.File(path, "w") as store:
             make(store)
         # In this process: the same code, without the time of starting another.
-        told, numbers = hdf5._told(path.read_bytes(), 12_000_000, 4_000_000)
-        assert (told["refused"][0], numbers) == (said, [])
+        with pytest.raises(InputError) as error:
+            hdf5_content(path.read_bytes(), 12_000_000, 4_000_000)
+        assert error.value.found == said
     assert "a filter of number 6" in refused(lambda p: read_sheet(p, ""), path)
 
 
@@ -113,9 +113,9 @@ def test_a_process_that_crashes_or_never_ends_is_one_line(tmp_path, monkeypatch)
         store["a"], store["b"], store["word"] = NUMBERS, np.float32(NUMBERS), ["x"] * 4
     sheet = read_sheet(path, "")
     assert (sheet["b"].tolist(), sheet["word"]) == ([0, 1, 2, 3], ["x"] * 4)
-    monkeypatch.setattr(hdf5, "PATIENCE", 0.01)
+    monkeypatch.setattr(isolated, "PATIENCE", 0.01)
     assert "does not read within 0.01 s" in refused(lambda p: read_sheet(p, ""), path)
-    monkeypatch.setattr(hdf5, "PATIENCE", 10)
+    monkeypatch.setattr(isolated, "PATIENCE", 10)
     monkeypatch.setattr(sys, "executable", "/bin/false")
     assert "is damaged" in refused(lambda p: read_sheet(p, ""), path)
 
@@ -127,7 +127,7 @@ def test_json_of_great_depth_and_long_numbers(content, tmp_path):
     for read in (
         load_fit,
         lambda p: read_fitted_beams(p, 0.511),
-        lambda p: archive_sheet(p, False),
+        lambda p: read_sheet(p, ""),
     ):
         assert str(path) in refused(read, path)
     path.write_text("9" * 400)

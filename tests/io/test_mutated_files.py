@@ -13,8 +13,9 @@ import beamfit
 from beamfit.errors import InputError
 from beamfit.io.emittance_gui import read_emittance_gui
 from beamfit.io.line import build_line, read_lattice
-from beamfit.io.measurement import read_quad_scan
+from beamfit.io.scan import read_quad_scan
 from tests.conftest import resident
+from tests.io.forked import in_forks  # noqa: F401
 from tests.io.test_emittance_gui import gui_data
 from tests.io.test_sequence import MADX
 

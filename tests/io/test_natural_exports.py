@@ -15,7 +15,8 @@ import scipy.io
 
 from beamfit.errors import InputError
 from beamfit.io.decay_record import read_decay_record
-from beamfit.io.measurement import read_quad_scan
+from beamfit.io.scan import read_quad_scan
+from tests.io.forked import in_forks  # noqa: F401
 
 pandas = pytest.importorskip("pandas")
 
@@ -129,6 +130,36 @@ SCANS = {
         "QUAD:IN20:525:BACT (kG)=Q525_kG",
     ),
 }  # fmt: skip
+
+
+def particles(path, name):
+    """Beams as openPMD-beamphysics stores them: a group each, what is the same for all beside."""
+    with h5py.File(path, "w") as file:
+        file.attrs.update({"openPMD": "2.0.0", "openPMDextension": "BeamPhysics;SpeciesType"})
+        for i, (quad, x, y) in enumerate(zip(SCAN["quad"], SCAN["x"], SCAN["y"], strict=True)):
+            beam = file.create_group(f"screen/{i}/electron")
+            file[f"screen/{i}"].attrs.update({"Q525_kG": quad} if name is None else {})
+            beam.attrs.update({} if name is None else {"latticeElementName": f"{name}{i}"})
+            for key, numbers, unit in (
+                ("position/x", [-1e-6 * x, 1e-6 * x, 5.0], 1.0),
+                ("position/y", [1.0 + 1e-6 * y, 1.0 - 1e-6 * y, 9.0], 1.0),
+                ("momentum/z", [135e6] * 3, 1.602176634e-19 / 299792458),
+                ("weight", [2e-15, 2e-15, 0.0], 1.0),
+            ):
+                beam.create_dataset(key, data=numbers).attrs["unitSI"] = unit
+            for key in ("momentum/x", "momentum/y"):
+                beam.create_group(key).attrs.update({"value": 0.0, "shape": [3], "unitSI": 1.0})
+
+
+def test_beams_of_openpmd_beamphysics(tmp_path):
+    particles(tmp_path / "a.h5", None)
+    scan = read_quad_scan(tmp_path / "a.h5")
+    assert (scan.settings["Q525"].tolist(), scan.energy_kind) == (SCAN["quad"], "momentum")
+    np.testing.assert_allclose(scan.energy, 135.0, rtol=1e-9)
+    particles(tmp_path / "b.h5", "OTR")
+    assert read_quad_scan(tmp_path / "b.h5").screen == tuple(f"OTR{i}" for i in range(5))
+    for plane in "xy":
+        np.testing.assert_allclose(1e6 * scan.size[plane], SCAN[plane], rtol=1e-9)
 
 
 def planes(names):

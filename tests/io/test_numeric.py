@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from beamfit.errors import InputError
-from beamfit.io import numeric, table
+from beamfit.io import cells, table
 from beamfit.io.decay_record import read_decay_record
 
 DATA = ("measurements", "tests/golden/data")
@@ -61,11 +61,11 @@ def outcome(path):
 
 def both(path, monkeypatch):
     slow = outcome(path)
-    monkeypatch.setattr(numeric, "LARGE", 0)
+    monkeypatch.setattr(cells, "LARGE", 0)
     calls = []
 
     def watched(*arguments):
-        calls.append(numeric.numeric_rows(*arguments))
+        calls.append(cells.numeric_rows(*arguments))
         return calls[-1]
 
     monkeypatch.setattr(table, "numeric_rows", watched)
@@ -88,7 +88,7 @@ def test_odd_tables_are_the_same_either_way(name, tmp_path, monkeypatch):
 
 
 def test_blocks_are_joined_at_lines(tmp_path, monkeypatch):
-    monkeypatch.setattr(numeric, "BLOCK", 1000)
+    monkeypatch.setattr(cells, "BLOCK", 1000)
     values = np.random.default_rng(1).normal(size=(500, 2)).round(6)
     path = tmp_path / "a.csv"
     path.write_text(HEAD + "\n".join(f"{a},{b}" for a, b in values))

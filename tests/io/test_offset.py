@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from beamfit.errors import InputError
-from beamfit.io.decay_record import read_decay_record
-from beamfit.io.monitor import offset_of
+from beamfit.io.decay_record import offset_of, read_decay_record
 from beamfit.studies.decay.fit import fit_decay
 
 

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from beamfit.errors import InputError
-from beamfit.io.ring import read_operation, read_ring, ring_from_pyat
-from beamfit.io.ring_tables import read_twiss
+from beamfit.io.ring import read_operation, read_ring, read_twiss, ring_from_pyat
 from beamfit.lifetime.losses import loss_coefficients
 
 SPEAR3 = Path("lattices/spear3_2003.toml")

@@ -10,7 +10,7 @@ import pytest
 
 import beamfit
 from beamfit.errors import InputError
-from beamfit.io.saved import HOMES
+from beamfit.io.result import HOMES
 from beamfit.studies.decay.fit import DecayFit
 from beamfit.studies.scan.results import PlaneFit
 from beamfit.table import json_of

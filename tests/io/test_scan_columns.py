@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from beamfit.errors import InputError
-from beamfit.io.measurement import read_quad_scan
+from beamfit.io.scan import read_quad_scan
 
 ROWS = [(-4.0, 111.5, 1.5), (-3.0, 60.0, 0.5), (-1.0, 104.0, 1.0)]
 METRES = np.array([111.5e-6, 60e-6, 104e-6])

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from beamfit.errors import InputError
 from beamfit.io.line import build_line, load_lattice, read_lattice
+from tests.io.forked import in_forks  # noqa: F401
 
 at = pytest.importorskip("at", reason="accelerator-toolbox is not installed")
 

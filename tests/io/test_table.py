@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from beamfit.errors import InputError
-from beamfit.io.sheet import UNITS, Sheet, columns_of
+from beamfit.io.columns import UNITS, Sheet, columns_of
 from beamfit.io.table import read_sheet
 
 EXAMPLE = "s_m,beta_x_m"

@@ -18,7 +18,7 @@ import pytest
 
 from beamfit.cli import main
 from beamfit.errors import InputError
-from beamfit.io.watched import Watched, read_watch_machine
+from beamfit.io.machine import Watched, read_watch_machine
 from beamfit.live.channel import Described, Reading, open_channel, run
 from beamfit.live.served import values_of
 from beamfit.live.watch import Arrived, _Course

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from beamfit.errors import InputError
-from beamfit.io.monitor import monitor_of
+from beamfit.io.decay_record import monitor_of
 from beamfit.lifetime.decay import HOUR
 from beamfit.quantity import Status
 from beamfit.studies.decay.fit import fit_decay, fit_decays

@@ -106,7 +106,7 @@ def decay_rows(decays: Sequence[Decay]) -> Rows:
     return _laid_out(decays, rows)
 
 
-# Rows of `decay_rows` that people look at second: they stand in the sentence, or say how it was had.
+# Rows of `decay_rows` that stand in the sentence, or say how the answer was had.
 SECOND = ("status", "readings", "rms residual", "errors")
 
 

@@ -11,15 +11,27 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from beamfit.errors import InputError, located
-from beamfit.io.columns import Columns, arranged, layout_of
+from beamfit.io.columns import (
+    UNITS,
+    Column,
+    Columns,
+    Sheet,
+    left_aside,
+    left_out,
+)
 from beamfit.io.emittance_gui import is_emittance_gui, read_emittance_gui
 from beamfit.io.files import name_of
 from beamfit.io.headers import SETTINGS
-from beamfit.io.scan_columns import ENERGIES, PERCENT, column_notes, is_scatter, scan_columns
-from beamfit.io.scan_comments import comment_notes
-from beamfit.io.sheet import UNITS, Column, Sheet, left_aside, left_out
+from beamfit.io.scan_columns import (
+    ENERGIES,
+    PERCENT,
+    column_notes,
+    comment_notes,
+    is_scatter,
+    scan_columns,
+)
 from beamfit.io.shots import average_shots
-from beamfit.io.table import read_sheet
+from beamfit.io.table import read_columns
 from beamfit.studies.scan.scans import POSSIBLE, USUAL, QuadScan, first_unusable, middle
 
 if TYPE_CHECKING:
@@ -93,11 +105,7 @@ def read_quad_scan(
         if columns is not None:
             raise InputError("--columns for a file of emittance_gui", "none: it says them", path)
         return read_emittance_gui(path).scan()
-    layout = layout_of(columns)
-    sheet = read_sheet(
-        path, "Q2_A,size_x_um", MOST_ROWS, ragged=skip_bad, names=layout.header or None
-    )
-    sheet = arranged(sheet.without(ignore), layout)
+    sheet = read_columns(path, "Q2_A,size_x_um", columns, ignore, skip_bad, MOST_ROWS)
     columns = scan_columns(sheet)
     if skip_bad:
         sheet = sheet.good(lambda rows: _values(rows, columns))
