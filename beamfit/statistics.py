@@ -171,7 +171,7 @@ def few_words(rests_on: float) -> str:
 
 
 def baseline(count: int) -> int:
-    """How many of some points, the first, say what is usual.
+    """Number of first points that form the baseline of a series.
 
     Examples
     --------

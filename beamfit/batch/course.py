@@ -53,7 +53,7 @@ class Course(NamedTuple):
 
     @property
     def beyond(self) -> np.ndarray:
-        """Whether each point lies beyond the limits, and 3 of its own errors from the centre."""
+        """True for each point beyond the limits and beyond 3 of its own errors from the centre."""
         return np.abs(self.value - self.centre) > np.maximum(self.limit, 3.0 * self.error)
 
 

@@ -24,7 +24,7 @@ BLOCK = 4096
 
 
 class Place(NamedTuple):
-    """Where the rows of a file are: bytes of a part; what they say, and why there is no answer."""
+    """Place of a file's rows (bytes of a part), their statuses, and the reason if refused."""
 
     part: Path
     start: int
@@ -62,7 +62,7 @@ class Ledger:
             self._learn(part, part.read_bytes())
 
     def answered(self, file: str) -> bool:
-        """Whether the same was asked of the same file before."""
+        """True if this job has answered the same file before."""
         place = self.places.get(file)
         try:
             return place is not None and place.sha256 == digest_now(file)

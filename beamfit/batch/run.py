@@ -33,7 +33,7 @@ INSTALL = "the extra: pip install 'beamfit[batch]'"
 
 
 class Batch(NamedTuple):
-    """What a batch did.
+    """Result of a batch.
 
     Attributes
     ----------
@@ -78,7 +78,7 @@ def files_of(paths: Iterable[str], kind: str) -> tuple[str, ...]:
 
 
 def _is_input(inside: Path) -> bool:
-    """Whether a file in a folder is neither hidden nor a part of an earlier batch."""
+    """True if a file in a folder is neither hidden nor a part of an earlier batch."""
     return not any(part.startswith(".") or part.endswith(".parts") for part in inside.parts)
 
 

@@ -106,7 +106,7 @@ def _check_kind(kind: str, of_scans: dict[str, Any]) -> None:
 
 
 class _Progress:
-    """One line on a terminal: files, files a second, what is left."""
+    """Progress on one line of a terminal: files, files a second, time left."""
 
     def __init__(self, shown: bool) -> None:
         self.shown, self.began, self.first = shown, time.monotonic(), None

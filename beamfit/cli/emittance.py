@@ -159,7 +159,7 @@ def _show_slices(terminal: Terminal, fits: SliceFits) -> None:
 def compared(
     gui: EmittanceGuiFile, line: Beamline, planes: tuple[str, ...]
 ) -> tuple[SizeMethods, ...]:
-    """What the size methods of a file of emittance_gui say of some planes."""
+    """Results by the size methods of an emittance_gui file, for these planes."""
     from beamfit.studies.scan.size_methods import compare_size_methods
 
     found = compare_size_methods(gui.scans, line, gui.stored, gui.means)
@@ -169,7 +169,7 @@ def compared(
 def results_of(
     fit: EmittanceFit, methods: tuple[SizeMethods, ...] = ()
 ) -> Iterator[dict[str, Any]]:
-    """What a fit says, and what small errors of the line and parts of the scan would change."""
+    """JSON entry of each plane: the fit, its systematics and its sensitivity to the range."""
     from beamfit.studies.scan.sensitivity import range_sensitivity, systematics
 
     ways = {m.plane: {"size_methods": m} for m in methods}

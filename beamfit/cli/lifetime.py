@@ -266,7 +266,7 @@ def _show_record(terminal: Terminal, study: RecordStudy) -> None:
 
 
 def _show_many(terminal: Terminal, study: RecordStudy) -> None:
-    """One row a decay; the name of the record is above."""
+    """Print a table with a row for each decay, below the record's name."""
     from beamfit.studies.decay import tables
     from beamfit.table import Table
 

@@ -210,7 +210,7 @@ def options(names: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
 
 
 class Sampling(NamedTuple):
-    """What --sample, --store and --seed say."""
+    """Values of --sample, --store and --seed."""
 
     wanted: bool
     store: str | None

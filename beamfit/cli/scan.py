@@ -86,7 +86,7 @@ def scan(
 
 
 class _Lines:
-    """What is said while a scan goes on: a line a point, with normalised emittances."""
+    """Progress of a scan: a line for each point, with normalised emittances."""
 
     def __init__(self, err: bool) -> None:
         self.err = err
@@ -115,7 +115,7 @@ class _Lines:
 
 
 def _known(plane: PlaneFit) -> str:
-    """What is known of an emittance by now, in a few words."""
+    """Present knowledge of a plane's emittance, in a few words."""
     if plane.emittance.error is None:
         return f"{plane.plane}: open"
     sure = "" if plane.status is Status.converged else f" ({cell(plane.status)})"

@@ -55,7 +55,7 @@ class _Console(Console):
 
 
 class Terminal:
-    """Where a command answers."""
+    """The terminal that a command writes to."""
 
     def __init__(self) -> None:
         # Names are shown as they are: a bracket in one is not a style.

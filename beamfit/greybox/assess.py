@@ -1,4 +1,4 @@
-"""Is a point an optimum, and what does it cost to hold its limits? Our own answer, not a solver's.
+"""Optimality of a point and multipliers of its limits, judged here and not by a solver.
 
 At an optimum of cost f within limits on c(theta) and bounds on theta there are multipliers y, z
 with grad f = J_c^T y + z (stationarity), y and z zero where a limit is not reached, not negative at
@@ -28,7 +28,7 @@ GROWN = 1e3
 
 
 class Slopes(NamedTuple):
-    """Everything of first order at a point."""
+    """Values and first derivatives at a point."""
 
     residual: np.ndarray
     residual_jacobian: Rows
@@ -39,7 +39,7 @@ class Slopes(NamedTuple):
 
     @property
     def finite(self) -> bool:
-        """Whether everything is."""
+        """True if every part is finite."""
         parts = (part.data if sparse.issparse(part) else part for part in self)
         return all(np.all(np.isfinite(part)) for part in parts)
 
@@ -63,14 +63,14 @@ class Limits(NamedTuple):
 
     @property
     def violation(self) -> np.ndarray:
-        """By how much each limit is crossed, in sizes."""
+        """Violation of each limit, in units of the limited value's size."""
         return (
             np.maximum(np.maximum(self.lower - self.value, self.value - self.upper), 0) / self.size
         )
 
     @property
     def reached(self) -> tuple[np.ndarray, np.ndarray]:
-        """Which lower and upper limits are reached."""
+        """True for each lower and each upper limit that is reached."""
         return self.value - self.lower <= self.near, self.upper - self.value <= self.near
 
     def distance(self, multiplier: np.ndarray) -> np.ndarray:
@@ -79,7 +79,7 @@ class Limits(NamedTuple):
         return np.where(multiplier > 0, low, np.where(multiplier < 0, high, 0.0))
 
     def states(self, multiplier: np.ndarray) -> np.ndarray:
-        """Whether each value is free, at its lower or upper limit, or fixed."""
+        """State of each value: free, at its lower or upper limit, or fixed."""
         low, high = self.reached
         cases = [self.lower == self.upper, low & ((multiplier > 0) | ~high), high]
         return np.select(cases, ["fixed", "lower", "upper"], "free")
@@ -93,7 +93,7 @@ class Multipliers(NamedTuple):
 
 
 class KKT(NamedTuple):
-    """How far a point is from an optimum; all three are zero at one.
+    """Residuals of the conditions of Karush, Kuhn and Tucker; all three are zero at an optimum.
 
     `stationarity` is the largest component of the Lagrangian's gradient in units of its terms,
     `feasibility` the largest violation in the size of what is limited, `complementarity` the
@@ -141,12 +141,12 @@ class State(NamedTuple):
 
     @property
     def feasible(self) -> bool:
-        """Whether all limits hold."""
+        """True if all limits hold within the tolerance."""
         return self.kkt.feasibility <= self.tolerance
 
     @property
     def optimal(self) -> bool:
-        """Whether it is an optimum to first order."""
+        """True if the conditions of first order hold within the tolerance."""
         return self.kkt.worst <= self.tolerance
 
 

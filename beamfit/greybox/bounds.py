@@ -24,7 +24,7 @@ _TINY = 1e-300  # covers underflow, which a relative error does not
 
 
 class Network(Protocol):
-    """What a bound reads of a network (`beamfit.greybox.mlp.MLP`, which stands on this module).
+    """The parts of a network that a bound reads (of `beamfit.greybox.mlp.MLP`, which uses this).
 
     `order` holds its layers in the order of computation, each with name, kind and size; a port has
     layer, node, scale and bias.

@@ -32,12 +32,12 @@ class Conflict(NamedTuple):
 
     @property
     def feasible(self) -> bool:
-        """Whether all constraints hold at the point."""
+        """True if all constraints hold at the point."""
         return not self.constraints
 
 
 def excess(data, theta):
-    """By how much each constraint is crossed, in sizes, where its weight is 1."""
+    """Violation of each constraint in units of its size, times its weight."""
     core, lower, upper, size, weight = data
     c = problem.constraints(core, theta)
     return weight * (jnp.maximum(lower - c, 0) + jnp.maximum(c - upper, 0)) / size
@@ -162,7 +162,7 @@ def dependence(p: Problem, s: State, stationary: bool) -> Dependence | None:
 
 
 def _changes(p: Problem, s: State) -> np.ndarray:
-    """By how much each constraint changes along the numbers, from points around."""
+    """Largest change of each constraint per unit of the numbers, at random points nearby."""
     unit = scale_of(p, s.theta, s.at).unit
     steps = np.random.default_rng(0).normal(size=(LOOKS, len(unit))) * NEAR * unit
     points = np.clip(s.theta + steps, p.lower, p.upper)

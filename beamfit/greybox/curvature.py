@@ -1,4 +1,4 @@
-"""Does the cost bend down at an optimum of first order, and where would it be lower?
+"""Second-order test of an optimum: directions in which the cost bends down.
 
 An optimum's Lagrangian does not bend downward along the limits that hold (Nocedal & Wright,
 Numerical Optimization, 2nd ed., section 12.5). Objectives are tested with exact derivatives,

@@ -45,7 +45,7 @@ WIDTH, LARGE = 4, 2**15
 
 
 class Found(NamedTuple):
-    """Where a start ended: numbers, half the sum of squares, steps, and whether it came to rest."""
+    """End of one start: numbers, half the sum of squares, steps, and if it came to rest."""
 
     theta: Array
     cost: Array
@@ -73,7 +73,7 @@ class Walk(NamedTuple):
 
     @property
     def memory(self) -> tuple[Array, Array, Array, Array]:
-        """What a search needs to go on."""
+        """State that the next segment of a search begins with."""
         return self.damping, self.growth, self.scale, self.steps
 
     @property
@@ -228,7 +228,7 @@ def _advance(residual, lower: Array, upper: Array, tolerance: float, moves, s: W
 
 
 def _easing(ratio: float) -> float:
-    """By how much the damping falls after a step that gained that share of its promise.
+    """Factor on the damping after a step that gained this share of its promised decrease.
 
     Nielsen's rule, and faster where a step gains what it promised: then steps become undamped and
     converge as fast as Gauss-Newton's. Few numbers keep to Nielsen's rule: in the flat valleys of
@@ -297,7 +297,7 @@ class Lanes:
 
     @property
     def done(self) -> np.ndarray:
-        """Which have come to rest, or cannot move."""
+        """True for each start that has come to rest or cannot move."""
         return self.at.rested | self.at.stuck
 
     def go(self, lanes: np.ndarray, limit: int, until: float | None) -> None:

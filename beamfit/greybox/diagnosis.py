@@ -135,7 +135,7 @@ def _looks(p: Problem) -> list[assess.Slopes]:
 
 
 def _rows(looks: list[assess.Slopes], which: Callable[[assess.Slopes], np.ndarray]) -> np.ndarray:
-    """Which numbers each row hangs on, at any of the points."""
+    """True for each row and number that it depends on, at any of the points."""
     return np.any([which(at) != 0 for at in looks], axis=0)
 
 

@@ -30,7 +30,7 @@ EDGES = ("lower", "upper")
 
 
 class Search(NamedTuple):
-    """What was done: every start, how many were moved onto bounds, the limit of time if it cut.
+    """Record of a search: its starts, those moved onto bounds, the time limit if it cut.
 
     `exact` tells whether second derivatives could be asked for, `conflict` what kept the search
     from a feasible point.
@@ -50,12 +50,12 @@ class Search(NamedTuple):
 
     @property
     def words(self) -> str:
-        """How many starts there were."""
+        """Number of starts, in words."""
         return f"{len(self.attempts)} start{'s' if len(self.attempts) != 1 else ''}"
 
 
 class Known(NamedTuple):
-    """What a point's residuals tell: groups of noise, spreads, directions not seen, rank.
+    """Information of a point's residuals: noise groups, spreads, undetermined directions, rank.
 
     `blind` tells which numbers would be open even if what is at a bound truly were there.
     """
@@ -70,7 +70,7 @@ class Known(NamedTuple):
 
 
 class Evidence(NamedTuple):
-    """What a verdict rests on; `chi2` and `dof` are of what has errors.
+    """Input of the verdict's rules; `chi2` and `dof` count residuals with errors only.
 
     `unseen` (n, k) are the directions that residuals do not see.
     """
@@ -129,7 +129,7 @@ def _stacked(blocks: list[Rows]) -> Rows:
 
 
 def settled(p: Problem, s: State) -> bool:
-    """Whether the search ended at an optimum as far as the data can tell.
+    """True if the search ended at an optimum as far as the data can tell.
 
     The decrease of chi-square that a further Gauss-Newton step promises, noise being what the
     scatter says where no errors were given, is below `SETTLED`. Networks have flat valleys in which

@@ -102,7 +102,7 @@ class Attempt(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """What a fit found and how far to believe it.
+    """Result of a fit, with its errors and verdict.
 
     Parameters
     ----------
@@ -290,7 +290,7 @@ class Fit:
 
     @property
     def optimum(self) -> Optimum:
-        """What the sampler needs to know of this fit."""
+        """This fit as a start for the sampler."""
         near = [a for a in self.attempts if a.kkt.worst <= self.problem.tolerance]
         return Optimum(
             self.theta,

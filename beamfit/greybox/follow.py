@@ -45,7 +45,7 @@ def followed(program: ClosedJaxpr, arguments: Sequence[Any], rule: Rule, kind: t
 
 
 def moves(step, operands: list[Any], kind: type) -> bool:
-    """Whether an operation moves elements to places that are known."""
+    """True if an operation only moves elements, to known positions."""
     first = MOVES.get(step.primitive.name)
     return first is not None and not (first and any(isinstance(v, kind) for v in operands[first:]))
 

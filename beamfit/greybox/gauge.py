@@ -84,7 +84,7 @@ def gauges(p: Problem, theta: np.ndarray, unseen: np.ndarray) -> tuple[Gauge, ..
 
 
 def _reached(tied: np.ndarray, first: int) -> set[int]:
-    """What hangs together with a number."""
+    """Numbers connected to one number, directly or through others."""
     group, fresh = {first}, {first}
     while fresh:
         fresh = {j for i in fresh for j in np.flatnonzero(tied[i]).tolist()} - group

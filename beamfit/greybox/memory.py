@@ -1,4 +1,4 @@
-"""Which noise with a memory is likely: what rows say of it, and quantities averaged over that.
+"""Posterior over noise models with a memory, and quantities averaged over it.
 
 The memory is not known either: each noise that is looked at whitens the rows once, and what is left
 of them says how likely it is and what the numbers are with it.
@@ -36,7 +36,7 @@ class Moments(NamedTuple):
 
 
 class Memory(NamedTuple):
-    """What rows of slopes and residuals say of the noise.
+    """Posterior over noise models, given Jacobian and residuals.
 
     Attributes
     ----------
@@ -101,7 +101,7 @@ class Memory(NamedTuple):
 
 
 def _inverted(within, scale: np.ndarray, probability: float) -> np.ndarray:
-    """By bisection: the reach within which so much lies."""
+    """Distance within which this probability lies, by bisection."""
     low, high = np.zeros_like(scale), 100.0 * scale
     for _ in range(50):
         middle = 0.5 * (low + high)
@@ -136,7 +136,7 @@ class Whitened(NamedTuple):
         return float(np.min(self.count * np.log(squares / self.count) - 2.0 * self.volume))
 
     def memory(self, numbers: int | None = None) -> Memory:
-        """What the rows say of the noise, the first `numbers` being free and others held.
+        """Posterior over noise models with the first `numbers` free and the others held.
 
         Directions that the rows do not see, by a share of `CUT`, are left where they are.
         """
@@ -182,7 +182,7 @@ def whitened_by_each(
 def _triangles(
     grid: Sequence[Noise], rows: np.ndarray, interval: np.ndarray, levels: Levels | None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Of one run, and the volumes; what depends on the correlation time alone is done once."""
+    """Triangular factors of one run's whitened rows, and log volumes, for each noise."""
     triangles, volumes = [], []
     for time, alike in groupby(grid, key=lambda noise: noise.time):
         with np.errstate(divide="ignore"):

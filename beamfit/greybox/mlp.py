@@ -30,7 +30,7 @@ class Layer(NamedTuple):
 
 
 class Port(NamedTuple):
-    """Where the outside world meets a node: outside value = scale * node value + bias.
+    """Input or output of a network: outside value = scale * node value + bias.
 
     The report does not say which way its scale and bias work; this reading makes both ends alike,
     and its example values look like standard deviations and means. `lower` and `upper` tell the

@@ -58,7 +58,7 @@ def endless(e: Evidence) -> Finding | None:
 
 
 def outgrown(s: assess.State) -> bool:
-    """Whether the start's cost was so tiny that its size is no measure of the end's."""
+    """True if the start's cost is too small to serve as the scale of the final cost."""
     cost, scale = s.at.cost, s.scale
     pole = np.any(np.abs(s.at.gradient) * scale.unit > AWAY * abs(cost))
     return bool(cost < ENDLESS * scale.cost and np.isfinite(cost) and not (pole or _far(s).any()))
@@ -103,7 +103,7 @@ def degenerate(e: Evidence) -> Finding | None:
 
 
 def _gap(e: Evidence) -> str:
-    """How far the point is from an optimum of first order, where it is none."""
+    """KKT residual in words, or nothing at an optimum of first order."""
     worst = e.state.kkt.worst
     return f" (KKT residual {worst:.1e})" if not e.state.optimal else ""
 
@@ -177,7 +177,7 @@ def optimal(e: Evidence) -> Finding:
 
 
 def _agreed(e: Evidence) -> int:
-    """How many starts ended on the answer."""
+    """Number of starts that ended on the answer."""
     least = ALIKE * max(e.state.scale.cost, abs(e.state.at.cost))
     ends = (a for a in e.search.attempts if a.kkt.worst <= e.problem.tolerance)
     return sum(abs(a.cost - e.state.at.cost) <= least for a in ends)

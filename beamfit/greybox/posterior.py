@@ -52,7 +52,7 @@ def _law(own, log_volume, derive, build) -> tuple[Law, Callable]:
         return own(tree.replace(data.core.model, data.core.chosen, theta))
 
     def residual(data: Sampled, moved: jax.Array) -> tuple[jax.Array, ...]:
-        """Of the records; priors are no measurements and know no common noise."""
+        """Residuals of the records, without priors: these share no noise with measurements."""
         model = model_of(data, moved)
         return tuple(record.residual(model) for record in data.core.records) or (jnp.zeros(0),)
 
@@ -235,7 +235,7 @@ def _with_slope(
 
 
 def _data(p: Problem, theta: np.ndarray, moving: np.ndarray, stated: Statement) -> Sampled:
-    """What the law needs; the solver's last digits do not make it another problem."""
+    """Data of the posterior's law; numbers that move are zeroed, so that equal problems compare."""
     fixed = np.array(theta)
     fixed[moving] = 0.0
     core = replace(p.core, model=tree.replace(p.core.model, p.core.chosen, jnp.asarray(fixed)))
@@ -250,7 +250,7 @@ def _widths(
     told: Mapping[str, float],
     priors: Mapping[str, Distribution],
 ) -> np.ndarray:
-    """How far each number may be from the optimum where the data do not say."""
+    """Largest distance of each number from the optimum where the data do not determine it."""
     width = np.where(np.isfinite(box), 0.5 * box, np.inf)
     width = np.minimum(width, [told.get(name, np.inf) for name in names])
     spread = [float(priors[name].std()) if name in priors else np.inf for name in names]
@@ -260,7 +260,7 @@ def _widths(
 def _groups(
     p: Problem, optimum: Optimum, stated: Statement, noise: str | None, outliers: bool
 ) -> tuple[Group, ...]:
-    """How each record scatters; a factor on errors cannot be inferred where nothing shows it."""
+    """Noise model of each record; a factor on its errors is free only if the data can show it."""
     groups = []
     for record, scale, given in zip(p.records, optimum.scales, optimum.given, strict=True):
         label = stated.labels.get(record.name, record.name if len(p.records) > 1 else "")
@@ -287,7 +287,7 @@ def _observed(p: Problem) -> dict[str, np.ndarray]:
 
 
 def _belonging(slopes: Sequence[np.ndarray], joined: bool) -> tuple[tuple[int, ...], ...]:
-    """Which record says most of each number, and which numbers some record or prior sees together.
+    """Record that says most of each number, and the pairs of numbers that some record or prior joins.
 
     Constraints are not looked into: where there are any, all numbers belong together.
     """

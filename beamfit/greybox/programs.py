@@ -17,7 +17,7 @@ from beamfit.greybox.problem import Problem
 
 
 class Budget(NamedTuple):
-    """How long a search may go on: steps from one start, and a moment on the clock or None.
+    """Limit of a search: iterations from one start, and a time on the clock or None.
 
     `solver` is the one asked for, if any, `tolerance` that of the problem.
     """
@@ -57,7 +57,7 @@ class Program(NamedTuple):
 
 
 class Proposal(NamedTuple):
-    """Where a solver ended, after how many iterations, and what it said."""
+    """End of a solver's search: point, number of iterations, the solver's own message."""
 
     x: np.ndarray
     iterations: int

@@ -40,7 +40,7 @@ class _Unknown(Exception):
 
 
 class Curve(NamedTuple):
-    """How every element of an array depends on the numbers.
+    """Curvature and degree of every element of an array as a function of the numbers.
 
     `sign` is 0 if it is affine, 1 convex, -1 concave, None if it is not known; `degree` is that of
     a polynomial, infinite if it is none.
@@ -51,7 +51,7 @@ class Curve(NamedTuple):
 
 
 def convex(p: Problem) -> bool:
-    """Whether a problem is proved to be convex: a convex cost within a convex set."""
+    """True if the problem is proved convex: a convex cost within a convex set."""
     cost = _curve(p, problem.cost)
     if cost is None or not (_upward(cost) or (cost.degree <= 2 and _positive(p))):
         return False
@@ -74,7 +74,7 @@ def _upward(curve: Curve) -> bool:
 
 
 def _positive(p: Problem) -> bool:
-    """Whether the Hessian of a quadratic cost has no negative eigenvalue."""
+    """True if the Hessian of a quadratic cost has no negative eigenvalue."""
     h = np.asarray(p.compiled(_hessian)(p.start))
     if not np.all(np.isfinite(h)):
         return False
@@ -87,7 +87,7 @@ def _hessian(core, theta):
 
 
 def _curve(p: Problem, function) -> Curve | None:
-    """How a function of (core, theta) depends on theta; None if it is not known."""
+    """Curve of a function of (core, theta) in theta; None if it is not known."""
     program, given = p.program(function)
     try:
         (found,) = followed(program, [*given, Curve(0, 1.0)], _rule, Curve)
@@ -156,7 +156,7 @@ def _composed(name: str, numbers: list[Curve]) -> int | None:
 
 
 def _common(signs: list[int | None]) -> int | None:
-    """Of a sum: that of all its terms, affine ones apart."""
+    """Sign of a sum's curvature: the one of all its terms that are not affine, else None."""
     bent = {sign for sign in signs if sign != 0}
     return 0 if not bent else bent.pop() if len(bent) == 1 else None
 

@@ -144,7 +144,7 @@ def _gap(problem: Quadratic, now: _Point) -> jax.Array:
 
 
 def _reach(problem: Quadratic, now: _Point, way: _Point) -> jax.Array:
-    """How far one may go until something that is positive is not, at most 1."""
+    """Longest step, at most 1, that keeps all slacks and multipliers positive."""
     soft = jnp.isfinite(problem.cost)
     values = jnp.concatenate([now.room, now.force, now.passed, _other(problem, now)])
     changes = jnp.concatenate([way.room, way.force, way.passed, -1.0 * soft * way.force])

@@ -193,7 +193,7 @@ def _drawn(p: Problem, number: int, seed: int) -> np.ndarray:
 
 
 def _good(s: State) -> bool:
-    """Whether a point is an optimum, to second order."""
+    """True if a point is an optimum to second order."""
     bent = s.bend is not None and (s.bend.direction is not None or s.bend.newton > curvature.STEP)
     return s.optimal and not bent
 
@@ -302,7 +302,7 @@ def _account(p: Problem, lanes: Lanes, lane: int, s: State | None) -> Attempt:
 
 
 def _judged(p: Problem, lanes: Lanes, lane: int) -> State:
-    """One search's end."""
+    """Judged end of one search."""
     theta = lanes.at.theta[lane].copy()
     at = assess.of_squares(lanes.at.residual[lane], lanes.at.jacobian[lane])
     return assess.state(p, theta, assess.scale_of(p, theta, at), at)

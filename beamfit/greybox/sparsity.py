@@ -71,7 +71,7 @@ class Pattern:
         return sweeps
 
     def holds(self, found: sparse.csr_array, swept: np.ndarray) -> bool:
-        """Whether the sweep of all numbers is what the matrix gives: a probe of the pattern."""
+        """True if a sweep along all numbers agrees with the matrix: the pattern is complete."""
         size = abs(found) @ self.seeds[-1]
         wrong = np.abs(found @ self.seeds[-1] - swept[-1])
         return not np.any(wrong > PROBE * (size + np.max(size, initial=0.0)))

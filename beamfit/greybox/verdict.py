@@ -1,4 +1,4 @@
-"""From the end of a search to a verdict: what the data determine, the gravest rule that applies."""
+"""Verdict on the end of a search: what the data determine, the gravest rule that applies."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from beamfit.verdict import Finding
 
 
 def _inner_failure(p: Problem, theta: np.ndarray) -> str | None:
-    """What an implicit map inside the model says of its own convergence at the answer."""
+    """Failure of an implicit map in the model to converge at the answer, or None."""
     if not p.has_part(Implicit):
         return None
     look = checkify.checkify(jax.jit(problem.values), errors=checkify.user_checks)
@@ -209,7 +209,7 @@ WITHOUT_DATA = (
 
 
 def _remarks(e: Evidence) -> list[str]:
-    """What became of starts, and whether time ran out."""
+    """Remarks on the starts and on the time limit."""
     search, said = e.search, []
     count = len(search.attempts)
     if search.dropped:

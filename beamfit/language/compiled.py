@@ -40,7 +40,7 @@ class Program:
 
     @property
     def scope(self) -> Scope:
-        """Its names."""
+        """Names of the mapping."""
         return self.order.scope
 
     @cached_property

@@ -175,7 +175,7 @@ class Goal:
 
 @dataclass(frozen=True)
 class Problem:
-    """What is free, what is limited, what is best."""
+    """The problem of a document: goals, variables, limits."""
 
     goals: tuple[Goal, ...]
     variables: tuple[Variable, ...] = ()

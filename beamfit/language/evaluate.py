@@ -40,7 +40,7 @@ class Value(NamedTuple):
 
 @dataclass(frozen=True)
 class Setting:
-    """In which an expression is evaluated.
+    """Context in which an expression is evaluated.
 
     `known` holds values of nodes computed elsewhere, by identity; `watch` is told every value.
     """

@@ -53,7 +53,7 @@ class Number(Expression):
 
     @property
     def value(self) -> float:
-        """What it is."""
+        """The number."""
         return float(self.text)
 
 

@@ -18,7 +18,7 @@ MOST_TRIED = 64
 
 
 class Written(NamedTuple):
-    """Along which dimension an array advances, and where it begins."""
+    """Dimension along which an array advances, and its first index there."""
 
     dim: int
     start: int
@@ -114,7 +114,7 @@ def _planned(scope, steps, owners, chosen) -> Plan | None:
 
 
 def _lag(read: Read, written: Written | None, k: int, length: int) -> Lagged | None:
-    """How far back a read lies along the time axis k; None if that changes, or lies ahead."""
+    """Lag of a read along the time axis k; None if it changes or is negative."""
     if written is None:
         return None
     rank = read.indices[0].ndim

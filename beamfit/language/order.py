@@ -1,4 +1,4 @@
-"""In which order the steps of a mapping are computed: which elements each defines and needs."""
+"""Order in which the steps of a mapping are computed, from the elements each defines and needs."""
 
 from __future__ import annotations
 

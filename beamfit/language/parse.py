@@ -78,7 +78,7 @@ def _parsed(text: str, start: str) -> Any:
 
 
 def _place(children: list[Any]) -> Place:
-    """Where the first of some parts stands."""
+    """Place of the first of some parts."""
     for child in children:
         if isinstance(child, Token):
             return Place(child.line, child.column)
@@ -107,7 +107,7 @@ class _Builder(Transformer):
     """Rules of the grammar to the values they stand for."""
 
     def STRING(self, token):
-        """Without its quotes, where it stood."""
+        """Content of a quoted text, with its place."""
         try:
             return token.update(value=json.loads(token))
         except ValueError:

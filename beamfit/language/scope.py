@@ -51,7 +51,7 @@ class IndexSet:
         return np.argsort(self.elements, kind="stable")
 
     def positions(self, values: np.ndarray) -> np.ndarray:
-        """Where values stand; -1 for those that are no elements."""
+        """Positions of values in the set; -1 for values that are no elements."""
         if self.step == 1:
             at = values - self.elements[0]
             return np.where((at >= 0) & (at < len(self)), at, -1)
@@ -80,22 +80,22 @@ class Array(NamedTuple):
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """Its lengths."""
+        """Length of each dimension."""
         return tuple(map(len, self.dims))
 
     @property
     def size(self) -> int:
-        """Its number of elements."""
+        """Number of elements."""
         return int(np.prod(self.shape, dtype=np.int64))
 
     @property
     def said(self) -> str:
-        """Its name with its dimensions."""
+        """Name with dimensions."""
         inner = ", ".join(dim.name or str(len(dim)) for dim in self.dims)
         return f"{self.name}[{inner}]" if self.dims else self.name
 
     def element(self, position: int) -> str:
-        """Its name with the index of an element, in C order."""
+        """Name with the index of an element, in C order."""
         if not self.dims:
             return self.name
         at = np.unravel_index(position, self.shape)
@@ -112,7 +112,7 @@ class Step(NamedTuple):
 
     @property
     def at(self) -> Place:
-        """Where it stands."""
+        """Place in the document."""
         return self.what.at
 
 
@@ -148,12 +148,12 @@ class Scope:
 
     @property
     def inputs(self) -> dict[str, Array]:
-        """What is given to it."""
+        """Arrays that are inputs."""
         return {k: a for k, a in self.arrays.items() if a.role == "input"}
 
     @property
     def outputs(self) -> dict[str, Array]:
-        """What it gives."""
+        """Arrays that are outputs."""
         return {k: a for k, a in self.arrays.items() if a.role == "output"}
 
     def constant(self, name: str) -> float | None:
@@ -297,7 +297,7 @@ def _outside(node, index, dim, axes, values, at) -> InputError:
 
 
 def said_at(axes: Axes, at: Sequence[int], lengths: Sequence[int], word: str) -> str:
-    """Where iterators stand, behind a word; nothing where none of them matters."""
+    """Values of the iterators, after a word; empty if none of them matters."""
     found = [
         f"{name.rstrip(HIDDEN)} = {s.elements[i]}"
         for (name, s), i, n in zip(axes.items(), at, lengths, strict=False)

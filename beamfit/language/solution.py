@@ -45,7 +45,7 @@ TOLERANCES = {"major feasibility tolerance", "major optimality tolerance"}
 @shown
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """What the solver found, in the names of the document.
+    """Answer of the solver, in the names of the document.
 
     Parameters
     ----------
@@ -81,7 +81,7 @@ class Solution:
 
     @property
     def message(self) -> str:
-        """Its sentence."""
+        """Sentence of the verdict."""
         return self.fit.message
 
     @property
@@ -91,7 +91,7 @@ class Solution:
 
     @property
     def solver(self) -> str:
-        """Which solvers were used from the start that led to the answer."""
+        """Solvers used from the start that led to the answer."""
         used = [a.solver for a in self.fit.attempts if np.array_equal(a.theta, self.fit.theta)]
         return (used or [a.solver for a in self.fit.attempts] or ["none"])[0]
 
@@ -268,7 +268,7 @@ def _started(made: Formulation) -> tuple[Formulation, tuple[str, ...]]:
 
 
 def _cause(made: Formulation, model: Mapping[str, np.ndarray]) -> str | None:
-    """Why the objective, a limit, or a derivative of them is not finite."""
+    """Cause of an objective, limit or derivative that is not finite."""
     problem = made.document.problem
     names = [one.model for one in (*problem.goals, *problem.limits)]
     found = cause_of(made.program, model, names)
@@ -276,7 +276,7 @@ def _cause(made: Formulation, model: Mapping[str, np.ndarray]) -> str | None:
 
 
 def _ailments(made: Formulation) -> list[str]:
-    """What the problem suffers from, but for what is told already with its place."""
+    """Defects that `diagnose` finds, except those reported elsewhere with their place."""
     found = (one for one in diagnose(made.problem) if one.kind not in TOLD_ELSEWHERE)
     return [f"{one.message[:-1]} ({_where(made, one.names)})." for one in found]
 
@@ -290,7 +290,7 @@ def _where(made: Formulation, names: Iterable[str]) -> str:
 
 
 def _places(made: Formulation, fit: Fit) -> list[str]:
-    """Where what the verdict is about stands in the document."""
+    """Places in the document that the verdict is about."""
     places = _where(made, fit.about)
     return [f"The verdict is about {places}."] if places else []
 

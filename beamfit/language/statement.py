@@ -182,7 +182,7 @@ def _free(document: d.Document, program: Program) -> tuple[list, dict[str, np.nd
 
 
 def _outside(v: d.Variable, given: Sequence[float] | None) -> list[str]:
-    """What there is to say of a start outside the bounds."""
+    """A warning if a variable's start lies outside its bounds."""
     begin = v.random or ((v.value,) if v.value is not None else given or (v.lower, v.upper))
     wrong = next((x for x in begin if not v.lower <= x <= v.upper), None)
     if wrong is None:
@@ -196,7 +196,7 @@ def _outside(v: d.Variable, given: Sequence[float] | None) -> list[str]:
 
 
 def _starts(v: d.Variable, shape, given) -> Iterator[np.ndarray]:
-    """Where searches start: drawn with the seed, or the value, or the middle of the bounds."""
+    """Starts of the search: drawn with the seed, or the value, or the middle of the bounds."""
     random = np.random.default_rng(v.seed)
     while v.random is not None:
         yield np.clip(random.uniform(*v.random, size=shape), v.lower, v.upper)

@@ -54,21 +54,21 @@ def gains_of(
 
 
 def targets(scope: Scope, step: Step) -> list[tuple[x.Name, Axes]]:
-    """Where a step writes, with the iterators in force there."""
+    """Names that a step writes, with the iterators in force there."""
     if isinstance(step.what, d.Assignment):
         return [(step.what.target, step.axes)]
     return [(w.target, widened(scope, step.axes, w.each)) for w in step.what.outputs]
 
 
 def sources(scope: Scope, step: Step) -> list[tuple[x.Expression, Axes]]:
-    """What a step computes from, with the iterators in force there."""
+    """Expressions that a step reads, with the iterators in force there."""
     if isinstance(step.what, d.Assignment):
         return [(step.what.value, step.axes)]
     return [(w.value, widened(scope, step.axes, w.each)) for w in step.what.inputs]
 
 
 def written(scope: Scope, node: x.Name, axes: Axes) -> Read:
-    """Where a target writes, which must be an output or a local variable."""
+    """The elements a target writes; it must be an output or a local variable."""
     found = scope.arrays.get(node.name)
     if found is None or found.role not in ("output", "real"):
         free = [a.name for a in scope.arrays.values() if a.role in ("output", "real")]

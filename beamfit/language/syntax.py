@@ -89,7 +89,7 @@ def explained(error: UnexpectedInput, text: str) -> InputError:
 
 
 def _habit(before: Token, token: Token, accepted: set[str], text: str) -> InputError | None:
-    """What other languages write otherwise: powers, assignments, products."""
+    """Error for a habit of other languages: powers, assignments, products; or None."""
     at, here = Place(before.line, before.column), Place(token.line, token.column)
     behind = text[token.end_pos : token.end_pos + 1]
     if token == "*" and before == "*":
@@ -123,7 +123,7 @@ def _misspelt(before: Token | None, token: Token, accepted: set[str]) -> InputEr
 
 
 def _choices(accepted: Any) -> str:
-    """What could stand there, in words."""
+    """Accepted tokens in words."""
     said = {SAID.get(name, name.lower()) for name in accepted}
     if {"real", "set", "a name"} <= said:
         return "a statement"

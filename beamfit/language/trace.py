@@ -1,4 +1,4 @@
-"""Why a document gives no number: the first part of a formula that is not finite, and where."""
+"""Trace of a document's first formula part that is not finite, with its place."""
 
 from __future__ import annotations
 
@@ -110,7 +110,7 @@ class _Watch:
 
 
 def _may_be_steep(e: x.Expression) -> bool:
-    """Whether a formula has an infinite derivative where it is zero."""
+    """True if a formula may have an infinite derivative where it is zero."""
     if isinstance(e, x.Application):
         return e.function in ("sqrt", "norm")
     if not (isinstance(e, x.Operation) and e.symbol == "^"):
@@ -119,7 +119,7 @@ def _may_be_steep(e: x.Expression) -> bool:
 
 
 def _of_group(program: Program, group: Group, arrays: Arrays, changed: Arrays) -> str:
-    """What is not finite behind a call, or in steps that advance: at their first bad time."""
+    """Description of what is not finite in a group: in a call, or at the first bad time."""
     scope = program.scope
     for step in group.steps if group.plan is None else group.plan.steps:
         axes = step.axes
@@ -156,7 +156,7 @@ def _of_step(program: Program, step: Step, s: Setting) -> str | None:
 
 
 def _of_call(program: Program, step: Step, s: Setting, slopes: bool = False) -> str | None:
-    """What is not finite in a mapping that is called, for the first point at which it is not."""
+    """Description of what is not finite in a called mapping, at its first bad point; or None."""
     callee = callee_of(s.scope, step.what)
     if not isinstance(callee, Scope):
         return None

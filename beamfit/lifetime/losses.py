@@ -23,7 +23,7 @@ NO_PRESSURE = 1e-30
 
 
 class Mechanism(NamedTuple):
-    """One way to lose beam.
+    """A mechanism of beam loss.
 
     Attributes
     ----------
@@ -167,7 +167,7 @@ def loss_coefficients(ring: Ring, operation: Operation, current: float | Array) 
 
 
 class Terms(NamedTuple):
-    """What first principles say at one setting, before scaling.
+    """Loss terms from first principles at one setting, before scaling.
 
     Attributes
     ----------

@@ -233,7 +233,9 @@ class Operation(NamedTuple):
 
 
 def unstored(operation: Operation, energy_loss: float, energy: float) -> str | None:
-    """What the RF voltage should be where it stores no beam of that loss and energy, eV; or None.
+    """Expected RF voltage, in words, if this one stores no beam of that loss and energy; or None.
+
+    Loss and energy are in eV.
 
     The main RF gives what a turn loses, less what the beam gains in a harmonic cavity.
     """

@@ -23,7 +23,7 @@ from beamfit.table import Table
 
 
 def _plain(value: Any) -> Any:
-    """What a value is made of: names of classes, texts and numbers."""
+    """A value as nested lists of class names, texts and numbers, for its digest."""
     if is_dataclass(value):
         return [type(value).__name__, *(_plain(getattr(value, f.name)) for f in fields(value))]
     if isinstance(value, tuple | list):
@@ -128,7 +128,7 @@ class Beamline:
 
     @cached_property
     def _first(self) -> dict[str, int]:
-        """Where the first element of each name stands."""
+        """Index of the first element of each name."""
         return {e.name: i for i, e in reversed(tuple(enumerate(self.elements)))}
 
     @cached_property

@@ -140,7 +140,7 @@ def _single(decays: Sequence[Decay]) -> list[Table]:
 
 
 def _verdicts(decays: Sequence[Decay]) -> list[Verdict]:
-    """One for each decay; of many decays one for each thing said."""
+    """Verdict of each decay; of many decays one for each distinct message."""
     if len(decays) <= tables.FEW:
         return [_verdict(decay) for decay in decays]
     return [Verdict(status, who, message) for status, who, message in tables.alike(decays)]
@@ -154,7 +154,7 @@ def _verdict(decay: Decay) -> Verdict:
 
 
 def _together(shift: Shift | None, trend: Trend | None) -> Iterator[Verdict]:
-    """What is said of all decays."""
+    """Verdicts on all decays together."""
     if shift is not None:
         fit, best, change = shift.fit, shift.best, shift.anomaly
         yield Verdict(fit.status, f"{len(fit.names)} decays together", fit.message)

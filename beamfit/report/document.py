@@ -46,12 +46,12 @@ class Verdict(NamedTuple):
 
     @classmethod
     def of(cls, result: Any) -> Verdict:
-        """What a result says of itself."""
+        """Status, headline and message of a result."""
         return cls(result.status, result.headline, result.message)
 
 
 class Picture(NamedTuple):
-    """What a picture shows, its height in inches, and how to draw it into a figure."""
+    """A picture: alternative text, height in inches, and a function that draws it."""
 
     alt: str
     height: float
@@ -102,12 +102,12 @@ def provenance(
 
 
 def written() -> str:
-    """When this is, for a subtitle."""
+    """Time of writing, for a subtitle."""
     return "written " + datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")
 
 
 def from_head(lines: Sequence[str]) -> tuple[str, ...]:
-    """What the head of a file says, as the notes of a page."""
+    """Comment lines at the head of a file, as notes of a page."""
     return ("From the head of the file:", *lines) if lines else ()
 
 

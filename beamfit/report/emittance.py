@@ -75,7 +75,7 @@ def emittance_page(fit: EmittanceFit, methods: tuple[SizeMethods, ...] = ()) -> 
 
 
 def about_input(notes: Sequence[str]) -> list[Table]:
-    """What is odd about a file, and what was done to its numbers."""
+    """Table of notes about the input: oddities, and changes made to its numbers."""
     return [Table("About the input", [], [[note] for note in notes])] if notes else []
 
 
@@ -90,7 +90,7 @@ def about_scan(scan: QuadScan) -> dict[str, Any]:
 
 
 def _budgets(fit: EmittanceFit, names: list[str]) -> list[Table]:
-    """What the emittance would be with another line or fewer points."""
+    """Tables of the emittance with another line and with fewer points."""
     changed = "Relative change of the normalised emittance, from exact derivatives."
     shifted = "Normalised emittance, and its shift in standard errors of the full fit."
     title, other = "If the line were a little different", "If some points were left out"
@@ -101,7 +101,7 @@ def _budgets(fit: EmittanceFit, names: list[str]) -> list[Table]:
 
 
 def _fitted_too(fit: EmittanceFit) -> list[Table]:
-    """What a scenario fitted besides the beam, and what the data leave open."""
+    """Tables of parameters fitted besides the beam, and of undetermined combinations."""
     header, parts = ["fitted too", "value", "bounds", "prior", "state"], []
     if rows := parameter_rows(fit.parameters):
         # What ties a network to the lattice; a calibration has priors instead.

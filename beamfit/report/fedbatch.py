@@ -78,7 +78,7 @@ def draw_batch(fit: FedBatchFit | TitreFit, i: int, figure: FigureBase) -> None:
 
 
 def draw_course(course: Course, figure: FigureBase) -> None:
-    """What comes of a feed profile, with bands, and the feed below."""
+    """Draw the predicted course of a feed profile, with error bands, and the feed below."""
     axes = figure.subplots(len(course.value) + 1, 1, sharex=True)
     for axis, (name, value) in zip(axes, course.value.items(), strict=False):
         axis.plot(course.time, value, color=BLUE)
@@ -91,7 +91,7 @@ def draw_course(course: Course, figure: FigureBase) -> None:
 
 
 def draw_ranking(ranked: Sequence[Ranked], figure: FigureBase) -> None:
-    """What an output hangs on, as correlations of normal variables of as much information."""
+    """Draw the nonlinear correlation of an output with each input."""
     axes = figure.subplots()
     order = list(reversed(ranked))
     axes.barh([each.name for each in order], [each.correlation for each in order], color=BLUE)

@@ -121,7 +121,7 @@ class _Pages:
 
 
 def width_of(words: str, size: float, weight: str = "normal") -> float:
-    """How wide a line of text is, inches."""
+    """Width of a line of text, inches."""
     font = FontProperties(size=size, weight=weight)
     return text_to_path.get_text_width_height_descent(words, font, ismath=False)[0] / 72
 

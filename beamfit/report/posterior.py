@@ -90,7 +90,7 @@ def _coefficient(value: float) -> str:
 
 
 def _how_sampled(title: str, found: Posterior) -> Table:
-    """How the draws were made and what they are worth."""
+    """Table of the sampling: noise, priors, draws, convergence."""
     d = found.diagnostics
     rows = [
         ["status", found.status.value.replace("_", " ")],

@@ -43,7 +43,7 @@ class Diagnostics(NamedTuple):
 
     @property
     def settled(self) -> bool:
-        """Whether the walkers agree and the chain is long against its own memory."""
+        """True if the walkers agree and the chain is many autocorrelation times long."""
         if self.steps == 0:
             return False
         agreed = bool(np.max(self.rhat) < AGREED)
@@ -132,7 +132,7 @@ def diagnose(chain: np.ndarray) -> Diagnostics:
 
 
 class Evidence(NamedTuple):
-    """What the rules look at: a chain's diagnostics, what was asked, and what the fit said.
+    """Input of the rules: the chain's diagnostics, the target, and the requested draws.
 
     `held` names the numbers asked for that the prior or the bounds decide.
     """

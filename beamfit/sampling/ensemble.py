@@ -1,4 +1,4 @@
-"""One sampler for every problem: start, warm up, sample, judge, go on or stop."""
+"""The sampler: start, warm up, sample, judge, go on or stop."""
 
 from __future__ import annotations
 
@@ -219,7 +219,7 @@ def _half_round(state: Checkpoint) -> slice:
 
 
 def _proposal(target: Target, state: Checkpoint) -> Proposal:
-    """How to leap: about the fit at first, then as fitted to the walkers of half a round."""
+    """Proposal of long moves: about the fit at first, then fitted to the last half round."""
     along = target.names.index(target.along) if target.along else -1
     first = about(target.covariance, target.widening, target.blocks, 5.0, along)
     recent = state.chain[_half_round(state)]
@@ -227,7 +227,7 @@ def _proposal(target: Target, state: Checkpoint) -> Proposal:
 
 
 def _next_stage(target: Target, state: Checkpoint, proposal: Proposal) -> Checkpoint:
-    """How often to leap from now on, and whether the walkers agree, which ends the warm-up."""
+    """Set the share of long moves from now on; end the warm-up once the walkers agree."""
     half = _half_round(state)
     recent, log_prob = state.chain[half], state.log_prob[half]
     # Chance of its own, so that looking at a proposal does not change the chain.

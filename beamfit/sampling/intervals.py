@@ -87,7 +87,7 @@ class Summary(NamedTuple):
 
 
 def interval_table(rows: Sequence[Summary], title: str = "", note: str = "") -> Table:
-    """One row a number: median and intervals."""
+    """Table with a row for each number: median and intervals."""
     cells = [row.row() for row in rows[:MOST_ROWS]]
     left = len(rows) - MOST_ROWS
     return Table(title, HEADER, [*cells, *([[f"and {left} more"]] if left > 0 else [])], note)
@@ -102,7 +102,7 @@ class Correlations(NamedTuple):
 
     @property
     def headline(self) -> str:
-        """Of what, in a line."""
+        """Names of the quantities, in a line."""
         return f"of {', '.join(self.names)}"
 
     def tables(self) -> tuple[Table, ...]:
@@ -124,7 +124,7 @@ class Band(NamedTuple):
 
 
 class Expected(NamedTuple):
-    """What a posterior expects of measurements; arrays of shape (n,) or (2, n).
+    """Posterior prediction of measurements; arrays of shape (n,) or (2, n).
 
     Attributes
     ----------

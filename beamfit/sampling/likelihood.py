@@ -35,7 +35,7 @@ class Own(NamedTuple):
 
 
 class Group(NamedTuple):
-    """How the points of one group scatter.
+    """Noise model of one group of points.
 
     Attributes
     ----------
@@ -59,12 +59,12 @@ class Group(NamedTuple):
 
     @property
     def prefix(self) -> str:
-        """Before the names of its numbers."""
+        """Prefix of the names of its numbers."""
         return f"{self.label}." if self.label else ""
 
     @property
     def inferred(self) -> bool:
-        """Whether the factor on its errors is free."""
+        """True if the factor on its errors is free."""
         return self.noise == "inferred"
 
     def own(self, factor: float = 1.0) -> tuple[Own, ...]:

@@ -18,7 +18,7 @@ PIECES, EACH, RARE = 6, 20, 0.05
 
 
 class Widening(NamedTuple):
-    """How numbers spread with a noise that is itself inferred: twice the noise, twice as wide.
+    """Widening of the numbers with an inferred noise: twice the noise, twice as wide.
 
     Attributes
     ----------
@@ -113,7 +113,7 @@ class Mixture(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Proposal:
-    """Where to leap, whatever the place one leaps from.
+    """Proposal of long moves, independent of the walker's present place.
 
     As a proposal of `emcee.moves.MHMove` it makes an independence sampler (L. Tierney, Annals of
     Statistics 22, 1701 (1994), section 2.3): exact whatever the proposal, fast where it is near
@@ -252,7 +252,7 @@ def _student(points: np.ndarray) -> Student:
 
 
 def _piecewise(points: np.ndarray, along: np.ndarray) -> Mixture:
-    """From above, where the tail is: pieces with few draws are one with those below."""
+    """Pieces of the draws from the tail down; a piece with few draws joins the next."""
     ends = np.linspace(along.min(), along.max(), PIECES + 1)[1:-1]
     piece, pieces, few = np.searchsorted(ends, along), [], np.zeros(0, int)
     for k in reversed(range(PIECES)):

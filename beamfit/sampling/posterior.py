@@ -170,7 +170,7 @@ class Posterior:
             return Correlations(names, np.corrcoef(columns).reshape((len(names),) * 2))
 
     def thinned(self, number: int = ENOUGH_DRAWS) -> np.ndarray:
-        """So many draws, evenly spaced along the chain, or all if there are fewer."""
+        """`count` draws, evenly spaced along the chain, or all if there are fewer."""
         draws = self.draws
         if len(draws) <= number:
             return draws
@@ -237,7 +237,7 @@ class Posterior:
 
     @property
     def apart(self) -> bool:
-        """Whether the walkers lie so far apart that no interval of theirs means anything."""
+        """True if the walkers disagree so much that their intervals mean nothing."""
         rhat = self.diagnostics.rhat
         return bool(rhat.size and np.max(rhat) > APART)
 

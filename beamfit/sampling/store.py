@@ -38,7 +38,7 @@ REMEDY = "; name another file, or move this one away"
 
 
 class Provenance(NamedTuple):
-    """Where a posterior comes from.
+    """Origin of a posterior.
 
     Attributes
     ----------
@@ -95,7 +95,7 @@ class Checkpoint(NamedTuple):
 
 
 def _moved(chain: np.ndarray) -> np.ndarray:
-    """Whether each walker moved in each step, shape (steps - 1, walkers)."""
+    """True for each walker and step in which it moved, shape (steps - 1, walkers)."""
     return np.any(np.diff(chain, axis=0) != 0, axis=2)
 
 
@@ -265,7 +265,7 @@ def load(path: str | PathLike[str], target: Target, seed: int, walkers: int) -> 
 def _difference(
     state: Checkpoint, names: tuple[str, ...], digest: str, target: Target, seed: int, walkers: int
 ) -> tuple[str, str] | None:
-    """In what a store is not the one to continue, and what would be; None if it is."""
+    """Difference of a store from the run to continue, and what was expected; None if equal."""
     if names != target.names:
         found = f"the posterior of other numbers, {', '.join(names)}"
         return found, f"one of {', '.join(target.names)}"
@@ -302,7 +302,7 @@ def _checkpoint(file: h5py.File) -> Checkpoint:
 
 
 def finished(path: str | PathLike[str]) -> bool:
-    """Whether a store holds a finished chain with its summary."""
+    """True if a store holds a finished chain with its summary."""
     import h5py
 
     try:

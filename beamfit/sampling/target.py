@@ -220,7 +220,7 @@ class Target:
 
     @cached_property
     def widening(self) -> Widening:
-        """How the noise, where it is inferred, widens the law's numbers."""
+        """Widening of the law's numbers by each inferred noise."""
         noises = [group.prefix + LOG_NOISE for group in self.groups]
         places = np.array([self.names.index(n) if n in self.names else -1 for n in noises])
         source = np.full(len(self.names), -1)
@@ -242,7 +242,7 @@ class Target:
 
     @cached_property
     def derived_units(self) -> tuple[str, ...]:
-        """Their units."""
+        """Units of the derived numbers."""
         return (*self.derived.values(), *(self.noise_unit for g in self.groups if g.inferred))
 
     def derive(self, thetas: np.ndarray) -> np.ndarray:

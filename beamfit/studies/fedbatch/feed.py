@@ -26,7 +26,7 @@ ROWS, ROUNDS = 31, 3
 
 
 class Course(NamedTuple):
-    """What comes of a feed profile.
+    """Predicted course of a batch under a feed profile.
 
     Attributes
     ----------
@@ -137,7 +137,7 @@ class FeedPlan:
 
     @property
     def headline(self) -> str:
-        """What was found, in a line."""
+        """The answer in a line."""
         return f"feed {self.status}: {self.hours} for {self.product.value:.4g} g of product"
 
     def tables(self) -> tuple[Table, ...]:

@@ -1,4 +1,4 @@
-"""From batches to judged rates: a search with the noise that its residuals have, bands, verdict."""
+"""Fit of growth rates to batches: search, noise from the residuals, bands, verdict."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ class FedBatchFit:
 
     @property
     def headline(self) -> str:
-        """What was found, in a line."""
+        """The answer in a line."""
         points = ", ".join(self.fit.model["rates"].inputs)
         return f"mu_b, mu_s {self.status}: of {points}, from {len(self.runs)} batches"
 

@@ -63,9 +63,9 @@ class Seen(NamedTuple):
 
 
 def known_at(b: Batches, x: Any, u: Any) -> dict[str, Any]:
-    """What a network may see, by name: states, the substrate by its logarithm, and inputs.
+    """Inputs of the networks by name: states, with the substrate's logarithm, and batch inputs.
 
-    Of the logarithm both ends of Monod's and Haldane's curves are alike.
+    In the logarithm both ends of Monod's and Haldane's curves are equally smooth.
     """
     known = dict(zip((*STATES, *b.inputs), [*x, *u], strict=True))
     return known | {"substrate": jnp.log(jnp.maximum(x[1], 0.0) + b.little)}

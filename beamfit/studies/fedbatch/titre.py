@@ -72,7 +72,7 @@ class TitreFit:
 
     @property
     def headline(self) -> str:
-        """What was found, in a line."""
+        """The answer in a line."""
         points = ", ".join(self.fit.model["make"].inputs)
         return f"titre {self.status}: of {points}, noise {self.noise}"
 
@@ -216,8 +216,8 @@ def _state(seen: Seen, model: Any, error: np.ndarray, free: Sequence[str] = OWN)
 
 
 class Ranked(NamedTuple):
-    """What an output hangs on: mutual information in nats, and the correlation of normal
-    variables that have as much, sqrt(1 - e^(-2 I)) (E. H. Linfoot, Information and Control 1
+    """Dependence of an output on one input: mutual information in nats, and the correlation of
+    normal variables with as much, sqrt(1 - e^(-2 I)) (E. H. Linfoot, Information and Control 1
     (1957) 85).
     """
 

@@ -30,7 +30,7 @@ class Noise(NamedTuple):
     relative: bool
 
     def errors(self, values: np.ndarray) -> np.ndarray:
-        """One standard deviation of each value."""
+        """Standard deviation of each value."""
         if not self.relative:
             return np.full_like(values, self.size)
         return self.size * np.hypot(values, FLOOR * np.max(np.abs(values)))
@@ -50,7 +50,7 @@ def noise_of(rest: np.ndarray, fitted: np.ndarray, read: np.ndarray) -> Noise:
 
 
 class Evidence(NamedTuple):
-    """What the rules look at; `fitted` has the shape of the readings."""
+    """Input of the rules; `fitted` has the shape of the readings."""
 
     fit: Fit
     rests: bool

@@ -100,7 +100,7 @@ class HeldBack(NamedTuple):
 
 
 def percent(rest: np.ndarray, y: np.ndarray) -> float:
-    """How much of y is explained: 100 (1 - |rest| / |y - mean|)."""
+    """Explained part of y in percent: 100 (1 - |rest| / |y - mean|)."""
     whole = float(np.linalg.norm(y - y.mean()))
     return 100.0 * (1.0 - float(np.linalg.norm(rest)) / whole) if whole > 0 else 0.0
 
@@ -164,15 +164,15 @@ def _share(residuals: tuple[np.ndarray, ...]) -> float:
 
 
 def _whitened(r: np.ndarray, memory: Sequence[float] | np.ndarray) -> np.ndarray:
-    """Less what the readings before tell, the first ones apart."""
+    """Residuals less their prediction from earlier ones; the first ones are dropped."""
     order = len(memory)
     return r[order:] - sum(m * r[order - k : -k] for k, m in enumerate(memory, start=1))
 
 
 def _memory(residuals: tuple[np.ndarray, ...]) -> np.ndarray:
-    """How residuals hang on those before: an autoregression, by least squares.
+    """Autoregression of the residuals, by least squares.
 
-    Of one order only, white noise on top of a drift would stay coloured.
+    With a first order alone, white noise on top of a drift would stay coloured.
     """
     order = max(1, min(ORDER, min(map(len, residuals)) // 20))
     before = [np.stack([r[order - k : -k] for k in range(1, order + 1)], axis=1) for r in residuals]
@@ -195,8 +195,8 @@ def _explained(
     slopes: Sequence[tuple[np.ndarray, np.ndarray]],
     delay: int,
 ) -> tuple[tuple[float, float], tuple[float, float]]:
-    """How much of the residuals a fuller model would explain, and its chance, all whitened alike;
-    and how much of what is left the inputs do that come after.
+    """Share of the whitened residuals that a fuller model explains, with its chance, and the share
+    of the rest that later inputs explain.
 
     A score test (Lagrange multipliers): columns are inputs before, those within the delay too,
     further paths of first order, and the slopes of the output by parameters that change with the

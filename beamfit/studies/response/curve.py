@@ -132,7 +132,7 @@ def derived(fit: Fit, errors: Memory | None, function: Callable, data: Any) -> D
 
 
 def quantity(found: Derived, i: Any, unit: str) -> Quantity:
-    """One of some numbers, without an error where the data do not determine it."""
+    """A quantity; it has no error where the data do not determine it."""
     error, raw = (float(e[i]) for e in (found.error, found.error_raw))
     known = np.isfinite(error)
     return Quantity(float(found.value[i]), error if known else None, unit, raw if known else None)
@@ -141,8 +141,10 @@ def quantity(found: Derived, i: Any, unit: str) -> Quantity:
 def told(
     quantities: Mapping[str, Quantity], curves: Sequence[Curve], seen: Seen, checks: Checks
 ) -> tuple[dict[str, Quantity], tuple[Curve, ...]]:
-    """Without errors where the runs determine nothing: of all where the inputs explain no more than
-    chance, of the gains of inputs that move together, of time constants not told from 0.
+    """Quantities and curves with errors only where the runs determine them.
+
+    No errors: of anything where the inputs explain no more than chance, of the gains of inputs that
+    move together, of time constants compatible with 0.
     """
     nothing = checks.nothing_probability >= POOR_FIT
     physics, inputs = seen.runs[0].physics, seen.inputs

@@ -1,4 +1,4 @@
-"""From runs to a judged response: start, delay, free-running fit, noise with a memory, verdict."""
+"""Fit of a response to runs: start, delay, free-running fit, noise with a memory, verdict."""
 
 from __future__ import annotations
 
@@ -97,7 +97,7 @@ class ResponseFit:
 
     @property
     def headline(self) -> str:
-        """What was found, in a line."""
+        """The answer in a line."""
         said = [f"{name} = {q}" for name, q in list(self.quantities.items())[:3]]
         found = ", ".join(said) or f"{len(self.curves)} parameter curves"
         return f"{self.output} {self.status}: {self.model}, {found}"

@@ -35,7 +35,7 @@ class Limited(NamedTuple):
 
 @dataclass(frozen=True)
 class _Value:
-    """One end of the enclosure of an output in every cell; equal ones share compiled code."""
+    """Lower or upper end of an output's enclosure in every cell; equal ones share compiled code."""
 
     output: int
     end: str

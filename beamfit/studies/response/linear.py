@@ -157,7 +157,7 @@ class Asked:
 
 
 def _quoted(model: Any, asked: Asked) -> jax.Array:
-    """Of each pole tau, T, zeta, itself and its frequency; gains at rest, outputs at the mean."""
+    """Tau, T, zeta, value and frequency of each pole; static gains; outputs at the mean inputs."""
     p, n, course = model["p"], asked.order, asked.course
     a, b, c, d, _ = course.system.matrices(p)
     a, b, c, units = a[:n, :n], b[:n], c[:, :n], p["units"]

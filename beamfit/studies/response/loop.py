@@ -149,7 +149,7 @@ class Loop:
 
     @property
     def headline(self) -> str:
-        """What was done, in a line."""
+        """Outputs, inputs and status in a line."""
         outputs = ", ".join(r.name for r in self.control.responses)
         return f"{outputs} by {', '.join(self.control.inputs)}: {self.status}"
 
@@ -200,7 +200,7 @@ def _range(low: float, high: float) -> str:
 
 
 def touched(loop: Loop) -> np.ndarray:
-    """Whether each input is at one of its limits, shape (steps, m)."""
+    """True for each input at one of its limits, shape (steps, m)."""
     c, u = loop.control, loop.trace.inputs
     near = TOUCHED * c.sizes
     return (u <= c.limits.low + near) | (u >= c.limits.high - near)
@@ -301,7 +301,7 @@ def _noise(fit: ResponseFit, time: np.ndarray, seed: int) -> np.ndarray:
 
 
 def _changes(loop: Loop, load: np.ndarray) -> list[Change]:
-    """How each step of a target, or of a disturbance, is followed until the next one."""
+    """Response of the loop to each step of a target or disturbance, until the next one."""
     time, wanted, trace = loop.time, loop.targets, loop.trace
     # A change of one output is felt by the others: all are followed until the next one of any.
     steps = np.diff(np.hstack([wanted, load]), axis=0, prepend=np.nan)

@@ -88,7 +88,7 @@ def _without(
 
 
 def _lone(y: np.ndarray, fitted: np.ndarray, size: float) -> np.ndarray:
-    """Which readings lie off by themselves, beyond the noise and what the model moves nearby."""
+    """Single readings that lie off, beyond the noise and the model's change nearby."""
     rest = y - fitted
     off = np.abs(rest - median_filter(rest, AROUND, mode="nearest"))
     noise = max(1.4826 * float(np.median(off)), CLOSE * size)
@@ -98,7 +98,7 @@ def _lone(y: np.ndarray, fitted: np.ndarray, size: float) -> np.ndarray:
 
 
 def _still(y: np.ndarray, fitted: np.ndarray | None = None, noise: float = 0.0) -> np.ndarray:
-    """Which readings belong to many equal ones; of which a model says otherwise, if given."""
+    """Readings in long series of equal ones, where a model, if given, says otherwise."""
     edges = np.flatnonzero(np.diff(y, prepend=np.nan, append=np.nan) != 0)
     mask = np.zeros(len(y), bool)
     for a, b in pairwise(edges):

@@ -78,7 +78,7 @@ class Seen(NamedTuple):
 
 
 def driven(run: Run, number: int, output: str, physics: Physics, delay: float) -> Driven:
-    """One run with its inputs `delay` samples late; before the first they are as the first.
+    """A run with its inputs `delay` samples late; earlier inputs equal the first.
 
     A delay of no whole number of samples has two rows a sample, one for each input that it feels.
     """
@@ -115,7 +115,7 @@ def parameters_at(physics: Physics, of: Any, point: jax.Array, more: Any = 0.0) 
 
 
 def predicted(model: Any, course: Any) -> jax.Array:
-    """What a model says of the readings of a run: a `Driven`, or another course."""
+    """Readings of a run that a model predicts; the course is a `Driven` or another."""
     return course.predicted(model)
 
 

@@ -42,7 +42,7 @@ class Linear:
         return jnp.pad(u, ((0, 0), (0, p["z"].shape[1] - u.shape[1])), constant_values=1.0)
 
     def linear(self, p: Any) -> Matrices:
-        """Of the linear part."""
+        """Matrices of the linear part."""
         return Matrices(*contraction(p["z"], p["around"]), p["c"], p["d"], jnp.zeros(len(p["c"])))
 
     matrices = linear
@@ -66,7 +66,7 @@ class Network(Linear):
         return y * p["units"]["y"][1] + p["units"]["y"][0], last
 
     def matrices(self, p: Any) -> Matrices:
-        """Of the system about where it rests at its mean input."""
+        """Matrices linearised about the rest at the mean input."""
         linear, (n, m), net = self.linear(p), p["z"].shape, p["net"]
 
         def after(x, u):

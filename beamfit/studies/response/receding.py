@@ -45,7 +45,7 @@ class Response(NamedTuple):
 
 
 class Limits(NamedTuple):
-    """Of inputs (lowest, highest, change in a step) and outputs; infinite where there are none."""
+    """Limits of inputs (lowest, highest, change in a step) and outputs; infinite if none."""
 
     low: np.ndarray
     high: np.ndarray
@@ -55,7 +55,7 @@ class Limits(NamedTuple):
 
 
 class State(NamedTuple):
-    """What a controller remembers.
+    """State of a controller between two steps.
 
     Attributes
     ----------
@@ -235,7 +235,7 @@ def _now(control: Controller, x: Sequence[jax.Array]) -> jax.Array:
 
 
 def outputs(control: Controller, state: State, plan: jax.Array) -> jax.Array:
-    """What comes of a plan, shape (horizon, outputs), the first a step from now."""
+    """Predicted outputs of a plan, shape (horizon, outputs), the first a step from now."""
     found = []
     for i, (r, x) in enumerate(zip(control.responses, state.x, strict=True)):
         felt = late(r, state.past, plan)
@@ -274,7 +274,7 @@ def advance(
 
 
 def _excess(control: Controller, ahead: jax.Array) -> jax.Array:
-    """How far outputs pass their limits less the margins."""
+    """Excess of outputs over their limits less the margins."""
     below, above = control.held
     return jnp.maximum(jnp.maximum(below - ahead, ahead - above), 0.0)
 

@@ -74,7 +74,7 @@ def begun(
 
 
 def is_first_order(found: Begun, offset: bool) -> bool:
-    """Whether a first order does as well as a higher one, by the Bayesian information criterion."""
+    """True if a first order does as well as a higher one by the Bayesian information criterion."""
     if found.seen.runs[0].physics is FIRST_ORDER:
         return False
     lower = found.seen._replace(runs=driven_by(found.seen, FIRST_ORDER))

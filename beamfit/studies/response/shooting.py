@@ -35,7 +35,7 @@ LONGEST, WORSE = 5000, 1.5
 
 
 class System(Protocol):
-    """What runs: `beamfit.dynamics.states.StateSpace`, or anything hashable with its `run`."""
+    """A system: `beamfit.dynamics.states.StateSpace`, or anything hashable with its `run`."""
 
     def run(
         self, p: Any, u: jax.Array, dt: jax.Array, x0: jax.Array
@@ -75,7 +75,7 @@ class Course:
 
 
 def course_of(system: System, seen: Sequence[Seen], i: int) -> Course:
-    """One run, of what is seen of each output."""
+    """Course of a run, from the prepared outputs."""
     run = seen[0].runs[i]
     index = [k * len(run.u) + np.asarray(s.runs[i].index) for k, s in enumerate(seen)]
     far = APART * float(np.sum(np.asarray(run.dt)))

@@ -1,4 +1,4 @@
-"""From runs to a judged state space, whose equations the user writes."""
+"""Fit of a state space whose equations the user writes."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ SEGMENTS = 32
 
 
 class Part(NamedTuple):
-    """One output of a state space: its readings, the free run, and what the residuals say."""
+    """An output of a state space: its readings, the free run, and the noise of its residuals."""
 
     output: str
     runs: tuple[Run, ...]
@@ -107,7 +107,7 @@ class StatesFit:
 
     @property
     def headline(self) -> str:
-        """What was found, in a line."""
+        """The answer in a line."""
         said = [f"{name} = {q}" for name, q in list(self.quantities.items())[:3]]
         found = ", ".join([f"state space of order {self.order}", *said])
         return f"{self.output} {self.status}: {found}"
@@ -275,7 +275,7 @@ def _numbers(found: Settled) -> Derived:
 
 
 def _explained(case: Case, found: Settled) -> list[float]:
-    """Of each output, by the free run."""
+    """Explained part of each output in percent, by the free run."""
     return [
         percent(
             np.concatenate([row[k] for row in found.rest]),
@@ -355,7 +355,7 @@ def answer(
 
 
 def _added(seen: Seen, i: int, fitted: np.ndarray) -> np.ndarray:
-    """What a state space that is not linear would add first: products of output and inputs."""
+    """First terms of a nonlinear state space: products of output and inputs."""
     u = seen.scaled(seen.runs[i].u)[np.asarray(seen.runs[i].index)]
     y = ((fitted - np.mean(fitted)) / seen.size_y)[:, None]
     return np.concatenate([y**2, y**3, u**2, u * y], axis=1)

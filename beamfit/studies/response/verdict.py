@@ -22,7 +22,7 @@ WORSE = 2.0
 
 
 class Evidence(NamedTuple):
-    """What the rules look at."""
+    """Input of the rules."""
 
     fit: Fit
     rests: bool
