@@ -287,7 +287,7 @@ def _observed(p: Problem) -> dict[str, np.ndarray]:
 
 
 def _belonging(slopes: Sequence[np.ndarray], joined: bool) -> tuple[tuple[int, ...], ...]:
-    """Record that says most of each number, and the pairs of numbers that some record or prior joins.
+    """Record that says most of each number, and groups of numbers joined by a record or prior.
 
     Constraints are not looked into: where there are any, all numbers belong together.
     """
