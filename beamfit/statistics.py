@@ -144,7 +144,7 @@ def one_sided_probability(deviations: float, dof: float) -> float:
 
 
 def reach_of(dof: float) -> float:
-    """Errors that 95 % of answers lie within, by Student's distribution.
+    """Half-width of the 95 % interval in standard errors, by Student's distribution.
 
     Examples
     --------
@@ -155,19 +155,17 @@ def reach_of(dof: float) -> float:
 
 
 def few_words(rests_on: float) -> str:
-    """Say how far errors reach that rest on few degrees of freedom.
+    """Sentence part on the 95 % interval, if it rests on few degrees of freedom.
 
     Examples
     --------
     >>> few_words(2.0)
-    '; errors rest on 2 degrees of freedom: 95 % of answers lie within 4.3 of them'
+    '; 2 degrees of freedom: the 95 % interval is ±4.3 σ'
     """
     if not 0 < rests_on < MANY:
         return ""
-    return (
-        f"; errors rest on {rests_on:.3g} degrees of freedom: 95 % of answers lie within "
-        f"{reach_of(rests_on):.1f} of them"
-    )
+    reach = f"±{reach_of(rests_on):.1f} σ"
+    return f"; {rests_on:.3g} degrees of freedom: the 95 % interval is {reach}"
 
 
 def baseline(count: int) -> int:

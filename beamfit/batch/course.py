@@ -15,7 +15,7 @@ from beamfit.statistics import baseline, control_limits
 from beamfit.studies.decay.evidence import UNITS
 from beamfit.studies.scan.model import QUANTITIES
 
-# Of each kind: the quantities there are, and the one that is followed unless said.
+# Quantities of each kind, and the default one.
 FOLLOWED = {
     "emittance": (QUANTITIES, "normalized_emittance"),
     "lifetime": (UNITS, "lifetime_mean"),
@@ -58,7 +58,7 @@ class Course(NamedTuple):
 
 
 def followed(kind: str, name: str | None = None) -> tuple[str, str]:
-    """A quantity of a kind and its unit; the usual one unless said.
+    """A quantity of a kind and its unit; by default the first choice of the kind.
 
     Raises
     ------
@@ -85,7 +85,7 @@ def courses_of(batch: Batch, name: str | None = None) -> list[Course]:
     batch : Batch
         Files in the order in which they are followed.
     name : str, optional
-        The normalised emittance or the mean lifetime unless said.
+        Default: the normalised emittance or the mean lifetime.
 
     Returns
     -------

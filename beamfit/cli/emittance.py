@@ -209,10 +209,10 @@ def show(
             terminal.table(Table("", [head, *names], cells), wrap=False)
             terminal.line()
     elif fit.parameters:
-        cells = parameter_rows(fit.parameters)
-        terminal.table(Table("", ["Fitted too", "value", "bounds", "prior", "state"], cells))
+        head = ["Other fitted parameters", "value", "bounds", "prior", "state"]
+        terminal.table(Table("", head, parameter_rows(fit.parameters)))
     for words in fit.null_directions:
-        terminal.line(f"Left open: {words}.")
+        terminal.line(f"Not determined: {words}.")
     if fit.statement.network:
         terminal.line(f"Anchor: {fit.anchor}.", style="dim")
     if not fit.statement.closed:

@@ -257,7 +257,7 @@ def _show_record(terminal: Terminal, study: RecordStudy) -> None:
         terminal.table(labelled("", [name], rows), [status])
         if decay.systematics:
             unseen = tables.systematic_rows(decay)
-            terminal.table(Table("\nWhat no residual shows", tables.SYSTEMATIC, unseen))
+            terminal.table(Table("\nSystematics", tables.SYSTEMATIC, unseen))
         if losses := tables.budget_rows([decay]):
             terminal.table(labelled("\nLosses from first principles", [name], losses))
         terminal.line()

@@ -54,9 +54,9 @@ SHARED: dict[str, Callable[..., Any]] = {
     "scan": click.argument("scan"),
     "columns": option(
         "--columns HEADER=NAME,...|LAYOUT.toml",
-        "What columns are whose headers do not say it, such as 'xrms=size_x_um, "
-        "QUAD:BACT=Q525_kG'; or a layout that keeps it; or day-month-year, for dates of numbers. "
-        "Other columns of unknown names are left aside.",
+        "Meaning of columns whose headers do not say it, such as 'xrms=size_x_um, "
+        "QUAD:BACT=Q525_kG'; or a file of such a layout; or day-month-year, for numeric dates. "
+        "Other columns of unknown names are ignored.",
         callback=_parsed(layout_of),
     ),
     "ignore": option(
@@ -72,7 +72,7 @@ SHARED: dict[str, Callable[..., Any]] = {
     "lattice": option("--lattice FILE", LATTICE, required=True),
     "maybe-lattice": option("--lattice FILE", LATTICE),
     "size-method": option(
-        "--size-method NAME", "Which sizes of a .mat file of emittance_gui; RMS unless said."
+        "--size-method NAME", "Sizes to take from a .mat file of emittance_gui; default: RMS."
     ),
     "noise": option(
         "--noise FILE",
@@ -81,13 +81,13 @@ SHARED: dict[str, Callable[..., Any]] = {
     ),
     "weights": option(
         "--weights",
-        "Whose size the error of size squared is taken at; measured sizes bias the answer.",
+        "Take the error of size squared at the model's or the measured size; the latter is biased.",
         choices=["model", "measured"],
         default="model",
     ),
     "particle": option(
         "--particle",
-        "Of a scan without a lattice; electrons unless said.",
+        "Particle of a scan without a lattice; default: electron.",
         choices=list(REST_ENERGY),
     ),
     "use": option("--use NAME", "Line or sequence of a lattice with several."),
@@ -95,7 +95,7 @@ SHARED: dict[str, Callable[..., Any]] = {
     "to": option("--to NAME", "Element with which the line ends.", name="last"),
     "screen": option(
         "--screen NAME",
-        "Screen or marker at which sizes are measured or wanted; the last screen unless said.",
+        "Screen or marker at which sizes are measured or wanted; default: the last screen.",
     ),
     "energy": option(
         "--energy MEV",
@@ -105,14 +105,14 @@ SHARED: dict[str, Callable[..., Any]] = {
     ),
     "scenario": option(
         "--scenario",
-        "What is unknown besides the beam: nothing, R11 and R12, the magnets' calibration, "
+        "Unknown besides the beam: nothing, R11 and R12, the magnets' calibration, "
         "or k1 as a function of the current.",
         choices=list(SCENARIOS),
         default="known",
     ),
     "prior": option(
         "--prior NAME=MEAN+-SD",
-        "What is known of a number: calibration, Q2.slope=167.23+-3.3446 (or ±); a study of "
+        "Prior of a number: of a calibration, Q2.slope=167.23+-3.3446 (or ±); of a study of "
         "lifetimes, its scales, and rf_voltage=1+-1% for the calibration of that reading.",
         name="priors",
         multiple=True,
@@ -120,7 +120,7 @@ SHARED: dict[str, Callable[..., Any]] = {
     ),
     "bounds": option(
         "--bounds NAME=LOW:HIGH",
-        "Calibration: bounds of a number; ± 12 % of the slope unless given. Transport "
+        "Calibration: bounds of a number; default: ± 12 % of the slope. Transport "
         "network: of the beam, x.sigma11=2e-8:3e-8 (SI), or of a setting the gains are held over.",
         multiple=True,
         callback=_parsed(bounds_of),
@@ -135,7 +135,7 @@ SHARED: dict[str, Callable[..., Any]] = {
     ),
     "anchor": option(
         "--anchor ANCHOR",
-        "Networks: what ties them to the lattice: first-principles=2%, a setting such as "
+        "Networks: their tie to the lattice: first-principles=2%, a setting such as "
         "Q2=0, or determinant.",
         multiple=True,
         callback=_parsed(anchor_of),
@@ -158,7 +158,7 @@ SHARED: dict[str, Callable[..., Any]] = {
     ),
     "order": option(
         "--order STATES",
-        "State space: its states; found by an information criterion unless said.",
+        "Number of states of a state space; default: chosen by an information criterion.",
         type=click.IntRange(1, 50),
     ),
     "map": option(
@@ -170,7 +170,7 @@ SHARED: dict[str, Callable[..., Any]] = {
     "input": option("--input COLUMN", "An input of any name.", name="inputs", multiple=True),
     "output": option("--output COLUMN", "An output of any name.", name="outputs", multiple=True),
     "step": option("--step SECONDS", "Distance of rows without a time.", type=float),
-    "delay": option("--delay SAMPLES", "Known delay; found unless said.", type=click.IntRange(0)),
+    "delay": option("--delay SAMPLES", "Known delay; default: fitted.", type=click.IntRange(0)),
     "no-offset": option("--no-offset", "The output at rest is 0, and not estimated.", is_flag=True),
     "report": option(
         "--report FILE.html|.pdf|.png|.svg",

@@ -39,7 +39,7 @@ Examples:
 @click.argument("machine", required=False)
 @option("--dry-run", "Check the machine, print the plan, move nothing.", is_flag=True)
 @option("--recover JOURNAL", "Restore what a scan that was killed has left, and move nothing else.")
-@option("--save FILE.csv", "The scan; NAME_DATE_TIME.csv unless said.")
+@option("--save FILE.csv", "File of the scan; default: NAME_DATE_TIME.csv.")
 @option("--journal FILE", "Where what is to be restored stands; beside MACHINE unless.")
 @option("--goal PERCENT", "Emittance error to stop at.")
 @option("--points", "Most settings.", type=click.IntRange(4, 200))

@@ -29,7 +29,7 @@ Examples:
 
 @click.command(epilog=EXAMPLE)
 @click.argument("machine")
-@option("--seconds", "How long; until Ctrl-C unless said.", type=click.FloatRange(0.0))
+@option("--seconds", "Duration; default: until Ctrl-C.", type=click.FloatRange(0.0))
 @option(
     "--port", "Of the page; 0 for any that is free.", type=click.IntRange(0, 65535), default=8050
 )

@@ -27,17 +27,14 @@ from beamfit.table import Table, cell
 
 # Draws of the same seeds that are tried until the start is finite.
 MOST_DRAWS = 100
-# Solver parameters that mean something here: how they are told to `solve`.
+# Solver options that are used, with the argument of `solve` that each sets.
 TOLD = {
     "major iterations limit": "iterations",
     "iterations limit": "iterations",
     "time limit": "seconds",
 }
-NOISE = (
-    "Errors take the terms that are squared for residuals of data, with the noise that their own "
-    "scatter shows."
-)
-# Kinds of ailments that are found with their place in the document.
+NOISE = "Errors treat squared terms as data residuals, with the noise inferred from their scatter."
+# Kinds of defects that are reported elsewhere, with their place in the document.
 TOLD_ELSEWHERE = {"contradictory_bounds", "not_finite", "unused"}
 TOLERANCES = {"major feasibility tolerance", "major optimality tolerance"}
 
@@ -311,7 +308,7 @@ def _told(solver: d.Solver | None) -> tuple[dict[str, Any], list[str]]:
             tight.append(number)
         else:
             unused.append(name)
-    said = [f"Solver parameters without a meaning here: {', '.join(unused)}."] if unused else []
+    said = [f"Ignored solver options: {', '.join(unused)}."] if unused else []
     if tight:
         told["tolerance"] = min(tight)
     return told, said

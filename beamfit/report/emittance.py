@@ -102,14 +102,14 @@ def _budgets(fit: EmittanceFit, names: list[str]) -> list[Table]:
 
 def _fitted_too(fit: EmittanceFit) -> list[Table]:
     """Tables of parameters fitted besides the beam, and of undetermined combinations."""
-    header, parts = ["fitted too", "value", "bounds", "prior", "state"], []
+    header, parts = ["other fitted parameters", "value", "bounds", "prior", "state"], []
     if rows := parameter_rows(fit.parameters):
         # What ties a network to the lattice; a calibration has priors instead.
         anchor = f"Anchor: {fit.anchor}." if fit.statement.network else ""
         parts.append(Table(f"Scenario {fit.scenario}", header, rows, anchor))
     if fit.null_directions:
         listed = [[words + "."] for words in fit.null_directions]
-        parts.append(Table("Left open by the data", [], listed))
+        parts.append(Table("Not determined by the data", [], listed))
     return parts
 
 

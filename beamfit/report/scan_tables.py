@@ -18,7 +18,7 @@ def identifiability_rows(
     """Label and one cell per plane for what the data determine."""
     rows: list[tuple[str, Callable[[PlaneFit], object]]] = [
         ("emittance", lambda p: "determined" if p.identifiability.determined else "not determined"),
-        ("left open", lambda p: ", ".join(p.identifiability.undetermined) or "nothing"),
+        ("not determined", lambda p: ", ".join(p.identifiability.undetermined) or "nothing"),
         (
             "singular values",
             lambda p: ", ".join(f"{v:.3g}" for v in p.identifiability.singular_values),

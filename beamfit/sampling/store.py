@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
     from beamfit.sampling.target import Target
 
-# Another number for every change of what a store holds or of how a problem is told from another.
+# To be changed with every change of a store's content or of the digest of a problem.
 KIND, FORMAT = "beamfit-posterior", "3"
 # Bytes before the HDF5 file (its user block), which hold its digest.
 SEAL = 512

@@ -21,7 +21,7 @@ from beamfit.table import Table, cell, json_of
 # Points of a curve; it was visited where so many samples lie within a share of its range.
 POINTS, VISITS, NEAR = 41, 5, 0.05
 SHOWN = 9
-# A time constant with an error above this share of itself is not told from 0 or from without end.
+# A time constant with a relative error above this is compatible with 0 and with infinity.
 WIDE = 0.5
 TIME, GAIN, PURE = "s", "output/input", "1"
 

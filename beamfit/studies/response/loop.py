@@ -361,7 +361,7 @@ def _short(loop: Loop) -> Finding | None:
         off = f"{change.output} stays {abs(change.left):.3g} off {change.after:.4g}"
         if not low <= change.after <= high:
             margin = loop.control.responses[i].margin
-            cause = f"{off}: its limit is held off by {margin:.3g} for noise and model."
+            cause = f"{off}: its limit has a safety margin of {margin:.3g} for noise and model."
             return Finding(Status.at_limit, cause, "Wish for less, or identify with less noise.")
         ends = touched(loop)[-max(1, int(LAST * len(loop.time))) :].mean(axis=0) > 0.5
         if ends.any():
@@ -379,7 +379,7 @@ def _kept(loop: Loop) -> Finding | None:
             if (loop.trace.beyond[:, i] > SOFT * r.size).any()]  # fmt: skip
     words = "The loop settles and keeps all limits."
     if soft:
-        words += f" Plans of {', '.join(soft)} went into the margin of a limit."
+        words += f" {', '.join(soft)} came within the safety margin of a limit."
     if not poor:
         return Finding(Status.converged, words)
     words += f" But the model of {', '.join(poor)} does not explain its runs."

@@ -77,7 +77,8 @@ def _nothing(e: Evidence) -> Finding | None:
 def _joint(e: Evidence) -> Finding | None:
     if not e.checks.together:
         return None
-    cause = f"Inputs {', '.join(e.checks.together)} move together: only their joint effect is told."
+    inputs = ", ".join(e.checks.together)
+    cause = f"Inputs {inputs} move together: only their joint effect is determined."
     return Finding(Status.unidentified, cause, "Move one at a time, or leave one out.")
 
 
@@ -88,7 +89,7 @@ def _lower(e: Evidence) -> Finding | None:
     if "a1" in e.quantities:
         cause += "a pole and a zero cancel, so that a1, a2, b1 and b2 are not determined; K is."
     else:
-        cause += "the shorter lag is not told from 0, so that T and zeta are not determined."
+        cause += "the shorter lag is compatible with 0, so that T and zeta are not determined."
     return Finding(Status.unidentified, cause, "Use --model first-order.")
 
 
@@ -147,7 +148,7 @@ def _worse(e: Evidence) -> Finding | None:
         f"Run {bad[0].name}, held back, is predicted with a residual of {bad[0].rms:.3g} rms, "
         f"where the fit has {e.rms:.3g}."
     )
-    remedy = "The model does not carry over: use runs that cover its range, or fewer hidden nodes."
+    remedy = "Use runs that cover the model's range, or fewer hidden nodes."
     return Finding(Status.poor_fit, cause, remedy)
 
 
@@ -157,13 +158,13 @@ def _good(e: Evidence) -> Finding:
         cause += " The noise has a memory, which the errors contain."
     gains = [q for name, q in e.quantities.items() if name.startswith("K")]
     if gains and all(q.error is not None and abs(q.value) < 2 * q.error for q in gains):
-        cause += " No gain is told from 0: what is seen is how the runs come to rest by themselves."
+        cause += " All gains are compatible with 0: only the return of the output to rest is seen."
     held = [c.name for c in e.fit.constraints if c.state in ("lower", "upper")]
     if held:
-        cause += f" It is held by its limits: {', '.join(held[:3])}."
+        cause += f" Limits reached: {', '.join(held[:3])}."
     gain = e.checks.against_constant
     if gain is not None and gain < 0:
-        cause += " Constant parameters do as well (BIC): the operating point need not be in it."
+        cause += " Constant parameters fit as well (BIC): the operating point is not needed."
     never = {c.input for c in e.curves if not c.visited.all()}
     if never:
         cause += f" Parts of the range of {', '.join(sorted(never))} were not visited."
