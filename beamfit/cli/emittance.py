@@ -209,8 +209,8 @@ def show(
             terminal.table(Table("", [head, *names], cells), wrap=False)
             terminal.line()
     elif fit.parameters:
-        head = ["Other fitted parameters", "value", "bounds", "prior", "state"]
-        terminal.table(Table("", head, parameter_rows(fit.parameters)))
+        head = ["", "value", "bounds", "prior", "state"]
+        terminal.table(Table("Other fitted parameters", head, parameter_rows(fit.parameters)))
     for words in fit.null_directions:
         terminal.line(f"Not determined: {words}.")
     if fit.statement.network:

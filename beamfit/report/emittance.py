@@ -102,7 +102,7 @@ def _budgets(fit: EmittanceFit, names: list[str]) -> list[Table]:
 
 def _fitted_too(fit: EmittanceFit) -> list[Table]:
     """Tables of parameters fitted besides the beam, and of undetermined combinations."""
-    header, parts = ["other fitted parameters", "value", "bounds", "prior", "state"], []
+    header, parts = ["parameter", "value", "bounds", "prior", "state"], []
     if rows := parameter_rows(fit.parameters):
         # What ties a network to the lattice; a calibration has priors instead.
         anchor = f"Anchor: {fit.anchor}." if fit.statement.network else ""
