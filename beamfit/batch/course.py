@@ -22,7 +22,7 @@ FOLLOWED = {
 }
 
 
-class Course(NamedTuple):
+class ControlChart(NamedTuple):
     """A quantity through a batch.
 
     Attributes
@@ -77,7 +77,7 @@ def followed(kind: str, name: str | None = None) -> tuple[str, str]:
     return name, known[name]
 
 
-def courses_of(batch: Batch, name: str | None = None) -> list[Course]:
+def courses_of(batch: Batch, name: str | None = None) -> list[ControlChart]:
     """Follow a quantity wherever the data determine it.
 
     Parameters
@@ -89,7 +89,7 @@ def courses_of(batch: Batch, name: str | None = None) -> list[Course]:
 
     Returns
     -------
-    list of Course
+    list of ControlChart
         One a plane and slice; limits are `control_limits` of the first 20 points, or of half of
         them.
 
@@ -107,7 +107,7 @@ def courses_of(batch: Batch, name: str | None = None) -> list[Course]:
         files, *numbers = zip(*own, strict=True)
         at, value, error = map(np.array, numbers)
         limits = control_limits(value[: baseline(len(value))])
-        found.append(Course(name, unit, of, list(files), at, value, error, *limits))
+        found.append(ControlChart(name, unit, of, list(files), at, value, error, *limits))
     return found
 
 

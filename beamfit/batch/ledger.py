@@ -23,7 +23,7 @@ from beamfit.writing import replacing, write_atomically
 BLOCK = 4096
 
 
-class Place(NamedTuple):
+class RowRange(NamedTuple):
     """Place of a file's rows (bytes of a part), their statuses, and the reason if refused."""
 
     part: Path
@@ -50,7 +50,7 @@ class Ledger:
         self.folder = out.with_name(f"{out.name}.parts")
         self.columns = COLUMNS[job.kind]
         self.header = (",".join(self.columns) + "\n").encode()
-        self.places: dict[str, Place] = {}
+        self.places: dict[str, RowRange] = {}
         self._next = 0
         try:
             self.folder.mkdir(exist_ok=True)
@@ -80,13 +80,13 @@ class Ledger:
     def _learn(self, part: Path, content: bytes) -> None:
         if not content.startswith(self.header):
             return
-        found: dict[str, Place] = {}
+        found: dict[str, RowRange] = {}
         status, at = self.columns.index("status"), len(self.header)
         for raw in content[at:].splitlines(keepends=True):
             row = next(csv.reader([raw.decode()]))
             end = at + len(raw)
             if tuple(row[2 : len(KEY)]) == self.job.key:
-                before = found.get(row[0], Place(part, at, at, row[1], ()))
+                before = found.get(row[0], RowRange(part, at, at, row[1], ()))
                 reason = row[status + 1] if row[status] == UNUSABLE else before.reason
                 statuses = (*before.statuses, sys.intern(row[status]))
                 found[row[0]] = before._replace(end=end, statuses=statuses, reason=reason)

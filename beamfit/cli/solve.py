@@ -15,7 +15,7 @@ from beamfit.io.files import digest
 if TYPE_CHECKING:
     from beamfit.cli.show import Terminal
     from beamfit.language.computed import Computed
-    from beamfit.language.solution import Solution
+    from beamfit.language.solution import ProblemSolution
 
 EXAMPLE = """\b
 Examples:
@@ -121,13 +121,13 @@ def _solved(document, given, starts, values, gains, told) -> tuple[Any, tuple[st
     return found, tuple(files.values())
 
 
-def _show(terminal: Terminal, found: Solution | Computed) -> None:
+def _show(terminal: Terminal, found: ProblemSolution | Computed) -> None:
     for table in found.tables():
         terminal.table(table)
         terminal.line()
-    from beamfit.language.solution import Solution
+    from beamfit.language.solution import ProblemSolution
 
-    if not isinstance(found, Solution):
+    if not isinstance(found, ProblemSolution):
         return
     asked = found.made.document.solver
     terminal.line(f"Solver: {found.solver}" + (f" (asked for: {asked.name})" if asked else ""))

@@ -52,7 +52,7 @@ class Scale(NamedTuple):
     cost: float
 
 
-class Limits(NamedTuple):
+class LimitedValues(NamedTuple):
     """Values with their lower and upper limits, their sizes, and how near counts as reached."""
 
     value: np.ndarray
@@ -126,13 +126,13 @@ class Bend(NamedTuple):
     clear: bool = False
 
 
-class State(NamedTuple):
+class SearchState(NamedTuple):
     """A point with its limits, their multipliers and its distance from an optimum."""
 
     theta: np.ndarray
     at: Slopes
-    bounds: Limits
-    limits: Limits
+    bounds: LimitedValues
+    limits: LimitedValues
     found: Multipliers
     kkt: KKT
     scale: Scale
@@ -214,7 +214,7 @@ def gradient_size(p: Problem, at: Slopes, scale: Scale) -> np.ndarray:
     return np.maximum(found, max(1e-12 * largest, 1e-100) / scale.unit)
 
 
-def holding(p: Problem, s: State, least: float) -> tuple[np.ndarray, np.ndarray]:
+def holding(p: Problem, s: SearchState, least: float) -> tuple[np.ndarray, np.ndarray]:
     """Numbers that do not move and constraints that hold, by forces above a share."""
     size = gradient_size(p, s.at, s.scale)
     held = ~p.moving | (np.abs(s.found.bounds) > least * size)
@@ -222,7 +222,7 @@ def holding(p: Problem, s: State, least: float) -> tuple[np.ndarray, np.ndarray]
     return held, p.equations | (pulls > least)
 
 
-def state(p: Problem, theta: np.ndarray, scale: Scale, at: Slopes | None = None) -> State:
+def state(p: Problem, theta: np.ndarray, scale: Scale, at: Slopes | None = None) -> SearchState:
     """Find the multipliers at a point and measure how far it is from an optimum.
 
     Parameters
@@ -238,7 +238,7 @@ def state(p: Problem, theta: np.ndarray, scale: Scale, at: Slopes | None = None)
 
     Returns
     -------
-    State
+    SearchState
         With an infinite residual where something is not finite.
     """
     at = slopes(p, theta) if at is None else at
@@ -250,13 +250,13 @@ def state(p: Problem, theta: np.ndarray, scale: Scale, at: Slopes | None = None)
         pushed = np.abs(at.gradient) > p.tolerance * size
         near = np.where(pushed, np.maximum(near, CLOSE * cost / np.abs(at.gradient)), near)
     near = np.where(np.isfinite(near), near, 0.0)
-    bounds = Limits(theta, p.lower, p.upper, scale.unit, near)
+    bounds = LimitedValues(theta, p.lower, p.upper, scale.unit, near)
     size_here = np.fmin(scale.limit, GROWN * scale_of(p, theta, at).limit)
-    limits = Limits(
+    limits = LimitedValues(
         at.constraints, p.constraint_lower, p.constraint_upper, size_here, p.tolerance * size_here
     )
     none = Multipliers(np.zeros(len(theta)), np.zeros(len(at.constraints)))
-    s = State(theta, at, bounds, limits, none, LOST, scale, p.tolerance)
+    s = SearchState(theta, at, bounds, limits, none, LOST, scale, p.tolerance)
     if not at.finite:
         return s
     s = s._replace(found=multipliers(at.gradient, at.jacobian, bounds, limits, size))
@@ -264,7 +264,11 @@ def state(p: Problem, theta: np.ndarray, scale: Scale, at: Slopes | None = None)
 
 
 def multipliers(
-    gradient: np.ndarray, jacobian: np.ndarray, bounds: Limits, limits: Limits, scale: np.ndarray
+    gradient: np.ndarray,
+    jacobian: np.ndarray,
+    bounds: LimitedValues,
+    limits: LimitedValues,
+    scale: np.ndarray,
 ) -> Multipliers:
     """Find the multipliers of the right signs that come nearest to stationarity.
 
@@ -274,7 +278,7 @@ def multipliers(
         Of the cost.
     jacobian : array, shape (m, n)
         Of the constraints.
-    bounds, limits : Limits
+    bounds, limits : LimitedValues
         Of the n free numbers and of the m constraints.
     scale : array, shape (n,)
         Size of a component of the gradient that matters.
@@ -288,8 +292,8 @@ def multipliers(
     Minimise (x-3)^2/2 with x <= 1: the cost falls by 2 for each unit the bound gives way.
 
     >>> one, none = np.ones(1), np.zeros(0)
-    >>> at = Limits(one, np.array([-np.inf]), one, one, 1e-6 * one)
-    >>> free = Limits(none, none, none, none, none)
+    >>> at = LimitedValues(one, np.array([-np.inf]), one, one, 1e-6 * one)
+    >>> free = LimitedValues(none, none, none, none, none)
     >>> multipliers(np.array([-2.0]), np.zeros((0, 1)), at, free, one).bounds.tolist()
     [-2.0]
     """
@@ -317,7 +321,7 @@ def multipliers(
     return Multipliers(found[:n], found[n:])
 
 
-def _distance(s: State, scale: np.ndarray, cost: float) -> KKT:
+def _distance(s: SearchState, scale: np.ndarray, cost: float) -> KKT:
     """Measure how far a point with multipliers is from an optimum, `cost` being a size of it."""
     at, found = s.at, s.found
     left = at.gradient - found.bounds - at.jacobian.T @ found.constraints

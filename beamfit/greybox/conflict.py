@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from beamfit.greybox import problem
-from beamfit.greybox.assess import State, gradient_size, scale_of
+from beamfit.greybox.assess import SearchState, gradient_size, scale_of
 from beamfit.greybox.descend import descend_all
 from beamfit.greybox.problem import Problem
 
@@ -43,14 +43,14 @@ def excess(data, theta):
     return weight * (jnp.maximum(lower - c, 0) + jnp.maximum(c - upper, 0)) / size
 
 
-def relaxed(p: Problem, s: State, starts: Iterable[np.ndarray]) -> Conflict:
+def relaxed(p: Problem, s: SearchState, starts: Iterable[np.ndarray]) -> Conflict:
     """Come as near to the constraints as the bounds allow, and name what conflicts.
 
     Parameters
     ----------
     p : Problem
         Of which no feasible point was found.
-    s : State
+    s : SearchState
         The nearest one.
     starts : iterable of array, shape (n,)
         From where to try besides.
@@ -114,14 +114,14 @@ class Dependence(NamedTuple):
     slopeless: tuple[str, ...]
 
 
-def dependence(p: Problem, s: State, stationary: bool) -> Dependence | None:
+def dependence(p: Problem, s: SearchState, stationary: bool) -> Dependence | None:
     """Find what is wrong with the limits that hold at a feasible point, if anything is.
 
     Parameters
     ----------
     p : Problem
         The problem.
-    s : State
+    s : SearchState
         The point.
     stationary : bool
         Whether the point has multipliers. If so they must be unique; if not, a combination of
@@ -161,7 +161,7 @@ def dependence(p: Problem, s: State, stationary: bool) -> Dependence | None:
     return Dependence(tuple(names[told].tolist()), tuple(names[flat].tolist()))
 
 
-def _changes(p: Problem, s: State) -> np.ndarray:
+def _changes(p: Problem, s: SearchState) -> np.ndarray:
     """Largest change of each constraint per unit of the numbers, at random points nearby."""
     unit = scale_of(p, s.theta, s.at).unit
     steps = np.random.default_rng(0).normal(size=(LOOKS, len(unit))) * NEAR * unit

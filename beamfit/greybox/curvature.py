@@ -49,8 +49,8 @@ def lagrangian_hessian(core, theta, sigma, y):
 
 
 def second_order(
-    p: Problem, s: assess.State, exact: bool
-) -> tuple[assess.State, np.ndarray | None]:
+    p: Problem, s: assess.SearchState, exact: bool
+) -> tuple[assess.SearchState, np.ndarray | None]:
     """The second-order test of a point that is an optimum to first order.
 
     Parameters
@@ -64,7 +64,7 @@ def second_order(
 
     Returns
     -------
-    assess.State
+    assess.SearchState
         With its `assess.Bend`.
     array, shape (n,), or None
         Another point, from where to go on, if the cost falls beside this one.
@@ -96,7 +96,7 @@ def second_order(
     return s._replace(bend=bent), None
 
 
-def lower_beside(p: Problem, s: assess.State, lagrangian: Look) -> np.ndarray | None:
+def lower_beside(p: Problem, s: assess.SearchState, lagrangian: Look) -> np.ndarray | None:
     """A lower point beside one where squares end, if the cost bends down there.
 
     The squares' own curvature never does; what their residuals bend shows first where that is
@@ -130,7 +130,7 @@ def lower_beside(p: Problem, s: assess.State, lagrangian: Look) -> np.ndarray | 
     return None
 
 
-def _weakest(p: Problem, s: assess.State) -> np.ndarray:
+def _weakest(p: Problem, s: assess.SearchState) -> np.ndarray:
     """The weakest directions of squares that keep to the limits held by a force."""
     unit = s.scale.unit
     held, on = assess.holding(p, s, p.tolerance)
@@ -147,7 +147,7 @@ def _weakest(p: Problem, s: assess.State) -> np.ndarray:
 
 def _along(
     p: Problem,
-    s: assess.State,
+    s: assess.SearchState,
     direction: np.ndarray,
     lagrangian: Look,
 ) -> np.ndarray | None:
@@ -166,7 +166,7 @@ def _along(
     return points[best] if cost[0] - cost[best] > counts else None
 
 
-def _restored(p: Problem, s: assess.State, point: np.ndarray) -> np.ndarray | None:
+def _restored(p: Problem, s: assess.SearchState, point: np.ndarray) -> np.ndarray | None:
     """A point moved onto the constraints that hold at another one, and inside all; None if not.
 
     Beside curved constraints a straight step leaves them, and a cost that is lower there is no
@@ -188,7 +188,7 @@ def _restored(p: Problem, s: assess.State, point: np.ndarray) -> np.ndarray | No
     return None
 
 
-def _bend(p: Problem, s: assess.State) -> assess.Bend:
+def _bend(p: Problem, s: assess.SearchState) -> assess.Bend:
     """Curvature on the directions that active limits leave, from exact derivatives."""
     unit, cost = s.scale.unit, s.scale.cost
     h = np.asarray(p.compiled(lagrangian_hessian)(s.theta, 1.0, s.found.constraints))
@@ -211,7 +211,7 @@ def _bend(p: Problem, s: assess.State) -> assess.Bend:
     return assess.Bend(down, float(newton), not steep.all() or largest < p.tolerance, clear)
 
 
-def _tangent(p: Problem, s: assess.State) -> np.ndarray:
+def _tangent(p: Problem, s: assess.SearchState) -> np.ndarray:
     """Directions, in the sizes of the numbers, that keep to the limits held by a force."""
     unit = s.scale.unit
     held, on = assess.holding(p, s, p.tolerance)

@@ -9,7 +9,7 @@ import numpy as np
 from scipy import sparse
 
 from beamfit.greybox import assess
-from beamfit.greybox.assess import State
+from beamfit.greybox.assess import SearchState
 from beamfit.greybox.conflict import Conflict
 from beamfit.greybox.covariance import (
     MOST_SHARE,
@@ -21,7 +21,7 @@ from beamfit.greybox.covariance import (
     triangle,
 )
 from beamfit.greybox.factors import Rows
-from beamfit.greybox.fit import Attempt, Limited, Variable
+from beamfit.greybox.fit import Attempt, FittedConstraint, FittedVariable
 from beamfit.greybox.problem import Problem
 
 # A further decrease of chi-square below this changes nothing anybody asks for.
@@ -69,25 +69,25 @@ class Known(NamedTuple):
     held: np.ndarray
 
 
-class Evidence(NamedTuple):
+class FitEvidence(NamedTuple):
     """Input of the verdict's rules; `chi2` and `dof` count residuals with errors only.
 
     `unseen` (n, k) are the directions that residuals do not see.
     """
 
     problem: Problem
-    state: State
+    state: SearchState
     search: Search
     settled: bool
-    variables: tuple[Variable, ...]
-    constraints: tuple[Limited, ...]
+    variables: tuple[FittedVariable, ...]
+    constraints: tuple[FittedConstraint, ...]
     blind: np.ndarray
     unseen: np.ndarray
     chi2: float
     dof: float
 
 
-def known(p: Problem, s: State) -> Known:
+def known(p: Problem, s: SearchState) -> Known:
     """Tell what the residuals know, along the limits that hold.
 
     For the degrees of freedom a number at an active bound is held; its error and that of what
@@ -128,7 +128,7 @@ def _stacked(blocks: list[Rows]) -> Rows:
     return np.vstack(blocks)
 
 
-def settled(p: Problem, s: State) -> bool:
+def settled(p: Problem, s: SearchState) -> bool:
     """True if the search ended at an optimum as far as the data can tell.
 
     The decrease of chi-square that a further Gauss-Newton step promises, noise being what the

@@ -23,7 +23,7 @@ SHORTEST, LONGEST, TIMES = 0.3, 5.0, 40
 WHITE, FEWER = (0.0, 1.0, 10.0, 100.0, 1000.0), 20
 
 
-class Moments(NamedTuple):
+class AveragedMoments(NamedTuple):
     """Quantities that are linear in the numbers: how far each moves from where the rows were
     taken, its error (68 % lie within), the reach within which 95 % lie, and the chance of a
     larger distance from zero movement if that is the truth.
@@ -78,7 +78,7 @@ class Memory(NamedTuple):
         """The step, averaged over noises."""
         return self.weight @ self.step
 
-    def moments(self, slopes: np.ndarray, least: float = 0.0) -> Moments:
+    def moments(self, slopes: np.ndarray, least: float = 0.0) -> AveragedMoments:
         """Quantities by their slopes, shape (q, p), averaged over noises.
 
         `least` is the least size of the errors: 1 where they were given and rows are in their
@@ -97,7 +97,7 @@ class Memory(NamedTuple):
         reaches = [_inverted(within, np.max(np.abs(centre - shift) + spread, 0), p)
                    for p in (0.6827, 0.95)]  # fmt: skip
         chance = self.weight @ (2 * stdtr(self.dof, -np.abs(centre) / spread))
-        return Moments(shift, *reaches, chance)
+        return AveragedMoments(shift, *reaches, chance)
 
 
 def _inverted(within, scale: np.ndarray, probability: float) -> np.ndarray:

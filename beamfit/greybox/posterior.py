@@ -17,10 +17,10 @@ from beamfit.errors import InputError
 from beamfit.greybox import tree
 from beamfit.greybox.problem import Core, Prior, Problem, with_slope
 from beamfit.greybox.stated import Optimum, Statement, unchanged
-from beamfit.sampling.likelihood import Group
+from beamfit.sampling.likelihood import NoiseGroup
 from beamfit.sampling.posterior import Posterior
 from beamfit.sampling.priors import Distribution, checked
-from beamfit.sampling.target import Law, Target, covariance_of, slopes_of
+from beamfit.sampling.target import PosteriorLaw, SamplingTarget, covariance_of, slopes_of
 
 # A number that is an undetermined direction's in less than this share is not part of it.
 PART = 0.05
@@ -44,7 +44,7 @@ class Sampled:
 
 
 @lru_cache(maxsize=64)
-def _law(own, log_volume, derive, build) -> tuple[Law, Callable]:
+def _law(own, log_volume, derive, build) -> tuple[PosteriorLaw, Callable]:
     """The law of a study's functions, and its residuals with the problem's priors at their end."""
 
     def model_of(data: Sampled, moved: jax.Array) -> Any:
@@ -78,7 +78,7 @@ def _law(own, log_volume, derive, build) -> tuple[Law, Callable]:
             inside &= jnp.all((held >= constraint.lower) & (held <= constraint.upper))
         return jnp.where(inside, value, -jnp.inf)
 
-    law = Law(
+    law = PosteriorLaw(
         residual,
         log_prior,
         lambda data, moved: derive(model_of(data, moved), data.more),
@@ -95,7 +95,7 @@ def target_of(
     noise: str | None = None,
     outliers: bool = False,
     priors: Mapping[str, Distribution] | None = None,
-) -> Target:
+) -> SamplingTarget:
     """State the posterior of a problem.
 
     Parameters
@@ -115,7 +115,7 @@ def target_of(
 
     Returns
     -------
-    Target
+    SamplingTarget
         Flat in the numbers that are sampled but for the problem's own priors and `priors`.
 
     Raises
@@ -145,7 +145,7 @@ def target_of(
     steps = [(turn @ (other - optimum.theta))[moving] for other in optimum.others]
     far = any(np.any(np.abs(step) > FAR * np.sqrt(np.diag(covariance))) for step in steps)
     group_of, block_of = _belonging(slopes, bool(p.constraints))
-    return Target(
+    return SamplingTarget(
         law=law,
         data=data,
         names=names,
@@ -259,7 +259,7 @@ def _widths(
 
 def _groups(
     p: Problem, optimum: Optimum, stated: Statement, noise: str | None, outliers: bool
-) -> tuple[Group, ...]:
+) -> tuple[NoiseGroup, ...]:
     """Noise model of each record; a factor on its errors is free only if the data can show it."""
     groups = []
     for record, scale, given in zip(p.records, optimum.scales, optimum.given, strict=True):
@@ -271,8 +271,8 @@ def _groups(
         if record.name in stated.averaged:
             kind = "averaged"
         doubted = outliers and not trusted and kind != "averaged"
-        groups.append(Group(label, kind, doubted, record.prior_noise))
-    return tuple(groups) or (Group("", noise or "known", outliers),)
+        groups.append(NoiseGroup(label, kind, doubted, record.prior_noise))
+    return tuple(groups) or (NoiseGroup("", noise or "known", outliers),)
 
 
 def _observed(p: Problem) -> dict[str, np.ndarray]:

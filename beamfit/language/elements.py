@@ -78,7 +78,7 @@ class Node(NamedTuple):
             raise self.error(found, "numbers separated by commas") from None
 
 
-class _Reader(ContentHandler):
+class _ElementReader(ContentHandler):
     """Builds nodes; text is padded to the line and column where it stands in the file."""
 
     def __init__(self, source: str) -> None:
@@ -132,7 +132,7 @@ class _Reader(ContentHandler):
         self.open[-1].text.append(content)
 
 
-def _ill_formed(said: str, at: Place, reader: _Reader) -> tuple[str, str]:
+def _ill_formed(said: str, at: Place, reader: _ElementReader) -> tuple[str, str]:
     """Error in a text that is not well-formed XML, and what was expected."""
     line = reader.lines[at.line - 1] if at.line <= len(reader.lines) else ""
     closing = re.search(r"</\s*([^\s>]*)", line[max(0, at.column - 3) :])
@@ -152,7 +152,7 @@ def read_elements(text: str) -> Node:
     InputError
         With its place, if it is not XML, or has entities, a document type, or nests too deep.
     """
-    reader = _Reader(text)
+    reader = _ElementReader(text)
     try:
         parseString(text.encode(), reader, forbid_dtd=True)
     except SAXParseException as error:

@@ -45,7 +45,7 @@ class Expression:
 
 
 @dataclass(frozen=True)
-class Number(Expression):
+class Literal(Expression):
     """A number, kept as it was written."""
 
     text: str
@@ -74,7 +74,7 @@ class Name(Expression):
 
 
 @dataclass(frozen=True)
-class Operation(Expression):
+class Arithmetic(Expression):
     """``+ - * / @ ^`` of two parts, or a sign of one."""
 
     symbol: str
@@ -124,7 +124,7 @@ def children(e: Expression) -> tuple[Expression, ...]:
     match e:
         case Name():
             return e.indices
-        case Operation() | Elements():
+        case Arithmetic() | Elements():
             return e.parts
         case Application():
             return e.arguments
@@ -151,7 +151,7 @@ SIGN, ATOM = 3, 5
 
 
 def _level(e: Expression) -> int:
-    if not isinstance(e, Operation):
+    if not isinstance(e, Arithmetic):
         return ATOM
     return SIGN if len(e.parts) == 1 else LEVELS[e.symbol]
 
@@ -164,14 +164,14 @@ def _inside(e: Expression, least: int) -> str:
 def text_of(e: Expression) -> str:
     """Print an expression, with the parentheses it needs."""
     match e:
-        case Number():
+        case Literal():
             return e.text
         case Whole():
             return ":"
         case Name():
             inner = ", ".join(map(text_of, e.indices))
             return f"{e.name}[{inner}]" if e.indices else e.name
-        case Operation():
+        case Arithmetic():
             return _operation_text(e)
         case Application():
             return f"{e.function}({', '.join(map(text_of, e.arguments))})"
@@ -184,7 +184,7 @@ def text_of(e: Expression) -> str:
     raise TypeError(e)
 
 
-def _operation_text(e: Operation) -> str:
+def _operation_text(e: Arithmetic) -> str:
     if len(e.parts) == 1:
         return e.symbol + _inside(e.parts[0], SIGN)
     left, right = e.parts

@@ -103,7 +103,7 @@ class Array(NamedTuple):
         return f"{self.name}[{inner}]"
 
 
-class Step(NamedTuple):
+class MappingStep(NamedTuple):
     """An assignment or a call, with everything it runs over; `number` counts steps of a mapping."""
 
     number: int
@@ -144,7 +144,7 @@ class Scope:
     arrays: dict[str, Array] = field(default_factory=dict)
     functions: dict[str, d.Function] = field(default_factory=dict)
     callees: dict[str, Any] = field(default_factory=dict)
-    steps: list[Step] = field(default_factory=list)
+    steps: list[MappingStep] = field(default_factory=list)
 
     @property
     def inputs(self) -> dict[str, Array]:
@@ -227,7 +227,7 @@ def widened(scope: Scope, axes: Axes, each: tuple[x.Iterator, ...]) -> dict[str,
 def index_of(scope: Scope, e: x.Expression, axes: Axes) -> np.ndarray:
     """The values of an index for all combinations of iterators, one axis each."""
     match e:
-        case x.Number():
+        case x.Literal():
             if e.value != int(min(e.value, 2**53)):
                 raise error_at(e.at, f"'{e}' as an index", "a whole number")
             return np.int64(e.value)
@@ -235,8 +235,8 @@ def index_of(scope: Scope, e: x.Expression, axes: Axes) -> np.ndarray:
             place = list(axes).index(name)
             return axes[name].elements.reshape([-1 if i == place else 1 for i in range(len(axes))])
         case x.Name(name, ()) if (value := scope.constant(name)) is not None:
-            return index_of(scope, x.Number(repr(value), e.at), axes)
-        case x.Operation(symbol, parts) if symbol in "+-*":
+            return index_of(scope, x.Literal(repr(value), e.at), axes)
+        case x.Arithmetic(symbol, parts) if symbol in "+-*":
             found = [index_of(scope, part, axes) for part in parts]
             if max(float(np.max(np.abs(f))) for f in found) > 2**31:
                 raise error_at(e.at, f"'{e}' as an index", "numbers below 2e9")
@@ -323,7 +323,7 @@ def reads(scope: Scope, e: x.Expression, axes: Axes) -> Iterator[Read]:
         case x.Application():
             _check_arguments(scope, e)
             yield from (r for part in e.arguments for r in reads(scope, part, axes))
-        case x.Operation():
+        case x.Arithmetic():
             yield from (r for part in e.parts for r in reads(scope, part, axes))
         case x.Whole():
             raise error_at(e.at, "':'", "an expression")

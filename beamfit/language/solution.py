@@ -12,7 +12,7 @@ import numpy as np
 
 from beamfit.greybox.assess import slopes
 from beamfit.greybox.diagnosis import diagnose
-from beamfit.greybox.fit import Fit, Limited, Variable
+from beamfit.greybox.fit import Fit, FittedConstraint, FittedVariable
 from beamfit.greybox.problem import TOLERANCE
 from beamfit.greybox.solve import solve
 from beamfit.language import document as d
@@ -41,7 +41,7 @@ TOLERANCES = {"major feasibility tolerance", "major optimality tolerance"}
 
 @shown
 @dataclass(frozen=True, eq=False)
-class Solution:
+class ProblemSolution:
     """Answer of the solver, in the names of the document.
 
     Parameters
@@ -92,18 +92,18 @@ class Solution:
         used = [a.solver for a in self.fit.attempts if np.array_equal(a.theta, self.fit.theta)]
         return (used or [a.solver for a in self.fit.attempts] or ["none"])[0]
 
-    def variables(self) -> list[Variable]:
+    def variables(self) -> list[FittedVariable]:
         """Free numbers by their labels, with d(objective)/d(bound)."""
         return [
             v._replace(reduced_gradient=self.factor * v.reduced_gradient)
             for v in self.fit.variables
         ]
 
-    def constraints(self) -> list[Limited]:
+    def constraints(self) -> list[FittedConstraint]:
         """Limited outputs by their labels, with d(objective)/d(limit)."""
         return [c._replace(multiplier=self.factor * c.multiplier) for c in self.fit.constraints]
 
-    def quantity(self, v: Variable) -> Quantity:
+    def quantity(self, v: FittedVariable) -> Quantity:
         """A free number with its error; its interval is that of Student's t."""
         if not math.isfinite(v.error):
             return Quantity(v.value, None, "1")
@@ -125,12 +125,12 @@ class Solution:
         tables += [Table("", ["output", "value"], values, numeric=True)] if values else []
         return tables + gain_tables(self.made.program.scope, self.gains)
 
-    def _row(self, v: Variable) -> list[str]:
+    def _row(self, v: FittedVariable) -> list[str]:
         error = ["-" if not math.isfinite(v.error) else f"{v.error:.2g}"] * self.squares
         slope = f"{v.reduced_gradient + 0.0:.3g}"
         return [v.name, f"{v.value:.8g}", *error, *_ends(v), v.state, slope]
 
-    def _variable(self, v: Variable) -> dict[str, Any]:
+    def _variable(self, v: FittedVariable) -> dict[str, Any]:
         kept = ("name", "lower", "upper", "state", "reduced_gradient")
         return {key: getattr(v, key) for key in kept} | {"value": self.quantity(v)}
 
@@ -167,11 +167,11 @@ def _range(values: np.ndarray) -> str:
     return f"{values.size} from {np.min(values):.5g} to {np.max(values):.5g}"
 
 
-def _ends(row: Variable | Limited) -> list[str]:
+def _ends(row: FittedVariable | FittedConstraint) -> list[str]:
     return [f"{end:.6g}" for end in (row.lower, row.upper)]
 
 
-def _limited(c: Limited) -> list[str]:
+def _limited(c: FittedConstraint) -> list[str]:
     return [c.name, f"{c.value:.8g}", *_ends(c), c.state, f"{c.multiplier + 0.0:.3g}"]
 
 
@@ -193,7 +193,7 @@ def solve_document(
     values: Mapping[str, Sequence[float]] | None = None,
     gains: Iterable[str] = (),
     **options: Any,
-) -> Solution:
+) -> ProblemSolution:
     """Solve the problem of a document.
 
     Parameters
@@ -215,7 +215,7 @@ def solve_document(
 
     Returns
     -------
-    Solution
+    ProblemSolution
         Never raises for a search that fails: its status says so.
 
     Raises
@@ -246,7 +246,7 @@ def solve_document(
         notes = (*notes, NOISE)
     outputs, gained = outputs_at(made.program, fit.model), gains_at(made.program, fit.model, gains)
     name = _goals(made.document)
-    return Solution(name, fit, outputs, gained, made.factor, made.squares, notes, made)
+    return ProblemSolution(name, fit, outputs, gained, made.factor, made.squares, notes, made)
 
 
 def _started(made: Formulation) -> tuple[Formulation, tuple[str, ...]]:

@@ -17,7 +17,7 @@ from beamfit.optics.arrays import value
 from beamfit.optics.calibration import FocusingStrength, IntegratedStrength
 from beamfit.optics.elements import IDENTITY, Element, Screen, SectorDipole, TransferMatrix
 from beamfit.optics.particle import ELECTRON_MASS
-from beamfit.optics.sections import Section, Series, in_series
+from beamfit.optics.sections import ElementSeries, LineSection, in_series
 from beamfit.shown import brief, shown
 from beamfit.table import Table
 
@@ -86,7 +86,7 @@ class Beamline:
     2.0595
     """
 
-    elements: tuple[Element | Section | Series, ...]
+    elements: tuple[Element | LineSection | ElementSeries, ...]
     energy: ArrayLike
     name: str = "line"
     mass: float = ELECTRON_MASS
@@ -355,13 +355,13 @@ class Beamline:
         >>> from beamfit.optics.elements import Drift
         >>> line = Beamline((Drift("A", 1.0), Drift("B", 2.0), Screen("S")), energy=100.0)
         >>> [type(e).__name__ for e in line.condensed(("S",)).elements]
-        ['Section', 'Screen']
+        ['LineSection', 'Screen']
         """
 
-        def one(part: Series) -> Section | Series:
+        def one(part: ElementSeries) -> LineSection | ElementSeries:
             if energy is None:
                 return part.multiplied()
-            return Section(part.matrix(None, energy).planes, part.length)
+            return LineSection(part.matrix(None, energy).planes, part.length)
 
         return self._with_parts(keep, one)
 

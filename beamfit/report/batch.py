@@ -13,14 +13,14 @@ from urllib.parse import quote
 from matplotlib import rc_context
 from matplotlib.figure import FigureBase
 
-from beamfit.batch.course import Course
+from beamfit.batch.course import ControlChart
 from beamfit.batch.run import Batch
 from beamfit.quantity import Quantity, display_unit
 from beamfit.report.document import (
     MANY,
     STYLE,
-    Page,
     Picture,
+    ReportPage,
     Verdict,
     control_chart,
     legend_below,
@@ -43,7 +43,7 @@ BY_CHANCE = 1 / 370
 def write_batch_report(
     path: str | PathLike[str],
     batch: Batch,
-    courses: Sequence[Course],
+    courses: Sequence[ControlChart],
     command: str | None = None,
 ) -> None:
     """Write the page of a batch, and single reports of the points beyond the limits.
@@ -55,7 +55,7 @@ def write_batch_report(
         after it; at most 40.
     batch : Batch
         The batch.
-    courses : sequence of Course
+    courses : sequence of ControlChart
         From `beamfit.batch.course.courses_of`.
     command : str, optional
         The command that made it.
@@ -80,7 +80,9 @@ def write_batch_report(
         write_page(target, _page(batch, courses, links), command)
 
 
-def _page(batch: Batch, courses: Sequence[Course], links: list[tuple[str, str]]) -> Page:
+def _page(
+    batch: Batch, courses: Sequence[ControlChart], links: list[tuple[str, str]]
+) -> ReportPage:
     job = batch.ledger.job
     answers = [[name.replace("_", " "), f"{n}"] for name, n in batch.statuses.items()]
     tables = [Table("Answers", ["status", "answers"], answers, numeric=True)]
@@ -101,7 +103,7 @@ def _page(batch: Batch, courses: Sequence[Course], links: list[tuple[str, str]])
     pictures = [
         Picture(f"course of {_label(c)}", 2.8, partial(draw_course, course=c)) for c in courses
     ]
-    return Page(
+    return ReportPage(
         title=f"{len(batch.files)} files: {job.kind}",
         subtitle="",
         verdicts=[_verdict(c) for c in courses],
@@ -115,11 +117,11 @@ def _page(batch: Batch, courses: Sequence[Course], links: list[tuple[str, str]])
     )
 
 
-def _label(c: Course) -> str:
+def _label(c: ControlChart) -> str:
     return f"{plain_name(c.name)} {c.of}".strip()
 
 
-def _verdict(c: Course) -> Verdict:
+def _verdict(c: ControlChart) -> Verdict:
     beyond, points = int(c.beyond.sum()), len(c.value)
     status = Status.poor_fit if beyond else Status.converged
     if not math.isfinite(c.limit):
@@ -134,14 +136,14 @@ def _verdict(c: Course) -> Verdict:
     return Verdict(status, f"{_label(c)}: usually {usual}", message)
 
 
-def draw_course(figure: FigureBase, course: Course) -> None:
+def draw_course(figure: FigureBase, course: ControlChart) -> None:
     """Draw a quantity against the number of its file, with control limits.
 
     Parameters
     ----------
     figure : Figure or SubFigure
         Where to.
-    course : Course
+    course : ControlChart
         What.
     """
     axes, many = figure.subplots(), len(course.value) > MANY

@@ -16,8 +16,8 @@ from beamfit.report.document import (
     BLUE,
     MANY,
     RED,
-    Page,
     Picture,
+    ReportPage,
     Verdict,
     from_head,
     legend_below,
@@ -61,7 +61,7 @@ ABREAST = 2
 
 def decay_page(
     studies: Sequence[RecordStudy], shift: Shift | None = None, trend: Trend | None = None
-) -> Page:
+) -> ReportPage:
     """Lay out decay records.
 
     Parameters
@@ -75,7 +75,7 @@ def decay_page(
 
     Returns
     -------
-    Page
+    ReportPage
     """
     decays = [decay for study in studies for decay in study.decays]
     listed = []
@@ -97,7 +97,7 @@ def decay_page(
     hours = sum(study.record.span for study in studies) / 3600
     counts = {"cycle": sum(d.fit.first.size for d in pooled), "decay": len(decays)}
     count = ", ".join(f"{n} {what}" + "s" * (n > 1) for what, n in counts.items() if n)
-    return Page(
+    return ReportPage(
         title=f"Beam lifetime of {title}",
         subtitle=f"{count} in {hours:.3g} h of record",
         verdicts=[*_together(shift, trend), *map(_verdict, pooled), *_verdicts(decays)],

@@ -58,7 +58,7 @@ class Picture(NamedTuple):
     draw: Callable[[FigureBase], None]
 
 
-class Page(NamedTuple):
+class ReportPage(NamedTuple):
     """A report: verdicts first, then tables with the pictures after the first one.
 
     ``links`` are names and addresses of further pages. Files and their SHA-256 in ``inputs``, and
@@ -79,8 +79,8 @@ class Page(NamedTuple):
 
 
 def written_now(
-    page: Page, command: str | None = None, inputs: Mapping[str, str | None] | None = None
-) -> Page:
+    page: ReportPage, command: str | None = None, inputs: Mapping[str, str | None] | None = None
+) -> ReportPage:
     """Say on a page when it is written and where it comes from: its own inputs unless given."""
     made = provenance(inputs or page.inputs or {}, page.remarks, command)
     subtitle = "; ".join(filter(None, (page.subtitle, written())))
@@ -140,12 +140,12 @@ def legend_below(figure: FigureBase, axes: Axes, columns: int) -> None:
     figure.legend(*shown, frameon=False, loc="outside lower center", ncols=columns)
 
 
-def html_of(page: Page) -> bytes:
+def html_of(page: ReportPage) -> bytes:
     """Make the HTML form of a report, pictures inside.
 
     Parameters
     ----------
-    page : Page
+    page : ReportPage
         The report.
 
     Returns

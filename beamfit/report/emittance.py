@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from functools import partial
 from typing import Any
 
-from beamfit.report.document import Page, Picture, Verdict, from_head
+from beamfit.report.document import Picture, ReportPage, Verdict, from_head
 from beamfit.report.scan_pictures import (
     PROFILES_ABREAST,
     draw_ellipses,
@@ -37,7 +37,7 @@ METHODS = (
 )
 
 
-def emittance_page(fit: EmittanceFit, methods: tuple[SizeMethods, ...] = ()) -> Page:
+def emittance_page(fit: EmittanceFit, methods: tuple[SizeMethods, ...] = ()) -> ReportPage:
     """Lay out an emittance fit.
 
     Parameters
@@ -49,7 +49,7 @@ def emittance_page(fit: EmittanceFit, methods: tuple[SizeMethods, ...] = ()) -> 
 
     Returns
     -------
-    Page
+    ReportPage
     """
     scan, line = fit.scan, fit.line
     names = [p.plane for p in fit.planes]
@@ -63,7 +63,7 @@ def emittance_page(fit: EmittanceFit, methods: tuple[SizeMethods, ...] = ()) -> 
     energy = f"{float(line.energy):g} MeV"
     if not fit.statement.closed:
         energy += f", scenario {fit.scenario}"
-    return Page(
+    return ReportPage(
         title=f"Emittance of {scan.name}",
         subtitle=f"{len(scan)} settings on line {line.name}, {energy}",
         verdicts=[Verdict(p.status, f"{p.plane}: {words_of(p)}", p.message) for p in fit.planes],

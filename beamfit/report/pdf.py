@@ -14,7 +14,7 @@ from matplotlib.font_manager import FontProperties
 from matplotlib.textpath import text_to_path
 
 from beamfit.errors import plain
-from beamfit.report.document import Page, Picture
+from beamfit.report.document import Picture, ReportPage
 from beamfit.table import Table
 
 WIDTH, HEIGHT, MARGIN = 8.27, 11.69, 0.75  # A4, inches
@@ -168,7 +168,7 @@ def _columns(lines: Sequence[Sequence[str]]) -> tuple[np.ndarray, float]:
     return widths, size
 
 
-def pages_of(page: Page) -> list[Figure]:
+def pages_of(page: ReportPage) -> list[Figure]:
     """Lay a report out on pages: verdicts, the first table, the pictures, what remains."""
     pages = _Pages()
     pages.paragraph(page.title, size=16, weight="bold", step=1.6)
@@ -199,12 +199,12 @@ def pages_of(page: Page) -> list[Figure]:
     return pages.pages
 
 
-def pdf_of(page: Page) -> bytes:
+def pdf_of(page: ReportPage) -> bytes:
     """Make the PDF of a report.
 
     Parameters
     ----------
-    page : Page
+    page : ReportPage
         The report.
 
     Returns

@@ -12,7 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import FigureBase
 from matplotlib.ticker import MaxNLocator, NullLocator
 
-from beamfit.report.document import BLUE, MANY, Page, Picture, Verdict, legend_below
+from beamfit.report.document import BLUE, MANY, Picture, ReportPage, Verdict, legend_below
 from beamfit.report.scan_pictures import COLOUR, setting_axis
 from beamfit.sampling.intervals import Expected, in_unit
 from beamfit.sampling.likelihood import noise_words
@@ -37,7 +37,7 @@ INTERVALS = (
 MOST_CORRELATED = 8
 
 
-class Sampled(NamedTuple):
+class ReportedPosterior(NamedTuple):
     """A posterior in a report: its label if there are several, and its pictures."""
 
     label: str
@@ -45,19 +45,19 @@ class Sampled(NamedTuple):
     pictures: list[Picture]
 
 
-def with_posteriors(page: Page, sampled: Sequence[Sampled]) -> Page:
+def with_posteriors(page: ReportPage, sampled: Sequence[ReportedPosterior]) -> ReportPage:
     """Add posteriors to a page: intervals after its first table, the rest at its end.
 
     Parameters
     ----------
-    page : Page
+    page : ReportPage
         Of the fits.
-    sampled : sequence of Sampled
+    sampled : sequence of ReportedPosterior
         From `of_scan` or `of_decay`.
 
     Returns
     -------
-    Page
+    ReportPage
     """
     verdicts, intervals, further = [], [], []
     for label, found, _ in sampled:
@@ -243,7 +243,7 @@ def _expectations(
     legend_below(figure, axes, 3)
 
 
-def of_scan(fit: EmittanceFit, posterior: Posterior) -> Sampled:
+def of_scan(fit: EmittanceFit, posterior: Posterior) -> ReportedPosterior:
     """The posterior of a scan, with two pictures a sampled plane."""
     expected, pairs = [], []
     for p in fit.planes:
@@ -265,7 +265,7 @@ def of_scan(fit: EmittanceFit, posterior: Posterior) -> Sampled:
         expected.append(Picture(f"sizes expected in the {p.plane} plane", 3.4, draw))
         words, of_plane = f"numbers of the {p.plane} plane in pairs", f"{p.plane} plane: posterior"
         pairs.append(_pairs(words, posterior, names, of_plane, COLOUR[p.plane]))
-    return Sampled("", posterior, expected + pairs)
+    return ReportedPosterior("", posterior, expected + pairs)
 
 
 def _of_plane(posterior: Posterior, plane: str) -> list[str]:
@@ -276,10 +276,10 @@ def _of_plane(posterior: Posterior, plane: str) -> list[str]:
     return [name for name in names if name in posterior.shown][:MOST_NUMBERS]
 
 
-def of_decay(fit: DecayFit, posterior: Posterior, label: str = "") -> Sampled:
+def of_decay(fit: DecayFit, posterior: Posterior, label: str = "") -> ReportedPosterior:
     """The posterior of a decay, with two pictures if it was sampled."""
     if not posterior.chain.size:
-        return Sampled(label, posterior, [])
+        return ReportedPosterior(label, posterior, [])
     wanted = ("lifetime_mean", "a", "b", "noise", "error_factor", "outlier_fraction")
     names = [name for name in wanted if name in posterior.shown][:MOST_NUMBERS]
     draw = partial(
@@ -298,7 +298,7 @@ def of_decay(fit: DecayFit, posterior: Posterior, label: str = "") -> Sampled:
         _pairs(words, posterior, names, f"{fit.record}: posterior", BLUE),
         Picture(f"current expected of {fit.record}", 3.4, draw),
     ]
-    return Sampled(label, posterior, pictures)
+    return ReportedPosterior(label, posterior, pictures)
 
 
 def _pairs(

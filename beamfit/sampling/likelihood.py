@@ -34,7 +34,7 @@ class Own(NamedTuple):
     spread: float
 
 
-class Group(NamedTuple):
+class NoiseGroup(NamedTuple):
     """Noise model of one group of points.
 
     Attributes
@@ -83,12 +83,12 @@ class Group(NamedTuple):
         return (noise,) * self.inferred + (fraction,) * self.outliers
 
 
-def noise_words(groups: Sequence[Group]) -> str:
+def noise_words(groups: Sequence[NoiseGroup]) -> str:
     """Say of each group of points what is taken of its errors.
 
     Examples
     --------
-    >>> noise_words((Group("x", "inferred"), Group("y")))
+    >>> noise_words((NoiseGroup("x", "inferred"), NoiseGroup("y")))
     'x inferred from the residuals; y as stated'
     """
     said = [WORDS[group.noise] + (", with outliers" if group.outliers else "") for group in groups]
@@ -127,7 +127,7 @@ def outlier_density(residual: Array) -> Array:
     return jnp.where(near, limit, between) / math.log(WIDEST / NARROWEST)
 
 
-def _of_group(residual: Array, counts: Array, group: Group, extra: list[Array]) -> Array:
+def _of_group(residual: Array, counts: Array, group: NoiseGroup, extra: list[Array]) -> Array:
     if group.noise == "averaged":
         return jnp.zeros(())
     log_scale = extra.pop(0) if group.inferred else 0.0
@@ -149,7 +149,7 @@ def _of_group(residual: Array, counts: Array, group: Group, extra: list[Array]) 
 
 
 def log_likelihood(
-    residuals: Sequence[Array], counts: Sequence[Array], groups: Sequence[Group], extra: Array
+    residuals: Sequence[Array], counts: Sequence[Array], groups: Sequence[NoiseGroup], extra: Array
 ) -> Array:
     """Log likelihood of residuals, up to a constant.
 
@@ -159,7 +159,7 @@ def log_likelihood(
         One vector a group, in units of the stated errors.
     counts : sequence of bool or array of bool
         Which of them count; the others fill a vector up to its length.
-    groups : sequence of Group
+    groups : sequence of NoiseGroup
         How they scatter.
     extra : array, shape (k,)
         The groups' own numbers, in order.
@@ -173,7 +173,7 @@ def log_likelihood(
 
     Examples
     --------
-    >>> print(log_likelihood([jnp.array([1.0, 2.0])], [True], [Group()], jnp.zeros(0)))
+    >>> print(log_likelihood([jnp.array([1.0, 2.0])], [True], [NoiseGroup()], jnp.zeros(0)))
     -2.5
     """
     own = list(extra)

@@ -23,7 +23,7 @@ from beamfit.sampling.intervals import (
 )
 from beamfit.sampling.likelihood import LOG_NOISE
 from beamfit.sampling.priors import in_words
-from beamfit.sampling.target import Target
+from beamfit.sampling.target import SamplingTarget
 from beamfit.shown import brief, shown
 from beamfit.status import Status
 from beamfit.table import Table, html_of, json_of, text_of
@@ -48,7 +48,7 @@ class Posterior:
 
     Parameters
     ----------
-    target : Target
+    target : SamplingTarget
         What was sampled.
     chain : array, shape (steps, walkers, n)
         The draws, without the warm-up.
@@ -83,7 +83,7 @@ class Posterior:
     ('converged', '1.993 ± 0.027')
     """
 
-    target: Target
+    target: SamplingTarget
     chain: np.ndarray
     log_prob: np.ndarray
     status: Status

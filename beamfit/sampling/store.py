@@ -23,7 +23,7 @@ from beamfit.writing import write_atomically
 if TYPE_CHECKING:
     import h5py
 
-    from beamfit.sampling.target import Target
+    from beamfit.sampling.target import SamplingTarget
 
 # To be changed with every change of a store's content or of the digest of a problem.
 KIND, FORMAT = "beamfit-posterior", "3"
@@ -100,7 +100,7 @@ def _moved(chain: np.ndarray) -> np.ndarray:
 
 
 def _contents(
-    target: Target,
+    target: SamplingTarget,
     state: Checkpoint,
     provenance: Provenance,
     summary: Mapping[str, Any] | None,
@@ -148,7 +148,7 @@ def _storable(values: Any) -> np.ndarray:
 
 def save(
     path: str | PathLike[str],
-    target: Target,
+    target: SamplingTarget,
     state: Checkpoint,
     provenance: Provenance,
     summary: Mapping[str, Any] | None = None,
@@ -159,7 +159,7 @@ def save(
     ----------
     path : str or path
         Where to.
-    target : Target
+    target : SamplingTarget
         What is sampled.
     state : Checkpoint
         How far it came.
@@ -218,14 +218,16 @@ def _unsealed(content: bytes, path: str | PathLike[str]) -> bytes:
     raise InputError(found, f"a posterior store ({KIND}-{FORMAT}){REMEDY}", path=path)
 
 
-def load(path: str | PathLike[str], target: Target, seed: int, walkers: int) -> Checkpoint | None:
+def load(
+    path: str | PathLike[str], target: SamplingTarget, seed: int, walkers: int
+) -> Checkpoint | None:
     """Read a checkpoint of the same problem; the file is opened for reading only.
 
     Parameters
     ----------
     path : str or path
         The store.
-    target : Target
+    target : SamplingTarget
         What is to be sampled.
     seed, walkers : int
         As of the run that began it.
@@ -263,7 +265,12 @@ def load(path: str | PathLike[str], target: Target, seed: int, walkers: int) -> 
 
 
 def _difference(
-    state: Checkpoint, names: tuple[str, ...], digest: str, target: Target, seed: int, walkers: int
+    state: Checkpoint,
+    names: tuple[str, ...],
+    digest: str,
+    target: SamplingTarget,
+    seed: int,
+    walkers: int,
 ) -> tuple[str, str] | None:
     """Difference of a store from the run to continue, and what was expected; None if equal."""
     if names != target.names:

@@ -53,7 +53,7 @@ class Batches:
     little: Any
 
 
-class Seen(NamedTuple):
+class PreparedBatches(NamedTuple):
     """Batches with what was read: `measured` and `read`, shape (batches, rows, outputs)."""
 
     batches: Batches
@@ -134,13 +134,13 @@ def bounds_of(runs: Sequence[Run], most: tuple[float, float] | None) -> Batches:
     return Batches(tuple(runs[0].inputs), steps, None, None, None, jnp.asarray(most), little)
 
 
-def seen_of(runs: Sequence[Run], like: Batches) -> Seen:
+def seen_of(runs: Sequence[Run], like: Batches) -> PreparedBatches:
     """Batches as the model sees them, like others."""
     hours = tuple((run.time - run.time[0]) / HOUR for run in runs)
     batches = batches_of(hours, [run.inputs for run in runs], like)
     read = [np.stack([run.outputs[s] for s in STATES], axis=1) for run in runs]
     measured = padded(read, batches.dt.shape[1], np.nan)
-    return Seen(batches, np.nan_to_num(measured), np.isfinite(measured), hours)
+    return PreparedBatches(batches, np.nan_to_num(measured), np.isfinite(measured), hours)
 
 
 def _sizes(runs: Sequence[Run]) -> tuple[np.ndarray, float, float]:
@@ -180,7 +180,7 @@ def network_of(
     return dense(ports, list(outputs), [hidden], seed=seed, spread=0.3)
 
 
-def state(seen: Seen, model: Any, noise: np.ndarray) -> Problem:
+def state(seen: PreparedBatches, model: Any, noise: np.ndarray) -> Problem:
     """State the problem; `noise`, of the shape of the readings, is a guess that they correct."""
     record = Record(
         "batches", course, seen.batches, seen.measured, error=noise, weight=seen.read * 1.0,

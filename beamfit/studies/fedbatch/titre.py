@@ -26,7 +26,7 @@ from beamfit.studies.fedbatch.model import (
     RATES,
     STATES,
     Batches,
-    Seen,
+    PreparedBatches,
     course,
     filled,
     known_at,
@@ -34,7 +34,7 @@ from beamfit.studies.fedbatch.model import (
     padded,
     rates_at,
 )
-from beamfit.studies.fedbatch.verdict import RULES, Evidence, Noise
+from beamfit.studies.fedbatch.verdict import RULES, RateEvidence, ReadingNoise
 from beamfit.studies.response.model import weight_priors
 from beamfit.table import Table, json_of
 from beamfit.verdict import judge
@@ -55,20 +55,20 @@ class TitreFit:
         How far to believe it; ``message`` says why and what to do.
     rates : FedBatchFit
         The first stage.
-    seen : Seen
+    seen : PreparedBatches
         Its batches, with the readings of the titre.
     fit : Fit
         Of both stages: the first stage's numbers have its own errors as their prior.
-    noise : Noise
+    noise : ReadingNoise
         Of the titre.
     """
 
     status: Status
     message: str
     rates: FedBatchFit
-    seen: Seen
+    seen: PreparedBatches
     fit: Fit
-    noise: Noise
+    noise: ReadingNoise
 
     @property
     def headline(self) -> str:
@@ -140,7 +140,7 @@ def fit_titre(
     model = dict(rates.fit.model) | _known(rates.fit) | _first(rates, seen, points, hidden, seed)
     fit, noise, rests = settled(seen, model, _state, _titres, (TITRE,))
     y = np.asarray(_titres(fit.model, b))
-    found = judge(Evidence(fit, rests, seen, y, noise), RULES)
+    found = judge(RateEvidence(fit, rests, seen, y, noise), RULES)
     error = noise[TITRE].errors(y[..., 0])[..., None]
     both = solve(_state(seen, fit.model, error, (*STAGES, *OWN)), iterations=JOINT)
     return TitreFit(found.status, found.message, rates, seen, both, noise[TITRE])
@@ -156,7 +156,7 @@ def _known(fit: Fit) -> dict[str, Any]:
 
 
 def _first(
-    rates: FedBatchFit, seen: Seen, points: Sequence[str], hidden: int, seed: int
+    rates: FedBatchFit, seen: PreparedBatches, points: Sequence[str], hidden: int, seed: int
 ) -> dict[str, Any]:
     b, top, values = seen.batches, [], []
     for i, (x, t) in enumerate(zip(rates.courses, seen.time, strict=True)):
@@ -203,7 +203,9 @@ def _held(model: Any) -> jax.Array:
     return model["known"] @ tree.read(first, leaves) - model["found"]
 
 
-def _state(seen: Seen, model: Any, error: np.ndarray, free: Sequence[str] = OWN) -> Problem:
+def _state(
+    seen: PreparedBatches, model: Any, error: np.ndarray, free: Sequence[str] = OWN
+) -> Problem:
     record = Record(
         TITRE, _titres, seen.batches, seen.measured, error=error, weight=seen.read * 1.0, worth=1.0
     )

@@ -16,7 +16,7 @@ from beamfit.greybox.problem import Constraint, Free, Prior, Problem, Record
 from beamfit.greybox.solve import solve
 from beamfit.noise.correlated import Noise, innovations, remembers
 from beamfit.status import Status
-from beamfit.studies.response.model import CLOSE, Seen, output_of, predicted
+from beamfit.studies.response.model import CLOSE, PreparedOutput, output_of, predicted
 from beamfit.studies.response.noise import noise_of
 
 # Rounds with a memory of the noise at most, and the gain in -2 ln L below which nothing is gained
@@ -30,7 +30,7 @@ class Case(NamedTuple):
     A course is a run as its model sees it: `model.Driven` or `shooting.Course`.
     """
 
-    seen: tuple[Seen, ...]
+    seen: tuple[PreparedOutput, ...]
     courses: tuple[Any, ...]
     free: tuple[Free, ...]
     priors: tuple[Prior, ...]
@@ -61,7 +61,7 @@ class Case(NamedTuple):
             for i, course in enumerate(self.courses)
         )
 
-    def rows(self, rest: Any) -> list[tuple[np.ndarray, np.ndarray, Seen]]:
+    def rows(self, rest: Any) -> list[tuple[np.ndarray, np.ndarray, PreparedOutput]]:
         """Residuals, their times and the output, for each run and output."""
         pairs = ((i, zip(row, self.seen, strict=True)) for i, row in enumerate(rest))
         return [(r, s.time[i], s) for i, row in pairs for r, s in row]

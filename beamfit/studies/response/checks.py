@@ -13,7 +13,7 @@ from beamfit.dynamics.response import FIRST_ORDER, Physics, simulate
 from beamfit.greybox.fit import Fit
 from beamfit.studies.response.model import (
     CLOSE,
-    Seen,
+    PreparedOutput,
     changed_by,
     driven,
     parameters_at,
@@ -87,7 +87,7 @@ class Checks(NamedTuple):
         return rows
 
 
-class HeldBack(NamedTuple):
+class HeldOutRun(NamedTuple):
     """A run that was only predicted: its name, how much is explained, and its rms residual."""
 
     name: str
@@ -106,7 +106,7 @@ def percent(rest: np.ndarray, y: np.ndarray) -> float:
 
 
 def checks_of(
-    seen: Seen,
+    seen: PreparedOutput,
     residuals: tuple[np.ndarray, ...],
     slopes: Sequence[tuple[np.ndarray, np.ndarray]],
     used: int,
@@ -138,7 +138,7 @@ def checks_of(
     )
 
 
-def _together(seen: Seen) -> tuple[str, ...]:
+def _together(seen: PreparedOutput) -> tuple[str, ...]:
     """Inputs whose gains cannot be told apart: their variance inflation is above a thousand."""
     u = (seen.points - seen.points.mean(0)) / seen.wide
     found = []
@@ -190,7 +190,7 @@ def _white(residuals: tuple[np.ndarray, ...]) -> float:
 
 
 def _explained(
-    seen: Seen,
+    seen: PreparedOutput,
     residuals: tuple[np.ndarray, ...],
     slopes: Sequence[tuple[np.ndarray, np.ndarray]],
     delay: int,
@@ -249,7 +249,7 @@ def _basis(columns: np.ndarray, size: np.ndarray | None = None) -> np.ndarray:
     return found[:, values > 1e-6]
 
 
-def slopes_of(seen: Seen, fit: Fit) -> list[tuple[np.ndarray, np.ndarray]]:
+def slopes_of(seen: PreparedOutput, fit: Fit) -> list[tuple[np.ndarray, np.ndarray]]:
     """Slopes of the output by the model's own numbers, and by parameters that change."""
     found = []
     for run in seen.runs:
@@ -259,7 +259,7 @@ def slopes_of(seen: Seen, fit: Fit) -> list[tuple[np.ndarray, np.ndarray]]:
     return found
 
 
-def predict_held(run: Run, output: str, fit: Fit, physics: Physics, delay: float) -> HeldBack:
+def predict_held(run: Run, output: str, fit: Fit, physics: Physics, delay: float) -> HeldOutRun:
     """Predict a run that was held back; only the state at its start is estimated."""
     seen = driven(run, 0, output, physics, delay)
     p = parameters_at(physics, fit.model["map"], seen.u)
@@ -274,4 +274,4 @@ def predict_held(run: Run, output: str, fit: Fit, physics: Physics, delay: float
     target = y - base - float(fit.model["offset"])
     first = np.linalg.lstsq(moved, target, rcond=1e-10)[0]
     rest = target - moved @ first
-    return HeldBack(run.name, percent(rest, y), float(rest.std()))
+    return HeldOutRun(run.name, percent(rest, y), float(rest.std()))

@@ -13,7 +13,7 @@ from beamfit.errors import InputError, nearest
 from beamfit.studies.response.certain import certain_range
 from beamfit.studies.response.fit import ResponseFit
 from beamfit.studies.response.model import parameters_at, predicted
-from beamfit.studies.response.receding import Controller, Limits, Response
+from beamfit.studies.response.receding import Controller, ControlLimits, Response
 
 # A limit of an output is held off by so many standard deviations of noise and model together.
 MARGIN = 2.0
@@ -99,7 +99,7 @@ def controller(
                 for r, a, b in zip(responses, below, above, strict=True)}  # fmt: skip
         low, high = certain_range(fits, hard, (low, high), ends)
     rate = step * np.array([_rates(names, rates or {}).get(name, np.inf) for name in names])
-    limits = Limits(low, high, rate, below, above)
+    limits = ControlLimits(low, high, rate, below, above)
     return Controller(names, responses, step, seen.wide, limits, horizon, smooth)
 
 

@@ -15,7 +15,7 @@ from beamfit.greybox.memory import Memory
 from beamfit.quantity import Quantity
 from beamfit.statistics import POOR_FIT
 from beamfit.studies.response.checks import Checks
-from beamfit.studies.response.model import Seen, curves
+from beamfit.studies.response.model import PreparedOutput, curves
 from beamfit.table import Table, cell, json_of
 
 # Points of a curve; it was visited where so many samples lie within a share of its range.
@@ -99,7 +99,7 @@ def _late(model: Any, of: tuple[Any, float]) -> jax.Array:
 
 
 def quantities_of(
-    fit: Fit, errors: Memory | None, seen: Seen, physics: Physics, delay: float
+    fit: Fit, errors: Memory | None, seen: PreparedOutput, physics: Physics, delay: float
 ) -> dict[str, Quantity]:
     """Constant parameters with errors, and the offset if it is free."""
     m = len(seen.inputs)
@@ -139,7 +139,10 @@ def quantity(found: Derived, i: Any, unit: str) -> Quantity:
 
 
 def told(
-    quantities: Mapping[str, Quantity], curves: Sequence[Curve], seen: Seen, checks: Checks
+    quantities: Mapping[str, Quantity],
+    curves: Sequence[Curve],
+    seen: PreparedOutput,
+    checks: Checks,
 ) -> tuple[dict[str, Quantity], tuple[Curve, ...]]:
     """Quantities and curves with errors only where the runs determine them.
 
@@ -166,7 +169,7 @@ def told(
     )
 
 
-def curves_of(fit: Fit, errors: Memory | None, seen: Seen) -> tuple[Curve, ...]:
+def curves_of(fit: Fit, errors: Memory | None, seen: PreparedOutput) -> tuple[Curve, ...]:
     """Every parameter against every input."""
     physics, m = seen.runs[0].physics, len(seen.inputs)
     points, made = seen.points, []

@@ -90,7 +90,7 @@ def closed_loop(
     return jax.lax.scan(on, (x, state), series)[1]
 
 
-class Change(NamedTuple):
+class StepResponse(NamedTuple):
     """A step of a target or of a disturbance, and how the loop takes it.
 
     `disturbed` is by how much, or 0; `settling` None where it does not settle before the next
@@ -134,7 +134,7 @@ class Loop:
         What was wanted.
     trace : Trace
         What came of it.
-    changes : tuple of Change
+    changes : tuple of StepResponse
         The steps of targets and disturbances.
     """
 
@@ -145,7 +145,7 @@ class Loop:
     time: np.ndarray
     targets: np.ndarray
     trace: Trace
-    changes: tuple[Change, ...]
+    changes: tuple[StepResponse, ...]
 
     @property
     def headline(self) -> str:
@@ -300,7 +300,7 @@ def _noise(fit: ResponseFit, time: np.ndarray, seed: int) -> np.ndarray:
     return size * (np.sqrt(1.0 - fit.memory.white) * wander + np.sqrt(fit.memory.white) * white)
 
 
-def _changes(loop: Loop, load: np.ndarray) -> list[Change]:
+def _changes(loop: Loop, load: np.ndarray) -> list[StepResponse]:
     """Response of the loop to each step of a target or disturbance, until the next one."""
     time, wanted, trace = loop.time, loop.targets, loop.trace
     # A change of one output is felt by the others: all are followed until the next one of any.
@@ -321,9 +321,9 @@ def _changes(loop: Loop, load: np.ndarray) -> list[Change]:
             settling = None if after >= len(error) else after * loop.control.step
             over = max(0.0, float((error * np.sign(step)).max()) / abs(step)) if step else None
             left = float(error[-max(1, int(LAST * len(error))) :].mean())
-            end_at = float(wanted[k, i])
-            found.append(Change(fit.output, float(time[k]), end_at - step, end_at, float(push[k]),
-                                settling, over, left))  # fmt: skip
+            end_at, load_step = float(wanted[k, i]), float(push[k])
+            found.append(StepResponse(fit.output, float(time[k]), end_at - step, end_at, load_step,
+                                      settling, over, left))  # fmt: skip
     return [c for c in found if c.disturbed or abs(c.after - c.before) > 1e-9 * abs(c.after)]
 
 

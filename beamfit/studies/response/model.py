@@ -46,7 +46,7 @@ class Driven:
         return model["offset"] + y[self.index]
 
 
-class Seen(NamedTuple):
+class PreparedOutput(NamedTuple):
     """Runs of one output, with what the model needs of them.
 
     `runs` by `Driven`; `measured` are the readings of each, without missing ones; `size_u` and
@@ -151,7 +151,9 @@ def weight_priors(path: str) -> tuple[Prior, ...]:
     return tuple(Prior(f"{path}.{part}", 0.0, WEIGHT) for part in ("weights", "biases"))
 
 
-def network_of(seen: Seen, physics: Physics, raw: np.ndarray, hidden: int, seed: int) -> MLP:
+def network_of(
+    seen: PreparedOutput, physics: Physics, raw: np.ndarray, hidden: int, seed: int
+) -> MLP:
     """A network that gives constant raw numbers everywhere but for small random weights."""
     m, wide = len(seen.inputs), seen.wide
     ports = [Port(n, "", 0, float(s), float(b))

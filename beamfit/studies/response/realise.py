@@ -48,7 +48,7 @@ class Linear:
     matrices = linear
 
 
-class Network(Linear):
+class LinearWithNetwork(Linear):
     """The same with x+ = a x + b u + steps * out @ tanh(inside @ (x/sizes, u) + bias)."""
 
     def run(self, p: Any, u: Any, dt: Any, x0: Any) -> tuple[jax.Array, jax.Array]:
@@ -82,7 +82,7 @@ class Network(Linear):
         return linear._replace(a=a, b=b + shift)
 
 
-LINEAR, NETWORK = Linear(), Network()
+LINEAR, NETWORK = Linear(), LinearWithNetwork()
 
 
 def realisations(

@@ -19,8 +19,8 @@ from beamfit.studies.response.case import (
     settled,
     with_memory,
 )
-from beamfit.studies.response.limits import Limited
-from beamfit.studies.response.model import Seen, weight_priors
+from beamfit.studies.response.limits import LimitedParameter
+from beamfit.studies.response.model import PreparedOutput, weight_priors
 from beamfit.studies.response.noise import Noise
 from beamfit.studies.response.record import Run
 from beamfit.studies.response.starts import best_start, driven_by, start_of
@@ -29,7 +29,9 @@ from beamfit.studies.response.starts import best_start, driven_by, start_of
 STEPS, ROUNDS = 100, 30
 
 
-def case_of(seen: Seen, offset: bool, network: bool = False, told: Limited | None = None) -> Case:
+def case_of(
+    seen: PreparedOutput, offset: bool, network: bool = False, told: LimitedParameter | None = None
+) -> Case:
     """The case of one output: constant raw numbers or a network of them, within limits if told."""
     ends = {} if told is None or network else {"lower": told.lower, "upper": told.upper}
     free = [Free("start", nuisance=True), Free("map", nuisance=network, **ends)]
@@ -60,7 +62,7 @@ def remembering(case: Case, models: Sequence[Any]) -> Settled:
 class Begun(NamedTuple):
     """Runs as the model sees them, the delay, and the fit with constant parameters."""
 
-    seen: Seen
+    seen: PreparedOutput
     delay: float
     plain: Settled
 

@@ -19,7 +19,7 @@ from beamfit.studies.response.case import (
     settled,
     with_memory,
 )
-from beamfit.studies.response.model import Seen
+from beamfit.studies.response.model import PreparedOutput
 from beamfit.studies.response.noise import Noise
 
 # Steps of a round, after which the noise is taken from the residuals again; rounds at most, and the
@@ -74,7 +74,7 @@ class Course:
         return self.shot(model)[0]
 
 
-def course_of(system: System, seen: Sequence[Seen], i: int) -> Course:
+def course_of(system: System, seen: Sequence[PreparedOutput], i: int) -> Course:
     """Course of a run, from the prepared outputs."""
     run = seen[0].runs[i]
     index = [k * len(run.u) + np.asarray(s.runs[i].index) for k, s in enumerate(seen)]

@@ -11,7 +11,7 @@ from beamfit.greybox.fit import Fit
 from beamfit.quantity import Quantity
 from beamfit.statistics import POOR_FIT
 from beamfit.status import Status
-from beamfit.studies.response.checks import Checks, HeldBack
+from beamfit.studies.response.checks import Checks, HeldOutRun
 from beamfit.studies.response.curve import TIME, Curve
 from beamfit.verdict import Finding
 
@@ -21,7 +21,7 @@ HALF = 0.5
 WORSE = 2.0
 
 
-class Evidence(NamedTuple):
+class ResponseEvidence(NamedTuple):
     """Input of the rules."""
 
     fit: Fit
@@ -29,12 +29,12 @@ class Evidence(NamedTuple):
     checks: Checks
     quantities: Mapping[str, Quantity]
     curves: tuple[Curve, ...]
-    held: tuple[HeldBack, ...]
+    held: tuple[HeldOutRun, ...]
     map: str
     rms: float
 
 
-def judged(found: Mapping[str, Evidence]) -> tuple[Status, str]:
+def judged(found: Mapping[str, ResponseEvidence]) -> tuple[Status, str]:
     """Status and sentences of several outputs of one model: the gravest rule that any breaks."""
     for rule in RULES:
         said = {name: f for name, e in found.items() if (f := rule(e)) is not None}
@@ -54,7 +54,7 @@ def rms_of(fit: Fit) -> float:
     return float(np.sqrt(np.mean(np.square(found))))
 
 
-def _lost(e: Evidence) -> Finding | None:
+def _lost(e: ResponseEvidence) -> Finding | None:
     if e.fit.status is Status.infeasible:
         return Finding(Status.infeasible, e.fit.message)
     if e.rests:
@@ -63,7 +63,7 @@ def _lost(e: Evidence) -> Finding | None:
     return Finding(Status.not_finite if lost else Status.not_converged, e.fit.message)
 
 
-def _nothing(e: Evidence) -> Finding | None:
+def _nothing(e: ResponseEvidence) -> Finding | None:
     if e.checks.nothing_probability < POOR_FIT:
         return None
     cause = "The inputs explain no more of the output than chance would."
@@ -74,7 +74,7 @@ def _nothing(e: Evidence) -> Finding | None:
     return Finding(Status.unidentified, cause, remedy)
 
 
-def _joint(e: Evidence) -> Finding | None:
+def _joint(e: ResponseEvidence) -> Finding | None:
     if not e.checks.together:
         return None
     inputs = ", ".join(e.checks.together)
@@ -82,7 +82,7 @@ def _joint(e: Evidence) -> Finding | None:
     return Finding(Status.unidentified, cause, "Move one at a time, or leave one out.")
 
 
-def _lower(e: Evidence) -> Finding | None:
+def _lower(e: ResponseEvidence) -> Finding | None:
     if not e.checks.first_order:
         return None
     cause = "A first order explains the runs as well: "
@@ -93,7 +93,7 @@ def _lower(e: Evidence) -> Finding | None:
     return Finding(Status.unidentified, cause, "Use --model first-order.")
 
 
-def _open(e: Evidence) -> Finding | None:
+def _open(e: ResponseEvidence) -> Finding | None:
     left = {n: q.unit for n, q in e.quantities.items() if q.error is None}
     left |= {
         f"{c.parameter}({c.input})": c.unit
@@ -112,7 +112,7 @@ def _open(e: Evidence) -> Finding | None:
     return Finding(Status.unidentified, cause, remedy)
 
 
-def _fed_back(e: Evidence) -> Finding | None:
+def _fed_back(e: ResponseEvidence) -> Finding | None:
     c = e.checks
     if c.feedback_probability >= POOR_FIT:
         return None
@@ -126,7 +126,7 @@ def _fed_back(e: Evidence) -> Finding | None:
     return Finding(Status.poor_fit, cause, remedy)
 
 
-def _refuted(e: Evidence) -> Finding | None:
+def _refuted(e: ResponseEvidence) -> Finding | None:
     c = e.checks
     if c.input_probability >= POOR_FIT:
         return None
@@ -140,7 +140,7 @@ def _refuted(e: Evidence) -> Finding | None:
     return Finding(Status.poor_fit, cause, f"Try {more}.")
 
 
-def _worse(e: Evidence) -> Finding | None:
+def _worse(e: ResponseEvidence) -> Finding | None:
     bad = [h for h in e.held if h.rms > WORSE * e.rms]
     if not bad:
         return None
@@ -152,7 +152,7 @@ def _worse(e: Evidence) -> Finding | None:
     return Finding(Status.poor_fit, cause, remedy)
 
 
-def _good(e: Evidence) -> Finding:
+def _good(e: ResponseEvidence) -> Finding:
     cause = f"The free run explains {e.checks.free_run_percent:.2f} % of the output."
     if e.checks.white_probability < POOR_FIT:
         cause += " The noise has a memory, which the errors contain."

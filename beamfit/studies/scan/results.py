@@ -16,7 +16,7 @@ from beamfit.status import Status
 from beamfit.table import Table, cell, json_of, labelled
 
 if TYPE_CHECKING:
-    from beamfit.greybox.fit import Variable
+    from beamfit.greybox.fit import FittedVariable as Variable
 
 
 def in_words(settings: Mapping[str, float], units: Mapping[str, str], digits: int = 4) -> str:
