@@ -19,7 +19,7 @@ from beamfit.errors import InputError
 from beamfit.io.files import digest_now
 from beamfit.writing import replacing, write_atomically
 
-# Rows that are turned from text into a table at a time.
+# Rows converted from text to a table at a time, to bound the memory.
 BLOCK = 4096
 
 

@@ -23,7 +23,7 @@ Examples:
   beamfit batch fills/ --kind lifetime --out fills.csv --workers 2
   beamfit batch scans/ --kind emittance --lattice line.toml --out year.h5 --scheduler tcp://host:8786
 """
-# Reasons that are printed; all are in the table.
+# Refusals printed on the terminal; the table has all.
 NAMED = 10
 
 

@@ -20,11 +20,13 @@ from beamfit.greybox import problem
 from beamfit.greybox.factors import Rows, lengths
 from beamfit.greybox.problem import Problem
 
-# A bound is reached, too, where moving onto it changes the cost by less than this share.
+# A bound also counts as reached if moving onto it changes the cost by less than this share.
 CLOSE = 1e-8
-# What is limited counts as no larger than this many times its size at the end: a start at which it
-# was exp(100) must not make every end feasible.
+# The size of a limited value is at most this many times the one at the end: a start at which it was
+# exp(100) must not make every end feasible.
 GROWN = 1e3
+# Random test points about a point, and their distance in sizes of the numbers.
+LOOKS, NEAR = 4, 0.3
 
 
 class Slopes(NamedTuple):
@@ -165,6 +167,12 @@ def slopes(p: Problem, theta: np.ndarray) -> Slopes:
     """Evaluate values and first derivatives at a point."""
     parts = p.compiled(first_order)(np.asarray(theta, float))
     return Slopes(*(np.asarray(part) for part in parts))
+
+
+def nearby(p: Problem, theta: np.ndarray, unit: np.ndarray) -> np.ndarray:
+    """Test points about a point, within the bounds, shape (`LOOKS`, n)."""
+    steps = np.random.default_rng(0).normal(size=(LOOKS, len(unit)))
+    return np.clip(theta + NEAR * steps * unit, p.lower, p.upper)
 
 
 def of_squares(residual: np.ndarray, jacobian: Rows) -> Slopes:

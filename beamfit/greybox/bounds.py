@@ -19,6 +19,7 @@ import numpy as np
 from beamfit.errors import InputError
 from beamfit.greybox.activations import Range, range_of
 
+# Relative error of one operation in double precision, half the distance between neighbours.
 _ROUNDING = 2.0**-53
 _TINY = 1e-300  # covers underflow, which a relative error does not
 

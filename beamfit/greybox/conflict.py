@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from beamfit.greybox import problem
-from beamfit.greybox.assess import SearchState, gradient_size, scale_of
+from beamfit.greybox.assess import NEAR, SearchState, gradient_size, nearby, scale_of
 from beamfit.greybox.descend import descend_all
 from beamfit.greybox.problem import Problem
 
@@ -97,13 +97,13 @@ def _held(p: Problem, theta: np.ndarray) -> list[tuple[int, bool]]:
     return [(i, low) for edge, low in sides for i in np.flatnonzero((theta == edge) & p.moving)]
 
 
-# Gradients count as dependent below this singular value, at an optimum; at a point that is none,
-# where solvers creep towards a place without multipliers, below this one.
+# Gradients are dependent below this singular value: the first at an optimum; the second elsewhere,
+# since solvers only approach a point without multipliers.
 DEPENDENT, NEARLY = 1e-8, 1e-2
-# A constraint has no slope where that is less than this share of how it changes within so much of
-# the numbers' sizes: a violation squared that a solver keeps below 1e-9 has a slope of 6e-5.
-SLOPELESS, NEAR, LOOKS = 1e-3, 0.3, 4
-# Of a combination, what is below this share of its largest part is none.
+# A constraint has no slope if that is below this share of its change nearby: a squared violation
+# that a solver keeps below 1e-9 has a slope of 6e-5.
+SLOPELESS = 1e-3
+# Entries of a combination below this share of its largest are rounding.
 PART = 1e-3
 
 
@@ -163,9 +163,7 @@ def dependence(p: Problem, s: SearchState, stationary: bool) -> Dependence | Non
 
 def _changes(p: Problem, s: SearchState) -> np.ndarray:
     """Largest change of each constraint per unit of the numbers, at random points nearby."""
-    unit = scale_of(p, s.theta, s.at).unit
-    steps = np.random.default_rng(0).normal(size=(LOOKS, len(unit))) * NEAR * unit
-    points = np.clip(s.theta + steps, p.lower, p.upper)
+    points = nearby(p, s.theta, scale_of(p, s.theta, s.at).unit)
     values = np.array([p.constraint_values(point) for point in points])
     change = np.abs(values - s.at.constraints) / NEAR
     return np.max(np.where(np.isfinite(change), change, 0.0), axis=0, initial=0.0)

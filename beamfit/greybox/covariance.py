@@ -20,16 +20,16 @@ from beamfit.greybox.terms import Record
 
 # A quantity counts as determined while bounds carry less than this share of its variance.
 MOST_SHARE = 0.5
-# A direction is seen while its singular value is above this share of the largest.
+# A direction is determined if its singular value exceeds this share of the largest: 1e6 roundings.
 CUT = 1e-10
 # A quantity moves along an open direction if more than this share of its terms remains.
 PART = 1e-6
-# The standard deviation, in units of the best known direction, of one that nothing limits.
+# Standard deviation of an undetermined direction, in units of the best determined one.
 FAR = 1e12
-# Of many numbers the normal equations tell errors while the least eigenvalue, columns having unit
-# length, is above this share of the largest: to 1e-6 and better.
+# Least eigenvalue of the normal equations, as a share of the largest with columns of unit length,
+# down to which their errors are good to 1e-6.
 SAFE = 1e-10
-# The noise of data that a model meets exactly, which must not be zero.
+# Noise of data that a model meets exactly; zero would divide by zero.
 EXACT = 1e-30
 
 

@@ -17,22 +17,22 @@ from beamfit.greybox.covariance import null_space, triangle
 from beamfit.greybox.factors import FEW, in_units, weakest
 from beamfit.greybox.problem import Problem
 
-# A Newton step of a further objective longer than this, in the sizes of the numbers, is no end.
+# A search has not ended while the next Newton step exceeds this, in sizes of the numbers.
 STEP = 1e-3
-# Bending down by less than this share of the strongest curvature is rounding.
+# Negative curvature below this share of the strongest curvature is rounding.
 FLAT = 1e-6
-# Bending down by more than this is a saddle even where no point looked at is lower, bounds apart.
+# Negative curvature above this share is a saddle even if no lower point was found nearby.
 PLAIN = 2e-3
-# Slopes below this share of the terms that cancel in them are rounding, too.
+# Slopes below this share of the terms that cancel in them are rounding.
 ROUNDING = 1e-13
-# A slope at a bound that promises so many times the cost and its change beside the bound is made of
-# rounding, and says nothing of the bound: b/(1 - exp(-b t)) has lost its figures at b = 1e-18.
+# A slope at a bound that predicts more than this many times the cost and its change nearby is
+# rounding: b/(1 - exp(-b t)) has lost its figures at b = 1e-18.
 LOST = 1e3
-# Points beside one are so far off in the sizes of the numbers, along so many of the weakest
-# directions of squares, or at random or inward from bounds.
+# Test points: distance in sizes of the numbers, count along the weakest directions of a sum of
+# squares, and count at random or inward from bounds.
 NEAR, WEAKEST, AROUND = 1e-3, 2, 4
 
-# Newton steps that bring a point back onto constraints, and how near they count as met.
+# Newton steps that bring a point back onto its constraints, and the tolerance of these.
 RESTORED, CLOSE = 10, 1e-10
 
 # Lagrangian at points, shape (k, n) to (k,).

@@ -24,23 +24,23 @@ from beamfit.greybox.factors import FEW, RIDGE, Factor, Rows, in_units, lengths,
 from beamfit.greybox.problem import Problem, sloped, with_slope
 from beamfit.greybox.problem import residual as problem_residual
 
+# Damping of the first step; the Jacobian's columns have unit length.
 DAMPING = 1e-3
-# On the length of a step relative to the numbers, both in units of the Jacobian's columns.
+# A search rests at a step below this share of the numbers, both in units of the Jacobian's columns.
 TOLERANCE = 1e-13
-# The damping falls by this factor at most in one step.
+# Smallest factor on the damping in one step.
 EASED = 1e-4
-# Beyond this no step however short lowers the cost.
+# Damping beyond which no step, however short, lowers the cost.
 STUCK = 1e30
-# What a step promises is below rounding under this share of the sum of squares.
+# A promised decrease below this share of the sum of squares is rounding.
 ROUNDING = 1e-16
-# Most rounds of pinning in a step; what the last one pushes out is clipped.
+# Rounds in which a step pins numbers to bounds; the rest is clipped.
 PINNED = 3
-# Where a step of many numbers gains what it promised to within a share, the damping falls by so
-# many times the share.
+# Factor on the damping of many numbers, times the relative miss of a step's promised decrease.
 TRUSTED = 10.0
-# With a limit of time the clock is looked at after so many steps.
+# Steps between two looks at the clock under a time limit.
 SEGMENT = 50
-# Searches in a compiled call, where their Jacobians have no more than so many numbers.
+# Starts searched in one compiled call, if their Jacobians have at most this many entries.
 WIDTH, LARGE = 4, 2**15
 
 

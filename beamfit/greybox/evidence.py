@@ -24,7 +24,7 @@ from beamfit.greybox.factors import Rows
 from beamfit.greybox.fit import Attempt, FittedConstraint, FittedVariable
 from beamfit.greybox.problem import Problem
 
-# A further decrease of chi-square below this changes nothing anybody asks for.
+# A search is settled if a further step lowers chi-square by less: a tenth of a standard error.
 SETTLED = 0.01
 EDGES = ("lower", "upper")
 

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from beamfit.sampling.posterior import Posterior
     from beamfit.sampling.priors import Distribution
 
-# Another optimum: a chi-square larger by less than 6.
+# Cost above the best (half of a chi-square of 6) up to which another optimum starts the sampler.
 NEAR_COST = 3.0
 
 

@@ -15,7 +15,7 @@ MOVES = dict.fromkeys(
     transpose unstack""".split(),  # noqa: SIM905
     0,
 ) | {"dynamic_slice": 1, "gather": 1, "dynamic_update_slice": 2}
-# A loop of known length is unrolled up to so many operations.
+# Operations up to which a loop of known length is unrolled.
 UNROLLED = 5_000
 
 Rule = Callable[[Any, list[Any]], list[Any]]

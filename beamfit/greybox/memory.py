@@ -16,10 +16,10 @@ from scipy.special import stdtr
 from beamfit.greybox.covariance import CUT
 from beamfit.noise.correlated import Levels, Noise, log_volume, white_beside, whitened
 
-# Correlation times looked at: from this share of the usual interval to so many times the record.
+# Grid of correlation times: from this share of the median interval to this many records, and count.
 SHORTEST, LONGEST, TIMES = 0.3, 5.0, 40
-# Variances of a part without memory that are looked at beside, in those that the part with a
-# memory gets anew from one reading to the next; correlation times are fewer then.
+# Grid of the white noise's variance, in units of the variance that the correlated part gains from
+# one reading to the next; with it a smaller count of correlation times.
 WHITE, FEWER = (0.0, 1.0, 10.0, 100.0, 1000.0), 20
 
 

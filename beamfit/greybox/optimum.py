@@ -11,12 +11,12 @@ from beamfit.greybox.proof import convex
 from beamfit.status import Status
 from beamfit.verdict import Finding
 
-# Below this the cost counts as without end, in its own size.
+# A cost below this, in units of its size, counts as unbounded.
 ENDLESS = -1e15
-# A number runs away beyond this many of its sizes; a pole is where the cost's slope in a number's
-# size is that much larger than the cost.
+# A number beyond this many of its sizes runs away; at a pole the cost's slope per size of a number
+# exceeds the cost by this factor.
 AWAY = 1e6
-# Costs of one optimum differ by less than this share, starts ending more or less near to it.
+# Relative difference in cost up to which two starts ended on the same optimum.
 ALIKE = 1e-4
 
 

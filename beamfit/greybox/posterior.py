@@ -22,9 +22,9 @@ from beamfit.sampling.posterior import Posterior
 from beamfit.sampling.priors import Distribution, checked
 from beamfit.sampling.target import PosteriorLaw, SamplingTarget, covariance_of, slopes_of
 
-# A number that is an undetermined direction's in less than this share is not part of it.
+# Smallest share of an undetermined direction at which a number belongs to it.
 PART = 0.05
-# Another optimum is one more than six errors away.
+# Standard errors beyond which a further optimum is another one.
 FAR = 6.0
 ELSEWHERE = (
     "The search met another optimum of nearly the same cost far from this one: the intervals are "

@@ -23,9 +23,9 @@ from beamfit.greybox import tree
 from beamfit.greybox.sparsity import Pattern, pattern_of
 from beamfit.greybox.terms import Constraint, Free, Objective, Prior, Record
 
-# Within which a limit counts as reached and a point as an optimum.
+# Default tolerance on limits and on the conditions of an optimum, in sizes.
 TOLERANCE = 1e-6
-# Records are padded to powers of two from here on.
+# Shortest padded record; lengths are powers of two, so that records share compiled code.
 SHORTEST = 8
 
 

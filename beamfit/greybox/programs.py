@@ -186,6 +186,7 @@ class Stage(NamedTuple):
 
 
 _SHARP = Stage("Uno filtersqp", "filtersqp", "exact", 300, _uno("filtersqp"))
+# Solvers in the order they are tried.
 SOLVERS: tuple[Stage, ...] = (
     Stage("Uno filtersqp with Gauss-Newton", "filtersqp", "gauss_newton", 3000, _uno("filtersqp")),
     _SHARP,

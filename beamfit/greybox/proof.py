@@ -31,7 +31,7 @@ SUMS = {
 PLACES = {"select_n": 0, "scatter": 1, "scatter-add": 1}
 # Functions of one affine or convex argument that are convex and do not fall, likewise for concave.
 RISING_CONVEX, RISING_CONCAVE = {"exp", "exp2", "expm1"}, {"log", "log1p", "sqrt"}
-# A Hessian's eigenvalue below zero by less than this share of the largest is rounding.
+# Negative eigenvalues of a Hessian below this share of the largest are rounding.
 ROUNDING = 1e-12
 
 

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jax.scipy.linalg import cho_factor, cho_solve
 
-# Steps at most; mean complementarity and residuals that end them; share of the way to a limit.
+# Most steps; mean complementarity and residuals that end them; share of the step to a limit.
 STEPS, CLOSE, SHARE = 40, 1e-9, 0.99
 
 

@@ -22,15 +22,15 @@ from beamfit.greybox.verdict import conclude, refused
 from beamfit.status import Status
 
 METHOD, SQUARES = "Levenberg-Marquardt", "levenberg-marquardt"
-# Steps from many starts; what is left is for the polish of the cheapest ends.
+# Steps from each of many starts, and number of cheapest ends that are polished.
 STEPS, POLISHED = 300, 4
-# A search whose cost falls by less than this share in so many steps gains nothing.
+# A search stops if its cost falls by less than this share in this many steps.
 NOTHING, STRETCH = 1e-7, 100
-# Bytes that Jacobians of starts searched together may take.
+# Bytes for the Jacobians of starts that are searched together.
 MEMORY = 2**24
-# Starts of the search for the point nearest to constraints that no search could keep.
+# Starts of the search for the least violation of constraints that no search could keep.
 ELASTIC = 6
-# How often a search moves off where the cost bends down.
+# Most moves of a search off a saddle.
 MOVES = 3
 
 

@@ -32,9 +32,9 @@ ELEMENTWISE = frozenset(
     stop_gradient sub tan tanh xlog1py xlogy""".split()  # noqa: SIM905
 )
 REDUCTIONS = {"reduce_sum", "reduce_max", "reduce_min", "reduce_prod"}
-# A probe may differ by this share of its terms.
+# Relative difference between probe and matrix up to which the pattern is complete.
 PROBE = 1e-9
-# A pattern with more than this share of all places is taken for dense.
+# Share of nonzero entries above which dense matrices are faster.
 FULL = 0.25
 
 

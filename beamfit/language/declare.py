@@ -24,7 +24,7 @@ from beamfit.language.scope import (
     widened,
 )
 
-# Operations that one use of a function may cost, those of functions in it included.
+# Most operations in one use of a function, nested functions included.
 MOST_WORK = 20_000
 
 

@@ -14,7 +14,7 @@ from defusedxml.sax import parseString
 from beamfit.errors import InputError
 from beamfit.language.expression import Place, error_at
 
-# Elements within each other, and lines that the beginning of one may take.
+# Most nested elements, and most lines of an opening tag.
 MOST_DEEP, MOST_LINES = 40, 12
 NAME = re.compile(r"[^\W\d]\w*")
 

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 from beamfit.errors import InputError
 
-# Formulas are walked by recursion. Written by people they have ten levels.
+# Most levels of a formula, which is walked by recursion; people write ten.
 MOST_LEVELS = 120
 REDUCTIONS = ("sum", "prod", "min", "max", "mean")
 
@@ -147,6 +147,7 @@ def check_depth(e: Expression) -> Expression:
 
 
 LEVELS = {"+": 1, "-": 1, "*": 2, "/": 2, "@": 2, "^": 4}
+# Binding strength of a sign and of an atom, between those of the operators.
 SIGN, ATOM = 3, 5
 
 

@@ -13,7 +13,7 @@ from beamfit.language import expression as x
 from beamfit.language.scope import MappingStep, Read, Scope, located, reads
 from beamfit.language.steps import sources, targets
 
-# Ways to choose a time index in each statement of a loop that are tried.
+# Most combinations of time indices, one for each statement of a loop, that are tried.
 MOST_TRIED = 64
 
 

@@ -30,11 +30,12 @@ from beamfit.language.scope import (
 )
 from beamfit.language.steps import callee_of, gains_of, sources, targets, written
 
+# Owner of an element that no statement defines.
 NOBODY = -1
-# Names that the message of a loop shows.
+# Most names shown in the message about a loop.
 MOST_NAMED = 8
-# Elements that all statements of a mapping may run over together, how many there may be, and from
-# how many of them the cycle of a loop is sought.
+# Limits of a mapping: elements of all statements together, statements, and statements from which
+# the cycle of a loop is sought.
 MOST_WORK, MOST_STEPS, MOST_TRIED = 60_000_000, 5_000, 50
 
 

@@ -18,7 +18,7 @@ from beamfit.language import document as d
 from beamfit.language import expression as x
 from beamfit.language.expression import REDUCTIONS, Place, error_at
 
-# Elements of a set, and combinations of indices one statement may run over.
+# Most elements of a set, and most combinations of indices in a statement.
 MOST_ELEMENTS, MOST_COMBINED = 2_000_000, 5_000_000
 # Behind the names of iterators that a function's body does not see.
 HIDDEN = "'"

@@ -16,16 +16,16 @@ from beamfit.greybox.fit import Fit, FittedConstraint, FittedVariable
 from beamfit.greybox.problem import TOLERANCE
 from beamfit.greybox.solve import solve
 from beamfit.language import document as d
-from beamfit.language.computed import MOST_ROWS, gain_tables, gains_at, outputs_at
+from beamfit.language.computed import gain_tables, gains_at, outputs_at
 from beamfit.language.statement import Formulation, at_start, formulate, starts_of
 from beamfit.language.trace import cause_of
 from beamfit.quantity import Quantity
 from beamfit.shown import shown
 from beamfit.statistics import reach_of
 from beamfit.status import Status
-from beamfit.table import Table, cell
+from beamfit.table import MOST_ROWS, Table, cell
 
-# Draws of the same seeds that are tried until the start is finite.
+# Most draws of a random start until it is finite.
 MOST_DRAWS = 100
 # Solver options that are used, with the argument of `solve` that each sets.
 TOLD = {

@@ -12,7 +12,7 @@ from lark.exceptions import UnexpectedCharacters, UnexpectedInput, UnexpectedTok
 from beamfit.errors import InputError
 from beamfit.language.expression import Place, error_at
 
-# Brackets open at once, and letters of an odd word that a message shows.
+# Most open brackets, and most letters of a wrong word in a message.
 MOST_OPEN, LONGEST = 60, 30
 BRACKET = re.compile(
     r"#[^\n]*|//[^\n]*|/\*.*?\*/|\"(?:\\.|[^\"\\\n])*\"|([(\[{])|([)\]}])|(/\*)", re.DOTALL

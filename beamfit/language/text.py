@@ -12,6 +12,7 @@ from textwrap import indent, wrap
 from beamfit.language import document as d
 from beamfit.language.expression import iterators_text
 
+# Letters in a line of a written document.
 WIDTH = 96
 NAME = re.compile(r"[^\W\d]\w*")
 NUMBER = re.compile(r"[+-]?(\d+(\.\d*)?|\.\d+)([eE][+-]?\d+)?")

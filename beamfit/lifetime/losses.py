@@ -18,7 +18,7 @@ from beamfit.lifetime.ring import Operation, Ring, unstored
 from beamfit.lifetime.touschek import touschek_loss
 from beamfit.shown import shown
 
-# Pa; a rise of the pressure over no pressure at all is taken over this.
+# Pa, base pressure of the relative rise with current if the pressure is zero.
 NO_PRESSURE = 1e-30
 
 

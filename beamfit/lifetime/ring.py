@@ -12,6 +12,7 @@ from scipy import constants
 from beamfit.particles import REST_ENERGY
 from beamfit.shown import shown
 
+# Rest energy of the electron, eV.
 ELECTRON_MASS_EV = 1e6 * REST_ENERGY["electron"]
 ELECTRON_RADIUS = constants.physical_constants["classical electron radius"][0]
 

@@ -19,7 +19,7 @@ from beamfit.optics.elements import IDENTITY, Element, Screen, SectorDipole, Tra
 from beamfit.optics.particle import ELECTRON_MASS
 from beamfit.optics.sections import ElementSeries, LineSection, in_series
 from beamfit.shown import brief, shown
-from beamfit.table import Table
+from beamfit.table import MOST_ROWS, Table
 
 
 def _plain(value: Any) -> Any:
@@ -29,10 +29,6 @@ def _plain(value: Any) -> Any:
     if isinstance(value, tuple | list):
         return [_plain(v) for v in value]
     return value if isinstance(value, str | bool) or value is None else np.asarray(value).tolist()
-
-
-# Elements of a line that a notebook shows.
-MOST_SHOWN = 40
 
 
 @shown
@@ -103,7 +99,7 @@ class Beamline:
 
     def tables(self) -> tuple[Table, ...]:
         """The first elements, to be shown."""
-        few = self.elements[:MOST_SHOWN]
+        few = self.elements[:MOST_ROWS]
         rows = [[e.name, type(e).__name__, brief(e.length), brief(e.setting)] for e in few]
         more = f"the first {len(few)} of {len(self)}" if len(few) < len(self) else ""
         return (Table(self.headline, ["element", "kind", "length m", "setting"], rows, more),)

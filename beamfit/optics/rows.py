@@ -18,9 +18,9 @@ from beamfit.optics.calibration import IntegratedStrength
 from beamfit.optics.elements import TransferMatrix
 from beamfit.optics.sections import ElementSeries
 
-# Elements, times rows, whose matrices are held at once where each row has its own energy.
+# Most matrices in memory, elements times rows, if each row has its own energy.
 MOST_AT_ONCE = 100_000
-# Numbers of a calibration that the line is differentiated by directly; a network has more.
+# Most numbers of a calibration by which the line is differentiated directly; a network has more.
 MOST_DIRECT = 3
 
 

@@ -26,18 +26,15 @@ from beamfit.report.document import (
     legend_below,
 )
 from beamfit.report.page import write_page, write_report
+from beamfit.statistics import BEYOND
 from beamfit.status import Status
-from beamfit.table import Table, plain_name
+from beamfit.table import MOST_ROWS, Table, plain_name
 
-# Points beyond the limits, and files without an answer, that are listed; the former have pages.
-LISTED = 40
 RULE = (
     "Control limits are those of an individuals chart: the mean of the first 20 points (half of "
     "them if there are fewer) ± 3 standard deviations from their mean moving range, Student's "
     "quantile; a point is beyond if it is also 3 of its own errors from the mean."
 )
-# How many points noise puts there.
-BY_CHANCE = 1 / 370
 
 
 def write_batch_report(
@@ -71,7 +68,7 @@ def write_batch_report(
     )
     folder = target.with_name(f"{target.stem}_reports")
     links = []
-    for i, file in enumerate(islice(beyond, LISTED), start=1):
+    for i, file in enumerate(islice(beyond, MOST_ROWS), start=1):
         folder.mkdir(exist_ok=True)
         single = folder / f"{i:02d}_{Path(file).stem}.html"
         write_report(single, batch.ledger.job.fit(file))
@@ -92,13 +89,13 @@ def _page(
             for file, value, error, off in zip(c.files, c.value, c.error, c.beyond, strict=True)
             if off
         ]
-        more = f"the first {LISTED} of {len(rows)}" if len(rows) > LISTED else ""
+        more = f"the first {MOST_ROWS} of {len(rows)}" if len(rows) > MOST_ROWS else ""
         title = f"Beyond the control limits: {_label(c)}"
-        tables += [Table(title, ["file", plain_name(c.name)], rows[:LISTED], more)] * bool(rows)
+        tables += [Table(title, ["file", plain_name(c.name)], rows[:MOST_ROWS], more)] * bool(rows)
     if batch.refused:
-        more = f"the first {LISTED} of {len(batch.refused)}; all are in the table of answers"
-        rows = [[reason] for reason in islice(batch.refused.values(), LISTED)]
-        note = more if len(batch.refused) > LISTED else ""
+        more = f"the first {MOST_ROWS} of {len(batch.refused)}; all are in the table of answers"
+        rows = [[reason] for reason in islice(batch.refused.values(), MOST_ROWS)]
+        note = more if len(batch.refused) > MOST_ROWS else ""
         tables.append(Table("Without an answer", ["file and reason"], rows, note))
     pictures = [
         Picture(f"course of {_label(c)}", 2.8, partial(draw_course, course=c)) for c in courses
@@ -130,9 +127,8 @@ def _verdict(c: ControlChart) -> Verdict:
     factor, unit = display_unit(abs(c.centre), c.unit)
     usual = f"{c.centre / factor:.3g} ± {c.limit / factor:.2g} {unit}".strip()
     message = f"{beyond} of {points} points lie beyond the control limits"
-    message += (
-        f"; noise alone puts {max(points * BY_CHANCE, 1):.0f} or so there." if beyond else "."
-    )
+    by_chance = max(2 * points * (1 - BEYOND), 1)
+    message += f"; noise alone puts about {by_chance:.0f} there." if beyond else "."
     return Verdict(status, f"{_label(c)}: usually {usual}", message)
 
 

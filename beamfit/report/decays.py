@@ -15,6 +15,7 @@ from beamfit.lifetime.decay import HOUR, current
 from beamfit.report.document import (
     BLUE,
     MANY,
+    MOST_DRAWN,
     RED,
     Picture,
     ReportPage,
@@ -35,8 +36,6 @@ from beamfit.studies.decay.trend import Trend
 from beamfit.table import Table, labelled
 
 COLOURS = (BLUE, "#c98a00", "#2c7a3f", "#7b4fa3", RED, "#4f9aa3", "0.5")
-# Decays shown in one budget; more have no room for their names.
-MOST_BARS = 12
 
 ERRORS = (
     "dI/dt = -a I² - b I. Errors are one standard deviation, scaled by sqrt(χ²/dof) where that "
@@ -55,7 +54,7 @@ SHIFT = (
     "Scales multiply the ring file's first principles. Brackets are 68 % credible intervals. The "
     "best point is sought within the range of settings seen."
 )
-# Decays beside one another in one table.
+# Columns of a table of decays that fit the page.
 ABREAST = 2
 
 
@@ -306,7 +305,7 @@ def draw_budget(figure: FigureBase, decays: Sequence[Decay]) -> None:
         With budgets.
     """
     axes: Axes = figure.subplots()
-    shown = decays[:MOST_BARS]
+    shown = decays[:MOST_DRAWN]
     place = np.arange(len(shown))[::-1]
     left = np.zeros(len(shown))
     for cause, colour in zip(decays[0].budget.rates, cycle(COLOURS), strict=False):
@@ -322,7 +321,7 @@ def draw_budget(figure: FigureBase, decays: Sequence[Decay]) -> None:
             axes.errorbar(1 / found.value, y, xerr=error, fmt="D", color="black", mfc=hollow, ms=5)
     axes.errorbar([], [], fmt="D", color="black", ms=5, label="measured")
     axes.set_yticks(place, [decay.fit.record for decay in shown])
-    more = f", {MOST_BARS} of {len(decays)} decays" if len(decays) > MOST_BARS else ""
+    more = f", {MOST_DRAWN} of {len(decays)} decays" if len(decays) > MOST_DRAWN else ""
     axes.set(title=f"computed losses{more}", xlabel="loss rate at the mean current, 1/h")
     axes.set(xlim=(0, None), ylim=(-0.6, len(shown) - 0.4))
     legend_below(figure, axes, 5)
@@ -344,6 +343,6 @@ def _pictures(studies: Sequence[RecordStudy]) -> list[Picture]:
         listed.append(Picture(f"lifetime of {name}", 3.0, partial(draw_lifetime, study=study)))
     decays = [decay for study in studies for decay in study.answers]
     if all(decay.budget is not None for decay in decays):
-        height = 1.5 + 0.3 * min(len(decays), MOST_BARS)
+        height = 1.5 + 0.3 * min(len(decays), MOST_DRAWN)
         listed.append(Picture("loss budget", height, partial(draw_budget, decays=decays)))
     return listed

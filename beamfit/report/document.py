@@ -33,8 +33,10 @@ STYLE = {
 }
 # Blue and red of the page; those of the planes.
 BLUE, RED = "#1f5fa8", "#b5421f"
-# More points than this are drawn as an image: as curves they would fill the page with bytes.
+# Points above which a curve is drawn as an image, to keep the page small.
 MANY = 500
+# Most curves, bars or profiles in a picture; the tables have all.
+MOST_DRAWN = 12
 
 
 class Verdict(NamedTuple):

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from functools import partial
 from typing import Any
 
-from beamfit.report.document import Picture, ReportPage, Verdict, from_head
+from beamfit.report.document import MOST_DRAWN, Picture, ReportPage, Verdict, from_head
 from beamfit.report.scan_pictures import (
     PROFILES_ABREAST,
     draw_ellipses,
@@ -23,9 +23,6 @@ from beamfit.studies.scan.scans import QuadScan
 from beamfit.studies.scan.sensitivity import budget_rows, range_rows
 from beamfit.studies.scan.size_methods import SizeMethods
 from beamfit.table import Table, labelled
-
-# Profiles in the picture.
-MOST_PROFILES = 12
 
 ERRORS = (
     "Errors are half of the central 68 % of the posterior, the noise averaged over. "
@@ -119,7 +116,7 @@ def _pictures(fit: EmittanceFit) -> list[Picture]:
         for p in fit.planes
     ]
     for p in fit.planes:
-        if shown := [f for f in fit.scan.profiles if f.plane == p.plane][:MOST_PROFILES]:
+        if shown := [f for f in fit.scan.profiles if f.plane == p.plane][:MOST_DRAWN]:
             height = 0.6 + 1.3 * math.ceil(len(shown) / PROFILES_ABREAST)
             draw = partial(draw_profiles, profiles=shown, fit=fit)
             listed.append(Picture(f"profiles of the {p.plane} plane", height, draw))

@@ -11,11 +11,8 @@ from matplotlib.figure import FigureBase
 from beamfit.language.computed import Computed
 from beamfit.language.solution import ProblemSolution
 from beamfit.language.text import format_document
-from beamfit.report.document import BLUE, Picture, ReportPage, Verdict
+from beamfit.report.document import BLUE, MOST_DRAWN, Picture, ReportPage, Verdict
 from beamfit.table import Table
-
-# Outputs that are drawn; the tables have all.
-MOST_DRAWN = 12
 
 
 def formulation_page(found: ProblemSolution) -> ReportPage:

@@ -18,10 +18,11 @@ from beamfit.report.document import Picture, ReportPage
 from beamfit.table import Table
 
 WIDTH, HEIGHT, MARGIN = 8.27, 11.69, 0.75  # A4, inches
+# Height of a line of text, inches.
 LINE = 0.185
-# Between columns of a table, inches; its letters, from the usual size to the smallest.
+# Gap between columns of a table, inches; size of its letters, usual and smallest, points.
 GAP, USUAL, SMALLEST = 0.22, 8.5, 6.0
-# A picture is made smaller by this at most to fit on a page.
+# Smallest factor by which a picture shrinks to fit on a page.
 LEAST = 0.7
 COLOUR = {"green": "#2c7a3f", "yellow": "#c98a00", "red": "#b3261e"}
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from functools import partial
 from importlib.metadata import version
@@ -24,16 +25,18 @@ from beamfit.studies.scan.posterior import expected_sizes
 from beamfit.table import Table, plain_name
 
 # Shares of the draws inside the contours of one and two standard deviations in two dimensions.
-INSIDE = (0.393, 0.865)
+INSIDE = tuple(1 - math.exp(-0.5 * r**2) for r in (1, 2))
+# Most numbers in a corner plot; more are too small to read.
 MOST_NUMBERS = 5
-# Draws beyond these quantiles are outside the axes.
+# Quantile of the draws at which the axes end.
 EDGE = 0.01
-# Beyond this correlation the bins of a histogram are wider than the distribution.
+# Correlation above which the bins of a histogram are wider than the distribution.
 ON_A_LINE = 0.95
 INTERVALS = (
     "Central credible intervals of the sampled posterior. Where the prior or the bounds decide a "
     "number and not the data, none is given."
 )
+# Most numbers in the table of correlations.
 MOST_CORRELATED = 8
 
 

@@ -19,7 +19,7 @@ NOTES = (
     "outputs enter through their residuals only. Bands are one standard deviation; where they are "
     "missing the data put none on the curve, or were never there.",
 )
-# Points drawn of one run, and runs drawn.
+# Most points drawn of a run, and most runs drawn.
 MOST, RUNS = 4000, 6
 
 

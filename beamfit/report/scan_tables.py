@@ -8,7 +8,7 @@ from itertools import islice
 from beamfit.studies.scan.results import PlaneFit, degrees
 from beamfit.table import cell
 
-# A longer table of points is cut, and says so.
+# Most rows in a table of points.
 MOST_ROWS = 500
 
 

@@ -7,7 +7,7 @@ from functools import partial
 import numpy as np
 from matplotlib.figure import FigureBase
 
-from beamfit.report.document import Picture, ReportPage, Verdict
+from beamfit.report.document import MOST_DRAWN, Picture, ReportPage, Verdict
 from beamfit.report.emittance import ERRORS, about_input, about_scan
 from beamfit.report.scan_pictures import COLOUR, draw_scan, words_of
 from beamfit.report.scan_tables import identifiability_rows, point_rows
@@ -17,8 +17,6 @@ from beamfit.studies.scan.scans import PROJECTED
 from beamfit.studies.scan.slices import SliceFits
 from beamfit.table import Table, labelled
 
-# Scans of more slices than these are in the tables alone.
-MOST_SCANS = 12
 FIXED = (
     "Each slice is fitted by its own rows and has a beam matrix of its own; magnets stay as they "
     "are for the line's energy."
@@ -50,7 +48,7 @@ def slices_page(fits: SliceFits) -> ReportPage:
     pictures = [Picture("emittance of each slice", 3.8, partial(draw_slices, fits=fits))]
     pictures += [
         Picture(f"scan of slice {name}", 4.6, partial(draw_scan, fit=fit, plane=p.plane))
-        for name, fit, p in found[:MOST_SCANS]
+        for name, fit, p in found[:MOST_DRAWN]
     ]
     return ReportPage(
         title=f"Slice emittances of {scan.name}",

@@ -12,11 +12,12 @@ from beamfit.status import Status
 from beamfit.table import plain_name
 from beamfit.verdict import Finding
 
-# Chains that agree; Vehtari et al., Bayesian Analysis 16, 667 (2021), advise 1.01.
+# R-hat below which chains agree: Vehtari et al., Bayesian Analysis 16, 667 (2021).
 AGREED = 1.01
-# emcee's advice for an estimate of the autocorrelation time that can be believed.
+# Autocorrelation times in a chain from which on their estimate is reliable (emcee's advice).
 LONG = 50
-# Data that leave this much of a prior's width have told a little more than half of what it did.
+# Posterior width, as a share of the prior's, above which the prior decides the answer: the data
+# then weigh about half as much as the prior.
 LITTLE = 0.8
 
 

@@ -25,12 +25,15 @@ from beamfit.writing import alone
 # Steps between two looks at the chain; every decision falls at a multiple, so that a run that was
 # interrupted decides as the uninterrupted one did.
 BLOCK = 50
-# Warm-up: rounds that end at these steps, until the walkers agree so well within half a round.
+# Steps at which the rounds of the warm-up end, until R-hat within half a round falls below WARM.
 ROUNDS = (100, 250, 500, 900, 1500, 2500)
+# R-hat that ends the warm-up.
 WARM = 1.15
+# Fewest walkers, for proposals fitted to them.
 FEWEST_WALKERS = 64
-# Share of time that may go into writing checkpoints.
+# Largest share of the time spent on writing checkpoints.
 WRITING = 0.05
+# Most draws of the walkers' starts until enough have a finite density.
 TRIES = 80
 
 

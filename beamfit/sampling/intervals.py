@@ -10,11 +10,9 @@ import numpy as np
 
 from beamfit.quantity import Quantity, display_unit
 from beamfit.shown import shown
-from beamfit.table import Table, plain_name
+from beamfit.table import MOST_ROWS, Table, plain_name
 
 HEADER = ("", "median", "68 % interval", "95 % interval")
-# A table of more numbers is cut, and says so.
-MOST_ROWS = 40
 
 
 class Interval(NamedTuple):

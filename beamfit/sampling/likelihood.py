@@ -13,9 +13,9 @@ from jax import Array
 from beamfit.errors import InputError
 
 LOG_NOISE, FRACTION = "log_noise", "outlier_fraction"
-# An outlier's own error is unknown: anything from so many to so many of the stated ones.
+# Range of an outlier's own error, in units of the stated one; the prior is flat in its logarithm.
 NARROWEST, WIDEST = 3.0, 1e5
-# The noise is sought within a factor e^10 of where the fit saw it.
+# Half-range of the logarithm of the noise about the fit's value.
 NOISE_REACH = 10.0
 WORDS = {
     "known": "as stated",

@@ -10,10 +10,10 @@ import numpy as np
 from scipy.linalg import solve_triangular
 from scipy.special import gammaln, logsumexp
 
-# Degrees of freedom tried, from heavy tails to nearly none; a normal distribution has too few.
+# Degrees of freedom that are tried, from heavy tails to nearly normal.
 DEGREES = (4.0, 6.0, 10.0, 30.0)
-# Pieces, as long as each other, along a number with which the spread of others changes; draws a
-# number that one needs, and the least share of leaps there, since walkers stick in a tail.
+# Pieces of equal length along a number that changes the spread of others; draws that a piece needs
+# for each number; least share of long moves into a piece, since walkers stick in a tail.
 PIECES, EACH, RARE = 6, 20, 0.05
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -33,11 +34,12 @@ if TYPE_CHECKING:
     from pandas import DataFrame
 
 # One standard deviation of a normal distribution to each side.
-ONE_SIGMA = 0.6826894921370859
-# Draws from which functions of the user's are computed, unless all are asked for.
+ONE_SIGMA = math.erf(math.sqrt(0.5))
+# Default number of draws at which a user's function is computed.
 ENOUGH_DRAWS = 4000
-# Beyond this R-hat walkers sit in places of their own.
+# R-hat above which walkers are separated and intervals mean nothing.
 APART = 1.2
+# Default quantiles: median, central 68 % and 95 %.
 QUANTILES = (0.025, 0.16, 0.5, 0.84, 0.975)
 
 

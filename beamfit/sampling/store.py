@@ -27,11 +27,11 @@ if TYPE_CHECKING:
 
 # To be changed with every change of a store's content or of the digest of a problem.
 KIND, FORMAT = "beamfit-posterior", "3"
-# Bytes before the HDF5 file (its user block), which hold its digest.
+# Bytes of the HDF5 user block, which holds the file's digest.
 SEAL = 512
-# Steps whose stored density is computed again.
+# Steps whose stored density is recomputed to recognise the model.
 RECOMPUTED = 8
-# Agreement of log densities of the same model, compiled by two versions.
+# Relative difference in the log density of one model between two versions of a compiler.
 SAME = 1e-6
 PACKAGES = ("emcee", "h5py", "jax", "numpy", "scipy")
 REMEDY = "; name another file, or move this one away"

@@ -21,7 +21,7 @@ from beamfit.studies.fedbatch.titre import TITRE, TitreFit, predicted
 from beamfit.table import Table
 
 OUTPUTS = (*STATES, TITRE)
-# Rows of a plan, and rounds in which its limits are held off by the errors it then has.
+# Rows of a plan, and rounds in which its safety margins follow the errors of the plan.
 ROWS, ROUNDS = 31, 3
 
 

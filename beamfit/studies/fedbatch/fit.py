@@ -33,19 +33,19 @@ from beamfit.studies.fedbatch.model import (
 )
 from beamfit.studies.fedbatch.verdict import RULES, RateEvidence, ReadingNoise, noise_of
 from beamfit.studies.response.case import rounds
-from beamfit.studies.response.curve import Curve
+from beamfit.studies.response.curve import NEAR, POINTS, Curve
 from beamfit.studies.response.record import Run, ordered
 from beamfit.table import Table, json_of
 from beamfit.verdict import judge
 
-# Steps of a round, after which the noise is taken from the residuals again; rounds at most, and
-# the gain in -2 ln L below which nothing is gained any more.
+# Steps of a round, after which the noise is estimated again; most rounds; gain in -2 ln L below
+# which they end.
 STEPS, ROUNDS, GAINED = 60, 8, 0.5
-# The first guess at the noise, a share of the values.
+# First estimate of the noise, as a share of the values.
 FIRST = 0.1
-# Points of a curve; it was visited where so many rows are within a share of its range, and within
-# a wider share of the range of whatever else the rates hang on. It begins at a share of its end.
-POINTS, VISITS, NEAR, BESIDE, LEAST = 41, 3, 0.05, 0.5, 1e-3
+# A point of a curve is visited if this many rows are NEAR it, and in the other inputs of the rates
+# within this share of their range. A curve begins at this share of its end.
+VISITS, BESIDE, LEAST = 3, 0.5, 1e-3
 
 
 @shown

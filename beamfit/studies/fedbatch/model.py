@@ -14,6 +14,7 @@ from beamfit.dynamics.states import StateSpace
 from beamfit.greybox import tree
 from beamfit.greybox.mlp import MLP, Port, dense
 from beamfit.greybox.problem import Free, Problem, Record
+from beamfit.quantity import HOUR
 from beamfit.studies.response.model import weight_priors
 from beamfit.studies.response.record import Run
 
@@ -21,16 +22,15 @@ STATES = ("biomass", "substrate", "volume")
 RATES = ("mu_b", "mu_s")
 # Inputs that are no operating point but flows: of liquid, and what it brings.
 FLOWS = ("feed", "feed_substrate", "outflow")
-HOUR = 3600.0
-# Rates reach so many times the largest that one of so many stretches of a batch shows.
+# Upper bound of a rate, in units of the largest one of any of this many stretches of a batch.
 ABOVE, STRETCHES = 2.0, 8
-# Shares of the usual high substrate (a percentile): below the first consumption slows down; below
-# the second all rates fall in proportion.
+# Percentile of the substrate that serves as its scale; shares of it below which consumption slows
+# down, and below which all rates fall in proportion.
 USUAL, SHORT, LITTLE = 90.0, 0.1, 0.01
-# A step of the integration, of a power of 2 to so many a row, is at most so many of the shortest
-# times in which substrate is eaten: the method is stable to 2.8.
+# Longest step of the integration in units of the shortest time of consumption (the method is stable
+# to 2.8), and most steps in a row of data.
 STABLE, MOST_STEPS = 2.0, 64
-# Batches are padded to a multiple of so many rows.
+# Batches are padded to a multiple of this many rows, so that they share compiled code.
 PADDED = 32
 
 

@@ -40,7 +40,7 @@ from beamfit.table import Table, json_of
 from beamfit.verdict import judge
 
 TITRE = "titre"
-# What is free in the first stage and in this one; steps of both together from where each rests.
+# Free parts of the first stage and of this one; steps of the joint search from their two optima.
 STAGES, OWN, JOINT = ("rates", "start"), ("make", "begin"), 5
 
 

@@ -12,15 +12,15 @@ from beamfit.greybox.fit import Fit
 from beamfit.status import Status
 from beamfit.studies.fedbatch.model import RATES, PreparedBatches
 from beamfit.studies.response.curve import Curve
+from beamfit.studies.response.verdict import WORSE
 from beamfit.verdict import Finding
 
-# Noise that goes with the value has this share of the largest as its floor.
+# Floor of a relative noise, as a share of the one at the largest value.
 FLOOR = 0.05
-# Neighbouring residuals are alike beyond chance from so many standard errors on (p < 1e-3).
+# Standard errors beyond which neighbouring residuals are correlated (p < 1e-3).
 ALIKE = 3.1
-# Rates above this share of their bound are held by it; a batch held back is predicted where its
-# residuals are at most so many times the noise.
-BOUND, WORSE = 0.95, 2.0
+# Rates above this share of their bound count as at the bound.
+BOUND = 0.95
 
 
 class ReadingNoise(NamedTuple):

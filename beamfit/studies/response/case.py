@@ -19,8 +19,7 @@ from beamfit.status import Status
 from beamfit.studies.response.model import CLOSE, PreparedOutput, output_of, predicted
 from beamfit.studies.response.noise import noise_of
 
-# Rounds with a memory of the noise at most, and the gain in -2 ln L below which nothing is gained
-# any more.
+# Most rounds with a memory of the noise, and the gain in -2 ln L below which they end.
 AGAIN, GAINED = 3, 0.05
 
 

@@ -23,11 +23,11 @@ from beamfit.studies.response.model import (
 from beamfit.studies.response.record import Run
 from beamfit.studies.response.starts import driven_by, unit_outputs
 
-# Lags of the tests at most: of residuals, of inputs before and after, and of what whitens.
+# Most lags of residuals, of earlier inputs, of later inputs, and of the whitening autoregression.
 LAGS, PAST, LATER, ORDER = 20, 10, 5, 8
-# Time constants of further paths that are looked for.
+# Time constants of the additional paths in the test for a fuller model.
 SLOW = 5
-# Below this part of its variance that other inputs do not give an input's gain is not told apart.
+# Share of an input's variance, independent of other inputs, below which its gain is not separable.
 ALONE = 1e-3
 
 

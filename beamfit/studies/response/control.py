@@ -15,11 +15,11 @@ from beamfit.studies.response.fit import ResponseFit
 from beamfit.studies.response.model import parameters_at, predicted
 from beamfit.studies.response.receding import Controller, ControlLimits, Response
 
-# A limit of an output is held off by so many standard deviations of noise and model together.
+# Safety margin of an output's limit, in standard deviations of noise and model together.
 MARGIN = 2.0
-# Steps of a horizon; it ends where so much of a transient is left.
+# Fewest and most steps of a horizon; share of a transient that is left at its end.
 FEWEST, MOST, LEFT = 8, 40, 0.05
-# Drift of the disturbance in a step, of the noise, where the noise itself has no memory.
+# Drift of the disturbance in a step, as a share of white noise.
 DRIFT = 0.2
 
 

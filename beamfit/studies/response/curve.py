@@ -18,8 +18,9 @@ from beamfit.studies.response.checks import Checks
 from beamfit.studies.response.model import PreparedOutput, curves
 from beamfit.table import Table, cell, json_of
 
-# Points of a curve; it was visited where so many samples lie within a share of its range.
+# Points of a curve; samples within a share of its range that make a point visited.
 POINTS, VISITS, NEAR = 41, 5, 0.05
+# Points of a curve in JSON and tables.
 SHOWN = 9
 # A time constant with a relative error above this is compatible with 0 and with infinity.
 WIDE = 0.5

@@ -21,7 +21,7 @@ from beamfit.greybox.gains import certified_gain
 from beamfit.greybox.problem import Constraint
 from beamfit.studies.response.model import PreparedOutput
 
-# Cells of a range in all, along several inputs fewer each.
+# Cells into which a range is split for bounds, in all; fewer each along several inputs.
 CELLS = 32
 
 

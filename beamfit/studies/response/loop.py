@@ -20,12 +20,12 @@ from beamfit.studies.response.receding import Controller, advance, moved, settle
 from beamfit.table import Table, json_of
 from beamfit.verdict import Finding, judge
 
-# A change has settled within this share of itself, or the output's noise if that is more; at the
-# end an output is judged by the mean of the last share of its steps.
+# Band of a settled step, as a share of it (or the noise if larger); last share of the steps whose
+# mean is the remaining offset.
 SETTLED, LAST = 0.02, 0.2
-# Steps simulated after the last change, in horizons; a limit is touched at this share of its unit.
+# Horizons simulated after the last change; distance, in units of the input, that touches a limit.
 HORIZONS, TOUCHED = 4, 1e-6
-# A limit counts as soft where a plan passes it by this share of the output's scatter.
+# Excess, as a share of the output's scatter, from which a plan uses the safety margin.
 SOFT = 1e-4
 
 

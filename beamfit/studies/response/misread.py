@@ -15,12 +15,11 @@ from beamfit.studies.response.record import LEAST, Run
 from beamfit.studies.response.settle import Begun
 from beamfit.studies.response.starts import seen_of
 
-# Single readings off by so many times the noise are wrong, up to this share of all: more are the
-# process's own. The noise is what a median over some neighbours leaves; where the model moves, a
-# reading may be off by so many of its steps. They are looked for so often, each time beside a
-# fit without those found before.
+# A single reading is bad beyond FAR times the noise, the residual about a running median of AROUND
+# readings, plus MOVES times the model's step there. More than the share MOST are the
+# process's own. The search is repeated ROUNDS times, each beside a fit without those found.
 FAR, MOST, AROUND, MOVES, ROUNDS = 10.0, 0.05, 7, 3.0, 3
-# Equal readings stand still from so many on, if the process moves away by so many times the noise.
+# Number of equal readings that count as stuck, if the model moves away by AWAY times the noise.
 HELD, AWAY = 8, 3.0
 
 

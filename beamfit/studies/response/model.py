@@ -15,9 +15,9 @@ from beamfit.greybox.problem import Prior, padded_length
 from beamfit.studies.response.noise import Noise
 from beamfit.studies.response.record import Run
 
-# A residual below this share of the output's scatter is the model's, and not fitted any closer.
+# Residual, as a share of the output's scatter, below which a fit counts as exact.
 CLOSE = 2e-4
-# Width of the prior on a network's weights, whose inputs and outputs are of size 1.
+# Standard deviation of the prior on a network's weights; inputs and outputs are of size 1.
 WEIGHT = 3.0
 
 

@@ -15,12 +15,12 @@ from beamfit.studies.response.noise import noise_of
 from beamfit.studies.response.realise import LINEAR, normal_form, padded, realisations
 from beamfit.studies.response.shooting import LONGEST, trained
 
-# States of the programs that search: what an order does not need is held at 0, so that all orders
-# of a size are compiled once. The search ends after so many orders that are no better.
+# State counts of the compiled searches (unused states are held at 0), and number of orders without
+# improvement that ends the search.
 SIZES, BEYOND = (4, 10), 2
-# Starts of an order that are searched from, of those that foretell best; readings a free number.
+# Starts searched for each order, the best predictors; readings needed for each free number.
 BEGINS, EACH = 2, 3
-# Pole and weight in the output of a state that is added to an order, and not seen yet.
+# Pole, and weight in the output, of a state that is added to an order.
 NEW, FAINT = 0.6, 1e-3
 
 

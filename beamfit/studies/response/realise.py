@@ -15,11 +15,11 @@ from scipy.linalg import solve_discrete_lyapunov
 
 from beamfit.dynamics.states import Matrices, contraction, linear_outputs
 
-# Samples of past and future at most, and rows of the regression.
+# Most samples of past and future, and most rows, of the regression.
 HORIZON, ROWS = 20, 20_000
-# Steps that are left out in between, for what is slow; fewest rows that must remain.
+# Strides through the samples, for slow responses; fewest rows that must remain.
 STRIDES, FEWEST = (1, 5, 25, 125), 100
-# Newton steps to where a network rests.
+# Newton steps to the rest of a network.
 REST = 20
 
 

@@ -20,10 +20,10 @@ from beamfit.errors import InputError
 from beamfit.greybox.quadratic import Quadratic, minimum
 from beamfit.studies.response.model import parameters_at
 
-# What breaking an output's limit costs, against squares of errors in units of its scatter: more
-# than any multiplier of a limit that can be kept, so that such a limit is kept exactly.
+# Penalty on an output beyond its limit, per unit of its scatter: larger than any multiplier of a
+# limit that can be kept, so that such a limit is kept exactly.
 PENALTY = 1e4
-# Linearisations of a response whose parameters change, and shares of a step that are tried.
+# Linearisations of a response with varying parameters, and shares of a step that are tried.
 ROUNDS, SHARES = 3, (1.0, 0.5, 0.25, 0.0)
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from beamfit.errors import InputError
 from beamfit.shown import shown
 
-# Fewest readings of an output: fewer cannot tell a response from its start.
+# Fewest readings of an output; with fewer its response and its start are not separable.
 LEAST = 8
 
 

@@ -25,7 +25,7 @@ from beamfit.studies.response.noise import Noise
 from beamfit.studies.response.record import Run
 from beamfit.studies.response.starts import best_start, driven_by, start_of
 
-# Steps of a round, after which the noise is taken from the residuals again, and rounds at most.
+# Steps of a round, after which the noise is estimated again, and most rounds.
 STEPS, ROUNDS = 100, 30
 
 

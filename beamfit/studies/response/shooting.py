@@ -22,15 +22,15 @@ from beamfit.studies.response.case import (
 from beamfit.studies.response.model import PreparedOutput
 from beamfit.studies.response.noise import Noise
 
-# Steps of a round, after which the noise is taken from the residuals again; rounds at most, and the
-# gain in -2 ln L of a reading below which nothing is gained any more.
+# Steps of a round, after which the noise is estimated again; most rounds; gain in -2 ln L per
+# reading below which they end.
 STEPS, ROUNDS, EACH = 25, 80, 1e-4
-# Gaps between segments, in units of the states' scatter, through which they are closed.
+# Allowed gaps between segments in turn, in units of the states' scatter.
 CLOSING = (1.0, 0.1, 1e-2, 1e-3, 1e-4)
-# Time from the last reading of an output to the first of another, in lengths of the run.
+# Distance in time between the series of two outputs, in lengths of the run: no correlation is left.
 APART = 1e6
-# Readings of each output that tell the noise with a memory; the share by which it may leave more of
-# the outputs than a fit without.
+# Most readings of each output that estimate correlated noise; factor by which the fit with it may
+# leave larger squares than the fit without.
 LONGEST, WORSE = 5000, 1.5
 
 

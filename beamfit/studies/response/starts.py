@@ -19,14 +19,14 @@ from beamfit.dynamics.response import ARX, FIRST_ORDER, SECOND_ORDER, Physics, s
 from beamfit.studies.response.model import Driven, PreparedOutput, driven
 from beamfit.studies.response.record import Run
 
-# Longest delay that is tried, in samples and as a share of the run.
+# Longest delay that is tried, in samples, and as a share of the run.
 LATEST, SHARE = 24, 0.1
-# A delay must raise the logarithm of the likelihood by so much over a shorter one; parts of a
-# sample that are tried besides.
+# Gain in log likelihood that a longer delay needs over a shorter one; fractions of a sample
+# that are tried besides.
 BETTER, PARTS = 5.0, (-0.75, -0.5, -0.25, 0.25, 0.5, 0.75)
 # Time constants of the grid, and dampings of a second order.
 TIMES, DAMPINGS = 16, (0.2, 0.6, 1.0, 2.0)
-# A second lag of which less than this is left after a sample is none.
+# Share of a second lag's transient after one sample below which the lag is ignored.
 FORGOTTEN = 1e-4
 
 

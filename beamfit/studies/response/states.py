@@ -40,8 +40,9 @@ from beamfit.studies.response.starts import seen_of
 from beamfit.studies.response.verdict import ResponseEvidence, judged
 from beamfit.table import Table, json_of
 
-# A free run that explains less of an output has gone astray: segments are tried.
+# Percent of an output explained by the free run below which segments are tried.
 ASTRAY = 50.0
+# Segments of a run in multiple shooting.
 SEGMENTS = 32
 
 

@@ -15,9 +15,9 @@ from beamfit.studies.response.checks import Checks, HeldOutRun
 from beamfit.studies.response.curve import TIME, Curve
 from beamfit.verdict import Finding
 
-# A curve of which less than this share has an error is not determined.
+# Share of a visited curve that must have an error for it to be determined.
 HALF = 0.5
-# Held-back runs are predicted where their residual is at most so many times that of the fit.
+# Largest residual of a held-out run, in units of the fit's, at which it counts as predicted.
 WORSE = 2.0
 
 
