@@ -66,7 +66,7 @@ def prepare_jax() -> None:
 
 
 def own_folder() -> str | None:
-    """This user's folder of beamfit, or None where there can be none: code in it is run.
+    """Cache folder of this user alone, or None; compiled code in it is executed.
 
     Examples
     --------

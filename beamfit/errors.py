@@ -17,7 +17,7 @@ ENDLESS = re.compile(r"(\S{60})\S{60,}")
 UNSHOWN = re.compile(
     "[\0-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]"
 )
-# Of a whole message, for which a terminal has a few lines, and of a path in it: its end.
+# Letters of a message (four lines of a terminal), and of the end of a path shown in it.
 LONGEST, LONGEST_PATH = 390, 120
 
 

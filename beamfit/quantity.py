@@ -9,9 +9,10 @@ from beamfit.status import Status
 
 __all__ = ["Quantity", "Status", "display_unit"]
 
-# 95 % of a normal distribution lie within so many standard deviations.
+# Half-width of the central 95 % of a normal distribution, in standard deviations.
 NORMAL_REACH = 1.96
-MINUTE = 1 / 60  # h
+HOUR = 3600.0  # s
+# Factors and letters of the unit prefixes.
 _PREFIXES = ((1.0, ""), (1e-3, "m"), (1e-6, "µ"), (1e-9, "n"), (1e-12, "p"))
 
 
@@ -147,8 +148,8 @@ def display_unit(size: float, unit: str) -> tuple[float, str]:
     >>> print(Quantity(0.005, 0.0001, "h"))
     18.00 ± 0.36 s
     """
-    if unit == "h" and 0 < size < MINUTE:
-        return 1 / 3600, "s"
+    if unit == "h" and 0 < size < 60 / HOUR:
+        return 1 / HOUR, "s"
     if unit != "m" or size == 0:
         return 1.0, "" if unit == "1" else unit
     factor, prefix = next((p for p in _PREFIXES if size >= 0.1 * p[0]), _PREFIXES[-1])

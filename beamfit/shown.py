@@ -12,9 +12,9 @@ from beamfit.quantity import Quantity
 from beamfit.table import Table, cell, html_of
 
 C = TypeVar("C", bound=type)
-# Letters of a text that are shown within another value, and things of a collection.
+# Letters of a text inside another value, and entries of a collection, that are displayed.
 LONGEST, MOST = 60, 6
-# Numbers of an array that are written out, and letters of a line.
+# Numbers of an array that are displayed, and letters of a line.
 FEW, WIDTH = 4, 150
 
 

@@ -10,18 +10,18 @@ from scipy.special import chdtrc, fdtrc, ndtr, stdtr, stdtrit
 
 from beamfit.quantity import NORMAL_REACH
 
-# A fit this unlikely to be noise alone is a poor fit: the contract of the JSON output.
+# Probability of the residuals below which a fit is poor: the contract of the JSON output.
 POOR_FIT = 1e-3
-# One over the relative error from which on a direction counts as undetermined.
+# A direction is undetermined if its value is below this many standard errors.
 OPEN = 3.0
-# Points that say what is usual: the first so many, half of them if there are fewer.
+# Points of a baseline at most (the first ones; at most half of all), and at least.
 BASELINE, FEWEST = 20, 3
-# Below so many degrees of freedom Student's distribution is told in words.
+# Degrees of freedom below which the message gives the 95 % interval of Student's distribution.
 MANY = 8
-# Mean range of two normal numbers, and the degrees of freedom of each moving range.
+# Mean range of two normal numbers in standard deviations; degrees of freedom of a moving range.
 RANGE, RANGE_DOF = 1.128, 0.62
-# One point in 370 of a normal distribution lies beyond 3 standard deviations to either side.
-BEYOND = 0.99865
+# Probability below 3 standard deviations; one point in 370 lies beyond them to either side.
+BEYOND = float(ndtr(3.0))
 
 
 class Directions(NamedTuple):
@@ -144,7 +144,7 @@ def one_sided_probability(deviations: float, dof: float) -> float:
 
 
 def reach_of(dof: float) -> float:
-    """Errors that 95 % of answers lie within, by Student's distribution.
+    """Half-width of the 95 % interval in standard errors, by Student's distribution.
 
     Examples
     --------
@@ -155,23 +155,21 @@ def reach_of(dof: float) -> float:
 
 
 def few_words(rests_on: float) -> str:
-    """Say how far errors reach that rest on few degrees of freedom.
+    """Sentence part on the 95 % interval, if it rests on few degrees of freedom.
 
     Examples
     --------
     >>> few_words(2.0)
-    '; errors rest on 2 degrees of freedom: 95 % of answers lie within 4.3 of them'
+    '; 2 degrees of freedom: the 95 % interval is ±4.3 σ'
     """
     if not 0 < rests_on < MANY:
         return ""
-    return (
-        f"; errors rest on {rests_on:.3g} degrees of freedom: 95 % of answers lie within "
-        f"{reach_of(rests_on):.1f} of them"
-    )
+    reach = f"±{reach_of(rests_on):.1f} σ"
+    return f"; {rests_on:.3g} degrees of freedom: the 95 % interval is {reach}"
 
 
 def baseline(count: int) -> int:
-    """How many of some points, the first, say what is usual.
+    """Number of first points that form the baseline of a series.
 
     Examples
     --------

@@ -4,7 +4,7 @@ from enum import StrEnum
 
 
 class Status(StrEnum):
-    """How a fit or a search for an optimum ended, always with a sentence beside it.
+    """Outcome of a fit or of a search for an optimum, always with a sentence beside it.
 
     Of a fit to data anything but ``converged`` is a warning. An objective without data is never
     ``converged``, ``unidentified``, ``at_limit`` or ``poor_fit``: it is ``optimal``,
@@ -33,7 +33,7 @@ class Status(StrEnum):
 
     @property
     def colour(self) -> str:
-        """How it is shown: green, yellow or red."""
+        """Colour on screen: green, yellow or red."""
         good = (Status.converged, Status.optimal)
         doubtful = (Status.poor_fit, Status.local_optimum)
         return "green" if self in good else "yellow" if self in doubtful else "red"

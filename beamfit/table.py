@@ -13,6 +13,9 @@ from beamfit.errors import plain
 from beamfit.quantity import Quantity
 from beamfit.status import Status
 
+# Rows shown of a long table; JSON has all.
+MOST_ROWS = 40
+
 
 class Table(NamedTuple):
     """Rows of cells under a heading; an empty header leaves the head row out.

@@ -11,7 +11,7 @@ Evidence = TypeVar("Evidence")
 
 
 class Finding(NamedTuple):
-    """What a rule found: a status, the cause in words, and what to do about it.
+    """Finding of a rule: a status, the cause in words, and the remedy.
 
     `about` names what the finding speaks of.
     """

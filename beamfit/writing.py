@@ -70,7 +70,7 @@ def write_atomically(path: str | PathLike[str], content: bytes, partial: str | N
 
 @contextmanager
 def replacing(path: str | PathLike[str], partial: str | None = None) -> Iterator[BinaryIO]:
-    """What is written here takes the place of a file when it is whole; as `write_atomically`."""
+    """Stream that replaces a file once it is completely written; as `write_atomically`."""
     check_place(path)
     target = Path(path)
     temporary = None

@@ -27,7 +27,7 @@ from beamfit.dynamics.response import FIRST_ORDER, SECOND_ORDER, simulate
 from beamfit.studies.response.control import controller
 from beamfit.studies.response.fit import identify
 from beamfit.studies.response.loop import closed_loop
-from beamfit.studies.response.receding import Controller, Limits, Response
+from beamfit.studies.response.receding import Controller, ControlLimits, Response
 from beamfit.studies.response.record import Run
 
 STEP, HORIZON, SMOOTH, RATE, ABOVE, FIRST = 0.5, 20, 0.1, 0.2, 2.3, 0.4
@@ -58,7 +58,7 @@ def ours(case: str) -> Controller:
     physics, of = (FIRST_ORDER, network) if case != "second order" else (
         SECOND_ORDER, SECOND_ORDER.raw(jnp.array(SECOND), 1))  # fmt: skip
     inf, one = np.full(1, np.inf), np.ones(1)
-    limits = Limits(0 * one, 2 * one, RATE * one, -inf, above(case) * one)
+    limits = ControlLimits(0 * one, 2 * one, RATE * one, -inf, above(case) * one)
     responses = (Response("y", physics, of, 0.0, 0, 1.0, 0.2, 0.0),)
     return Controller(("u",), responses, STEP, one, limits, HORIZON, SMOOTH)
 

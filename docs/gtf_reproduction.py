@@ -31,8 +31,8 @@ from beamfit.report.document import (
     BLUE,
     RED,
     STYLE,
-    Page,
     Picture,
+    ReportPage,
     Verdict,
     html_of,
     provenance,
@@ -163,9 +163,11 @@ GREY, GREEN = "0.35", "#2c7a3f"
 GRID = np.linspace(0.0, 3.9, 201)
 
 
-def reproduction_page(found: Reproduction, command: str, inputs: Mapping[str, str | None]) -> Page:
+def reproduction_page(
+    found: Reproduction, command: str, inputs: Mapping[str, str | None]
+) -> ReportPage:
     """Lay the page out."""
-    return Page(
+    return ReportPage(
         title="Gun Test Facility: Table 2 and figures 19 to 25 of the PUNDA report",
         subtitle="On a SIMULATED scan: the report's 14 measured points were never published. "
         f"The simulation's true beam is Table 2, row 1, with 2 % errors; {written()}",

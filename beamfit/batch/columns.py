@@ -1,4 +1,4 @@
-"""One row an answer: the columns of a table of answers, and the cells of one.
+"""Columns and rows of the table of answers.
 
 A number keeps the name it has in JSON, with its unit at the end; its error, its error before
 scaling and the ends of its 95 % interval stand beside it. An empty cell is null.

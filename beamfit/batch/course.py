@@ -15,14 +15,14 @@ from beamfit.statistics import baseline, control_limits
 from beamfit.studies.decay.evidence import UNITS
 from beamfit.studies.scan.model import QUANTITIES
 
-# Of each kind: the quantities there are, and the one that is followed unless said.
+# Quantities of each kind, and the default one.
 FOLLOWED = {
     "emittance": (QUANTITIES, "normalized_emittance"),
     "lifetime": (UNITS, "lifetime_mean"),
 }
 
 
-class Course(NamedTuple):
+class ControlChart(NamedTuple):
     """A quantity through a batch.
 
     Attributes
@@ -53,12 +53,12 @@ class Course(NamedTuple):
 
     @property
     def beyond(self) -> np.ndarray:
-        """Whether each point lies beyond the limits, and 3 of its own errors from the centre."""
+        """True for each point beyond the limits and beyond 3 of its own errors from the centre."""
         return np.abs(self.value - self.centre) > np.maximum(self.limit, 3.0 * self.error)
 
 
 def followed(kind: str, name: str | None = None) -> tuple[str, str]:
-    """A quantity of a kind and its unit; the usual one unless said.
+    """A quantity of a kind and its unit; by default the first choice of the kind.
 
     Raises
     ------
@@ -77,7 +77,7 @@ def followed(kind: str, name: str | None = None) -> tuple[str, str]:
     return name, known[name]
 
 
-def courses_of(batch: Batch, name: str | None = None) -> list[Course]:
+def courses_of(batch: Batch, name: str | None = None) -> list[ControlChart]:
     """Follow a quantity wherever the data determine it.
 
     Parameters
@@ -85,11 +85,11 @@ def courses_of(batch: Batch, name: str | None = None) -> list[Course]:
     batch : Batch
         Files in the order in which they are followed.
     name : str, optional
-        The normalised emittance or the mean lifetime unless said.
+        Default: the normalised emittance or the mean lifetime.
 
     Returns
     -------
-    list of Course
+    list of ControlChart
         One a plane and slice; limits are `control_limits` of the first 20 points, or of half of
         them.
 
@@ -107,7 +107,7 @@ def courses_of(batch: Batch, name: str | None = None) -> list[Course]:
         files, *numbers = zip(*own, strict=True)
         at, value, error = map(np.array, numbers)
         limits = control_limits(value[: baseline(len(value))])
-        found.append(Course(name, unit, of, list(files), at, value, error, *limits))
+        found.append(ControlChart(name, unit, of, list(files), at, value, error, *limits))
     return found
 
 

@@ -38,7 +38,7 @@ def _lattice(path: str, sha256: str, part: tuple[tuple[str, Any], ...]) -> _Latt
 
 @dataclass(frozen=True)
 class Job:
-    """What is asked of every file.
+    """The question a batch puts to every file: kind of fit, line, options.
 
     Parameters
     ----------
@@ -80,7 +80,7 @@ class Job:
 
     @property
     def key(self) -> tuple[str, str, str]:
-        """What besides the file makes an answer: lattice, options, version."""
+        """Inputs of an answer besides the file: lattice, options, version."""
         said = {**self.part, **self.reading, "weights": self.weights}
         said |= {} if self.noise is None else {"noise": digest(self.noise)}
         words = (f"{k}={' '.join(v) if isinstance(v, tuple) else v}" for k, v in said.items())
@@ -120,7 +120,7 @@ class Job:
         return self._line().line if own else build_line(found.lattice)
 
     def fit(self, file: str) -> Any:
-        """What `beamfit.write_report` takes, of one file."""
+        """Result of one file, as `beamfit.write_report` takes it."""
         if self.kind == "lifetime":
             from beamfit.studies.decay.study import study_record
 

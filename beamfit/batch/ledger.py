@@ -19,12 +19,12 @@ from beamfit.errors import InputError
 from beamfit.io.files import digest_now
 from beamfit.writing import replacing, write_atomically
 
-# Rows that are turned from text into a table at a time.
+# Rows converted from text to a table at a time, to bound the memory.
 BLOCK = 4096
 
 
-class Place(NamedTuple):
-    """Where the rows of a file are: bytes of a part; what they say, and why there is no answer."""
+class RowRange(NamedTuple):
+    """Place of a file's rows (bytes of a part), their statuses, and the reason if refused."""
 
     part: Path
     start: int
@@ -50,7 +50,7 @@ class Ledger:
         self.folder = out.with_name(f"{out.name}.parts")
         self.columns = COLUMNS[job.kind]
         self.header = (",".join(self.columns) + "\n").encode()
-        self.places: dict[str, Place] = {}
+        self.places: dict[str, RowRange] = {}
         self._next = 0
         try:
             self.folder.mkdir(exist_ok=True)
@@ -62,7 +62,7 @@ class Ledger:
             self._learn(part, part.read_bytes())
 
     def answered(self, file: str) -> bool:
-        """Whether the same was asked of the same file before."""
+        """True if this job has answered the same file before."""
         place = self.places.get(file)
         try:
             return place is not None and place.sha256 == digest_now(file)
@@ -80,13 +80,13 @@ class Ledger:
     def _learn(self, part: Path, content: bytes) -> None:
         if not content.startswith(self.header):
             return
-        found: dict[str, Place] = {}
+        found: dict[str, RowRange] = {}
         status, at = self.columns.index("status"), len(self.header)
         for raw in content[at:].splitlines(keepends=True):
             row = next(csv.reader([raw.decode()]))
             end = at + len(raw)
             if tuple(row[2 : len(KEY)]) == self.job.key:
-                before = found.get(row[0], Place(part, at, at, row[1], ()))
+                before = found.get(row[0], RowRange(part, at, at, row[1], ()))
                 reason = row[status + 1] if row[status] == UNUSABLE else before.reason
                 statuses = (*before.statuses, sys.intern(row[status]))
                 found[row[0]] = before._replace(end=end, statuses=statuses, reason=reason)

@@ -19,11 +19,11 @@ from beamfit.writing import alone, check_place
 if TYPE_CHECKING:
     from distributed import Client
 
-# Files of a task: one costs milliseconds to hand out, a file hardly more to answer.
+# Files in a task: handing out a task costs milliseconds, about as much as fitting a file.
 TASK = 256
-# Tasks handed out at a time, a worker.
+# Tasks queued for each worker, so that none waits for the scheduler.
 AHEAD = 3
-# Seconds until workers are counted, and how often fewer than asked for are seen.
+# Seconds to wait for an answer; waits in a row with too few workers before one more is started.
 PATIENCE, CHECKS = 10.0, 3
 SUFFIXES = {
     "emittance": (".csv", ".txt", ".h5", ".hdf5", ".mat", ".tfs"),
@@ -33,7 +33,7 @@ INSTALL = "the extra: pip install 'beamfit[batch]'"
 
 
 class Batch(NamedTuple):
-    """What a batch did.
+    """Result of a batch.
 
     Attributes
     ----------
@@ -78,7 +78,7 @@ def files_of(paths: Iterable[str], kind: str) -> tuple[str, ...]:
 
 
 def _is_input(inside: Path) -> bool:
-    """Whether a file in a folder is neither hidden nor a part of an earlier batch."""
+    """True if a file in a folder is neither hidden nor a part of an earlier batch."""
     return not any(part.startswith(".") or part.endswith(".parts") for part in inside.parts)
 
 

@@ -23,7 +23,7 @@ Examples:
   beamfit batch fills/ --kind lifetime --out fills.csv --workers 2
   beamfit batch scans/ --kind emittance --lattice line.toml --out year.h5 --scheduler tcp://host:8786
 """
-# Reasons that are printed; all are in the table.
+# Refusals printed on the terminal; the table has all.
 NAMED = 10
 
 
@@ -106,7 +106,7 @@ def _check_kind(kind: str, of_scans: dict[str, Any]) -> None:
 
 
 class _Progress:
-    """One line on a terminal: files, files a second, what is left."""
+    """Progress on one line of a terminal: files, files a second, time left."""
 
     def __init__(self, shown: bool) -> None:
         self.shown, self.began, self.first = shown, time.monotonic(), None

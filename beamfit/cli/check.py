@@ -72,6 +72,6 @@ def _on_all(scan: Understood, lattices: list[Understood]) -> Understood:
 
 
 def _show(found: list[Understood]) -> None:
-    """One table a file, and below it what is odd."""
+    """Print a table for each file, and its oddities below."""
     for each in found:
         click.echo("\n".join([text_of(each.table()), *(f"Note: {n}" for n in each.notes), ""]))

@@ -34,14 +34,14 @@ LIMIT = "NAME=LOW:HIGH, one of them may be left out, such as level=:3"
 @options("model map input output step delay no-offset response-gain")
 @option(
     "--set OUTPUT=VALUE[@SECONDS]",
-    "What an output shall be, from a time on.",
+    "Target of an output, from a time on.",
     name="wishes",
     multiple=True,
     required=True,
 )
 @option(
     "--limit NAME=LOW:HIGH",
-    "Of an input (default: the range of the runs) or of an output.",
+    "Limits of an input (default: the range of the runs) or of an output.",
     multiple=True,
 )
 @option("--rate INPUT=PER_SECOND", "Largest change of an input in a second.", multiple=True)
@@ -56,8 +56,8 @@ LIMIT = "NAME=LOW:HIGH, one of them may be left out, such as level=:3"
     "disturbances up to a size.",
     multiple=True,
 )
-@option("--horizon STEPS", "Of a plan.", type=click.IntRange(2))
-@option("--every SAMPLES", "Of the runs to a step of the controller.", type=click.IntRange(1))
+@option("--horizon STEPS", "Steps of a plan.", type=click.IntRange(2))
+@option("--every SAMPLES", "Samples of the runs in a step of control.", type=click.IntRange(1))
 @option("--smooth", "Cost of input changes against errors.", type=float, default=0.1)
 @option("--for SECONDS", "Time simulated.", name="duration", type=float)
 @options("hidden columns ignore skip-bad seed report json")

@@ -161,7 +161,7 @@ def _show_slices(terminal: Terminal, fits: SliceFits) -> None:
 def compared(
     gui: EmittanceGuiFile, line: Beamline, planes: tuple[str, ...]
 ) -> tuple[SizeMethods, ...]:
-    """What the size methods of a file of emittance_gui say of some planes."""
+    """Results by the size methods of an emittance_gui file, for these planes."""
     from beamfit.studies.scan.size_methods import compare_size_methods
 
     found = compare_size_methods(gui.scans, line, gui.stored, gui.means)
@@ -171,7 +171,7 @@ def compared(
 def results_of(
     fit: EmittanceFit, methods: tuple[SizeMethods, ...] = ()
 ) -> Iterator[dict[str, Any]]:
-    """What a fit says, and what small errors of the line and parts of the scan would change."""
+    """JSON entry of each plane: the fit, its systematics and its sensitivity to the range."""
     from beamfit.studies.scan.sensitivity import range_sensitivity, systematics
 
     ways = {m.plane: {"size_methods": m} for m in methods}
@@ -220,8 +220,8 @@ def _show_fully(terminal: Terminal, fit: EmittanceFit, methods: tuple[SizeMethod
             terminal.table(Table("", [head, *names], cells), wrap=False)
             terminal.line()
     elif fit.parameters:
-        header = ["Other fitted parameters", "value", "bounds", "prior", "state"]
-        terminal.table(Table("", header, parameter_rows(fit.parameters)))
+        head = ["", "value", "bounds", "prior", "state"]
+        terminal.table(Table("Other fitted parameters", head, parameter_rows(fit.parameters)))
     for words in fit.null_directions:
         terminal.line(f"Not determined: {words}.")
     if fit.statement.network:

@@ -268,7 +268,7 @@ def _show_record(terminal: Terminal, study: RecordStudy) -> None:
         terminal.table(labelled("", [name], rows), [status])
         if decay.systematics:
             unseen = tables.systematic_rows(decay)
-            terminal.table(Table("\nWhat no residual shows", tables.SYSTEMATIC, unseen))
+            terminal.table(Table("\nSystematics", tables.SYSTEMATIC, unseen))
         if losses := tables.budget_rows([decay]):
             terminal.table(labelled("\nLosses from first principles", [name], losses))
         terminal.line()
@@ -277,7 +277,7 @@ def _show_record(terminal: Terminal, study: RecordStudy) -> None:
 
 
 def _show_many(terminal: Terminal, study: RecordStudy) -> None:
-    """One row a decay; the name of the record is above."""
+    """Print a table with a row for each decay, below the record's name."""
     from beamfit.studies.decay import tables
     from beamfit.table import Table
 

@@ -96,8 +96,8 @@ SHARED: dict[str, Callable[..., Any]] = {
     "scan": click.argument("scan"),
     "columns": option(
         "--columns HEADER=NAME,...|LAYOUT.toml",
-        "What columns are whose headers do not say it, such as 'xrms=size_x_um, "
-        "QUAD:BACT=Q525_kG'; or a layout that keeps it; or day-month-year, for dates of numbers. "
+        "Meaning of columns whose headers do not say it, such as 'xrms=size_x_um, "
+        "QUAD:BACT=Q525_kG'; or a file of such a layout; or day-month-year, for numeric dates. "
         "Other columns of unknown names are ignored.",
         callback=_parsed(layout_of),
     ),
@@ -114,7 +114,7 @@ SHARED: dict[str, Callable[..., Any]] = {
     "lattice": option("--lattice FILE", LATTICE, required=True),
     "maybe-lattice": option("--lattice FILE", LATTICE),
     "size-method": option(
-        "--size-method NAME", "Which sizes of a .mat file of emittance_gui; default: RMS."
+        "--size-method NAME", "Sizes to take from a .mat file of emittance_gui; default: RMS."
     ),
     "noise": option(
         "--noise FILE",
@@ -123,13 +123,13 @@ SHARED: dict[str, Callable[..., Any]] = {
     ),
     "weights": option(
         "--weights",
-        "Whose size the error of size squared is taken at; measured sizes bias the answer.",
+        "Take the error of size squared at the model's or the measured size; the latter is biased.",
         choices=["model", "measured"],
         default="model",
     ),
     "particle": option(
         "--particle",
-        "Of a scan without a lattice; default: electron.",
+        "Particle of a scan without a lattice; default: electron.",
         choices=list(REST_ENERGY),
     ),
     "use": option("--use NAME", "Line or sequence of a lattice with several."),
@@ -147,7 +147,7 @@ SHARED: dict[str, Callable[..., Any]] = {
     ),
     "scenario": option(
         "--scenario",
-        "What is unknown besides the beam: nothing, R11 and R12, the magnets' calibration, "
+        "Unknown besides the beam: nothing, R11 and R12, the magnets' calibration, "
         "or k1 as a function of the current.",
         choices=list(SCENARIOS),
         default="known",
@@ -191,7 +191,7 @@ SHARED: dict[str, Callable[..., Any]] = {
     ),
     "anchor": option(
         "--anchor ANCHOR",
-        "Networks: what ties them to the lattice: first-principles=2%, a setting such as "
+        "Networks: their tie to the lattice: first-principles=2%, a setting such as "
         "Q2=0, or determinant.",
         multiple=True,
         callback=_parsed(anchor_of),
@@ -214,7 +214,7 @@ SHARED: dict[str, Callable[..., Any]] = {
     ),
     "order": option(
         "--order STATES",
-        "State space: its states; default: found by an information criterion.",
+        "Number of states of a state space; default: chosen by an information criterion.",
         type=click.IntRange(1, 50),
     ),
     "map": option(
@@ -226,7 +226,7 @@ SHARED: dict[str, Callable[..., Any]] = {
     "input": option("--input COLUMN", "An input of any name.", name="inputs", multiple=True),
     "output": option("--output COLUMN", "An output of any name.", name="outputs", multiple=True),
     "step": option("--step SECONDS", "Distance of rows without a time.", type=float),
-    "delay": option("--delay SAMPLES", "Known delay; default: found.", type=click.IntRange(0)),
+    "delay": option("--delay SAMPLES", "Known delay; default: fitted.", type=click.IntRange(0)),
     "no-offset": option("--no-offset", "The output at rest is 0, and not estimated.", is_flag=True),
     "report": option(
         "--report FILE.html|.pdf|.png|.svg",
@@ -267,7 +267,7 @@ def options(names: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
 
 
 class Sampling(NamedTuple):
-    """What --sample, --store and --seed say."""
+    """Values of --sample, --store and --seed."""
 
     wanted: bool
     store: str | None

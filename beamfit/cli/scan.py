@@ -40,7 +40,7 @@ Examples:
 @click.argument("machine", required=False)
 @option("--dry-run", "Check the machine, print the plan, move nothing.", is_flag=True)
 @option("--recover JOURNAL", "Restore what a scan that was killed has left, and move nothing else.")
-@option("--save FILE.csv", "The scan; default: NAME_DATE_TIME.csv.")
+@option("--save FILE.csv", "File of the scan; default: NAME_DATE_TIME.csv.")
 @option("--journal FILE", "Where what is to be restored stands; beside MACHINE unless.")
 @option("--goal PERCENT", "Emittance error to stop at.")
 @option("--points", "Most settings.", type=click.IntRange(4, 200))
@@ -87,7 +87,7 @@ def scan(
 
 
 class _Lines:
-    """What is said while a scan goes on: a line a point, with normalised emittances."""
+    """Progress of a scan: a line for each point, with normalised emittances."""
 
     def __init__(self, err: bool) -> None:
         self.err = err
@@ -116,7 +116,7 @@ class _Lines:
 
 
 def _known(plane: PlaneFit) -> str:
-    """What is known of an emittance by now, in a few words."""
+    """Present knowledge of a plane's emittance, in a few words."""
     if plane.emittance.error is None:
         return f"{plane.plane}: open"
     sure = "" if plane.status is Status.converged else f" ({cell(plane.status)})"

@@ -15,7 +15,7 @@ from beamfit.io.files import digest
 if TYPE_CHECKING:
     from beamfit.cli.show import Terminal
     from beamfit.language.computed import Computed
-    from beamfit.language.solution import Solution
+    from beamfit.language.solution import ProblemSolution
 
 EXAMPLE = """\b
 Examples:
@@ -121,10 +121,10 @@ def _solved(document, given, starts, values, gains, told) -> tuple[Any, tuple[st
     return found, tuple(files.values())
 
 
-def _show(terminal: Terminal, found: Solution | Computed) -> None:
-    from beamfit.language.solution import Solution
+def _show(terminal: Terminal, found: ProblemSolution | Computed) -> None:
+    from beamfit.language.solution import ProblemSolution
 
-    if isinstance(found, Solution):
+    if isinstance(found, ProblemSolution):
         terminal.verdict(found.headline, found.status, found.message)
         asked = found.made.document.solver
         terminal.line(f"Solver: {found.solver}" + (f" (asked for: {asked.name})" if asked else ""))

@@ -29,7 +29,7 @@ Examples:
 
 @click.command(cls=Command, epilog=EXAMPLE)
 @click.argument("machine")
-@option("--seconds", "How long; default: until Ctrl-C.", type=click.FloatRange(0.0))
+@option("--seconds", "Duration; default: until Ctrl-C.", type=click.FloatRange(0.0))
 @option(
     "--port", "Of the page; 0 for any that is free.", type=click.IntRange(0, 65535), default=8050
 )
@@ -116,7 +116,7 @@ def _clock(time: float) -> str:
 
 
 def _table(told: Told) -> Table:
-    """What is known, a line each."""
+    """Present state of the watch, a line for each quantity."""
     state, answer = told.state, told.state.answer
     fit = answer and answer.window.fit
     counts = state.counts
@@ -140,7 +140,7 @@ def _table(told: Told) -> Table:
 
 
 def _results(told: Told) -> list[dict[str, Any]]:
-    """As `beamfit lifetime --json` has a decay, with alarms and what was counted."""
+    """Results in the form of `beamfit lifetime --json`, with alarms and counts."""
     from beamfit.studies.decay.watch import nothing_yet
 
     state = told.state

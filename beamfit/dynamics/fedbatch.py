@@ -12,7 +12,7 @@ import jax.numpy as jnp
 
 
 class Flow(NamedTuple):
-    """What runs in and out: feed and outflow in L/h, substrate in the feed in g/L."""
+    """Flows of the vessel: feed and outflow in L/h, substrate in the feed in g/L."""
 
     feed: jax.Array
     fed: jax.Array

@@ -11,9 +11,9 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-# Samples that `linear_outputs` takes at once.
+# Samples that `linear_outputs` computes by one matrix product.
 BLOCK = 32
-# Of the matrix exponential: it loses nothing (1e-12) up to 4000 time constants in a step.
+# Scaling and terms of the matrix exponential: exact to 1e-12 up to 4000 time constants in a step.
 HALVINGS, TERMS = 16, 8
 
 

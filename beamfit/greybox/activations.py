@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 
 
-class Kind(NamedTuple):
+class Activation(NamedTuple):
     """A node function and where its derivatives turn.
 
     Parameters
@@ -52,20 +52,20 @@ _G1, _G2 = math.sqrt(1 / 2), math.sqrt(3 / 2)
 _G3, _G4 = (math.sqrt((3 + sign * math.sqrt(6)) / 2) for sign in (-1, 1))
 _NONE: tuple[tuple[float, ...], ...] = ((), (), (), ())
 
-KINDS: dict[str, Kind] = {
-    "identity": Kind(lambda s: s, _NONE, True),
-    "linear": Kind(lambda s: s, _NONE, True),
-    "quadratic": Kind(lambda s: s * s, ((0.0,), (), (), ()), False),
-    "sigmoid": Kind(
+KINDS: dict[str, Activation] = {
+    "identity": Activation(lambda s: s, _NONE, True),
+    "linear": Activation(lambda s: s, _NONE, True),
+    "quadratic": Activation(lambda s: s * s, ((0.0,), (), (), ()), False),
+    "sigmoid": Activation(
         jax.nn.sigmoid, ((), (0.0,), (-2 * _T2, 2 * _T2), (-2 * _T3, 0.0, 2 * _T3)), True
     ),
-    "tanh": Kind(jnp.tanh, ((), (0.0,), (-_T2, _T2), (-_T3, 0.0, _T3)), True),
-    "gaussian": Kind(
+    "tanh": Activation(jnp.tanh, ((), (0.0,), (-_T2, _T2), (-_T3, 0.0, _T3)), True),
+    "gaussian": Activation(
         lambda s: jnp.exp(-s * s),
         ((0.0,), (-_G1, _G1), (-_G2, 0.0, _G2), (-_G4, -_G3, _G3, _G4)),
         False,
     ),
-    "logcosh": Kind(_logcosh, ((0.0,), (), (0.0,), (-_T2, _T2)), False),
+    "logcosh": Activation(_logcosh, ((0.0,), (), (0.0,), (-_T2, _T2)), False),
 }
 """Node functions by the report's names; gaussian is exp(-s^2), logcosh is log(cosh(s))."""
 

@@ -1,4 +1,4 @@
-"""Is a point an optimum, and what does it cost to hold its limits? Our own answer, not a solver's.
+"""Optimality of a point and multipliers of its limits, judged here and not by a solver.
 
 At an optimum of cost f within limits on c(theta) and bounds on theta there are multipliers y, z
 with grad f = J_c^T y + z (stationarity), y and z zero where a limit is not reached, not negative at
@@ -20,15 +20,17 @@ from beamfit.greybox import problem
 from beamfit.greybox.factors import Rows, lengths
 from beamfit.greybox.problem import Problem
 
-# A bound is reached, too, where moving onto it changes the cost by less than this share.
+# A bound also counts as reached if moving onto it changes the cost by less than this share.
 CLOSE = 1e-8
-# What is limited counts as no larger than this many times its size at the end: a start at which it
-# was exp(100) must not make every end feasible.
+# The size of a limited value is at most this many times the one at the end: a start at which it was
+# exp(100) must not make every end feasible.
 GROWN = 1e3
+# Random test points about a point, and their distance in sizes of the numbers.
+LOOKS, NEAR = 4, 0.3
 
 
 class Slopes(NamedTuple):
-    """Everything of first order at a point."""
+    """Values and first derivatives at a point."""
 
     residual: np.ndarray
     residual_jacobian: Rows
@@ -39,7 +41,7 @@ class Slopes(NamedTuple):
 
     @property
     def finite(self) -> bool:
-        """Whether everything is."""
+        """True if every part is finite."""
         parts = (part.data if sparse.issparse(part) else part for part in self)
         return all(np.all(np.isfinite(part)) for part in parts)
 
@@ -52,7 +54,7 @@ class Scale(NamedTuple):
     cost: float
 
 
-class Limits(NamedTuple):
+class LimitedValues(NamedTuple):
     """Values with their lower and upper limits, their sizes, and how near counts as reached."""
 
     value: np.ndarray
@@ -63,14 +65,14 @@ class Limits(NamedTuple):
 
     @property
     def violation(self) -> np.ndarray:
-        """By how much each limit is crossed, in sizes."""
+        """Violation of each limit, in units of the limited value's size."""
         return (
             np.maximum(np.maximum(self.lower - self.value, self.value - self.upper), 0) / self.size
         )
 
     @property
     def reached(self) -> tuple[np.ndarray, np.ndarray]:
-        """Which lower and upper limits are reached."""
+        """True for each lower and each upper limit that is reached."""
         return self.value - self.lower <= self.near, self.upper - self.value <= self.near
 
     def distance(self, multiplier: np.ndarray) -> np.ndarray:
@@ -79,7 +81,7 @@ class Limits(NamedTuple):
         return np.where(multiplier > 0, low, np.where(multiplier < 0, high, 0.0))
 
     def states(self, multiplier: np.ndarray) -> np.ndarray:
-        """Whether each value is free, at its lower or upper limit, or fixed."""
+        """State of each value: free, at its lower or upper limit, or fixed."""
         low, high = self.reached
         cases = [self.lower == self.upper, low & ((multiplier > 0) | ~high), high]
         return np.select(cases, ["fixed", "lower", "upper"], "free")
@@ -93,7 +95,7 @@ class Multipliers(NamedTuple):
 
 
 class KKT(NamedTuple):
-    """How far a point is from an optimum; all three are zero at one.
+    """Residuals of the conditions of Karush, Kuhn and Tucker; all three are zero at an optimum.
 
     `stationarity` is the largest component of the Lagrangian's gradient in units of its terms,
     `feasibility` the largest violation in the size of what is limited, `complementarity` the
@@ -126,13 +128,13 @@ class Bend(NamedTuple):
     clear: bool = False
 
 
-class State(NamedTuple):
+class SearchState(NamedTuple):
     """A point with its limits, their multipliers and its distance from an optimum."""
 
     theta: np.ndarray
     at: Slopes
-    bounds: Limits
-    limits: Limits
+    bounds: LimitedValues
+    limits: LimitedValues
     found: Multipliers
     kkt: KKT
     scale: Scale
@@ -141,12 +143,12 @@ class State(NamedTuple):
 
     @property
     def feasible(self) -> bool:
-        """Whether all limits hold."""
+        """True if all limits hold within the tolerance."""
         return self.kkt.feasibility <= self.tolerance
 
     @property
     def optimal(self) -> bool:
-        """Whether it is an optimum to first order."""
+        """True if the conditions of first order hold within the tolerance."""
         return self.kkt.worst <= self.tolerance
 
 
@@ -165,6 +167,12 @@ def slopes(p: Problem, theta: np.ndarray) -> Slopes:
     """Evaluate values and first derivatives at a point."""
     parts = p.compiled(first_order)(np.asarray(theta, float))
     return Slopes(*(np.asarray(part) for part in parts))
+
+
+def nearby(p: Problem, theta: np.ndarray, unit: np.ndarray) -> np.ndarray:
+    """Test points about a point, within the bounds, shape (`LOOKS`, n)."""
+    steps = np.random.default_rng(0).normal(size=(LOOKS, len(unit)))
+    return np.clip(theta + NEAR * steps * unit, p.lower, p.upper)
 
 
 def of_squares(residual: np.ndarray, jacobian: Rows) -> Slopes:
@@ -214,7 +222,7 @@ def gradient_size(p: Problem, at: Slopes, scale: Scale) -> np.ndarray:
     return np.maximum(found, max(1e-12 * largest, 1e-100) / scale.unit)
 
 
-def holding(p: Problem, s: State, least: float) -> tuple[np.ndarray, np.ndarray]:
+def holding(p: Problem, s: SearchState, least: float) -> tuple[np.ndarray, np.ndarray]:
     """Numbers that do not move and constraints that hold, by forces above a share."""
     size = gradient_size(p, s.at, s.scale)
     held = ~p.moving | (np.abs(s.found.bounds) > least * size)
@@ -222,7 +230,7 @@ def holding(p: Problem, s: State, least: float) -> tuple[np.ndarray, np.ndarray]
     return held, p.equations | (pulls > least)
 
 
-def state(p: Problem, theta: np.ndarray, scale: Scale, at: Slopes | None = None) -> State:
+def state(p: Problem, theta: np.ndarray, scale: Scale, at: Slopes | None = None) -> SearchState:
     """Find the multipliers at a point and measure how far it is from an optimum.
 
     Parameters
@@ -238,7 +246,7 @@ def state(p: Problem, theta: np.ndarray, scale: Scale, at: Slopes | None = None)
 
     Returns
     -------
-    State
+    SearchState
         With an infinite residual where something is not finite.
     """
     at = slopes(p, theta) if at is None else at
@@ -250,13 +258,13 @@ def state(p: Problem, theta: np.ndarray, scale: Scale, at: Slopes | None = None)
         pushed = np.abs(at.gradient) > p.tolerance * size
         near = np.where(pushed, np.maximum(near, CLOSE * cost / np.abs(at.gradient)), near)
     near = np.where(np.isfinite(near), near, 0.0)
-    bounds = Limits(theta, p.lower, p.upper, scale.unit, near)
+    bounds = LimitedValues(theta, p.lower, p.upper, scale.unit, near)
     size_here = np.fmin(scale.limit, GROWN * scale_of(p, theta, at).limit)
-    limits = Limits(
+    limits = LimitedValues(
         at.constraints, p.constraint_lower, p.constraint_upper, size_here, p.tolerance * size_here
     )
     none = Multipliers(np.zeros(len(theta)), np.zeros(len(at.constraints)))
-    s = State(theta, at, bounds, limits, none, LOST, scale, p.tolerance)
+    s = SearchState(theta, at, bounds, limits, none, LOST, scale, p.tolerance)
     if not at.finite:
         return s
     s = s._replace(found=multipliers(at.gradient, at.jacobian, bounds, limits, size))
@@ -264,7 +272,11 @@ def state(p: Problem, theta: np.ndarray, scale: Scale, at: Slopes | None = None)
 
 
 def multipliers(
-    gradient: np.ndarray, jacobian: np.ndarray, bounds: Limits, limits: Limits, scale: np.ndarray
+    gradient: np.ndarray,
+    jacobian: np.ndarray,
+    bounds: LimitedValues,
+    limits: LimitedValues,
+    scale: np.ndarray,
 ) -> Multipliers:
     """Find the multipliers of the right signs that come nearest to stationarity.
 
@@ -274,7 +286,7 @@ def multipliers(
         Of the cost.
     jacobian : array, shape (m, n)
         Of the constraints.
-    bounds, limits : Limits
+    bounds, limits : LimitedValues
         Of the n free numbers and of the m constraints.
     scale : array, shape (n,)
         Size of a component of the gradient that matters.
@@ -288,8 +300,8 @@ def multipliers(
     Minimise (x-3)^2/2 with x <= 1: the cost falls by 2 for each unit the bound gives way.
 
     >>> one, none = np.ones(1), np.zeros(0)
-    >>> at = Limits(one, np.array([-np.inf]), one, one, 1e-6 * one)
-    >>> free = Limits(none, none, none, none, none)
+    >>> at = LimitedValues(one, np.array([-np.inf]), one, one, 1e-6 * one)
+    >>> free = LimitedValues(none, none, none, none, none)
     >>> multipliers(np.array([-2.0]), np.zeros((0, 1)), at, free, one).bounds.tolist()
     [-2.0]
     """
@@ -317,7 +329,7 @@ def multipliers(
     return Multipliers(found[:n], found[n:])
 
 
-def _distance(s: State, scale: np.ndarray, cost: float) -> KKT:
+def _distance(s: SearchState, scale: np.ndarray, cost: float) -> KKT:
     """Measure how far a point with multipliers is from an optimum, `cost` being a size of it."""
     at, found = s.at, s.found
     left = at.gradient - found.bounds - at.jacobian.T @ found.constraints

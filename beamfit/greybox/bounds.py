@@ -19,12 +19,13 @@ import numpy as np
 from beamfit.errors import InputError
 from beamfit.greybox.activations import Range, range_of
 
+# Relative error of one operation in double precision, half the distance between neighbours.
 _ROUNDING = 2.0**-53
 _TINY = 1e-300  # covers underflow, which a relative error does not
 
 
-class Network(Protocol):
-    """What a bound reads of a network (`beamfit.greybox.mlp.MLP`, which stands on this module).
+class LayeredNetwork(Protocol):
+    """The parts of a network that a bound reads (of `beamfit.greybox.mlp.MLP`, which uses this).
 
     `order` holds its layers in the order of computation, each with name, kind and size; a port has
     layer, node, scale and bias.
@@ -134,7 +135,7 @@ def _activated(s: _Nodes, kind: str) -> _Nodes:
     return _Nodes(range_of(kind, 0, s.value), _times(d1[n, new], s.first), second, third)
 
 
-def _entered(s: _Nodes, net: Network, layer: str, box: Range) -> _Nodes:
+def _entered(s: _Nodes, net: LayeredNetwork, layer: str, box: Range) -> _Nodes:
     """Add the inputs that enter a layer."""
     value, first = s.value, s.first
     for i, port in enumerate(net.input_ports):
@@ -153,7 +154,7 @@ def _entered(s: _Nodes, net: Network, layer: str, box: Range) -> _Nodes:
     return s._replace(value=value, first=first)
 
 
-def _enclose(net: Network, box: Range) -> _Nodes:
+def _enclose(net: LayeredNetwork, box: Range) -> _Nodes:
     """Enclose the derivatives of every output over a box (values keep their node's scale)."""
     inputs = len(net.input_ports)
     done: dict[str, _Nodes] = {}
@@ -206,12 +207,12 @@ def _taylor(middle: _Nodes, whole: _Nodes, radius: jax.Array) -> Range:
     return Range(middle.first.middle - down - reach, middle.first.middle + up + reach)
 
 
-def gain_bounds(net: Network, lower: jax.Array, upper: jax.Array) -> Range:
+def gain_bounds(net: LayeredNetwork, lower: jax.Array, upper: jax.Array) -> Range:
     """Enclose every first-order gain of a network over one box.
 
     Parameters
     ----------
-    net : Network
+    net : LayeredNetwork
         The network; its own gain outputs play no part.
     lower, upper : array, shape (inputs,)
         Corners of the box; infinite sides are allowed.
@@ -233,7 +234,7 @@ def gain_bounds(net: Network, lower: jax.Array, upper: jax.Array) -> Range:
 
 
 @jax.jit
-def _bounds(net: Network, lower: jax.Array, upper: jax.Array) -> Range:
+def _bounds(net: LayeredNetwork, lower: jax.Array, upper: jax.Array) -> Range:
     """The bounds of `gain_bounds`, compiled once for each structure of network."""
     finite = jnp.all(jnp.isfinite(upper - lower))
     low, high = (jnp.where(finite, end, 0.0) for end in (lower, upper))
@@ -255,12 +256,12 @@ def _bounds(net: Network, lower: jax.Array, upper: jax.Array) -> Range:
     )
 
 
-def value_bounds(net: Network, lower: jax.Array, upper: jax.Array) -> Range:
+def value_bounds(net: LayeredNetwork, lower: jax.Array, upper: jax.Array) -> Range:
     """Enclose every output of a network over one finite box, by its gains from the centre.
 
     Parameters
     ----------
-    net : Network
+    net : LayeredNetwork
         The network; its own gain outputs play no part.
     lower, upper : array, shape (inputs,)
         Corners of the box.
@@ -332,12 +333,12 @@ def cells(lower, upper, number: int) -> tuple[np.ndarray, np.ndarray]:
     return low.reshape(-1, lower.size), high.reshape(-1, lower.size)
 
 
-def over_cells(net: Network, lower, upper, number: int) -> Range:
+def over_cells(net: LayeredNetwork, lower, upper, number: int) -> Range:
     """Enclose every first-order gain over each cell of a box.
 
     Parameters
     ----------
-    net : Network
+    net : LayeredNetwork
         The network.
     lower, upper : array, shape (inputs,)
         Corners of the box, finite.

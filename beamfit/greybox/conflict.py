@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from beamfit.greybox import problem
-from beamfit.greybox.assess import State, gradient_size, scale_of
+from beamfit.greybox.assess import NEAR, SearchState, gradient_size, nearby, scale_of
 from beamfit.greybox.descend import descend_all
 from beamfit.greybox.problem import Problem
 
@@ -32,25 +32,25 @@ class Conflict(NamedTuple):
 
     @property
     def feasible(self) -> bool:
-        """Whether all constraints hold at the point."""
+        """True if all constraints hold at the point."""
         return not self.constraints
 
 
 def excess(data, theta):
-    """By how much each constraint is crossed, in sizes, where its weight is 1."""
+    """Violation of each constraint in units of its size, times its weight."""
     core, lower, upper, size, weight = data
     c = problem.constraints(core, theta)
     return weight * (jnp.maximum(lower - c, 0) + jnp.maximum(c - upper, 0)) / size
 
 
-def relaxed(p: Problem, s: State, starts: Iterable[np.ndarray]) -> Conflict:
+def relaxed(p: Problem, s: SearchState, starts: Iterable[np.ndarray]) -> Conflict:
     """Come as near to the constraints as the bounds allow, and name what conflicts.
 
     Parameters
     ----------
     p : Problem
         Of which no feasible point was found.
-    s : State
+    s : SearchState
         The nearest one.
     starts : iterable of array, shape (n,)
         From where to try besides.
@@ -97,13 +97,13 @@ def _held(p: Problem, theta: np.ndarray) -> list[tuple[int, bool]]:
     return [(i, low) for edge, low in sides for i in np.flatnonzero((theta == edge) & p.moving)]
 
 
-# Gradients count as dependent below this singular value, at an optimum; at a point that is none,
-# where solvers creep towards a place without multipliers, below this one.
+# Gradients are dependent below this singular value: the first at an optimum; the second elsewhere,
+# since solvers only approach a point without multipliers.
 DEPENDENT, NEARLY = 1e-8, 1e-2
-# A constraint has no slope where that is less than this share of how it changes within so much of
-# the numbers' sizes: a violation squared that a solver keeps below 1e-9 has a slope of 6e-5.
-SLOPELESS, NEAR, LOOKS = 1e-3, 0.3, 4
-# Of a combination, what is below this share of its largest part is none.
+# A constraint has no slope if that is below this share of its change nearby: a squared violation
+# that a solver keeps below 1e-9 has a slope of 6e-5.
+SLOPELESS = 1e-3
+# Entries of a combination below this share of its largest are rounding.
 PART = 1e-3
 
 
@@ -114,14 +114,14 @@ class Dependence(NamedTuple):
     slopeless: tuple[str, ...]
 
 
-def dependence(p: Problem, s: State, stationary: bool) -> Dependence | None:
+def dependence(p: Problem, s: SearchState, stationary: bool) -> Dependence | None:
     """Find what is wrong with the limits that hold at a feasible point, if anything is.
 
     Parameters
     ----------
     p : Problem
         The problem.
-    s : State
+    s : SearchState
         The point.
     stationary : bool
         Whether the point has multipliers. If so they must be unique; if not, a combination of
@@ -161,11 +161,9 @@ def dependence(p: Problem, s: State, stationary: bool) -> Dependence | None:
     return Dependence(tuple(names[told].tolist()), tuple(names[flat].tolist()))
 
 
-def _changes(p: Problem, s: State) -> np.ndarray:
-    """By how much each constraint changes along the numbers, from points around."""
-    unit = scale_of(p, s.theta, s.at).unit
-    steps = np.random.default_rng(0).normal(size=(LOOKS, len(unit))) * NEAR * unit
-    points = np.clip(s.theta + steps, p.lower, p.upper)
+def _changes(p: Problem, s: SearchState) -> np.ndarray:
+    """Largest change of each constraint per unit of the numbers, at random points nearby."""
+    points = nearby(p, s.theta, scale_of(p, s.theta, s.at).unit)
     values = np.array([p.constraint_values(point) for point in points])
     change = np.abs(values - s.at.constraints) / NEAR
     return np.max(np.where(np.isfinite(change), change, 0.0), axis=0, initial=0.0)

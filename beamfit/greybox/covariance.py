@@ -20,16 +20,16 @@ from beamfit.greybox.terms import Record
 
 # A quantity counts as determined while bounds carry less than this share of its variance.
 MOST_SHARE = 0.5
-# A direction is seen while its singular value is above this share of the largest.
+# A direction is determined if its singular value exceeds this share of the largest: 1e6 roundings.
 CUT = 1e-10
 # A quantity moves along an open direction if more than this share of its terms remains.
 PART = 1e-6
-# The standard deviation, in units of the best known direction, of one that nothing limits.
+# Standard deviation of an undetermined direction, in units of the best determined one.
 FAR = 1e12
-# Of many numbers the normal equations tell errors while the least eigenvalue, columns having unit
-# length, is above this share of the largest: to 1e-6 and better.
+# Least eigenvalue of the normal equations, as a share of the largest with columns of unit length,
+# down to which their errors are good to 1e-6.
 SAFE = 1e-10
-# The noise of data that a model meets exactly, which must not be zero.
+# Noise of data that a model meets exactly; zero would divide by zero.
 EXACT = 1e-30
 
 
@@ -51,17 +51,17 @@ class Group(NamedTuple):
 
     @property
     def factor(self) -> float:
-        """What divides the rows for their information; 1 where the scatter says nothing."""
+        """Divisor of the residuals before their information counts; 1 if the scatter is unknown."""
         return 1.0 if math.isnan(self.scale) else max(self.scale, EXACT)
 
     @property
     def unknown(self) -> bool:
-        """Whether neither errors nor scatter tell the noise."""
+        """True if the noise is known neither from errors nor from the scatter."""
         return not (self.errors_given or self.scale >= 0)
 
 
 class Spread(NamedTuple):
-    """How far the free numbers may be off.
+    """Error of the free numbers: directions that the data determine, and open ones.
 
     `half` (n, k) has the covariance of the directions that are seen, half @ half.T; `open` (n, u)
     are the others, `FAR` long, `reach` (n,) how far each number moves along one at most;
@@ -85,7 +85,7 @@ class Spread(NamedTuple):
 
     @property
     def rank(self) -> int:
-        """How many directions are seen."""
+        """Number of directions that the data determine."""
         return self.half.shape[1]
 
     @property
@@ -137,7 +137,7 @@ class FactoredSpread:
 
     @property
     def safe(self) -> bool:
-        """Whether all directions are seen, so clearly that normal equations tell their errors.
+        """True if the normal equations determine every direction beyond rounding errors.
 
         The trace of the inverse is not below 1 over the least eigenvalue.
         """

@@ -1,4 +1,4 @@
-"""Does the cost bend down at an optimum of first order, and where would it be lower?
+"""Second-order test of an optimum: directions in which the cost bends down.
 
 An optimum's Lagrangian does not bend downward along the limits that hold (Nocedal & Wright,
 Numerical Optimization, 2nd ed., section 12.5). Objectives are tested with exact derivatives,
@@ -17,22 +17,22 @@ from beamfit.greybox.covariance import null_space, triangle
 from beamfit.greybox.factors import FEW, in_units, weakest
 from beamfit.greybox.problem import Problem
 
-# A Newton step of a further objective longer than this, in the sizes of the numbers, is no end.
+# A search has not ended while the next Newton step exceeds this, in sizes of the numbers.
 STEP = 1e-3
-# Bending down by less than this share of the strongest curvature is rounding.
+# Negative curvature below this share of the strongest curvature is rounding.
 FLAT = 1e-6
-# Bending down by more than this is a saddle even where no point looked at is lower, bounds apart.
+# Negative curvature above this share is a saddle even if no lower point was found nearby.
 PLAIN = 2e-3
-# Slopes below this share of the terms that cancel in them are rounding, too.
+# Slopes below this share of the terms that cancel in them are rounding.
 ROUNDING = 1e-13
-# A slope at a bound that promises so many times the cost and its change beside the bound is made of
-# rounding, and says nothing of the bound: b/(1 - exp(-b t)) has lost its figures at b = 1e-18.
+# A slope at a bound that predicts more than this many times the cost and its change nearby is
+# rounding: b/(1 - exp(-b t)) has lost its figures at b = 1e-18.
 LOST = 1e3
-# Points beside one are so far off in the sizes of the numbers, along so many of the weakest
-# directions of squares, or at random or inward from bounds.
+# Test points: distance in sizes of the numbers, count along the weakest directions of a sum of
+# squares, and count at random or inward from bounds.
 NEAR, WEAKEST, AROUND = 1e-3, 2, 4
 
-# Newton steps that bring a point back onto constraints, and how near they count as met.
+# Newton steps that bring a point back onto its constraints, and the tolerance of these.
 RESTORED, CLOSE = 10, 1e-10
 
 # Lagrangian at points, shape (k, n) to (k,).
@@ -49,8 +49,8 @@ def lagrangian_hessian(core, theta, sigma, y):
 
 
 def second_order(
-    p: Problem, s: assess.State, exact: bool
-) -> tuple[assess.State, np.ndarray | None]:
+    p: Problem, s: assess.SearchState, exact: bool
+) -> tuple[assess.SearchState, np.ndarray | None]:
     """The second-order test of a point that is an optimum to first order.
 
     Parameters
@@ -64,7 +64,7 @@ def second_order(
 
     Returns
     -------
-    assess.State
+    assess.SearchState
         With its `assess.Bend`.
     array, shape (n,), or None
         Another point, from where to go on, if the cost falls beside this one.
@@ -96,7 +96,7 @@ def second_order(
     return s._replace(bend=bent), None
 
 
-def lower_beside(p: Problem, s: assess.State, lagrangian: Look) -> np.ndarray | None:
+def lower_beside(p: Problem, s: assess.SearchState, lagrangian: Look) -> np.ndarray | None:
     """A lower point beside one where squares end, if the cost bends down there.
 
     The squares' own curvature never does; what their residuals bend shows first where that is
@@ -130,7 +130,7 @@ def lower_beside(p: Problem, s: assess.State, lagrangian: Look) -> np.ndarray | 
     return None
 
 
-def _weakest(p: Problem, s: assess.State) -> np.ndarray:
+def _weakest(p: Problem, s: assess.SearchState) -> np.ndarray:
     """The weakest directions of squares that keep to the limits held by a force."""
     unit = s.scale.unit
     held, on = assess.holding(p, s, p.tolerance)
@@ -147,7 +147,7 @@ def _weakest(p: Problem, s: assess.State) -> np.ndarray:
 
 def _along(
     p: Problem,
-    s: assess.State,
+    s: assess.SearchState,
     direction: np.ndarray,
     lagrangian: Look,
 ) -> np.ndarray | None:
@@ -166,7 +166,7 @@ def _along(
     return points[best] if cost[0] - cost[best] > counts else None
 
 
-def _restored(p: Problem, s: assess.State, point: np.ndarray) -> np.ndarray | None:
+def _restored(p: Problem, s: assess.SearchState, point: np.ndarray) -> np.ndarray | None:
     """A point moved onto the constraints that hold at another one, and inside all; None if not.
 
     Beside curved constraints a straight step leaves them, and a cost that is lower there is no
@@ -188,7 +188,7 @@ def _restored(p: Problem, s: assess.State, point: np.ndarray) -> np.ndarray | No
     return None
 
 
-def _bend(p: Problem, s: assess.State) -> assess.Bend:
+def _bend(p: Problem, s: assess.SearchState) -> assess.Bend:
     """Curvature on the directions that active limits leave, from exact derivatives."""
     unit, cost = s.scale.unit, s.scale.cost
     h = np.asarray(p.compiled(lagrangian_hessian)(s.theta, 1.0, s.found.constraints))
@@ -211,7 +211,7 @@ def _bend(p: Problem, s: assess.State) -> assess.Bend:
     return assess.Bend(down, float(newton), not steep.all() or largest < p.tolerance, clear)
 
 
-def _tangent(p: Problem, s: assess.State) -> np.ndarray:
+def _tangent(p: Problem, s: assess.SearchState) -> np.ndarray:
     """Directions, in the sizes of the numbers, that keep to the limits held by a force."""
     unit = s.scale.unit
     held, on = assess.holding(p, s, p.tolerance)

@@ -24,28 +24,28 @@ from beamfit.greybox.factors import FEW, RIDGE, Factor, Rows, in_units, lengths,
 from beamfit.greybox.problem import Problem, sloped, with_slope
 from beamfit.greybox.problem import residual as problem_residual
 
+# Damping of the first step; the Jacobian's columns have unit length.
 DAMPING = 1e-3
-# On the length of a step relative to the numbers, both in units of the Jacobian's columns.
+# A search rests at a step below this share of the numbers, both in units of the Jacobian's columns.
 TOLERANCE = 1e-13
-# The damping falls by this factor at most in one step.
+# Smallest factor on the damping in one step.
 EASED = 1e-4
-# Beyond this no step however short lowers the cost.
+# Damping beyond which no step, however short, lowers the cost.
 STUCK = 1e30
-# What a step promises is below rounding under this share of the sum of squares.
+# A promised decrease below this share of the sum of squares is rounding.
 ROUNDING = 1e-16
-# Most rounds of pinning in a step; what the last one pushes out is clipped.
+# Rounds in which a step pins numbers to bounds; the rest is clipped.
 PINNED = 3
-# Where a step of many numbers gains what it promised to within a share, the damping falls by so
-# many times the share.
+# Factor on the damping of many numbers, times the relative miss of a step's promised decrease.
 TRUSTED = 10.0
-# With a limit of time the clock is looked at after so many steps.
+# Steps between two looks at the clock under a time limit.
 SEGMENT = 50
-# Searches in a compiled call, where their Jacobians have no more than so many numbers.
+# Starts searched in one compiled call, if their Jacobians have at most this many entries.
 WIDTH, LARGE = 4, 2**15
 
 
 class Found(NamedTuple):
-    """Where a start ended: numbers, half the sum of squares, steps, and whether it came to rest."""
+    """End of one start: numbers, half the sum of squares, steps, and if it came to rest."""
 
     theta: Array
     cost: Array
@@ -73,7 +73,7 @@ class Walk(NamedTuple):
 
     @property
     def memory(self) -> tuple[Array, Array, Array, Array]:
-        """What a search needs to go on."""
+        """State that the next segment of a search begins with."""
         return self.damping, self.growth, self.scale, self.steps
 
     @property
@@ -228,7 +228,7 @@ def _advance(residual, lower: Array, upper: Array, tolerance: float, moves, s: W
 
 
 def _easing(ratio: float) -> float:
-    """By how much the damping falls after a step that gained that share of its promise.
+    """Factor on the damping after a step that gained this share of its promised decrease.
 
     Nielsen's rule, and faster where a step gains what it promised: then steps become undamped and
     converge as fast as Gauss-Newton's. Few numbers keep to Nielsen's rule: in the flat valleys of
@@ -297,7 +297,7 @@ class Lanes:
 
     @property
     def done(self) -> np.ndarray:
-        """Which have come to rest, or cannot move."""
+        """True for each start that has come to rest or cannot move."""
         return self.at.rested | self.at.stuck
 
     def go(self, lanes: np.ndarray, limit: int, until: float | None) -> None:

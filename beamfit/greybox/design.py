@@ -14,7 +14,7 @@ from beamfit.greybox.covariance import Spread, spread_of
 
 
 class Information(NamedTuple):
-    """What is known of some quantities, ready to be added to.
+    """Present information on some quantities, to which candidates add.
 
     Attributes
     ----------
@@ -96,7 +96,7 @@ def rows_of(covariance: np.ndarray) -> np.ndarray:
 
 
 def scores(known: Information, candidates: np.ndarray, volume: bool = False) -> np.ndarray:
-    """What is to be small after each candidate alone.
+    """Score of each candidate alone: the expected error with it; smaller is better.
 
     Parameters
     ----------

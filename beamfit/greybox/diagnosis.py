@@ -14,9 +14,7 @@ from beamfit.greybox.covariance import CUT, directions
 from beamfit.greybox.evidence import listed
 from beamfit.greybox.problem import Problem, with_slope
 
-# Points near the start whose derivatives tell what hangs on what, and how far off in sizes.
-LOOKS, NEAR = 4, 0.3
-# Rows whose sizes differ by more than this are scaled badly.
+# Rows are badly scaled if their sizes differ by more than this: half the digits are lost.
 APART = 1e8
 
 
@@ -128,14 +126,13 @@ def _parts(p: Problem) -> Iterator[tuple[str, str, Callable[[Any], jax.Array]]]:
 
 
 def _looks(p: Problem) -> list[assess.Slopes]:
-    random, width = np.random.default_rng(0), np.maximum(np.abs(p.start), 1.0)
-    steps = random.normal(size=(LOOKS, len(width))) * NEAR * width
-    points = [p.start, *(p.start + step for step in steps)]
-    return [assess.slopes(p, np.clip(point, p.lower, p.upper)) for point in points]
+    start = np.clip(p.start, p.lower, p.upper)
+    points = [start, *assess.nearby(p, p.start, np.maximum(np.abs(p.start), 1.0))]
+    return [assess.slopes(p, point) for point in points]
 
 
 def _rows(looks: list[assess.Slopes], which: Callable[[assess.Slopes], np.ndarray]) -> np.ndarray:
-    """Which numbers each row hangs on, at any of the points."""
+    """True for each row and number that it depends on, at any of the points."""
     return np.any([which(at) != 0 for at in looks], axis=0)
 
 

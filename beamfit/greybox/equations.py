@@ -21,7 +21,7 @@ from beamfit.greybox import tree
 
 
 class Root(NamedTuple):
-    """What the inner solver found at one point.
+    """Result of the inner solver at one point.
 
     ``defect`` is ``max |f(x, y)|``; ``converged`` is 1 where it is within the tolerance, else 0.
     """

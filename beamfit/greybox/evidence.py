@@ -9,7 +9,7 @@ import numpy as np
 from scipy import sparse
 
 from beamfit.greybox import assess
-from beamfit.greybox.assess import State
+from beamfit.greybox.assess import SearchState
 from beamfit.greybox.conflict import Conflict
 from beamfit.greybox.covariance import (
     MOST_SHARE,
@@ -21,16 +21,16 @@ from beamfit.greybox.covariance import (
     triangle,
 )
 from beamfit.greybox.factors import Rows
-from beamfit.greybox.fit import Attempt, Limited, Variable
+from beamfit.greybox.fit import Attempt, FittedConstraint, FittedVariable
 from beamfit.greybox.problem import Problem
 
-# A further decrease of chi-square below this changes nothing anybody asks for.
+# A search is settled if a further step lowers chi-square by less: a tenth of a standard error.
 SETTLED = 0.01
 EDGES = ("lower", "upper")
 
 
 class Search(NamedTuple):
-    """What was done: every start, how many were moved onto bounds, the limit of time if it cut.
+    """Record of a search: its starts, those moved onto bounds, the time limit if it cut.
 
     `exact` tells whether second derivatives could be asked for, `conflict` what kept the search
     from a feasible point.
@@ -50,12 +50,12 @@ class Search(NamedTuple):
 
     @property
     def words(self) -> str:
-        """How many starts there were."""
+        """Number of starts, in words."""
         return f"{len(self.attempts)} start{'s' if len(self.attempts) != 1 else ''}"
 
 
 class Known(NamedTuple):
-    """What a point's residuals tell: groups of noise, spreads, directions not seen, rank.
+    """Information of a point's residuals: noise groups, spreads, undetermined directions, rank.
 
     `blind` tells which numbers would be open even if what is at a bound truly were there.
     """
@@ -69,25 +69,25 @@ class Known(NamedTuple):
     held: np.ndarray
 
 
-class Evidence(NamedTuple):
-    """What a verdict rests on; `chi2` and `dof` are of what has errors.
+class FitEvidence(NamedTuple):
+    """Input of the verdict's rules; `chi2` and `dof` count residuals with errors only.
 
     `unseen` (n, k) are the directions that residuals do not see.
     """
 
     problem: Problem
-    state: State
+    state: SearchState
     search: Search
     settled: bool
-    variables: tuple[Variable, ...]
-    constraints: tuple[Limited, ...]
+    variables: tuple[FittedVariable, ...]
+    constraints: tuple[FittedConstraint, ...]
     blind: np.ndarray
     unseen: np.ndarray
     chi2: float
     dof: float
 
 
-def known(p: Problem, s: State) -> Known:
+def known(p: Problem, s: SearchState) -> Known:
     """Tell what the residuals know, along the limits that hold.
 
     For the degrees of freedom a number at an active bound is held; its error and that of what
@@ -128,8 +128,8 @@ def _stacked(blocks: list[Rows]) -> Rows:
     return np.vstack(blocks)
 
 
-def settled(p: Problem, s: State) -> bool:
-    """Whether the search ended at an optimum as far as the data can tell.
+def settled(p: Problem, s: SearchState) -> bool:
+    """True if the search ended at an optimum as far as the data can tell.
 
     The decrease of chi-square that a further Gauss-Newton step promises, noise being what the
     scatter says where no errors were given, is below `SETTLED`. Networks have flat valleys in which

@@ -16,11 +16,11 @@ import numpy as np
 from scipy import linalg, sparse
 from scipy.sparse.linalg import splu
 
-# Up to so many free numbers everything is dense, by orthogonal factors and singular values.
+# Free numbers up to which all is dense, by orthogonal factors and singular values.
 FEW = 200
-# Rounds of inverse iteration for the weakest directions: each gains the ratio of eigenvalues.
+# Rounds of inverse iteration for the weakest directions; each gains the ratio of eigenvalues.
 ROUNDS = 10
-# Rounding of an element of A, columns of J having unit length: what A needs to stay positive.
+# Added to the diagonal of A = J'J, columns of unit length, so that rounding leaves it positive.
 RIDGE = 1e-13
 
 Rows = np.ndarray | sparse.csr_array

@@ -27,11 +27,11 @@ if TYPE_CHECKING:
     from beamfit.sampling.posterior import Posterior
     from beamfit.sampling.priors import Distribution
 
-# Another optimum: a chi-square larger by less than 6.
+# Cost above the best (half of a chi-square of 6) up to which another optimum starts the sampler.
 NEAR_COST = 3.0
 
 
-class Variable(NamedTuple):
+class FittedVariable(NamedTuple):
     """A free number: value, error, bounds, state and reduced gradient d(cost)/d(bound).
 
     `error` is one standard deviation, NaN where the data do not determine the value; `error_raw`
@@ -49,7 +49,7 @@ class Variable(NamedTuple):
     reduced_gradient: float
 
 
-class Limited(NamedTuple):
+class FittedConstraint(NamedTuple):
     """A constraint element: value, limits, state and multiplier d(cost)/d(limit)."""
 
     name: str
@@ -102,7 +102,7 @@ class Attempt(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """What a fit found and how far to believe it.
+    """Result of a fit, with its errors and verdict.
 
     Parameters
     ----------
@@ -151,8 +151,8 @@ class Fit:
     dof: int
     groups: tuple[Group, ...]
     kkt: KKT
-    variables: tuple[Variable, ...]
-    constraints: tuple[Limited, ...]
+    variables: tuple[FittedVariable, ...]
+    constraints: tuple[FittedConstraint, ...]
     spread: Spread | FactoredSpread
     spread_raw: Spread | FactoredSpread
     jacobian: Rows
@@ -201,10 +201,10 @@ class Fit:
         return tuple(row.name for row in rows if row.state in ("lower", "upper"))
 
     @cached_property
-    def _rows(self) -> dict[str, Variable | Limited]:
+    def _rows(self) -> dict[str, FittedVariable | FittedConstraint]:
         return {row.name: row for row in (*self.constraints, *self.variables)}
 
-    def __getitem__(self, name: str) -> Variable | Limited:
+    def __getitem__(self, name: str) -> FittedVariable | FittedConstraint:
         """The free number or constraint element of a name."""
         if name not in self._rows:
             raise InputError(f"no result '{name}'", nearest(name, list(self._rows)))
@@ -290,7 +290,7 @@ class Fit:
 
     @property
     def optimum(self) -> Optimum:
-        """What the sampler needs to know of this fit."""
+        """This fit as a start for the sampler."""
         near = [a for a in self.attempts if a.kkt.worst <= self.problem.tolerance]
         return Optimum(
             self.theta,

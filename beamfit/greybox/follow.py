@@ -15,7 +15,7 @@ MOVES = dict.fromkeys(
     transpose unstack""".split(),  # noqa: SIM905
     0,
 ) | {"dynamic_slice": 1, "gather": 1, "dynamic_update_slice": 2}
-# A loop of known length is unrolled up to so many operations.
+# Operations up to which a loop of known length is unrolled.
 UNROLLED = 5_000
 
 Rule = Callable[[Any, list[Any]], list[Any]]
@@ -45,7 +45,7 @@ def followed(program: ClosedJaxpr, arguments: Sequence[Any], rule: Rule, kind: t
 
 
 def moves(step, operands: list[Any], kind: type) -> bool:
-    """Whether an operation moves elements to places that are known."""
+    """True if an operation only moves elements, to known positions."""
     first = MOVES.get(step.primitive.name)
     return first is not None and not (first and any(isinstance(v, kind) for v in operands[first:]))
 

@@ -18,7 +18,7 @@ import numpy as np
 from beamfit.errors import InputError
 from beamfit.greybox import tree
 from beamfit.greybox.activations import KINDS
-from beamfit.greybox.bounds import Network, cells, gain_bounds
+from beamfit.greybox.bounds import LayeredNetwork, cells, gain_bounds
 from beamfit.greybox.maps import Map, positions
 from beamfit.greybox.terms import Constraint
 
@@ -329,7 +329,7 @@ def certified_gain(
     return found
 
 
-def monotone_signs(net: Network, signs: Mapping[str, int]) -> dict[str, np.ndarray]:
+def monotone_signs(net: LayeredNetwork, signs: Mapping[str, int]) -> dict[str, np.ndarray]:
     """Signs of the weights that make every output monotonic in chosen inputs by construction.
 
     With weights of these signs (0: free) each path from such an input to an output is a product of
@@ -338,7 +338,7 @@ def monotone_signs(net: Network, signs: Mapping[str, int]) -> dict[str, np.ndarr
 
     Parameters
     ----------
-    net : Network
+    net : LayeredNetwork
         All its node functions between input and output must rise: identity, linear, sigmoid, tanh.
     signs : mapping of str to int
         Input name to +1 (outputs rise) or -1 (outputs fall); other inputs stay free.

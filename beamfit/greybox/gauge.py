@@ -8,13 +8,12 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
+from beamfit.greybox.assess import LOOKS, NEAR
 from beamfit.greybox.problem import Problem, compiled_at, sloped
 
-# Made-up settings at which a direction must still change nothing, and how far off they are.
-TRIALS, OFF = 4, 0.3
-# A row that changes by less than this share of its terms along a direction does not change.
+# A row is constant along a direction if it changes by less than this share of its terms.
 STILL = 1e-7
-# Numbers are tied where their part of the open directions is more than this share of the largest.
+# Numbers are tied if their part of the open directions exceeds this share of the largest.
 TIED = 1e-3
 
 
@@ -84,7 +83,7 @@ def gauges(p: Problem, theta: np.ndarray, unseen: np.ndarray) -> tuple[Gauge, ..
 
 
 def _reached(tied: np.ndarray, first: int) -> set[int]:
-    """What hangs together with a number."""
+    """Numbers connected to one number, directly or through others."""
     group, fresh = {first}, {first}
     while fresh:
         fresh = {j for i in fresh for j in np.flatnonzero(tied[i]).tolist()} - group
@@ -96,7 +95,7 @@ def _still(p: Problem, theta: np.ndarray, unseen: np.ndarray) -> np.ndarray:
     """Combinations of directions along which rows change at no made-up settings."""
     random, size = np.random.default_rng(0), np.where(theta != 0, np.abs(theta), 1.0)
     rows = []
-    for _ in range(TRIALS if unseen.shape[1] else 0):
+    for _ in range(LOOKS if unseen.shape[1] else 0):
         records = tuple(
             dataclasses.replace(r, data=jax.tree.map(lambda v: _moved(v, random), r.data))
             for r in p.core.records
@@ -119,6 +118,5 @@ def _moved(value: Any, random: np.random.Generator) -> Any:
     if not np.issubdtype(value.dtype, np.floating) or not value.size:
         return value
     spread = float(np.std(value)) or float(np.max(np.abs(value))) or 1.0
-    return value * (1 + OFF * random.normal(size=value.shape)) + OFF * spread * random.normal(
-        size=value.shape
-    )
+    factor, shift = (NEAR * random.normal(size=value.shape) for _ in range(2))
+    return value * (1 + factor) + spread * shift

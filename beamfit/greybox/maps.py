@@ -19,7 +19,7 @@ from beamfit.greybox import tree
 
 
 class Map(Protocol):
-    """What every map offers: names, and a function of one point."""
+    """A map: named inputs and outputs, and a function of one point."""
 
     @property
     def inputs(self) -> tuple[str, ...]:

@@ -1,4 +1,4 @@
-"""Which noise with a memory is likely: what rows say of it, and quantities averaged over that.
+"""Posterior over noise models with a memory, and quantities averaged over it.
 
 The memory is not known either: each noise that is looked at whitens the rows once, and what is left
 of them says how likely it is and what the numbers are with it.
@@ -16,14 +16,14 @@ from scipy.special import stdtr
 from beamfit.greybox.covariance import CUT
 from beamfit.noise.correlated import Levels, Noise, log_volume, white_beside, whitened
 
-# Correlation times looked at: from this share of the usual interval to so many times the record.
+# Grid of correlation times: from this share of the median interval to this many records, and count.
 SHORTEST, LONGEST, TIMES = 0.3, 5.0, 40
-# Variances of a part without memory that are looked at beside, in those that the part with a
-# memory gets anew from one reading to the next; correlation times are fewer then.
+# Grid of the white noise's variance, in units of the variance that the correlated part gains from
+# one reading to the next; with it a smaller count of correlation times.
 WHITE, FEWER = (0.0, 1.0, 10.0, 100.0, 1000.0), 20
 
 
-class Moments(NamedTuple):
+class AveragedMoments(NamedTuple):
     """Quantities that are linear in the numbers: how far each moves from where the rows were
     taken, its error (68 % lie within), the reach within which 95 % lie, and the chance of a
     larger distance from zero movement if that is the truth.
@@ -36,7 +36,7 @@ class Moments(NamedTuple):
 
 
 class Memory(NamedTuple):
-    """What rows of slopes and residuals say of the noise.
+    """Posterior over noise models, given Jacobian and residuals.
 
     Attributes
     ----------
@@ -78,7 +78,7 @@ class Memory(NamedTuple):
         """The step, averaged over noises."""
         return self.weight @ self.step
 
-    def moments(self, slopes: np.ndarray, least: float = 0.0) -> Moments:
+    def moments(self, slopes: np.ndarray, least: float = 0.0) -> AveragedMoments:
         """Quantities by their slopes, shape (q, p), averaged over noises.
 
         `least` is the least size of the errors: 1 where they were given and rows are in their
@@ -97,11 +97,11 @@ class Memory(NamedTuple):
         reaches = [_inverted(within, np.max(np.abs(centre - shift) + spread, 0), p)
                    for p in (0.6827, 0.95)]  # fmt: skip
         chance = self.weight @ (2 * stdtr(self.dof, -np.abs(centre) / spread))
-        return Moments(shift, *reaches, chance)
+        return AveragedMoments(shift, *reaches, chance)
 
 
 def _inverted(within, scale: np.ndarray, probability: float) -> np.ndarray:
-    """By bisection: the reach within which so much lies."""
+    """Distance within which this probability lies, by bisection."""
     low, high = np.zeros_like(scale), 100.0 * scale
     for _ in range(50):
         middle = 0.5 * (low + high)
@@ -136,7 +136,7 @@ class Whitened(NamedTuple):
         return float(np.min(self.count * np.log(squares / self.count) - 2.0 * self.volume))
 
     def memory(self, numbers: int | None = None) -> Memory:
-        """What the rows say of the noise, the first `numbers` being free and others held.
+        """Posterior over noise models with the first `numbers` free and the others held.
 
         Directions that the rows do not see, by a share of `CUT`, are left where they are.
         """
@@ -182,7 +182,7 @@ def whitened_by_each(
 def _triangles(
     grid: Sequence[Noise], rows: np.ndarray, interval: np.ndarray, levels: Levels | None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Of one run, and the volumes; what depends on the correlation time alone is done once."""
+    """Triangular factors of one run's whitened rows, and log volumes, for each noise."""
     triangles, volumes = [], []
     for time, alike in groupby(grid, key=lambda noise: noise.time):
         with np.errstate(divide="ignore"):

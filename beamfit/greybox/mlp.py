@@ -30,7 +30,7 @@ class Layer(NamedTuple):
 
 
 class Port(NamedTuple):
-    """Where the outside world meets a node: outside value = scale * node value + bias.
+    """Input or output of a network: outside value = scale * node value + bias.
 
     The report does not say which way its scale and bias work; this reading makes both ends alike,
     and its example values look like standard deviations and means. `lower` and `upper` tell the
@@ -46,7 +46,7 @@ class Port(NamedTuple):
     upper: float = np.inf
 
 
-class Gain(NamedTuple):
+class NetworkGain(NamedTuple):
     """A gain as a further output: d(output)/d(by[0])..., of order len(by), 1 to 3.
 
     `kind` is ``local`` (at the point), ``lower`` or ``upper`` (a certified bound over the whole
@@ -90,7 +90,7 @@ class MLP:
         ``"source->target"`` to an array of shape (source size, target size); zero if absent.
     biases : mapping of str to array, optional
         Layer name to shape (size,); zero if absent.
-    gains : sequence of Gain, optional
+    gains : sequence of NetworkGain, optional
         Gains that follow the outputs.
 
     Raises
@@ -102,7 +102,7 @@ class MLP:
     --------
     >>> net = MLP([Layer("in", "identity", 1), Layer("out", "tanh", 1, bias=True)],
     ...           [("in", "out")], [Port("u", "in")], [Port("y", "out")],
-    ...           {"in->out": [[2.0]]}, gains=[Gain("dy/du", "y", ("u",))])
+    ...           {"in->out": [[2.0]]}, gains=[NetworkGain("dy/du", "y", ("u",))])
     >>> net.outputs, net(jnp.array([0.0])).tolist()
     (('y', 'dy/du'), [0.0, 2.0])
     """
@@ -113,7 +113,7 @@ class MLP:
     output_ports: tuple[Port, ...]
     weights: Mapping[str, jax.Array] | None = None
     biases: Mapping[str, jax.Array] | None = None
-    gains: tuple[Gain, ...] = ()
+    gains: tuple[NetworkGain, ...] = ()
 
     def __post_init__(self):
         for name in ("layers", "input_ports", "output_ports", "gains"):
@@ -187,7 +187,7 @@ class MLP:
         ]
 
 
-def _certified(net: MLP, asked: Gain) -> jax.Array:
+def _certified(net: MLP, asked: NetworkGain) -> jax.Array:
     """The certified bound of a gain over the range of the input ports."""
     (row,) = positions([asked.output], net.outputs)
     (column,) = positions(asked.by, net.inputs)
@@ -279,7 +279,7 @@ def dense(
     kind: str = "tanh",
     seed: int = 0,
     spread: float = 1.0,
-    gains: Sequence[Gain] = (),
+    gains: Sequence[NetworkGain] = (),
 ) -> MLP:
     """Build a network of fully connected layers with random weights.
 
@@ -295,7 +295,7 @@ def dense(
         Of the random weights.
     spread : float
         Weights are normal with standard deviation spread / sqrt(source size), biases with spread.
-    gains : sequence of Gain
+    gains : sequence of NetworkGain
         Gains to append to the outputs.
 
     Returns

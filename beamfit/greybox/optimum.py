@@ -6,21 +6,21 @@ import numpy as np
 
 from beamfit.greybox import assess, curvature
 from beamfit.greybox.conflict import dependence
-from beamfit.greybox.evidence import Evidence, listed
+from beamfit.greybox.evidence import FitEvidence, listed
 from beamfit.greybox.proof import convex
 from beamfit.status import Status
 from beamfit.verdict import Finding
 
-# Below this the cost counts as without end, in its own size.
+# A cost below this, in units of its size, counts as unbounded.
 ENDLESS = -1e15
-# A number runs away beyond this many of its sizes; a pole is where the cost's slope in a number's
-# size is that much larger than the cost.
+# A number beyond this many of its sizes runs away; at a pole the cost's slope per size of a number
+# exceeds the cost by this factor.
 AWAY = 1e6
-# Costs of one optimum differ by less than this share, starts ending more or less near to it.
+# Relative difference in cost up to which two starts ended on the same optimum.
 ALIKE = 1e-4
 
 
-def crossed(e: Evidence) -> Finding | None:
+def crossed(e: FitEvidence) -> Finding | None:
     """Say which limits cannot be kept together."""
     if e.state.feasible:
         return None
@@ -45,7 +45,7 @@ def crossed(e: Evidence) -> Finding | None:
     return Finding(Status.infeasible, cause, remedy, about)
 
 
-def endless(e: Evidence) -> Finding | None:
+def endless(e: FitEvidence) -> Finding | None:
     """Say that the cost has no least value."""
     cost, far = float(e.state.at.cost), _far(e.state)
     if not e.problem.objectives or cost >= ENDLESS * e.state.scale.cost or outgrown(e.state):
@@ -57,18 +57,18 @@ def endless(e: Evidence) -> Finding | None:
     return Finding(Status.unbounded, cause, remedy, about)
 
 
-def outgrown(s: assess.State) -> bool:
-    """Whether the start's cost was so tiny that its size is no measure of the end's."""
+def outgrown(s: assess.SearchState) -> bool:
+    """True if the start's cost is too small to serve as the scale of the final cost."""
     cost, scale = s.at.cost, s.scale
     pole = np.any(np.abs(s.at.gradient) * scale.unit > AWAY * abs(cost))
     return bool(cost < ENDLESS * scale.cost and np.isfinite(cost) and not (pole or _far(s).any()))
 
 
-def _far(s: assess.State) -> np.ndarray:
+def _far(s: assess.SearchState) -> np.ndarray:
     return np.abs(s.theta) > AWAY * s.scale.unit
 
 
-def degenerate(e: Evidence) -> Finding | None:
+def degenerate(e: FitEvidence) -> Finding | None:
     """Say that multipliers are not unique, or that there are none."""
     s = e.state
     found = dependence(e.problem, s, s.optimal)
@@ -102,13 +102,13 @@ def degenerate(e: Evidence) -> Finding | None:
     )
 
 
-def _gap(e: Evidence) -> str:
-    """How far the point is from an optimum of first order, where it is none."""
+def _gap(e: FitEvidence) -> str:
+    """KKT residual in words, or nothing at an optimum of first order."""
     worst = e.state.kkt.worst
     return f" (KKT residual {worst:.1e})" if not e.state.optimal else ""
 
 
-def saddle(e: Evidence) -> Finding | None:
+def saddle(e: FitEvidence) -> Finding | None:
     """Say that the cost falls on both sides of a stationary point."""
     bend = e.state.bend
     if not e.state.optimal or bend is None or bend.direction is None:
@@ -119,7 +119,7 @@ def saddle(e: Evidence) -> Finding | None:
     return Finding(Status.saddle, cause, "start elsewhere, or give more starts.")
 
 
-def restless(e: Evidence) -> Finding | None:
+def restless(e: FitEvidence) -> Finding | None:
     """Say that the search ended short of an optimum."""
     bend, steps = e.state.bend, sum(a.iterations for a in e.search.attempts)
     why = None
@@ -136,7 +136,7 @@ def restless(e: Evidence) -> Finding | None:
     return Finding(Status.not_converged, cause, remedy)
 
 
-def others(e: Evidence) -> list[tuple[float, int]]:
+def others(e: FitEvidence) -> list[tuple[float, int]]:
     """Costs of other optima on which starts ended, and of how many."""
     least = ALIKE * max(e.state.scale.cost, abs(e.state.at.cost))
     ends = sorted(a.cost for a in e.search.attempts if a.kkt.worst <= e.problem.tolerance)
@@ -149,7 +149,7 @@ def others(e: Evidence) -> list[tuple[float, int]]:
     return seen
 
 
-def local(e: Evidence) -> Finding | None:
+def local(e: FitEvidence) -> Finding | None:
     """Say that there are other optima, or that nobody looked for them."""
     seen, worst = others(e), f"(KKT residual {e.state.kkt.worst:.1e})"
     if seen:
@@ -169,15 +169,15 @@ def local(e: Evidence) -> Finding | None:
     return Finding(Status.local_optimum, told, remedy)
 
 
-def optimal(e: Evidence) -> Finding:
+def optimal(e: FitEvidence) -> Finding:
     """Say that it is the optimum, and why."""
     worst = e.state.kkt.worst
     cause = f"the optimum was reached: the problem is convex (KKT residual {worst:.1e})."
     return Finding(Status.optimal, cause)
 
 
-def _agreed(e: Evidence) -> int:
-    """How many starts ended on the answer."""
+def _agreed(e: FitEvidence) -> int:
+    """Number of starts that ended on the answer."""
     least = ALIKE * max(e.state.scale.cost, abs(e.state.at.cost))
     ends = (a for a in e.search.attempts if a.kkt.worst <= e.problem.tolerance)
     return sum(abs(a.cost - e.state.at.cost) <= least for a in ends)

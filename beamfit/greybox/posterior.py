@@ -17,14 +17,14 @@ from beamfit.errors import InputError
 from beamfit.greybox import tree
 from beamfit.greybox.problem import Core, Prior, Problem, with_slope
 from beamfit.greybox.stated import Optimum, Statement, unchanged
-from beamfit.sampling.likelihood import Group
+from beamfit.sampling.likelihood import NoiseGroup
 from beamfit.sampling.posterior import Posterior
 from beamfit.sampling.priors import Distribution, checked
-from beamfit.sampling.target import Law, Target, covariance_of, slopes_of
+from beamfit.sampling.target import PosteriorLaw, SamplingTarget, covariance_of, slopes_of
 
-# A number that is an undetermined direction's in less than this share is not part of it.
+# Smallest share of an undetermined direction at which a number belongs to it.
 PART = 0.05
-# Another optimum is one more than six errors away.
+# Standard errors beyond which a further optimum is another one.
 FAR = 6.0
 ELSEWHERE = (
     "The search met another optimum of nearly the same cost far from this one: the intervals are "
@@ -44,7 +44,7 @@ class Sampled:
 
 
 @lru_cache(maxsize=64)
-def _law(own, log_volume, derive, build) -> tuple[Law, Callable]:
+def _law(own, log_volume, derive, build) -> tuple[PosteriorLaw, Callable]:
     """The law of a study's functions, and its residuals with the problem's priors at their end."""
 
     def model_of(data: Sampled, moved: jax.Array) -> Any:
@@ -52,7 +52,7 @@ def _law(own, log_volume, derive, build) -> tuple[Law, Callable]:
         return own(tree.replace(data.core.model, data.core.chosen, theta))
 
     def residual(data: Sampled, moved: jax.Array) -> tuple[jax.Array, ...]:
-        """Of the records; priors are no measurements and know no common noise."""
+        """Residuals of the records, without priors: these share no noise with measurements."""
         model = model_of(data, moved)
         return tuple(record.residual(model) for record in data.core.records) or (jnp.zeros(0),)
 
@@ -78,7 +78,7 @@ def _law(own, log_volume, derive, build) -> tuple[Law, Callable]:
             inside &= jnp.all((held >= constraint.lower) & (held <= constraint.upper))
         return jnp.where(inside, value, -jnp.inf)
 
-    law = Law(
+    law = PosteriorLaw(
         residual,
         log_prior,
         lambda data, moved: derive(model_of(data, moved), data.more),
@@ -95,7 +95,7 @@ def target_of(
     noise: str | None = None,
     outliers: bool = False,
     priors: Mapping[str, Distribution] | None = None,
-) -> Target:
+) -> SamplingTarget:
     """State the posterior of a problem.
 
     Parameters
@@ -115,7 +115,7 @@ def target_of(
 
     Returns
     -------
-    Target
+    SamplingTarget
         Flat in the numbers that are sampled but for the problem's own priors and `priors`.
 
     Raises
@@ -145,7 +145,7 @@ def target_of(
     steps = [(turn @ (other - optimum.theta))[moving] for other in optimum.others]
     far = any(np.any(np.abs(step) > FAR * np.sqrt(np.diag(covariance))) for step in steps)
     group_of, block_of = _belonging(slopes, bool(p.constraints))
-    return Target(
+    return SamplingTarget(
         law=law,
         data=data,
         names=names,
@@ -235,7 +235,7 @@ def _with_slope(
 
 
 def _data(p: Problem, theta: np.ndarray, moving: np.ndarray, stated: Statement) -> Sampled:
-    """What the law needs; the solver's last digits do not make it another problem."""
+    """Data of the posterior's law; numbers that move are zeroed, so that equal problems compare."""
     fixed = np.array(theta)
     fixed[moving] = 0.0
     core = replace(p.core, model=tree.replace(p.core.model, p.core.chosen, jnp.asarray(fixed)))
@@ -250,7 +250,7 @@ def _widths(
     told: Mapping[str, float],
     priors: Mapping[str, Distribution],
 ) -> np.ndarray:
-    """How far each number may be from the optimum where the data do not say."""
+    """Largest distance of each number from the optimum where the data do not determine it."""
     width = np.where(np.isfinite(box), 0.5 * box, np.inf)
     width = np.minimum(width, [told.get(name, np.inf) for name in names])
     spread = [float(priors[name].std()) if name in priors else np.inf for name in names]
@@ -259,8 +259,8 @@ def _widths(
 
 def _groups(
     p: Problem, optimum: Optimum, stated: Statement, noise: str | None, outliers: bool
-) -> tuple[Group, ...]:
-    """How each record scatters; a factor on errors cannot be inferred where nothing shows it."""
+) -> tuple[NoiseGroup, ...]:
+    """Noise model of each record; a factor on its errors is free only if the data can show it."""
     groups = []
     for record, scale, given in zip(p.records, optimum.scales, optimum.given, strict=True):
         label = stated.labels.get(record.name, record.name if len(p.records) > 1 else "")
@@ -271,8 +271,8 @@ def _groups(
         if record.name in stated.averaged:
             kind = "averaged"
         doubted = outliers and not trusted and kind != "averaged"
-        groups.append(Group(label, kind, doubted, record.prior_noise))
-    return tuple(groups) or (Group("", noise or "known", outliers),)
+        groups.append(NoiseGroup(label, kind, doubted, record.prior_noise))
+    return tuple(groups) or (NoiseGroup("", noise or "known", outliers),)
 
 
 def _observed(p: Problem) -> dict[str, np.ndarray]:
@@ -287,7 +287,7 @@ def _observed(p: Problem) -> dict[str, np.ndarray]:
 
 
 def _belonging(slopes: Sequence[np.ndarray], joined: bool) -> tuple[tuple[int, ...], ...]:
-    """Which record says most of each number, and which numbers some record or prior sees together.
+    """Record that says most of each number, and groups of numbers joined by a record or prior.
 
     Constraints are not looked into: where there are any, all numbers belong together.
     """

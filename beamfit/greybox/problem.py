@@ -23,9 +23,9 @@ from beamfit.greybox import tree
 from beamfit.greybox.sparsity import Pattern, pattern_of
 from beamfit.greybox.terms import Constraint, Free, Objective, Prior, Record
 
-# Within which a limit counts as reached and a point as an optimum.
+# Default tolerance on limits and on the conditions of an optimum, in sizes.
 TOLERANCE = 1e-6
-# Records are padded to powers of two from here on.
+# Shortest padded record; lengths are powers of two, so that records share compiled code.
 SHORTEST = 8
 
 
@@ -218,22 +218,22 @@ class Problem:
 
     @cached_property
     def moving(self) -> np.ndarray:
-        """Whether each free number may move between its bounds."""
+        """True for each free number whose bounds differ."""
         return self.lower < self.upper
 
     @cached_property
     def equations(self) -> np.ndarray:
-        """Whether each constraint element is an equation."""
+        """True for each constraint element that is an equation."""
         return self.constraint_lower == self.constraint_upper
 
     @cached_property
     def nuisance(self) -> np.ndarray:
-        """Whether each free number is one nobody asks for."""
+        """True for each free number that no result quotes."""
         return self._column("nuisance").astype(bool)
 
     @cached_property
     def with_prior(self) -> np.ndarray:
-        """Whether each free number has a prior of its own."""
+        """True for each free number with a prior of its own."""
         own = [prior.name for prior in self.priors if prior.function is None]
         told = {leaf.path for name in own for leaf in tree.find_leaves(self.core.model, name)}
         parts = [np.full(leaf.size, leaf.path in told) for leaf in self.core.chosen]
@@ -269,22 +269,22 @@ class Problem:
 
     @property
     def has_data(self) -> bool:
-        """Whether anything was measured or known beforehand: a fit, and not an optimum alone."""
+        """True if there are records or priors: a fit, not an optimisation alone."""
         return bool(self.records or self.priors)
 
     @property
     def errors_known(self) -> bool:
-        """Whether any record brings measurement errors."""
+        """True if any record has measurement errors."""
         return any(record.errors_given for record in self.records)
 
     @cached_property
     def size(self) -> int:
-        """How many values were measured, padding included."""
+        """Number of measured values, padding included."""
         return sum(record.measured.size for record in self.records)
 
     @cached_property
     def residual_count(self) -> int:
-        """How many residuals there are, those of priors included."""
+        """Number of residuals, those of priors included."""
         return self.size + sum(shape_of(p.residual, self.core.model)[0] for p in self.priors)
 
     @cached_property
@@ -304,7 +304,7 @@ class Problem:
         return 1e-6 * float(np.sqrt(sum(squares))) or 1.0
 
     def has_part(self, kind: type) -> bool:
-        """Whether a part of the problem is of a class."""
+        """True if any part of the problem is an instance of this class."""
         parts = jax.tree_util.tree_leaves(self.core, is_leaf=lambda part: isinstance(part, kind))
         return any(isinstance(part, kind) for part in parts)
 

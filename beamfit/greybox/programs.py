@@ -16,8 +16,8 @@ from beamfit.greybox import assess, curvature, problem
 from beamfit.greybox.problem import Problem
 
 
-class Budget(NamedTuple):
-    """How long a search may go on: steps from one start, and a moment on the clock or None.
+class SearchLimit(NamedTuple):
+    """Limit of a search: iterations from one start, and a time on the clock or None.
 
     `solver` is the one asked for, if any, `tolerance` that of the problem.
     """
@@ -37,7 +37,7 @@ class _TimeIsUp(Exception):
     """Ends a solver that cannot be told of a limit."""
 
 
-class Program(NamedTuple):
+class NonlinearProgram(NamedTuple):
     """A constrained minimisation in plain NumPy functions of x, well scaled.
 
     `values(x)` gives cost and constraints, `slopes(x)` the cost's gradient and the constraints'
@@ -56,18 +56,20 @@ class Program(NamedTuple):
     point: Callable[[np.ndarray], np.ndarray]
 
 
-class Proposal(NamedTuple):
-    """Where a solver ended, after how many iterations, and what it said."""
+class SolverEnd(NamedTuple):
+    """End of a solver's search: point, number of iterations, the solver's own message."""
 
     x: np.ndarray
     iterations: int
     said: str
 
 
-def _uno(preset: str) -> Callable[[Program, np.ndarray, int], Proposal]:
+def _uno(preset: str) -> Callable[[NonlinearProgram, np.ndarray, int], SolverEnd]:
     """A solver by Uno with one of its presets."""
 
-    def solve(program: Program, x: np.ndarray, iterations: int, budget: Budget) -> Proposal:
+    def solve(
+        program: NonlinearProgram, x: np.ndarray, iterations: int, budget: SearchLimit
+    ) -> SolverEnd:
         import unopy
 
         solver = unopy.UnoSolver()
@@ -80,12 +82,12 @@ def _uno(preset: str) -> Callable[[Program, np.ndarray, int], Proposal]:
         found = solver.optimize(_uno_model(unopy, program, x))
         # Uno reports an infeasible problem as an optimisation status of success.
         said = f"{found.solution_status.name}, {found.optimization_status.name}"
-        return Proposal(np.array(found.primal_solution), int(found.number_iterations), said)
+        return SolverEnd(np.array(found.primal_solution), int(found.number_iterations), said)
 
     return solve
 
 
-def _uno_model(unopy, program: Program, x: np.ndarray):
+def _uno_model(unopy, program: NonlinearProgram, x: np.ndarray):
     """State the program to Uno with dense derivatives."""
     n, m = len(x), len(program.c_lower)
     model = unopy.Model(
@@ -130,7 +132,9 @@ def _uno_model(unopy, program: Program, x: np.ndarray):
     return model
 
 
-def _slsqp(program: Program, x: np.ndarray, iterations: int, budget: Budget) -> Proposal:
+def _slsqp(
+    program: NonlinearProgram, x: np.ndarray, iterations: int, budget: SearchLimit
+) -> SolverEnd:
     """Solve by scipy's sequential quadratic programming."""
     from scipy import optimize
 
@@ -164,8 +168,8 @@ def _slsqp(program: Program, x: np.ndarray, iterations: int, budget: Budget) -> 
             options={"maxiter": iterations, "ftol": 1e-15},
         )
     except _TimeIsUp:
-        return Proposal(last[0], 0, "time is up")
-    return Proposal(found.x, int(found.nit), found.message)
+        return SolverEnd(last[0], 0, "time is up")
+    return SolverEnd(found.x, int(found.nit), found.message)
 
 
 class Stage(NamedTuple):
@@ -178,10 +182,11 @@ class Stage(NamedTuple):
     preset: str
     hessian: str
     steps: int
-    solve: Callable[[Program, np.ndarray, int, Budget], Proposal]
+    solve: Callable[[NonlinearProgram, np.ndarray, int, SearchLimit], SolverEnd]
 
 
 _SHARP = Stage("Uno filtersqp", "filtersqp", "exact", 300, _uno("filtersqp"))
+# Solvers in the order they are tried.
 SOLVERS: tuple[Stage, ...] = (
     Stage("Uno filtersqp with Gauss-Newton", "filtersqp", "gauss_newton", 3000, _uno("filtersqp")),
     _SHARP,
@@ -199,7 +204,7 @@ def _tame(size: np.ndarray) -> np.ndarray:
 
 def scaled(
     p: Problem, start: np.ndarray, at: assess.Slopes, scale: assess.Scale, hessian: str
-) -> Program:
+) -> NonlinearProgram:
     """A problem for a solver: moving numbers, cost and constraints in their sizes.
 
     Parameters
@@ -217,7 +222,7 @@ def scaled(
 
     Returns
     -------
-    Program
+    NonlinearProgram
         That remembers its last points.
     """
     moving = np.flatnonzero(p.moving)
@@ -252,7 +257,7 @@ def scaled(
         h = np.asarray(exact(full(x), sigma * flat, y / limit))
         return h[np.ix_(moving, moving)] * np.outer(unit, unit)
 
-    return Program(
+    return NonlinearProgram(
         values,
         slopes,
         squares if hessian == "gauss_newton" else bend,

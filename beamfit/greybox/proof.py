@@ -31,7 +31,7 @@ SUMS = {
 PLACES = {"select_n": 0, "scatter": 1, "scatter-add": 1}
 # Functions of one affine or convex argument that are convex and do not fall, likewise for concave.
 RISING_CONVEX, RISING_CONCAVE = {"exp", "exp2", "expm1"}, {"log", "log1p", "sqrt"}
-# A Hessian's eigenvalue below zero by less than this share of the largest is rounding.
+# Negative eigenvalues of a Hessian below this share of the largest are rounding.
 ROUNDING = 1e-12
 
 
@@ -39,8 +39,8 @@ class _Unknown(Exception):
     """No rule covers an operation."""
 
 
-class Curve(NamedTuple):
-    """How every element of an array depends on the numbers.
+class Curvature(NamedTuple):
+    """Curvature and degree of every element of an array as a function of the numbers.
 
     `sign` is 0 if it is affine, 1 convex, -1 concave, None if it is not known; `degree` is that of
     a polynomial, infinite if it is none.
@@ -51,7 +51,7 @@ class Curve(NamedTuple):
 
 
 def convex(p: Problem) -> bool:
-    """Whether a problem is proved to be convex: a convex cost within a convex set."""
+    """True if the problem is proved convex: a convex cost within a convex set."""
     cost = _curve(p, problem.cost)
     if cost is None or not (_upward(cost) or (cost.degree <= 2 and _positive(p))):
         return False
@@ -69,12 +69,12 @@ def convex(p: Problem) -> bool:
     )
 
 
-def _upward(curve: Curve) -> bool:
+def _upward(curve: Curvature) -> bool:
     return curve.sign in (0, 1)
 
 
 def _positive(p: Problem) -> bool:
-    """Whether the Hessian of a quadratic cost has no negative eigenvalue."""
+    """True if the Hessian of a quadratic cost has no negative eigenvalue."""
     h = np.asarray(p.compiled(_hessian)(p.start))
     if not np.all(np.isfinite(h)):
         return False
@@ -86,65 +86,67 @@ def _hessian(core, theta):
     return jax.hessian(problem.cost, 1)(core, theta)
 
 
-def _curve(p: Problem, function) -> Curve | None:
-    """How a function of (core, theta) depends on theta; None if it is not known."""
+def _curve(p: Problem, function) -> Curvature | None:
+    """Curvature of a function of (core, theta) in theta; None if it is not known."""
     program, given = p.program(function)
     try:
-        (found,) = followed(program, [*given, Curve(0, 1.0)], _rule, Curve)
+        (found,) = followed(program, [*given, Curvature(0, 1.0)], _rule, Curvature)
     except _Unknown:
         return None
-    return found if isinstance(found, Curve) else Curve(0, 0.0)
+    return found if isinstance(found, Curvature) else Curvature(0, 0.0)
 
 
-def _rule(step, operands: list[Any]) -> list[Curve]:
+def _rule(step, operands: list[Any]) -> list[Curvature]:
     found = _of_step(step, operands)
     if found.sign is None and not np.isfinite(found.degree):
         raise _Unknown
     return [found] * len(step.outvars)
 
 
-def _of_step(step, operands: list[Any]) -> Curve:
+def _of_step(step, operands: list[Any]) -> Curvature:
     name = step.primitive.name
-    numbers = [v for v in operands if isinstance(v, Curve)]
+    numbers = [v for v in operands if isinstance(v, Curvature)]
     first, degree = numbers[0], max(v.degree for v in numbers)
-    if name in SUMS or moves(step, operands, Curve):
-        return Curve(_common([v.sign for v in numbers]), degree)
+    if name in SUMS or moves(step, operands, Curvature):
+        return Curvature(_common([v.sign for v in numbers]), degree)
     place = PLACES.get(name)
-    if place is not None and not isinstance(operands[place], Curve):
-        return Curve(_common([v.sign for v in numbers]), degree)
+    if place is not None and not isinstance(operands[place], Curvature):
+        return Curvature(_common([v.sign for v in numbers]), degree)
     if name == "neg":
-        return Curve(_times(first.sign, -1), degree)
+        return Curvature(_times(first.sign, -1), degree)
     if name == "sub":
         signs = [v.sign if i == 0 else _times(v.sign, -1)
-                 for i, v in enumerate(operands) if isinstance(v, Curve)]  # fmt: skip
-        return Curve(_common(signs), degree)
-    if name in ("mul", "dot_general") or (name == "div" and not isinstance(operands[1], Curve)):
+                 for i, v in enumerate(operands) if isinstance(v, Curvature)]  # fmt: skip
+        return Curvature(_common(signs), degree)
+    if name in ("mul", "dot_general") or (name == "div" and not isinstance(operands[1], Curvature)):
         return _product(step, operands, numbers)
     if name in ("square", "integer_pow"):
         power = 2 if name == "square" else step.params["y"]
         return _power(first, power)
-    return Curve(_composed(name, numbers), np.inf)
+    return Curvature(_composed(name, numbers), np.inf)
 
 
-def _product(step, operands: list[Any], numbers: list[Curve]) -> Curve:
+def _product(step, operands: list[Any], numbers: list[Curvature]) -> Curvature:
     if len(numbers) == 2:
         same = step.invars[0] is step.invars[1]
-        return Curve(1 if same and numbers[0].sign == 0 else None, sum(v.degree for v in numbers))
-    factor = np.asarray(next(v for v in operands if not isinstance(v, Curve)))
+        return Curvature(
+            1 if same and numbers[0].sign == 0 else None, sum(v.degree for v in numbers)
+        )
+    factor = np.asarray(next(v for v in operands if not isinstance(v, Curvature)))
     sign = 1 if np.all(factor >= 0) else -1 if np.all(factor <= 0) else None
     known = numbers[0].sign
-    return Curve(0 if known == 0 else _times(known, sign), numbers[0].degree)
+    return Curvature(0 if known == 0 else _times(known, sign), numbers[0].degree)
 
 
-def _power(v: Curve, power: int) -> Curve:
+def _power(v: Curvature, power: int) -> Curvature:
     if power < 0:
-        return Curve(None, np.inf)
+        return Curvature(None, np.inf)
     if power <= 1:
-        return Curve(v.sign if power else 0, v.degree * power)
-    return Curve(1 if v.sign == 0 and power % 2 == 0 else None, v.degree * power)
+        return Curvature(v.sign if power else 0, v.degree * power)
+    return Curvature(1 if v.sign == 0 and power % 2 == 0 else None, v.degree * power)
 
 
-def _composed(name: str, numbers: list[Curve]) -> int | None:
+def _composed(name: str, numbers: list[Curvature]) -> int | None:
     signs = {v.sign for v in numbers}
     if name in RISING_CONVEX | {"max", "reduce_max"} and signs <= {0, 1}:
         return 1
@@ -156,7 +158,7 @@ def _composed(name: str, numbers: list[Curve]) -> int | None:
 
 
 def _common(signs: list[int | None]) -> int | None:
-    """Of a sum: that of all its terms, affine ones apart."""
+    """Sign of a sum's curvature: the one of all its terms that are not affine, else None."""
     bent = {sign for sign in signs if sign != 0}
     return 0 if not bent else bent.pop() if len(bent) == 1 else None
 

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jax.scipy.linalg import cho_factor, cho_solve
 
-# Steps at most; mean complementarity and residuals that end them; share of the way to a limit.
+# Most steps; mean complementarity and residuals that end them; share of the step to a limit.
 STEPS, CLOSE, SHARE = 40, 1e-9, 0.99
 
 
@@ -144,7 +144,7 @@ def _gap(problem: Quadratic, now: _Point) -> jax.Array:
 
 
 def _reach(problem: Quadratic, now: _Point, way: _Point) -> jax.Array:
-    """How far one may go until something that is positive is not, at most 1."""
+    """Longest step, at most 1, that keeps all slacks and multipliers positive."""
     soft = jnp.isfinite(problem.cost)
     values = jnp.concatenate([now.room, now.force, now.passed, _other(problem, now)])
     changes = jnp.concatenate([way.room, way.force, way.passed, -1.0 * soft * way.force])

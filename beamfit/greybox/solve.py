@@ -9,7 +9,7 @@ import numpy as np
 
 from beamfit.errors import InputError
 from beamfit.greybox import assess, curvature
-from beamfit.greybox.assess import State
+from beamfit.greybox.assess import SearchState
 from beamfit.greybox.conflict import relaxed
 from beamfit.greybox.descend import Lanes, lanes_of
 from beamfit.greybox.diagnosis import contradictory, not_finite
@@ -17,20 +17,20 @@ from beamfit.greybox.evidence import Search, settled
 from beamfit.greybox.fit import Attempt, Fit
 from beamfit.greybox.optimum import outgrown
 from beamfit.greybox.problem import Problem
-from beamfit.greybox.programs import SOLVERS, Budget, scaled
+from beamfit.greybox.programs import SOLVERS, SearchLimit, scaled
 from beamfit.greybox.verdict import conclude, refused
 from beamfit.status import Status
 
 METHOD, SQUARES = "Levenberg-Marquardt", "levenberg-marquardt"
-# Steps from many starts; what is left is for the polish of the cheapest ends.
+# Steps from each of many starts, and number of cheapest ends that are polished.
 STEPS, POLISHED = 300, 4
-# A search whose cost falls by less than this share in so many steps gains nothing.
+# A search stops if its cost falls by less than this share in this many steps.
 NOTHING, STRETCH = 1e-7, 100
-# Bytes that Jacobians of starts searched together may take.
+# Bytes for the Jacobians of starts that are searched together.
 MEMORY = 2**24
-# Starts of the search for the point nearest to constraints that no search could keep.
+# Starts of the search for the least violation of constraints that no search could keep.
 ELASTIC = 6
-# How often a search moves off where the cost bends down.
+# Most moves of a search off a saddle.
 MOVES = 3
 
 
@@ -108,7 +108,7 @@ def solve(
     points = np.clip(drawn, p.lower, p.upper)
     moved = int(np.sum(np.any(points != drawn, axis=1)))
     until = None if seconds is None else began + seconds
-    budget = Budget(iterations, until, solver, p.tolerance)
+    budget = SearchLimit(iterations, until, solver, p.tolerance)
     if not squares or solver not in (None, SQUARES):
         found, attempts = _one_by_one(p, _bar(points, progress), budget, hessian)
     else:
@@ -192,13 +192,13 @@ def _drawn(p: Problem, number: int, seed: int) -> np.ndarray:
     return np.array(points)
 
 
-def _good(s: State) -> bool:
-    """Whether a point is an optimum, to second order."""
+def _good(s: SearchState) -> bool:
+    """True if a point is an optimum to second order."""
     bent = s.bend is not None and (s.bend.direction is not None or s.bend.newton > curvature.STEP)
     return s.optimal and not bent
 
 
-def _best(p: Problem, found: list[State]) -> int:
+def _best(p: Problem, found: list[SearchState]) -> int:
     """The cheapest feasible point, or the least infeasible; of equally cheap ones an optimum.
 
     Equally cheap are those within one standard deviation, or 1e-6 of the cost's scale
@@ -206,7 +206,7 @@ def _best(p: Problem, found: list[State]) -> int:
     saves by lying a little outside its limits is no merit: their multipliers tell how much that is.
     """
 
-    def rank(s: State) -> tuple:
+    def rank(s: SearchState) -> tuple:
         feasible = s.feasible
         saved = np.abs(s.found.constraints) @ (s.limits.violation * s.limits.size)
         return (not feasible, s.at.cost + saved if feasible else s.kkt.feasibility)
@@ -221,13 +221,13 @@ def _best(p: Problem, found: list[State]) -> int:
     return next((i for i in alike if _rests(p, found[i])), order[0])
 
 
-def _rests(p: Problem, s: State) -> bool:
+def _rests(p: Problem, s: SearchState) -> bool:
     return _good(s) or (not p.constraints and settled(p, s))
 
 
 def search(
     p: Problem, start: np.ndarray, iterations: int = 3000, hessian: str = "exact"
-) -> tuple[State, Attempt]:
+) -> tuple[SearchState, Attempt]:
     """Search from one start.
 
     Parameters
@@ -239,10 +239,10 @@ def search(
 
     Returns
     -------
-    tuple of State and Attempt
+    tuple of SearchState and Attempt
         The end point, judged, and the account of it.
     """
-    start, budget = np.asarray(start, float), Budget(iterations, None, None, p.tolerance)
+    start, budget = np.asarray(start, float), SearchLimit(iterations, None, None, p.tolerance)
     if p.constraints or p.objectives:
         return _program(p, start, assess.slopes(p, start), budget, hessian)
     found, attempts = _together(p, start[None], budget, False)
@@ -253,11 +253,11 @@ def search(
 
 
 def _together(
-    p: Problem, points: np.ndarray, budget: Budget, progress: bool
-) -> tuple[list[State], tuple[Attempt, ...]]:
+    p: Problem, points: np.ndarray, budget: SearchLimit, progress: bool
+) -> tuple[list[SearchState], tuple[Attempt, ...]]:
     """Search from all starts, in parts that fit the memory, and polish the cheapest ends."""
     part = max(1, MEMORY // (8 * (p.size + 1) * len(p.names)))
-    found: list[State] = []
+    found: list[SearchState] = []
     attempts: list[Attempt] = []
     for some in _bar(np.split(points, range(part, len(points), part)), progress):
         states, accounts = _lanes(p, some, budget)
@@ -265,12 +265,14 @@ def _together(
     return found, tuple(attempts)
 
 
-def _lanes(p: Problem, points: np.ndarray, budget: Budget) -> tuple[list[State], list[Attempt]]:
+def _lanes(
+    p: Problem, points: np.ndarray, budget: SearchLimit
+) -> tuple[list[SearchState], list[Attempt]]:
     k = len(points)
     lanes = lanes_of(p, points)
     lanes.go(np.arange(k), min(STEPS, budget.iterations), budget.until)
     cost = lanes.cost[:k]
-    found: dict[int, State] = {}
+    found: dict[int, SearchState] = {}
     for lane in np.argsort(cost, kind="stable")[:POLISHED].tolist():
         if not np.isfinite(cost[lane]):
             break
@@ -282,7 +284,7 @@ def _lanes(p: Problem, points: np.ndarray, budget: Budget) -> tuple[list[State],
     return list(found.values()), accounts
 
 
-def _go_on(p: Problem, lanes: Lanes, lane: int, limit: int, budget: Budget) -> None:
+def _go_on(p: Problem, lanes: Lanes, lane: int, limit: int, budget: SearchLimit) -> None:
     """Polish one search until it rests, or has settled in a flat valley where it gains nothing."""
     while not lanes.done[lane] and lanes.at.steps[lane] < limit and budget.left > 0:
         before = lanes.cost[lane]
@@ -292,7 +294,7 @@ def _go_on(p: Problem, lanes: Lanes, lane: int, limit: int, budget: Budget) -> N
             return
 
 
-def _account(p: Problem, lanes: Lanes, lane: int, s: State | None) -> Attempt:
+def _account(p: Problem, lanes: Lanes, lane: int, s: SearchState | None) -> Attempt:
     theta, steps = lanes.at.theta[lane].copy(), int(lanes.at.steps[lane])
     if not np.isfinite(lanes.cost[lane]):
         return Attempt(METHOD, theta, np.nan, assess.LOST, steps, "cost not finite")
@@ -301,14 +303,14 @@ def _account(p: Problem, lanes: Lanes, lane: int, s: State | None) -> Attempt:
     return Attempt(METHOD, theta, float(s.at.cost), s.kkt, steps, said)
 
 
-def _judged(p: Problem, lanes: Lanes, lane: int) -> State:
-    """One search's end."""
+def _judged(p: Problem, lanes: Lanes, lane: int) -> SearchState:
+    """Judged end of one search."""
     theta = lanes.at.theta[lane].copy()
     at = assess.of_squares(lanes.at.residual[lane], lanes.at.jacobian[lane])
     return assess.state(p, theta, assess.scale_of(p, theta, at), at)
 
 
-def _moved_off(p: Problem, lanes: Lanes, lane: int, budget: Budget) -> State:
+def _moved_off(p: Problem, lanes: Lanes, lane: int, budget: SearchLimit) -> SearchState:
     """Judge one end; where the cost bends down there, move off and go on."""
     s = _judged(p, lanes, lane)
     for _ in range(MOVES):
@@ -325,8 +327,8 @@ def _moved_off(p: Problem, lanes: Lanes, lane: int, budget: Budget) -> State:
 
 
 def _one_by_one(
-    p: Problem, points: Iterable[np.ndarray], budget: Budget, hessian: str
-) -> tuple[list[State], tuple[Attempt, ...]]:
+    p: Problem, points: Iterable[np.ndarray], budget: SearchLimit, hessian: str
+) -> tuple[list[SearchState], tuple[Attempt, ...]]:
     found, attempts = [], []
     for point in points:
         if found and budget.left <= 0:
@@ -344,8 +346,8 @@ def _one_by_one(
 
 
 def _program(
-    p: Problem, start: np.ndarray, at: assess.Slopes, budget: Budget, hessian: str
-) -> tuple[State, Attempt]:
+    p: Problem, start: np.ndarray, at: assess.Slopes, budget: SearchLimit, hessian: str
+) -> tuple[SearchState, Attempt]:
     """Search with the solvers for constraints, until one ends on an optimum."""
     scale = assess.scale_of(p, start, at)
     # Squares say nothing of further objectives; foreign code may have first derivatives only.

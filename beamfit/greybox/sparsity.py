@@ -32,9 +32,9 @@ ELEMENTWISE = frozenset(
     stop_gradient sub tan tanh xlog1py xlogy""".split()  # noqa: SIM905
 )
 REDUCTIONS = {"reduce_sum", "reduce_max", "reduce_min", "reduce_prod"}
-# A probe may differ by this share of its terms.
+# Relative difference between probe and matrix up to which the pattern is complete.
 PROBE = 1e-9
-# A pattern with more than this share of all places is taken for dense.
+# Share of nonzero entries above which dense matrices are faster.
 FULL = 0.25
 
 
@@ -71,7 +71,7 @@ class Pattern:
         return sweeps
 
     def holds(self, found: sparse.csr_array, swept: np.ndarray) -> bool:
-        """Whether the sweep of all numbers is what the matrix gives: a probe of the pattern."""
+        """True if a sweep along all numbers agrees with the matrix: the pattern is complete."""
         size = abs(found) @ self.seeds[-1]
         wrong = np.abs(found @ self.seeds[-1] - swept[-1])
         return not np.any(wrong > PROBE * (size + np.max(size, initial=0.0)))

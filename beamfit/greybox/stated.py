@@ -13,7 +13,7 @@ from beamfit.verdict import Finding
 
 
 class Optimum(NamedTuple):
-    """Where a search ended and what a fit says there.
+    """An optimum and what the fit found there: the start of a sampler.
 
     Attributes
     ----------
@@ -53,7 +53,7 @@ def _model_itself(model: Any, data: Any) -> Any:
 
 
 class Statement(NamedTuple):
-    """What a study adds to its problem for the sampler; by default nothing.
+    """A study's additions to its problem for the sampler; by default none.
 
     The functions stand at the top of modules, so that they are compiled once.
 

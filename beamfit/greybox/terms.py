@@ -119,12 +119,12 @@ class Record:
         return rows if self.apart is None else whitened(rows, self.apart(model, self.data))
 
     def log_volume(self, model: Any) -> jax.Array:
-        """What whitening adds to the logarithm of the density."""
+        """Logarithm of the density's factor from whitening."""
         return jnp.zeros(()) if self.apart is None else log_volume(self.apart(model, self.data))
 
     @property
     def errors_given(self) -> bool:
-        """Whether its errors are known, so that residuals can speak against the model."""
+        """True if its errors are known, so that residuals can refute the model."""
         return self.error is not None and np.isinf(self.worth)
 
     @property
@@ -136,7 +136,7 @@ class Record:
 
     @property
     def used(self) -> np.ndarray:
-        """Which values count, shape (values,)."""
+        """True for each value that counts, shape (values,)."""
         return np.broadcast_to(np.asarray(self.weight) > 0, self.measured.shape).ravel()
 
 

@@ -1,4 +1,4 @@
-"""From the end of a search to a verdict: what the data determine, the gravest rule that applies."""
+"""Verdict on the end of a search: what the data determine, the gravest rule that applies."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from jax.experimental import checkify
 
 from beamfit import verdict
 from beamfit.greybox import assess, optimum, problem
-from beamfit.greybox.assess import State
+from beamfit.greybox.assess import SearchState
 from beamfit.greybox.covariance import MOST_SHARE, Spread
 from beamfit.greybox.equations import Implicit
-from beamfit.greybox.evidence import EDGES, Evidence, Known, Search, known, listed, settled
-from beamfit.greybox.fit import Attempt, Fit, Limited, Variable
+from beamfit.greybox.evidence import EDGES, FitEvidence, Known, Search, known, listed, settled
+from beamfit.greybox.fit import Attempt, Fit, FittedConstraint, FittedVariable
 from beamfit.greybox.gauge import Gauge, gauges
 from beamfit.greybox.problem import Problem
 from beamfit.statistics import POOR_FIT, chi2_probability
@@ -22,7 +22,7 @@ from beamfit.verdict import Finding
 
 
 def _inner_failure(p: Problem, theta: np.ndarray) -> str | None:
-    """What an implicit map inside the model says of its own convergence at the answer."""
+    """Failure of an implicit map in the model to converge at the answer, or None."""
     if not p.has_part(Implicit):
         return None
     look = checkify.checkify(jax.jit(problem.values), errors=checkify.user_checks)
@@ -30,14 +30,14 @@ def _inner_failure(p: Problem, theta: np.ndarray) -> str | None:
     return None if said is None else said.removesuffix(" (`check` failed)")
 
 
-def conclude(p: Problem, s: State, search: Search, seconds: float) -> Fit:
+def conclude(p: Problem, s: SearchState, search: Search, seconds: float) -> Fit:
     """Judge the best point of a search.
 
     Parameters
     ----------
     p : Problem
         The problem.
-    s : State
+    s : SearchState
         The best point.
     search : Search
         What was done.
@@ -73,7 +73,7 @@ def conclude(p: Problem, s: State, search: Search, seconds: float) -> Fit:
     spoken = chi2 - sum(g.chi2 for g in silent), dof - sum(g.dof for g in silent)
     rest = not s.optimal and settled(p, s)
     seen = (found.blind, found.unseen)
-    evidence = Evidence(p, s, search, rest, variables, constraints, *seen, *spoken)
+    evidence = FitEvidence(p, s, search, rest, variables, constraints, *seen, *spoken)
     finding = verdict.judge(evidence, RULES if p.has_data else WITHOUT_DATA)
     message = " ".join([finding.message, *_remarks(evidence)])
     return Fit(
@@ -83,17 +83,17 @@ def conclude(p: Problem, s: State, search: Search, seconds: float) -> Fit:
     )  # fmt: skip
 
 
-def _variables(p: Problem, s: State, found: Known) -> tuple[Variable, ...]:
+def _variables(p: Problem, s: SearchState, found: Known) -> tuple[FittedVariable, ...]:
     nothing = (found.spread.shares >= MOST_SHARE) | found.held
     nothing |= any(group.unknown for group in found.groups)
     errors = (np.where(nothing, np.nan, part.errors) for part in (found.spread, found.raw))
     columns = (s.theta, *errors, p.lower, p.upper, s.bounds.states(s.found.bounds), s.found.bounds)
-    return _rows(Variable, p.names, *columns)
+    return _rows(FittedVariable, p.names, *columns)
 
 
-def _constraints(p: Problem, s: State) -> tuple[Limited, ...]:
+def _constraints(p: Problem, s: SearchState) -> tuple[FittedConstraint, ...]:
     states = s.limits.states(s.found.constraints)
-    return _rows(Limited, p.constraint_names, *s.limits[:3], states, s.found.constraints)
+    return _rows(FittedConstraint, p.constraint_names, *s.limits[:3], states, s.found.constraints)
 
 
 def _rows(kind: type, names: tuple[str, ...], *columns: np.ndarray) -> tuple:
@@ -113,17 +113,17 @@ def refused(
     n, nan = len(theta), np.nan
     lost = Spread(np.full((n, n), nan), np.eye(n), np.ones(n), np.zeros(n))
     none, free = np.full(n, nan), np.full(n, "free")
-    variables = _rows(Variable, p.names, theta, none, none, p.lower, p.upper, free, none)
+    variables = _rows(FittedVariable, p.names, theta, none, none, p.lower, p.upper, free, none)
     none = np.full(len(p.constraint_names), nan)
     ends, free = (p.constraint_lower, p.constraint_upper), np.full(len(none), "free")
-    constraints = _rows(Limited, p.constraint_names, none, *ends, free, none)
+    constraints = _rows(FittedConstraint, p.constraint_names, none, *ends, free, none)
     return Fit(
         p, theta, status, message, nan, nan, 0, (), assess.LOST, variables,
         constraints, lost, lost, np.zeros((p.size, n)), np.eye(n), nan, attempts, seconds,
     )  # fmt: skip
 
 
-def _undetermined(e: Evidence) -> Finding | None:
+def _undetermined(e: FitEvidence) -> Finding | None:
     """Say what the data do not determine, of what is asked for."""
     open_ones = e.blind & ~e.problem.nuisance
     if not open_ones.any():
@@ -152,7 +152,7 @@ def _together(found: list[Gauge]) -> Finding:
     return Finding(Status.unidentified, cause, f"fix {few}, or give a prior.", names)
 
 
-def _poor(e: Evidence) -> Finding | None:
+def _poor(e: FitEvidence) -> Finding | None:
     """Say that the residuals are larger than the errors allow."""
     chance = chi2_probability(e.chi2, e.dof) if e.dof > 0 else 1.0
     if not e.problem.errors_known or chance >= POOR_FIT:
@@ -165,7 +165,7 @@ def _poor(e: Evidence) -> Finding | None:
     return Finding(Status.poor_fit, cause, remedy)
 
 
-def _held(e: Evidence) -> Finding | None:
+def _held(e: FitEvidence) -> Finding | None:
     """Say which numbers a bound decided, where data were to."""
     pairs = zip(e.variables, e.problem.nuisance, strict=True)
     held = [v for v, nuisance in pairs if not nuisance and v.state in EDGES]
@@ -177,7 +177,7 @@ def _held(e: Evidence) -> Finding | None:
     )
 
 
-def _optimal(e: Evidence) -> Finding:
+def _optimal(e: FitEvidence) -> Finding:
     """Say that nothing is wrong, and what kind of optimum it is."""
     worst = f"(KKT residual {e.state.kkt.worst:.1e})"
     if e.settled:
@@ -208,8 +208,8 @@ WITHOUT_DATA = (
 """The same for an objective alone."""
 
 
-def _remarks(e: Evidence) -> list[str]:
-    """What became of starts, and whether time ran out."""
+def _remarks(e: FitEvidence) -> list[str]:
+    """Remarks on the starts and on the time limit."""
     search, said = e.search, []
     count = len(search.attempts)
     if search.dropped:

@@ -24,7 +24,7 @@ from beamfit.writing import write_atomically
 
 if TYPE_CHECKING:
     from beamfit.language.computed import Computed
-    from beamfit.language.solution import Solution
+    from beamfit.language.solution import ProblemSolution as Solution
 
 MOST_NUMBERS = 4_000_000
 

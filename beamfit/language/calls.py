@@ -48,7 +48,7 @@ def called(statement: d.Call, s: Setting, inner: Callable[[str], Callable]) -> A
 
 
 def given_to(statement: d.Call, callee: Scope | Net, s: Setting) -> Arrays:
-    """What a call gives: one axis for each of its iterators, then the dimensions of the input."""
+    """Inputs of a call: one axis for each of its iterators, then the dimensions of the input."""
     given = {}
     for name, array in callee.inputs.items():
         wires = [w for w in statement.inputs if w.target.name == name]
@@ -109,7 +109,7 @@ def _output(s: Setting, v: Value, output: x.Name, callee, axes: Axes, count: int
 
 
 def _function(s: Setting, callee: Scope | Net, run: Callable, wanted) -> Callable:
-    """What is called as a function of its inputs, giving outputs and gains in order."""
+    """The called mapping as a function of its inputs; it returns outputs and gains in order."""
     names = sorted({output.name for output, _ in wanted})
 
     def outputs(given: Arrays) -> Arrays:

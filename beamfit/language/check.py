@@ -55,7 +55,7 @@ def check_problem(document: d.Document, given: Iterable[str] = ()) -> None:
             raise error_at(one.at, f"input '{one.name}' without a value", expected)
 
 
-def _check_variables(p: d.Problem) -> None:
+def _check_variables(p: d.ProblemStatement) -> None:
     for one in (*p.variables, *p.limits):
         if not one.lower <= one.upper:
             found = f"bounds of '{one.label}' from {one.lower:g} up to {one.upper:g}"

@@ -16,9 +16,9 @@ from beamfit.language import expression as x
 from beamfit.language.calls import Arrays, called, defaults
 from beamfit.language.evaluate import Setting, check_rank, evaluate, stored
 from beamfit.language.expression import error_at
-from beamfit.language.order import Group, Order, checked
+from beamfit.language.order import Order, StepGroup, checked
 from beamfit.language.recurrence import scanned
-from beamfit.language.scope import Scope, Step, reads, widened
+from beamfit.language.scope import MappingStep, Scope, reads, widened
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,7 +40,7 @@ class Program:
 
     @property
     def scope(self) -> Scope:
-        """Its names."""
+        """Names of the mapping."""
         return self.order.scope
 
     @cached_property
@@ -180,7 +180,7 @@ def _traced(program: Program) -> None:
 # ---- running
 
 
-def carry_out(order: Order, group: Group, arrays: Arrays, watch=None) -> Arrays:
+def carry_out(order: Order, group: StepGroup, arrays: Arrays, watch=None) -> Arrays:
     """Compute the steps of a group, and give the arrays they change."""
     if group.plan is not None:
         return scanned(order.scope, group.plan, arrays, partial(_assigned, order))
@@ -188,7 +188,7 @@ def carry_out(order: Order, group: Group, arrays: Arrays, watch=None) -> Arrays:
     return _assigned(order, step, Setting(order.scope, arrays, step.axes, watch=watch))
 
 
-def _assigned(order: Order, step: Step, s: Setting) -> Arrays:
+def _assigned(order: Order, step: MappingStep, s: Setting) -> Arrays:
     """The arrays that a step changes."""
     if isinstance(step.what, d.Call):
         return called(step.what, s, lambda label: Program(order.inner[label], {}))

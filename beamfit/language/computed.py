@@ -20,10 +20,8 @@ from beamfit.language.compiled import Program, compile_mapping
 from beamfit.language.expression import error_at
 from beamfit.language.scope import Scope
 from beamfit.shown import shown
-from beamfit.table import Table
+from beamfit.table import MOST_ROWS, Table
 
-# Rows of a table on a terminal; JSON has all.
-MOST_ROWS = 40
 GAIN = re.compile(r"\s*d(\w+)\s*/\s*d(\w+)\s*")
 
 

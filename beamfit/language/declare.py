@@ -15,16 +15,16 @@ from beamfit.language.scope import (
     MOST_ELEMENTS,
     Array,
     IndexSet,
+    MappingStep,
     Net,
     Scope,
-    Step,
     check_size,
     reads,
     set_of,
     widened,
 )
 
-# Operations that one use of a function may cost, those of functions in it included.
+# Most operations in one use of a function, nested functions included.
 MOST_WORK = 20_000
 
 
@@ -58,7 +58,7 @@ def scope_of(m: d.Mapping, shapes: Mapping[str, tuple[int, int]] | None = None) 
     _declare_tables(scope, m, shapes or {})
     for inner in m.mappings:
         _new(scope, inner.name, inner.at)
-        if isinstance(inner, d.Network):
+        if isinstance(inner, d.NetworkDefinition):
             scope.callees[inner.name] = _net(inner)
         else:
             scope.callees[inner.name] = scope_of(inner)
@@ -68,7 +68,7 @@ def scope_of(m: d.Mapping, shapes: Mapping[str, tuple[int, int]] | None = None) 
     return scope
 
 
-def _net(network: d.Network) -> Net:
+def _net(network: d.NetworkDefinition) -> Net:
     from beamfit.language.network import network_of, weights_of  # JAX from here on
 
     mlp = network_of(network)
@@ -166,10 +166,10 @@ def _declare_statements(
             _declare_statements(scope, s.statements, widened(scope, axes, s.each))
         elif isinstance(s, d.Real) and s.value is not None:
             what = d.Assignment(x.Name(s.name, (), s.at), s.value, (), s.at)
-            scope.steps.append(Step(len(scope.steps), {}, what))
+            scope.steps.append(MappingStep(len(scope.steps), {}, what))
         elif isinstance(s, d.Assignment | d.Call):
             inner = widened(scope, axes, s.each)
-            scope.steps.append(Step(len(scope.steps), inner, s))
+            scope.steps.append(MappingStep(len(scope.steps), inner, s))
 
 
 # ---- functions

@@ -100,7 +100,7 @@ class DataTable:
 
 
 @dataclass(frozen=True)
-class Part:
+class NetworkElement:
     """A layer, connection, input, output or gain of a network, as the report writes it."""
 
     kind: str
@@ -110,11 +110,11 @@ class Part:
 
 
 @dataclass(frozen=True)
-class Network:
+class NetworkDefinition:
     """A multi-layer perceptron (report 3.1.3)."""
 
     name: str
-    parts: tuple[Part, ...]
+    parts: tuple[NetworkElement, ...]
     at: Place = field(**PLACE)
 
 
@@ -124,7 +124,7 @@ class Mapping:
 
     name: str = ""
     tables: tuple[DataTable, ...] = ()
-    mappings: tuple[Mapping | Network, ...] = ()
+    mappings: tuple[Mapping | NetworkDefinition, ...] = ()
     inputs: tuple[Declared, ...] = ()
     outputs: tuple[Declared, ...] = ()
     parameters: tuple[Declared, ...] = ()
@@ -136,7 +136,7 @@ class Mapping:
 
 
 @dataclass(frozen=True)
-class Variable:
+class FreeInput:
     """An input that is free: bounds, and where searches start.
 
     `random` is the range of a start drawn with `seed`; without it the start is `value`.
@@ -174,11 +174,11 @@ class Goal:
 
 
 @dataclass(frozen=True)
-class Problem:
-    """What is free, what is limited, what is best."""
+class ProblemStatement:
+    """The problem of a document: goals, variables, limits."""
 
     goals: tuple[Goal, ...]
-    variables: tuple[Variable, ...] = ()
+    variables: tuple[FreeInput, ...] = ()
     limits: tuple[Limit, ...] = ()
     maximize: bool = False
 
@@ -197,5 +197,5 @@ class Document:
     """A formulation; a mapping alone has no problem."""
 
     mapping: Mapping
-    problem: Problem | None = None
+    problem: ProblemStatement | None = None
     solver: Solver | None = None

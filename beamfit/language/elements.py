@@ -14,7 +14,7 @@ from defusedxml.sax import parseString
 from beamfit.errors import InputError
 from beamfit.language.expression import Place, error_at
 
-# Elements within each other, and lines that the beginning of one may take.
+# Most nested elements, and most lines of an opening tag.
 MOST_DEEP, MOST_LINES = 40, 12
 NAME = re.compile(r"[^\W\d]\w*")
 
@@ -30,7 +30,7 @@ class Node(NamedTuple):
 
     @property
     def at(self) -> Place:
-        """Where the name it gives stands, or where it begins."""
+        """Place of the name it declares, or else of its beginning."""
         keys = ("modelVariable", "label", "name", "")
         return next(self.places[key] for key in keys if key in self.places)
 
@@ -39,7 +39,7 @@ class Node(NamedTuple):
         return [child for child in self.children if child.tag == tag]
 
     def error(self, found: str, expected: str, key: str = "") -> InputError:
-        """What is wrong with it, or with an attribute."""
+        """An error at its place, or at the place of an attribute."""
         return error_at(self.places[key], found, expected)
 
     def need(self, key: str) -> str:
@@ -78,7 +78,7 @@ class Node(NamedTuple):
             raise self.error(found, "numbers separated by commas") from None
 
 
-class _Reader(ContentHandler):
+class _ElementReader(ContentHandler):
     """Builds nodes; text is padded to the line and column where it stands in the file."""
 
     def __init__(self, source: str) -> None:
@@ -101,7 +101,7 @@ class _Reader(ContentHandler):
         self.end = Place(1, 1)
 
     def _places(self, given: dict[str, str]) -> dict[str, Place]:
-        """Where an element begins, under an empty key, and the values of its attributes."""
+        """Places of an element's attribute values; its own under the empty key."""
         here = self._here()
         first = "".join(self.lines[here.line - 1 : here.line + MOST_LINES])[here.column - 1 :]
         found = {"": here}
@@ -132,8 +132,8 @@ class _Reader(ContentHandler):
         self.open[-1].text.append(content)
 
 
-def _ill_formed(said: str, at: Place, reader: _Reader) -> tuple[str, str]:
-    """What is wrong with a text that is no XML, and what was expected."""
+def _ill_formed(said: str, at: Place, reader: _ElementReader) -> tuple[str, str]:
+    """Error in a text that is not well-formed XML, and what was expected."""
     line = reader.lines[at.line - 1] if at.line <= len(reader.lines) else ""
     closing = re.search(r"</\s*([^\s>]*)", line[max(0, at.column - 3) :])
     inner = reader.open[-1]
@@ -152,7 +152,7 @@ def read_elements(text: str) -> Node:
     InputError
         With its place, if it is not XML, or has entities, a document type, or nests too deep.
     """
-    reader = _Reader(text)
+    reader = _ElementReader(text)
     try:
         parseString(text.encode(), reader, forbid_dtd=True)
     except SAXParseException as error:

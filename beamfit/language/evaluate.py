@@ -40,7 +40,7 @@ class Value(NamedTuple):
 
 @dataclass(frozen=True)
 class Setting:
-    """In which an expression is evaluated.
+    """Context in which an expression is evaluated.
 
     `known` holds values of nodes computed elsewhere, by identity; `watch` is told every value.
     """
@@ -78,16 +78,16 @@ def evaluate(e: x.Expression, s: Setting) -> Value:
     if found is not None:
         return _lifted(found, len(s.axes))
     match e:
-        case x.Number():
+        case x.Literal():
             found = Value(jnp.full((1,) * len(s.axes), e.value))
         case x.Name():
             found = _named(e, s)
-        case x.Operation(_, (one,)):
+        case x.Arithmetic(_, (one,)):
             inner = evaluate(one, s)
             found = Value(-inner.array, inner.rank)
-        case x.Operation("^", (base, x.Number() as power)):
+        case x.Arithmetic("^", (base, x.Literal() as power)):
             found = _power(evaluate(base, s), power.value)
-        case x.Operation(symbol, parts):
+        case x.Arithmetic(symbol, parts):
             found = _operated(e, symbol, [evaluate(part, s) for part in parts])
         case x.Application():
             found = _applied(e, s)

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 from beamfit.errors import InputError
 
-# Formulas are walked by recursion. Written by people they have ten levels.
+# Most levels of a formula, which is walked by recursion; people write ten.
 MOST_LEVELS = 120
 REDUCTIONS = ("sum", "prod", "min", "max", "mean")
 
@@ -45,7 +45,7 @@ class Expression:
 
 
 @dataclass(frozen=True)
-class Number(Expression):
+class Literal(Expression):
     """A number, kept as it was written."""
 
     text: str
@@ -53,7 +53,7 @@ class Number(Expression):
 
     @property
     def value(self) -> float:
-        """What it is."""
+        """The number."""
         return float(self.text)
 
 
@@ -74,7 +74,7 @@ class Name(Expression):
 
 
 @dataclass(frozen=True)
-class Operation(Expression):
+class Arithmetic(Expression):
     """``+ - * / @ ^`` of two parts, or a sign of one."""
 
     symbol: str
@@ -124,7 +124,7 @@ def children(e: Expression) -> tuple[Expression, ...]:
     match e:
         case Name():
             return e.indices
-        case Operation() | Elements():
+        case Arithmetic() | Elements():
             return e.parts
         case Application():
             return e.arguments
@@ -147,11 +147,12 @@ def check_depth(e: Expression) -> Expression:
 
 
 LEVELS = {"+": 1, "-": 1, "*": 2, "/": 2, "@": 2, "^": 4}
+# Binding strength of a sign and of an atom, between those of the operators.
 SIGN, ATOM = 3, 5
 
 
 def _level(e: Expression) -> int:
-    if not isinstance(e, Operation):
+    if not isinstance(e, Arithmetic):
         return ATOM
     return SIGN if len(e.parts) == 1 else LEVELS[e.symbol]
 
@@ -164,14 +165,14 @@ def _inside(e: Expression, least: int) -> str:
 def text_of(e: Expression) -> str:
     """Print an expression, with the parentheses it needs."""
     match e:
-        case Number():
+        case Literal():
             return e.text
         case Whole():
             return ":"
         case Name():
             inner = ", ".join(map(text_of, e.indices))
             return f"{e.name}[{inner}]" if e.indices else e.name
-        case Operation():
+        case Arithmetic():
             return _operation_text(e)
         case Application():
             return f"{e.function}({', '.join(map(text_of, e.arguments))})"
@@ -184,7 +185,7 @@ def text_of(e: Expression) -> str:
     raise TypeError(e)
 
 
-def _operation_text(e: Operation) -> str:
+def _operation_text(e: Arithmetic) -> str:
     if len(e.parts) == 1:
         return e.symbol + _inside(e.parts[0], SIGN)
     left, right = e.parts

@@ -10,15 +10,15 @@ from typing import NamedTuple
 import numpy as np
 
 from beamfit.language import expression as x
-from beamfit.language.scope import Read, Scope, Step, located, reads
+from beamfit.language.scope import MappingStep, Read, Scope, located, reads
 from beamfit.language.steps import sources, targets
 
-# Ways to choose a time index in each statement of a loop that are tried.
+# Most combinations of time indices, one for each statement of a loop, that are tried.
 MOST_TRIED = 64
 
 
 class Written(NamedTuple):
-    """Along which dimension an array advances, and where it begins."""
+    """Dimension along which an array advances, and its first index there."""
 
     dim: int
     start: int
@@ -33,13 +33,13 @@ class Lagged(NamedTuple):
     whole: int
 
 
-class Plan(NamedTuple):
+class RecurrencePlan(NamedTuple):
     """Steps in their order at one time, their time iterators, and what each reads of the past.
 
     `reads` are by identity of the node, `depth` is the longest way back.
     """
 
-    steps: tuple[Step, ...]
+    steps: tuple[MappingStep, ...]
     time: dict[int, str]
     written: dict[str, Written]
     length: int
@@ -47,7 +47,9 @@ class Plan(NamedTuple):
     depth: int
 
 
-def plan_of(scope: Scope, steps: tuple[Step, ...], owners: dict[str, np.ndarray]) -> Plan | None:
+def plan_of(
+    scope: Scope, steps: tuple[MappingStep, ...], owners: dict[str, np.ndarray]
+) -> RecurrencePlan | None:
     """Find how steps that need one another advance in time; None if they form a true loop."""
     choices = [list(_advances(scope, step)) for step in steps]
     for chosen in islice(product(*choices), MOST_TRIED):
@@ -57,7 +59,7 @@ def plan_of(scope: Scope, steps: tuple[Step, ...], owners: dict[str, np.ndarray]
     return None
 
 
-def _advances(scope: Scope, step: Step) -> Iterator[tuple[str, dict[str, Written], int]]:
+def _advances(scope: Scope, step: MappingStep) -> Iterator[tuple[str, dict[str, Written], int]]:
     """The iterators along which all that a step writes advances by one."""
     for k, (axis, over) in enumerate(step.axes.items()):
         found: dict[str, Written] = {}
@@ -77,7 +79,7 @@ def _advances(scope: Scope, step: Step) -> Iterator[tuple[str, dict[str, Written
             yield axis, found, len(over)
 
 
-def _planned(scope, steps, owners, chosen) -> Plan | None:
+def _planned(scope, steps, owners, chosen) -> RecurrencePlan | None:
     """The plan for one choice of time iterators, if every read lies at this time or before."""
     if len({n for _, _, n in chosen}) > 1:
         return None
@@ -110,11 +112,11 @@ def _planned(scope, steps, owners, chosen) -> Plan | None:
     time = {step.number: axis for step, (axis, _, _) in zip(steps, chosen, strict=True)}
     depth = max((int(np.max(r.lag)) for r in lagged.values()), default=0)
     ordered = tuple(by_number[n] for n in order)
-    return Plan(ordered, time, written, chosen[0][2], lagged, depth)
+    return RecurrencePlan(ordered, time, written, chosen[0][2], lagged, depth)
 
 
 def _lag(read: Read, written: Written | None, k: int, length: int) -> Lagged | None:
-    """How far back a read lies along the time axis k; None if that changes, or lies ahead."""
+    """Lag of a read along the time axis k; None if it changes or is negative."""
     if written is None:
         return None
     rank = read.indices[0].ndim

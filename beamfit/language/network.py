@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from beamfit.errors import InputError
-from beamfit.greybox.mlp import MLP, Gain, Layer, Port, connection
+from beamfit.greybox.mlp import MLP, Layer, NetworkGain, Port, connection
 from beamfit.language import document as d
 from beamfit.language.elements import Node, read_elements
 from beamfit.language.expression import error_at
@@ -150,7 +150,7 @@ def format_network(net: MLP, name: str = "mlp") -> str:
     return Plain.tostring(root, encoding="unicode") + "\n"
 
 
-def network_of(n: d.Network) -> MLP:
+def network_of(n: d.NetworkDefinition) -> MLP:
     """Build the network of a document.
 
     Raises
@@ -220,14 +220,14 @@ def _ports(elements: list[Node]) -> list[Port]:
     return ports
 
 
-def _gain(e: Node) -> Gain:
+def _gain(e: Node) -> NetworkGain:
     """A gain from its element."""
     order = e.number("order", 1, int)
     if not 1 <= order <= 3:
         raise e.error(f"order {order} of the gain '{e.given.get('name', '')}'", "1, 2 or 3")
     by = tuple(e.need(key) for key in ("da", "db", "dc")[:order])
     kind = e.given.get("type", "local")
-    return Gain(e.need("name"), e.need("dy"), by, kind, e.number("cells", 64, int))
+    return NetworkGain(e.need("name"), e.need("dy"), by, kind, e.number("cells", 64, int))
 
 
 def _text(values) -> str:

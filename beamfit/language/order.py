@@ -1,4 +1,4 @@
-"""In which order the steps of a mapping are computed: which elements each defines and needs."""
+"""Order in which the steps of a mapping are computed, from the elements each defines and needs."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from beamfit.language import document as d
 from beamfit.language import expression as x
 from beamfit.language.declare import scope_of
 from beamfit.language.expression import error_at
-from beamfit.language.lags import Plan, plan_of
+from beamfit.language.lags import RecurrencePlan, plan_of
 from beamfit.language.scope import (
     Array,
+    MappingStep,
     Read,
     Scope,
-    Step,
     located,
     reads,
     whole_of,
@@ -30,19 +30,20 @@ from beamfit.language.scope import (
 )
 from beamfit.language.steps import callee_of, gains_of, sources, targets, written
 
+# Owner of an element that no statement defines.
 NOBODY = -1
-# Names that the message of a loop shows.
+# Most names shown in the message about a loop.
 MOST_NAMED = 8
-# Elements that all statements of a mapping may run over together, how many there may be, and from
-# how many of them the cycle of a loop is sought.
+# Limits of a mapping: elements of all statements together, statements, and statements from which
+# the cycle of a loop is sought.
 MOST_WORK, MOST_STEPS, MOST_TRIED = 60_000_000, 5_000, 50
 
 
-class Group(NamedTuple):
+class StepGroup(NamedTuple):
     """Steps that are computed together; those with a plan need their own earlier values."""
 
-    steps: tuple[Step, ...]
-    plan: Plan | None
+    steps: tuple[MappingStep, ...]
+    plan: RecurrencePlan | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,7 +56,7 @@ class Order:
     """
 
     scope: Scope
-    groups: tuple[Group, ...]
+    groups: tuple[StepGroup, ...]
     owners: dict[str, np.ndarray]
     needs: dict[int, set[int]]
     given: dict[int, set[str]] = field(default_factory=dict)
@@ -77,7 +78,7 @@ class Order:
         direct = {name for name in names if name not in self.owners}
         return found, direct.union(*(self.given[n] for n in found))
 
-    def needed(self, names: Iterable[str]) -> Iterator[Group]:
+    def needed(self, names: Iterable[str]) -> Iterator[StepGroup]:
         """Groups that some names hang on, each after what it needs."""
         wanted, _ = self.closure(names)
         return (g for g in self.groups if not wanted.isdisjoint(step.number for step in g.steps))
@@ -142,17 +143,17 @@ def _check_work(scope: Scope) -> None:
             raise error_at(step.at, found, "fewer")
 
 
-def _group(scope, numbers: list[int], needs, owners) -> Group:
+def _group(scope, numbers: list[int], needs, owners) -> StepGroup:
     steps = tuple(scope.steps[n] for n in numbers)
     if len(steps) == 1 and numbers[0] not in needs[numbers[0]]:
-        return Group(steps, None)
+        return StepGroup(steps, None)
     plan = plan_of(scope, steps, owners)
     if plan is None:
         raise _loop(scope, steps, needs, owners)
-    return Group(steps, plan)
+    return StepGroup(steps, plan)
 
 
-def _own(scope: Scope, owners: dict[str, np.ndarray], step: Step, write: Read) -> None:
+def _own(scope: Scope, owners: dict[str, np.ndarray], step: MappingStep, write: Read) -> None:
     """Note which elements a step defines."""
     array, node = write.array, write.node
     owner = owners.setdefault(array.name, np.full(max(array.size, 1), NOBODY))
@@ -204,7 +205,7 @@ def _check_defined(array: Array, owners: dict[str, np.ndarray]) -> None:
         raise error_at(array.at, f"output '{name}' that no statement sets", f"{name} = ...;")
 
 
-def _check_wires(scope: Scope, step: Step, call: d.Call) -> None:
+def _check_wires(scope: Scope, step: MappingStep, call: d.Call) -> None:
     """Check indices on the side of what is called, and that each input is given whole."""
     callee = callee_of(scope, call)
     given: dict[str, np.ndarray] = {}
@@ -248,7 +249,7 @@ def _components(needs: dict[int, set[int]]) -> list[list[int]]:
     return [members[at] for at in TopologicalSorter(before).static_order()]
 
 
-def _loop(scope: Scope, steps: tuple[Step, ...], needs, owners) -> InputError:
+def _loop(scope: Scope, steps: tuple[MappingStep, ...], needs, owners) -> InputError:
     """An algebraic loop, with the names along a cycle that no time takes apart."""
     members = {s.number for s in steps}
     cycles = (_cycle(n, needs, members) for n in sorted(members)[:MOST_TRIED])

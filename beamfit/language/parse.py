@@ -78,7 +78,7 @@ def _parsed(text: str, start: str) -> Any:
 
 
 def _place(children: list[Any]) -> Place:
-    """Where the first of some parts stands."""
+    """Place of the first of some parts."""
     for child in children:
         if isinstance(child, Token):
             return Place(child.line, child.column)
@@ -107,7 +107,7 @@ class _Builder(Transformer):
     """Rules of the grammar to the values they stand for."""
 
     def STRING(self, token):
-        """Without its quotes, where it stood."""
+        """Content of a quoted text, with its place."""
         try:
             return token.update(value=json.loads(token))
         except ValueError:
@@ -118,7 +118,7 @@ class _Builder(Transformer):
 
     def number(self, c):
         _number(c[0])
-        return x.Number(str(c[0]), _place(c))
+        return x.Literal(str(c[0]), _place(c))
 
     def element(self, c):
         return x.Name(str(c[0]), tuple(part for part in c[1:] if part is not None), _place(c))
@@ -127,10 +127,10 @@ class _Builder(Transformer):
         return x.Whole(_place(c))
 
     def operation(self, c):
-        return x.Operation(str(c[1]), (c[0], c[2]), c[0].at)
+        return x.Arithmetic(str(c[1]), (c[0], c[2]), c[0].at)
 
     def sign(self, c):
-        return c[1] if c[0] == "+" else x.Operation("-", (c[1],), _place(c))
+        return c[1] if c[0] == "+" else x.Arithmetic("-", (c[1],), _place(c))
 
     def application(self, c):
         return x.Application(str(c[0]), tuple(p for p in c[1:] if p is not None), _place(c))
@@ -224,10 +224,10 @@ class _Builder(Transformer):
         attributes = tuple(a for a in c[3:-1] if a is not None)
         named = (("srcName", str(name)), ("dstName", str(target)))
         head = named if target is not None else (("name", str(name)),)
-        return d.Part(str(kind), (*head, *attributes), c[-1], _place(c))
+        return d.NetworkElement(str(kind), (*head, *attributes), c[-1], _place(c))
 
     def network(self, c):
-        return "mappings", d.Network(str(c[1]), tuple(c[2:]), _place(c[1:]))
+        return "mappings", d.NetworkDefinition(str(c[1]), tuple(c[2:]), _place(c[1:]))
 
     def inputs(self, c):
         return "inputs", c[1:]
@@ -266,7 +266,7 @@ class _Builder(Transformer):
         value = None if value is None else _number(value)
         low, high = bounds or (-math.inf, math.inf)
         start = value, random, _count(seed) or 0
-        return "variables", d.Variable(name.label, name.model, low, high, *start, name.at)
+        return "variables", d.FreeInput(name.label, name.model, low, high, *start, name.at)
 
     def limit(self, c):
         low, high = c[2] if len(c) == 3 else (_number(c[3]), _number(c[3]))
@@ -290,7 +290,7 @@ class _Builder(Transformer):
         if found["goals"] or found["variables"] or found["limits"]:
             goals = tuple(goal for _, goal in found["goals"])
             free, limits = tuple(found["variables"]), tuple(found["limits"])
-            problem = d.Problem(goals, free, limits, words == {"maximize"})
+            problem = d.ProblemStatement(goals, free, limits, words == {"maximize"})
         mapping = _mapping((found["titles"] or [""])[0], found)
         return d.Document(mapping, problem, (found["solvers"] or [None])[0])
 

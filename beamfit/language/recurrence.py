@@ -12,22 +12,22 @@ import numpy as np
 from beamfit.language import document as d
 from beamfit.language import expression as x
 from beamfit.language.evaluate import Setting, Value, evaluate, picked
-from beamfit.language.lags import Lagged, Plan
-from beamfit.language.scope import Array, Axes, IndexSet, Scope, Step, widened
+from beamfit.language.lags import Lagged, RecurrencePlan
+from beamfit.language.scope import Array, Axes, IndexSet, MappingStep, Scope, widened
 from beamfit.language.steps import sources
 
 ONE = IndexSet("", np.arange(1))
 Arrays = dict[str, jax.Array]
 
 
-def scanned(scope: Scope, plan: Plan, arrays: Arrays, assigned) -> Arrays:
+def scanned(scope: Scope, plan: RecurrencePlan, arrays: Arrays, assigned) -> Arrays:
     """Compute the arrays that the steps of a plan advance.
 
     Parameters
     ----------
     scope : Scope
         The names of the mapping.
-    plan : Plan
+    plan : RecurrencePlan
         The steps, and how far back each reads.
     arrays : dict of str to array
         Everything that is known before, first values of what advances included.
@@ -69,7 +69,7 @@ def scanned(scope: Scope, plan: Plan, arrays: Arrays, assigned) -> Arrays:
     }
 
 
-def _apart(scope: Scope, plan: Plan, arrays: Arrays):
+def _apart(scope: Scope, plan: RecurrencePlan, arrays: Arrays):
     """Values of all that does not hang on what advances: fixed ones, and those that run with time.
 
     The latter are the axis of time, the rank, and the array with time in front.
@@ -89,10 +89,10 @@ def _apart(scope: Scope, plan: Plan, arrays: Arrays):
 
 
 def _independent(
-    scope: Scope, e: x.Expression, axes: Axes, plan: Plan
+    scope: Scope, e: x.Expression, axes: Axes, plan: RecurrencePlan
 ) -> Iterator[tuple[x.Expression, Axes]]:
     """The largest parts of an expression that read nothing that advances."""
-    if id(e) in plan.reads or isinstance(e, x.Number):
+    if id(e) in plan.reads or isinstance(e, x.Literal):
         return
     if not _advancing(e, plan):
         yield e, axes
@@ -103,7 +103,7 @@ def _independent(
             yield from _independent(scope, part, axes, plan)
 
 
-def _advancing(e: x.Expression, plan: Plan) -> bool:
+def _advancing(e: x.Expression, plan: RecurrencePlan) -> bool:
     return id(e) in plan.reads or any(_advancing(part, plan) for part in x.children(e))
 
 
@@ -119,7 +119,7 @@ def _looked_up(lagged: Lagged, fresh: Arrays, history: Arrays) -> Value:
     return Value(picked(stack, [lagged.lag, *lagged.rest], rank), lagged.whole)
 
 
-def _without_time(scope: Scope, plan: Plan) -> Scope:
+def _without_time(scope: Scope, plan: RecurrencePlan) -> Scope:
     """The names as they are at one time."""
     small: dict[str, Array] = {}
     for name, w in plan.written.items():
@@ -128,7 +128,7 @@ def _without_time(scope: Scope, plan: Plan) -> Scope:
     return replace(scope, arrays=scope.arrays | small)
 
 
-def _timeless(step: Step, plan: Plan) -> Step:
+def _timeless(step: MappingStep, plan: RecurrencePlan) -> MappingStep:
     """A step whose targets have no index of time."""
 
     def target(node: x.Name) -> x.Name:

@@ -18,7 +18,7 @@ from beamfit.language import document as d
 from beamfit.language import expression as x
 from beamfit.language.expression import REDUCTIONS, Place, error_at
 
-# Elements of a set, and combinations of indices one statement may run over.
+# Most elements of a set, and most combinations of indices in a statement.
 MOST_ELEMENTS, MOST_COMBINED = 2_000_000, 5_000_000
 # Behind the names of iterators that a function's body does not see.
 HIDDEN = "'"
@@ -51,7 +51,7 @@ class IndexSet:
         return np.argsort(self.elements, kind="stable")
 
     def positions(self, values: np.ndarray) -> np.ndarray:
-        """Where values stand; -1 for those that are no elements."""
+        """Positions of values in the set; -1 for values that are no elements."""
         if self.step == 1:
             at = values - self.elements[0]
             return np.where((at >= 0) & (at < len(self)), at, -1)
@@ -80,22 +80,22 @@ class Array(NamedTuple):
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """Its lengths."""
+        """Length of each dimension."""
         return tuple(map(len, self.dims))
 
     @property
     def size(self) -> int:
-        """Its number of elements."""
+        """Number of elements."""
         return int(np.prod(self.shape, dtype=np.int64))
 
     @property
     def said(self) -> str:
-        """Its name with its dimensions."""
+        """Name with dimensions."""
         inner = ", ".join(dim.name or str(len(dim)) for dim in self.dims)
         return f"{self.name}[{inner}]" if self.dims else self.name
 
     def element(self, position: int) -> str:
-        """Its name with the index of an element, in C order."""
+        """Name with the index of an element, in C order."""
         if not self.dims:
             return self.name
         at = np.unravel_index(position, self.shape)
@@ -103,7 +103,7 @@ class Array(NamedTuple):
         return f"{self.name}[{inner}]"
 
 
-class Step(NamedTuple):
+class MappingStep(NamedTuple):
     """An assignment or a call, with everything it runs over; `number` counts steps of a mapping."""
 
     number: int
@@ -112,7 +112,7 @@ class Step(NamedTuple):
 
     @property
     def at(self) -> Place:
-        """Where it stands."""
+        """Place in the document."""
         return self.what.at
 
 
@@ -144,16 +144,16 @@ class Scope:
     arrays: dict[str, Array] = field(default_factory=dict)
     functions: dict[str, d.Function] = field(default_factory=dict)
     callees: dict[str, Any] = field(default_factory=dict)
-    steps: list[Step] = field(default_factory=list)
+    steps: list[MappingStep] = field(default_factory=list)
 
     @property
     def inputs(self) -> dict[str, Array]:
-        """What is given to it."""
+        """Arrays that are inputs."""
         return {k: a for k, a in self.arrays.items() if a.role == "input"}
 
     @property
     def outputs(self) -> dict[str, Array]:
-        """What it gives."""
+        """Arrays that are outputs."""
         return {k: a for k, a in self.arrays.items() if a.role == "output"}
 
     def constant(self, name: str) -> float | None:
@@ -227,7 +227,7 @@ def widened(scope: Scope, axes: Axes, each: tuple[x.Iterator, ...]) -> dict[str,
 def index_of(scope: Scope, e: x.Expression, axes: Axes) -> np.ndarray:
     """The values of an index for all combinations of iterators, one axis each."""
     match e:
-        case x.Number():
+        case x.Literal():
             if e.value != int(min(e.value, 2**53)):
                 raise error_at(e.at, f"'{e}' as an index", "a whole number")
             return np.int64(e.value)
@@ -235,8 +235,8 @@ def index_of(scope: Scope, e: x.Expression, axes: Axes) -> np.ndarray:
             place = list(axes).index(name)
             return axes[name].elements.reshape([-1 if i == place else 1 for i in range(len(axes))])
         case x.Name(name, ()) if (value := scope.constant(name)) is not None:
-            return index_of(scope, x.Number(repr(value), e.at), axes)
-        case x.Operation(symbol, parts) if symbol in "+-*":
+            return index_of(scope, x.Literal(repr(value), e.at), axes)
+        case x.Arithmetic(symbol, parts) if symbol in "+-*":
             found = [index_of(scope, part, axes) for part in parts]
             if max(float(np.max(np.abs(f))) for f in found) > 2**31:
                 raise error_at(e.at, f"'{e}' as an index", "numbers below 2e9")
@@ -297,7 +297,7 @@ def _outside(node, index, dim, axes, values, at) -> InputError:
 
 
 def said_at(axes: Axes, at: Sequence[int], lengths: Sequence[int], word: str) -> str:
-    """Where iterators stand, behind a word; nothing where none of them matters."""
+    """Values of the iterators, after a word; empty if none of them matters."""
     found = [
         f"{name.rstrip(HIDDEN)} = {s.elements[i]}"
         for (name, s), i, n in zip(axes.items(), at, lengths, strict=False)
@@ -323,7 +323,7 @@ def reads(scope: Scope, e: x.Expression, axes: Axes) -> Iterator[Read]:
         case x.Application():
             _check_arguments(scope, e)
             yield from (r for part in e.arguments for r in reads(scope, part, axes))
-        case x.Operation():
+        case x.Arithmetic():
             yield from (r for part in e.parts for r in reads(scope, part, axes))
         case x.Whole():
             raise error_at(e.at, "':'", "an expression")

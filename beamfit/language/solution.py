@@ -12,40 +12,37 @@ import numpy as np
 
 from beamfit.greybox.assess import slopes
 from beamfit.greybox.diagnosis import diagnose
-from beamfit.greybox.fit import Fit, Limited, Variable
+from beamfit.greybox.fit import Fit, FittedConstraint, FittedVariable
 from beamfit.greybox.problem import TOLERANCE
 from beamfit.greybox.solve import solve
 from beamfit.language import document as d
-from beamfit.language.computed import MOST_ROWS, gain_tables, gains_at, outputs_at
+from beamfit.language.computed import gain_tables, gains_at, outputs_at
 from beamfit.language.statement import Formulation, at_start, formulate, starts_of
 from beamfit.language.trace import cause_of
 from beamfit.quantity import Quantity
 from beamfit.shown import shown
 from beamfit.statistics import reach_of
 from beamfit.status import Status
-from beamfit.table import Table, cell
+from beamfit.table import MOST_ROWS, Table, cell
 
-# Draws of the same seeds that are tried until the start is finite.
+# Most draws of a random start until it is finite.
 MOST_DRAWS = 100
-# Solver parameters that mean something here: how they are told to `solve`.
+# Solver options that are used, with the argument of `solve` that each sets.
 TOLD = {
     "major iterations limit": "iterations",
     "iterations limit": "iterations",
     "time limit": "seconds",
 }
-NOISE = (
-    "Errors take the terms that are squared for residuals of data, with the noise that their own "
-    "scatter shows."
-)
-# Kinds of ailments that are found with their place in the document.
+NOISE = "Errors treat squared terms as data residuals, with the noise inferred from their scatter."
+# Kinds of defects that are reported elsewhere, with their place in the document.
 TOLD_ELSEWHERE = {"contradictory_bounds", "not_finite", "unused"}
 TOLERANCES = {"major feasibility tolerance", "major optimality tolerance"}
 
 
 @shown
 @dataclass(frozen=True, eq=False)
-class Solution:
-    """What the solver found, in the names of the document.
+class ProblemSolution:
+    """Answer of the solver, in the names of the document.
 
     Parameters
     ----------
@@ -81,7 +78,7 @@ class Solution:
 
     @property
     def message(self) -> str:
-        """Its sentence."""
+        """Sentence of the verdict."""
         return self.fit.message
 
     @property
@@ -91,22 +88,22 @@ class Solution:
 
     @property
     def solver(self) -> str:
-        """Which solvers were used from the start that led to the answer."""
+        """Solvers used from the start that led to the answer."""
         used = [a.solver for a in self.fit.attempts if np.array_equal(a.theta, self.fit.theta)]
         return (used or [a.solver for a in self.fit.attempts] or ["none"])[0]
 
-    def variables(self) -> list[Variable]:
+    def variables(self) -> list[FittedVariable]:
         """Free numbers by their labels, with d(objective)/d(bound)."""
         return [
             v._replace(reduced_gradient=self.factor * v.reduced_gradient)
             for v in self.fit.variables
         ]
 
-    def constraints(self) -> list[Limited]:
+    def constraints(self) -> list[FittedConstraint]:
         """Limited outputs by their labels, with d(objective)/d(limit)."""
         return [c._replace(multiplier=self.factor * c.multiplier) for c in self.fit.constraints]
 
-    def quantity(self, v: Variable) -> Quantity:
+    def quantity(self, v: FittedVariable) -> Quantity:
         """A free number with its error; its interval is that of Student's t."""
         if not math.isfinite(v.error):
             return Quantity(v.value, None, "1")
@@ -128,12 +125,12 @@ class Solution:
         tables += [Table("", ["output", "value"], values, numeric=True)] if values else []
         return tables + gain_tables(self.made.program.scope, self.gains)
 
-    def _row(self, v: Variable) -> list[str]:
+    def _row(self, v: FittedVariable) -> list[str]:
         error = ["-" if not math.isfinite(v.error) else f"{v.error:.2g}"] * self.squares
         slope = f"{v.reduced_gradient + 0.0:.3g}"
         return [v.name, f"{v.value:.8g}", *error, *_ends(v), v.state, slope]
 
-    def _variable(self, v: Variable) -> dict[str, Any]:
+    def _variable(self, v: FittedVariable) -> dict[str, Any]:
         kept = ("name", "lower", "upper", "state", "reduced_gradient")
         return {key: getattr(v, key) for key in kept} | {"value": self.quantity(v)}
 
@@ -170,11 +167,11 @@ def _range(values: np.ndarray) -> str:
     return f"{values.size} from {np.min(values):.5g} to {np.max(values):.5g}"
 
 
-def _ends(row: Variable | Limited) -> list[str]:
+def _ends(row: FittedVariable | FittedConstraint) -> list[str]:
     return [f"{end:.6g}" for end in (row.lower, row.upper)]
 
 
-def _limited(c: Limited) -> list[str]:
+def _limited(c: FittedConstraint) -> list[str]:
     return [c.name, f"{c.value:.8g}", *_ends(c), c.state, f"{c.multiplier + 0.0:.3g}"]
 
 
@@ -196,7 +193,7 @@ def solve_document(
     values: Mapping[str, Sequence[float]] | None = None,
     gains: Iterable[str] = (),
     **options: Any,
-) -> Solution:
+) -> ProblemSolution:
     """Solve the problem of a document.
 
     Parameters
@@ -218,7 +215,7 @@ def solve_document(
 
     Returns
     -------
-    Solution
+    ProblemSolution
         Never raises for a search that fails: its status says so.
 
     Raises
@@ -249,7 +246,7 @@ def solve_document(
         notes = (*notes, NOISE)
     outputs, gained = outputs_at(made.program, fit.model), gains_at(made.program, fit.model, gains)
     name = _goals(made.document)
-    return Solution(name, fit, outputs, gained, made.factor, made.squares, notes, made)
+    return ProblemSolution(name, fit, outputs, gained, made.factor, made.squares, notes, made)
 
 
 def _started(made: Formulation) -> tuple[Formulation, tuple[str, ...]]:
@@ -268,7 +265,7 @@ def _started(made: Formulation) -> tuple[Formulation, tuple[str, ...]]:
 
 
 def _cause(made: Formulation, model: Mapping[str, np.ndarray]) -> str | None:
-    """Why the objective, a limit, or a derivative of them is not finite."""
+    """Cause of an objective, limit or derivative that is not finite."""
     problem = made.document.problem
     names = [one.model for one in (*problem.goals, *problem.limits)]
     found = cause_of(made.program, model, names)
@@ -276,7 +273,7 @@ def _cause(made: Formulation, model: Mapping[str, np.ndarray]) -> str | None:
 
 
 def _ailments(made: Formulation) -> list[str]:
-    """What the problem suffers from, but for what is told already with its place."""
+    """Defects that `diagnose` finds, except those reported elsewhere with their place."""
     found = (one for one in diagnose(made.problem) if one.kind not in TOLD_ELSEWHERE)
     return [f"{one.message[:-1]} ({_where(made, one.names)})." for one in found]
 
@@ -290,7 +287,7 @@ def _where(made: Formulation, names: Iterable[str]) -> str:
 
 
 def _places(made: Formulation, fit: Fit) -> list[str]:
-    """Where what the verdict is about stands in the document."""
+    """Places in the document that the verdict is about."""
     places = _where(made, fit.about)
     return [f"The verdict is about {places}."] if places else []
 
@@ -311,7 +308,7 @@ def _told(solver: d.Solver | None) -> tuple[dict[str, Any], list[str]]:
             tight.append(number)
         else:
             unused.append(name)
-    said = [f"Solver parameters without a meaning here: {', '.join(unused)}."] if unused else []
+    said = [f"Ignored solver options: {', '.join(unused)}."] if unused else []
     if tight:
         told["tolerance"] = min(tight)
     return told, said

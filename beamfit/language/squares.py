@@ -25,14 +25,14 @@ def squares_of(m: d.Mapping, name: str, weight: float = 1.0) -> list[Square] | N
         match e:
             case x.Name(n, ()) if n in set_by and n not in seen:
                 return terms(set_by[n], factor, (*seen, n))
-            case x.Operation("^", (body, x.Number() as two)) if two.value == 2.0 and factor > 0:
+            case x.Arithmetic("^", (body, x.Literal() as two)) if two.value == 2.0 and factor > 0:
                 return [Square(factor, body)]
-            case x.Operation("+", (left, right)):
+            case x.Arithmetic("+", (left, right)):
                 both = terms(left, factor, seen), terms(right, factor, seen)
                 return None if None in both else both[0] + both[1]
-            case x.Operation("*", (x.Number() as n, inner)):
+            case x.Arithmetic("*", (x.Literal() as n, inner)):
                 return terms(inner, factor * n.value, seen)
-            case x.Operation("/", (inner, x.Number() as n)) if n.value != 0:
+            case x.Arithmetic("/", (inner, x.Literal() as n)) if n.value != 0:
                 return terms(inner, factor / n.value, seen)
             case x.Reduction("sum", each, inner):
                 found = terms(inner, factor, seen)

@@ -155,7 +155,7 @@ def _begun(document: d.Document, values: Mapping[str, Sequence[float]]) -> d.Doc
 # ---- variables
 
 
-def _names(asked: d.Variable | d.Limit, array: Any) -> tuple[str, ...]:
+def _names(asked: d.FreeInput | d.Limit, array: Any) -> tuple[str, ...]:
     """A name for each element of what is free or limited, in the document's indices."""
     elements = (array.element(i).removeprefix(asked.model) for i in range(array.size))
     return tuple(asked.label + element for element in elements)
@@ -181,8 +181,8 @@ def _free(document: d.Document, program: Program) -> tuple[list, dict[str, np.nd
     return free, model, tuple(notes)
 
 
-def _outside(v: d.Variable, given: Sequence[float] | None) -> list[str]:
-    """What there is to say of a start outside the bounds."""
+def _outside(v: d.FreeInput, given: Sequence[float] | None) -> list[str]:
+    """A warning if a variable's start lies outside its bounds."""
     begin = v.random or ((v.value,) if v.value is not None else given or (v.lower, v.upper))
     wrong = next((x for x in begin if not v.lower <= x <= v.upper), None)
     if wrong is None:
@@ -195,8 +195,8 @@ def _outside(v: d.Variable, given: Sequence[float] | None) -> list[str]:
     ]
 
 
-def _starts(v: d.Variable, shape, given) -> Iterator[np.ndarray]:
-    """Where searches start: drawn with the seed, or the value, or the middle of the bounds."""
+def _starts(v: d.FreeInput, shape, given) -> Iterator[np.ndarray]:
+    """Starts of the search: drawn with the seed, or the value, or the middle of the bounds."""
     random = np.random.default_rng(v.seed)
     while v.random is not None:
         yield np.clip(random.uniform(*v.random, size=shape), v.lower, v.upper)

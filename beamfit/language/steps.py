@@ -6,7 +6,7 @@ from beamfit.errors import nearest
 from beamfit.language import document as d
 from beamfit.language import expression as x
 from beamfit.language.expression import error_at
-from beamfit.language.scope import Axes, Net, Read, Scope, Step, located, widened
+from beamfit.language.scope import Axes, MappingStep, Net, Read, Scope, located, widened
 
 
 def callee_of(scope: Scope, call: d.Call) -> Scope | Net:
@@ -53,22 +53,22 @@ def gains_of(
     return names[0], names[1:]
 
 
-def targets(scope: Scope, step: Step) -> list[tuple[x.Name, Axes]]:
-    """Where a step writes, with the iterators in force there."""
+def targets(scope: Scope, step: MappingStep) -> list[tuple[x.Name, Axes]]:
+    """Names that a step writes, with the iterators in force there."""
     if isinstance(step.what, d.Assignment):
         return [(step.what.target, step.axes)]
     return [(w.target, widened(scope, step.axes, w.each)) for w in step.what.outputs]
 
 
-def sources(scope: Scope, step: Step) -> list[tuple[x.Expression, Axes]]:
-    """What a step computes from, with the iterators in force there."""
+def sources(scope: Scope, step: MappingStep) -> list[tuple[x.Expression, Axes]]:
+    """Expressions that a step reads, with the iterators in force there."""
     if isinstance(step.what, d.Assignment):
         return [(step.what.value, step.axes)]
     return [(w.value, widened(scope, step.axes, w.each)) for w in step.what.inputs]
 
 
 def written(scope: Scope, node: x.Name, axes: Axes) -> Read:
-    """Where a target writes, which must be an output or a local variable."""
+    """The elements a target writes; it must be an output or a local variable."""
     found = scope.arrays.get(node.name)
     if found is None or found.role not in ("output", "real"):
         free = [a.name for a in scope.arrays.values() if a.role in ("output", "real")]

@@ -12,7 +12,7 @@ from lark.exceptions import UnexpectedCharacters, UnexpectedInput, UnexpectedTok
 from beamfit.errors import InputError
 from beamfit.language.expression import Place, error_at
 
-# Brackets open at once, and letters of an odd word that a message shows.
+# Most open brackets, and most letters of a wrong word in a message.
 MOST_OPEN, LONGEST = 60, 30
 BRACKET = re.compile(
     r"#[^\n]*|//[^\n]*|/\*.*?\*/|\"(?:\\.|[^\"\\\n])*\"|([(\[{])|([)\]}])|(/\*)", re.DOTALL
@@ -89,7 +89,7 @@ def explained(error: UnexpectedInput, text: str) -> InputError:
 
 
 def _habit(before: Token, token: Token, accepted: set[str], text: str) -> InputError | None:
-    """What other languages write otherwise: powers, assignments, products."""
+    """Error for a habit of other languages: powers, assignments, products; or None."""
     at, here = Place(before.line, before.column), Place(token.line, token.column)
     behind = text[token.end_pos : token.end_pos + 1]
     if token == "*" and before == "*":
@@ -123,7 +123,7 @@ def _misspelt(before: Token | None, token: Token, accepted: set[str]) -> InputEr
 
 
 def _choices(accepted: Any) -> str:
-    """What could stand there, in words."""
+    """Accepted tokens in words."""
     said = {SAID.get(name, name.lower()) for name in accepted}
     if {"real", "set", "a name"} <= said:
         return "a statement"

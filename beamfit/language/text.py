@@ -12,6 +12,7 @@ from textwrap import indent, wrap
 from beamfit.language import document as d
 from beamfit.language.expression import iterators_text
 
+# Letters in a line of a written document.
 WIDTH = 96
 NAME = re.compile(r"[^\W\d]\w*")
 NUMBER = re.compile(r"[+-]?(\d+(\.\d*)?|\.\d+)([eE][+-]?\d+)?")
@@ -73,7 +74,7 @@ def _pair(low: float, high: float) -> str:
     return f"[{number_text(low)}, {number_text(high)}]"
 
 
-def _problem(p: d.Problem | None) -> Iterable[str]:
+def _problem(p: d.ProblemStatement | None) -> Iterable[str]:
     if p is None:
         return
     for goal in p.goals:
@@ -99,7 +100,7 @@ def _problem(p: d.Problem | None) -> Iterable[str]:
         yield f"constraint {_label(limit)} {short};"
 
 
-def _label(named: d.Goal | d.Variable | d.Limit) -> str:
+def _label(named: d.Goal | d.FreeInput | d.Limit) -> str:
     return _name(named.label) + ("" if named.model == named.label else f": {named.model}")
 
 
@@ -156,7 +157,7 @@ def _declared(n: d.Declared) -> str:
     return f"{n.name}{_dims(n.dimensions)}{value}"
 
 
-def _part(p: d.Part) -> str:
+def _part(p: d.NetworkElement) -> str:
     heads = 2 if p.kind == "connection" else 1
     name = " -> ".join(value for _, value in p.attributes[:heads])
     rest = ", ".join(f"{k} = {_word(v)}" for k, v in p.attributes[heads:])

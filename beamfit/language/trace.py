@@ -1,4 +1,4 @@
-"""Why a document gives no number: the first part of a formula that is not finite, and where."""
+"""Trace of a document's first formula part that is not finite, with its place."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from beamfit.language import expression as x
 from beamfit.language.calls import Arrays, given_to
 from beamfit.language.compiled import Program, carry_out
 from beamfit.language.evaluate import Setting, Value, evaluate
-from beamfit.language.lags import Plan
-from beamfit.language.order import Group
-from beamfit.language.scope import Axes, IndexSet, Scope, Step, said_at
+from beamfit.language.lags import RecurrencePlan
+from beamfit.language.order import StepGroup
+from beamfit.language.scope import Axes, IndexSet, MappingStep, Scope, said_at
 from beamfit.language.steps import callee_of
 
 
@@ -99,7 +99,7 @@ class _Watch:
         raise _FoundError(said + (f": {inner}" if inner else ""))
 
     def _tells(self, part: x.Expression) -> bool:
-        return id(part) in self.seen and not isinstance(part, x.Number)
+        return id(part) in self.seen and not isinstance(part, x.Literal)
 
     def _said(self, part: x.Expression, at: np.ndarray) -> str:
         array = np.asarray(self.seen[id(part)].array)
@@ -110,16 +110,16 @@ class _Watch:
 
 
 def _may_be_steep(e: x.Expression) -> bool:
-    """Whether a formula has an infinite derivative where it is zero."""
+    """True if a formula may have an infinite derivative where it is zero."""
     if isinstance(e, x.Application):
         return e.function in ("sqrt", "norm")
-    if not (isinstance(e, x.Operation) and e.symbol == "^"):
+    if not (isinstance(e, x.Arithmetic) and e.symbol == "^"):
         return False
-    return not (isinstance(e.parts[1], x.Number) and e.parts[1].value >= 1)
+    return not (isinstance(e.parts[1], x.Literal) and e.parts[1].value >= 1)
 
 
-def _of_group(program: Program, group: Group, arrays: Arrays, changed: Arrays) -> str:
-    """What is not finite behind a call, or in steps that advance: at their first bad time."""
+def _of_group(program: Program, group: StepGroup, arrays: Arrays, changed: Arrays) -> str:
+    """Description of what is not finite in a group: in a call, or at the first bad time."""
     scope = program.scope
     for step in group.steps if group.plan is None else group.plan.steps:
         axes = step.axes
@@ -136,7 +136,7 @@ def _of_group(program: Program, group: Group, arrays: Arrays, changed: Arrays) -
     return f"{element} is not finite ({at})"
 
 
-def _first_time(plan: Plan, changed: Arrays) -> int:
+def _first_time(plan: RecurrencePlan, changed: Arrays) -> int:
     """The first time at which what advances is not finite."""
     bad = []
     for name, w in plan.written.items():
@@ -145,7 +145,7 @@ def _first_time(plan: Plan, changed: Arrays) -> int:
     return int(np.argmax(np.any(bad, axis=0)))
 
 
-def _of_step(program: Program, step: Step, s: Setting) -> str | None:
+def _of_step(program: Program, step: MappingStep, s: Setting) -> str | None:
     if isinstance(step.what, d.Call):
         return _of_call(program, step, s)
     try:
@@ -155,8 +155,8 @@ def _of_step(program: Program, step: Step, s: Setting) -> str | None:
     return None
 
 
-def _of_call(program: Program, step: Step, s: Setting, slopes: bool = False) -> str | None:
-    """What is not finite in a mapping that is called, for the first point at which it is not."""
+def _of_call(program: Program, step: MappingStep, s: Setting, slopes: bool = False) -> str | None:
+    """Description of what is not finite in a called mapping, at its first bad point; or None."""
     callee = callee_of(s.scope, step.what)
     if not isinstance(callee, Scope):
         return None

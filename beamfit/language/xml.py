@@ -89,7 +89,7 @@ def _one(node: Node, tag: str) -> Node | None:
     return found[0] if found else None
 
 
-def _problem(node: Node) -> d.Problem:
+def _problem(node: Node) -> d.ProblemStatement:
     _check(node, "problem")
     direction = node.given.get("direction", "minimize").strip().lower()
     if direction not in ("minimize", "maximize"):
@@ -100,7 +100,7 @@ def _problem(node: Node) -> d.Problem:
     )
     limits = tuple(d.Limit(*_labels(e), *_bounds(e), at=e.at) for e in node.all("constraint"))
     variables = tuple(map(_variable, node.all("variable")))
-    return d.Problem(goals, variables, limits, direction == "maximize")
+    return d.ProblemStatement(goals, variables, limits, direction == "maximize")
 
 
 def _labels(e: Node) -> tuple[str, str]:
@@ -112,7 +112,7 @@ def _bounds(e: Node) -> tuple[float, float]:
     return e.number("lower", -math.inf), e.number("upper", math.inf)
 
 
-def _variable(e: Node) -> d.Variable:
+def _variable(e: Node) -> d.FreeInput:
     low, high = _bounds(e)
     random = None
     if e.given.get("useRandomInitial", "false").strip().lower() == "true":
@@ -120,7 +120,7 @@ def _variable(e: Node) -> d.Variable:
     seed = e.number("randomSeed", 0, int)
     if seed < 0:
         raise e.error(f"randomSeed='{seed}'", "a whole number from 0", "randomSeed")
-    return d.Variable(*_labels(e), low, high, e.number("value", None), random, seed, at=e.at)
+    return d.FreeInput(*_labels(e), low, high, e.number("value", None), random, seed, at=e.at)
 
 
 def _solver(node: Node) -> d.Solver:
@@ -191,7 +191,7 @@ def _set(e: Node) -> d.IndexedSet:
     return d.IndexedSet(e.name(), Elements(parts, kind == "range", e.at), e.at)
 
 
-def _network(node: Node) -> d.Network:
+def _network(node: Node) -> d.NetworkDefinition:
     _check(node, "network")
     parts = []
     for e in node.children:
@@ -199,8 +199,8 @@ def _network(node: Node) -> d.Network:
         rest = [(k, v) for k, v in e.given.items() if k not in heads]
         values = e.numbers() if "".join(e.text).strip() else None
         head = [(k, e.name(k)) for k in heads]
-        parts.append(d.Part(e.tag, (*head, *rest), values, e.at))
-    return d.Network(node.name(), tuple(parts), node.at)
+        parts.append(d.NetworkElement(e.tag, (*head, *rest), values, e.at))
+    return d.NetworkDefinition(node.name(), tuple(parts), node.at)
 
 
 # ---- writing
@@ -233,7 +233,7 @@ def format_xml(document: d.Document) -> str:
     return head + Plain.tostring(root, encoding="unicode") + "\n"
 
 
-def _problem_elements(p: d.Problem | None) -> list[Plain.Element]:
+def _problem_elements(p: d.ProblemStatement | None) -> list[Plain.Element]:
     if p is None:
         return []
     e = Plain.Element("problem", classname=NLP, direction="maximize" if p.maximize else "minimize")
@@ -255,7 +255,7 @@ def _problem_elements(p: d.Problem | None) -> list[Plain.Element]:
     return [e]
 
 
-def _labelled(of: d.Variable | d.Limit | d.Goal) -> dict[str, str]:
+def _labelled(of: d.FreeInput | d.Limit | d.Goal) -> dict[str, str]:
     given = {"label": of.label, "modelVariable": of.model}
     for key, usual in (("lower", -math.inf), ("upper", math.inf)):
         if (value := getattr(of, key, usual)) != usual:
@@ -297,7 +297,7 @@ def _row(values: Sequence[float]) -> str:
     return f"[{', '.join(map(number_text, values))}]"
 
 
-def _network_element(n: d.Network) -> Plain.Element:
+def _network_element(n: d.NetworkDefinition) -> Plain.Element:
     e = Plain.Element("mapping", classname=MLP, name=n.name)
     for part in n.parts:
         inner = Plain.SubElement(e, part.kind, dict(part.attributes))

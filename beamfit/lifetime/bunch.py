@@ -12,7 +12,7 @@ from scipy import constants
 from beamfit.lifetime.ring import Operation, Ring
 from beamfit.lifetime.well import length_and_height
 
-# The largest share of its momentum that an electron loses.
+# Largest relative momentum acceptance: an electron cannot lose more than its momentum.
 MOST = 0.99
 
 

@@ -8,8 +8,9 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-HOUR = 3600.0
-# exp(-x) mean over [0, x]: below this the series is exact to rounding, above it the quotient is.
+from beamfit.quantity import HOUR as HOUR
+
+# Mean of exp(-x) over [0, x]: below this x the series is exact to rounding, above it the quotient.
 SERIES_BELOW = 0.1
 
 

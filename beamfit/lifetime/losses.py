@@ -18,12 +18,12 @@ from beamfit.lifetime.ring import Operation, Ring, unstored
 from beamfit.lifetime.touschek import touschek_loss
 from beamfit.shown import shown
 
-# Pa; a rise of the pressure over no pressure at all is taken over this.
+# Pa, base pressure of the relative rise with current if the pressure is zero.
 NO_PRESSURE = 1e-30
 
 
 class Mechanism(NamedTuple):
-    """One way to lose beam.
+    """A mechanism of beam loss.
 
     Attributes
     ----------
@@ -166,8 +166,8 @@ def loss_coefficients(ring: Ring, operation: Operation, current: float | Array) 
     return added(parts, operation.pressure_base, operation.pressure_slope)
 
 
-class Terms(NamedTuple):
-    """What first principles say at one setting, before scaling.
+class LossTerms(NamedTuple):
+    """Loss terms from first principles at one setting, before scaling.
 
     Attributes
     ----------
@@ -199,7 +199,7 @@ class Terms(NamedTuple):
 
 def loss_terms(
     ring: Ring, operation: Operation, current: Array, voltages: Array | None = None
-) -> Terms:
+) -> LossTerms:
     """Compute the terms of one setting.
 
     Parameters
@@ -211,11 +211,11 @@ def loss_terms(
     current : float
         Mean current, mA.
     voltages : array, shape (k,), optional
-        As of `Terms`, where the RF voltage has a scale of its own.
+        As of `LossTerms`, where the RF voltage has a scale of its own.
 
     Returns
     -------
-    Terms
+    LossTerms
         Differentiable in every argument.
 
     Raises
@@ -238,7 +238,7 @@ def loss_terms(
         settings = [operation._replace(rf_voltage=operation.rf_voltage * v) for v in voltages]
         each = [terms_of(ring, setting, current) for setting in settings]
         parts = tuple(jnp.stack(part, axis=-1) for part in zip(*each, strict=True))
-    return Terms(
+    return LossTerms(
         parts,
         pressure=jnp.asarray(base + slope * current, float),
         rise=jnp.asarray(slope / jnp.maximum(base, NO_PRESSURE), float),
@@ -247,7 +247,9 @@ def loss_terms(
     )
 
 
-def scaled_losses(scales: Array, terms: Terms, pressure_factor: Array = 1.0) -> tuple[Array, Array]:
+def scaled_losses(
+    scales: Array, terms: LossTerms, pressure_factor: Array = 1.0
+) -> tuple[Array, Array]:
     """Coefficients a and b with each mechanism scaled.
 
     Parameters
@@ -256,7 +258,7 @@ def scaled_losses(scales: Array, terms: Terms, pressure_factor: Array = 1.0) -> 
         A factor for each of `SCALES`: on Touschek, bremsstrahlung, elastic scattering, and on
         P1/P0 (desorption); 1 is the ring file. What is not fitted keeps its size. A fifth is the
         true over the stated RF voltage, for terms with `voltages`.
-    terms : Terms
+    terms : LossTerms
         First principles at one setting.
     pressure_factor : float, optional
         True pressure over the pressure reading.
@@ -285,7 +287,7 @@ def scaled_losses(scales: Array, terms: Terms, pressure_factor: Array = 1.0) -> 
     return losses.a, losses.b
 
 
-def scaled_parts(scales: Array, terms: Terms, pressure_factor: Array = 1.0) -> Losses:
+def scaled_parts(scales: Array, terms: LossTerms, pressure_factor: Array = 1.0) -> Losses:
     """The parts that `scaled_losses` adds up."""
     *sizes, desorption = jnp.asarray(scales, float)[: len(SCALES)]
     parts = terms.parts if terms.voltages is None else terms.at_voltage(scales[len(SCALES)])

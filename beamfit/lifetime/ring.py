@@ -12,6 +12,7 @@ from scipy import constants
 from beamfit.particles import REST_ENERGY
 from beamfit.shown import shown
 
+# Rest energy of the electron, eV.
 ELECTRON_MASS_EV = 1e6 * REST_ENERGY["electron"]
 ELECTRON_RADIUS = constants.physical_constants["classical electron radius"][0]
 
@@ -233,7 +234,9 @@ class Operation(NamedTuple):
 
 
 def unstored(operation: Operation, energy_loss: float, energy: float) -> str | None:
-    """What the RF voltage should be where it stores no beam of that loss and energy, eV; or None.
+    """Expected RF voltage, in words, if this one stores no beam of that loss and energy; or None.
+
+    Loss and energy are in eV.
 
     The main RF gives what a turn loses, less what the beam gains in a harmonic cavity.
     """

@@ -165,7 +165,7 @@ def touschek_loss(ring: Ring, operation: Operation, current: Array) -> Array:
 
 
 def touschek_shape(ring: Ring, operation: Operation) -> Callable[[Array], Array]:
-    """How the Touschek part of a depends on the beam current through bunch lengthening.
+    """Relative Touschek part of a as a function of beam current, through bunch lengthening.
 
     Parameters
     ----------

@@ -17,22 +17,18 @@ from beamfit.optics.arrays import value
 from beamfit.optics.calibration import FocusingStrength, IntegratedStrength
 from beamfit.optics.elements import IDENTITY, Element, Screen, SectorDipole, TransferMatrix
 from beamfit.optics.particle import ELECTRON_MASS
-from beamfit.optics.sections import Section, Series, in_series
+from beamfit.optics.sections import ElementSeries, LineSection, in_series
 from beamfit.shown import brief, shown
-from beamfit.table import Table
+from beamfit.table import MOST_ROWS, Table
 
 
 def _plain(value: Any) -> Any:
-    """What a value is made of: names of classes, texts and numbers."""
+    """A value as nested lists of class names, texts and numbers, for its digest."""
     if is_dataclass(value):
         return [type(value).__name__, *(_plain(getattr(value, f.name)) for f in fields(value))]
     if isinstance(value, tuple | list):
         return [_plain(v) for v in value]
     return value if isinstance(value, str | bool) or value is None else np.asarray(value).tolist()
-
-
-# Elements of a line that a notebook shows.
-MOST_SHOWN = 40
 
 
 @shown
@@ -86,7 +82,7 @@ class Beamline:
     2.0595
     """
 
-    elements: tuple[Element | Section | Series, ...]
+    elements: tuple[Element | LineSection | ElementSeries, ...]
     energy: ArrayLike
     name: str = "line"
     mass: float = ELECTRON_MASS
@@ -103,7 +99,7 @@ class Beamline:
 
     def tables(self) -> tuple[Table, ...]:
         """The first elements, to be shown."""
-        few = self.elements[:MOST_SHOWN]
+        few = self.elements[:MOST_ROWS]
         rows = [[e.name, type(e).__name__, brief(e.length), brief(e.setting)] for e in few]
         more = f"the first {len(few)} of {len(self)}" if len(few) < len(self) else ""
         return (Table(self.headline, ["element", "kind", "length m", "setting"], rows, more),)
@@ -128,7 +124,7 @@ class Beamline:
 
     @cached_property
     def _first(self) -> dict[str, int]:
-        """Where the first element of each name stands."""
+        """Index of the first element of each name."""
         return {e.name: i for i, e in reversed(tuple(enumerate(self.elements)))}
 
     @cached_property
@@ -355,13 +351,13 @@ class Beamline:
         >>> from beamfit.optics.elements import Drift
         >>> line = Beamline((Drift("A", 1.0), Drift("B", 2.0), Screen("S")), energy=100.0)
         >>> [type(e).__name__ for e in line.condensed(("S",)).elements]
-        ['Section', 'Screen']
+        ['LineSection', 'Screen']
         """
 
-        def one(part: Series) -> Section | Series:
+        def one(part: ElementSeries) -> LineSection | ElementSeries:
             if energy is None:
                 return part.multiplied()
-            return Section(part.matrix(None, energy).planes, part.length)
+            return LineSection(part.matrix(None, energy).planes, part.length)
 
         return self._with_parts(keep, one)
 

@@ -284,7 +284,7 @@ def scaled(calibration: Calibration, factor: ArrayLike) -> Calibration:
 
 
 def plain_meaning(unit: str, mass: float) -> Calibration | None:
-    """What settings in a unit mean that is none of a current; None of amperes.
+    """Calibration of settings in a unit other than amperes; None for amperes.
 
     Examples
     --------

@@ -15,7 +15,7 @@ from jax.typing import ArrayLike
 
 from beamfit.optics.arrays import array_module, floats
 
-# Below |k L²| = 0.5 the series is used; nine terms leave out less than 1e-18.
+# |k L²| below which the series is used; nine terms leave out less than 1e-18.
 _NEAR, _TERMS = 0.5, 9
 _SERIES = np.array(
     [[(-1) ** n / math.factorial(2 * n + m) for m in (0, 1, 2)] for n in range(_TERMS)]

@@ -16,11 +16,11 @@ from jax.typing import ArrayLike
 from beamfit.optics.beamline import Beamline
 from beamfit.optics.calibration import IntegratedStrength
 from beamfit.optics.elements import TransferMatrix
-from beamfit.optics.sections import Series
+from beamfit.optics.sections import ElementSeries
 
-# Elements, times rows, whose matrices are held at once where each row has its own energy.
+# Most matrices in memory, elements times rows, if each row has its own energy.
 MOST_AT_ONCE = 100_000
-# Numbers of a calibration that the line is differentiated by directly; a network has more.
+# Most numbers of a calibration by which the line is differentiated directly; a network has more.
 MOST_DIRECT = 3
 
 
@@ -135,7 +135,7 @@ def _rows(
         return through(places, strengths, bare, at)
 
     rows = (settings, None if jnp.ndim(energy) == 0 else energy)
-    long = max((e.order.size for e in line.elements if isinstance(e, Series)), default=0)
+    long = max((e.order.size for e in line.elements if isinstance(e, ElementSeries)), default=0)
     if jnp.size(energy) * long <= MOST_AT_ONCE:
         return TransferMatrix(jax.vmap(one)(rows))
     by_turns = jax.lax.map(jax.checkpoint(one), rows, batch_size=max(1, MOST_AT_ONCE // long))

@@ -20,12 +20,12 @@ from beamfit.optics.elements import IDENTITY, Marker, TransferMatrix
 
 
 @value("name")
-class Section:
+class LineSection:
     """A part of a line that is known as a whole: its transfer matrix and its length in m.
 
     Examples
     --------
-    >>> Section(IDENTITY.planes).matrix().x[0, 0].item()
+    >>> LineSection(IDENTITY.planes).matrix().x[0, 0].item()
     1.0
     """
 
@@ -40,7 +40,7 @@ class Section:
 
 
 @value("name")
-class Series:
+class ElementSeries:
     """Elements in series, stored by kind.
 
     Parameters
@@ -77,26 +77,28 @@ class Series:
         every += [p for p, t in zip(planes, traced, strict=True) if t]
         return TransferMatrix(_product(array_module(*every).concatenate(every)[order]))
 
-    def multiplied(self) -> Section | Series:
+    def multiplied(self) -> LineSection | ElementSeries:
         """Multiply out what does not depend on the energy: all of it, if nothing does.
 
         Examples
         --------
         >>> from beamfit.optics.elements import Drift
         >>> type(in_series((Drift("A", 1.0), Drift("B", 2.0))).multiplied()).__name__
-        'Section'
+        'LineSection'
         """
         # A kind that feels the energy is no number where the energy is none.
         planes = [_planes(k, np.nan) for k in self.kinds]
         feels = [bool(np.isnan(p).any()) for p in planes]
         if not any(feels):
-            return Section(self.matrix().planes, self.length)
+            return LineSection(self.matrix().planes, self.length)
         products, order = _multiplied(planes, feels, self.order)
         kept = (k for k, f in zip(self.kinds, feels, strict=True) if f)
-        return Series((*map(Section, products), *kept), order, self.length)
+        return ElementSeries((*map(LineSection, products), *kept), order, self.length)
 
 
-def in_series(elements: Iterable[Any], settings: Mapping[str, ArrayLike] | None = None) -> Series:
+def in_series(
+    elements: Iterable[Any], settings: Mapping[str, ArrayLike] | None = None
+) -> ElementSeries:
     """Store elements by kind, magnets at the settings given by name or else at their own.
 
     Markers and screens, which are no more than places, are left out. Numbers that JAX traces
@@ -115,7 +117,7 @@ def in_series(elements: Iterable[Any], settings: Mapping[str, ArrayLike] | None 
         groups.setdefault((kind, traced, alone), []).append((i, bare, leaves))
     kinds = tuple(_stacked(*key, members) for key, members in groups.items())
     places = [i for members in groups.values() for i, _, _ in members]
-    return Series(kinds, np.argsort(places), length)
+    return ElementSeries(kinds, np.argsort(places), length)
 
 
 def _stacked(kind: Any, traced: bool, alone: int | None, members: Sequence[Any]) -> Any:

@@ -13,37 +13,34 @@ from urllib.parse import quote
 from matplotlib import rc_context
 from matplotlib.figure import FigureBase
 
-from beamfit.batch.course import Course
+from beamfit.batch.course import ControlChart
 from beamfit.batch.run import Batch
 from beamfit.quantity import Quantity, display_unit
 from beamfit.report.document import (
     MANY,
     STYLE,
-    Page,
     Picture,
+    ReportPage,
     Verdict,
     control_chart,
     legend_below,
 )
 from beamfit.report.page import write_page, write_report
+from beamfit.statistics import BEYOND
 from beamfit.status import Status
-from beamfit.table import Table, plain_name
+from beamfit.table import MOST_ROWS, Table, plain_name
 
-# Points beyond the limits, and files without an answer, that are listed; the former have pages.
-LISTED = 40
 RULE = (
     "Control limits are those of an individuals chart: the mean of the first 20 points (half of "
     "them if there are fewer) ± 3 standard deviations from their mean moving range, Student's "
     "quantile; a point is beyond if it is also 3 of its own errors from the mean."
 )
-# How many points noise puts there.
-BY_CHANCE = 1 / 370
 
 
 def write_batch_report(
     path: str | PathLike[str],
     batch: Batch,
-    courses: Sequence[Course],
+    courses: Sequence[ControlChart],
     command: str | None = None,
 ) -> None:
     """Write the page of a batch, and single reports of the points beyond the limits.
@@ -55,7 +52,7 @@ def write_batch_report(
         after it; at most 40.
     batch : Batch
         The batch.
-    courses : sequence of Course
+    courses : sequence of ControlChart
         From `beamfit.batch.course.courses_of`.
     command : str, optional
         The command that made it.
@@ -71,7 +68,7 @@ def write_batch_report(
     )
     folder = target.with_name(f"{target.stem}_reports")
     links = []
-    for i, file in enumerate(islice(beyond, LISTED), start=1):
+    for i, file in enumerate(islice(beyond, MOST_ROWS), start=1):
         folder.mkdir(exist_ok=True)
         single = folder / f"{i:02d}_{Path(file).stem}.html"
         write_report(single, batch.ledger.job.fit(file))
@@ -80,7 +77,9 @@ def write_batch_report(
         write_page(target, _page(batch, courses, links), command)
 
 
-def _page(batch: Batch, courses: Sequence[Course], links: list[tuple[str, str]]) -> Page:
+def _page(
+    batch: Batch, courses: Sequence[ControlChart], links: list[tuple[str, str]]
+) -> ReportPage:
     job = batch.ledger.job
     answers = [[name.replace("_", " "), f"{n}"] for name, n in batch.statuses.items()]
     tables = [Table("Answers", ["status", "answers"], answers, numeric=True)]
@@ -90,18 +89,18 @@ def _page(batch: Batch, courses: Sequence[Course], links: list[tuple[str, str]])
             for file, value, error, off in zip(c.files, c.value, c.error, c.beyond, strict=True)
             if off
         ]
-        more = f"the first {LISTED} of {len(rows)}" if len(rows) > LISTED else ""
+        more = f"the first {MOST_ROWS} of {len(rows)}" if len(rows) > MOST_ROWS else ""
         title = f"Beyond the control limits: {_label(c)}"
-        tables += [Table(title, ["file", plain_name(c.name)], rows[:LISTED], more)] * bool(rows)
+        tables += [Table(title, ["file", plain_name(c.name)], rows[:MOST_ROWS], more)] * bool(rows)
     if batch.refused:
-        more = f"the first {LISTED} of {len(batch.refused)}; all are in the table of answers"
-        rows = [[reason] for reason in islice(batch.refused.values(), LISTED)]
-        note = more if len(batch.refused) > LISTED else ""
+        more = f"the first {MOST_ROWS} of {len(batch.refused)}; all are in the table of answers"
+        rows = [[reason] for reason in islice(batch.refused.values(), MOST_ROWS)]
+        note = more if len(batch.refused) > MOST_ROWS else ""
         tables.append(Table("Without an answer", ["file and reason"], rows, note))
     pictures = [
         Picture(f"course of {_label(c)}", 2.8, partial(draw_course, course=c)) for c in courses
     ]
-    return Page(
+    return ReportPage(
         title=f"{len(batch.files)} files: {job.kind}",
         subtitle="",
         verdicts=[_verdict(c) for c in courses],
@@ -115,11 +114,11 @@ def _page(batch: Batch, courses: Sequence[Course], links: list[tuple[str, str]])
     )
 
 
-def _label(c: Course) -> str:
+def _label(c: ControlChart) -> str:
     return f"{plain_name(c.name)} {c.of}".strip()
 
 
-def _verdict(c: Course) -> Verdict:
+def _verdict(c: ControlChart) -> Verdict:
     beyond, points = int(c.beyond.sum()), len(c.value)
     status = Status.poor_fit if beyond else Status.converged
     if not math.isfinite(c.limit):
@@ -128,20 +127,19 @@ def _verdict(c: Course) -> Verdict:
     factor, unit = display_unit(abs(c.centre), c.unit)
     usual = f"{c.centre / factor:.3g} ± {c.limit / factor:.2g} {unit}".strip()
     message = f"{beyond} of {points} points lie beyond the control limits"
-    message += (
-        f"; noise alone puts {max(points * BY_CHANCE, 1):.0f} or so there." if beyond else "."
-    )
+    by_chance = max(2 * points * (1 - BEYOND), 1)
+    message += f"; noise alone puts about {by_chance:.0f} there." if beyond else "."
     return Verdict(status, f"{_label(c)}: usually {usual}", message)
 
 
-def draw_course(figure: FigureBase, course: Course) -> None:
+def draw_course(figure: FigureBase, course: ControlChart) -> None:
     """Draw a quantity against the number of its file, with control limits.
 
     Parameters
     ----------
     figure : Figure or SubFigure
         Where to.
-    course : Course
+    course : ControlChart
         What.
     """
     axes, many = figure.subplots(), len(course.value) > MANY

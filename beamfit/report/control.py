@@ -7,7 +7,7 @@ from functools import partial
 import numpy as np
 from matplotlib.figure import FigureBase
 
-from beamfit.report.document import BLUE, RED, Page, Picture, Verdict
+from beamfit.report.document import BLUE, RED, Picture, ReportPage, Verdict
 from beamfit.report.response import about_runs
 from beamfit.studies.response.loop import Loop
 
@@ -18,11 +18,11 @@ NOTES = (
 )
 
 
-def control_page(loop: Loop) -> Page:
+def control_page(loop: Loop) -> ReportPage:
     """Lay out a loop."""
     runs = loop.fits[0].runs
     tables = [*loop.tables(), *(table for fit in loop.fits for table in fit.tables()[:1])]
-    return Page(
+    return ReportPage(
         title=f"Control of {', '.join(r.name for r in loop.control.responses)}",
         subtitle=f"a loop simulated on models of {', '.join(r.name for r in runs)}",
         verdicts=[Verdict.of(each) for each in (loop, *loop.fits)],

@@ -15,9 +15,10 @@ from beamfit.lifetime.decay import HOUR, current
 from beamfit.report.document import (
     BLUE,
     MANY,
+    MOST_DRAWN,
     RED,
-    Page,
     Picture,
+    ReportPage,
     Verdict,
     from_head,
     legend_below,
@@ -35,8 +36,6 @@ from beamfit.studies.decay.trend import Trend
 from beamfit.table import Table, labelled
 
 COLOURS = (BLUE, "#c98a00", "#2c7a3f", "#7b4fa3", RED, "#4f9aa3", "0.5")
-# Decays shown in one budget; more have no room for their names.
-MOST_BARS = 12
 
 ERRORS = (
     "dI/dt = -a I² - b I. Errors are one standard deviation, scaled by sqrt(χ²/dof) where that "
@@ -55,13 +54,13 @@ SHIFT = (
     "Scales multiply the ring file's first principles. Brackets are 68 % credible intervals. The "
     "best point is sought within the range of settings seen."
 )
-# Decays beside one another in one table.
+# Columns of a table of decays that fit the page.
 ABREAST = 2
 
 
 def decay_page(
     studies: Sequence[RecordStudy], shift: Shift | None = None, trend: Trend | None = None
-) -> Page:
+) -> ReportPage:
     """Lay out decay records.
 
     Parameters
@@ -75,7 +74,7 @@ def decay_page(
 
     Returns
     -------
-    Page
+    ReportPage
     """
     decays = [decay for study in studies for decay in study.decays]
     listed = []
@@ -97,7 +96,7 @@ def decay_page(
     hours = sum(study.record.span for study in studies) / 3600
     counts = {"cycle": sum(d.fit.first.size for d in pooled), "decay": len(decays)}
     count = ", ".join(f"{n} {what}" + "s" * (n > 1) for what, n in counts.items() if n)
-    return Page(
+    return ReportPage(
         title=f"Beam lifetime of {title}",
         subtitle=f"{count} in {hours:.3g} h of record",
         verdicts=[*_together(shift, trend), *map(_verdict, pooled), *_verdicts(decays)],
@@ -140,7 +139,7 @@ def _single(decays: Sequence[Decay]) -> list[Table]:
 
 
 def _verdicts(decays: Sequence[Decay]) -> list[Verdict]:
-    """One for each decay; of many decays one for each thing said."""
+    """Verdict of each decay; of many decays one for each distinct message."""
     if len(decays) <= tables.FEW:
         return [_verdict(decay) for decay in decays]
     return [Verdict(status, who, message) for status, who, message in tables.alike(decays)]
@@ -154,7 +153,7 @@ def _verdict(decay: Decay) -> Verdict:
 
 
 def _together(shift: Shift | None, trend: Trend | None) -> Iterator[Verdict]:
-    """What is said of all decays."""
+    """Verdicts on all decays together."""
     if shift is not None:
         fit, best, change = shift.fit, shift.best, shift.anomaly
         yield Verdict(fit.status, f"{len(fit.names)} decays together", fit.message)
@@ -306,7 +305,7 @@ def draw_budget(figure: FigureBase, decays: Sequence[Decay]) -> None:
         With budgets.
     """
     axes: Axes = figure.subplots()
-    shown = decays[:MOST_BARS]
+    shown = decays[:MOST_DRAWN]
     place = np.arange(len(shown))[::-1]
     left = np.zeros(len(shown))
     for cause, colour in zip(decays[0].budget.rates, cycle(COLOURS), strict=False):
@@ -322,7 +321,7 @@ def draw_budget(figure: FigureBase, decays: Sequence[Decay]) -> None:
             axes.errorbar(1 / found.value, y, xerr=error, fmt="D", color="black", mfc=hollow, ms=5)
     axes.errorbar([], [], fmt="D", color="black", ms=5, label="measured")
     axes.set_yticks(place, [decay.fit.record for decay in shown])
-    more = f", {MOST_BARS} of {len(decays)} decays" if len(decays) > MOST_BARS else ""
+    more = f", {MOST_DRAWN} of {len(decays)} decays" if len(decays) > MOST_DRAWN else ""
     axes.set(title=f"computed losses{more}", xlabel="loss rate at the mean current, 1/h")
     axes.set(xlim=(0, None), ylim=(-0.6, len(shown) - 0.4))
     legend_below(figure, axes, 5)
@@ -344,6 +343,6 @@ def _pictures(studies: Sequence[RecordStudy]) -> list[Picture]:
         listed.append(Picture(f"lifetime of {name}", 3.0, partial(draw_lifetime, study=study)))
     decays = [decay for study in studies for decay in study.answers]
     if all(decay.budget is not None for decay in decays):
-        height = 1.5 + 0.3 * min(len(decays), MOST_BARS)
+        height = 1.5 + 0.3 * min(len(decays), MOST_DRAWN)
         listed.append(Picture("loss budget", height, partial(draw_budget, decays=decays)))
     return listed

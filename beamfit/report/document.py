@@ -33,8 +33,10 @@ STYLE = {
 }
 # Blue and red of the page; those of the planes.
 BLUE, RED = "#1f5fa8", "#b5421f"
-# More points than this are drawn as an image: as curves they would fill the page with bytes.
+# Points above which a curve is drawn as an image, to keep the page small.
 MANY = 500
+# Most curves, bars or profiles in a picture; the tables have all.
+MOST_DRAWN = 12
 
 
 class Verdict(NamedTuple):
@@ -46,19 +48,19 @@ class Verdict(NamedTuple):
 
     @classmethod
     def of(cls, result: Any) -> Verdict:
-        """What a result says of itself."""
+        """Status, headline and message of a result."""
         return cls(result.status, result.headline, result.message)
 
 
 class Picture(NamedTuple):
-    """What a picture shows, its height in inches, and how to draw it into a figure."""
+    """A picture: alternative text, height in inches, and a function that draws it."""
 
     alt: str
     height: float
     draw: Callable[[FigureBase], None]
 
 
-class Page(NamedTuple):
+class ReportPage(NamedTuple):
     """A report: verdicts first, then tables with the pictures after the first one.
 
     ``links`` are names and addresses of further pages. Files and their SHA-256 in ``inputs``, and
@@ -79,8 +81,8 @@ class Page(NamedTuple):
 
 
 def written_now(
-    page: Page, command: str | None = None, inputs: Mapping[str, str | None] | None = None
-) -> Page:
+    page: ReportPage, command: str | None = None, inputs: Mapping[str, str | None] | None = None
+) -> ReportPage:
     """Say on a page when it is written and where it comes from: its own inputs unless given."""
     made = provenance(inputs or page.inputs or {}, page.remarks, command)
     subtitle = "; ".join(filter(None, (page.subtitle, written())))
@@ -102,12 +104,12 @@ def provenance(
 
 
 def written() -> str:
-    """When this is, for a subtitle."""
+    """Time of writing, for a subtitle."""
     return "written " + datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")
 
 
 def from_head(lines: Sequence[str]) -> tuple[str, ...]:
-    """What the head of a file says, as the notes of a page."""
+    """Comment lines at the head of a file, as notes of a page."""
     return ("From the head of the file:", *lines) if lines else ()
 
 
@@ -140,12 +142,12 @@ def legend_below(figure: FigureBase, axes: Axes, columns: int) -> None:
     figure.legend(*shown, frameon=False, loc="outside lower center", ncols=columns)
 
 
-def html_of(page: Page) -> bytes:
+def html_of(page: ReportPage) -> bytes:
     """Make the HTML form of a report, pictures inside.
 
     Parameters
     ----------
-    page : Page
+    page : ReportPage
         The report.
 
     Returns

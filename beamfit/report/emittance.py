@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from functools import partial
 from typing import Any
 
-from beamfit.report.document import Page, Picture, Verdict, from_head
+from beamfit.report.document import MOST_DRAWN, Picture, ReportPage, Verdict, from_head
 from beamfit.report.scan_pictures import (
     PROFILES_ABREAST,
     draw_ellipses,
@@ -24,9 +24,6 @@ from beamfit.studies.scan.sensitivity import budget_rows, range_rows
 from beamfit.studies.scan.size_methods import SizeMethods
 from beamfit.table import Table, labelled
 
-# Profiles in the picture.
-MOST_PROFILES = 12
-
 ERRORS = (
     "Errors are half of the central 68 % of the posterior, the noise averaged over. "
     "“Not determined” means the data put no error on the value; it is not to be quoted."
@@ -37,7 +34,7 @@ METHODS = (
 )
 
 
-def emittance_page(fit: EmittanceFit, methods: tuple[SizeMethods, ...] = ()) -> Page:
+def emittance_page(fit: EmittanceFit, methods: tuple[SizeMethods, ...] = ()) -> ReportPage:
     """Lay out an emittance fit.
 
     Parameters
@@ -49,7 +46,7 @@ def emittance_page(fit: EmittanceFit, methods: tuple[SizeMethods, ...] = ()) -> 
 
     Returns
     -------
-    Page
+    ReportPage
     """
     scan, line = fit.scan, fit.line
     names = [p.plane for p in fit.planes]
@@ -63,7 +60,7 @@ def emittance_page(fit: EmittanceFit, methods: tuple[SizeMethods, ...] = ()) -> 
     energy = f"{float(line.energy):g} MeV"
     if not fit.statement.closed:
         energy += f", scenario {fit.scenario}"
-    return Page(
+    return ReportPage(
         title=f"Emittance of {scan.name}",
         subtitle=f"{len(scan)} settings on line {line.name}, {energy}",
         verdicts=[Verdict(p.status, f"{p.plane}: {words_of(p)}", p.message) for p in fit.planes],
@@ -75,7 +72,7 @@ def emittance_page(fit: EmittanceFit, methods: tuple[SizeMethods, ...] = ()) -> 
 
 
 def about_input(notes: Sequence[str]) -> list[Table]:
-    """What is odd about a file, and what was done to its numbers."""
+    """Table of notes about the input: oddities, and changes made to its numbers."""
     return [Table("About the input", [], [[note] for note in notes])] if notes else []
 
 
@@ -90,7 +87,7 @@ def about_scan(scan: QuadScan) -> dict[str, Any]:
 
 
 def _budgets(fit: EmittanceFit, names: list[str]) -> list[Table]:
-    """What the emittance would be with another line or fewer points."""
+    """Tables of the emittance with another line and with fewer points."""
     changed = "Relative change of the normalised emittance, from exact derivatives."
     shifted = "Normalised emittance, and its shift in standard errors of the full fit."
     title, other = "If the line were a little different", "If some points were left out"
@@ -101,15 +98,15 @@ def _budgets(fit: EmittanceFit, names: list[str]) -> list[Table]:
 
 
 def _fitted_too(fit: EmittanceFit) -> list[Table]:
-    """What a scenario fitted besides the beam, and what the data leave open."""
-    header, parts = ["fitted too", "value", "bounds", "prior", "state"], []
+    """Tables of parameters fitted besides the beam, and of undetermined combinations."""
+    header, parts = ["parameter", "value", "bounds", "prior", "state"], []
     if rows := parameter_rows(fit.parameters):
         # What ties a network to the lattice; a calibration has priors instead.
         anchor = f"Anchor: {fit.anchor}." if fit.statement.network else ""
         parts.append(Table(f"Scenario {fit.scenario}", header, rows, anchor))
     if fit.null_directions:
         listed = [[words + "."] for words in fit.null_directions]
-        parts.append(Table("Left open by the data", [], listed))
+        parts.append(Table("Not determined by the data", [], listed))
     return parts
 
 
@@ -119,7 +116,7 @@ def _pictures(fit: EmittanceFit) -> list[Picture]:
         for p in fit.planes
     ]
     for p in fit.planes:
-        if shown := [f for f in fit.scan.profiles if f.plane == p.plane][:MOST_PROFILES]:
+        if shown := [f for f in fit.scan.profiles if f.plane == p.plane][:MOST_DRAWN]:
             height = 0.6 + 1.3 * math.ceil(len(shown) / PROFILES_ABREAST)
             draw = partial(draw_profiles, profiles=shown, fit=fit)
             listed.append(Picture(f"profiles of the {p.plane} plane", height, draw))

@@ -8,9 +8,9 @@ from functools import partial
 import numpy as np
 from matplotlib.figure import FigureBase
 
-from beamfit.report.document import BLUE, RED, Page, Picture, Verdict
+from beamfit.report.document import BLUE, RED, Picture, ReportPage, Verdict
 from beamfit.report.response import about_runs, draw_curve
-from beamfit.studies.fedbatch.feed import Course, FeedPlan
+from beamfit.studies.fedbatch.feed import FeedCourse, FeedPlan
 from beamfit.studies.fedbatch.fit import FedBatchFit
 from beamfit.studies.fedbatch.titre import Ranked, TitreFit
 
@@ -21,7 +21,7 @@ NOTES = (
 UNITS = {"biomass": "g/L", "substrate": "g/L", "volume": "L", "titre": "g/L"}
 
 
-def fedbatch_page(fits: Sequence[FedBatchFit | TitreFit]) -> Page:
+def fedbatch_page(fits: Sequence[FedBatchFit | TitreFit]) -> ReportPage:
     """Lay out the rates, and the titre if it was fitted."""
     rates = fits[0].rates if isinstance(fits[0], TitreFit) else fits[0]
     pictures = [
@@ -32,7 +32,7 @@ def fedbatch_page(fits: Sequence[FedBatchFit | TitreFit]) -> Page:
         Picture(f"{c.parameter} by {c.input} with its band", 2.8, partial(draw_curve, rates, j))
         for j, c in enumerate(rates.curves)
     ]
-    return Page(
+    return ReportPage(
         title="Fed-batch process",
         subtitle=f"identified from {', '.join(run.name for run in rates.runs)}",
         verdicts=[Verdict.of(fit) for fit in fits],
@@ -44,9 +44,9 @@ def fedbatch_page(fits: Sequence[FedBatchFit | TitreFit]) -> Page:
     )
 
 
-def feed_page(plan: FeedPlan) -> Page:
+def feed_page(plan: FeedPlan) -> ReportPage:
     """Lay out a planned feed."""
-    return Page(
+    return ReportPage(
         title="Feed profile",
         subtitle="planned on the identified process",
         verdicts=[Verdict.of(plan)],
@@ -77,8 +77,8 @@ def draw_batch(fit: FedBatchFit | TitreFit, i: int, figure: FigureBase) -> None:
     figure.align_ylabels(axes)
 
 
-def draw_course(course: Course, figure: FigureBase) -> None:
-    """What comes of a feed profile, with bands, and the feed below."""
+def draw_course(course: FeedCourse, figure: FigureBase) -> None:
+    """Draw the predicted course of a feed profile, with error bands, and the feed below."""
     axes = figure.subplots(len(course.value) + 1, 1, sharex=True)
     for axis, (name, value) in zip(axes, course.value.items(), strict=False):
         axis.plot(course.time, value, color=BLUE)
@@ -91,7 +91,7 @@ def draw_course(course: Course, figure: FigureBase) -> None:
 
 
 def draw_ranking(ranked: Sequence[Ranked], figure: FigureBase) -> None:
-    """What an output hangs on, as correlations of normal variables of as much information."""
+    """Draw the nonlinear correlation of an output with each input."""
     axes = figure.subplots()
     order = list(reversed(ranked))
     axes.barh([each.name for each in order], [each.correlation for each in order], color=BLUE)

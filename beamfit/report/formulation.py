@@ -9,26 +9,23 @@ import numpy as np
 from matplotlib.figure import FigureBase
 
 from beamfit.language.computed import Computed
-from beamfit.language.solution import Solution
+from beamfit.language.solution import ProblemSolution
 from beamfit.language.text import format_document
-from beamfit.report.document import BLUE, Page, Picture, Verdict
+from beamfit.report.document import BLUE, MOST_DRAWN, Picture, ReportPage, Verdict
 from beamfit.table import Table
 
-# Outputs that are drawn; the tables have all.
-MOST_DRAWN = 12
 
-
-def formulation_page(found: Solution) -> Page:
+def formulation_page(found: ProblemSolution) -> ReportPage:
     """Lay out a solution.
 
     Parameters
     ----------
-    found : Solution
+    found : ProblemSolution
         From `beamfit.language.solution.solve_document`.
 
     Returns
     -------
-    Page
+    ReportPage
     """
     p = found.fit.problem
     titles = ["Variables", *["Constraints"] * bool(found.fit.constraints)]
@@ -47,7 +44,7 @@ def formulation_page(found: Solution) -> Page:
     called = found.made.document.mapping.name
     sizes = {"variable": len(p.names), "limit": len(p.constraint_names)}
     counts = ", ".join(f"{n} {what}" + "s" * (n != 1) for what, n in sizes.items())
-    return Page(
+    return ReportPage(
         title=f"Formulation {called}".strip(),
         subtitle=f"{counts}, {goals}",
         verdicts=[
@@ -60,12 +57,12 @@ def formulation_page(found: Solution) -> Page:
     )
 
 
-def computed_page(found: Computed) -> Page:
+def computed_page(found: Computed) -> ReportPage:
     """Lay out a mapping computed."""
     titles = ["Outputs"] + ["Gains"] * bool(found.gains)
     tables = [t._replace(title=name) for name, t in zip(titles, found.tables(), strict=True)]
     counts = f"{len(found.outputs)} outputs"
-    return Page(
+    return ReportPage(
         title=f"Mapping {found.name}".strip(),
         subtitle=counts,
         verdicts=[],
@@ -75,21 +72,21 @@ def computed_page(found: Computed) -> Page:
     )
 
 
-def _drawn(found: Solution):
+def _drawn(found: ProblemSolution):
     """Outputs with one dimension: name, elements of its set, values."""
     arrays = found.made.program.scope.outputs
     lines = [(n, arrays[n].dims[0], v) for n, v in found.outputs.items() if v.ndim == 1]
     return lines[:MOST_DRAWN]
 
 
-def draw_outputs(figure: FigureBase, found: Solution) -> None:
+def draw_outputs(figure: FigureBase, found: ProblemSolution) -> None:
     """Draw every output that runs over one set, each in axes of its own.
 
     Parameters
     ----------
     figure : Figure or SubFigure
         Where to.
-    found : Solution
+    found : ProblemSolution
         The solution.
     """
     drawn = _drawn(found)

@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from typing import Any
 
 from beamfit.language.computed import Computed
-from beamfit.language.solution import Solution
+from beamfit.language.solution import ProblemSolution
 from beamfit.report.control import control_page
-from beamfit.report.document import Page
+from beamfit.report.document import ReportPage
 from beamfit.report.fedbatch import fedbatch_page, feed_page
 from beamfit.report.formulation import computed_page, formulation_page
 from beamfit.report.response import response_page
@@ -23,7 +23,7 @@ from beamfit.studies.scan.slices import SliceFits
 
 # A result by itself, and several beside one another.
 OF_ONE = {
-    Solution: formulation_page,
+    ProblemSolution: formulation_page,
     Computed: computed_page,
     SliceFits: slices_page,
     FeedPlan: feed_page,
@@ -33,7 +33,7 @@ OF_SEVERAL = dict.fromkeys((ResponseFit, StatesFit), response_page)
 OF_SEVERAL |= dict.fromkeys((FedBatchFit, TitreFit), fedbatch_page)
 
 
-def page_of(several: Sequence[Any]) -> Page:
+def page_of(several: Sequence[Any]) -> ReportPage:
     """The page of such a result, or of several."""
     kind = type(several[0])
     return OF_ONE[kind](several[0]) if kind in OF_ONE else OF_SEVERAL[kind](several)

@@ -17,8 +17,9 @@ from beamfit.studies.decay.budget import operation_during
 from beamfit.studies.decay.shift import Shift
 from beamfit.studies.decay.study import Decay
 
+# Points of a curve.
 POINTS = 33
-# Decays shown, as many as the report shows.
+# Decays drawn, as many as in the report's figure.
 SHOWN = 4
 SETTINGS = {
     "rf_voltage": (1e6, "RF voltage, MV"),

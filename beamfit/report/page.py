@@ -12,9 +12,9 @@ from matplotlib import rc_context
 
 from beamfit.errors import InputError
 from beamfit.report import kind_of
-from beamfit.report.document import STYLE, Page, Picture, drawn, html_of, written_now
+from beamfit.report.document import STYLE, Picture, ReportPage, drawn, html_of, written_now
 from beamfit.report.emittance import emittance_page
-from beamfit.report.posterior import Sampled, of_decay, of_scan, with_posteriors
+from beamfit.report.posterior import ReportedPosterior, of_decay, of_scan, with_posteriors
 from beamfit.sampling.posterior import Posterior
 from beamfit.studies.decay.fit import DecayFit
 from beamfit.studies.decay.study import RecordStudy
@@ -22,7 +22,7 @@ from beamfit.studies.scan.fit import EmittanceFit
 from beamfit.writing import write_atomically
 
 if TYPE_CHECKING:
-    from beamfit.language.solution import Solution
+    from beamfit.language.solution import ProblemSolution
     from beamfit.studies.decay.shift import Shift
     from beamfit.studies.decay.trend import Trend
     from beamfit.studies.fedbatch.feed import FeedPlan
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from beamfit.studies.scan.slices import SliceFits
 
     Reported = (
-        EmittanceFit | SliceFits | DecayFit | Solution | ResponseFit | Loop
+        EmittanceFit | SliceFits | DecayFit | ProblemSolution | ResponseFit | Loop
         | FedBatchFit | TitreFit | FeedPlan
     )  # fmt: skip
 
@@ -57,7 +57,7 @@ def write_report(
     path : str or path
         Ends in ``.html`` (self-contained) or ``.pdf``; in ``.png`` or ``.svg`` its pictures are
         written one by one, the first under this name. An existing file is replaced whole.
-    result : EmittanceFit, SliceFits, DecayFit, Solution, ResponseFit, Loop, or sequence
+    result : EmittanceFit, SliceFits, DecayFit, ProblemSolution, ResponseFit, Loop, or sequence
         The emittance of a scan or of the slices of a beam, the lifetime of a decay, a formulation
         solved, the response of a process, a simulated loop; or a sequence of RecordStudy (the
         lifetimes of whole records) or of ResponseFit (several outputs); the rates and the titre
@@ -96,7 +96,7 @@ def write_report(
     kind_of(path)  # says so if it is none
     with rc_context(STYLE):
         several = tuple(result) if isinstance(result, list | tuple) else (result,)
-        sampled: list[Sampled] = []
+        sampled: list[ReportedPosterior] = []
         first = several[0]
         if isinstance(first, EmittanceFit):
             page = emittance_page(first, methods)
@@ -116,7 +116,7 @@ def write_report(
 
 def write_page(
     path: str | PathLike[str],
-    page: Page,
+    page: ReportPage,
     command: str | None = None,
     inputs: Mapping[str, str | None] | None = None,
 ) -> None:
@@ -149,7 +149,7 @@ def _pictures(path: Path, pictures: Sequence[Picture]) -> dict[Path, bytes]:
 
 def _of_decays(
     studies: Sequence[RecordStudy], posterior: Posterior | Sequence[Posterior] | None
-) -> list[Sampled]:
+) -> list[ReportedPosterior]:
     if posterior is None:
         return []
     found = [posterior] if isinstance(posterior, Posterior) else posterior

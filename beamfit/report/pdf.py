@@ -14,14 +14,15 @@ from matplotlib.font_manager import FontProperties
 from matplotlib.textpath import text_to_path
 
 from beamfit.errors import plain
-from beamfit.report.document import Page, Picture
+from beamfit.report.document import Picture, ReportPage
 from beamfit.table import Table
 
 WIDTH, HEIGHT, MARGIN = 8.27, 11.69, 0.75  # A4, inches
+# Height of a line of text, inches.
 LINE = 0.185
-# Between columns of a table, inches; its letters, from the usual size to the smallest.
+# Gap between columns of a table, inches; size of its letters, usual and smallest, points.
 GAP, USUAL, SMALLEST = 0.22, 8.5, 6.0
-# A picture is made smaller by this at most to fit on a page.
+# Smallest factor by which a picture shrinks to fit on a page.
 LEAST = 0.7
 COLOUR = {"green": "#2c7a3f", "yellow": "#c98a00", "red": "#b3261e"}
 
@@ -121,7 +122,7 @@ class _Pages:
 
 
 def width_of(words: str, size: float, weight: str = "normal") -> float:
-    """How wide a line of text is, inches."""
+    """Width of a line of text, inches."""
     font = FontProperties(size=size, weight=weight)
     return text_to_path.get_text_width_height_descent(words, font, ismath=False)[0] / 72
 
@@ -168,7 +169,7 @@ def _columns(lines: Sequence[Sequence[str]]) -> tuple[np.ndarray, float]:
     return widths, size
 
 
-def pages_of(page: Page) -> list[Figure]:
+def pages_of(page: ReportPage) -> list[Figure]:
     """Lay a report out on pages: verdicts, the first table, the pictures, what remains."""
     pages = _Pages()
     pages.paragraph(page.title, size=16, weight="bold", step=1.6)
@@ -199,12 +200,12 @@ def pages_of(page: Page) -> list[Figure]:
     return pages.pages
 
 
-def pdf_of(page: Page) -> bytes:
+def pdf_of(page: ReportPage) -> bytes:
     """Make the PDF of a report.
 
     Parameters
     ----------
-    page : Page
+    page : ReportPage
         The report.
 
     Returns

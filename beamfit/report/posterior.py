@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from functools import partial
 from importlib.metadata import version
@@ -12,7 +13,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import FigureBase
 from matplotlib.ticker import MaxNLocator, NullLocator
 
-from beamfit.report.document import BLUE, MANY, Page, Picture, Verdict, legend_below
+from beamfit.report.document import BLUE, MANY, Picture, ReportPage, Verdict, legend_below
 from beamfit.report.scan_pictures import COLOUR, setting_axis
 from beamfit.sampling.intervals import Expected, in_unit
 from beamfit.sampling.likelihood import noise_words
@@ -24,20 +25,22 @@ from beamfit.studies.scan.posterior import expected_sizes
 from beamfit.table import Table, plain_name
 
 # Shares of the draws inside the contours of one and two standard deviations in two dimensions.
-INSIDE = (0.393, 0.865)
+INSIDE = tuple(1 - math.exp(-0.5 * r**2) for r in (1, 2))
+# Most numbers in a corner plot; more are too small to read.
 MOST_NUMBERS = 5
-# Draws beyond these quantiles are outside the axes.
+# Quantile of the draws at which the axes end.
 EDGE = 0.01
-# Beyond this correlation the bins of a histogram are wider than the distribution.
+# Correlation above which the bins of a histogram are wider than the distribution.
 ON_A_LINE = 0.95
 INTERVALS = (
     "Central credible intervals of the sampled posterior. Where the prior or the bounds decide a "
     "number and not the data, none is given."
 )
+# Most numbers in the table of correlations.
 MOST_CORRELATED = 8
 
 
-class Sampled(NamedTuple):
+class ReportedPosterior(NamedTuple):
     """A posterior in a report: its label if there are several, and its pictures."""
 
     label: str
@@ -45,19 +48,19 @@ class Sampled(NamedTuple):
     pictures: list[Picture]
 
 
-def with_posteriors(page: Page, sampled: Sequence[Sampled]) -> Page:
+def with_posteriors(page: ReportPage, sampled: Sequence[ReportedPosterior]) -> ReportPage:
     """Add posteriors to a page: intervals after its first table, the rest at its end.
 
     Parameters
     ----------
-    page : Page
+    page : ReportPage
         Of the fits.
-    sampled : sequence of Sampled
+    sampled : sequence of ReportedPosterior
         From `of_scan` or `of_decay`.
 
     Returns
     -------
-    Page
+    ReportPage
     """
     verdicts, intervals, further = [], [], []
     for label, found, _ in sampled:
@@ -90,7 +93,7 @@ def _coefficient(value: float) -> str:
 
 
 def _how_sampled(title: str, found: Posterior) -> Table:
-    """How the draws were made and what they are worth."""
+    """Table of the sampling: noise, priors, draws, convergence."""
     d = found.diagnostics
     rows = [
         ["status", found.status.value.replace("_", " ")],
@@ -243,7 +246,7 @@ def _expectations(
     legend_below(figure, axes, 3)
 
 
-def of_scan(fit: EmittanceFit, posterior: Posterior) -> Sampled:
+def of_scan(fit: EmittanceFit, posterior: Posterior) -> ReportedPosterior:
     """The posterior of a scan, with two pictures a sampled plane."""
     expected, pairs = [], []
     for p in fit.planes:
@@ -265,7 +268,7 @@ def of_scan(fit: EmittanceFit, posterior: Posterior) -> Sampled:
         expected.append(Picture(f"sizes expected in the {p.plane} plane", 3.4, draw))
         words, of_plane = f"numbers of the {p.plane} plane in pairs", f"{p.plane} plane: posterior"
         pairs.append(_pairs(words, posterior, names, of_plane, COLOUR[p.plane]))
-    return Sampled("", posterior, expected + pairs)
+    return ReportedPosterior("", posterior, expected + pairs)
 
 
 def _of_plane(posterior: Posterior, plane: str) -> list[str]:
@@ -276,10 +279,10 @@ def _of_plane(posterior: Posterior, plane: str) -> list[str]:
     return [name for name in names if name in posterior.shown][:MOST_NUMBERS]
 
 
-def of_decay(fit: DecayFit, posterior: Posterior, label: str = "") -> Sampled:
+def of_decay(fit: DecayFit, posterior: Posterior, label: str = "") -> ReportedPosterior:
     """The posterior of a decay, with two pictures if it was sampled."""
     if not posterior.chain.size:
-        return Sampled(label, posterior, [])
+        return ReportedPosterior(label, posterior, [])
     wanted = ("lifetime_mean", "a", "b", "noise", "error_factor", "outlier_fraction")
     names = [name for name in wanted if name in posterior.shown][:MOST_NUMBERS]
     draw = partial(
@@ -298,7 +301,7 @@ def of_decay(fit: DecayFit, posterior: Posterior, label: str = "") -> Sampled:
         _pairs(words, posterior, names, f"{fit.record}: posterior", BLUE),
         Picture(f"current expected of {fit.record}", 3.4, draw),
     ]
-    return Sampled(label, posterior, pictures)
+    return ReportedPosterior(label, posterior, pictures)
 
 
 def _pairs(

@@ -9,24 +9,24 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import FigureBase
 
-from beamfit.report.document import BLUE, RED, Page, Picture, Verdict
+from beamfit.report.document import BLUE, RED, Picture, ReportPage, Verdict
 from beamfit.studies.response.fit import ResponseFit
 from beamfit.studies.response.record import Run
-from beamfit.studies.response.states import Part, StatesFit
+from beamfit.studies.response.states import StatesFit, StateSpaceOutput
 
 NOTES = (
     "Errors are one standard deviation. The model runs free from the start of each run: measured "
     "outputs enter through their residuals only. Bands are one standard deviation; where they are "
     "missing the data put none on the curve, or were never there.",
 )
-# Points drawn of one run, and runs drawn.
+# Most points drawn of a run, and most runs drawn.
 MOST, RUNS = 4000, 6
 
 
-def response_page(fits: Sequence[ResponseFit | StatesFit]) -> Page:
+def response_page(fits: Sequence[ResponseFit | StatesFit]) -> ReportPage:
     """Lay out the responses of some outputs."""
     runs = fits[0].runs
-    return Page(
+    return ReportPage(
         title=f"Response of {', '.join(fit.output for fit in fits)}",
         subtitle=f"identified from {', '.join(run.name for run in runs)}",
         verdicts=[Verdict.of(fit) for fit in fits],
@@ -46,7 +46,7 @@ def about_runs(runs: Sequence[Run]) -> dict[str, Any]:
     }
 
 
-def _pictures(fit: ResponseFit | Part) -> list[Picture]:
+def _pictures(fit: ResponseFit | StateSpaceOutput) -> list[Picture]:
     runs = range(min(len(fit.runs), RUNS))
     found = [
         Picture(f"{fit.output} measured and simulated in {fit.runs[i].name}", 4.2,
@@ -61,7 +61,7 @@ def _pictures(fit: ResponseFit | Part) -> list[Picture]:
                             partial(_draw_correlations, fit))]  # fmt: skip
 
 
-def _draw_run(fit: ResponseFit | Part, i: int, figure: FigureBase) -> None:
+def _draw_run(fit: ResponseFit | StateSpaceOutput, i: int, figure: FigureBase) -> None:
     """Measured and simulated output, their difference, and the inputs."""
     run, time, y = fit.runs[i], fit.seen.time[i], fit.seen.measured[i]
     simulated = fit.fitted[i]
@@ -81,7 +81,7 @@ def _draw_run(fit: ResponseFit | Part, i: int, figure: FigureBase) -> None:
         below.legend(frameon=False, fontsize=8, ncols=len(run.inputs))
 
 
-def draw_curve(fit: ResponseFit | Part, j: int, figure: FigureBase) -> None:
+def draw_curve(fit: ResponseFit | StateSpaceOutput, j: int, figure: FigureBase) -> None:
     """A parameter against the operating point, dashed where the runs never were."""
     c = fit.curves[j]
     axes = figure.subplots()
@@ -98,7 +98,7 @@ def draw_curve(fit: ResponseFit | Part, j: int, figure: FigureBase) -> None:
         axes.set_ylim(inside.min() - edge, inside.max() + edge)
 
 
-def _draw_correlations(fit: ResponseFit | Part, figure: FigureBase) -> None:
+def _draw_correlations(fit: ResponseFit | StateSpaceOutput, figure: FigureBase) -> None:
     """Correlation of residuals with themselves and with past inputs, with the 99 % band of none."""
     own, others = figure.subplots(1, 2)
     rest = [y - s for y, s in zip(fit.seen.measured, fit.fitted, strict=True)]

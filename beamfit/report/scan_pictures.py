@@ -91,7 +91,7 @@ def _varied(p: PlaneFit) -> list[str]:
 
 
 def setting_axis(p: PlaneFit) -> tuple[np.ndarray, str]:
-    """Against what points are drawn: the setting of the one varied magnet, or else their number."""
+    """Horizontal axis of a scan: setting of the one varied magnet, or the number of the point."""
     varied = _varied(p)
     if len(varied) != 1:
         return np.arange(1, len(p.points.size) + 1), "measurement"
@@ -172,7 +172,7 @@ def draw_profiles(figure: FigureBase, profiles: list[Profile], fit: EmittanceFit
 
 
 def has_ellipses(p: PlaneFit) -> bool:
-    """Whether the data determine β and α, at the start and at the screen."""
+    """True if the data determine β and α, at the start and at the screen."""
     numbers = (p.emittance, p.beta, p.alpha, p.screen.beta, p.screen.alpha)
     known = all(q.error is not None and math.isfinite(q.value) for q in numbers)
     return known and p.emittance.value > 0

@@ -8,7 +8,7 @@ from itertools import islice
 from beamfit.studies.scan.results import PlaneFit, degrees
 from beamfit.table import cell
 
-# A longer table of points is cut, and says so.
+# Most rows in a table of points.
 MOST_ROWS = 500
 
 
@@ -18,7 +18,7 @@ def identifiability_rows(
     """Label and one cell per plane for what the data determine."""
     rows: list[tuple[str, Callable[[PlaneFit], object]]] = [
         ("emittance", lambda p: "determined" if p.identifiability.determined else "not determined"),
-        ("left open", lambda p: ", ".join(p.identifiability.undetermined) or "nothing"),
+        ("not determined", lambda p: ", ".join(p.identifiability.undetermined) or "nothing"),
         (
             "singular values",
             lambda p: ", ".join(f"{v:.3g}" for v in p.identifiability.singular_values),

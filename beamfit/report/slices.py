@@ -7,7 +7,7 @@ from functools import partial
 import numpy as np
 from matplotlib.figure import FigureBase
 
-from beamfit.report.document import Page, Picture, Verdict
+from beamfit.report.document import MOST_DRAWN, Picture, ReportPage, Verdict
 from beamfit.report.emittance import ERRORS, about_input, about_scan
 from beamfit.report.scan_pictures import COLOUR, draw_scan, words_of
 from beamfit.report.scan_tables import identifiability_rows, point_rows
@@ -17,15 +17,13 @@ from beamfit.studies.scan.scans import PROJECTED
 from beamfit.studies.scan.slices import SliceFits
 from beamfit.table import Table, labelled
 
-# Scans of more slices than these are in the tables alone.
-MOST_SCANS = 12
 FIXED = (
     "Each slice is fitted by its own rows and has a beam matrix of its own; magnets stay as they "
     "are for the line's energy."
 )
 
 
-def slices_page(fits: SliceFits) -> Page:
+def slices_page(fits: SliceFits) -> ReportPage:
     """Lay out the fits of the slices of a beam.
 
     Parameters
@@ -35,7 +33,7 @@ def slices_page(fits: SliceFits) -> Page:
 
     Returns
     -------
-    Page
+    ReportPage
     """
     scan, line = fits.scan, fits.fits[0].line
     found = [(f"{fit.scan.slices[0]}, {p.plane}", fit, p) for fit in fits for p in fit.planes]
@@ -50,9 +48,9 @@ def slices_page(fits: SliceFits) -> Page:
     pictures = [Picture("emittance of each slice", 3.8, partial(draw_slices, fits=fits))]
     pictures += [
         Picture(f"scan of slice {name}", 4.6, partial(draw_scan, fit=fit, plane=p.plane))
-        for name, fit, p in found[:MOST_SCANS]
+        for name, fit, p in found[:MOST_DRAWN]
     ]
-    return Page(
+    return ReportPage(
         title=f"Slice emittances of {scan.name}",
         subtitle=f"{len(scan)} rows of {len(fits)} slices on line {line.name}, "
         f"{float(line.energy):g} MeV",

@@ -7,16 +7,17 @@ from typing import NamedTuple
 import numpy as np
 
 from beamfit.sampling.likelihood import FRACTION, noise_words
-from beamfit.sampling.target import Target
+from beamfit.sampling.target import SamplingTarget
 from beamfit.status import Status
 from beamfit.table import plain_name
 from beamfit.verdict import Finding
 
-# Chains that agree; Vehtari et al., Bayesian Analysis 16, 667 (2021), advise 1.01.
+# R-hat below which chains agree: Vehtari et al., Bayesian Analysis 16, 667 (2021).
 AGREED = 1.01
-# emcee's advice for an estimate of the autocorrelation time that can be believed.
+# Autocorrelation times in a chain from which on their estimate is reliable (emcee's advice).
 LONG = 50
-# Data that leave this much of a prior's width have told a little more than half of what it did.
+# Posterior width, as a share of the prior's, above which the prior decides the answer: the data
+# then weigh about half as much as the prior.
 LITTLE = 0.8
 
 
@@ -43,7 +44,7 @@ class Diagnostics(NamedTuple):
 
     @property
     def settled(self) -> bool:
-        """Whether the walkers agree and the chain is long against its own memory."""
+        """True if the walkers agree and the chain is many autocorrelation times long."""
         if self.steps == 0:
             return False
         agreed = bool(np.max(self.rhat) < AGREED)
@@ -131,25 +132,25 @@ def diagnose(chain: np.ndarray) -> Diagnostics:
     return Diagnostics(times, steps * walkers / times, split_rhat(chain), steps, walkers)
 
 
-class Evidence(NamedTuple):
-    """What the rules look at: a chain's diagnostics, what was asked, and what the fit said.
+class ChainEvidence(NamedTuple):
+    """Input of the rules: the chain's diagnostics, the target, and the requested draws.
 
     `held` names the numbers asked for that the prior or the bounds decide.
     """
 
     diagnostics: Diagnostics
-    target: Target
+    target: SamplingTarget
     target_ess: float
     budget: int
     held: tuple[str, ...]
 
 
-def held_by_priors(target: Target, draws: np.ndarray) -> tuple[str, ...]:
+def held_by_priors(target: SamplingTarget, draws: np.ndarray) -> tuple[str, ...]:
     """Name the numbers whose posterior is about as wide as what held them beforehand.
 
     Parameters
     ----------
-    target : Target
+    target : SamplingTarget
         The problem.
     draws : array, shape (m, n)
         Its draws.
@@ -172,14 +173,14 @@ def held_by_priors(target: Target, draws: np.ndarray) -> tuple[str, ...]:
     )
 
 
-def _never_settled(e: Evidence) -> Finding | None:
+def _never_settled(e: ChainEvidence) -> Finding | None:
     if e.diagnostics.steps:
         return None
     said = f"The walkers did not settle within the budget of {e.budget} steps: raise it."
     return Finding(Status.not_converged, said)
 
 
-def _walkers_disagree(e: Evidence) -> Finding | None:
+def _walkers_disagree(e: ChainEvidence) -> Finding | None:
     if e.diagnostics.settled:
         return None
     worst = e.target.names[int(np.argmax(e.diagnostics.rhat / (1 + 1 / e.diagnostics.effective)))]
@@ -188,7 +189,7 @@ def _walkers_disagree(e: Evidence) -> Finding | None:
     return Finding(Status.not_converged, said)
 
 
-def _too_few_draws(e: Evidence) -> Finding | None:
+def _too_few_draws(e: ChainEvidence) -> Finding | None:
     if np.min(e.diagnostics.effective) >= e.target_ess:
         return None
     cause = f"The walkers agree, but the budget of {e.budget} steps ended before"
@@ -196,7 +197,7 @@ def _too_few_draws(e: Evidence) -> Finding | None:
     return Finding(Status.not_converged, said)
 
 
-def _priors_decide(e: Evidence) -> Finding | None:
+def _priors_decide(e: ChainEvidence) -> Finding | None:
     if not e.held:
         return None
     named = ", ".join(plain_name(name) for name in e.held)
@@ -206,7 +207,7 @@ def _priors_decide(e: Evidence) -> Finding | None:
     )
 
 
-def _poor_model(e: Evidence) -> Finding | None:
+def _poor_model(e: ChainEvidence) -> Finding | None:
     forgiving = any(group.inferred or group.outliers for group in e.target.groups)
     if e.target.verdict.status is not Status.poor_fit or forgiving:
         return None
@@ -214,7 +215,7 @@ def _poor_model(e: Evidence) -> Finding | None:
     return Finding(Status.poor_fit, f"{cause} mend the model, or infer the noise.")
 
 
-def _agreed(e: Evidence) -> Finding:
+def _agreed(e: ChainEvidence) -> Finding:
     return Finding(Status.converged, f"The walkers agree; errors {noise_words(e.target.groups)}.")
 
 

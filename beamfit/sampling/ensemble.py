@@ -1,4 +1,4 @@
-"""One sampler for every problem: start, warm up, sample, judge, go on or stop."""
+"""The sampler: start, warm up, sample, judge, go on or stop."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from beamfit.errors import InputError
 from beamfit.sampling import store as disk
-from beamfit.sampling.convergence import RULES, Diagnostics, Evidence, diagnose, held_by_priors
-from beamfit.sampling.moves import Proposal, about, fitted, moves_of, share_of
+from beamfit.sampling.convergence import RULES, ChainEvidence, Diagnostics, diagnose, held_by_priors
+from beamfit.sampling.moves import IndependenceProposal, about, fitted, moves_of, share_of
 from beamfit.sampling.posterior import Posterior
 from beamfit.sampling.store import FROM_PYTHON, Checkpoint, Provenance
-from beamfit.sampling.target import Target
+from beamfit.sampling.target import SamplingTarget
 from beamfit.status import Status
 from beamfit.verdict import judge
 from beamfit.writing import alone
@@ -25,17 +25,20 @@ from beamfit.writing import alone
 # Steps between two looks at the chain; every decision falls at a multiple, so that a run that was
 # interrupted decides as the uninterrupted one did.
 BLOCK = 50
-# Warm-up: rounds that end at these steps, until the walkers agree so well within half a round.
+# Steps at which the rounds of the warm-up end, until R-hat within half a round falls below WARM.
 ROUNDS = (100, 250, 500, 900, 1500, 2500)
+# R-hat that ends the warm-up.
 WARM = 1.15
+# Fewest walkers, for proposals fitted to them.
 FEWEST_WALKERS = 64
-# Share of time that may go into writing checkpoints.
+# Largest share of the time spent on writing checkpoints.
 WRITING = 0.05
+# Most draws of the walkers' starts until enough have a finite density.
 TRIES = 80
 
 
 def draw(
-    target: Target,
+    target: SamplingTarget,
     *,
     seed: int = 0,
     target_ess: float = 4000.0,
@@ -49,7 +52,7 @@ def draw(
 
     Parameters
     ----------
-    target : Target
+    target : SamplingTarget
         What to sample.
     seed : int
         Of the random numbers: the same seed, problem and versions give the same chain.
@@ -122,12 +125,14 @@ def _check_options(n: int, seed: int, target_ess: float, budget: int, walkers: i
         raise InputError(f"seed {seed!r}", "a whole number from 0 to 4294967295")
 
 
-def first_walkers(target: Target, number: int, random: np.random.RandomState) -> np.ndarray | None:
+def first_walkers(
+    target: SamplingTarget, number: int, random: np.random.RandomState
+) -> np.ndarray | None:
     """Place walkers inside the feasible set, spread as the fit's covariance says.
 
     Parameters
     ----------
-    target : Target
+    target : SamplingTarget
         What is to be sampled.
     number : int
         How many.
@@ -160,7 +165,11 @@ def first_walkers(target: Target, number: int, random: np.random.RandomState) ->
 
 
 def _blocks(
-    target: Target, state: Checkpoint, start: np.ndarray | None, target_ess: float, budget: int
+    target: SamplingTarget,
+    state: Checkpoint,
+    start: np.ndarray | None,
+    target_ess: float,
+    budget: int,
 ) -> Iterator[tuple[Checkpoint, Diagnostics | None]]:
     """Sample block by block; every decision depends on the chain alone."""
     proposal = _proposal(target, state)
@@ -189,7 +198,10 @@ def _judged(state: Checkpoint) -> Diagnostics | None:
 
 
 def _block(
-    target: Target, state: Checkpoint, start: np.ndarray | None, proposal: Proposal
+    target: SamplingTarget,
+    state: Checkpoint,
+    start: np.ndarray | None,
+    proposal: IndependenceProposal,
 ) -> Checkpoint:
     """Advance the chain by one block."""
     import emcee
@@ -218,16 +230,18 @@ def _half_round(state: Checkpoint) -> slice:
     return slice((before + state.began) // 2, state.began)
 
 
-def _proposal(target: Target, state: Checkpoint) -> Proposal:
-    """How to leap: about the fit at first, then as fitted to the walkers of half a round."""
+def _proposal(target: SamplingTarget, state: Checkpoint) -> IndependenceProposal:
+    """Proposal of long moves: about the fit at first, then fitted to the last half round."""
     along = target.names.index(target.along) if target.along else -1
     first = about(target.covariance, target.widening, target.blocks, 5.0, along)
     recent = state.chain[_half_round(state)]
     return fitted(recent.reshape(-1, recent.shape[2]), first) if state.began else first
 
 
-def _next_stage(target: Target, state: Checkpoint, proposal: Proposal) -> Checkpoint:
-    """How often to leap from now on, and whether the walkers agree, which ends the warm-up."""
+def _next_stage(
+    target: SamplingTarget, state: Checkpoint, proposal: IndependenceProposal
+) -> Checkpoint:
+    """Set the share of long moves from now on; end the warm-up once the walkers agree."""
     half = _half_round(state)
     recent, log_prob = state.chain[half], state.log_prob[half]
     # Chance of its own, so that looking at a proposal does not change the chain.
@@ -239,7 +253,7 @@ def _next_stage(target: Target, state: Checkpoint, proposal: Proposal) -> Checkp
     return state._replace(share=share, producing=bool(agreed) or state.began == ROUNDS[-1])
 
 
-def _refused(target: Target, seed: int, status: Status, said: str) -> Posterior:
+def _refused(target: SamplingTarget, seed: int, status: Status, said: str) -> Posterior:
     """A posterior that was not sampled, and why."""
     chain = np.zeros((0, 0, len(target.names)))
     every, nothing = (*target.derived_names, *target.names), diagnose(chain)
@@ -249,7 +263,9 @@ def _refused(target: Target, seed: int, status: Status, said: str) -> Posterior:
     )
 
 
-def _concluded(target: Target, state: Checkpoint, target_ess: float, budget: int) -> Posterior:
+def _concluded(
+    target: SamplingTarget, state: Checkpoint, target_ess: float, budget: int
+) -> Posterior:
     """Judge a finished chain."""
     chain, began = state.counting, state.began
     found = diagnose(chain)
@@ -258,7 +274,7 @@ def _concluded(target: Target, state: Checkpoint, target_ess: float, budget: int
         held = held_by_priors(target, chain.reshape(-1, chain.shape[2]))
     held = tuple(dict.fromkeys((*target.priors_own, *held)))
     shown = tuple(name for name in held if name not in target.hidden)
-    verdict = judge(Evidence(found, target, target_ess, budget, shown), RULES)
+    verdict = judge(ChainEvidence(found, target, target_ess, budget, shown), RULES)
     sampled = (
         f"{np.min(found.effective):.0f} effective draws after {began} steps left out "
         f"(autocorrelation {np.max(found.autocorrelation):.1f} steps, "

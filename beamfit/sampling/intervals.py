@@ -10,11 +10,9 @@ import numpy as np
 
 from beamfit.quantity import Quantity, display_unit
 from beamfit.shown import shown
-from beamfit.table import Table, plain_name
+from beamfit.table import MOST_ROWS, Table, plain_name
 
 HEADER = ("", "median", "68 % interval", "95 % interval")
-# A table of more numbers is cut, and says so.
-MOST_ROWS = 40
 
 
 class Interval(NamedTuple):
@@ -87,7 +85,7 @@ class Summary(NamedTuple):
 
 
 def interval_table(rows: Sequence[Summary], title: str = "", note: str = "") -> Table:
-    """One row a number: median and intervals."""
+    """Table with a row for each number: median and intervals."""
     cells = [row.row() for row in rows[:MOST_ROWS]]
     left = len(rows) - MOST_ROWS
     return Table(title, HEADER, [*cells, *([[f"and {left} more"]] if left > 0 else [])], note)
@@ -102,7 +100,7 @@ class Correlations(NamedTuple):
 
     @property
     def headline(self) -> str:
-        """Of what, in a line."""
+        """Names of the quantities, in a line."""
         return f"of {', '.join(self.names)}"
 
     def tables(self) -> tuple[Table, ...]:
@@ -124,7 +122,7 @@ class Band(NamedTuple):
 
 
 class Expected(NamedTuple):
-    """What a posterior expects of measurements; arrays of shape (n,) or (2, n).
+    """Posterior prediction of measurements; arrays of shape (n,) or (2, n).
 
     Attributes
     ----------

@@ -13,9 +13,9 @@ from jax import Array
 from beamfit.errors import InputError
 
 LOG_NOISE, FRACTION = "log_noise", "outlier_fraction"
-# An outlier's own error is unknown: anything from so many to so many of the stated ones.
+# Range of an outlier's own error, in units of the stated one; the prior is flat in its logarithm.
 NARROWEST, WIDEST = 3.0, 1e5
-# The noise is sought within a factor e^10 of where the fit saw it.
+# Half-range of the logarithm of the noise about the fit's value.
 NOISE_REACH = 10.0
 WORDS = {
     "known": "as stated",
@@ -34,8 +34,8 @@ class Own(NamedTuple):
     spread: float
 
 
-class Group(NamedTuple):
-    """How the points of one group scatter.
+class NoiseGroup(NamedTuple):
+    """Noise model of one group of points.
 
     Attributes
     ----------
@@ -59,12 +59,12 @@ class Group(NamedTuple):
 
     @property
     def prefix(self) -> str:
-        """Before the names of its numbers."""
+        """Prefix of the names of its numbers."""
         return f"{self.label}." if self.label else ""
 
     @property
     def inferred(self) -> bool:
-        """Whether the factor on its errors is free."""
+        """True if the factor on its errors is free."""
         return self.noise == "inferred"
 
     def own(self, factor: float = 1.0) -> tuple[Own, ...]:
@@ -83,12 +83,12 @@ class Group(NamedTuple):
         return (noise,) * self.inferred + (fraction,) * self.outliers
 
 
-def noise_words(groups: Sequence[Group]) -> str:
+def noise_words(groups: Sequence[NoiseGroup]) -> str:
     """Say of each group of points what is taken of its errors.
 
     Examples
     --------
-    >>> noise_words((Group("x", "inferred"), Group("y")))
+    >>> noise_words((NoiseGroup("x", "inferred"), NoiseGroup("y")))
     'x inferred from the residuals; y as stated'
     """
     said = [WORDS[group.noise] + (", with outliers" if group.outliers else "") for group in groups]
@@ -127,7 +127,7 @@ def outlier_density(residual: Array) -> Array:
     return jnp.where(near, limit, between) / math.log(WIDEST / NARROWEST)
 
 
-def _of_group(residual: Array, counts: Array, group: Group, extra: list[Array]) -> Array:
+def _of_group(residual: Array, counts: Array, group: NoiseGroup, extra: list[Array]) -> Array:
     if group.noise == "averaged":
         return jnp.zeros(())
     log_scale = extra.pop(0) if group.inferred else 0.0
@@ -149,7 +149,7 @@ def _of_group(residual: Array, counts: Array, group: Group, extra: list[Array]) 
 
 
 def log_likelihood(
-    residuals: Sequence[Array], counts: Sequence[Array], groups: Sequence[Group], extra: Array
+    residuals: Sequence[Array], counts: Sequence[Array], groups: Sequence[NoiseGroup], extra: Array
 ) -> Array:
     """Log likelihood of residuals, up to a constant.
 
@@ -159,7 +159,7 @@ def log_likelihood(
         One vector a group, in units of the stated errors.
     counts : sequence of bool or array of bool
         Which of them count; the others fill a vector up to its length.
-    groups : sequence of Group
+    groups : sequence of NoiseGroup
         How they scatter.
     extra : array, shape (k,)
         The groups' own numbers, in order.
@@ -173,7 +173,7 @@ def log_likelihood(
 
     Examples
     --------
-    >>> print(log_likelihood([jnp.array([1.0, 2.0])], [True], [Group()], jnp.zeros(0)))
+    >>> print(log_likelihood([jnp.array([1.0, 2.0])], [True], [NoiseGroup()], jnp.zeros(0)))
     -2.5
     """
     own = list(extra)

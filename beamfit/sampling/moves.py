@@ -10,15 +10,15 @@ import numpy as np
 from scipy.linalg import solve_triangular
 from scipy.special import gammaln, logsumexp
 
-# Degrees of freedom tried, from heavy tails to nearly none; a normal distribution has too few.
+# Degrees of freedom that are tried, from heavy tails to nearly normal.
 DEGREES = (4.0, 6.0, 10.0, 30.0)
-# Pieces, as long as each other, along a number with which the spread of others changes; draws a
-# number that one needs, and the least share of leaps there, since walkers stick in a tail.
+# Pieces of equal length along a number that changes the spread of others; draws that a piece needs
+# for each number; least share of long moves into a piece, since walkers stick in a tail.
 PIECES, EACH, RARE = 6, 20, 0.05
 
 
 class Widening(NamedTuple):
-    """How numbers spread with a noise that is itself inferred: twice the noise, twice as wide.
+    """Widening of the numbers with an inferred noise: twice the noise, twice as wide.
 
     Attributes
     ----------
@@ -112,8 +112,8 @@ class Mixture(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Proposal:
-    """Where to leap, whatever the place one leaps from.
+class IndependenceProposal:
+    """Proposal of long moves, independent of the walker's present place.
 
     As a proposal of `emcee.moves.MHMove` it makes an independence sampler (L. Tierney, Annals of
     Statistics 22, 1701 (1994), section 2.3): exact whatever the proposal, fast where it is near
@@ -187,7 +187,7 @@ def about(
     blocks: tuple[np.ndarray, ...],
     degrees: float = 5.0,
     along: int = -1,
-) -> Proposal:
+) -> IndependenceProposal:
     """Leap about a centre with the covariance of a fit.
 
     Parameters
@@ -195,34 +195,34 @@ def about(
     covariance : array, shape (n, n)
         Of which each block is used.
     widening, blocks, along
-        As of `Proposal`.
+        As of `IndependenceProposal`.
     degrees : float
         Of freedom.
 
     Returns
     -------
-    Proposal
+    IndependenceProposal
     """
     parts = (
         Student(np.zeros(len(block)), _root(covariance[np.ix_(block, block)]), degrees)
         for block in blocks
     )
-    return Proposal(widening, blocks, tuple(parts), along)
+    return IndependenceProposal(widening, blocks, tuple(parts), along)
 
 
-def fitted(points: np.ndarray, before: Proposal) -> Proposal:
+def fitted(points: np.ndarray, before: IndependenceProposal) -> IndependenceProposal:
     """Fit a proposal to draws from a posterior.
 
     Parameters
     ----------
     points : array, shape (m, n)
         Draws.
-    before : Proposal
+    before : IndependenceProposal
         Whose widening and blocks to keep.
 
     Returns
     -------
-    Proposal
+    IndependenceProposal
         Each part with the draws' mean and covariance and, of a few degrees of freedom, those of
         the highest likelihood; along a number with which the spread changes, piece by piece.
 
@@ -241,7 +241,7 @@ def fitted(points: np.ndarray, before: Proposal) -> Proposal:
         return _piecewise(evened[:, block], evened[:, before.along])
 
     parts = tuple(map(part, before.blocks))
-    return Proposal(before.widening, before.blocks, parts, before.along)
+    return IndependenceProposal(before.widening, before.blocks, parts, before.along)
 
 
 def _student(points: np.ndarray) -> Student:
@@ -252,7 +252,7 @@ def _student(points: np.ndarray) -> Student:
 
 
 def _piecewise(points: np.ndarray, along: np.ndarray) -> Mixture:
-    """From above, where the tail is: pieces with few draws are one with those below."""
+    """Pieces of the draws from the tail down; a piece with few draws joins the next."""
     ends = np.linspace(along.min(), along.max(), PIECES + 1)[1:-1]
     piece, pieces, few = np.searchsorted(ends, along), [], np.zeros(0, int)
     for k in reversed(range(PIECES)):
@@ -265,7 +265,7 @@ def _piecewise(points: np.ndarray, along: np.ndarray) -> Mixture:
 
 
 def share_of(
-    proposal: Proposal,
+    proposal: IndependenceProposal,
     points: np.ndarray,
     log_prob: np.ndarray,
     drawn: np.ndarray,
@@ -275,7 +275,7 @@ def share_of(
 
     Parameters
     ----------
-    proposal : Proposal
+    proposal : IndependenceProposal
         To be used.
     points, log_prob : array, shape (m, n) and (m,)
         Draws from the posterior.
@@ -294,12 +294,12 @@ def share_of(
     return 0.9 if accepted > 0.15 else (0.5 if accepted > 0.03 else 0.1)
 
 
-def moves_of(proposal: Proposal, share: float) -> list[tuple[Any, float]]:
+def moves_of(proposal: IndependenceProposal, share: float) -> list[tuple[Any, float]]:
     """Mix moves for emcee.
 
     Parameters
     ----------
-    proposal : Proposal
+    proposal : IndependenceProposal
         For the leaps.
     share : float
         Of steps that leap.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -23,7 +24,7 @@ from beamfit.sampling.intervals import (
 )
 from beamfit.sampling.likelihood import LOG_NOISE
 from beamfit.sampling.priors import in_words
-from beamfit.sampling.target import Target
+from beamfit.sampling.target import SamplingTarget
 from beamfit.shown import brief, shown
 from beamfit.status import Status
 from beamfit.table import Table, html_of, json_of, text_of
@@ -33,11 +34,12 @@ if TYPE_CHECKING:
     from pandas import DataFrame
 
 # One standard deviation of a normal distribution to each side.
-ONE_SIGMA = 0.6826894921370859
-# Draws from which functions of the user's are computed, unless all are asked for.
+ONE_SIGMA = math.erf(math.sqrt(0.5))
+# Default number of draws at which a user's function is computed.
 ENOUGH_DRAWS = 4000
-# Beyond this R-hat walkers sit in places of their own.
+# R-hat above which walkers are separated and intervals mean nothing.
 APART = 1.2
+# Default quantiles: median, central 68 % and 95 %.
 QUANTILES = (0.025, 0.16, 0.5, 0.84, 0.975)
 
 
@@ -48,7 +50,7 @@ class Posterior:
 
     Parameters
     ----------
-    target : Target
+    target : SamplingTarget
         What was sampled.
     chain : array, shape (steps, walkers, n)
         The draws, without the warm-up.
@@ -83,7 +85,7 @@ class Posterior:
     ('converged', '1.993 ± 0.027')
     """
 
-    target: Target
+    target: SamplingTarget
     chain: np.ndarray
     log_prob: np.ndarray
     status: Status
@@ -170,7 +172,7 @@ class Posterior:
             return Correlations(names, np.corrcoef(columns).reshape((len(names),) * 2))
 
     def thinned(self, number: int = ENOUGH_DRAWS) -> np.ndarray:
-        """So many draws, evenly spaced along the chain, or all if there are fewer."""
+        """`count` draws, evenly spaced along the chain, or all if there are fewer."""
         draws = self.draws
         if len(draws) <= number:
             return draws
@@ -237,7 +239,7 @@ class Posterior:
 
     @property
     def apart(self) -> bool:
-        """Whether the walkers lie so far apart that no interval of theirs means anything."""
+        """True if the walkers disagree so much that their intervals mean nothing."""
         rhat = self.diagnostics.rhat
         return bool(rhat.size and np.max(rhat) > APART)
 

@@ -15,7 +15,7 @@ from beamfit.errors import InputError, nearest
 
 @runtime_checkable
 class Distribution(Protocol):
-    """What a prior needs: frozen distributions of scipy.stats have it."""
+    """A prior's distribution; frozen distributions of scipy.stats have these methods."""
 
     def logpdf(self, x: np.ndarray) -> np.ndarray:
         """Log density; -inf outside the support."""

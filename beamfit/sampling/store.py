@@ -23,22 +23,22 @@ from beamfit.writing import write_atomically
 if TYPE_CHECKING:
     import h5py
 
-    from beamfit.sampling.target import Target
+    from beamfit.sampling.target import SamplingTarget
 
-# Another number for every change of what a store holds or of how a problem is told from another.
+# To be changed with every change of a store's content or of the digest of a problem.
 KIND, FORMAT = "beamfit-posterior", "3"
-# Bytes before the HDF5 file (its user block), which hold its digest.
+# Bytes of the HDF5 user block, which holds the file's digest.
 SEAL = 512
-# Steps whose stored density is computed again.
+# Steps whose stored density is recomputed to recognise the model.
 RECOMPUTED = 8
-# Agreement of log densities of the same model, compiled by two versions.
+# Relative difference in the log density of one model between two versions of a compiler.
 SAME = 1e-6
 PACKAGES = ("emcee", "h5py", "jax", "numpy", "scipy")
 REMEDY = "; name another file, or move this one away"
 
 
 class Provenance(NamedTuple):
-    """Where a posterior comes from.
+    """Origin of a posterior.
 
     Attributes
     ----------
@@ -95,12 +95,12 @@ class Checkpoint(NamedTuple):
 
 
 def _moved(chain: np.ndarray) -> np.ndarray:
-    """Whether each walker moved in each step, shape (steps - 1, walkers)."""
+    """True for each walker and step in which it moved, shape (steps - 1, walkers)."""
     return np.any(np.diff(chain, axis=0) != 0, axis=2)
 
 
 def _contents(
-    target: Target,
+    target: SamplingTarget,
     state: Checkpoint,
     provenance: Provenance,
     summary: Mapping[str, Any] | None,
@@ -148,7 +148,7 @@ def _storable(values: Any) -> np.ndarray:
 
 def save(
     path: str | PathLike[str],
-    target: Target,
+    target: SamplingTarget,
     state: Checkpoint,
     provenance: Provenance,
     summary: Mapping[str, Any] | None = None,
@@ -159,7 +159,7 @@ def save(
     ----------
     path : str or path
         Where to.
-    target : Target
+    target : SamplingTarget
         What is sampled.
     state : Checkpoint
         How far it came.
@@ -218,14 +218,16 @@ def _unsealed(content: bytes, path: str | PathLike[str]) -> bytes:
     raise InputError(found, f"a posterior store ({KIND}-{FORMAT}){REMEDY}", path=path)
 
 
-def load(path: str | PathLike[str], target: Target, seed: int, walkers: int) -> Checkpoint | None:
+def load(
+    path: str | PathLike[str], target: SamplingTarget, seed: int, walkers: int
+) -> Checkpoint | None:
     """Read a checkpoint of the same problem; the file is opened for reading only.
 
     Parameters
     ----------
     path : str or path
         The store.
-    target : Target
+    target : SamplingTarget
         What is to be sampled.
     seed, walkers : int
         As of the run that began it.
@@ -263,9 +265,14 @@ def load(path: str | PathLike[str], target: Target, seed: int, walkers: int) -> 
 
 
 def _difference(
-    state: Checkpoint, names: tuple[str, ...], digest: str, target: Target, seed: int, walkers: int
+    state: Checkpoint,
+    names: tuple[str, ...],
+    digest: str,
+    target: SamplingTarget,
+    seed: int,
+    walkers: int,
 ) -> tuple[str, str] | None:
-    """In what a store is not the one to continue, and what would be; None if it is."""
+    """Difference of a store from the run to continue, and what was expected; None if equal."""
     if names != target.names:
         found = f"the posterior of other numbers, {', '.join(names)}"
         return found, f"one of {', '.join(target.names)}"
@@ -302,7 +309,7 @@ def _checkpoint(file: h5py.File) -> Checkpoint:
 
 
 def finished(path: str | PathLike[str]) -> bool:
-    """Whether a store holds a finished chain with its summary."""
+    """True if a store holds a finished chain with its summary."""
     import h5py
 
     try:

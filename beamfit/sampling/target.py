@@ -15,7 +15,7 @@ from jax import Array
 from scipy.linalg import block_diag
 
 from beamfit.compile_cache import prepare_jax
-from beamfit.sampling.likelihood import LOG_NOISE, Group, log_likelihood
+from beamfit.sampling.likelihood import LOG_NOISE, NoiseGroup, log_likelihood
 from beamfit.sampling.moves import Widening
 from beamfit.sampling.priors import Distribution, in_words
 from beamfit.status import Status
@@ -27,7 +27,7 @@ prepare_jax()
 GOOD = Finding(Status.converged, "")
 
 
-class Law(NamedTuple):
+class PosteriorLaw(NamedTuple):
     """The functions of a problem, at the top of modules so that they are compiled once.
 
     Attributes
@@ -51,7 +51,7 @@ class Law(NamedTuple):
 
 @partial(jax.jit, static_argnames=("law", "groups"))
 def _log_densities(
-    data: Any, counts: Any, thetas: Array, law: Law, groups: tuple[Group, ...]
+    data: Any, counts: Any, thetas: Array, law: PosteriorLaw, groups: tuple[NoiseGroup, ...]
 ) -> Array:
     count = thetas.shape[1] - sum(len(group.own()) for group in groups)
 
@@ -65,7 +65,7 @@ def _log_densities(
 
 
 @partial(jax.jit, static_argnames=("law",))
-def _jacobian(data: Any, theta: Array, law: Law) -> list[Array]:
+def _jacobian(data: Any, theta: Array, law: PosteriorLaw) -> list[Array]:
     return jax.jacfwd(lambda moved: list(law.residual(data, moved)))(theta)
 
 
@@ -75,12 +75,12 @@ def _each(data: Any, thetas: Array, function: Callable[[Any, Array], Any]) -> An
 
 
 @dataclass(frozen=True, eq=False)
-class Target:
+class SamplingTarget:
     """A posterior to draw from.
 
     Parameters
     ----------
-    law : Law
+    law : PosteriorLaw
         Residuals, prior, derived numbers.
     data : pytree
         What the law needs.
@@ -92,7 +92,7 @@ class Target:
         Where a fit found the optimum.
     covariance : array, shape (n, n)
         Of the fit: the spread of the first walkers and the shape of the first proposals.
-    groups : tuple of Group
+    groups : tuple of NoiseGroup
         How the points scatter, one for each of the law's vectors of residuals.
     noise : tuple of float
         Factor on the stated errors that the fit's residuals show, one a group.
@@ -103,7 +103,7 @@ class Target:
     priors : mapping of str to distribution
         In addition to the law's own.
     derived : mapping of str to str
-        Names and units of what ``Law.derive`` gives.
+        Names and units of what ``PosteriorLaw.derive`` gives.
     observed : mapping of str to array
         The data, for the store, and to tell one problem from another.
     priors_own : tuple of str
@@ -131,14 +131,14 @@ class Target:
     ...     return ((theta[0] - data) / 0.1,)
     >>> def flat(data, theta):
     ...     return 0.0
-    >>> law = Law(residual, flat, lambda data, theta: theta[:0], lambda data, theta: theta)
-    >>> target = Target(law, np.array([1.0, 1.2]), ("level",), ("mm",), [-np.inf], [np.inf],
+    >>> law = PosteriorLaw(residual, flat, lambda data, theta: theta[:0], lambda data, theta: theta)
+    >>> target = SamplingTarget(law, np.array([1.0, 1.2]), ("level",), ("mm",), [-np.inf], [np.inf],
     ...                 [1.1], [[0.005]])
     >>> target.log_probability(np.array([[1.1], [1.2]])).round(3).tolist()
     [-1.0, -2.0]
     """
 
-    law: Law
+    law: PosteriorLaw
     data: Any
     names: tuple[str, ...]
     units: tuple[str, ...]
@@ -146,7 +146,7 @@ class Target:
     upper: np.ndarray
     mode: np.ndarray
     covariance: np.ndarray
-    groups: tuple[Group, ...] = (Group(),)
+    groups: tuple[NoiseGroup, ...] = (NoiseGroup(),)
     noise: tuple[float, ...] = (1.0,)
     counts: tuple[np.ndarray, ...] = ()
     noise_unit: str = "1"
@@ -220,7 +220,7 @@ class Target:
 
     @cached_property
     def widening(self) -> Widening:
-        """How the noise, where it is inferred, widens the law's numbers."""
+        """Widening of the law's numbers by each inferred noise."""
         noises = [group.prefix + LOG_NOISE for group in self.groups]
         places = np.array([self.names.index(n) if n in self.names else -1 for n in noises])
         source = np.full(len(self.names), -1)
@@ -242,7 +242,7 @@ class Target:
 
     @cached_property
     def derived_units(self) -> tuple[str, ...]:
-        """Their units."""
+        """Units of the derived numbers."""
         return (*self.derived.values(), *(self.noise_unit for g in self.groups if g.inferred))
 
     def derive(self, thetas: np.ndarray) -> np.ndarray:
@@ -281,7 +281,7 @@ def _digits(values: Any) -> bytes:
     return repr(values.shape).encode() + b"".join(part.tobytes() for part in parts)
 
 
-def slopes_of(law: Law, data: Any, theta: np.ndarray) -> list[np.ndarray]:
+def slopes_of(law: PosteriorLaw, data: Any, theta: np.ndarray) -> list[np.ndarray]:
     """Derivatives of a law's vectors of residuals by its numbers, each of shape (rows, n)."""
     return [np.asarray(part) for part in _jacobian(data, jnp.asarray(theta), law)]
 

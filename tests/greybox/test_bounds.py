@@ -10,7 +10,7 @@ from scipy.optimize import minimize_scalar
 from beamfit.errors import InputError
 from beamfit.greybox.activations import KINDS
 from beamfit.greybox.bounds import cells, gain_bounds, over_cells, value_bounds
-from beamfit.greybox.mlp import MLP, Gain, Layer, Port, dense
+from beamfit.greybox.mlp import MLP, Layer, NetworkGain, Port, dense
 
 sampled_gains = jax.jit(lambda net, x: jax.vmap(jax.jacfwd(net.values))(x))
 cell_bounds = jax.jit(over_cells, static_argnums=(1, 2, 3))
@@ -122,7 +122,10 @@ def test_infinite_boxes_give_the_global_range_of_the_slopes():
 
 
 def test_bounds_as_outputs_of_the_network():
-    gains = [Gain("low", "y", ("u",), "lower", 8), Gain("high", "y", ("u",), "upper", 8)]
+    gains = [
+        NetworkGain("low", "y", ("u",), "lower", 8),
+        NetworkGain("high", "y", ("u",), "upper", 8),
+    ]
     net = dense([Port("u", "", lower=-1.0, upper=2.0)], ["y"], gains=gains, seed=2)
     _, low, high = (float(v) for v in jax.jit(net.__call__)(jnp.array([0.0])))
     bound = cell_bounds(net, (-1.0,), (2.0,), 8)

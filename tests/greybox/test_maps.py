@@ -22,7 +22,7 @@ from beamfit.greybox.maps import (
     Parallel,
     Series,
 )
-from beamfit.greybox.mlp import MLP, Gain, dense
+from beamfit.greybox.mlp import MLP, NetworkGain, dense
 
 AFFINE = Affine(["a", "b"], ["p", "q"], [[1.0, -2.0], [0.5, 3.0]], [0.1, 0.2])
 FORMULA = Formula(
@@ -61,7 +61,7 @@ CASES = {
         start=[1.0, 0.0],
         parameters=0.4,
     ),
-    MLP: dense(["a", "b"], ["y", "z"], [3, 2], gains=[Gain("dy/da", "y", ("a",))]),
+    MLP: dense(["a", "b"], ["y", "z"], [3, 2], gains=[NetworkGain("dy/da", "y", ("a",))]),
     TaylorDifference: TaylorDifference(("u",), ("y", "z"), y_past=1, u_past=1, degree=2),
 }
 

@@ -9,7 +9,7 @@ import pytest
 from beamfit.errors import InputError
 from beamfit.greybox.activations import KINDS, Range, range_of
 from beamfit.greybox.gains import monotone_signs
-from beamfit.greybox.mlp import MLP, Gain, Layer, Port, dense
+from beamfit.greybox.mlp import MLP, Layer, NetworkGain, Port, dense
 from beamfit.io.formulation import read_network, write_network
 from beamfit.language.network import format_network, parse_network
 
@@ -76,7 +76,7 @@ def test_third_order_gain_of_a_single_tanh():
         [Port("y", "out", scale=2.0)],
         {"in->out": [[1.5]]},
         {"out": [0.2]},
-        [Gain(f"g{n}", "y", ("u",) * n) for n in (1, 2, 3)],
+        [NetworkGain(f"g{n}", "y", ("u",) * n) for n in (1, 2, 3)],
     )
     t = float(mpmath.tanh(mpmath.mpf(1.5) * 0.4 + 0.2))
     slope = 1 - t * t
@@ -138,7 +138,7 @@ def test_skip_connections_and_inputs_on_any_layer():
 
 def test_xml_round_trip_is_exact(tmp_path):
     ports = [Port("u", "", lower=-1.0, upper=2.0, scale=0.1), Port("v", "", bias=1 / 3)]
-    gains = [Gain("g", "y", ("u", "v")), Gain("top", "y", ("u",), "upper", 8)]
+    gains = [NetworkGain("g", "y", ("u", "v")), NetworkGain("top", "y", ("u",), "upper", 8)]
     net = dense(ports, ["y", "z"], [3, 2], kind="gaussian", seed=4, gains=gains)
     write_network(tmp_path / "net.xml", net)
     back = read_network(tmp_path / "net.xml")

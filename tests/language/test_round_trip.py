@@ -41,11 +41,11 @@ class Writer:
 
     def formula(self, depth=4):
         if depth == 0 or self.random.random() < 0.2:
-            return self.random.choice([x.Number(self.random.choice(NUMBERS)), x.Name(self.word())])
+            return self.random.choice([x.Literal(self.random.choice(NUMBERS)), x.Name(self.word())])
         inner = lambda: self.formula(depth - 1)  # noqa: E731
         kind = self.random.randrange(6)
         if kind == 0:
-            return x.Operation("-", (inner(),))
+            return x.Arithmetic("-", (inner(),))
         if kind == 1:
             return x.Application(self.word(), self.several(inner, 1, 3))
         if kind == 2:
@@ -53,7 +53,7 @@ class Writer:
         if kind == 3:
             each = self.several(lambda: self.iterator(depth - 1), 1, 2)
             return x.Reduction(self.random.choice(x.REDUCTIONS), each, inner())
-        return x.Operation(self.random.choice("+-*/@^"), (inner(), inner()))
+        return x.Arithmetic(self.random.choice("+-*/@^"), (inner(), inner()))
 
     def elements(self, depth):
         ranged = self.random.random() < 0.5
@@ -99,11 +99,12 @@ class Writer:
         return d.Declared(self.word(), self.dimensions(), values)
 
     def network(self):
-        named = lambda kind: d.Part(kind, (("name", self.word()), ("layer", self.text())))  # noqa: E731
+        named = lambda kind: d.NetworkElement(kind, (("name", self.word()), ("layer", self.text())))  # noqa: E731
         pair = (("srcName", self.word()), ("dstName", self.word()))
         numbers = self.several(self.value, 1, 3)
-        return d.Network(
-            self.word(), (named("input"), named("gain"), d.Part("connection", pair, numbers))
+        return d.NetworkDefinition(
+            self.word(),
+            (named("input"), named("gain"), d.NetworkElement("connection", pair, numbers)),
         )
 
     def table(self):
@@ -128,10 +129,10 @@ class Writer:
     def variable(self):
         pair = lambda: (self.value(), self.value())  # noqa: E731
         start = self.maybe(self.value), self.maybe(pair), self.random.randrange(99)
-        return d.Variable(self.text(), self.word(), *self.bounds(), *start)
+        return d.FreeInput(self.text(), self.word(), *self.bounds(), *start)
 
     def problem(self):
-        return d.Problem(
+        return d.ProblemStatement(
             self.several(lambda: d.Goal(self.text(), self.word(), self.value()), 1, 2),
             self.several(self.variable, 0, 2),
             self.several(lambda: d.Limit(self.text(), self.word(), *self.bounds()), 0, 2),

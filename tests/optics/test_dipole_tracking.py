@@ -186,4 +186,4 @@ def test_a_magnet_that_stays_bends_another_beam_as_a_slice(mass):
     assert len(stays.condensed(()).elements[0].kinds) > 0
     short = stays.condensed(("S",)).matrix(energy=1.01 * energy)
     np.testing.assert_allclose(short.planes, slice_, rtol=1e-13)
-    assert type(line().condensed(()).elements[0]).__name__ == "Section"
+    assert type(line().condensed(()).elements[0]).__name__ == "LineSection"

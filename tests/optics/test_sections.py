@@ -17,7 +17,7 @@ from beamfit.optics.beamline import Beamline
 from beamfit.optics.calibration import CurrentPolynomial, IntegratedGradient, SlopeIntercept
 from beamfit.optics.elements import Drift, Marker, Quadrupole, Screen, SectorDipole, ThinLens
 from beamfit.optics.rows import transfer_rows
-from beamfit.optics.sections import Section, Series, in_series
+from beamfit.optics.sections import ElementSeries, LineSection, in_series
 
 ENERGIES = np.array([95.0, 100.0, 104.0])
 
@@ -193,10 +193,10 @@ def test_what_feels_the_energy_stays_and_the_rest_is_multiplied_out():
     plain, gradient = Quadrupole("A", 0.1, 2.0), Quadrupole("B", 0.1, 2.0, IntegratedGradient())
     parts = (Drift("1", 1.0), plain, gradient, Drift("2", 1.0), gradient, Drift("3", 1.0), plain)
     series = in_series(parts).multiplied()
-    assert isinstance(series, Series)
-    assert [type(k) for k in series.kinds] == [Section, Quadrupole]
+    assert isinstance(series, ElementSeries)
+    assert [type(k) for k in series.kinds] == [LineSection, Quadrupole]
     assert series.order.tolist() == [0, 3, 1, 4, 2]
-    assert isinstance(in_series(parts[:2]).multiplied(), Section)
+    assert isinstance(in_series(parts[:2]).multiplied(), LineSection)
 
 
 def test_elements_that_share_a_kind_are_stored_in_one():

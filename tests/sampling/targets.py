@@ -5,7 +5,7 @@ from __future__ import annotations
 import jax.numpy as jnp
 import numpy as np
 
-from beamfit.sampling.target import Law, Target
+from beamfit.sampling.target import PosteriorLaw, SamplingTarget
 
 BANANA = (1.0, 1.0, 0.3)  # mean and sd of x, sd of y about x²
 PEAKS = (-3.0, 4.0, 0.6, 0.3)  # two places, their common sd, weight of the first
@@ -46,10 +46,12 @@ def gaussian(data, theta):
     return -0.5 * off @ data["precision"] @ off
 
 
-def target(density, n=2, lower=-np.inf, upper=np.inf, mode=None, covariance=None, **more) -> Target:
+def target(
+    density, n=2, lower=-np.inf, upper=np.inf, mode=None, covariance=None, **more
+) -> SamplingTarget:
     data = more.pop("data", {"none": np.zeros(0)})
-    return Target(
-        Law(nothing, density, none_derived, itself),
+    return SamplingTarget(
+        PosteriorLaw(nothing, density, none_derived, itself),
         data,
         tuple("xyzuvw"[:n]),
         ("1",) * n,

@@ -10,8 +10,8 @@ from scipy import integrate, stats
 from beamfit.errors import InputError
 from beamfit.sampling.convergence import autocorrelation_times, split_rhat
 from beamfit.sampling.ensemble import draw
-from beamfit.sampling.likelihood import Group, log_likelihood, outlier_density
-from beamfit.sampling.target import Law, Target
+from beamfit.sampling.likelihood import NoiseGroup, log_likelihood, outlier_density
+from beamfit.sampling.target import PosteriorLaw, SamplingTarget
 from tests.sampling.targets import itself, none_derived
 
 
@@ -24,9 +24,9 @@ def flat(data, theta):
 
 
 def level(y, error, group, noise=1.0):
-    law = Law(residual, flat, none_derived, itself)
+    law = PosteriorLaw(residual, flat, none_derived, itself)
     spread = noise**2 * error**2 / len(y)
-    return Target(
+    return SamplingTarget(
         law,
         {"y": np.asarray(y), "error": np.asarray(error)},
         ("level",),
@@ -44,7 +44,9 @@ def test_noise_inferred_is_students_distribution():
     """A mean with unknown noise, flat in the mean and in ln s: Student's t (1908)."""
     y = np.array([1.0, 1.4, 0.8, 1.1, 1.3, 0.7])
     scale = y.std(ddof=1) / np.sqrt(6)
-    found = draw(level(y, 0.1, Group("", "inferred"), y.std(ddof=1) / 0.1), seed=1, target_ess=8000)
+    found = draw(
+        level(y, 0.1, NoiseGroup("", "inferred"), y.std(ddof=1) / 0.1), seed=1, target_ess=8000
+    )
     exact = stats.t(5, loc=y.mean(), scale=scale)
     draws = found.thinned(2000)[:, 0]
     assert stats.kstest(draws, exact.cdf).pvalue > 1e-3
@@ -56,7 +58,7 @@ def test_noise_inferred_is_students_distribution():
 
 def test_noise_known_is_normal():
     y = np.array([1.0, 1.4, 0.8, 1.1])
-    found = draw(level(y, 0.1, Group()), seed=1, target_ess=8000)
+    found = draw(level(y, 0.1, NoiseGroup()), seed=1, target_ess=8000)
     assert found.values("level").mean() == pytest.approx(y.mean(), abs=0.003)
     assert found.values("level").std() == pytest.approx(0.05, rel=0.04)
 
@@ -64,7 +66,7 @@ def test_noise_known_is_normal():
 def test_outliers_are_left_alone():
     """Twenty good points and two wild ones: mean and fraction by quadrature."""
     y = np.concatenate([1.0 + 0.1 * np.random.default_rng(3).normal(size=20), [9.0, 30.0]])
-    found = draw(level(y, 0.1, Group("", "known", True)), seed=1, target_ess=8000)
+    found = draw(level(y, 0.1, NoiseGroup("", "known", True)), seed=1, target_ess=8000)
 
     fraction = np.linspace(0.0, 0.5, 401)[1:-1]
     level_at = np.linspace(0.85, 1.15, 301)
@@ -87,7 +89,7 @@ def test_the_outlier_density_is_a_mean_over_widths():
 
 
 def test_groups_have_noises_of_their_own():
-    groups = (Group("x", "inferred"), Group("y", "known"))
+    groups = (NoiseGroup("x", "inferred"), NoiseGroup("y", "known"))
     assert [number.name for group in groups for number in group.own()] == ["x.log_noise"]
     parts = (jnp.array([2.0, 4.0]), jnp.array([3.0]))
     value = log_likelihood(parts, (True, True), groups, jnp.array([np.log(2.0)]))
@@ -96,7 +98,7 @@ def test_groups_have_noises_of_their_own():
 
 def test_rows_that_only_fill_a_vector_count_nowhere():
     """With the noise inferred and outliers: the same density with three rows more."""
-    group, extra = Group("", "inferred", True), jnp.array([0.3, 0.2])
+    group, extra = NoiseGroup("", "inferred", True), jnp.array([0.3, 0.2])
     own = jnp.array([0.5, -1.0, 7.0])
     padded = jnp.concatenate([own, jnp.array([0.0, 9.0, jnp.nan])])
     counts = jnp.arange(6) < 3
@@ -106,7 +108,7 @@ def test_rows_that_only_fill_a_vector_count_nowhere():
 
 def test_noise_of_another_name():
     with pytest.raises(InputError, match="known or inferred"):
-        level([1.0, 2.0], 0.1, Group("", "guessed"))
+        level([1.0, 2.0], 0.1, NoiseGroup("", "guessed"))
 
 
 def test_autocorrelation_of_a_known_process():

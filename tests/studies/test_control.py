@@ -15,7 +15,7 @@ from beamfit.status import Status
 from beamfit.studies.response.control import controller
 from beamfit.studies.response.fit import identify
 from beamfit.studies.response.loop import closed_loop, simulate_loop
-from beamfit.studies.response.receding import Controller, Limits, Response, start
+from beamfit.studies.response.receding import Controller, ControlLimits, Response, start
 from beamfit.studies.response.record import Run
 
 INF = np.inf
@@ -28,7 +28,7 @@ def response(physics, p, m=1, delay=0, margin=0.05, of=None, name="y"):
 
 def made(*responses, horizon=10, rate=0.3, above=INF, step=0.5, m=1, smooth=0.1):
     many = len(responses)
-    limits = Limits(np.zeros(m), np.full(m, 2.0), np.full(m, rate), np.full(many, -INF),
+    limits = ControlLimits(np.zeros(m), np.full(m, 2.0), np.full(m, rate), np.full(many, -INF),
                     np.broadcast_to(above, many))  # fmt: skip
     names = tuple(f"u{i}" for i in range(m))
     return Controller(names, responses, step, np.ones(m), limits, horizon, smooth)

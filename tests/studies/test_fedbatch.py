@@ -19,7 +19,7 @@ from beamfit.studies.fedbatch.feed import best_feed, predict
 from beamfit.studies.fedbatch.fit import identify_batches
 from beamfit.studies.fedbatch.model import STATES, bounds_of, course, network_of, rates_at
 from beamfit.studies.fedbatch.titre import fit_titre, rank_inputs
-from beamfit.studies.fedbatch.verdict import RULES, Evidence
+from beamfit.studies.fedbatch.verdict import RULES, RateEvidence
 from beamfit.studies.response.record import Run
 from beamfit.verdict import judge
 
@@ -160,7 +160,7 @@ def test_residuals_that_follow_one_another_are_no_noise(fit):
     fitted = np.asarray(course(fit.fit.model, fit.seen.batches))
     slow = 1.0 + 0.02 * np.sin(np.arange(fitted.shape[1]) / 4)[None, :, None]
     for factor, status in ((1.0, Status.converged), (slow, Status.poor_fit)):
-        evidence = Evidence(fit.fit, True, fit.seen, factor * fitted, fit.noise, fit.curves)
+        evidence = RateEvidence(fit.fit, True, fit.seen, factor * fitted, fit.noise, fit.curves)
         assert judge(evidence, RULES).status is status
 
 

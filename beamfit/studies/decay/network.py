@@ -26,7 +26,8 @@ from beamfit.greybox.mlp import MLP, Layer, Port
 from beamfit.greybox.problem import Free, Prior, Problem, Record
 from beamfit.greybox.solve import solve
 from beamfit.lifetime.decay import HOUR
-from beamfit.lifetime.losses import Terms, loss_terms, scaled_losses
+from beamfit.lifetime.losses import LossTerms as Terms
+from beamfit.lifetime.losses import loss_terms, scaled_losses
 from beamfit.lifetime.ring import Operation
 from beamfit.quantity import Quantity
 from beamfit.shown import shown

@@ -16,7 +16,8 @@ from beamfit.errors import InputError
 from beamfit.greybox.design import Information, scores
 from beamfit.lifetime.decay import HOUR
 from beamfit.lifetime.decay import current as decayed
-from beamfit.lifetime.losses import Terms, loss_terms, scaled_losses
+from beamfit.lifetime.losses import LossTerms as Terms
+from beamfit.lifetime.losses import loss_terms, scaled_losses
 from beamfit.lifetime.ring import Operation
 from beamfit.quantity import Quantity, Status
 from beamfit.sampling.posterior import Posterior

@@ -27,7 +27,7 @@ from beamfit.noise.correlated import (
 from beamfit.sampling.intervals import Expected
 from beamfit.sampling.posterior import Posterior
 from beamfit.sampling.priors import Distribution
-from beamfit.sampling.target import Target
+from beamfit.sampling.target import SamplingTarget as Target
 from beamfit.studies.decay.law import DecayNumbers, Moments, monitored_current
 from beamfit.studies.decay.model import RECORD, apart, decay_problem
 from beamfit.studies.decay.record import DecayRecord

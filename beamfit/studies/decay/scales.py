@@ -19,7 +19,8 @@ from beamfit.greybox.posterior import target_of
 from beamfit.greybox.problem import Free, Prior, Problem, Record
 from beamfit.greybox.solve import solve
 from beamfit.greybox.stated import Optimum, Statement
-from beamfit.lifetime.losses import SCALES, Terms, loss_terms, scaled_losses
+from beamfit.lifetime.losses import SCALES, loss_terms, scaled_losses
+from beamfit.lifetime.losses import LossTerms as Terms
 from beamfit.lifetime.ring import Operation
 from beamfit.quantity import Quantity, Status
 from beamfit.shown import shown

@@ -21,12 +21,12 @@ from beamfit.studies.fedbatch.titre import TITRE, TitreFit, predicted
 from beamfit.table import Table
 
 OUTPUTS = (*STATES, TITRE)
-# Rows of a plan, and rounds in which its limits are held off by the errors it then has.
+# Rows of a plan, and rounds in which its safety margins follow the errors of the plan.
 ROWS, ROUNDS = 31, 3
 
 
-class Course(NamedTuple):
-    """What comes of a feed profile.
+class FeedCourse(NamedTuple):
+    """Predicted course of a batch under a feed profile.
 
     Attributes
     ----------
@@ -65,7 +65,7 @@ def _ahead(model: Any, asked: tuple[Batches, Any]) -> Any:
 
 def predict(
     fit: TitreFit, time: np.ndarray, inputs: Mapping[str, Any], start: tuple[float, ...]
-) -> Course:
+) -> FeedCourse:
     """Predict a batch.
 
     Parameters
@@ -81,7 +81,7 @@ def predict(
 
     Returns
     -------
-    Course
+    FeedCourse
 
     Raises
     ------
@@ -93,7 +93,7 @@ def predict(
     n, found = len(time), fit.fit.derive(_ahead, (b, jnp.asarray(start, float)))
     value, error = (dict(zip(OUTPUTS, part[:n].T, strict=True))
                     for part in (found.value, found.error))  # fmt: skip
-    return Course(time, np.asarray(b.flow.feed)[0, :n], value, error)
+    return FeedCourse(time, np.asarray(b.flow.feed)[0, :n], value, error)
 
 
 def _one(
@@ -118,7 +118,7 @@ class FeedPlan:
     ----------
     status : Status
         Of the search; ``message`` says what holds the plan.
-    course : Course
+    course : FeedCourse
         What comes of it.
     hours : Quantity
         Its length, with the error that the titre's makes.
@@ -130,14 +130,14 @@ class FeedPlan:
 
     status: Status
     message: str
-    course: Course
+    course: FeedCourse
     hours: Quantity
     product: Quantity
     fit: Fit
 
     @property
     def headline(self) -> str:
-        """What was found, in a line."""
+        """The answer in a line."""
         return f"feed {self.status}: {self.hours} for {self.product.value:.4g} g of product"
 
     def tables(self) -> tuple[Table, ...]:

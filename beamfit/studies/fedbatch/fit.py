@@ -1,4 +1,4 @@
-"""From batches to judged rates: a search with the noise that its residuals have, bands, verdict."""
+"""Fit of growth rates to batches: search, noise from the residuals, bands, verdict."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from beamfit.studies.fedbatch.model import (
     FLOWS,
     RATES,
     STATES,
-    Seen,
+    PreparedBatches,
     bounds_of,
     course,
     filled,
@@ -31,21 +31,21 @@ from beamfit.studies.fedbatch.model import (
     seen_of,
     state,
 )
-from beamfit.studies.fedbatch.verdict import RULES, Evidence, Noise, noise_of
+from beamfit.studies.fedbatch.verdict import RULES, RateEvidence, ReadingNoise, noise_of
 from beamfit.studies.response.case import rounds
-from beamfit.studies.response.curve import Curve
+from beamfit.studies.response.curve import NEAR, POINTS, Curve
 from beamfit.studies.response.record import Run, ordered
 from beamfit.table import Table, json_of
 from beamfit.verdict import judge
 
-# Steps of a round, after which the noise is taken from the residuals again; rounds at most, and
-# the gain in -2 ln L below which nothing is gained any more.
+# Steps of a round, after which the noise is estimated again; most rounds; gain in -2 ln L below
+# which they end.
 STEPS, ROUNDS, GAINED = 60, 8, 0.5
-# The first guess at the noise, a share of the values.
+# First estimate of the noise, as a share of the values.
 FIRST = 0.1
-# Points of a curve; it was visited where so many rows are within a share of its range, and within
-# a wider share of the range of whatever else the rates hang on. It begins at a share of its end.
-POINTS, VISITS, NEAR, BESIDE, LEAST = 41, 3, 0.05, 0.5, 1e-3
+# A point of a curve is visited if this many rows are NEAR it, and in the other inputs of the rates
+# within this share of their range. A curve begins at this share of its end.
+VISITS, BESIDE, LEAST = 3, 0.5, 1e-3
 
 
 @shown
@@ -59,13 +59,13 @@ class FedBatchFit:
         How far to believe it; ``message`` says why and what to do.
     runs : tuple of Run
         The batches.
-    seen : Seen
+    seen : PreparedBatches
         The same as the model sees them.
     fit : Fit
         The grey-box fit.
     curves : tuple of Curve
         mu_b and mu_s against each thing they hang on, the others at their means, 1/h.
-    noise : dict of str to Noise
+    noise : dict of str to ReadingNoise
         Of biomass, substrate and volume.
     held : dict of str to float
         Residual of each batch that was held back, rms in units of the noise.
@@ -74,15 +74,15 @@ class FedBatchFit:
     status: Status
     message: str
     runs: tuple[Run, ...]
-    seen: Seen
+    seen: PreparedBatches
     fit: Fit
     curves: tuple[Curve, ...]
-    noise: dict[str, Noise]
+    noise: dict[str, ReadingNoise]
     held: dict[str, float]
 
     @property
     def headline(self) -> str:
-        """What was found, in a line."""
+        """The answer in a line."""
         points = ", ".join(self.fit.model["rates"].inputs)
         return f"mu_b, mu_s {self.status}: of {points}, from {len(self.runs)} batches"
 
@@ -172,7 +172,7 @@ def identify_batches(
     curves = curves_of(fit, seen)
     ahead = {run.name: _held_back(run, seen, fit, noise) for run in held}
     y = np.asarray(course(fit.model, seen.batches))
-    found = judge(Evidence(fit, rests, seen, y, noise, curves, ahead), RULES)
+    found = judge(RateEvidence(fit, rests, seen, y, noise, curves, ahead), RULES)
     return FedBatchFit(found.status, found.message, tuple(runs), seen, fit, curves, noise, ahead)
 
 
@@ -199,7 +199,7 @@ def check_names(names: Sequence[str], known: Sequence[str], what: str) -> None:
             raise InputError(f"{what} that hang on '{name}'", nearest(name, list(known)))
 
 
-def _first(seen: Seen, names: Sequence[str], hidden: int, seed: int) -> dict[str, Any]:
+def _first(seen: PreparedBatches, names: Sequence[str], hidden: int, seed: int) -> dict[str, Any]:
     """The model a search begins with: rates of half their bounds, states as first read."""
     b, start, points = seen.batches, [], []
     values = np.where(seen.read, seen.measured, np.nan)
@@ -219,22 +219,22 @@ def _first(seen: Seen, names: Sequence[str], hidden: int, seed: int) -> dict[str
 class _Searched(NamedTuple):
     fit: Fit
     model: Any
-    noise: list[Noise]
+    noise: list[ReadingNoise]
     error: np.ndarray
     likelihood: float
 
 
-def _errors(noise: Iterable[Noise], values: np.ndarray) -> np.ndarray:
+def _errors(noise: Iterable[ReadingNoise], values: np.ndarray) -> np.ndarray:
     return np.stack([each.errors(values[..., k]) for k, each in enumerate(noise)], axis=-1)
 
 
 def settled(
-    seen: Seen,
+    seen: PreparedBatches,
     model: Any,
     stated: Callable[..., Problem] = state,
     fitted: Callable[..., jax.Array] = course,
     names: Sequence[str] = STATES,
-) -> tuple[Fit, dict[str, Noise], bool]:
+) -> tuple[Fit, dict[str, ReadingNoise], bool]:
     """Search in rounds, each with the noise of the last one's residuals, until nothing is gained.
 
     The third value tells whether the search rests.
@@ -251,7 +251,7 @@ def settled(
         return _Searched(fit, model, noise, error, minus)
 
     # Begun as a share of the values: where all errors are alike, small values are never looked at.
-    found = search(model, _errors([Noise(FIRST, True)] * len(names), seen.measured))
+    found = search(model, _errors([ReadingNoise(FIRST, True)] * len(names), seen.measured))
     found, rests = rounds(found, lambda f: search(f.model, f.error), GAINED, ROUNDS - 1)
     rests |= found.fit.status is Status.converged
     return found.fit, dict(zip(names, found.noise, strict=True)), rests
@@ -265,7 +265,7 @@ def _rates(model: Any, asked: tuple[Any, Any, Any]) -> jax.Array:
     return jax.vmap(lambda x, u: rates_at(b, model["rates"], x, u))(x, u)
 
 
-def curves_of(fit: Fit, seen: Seen) -> tuple[Curve, ...]:
+def curves_of(fit: Fit, seen: PreparedBatches) -> tuple[Curve, ...]:
     """Each rate against each thing it hangs on, the others at their means."""
     b = seen.batches
     found = np.asarray(course(fit.model, b))
@@ -289,7 +289,7 @@ def curves_of(fit: Fit, seen: Seen) -> tuple[Curve, ...]:
     return tuple(made)
 
 
-def _held_back(run: Run, seen: Seen, fit: Fit, noise: dict[str, Noise]) -> float:
+def _held_back(run: Run, seen: PreparedBatches, fit: Fit, noise: dict[str, ReadingNoise]) -> float:
     """Rms residual, over the noise, of a batch of which only the states at the start are fitted."""
     own, net = seen_of([run], seen.batches), fit.model["rates"]
     model = _first(own, net.inputs, 1, 0) | {"rates": net}

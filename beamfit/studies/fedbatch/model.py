@@ -14,6 +14,7 @@ from beamfit.dynamics.states import StateSpace
 from beamfit.greybox import tree
 from beamfit.greybox.mlp import MLP, Port, dense
 from beamfit.greybox.problem import Free, Problem, Record
+from beamfit.quantity import HOUR
 from beamfit.studies.response.model import weight_priors
 from beamfit.studies.response.record import Run
 
@@ -21,16 +22,15 @@ STATES = ("biomass", "substrate", "volume")
 RATES = ("mu_b", "mu_s")
 # Inputs that are no operating point but flows: of liquid, and what it brings.
 FLOWS = ("feed", "feed_substrate", "outflow")
-HOUR = 3600.0
-# Rates reach so many times the largest that one of so many stretches of a batch shows.
+# Upper bound of a rate, in units of the largest one of any of this many stretches of a batch.
 ABOVE, STRETCHES = 2.0, 8
-# Shares of the usual high substrate (a percentile): below the first consumption slows down; below
-# the second all rates fall in proportion.
+# Percentile of the substrate that serves as its scale; shares of it below which consumption slows
+# down, and below which all rates fall in proportion.
 USUAL, SHORT, LITTLE = 90.0, 0.1, 0.01
-# A step of the integration, of a power of 2 to so many a row, is at most so many of the shortest
-# times in which substrate is eaten: the method is stable to 2.8.
+# Longest step of the integration in units of the shortest time of consumption (the method is stable
+# to 2.8), and most steps in a row of data.
 STABLE, MOST_STEPS = 2.0, 64
-# Batches are padded to a multiple of so many rows.
+# Batches are padded to a multiple of this many rows, so that they share compiled code.
 PADDED = 32
 
 
@@ -53,7 +53,7 @@ class Batches:
     little: Any
 
 
-class Seen(NamedTuple):
+class PreparedBatches(NamedTuple):
     """Batches with what was read: `measured` and `read`, shape (batches, rows, outputs)."""
 
     batches: Batches
@@ -63,9 +63,9 @@ class Seen(NamedTuple):
 
 
 def known_at(b: Batches, x: Any, u: Any) -> dict[str, Any]:
-    """What a network may see, by name: states, the substrate by its logarithm, and inputs.
+    """Inputs of the networks by name: states, with the substrate's logarithm, and batch inputs.
 
-    Of the logarithm both ends of Monod's and Haldane's curves are alike.
+    In the logarithm both ends of Monod's and Haldane's curves are equally smooth.
     """
     known = dict(zip((*STATES, *b.inputs), [*x, *u], strict=True))
     return known | {"substrate": jnp.log(jnp.maximum(x[1], 0.0) + b.little)}
@@ -134,13 +134,13 @@ def bounds_of(runs: Sequence[Run], most: tuple[float, float] | None) -> Batches:
     return Batches(tuple(runs[0].inputs), steps, None, None, None, jnp.asarray(most), little)
 
 
-def seen_of(runs: Sequence[Run], like: Batches) -> Seen:
+def seen_of(runs: Sequence[Run], like: Batches) -> PreparedBatches:
     """Batches as the model sees them, like others."""
     hours = tuple((run.time - run.time[0]) / HOUR for run in runs)
     batches = batches_of(hours, [run.inputs for run in runs], like)
     read = [np.stack([run.outputs[s] for s in STATES], axis=1) for run in runs]
     measured = padded(read, batches.dt.shape[1], np.nan)
-    return Seen(batches, np.nan_to_num(measured), np.isfinite(measured), hours)
+    return PreparedBatches(batches, np.nan_to_num(measured), np.isfinite(measured), hours)
 
 
 def _sizes(runs: Sequence[Run]) -> tuple[np.ndarray, float, float]:
@@ -180,7 +180,7 @@ def network_of(
     return dense(ports, list(outputs), [hidden], seed=seed, spread=0.3)
 
 
-def state(seen: Seen, model: Any, noise: np.ndarray) -> Problem:
+def state(seen: PreparedBatches, model: Any, noise: np.ndarray) -> Problem:
     """State the problem; `noise`, of the shape of the readings, is a guess that they correct."""
     record = Record(
         "batches", course, seen.batches, seen.measured, error=noise, weight=seen.read * 1.0,

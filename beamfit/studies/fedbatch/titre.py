@@ -26,7 +26,7 @@ from beamfit.studies.fedbatch.model import (
     RATES,
     STATES,
     Batches,
-    Seen,
+    PreparedBatches,
     course,
     filled,
     known_at,
@@ -34,13 +34,13 @@ from beamfit.studies.fedbatch.model import (
     padded,
     rates_at,
 )
-from beamfit.studies.fedbatch.verdict import RULES, Evidence, Noise
+from beamfit.studies.fedbatch.verdict import RULES, RateEvidence, ReadingNoise
 from beamfit.studies.response.model import weight_priors
 from beamfit.table import Table, json_of
 from beamfit.verdict import judge
 
 TITRE = "titre"
-# What is free in the first stage and in this one; steps of both together from where each rests.
+# Free parts of the first stage and of this one; steps of the joint search from their two optima.
 STAGES, OWN, JOINT = ("rates", "start"), ("make", "begin"), 5
 
 
@@ -55,24 +55,24 @@ class TitreFit:
         How far to believe it; ``message`` says why and what to do.
     rates : FedBatchFit
         The first stage.
-    seen : Seen
+    seen : PreparedBatches
         Its batches, with the readings of the titre.
     fit : Fit
         Of both stages: the first stage's numbers have its own errors as their prior.
-    noise : Noise
+    noise : ReadingNoise
         Of the titre.
     """
 
     status: Status
     message: str
     rates: FedBatchFit
-    seen: Seen
+    seen: PreparedBatches
     fit: Fit
-    noise: Noise
+    noise: ReadingNoise
 
     @property
     def headline(self) -> str:
-        """What was found, in a line."""
+        """The answer in a line."""
         points = ", ".join(self.fit.model["make"].inputs)
         return f"titre {self.status}: of {points}, noise {self.noise}"
 
@@ -140,7 +140,7 @@ def fit_titre(
     model = dict(rates.fit.model) | _known(rates.fit) | _first(rates, seen, points, hidden, seed)
     fit, noise, rests = settled(seen, model, _state, _titres, (TITRE,))
     y = np.asarray(_titres(fit.model, b))
-    found = judge(Evidence(fit, rests, seen, y, noise), RULES)
+    found = judge(RateEvidence(fit, rests, seen, y, noise), RULES)
     error = noise[TITRE].errors(y[..., 0])[..., None]
     both = solve(_state(seen, fit.model, error, (*STAGES, *OWN)), iterations=JOINT)
     return TitreFit(found.status, found.message, rates, seen, both, noise[TITRE])
@@ -156,7 +156,7 @@ def _known(fit: Fit) -> dict[str, Any]:
 
 
 def _first(
-    rates: FedBatchFit, seen: Seen, points: Sequence[str], hidden: int, seed: int
+    rates: FedBatchFit, seen: PreparedBatches, points: Sequence[str], hidden: int, seed: int
 ) -> dict[str, Any]:
     b, top, values = seen.batches, [], []
     for i, (x, t) in enumerate(zip(rates.courses, seen.time, strict=True)):
@@ -203,7 +203,9 @@ def _held(model: Any) -> jax.Array:
     return model["known"] @ tree.read(first, leaves) - model["found"]
 
 
-def _state(seen: Seen, model: Any, error: np.ndarray, free: Sequence[str] = OWN) -> Problem:
+def _state(
+    seen: PreparedBatches, model: Any, error: np.ndarray, free: Sequence[str] = OWN
+) -> Problem:
     record = Record(
         TITRE, _titres, seen.batches, seen.measured, error=error, weight=seen.read * 1.0, worth=1.0
     )
@@ -216,8 +218,8 @@ def _state(seen: Seen, model: Any, error: np.ndarray, free: Sequence[str] = OWN)
 
 
 class Ranked(NamedTuple):
-    """What an output hangs on: mutual information in nats, and the correlation of normal
-    variables that have as much, sqrt(1 - e^(-2 I)) (E. H. Linfoot, Information and Control 1
+    """Dependence of an output on one input: mutual information in nats, and the correlation of
+    normal variables with as much, sqrt(1 - e^(-2 I)) (E. H. Linfoot, Information and Control 1
     (1957) 85).
     """
 

@@ -10,27 +10,27 @@ import numpy as np
 
 from beamfit.greybox.fit import Fit
 from beamfit.status import Status
-from beamfit.studies.fedbatch.model import RATES, Seen
+from beamfit.studies.fedbatch.model import RATES, PreparedBatches
 from beamfit.studies.response.curve import Curve
+from beamfit.studies.response.verdict import WORSE
 from beamfit.verdict import Finding
 
-# Noise that goes with the value has this share of the largest as its floor.
+# Floor of a relative noise, as a share of the one at the largest value.
 FLOOR = 0.05
-# Neighbouring residuals are alike beyond chance from so many standard errors on (p < 1e-3).
+# Standard errors beyond which neighbouring residuals are correlated (p < 1e-3).
 ALIKE = 3.1
-# Rates above this share of their bound are held by it; a batch held back is predicted where its
-# residuals are at most so many times the noise.
-BOUND, WORSE = 0.95, 2.0
+# Rates above this share of their bound count as at the bound.
+BOUND = 0.95
 
 
-class Noise(NamedTuple):
+class ReadingNoise(NamedTuple):
     """Noise of an output: a share of the value where `relative`, else the same everywhere."""
 
     size: float
     relative: bool
 
     def errors(self, values: np.ndarray) -> np.ndarray:
-        """One standard deviation of each value."""
+        """Standard deviation of each value."""
         if not self.relative:
             return np.full_like(values, self.size)
         return self.size * np.hypot(values, FLOOR * np.max(np.abs(values)))
@@ -39,36 +39,36 @@ class Noise(NamedTuple):
         return f"{100 * self.size:.2g} % of the value" if self.relative else f"{self.size:.3g}"
 
 
-def noise_of(rest: np.ndarray, fitted: np.ndarray, read: np.ndarray) -> Noise:
+def noise_of(rest: np.ndarray, fitted: np.ndarray, read: np.ndarray) -> ReadingNoise:
     """The noise of one output, of the kind that is likelier."""
     found = []
     for relative in (False, True):
-        unit = Noise(1.0, relative).errors(fitted)[read]
+        unit = ReadingNoise(1.0, relative).errors(fitted)[read]
         size = max(float(np.sqrt(np.mean((rest[read] / unit) ** 2))), 1e-12)
-        found.append((float(np.sum(np.log(size * unit))), Noise(size, relative)))
+        found.append((float(np.sum(np.log(size * unit))), ReadingNoise(size, relative)))
     return min(found, key=lambda each: each[0])[1]
 
 
-class Evidence(NamedTuple):
-    """What the rules look at; `fitted` has the shape of the readings."""
+class RateEvidence(NamedTuple):
+    """Input of the rules; `fitted` has the shape of the readings."""
 
     fit: Fit
     rests: bool
-    seen: Seen
+    seen: PreparedBatches
     fitted: np.ndarray
-    noise: dict[str, Noise]
+    noise: dict[str, ReadingNoise]
     curves: tuple[Curve, ...] = ()
     held: Mapping[str, float] = MappingProxyType({})
 
 
-def _lost(e: Evidence) -> Finding | None:
+def _lost(e: RateEvidence) -> Finding | None:
     if e.rests and e.fit.status is not Status.not_finite:
         return None
     lost = e.fit.status is Status.not_finite
     return Finding(Status.not_finite if lost else Status.not_converged, e.fit.message)
 
 
-def _open(e: Evidence) -> Finding | None:
+def _open(e: RateEvidence) -> Finding | None:
     left = [f"{c.parameter}({c.input})" for c in e.curves
             if not np.any(np.isfinite(c.error) & c.visited & (c.error < c.value))]  # fmt: skip
     if not left:
@@ -77,7 +77,7 @@ def _open(e: Evidence) -> Finding | None:
     return Finding(Status.unidentified, cause, "Add batches that visit more, or read more often.")
 
 
-def _bounded(e: Evidence) -> Finding | None:
+def _bounded(e: RateEvidence) -> Finding | None:
     most = dict(zip(RATES, np.asarray(e.seen.batches.most), strict=True))
     held = {c.parameter for c in e.curves
             if np.any(c.value[c.visited] > BOUND * most[c.parameter])}  # fmt: skip
@@ -87,7 +87,7 @@ def _bounded(e: Evidence) -> Finding | None:
     return Finding(Status.at_limit, cause, "Give higher bounds (most=) if the physics allows.")
 
 
-def _refuted(e: Evidence) -> Finding | None:
+def _refuted(e: RateEvidence) -> Finding | None:
     """Residuals that follow one another; those of free numbers fitted to them lean away."""
     follow, squares, count = np.zeros(len(e.noise)), np.zeros(len(e.noise)), 0
     for k, noise in enumerate(e.noise.values()):
@@ -107,7 +107,7 @@ def _refuted(e: Evidence) -> Finding | None:
     return Finding(Status.poor_fit, cause, remedy)
 
 
-def _worse(e: Evidence) -> Finding | None:
+def _worse(e: RateEvidence) -> Finding | None:
     bad = {name: r for name, r in e.held.items() if r > WORSE}
     if not bad:
         return None
@@ -116,7 +116,7 @@ def _worse(e: Evidence) -> Finding | None:
     return Finding(Status.poor_fit, cause, "Use batches that cover its range, or fewer nodes.")
 
 
-def _good(e: Evidence) -> Finding:
+def _good(e: RateEvidence) -> Finding:
     said = ", ".join(f"{name} {noise}" for name, noise in e.noise.items())
     cause = f"The balances follow all batches within noise: {said}."
     never = sorted({c.input for c in e.curves if not c.visited.all()})

@@ -16,21 +16,20 @@ from beamfit.greybox.problem import Constraint, Free, Prior, Problem, Record
 from beamfit.greybox.solve import solve
 from beamfit.noise.correlated import Noise, innovations, remembers
 from beamfit.status import Status
-from beamfit.studies.response.model import CLOSE, Seen, output_of, predicted
+from beamfit.studies.response.model import CLOSE, PreparedOutput, output_of, predicted
 from beamfit.studies.response.noise import noise_of
 
-# Rounds with a memory of the noise at most, and the gain in -2 ln L below which nothing is gained
-# any more.
+# Most rounds with a memory of the noise, and the gain in -2 ln L below which they end.
 AGAIN, GAINED = 3, 0.05
 
 
 class Case(NamedTuple):
-    """What is to be fitted: each output as seen, each run, and what is free, known and limited.
+    """A fit to be made: prepared outputs, runs, free numbers, priors and limits.
 
     A course is a run as its model sees it: `model.Driven` or `shooting.Course`.
     """
 
-    seen: tuple[Seen, ...]
+    seen: tuple[PreparedOutput, ...]
     courses: tuple[Any, ...]
     free: tuple[Free, ...]
     priors: tuple[Prior, ...]
@@ -43,7 +42,7 @@ class Case(NamedTuple):
 
     @property
     def floor(self) -> np.ndarray:
-        """What is left of each output below which it is the model's."""
+        """Residual of each output below which the model explains it completely."""
         return np.array([CLOSE * s.size_y for s in self.seen])
 
     def measured(self, i: int) -> np.ndarray:
@@ -55,19 +54,19 @@ class Case(NamedTuple):
         return np.split(rows, np.cumsum([len(s.measured[i]) for s in self.seen])[:-1])
 
     def rest(self, model: Any) -> tuple[tuple[np.ndarray, ...], ...]:
-        """What a model leaves of the readings, by run and output."""
+        """Residuals of a model, by run and output."""
         return tuple(
             tuple(self.split(i, self.measured(i) - np.asarray(output_of(model, course))))
             for i, course in enumerate(self.courses)
         )
 
-    def rows(self, rest: Any) -> list[tuple[np.ndarray, np.ndarray, Seen]]:
-        """What is left of the readings and their times, of each run and output."""
+    def rows(self, rest: Any) -> list[tuple[np.ndarray, np.ndarray, PreparedOutput]]:
+        """Residuals, their times and the output, for each run and output."""
         pairs = ((i, zip(row, self.seen, strict=True)) for i, row in enumerate(rest))
         return [(r, s.time[i], s) for i, row in pairs for r, s in row]
 
     def squares(self, rest: Any) -> float:
-        """What is left of the outputs, in units of their scatter."""
+        """Sum of squared residuals, in units of each output's scatter."""
         return sum(float(np.sum((r / s.size_y) ** 2)) for r, _, s in self.rows(rest))
 
     def problem(
@@ -141,14 +140,14 @@ class Settled(NamedTuple):
         return noise_of(rows, [time[:most] for _, time, _ in rest], known, noise)
 
     def correlated(self, case: Case) -> bool:
-        """Whether the noise of an output, that is more than rounding, has a memory."""
+        """True if the noise of any output has a memory and exceeds rounding."""
         used = used_by(self.fit)
         return any(remembers(r, used) and r.std() > CLOSE * s.size_y
                    for r, _, s in case.rows(self.rest))  # fmt: skip
 
 
 def used_by(fit: Fit) -> int:
-    """How many numbers the readings determined."""
+    """Number of numbers that the readings determine."""
     return max(round(sum(group.count - group.dof for group in fit.groups)), 1)
 
 
@@ -171,7 +170,7 @@ def _with_gaps(model: Any, course: Any) -> jax.Array:
 
 
 def _surprising(model: Any, course: Any) -> jax.Array:
-    """What outputs add to what the readings before foretell."""
+    """Innovations of a run: readings less their prediction from earlier ones."""
     return innovations(predicted(model, course), course.time, course.noise)[0]
 
 

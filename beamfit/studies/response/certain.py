@@ -20,7 +20,7 @@ from beamfit.greybox.mlp import MLP
 from beamfit.studies.response.fit import ResponseFit
 from beamfit.studies.response.limits import cells_of
 
-# Halvings of the way to an end of a range.
+# Bisections for an end of a range: to 1e-9 of it.
 HALVINGS = 30
 
 

@@ -13,7 +13,7 @@ from beamfit.dynamics.response import FIRST_ORDER, Physics, simulate
 from beamfit.greybox.fit import Fit
 from beamfit.studies.response.model import (
     CLOSE,
-    Seen,
+    PreparedOutput,
     changed_by,
     driven,
     parameters_at,
@@ -23,11 +23,11 @@ from beamfit.studies.response.model import (
 from beamfit.studies.response.record import Run
 from beamfit.studies.response.starts import driven_by, unit_outputs
 
-# Lags of the tests at most: of residuals, of inputs before and after, and of what whitens.
+# Most lags of residuals, of earlier inputs, of later inputs, and of the whitening autoregression.
 LAGS, PAST, LATER, ORDER = 20, 10, 5, 8
-# Time constants of further paths that are looked for.
+# Time constants of the additional paths in the test for a fuller model.
 SLOW = 5
-# Below this part of its variance that other inputs do not give an input's gain is not told apart.
+# Share of an input's variance, independent of other inputs, below which its gain is not separable.
 ALONE = 1e-3
 
 
@@ -87,7 +87,7 @@ class Checks(NamedTuple):
         return rows
 
 
-class HeldBack(NamedTuple):
+class HeldOutRun(NamedTuple):
     """A run that was only predicted: its name, how much is explained, and its rms residual."""
 
     name: str
@@ -100,13 +100,13 @@ class HeldBack(NamedTuple):
 
 
 def percent(rest: np.ndarray, y: np.ndarray) -> float:
-    """How much of y is explained: 100 (1 - |rest| / |y - mean|)."""
+    """Explained part of y in percent: 100 (1 - |rest| / |y - mean|)."""
     whole = float(np.linalg.norm(y - y.mean()))
     return 100.0 * (1.0 - float(np.linalg.norm(rest)) / whole) if whole > 0 else 0.0
 
 
 def checks_of(
-    seen: Seen,
+    seen: PreparedOutput,
     residuals: tuple[np.ndarray, ...],
     slopes: Sequence[tuple[np.ndarray, np.ndarray]],
     used: int,
@@ -138,7 +138,7 @@ def checks_of(
     )
 
 
-def _together(seen: Seen) -> tuple[str, ...]:
+def _together(seen: PreparedOutput) -> tuple[str, ...]:
     """Inputs whose gains cannot be told apart: their variance inflation is above a thousand."""
     u = (seen.points - seen.points.mean(0)) / seen.wide
     found = []
@@ -164,15 +164,15 @@ def _share(residuals: tuple[np.ndarray, ...]) -> float:
 
 
 def _whitened(r: np.ndarray, memory: Sequence[float] | np.ndarray) -> np.ndarray:
-    """Less what the readings before tell, the first ones apart."""
+    """Residuals less their prediction from earlier ones; the first ones are dropped."""
     order = len(memory)
     return r[order:] - sum(m * r[order - k : -k] for k, m in enumerate(memory, start=1))
 
 
 def _memory(residuals: tuple[np.ndarray, ...]) -> np.ndarray:
-    """How residuals hang on those before: an autoregression, by least squares.
+    """Autoregression of the residuals, by least squares.
 
-    Of one order only, white noise on top of a drift would stay coloured.
+    With a first order alone, white noise on top of a drift would stay coloured.
     """
     order = max(1, min(ORDER, min(map(len, residuals)) // 20))
     before = [np.stack([r[order - k : -k] for k in range(1, order + 1)], axis=1) for r in residuals]
@@ -190,13 +190,13 @@ def _white(residuals: tuple[np.ndarray, ...]) -> float:
 
 
 def _explained(
-    seen: Seen,
+    seen: PreparedOutput,
     residuals: tuple[np.ndarray, ...],
     slopes: Sequence[tuple[np.ndarray, np.ndarray]],
     delay: int,
 ) -> tuple[tuple[float, float], tuple[float, float]]:
-    """How much of the residuals a fuller model would explain, and its chance, all whitened alike;
-    and how much of what is left the inputs do that come after.
+    """Share of the whitened residuals that a fuller model explains, with its chance, and the share
+    of the rest that later inputs explain.
 
     A score test (Lagrange multipliers): columns are inputs before, those within the delay too,
     further paths of first order, and the slopes of the output by parameters that change with the
@@ -249,7 +249,7 @@ def _basis(columns: np.ndarray, size: np.ndarray | None = None) -> np.ndarray:
     return found[:, values > 1e-6]
 
 
-def slopes_of(seen: Seen, fit: Fit) -> list[tuple[np.ndarray, np.ndarray]]:
+def slopes_of(seen: PreparedOutput, fit: Fit) -> list[tuple[np.ndarray, np.ndarray]]:
     """Slopes of the output by the model's own numbers, and by parameters that change."""
     found = []
     for run in seen.runs:
@@ -259,7 +259,7 @@ def slopes_of(seen: Seen, fit: Fit) -> list[tuple[np.ndarray, np.ndarray]]:
     return found
 
 
-def predict_held(run: Run, output: str, fit: Fit, physics: Physics, delay: float) -> HeldBack:
+def predict_held(run: Run, output: str, fit: Fit, physics: Physics, delay: float) -> HeldOutRun:
     """Predict a run that was held back; only the state at its start is estimated."""
     seen = driven(run, 0, output, physics, delay)
     p = parameters_at(physics, fit.model["map"], seen.u)
@@ -274,4 +274,4 @@ def predict_held(run: Run, output: str, fit: Fit, physics: Physics, delay: float
     target = y - base - float(fit.model["offset"])
     first = np.linalg.lstsq(moved, target, rcond=1e-10)[0]
     rest = target - moved @ first
-    return HeldBack(run.name, percent(rest, y), float(rest.std()))
+    return HeldOutRun(run.name, percent(rest, y), float(rest.std()))

@@ -13,13 +13,13 @@ from beamfit.errors import InputError, nearest
 from beamfit.studies.response.certain import certain_range
 from beamfit.studies.response.fit import ResponseFit
 from beamfit.studies.response.model import parameters_at, predicted
-from beamfit.studies.response.receding import Controller, Limits, Response
+from beamfit.studies.response.receding import Controller, ControlLimits, Response
 
-# A limit of an output is held off by so many standard deviations of noise and model together.
+# Safety margin of an output's limit, in standard deviations of noise and model together.
 MARGIN = 2.0
-# Steps of a horizon; it ends where so much of a transient is left.
+# Fewest and most steps of a horizon; share of a transient that is left at its end.
 FEWEST, MOST, LEFT = 8, 40, 0.05
-# Drift of the disturbance in a step, of the noise, where the noise itself has no memory.
+# Drift of the disturbance in a step, as a share of white noise.
 DRIFT = 0.2
 
 
@@ -99,7 +99,7 @@ def controller(
                 for r, a, b in zip(responses, below, above, strict=True)}  # fmt: skip
         low, high = certain_range(fits, hard, (low, high), ends)
     rate = step * np.array([_rates(names, rates or {}).get(name, np.inf) for name in names])
-    limits = Limits(low, high, rate, below, above)
+    limits = ControlLimits(low, high, rate, below, above)
     return Controller(names, responses, step, seen.wide, limits, horizon, smooth)
 
 

@@ -15,13 +15,14 @@ from beamfit.greybox.memory import Memory
 from beamfit.quantity import Quantity
 from beamfit.statistics import POOR_FIT
 from beamfit.studies.response.checks import Checks
-from beamfit.studies.response.model import Seen, curves
+from beamfit.studies.response.model import PreparedOutput, curves
 from beamfit.table import Table, cell, json_of
 
-# Points of a curve; it was visited where so many samples lie within a share of its range.
+# Points of a curve; samples within a share of its range that make a point visited.
 POINTS, VISITS, NEAR = 41, 5, 0.05
+# Points of a curve in JSON and tables.
 SHOWN = 9
-# A time constant with an error above this share of itself is not told from 0 or from without end.
+# A time constant with a relative error above this is compatible with 0 and with infinity.
 WIDE = 0.5
 TIME, GAIN, PURE = "s", "output/input", "1"
 
@@ -99,7 +100,7 @@ def _late(model: Any, of: tuple[Any, float]) -> jax.Array:
 
 
 def quantities_of(
-    fit: Fit, errors: Memory | None, seen: Seen, physics: Physics, delay: float
+    fit: Fit, errors: Memory | None, seen: PreparedOutput, physics: Physics, delay: float
 ) -> dict[str, Quantity]:
     """Constant parameters with errors, and the offset if it is free."""
     m = len(seen.inputs)
@@ -132,17 +133,22 @@ def derived(fit: Fit, errors: Memory | None, function: Callable, data: Any) -> D
 
 
 def quantity(found: Derived, i: Any, unit: str) -> Quantity:
-    """One of some numbers, without an error where the data do not determine it."""
+    """A quantity; it has no error where the data do not determine it."""
     error, raw = (float(e[i]) for e in (found.error, found.error_raw))
     known = np.isfinite(error)
     return Quantity(float(found.value[i]), error if known else None, unit, raw if known else None)
 
 
 def told(
-    quantities: Mapping[str, Quantity], curves: Sequence[Curve], seen: Seen, checks: Checks
+    quantities: Mapping[str, Quantity],
+    curves: Sequence[Curve],
+    seen: PreparedOutput,
+    checks: Checks,
 ) -> tuple[dict[str, Quantity], tuple[Curve, ...]]:
-    """Without errors where the runs determine nothing: of all where the inputs explain no more than
-    chance, of the gains of inputs that move together, of time constants not told from 0.
+    """Quantities and curves with errors only where the runs determine them.
+
+    No errors: of anything where the inputs explain no more than chance, of the gains of inputs that
+    move together, of time constants compatible with 0.
     """
     nothing = checks.nothing_probability >= POOR_FIT
     physics, inputs = seen.runs[0].physics, seen.inputs
@@ -164,7 +170,7 @@ def told(
     )
 
 
-def curves_of(fit: Fit, errors: Memory | None, seen: Seen) -> tuple[Curve, ...]:
+def curves_of(fit: Fit, errors: Memory | None, seen: PreparedOutput) -> tuple[Curve, ...]:
     """Every parameter against every input."""
     physics, m = seen.runs[0].physics, len(seen.inputs)
     points, made = seen.points, []

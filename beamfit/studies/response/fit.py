@@ -1,4 +1,4 @@
-"""From runs to a judged response: start, delay, free-running fit, noise with a memory, verdict."""
+"""Fit of a response to runs: start, delay, free-running fit, noise with a memory, verdict."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ from beamfit.quantity import Quantity
 from beamfit.shown import shown
 from beamfit.status import Status
 from beamfit.studies.response.case import used_by
-from beamfit.studies.response.checks import Checks, HeldBack, checks_of, predict_held, slopes_of
+from beamfit.studies.response.checks import Checks, HeldOutRun, checks_of, predict_held, slopes_of
 from beamfit.studies.response.curve import Curve, curves_of, quantities_of, told
 from beamfit.studies.response.limits import limited
 from beamfit.studies.response.misread import Misread, sound
-from beamfit.studies.response.model import Seen, network_of, output_of
+from beamfit.studies.response.model import PreparedOutput, network_of, output_of
 from beamfit.studies.response.noise import Noise
 from beamfit.studies.response.record import Run, check_inputs, checked
 from beamfit.studies.response.settle import begun, case_of, is_first_order, remembering, within
 from beamfit.studies.response.starts import latest
-from beamfit.studies.response.verdict import Evidence, judged, rms_of
+from beamfit.studies.response.verdict import ResponseEvidence, judged, rms_of
 from beamfit.table import Table, json_of
 
 if TYPE_CHECKING:
@@ -53,7 +53,7 @@ class ResponseFit:
         Samples by which the output follows the inputs late.
     runs : tuple of Run
         What it was identified from.
-    seen : Seen
+    seen : PreparedOutput
         The same as the model sees it.
     fit : Fit
         The grey-box fit.
@@ -67,7 +67,7 @@ class ResponseFit:
         How the noise wanders; None where it does not.
     checks : Checks
         What the residuals say.
-    held : tuple of HeldBack
+    held : tuple of HeldOutRun
         How runs are predicted that were not used.
     left_out : tuple of Misread
         Readings that show no output; they are missing from ``runs`` and ``seen``.
@@ -80,14 +80,14 @@ class ResponseFit:
     map: str
     delay: float
     runs: tuple[Run, ...]
-    seen: Seen
+    seen: PreparedOutput
     fit: Fit
     quantities: dict[str, Quantity]
     curves: tuple[Curve, ...]
     noise: tuple[float, ...]
     memory: Noise | None
     checks: Checks
-    held: tuple[HeldBack, ...] = ()
+    held: tuple[HeldOutRun, ...] = ()
     left_out: tuple[Misread, ...] = ()
 
     @property
@@ -97,7 +97,7 @@ class ResponseFit:
 
     @property
     def headline(self) -> str:
-        """What was found, in a line."""
+        """The answer in a line."""
         said = [f"{name} = {q}" for name, q in list(self.quantities.items())[:3]]
         found = ", ".join(said) or f"{len(self.curves)} parameter curves"
         return f"{self.output} {self.status}: {self.model}, {found}"
@@ -259,7 +259,7 @@ def identify(
     quantities, curves = told(quantities, curves, seen, checks)
     ahead = tuple(predict_held(each, output, answer.fit, physics, delay) for each in held)
     evidence = (answer.fit, answer.rests, checks, quantities, curves, ahead, map)
-    status, message = judged({output: Evidence(*evidence, rms_of(answer.fit))})
+    status, message = judged({output: ResponseEvidence(*evidence, rms_of(answer.fit))})
     late = [LATEST] if given is None and delay == latest(runs) > 0 else []
     message = " ".join([message, *late, *(f"Left out: {each}." for each in left_out)])
     delay = delay if delay % 1 == 0 else delay + float(answer.fit.model["late"])

@@ -19,13 +19,13 @@ from beamfit.errors import InputError, nearest
 from beamfit.greybox.bounds import cells, value_bounds
 from beamfit.greybox.gains import certified_gain
 from beamfit.greybox.problem import Constraint
-from beamfit.studies.response.model import Seen
+from beamfit.studies.response.model import PreparedOutput
 
-# Cells of a range in all, along several inputs fewer each.
+# Cells into which a range is split for bounds, in all; fewer each along several inputs.
 CELLS = 32
 
 
-class Limited(NamedTuple):
+class LimitedParameter(NamedTuple):
     """Bounds of constant raw numbers, and constraints on a network of them."""
 
     lower: np.ndarray
@@ -35,7 +35,7 @@ class Limited(NamedTuple):
 
 @dataclass(frozen=True)
 class _Value:
-    """One end of the enclosure of an output in every cell; equal ones share compiled code."""
+    """Lower or upper end of an output's enclosure in every cell; equal ones share compiled code."""
 
     output: int
     end: str
@@ -55,8 +55,8 @@ def _each(low: np.ndarray) -> int:
 
 
 def limited(
-    told: Mapping[str, tuple[float, float]], seen: Seen, physics: Physics, network: bool
-) -> Limited:
+    told: Mapping[str, tuple[float, float]], seen: PreparedOutput, physics: Physics, network: bool
+) -> LimitedParameter:
     """State limits such as {"K": (1.0, 3.0), "dK/dvalve": (0.0, inf)}.
 
     Raises
@@ -89,4 +89,4 @@ def limited(
         else:
             found += certified_gain("map", name, by, box, _each(box[0]), lower=low, upper=high)
     finite = [c for c in found if np.isfinite([c.lower, c.upper]).any()]
-    return Limited(lower, upper, tuple(finite) if network else ())
+    return LimitedParameter(lower, upper, tuple(finite) if network else ())

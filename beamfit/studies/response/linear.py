@@ -149,15 +149,15 @@ def _networks(best: Tried, hidden: int, seeds: range) -> list[dict[str, Any]]:
 
 
 @tree.node("order")
-class Asked:
+class UsedStates:
     """The states that a model uses, and a run."""
 
     order: int
     course: Course
 
 
-def _quoted(model: Any, asked: Asked) -> jax.Array:
-    """Of each pole tau, T, zeta, itself and its frequency; gains at rest, outputs at the mean."""
+def _quoted(model: Any, asked: UsedStates) -> jax.Array:
+    """Tau, T, zeta, value and frequency of each pole; static gains; outputs at the mean inputs."""
     p, n, course = model["p"], asked.order, asked.course
     a, b, c, d, _ = course.system.matrices(p)
     a, b, c, units = a[:n, :n], b[:n], c[:, :n], p["units"]
@@ -174,7 +174,7 @@ def _quantities(
     case: Case, found: Settled, n: int, runs: Sequence[Run], offset: bool
 ) -> tuple[dict[str, Quantity], dict[str, list[str]]]:
     """Time constants from the slowest, gains and levels; and the names of each input's gains."""
-    numbers = derived(found.fit, found.errors, _quoted, Asked(n, case.courses[0]))
+    numbers = derived(found.fit, found.errors, _quoted, UsedStates(n, case.courses[0]))
     step, said = float(case.courses[0].dt[0]), {}
     inputs, outputs = list(runs[0].inputs), list(runs[0].outputs)
     tau, time, zeta, pole, turn = np.arange(5 * n).reshape(5, n)

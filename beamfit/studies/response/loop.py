@@ -20,12 +20,12 @@ from beamfit.studies.response.receding import Controller, advance, moved, settle
 from beamfit.table import Table, json_of
 from beamfit.verdict import Finding, judge
 
-# A change has settled within this share of itself, or the output's noise if that is more; at the
-# end an output is judged by the mean of the last share of its steps.
+# Band of a settled step, as a share of it (or the noise if larger); last share of the steps whose
+# mean is the remaining offset.
 SETTLED, LAST = 0.02, 0.2
-# Steps simulated after the last change, in horizons; a limit is touched at this share of its unit.
+# Horizons simulated after the last change; distance, in units of the input, that touches a limit.
 HORIZONS, TOUCHED = 4, 1e-6
-# A limit counts as soft where a plan passes it by this share of the output's scatter.
+# Excess, as a share of the output's scatter, from which a plan uses the safety margin.
 SOFT = 1e-4
 
 
@@ -90,7 +90,7 @@ def closed_loop(
     return jax.lax.scan(on, (x, state), series)[1]
 
 
-class Change(NamedTuple):
+class StepResponse(NamedTuple):
     """A step of a target or of a disturbance, and how the loop takes it.
 
     `disturbed` is by how much, or 0; `settling` None where it does not settle before the next
@@ -134,7 +134,7 @@ class Loop:
         What was wanted.
     trace : Trace
         What came of it.
-    changes : tuple of Change
+    changes : tuple of StepResponse
         The steps of targets and disturbances.
     """
 
@@ -145,11 +145,11 @@ class Loop:
     time: np.ndarray
     targets: np.ndarray
     trace: Trace
-    changes: tuple[Change, ...]
+    changes: tuple[StepResponse, ...]
 
     @property
     def headline(self) -> str:
-        """What was done, in a line."""
+        """Outputs, inputs and status in a line."""
         outputs = ", ".join(r.name for r in self.control.responses)
         return f"{outputs} by {', '.join(self.control.inputs)}: {self.status}"
 
@@ -200,7 +200,7 @@ def _range(low: float, high: float) -> str:
 
 
 def touched(loop: Loop) -> np.ndarray:
-    """Whether each input is at one of its limits, shape (steps, m)."""
+    """True for each input at one of its limits, shape (steps, m)."""
     c, u = loop.control, loop.trace.inputs
     near = TOUCHED * c.sizes
     return (u <= c.limits.low + near) | (u >= c.limits.high - near)
@@ -300,8 +300,8 @@ def _noise(fit: ResponseFit, time: np.ndarray, seed: int) -> np.ndarray:
     return size * (np.sqrt(1.0 - fit.memory.white) * wander + np.sqrt(fit.memory.white) * white)
 
 
-def _changes(loop: Loop, load: np.ndarray) -> list[Change]:
-    """How each step of a target, or of a disturbance, is followed until the next one."""
+def _changes(loop: Loop, load: np.ndarray) -> list[StepResponse]:
+    """Response of the loop to each step of a target or disturbance, until the next one."""
     time, wanted, trace = loop.time, loop.targets, loop.trace
     # A change of one output is felt by the others: all are followed until the next one of any.
     steps = np.diff(np.hstack([wanted, load]), axis=0, prepend=np.nan)
@@ -321,9 +321,9 @@ def _changes(loop: Loop, load: np.ndarray) -> list[Change]:
             settling = None if after >= len(error) else after * loop.control.step
             over = max(0.0, float((error * np.sign(step)).max()) / abs(step)) if step else None
             left = float(error[-max(1, int(LAST * len(error))) :].mean())
-            end_at = float(wanted[k, i])
-            found.append(Change(fit.output, float(time[k]), end_at - step, end_at, float(push[k]),
-                                settling, over, left))  # fmt: skip
+            end_at, load_step = float(wanted[k, i]), float(push[k])
+            found.append(StepResponse(fit.output, float(time[k]), end_at - step, end_at, load_step,
+                                      settling, over, left))  # fmt: skip
     return [c for c in found if c.disturbed or abs(c.after - c.before) > 1e-9 * abs(c.after)]
 
 
@@ -361,7 +361,7 @@ def _short(loop: Loop) -> Finding | None:
         off = f"{change.output} stays {abs(change.left):.3g} off {change.after:.4g}"
         if not low <= change.after <= high:
             margin = loop.control.responses[i].margin
-            cause = f"{off}: its limit is held off by {margin:.3g} for noise and model."
+            cause = f"{off}: its limit has a safety margin of {margin:.3g} for noise and model."
             return Finding(Status.at_limit, cause, "Wish for less, or identify with less noise.")
         ends = touched(loop)[-max(1, int(LAST * len(loop.time))) :].mean(axis=0) > 0.5
         if ends.any():
@@ -379,7 +379,7 @@ def _kept(loop: Loop) -> Finding | None:
             if (loop.trace.beyond[:, i] > SOFT * r.size).any()]  # fmt: skip
     words = "The loop settles and keeps all limits."
     if soft:
-        words += f" Plans of {', '.join(soft)} went into the margin of a limit."
+        words += f" {', '.join(soft)} came within the safety margin of a limit."
     if not poor:
         return Finding(Status.converged, words)
     words += f" But the model of {', '.join(poor)} does not explain its runs."

@@ -15,12 +15,11 @@ from beamfit.studies.response.record import LEAST, Run
 from beamfit.studies.response.settle import Begun
 from beamfit.studies.response.starts import seen_of
 
-# Single readings off by so many times the noise are wrong, up to this share of all: more are the
-# process's own. The noise is what a median over some neighbours leaves; where the model moves, a
-# reading may be off by so many of its steps. They are looked for so often, each time beside a
-# fit without those found before.
+# A single reading is bad beyond FAR times the noise, the residual about a running median of AROUND
+# readings, plus MOVES times the model's step there. More than the share MOST are the
+# process's own. The search is repeated ROUNDS times, each beside a fit without those found.
 FAR, MOST, AROUND, MOVES, ROUNDS = 10.0, 0.05, 7, 3.0, 3
-# Equal readings stand still from so many on, if the process moves away by so many times the noise.
+# Number of equal readings that count as stuck, if the model moves away by AWAY times the noise.
 HELD, AWAY = 8, 3.0
 
 
@@ -88,7 +87,7 @@ def _without(
 
 
 def _lone(y: np.ndarray, fitted: np.ndarray, size: float) -> np.ndarray:
-    """Which readings lie off by themselves, beyond the noise and what the model moves nearby."""
+    """Single readings that lie off, beyond the noise and the model's change nearby."""
     rest = y - fitted
     off = np.abs(rest - median_filter(rest, AROUND, mode="nearest"))
     noise = max(1.4826 * float(np.median(off)), CLOSE * size)
@@ -98,7 +97,7 @@ def _lone(y: np.ndarray, fitted: np.ndarray, size: float) -> np.ndarray:
 
 
 def _still(y: np.ndarray, fitted: np.ndarray | None = None, noise: float = 0.0) -> np.ndarray:
-    """Which readings belong to many equal ones; of which a model says otherwise, if given."""
+    """Readings in long series of equal ones, where a model, if given, says otherwise."""
     edges = np.flatnonzero(np.diff(y, prepend=np.nan, append=np.nan) != 0)
     mask = np.zeros(len(y), bool)
     for a, b in pairwise(edges):

@@ -15,9 +15,9 @@ from beamfit.greybox.problem import Prior, padded_length
 from beamfit.studies.response.noise import Noise
 from beamfit.studies.response.record import Run
 
-# A residual below this share of the output's scatter is the model's, and not fitted any closer.
+# Residual, as a share of the output's scatter, below which a fit counts as exact.
 CLOSE = 2e-4
-# Width of the prior on a network's weights, whose inputs and outputs are of size 1.
+# Standard deviation of the prior on a network's weights; inputs and outputs are of size 1.
 WEIGHT = 3.0
 
 
@@ -46,7 +46,7 @@ class Driven:
         return model["offset"] + y[self.index]
 
 
-class Seen(NamedTuple):
+class PreparedOutput(NamedTuple):
     """Runs of one output, with what the model needs of them.
 
     `runs` by `Driven`; `measured` are the readings of each, without missing ones; `size_u` and
@@ -78,7 +78,7 @@ class Seen(NamedTuple):
 
 
 def driven(run: Run, number: int, output: str, physics: Physics, delay: float) -> Driven:
-    """One run with its inputs `delay` samples late; before the first they are as the first.
+    """A run with its inputs `delay` samples late; earlier inputs equal the first.
 
     A delay of no whole number of samples has two rows a sample, one for each input that it feels.
     """
@@ -115,7 +115,7 @@ def parameters_at(physics: Physics, of: Any, point: jax.Array, more: Any = 0.0) 
 
 
 def predicted(model: Any, course: Any) -> jax.Array:
-    """What a model says of the readings of a run: a `Driven`, or another course."""
+    """Readings of a run that a model predicts; the course is a `Driven` or another."""
     return course.predicted(model)
 
 
@@ -151,7 +151,9 @@ def weight_priors(path: str) -> tuple[Prior, ...]:
     return tuple(Prior(f"{path}.{part}", 0.0, WEIGHT) for part in ("weights", "biases"))
 
 
-def network_of(seen: Seen, physics: Physics, raw: np.ndarray, hidden: int, seed: int) -> MLP:
+def network_of(
+    seen: PreparedOutput, physics: Physics, raw: np.ndarray, hidden: int, seed: int
+) -> MLP:
     """A network that gives constant raw numbers everywhere but for small random weights."""
     m, wide = len(seen.inputs), seen.wide
     ports = [Port(n, "", 0, float(s), float(b))

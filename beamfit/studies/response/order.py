@@ -1,4 +1,4 @@
-"""Which order a linear state space has: fits of one after the other, and their criterion."""
+"""Order of a linear state space: fits of rising order and their information criterion."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from beamfit.studies.response.noise import noise_of
 from beamfit.studies.response.realise import LINEAR, normal_form, padded, realisations
 from beamfit.studies.response.shooting import LONGEST, trained
 
-# States of the programs that search: what an order does not need is held at 0, so that all orders
-# of a size are compiled once. The search ends after so many orders that are no better.
+# State counts of the compiled searches (unused states are held at 0), and number of orders without
+# improvement that ends the search.
 SIZES, BEYOND = (4, 10), 2
-# Starts of an order that are searched from, of those that foretell best; readings a free number.
+# Starts searched for each order, the best predictors; readings needed for each free number.
 BEGINS, EACH = 2, 3
-# Pole and weight in the output of a state that is added to an order, and not seen yet.
+# Pole, and weight in the output, of a state that is added to an order.
 NEW, FAINT = 0.6, 1e-3
 
 
@@ -34,7 +34,7 @@ class Tried(NamedTuple):
 
 
 def count_of(case: Case) -> int:
-    """How many readings there are."""
+    """Number of readings."""
     return sum(len(m) for s in case.seen for m in s.measured)
 
 
@@ -81,7 +81,7 @@ def _noise_of(case: Case, found: Settled) -> Noise | None:
 
 
 def free_of(case: Case, order: int, size: int, offset: bool, direct: bool) -> tuple[Free, ...]:
-    """What is free of a model of so many states: what an order does not need is held at 0."""
+    """Free numbers of a model of `size` states; those beyond the order are held at 0."""
     k, m, runs = len(case.seen), len(case.seen[0].inputs), len(case.courses)
     used, straight = np.arange(size) < order, np.full((k, m + offset), direct)
     straight[:, m:] = True

@@ -15,11 +15,11 @@ from scipy.linalg import solve_discrete_lyapunov
 
 from beamfit.dynamics.states import Matrices, contraction, linear_outputs
 
-# Samples of past and future at most, and rows of the regression.
+# Most samples of past and future, and most rows, of the regression.
 HORIZON, ROWS = 20, 20_000
-# Steps that are left out in between, for what is slow; fewest rows that must remain.
+# Strides through the samples, for slow responses; fewest rows that must remain.
 STRIDES, FEWEST = (1, 5, 25, 125), 100
-# Newton steps to where a network rests.
+# Newton steps to the rest of a network.
 REST = 20
 
 
@@ -42,13 +42,13 @@ class Linear:
         return jnp.pad(u, ((0, 0), (0, p["z"].shape[1] - u.shape[1])), constant_values=1.0)
 
     def linear(self, p: Any) -> Matrices:
-        """Of the linear part."""
+        """Matrices of the linear part."""
         return Matrices(*contraction(p["z"], p["around"]), p["c"], p["d"], jnp.zeros(len(p["c"])))
 
     matrices = linear
 
 
-class Network(Linear):
+class LinearWithNetwork(Linear):
     """The same with x+ = a x + b u + steps * out @ tanh(inside @ (x/sizes, u) + bias)."""
 
     def run(self, p: Any, u: Any, dt: Any, x0: Any) -> tuple[jax.Array, jax.Array]:
@@ -66,7 +66,7 @@ class Network(Linear):
         return y * p["units"]["y"][1] + p["units"]["y"][0], last
 
     def matrices(self, p: Any) -> Matrices:
-        """Of the system about where it rests at its mean input."""
+        """Matrices linearised about the rest at the mean input."""
         linear, (n, m), net = self.linear(p), p["z"].shape, p["net"]
 
         def after(x, u):
@@ -82,7 +82,7 @@ class Network(Linear):
         return linear._replace(a=a, b=b + shift)
 
 
-LINEAR, NETWORK = Linear(), Network()
+LINEAR, NETWORK = Linear(), LinearWithNetwork()
 
 
 def realisations(

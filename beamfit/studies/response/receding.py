@@ -20,10 +20,10 @@ from beamfit.errors import InputError
 from beamfit.greybox.quadratic import Quadratic, minimum
 from beamfit.studies.response.model import parameters_at
 
-# What breaking an output's limit costs, against squares of errors in units of its scatter: more
-# than any multiplier of a limit that can be kept, so that such a limit is kept exactly.
+# Penalty on an output beyond its limit, per unit of its scatter: larger than any multiplier of a
+# limit that can be kept, so that such a limit is kept exactly.
 PENALTY = 1e4
-# Linearisations of a response whose parameters change, and shares of a step that are tried.
+# Linearisations of a response with varying parameters, and shares of a step that are tried.
 ROUNDS, SHARES = 3, (1.0, 0.5, 0.25, 0.0)
 
 
@@ -44,8 +44,8 @@ class Response(NamedTuple):
     margin: float
 
 
-class Limits(NamedTuple):
-    """Of inputs (lowest, highest, change in a step) and outputs; infinite where there are none."""
+class ControlLimits(NamedTuple):
+    """Limits of inputs (lowest, highest, change in a step) and outputs; infinite if none."""
 
     low: np.ndarray
     high: np.ndarray
@@ -54,8 +54,8 @@ class Limits(NamedTuple):
     above: np.ndarray
 
 
-class State(NamedTuple):
-    """What a controller remembers.
+class ControllerState(NamedTuple):
+    """State of a controller between two steps.
 
     Attributes
     ----------
@@ -105,7 +105,7 @@ class Controller:
         Time from one input to the next, s.
     sizes : array, shape (m,)
         Scatter of the inputs.
-    limits : Limits
+    limits : ControlLimits
         Those of inputs and of their changes are never broken. Those of outputs are, where they
         cannot be kept, and `Said.beyond` tells.
     horizon : int
@@ -119,11 +119,11 @@ class Controller:
     responses: tuple[Response, ...]
     step: float
     sizes: np.ndarray
-    limits: Limits
+    limits: ControlLimits
     horizon: int
     smooth: float = 0.1
 
-    def begin(self, inputs: Any, reading: Any = None) -> State:
+    def begin(self, inputs: Any, reading: Any = None) -> ControllerState:
         """Give the state of a process at rest.
 
         Parameters
@@ -145,19 +145,21 @@ class Controller:
                 raise InputError(f"{name} at {u[i]:g} to begin with", expected)
         return start(self, jnp.asarray(u), reading)
 
-    def __call__(self, state: State, reading: Any, target: Any) -> tuple[State, jax.Array, Said]:
+    def __call__(
+        self, state: ControllerState, reading: Any, target: Any
+    ) -> tuple[ControllerState, jax.Array, Said]:
         """Take a reading and give the next input.
 
         Parameters
         ----------
-        state : State
+        state : ControllerState
             Of `begin`, or of the step before.
         reading, target : array, shape (outputs,)
             What is read now, NaN where nothing is, and what is wanted from now on.
 
         Returns
         -------
-        (State, array of shape (m,), Said)
+        (ControllerState, array of shape (m,), Said)
             What to hand to the next step, the input to hold until then, and the plan behind it.
         """
         return self._compiled(state, jnp.asarray(reading, float), jnp.asarray(target, float))
@@ -202,7 +204,7 @@ def settled(response: Response, u: jax.Array, step: float, factor: Any = 1.0) ->
     return jnp.linalg.solve(jnp.eye(len(like)) - jax.jacfwd(after)(zero), after(zero))
 
 
-def start(control: Controller, u: jax.Array, reading: Any = None) -> State:
+def start(control: Controller, u: jax.Array, reading: Any = None) -> ControllerState:
     """The state at rest under u."""
     latest = max(1, *(r.delay for r in control.responses))
     x = tuple(settled(r, u, control.step) for r in control.responses)
@@ -211,7 +213,7 @@ def start(control: Controller, u: jax.Array, reading: Any = None) -> State:
         level = jnp.asarray(reading, float) - _now(control, x)
     m = len(control.inputs)
     held = jnp.broadcast_to(u, (latest, m)), jnp.broadcast_to(u, (control.horizon, m))
-    return State(x, held[0], level, held[1])
+    return ControllerState(x, held[0], level, held[1])
 
 
 def late(response: Response, past: jax.Array, plan: jax.Array) -> jax.Array:
@@ -234,8 +236,8 @@ def _now(control: Controller, x: Sequence[jax.Array]) -> jax.Array:
     return jnp.stack([r.offset + state[0] for r, state in pairs])
 
 
-def outputs(control: Controller, state: State, plan: jax.Array) -> jax.Array:
-    """What comes of a plan, shape (horizon, outputs), the first a step from now."""
+def outputs(control: Controller, state: ControllerState, plan: jax.Array) -> jax.Array:
+    """Predicted outputs of a plan, shape (horizon, outputs), the first a step from now."""
     found = []
     for i, (r, x) in enumerate(zip(control.responses, state.x, strict=True)):
         felt = late(r, state.past, plan)
@@ -250,8 +252,8 @@ def outputs(control: Controller, state: State, plan: jax.Array) -> jax.Array:
 
 
 def advance(
-    control: Controller, state: State, reading: jax.Array, target: jax.Array
-) -> tuple[State, jax.Array, Said]:
+    control: Controller, state: ControllerState, reading: jax.Array, target: jax.Array
+) -> tuple[ControllerState, jax.Array, Said]:
     """Correct the disturbances by the reading, plan, and go on by a step."""
     surprise = reading - _now(control, state.x) - state.level
     share = jnp.array([r.correction for r in control.responses])
@@ -270,16 +272,18 @@ def advance(
               for r, x in zip(control.responses, state.x, strict=True))  # fmt: skip
     past = jnp.concatenate([state.past[1:], u[None]])
     shifted = jnp.concatenate([plan[1:], plan[-1:]])
-    return State(x, past, level, shifted), u, said
+    return ControllerState(x, past, level, shifted), u, said
 
 
 def _excess(control: Controller, ahead: jax.Array) -> jax.Array:
-    """How far outputs pass their limits less the margins."""
+    """Excess of outputs over their limits less the margins."""
     below, above = control.held
     return jnp.maximum(jnp.maximum(below - ahead, ahead - above), 0.0)
 
 
-def _better(control: Controller, state: State, target: jax.Array, plan: jax.Array) -> jax.Array:
+def _better(
+    control: Controller, state: ControllerState, target: jax.Array, plan: jax.Array
+) -> jax.Array:
     """The best plan of the process as it is around a plan."""
     slope = control.slope
     if slope is not None:
@@ -297,7 +301,9 @@ def _better(control: Controller, state: State, target: jax.Array, plan: jax.Arra
     return tried[jnp.argmin(jnp.where(jnp.isfinite(cost), cost, jnp.inf))]
 
 
-def _cost(control: Controller, state: State, target: jax.Array, plan: jax.Array) -> jax.Array:
+def _cost(
+    control: Controller, state: ControllerState, target: jax.Array, plan: jax.Array
+) -> jax.Array:
     size = np.array([r.size for r in control.responses])
     ahead = outputs(control, state, plan)
     change = jnp.diff(plan, axis=0, prepend=state.past[-1:]) / control.sizes
@@ -307,7 +313,7 @@ def _cost(control: Controller, state: State, target: jax.Array, plan: jax.Array)
 
 def _planned(
     control: Controller,
-    state: State,
+    state: ControllerState,
     target: jax.Array,
     plan: jax.Array,
     slope: jax.Array,

@@ -10,14 +10,14 @@ import numpy as np
 from beamfit.errors import InputError
 from beamfit.shown import shown
 
-# Fewest readings of an output: fewer cannot tell a response from its start.
+# Fewest readings of an output; with fewer its response and its start are not separable.
 LEAST = 8
 
 
 @shown
 @dataclass(frozen=True, eq=False)
 class Run:
-    """One run.
+    """A run.
 
     Parameters
     ----------
@@ -96,7 +96,7 @@ class Run:
 
     @property
     def headline(self) -> str:
-        """How much there is, in a line."""
+        """Size and content of the record, in a line."""
         span = self.time[-1] - self.time[0]
         kinds = f"inputs {', '.join(self.inputs)}, outputs {', '.join(self.outputs)}"
         return f"{self.name}: {len(self)} rows over {span:.4g} s, {kinds}"

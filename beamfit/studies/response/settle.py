@@ -19,17 +19,19 @@ from beamfit.studies.response.case import (
     settled,
     with_memory,
 )
-from beamfit.studies.response.limits import Limited
-from beamfit.studies.response.model import Seen, weight_priors
+from beamfit.studies.response.limits import LimitedParameter
+from beamfit.studies.response.model import PreparedOutput, weight_priors
 from beamfit.studies.response.noise import Noise
 from beamfit.studies.response.record import Run
 from beamfit.studies.response.starts import best_start, driven_by, start_of
 
-# Steps of a round, after which the noise is taken from the residuals again, and rounds at most.
+# Steps of a round, after which the noise is estimated again, and most rounds.
 STEPS, ROUNDS = 100, 30
 
 
-def case_of(seen: Seen, offset: bool, network: bool = False, told: Limited | None = None) -> Case:
+def case_of(
+    seen: PreparedOutput, offset: bool, network: bool = False, told: LimitedParameter | None = None
+) -> Case:
     """The case of one output: constant raw numbers or a network of them, within limits if told."""
     ends = {} if told is None or network else {"lower": told.lower, "upper": told.upper}
     free = [Free("start", nuisance=True), Free("map", nuisance=network, **ends)]
@@ -60,7 +62,7 @@ def remembering(case: Case, models: Sequence[Any]) -> Settled:
 class Begun(NamedTuple):
     """Runs as the model sees them, the delay, and the fit with constant parameters."""
 
-    seen: Seen
+    seen: PreparedOutput
     delay: float
     plain: Settled
 
@@ -74,7 +76,7 @@ def begun(
 
 
 def is_first_order(found: Begun, offset: bool) -> bool:
-    """Whether a first order does as well as a higher one, by the Bayesian information criterion."""
+    """True if a first order does as well as a higher one by the Bayesian information criterion."""
     if found.seen.runs[0].physics is FIRST_ORDER:
         return False
     lower = found.seen._replace(runs=driven_by(found.seen, FIRST_ORDER))

@@ -19,23 +19,23 @@ from beamfit.studies.response.case import (
     settled,
     with_memory,
 )
-from beamfit.studies.response.model import Seen
+from beamfit.studies.response.model import PreparedOutput
 from beamfit.studies.response.noise import Noise
 
-# Steps of a round, after which the noise is taken from the residuals again; rounds at most, and the
-# gain in -2 ln L of a reading below which nothing is gained any more.
+# Steps of a round, after which the noise is estimated again; most rounds; gain in -2 ln L per
+# reading below which they end.
 STEPS, ROUNDS, EACH = 25, 80, 1e-4
-# Gaps between segments, in units of the states' scatter, through which they are closed.
+# Allowed gaps between segments in turn, in units of the states' scatter.
 CLOSING = (1.0, 0.1, 1e-2, 1e-3, 1e-4)
-# Time from the last reading of an output to the first of another, in lengths of the run.
+# Distance in time between the series of two outputs, in lengths of the run: no correlation is left.
 APART = 1e6
-# Readings of each output that tell the noise with a memory; the share by which it may leave more of
-# the outputs than a fit without.
+# Most readings of each output that estimate correlated noise; factor by which the fit with it may
+# leave larger squares than the fit without.
 LONGEST, WORSE = 5000, 1.5
 
 
 class System(Protocol):
-    """What runs: `beamfit.dynamics.states.StateSpace`, or anything hashable with its `run`."""
+    """A system: `beamfit.dynamics.states.StateSpace`, or anything hashable with its `run`."""
 
     def run(
         self, p: Any, u: jax.Array, dt: jax.Array, x0: jax.Array
@@ -74,8 +74,8 @@ class Course:
         return self.shot(model)[0]
 
 
-def course_of(system: System, seen: Sequence[Seen], i: int) -> Course:
-    """One run, of what is seen of each output."""
+def course_of(system: System, seen: Sequence[PreparedOutput], i: int) -> Course:
+    """Course of a run, from the prepared outputs."""
     run = seen[0].runs[i]
     index = [k * len(run.u) + np.asarray(s.runs[i].index) for k, s in enumerate(seen)]
     far = APART * float(np.sum(np.asarray(run.dt)))

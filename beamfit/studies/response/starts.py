@@ -16,17 +16,17 @@ import numpy as np
 from scipy.optimize import minimize
 
 from beamfit.dynamics.response import ARX, FIRST_ORDER, SECOND_ORDER, Physics, simulate
-from beamfit.studies.response.model import Driven, Seen, driven
+from beamfit.studies.response.model import Driven, PreparedOutput, driven
 from beamfit.studies.response.record import Run
 
-# Longest delay that is tried, in samples and as a share of the run.
+# Longest delay that is tried, in samples, and as a share of the run.
 LATEST, SHARE = 24, 0.1
-# A delay must raise the logarithm of the likelihood by so much over a shorter one; parts of a
-# sample that are tried besides.
+# Gain in log likelihood that a longer delay needs over a shorter one; fractions of a sample
+# that are tried besides.
 BETTER, PARTS = 5.0, (-0.75, -0.5, -0.25, 0.25, 0.5, 0.75)
 # Time constants of the grid, and dampings of a second order.
 TIMES, DAMPINGS = 16, (0.2, 0.6, 1.0, 2.0)
-# A second lag of which less than this is left after a sample is none.
+# Share of a second lag's transient after one sample below which the lag is ignored.
 FORGOTTEN = 1e-4
 
 
@@ -45,7 +45,7 @@ class Start(NamedTuple):
         return {"map": raw, "start": self.first, "offset": self.offset, "late": 0.0}
 
 
-def best_start(seen: Seen, offset: bool) -> Start:
+def best_start(seen: PreparedOutput, offset: bool) -> Start:
     """The best of the grid."""
     physics = seen.runs[0].physics
     if physics is ARX:
@@ -89,7 +89,9 @@ def unit_outputs(run: Driven, shapes: jax.Array) -> jax.Array:
     return jax.vmap(each, in_axes=(0, None, None))(shapes, gains, firsts)
 
 
-def _fitted(seen: Seen, shape: np.ndarray, columns: list[np.ndarray], offset: bool) -> Start:
+def _fitted(
+    seen: PreparedOutput, shape: np.ndarray, columns: list[np.ndarray], offset: bool
+) -> Start:
     m, k, runs = len(seen.inputs), seen.runs[0].physics.free_states, len(columns)
     parts = []
     for i, column in enumerate(columns):
@@ -108,12 +110,12 @@ def _fitted(seen: Seen, shape: np.ndarray, columns: list[np.ndarray], offset: bo
     return Start(raw, first, float(found[-1]) if offset else 0.0, rest)
 
 
-def driven_by(seen: Seen, physics: Physics) -> tuple[Driven, ...]:
+def driven_by(seen: PreparedOutput, physics: Physics) -> tuple[Driven, ...]:
     """The runs with another physics."""
     return tuple(replace(run, physics=physics) for run in seen.runs)
 
 
-def _as_difference(seen: Seen, found: Start) -> Start:
+def _as_difference(seen: PreparedOutput, found: Start) -> Start:
     """The difference equation whose samples are those of a second order (eqs 13-16)."""
     m = len(seen.inputs)
     dt = float(np.median(np.asarray(seen.runs[0].dt)[: len(seen.time[0]) - 1]))
@@ -137,7 +139,7 @@ def _as_difference(seen: Seen, found: Start) -> Start:
     return Start(np.asarray(raw), states, found.offset, found.squares)
 
 
-def seen_of(runs: tuple[Run, ...], output: str, physics: Physics, delay: float) -> Seen:
+def seen_of(runs: tuple[Run, ...], output: str, physics: Physics, delay: float) -> PreparedOutput:
     """The runs as the model sees them."""
     drives = tuple(driven(run, i, output, physics, delay) for i, run in enumerate(runs))
     read = [np.isfinite(run.outputs[output]) for run in runs]
@@ -145,18 +147,20 @@ def seen_of(runs: tuple[Run, ...], output: str, physics: Physics, delay: float) 
     time = tuple(run.time[k] for run, k in zip(runs, read, strict=True))
     u = np.concatenate([np.stack(list(run.inputs.values()), axis=1) for run in runs])
     spread = float(np.concatenate(measured).std()) or 1.0
-    return Seen(tuple(runs[0].inputs), output, drives, measured, time, u.mean(0), u.std(0), spread)
+    return PreparedOutput(
+        tuple(runs[0].inputs), output, drives, measured, time, u.mean(0), u.std(0), spread
+    )
 
 
 def start_of(
     runs: tuple[Run, ...], output: str, physics: Physics, delay: float | None, offset: bool
-) -> tuple[Start, Seen, float]:
+) -> tuple[Start, PreparedOutput, float]:
     """The best start, and the delay: the shortest of those that fit about as well as any.
 
     A part of a sample must do as much better: only an input that moves within a sample tells it.
     """
 
-    def at(late: float) -> tuple[Start, Seen, float]:
+    def at(late: float) -> tuple[Start, PreparedOutput, float]:
         seen = seen_of(runs, output, physics, late)
         return best_start(seen, offset), seen, late
 

@@ -1,4 +1,4 @@
-"""From runs to a judged state space, whose equations the user writes."""
+"""Fit of a state space whose equations the user writes."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ from beamfit.shown import shown
 from beamfit.statistics import POOR_FIT
 from beamfit.status import Status
 from beamfit.studies.response.case import Case, Settled, used_by
-from beamfit.studies.response.checks import Checks, HeldBack, checks_of, percent
+from beamfit.studies.response.checks import Checks, HeldOutRun, checks_of, percent
 from beamfit.studies.response.curve import quantity
-from beamfit.studies.response.model import Seen, weight_priors
+from beamfit.studies.response.model import PreparedOutput, weight_priors
 from beamfit.studies.response.noise import Noise
 from beamfit.studies.response.record import Run, checked
 from beamfit.studies.response.shooting import (
@@ -37,20 +37,21 @@ from beamfit.studies.response.shooting import (
     trained,
 )
 from beamfit.studies.response.starts import seen_of
-from beamfit.studies.response.verdict import Evidence, judged
+from beamfit.studies.response.verdict import ResponseEvidence, judged
 from beamfit.table import Table, json_of
 
-# A free run that explains less of an output has gone astray: segments are tried.
+# Percent of an output explained by the free run below which segments are tried.
 ASTRAY = 50.0
+# Segments of a run in multiple shooting.
 SEGMENTS = 32
 
 
-class Part(NamedTuple):
-    """One output of a state space: its readings, the free run, and what the residuals say."""
+class StateSpaceOutput(NamedTuple):
+    """An output of a state space: its readings, the free run, and the noise of its residuals."""
 
     output: str
     runs: tuple[Run, ...]
-    seen: Seen
+    seen: PreparedOutput
     fitted: tuple[np.ndarray, ...]
     checks: Checks
     curves: tuple = ()
@@ -71,7 +72,7 @@ class StatesFit:
         States.
     runs : tuple of Run
         What it was identified from.
-    parts : tuple of Part
+    parts : tuple of StateSpaceOutput
         Each output with its checks.
     fit : Fit
         The grey-box fit; ``fit.model["p"]`` are the parameters, ``["start"]`` the first states.
@@ -81,7 +82,7 @@ class StatesFit:
         Rms residuals.
     memory : Noise or None
         How the noise of all outputs wanders; None where it does not.
-    held : dict of str to tuple of HeldBack
+    held : dict of str to tuple of HeldOutRun
         How runs are predicted that were not used, by output.
     more : dict
         Further entries of the JSON.
@@ -92,12 +93,12 @@ class StatesFit:
     map: str
     order: int
     runs: tuple[Run, ...]
-    parts: tuple[Part, ...]
+    parts: tuple[StateSpaceOutput, ...]
     fit: Fit
     quantities: dict[str, Quantity]
     noise: np.ndarray
     memory: Noise | None
-    held: dict[str, tuple[HeldBack, ...]]
+    held: dict[str, tuple[HeldOutRun, ...]]
     more: dict[str, Any]
 
     @property
@@ -107,7 +108,7 @@ class StatesFit:
 
     @property
     def headline(self) -> str:
-        """What was found, in a line."""
+        """The answer in a line."""
         said = [f"{name} = {q}" for name, q in list(self.quantities.items())[:3]]
         found = ", ".join([f"state space of order {self.order}", *said])
         return f"{self.output} {self.status}: {found}"
@@ -275,7 +276,7 @@ def _numbers(found: Settled) -> Derived:
 
 
 def _explained(case: Case, found: Settled) -> list[float]:
-    """Of each output, by the free run."""
+    """Explained part of each output in percent, by the free run."""
     return [
         percent(
             np.concatenate([row[k] for row in found.rest]),
@@ -333,13 +334,13 @@ def answer(
         added = [_added(s, i, y) for i, y in enumerate(fitted)]
         pairs = list(zip(own, added, strict=True))
         checks = checks_of(s, rest, pairs, max(1, used // len(case.seen)), gain, delay)
-        parts.append(Part(list(runs[0].outputs)[k], runs, s, fitted, checks))
+        parts.append(StateSpaceOutput(list(runs[0].outputs)[k], runs, s, fitted, checks))
     ahead = _ahead(case, found, held, delay)
     nothing = all(part.checks.nothing_probability >= POOR_FIT for part in parts)
     joint = {q for name in parts[0].checks.together for q in (by_input or {}).get(name, ())}
     told = {n: q.open() if nothing or n in joint else q for n, q in quantities.items()}
     evidence = {
-        part.output: Evidence(
+        part.output: ResponseEvidence(
             found.fit, found.rests, part.checks, told, (), ahead[part.output], map,
             float(np.sqrt(np.mean(found.noise[:, k] ** 2))),
         )
@@ -354,8 +355,8 @@ def answer(
     )  # fmt: skip
 
 
-def _added(seen: Seen, i: int, fitted: np.ndarray) -> np.ndarray:
-    """What a state space that is not linear would add first: products of output and inputs."""
+def _added(seen: PreparedOutput, i: int, fitted: np.ndarray) -> np.ndarray:
+    """First terms of a nonlinear state space: products of output and inputs."""
     u = seen.scaled(seen.runs[i].u)[np.asarray(seen.runs[i].index)]
     y = ((fitted - np.mean(fitted)) / seen.size_y)[:, None]
     return np.concatenate([y**2, y**3, u**2, u * y], axis=1)
@@ -363,9 +364,9 @@ def _added(seen: Seen, i: int, fitted: np.ndarray) -> np.ndarray:
 
 def _ahead(
     case: Case, found: Settled, held: Sequence[Run], delay: int
-) -> dict[str, tuple[HeldBack, ...]]:
+) -> dict[str, tuple[HeldOutRun, ...]]:
     """Predict runs that were held back; only the state at their start is estimated."""
-    ahead: dict[str, list[HeldBack]] = {name: [] for name in held[0].outputs} if held else {}
+    ahead: dict[str, list[HeldOutRun]] = {name: [] for name in held[0].outputs} if held else {}
     for run in held:
         one = case_of((run,), case.courses[0].system, [Free("start")], (), delay)
         model = found.fit.model
@@ -375,7 +376,9 @@ def _ahead(
         (rest,) = one.rest(begun(one, model, sizes))
         for s, r in zip(one.seen, rest, strict=True):
             ahead[s.output].append(
-                HeldBack(run.name, percent(r, s.measured[0] - s.measured[0].mean()), float(r.std()))
+                HeldOutRun(
+                    run.name, percent(r, s.measured[0] - s.measured[0].mean()), float(r.std())
+                )
             )
     names = [s.output for s in case.seen]
     return {name: tuple(ahead.get(name, ())) for name in names}

@@ -11,30 +11,30 @@ from beamfit.greybox.fit import Fit
 from beamfit.quantity import Quantity
 from beamfit.statistics import POOR_FIT
 from beamfit.status import Status
-from beamfit.studies.response.checks import Checks, HeldBack
+from beamfit.studies.response.checks import Checks, HeldOutRun
 from beamfit.studies.response.curve import TIME, Curve
 from beamfit.verdict import Finding
 
-# A curve of which less than this share has an error is not determined.
+# Share of a visited curve that must have an error for it to be determined.
 HALF = 0.5
-# Held-back runs are predicted where their residual is at most so many times that of the fit.
+# Largest residual of a held-out run, in units of the fit's, at which it counts as predicted.
 WORSE = 2.0
 
 
-class Evidence(NamedTuple):
-    """What the rules look at."""
+class ResponseEvidence(NamedTuple):
+    """Input of the rules."""
 
     fit: Fit
     rests: bool
     checks: Checks
     quantities: Mapping[str, Quantity]
     curves: tuple[Curve, ...]
-    held: tuple[HeldBack, ...]
+    held: tuple[HeldOutRun, ...]
     map: str
     rms: float
 
 
-def judged(found: Mapping[str, Evidence]) -> tuple[Status, str]:
+def judged(found: Mapping[str, ResponseEvidence]) -> tuple[Status, str]:
     """Status and sentences of several outputs of one model: the gravest rule that any breaks."""
     for rule in RULES:
         said = {name: f for name, e in found.items() if (f := rule(e)) is not None}
@@ -54,7 +54,7 @@ def rms_of(fit: Fit) -> float:
     return float(np.sqrt(np.mean(np.square(found))))
 
 
-def _lost(e: Evidence) -> Finding | None:
+def _lost(e: ResponseEvidence) -> Finding | None:
     if e.fit.status is Status.infeasible:
         return Finding(Status.infeasible, e.fit.message)
     if e.rests:
@@ -63,7 +63,7 @@ def _lost(e: Evidence) -> Finding | None:
     return Finding(Status.not_finite if lost else Status.not_converged, e.fit.message)
 
 
-def _nothing(e: Evidence) -> Finding | None:
+def _nothing(e: ResponseEvidence) -> Finding | None:
     if e.checks.nothing_probability < POOR_FIT:
         return None
     cause = "The inputs explain no more of the output than chance would."
@@ -74,25 +74,26 @@ def _nothing(e: Evidence) -> Finding | None:
     return Finding(Status.unidentified, cause, remedy)
 
 
-def _joint(e: Evidence) -> Finding | None:
+def _joint(e: ResponseEvidence) -> Finding | None:
     if not e.checks.together:
         return None
-    cause = f"Inputs {', '.join(e.checks.together)} move together: only their joint effect is told."
+    inputs = ", ".join(e.checks.together)
+    cause = f"Inputs {inputs} move together: only their joint effect is determined."
     return Finding(Status.unidentified, cause, "Move one at a time, or leave one out.")
 
 
-def _lower(e: Evidence) -> Finding | None:
+def _lower(e: ResponseEvidence) -> Finding | None:
     if not e.checks.first_order:
         return None
     cause = "A first order explains the runs as well: "
     if "a1" in e.quantities:
         cause += "a pole and a zero cancel, so that a1, a2, b1 and b2 are not determined; K is."
     else:
-        cause += "the shorter lag is not told from 0, so that T and zeta are not determined."
+        cause += "the shorter lag is compatible with 0, so that T and zeta are not determined."
     return Finding(Status.unidentified, cause, "Use --model first-order.")
 
 
-def _open(e: Evidence) -> Finding | None:
+def _open(e: ResponseEvidence) -> Finding | None:
     left = {n: q.unit for n, q in e.quantities.items() if q.error is None}
     left |= {
         f"{c.parameter}({c.input})": c.unit
@@ -111,7 +112,7 @@ def _open(e: Evidence) -> Finding | None:
     return Finding(Status.unidentified, cause, remedy)
 
 
-def _fed_back(e: Evidence) -> Finding | None:
+def _fed_back(e: ResponseEvidence) -> Finding | None:
     c = e.checks
     if c.feedback_probability >= POOR_FIT:
         return None
@@ -125,7 +126,7 @@ def _fed_back(e: Evidence) -> Finding | None:
     return Finding(Status.poor_fit, cause, remedy)
 
 
-def _refuted(e: Evidence) -> Finding | None:
+def _refuted(e: ResponseEvidence) -> Finding | None:
     c = e.checks
     if c.input_probability >= POOR_FIT:
         return None
@@ -139,7 +140,7 @@ def _refuted(e: Evidence) -> Finding | None:
     return Finding(Status.poor_fit, cause, f"Try {more}.")
 
 
-def _worse(e: Evidence) -> Finding | None:
+def _worse(e: ResponseEvidence) -> Finding | None:
     bad = [h for h in e.held if h.rms > WORSE * e.rms]
     if not bad:
         return None
@@ -147,23 +148,23 @@ def _worse(e: Evidence) -> Finding | None:
         f"Run {bad[0].name}, held back, is predicted with a residual of {bad[0].rms:.3g} rms, "
         f"where the fit has {e.rms:.3g}."
     )
-    remedy = "The model does not carry over: use runs that cover its range, or fewer hidden nodes."
+    remedy = "Use runs that cover the model's range, or fewer hidden nodes."
     return Finding(Status.poor_fit, cause, remedy)
 
 
-def _good(e: Evidence) -> Finding:
+def _good(e: ResponseEvidence) -> Finding:
     cause = f"The free run explains {e.checks.free_run_percent:.2f} % of the output."
     if e.checks.white_probability < POOR_FIT:
         cause += " The noise has a memory, which the errors contain."
     gains = [q for name, q in e.quantities.items() if name.startswith("K")]
     if gains and all(q.error is not None and abs(q.value) < 2 * q.error for q in gains):
-        cause += " No gain is told from 0: what is seen is how the runs come to rest by themselves."
+        cause += " All gains are compatible with 0: only the return of the output to rest is seen."
     held = [c.name for c in e.fit.constraints if c.state in ("lower", "upper")]
     if held:
-        cause += f" It is held by its limits: {', '.join(held[:3])}."
+        cause += f" Limits reached: {', '.join(held[:3])}."
     gain = e.checks.against_constant
     if gain is not None and gain < 0:
-        cause += " Constant parameters do as well (BIC): the operating point need not be in it."
+        cause += " Constant parameters fit as well (BIC): the operating point is not needed."
     never = {c.input for c in e.curves if not c.visited.all()}
     if never:
         cause += f" Parts of the range of {', '.join(sorted(never))} were not visited."

@@ -22,7 +22,7 @@ from beamfit.quantity import Status
 from beamfit.sampling.intervals import Expected
 from beamfit.sampling.posterior import Posterior
 from beamfit.sampling.priors import Distribution
-from beamfit.sampling.target import Target
+from beamfit.sampling.target import SamplingTarget as Target
 from beamfit.studies.scan.assumptions import Assumptions
 from beamfit.studies.scan.beam_draws import BRIGHT
 from beamfit.studies.scan.model import (

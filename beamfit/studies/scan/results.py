@@ -16,7 +16,7 @@ from beamfit.status import Status
 from beamfit.table import Table, cell, json_of, labelled
 
 if TYPE_CHECKING:
-    from beamfit.greybox.fit import Variable
+    from beamfit.greybox.fit import FittedVariable as Variable
 
 
 # What a cell says of a number that the data leave open, and of one that is not there.

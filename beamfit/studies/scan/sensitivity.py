@@ -27,7 +27,7 @@ from beamfit.optics.elements import (
     Marker,
     SectorDipole,
 )
-from beamfit.optics.sections import Series
+from beamfit.optics.sections import ElementSeries as Series
 from beamfit.studies.scan.fit import EmittanceFit
 from beamfit.studies.scan.known import WEIGHTS
 from beamfit.studies.scan.model import coefficients, emittance_parts, size_squared

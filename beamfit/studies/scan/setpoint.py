@@ -19,7 +19,8 @@ from beamfit.compile_cache import SELDOM
 from beamfit.errors import InputError
 from beamfit.greybox import tree
 from beamfit.greybox.descend import Found, descend_all
-from beamfit.greybox.fit import Fit, Variable
+from beamfit.greybox.fit import Fit
+from beamfit.greybox.fit import FittedVariable as Variable
 from beamfit.greybox.problem import (
     TOLERANCE,
     Free,
