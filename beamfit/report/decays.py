@@ -28,9 +28,8 @@ from beamfit.status import Status
 from beamfit.studies.decay import tables
 from beamfit.studies.decay.checks import moving_lifetime
 from beamfit.studies.decay.fit import DecayFit
-from beamfit.studies.decay.pooled import cycle_lifetimes
 from beamfit.studies.decay.shift import Shift
-from beamfit.studies.decay.study import Decay, RecordStudy
+from beamfit.studies.decay.study import Decay, RecordStudy, cycle_lifetimes
 from beamfit.studies.decay.trend import Trend
 from beamfit.table import Table, labelled
 

@@ -12,11 +12,10 @@ from beamfit.errors import InputError
 from beamfit.lifetime.decay import HOUR
 from beamfit.quantity import Quantity
 from beamfit.shown import shown
-from beamfit.studies.decay.departures import ConstantA
+from beamfit.studies.decay.alternatives import ConstantA
+from beamfit.studies.decay.expansion import LEVEL, LOSS, Pieces, lifetime_of, solved
 from beamfit.studies.decay.fit import DecayFit, bare, fit_decay
-from beamfit.studies.decay.law import lifetime_of
 from beamfit.studies.decay.marginal import Law
-from beamfit.studies.decay.model import padded, solve_decay
 from beamfit.studies.decay.record import DecayRecord
 from beamfit.table import json_of
 
@@ -86,13 +85,12 @@ def single_exponential(record: DecayRecord, fit: DecayFit | None = None) -> OneL
     >>> print(single_exponential(DecayRecord(t, 500 / (1 + t / 36000))).lifetime.value > 10)
     True
     """
-    found = solve_decay(*padded(record), free=np.array([1.0, 1.0, 0.0, 0.0]))
-    scale = math.sqrt(float(found.sum_squares) / (len(record) - 2))
-    scale = scale if record.error is None else max(1.0, scale)
-    rate, error = float(found.values.b), float(found.errors.b) * scale
-    return _one_lifetime(
-        rate, error, found.residuals[: len(record)], fit or fit_decay(record, law=Law.constant)
-    )
+    found = solved(Pieces.of(record), (LOSS,))
+    moments = found.whitened((LEVEL, LOSS), True).memory().moments(np.eye(2)[1:], found.given)
+    error = float(moments.error[0]) / record.span
+    left = found.residuals * found.pieces.over
+    fit = fit or fit_decay(record, law=Law.constant)
+    return _one_lifetime(float(found.values.b), error, left, fit)
 
 
 def log_linear(record: DecayRecord, fit: DecayFit | None = None) -> OneLifetime:

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from beamfit.quantity import Quantity
-from beamfit.studies.decay.law import lifetime_of
+from beamfit.studies.decay.expansion import lifetime_of
 from beamfit.studies.decay.scales import SEPARABLE, ScaleFit, spread_of_scales
 
 

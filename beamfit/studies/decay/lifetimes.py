@@ -19,14 +19,8 @@ from beamfit.lifetime.decay import HOUR
 from beamfit.quantity import Quantity, Status
 from beamfit.shown import shown
 from beamfit.statistics import reach_of
-from beamfit.studies.decay.departures import (
-    CURRENTS,
-    EXACT,
-    ConstantA,
-    LifetimeLaw,
-    constant_a,
-)
-from beamfit.studies.decay.evidence import UNITS
+from beamfit.studies.decay.alternatives import CURRENTS, ConstantA, LifetimeLaw, constant_a
+from beamfit.studies.decay.evidence import EXACT, UNITS
 from beamfit.studies.decay.fit import bare
 from beamfit.studies.decay.record import FEWEST_LIFETIMES, LifetimeTable
 from beamfit.studies.decay.verdict import TableEvidence, finding_of_table

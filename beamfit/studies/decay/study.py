@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -10,16 +11,25 @@ from typing import Any
 import numpy as np
 
 from beamfit.errors import InputError, expect
+from beamfit.lifetime.decay import HOUR
+from beamfit.quantity import Status
 from beamfit.shown import shown
 from beamfit.studies.decay.budget import Budget, Machine, budget
 from beamfit.studies.decay.checks import DecayChecks, check_decay
-from beamfit.studies.decay.cycles import alike, cut_at_refills, is_refilled, joined, usual_cycle
-from beamfit.studies.decay.fit import DecayFit, bare, fit_decay
+from beamfit.studies.decay.cycles import (
+    alike,
+    cut_at_refills,
+    is_refilled,
+    joined,
+    unresolved,
+    usual_cycle,
+)
+from beamfit.studies.decay.evidence import SEPARABLE
+from beamfit.studies.decay.fit import DecayFit, bare, fit_cycles, fit_decay
 from beamfit.studies.decay.marginal import Law
-from beamfit.studies.decay.pool import FEWEST_CYCLES
-from beamfit.studies.decay.pooled import fit_cycles, seen_through, stands_alone
+from beamfit.studies.decay.pool import FEWEST_CYCLES, MOST
 from beamfit.studies.decay.record import DecayRecord
-from beamfit.studies.decay.segments import Event, Split, split_record
+from beamfit.studies.decay.segments import Event, Split, noise_of, split_record
 from beamfit.studies.decay.systematics import Systematic, systematics
 from beamfit.studies.decay.thinning import on_edges, thinned, without_repeats
 from beamfit.table import json_of
@@ -29,6 +39,87 @@ CHANGED = 0.01
 SETTINGS = ("rf_voltage", "scraper_y", "bunches")
 # Decays shorter than this are pieces between two events.
 SHORTEST = 8
+# Refills of so many standard deviations of the means beside them are none of them missed.
+SEEN = 6.0
+# Scatter, over the length squared, of the parabola t² beside its line, halved: the bend of a decay.
+BEND = 1 / 12 / math.sqrt(5)
+# Noise with a memory is taken for so many times what neighbouring readings scatter by.
+OWN = 3.0
+# Probability of refills faster than the record is read from which cycles tell no lifetime.
+UNSURE = 0.05
+# Points of a picture.
+POINTS = 60
+
+
+def stands_alone(cycle: DecayRecord, fit: DecayFit) -> bool:
+    """Whether a cycle by itself would tell a from b, by the bend of its decay and the noise that
+    all cycles show; where one law does not hold for all, that of its neighbouring readings.
+    """
+    noise = fit.rms_residual * fit.inflation
+    if fit.status is Status.poor_fit:
+        noise = min(noise, OWN * noise_of(cycle.time, cycle.current))
+    loss = cycle.span / HOUR / fit.lifetime_mean.value
+    bend = float(cycle.current.mean()) * loss**2 * BEND / 2 * math.sqrt(len(cycle))
+    return noise * math.sqrt(max(len(cycle) / MOST, 1.0)) < SEPARABLE * bend
+
+
+def seen_through(fit: DecayFit, usual: float, interval: float) -> DecayFit:
+    """A fit to cycles that were found, without errors where refills may have been missed: then the
+    beam seems to live longer than it does. `usual` is how many readings
+    a cycle has, one each `interval`.
+
+    The refill that holds the current gives back what a cycle loses. It is told from the noise by
+    the means of half a cycle before and after.
+    """
+    lifetime = fit.lifetime_mean.value * HOUR
+    if lifetime > 0 and unresolved(usual, interval, lifetime) > UNSURE:
+        cause = (
+            "The beam is held by refills that the record may not resolve: of those that were found "
+            f"the next comes after {usual:.3g} readings, but faster ones look the same when read "
+            f"every {interval:.3g} s. Record more readings from refill to refill. "
+        )
+        return _opened(fit, cause)
+    record, memory = fit.readings, fit.identifiability.residual_correlation
+    half = max(len(record) / fit.first.size / 2, 1.0)
+    mean = (1 + memory) / (1 - memory) / half if memory else 1 / half
+    least = SEEN * fit.rms_residual * math.sqrt(2 * min(mean, 1.0))
+    lasts = 2 * half * float(np.median(np.diff(record.time)))
+    lifetime = fit.lifetime_mean.value
+    lost = fit.mean_current * lasts / (lifetime * HOUR)
+    if lost >= least or not lifetime > 0:  # that of a current that rises is nan
+        return fit
+    cause = (
+        f"A cycle of the {fit.first.size} that were found loses {lost:.2g} mA, and refills below "
+        f"{least:.2g} mA can be missed in this noise: the beam then seems to live longer than it "
+        f"does. Average readings, or give the times of the refills by cutting the record there. "
+    )
+    return _opened(fit, cause)
+
+
+def _opened(fit: DecayFit, cause: str) -> DecayFit:
+    bare = {name: quantity.open() for name, quantity in fit.quantities.items()}
+    return replace(fit, status=Status.unidentified, message=cause + fit.message, exact=bare, **bare)
+
+
+def cycle_lifetimes(fit: DecayFit) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Time, s, lifetime and its error, h, of up to 60 parts of a pooled fit; for a picture.
+
+    The slope of the residuals of its cycles is what the loss rate of a part departs by.
+    """
+    record, first = fit.readings, fit.first
+    lengths = np.diff(first, append=len(record))
+    columns = np.column_stack([record.time, fit.residuals])
+    mean = np.add.reduceat(columns, first) / lengths[:, None]
+    since, residual = (columns - np.repeat(mean, lengths, axis=0)).T
+    part = first[np.linspace(0, first.size, min(first.size, POINTS), endpoint=False).astype(int)]
+    count = np.diff(part, append=len(record))
+    at, level = (np.add.reduceat(v, part) / count for v in (record.time, record.current))
+    squares = np.add.reduceat(since**2, part)
+    rate = np.add.reduceat(since * residual, part) / squares / level
+    rate += fit.a.value * level + fit.b.value
+    error = fit.rms_residual / np.sqrt(squares) / level
+    seen = rate > 0
+    return at[seen], 1 / rate[seen] / HOUR, (error / rate**2)[seen] / HOUR
 
 
 @dataclass(frozen=True, eq=False)

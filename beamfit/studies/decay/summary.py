@@ -10,8 +10,8 @@ import numpy as np
 from jax import Array
 
 from beamfit.lifetime.decay import current
+from beamfit.studies.decay.expansion import padded_size
 from beamfit.studies.decay.fit import DecayFit
-from beamfit.studies.decay.model import padded_size
 from beamfit.studies.decay.study import Decay
 from beamfit.studies.decay.systematics import about_fit
 

@@ -10,9 +10,15 @@ from beamfit.lifetime.decay import HOUR
 from beamfit.quantity import Status
 from beamfit.shown import shown
 from beamfit.studies.decay.evidence import UNITS
+from beamfit.studies.decay.expansion import (
+    POWER,
+    Expansion,
+    Physical,
+    Pieces,
+    expanded,
+    further_columns,
+)
 from beamfit.studies.decay.fit import DecayFit, bare
-from beamfit.studies.decay.law import Expansion, Physical
-from beamfit.studies.decay.model import expanded
 from beamfit.studies.decay.record import DecayRecord
 from beamfit.table import json_of
 
@@ -66,9 +72,9 @@ def systematics(fit: DecayFit) -> tuple[Systematic, ...]:
     Notes
     -----
     A change of the readings d moves the numbers by (JᵀWJ)⁻¹ JᵀW d. A pressure that rises by the
-    share e over the record adds -b e (t/T - 1/2) I to dI/dt, and so d = -I² exp(bt) b e
-    ∫ (t/T - 1/2) exp(-bt)/I dt, as of `law.bent_current`. A pressure P0 + P1 I adds the part that
-    follows the current to a exactly: no decay tells it from a.
+    share e over the record adds -b e (t/T - 1/2) I to dI/dt: a column of the law, as an exponent
+    is. A pressure P0 + P1 I adds the part that follows the current to a exactly: no decay tells it
+    from a.
 
     Examples
     --------
@@ -86,15 +92,12 @@ def systematics(fit: DecayFit) -> tuple[Systematic, ...]:
     if record is None or another or fit.status is Status.infeasible or fit.a.error is None:
         return ()
     about = about_fit(fit)
-    over = 1.0 if record.error is None else record.error
-    level = record.current + about.residuals * over
-    share = record.time / record.span
-    source = (share - 0.5) * np.exp(-b * record.time) / level
-    grown = level**2 * np.exp(b * record.time) * record.integral(source)
+    over, share = about.pieces.over, record.time / record.span
+    grown = further_columns(about, "drift", np.zeros(1))[:, 0] * over * record.span
     rises = f"pressure rises by {100 * PRESSURE:g} % over the record"
     bends = f"a goes as I^{EXPONENT:g}, as of a bunch that lengthens"
-    causes = {rises: -b * PRESSURE * grown, **_monitor(record, share)}
-    causes |= {bends: EXPONENT * (about.rows[:, 3] * over)}
+    causes = {rises: b * PRESSURE * grown, **_monitor(record, share)}
+    causes |= {bends: EXPONENT * (about.rows[:, POWER] * over)}
     if fit.free_law is not None:
         contained = {bends} if fit.free_law.drift is None else {bends, rises}
         causes = {cause: change for cause, change in causes.items() if cause not in contained}
@@ -125,4 +128,4 @@ def about_fit(fit: DecayFit) -> Expansion:
     i0, a, b = (fit.if_constant(name).value for name in ("i0", "a", "b"))
     rate, unused = a * fit.mean_current + b, np.nan
     values = Physical(i0, a, b, unused, unused, rate, unused, unused)
-    return expanded(fit.readings, values)
+    return expanded(Pieces.of(fit.readings), values)

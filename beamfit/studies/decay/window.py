@@ -16,11 +16,10 @@ from beamfit.studies.decay.budget import Machine, budget
 from beamfit.studies.decay.conditions import Conditions
 from beamfit.studies.decay.cycles import alike, cut_at_refills, joined, usual_cycle
 from beamfit.studies.decay.evidence import UNITS
-from beamfit.studies.decay.fit import DecayFit, bare, fit_decay
+from beamfit.studies.decay.fit import DecayFit, bare, fit_decay, fit_pieces
 from beamfit.studies.decay.marginal import Law
-from beamfit.studies.decay.pooled import fit_pieces, seen_through
 from beamfit.studies.decay.record import DecayRecord
-from beamfit.studies.decay.study import SHORTEST, at_settings
+from beamfit.studies.decay.study import SHORTEST, at_settings, seen_through
 from beamfit.table import json_of
 
 
