@@ -10,9 +10,8 @@ from beamfit.errors import InputError
 from beamfit.io.monitor import monitor_of
 from beamfit.lifetime.decay import HOUR
 from beamfit.quantity import Status
-from beamfit.studies.decay.fit import fit_decay, fit_decays
+from beamfit.studies.decay.fit import fit_cycles, fit_decay, fit_decays
 from beamfit.studies.decay.monitor import Monitor
-from beamfit.studies.decay.pooled import fit_cycles
 from beamfit.studies.decay.record import DecayRecord
 from beamfit.studies.decay.study import study_record
 from beamfit.studies.decay.summary import summarise

@@ -28,6 +28,7 @@ from beamfit.studies.decay.expansion import (
     PLAIN,
     POWER,
     QUADRATIC,
+    TIMES,
     WHEN,
     Expansion,
     Pieces,
@@ -48,12 +49,15 @@ FOUND = 4.57
 # Readings from which a search with further numbers learns all that it can.
 ENOUGH = 1024
 # Times, over the span, that are looked at for a change, and from which searches for gas begin.
-GRID, STARTS = np.linspace(0.05, 0.95, 40), (0.05, 0.2, 0.7)
+GRID, STARTS, LONGEST = np.linspace(0.05, 0.95, 40), (0.05, 0.2, 0.7), 1.0
+# Changes are placed on ever finer grids about the best of the last, so often.
+FINER = 3
 # Two changes within so many readings are a step.
 STEP = 3.0
-# Prior odds of a change, of two, and of gas that relaxes, to the law without; and the width of the
-# further loss over the whole loss: what is worth a name.
-ODDS, WIDTH = {"step": 0.03, "steps": 0.01, "relaxing": 0.03}, 0.3
+# Prior probabilities: constant a and b, a power of a, a drift of b beside, one change, two, gas
+# that relaxes; and between which shares of the loss a further one lies, flat in its logarithm.
+CHANCES = {"": 0.4, "power": 0.2, "drift": 0.2, "step": 0.08, "steps": 0.04, "relaxing": 0.08}
+SIZES = (1e-3, 1.0)
 # Currents at which a lifetime is offered, if the loss rate there is so many errors above zero.
 CURRENTS, CLEAR = 5, 3.0
 
@@ -243,11 +247,13 @@ class Outgassing(NamedTuple):
 class Rival(NamedTuple):
     """What explains a record better than a smooth law: a change or gas, and by how much.
 
-    `odds` is the logarithm of its probability over that of a power of a with a drift of b.
+    `odds` is the logarithm of its probability over that of a power of a with a drift of b, and
+    `scatter` what it leaves of the readings, mA rms.
     """
 
     found: Change | Outgassing
     odds: float
+    scatter: float
 
     def __str__(self) -> str:
         size = self.odds / math.log(10.0)
@@ -271,9 +277,8 @@ def rival_of(plain: Expansion) -> Rival | None:
     Notes
     -----
     Probabilities by Laplace's approximation about the best numbers of each, the size and the memory
-    of the noise averaged over as in `beamfit.studies.decay.marginal`. Further losses are normal
-    about zero, `WIDTH` of the whole loss wide; times are flat in the record, those of gas in their
-    logarithm up to the length of the record.
+    of the noise averaged over as in `beamfit.studies.decay.marginal`. Further losses are flat in
+    their logarithm, times in the record, those of gas in their logarithm up to its length.
     """
     pieces = _averaged(plain.pieces)
     if pieces.time.size <= WHEN + 2:
@@ -285,12 +290,13 @@ def rival_of(plain: Expansion) -> Rival | None:
     laws["relaxing"] = _relaxing(plain) if pieces.gauge is None else None
     for name, law in laws.items():
         if law is not None:
-            found.append((_log_evidence(law, name) + math.log(ODDS[name]), name, law))
+            found.append((_log_evidence(law, name), name, law))
     log, name, best = max(found, key=lambda one: one[0], default=(-math.inf, "", plain))
     if not log > smooth:
         return None
     answer = _outgassing(best) if name == "relaxing" else _change(best)
-    return Rival(answer, log - smooth)
+    scatter = float(np.sqrt(np.mean((best.residuals * pieces.over) ** 2)))
+    return Rival(answer, log - smooth, scatter)
 
 
 def _averaged(pieces: Pieces) -> Pieces:
@@ -315,30 +321,33 @@ def _smooth(plain: Expansion) -> float:
 
 
 def _changed(plain: Expansion, count: int) -> Expansion | None:
-    """The law with changes of the loss rate, searched from the times that explain most."""
-    time = plain.pieces.time / plain.pieces.units[0]
-    basis = np.linalg.qr(plain.rows[:, [LEVEL, *PLAIN]])[0]
+    """The law with changes of the loss rate at the times that explain most, in linear
+    approximation about the law without.
+    """
+    basis = np.linalg.qr(plain.left[:, [LEVEL, *PLAIN]])[0]
 
     def beside(columns: np.ndarray) -> np.ndarray:
         return columns - basis @ (basis.T @ columns)
 
-    residual, kinks = beside(plain.residuals), beside(further_columns(plain, "step", GRID))
-    pairs = list(itertools.combinations(range(GRID.size), count))
-    products, along = kinks.T @ kinks, kinks.T @ residual
-    found = []
-    for chosen in pairs:
-        rows = products[np.ix_(chosen, chosen)] + 1e-12 * np.eye(count) * products.max()
-        found.append(along[list(chosen)] @ np.linalg.solve(rows, along[list(chosen)]))
-    best = list(pairs[int(np.argmax(found))])
-    rows = products[np.ix_(best, best)] + 1e-12 * np.eye(count) * products.max()
-    sizes = -np.linalg.solve(rows, along[best])
-    further = np.column_stack([sizes, GRID[best]]).ravel()
-    free = (*PLAIN, *range(FURTHER, FURTHER + 2 * count))
+    residual, windows = beside(plain.residuals), [GRID] * count
+    for _ in range(FINER):
+        every = np.concatenate(windows)
+        kinks = beside(further_columns(plain, "step", every))
+        size = np.linalg.norm(kinks, axis=0) + 1e-300
+        along, products = kinks.T @ residual / size, kinks.T @ kinks / size / size[:, None]
+        place = np.array(list(itertools.product(*np.split(np.arange(every.size), count))))
+        pairs = products[place[:, :, None], place[:, None, :]] + 1e-6 * np.eye(count)
+        sizes = np.linalg.solve(pairs, along[place][..., None])[..., 0]
+        best = int(np.argmax(np.sum(sizes * along[place], axis=1)))
+        times, steps = every[place[best]], [window[1] - window[0] for window in windows]
+        windows = [np.linspace(t - d, t + d, GRID.size) for t, d in zip(times, steps, strict=True)]
+    further = np.column_stack([-sizes[best] / size[place[best]], times])
+    further = further[np.argsort(times)].ravel()
+    free = (*PLAIN, *range(FURTHER, FURTHER + 2 * count, 2))
     law = solved(plain.pieces, free, "step", start=np.append(plain.numbers, further))
-    times = np.sort(law.numbers[4::2])
-    apart = STEP * float(np.median(np.diff(time)))
-    inside = apart < times[0] and times[-1] < 1 - apart and np.all(np.diff(times) > apart)
-    return law if law.rested and inside else None
+    apart = STEP * float(np.median(np.diff(plain.pieces.time))) / plain.pieces.units[0]
+    clear = np.all(np.diff([0.0, *law.numbers[4::2], 1.0]) > apart)
+    return law if law.rested and clear else None
 
 
 def _relaxing(plain: Expansion) -> Expansion | None:
@@ -349,7 +358,11 @@ def _relaxing(plain: Expansion) -> Expansion | None:
                start=np.append(plain.numbers, [0.1 * abs(plain.numbers[0]), at]))
         for at in STARTS
     ]  # fmt: skip
-    laws = [law for law in laws if law.rested and law.numbers[3] > 0 and law.numbers[4] < 1]
+    shortest = float(np.median(np.diff(plain.pieces.time))) / plain.pieces.units[0]
+    laws = [
+        law for law in laws
+        if law.rested and law.numbers[3] > 0 and shortest < law.numbers[4] < LONGEST
+    ]  # fmt: skip
     return min(laws, key=lambda law: float(law.residuals @ law.residuals), default=None)
 
 
@@ -361,15 +374,18 @@ def _log_evidence(law: Expansion, name: str) -> float:
         extra[POWER] = BELOW if power < 0 else ABOVE
     if name == "drift":
         extra[FURTHER] = DRIFT * max(abs(loss - quadratic), 1e-300)
-    volume = 0.0
-    for k in range(len(further) // 2 * (name != "drift")):
-        extra |= {FURTHER + 2 * k: WIDTH * abs(loss), WHEN + 2 * k: np.inf}
-        volume += 0.5 * math.log(2 * math.pi)
-        if name == "relaxing":
-            volume -= math.log(further[1] * -math.log(1e-3))
+    flat = []
+    for k in range(0, len(further) * (name != "drift"), 2):
+        # A flat prior as a normal one of that density: what is not determined costs nothing.
+        size = 2 * max(abs(further[k]), SIZES[0] * abs(loss)) * math.log(SIZES[1] / SIZES[0])
+        time = 1.0 if name != "relaxing" else further[1] * math.log(LONGEST / TIMES[0])
+        for column, wide in ((FURTHER + k, size), (WHEN + k, time)):
+            extra[column] = wide / math.sqrt(2 * math.pi)
+            flat.append(column)
     columns = [LEVEL, *PLAIN, *extra]
     width = np.array([np.inf] * 3 + list(extra.values()))
-    centre = np.array([0.0] * 3 + [law.numbers[c - 1] for c in extra])
+    known = [0.0 if column in flat else law.numbers[column - 1] for column in extra]
+    centre = np.array([0.0] * 3 + known)
     rows = np.column_stack([law.residuals, law.rows[:, columns]])
     products = Products.of(rows, law.pieces.time, law.pieces.error is not None)
     along, matrix = products.matrix[:, 1:, 0], products.matrix[:, 1:, 1:]
@@ -387,7 +403,8 @@ def _log_evidence(law: Expansion, name: str) -> float:
     log = log - 0.5 * np.linalg.slogdet(scaled)[1] - np.log(scale).sum(1)
     finite = np.isfinite(width)
     log = log - 0.5 * np.sum(((centre + step) / width)[:, finite] ** 2, 1)
-    return float(logsumexp(log)) - float(np.log(width[finite]).sum()) + volume
+    chance = math.log(CHANCES[name])
+    return float(logsumexp(log)) - float(np.log(width[finite]).sum()) + chance
 
 
 def _quantities(law: Expansion, values: np.ndarray, slopes: np.ndarray, columns: list[int]):

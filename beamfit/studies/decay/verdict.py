@@ -399,10 +399,11 @@ def _moved(e: Evidence) -> str | None:
 
 def _wandering(e: Evidence) -> str | None:
     """Residuals as long as the record, of readings that by themselves are far better than that."""
-    length, record = e.correlation_time, e.record
+    length, record, rival = e.correlation_time, e.record, e.explained
     local = noise_of(record.time, record.current)
-    rms = float(np.std(e.residuals))
-    if length is None or length < record.span / 3 or rms < WANDERS * local:
+    rms = float(np.std(e.residuals)) if rival is None else rival.scatter
+    short = length is not None and length < record.span / 3
+    if not e.about.wanders or short or rms < WANDERS * local:
         return None
     return (
         f"Neighbouring readings scatter by {local:.2g} mA alone: the loss rate or the monitor "
