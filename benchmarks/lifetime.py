@@ -21,6 +21,7 @@ import at
 import h5py
 import jax
 import numpy as np
+from beamfit.studies.decay.model import solve_decay
 from rich.console import Console
 from rich.table import Table
 from scipy.optimize import curve_fit
@@ -29,7 +30,6 @@ from beamfit.io.ring import ring_from_pyat
 from beamfit.lifetime.bunch import population
 from beamfit.lifetime.touschek import piwinski_rate
 from beamfit.studies.decay.fit import fit_decay, fit_decays
-from beamfit.studies.decay.model import solve_decay
 from beamfit.studies.decay.record import DecayRecord
 
 sys.path.insert(0, str(Path(__file__).parent))

@@ -181,7 +181,7 @@ def of_record(record: DecayRecord | LifetimeTable) -> list[Fact]:
         began = datetime.fromtimestamp(record.start, UTC).isoformat(timespec="seconds")
         facts.append(Fact("began", began, began))
     facts += _known(record.conditions, CONDITIONS)
-    from beamfit.studies.decay.segments import split_record  # scipy, for records alone
+    from beamfit.studies.decay.pieces import split_record  # scipy, for records alone
 
     split = split_record(record)
     kinds = Counter(event.kind for event in split.events)

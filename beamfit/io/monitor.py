@@ -10,7 +10,7 @@ import numpy as np
 
 from beamfit.errors import InputError
 from beamfit.io.sheet import UNITS
-from beamfit.studies.decay.monitor import Monitor
+from beamfit.studies.decay.record import Monitor
 
 ZERO_BEAM = "zero-beam"
 # Readings below this share of the largest are of no beam, if so many stand in a row. They scatter

@@ -13,7 +13,7 @@ from beamfit.io.machine import POSITIVE, read_machine
 from beamfit.io.record_columns import QUANTITIES
 from beamfit.io.sheet import UNITS
 from beamfit.io.toml import TEXT, Key, Section
-from beamfit.studies.decay.conditions import Conditions
+from beamfit.studies.decay.record import Conditions
 
 # Keys are named as the columns of a decay record are.
 NAMES = ("beam_current", *Conditions._fields)

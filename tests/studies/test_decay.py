@@ -11,15 +11,15 @@ from beamfit.io.decay_record import read_decay_record
 from beamfit.lifetime.decay import current_by_rate
 from beamfit.quantity import Status
 from beamfit.studies.decay import alternatives
-from beamfit.studies.decay.checks import (
+from beamfit.studies.decay.expansion import Pieces, solved
+from beamfit.studies.decay.fit import DecayFit, fit_decay, fit_decays
+from beamfit.studies.decay.record import DecayRecord
+from beamfit.studies.decay.systematics import (
     constant_a_test,
     log_linear,
     moving_lifetime,
     single_exponential,
 )
-from beamfit.studies.decay.expansion import Pieces, solved
-from beamfit.studies.decay.fit import DecayFit, fit_decay, fit_decays
-from beamfit.studies.decay.record import DecayRecord
 
 constant_fit = partial(fit_decay, law="constant")
 constant_fits = partial(fit_decays, law="constant")

@@ -11,7 +11,7 @@ from beamfit.errors import InputError
 from beamfit.studies.decay.cycles import find_cycles
 from beamfit.studies.decay.expansion import Pieces, solved
 from beamfit.studies.decay.fit import fit_cycles, fit_decay, fit_decays
-from beamfit.studies.decay.lifetimes import fit_lifetimes
+from beamfit.studies.decay.lifetime_table import fit_lifetimes
 from beamfit.studies.decay.marginal import NODE, Numbers, Seen, drawn, quantiles
 from beamfit.studies.decay.record import Conditions, DecayRecord, LifetimeTable
 from beamfit.studies.decay.study import study_record

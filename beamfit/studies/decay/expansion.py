@@ -23,8 +23,7 @@ from beamfit.greybox.problem import padded_length
 from beamfit.lifetime.decay import HOUR, Moments, beam_current, cumulative
 from beamfit.noise.correlated import Levels, Noise, remembers
 from beamfit.quantity import Quantity
-from beamfit.studies.decay.monitor import Monitor
-from beamfit.studies.decay.record import DecayRecord
+from beamfit.studies.decay.record import DecayRecord, Monitor
 
 # Columns of the slopes: the current of the piece, loss at the mean current and its quadratic part,
 # power of a, a further loss and its time.

@@ -14,13 +14,12 @@ from beamfit.frames import quantity_frame
 from beamfit.quantity import Quantity, Status
 from beamfit.shown import shown
 from beamfit.studies.decay.alternatives import Change, ConstantA, LifetimeLaw, Outgassing
+from beamfit.studies.decay.answer import finding_of, finding_of_cycles
+from beamfit.studies.decay.cycles import FEWEST_CYCLES, FEWEST_READINGS, averaged, cleaned
 from beamfit.studies.decay.evidence import BELIEVED, UNITS, Evidence, Separability
 from beamfit.studies.decay.expansion import Expansion, Pieces, Shape, solved, solved_together
 from beamfit.studies.decay.marginal import FreeLaw, Law
-from beamfit.studies.decay.monitor import Monitor
-from beamfit.studies.decay.pool import FEWEST_CYCLES, FEWEST_READINGS, averaged, cleaned
-from beamfit.studies.decay.record import DecayRecord
-from beamfit.studies.decay.verdict import finding_of, finding_of_cycles
+from beamfit.studies.decay.record import DecayRecord, Monitor
 from beamfit.table import Table, cell, json_of, labelled, plain_name
 
 if TYPE_CHECKING:

@@ -14,15 +14,9 @@ from beamfit.statistics import MANY, POOR_FIT, chi2_probability, few_words
 from beamfit.status import Status
 from beamfit.studies.decay.alternatives import ConstantA, LifetimeLaw, Outgassing
 from beamfit.studies.decay.cycles import is_sawtooth
-from beamfit.studies.decay.evidence import (
-    BELIEVED,
-    DETERMINED,
-    SEPARABLE,
-    UNITS,
-    Evidence,
-)
-from beamfit.studies.decay.monitor import Monitor
-from beamfit.studies.decay.segments import noise_of
+from beamfit.studies.decay.evidence import BELIEVED, DETERMINED, SEPARABLE, UNITS, Evidence
+from beamfit.studies.decay.pieces import noise_of
+from beamfit.studies.decay.record import Monitor
 from beamfit.verdict import Finding, judge
 
 # Lifetimes, s, that stored beams seldom have, but times in a wrong unit often give.
