@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.stats import t
 
 from beamfit.errors import InputError
 from beamfit.io.decay_record import read_decay_record
@@ -139,7 +140,8 @@ def test_errors_missing_from_the_file_are_inferred_and_said_so():
     assert fit.noise_inferred
     assert "inferred from the residuals" in fit.message
     assert fit.chi2 == fit.dof
-    assert fit.a.error == fit.a.error_raw
+    # Half of the central 68 % of Student's distribution.
+    assert fit.a.error == pytest.approx(fit.a.error_raw * t.ppf(0.841344746, fit.dof), rel=1e-9)
     stated = constant_fit(simulated(8 * HOUR, stated=1e-3))
     assert fit.a.error == pytest.approx(stated.a.error_raw, rel=0.1)
 
