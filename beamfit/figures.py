@@ -21,10 +21,10 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from beamfit.sampling.posterior import Posterior
+    from beamfit.studies.decay.course import Trend
     from beamfit.studies.decay.fit import DecayFit
-    from beamfit.studies.decay.shift import Shift
+    from beamfit.studies.decay.ring_study import Shift
     from beamfit.studies.decay.study import Decay, RecordStudy
-    from beamfit.studies.decay.trend import Trend
     from beamfit.studies.scan.fit import EmittanceFit
 
 __all__ = [
@@ -148,7 +148,7 @@ def trend(result: Trend) -> Figure:
     Parameters
     ----------
     result : Trend
-        Of `beamfit.studies.decay.trend.trend_of`.
+        Of `beamfit.studies.decay.course.trend_of`.
 
     Returns
     -------

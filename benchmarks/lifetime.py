@@ -28,8 +28,8 @@ from scipy.optimize import curve_fit
 from beamfit.io.ring import ring_from_pyat
 from beamfit.lifetime.bunch import population
 from beamfit.lifetime.touschek import piwinski_rate
+from beamfit.studies.decay.expansion import Pieces, solved
 from beamfit.studies.decay.fit import fit_decay, fit_decays
-from beamfit.studies.decay.model import solve_decay
 from beamfit.studies.decay.record import DecayRecord
 
 sys.path.insert(0, str(Path(__file__).parent))
@@ -89,14 +89,13 @@ def fit(table: Table) -> None:
     t = np.linspace(0, 8 * HOUR, 1000)
     noise = 1e-3 * np.random.default_rng(1).normal(size=1000)
     measured = law(t, 500.0, 2.0, 1.0) + noise
-    error, weight = np.full(1000, 1e-3), np.full(1000, 1e3)
-    record = DecayRecord(t, measured, error)
-    ours, least = seconds(lambda: solve_decay(t, measured, weight), 300)
+    record = DecayRecord(t, measured, np.full(1000, 1e-3))
+    ours, least = seconds(lambda: solved(Pieces.of(record)), 300)
     whole, whole_least = seconds(lambda: fit_decay(record), 300)
-    peer, _ = seconds(lambda: curve_fit(law, t, measured, [490, 5, 5], error, True), 20)
-    best, _ = curve_fit(law, t, measured, [490, 5, 5], error, True)
-    found = solve_decay(t, measured, weight)
-    off = abs(float(found.values.a) * 1e8 - best[1]) / (float(found.errors.a) * 1e8)
+    peer, _ = seconds(lambda: curve_fit(law, t, measured, [490, 5, 5], record.error, True), 20)
+    best, _ = curve_fit(law, t, measured, [490, 5, 5], record.error, True)
+    found = fit_decay(record, law="constant").a
+    off = abs(found.value * 1e8 - best[1]) / (found.error * 1e8)
     for name, median, smallest in (
         ("1000-point solve", ours, least),
         ("1000-point fit with verdict", whole, whole_least),

@@ -186,7 +186,7 @@ class Job:
             yield from (row | about for row in found)
 
     def _decay_rows(self, file: str) -> list[dict[str, Any]]:
-        from beamfit.studies.decay.lifetimes import fit_lifetimes
+        from beamfit.studies.decay.lifetime_table import fit_lifetimes
         from beamfit.studies.decay.study import study_record
 
         record = read_lifetime_input(file, **self.reading)

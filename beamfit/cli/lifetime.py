@@ -17,11 +17,10 @@ from beamfit.studies.decay.record import LifetimeTable
 if TYPE_CHECKING:
     from beamfit.cli.show import Terminal
     from beamfit.sampling.posterior import Posterior
-    from beamfit.studies.decay.budget import Machine
-    from beamfit.studies.decay.lifetimes import LifetimeFit
-    from beamfit.studies.decay.shift import Shift
-    from beamfit.studies.decay.study import Decay, RecordStudy
-    from beamfit.studies.decay.trend import Trend
+    from beamfit.studies.decay.course import Trend
+    from beamfit.studies.decay.lifetime_table import LifetimeFit
+    from beamfit.studies.decay.ring_study import Shift
+    from beamfit.studies.decay.study import Decay, Machine, RecordStudy
 
 EXAMPLE = """\b
 Examples:
@@ -161,7 +160,7 @@ def lifetime(
 
 def _lifetimes(tables: list[LifetimeTable], inputs: dict[str, str], as_json: bool) -> None:
     """Fit and show tables of lifetimes."""
-    from beamfit.studies.decay.lifetimes import fit_lifetimes  # JAX from here on
+    from beamfit.studies.decay.lifetime_table import fit_lifetimes  # JAX from here on
 
     fits = [fit_lifetimes(table) for table in tables]
     answered(as_json, fits, inputs, lambda terminal: _show_lifetimes(terminal, fits))
@@ -190,7 +189,7 @@ def _check_study(study: bool, ring: str | None, network: str | None, priors: dic
 def _machine(path: str) -> Machine:
     ring, operation = beamfit.read_ring(path), beamfit.read_operation(path)
 
-    from beamfit.studies.decay.budget import Machine
+    from beamfit.studies.decay.study import Machine
 
     return Machine(ring, operation)
 
@@ -201,14 +200,14 @@ def _shift(
     network: str | None,
     priors: dict[str, tuple[float, float]] | None,
 ) -> Shift:
-    from beamfit.studies.decay.network import Network
-    from beamfit.studies.decay.shift import study_shift
+    from beamfit.studies.decay.loss_network import Network
+    from beamfit.studies.decay.ring_study import study_shift
 
     return study_shift(decays, machine, network=network and Network(network), priors=priors)
 
 
 def _trend(studies: tuple[RecordStudy, ...], machine: Machine | None) -> Trend:
-    from beamfit.studies.decay.trend import trend_of
+    from beamfit.studies.decay.course import trend_of
 
     return trend_of(studies, machine)
 

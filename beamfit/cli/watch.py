@@ -66,7 +66,7 @@ async def _watched(
     from beamfit.live.page import page
     from beamfit.live.served import check_unserved, served
     from beamfit.live.watch import connect, watch
-    from beamfit.studies.decay.budget import Machine
+    from beamfit.studies.decay.study import Machine
     from beamfit.studies.decay.watch import Plan
 
     ring = machine.ring and Machine(

@@ -11,7 +11,7 @@ from itertools import groupby
 from typing import NamedTuple
 
 import numpy as np
-from scipy.special import stdtr
+from scipy.special import stdtr, stdtrit
 
 from beamfit.greybox.covariance import CUT
 from beamfit.noise.correlated import Levels, Noise, log_volume, white_beside, whitened
@@ -21,6 +21,8 @@ SHORTEST, LONGEST, TIMES = 0.3, 5.0, 40
 # Grid of the white noise's variance, in units of the variance that the correlated part gains from
 # one reading to the next; with it a smaller count of correlation times.
 WHITE, FEWER = (0.0, 1.0, 10.0, 100.0, 1000.0), 20
+# Central 68 %, one standard deviation to either side of a normal distribution, and its upper end.
+CENTRAL, HALF = 0.682689492, 0.841344746
 
 
 class AveragedMoments(NamedTuple):
@@ -82,20 +84,26 @@ class Memory(NamedTuple):
         """Quantities by their slopes, shape (q, p), averaged over noises.
 
         `least` is the least size of the errors: 1 where they were given and rows are in their
-        unit.
+        unit. Of a single noise errors that were given are normal.
         """
         centre = self.step @ slopes.T
         size = np.maximum(np.sqrt(self.squares / self.dof), least)
         spread = np.linalg.norm(np.einsum("qp,gpr->gqr", slopes, self.half), axis=2)
         spread = np.maximum(spread * size[:, None], 1e-300)
         shift = self.weight @ centre
+        if self.weight.size == 1:
+            [spread], dof = spread, np.inf if least else self.dof
+            chance = 2 * stdtr(self.dof, -np.abs(shift) / spread)
+            return AveragedMoments(
+                shift, stdtrit(dof, HALF) * spread, stdtrit(dof, 0.975) * spread, chance
+            )
 
         def within(reach: np.ndarray) -> np.ndarray:
             ends = [(shift + sign * reach - centre) / spread for sign in (1, -1)]
             return self.weight @ (stdtr(self.dof, ends[0]) - stdtr(self.dof, ends[1]))
 
         reaches = [_inverted(within, np.max(np.abs(centre - shift) + spread, 0), p)
-                   for p in (0.6827, 0.95)]  # fmt: skip
+                   for p in (CENTRAL, 0.95)]  # fmt: skip
         chance = self.weight @ (2 * stdtr(self.dof, -np.abs(centre) / spread))
         return AveragedMoments(shift, *reaches, chance)
 

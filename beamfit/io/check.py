@@ -335,7 +335,7 @@ def of_record(record: DecayRecord | LifetimeTable) -> list[Fact]:
         columns = ("lifetime", record.lifetime, "h"), ("beam current", record.current, "mA")
         facts = [Fact("lifetimes", str(len(record)), len(record)), *_ranges(columns)]
         return [*facts, Fact("errors", errors, record.error is not None)]
-    from beamfit.studies.decay.segments import split_record  # scipy, for records alone
+    from beamfit.studies.decay.pieces import split_record  # scipy, for records alone
 
     hours = record.span / 3600
     value = {"count": len(record), "span_h": hours}

@@ -26,9 +26,14 @@ from beamfit.io.headers import spelled
 from beamfit.io.record_columns import dated, known, record_columns, taken_for_current
 from beamfit.io.scan_columns import is_size
 from beamfit.io.table import read_columns
-from beamfit.studies.decay.conditions import Conditions, Fault, first_fault
-from beamfit.studies.decay.monitor import Monitor
-from beamfit.studies.decay.record import DecayRecord, LifetimeTable
+from beamfit.studies.decay.record import (
+    Conditions,
+    DecayRecord,
+    Fault,
+    LifetimeTable,
+    Monitor,
+    first_fault,
+)
 
 if TYPE_CHECKING:
     from pandas import DataFrame

@@ -27,12 +27,11 @@ from beamfit.report.network import network_pictures
 from beamfit.report.trend import trend_picture
 from beamfit.status import Status
 from beamfit.studies.decay import tables
-from beamfit.studies.decay.checks import moving_lifetime
+from beamfit.studies.decay.course import Trend
 from beamfit.studies.decay.fit import DecayFit
-from beamfit.studies.decay.pooled import cycle_lifetimes
-from beamfit.studies.decay.shift import Shift
-from beamfit.studies.decay.study import Decay, RecordStudy
-from beamfit.studies.decay.trend import Trend
+from beamfit.studies.decay.ring_study import Shift
+from beamfit.studies.decay.study import Decay, RecordStudy, cycle_lifetimes
+from beamfit.studies.decay.systematics import moving_lifetime
 from beamfit.table import Table, labelled
 
 COLOURS = (BLUE, "#c98a00", "#2c7a3f", "#7b4fa3", RED, "#4f9aa3", "0.5")

@@ -13,9 +13,8 @@ from beamfit.lifetime.decay import HOUR, current
 from beamfit.lifetime.losses import loss_terms, scaled_losses
 from beamfit.lifetime.ring import Operation
 from beamfit.report.document import BLUE, RED, Picture, legend_below
-from beamfit.studies.decay.budget import operation_during
-from beamfit.studies.decay.shift import Shift
-from beamfit.studies.decay.study import Decay
+from beamfit.studies.decay.ring_study import Shift
+from beamfit.studies.decay.study import Decay, operation_during
 
 # Points of a curve.
 POINTS = 33

@@ -23,8 +23,8 @@ from beamfit.writing import write_atomically
 
 if TYPE_CHECKING:
     from beamfit.language.solution import ProblemSolution
-    from beamfit.studies.decay.shift import Shift
-    from beamfit.studies.decay.trend import Trend
+    from beamfit.studies.decay.course import Trend
+    from beamfit.studies.decay.ring_study import Shift
     from beamfit.studies.fedbatch.feed import FeedPlan
     from beamfit.studies.fedbatch.fit import FedBatchFit
     from beamfit.studies.fedbatch.titre import TitreFit

@@ -10,7 +10,7 @@ from matplotlib.dates import AutoDateLocator, ConciseDateFormatter
 from matplotlib.figure import FigureBase
 
 from beamfit.report.document import BLUE, RED, Picture, control_chart
-from beamfit.studies.decay.trend import Trend
+from beamfit.studies.decay.course import Trend
 
 RELATIVE = ("a", "b")
 

@@ -22,7 +22,7 @@ SCRIPT = """
 import json
 from beamfit.io.ring import read_operation, read_ring
 from beamfit.lifetime.losses import SCALES
-from beamfit.studies.decay.budget import Machine, budget
+from beamfit.studies.decay.study import Machine, budget
 from beamfit.studies.decay.record import DecayRecord
 path = "lattices/spear3_2003.toml"
 machine = Machine(read_ring(path), read_operation(path))

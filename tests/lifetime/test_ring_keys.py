@@ -21,7 +21,7 @@ from beamfit.lifetime.losses import loss_coefficients
 from beamfit.lifetime.ring import HarmonicCavity
 from beamfit.lifetime.touschek import piwinski_rate
 from beamfit.lifetime.well import length_and_height
-from beamfit.studies.decay.budget import Machine, budget, operation_during
+from beamfit.studies.decay.study import Machine, budget, operation_during
 from tests.lifetime.test_mechanisms import spear3_cells
 
 SPEAR3 = Path("lattices/spear3_2003.toml")

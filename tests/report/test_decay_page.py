@@ -8,9 +8,8 @@ import pytest
 
 import beamfit
 from beamfit.io.ring import read_operation, read_ring
-from beamfit.studies.decay.budget import Machine
 from beamfit.studies.decay.record import DecayRecord
-from beamfit.studies.decay.study import study_record
+from beamfit.studies.decay.study import Machine, study_record
 
 
 @pytest.fixture(scope="module")

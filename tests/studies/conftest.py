@@ -5,8 +5,7 @@ import pytest
 
 import beamfit
 from beamfit.io.ring import read_operation, read_ring
-from beamfit.studies.decay.budget import Machine
-from beamfit.studies.decay.study import study_record
+from beamfit.studies.decay.study import Machine, study_record
 
 TABLE_2 = np.array([2.62035, 1.55237, 1.40828]) * 1e-8  # report, table 2, first row, SI
 

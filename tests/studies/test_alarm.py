@@ -8,10 +8,10 @@ from beamfit.studies.decay.alarm import (
     Reading,
     Reference,
     alarms_of,
+    falls_of,
     started,
     watched,
 )
-from beamfit.studies.decay.alarm_windows import falls_of
 
 # Ten hours at 500 mA, two thirds of the loss from a; 1 µA a second.
 USUAL = Reference(a=3.7e-8, b=9.26e-6, noise=1e-3)

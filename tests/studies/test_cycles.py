@@ -9,10 +9,10 @@ from beamfit.errors import InputError
 from beamfit.greybox.memory import memory_of
 from beamfit.noise.correlated import Levels
 from beamfit.studies.decay.cycles import find_cycles, is_refilled
-from beamfit.studies.decay.pooled import fit_cycles
+from beamfit.studies.decay.fit import fit_cycles
+from beamfit.studies.decay.pieces import thinned
 from beamfit.studies.decay.record import Conditions, DecayRecord
 from beamfit.studies.decay.study import study_record
-from beamfit.studies.decay.thinning import thinned
 
 LIFETIME = 10.01 * 3600
 

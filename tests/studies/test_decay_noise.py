@@ -7,13 +7,19 @@ from functools import partial
 import numpy as np
 import pytest
 from scipy.signal import lfilter
+from scipy.stats import t
 
 from beamfit.greybox.solve import solve
 from beamfit.studies.decay.evidence import Evidence
+from beamfit.studies.decay.expansion import Pieces, solved
 from beamfit.studies.decay.fit import fit_decay, fit_decays
-from beamfit.studies.decay.law import DecayNumbers
-from beamfit.studies.decay.model import decay_problem, padded, solve_decay
-from beamfit.studies.decay.posterior import _noise_of, _with_memory, log_wander
+from beamfit.studies.decay.posterior import (
+    DecayNumbers,
+    _noise_of,
+    _with_memory,
+    decay_problem,
+    log_wander,
+)
 from beamfit.studies.decay.record import DecayRecord
 from beamfit.studies.decay.study import study_record
 from beamfit.studies.decay.tables import separability_rows
@@ -56,10 +62,14 @@ def test_correlated_noise_is_covered(correlation):
 def test_independent_noise_gives_plain_least_squares():
     for seed in range(5):
         plain = record(0.0, seed=seed)
-        fit, solution = constant_fit(plain), solve_decay(*padded(plain))
-        assert fit.a.value == solution.values.a
-        size = (solution.sum_squares / 197) ** 0.5
-        assert fit.a.error == pytest.approx(solution.errors.a * size, rel=1e-12)
+        fit, found = constant_fit(plain), solved(Pieces.of(plain))
+        assert fit.a.value == found.values.a
+        rows, slope = found.rows[:, :3], found.slopes[1, :3]
+        size = (found.residuals @ found.residuals / 197) ** 0.5
+        spread = size * np.sqrt(slope @ np.linalg.inv(rows.T @ rows) @ slope)
+        # Half of the central 68 % of Student's distribution.
+        assert fit.a.error_raw == pytest.approx(spread, rel=1e-6)
+        assert fit.a.error == pytest.approx(spread * t.ppf(0.841344746, 197), rel=1e-6)
         assert fit.correlation_time is None
         assert fit.identifiability.error_inflation == 1
 
@@ -119,15 +129,14 @@ def test_stated_errors_are_the_least():
     fit = fit_decay(record(0.9, seed=4, stated=0.1))
     assert fit.status == "converged"
     assert fit.chi2 / fit.dof < 0.2
-    independent = solve_decay(*padded(record(0.9, seed=4, stated=0.1)))
-    assert fit.a.error > 2 * independent.errors.a
+    assert fit.a.error > 2 * fit.a.error_raw
 
 
 def test_a_drift_that_moves_a_value_by_its_error_does_so():
     plain = record(0.0, seed=7)
     fit = constant_fit(plain)
     assert "stability is not stated" in fit.message
-    evidence = Evidence.of(plain, solve_decay(*padded(plain)))
+    evidence = Evidence(solved(Pieces.of(plain)), record=plain)
     drift = evidence.drift_of_one_error("b")
     assert f"{drift:.2g} mA" in fit.message
     drifted = DecayRecord(plain.time, plain.current + drift * plain.time / SPAN)

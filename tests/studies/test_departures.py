@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp, trapezoid
 
+from beamfit.lifetime.decay import Moments, beam_current
 from beamfit.quantity import Status
 from beamfit.studies.decay.fit import fit_decay
-from beamfit.studies.decay.law import DecayNumbers, Moments, beam_current, bent_current
 from beamfit.studies.decay.record import Conditions, DecayRecord
 from beamfit.studies.decay.systematics import systematics
 
@@ -33,22 +33,47 @@ def noisy(time, beam, noise=2e-3, seed=1, stated=None, **conditions):
     return DecayRecord(time, measured, error, conditions=Conditions(**conditions))
 
 
-def test_the_bend_is_the_derivative_of_the_integrated_law():
-    time = np.linspace(0, 1, 60)
-    for gauge in (None, time + 0.1 * time * (1 - time)):
-        numbers = DecayNumbers(1.3, 0.4, 0.3)
-        pressure = np.ones(60) if gauge is None else 1 + 0.1 * (1 - 2 * time)
+LAWS = {
+    "plain": (None, ()),
+    "power": (None, ()),
+    "relaxing": ("relaxing", (0.2, 0.3)),
+    "step": ("step", (0.2, 0.4)),
+    "steps": ("step", (0.2, 0.4, -0.1, 0.7)),
+    "drift": ("drift", (0.2, 0.0)),
+}
 
-        def law(exponent, pressure=pressure):
-            def slope(t, i):
-                return -(0.4 * i ** (2 + exponent) + 0.3 * np.interp(t, time, pressure) * i)
 
-            return solve_ivp(slope, (0, 1), [1.3], t_eval=time, rtol=1e-11, atol=1e-12).y[0]
+@pytest.mark.parametrize("gauged", [False, True])
+@pytest.mark.parametrize("name", LAWS)
+def test_the_closed_form_is_the_integrated_law(name, gauged):
+    """Any power of a, any course of b, and a pressure that is read."""
+    kind, further = LAWS[name]
+    power, time = {"power": -0.3}.get(name, 0.0), np.linspace(0, 1, 401)
+    gauge = time + 0.1 * time * (1 - time)
 
-        at = Moments(time, 1.0, gauge)
-        np.testing.assert_allclose(beam_current(numbers, at), law(0.0), rtol=2e-5)
-        ours = bent_current(numbers._replace(exponent=1e-3), at) - bent_current(numbers, at)
-        np.testing.assert_allclose(ours / 1e-3, (law(1e-3) - law(-1e-3)) / 2e-3, atol=3e-5)
+    def more(t):
+        if kind == "step":
+            return sum(f * (t > w) for f, w in zip(further[::2], further[1::2], strict=True))
+        return {"relaxing": 0.2 * np.exp(-t / 0.3), "drift": 0.2 * (t - 0.5)}.get(kind, 0.0)
+
+    def slope(t, x):
+        gas = 1 + 0.1 * (1 - 2 * t) if gauged else 1.0
+        return -(0.4 * x ** (2 + power) + (0.3 * gas + more(t)) * x)
+
+    true = solve_ivp(slope, (0, 1), [1.3], t_eval=time, rtol=1e-11, atol=1e-12, max_step=1e-3).y[0]
+    numbers = np.array([0.7, 0.4, power, *further])
+    found = beam_current(1.3, numbers, Moments(time, gauge if gauged else None), kind)
+    np.testing.assert_allclose(found, true, rtol=2e-5 if kind == "step" else 2e-7)
+
+
+def test_pieces_begin_anew():
+    time = np.linspace(0, 1, 50)
+    at = Moments(np.tile(time, 2), np.tile(time, 2), np.repeat([0, 50], 50))
+    numbers = np.array([0.7, 0.4, 0.2])
+    both = beam_current(np.repeat([1.3, 0.9], 50), numbers, at)
+    for k, level in enumerate((1.3, 0.9)):
+        alone = beam_current(level, numbers, Moments(time))
+        np.testing.assert_allclose(both[50 * k : 50 * k + 50], alone, rtol=1e-9)
 
 
 # Exponents of the lifetime by current of two published IOTA tables; a and b are not constant there.

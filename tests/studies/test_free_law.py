@@ -9,11 +9,10 @@ from scipy.integrate import solve_ivp
 
 from beamfit.errors import InputError
 from beamfit.studies.decay.cycles import find_cycles
-from beamfit.studies.decay.fit import fit_decay, fit_decays
-from beamfit.studies.decay.lifetimes import fit_lifetimes
+from beamfit.studies.decay.expansion import Pieces, solved
+from beamfit.studies.decay.fit import fit_cycles, fit_decay, fit_decays
+from beamfit.studies.decay.lifetime_table import fit_lifetimes
 from beamfit.studies.decay.marginal import NODE, Numbers, Seen, drawn, quantiles
-from beamfit.studies.decay.model import padded, solve_decay
-from beamfit.studies.decay.pooled import fit_cycles
 from beamfit.studies.decay.record import Conditions, DecayRecord, LifetimeTable
 from beamfit.studies.decay.study import study_record
 
@@ -71,7 +70,7 @@ def test_intervals_hold_the_truth_whatever_the_law(given):
 def test_the_draws_are_those_of_the_posterior():
     """With constant a and b against a grid of the exact law in white noise."""
     one = record(3, noise=3.0)
-    values = solve_decay(*padded(one)).values
+    values = solved(Pieces.of(one)).values
     draws = drawn(Seen.of(one, values), [0, 1, 2])
     time, rates, shares = one.time, np.linspace(0.97, 1.03, 61), np.linspace(0.0, 1.0, 81)
     unit, mean, log = float(values.rate_mean), float(one.current.mean()), np.zeros((61, 81))

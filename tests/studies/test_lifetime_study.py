@@ -13,12 +13,11 @@ from beamfit.lifetime.bunch import rf_acceptance
 from beamfit.lifetime.decay import current
 from beamfit.lifetime.losses import SCALES, loss_coefficients, loss_terms, scaled_losses
 from beamfit.quantity import Status
-from beamfit.studies.decay.next_decay import Candidate, Limits, best_operating_point, next_decays
+from beamfit.studies.decay.advice import Candidate, Limits, best_operating_point, next_decays
 from beamfit.studies.decay.record import Conditions, DecayRecord
-from beamfit.studies.decay.scales import fit_scales
-from beamfit.studies.decay.shift import budget_intervals, find_anomaly
+from beamfit.studies.decay.ring_study import budget_intervals, find_anomaly
+from beamfit.studies.decay.scales import fit_scales, summarise
 from beamfit.studies.decay.study import study_record
-from beamfit.studies.decay.summary import summarise
 
 TRUE = np.array([1.12, 1.30, 0.85, 1.25])  # measurements/make_spear3_shift.py
 

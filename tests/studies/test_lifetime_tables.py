@@ -7,7 +7,7 @@ import pytest
 from scipy.optimize import curve_fit
 from scipy.special import stdtrit
 
-from beamfit.studies.decay.lifetimes import fit_lifetimes
+from beamfit.studies.decay.lifetime_table import fit_lifetimes
 from beamfit.studies.decay.record import LifetimeTable
 
 A, B = 1e-4, 0.01  # 1/(mA h), 1/h

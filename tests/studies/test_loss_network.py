@@ -13,7 +13,7 @@ from beamfit.errors import InputError
 from beamfit.lifetime.decay import current
 from beamfit.lifetime.losses import loss_coefficients, loss_terms, scaled_losses
 from beamfit.quantity import Status
-from beamfit.studies.decay.network import SIGNS, Box, fit_loss_network
+from beamfit.studies.decay.loss_network import SIGNS, Box, fit_loss_network
 from beamfit.studies.decay.record import Conditions, DecayRecord
 from beamfit.studies.decay.scales import fit_scales
 from beamfit.studies.decay.study import study_record

@@ -10,12 +10,10 @@ from beamfit.errors import InputError
 from beamfit.io.decay_record import monitor_of
 from beamfit.lifetime.decay import HOUR
 from beamfit.quantity import Status
-from beamfit.studies.decay.fit import fit_decay, fit_decays
-from beamfit.studies.decay.monitor import Monitor
-from beamfit.studies.decay.pooled import fit_cycles
-from beamfit.studies.decay.record import DecayRecord
+from beamfit.studies.decay.fit import fit_cycles, fit_decay, fit_decays
+from beamfit.studies.decay.record import DecayRecord, Monitor
+from beamfit.studies.decay.scales import summarise
 from beamfit.studies.decay.study import study_record
-from beamfit.studies.decay.summary import summarise
 from beamfit.studies.decay.systematics import systematics
 
 I0, A, B = 300.0, 2e-8, 2e-6

@@ -4,8 +4,8 @@ from scipy.signal import lfilter
 
 from beamfit.errors import InputError
 from beamfit.studies.decay.fit import fit_decays
+from beamfit.studies.decay.pieces import noise_of, split_record
 from beamfit.studies.decay.record import Conditions, DecayRecord
-from beamfit.studies.decay.segments import noise_of, split_record
 from beamfit.studies.decay.study import study_record
 
 

@@ -9,12 +9,10 @@ from beamfit.errors import InputError
 from beamfit.lifetime.decay import HOUR, current
 from beamfit.lifetime.losses import loss_coefficients, loss_terms, scaled_losses
 from beamfit.quantity import Status
-from beamfit.studies.decay.budget import operation_during
-from beamfit.studies.decay.held_back import predict_held_back
 from beamfit.studies.decay.record import Conditions, DecayRecord
+from beamfit.studies.decay.ring_study import predict_held_back, study_shift
 from beamfit.studies.decay.scales import fit_scales
-from beamfit.studies.decay.shift import study_shift
-from beamfit.studies.decay.study import study_record
+from beamfit.studies.decay.study import operation_during, study_record
 from beamfit.studies.decay.tables import shift_rows
 from tests.studies.test_lifetime_study import simulated
 

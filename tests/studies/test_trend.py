@@ -8,9 +8,9 @@ import pytest
 from beamfit.errors import InputError
 from beamfit.lifetime.losses import loss_coefficients
 from beamfit.statistics import control_limits
+from beamfit.studies.decay.course import trend_of
 from beamfit.studies.decay.record import Conditions, DecayRecord
 from beamfit.studies.decay.study import study_record
-from beamfit.studies.decay.trend import trend_of
 from tests.studies.test_alarm import beam_after
 
 A, B, FILL, STEP = 3.7e-8, 9.26e-6, 8 * 3600.0, 60.0

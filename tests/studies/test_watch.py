@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from beamfit.lifetime.losses import loss_coefficients
-from beamfit.studies.decay.usual import learnt
+from beamfit.studies.decay.sliding_fit import Row, fit_window, learnt
 from beamfit.studies.decay.watch import CURRENT, Plan, State, stepped
-from beamfit.studies.decay.window import Row, fit_window
 from tests.studies.test_alarm import beam_after
 
 A, B, NOISE, START = 3.7e-8, 9.26e-6, 5e-4, 1.7e9

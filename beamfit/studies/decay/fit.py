@@ -7,21 +7,19 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
-import jax
 import numpy as np
 
 from beamfit.errors import InputError, expect
 from beamfit.frames import quantity_frame
 from beamfit.quantity import Quantity, Status
 from beamfit.shown import shown
-from beamfit.studies.decay.departures import Change, ConstantA, LifetimeLaw
+from beamfit.studies.decay.alternatives import Change, ConstantA, LifetimeLaw, Outgassing
+from beamfit.studies.decay.answer import finding_of, finding_of_cycles
+from beamfit.studies.decay.cycles import FEWEST_CYCLES, FEWEST_READINGS, averaged, cleaned
 from beamfit.studies.decay.evidence import BELIEVED, UNITS, Evidence, Separability
+from beamfit.studies.decay.expansion import Expansion, Pieces, Shape, solved, solved_together
 from beamfit.studies.decay.marginal import FreeLaw, Law
-from beamfit.studies.decay.model import Solution, padded, padded_size, solve_decay, solve_decays
-from beamfit.studies.decay.monitor import Monitor
-from beamfit.studies.decay.outgassing import Outgassing
-from beamfit.studies.decay.record import DecayRecord
-from beamfit.studies.decay.verdict import finding_of
+from beamfit.studies.decay.record import DecayRecord, Monitor
 from beamfit.table import Table, cell, json_of, labelled, plain_name
 
 if TYPE_CHECKING:
@@ -31,9 +29,6 @@ if TYPE_CHECKING:
     from beamfit.sampling.priors import Distribution
 
 FEWEST = 5
-# Records solved in one call; fewer are filled up, so that one number is compiled. A call takes as
-# many steps as its slowest record.
-TOGETHER = 16
 
 
 def bare(value: float | None, unit: str) -> dict[str, Any]:
@@ -311,7 +306,7 @@ def fit_decay(
     record = record if monitor is None else replace(record, monitor=monitor)
     if _says_nothing(record):
         return _constant(record)
-    return _judged(record, solve_decay(*padded(record), shape=shape), shape, Law(law))
+    return _judged(record, solved(Pieces.of(record), shape=shape), shape, Law(law))
 
 
 def fit_decays(records: Sequence[DecayRecord], law: Law | str = Law.free) -> tuple[DecayFit, ...]:
@@ -342,25 +337,13 @@ def fit_decays(records: Sequence[DecayRecord], law: Law | str = Law.free) -> tup
     >>> [f"{fit.a.value:.3e}" for fit in fit_decays(records)]
     ['1.000e-08', '1.000e-08']
     """
-    fits: dict[int, DecayFit] = {}
-    groups: dict[tuple[int, bool], list[int]] = {}
-    for k, record in enumerate(records):
-        if _says_nothing(record):
-            fits[k] = _constant(record)
-        else:
-            size = padded_size(len(record)), record.gauge is None
-            groups.setdefault(size, []).append(k)
-    for members in groups.values():
-        for first in range(0, len(members), TOGETHER):
-            chosen = members[first : first + TOGETHER]
-            rows = [padded(records[k]) for k in chosen]
-            rows += rows[:1] * (TOGETHER - len(chosen))
-            stacked = [np.stack(arrays) for arrays in zip(*rows, strict=True)]
-            solutions = solve_decays(*stacked)
-            for row, k in enumerate(chosen):
-                one = jax.tree.map(lambda leaf, r=row: leaf[r], solutions)
-                fits[k] = _judged(records[k], one, law=Law(law))
-    return tuple(fits[k] for k in range(len(records)))
+    telling = [k for k, record in enumerate(records) if not _says_nothing(record)]
+    found = solved_together([records[k] for k in telling])
+    fits = dict(zip(telling, found, strict=True))
+    return tuple(
+        _judged(record, fits[k], law=Law(law)) if k in fits else _constant(record)
+        for k, record in enumerate(records)
+    )
 
 
 def _says_nothing(record: DecayRecord) -> bool:
@@ -396,29 +379,99 @@ def _constant(record: DecayRecord) -> DecayFit:
 
 
 def _judged(
-    record: DecayRecord, solution: Solution, shape: Callable[[Any], Any] | None = None,
-    law: Law = Law.constant,
-) -> DecayFit:  # fmt: skip
+    record: DecayRecord, about: Expansion, shape: Shape | None = None, law: Law = Law.constant
+) -> DecayFit:
     """Turn a solution into quantities, a status and its sentence."""
-    evidence = Evidence.of(record, solution, shape, law)
+    evidence = Evidence(about, law, shape is not None, record)
     rate, error = evidence.sure("rate_mean")
     if rate < -BELIEVED * error:
         first, last = record.current[0], record.current[-1]
         expected = "a decay; cut out refills with split_record"
         found = f"a current that rises, {first:.6g} to {last:.6g} mA"
         raise InputError(found, expected, path=record.name, column="current")
-    known = bool(solution.converged)
     finding = finding_of(evidence)
     return DecayFit(
         record=record.name,
         status=finding.status,
         message=finding.message,
-        **evidence.quoted(known),
+        **evidence.quoted(about.rested),
         mean_current=float(record.current.mean()),
         rms_residual=float(np.sqrt(np.mean(evidence.residuals**2))),
-        residuals=evidence.residuals,
-        change=evidence.change if evidence.refuted and evidence.outgassing is None else None,
+        change=evidence.change,
         outgassing=evidence.outgassing,
         readings=record,
-        shaped=shape is not None,
+    )
+
+
+def fit_cycles(
+    cycles: Sequence[DecayRecord], name: str = "cycles", law: Law | str = Law.free
+) -> DecayFit:
+    """Fit one a and one b to many cycles, as of top-up, each with an own current at its start.
+
+    Parameters
+    ----------
+    cycles : sequence of DecayRecord
+        Three or more, of three readings or more, in order of time; as of `find_cycles`. Their
+        `start`, where all have it, says how far apart they lie.
+    name : str, optional
+        What to call them together.
+    law : {"free", "constant"}
+        Whether a may go as a power of the current, which errors of a and b then contain.
+
+    Returns
+    -------
+    DecayFit
+        Of all cycles: `lifetime_start` and `lifetime_end` are at the highest and the lowest
+        current, `i0` is the mean of the cycles' own, without an error, and `lifetimes` has the
+        lifetime by current where the currents are wide enough apart. Where a and b are not
+        separable the lifetime at the mean current is the answer.
+
+    Raises
+    ------
+    InputError
+        If there are fewer than three cycles, one has fewer than three readings, or they are not in
+        order of time.
+
+    Notes
+    -----
+    Least squares; the currents at the starts are eliminated, so that time and memory grow with the
+    readings alone. Noise with a memory goes on from cycle to cycle (`beamfit.noise.correlated`).
+    Readings, cycles and heads of cycles that lie far off are left out and counted.
+
+    Examples
+    --------
+    >>> t = np.arange(0.0, 180.0, 10.0)
+    >>> noise = 1e-3 * np.random.default_rng(1).normal(size=(50, 18))
+    >>> cycles = [DecayRecord(t, 500 * np.exp(-t / 36000) + row) for row in noise]
+    >>> print(fit_cycles(cycles).lifetime_mean)
+    9.99999 ± 0.00046 h
+    """
+    if len(cycles) < FEWEST_CYCLES:
+        raise InputError(f"{len(cycles)} cycles", f"{FEWEST_CYCLES} or more", path=name)
+    for cycle in cycles:
+        if len(cycle) < FEWEST_READINGS:
+            found, expected = f"{len(cycle)} readings", f"{FEWEST_READINGS} or more in a cycle"
+            raise InputError(found, expected, path=cycle.name)
+    return fit_pieces(cycles, name, Law(law))
+
+
+def fit_pieces(cycles: Sequence[DecayRecord], name: str, law: Law = Law.constant) -> DecayFit:
+    """As `fit_cycles`, also of two, such as before and after a refill or a gap."""
+    gathered = averaged(cycles)
+    if np.any(np.diff(gathered.time) <= 0):
+        raise InputError("a cycle before the end of the one before", "an order in time", path=name)
+    about, left_out = cleaned(gathered)
+    evidence, pieces = Evidence(about, law), about.pieces
+    finding = finding_of_cycles(evidence, pieces.monitor, left_out)
+    return DecayFit(
+        record=name,
+        status=finding.status,
+        message=finding.message,
+        **evidence.quoted(),
+        mean_current=pieces.units[1],
+        rms_residual=float(np.sqrt(np.mean((about.left[:, -1] * pieces.over) ** 2))),
+        readings=DecayRecord(
+            pieces.time, pieces.current, pieces.error, name, float(pieces.time[0])
+        ),
+        first=pieces.first,
     )

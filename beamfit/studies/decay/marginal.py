@@ -19,10 +19,10 @@ import numpy as np
 from numpy.polynomial.chebyshev import chebint, chebvander
 from scipy.special import gammaln, log_ndtr, logsumexp
 
-from beamfit.lifetime.decay import HOUR
+from beamfit.lifetime.decay import HOUR, closed_form
 from beamfit.noise.memory import Products
 from beamfit.quantity import Quantity
-from beamfit.studies.decay.law import Physical
+from beamfit.studies.decay.expansion import Physical
 from beamfit.studies.decay.record import DecayRecord
 
 # Standard deviations of the exponent below and above zero. Bunches lengthen with the current, in
@@ -102,15 +102,17 @@ class Numbers(NamedTuple):
     def currents(self, gas: np.ndarray) -> np.ndarray:
         """Currents at the nodes over the mean, one column a set; `gas` is ∫ P dt over the mean.
 
-        x = x0 exp(-B) (1 + c A x0^c W)^(-1/c), c = 1 + g, W = ∫ exp(-c B) ds: Bernoulli's equation
-        for dx/ds = -A x^(1 + c) - B' x.
+        As of `closed_form`, W = ∫ exp(-c B) ds.
         """
         c = 1 + self.power
         course = gas[:, None] + self.drift * (NODE**2 - NODE)[:, None] / 2
         lost = (1 - self.share) * self.rate * course
+        whole = INTEGRAL @ np.exp(np.clip(-c * lost, -700, 700))
+        # Where a loss that is no beam's would have ended the record the law has no value.
         inside = c * self.share * self.rate * self.level**c
-        inside = 1 + inside * (INTEGRAL @ np.exp(np.clip(-c * lost, -700, 700)))
-        return self.level * np.exp(-lost) * np.maximum(inside, 1e-3) ** (-1 / c)
+        least = (1e-3 - 1) / np.where(inside == 0, 1.0, inside)
+        whole = np.where(inside * whole < 1e-3 - 1, least, whole)
+        return closed_form(self.level, self.share * self.rate, self.power, lost, whole, np)
 
 
 def log_prior(power: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -442,11 +444,11 @@ def free_law(record: DecayRecord, values: Physical) -> FreeLaw | None:
 
     Examples
     --------
-    >>> from beamfit.studies.decay.model import padded, solve_decay
+    >>> from beamfit.studies.decay.expansion import Pieces, solved
     >>> t = np.linspace(0, 36000, 100)
     >>> noise = 1e-2 * np.random.default_rng(1).normal(size=100)
     >>> record = DecayRecord(t, 100.0 / (1.0 + 100.0 * 1e-7 * t) + noise)
-    >>> found = free_law(record, solve_decay(*padded(record)).values)
+    >>> found = free_law(record, solved(Pieces.of(record)).values)
     >>> found.spans["a"].interval[0] < 1e-7 <= found.spans["a"].interval[1]
     True
     """

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import NamedTuple
@@ -16,7 +17,7 @@ from beamfit.greybox.memory import range_of
 from beamfit.greybox.posterior import Sampled, target_of
 from beamfit.greybox.problem import Free, Prior, Problem, Record
 from beamfit.greybox.stated import Optimum, Statement
-from beamfit.lifetime.decay import HOUR, current
+from beamfit.lifetime.decay import HOUR, Moments, beam_current, current
 from beamfit.noise.correlated import (
     Noise,
     innovations,
@@ -28,11 +29,11 @@ from beamfit.sampling.intervals import Expected
 from beamfit.sampling.posterior import Posterior
 from beamfit.sampling.priors import Distribution
 from beamfit.sampling.target import SamplingTarget as Target
-from beamfit.studies.decay.law import DecayNumbers, Moments, monitored_current
-from beamfit.studies.decay.model import RECORD, apart, decay_problem
+from beamfit.studies.decay.expansion import Pieces, solved
 from beamfit.studies.decay.record import DecayRecord
 from beamfit.verdict import Finding
 
+RECORD = "decay"
 UNITS = {"i0": "mA", "a": "1/(mA s)", "b": "1/s"}
 SAMPLED = UNITS | {"log_memory": "1", "log_wander": "1", "drift": "mA/s", "offset": "mA"}
 # A share of the noise below which it is rounding.
@@ -43,6 +44,77 @@ LEAST_NEW, MOST_NEW = 1e-4, 10.0
 # The monitor is taken to be within so many of its stated errors.
 WIDEST = 8.0
 LIFETIMES = {"lifetime_start": "h", "lifetime_mean": "h", "lifetime_end": "h"}
+
+
+class DecayNumbers(NamedTuple):
+    """Current at the first reading, mA, and a, 1/(mA s), and b, 1/s, of dI/dt = -a I² - b I.
+
+    `log_memory` is the logarithm of the correlation time of the readings' errors, s, and
+    `log_wander` that of the variance that they get anew in a usual interval over that of their
+    white part; `drift`, mA/s, and `offset`, mA, are the monitor's.
+    """
+
+    i0: Array
+    a: Array
+    b: Array
+    log_memory: Array = 0.0
+    log_wander: Array = 0.0
+    drift: Array = 0.0
+    offset: Array = 0.0
+
+
+class Readings(NamedTuple):
+    """Times, s, the mean current, mA, and the integral of the pressure as of `Moments`."""
+
+    time: Array
+    mean: Array
+    gas: Array | None = None
+
+
+def monitored_current(numbers: DecayNumbers, at: Readings) -> Array:
+    """Current that a monitor with a drift and an offset reads, mA."""
+    quadratic = numbers.a * at.mean
+    law = jnp.stack([quadratic + numbers.b, quadratic, 0.0])
+    beam = beam_current(numbers.i0 / at.mean, law, Moments(at.time, at.gas))
+    return at.mean * beam + numbers.offset + numbers.drift * at.time
+
+
+def apart(model: DecayNumbers, at: Readings) -> Array:
+    """Time between neighbouring readings over the correlation time of their errors."""
+    return jnp.diff(at.time) * jnp.exp(-model.log_memory)
+
+
+def decay_problem(record: DecayRecord, memory: float | None = None) -> Problem:
+    """State the fit of a decay: I0, a and b free, one record.
+
+    Parameters
+    ----------
+    record : DecayRecord
+        The readings.
+    memory : float, optional
+        Correlation time of the errors, s.
+
+    Returns
+    -------
+    Problem
+        Whose solution `fit_decay` finds faster.
+
+    Examples
+    --------
+    >>> from beamfit.greybox.solve import solve
+    >>> t = np.linspace(0, 36000, 50)
+    >>> fit = solve(decay_problem(DecayRecord(t, 500 / (1 + 500 * 2e-8 * t))))
+    >>> print(f"{fit['a'].value:.3e}")
+    2.000e-08
+    """
+    found, mean = solved(Pieces.of(record)).values, float(record.current.mean())
+    numbers = DecayNumbers(*map(float, found[:3]))
+    at = Readings(record.time, mean, record.gauge)
+    readings = Record(RECORD, monitored_current, at, record.current, record.error)
+    if memory is not None:
+        numbers = numbers._replace(log_memory=math.log(memory))
+        readings = replace(readings, apart=apart)
+    return Problem(numbers, [Free("i0"), Free("a"), Free("b")], [readings])
 
 
 def _lifetimes(numbers: DecayNumbers, at: tuple[Array, Array]) -> Array:
@@ -95,8 +167,7 @@ def decay_target(
     if fit.shaped:
         expected = "a fit of eq. 44 with constant a and b; sample fit_decay(record) without shape"
         raise InputError("a fit with a shape of a(I), which is not sampled", expected)
-    # The fit's weak prior only keeps a search from running away; the bounds do that here.
-    problem = replace(decay_problem(record, memory=fit.correlation_time), priors=())
+    problem = decay_problem(record, memory=fit.correlation_time)
     problem, monitor = _with_monitor(problem, record)
     theta, rate = _start(fit, record)
     theta = np.append(theta, np.zeros(len(monitor)))
@@ -148,10 +219,7 @@ def _with_monitor(problem: Problem, record: DecayRecord) -> tuple[Problem, dict[
         return problem, size
     free = [Free(name, -WIDEST * sd, WIDEST * sd, nuisance=True) for name, sd in size.items()]
     priors = [Prior(name, 0.0, sd) for name, sd in size.items()]
-    readings = replace(problem.records[0], predict=monitored_current)
-    return replace(
-        problem, free=[*problem.free, *free], priors=[*problem.priors, *priors], records=[readings]
-    ), size
+    return replace(problem, free=[*problem.free, *free], priors=priors), size
 
 
 class Remembered(NamedTuple):
@@ -160,7 +228,7 @@ class Remembered(NamedTuple):
     fitted share without a memory, None where there is none.
     """
 
-    at: Moments
+    at: Readings
     measured: Array
     error: Array
     usual: Array

@@ -10,9 +10,9 @@ from beamfit.lifetime.losses import LINEAR, QUADRATIC, Mechanism
 from beamfit.lifetime.ring import Operation
 from beamfit.quantity import Quantity, Status
 from beamfit.studies.decay.fit import DecayFit
-from beamfit.studies.decay.scale_verdict import VOLTAGE
-from beamfit.studies.decay.segments import Event
-from beamfit.studies.decay.shift import Shift
+from beamfit.studies.decay.pieces import Event
+from beamfit.studies.decay.ring_study import Shift
+from beamfit.studies.decay.scales import VOLTAGE
 from beamfit.studies.decay.study import Decay, RecordStudy
 from beamfit.table import cell
 

@@ -11,12 +11,20 @@ from typing import NamedTuple
 from beamfit.errors import InputError
 from beamfit.quantity import Status
 from beamfit.studies.decay import alarm
-from beamfit.studies.decay.budget import Machine
-from beamfit.studies.decay.conditions import PLAUSIBLE, Conditions
-from beamfit.studies.decay.segments import DROPOUT
-from beamfit.studies.decay.trend import BEST_MONITOR
-from beamfit.studies.decay.usual import Alarmed, followed, learnt
-from beamfit.studies.decay.window import Answer, Row, Window, fit_window, normalised
+from beamfit.studies.decay.course import BEST_MONITOR
+from beamfit.studies.decay.pieces import DROPOUT
+from beamfit.studies.decay.record import PLAUSIBLE, Conditions
+from beamfit.studies.decay.sliding_fit import (
+    Alarmed,
+    Answer,
+    Row,
+    Window,
+    fit_window,
+    followed,
+    learnt,
+    normalised,
+)
+from beamfit.studies.decay.study import Machine
 
 CURRENT = "beam_current"
 # Dead readings in a row from which the beam is gone.

@@ -21,11 +21,7 @@ from beamfit.quantity import Quantity, Status
 from beamfit.sampling.intervals import Interval
 from beamfit.sampling.posterior import Posterior
 from beamfit.shown import shown
-from beamfit.studies.decay.budget import Machine, operation_during, settings_json
-from beamfit.studies.decay.fit import bare
-from beamfit.studies.decay.held_back import HeldBack, predict_held_back
-from beamfit.studies.decay.network import Network, NetworkFit, fit_loss_network
-from beamfit.studies.decay.next_decay import (
+from beamfit.studies.decay.advice import (
     BestPoint,
     Candidate,
     Limits,
@@ -33,9 +29,19 @@ from beamfit.studies.decay.next_decay import (
     best_operating_point,
     next_decays,
 )
-from beamfit.studies.decay.scales import ScaleFit, fit_scales, stacked_terms
-from beamfit.studies.decay.study import Decay
-from beamfit.studies.decay.summary import by_losses, summarise
+from beamfit.studies.decay.expansion import lifetime_of
+from beamfit.studies.decay.fit import bare
+from beamfit.studies.decay.loss_network import Network, NetworkFit, fit_loss_network
+from beamfit.studies.decay.scales import (
+    SEPARABLE,
+    ScaleFit,
+    by_losses,
+    fit_scales,
+    spread_of_scales,
+    stacked_terms,
+    summarise,
+)
+from beamfit.studies.decay.study import Decay, Machine, operation_during, settings_json
 from beamfit.table import json_of
 
 # Chance of a false alarm in one call.
@@ -362,3 +368,89 @@ def _anomaly(
     if not np.isfinite(reference.covariance).all():
         return None
     return find_anomaly(reference, decays[half:])
+
+
+class HeldBack(NamedTuple):
+    """A decay as the others predict it.
+
+    Attributes
+    ----------
+    name : str
+        Of the decay.
+    predicted : Quantity
+        Lifetime at its mean current, h, from a fit to the other decays; the error is that of the
+        scales and of this decay's pressure reading.
+    measured : Quantity
+        What the decay itself says, h.
+    pull : float
+        Predicted less measured loss rate, in standard errors of both.
+    """
+
+    name: str
+    predicted: Quantity
+    measured: Quantity
+    pull: float
+
+
+# A decay that leaves less than this of one to the others is known by nothing else.
+LEAST = 1e-6
+
+
+def predict_held_back(fit: ScaleFit) -> tuple[HeldBack, ...]:
+    """Predict the lifetime of each decay by a fit to all the others.
+
+    Parameters
+    ----------
+    fit : ScaleFit
+        Of all decays.
+
+    Returns
+    -------
+    tuple of HeldBack
+        In the order of the decays. Those that say nothing of the loss, and those without which the
+        scales do not predict them, are left out.
+
+    Notes
+    -----
+    Least squares linear about the fit: with H = J (JᵀJ)⁻¹ Jᵀ of one decay's whitened rows J and its
+    residuals r, those of the fit without it are (1 - H)⁻¹ r, with the covariance (1 - H)⁻¹: R. D.
+    Cook and S. Weisberg, Residuals and Influence in Regression (1982), section 2.2.
+
+    Examples
+    --------
+    >>> import beamfit
+    >>> from beamfit.studies.decay.scales import fit_scales
+    >>> from beamfit.studies.decay.study import Machine, study_record
+    >>> path = "lattices/spear3_2003.toml"
+    >>> machine = Machine(beamfit.read_ring(path), beamfit.read_operation(path))
+    >>> record = beamfit.read_decay_record("measurements/spear3_shift_simulated.csv")
+    >>> found = predict_held_back(fit_scales(study_record(record).decays, machine))
+    >>> print(found[3].predicted, "predicted,", found[3].measured, "measured")
+    9.83 ± 0.14 h predicted, 9.739034 ± 0.000099 h measured
+    """
+    measured = fit.measured
+    weight, left, rows = fit.about(fit.terms, measured)
+    half = spread_of_scales(fit.fit).half
+    found = []
+    for k, name in enumerate(fit.names):
+        root, own = np.asarray(measured.root[k]), rows[k] @ half
+        rest = np.eye(2) - own @ own.T
+        if not np.any(root) or np.linalg.eigvalsh(rest)[0] < LEAST:
+            continue
+        back = np.linalg.inv(weight[k])
+        whole = back @ np.linalg.inv(rest) @ back.T * fit.error_scale**2
+        off = (back @ np.linalg.solve(rest, left[k]))[1]
+        reading = np.linalg.inv(root)[1]
+        rate, error = measured.parts[k, 1], fit.error_scale * np.linalg.norm(reading)
+        spread = np.sqrt(max(whole[1, 1] - error**2, 0.0))
+        if not spread < SEPARABLE * rate:
+            continue
+        found.append(
+            HeldBack(
+                name,
+                lifetime_of(rate + off, spread),
+                lifetime_of(rate, error),
+                float(off / np.sqrt(whole[1, 1])),
+            )
+        )
+    return tuple(found)

@@ -21,8 +21,7 @@ from beamfit.lifetime.losses import loss_terms, scaled_losses
 from beamfit.lifetime.ring import Operation
 from beamfit.quantity import Quantity, Status
 from beamfit.sampling.posterior import Posterior
-from beamfit.studies.decay.scales import ScaleFit
-from beamfit.studies.decay.summary import Summaries, information_root, loss_parts
+from beamfit.studies.decay.scales import ScaleFit, Summaries, information_root, loss_parts
 
 # So wide a prior on scales near 1 decides nothing, and keeps determinants finite.
 WIDE = 10.0

@@ -12,19 +12,11 @@ import numpy as np
 from beamfit.lifetime.decay import HOUR
 from beamfit.statistics import MANY, POOR_FIT, chi2_probability, few_words
 from beamfit.status import Status
+from beamfit.studies.decay.alternatives import ConstantA, LifetimeLaw, Outgassing
 from beamfit.studies.decay.cycles import is_sawtooth
-from beamfit.studies.decay.departures import Change, ConstantA, LifetimeLaw
-from beamfit.studies.decay.evidence import (
-    BELIEVED,
-    DETERMINED,
-    SEPARABLE,
-    UNITS,
-    Evidence,
-    Weighed,
-)
-from beamfit.studies.decay.monitor import Monitor
-from beamfit.studies.decay.outgassing import Outgassing
-from beamfit.studies.decay.segments import noise_of
+from beamfit.studies.decay.evidence import BELIEVED, DETERMINED, SEPARABLE, UNITS, Evidence
+from beamfit.studies.decay.pieces import noise_of
+from beamfit.studies.decay.record import Monitor
 from beamfit.verdict import Finding, judge
 
 # Lifetimes, s, that stored beams seldom have, but times in a wrong unit often give.
@@ -63,8 +55,7 @@ class TableEvidence(NamedTuple):
     lifetimes: LifetimeLaw | None
     outliers: tuple[str, ...]
     noise: float | None
-    change: Change | None = None
-    outgassing: Outgassing | None = None
+    explained: None = None
     changed: bool = False
     free: None = None
 
@@ -81,7 +72,7 @@ class TableEvidence(NamedTuple):
 
 
 def _lost(e: Evidence) -> Finding | None:
-    if bool(e.solution.converged):
+    if e.about.rested:
         return None
     cause = "The search found no finite minimum: look at the record for steps."
     return Finding(Status.not_finite, cause)
@@ -91,7 +82,7 @@ def _within_noise(e: Evidence) -> Finding | None:
     rate, error = e.sure("rate_mean")
     if e.separability.separable or error <= DETERMINED * abs(rate):
         return None
-    if isinstance(e, Evidence) and e.record.resolution is None and is_sawtooth(e.residuals):
+    if e.record is not None and e.record.resolution is None and is_sawtooth(e.residuals):
         return Finding(
             Status.unidentified,
             "The beam is held by refills that the record does not resolve: its readings lie evenly "
@@ -126,7 +117,7 @@ def _stepped(e: Evidence) -> Finding | None:
     )
 
 
-def _negative(name: str, cause: str, e: Weighed | TableEvidence) -> Finding | None:
+def _negative(name: str, cause: str, e: Evidence | TableEvidence) -> Finding | None:
     value, error = e.sure(name)
     if not (value < -BELIEVED * error and value < 0) or e.free is not None:
         return None
@@ -141,14 +132,16 @@ NOT_GAS = (
 RISING = "the loss rate rises as the current falls: look for a changing vacuum or setting"
 
 
-def _explained(e: Weighed | TableEvidence) -> str | None:
+def _explained(e: Evidence | TableEvidence) -> str | None:
     """What explains a refuted law better than an exponent of the current, and the remedy."""
-    if e.outgassing is not None:
-        return f"{e.outgassing}. Fit what comes later, or give the pressure in a column"
-    return None if e.change is None else f"{e.change}: cut the record there"
+    if e.explained is None:
+        return None
+    gas = isinstance(e.explained.found, Outgassing)
+    remedy = ". Fit what comes later, or give the pressure in a column"
+    return f"{e.explained}{remedy if gas else ': cut the record there'}"
 
 
-def _refuted(e: Weighed | TableEvidence) -> Finding | None:
+def _refuted(e: Evidence | TableEvidence) -> Finding | None:
     """Data that refute constant a and b: what is quoted of them is not of this beam."""
     if (e.constant_a.status is not Status.poor_fit and not e.changed) or e.free is not None:
         return None
@@ -184,8 +177,8 @@ def _beyond(e: Evidence, errors: float) -> Finding:
         f"The share of a in the loss is {found.share:.2g} ± {found.share_error:.2g}, {errors:.1f} "
         "errors outside 0 to 1: a longer record does not help. "
     )
-    if e.change is not None:
-        return Finding(Status.unidentified, f"{cause}Likely {e.change}: cut the record there")
+    if e.rival is not None:
+        return Finding(Status.unidentified, f"{cause}Likely {e.rival}: cut the record there")
     drift = abs(min(-found.share, 1.0 - found.share, key=abs)) / found.share_error
     drift *= e.drift_of_one_error("share")
     return Finding(
@@ -195,11 +188,11 @@ def _beyond(e: Evidence, errors: float) -> Finding:
     )
 
 
-def _improbable(e: Weighed | TableEvidence, remedy: str = "") -> Finding | None:
+def _improbable(e: Evidence | TableEvidence, remedy: str = "") -> Finding | None:
     if e.noise_inferred or chi2_probability(e.chi2, e.dof) >= POOR_FIT:
         return None
     # Errors that are right may have a memory: by the evidence of all noises together.
-    if isinstance(e, Evidence) and e.stated_odds > math.log(POOR_FIT):
+    if isinstance(e, Evidence) and e.cycles == 1 and e.stated_odds > math.log(POOR_FIT):
         return None
     return Finding(
         Status.poor_fit,
@@ -208,7 +201,7 @@ def _improbable(e: Weighed | TableEvidence, remedy: str = "") -> Finding | None:
     )
 
 
-def _determined(e: Weighed | TableEvidence) -> Finding:
+def _determined(e: Evidence | TableEvidence) -> Finding:
     """Each of the two by itself: one that is small is known to be so, but is not told from zero."""
     found = {name: e.sure(name) for name in "ab"}
     small = {n: (v, error) for n, (v, error) in found.items() if not error < DETERMINED * v}
@@ -223,7 +216,7 @@ def _determined(e: Weighed | TableEvidence) -> Finding:
     return Finding(Status.converged, f"{clear}{limits}")
 
 
-def _bending(e: Weighed) -> Finding | None:
+def _bending(e: Evidence) -> Finding | None:
     """Cycles whose a and b contain an exponent of a."""
     if e.bending is None:
         return None
@@ -299,7 +292,7 @@ def _with_remarks(found: Finding, said: Iterable[str | None]) -> Finding:
     return Finding(found.status, ". ".join([found.cause.rstrip("."), *filter(None, said)]) + ".")
 
 
-def _parts_differ(e: Weighed) -> Finding | None:
+def _parts_differ(e: Evidence) -> Finding | None:
     chance, lifetimes = e.parts
     if not e.changed or not lifetimes:
         return None
@@ -312,7 +305,7 @@ def _parts_differ(e: Weighed) -> Finding | None:
     )
 
 
-def _one_current(e: Weighed) -> Finding | None:
+def _one_current(e: Evidence) -> Finding | None:
     share, error = e.scaled("share")
     if error < SEPARABLE:
         return None
@@ -324,7 +317,7 @@ def _one_current(e: Weighed) -> Finding | None:
     )
 
 
-def _rises(e: Weighed) -> Finding | None:
+def _rises(e: Evidence) -> Finding | None:
     rate, error = e.sure("rate_mean")
     if rate > -BELIEVED * error:
         return None
@@ -337,7 +330,7 @@ CYCLE_RULES += (_one_current, _improbable, _bending, _determined)
 
 
 def finding_of_cycles(
-    evidence: Weighed, monitor: Monitor | None, left_out: Sequence[str]
+    evidence: Evidence, monitor: Monitor | None, left_out: Sequence[str]
 ) -> Finding:
     """Status and sentences on many cycles fitted together; `left_out` is what was not fitted."""
     found, (low, high) = judge(evidence, CYCLE_RULES), evidence.currents
@@ -348,7 +341,7 @@ def finding_of_cycles(
     return _with_remarks(found._replace(cause=f"{first}. {found.cause}"), remarks)
 
 
-def _noise_inferred(e: Weighed) -> str | None:
+def _noise_inferred(e: Evidence) -> str | None:
     if not e.noise_inferred:
         return None
     noise = f"{e.noise:.3g} mA rms is inferred from the residuals"
@@ -357,7 +350,7 @@ def _noise_inferred(e: Weighed) -> str | None:
 
 def _few(e: Evidence) -> str | None:
     """How far errors reach that few residuals tell."""
-    said = few_words(e.dof) if e.noise_inferred and e.memory is None else ""
+    said = few_words(e.dof) if e.noise_inferred and e.independent else ""
     return said.removeprefix("; ").capitalize() or None
 
 
@@ -375,7 +368,7 @@ def _correlated(e: Evidence) -> str | None:
 
 def _cautious(e: Evidence) -> str | None:
     """Stated errors far above the scatter: what is quoted is then too large."""
-    if e.record.error is None or e.memory is not None:
+    if e.noise_inferred or not e.independent:
         return None
     if e.chi2 > CAUTIOUS * e.dof or chi2_probability(e.chi2, e.dof) < 1 - POOR_FIT:
         return None
@@ -400,10 +393,11 @@ def _moved(e: Evidence) -> str | None:
 
 def _wandering(e: Evidence) -> str | None:
     """Residuals as long as the record, of readings that by themselves are far better than that."""
-    length, record = e.correlation_time, e.record
+    length, record, rival = e.correlation_time, e.record, e.explained
     local = noise_of(record.time, record.current)
-    rms = float(np.std(e.residuals))
-    if length is None or length < record.span / 3 or rms < WANDERS * local:
+    rms = float(np.std(e.residuals)) if rival is None else rival.scatter
+    short = length is not None and length < record.span / 3
+    if not e.about.wanders or short or rms < WANDERS * local:
         return None
     return (
         f"Neighbouring readings scatter by {local:.2g} mA alone: the loss rate or the monitor "

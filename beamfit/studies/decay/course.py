@@ -16,10 +16,9 @@ from beamfit.quantity import Quantity, Status
 from beamfit.shown import shown
 from beamfit.statistics import FEWEST, baseline, control_limits
 from beamfit.studies.decay.alarm import Alarm, Reference, alarms_of, when
-from beamfit.studies.decay.budget import Machine
 from beamfit.studies.decay.fit import DecayFit, bare
-from beamfit.studies.decay.study import Decay, RecordStudy
-from beamfit.studies.decay.summary import by_losses, summarise
+from beamfit.studies.decay.scales import by_losses, summarise
+from beamfit.studies.decay.study import Decay, Machine, RecordStudy
 from beamfit.table import Table, cell, json_of
 
 # a and b wander by so much on an ordinary day.

@@ -19,17 +19,11 @@ from beamfit.lifetime.decay import HOUR
 from beamfit.quantity import Quantity, Status
 from beamfit.shown import shown
 from beamfit.statistics import reach_of
-from beamfit.studies.decay.departures import (
-    CURRENTS,
-    EXACT,
-    ConstantA,
-    LifetimeLaw,
-    constant_a,
-)
-from beamfit.studies.decay.evidence import UNITS
+from beamfit.studies.decay.alternatives import CURRENTS, ConstantA, LifetimeLaw, constant_a
+from beamfit.studies.decay.answer import TableEvidence, finding_of_table
+from beamfit.studies.decay.evidence import EXACT, UNITS
 from beamfit.studies.decay.fit import bare
 from beamfit.studies.decay.record import FEWEST_LIFETIMES, LifetimeTable
-from beamfit.studies.decay.verdict import TableEvidence, finding_of_table
 from beamfit.table import Table, json_of, labelled, plain_name
 
 # Points so many robust standard deviations off the law with a free exponent are outliers; no more
