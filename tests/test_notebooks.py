@@ -44,7 +44,7 @@ def test_the_lifetime_study_runs(executed):
 @pytest.mark.parametrize(
     ("name", "words"),
     [
-        ("emittance_lcls", ["x converged 0.702 ± 0.025 µm", "0.786 µm (+2.0 errors)"]),
+        ("emittance_lcls", ["x converged 0.702 ± 0.023 µm", "0.786 µm (+2.0 errors)"]),
         ("greybox_from_scratch", ["free: rms off by 0.2", "rising: rms off by 0.0"]),
         ("identification", ["poor_fit Past inputs", "converged The free run"]),
     ],

@@ -227,7 +227,7 @@ HELD = {
     f"{DECAY}.marginal": "FreeLaw Span",
     f"{OPTICS}.beamline": "Beamline Design",
     f"{OPTICS}.elements": "Drift Quadrupole ThinLens SectorDipole Marker Screen TransferMatrix",
-    f"{OPTICS}.sections": "Section Series",
+    f"{OPTICS}.sections": "LineSection ElementSeries",
     f"{OPTICS}.calibration": "SlopeIntercept CurrentPolynomial CurrentTable Gradient "
     "IntegratedGradient FocusingStrength IntegratedStrength",
 }

@@ -63,7 +63,7 @@ def test_both_planes_of_a_scan_that_has_one(run):
 
 
 def test_the_tables_and_the_verdict(run):
-    status, out, err = run(*REAL)
+    status, out, err = run(*REAL, "--full")
     assert (status, err) == (0, "")
     for words in (
         "x converged: normalised emittance 0.70",

@@ -94,7 +94,7 @@ def test_a_slow_refill_is_an_event_and_not_an_error(run, tmp_path):
     current = np.where(time < 3600, decay(time), decay(time - 5000))
     current = np.where(filling, current[359] - 300 + 0.2 * (time - 3600), current)
     path = write_record(tmp_path / "slow.csv", time, current)
-    status, out, _ = run("lifetime", path)
+    status, out, _ = run("lifetime", path, "--full")
     assert status == 0
     assert "slow refill at 3600 s" in out
     assert sum(line.split() == ["status", "converged"] for line in out.splitlines()) == 2
@@ -120,7 +120,7 @@ def test_a_record_too_short_has_a_lifetime_and_null_errors_of_a_and_b(run, tmp_p
 
 def test_tables_and_report(run, tmp_path, well_shown):
     report = tmp_path / "aps.html"
-    status, out, err = run("lifetime", APS, "--ring", RING, "--report", report)
+    status, out, err = run("lifetime", APS, "--ring", RING, "--report", report, "--full")
     assert (status, err) == (0, "")
     for words in ("converged", "lifetime at the mean current", "a, Touschek", "b, measured"):
         assert words in out
@@ -178,7 +178,7 @@ def test_bad_arguments(run, arguments, words):
 def test_a_gap_is_no_error(run, tmp_path):
     time = np.r_[TIME, TIME + 3600]
     path = write_record(tmp_path / "gap.csv", time, decay(time))
-    status, out, _ = run("lifetime", path)
+    status, out, _ = run("lifetime", path, "--full")
     assert status == 0
     assert "gap at" in out
     assert "120 over" in out
@@ -282,7 +282,7 @@ def test_simpler_analyses_stand_beside_with_their_bias(run):
         assert simple["rms_residual"]["value"] > 10 * result["rms_residual"]["value"]
     assert result["constant_a"]["status"] == "unidentified"
     assert result["constant_a"]["exponent"]["error"] is None
-    _, shown, _ = run("lifetime", APS)
+    _, shown, _ = run("lifetime", APS, "--full")
     assert "single exponential" in shown
     assert "the record cannot tell" in shown
 
@@ -325,12 +325,12 @@ def test_many_decays_are_a_row_each_and_nothing_is_cut_short(run, tmp_path, monk
     noise = 1e-3 * np.random.default_rng(3).normal(size=time.size)
     saw = 100 * np.exp(-(time % 2000) / 36000) + noise
     path = write_record(tmp_path / "a_rather_long_name_of_a_topup_record.csv", time, saw)
-    _, shown, _ = run("lifetime", str(path), "--ring", RING)
+    _, shown, _ = run("lifetime", str(path), "--ring", RING, "--full")
     assert "…" not in shown
     for number in range(1, 6):
         assert len([row for row in shown.splitlines() if row.startswith(f"#{number} ")]) == 3
     two = write_record(tmp_path / "two.csv", time[:400], saw[:400])
-    _, shown, _ = run("lifetime", str(two), "--ring", RING)
+    _, shown, _ = run("lifetime", str(two), "--ring", RING, "--full")
     assert "…" not in shown
     assert shown.count("lifetime at the mean current ") == 2
     assert shown.count("a, Touschek ") == 2
