@@ -122,15 +122,15 @@ def _solved(document, given, starts, values, gains, told) -> tuple[Any, tuple[st
 
 
 def _show(terminal: Terminal, found: ProblemSolution | Computed) -> None:
-    from beamfit.language.solution import ProblemSolution
-
-    if isinstance(found, ProblemSolution):
-        terminal.verdict(found.headline, found.status, found.message)
-        asked = found.made.document.solver
-        terminal.line(f"Solver: {found.solver}" + (f" (asked for: {asked.name})" if asked else ""))
-        for note in found.notes:
-            terminal.line(note)
-        terminal.line()
     for table in found.tables():
         terminal.table(table)
         terminal.line()
+    from beamfit.language.solution import ProblemSolution
+
+    if not isinstance(found, ProblemSolution):
+        return
+    asked = found.made.document.solver
+    terminal.line(f"Solver: {found.solver}" + (f" (asked for: {asked.name})" if asked else ""))
+    for note in found.notes:
+        terminal.line(note)
+    terminal.verdict(found.headline, found.status, found.message)

@@ -73,7 +73,7 @@ SETTINGS = np.linspace(-1.0, 11.0, 9)
 SIZE_ERROR = 8e-6
 PRIORS = {f"x.{name}": Uniform(*ends) for name, ends in BOX.items()}
 # Sure of stated errors and of readings, as they are simulated.
-SURE = beamfit.Noise(right=1.0 - 1e-9, most=99)
+SURE = beamfit.Noise(right=1.0 - 1e-9, bad=1e-12)
 
 
 def true_sigma(random):

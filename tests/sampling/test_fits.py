@@ -233,7 +233,7 @@ def test_sure_errors_give_the_errors_as_stated():
     """Priors that leave stated errors no doubt: the width is that of linear theory."""
     scan = beamfit.read_quad_scan("measurements/gtf_simulated.csv")
     line = beamfit.load_lattice("lattices/gtf.toml")
-    fit = beamfit.fit_emittance(scan, line, noise=beamfit.Noise(right=1 - 1e-9, most=99))
+    fit = beamfit.fit_emittance(scan, line, noise=beamfit.Noise(right=1 - 1e-9, bad=1e-12))
     found = fit.sample(("x",), seed=1, target_ess=8000)
     assert found.status is Status.converged
     raw = fit.x.normalized_emittance.error_raw

@@ -349,5 +349,5 @@ def test_few_residuals_do_not_refute_a_law():
 
 
 def test_few_residuals_are_said_to_tell_the_noise_badly():
-    assert "95 % of answers lie within 4.3 of them" in few_readings(1).message
+    assert "the 95 % interval is ±4.3 σ" in few_readings(1).message
     assert "degrees of freedom" not in few_readings(1, 20).message

@@ -195,16 +195,16 @@ def test_shots_of_a_setting_are_evened_out(otr2, true):
 
 def test_errors_that_are_one_share_of_the_size_follow_the_model(otr2, true):
     size = true(REAL) * np.array([1.02, 0.98, 1.01, 0.99, 1.0])
-    share = beamfit.fit_emittance(otr2_scan(REAL, size, 0.05 * size), otr2).x.points
+    sure = beamfit.Noise(bad=1e-12)
+    share = beamfit.fit_emittance(otr2_scan(REAL, size, 0.05 * size), otr2, noise=sure).x.points
     assert share.relative == 1.0
-    # Of the worst one of five a part of the weight is that of a bad reading.
     found = np.sort(share.error / share.model)
-    np.testing.assert_allclose(found[:4], found[0], rtol=1e-9)
+    np.testing.assert_allclose(found, found[0], rtol=1e-9)
     assert 0.05 <= found[0] < 0.06
-    same = beamfit.fit_emittance(otr2_scan(REAL, size, np.full(5, 5e-6)), otr2).x.points
+    same = beamfit.fit_emittance(otr2_scan(REAL, size, np.full(5, 5e-6)), otr2, noise=sure).x.points
     assert same.relative == 0.0
     found = np.sort(same.error)
-    np.testing.assert_allclose(found[:4], found[0], rtol=1e-9)
+    np.testing.assert_allclose(found, found[0], rtol=1e-9)
     assert 5e-6 <= found[0] < 6e-6
 
 
@@ -230,7 +230,7 @@ def test_one_gross_outlier_is_named_and_spoils_nothing(otr2, true, errors, robus
     assert fit.status is Status.converged
     assert re.search(rf"1 of 10 readings .* bad: Q525 = {settings[6]:.4g} kG\.", fit.message)
     probability = fit.points.outlier_probability
-    assert probability[6] > 0.99
+    assert probability[6] > 0.98
     assert np.delete(probability, 6).max() < 0.5
     assert abs(fit.normalized_emittance.value - 1e-6) < 4 * fit.normalized_emittance.error
     clean = beamfit.fit_emittance(
