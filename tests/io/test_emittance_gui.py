@@ -314,7 +314,7 @@ def test_four_wires(save, monkeypatch, capsys):
     gui = read_emittance_gui(path)
     assert gui.scan().screen == tuple(names[0])
     assert len(gui.scan().error["x"]) == 4
-    code, out, err = run(monkeypatch, capsys, path)
+    code, out, err = run(monkeypatch, capsys, path, "--full")
     assert (code, err) == (0, "")
     assert "in x, µm, by size method" in out
 
