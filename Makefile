@@ -44,7 +44,7 @@ calibrate: .venv/test
 
 # Errors of every scenario held against 500 simulated scans each.
 coverage: .venv/test
-	BEAMFIT_COVERAGE=500 $(BIN)/python -m pytest --quiet tests/studies/test_coverage.py tests/studies/test_systematics.py
+	BEAMFIT_COVERAGE=500 $(BIN)/python -m pytest --quiet tests/emittance/test_coverage.py tests/emittance/test_systematics.py
 
 # Damaged files, read or refused in one line: 10 000 of every kind, and 10 000 documents. Hours.
 soak: .venv/test

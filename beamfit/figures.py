@@ -20,12 +20,12 @@ from beamfit.errors import InputError
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+    from beamfit.emittance.fit import EmittanceFit
+    from beamfit.lifetime.course import Trend
+    from beamfit.lifetime.fit import DecayFit
+    from beamfit.lifetime.ring_study import Shift
+    from beamfit.lifetime.study import Decay, RecordStudy
     from beamfit.sampling.posterior import Posterior
-    from beamfit.studies.decay.course import Trend
-    from beamfit.studies.decay.fit import DecayFit
-    from beamfit.studies.decay.ring_study import Shift
-    from beamfit.studies.decay.study import Decay, RecordStudy
-    from beamfit.studies.scan.fit import EmittanceFit
 
 __all__ = [
     "decay",
@@ -148,7 +148,7 @@ def trend(result: Trend) -> Figure:
     Parameters
     ----------
     result : Trend
-        Of `beamfit.studies.decay.course.trend_of`.
+        Of `beamfit.lifetime.course.trend_of`.
 
     Returns
     -------

@@ -11,8 +11,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from beamfit.lifetime.decay import HOUR
-from beamfit.studies.decay.alarm import NAMES, Reading, Reference, started, watched
+from beamfit.lifetime.alarm import NAMES, Reading, Reference, started, watched
+from beamfit.lifetime.decay_law import HOUR
 
 STARTS, BEFORE = 500.0, 1800
 

@@ -23,12 +23,12 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from beamfit.dynamics.control import controller
+from beamfit.dynamics.fit import identify
+from beamfit.dynamics.loop import closed_loop
+from beamfit.dynamics.receding import Controller, ControlLimits, Response
+from beamfit.dynamics.record import Run
 from beamfit.dynamics.response import FIRST_ORDER, SECOND_ORDER, simulate
-from beamfit.studies.response.control import controller
-from beamfit.studies.response.fit import identify
-from beamfit.studies.response.loop import closed_loop
-from beamfit.studies.response.receding import Controller, ControlLimits, Response
-from beamfit.studies.response.record import Run
 
 STEP, HORIZON, SMOOTH, RATE, ABOVE, FIRST = 0.5, 20, 0.1, 0.2, 2.3, 0.4
 BINDING = 1.8

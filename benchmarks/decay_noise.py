@@ -17,9 +17,9 @@ from rich.console import Console
 from rich.table import Table
 from scipy.signal import lfilter
 
-from beamfit.studies.decay.fit import DecayFit, fit_decays
-from beamfit.studies.decay.record import DecayRecord
-from beamfit.studies.decay.study import study_record
+from beamfit.lifetime.fit import DecayFit, fit_decays
+from beamfit.lifetime.record import DecayRecord
+from beamfit.lifetime.study import study_record
 
 HOUR, SPAN = 3600.0, 8 * 3600.0
 I0, A, B = 500.0, 4e-8, 2e-6

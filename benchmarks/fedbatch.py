@@ -16,11 +16,11 @@ import numpy as np
 from matplotlib.figure import Figure
 
 import beamfit
+from beamfit.dynamics.fedbatch import identify_batches
+from beamfit.dynamics.feed import best_feed, predict
+from beamfit.dynamics.titre import fit_titre, rank_inputs
 from beamfit.io.run import read_run
 from beamfit.report.fedbatch import draw_ranking
-from beamfit.studies.fedbatch.feed import best_feed, predict
-from beamfit.studies.fedbatch.fit import identify_batches
-from beamfit.studies.fedbatch.titre import fit_titre, rank_inputs
 
 PLACE = Path(__file__).resolve().parents[1] / "measurements"
 START, REST = (1.0, 8.0, 4.0, 0.0), {"feed_substrate": 200.0, "air": 1.0}

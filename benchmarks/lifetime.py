@@ -27,10 +27,10 @@ from scipy.optimize import curve_fit
 
 from beamfit.io.ring import ring_from_pyat
 from beamfit.lifetime.bunch import population
+from beamfit.lifetime.expansion import Pieces, solved
+from beamfit.lifetime.fit import fit_decay, fit_decays
+from beamfit.lifetime.record import DecayRecord
 from beamfit.lifetime.touschek import piwinski_rate
-from beamfit.studies.decay.expansion import Pieces, solved
-from beamfit.studies.decay.fit import fit_decay, fit_decays
-from beamfit.studies.decay.record import DecayRecord
 
 sys.path.insert(0, str(Path(__file__).parent))
 import spear3_lattice

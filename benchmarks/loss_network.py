@@ -13,12 +13,12 @@ from pathlib import Path
 import numpy as np
 
 from beamfit.io.ring import read_operation, read_ring
-from beamfit.lifetime.decay import HOUR, current
-from beamfit.lifetime.losses import loss_terms, scaled_losses
+from beamfit.lifetime.decay_law import HOUR, current
+from beamfit.lifetime.loss_network import Box, NetworkFit, fit_loss_network
+from beamfit.lifetime.mechanisms import loss_terms, scaled_losses
+from beamfit.lifetime.record import Conditions, DecayRecord
 from beamfit.lifetime.ring import Operation
-from beamfit.studies.decay.loss_network import Box, NetworkFit, fit_loss_network
-from beamfit.studies.decay.record import Conditions, DecayRecord
-from beamfit.studies.decay.study import Decay, Machine, study_record
+from beamfit.lifetime.study import Decay, Machine, study_record
 
 TOP = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(TOP / "measurements"))

@@ -17,9 +17,9 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from beamfit.dynamics.fit import identify
+from beamfit.dynamics.record import Run
 from beamfit.dynamics.response import SECOND_ORDER, simulate
-from beamfit.studies.response.fit import identify
-from beamfit.studies.response.record import Run
 
 APART = 0.5
 

@@ -15,8 +15,8 @@ from rich.console import Console
 from rich.table import Table
 from scipy.signal import lfilter
 
-from beamfit.studies.response.fit import identify
-from beamfit.studies.response.record import Run
+from beamfit.dynamics.fit import identify
+from beamfit.dynamics.record import Run
 
 COUNT, APART, TRUTH = 300, 0.5, {"K": 2.0, "tau": 3.0}
 

@@ -19,12 +19,12 @@ from rich.console import Console
 from rich.table import Table
 
 import beamfit
-from beamfit.lifetime.decay import current
+from beamfit.emittance.model import size_squared
+from beamfit.lifetime.decay_law import current
+from beamfit.lifetime.fit import fit_decay
+from beamfit.lifetime.record import DecayRecord
 from beamfit.noise.sizes import averaged, log_likelihood
 from beamfit.sampling.posterior import Posterior
-from beamfit.studies.decay.fit import fit_decay
-from beamfit.studies.decay.record import DecayRecord
-from beamfit.studies.scan.model import size_squared
 
 WALKERS, STEPS, DISCARD, REPEATS = 32, 4000, 500, 3
 

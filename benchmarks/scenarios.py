@@ -19,13 +19,13 @@ from rich.console import Console
 from rich.table import Table
 
 import beamfit
+from beamfit.emittance.assumptions import Anchor, Assumptions
+from beamfit.emittance.known import see
+from beamfit.emittance.model import predict_sizes
+from beamfit.emittance.transport_network import SCENARIO
 from beamfit.greybox import problem as greybox
 from beamfit.greybox.descend import descend_all
 from beamfit.greybox.solve import solve, starting_points
-from beamfit.studies.scan.assumptions import Anchor, Assumptions
-from beamfit.studies.scan.known import see
-from beamfit.studies.scan.model import predict_sizes
-from beamfit.studies.scan.transport_network import SCENARIO
 
 ROOT = Path(__file__).parents[1]
 OPTIONS = {"ipopt.print_level": 0, "print_time": 0, "ipopt.tol": 1e-9, "ipopt.max_iter": 3000}

@@ -10,8 +10,8 @@ import numpy as np
 from scipy.optimize import minimize
 
 import beamfit
-from beamfit.studies.scan.setpoint import Beam, find_setpoint
-from tests.studies.test_hard_setpoints import REQUESTS, objective
+from beamfit.emittance.setpoint import Beam, find_setpoint
+from tests.emittance.test_hard_setpoints import REQUESTS, objective
 
 STEPS, CARRIED_ON = 31, 12
 

@@ -19,11 +19,11 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.signal import cont2discrete, dlsim
 
+from beamfit.dynamics.linear import identify_states
+from beamfit.dynamics.record import Run
+from beamfit.dynamics.state_fit import fit_states
 from beamfit.dynamics.states import StateSpace
 from beamfit.greybox.problem import Free, Prior
-from beamfit.studies.response.linear import identify_states
-from beamfit.studies.response.record import Run
-from beamfit.studies.response.states import fit_states
 
 SYSID = """
 import time, numpy as np, jax

@@ -17,10 +17,10 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import betaincinv
 
+from beamfit.emittance.many import fit_many
+from beamfit.emittance.scan import QuadScan
+from beamfit.emittance.transport import rows_line
 from beamfit.status import Status
-from beamfit.studies.scan.many import fit_many
-from beamfit.studies.scan.scans import QuadScan
-from beamfit.studies.scan.transport import rows_line
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "verdict.md"
 MARKS = "<!-- measured: benchmarks/verdict.py -->", "<!-- end of measured -->"

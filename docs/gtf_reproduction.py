@@ -21,6 +21,13 @@ from matplotlib import rc_context
 from matplotlib.figure import FigureBase
 
 import beamfit
+from beamfit.emittance.assumptions import Assumptions
+from beamfit.emittance.calibration import with_numbers
+from beamfit.emittance.fit import EmittanceFit, fit_emittance
+from beamfit.emittance.known import see
+from beamfit.emittance.model import UNIT
+from beamfit.emittance.scan import QuadScan
+from beamfit.emittance.transport_network import SCENARIO
 from beamfit.greybox.fit import Fit
 from beamfit.greybox.solve import solve
 from beamfit.io.files import digest
@@ -38,13 +45,6 @@ from beamfit.report.document import (
     provenance,
     written,
 )
-from beamfit.studies.scan.assumptions import Assumptions
-from beamfit.studies.scan.calibration import with_numbers
-from beamfit.studies.scan.fit import EmittanceFit, fit_emittance
-from beamfit.studies.scan.known import see
-from beamfit.studies.scan.model import UNIT
-from beamfit.studies.scan.scans import QuadScan
-from beamfit.studies.scan.transport_network import SCENARIO
 from beamfit.table import Table
 from beamfit.writing import write_atomically
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 import beamfit
-from beamfit.studies.scan.calibration import with_numbers
+from beamfit.emittance.calibration import with_numbers
 
 SIGMA = np.array([2.62035, 1.55237, 1.40828]) * 1e-8  # m², m rad, rad²: Table 2, row 1
 TRUE = {"Q2.slope": 160.0, "Q2.intercept": 50.0}

@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 
 from beamfit.io.ring import read_operation, read_ring
-from beamfit.lifetime.decay import current
-from beamfit.lifetime.losses import loss_terms, scaled_losses
+from beamfit.lifetime.decay_law import current
+from beamfit.lifetime.mechanisms import loss_terms, scaled_losses
 
 SCALES = np.array([1.12, 1.30, 0.85, 1.0])  # Touschek, bremsstrahlung, elastic
 DESORPTION = 1.25  # on the pressure rise with current, in the pressure itself

@@ -6,7 +6,7 @@ from types import ModuleType
 
 import pytest
 
-from beamfit.studies.scan.assumptions import SCENARIOS, Entry
+from beamfit.emittance.assumptions import SCENARIOS, Entry
 from tests.lifetime.test_new_mechanism import FORMULA, LINE
 
 
@@ -24,7 +24,7 @@ def test_every_block_gives_what_stands_beside_it(page, tmp_path, monkeypatch):
         if "SCENARIO = " in block:
             module = ModuleType("blurred_screen")
             module.SCENARIO = names["SCENARIO"]
-            monkeypatch.setitem(sys.modules, "beamfit.studies.scan.blurred_screen", module)
+            monkeypatch.setitem(sys.modules, "beamfit.emittance.blurred_screen", module)
             (entry,) = re.findall(r'`"blurred-screen": Entry\("(\w+)"\)`', page)
             monkeypatch.setitem(SCENARIOS, "blurred-screen", Entry(entry))
     shown = re.findall(r"^print\(.*\)  # (.*)$", page, re.MULTILINE)

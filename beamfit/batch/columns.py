@@ -13,13 +13,13 @@ from collections.abc import Iterable, Iterator, Mapping
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
+from beamfit.emittance.model import QUANTITIES
+from beamfit.lifetime.evidence import UNITS
 from beamfit.quantity import Quantity
-from beamfit.studies.decay.evidence import UNITS
-from beamfit.studies.scan.model import QUANTITIES
 
 if TYPE_CHECKING:
-    from beamfit.studies.decay.study import RecordStudy
-    from beamfit.studies.scan.fit import EmittanceFit
+    from beamfit.emittance.fit import EmittanceFit
+    from beamfit.lifetime.study import RecordStudy
 
 UNUSABLE = "unusable"
 # How a unit is written at the end of a name.

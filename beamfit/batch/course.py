@@ -10,10 +10,10 @@ import numpy as np
 
 from beamfit.batch.columns import COLUMNS, named
 from beamfit.batch.run import Batch
+from beamfit.emittance.model import QUANTITIES
 from beamfit.errors import InputError, nearest
+from beamfit.lifetime.evidence import UNITS
 from beamfit.statistics import baseline, control_limits
-from beamfit.studies.decay.evidence import UNITS
-from beamfit.studies.scan.model import QUANTITIES
 
 # Quantities of each kind, and the default one.
 FOLLOWED = {

@@ -15,9 +15,9 @@ from beamfit.io.files import digest
 from beamfit.io.lattice import LatticeFile
 from beamfit.io.line import Inputs, build_line, read_inputs, read_lattice
 from beamfit.io.noise import read_noise
+from beamfit.lifetime.record import LifetimeTable
 from beamfit.noise.learn import Learned, learn_noise
 from beamfit.noise.model import Noise
-from beamfit.studies.decay.record import LifetimeTable
 
 if TYPE_CHECKING:
     from beamfit.optics.beamline import Beamline
@@ -122,10 +122,10 @@ class Job:
     def fit(self, file: str) -> Any:
         """Result of one file, as `beamfit.write_report` takes it."""
         if self.kind == "lifetime":
-            from beamfit.studies.decay.study import study_record
+            from beamfit.lifetime.study import study_record
 
             return (study_record(read_lifetime_input(file, **self.reading)),)
-        from beamfit.studies.scan.slices import fit_slices
+        from beamfit.emittance.slices import fit_slices
 
         found = self.read(file)
         fit = fit_slices if len(found.scan.slices) > 1 else beamfit.fit_emittance
@@ -143,7 +143,7 @@ class Job:
         InputError
             If there are fewer than five planes of a kind.
         """
-        from beamfit.studies.scan.many import noise_samples
+        from beamfit.emittance.many import noise_samples
 
         read = (found for file in files if isinstance(found := _tried(self.read, file), Inputs))
         pairs = [(found.scan, self.line_of(found)) for found in read if len(found.scan.slices) < 2]
@@ -151,7 +151,7 @@ class Job:
         return learn_noise(list(noise_samples(pairs, self._priors)), self._priors, source)
 
     def _emittances(self, files: Iterable[str]) -> Iterator[dict[str, Any]]:
-        from beamfit.studies.scan.many import fit_many
+        from beamfit.emittance.many import fit_many
 
         read = [_tried(self.read, file) for file in files]
         parts = []
@@ -186,8 +186,8 @@ class Job:
             yield from (row | about for row in found)
 
     def _decay_rows(self, file: str) -> list[dict[str, Any]]:
-        from beamfit.studies.decay.lifetime_table import fit_lifetimes
-        from beamfit.studies.decay.study import study_record
+        from beamfit.lifetime.lifetime_table import fit_lifetimes
+        from beamfit.lifetime.study import study_record
 
         record = read_lifetime_input(file, **self.reading)
         if isinstance(record, LifetimeTable):

@@ -8,15 +8,15 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from beamfit.cli.option_text import gains_of
 from beamfit.cli.options import Command, answered, option, options, reported
 from beamfit.errors import InputError, nearest
 from beamfit.io.files import digest
 from beamfit.io.run import read_run
-from beamfit.studies.scan.typed import gains_of
 
 if TYPE_CHECKING:
     from beamfit.cli.show import Terminal
-    from beamfit.studies.response.loop import Loop
+    from beamfit.dynamics.loop import Loop
 
 
 EXAMPLE = """\b
@@ -93,9 +93,9 @@ def control(
     _check("set", [t[0] for t in targets], outputs)
     _check("disturb", [t[0] for t in loads], outputs)
 
-    from beamfit.studies.response.control import controller  # JAX from here on
-    from beamfit.studies.response.fit import identify
-    from beamfit.studies.response.loop import simulate_loop
+    from beamfit.dynamics.control import controller  # JAX from here on
+    from beamfit.dynamics.fit import identify
+    from beamfit.dynamics.loop import simulate_loop
 
     settings = {n: told[n] for n in ("delay", "hidden", "gains")}
     settings |= {"offset": not no_offset, "seed": seed}

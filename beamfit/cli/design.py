@@ -7,16 +7,16 @@ from typing import TYPE_CHECKING, Any
 import click
 
 import beamfit
+from beamfit.cli.option_text import energies_of, goal_of
 from beamfit.cli.options import Command, answered, option, options
+from beamfit.emittance.assumptions import Assumptions
 from beamfit.io.line import build_line, read_inputs
 from beamfit.io.noise import read_noise
-from beamfit.studies.scan.assumptions import Assumptions
-from beamfit.studies.scan.typed import energies_of, goal_of
 from beamfit.table import text_of
 
 if TYPE_CHECKING:
     from beamfit.cli.show import Terminal
-    from beamfit.studies.scan.design import Advice
+    from beamfit.emittance.design import Advice
 
 # What `read_inputs` takes besides the scan.
 GIVEN = ["lattice", "use", "first", "last", "screen", "energy", "columns", "ignore", "skip_bad"]
@@ -68,7 +68,7 @@ def design(
     described.check_magnets(limits)
     described.check_energies(others)
 
-    from beamfit.studies.scan.design import plan_measurements  # JAX from here on
+    from beamfit.emittance.design import plan_measurements  # JAX from here on
 
     fit = beamfit.fit_emittance(measured, build_line(described), scenario=scenario, **told)
     wanted = {"criterion": criterion, "goal": aim, "count": count, "energies": others}

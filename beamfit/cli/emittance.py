@@ -9,21 +9,21 @@ import click
 
 import beamfit
 from beamfit.cli.options import Command, Sampling, answered, option, options, reported
+from beamfit.emittance.assumptions import Assumptions
 from beamfit.errors import InputError
 from beamfit.io.line import build_line, read_inputs
 from beamfit.io.noise import read_noise
 from beamfit.io.systematics import read_systematics
-from beamfit.studies.scan.assumptions import Assumptions
 from beamfit.table import Table, labelled
 
 if TYPE_CHECKING:
     from beamfit.cli.show import Terminal
+    from beamfit.emittance.fit import EmittanceFit
+    from beamfit.emittance.size_methods import SizeMethods
+    from beamfit.emittance.slices import SliceFits
     from beamfit.io.emittance_gui import EmittanceGuiFile
     from beamfit.optics.beamline import Beamline
     from beamfit.sampling.posterior import Posterior
-    from beamfit.studies.scan.fit import EmittanceFit
-    from beamfit.studies.scan.size_methods import SizeMethods
-    from beamfit.studies.scan.slices import SliceFits
 
 # What `read_inputs` takes besides the scan.
 GIVEN = ["lattice", "use", "first", "last", "screen", "energy", "particle"]
@@ -121,7 +121,7 @@ def emittance(
     told |= {"noise": own}
     inputs = read.digests
     if len(measured.slices) > 1:
-        from beamfit.studies.scan.slices import fit_slices
+        from beamfit.emittance.slices import fit_slices
 
         fits = fit_slices(measured, line, **told)
         reported(report, fits, inputs)
@@ -162,7 +162,7 @@ def compared(
     gui: EmittanceGuiFile, line: Beamline, planes: tuple[str, ...]
 ) -> tuple[SizeMethods, ...]:
     """Results by the size methods of an emittance_gui file, for these planes."""
-    from beamfit.studies.scan.size_methods import compare_size_methods
+    from beamfit.emittance.size_methods import compare_size_methods
 
     found = compare_size_methods(gui.scans, line, gui.stored, gui.means)
     return tuple(m for m in found if m.plane in planes)
@@ -172,7 +172,7 @@ def results_of(
     fit: EmittanceFit, methods: tuple[SizeMethods, ...] = ()
 ) -> Iterator[dict[str, Any]]:
     """JSON entry of each plane: the fit, its systematics and its sensitivity to the range."""
-    from beamfit.studies.scan.sensitivity import range_sensitivity, systematics
+    from beamfit.emittance.sensitivity import range_sensitivity, systematics
 
     ways = {m.plane: {"size_methods": m} for m in methods}
     for p, entry in zip(fit.planes, fit.to_json(), strict=True):
@@ -205,8 +205,8 @@ def show(
 
 def _show_fully(terminal: Terminal, fit: EmittanceFit, methods: tuple[SizeMethods, ...]) -> None:
     """Show every number, the systematics budget and the range of the scan."""
-    from beamfit.studies.scan.results import parameter_rows, result_rows
-    from beamfit.studies.scan.sensitivity import budget_rows, range_rows
+    from beamfit.emittance.results import parameter_rows, result_rows
+    from beamfit.emittance.sensitivity import budget_rows, range_rows
 
     names, statuses = [p.plane for p in fit.planes], [p.status for p in fit.planes]
     terminal.table(labelled("", names, result_rows(fit.planes)), statuses)
@@ -233,8 +233,8 @@ def _show_fully(terminal: Terminal, fit: EmittanceFit, methods: tuple[SizeMethod
 
 def _show_briefly(terminal: Terminal, fit: EmittanceFit) -> None:
     """Show what is quoted, the largest systematic of each plane, and where the rest is."""
-    from beamfit.studies.scan.results import quoted_rows
-    from beamfit.studies.scan.sensitivity import systematics
+    from beamfit.emittance.results import quoted_rows
+    from beamfit.emittance.sensitivity import systematics
 
     if rows := quoted_rows(fit.planes):
         terminal.table(labelled("", [p.plane for p in fit.planes], rows), wrap=False)

@@ -13,10 +13,10 @@ from beamfit.io.run import read_run
 
 if TYPE_CHECKING:
     from beamfit.cli.show import Terminal
-    from beamfit.studies.fedbatch.fit import FedBatchFit
-    from beamfit.studies.fedbatch.titre import TitreFit
-    from beamfit.studies.response.fit import ResponseFit
-    from beamfit.studies.response.states import StatesFit
+    from beamfit.dynamics.fedbatch import FedBatchFit
+    from beamfit.dynamics.fit import ResponseFit
+    from beamfit.dynamics.state_fit import StatesFit
+    from beamfit.dynamics.titre import TitreFit
 
 
 STATES, FED_BATCH = "state-space", "fed-batch"
@@ -74,18 +74,18 @@ def identify(
 
     options = {"map": map, "offset": not no_offset, "hidden": hidden, "seed": seed, "held": held}
     if model == STATES:
-        from beamfit.studies.response.linear import identify_states  # JAX from here on
+        from beamfit.dynamics.linear import identify_states  # JAX from here on
 
         fits = [identify_states(runs, order, delay=delay or 0, **options)]
     elif model == FED_BATCH:
-        from beamfit.studies.fedbatch.fit import identify_batches
-        from beamfit.studies.fedbatch.titre import fit_titre
+        from beamfit.dynamics.fedbatch import identify_batches
+        from beamfit.dynamics.titre import fit_titre
 
         fits = [identify_batches(runs, held=held, hidden=hidden, seed=seed)]
         if all("titre" in run.outputs for run in runs):
             fits.append(fit_titre(fits[0], seed=seed))
     else:
-        from beamfit.studies.response.fit import identify as fit_response
+        from beamfit.dynamics.fit import identify as fit_response
 
         options |= {"model": model, "delay": delay, "gains": gains}
         fits = [fit_response(runs, output=name, **options) for name in runs[0].outputs]

@@ -12,15 +12,15 @@ from beamfit.cli.options import Command, Sampling, answered, option, options, re
 from beamfit.errors import InputError
 from beamfit.io.decay_record import monitor_of, read_lifetime_input
 from beamfit.io.files import digest
-from beamfit.studies.decay.record import LifetimeTable
+from beamfit.lifetime.record import LifetimeTable
 
 if TYPE_CHECKING:
     from beamfit.cli.show import Terminal
+    from beamfit.lifetime.course import Trend
+    from beamfit.lifetime.lifetime_table import LifetimeFit
+    from beamfit.lifetime.ring_study import Shift
+    from beamfit.lifetime.study import Decay, Machine, RecordStudy
     from beamfit.sampling.posterior import Posterior
-    from beamfit.studies.decay.course import Trend
-    from beamfit.studies.decay.lifetime_table import LifetimeFit
-    from beamfit.studies.decay.ring_study import Shift
-    from beamfit.studies.decay.study import Decay, Machine, RecordStudy
 
 EXAMPLE = """\b
 Examples:
@@ -131,7 +131,7 @@ def lifetime(
         _lifetimes(tables, inputs, as_json)
         return
 
-    from beamfit.studies.decay.study import study_record  # JAX from here on
+    from beamfit.lifetime.study import study_record  # JAX from here on
 
     if monitor is not None:
         records = [replace(each, monitor=monitor.beside(each.monitor)) for each in records]
@@ -160,7 +160,7 @@ def lifetime(
 
 def _lifetimes(tables: list[LifetimeTable], inputs: dict[str, str], as_json: bool) -> None:
     """Fit and show tables of lifetimes."""
-    from beamfit.studies.decay.lifetime_table import fit_lifetimes  # JAX from here on
+    from beamfit.lifetime.lifetime_table import fit_lifetimes  # JAX from here on
 
     fits = [fit_lifetimes(table) for table in tables]
     answered(as_json, fits, inputs, lambda terminal: _show_lifetimes(terminal, fits))
@@ -189,7 +189,7 @@ def _check_study(study: bool, ring: str | None, network: str | None, priors: dic
 def _machine(path: str) -> Machine:
     ring, operation = beamfit.read_ring(path), beamfit.read_operation(path)
 
-    from beamfit.studies.decay.study import Machine
+    from beamfit.lifetime.study import Machine
 
     return Machine(ring, operation)
 
@@ -200,14 +200,14 @@ def _shift(
     network: str | None,
     priors: dict[str, tuple[float, float]] | None,
 ) -> Shift:
-    from beamfit.studies.decay.loss_network import Network
-    from beamfit.studies.decay.ring_study import study_shift
+    from beamfit.lifetime.loss_network import Network
+    from beamfit.lifetime.ring_study import study_shift
 
     return study_shift(decays, machine, network=network and Network(network), priors=priors)
 
 
 def _trend(studies: tuple[RecordStudy, ...], machine: Machine | None) -> Trend:
-    from beamfit.studies.decay.course import trend_of
+    from beamfit.lifetime.course import trend_of
 
     return trend_of(studies, machine)
 
@@ -242,7 +242,7 @@ def _show(
 
 def _show_record(terminal: Terminal, study: RecordStudy) -> None:
     """Lay out a record: what was cut away, and every decay with its verdict and budget."""
-    from beamfit.studies.decay import tables
+    from beamfit.lifetime import tables
     from beamfit.table import Table, labelled
 
     terminal.line(str(study.record), style="bold")
@@ -277,7 +277,7 @@ def _show_record(terminal: Terminal, study: RecordStudy) -> None:
 
 def _show_many(terminal: Terminal, study: RecordStudy) -> None:
     """Print a table with a row for each decay, below the record's name."""
-    from beamfit.studies.decay import tables
+    from beamfit.lifetime import tables
     from beamfit.table import Table
 
     for title, header, rows in tables.overview(study.decays):
@@ -305,7 +305,7 @@ def _say_shift(terminal: Terminal, shift: Shift) -> None:
 
 def _show_shift(terminal: Terminal, shift: Shift) -> None:
     """Lay out a study of many decays."""
-    from beamfit.studies.decay import tables
+    from beamfit.lifetime import tables
     from beamfit.table import labelled
 
     fit, count = shift.fit, len(shift.fit.names)

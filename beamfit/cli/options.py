@@ -10,13 +10,13 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import click
 
 import beamfit
+from beamfit.cli.option_text import anchor_of, bounds_of, gains_of, limits_of, priors_of
+from beamfit.emittance.assumptions import SCENARIOS
 from beamfit.errors import InputError
 from beamfit.io.columns import layout_of
 from beamfit.io.result import results_text
 from beamfit.particles import REST_ENERGY
 from beamfit.report import kind_of
-from beamfit.studies.scan.assumptions import SCENARIOS
-from beamfit.studies.scan.typed import anchor_of, bounds_of, gains_of, limits_of, priors_of
 from beamfit.writing import check_place
 
 if TYPE_CHECKING:

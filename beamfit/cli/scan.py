@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 import beamfit
+from beamfit.cli.option_text import goal_of
 from beamfit.cli.options import Command, answered, command_line, option, options, reported
 from beamfit.errors import InputError, plain
 from beamfit.io.files import digest
@@ -20,13 +21,12 @@ from beamfit.io.line import build_line, read_inputs
 from beamfit.io.machine import ScanMachine, read_scan_machine
 from beamfit.io.result import results_text
 from beamfit.status import Status
-from beamfit.studies.scan.typed import goal_of
 from beamfit.table import cell
 from beamfit.writing import check_place, write_atomically
 
 if TYPE_CHECKING:
+    from beamfit.emittance.results import PlaneFit
     from beamfit.live.scan import Outcome, Told
-    from beamfit.studies.scan.results import PlaneFit
 
 EXAMPLE = """\b
 Examples:

@@ -9,19 +9,19 @@ import click
 import numpy as np
 
 import beamfit
+from beamfit.cli.option_text import target_of
 from beamfit.cli.options import Command, answered, option, options
+from beamfit.emittance.wishes import Beam, Target, common_energy
 from beamfit.errors import InputError, located
 from beamfit.io.files import digest
 from beamfit.io.line import build_line, read_lattice
 from beamfit.io.result import read_fitted_beams
-from beamfit.studies.scan.typed import target_of
-from beamfit.studies.scan.wishes import Beam, Target, common_energy
 from beamfit.table import text_of
 
 if TYPE_CHECKING:
     from beamfit.cli.show import Terminal
+    from beamfit.emittance.setpoint_result import Setpoint
     from beamfit.io.lattice import LatticeFile
-    from beamfit.studies.scan.setpoint_result import Setpoint
 
 EXAMPLE = """\b
 Examples:

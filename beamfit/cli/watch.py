@@ -63,11 +63,11 @@ async def _watched(
     machine: WatchMachine, seconds: float | None, bind: str, port: int, quiet: bool
 ) -> tuple[Told, int]:
     """See that the variables answer, serve, and watch."""
+    from beamfit.lifetime.study import Machine
+    from beamfit.lifetime.watch import Plan
     from beamfit.live.page import page
     from beamfit.live.served import check_unserved, served
     from beamfit.live.watch import connect, watch
-    from beamfit.studies.decay.study import Machine
-    from beamfit.studies.decay.watch import Plan
 
     ring = machine.ring and Machine(
         beamfit.read_ring(machine.ring), beamfit.read_operation(machine.ring)
@@ -141,7 +141,7 @@ def _table(told: Told) -> Table:
 
 def _results(told: Told) -> list[dict[str, Any]]:
     """Results in the form of `beamfit lifetime --json`, with alarms and counts."""
-    from beamfit.studies.decay.watch import nothing_yet
+    from beamfit.lifetime.watch import nothing_yet
 
     state = told.state
     answer = state.answer or nothing_yet(state)

@@ -1,5 +1,1 @@
-"""How processes respond to their inputs: difference and differential equations in JAX."""
-
-from beamfit.compile_cache import prepare_jax
-
-prepare_jax()
+"""Processes in time: responses, state spaces, balances, and what runs say of them."""

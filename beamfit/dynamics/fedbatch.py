@@ -1,97 +1,300 @@
-"""Mass balances of a fed-batch process (report eqs 45 and 46), as concentrations in a volume.
-
-Concentrations are in g/L, volumes in L, times in h; rates are per gram of biomass.
-"""
+"""Fit of growth rates to batches: search, noise from the residuals, bands, verdict."""
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
+
+from beamfit.dynamics.case import rounds
+from beamfit.dynamics.curve import NEAR, POINTS, Curve
+from beamfit.dynamics.fedbatch_model import (
+    FLOWS,
+    RATES,
+    STATES,
+    PreparedBatches,
+    bounds_of,
+    course,
+    filled,
+    known_at,
+    network_of,
+    rates_at,
+    seen_of,
+    state,
+)
+from beamfit.dynamics.fedbatch_verdict import RULES, RateEvidence, ReadingNoise, noise_of
+from beamfit.dynamics.record import Run, ordered
+from beamfit.errors import InputError, nearest
+from beamfit.greybox.fit import Fit
+from beamfit.greybox.problem import Free, Problem
+from beamfit.greybox.solve import solve
+from beamfit.shown import shown
+from beamfit.status import Status
+from beamfit.table import Table, json_of
+from beamfit.verdict import judge
+
+# Steps of a round, after which the noise is estimated again; most rounds; gain in -2 ln L below
+# which they end.
+STEPS, ROUNDS, GAINED = 60, 8, 0.5
+# First estimate of the noise, as a share of the values.
+FIRST = 0.1
+# A point of a curve is visited if this many rows are NEAR it, and in the other inputs of the rates
+# within this share of their range. A curve begins at this share of its end.
+VISITS, BESIDE, LEAST = 3, 0.5, 1e-3
 
 
-class Flow(NamedTuple):
-    """Flows of the vessel: feed and outflow in L/h, substrate in the feed in g/L."""
+@shown
+@dataclass(frozen=True, eq=False)
+class FedBatchFit:
+    """Rates of a fed-batch process, identified from batches.
 
-    feed: jax.Array
-    fed: jax.Array
-    out: jax.Array
+    Attributes
+    ----------
+    status : Status
+        How far to believe it; ``message`` says why and what to do.
+    runs : tuple of Run
+        The batches.
+    seen : PreparedBatches
+        The same as the model sees them.
+    fit : Fit
+        The grey-box fit.
+    curves : tuple of Curve
+        mu_b and mu_s against each thing they hang on, the others at their means, 1/h.
+    noise : dict of str to ReadingNoise
+        Of biomass, substrate and volume.
+    held : dict of str to float
+        Residual of each batch that was held back, rms in units of the noise.
+    """
+
+    status: Status
+    message: str
+    runs: tuple[Run, ...]
+    seen: PreparedBatches
+    fit: Fit
+    curves: tuple[Curve, ...]
+    noise: dict[str, ReadingNoise]
+    held: dict[str, float]
+
+    @property
+    def headline(self) -> str:
+        """The answer in a line."""
+        points = ", ".join(self.fit.model["rates"].inputs)
+        return f"mu_b, mu_s {self.status}: of {points}, from {len(self.runs)} batches"
+
+    @cached_property
+    def courses(self) -> tuple[np.ndarray, ...]:
+        """Biomass, substrate and volume at the rows of each batch, shape (rows, 3)."""
+        found = np.asarray(course(self.fit.model, self.seen.batches))
+        return tuple(x[: len(t)] for x, t in zip(found, self.seen.time, strict=True))
+
+    def tables(self) -> tuple[Table, ...]:
+        """All numbers, to be shown."""
+        rows = [[f"noise of {name}", str(noise)] for name, noise in self.noise.items()]
+        rows += [[f"bound of {r}", f"{m:.3g} 1/h"]
+                 for r, m in zip(RATES, self.seen.batches.most, strict=True)]  # fmt: skip
+        rows += [[f"{n} held back", f"residual {r:.2f} times the noise"]
+                 for n, r in self.held.items()]  # fmt: skip
+        return (Table("fed-batch", [], rows), *(curve.table() for curve in self.curves))
+
+    def to_json(self) -> dict[str, Any]:
+        """Give one entry of ``results`` in the JSON contract."""
+        return json_of(
+            {"output": "rates", "status": self.status, "message": self.message}
+            | {"model": "fed-batch", "map": "network"}
+            | {"records": [run.path or run.name for run in self.runs]}
+            | {"curves": [curve.to_json() for curve in self.curves]}
+            | {"noise": {name: noise._asdict() for name, noise in self.noise.items()}}
+            | {"held_back": self.held}
+        )
 
 
-def balances(x: jax.Array, rates: jax.Array, flow: Flow) -> jax.Array:
-    """Slopes of biomass, substrate and volume.
+def identify_batches(
+    runs: Run | Sequence[Run],
+    *,
+    points: Sequence[str] | None = None,
+    held: Sequence[Run] = (),
+    hidden: int = 5,
+    most: tuple[float, float] | None = None,
+    seed: int = 0,
+) -> FedBatchFit:
+    """Identify the rates of a fed-batch process.
 
     Parameters
     ----------
-    x : array, shape (3,)
-        Biomass X and substrate S in g/L, volume V in L.
-    rates : array, shape (2,)
-        Growth mu_b and consumption mu_s, both per gram of biomass, 1/h.
-    flow : Flow
-        The feed brings no biomass; what runs out has the concentrations inside.
+    runs : Run or sequence of Run
+        Batches, of any lengths: outputs ``biomass`` and ``substrate`` in g/L and ``volume`` in L,
+        NaN where nothing was read; inputs ``feed`` in L/h and ``feed_substrate`` in g/L, optionally
+        ``outflow`` in L/h, and whatever else was set.
+    points : sequence of str, optional
+        What the rates hang on, of states and inputs; the substrate and all inputs that are no
+        flow if None.
+    held : sequence of Run
+        Batches that are only predicted, from states at the start that fit them.
+    hidden : int
+        Nodes of the network.
+    most : (float, float), optional
+        Bounds of mu_b and mu_s, 1/h; twice the largest that an eighth of a batch shows if None.
+    seed : int
+        Of the network's first weights.
 
     Returns
     -------
-    jax.Array, shape (3,)
-        Per hour.
+    FedBatchFit
+
+    Raises
+    ------
+    InputError
+        If a column is missing, batches have other columns, the biomass never grows, or a name is
+        unknown.
 
     Notes
     -----
-    Report eqs 45 and 46, accumulation = in - out + generation, are balances of the masses X V and
-    S V: (X V)' = mu_b X V - out X, (S V)' = feed S_f - out S - mu_s X V. With V' = feed - out the
-    outflow leaves the concentrations. The report multiplies mu_s by the substrate; a rate of
-    consumption is one of the cells, so that it is of the biomass here.
-
-    Examples
-    --------
-    >>> flow = Flow(jnp.array(0.1), jnp.array(200.0), jnp.array(0.0))
-    >>> print(balances(jnp.array([2.0, 5.0, 4.0]), jnp.array([0.2, 0.4]), flow))
-    [0.35  4.075 0.1  ]
+    The balances (report eqs 45 and 46, `beamfit.dynamics.balances.balances`) hold exactly; a
+    network gives mu = bound S/(S + s) sigmoid(net), so that rates are never negative, bounded, and
+    nothing without substrate. All batches run free from states that are estimated. The noise of
+    each output is the same everywhere or a share of the value, whichever is likelier, and is taken
+    from the residuals after every round.
     """
-    thinned = flow.feed / x[2]
-    return jnp.stack(
-        [
-            (rates[0] - thinned) * x[0],
-            thinned * (flow.fed - x[1]) - rates[1] * x[0],
-            flow.feed - flow.out,
-        ]
-    )
+    runs = (runs,) if isinstance(runs, Run) else tuple(runs)
+    for run in (*runs, *held):
+        _check(run, runs[0])
+    runs, held = ([ordered(run, runs[0]) for run in each] for each in (runs, held))
+    own = [n for n in runs[0].inputs if n not in FLOWS]
+    names = ("substrate", *own) if points is None else tuple(points)
+    check_names(names, (*STATES, *runs[0].inputs), "rates")
+    seen = seen_of(runs, bounds_of(runs, most))
+    fit, noise, rests = settled(seen, _first(seen, names, hidden, seed))
+    curves = curves_of(fit, seen)
+    ahead = {run.name: _held_back(run, seen, fit, noise) for run in held}
+    y = np.asarray(course(fit.model, seen.batches))
+    found = judge(RateEvidence(fit, rests, seen, y, noise, curves, ahead), RULES)
+    return FedBatchFit(found.status, found.message, tuple(runs), seen, fit, curves, noise, ahead)
 
 
-def titre_of(
-    begin: jax.Array, made: jax.Array, x: jax.Array, out: jax.Array, dt: jax.Array
-) -> jax.Array:
-    """Titre along a course: the mass of product, (P V)' = q X V - out P, over the volume.
+def _check(run: Run, first: Run) -> None:
+    for kind, has, needs in (
+        ("output", run.outputs, STATES),
+        ("input", run.inputs, ("feed", "feed_substrate")),
+    ):
+        missing = [name for name in needs if name not in has]
+        if missing:
+            prefix = "y" if kind == "output" else "u"
+            raise run.unusable(f"no {kind} {missing[0]}", f"a column {prefix}_{missing[0]}")
+    if set(run.inputs) != set(first.inputs):
+        raise run.unusable(f"inputs {', '.join(run.inputs)}", f"those of {first.name}")
+    for name in ("biomass", "volume"):
+        if (low := np.nanmin(run.outputs[name])) < 0 or np.nanmax(run.outputs[name]) == 0:
+            raise run.unusable(f"{name} of {low:g}", "values above 0")
 
-    Parameters
-    ----------
-    begin : array, shape ()
-        Titre at the first point, g/L.
-    made : array, shape (2, n)
-        Product formed, q, per gram of biomass, 1/h: from each point on, and just before the next.
-    x : array, shape (n, 3)
-        Biomass, substrate, volume.
-    out : array, shape (n,)
-        Outflow until the next point, L/h.
-    dt : array, shape (n,)
-        Time to the next point, h; the last is not used.
 
-    Returns
-    -------
-    jax.Array, shape (n,)
-        By the trapezoidal rule: with kept(t) = exp(-∫ out/V), P V = kept (P0 V0 + ∫ q X V/kept).
+def check_names(names: Sequence[str], known: Sequence[str], what: str) -> None:
+    """Refuse names that are neither states nor inputs."""
+    for name in names:
+        if name not in known:
+            raise InputError(f"{what} that hang on '{name}'", nearest(name, list(known)))
 
-    Examples
-    --------
-    >>> x = jnp.tile(jnp.array([10.0, 1.0, 4.0]), (3, 1))
-    >>> titre_of(jnp.array(1.0), jnp.full((2, 3), 0.1), x, jnp.zeros(3), jnp.ones(3)).tolist()
-    [1.0, 2.0, 3.0]
+
+def _first(seen: PreparedBatches, names: Sequence[str], hidden: int, seed: int) -> dict[str, Any]:
+    """The model a search begins with: rates of half their bounds, states as first read."""
+    b, start, points = seen.batches, [], []
+    values = np.where(seen.read, seen.measured, np.nan)
+    for x, u, t in zip(values, np.asarray(b.u), seen.time, strict=True):
+        whole = np.stack([filled(t, c) for c in x[: len(t)].T])
+        known = known_at(b, whole, u[: len(t)].T)
+        points.append(np.stack([known[name] for name in names], axis=1))
+        start.append(whole[:, 0])
+    net = network_of(names, np.concatenate(points), RATES, hidden, seed)
+    floor = 1e-3 * np.nanmax(values, axis=(0, 1))
+    return {"rates": net, "start": np.log(np.maximum(start, floor))}
+
+
+# ---- the search
+
+
+class _Searched(NamedTuple):
+    fit: Fit
+    model: Any
+    noise: list[ReadingNoise]
+    error: np.ndarray
+    likelihood: float
+
+
+def _errors(noise: Iterable[ReadingNoise], values: np.ndarray) -> np.ndarray:
+    return np.stack([each.errors(values[..., k]) for k, each in enumerate(noise)], axis=-1)
+
+
+def settled(
+    seen: PreparedBatches,
+    model: Any,
+    stated: Callable[..., Problem] = state,
+    fitted: Callable[..., jax.Array] = course,
+    names: Sequence[str] = STATES,
+) -> tuple[Fit, dict[str, ReadingNoise], bool]:
+    """Search in rounds, each with the noise of the last one's residuals, until nothing is gained.
+
+    The third value tells whether the search rests.
     """
-    mass, dt, start = x[:, 0] * x[:, 2], dt[:-1], jnp.zeros(1)
-    lost = 0.5 * out[:-1] * dt * (1.0 / x[:-1, 2] + 1.0 / x[1:, 2])
-    lost = jnp.concatenate([start, jnp.cumsum(lost)])
-    grown = mass * jnp.exp(lost)
-    gained = 0.5 * dt * (made[0, :-1] * grown[:-1] + made[1, :-1] * grown[1:])
-    whole = begin * x[0, 2] + jnp.concatenate([start, jnp.cumsum(gained)])
-    return jnp.exp(-lost) * whole / x[:, 2]
+
+    def search(model, error):
+        fit = solve(stated(seen, model, error), iterations=STEPS)
+        model = jax.tree_util.tree_map(np.asarray, fit.model)
+        y = np.asarray(fitted(model, seen.batches))
+        rest = seen.measured - y
+        noise = [noise_of(rest[..., k], y[..., k], seen.read[..., k]) for k in range(len(names))]
+        error = _errors(noise, y)
+        minus = float(np.sum((rest / error)[seen.read] ** 2 + 2 * np.log(error[seen.read])))
+        return _Searched(fit, model, noise, error, minus)
+
+    # Begun as a share of the values: where all errors are alike, small values are never looked at.
+    found = search(model, _errors([ReadingNoise(FIRST, True)] * len(names), seen.measured))
+    found, rests = rounds(found, lambda f: search(f.model, f.error), GAINED, ROUNDS - 1)
+    rests |= found.fit.status is Status.converged
+    return found.fit, dict(zip(names, found.noise, strict=True)), rests
+
+
+# ---- curves
+
+
+def _rates(model: Any, asked: tuple[Any, Any, Any]) -> jax.Array:
+    b, x, u = asked
+    return jax.vmap(lambda x, u: rates_at(b, model["rates"], x, u))(x, u)
+
+
+def curves_of(fit: Fit, seen: PreparedBatches) -> tuple[Curve, ...]:
+    """Each rate against each thing it hangs on, the others at their means."""
+    b = seen.batches
+    found = np.asarray(course(fit.model, b))
+    rows = np.concatenate([
+        np.concatenate([x, u], axis=1)[: len(t)]
+        for x, u, t in zip(found, np.asarray(b.u), seen.time, strict=True)
+    ])  # fmt: skip
+    names, made = (*STATES, *b.inputs), []
+    wide = np.where(np.ptp(rows, axis=0) > 0, np.ptp(rows, axis=0), 1.0)
+    own = [names.index(name) for name in fit.model["rates"].inputs]
+    for j in own:
+        grid = np.tile(rows.mean(0), (POINTS, 1))
+        high = rows[:, j].max()  # of no substrate rates are nothing, without an error
+        grid[:, j] = at = np.linspace(max(rows[:, j].min(), LEAST * high), high, POINTS)
+        near = np.where(np.arange(len(names)) == j, NEAR, BESIDE)[own]
+        apart = np.abs(rows[None, :, own] - grid[:, None, own]) / wide[own]
+        visited = np.sum(np.all(apart <= near, axis=2), axis=1) >= VISITS
+        value = fit.derive(_rates, (b, jnp.asarray(grid[:, :3]), jnp.asarray(grid[:, 3:])))
+        made += [Curve(rate, names[j], "1/h", at, value.value[:, i], value.error[:, i], visited)
+                 for i, rate in enumerate(RATES)]  # fmt: skip
+    return tuple(made)
+
+
+def _held_back(run: Run, seen: PreparedBatches, fit: Fit, noise: dict[str, ReadingNoise]) -> float:
+    """Rms residual, over the noise, of a batch of which only the states at the start are fitted."""
+    own, net = seen_of([run], seen.batches), fit.model["rates"]
+    model = _first(own, net.inputs, 1, 0) | {"rates": net}
+    error = _errors(noise.values(), own.measured)
+    stated = state(own, model, error)
+    end = solve(Problem(stated.model, [Free("start", nuisance=True)], stated.records))
+    rest = (np.asarray(course(end.model, own.batches)) - own.measured) / error
+    return float(np.sqrt(np.mean(rest[own.read] ** 2)))

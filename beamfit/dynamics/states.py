@@ -11,6 +11,9 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from beamfit.compile_cache import prepare_jax
+
+prepare_jax()
 # Samples that `linear_outputs` computes by one matrix product.
 BLOCK = 32
 # Scaling and terms of the matrix exponential: exact to 1e-12 up to 4000 time constants in a step.

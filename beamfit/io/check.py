@@ -13,6 +13,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from beamfit.dynamics.record import Run
+from beamfit.emittance.scan import QuadScan
 from beamfit.errors import InputError
 from beamfit.io.columns import Columns, Layout, layout_of, proposal
 from beamfit.io.decay_record import read_lifetime_input
@@ -30,10 +32,8 @@ from beamfit.io.scan_columns import likely_name as scan_name
 from beamfit.io.table import header_of, is_binary, read_columns, read_sheet
 from beamfit.io.toml import read_toml
 from beamfit.language.document import Document
+from beamfit.lifetime.record import DecayRecord, LifetimeTable
 from beamfit.quantity import display_unit
-from beamfit.studies.decay.record import DecayRecord, LifetimeTable
-from beamfit.studies.response.record import Run
-from beamfit.studies.scan.scans import QuadScan
 from beamfit.table import Table
 
 
@@ -126,7 +126,7 @@ def understand(
     content = read(path, **reading)
     facts, notes = told(content), tuple(getattr(content, "notes", ()))
     if kind == "scan":
-        from beamfit.studies.scan.questions import of_sizes
+        from beamfit.emittance.questions import of_sizes
 
         notes += tuple(of_sizes(content))
         if is_emittance_gui(path):
@@ -172,8 +172,8 @@ def with_lattice(scan: Understood, lattice: Understood) -> Understood:
     except InputError as error:
         said = str(replace(error, path=None))
         return replace(scan, facts=(*scan.facts, Fact(label, said, {"fits": False, "why": said})))
-    from beamfit.studies.scan.questions import questions  # JAX from here on
-    from beamfit.studies.scan.transport import scanned_line
+    from beamfit.emittance.questions import questions  # JAX from here on
+    from beamfit.emittance.transport import scanned_line
 
     line = build_line(lattice.content)
     own = scan.content.of_particle(line.mass)
@@ -335,7 +335,7 @@ def of_record(record: DecayRecord | LifetimeTable) -> list[Fact]:
         columns = ("lifetime", record.lifetime, "h"), ("beam current", record.current, "mA")
         facts = [Fact("lifetimes", str(len(record)), len(record)), *_ranges(columns)]
         return [*facts, Fact("errors", errors, record.error is not None)]
-    from beamfit.studies.decay.pieces import split_record  # scipy, for records alone
+    from beamfit.lifetime.pieces import split_record  # scipy, for records alone
 
     hours = record.span / 3600
     value = {"count": len(record), "span_h": hours}

@@ -26,7 +26,7 @@ from beamfit.io.headers import spelled
 from beamfit.io.record_columns import dated, known, record_columns, taken_for_current
 from beamfit.io.scan_columns import is_size
 from beamfit.io.table import read_columns
-from beamfit.studies.decay.record import (
+from beamfit.lifetime.record import (
     Conditions,
     DecayRecord,
     Fault,

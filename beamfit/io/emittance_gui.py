@@ -12,13 +12,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from beamfit.emittance.scan import POSSIBLE, Profile, QuadScan
 from beamfit.errors import InputError, nearest
 from beamfit.io.binary import matlab_variables
 from beamfit.io.files import digest, laid_out, name_of
 from beamfit.io.lattice import LatticeFile
 from beamfit.io.shots import average_shots
 from beamfit.quantity import Quantity
-from beamfit.studies.scan.scans import POSSIBLE, Profile, QuadScan
 
 # GeV, of files that have none; the electron's is the only particle there.
 USUAL_ENERGY = 0.135

@@ -6,8 +6,8 @@ import re
 from collections.abc import Sequence
 from functools import lru_cache
 
+from beamfit.emittance.scan import SETTINGS
 from beamfit.errors import InputError
-from beamfit.studies.scan.scans import SETTINGS
 
 UNITS: dict[str, dict[str, float]] = {
     # quantity: unit at the end of a name -> factor to SI (a stored current: to mA)

@@ -16,14 +16,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from beamfit.emittance.names import check_names
+from beamfit.emittance.scan import QuadScan
 from beamfit.errors import InputError, nearest
 from beamfit.io.columns import Sheet, columns_of
 from beamfit.io.files import name_of
 from beamfit.io.table import read_sheet
 from beamfit.io.toml import FLAG, LIST, NUMBER, TABLE, TEXT, Key, Section, is_number, read_toml
 from beamfit.particles import ENERGY_KEYS, REST_ENERGY, expected_energy, total_energy
-from beamfit.studies.scan.names import check_names
-from beamfit.studies.scan.scans import QuadScan
 
 if TYPE_CHECKING:
     from beamfit.optics.calibration import Calibration

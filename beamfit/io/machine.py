@@ -15,7 +15,7 @@ from beamfit.io.lattice import LatticeFile
 from beamfit.io.line import part_of, read_lattice
 from beamfit.io.record_columns import QUANTITIES
 from beamfit.io.toml import LIST, TABLE, TEXT, Key, Section, is_number, read_toml
-from beamfit.studies.decay.record import Conditions
+from beamfit.lifetime.record import Conditions
 
 FORMAT = "beamfit-machine-1"
 APPROACHES = ("either", "below", "above")

@@ -10,7 +10,7 @@ from beamfit.errors import InputError
 from beamfit.io.cells import DAY_FIRST, dates_in_order
 from beamfit.io.columns import DATE, UNITS, Column, Sheet, columns_of
 from beamfit.io.headers import is_number, spelled, unit_at_end
-from beamfit.studies.decay.record import Conditions
+from beamfit.lifetime.record import Conditions
 
 QUANTITIES = {
     "time": "time",

@@ -14,16 +14,16 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from beamfit import __version__
+from beamfit.emittance.scan import PROJECTED
+from beamfit.emittance.wishes import Beam
 from beamfit.errors import InputError
 from beamfit.io.files import laid_out, read_json
-from beamfit.studies.scan.scans import PROJECTED
-from beamfit.studies.scan.wishes import Beam
 from beamfit.table import json_of
 from beamfit.writing import write_atomically
 
 if TYPE_CHECKING:
-    from beamfit.studies.decay.fit import DecayFit
-    from beamfit.studies.scan.fit import EmittanceFit
+    from beamfit.emittance.fit import EmittanceFit
+    from beamfit.lifetime.fit import DecayFit
 
 HOW = "the output of beamfit emittance --json"
 NUMBERS = ("sigma11", "sigma12", "sigma22")
@@ -211,7 +211,7 @@ def _doubt(entry: Mapping[str, Any]) -> str | None:
 FORMAT = "beamfit-fit-2"
 KEPT = "a file that beamfit.save_fit wrote"
 # What a file may hold, by where it is defined. A file names these and nothing else.
-SCAN, DECAY, OPTICS = "beamfit.studies.scan", "beamfit.studies.decay", "beamfit.optics"
+SCAN, DECAY, OPTICS = "beamfit.emittance", "beamfit.lifetime", "beamfit.optics"
 HELD = {
     "beamfit.quantity": "Quantity",
     "beamfit.status": "Status",
@@ -263,8 +263,8 @@ def save_fit(path: str | PathLike[str], fit: EmittanceFit | DecayFit) -> None:
     >>> str(load_fit(file)) == str(fit)
     True
     """
-    from beamfit.studies.decay.fit import DecayFit  # JAX from here on
-    from beamfit.studies.scan.fit import EmittanceFit
+    from beamfit.emittance.fit import EmittanceFit
+    from beamfit.lifetime.fit import DecayFit  # JAX from here on
 
     if isinstance(fit, DecayFit):
         content = _plain(fit)
@@ -323,8 +323,8 @@ def _fit(kind: str, content: Any) -> EmittanceFit | DecayFit:
         return _value(content)
     if kind != "EmittanceFit":
         raise InputError(f"a fit of kind {str(kind)[:40]}", "EmittanceFit or DecayFit")
-    from beamfit.studies.scan.fit import EmittanceFit, scenario_of
-    from beamfit.studies.scan.known import see
+    from beamfit.emittance.fit import EmittanceFit, scenario_of
+    from beamfit.emittance.known import see
 
     own = {name: _value(content[name]) for name in OWN}
     line, statement = _value(content["line"]), scenario_of("known")

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from beamfit.dynamics.record import Run
 from beamfit.errors import InputError
 from beamfit.io.columns import (
     DATE,
@@ -20,7 +21,6 @@ from beamfit.io.columns import (
 )
 from beamfit.io.files import name_of
 from beamfit.io.table import read_columns
-from beamfit.studies.response.record import Run
 
 if TYPE_CHECKING:
     from pandas import DataFrame

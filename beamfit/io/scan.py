@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from beamfit.emittance.scan import POSSIBLE, USUAL, QuadScan, first_unusable, middle
 from beamfit.errors import InputError, located
 from beamfit.io.columns import (
     UNITS,
@@ -32,7 +33,6 @@ from beamfit.io.scan_columns import (
 )
 from beamfit.io.shots import average_shots
 from beamfit.io.table import read_columns
-from beamfit.studies.scan.scans import POSSIBLE, USUAL, QuadScan, first_unusable, middle
 
 if TYPE_CHECKING:
     from pandas import DataFrame

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from beamfit.studies.scan.scans import QuadScan, row_keys
+from beamfit.emittance.scan import QuadScan, row_keys
 
 # With fewer repeats in all (two or three accidental ones) the scatter says nothing.
 ENOUGH_DEGREES = 3

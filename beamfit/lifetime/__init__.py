@@ -1,5 +1,1 @@
-"""How a stored beam decays: the law, the loss mechanisms, and the fit of the law's parameters."""
-
-from beamfit.compile_cache import prepare_jax
-
-prepare_jax()
+"""Stored beams: the decay law, the loss mechanisms, and what records of current say of them."""

@@ -9,8 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 from scipy import constants
 
+from beamfit.compile_cache import prepare_jax
 from beamfit.particles import REST_ENERGY
 from beamfit.shown import shown
+
+prepare_jax()
 
 # Rest energy of the electron, eV.
 ELECTRON_MASS_EV = 1e6 * REST_ENERGY["electron"]

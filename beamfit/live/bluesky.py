@@ -14,13 +14,13 @@ import bluesky.preprocessors as bpp
 from bluesky.utils import FailedStatus, MsgGenerator
 
 import beamfit
+from beamfit.emittance.fit import EmittanceFit
 from beamfit.io.machine import ScanMachine
 from beamfit.live.devices import connect
 from beamfit.live.points import Point
 from beamfit.live.restore import journal_of
 from beamfit.live.scan import Outcome, Told, scan
 from beamfit.optics.beamline import Beamline
-from beamfit.studies.scan.fit import EmittanceFit
 
 # Quantities of each plane in the event of a fit.
 QUOTED = ("emittance", "normalized_emittance", "beta", "alpha")

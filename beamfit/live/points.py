@@ -13,16 +13,16 @@ from typing import NamedTuple
 import numpy as np
 
 import beamfit
+from beamfit.emittance.candidates import information_of
+from beamfit.emittance.design import best_steps
+from beamfit.emittance.fit import EmittanceFit, fit_emittance
+from beamfit.emittance.scan import QuadScan
 from beamfit.errors import InputError, plain
 from beamfit.greybox.problem import padded_length
 from beamfit.io.machine import Magnet, ScanMachine
 from beamfit.optics.beamline import Beamline
 from beamfit.statistics import POOR_FIT, chi2_probability
 from beamfit.status import Status
-from beamfit.studies.scan.candidates import information_of
-from beamfit.studies.scan.design import best_steps
-from beamfit.studies.scan.fit import EmittanceFit, fit_emittance
-from beamfit.studies.scan.scans import QuadScan
 
 # Where a scan begins, in parts of the range of its first magnet.
 BEGIN = (0.1, 0.37, 0.63, 0.9)
@@ -200,7 +200,7 @@ def next_setting(
     -------
     Next or str
         First settings over the range of the first magnet; then those that tell most, by
-        `beamfit.studies.scan.design`: of magnets that fewer than three points moved where there are
+        `beamfit.emittance.design`: of magnets that fewer than three points moved where there are
         some, since a wrong line shows there alone. The middle of the largest gap where nothing can
         be fitted.
     """

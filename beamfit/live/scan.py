@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from beamfit.emittance.fit import EmittanceFit
 from beamfit.errors import InputError
 from beamfit.io.machine import ScanMachine
 from beamfit.live.devices import Connected, NoSizesError, Shots
@@ -29,7 +30,6 @@ from beamfit.live.restore import (
     restore,
 )
 from beamfit.optics.beamline import Beamline
-from beamfit.studies.scan.fit import EmittanceFit
 
 # Settings in a row at which nothing can be measured, after which a scan ends.
 BARREN = 3

@@ -13,9 +13,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from beamfit.io.machine import Watched, WatchMachine
+from beamfit.lifetime.watch import CURRENT, RULE, Plan, State, noted, stepped
 from beamfit.live.channel import Channel, LostError, Reading, kept, open_channel
 from beamfit.status import Status
-from beamfit.studies.decay.watch import CURRENT, RULE, Plan, State, noted, stepped
 from beamfit.table import cell, json_of
 
 # Without a reading for so long, or so many usual intervals, what is shown is old, s.

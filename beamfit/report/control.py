@@ -7,9 +7,9 @@ from functools import partial
 import numpy as np
 from matplotlib.figure import FigureBase
 
+from beamfit.dynamics.loop import Loop
 from beamfit.report.document import BLUE, RED, Picture, ReportPage, Verdict
 from beamfit.report.response import about_runs
-from beamfit.studies.response.loop import Loop
 
 NOTES = (
     "SIMULATED: the process is the fitted model, with the noise of its residuals. Limits of inputs "

@@ -11,7 +11,13 @@ from matplotlib.axes import Axes
 from matplotlib.figure import FigureBase
 
 from beamfit.errors import InputError
-from beamfit.lifetime.decay import HOUR, current
+from beamfit.lifetime import tables
+from beamfit.lifetime.course import Trend
+from beamfit.lifetime.decay_law import HOUR, current
+from beamfit.lifetime.fit import DecayFit
+from beamfit.lifetime.ring_study import Shift
+from beamfit.lifetime.study import Decay, RecordStudy, cycle_lifetimes
+from beamfit.lifetime.systematics import moving_lifetime
 from beamfit.report.document import (
     BLUE,
     MANY,
@@ -26,12 +32,6 @@ from beamfit.report.document import (
 from beamfit.report.network import network_pictures
 from beamfit.report.trend import trend_picture
 from beamfit.status import Status
-from beamfit.studies.decay import tables
-from beamfit.studies.decay.course import Trend
-from beamfit.studies.decay.fit import DecayFit
-from beamfit.studies.decay.ring_study import Shift
-from beamfit.studies.decay.study import Decay, RecordStudy, cycle_lifetimes
-from beamfit.studies.decay.systematics import moving_lifetime
 from beamfit.table import Table, labelled
 
 COLOURS = (BLUE, "#c98a00", "#2c7a3f", "#7b4fa3", RED, "#4f9aa3", "0.5")

@@ -7,6 +7,11 @@ from collections.abc import Sequence
 from functools import partial
 from typing import Any
 
+from beamfit.emittance.fit import EmittanceFit
+from beamfit.emittance.results import parameter_rows, result_rows
+from beamfit.emittance.scan import QuadScan
+from beamfit.emittance.sensitivity import budget_rows, range_rows
+from beamfit.emittance.size_methods import SizeMethods
 from beamfit.report.document import MOST_DRAWN, Picture, ReportPage, Verdict, from_head
 from beamfit.report.scan_pictures import (
     PROFILES_ABREAST,
@@ -17,11 +22,6 @@ from beamfit.report.scan_pictures import (
     words_of,
 )
 from beamfit.report.scan_tables import identifiability_rows, point_rows
-from beamfit.studies.scan.fit import EmittanceFit
-from beamfit.studies.scan.results import parameter_rows, result_rows
-from beamfit.studies.scan.scans import QuadScan
-from beamfit.studies.scan.sensitivity import budget_rows, range_rows
-from beamfit.studies.scan.size_methods import SizeMethods
 from beamfit.table import Table, labelled
 
 ERRORS = (

@@ -8,11 +8,11 @@ from functools import partial
 import numpy as np
 from matplotlib.figure import FigureBase
 
+from beamfit.dynamics.fedbatch import FedBatchFit
+from beamfit.dynamics.feed import FeedCourse, FeedPlan
+from beamfit.dynamics.titre import Ranked, TitreFit
 from beamfit.report.document import BLUE, RED, Picture, ReportPage, Verdict
 from beamfit.report.response import about_runs, draw_curve
-from beamfit.studies.fedbatch.feed import FeedCourse, FeedPlan
-from beamfit.studies.fedbatch.fit import FedBatchFit
-from beamfit.studies.fedbatch.titre import Ranked, TitreFit
 
 NOTES = (
     "Errors and bands are one standard deviation. The balances run free from the start of each "

@@ -5,6 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+from beamfit.dynamics.fedbatch import FedBatchFit
+from beamfit.dynamics.feed import FeedPlan
+from beamfit.dynamics.fit import ResponseFit
+from beamfit.dynamics.loop import Loop
+from beamfit.dynamics.state_fit import StatesFit
+from beamfit.dynamics.titre import TitreFit
+from beamfit.emittance.slices import SliceFits
 from beamfit.language.computed import Computed
 from beamfit.language.solution import ProblemSolution
 from beamfit.report.control import control_page
@@ -13,13 +20,6 @@ from beamfit.report.fedbatch import fedbatch_page, feed_page
 from beamfit.report.formulation import computed_page, formulation_page
 from beamfit.report.response import response_page
 from beamfit.report.slices import slices_page
-from beamfit.studies.fedbatch.feed import FeedPlan
-from beamfit.studies.fedbatch.fit import FedBatchFit
-from beamfit.studies.fedbatch.titre import TitreFit
-from beamfit.studies.response.fit import ResponseFit
-from beamfit.studies.response.loop import Loop
-from beamfit.studies.response.states import StatesFit
-from beamfit.studies.scan.slices import SliceFits
 
 # A result by itself, and several beside one another.
 OF_ONE = {

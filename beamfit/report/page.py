@@ -10,28 +10,28 @@ from typing import TYPE_CHECKING
 
 from matplotlib import rc_context
 
+from beamfit.emittance.fit import EmittanceFit
 from beamfit.errors import InputError
+from beamfit.lifetime.fit import DecayFit
+from beamfit.lifetime.study import RecordStudy
 from beamfit.report import kind_of
 from beamfit.report.document import STYLE, Picture, ReportPage, drawn, html_of, written_now
 from beamfit.report.emittance import emittance_page
 from beamfit.report.posterior import ReportedPosterior, of_decay, of_scan, with_posteriors
 from beamfit.sampling.posterior import Posterior
-from beamfit.studies.decay.fit import DecayFit
-from beamfit.studies.decay.study import RecordStudy
-from beamfit.studies.scan.fit import EmittanceFit
 from beamfit.writing import write_atomically
 
 if TYPE_CHECKING:
+    from beamfit.dynamics.fedbatch import FedBatchFit
+    from beamfit.dynamics.feed import FeedPlan
+    from beamfit.dynamics.fit import ResponseFit
+    from beamfit.dynamics.loop import Loop
+    from beamfit.dynamics.titre import TitreFit
+    from beamfit.emittance.size_methods import SizeMethods
+    from beamfit.emittance.slices import SliceFits
     from beamfit.language.solution import ProblemSolution
-    from beamfit.studies.decay.course import Trend
-    from beamfit.studies.decay.ring_study import Shift
-    from beamfit.studies.fedbatch.feed import FeedPlan
-    from beamfit.studies.fedbatch.fit import FedBatchFit
-    from beamfit.studies.fedbatch.titre import TitreFit
-    from beamfit.studies.response.fit import ResponseFit
-    from beamfit.studies.response.loop import Loop
-    from beamfit.studies.scan.size_methods import SizeMethods
-    from beamfit.studies.scan.slices import SliceFits
+    from beamfit.lifetime.course import Trend
+    from beamfit.lifetime.ring_study import Shift
 
     Reported = (
         EmittanceFit | SliceFits | DecayFit | ProblemSolution | ResponseFit | Loop

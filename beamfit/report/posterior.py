@@ -13,15 +13,15 @@ from matplotlib.axes import Axes
 from matplotlib.figure import FigureBase
 from matplotlib.ticker import MaxNLocator, NullLocator
 
+from beamfit.emittance.fit import EmittanceFit
+from beamfit.emittance.posterior import expected_sizes
+from beamfit.lifetime.fit import DecayFit
+from beamfit.lifetime.posterior import expected_current
 from beamfit.report.document import BLUE, MANY, Picture, ReportPage, Verdict, legend_below
 from beamfit.report.scan_pictures import COLOUR, setting_axis
 from beamfit.sampling.intervals import Expected, in_unit
 from beamfit.sampling.likelihood import noise_words
 from beamfit.sampling.posterior import Posterior
-from beamfit.studies.decay.fit import DecayFit
-from beamfit.studies.decay.posterior import expected_current
-from beamfit.studies.scan.fit import EmittanceFit
-from beamfit.studies.scan.posterior import expected_sizes
 from beamfit.table import Table, plain_name
 
 # Shares of the draws inside the contours of one and two standard deviations in two dimensions.

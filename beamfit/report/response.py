@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import FigureBase
 
+from beamfit.dynamics.fit import ResponseFit
+from beamfit.dynamics.record import Run
+from beamfit.dynamics.state_fit import StatesFit, StateSpaceOutput
 from beamfit.report.document import BLUE, RED, Picture, ReportPage, Verdict
-from beamfit.studies.response.fit import ResponseFit
-from beamfit.studies.response.record import Run
-from beamfit.studies.response.states import StatesFit, StateSpaceOutput
 
 NOTES = (
     "Errors are one standard deviation. The model runs free from the start of each run: measured "

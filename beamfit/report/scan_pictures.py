@@ -9,10 +9,10 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import FigureBase
 
+from beamfit.emittance.fit import EmittanceFit
+from beamfit.emittance.results import PlaneFit
+from beamfit.emittance.scan import Profile
 from beamfit.report.document import BLUE, MANY, RED, legend_below
-from beamfit.studies.scan.fit import EmittanceFit
-from beamfit.studies.scan.results import PlaneFit
-from beamfit.studies.scan.scans import Profile
 
 # Profiles in a row of the picture.
 PROFILES_ABREAST = 3

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from itertools import islice
 
-from beamfit.studies.scan.results import PlaneFit, degrees
+from beamfit.emittance.results import PlaneFit, degrees
 from beamfit.table import cell
 
 # Most rows in a table of points.

@@ -7,14 +7,14 @@ from functools import partial
 import numpy as np
 from matplotlib.figure import FigureBase
 
+from beamfit.emittance.results import result_rows
+from beamfit.emittance.scan import PROJECTED
+from beamfit.emittance.slices import SliceFits
 from beamfit.report.document import MOST_DRAWN, Picture, ReportPage, Verdict
 from beamfit.report.emittance import ERRORS, about_input, about_scan
 from beamfit.report.scan_pictures import COLOUR, draw_scan, words_of
 from beamfit.report.scan_tables import identifiability_rows, point_rows
 from beamfit.status import Status
-from beamfit.studies.scan.results import result_rows
-from beamfit.studies.scan.scans import PROJECTED
-from beamfit.studies.scan.slices import SliceFits
 from beamfit.table import Table, labelled
 
 FIXED = (

@@ -9,8 +9,8 @@ from matplotlib.axes import Axes
 from matplotlib.dates import AutoDateLocator, ConciseDateFormatter
 from matplotlib.figure import FigureBase
 
+from beamfit.lifetime.course import Trend
 from beamfit.report.document import BLUE, RED, Picture, control_chart
-from beamfit.studies.decay.course import Trend
 
 RELATIVE = ("a", "b")
 

@@ -6,9 +6,9 @@ import emcee
 import numpy as np
 from scipy.optimize import curve_fit
 
-from beamfit.studies.decay.record import DecayRecord
-from beamfit.studies.decay.study import study_record
-from beamfit.studies.decay.systematics import systematics
+from beamfit.lifetime.record import DecayRecord
+from beamfit.lifetime.study import study_record
+from beamfit.lifetime.systematics import systematics
 
 from .answers import Answer, ask, of_quantity
 from .decays import HOUR, Decay, closed

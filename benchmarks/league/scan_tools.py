@@ -10,9 +10,9 @@ import numpy as np
 from scipy.optimize import curve_fit, minimize
 
 import beamfit
+from beamfit.emittance.many import fit_many
+from beamfit.emittance.sensitivity import systematics
 from beamfit.optics.elements import Drift, Quadrupole, Screen
-from beamfit.studies.scan.many import fit_many
-from beamfit.studies.scan.sensitivity import systematics
 
 from .answers import Answer, of_quantity
 from .scans import Line, Scan

@@ -85,8 +85,8 @@ def many(n: int) -> dict[str, Callable]:
 
 
 def readings(n: int) -> dict[str, Callable]:
-    from beamfit.studies.decay.fit import fit_decay
-    from beamfit.studies.decay.record import DecayRecord
+    from beamfit.lifetime.fit import fit_decay
+    from beamfit.lifetime.record import DecayRecord
 
     case = decays.decay(np.random.default_rng(n), n=n, stated=1.0)
     record = DecayRecord(case.time, case.current, case.error)
@@ -220,8 +220,8 @@ def samples(n: int) -> dict[str, Callable]:
     """A first-order lag from n samples with 2 % of noise."""
     from jax_sysid.models import LinearModel
 
-    from beamfit.studies.response.fit import identify
-    from beamfit.studies.response.record import Run
+    from beamfit.dynamics.fit import identify
+    from beamfit.dynamics.record import Run
 
     rng = np.random.default_rng(n)
     u = np.repeat(rng.uniform(0.1, 2.9, n // 8 + 1), 8)[:n]

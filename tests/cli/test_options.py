@@ -7,12 +7,12 @@ import sys
 import pytest
 
 from beamfit.cli import cli
+from beamfit.cli.option_text import anchor_of, bounds_of, limits_of, priors_of, target_of
 from beamfit.errors import InputError
 from beamfit.io.line import read_lattice
 from beamfit.io.result import results_text
 from beamfit.io.scan import read_quad_scan
 from beamfit.quantity import Quantity
-from beamfit.studies.scan.typed import anchor_of, bounds_of, limits_of, priors_of, target_of
 
 LIGHT = """
 import sys

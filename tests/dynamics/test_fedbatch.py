@@ -1,48 +1,186 @@
-"""Mass balances against the SIMULATED plant's own integration by LSODA."""
+"""Fed-batch processes from SIMULATED batches: rates, titre, another feed and the best one."""
 
+import re
 import runpy
+import sys
+from unittest.mock import create_autospec
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from beamfit.dynamics.fedbatch import Flow, balances, titre_of
-from beamfit.dynamics.states import StateSpace
+from beamfit.dynamics import fedbatch as rates_of
+from beamfit.dynamics import feed as feeding
+from beamfit.dynamics import titre as titre_of
+from beamfit.dynamics.fedbatch import identify_batches
+from beamfit.dynamics.fedbatch_model import STATES, bounds_of, course, network_of, rates_at
+from beamfit.dynamics.fedbatch_verdict import RULES, RateEvidence
+from beamfit.dynamics.feed import best_feed, predict
+from beamfit.dynamics.record import Run
+from beamfit.dynamics.titre import fit_titre, rank_inputs
+from beamfit.errors import InputError
+from beamfit.status import Status
+from beamfit.verdict import judge
+
+FED = {"feed_substrate": 200.0}
 
 
 @pytest.fixture(scope="module")
-def plant(root):
+def made(root):
     return runpy.run_path(str(root / "measurements/make_fedbatch.py"))
 
 
-def test_balances_and_titre_follow_an_independent_integration(plant):
-    steps = 25
-    feed, air = np.linspace(0.05, 0.2, steps), np.full(steps, 0.8)
-    true = plant["plant"]((2.0, 5.0, 4.0, 0.3), feed, air, apart=0.1)
+@pytest.fixture(scope="module")
+def runs(made):
+    """Three short batches of different length; of air above 1.2 there are two rows only."""
+    random, found = np.random.default_rng(3), []
+    for name, rows, begin, of in (
+        ("one", 46, (2.0, 8.0, 4.0, 0.2), lambda t: 0.02 * np.exp(0.09 * t)),
+        ("two", 40, (1.5, 14.0, 5.0, 0.0), lambda t: 0.05 * (t > 6)),
+        ("three", 43, (3.0, 3.0, 4.0, 0.1), lambda t: 0.05 + 0.05 * (t > 8)),
+    ):
+        wild = np.repeat(random.uniform(0.5, 1.5, 12), 4)[:rows]
+        feed = of(0.5 * np.arange(rows)) * wild
+        air = np.repeat(random.uniform(0.3, 1.2, 8), 6)[:rows]
+        air[20:22] = 1.9 if name == "one" else air[20]
+        states = made["plant"](begin, feed, air)
+        outputs = made["measured"](random, air, states)
+        for output in STATES:  # read at every row: the record is short
+            noise = 0.003 if output == "volume" else 0.02
+            true = states[:, STATES.index(output)]
+            outputs[output] = true * (1 + noise * random.normal(size=rows))
+        outputs["titre"] = states[:, 3] * (1 + 0.02 * random.normal(size=rows))
+        inputs = {"feed": feed, "air": air, "feed_substrate": np.full(rows, 200.0)}
+        found.append(Run(1800.0 * np.arange(rows), inputs, outputs, name=name))
+    return found
 
-    def plant_rates(s):
-        growth = 0.30 * s / (1.0 + s + s**2 / 20.0) * 0.8 / 1.05
-        made = (0.10 * growth + 0.004 * s / (1.0 + s)) / (1.0 + s / 8.0)
-        return growth, growth / 0.5 + 0.03 * s / (1.0 + s), made
 
-    def slope(x, u, _):
-        return balances(x, jnp.stack(plant_rates(x[1])[:2]), Flow(u[0], plant["FED"], 0.0))
-
-    begin = jnp.array([2.0, 5.0, 4.0])
-    space = StateSpace(slope, lambda x, u, p: x, parts=2)
-    x, _ = space.run(None, jnp.asarray(feed)[:, None], jnp.full(steps, 0.1), begin)
-    np.testing.assert_allclose(x, true[:, :3], rtol=2e-6)
-    made = plant_rates(x[:, 1])[2]
-    both = jnp.stack([made, jnp.append(made[1:], 0.0)])
-    found = titre_of(0.3, both, x, jnp.zeros(steps), jnp.full(steps, 0.1))
-    np.testing.assert_allclose(found, true[:, 3], rtol=2e-4)
+@pytest.fixture(scope="module")
+def fit(runs):
+    return identify_batches(runs, hidden=4)
 
 
-def test_what_runs_out_leaves_concentrations_and_takes_its_share_of_product():
-    """At rest: X V falls by what runs out; product without formation keeps its titre."""
-    inside, still = jnp.array([3.0, 2.0, 5.0]), jnp.zeros(2)
-    out = balances(inside, still, Flow(0.0, 100.0, 0.4))
-    np.testing.assert_allclose(out, [0.0, 0.0, -0.4])
-    x = jnp.stack([jnp.full(11, 3.0), jnp.full(11, 2.0), 5.0 - 0.04 * jnp.arange(11)], axis=1)
-    found = titre_of(0.7, jnp.zeros((2, 11)), x, jnp.full(11, 0.4), jnp.full(11, 0.1))
-    np.testing.assert_allclose(found, 0.7, rtol=1e-5)
+@pytest.fixture(scope="module")
+def titre(fit):
+    return fit_titre(fit, hidden=2)
+
+
+def test_true_rates_are_found_within_their_bands_where_the_batches_were(fit, made):
+    assert fit.status is Status.converged, fit.message
+    assert fit.noise["biomass"].relative
+    assert 0.015 < fit.noise["biomass"].size < 0.025
+    air = np.concatenate([run.inputs["air"] for run in fit.runs]).mean()
+    substrate = np.concatenate([x[:, 1] for x in fit.courses]).mean()
+    for curve in fit.curves:
+        at = (curve.at, air) if curve.input == "substrate" else (substrate, curve.at)
+        true = made["rates"](*at)[("mu_b", "mu_s").index(curve.parameter)]
+        seen = curve.visited & (curve.at > 0.5 if curve.input == "substrate" else True)
+        off = (curve.value - true)[seen]
+        assert np.all(np.abs(off) < 0.1 * np.max(true)), curve
+        assert np.sqrt(np.mean((off / curve.error[seen]) ** 2)) < 2.0, curve
+    air = fit.curves[2]
+    assert air.input == "air"
+    far = air.at > 1.35
+    assert not air.visited[far].any()
+    assert air.quantity(int(np.flatnonzero(far)[0])).error is None
+
+
+def test_rates_are_never_negative_bounded_and_nothing_without_substrate(runs):
+    b = bounds_of(runs, None)
+    net = network_of(("substrate", "air"), np.array([[0.0, 0.5], [2.0, 1.0]]), "ab", 5, 0)
+    net = jax.tree_util.tree_map(lambda v: 30.0 * v, net)
+    draw = np.random.default_rng(0).uniform(0, 2, (200, 3))
+    u = draw[:, [2, 0, 1]]
+    rates = jax.vmap(lambda x, u: rates_at(b, net, x, u))(jnp.asarray(draw), jnp.asarray(u))
+    assert jnp.all(rates >= 0)
+    assert jnp.all(rates <= b.most)
+    assert jnp.any(rates > 0.9 * b.most)
+    np.testing.assert_array_equal(rates_at(b, net, jnp.array([9.0, 0.0, 4.0]), u[0]), 0.0)
+
+
+def test_another_feed_is_predicted_with_its_length_and_the_best_keeps_its_limits(titre, made):
+    assert titre.status is Status.converged, titre.message
+    start, time = (3.0, 6.0, 4.0, 0.1), 0.5 * np.arange(40)
+    feed, air = np.linspace(0.03, 0.12, 40), np.full(40, 1.0)
+    course = predict(titre, time, FED | {"feed": feed, "air": 1.0}, start)
+    true = made["plant"](start, feed, air)
+    for k, name in enumerate(("biomass", "substrate", "volume", "titre")):
+        band = 4 * course.error[name] + 0.003 * true[:, k]
+        assert np.all(np.abs(course.value[name] - true[:, k]) < band), name
+    length = course.length(1.2)
+    assert abs(length.value - np.interp(1.2, true[:, 3], time)) < 3 * length.error
+    assert 0 < length.error < 1.0
+    assert course.length(99.0).error is None
+
+    plan = best_feed(
+        titre, start, FED | {"air": 1.0}, product=7.0, feed=(0.0, 0.3), volume=6.0,
+        substrate=8.0, hours=(5.0, 20.0), pieces=3,
+    )  # fmt: skip
+    assert plan.status in (Status.optimal, Status.local_optimum), plan.message
+    end = plan.course.time
+    true = made["plant"](start, plan.course.feed, np.ones(len(end)), apart=end[1])
+    assert true[-1, 2] * true[-1, 3] > 7.0
+    assert true[:, 1].max() < 8.0
+    assert true[-1, 2] < 6.0 + 1e-6
+    steady = predict(titre, end, FED | {"feed": plan.course.feed.mean(), "air": 1.0}, start)
+    assert steady.value["titre"][-1] < plan.course.value["titre"][-1]
+
+
+def test_the_page_s_block_runs(root, fit, titre, monkeypatch):
+    """Its three searches, which take a minute, are answered by those of this file."""
+    for module, name, answer in (
+        (rates_of, "identify_batches", fit),
+        (titre_of, "fit_titre", titre),
+        (feeding, "best_feed", None),
+    ):
+        known = create_autospec(getattr(module, name), return_value=answer)
+        monkeypatch.setattr(module, name, known)
+    monkeypatch.chdir(root)
+    page = (root / "docs/fedbatch.md").read_text()
+    (block,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    names = {}
+    exec(block, names)
+    assert [len(run) for run in names["runs"]] == [81, 69, 89, 77]
+    assert names["course"].value["titre"].shape == (81,)
+
+
+def test_what_a_titre_hangs_on_is_ranked(fit, monkeypatch):
+    ranked = {each.name: each for each in rank_inputs(fit)}
+    told = ranked["predicted biomass"].information
+    assert told > 1.2 * max(ranked[name].information for name in ("air", "feed", "predicted mu_b"))
+    one = ranked["total feed"]
+    assert one.correlation == pytest.approx(np.sqrt(1 - np.exp(-2 * one.information)))
+    monkeypatch.setitem(sys.modules, "sklearn.feature_selection", None)
+    with pytest.raises(InputError, match=r"beamfit\[mutual\]"):
+        rank_inputs(fit)
+
+
+def test_residuals_that_follow_one_another_are_no_noise(fit):
+    fitted = np.asarray(course(fit.fit.model, fit.seen.batches))
+    slow = 1.0 + 0.02 * np.sin(np.arange(fitted.shape[1]) / 4)[None, :, None]
+    for factor, status in ((1.0, Status.converged), (slow, Status.poor_fit)):
+        evidence = RateEvidence(fit.fit, True, fit.seen, factor * fitted, fit.noise, fit.curves)
+        assert judge(evidence, RULES).status is status
+
+
+def test_batches_that_cannot_be_used_are_refused(runs):
+    run = runs[0]
+
+    def without(kind, name):
+        left = {k: v for k, v in getattr(run, kind).items() if k != name}
+        parts = {"inputs": run.inputs, "outputs": run.outputs} | {kind: left}
+        return Run(run.time, parts["inputs"], parts["outputs"])
+
+    for bad, said in (
+        (without("outputs", "substrate"), "y_substrate"),
+        (without("inputs", "feed"), "u_feed"),
+        (without("inputs", "air"), "inputs feed, feed_substrate"),
+    ):
+        with pytest.raises(InputError, match=said):
+            identify_batches([run, bad])
+    with pytest.raises(InputError, match="ait"):
+        identify_batches(run, points=["ait"])
+    dead = Run(run.time, run.inputs, run.outputs | {"biomass": np.linspace(2, 1, len(run))})
+    with pytest.raises(InputError, match="never grows"):
+        identify_batches(dead)

@@ -1,92 +1,354 @@
-"""Steps of the responses against matrix exponentials, the report's equations and limits."""
+"""Responses identified from SIMULATED runs: values, errors, verdicts, and what is refused."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scipy.linalg import expm
 from scipy.signal import lfilter
 
-from beamfit.dynamics.response import ARX, FIRST_ORDER, PHYSICS, SECOND_ORDER, simulate
+from beamfit.dynamics.fit import identify
+from beamfit.dynamics.limits import limited
+from beamfit.dynamics.model import network_of
+from beamfit.dynamics.record import Run
+from beamfit.dynamics.response import FIRST_ORDER, SECOND_ORDER, simulate
+from beamfit.errors import InputError
+from beamfit.noise.correlated import Noise, innovations
+from beamfit.status import Status
 
 
-def held(matrix, drive, x, u, dt):
-    """The state of x' = A x + B u after dt, by the exponential of both together (Van Loan)."""
-    n = len(matrix)
-    both = np.zeros((n + 1, n + 1))
-    both[:n, :n], both[:n, n] = matrix * dt, drive * dt * u
-    return expm(both)[:n] @ np.append(x, 1.0)
+def steps(n, rng, low=0.1, high=2.9, every=8):
+    return np.repeat(rng.uniform(low, high, n // every + 1), every)[:n]
 
 
-@pytest.mark.parametrize("time", [1e-3, 0.7, 40.0])
-@pytest.mark.parametrize("zeta", [0.0, 0.3, 1.0 - 1e-9, 1.0, 1.0 + 1e-5, 4.0])
-def test_a_second_order_moves_as_its_matrix_exponential_does(time, zeta):
-    x, u, dt = np.array([0.4, -0.2]), 1.7, 0.37
-    matrix = np.array([[0.0, 1.0], [-1 / time**2, -2 * zeta / time]])
-    expected = held(matrix, np.array([0.0, 2.5 / time**2]), x, u, dt)
-    found = SECOND_ORDER.advance(jnp.array([time, zeta, 2.5]), jnp.array(x), jnp.array([u]), dt)
-    scale = np.array([1.0, max(1.0, 1 / time)])
-    np.testing.assert_allclose(found / scale, expected / scale, rtol=1e-9, atol=1e-9)
+def run_of(physics, of_u, n=200, noise=0.1, seed=0, delay=0, apart=None, offset=0.0, name="run"):
+    """A run whose parameters are `of_u(u)`, shape (n, parameters), with noise of its scatter."""
+    rng = np.random.default_rng(seed)
+    dt = np.full(n, 0.5) if apart is None else apart
+    u = steps(n, rng)
+    late = np.concatenate([np.repeat(u[:1], delay), u])[:n]
+    free = jnp.zeros(physics.free_states)
+    y = simulate(
+        physics, jnp.asarray(of_u(late)), jnp.asarray(late)[:, None], jnp.asarray(dt), free
+    )
+    y = np.asarray(y) + offset
+    y = y + noise * y.std() * rng.normal(size=n)
+    return Run(np.concatenate([[0.0], np.cumsum(dt[:-1])]), {"valve": u}, {"level": y}, name=name)
 
 
-def test_slopes_are_finite_where_both_lags_are_equal():
-    def after(p):
-        return SECOND_ORDER.advance(p, jnp.array([0.4, -0.2]), jnp.array([1.7]), 0.37)
-
-    p = jnp.array([1.3, 1.0, 2.0])
-    step = 1e-5 * jnp.array([0.0, 1.0, 0.0])
-    expected = (after(p + step) - after(p - step)) / 2e-5
-    np.testing.assert_allclose(jax.jacfwd(after)(p)[:, 1], expected, rtol=1e-6)
+def constant(*p):
+    return lambda u: np.tile(np.array(p), (len(u), 1))
 
 
-def test_a_first_order_moves_as_its_exponential_does():
-    expected = held(np.array([[-1 / 3.0]]), np.array([2.0 / 3.0]), [0.4], 1.7, 0.5)
-    found = FIRST_ORDER.advance(jnp.array([3.0, 2.0]), jnp.array([0.4]), jnp.array([1.7]), 0.5)
-    np.testing.assert_allclose(found, expected, rtol=1e-12)
+def varying(u):
+    """The report's eqs 6 and 7."""
+    return np.stack([5 * np.tanh(u) + 0.5, 5 * np.tanh(u / 4) + 5], axis=1)
 
 
-@pytest.mark.parametrize(("tau1", "tau2"), [(5.5, 0.4), (2.0, 2.0 + 1e-4)])
-def test_the_difference_equation_of_the_report_has_the_samples_of_a_second_order(tau1, tau2):
-    """Eqs 13-16, which are 0/0 at equal lags, against the step that is not."""
-    gain, dt, n = 1.5, 0.5, 40
-    e1, e2 = np.exp(-dt / tau1), np.exp(-dt / tau2)
-    share1, share2 = gain * tau1 / (tau1 - tau2), -gain * tau2 / (tau1 - tau2)
-    p = [-(e1 + e2), e1 * e2, share1 * (1 - e1) + share2 * (1 - e2)]
-    p.append(-(share1 * e2 * (1 - e1) + share2 * e1 * (1 - e2)))
-    u = np.random.default_rng(0).normal(size=(n, 1))
-    natural = np.sqrt(tau1 * tau2)
-    second = [natural, (tau1 + tau2) / (2 * natural), gain]
-
-    def run(physics, numbers, free):
-        every = jnp.tile(jnp.array(numbers), (n, 1))
-        return simulate(physics, every, jnp.array(u), jnp.full(n, dt), jnp.array(free))
-
-    smooth = run(SECOND_ORDER, second, [0.0, 0.0])
-    filtered = lfilter([0.0, *p[2:]], [1.0, *p[:2]], u[:, 0])
-    np.testing.assert_allclose(smooth, filtered, rtol=1e-7, atol=1e-8)
-    # Before the first sample its input is taken to have been as it is.
-    moved = run(ARX, p, [0.0, 0.0])
-    extra = lfilter([1.0], [1.0, *p[:2]], np.eye(1, n, 1)[0] * p[3] * u[0])
-    np.testing.assert_allclose(moved, filtered + extra, rtol=1e-9, atol=1e-9)
+def test_truths_lie_within_their_errors_as_often_as_they_should():
+    pulls = []
+    for seed in range(30):
+        fit = identify(run_of(SECOND_ORDER, constant(2.0, 0.5, 3.0), seed=seed), "second-order",
+                       delay=0)  # fmt: skip
+        assert fit.status is Status.converged, fit.message
+        truths = {"T": 2.0, "zeta": 0.5, "K": 3.0, "offset": 0.0}
+        pulls.append([(q.value - truths[n]) / q.error for n, q in fit.quantities.items()])
+    rms = np.sqrt(np.mean(np.square(pulls), axis=0))
+    assert np.all((rms > 0.7) & (rms < 1.35)), rms
 
 
-@pytest.mark.parametrize("physics", PHYSICS.values(), ids=list(PHYSICS))
-def test_raw_numbers_of_any_size_are_stable_and_come_back(physics):
-    count = len(physics.parameters(("a", "b")))
-    for q in np.random.default_rng(1).normal(0, 1.5, (20, count)):
-        p = physics.physical(jnp.array(q), 2)
-        np.testing.assert_allclose(physics.raw(p, 2), q, rtol=1e-6)
-        x = physics.begin(jnp.ones(physics.free_states), jnp.zeros(2))
-        y = simulate(physics, jnp.tile(p, (4000, 1)), jnp.zeros((4000, 2)), jnp.ones(4000), x[
-            : physics.free_states])  # fmt: skip
-        assert jnp.max(jnp.abs(y[-1])) < max(1.0, float(jnp.max(jnp.abs(y[:50]))))
+def walk_and_white(rng, n):
+    """One lag sees little of a drift under white noise: neighbours hardly resemble each other."""
+    return rng.normal(size=n) + 0.3 * np.cumsum(rng.normal(size=n))
 
 
-def test_samples_at_unequal_distances_are_those_of_the_same_process():
-    """The output at 0, 1, 2, ... is the same whether or not it is looked at in between."""
-    p, free = jnp.array([1.4, 0.3, 2.0]), jnp.array([0.5, -0.1])
-    u = jnp.repeat(jnp.array([[1.0], [0.0], [2.0], [-1.0]]), 2, axis=0)
-    dt = jnp.tile(jnp.array([0.3, 0.7]), 4)
-    fine = simulate(SECOND_ORDER, jnp.tile(p, (8, 1)), u, dt, free)
-    coarse = simulate(SECOND_ORDER, jnp.tile(p, (4, 1)), u[::2], jnp.ones(4), free)
-    np.testing.assert_allclose(fine[::2], coarse, rtol=1e-12)
+@pytest.mark.parametrize(
+    "noise_of",
+    [lambda rng, n: lfilter([1.0], [1.0, -0.8], rng.normal(size=n)), walk_and_white],
+    ids=["autoregressive", "random walk and white"],
+)
+def test_noise_with_a_memory_is_in_the_errors(noise_of):
+    pulls = []
+    for seed in range(16):
+        clean = run_of(FIRST_ORDER, constant(3.0, 2.0), noise=0.0, seed=seed)
+        noise = noise_of(np.random.default_rng([seed, 1]), len(clean))
+        level = clean.outputs["level"] + 0.3 * noise
+        fit = identify(Run(clean.time, clean.inputs, {"level": level}), delay=0)
+        found = (fit.quantities[name] for name in ("K", "tau"))
+        pulls.append([(q.value - v) / q.error for q, v in zip(found, (2.0, 3.0), strict=True)])
+        assert fit.memory is not None
+    rms = np.sqrt(np.mean(np.square(pulls), axis=0))
+    assert np.all((rms > 0.6) & (rms < 1.4)), rms
+
+
+def test_a_drift_that_is_as_slow_as_the_response_is_said_and_leaves_no_small_error():
+    """One step of a lag of 60 s in 100 s, on a random walk."""
+    rng, t = np.random.default_rng(5), 0.5 * np.arange(200)
+    drift = 0.05 * np.cumsum(rng.normal(size=200)) + 0.02 * rng.normal(size=200)
+    level = 2.0 * -np.expm1(-np.maximum(t - 20.0, 0.0) / 60.0) + drift
+    fit = identify(Run(t, {"valve": t > 19.9}, {"level": level}), delay=0)
+    assert fit.status is Status.unidentified
+    assert "wanders about as slowly" in fit.message
+    assert fit.quantities["tau"].error is None
+    assert fit.quantities["K"].error is None or fit.quantities["K"].error > 0.5
+
+
+def test_innovations_of_a_noise_are_those_of_its_covariance():
+    rng, noise = np.random.default_rng(0), Noise(3.0, 0.4)
+    time = np.cumsum(rng.uniform(0.1, 2.0, 30))
+    rows = rng.normal(size=(30, 2))
+    apart = np.abs(time[:, None] - time[None, :])
+    factor = np.linalg.cholesky(0.6 * np.exp(-apart / 3.0) + 0.4 * np.eye(30))
+    found, volume = innovations(jnp.asarray(rows), jnp.asarray(time), noise)
+    np.testing.assert_allclose(found, np.linalg.solve(factor, rows), atol=1e-12)
+    assert float(volume) == pytest.approx(np.log(np.diag(factor)).sum())
+
+
+@pytest.mark.parametrize("delay", [0, 3])
+def test_the_delay_is_found(delay):
+    run = run_of(SECOND_ORDER, constant(2.0, 1.5, 3.0), seed=4, delay=delay)
+    fit = identify(run, "second-order")
+    assert fit.delay == delay
+    tau1, tau2 = (fit.quantities[n] for n in ("tau1", "tau2"))
+    # Eq 8: tau1 tau2 = T², tau1 + tau2 = 2 zeta T.
+    assert abs(tau1.value - 2.0 * (1.5 + np.sqrt(1.25))) < 4 * tau1.error
+    assert abs(tau2.value - 2.0 * (1.5 - np.sqrt(1.25))) < 4 * tau2.error
+
+
+def test_a_delay_of_no_whole_number_of_samples_is_estimated():
+    """One and a half samples: whole ones say that the model lacks a part of the response."""
+    valve = np.repeat(steps(200, np.random.default_rng(0)), 2)
+    late = np.concatenate([np.repeat(valve[:1], 3), valve])[:400, None]
+    y = simulate(FIRST_ORDER, jnp.tile(jnp.array([3.0, 2.0]), (400, 1)), jnp.asarray(late),
+                 jnp.full(400, 0.25), jnp.zeros(1))  # fmt: skip
+    level = np.asarray(y)[::2] + 0.05 * np.random.default_rng(2).normal(size=200)
+    fit = identify(Run(0.5 * np.arange(200), {"valve": valve[::2]}, {"level": level}))
+    assert fit.status is Status.converged, fit.message
+    for name, truth in (("tau", 3.0), ("K", 2.0), ("delay", 0.75)):
+        assert abs(fit.quantities[name].value - truth) < 4 * fit.quantities[name].error
+    assert fit.quantities["delay"].error < 0.03
+
+
+def test_runs_of_several_lengths_gaps_and_uneven_samples_are_one_fit():
+    rng = np.random.default_rng(2)
+    law = constant(3.0, 2.0)
+    one = run_of(FIRST_ORDER, law, 150, seed=1, offset=7.0, name="one")
+    two = run_of(
+        FIRST_ORDER, law, 90, seed=2, offset=7.0, apart=rng.uniform(0.1, 1.0, 90), name="b"
+    )
+    level = two.outputs["level"].copy()
+    level[rng.choice(90, 30, replace=False)] = np.nan
+    two = Run(two.time, two.inputs, {"level": level}, name="two")
+    held = run_of(FIRST_ORDER, law, 80, seed=3, offset=7.0, name="held")
+    fit = identify([one, two], held=[held], delay=0)
+    assert fit.status is Status.converged, fit.message
+    for name, truth in (("tau", 3.0), ("K", 2.0), ("offset", 7.0)):
+        assert abs(fit.quantities[name].value - truth) < 4 * fit.quantities[name].error
+    assert [len(y) for y in fit.fitted] == [150, 60]
+    assert fit.held[0].rms < 1.5 * max(fit.noise)
+
+
+def test_a_constant_model_of_a_process_that_changes_is_refuted_and_a_network_is_not():
+    run = run_of(FIRST_ORDER, varying, 400, seed=5)
+    assert identify(run, delay=0).status is Status.poor_fit
+    fit = identify(run, map="network", delay=0, starts=2)
+    assert fit.status is Status.converged, fit.message
+    assert fit.checks.against_constant > 100
+    tau = fit.curves[0]
+    truth = varying(tau.at)[:, 0]
+    known = tau.visited & np.isfinite(tau.error)
+    assert known.mean() > 0.8
+    pulls = ((tau.value - truth) / tau.error)[known]
+    assert np.sqrt(np.mean(pulls**2)) < 2.0
+    assert np.max(np.abs(tau.value - truth)[known]) < 1.5
+
+
+def test_a_part_of_the_response_that_the_model_lacks_is_no_noise_with_a_memory():
+    """An undershoot that a delay hides, and a second input of another time constant: their gains
+    would be several errors off."""
+    rng = np.random.default_rng(1)
+    t, u, v = np.arange(400.0), steps(400, rng, -1, 1, 20), steps(400, rng, -1, 1, 15)
+    noise = 0.05 * rng.normal(size=400)
+    fast, slow = np.exp(-1 / 4.0), np.exp(-1 / 40.0)
+
+    def lag(share, of):
+        return lfilter([0.0, 1 - share], [1.0, -share], of)
+
+    under = lag(np.exp(-1 / 8.0), lag(fast, u) - 5.0 * np.diff(lag(fast, u), prepend=0.0))
+    for run in (
+        Run(t, {"u": u}, {"y": under + noise}),
+        Run(t, {"u": u, "v": v}, {"y": 3 * lag(fast, u) + lag(slow, v) + noise}),
+    ):
+        assert identify(run).status is Status.poor_fit
+
+
+@pytest.mark.parametrize("closed", [True, False])
+def test_inputs_that_were_set_from_the_output_are_named(closed):
+    """A PI controller at one set point: the gain would be -0.2 ± 0.02, its truth 2. And runs
+    with inputs of their own."""
+    kept = np.exp(-0.5 / 3.0)
+    for seed in range(2 if closed else 10):
+        rng = np.random.default_rng(seed)
+        drift = 0.05 * lfilter([1.0], [1.0, -0.9], rng.normal(size=200))
+        u, y, state, summed = steps(200, rng), np.zeros(200), 0.0, 0.0
+        for k in range(200):
+            y[k] = state + drift[k]
+            summed += 0.1 * (3.0 - y[k])
+            u[k] = 0.8 * (3.0 - y[k]) + summed if closed else u[k]
+            state = 2.0 * u[k] + (state - 2.0 * u[k]) * kept
+        fit = identify(Run(0.5 * np.arange(200), {"valve": u}, {"level": y}), delay=0)
+        assert ("feedback" in fit.message) == closed, (seed, fit.message)
+        assert not closed or fit.status is Status.poor_fit
+
+
+def test_readings_that_show_no_output_are_left_out_and_named():
+    run = run_of(FIRST_ORDER, constant(3.0, 2.0), noise=0.05)
+    level = run.outputs["level"].copy()
+    limit = np.quantile(level, 0.8)
+    high = level > limit  # a sensor at its end
+    level[high] = limit
+    level[[30, 90, 131]] = [30.0, -5.0, 12.0]
+    fit = identify(Run(run.time, run.inputs, {"level": level}), delay=0)
+    assert fit.left_out[0].count == 3
+    assert 0.7 * high.sum() < fit.left_out[1].count <= high.sum()
+    assert "3 readings far off their neighbours (run, the first at 15 s)" in fit.message
+    for name, truth in (("tau", 3.0), ("K", 2.0)):
+        assert abs(fit.quantities[name].value - truth) < 4 * fit.quantities[name].error
+        assert fit.quantities[name].error < 0.05 * truth
+
+
+def test_a_higher_order_of_a_first_order_plant_says_what_is_determined():
+    run = run_of(FIRST_ORDER, constant(3.0, 2.0))
+    for model, words in (("arx", "a pole and a zero cancel"), ("second-order", "shorter lag")):
+        fit = identify(run, model, delay=0)
+        assert fit.status is Status.unidentified
+        assert words in fit.message
+        assert abs(fit.quantities["K"].value - 2.0) < 4 * fit.quantities["K"].error < 0.4
+        assert fit.quantities["a1" if model == "arx" else "T"].error is None
+
+
+def test_inputs_that_move_together_have_no_gains_of_their_own():
+    run = run_of(FIRST_ORDER, constant(3.0, 2.0))
+    other = run.inputs["valve"] + 1e-6 * np.random.default_rng(1).normal(size=len(run))
+    fit = identify(Run(run.time, {**run.inputs, "pump": other}, run.outputs))
+    assert fit.status is Status.unidentified
+    assert "valve, pump move together" in fit.message
+    assert fit.quantities["K_valve"].error is None
+    assert fit.quantities["K_pump"].error is None
+    assert abs(fit.quantities["tau"].value - 3.0) < 4 * fit.quantities["tau"].error
+
+
+def test_a_delay_at_the_end_of_the_candidates_is_said():
+    fit = identify(run_of(FIRST_ORDER, constant(3.0, 2.0), delay=22))
+    assert fit.delay == 20
+    assert "say a longer one by --delay" in fit.message
+
+
+def test_limits_of_parameters_are_kept_or_enclosed_over_the_whole_range_of_the_runs():
+    run = run_of(FIRST_ORDER, constant(3.0, 2.0), 80)
+    fit = identify(run, delay=0, gains={"K": (-np.inf, 1.9)})
+    assert fit.quantities["K"].value == pytest.approx(1.9)
+    net = network_of(fit.seen, FIRST_ORDER, np.array([1.0, 2.0]), 3, 1)
+    told = {"K": (1.0, 3.0), "dK/dvalve": (0.2, np.inf), "tau": (1.0, np.inf)}
+    found = limited(told, fit.seen, FIRST_ORDER, network=True)
+    ends = {c.name: np.asarray(c.function({"map": net}, c.data)) for c in found.constraints}
+    at = np.linspace(run.inputs["valve"].min(), run.inputs["valve"].max(), 2001)
+    log_tau, gain = np.asarray(jax.vmap(lambda u: net(u[None]))(jnp.asarray(at))).T
+    slope = np.gradient(gain, at)
+    for name, true in (("least K", gain.min()), ("min dK/dvalve", slope.min()),
+                       ("least tau", log_tau.min())):  # fmt: skip
+        assert ends[name].min() <= true + 1e-6 < ends[name].min() + 0.1 * np.ptp(gain)
+    assert ends["most K"].max() >= gain.max() > ends["most K"].max() - 0.1 * np.ptp(gain)
+    for wrong, words in (({"Kay": (0, 1)}, "limit of 'Kay'"), ({"dtau/dvalve": (1, 2)}, "a sign")):
+        with pytest.raises(InputError, match=words):
+            limited(wrong, fit.seen, FIRST_ORDER, network=True)
+
+
+def test_where_the_runs_never_were_a_curve_has_no_error():
+    run = run_of(FIRST_ORDER, constant(3.0, 2.0), 160, seed=6)
+    low = np.where(run.inputs["valve"] > 1.5, 2.8, 0.2)
+    y = simulate(FIRST_ORDER, jnp.tile(jnp.array([3.0, 2.0]), (160, 1)), jnp.asarray(low)[:, None],
+                 jnp.full(160, 0.5), jnp.zeros(1))  # fmt: skip
+    noise = 0.05 * np.random.default_rng(0).normal(size=160)
+    gap = Run(run.time, {"valve": low}, {"level": np.asarray(y) + noise})
+    curve = identify(gap, map="network", delay=0, starts=1).curves[0]
+    assert not curve.visited[len(curve.at) // 2]
+    assert curve.quantity(len(curve.at) // 2).error is None
+
+
+def test_the_difference_equation_is_identified_inside_the_stability_triangle():
+    fit = identify(run_of(SECOND_ORDER, constant(2.0, 0.5, 3.0), noise=0.02), "arx", delay=0)
+    a1, a2 = (fit.quantities[n] for n in ("a1", "a2"))
+    root = np.exp((-0.5 + 1j * np.sqrt(0.75)) * 0.5 / 2.0)  # eqs 13, 14 with complex lags
+    assert abs(a1.value + 2 * root.real) < 4 * a1.error
+    assert abs(a2.value - abs(root) ** 2) < 4 * a2.error
+
+
+def test_an_output_that_hangs_on_nothing_is_said_to():
+    rng = np.random.default_rng(0)
+    t = np.arange(200.0)
+    run = Run(t, {"valve": (t // 10) % 2}, {"level": rng.normal(size=200)})
+    for model in ("first-order", "second-order", "arx"):
+        fit = identify(run, model, delay=0)
+        assert fit.status is Status.unidentified
+        assert {q.error for q in fit.quantities.values()} == {None}
+    curves = identify(run, map="network", delay=0, starts=1).curves
+    assert all(np.isnan(curve.error).all() for curve in curves)
+
+
+def test_a_constant_can_be_sampled():
+    fit = identify(run_of(FIRST_ORDER, constant(3.0, 2.0), 80), delay=0)
+    drawn = fit.sample(seed=1, target_ess=60, budget=20_000, progress=False)
+    assert any("map" in name for name in drawn.names)
+    network = identify(
+        run_of(FIRST_ORDER, constant(3.0, 2.0), 80), map="network", delay=0, starts=1
+    )
+    with pytest.raises(InputError, match="network"):
+        network.sample()
+
+
+def test_columns_may_stand_in_another_order_in_every_run():
+    rng = np.random.default_rng(3)
+    runs = []
+    for names in (("a", "b"), ("b", "a"), ("b", "a")):
+        u = {name: steps(120, rng) for name in ("a", "b")}
+        p = jnp.tile(jnp.array([3.0, 2.0, -1.0]), (120, 1))
+        y = simulate(FIRST_ORDER, p, jnp.stack([u["a"], u["b"]], axis=1), jnp.full(120, 0.5),
+                     jnp.zeros(1))  # fmt: skip
+        level = np.asarray(y) + 0.05 * rng.normal(size=120)
+        runs.append(Run(0.5 * np.arange(120), {n: u[n] for n in names}, {"level": level}))
+    fit = identify(runs[:2], held=runs[2:], delay=0)
+    assert fit.status is Status.converged, fit.message
+    for name, truth in (("K_a", 2.0), ("K_b", -1.0)):
+        assert abs(fit.quantities[name].value - truth) < 4 * fit.quantities[name].error
+    assert fit.held[0].rms < 0.1
+
+
+T = np.arange(20.0)
+BAD = {
+    "time backwards": (lambda: Run(T[::-1], {"u": T}, {"y": T}), "times that increase"),
+    "too short": (lambda: Run(T[:5], {"u": T[:5]}, {"y": T[:5]}), "at least 8"),
+    "a constant input": (lambda: identify(Run(T, {"u": 0 * T}, {"y": T})), "an input that changes"),
+    "uneven samples": (lambda: identify(Run(T**1.5, {"u": T}, {"y": T}), "arx"), "equal"),
+    "runs of other steps": (
+        lambda: identify([Run(k * T, {"u": T}, {"y": T}) for k in (1, 2)], "arx"),
+        "samples every 2 s; expected 1 s",
+    ),
+    "an unknown model": (lambda: identify(Run(T, {"u": T}, {"y": T}), "arxx"), "did you mean arx"),
+    "other columns": (
+        lambda: identify([Run(T, {"u": T}, {"y": T}), Run(T, {"v": T}, {"y": T})]),
+        "inputs u",
+    ),
+    "a delay longer than the run": (
+        lambda: identify(Run(T, {"u": T}, {"y": T}), delay=19),
+        "less than the 20 rows",
+    ),
+    "a gap in an input": (lambda: Run(T, {"u": np.log(T - 3)}, {"y": T}), "row 1: no value of u"),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")
+def test_what_cannot_be_used_is_refused_in_words(case):
+    make, words = BAD[case]
+    with pytest.raises(InputError, match=words):
+        make()

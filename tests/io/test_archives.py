@@ -11,7 +11,7 @@ from beamfit.errors import InputError
 from beamfit.io.check import understand
 from beamfit.io.decay_record import read_decay_record, read_lifetime_input, read_lifetimes
 from beamfit.io.scan import read_quad_scan
-from beamfit.studies.decay.record import LifetimeTable
+from beamfit.lifetime.record import LifetimeTable
 
 START = 1709290800.25  # 2024-03-01T11:00:00.25 UTC
 CURRENT = [200.0, 199.5, 199.1, 198.6]

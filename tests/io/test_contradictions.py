@@ -6,7 +6,7 @@ import pytest
 
 import beamfit
 from beamfit.errors import InputError
-from beamfit.studies.decay.lifetime_table import fit_lifetimes
+from beamfit.lifetime.lifetime_table import fit_lifetimes
 
 SETTINGS, SIZES = {"Q": [0.0, 1.0, 2.0]}, {"x": [2e-4, 1e-4, 3e-4]}
 

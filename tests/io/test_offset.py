@@ -5,7 +5,7 @@ import pytest
 
 from beamfit.errors import InputError
 from beamfit.io.decay_record import offset_of, read_decay_record
-from beamfit.studies.decay.fit import fit_decay
+from beamfit.lifetime.fit import fit_decay
 
 
 @pytest.fixture(scope="module")

@@ -6,7 +6,7 @@ import pytest
 from beamfit.errors import InputError
 from beamfit.io.check import understand
 from beamfit.io.decay_record import read_decay_record, read_lifetime_input
-from beamfit.studies.decay.record import DecayRecord
+from beamfit.lifetime.record import DecayRecord
 
 CURRENT = [200.0, 199.5, 199.1, 198.6]
 

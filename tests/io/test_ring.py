@@ -5,7 +5,7 @@ import pytest
 
 from beamfit.errors import InputError
 from beamfit.io.ring import read_operation, read_ring, read_twiss, ring_from_pyat
-from beamfit.lifetime.losses import loss_coefficients
+from beamfit.lifetime.mechanisms import loss_coefficients
 
 SPEAR3 = Path("lattices/spear3_2003.toml")
 CIRCUMFERENCE = 234.1440122400003

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 import beamfit
+from beamfit.emittance.results import PlaneFit
 from beamfit.errors import InputError
 from beamfit.io.result import HOMES
-from beamfit.studies.decay.fit import DecayFit
-from beamfit.studies.scan.results import PlaneFit
+from beamfit.lifetime.fit import DecayFit
 from beamfit.table import json_of
 
 

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
-from beamfit.lifetime.decay import (
+from beamfit.lifetime.decay_law import (
     SERIES_BELOW,
     current,
     current_by_rate,

@@ -25,7 +25,7 @@ from beamfit.lifetime.gas import (
     elastic_cross_section,
     gas_rate_coefficient,
 )
-from beamfit.lifetime.losses import loss_coefficients
+from beamfit.lifetime.mechanisms import loss_coefficients
 from beamfit.lifetime.ring import gas_mixture
 from beamfit.lifetime.touschek import (
     piwinski_rate,

@@ -21,9 +21,9 @@ LINE = (
 SCRIPT = """
 import json
 from beamfit.io.ring import read_operation, read_ring
-from beamfit.lifetime.losses import SCALES
-from beamfit.studies.decay.study import Machine, budget
-from beamfit.studies.decay.record import DecayRecord
+from beamfit.lifetime.mechanisms import SCALES
+from beamfit.lifetime.study import Machine, budget
+from beamfit.lifetime.record import DecayRecord
 path = "lattices/spear3_2003.toml"
 machine = Machine(read_ring(path), read_operation(path))
 found = budget(DecayRecord([0, 60], [500.0, 499.9]), machine)
@@ -36,7 +36,7 @@ def test_a_new_mechanism_touches_two_files(tmp_path, root):
     shutil.copytree(package, tmp_path / "beamfit", ignore=shutil.ignore_patterns("__pycache__"))
     gas = tmp_path / "beamfit/lifetime/gas.py"
     gas.write_text(gas.read_text() + FORMULA)
-    losses = tmp_path / "beamfit/lifetime/losses.py"
+    losses = tmp_path / "beamfit/lifetime/mechanisms.py"
     text = losses.read_text().replace("elastic_loss\n", "elastic_loss, horizontal_loss\n", 1)
     losses.write_text(text.replace('    Mechanism("quantum"', LINE + '    Mechanism("quantum"'))
     done = subprocess.run(

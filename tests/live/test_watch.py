@@ -19,10 +19,10 @@ import pytest
 from beamfit.cli import main
 from beamfit.errors import InputError
 from beamfit.io.machine import Watched, read_watch_machine
+from beamfit.lifetime.watch import Plan
 from beamfit.live.channel import Described, Reading, open_channel, run
 from beamfit.live.served import values_of
 from beamfit.live.watch import Arrived, _Course
-from beamfit.studies.decay.watch import Plan
 from tests.live.conftest import ROOT
 from tests.live.ioc import A, B
 from tests.report.browser import NAME

@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 
 import beamfit
+from beamfit.emittance.many import noise_samples
+from beamfit.emittance.scan import QuadScan
+from beamfit.emittance.transport import rows_line
 from beamfit.errors import InputError
 from beamfit.io.noise import read_noise, write_noise
 from beamfit.noise.learn import learn_noise
 from beamfit.noise.model import Noise
-from beamfit.studies.scan.many import noise_samples
-from beamfit.studies.scan.scans import QuadScan
-from beamfit.studies.scan.transport import rows_line
 
 
 def archive(scatter, count, seed=0):

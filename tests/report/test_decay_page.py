@@ -8,8 +8,8 @@ import pytest
 
 import beamfit
 from beamfit.io.ring import read_operation, read_ring
-from beamfit.studies.decay.record import DecayRecord
-from beamfit.studies.decay.study import Machine, study_record
+from beamfit.lifetime.record import DecayRecord
+from beamfit.lifetime.study import Machine, study_record
 
 
 @pytest.fixture(scope="module")

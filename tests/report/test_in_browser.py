@@ -1,6 +1,7 @@
 """Pages in headless Chromium. Each kind is looked at where it is made, by `well_shown`:
 
-emittance here, slices, lifetime, identify, control and solve in tests/cli, trends in tests/studies.
+emittance here, slices, lifetime, identify, control and solve in tests/cli, trends in
+tests/lifetime.
 """
 
 import re

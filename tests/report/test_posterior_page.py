@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 import beamfit
+from beamfit.lifetime.fit import fit_decay
+from beamfit.lifetime.record import DecayRecord
 from beamfit.report.posterior import draw_pairs
-from beamfit.studies.decay.fit import fit_decay
-from beamfit.studies.decay.record import DecayRecord
 
 
 @pytest.fixture(scope="module")

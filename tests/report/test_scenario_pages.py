@@ -6,7 +6,7 @@ import re
 import pytest
 
 import beamfit
-from beamfit.studies.scan.assumptions import Anchor
+from beamfit.emittance.assumptions import Anchor
 
 
 @pytest.fixture(scope="module")

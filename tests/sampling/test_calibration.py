@@ -12,13 +12,13 @@ import numpy as np
 import pytest
 
 import beamfit
-from beamfit.lifetime.decay import current
+from beamfit.emittance.posterior import beam_target
+from beamfit.emittance.scan import QuadScan
+from beamfit.lifetime.decay_law import current
+from beamfit.lifetime.fit import fit_decay
+from beamfit.lifetime.record import DecayRecord
 from beamfit.optics.elements import Drift, Quadrupole, Screen
 from beamfit.sampling.priors import Uniform
-from beamfit.studies.decay.fit import fit_decay
-from beamfit.studies.decay.record import DecayRecord
-from beamfit.studies.scan.posterior import beam_target
-from beamfit.studies.scan.scans import QuadScan
 from tests.noise import reference as ref
 from tests.sampling.ranks import rank, uniformity
 

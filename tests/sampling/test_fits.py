@@ -12,18 +12,18 @@ import pytest
 from scipy import stats
 
 import beamfit
+from beamfit.emittance.posterior import beam_target, expected_sizes
 from beamfit.errors import InputError
 from beamfit.greybox.posterior import target_of
 from beamfit.greybox.problem import Constraint, Free, Prior, Problem, Record
 from beamfit.greybox.solve import solve
 from beamfit.greybox.stated import Statement
-from beamfit.lifetime.decay import current
+from beamfit.lifetime.decay_law import current
+from beamfit.lifetime.fit import fit_decay
+from beamfit.lifetime.posterior import expected_current
+from beamfit.lifetime.record import DecayRecord
 from beamfit.sampling.priors import Normal, Uniform
 from beamfit.status import Status
-from beamfit.studies.decay.fit import fit_decay
-from beamfit.studies.decay.posterior import expected_current
-from beamfit.studies.decay.record import DecayRecord
-from beamfit.studies.scan.posterior import beam_target, expected_sizes
 
 X = np.linspace(0.0, 1.0, 12)
 Y = 1.0 + 2.0 * X + 0.1 * np.random.default_rng(1).normal(size=12)

@@ -1,0 +1,277 @@
+"""What residuals say of an identified response, and how runs are predicted that it never saw."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from scipy.stats import chi2, f
+
+from beamfit.dynamics.model import (
+    CLOSE,
+    PreparedOutput,
+    changed_by,
+    driven,
+    parameters_at,
+    predicted,
+    steps_of,
+)
+from beamfit.dynamics.record import Run
+from beamfit.dynamics.response import FIRST_ORDER, Physics, simulate
+from beamfit.dynamics.starts import driven_by, unit_outputs
+from beamfit.greybox.fit import Fit
+
+# Most lags of residuals, of earlier inputs, of later inputs, and of the whitening autoregression.
+LAGS, PAST, LATER, ORDER = 20, 10, 5, 8
+# Time constants of the additional paths in the test for a fuller model.
+SLOW = 5
+# Share of an input's variance, independent of other inputs, below which its gain is not separable.
+ALONE = 1e-3
+
+
+class Checks(NamedTuple):
+    """Tests of the residuals of the free-running output.
+
+    Attributes
+    ----------
+    free_run_percent : float
+        100 (1 - |residual| / |output - mean|).
+    one_step_percent : float
+        The same for predictions from the reading before, by the noise's memory.
+    nothing_probability : float
+        Chance that a response explains so much of an output that hangs on no input (F).
+    white_probability : float
+        Chance of so large correlations of the residuals in white noise (Ljung and Box 1978).
+    input_probability : float
+        Chance that past inputs, or parameters that change with the operating point, explain so
+        much of the whitened residuals if they have no part in them (F).
+    input_share : float
+        The part of the whitened residuals' squares that these explain.
+    feedback_probability, feedback_share : float
+        The same for inputs of the same moment and later, which only a feedback would explain.
+    against_constant : float or None
+        By how much the Bayesian information criterion falls from constant parameters.
+    together : tuple of str
+        Inputs that the others give but for a thousandth of their variance.
+    first_order : bool
+        Whether a first order does as well.
+    """
+
+    free_run_percent: float
+    one_step_percent: float
+    nothing_probability: float
+    white_probability: float
+    input_probability: float
+    input_share: float
+    feedback_probability: float
+    feedback_share: float
+    against_constant: float | None
+    together: tuple[str, ...] = ()
+    first_order: bool = False
+
+    def rows(self) -> list[list[str]]:
+        """Label and value."""
+        rows = [
+            ["free run explains", f"{self.free_run_percent:.2f} %"],
+            ["one step ahead", f"{self.one_step_percent:.2f} %"],
+            ["residuals white", f"p = {self.white_probability:.2g}"],
+            [
+                "residuals explained",
+                f"{100 * self.input_share:.1f} %, p = {self.input_probability:.2g}",
+            ],
+        ]
+        if self.against_constant is not None:
+            rows.append(["BIC below constant", f"{self.against_constant:.1f}"])
+        return rows
+
+
+class HeldOutRun(NamedTuple):
+    """A run that was only predicted: its name, how much is explained, and its rms residual."""
+
+    name: str
+    free_run_percent: float
+    rms: float
+
+    def row(self) -> list[str]:
+        """Label and value."""
+        return [f"held back {self.name}", f"{self.free_run_percent:.2f} %, rms {self.rms:.3g}"]
+
+
+def percent(rest: np.ndarray, y: np.ndarray) -> float:
+    """Explained part of y in percent: 100 (1 - |rest| / |y - mean|)."""
+    whole = float(np.linalg.norm(y - y.mean()))
+    return 100.0 * (1.0 - float(np.linalg.norm(rest)) / whole) if whole > 0 else 0.0
+
+
+def checks_of(
+    seen: PreparedOutput,
+    residuals: tuple[np.ndarray, ...],
+    slopes: Sequence[tuple[np.ndarray, np.ndarray]],
+    used: int,
+    gain: float | None,
+    delay: int,
+) -> Checks:
+    """Test the residuals of every run together.
+
+    `slopes` has those of the output by the model's own numbers, and what a fuller model would add.
+    """
+    y = np.concatenate([m - m.mean() for m in seen.measured])
+    rest = np.concatenate(residuals)
+    ahead = np.concatenate([_whitened(r, [_share(residuals)]) for r in residuals])
+    (explained, chance), (later, fed) = _explained(seen, residuals, slopes, delay)
+    white = _white(residuals)
+    if rest.std() <= CLOSE * seen.size_y:  # what is left is rounding, or the network's own detail
+        explained, chance, later, fed, white = 0.0, 1.0, 0.0, 1.0, 1.0
+    return Checks(
+        percent(rest, y),
+        percent(ahead, y),
+        _chance(y, rest, used),
+        white,
+        chance,
+        explained,
+        fed,
+        later,
+        gain,
+        _together(seen),
+    )
+
+
+def _together(seen: PreparedOutput) -> tuple[str, ...]:
+    """Inputs whose gains cannot be told apart: their variance inflation is above a thousand."""
+    u = (seen.points - seen.points.mean(0)) / seen.wide
+    found = []
+    for i, name in enumerate(seen.inputs):
+        one, others = u[:, i], np.delete(u, i, axis=1)
+        rest = one - others @ np.linalg.lstsq(others, one, rcond=1e-10)[0]
+        if rest @ rest < ALONE * (one @ one):
+            found.append(name)
+    return tuple(found)
+
+
+def _chance(y: np.ndarray, rest: np.ndarray, used: int) -> float:
+    whole, left, free = float(y @ y), float(rest @ rest), len(rest) - used
+    if free < 1 or left >= whole:
+        return 1.0
+    return float(f.sf((whole - left) / used / max(left / free, 1e-300), used, free))
+
+
+def _share(residuals: tuple[np.ndarray, ...]) -> float:
+    """Correlation of neighbours."""
+    both = sum(float(r[1:] @ r[:-1]) for r in residuals)
+    return float(np.clip(both / max(sum(float(r @ r) for r in residuals), 1e-300), 0.0, 0.999))
+
+
+def _whitened(r: np.ndarray, memory: Sequence[float] | np.ndarray) -> np.ndarray:
+    """Residuals less their prediction from earlier ones; the first ones are dropped."""
+    order = len(memory)
+    return r[order:] - sum(m * r[order - k : -k] for k, m in enumerate(memory, start=1))
+
+
+def _memory(residuals: tuple[np.ndarray, ...]) -> np.ndarray:
+    """Autoregression of the residuals, by least squares.
+
+    With a first order alone, white noise on top of a drift would stay coloured.
+    """
+    order = max(1, min(ORDER, min(map(len, residuals)) // 20))
+    before = [np.stack([r[order - k : -k] for k in range(1, order + 1)], axis=1) for r in residuals]
+    after = np.concatenate([r[order:] for r in residuals])
+    return np.linalg.lstsq(np.vstack(before), after, rcond=1e-10)[0]
+
+
+def _white(residuals: tuple[np.ndarray, ...]) -> float:
+    count = sum(map(len, residuals))
+    lags = min(LAGS, count // 5)
+    squares = max(sum(float(r @ r) for r in residuals), 1e-300)
+    found = [sum(float(r[k:] @ r[:-k]) for r in residuals) / squares for k in range(1, lags + 1)]
+    q = count * (count + 2) * sum(c**2 / (count - k) for k, c in enumerate(found, start=1))
+    return float(chi2.sf(q, lags))
+
+
+def _explained(
+    seen: PreparedOutput,
+    residuals: tuple[np.ndarray, ...],
+    slopes: Sequence[tuple[np.ndarray, np.ndarray]],
+    delay: int,
+) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Share of the whitened residuals that a fuller model explains, with its chance, and the share
+    of the rest that later inputs explain.
+
+    A score test (Lagrange multipliers): columns are inputs before, those within the delay too,
+    further paths of first order, and the slopes of the output by parameters that change with the
+    operating point, less what the model's own numbers can do.
+    """
+    memory = _memory(residuals)
+    apart = min(float(np.median(np.diff(t))) for t in seen.time)
+    times = np.geomspace(apart, max(float(np.ptp(t)) for t in seen.time) / 4, SLOW)[:, None]
+    paths = driven_by(seen, FIRST_ORDER)
+    own, slow, quick, later, targets = [], [], [], [], []
+    for run, path, r, (by_own, added) in zip(seen.runs, paths, residuals, slopes, strict=True):
+        u = seen.scaled(run.u)
+        index = np.asarray(run.index)
+        past = [u[np.clip(index + k, 0, len(u) - 1)] for k in range(-PAST, delay)]
+        after = [u[np.clip(index + delay + k, 0, len(u) - 1)] for k in range(LATER)]
+        later.append(np.concatenate(after, axis=1))
+        slow.append(np.asarray(unit_outputs(path, times))[:, : u.shape[1]].reshape(-1, len(r)).T)
+        quick.append(np.concatenate([*past, added], axis=1))
+        own.append(by_own)
+        targets.append(r)
+
+    def white(parts: list[np.ndarray]) -> np.ndarray:
+        return np.concatenate([_whitened(part, memory) for part in parts])
+
+    basis = _basis(white(own))
+    rest = white(targets)
+    rest = rest - basis @ (basis.T @ rest)
+    few, more = (_tested(rest, basis, white(columns)) for columns in (slow, quick))
+    share, chance = min(few, more, key=lambda each: each[1])
+    basis = _basis(np.hstack([white(columns) for columns in (own, slow, quick)]))
+    rest = rest - basis @ (basis.T @ rest)
+    return (share, min(2.0 * chance, 1.0)), _tested(rest, basis, white(later))
+
+
+def _tested(rest: np.ndarray, basis: np.ndarray, columns: np.ndarray) -> tuple[float, float]:
+    """Share of the squares that columns explain beyond a basis, and its chance (F)."""
+    new = _basis(columns - basis @ (basis.T @ columns), np.linalg.norm(columns, axis=0))
+    k, left = new.shape[1], len(rest) - basis.shape[1] - new.shape[1]
+    inside, whole = float(np.sum((new.T @ rest) ** 2)), float(rest @ rest)
+    if left < 1 or whole <= 0 or k == 0:
+        return 0.0, 1.0
+    ratio = (inside / k) / max((whole - inside) / left, 1e-300)
+    return inside / whole, float(f.sf(ratio, k, left))
+
+
+def _basis(columns: np.ndarray, size: np.ndarray | None = None) -> np.ndarray:
+    """Orthonormal columns that span these; those that are nothing beside their size are none."""
+    size = np.linalg.norm(columns, axis=0) if size is None else size
+    found, values, _ = np.linalg.svd(columns / np.where(size > 0, size, 1.0), full_matrices=False)
+    return found[:, values > 1e-6]
+
+
+def slopes_of(seen: PreparedOutput, fit: Fit) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Slopes of the output by the model's own numbers, and by parameters that change."""
+    found = []
+    for run in seen.runs:
+        u = seen.scaled(run.u)
+        added = changed_by(fit.model, run, np.concatenate([u, u**2], axis=1))
+        found.append((fit.derive(predicted, run).slope, np.asarray(added)))
+    return found
+
+
+def predict_held(run: Run, output: str, fit: Fit, physics: Physics, delay: float) -> HeldOutRun:
+    """Predict a run that was held back; only the state at its start is estimated."""
+    seen = driven(run, 0, output, physics, delay)
+    p = parameters_at(physics, fit.model["map"], seen.u)
+    y = run.outputs[output][np.asarray(seen.index)]
+
+    def from_start(free: Any) -> np.ndarray:
+        return np.asarray(simulate(physics, p, seen.u, steps_of(fit.model, seen), free)[seen.index])
+
+    zero = jnp.zeros(physics.free_states)
+    base = from_start(zero)
+    moved = np.stack([from_start(e) - base for e in jnp.eye(physics.free_states)], axis=1)
+    target = y - base - float(fit.model["offset"])
+    first = np.linalg.lstsq(moved, target, rcond=1e-10)[0]
+    rest = target - moved @ first
+    return HeldOutRun(run.name, percent(rest, y), float(rest.std()))

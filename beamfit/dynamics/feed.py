@@ -1,0 +1,253 @@
+"""What comes of another feed profile, and the best one within limits (report fig 36)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+
+from beamfit.dynamics.fedbatch_model import STATES, Batches, batches_of
+from beamfit.dynamics.titre import TITRE, TitreFit, predicted
+from beamfit.errors import InputError
+from beamfit.greybox.fit import Fit
+from beamfit.greybox.problem import Constraint, Free, Objective, Problem
+from beamfit.greybox.solve import solve
+from beamfit.quantity import Quantity
+from beamfit.shown import shown
+from beamfit.status import Status
+from beamfit.table import Table
+
+OUTPUTS = (*STATES, TITRE)
+# Rows of a plan, and rounds in which its safety margins follow the errors of the plan.
+ROWS, ROUNDS = 31, 3
+
+
+class FeedCourse(NamedTuple):
+    """Predicted course of a batch under a feed profile.
+
+    Attributes
+    ----------
+    time : array, shape (n,)
+        h.
+    feed : array, shape (n,)
+        L/h, each until the next time.
+    value, error : dict of str to array
+        Biomass, substrate, volume and titre; errors are of the model, without the noise of
+        readings.
+    """
+
+    time: np.ndarray
+    feed: np.ndarray
+    value: dict[str, np.ndarray]
+    error: dict[str, np.ndarray]
+
+    def length(self, titre: float) -> Quantity:
+        """Time until a titre is reached, h, with its error; not determined if it never is."""
+        y = self.value[TITRE]
+        above = np.flatnonzero(y >= titre)
+        if not above.size or above[0] == 0:
+            return Quantity(float("nan") if not above.size else float(self.time[0]), None, "h")
+        near = slice(above[0] - 1, above[0] + 1)
+        (slope,) = np.diff(y[near]) / np.diff(self.time[near])
+        at, error = (np.interp(titre, y[near], of[near]) for of in (self.time, self.error[TITRE]))
+        return Quantity(float(at), float(error / slope), "h")
+
+
+def _ahead(model: Any, asked: tuple[Batches, Any]) -> Any:
+    """Outputs of one batch from a start that is known, shape (rows, 4)."""
+    b, start = asked
+    begun = {"start": jnp.log(start[None, :3]), "begin": start[3:]}
+    return predicted(model | begun, b)[0]
+
+
+def predict(
+    fit: TitreFit, time: np.ndarray, inputs: Mapping[str, Any], start: tuple[float, ...]
+) -> FeedCourse:
+    """Predict a batch.
+
+    Parameters
+    ----------
+    fit : TitreFit
+        Both stages.
+    time : array, shape (n,)
+        h, increasing.
+    inputs : mapping of str to array or float
+        All inputs that the batches had.
+    start : (float, float, float, float)
+        Biomass, substrate (g/L), volume (L) and titre at the first time.
+
+    Returns
+    -------
+    FeedCourse
+
+    Raises
+    ------
+    InputError
+        If an input is missing, or the start is not positive.
+    """
+    time = np.asarray(time, float)
+    b = _one(fit, time, inputs, start)
+    n, found = len(time), fit.fit.derive(_ahead, (b, jnp.asarray(start, float)))
+    value, error = (dict(zip(OUTPUTS, part[:n].T, strict=True))
+                    for part in (found.value, found.error))  # fmt: skip
+    return FeedCourse(time, np.asarray(b.flow.feed)[0, :n], value, error)
+
+
+def _one(
+    fit: TitreFit, time: np.ndarray, inputs: Mapping[str, Any], start: tuple[float, ...]
+) -> Batches:
+    like = fit.seen.batches
+    missing = [name for name in like.inputs if name not in inputs]
+    if missing:
+        raise InputError(f"no input {missing[0]}", f"all of {', '.join(like.inputs)}")
+    if len(start) != len(OUTPUTS) or not min(start[0], start[2]) > 0 or min(start) < 0:
+        raise InputError(f"a start of {start}", f"{', '.join(OUTPUTS)}, biomass and volume above 0")
+    held = {n: np.broadcast_to(np.asarray(v, float), time.shape) for n, v in inputs.items()}
+    return batches_of([time], [held], like)
+
+
+@shown
+@dataclass(frozen=True, eq=False)
+class FeedPlan:
+    """The best feed profile found.
+
+    Attributes
+    ----------
+    status : Status
+        Of the search; ``message`` says what holds the plan.
+    course : FeedCourse
+        What comes of it.
+    hours : Quantity
+        Its length, with the error that the titre's makes.
+    product : Quantity
+        Product at the end, g.
+    fit : Fit
+        The optimum, with the multipliers of its limits.
+    """
+
+    status: Status
+    message: str
+    course: FeedCourse
+    hours: Quantity
+    product: Quantity
+    fit: Fit
+
+    @property
+    def headline(self) -> str:
+        """The answer in a line."""
+        return f"feed {self.status}: {self.hours} for {self.product.value:.4g} g of product"
+
+    def tables(self) -> tuple[Table, ...]:
+        """The feed of each piece, and what comes of it."""
+        feed = np.asarray(self.fit.model["feed"])
+        ends = np.linspace(0.0, self.course.time[-1], len(feed) + 1)
+        rows = [[f"{ends[k]:.4g} to {ends[k + 1]:.4g} h", f"{f:.4g} L/h"]
+                for k, f in enumerate(feed)]  # fmt: skip
+        rows += [["product", str(self.product)], ["length", str(self.hours)]]
+        return (Table("feed", [], rows, f"held by {', '.join(self.fit.active) or 'nothing'}"),)
+
+
+def best_feed(
+    fit: TitreFit,
+    start: tuple[float, ...],
+    inputs: Mapping[str, float],
+    *,
+    product: float,
+    feed: tuple[float, float],
+    volume: float,
+    substrate: float,
+    hours: tuple[float, float] = (5.0, 60.0),
+    pieces: int = 8,
+    margin: float = 2.0,
+) -> FeedPlan:
+    """Find the feed profile that makes so much product soonest, within limits.
+
+    Parameters
+    ----------
+    fit : TitreFit
+        Both stages.
+    start : (float, float, float, float)
+        Biomass, substrate (g/L), volume (L) and titre to begin with.
+    inputs : mapping of str to float
+        All other inputs, held.
+    product : float
+        Product wanted at the end, g.
+    feed : (float, float)
+        Lowest and highest feed, L/h.
+    volume, substrate : float
+        Highest volume at the end, L, and highest substrate from the first feed on, g/L.
+    hours : (float, float)
+        Shortest and longest batch.
+    pieces : int
+        Of equal length, the feed constant in each.
+    margin : float
+        Standard errors of the model by which product and substrate are held off their limits.
+
+    Returns
+    -------
+    FeedPlan
+
+    Raises
+    ------
+    InputError
+        If a range is none, or the start is above the cap of the substrate.
+    """
+    if not (0 <= feed[0] < feed[1] and 0 < hours[0] < hours[1] and pieces > 0):
+        found = f"feed {feed[0]:g} to {feed[1]:g}, hours {hours[0]:g} to {hours[1]:g}"
+        raise InputError(found, "the lower end first")
+    if start[1] > substrate:
+        raise InputError(f"a start at {start[1]:g} g/L", f"at most {substrate:g}, the cap")
+    rows = pieces * max(ROWS // pieces, 1)
+    b = _one(fit, np.linspace(0.0, hours[1], rows + 1), dict(inputs) | {"feed": 0.0}, start)
+    data = b, jnp.asarray(np.maximum(start, 1e-9), float), jnp.arange(1, rows + 1)
+    free = [Free("feed", *feed), Free("hours", *hours)]
+    middle = {"feed": np.full(pieces, 0.5 * sum(feed)), "hours": 0.5 * sum(hours)}
+    model, off = dict(fit.fit.model) | middle, (0.0, np.zeros(rows))
+    labels = ("product", "volume", *(f"substrate[{k}]" for k in range(1, rows + 1)))
+    for _ in range(ROUNDS):
+        low = np.append([product + off[0], -np.inf], np.full(rows, -np.inf))
+        high = np.append([np.inf, volume], substrate - off[1])
+        limits = [Constraint("batch", _limited, data, low, high, labels)]
+        end = solve(
+            Problem(model, free, (), (), limits, [Objective("hours", _hours)]),
+        )
+        model = dict(end.model)
+        found = fit.fit.derive(_planned_by, (model["feed"], model["hours"], data))
+        mass = found.error[-1, 3] * found.value[-1, 2]
+        off = margin * mass, margin * found.error[:, 1]
+    time = np.linspace(0.0, float(model["hours"]), rows + 1)
+    steady = np.append(np.repeat(np.asarray(model["feed"]), rows // pieces), 0.0)
+    course = predict(fit, time, dict(inputs) | {"feed": steady}, start)
+    made = float(course.value[TITRE][-1] * course.value["volume"][-1])
+    return FeedPlan(end.status, end.message, course, course.length(float(course.value[TITRE][-1])),
+                    Quantity(made, float(mass), "g"), end)  # fmt: skip
+
+
+def _hours(model: Any, data: Any) -> Any:
+    return model["hours"]
+
+
+def _planned(model: Any, data: Any) -> Any:
+    """Outputs after each row of a plan, shape (rows, 4)."""
+    b, start, rows = data
+    piece = jnp.minimum(jnp.arange(b.dt.shape[1]) * len(model["feed"]) // len(rows),
+                        len(model["feed"]) - 1)  # fmt: skip
+    feed = model["feed"][piece][None]
+    dt = jnp.where(b.dt > 0, model["hours"] / len(rows), 0.0)
+    u = b.u.at[..., b.inputs.index("feed")].set(feed)
+    b = replace(b, u=u, flow=b.flow._replace(feed=feed), dt=dt)
+    return _ahead(model, (b, start))[rows]
+
+
+def _planned_by(model: Any, asked: Any) -> Any:
+    feed, hours, data = asked
+    return _planned(model | {"feed": feed, "hours": hours}, data)
+
+
+def _limited(model: Any, data: Any) -> Any:
+    """Product and volume at the end, then the substrate after each row."""
+    found = _planned(model, data)
+    return jnp.concatenate([jnp.stack([found[-1, 2] * found[-1, 3], found[-1, 2]]), found[:, 1]])

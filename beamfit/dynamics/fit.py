@@ -1,0 +1,277 @@
+"""Fit of a response to runs: start, delay, free-running fit, noise with a memory, verdict."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from beamfit.dynamics.case import used_by
+from beamfit.dynamics.checks import Checks, HeldOutRun, checks_of, predict_held, slopes_of
+from beamfit.dynamics.curve import Curve, curves_of, quantities_of, told
+from beamfit.dynamics.limits import limited
+from beamfit.dynamics.misread import Misread, sound
+from beamfit.dynamics.model import PreparedOutput, network_of, output_of
+from beamfit.dynamics.noise import Noise
+from beamfit.dynamics.record import Run, check_inputs, checked
+from beamfit.dynamics.response import PHYSICS
+from beamfit.dynamics.settle import begun, case_of, is_first_order, remembering, within
+from beamfit.dynamics.starts import latest
+from beamfit.dynamics.verdict import ResponseEvidence, judged, rms_of
+from beamfit.errors import InputError, nearest
+from beamfit.greybox.fit import Fit
+from beamfit.quantity import Quantity
+from beamfit.shown import shown
+from beamfit.status import Status
+from beamfit.table import Table, json_of
+
+if TYPE_CHECKING:
+    from beamfit.sampling.posterior import Posterior
+
+
+MAPS = ("constant", "network")
+LATEST = "The delay is the longest that was tried: say a longer one by --delay."
+
+
+@shown
+@dataclass(frozen=True, eq=False)
+class ResponseFit:
+    """An identified response of one output.
+
+    Attributes
+    ----------
+    output : str
+        Which.
+    status : Status
+        How far to believe it; ``message`` says why and what to do.
+    model, map : str
+        The physics, and what gives its parameters.
+    delay : float
+        Samples by which the output follows the inputs late.
+    runs : tuple of Run
+        What it was identified from.
+    seen : PreparedOutput
+        The same as the model sees it.
+    fit : Fit
+        The grey-box fit.
+    quantities : dict of str to Quantity
+        Constant parameters, and the offset, with errors.
+    curves : tuple of Curve
+        Parameters against the operating point, of a network.
+    noise : tuple of float
+        Rms residual of each run.
+    memory : Noise or None
+        How the noise wanders; None where it does not.
+    checks : Checks
+        What the residuals say.
+    held : tuple of HeldOutRun
+        How runs are predicted that were not used.
+    left_out : tuple of Misread
+        Readings that show no output; they are missing from ``runs`` and ``seen``.
+    """
+
+    output: str
+    status: Status
+    message: str
+    model: str
+    map: str
+    delay: float
+    runs: tuple[Run, ...]
+    seen: PreparedOutput
+    fit: Fit
+    quantities: dict[str, Quantity]
+    curves: tuple[Curve, ...]
+    noise: tuple[float, ...]
+    memory: Noise | None
+    checks: Checks
+    held: tuple[HeldOutRun, ...] = ()
+    left_out: tuple[Misread, ...] = ()
+
+    @property
+    def parts(self) -> tuple[ResponseFit]:
+        """Itself: the outputs it has pictures of."""
+        return (self,)
+
+    @property
+    def headline(self) -> str:
+        """The answer in a line."""
+        said = [f"{name} = {q}" for name, q in list(self.quantities.items())[:3]]
+        found = ", ".join(said) or f"{len(self.curves)} parameter curves"
+        return f"{self.output} {self.status}: {self.model}, {found}"
+
+    @cached_property
+    def fitted(self) -> tuple[np.ndarray, ...]:
+        """The free-running output at the readings of each run."""
+        return tuple(np.asarray(output_of(self.fit.model, run)) for run in self.seen.runs)
+
+    def tables(self) -> tuple[Table, ...]:
+        """All numbers, to be shown."""
+        rows = [[name, str(q)] for name, q in self.quantities.items()]
+        rows += [["delay", f"{self.delay:.4g} samples"]]
+        rows += self.checks.rows() + [each.row() for each in self.held]
+        found = [Table(f"{self.output} ({self.model}, {self.map} parameters)", [], rows)]
+        return (*found, *(curve.table() for curve in self.curves))
+
+    def to_json(self) -> dict[str, Any]:
+        """Give one entry of ``results`` in the JSON contract."""
+        names = ("output", "status", "message", "model", "map")
+        entry = {name: getattr(self, name) for name in names}
+        return json_of(
+            entry
+            | {"records": [run.path or run.name for run in self.runs]}
+            | {"delay_samples": self.delay, "parameters": self.quantities}
+            | {"curves": [curve.to_json() for curve in self.curves]}
+            | {"noise_rms": list(self.noise), "noise_memory": self.memory}
+            | {"checks": self.checks._asdict(), "held_back": [h._asdict() for h in self.held]}
+            | {"left_out": [each._asdict() for each in self.left_out]}
+        )
+
+    def sample(self, **options: Any) -> Posterior:
+        """Draw the free numbers of a response with constant parameters from their posterior.
+
+        Parameters
+        ----------
+        **options
+            As `beamfit.greybox.fit.Fit.sample`.
+
+        Raises
+        ------
+        InputError
+            If the parameters are a network: the weights are too many and stand for each other.
+        """
+        if self.map != "constant":
+            raise InputError("a posterior of a network", "constant parameters; curves have bands")
+        return self.fit.sample(**options)
+
+
+def identify(
+    runs: Run | Sequence[Run],
+    model: str = "first-order",
+    map: str = "constant",
+    *,
+    output: str | None = None,
+    delay: float | None = None,
+    offset: bool = True,
+    hidden: int = 5,
+    starts: int = 3,
+    seed: int = 0,
+    held: Sequence[Run] = (),
+    gains: Mapping[str, tuple[float, float]] | None = None,
+) -> ResponseFit:
+    """Identify the response of an output to the inputs of some runs.
+
+    Parameters
+    ----------
+    runs : Run or sequence of Run
+        Records with the same inputs and outputs.
+    model : {"first-order", "second-order", "arx"}
+        tau y' + y = K u (report eq 5); T² y'' + 2 zeta T y' + y = K u, which is eq 8 with
+        T² = tau1 tau2 and 2 zeta T = tau1 + tau2; or the difference equation (eq 12), stable by
+        construction.
+    map : {"constant", "network"}
+        Whether parameters are numbers, or a network of the inputs at each moment.
+    output : str, optional
+        Which output, if the runs have several.
+    delay : float, optional
+        Samples by which the output follows late; found among candidates if None. What is no whole
+        number is estimated besides, with an error.
+    offset : bool
+        Whether the output at rest is a free number; else it is 0.
+    hidden, starts, seed : int
+        Hidden nodes of the network, starts of its training, seed of their weights.
+    held : sequence of Run
+        Runs that are only predicted.
+    gains : mapping of str to (float, float), optional
+        Limits of parameters and of their slopes by an input, such as {"K": (1.0, 3.0),
+        "dK/dvalve": (0.0, inf)}, which a network certainly keeps over the whole range of the runs;
+        of tau, T and zeta only signs of slopes.
+
+    Returns
+    -------
+    ResponseFit
+
+    Raises
+    ------
+    InputError
+        If runs do not fit together, an option is unknown, no input ever changes, or samples of
+        ``"arx"`` are not at equal distances.
+
+    Notes
+    -----
+    The output runs free from the start of each run (output error): predictions from measured
+    outputs are useless under noise. The first states are estimated. Noise is inferred from the
+    residuals, with a correlation time where neighbours are correlated. Sources: report 3.2;
+    L. Ljung, System Identification (1999), chapters 7 and 16.
+
+    Examples
+    --------
+    >>> t = np.arange(60.0)
+    >>> u = (t // 15) % 2
+    >>> y = [0.0]
+    >>> for value in u[:-1]:
+    ...     y.append(2.0 * value + (y[-1] - 2.0 * value) * np.exp(-1 / 5.0))
+    >>> noise = 0.01 * np.random.default_rng(0).normal(size=60)
+    >>> fit = identify(Run(t, {"valve": u}, {"level": y + noise}))
+    >>> fit.status.value, fit.delay, abs(fit.quantities["tau"].value - 5.0) < 0.1
+    ('converged', 0, True)
+    """
+    if model not in PHYSICS:
+        raise InputError(f"model '{model}'", nearest(model, list(PHYSICS)))
+    if map not in MAPS:
+        raise InputError(f"map '{map}'", nearest(map, list(MAPS)))
+    physics = PHYSICS[model]
+    runs, held = checked(runs, held, physics.even)
+    check_inputs(runs)
+    output = _output(runs[0], output)
+    shortest = min(len(run) for run in runs)
+    if delay is not None and not 0 <= delay < shortest - 1:
+        raise InputError(f"a delay of {delay} samples", f"less than the {shortest} rows of a run")
+    given = delay
+    runs, left_out, found = sound(
+        runs, output, lambda these: begun(these, output, physics, given, offset)
+    )
+    seen, delay, plain = found
+    answer = plain
+    if map == "network":
+        first = plain.fit.model
+        raw = np.asarray(first["map"])
+        nets = (network_of(seen, physics, raw, hidden, seed + k) for k in range(starts))
+        answer = remembering(case_of(seen, offset, True), [first | {"map": net} for net in nets])
+    if gains:
+        limits = limited(gains, seen, physics, map == "network")
+        answer = within(case_of(seen, offset, map == "network", limits), answer)
+    checks = checks_of(
+        seen,
+        tuple(rest for (rest,) in answer.rest),
+        slopes_of(seen, answer.fit),
+        used_by(answer.fit),
+        plain.likelihood - answer.likelihood if map == "network" else None,
+        int(np.ceil(delay)) * (1 if delay % 1 == 0 else 2),  # in rows
+    )
+    checks = checks._replace(first_order=map == "constant" and is_first_order(found, offset))
+    quantities = (
+        quantities_of(answer.fit, answer.errors, seen, physics, delay) if map == "constant" else {}
+    )
+    curves = curves_of(answer.fit, answer.errors, seen) if map == "network" else ()
+    quantities, curves = told(quantities, curves, seen, checks)
+    ahead = tuple(predict_held(each, output, answer.fit, physics, delay) for each in held)
+    evidence = (answer.fit, answer.rests, checks, quantities, curves, ahead, map)
+    status, message = judged({output: ResponseEvidence(*evidence, rms_of(answer.fit))})
+    late = [LATEST] if given is None and delay == latest(runs) > 0 else []
+    message = " ".join([message, *late, *(f"Left out: {each}." for each in left_out)])
+    delay = delay if delay % 1 == 0 else delay + float(answer.fit.model["late"])
+    noise = tuple(answer.noise[:, 0].tolist())
+    parts = (quantities, curves, noise, answer.memory, checks, ahead, left_out)
+    return ResponseFit(output, status, message, model, map, delay, runs, seen, answer.fit, *parts)
+
+
+def _output(run: Run, output: str | None) -> str:
+    names = list(run.outputs)
+    if output is not None and output not in names:
+        raise InputError(f"no output '{output}'", nearest(output, names))
+    if output is None and len(names) > 1:
+        raise InputError(f"{len(names)} outputs", f"one of {', '.join(names)}")
+    return output or names[0]

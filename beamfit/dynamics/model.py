@@ -1,0 +1,165 @@
+"""A response as a problem: runs, a map from the operating point to its parameters, its physics."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from beamfit.dynamics.noise import Noise
+from beamfit.dynamics.record import Run
+from beamfit.dynamics.response import Physics, simulate
+from beamfit.greybox import tree
+from beamfit.greybox.mlp import MLP, Port, dense
+from beamfit.greybox.problem import Prior, padded_length
+
+# Residual, as a share of the output's scatter, below which a fit counts as exact.
+CLOSE = 2e-4
+# Standard deviation of the prior on a network's weights; inputs and outputs are of size 1.
+WEIGHT = 3.0
+
+
+@tree.node("physics")
+class Driven:
+    """A run as the model sees it: inputs, its operating points, and steps, padded; what was read.
+
+    Shapes (samples, inputs), (samples,), (readings,), (readings,); `run` is its number,
+    `noise` that of its readings, if it has a memory; `held` by how much each step grows, s, for a
+    delay that is longer by a sample, where the delay is no whole number of them.
+    """
+
+    physics: Physics
+    u: Any
+    dt: Any
+    time: Any
+    index: Any
+    run: Any
+    noise: Noise | None
+    held: Any
+
+    def predicted(self, model: Any) -> jax.Array:
+        """The output where it was read, running free from the start of the run."""
+        p = parameters_at(self.physics, model["map"], self.u)
+        y = simulate(self.physics, p, self.u, steps_of(model, self), model["start"][self.run])
+        return model["offset"] + y[self.index]
+
+
+class PreparedOutput(NamedTuple):
+    """Runs of one output, with what the model needs of them.
+
+    `runs` by `Driven`; `measured` are the readings of each, without missing ones; `size_u` and
+    `size_y` the scatter of inputs and output.
+    """
+
+    inputs: tuple[str, ...]
+    output: str
+    runs: tuple[Driven, ...]
+    measured: tuple[np.ndarray, ...]
+    time: tuple[np.ndarray, ...]
+    mean_u: np.ndarray
+    size_u: np.ndarray
+    size_y: float
+
+    @property
+    def wide(self) -> np.ndarray:
+        """The scatter of the inputs, 1 where one does not change."""
+        return np.where(self.size_u > 0, self.size_u, 1.0)
+
+    @property
+    def points(self) -> np.ndarray:
+        """The inputs at all readings, shape (readings, inputs)."""
+        return np.concatenate([np.asarray(run.u)[np.asarray(run.index)] for run in self.runs])
+
+    def scaled(self, u: Any) -> np.ndarray:
+        """Inputs in units of their scatter."""
+        return (np.asarray(u) - self.mean_u) / self.wide
+
+
+def driven(run: Run, number: int, output: str, physics: Physics, delay: float) -> Driven:
+    """A run with its inputs `delay` samples late; earlier inputs equal the first.
+
+    A delay of no whole number of samples has two rows a sample, one for each input that it feels.
+    """
+    n, u, part = len(run), np.stack(list(run.inputs.values()), axis=1), delay % 1.0
+    whole = [np.concatenate([np.repeat(u[:1], k, axis=0), u])[:n]
+             for k in ((int(delay),) if part == 0.0 else (int(delay) + 1, int(delay)))]  # fmt: skip
+    late = np.stack(whole, axis=1).reshape(-1, u.shape[1])
+    longer = padded_length(len(late)) - len(late)
+    late = np.concatenate([late, np.repeat(late[-1:], longer, axis=0)])
+    apart = np.append(np.diff(run.time), 0.0)
+    shares, held = ([[1.0]], None) if part == 0.0 else ([[part], [1.0 - part]], [[1.0], [-1.0]])
+    dt, held = (None if s is None else np.append((s * apart).T.ravel(), np.zeros(longer))
+                for s in (shares, held))  # fmt: skip
+    rows = np.flatnonzero(np.isfinite(run.outputs[output]))
+    seen = (late, dt, run.time[rows] - run.time[0], rows * len(whole))
+    arrays = (jnp.asarray(v) for v in seen)
+    held = None if held is None else jnp.asarray(held)
+    return Driven(physics, *arrays, jnp.asarray(number), None, held)
+
+
+def steps_of(model: Any, seen: Driven) -> jax.Array:
+    """The distances of the rows, of which a delay that is estimated decides."""
+    return seen.dt if seen.held is None else seen.dt + model["late"] * seen.held
+
+
+def parameters_at(physics: Physics, of: Any, point: jax.Array, more: Any = 0.0) -> jax.Array:
+    """Parameters p at operating points, shape (points, parameters); `of` a map, or raw numbers.
+
+    `more` is added to the raw numbers.
+    """
+    m = point.shape[1]
+    raw = jax.vmap(of)(point) if callable(of) else jnp.broadcast_to(of, (len(point), len(of)))
+    return jax.vmap(lambda q: physics.physical(q, m))(raw + more)
+
+
+def predicted(model: Any, course: Any) -> jax.Array:
+    """Readings of a run that a model predicts; the course is a `Driven` or another."""
+    return course.predicted(model)
+
+
+output_of = jax.jit(predicted)
+
+
+@jax.jit
+def changed_by(model: Any, seen: Driven, scaled: jax.Array) -> jax.Array:
+    """Slopes of the output by parameters that change with the operating point.
+
+    The raw numbers get S s more, where s holds the scaled inputs and their squares, shape
+    (samples, 2 m); the slopes are by S at 0, shape (readings, parameters * 2 m).
+    """
+    start = model["start"][seen.run]
+    count = parameters_at(seen.physics, model["map"], seen.u[:1]).shape[1]
+
+    def output(more):
+        p = parameters_at(seen.physics, model["map"], seen.u, scaled @ more.T)
+        return simulate(seen.physics, p, seen.u, steps_of(model, seen), start)[seen.index]
+
+    slopes = jax.jacfwd(output)(jnp.zeros((count, scaled.shape[1])))
+    return slopes.reshape(len(slopes), -1)
+
+
+def curves(model: Any, asked: tuple[Driven, Any]) -> jax.Array:
+    """Parameters at operating points, shape (points, parameters)."""
+    seen, point = asked
+    return parameters_at(seen.physics, model["map"], point)
+
+
+def weight_priors(path: str) -> tuple[Prior, ...]:
+    """Priors on the numbers of a network."""
+    return tuple(Prior(f"{path}.{part}", 0.0, WEIGHT) for part in ("weights", "biases"))
+
+
+def network_of(
+    seen: PreparedOutput, physics: Physics, raw: np.ndarray, hidden: int, seed: int
+) -> MLP:
+    """A network that gives constant raw numbers everywhere but for small random weights."""
+    m, wide = len(seen.inputs), seen.wide
+    ports = [Port(n, "", 0, float(s), float(b))
+             for n, s, b in zip(seen.inputs, wide, seen.mean_u, strict=True)]  # fmt: skip
+    gain = seen.size_y / float(np.min(wide))
+    sizes = [gain if power else 1.0 for _, power in physics.units(m)]
+    names = physics.parameters(seen.inputs)
+    outputs = [Port(n, "", 0, s, float(b)) for n, s, b in zip(names, sizes, raw, strict=True)]
+    return dense(ports, outputs, [hidden], seed=seed, spread=0.3)

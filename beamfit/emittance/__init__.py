@@ -1,0 +1,1 @@
+"""Beams from sizes: scans, their fit, and what to measure next."""

@@ -1,0 +1,396 @@
+"""From the posterior of a plane to its result: the one way of every scenario."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from scipy.special import ndtri
+
+from beamfit.emittance.comparison import BEAM, FLAT, PlanePosterior, weighted_quantiles
+from beamfit.emittance.model import QUANTITIES, coefficients, numbers_of, phase_coverage
+from beamfit.emittance.next_point import next_measurement
+from beamfit.emittance.results import Identifiability, PlaneFit, Points, ScreenTwiss
+from beamfit.emittance.statement import Seen
+from beamfit.emittance.transport import setting_units
+from beamfit.emittance.verdict import (
+    CARRIES,
+    MOVES,
+    Evidence,
+    noise_remark,
+    point_remarks,
+    verdict,
+    waist_bracketed,
+)
+from beamfit.optics.beamline import Beamline
+from beamfit.quantity import Quantity
+from beamfit.statistics import Directions, chi2_probability, scaled_directions
+from beamfit.status import Status
+from beamfit.verdict import Finding
+
+SIGMA = slice(4, 7)
+# Normalised emittances in m beyond which only a wrong unit leads: rings and linacs have 1e-9 and
+# more, muons before cooling 2e-2; sizes a thousand times off are a million in this.
+LEAST, MOST = 1e-10, 0.1
+# What a beam of unknown emittance may have all the same: σ, and the size at the screen.
+LINEAR = np.isin(list(QUANTITIES), ("sigma11", "sigma12", "sigma22", "screen_size"))
+# Numbers of either sign; the others are positive, and spread by a factor.
+SIGNED = np.isin(list(QUANTITIES), ("alpha", "sigma12", "screen_alpha"))
+AT = (0.025, 0.1587, 0.5, 0.8413, 0.975)
+
+
+class Places(NamedTuple):
+    """Where the numbers of a beam are asked for: βγ, matrices to the screen and the design."""
+
+    factor: float
+    to_screen: np.ndarray
+    to_design: np.ndarray
+    design: np.ndarray
+
+
+class Beside(NamedTuple):
+    """What a scenario adds to the answer of a plane, whose line is known otherwise.
+
+    Attributes
+    ----------
+    value, spread : ndarray
+        Shape (11,), in the order of `QUANTITIES`: best values, and standard deviations that the
+        other unknowns add to those of known transport.
+    covariance : ndarray
+        Shape (3, 3), of σ11, σ12, σ22.
+    directions : Directions
+        What the data leave open.
+    dof : float
+        Degrees of freedom of the plane's sizes.
+    ending, opened, remedy, remark, scenario
+        As of `Evidence`, and a further sentence.
+    holds : str
+        What the error includes.
+    """
+
+    value: np.ndarray
+    spread: np.ndarray
+    covariance: np.ndarray
+    directions: Directions
+    dof: float
+    ending: Finding | None
+    opened: str
+    remedy: str
+    remark: str
+    scenario: str
+    holds: str
+
+
+class Influence(NamedTuple):
+    """The point without which the emittance moves most: where it lies, by how many errors."""
+
+    place: str = ""
+    shift: float = 0.0
+    without: float = math.nan
+
+
+class Numbers(NamedTuple):
+    """Numbers of a plane in the order of `QUANTITIES`, each of shape (11,)."""
+
+    value: np.ndarray
+    half: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+    raw: np.ndarray
+
+    def quantities(self, known: np.ndarray, limits: bool) -> list[Quantity]:
+        """Quantities with errors where they are known, else with intervals if the model holds."""
+        rows = zip(*self, QUANTITIES.values(), known, strict=True)
+        return [_quantity(*row, limits) for row in rows]
+
+
+class Judged(NamedTuple):
+    """A finding, whether the emittance is determined, and what to measure next."""
+
+    finding: Finding
+    determined: bool
+    of_a_beam: bool
+    advice: str | None
+
+
+def plane_answer(
+    seen: Seen, line: Beamline, plane: str, places: Places, b: Beside | None
+) -> PlaneFit:
+    """Answer for one plane.
+
+    Parameters
+    ----------
+    seen : Seen
+        The scan through its line, as found.
+    line : Beamline
+        The line as found.
+    plane : str
+        "x" or "y".
+    places : Places
+        Where the beam is asked for.
+    b : Beside or None
+        What a scenario adds.
+
+    Returns
+    -------
+    PlaneFit
+        Errors only for what the data determine: half of the central 68 % of the posterior.
+    """
+    post, p = seen.works[plane].posterior, seen.works[plane].points
+    n, carrying = _numbers(post, p, places, b)
+    e = _evidence(seen, plane, n.low[1], n.high[1], b)
+    j = _judged(seen, plane, e, b, carrying, n.value)
+    known = j.determined | (LINEAR & j.of_a_beam & (b is None))
+    emittance, normalized, beta, alpha, s11, s12, s22, *screen, mismatch = n.quantities(
+        known, j.of_a_beam and not e.opened and e.ending is None
+    )
+    scale = _scale(n) if j.determined else 1.0
+    place = seen.rows.places[-1]
+    own = {name: float(line[name].setting) for name in line.upto(place).magnets}
+    return PlaneFit(
+        plane=plane,
+        status=j.finding.status,
+        message=j.finding.message,
+        emittance=emittance,
+        normalized_emittance=normalized,
+        beta=beta,
+        alpha=alpha,
+        sigma=(s11, s12, s22),
+        screen=ScreenTwiss(place, own, setting_units(line, own), *screen),
+        mismatch=None if getattr(seen.line.design, plane, None) is None else mismatch,
+        chi2=post.chi2 if math.isfinite(post.chi2) else None,
+        dof=max(len(p.size) - 3, 0) if b is None else round(b.dof),
+        rms_residual=Quantity(float(np.sqrt(np.mean((p.size - p.model) ** 2))), None, "m"),
+        covariance=_covariance(post, b, scale, bool(known[SIGMA].all())),
+        error_scale=scale,
+        noise=noise_words(seen.works[plane].sizes.likeness[1], post.scale, post.relative, p),
+        method=seen.method,
+        weights=seen.weights,
+        identifiability=_identifiability(post, p, n, e, j, b),
+        points=p,
+        holds="statistics only" if b is None else b.holds,
+    )
+
+
+def _numbers(
+    post: PlanePosterior, p: Points, places: Places, b: Beside | None
+) -> tuple[Numbers, Influence]:
+    """The numbers of a plane, and the point that carries them."""
+    flat = post.probability[FLAT] / max(post.probability[BEAM] + post.probability[FLAT], 1e-300)
+    spread = None if b is None else b.spread
+    quantiles = _quantiles(post.sigma, post.weight, tuple(places), spread, flat)
+    value = numbers_of(post.best, *places) if b is None else b.value
+    half = 0.5 * (quantiles[3] - quantiles[1])
+    low, high = quantiles[0], quantiles[4]
+    alone = post.positive and len(p.size) > 3
+    carrying = _influence(p, post.best, half[0]) if alone else Influence()
+    if abs(carrying.shift) > MOVES:
+        low, high, half = _reaching(low, high, half, value, carrying.without)
+    raw = _raw(post, tuple(places))
+    raw = raw if b is None else np.hypot(raw, b.spread)
+    return Numbers(value, half, low, high, raw), carrying
+
+
+def _judged(
+    seen: Seen, plane: str, e: Evidence, b: Beside | None, carrying: Influence, value: np.ndarray
+) -> Judged:
+    """The verdict on a plane."""
+    work = seen.works[plane]
+    post, p = work.posterior, work.points
+    column = seen.scan.columns.get(f"size_{plane}", f"size_{plane}")
+    if e.determined and (other := _impossible(float(value[1]), column)):
+        return Judged(other, False, False, None)
+    remarks = [work.shot_words]
+    if e.of_a_beam:
+        likely = chi2_probability(post.chi2, max(len(p.size) - 3, 0))
+        remarks.insert(0, noise_remark(work.sizes.likeness[1], post.scale, likely))
+        without = carrying.without * value[1] / value[0]
+        place = "" if e.opened else carrying.place
+        remarks += point_remarks(p, place, float(without), abs(carrying.shift) > MOVES)
+    if b is not None and e.determined:
+        remarks.append(b.remark)
+    advised = e.of_a_beam and not e.determined and b is None
+    advice = next_measurement(seen, plane) if advised else None
+    finding = verdict(e, " ".join(filter(None, remarks)), advice or "")
+    return Judged(finding, e.determined, e.of_a_beam, advice)
+
+
+def _scale(n: Numbers) -> float:
+    """The error of the emittance over that by the stated errors alone; 1 without."""
+    return float(n.half[0] / n.raw[0]) if np.isfinite(n.raw[0]) and n.raw[0] > 0 else 1.0
+
+
+def _covariance(post: PlanePosterior, b: Beside | None, scale: float, known: bool) -> np.ndarray:
+    """Covariance of σ over the square of ``scale``; NaN where σ is not known."""
+    if not known:
+        return np.full((3, 3), np.nan)
+    if b is not None:
+        return b.covariance / scale**2
+    return post.stated if np.isfinite(post.stated).all() else post.covariance
+
+
+def _identifiability(
+    post: PlanePosterior, p: Points, n: Numbers, e: Evidence, j: Judged, b: Beside | None
+) -> Identifiability:
+    directions = _directions(p, post) if b is None else b.directions
+    return Identifiability(
+        determined=j.determined,
+        probability=post.probability,
+        singular_values=tuple(float(v) for v in directions.singular_values),
+        condition=directions.condition if math.isfinite(directions.condition) else None,
+        waist_bracketed=e.bracketed,
+        phase_coverage=phase_coverage(p.r11, p.r12, float(n.value[2]), float(n.value[3])),
+        undetermined=(*directions.undetermined, *["emittance"] * (not j.determined)),
+        next_measurement=j.advice,
+    )
+
+
+def _quantiles(
+    sigma: np.ndarray, weight: np.ndarray, given: tuple, spread: np.ndarray | None, flat: float
+) -> np.ndarray:
+    """Quantiles `AT` of every number, shape (5, 11); of emittances with the share ``flat`` at 0."""
+    kept = weight > 0.0
+    sigma, weight = sigma[kept], weight[kept]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        numbers = numbers_of(sigma.T, *given)
+    if spread is not None:
+        # Even steps of a normal distribution, in an order that has nothing to do with the draws'.
+        z = ndtri((0.5 + np.arange(len(weight)) * 0.6180339887498949) % 1.0)
+        with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
+            middle = np.abs(numbers @ (weight / weight.sum()))
+            grown = numbers * np.exp(z * (spread / middle)[:, None])
+            numbers = np.where(SIGNED[:, None], numbers + z * spread[:, None], grown)
+            numbers = np.where(np.isfinite(spread)[:, None], numbers, 0.0)
+    found = np.array([weighted_quantiles(row, weight, AT) for row in numbers]).T
+    at = np.array(AT)
+    within = np.maximum((at - flat) / (1.0 - flat), 0.0) if flat < 1.0 else 0.0 * at
+    for i in (0, 1):
+        found[:, i] = np.where(at > flat, weighted_quantiles(numbers[i], weight, within), 0.0)
+    return found if spread is None else np.where(np.isfinite(spread), found, np.nan)
+
+
+def _reaching(
+    low: np.ndarray, high: np.ndarray, half: np.ndarray, value: np.ndarray, without: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Intervals that reach to the emittance without the point that carries it."""
+    shift = without - value[0]
+    if not math.isfinite(shift):
+        return low, high, half
+    reach = np.array([shift, shift * value[1] / value[0]])
+    low, high, half = low.copy(), high.copy(), half.copy()
+    low[:2] = np.minimum(low[:2], value[:2] + reach)
+    high[:2] = np.maximum(high[:2], value[:2] + reach)
+    # Two answers, one of which is right: half of what lies between them.
+    half[:2] = np.maximum(half[:2], 0.5 * np.abs(reach))
+    return low, high, half
+
+
+def _evidence(seen: Seen, plane: str, low: float, high: float, b: Beside | None) -> Evidence:
+    work = seen.works[plane]
+    p, post = work.points, work.posterior
+    found = Evidence(
+        probability=post.probability,
+        seen=post.seen,
+        points=len(p.size),
+        moved=work.sizes.moved,
+        errors=work.sizes.error is not None,
+        low=float(low),
+        high=float(high),
+        bracketed=waist_bracketed(p.settings, p.screen, p.size, p.error),
+    )
+    if b is None:
+        return found
+    return found._replace(ending=b.ending, scenario=b.scenario, opened=b.opened, remedy=b.remedy)
+
+
+def _impossible(emittance: float, sizes: str) -> Finding | None:
+    """The finding on an emittance that only a wrong unit explains; None of a possible one."""
+    if LEAST <= emittance <= MOST:
+        return None
+    cause = (
+        f"Not determined: a normalised emittance of {emittance:.2g} m is "
+        f"{'less' if emittance < LEAST else 'more'} than any accelerator has."
+    )
+    remedy = (
+        f"Check the units of '{sizes}', the settings and the energy: sizes in mm under a header "
+        "that says um make it a million times less."
+    )
+    return Finding(Status.unidentified, cause, remedy)
+
+
+def _quantity(
+    value: float, half: float, low: float, high: float, raw: float, unit: str, known: bool,
+    limits: bool,
+) -> Quantity:  # fmt: skip
+    """A number with its error; of one that is not determined its interval, if the model holds."""
+    value, low, high = float(value), float(low), float(high)
+    if not (math.isfinite(low) and math.isfinite(high)):
+        return Quantity(value, None, unit)
+    if not known:
+        return Quantity(value, None, unit, None, (low, high) if limits else None)
+    raw = float(raw)
+    return Quantity(value, float(half), unit, raw if math.isfinite(raw) else None, (low, high))
+
+
+def _raw(post: PlanePosterior, given: tuple) -> np.ndarray:
+    """Errors by the stated errors alone: sqrt(∇f C ∇f), derivatives by complex steps."""
+    if not np.isfinite(post.stated).all():
+        return np.full(len(QUANTITIES), np.nan)
+    unit = np.sqrt(np.diag(post.stated))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        steps = np.array(post.best, complex)[:, None] + 1e-20j * np.diag(unit)
+        slope = numbers_of(steps, *given).imag / 1e-20 / unit
+        return np.sqrt(np.sum((slope @ post.stated) * slope, axis=1))
+
+
+def _directions(p: Points, post: PlanePosterior) -> Directions:
+    """What the sizes leave open of σ."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        jacobian = np.stack(coefficients(p.r11, p.r12), -1) / (2.0 * p.weighed * p.error)[:, None]
+    return scaled_directions(jacobian, np.array(units_of(post.best)), list(QUANTITIES)[SIGMA])
+
+
+def units_of(sigma: np.ndarray) -> list[float]:
+    """A change of σ11, σ12 and σ22 by 100 %."""
+    return [float(sigma[0]), math.sqrt(max(float(sigma[0] * sigma[2]), 0.0)), float(sigma[2])]
+
+
+def _influence(p: Points, sigma: np.ndarray, error: float) -> Influence:
+    """Leave out each point in turn, at the weights of the fit.
+
+    Notes
+    -----
+    Of weighted rows a_i with residuals r_i and leverages h_i = a_iᵀ(AᵀA)⁻¹a_i, leaving out row i
+    changes σ by -(AᵀA)⁻¹ a_i r_i/(1 - h_i): R. D. Cook and S. Weisberg, Residuals and Influence in
+    Regression (1982), eq. 2.2.3.
+    """
+    scale = 0.5 / (p.weighed * p.error)
+    rows = np.stack(coefficients(p.r11, p.r12), -1) * scale[:, None]
+    left = (p.size**2 - p.known) * scale - rows @ sigma
+    norm = np.linalg.norm(rows, axis=0)
+    q, r = np.linalg.qr(rows / norm)
+    free = np.maximum(1.0 - np.sum(q**2, axis=1), 1e-12)
+    moves = np.linalg.solve(r, q.T).T * (left / free)[:, None] / norm
+    s11, s12, s22 = (sigma - moves).T
+    determinant = np.where((s11 > 0) & (s22 > 0), s11 * s22 - s12**2, np.nan)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        without = np.sqrt(determinant)
+        shifts = (without - math.sqrt(sigma[0] * sigma[2] - sigma[1] ** 2)) / error
+    # A reading that is bad already has no part in the answer.
+    shifts = np.where(p.outlier_probability > 0.5, 0.0, shifts)
+    most = int(np.argmax(np.where(np.isnan(shifts), np.inf, np.abs(shifts))))
+    if abs(shifts[most]) <= CARRIES:
+        return Influence()
+    return Influence(p.where(most), float(shifts[most]), float(without[most]))
+
+
+def noise_words(noise: str, scale: np.ndarray, relative: float, p: Points) -> str:
+    """Where the errors are from, in a few words."""
+    if noise == "shots":
+        return f"of the shots, settings ± {100 * scale[0]:.2g} % beyond"
+    if noise != "none":
+        return "given" if scale[1] <= 1.05 else f"given, × {scale[0]:.2f}"
+    if relative < 0.5:
+        return f"inferred, {1e6 * float(np.median(p.error)):.2g} µm"
+    return f"inferred, {100 * float((p.error / p.weighed).mean()):.2g} % of size"

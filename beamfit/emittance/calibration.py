@@ -1,0 +1,232 @@
+"""The calibration scenario: what a magnet's setting means is free, within priors and bounds."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from enum import Enum
+from typing import NamedTuple
+
+import jax
+
+from beamfit.emittance.assumptions import Assumptions
+from beamfit.emittance.results import Parameter
+from beamfit.emittance.statement import Scenario, Seen, beam_problem, varied_magnets
+from beamfit.errors import InputError, nearest
+from beamfit.greybox.fit import Fit
+from beamfit.greybox.problem import Free, Prior, Problem
+from beamfit.greybox.tree import leaves
+from beamfit.optics.beamline import Beamline
+from beamfit.optics.calibration import CurrentPolynomial, SlopeIntercept
+from beamfit.status import Status
+
+# The report's bounds are 167.23 ± 20 for the slope and 43.17 ± 20 for the intercept (appendix C).
+WIDTH = 20.0 / 167.23
+
+
+class Kind(Enum):
+    """What a number of a calibration does to k1: scales it, shifts it, or bends its curve."""
+
+    slope = "slope"
+    offset = "offset"
+    bend = "bend"
+
+
+# The numbers of a calibration in the order of its fields; of any further ones the last.
+_SCALE = ((Kind.slope, "1"),)
+_MEANINGS = {
+    SlopeIntercept: ((Kind.slope, "MeV/(m^2 A)"), (Kind.offset, "MeV/m^2")),
+    CurrentPolynomial: ((Kind.offset, "T/m"), (Kind.slope, "T/(m A)"), (Kind.bend, "1")),
+}
+
+
+class Number(NamedTuple):
+    """A number of a magnet's calibration as the lattice has it.
+
+    Attributes
+    ----------
+    magnet, path : str
+        Whose, and where in its calibration.
+    value : float
+        In ``unit``.
+    kind : Kind
+        What it does.
+    reach : float
+        Half the width of its usual bounds.
+    unit : str
+        Of the value.
+    """
+
+    magnet: str
+    path: str
+    value: float
+    kind: Kind
+    reach: float
+    unit: str
+
+    @property
+    def name(self) -> str:
+        """As users call it."""
+        return f"{self.magnet}.{self.path}"
+
+
+def numbers_of_magnets(line: Beamline, magnets: tuple[str, ...] | None = None) -> dict[str, Number]:
+    """The numbers of the calibrations of magnets, by name.
+
+    Parameters
+    ----------
+    line : Beamline
+        The line.
+    magnets : tuple of str, optional
+        Which; all of the line if None.
+
+    Returns
+    -------
+    dict of str to Number
+        Bounds reach as far in proportion to the slope as the report's: 12 % of the slope, for the
+        offset 12 % of what one ampere gives, for any other number 12 % of itself.
+
+    Examples
+    --------
+    >>> from beamfit.optics.elements import Quadrupole
+    >>> magnet = Quadrupole("Q2", 0.1, 0.0, SlopeIntercept(167.23, 43.17))
+    >>> found = numbers_of_magnets(Beamline((magnet,), energy=100.0))
+    >>> [(name, n.value, round(n.reach, 2)) for name, n in found.items()]
+    [('Q2.slope', 167.23, 20.0), ('Q2.intercept', 43.17, 20.0)]
+    """
+    found = {}
+    for magnet in line.magnets if magnets is None else magnets:
+        if len(line.members(magnet)) > 1:  # each of them has numbers of its own
+            if magnets is None:
+                continue
+            wrong = f"a calibration of '{magnet}', which feeds several magnets"
+            raise InputError(wrong, "scenario known, or a scan of magnets on supplies of their own")
+        calibration = line[magnet].calibration
+        meanings = _MEANINGS.get(type(calibration), _SCALE)
+        values = [float(v) for v in jax.tree_util.tree_leaves(calibration)]
+        told = [meanings[min(i, len(meanings) - 1)] for i in range(len(values))]
+        slopes = [v for v, (kind, _) in zip(values, told, strict=True) if kind is Kind.slope]
+        for leaf, value, (kind, unit) in zip(leaves(calibration), values, told, strict=True):
+            own = WIDTH * abs(value) + 1e-3 if kind is Kind.bend else WIDTH * abs(slopes[0])
+            number = Number(magnet, leaf.path, value, kind, own, unit)
+            found[number.name] = number
+    return found
+
+
+def with_numbers(line: Beamline, numbers: Mapping[str, float]) -> Beamline:
+    """Put calibration numbers into a line.
+
+    Parameters
+    ----------
+    line : Beamline
+        The line.
+    numbers : mapping of str to float
+        Such as ``{"Q2.slope": 160.0}``.
+
+    Returns
+    -------
+    Beamline
+
+    Raises
+    ------
+    InputError
+        If the line has no such number.
+
+    Examples
+    --------
+    >>> from beamfit.optics.elements import Quadrupole
+    >>> line = Beamline((Quadrupole("Q", 0.1),), energy=100.0)
+    >>> float(with_numbers(line, {"Q.scale": 1.1})["Q"].calibration.scale)
+    1.1
+    """
+    known = numbers_of_magnets(line)
+    for name in numbers:
+        if name not in known:
+            raise InputError(f"a calibration number '{name}'", nearest(name, list(known)))
+    for magnet in dict.fromkeys(known[name].magnet for name in numbers):
+        old = line[line.members(magnet)[0]]
+        structure = jax.tree_util.tree_structure(old.calibration)
+        own = [numbers.get(n, v.value) for n, v in known.items() if v.magnet == magnet]
+        new = jax.tree_util.tree_unflatten(structure, own)
+        line = line.with_element(replace(old, calibration=new))
+    return line
+
+
+def _free_numbers(seen: Seen, told: Assumptions) -> dict[str, Number]:
+    """Slope and offset of the scanned magnets, and whatever is named."""
+    known, varied = numbers_of_magnets(seen.scanned), varied_magnets(seen.scan)
+    named = [*told.calibrations, *told.bounds]
+    for name in named:
+        if name not in known:
+            raise InputError(f"a prior or bounds on '{name}'", nearest(name, list(known)))
+    return {
+        name: number
+        for name, number in known.items()
+        if name in named or (number.magnet in varied and number.kind is not Kind.bend)
+    }
+
+
+def _state(seen: Seen, told: Assumptions) -> Problem:
+    """Beams and calibrations free, all planes together."""
+    numbers = _free_numbers(seen, told)
+    magnets = {n.magnet: seen.scanned[n.magnet].calibration for n in numbers.values()}
+    free, priors = [], []
+    for name, number in numbers.items():
+        low, high = number.value - number.reach, number.value + number.reach
+        if name in told.priors:
+            mean, sd = told.priors[name]
+            low, high = min(low, mean - 6 * sd), max(high, mean + 6 * sd)
+            priors.append(Prior(f"magnets.{name}", mean, sd))
+        free.append(Free(f"magnets.{name}", *told.bounds.get(name, (low, high))))
+    seen = seen.keeping(magnets)
+    return beam_problem(seen, model={"magnets": magnets}, free=free, priors=priors)
+
+
+def _parameters(seen: Seen, told: Assumptions, fit: Fit) -> Iterator[Parameter]:
+    settled = fit.status is not Status.not_converged
+    for name, number in _free_numbers(seen, told).items():
+        v, prior = fit[f"magnets.{name}"], told.priors.get(name)
+        yield Parameter.of(name, v, number.unit, prior, settled)
+
+
+def _null_directions(
+    seen: Seen, parameters: tuple[Parameter, ...], identified: bool
+) -> tuple[str, ...]:
+    known, said = numbers_of_magnets(seen.scanned), []
+    for parameter in parameters:
+        if parameter.status is Status.converged:
+            continue
+        if known[parameter.name].kind is Kind.offset:
+            said.append(
+                f"{parameter.name}: a shift of k1 is undone by a lens at that magnet in the beam, "
+                "so beta and alpha change and the emittance does not (exact for a thin lens)"
+            )
+        elif not identified:
+            said.append(
+                f"{parameter.name}: a steeper calibration with a beam of smaller emittance gives "
+                "the same sizes (emittance as 1/slope)"
+            )
+    if not identified and not said:
+        said.append("the calibration and the beam together: no single number is to blame")
+    return tuple(said)
+
+
+def _remedy(seen: Seen, told: Assumptions) -> str:
+    known = numbers_of_magnets(seen.scanned, varied_magnets(seen.scan))
+    slopes = [name for name, number in known.items() if number.kind is Kind.slope]
+    without = [name for name in slopes if name not in told.priors]
+    second = "a second screen (see beamfit design)"
+    if without:
+        return f"a prior on {without[0]}, or {second}"
+    tighter = f", or a tighter prior on {slopes[0]} than the one given" if slopes else ""
+    return f"{second}, more settings{tighter}"
+
+
+SCENARIO = Scenario(
+    "calibration",
+    _state,
+    _parameters,
+    _null_directions,
+    _remedy,
+    aside=", and the emittance hardly does",
+)

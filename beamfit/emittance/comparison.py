@@ -1,0 +1,407 @@
+"""Is there a beam, and how sure is its emittance? One posterior for every answer of a scan."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from beamfit.emittance.beam_draws import (
+    FURTHEST,
+    BeamDraws,
+    Coordinates,
+    coordinates,
+    draw_beams,
+)
+from beamfit.emittance.model import coefficients
+from beamfit.emittance.rivals import curve_evidences, flat_beam
+from beamfit.noise.model import Noise
+from beamfit.noise.sizes import (
+    Kind,
+    Scales,
+    averaged,
+    kinds_of,
+    log_odds,
+    squared_pulls,
+    variance_of,
+)
+
+# What scans turn out to be, before their sizes are seen: most are scans of a beam.
+MODELS = {
+    "beam": 0.85,
+    "beam of no emittance": 0.03,
+    "one constant size": 0.03,
+    "sizes at random": 0.04,
+    "sizes that drift": 0.02,
+    "a smooth curve that is no beam's": 0.03,
+}
+BEAM, FLAT = "beam", "beam of no emittance"
+# Of rows that moved no magnet only a beam and sizes at random are possible.
+UNMOVED = {BEAM: 0.9, FLAT: 0.05, "sizes at random": 0.05}
+# Models are told apart by at most so many points, evenly among all: the beam by every one.
+COMPARED = 100
+# Planes that are looked at in one call, and rounds of the best fit and when it rests.
+TOGETHER, ROUNDS, REST = 16, 40, 1e-11
+
+
+class PlaneSizes(NamedTuple):
+    """The sizes of one plane and how they were seen, arrays of shape (n,).
+
+    Attributes
+    ----------
+    r11, r12, known : ndarray
+        Transfer-matrix elements (R12 in m), and size² that is not due to the beam, m².
+    size : ndarray
+        m.
+    error : ndarray or None
+        Stated errors, or those of means of shots, m.
+    of_shots : bool
+        Whether they are the latter.
+    moved : bool
+        Whether a magnet was.
+    """
+
+    r11: np.ndarray
+    r12: np.ndarray
+    known: np.ndarray
+    size: np.ndarray
+    error: np.ndarray | None
+    of_shots: bool
+    moved: bool
+
+    def thinned(self, number: int) -> PlaneSizes:
+        """So many points, evenly among all."""
+        at = np.linspace(0, len(self.size) - 1, number).astype(int)
+        error = None if self.error is None else self.error[at]
+        rows = self.r11[at], self.r12[at], self.known[at], self.size[at]
+        return PlaneSizes(*rows, error, self.of_shots, self.moved)
+
+    @property
+    def likeness(self) -> tuple:
+        """What planes have in common that are compared in one call."""
+        if self.error is None:
+            return len(self.size), "none", self.moved
+        share = self.error / self.size
+        same = np.ptp(share) <= 0.01 * share.mean()
+        word = "shots" if self.of_shots else "share" if same else "stated"
+        return len(self.size), word, self.moved
+
+
+class PlanePosterior(NamedTuple):
+    """What the sizes of a plane say, the noise averaged over.
+
+    Attributes
+    ----------
+    probability : dict of str to float
+        Of a beam and of its rivals.
+    sigma, weight : ndarray
+        Draws of σ11, σ12, σ22 in SI, shape (d, 3), and their weights, which sum to 1.
+    best : ndarray
+        Shape (3,): σ that fits best, or the mean of the draws where that is no beam.
+    positive : bool
+        Whether the best one is a beam.
+    covariance, stated : ndarray
+        Shape (3, 3): of the best σ by linear theory, with the errors found and with those stated
+        (NaN without); NaN where the settings do not separate the three numbers.
+    model, error, bad : ndarray
+        Shape (n,): fitted sizes and the errors found, m, and the probability of a bad reading.
+    scale : ndarray
+        Shape (3,): median and central 68 % of the scale of the noise.
+    relative : float
+        Probability that errors are shares of the size.
+    chi2 : float
+        By the stated errors; NaN without.
+    seen : bool
+        Whether the settings separate the numbers of the beam.
+    kinds, scales : tuple
+        Kinds of noise and their nodes, in units of ``unit``.
+    by_scale : tuple of ndarray
+        Log evidence of a beam at every node of each kind.
+    unit : float
+        The mean size, m.
+    trace : ndarray
+        Shape (3,): T of the prior is ``trace @ sigma``.
+    """
+
+    probability: dict[str, float]
+    sigma: np.ndarray
+    weight: np.ndarray
+    best: np.ndarray
+    positive: bool
+    covariance: np.ndarray
+    stated: np.ndarray
+    model: np.ndarray
+    error: np.ndarray
+    bad: np.ndarray
+    scale: np.ndarray
+    relative: float
+    chi2: float
+    seen: bool
+    kinds: tuple[Kind, ...]
+    scales: tuple[Scales, ...]
+    by_scale: tuple[np.ndarray, ...]
+    unit: float
+    trace: np.ndarray
+
+    @property
+    def cause(self) -> str:
+        """The likeliest model."""
+        return max(self.probability, key=self.probability.__getitem__)
+
+
+def compare(
+    planes: Sequence[PlaneSizes],
+    noise: Noise,
+    method: str = "size_squared",
+    weights: str = "model",
+) -> list[PlanePosterior]:
+    """Compare a beam with its rivals in each of many planes.
+
+    Parameters
+    ----------
+    planes : sequence of PlaneSizes
+        Those that are alike are looked at in one call.
+    noise : Noise
+        Priors of the noise.
+    method : {"size_squared", "size"}
+        Which residual the best fit makes small.
+    weights : {"model", "measured"}
+        Whose size its errors are taken at.
+
+    Returns
+    -------
+    list of PlanePosterior
+
+    Notes
+    -----
+    Evidences are integrals of the likelihood over the prior; their ratios times the priors' are
+    the odds of the models (D. J. C. MacKay, Information Theory, Inference, and Learning Algorithms
+    (2003), eq. 28.4). All models share the noise.
+    """
+    found: list[PlanePosterior | None] = [None] * len(planes)
+    alike: dict[tuple, list[int]] = {}
+    for i, plane in enumerate(planes):
+        alike.setdefault(plane.likeness, []).append(i)
+    for members in alike.values():
+        for start in range(0, len(members), TOGETHER):
+            own = members[start : start + TOGETHER]
+            for i, posterior in zip(
+                own, _compared([planes[i] for i in own], noise, method, weights), strict=True
+            ):
+                found[i] = posterior
+    return found
+
+
+class _Stack(NamedTuple):
+    """Planes that are alike, in their own coordinates: arrays begin with the planes."""
+
+    c: Coordinates
+    u: np.ndarray
+    kinds: tuple[Kind, ...]
+
+
+def _stacked(planes: Sequence[PlaneSizes], noise: Noise) -> _Stack:
+    r11, r12, known, size = (np.stack([p[i] for p in planes]) for i in range(4))
+    c = coordinates(r11, r12, size, known)
+    first, error = planes[0], None
+    if first.error is not None:
+        error = np.stack([p.error for p in planes]) / c.unit[:, None]
+    floor = error if first.of_shots else None
+    kinds = kinds_of(noise, c.size, None if first.of_shots else error, floor)
+    return _Stack(c, np.stack([r11, r12], -1), kinds)
+
+
+def _compared(
+    planes: Sequence[PlaneSizes], noise: Noise, method: str, weights: str
+) -> list[PlanePosterior]:
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        s = _stacked(planes, noise)
+        draws = [draw_beams(s.c, kind, noise) for kind in s.kinds]
+        few, own = s, draws
+        if s.c.size.shape[-1] > COMPARED:
+            few = _stacked([p.thinned(COMPARED) for p in planes], noise)
+            own = [draw_beams(few.c, kind, noise) for kind in few.kinds]
+        evidence = np.array([_evidences(few, i, d, noise) for i, d in enumerate(own)])
+        of_kind = np.logaddexp.reduce(evidence, axis=-1)
+        of_kind = np.exp(of_kind - np.logaddexp.reduce(of_kind, axis=0))
+        best = _best(s, draws, of_kind, noise, method, weights)
+    every = np.logaddexp.reduce(evidence, axis=0)
+    prior = MODELS if planes[0].moved else UNMOVED
+    log = every + np.log([prior.get(name, 1e-300) for name in MODELS])
+    log = np.where(np.isfinite(log), log, -1e300)
+    probability = np.exp(log - np.logaddexp.reduce(log, axis=-1)[:, None])
+    return [
+        _posterior(plane, i, s, draws, of_kind[:, i], probability[i], best, noise, weights)
+        for i, plane in enumerate(planes)
+    ]
+
+
+def _evidences(s: _Stack, i: int, draws: BeamDraws, noise: Noise) -> np.ndarray:
+    """Log evidences of all models under one kind of noise, as densities of ln size."""
+    kind = s.kinds[i]
+    beam = averaged(draws.log_weight, 0.0)
+    # Noise in proportion to the size would vanish where such a beam does.
+    flat = np.full_like(beam, -np.inf)
+    if not kind.power:
+        flat = flat_beam(s.c, kind, noise)
+    elif len(s.kinds) == 1:
+        flat = flat_beam(s.c, kind._replace(power=0, unit=kind.unit * s.c.size), noise)
+    jacobian = np.log(s.c.size).sum(-1)
+    curves = curve_evidences(s.u, s.c, kind, noise)
+    return np.stack([beam + jacobian, flat + jacobian, *curves], -1)
+
+
+class _Best(NamedTuple):
+    """The best fit of planes: T, T p, normal matrix, model, precision and doubt of their points."""
+
+    x: np.ndarray
+    normal: np.ndarray
+    model: np.ndarray
+    precision: np.ndarray
+    bad: np.ndarray
+
+
+def _best(
+    s: _Stack,
+    draws: Sequence[BeamDraws],
+    of_kind: np.ndarray,
+    noise: Noise,
+    method: str,
+    weights: str,
+) -> _Best:
+    """Find the weighted least squares at the expected precision of every point.
+
+    How large the noise is comes from its posterior, which of the points are bad from the last fit
+    (expectation and maximisation; A. P. Dempster, N. M. Laird and D. B. Rubin, J. R. Stat. Soc. B
+    39, 1 (1977)).
+    """
+    c, rows = s.c, s.c.rows
+    top = np.array([d.best_log for d in draws]) + np.log(np.maximum(of_kind, 1e-300))
+    first = np.argmax(top, axis=0)
+    x = np.array([d.best for d in draws])[first, np.arange(len(first))]
+    rests = np.zeros(len(x), bool)
+    for _ in range(ROUNDS):
+        model = _model(x, c)
+        parts = [
+            _expected(model, c, kind, d, noise) for kind, d in zip(s.kinds, draws, strict=True)
+        ]
+        precision = sum(w[:, None] * p for w, (p, _) in zip(of_kind, parts, strict=True))
+        if method == "size_squared":
+            target, at = c.size**2, model if weights == "model" else c.size
+        else:  # size² that is as far from the model's as the size is, in first order
+            target, at = model**2 + 2.0 * model * (c.size - model), model
+        scale = np.sqrt(precision) / (2.0 * at)
+        design = rows * scale[..., None]
+        normal = np.swapaxes(design, -1, -2) @ design
+        trace = np.trace(normal, axis1=-2, axis2=-1)[:, None, None]
+        last = x
+        right = np.swapaxes(design, -1, -2) @ ((target - c.known) * scale)[..., None]
+        x = np.linalg.solve(normal + 1e-14 * trace * np.eye(3), right)[..., 0]
+        # A plane that rests stays, whatever the others do.
+        x = np.where(rests[:, None], last, x)
+        rests |= np.abs(x - last).max(-1) < REST * np.abs(x).max(-1)
+        if rests.all():
+            break
+    bad = sum(w[:, None] * b for w, (_, b) in zip(of_kind, parts, strict=True))
+    return _Best(x, normal, _model(x, c), precision, bad)
+
+
+def _model(x: np.ndarray, c: Coordinates) -> np.ndarray:
+    squared = (c.rows @ x[..., None])[..., 0] + c.known
+    return np.sqrt(np.clip(squared, (c.size / FURTHEST) ** 2, (c.size * FURTHEST) ** 2))
+
+
+def _expected(
+    model: np.ndarray, c: Coordinates, kind: Kind, draws: BeamDraws, noise: Noise
+) -> tuple[np.ndarray, np.ndarray]:
+    """Expected precision of each point's size, and probability that it is bad, (planes, n)."""
+    off, model = (c.size - model)[:, None, :], model[:, None, :]
+    scale, share = draws.scales.scale, draws.scale_weight[..., None]
+    z2 = squared_pulls(off, model, kind, scale)
+    odds = np.moveaxis(log_odds(z2, kind, noise)[..., 0, :], 0, -1)
+    bad = 1.0 / (1.0 + np.exp(-odds))
+    wide = (noise.width * kind.usual[:, None, :]) ** -2
+    each = (1.0 - bad * (1.0 - wide)) / variance_of(kind, scale)
+    return (share * each).sum(1) / model[:, 0] ** (2 * kind.power), (share * bad).sum(1)
+
+
+def _posterior(
+    plane: PlaneSizes, i: int, s: _Stack, draws: Sequence[BeamDraws], of_kind: np.ndarray,
+    probability: np.ndarray, best: _Best, noise: Noise, weights: str,
+) -> PlanePosterior:  # fmt: skip
+    c = Coordinates(*(part[i] for part in s.c))
+    log = np.concatenate([d.log_weight[i] for d in draws])
+    weight = np.exp(log - log.max()) if np.isfinite(log.max()) else np.ones(len(log))
+    weight /= weight.sum()
+    sigma = c.sigma(np.concatenate([d.x[i] for d in draws]))
+    found, unit = c.sigma(best.x[i][None])[0], float(c.unit)
+    positive = bool(found[0] > 0 and found[0] * found[2] > found[1] ** 2) and bool(c.seen)
+    model = best.model[i] * unit
+    error = unit / np.sqrt(best.precision[i])
+    weighed = model if weights == "model" else plane.size
+    rows = np.stack(coefficients(plane.r11, plane.r12), -1) / (2.0 * weighed)[:, None]
+    none = np.full((3, 3), np.nan)
+    stated, chi2 = none, math.nan
+    if plane.error is not None:
+        own = plane.error * (model / plane.size if plane.likeness[1] == "share" else 1.0)
+        stated = _covariance(rows / own[:, None]) if c.seen else none
+        chi2 = float(np.sum(((plane.size - model) / own) ** 2))
+    turned = np.linalg.inv(c.back * unit)
+    trace = turned.T @ turned
+    return PlanePosterior(
+        probability=dict(zip(MODELS, map(float, probability), strict=True)),
+        sigma=sigma,
+        weight=weight,
+        best=found
+        if positive
+        else np.maximum(weight, 0.0) @ np.where(weight[:, None] > 0, sigma, 0.0),
+        positive=positive,
+        covariance=_covariance(rows / error[:, None]) if c.seen else none,
+        stated=stated,
+        model=model,
+        error=error,
+        bad=best.bad[i],
+        scale=_scale_of(i, draws, of_kind),
+        relative=float(sum(w * k.power for w, k in zip(of_kind, s.kinds, strict=True))),
+        chi2=chi2,
+        seen=bool(c.seen),
+        kinds=tuple(_of_plane(k, i) for k in s.kinds),
+        scales=tuple(Scales(*(part[i] for part in d.scales)) for d in draws),
+        by_scale=tuple(d.by_scale[i] for d in draws),
+        unit=unit,
+        trace=np.array([trace[0, 0], 2.0 * trace[0, 1], trace[1, 1]]),
+    )
+
+
+def _of_plane(kind: Kind, i: int) -> Kind:
+    """A kind of noise of one plane of many."""
+    return kind._replace(floor=kind.floor[i], unit=kind.unit[i], usual=kind.usual[i])
+
+
+def _covariance(rows: np.ndarray) -> np.ndarray:
+    """Inverse of rowsᵀrows, by QR with unit columns."""
+    norm = np.linalg.norm(rows, axis=0)
+    r = np.linalg.qr(rows / norm, mode="r")
+    half = np.linalg.solve(r, np.eye(3)) / norm[:, None]
+    return half @ half.T
+
+
+def _scale_of(i: int, draws: Sequence[BeamDraws], of_kind: np.ndarray) -> np.ndarray:
+    """Median and central 68 % of the scale of the likelier kind of noise."""
+    own = draws[int(np.argmax(of_kind))]
+    return weighted_quantiles(own.scales.scale[i], own.scale_weight[i], (0.5, 0.1587, 0.8413))
+
+
+def weighted_quantiles(values: np.ndarray, weight: np.ndarray, at: Sequence[float]) -> np.ndarray:
+    """Quantiles of weighted draws, shape (d,).
+
+    Examples
+    --------
+    >>> weighted_quantiles(np.array([3.0, 1.0, 2.0]), np.ones(3), (0.5,)).tolist()
+    [2.0]
+    """
+    order = np.argsort(values)
+    heap = np.cumsum(weight[order])
+    return np.interp(np.asarray(at) * heap[-1], heap - 0.5 * weight[order], values[order])

@@ -1,0 +1,409 @@
+"""The emittance fit: a scan and a line in, a judged result out, in every scenario by one path."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+from html import escape
+from typing import TYPE_CHECKING, Any
+
+from beamfit.emittance.assumptions import Anchor, Assumptions
+from beamfit.emittance.known import METHODS, WEIGHTS, judged_beam, prepared, see
+from beamfit.emittance.model import line_of
+from beamfit.emittance.predicted import Prediction, correlations_of, predicted_sizes
+from beamfit.emittance.questions import of_emittances, of_priors, questions
+from beamfit.emittance.results import Parameter, PlaneFit, parameter_rows, result_rows
+from beamfit.emittance.scan import QuadScan
+from beamfit.emittance.statement import Scenario, Seen, scenario_of
+from beamfit.errors import InputError, expect
+from beamfit.frames import quantity_frame
+from beamfit.greybox.problem import Problem
+from beamfit.noise.model import ROBUST, Noise
+from beamfit.optics.beamline import Beamline
+from beamfit.quantity import Quantity
+from beamfit.shown import shown
+from beamfit.table import Table, html_of, json_of, labelled, text_of
+
+if TYPE_CHECKING:
+    from pandas import DataFrame
+
+    from beamfit.greybox.fit import Fit
+    from beamfit.sampling.intervals import Correlations
+    from beamfit.sampling.posterior import Posterior
+    from beamfit.sampling.priors import Distribution
+
+
+def fit_emittance(
+    scan: QuadScan,
+    line: Beamline | None = None,
+    *,
+    planes: tuple[str, ...] | None = None,
+    method: str = "size_squared",
+    robust: bool = False,
+    noise: Noise | None = None,
+    weights: str = "model",
+    scenario: str = "known",
+    priors: Mapping[str, tuple[float, float]] | None = None,
+    bounds: Mapping[str, tuple[float, float]] | None = None,
+    gains: Mapping[str, tuple[float, float]] | None = None,
+    anchor: Anchor | None = None,
+    hysteresis: bool = False,
+    hidden: int = 5,
+    starts: int = 20,
+    seed: int = 0,
+) -> EmittanceFit:
+    """Fit the beam matrix at the start of a line to a scan, and judge the result.
+
+    Parameters
+    ----------
+    scan : QuadScan
+        The measured sizes.
+    line : Beamline, optional
+        The line, from where the beam matrix is wanted to the screens. Rows with matrices of their
+        own have none; the beam is then that where the matrices begin.
+    planes : tuple of str, optional
+        ("x",), ("y",) or both; all planes of the scan if None.
+    method : {"size_squared", "size"}
+        The residual: the report's ``error_linear`` or ``error_nonlinear``.
+    robust : bool
+        Expect bad readings: one in ten, where the usual prior is 3 %.
+    noise : Noise, optional
+        Priors of the noise of sizes; `beamfit.Noise()` if None.
+    weights : {"model", "measured"}
+        Whose size the errors of size² are taken at. That of the model has no part in the noise;
+        with the measured one, as older programs have it, the emittance comes out too small, by
+        3 to 7 times the square of the relative size error.
+    scenario : {"known", "transport-network", "calibration", "focusing-network"}
+        What is unknown besides the beam: nothing; R11 and R12; slope and offset of the scanned
+        magnets' calibration; k1 as a function of the current. All planes are then fitted
+        together. See docs/scenarios.md for what each cannot know.
+    priors, bounds : mapping of str to (float, float), optional
+        Calibration number, such as "Q2.slope", to mean and standard deviation, or to lower and
+        upper bound ("calibration"). In any scenario also priors on screen, beam and line, which
+        become part of the error: "size_scale", "resolution", "wire" (m), "energy", "dispersion"
+        (m), "dispersion_slope", "NAME.gradient", "NAME.length" (m); see docs/systematics.md.
+        Bounds of a "transport-network" are the box of the beam ("x.sigma11", SI) and that of the
+        network's inputs ("Q2"), over which its gains keep to their signs or limits.
+    gains : mapping of str to (float, float), optional
+        Limits of gains in place of their signs, such as {"dA_x/dQ2": (-inf, -0.0083)}, for the
+        report's own network without scales ("transport-network").
+    anchor : Anchor, optional
+        What ties a network to first principles.
+    hysteresis : bool
+        Two branches of k1, for rising and falling currents ("focusing-network").
+    hidden, starts, seed : int
+        Hidden nodes of a network, starts of its training, seed of their random numbers.
+
+    Returns
+    -------
+    EmittanceFit
+        Values, errors, statuses and sentences; `print` it.
+
+    Raises
+    ------
+    InputError
+        If the line lacks a magnet or screen of the scan, or an option is unknown.
+
+    Notes
+    -----
+    One beam matrix at the start is common to all rows. Where their energies differ it is that of
+    the mean energy, and scales with 1/βγ: the normalised emittance is common. Values are those
+    that fit best; errors are half of the central 68 % of the posterior, the noise averaged over;
+    see docs/emittance.md and docs/verdict.md.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from beamfit.optics.beam import BeamMatrix
+    >>> from beamfit.optics.elements import Drift, Quadrupole, Screen
+    >>> line = Beamline((Quadrupole("Q", 0.1), Drift("D", 2.0), Screen("S")), energy=135.0)
+    >>> k1 = np.linspace(-2.0, 12.0, 8)
+    >>> sizes = [float(BeamMatrix.from_twiss(2e-9, 5.0, 0.0).transport(
+    ...     line.matrix({"Q": k}).x).l11) for k in k1]
+    >>> scan = QuadScan({"Q": k1}, {"Q": "k1"}, {"x": sizes}, {"x": 0.02 * np.array(sizes)})
+    >>> fit = fit_emittance(scan, line)
+    >>> fit.x.status.value, f"{fit.x.emittance.value * 1e9:.4f} nm"
+    ('converged', '2.0000 nm')
+    """
+    expect(scan, QuadScan, "beamfit.read_quad_scan(path)")
+    if line is not None:
+        expect(line, Beamline, "beamfit.load_lattice(path)")
+    for name, given, known in (("method", method, METHODS), ("weights", weights, WEIGHTS)):
+        if given not in known:
+            raise InputError(f"{name} '{given}'", " or ".join(known))
+    ties = (gains or {}, anchor or Anchor(), hysteresis)
+    told = Assumptions(priors or {}, bounds or {}, *ties, hidden, starts, seed)
+    told.check_scenario(scenario)
+    noise = replace(noise or Noise(), bad=ROBUST) if robust else noise
+    scan, line = prepared(scan, line, scenario)
+    statement = scenario_of(scenario)
+    if told.systematics:
+        from beamfit.emittance.systematics import with_systematics
+
+        statement = with_systematics(statement, told)
+    seen = see(scan, line, planes, method, noise, weights)
+    if statement.closed:
+        return EmittanceFit(judged_beam(seen), scan, line, statement, told, seen)
+
+    from beamfit.emittance.scenario_fit import judged_scenario, settled_fit  # loads the solvers
+
+    fit, seen = settled_fit(seen, statement, told)
+    parameters = tuple(statement.parameters(seen, told, fit))
+    found = line_of(fit.model, seen.scanned)
+    judged = judged_scenario(fit, seen, found, statement, told, parameters)
+    identified = all(p.identifiability.determined for p in judged)
+    left = statement.null_directions(seen, parameters, identified)
+    return EmittanceFit(judged, scan, found, statement, told, seen, parameters, left, fit)
+
+
+@shown
+@dataclass(frozen=True, eq=False)
+class EmittanceFit:
+    """A fitted scan, printed as a table: one `PlaneFit` a plane, with the scan and its line.
+
+    Attributes
+    ----------
+    planes : tuple of PlaneFit
+        One a plane.
+    scan : QuadScan
+        The scan.
+    line : Beamline
+        The line; in a scenario with the calibration or the network of k1 as fitted.
+    statement : Scenario
+        What was unknown besides the beam.
+    told : Assumptions
+        What was known besides the data.
+    seen : Seen
+        The scan through the line as it was given.
+    parameters : tuple of Parameter
+        Numbers fitted besides the beam.
+    null_directions : tuple of str
+        Changes of the unknowns that leave the sizes as they are.
+    solved : Fit or None
+        The grey-box fit where there was one; None where the fit is linear and in closed form.
+
+    Examples
+    --------
+    >>> from beamfit.optics.beamline import Beamline
+    >>> from beamfit.optics.elements import Drift, Quadrupole, Screen
+    >>> line = Beamline((Quadrupole("Q", 0.1), Drift("D", 2.0), Screen("S")), 135.0)
+    >>> sizes = [3.4e-4, 1.9e-4, 0.9e-4, 1.9e-4, 3.4e-4]
+    >>> scan = QuadScan({"Q": [-1.0, 1.5, 4.0, 6.5, 9.0]}, {"Q": "k1"}, {"x": sizes})
+    >>> fit = fit_emittance(scan, line)
+    >>> [p.plane for p in fit.planes], fit.x.dof
+    (['x'], 2)
+    """
+
+    planes: tuple[PlaneFit, ...]
+    scan: QuadScan
+    line: Beamline
+    statement: Scenario
+    told: Assumptions
+    seen: Seen
+    parameters: tuple[Parameter, ...] = ()
+    null_directions: tuple[str, ...] = ()
+    solved: Fit | None = None
+
+    @property
+    def headline(self) -> str:
+        """The scan, the line, and what was found in each plane, in a line."""
+        found = "; ".join(p.headline for p in self.planes)
+        return f"{self.scan.name} on {self.line.name}: {found}"
+
+    @property
+    def scenario(self) -> str:
+        """The name of the scenario."""
+        return self.statement.name
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What was done to the numbers of the file, and what is odd about them, in sentences."""
+        measured = self.seen.weights == "measured"
+        own = ("Errors of size squared are taken at the measured sizes, on request.",) * measured
+        asked = (
+            *questions(self.scan, self.seen.scanned),
+            *of_priors(self.told.priors, self.seen.scanned),
+            *of_emittances(self.planes),
+        )
+        return (*self.scan.notes, *asked, *own)
+
+    @property
+    def anchor(self) -> str:
+        """What ties a network to first principles, in words."""
+        return self.told.anchor.words
+
+    @cached_property
+    def stated(self) -> Problem:
+        """The grey-box problem of all planes together, starting from first principles.
+
+        Numbers of the beam are ``beam.x.l11``, ``beam.x.l21``, ``beam.x.l22``: the Cholesky factor
+        of σ in units of 1e-4 (m, rad); those of a calibration ``magnets.Q2.slope`` and so on.
+        """
+        return self.statement.state(self.seen, self.told)
+
+    @cached_property
+    def fit(self) -> Fit:
+        """The grey-box fit; of a linear one solved when it is asked for, from its closed form."""
+        from beamfit.greybox.solve import solve
+
+        return solve(self.stated) if self.solved is None else self.solved
+
+    @property
+    def problem(self) -> Problem:
+        """The problem as it was fitted or could be."""
+        return self.stated if self.solved is None else self.solved.problem
+
+    def __getitem__(self, plane: str) -> PlaneFit:
+        found = {p.plane: p for p in self.planes}
+        if plane not in found:
+            raise self.scan.unusable(f"no fit of plane '{plane}'", " or ".join(found))
+        return found[plane]
+
+    @property
+    def x(self) -> PlaneFit:
+        """The fit of the x plane."""
+        return self["x"]
+
+    @property
+    def y(self) -> PlaneFit:
+        """The fit of the y plane."""
+        return self["y"]
+
+    def sample(
+        self,
+        planes: tuple[str, ...] | None = None,
+        *,
+        priors: Mapping[str, Distribution] | None = None,
+        **options: Any,
+    ) -> Posterior:
+        """Draw σ of the planes from the posterior that the fit quotes.
+
+        Parameters
+        ----------
+        planes : tuple of str, optional
+            Which; all that were fitted if None.
+        priors
+            As `beamfit.emittance.posterior.beam_target`, on ``x.sigma11`` and so
+            on; in a scenario also on the further names of its ``problem``.
+        **options
+            ``seed, target_ess, budget, walkers, store, provenance, progress`` of
+            `beamfit.sampling.ensemble.draw`.
+
+        Returns
+        -------
+        Posterior
+            Of ``x.sigma11`` ... and what else a scenario fitted; ``x.emittance``,
+            ``x.normalized_emittance``, ``x.beta``, ``x.alpha``, ``x.mismatch`` are derived.
+
+        Raises
+        ------
+        InputError
+            As `beam_target` and `draw`.
+        """
+        from beamfit.emittance.posterior import beam_target
+        from beamfit.sampling.ensemble import draw
+
+        return draw(beam_target(self, planes, priors), **options)
+
+    def predict(
+        self, settings: Mapping[str, Any], plane: str | None = None, *, screen: str | None = None
+    ) -> Prediction:
+        """Predict the sizes of the fitted beam at other settings, with their errors.
+
+        Parameters
+        ----------
+        settings : mapping of str to float or array
+            Magnet to settings, shape (n,) or one number for all, in the unit of the scan's column
+            (of the lattice for a magnet that was not scanned). Others are as the lattice has them.
+        plane : str, optional
+            "x" or "y"; the first that was fitted if None.
+        screen : str, optional
+            Where; the scan's last screen if None.
+
+        Returns
+        -------
+        Prediction
+            ``size`` and ``error`` in m, shape (n,), at the mean energy of the scan.
+
+        Raises
+        ------
+        InputError
+            If a magnet or screen is not in the line, or the fit knows the transport at the
+            measured rows alone.
+
+        Examples
+        --------
+        >>> from beamfit.optics.elements import Drift, Quadrupole, Screen
+        >>> line = Beamline((Quadrupole("Q", 0.1), Drift("D", 2.0), Screen("S")), 135.0)
+        >>> sizes = [3.4e-4, 1.9e-4, 0.9e-4, 1.9e-4, 3.4e-4]
+        >>> scan = QuadScan({"Q": [-1.0, 1.5, 4.0, 6.5, 9.0]}, {"Q": "k1"}, {"x": sizes})
+        >>> fit_emittance(scan, line).predict({"Q": [0.0, 2.0]}).size.round(5).tolist()
+        [0.00028, 0.00016]
+        """
+        return predicted_sizes(self, settings, plane or self.planes[0].plane, screen)
+
+    def correlations(self, plane: str | None = None) -> Correlations:
+        """Correlation coefficients of one plane's σ11, σ12, σ22, emittance, β and α.
+
+        Parameters
+        ----------
+        plane : str, optional
+            "x" or "y"; the first that was fitted if None.
+
+        Returns
+        -------
+        Correlations
+            ``names`` and ``values``, shape (6, 6); NaN where the data do not determine the beam.
+        """
+        return correlations_of(self[plane or self.planes[0].plane])
+
+    def to_frame(self) -> DataFrame:
+        """Give a pandas data frame of all numbers, one row for each plane and quantity.
+
+        Columns are value, error, error_raw, low_95, high_95 (NaN where there is none) and unit.
+
+        Raises
+        ------
+        InputError
+            If pandas is not installed.
+        """
+        rows = {(p.plane, n): q for p in self.planes for n, q in p.quantities.items()}
+        return quantity_frame(rows, ("plane", "quantity"))
+
+    def to_json(self) -> list[dict[str, Any]]:
+        """Give the ``results`` list of the JSON contract."""
+        line = {"name": self.line.name, "sha256": self.seen.line.digest}
+        common = {"slice": self.scan.slices[0]} if self.scan.slices else {}
+        common |= {"line": line} | ({"notes": list(self.notes)} if self.notes else {})
+        energy = Quantity(self.seen.energy, None, "MeV").to_json()
+        entries = [p.to_json() | {"energy": energy} | common for p in self.planes]
+        own = {
+            "scenario": self.scenario,
+            "anchor": self.anchor,
+            "parameters": json_of(self.parameters),
+            "null_directions": list(self.null_directions),
+        }
+        return entries if self.statement.closed else [entry | own for entry in entries]
+
+    @property
+    def _table(self) -> Table:
+        return labelled("", [p.plane for p in self.planes], result_rows(self.planes))
+
+    def __str__(self) -> str:
+        heading = f"{self.scan.name} on {self.line.name}, fit of {self.planes[0].method}"
+        lines = [heading.replace("_", " "), ""]
+        lines += [f"{p.headline}. {p.message}" for p in self.planes]
+        lines += ["", text_of(self._table)]
+        lines += ["", *self.notes] if self.notes else []
+        if not self.statement.closed:
+            rows = parameter_rows(self.parameters)
+            lines += ["", f"scenario {self.scenario}, anchor: {self.anchor}"]
+            lines += [text_of(Table("", [], rows))] if rows else []
+            lines += [f"Left open: {words}." for words in self.null_directions]
+        return "\n".join(lines)
+
+    def _repr_html_(self) -> str:
+        said = (f"<p><b>{escape(p.headline)}.</b> {escape(p.message)}</p>" for p in self.planes)
+        more = (f"<p>{escape(note)}</p>" for note in self.notes)
+        return "".join((*said, html_of(self._table), *more))

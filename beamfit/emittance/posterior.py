@@ -1,0 +1,301 @@
+"""The posterior of a scan for the sampler: that of the fit, the noise averaged over."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple, Protocol
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from beamfit.emittance.assumptions import Assumptions
+from beamfit.emittance.beam_draws import BRIGHT
+from beamfit.emittance.model import (
+    QUANTITIES,
+    UNIT,
+    Asked,
+    asked_numbers,
+    sigma_of,
+    size_squared,
+    spoken,
+)
+from beamfit.emittance.results import PlaneFit
+from beamfit.emittance.statement import Scenario, Seen, asked_in, factor_of, size_records
+from beamfit.errors import InputError
+from beamfit.greybox import tree
+from beamfit.greybox.fit import Fit
+from beamfit.greybox.posterior import predicted, target_of
+from beamfit.greybox.problem import Problem
+from beamfit.greybox.stated import Optimum, Statement
+from beamfit.noise.model import Lognormal, Noise
+from beamfit.noise.sizes import Kind, averaged, log_likelihood
+from beamfit.optics.beam import BeamMatrix
+from beamfit.quantity import Status
+from beamfit.sampling.intervals import Expected
+from beamfit.sampling.posterior import Posterior
+from beamfit.sampling.priors import Distribution
+from beamfit.sampling.target import SamplingTarget as Target
+from beamfit.verdict import Finding
+
+CHOLESKY, SIGMA = ("l11", "l21", "l22"), ("sigma11", "sigma12", "sigma22")
+TWISS = ("emittance", "normalized_emittance", "beta", "alpha", "mismatch")
+PLACES = np.array([list(QUANTITIES).index(name) for name in TWISS])
+OPEN = "the scan does not determine sigma11, sigma12 and sigma22"
+
+
+class Scanned(Protocol):
+    """A fitted scan, of any scenario."""
+
+    planes: tuple[PlaneFit, ...]
+    statement: Scenario
+    told: Assumptions
+    seen: Seen
+    solved: Fit | None
+
+
+def _quoted(model: Mapping[str, Any]) -> dict[str, Any]:
+    """σ in SI in the place of its Cholesky factor."""
+    beams = model["beam"].items()
+    sigmas = {plane: dict(zip(CHOLESKY, sigma_of(beam), strict=True)) for plane, beam in beams}
+    return {**model, "beam": sigmas}
+
+
+def _own(model: Mapping[str, Any]) -> dict[str, Any]:
+    """The Cholesky factor of σ again, NaN where it is not positive definite."""
+    beams = {}
+    for plane, sigma in model["beam"].items():
+        s11, s12, s22 = (sigma[name] / UNIT**2 for name in CHOLESKY)
+        l11 = jnp.sqrt(s11)
+        beams[plane] = {"l11": l11, "l21": s12 / l11, "l22": jnp.sqrt(s22 - s12**2 / s11)}
+    return {**model, "beam": beams}
+
+
+@tree.node("power", "special", "chance", "least", "log_weight", "prior")
+class AveragedNoise:
+    """One kind of noise of a plane with its nodes, in units of the mean size."""
+
+    power: int
+    special: float
+    chance: float
+    least: float
+    log_weight: float
+    prior: tuple[float, float]
+    floor: Any
+    unit: Any
+    usual: Any
+    scale: Any
+    log_scale_weight: Any
+
+    @property
+    def kind(self) -> Kind:
+        """The same as the likelihood takes it."""
+        named = (self.power, self.floor, self.unit, self.usual, Lognormal(*self.prior))
+        return Kind(*named, self.special, self.chance, self.least, self.log_weight)
+
+
+@tree.node("plane", "noise")
+class Sizes:
+    """The sizes of a plane for its likelihood: where its rows are, what was measured, its noise."""
+
+    plane: str
+    noise: Noise
+    rows: Any
+    used: Any
+    size: Any
+    unit: Any
+    trace: Any
+    kinds: tuple[AveragedNoise, ...]
+
+    def log_density(self, model: Mapping[str, Any]) -> Array:
+        """Log likelihood of the sizes, the noise averaged over, with the prior of the beam."""
+        sigma = sigma_of(model["beam"][self.plane])
+        squared = size_squared(sigma, *(v[self.used] for v in self.rows.elements(model)))
+        found = jnp.sqrt(jnp.maximum(squared, 1e-300))[None] / self.unit
+        off, parts = self.size[None] - found, []
+        for each in self.kinds:
+            log = log_likelihood(off, found, each.kind, each.scale, self.noise)[0]
+            parts.append(averaged(log, each.log_scale_weight) + each.log_weight)
+        bright = jnp.log(jnp.maximum(self.trace @ sigma, 1e-300))
+        determinant = jnp.maximum(sigma[0] * sigma[2] - sigma[1] ** 2, 1e-300)
+        prior = -2.0 * bright - 0.5 * (bright / BRIGHT) ** 2 - 0.5 * jnp.log(determinant)
+        return averaged(jnp.stack(parts), 0.0) + prior
+
+
+class Told(NamedTuple):
+    """Data of the functions of a scan's statement."""
+
+    asked: tuple[Asked, ...]
+    sizes: tuple[Sizes, ...]
+
+
+def _log_volume(model: Mapping[str, Any], told: Told) -> Array:
+    """The density of the sizes, whose noise is averaged over, and the prior of the beams."""
+    return sum((each.log_density(model) for each in told.sizes), jnp.zeros(()))
+
+
+def _sizes_of(problem: Problem, seen: Seen, planes: Sequence[str]) -> tuple[Sizes, ...]:
+    """What the likelihood needs of each plane."""
+    records, found = size_records(problem), []
+    for plane in planes:
+        work = seen.works[plane]
+        post = work.posterior
+        kinds = [
+            AveragedNoise(
+                k.power, k.special, k.chance, k.least, k.log_weight, tuple(k.prior), k.floor,
+                k.unit, k.usual, nodes.scale, nodes.log_weight,
+            )
+            for k, nodes in zip(post.kinds, post.scales, strict=True)
+        ]  # fmt: skip
+        at, size = seen.measured(plane), work.sizes.size / post.unit
+        own = (records[plane].data, at, size, post.unit, post.trace, tuple(kinds))
+        found.append(Sizes(plane, seen.noise, *own))
+    return tuple(found)
+
+
+def _beams(model: Mapping[str, Any], told: Told) -> dict[str, Any]:
+    """The beam matrix of each plane, and the model, for functions of the user's."""
+    parts = model["beam"].items()
+    beams = {p: BeamMatrix(*(UNIT * beam[name] for name in CHOLESKY)) for p, beam in parts}
+    return {**beams, "model": model}
+
+
+def _twiss(model: Mapping[str, Any], told: Told) -> Array:
+    """Emittance, normalised emittance, β, α at the start and mismatch, plane after plane."""
+    return jnp.concatenate([asked_numbers(model, plane)[PLACES] for plane in told.asked])
+
+
+def beam_target(
+    fit: Scanned,
+    planes: Sequence[str] | None = None,
+    priors: Mapping[str, Distribution] | None = None,
+) -> Target:
+    """State the posterior of a fitted scan.
+
+    Parameters
+    ----------
+    fit : EmittanceFit
+        The fit.
+    planes : sequence of str, optional
+        Which; all that were fitted if None.
+    priors
+        As of `beamfit.greybox.posterior.target_of`; on ``x.sigma11`` and so on, in addition to the
+        fit's own.
+
+    Returns
+    -------
+    Target
+        Names ``x.sigma11`` and so on, derived numbers ``x.emittance`` and so on.
+
+    Raises
+    ------
+    InputError
+        If a plane was not fitted, or as `target_of`.
+
+    Notes
+    -----
+    Likelihood and prior are those of the fit: noise averaged over, bad readings included.
+    Where transport is known, a plane whose scan does not determine σ11, σ12 and σ22 has no
+    posterior unless priors on all three give it one; it is left out and named.
+    """
+    asked = _asked(fit, planes)
+    if fit.solved is not None:
+        problem, optimum, kept = fit.solved.problem, fit.solved.optimum, asked
+    else:
+        given = [p for p in asked if all(f"{p.plane}.{name}" in (priors or {}) for name in SIGMA)]
+        kept = [p for p in asked if np.isfinite(p.covariance).all() or p in given]
+        names = tuple(p.plane for p in kept or asked)
+        problem = fit.statement.state(fit.seen._replace(planes=names), fit.told)
+        optimum = _optimum(problem.names, kept or asked, given, priors or {})
+    return target_of(
+        problem,
+        optimum,
+        _stated(problem, fit, kept, asked),
+        priors=priors,
+    )
+
+
+def _asked(fit: Scanned, planes: Sequence[str] | None) -> list[PlaneFit]:
+    fitted = [p.plane for p in fit.planes]
+    for plane in planes or ():
+        if plane not in fitted:
+            raise InputError(f"plane '{plane}'", f"one that was fitted: {', '.join(fitted)}")
+    if fit.solved is not None and planes is not None and list(planes) != fitted:
+        expected = f"all that were fitted, {', '.join(fitted)}: their unknowns are common"
+        raise InputError(f"planes {', '.join(planes)} of this scenario", expected)
+    return [p for p in fit.planes if planes is None or p.plane in planes]
+
+
+def _optimum(
+    names: Sequence[str],
+    chosen: Sequence[PlaneFit],
+    given: Sequence[PlaneFit],
+    priors: Mapping[str, Distribution],
+) -> Optimum:
+    """Where to begin: the fit, or else the priors; a little off zero emittance, an edge."""
+    begin = {}
+    for p in chosen:
+        sigma = [q.value for q in p.sigma]
+        if not np.isfinite(p.covariance).all() and p in given:
+            sigma = [priors[f"{p.plane}.{name}"].mean() for name in SIGMA]
+        numbers = factor_of(sigma, 1e-4)
+        begin |= {f"beam.{p.plane}.{name}": value for name, value in numbers.items()}
+    theta = np.array([begin[name] for name in names])
+    worst = max(chosen, key=lambda p: p.status is Status.poor_fit)
+    return Optimum(
+        theta, Finding(worst.status, worst.message), [1.0] * len(chosen), [True] * len(chosen)
+    )
+
+
+def _stated(
+    problem: Problem, fit: Scanned, kept: Sequence[PlaneFit], asked: Sequence[PlaneFit]
+) -> Statement:
+    chosen = kept or asked
+    shown = {(p.plane, name): getattr(p, name) for p in chosen for name in TWISS}
+    lost = ", ".join(f"{p.plane} plane" for p in asked if p not in kept)
+    sigmas = [f"{p.plane}.{name}" for p in chosen for name in SIGMA]
+    own = [f"beam.{p.plane}.{name}" for p in chosen for name in CHOLESKY]
+    labels = {f"size {p.plane}": p.plane for p in chosen}
+    # As users name them in a calibration: Q2.slope.
+    renamed = {name: spoken(name) for name in problem.names}
+    return Statement(
+        derived={f"{plane}.{name}": QUANTITIES[name] for plane, name in shown},
+        derive=_twiss,
+        build=_beams,
+        data=Told(
+            asked_in(
+                problem, fit.seen, planes := [p.plane for p in chosen], fit.statement.whole_map
+            ),
+            _sizes_of(problem, fit.seen, planes),
+        ),
+        log_volume=_log_volume,
+        averaged=[f"size {plane}" for plane in planes],
+        quoted=_quoted,
+        own=_own,
+        renamed=renamed | dict(zip(own, sigmas, strict=True)),
+        units={name: QUANTITIES[name.split(".")[1]] for name in sigmas},
+        lower={f"{p.plane}.{name}": 0.0 for p in chosen for name in ("sigma11", "sigma22")},
+        labels=labels,
+        trusted=[record.name for record in problem.records if record.name not in labels],
+        priors_own=[f"{p}.{name}" for (p, name), q in shown.items() if q and q.error is None],
+        hidden=[f"{plane}.{name}" for (plane, name), q in shown.items() if q is None],
+        remark=f"Left out: the {lost}, because {OPEN}." if kept and lost else "",
+        nothing="" if kept else f"{OPEN} in the {lost}; {chosen[0].message}",
+    )
+
+
+def expected_sizes(posterior: Posterior, plane: str) -> Expected:
+    """Sizes that the posterior of a scan expects at the points of a plane, m.
+
+    Parameters
+    ----------
+    posterior : Posterior
+        Of `EmittanceFit.sample`.
+    plane : str
+        "x" or "y".
+    """
+    draws, measured, error = predicted(posterior, f"size {plane}")
+    records = {record.name: record for record in posterior.target.data.core.records}
+    if records[f"size {plane}"].data.squared:  # the error of size² is 2 x dx
+        draws, error = np.sqrt(draws), error / (2.0 * np.sqrt(measured))
+    return posterior.expected(1e-6 * draws, 1e-6 * error, plane)

@@ -1,0 +1,139 @@
+"""What a fitted beam would measure at other settings, and how its numbers go together."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from beamfit.emittance.comparison import PlanePosterior, weighted_quantiles
+from beamfit.emittance.model import coefficients, emittance_parts, predict_sizes, size_squared
+from beamfit.emittance.results import PlaneFit
+from beamfit.emittance.transport import Rows, padded, rows_at
+from beamfit.errors import InputError, nearest
+from beamfit.optics.rows import seen_line
+from beamfit.sampling.intervals import Correlations
+from beamfit.shown import shown
+
+if TYPE_CHECKING:
+    from beamfit.emittance.posterior import Scanned
+
+NAMES = ("sigma11", "sigma12", "sigma22", "emittance", "beta", "alpha")
+
+
+@shown
+@dataclass(frozen=True, eq=False)
+class Prediction:
+    """Sizes to be expected of a fitted beam.
+
+    Attributes
+    ----------
+    plane, screen : str
+        Which size, and where.
+    settings : dict of str to ndarray
+        Of the magnets that were named, shape (n,), in the units of the scan.
+    size : ndarray
+        Rms size with dispersion and resolution, m, shape (n,).
+    error : ndarray
+        Its standard error from the error of the beam alone, m, shape (n,); a further reading
+        scatters by its own error besides. NaN where the data do not determine the beam.
+    """
+
+    plane: str
+    screen: str
+    settings: dict[str, np.ndarray]
+    size: np.ndarray
+    error: np.ndarray
+
+
+def predicted_sizes(
+    fit: Scanned, settings: Mapping[str, Any], plane: str, screen: str | None = None
+) -> Prediction:
+    """Predict sizes; see `EmittanceFit.predict`.
+
+    size² = R11² σ11 + 2 R11 R12 σ12 + R12² σ22 + known (report eq. 37) is linear in σ, so that its
+    error is that of a sum; what a scenario fitted besides σ goes in by the core's `derive`.
+    """
+    fitted = {p.plane: p for p in fit.planes}
+    if plane not in fitted:
+        raise InputError(f"no fit of plane '{plane}'", " or ".join(fitted))
+    p, given = fitted[plane], {n: np.atleast_1d(np.asarray(v, float)) for n, v in settings.items()}
+    n = max((len(v) for v in given.values()), default=1)
+    try:
+        given = {name: np.array(np.broadcast_to(v, n)) for name, v in given.items()}
+    except ValueError:
+        lengths = {name: len(v) for name, v in given.items()}
+        raise InputError(f"settings of lengths {lengths}", "one length, or one number") from None
+    rows = _rows(fit, given, n, plane, screen)
+    if fit.statement.closed:
+        r11, r12, known = (np.asarray(part)[:n] for part in rows.elements({}))
+        sigma = np.array([q.value for q in p.sigma])
+        size = np.sqrt(np.maximum(size_squared(sigma, r11, r12, known), 0.0))
+        error = _spread(fit.seen.works[plane].posterior, r11, r12, known)
+        error = np.where(np.isfinite(p.covariance).all(), error, np.nan)
+    else:
+        found = fit.solved.derive(predict_sizes, rows)
+        size, whole = 1e-6 * found.value[:n], 1e-6 * found.error[:n]
+        r11, r12, known = (np.asarray(part)[:n] for part in rows.elements(fit.solved.model))
+        post = fit.seen.works[plane].posterior
+        slope = np.stack(coefficients(r11, r12), -1) / (2.0 * size[:, None])
+        held = np.einsum("ij,jk,ik->i", slope, post.covariance, slope)
+        # What the other unknowns add in linear theory, beside the posterior of the beam.
+        further = np.sqrt(np.maximum(whole**2 - held, 0.0))
+        error = np.where(
+            np.isfinite(whole), np.hypot(_spread(post, r11, r12, known), further), whole
+        )
+    return Prediction(plane, rows.places[0], given, size, error)
+
+
+def _spread(
+    post: PlanePosterior, r11: np.ndarray, r12: np.ndarray, known: np.ndarray
+) -> np.ndarray:
+    """Half of the central 68 % of the sizes that the posterior predicts."""
+    kept = post.weight > 0.0
+    sigma, weight = post.sigma[kept].T, post.weight[kept]
+    sizes = np.sqrt(size_squared(sigma, r11[:, None], r12[:, None], known[:, None]))
+    ends = [weighted_quantiles(row, weight, (0.1587, 0.8413)) for row in sizes]
+    return 0.5 * np.diff(ends, axis=1)[:, 0]
+
+
+def _rows(
+    fit: Scanned, given: Mapping[str, np.ndarray], n: int, plane: str, screen: str | None
+) -> Rows:
+    """The settings asked for as rows of a scan, padded."""
+    seen, line = fit.seen, fit.seen.scanned
+    if seen.scan.transfer or not fit.statement.whole_map or fit.told.hysteresis:
+        found = "a fit that knows the transport at the measured rows alone"
+        raise InputError(found, "a scan with a lattice, and a scenario that keeps its map")
+    place = screen or seen.rows.places[-1]
+    for name in given:
+        if name not in line.magnets:
+            raise InputError(f"no magnet '{name}'", nearest(name, list(line.magnets)))
+    if place not in (known := [e.name for e in line.elements]):
+        raise InputError(f"no screen '{place}'", nearest(place, known))
+    model = {} if fit.statement.closed else fit.solved.model
+    keep = dict.fromkeys((*given, *model.get("magnets", {})))
+    table = {name: padded(given.get(name, np.full(n, float(line[name].setting)))) for name in keep}
+    energy = padded(np.full(n, seen.energy))
+    seen_by = seen_line(line, tuple(keep), energy, (place,))
+    return rows_at(seen_by, plane, place, table, energy, *seen.known_at(line, place))
+
+
+def correlations_of(p: PlaneFit) -> Correlations:
+    """How the errors of σ11, σ12, σ22, emittance, β and α go together, in linear approximation.
+
+    Those of the last three follow by the gradients of ε = sqrt(σ11σ22 - σ12²), σ11/ε and -σ12/ε.
+    """
+    sigma = np.array([q.value for q in p.sigma])
+    if not np.isfinite(p.covariance).all() or not p.emittance.value > 0:
+        return Correlations(NAMES, np.full((6, 6), np.nan))
+    slope = np.concatenate(
+        [np.eye(3), np.asarray(jax.jacobian(emittance_parts)(jnp.asarray(sigma)))]
+    )
+    covariance = slope @ p.covariance @ slope.T
+    error = np.sqrt(np.diagonal(covariance))
+    return Correlations(NAMES, covariance / np.outer(error, error))

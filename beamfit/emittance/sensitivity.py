@@ -1,0 +1,375 @@
+"""What the emittance would be if something were a little different.
+
+The systematics budget takes the exact derivative of the whole chain, transport and fit, by
+each number of the line; the range table refits without some points.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import replace
+from functools import partial
+from itertools import islice
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from beamfit.compile_cache import SELDOM
+from beamfit.emittance.fit import EmittanceFit
+from beamfit.emittance.known import WEIGHTS
+from beamfit.emittance.model import coefficients, emittance_parts, size_squared
+from beamfit.emittance.results import PlaneFit, Points
+from beamfit.emittance.sigma import error_at, weighed_size
+from beamfit.emittance.statement import varied_magnets
+from beamfit.emittance.transport import Rows
+from beamfit.optics.beamline import Beamline
+from beamfit.optics.calibration import SlopeIntercept, scaled
+from beamfit.optics.elements import (
+    Drift,
+    Element,
+    Marker,
+    SectorDipole,
+)
+from beamfit.optics.sections import ElementSeries as Series
+
+# Leaving out one of more points than this tells nothing.
+MOST_POINTS = 50
+# A relative change of an emittance below this is rounding.
+ROUNDING = 1e-12
+# From this share of rest energy on, total and kinetic energy are told apart.
+SLOW = 0.1
+# Nobody reads a budget of more causes than this, nor of smaller changes.
+MOST_CAUSES, SMALLEST = 30, 5e-4
+# Steps of the budget: resolution and dispersion in m, and a momentum spread where none is stated.
+RESOLUTION, DISPERSION, SPREAD = 10e-6, 0.01, 1e-3
+# What saturation, space charge or a pedestal add to every size², told at the smallest size.
+AT_WAIST = 0.05
+
+
+class Change(NamedTuple):
+    """What one small change of the line does to the emittance.
+
+    Attributes
+    ----------
+    cause : str
+        For example "Q2 slope +1 %" or "drift D1 +1 cm".
+    emittance : float
+        Relative change of the geometric emittance.
+    normalized_emittance : float
+        Relative change of the normalised emittance.
+    """
+
+    cause: str
+    emittance: float
+    normalized_emittance: float
+
+
+class RangeRow(NamedTuple):
+    """The emittance without some points.
+
+    Attributes
+    ----------
+    left_out : str
+        Which.
+    normalized_emittance : float
+        In m; NaN where the rest has no positive solution.
+    shift : float
+        Its change from the full fit, in standard errors of the full fit.
+    """
+
+    left_out: str
+    normalized_emittance: float
+    shift: float
+
+
+def systematics(fit: EmittanceFit, plane: str) -> list[Change]:
+    """Change of the emittance for small changes of the line, the energy, the screen and the beam.
+
+    Parameters
+    ----------
+    fit : EmittanceFit
+        A fit.
+    plane : str
+        "x" or "y".
+
+    Returns
+    -------
+    list of Change
+        The largest change first; empty where the emittance is not determined. For +1 % of each
+        magnet, scanned or not, of the angle of each bend, of the energy and of the screen's scale;
+        for +1 cm of each drift; for 10 µm of resolution and 1 cm of dispersion of the incoming beam
+        (of the line's momentum spread, or 0.1 % where it has none) that were not thought of; for
+        what saturation, space charge or a pedestal add to size² at the waist. First
+        order: exact derivatives (through transport, and through the minimum by the implicit
+        function theorem) times the step.
+
+    Examples
+    --------
+    >>> from beamfit.optics.beam import BeamMatrix
+    >>> from beamfit.optics.elements import Quadrupole, Screen
+    >>> from beamfit.emittance.fit import fit_emittance
+    >>> from beamfit.emittance.scan import QuadScan
+    >>> line = Beamline((Quadrupole("Q", 0.1), Drift("D", 2.0), Screen("S")), energy=135.0)
+    >>> k1 = np.linspace(-2.0, 12.0, 8)
+    >>> sizes = [float(BeamMatrix.from_twiss(2e-9, 5.0, 0.0).transport(
+    ...     line.matrix({"Q": k}).x).l11) for k in k1]
+    >>> fit = fit_emittance(QuadScan({"Q": k1}, {"Q": "k1"}, {"x": sizes}), line)
+    >>> [c.cause for c in systematics(fit, "x")][:2]
+    ['smallest size 5 % too large (saturation, space charge)', 'screen resolution 10 µm larger']
+    """
+    result = fit[plane]
+    if result.emittance.error is None:
+        return []
+    rows, p = fit.seen.rows, result.points
+    keep = fit.seen.measured(plane)
+    size, weighed, sharp = np.ones((3, len(rows.energy))) * [[1.0], [1.0], [0.0]]
+    size[keep], weighed[keep], sharp[keep] = p.size, p.weighed, 1.0 / p.error
+    follows = fit.seen.weights == WEIGHTS[0]
+    noise = _Weighing(weighed, sharp, np.array(p.relative), np.array(float(follows)))
+    sigma = np.array([q.value for q in result.sigma])
+    line = fit.seen.scanned.stored_by_kind((*rows.settings, *rows.places))
+    upright = np.array(plane == "y")
+    by_parts, by_energy, by_known = _slopes(replace(rows, line=line), upright, sigma, size, noise)
+    changes = {_magnet_cause(fit, name): 0.0 for name in rows.settings}
+    upstream = {e.name for e in fit.seen.scanned.upto(result.screen.name).elements}
+    for element, slope in _by_element(fit.seen.scanned, line, by_parts):
+        cause, step = _cause(fit, element)
+        if cause and (cause in changes or element.name in upstream):
+            changes[cause] = changes.get(cause, 0.0) + step * float(slope)
+    energy, mass = fit.seen.energy, fit.line.mass
+    changes[of_energy := _energy_cause(energy, mass)] = 0.01 * float(by_energy)
+    changes |= _of_screen(fit, p, np.asarray(by_known)[keep])
+    # ln βγ rises by E²/(E² - m²) for each relative step of the energy.
+    stiffer = 0.01 * energy**2 / (energy**2 - mass**2)
+    # What is zero but for rounding is zero, and keeps its place.
+    whole = {cause: d if abs(d) > ROUNDING else 0.0 for cause, d in changes.items()}
+    found = [Change(c, d, d + stiffer * (c == of_energy)) for c, d in whole.items()]
+    return sorted(found, key=lambda change: -abs(change.normalized_emittance))
+
+
+def _energy_cause(energy: float, mass: float) -> str:
+    """A step of the energy in words: of slow particles whose energies are called kinetic, both."""
+    if mass < SLOW * energy:
+        return "energy +1 %"
+    return f"total energy +1 % (kinetic +{energy / (energy - mass):.2g} %)"
+
+
+def _by_element(
+    line: Beamline, stored: Beamline, by_parts: list[Array]
+) -> Iterator[tuple[Element, float]]:
+    """Each element of a line, but for mere places, with the slope by its small change."""
+    left, slopes = (e for e in line.elements if not isinstance(e, Marker)), iter(by_parts)
+    for part in stored.elements:
+        if isinstance(part, Series):
+            # An element stands at `order` among those of all kinds, counted kind after kind.
+            elements = np.empty(len(part.order), object)
+            elements[part.order] = list(islice(left, len(part.order)))
+            each = np.concatenate([np.atleast_1d(next(slopes)) for _ in part.kinds])
+            yield from zip(elements, each, strict=True)
+        elif not isinstance(part, Marker):
+            yield next(left), next(slopes)
+
+
+def _moved(line: Beamline, changes: Iterator[Array]) -> Beamline:
+    """A line stored by kind with small changes, those of `_cause`, of all but mere places."""
+
+    def changed(part: Element | Series) -> Element | Series:
+        if isinstance(part, Marker):
+            return part
+        if isinstance(part, Series):
+            return replace(part, kinds=tuple(map(changed, part.kinds)))
+        change = next(changes)
+        if isinstance(part, Drift):
+            return replace(part, length=part.length + change)
+        if isinstance(part, SectorDipole):
+            return replace(part, angle=part.angle * (1.0 + change))
+        if hasattr(part, "calibration"):
+            return replace(part, calibration=scaled(part.calibration, 1.0 + change))
+        return part
+
+    return replace(line, elements=tuple(map(changed, line.elements)))
+
+
+def _cause(fit: EmittanceFit, element: Element) -> tuple[str, float]:
+    """What a small change of an element is called, and how large it is."""
+    if isinstance(element, Drift):
+        return f"drift {element.name} +1 cm", 0.01
+    if isinstance(element, SectorDipole):
+        return f"bend {element.name} angle +1 %", 0.01
+    if hasattr(element, "calibration"):
+        # What a supply does to its magnets is one cause.
+        supplies = fit.seen.scanned.supplies
+        name = next((s for s, members in supplies if element.name in members), element.name)
+        return _magnet_cause(fit, name), 0.01
+    return "", 0.0
+
+
+def _magnet_cause(fit: EmittanceFit, name: str) -> str:
+    calibration = fit.seen.scanned[name].calibration
+    word = "gradient" if calibration.unit in ("A", "kG", "T_per_m") else "strength"
+    word = "slope" if isinstance(calibration, SlopeIntercept) else word
+    return f"{name} {word} +1 %" + ", not scanned" * (name not in varied_magnets(fit.scan))
+
+
+def _of_screen(fit: EmittanceFit, p: Points, by_known: np.ndarray) -> dict[str, float]:
+    """Changes by the screen's scale and resolution, and by dispersion of the incoming beam."""
+    spread = float(fit.seen.scanned.energy_spread) or SPREAD
+    if fit.scan.energy_spread is not None:
+        spread = float(np.mean(fit.scan.energy_spread)) or SPREAD
+    # A scale on sizes is one on what is known of them and on σ, whose emittance goes with it.
+    scale = 2.0 * (1.0 - float(by_known @ p.known))
+    dispersed = float(by_known @ (p.r11 * DISPERSION * spread) ** 2)
+    smallest = float(np.min(p.size))
+    return {
+        "screen scale +1 %": 0.01 * scale,
+        "smallest size 5 % too large (saturation, space charge)": float(by_known.sum())
+        * ((1.0 + AT_WAIST) ** 2 - 1.0)
+        * smallest**2,
+        "screen resolution 10 µm larger": float(by_known.sum()) * RESOLUTION**2,
+        f"dispersion 1 cm larger (spread {100 * spread:.2g} %)": dispersed,
+    }
+
+
+class _Weighing(NamedTuple):
+    """Sizes that weights are taken at, 1/error there, and whether each follows the model's size."""
+
+    weighed: Array
+    sharp: Array
+    relative: Array
+    follows: Array
+
+
+@partial(jax.jit, compiler_options=SELDOM)
+def _slopes(
+    rows: Rows, upright: Array, sigma: Array, size: Array, noise: _Weighing
+) -> tuple[list[Array], Array, Array]:
+    """Derivatives of ln ε of the fit by the parts of the line, by ln E, and by known size².
+
+    At the answer the weighted residuals F(σ, rows) = Σ w ∂m²/∂σ (m² - size²) vanish, so dσ =
+    -(∂F/∂σ)⁻¹ ∂F/∂rows: exact for either residual, without differentiating the solver, weights
+    that follow the model included. One reverse pass carries that back to every number of the line,
+    however long it is.
+    """
+    unit = jnp.abs(sigma)
+
+    def elements(changes: list[Array], factor: Array, more: Array) -> tuple[Array, ...]:
+        x, y = rows.both(_moved(rows.line, iter(changes)), rows.energy * factor)
+        # Either plane in one program, which is compiled once.
+        r11, r12, known = rows.known(jnp.where(upright, y, x))
+        return r11, r12, known + more
+
+    def slope(relative: Array, seen: tuple[Array, ...]) -> Array:
+        def squared_of(r: Array) -> Array:
+            return size_squared(r * unit, *seen)
+
+        squared, back = jax.vjp(squared_of, relative)
+        if not rows.squared:
+            return back((jnp.sqrt(squared) - size) * noise.sharp**2 / jnp.sqrt(squared))[0]
+        at = noise.weighed + noise.follows * (weighed_size(size, squared) - noise.weighed)
+        grown = error_at(at, noise.weighed, 1.0, noise.relative)
+        return back((squared - size**2) * (noise.sharp / (at * grown)) ** 2)[0]
+
+    kinds = (k for e in rows.line.elements for k in (e.kinds if isinstance(e, Series) else (e,)))
+    still = [jnp.zeros(_shape(kind)) for kind in kinds if not isinstance(kind, Marker)]
+    here = sigma / unit
+    seen, back = jax.vjp(elements, still, jnp.ones(()), jnp.zeros(len(size)))
+    by_sigma = jax.grad(lambda s: jnp.log(emittance_parts(s * unit)[0]))(here)
+    weights = jnp.linalg.solve(jax.jacfwd(slope)(here, seen), by_sigma)
+    return back(jax.grad(lambda seen: -weights @ slope(here, seen))(seen))
+
+
+def _shape(kind: Element) -> tuple[int, ...]:
+    """Of the numbers of elements that are stored together; () of one that stands alone."""
+    return max(map(np.shape, jax.tree.leaves(kind)), key=len, default=())
+
+
+def range_sensitivity(plane: PlaneFit) -> list[RangeRow]:
+    """Refit without each point in turn, and without the points far from the waist.
+
+    Parameters
+    ----------
+    plane : PlaneFit
+        A fitted plane.
+
+    Returns
+    -------
+    list of RangeRow
+        One a point left out (of at most 50: of more, one says nothing), and one for sizes
+        within twice the smallest if that leaves enough. A shift of more than about one
+        standard error, again and again in one direction, says that the fit range decides the
+        answer.
+    """
+    p = plane.points
+    n = len(p.size)
+    few = 4 <= n <= MOST_POINTS
+    rows = [(f"without {_place(p, i)}", np.arange(n) != i) for i in range(n if few else 0)]
+    near = p.size <= 2.0 * p.size.min()
+    if 4 <= near.sum() < n:
+        rows.append(("only sizes within 2 x the smallest", near))
+    whole, found = plane.emittance, []
+    factor = plane.normalized_emittance.value / whole.value if whole.value else 0.0
+    for name, kept in rows:
+        rest = _without(plane, ~kept)
+        shift = (rest - whole.value) / whole.error if whole.error else math.nan
+        found.append(RangeRow(name, rest * factor, shift))
+    return found
+
+
+def _without(plane: PlaneFit, left_out: np.ndarray) -> float:
+    """The emittance without some points, at the weights of the fit; NaN where the rest has none."""
+    p = plane.points
+    scale = np.where(left_out, 0.0, 0.5 / (p.weighed * p.error))
+    rows = np.stack(coefficients(p.r11, p.r12), -1) * scale[:, None]
+    norm = np.linalg.norm(rows, axis=0)
+    sigma = np.linalg.lstsq(rows / norm, (p.size**2 - p.known) * scale, rcond=None)[0] / norm
+    determinant = sigma[0] * sigma[2] - sigma[1] ** 2
+    return math.sqrt(determinant) if sigma[0] > 0 and determinant > 0 else math.nan
+
+
+def _place(points: Points, i: int) -> str:
+    """Name a point by its screen, where there are several, and the settings that vary."""
+    varied = [
+        f"{n} = {v[i]:.4g} {points.units[n]}" for n, v in points.settings.items() if np.ptp(v) > 0
+    ]
+    screen = [points.screen[i]] if len(set(points.screen)) > 1 else []
+    return ", ".join(screen + varied)
+
+
+def budget_rows(fit: EmittanceFit) -> list[tuple[str, list[str]]]:
+    """Cause and one cell per plane: the change of the normalised emittance, the largest first.
+
+    Those below 0.05 % share one line.
+    """
+    columns = [
+        {c.cause: c.normalized_emittance for c in systematics(fit, p.plane)} for p in fit.planes
+    ]
+    causes = dict.fromkeys(cause for column in columns for cause in column)
+    largest = {cause: max(abs(c.get(cause, 0.0)) for c in columns) for cause in causes}
+    ranked = sorted(largest, key=largest.__getitem__, reverse=True)
+    shown = [cause for cause in ranked if largest[cause] >= SMALLEST][:MOST_CAUSES]
+    rows = [
+        (cause, [f"{100 * c[cause]:+.2f} %" if cause in c else "-" for c in columns])
+        for cause in shown
+    ]
+    if others := ranked[len(shown) :]:
+        most = [f"±{100 * largest[others[0]]:.2g} % at most" for _ in columns]
+        rows.append((f"{len(others)} other cause{'s, each' * (len(others) > 1)}", most))
+    return rows
+
+
+def range_rows(fit: EmittanceFit) -> list[tuple[str, list[str]]]:
+    """What was left out and one cell per plane: the normalised emittance and its shift."""
+    columns = [{r.left_out: r for r in range_sensitivity(p)} for p in fit.planes]
+    names = dict.fromkeys(name for column in columns for name in column)
+    return [(name, [_range_cell(column.get(name)) for column in columns]) for name in names]
+
+
+def _range_cell(row: RangeRow | None) -> str:
+    if row is None or math.isnan(row.normalized_emittance):
+        return "-" if row is None else "none"
+    shift = "" if math.isnan(row.shift) else f" ({row.shift:+.1f})"
+    return f"{row.normalized_emittance * 1e6:.3f} µm{shift}"

@@ -1,0 +1,366 @@
+"""The best magnet settings for a wanted beam at the screen (report Appendix D)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from scipy.linalg import block_diag
+from scipy.stats import qmc
+
+from beamfit.compile_cache import SELDOM
+from beamfit.emittance.calibration import with_numbers
+from beamfit.emittance.setpoint_result import (
+    Evidence,
+    Minimum,
+    PlaneBeam,
+    Setpoint,
+    doubts_on,
+    notes_on,
+    reached_words,
+    verdict_on,
+)
+from beamfit.emittance.transport import setting_units
+from beamfit.emittance.wishes import (
+    KINDS,
+    Beam,
+    Target,
+    checked_place,
+    common_energy,
+    resolved,
+)
+from beamfit.errors import InputError
+from beamfit.greybox import tree
+from beamfit.greybox.descend import Found, descend_all
+from beamfit.greybox.fit import Fit
+from beamfit.greybox.fit import FittedVariable as Variable
+from beamfit.greybox.problem import (
+    TOLERANCE,
+    Free,
+    Problem,
+    Record,
+    padded_length,
+    residual,
+)
+from beamfit.greybox.solve import search, solve
+from beamfit.optics.beamline import Beamline
+from beamfit.quantity import Quantity
+
+# Starts of the search: enough for the minima that a few magnets have; no number fills the box of
+# many magnets, whose wishes can usually be met in many ways.
+STARTS, FEW, MANY = 256, 64, 8
+# Of each of them, and how sharp; the lowest goes on to the end.
+STEPS, SHARP = 300, 1e-10
+# Two end points are one minimum if they differ by less than this share of the range.
+SAME = 1e-3
+MOST_MINIMA = 10
+PLANES = ("x", "y")
+
+
+@tree.node("names")
+class _Wanted:
+    """The data of a search: magnets (by name), their line, the wishes, the beams.
+
+    Of the wishes `kinds` and `planes`, shape (wishes,), `values` (wishes, 2) and `weight` (wishes,
+    1), padded to a length that searches share; `middle` and `reach` (magnets,), `sigma` (2, 3).
+    """
+
+    names: tuple[str, ...]
+    line: Any
+    kinds: Any
+    planes: Any
+    values: Any
+    weight: Any
+    middle: Any
+    reach: Any
+    sigma: Any
+
+
+def find_setpoint(
+    line: Beamline,
+    beams: Mapping[str, Beam],
+    vary: Mapping[str, tuple[float, float]],
+    targets: Sequence[Target],
+    *,
+    screen: str | None = None,
+    seed: int = 0,
+) -> Setpoint:
+    """Find the settings that bring the beam nearest to what is wanted.
+
+    Parameters
+    ----------
+    line : Beamline
+        From where the beam matrix is known to the screen.
+    beams : mapping of str to Beam
+        Plane to beam at the start. A beam that says at which energy it was measured is carried at
+        that, and one that was fitted with a calibration meets it.
+    vary : mapping of str to (float, float)
+        Magnet to its limits, in the unit of its calibration. The others stay as the line has them.
+    targets : sequence of Target
+        What is wanted. The objective is the sum of (size - target)² in µm² and (divergence -
+        target)² in µrad² (Appendix D), and of BMAG - 1 for a match.
+    screen : str, optional
+        Where; the line's last screen if None, or the place of its design for matches to that.
+    seed : int
+        Of the starts.
+
+    Returns
+    -------
+    Setpoint
+        The lowest of the minima found from 256 starts, of many magnets from 64. Its status says
+        whether the wish is met, and if not what keeps it from being met.
+
+    Raises
+    ------
+    InputError
+        If a magnet, screen or plane is unknown, limits are reversed, nothing is wanted, or beams
+        are of different energies.
+
+    Notes
+    -----
+    The miss of a size is stated as a vector: with R the transfer matrix, σ = L Lᵀ the beam at the
+    start and v the first row of R L, the size is ``|v|`` and the miss ``(1 - target/|v|) v``. Its
+    square is (size - target)², and where the target is out of reach the linear picture of v still
+    has the curvature that that of ``|v|`` lacks, so that Gauss-Newton comes to rest there too.
+
+    The predicted beam has the error that the beam matrix gives it at fixed settings. The best
+    setting I of a beam σ has ∂f/∂I(I, σ) = 0, so it moves by -(∂²f/∂I²)⁻¹ ∂²f/∂I∂σ dσ; that is its
+    error.
+
+    Examples
+    --------
+    >>> from beamfit.optics.elements import Drift, Quadrupole, Screen
+    >>> line = Beamline((Quadrupole("Q", 0.1), Drift("D", 2.0), Screen("S")), energy=135.0)
+    >>> beam = Beam(np.array([4e-8, 0.0, 1e-10]))
+    >>> found = find_setpoint(line, {"x": beam}, {"Q": (0.0, 20.0)}, [Target("size", "x", 1e-4)])
+    >>> round(1e6 * found.predicted[0].size.value, 3), len(found.others)
+    (100.0, 1)
+    """
+    targets, screen = resolved(line, targets, screen)
+    screen = checked_place(line, beams, vary, targets, screen)
+    used = {plane: beams[plane] for plane in dict.fromkeys(t.plane for t in targets)}
+    energy = common_energy(used)
+    carrying = line if energy is None else replace(line, energy=energy)
+    for beam in beams.values():
+        carrying = with_numbers(carrying, beam.calibration)
+    carrying = carrying.upto(screen)
+    short = carrying.condensed((*vary, screen), carrying.energy)
+    wanted = _wanted(short, used, vary, targets)
+    minima, fit = _search(_stated(wanted), seed)
+    units = setting_units(line, vary)
+    listed = [Minimum(_settings(wanted, theta), value) for theta, value in minima]
+    predicted = _predicted(wanted, used, fit.theta)
+    misses = _relative_misses(wanted, targets, fit.theta)
+    evidence = Evidence(
+        reached_words(targets, predicted, misses),
+        misses,
+        listed[0].objective,
+        fit.kkt.worst <= TOLERANCE,
+        tuple(n for n, v in zip(vary, fit.variables, strict=True) if _pulled(v, fit.cost)),
+    )
+    status, message = verdict_on(evidence, listed, units)
+    return Setpoint(
+        status, message, listed[0], tuple(listed[1:]), _setting_errors(wanted, used, fit.theta),
+        tuple(n for n, t in zip(vary, fit.theta, strict=True) if abs(t) == 1.0), screen,
+        predicted, targets, units, float(carrying.energy), line.name,
+        notes_on(used, float(carrying.energy), float(line.energy)), doubts_on(used),
+    )  # fmt: skip
+
+
+def _wanted(line, beams, vary, targets) -> _Wanted:
+    """Gather the data of a search; `line` ends at the place."""
+    low, high = np.array([*vary.values()], float).T
+    size = padded_length(len(targets))
+    padded = [*targets, *[targets[0]] * (size - len(targets))]
+    other = next(iter(beams.values()))
+    return _Wanted(
+        tuple(vary),
+        line,
+        jnp.array([KINDS.index(t.kind) for t in padded]),
+        jnp.array([PLANES.index(t.plane) for t in padded]),
+        jnp.array([np.broadcast_to(t.value, 2) for t in padded], float),
+        np.arange(size)[:, None] < len(targets),
+        jnp.asarray(0.5 * (low + high)),
+        jnp.asarray(0.5 * (high - low)),
+        jnp.array([beams.get(plane, other).sigma for plane in PLANES], float),
+    )
+
+
+def _stated(wanted: _Wanted) -> Problem:
+    """The search as a problem: settings from -1 to 1 between their limits, no miss "measured"."""
+    none = np.zeros(wanted.values.shape)
+    weight = np.broadcast_to(wanted.weight, none.shape)
+    record = Record("wishes", _misses, wanted, none, error=1.0, weight=weight)
+    start = jnp.zeros(len(wanted.names))
+    return Problem({"settings": start}, [Free("settings", -1.0, 1.0)], [record])
+
+
+def _settings(wanted: _Wanted, theta) -> dict[str, float]:
+    values = np.asarray(wanted.middle + wanted.reach * theta)
+    return dict(zip(wanted.names, map(float, values), strict=True))
+
+
+def _plain(names: tuple[str, ...], line: Beamline, settings: Array) -> Array:
+    return line.matrix(dict(zip(names, settings, strict=True))).planes[:, :2, :2]
+
+
+# The derivatives by many settings of these eight numbers are had backwards, and once for all
+# directions: forwards they take five times as long with 31 magnets.
+_through = jax.custom_jvp(_plain, nondiff_argnums=(0,))
+
+
+@_through.defjvp
+def _through_slope(names, primals, tangents):
+    line, settings = primals
+    slope = jax.jacrev(_plain, 2)(names, line, settings)
+    return _plain(names, line, settings), slope @ tangents[1]
+
+
+def _at_place(wanted: _Wanted, theta: Array) -> Array:
+    """R L of both planes, shape (2, 2, 2), with σ = L Lᵀ: rows are size and divergence."""
+    matrix = _through if len(wanted.names) > MANY else _plain
+    r = matrix(wanted.names, wanted.line, wanted.middle + wanted.reach * theta)
+    l11 = jnp.sqrt(wanted.sigma[:, 0])
+    l21 = wanted.sigma[:, 1] / l11
+    l22 = jnp.sqrt(wanted.sigma[:, 2] - l21**2)
+    columns = [jnp.stack([l11, l21], -1), jnp.stack([jnp.zeros_like(l22), l22], -1)]
+    return r @ jnp.stack(columns, -1)
+
+
+def _misses(model: Any, wanted: _Wanted) -> Array:
+    """Miss of every wish, shape (wishes, 2); the objective is the sum of their squares.
+
+    Of sizes in µm and divergences in µrad, along the vector; of matches two numbers whose squares
+    add to BMAG - 1, linear in R. In the order of KINDS.
+    """
+    at = _at_place(wanted, model["settings"])
+
+    def miss(kind, plane, value):
+        vectors, (beta, alpha) = at[plane], value
+        far = 1e6 * (1.0 - beta / jnp.linalg.norm(vectors, axis=1))[:, None] * vectors
+        # N = D⁻¹ R L/√ε is a rotation where the beam is matched; BMAG = |N|²/2 and det N = 1.
+        inverse = jnp.array([[1.0, 0.0], [alpha, beta]]) / jnp.sqrt(beta)
+        n = inverse @ vectors / jnp.sqrt(jnp.linalg.det(vectors))
+        mismatch = jnp.stack([n[0, 0] - n[1, 1], n[0, 1] + n[1, 0]]) / math.sqrt(2.0)
+        return jnp.concatenate([far, mismatch[None]])[kind]
+
+    return jax.vmap(miss)(wanted.kinds, wanted.planes, wanted.values)
+
+
+def _search(stated: Problem, seed: int) -> tuple[list[tuple[np.ndarray, float]], Fit]:
+    """Descend from points that fill the box, and let the core go on from the lowest and judge it.
+
+    Gives minima, best first, and the fit of the best.
+    """
+    count = len(stated.names)
+    starts = qmc.LatinHypercube(count, rng=seed).random(FEW if count > MANY else STARTS)
+    found = descend_all(
+        residual, stated.core, 2.0 * starts - 1.0, stated.lower, stated.upper, STEPS, SHARP
+    )
+    found = Found(*map(np.asarray, found))
+    ends, cost = found.theta, found.cost
+    if not np.isfinite(cost).any():
+        raise InputError("a beam that no setting within the limits can carry", "other limits")
+    order = np.argsort(cost, kind="stable")
+    fit = solve(replace(stated, model={"settings": ends[order[0]]}))
+    minima = [(fit.theta, 2.0 * float(fit.cost))]
+    for i in order[found.rested[order]]:
+        if len(minima) == MOST_MINIMA:
+            break
+        if _apart(ends[i], minima):
+            _, end = search(stated, ends[i], STEPS)
+            # Where a search got stuck is no minimum, and one that it only now reaches may be known.
+            if end.kkt.worst <= TOLERANCE and _apart(end.theta, minima):
+                minima.append((end.theta, 2.0 * end.cost))
+    return minima, fit
+
+
+def _apart(theta: np.ndarray, minima: Sequence[tuple[np.ndarray, float]]) -> bool:
+    """Whether settings are none of those found."""
+    return all(np.abs(theta - known).max() > 2.0 * SAME for known, _ in minima)
+
+
+@partial(jax.jit, compiler_options=SELDOM)
+def _numbers(wanted: _Wanted, theta: Array) -> tuple[Array, Array]:
+    """Size, divergence, β and α of each plane, shape (planes, 4), and their slopes by σ."""
+
+    def of_sigma(sigma):
+        v = _at_place(replace(wanted, sigma=sigma), theta)
+        s = v @ jnp.swapaxes(v, -1, -2)
+        s11, s12, s22, emittance = s[:, 0, 0], s[:, 0, 1], s[:, 1, 1], jnp.linalg.det(v)
+        return jnp.stack([jnp.sqrt(s11), jnp.sqrt(s22), s11 / emittance, -s12 / emittance], -1)
+
+    return of_sigma(wanted.sigma), jax.jacfwd(of_sigma)(wanted.sigma)
+
+
+@partial(jax.jit, compiler_options=SELDOM)
+def _curvature(wanted: _Wanted, theta: Array) -> Array:
+    """Second derivatives of the objective by settings and σ together."""
+    size = len(wanted.names)
+
+    def objective(both):
+        sigma = both[size:].reshape(wanted.sigma.shape)
+        misses = _misses({"settings": both[:size]}, replace(wanted, sigma=sigma))
+        return jnp.sum(wanted.weight * misses**2)
+
+    both = jnp.concatenate([theta, wanted.sigma.ravel()])
+    return jax.jacfwd(jax.jacfwd(objective))(both)
+
+
+def _covariance(beam: Beam) -> np.ndarray | None:
+    known = beam.covariance is not None and np.isfinite(beam.covariance).all()
+    return beam.covariance if known else None
+
+
+def _predicted(
+    wanted: _Wanted, beams: Mapping[str, Beam], theta: np.ndarray
+) -> tuple[PlaneBeam, ...]:
+    values, slopes = map(np.asarray, _numbers(wanted, jnp.asarray(theta)))
+    found = []
+    for plane, beam in beams.items():
+        i, covariance = PLANES.index(plane), _covariance(beam)
+        error: Sequence[float | None] = [None] * 4
+        if covariance is not None:
+            slope = slopes[i, :, i]
+            error = np.sqrt(np.einsum("ij,jk,ik->i", slope, covariance, slope).clip(0)).tolist()
+        parts = zip(values[i].tolist(), error, ("m", "rad", "m", "1"), strict=True)
+        found.append(PlaneBeam(plane, *(Quantity(*part) for part in parts)))
+    return tuple(found)
+
+
+def _relative_misses(wanted: _Wanted, targets, theta: np.ndarray) -> tuple[float, ...]:
+    """Distance of each wish over what is wanted; BMAG - 1 of a match."""
+    lengths = np.linalg.norm(_misses({"settings": jnp.asarray(theta)}, wanted), axis=1)
+    pairs = zip(targets, lengths, strict=False)  # the rest is padding
+    return tuple(float(m / (1e6 * t.value) if np.ndim(t.value) == 0 else m**2) for t, m in pairs)
+
+
+def _pulled(v: Variable, cost: float) -> bool:
+    """Whether a setting on its limit would lower the objective if it went on."""
+    return abs(v.value) == 1.0 and abs(v.reduced_gradient) > 1e-6 * cost
+
+
+def _setting_errors(
+    wanted: _Wanted, beams: Mapping[str, Beam], theta: np.ndarray
+) -> dict[str, float | None]:
+    """Error of each best setting due to the beam; None at a limit or without a covariance."""
+    errors: dict[str, float | None] = dict.fromkeys(wanted.names)
+    covariances = [_covariance(beams[p]) if p in beams else np.zeros((3, 3)) for p in PLANES]
+    loose = np.flatnonzero(np.abs(theta) < 1.0)
+    if any(c is None for c in covariances) or not loose.size:
+        return errors
+    rows = np.asarray(_curvature(wanted, jnp.asarray(theta)))[loose]
+    second, mixed = rows[:, loose], rows[:, len(theta) :]
+    if np.linalg.cond(second) > 1e12:
+        return errors
+    moved = np.linalg.solve(second, mixed)
+    variance = np.einsum("ij,jk,ik->i", moved, block_diag(*covariances), moved)
+    found = np.sqrt(variance.clip(0)) * np.asarray(wanted.reach)[loose]
+    return errors | {wanted.names[i]: float(e) for i, e in zip(loose, found, strict=True)}

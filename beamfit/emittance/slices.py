@@ -1,0 +1,152 @@
+"""Slices of a beam, each fitted by its own rows, with the projected beam beside them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+from beamfit.emittance.fit import EmittanceFit, fit_emittance
+from beamfit.emittance.results import PlaneFit
+from beamfit.emittance.scan import PROJECTED, QuadScan
+from beamfit.optics.beamline import Beamline
+from beamfit.shown import shown
+from beamfit.table import Table, cell, text_of
+
+HEADER = ("slice", "energy", "status", "normalised emittance", "beta at the start")
+HEADER += ("alpha at the start", "chi2/dof")
+
+
+@shown
+@dataclass(frozen=True, eq=False)
+class SliceFits:
+    """The fits of the slices of a beam, in the order of the scan, the projected beam last.
+
+    Attributes
+    ----------
+    scan : QuadScan
+        All rows.
+    fits : tuple of EmittanceFit
+        One a slice.
+    """
+
+    scan: QuadScan
+    fits: tuple[EmittanceFit, ...]
+
+    def __iter__(self) -> Iterator[EmittanceFit]:
+        return iter(self.fits)
+
+    def __len__(self) -> int:
+        return len(self.fits)
+
+    def __getitem__(self, name: str) -> EmittanceFit:
+        return dict(zip(self.slices, self.fits, strict=True))[name]
+
+    @property
+    def slices(self) -> tuple[str, ...]:
+        """What the slices are called."""
+        return tuple(fit.scan.slices[0] for fit in self.fits)
+
+    @property
+    def projected(self) -> EmittanceFit | None:
+        """The fit of the whole beam, if it was measured."""
+        return self[PROJECTED] if PROJECTED in self.slices else None
+
+    @property
+    def planes(self) -> tuple[str, ...]:
+        """The planes that some slice was fitted in."""
+        fitted = {p.plane for fit in self.fits for p in fit.planes}
+        return tuple(p for p in self.scan.planes if p in fitted)
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What is odd about the numbers of any slice, each said once."""
+        return tuple(dict.fromkeys(note for fit in self.fits for note in fit.notes))
+
+    def of_plane(self, plane: str) -> list[tuple[EmittanceFit, PlaneFit]]:
+        """The slices that were fitted in a plane, each with its fit there."""
+        return [(fit, p) for fit in self.fits for p in fit.planes if p.plane == plane]
+
+    @property
+    def headline(self) -> str:
+        """The scan in a line."""
+        return f"{self.scan.name}: {', '.join(self.slices)}, planes {', '.join(self.planes)}"
+
+    def tables(self) -> tuple[Table, ...]:
+        """One table a plane, one row a slice."""
+        found = []
+        for plane in self.planes:
+            rows = [_row(fit, p) for fit, p in self.of_plane(plane)]
+            found.append(Table(f"Slices of {self.scan.name}, {plane} plane", HEADER, rows))
+        return tuple(found)
+
+    def to_json(self) -> list[dict[str, Any]]:
+        """Give the ``results`` list of the JSON contract, each entry with its ``slice``."""
+        return [entry for fit in self.fits for entry in fit.to_json()]
+
+    def __str__(self) -> str:
+        said = [
+            f"{fit.scan.slices[0]}, {p.plane}: {p.message}" for fit in self.fits for p in fit.planes
+        ]
+        tables = [
+            f"{table.title}\n\n{text_of(table._replace(title=''))}" for table in self.tables()
+        ]
+        return "\n\n".join([*tables, "\n".join((*said, *self.notes))])
+
+
+def _row(fit: EmittanceFit, p: PlaneFit) -> list[str]:
+    chi2 = "-" if p.chi2 is None else f"{p.chi2:.1f}/{p.dof}"
+    quantities = (p.status, p.normalized_emittance, p.beta, p.alpha)
+    return [fit.scan.slices[0], f"{fit.seen.energy:.6g} MeV", *map(cell, quantities), chi2]
+
+
+def fit_slices(scan: QuadScan, line: Beamline | None = None, **options: Any) -> SliceFits:
+    """Fit the beam matrix of every slice of a beam, and of the projected beam where measured.
+
+    Parameters
+    ----------
+    scan : QuadScan
+        With ``slice``, and ``energy`` where the slices differ in it.
+    line : Beamline, optional
+        As for `beamfit.fit_emittance`. Its magnets stay as they are for the line's energy.
+    **options
+        As for `beamfit.fit_emittance`; ``planes`` a slice was not measured in are passed over.
+
+    Returns
+    -------
+    SliceFits
+        ``fits["3"].x.normalized_emittance``; `print` it.
+
+    Raises
+    ------
+    InputError
+        As `beamfit.fit_emittance`, or if the scan has no slices.
+
+    Notes
+    -----
+    A slice has a beam matrix of its own, and so a fit of its own rows: slices share nothing but the
+    line. A slice of another energy takes its own way through magnets that stay, and its matrix is
+    that about its own orbit (report eqs 24-28, with the corrections of docs/emittance.md).
+
+    Examples
+    --------
+    >>> from beamfit.optics.elements import Drift, Quadrupole, Screen
+    >>> line = Beamline((Quadrupole("Q", 0.1), Drift("D", 2.0), Screen("S")), 135.0)
+    >>> sizes = [3.4e-4, 1.9e-4, 0.9e-4, 1.9e-4, 3.4e-4] * 2
+    >>> scan = QuadScan({"Q": [-1.0, 1.5, 4.0, 6.5, 9.0] * 2}, {"Q": "k1"}, {"x": sizes},
+    ...                 energy=[134.0] * 5 + [136.0] * 5, slice=["head"] * 5 + ["tail"] * 5)
+    >>> fits = fit_slices(scan, line)
+    >>> fits.slices, fits["tail"].x.dof
+    (('head', 'tail'), 2)
+    """
+    if scan.slice is None:
+        raise scan.unusable("a scan without slices", "a column slice, or fit_emittance")
+    asked = options.pop("planes", None) or scan.planes
+    for plane in asked:
+        scan.rows(plane)  # says so if it was not measured
+    fits = []
+    for name in scan.slices:
+        part = scan.of_slice(name)
+        if planes := tuple(p for p in asked if p in part.planes):
+            fits.append(fit_emittance(part, line, planes=planes, **options))
+    return SliceFits(scan, tuple(fits))

@@ -1,0 +1,304 @@
+"""The transport-network scenario: A_T and B_T are networks of the settings (report 3.3.2, case 2).
+
+Signs of the gains, report eqs 38-39, are taken from first principles over the box of the scan,
+where they have one sign, and hold by the signs of the weights. What the sizes then leave open is
+large: see docs/scenarios.md.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import jax
+import numpy as np
+
+from beamfit.emittance.assumptions import Assumptions
+from beamfit.emittance.constrained_network import (
+    beam_box,
+    check_box,
+    known_record,
+    limited_network,
+    network_problem,
+    signed_network,
+    weight_free,
+)
+from beamfit.emittance.statement import Scenario, Seen, varied_magnets
+from beamfit.emittance.transport import NetworkRows, padded
+from beamfit.greybox.bounds import over_cells
+from beamfit.greybox.mlp import MLP, Port
+from beamfit.greybox.problem import Free, Problem, Record
+from beamfit.optics.rows import transfer_rows
+
+CELLS = 32
+ELEMENTS = "ABCD"
+# The sharpness of det T = 1.
+DETERMINANT = 1e-3
+
+
+class Gain(NamedTuple):
+    """A gain of the network over the box of the scan: its enclosure, and the sign it must have."""
+
+    name: str
+    lower: float
+    upper: float
+    sign: int
+
+    @property
+    def holds(self) -> bool:
+        """Whether the enclosure keeps to the sign; rounding is part of the enclosure."""
+        reach = 1e-12 * max(abs(self.lower), abs(self.upper))
+        if self.sign == 0:
+            return True
+        return self.upper <= reach if self.sign < 0 else self.lower >= -reach
+
+
+class Certificate(NamedTuple):
+    """Certified gains of a fitted network, and the box they hold over."""
+
+    gains: tuple[Gain, ...]
+    box: dict[str, tuple[float, float]]
+
+    @property
+    def holds(self) -> bool:
+        """Whether every gain keeps to its sign everywhere in the box."""
+        return all(gain.holds for gain in self.gains)
+
+
+class _Layout(NamedTuple):
+    """Inputs of the network, their columns and box, if the last is the energy; elements of T."""
+
+    names: tuple[str, ...]
+    columns: np.ndarray
+    with_energy: bool
+    elements: int
+    box: np.ndarray
+
+    @property
+    def cells(self) -> int:
+        """Along each input, in which gains are enclosed."""
+        return CELLS if len(self.names) == 1 else 8
+
+
+def _layout(seen: Seen, told: Assumptions) -> _Layout:
+    scan = seen.scan
+    columns = {name: scan.settings[name] for name in varied_magnets(scan)}
+    with_energy = scan.energy is not None and np.ptp(scan.energy) > 0
+    columns |= {"energy": scan.energy} if with_energy else {}
+    if not columns:
+        found = "a transport network for a scan in which no magnet and no energy changes"
+        raise scan.unusable(found, "scenario known: the network maps settings to R11 and R12")
+    elements, values = 4 if told.anchor.determinant else 2, np.stack([*columns.values()], -1)
+    return _Layout(tuple(columns), values, with_energy, elements, _box(seen, told, columns))
+
+
+def _box(seen: Seen, told: Assumptions, columns: dict[str, np.ndarray]) -> np.ndarray:
+    """Ends of the inputs' box: those that were given, or else of the scan; shape (2, inputs)."""
+    ends = []
+    for name, values in columns.items():
+        own = (values.min(), values.max())
+        low, high = told.bounds.get(name, own)
+        if low > own[0] or high < own[1]:
+            found = f"bounds {name} = {low:g}:{high:g}, and a scan from {own[0]:g} to {own[1]:g}"
+            raise seen.scan.unusable(found, "bounds that hold the scan", name)
+        ends.append((low, high))
+    return np.array(ends, float).T
+
+
+def _first_principles(seen: Seen, lay: _Layout, points: np.ndarray) -> np.ndarray:
+    """A, B, C, D of the line, shape (points, planes, places, 4)."""
+    full = padded(points)
+    columns = dict(zip(lay.names, full.T, strict=True))
+    energy = columns.pop("energy") if lay.with_energy else np.full(len(full), seen.energy)
+    settings = {k: np.full(len(full), np.median(v)) for k, v in seen.scan.settings.items()}
+    every = transfer_rows(seen.scanned, settings | columns, energy, seen.rows.places).planes
+    r = np.asarray(every)[: len(points), ["xy".index(p) for p in seen.planes], :, :2, :2]
+    return r.reshape(*r.shape[:3], 4)
+
+
+def _grid(lay: _Layout) -> np.ndarray:
+    """Points that fill the box, its edges included."""
+    number = max(3, round(600 ** (1 / len(lay.names))))
+    axes = [np.linspace(a, b, number) for a, b in zip(*lay.box, strict=True)]
+    return np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, len(axes))
+
+
+def _signs(seen: Seen, lay: _Layout, grid: np.ndarray) -> np.ndarray:
+    """Signs of the gains of A and B by first principles, shape (outputs, inputs); 0 if mixed."""
+    half = 0.5 * (lay.box[1] - lay.box[0])
+    found = np.zeros((len(seen.planes) * len(seen.rows.places) * lay.elements, len(half)))
+    # Nothing is asked of the gains by the energy, nor of C and D.
+    for i in range(len(half) - lay.with_energy):
+        step = np.zeros(len(half))
+        step[i] = 1e-4 * half[i]
+        up, down = (_first_principles(seen, lay, grid + s) for s in (step, -step))
+        sign = ((up > down).all(axis=0)).astype(int) - ((up < down).all(axis=0)).astype(int)
+        sign[..., 2:] = 0
+        found[:, i] = sign[..., : lay.elements].ravel()
+    return found
+
+
+def network_rows(seen: Seen, lay: _Layout, plane: str) -> NetworkRows:
+    """Inputs of the network and the place of A and B among its outputs, for one plane's rows."""
+    return NetworkRows(
+        plane,
+        seen.rows.squared,
+        padded(lay.columns),
+        _columns(seen, lay, plane, seen.rows.which),
+        seen.look.known["xy".index(plane)],
+        seen.rows.damping,
+    )
+
+
+def _columns(seen: Seen, lay: _Layout, plane: str, which: np.ndarray) -> np.ndarray:
+    first = (seen.planes.index(plane) * len(seen.rows.places) + which) * lay.elements
+    return first[:, None] + np.arange(lay.elements)
+
+
+def _state(seen: Seen, told: Assumptions) -> Problem:
+    """Beams, and one network for A and B of every plane and screen."""
+    lay = _layout(seen, told)
+    outputs = _names(seen, lay)
+    check_box(told, lay.names, outputs, seen.planes)
+    if told.gains:
+        net, weights, limits = limited_network(lay.names, lay.box, outputs, told, lay.cells)
+    else:
+        (net, weights), limits = _signed(seen, lay, told), []
+    limits += beam_box(told, seen.planes)
+    rows = {plane: network_rows(seen, lay, plane) for plane in seen.planes}
+    anchors = [record for own in rows.values() for record in _anchors(seen, lay, told, own)]
+    part = {"map": net}
+    return network_problem(seen, told, lay.names, seen.planes, rows, part, weights, anchors, limits)
+
+
+def _signed(seen: Seen, lay: _Layout, told: Assumptions) -> tuple[MLP, list[Free]]:
+    """A network scaled to its box, whose gains have the signs of first principles."""
+    grid = _grid(lay)
+    first = _first_principles(seen, lay, grid)[..., : lay.elements].reshape(len(grid), -1)
+    inputs = [
+        Port(n, "", 0, (b - a) / 2, (b + a) / 2)
+        for n, a, b in zip(lay.names, *lay.box, strict=True)
+    ]
+    outputs = [
+        Port(name, "", 0, np.ptp(v) / 2 or 1.0, (v.max() + v.min()) / 2)
+        for name, v in zip(_names(seen, lay), first.T, strict=True)
+    ]
+    net, bounds = signed_network(inputs, outputs, _signs(seen, lay, grid), told.hidden, told.seed)
+    return net, weight_free("map", bounds)
+
+
+def _names(seen: Seen, lay: _Layout) -> list[str]:
+    places = seen.rows.places
+    return [
+        f"{e}_{plane}" + (f"@{place}" if len(places) > 1 else "")
+        for plane in seen.planes
+        for place in places
+        for e in ELEMENTS[: lay.elements]
+    ]
+
+
+def _anchors(seen: Seen, lay: _Layout, told: Assumptions, rows: NetworkRows) -> Iterator[Record]:
+    """What ties the network to first principles, as records."""
+    anchor, plane, at = told.anchor, rows.plane, seen.measured(rows.plane)
+    i, places = seen.planes.index(plane), len(seen.rows.places)
+    points, which = lay.columns[at], seen.rows.which[at]
+    own = _first_principles(seen, lay, points)[np.arange(len(at)), i, which]
+    size = np.sqrt(np.mean(own**2, axis=0))[: lay.elements]
+
+    def known(name, inputs, screens, values, sd, predict=_outputs, elements=lay.elements):
+        columns = _columns(seen, lay, plane, padded(screens))[:, :elements]
+        data = NetworkRows(plane, rows.squared, padded(inputs), columns, rows.known, rows.damping)
+        return known_record(name, predict, data, values, sd)
+
+    if anchor.deviation is not None:
+        sd = anchor.deviation * size[:2]
+        name = f"anchor {plane}"
+        yield known(name, points, which, own[:, :2], sd, predict=_less_common, elements=2)
+    for place in anchor.at:
+        middle = 0.5 * (lay.box[0] + lay.box[1])
+        point = np.array([[place.get(n, m) for n, m in zip(lay.names, middle, strict=True)]])
+        here = _first_principles(seen, lay, point)[0, i, :, : lay.elements]
+        inputs, screens = np.repeat(point, places, axis=0), np.arange(places)
+        yield known(f"anchor {plane} at one setting", inputs, screens, here, anchor.sd * size)
+    if anchor.determinant:
+        yield known(f"det T {plane}", points, which, np.ones(len(at)), DETERMINANT, _determinant)
+
+
+def _outputs(model, rows: NetworkRows) -> jax.Array:
+    return rows.outputs(model)
+
+
+def _less_common(model, rows: NetworkRows) -> jax.Array:
+    """A and B without the error that all settings share."""
+    return rows.outputs(model) / (1.0 + model["anchor"][rows.plane])
+
+
+def _determinant(model, rows: NetworkRows) -> jax.Array:
+    """A D - B C at every row."""
+    a, b, c, d = rows.outputs(model).T
+    return a * d - b * c
+
+
+OPEN = (
+    "[A B] -> [A B] G with sigma -> G^-1 sigma G^-T leaves every size as it is, for any "
+    "invertible 2 x 2 matrix G (four directions; the emittance goes as 1/det G)",
+    "at each setting one size is measured for two numbers A and B: what one gives the other can "
+    "take",
+)
+SCENARIO = Scenario(
+    "transport-network",
+    _state,
+    null_directions=lambda _seen, _parameters, identified: () if identified else OPEN,
+    remedy=lambda _seen, _told: (
+        "an anchor to first principles at every setting (--anchor first-principles=2%); T known at "
+        "single settings or det T = 1 with C and D free do not suffice"
+    ),
+    network=True,
+    whole_map=False,
+)
+
+
+def certificate_of(problem: Problem, net: MLP) -> Certificate:
+    """Enclose the gains of a fitted network over the box of the scan.
+
+    Parameters
+    ----------
+    problem : Problem
+        From `transport_problem`; its bounds tell which sign each gain must have. A limit that was
+        given for a gain is a constraint of the problem, and asks for no sign here.
+    net : MLP
+        The fitted network.
+
+    Returns
+    -------
+    Certificate
+        For every current in the box, not only the measured ones, outward rounding included.
+    """
+    ports = net.input_ports
+    # A network that is scaled to its box has it in the scales.
+    scaled = [(p.bias - p.scale, p.bias + p.scale) for p in ports]
+    given = [(p.lower, p.upper) for p in ports]
+    low, high = np.where(np.isfinite(given), given, scaled).T
+    bound = over_cells(net, low, high, CELLS if len(ports) == 1 else 8)
+    lower, upper = np.asarray(bound.lower).min(axis=0), np.asarray(bound.upper).max(axis=0)
+    sign = _asked(problem, net)
+    gains = tuple(
+        Gain(f"d{out.name}/d{port.name}", float(lower[o, i]), float(upper[o, i]), int(sign[o, i]))
+        for o, out in enumerate(net.output_ports)
+        for i, port in enumerate(ports)
+    )
+    box = {p.name: (float(a), float(b)) for p, a, b in zip(ports, low, high, strict=True)}
+    return Certificate(gains, box)
+
+
+def _asked(problem: Problem, net: MLP) -> np.ndarray:
+    """Signs the bounds of the weights ask of the gains, shape (outputs, inputs)."""
+    ends = {
+        f.path.rsplit(".", 1)[-1]: np.sign(np.asarray(f.lower) + np.asarray(f.upper))
+        for f in problem.free
+        if ".weights." in f.path
+    }
+    if not ends:  # limits, and no signs
+        return np.zeros((len(net.output_ports), len(net.input_ports)))
+    first, last = (ends[f"layer{i}->layer{i + 1}"][...] for i in (0, 1))
+    return last[0][:, None] * first[:, 0][None, :]

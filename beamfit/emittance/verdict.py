@@ -1,0 +1,305 @@
+"""Whether sizes determine an emittance: what the comparison of models says, in sentences."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+
+from beamfit.emittance.comparison import BEAM, FLAT
+from beamfit.emittance.results import Points
+from beamfit.quantity import display_unit
+from beamfit.status import Status
+from beamfit.verdict import Finding
+
+# A beam is sure with this probability: one answer in a hundred may be another thing.
+SURE = 0.99
+# An emittance is of use where its 95 % interval spans less than this factor.
+USEFUL = 2.5
+# A point carries the answer if the emittance moves by so many errors without it; the interval
+# reaches to where it goes if that is farther than any noise would move it.
+CARRIES, MOVES = 2.0, 3.0
+# Above this probability of χ² stated errors are called too large.
+OVERSTATED = 0.999
+# Points that a sentence names.
+MOST_NAMED = 5
+# What to check where a rival explains the sizes.
+REMEDIES = {
+    FLAT: "The smallest sizes decide: measure over the waist, and check resolution_um.",
+    "one constant size": (
+        "Check that the magnet moved and that the screen shows the beam, and scan further."
+    ),
+    "sizes at random": "Check settings, units, energy and screen, or measure more settings.",
+    "sizes that drift": "Check that the beam was stable while the scan was taken.",
+    "a smooth curve that is no beam's": (
+        "Check the line, the settings' units, and how sizes are taken from the profile "
+        "(saturation, background, cut edges)."
+    ),
+}
+
+
+class Evidence(NamedTuple):
+    """What a verdict on one plane rests on.
+
+    Attributes
+    ----------
+    probability : dict of str to float
+        Of a beam and its rivals.
+    seen : bool
+        Whether the settings separate the three numbers of the beam.
+    points : int
+        How many there are.
+    moved, errors : bool
+        Whether a magnet was, and whether errors were stated.
+    low, high : float
+        Central 95 % of the normalised emittance, m; infinite where other unknowns leave it open.
+    bracketed : bool or None
+        Whether the waist is.
+    ending : Finding or None
+        How a search ended, where that was no answer.
+    scenario : str
+        What is free besides the beam, in words; empty where nothing is.
+    opened : str
+        What leaves the emittance open in a scenario, in words.
+    remedy : str
+        What would close it.
+    """
+
+    probability: dict[str, float]
+    seen: bool
+    points: int
+    moved: bool
+    errors: bool
+    low: float
+    high: float
+    bracketed: bool | None
+    ending: Finding | None = None
+    scenario: str = ""
+    opened: str = ""
+    remedy: str = ""
+
+    @property
+    def cause(self) -> str:
+        """The likeliest model."""
+        return max(self.probability, key=self.probability.__getitem__)
+
+    @property
+    def untested(self) -> bool:
+        """Whether three monitors give three numbers, and nothing is left to compare."""
+        return self.points == 3 and not self.moved and self.errors
+
+    @property
+    def of_a_beam(self) -> bool:
+        """Whether the sizes are a beam's, of an emittance or none."""
+        if not self.seen or self.points <= 3:
+            return self.seen and self.untested
+        return self.probability[BEAM] + self.probability[FLAT] > SURE
+
+    @property
+    def determined(self) -> bool:
+        """Whether they are a beam's and say its emittance."""
+        sure = self.untested or self.probability[BEAM] > SURE
+        narrow = self.low > 0.0 and self.high < USEFUL * self.low
+        return self.of_a_beam and sure and narrow and not self.opened and self.ending is None
+
+
+def verdict(e: Evidence, remarks: str = "", advice: str = "") -> Finding:
+    """Say whether a plane's sizes determine its emittance.
+
+    Parameters
+    ----------
+    e : Evidence
+        Of the plane.
+    remarks : str
+        Further sentences on noise and points.
+    advice : str
+        What to measure next.
+
+    Examples
+    --------
+    >>> probability = {"beam": 0.999, "beam of no emittance": 0.001}
+    >>> e = Evidence(probability, True, 9, True, True, 0.9e-6, 1.1e-6, True)
+    >>> verdict(e).status.value, verdict(e._replace(high=4e-6)).status.value
+    ('converged', 'unidentified')
+    """
+    if e.ending is not None and (e.of_a_beam or e.ending.status is not Status.not_converged):
+        return e.ending
+    if e.determined:
+        return Finding(Status.converged, f"{_determined(e)} {remarks}".strip())
+    status = Status.unidentified
+    if e.cause.startswith("a smooth curve") and e.probability[e.cause] > SURE:
+        status = Status.poor_fit
+    where = f" in scenario {e.scenario}" if e.scenario else ""
+    said = f"Not determined{where}: {_open(e)}."
+    help_ = [advice or (REMEDIES.get(e.cause, "") if not e.of_a_beam and e.seen else "")]
+    help_ += [f"Needed: {e.remedy}."] if e.remedy and e.of_a_beam else []
+    return Finding(status, f"{said} {remarks}".strip(), " ".join(filter(None, help_)))
+
+
+def _determined(e: Evidence) -> str:
+    where = f" in scenario {e.scenario}" if e.scenario else ""
+    if e.untested:
+        return (
+            f"Determined{where}, but not testable: three monitors give three numbers exactly, and "
+            "nothing is left to test line and stated errors by."
+        )
+    waist = {None: "", True: ", the waist is bracketed", False: ", the waist is not bracketed"}
+    return f"Determined{where}: {_sure(e.probability[BEAM])}{waist[e.bracketed]}."
+
+
+def _sure(probability: float) -> str:
+    return "the sizes are those of a beam with " + (
+        "P > 0.9999" if probability > 0.9999 else f"P = {probability:.4f}"
+    )
+
+
+def _open(e: Evidence) -> str:
+    """Why the emittance is not determined."""
+    if not e.seen:
+        return (
+            "the settings do not separate the three numbers of the beam matrix, as if the "
+            "scanned magnet were downstream of the screen or hardly moved"
+        )
+    if e.points == 3 and not e.untested:
+        return (
+            "three points fit any three numbers exactly and leave nothing to judge them by; "
+            "measure a fourth setting"
+        )
+    if not e.of_a_beam:
+        rival = e.cause
+        if rival in (BEAM, FLAT):
+            rest = {k: v for k, v in e.probability.items() if k not in (BEAM, FLAT)}
+            rival = max(rest, key=rest.__getitem__)
+            return (
+                f"these sizes may be a beam's (P = {e.probability[BEAM]:.2g}), or else {rival} "
+                f"(P = {rest[rival]:.2g})"
+            )
+        return f"the sizes look like {rival} (P = {e.probability[rival]:.2g}), not like a beam's"
+    if e.opened:
+        return e.opened
+    if e.probability[BEAM] <= SURE:
+        return f"a beam of no emittance explains the sizes, too (P = {e.probability[FLAT]:.2g})"
+    if not e.low > 0.0:
+        return "the 95 % interval of the emittance begins at zero"
+    factor = e.high / e.low
+    said = f"{factor:.2g}" if factor < 100 else "more than 100"
+    return f"the 95 % interval of the emittance spans a factor {said}"
+
+
+def noise_remark(noise: str, scale: np.ndarray, probability: float | None = None) -> str:
+    """Say what the noise turned out to be, where that differs from what was stated.
+
+    Parameters
+    ----------
+    noise : {"stated", "share", "shots", "none"}
+        What was known of it.
+    scale : ndarray
+        Median and central 68 % of its scale.
+    probability : float, optional
+        Of a χ² at least as large as that of the stated errors.
+
+    Examples
+    --------
+    >>> noise_remark("stated", np.array([2.0, 1.6, 2.5]))
+    'Stated errors are too small by a factor 2 (1.6 to 2.5), which the error includes.'
+    """
+    middle, low, high = scale
+    if noise in ("stated", "share"):
+        if low > 1.05:
+            return (
+                f"Stated errors are too small by a factor {middle:.2g} ({low:.2g} to {high:.2g}), "
+                "which the error includes."
+            )
+        if probability is not None and probability > OVERSTATED:
+            return (
+                "Stated errors seem too large, and so is the error here: the sizes scatter less "
+                f"(probability {1.0 - probability:.1g})."
+            )
+    if noise == "shots" and middle > 0.005:
+        return (
+            f"Settings scatter by {100 * middle:.2g} % ({100 * low:.2g} to {100 * high:.2g} %) of "
+            "the size beyond their shots, which the error includes."
+        )
+    return ""
+
+
+def point_remarks(
+    p: Points, carrying: str = "", without: float = math.nan, reached: bool = False
+) -> Iterator[str]:
+    """Name bad readings, and the point that carries the answer.
+
+    Parameters
+    ----------
+    p : Points
+        With the probability of each that it is bad.
+    carrying, without : str and float
+        The point without which the emittance moves most, and what it is then, normalised, m; NaN
+        where the others give none.
+    reached : bool
+        Whether the interval was widened to hold that.
+    """
+    bad = np.flatnonzero(p.outlier_probability > 0.5)
+    if len(bad):
+        places = [p.where(i) for i in bad[:MOST_NAMED]]
+        places += [f"{len(bad) - MOST_NAMED} more"] * (len(bad) > MOST_NAMED)
+        verb = "are" if len(bad) > 1 else "is"
+        said = f"{len(bad)} of {len(p.size)} readings {verb} probably bad"
+        yield f"{said}: {'; '.join(places)}."
+    if carrying and math.isnan(without):
+        yield f"It rests on the point at {carrying}: without it there is no answer."
+    elif carrying:
+        factor, unit = display_unit(without, "m")
+        reach = ", to which the interval reaches" * reached
+        yield (
+            f"It rests on the point at {carrying}: without it the normalised emittance is "
+            f"{without / factor:.3g} {unit}{reach}."
+        )
+
+
+def one_magnet(settings: dict[str, np.ndarray], screens: tuple[str, ...]) -> np.ndarray | None:
+    """The settings of the one magnet that was scanned before one screen; None if there were more.
+
+    Examples
+    --------
+    >>> one_magnet({"Q1": np.zeros(3), "Q2": np.arange(3.0)}, ("S",) * 3).tolist()
+    [0.0, 1.0, 2.0]
+    """
+    varied = [v for v in settings.values() if np.ptp(v) > 0]
+    return varied[0] if len(varied) == 1 and len(set(screens)) == 1 else None
+
+
+def waist_bracketed(
+    settings: dict[str, np.ndarray], screens: tuple[str, ...], size: np.ndarray, error: np.ndarray
+) -> bool | None:
+    """Whether the sizes rise, by two standard errors, on both sides of the smallest.
+
+    Parameters
+    ----------
+    settings : dict of str to ndarray
+        Magnet name to settings.
+    screens : tuple of str
+        The screen of each point.
+    size, error : ndarray
+        Sizes and errors, m.
+
+    Returns
+    -------
+    bool or None
+        None if more than one magnet or screen was varied: there is no side then.
+
+    Examples
+    --------
+    >>> sizes = np.array([2.0, 1.0, 3.0])
+    >>> waist_bracketed({"Q": np.arange(3.0)}, ("S",) * 3, sizes, 0.1 * sizes)
+    True
+    """
+    varied = one_magnet(settings, screens)
+    if varied is None:
+        return None
+    order = np.argsort(varied, kind="stable")
+    size, error = size[order], error[order]
+    low = int(np.argmin(size))
+    rise = (size - size[low]) > 2.0 * np.hypot(error, error[low])
+    return bool(rise[:low].any() and rise[low + 1 :].any())

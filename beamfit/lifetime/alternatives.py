@@ -1,0 +1,461 @@
+"""What may be behind a decay that constant a and b do not describe, compared by evidence.
+
+A bunch that lengthens, a gas that is pumped away after a fill, a loss rate that changes once or
+twice: each is the one law with further numbers, under the same noises, with stated priors.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from scipy.special import logsumexp
+
+from beamfit.lifetime.decay_law import HOUR
+from beamfit.lifetime.expansion import (
+    FURTHER,
+    LEVEL,
+    LOSS,
+    PLAIN,
+    POWER,
+    QUADRATIC,
+    TIMES,
+    WHEN,
+    Expansion,
+    Pieces,
+    further_columns,
+    lifetime_of,
+    solved,
+)
+from beamfit.lifetime.marginal import ABOVE, BELOW, DRIFT
+from beamfit.lifetime.record import DecayRecord
+from beamfit.noise.memory import Products
+from beamfit.quantity import Quantity
+from beamfit.shown import shown
+from beamfit.status import Status
+from beamfit.table import json_of
+
+# Probability of so large an exponent from which a constant a is rejected.
+REJECTED = 1e-3
+# An exponent known worse than this tells no bunch that lengthens from one that does not.
+TELLING = 1 / 3
+# A departure of so many errors is found with 90 % at a false alarm rate of `REJECTED`.
+FOUND = 4.57
+# Readings from which a search with further numbers learns all that it can.
+ENOUGH = 1024
+# Times, over the span, that are looked at for a change, and from which searches for gas begin.
+GRID, STARTS, LONGEST = np.linspace(0.05, 0.95, 40), (0.05, 0.2, 0.7), 1.0
+# Changes are placed on ever finer grids about the best of the last, so often.
+FINER = 3
+# Two changes within so many readings are a step.
+STEP = 3.0
+# Prior probabilities: constant a and b, a power of a, a drift of b beside, one change, two, gas
+# that relaxes; and between which shares of the loss a further one lies, flat in its logarithm.
+CHANCES = {"": 0.4, "power": 0.2, "drift": 0.2, "step": 0.08, "steps": 0.04, "relaxing": 0.08}
+SIZES = (1e-3, 1.0)
+# Currents at which a lifetime is offered, if the loss rate there is so many errors above zero.
+CURRENTS, CLEAR = 5, 3.0
+
+
+@shown
+@dataclass(frozen=True)
+class ConstantA:
+    """Whether one record contradicts a constant a.
+
+    Parameters
+    ----------
+    status : Status
+        `converged` if a constant a describes the record, `poor_fit` if it is rejected,
+        `unidentified` if the record cannot tell.
+    message : str
+        The verdict in a sentence.
+    exponent : Quantity
+        s in a(I) proportional to I^s: 0 for constant a, -1/3 for a strongly lengthening bunch,
+        above 0 where the loss rate falls otherwise, as in a vacuum that recovers; NaN if the
+        record cannot tell.
+    p_value : float
+        Probability of a worse contradiction if a is constant; NaN if the record cannot tell.
+    """
+
+    status: Status
+    message: str
+    exponent: Quantity
+    p_value: float
+
+    def widened(self, error: float) -> ConstantA:
+        """The verdict with a further, independent error of the exponent."""
+        exponent = self.exponent
+        if not math.isfinite(exponent.value):
+            return self
+        whole = math.hypot(exponent.error, error)
+        chance = math.erfc(abs(exponent.value) / whole / math.sqrt(2))
+        return constant_a(exponent.value, whole, exponent.error_raw, chance)
+
+    def __str__(self) -> str:
+        return f"{self.status}. {self.message}"
+
+
+def constant_a(exponent: float, error: float, raw: float, chance: float) -> ConstantA:
+    """Judge an exponent by its error and the chance of so large a one where a is constant."""
+    if not error < TELLING:
+        message = "The record cannot tell a constant a from one that depends on the current"
+        unknown = Quantity(math.nan, None, "1")
+        return ConstantA(Status.unidentified, f"{message}: record longer.", unknown, math.nan)
+    found, chance = Quantity(float(exponent), float(error), "1", float(raw)), float(chance)
+    if chance >= REJECTED:
+        message = (
+            f"A constant a describes the record (p = {chance:.2g}, exponent {found}; one of "
+            f"{FOUND * error:.2g} would be seen)."
+        )
+        return ConstantA(Status.converged, message, found, chance)
+    cause = (
+        "so b of the constant-a fit is not a gas loss; fit with the shape of a"
+        if exponent < 0
+        else "which no bunch length does: look for a vacuum that changes, as after a fill"
+    )
+    message = (
+        f"A constant a is rejected (p = {max(chance, 1e-300):.2g}): a goes as "
+        f"I^{found.value:.3f}, {cause}."
+    )
+    return ConstantA(Status.poor_fit, message, found, chance)
+
+
+@shown
+@dataclass(frozen=True)
+class LifetimeLaw:
+    """The lifetime as a function of the current, where constant a and b do not describe it.
+
+    Parameters
+    ----------
+    current : tuple of float
+        Currents, mA, from the last to the first of the record.
+    lifetime : tuple of Quantity
+        Lifetime at each, h, of a law with a going as a power of the current.
+    exponent : Quantity
+        The power.
+    """
+
+    current: tuple[float, ...]
+    lifetime: tuple[Quantity, ...]
+    exponent: Quantity
+
+    def __str__(self) -> str:
+        pairs = zip(self.current, self.lifetime, strict=True)
+        return ", ".join(f"{lifetime} at {current:.4g} mA" for current, lifetime in pairs)
+
+
+def lifetime_law(about: Expansion, independent: bool, free: bool) -> LifetimeLaw | None:
+    """Lifetimes by current of a law with a power of a that is free, or as it is.
+
+    None where the search for the power does not come to rest.
+    """
+    if free:
+        about = solved(_averaged(about.pieces), (*PLAIN, POWER))
+        if not about.rested:
+            return None
+    (span, mean), current = about.pieces.units, about.pieces.current
+    x = np.geomspace(current.min(), current.max(), CURRENTS) / mean
+
+    def rates(numbers: jax.Array) -> jax.Array:
+        loss, quadratic, power = numbers[:3]
+        found = (quadratic * x ** (1 + power) + loss - quadratic) / span
+        return jnp.append(found, power)
+
+    columns = about.columns(*[POWER] * free)
+    slopes = np.zeros((CURRENTS + 1, about.rows.shape[1]))
+    slopes[:, 1:4] = np.asarray(jax.jacfwd(rates)(about.numbers[:3]))
+    memory = about.whitened(columns, independent).memory()
+    errors = memory.moments(slopes[:, columns], about.given).error
+    over = about.pieces.over
+    for change in about.pieces.monitor_changes:
+        moved = np.linalg.lstsq(about.left[:, columns], change / over, rcond=None)[0]
+        errors = np.hypot(errors, slopes[:, columns] @ moved)
+    *found, power = np.asarray(rates(about.numbers))
+    exponent = Quantity(float(power), float(errors[-1]) if free else None, "1")
+    lifetimes = (lifetime_of(*pair, CLEAR) for pair in zip(found, errors[:-1], strict=True))
+    return LifetimeLaw(tuple(map(float, x * mean)), tuple(lifetimes), exponent)
+
+
+@shown
+class Change(NamedTuple):
+    """A change of the loss rate in a record.
+
+    Attributes
+    ----------
+    time : float
+        When, s from the first reading.
+    before, after : Quantity
+        Lifetime at that moment's current before and after it, h.
+    then : Change or None
+        A second one, as where a scraper was moved in and out again.
+    """
+
+    time: float
+    before: Quantity
+    after: Quantity
+    then: Change | None = None
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the time and the two lifetimes as JSON's types, and of a second change too."""
+        told = {"time": self.time, "before": self.before, "after": self.after}
+        return json_of(told if self.then is None else told | {"then": self.then})
+
+    def __str__(self) -> str:
+        again = "" if self.then is None else f", and {str(self.then).partition('changed ')[2]}"
+        return (
+            f"the loss rate changed near t = {self.time:.4g} s, where the lifetime went from "
+            f"{self.before} to {self.after}{again}"
+        )
+
+
+@shown
+class Outgassing(NamedTuple):
+    """A gas loss b0 + b1 exp(-t/T): what a fill sets free is pumped away.
+
+    Attributes
+    ----------
+    time_constant : Quantity
+        T, h.
+    a, b : Quantity
+        The law's a, 1/(mA s), and b0, 1/s, that is left in the end.
+    before, after : Quantity
+        Lifetime at the first current, h: with the loss there was at first, and with b0 alone.
+    current : float
+        That current, mA.
+    """
+
+    time_constant: Quantity
+    a: Quantity
+    b: Quantity
+    before: Quantity
+    after: Quantity
+    current: float
+
+    def __str__(self) -> str:
+        return (
+            f"the gas loss falls with a time constant of {self.time_constant}, as in a vacuum that "
+            f"recovers after a fill (outgassing): at {self.current:.4g} mA the lifetime goes from "
+            f"{self.before} to {self.after}, with a = {self.a}, b = {self.b}"
+        )
+
+
+class Rival(NamedTuple):
+    """What explains a record better than a smooth law: a change or gas, and by how much.
+
+    `odds` is the logarithm of its probability over that of a power of a with a drift of b, and
+    `scatter` what it leaves of the readings, mA rms.
+    """
+
+    found: Change | Outgassing
+    odds: float
+    scatter: float
+
+    def __str__(self) -> str:
+        size = self.odds / math.log(10.0)
+        times = f"{10**size:.2g}" if size < 6 else f"1e{size:.0f}"
+        return f"{self.found} ({times} times likelier than a power of a with a drift of b)"
+
+
+def rival_of(plain: Expansion) -> Rival | None:
+    """The likeliest of a change, two changes and gas that relaxes, if it beats a smooth law.
+
+    Parameters
+    ----------
+    plain : Expansion
+        Of a single decay, with constant a and b.
+
+    Returns
+    -------
+    Rival or None
+        None also where so few readings tell nothing of further numbers.
+
+    Notes
+    -----
+    Probabilities by Laplace's approximation about the best numbers of each, the size and the memory
+    of the noise averaged over as in `beamfit.lifetime.marginal`. Further losses are flat in
+    their logarithm, times in the record, those of gas in their logarithm up to its length.
+    """
+    pieces = _averaged(plain.pieces)
+    if pieces.time.size <= WHEN + 2:
+        return None
+    plain = solved(pieces) if pieces is not plain.pieces else plain
+    smooth = _smooth(plain)
+    found: list[tuple[float, str, Expansion]] = []
+    laws = {"step": _changed(plain, 1), "steps": _changed(plain, 2)}
+    laws["relaxing"] = _relaxing(plain) if pieces.gauge is None else None
+    for name, law in laws.items():
+        if law is not None:
+            found.append((_log_evidence(law, name), name, law))
+    log, name, best = max(found, key=lambda one: one[0], default=(-math.inf, "", plain))
+    if not log > smooth:
+        return None
+    answer = _outgassing(best) if name == "relaxing" else _change(best)
+    scatter = float(np.sqrt(np.mean((best.residuals * pieces.over) ** 2)))
+    return Rival(answer, log - smooth, scatter)
+
+
+def _averaged(pieces: Pieces) -> Pieces:
+    """A long decay as the means of neighbouring readings: the curve is smooth between them."""
+    if pieces.time.size <= ENOUGH or pieces.first.size > 1 or pieces.gauge is not None:
+        return pieces
+    record = DecayRecord(pieces.time, pieces.current, pieces.error, monitor=pieces.monitor)
+    return Pieces.of(DecayRecord(*record.blocks(ENOUGH), monitor=pieces.monitor))
+
+
+def _smooth(plain: Expansion) -> float:
+    """Log evidence of a power of the current with a drift of b, or of neither."""
+    start = np.append(plain.numbers, [0.0, 0.0])
+    laws = [plain, solved(plain.pieces, (*PLAIN, POWER))]
+    if plain.pieces.gauge is None:
+        gas = abs(plain.numbers[0] - plain.numbers[1])
+        width = (BELOW + ABOVE) / 2
+        laws.append(solved(plain.pieces, (*PLAIN, POWER, FURTHER), "drift", start=start,
+                           widths={POWER: width, FURTHER: DRIFT * gas}))  # fmt: skip
+    named = zip(laws, ("", "power", "drift"), strict=False)
+    return float(logsumexp([_log_evidence(law, name) for law, name in named if law.rested]))
+
+
+def _changed(plain: Expansion, count: int) -> Expansion | None:
+    """The law with changes of the loss rate at the times that explain most, in linear
+    approximation about the law without.
+    """
+    basis = np.linalg.qr(plain.left[:, [LEVEL, *PLAIN]])[0]
+
+    def beside(columns: np.ndarray) -> np.ndarray:
+        return columns - basis @ (basis.T @ columns)
+
+    residual, windows = beside(plain.residuals), [GRID] * count
+    for _ in range(FINER):
+        every = np.concatenate(windows)
+        kinks = beside(further_columns(plain, "step", every))
+        size = np.linalg.norm(kinks, axis=0) + 1e-300
+        along, products = kinks.T @ residual / size, kinks.T @ kinks / size / size[:, None]
+        place = np.array(list(itertools.product(*np.split(np.arange(every.size), count))))
+        pairs = products[place[:, :, None], place[:, None, :]] + 1e-6 * np.eye(count)
+        sizes = np.linalg.solve(pairs, along[place][..., None])[..., 0]
+        best = int(np.argmax(np.sum(sizes * along[place], axis=1)))
+        times, steps = every[place[best]], [window[1] - window[0] for window in windows]
+        windows = [np.linspace(t - d, t + d, GRID.size) for t, d in zip(times, steps, strict=True)]
+    further = np.column_stack([-sizes[best] / size[place[best]], times])
+    further = further[np.argsort(times)].ravel()
+    free = (*PLAIN, *range(FURTHER, FURTHER + 2 * count, 2))
+    law = solved(plain.pieces, free, "step", start=np.append(plain.numbers, further))
+    apart = STEP * float(np.median(np.diff(plain.pieces.time))) / plain.pieces.units[0]
+    clear = np.all(np.diff([0.0, *law.numbers[4::2], 1.0]) > apart)
+    return law if law.rested and clear else None
+
+
+def _relaxing(plain: Expansion) -> Expansion | None:
+    """The law with gas that relaxes."""
+    free = (*PLAIN, FURTHER, WHEN)
+    laws = [
+        solved(plain.pieces, free, "relaxing",
+               start=np.append(plain.numbers, [0.1 * abs(plain.numbers[0]), at]))
+        for at in STARTS
+    ]  # fmt: skip
+    shortest = float(np.median(np.diff(plain.pieces.time))) / plain.pieces.units[0]
+    laws = [
+        law for law in laws
+        if law.rested and law.numbers[3] > 0 and shortest < law.numbers[4] < LONGEST
+    ]  # fmt: skip
+    return min(laws, key=lambda law: float(law.residuals @ law.residuals), default=None)
+
+
+def _log_evidence(law: Expansion, name: str) -> float:
+    """Logarithm of the probability of the readings, the noise averaged over, up to a constant."""
+    loss, quadratic, power, *further = law.numbers
+    extra: dict[int, float] = {}
+    if name in ("power", "drift"):
+        extra[POWER] = BELOW if power < 0 else ABOVE
+    if name == "drift":
+        extra[FURTHER] = DRIFT * max(abs(loss - quadratic), 1e-300)
+    flat = []
+    for k in range(0, len(further) * (name != "drift"), 2):
+        # A flat prior as a normal one of that density: what is not determined costs nothing.
+        size = 2 * max(abs(further[k]), SIZES[0] * abs(loss)) * math.log(SIZES[1] / SIZES[0])
+        time = 1.0 if name != "relaxing" else further[1] * math.log(LONGEST / TIMES[0])
+        for column, wide in ((FURTHER + k, size), (WHEN + k, time)):
+            extra[column] = wide / math.sqrt(2 * math.pi)
+            flat.append(column)
+    columns = [LEVEL, *PLAIN, *extra]
+    width = np.array([np.inf] * 3 + list(extra.values()))
+    known = [0.0 if column in flat else law.numbers[column - 1] for column in extra]
+    centre = np.array([0.0] * 3 + known)
+    rows = np.column_stack([law.residuals, law.rows[:, columns]])
+    products = Products.of(rows, law.pieces.time, law.pieces.error is not None)
+    along, matrix = products.matrix[:, 1:, 0], products.matrix[:, 1:, 1:]
+    after, first = products.matrix[:, 0, 0], products.matrix[:, 0, 0]
+    for _ in range(3):
+        unit = products.variance(after, len(columns))[:, None]
+        precision = matrix / unit[..., None] + np.diag(1 / width**2)
+        scale = np.sqrt(np.einsum("kpp->kp", precision)) + 1e-300
+        scaled = precision / scale[:, :, None] / scale[:, None, :] + 1e-12 * np.eye(len(columns))
+        pull = (along / unit + centre / width**2) / scale
+        step = -np.linalg.solve(scaled, pull[..., None])[..., 0] / scale
+        after = first + 2 * np.sum(along * step, 1) + np.einsum("kp,kpq,kq->k", step, matrix, step)
+        after = np.maximum(after, 1e-30)
+    log = products.log_prior + products.log_size(after)
+    log = log - 0.5 * np.linalg.slogdet(scaled)[1] - np.log(scale).sum(1)
+    finite = np.isfinite(width)
+    log = log - 0.5 * np.sum(((centre + step) / width)[:, finite] ** 2, 1)
+    chance = math.log(CHANCES[name])
+    return float(logsumexp(log)) - float(np.log(width[finite]).sum()) + chance
+
+
+def _quantities(law: Expansion, values: np.ndarray, slopes: np.ndarray, columns: list[int]):
+    """Values with their errors by slopes of all columns."""
+    independent = not law.wanders
+    memory = law.whitened(columns, independent).memory()
+    errors = memory.moments(slopes[:, columns], law.given).error
+    return zip(values, errors, strict=True)
+
+
+def _change(law: Expansion) -> Change:
+    """The lifetimes before and after each time, from the law with changes there."""
+    (span, mean), (loss, quadratic, _, *further) = law.pieces.units, law.numbers
+    pairs = sorted(zip(further[1::2], further[::2], range(len(further)), strict=False))
+    columns = [LEVEL, *PLAIN, *(FURTHER + 2 * k for *_, k in pairs)]
+    told, here, slopes = None, [], []
+    gone, slope = 0.0, np.zeros(law.rows.shape[1])
+    for at, size, k in pairs:
+        x = float(np.interp(at * span, law.pieces.time, law.pieces.current)) / mean
+        slope[[LOSS, QUADRATIC]] = 1.0, x - 1
+        for more in (0.0, size):
+            slope = slope.copy()
+            slope[FURTHER + 2 * k] = 1.0 * (more != 0.0)
+            here.append(loss + quadratic * (x - 1) + gone + more)
+            slopes.append(slope)
+        gone += size
+    found = _quantities(law, np.array(here) / span, np.array(slopes) / span, columns)
+    lifetimes = [lifetime_of(*one) for one in found]
+    for k in reversed(range(len(pairs))):
+        told = Change(float(pairs[k][0] * span), *lifetimes[2 * k : 2 * k + 2], told)
+    return told
+
+
+def _outgassing(law: Expansion) -> Outgassing:
+    (span, mean), (_, quadratic, _, further, when) = law.pieces.units, law.numbers
+    start = float(law.level[0])
+
+    def quoted(step: jax.Array) -> jax.Array:
+        x, q = start + step[LEVEL], quadratic + step[QUADRATIC]
+        b, more = law.numbers[0] + step[LOSS] - q, further + step[FURTHER]
+        return jnp.stack([(when + step[WHEN]) * span / HOUR, q / mean / span, b / span,
+                          (q * x + b + more) / span, (q * x + b) / span])  # fmt: skip
+
+    zero = jnp.zeros(law.rows.shape[1])
+    columns = [LEVEL, *PLAIN, FURTHER, WHEN]
+    found = _quantities(
+        law, np.asarray(quoted(zero)), np.asarray(jax.jacfwd(quoted)(zero)), columns
+    )
+    units = ("h", "1/(mA s)", "1/s", "1/s", "1/s")
+    constant, a, b, *rates = (
+        Quantity(float(v), float(e), u) for (v, e), u in zip(found, units, strict=True)
+    )
+    before, after = (lifetime_of(rate.value, rate.error, CLEAR) for rate in rates)
+    return Outgassing(constant, a, b, before, after, start * mean)

@@ -1,0 +1,343 @@
+"""Lifetime over weeks: normalised, with control limits, and watched for changes of a and b."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from beamfit.errors import InputError
+from beamfit.lifetime.alarm import Alarm, Reference, alarms_of, when
+from beamfit.lifetime.decay_law import HOUR
+from beamfit.lifetime.fit import DecayFit, bare
+from beamfit.lifetime.mechanisms import loss_coefficients
+from beamfit.lifetime.scales import by_losses, summarise
+from beamfit.lifetime.study import Decay, Machine, RecordStudy
+from beamfit.quantity import Quantity, Status
+from beamfit.shown import shown
+from beamfit.statistics import FEWEST, baseline, control_limits
+from beamfit.table import Table, cell, json_of
+
+# a and b wander by so much on an ordinary day.
+WANDER = 0.005
+DAY = 24 * HOUR
+# No monitor is better than this share of the current.
+BEST_MONITOR = 1e-7
+# More readings are watched every second, third, ... one.
+MOST = 50_000
+
+
+class Point(NamedTuple):
+    """One decay.
+
+    Attributes
+    ----------
+    record : str
+        Name of the decay.
+    time : float
+        Of its first reading: Unix time, or s from the start of the record.
+    current : float
+        Mean current, mA.
+    lifetime : Quantity
+        At the mean current, h.
+    normalised : Quantity
+        Current times lifetime, at the reference current and settings where a ring is given, mA h.
+    a, b : Quantity or None
+        Over the usual ones, of 1; None where the decay does not determine or refutes them.
+    beyond : int
+        +1 above the control limits, -1 below, 0 within.
+    """
+
+    record: str
+    time: float
+    current: float
+    lifetime: Quantity
+    normalised: Quantity
+    a: Quantity | None
+    b: Quantity | None
+    beyond: int
+
+
+@shown
+@dataclass(frozen=True, eq=False)
+class Trend:
+    """Many decays in order of time.
+
+    Parameters
+    ----------
+    status : Status
+        `converged` if all is usual, `poor_fit` if an alarm was raised or a lifetime lies beyond the
+        limits, `unidentified` if there are too few lifetimes to say what is usual.
+    message : str
+        The verdict in a sentence.
+    points : tuple of Point
+        The decays whose lifetime is determined.
+    current : float
+        Reference current, mA.
+    scaled : bool
+        Whether lifetimes are scaled by the ring to the reference current and its usual settings.
+    centre, limit : float
+        Usual normalised lifetime, mA h, and how far from it the control limits are.
+    drift : Quantity
+        Relative change of the normalised lifetime in a week.
+    reference : Reference or None
+        Usual a and b; None where the first decays do not give them.
+    alarms : tuple of Alarm
+        Of the readings after the first decays.
+    dated : bool
+        Whether times are Unix times.
+    """
+
+    status: Status
+    message: str
+    points: tuple[Point, ...]
+    current: float
+    scaled: bool
+    centre: float
+    limit: float
+    drift: Quantity
+    reference: Reference | None
+    alarms: tuple[Alarm, ...]
+    dated: bool
+
+    @property
+    def headline(self) -> str:
+        """The verdict in a line."""
+        return f"{cell(self.status)}: {self.message}"
+
+    def tables(self) -> tuple[Table, ...]:
+        """Every lifetime, and every alarm."""
+        header = ["decay", "from", "I, mA", "τ, h", "I τ, mA h", "a, %", "b, %", ""]
+        records = {point.record.partition("#")[0] for point in self.points}
+        shared = records.pop() if len(records) == 1 else ""
+        rows = [
+            [
+                point.record.removeprefix(shared) or shared,
+                when(point.time, self.dated).partition("-")[2] or when(point.time, self.dated),
+                f"{point.current:.4g}", f"{point.lifetime.value:.4g}",
+                f"{point.normalised.value:.5g}", _percent(point.a), _percent(point.b),
+                {1: "above", 0: "", -1: "below"}[point.beyond],
+            ]
+            for point in self.points
+        ]  # fmt: skip
+        by = f"by the ring to {self.current:.4g} mA" if self.scaled else "as measured"
+        note = f"I τ is current times lifetime, {by}; a and b are over the usual ones."
+        tables = [Table("Course of the lifetime", header, rows, note, numeric=True)]
+        if self.alarms:
+            rows = [[when(alarm.time, self.dated), alarm.said(self.dated)] for alarm in self.alarms]
+            tables.append(Table("Alarms", ["raised", "what"], rows))
+        return tuple(tables)
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the points, what is usual, and the alarms as JSON's types."""
+        usual = self.reference
+        known = usual and {"a": bare(usual.a, "1/(mA s)"), "b": bare(usual.b, "1/s")}
+        named = ("status", "message", "points", "drift", "alarms")
+        rest = {
+            "current": bare(self.current, "mA"),
+            "scaled_by_ring": self.scaled,
+            "centre": bare(self.centre, "mA h"),
+            "limit": bare(self.limit, "mA h"),
+            "reference": known,
+        }
+        return json_of({name: getattr(self, name) for name in named} | rest)
+
+
+def _percent(ratio: Quantity | None) -> str:
+    if ratio is None:
+        return "-"
+    error = f" ± {100 * ratio.error:.2f}" if 100 * ratio.error >= 0.005 else ""
+    return f"{100 * ratio.value:.2f}{error}"
+
+
+def trend_of(studies: Sequence[RecordStudy], machine: Machine | None = None) -> Trend:
+    """Follow the lifetime through many decays.
+
+    Parameters
+    ----------
+    studies : sequence of RecordStudy
+        Records, each with its decays; of several, all with dates.
+    machine : Machine, optional
+        The ring, which scales lifetimes to its usual settings and the reference current, the
+        median of all. Otherwise current times lifetime is taken as it is, which is constant where
+        all loss goes with the square of the current.
+
+    Returns
+    -------
+    Trend
+        With control limits from the first decays, 20 or half of them, and with the alarms of
+        `beamfit.lifetime.alarm` on all readings after those.
+
+    Raises
+    ------
+    InputError
+        If several records are not all dated.
+
+    Notes
+    -----
+    Limits are those of an individuals chart (D. C. Montgomery, Introduction to Statistical Quality
+    Control, 7th ed., section 6.4): 3 standard deviations, these from the mean moving range over
+    1.128, which a slow drift does not widen; Student's quantile, since they come from few points.
+    """
+    if len(studies) > 1 and any(study.record.start is None for study in studies):
+        name = next(study.record.name for study in studies if study.record.start is None)
+        raise InputError("times without a date", "dated records, to put them in order", path=name)
+    dated = all(study.record.start is not None for study in studies)
+    studies = sorted(studies, key=lambda study: study.record.start or 0.0)
+    placed = [
+        ((study.record.start or 0.0) + decay.offset, decay)
+        for study in studies
+        for decay in study.decays or study.pooled
+        if decay.fit.lifetime_mean.error is not None
+    ]
+    if not placed:
+        expected = "one decay at least whose lifetime is determined"
+        raise InputError("no lifetime", expected, path=studies[0].record.name)
+    times, decays = zip(*placed, strict=True)
+    current = float(np.median([decay.fit.mean_current for decay in decays]))
+    a, b, lifetime = _by_ring(decays, machine, current)
+    first = baseline(len(decays))
+    watched = len(decays) > first
+    usual = _reference(decays[:first], a[:first], b[:first]) if watched else None
+    values = _normalised(decays, lifetime, current if machine else None)
+    centre, limit = control_limits(np.array([value.value for value in values[:first]]))
+    points = tuple(
+        _point(*of_decay, usual, (centre, limit))
+        for of_decay in zip(decays, times, a, b, values, strict=True)
+    )
+    drift = _drift(np.array(times), values, centre)
+    alarms = () if usual is None else _alarms(studies, usual, times[first:], a[first:], b[first:])
+    found = (points, current, machine is not None, centre, limit, drift, usual, alarms, dated)
+    trend = Trend(Status.converged, "", *found)
+    return replace(trend, **dict(zip(("status", "message"), _verdict(trend), strict=True)))
+
+
+def _by_ring(decays: Sequence[Decay], machine: Machine | None, current: float) -> np.ndarray:
+    """a, b and lifetime of the ring at each decay over those of the reference, (3, n)."""
+    if machine is None:
+        return np.ones((3, len(decays)))
+    usual = loss_coefficients(machine.ring, machine.operation, current)
+    rate = usual.a * current + usual.b
+    rows = [
+        (d.budget.losses.a / usual.a, d.budget.losses.b / usual.b, d.budget.lifetime * HOUR * rate)
+        for d in decays
+    ]
+    return np.array(rows, float).T
+
+
+def _normalised(
+    decays: Sequence[Decay], factors: np.ndarray, current: float | None
+) -> list[Quantity]:
+    """Current times lifetime, mA h."""
+    values = []
+    for decay, factor in zip(decays, factors, strict=True):
+        found = decay.fit.lifetime_mean
+        by = (current or decay.fit.mean_current) / factor
+        values.append(Quantity(by * found.value, by * found.error, "mA h"))
+    return values
+
+
+def _point(
+    decay: Decay, time: float, a: float, b: float, value: Quantity, usual: Reference | None, limits
+) -> Point:
+    centre, limit = limits
+    off = value.value - centre
+    beyond = int(np.sign(off)) if abs(off) > max(limit, 3 * value.error) else 0
+    fit = decay.fit
+    relative: list[Quantity | None] = [None, None]
+    if usual is not None and fit.status is not Status.poor_fit:
+        relative = [
+            None if q.error is None else Quantity(q.value / by, q.error / by, "1")
+            for q, by in ((fit.if_constant("a"), usual.a * a), (fit.if_constant("b"), usual.b * b))
+        ]
+    return Point(fit.record, time, fit.mean_current, fit.lifetime_mean, value, *relative, beyond)
+
+
+def _drift(time: np.ndarray, values: Sequence[Quantity], centre: float) -> Quantity:
+    """Relative slope by least squares, its error from the residuals."""
+    if len(values) < FEWEST + 1 or np.ptp(time) < DAY:
+        return Quantity(math.nan, None, "1")
+    level = np.array([value.value for value in values]) / centre
+    weeks = (time - time.mean()) / (7 * DAY)
+    [slope, _], covariance = np.polyfit(weeks, level, 1, cov=True)
+    return Quantity(float(slope), float(np.sqrt(covariance[0, 0])), "1")
+
+
+def _reference(decays: Sequence[Decay], a: np.ndarray, b: np.ndarray) -> Reference | None:
+    """Usual a and b of some decays, with their noise; None where they do not give both above zero.
+
+    Least squares on what each decay says of a I and a I + b. How far the decays scatter about it
+    is how far a and b are expected to wander.
+    """
+    current, parts, root = map(np.asarray, summarise(tuple(decays)))
+    rows = by_losses(a * current, b)
+    weighted = (root @ rows).reshape(-1, 2)
+    seen = np.einsum("nij,nj->ni", root, parts).ravel()
+    size = np.linalg.norm(weighted, axis=0)
+    found = np.linalg.lstsq(weighted / size, seen, rcond=None)[0] / size
+    if not (np.isfinite(found).all() and found.min() > 0):
+        return None
+    relative = weighted * found
+    covariance = np.linalg.pinv(relative.T @ relative, hermitian=True)
+    off = parts[:, 1] / (rows @ found)[:, 1] - 1
+    wander = math.sqrt(float(off @ off) / max(off.size - 2, 1))
+    covariance = covariance + max(WANDER, wander) ** 2 * np.eye(2)
+    return Reference(*map(float, found), *_noise(decays), covariance)
+
+
+def alike_over(fit: DecayFit) -> float:
+    """Correlation time of noise with a fit's neighbours and no white part, s; 0 for none."""
+    alike = fit.identifiability.residual_correlation
+    return -float(np.median(np.diff(fit.readings.time))) / math.log(alike) if alike else 0.0
+
+
+def _noise(decays: Sequence[Decay]) -> tuple[float, float, float]:
+    """Noise of a reading, mA, its correlation time and the interval of readings, s."""
+    fits = [decay.fit for decay in decays]
+    memory = np.median([alike_over(fit) for fit in fits])
+    least = BEST_MONITOR * np.median([fit.mean_current for fit in fits])
+    noise = max(np.median([fit.noise for fit in fits]), least)
+    interval = np.median([np.median(np.diff(decay.segment.time)) for decay in decays])
+    return float(noise), float(memory), float(interval)
+
+
+def _alarms(
+    studies: Sequence[RecordStudy],
+    usual: Reference,
+    times: Sequence[float],
+    a: np.ndarray,
+    b: np.ndarray,
+) -> tuple[Alarm, ...]:
+    """Watch all readings from the first of some decays on; a and b are the ring's at each."""
+    rows = [
+        np.stack([(study.record.start or 0.0) + study.record.time, study.record.current], axis=-1)
+        for study in studies
+    ]
+    rows = np.concatenate(rows)
+    rows = rows[rows[:, 0] >= times[0]]
+    rows = rows[:: math.ceil(len(rows) / MOST)]
+    place = np.searchsorted(times, rows[:, 0], side="right") - 1
+    return alarms_of(usual, *rows.T, a[place], b[place])
+
+
+def _verdict(trend: Trend) -> tuple[Status, str]:
+    count, centre = len(trend.points), trend.centre
+    many = f"{count} lifetime" + "s" * (count > 1)
+    usual = f"{many}; current times lifetime is usually {centre:.4g} mA h"
+    if not math.isfinite(trend.limit):
+        more = f"{FEWEST + 1} or more decays are needed to say what is usual."
+        return Status.unidentified, f"{usual}; {more}"
+    beyond = sum(point.beyond != 0 for point in trend.points)
+    said = f"{usual} ± {100 * trend.limit / centre:.2g} %, {beyond} beyond that."
+    drift = trend.drift
+    if drift.error is not None and abs(drift.value) > 3 * drift.error:
+        said += f" It changes by {100 * drift.value:+.2g} ± {100 * drift.error:.1g} % a week."
+    if trend.reference is None:
+        said += " Readings are not watched: the first decays give no a and b above zero."
+    if trend.alarms:
+        first = "Alarm" if len(trend.alarms) == 1 else f"{len(trend.alarms)} alarms, the first"
+        said += f" {first}: {trend.alarms[0].said(trend.dated)}."
+    return (Status.poor_fit if beyond or trend.alarms else Status.converged), said

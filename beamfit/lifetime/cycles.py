@@ -1,0 +1,483 @@
+"""The cycles of a record with many refills, as of top-up: found, and cleaned for one law."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from scipy.ndimage import maximum_filter1d
+from scipy.special import ndtr
+
+from beamfit.lifetime.expansion import LOSS, Expansion, Pieces, solved
+from beamfit.lifetime.pieces import Event, Split, beam_readings, event_of, split_record
+from beamfit.lifetime.record import Conditions, DecayRecord
+
+# Standard deviations by which two levels must differ to be two: a false step costs no more than an
+# own current for the rest.
+THRESHOLD = 5.0
+# Least step in units of the last digit of the readings.
+DIGITS = 1.5
+# Readings in which steps are sought at once, and of them those that the next stretch has, too.
+STRETCH, OVERLAP = 1 << 16, 1 << 12
+# Readings on either side whose means are compared, and the fewest places that tell their scatter.
+WINDOWS, PLACES = (1, 2, 4, 8, 16, 32, 64), 20
+# In so many windows the usual difference, which the decay makes, is taken off.
+BLOCK = 16
+# A step is placed to the reading within so many of where it was seen.
+NEAR = 8
+# How often steps are sought with the law that those found leave.
+ROUNDS = 20
+# From so many times the cycles and some more on the finer search is taken.
+MORE, FEW = 1.1, 1
+# Share of the usual length below which a piece is the head of a cycle, as of fresh beam.
+SHORT = 0.25
+# Least step as a share of what is lost in the piece that it divides.
+LEAST = 0.2
+# Share of what the cycles lose that refills give back at least.
+RETURNED = 0.5
+# Cycles whose settings and pressure agree to this share have one a and one b.
+SAME = 0.02
+# Currents so alike that a and b do as one number.
+NARROW = 0.02
+# Noise over the height of a sawtooth that is looked at, and the logarithm of the likelihood ratio
+# from which readings are of one: 1 in 1000 at even odds.
+NOISES, EVEN = (0.01, 0.03, 0.1, 0.2), math.log(1000.0)
+# Refills of top-up come every 3 min, within a factor 3, those of fills hours apart; lifetimes are
+# 15 h within a factor 3, the rest within seconds to years:
+# middle, s, width of the logarithm, and its whole range.
+PERIOD, LIFETIME = (180.0, 1.2, 12.0), (15 * 3600.0, 1.2, 17.0)
+# Readings beyond which the scatter of their mean is followed no farther.
+LONG = 4096
+
+
+def find_cycles(record: DecayRecord) -> Split:
+    """Cut a record at every refill, also where it exceeds the noise but little.
+
+    Parameters
+    ----------
+    record : DecayRecord
+        Top-up, or fills with refills between them.
+
+    Returns
+    -------
+    Split
+        Cycles, and the refills, losses and pieces left out.
+
+    Notes
+    -----
+    Steps that stand out in the means of 1, 2, 4, ... 64 readings before and after, by the scatter
+    of most places, come first. Between them one law -a I² - b I for all pieces puts the loss back,
+    and two levels are tested against one by their likelihood ratio, in noise whose memory the
+    differences of neighbours show; what is found improves the law, and so on. Steps of three
+    standard deviations of the noise are found in cycles of 60 readings and more, of ten always.
+    Pieces of less than three readings or a quarter of the usual length, as of spikes, injection
+    ramps and fresh beam, are left out, and the rest is looked at anew.
+
+    Examples
+    --------
+    >>> t = np.arange(0.0, 3600.0, 10.0)
+    >>> noise = np.random.default_rng(1).normal(size=t.size)
+    >>> split = find_cycles(DecayRecord(t, 500 - (t % 180) / 180 + 0.2 * noise))
+    >>> len(split.segments), str(split.events[0])
+    (20, 'refill at 180 s (+0.9698 mA)')
+    """
+    kept, events = beam_readings(record, spikes=False)
+    grain = _grain(record.current)
+    for _ in range(2):
+        pieces = np.split(kept, _steps(record.time[kept], record.current[kept], grain))
+        lengths = [piece.size for piece in pieces]
+        usual = np.median(np.repeat(lengths, lengths)) if kept.size else 0  # of most readings
+        fewest = max(FEWEST_READINGS, usual * SHORT)
+        long = [piece for piece in pieces if piece.size >= fewest]
+        short = [piece for piece in pieces if 0 < piece.size < fewest]
+        events += [event_of(record, "short", piece[0], piece[-1]) for piece in short]
+        kept = np.concatenate(long or [kept[:0]])
+    for after, change in zip(long[1:], _changes_between(record, long), strict=True):
+        kind, at = "refill" if change > 0 else "loss", float(record.time[after[0]])
+        events.append(Event(kind, at, 0.0, change))
+    cycles = (record.select(piece, f"{record.name}#{k}") for k, piece in enumerate(long, 1))
+    return Split(tuple(cycles), tuple(sorted(events, key=lambda event: event.time)))
+
+
+def cut_at_refills(record: DecayRecord) -> Split:
+    """As `split_record`, but as `find_cycles` where that finds more cycles: the former cuts
+    nothing but clear steps between pieces of eight readings, whatever the law of the decay.
+    """
+    clear, fine = split_record(record), find_cycles(record)
+    more = len(fine.segments) > MORE * len(clear.segments) + FEW
+    return fine if more and is_refilled(fine) else clear
+
+
+def is_refilled(split: Split) -> bool:
+    """Whether three cycles or more are held by refills, which a decay with odd steps is not.
+
+    Refills give back at least half of what the cycles lose.
+    """
+    cycles = split.segments
+    if len(cycles) < FEWEST_CYCLES:
+        return False
+    lost = sum(float(cycle.current[0] - cycle.current[-1]) for cycle in cycles)
+    refills = [event.change for event in split.events if event.kind == "refill"]
+    return len(refills) + 1 >= FEWEST_CYCLES and sum(refills) > RETURNED * max(lost, 0.0)
+
+
+def is_sawtooth(residuals: np.ndarray) -> bool:
+    """Whether readings lie evenly between two currents, as of refills that an archive is too slow
+    to resolve, and not about one: by the likelihood of an even distribution with normal noise.
+
+    Examples
+    --------
+    >>> random = np.random.default_rng(1)
+    >>> is_sawtooth(random.uniform(size=200)), is_sawtooth(random.normal(size=200))
+    (True, False)
+    """
+    off = residuals - residuals.mean()
+    normal = -off.size * (math.log(max(off.std(), 1e-300)) + 0.5 * math.log(2 * math.pi * math.e))
+    best = -math.inf
+    for share in NOISES:
+        width = math.sqrt(12) * off.std() / math.sqrt(1 + 12 * share**2)
+        ends = ((off + sign * width / 2) / (share * width) for sign in (1, -1))
+        inside = np.subtract(*map(ndtr, ends)) / width
+        best = max(best, float(np.sum(np.log(np.maximum(inside, 1e-300)))))
+    return best - normal > EVEN
+
+
+def unresolved(usual: float, interval: float, lifetime: float) -> float:
+    """Probability that refills faster than a record is read look like slower ones.
+
+    Parameters
+    ----------
+    usual : float
+        Readings from one refill that is seen to the next.
+    interval : float
+        Time between readings, s.
+    lifetime : float
+        Of the cycles as they look, s.
+
+    Notes
+    -----
+    A sawtooth that is read every interval looks the same for all its periods that differ by whole
+    phases: of those shorter than two intervals one in usual² has so many readings a cycle. Both
+    kinds are weighed by priors of the period of refills and of the lifetime.
+
+    Examples
+    --------
+    >>> found = [unresolved(18, 10.0, 36000.0), unresolved(10, 600.0, 4e6)]
+    >>> f"{found[0]:.3f}, {found[1]:.2f}"
+    '0.002, 0.98'
+    """
+    lost = usual * interval / lifetime
+
+    def chance(period: np.ndarray) -> np.ndarray:
+        return _prior(period, *PERIOD) * _prior(period / lost, *LIFETIME)
+
+    fast = np.geomspace(1e-3 * interval, 2 * interval, 200)
+    others = float(np.trapezoid(chance(fast), np.log(fast))) / usual**2
+    same = float(chance(np.array(usual * interval))) / usual
+    return others / max(others + same, 1e-300)
+
+
+def _prior(value: np.ndarray, middle: float, width: float, wide: float) -> np.ndarray:
+    """Density in the logarithm: normal about the middle, a fifth of it flat over a wide range."""
+    normal = np.exp(-0.5 * (np.log(value / middle) / width) ** 2) / math.sqrt(2 * math.pi) / width
+    return 0.8 * normal + 0.2 / wide
+
+
+def _grain(current: np.ndarray) -> float:
+    """The last digit of the readings, mA."""
+    levels = np.unique(current)
+    apart = np.diff(levels)
+    return float(apart[apart > 1e-12 * levels[-1]].min(initial=levels[-1]))
+
+
+def _levelled(time: np.ndarray, current: np.ndarray, first: np.ndarray) -> np.ndarray:
+    """Currents with the loss put back, by one a and one b for all pieces."""
+    if not first.size:
+        return current
+    parts = np.diff(time) * np.array([current[:-1], current[:-1] ** 2])
+    columns = np.vstack([np.zeros(2), np.cumsum(parts, axis=1).T])
+    lengths = np.diff(first, append=time.size)
+    both = np.column_stack([columns, current])
+    both -= np.repeat(np.add.reduceat(both, first) / lengths[:, None], lengths, axis=0)
+    scale = np.linalg.norm(both[:, :2], axis=0) + 1e-300
+    loss = np.linalg.lstsq(both[:, :2] / scale, both[:, 2], rcond=NARROW)[0] / scale
+    return current - columns @ loss
+
+
+def _changes_between(record: DecayRecord, pieces: Sequence[np.ndarray]) -> list[float]:
+    """By how much the current changes from each piece to the next, mA, the loss put back; by one
+    law for some pieces together.
+    """
+    ends, found = np.cumsum([piece.size for piece in pieces]) // STRETCH, []
+    for batch in np.split(np.arange(len(pieces)), np.flatnonzero(np.diff(ends)) + 1):
+        some = [pieces[k] for k in batch] + list(pieces[batch[-1] + 1 : batch[-1] + 2])
+        rows, first = np.concatenate(some), np.cumsum([0] + [piece.size for piece in some[:-1]])
+        level = _levelled(record.time[rows], record.current[rows], first)
+        for begin, middle, end in zip(first, first[1:], [*first[2:], rows.size], strict=False):
+            before = level[max(begin, middle - NEAR) : middle]
+            after = level[middle : min(end, middle + NEAR)]
+            found.append(float(np.median(after) - np.median(before)))
+    return found
+
+
+def _steps(time: np.ndarray, current: np.ndarray, grain: float) -> np.ndarray:
+    """Indices of the first readings after a step, in order; of a long record by stretches of it,
+    each of which tells the steps that are not near its ends.
+    """
+    found = []
+    for start in range(0, max(current.size - OVERLAP, 1), STRETCH - OVERLAP):
+        stop = min(start + STRETCH, current.size)
+        steps = start + _steps_of(time[start:stop], current[start:stop], grain)
+        low = start + OVERLAP // 2 if start else 0
+        high = stop - OVERLAP // 2 if stop < current.size else stop
+        found.append(steps[(steps >= low) & (steps < high)])
+    return np.concatenate(found)
+
+
+def _steps_of(time: np.ndarray, current: np.ndarray, grain: float) -> np.ndarray:
+    if current.size < PLACES:
+        return np.zeros(0, int)
+    found = np.zeros(current.size, bool)
+    for window in WINDOWS:
+        level = _levelled(time, current, np.append(0, np.flatnonzero(found)))
+        total = np.append(0.0, np.cumsum(level))
+        for _ in range(2):
+            free, change = _changes(total, found, window)
+            if free.sum() < PLACES:
+                break
+            size = np.where(free, np.abs(change), 0.0)
+            least = max(THRESHOLD * 1.4826 * np.median(size[free]), DIGITS * grain)
+            peak = size >= maximum_filter1d(size, 2 * window - 1)
+            found[window : current.size - window + 1] |= peak & (size > least)
+    clear = steps = np.flatnonzero(found)
+    for _ in range(ROUNDS):
+        level = _levelled(time, current, np.append(0, steps))
+        total = np.append(0.0, np.cumsum(level))
+        more = _placed(total, _divided(level, total, level - current, clear, grain))
+        if np.array_equal(more, steps):
+            break
+        steps = more
+    return steps
+
+
+def _divided(
+    level: np.ndarray, total: np.ndarray, lost: np.ndarray, clear: np.ndarray, grain: float
+) -> np.ndarray:
+    """Divide pieces in two as long as two levels explain them better than one, and give back some
+    of what a piece loses: a law that is not quite right makes smaller steps.
+    """
+    variance = _mean_variance(np.delete(np.diff(level), clear - 1), min(level.size, LONG))
+    ends = [0, *clear.tolist(), level.size]
+    waiting, found = list(itertools.pairwise(ends)), clear.tolist()
+    while waiting:
+        low, high = waiting.pop()
+        if high - low < 2:
+            continue
+        at = np.arange(low + 1, high)
+        step = (total[high] - total[at]) / (high - at) - (total[at] - total[low]) / (at - low)
+        scatter = np.sqrt(variance(at - low) + variance(high - at))
+        best = int(np.argmax(np.abs(step) / scatter))
+        least = max(DIGITS * grain, LEAST * (lost[high - 1] - lost[low]))
+        if abs(step[best]) > max(THRESHOLD * scatter[best], least):
+            found.append(int(at[best]))
+            waiting += [(low, int(at[best])), (int(at[best]), high)]
+    return np.sort(found)
+
+
+def _mean_variance(change: np.ndarray, longest: int) -> Callable[[np.ndarray], np.ndarray]:
+    """Variance of the mean of so many readings in autoregressive noise, by its differences.
+
+    Those over two intervals have 1 + c times the variance of those over one, c being the
+    correlation of neighbours; medians, for the steps among them.
+    """
+    one, two = (np.median(np.abs(values)) for values in (change, change[1:] + change[:-1]))
+    kept = float(np.clip((two / max(one, 1e-300)) ** 2 - 1, 0.0, 0.99))
+    many = np.arange(1, longest + 1)
+    # The sum of many readings: n + 2 sum (n - k) c^k.
+    sums = many + 2 * (kept * many / (1 - kept) - kept * (1 - kept**many) / (1 - kept) ** 2)
+    table = (1.4826 * one) ** 2 / 2 / (1 - kept) * sums / many**2 + 1e-300
+    return lambda count: table[np.minimum(count, longest) - 1]
+
+
+def _changes(total: np.ndarray, found: np.ndarray, window: int) -> tuple[np.ndarray, np.ndarray]:
+    """At every place, whether no step is found within a window, and by how much the means of so
+    many readings before and after differ beside their usual difference; from sums of readings.
+    """
+    place = np.arange(window, found.size - window + 1)
+    steps = np.append(0, np.cumsum(found))
+    free = steps[place + window] == steps[place - window + 1]
+    change = (total[place + window] - 2 * total[place] + total[place - window]) / window
+    return free, change - _usual(np.where(free, change, np.nan), BLOCK * window)
+
+
+def _usual(values: np.ndarray, size: int) -> np.ndarray:
+    """The median of each block of about this size, for each value; 0 where none is finite."""
+    if not values.size:
+        return values
+    blocks = max(1, values.size // size)
+    size = -(-values.size // blocks)
+    padded = np.append(values, np.full(blocks * size - values.size, np.nan)).reshape(blocks, size)
+    ordered = np.sort(padded, axis=1)  # what is not finite comes last
+    count = np.isfinite(ordered).sum(axis=1)[:, None]
+    middle = np.concatenate([np.maximum(count - 1, 0) // 2, count // 2], axis=1)
+    found = np.take_along_axis(ordered, np.minimum(middle, size - 1), axis=1).mean(axis=1)
+    return np.repeat(np.where(count[:, 0] > 0, found, 0.0), size)[: values.size]
+
+
+def _placed(total: np.ndarray, steps: np.ndarray) -> np.ndarray:
+    """Each step where two levels between its neighbours explain most."""
+    ends = np.concatenate([[0], steps, [total.size - 1]])
+    widest = WINDOWS[-1]
+    for k in range(1, ends.size - 1):
+        low, high = max(ends[k - 1], ends[k] - widest), min(ends[k + 1], ends[k] + widest)
+        at = np.arange(max(low + 1, ends[k] - NEAR), min(high, ends[k] + NEAR + 1))
+        before = (total[at] - total[low]) / (at - low)
+        after = (total[high] - total[at]) / (high - at)
+        ends[k] = at[np.argmax((before - after) ** 2 * (at - low) * (high - at))]
+    return np.unique(ends[1:-1])
+
+
+def usual_cycle(cycles: Sequence[DecayRecord]) -> tuple[float, float]:
+    """Median number of readings of cycles, and time between them, s."""
+    count = float(np.median([len(cycle) for cycle in cycles]))
+    return count, float(np.median([cycle.span / (len(cycle) - 1) for cycle in cycles]))
+
+
+def alike(cycles: Sequence[DecayRecord]) -> list[list[DecayRecord]]:
+    """Cycles by their settings and their pressure."""
+    groups: list[tuple[np.ndarray, list[DecayRecord]]] = []
+    for cycle in cycles:
+        at = np.array([0.0 if v is None else np.median(v) for v in cycle.conditions])
+        for other, group in groups:
+            if np.all(np.abs(at - other) <= SAME * np.maximum(at, other)):
+                group.append(cycle)
+                break
+        else:
+            groups.append((at, [cycle]))
+    return [group for _, group in groups]
+
+
+def joined(cycles: Sequence[DecayRecord], name: str) -> DecayRecord:
+    """The readings of many cycles as one record."""
+
+    def all_of(parts: Sequence[np.ndarray | None]) -> np.ndarray | None:
+        return None if parts[0] is None else np.concatenate(parts)
+
+    return DecayRecord(
+        np.concatenate([cycle.start + cycle.time for cycle in cycles]),
+        np.concatenate([cycle.current for cycle in cycles]),
+        all_of([cycle.error for cycle in cycles]), name, cycles[0].start,
+        Conditions(*map(all_of, zip(*(c.conditions for c in cycles), strict=True))),
+        notes=cycles[0].notes,
+    )  # fmt: skip
+
+
+FEWEST_CYCLES, FEWEST_READINGS = 3, 3
+# Readings beyond which neighbours are averaged, in blocks within a cycle.
+MOST = 16384
+# Robust standard deviations off which a reading or a cycle is left out; at most this share of them.
+OUTLIER, SHARE = 7.0, 0.2
+# Errors of the mean by which readings at the edges of cycles lie off the law where they are of an
+# injection: what stays below moves the lifetime by no more than its error.
+EDGE, WITHIN = 2.5, "they lie within injections"
+# Readings from the edge inwards that tell whether the edge lies off.
+NEXT = 9
+
+
+def averaged(cycles: Sequence[DecayRecord]) -> Pieces:
+    """All readings, in time; of very many the means of neighbours within a cycle."""
+    total = sum(map(len, cycles))
+    fewer = max(1.0, total / MOST)
+    begin, place, parts = 0.0, 0, []
+    known = all(cycle.start is not None for cycle in cycles)
+    for cycle in cycles:
+        begin = cycle.start if known else begin
+        blocks = min(len(cycle), max(FEWEST_READINGS, round(len(cycle) / fewer)))
+        time, current, error = cycle.blocks(blocks)
+        parts.append((begin + time, time - time[0], current, error, place))
+        place += blocks
+        begin += 2 * cycle.span  # nobody said when: as if a cycle were missing in between
+    time, since, current, errors, first = zip(*parts, strict=True)
+    given = all(error is not None for error in errors)
+    return Pieces(
+        *map(np.concatenate, (time, since, current)),
+        np.concatenate(errors) if given else None, np.array(first), None, cycles[0].monitor,
+    )  # fmt: skip
+
+
+def _per_cycle(about: Expansion) -> tuple[np.ndarray, np.ndarray]:
+    """By how much the loss of each cycle departs, and its error for noise of size 1."""
+    first, slope, residual = about.pieces.first, about.left[:, LOSS], about.left[:, -1]
+    squares = np.add.reduceat(slope**2, first)
+    return -np.add.reduceat(slope * residual, first) / squares, 1 / np.sqrt(squares)
+
+
+def _far(values: np.ndarray) -> np.ndarray:
+    """Which values lie off the others, unless these are too many to be outliers."""
+    off = np.abs(values - np.median(values))
+    spread = 1.4826 * np.median(off)
+    far = off > OUTLIER * spread
+    return far if spread > 0 and far.mean() <= SHARE else np.zeros(values.size, bool)
+
+
+def _edges(about: Expansion) -> np.ndarray:
+    """How far the first and the last readings of all cycles lie above the law, beside those next to
+    them, in errors: fresh beam decays faster, and a reading within an injection lies below.
+    """
+    first, lengths = about.pieces.first, about.pieces.lengths
+    long = lengths > NEXT
+    ends = np.array([first[long], (first + lengths - 1)[long]])
+    if ends.shape[1] < FEWEST_CYCLES:
+        return np.zeros(2)
+    off = -about.left[:, -1]
+    scatter = max(1.4826 * float(np.median(np.abs(off))), 1e-300)
+    inward = np.array([[1], [-1]])[..., None] * np.arange(1, NEXT)
+    beside = off[ends] - off[ends[..., None] + inward].mean(axis=2)
+    beside = np.clip(beside / scatter, -OUTLIER, OUTLIER)
+    return beside.mean(axis=1) * math.sqrt(ends.shape[1] / (1 + 1 / (NEXT - 1)))
+
+
+def _trimmed(about: Expansion) -> tuple[Expansion, list[str]]:
+    """The fit without readings at the edges of cycles that are not of the decay."""
+    cut, high = np.zeros(2, int), 0
+    most = int(np.median(about.pieces.lengths)) // 3
+    while cut.max() < most and np.any(far := np.abs(edges := _edges(about)) > EDGE):
+        high += int(edges[0] > EDGE)
+        keep = np.ones(about.pieces.time.size, bool)
+        first, lengths = about.pieces.first, about.pieces.lengths
+        long = lengths > NEXT
+        for side, ends in enumerate((first, first + lengths - 1)):
+            keep[ends[long]] &= not far[side]
+        about, cut = solved(about.pieces.kept(keep, FEWEST_READINGS)), cut + far
+    said = []
+    for side, why in enumerate(
+        ("fresh beam decays faster" if 2 * high >= cut[0] else WITHIN, WITHIN)
+    ):
+        if cut[side]:
+            which = f"{('first', 'last')[side]} {cut[side]}"
+            of_each = (
+                "reading of each cycle was" if cut[side] == 1 else "readings of each cycle were"
+            )
+            said.append(f"the {which} {of_each} left out: {why}")
+    return about, said
+
+
+def cleaned(cycles: Pieces) -> tuple[Expansion, tuple[str, ...]]:
+    """The fit without readings, edges of cycles and cycles that are not of the decay."""
+    said, about = [], solved(cycles)
+    departure, error = _per_cycle(about)
+    cut = np.repeat(_far(departure / error), about.pieces.lengths)
+    if cut.any():
+        before = about.pieces.first.size
+        about = solved(about.pieces.kept(~cut, FEWEST_READINGS))
+        left = before - about.pieces.first.size
+        were = "cycle was" if left == 1 else "cycles were"
+        said.append(f"{left} {were} left out, whose loss rate lies far off the others'")
+    about, edges = _trimmed(about)
+    said = edges + said
+    if (lone := _far(about.left[:, -1])).any():
+        said.append(f"{int(lone.sum())} readings were left out as outliers")
+        about = solved(about.pieces.kept(~lone, FEWEST_READINGS))
+    return about, tuple(said)

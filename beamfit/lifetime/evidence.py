@@ -1,0 +1,484 @@
+"""What a fitted law is worth: values and errors of one decay or many cycles, with their noise."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from scipy.special import fdtrc
+
+from beamfit.greybox.memory import AveragedMoments, Memory
+from beamfit.lifetime.alternatives import (
+    REJECTED,
+    Change,
+    ConstantA,
+    LifetimeLaw,
+    Outgassing,
+    Rival,
+    constant_a,
+    lifetime_law,
+    rival_of,
+)
+from beamfit.lifetime.decay_law import HOUR
+from beamfit.lifetime.expansion import LOSS, POWER, QUADRATIC, Expansion, Physical, lifetime_of
+from beamfit.lifetime.marginal import BELOW, FreeLaw, Law, free_law
+from beamfit.lifetime.record import DecayRecord
+from beamfit.noise.correlated import whitened
+from beamfit.noise.memory import CLOSE, Products
+from beamfit.quantity import Quantity
+from beamfit.shown import shown
+from beamfit.status import Status
+
+UNITS = {
+    "a": "1/(mA s)",
+    "b": "1/s",
+    "i0": "mA",
+    "lifetime_start": "h",
+    "lifetime_end": "h",
+    "lifetime_mean": "h",
+}
+ENDS = ("start", "end", "mean")
+# The share of a in the loss lies between 0 and 1: known to 0.2, the record tells pure Touschek
+# from pure gas at five standard deviations; known worse, a and b are one number.
+SEPARABLE = 0.2
+# A loss rate less than three errors from zero leaves the lifetime without an upper limit.
+DETERMINED = 1 / 3
+# How many errors below zero an unphysical a or b, or a rising current, is believed.
+BELIEVED = 5.0
+# Standard deviations that hold 95 % of a normal distribution.
+NORMAL = 1.96
+# Below this share of the current differences are those of the arithmetic, not of the beam.
+EXACT = 1e-12
+# A smooth law is believed where it is likelier than not.
+LIKELIER = 0.5
+# Parts of a record of many cycles whose loss rates are compared.
+PARTS = 8
+
+
+@shown
+@dataclass(frozen=True)
+class Separability:
+    """Whether the record tells a from b.
+
+    Parameters
+    ----------
+    separable : bool
+        Whether the share of a in the loss is known to better than 0.2.
+    share, share_error : float or None
+        Share of a in the loss at the mean current (0: all gas-like, 1: all Touschek-like), and
+        its standard deviation.
+    correlation : float or None
+        Correlation of a and b; near -1 on every record, also where both are well determined.
+    residual_correlation : float or None
+        Correlation of the errors of neighbouring readings; zero where none is seen.
+    error_inflation : float or None
+        By how much that makes the errors, which contain it, larger than independent readings
+        would; None where the lifetime is not determined.
+    """
+
+    separable: bool
+    share: float | None
+    share_error: float | None
+    correlation: float | None
+    residual_correlation: float | None
+    error_inflation: float | None
+
+
+@dataclass(frozen=True, eq=False)
+class Evidence:
+    """A fitted law with the noise that it leaves, and what else may explain the readings.
+
+    Parameters
+    ----------
+    about : Expansion
+        The law with constant a and b, or a given dependence of a.
+    law : Law
+        Whether an exponent of a and a drift of b are left open.
+    shaped : bool
+        Whether the dependence of a was given.
+    record : DecayRecord or None
+        The readings of a single decay.
+    """
+
+    about: Expansion
+    law: Law = Law.constant
+    shaped: bool = False
+    record: DecayRecord | None = None
+
+    @property
+    def cycles(self) -> int:
+        """How many pieces."""
+        return self.about.level.size
+
+    @property
+    def currents(self) -> tuple[float, float]:
+        """Lowest and highest, mA."""
+        return float(self.about.pieces.current.min()), float(self.about.pieces.current.max())
+
+    @property
+    def time(self) -> np.ndarray:
+        """Of the readings, s."""
+        return self.about.pieces.time
+
+    @property
+    def noise_inferred(self) -> bool:
+        """Whether the residuals tell the noise."""
+        return self.about.pieces.error is None
+
+    @cached_property
+    def changed(self) -> bool:
+        """Whether the loss rate is not the same all along: what correlates the residuals of a decay
+        is something else than noise, or parts of many cycles differ.
+        """
+        if self.cycles > 1:
+            return self.parts[0] < REJECTED
+        return self.about.wanders and self.rival is not None
+
+    @cached_property
+    def independent(self) -> bool:
+        """Whether errors of neighbouring readings are."""
+        return not self.about.wanders or (self.cycles == 1 and self.changed)
+
+    def _memory(self, independent: bool, *more: int) -> Memory:
+        return self.about.whitened(self.about.columns(*more), independent).memory()
+
+    @cached_property
+    def memory(self) -> Memory:
+        """The noise, a and b being constant."""
+        return self._memory(self.independent)
+
+    @cached_property
+    def plain(self) -> Memory:
+        """The same for independent errors."""
+        return self.memory if self.independent else self._memory(True)
+
+    @cached_property
+    def power(self) -> Memory:
+        """The noise beside a power of the current."""
+        memory = self._memory(self.independent, POWER)
+        # Differences of an exact curve are those of the arithmetic.
+        floor = np.sum((EXACT * self.about.pieces.current / self.about.pieces.over) ** 2)
+        return memory._replace(squares=np.maximum(memory.squares, floor))
+
+    def _moments(self, memory: Memory, columns: list[int]) -> AveragedMoments:
+        return memory.moments(self.about.slopes[:, columns], self.about.given)
+
+    @cached_property
+    def moments(self) -> AveragedMoments:
+        """How far values move by the noise, their errors and how far 95 % reach."""
+        found = self._moments(self.memory, self.about.columns())
+        if not self.independent:
+            return found
+        # The weak prior stays where the noise is that of the search.
+        return found._replace(shift=np.zeros_like(found.shift))
+
+    @cached_property
+    def drifted(self) -> np.ndarray:
+        """By how much what is stated of the monitor moves the values."""
+        moved = [self.about.moved(c / self.about.pieces.over) for c in self.monitor_changes]
+        return np.linalg.norm(moved, axis=0) if moved else np.zeros(len(Physical._fields))
+
+    @property
+    def monitor_changes(self) -> list[np.ndarray]:
+        """What is stated of the monitor, mA."""
+        return self.about.pieces.monitor_changes if self.about.rested else []
+
+    @cached_property
+    def values(self) -> Physical:
+        """What is quoted of the law with constant a and b."""
+        return Physical(*(np.array(self.about.values) + self.moments.shift))
+
+    @cached_property
+    def errors(self) -> Physical:
+        """Half of the central 68 %."""
+        return Physical(*np.hypot(self.moments.error, self.drifted))
+
+    @cached_property
+    def reach(self) -> Physical:
+        """How far 95 % reach."""
+        return Physical(*np.hypot(self.moments.reach, NORMAL * self.drifted))
+
+    @cached_property
+    def raw(self) -> Physical:
+        """Standard deviations for errors as stated, and independent."""
+        slopes = self.about.slopes[:, self.about.columns()]
+        size = 1.0 if self.about.given else math.sqrt(self.plain.squares[0] / self.plain.dof)
+        return Physical(*(size * np.linalg.norm(slopes @ self.plain.half[0], axis=1)))
+
+    @cached_property
+    def constant_a(self) -> ConstantA:
+        """Whether the readings contradict a constant a: by an exponent beside the other numbers."""
+        if self.cycles > 1 and not self.separability.separable:
+            return constant_a(math.nan, math.inf, math.inf, math.nan)
+        place = np.eye(self.about.rows.shape[1])[[POWER]][:, self.about.columns(POWER)]
+        found = self.power.moments(place, self.about.given)
+        error = float(found.error[0])
+        test = constant_a(float(found.shift[0]), error, error, float(found.chance[0]))
+        return test.widened(float(self.drifted[-1])) if self.monitor_changes else test
+
+    @property
+    def dof(self) -> int:
+        """Readings less numbers."""
+        return self.memory.dof
+
+    @cached_property
+    def residuals(self) -> np.ndarray:
+        """Model less reading, mA."""
+        after = self.about.residuals
+        if self.cycles == 1 and not self.independent:
+            after = after + self.about.rows[:, self.about.columns()] @ self.memory.mean_step
+        return after * self.about.pieces.over
+
+    @cached_property
+    def squares(self) -> float:
+        """Sum of squares of the residuals over their errors, whitened.
+
+        How far a drift under white noise gets in the end says nothing of the errors.
+        """
+        likely = self.memory.likely
+        if self.memory.white[likely]:
+            return float(np.sum((self.residuals / self.about.pieces.over) ** 2))
+        return float(self.memory.squares[likely])
+
+    @property
+    def chi2(self) -> float:
+        """The same; equal to `dof` where there are no errors."""
+        return float(self.dof) if self.noise_inferred else self.squares
+
+    @property
+    def noise(self) -> float:
+        """What multiplies errors that were given (at least 1), or the noise in mA."""
+        return max(math.sqrt(self.squares / self.dof), self.about.given)
+
+    @property
+    def correlation(self) -> float:
+        """Of a and b."""
+        a, b = self.about.slopes[1:3, self.about.columns()] @ self.plain.half[0]
+        return float(a @ b / np.linalg.norm(a) / np.linalg.norm(b))
+
+    @property
+    def correlation_time(self) -> float | None:
+        """Of the part of the errors that has one, s; None where they are independent."""
+        return None if self.independent else self.memory.noise.time
+
+    @property
+    def white(self) -> float:
+        """The share of their variance that has none."""
+        return 0.0 if self.independent else self.memory.noise.white
+
+    @property
+    def inflation(self) -> float:
+        """By how much the memory of the noise enlarges errors."""
+        if self.independent:
+            return 1.0
+        # Of a loss rate that is not clear of zero the share of a says nothing.
+        names = ("rate_mean", "share")[: 1 + (self.cycles == 1 and self.is_clear("rate_mean"))]
+        size = max(math.sqrt(self.plain.squares[0] / self.plain.dof), self.about.given)
+        size = size if self.about.given else 1.0  # raw errors have the size of the noise else
+        return max(1.0, *(getattr(self.errors, n) / getattr(self.raw, n) / size for n in names))
+
+    def sure(self, name: str) -> tuple[float, float]:
+        """A value, and the error of a normal number that reaches as far: few residuals count."""
+        return float(getattr(self.values, name)), float(getattr(self.reach, name)) / NORMAL
+
+    def scaled(self, name: str) -> tuple[float, float]:
+        """A value and its error."""
+        return float(getattr(self.values, name)), float(getattr(self.errors, name))
+
+    def is_clear(self, name: str) -> bool:
+        """Whether a value is clear of zero."""
+        value, error = self.sure(name)
+        return error < DETERMINED * value
+
+    def _parts(self, name: str) -> tuple[float, ...]:
+        every = (self.values, self.errors, self.raw, self.reach)
+        return tuple(float(getattr(part, name)) for part in every)
+
+    def quantity(self, name: str, known: bool) -> Quantity:
+        """I0, a or b; without an error where it is not determined."""
+        value, error, raw, reach = self._parts(name)
+        if not (known and math.isfinite(value) and math.isfinite(error)):
+            return Quantity(value, None, UNITS[name])
+        return Quantity.reaching(value, error, UNITS[name], raw, reach)
+
+    def lifetime(self, name: str, known: bool) -> Quantity:
+        """Lifetime in hours from a loss rate; no error where the rate is not clear of zero."""
+        rate, error, raw, reach = self._parts(name)
+        if not rate > 0:
+            return Quantity(math.nan, None, "h")
+        if not (known and self.is_clear(name)):
+            return Quantity(1 / rate / HOUR, None, "h")
+        interval = tuple(1 / max(rate + sign * reach, 1e-300) / HOUR for sign in (1, -1))
+        error, raw = (part / rate**2 / HOUR for part in (error, raw))
+        return Quantity(1 / rate / HOUR, error, "h", raw, interval)
+
+    @cached_property
+    def separability(self) -> Separability:
+        """Of a and b."""
+        share, error = self.scaled("share")
+        finite = math.isfinite(share) and math.isfinite(error)
+        length, usual = self.correlation_time, float(np.median(np.diff(self.time)))
+        told = length is None or self.is_clear("rate_mean")
+        alike = 0.0 if length is None else (1.0 - self.white) * math.exp(-usual / length)
+        return Separability(
+            separable=finite and self.sure("share")[1] < SEPARABLE,
+            share=share if finite else None,
+            share_error=error if finite else None,
+            correlation=self.correlation if math.isfinite(self.correlation) else None,
+            residual_correlation=alike,
+            error_inflation=self.inflation if told else None,
+        )
+
+    @property
+    def refuted(self) -> bool:
+        """Whether the readings contradict constant a and b, or show values that no beam has."""
+        if self.changed or self.constant_a.status is Status.poor_fit:
+            return True
+        return self.cycles == 1 and any(
+            value < -BELIEVED * error for value, error in map(self.sure, "ab")
+        )
+
+    @cached_property
+    def rival(self) -> Rival | None:
+        """What explains a single decay better than any smooth law."""
+        if self.cycles > 1 or self.shaped or not self.about.rested:
+            return None
+        return rival_of(self.about)
+
+    @property
+    def explained(self) -> Rival | None:
+        """What explains a refuted law better than a power of the current."""
+        return self.rival if self.refuted else None
+
+    @property
+    def change(self) -> Change | None:
+        """A change of the loss rate that explains a refuted law."""
+        found = self.explained
+        return found.found if found is not None and isinstance(found.found, Change) else None
+
+    @property
+    def outgassing(self) -> Outgassing | None:
+        """A gas loss that relaxes, where that explains a refuted law."""
+        found = self.explained
+        return found.found if found is not None and isinstance(found.found, Outgassing) else None
+
+    @cached_property
+    def free(self) -> FreeLaw | None:
+        """What the record tells where its law is free; None where the law is known, something
+        else than the law explains the record better, or the decay is within its noise.
+        """
+        known = self.law is Law.constant or self.shaped or self.cycles > 1
+        if known or not self.is_clear("rate_mean") or self.explained is not None:
+            return None
+        found = free_law(self.record, self.values)
+        return None if found is None or found.odd > LIKELIER else found
+
+    @cached_property
+    def bending(self) -> Physical | None:
+        """How far an exponent of a within its prior moves the values, beside what cycles tell of
+        it; None where the law is known, or a and b are one number.
+
+        The exponent is normal, `BELOW` wide to either side, and its error beside the other numbers
+        is combined with that.
+        """
+        if self.law is Law.constant or self.cycles == 1 or not self.separability.separable:
+            return None
+        columns = self.about.columns(POWER)
+        place = np.eye(self.about.rows.shape[1])[[POWER]][:, columns]
+        seen = self.power.moments(place, self.about.given).error[0]
+        size = 1 / math.hypot(1 / BELOW, 1 / seen)
+        rows, plain = self.about.left[:, columns], self.about.columns()
+        step = np.linalg.lstsq(rows[:, : len(plain)], -size * rows[:, -1], rcond=None)[0]
+        return Physical(*np.abs(self.about.slopes[:, columns] @ np.append(step, size)))
+
+    def widely(self, name: str, exact: Quantity) -> Quantity:
+        """A quantity with the exponent and the drift of b that the readings leave open.
+
+        The value is that of constant a and b where they are likelier, else the median. What is not
+        determined keeps its interval.
+        """
+        if not math.isfinite(exact.value):
+            return exact
+        rate = name.replace("lifetime", "rate")
+        by = HOUR if rate != name else 0.0
+        if self.bending is not None and exact.error is not None and not self.refuted:
+            moved = float(getattr(self.bending, rate)) * (by * exact.value**2 or 1.0)
+            low, high = (np.hypot(exact.value - end, NORMAL * moved) for end in exact.interval_95)
+            interval = exact.value - float(low), exact.value + float(high)
+            error = math.hypot(exact.error, moved)
+            return Quantity(exact.value, error, exact.unit, exact.error_raw, interval)
+        if self.free is None:
+            return exact
+        span = self.free.spans[name]
+        value = exact.value if self.free.constant > LIKELIER else span.median
+        value = float(np.clip(value, *span.interval))
+        moved = float(getattr(Physical(*self.drifted), rate)) * (by * value**2 or 1.0)
+        error, interval = span.beside(value, moved)
+        error = None if exact.error is None else error
+        return Quantity(value, error, exact.unit, exact.error_raw, interval)
+
+    def quoted(self, known: bool = True) -> dict[str, Any]:
+        """What a `DecayFit` has of this, by its names."""
+        apart = known and self.separability.separable
+        same = ("chi2", "dof", "noise_inferred", "constant_a", "correlation_time", "lifetimes")
+        exact = {"i0": self.quantity("i0", known and self.cycles == 1)}
+        exact |= {name: self.quantity(name, apart) for name in "ab"}
+        exact |= {f"lifetime_{at}": self.lifetime(f"rate_{at}", known) for at in ENDS}
+        found = {name: self.widely(name, quantity) for name, quantity in exact.items()}
+        found |= {"exact": exact, "free_law": self.free, "shaped": self.shaped}
+        found |= {name: getattr(self, name) for name in (*same, "inflation", "residuals")}
+        return found | {"identifiability": self.separability}
+
+    @cached_property
+    def stated_odds(self) -> float:
+        """Log odds that the stated errors are right, whatever memory the noise has."""
+        columns = np.column_stack([self.about.residuals, self.about.rows[:, : POWER + 1]])
+        products = Products.of(columns, self.time, stated=True, times=CLOSE)
+        rest, rows = products.matrix[:, :1, 1:], products.matrix[:, 1:, 1:]
+        step = np.linalg.solve(rows, np.swapaxes(rest, 1, 2))
+        squares = products.matrix[:, 0, 0] - (rest @ step)[:, 0, 0]
+        return products.stated_odds(np.maximum(squares, 0.0), rows.shape[1])
+
+    @cached_property
+    def parts(self) -> tuple[float, list[Quantity]]:
+        """The chance that the loss rate is one in all parts of many cycles, and their lifetimes."""
+        about, pieces = self.about, self.about.pieces
+        count = min(PARTS, self.cycles)
+        part = np.repeat(np.arange(self.cycles) * count // self.cycles, pieces.lengths)
+        length = self.correlation_time or 1e-300
+        apart = np.diff(pieces.time) / length
+        own = about.rows[:, [LOSS]] * (part[:, None] == np.arange(count))
+        every = np.column_stack([own, about.rows[:, QUADRATIC], about.residuals])
+        every = about.levels.left(whitened(every, apart, np), apart)[0]
+        columns, residual = every[:, :-1], every[:, -1]
+        step, rest, *_ = np.linalg.lstsq(columns, -residual, rcond=None)
+        dof = self.dof - count + 1
+        unit = max(float(rest[0]) / dof, self.about.given)
+        fall = float(self.memory.squares[self.memory.likely]) - float(rest[0])
+        chance = float(fdtrc(count - 1, dof, max(fall, 0.0) / (count - 1) / unit))
+        spread = np.linalg.norm(np.linalg.pinv(columns), axis=1) * math.sqrt(unit)
+        span = pieces.units[0]
+        pairs = zip((about.numbers[0] + step[:count]) / span, spread[:count] / span, strict=True)
+        return chance, [lifetime_of(rate, error) for rate, error in pairs if rate > 0]
+
+    @cached_property
+    def lifetimes(self) -> LifetimeLaw | None:
+        """The lifetime by current: of a decay where a constant a is refuted and it is the current's
+        doing, of many cycles where the currents are wide enough apart.
+        """
+        refuted = self.constant_a.status is Status.poor_fit
+        if self.cycles > 1:
+            known = self.separability.separable
+        else:
+            plain = not self.shaped and self.about.pieces.gauge is None
+            known = plain and refuted and self.outgassing is None
+        return lifetime_law(self.about, self.independent, refuted) if known else None
+
+    def drift_of_one_error(self, name: str) -> float:
+        """Straight drift of the monitor over the record, mA, that moves a value by its error."""
+        change = self.time / self.time[-1] / self.about.pieces.over
+        moved = abs(float(getattr(self.about.moved(change), name)))
+        return float(getattr(self.errors, name)) / moved if moved > 0 else math.inf

@@ -1,0 +1,477 @@
+"""Lifetime from a decay record: I0, a and b, and what the record could not tell."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from beamfit.errors import InputError, expect
+from beamfit.frames import quantity_frame
+from beamfit.lifetime.alternatives import Change, ConstantA, LifetimeLaw, Outgassing
+from beamfit.lifetime.answer import finding_of, finding_of_cycles
+from beamfit.lifetime.cycles import FEWEST_CYCLES, FEWEST_READINGS, averaged, cleaned
+from beamfit.lifetime.evidence import BELIEVED, UNITS, Evidence, Separability
+from beamfit.lifetime.expansion import Expansion, Pieces, Shape, solved, solved_together
+from beamfit.lifetime.marginal import FreeLaw, Law
+from beamfit.lifetime.record import DecayRecord, Monitor
+from beamfit.quantity import Quantity, Status
+from beamfit.shown import shown
+from beamfit.table import Table, cell, json_of, labelled, plain_name
+
+if TYPE_CHECKING:
+    from pandas import DataFrame
+
+    from beamfit.sampling.posterior import Posterior
+    from beamfit.sampling.priors import Distribution
+
+FEWEST = 5
+
+
+def bare(value: float | None, unit: str) -> dict[str, Any]:
+    """A number that has no error, as JSON."""
+    return {"value": value, "error": None, "unit": unit}
+
+
+@shown
+@dataclass(frozen=True, eq=False)
+class DecayFit:
+    """The result of `fit_decay`.
+
+    Parameters
+    ----------
+    record : str
+        Name of the record.
+    status : Status
+        `converged`; `poor_fit` if chi² is improbable (below 1e-3) or the record refutes constant a
+        and b; `infeasible` if a or b is negative by more than its error allows; `unidentified` if
+        a and b, or the lifetime itself, are not determined; `not_finite` if the search failed.
+    message : str
+        One sentence or two of cause and remedy.
+    i0, a, b : Quantity
+        Current at the first reading, mA, and the coefficients of dI/dt = -a I² - b I.
+    lifetime_start, lifetime_end, lifetime_mean : Quantity
+        Lifetime 1/(a I + b) at the first and last reading and at the mean current, h.
+    mean_current : float
+        Mean current of the record, mA.
+    chi2 : float
+        Weighted sum of squares. Without errors in the record the noise is inferred from the
+        residuals, and chi2 equals dof.
+    dof : int
+        Readings less parameters.
+    rms_residual : float
+        Root mean square of the residuals, mA.
+    noise_inferred : bool
+        Whether the record came without errors.
+    residuals : array, shape (n,)
+        Model minus reading, mA.
+    identifiability : Separability
+        Whether the record tells a from b.
+    constant_a : ConstantA or None
+        Whether the record contradicts a constant a; None where nothing decays.
+    correlation_time : float or None
+        Of the part of the errors that has one, s; None where they are independent.
+    inflation : float
+        By how much the memory of the noise enlarges the error of the loss rate, determined or not.
+    lifetimes : LifetimeLaw or None
+        The lifetime by current, where a constant a is refuted.
+    change : Change or None
+        When the loss rate changed, where that explains a refuted law.
+    outgassing : Outgassing or None
+        A gas loss that relaxes, where that explains a refuted law better.
+    readings : DecayRecord, optional
+        What was fitted.
+    shaped : bool
+        Whether a was given a dependence on the current.
+    first : array of int, optional
+        Where each cycle begins, of a fit to many cycles.
+    exact : mapping of str to Quantity
+        The same quantities if a and b are constant.
+    free_law : FreeLaw or None
+        The exponent of a and the drift of b that the errors contain; None where the law is known.
+
+    Examples
+    --------
+    >>> hours = np.linspace(0.0, 36000.0, 40)
+    >>> fit = fit_decay(DecayRecord(hours, 100.0 / (1.0 + 100.0 * 1e-7 * hours)))
+    >>> isinstance(fit, DecayFit), f"{fit.a.value:.2e}"
+    (True, '1.00e-07')
+    """
+
+    record: str
+    status: Status
+    message: str
+    i0: Quantity
+    a: Quantity
+    b: Quantity
+    lifetime_start: Quantity
+    lifetime_end: Quantity
+    lifetime_mean: Quantity
+    mean_current: float
+    chi2: float
+    dof: int
+    rms_residual: float
+    noise_inferred: bool
+    residuals: np.ndarray
+    identifiability: Separability
+    constant_a: ConstantA | None = None
+    correlation_time: float | None = None
+    inflation: float = 1.0
+    lifetimes: LifetimeLaw | None = None
+    change: Change | None = None
+    outgassing: Outgassing | None = None
+    readings: DecayRecord | None = None
+    shaped: bool = False
+    first: np.ndarray | None = None
+    exact: Mapping[str, Quantity] = field(default_factory=dict)
+    free_law: FreeLaw | None = None
+
+    def sample(
+        self,
+        *,
+        noise: str | None = None,
+        outliers: bool = False,
+        priors: Mapping[str, Distribution] | None = None,
+        **options: Any,
+    ) -> Posterior:
+        """Draw I0, a and b from their posterior, flat above zero; lifetimes are derived.
+
+        a and b are constant in it, as in `exact`, also where the errors of the fit contain more.
+
+        Parameters
+        ----------
+        noise : {"known", "inferred"}, optional
+            Whether the errors are right, or right up to a common factor that is inferred. By
+            default they are inferred where the record has none or the fit enlarged them.
+        outliers : bool
+            Let an unknown fraction of the readings be outliers.
+        priors : mapping of str to distribution, optional
+            On ``i0``, ``a`` or ``b``: `Normal`, `LogNormal`, `Uniform`, `HalfNormal` of
+            `beamfit.sampling.priors`, or a frozen one of scipy.stats.
+        **options
+            ``seed, target_ess, budget, walkers, store, provenance, progress`` of
+            `beamfit.sampling.ensemble.draw`.
+
+        Returns
+        -------
+        Posterior
+
+        Raises
+        ------
+        InputError
+            As `beamfit.lifetime.posterior.decay_target` and `draw`.
+
+        Examples
+        --------
+        >>> t = np.linspace(0, 8 * 3600, 100)
+        >>> noise = 1e-2 * np.random.default_rng(1).normal(size=t.size)
+        >>> fit = fit_decay(DecayRecord(t, 100.0 / (1.0 + 100.0 * 1e-7 * t) + noise))
+        >>> posterior = fit.sample(seed=1)
+        >>> posterior.status.value, bool(posterior.values("b").min() >= 0)
+        ('converged', True)
+        """
+        from beamfit.lifetime.posterior import decay_target
+        from beamfit.sampling.ensemble import draw
+
+        if self.first is not None:
+            expected = "one decay; the errors of cycles fitted together are those of the fit"
+            raise InputError("samples of many cycles", expected, path=self.record)
+        return draw(decay_target(self, noise, outliers, priors), **options)
+
+    def if_constant(self, name: str) -> Quantity:
+        """A quantity of the law with constant a and b, as the curve through the readings has it."""
+        return self.exact.get(name, getattr(self, name))
+
+    @property
+    def quantities(self) -> dict[str, Quantity]:
+        """What is quoted, by name."""
+        return {name: getattr(self, name) for name in UNITS}
+
+    @property
+    def noise(self) -> float:
+        """Standard deviation of a reading that the residuals show, mA."""
+        return self.rms_residual * math.sqrt(self.residuals.size / self.dof)
+
+    @property
+    def headline(self) -> str:
+        """The record, its status and its lifetime in a line."""
+        return f"{self.record} {cell(self.status)}: mean lifetime {self.lifetime_mean}"
+
+    def tables(self) -> tuple[Table, ...]:
+        """The numbers, to be shown."""
+        rows = [(plain_name(name), [value]) for name, value in self.quantities.items()]
+        rows.append(("chi2/dof", [f"{self.chi2:.4g}/{self.dof}"]))
+        rows.append(("rms residual", [f"{self.rms_residual:.3g} mA"]))
+        return (labelled(f"{self.record}: {cell(self.status)}", [], rows),)
+
+    def __str__(self) -> str:
+        rows = [f"{self.record}: {self.status}. {self.message}"]
+        rows += [f"  {name:15s} {value}" for name, value in self.quantities.items()]
+        noise = f"residual {self.rms_residual:.3g} mA rms"
+        return "\n".join([*rows, f"  chi²/dof {self.chi2:.4g}/{self.dof}, {noise}"])
+
+    def to_frame(self) -> DataFrame:
+        """Give a pandas data frame of all numbers, one row a quantity.
+
+        Columns are value, error, error_raw, low_95, high_95 (NaN where there is none) and unit.
+
+        Raises
+        ------
+        InputError
+            If pandas is not installed.
+        """
+        rows = {(self.record, name): value for name, value in self.quantities.items()}
+        return quantity_frame(rows, ("record", "quantity"))
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the result as one JSON object, as `beamfit lifetime --json` prints it."""
+        found = {
+            "record": self.record,
+            "status": self.status,
+            "message": self.message,
+            **self.quantities,
+            "mean_current": bare(self.mean_current, "mA"),
+            "chi2": self.chi2,
+            "dof": self.dof,
+            "rms_residual": bare(self.rms_residual, "mA"),
+            "noise_inferred": self.noise_inferred,
+            "identifiability": self.identifiability,
+            "constant_a": self.constant_a,
+            "correlation_time": bare(self.correlation_time, "s"),
+            "lifetime_by_current": self.lifetimes,
+            "change": self.change,
+        }
+        if self.free_law is not None:
+            found |= {"if_a_and_b_are_constant": dict(self.exact), "free_law": self.free_law}
+        found |= {} if self.outgassing is None else {"outgassing": self.outgassing}
+        return json_of(found if self.first is None else found | {"cycles": self.first.size})
+
+
+def fit_decay(
+    record: DecayRecord,
+    shape: Callable[[Any], Any] | None = None,
+    monitor: Monitor | None = None,
+    law: Law | str = Law.free,
+) -> DecayFit:
+    """Fit the decay law to one decay.
+
+    Parameters
+    ----------
+    record : DecayRecord
+        One decay, without refills or steps: cut others with `split_record` first.
+    shape : callable, optional
+        How a depends on the current in mA, up to a factor, where it is not constant; for
+        example `beamfit.lifetime.touschek.touschek_shape(ring, operation)`. The rate equation is
+        then integrated, and `a` is the value at the mean current.
+    monitor : Monitor, optional
+        Stability of the current monitor, instead of what the record says of it; the errors contain
+        it.
+    law : {"free", "constant"}
+        Whether a may depend on the current by a power and b drift in the record, with the priors
+        of `beamfit.lifetime.marginal`, which the errors then contain; or both are constant.
+        With a `shape` the law is known.
+
+    Returns
+    -------
+    DecayFit
+        Values, errors, and a verdict. A record from which nothing can be learned is a result
+        with the status `unidentified`, not an error.
+
+    Raises
+    ------
+    InputError
+        If the record has fewer than five readings, or rises.
+
+    Notes
+    -----
+    Least squares with report equation 44, or with equation 42 if `shape` is given. With constant
+    a and b errors are those of the linearised problem, else those of the posterior of
+    `beamfit.lifetime.marginal.free_law`.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from beamfit.lifetime.decay_law import current
+    >>> t = np.linspace(0, 8 * 3600, 1000)
+    >>> noise = 1e-3 * np.random.default_rng(1).normal(size=t.size)
+    >>> record = DecayRecord(t, np.array(current(t, 500.0, 2e-8, 1e-6)) + noise)
+    >>> fit = fit_decay(record, law="constant")
+    >>> print(fit.status, fit.lifetime_mean)
+    converged 28.704763 ± 0.000026 h
+    """
+    expect(record, DecayRecord, "beamfit.read_decay_record(path)")
+    record = record if monitor is None else replace(record, monitor=monitor)
+    if _says_nothing(record):
+        return _constant(record)
+    return _judged(record, solved(Pieces.of(record), shape=shape), shape, Law(law))
+
+
+def fit_decays(records: Sequence[DecayRecord], law: Law | str = Law.free) -> tuple[DecayFit, ...]:
+    """Fit many decays; records of similar length are solved together.
+
+    Parameters
+    ----------
+    records : sequence of DecayRecord
+        As for `fit_decay`.
+    law : {"free", "constant"}
+        As for `fit_decay`.
+
+    Returns
+    -------
+    tuple of DecayFit
+        In the order of the records.
+
+    Raises
+    ------
+    InputError
+        As for `fit_decay`.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> t = np.linspace(0, 36000, 50)
+    >>> records = [DecayRecord(t, i0 / (1 + i0 * 1e-8 * t)) for i0 in (100.0, 200.0)]
+    >>> [f"{fit.a.value:.3e}" for fit in fit_decays(records)]
+    ['1.000e-08', '1.000e-08']
+    """
+    telling = [k for k, record in enumerate(records) if not _says_nothing(record)]
+    found = solved_together([records[k] for k in telling])
+    fits = dict(zip(telling, found, strict=True))
+    return tuple(
+        _judged(record, fits[k], law=Law(law)) if k in fits else _constant(record)
+        for k, record in enumerate(records)
+    )
+
+
+def _says_nothing(record: DecayRecord) -> bool:
+    """Whether all readings are equal; a record too short for any fit is an error."""
+    if len(record) < FEWEST:
+        expected = f"{FEWEST} or more for a decay"
+        raise InputError(f"{len(record)} readings", expected, path=record.name)
+    return bool(np.ptp(record.current) == 0)
+
+
+def _constant(record: DecayRecord) -> DecayFit:
+    """The result for readings that are all equal: no decay is seen, and no noise either."""
+    level = float(record.current[0])
+    unknown = {name: Quantity(math.nan, None, unit) for name, unit in UNITS.items()}
+    message = (
+        f"All {len(record)} readings are {level:.6g} mA, so neither decay nor noise is seen: "
+        "record longer, or read the monitor with more digits."
+    )
+    return DecayFit(
+        record=record.name,
+        status=Status.unidentified,
+        message=message,
+        **unknown | {"i0": Quantity(level, None, "mA")},
+        mean_current=level,
+        chi2=0.0,
+        dof=len(record) - 1,
+        rms_residual=0.0,
+        noise_inferred=record.error is None,
+        residuals=np.zeros(len(record)),
+        identifiability=Separability(False, None, None, None, None, 1.0),
+        readings=record,
+    )
+
+
+def _judged(
+    record: DecayRecord, about: Expansion, shape: Shape | None = None, law: Law = Law.constant
+) -> DecayFit:
+    """Turn a solution into quantities, a status and its sentence."""
+    evidence = Evidence(about, law, shape is not None, record)
+    rate, error = evidence.sure("rate_mean")
+    if rate < -BELIEVED * error:
+        first, last = record.current[0], record.current[-1]
+        expected = "a decay; cut out refills with split_record"
+        found = f"a current that rises, {first:.6g} to {last:.6g} mA"
+        raise InputError(found, expected, path=record.name, column="current")
+    finding = finding_of(evidence)
+    return DecayFit(
+        record=record.name,
+        status=finding.status,
+        message=finding.message,
+        **evidence.quoted(about.rested),
+        mean_current=float(record.current.mean()),
+        rms_residual=float(np.sqrt(np.mean(evidence.residuals**2))),
+        change=evidence.change,
+        outgassing=evidence.outgassing,
+        readings=record,
+    )
+
+
+def fit_cycles(
+    cycles: Sequence[DecayRecord], name: str = "cycles", law: Law | str = Law.free
+) -> DecayFit:
+    """Fit one a and one b to many cycles, as of top-up, each with an own current at its start.
+
+    Parameters
+    ----------
+    cycles : sequence of DecayRecord
+        Three or more, of three readings or more, in order of time; as of `find_cycles`. Their
+        `start`, where all have it, says how far apart they lie.
+    name : str, optional
+        What to call them together.
+    law : {"free", "constant"}
+        Whether a may go as a power of the current, which errors of a and b then contain.
+
+    Returns
+    -------
+    DecayFit
+        Of all cycles: `lifetime_start` and `lifetime_end` are at the highest and the lowest
+        current, `i0` is the mean of the cycles' own, without an error, and `lifetimes` has the
+        lifetime by current where the currents are wide enough apart. Where a and b are not
+        separable the lifetime at the mean current is the answer.
+
+    Raises
+    ------
+    InputError
+        If there are fewer than three cycles, one has fewer than three readings, or they are not in
+        order of time.
+
+    Notes
+    -----
+    Least squares; the currents at the starts are eliminated, so that time and memory grow with the
+    readings alone. Noise with a memory goes on from cycle to cycle (`beamfit.noise.correlated`).
+    Readings, cycles and heads of cycles that lie far off are left out and counted.
+
+    Examples
+    --------
+    >>> t = np.arange(0.0, 180.0, 10.0)
+    >>> noise = 1e-3 * np.random.default_rng(1).normal(size=(50, 18))
+    >>> cycles = [DecayRecord(t, 500 * np.exp(-t / 36000) + row) for row in noise]
+    >>> print(fit_cycles(cycles).lifetime_mean)
+    9.99999 ± 0.00046 h
+    """
+    if len(cycles) < FEWEST_CYCLES:
+        raise InputError(f"{len(cycles)} cycles", f"{FEWEST_CYCLES} or more", path=name)
+    for cycle in cycles:
+        if len(cycle) < FEWEST_READINGS:
+            found, expected = f"{len(cycle)} readings", f"{FEWEST_READINGS} or more in a cycle"
+            raise InputError(found, expected, path=cycle.name)
+    return fit_pieces(cycles, name, Law(law))
+
+
+def fit_pieces(cycles: Sequence[DecayRecord], name: str, law: Law = Law.constant) -> DecayFit:
+    """As `fit_cycles`, also of two, such as before and after a refill or a gap."""
+    gathered = averaged(cycles)
+    if np.any(np.diff(gathered.time) <= 0):
+        raise InputError("a cycle before the end of the one before", "an order in time", path=name)
+    about, left_out = cleaned(gathered)
+    evidence, pieces = Evidence(about, law), about.pieces
+    finding = finding_of_cycles(evidence, pieces.monitor, left_out)
+    return DecayFit(
+        record=name,
+        status=finding.status,
+        message=finding.message,
+        **evidence.quoted(),
+        mean_current=pieces.units[1],
+        rms_residual=float(np.sqrt(np.mean((about.left[:, -1] * pieces.over) ** 2))),
+        readings=DecayRecord(
+            pieces.time, pieces.current, pieces.error, name, float(pieces.time[0])
+        ),
+        first=pieces.first,
+    )

@@ -1,0 +1,493 @@
+"""Posterior of a decay whose law and noise are not certain: a(I), b(t) and noise averaged over.
+
+With x the current over its mean and s the time over the span, the loss rate is
+share R x^(1 + g) + (1 - share) R (1 + h (s - 1/2)) with the share of a from 0 to 1. The exponent g
+and the drift h have priors, the first current, R and the share are flat. The law has a closed form
+with one integral, taken to rounding on Chebyshev nodes; readings see the nodes through one matrix,
+so that whitened products of its columns are all that the readings say.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from enum import StrEnum
+from typing import NamedTuple
+
+import numpy as np
+from numpy.polynomial.chebyshev import chebint, chebvander
+from scipy.special import gammaln, log_ndtr, logsumexp
+
+from beamfit.lifetime.decay_law import HOUR, closed_form
+from beamfit.lifetime.expansion import Physical
+from beamfit.lifetime.record import DecayRecord
+from beamfit.noise.memory import Products
+from beamfit.quantity import Quantity
+
+# Standard deviations of the exponent below and above zero. Bunches lengthen with the current, in
+# the potential well by x³ - x ∝ I (`beamfit.lifetime.bunch`), so that a goes as I^0 to I^-1/3; that
+# they shorten, or the vacuum follows the current, is seldom. A twentieth of the prior is flat.
+BELOW, ABOVE, ODD = 0.3, 0.2, 0.05
+LEAST, MOST = -0.9, 2.0
+# Standard deviation of the change of b in one record: pressures of stored beams are read to 10 %.
+DRIFT = 0.1
+# Nodes of the integral: exact to rounding up to four lifetimes in a record.
+NODES = 14
+# Exponents looked at, in ever narrower ranges, and steps of the search with each.
+EXPONENTS, RANGES, STEPS = 33, 5, 6
+# Readings beyond which neighbours are averaged: the curve is smooth between them.
+ENOUGH = 1024
+# Draws at first and again where they are worth too few, the degrees of freedom of what they come
+# from, and how many independent ones an answer needs.
+DRAWS, TAIL, WORTH = (6000, 60000), 8.0, 200.0
+# Width of the share in what draws come from, which its bounds cut off otherwise.
+AROUND = 0.6
+# Where the record's bend would not depend on the share its coordinate takes this slope instead.
+FLAT = 0.2
+# Standard deviations of the share beside a bound in which draws tell the density there.
+NEAR = 0.25
+# Shares of a of losses that are no beam's, and the prior odds of one.
+NO_BEAM, UNPHYSICAL = (-2.0, 3.0), 0.05
+# Step of the differences that give slopes.
+STEP = 1e-5
+# What lies farther below the largest log probability adds nothing.
+FAR = 9.0
+
+ANGLE = -np.cos(np.pi * np.arange(NODES) / (NODES - 1))
+NODE = (1 + ANGLE) / 2
+FROM_NODES = np.linalg.inv(chebvander(ANGLE, NODES - 1))
+INTEGRAL = chebvander(ANGLE, NODES) @ chebint(FROM_NODES, lbnd=-1) / 2
+
+
+class Law(StrEnum):
+    """What is known of the law of a decay.
+
+    Attributes
+    ----------
+    free
+        The exponent of a and a drift of b are free, with priors.
+    constant
+        a and b are constant, or their dependence is given.
+    """
+
+    free = "free"
+    constant = "constant"
+
+
+class Numbers(NamedTuple):
+    """First current over the mean, loss in the span at the mean current, share of a, exponent,
+    drift, and by how much the share changes with the third of the search's numbers.
+    """
+
+    level: np.ndarray
+    rate: np.ndarray
+    share: np.ndarray
+    power: np.ndarray
+    drift: np.ndarray
+    unit: np.ndarray
+
+    @classmethod
+    def of(cls, found: np.ndarray) -> Numbers:
+        """From columns of ln level, ln rate, bend, exponent, drift.
+
+        The bend, share (1 + g) - (1 - share) h / R, is how the loss rate falls with the current,
+        which the record shows: with it the posterior is nearly normal.
+        """
+        level, rate = np.exp(np.clip(found[:2], -30.0, 8.0))
+        power, drift = found[3], found[4]
+        unit = np.maximum(1 + power + drift / rate, FLAT)
+        return cls(level, rate, (found[2] + drift / rate) / unit, power, drift, 1 / unit)
+
+    def currents(self, gas: np.ndarray) -> np.ndarray:
+        """Currents at the nodes over the mean, one column a set; `gas` is ∫ P dt over the mean.
+
+        As of `closed_form`, W = ∫ exp(-c B) ds.
+        """
+        c = 1 + self.power
+        course = gas[:, None] + self.drift * (NODE**2 - NODE)[:, None] / 2
+        lost = (1 - self.share) * self.rate * course
+        whole = INTEGRAL @ np.exp(np.clip(-c * lost, -700, 700))
+        # Where a loss that is no beam's would have ended the record the law has no value.
+        inside = c * self.share * self.rate * self.level**c
+        least = (1e-3 - 1) / np.where(inside == 0, 1.0, inside)
+        whole = np.where(inside * whole < 1e-3 - 1, least, whole)
+        return closed_form(self.level, self.share * self.rate, self.power, lost, whole, np)
+
+
+def log_prior(power: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Log density of exponents, and of its flat part alone."""
+    width = np.where(power < 0, BELOW, ABOVE)
+    usual = np.exp(-0.5 * (power / width) ** 2) / (np.sqrt(np.pi / 2) * (BELOW + ABOVE))
+    odd = np.full_like(usual, ODD / (MOST - LEAST))
+    return np.log((1 - ODD) * usual + odd), np.log(odd)
+
+
+@dataclass(frozen=True)
+class Seen:
+    """A record as products of the columns that its readings see the nodes through.
+
+    Parameters
+    ----------
+    products : Products
+        Of what is left of the readings at `start`, and of the columns of the nodes.
+    start : array, shape (5, 1)
+        Numbers of a law near the most probable one.
+    origin : array, shape (14, 1)
+        Its currents at the nodes.
+    gas : array, shape (14,)
+        Integral of the pressure over its mean at the nodes, over the span.
+    ends : tuple of float
+        Pressure over its mean at the first and the last reading.
+    drifts : bool
+        Whether b may drift.
+    share : tuple of float
+        Between which the share of a lies.
+    """
+
+    products: Products
+    start: np.ndarray
+    origin: np.ndarray
+    gas: np.ndarray
+    ends: tuple[float, float]
+    drifts: bool
+    share: tuple[float, float] = (0.0, 1.0)
+
+    @classmethod
+    def of(cls, record: DecayRecord, values: Physical) -> Seen:
+        """Whiten the readings of a record about the law with constant a and b."""
+        span, mean = record.span, float(record.current.mean())
+        rate = max(float(values.rate_mean) * span, 1e-9)
+        share = float(np.clip(values.share, -0.2, 1.2))
+        start = np.array([[np.log(values.i0 / mean)], [np.log(rate)], [share], [0.0], [0.0]])
+        gas, bumps, ends = NODE, 0.0, (1.0, 1.0)
+        time, current, error = record.time, record.current, record.error
+        if record.gauge is not None:
+            s = record.time / span
+            smooth = np.linalg.lstsq(chebvander(2 * s - 1, 9), record.gauge / span, rcond=None)[0]
+            gas = chebvander(ANGLE, 9) @ smooth
+            bumps = record.gauge / span - chebvander(2 * s - 1, 9) @ smooth
+            slope = np.diff(record.gauge) / np.diff(record.time)
+            ends = float(slope[0]), float(slope[-1])
+            current = current * np.exp((1 - share) * rate * bumps)
+        if len(record) > ENOUGH:
+            time, current, error = DecayRecord(time, current, error).blocks(ENOUGH)
+        origin = Numbers.of(start).currents(gas)
+        sees = chebvander(2 * time / span - 1, NODES - 1) @ FROM_NODES
+        rows = np.column_stack([current / mean - sees @ origin[:, 0], sees])
+        rows = rows if error is None else rows * (mean / error)[:, None]
+        products = Products.of(rows, time, error is not None)
+        return cls(products, start, origin, gas, ends, record.gauge is None)
+
+    def of_noises(self, kept: np.ndarray) -> Seen:
+        """The same with some of the noises."""
+        return replace(self, products=self.products.some(kept))
+
+    def left(self, numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Sums of squares (k, m) by noise and set of numbers, and products with node columns."""
+        away = Numbers.of(numbers).currents(self.gas) - self.origin
+        matrix, along = self.products.matrix[:, 1:, 1:], self.products.matrix[:, 0, 1:]
+        pulled = matrix @ away
+        first = self.products.matrix[:, 0, 0][:, None]
+        squares = first - 2 * along @ away + np.sum(away * pulled, axis=1)
+        return np.maximum(squares, 1e-30), along[:, :, None] - pulled
+
+
+class Peaks(NamedTuple):
+    """Normal approximations by noise (k) and exponent (m): centre, scaled triangle of the inverse
+    covariance, log of the integral; and numbers (5, m) about which the last step was taken.
+    """
+
+    centre: np.ndarray
+    precision: np.ndarray
+    log: np.ndarray
+    numbers: np.ndarray
+
+
+def _slopes(seen: Seen, numbers: np.ndarray, free: list[int]) -> tuple[np.ndarray, np.ndarray]:
+    """Slopes of the currents at the nodes, (14, m, p), and of the share, (m, p)."""
+    currents, share = [], []
+    for move in STEP * np.eye(5)[free]:
+        more, less = (Numbers.of(numbers + sign * move[:, None]) for sign in (1, -1))
+        currents.append(more.currents(seen.gas) - less.currents(seen.gas))
+        share.append(more.share - less.share)
+    return np.stack(currents, axis=2) / (2 * STEP), np.stack(share, axis=1) / (2 * STEP)
+
+
+def _log_within(bounds: tuple[float, float], middle: np.ndarray, sd: np.ndarray) -> np.ndarray:
+    """Logarithm of the part of normal distributions between two bounds."""
+    low, high = ((bound - middle) / np.maximum(sd, 1e-300) for bound in bounds)
+    above = low > 0  # both ends on one side: the tail that is not near 1
+    low, high = np.where(above, -high, low), np.where(above, -low, high)
+    upper, lower = log_ndtr(high), log_ndtr(low)
+    return upper + np.log1p(-np.exp(np.minimum(lower - upper, -1e-12)))
+
+
+def _expanded(seen: Seen, numbers: np.ndarray, free: list[int]) -> Peaks:
+    """Expand the posterior about numbers (5, m) for every noise."""
+    slopes, of_share = _slopes(seen, numbers, free)
+    squares, pulled = seen.left(numbers)
+    gradient = np.einsum("nmp,knm->kmp", slopes, pulled)
+    turned = (seen.products.matrix[:, 1:, 1:] @ slopes.reshape(NODES, -1)).reshape(
+        (-1, *slopes.shape)
+    )
+    normal = np.einsum("nmp,knmq->kmpq", slopes, turned)
+    width, middle = np.array([np.inf, np.inf, AROUND, np.inf, DRIFT])[free], np.zeros(len(free))
+    middle[2] = 0.5
+    known, pull = np.diag(1 / width**2), ((middle - numbers[free].T) / width**2)[None]
+    after = squares
+    for _ in range(2):
+        unit = seen.products.variance(after, len(free))[..., None]
+        precision = normal / unit[..., None] + known
+        step = np.linalg.solve(precision, (gradient / unit + pull)[..., None])[..., 0]
+        after = squares - 2 * np.sum(step * gradient, 2)
+        after = np.maximum(after + np.einsum("kmp,kmpq,kmq->km", step, normal, step), 1e-30)
+    centre = numbers[free].T + step
+    log = seen.products.log_prior[:, None] + seen.products.log_size(after)
+    log = log - 0.5 * np.linalg.slogdet(precision)[1]
+    log = log - 0.5 * np.sum((centre - middle) ** 2 / width**2, axis=2)
+    share = Numbers.of(numbers).share + np.sum(of_share * step, axis=2)
+    spread = np.linalg.solve(precision, np.broadcast_to(of_share, step.shape)[..., None])[..., 0]
+    log = log + _log_within(seen.share, share, np.sqrt(np.sum(of_share * spread, axis=2)))
+    return Peaks(centre, precision, log + log_prior(numbers[3])[0], numbers)
+
+
+def _searched(seen: Seen, numbers: np.ndarray, free: list[int]) -> Peaks:
+    """The most probable of the free numbers at each exponent, by Gauss and Newton."""
+    for _ in range(STEPS):
+        found = _expanded(seen, numbers, free)
+        weight = np.exp(found.log - logsumexp(found.log, axis=0))
+        step = np.einsum("km,kmp->pm", weight, found.centre) - numbers[free]
+        numbers = numbers.copy()
+        numbers[free] += np.clip(step, -0.5, 0.5)
+        numbers[4] = np.clip(numbers[4], -5 * DRIFT, 5 * DRIFT)
+        named = Numbers.of(numbers)
+        numbers[2] += (np.clip(named.share, -1.0, 2.0) - named.share) / named.unit
+        spread = 1 / np.sqrt(np.einsum("kmpp->pm", weight[..., None, None] * found.precision))
+        if np.all(np.abs(step) < 0.03 * spread + 1e-9):
+            break
+    return _expanded(seen, numbers, free)
+
+
+def _by_exponent(seen: Seen, free: list[int]) -> tuple[Seen, Peaks]:
+    """Expansions at exponents and by noises that hold the posterior, in ever narrower ranges."""
+    low, high, numbers = LEAST, MOST, np.tile(seen.start, (1, EXPONENTS))
+    for _ in range(RANGES):
+        power = np.linspace(low, high, EXPONENTS)
+        numbers = np.vstack([numbers[:3], power, numbers[4]])
+        found = _searched(seen, numbers, free)
+        seen = seen.of_noises(found.log.max(axis=1) > found.log.max() - FAR)
+        whole = logsumexp(found.log, axis=0)
+        held = np.flatnonzero(whole > whole.max() - FAR)
+        ends = max(held[0] - 1, 0), min(held[-1] + 1, EXPONENTS - 1)
+        if ends[1] - ends[0] > 0.6 * EXPONENTS:
+            break
+        low, high = power[ends[0]], power[ends[1]]
+        at = np.linspace(low, high, EXPONENTS)
+        numbers = np.array([np.interp(at, power, row) for row in found.numbers])
+    return seen, _expanded(seen, found.numbers, free)
+
+
+class Draws(NamedTuple):
+    """Numbers with their weights, their log evidence, and how many draws they are worth."""
+
+    numbers: Numbers
+    weight: np.ndarray
+    log: float
+    worth: float
+
+
+def drawn(seen: Seen, free: list[int]) -> Draws:
+    """Draw the free numbers from their posterior; more of them where they are worth too few."""
+    if 3 in free:
+        seen, peaks = _by_exponent(seen, free[:3] + free[4:])
+    else:
+        peaks = _searched(seen, seen.start, free)
+    found = _drawn(seen, peaks, DRAWS[0])
+    return found if found.worth >= WORTH else _drawn(seen, peaks, DRAWS[1])
+
+
+def _drawn(seen: Seen, peaks: Peaks, draws: int) -> Draws:
+    """Draw from normal approximations, Student's tails, each draw weighed by the posterior."""
+    rng, free = np.random.default_rng(0), [0, 1, 2, 4][: peaks.centre.shape[2]]
+    odds = np.exp(peaks.log - peaks.log.max()).ravel()
+    ends = np.cumsum(odds) / odds.sum()
+    which = np.minimum(np.searchsorted(ends, (np.arange(draws) + 0.5) / draws), odds.size - 1)
+    kind, at = np.unravel_index(which, peaks.log.shape)
+    size, count = np.sqrt(TAIL / rng.chisquare(TAIL, draws)), len(free)
+    normal = rng.normal(size=(draws, count)) * size[:, None]
+    root = np.linalg.cholesky(np.linalg.inv(peaks.precision))[kind, at]
+    numbers = peaks.numbers[:, at]
+    numbers[free] = (peaks.centre[kind, at] + np.einsum("dpq,dq->dp", root, normal)).T
+    given = gammaln((TAIL + count) / 2) - gammaln(TAIL / 2) - 0.5 * count * np.log(np.pi * TAIL)
+    given = given - np.log(np.einsum("dpp->dp", root)).sum(1)
+    given = given - 0.5 * (TAIL + count) * np.log1p(np.sum(normal**2, 1) / TAIL)
+    named = Numbers.of(numbers)
+    away = named.currents(seen.gas) - seen.origin
+    products = seen.products
+    squares = products.matrix[kind, 0, 0] - 2 * np.sum(products.matrix[kind, 0, 1:] * away.T, 1)
+    squares = squares + np.einsum("dn,dnm,dm->d", away.T, products.matrix[kind, 1:, 1:], away.T)
+    log = products.log_prior[kind] + products.log_size(np.maximum(squares, 1e-30))
+    log = log + np.log(named.level * named.rate * named.unit) + log_prior(named.power)[0]
+    if 4 in free:
+        log = log - 0.5 * (named.drift / DRIFT) ** 2 - np.log(DRIFT * np.sqrt(2 * np.pi))
+    inside = (named.share >= seen.share[0]) & (named.share <= seen.share[1])
+    log = log - np.log(seen.share[1] - seen.share[0])
+    log = np.where(inside, log - given - np.log(odds[which] / odds.sum()), -np.inf)
+    if not inside.any():
+        return Draws(named, np.zeros(draws), -np.inf, 0.0)
+    weight = np.exp(log - logsumexp(log))
+    spacing = float(np.diff(peaks.numbers[3])[0]) if peaks.log.shape[1] > 1 else 1.0
+    whole = float(logsumexp(log)) - np.log(draws) + np.log(spacing)
+    return Draws(named, weight, whole, float(1 / np.sum(weight**2)))
+
+
+def quantiles(values: np.ndarray, weight: np.ndarray, at: np.ndarray) -> np.ndarray:
+    """Quantiles of weighted values.
+
+    Examples
+    --------
+    >>> quantiles(np.array([3.0, 1.0, 2.0]), np.full(3, 1 / 3), np.array([0.5])).tolist()
+    [2.0]
+    """
+    order = np.argsort(values)
+    below = np.cumsum(weight[order]) - weight[order] / 2
+    return np.interp(at, below, values[order])
+
+
+class Span(NamedTuple):
+    """Median, half of the central 68 %, and the interval of 95 % of one quantity."""
+
+    median: float
+    error: float
+    interval: tuple[float, float]
+
+    @classmethod
+    def of(
+        cls, values: np.ndarray, weight: np.ndarray, bounds: tuple[bool, bool] = (False, False)
+    ) -> Span:
+        """From draws; where a bound below or above is not excluded the interval reaches to it."""
+        ends = {(False, False): (0.025, 0.975), (True, False): (0.0, 0.95)}
+        ends |= {(False, True): (0.05, 0.999), (True, True): (0.0, 0.999)}
+        at = np.array([0.5, 0.1587, 0.8413, *ends[bounds]])
+        middle, less, more, low, high = map(float, quantiles(values, weight, at))
+        return cls(middle, (more - less) / 2, (0.0 if bounds[0] else low, high))
+
+    def beside(self, value: float, moved: float) -> tuple[float, tuple[float, float]]:
+        """Error and interval about a value with a further, independent error."""
+        reaches = (np.hypot(value - self.interval[0], 1.96 * moved),
+                   np.hypot(self.interval[1] - value, 1.96 * moved))  # fmt: skip
+        return float(np.hypot(self.error, moved)), (value - reaches[0], value + reaches[1])
+
+
+@dataclass(frozen=True)
+class FreeLaw:
+    """What a record tells where its law and its noise are not certain.
+
+    Parameters
+    ----------
+    spans : mapping of str to Span
+        Of I0, a, b and the lifetimes at the start, the end and the mean current, in mA, 1/(mA s),
+        1/s and h.
+    exponent : Quantity
+        g in a(I) proportional to I^g, with its prior.
+    drift : Quantity or None
+        Change of b over the record as a share of it, with its prior; None where a gauge tells it.
+    constant : float
+        Probability of constant a and b, at even odds with the free law.
+    odd : float
+        Probability that the exponent is none of a bunch's length.
+    """
+
+    spans: Mapping[str, Span]
+    exponent: Quantity
+    drift: Quantity | None
+    constant: float
+    odd: float
+
+    def to_json(self) -> dict[str, object]:
+        """Return the exponent, the drift and the probability of constant a and b."""
+        told = {"exponent": self.exponent, "drift": self.drift}
+        return told | {"probability_of_constant_a_and_b": self.constant}
+
+
+def _at_bounds(share: np.ndarray, weight: np.ndarray) -> tuple[bool, bool]:
+    """Whether shares of 0 and of 1 are not excluded at 95 %: by the density of draws beside them
+    in that of a normal distribution, two standard deviations off.
+    """
+    near = NEAR * math.sqrt(weight @ (share - weight @ share) ** 2)
+    least = NEAR * math.exp(-(1.96**2) / 2) / math.sqrt(2 * math.pi)
+    return bool(weight @ (share < near) > least), bool(weight @ (share > 1 - near) > least)
+
+
+def free_law(record: DecayRecord, values: Physical) -> FreeLaw | None:
+    """Average a decay over exponents of a, drifts of b and noises.
+
+    Parameters
+    ----------
+    record : DecayRecord
+        One decay.
+    values : Physical
+        Of the law with constant a and b.
+
+    Returns
+    -------
+    FreeLaw or None
+        None where no such law fits the record: its draws are worth too few, or a loss with a
+        negative a or b is likelier.
+
+    Notes
+    -----
+    For each exponent on a grid and each noise of `beamfit.noise.memory` a normal approximation of
+    the other numbers, whose draws are weighed by the posterior itself (importance sampling), with
+    the size of the noise integrated over.
+
+    Examples
+    --------
+    >>> from beamfit.lifetime.expansion import Pieces, solved
+    >>> t = np.linspace(0, 36000, 100)
+    >>> noise = 1e-2 * np.random.default_rng(1).normal(size=100)
+    >>> record = DecayRecord(t, 100.0 / (1.0 + 100.0 * 1e-7 * t) + noise)
+    >>> found = free_law(record, solved(Pieces.of(record)).values)
+    >>> found.spans["a"].interval[0] < 1e-7 <= found.spans["a"].interval[1]
+    True
+    """
+    seen = Seen.of(record, values)
+    draws = drawn(seen, [0, 1, 2, 3, 4] if seen.drifts else [0, 1, 2, 3])
+    if draws.worth < WORTH / 4:
+        return None
+    plain = drawn(seen, [0, 1, 2])
+    if not 0 <= values.share <= 1:
+        rival = drawn(replace(seen, share=NO_BEAM), [0, 1, 2])
+        if rival.log + np.log(UNPHYSICAL) > draws.log:
+            return None
+    usual, odd = log_prior(draws.numbers.power)
+    bounds = _at_bounds(draws.numbers.share, draws.weight)
+    ends = {"a": bounds, "b": bounds[::-1]}
+    spans = {
+        n: Span.of(v, draws.weight, ends.get(n, (False, False)))
+        for n, v in _quoted(record, seen, draws.numbers).items()
+    }
+    power, drift = (Span.of(v, draws.weight) for v in (draws.numbers.power, draws.numbers.drift))
+    return FreeLaw(
+        spans, Quantity(power.median, power.error, "1", None, power.interval),
+        Quantity(drift.median, drift.error, "1", None, drift.interval) if seen.drifts else None,
+        float(1 / (1 + np.exp(draws.log - plain.log))), float(draws.weight @ np.exp(odd - usual)),
+    )  # fmt: skip
+
+
+def _quoted(record: DecayRecord, seen: Seen, found: Numbers) -> dict[str, np.ndarray]:
+    """What is quoted, by draw."""
+    span, mean = record.span, float(record.current.mean())
+    x = found.currents(seen.gas)
+    # Where the current is its mean: the drift has gone so far by then.
+    middle = float(np.interp(-1.0, -seen.origin[:, 0], NODE)) - 0.5
+    gas = {"start": (-0.5, seen.ends[0]), "end": (0.5, seen.ends[1]), "mean": (middle, 1.0)}
+    beam = {"start": x[0], "end": x[-1], "mean": np.ones_like(found.level)}
+    a, b = found.share * found.rate, (1 - found.share) * found.rate
+    rates = {
+        at: a * beam[at] ** (1 + found.power) + b * pressure * (1 + found.drift * s)
+        for at, (s, pressure) in gas.items()
+    }
+    quoted = {"i0": found.level * mean, "a": a / mean / span, "b": b / span}
+    return quoted | {f"lifetime_{at}": span / rate / HOUR for at, rate in rates.items()}

@@ -1,0 +1,442 @@
+"""Clean decays of a record: cut at refills, steps and gaps, without repeats; means and edges."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+from scipy.ndimage import median_filter
+
+from beamfit.errors import expect
+from beamfit.lifetime.record import Conditions, DecayRecord
+from beamfit.shown import shown
+
+# Robust z-score at which a step or spike is an event: one false alarm in 1e20 Gaussian readings.
+THRESHOLD = 10.0
+# Readings below this share of the largest one near them are dropouts of the monitor.
+DROPOUT = 0.02
+WINDOW = 9
+FEWEST = 8
+# Readings whose means are looked at for a ramp at the head, the share of its rise by which a fall
+# ends it, and by how much it exceeds any later rise.
+SMOOTH, FALL, RISE = 5, 0.1, 3.0
+# A refill of many readings rises by so many standard deviations, this share of the current, and so
+# many times faster than the record usually falls: a drift of the monitor does none of these.
+REFILL, SHARE, FASTER = 30.0, 0.01, 4.0
+# Readings that are looked through for one at first.
+BLOCK = 4096
+# A gap is this many usual sampling intervals.
+GAP = 10.0
+
+
+class Event(NamedTuple):
+    """Something in a record other than a smooth decay.
+
+    Attributes
+    ----------
+    kind : str
+        `refill`, `loss`, `dropout`, `spike`, `saturated`, `gap`, `ramp` (the end of injection at
+        the head of a decay) or `short` (a piece too short to keep).
+    time : float
+        When it begins, s from the record's start.
+    duration : float
+        How long it lasts, s.
+    change : float
+        Change of the current, mA.
+    """
+
+    kind: str
+    time: float
+    duration: float
+    change: float
+
+    def __str__(self) -> str:
+        return f"{self.kind} at {self.time:.0f} s ({self.change:+.4g} mA)"
+
+
+@shown
+class Split(NamedTuple):
+    """A record's clean decays, and what lies between them.
+
+    Attributes
+    ----------
+    segments : tuple of DecayRecord
+        Decays without steps; named after the record, with #1, #2, ... if there is more than one.
+    events : tuple of Event
+        What was cut away or noted, in order of time.
+    """
+
+    segments: tuple[DecayRecord, ...]
+    events: tuple[Event, ...]
+
+
+def noise_of(time: np.ndarray, current: np.ndarray) -> float:
+    """Noise of single readings, from how far each lies off the line through its neighbours.
+
+    Parameters
+    ----------
+    time, current : array, shape (n,)
+        Readings; n at least 3.
+
+    Returns
+    -------
+    float
+        Robust standard deviation, in the unit of the current.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> t = np.arange(1000.0)
+    >>> noise = 0.01 * np.random.default_rng(1).normal(size=1000)
+    >>> f"{noise_of(t, 100 - t / 100 + noise):.3f}"
+    '0.010'
+    """
+    share = (time[1:-1] - time[:-2]) / (time[2:] - time[:-2])
+    off = current[1:-1] - (1 - share) * current[:-2] - share * current[2:]
+    off = off / np.sqrt(1 + share**2 + (1 - share) ** 2)
+    return float(1.4826 * np.median(np.abs(off)))
+
+
+def _dropouts(current: np.ndarray) -> tuple[np.ndarray, int]:
+    """Readings near zero although the beam comes back, and where it is gone for good."""
+    flagged = np.zeros(current.size, bool)
+    # Readings before the beam is seen have no reading before them to compare with.
+    beam = np.median(current[current > 0]) if np.any(current > 0) else 0.0
+    flagged[: int(np.argmax(current > DROPOUT * beam))] = True
+    for start in np.flatnonzero(current[1:] < DROPOUT * current[:-1]) + 1:
+        if flagged[start]:
+            continue
+        back = _first_above(current, start, DROPOUT * current[start - 1])
+        if back == current.size:
+            return flagged, int(start)
+        flagged[start:back] = True
+    return flagged, current.size
+
+
+def _first_above(current: np.ndarray, start: int, least: float) -> int:
+    """The first reading from one on that is as large as this; their number if none is."""
+    width = BLOCK
+    while start < current.size:
+        above = np.flatnonzero(current[start : start + width] >= least)
+        if above.size:
+            return int(start + above[0])
+        start, width = start + width, 2 * width
+    return current.size
+
+
+def _saturated(current: np.ndarray) -> np.ndarray:
+    """A run of identical largest readings, far longer than any other run of equal ones."""
+    starts = np.flatnonzero(np.diff(current, prepend=np.nan) != 0)
+    lengths = np.diff(starts, append=current.size)
+    top = current[starts] == current.max()
+    usual = current.size if top.all() else lengths[~top].max()
+    return np.repeat(top & (lengths >= 5) & (lengths > 5 * usual), lengths)
+
+
+def _flattened(time: np.ndarray, current: np.ndarray) -> np.ndarray:
+    """The readings without their decay: level, but for noise, steps and spikes."""
+    interval = np.diff(time)
+    slope = median_filter(np.diff(current) / interval, WINDOW, mode="nearest")
+    return current - np.concatenate([[0.0], np.cumsum(slope * interval)])
+
+
+def _spikes(time: np.ndarray, current: np.ndarray, noise: float) -> np.ndarray:
+    """Up to three readings off the running median, which follows steps exactly."""
+    level = _flattened(time, current)
+    return np.abs(level - median_filter(level, 7, mode="nearest")) > THRESHOLD * noise
+
+
+def _runs(flags: np.ndarray) -> list[tuple[int, int]]:
+    """First and past-the-last index of each run of true values."""
+    edges = np.flatnonzero(np.diff(np.r_[False, flags, False].astype(int)))
+    return list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))
+
+
+def event_of(record: DecayRecord, kind: str, first: int, last: int, sudden: bool = False) -> Event:
+    """An event from reading `first` to `last`; the change of a sudden one is that at its begin."""
+    begin, end = (first - 1, first) if sudden and first else (first, last)
+    lasts, change = (
+        record.time[last] - record.time[first],
+        record.current[end] - record.current[begin],
+    )
+    return Event(kind, float(record.time[first]), float(lasts), float(change))
+
+
+def _noise(record: DecayRecord, kept: np.ndarray) -> float:
+    scatter = noise_of(record.time[kept], record.current[kept])
+    return max(scatter, (record.resolution or 0.0) / 2)
+
+
+def beam_readings(record: DecayRecord, spikes: bool = True) -> tuple[np.ndarray, list[Event]]:
+    """Indices of the readings that show the beam, and what the others are; of short cycles the
+    first readings look like spikes.
+    """
+    dropped, end_of_beam = _dropouts(record.current)
+    found = {"dropout": dropped, "saturated": _saturated(record.current)}
+    kept = np.flatnonzero(~dropped & ~found["saturated"] & (np.arange(len(record)) < end_of_beam))
+    if spikes and kept.size >= FEWEST:
+        found["spike"] = np.zeros(len(record), bool)
+        lone = _spikes(record.time[kept], record.current[kept], _noise(record, kept))
+        found["spike"][kept[lone]] = True
+        kept = kept[~lone]
+    events = [
+        event_of(record, kind, first, end - 1, sudden=True)
+        for kind, flags in found.items()
+        for first, end in _runs(flags)
+    ]
+    if end_of_beam < len(record):
+        events.append(event_of(record, "loss", end_of_beam, len(record) - 1, sudden=True))
+    return kept, events
+
+
+def _steps(time: np.ndarray, current: np.ndarray, noise: float) -> np.ndarray:
+    """Change from each reading to the next beyond what the decay around it explains, or zero."""
+    change = np.diff(current)
+    excess = np.diff(_flattened(time, current))
+    usual = 1.4826 * np.median(np.abs(excess))
+    allowed = THRESHOLD * max(usual, np.sqrt(2) * noise) + 0.5 * np.abs(change - excess)
+    return np.where(np.abs(excess) > allowed, change, 0.0)
+
+
+def _highest(smooth: np.ndarray, low: float, noise: float) -> int:
+    """Where a rise from a low current ends: it falls again by more than noise and a tenth of it."""
+    top = np.maximum.accumulate(smooth)
+    falls = np.flatnonzero(top - smooth > np.maximum(5 * noise, FALL * (top - low)))
+    return int(np.argmax(smooth[: falls[0] if falls.size else None]))
+
+
+def _ramp(current: np.ndarray, noise: float) -> int:
+    """How many readings at the head of a piece are of injection: the current still rises, by more
+    than noise and three times more than anywhere later. Half as many again are cut, where a ramp
+    that ends smoothly still counts.
+    """
+    if current.size < 3 * FEWEST:
+        return 0
+    smooth = np.convolve(current, np.full(SMOOTH, 1 / SMOOTH), "valid")
+    highest = _highest(smooth, smooth[0], noise)
+    after = smooth[highest:]
+    later = float(np.max(after - np.minimum.accumulate(after)))
+    if smooth[highest] - smooth[0] <= max(6 * noise, RISE * later):
+        return 0
+    cut = int(1.5 * (highest + SMOOTH // 2)) + 1
+    return cut if current.size - cut >= FEWEST else 0
+
+
+def _refills(time: np.ndarray, current: np.ndarray, noise: float) -> list[int]:
+    """Where refills of many readings begin: their ramps are then at the heads of pieces."""
+    if current.size < 3 * FEWEST:
+        return []
+    smooth = np.convolve(current, np.full(SMOOTH, 1 / SMOOTH), "valid")
+    usual = np.median(np.abs(np.diff(smooth) / np.diff(time[: smooth.size])))
+    found, start, width = [], 0, BLOCK
+    while start < smooth.size:
+        block = smooth[start : start + width]
+        lowest = np.minimum.accumulate(block)
+        rises = np.flatnonzero(block - lowest > np.maximum(REFILL * noise, SHARE * np.abs(lowest)))
+        if not rises.size and start + width >= smooth.size:
+            break
+        if not rises.size:
+            width *= 2
+            continue
+        top = rises[0]
+        begin = np.flatnonzero(block[:top] == lowest[top])[-1]
+        lasted = time[start + top] - time[start + begin]
+        if block[top] - block[begin] <= FASTER * usual * lasted:
+            break  # a drift of the monitor, which has no end to be seen
+        highest = _highest(block[top:], block[begin], noise)
+        at = start + int(begin) + SMOOTH // 2 + 1
+        if at - (found[-1] if found else 0) >= FEWEST:  # else the ramp is at the head already
+            found.append(at)
+        start, width = start + int(top) + max(highest, 1), BLOCK
+    return found
+
+
+def split_record(record: DecayRecord) -> Split:
+    """Cut a record at refills and loss steps, and drop readings that are not of the beam.
+
+    Parameters
+    ----------
+    record : DecayRecord
+        Any record: one decay, fills with refills between them, or top-up.
+
+    Returns
+    -------
+    Split
+        Decays of at least 8 readings, and the events between and in them.
+
+    Notes
+    -----
+    A step must exceed ten robust standard deviations of the changes between readings; a refill of
+    many readings must rise by 30 and by 1 %, four times faster than the record falls: other slow
+    or noisy changes stay in. A gap alone does not end a decay; a step across it does.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> t = np.arange(0.0, 4000.0, 10.0)
+    >>> saw = 100 * np.exp(-(t % 2000) / 36000)
+    >>> split = split_record(DecayRecord(t, saw))
+    >>> len(split.segments), str(split.events[0])
+    (2, 'refill at 2000 s (+5.378 mA)')
+    """
+    expect(record, DecayRecord, "beamfit.read_decay_record(path)")
+    kept, events = beam_readings(record)
+    if kept.size < FEWEST:
+        return Split((), tuple(events))
+    noise = _noise(record, kept)
+    steps = _steps(record.time[kept], record.current[kept], noise)
+    for before in np.flatnonzero(steps):
+        kind = "refill" if steps[before] > 0 else "loss"
+        at = float(record.time[kept[before + 1]])
+        events.append(Event(kind, at, 0.0, float(steps[before])))
+    interval = np.diff(record.time)
+    for before in np.flatnonzero(interval > GAP * np.median(interval)):
+        events.append(event_of(record, "gap", before, before + 1))
+    long = []
+    between = np.split(kept, np.flatnonzero(steps) + 1)
+    parts = [
+        part
+        for piece in between
+        for part in np.split(piece, _refills(record.time[piece], record.current[piece], noise))
+    ]
+    for piece in parts:
+        if cut := _ramp(record.current[piece], noise):
+            events.append(event_of(record, "ramp", piece[0], piece[cut - 1]))
+        if piece.size < FEWEST:
+            events.append(event_of(record, "short", piece[0], piece[-1]))
+        else:
+            long.append(piece[cut:])
+    names = [record.name if len(long) == 1 else f"{record.name}#{k + 1}" for k in range(len(long))]
+    segments = tuple(record.select(rows, name) for rows, name in zip(long, names, strict=True))
+    return Split(segments, tuple(sorted(events, key=lambda event: event.time)))
+
+
+# Readings beyond which neighbours are averaged.
+MOST_READINGS = 1 << 16
+# Robust standard deviations off the median of its block that a reading may lie.
+OUTLIER = 10.0
+# Repeats are of a monitor slower than its archive if half of the readings are, and nearly all come
+# by equal numbers, or what changes, changes by more than so many digits. Runs so much longer than
+# usual are of a monitor that stands.
+EQUAL, DIGITS, STANDS, FEWEST_EDGES = 0.95, 3.0, 5, 8
+# Readings that a step of a staircase lasts at least, and by how much of a digit steps may differ.
+STAIR, ROUNDING = 3, 1e-6
+
+
+def without_repeats(record: DecayRecord) -> DecayRecord:
+    """Leave out readings that repeat the one before where the monitor is slower than its archive:
+    they are late, and a curve through them lies half a step too high.
+    """
+    fresh = np.diff(record.current, prepend=np.nan) != 0
+    first = np.flatnonzero(fresh)
+    runs = np.diff(first, append=fresh.size)
+    usual = int(np.median(runs))
+    if not FEWEST_EDGES <= first.size <= len(record) / 2 or usual < 2:
+        return record
+    change = float(np.median(np.abs(np.diff(record.current[first]))))
+    kept = fresh | np.repeat(runs > STANDS * usual, runs)
+    period = int(np.bincount(runs).argmax())
+    if period > 1 and np.mean(runs % period == 0) > EQUAL:
+        # Two values in a row may be equal by themselves.
+        kept |= (np.arange(fresh.size) - np.repeat(first, runs)) % period == 0
+    elif record.resolution is not None and change <= DIGITS * record.resolution:
+        return record
+    note = (
+        f"{np.sum(~kept)} of {len(record)} readings repeat the one before to the last digit, as of "
+        "a monitor slower than its archive: left out."
+    )
+    return replace(record.select(kept), notes=(*record.notes, note))
+
+
+def on_edges(record: DecayRecord) -> DecayRecord:
+    """Take the edges between the digits of a monitor that has less noise than a digit.
+
+    Parameters
+    ----------
+    record : DecayRecord
+        One decay. One that is no staircase of single digits, or has errors, is given back.
+
+    Returns
+    -------
+    DecayRecord
+        Half a digit between both readings of each step. The readings themselves are off by up to
+        half a digit for as long as a step lasts, as of noise with a memory; the edges are off by
+        what the beam loses between two readings.
+
+    Examples
+    --------
+    >>> t = np.arange(0.0, 3600.0, 10.0)
+    >>> print(on_edges(DecayRecord(t, np.round(100 * np.exp(-t / 36000), 1))))
+    record: 95 readings over 0.989 h, 99.95 to 90.55 mA
+    """
+    digit, change = record.resolution, np.diff(record.current)
+    edge = np.flatnonzero(change)
+    if digit is None or record.error is not None or edge.size < FEWEST_EDGES:
+        return record
+    single = np.abs(change[edge] + digit) < ROUNDING * digit
+    if not single.all() or np.median(np.diff(edge)) < STAIR:
+        return record
+    note = f"Steps of {digit:.3g} mA without noise: the {edge.size} edges between them were fitted."
+    at = record.select(edge)
+    middle = (record.time[edge] + record.time[edge + 1]) / 2
+    return replace(
+        at, time=middle, current=(record.current[edge] + record.current[edge + 1]) / 2,
+        start=None if record.start is None else record.start + float(middle[0]),
+        notes=(*record.notes, note),
+    )  # fmt: skip
+
+
+def thinned(record: DecayRecord) -> DecayRecord:
+    """Average neighbours of a long decay in equal blocks, up to 65536.
+
+    Parameters
+    ----------
+    record : DecayRecord
+        One decay: means across a refill are of neither side. A short one is given back.
+
+    Returns
+    -------
+    DecayRecord
+        Means of time, current and conditions of each block; errors are those of a mean of
+        independent readings. Single readings far off, as of spikes and dropouts, do not enter.
+        `notes` says how many were averaged.
+
+    Notes
+    -----
+    Over a block of length d a decay of lifetime T bends by (d/T)²/24 of the current, 1e-9 for the
+    8 s of a week's blocks at 15 h. Noise of a memory shorter than a block is white in the means.
+
+    Examples
+    --------
+    >>> t = np.arange(200_000.0)
+    >>> thinned(DecayRecord(t, 500 - t / 1e4)).notes
+    ('The means of 4 readings each were fitted, of 200000 in all.',)
+    """
+    size = -(-len(record) // MOST_READINGS)
+    if size == 1:
+        return record
+    first = np.arange(0, len(record), size)
+    count = np.diff(first, append=len(record))
+    whole = len(record) // size * size
+    blocks = record.current[:whole].reshape(-1, size)
+    off = np.abs(blocks - np.median(blocks, axis=1, keepdims=True))
+    spread = 1.4826 * np.median(off, axis=1)
+    kept = np.ones(len(record), bool)
+    limit = OUTLIER * max(float(np.median(spread)), record.resolution or 0.0)
+    kept[:whole] = (off <= np.maximum(OUTLIER * spread, limit)[:, None]).ravel()
+    count = np.maximum(np.add.reduceat(kept.astype(int), first), 1)
+
+    def mean(values: np.ndarray) -> np.ndarray:
+        return np.add.reduceat(values * kept, first) / count
+
+    error = record.error
+    conditions = {name: mean(values) for name, values in record.conditions.given.items()}
+    note = f"The means of {size} readings each were fitted, of {len(record)} in all."
+    time = mean(record.time)
+    return replace(
+        record, time=time, current=mean(record.current),
+        error=None if error is None else np.sqrt(mean(error**2) / count),
+        start=None if record.start is None else record.start + float(time[0]),
+        conditions=Conditions(**conditions), notes=(*record.notes, note),
+    )  # fmt: skip

@@ -1,0 +1,508 @@
+"""A record from file to verdicts: cut into decays, each fitted, with its loss budget."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from beamfit.errors import InputError, expect
+from beamfit.lifetime.bunch import stored_bunch
+from beamfit.lifetime.cycles import (
+    FEWEST_CYCLES,
+    MOST,
+    alike,
+    cut_at_refills,
+    is_refilled,
+    joined,
+    unresolved,
+    usual_cycle,
+)
+from beamfit.lifetime.decay_law import HOUR
+from beamfit.lifetime.evidence import SEPARABLE
+from beamfit.lifetime.fit import DecayFit, bare, fit_cycles, fit_decay
+from beamfit.lifetime.marginal import Law
+from beamfit.lifetime.mechanisms import MECHANISMS, Losses, loss_coefficients
+from beamfit.lifetime.pieces import (
+    Event,
+    Split,
+    noise_of,
+    on_edges,
+    split_record,
+    thinned,
+    without_repeats,
+)
+from beamfit.lifetime.record import DecayRecord
+from beamfit.lifetime.ring import MeasuredLength, Operation, Ring, unstored
+from beamfit.lifetime.systematics import DecayChecks, Systematic, check_decay, systematics
+from beamfit.quantity import Quantity, Status
+from beamfit.shown import shown
+from beamfit.table import json_of
+
+# A setting that moves by more than this share between two readings was changed by somebody.
+CHANGED = 0.01
+SETTINGS = ("rf_voltage", "scraper_y", "bunches")
+# Decays shorter than this are pieces between two events.
+SHORTEST = 8
+# Refills of so many standard deviations of the means beside them are none of them missed.
+SEEN = 6.0
+# Scatter, over the length squared, of the parabola t² beside its line, halved: the bend of a decay.
+BEND = 1 / 12 / math.sqrt(5)
+# Noise with a memory is taken for so many times what neighbouring readings scatter by.
+OWN = 3.0
+# Probability of refills faster than the record is read from which cycles tell no lifetime.
+UNSURE = 0.05
+# Points of a picture.
+POINTS = 60
+
+
+@shown
+class Machine(NamedTuple):
+    """A ring and the settings and vacuum that hold where a record does not say otherwise."""
+
+    ring: Ring
+    operation: Operation
+
+
+class Budget(NamedTuple):
+    """Losses from first principles during a record.
+
+    Attributes
+    ----------
+    operation : Operation
+        The settings and the vacuum they were computed for.
+    losses : Losses
+        Coefficients by mechanism, 1/(mA s) and 1/s, as plain numbers.
+    current : float
+        Mean current of the record, mA.
+    bunch_length : float
+        Rms length of the bunches, m, computed or given.
+    emittances : tuple of float
+        Horizontal and vertical, m rad, as given: intrabeam scattering is not computed.
+    """
+
+    operation: Operation
+    losses: Losses
+    current: float
+    bunch_length: float
+    emittances: tuple[float, float]
+
+    @property
+    def rates(self) -> dict[str, float]:
+        """Loss rate at the mean current by cause, 1/h."""
+        rates = self.losses.rates(self.current)
+        return {m.label: HOUR * rates[m.name] for m in MECHANISMS}
+
+    @property
+    def lifetime(self) -> float:
+        """Lifetime at the mean current, h."""
+        return 1 / sum(self.rates.values())
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the coefficients as quantities without errors, and the settings in SI."""
+        losses = self.losses
+        names = (*losses._fields, "a", "b", "lifetime_mean")
+        values = (*losses, losses.a, losses.b, self.lifetime)
+        units = (*losses.units, "1/(mA s)", "1/s", "h")
+        pressure = {
+            "pressure_base_Pa": float(self.operation.pressure_base),
+            "pressure_slope_Pa_per_mA": float(self.operation.pressure_slope),
+        }
+        rows = zip(names, values, units, strict=True)
+        rows = {name: Quantity(value, None, unit) for name, value, unit in rows}
+        return json_of(rows | {"operation": settings_json(self.operation) | pressure})
+
+
+def settings_json(operation: Operation) -> dict[str, float]:
+    """The settings of an operation, with their units."""
+    return {
+        "rf_voltage_V": float(operation.rf_voltage),
+        "scraper_y_m": float(operation.scraper_y),
+        "bunches": float(operation.bunches),
+    }
+
+
+def operation_during(record: DecayRecord, machine: Machine) -> Operation:
+    """Settings and vacuum during a record: its own where it gives them, else the machine's.
+
+    Parameters
+    ----------
+    record : DecayRecord
+        One decay.
+    machine : Machine
+        The ring and its usual operation.
+
+    Returns
+    -------
+    Operation
+        With medians over the record. A pressure reading scales the machine's base pressure and
+        its rise with current by one factor: a single decay spans too little current to tell the
+        two apart. One that does not follow the current enters the fit as it is, and stands here
+        by its mean.
+
+    Raises
+    ------
+    InputError
+        If the record's RF voltage stores no beam, or its scraper, bunches or pressure are zero.
+
+    Examples
+    --------
+    >>> from beamfit.io.ring import read_operation, read_ring
+    >>> from beamfit.lifetime.record import Conditions
+    >>> path = "lattices/spear3_2003.toml"
+    >>> scan = Conditions(rf_voltage=[2.4e6, 2.4e6])
+    >>> record = DecayRecord([0, 60], [100, 99.9], conditions=scan)
+    >>> operation_during(record, Machine(read_ring(path), read_operation(path))).rf_voltage
+    2400000.0
+    """
+    usual = machine.operation
+    said = {name: float(np.median(values)) for name, values in record.conditions.given.items()}
+    for name, value in said.items():
+        if not value > 0:
+            raise InputError(f"{name} {value:g}", "above zero", path=record.name, column=name)
+    if "rf_voltage" in said:
+        usual = usual._replace(rf_voltage=said["rf_voltage"])
+        expected = unstored(usual, machine.ring.energy_loss, machine.ring.energy)
+        if expected is not None:
+            found = f"{said['rf_voltage'] / 1e3:.6g} kV"
+            raise InputError(found, expected, path=record.name, column="rf_voltage_kV")
+    if "bunch_length" in said:
+        length = np.array([said.pop("bunch_length")])
+        said["bunch_length"] = MeasuredLength(np.zeros(1), length, 0.0, usual.rf_voltage)
+    if "pressure" in said:
+        read = said.pop("pressure")
+        if record.gauge is not None:
+            # The fit has the gauge's own course: b is the gas at its mean, and a is without gas.
+            mean = record.integral(record.conditions.pressure)[-1] / record.span
+            return usual._replace(**said, pressure_base=mean, pressure_slope=0.0)
+        mean = usual.pressure_base + usual.pressure_slope * float(record.current.mean())
+        if not mean > 0:
+            usual, mean = usual._replace(pressure_base=1.0, pressure_slope=0.0), 1.0
+        said["pressure_base"] = usual.pressure_base * read / mean
+        said["pressure_slope"] = usual.pressure_slope * read / mean
+    return usual._replace(**said)
+
+
+def budget(record: DecayRecord, machine: Machine) -> Budget:
+    """Compute the losses during a record from first principles.
+
+    Parameters
+    ----------
+    record : DecayRecord
+        One decay.
+    machine : Machine
+        The ring and its usual operation.
+
+    Returns
+    -------
+    Budget
+        At the record's mean current.
+
+    Raises
+    ------
+    InputError
+        As for `operation_during`.
+
+    Examples
+    --------
+    >>> from beamfit.io.ring import read_operation, read_ring
+    >>> path = "lattices/spear3_2003.toml"
+    >>> machine = Machine(read_ring(path), read_operation(path))
+    >>> found = budget(DecayRecord([0, 60], [500.0, 499.9]), machine)
+    >>> print(f"{found.lifetime:.1f} h, Touschek alone {1 / found.rates['Touschek']:.1f} h")
+    18.4 h, Touschek alone 30.4 h
+    """
+    operation = operation_during(record, machine)
+    current = float(record.current.mean())
+    losses = loss_coefficients(machine.ring, operation, current)
+    ring, parts = machine.ring, Losses(*(float(part) for part in losses))
+    length = float(stored_bunch(ring, operation, current).length)
+    emittances = float(ring.emittance_x), float(ring.emittance_y)
+    return Budget(operation, parts, current, length, emittances)
+
+
+def stands_alone(cycle: DecayRecord, fit: DecayFit) -> bool:
+    """Whether a cycle by itself would tell a from b, by the bend of its decay and the noise that
+    all cycles show; where one law does not hold for all, that of its neighbouring readings.
+    """
+    noise = fit.rms_residual * fit.inflation
+    if fit.status is Status.poor_fit:
+        noise = min(noise, OWN * noise_of(cycle.time, cycle.current))
+    loss = cycle.span / HOUR / fit.lifetime_mean.value
+    bend = float(cycle.current.mean()) * loss**2 * BEND / 2 * math.sqrt(len(cycle))
+    return noise * math.sqrt(max(len(cycle) / MOST, 1.0)) < SEPARABLE * bend
+
+
+def seen_through(fit: DecayFit, usual: float, interval: float) -> DecayFit:
+    """A fit to cycles that were found, without errors where refills may have been missed: then the
+    beam seems to live longer than it does. `usual` is how many readings
+    a cycle has, one each `interval`.
+
+    The refill that holds the current gives back what a cycle loses. It is told from the noise by
+    the means of half a cycle before and after.
+    """
+    lifetime = fit.lifetime_mean.value * HOUR
+    if lifetime > 0 and unresolved(usual, interval, lifetime) > UNSURE:
+        cause = (
+            "The beam is held by refills that the record may not resolve: of those that were found "
+            f"the next comes after {usual:.3g} readings, but faster ones look the same when read "
+            f"every {interval:.3g} s. Record more readings from refill to refill. "
+        )
+        return _opened(fit, cause)
+    record, memory = fit.readings, fit.identifiability.residual_correlation
+    half = max(len(record) / fit.first.size / 2, 1.0)
+    mean = (1 + memory) / (1 - memory) / half if memory else 1 / half
+    least = SEEN * fit.rms_residual * math.sqrt(2 * min(mean, 1.0))
+    lasts = 2 * half * float(np.median(np.diff(record.time)))
+    lifetime = fit.lifetime_mean.value
+    lost = fit.mean_current * lasts / (lifetime * HOUR)
+    if lost >= least or not lifetime > 0:  # that of a current that rises is nan
+        return fit
+    cause = (
+        f"A cycle of the {fit.first.size} that were found loses {lost:.2g} mA, and refills below "
+        f"{least:.2g} mA can be missed in this noise: the beam then seems to live longer than it "
+        f"does. Average readings, or give the times of the refills by cutting the record there. "
+    )
+    return _opened(fit, cause)
+
+
+def _opened(fit: DecayFit, cause: str) -> DecayFit:
+    bare = {name: quantity.open() for name, quantity in fit.quantities.items()}
+    return replace(fit, status=Status.unidentified, message=cause + fit.message, exact=bare, **bare)
+
+
+def cycle_lifetimes(fit: DecayFit) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Time, s, lifetime and its error, h, of up to 60 parts of a pooled fit; for a picture.
+
+    The slope of the residuals of its cycles is what the loss rate of a part departs by.
+    """
+    record, first = fit.readings, fit.first
+    lengths = np.diff(first, append=len(record))
+    columns = np.column_stack([record.time, fit.residuals])
+    mean = np.add.reduceat(columns, first) / lengths[:, None]
+    since, residual = (columns - np.repeat(mean, lengths, axis=0)).T
+    part = first[np.linspace(0, first.size, min(first.size, POINTS), endpoint=False).astype(int)]
+    count = np.diff(part, append=len(record))
+    at, level = (np.add.reduceat(v, part) / count for v in (record.time, record.current))
+    squares = np.add.reduceat(since**2, part)
+    rate = np.add.reduceat(since * residual, part) / squares / level
+    rate += fit.a.value * level + fit.b.value
+    error = fit.rms_residual / np.sqrt(squares) / level
+    seen = rate > 0
+    return at[seen], 1 / rate[seen] / HOUR, (error / rate**2)[seen] / HOUR
+
+
+@dataclass(frozen=True, eq=False)
+class Decay:
+    """One decay of a record, or many cycles of it together.
+
+    Parameters
+    ----------
+    segment : DecayRecord
+        Its readings.
+    offset : float
+        Its first reading's time in the record, s.
+    fit : DecayFit
+        I0, a, b, lifetimes and verdict.
+    budget : Budget or None
+        Losses from first principles, where a ring was given.
+    """
+
+    segment: DecayRecord
+    offset: float
+    fit: DecayFit
+    budget: Budget | None
+
+    @classmethod
+    def of(
+        cls, segment: DecayRecord, offset: float, fit: DecayFit, machine: Machine | None
+    ) -> Decay:
+        """With the losses of a ring, if there is one."""
+        return cls(segment, offset, fit, None if machine is None else budget(segment, machine))
+
+    @cached_property
+    def checks(self) -> DecayChecks | None:
+        """What simpler analyses say of it, and whether a is constant; None if nothing decays, and
+        for many cycles.
+        """
+        return check_decay(self.segment, self.fit) if self.fit.first is None else None
+
+    @cached_property
+    def systematics(self) -> tuple[Systematic, ...]:
+        """What no residual shows."""
+        return systematics(self.fit)
+
+    def to_json(self) -> dict[str, Any]:
+        """Give one entry of the ``results`` list of the JSON contract."""
+        more = {"start": bare(self.offset, "s")} | (vars(self.checks) if self.checks else {})
+        more["systematics"] = self.systematics
+        more |= {"notes": self.segment.notes} if self.segment.notes else {}
+        more |= {} if self.budget is None else {"budget": self.budget}
+        return self.fit.to_json() | json_of(more)
+
+
+@shown
+@dataclass(frozen=True, eq=False)
+class RecordStudy:
+    """A record with its decays and what lies between them.
+
+    Parameters
+    ----------
+    record : DecayRecord
+        The whole record.
+    decays : tuple of Decay
+        In order of time; of many cycles those that tell a from b by themselves.
+    events : tuple of Event
+        Refills, losses, dropouts and what else was cut away.
+    pooled : tuple of Decay
+        Cycles at the same settings fitted together, as of top-up.
+    """
+
+    record: DecayRecord
+    decays: tuple[Decay, ...]
+    events: tuple[Event, ...]
+    pooled: tuple[Decay, ...] = ()
+
+    @property
+    def answers(self) -> tuple[Decay, ...]:
+        """What is quoted of the record: cycles together, then single decays; at least one."""
+        return self.pooled + self.decays
+
+
+def _steps(record: DecayRecord) -> dict[str, np.ndarray]:
+    """After which readings somebody changed each setting."""
+    given = {name: v for name, v in record.conditions.given.items() if name in SETTINGS}
+    return {n: np.abs(np.diff(v)) > CHANGED * np.maximum(v[1:], v[:-1]) for n, v in given.items()}
+
+
+def at_settings(segment: DecayRecord) -> list[DecayRecord]:
+    """Cut where somebody changed a setting."""
+    moved = np.any(list(_steps(segment).values()), axis=0)
+    pieces = np.split(np.arange(len(segment)), np.flatnonzero(moved) + 1)
+    return [segment.select(rows) for rows in pieces if len(rows) >= SHORTEST]
+
+
+def _pooled(
+    cycles: Sequence[DecayRecord], name: str, machine: Machine | None, law: Law
+) -> tuple[list[Decay], list[DecayRecord]]:
+    """Cycles at the same settings together, and those of them that also stand alone."""
+    groups, pooled, alone = alike(cycles), [], []
+    many = sum(len(group) >= FEWEST_CYCLES for group in groups)
+    for group in groups:
+        if len(group) < FEWEST_CYCLES:
+            alone += [cycle for cycle in group if len(cycle) >= SHORTEST]
+            continue
+        called = name if many == 1 else f"{name}@{len(pooled) + 1}"
+        fit = seen_through(fit_cycles(group, called, law), *usual_cycle(group))
+        segment = joined(group, called)
+        pooled.append(Decay.of(segment, segment.start, fit, machine))
+        alone += [c for c in group if len(c) >= SHORTEST and stands_alone(c, fit)]
+    return pooled, alone
+
+
+def _refilled(record: DecayRecord) -> Split:
+    """The cycles of what is held by refills in a record, of all its settings, and the decays of
+    the rest; no cycle if nothing is.
+    """
+    sections = at_settings(record)
+    found = [cut_at_refills(section) for section in sections]
+    if not any(map(is_refilled, found)):
+        return Split((), ())
+    placed = [
+        event._replace(time=event.time + part.start)
+        for split, part in zip(found, sections, strict=True)
+        for event in split.events
+    ]
+    return Split(tuple(c for split in found for c in split.segments), tuple(placed))
+
+
+def _decays(record: DecayRecord) -> tuple[list[DecayRecord], tuple[Event, ...]]:
+    """Clean decays at constant settings, and the events."""
+    if len(record) < SHORTEST:
+        return [record], ()
+    split = split_record(record)
+    pieces = [piece for segment in split.segments for piece in at_settings(segment)]
+    if not pieces:
+        moving = [name for name, steps in _steps(record).items() if steps.any()]
+        changes = f"changes of {', '.join(moving)} by more than {100 * CHANGED:g} %"
+        kinds = ", ".join(sorted({event.kind for event in split.events})) or changes
+        expected = f"at least {SHORTEST} readings in a row of a stored beam"
+        expected += "; leave out a setting that only scatters with --ignore" if moving else ""
+        raise InputError(f"no decay between {kinds}", expected, record.name, column="current")
+    return pieces, split.events
+
+
+def study_record(
+    record: DecayRecord, machine: Machine | None = None, law: Law | str = Law.free
+) -> RecordStudy:
+    """Cut a record into decays, fit each, and say what first principles expect.
+
+    Parameters
+    ----------
+    record : DecayRecord
+        Any record: one decay, fills with refills between them, or top-up. It is also cut where
+        RF voltage, scraper or bunches change by more than 1 %.
+    machine : Machine, optional
+        Ring and usual operation, for the loss budget; with them a and b are constant.
+    law : {"free", "constant"}
+        As for `fit_decay`.
+
+    Returns
+    -------
+    RecordStudy
+        At least one decay. Pieces between events in which the current rises (a slow refill) are
+        listed as events.
+
+    Raises
+    ------
+    InputError
+        If the record has fewer than five readings, holds no decay, or only rises; and as for
+        `budget`.
+
+    Examples
+    --------
+    >>> t = np.arange(0.0, 4000.0, 10.0)
+    >>> saw = 100 * np.exp(-(t % 2000) / 36000)
+    >>> study = study_record(DecayRecord(t, saw))
+    >>> [f"{decay.fit.lifetime_mean.value:.3f} h" for decay in study.decays]
+    ['10.000 h', '10.000 h']
+    """
+    expect(record, DecayRecord, "beamfit.read_decay_record(path)")
+    record, law = without_repeats(record), Law(law) if machine is None else Law.constant
+    # Segments move `start` with them: counted from zero it is their place in the record.
+    placed = replace(record, start=0.0)
+    cycles, events = _refilled(placed)
+    pooled, pieces = _pooled(cycles, record.name, machine, law)
+    if not pooled:
+        pieces, events = _decays(placed)
+    if len(pieces) > 1:
+        ordered = sorted(pieces, key=lambda piece: piece.start)
+        pieces = [replace(piece, name=f"{record.name}#{k}") for k, piece in enumerate(ordered, 1)]
+    decays, rising = [], []
+    for piece in pieces:
+        offset = piece.start
+        start = None if record.start is None else record.start + offset
+        segment = thinned(on_edges(replace(piece, start=start)))
+        try:
+            fit = fit_decay(segment, law=law)
+        except InputError:
+            # A record that does nothing but rise is an error; a slow refill within one is not.
+            if len(pieces) == 1 and not pooled:
+                raise
+            change = float(segment.current[-1] - segment.current[0])
+            rising.append(Event("slow refill", offset, segment.span, change))
+            continue
+        decays.append(Decay.of(segment, offset, fit, machine))
+    if not decays and not pooled:
+        expected = "a decay between refills"
+        raise InputError("a current that rises", expected, path=record.name, column="current")
+    shown = thinned(record)
+    shown = replace(shown, notes=record.notes) if pooled else shown
+    return RecordStudy(
+        shown, tuple(decays), tuple(sorted((*events, *rising), key=lambda event: event.time)),
+        tuple(pooled),
+    )  # fmt: skip

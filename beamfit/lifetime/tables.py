@@ -1,0 +1,378 @@
+"""Decays and their loss budgets as rows of text: the one list that terminal and report show."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable, Sequence
+
+from beamfit.lifetime.fit import DecayFit
+from beamfit.lifetime.mechanisms import LINEAR, QUADRATIC, Mechanism
+from beamfit.lifetime.pieces import Event
+from beamfit.lifetime.ring import Operation
+from beamfit.lifetime.ring_study import Shift
+from beamfit.lifetime.scales import VOLTAGE
+from beamfit.lifetime.study import Decay, RecordStudy
+from beamfit.quantity import Quantity, Status
+from beamfit.table import cell
+
+# Label and values, as `beamfit.table.labelled` takes them.
+Rows = list[tuple[str, list[object]]]
+Row = tuple[str, Callable[[Decay], object]]
+MOST_EVENTS = 100
+# How many decays have every number shown; of more only the main ones, a row each.
+FEW = 4
+SHORT = {
+    "Result": ("status", "current at the start", "lifetime at the mean current"),
+    "a and b": ("a", "b", "chi2/dof"),
+    "Losses from first principles": (
+        "RF voltage",
+        "scraper",
+        "bunches",
+        "lifetime at the mean, computed",
+        "lifetime at the mean, measured",
+    ),
+}
+# Percent of the loss below which a mechanism's digits say nothing.
+NEGLIGIBLE = 1e-6
+
+
+def _laid_out(decays: Sequence[Decay], rows: Sequence[Row]) -> Rows:
+    return [(label, [value(decay) for decay in decays]) for label, value in rows]
+
+
+def _span(seconds: float) -> str:
+    if seconds >= 3600:
+        return f"{seconds / 3600:.3g} h"
+    return f"{seconds / 60:.3g} min" if seconds >= 60 else f"{seconds:.3g} s"
+
+
+def _chi2(decay: Decay) -> str:
+    fit = decay.fit
+    if fit.noise_inferred:
+        return f"not testable ({fit.dof} dof)"
+    return f"{fit.chi2:.4g}/{fit.dof} = {fit.chi2 / fit.dof:.3g}"
+
+
+def _noise(decay: Decay) -> str:
+    return "inferred from the residuals" if decay.fit.noise_inferred else "as given"
+
+
+def _interval(found: Quantity) -> str | None:
+    if found.interval_95 is None:
+        return None
+    low, high = found.interval_95
+    return f"{low:.4g} to {high:.4g} {found.unit}"
+
+
+RESULT: tuple[Row, ...] = (
+    ("status", lambda d: d.fit.status),
+    ("readings", lambda d: f"{len(d.segment)} over {_span(d.segment.span)}"),
+    ("current at the start", lambda d: d.fit.i0),
+    ("lifetime at the start", lambda d: d.fit.lifetime_start),
+    ("lifetime at the mean current", lambda d: d.fit.lifetime_mean),
+    ("lifetime at the end", lambda d: d.fit.lifetime_end),
+    ("a", lambda d: d.fit.a),
+    ("b", lambda d: d.fit.b),
+    ("95 % interval of a", lambda d: _interval(d.fit.a)),
+    ("95 % interval of b", lambda d: _interval(d.fit.b)),
+    ("chi2/dof", _chi2),
+    ("rms residual", lambda d: f"{d.fit.rms_residual:.3g} mA"),
+    ("errors", _noise),
+)
+
+
+EXACT: tuple[Row, ...] = (
+    ("a if a and b are constant", lambda d: d.fit.if_constant("a")),
+    ("b if a and b are constant", lambda d: d.fit.if_constant("b")),
+)
+CYCLES: tuple[Row, ...] = (
+    ("status", lambda d: d.fit.status),
+    ("cycles", lambda d: f"{d.fit.first.size} at {d.fit.mean_current:.5g} mA"),
+    ("readings", lambda d: f"{len(d.segment)} over {_span(d.segment.span)}"),
+    ("lifetime at the mean current", lambda d: d.fit.lifetime_mean),
+    ("lifetime at the highest current", lambda d: d.fit.lifetime_start),
+    ("lifetime at the lowest current", lambda d: d.fit.lifetime_end),
+    *RESULT[6:10],
+    *RESULT[-3:],
+)
+
+
+def decay_rows(decays: Sequence[Decay]) -> Rows:
+    """Label and one cell per decay, for every number a fit has."""
+    together = all(decay.fit.first is not None for decay in decays)
+    free = any(decay.fit.free_law for decay in decays)
+    rows = CYCLES if together else (*RESULT[:-3], *EXACT * free, *RESULT[-3:])
+    return _laid_out(decays, rows)
+
+
+# Rows of `decay_rows` that stand in the sentence, or say how the answer was had.
+SECOND = ("status", "readings", "rms residual", "errors")
+
+
+def quoted_rows(decays: Sequence[Decay]) -> Rows:
+    """The rows of `decay_rows` that people quote."""
+    return [row for row in decay_rows(decays) if row[0] not in SECOND]
+
+
+def _number(value: float | None, form: str, unit: str = "") -> str:
+    return "-" if value is None else f"{value:{form}}{unit}"
+
+
+def _share(decay: Decay) -> Quantity | None:
+    found = decay.fit.identifiability
+    return None if found.share is None else Quantity(found.share, found.share_error, "1")
+
+
+APART: tuple[Row, ...] = (
+    ("a and b", lambda d: "separable" if d.fit.identifiability.separable else "not separable"),
+    ("share of a in the loss", _share),
+    ("correlation of a and b", lambda d: _number(d.fit.identifiability.correlation, ".6f")),
+    (
+        "neighbouring residuals",
+        lambda d: _number(d.fit.identifiability.residual_correlation, ".2f"),
+    ),
+    (
+        "errors enlarged for that",
+        lambda d: _number(d.fit.identifiability.error_inflation, ".1f", " times"),
+    ),
+)
+
+
+def separability_rows(decays: Sequence[Decay]) -> Rows:
+    """Label and one cell per decay for what the record tells of a and b apart."""
+    return _laid_out(decays, APART)
+
+
+def _one_lifetime(decay: Decay, name: str) -> str | None:
+    found = getattr(decay.checks, name, None)
+    if found is None:
+        return None
+    known = math.isfinite(found.bias_start)
+    bias = f"{100 * found.bias_start:+.2g} % at start, " if known else ""
+    return f"{found.lifetime} ({bias}{found.rms_residual:.3g} mA rms)"
+
+
+def _constant_a(decay: Decay) -> str | None:
+    found = decay.fit.constant_a
+    if found is None:
+        return None
+    said = {Status.converged: "not contradicted", Status.poor_fit: "rejected"}
+    chance = f" (p = {found.p_value:.2g})"
+    return said[found.status] + chance if found.status in said else "the record cannot tell"
+
+
+CHECKS: tuple[Row, ...] = (
+    ("single exponential", lambda d: _one_lifetime(d, "single_exponential")),
+    ("line through ln I", lambda d: _one_lifetime(d, "log_linear")),
+    ("constant a", _constant_a),
+)
+LIFETIMES: tuple[Row, ...] = (
+    ("lifetime by current", lambda d: d.fit.lifetimes and str(d.fit.lifetimes)),
+)
+OUTGASSING: tuple[Row, ...] = (
+    ("gas loss relaxes within", lambda d: d.fit.outgassing.time_constant),
+    ("lifetime at first", lambda d: d.fit.outgassing.before),
+    ("without that gas", lambda d: d.fit.outgassing.after),
+    ("a beside it", lambda d: d.fit.outgassing.a),
+    ("b in the end", lambda d: d.fit.outgassing.b),
+)
+SYSTEMATIC = ["if the", "a", "b", "lifetime at the mean"]
+
+
+def check_rows(decays: Sequence[Decay]) -> Rows:
+    """Label and one cell per decay for what simpler analyses say, and whether a is constant."""
+    rows = CHECKS if any(decay.checks for decay in decays) else CHECKS[-1:]
+    rows += LIFETIMES if any(decay.fit.lifetimes for decay in decays) else ()
+    rows += OUTGASSING if all(decay.fit.outgassing for decay in decays) else ()
+    return _laid_out(decays, rows)
+
+
+def systematic_rows(decay: Decay) -> list[list[str]]:
+    """A cause in each row, and by how much it moves a, b and the lifetime at the mean current."""
+    fit = decay.fit
+    values = fit.a.value, fit.b.value, fit.lifetime_mean.value
+    return [
+        [cause, *(_percent(moved / value) for moved, value in zip(by, values, strict=True))]
+        for cause, *by in decay.systematics
+    ]
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:+.0f} %" if abs(share) > 1 - 1e-9 else f"{100 * share:+.2g} %"
+
+
+def _part(kind: str, mechanism: Mechanism) -> Row:
+    """A mechanism's part of a or b, with its share of the loss at the mean current."""
+    name, unit = f"{kind}_{mechanism.name}", {"a": "1/(mA s)", "b": "1/s"}[kind]
+
+    def shown(decay: Decay) -> str:
+        budget = decay.budget
+        value = float(getattr(budget.losses, name))
+        rate = value * {"a": budget.current, "b": 1.0}[kind]
+        share = 100 * rate * 3600 * budget.lifetime
+        if share < NEGLIGIBLE:
+            return "negligible"
+        return f"{value:.4g} {unit} ({share:.3g} % of the loss)"
+
+    return f"{kind}, {mechanism.label}", shown
+
+
+def _emittances(decay: Decay) -> str:
+    x, y = (f"{1e9 * value:.4g}" for value in decay.budget.emittances)
+    return f"{x} and {y} nm"
+
+
+def _pressure(decay: Decay) -> str:
+    operation, current = decay.budget.operation, decay.budget.current
+    return f"{float(operation.pressure_base + operation.pressure_slope * current):.3g} Pa"
+
+
+BUDGET: tuple[Row, ...] = (
+    ("RF voltage", lambda d: f"{float(d.budget.operation.rf_voltage) / 1e3:.6g} kV"),
+    ("scraper", lambda d: f"{float(d.budget.operation.scraper_y) * 1e3:.4g} mm"),
+    ("bunches", lambda d: f"{float(d.budget.operation.bunches):.6g}"),
+    ("emittances, as given: no intrabeam scattering", _emittances),
+    ("rms bunch length", lambda d: f"{1e3 * d.budget.bunch_length:.4g} mm"),
+    ("pressure at the mean current", _pressure),
+    *(_part("a", mechanism) for mechanism in QUADRATIC),
+    ("a, sum", lambda d: f"{d.budget.losses.a:.4g} 1/(mA s)"),
+    ("a, measured", lambda d: d.fit.a),
+    *(_part("b", mechanism) for mechanism in LINEAR),
+    ("b, sum", lambda d: f"{d.budget.losses.b:.4g} 1/s"),
+    ("b, measured", lambda d: d.fit.b),
+    ("lifetime at the mean, computed", lambda d: f"{d.budget.lifetime:.4g} h"),
+    ("lifetime at the mean, measured", lambda d: d.fit.lifetime_mean),
+)
+
+
+def budget_rows(decays: Sequence[Decay]) -> Rows:
+    """Label and one cell per decay: first principles beside the measured; empty without a ring."""
+    known = decays and all(decay.budget is not None for decay in decays)
+    return _laid_out(decays, BUDGET) if known else []
+
+
+def overview(decays: Sequence[Decay]) -> list[tuple[str, list[str], list[list[str]]]]:
+    """The main numbers of many decays, one row each.
+
+    Parameters
+    ----------
+    decays : sequence of Decay
+        More than `FEW`.
+
+    Returns
+    -------
+    list of (str, list of str, list of list of str)
+        Title, header and rows of each table.
+    """
+    every = dict(decay_rows(decays)) | dict(budget_rows(decays))
+    every["chi2/dof"] = [
+        "not testable" if d.fit.noise_inferred else f"{d.fit.chi2 / d.fit.dof:.3g}" for d in decays
+    ]
+    names = [decay.fit.record for decay in decays]
+    tables = []
+    for title, wanted in SHORT.items():
+        labels = [label for label in wanted if label in every]
+        if labels:
+            header = ["decay", *(label.removeprefix("lifetime at the mean, ") for label in labels)]
+            columns = [map(cell, every[label]) for label in labels]
+            tables.append((title, header, [list(r) for r in zip(names, *columns, strict=True)]))
+    return tables
+
+
+def alike(decays: Sequence[Decay]) -> list[tuple[Status, str, str]]:
+    """Status, decays and message for each different verdict on many decays; where all is well and
+    only numbers differ, those of the first.
+    """
+    found: dict[tuple[Status, str], list[DecayFit]] = {}
+    for decay in decays:
+        fit = decay.fit
+        well = fit.status is Status.converged
+        words = re.sub(r"\d[\d.e+-]*", "#", fit.message) if well else fit.message
+        found.setdefault((fit.status, words), []).append(fit)
+    told = []
+    for (status, _), fits in found.items():
+        who, said = fits[0].record, fits[0].message
+        if len(fits) > 1:
+            who = f"{len(fits)} decays, {who} to {fits[-1].record}"
+        if len({fit.message for fit in fits}) > 1:
+            said = f"{said.rstrip('.')} (numbers are the first's)."
+        told.append((status, who, said))
+    return told
+
+
+def counted(events: Sequence[Event]) -> str:
+    """Events of each kind, how many and how large."""
+    said = []
+    for kind in dict.fromkeys(event.kind for event in events):
+        changes = [event.change for event in events if event.kind == kind]
+        low, high = min(changes), max(changes)
+        size = f"{low:+.3g} mA" if len(changes) == 1 else f"{low:+.3g} to {high:+.3g} mA"
+        said.append(f"{kind} {len(changes)} times ({size})")
+    return "; ".join(said)
+
+
+def event_rows(study: RecordStudy) -> list[list[str]]:
+    """Kind, time, duration and change of what was cut away; a long list is cut, and says so."""
+    rows = [
+        [event.kind, f"{event.time:.0f} s", f"{event.duration:.0f} s", f"{event.change:+.4g} mA"]
+        for event in study.events[:MOST_EVENTS]
+    ]
+    left = len(study.events) - len(rows)
+    return rows + ([[f"{left} more", "", "", ""]] if left else [])
+
+
+def _setting(operation: Operation) -> str:
+    voltage, scraper = float(operation.rf_voltage) / 1e3, 1e3 * float(operation.scraper_y)
+    return f"{voltage:.6g} kV, {scraper:.4g} mm, {float(operation.bunches):.6g} bunches"
+
+
+def shift_rows(shift: Shift) -> Rows:
+    """Label and one cell for each answer of a study of many decays."""
+    fit, best, at = shift.fit, shift.best, f"at {shift.current:.4g} mA"
+    rows: list[tuple[str, object]] = [("status", fit.status)]
+    for name, scale in fit.scales.items():
+        of, told = "scale on the ring file", "not separable"
+        if name == VOLTAGE:
+            of, told = "true over read", "not told: its prior's"
+        rows.append((f"{name}, {of}", told if scale.error is None else scale))
+    rows.append(("chi2/dof", f"{fit.chi2:.4g}/{fit.dof}" if fit.dof > 0 else "not testable"))
+    for row in shift.budget:
+        shown = f"{row.median:.4g} ({row.lower:.4g} to {row.upper:.4g}) {row.unit}"
+        rows.append((f"{row.name} {at}", shown if row.separable else "not determined"))
+    volts, error = best.rf_voltage.value / 1e3, best.rf_voltage.error
+    limit = f"{volts:.6g} kV, at its limit"
+    rows += [
+        ("best RF voltage", limit if error is None else Quantity(volts, error / 1e3, "kV")),
+        ("best scraper and bunches", f"{1e3 * best.scraper_y:.4g} mm, {best.bunches:.6g}"),
+        ("lifetime there", best.lifetime),
+        ("lifetime at the usual settings", best.usual),
+    ]
+    if shift.held_back:
+        off = [abs(one.pull) for one in shift.held_back]
+        within = [sum(pull < most for pull in off) for most in (1, 2)]
+        said = f"{within[0]} of {len(off)} within 1, {within[1]} within 2 errors"
+        rows.append(("each decay predicted by the others", said))
+    for number, proposal in enumerate(shift.proposals, 1):
+        asked = proposal.candidate
+        said = f"{asked.current:.4g} mA (information {proposal.information:.3g})"
+        rows.append((f"next decay, choice {number}", f"{_setting(asked.operation)}, {said}"))
+    return [(label, [value]) for label, value in rows]
+
+
+def network_rows(shift: Shift) -> Rows:
+    """Label and one cell for what a network of the losses says, and what it obeys."""
+    network, at = shift.network, f"at the usual settings, {shift.current:.4g} mA"
+    a, b, lifetime = network.predict(network.usual, shift.current)
+    held, wrong = network.certificate, network.discrepancy.size
+    rows = [
+        ("status", network.fit.status),
+        ("chi2/dof", f"{network.fit.chi2:.4g}/{network.fit.dof}"),
+        ("what it may be wrong by, a and b", " and ".join(f"{100 * size:.2g} %" for size in wrong)),
+        (f"a {at}", a),
+        (f"b {at}", b),
+        (f"lifetime {at}", lifetime),
+        ("falls with scraper and bunches, rises with pressure", held.holds),
+        ("single maximum of the lifetime in the RF voltage", held.single_maximum),
+    ]
+    return [(label, [value]) for label, value in rows]

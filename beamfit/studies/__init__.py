@@ -1,1 +1,0 @@
-"""Studies: emittance, lifetime, dynamics."""

@@ -1,1 +1,0 @@
-"""From a record of beam current to lifetimes and loss mechanisms."""

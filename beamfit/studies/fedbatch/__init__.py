@@ -1,1 +1,0 @@
-"""Fed-batch processes: mass balances whose rates are networks (report 3.5)."""

@@ -1,1 +1,0 @@
-"""Responses of a process to its inputs, identified from records of runs."""

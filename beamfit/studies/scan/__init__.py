@@ -1,1 +1,0 @@
-"""From a scan of sizes to an emittance, and what to set or measure next."""

@@ -1,0 +1,260 @@
+"""Top-up and repeated fills: one a and one b from many cycles."""
+
+import numpy as np
+import pytest
+from scipy.optimize import least_squares
+from scipy.signal import lfilter
+
+from beamfit.errors import InputError
+from beamfit.greybox.memory import memory_of
+from beamfit.lifetime.cycles import find_cycles, is_refilled
+from beamfit.lifetime.fit import fit_cycles
+from beamfit.lifetime.pieces import thinned
+from beamfit.lifetime.record import Conditions, DecayRecord
+from beamfit.lifetime.study import study_record
+from beamfit.noise.correlated import Levels
+
+LIFETIME = 10.01 * 3600
+
+
+def law(since, start, a, b):
+    """Equation 44, by its own words."""
+    return start * np.exp(-b * since) / (1 + a / b * start * -np.expm1(-b * since))
+
+
+def top_up(noise, seed, *, cycle=180.0, step=10.0, hours=10.0, memory=0.0, a=3.3e-8, change=0.0):
+    """A record held at 500 mA, in cycles; `change` is that of b over the record."""
+    rng = np.random.default_rng(seed)
+    time = np.arange(0.0, hours * 3600, step)
+    number = (time // cycle).astype(int)
+    start = (500 * (1 + 5e-4 * rng.normal(size=number[-1] + 1)))[number]
+    b = (1 / LIFETIME - a * 500) * (1 + change * number / number[-1])
+    error = lfilter([np.sqrt(1 - memory**2)], [1, -memory], rng.normal(size=time.size))
+    return time, law(time - cycle * number, start, a, b) + noise * error, number
+
+
+def true_lifetime(current, a=3.3e-8):
+    return 1 / (a * (current - 500) + 1 / LIFETIME) / 3600
+
+
+def cut(time, current, number):
+    first = np.flatnonzero(np.diff(number)) + 1
+    return [
+        DecayRecord(t, i, start=float(t[0]))
+        for t, i in zip(np.split(time, first), np.split(current, first), strict=True)
+    ]
+
+
+@pytest.mark.parametrize("noise", [0.001, 0.01, 0.02, 0.05])
+def test_top_up_of_ten_hours_has_one_answer(noise):
+    time, current, number = top_up(noise, seed=1)
+    study = study_record(DecayRecord(time, current))
+    assert study.decays == ()
+    [pooled] = study.pooled
+    fit = pooled.fit
+    assert fit.first.size == number[-1] + 1
+    off = fit.lifetime_mean.value - true_lifetime(fit.mean_current)
+    assert abs(off) < 2 * fit.lifetime_mean.error < 0.02 * fit.lifetime_mean.value
+    assert "200 cycles" in fit.message
+
+
+@pytest.mark.parametrize(("step", "memory"), [(60.0, 0.0), (10.0, 0.0), (10.0, 0.6), (10.0, 0.95)])
+def test_errors_cover(step, memory):
+    pulls, held = [], []
+    for seed in range(30):
+        fit = fit_cycles(cut(*top_up(0.01, seed, step=step, memory=memory)))
+        truth = true_lifetime(fit.mean_current)
+        pulls.append(abs(fit.lifetime_mean.value - truth) / fit.lifetime_mean.error)
+        low, high = fit.lifetime_mean.interval_95
+        held.append(low < truth < high)
+    # 68 % and 95 % of 30, within three standard deviations; more would be errors too large.
+    assert 13 <= np.sum(np.array(pulls) < 1) <= 28
+    assert np.sum(held) >= 25
+
+
+def test_the_fit_is_that_of_all_numbers_at_once():
+    time, current, number = top_up(0.01, 3, hours=1.0, cycle=600.0)
+    fit = fit_cycles(cut(time, current, number))
+    since = time - 600 * number
+
+    def residuals(numbers):
+        return law(since, numbers[2:][number], numbers[0] * 1e-8, numbers[1] * 1e-5) - current
+
+    found = least_squares(residuals, [3.0, 1.0, *[500.0] * (number[-1] + 1)], x_scale="jac",
+                          xtol=1e-15, ftol=1e-15, gtol=1e-15)  # fmt: skip
+    covariance = np.linalg.inv(found.jac.T @ found.jac) * 2 * found.cost / fit.dof
+    a, b = found.x[:2] * [1e-8, 1e-5]
+    assert fit.dof == time.size - found.x.size
+    lifetime = 1 / (a * fit.mean_current + b) / 3600
+    assert fit.lifetime_mean.value == pytest.approx(lifetime, rel=1e-7)
+    rate = np.array([1e-8 * fit.mean_current, 1e-5])
+    error = np.sqrt(rate @ covariance[:2, :2] @ rate) * lifetime**2 * 3600
+    assert fit.lifetime_mean.error_raw == pytest.approx(error, rel=1e-3)
+    share = a * fit.mean_current * lifetime * 3600
+    found = fit.identifiability
+    assert found.share == pytest.approx(share, abs=0.01 * found.share_error)
+
+
+def test_levels_are_eliminated_as_if_they_were_numbers():
+    rng = np.random.default_rng(1)
+    time, first = np.cumsum(rng.uniform(0.5, 1.5, 40)), np.array([0, 5, 17, 30])
+    slope, rows = rng.uniform(0.5, 1.5, 40), rng.normal(size=(40, 2))
+    residuals = rng.normal(size=40).cumsum()
+    block = np.searchsorted(first, np.arange(40), side="right")[:, None] == np.arange(1, 5)
+    columns = np.column_stack([rows, block * slope[:, None]])
+    whole = memory_of(columns, residuals, time)
+    short = memory_of(rows, residuals, time, Levels(first, slope))
+    assert short.dof == whole.dof
+    # Levels have no white part beside the memory, and more times between the same ends.
+    ends = whole.weight[whole.white == 0][[0, -1]]
+    assert short.weight[-1] / short.weight[0] == pytest.approx(ends[1] / ends[0], rel=1e-9)
+    for k in (0, 9, 39):
+        one = memory_of(columns, residuals, time, known=float(short.time[k]))
+        np.testing.assert_allclose(short.step[k], one.step[0, :2], atol=1e-12)
+        found, expected = (half @ half.T for half in (short.half[k], one.half[0]))
+        np.testing.assert_allclose(found, expected[:2, :2], rtol=1e-8)
+
+
+def test_three_fills_of_eight_hours_have_one_a_and_one_b():
+    time, current, _ = top_up(0.005, 5, hours=24.0, cycle=8 * 3600.0, step=60.0)
+    study = study_record(DecayRecord(time, current))
+    [pooled] = study.pooled
+    assert len(study.decays) == 3
+    b = 1 / LIFETIME - 3.3e-8 * 500
+    for name, truth in {"a": 3.3e-8, "b": b}.items():
+        found = getattr(pooled.fit, name)
+        assert found.value == pytest.approx(truth, abs=2.5 * found.error)
+        assert found.error < 0.8 * min(getattr(d.fit, name).error for d in study.decays)
+    assert pooled.fit.status.value == "converged"
+    assert len(pooled.fit.lifetimes.lifetime) == 5
+
+
+@pytest.mark.parametrize(("noise", "step"), [(0.8, 2.0), (0.25, 10.0), (0.02, 60.0)])
+def test_steps_of_a_few_standard_deviations_are_found(noise, step):
+    time, current, number = top_up(noise, 2, step=step, hours=5.0)
+    split = find_cycles(DecayRecord(time, current))
+    assert is_refilled(split)
+    refills = [event for event in split.events if event.kind == "refill"]
+    assert len(refills) == number[-1]
+    assert len(split.events) == len(refills)
+    fit = fit_cycles(split.segments)
+    off = fit.lifetime_mean.value - true_lifetime(fit.mean_current)
+    assert abs(off) < 3 * fit.lifetime_mean.error
+
+
+def test_ramps_are_cut_and_fresh_beam_that_decays_fast_is_no_spike():
+    time, current, number = top_up(0.01, 4, step=2.0, hours=3.0)
+    since = time - 180 * number
+    ramp = np.where((since < 8) & (number > 0), -0.5 * (8 - since) / 2, 0.0)
+    fresh = 0.4 * np.exp(-np.maximum(since - 8, 0) / 2)
+    for disturbed in (current + ramp, current + fresh, current + ramp + fresh):
+        [pooled] = study_record(DecayRecord(time, disturbed)).pooled
+        fit = pooled.fit
+        assert fit.first.size == number[-1] + 1
+        off = fit.lifetime_mean.value - true_lifetime(fit.mean_current)
+        assert abs(off) < 3 * fit.lifetime_mean.error
+        assert fit.lifetime_mean.error < 0.02
+
+
+def test_readings_and_cycles_far_off_are_left_out_and_counted():
+    time, current, number = top_up(0.01, 4, hours=3.0)
+    current[[100, 501]] += 0.2
+    current[number == 20] -= 4e-3 * (time[number == 20] - time[number == 20][0])
+    fit = fit_cycles(cut(time, current, number))
+    assert "1 cycle was left out" in fit.message
+    assert "2 readings were left out" in fit.message
+    off = fit.lifetime_mean.value - true_lifetime(fit.mean_current)
+    assert abs(off) < 3 * fit.lifetime_mean.error
+
+
+def test_a_loss_rate_that_changes_is_no_one_answer():
+    fit = fit_cycles(cut(*top_up(0.01, 1, change=0.2)))
+    assert fit.status.value == "poor_fit"
+    assert "not the same in all cycles" in fit.message
+    assert fit_cycles(cut(*top_up(0.01, 1))).status.value == "unidentified"
+
+
+def test_a_that_depends_on_the_current_is_seen():
+    time = np.arange(0.0, 6 * 3600, 30.0)
+    rate = 1 / LIFETIME
+    # dI/dt = -rate I (I/500)^0.6: a goes as I^-0.4, by quadrature.
+    one = 500 * (1 + 0.6 * rate * time) ** (-1 / 0.6)
+    noise = 0.005 * np.random.default_rng(1).normal(size=(3, time.size))
+    cycles = [DecayRecord(time, one + row, start=3e4 * k) for k, row in enumerate(noise)]
+    fit = fit_cycles(cycles)
+    assert fit.status.value == "poor_fit"
+    assert "constant a is rejected" in fit.message
+    for current, lifetime in zip(fit.lifetimes.current, fit.lifetimes.lifetime, strict=True):
+        truth = (500 / current) ** 0.6 / rate / 3600
+        assert lifetime.value == pytest.approx(truth, rel=1e-3)
+
+
+def test_one_decay_is_no_cycles_whatever_its_noise():
+    time = np.linspace(0.0, 8 * 3600, 1000)
+    for seed, memory in enumerate([0.0, 0.5, 0.9, 0.97] * 3):
+        noise = lfilter([1], [1, -memory], np.random.default_rng(seed).normal(size=time.size))
+        current = 500 / (1 + time / 36000) + 10.0 ** (seed % 4 - 3) * noise
+        assert not is_refilled(find_cycles(DecayRecord(time, current)))
+        assert not is_refilled(find_cycles(DecayRecord(time, np.round(current, 1))))
+
+
+def test_cycles_at_two_settings_have_two_answers():
+    time, current, number = top_up(0.01, 6, hours=2.0)
+    voltage = Conditions(rf_voltage=np.where(number < 20, 2.0e6, 3.0e6))
+    study = study_record(DecayRecord(time, current, name="r", conditions=voltage))
+    assert [decay.fit.record for decay in study.pooled] == ["r@1", "r@2"]
+    assert [decay.fit.first.size for decay in study.pooled] == [20, 20]
+
+
+def test_very_many_readings_are_averaged_and_the_answer_stays():
+    rng = np.random.default_rng(1)
+    time = np.arange(200_000) * 0.1
+    current = law(time, 500.0, 3.3e-8, 1.1e-5) + 0.02 * rng.normal(size=time.size)
+    current[[7, 50_000]] = 900.0, 0.0
+    record = DecayRecord(time, current, np.full(time.size, 0.02), start=1e9)
+    few = thinned(record)
+    assert len(few) == 50_000
+    assert few.notes == ("The means of 4 readings each were fitted, of 200000 in all.",)
+    assert few.error[1] == pytest.approx(0.02 / np.sqrt(3))
+    assert few.error[0] == pytest.approx(0.01)
+    assert few.start == pytest.approx(1e9 + 0.15, abs=1e-6)
+    exact = law(few.start - 1e9 + few.time, 500.0, 3.3e-8, 1.1e-5)
+    pulls = (few.current - exact) / few.error
+    assert abs(pulls).max() < 6
+    assert np.mean(pulls**2) == pytest.approx(1, abs=0.05)
+    assert thinned(few) is few
+
+
+def test_too_few_are_refused():
+    cycles = cut(*top_up(0.01, 1, hours=0.1))
+    with pytest.raises(InputError, match="2 cycles"):
+        fit_cycles(cycles)
+    with pytest.raises(InputError, match="before the end"):
+        fit_cycles([*cycles, cycles[0]])
+    with pytest.raises(InputError, match="samples of many cycles"):
+        fit_cycles(cut(*top_up(0.01, 1, hours=0.5))).sample(seed=1)
+
+
+@pytest.mark.parametrize(("memory", "ratio"), [(0.8, 3.0), (0.9, 3.0), (0.8, 5.0), (0.0, 3.0)])
+def test_refills_that_may_be_missed_leave_no_lifetime_with_an_error(memory, ratio):
+    """Noise with a memory, as large as a third of a refill: missed ones make 10 h into 12 to 50."""
+    for seed in (1, 2, 3):
+        time, current, _ = top_up(2.5 / ratio, seed, step=2.0, hours=5.0, memory=memory)
+        for pooled in study_record(DecayRecord(time, current)).pooled:
+            found = pooled.fit.lifetime_mean
+            if memory == 0.0 or ratio == 5.0:
+                assert abs(found.value - 10.02) < 3 * found.error
+            else:
+                assert found.error is None
+                assert "refills below" in pooled.fit.message
+
+
+def test_long_fills_whose_losses_differ_follow_one_by_one():
+    """One law does not hold for all; the scatter about it is then not the noise of a fill."""
+    time = np.arange(0, 8 * 3600, 120.0)
+    fills = [law(time, 500.0, 2.5e-8, b) for b in (2e-6, 2e-6, 2e-6, 2.5e-6, 2.5e-6, 2.5e-6)]
+    beam = np.concatenate(fills)
+    noise = 3e-3 * np.random.default_rng(1).normal(size=beam.size)
+    study = study_record(DecayRecord(120.0 * np.arange(beam.size), beam + noise))
+    assert study.pooled[0].fit.status == "poor_fit"
+    assert [decay.fit.status for decay in study.decays] == ["converged"] * 6

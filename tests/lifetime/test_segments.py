@@ -1,0 +1,255 @@
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+
+from beamfit.errors import InputError
+from beamfit.lifetime.fit import fit_decays
+from beamfit.lifetime.pieces import noise_of, split_record
+from beamfit.lifetime.record import Conditions, DecayRecord
+from beamfit.lifetime.study import study_record
+
+
+def decay(time, i0=100.0, lifetime=36000.0, noise=1e-3, seed=1):
+    exact = i0 * np.exp(-time / lifetime)
+    return exact + noise * np.random.default_rng(seed).normal(size=time.size)
+
+
+TIME = np.arange(0.0, 6000.0, 10.0)
+
+
+def kinds(split):
+    return [event.kind for event in split.events]
+
+
+def test_a_clean_decay_is_left_alone():
+    split = split_record(DecayRecord(TIME, decay(TIME), name="clean"))
+    assert kinds(split) == []
+    assert [len(part) for part in split.segments] == [600]
+    assert split.segments[0].name == "clean"
+
+
+def test_no_false_alarm_in_noise_of_any_size():
+    for seed in range(40):
+        noise = 10.0 ** (seed % 5 - 4)
+        split = split_record(DecayRecord(TIME, decay(TIME, noise=noise, seed=seed)))
+        assert kinds(split) == []
+
+
+def test_top_up_is_cut_at_every_refill():
+    saw = decay(TIME % 500, noise=1e-3)
+    split = split_record(DecayRecord(TIME, saw, name="top-up"))
+    assert kinds(split) == ["refill"] * 11
+    assert [event.time for event in split.events] == [500.0 * k for k in range(1, 12)]
+    assert [len(part) for part in split.segments] == [50] * 12
+    assert split.segments[3].name == "top-up#4"
+    fits = fit_decays(split.segments)
+    assert all(
+        fit.lifetime_mean.value == pytest.approx(10, abs=4 * fit.lifetime_mean.error)
+        for fit in fits
+    )
+
+
+def test_a_loss_step_ends_a_decay():
+    current = decay(TIME)
+    current[300:] -= 0.5
+    split = split_record(DecayRecord(TIME, current))
+    assert kinds(split) == ["loss"]
+    assert split.events[0].time == 3000.0
+    assert split.events[0].change == pytest.approx(-0.53, abs=0.02)
+    assert [len(part) for part in split.segments] == [300, 300]
+    assert split.segments[1].time[0] == 0
+
+
+def test_dropouts_and_spikes_are_dropped_and_the_decay_goes_on():
+    current = decay(TIME)
+    current[100:140] = 0.0
+    current[400] += 3.0
+    split = split_record(DecayRecord(TIME, current))
+    assert kinds(split) == ["dropout", "spike"]
+    assert split.events[0].duration == pytest.approx(390.0)
+    assert [len(part) for part in split.segments] == [559]
+
+
+def test_a_beam_that_is_lost_does_not_come_back():
+    current = decay(TIME)
+    current[500:] = 0.0
+    split = split_record(DecayRecord(TIME, current))
+    assert kinds(split) == ["loss"]
+    assert split.events[0].change == pytest.approx(-87, abs=1)
+    assert [len(part) for part in split.segments] == [500]
+
+
+def test_a_decay_over_many_lifetimes_is_no_dropout():
+    time = np.arange(0.0, 6000.0, 10.0)
+    split = split_record(DecayRecord(time, np.abs(decay(time, lifetime=600.0, noise=1e-4))))
+    assert [len(part) for part in split.segments] == [600]
+
+
+def test_saturated_readings_are_dropped():
+    current = np.minimum(decay(TIME), 98.0)
+    split = split_record(DecayRecord(TIME, current))
+    assert kinds(split) == ["saturated"]
+    assert split.segments[0].current.max() < 98.0
+    assert len(split.segments[0]) == pytest.approx(527, abs=2)
+
+
+def test_quantised_readings_are_not_steps():
+    record = DecayRecord(TIME, np.round(decay(TIME), 1))
+    assert record.resolution == pytest.approx(0.1)
+    split = split_record(record)
+    assert kinds(split) == []
+    assert [len(part) for part in split.segments] == [600]
+
+
+@pytest.mark.parametrize("digits", [6, 2])
+def test_readings_that_are_held_are_those_of_a_slow_monitor(digits):
+    """Repeats lie half a step too high, and are no digits of the monitor."""
+    time = np.arange(0.0, 7200.0)
+    exact = 500 * np.exp(-time / 36000)
+    noise = 0.01 * np.random.default_rng(3).normal(size=time.size)
+    held = np.round(exact + noise, digits)[(time // 5 * 5).astype(int)]
+    study = study_record(DecayRecord(time, held, start=0.0))
+    assert len(study.record) == 1440
+    assert "5760 of 7200 readings repeat" in study.record.notes[0]
+    (fit,) = (decay.fit for decay in study.decays)
+    assert "quantised" not in fit.message or digits == 2
+    assert abs(fit.i0.value - 500) < 3 * fit.i0.error < 0.01
+    assert abs(fit.lifetime_mean.value - 10) < 3 * fit.lifetime_mean.error < 0.01
+
+
+def test_repeats_of_a_coarse_monitor_are_kept():
+    assert len(study_record(DecayRecord(TIME, np.round(decay(TIME), 1))).record) == TIME.size
+
+
+def test_a_gap_is_noted_and_a_refill_in_it_found():
+    kept = (TIME < 2000) | (TIME > 4000)
+    smooth = split_record(DecayRecord(TIME[kept], decay(TIME)[kept]))
+    assert kinds(smooth) == ["gap"]
+    assert [len(part) for part in smooth.segments] == [int(kept.sum())]
+    refilled = decay(TIME)[kept]
+    refilled[200:] += 10
+    cut = split_record(DecayRecord(TIME[kept], refilled))
+    assert sorted(kinds(cut)) == ["gap", "refill"]
+    assert [len(part) for part in cut.segments] == [200, int(kept.sum()) - 200]
+
+
+def test_pieces_too_short_to_fit_are_named():
+    current = decay(TIME)
+    current[590:] += 5
+    current[595:] += 5
+    split = split_record(DecayRecord(TIME, current))
+    assert kinds(split).count("short") == 2
+    assert [len(part) for part in split.segments] == [590]
+
+
+def test_the_noise_of_uneven_readings():
+    rng = np.random.default_rng(3)
+    time = np.sort(rng.uniform(0, 6000, 2000))
+    current = 100 * np.exp(-time / 36000) + 0.02 * rng.normal(size=2000)
+    assert noise_of(time, current) == pytest.approx(0.02, rel=0.1)
+
+
+@pytest.mark.parametrize(
+    ("time", "current", "column", "words"),
+    [
+        ([0, 1, 1, 2], [4, 3, 2, 1], "time", "reading 3: time 1 s after 1 s"),
+        ([0, 1, 2, 3], [4, 3, -2, 1], "current", "reading 3: a negative current, -2 mA"),
+        ([0, 1, 2, 3], [4, np.nan, 2, 1], "current", "reading 2: nan"),
+        ([0, 1, 2, 3, 4], [99, 98, 0.097, 0.096, 0.095], "current", "a factor of 1000"),
+    ],
+)
+def test_what_no_beam_can_do(time, current, column, words):
+    with pytest.raises(InputError, match=words) as caught:
+        DecayRecord(time, current)
+    assert caught.value.column == column
+
+
+def test_errors_and_conditions_are_checked():
+    with pytest.raises(InputError, match="reading 2: an error of 0 mA"):
+        DecayRecord([0, 1], [2, 1], [0.1, 0.0])
+    with pytest.raises(InputError, match="a negative pressure"):
+        DecayRecord([0, 1], [2, 1], conditions=Conditions(pressure=[1e-8, -1e-8]))
+    with pytest.raises(InputError, match=r"current of shape \(3,\); expected 2 readings"):
+        DecayRecord([0, 1], [3, 2, 1])
+    with pytest.raises(InputError, match="1 readings; expected two or more"):
+        DecayRecord([0], [3])
+
+
+def test_a_record_cannot_be_changed():
+    source = np.array([3.0, 2.0, 1.0])
+    record = DecayRecord([5, 6, 7], source, conditions=Conditions(bunches=[280, 280, 280]))
+    source[0] = 9.0
+    assert record.current[0] == 3.0
+    assert record.time.tolist() == [0.0, 1.0, 2.0]
+    with pytest.raises(ValueError, match="read-only"):
+        record.current[0] = 4.0
+    assert record.select([0, 2]).conditions.bunches.tolist() == [280.0, 280.0]
+
+
+def test_a_dead_first_reading_is_a_dropout_and_not_a_refill():
+    time = np.arange(0.0, 6000.0, 10.0)
+    noise = 5e-3 * np.random.default_rng(8).normal(size=time.size)
+    current = 200.0 / (1 + 1e-5 * time) + noise
+    dead = current.copy()
+    dead[:2] = 0.0
+    found = split_record(DecayRecord(time, dead))
+    assert [event.kind for event in found.events] == ["dropout"]
+    assert len(found.segments) == 1
+    np.testing.assert_array_equal(found.segments[0].current, current[2:])
+
+
+@pytest.mark.parametrize("kind", ["linear", "small", "smooth"])
+@pytest.mark.parametrize("noise", [0.002, 0.1])
+def test_a_ramp_of_injection_at_the_head_is_cut(kind, noise):
+    ramp = np.clip(TIME / 300, 0, 1)
+    lacking = {
+        "linear": 50 * (1 - ramp),
+        "small": 1 - ramp,
+        "smooth": 30 * np.exp(-TIME / 50),
+    }[kind]
+    split = split_record(DecayRecord(TIME, decay(TIME, lifetime=31 * 3600, noise=noise) - lacking))
+    assert kinds(split) == ["ramp"]
+    [found] = fit_decays(split.segments)
+    off = found.lifetime_mean.value - 31
+    assert abs(off) < 3 * found.lifetime_mean.error < 0.02 * 31
+    assert len(split.segments[0]) > 500
+
+
+def test_noise_with_a_memory_is_no_ramp():
+    for seed in range(40):
+        memory = (0.5, 0.9, 0.97, 0.99)[seed % 4]
+        fresh = np.random.default_rng(seed).normal(size=1600)
+        noise = lfilter([np.sqrt(1 - memory**2)], [1, -memory], fresh)[-600:]
+        split = split_record(DecayRecord(TIME, decay(TIME) + 10.0 ** -(seed % 3) * noise))
+        assert "ramp" not in kinds(split)
+
+
+def test_a_setting_that_only_scatters_is_named_with_its_remedy():
+    volts = 3.2e6 * (1 + 0.02 * np.random.default_rng(1).normal(size=TIME.size))
+    record = DecayRecord(TIME, decay(TIME), conditions=Conditions(rf_voltage=volts))
+    with pytest.raises(InputError, match=r"changes of rf_voltage by more than 1 %; .* --ignore"):
+        study_record(record)
+
+
+def test_a_current_that_rises_is_no_decay():
+    time = np.arange(500.0)
+    noise = 5e-3 * np.random.default_rng(1).normal(size=time.size)
+    study = study_record(DecayRecord(time, 100 + time / 100 + noise))
+    assert [decay.fit.status for decay in study.answers] == ["infeasible"]
+    assert "The current rises" in study.answers[0].fit.message
+
+
+def test_refills_of_many_readings_are_cut_and_drifts_are_not():
+    for ramp in (60.0, 300.0):  # s
+        phase = TIME % 2000
+        low = 100 * np.exp(-(2000 - ramp) / 36000)
+        fill = np.where(phase < ramp, low + (100 - low) * phase / ramp, decay(phase - ramp))
+        split = split_record(DecayRecord(TIME, fill))
+        assert kinds(split) == ["ramp"] * 3
+        assert [part.current[0] > 99 for part in split.segments] == [True] * 3
+        for part in split.segments:
+            assert np.polyfit(part.time, np.log(part.current), 1)[0] == pytest.approx(
+                -1 / 36000, 1e-2
+            )
+    drift = decay(TIME) * (1 + 0.02 * np.sin(TIME / 500))
+    assert kinds(split_record(DecayRecord(TIME, drift))) == []

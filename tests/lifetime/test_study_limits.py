@@ -1,0 +1,114 @@
+"""What a study of decays does not know, a calibration it may have to find, and what it predicts."""
+
+import json
+
+import numpy as np
+import pytest
+
+from beamfit.errors import InputError
+from beamfit.lifetime.decay_law import HOUR, current
+from beamfit.lifetime.mechanisms import loss_coefficients, loss_terms, scaled_losses
+from beamfit.lifetime.record import Conditions, DecayRecord
+from beamfit.lifetime.ring_study import predict_held_back, study_shift
+from beamfit.lifetime.scales import fit_scales
+from beamfit.lifetime.study import operation_during, study_record
+from beamfit.lifetime.tables import shift_rows
+from beamfit.quantity import Status
+from tests.lifetime.test_lifetime_study import simulated
+
+
+def test_what_only_the_limits_of_the_scales_decide_is_not_determined(machine):
+    """Three minutes tell the lifetime, and nothing of a and b: truth is b = 1.2e-6 /s."""
+    losses = loss_coefficients(machine.ring, machine.operation, 500.0)
+    time = np.arange(0.0, 181.0, 1.0)
+    noise = 1e-3 * np.random.default_rng(1).normal(size=time.size)
+    record = DecayRecord(time, np.array(current(time, 500.0, losses.a, losses.b)) + noise)
+    shift = study_shift(study_record(record).decays, machine)
+    assert shift.fit.status is Status.unidentified
+    found = {row.name: row for row in shift.budget}
+    assert not found["a"].separable
+    assert not found["b"].separable
+    assert np.isnan([found["b"].median, found["b"].lower, found["b"].upper]).all()
+    said = json.loads(json.dumps(shift.to_json()))
+    assert [row["median"] for row in said["budget"] if row["name"] in "ab"] == [None, None]
+    assert "a, b at 499.3 mA" in said["not_determined"]
+    assert "not determined" in dict(shift_rows(shift))["b at 499.3 mA"][0]
+    truth = 1 / float(losses.a * 500 + losses.b) / HOUR
+    assert found["lifetime"].separable
+    assert found["lifetime"].lower < truth < found["lifetime"].upper
+
+
+TRUE, PRIOR = 1.012, (1.0, 0.01)
+
+
+def read_low(machine, count=12):
+    """Decays at a voltage above its reading, at several voltages, scrapers and currents."""
+    random = np.random.default_rng(3)
+    time, made = np.arange(0.0, 7200.0, 60.0), []
+    for k in range(count):
+        stated = machine.operation._replace(
+            rf_voltage=(1.6e6, 2.2e6, 2.8e6)[k % 3], scraper_y=(6e-3, 3e-3)[k % 2]
+        )
+        i0 = (500.0, 200.0)[k // 6]
+        true = stated._replace(rf_voltage=TRUE * stated.rf_voltage)
+        losses = loss_coefficients(machine.ring, true, i0)
+        beam = np.array(current(time, i0, losses.a, losses.b))
+        pressure = stated.pressure_base + stated.pressure_slope * beam
+        said = Conditions(*(np.full(time.size, v) for v in stated[:2]), pressure=pressure)
+        noise = 1e-3 * random.normal(size=time.size)
+        error = np.full(time.size, 1e-3)
+        made += study_record(DecayRecord(time, beam + noise, error, conditions=said)).decays
+    return made
+
+
+def test_the_calibration_of_the_rf_voltage_is_found_and_told(machine):
+    decays = read_low(machine)
+    plain = fit_scales(decays, machine)
+    assert plain.status is Status.poor_fit
+    free = fit_scales(decays, machine, priors={"rf_voltage": PRIOR})
+    assert free.status is Status.converged
+    assert abs(free.rf_voltage.value - TRUE) < 3 * free.rf_voltage.error
+    assert free.rf_voltage.error < 0.002
+    assert abs(free.touschek.value - 1) < 3 * free.touschek.error
+    at = free.terms_at(machine.operation._replace(rf_voltage=2e6), 300.0)
+    found = scaled_losses(free.vector, at)[0]
+    there = machine.operation._replace(rf_voltage=TRUE * 2e6)
+    truth = loss_coefficients(machine.ring, there, 300.0)
+    assert float(found) == pytest.approx(float(truth.a), rel=2e-3)
+    draws = free.sample(seed=1, target_ess=300).draws
+    assert draws[:, 4].mean() == pytest.approx(free.rf_voltage.value, abs=free.rf_voltage.error)
+
+
+def test_losses_between_voltages_are_those_of_the_ring(machine):
+    nodes = 1 + 0.01 * np.arange(-3, 4)
+    terms = loss_terms(machine.ring, machine.operation._replace(rf_voltage=2e6), 300.0, nodes)
+    for scale, accuracy in ((1.0, 1e-12), (0.98, 1e-12), (1.0234, 2e-4)):
+        there = machine.operation._replace(rf_voltage=2e6 * scale)
+        expected = scaled_losses(np.ones(4), loss_terms(machine.ring, there, 300.0))
+        found = scaled_losses(np.append(np.ones(4), scale), terms)
+        np.testing.assert_allclose(found, expected, rtol=accuracy)
+
+
+def test_a_voltage_that_no_decay_tells_is_its_priors(machine):
+    """At 3.2 MV the lattice limits, and only the bunch length depends on the voltage."""
+    still = [d for d in simulated(machine, 4) if d.segment.conditions.rf_voltage[0] == 3.2e6]
+    found = fit_scales(still, machine, priors={"rf_voltage": (1.0, 0.003)})
+    assert found.rf_voltage.error is None
+    assert "its prior does" in found.message
+    with pytest.raises(InputError, match="every decay is still stored"):
+        fit_scales(still, machine, priors={"rf_voltage": (1.0, 0.3)})
+
+
+def test_decays_held_back_lie_in_the_band_of_the_others(machine, decays):
+    found = predict_held_back(fit_scales(decays, machine))
+    assert len(found) == len(decays)
+    pulls = np.abs([one.pull for one in found])
+    assert 15 <= np.sum(pulls < 1) <= 26
+    assert np.sum(pulls < 1.96) >= 26
+    for k in (3, 20):
+        others = fit_scales([*decays[:k], *decays[k + 1 :]], machine)
+        there = operation_during(decays[k].segment, machine), decays[k].fit.mean_current
+        a, b = scaled_losses(others.vector, others.terms_at(*there))
+        hours = 1 / float(a * there[1] + b) / HOUR
+        assert found[k].predicted.value == pytest.approx(hours, rel=2e-3)
+        assert found[k].measured.value == pytest.approx(decays[k].fit.lifetime_mean.value)
