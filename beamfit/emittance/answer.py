@@ -8,7 +8,11 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import ndtri
 
-from beamfit.emittance.comparison import BEAM, FLAT, PlanePosterior, weighted_quantiles
+from beamfit.emittance.comparison import (
+    PlanePosterior,
+    emittance_quantiles,
+    weighted_quantiles,
+)
 from beamfit.emittance.model import QUANTITIES, coefficients, numbers_of, phase_coverage
 from beamfit.emittance.next_point import next_measurement
 from beamfit.emittance.results import Identifiability, PlaneFit, Points, ScreenTwiss
@@ -177,9 +181,8 @@ def _numbers(
     post: PlanePosterior, p: Points, places: Places, b: Beside | None
 ) -> tuple[Numbers, Influence]:
     """The numbers of a plane, and the point that carries them."""
-    flat = post.probability[FLAT] / max(post.probability[BEAM] + post.probability[FLAT], 1e-300)
     spread = None if b is None else b.spread
-    quantiles = _quantiles(post.sigma, post.weight, tuple(places), spread, flat)
+    quantiles = _quantiles(post, tuple(places), spread)
     value = numbers_of(post.best, *places) if b is None else b.value
     half = 0.5 * (quantiles[3] - quantiles[1])
     low, high = quantiles[0], quantiles[4]
@@ -246,12 +249,10 @@ def _identifiability(
     )
 
 
-def _quantiles(
-    sigma: np.ndarray, weight: np.ndarray, given: tuple, spread: np.ndarray | None, flat: float
-) -> np.ndarray:
-    """Quantiles `AT` of every number, shape (5, 11); of emittances with the share ``flat`` at 0."""
-    kept = weight > 0.0
-    sigma, weight = sigma[kept], weight[kept]
+def _quantiles(post: PlanePosterior, given: tuple, spread: np.ndarray | None) -> np.ndarray:
+    """Quantiles `AT` of every number, shape (5, 11)."""
+    kept = post.weight > 0.0
+    sigma, weight = post.sigma[kept], post.weight[kept]
     with np.errstate(invalid="ignore", divide="ignore"):
         numbers = numbers_of(sigma.T, *given)
     if spread is not None:
@@ -262,11 +263,9 @@ def _quantiles(
             grown = numbers * np.exp(z * (spread / middle)[:, None])
             numbers = np.where(SIGNED[:, None], numbers + z * spread[:, None], grown)
             numbers = np.where(np.isfinite(spread)[:, None], numbers, 0.0)
-    found = np.array([weighted_quantiles(row, weight, AT) for row in numbers]).T
-    at = np.array(AT)
-    within = np.maximum((at - flat) / (1.0 - flat), 0.0) if flat < 1.0 else 0.0 * at
-    for i in (0, 1):
-        found[:, i] = np.where(at > flat, weighted_quantiles(numbers[i], weight, within), 0.0)
+    emittances = [emittance_quantiles(row, weight, post.flat, AT) for row in numbers[:2]]
+    others = [weighted_quantiles(row, weight, AT) for row in numbers[2:]]
+    found = np.array([*emittances, *others]).T
     return found if spread is None else np.where(np.isfinite(spread), found, np.nan)
 
 

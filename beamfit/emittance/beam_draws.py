@@ -241,7 +241,8 @@ def fits(c: Coordinates, kind: Kind) -> tuple[np.ndarray, np.ndarray]:
         Shape (..., m, 3) and (..., m, 3, 3).
     """
     n = c.size.shape[-1]
-    kept = np.broadcast_to(left_out(n), (*c.unit.shape, *left_out(n).shape))
+    kept = left_out(n)
+    kept = np.broadcast_to(kept, (*c.unit.shape, *kept.shape))
     found = [_fitted(c, kind, deviation, kept) for deviation in _deviations(kind, c)]
     if WORST * n > 2:
         found += [_greedy(c, kind, deviation) for deviation in _deviations(kind, c)]

@@ -7,31 +7,378 @@ the advice holds for calibrations and networks as well as for the beam alone.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import product
 from typing import Any, NamedTuple
 
-from beamfit.emittance.candidates import (
-    Candidate,
-    by_plane,
-    candidate_rows,
-    determined_by,
-    further_options,
-    information_of,
-    judge_of,
-)
+import jax.numpy as jnp
+import numpy as np
+
+from beamfit.emittance.calibration import Kind, numbers_of_magnets
 from beamfit.emittance.fit import EmittanceFit
-from beamfit.errors import InputError
+from beamfit.emittance.model import emittance_parts, predict_sizes, sigma_of, spoken
+from beamfit.emittance.next_point import (
+    BeamSpread,
+    Further,
+    Predict,
+    beam_information,
+    beam_sizes,
+    candidate_settings,
+    elements_at,
+    on_screen,
+    relative_error,
+    simulated,
+    spread_of,
+)
+from beamfit.emittance.results import in_words
+from beamfit.emittance.statement import size_records, varied_magnets
+from beamfit.emittance.transport import NetworkRows, Rows, rows_at, setting_units
+from beamfit.emittance.verdict import USEFUL
+from beamfit.errors import InputError, nearest
+from beamfit.greybox import assess
+from beamfit.greybox.covariance import MOST_SHARE
 from beamfit.greybox.design import Information, greedy
+from beamfit.greybox.fit import value_and_slope
+from beamfit.optics.beamline import Beamline
+from beamfit.optics.elements import Drift, Screen
 from beamfit.shown import shown
 from beamfit.status import Status
 from beamfit.table import Table, json_of, text_of
 
+# The error of ln ε whose 95 % interval spans the factor within which an emittance is of use.
+NARROW = float(np.log(USEFUL)) / 3.92
+# Other energies to consider where none is named: what a linac can usually do.
+USUAL_ENERGIES = (0.8, 1.25)
 CRITERIA = ("emittance", "D")
 # A further point that sharpens the emittance by less than this is not worth its shift time.
 LEAST_GAIN = 0.01
 PERHAPS = "In brackets: for the beam as it is best known, which the data do not determine."
 TIE = " Tie the network to first principles (--anchor first-principles=2%)."
+
+
+class Candidate(NamedTuple):
+    """A further measurement: settings of the magnets, screen, and energy in MeV."""
+
+    settings: dict[str, float]
+    screen: str
+    energy: float
+    words: str
+
+
+# Which planes are determined, by what is known and by what is measured further.
+Judge = Callable[[Information, Sequence[Candidate]], dict[str, bool]]
+
+
+def by_plane(fit: EmittanceFit, known: Information) -> dict[str, float]:
+    """Relative error of each plane's emittance."""
+    error = map(float, known.relative_error)
+    return dict(zip((p.plane for p in fit.planes), error, strict=True))
+
+
+def determined_by(fit: EmittanceFit, known: Information) -> dict[str, bool]:
+    """Whether each plane's emittance rests on data and priors, within a factor that is of use."""
+    clear = (known.relative_error <= NARROW) & (known.share < MOST_SHARE)
+    return dict(zip((p.plane for p in fit.planes), map(bool, clear), strict=True))
+
+
+def judge_of(fit: EmittanceFit) -> Judge:
+    """How to tell which planes would be determined after further measurements.
+
+    Of known transport they are simulated, and compared with the rivals as a scan is; in a scenario
+    linear theory says.
+    """
+    if fit.solved is not None:
+        return lambda known, _: determined_by(fit, known)
+    seen, now = fit.seen, {p.plane: p.identifiability.determined for p in fit.planes}
+
+    def judge(_: Information, further: Sequence[Candidate]) -> dict[str, bool]:
+        if not further or all(now.values()):
+            return now
+        rows = []
+        for c in further:
+            table = {name: np.array([v]) for name, v in c.settings.items()}
+            rows.append(elements_at(seen, seen.scanned, table, c.screen, np.array([c.energy])))
+        every = np.concatenate(rows, axis=-1)
+        own = {plane: every["xy".index(plane)] for plane in now}
+        return {plane: sure or simulated(seen, plane, *own[plane]) for plane, sure in now.items()}
+
+    return judge
+
+
+def planes_of(fit: EmittanceFit) -> list[str]:
+    """The planes that were fitted."""
+    return [p.plane for p in fit.planes]
+
+
+def _spreads(fit: EmittanceFit) -> dict[str, BeamSpread]:
+    """Draws of each plane that was fitted."""
+    return {plane: spread_of(fit.seen, plane) for plane in planes_of(fit)}
+
+
+def information_of(fit: EmittanceFit) -> Information:
+    """Gather the information of a fit: of known transport from the draws, else by linear theory.
+
+    Parameters
+    ----------
+    fit : EmittanceFit
+        The fit.
+
+    Returns
+    -------
+    Information
+    """
+    if fit.solved is None:
+        quoted = [p.emittance.error and p.emittance.relative for p in fit.planes]
+        return beam_information(list(_spreads(fit).values()), [q or np.nan for q in quoted])
+    p, theta = fit.problem, linearised_at(fit)
+    held = p.lower == p.upper
+    if _determined(fit):
+        edge = np.array([v.state in ("lower", "upper") for v in fit.fit.variables])
+        held = held | (edge & p.nuisance)
+    return Information(
+        assess.slopes(p, theta).residual_jacobian,
+        *value_and_slope(p, _emittances, theta),
+        ~p.nuisance & ~held,
+        p.lower,
+        p.upper,
+        held,
+        np.isin(np.array(p.names), [prior.name for prior in p.priors]),
+    )
+
+
+def linearised_at(fit: EmittanceFit) -> np.ndarray:
+    """Where to take derivatives: at the answer, or at first principles where there is none.
+
+    Numbers that the data do not determine end anywhere; what a measurement would tell is then
+    asked of the line and the beam one started from.
+    """
+    if _determined(fit):
+        return fit.fit.theta
+    return np.clip(fit.stated.start, fit.stated.lower, fit.stated.upper)
+
+
+def _determined(fit: EmittanceFit) -> bool:
+    return all(plane.identifiability.determined for plane in fit.planes)
+
+
+def _emittances(model, data):
+    return jnp.stack([emittance_parts(sigma_of(beam))[0] for beam in model["beam"].values()])
+
+
+def candidate_rows(
+    fit: EmittanceFit,
+    limits: Mapping[str, tuple[float, float]] | None,
+    energies: tuple[float, ...],
+) -> tuple[list[Candidate], np.ndarray]:
+    """List single further measurements with their rows of the Jacobian.
+
+    Parameters
+    ----------
+    fit : EmittanceFit
+        What is measured already.
+    limits : mapping of str to (float, float), or None
+        Magnets that may be set, each in turn over 41 settings, the others at their median.
+    energies : tuple of float
+        Further energies, MeV.
+
+    Returns
+    -------
+    list of Candidate and ndarray
+        At every screen of the line, and every energy; rows of shape (candidates, planes, n).
+
+    Raises
+    ------
+    InputError
+        If limits name no magnet of the line, or are reversed.
+    """
+    seen, screens, found, rows = fit.seen, _screens(fit), [], []
+    predict = _predicted(fit)
+    for _, table in candidate_settings(fit.scan.settings, _checked(fit, limits)):
+        rows_of_table = zip(*table.values(), strict=True)
+        points = [dict(zip(table, map(float, row), strict=True)) for row in rows_of_table]
+        for screen, energy in product(screens, (seen.energy, *energies)):
+            further = predict(seen.scanned, table, screen, np.full(len(points), energy))
+            usable = np.ones(len(points), bool)
+            if limits is None and (there := on_screen(seen, planes_of(fit), further.size)).any():
+                usable = there
+            rows += list(further.rows.swapaxes(0, 1)[usable])
+            where = f" on {screen}" if len(screens) > 1 else ""
+            where += f" at {energy:g} MeV" if energy != seen.energy else ""
+            for i in np.flatnonzero(usable):
+                words = _in_words(fit, points[i]) + where
+                found.append(Candidate(points[i], screen, float(energy), words))
+    return found, np.array(rows)
+
+
+def _checked(fit: EmittanceFit, limits):
+    """Limits of magnets that can be set, refused if they cannot be used, or if none can be told."""
+    if fit.scan.transfer:
+        found = "advice on rows with matrices of their own"
+        raise fit.scan.unusable(found, "a lattice in which other settings can be tried")
+    if not limits and not varied_magnets(fit.scan):
+        found = "advice on a scan that moved no magnet"
+        raise fit.scan.unusable(found, "limits of a magnet, such as --vary Q1=LOW:HIGH")
+    for name, (low, high) in (limits or {}).items():
+        if name not in fit.seen.scanned.magnets:
+            raise InputError(
+                f"limits of '{name}'", nearest(name, list(fit.seen.scanned.magnets)) + ", a magnet"
+            )
+        if not (np.isfinite(low) and np.isfinite(high) and low < high):
+            raise InputError(f"limits {low:g}:{high:g} of {name}", "finite limits, lower first")
+        if not fit.statement.whole_map and name not in varied_magnets(fit.scan):
+            raise InputError(f"limits of '{name}', which was not scanned", "a scanned magnet")
+    return limits
+
+
+def _screens(fit: EmittanceFit) -> tuple[str, ...]:
+    """Screens to measure at: all of the line, downstream of a scanned magnet."""
+    measured = fit.seen.rows.places
+    if not fit.statement.whole_map:  # another screen has another network
+        return measured
+    names, magnets = _along(fit)
+    later = [s for s in fit.seen.scanned.screens if names.index(s) > min(magnets)]
+    return tuple(dict.fromkeys((*measured, *later)))
+
+
+def _along(fit: EmittanceFit) -> tuple[list[str], list[int]]:
+    """Names along the line, and where in them the scanned magnets stand."""
+    line = fit.seen.scanned
+    names = [e.name for e in line.elements]
+    magnets = [m for name in varied_magnets(fit.scan) for m in line.members(name)]
+    return names, [names.index(m) for m in magnets] or [-1]
+
+
+def _in_words(fit: EmittanceFit, settings: Mapping[str, float]) -> str:
+    """Settings with the units of the scan."""
+    return in_words(settings, setting_units(fit.seen.scanned, settings))
+
+
+def _predicted(fit: EmittanceFit) -> Predict:
+    """How a fit predicts further sizes: by the draws of the beams, or by its derivatives."""
+    if fit.solved is None:
+        return beam_sizes(fit.seen, _spreads(fit))
+    problem, theta = fit.problem, linearised_at(fit)
+
+    def predict(line, table, screen, energy) -> Further:
+        sizes, rows = [], []
+        for plane in planes_of(fit):
+            if fit.statement.whole_map:
+                data = _line_rows(fit, line, plane, table, screen, energy)
+            else:
+                data = _network_rows(fit, plane, table, screen)
+            size, slope = value_and_slope(problem, predict_sizes, theta, data)
+            rows.append(slope / (relative_error(fit.seen, plane) * size)[:, None])
+            sizes.append(1e-6 * size)
+        return Further(np.array(sizes), np.array(rows))
+
+    return predict
+
+
+def _line_rows(fit, line, plane, table, screen, energy) -> Rows:
+    count = len(energy)
+    measured = size_records(fit.problem)[plane].data
+    shapes = {n: np.ndim(v) for n, v in measured.settings.items()}
+    # Where a magnet has branches, a further point is measured on the rising one.
+    settings = {
+        n: jnp.stack([v, jnp.ones(count)], -1) if shapes.get(n) == 2 else jnp.asarray(v)
+        for n, v in table.items()
+    }
+    known = fit.seen.known_at(line, screen)
+    return rows_at(line, plane, screen, settings, np.asarray(energy), *known)
+
+
+def _network_rows(fit, plane, table, screen) -> NetworkRows:
+    measured, seen = size_records(fit.problem)[plane].data, fit.seen
+    place = seen.rows.places.index(screen)
+    which = next(i for i in seen.measured(plane) if seen.rows.which[i] == place)
+    count = len(next(iter(table.values())))
+    names = fit.fit.model["map"].inputs
+    inputs = [table.get(n, np.full(count, fit.seen.energy)) for n in names]
+    return NetworkRows(
+        plane,
+        False,
+        jnp.asarray(np.stack(inputs, -1)),
+        jnp.tile(measured.columns[which], (count, 1)),
+        jnp.full(count, float(np.median(np.asarray(measured.known)))),
+        jnp.ones(count),
+    )
+
+
+def further_options(
+    fit: EmittanceFit, base: Information, energies: tuple[float, ...]
+) -> Iterator[tuple[str, np.ndarray]]:
+    """Kinds of measurement that might identify a scenario, each with its rows.
+
+    A single size at every other screen, the same scan at it; the same scan at other energies;
+    and, where the line has no second screen, at screens one could put into its drifts.
+
+    Parameters
+    ----------
+    fit : EmittanceFit
+        What is measured already.
+    base : Information
+        Its information.
+    energies : tuple of float
+        Energies to consider, MeV; 20 % below and 25 % above if empty.
+
+    Yields
+    ------
+    tuple of str and ndarray
+        Words, and rows of shape (m, n).
+    """
+    table = {n: np.asarray(v) for n, v in fit.scan.settings.items()}
+    own = fit.seen.energy
+    energy = np.full(len(fit.scan), own) if fit.scan.energy is None else fit.scan.energy
+    if fit.statement.whole_map:
+        predict = _predicted(fit)
+        for line, screen, words in _other_screens(fit):
+            rows = predict(line, table, screen, energy).rows
+            best = min(range(rows.shape[1]), key=lambda i: _worst(base.with_rows(rows[:, i])))
+            at = _in_words(fit, {n: float(v[best]) for n, v in table.items()})
+            yield f"one size on {words} ({at})", rows[:, best]
+            yield f"the same scan on {words}", rows.reshape(-1, rows.shape[-1])
+        for factor in energies or tuple(own * f for f in USUAL_ENERGIES):
+            screen = (fit.scan.screen or fit.seen.rows.places)[-1]
+            rows = predict(fit.seen.scanned, table, screen, np.full(len(fit.scan), factor)).rows
+            yield f"the same scan at {factor:.4g} MeV", rows.reshape(-1, rows.shape[-1])
+    yield from _priors(fit)
+
+
+def _worst(after: Information) -> float:
+    """Relative error that counts bounds as nothing: large while they decide."""
+    return float(after.relative_error.max() / max(1.0 - after.share.max(), 1e-6))
+
+
+def _other_screens(fit: EmittanceFit) -> list[tuple[Beamline, str, str]]:
+    """Screens that were not used, or else places for one in the drifts after the magnets."""
+    line = fit.seen.scanned
+    unused = [s for s in _screens(fit) if s not in fit.seen.rows.places]
+    if unused:
+        return [(line, s, f"screen {s}") for s in unused]
+    _, magnets = _along(fit)
+    found = []
+    for i, element in enumerate(line.elements):
+        if i > max(magnets) and isinstance(element, Drift) and element.length > 0.3:
+            half = replace(element, length=0.5 * element.length)
+            elements = (*line.elements[:i], half, Screen("NEW"), half, *line.elements[i + 1 :])
+            words = f"a new screen in the middle of {element.name}"
+            found.append((replace(line, elements=elements), "NEW", words))
+    return found
+
+
+def _priors(fit: EmittanceFit) -> Iterator[tuple[str, np.ndarray]]:
+    """A 2 % measurement of each slope, as from a field map of the magnet."""
+    slopes = {
+        f"magnets.{name}": number.value
+        for name, number in numbers_of_magnets(fit.seen.scanned).items()
+        if number.kind is Kind.slope
+    }
+    for i, name in enumerate(fit.problem.names):
+        if name in slopes:
+            row = np.zeros((1, len(fit.problem.names)))
+            row[0, i] = 1.0 / (0.02 * abs(slopes[name]))
+            yield f"a prior of 2 % on {spoken(name)}", row
 
 
 class Step(NamedTuple):

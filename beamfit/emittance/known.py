@@ -12,10 +12,9 @@ import numpy as np
 from beamfit.compile_cache import SELDOM
 from beamfit.emittance.answer import Places, plane_answer
 from beamfit.emittance.comparison import PlanePosterior, PlaneSizes, compare
-from beamfit.emittance.names import check_names
 from beamfit.emittance.questions import check_gradients
 from beamfit.emittance.results import PlaneFit, Points
-from beamfit.emittance.scan import QuadScan
+from beamfit.emittance.scan import QuadScan, check_names
 from beamfit.emittance.statement import Scenario, Seen, Work, asked_of, beam_problem
 from beamfit.emittance.transport import (
     Look,

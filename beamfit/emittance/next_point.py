@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.linalg import block_diag
 
-from beamfit.emittance.comparison import PlaneSizes, compare, weighted_quantiles
+from beamfit.emittance.comparison import PlaneSizes, compare, emittance_quantiles
 from beamfit.emittance.model import size_squared
 from beamfit.emittance.results import in_words
 from beamfit.emittance.statement import Seen
@@ -77,7 +77,7 @@ def candidate_settings(
     return found
 
 
-class _Spread(NamedTuple):
+class BeamSpread(NamedTuple):
     """Draws of σ, shape (d, 3), how far off their mean in units of each, weights, covariance."""
 
     sigma: np.ndarray
@@ -92,7 +92,8 @@ class _Spread(NamedTuple):
         return np.linalg.solve(self.covariance, across.T).T
 
 
-def _spread(seen: Seen, plane: str) -> _Spread:
+def spread_of(seen: Seen, plane: str) -> BeamSpread:
+    """How the draws of the beam of a plane lie about their mean."""
     post = seen.works[plane].posterior
     kept = post.weight > 0.0
     sigma, weight = post.sigma[kept], post.weight[kept]
@@ -100,18 +101,16 @@ def _spread(seen: Seen, plane: str) -> _Spread:
     unit = np.sqrt(weight @ sigma**2)
     off = (sigma - weight @ sigma) / unit
     covariance = (weight[:, None] * off).T @ off
-    return _Spread(sigma, off, weight, covariance + 1e-12 * np.trace(covariance) * np.eye(3))
+    return BeamSpread(sigma, off, weight, covariance + 1e-12 * np.trace(covariance) * np.eye(3))
 
 
-def beam_information(seen: Seen, planes: Sequence[str], error: Sequence[float]) -> Information:
+def beam_information(beams: Sequence[BeamSpread], error: Sequence[float]) -> Information:
     """What the posterior tells of the emittances of some planes.
 
     Parameters
     ----------
-    seen : Seen
-        The scan.
-    planes : sequence of str
-        Which, each with three numbers.
+    beams : sequence of BeamSpread
+        One a plane, each with three numbers.
     error : sequence of float
         Relative errors of the emittances as quoted; NaN to take those of the draws.
 
@@ -122,8 +121,7 @@ def beam_information(seen: Seen, planes: Sequence[str], error: Sequence[float]) 
     of ε and of sizes are those of the regression over the draws.
     """
     roots, slopes = [], []
-    for plane, quoted in zip(planes, error, strict=True):
-        s = _spread(seen, plane)
+    for s, quoted in zip(beams, error, strict=True):
         drawn = emittances(s.sigma)
         slope = s.slope(drawn / (drawn @ s.weight))
         own = float(np.sqrt(slope @ s.covariance @ slope))
@@ -135,18 +133,17 @@ def beam_information(seen: Seen, planes: Sequence[str], error: Sequence[float]) 
     return Information(block_diag(*roots), one, block_diag(*slopes), free > 0, -free, free)
 
 
-def beam_sizes(seen: Seen, planes: Sequence[str]) -> Predict:
+def beam_sizes(seen: Seen, beams: Mapping[str, BeamSpread]) -> Predict:
     """How the draws of some planes predict further sizes, with the scan's own relative error."""
-    spreads = [_spread(seen, plane) for plane in planes]
 
     def predict(line, table, screen, energy) -> Further:
         every = elements_at(seen, line, table, screen, energy)
         sizes, rows = [], []
-        for i, (plane, s) in enumerate(zip(planes, spreads, strict=True)):
+        for i, (plane, s) in enumerate(beams.items()):
             r11, r12, known = every["xy".index(plane)]
             drawn = np.sqrt(size_squared(s.sigma.T, *(v[:, None] for v in (r11, r12, known))))
             size = drawn @ s.weight
-            own = np.zeros((len(size), 3 * len(planes)))
+            own = np.zeros((len(size), 3 * len(beams)))
             error = relative_error(seen, plane) * size
             own[:, 3 * i : 3 * i + 3] = s.slope(drawn) / error[:, None]
             sizes.append(size)
@@ -183,8 +180,8 @@ def next_measurement(seen: Seen, plane: str) -> str | None:
     p, screen = work.points, seen.rows.places[-1]
     if seen.scan.transfer or not work.posterior.seen:
         return None
-    every = list(seen.works)
-    predict, tried, rows = beam_sizes(seen, every), [], []
+    beams = {name: spread_of(seen, name) for name in seen.works}
+    every, predict, tried, rows = list(beams), beam_sizes(seen, beams), [], []
     for name, table in candidate_settings(p.settings):
         found = predict(seen.scanned, table, screen, np.full(COUNT, seen.energy))
         usable = on_screen(seen, every, found.size)
@@ -193,7 +190,7 @@ def next_measurement(seen: Seen, plane: str) -> str | None:
         rows.append(found.rows[i, usable][:, None, 3 * i : 3 * i + 3])
     if not tried:
         return None
-    known = beam_information(seen, (plane,), (np.nan,))
+    known = beam_information((beams[plane],), (np.nan,))
     magnet, setting = tried[next(greedy(known, np.concatenate(rows))).index]
     values = p.settings[magnet]
     inside = values.min() <= setting <= values.max()
@@ -225,6 +222,7 @@ def simulated(seen: Seen, plane: str, r11: np.ndarray, r12: np.ndarray, known: n
     rows = [np.append(v, w) for v, w in zip(old[:4], (r11, r12, known, size), strict=True)]
     error = None if old.error is None else np.append(old.error, off)
     [found] = compare([PlaneSizes(*rows, error, old.of_shots, old.moved)], seen.noise)
-    low, high = weighted_quantiles(emittances(found.sigma), found.weight, (0.025, 0.975))
+    drawn = emittances(found.sigma)
+    low, high = emittance_quantiles(drawn, found.weight, found.flat, (0.025, 0.975))
     given = len(rows[0]), old.moved, error is not None
     return Evidence(found.probability, found.seen, *given, low, high, None).determined

@@ -16,8 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from beamfit.emittance.names import check_names
-from beamfit.emittance.scan import QuadScan
+from beamfit.emittance.scan import QuadScan, check_names
 from beamfit.errors import InputError, nearest
 from beamfit.io.columns import Sheet, columns_of
 from beamfit.io.files import name_of

@@ -13,8 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 import beamfit
-from beamfit.emittance.candidates import information_of
-from beamfit.emittance.design import best_steps
+from beamfit.emittance.design import best_steps, information_of
 from beamfit.emittance.fit import EmittanceFit, fit_emittance
 from beamfit.emittance.scan import QuadScan
 from beamfit.errors import InputError, plain

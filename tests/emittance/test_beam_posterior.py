@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 import beamfit
-from beamfit.emittance.comparison import MODELS, weighted_quantiles
-from beamfit.emittance.rivals import BENDS, LENGTHS, STEPS
+from beamfit.emittance.comparison import BENDS, LENGTHS, MODELS, STEPS, weighted_quantiles
 from beamfit.noise.model import Noise
 from tests.emittance.conftest import TABLE_2, design
 from tests.noise import reference as ref

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 import beamfit
-from beamfit.emittance.candidates import candidate_rows
-from beamfit.emittance.design import plan_measurements
+from beamfit.emittance.design import candidate_rows, plan_measurements
 from beamfit.errors import InputError
 from beamfit.quantity import Status
 from tests.emittance.conftest import TABLE_2, design
