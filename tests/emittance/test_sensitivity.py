@@ -95,7 +95,11 @@ def test_budget_of_a_drift_in_parts_is_that_of_the_whole(gtf, gtf_sizes):
 
 @pytest.mark.parametrize("weights", ["model", "measured"])
 def test_the_screen_in_the_budget_is_the_slope_of_a_refit(gtf, gtf_sizes, weights):
-    """Scale, resolution and dispersion: a screen that is a little another one."""
+    """Scale, resolution and dispersion: a screen that is a little another one.
+
+    The refit finds its noise anew, of which sizes that are 1 % larger have another share: a
+    hundred-thousandth of the slope.
+    """
     currents, _, sizes = gtf_sizes
     scan = scan_of("Q2", "A", currents, sizes, seed=4)
     blurred = gtf.with_element(Screen("SCREEN", resolution=2e-5))
@@ -110,7 +114,7 @@ def test_the_screen_in_the_budget_is_the_slope_of_a_refit(gtf, gtf_sizes, weight
 
     h = 1e-4
     slope = (emittance(larger(h), blurred) - emittance(larger(-h), blurred)) / (2 * h)
-    assert changes["screen scale +1 %"] == pytest.approx(0.01 * slope, rel=1e-5)
+    assert changes["screen scale +1 %"] == pytest.approx(0.01 * slope, rel=3e-5)
     added = 1e-13  # m²
     ends = [gtf.with_element(Screen("SCREEN", float(np.sqrt(4e-10 + s)))) for s in (added, -added)]
     slope = (emittance(scan, ends[0]) - emittance(scan, ends[1])) / (2 * added)
