@@ -45,7 +45,7 @@ AT = (0.025, 0.1587, 0.5, 0.8413, 0.975)
 
 
 class Places(NamedTuple):
-    """Where the numbers of a beam are asked for: βγ, matrices to the screen and the design."""
+    """Places at which the numbers of a beam are asked for: βγ, matrices to screen and design."""
 
     factor: float
     to_screen: np.ndarray
@@ -54,7 +54,7 @@ class Places(NamedTuple):
 
 
 class Beside(NamedTuple):
-    """What a scenario adds to the answer of a plane, whose line is known otherwise.
+    """Further unknowns of a scenario, as they enter the answer of a plane.
 
     Attributes
     ----------
@@ -344,7 +344,7 @@ def _raw(post: PlanePosterior, given: tuple) -> np.ndarray:
 
 
 def _directions(p: Points, post: PlanePosterior) -> Directions:
-    """What the sizes leave open of σ."""
+    """Directions of σ that the sizes leave open."""
     with np.errstate(divide="ignore", invalid="ignore"):
         jacobian = np.stack(coefficients(p.r11, p.r12), -1) / (2.0 * p.weighed * p.error)[:, None]
     return scaled_directions(jacobian, np.array(units_of(post.best)), list(QUANTITIES)[SIGMA])
@@ -385,7 +385,7 @@ def _influence(p: Points, sigma: np.ndarray, error: float) -> Influence:
 
 
 def noise_words(noise: str, scale: np.ndarray, relative: float, p: Points) -> str:
-    """Where the errors are from, in a few words."""
+    """Source of the errors, in a few words."""
     if noise == "shots":
         return f"of the shots, settings ± {100 * scale[0]:.2g} % beyond"
     if noise != "none":

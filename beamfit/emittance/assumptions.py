@@ -42,7 +42,7 @@ OF_ELEMENTS = (".gradient", ".length")
 
 
 def is_systematic(name: str) -> bool:
-    """Whether a prior is one on screen, beam or line rather than on a calibration.
+    """Tell a prior on screen, beam or line from one on a calibration.
 
     Examples
     --------
@@ -60,7 +60,7 @@ def _taking(what: str) -> str:
 @shown
 @dataclass(frozen=True)
 class Anchor:
-    """What ties a network to first principles; without it a scan cannot tell scale from beam.
+    """A tie of a network to first principles; without it a scan cannot tell scale from beam.
 
     Parameters
     ----------

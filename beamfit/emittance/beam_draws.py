@@ -288,7 +288,7 @@ def _fitted(
 
 
 def _little(normal: np.ndarray) -> np.ndarray:
-    """What keeps a normal matrix of points that say nothing of a direction from being singular."""
+    """A little of the unit matrix: points may say nothing of a direction."""
     trace = np.trace(normal, axis1=-2, axis2=-1)[..., None, None]
     return 1e-9 * np.maximum(trace, 1e-30) * np.eye(3)
 

@@ -25,7 +25,7 @@ WIDTH = 20.0 / 167.23
 
 
 class Kind(Enum):
-    """What a number of a calibration does to k1: scales it, shifts it, or bends its curve."""
+    """The effect of a calibration's number on k1: it scales it, shifts it, or bends its curve."""
 
     slope = "slope"
     offset = "offset"

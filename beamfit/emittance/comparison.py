@@ -237,7 +237,7 @@ class PlaneSizes(NamedTuple):
 
     @property
     def likeness(self) -> tuple:
-        """What planes have in common that are compared in one call."""
+        """Key of the planes that can be compared in one call: points, errors, moved magnets."""
         if self.error is None:
             return len(self.size), "none", self.moved
         share = self.error / self.size
@@ -247,7 +247,7 @@ class PlaneSizes(NamedTuple):
 
 
 class PlanePosterior(NamedTuple):
-    """What the sizes of a plane say, the noise averaged over.
+    """The posterior of a plane's beam, the noise averaged over.
 
     Attributes
     ----------

@@ -134,7 +134,7 @@ def network_problem(
 def known_record(
     name: str, predict: Callable[[Any, Any], Any], data: Any, values: Any, sd: Any
 ) -> Record:
-    """What first principles say of a network beforehand, padded; ``data`` is padded already."""
+    """First principles as a record of a network, padded; ``data`` is padded already."""
     values = np.asarray(values, float)
     full = padded(values)
     weight = np.zeros(full.shape)

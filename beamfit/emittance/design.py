@@ -77,13 +77,13 @@ def by_plane(fit: EmittanceFit, known: Information) -> dict[str, float]:
 
 
 def determined_by(fit: EmittanceFit, known: Information) -> dict[str, bool]:
-    """Whether each plane's emittance rests on data and priors, within a factor that is of use."""
+    """Tell of each plane if its emittance rests on data and priors, within a factor of use."""
     clear = (known.relative_error <= NARROW) & (known.share < MOST_SHARE)
     return dict(zip((p.plane for p in fit.planes), map(bool, clear), strict=True))
 
 
 def judge_of(fit: EmittanceFit) -> Judge:
-    """How to tell which planes would be determined after further measurements.
+    """Give the function that tells which planes further measurements would determine.
 
     Of known transport they are simulated, and compared with the rivals as a scan is; in a scenario
     linear theory says.
@@ -148,7 +148,7 @@ def information_of(fit: EmittanceFit) -> Information:
 
 
 def linearised_at(fit: EmittanceFit) -> np.ndarray:
-    """Where to take derivatives: at the answer, or at first principles where there is none.
+    """Numbers to take derivatives at: the answer, or first principles where there is none.
 
     Numbers that the data do not determine end anywhere; what a measurement would tell is then
     asked of the line and the beam one started from.
@@ -255,7 +255,7 @@ def _in_words(fit: EmittanceFit, settings: Mapping[str, float]) -> str:
 
 
 def _predicted(fit: EmittanceFit) -> Predict:
-    """How a fit predicts further sizes: by the draws of the beams, or by its derivatives."""
+    """Give the prediction of further sizes: by the draws of the beams, or by derivatives."""
     if fit.solved is None:
         return beam_sizes(fit.seen, _spreads(fit))
     problem, theta = fit.problem, linearised_at(fit)
@@ -390,7 +390,7 @@ class Step(NamedTuple):
 
     @property
     def identified(self) -> bool:
-        """Whether every plane is determined then."""
+        """True if every plane is determined then."""
         return all(self.determined.values())
 
 
@@ -404,14 +404,14 @@ class Option(NamedTuple):
 
     @property
     def identified(self) -> bool:
-        """Whether every plane is determined then."""
+        """True if every plane is determined then."""
         return all(self.determined.values())
 
 
 @shown
 @dataclass(frozen=True)
 class Advice:
-    """What to measure next, and when to stop.
+    """Advice on the next measurements, and when to stop.
 
     Attributes
     ----------
@@ -442,7 +442,7 @@ class Advice:
 
     @property
     def identified(self) -> bool:
-        """Whether the data so far determine the emittance of every plane."""
+        """True if the data so far determine the emittance of every plane."""
         return all(self.determined.values())
 
     @property
@@ -646,7 +646,7 @@ def best_steps(
 
 
 def _options(fit: EmittanceFit, base: Information, energies: tuple[float, ...]) -> Iterator[Option]:
-    """What each kind of further measurement would make of the emittance."""
+    """The emittance after each kind of further measurement."""
     for words, rows in further_options(fit, base, energies):
         after = base.with_rows(rows)
         found = float(after.share.max()), determined_by(fit, after)

@@ -218,7 +218,7 @@ class EmittanceFit:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What was done to the numbers of the file, and what is odd about them, in sentences."""
+        """Sentences on changes to the numbers of the file, and on what is odd about them."""
         measured = self.seen.weights == "measured"
         own = ("Errors of size squared are taken at the measured sizes, on request.",) * measured
         asked = (
@@ -230,7 +230,7 @@ class EmittanceFit:
 
     @property
     def anchor(self) -> str:
-        """What ties a network to first principles, in words."""
+        """The tie of a network to first principles, in words."""
         return self.told.anchor.words
 
     @cached_property

@@ -187,7 +187,7 @@ def _strength(
 
 
 def _anchors(seen: Seen, name: str, told: Assumptions, branches: bool) -> Iterator[Record]:
-    """What is known of k1 beforehand, midway between the branches where there are two."""
+    """Prior knowledge of k1, midway between the branches where there are two."""
     settings, anchor = seen.scan.settings[name], told.anchor
     largest = float(np.abs(_first_strength(seen, name, settings)).max())
     places = np.array([place[name] for place in anchor.at if name in place], float)

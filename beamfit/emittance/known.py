@@ -115,7 +115,7 @@ def unfitted(
 
 
 def one_by_one(function: Callable[..., Any], given: Iterable[tuple], *static: str) -> list[Any]:
-    """What a function gives of each, as NumPy arrays."""
+    """Results of a function for each, as NumPy arrays."""
     return [jax.tree.map(np.asarray, _compiled(function, each, static)) for each in given]
 
 
@@ -228,7 +228,7 @@ def judged_beam(seen: Seen) -> tuple[PlaneFit, ...]:
 
 
 def places_of(seen: Seen, plane: str) -> Places:
-    """Where the beam of a plane is asked for, magnets as the lattice has them."""
+    """Places of a plane's numbers, magnets as the lattice has them."""
     asked, i = asked_of(seen, plane), "xy".index(plane)
     look: Look = seen.look
     return Places(float(asked.factor), look.to_screen[i], look.to_design[i], asked.design)

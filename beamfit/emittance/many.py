@@ -69,7 +69,7 @@ def fit_many(
 
 
 def noise_samples(scans: Iterable[tuple[QuadScan, Beamline]], noise: Noise) -> Iterator[Sample]:
-    """What the planes of many scans that are surely a beam's say of the scale of their noise.
+    """Scales of the noise by the planes of many scans that are surely a beam's.
 
     Parameters
     ----------
@@ -92,7 +92,7 @@ def noise_samples(scans: Iterable[tuple[QuadScan, Beamline]], noise: Noise) -> I
 
 
 def _together(function: Callable[..., Any], given: Sequence[tuple], *static: str) -> list[Any]:
-    """What a function gives of each, as NumPy arrays; those of one shape are one call."""
+    """Results of a function for each, as NumPy arrays; those of one shape are one call."""
     found: list[Any] = [None] * len(given)
     alike: dict[Any, list[tuple[int, list[Any]]]] = {}
     for i, each in enumerate(given):

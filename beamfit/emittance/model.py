@@ -203,7 +203,7 @@ def _carried(matrix: Array, sigma: Array) -> tuple[Array, Array, Array]:
 
 @tree.node("plane", "screen", "place")
 class Asked:
-    """Where the beam of a plane is asked for: the last screen, and where the design holds.
+    """Places of a plane's numbers: the last screen, and where the design holds.
 
     ``screen`` is None where the map beyond R11 and R12 is not known.
     """

@@ -93,7 +93,7 @@ class BeamSpread(NamedTuple):
 
 
 def spread_of(seen: Seen, plane: str) -> BeamSpread:
-    """How the draws of the beam of a plane lie about their mean."""
+    """Draws of a plane's beam about their mean."""
     post = seen.works[plane].posterior
     kept = post.weight > 0.0
     sigma, weight = post.sigma[kept], post.weight[kept]
@@ -105,7 +105,7 @@ def spread_of(seen: Seen, plane: str) -> BeamSpread:
 
 
 def beam_information(beams: Sequence[BeamSpread], error: Sequence[float]) -> Information:
-    """What the posterior tells of the emittances of some planes.
+    """Information of the posterior on the emittances of some planes.
 
     Parameters
     ----------
@@ -134,7 +134,7 @@ def beam_information(beams: Sequence[BeamSpread], error: Sequence[float]) -> Inf
 
 
 def beam_sizes(seen: Seen, beams: Mapping[str, BeamSpread]) -> Predict:
-    """How the draws of some planes predict further sizes, with the scan's own relative error."""
+    """Give the prediction of further sizes by draws, with the scan's own relative error."""
 
     def predict(line, table, screen, energy) -> Further:
         every = elements_at(seen, line, table, screen, energy)
@@ -204,13 +204,13 @@ def next_measurement(seen: Seen, plane: str) -> str | None:
 
 
 def on_screen(seen: Seen, planes: Sequence[str], size: np.ndarray) -> np.ndarray:
-    """Where no plane's size exceeds those measured, since screens have edges; shape (m,)."""
+    """Rows in which no plane's size exceeds those measured: screens have edges; shape (m,)."""
     largest = np.array([np.nanmax(seen.scan.size[plane]) for plane in planes])
     return (size <= largest[:, None]).all(axis=0)
 
 
 def simulated(seen: Seen, plane: str, r11: np.ndarray, r12: np.ndarray, known: np.ndarray) -> bool:
-    """Whether the emittance of a plane would be determined with further sizes.
+    """Simulate further sizes, and tell if they determine the emittance of a plane.
 
     They are those that the draws predict in the mean, off by one error up and down in turn.
     """

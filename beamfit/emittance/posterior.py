@@ -35,7 +35,7 @@ from beamfit.quantity import Status
 from beamfit.sampling.intervals import Expected
 from beamfit.sampling.posterior import Posterior
 from beamfit.sampling.priors import Distribution
-from beamfit.sampling.target import SamplingTarget as Target
+from beamfit.sampling.target import SamplingTarget
 from beamfit.verdict import Finding
 
 CHOLESKY, SIGMA = ("l11", "l21", "l22"), ("sigma11", "sigma12", "sigma22")
@@ -135,7 +135,7 @@ def _log_volume(model: Mapping[str, Any], told: Told) -> Array:
 
 
 def _sizes_of(problem: Problem, seen: Seen, planes: Sequence[str]) -> tuple[Sizes, ...]:
-    """What the likelihood needs of each plane."""
+    """Data of each plane for the likelihood."""
     records, found = size_records(problem), []
     for plane in planes:
         work = seen.works[plane]
@@ -169,7 +169,7 @@ def beam_target(
     fit: Scanned,
     planes: Sequence[str] | None = None,
     priors: Mapping[str, Distribution] | None = None,
-) -> Target:
+) -> SamplingTarget:
     """State the posterior of a fitted scan.
 
     Parameters
@@ -184,7 +184,7 @@ def beam_target(
 
     Returns
     -------
-    Target
+    SamplingTarget
         Names ``x.sigma11`` and so on, derived numbers ``x.emittance`` and so on.
 
     Raises
@@ -232,7 +232,7 @@ def _optimum(
     given: Sequence[PlaneFit],
     priors: Mapping[str, Distribution],
 ) -> Optimum:
-    """Where to begin: the fit, or else the priors; a little off zero emittance, an edge."""
+    """Starting point: the fit, or else the priors; a little off zero emittance, an edge."""
     begin = {}
     for p in chosen:
         sigma = [q.value for q in p.sigma]

@@ -124,7 +124,7 @@ def _rows(
 
 
 def correlations_of(p: PlaneFit) -> Correlations:
-    """How the errors of σ11, σ12, σ22, emittance, β and α go together, in linear approximation.
+    """Correlate the errors of σ11, σ12, σ22, emittance, β and α, in linear approximation.
 
     Those of the last three follow by the gradients of ε = sqrt(σ11σ22 - σ12²), σ11/ε and -σ12/ε.
     """

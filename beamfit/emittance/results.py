@@ -16,7 +16,7 @@ from beamfit.status import Status
 from beamfit.table import Table, cell, json_of, labelled
 
 if TYPE_CHECKING:
-    from beamfit.greybox.fit import FittedVariable as Variable
+    from beamfit.greybox.fit import FittedVariable
 
 
 # What a cell says of a number that the data leave open, and of one that is not there.
@@ -118,7 +118,7 @@ class Parameter(NamedTuple):
     def of(
         cls,
         name: str,
-        v: Variable,
+        v: FittedVariable,
         unit: str,
         prior: tuple[float, float] | None = None,
         settled: bool = True,
@@ -160,7 +160,7 @@ class ScreenTwiss(NamedTuple):
 @shown
 @dataclass(frozen=True)
 class Identifiability:
-    """What the scan determines.
+    """The verdict on what a scan determines.
 
     Attributes
     ----------

@@ -40,7 +40,7 @@ EACH_ROW += ("shots", "shot_size", "slice", "transfer")
 
 @shown
 class PlaneRows(NamedTuple):
-    """What a `QuadScan` has of the rows in which one plane was measured, each of shape (n,).
+    """Rows of a `QuadScan` in which one plane was measured, each of shape (n,).
 
     ``error``, ``energy``, ``screen``, ``resolution`` and ``energy_spread`` are None where it has
     none.
@@ -291,7 +291,7 @@ class QuadScan:
         return PlaneRows(**{name: (part | own)[name] for name in PlaneRows._fields})
 
     def columns_at(self, rows: Sequence[int]) -> dict[str, Any]:
-        """What the scan has for each row, of some of them: arguments of `QuadScan` by name."""
+        """Select some rows: arguments of `QuadScan` by name."""
 
         def taken(values: Any) -> Any:
             if isinstance(values, Mapping):
@@ -441,7 +441,7 @@ class QuadScan:
 
 
 def row_keys(scan: QuadScan) -> list[tuple]:
-    """What makes rows the same measurement: slice, settings, energy, screen and own matrices."""
+    """Key of rows that are one measurement: slice, settings, energy, screen, own matrices."""
     columns = [scan.slice or ("",) * len(scan), *(list(v) for v in scan.settings.values())]
     columns += [list(v) for v in (scan.energy, scan.screen) if v is not None]
     columns += [list(map(tuple, v)) for v in (scan.transfer or {}).values()]

@@ -169,7 +169,7 @@ def _beside(
     dof: float,
     jacobian: np.ndarray,
 ) -> Beside:
-    """What the fit adds to the posterior of the beam."""
+    """Further unknowns of the fit, as they enter the posterior of the beam."""
     on_data = bool(np.isfinite(own.error[0])) and _held(fit) is None
     effects = effects_of(fit, told, float(own.value[1]), np.nan_to_num(own.slope[1]))
     edges = "".join(
@@ -208,7 +208,7 @@ def _further_spread(fit: Fit, plane: str, own: Derived, jacobian: np.ndarray) ->
 
 
 def _remark(scenario: Scenario, parameters: tuple[Parameter, ...]) -> str:
-    """What is open besides the beam, and what it rests on."""
+    """Say what is open besides the beam, and what it rests on."""
     left = ", ".join(p.name for p in parameters if p.status is not Status.converged)
     priors = ", ".join(p.name for p in parameters if p.prior is not None)
     said = ""
@@ -222,7 +222,7 @@ def _remark(scenario: Scenario, parameters: tuple[Parameter, ...]) -> str:
 
 
 def _ending(scenario: Scenario, told: Assumptions, fit: Fit) -> Finding | None:
-    """How the search ended, where that was at no optimum."""
+    """Finding on a search that ended at no optimum."""
     if fit.status is Status.not_converged and scenario.network:
         said = (
             f"The search from {told.starts} starts came to no rest (chi2 = {fit.chi2:.4g}); give "
@@ -235,7 +235,7 @@ def _ending(scenario: Scenario, told: Assumptions, fit: Fit) -> Finding | None:
 
 
 def _held(fit: Fit) -> Finding | None:
-    """Whether a box or a limit that was given holds the answer: it then decides, not the data.
+    """Finding on an answer held by a box or limit that was given: it decides, not the data.
 
     A constraint that is active counts as exact in the covariance, and a beam in a corner of its box
     as known to the last digit.
@@ -254,7 +254,7 @@ def _held(fit: Fit) -> Finding | None:
 def _directions(
     fit: Fit, sigma: np.ndarray, slopes: np.ndarray, jacobian: np.ndarray
 ) -> Directions:
-    """What the data leave open of σ and of the other numbers that are asked for."""
+    """Directions of σ and of the other numbers asked for that the data leave open."""
     p, theta = fit.problem, fit.theta
     loose = ~p.nuisance & (p.lower < p.upper)
     further = [i for i in np.flatnonzero(loose) if not p.names[i].startswith("beam.")]

@@ -34,7 +34,7 @@ from beamfit.optics.elements import (
     Marker,
     SectorDipole,
 )
-from beamfit.optics.sections import ElementSeries as Series
+from beamfit.optics.sections import ElementSeries
 
 # Leaving out one of more points than this tells nothing.
 MOST_POINTS = 50
@@ -51,7 +51,7 @@ AT_WAIST = 0.05
 
 
 class Change(NamedTuple):
-    """What one small change of the line does to the emittance.
+    """Change of the emittance by one small change of the line.
 
     Attributes
     ----------
@@ -164,7 +164,7 @@ def _by_element(
     """Each element of a line, but for mere places, with the slope by its small change."""
     left, slopes = (e for e in line.elements if not isinstance(e, Marker)), iter(by_parts)
     for part in stored.elements:
-        if isinstance(part, Series):
+        if isinstance(part, ElementSeries):
             # An element stands at `order` among those of all kinds, counted kind after kind.
             elements = np.empty(len(part.order), object)
             elements[part.order] = list(islice(left, len(part.order)))
@@ -177,10 +177,10 @@ def _by_element(
 def _moved(line: Beamline, changes: Iterator[Array]) -> Beamline:
     """A line stored by kind with small changes, those of `_cause`, of all but mere places."""
 
-    def changed(part: Element | Series) -> Element | Series:
+    def changed(part: Element | ElementSeries) -> Element | ElementSeries:
         if isinstance(part, Marker):
             return part
-        if isinstance(part, Series):
+        if isinstance(part, ElementSeries):
             return replace(part, kinds=tuple(map(changed, part.kinds)))
         change = next(changes)
         if isinstance(part, Drift):
@@ -195,7 +195,7 @@ def _moved(line: Beamline, changes: Iterator[Array]) -> Beamline:
 
 
 def _cause(fit: EmittanceFit, element: Element) -> tuple[str, float]:
-    """What a small change of an element is called, and how large it is."""
+    """Name and size of the small change of an element."""
     if isinstance(element, Drift):
         return f"drift {element.name} +1 cm", 0.01
     if isinstance(element, SectorDipole):
@@ -273,7 +273,9 @@ def _slopes(
         grown = error_at(at, noise.weighed, 1.0, noise.relative)
         return back((squared - size**2) * (noise.sharp / (at * grown)) ** 2)[0]
 
-    kinds = (k for e in rows.line.elements for k in (e.kinds if isinstance(e, Series) else (e,)))
+    kinds = (
+        k for e in rows.line.elements for k in (e.kinds if isinstance(e, ElementSeries) else (e,))
+    )
     still = [jnp.zeros(_shape(kind)) for kind in kinds if not isinstance(kind, Marker)]
     here = sigma / unit
     seen, back = jax.vjp(elements, still, jnp.ones(()), jnp.zeros(len(size)))
@@ -283,7 +285,7 @@ def _slopes(
 
 
 def _shape(kind: Element) -> tuple[int, ...]:
-    """Of the numbers of elements that are stored together; () of one that stands alone."""
+    """Shape of the numbers of elements stored together; () of one that stands alone."""
     return max(map(np.shape, jax.tree.leaves(kind)), key=len, default=())
 
 
@@ -362,7 +364,7 @@ def budget_rows(fit: EmittanceFit) -> list[tuple[str, list[str]]]:
 
 
 def range_rows(fit: EmittanceFit) -> list[tuple[str, list[str]]]:
-    """What was left out and one cell per plane: the normalised emittance and its shift."""
+    """Points left out, and one cell per plane: the normalised emittance and its shift."""
     columns = [{r.left_out: r for r in range_sensitivity(p)} for p in fit.planes]
     names = dict.fromkeys(name for column in columns for name in column)
     return [(name, [_range_cell(column.get(name)) for column in columns]) for name in names]

@@ -39,8 +39,7 @@ from beamfit.emittance.wishes import (
 from beamfit.errors import InputError
 from beamfit.greybox import tree
 from beamfit.greybox.descend import Found, descend_all
-from beamfit.greybox.fit import Fit
-from beamfit.greybox.fit import FittedVariable as Variable
+from beamfit.greybox.fit import Fit, FittedVariable
 from beamfit.greybox.problem import (
     TOLERANCE,
     Free,
@@ -283,7 +282,7 @@ def _search(stated: Problem, seed: int) -> tuple[list[tuple[np.ndarray, float]],
 
 
 def _apart(theta: np.ndarray, minima: Sequence[tuple[np.ndarray, float]]) -> bool:
-    """Whether settings are none of those found."""
+    """True if settings are none of those found."""
     return all(np.abs(theta - known).max() > 2.0 * SAME for known, _ in minima)
 
 
@@ -342,8 +341,8 @@ def _relative_misses(wanted: _Wanted, targets, theta: np.ndarray) -> tuple[float
     return tuple(float(m / (1e6 * t.value) if np.ndim(t.value) == 0 else m**2) for t, m in pairs)
 
 
-def _pulled(v: Variable, cost: float) -> bool:
-    """Whether a setting on its limit would lower the objective if it went on."""
+def _pulled(v: FittedVariable, cost: float) -> bool:
+    """True if a setting on its limit would lower the objective by going on."""
     return abs(v.value) == 1.0 and abs(v.reduced_gradient) > 1e-6 * cost
 
 

@@ -154,7 +154,7 @@ class Setpoint:
 
 
 class Evidence(NamedTuple):
-    """What the verdict on a set point rests on.
+    """Evidence for the verdict on a set point.
 
     Attributes
     ----------

@@ -118,7 +118,7 @@ def solve_size_squared(data: SizeData, weights: str = "model") -> SigmaFit:
 
 
 def _determinant(sigma: Array, covariance: Array) -> tuple[Array, Array]:
-    """Of the beam matrix, with its error."""
+    """Determinant of the beam matrix, with its error."""
     gradient = jnp.stack([sigma[2], -2.0 * sigma[1], sigma[0]])
     return sigma[0] * sigma[2] - sigma[1] ** 2, jnp.sqrt(gradient @ covariance @ gradient)
 

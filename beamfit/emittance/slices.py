@@ -44,7 +44,7 @@ class SliceFits:
 
     @property
     def slices(self) -> tuple[str, ...]:
-        """What the slices are called."""
+        """Names of the slices."""
         return tuple(fit.scan.slices[0] for fit in self.fits)
 
     @property
@@ -60,7 +60,7 @@ class SliceFits:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What is odd about the numbers of any slice, each said once."""
+        """Sentences on what is odd about any slice, each said once."""
         return tuple(dict.fromkeys(note for fit in self.fits for note in fit.notes))
 
     def of_plane(self, plane: str) -> list[tuple[EmittanceFit, PlaneFit]]:

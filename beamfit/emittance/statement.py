@@ -123,7 +123,7 @@ class Seen(NamedTuple):
 
 @dataclass(frozen=True)
 class Scenario:
-    """What is unknown besides the beam, as a value that everybody asks and nobody compares.
+    """A choice of unknowns besides the beam, as a value that everybody asks and nobody compares.
 
     Parameters
     ----------
@@ -177,7 +177,7 @@ def varied_magnets(scan: QuadScan) -> tuple[str, ...]:
 
 
 def asked_of(seen: Seen, plane: str, whole_map: bool = True, line: Beamline | None = None) -> Asked:
-    """Where the beam of a plane is asked for, through a line: the rows' own, if none is given."""
+    """Places of a plane's numbers through a line: the rows' own, if none is given."""
     design = seen.scanned.design
     twiss = getattr(design, plane, None)
     return Asked(
@@ -214,7 +214,7 @@ def size_records(problem: Problem) -> dict[str, Record]:
 def asked_in(
     problem: Problem, seen: Seen, planes: Iterable[str], whole_map: bool
 ) -> tuple[Asked, ...]:
-    """Where the beams of planes are asked for, through the lines that a problem has."""
+    """Places of the planes' numbers, through the lines that a problem has."""
     records = size_records(problem)
     lines = {plane: records[plane].data.line if whole_map else None for plane in planes}
     return tuple(asked_of(seen, plane, whole_map, line) for plane, line in lines.items())

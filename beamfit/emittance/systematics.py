@@ -51,7 +51,7 @@ class Term(NamedTuple):
 
 
 class Effects(NamedTuple):
-    """What makes up the error of a normalised emittance, relative to it.
+    """Parts of the error of a normalised emittance, relative to it.
 
     Attributes
     ----------

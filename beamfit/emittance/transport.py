@@ -177,7 +177,7 @@ class Rows:
 def through_screen(
     found: Mapping[str, Any], r11: Array, r12: Array, known: Array
 ) -> tuple[Array, Array, Array]:
-    """What a screen or wire makes of them that has a scale and a thickness."""
+    """R11, R12 and known size² as a screen or wire of some scale and thickness shows them."""
     scale, wire = found.get("size_scale", 1.0), found.get("wire", 0.0)
     return scale * r11, scale * r12, scale**2 * (known + (wire / 4.0) ** 2)
 

@@ -46,7 +46,7 @@ class Gain(NamedTuple):
 
     @property
     def holds(self) -> bool:
-        """Whether the enclosure keeps to the sign; rounding is part of the enclosure."""
+        """True if the enclosure keeps to the sign; rounding is part of the enclosure."""
         reach = 1e-12 * max(abs(self.lower), abs(self.upper))
         if self.sign == 0:
             return True
@@ -61,7 +61,7 @@ class Certificate(NamedTuple):
 
     @property
     def holds(self) -> bool:
-        """Whether every gain keeps to its sign everywhere in the box."""
+        """True if every gain keeps to its sign everywhere in the box."""
         return all(gain.holds for gain in self.gains)
 
 
@@ -198,7 +198,7 @@ def _names(seen: Seen, lay: _Layout) -> list[str]:
 
 
 def _anchors(seen: Seen, lay: _Layout, told: Assumptions, rows: NetworkRows) -> Iterator[Record]:
-    """What ties the network to first principles, as records."""
+    """Tie of the network to first principles, as records."""
     anchor, plane, at = told.anchor, rows.plane, seen.measured(rows.plane)
     i, places = seen.planes.index(plane), len(seen.rows.places)
     points, which = lay.columns[at], seen.rows.which[at]

@@ -41,7 +41,7 @@ REMEDIES = {
 
 
 class Evidence(NamedTuple):
-    """What a verdict on one plane rests on.
+    """Evidence for the verdict on one plane.
 
     Attributes
     ----------
@@ -87,19 +87,19 @@ class Evidence(NamedTuple):
 
     @property
     def untested(self) -> bool:
-        """Whether three monitors give three numbers, and nothing is left to compare."""
+        """True if three monitors give three numbers, and nothing is left to compare."""
         return self.points == 3 and not self.moved and self.errors
 
     @property
     def of_a_beam(self) -> bool:
-        """Whether the sizes are a beam's, of an emittance or none."""
+        """True if the sizes are a beam's, of an emittance or none."""
         if not self.seen or self.points <= 3:
             return self.seen and self.untested
         return self.probability[BEAM] + self.probability[FLAT] > SURE
 
     @property
     def determined(self) -> bool:
-        """Whether they are a beam's and say its emittance."""
+        """True if they are a beam's and say its emittance."""
         sure = self.untested or self.probability[BEAM] > SURE
         narrow = self.low > 0.0 and self.high < USEFUL * self.low
         return self.of_a_beam and sure and narrow and not self.opened and self.ending is None
@@ -273,7 +273,7 @@ def one_magnet(settings: dict[str, np.ndarray], screens: tuple[str, ...]) -> np.
 def waist_bracketed(
     settings: dict[str, np.ndarray], screens: tuple[str, ...], size: np.ndarray, error: np.ndarray
 ) -> bool | None:
-    """Whether the sizes rise, by two standard errors, on both sides of the smallest.
+    """Tell if the sizes rise, by two standard errors, on both sides of the smallest.
 
     Parameters
     ----------

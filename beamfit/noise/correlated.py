@@ -58,7 +58,7 @@ def log_volume(apart, xp=jnp):
 
 
 def is_correlated(residuals: np.ndarray, parameters: int, seen: float = SEEN) -> bool:
-    """Whether residuals lie closer to their neighbours than independent ones would.
+    """Tell if residuals lie closer to their neighbours than independent ones would.
 
     The mean correlation of residuals of independent errors is -parameters/n.
 
@@ -75,7 +75,7 @@ def is_correlated(residuals: np.ndarray, parameters: int, seen: float = SEEN) ->
 
 
 def remembers(residuals: np.ndarray, parameters: int, slow: float = SEEN) -> bool:
-    """Whether residuals, or their means over some neighbours, are correlated, these by `slow`.
+    """Tell if residuals, or their means over some neighbours, are correlated, these by `slow`.
 
     Examples
     --------

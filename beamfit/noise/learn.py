@@ -29,7 +29,7 @@ PRIORS = {
 
 
 class Sample(NamedTuple):
-    """What one plane says of the scale of its noise.
+    """Evidence of one plane for the scale of its noise.
 
     Attributes
     ----------

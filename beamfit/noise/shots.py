@@ -20,7 +20,7 @@ LARGEST = 2.0
 
 
 class ShotMeans(NamedTuple):
-    """What shots say of the sizes at their settings.
+    """Mean sizes and errors of the shots at each setting.
 
     Attributes
     ----------
