@@ -350,9 +350,10 @@ def compare(
     for members in alike.values():
         for start in range(0, len(members), TOGETHER):
             own = members[start : start + TOGETHER]
-            for i, posterior in zip(
-                own, _compared([planes[i] for i in own], noise, method, weights), strict=True
-            ):
+            several = [planes[i] for i in own]
+            of_these = noise.of_points(len(several[0].size))
+            posteriors = _compared(several, of_these, method, weights)
+            for i, posterior in zip(own, posteriors, strict=True):
                 found[i] = posterior
     return found
 

@@ -149,7 +149,7 @@ def _sizes_of(problem: Problem, seen: Seen, planes: Sequence[str]) -> tuple[Size
         ]  # fmt: skip
         at, size = seen.measured(plane), work.sizes.size / post.unit
         own = (records[plane].data, at, size, post.unit, post.trace, tuple(kinds))
-        found.append(Sizes(plane, seen.noise, *own))
+        found.append(Sizes(plane, seen.noise.of_points(len(size)), *own))
     return tuple(found)
 
 

@@ -185,7 +185,8 @@ def _open(e: Evidence) -> str:
         return "the 95 % interval of the emittance begins at zero"
     factor = e.high / e.low
     said = f"{factor:.2g}" if factor < 100 else "more than 100"
-    return f"the 95 % interval of the emittance spans a factor {said}"
+    waist = " and the waist is not bracketed" if e.bracketed is False else ""
+    return f"the 95 % interval of the emittance spans a factor {said}{waist}"
 
 
 def noise_remark(noise: str, scale: np.ndarray, probability: float | None = None) -> str:

@@ -70,7 +70,8 @@ def test_errors_and_correlations_are_those_of_repeated_scans(line):
     np.testing.assert_allclose(np.diagonal(values), 1.0)
 
 
-def test_a_calibration_widens_the_errors(root):
+def test_a_calibration_widens_the_emittance_and_not_what_settings_give(root):
+    """Another slope with another beam gives the same sizes, inside the scan and near it."""
     scan = beamfit.read_quad_scan(root / "measurements/gtf_simulated.csv")
     line = beamfit.load_lattice(root / "lattices/gtf.toml")
     known = beamfit.fit_emittance(scan, line)
@@ -78,7 +79,8 @@ def test_a_calibration_widens_the_errors(root):
     open_ = beamfit.fit_emittance(scan, line, scenario="calibration", priors=prior)
     at = {"Q2": np.array([2.0, 6.0])}
     narrow, wide = known.predict(at), open_.predict(at)
-    assert (wide.error > narrow.error).all()
+    np.testing.assert_allclose(wide.error, narrow.error, rtol=0.1)
+    assert open_.x.emittance.error > known.x.emittance.error
     np.testing.assert_allclose(wide.size[0], narrow.size[0], atol=3 * wide.error[0])
 
 
