@@ -17,6 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from scipy.integrate import cumulative_trapezoid
 
 from beamfit.greybox.memory import Whitened, remembered
 from beamfit.greybox.problem import padded_length
@@ -555,16 +556,24 @@ def expanded(
     return Expansion.of(pieces, (numbers, level, *found))
 
 
-@partial(jax.jit, static_argnames="kind")
-def _further(rows: _Rows, numbers: Array, level: Array, times: Array, kind: str):
-    def slope(when: Array) -> Array:
-        return _about(jnp.concatenate([numbers[:3], jnp.array([0.0]), when[None]]), level, rows,
-                      kind, None)[1][:, FURTHER]  # fmt: skip
-
-    return jax.lax.map(slope, times).T
-
-
 def further_columns(about: Expansion, kind: str, times: np.ndarray) -> np.ndarray:
-    """Slopes of the residuals by a further loss at each time, both in units of the search."""
-    found = _further(about.pieces.scaled(), about.numbers, about.level, times, kind)
-    return np.asarray(found)[: about.residuals.size]
+    """Slopes of the residuals of a single decay by a further loss of each time, in units of the
+    search: what a loss takes fades as a difference of the first current does.
+
+    Examples
+    --------
+    >>> time = np.linspace(0.0, 1.0, 101)
+    >>> found = solved(Pieces.of(DecayRecord(time, 100 * np.exp(-0.1 * time))))
+    >>> column = further_columns(found, "step", np.array([0.5]))[:, 0]
+    >>> print(f"{column[50]:.3f} {column[-1] / found.pieces.current[-1]:.3f}")
+    0.000 -0.500
+    """
+    (span, _), level = about.pieces.units, about.rows[:, [LEVEL]]
+    time = (about.pieces.time / span)[:, None]
+    model = about.pieces.current / about.pieces.over + about.residuals
+    fading = model[:, None] / level
+    if kind == "step":
+        whole = cumulative_trapezoid(fading, time, axis=0, initial=0.0)
+        return -level * np.maximum(whole - np.interp(times, time[:, 0], whole[:, 0]), 0.0)
+    rates = time - 0.5 if kind == "drift" else np.exp(-time / times)
+    return -level * cumulative_trapezoid(rates * fading, time, axis=0, initial=0.0)
