@@ -172,7 +172,7 @@ def lifetime_law(about: Expansion, independent: bool, free: bool) -> LifetimeLaw
     columns = about.columns(*[POWER] * free)
     slopes = np.zeros((CURRENTS + 1, about.rows.shape[1]))
     slopes[:, 1:4] = np.asarray(jax.jacfwd(rates)(about.numbers[:3]))
-    memory = about.whitened(columns, independent).memory()
+    memory = about.memory(columns, independent)
     errors = memory.moments(slopes[:, columns], about.given).error
     over = about.pieces.over
     for change in about.pieces.monitor_changes:
@@ -460,7 +460,7 @@ def _log_evidence(law: Expansion, name: str) -> float:
 def _quantities(law: Expansion, values: np.ndarray, slopes: np.ndarray, columns: list[int]):
     """Values with their errors by slopes of all columns."""
     independent = not law.wanders
-    memory = law.whitened(columns, independent).memory()
+    memory = law.memory(columns, independent)
     errors = memory.moments(slopes[:, columns], law.given).error
     return zip(values, errors, strict=True)
 

@@ -143,7 +143,7 @@ class Evidence:
         return not self.about.wanders or (self.cycles == 1 and self.changed)
 
     def _memory(self, independent: bool, *more: int) -> Memory:
-        return self.about.whitened(self.about.columns(*more), independent).memory()
+        return self.about.memory(self.about.columns(*more), independent)
 
     @cached_property
     def memory(self) -> Memory:

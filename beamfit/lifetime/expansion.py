@@ -19,7 +19,7 @@ import numpy as np
 from jax import Array
 from scipy.integrate import cumulative_trapezoid
 
-from beamfit.greybox.memory import Whitened, remembered
+from beamfit.greybox.memory import Memory, Whitened, remembered
 from beamfit.greybox.problem import padded_length
 from beamfit.lifetime.decay_law import HOUR, Moments, beam_current, cumulative
 from beamfit.lifetime.record import DecayRecord, Monitor
@@ -42,6 +42,8 @@ POWERS, TIMES = (-0.95, 3.0), (1e-3, 10.0)
 # A drift under white noise counts from so many standard errors on: it enlarges errors much. Fewer
 # readings tell nothing of the memory of their noise.
 SLOW, FEWEST = 3.0, 12
+# Noises of so small a part of the largest probability move no digit.
+NO_WEIGHT = 1e-12
 # Records solved in one call; fewer are filled up, so that one number is compiled.
 TOGETHER = 16
 
@@ -439,20 +441,22 @@ class Expansion:
         """Places of the plain law's columns and of more; levels of many pieces are eliminated."""
         return [LEVEL] * (self.level.size == 1) + [*PLAIN, *more]
 
-    def whitened(self, columns: Sequence[int], independent: bool) -> Whitened:
-        """What slopes by some columns and residuals say of the noise.
+    def memory(self, columns: Sequence[int], independent: bool) -> Memory:
+        """Posterior over noises, given the slopes by some columns and the residuals.
 
         Independent noise has the prior beside the residuals, for one too short a record; whatever
-        memory the noise may have otherwise.
+        memory the noise may have otherwise. Noises of no weight are left out.
         """
         if not independent:
             slopes, time = self.rows[:, columns], self.pieces.time
-            return remembered(slopes, self.residuals, time, self.levels)
+            found = remembered(slopes, self.residuals, time, self.levels).memory()
+            kept = found.weight > NO_WEIGHT * found.weight.max()
+            return Memory(*(part[kept] for part in found[:-1]), found.dof)
         known = np.append(np.equal(columns, QUADRATIC), self.numbers[QUADRATIC - 1])
         rows = np.vstack([self.left[:, [*columns, -1]], self.prior * known])
         count = self.residuals.size - (0 if self.levels is None else self.level.size)
         triangle = np.linalg.qr(rows, mode="r")[None]
-        return Whitened(Noise(np.zeros(1), np.zeros(1)), triangle, np.zeros(1), count)
+        return Whitened(Noise(np.zeros(1), np.zeros(1)), triangle, np.zeros(1), count).memory()
 
     def moved(self, change: np.ndarray) -> Physical:
         """What a change of the readings, over their errors, does to the values by least squares;

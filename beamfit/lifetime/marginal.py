@@ -325,8 +325,11 @@ def _drawn(seen: Seen, peaks: Peaks, draws: int) -> Draws:
     named = Numbers.of(numbers)
     away = named.currents(seen.gas) - seen.origin
     products = seen.products
-    squares = products.matrix[kind, 0, 0] - 2 * np.sum(products.matrix[kind, 0, 1:] * away.T, 1)
-    squares = squares + np.einsum("dn,dnm,dm->d", away.T, products.matrix[kind, 1:, 1:], away.T)
+    beside = np.vstack([-np.ones(draws), away])
+    squares = np.empty(draws)
+    for one in np.unique(kind):  # draws of one noise together: one product of matrices
+        some = beside[:, kind == one]
+        squares[kind == one] = np.sum(some * (products.matrix[one] @ some), axis=0)
     log = products.log_prior[kind] + products.log_size(np.maximum(squares, 1e-30))
     log = log + np.log(named.level * named.rate * named.unit) + log_prior(named.power)[0]
     if 4 in free:

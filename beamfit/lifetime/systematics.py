@@ -207,7 +207,7 @@ def single_exponential(record: DecayRecord, fit: DecayFit | None = None) -> OneL
     True
     """
     found = solved(Pieces.of(record), (LOSS,))
-    moments = found.whitened((LEVEL, LOSS), True).memory().moments(np.eye(2)[1:], found.given)
+    moments = found.memory((LEVEL, LOSS), True).moments(np.eye(2)[1:], found.given)
     error = float(moments.error[0]) / record.span
     left = found.residuals * found.pieces.over
     fit = fit or fit_decay(record, law=Law.constant)
