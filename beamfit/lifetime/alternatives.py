@@ -16,7 +16,6 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.special import logsumexp
 
-from beamfit.lifetime.decay_law import HOUR
 from beamfit.lifetime.expansion import (
     FURTHER,
     LEVEL,
@@ -35,7 +34,7 @@ from beamfit.lifetime.expansion import (
 from beamfit.lifetime.marginal import ABOVE, BELOW, DRIFT
 from beamfit.lifetime.record import DecayRecord
 from beamfit.noise.memory import Products
-from beamfit.quantity import Quantity
+from beamfit.quantity import HOUR, Quantity
 from beamfit.shown import shown
 from beamfit.status import Status
 from beamfit.table import json_of

@@ -11,10 +11,10 @@ import numpy as np
 
 from beamfit.lifetime.alternatives import ConstantA, LifetimeLaw, Outgassing
 from beamfit.lifetime.cycles import is_sawtooth
-from beamfit.lifetime.decay_law import HOUR
 from beamfit.lifetime.evidence import BELIEVED, DETERMINED, SEPARABLE, UNITS, Evidence
 from beamfit.lifetime.pieces import noise_of
 from beamfit.lifetime.record import Monitor
+from beamfit.quantity import HOUR
 from beamfit.statistics import MANY, POOR_FIT, chi2_probability, few_words
 from beamfit.status import Status
 from beamfit.verdict import Finding, judge

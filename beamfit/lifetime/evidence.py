@@ -22,13 +22,12 @@ from beamfit.lifetime.alternatives import (
     lifetime_law,
     rival_of,
 )
-from beamfit.lifetime.decay_law import HOUR
 from beamfit.lifetime.expansion import LOSS, POWER, QUADRATIC, Expansion, Physical, lifetime_of
 from beamfit.lifetime.marginal import BELOW, FreeLaw, Law, free_law
 from beamfit.lifetime.record import DecayRecord
 from beamfit.noise.correlated import whitened
 from beamfit.noise.memory import CLOSE, Products
-from beamfit.quantity import Quantity
+from beamfit.quantity import HOUR, Quantity
 from beamfit.shown import shown
 from beamfit.status import Status
 

@@ -17,14 +17,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from scipy.integrate import cumulative_trapezoid
+from scipy.integrate import cumulative_simpson
 
 from beamfit.greybox.memory import Memory, Whitened, remembered
 from beamfit.greybox.problem import padded_length
-from beamfit.lifetime.decay_law import HOUR, Moments, beam_current, cumulative
+from beamfit.lifetime.decay_law import Moments, beam_current, cumulative
 from beamfit.lifetime.record import DecayRecord, Monitor
 from beamfit.noise.correlated import Levels, Noise, remembers
-from beamfit.quantity import Quantity
+from beamfit.quantity import HOUR, Quantity
 
 # Columns of the slopes: the current of the piece, loss at the mean current and its quadratic part,
 # power of a, a further loss and its time.
@@ -286,66 +286,91 @@ def _start(rows: _Rows) -> tuple[Array, Array, Array, Array]:
     return both, level, jnp.maximum(jnp.minimum(noise, less), least), width
 
 
+class _Question(NamedTuple):
+    """Columns whose numbers are free, the kind of further losses, and the shape of a."""
+
+    free: tuple[int, ...]
+    kind: str | None
+    shape: Shape | None
+
+    def mask(self, size: int) -> Array:
+        """Free ones of so many numbers."""
+        return jnp.isin(jnp.arange(1, size + 1), jnp.array(self.free))
+
+    def within(self, numbers: Array, before: Array) -> Array:
+        """Free numbers within their bounds, and the others as before."""
+        more = numbers.size // 2 - 1
+        low = jnp.array([-jnp.inf, -jnp.inf, POWERS[0]] + [-jnp.inf, TIMES[0]] * more)
+        high = jnp.array([jnp.inf, jnp.inf, POWERS[1]] + [jnp.inf, TIMES[1]] * more)
+        return jnp.where(self.mask(numbers.size), jnp.clip(numbers, low, high), before)
+
+
+def _begun(rows: _Rows, begin: Array, both: Array, level: Array, question: _Question):
+    """Numbers and levels to begin at: those given, or from integrals, or a plain decay's."""
+    mask, given = question.mask(begin.size), jnp.isfinite(begin[0])
+    own = jnp.zeros(begin.size).at[:2].set(both)
+    plain = jnp.zeros(begin.size).at[:2].set(jnp.array([0.1, 0.05]))
+    start = jnp.where(given, begin, own * mask)
+    # A start taken from noise can lie where the law has no value; a plain decay never does.
+    good = jnp.isfinite(_about(start, level, rows, question.kind, question.shape)[0]).all()
+    return jnp.where(good | given, start, plain * mask), jnp.where(good, level, 1.0)
+
+
+def _tried(numbers: Array, level: Array, rows: _Rows, prior: Array, question: _Question):
+    """Residuals, slopes and their sum of squares, infinite where the law has no value."""
+    residual, slopes, *_ = _about(numbers, level, rows, question.kind, question.shape)
+    known = prior * numbers[jnp.array(question.free) - 1]
+    cost = residual @ residual + jnp.sum(known**2)
+    fine = jnp.isfinite(slopes).all() & jnp.isfinite(cost)
+    return residual, slopes, jnp.where(fine, cost, jnp.inf)
+
+
+def _advanced(s: _State, rows: _Rows, prior: Array, noise: Array, question: _Question) -> _State:
+    """Take the step, or half of it where it did not help, and find the next."""
+    places = jnp.array(question.free)
+    tried = question.within(s.numbers + s.share * s.step, s.numbers), s.level - s.share * s.down
+    tried += _tried(*tried, rows, prior, question)
+    better = tried[-1] <= s.cost * (1 + 1e-15)
+    numbers, level, residual, slopes, cost = (
+        jnp.where(better, new, old) for new, old in zip(tried, s[:5], strict=True)
+    )
+    columns = jnp.column_stack([slopes[:, places], residual])
+    left, worth = rows.without_levels(slopes[:, LEVEL], columns)
+    known = jnp.column_stack([jnp.diag(prior), prior * numbers[places - 1]])
+    step = _least_squares(left, known)
+    promised = jnp.linalg.norm(left[:, :-1] @ step)
+    rounding = 1e-14 * jnp.linalg.norm(slopes[:, LEVEL])
+    share = jnp.where(better, 1.0, s.share / 2)
+    # Where no step however short is better, what it promised must be below the noise.
+    small = s.rested | (better & (promised <= NEAR * noise + rounding))
+    stuck = ~better & (s.share <= 0.5**HALVED)
+    return _State(
+        numbers, level, residual, slopes, cost, jnp.zeros_like(numbers).at[places - 1].set(step),
+        worth[:, :-1] @ step + worth[:, -1], share, small | stuck, s.count + 1,
+    )  # fmt: skip
+
+
 @partial(jax.jit, static_argnames=("free", "kind", "shape"))
 def _searched(rows: _Rows, begin: Array, widths: Array, free, kind=None, shape=None):
     """Gauss and Newton from numbers, NaN where the start is to be found; and what they leave.
 
     `widths` are those of normal priors about zero.
     """
+    question = _Question(free, kind, shape)
     both, level, noise, width = _start(rows)
-    own = jnp.zeros(begin.size).at[:2].set(both)
-    plain = jnp.zeros(begin.size).at[:2].set(jnp.array([0.1, 0.05]))
-    mask = jnp.isin(jnp.arange(1, begin.size + 1), jnp.array(free))
-    given = jnp.isfinite(begin[0])
-    start = jnp.where(given, begin, own * mask)
-    # A start taken from noise can lie where the law has no value; a plain decay never does.
-    good = jnp.isfinite(_about(start, level, rows, kind, shape)[0]).all()
-    start = jnp.where(good | given, start, plain * mask)
-    level = jnp.where(good, level, 1.0)
-    places = jnp.array(free)
-    prior = noise / widths + jnp.where(places == QUADRATIC, noise / width, 0.0) * (shape is None)
-    low = jnp.array([-jnp.inf, -jnp.inf, POWERS[0]] + [-jnp.inf, TIMES[0]] * (begin.size // 2 - 1))
-    high = jnp.array([jnp.inf, jnp.inf, POWERS[1]] + [jnp.inf, TIMES[1]] * (begin.size // 2 - 1))
-
-    def tried(numbers: Array, level: Array):
-        residual, slopes, *_ = _about(numbers, level, rows, kind, shape)
-        cost = residual @ residual + jnp.sum((prior * numbers[places - 1]) ** 2)
-        fine = jnp.isfinite(slopes).all() & jnp.isfinite(cost)
-        return residual, slopes, jnp.where(fine, cost, jnp.inf)
-
-    def advance(s: _State) -> _State:
-        numbers = jnp.clip(s.numbers + s.share * s.step, low, high)
-        numbers = jnp.where(mask, numbers, s.numbers)
-        at = s.level - s.share * s.down
-        residual, slopes, cost = tried(numbers, at)
-        better = cost <= s.cost * (1 + 1e-15)
-        numbers, at, residual, slopes, cost = (
-            jnp.where(better, new, old)
-            for new, old in zip((numbers, at, residual, slopes, cost), s[:5], strict=True)
-        )
-        columns = jnp.column_stack([slopes[:, places], residual])
-        left, worth = rows.without_levels(slopes[:, LEVEL], columns)
-        known = jnp.column_stack([jnp.diag(prior), prior * numbers[places - 1]])
-        step = _least_squares(left, known)
-        promised = jnp.linalg.norm(left[:, :-1] @ step)
-        rounding = 1e-14 * jnp.linalg.norm(slopes[:, LEVEL])
-        share = jnp.where(better, 1.0, s.share / 2)
-        # Where no step however short is better, what it promised must be below the noise.
-        small = s.rested | (better & (promised <= NEAR * noise + rounding))
-        stuck = ~better & (s.share <= 0.5**HALVED)
-        return _State(
-            numbers, at, residual, slopes, cost, jnp.zeros_like(numbers).at[places - 1].set(step),
-            worth[:, :-1] @ step + worth[:, -1], share, small | stuck, s.count + 1,
-        )  # fmt: skip
-
-    residual, slopes, _ = tried(start, level)
+    weak = noise / width * (shape is None)
+    prior = noise / widths + jnp.where(jnp.array(free) == QUADRATIC, weak, 0.0)
+    start, level = _begun(rows, begin, both, level, question)
+    residual, slopes, _ = _tried(start, level, rows, prior, question)
     first = _State(start, level, residual, slopes, jnp.inf, jnp.zeros_like(start),
                    jnp.zeros_like(level), 1.0, False, 0)  # fmt: skip
-    first = jax.tree.map(jnp.asarray, first)
-    last = jax.lax.while_loop(lambda s: ~s.rested & (s.count < STEPS), advance, first)
+    last = jax.lax.while_loop(
+        lambda s: ~s.rested & (s.count < STEPS),
+        lambda s: _advanced(s, rows, prior, noise, question),
+        jax.tree.map(jnp.asarray, first),
+    )
     residual, slopes, values, by = _about(last.numbers, last.level, rows, kind, shape)
-    prior = noise / width * (shape is None)
-    return last.numbers, last.level, residual, slopes, values, by, last.rested, prior
+    return last.numbers, last.level, residual, slopes, values, by, last.rested, weak
 
 
 @partial(jax.jit, static_argnames=("kind", "shape"))
@@ -573,11 +598,10 @@ def further_columns(about: Expansion, kind: str, times: np.ndarray) -> np.ndarra
     0.000 -0.500
     """
     (span, _), level = about.pieces.units, about.rows[:, [LEVEL]]
-    time = (about.pieces.time / span)[:, None]
-    model = about.pieces.current / about.pieces.over + about.residuals
-    fading = model[:, None] / level
+    time, model = about.pieces.time / span, about.pieces.current / about.pieces.over
+    fading = (model + about.residuals)[:, None] / level
     if kind == "step":
-        whole = cumulative_trapezoid(fading, time, axis=0, initial=0.0)
-        return -level * np.maximum(whole - np.interp(times, time[:, 0], whole[:, 0]), 0.0)
-    rates = time - 0.5 if kind == "drift" else np.exp(-time / times)
-    return -level * cumulative_trapezoid(rates * fading, time, axis=0, initial=0.0)
+        whole = cumulative_simpson(fading, x=time, axis=0, initial=0.0)
+        return -level * np.maximum(whole - np.interp(times, time, whole[:, 0]), 0.0)
+    rates = time[:, None] - 0.5 if kind == "drift" else np.exp(-time[:, None] / times)
+    return -level * cumulative_simpson(rates * fading, x=time, axis=0, initial=0.0)

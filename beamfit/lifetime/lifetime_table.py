@@ -17,11 +17,10 @@ from beamfit.greybox.problem import Free, Problem, Record, padded_length
 from beamfit.greybox.solve import solve
 from beamfit.lifetime.alternatives import CURRENTS, ConstantA, LifetimeLaw, constant_a
 from beamfit.lifetime.answer import TableEvidence, finding_of_table
-from beamfit.lifetime.decay_law import HOUR
 from beamfit.lifetime.evidence import EXACT, UNITS
 from beamfit.lifetime.fit import bare
 from beamfit.lifetime.record import FEWEST_LIFETIMES, LifetimeTable
-from beamfit.quantity import Quantity, Status
+from beamfit.quantity import HOUR, Quantity, Status
 from beamfit.shown import shown
 from beamfit.statistics import reach_of
 from beamfit.table import Table, json_of, labelled, plain_name

@@ -25,9 +25,7 @@ from beamfit.greybox.fit import Fit
 from beamfit.greybox.mlp import MLP, Layer, Port
 from beamfit.greybox.problem import Free, Prior, Problem, Record
 from beamfit.greybox.solve import solve
-from beamfit.lifetime.decay_law import HOUR
-from beamfit.lifetime.mechanisms import LossTerms as Terms
-from beamfit.lifetime.mechanisms import loss_terms, scaled_losses
+from beamfit.lifetime.mechanisms import LossTerms, loss_terms, scaled_losses
 from beamfit.lifetime.ring import Operation
 from beamfit.lifetime.scales import (
     PRESSURE_ERROR,
@@ -39,7 +37,7 @@ from beamfit.lifetime.scales import (
     summarise,
 )
 from beamfit.lifetime.study import Decay, Machine, operation_during
-from beamfit.quantity import Quantity
+from beamfit.quantity import HOUR, Quantity
 from beamfit.shown import shown
 from beamfit.table import json_of
 
@@ -346,7 +344,7 @@ def _predict(model: Mapping[str, MLP], data: Data) -> Array:
     return weight @ loss_parts(a, b, current).ravel()
 
 
-def _base(scales: np.ndarray | None, terms: Terms) -> Array:
+def _base(scales: np.ndarray | None, terms: LossTerms) -> Array:
     """ln a and ln b of first principles, which the network corrects; zero if it stands alone."""
     if scales is None:
         return jnp.zeros((terms.current.size, 2))

@@ -19,11 +19,11 @@ import numpy as np
 from numpy.polynomial.chebyshev import chebint, chebvander
 from scipy.special import gammaln, log_ndtr, logsumexp
 
-from beamfit.lifetime.decay_law import HOUR, closed_form
+from beamfit.lifetime.decay_law import closed_form
 from beamfit.lifetime.expansion import Physical
 from beamfit.lifetime.record import DecayRecord
 from beamfit.noise.memory import Products
-from beamfit.quantity import Quantity
+from beamfit.quantity import HOUR, Quantity
 
 # Standard deviations of the exponent below and above zero. Bunches lengthen with the current, in
 # the potential well by x³ - x ∝ I (`beamfit.lifetime.bunch`), so that a goes as I^0 to I^-1/3; that

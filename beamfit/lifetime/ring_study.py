@@ -22,7 +22,6 @@ from beamfit.lifetime.advice import (
     best_operating_point,
     next_decays,
 )
-from beamfit.lifetime.decay_law import HOUR
 from beamfit.lifetime.expansion import lifetime_of
 from beamfit.lifetime.fit import bare
 from beamfit.lifetime.loss_network import Network, NetworkFit, fit_loss_network
@@ -38,7 +37,7 @@ from beamfit.lifetime.scales import (
     summarise,
 )
 from beamfit.lifetime.study import Decay, Machine, operation_during, settings_json
-from beamfit.quantity import Quantity, Status
+from beamfit.quantity import HOUR, Quantity, Status
 from beamfit.sampling.intervals import Interval
 from beamfit.sampling.posterior import Posterior
 from beamfit.shown import shown

@@ -13,7 +13,6 @@ from beamfit.errors import InputError
 from beamfit.lifetime import alarm
 from beamfit.lifetime.course import BEST_MONITOR, WANDER, alike_over
 from beamfit.lifetime.cycles import alike, cut_at_refills, joined, usual_cycle
-from beamfit.lifetime.decay_law import HOUR
 from beamfit.lifetime.evidence import UNITS
 from beamfit.lifetime.fit import DecayFit, bare, fit_decay, fit_pieces
 from beamfit.lifetime.marginal import Law
@@ -27,7 +26,7 @@ from beamfit.lifetime.study import (
     operation_during,
     seen_through,
 )
-from beamfit.quantity import Quantity, Status
+from beamfit.quantity import HOUR, Quantity, Status
 from beamfit.table import json_of
 
 

@@ -22,7 +22,6 @@ from beamfit.lifetime.cycles import (
     unresolved,
     usual_cycle,
 )
-from beamfit.lifetime.decay_law import HOUR
 from beamfit.lifetime.evidence import SEPARABLE
 from beamfit.lifetime.fit import DecayFit, bare, fit_cycles, fit_decay
 from beamfit.lifetime.marginal import Law
@@ -39,7 +38,7 @@ from beamfit.lifetime.pieces import (
 from beamfit.lifetime.record import DecayRecord
 from beamfit.lifetime.ring import MeasuredLength, Operation, Ring, unstored
 from beamfit.lifetime.systematics import DecayChecks, Systematic, check_decay, systematics
-from beamfit.quantity import Quantity, Status
+from beamfit.quantity import HOUR, Quantity, Status
 from beamfit.shown import shown
 from beamfit.table import json_of
 

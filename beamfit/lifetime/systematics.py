@@ -10,7 +10,6 @@ import numpy as np
 
 from beamfit.errors import InputError
 from beamfit.lifetime.alternatives import ConstantA
-from beamfit.lifetime.decay_law import HOUR
 from beamfit.lifetime.evidence import UNITS
 from beamfit.lifetime.expansion import (
     LEVEL,
@@ -27,7 +26,7 @@ from beamfit.lifetime.expansion import (
 from beamfit.lifetime.fit import DecayFit, bare, fit_decay
 from beamfit.lifetime.marginal import Law
 from beamfit.lifetime.record import DecayRecord
-from beamfit.quantity import Quantity, Status
+from beamfit.quantity import HOUR, Quantity, Status
 from beamfit.shown import shown
 from beamfit.table import json_of
 
@@ -351,7 +350,8 @@ def constant_a_test(record: DecayRecord) -> ConstantA:
 
     Examples
     --------
-    >>> from beamfit.lifetime.decay_law import HOUR, current
+    >>> from beamfit.lifetime.decay_law import current
+    >>> from beamfit.quantity import HOUR
     >>> t = np.linspace(0, 8 * 3600, 500)
     >>> noise = 1e-3 * np.random.default_rng(1).normal(size=t.size)
     >>> record = DecayRecord(t, np.array(current(t, 500.0, 2e-8, 1e-6)) + noise)
