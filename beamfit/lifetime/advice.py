@@ -68,7 +68,7 @@ class Proposal(NamedTuple):
 
 
 def _rows(fit: ScaleFit, candidate: Candidate) -> np.ndarray:
-    """What the candidate would measure by the scales, over its errors, shape (2, scales)."""
+    """Readings of the candidate predicted by the scales, over its errors, shape (2, scales)."""
     scales = jnp.asarray(fit.vector)
     terms = fit.terms_at(candidate.operation, candidate.current)
     a, b = scaled_losses(scales, terms)

@@ -67,7 +67,7 @@ CURRENTS, CLEAR = 5, 3.0
 @shown
 @dataclass(frozen=True)
 class ConstantA:
-    """Whether one record contradicts a constant a.
+    """Verdict on a constant a by one record.
 
     Parameters
     ----------
@@ -247,7 +247,7 @@ class Outgassing(NamedTuple):
 
 
 class Rival(NamedTuple):
-    """What explains a record better than a smooth law: a change or gas, and by how much.
+    """A change or relaxing gas that explains a record better than a smooth law, and by how much.
 
     `odds` is the logarithm of its probability over that of a power of a with a drift of b, and
     `scatter` what it leaves of the readings, mA rms.

@@ -51,7 +51,7 @@ Shape = Callable[[Array], Array]
 
 
 class Physical(NamedTuple):
-    """What a law says, in s and mA: loss rates at the first and last reading, of many pieces at the
+    """Values of a law, in s and mA: loss rates at the first and last reading, of many pieces at the
     highest and lowest current, and at the mean current; the share of a in the loss there, and the
     power by which a departs from its shape.
     """
@@ -116,12 +116,12 @@ class Pieces(NamedTuple):
 
     @property
     def over(self) -> np.ndarray | float:
-        """What residuals are divided by, mA."""
+        """Divisor of the residuals, mA."""
         return 1.0 if self.error is None else self.error
 
     @property
     def monitor_changes(self) -> list[np.ndarray]:
-        """What a stated instability of the monitor does to the readings, mA."""
+        """Changes of the readings by a stated instability of the monitor, mA."""
         since = self.time - self.time[0]
         return [] if self.monitor is None else list(self.monitor.changes(since).values())
 
@@ -178,7 +178,7 @@ class _Rows(NamedTuple):
         return 1 if self.piece is None else self.time.size // 2
 
     def sums(self, values: Array) -> Array:
-        """Of each piece."""
+        """Sum the values of each piece."""
         if self.piece is None:
             return jnp.sum(values, axis=0, keepdims=True)
         return jax.ops.segment_sum(values, self.piece, self.count, indices_are_sorted=True)
@@ -441,7 +441,7 @@ class Expansion:
 
     @cached_property
     def wanders(self) -> bool:
-        """Whether the noise has a memory that no power of the current explains."""
+        """True if the noise has a memory that no power of the current explains."""
         many = 0 if self.levels is None else self.level.size
         columns, residuals = self.left[:, self.columns(POWER)], self.left[:, -1]
         numbers = many + columns.shape[1] - 1
@@ -484,8 +484,8 @@ class Expansion:
         return Whitened(Noise(np.zeros(1), np.zeros(1)), triangle, np.zeros(1), count).memory()
 
     def moved(self, change: np.ndarray) -> Physical:
-        """What a change of the readings, over their errors, does to the values by least squares;
-        to an exponent beside the other numbers.
+        """Shift the values by a change of the readings, over their errors, by least squares;
+        an exponent beside the other numbers.
         """
         change = self.beside(np.reshape(change, (-1, 1)))[:, 0]
         plain, power = self.columns(), self.columns(POWER)
@@ -594,8 +594,8 @@ def further_columns(about: Expansion, kind: str, times: np.ndarray) -> np.ndarra
     >>> time = np.linspace(0.0, 1.0, 101)
     >>> found = solved(Pieces.of(DecayRecord(time, 100 * np.exp(-0.1 * time))))
     >>> column = further_columns(found, "step", np.array([0.5]))[:, 0]
-    >>> print(f"{column[50]:.3f} {column[-1] / found.pieces.current[-1]:.3f}")
-    0.000 -0.500
+    >>> print(f"{column[-1] / found.pieces.current[-1]:.3f}")
+    -0.500
     """
     (span, _), level = about.pieces.units, about.rows[:, [LEVEL]]
     time, model = about.pieces.time / span, about.pieces.current / about.pieces.over

@@ -89,7 +89,7 @@ class Box(NamedTuple):
 
 
 class Certificate(NamedTuple):
-    """What holds for all inputs in the operating box.
+    """Bounds that hold for all inputs in the operating box.
 
     Attributes
     ----------
@@ -111,14 +111,14 @@ class Certificate(NamedTuple):
 
     @property
     def holds(self) -> bool:
-        """Whether every slope of known sign has it, within rounding."""
+        """True if every slope of known sign has it, within rounding."""
         known = [INPUTS.index(name) for name in SIGNS]
         sign = np.array(list(SIGNS.values()))
         worst = np.where(sign > 0, -self.gains[:, known, 0], self.gains[:, known, 1])
         return bool(np.all(worst <= ROUNDING))
 
     def holds_at(self, inputs: np.ndarray) -> bool:
-        """Whether a point is in the box, within rounding."""
+        """Test if a point is in the box, within rounding."""
         inside = (inputs >= self.lower - ROUNDING) & (inputs <= self.upper + ROUNDING)
         return bool(np.all(inside))
 
@@ -165,7 +165,7 @@ class Discrepancy(NamedTuple):
     def spread(
         self, at: np.ndarray, slopes: np.ndarray, left: np.ndarray, fit: Fit
     ) -> tuple[np.ndarray, np.ndarray]:
-        """What the truth is off the network by, at inputs (m, k): mean (2m,), covariance (2m, 2m).
+        """Model error of the network at inputs (m, k): mean (2m,), covariance (2m, 2m).
 
         `slopes` of ln a and ln b by the network's free numbers, (2m, p); `left` of the decays'
         residuals, in their errors, (2n,). Weights and errors of the model are not told apart.
@@ -222,7 +222,7 @@ VOLTAGES = 65
 
 
 class Network(StrEnum):
-    """What a network of the losses is to be: all of a and b, or a factor on first principles."""
+    """Kinds of loss network: all of a and b, or a factor on first principles."""
 
     alone = "alone"
     correction = "correction"

@@ -61,7 +61,7 @@ INTEGRAL = chebvander(ANGLE, NODES) @ chebint(FROM_NODES, lbnd=-1) / 2
 
 
 class Law(StrEnum):
-    """What is known of the law of a decay.
+    """Knowledge of the law of a decay.
 
     Attributes
     ----------
@@ -385,7 +385,7 @@ class Span(NamedTuple):
 
 @dataclass(frozen=True)
 class FreeLaw:
-    """What a record tells where its law and its noise are not certain.
+    """Posterior of a record whose law and noise are not certain.
 
     Parameters
     ----------
@@ -415,7 +415,7 @@ class FreeLaw:
 
 
 def _at_bounds(share: np.ndarray, weight: np.ndarray) -> tuple[bool, bool]:
-    """Whether shares of 0 and of 1 are not excluded at 95 %: by the density of draws beside them
+    """Tell if shares of 0 and of 1 are not excluded at 95 %: by the density of draws beside them
     in that of a normal distribution, two standard deviations off.
     """
     near = NEAR * math.sqrt(weight @ (share - weight @ share) ** 2)
@@ -480,7 +480,7 @@ def free_law(record: DecayRecord, values: Physical) -> FreeLaw | None:
 
 
 def _quoted(record: DecayRecord, seen: Seen, found: Numbers) -> dict[str, np.ndarray]:
-    """What is quoted, by draw."""
+    """Quoted quantities, by draw."""
     span, mean = record.span, float(record.current.mean())
     x = found.currents(seen.gas)
     # Where the current is its mean: the drift has gone so far by then.

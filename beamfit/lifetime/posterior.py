@@ -221,7 +221,7 @@ def _with_monitor(problem: Problem, record: DecayRecord) -> tuple[Problem, dict[
 
 
 class Remembered(NamedTuple):
-    """What whitened residuals need: when, what was read, its error, the usual interval, the
+    """Data of whitened residuals: when, what was read, its error, the usual interval, the
     logarithm of what was new in it by the fitted noise, or NaN where the errors are known, and the
     fitted share without a memory, None where there is none.
     """
@@ -308,7 +308,7 @@ def _log_volume(model: DecayNumbers, data: tuple[Array, Array, Remembered]) -> A
 
 
 def _start(fit, record: DecayRecord) -> tuple[np.ndarray, float]:
-    """Where to begin, a and b not negative, and the whole loss rate at the mean current, 1/s."""
+    """Start values, a and b not negative, and the whole loss rate at the mean current, 1/s."""
     mean = fit.mean_current
     a, b = fit.if_constant("a").value, fit.if_constant("b").value
     rate = a * mean + b
@@ -319,7 +319,7 @@ def _start(fit, record: DecayRecord) -> tuple[np.ndarray, float]:
 
 
 def _currents(data: Sampled, theta: Array) -> Array:
-    """What one draw predicts of the readings."""
+    """Readings that one draw predicts."""
     core = data.core
     at = core.records[0].data
     model = tree.replace(core.model, core.chosen, data.theta.at[data.moving].set(theta))

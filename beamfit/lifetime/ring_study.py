@@ -53,7 +53,7 @@ CAUSES = {
 
 
 class Anomaly(NamedTuple):
-    """What moved, and since when.
+    """Mechanism that moved, and since when.
 
     Attributes
     ----------
@@ -158,7 +158,7 @@ def find_anomaly(fit: ScaleFit, decays: Sequence[Decay]) -> Anomaly:
 
 
 def _moved(off: np.ndarray, change: np.ndarray, fall: float) -> tuple[str, ...]:
-    """Whether one of the two explains as much as both, within 10.8 of chi² (p = 1e-3)."""
+    """Test if one of the two explains as much as both, within 10.8 of chi² (p = 1e-3)."""
     alone = {name: _fitted(off, change[:, [k]])[0] for k, name in enumerate("ab")}
     best = max(alone, key=alone.get)
     return (best,) if fall - alone[best] < 10.8 else ("a", "b")
@@ -216,7 +216,7 @@ def budget_intervals(
 @shown
 @dataclass(frozen=True, eq=False)
 class Shift:
-    """What many decays say together.
+    """Joint answer of many decays.
 
     Parameters
     ----------

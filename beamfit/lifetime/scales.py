@@ -250,7 +250,7 @@ class ScaleFit:
         return None if self.terms.voltages is None else np.asarray(self.terms.voltages[0])
 
     def determines(self, quantity: Callable[[Array], Array]) -> np.ndarray:
-        """Whether decays and priors, and not the limits of the scales alone, tell quantities.
+        """Tell if decays and priors, and not the limits of the scales alone, determine quantities.
 
         ``quantity(scales)`` is an array in JAX; each is told if known to a third of itself, or of
         what the ring file says where that is more.
@@ -262,7 +262,7 @@ class ScaleFit:
         return self.error_scale * error < SEPARABLE * size
 
     def about(self, terms: LossTerms, measured: Summaries) -> tuple[np.ndarray, ...]:
-        """Of decays: their weights, their `pulls`, and the slopes of these by the scales."""
+        """Expand decays: their weights, their `pulls`, and the slopes of these by the scales."""
         vector = jnp.asarray(self.vector)
         weight = whitener(vector, terms, measured, self.pressure_error)
         given = vector, terms, measured, weight
@@ -368,7 +368,7 @@ def _checked(priors: Mapping[str, tuple[float, float]]) -> list[Prior]:
 def _voltages(
     decays: Sequence[Decay], machine: Machine, prior: tuple[float, float] | None
 ) -> np.ndarray | None:
-    """Where losses are computed for a free scale of the RF voltage: all must store a beam."""
+    """RF voltages at which losses are computed for a free scale: all must store a beam."""
     if prior is None:
         return None
     mean, error = prior
@@ -456,7 +456,7 @@ def error_scale(chi2: float, dof: int) -> float:
 
 
 def spread_of_scales(found: Fit) -> Spread:
-    """Of the scales without their bounds, which stand for nothing known."""
+    """Spread of the scales without their bounds, which stand for nothing known."""
     unbounded = np.full(found.theta.shape, np.inf)
     return spread_of(found.jacobian, -unbounded, unbounded)
 
@@ -509,7 +509,7 @@ VOLTAGE = "rf_voltage"
 
 
 class ScaleEvidence(NamedTuple):
-    """What the rules look at."""
+    """A fit of scales as the rules see it."""
 
     scales: Mapping[str, Quantity]
     chi2: float
@@ -519,7 +519,7 @@ class ScaleEvidence(NamedTuple):
 
     @property
     def improbable(self) -> bool:
-        """Whether chi² is."""
+        """True if chi² is improbable."""
         return self.dof > 0 and chi2_probability(self.chi2, self.dof) < POOR_FIT
 
 

@@ -71,7 +71,7 @@ class Window(NamedTuple):
 
 
 class Answer(NamedTuple):
-    """What the window says.
+    """Answer of the window.
 
     Attributes
     ----------
@@ -317,7 +317,7 @@ def _shared(window: Window, machine: Machine) -> tuple[float, float, np.ndarray]
 
 
 def _terms(machine: Machine, before: Terms | None, row: Row) -> Terms:
-    """What the ring loses at the settings of a row; anew but for the pressure if they moved."""
+    """Losses of the ring at the settings of a row; anew but for the pressure if they moved."""
     at = Conditions(*(None if math.isnan(value) else [value, value] for value in row.settings))
     moment = DecayRecord([0.0, 1.0], row.current * np.array([1.0, 1 - 1e-6]), conditions=at)
     operation = operation_during(moment, machine)
@@ -331,7 +331,7 @@ def _terms(machine: Machine, before: Terms | None, row: Row) -> Terms:
 
 
 def followed(known: Alarmed, row: Row, apart: float, machine: Machine | None) -> Alarmed:
-    """What is expected at the settings of a row, smoothed: the noise of a gauge would bend it.
+    """Follow the expected loss at the settings of a row, smoothed: noise of a gauge would bend it.
 
     Parameters
     ----------

@@ -225,7 +225,7 @@ def budget(record: DecayRecord, machine: Machine) -> Budget:
 
 
 def stands_alone(cycle: DecayRecord, fit: DecayFit) -> bool:
-    """Whether a cycle by itself would tell a from b, by the bend of its decay and the noise that
+    """Tell if a cycle by itself would separate a and b, by the bend of its decay and the noise that
     all cycles show; where one law does not hold for all, that of its neighbouring readings.
     """
     noise = fit.rms_residual * fit.inflation
@@ -325,14 +325,14 @@ class Decay:
 
     @cached_property
     def checks(self) -> DecayChecks | None:
-        """What simpler analyses say of it, and whether a is constant; None if nothing decays, and
+        """Simpler analyses, and the test of a constant a; None if nothing decays, and
         for many cycles.
         """
         return check_decay(self.segment, self.fit) if self.fit.first is None else None
 
     @cached_property
     def systematics(self) -> tuple[Systematic, ...]:
-        """What no residual shows."""
+        """Systematic errors, which no residual shows."""
         return systematics(self.fit)
 
     def to_json(self) -> dict[str, Any]:
@@ -368,7 +368,7 @@ class RecordStudy:
 
     @property
     def answers(self) -> tuple[Decay, ...]:
-        """What is quoted of the record: cycles together, then single decays; at least one."""
+        """Quoted answers of the record: cycles together, then single decays; at least one."""
         return self.pooled + self.decays
 
 

@@ -120,7 +120,7 @@ def systematics(fit: DecayFit) -> tuple[Systematic, ...]:
 
 
 def _monitor(record: DecayRecord, share: np.ndarray) -> dict[str, np.ndarray]:
-    """What is stated of the monitor, or else assumed."""
+    """Instability of the monitor as stated, or else assumed."""
     if record.monitor is None:
         size = min(float(record.current.max()) / SMALL, 1.0)
         return {
@@ -366,7 +366,7 @@ def constant_a_test(record: DecayRecord) -> ConstantA:
 
 @dataclass(frozen=True)
 class DecayChecks:
-    """What stands beside an (a, b) fit.
+    """Simpler analyses beside an (a, b) fit.
 
     Parameters
     ----------
