@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from beamfit.lifetime.alarm import NAMES, Reading, Reference, started, watched
-from beamfit.lifetime.decay_law import HOUR
+from beamfit.quantity import HOUR
 
 STARTS, BEFORE = 500.0, 1800
 

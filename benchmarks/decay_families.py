@@ -18,11 +18,10 @@ from scipy.signal import lfilter
 from scipy.stats import beta
 
 from beamfit.errors import InputError
-from beamfit.lifetime.decay_law import HOUR
 from beamfit.lifetime.fit import DecayFit
 from beamfit.lifetime.record import DecayRecord
 from beamfit.lifetime.study import study_record
-from beamfit.quantity import Quantity
+from beamfit.quantity import HOUR, Quantity
 
 LIFETIME, START = 10.0 * HOUR, 300.0
 

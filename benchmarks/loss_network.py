@@ -13,12 +13,13 @@ from pathlib import Path
 import numpy as np
 
 from beamfit.io.ring import read_operation, read_ring
-from beamfit.lifetime.decay_law import HOUR, current
+from beamfit.lifetime.decay_law import current
 from beamfit.lifetime.loss_network import Box, NetworkFit, fit_loss_network
 from beamfit.lifetime.mechanisms import loss_terms, scaled_losses
 from beamfit.lifetime.record import Conditions, DecayRecord
 from beamfit.lifetime.ring import Operation
 from beamfit.lifetime.study import Decay, Machine, study_record
+from beamfit.quantity import HOUR
 
 TOP = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(TOP / "measurements"))

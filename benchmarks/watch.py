@@ -14,8 +14,8 @@ import time
 
 import numpy as np
 
-from beamfit.lifetime.decay_law import HOUR
 from beamfit.lifetime.watch import CURRENT, Plan, State, stepped
+from beamfit.quantity import HOUR
 
 A, B, FULL, NOISE = 3.7e-8, 9.26e-6, 500.0, 2e-3
 DAY = 24 * HOUR

@@ -14,13 +14,11 @@ from jax import Array
 
 from beamfit.errors import InputError
 from beamfit.greybox.design import Information, scores
-from beamfit.lifetime.decay_law import HOUR
-from beamfit.lifetime.decay_law import current as decayed
-from beamfit.lifetime.mechanisms import LossTerms as Terms
-from beamfit.lifetime.mechanisms import loss_terms, scaled_losses
+from beamfit.lifetime.decay_law import current
+from beamfit.lifetime.mechanisms import LossTerms, loss_terms, scaled_losses
 from beamfit.lifetime.ring import Operation
 from beamfit.lifetime.scales import ScaleFit, Summaries, information_root, loss_parts
-from beamfit.quantity import Quantity, Status
+from beamfit.quantity import HOUR, Quantity, Status
 from beamfit.sampling.posterior import Posterior
 
 # So wide a prior on scales near 1 decides nothing, and keeps determinants finite.
@@ -70,12 +68,12 @@ class Proposal(NamedTuple):
 
 
 def _rows(fit: ScaleFit, candidate: Candidate) -> np.ndarray:
-    """What the candidate would measure by the scales, over its errors, shape (2, scales)."""
+    """Readings of the candidate predicted by the scales, over its errors, shape (2, scales)."""
     scales = jnp.asarray(fit.vector)
     terms = fit.terms_at(candidate.operation, candidate.current)
     a, b = scaled_losses(scales, terms)
     time = jnp.linspace(0.0, candidate.duration, READINGS)
-    mean = jnp.mean(decayed(time, candidate.current, a, b))
+    mean = jnp.mean(current(time, candidate.current, a, b))
     parts = loss_parts(a, b, mean)
     weight = jnp.full(READINGS, 1 / candidate.noise)
     root = information_root(time, weight, candidate.current, parts, mean)
@@ -178,7 +176,9 @@ class BestPoint(NamedTuple):
         return Status.unidentified if self.lifetime.error is None else Status.converged
 
 
-def _over_voltages(fit: ScaleFit, operation: Operation, current: float, at: np.ndarray) -> Terms:
+def _over_voltages(
+    fit: ScaleFit, operation: Operation, current: float, at: np.ndarray
+) -> LossTerms:
     def one(voltage):
         return loss_terms(fit.machine.ring, operation._replace(rf_voltage=voltage), current)
 
@@ -188,10 +188,10 @@ def _over_voltages(fit: ScaleFit, operation: Operation, current: float, at: np.n
     found = jax.lax.map(one, jnp.asarray(np.outer(at, fit.voltages).ravel()))
     parts = tuple(part.reshape(shape) for part in found.parts)
     rest = [part.reshape(shape)[:, 0] for part in found[1:-1]]
-    return Terms(parts, *rest, jnp.broadcast_to(fit.voltages, shape))
+    return LossTerms(parts, *rest, jnp.broadcast_to(fit.voltages, shape))
 
 
-def _rate(scales: Array, terms: Terms) -> Array:
+def _rate(scales: Array, terms: LossTerms) -> Array:
     """Loss rate at the mean current, 1/s."""
     a, b = scaled_losses(scales, terms)
     return a * terms.current + b

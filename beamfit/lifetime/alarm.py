@@ -23,7 +23,7 @@ WIDE = 0.3
 
 
 class State(NamedTuple):
-    """What is remembered between readings; arrays may have leading axes, of many beams at once.
+    """Sums kept between readings; arrays may have leading axes, of many beams at once.
 
     Attributes
     ----------
@@ -136,7 +136,7 @@ def change_since(state: State, moved: np.ndarray) -> tuple[np.ndarray, np.ndarra
     b_error = 1 / vv + cbb + 2 * uv / vv * cab + (uv / vv) ** 2 * caa
 
     def told(a: np.ndarray, b: np.ndarray, whole: np.ndarray) -> np.ndarray:
-        """Of a alone, of b alone, or of both."""
+        """Fall of chi² by a alone, by b alone, or by both."""
         zero = np.zeros_like(a)
         rest = either(moved == 2, np.stack([zero, b], -1), whole)
         return either(moved == 1, np.stack([a, zero], -1), rest)
@@ -182,7 +182,7 @@ NAMES = ("", "a", "b", "a and b", "a or b")
 
 
 class Reference(NamedTuple):
-    """What the beam loses as long as nothing moves.
+    """Loss of the beam as long as nothing moves.
 
     Attributes
     ----------
@@ -228,7 +228,7 @@ class Reading(NamedTuple):
 
 
 class Told(NamedTuple):
-    """What a reading brought.
+    """Finding of the alarm at one reading.
 
     Attributes
     ----------
@@ -418,7 +418,7 @@ def _since(usual: Reference, state: State, change: np.ndarray) -> np.ndarray:
 
 
 def _adopted(state: State, done: np.ndarray, change: np.ndarray, covariance: np.ndarray) -> State:
-    """Where an alarm is told, what was found is the usual loss from now on."""
+    """After a named alarm, take the loss that was found as the usual one."""
     new = {name: np.zeros_like(getattr(state, name)) for name in ("age", "weight", "product")}
     new["factor"], new["covariance"] = state.factor * (1 + change), state.covariance + covariance
     new["raised"] = np.full_like(state.raised, np.nan)
@@ -498,7 +498,7 @@ def alarms_of(
 
 
 def alarm_of(raised: float, told: Told, at: float | None) -> Alarm:
-    """What was told of an alarm, and when."""
+    """Make the alarm of a finding, with its time."""
     moved = NAMES[int(told.moved)]
     a, b = (
         Quantity(float(v), float(e), "1") if name in moved.split() else None

@@ -16,7 +16,6 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.special import logsumexp
 
-from beamfit.lifetime.decay_law import HOUR
 from beamfit.lifetime.expansion import (
     FURTHER,
     LEVEL,
@@ -35,7 +34,7 @@ from beamfit.lifetime.expansion import (
 from beamfit.lifetime.marginal import ABOVE, BELOW, DRIFT
 from beamfit.lifetime.record import DecayRecord
 from beamfit.noise.memory import Products
-from beamfit.quantity import Quantity
+from beamfit.quantity import HOUR, Quantity
 from beamfit.shown import shown
 from beamfit.status import Status
 from beamfit.table import json_of
@@ -58,6 +57,9 @@ STEP = 3.0
 # that relaxes; and between which shares of the loss a further one lies, flat in its logarithm.
 CHANCES = {"": 0.4, "power": 0.2, "drift": 0.2, "step": 0.08, "steps": 0.04, "relaxing": 0.08}
 SIZES = (1e-3, 1.0)
+# An alternative is fitted if in linear approximation its evidence, by noises of so many correlation
+# times, is not below that of constant a and b by more than this: it is good to about 1.
+COARSE, HOPELESS = 7, -1.0
 # Currents at which a lifetime is offered, if the loss rate there is so many errors above zero.
 CURRENTS, CLEAR = 5, 3.0
 
@@ -65,7 +67,7 @@ CURRENTS, CLEAR = 5, 3.0
 @shown
 @dataclass(frozen=True)
 class ConstantA:
-    """Whether one record contradicts a constant a.
+    """Verdict on a constant a by one record.
 
     Parameters
     ----------
@@ -169,7 +171,7 @@ def lifetime_law(about: Expansion, independent: bool, free: bool) -> LifetimeLaw
     columns = about.columns(*[POWER] * free)
     slopes = np.zeros((CURRENTS + 1, about.rows.shape[1]))
     slopes[:, 1:4] = np.asarray(jax.jacfwd(rates)(about.numbers[:3]))
-    memory = about.whitened(columns, independent).memory()
+    memory = about.memory(columns, independent)
     errors = memory.moments(slopes[:, columns], about.given).error
     over = about.pieces.over
     for change in about.pieces.monitor_changes:
@@ -245,7 +247,7 @@ class Outgassing(NamedTuple):
 
 
 class Rival(NamedTuple):
-    """What explains a record better than a smooth law: a change or gas, and by how much.
+    """A change or relaxing gas that explains a record better than a smooth law, and by how much.
 
     `odds` is the logarithm of its probability over that of a power of a with a drift of b, and
     `scatter` what it leaves of the readings, mA rms.
@@ -284,13 +286,14 @@ def rival_of(plain: Expansion) -> Rival | None:
     if pieces.time.size <= WHEN + 2:
         return None
     plain = solved(pieces) if pieces is not plain.pieces else plain
+    likely = _likely(plain)
+    if not likely:
+        return None
     smooth = _smooth(plain)
-    found: list[tuple[float, str, Expansion]] = []
-    laws = {"step": _changed(plain, 1), "steps": _changed(plain, 2)}
-    laws["relaxing"] = _relaxing(plain) if pieces.gauge is None else None
-    for name, law in laws.items():
-        if law is not None:
-            found.append((_log_evidence(law, name), name, law))
+    fitted = {"step": lambda: _changed(plain, 1), "steps": lambda: _changed(plain, 2),
+              "relaxing": lambda: _relaxing(plain)}  # fmt: skip
+    laws = [(name, fitted[name]()) for name in likely]
+    found = [(_log_evidence(law, name), name, law) for name, law in laws if law is not None]
     log, name, best = max(found, key=lambda one: one[0], default=(-math.inf, "", plain))
     if not log > smooth:
         return None
@@ -305,6 +308,53 @@ def _averaged(pieces: Pieces) -> Pieces:
         return pieces
     record = DecayRecord(pieces.time, pieces.current, pieces.error, monitor=pieces.monitor)
     return Pieces.of(DecayRecord(*record.blocks(ENOUGH), monitor=pieces.monitor))
+
+
+def _likely(plain: Expansion) -> list[str]:
+    """List the alternatives that are not much less likely than constant a and b.
+
+    Their evidence is that of losses about the law without, averaged over times and noises.
+    """
+    columns = plain.rows[:, [LEVEL, *PLAIN]]
+    kinks, gas = further_columns(plain, "step", GRID[::2]), further_columns(
+        plain, "relaxing", np.array(STARTS))  # fmt: skip
+    columns = np.column_stack([columns, plain.residuals, kinks, gas])
+    products = Products.of(columns, plain.pieces.time, bool(plain.given), COARSE)
+    base, across = products.matrix[:, :3, :3], products.matrix[:, :3, 3:]
+    left = products.matrix[:, 3:, 3:] - np.swapaxes(across, 1, 2) @ np.linalg.solve(base, across)
+    known = products.log_prior - 0.5 * np.linalg.slogdet(base)[1]
+    least = SIZES[0] * abs(plain.numbers[0])
+
+    def log_evidence(place: np.ndarray) -> float:
+        """Further losses in the columns of each row of places."""
+        count = place.shape[1]
+        pull, pairs = left[:, 0, place], left[:, place[:, :, None], place[:, None, :]]
+        pairs = pairs * (1 + 1e-6 * np.eye(count))
+        sizes = np.linalg.solve(pairs, pull[..., None])[..., 0]
+        after = np.maximum(left[:, 0, 0, None] - np.sum(sizes * pull, axis=2), 1e-30)
+        unit = products.variance(after, 3 + count)
+        width = _flat(np.maximum(np.abs(sizes), least))
+        pairs = pairs / unit[..., None, None] + np.eye(count) / width[..., None] ** 2
+        log = products.log_size(after) + 1.5 * np.log(unit) - np.log(width).sum(axis=2)
+        log = known[:, None] + log - 0.5 * np.linalg.slogdet(pairs)[1]
+        return float(logsumexp(log)) - math.log(len(place))
+
+    first, last = np.split(np.arange(1, left.shape[1])[:, None], [kinks.shape[1]])
+    both = np.array(list(itertools.combinations(first[:, 0], 2)))
+    places = {"step": first, "steps": both} | (
+        {"relaxing": last} if plain.pieces.gauge is None else {}
+    )
+    least_log = log_evidence(np.empty((1, 0), int)) + math.log(CHANCES[""]) + HOPELESS
+    return [
+        name
+        for name, place in places.items()
+        if log_evidence(place) + math.log(CHANCES[name]) > least_log
+    ]
+
+
+def _flat(size: np.ndarray) -> np.ndarray:
+    """Width of a normal prior with the density, at a size, of one flat in its logarithm."""
+    return 2 * size * math.log(SIZES[1] / SIZES[0]) / math.sqrt(2 * math.pi)
 
 
 def _smooth(plain: Expansion) -> float:
@@ -377,11 +427,10 @@ def _log_evidence(law: Expansion, name: str) -> float:
     flat = []
     for k in range(0, len(further) * (name != "drift"), 2):
         # A flat prior as a normal one of that density: what is not determined costs nothing.
-        size = 2 * max(abs(further[k]), SIZES[0] * abs(loss)) * math.log(SIZES[1] / SIZES[0])
         time = 1.0 if name != "relaxing" else further[1] * math.log(LONGEST / TIMES[0])
-        for column, wide in ((FURTHER + k, size), (WHEN + k, time)):
-            extra[column] = wide / math.sqrt(2 * math.pi)
-            flat.append(column)
+        extra[FURTHER + k] = _flat(max(abs(further[k]), SIZES[0] * abs(loss)))
+        extra[WHEN + k] = time / math.sqrt(2 * math.pi)
+        flat += [FURTHER + k, WHEN + k]
     columns = [LEVEL, *PLAIN, *extra]
     width = np.array([np.inf] * 3 + list(extra.values()))
     known = [0.0 if column in flat else law.numbers[column - 1] for column in extra]
@@ -410,7 +459,7 @@ def _log_evidence(law: Expansion, name: str) -> float:
 def _quantities(law: Expansion, values: np.ndarray, slopes: np.ndarray, columns: list[int]):
     """Values with their errors by slopes of all columns."""
     independent = not law.wanders
-    memory = law.whitened(columns, independent).memory()
+    memory = law.memory(columns, independent)
     errors = memory.moments(slopes[:, columns], law.given).error
     return zip(values, errors, strict=True)
 

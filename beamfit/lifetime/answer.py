@@ -11,10 +11,10 @@ import numpy as np
 
 from beamfit.lifetime.alternatives import ConstantA, LifetimeLaw, Outgassing
 from beamfit.lifetime.cycles import is_sawtooth
-from beamfit.lifetime.decay_law import HOUR
 from beamfit.lifetime.evidence import BELIEVED, DETERMINED, SEPARABLE, UNITS, Evidence
 from beamfit.lifetime.pieces import noise_of
 from beamfit.lifetime.record import Monitor
+from beamfit.quantity import HOUR
 from beamfit.statistics import MANY, POOR_FIT, chi2_probability, few_words
 from beamfit.status import Status
 from beamfit.verdict import Finding, judge
@@ -41,7 +41,7 @@ SLOW = 0.01
 
 
 class TableEvidence(NamedTuple):
-    """What the rules look at of a table of lifetimes.
+    """A table of lifetimes as the rules see it.
 
     `numbers` has values and errors of a, b and the share of a in the loss at the mean current,
     `outliers` names the points that were left out, `noise` is what the points scatter by, h, where
@@ -61,7 +61,7 @@ class TableEvidence(NamedTuple):
 
     @property
     def noise_inferred(self) -> bool:
-        """Whether the points tell the noise."""
+        """True if the residuals of the points tell the noise."""
         return self.noise is not None
 
     def scaled(self, name: str) -> tuple[float, float]:
@@ -133,7 +133,7 @@ RISING = "the loss rate rises as the current falls: look for a changing vacuum o
 
 
 def _explained(e: Evidence | TableEvidence) -> str | None:
-    """What explains a refuted law better than an exponent of the current, and the remedy."""
+    """Cause that explains a refuted law better than an exponent of the current, and the remedy."""
     if e.explained is None:
         return None
     gas = isinstance(e.explained.found, Outgassing)
@@ -349,7 +349,7 @@ def _noise_inferred(e: Evidence) -> str | None:
 
 
 def _few(e: Evidence) -> str | None:
-    """How far errors reach that few residuals tell."""
+    """Sentence on the reach of errors that few residuals tell."""
     said = few_words(e.dof) if e.noise_inferred and e.independent else ""
     return said.removeprefix("; ").capitalize() or None
 
@@ -419,7 +419,7 @@ def _stated(monitor: Monitor) -> str:
 
 
 def _drifting(e: Evidence) -> str | None:
-    """What no residual shows: a drift of the monitor that is slow against the record."""
+    """Sentence on a monitor drift that is slow against the record, which no residual shows."""
     if e.record.monitor is not None:
         return _stated(e.record.monitor)
     if e.record.error is not None:

@@ -11,12 +11,11 @@ import numpy as np
 
 from beamfit.errors import InputError
 from beamfit.lifetime.alarm import Alarm, Reference, alarms_of, when
-from beamfit.lifetime.decay_law import HOUR
 from beamfit.lifetime.fit import DecayFit, bare
 from beamfit.lifetime.mechanisms import loss_coefficients
 from beamfit.lifetime.scales import by_losses, summarise
 from beamfit.lifetime.study import Decay, Machine, RecordStudy
-from beamfit.quantity import Quantity, Status
+from beamfit.quantity import HOUR, Quantity, Status
 from beamfit.shown import shown
 from beamfit.statistics import FEWEST, baseline, control_limits
 from beamfit.table import Table, cell, json_of

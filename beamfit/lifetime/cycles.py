@@ -111,7 +111,7 @@ def cut_at_refills(record: DecayRecord) -> Split:
 
 
 def is_refilled(split: Split) -> bool:
-    """Whether three cycles or more are held by refills, which a decay with odd steps is not.
+    """Tell three or more cycles held by refills from a decay with odd steps.
 
     Refills give back at least half of what the cycles lose.
     """
@@ -124,8 +124,8 @@ def is_refilled(split: Split) -> bool:
 
 
 def is_sawtooth(residuals: np.ndarray) -> bool:
-    """Whether readings lie evenly between two currents, as of refills that an archive is too slow
-    to resolve, and not about one: by the likelihood of an even distribution with normal noise.
+    """Compare an even distribution between two currents, as of refills that an archive is too slow
+    to resolve, with one about a single value, by likelihood under normal noise.
 
     Examples
     --------
@@ -207,7 +207,7 @@ def _levelled(time: np.ndarray, current: np.ndarray, first: np.ndarray) -> np.nd
 
 
 def _changes_between(record: DecayRecord, pieces: Sequence[np.ndarray]) -> list[float]:
-    """By how much the current changes from each piece to the next, mA, the loss put back; by one
+    """Changes of the current from each piece to the next, mA, the loss put back; by one
     law for some pieces together.
     """
     ends, found = np.cumsum([piece.size for piece in pieces]) // STRETCH, []
@@ -408,7 +408,7 @@ def averaged(cycles: Sequence[DecayRecord]) -> Pieces:
 
 
 def _per_cycle(about: Expansion) -> tuple[np.ndarray, np.ndarray]:
-    """By how much the loss of each cycle departs, and its error for noise of size 1."""
+    """Departure of the loss of each cycle, and its error for noise of size 1."""
     first, slope, residual = about.pieces.first, about.left[:, LOSS], about.left[:, -1]
     squares = np.add.reduceat(slope**2, first)
     return -np.add.reduceat(slope * residual, first) / squares, 1 / np.sqrt(squares)
@@ -423,7 +423,7 @@ def _far(values: np.ndarray) -> np.ndarray:
 
 
 def _edges(about: Expansion) -> np.ndarray:
-    """How far the first and the last readings of all cycles lie above the law, beside those next to
+    """Excess of the first and the last readings of all cycles over the law, beside those next to
     them, in errors: fresh beam decays faster, and a reading within an injection lies below.
     """
     first, lengths = about.pieces.first, about.pieces.lengths

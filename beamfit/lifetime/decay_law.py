@@ -12,7 +12,6 @@ import numpy as np
 from jax import Array
 
 from beamfit.compile_cache import prepare_jax
-from beamfit.quantity import HOUR as HOUR
 
 prepare_jax()
 

@@ -22,13 +22,12 @@ from beamfit.lifetime.alternatives import (
     lifetime_law,
     rival_of,
 )
-from beamfit.lifetime.decay_law import HOUR
 from beamfit.lifetime.expansion import LOSS, POWER, QUADRATIC, Expansion, Physical, lifetime_of
 from beamfit.lifetime.marginal import BELOW, FreeLaw, Law, free_law
 from beamfit.lifetime.record import DecayRecord
 from beamfit.noise.correlated import whitened
 from beamfit.noise.memory import CLOSE, Products
-from beamfit.quantity import Quantity
+from beamfit.quantity import HOUR, Quantity
 from beamfit.shown import shown
 from beamfit.status import Status
 
@@ -61,7 +60,7 @@ PARTS = 8
 @shown
 @dataclass(frozen=True)
 class Separability:
-    """Whether the record tells a from b.
+    """Separability of a and b in one record.
 
     Parameters
     ----------
@@ -110,7 +109,7 @@ class Evidence:
 
     @property
     def cycles(self) -> int:
-        """How many pieces."""
+        """Number of pieces."""
         return self.about.level.size
 
     @property
@@ -120,18 +119,18 @@ class Evidence:
 
     @property
     def time(self) -> np.ndarray:
-        """Of the readings, s."""
+        """Times of the readings, s."""
         return self.about.pieces.time
 
     @property
     def noise_inferred(self) -> bool:
-        """Whether the residuals tell the noise."""
+        """True if the noise is taken from the residuals."""
         return self.about.pieces.error is None
 
     @cached_property
     def changed(self) -> bool:
-        """Whether the loss rate is not the same all along: what correlates the residuals of a decay
-        is something else than noise, or parts of many cycles differ.
+        """True if the loss rate is not the same all along: something else than noise correlates the
+        residuals of a decay, or parts of many cycles differ.
         """
         if self.cycles > 1:
             return self.parts[0] < REJECTED
@@ -139,11 +138,11 @@ class Evidence:
 
     @cached_property
     def independent(self) -> bool:
-        """Whether errors of neighbouring readings are."""
+        """True if errors of neighbouring readings are independent."""
         return not self.about.wanders or (self.cycles == 1 and self.changed)
 
     def _memory(self, independent: bool, *more: int) -> Memory:
-        return self.about.whitened(self.about.columns(*more), independent).memory()
+        return self.about.memory(self.about.columns(*more), independent)
 
     @cached_property
     def memory(self) -> Memory:
@@ -168,7 +167,7 @@ class Evidence:
 
     @cached_property
     def moments(self) -> AveragedMoments:
-        """How far values move by the noise, their errors and how far 95 % reach."""
+        """Shifts of the values by the noise, their errors and the reach of 95 %."""
         found = self._moments(self.memory, self.about.columns())
         if not self.independent:
             return found
@@ -177,18 +176,18 @@ class Evidence:
 
     @cached_property
     def drifted(self) -> np.ndarray:
-        """By how much what is stated of the monitor moves the values."""
+        """Shifts of the values by the stated instability of the monitor."""
         moved = [self.about.moved(c / self.about.pieces.over) for c in self.monitor_changes]
         return np.linalg.norm(moved, axis=0) if moved else np.zeros(len(Physical._fields))
 
     @property
     def monitor_changes(self) -> list[np.ndarray]:
-        """What is stated of the monitor, mA."""
+        """Stated instabilities of the monitor, mA."""
         return self.about.pieces.monitor_changes if self.about.rested else []
 
     @cached_property
     def values(self) -> Physical:
-        """What is quoted of the law with constant a and b."""
+        """Values of the law with constant a and b."""
         return Physical(*(np.array(self.about.values) + self.moments.shift))
 
     @cached_property
@@ -198,7 +197,7 @@ class Evidence:
 
     @cached_property
     def reach(self) -> Physical:
-        """How far 95 % reach."""
+        """Reach of 95 % about the values."""
         return Physical(*np.hypot(self.moments.reach, NORMAL * self.drifted))
 
     @cached_property
@@ -210,7 +209,7 @@ class Evidence:
 
     @cached_property
     def constant_a(self) -> ConstantA:
-        """Whether the readings contradict a constant a: by an exponent beside the other numbers."""
+        """Test of a constant a by an exponent beside the other numbers."""
         if self.cycles > 1 and not self.separability.separable:
             return constant_a(math.nan, math.inf, math.inf, math.nan)
         place = np.eye(self.about.rows.shape[1])[[POWER]][:, self.about.columns(POWER)]
@@ -250,18 +249,18 @@ class Evidence:
 
     @property
     def noise(self) -> float:
-        """What multiplies errors that were given (at least 1), or the noise in mA."""
+        """Factor on errors that were given (at least 1), or the noise in mA."""
         return max(math.sqrt(self.squares / self.dof), self.about.given)
 
     @property
     def correlation(self) -> float:
-        """Of a and b."""
+        """Correlation of a and b."""
         a, b = self.about.slopes[1:3, self.about.columns()] @ self.plain.half[0]
         return float(a @ b / np.linalg.norm(a) / np.linalg.norm(b))
 
     @property
     def correlation_time(self) -> float | None:
-        """Of the part of the errors that has one, s; None where they are independent."""
+        """Correlation time of the noise, s; None where errors are independent."""
         return None if self.independent else self.memory.noise.time
 
     @property
@@ -271,7 +270,7 @@ class Evidence:
 
     @property
     def inflation(self) -> float:
-        """By how much the memory of the noise enlarges errors."""
+        """Factor by which the memory of the noise enlarges errors."""
         if self.independent:
             return 1.0
         # Of a loss rate that is not clear of zero the share of a says nothing.
@@ -289,7 +288,7 @@ class Evidence:
         return float(getattr(self.values, name)), float(getattr(self.errors, name))
 
     def is_clear(self, name: str) -> bool:
-        """Whether a value is clear of zero."""
+        """Test if a value is clear of zero."""
         value, error = self.sure(name)
         return error < DETERMINED * value
 
@@ -317,7 +316,7 @@ class Evidence:
 
     @cached_property
     def separability(self) -> Separability:
-        """Of a and b."""
+        """Separability of a and b."""
         share, error = self.scaled("share")
         finite = math.isfinite(share) and math.isfinite(error)
         length, usual = self.correlation_time, float(np.median(np.diff(self.time)))
@@ -334,7 +333,7 @@ class Evidence:
 
     @property
     def refuted(self) -> bool:
-        """Whether the readings contradict constant a and b, or show values that no beam has."""
+        """True if the readings contradict constant a and b, or show values that no beam has."""
         if self.changed or self.constant_a.status is Status.poor_fit:
             return True
         return self.cycles == 1 and any(
@@ -343,14 +342,14 @@ class Evidence:
 
     @cached_property
     def rival(self) -> Rival | None:
-        """What explains a single decay better than any smooth law."""
+        """Alternative that explains a single decay better than any smooth law."""
         if self.cycles > 1 or self.shaped or not self.about.rested:
             return None
         return rival_of(self.about)
 
     @property
     def explained(self) -> Rival | None:
-        """What explains a refuted law better than a power of the current."""
+        """Alternative that explains a refuted law better than a power of the current."""
         return self.rival if self.refuted else None
 
     @property
@@ -367,8 +366,8 @@ class Evidence:
 
     @cached_property
     def free(self) -> FreeLaw | None:
-        """What the record tells where its law is free; None where the law is known, something
-        else than the law explains the record better, or the decay is within its noise.
+        """Posterior of the free law; None where the law is known, an alternative explains the
+        record better, or the decay is within its noise.
         """
         known = self.law is Law.constant or self.shaped or self.cycles > 1
         if known or not self.is_clear("rate_mean") or self.explained is not None:
@@ -378,7 +377,7 @@ class Evidence:
 
     @cached_property
     def bending(self) -> Physical | None:
-        """How far an exponent of a within its prior moves the values, beside what cycles tell of
+        """Shifts of the values by an exponent of a within its prior, beside what cycles tell of
         it; None where the law is known, or a and b are one number.
 
         The exponent is normal, `BELOW` wide to either side, and its error beside the other numbers
@@ -421,7 +420,7 @@ class Evidence:
         return Quantity(value, error, exact.unit, exact.error_raw, interval)
 
     def quoted(self, known: bool = True) -> dict[str, Any]:
-        """What a `DecayFit` has of this, by its names."""
+        """Fields of a `DecayFit`, by name."""
         apart = known and self.separability.separable
         same = ("chi2", "dof", "noise_inferred", "constant_a", "correlation_time", "lifetimes")
         exact = {"i0": self.quantity("i0", known and self.cycles == 1)}

@@ -17,13 +17,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from scipy.integrate import cumulative_simpson
 
-from beamfit.greybox.memory import Whitened, remembered
+from beamfit.greybox.memory import Memory, Whitened, remembered
 from beamfit.greybox.problem import padded_length
-from beamfit.lifetime.decay_law import HOUR, Moments, beam_current, cumulative
+from beamfit.lifetime.decay_law import Moments, beam_current, cumulative
 from beamfit.lifetime.record import DecayRecord, Monitor
 from beamfit.noise.correlated import Levels, Noise, remembers
-from beamfit.quantity import Quantity
+from beamfit.quantity import HOUR, Quantity
 
 # Columns of the slopes: the current of the piece, loss at the mean current and its quadratic part,
 # power of a, a further loss and its time.
@@ -41,6 +42,8 @@ POWERS, TIMES = (-0.95, 3.0), (1e-3, 10.0)
 # A drift under white noise counts from so many standard errors on: it enlarges errors much. Fewer
 # readings tell nothing of the memory of their noise.
 SLOW, FEWEST = 3.0, 12
+# Noises of so small a part of the largest probability move no digit.
+NO_WEIGHT = 1e-12
 # Records solved in one call; fewer are filled up, so that one number is compiled.
 TOGETHER = 16
 
@@ -48,7 +51,7 @@ Shape = Callable[[Array], Array]
 
 
 class Physical(NamedTuple):
-    """What a law says, in s and mA: loss rates at the first and last reading, of many pieces at the
+    """Values of a law, in s and mA: loss rates at the first and last reading, of many pieces at the
     highest and lowest current, and at the mean current; the share of a in the loss there, and the
     power by which a departs from its shape.
     """
@@ -113,12 +116,12 @@ class Pieces(NamedTuple):
 
     @property
     def over(self) -> np.ndarray | float:
-        """What residuals are divided by, mA."""
+        """Divisor of the residuals, mA."""
         return 1.0 if self.error is None else self.error
 
     @property
     def monitor_changes(self) -> list[np.ndarray]:
-        """What a stated instability of the monitor does to the readings, mA."""
+        """Changes of the readings by a stated instability of the monitor, mA."""
         since = self.time - self.time[0]
         return [] if self.monitor is None else list(self.monitor.changes(since).values())
 
@@ -175,7 +178,7 @@ class _Rows(NamedTuple):
         return 1 if self.piece is None else self.time.size // 2
 
     def sums(self, values: Array) -> Array:
-        """Of each piece."""
+        """Sum the values of each piece."""
         if self.piece is None:
             return jnp.sum(values, axis=0, keepdims=True)
         return jax.ops.segment_sum(values, self.piece, self.count, indices_are_sorted=True)
@@ -283,66 +286,91 @@ def _start(rows: _Rows) -> tuple[Array, Array, Array, Array]:
     return both, level, jnp.maximum(jnp.minimum(noise, less), least), width
 
 
+class _Question(NamedTuple):
+    """Columns whose numbers are free, the kind of further losses, and the shape of a."""
+
+    free: tuple[int, ...]
+    kind: str | None
+    shape: Shape | None
+
+    def mask(self, size: int) -> Array:
+        """Free ones of so many numbers."""
+        return jnp.isin(jnp.arange(1, size + 1), jnp.array(self.free))
+
+    def within(self, numbers: Array, before: Array) -> Array:
+        """Free numbers within their bounds, and the others as before."""
+        more = numbers.size // 2 - 1
+        low = jnp.array([-jnp.inf, -jnp.inf, POWERS[0]] + [-jnp.inf, TIMES[0]] * more)
+        high = jnp.array([jnp.inf, jnp.inf, POWERS[1]] + [jnp.inf, TIMES[1]] * more)
+        return jnp.where(self.mask(numbers.size), jnp.clip(numbers, low, high), before)
+
+
+def _begun(rows: _Rows, begin: Array, both: Array, level: Array, question: _Question):
+    """Numbers and levels to begin at: those given, or from integrals, or a plain decay's."""
+    mask, given = question.mask(begin.size), jnp.isfinite(begin[0])
+    own = jnp.zeros(begin.size).at[:2].set(both)
+    plain = jnp.zeros(begin.size).at[:2].set(jnp.array([0.1, 0.05]))
+    start = jnp.where(given, begin, own * mask)
+    # A start taken from noise can lie where the law has no value; a plain decay never does.
+    good = jnp.isfinite(_about(start, level, rows, question.kind, question.shape)[0]).all()
+    return jnp.where(good | given, start, plain * mask), jnp.where(good, level, 1.0)
+
+
+def _tried(numbers: Array, level: Array, rows: _Rows, prior: Array, question: _Question):
+    """Residuals, slopes and their sum of squares, infinite where the law has no value."""
+    residual, slopes, *_ = _about(numbers, level, rows, question.kind, question.shape)
+    known = prior * numbers[jnp.array(question.free) - 1]
+    cost = residual @ residual + jnp.sum(known**2)
+    fine = jnp.isfinite(slopes).all() & jnp.isfinite(cost)
+    return residual, slopes, jnp.where(fine, cost, jnp.inf)
+
+
+def _advanced(s: _State, rows: _Rows, prior: Array, noise: Array, question: _Question) -> _State:
+    """Take the step, or half of it where it did not help, and find the next."""
+    places = jnp.array(question.free)
+    tried = question.within(s.numbers + s.share * s.step, s.numbers), s.level - s.share * s.down
+    tried += _tried(*tried, rows, prior, question)
+    better = tried[-1] <= s.cost * (1 + 1e-15)
+    numbers, level, residual, slopes, cost = (
+        jnp.where(better, new, old) for new, old in zip(tried, s[:5], strict=True)
+    )
+    columns = jnp.column_stack([slopes[:, places], residual])
+    left, worth = rows.without_levels(slopes[:, LEVEL], columns)
+    known = jnp.column_stack([jnp.diag(prior), prior * numbers[places - 1]])
+    step = _least_squares(left, known)
+    promised = jnp.linalg.norm(left[:, :-1] @ step)
+    rounding = 1e-14 * jnp.linalg.norm(slopes[:, LEVEL])
+    share = jnp.where(better, 1.0, s.share / 2)
+    # Where no step however short is better, what it promised must be below the noise.
+    small = s.rested | (better & (promised <= NEAR * noise + rounding))
+    stuck = ~better & (s.share <= 0.5**HALVED)
+    return _State(
+        numbers, level, residual, slopes, cost, jnp.zeros_like(numbers).at[places - 1].set(step),
+        worth[:, :-1] @ step + worth[:, -1], share, small | stuck, s.count + 1,
+    )  # fmt: skip
+
+
 @partial(jax.jit, static_argnames=("free", "kind", "shape"))
 def _searched(rows: _Rows, begin: Array, widths: Array, free, kind=None, shape=None):
     """Gauss and Newton from numbers, NaN where the start is to be found; and what they leave.
 
     `widths` are those of normal priors about zero.
     """
+    question = _Question(free, kind, shape)
     both, level, noise, width = _start(rows)
-    own = jnp.zeros(begin.size).at[:2].set(both)
-    plain = jnp.zeros(begin.size).at[:2].set(jnp.array([0.1, 0.05]))
-    mask = jnp.isin(jnp.arange(1, begin.size + 1), jnp.array(free))
-    given = jnp.isfinite(begin[0])
-    start = jnp.where(given, begin, own * mask)
-    # A start taken from noise can lie where the law has no value; a plain decay never does.
-    good = jnp.isfinite(_about(start, level, rows, kind, shape)[0]).all()
-    start = jnp.where(good | given, start, plain * mask)
-    level = jnp.where(good, level, 1.0)
-    places = jnp.array(free)
-    prior = noise / widths + jnp.where(places == QUADRATIC, noise / width, 0.0) * (shape is None)
-    low = jnp.array([-jnp.inf, -jnp.inf, POWERS[0]] + [-jnp.inf, TIMES[0]] * (begin.size // 2 - 1))
-    high = jnp.array([jnp.inf, jnp.inf, POWERS[1]] + [jnp.inf, TIMES[1]] * (begin.size // 2 - 1))
-
-    def tried(numbers: Array, level: Array):
-        residual, slopes, *_ = _about(numbers, level, rows, kind, shape)
-        cost = residual @ residual + jnp.sum((prior * numbers[places - 1]) ** 2)
-        fine = jnp.isfinite(slopes).all() & jnp.isfinite(cost)
-        return residual, slopes, jnp.where(fine, cost, jnp.inf)
-
-    def advance(s: _State) -> _State:
-        numbers = jnp.clip(s.numbers + s.share * s.step, low, high)
-        numbers = jnp.where(mask, numbers, s.numbers)
-        at = s.level - s.share * s.down
-        residual, slopes, cost = tried(numbers, at)
-        better = cost <= s.cost * (1 + 1e-15)
-        numbers, at, residual, slopes, cost = (
-            jnp.where(better, new, old)
-            for new, old in zip((numbers, at, residual, slopes, cost), s[:5], strict=True)
-        )
-        columns = jnp.column_stack([slopes[:, places], residual])
-        left, worth = rows.without_levels(slopes[:, LEVEL], columns)
-        known = jnp.column_stack([jnp.diag(prior), prior * numbers[places - 1]])
-        step = _least_squares(left, known)
-        promised = jnp.linalg.norm(left[:, :-1] @ step)
-        rounding = 1e-14 * jnp.linalg.norm(slopes[:, LEVEL])
-        share = jnp.where(better, 1.0, s.share / 2)
-        # Where no step however short is better, what it promised must be below the noise.
-        small = s.rested | (better & (promised <= NEAR * noise + rounding))
-        stuck = ~better & (s.share <= 0.5**HALVED)
-        return _State(
-            numbers, at, residual, slopes, cost, jnp.zeros_like(numbers).at[places - 1].set(step),
-            worth[:, :-1] @ step + worth[:, -1], share, small | stuck, s.count + 1,
-        )  # fmt: skip
-
-    residual, slopes, _ = tried(start, level)
+    weak = noise / width * (shape is None)
+    prior = noise / widths + jnp.where(jnp.array(free) == QUADRATIC, weak, 0.0)
+    start, level = _begun(rows, begin, both, level, question)
+    residual, slopes, _ = _tried(start, level, rows, prior, question)
     first = _State(start, level, residual, slopes, jnp.inf, jnp.zeros_like(start),
                    jnp.zeros_like(level), 1.0, False, 0)  # fmt: skip
-    first = jax.tree.map(jnp.asarray, first)
-    last = jax.lax.while_loop(lambda s: ~s.rested & (s.count < STEPS), advance, first)
+    last = jax.lax.while_loop(
+        lambda s: ~s.rested & (s.count < STEPS),
+        lambda s: _advanced(s, rows, prior, noise, question),
+        jax.tree.map(jnp.asarray, first),
+    )
     residual, slopes, values, by = _about(last.numbers, last.level, rows, kind, shape)
-    prior = noise / width * (shape is None)
-    return last.numbers, last.level, residual, slopes, values, by, last.rested, prior
+    return last.numbers, last.level, residual, slopes, values, by, last.rested, weak
 
 
 @partial(jax.jit, static_argnames=("kind", "shape"))
@@ -413,7 +441,7 @@ class Expansion:
 
     @cached_property
     def wanders(self) -> bool:
-        """Whether the noise has a memory that no power of the current explains."""
+        """True if the noise has a memory that no power of the current explains."""
         many = 0 if self.levels is None else self.level.size
         columns, residuals = self.left[:, self.columns(POWER)], self.left[:, -1]
         numbers = many + columns.shape[1] - 1
@@ -438,24 +466,26 @@ class Expansion:
         """Places of the plain law's columns and of more; levels of many pieces are eliminated."""
         return [LEVEL] * (self.level.size == 1) + [*PLAIN, *more]
 
-    def whitened(self, columns: Sequence[int], independent: bool) -> Whitened:
-        """What slopes by some columns and residuals say of the noise.
+    def memory(self, columns: Sequence[int], independent: bool) -> Memory:
+        """Posterior over noises, given the slopes by some columns and the residuals.
 
         Independent noise has the prior beside the residuals, for one too short a record; whatever
-        memory the noise may have otherwise.
+        memory the noise may have otherwise. Noises of no weight are left out.
         """
         if not independent:
             slopes, time = self.rows[:, columns], self.pieces.time
-            return remembered(slopes, self.residuals, time, self.levels)
+            found = remembered(slopes, self.residuals, time, self.levels).memory()
+            kept = found.weight > NO_WEIGHT * found.weight.max()
+            return Memory(*(part[kept] for part in found[:-1]), found.dof)
         known = np.append(np.equal(columns, QUADRATIC), self.numbers[QUADRATIC - 1])
         rows = np.vstack([self.left[:, [*columns, -1]], self.prior * known])
         count = self.residuals.size - (0 if self.levels is None else self.level.size)
         triangle = np.linalg.qr(rows, mode="r")[None]
-        return Whitened(Noise(np.zeros(1), np.zeros(1)), triangle, np.zeros(1), count)
+        return Whitened(Noise(np.zeros(1), np.zeros(1)), triangle, np.zeros(1), count).memory()
 
     def moved(self, change: np.ndarray) -> Physical:
-        """What a change of the readings, over their errors, does to the values by least squares;
-        to an exponent beside the other numbers.
+        """Shift the values by a change of the readings, over their errors, by least squares;
+        an exponent beside the other numbers.
         """
         change = self.beside(np.reshape(change, (-1, 1)))[:, 0]
         plain, power = self.columns(), self.columns(POWER)
@@ -555,16 +585,23 @@ def expanded(
     return Expansion.of(pieces, (numbers, level, *found))
 
 
-@partial(jax.jit, static_argnames="kind")
-def _further(rows: _Rows, numbers: Array, level: Array, times: Array, kind: str):
-    def slope(when: Array) -> Array:
-        return _about(jnp.concatenate([numbers[:3], jnp.array([0.0]), when[None]]), level, rows,
-                      kind, None)[1][:, FURTHER]  # fmt: skip
-
-    return jax.lax.map(slope, times).T
-
-
 def further_columns(about: Expansion, kind: str, times: np.ndarray) -> np.ndarray:
-    """Slopes of the residuals by a further loss at each time, both in units of the search."""
-    found = _further(about.pieces.scaled(), about.numbers, about.level, times, kind)
-    return np.asarray(found)[: about.residuals.size]
+    """Slopes of the residuals of a single decay by a further loss of each time, in units of the
+    search: what a loss takes fades as a difference of the first current does.
+
+    Examples
+    --------
+    >>> time = np.linspace(0.0, 1.0, 101)
+    >>> found = solved(Pieces.of(DecayRecord(time, 100 * np.exp(-0.1 * time))))
+    >>> column = further_columns(found, "step", np.array([0.5]))[:, 0]
+    >>> print(f"{column[-1] / found.pieces.current[-1]:.3f}")
+    -0.500
+    """
+    (span, _), level = about.pieces.units, about.rows[:, [LEVEL]]
+    time, model = about.pieces.time / span, about.pieces.current / about.pieces.over
+    fading = (model + about.residuals)[:, None] / level
+    if kind == "step":
+        whole = cumulative_simpson(fading, x=time, axis=0, initial=0.0)
+        return -level * np.maximum(whole - np.interp(times, time, whole[:, 0]), 0.0)
+    rates = time[:, None] - 0.5 if kind == "drift" else np.exp(-time[:, None] / times)
+    return -level * cumulative_simpson(rates * fading, x=time, axis=0, initial=0.0)

@@ -187,7 +187,7 @@ class DecayFit:
 
     @property
     def quantities(self) -> dict[str, Quantity]:
-        """What is quoted, by name."""
+        """Quoted quantities, by name."""
         return {name: getattr(self, name) for name in UNITS}
 
     @property
@@ -347,7 +347,7 @@ def fit_decays(records: Sequence[DecayRecord], law: Law | str = Law.free) -> tup
 
 
 def _says_nothing(record: DecayRecord) -> bool:
-    """Whether all readings are equal; a record too short for any fit is an error."""
+    """True if all readings are equal; a record too short for any fit is an error."""
     if len(record) < FEWEST:
         expected = f"{FEWEST} or more for a decay"
         raise InputError(f"{len(record)} readings", expected, path=record.name)

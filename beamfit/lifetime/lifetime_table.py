@@ -17,11 +17,10 @@ from beamfit.greybox.problem import Free, Problem, Record, padded_length
 from beamfit.greybox.solve import solve
 from beamfit.lifetime.alternatives import CURRENTS, ConstantA, LifetimeLaw, constant_a
 from beamfit.lifetime.answer import TableEvidence, finding_of_table
-from beamfit.lifetime.decay_law import HOUR
 from beamfit.lifetime.evidence import EXACT, UNITS
 from beamfit.lifetime.fit import bare
 from beamfit.lifetime.record import FEWEST_LIFETIMES, LifetimeTable
-from beamfit.quantity import Quantity, Status
+from beamfit.quantity import HOUR, Quantity, Status
 from beamfit.shown import shown
 from beamfit.statistics import reach_of
 from beamfit.table import Table, json_of, labelled, plain_name
@@ -78,7 +77,7 @@ class LifetimeFit:
 
     @property
     def quantities(self) -> dict[str, Quantity]:
-        """What is quoted, by name."""
+        """Quoted quantities, by name."""
         return {name: getattr(self, name) for name in UNITS if hasattr(self, name)}
 
     def __str__(self) -> str:
@@ -87,7 +86,7 @@ class LifetimeFit:
         return "\n".join([*rows, f"  chi²/dof {self.chi2:.4g}/{self.dof}"])
 
     def table(self) -> Table:
-        """What is quoted, to be shown."""
+        """Quoted quantities, to be shown."""
         rows = [(plain_name(name), [value]) for name, value in self.quantities.items()]
         rows.append(("share of a in the loss", [self.share]))
         tested = self.readings.error is not None
@@ -176,7 +175,7 @@ class _Off(NamedTuple):
 
 
 def _farthest_off(table: LifetimeTable, kept: np.ndarray) -> _Off:
-    """By residuals of each point from the others (R. D. Cook and S. Weisberg, Residuals and
+    """Point with the largest residual from the others (R. D. Cook and S. Weisberg, Residuals and
     influence in regression, 1982, eq. 2.2.8), in the loss rates, which are linear in the current.
     """
     rows = np.flatnonzero(kept)
@@ -206,7 +205,7 @@ def _bends_alone(table: LifetimeTable, kept: np.ndarray, power: np.ndarray) -> i
 
 
 def _tested(table: LifetimeTable, plain: Fit, power: Fit) -> ConstantA:
-    """Whether a constant a is refuted: by the fall of chi², which knows no curvature."""
+    """Test a constant a by the fall of chi², which knows no curvature."""
     before, after = plain.group(RECORD), power.group(RECORD)
     found, dof = power["exponent"], max(after.dof, 1.0)
     fall = max(before.chi2 - after.chi2, 0.0)
@@ -291,7 +290,7 @@ def _reach(table: LifetimeTable, fit: Fit) -> float:
 
 
 def _lifetimes_of(table: LifetimeTable, found: Derived, far: float) -> list[Quantity]:
-    """Of what `_quoted` gives, by its rates."""
+    """Lifetimes of the rates that `_quoted` gives."""
     rate, error = found.value[4:], found.error[4:]
     lifetime = float(np.median(table.lifetime)) / rate
     pairs = zip(lifetime, lifetime * np.maximum(error / rate, EXACT), strict=True)

@@ -25,9 +25,7 @@ from beamfit.greybox.fit import Fit
 from beamfit.greybox.mlp import MLP, Layer, Port
 from beamfit.greybox.problem import Free, Prior, Problem, Record
 from beamfit.greybox.solve import solve
-from beamfit.lifetime.decay_law import HOUR
-from beamfit.lifetime.mechanisms import LossTerms as Terms
-from beamfit.lifetime.mechanisms import loss_terms, scaled_losses
+from beamfit.lifetime.mechanisms import LossTerms, loss_terms, scaled_losses
 from beamfit.lifetime.ring import Operation
 from beamfit.lifetime.scales import (
     PRESSURE_ERROR,
@@ -39,7 +37,7 @@ from beamfit.lifetime.scales import (
     summarise,
 )
 from beamfit.lifetime.study import Decay, Machine, operation_during
-from beamfit.quantity import Quantity
+from beamfit.quantity import HOUR, Quantity
 from beamfit.shown import shown
 from beamfit.table import json_of
 
@@ -91,7 +89,7 @@ class Box(NamedTuple):
 
 
 class Certificate(NamedTuple):
-    """What holds for all inputs in the operating box.
+    """Bounds that hold for all inputs in the operating box.
 
     Attributes
     ----------
@@ -113,14 +111,14 @@ class Certificate(NamedTuple):
 
     @property
     def holds(self) -> bool:
-        """Whether every slope of known sign has it, within rounding."""
+        """True if every slope of known sign has it, within rounding."""
         known = [INPUTS.index(name) for name in SIGNS]
         sign = np.array(list(SIGNS.values()))
         worst = np.where(sign > 0, -self.gains[:, known, 0], self.gains[:, known, 1])
         return bool(np.all(worst <= ROUNDING))
 
     def holds_at(self, inputs: np.ndarray) -> bool:
-        """Whether a point is in the box, within rounding."""
+        """Test if a point is in the box, within rounding."""
         inside = (inputs >= self.lower - ROUNDING) & (inputs <= self.upper + ROUNDING)
         return bool(np.all(inside))
 
@@ -167,7 +165,7 @@ class Discrepancy(NamedTuple):
     def spread(
         self, at: np.ndarray, slopes: np.ndarray, left: np.ndarray, fit: Fit
     ) -> tuple[np.ndarray, np.ndarray]:
-        """What the truth is off the network by, at inputs (m, k): mean (2m,), covariance (2m, 2m).
+        """Model error of the network at inputs (m, k): mean (2m,), covariance (2m, 2m).
 
         `slopes` of ln a and ln b by the network's free numbers, (2m, p); `left` of the decays'
         residuals, in their errors, (2n,). Weights and errors of the model are not told apart.
@@ -224,7 +222,7 @@ VOLTAGES = 65
 
 
 class Network(StrEnum):
-    """What a network of the losses is to be: all of a and b, or a factor on first principles."""
+    """Kinds of loss network: all of a and b, or a factor on first principles."""
 
     alone = "alone"
     correction = "correction"
@@ -346,7 +344,7 @@ def _predict(model: Mapping[str, MLP], data: Data) -> Array:
     return weight @ loss_parts(a, b, current).ravel()
 
 
-def _base(scales: np.ndarray | None, terms: Terms) -> Array:
+def _base(scales: np.ndarray | None, terms: LossTerms) -> Array:
     """ln a and ln b of first principles, which the network corrects; zero if it stands alone."""
     if scales is None:
         return jnp.zeros((terms.current.size, 2))

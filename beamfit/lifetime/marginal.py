@@ -19,11 +19,11 @@ import numpy as np
 from numpy.polynomial.chebyshev import chebint, chebvander
 from scipy.special import gammaln, log_ndtr, logsumexp
 
-from beamfit.lifetime.decay_law import HOUR, closed_form
+from beamfit.lifetime.decay_law import closed_form
 from beamfit.lifetime.expansion import Physical
 from beamfit.lifetime.record import DecayRecord
 from beamfit.noise.memory import Products
-from beamfit.quantity import Quantity
+from beamfit.quantity import HOUR, Quantity
 
 # Standard deviations of the exponent below and above zero. Bunches lengthen with the current, in
 # the potential well by x³ - x ∝ I (`beamfit.lifetime.bunch`), so that a goes as I^0 to I^-1/3; that
@@ -61,7 +61,7 @@ INTEGRAL = chebvander(ANGLE, NODES) @ chebint(FROM_NODES, lbnd=-1) / 2
 
 
 class Law(StrEnum):
-    """What is known of the law of a decay.
+    """Knowledge of the law of a decay.
 
     Attributes
     ----------
@@ -325,8 +325,11 @@ def _drawn(seen: Seen, peaks: Peaks, draws: int) -> Draws:
     named = Numbers.of(numbers)
     away = named.currents(seen.gas) - seen.origin
     products = seen.products
-    squares = products.matrix[kind, 0, 0] - 2 * np.sum(products.matrix[kind, 0, 1:] * away.T, 1)
-    squares = squares + np.einsum("dn,dnm,dm->d", away.T, products.matrix[kind, 1:, 1:], away.T)
+    beside = np.vstack([-np.ones(draws), away])
+    squares = np.empty(draws)
+    for one in np.unique(kind):  # draws of one noise together: one product of matrices
+        some = beside[:, kind == one]
+        squares[kind == one] = np.sum(some * (products.matrix[one] @ some), axis=0)
     log = products.log_prior[kind] + products.log_size(np.maximum(squares, 1e-30))
     log = log + np.log(named.level * named.rate * named.unit) + log_prior(named.power)[0]
     if 4 in free:
@@ -382,7 +385,7 @@ class Span(NamedTuple):
 
 @dataclass(frozen=True)
 class FreeLaw:
-    """What a record tells where its law and its noise are not certain.
+    """Posterior of a record whose law and noise are not certain.
 
     Parameters
     ----------
@@ -412,7 +415,7 @@ class FreeLaw:
 
 
 def _at_bounds(share: np.ndarray, weight: np.ndarray) -> tuple[bool, bool]:
-    """Whether shares of 0 and of 1 are not excluded at 95 %: by the density of draws beside them
+    """Tell if shares of 0 and of 1 are not excluded at 95 %: by the density of draws beside them
     in that of a normal distribution, two standard deviations off.
     """
     near = NEAR * math.sqrt(weight @ (share - weight @ share) ** 2)
@@ -477,7 +480,7 @@ def free_law(record: DecayRecord, values: Physical) -> FreeLaw | None:
 
 
 def _quoted(record: DecayRecord, seen: Seen, found: Numbers) -> dict[str, np.ndarray]:
-    """What is quoted, by draw."""
+    """Quoted quantities, by draw."""
     span, mean = record.span, float(record.current.mean())
     x = found.currents(seen.gas)
     # Where the current is its mean: the drift has gone so far by then.

@@ -200,14 +200,14 @@ def _steps(time: np.ndarray, current: np.ndarray, noise: float) -> np.ndarray:
 
 
 def _highest(smooth: np.ndarray, low: float, noise: float) -> int:
-    """Where a rise from a low current ends: it falls again by more than noise and a tenth of it."""
+    """End of a rise from a low current: it falls again by more than noise and a tenth of it."""
     top = np.maximum.accumulate(smooth)
     falls = np.flatnonzero(top - smooth > np.maximum(5 * noise, FALL * (top - low)))
     return int(np.argmax(smooth[: falls[0] if falls.size else None]))
 
 
 def _ramp(current: np.ndarray, noise: float) -> int:
-    """How many readings at the head of a piece are of injection: the current still rises, by more
+    """Count the readings of injection at the head of a piece: the current still rises, by more
     than noise and three times more than anywhere later. Half as many again are cut, where a ramp
     that ends smoothly still counts.
     """
@@ -224,7 +224,7 @@ def _ramp(current: np.ndarray, noise: float) -> int:
 
 
 def _refills(time: np.ndarray, current: np.ndarray, noise: float) -> list[int]:
-    """Where refills of many readings begin: their ramps are then at the heads of pieces."""
+    """Find where refills of many readings begin: their ramps are then at the heads of pieces."""
     if current.size < 3 * FEWEST:
         return []
     smooth = np.convolve(current, np.full(SMOOTH, 1 / SMOOTH), "valid")

@@ -17,7 +17,7 @@ from beamfit.greybox.memory import range_of
 from beamfit.greybox.posterior import Sampled, target_of
 from beamfit.greybox.problem import Free, Prior, Problem, Record
 from beamfit.greybox.stated import Optimum, Statement
-from beamfit.lifetime.decay_law import HOUR, Moments, beam_current, current
+from beamfit.lifetime.decay_law import Moments, beam_current, current
 from beamfit.lifetime.expansion import Pieces, solved
 from beamfit.lifetime.record import DecayRecord
 from beamfit.noise.correlated import (
@@ -27,10 +27,11 @@ from beamfit.noise.correlated import (
     whitened,
     whitened_of_both,
 )
+from beamfit.quantity import HOUR
 from beamfit.sampling.intervals import Expected
 from beamfit.sampling.posterior import Posterior
 from beamfit.sampling.priors import Distribution
-from beamfit.sampling.target import SamplingTarget as Target
+from beamfit.sampling.target import SamplingTarget
 from beamfit.verdict import Finding
 
 RECORD = "decay"
@@ -129,7 +130,7 @@ def decay_target(
     noise: str | None = None,
     outliers: bool = False,
     priors: Mapping[str, Distribution] | None = None,
-) -> Target:
+) -> SamplingTarget:
     """State the posterior of a fitted decay.
 
     Parameters
@@ -141,7 +142,7 @@ def decay_target(
 
     Returns
     -------
-    Target
+    SamplingTarget
         Lifetimes are its derived numbers.
 
     Raises
@@ -167,47 +168,44 @@ def decay_target(
     if fit.shaped:
         expected = "a fit of eq. 44 with constant a and b; sample fit_decay(record) without shape"
         raise InputError("a fit with a shape of a(I), which is not sampled", expected)
-    problem = decay_problem(record, memory=fit.correlation_time)
-    problem, monitor = _with_monitor(problem, record)
+    problem, monitor = _with_monitor(decay_problem(record, memory=fit.correlation_time), record)
     theta, rate = _start(fit, record)
     theta = np.append(theta, np.zeros(len(monitor)))
-    scale = fit.noise
-    if record.error is not None:
-        scale = max(1.0, np.sqrt(fit.chi2 / fit.dof))
-    more = {}
+    scale = fit.noise if record.error is None else max(1.0, np.sqrt(fit.chi2 / fit.dof))
     if fit.correlation_time is not None:
-        more["log_volume"] = _log_volume
         inferred = noise == "inferred" or (noise is None and (record.error is None or scale > 1))
         remembered = _noise_of(fit)
         problem = _with_memory(problem, fit, remembered, inferred)
         theta = np.append(theta, np.log(remembered.time))
         theta = np.append(theta, log_wander(remembered, record)) if remembered.white else theta
-        more["along"] = "log_memory"
+    stated = _statement(fit, problem, monitor, rate, priors or {})
+    verdict, given = Finding(fit.status, fit.message), [record.error is not None]
+    optimum = Optimum(theta, verdict, [max(scale, 1e-12)], given)
+    return target_of(problem, optimum, stated, noise=noise, outliers=outliers, priors=priors)
+
+
+def _statement(
+    fit, problem: Problem, monitor: dict[str, float], rate: float, priors: Mapping[str, object]
+) -> Statement:
+    """Units, bounds, widths and derived numbers of the posterior."""
+    record, memory = fit.readings, fit.correlation_time is not None
     nothing = f"the readings show neither decay nor noise; {fit.message}".rstrip(".")
     seen = fit.rms_residual > 0 or record.error is not None
     # A prior on one of the two tells them apart, if anything does.
-    told = fit.identifiability.separable or {"a", "b"} & set(priors or {})
-    stated = Statement(
+    told = fit.identifiability.separable or {"a", "b"} & set(priors)
+    widths = {"a": rate / fit.mean_current, "b": rate, "log_memory": 1.0, "log_wander": 1.0}
+    return Statement(
         derived=LIFETIMES,
         derive=_lifetimes,
         data=(fit.mean_current, record.time[-1], problem.records[0].data),
         units=SAMPLED,
         lower=dict.fromkeys(UNITS, 0.0),
-        width={
-            "a": rate / fit.mean_current,
-            "b": rate,
-            "log_memory": 1.0,
-            "log_wander": 1.0,
-            **monitor,
-        },
+        width=widths | monitor,
         noise_unit="mA",
         priors_own=() if told else ("a", "b"),
         nothing="" if seen else nothing,
-        **more,
+        **{"log_volume": _log_volume, "along": "log_memory"} if memory else {},
     )
-    verdict, given = Finding(fit.status, fit.message), [record.error is not None]
-    optimum = Optimum(theta, verdict, [max(scale, 1e-12)], given)
-    return target_of(problem, optimum, stated, noise=noise, outliers=outliers, priors=priors)
 
 
 def _with_monitor(problem: Problem, record: DecayRecord) -> tuple[Problem, dict[str, float]]:
@@ -223,7 +221,7 @@ def _with_monitor(problem: Problem, record: DecayRecord) -> tuple[Problem, dict[
 
 
 class Remembered(NamedTuple):
-    """What whitened residuals need: when, what was read, its error, the usual interval, the
+    """Data of whitened residuals: when, what was read, its error, the usual interval, the
     logarithm of what was new in it by the fitted noise, or NaN where the errors are known, and the
     fitted share without a memory, None where there is none.
     """
@@ -310,7 +308,7 @@ def _log_volume(model: DecayNumbers, data: tuple[Array, Array, Remembered]) -> A
 
 
 def _start(fit, record: DecayRecord) -> tuple[np.ndarray, float]:
-    """Where to begin, a and b not negative, and the whole loss rate at the mean current, 1/s."""
+    """Start values, a and b not negative, and the whole loss rate at the mean current, 1/s."""
     mean = fit.mean_current
     a, b = fit.if_constant("a").value, fit.if_constant("b").value
     rate = a * mean + b
@@ -321,7 +319,7 @@ def _start(fit, record: DecayRecord) -> tuple[np.ndarray, float]:
 
 
 def _currents(data: Sampled, theta: Array) -> Array:
-    """What one draw predicts of the readings."""
+    """Readings that one draw predicts."""
     core = data.core
     at = core.records[0].data
     model = tree.replace(core.model, core.chosen, data.theta.at[data.moving].set(theta))

@@ -60,7 +60,7 @@ class Conditions(NamedTuple):
 
     @property
     def given(self) -> dict[str, np.ndarray]:
-        """What the file gives, by name."""
+        """Columns of the file, by name."""
         return {name: values for name, values in self._asdict().items() if values is not None}
 
 
@@ -88,7 +88,7 @@ def _first(bad: np.ndarray) -> int | None:
 
 
 def _unit_change(current: np.ndarray) -> int | None:
-    """Where A follow mA or the other way round: by 1000, and the decay goes on from there."""
+    """Row at which the unit switches between A and mA: by 1000, and the decay goes on there."""
     with np.errstate(divide="ignore", invalid="ignore"):
         decades = np.abs(np.log10(current[1:] / current[:-1]))
     for row in np.flatnonzero(np.abs(decades - 3) < 0.01) + 1:
@@ -192,7 +192,7 @@ class Monitor(NamedTuple):
                 raise InputError(f"monitor {name} {value}", "zero or more", column=name)
 
     def beside(self, other: Monitor | None) -> Monitor:
-        """What is known of one monitor from two sources, added in quadrature."""
+        """Add the knowledge of one monitor from two sources in quadrature."""
         return self if other is None else Monitor(*map(float, np.hypot(self, other)))
 
     def changes(self, time: np.ndarray) -> dict[str, np.ndarray]:
@@ -377,7 +377,7 @@ class DecayRecord:
 
     @property
     def monitor_changes(self) -> list[np.ndarray]:
-        """What a stated instability of the monitor does to the readings, over their errors."""
+        """Changes of the readings by a stated instability of the monitor, over their errors."""
         over = 1.0 if self.error is None else self.error
         changes = {} if self.monitor is None else self.monitor.changes(self.time)
         return [change / over for change in changes.values()]

@@ -22,7 +22,6 @@ from beamfit.lifetime.advice import (
     best_operating_point,
     next_decays,
 )
-from beamfit.lifetime.decay_law import HOUR
 from beamfit.lifetime.expansion import lifetime_of
 from beamfit.lifetime.fit import bare
 from beamfit.lifetime.loss_network import Network, NetworkFit, fit_loss_network
@@ -38,7 +37,7 @@ from beamfit.lifetime.scales import (
     summarise,
 )
 from beamfit.lifetime.study import Decay, Machine, operation_during, settings_json
-from beamfit.quantity import Quantity, Status
+from beamfit.quantity import HOUR, Quantity, Status
 from beamfit.sampling.intervals import Interval
 from beamfit.sampling.posterior import Posterior
 from beamfit.shown import shown
@@ -54,7 +53,7 @@ CAUSES = {
 
 
 class Anomaly(NamedTuple):
-    """What moved, and since when.
+    """Mechanism that moved, and since when.
 
     Attributes
     ----------
@@ -159,7 +158,7 @@ def find_anomaly(fit: ScaleFit, decays: Sequence[Decay]) -> Anomaly:
 
 
 def _moved(off: np.ndarray, change: np.ndarray, fall: float) -> tuple[str, ...]:
-    """Whether one of the two explains as much as both, within 10.8 of chi² (p = 1e-3)."""
+    """Test if one of the two explains as much as both, within 10.8 of chi² (p = 1e-3)."""
     alone = {name: _fitted(off, change[:, [k]])[0] for k, name in enumerate("ab")}
     best = max(alone, key=alone.get)
     return (best,) if fall - alone[best] < 10.8 else ("a", "b")
@@ -217,7 +216,7 @@ def budget_intervals(
 @shown
 @dataclass(frozen=True, eq=False)
 class Shift:
-    """What many decays say together.
+    """Joint answer of many decays.
 
     Parameters
     ----------

@@ -22,8 +22,7 @@ from beamfit.greybox.stated import Optimum, Statement
 from beamfit.lifetime.decay_law import current
 from beamfit.lifetime.expansion import padded_size
 from beamfit.lifetime.fit import DecayFit
-from beamfit.lifetime.mechanisms import SCALES, loss_terms, scaled_losses
-from beamfit.lifetime.mechanisms import LossTerms as Terms
+from beamfit.lifetime.mechanisms import SCALES, LossTerms, loss_terms, scaled_losses
 from beamfit.lifetime.ring import Operation
 from beamfit.lifetime.study import Decay, Machine, operation_during
 from beamfit.lifetime.systematics import about_fit
@@ -206,7 +205,7 @@ class ScaleFit:
         Relative error of the pressure readings, of each record independently.
     machine : Machine
         The ring and its usual operation.
-    terms : Terms
+    terms : LossTerms
         First principles at the settings of each decay.
     measured : Summaries
         What each decay says.
@@ -222,7 +221,7 @@ class ScaleFit:
     covariance: np.ndarray
     pressure_error: float
     machine: Machine
-    terms: Terms
+    terms: LossTerms
     measured: Summaries
     names: tuple[str, ...]
 
@@ -241,7 +240,7 @@ class ScaleFit:
         """sqrt(chi²/dof) where above 1."""
         return error_scale(self.chi2, self.dof)
 
-    def terms_at(self, operation: Operation, current: float) -> Terms:
+    def terms_at(self, operation: Operation, current: float) -> LossTerms:
         """First principles at a setting, for these scales."""
         return loss_terms(self.machine.ring, operation, current, self.voltages)
 
@@ -251,7 +250,7 @@ class ScaleFit:
         return None if self.terms.voltages is None else np.asarray(self.terms.voltages[0])
 
     def determines(self, quantity: Callable[[Array], Array]) -> np.ndarray:
-        """Whether decays and priors, and not the limits of the scales alone, tell quantities.
+        """Tell if decays and priors, and not the limits of the scales alone, determine quantities.
 
         ``quantity(scales)`` is an array in JAX; each is told if known to a third of itself, or of
         what the ring file says where that is more.
@@ -262,8 +261,8 @@ class ScaleFit:
         error = spread_of_scales(self.fit).error(np.asarray(jax.jacfwd(quantity)(vector)))
         return self.error_scale * error < SEPARABLE * size
 
-    def about(self, terms: Terms, measured: Summaries) -> tuple[np.ndarray, ...]:
-        """Of decays: their weights, their `pulls`, and the slopes of these by the scales."""
+    def about(self, terms: LossTerms, measured: Summaries) -> tuple[np.ndarray, ...]:
+        """Expand decays: their weights, their `pulls`, and the slopes of these by the scales."""
         vector = jnp.asarray(self.vector)
         weight = whitener(vector, terms, measured, self.pressure_error)
         given = vector, terms, measured, weight
@@ -319,21 +318,21 @@ class ScaleFit:
 
 def stacked_terms(
     decays: Sequence[Decay], machine: Machine, voltages: np.ndarray | None = None
-) -> Terms:
+) -> LossTerms:
     """First principles at the settings of each decay, each of shape (n,); `voltages` as of
-    `Terms`.
+    `LossTerms`.
     """
     settings = [(operation_during(d.segment, machine), d.fit.mean_current) for d in decays]
     rows = [loss_terms(machine.ring, *setting, voltages) for setting in settings]
     return jax.tree.map(lambda *parts: jnp.stack(parts), *rows)
 
 
-def _parts(scales: Array, terms: Terms, factor: Array) -> Array:
+def _parts(scales: Array, terms: LossTerms, factor: Array) -> Array:
     return loss_parts(*scaled_losses(scales, terms, factor), terms.current)
 
 
 @jax.jit
-def whitener(scales: Array, terms: Terms, measured: Summaries, pressure_error: Array) -> Array:
+def whitener(scales: Array, terms: LossTerms, measured: Summaries, pressure_error: Array) -> Array:
     """W of shape (n, 2, 2) with WᵀW = Rᵀ (1 + g gᵀ)⁻¹ R, g = R ∂(parts)/∂(factor) times the
     relative pressure error: each decay's pressure factor integrated out (Sherman and Morrison).
     """
@@ -348,7 +347,7 @@ def whitener(scales: Array, terms: Terms, measured: Summaries, pressure_error: A
 
 
 @jax.jit
-def pulls(scales: Array, terms: Terms, measured: Summaries, weight: Array) -> Array:
+def pulls(scales: Array, terms: LossTerms, measured: Summaries, weight: Array) -> Array:
     """Model minus measurement in standard errors, shape (n, 2); `weight` is that of `whitener`."""
     off = _parts(scales, terms, jnp.ones_like(terms.current)) - measured.parts
     return jnp.einsum("nij,nj->ni", weight, off)
@@ -369,7 +368,7 @@ def _checked(priors: Mapping[str, tuple[float, float]]) -> list[Prior]:
 def _voltages(
     decays: Sequence[Decay], machine: Machine, prior: tuple[float, float] | None
 ) -> np.ndarray | None:
-    """Where losses are computed for a free scale of the RF voltage: all must store a beam."""
+    """RF voltages at which losses are computed for a free scale: all must store a beam."""
     if prior is None:
         return None
     mean, error = prior
@@ -457,7 +456,7 @@ def error_scale(chi2: float, dof: int) -> float:
 
 
 def spread_of_scales(found: Fit) -> Spread:
-    """Of the scales without their bounds, which stand for nothing known."""
+    """Spread of the scales without their bounds, which stand for nothing known."""
     unbounded = np.full(found.theta.shape, np.inf)
     return spread_of(found.jacobian, -unbounded, unbounded)
 
@@ -466,7 +465,7 @@ def _vector(model: Mapping[str, Array]) -> Array:
     return jnp.stack([model[name] for name in (*SCALES, VOLTAGE) if name in model])
 
 
-def _weighted(model: Mapping[str, Array], data: tuple[Terms, Summaries, Array]) -> Array:
+def _weighted(model: Mapping[str, Array], data: tuple[LossTerms, Summaries, Array]) -> Array:
     """Model minus measurement, in standard errors taken at the last scales."""
     return pulls(_vector(model), *data)
 
@@ -484,7 +483,7 @@ def _scale(
 
 
 # First principles, the decays, the relative error of pressure readings, the factor on errors.
-Study = tuple[Terms, Summaries, Array, Array]
+Study = tuple[LossTerms, Summaries, Array, Array]
 
 
 def _whitened(scales: Mapping[str, Array], study: Study) -> tuple[Array, Array]:
@@ -510,7 +509,7 @@ VOLTAGE = "rf_voltage"
 
 
 class ScaleEvidence(NamedTuple):
-    """What the rules look at."""
+    """A fit of scales as the rules see it."""
 
     scales: Mapping[str, Quantity]
     chi2: float
@@ -520,7 +519,7 @@ class ScaleEvidence(NamedTuple):
 
     @property
     def improbable(self) -> bool:
-        """Whether chi² is."""
+        """True if chi² is improbable."""
         return self.dof > 0 and chi2_probability(self.chi2, self.dof) < POOR_FIT
 
 

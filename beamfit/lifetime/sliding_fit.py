@@ -13,7 +13,6 @@ from beamfit.errors import InputError
 from beamfit.lifetime import alarm
 from beamfit.lifetime.course import BEST_MONITOR, WANDER, alike_over
 from beamfit.lifetime.cycles import alike, cut_at_refills, joined, usual_cycle
-from beamfit.lifetime.decay_law import HOUR
 from beamfit.lifetime.evidence import UNITS
 from beamfit.lifetime.fit import DecayFit, bare, fit_decay, fit_pieces
 from beamfit.lifetime.marginal import Law
@@ -27,7 +26,7 @@ from beamfit.lifetime.study import (
     operation_during,
     seen_through,
 )
-from beamfit.quantity import Quantity, Status
+from beamfit.quantity import HOUR, Quantity, Status
 from beamfit.table import json_of
 
 
@@ -72,7 +71,7 @@ class Window(NamedTuple):
 
 
 class Answer(NamedTuple):
-    """What the window says.
+    """Answer of the window.
 
     Attributes
     ----------
@@ -318,7 +317,7 @@ def _shared(window: Window, machine: Machine) -> tuple[float, float, np.ndarray]
 
 
 def _terms(machine: Machine, before: Terms | None, row: Row) -> Terms:
-    """What the ring loses at the settings of a row; anew but for the pressure if they moved."""
+    """Losses of the ring at the settings of a row; anew but for the pressure if they moved."""
     at = Conditions(*(None if math.isnan(value) else [value, value] for value in row.settings))
     moment = DecayRecord([0.0, 1.0], row.current * np.array([1.0, 1 - 1e-6]), conditions=at)
     operation = operation_during(moment, machine)
@@ -332,7 +331,7 @@ def _terms(machine: Machine, before: Terms | None, row: Row) -> Terms:
 
 
 def followed(known: Alarmed, row: Row, apart: float, machine: Machine | None) -> Alarmed:
-    """What is expected at the settings of a row, smoothed: the noise of a gauge would bend it.
+    """Follow the expected loss at the settings of a row, smoothed: noise of a gauge would bend it.
 
     Parameters
     ----------

@@ -22,7 +22,6 @@ from beamfit.lifetime.cycles import (
     unresolved,
     usual_cycle,
 )
-from beamfit.lifetime.decay_law import HOUR
 from beamfit.lifetime.evidence import SEPARABLE
 from beamfit.lifetime.fit import DecayFit, bare, fit_cycles, fit_decay
 from beamfit.lifetime.marginal import Law
@@ -39,7 +38,7 @@ from beamfit.lifetime.pieces import (
 from beamfit.lifetime.record import DecayRecord
 from beamfit.lifetime.ring import MeasuredLength, Operation, Ring, unstored
 from beamfit.lifetime.systematics import DecayChecks, Systematic, check_decay, systematics
-from beamfit.quantity import Quantity, Status
+from beamfit.quantity import HOUR, Quantity, Status
 from beamfit.shown import shown
 from beamfit.table import json_of
 
@@ -226,7 +225,7 @@ def budget(record: DecayRecord, machine: Machine) -> Budget:
 
 
 def stands_alone(cycle: DecayRecord, fit: DecayFit) -> bool:
-    """Whether a cycle by itself would tell a from b, by the bend of its decay and the noise that
+    """Tell if a cycle by itself would separate a and b, by the bend of its decay and the noise that
     all cycles show; where one law does not hold for all, that of its neighbouring readings.
     """
     noise = fit.rms_residual * fit.inflation
@@ -326,14 +325,14 @@ class Decay:
 
     @cached_property
     def checks(self) -> DecayChecks | None:
-        """What simpler analyses say of it, and whether a is constant; None if nothing decays, and
+        """Simpler analyses, and the test of a constant a; None if nothing decays, and
         for many cycles.
         """
         return check_decay(self.segment, self.fit) if self.fit.first is None else None
 
     @cached_property
     def systematics(self) -> tuple[Systematic, ...]:
-        """What no residual shows."""
+        """Systematic errors, which no residual shows."""
         return systematics(self.fit)
 
     def to_json(self) -> dict[str, Any]:
@@ -369,7 +368,7 @@ class RecordStudy:
 
     @property
     def answers(self) -> tuple[Decay, ...]:
-        """What is quoted of the record: cycles together, then single decays; at least one."""
+        """Quoted answers of the record: cycles together, then single decays; at least one."""
         return self.pooled + self.decays
 
 

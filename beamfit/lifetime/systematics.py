@@ -10,7 +10,6 @@ import numpy as np
 
 from beamfit.errors import InputError
 from beamfit.lifetime.alternatives import ConstantA
-from beamfit.lifetime.decay_law import HOUR
 from beamfit.lifetime.evidence import UNITS
 from beamfit.lifetime.expansion import (
     LEVEL,
@@ -27,7 +26,7 @@ from beamfit.lifetime.expansion import (
 from beamfit.lifetime.fit import DecayFit, bare, fit_decay
 from beamfit.lifetime.marginal import Law
 from beamfit.lifetime.record import DecayRecord
-from beamfit.quantity import Quantity, Status
+from beamfit.quantity import HOUR, Quantity, Status
 from beamfit.shown import shown
 from beamfit.table import json_of
 
@@ -121,7 +120,7 @@ def systematics(fit: DecayFit) -> tuple[Systematic, ...]:
 
 
 def _monitor(record: DecayRecord, share: np.ndarray) -> dict[str, np.ndarray]:
-    """What is stated of the monitor, or else assumed."""
+    """Instability of the monitor as stated, or else assumed."""
     if record.monitor is None:
         size = min(float(record.current.max()) / SMALL, 1.0)
         return {
@@ -207,7 +206,7 @@ def single_exponential(record: DecayRecord, fit: DecayFit | None = None) -> OneL
     True
     """
     found = solved(Pieces.of(record), (LOSS,))
-    moments = found.whitened((LEVEL, LOSS), True).memory().moments(np.eye(2)[1:], found.given)
+    moments = found.memory((LEVEL, LOSS), True).moments(np.eye(2)[1:], found.given)
     error = float(moments.error[0]) / record.span
     left = found.residuals * found.pieces.over
     fit = fit or fit_decay(record, law=Law.constant)
@@ -351,7 +350,8 @@ def constant_a_test(record: DecayRecord) -> ConstantA:
 
     Examples
     --------
-    >>> from beamfit.lifetime.decay_law import HOUR, current
+    >>> from beamfit.lifetime.decay_law import current
+    >>> from beamfit.quantity import HOUR
     >>> t = np.linspace(0, 8 * 3600, 500)
     >>> noise = 1e-3 * np.random.default_rng(1).normal(size=t.size)
     >>> record = DecayRecord(t, np.array(current(t, 500.0, 2e-8, 1e-6)) + noise)
@@ -366,7 +366,7 @@ def constant_a_test(record: DecayRecord) -> ConstantA:
 
 @dataclass(frozen=True)
 class DecayChecks:
-    """What stands beside an (a, b) fit.
+    """Simpler analyses beside an (a, b) fit.
 
     Parameters
     ----------

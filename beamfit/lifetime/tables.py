@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 from beamfit.lifetime.fit import DecayFit
 from beamfit.lifetime.mechanisms import LINEAR, QUADRATIC, Mechanism
@@ -18,27 +19,25 @@ from beamfit.table import cell
 
 # Label and values, as `beamfit.table.labelled` takes them.
 Rows = list[tuple[str, list[object]]]
-Row = tuple[str, Callable[[Decay], object]]
+
+
+class DecayRow(NamedTuple):
+    """A label, what stands beside it for a decay, and whether people quote it."""
+
+    label: str
+    value: Callable[[Decay], object]
+    quoted: bool = False
+
+
 MOST_EVENTS = 100
 # How many decays have every number shown; of more only the main ones, a row each.
 FEW = 4
-SHORT = {
-    "Result": ("status", "current at the start", "lifetime at the mean current"),
-    "a and b": ("a", "b", "chi2/dof"),
-    "Losses from first principles": (
-        "RF voltage",
-        "scraper",
-        "bunches",
-        "lifetime at the mean, computed",
-        "lifetime at the mean, measured",
-    ),
-}
 # Percent of the loss below which a mechanism's digits say nothing.
 NEGLIGIBLE = 1e-6
 
 
-def _laid_out(decays: Sequence[Decay], rows: Sequence[Row]) -> Rows:
-    return [(label, [value(decay) for decay in decays]) for label, value in rows]
+def _laid_out(decays: Sequence[Decay], rows: Sequence[DecayRow]) -> Rows:
+    return [(row.label, [row.value(decay) for decay in decays]) for row in rows]
 
 
 def _span(seconds: float) -> str:
@@ -54,6 +53,11 @@ def _chi2(decay: Decay) -> str:
     return f"{fit.chi2:.4g}/{fit.dof} = {fit.chi2 / fit.dof:.3g}"
 
 
+def _reduced_chi2(decay: Decay) -> str:
+    fit = decay.fit
+    return "not testable" if fit.noise_inferred else f"{fit.chi2 / fit.dof:.3g}"
+
+
 def _noise(decay: Decay) -> str:
     return "inferred from the residuals" if decay.fit.noise_inferred else "as given"
 
@@ -65,54 +69,65 @@ def _interval(found: Quantity) -> str | None:
     return f"{low:.4g} to {high:.4g} {found.unit}"
 
 
-RESULT: tuple[Row, ...] = (
-    ("status", lambda d: d.fit.status),
-    ("readings", lambda d: f"{len(d.segment)} over {_span(d.segment.span)}"),
-    ("current at the start", lambda d: d.fit.i0),
-    ("lifetime at the start", lambda d: d.fit.lifetime_start),
-    ("lifetime at the mean current", lambda d: d.fit.lifetime_mean),
-    ("lifetime at the end", lambda d: d.fit.lifetime_end),
-    ("a", lambda d: d.fit.a),
-    ("b", lambda d: d.fit.b),
-    ("95 % interval of a", lambda d: _interval(d.fit.a)),
-    ("95 % interval of b", lambda d: _interval(d.fit.b)),
-    ("chi2/dof", _chi2),
-    ("rms residual", lambda d: f"{d.fit.rms_residual:.3g} mA"),
-    ("errors", _noise),
+STATUS = DecayRow("status", lambda d: d.fit.status)
+READINGS = DecayRow("readings", lambda d: f"{len(d.segment)} over {_span(d.segment.span)}")
+START = DecayRow("current at the start", lambda d: d.fit.i0, quoted=True)
+MEAN = DecayRow("lifetime at the mean current", lambda d: d.fit.lifetime_mean, quoted=True)
+A, B = (DecayRow(name, lambda d, name=name: getattr(d.fit, name), quoted=True) for name in "ab")
+INTERVALS = tuple(
+    DecayRow(
+        f"95 % interval of {row.label}", lambda d, row=row: _interval(row.value(d)), quoted=True
+    )
+    for row in (A, B)
+)
+QUALITY: tuple[DecayRow, ...] = (
+    DecayRow("chi2/dof", _chi2, quoted=True),
+    DecayRow("rms residual", lambda d: f"{d.fit.rms_residual:.3g} mA"),
+    DecayRow("errors", _noise),
+)
+RESULT: tuple[DecayRow, ...] = (
+    STATUS,
+    READINGS,
+    START,
+    DecayRow("lifetime at the start", lambda d: d.fit.lifetime_start, quoted=True),
+    MEAN,
+    DecayRow("lifetime at the end", lambda d: d.fit.lifetime_end, quoted=True),
+    A,
+    B,
+    *INTERVALS,
+)
+EXACT: tuple[DecayRow, ...] = (
+    DecayRow("a if a and b are constant", lambda d: d.fit.if_constant("a"), quoted=True),
+    DecayRow("b if a and b are constant", lambda d: d.fit.if_constant("b"), quoted=True),
+)
+CYCLES: tuple[DecayRow, ...] = (
+    STATUS,
+    DecayRow("cycles", lambda d: f"{d.fit.first.size} at {d.fit.mean_current:.5g} mA", quoted=True),
+    READINGS,
+    MEAN,
+    DecayRow("lifetime at the highest current", lambda d: d.fit.lifetime_start, quoted=True),
+    DecayRow("lifetime at the lowest current", lambda d: d.fit.lifetime_end, quoted=True),
+    A,
+    B,
+    *INTERVALS,
 )
 
 
-EXACT: tuple[Row, ...] = (
-    ("a if a and b are constant", lambda d: d.fit.if_constant("a")),
-    ("b if a and b are constant", lambda d: d.fit.if_constant("b")),
-)
-CYCLES: tuple[Row, ...] = (
-    ("status", lambda d: d.fit.status),
-    ("cycles", lambda d: f"{d.fit.first.size} at {d.fit.mean_current:.5g} mA"),
-    ("readings", lambda d: f"{len(d.segment)} over {_span(d.segment.span)}"),
-    ("lifetime at the mean current", lambda d: d.fit.lifetime_mean),
-    ("lifetime at the highest current", lambda d: d.fit.lifetime_start),
-    ("lifetime at the lowest current", lambda d: d.fit.lifetime_end),
-    *RESULT[6:10],
-    *RESULT[-3:],
-)
+def _rows_of(decays: Sequence[Decay]) -> tuple[DecayRow, ...]:
+    if all(decay.fit.first is not None for decay in decays):
+        return *CYCLES, *QUALITY
+    free = any(decay.fit.free_law for decay in decays)
+    return *RESULT, *EXACT * free, *QUALITY
 
 
 def decay_rows(decays: Sequence[Decay]) -> Rows:
     """Label and one cell per decay, for every number a fit has."""
-    together = all(decay.fit.first is not None for decay in decays)
-    free = any(decay.fit.free_law for decay in decays)
-    rows = CYCLES if together else (*RESULT[:-3], *EXACT * free, *RESULT[-3:])
-    return _laid_out(decays, rows)
-
-
-# Rows of `decay_rows` that stand in the sentence, or say how the answer was had.
-SECOND = ("status", "readings", "rms residual", "errors")
+    return _laid_out(decays, _rows_of(decays))
 
 
 def quoted_rows(decays: Sequence[Decay]) -> Rows:
     """The rows of `decay_rows` that people quote."""
-    return [row for row in decay_rows(decays) if row[0] not in SECOND]
+    return _laid_out(decays, [row for row in _rows_of(decays) if row.quoted])
 
 
 def _number(value: float | None, form: str, unit: str = "") -> str:
@@ -124,15 +139,17 @@ def _share(decay: Decay) -> Quantity | None:
     return None if found.share is None else Quantity(found.share, found.share_error, "1")
 
 
-APART: tuple[Row, ...] = (
-    ("a and b", lambda d: "separable" if d.fit.identifiability.separable else "not separable"),
-    ("share of a in the loss", _share),
-    ("correlation of a and b", lambda d: _number(d.fit.identifiability.correlation, ".6f")),
-    (
+APART: tuple[DecayRow, ...] = (
+    DecayRow(
+        "a and b", lambda d: "separable" if d.fit.identifiability.separable else "not separable"
+    ),
+    DecayRow("share of a in the loss", _share),
+    DecayRow("correlation of a and b", lambda d: _number(d.fit.identifiability.correlation, ".6f")),
+    DecayRow(
         "neighbouring residuals",
         lambda d: _number(d.fit.identifiability.residual_correlation, ".2f"),
     ),
-    (
+    DecayRow(
         "errors enlarged for that",
         lambda d: _number(d.fit.identifiability.error_inflation, ".1f", " times"),
     ),
@@ -162,20 +179,20 @@ def _constant_a(decay: Decay) -> str | None:
     return said[found.status] + chance if found.status in said else "the record cannot tell"
 
 
-CHECKS: tuple[Row, ...] = (
-    ("single exponential", lambda d: _one_lifetime(d, "single_exponential")),
-    ("line through ln I", lambda d: _one_lifetime(d, "log_linear")),
-    ("constant a", _constant_a),
+CHECKS: tuple[DecayRow, ...] = (
+    DecayRow("single exponential", lambda d: _one_lifetime(d, "single_exponential")),
+    DecayRow("line through ln I", lambda d: _one_lifetime(d, "log_linear")),
+    DecayRow("constant a", _constant_a),
 )
-LIFETIMES: tuple[Row, ...] = (
-    ("lifetime by current", lambda d: d.fit.lifetimes and str(d.fit.lifetimes)),
+LIFETIMES: tuple[DecayRow, ...] = (
+    DecayRow("lifetime by current", lambda d: d.fit.lifetimes and str(d.fit.lifetimes)),
 )
-OUTGASSING: tuple[Row, ...] = (
-    ("gas loss relaxes within", lambda d: d.fit.outgassing.time_constant),
-    ("lifetime at first", lambda d: d.fit.outgassing.before),
-    ("without that gas", lambda d: d.fit.outgassing.after),
-    ("a beside it", lambda d: d.fit.outgassing.a),
-    ("b in the end", lambda d: d.fit.outgassing.b),
+OUTGASSING: tuple[DecayRow, ...] = (
+    DecayRow("gas loss relaxes within", lambda d: d.fit.outgassing.time_constant),
+    DecayRow("lifetime at first", lambda d: d.fit.outgassing.before),
+    DecayRow("without that gas", lambda d: d.fit.outgassing.after),
+    DecayRow("a beside it", lambda d: d.fit.outgassing.a),
+    DecayRow("b in the end", lambda d: d.fit.outgassing.b),
 )
 SYSTEMATIC = ["if the", "a", "b", "lifetime at the mean"]
 
@@ -202,7 +219,7 @@ def _percent(share: float) -> str:
     return f"{100 * share:+.0f} %" if abs(share) > 1 - 1e-9 else f"{100 * share:+.2g} %"
 
 
-def _part(kind: str, mechanism: Mechanism) -> Row:
+def _part(kind: str, mechanism: Mechanism) -> DecayRow:
     """A mechanism's part of a or b, with its share of the loss at the mean current."""
     name, unit = f"{kind}_{mechanism.name}", {"a": "1/(mA s)", "b": "1/s"}[kind]
 
@@ -215,7 +232,7 @@ def _part(kind: str, mechanism: Mechanism) -> Row:
             return "negligible"
         return f"{value:.4g} {unit} ({share:.3g} % of the loss)"
 
-    return f"{kind}, {mechanism.label}", shown
+    return DecayRow(f"{kind}, {mechanism.label}", shown)
 
 
 def _emittances(decay: Decay) -> str:
@@ -228,28 +245,44 @@ def _pressure(decay: Decay) -> str:
     return f"{float(operation.pressure_base + operation.pressure_slope * current):.3g} Pa"
 
 
-BUDGET: tuple[Row, ...] = (
-    ("RF voltage", lambda d: f"{float(d.budget.operation.rf_voltage) / 1e3:.6g} kV"),
-    ("scraper", lambda d: f"{float(d.budget.operation.scraper_y) * 1e3:.4g} mm"),
-    ("bunches", lambda d: f"{float(d.budget.operation.bunches):.6g}"),
-    ("emittances, as given: no intrabeam scattering", _emittances),
-    ("rms bunch length", lambda d: f"{1e3 * d.budget.bunch_length:.4g} mm"),
-    ("pressure at the mean current", _pressure),
-    *(_part("a", mechanism) for mechanism in QUADRATIC),
-    ("a, sum", lambda d: f"{d.budget.losses.a:.4g} 1/(mA s)"),
-    ("a, measured", lambda d: d.fit.a),
-    *(_part("b", mechanism) for mechanism in LINEAR),
-    ("b, sum", lambda d: f"{d.budget.losses.b:.4g} 1/s"),
-    ("b, measured", lambda d: d.fit.b),
-    ("lifetime at the mean, computed", lambda d: f"{d.budget.lifetime:.4g} h"),
-    ("lifetime at the mean, measured", lambda d: d.fit.lifetime_mean),
+SETTINGS: tuple[DecayRow, ...] = (
+    DecayRow("RF voltage", lambda d: f"{float(d.budget.operation.rf_voltage) / 1e3:.6g} kV"),
+    DecayRow("scraper", lambda d: f"{float(d.budget.operation.scraper_y) * 1e3:.4g} mm"),
+    DecayRow("bunches", lambda d: f"{float(d.budget.operation.bunches):.6g}"),
 )
+BUDGET: tuple[DecayRow, ...] = (
+    *SETTINGS,
+    DecayRow("emittances, as given: no intrabeam scattering", _emittances),
+    DecayRow("rms bunch length", lambda d: f"{1e3 * d.budget.bunch_length:.4g} mm"),
+    DecayRow("pressure at the mean current", _pressure),
+    *(_part("a", mechanism) for mechanism in QUADRATIC),
+    DecayRow("a, sum", lambda d: f"{d.budget.losses.a:.4g} 1/(mA s)"),
+    DecayRow("a, measured", lambda d: d.fit.a),
+    *(_part("b", mechanism) for mechanism in LINEAR),
+    DecayRow("b, sum", lambda d: f"{d.budget.losses.b:.4g} 1/s"),
+    DecayRow("b, measured", lambda d: d.fit.b),
+    DecayRow("lifetime at the mean, computed", lambda d: f"{d.budget.lifetime:.4g} h"),
+    DecayRow("lifetime at the mean, measured", lambda d: d.fit.lifetime_mean),
+)
+# Of many decays only the main numbers are shown, a row each.
+MAIN: dict[str, tuple[DecayRow, ...]] = {
+    "Result": (STATUS, START, MEAN),
+    "a and b": (A, B, DecayRow("chi2/dof", _reduced_chi2)),
+}
+LOSSES: tuple[DecayRow, ...] = (
+    *SETTINGS,
+    DecayRow("computed", lambda d: f"{d.budget.lifetime:.4g} h"),
+    DecayRow("measured", MEAN.value),
+)
+
+
+def _budgets_known(decays: Sequence[Decay]) -> bool:
+    return all(decay.budget is not None for decay in decays) and len(decays) > 0
 
 
 def budget_rows(decays: Sequence[Decay]) -> Rows:
     """Label and one cell per decay: first principles beside the measured; empty without a ring."""
-    known = decays and all(decay.budget is not None for decay in decays)
-    return _laid_out(decays, BUDGET) if known else []
+    return _laid_out(decays, BUDGET) if _budgets_known(decays) else []
 
 
 def overview(decays: Sequence[Decay]) -> list[tuple[str, list[str], list[list[str]]]]:
@@ -265,18 +298,11 @@ def overview(decays: Sequence[Decay]) -> list[tuple[str, list[str], list[list[st
     list of (str, list of str, list of list of str)
         Title, header and rows of each table.
     """
-    every = dict(decay_rows(decays)) | dict(budget_rows(decays))
-    every["chi2/dof"] = [
-        "not testable" if d.fit.noise_inferred else f"{d.fit.chi2 / d.fit.dof:.3g}" for d in decays
-    ]
-    names = [decay.fit.record for decay in decays]
+    known = {"Losses from first principles": LOSSES} if _budgets_known(decays) else {}
     tables = []
-    for title, wanted in SHORT.items():
-        labels = [label for label in wanted if label in every]
-        if labels:
-            header = ["decay", *(label.removeprefix("lifetime at the mean, ") for label in labels)]
-            columns = [map(cell, every[label]) for label in labels]
-            tables.append((title, header, [list(r) for r in zip(names, *columns, strict=True)]))
+    for title, wanted in (MAIN | known).items():
+        rows = [[d.fit.record, *(cell(row.value(d)) for row in wanted)] for d in decays]
+        tables.append((title, ["decay", *(row.label for row in wanted)], rows))
     return tables
 
 

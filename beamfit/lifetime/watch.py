@@ -46,7 +46,7 @@ RULE = (
 
 
 class Plan(NamedTuple):
-    """How a beam is watched.
+    """Plan of a watch.
 
     Attributes
     ----------
@@ -87,7 +87,7 @@ class Point(NamedTuple):
 
 
 class State(NamedTuple):
-    """What is remembered between readings.
+    """State of a watch between readings.
 
     Attributes
     ----------
@@ -132,7 +132,7 @@ class State(NamedTuple):
 
     @property
     def alarmed(self) -> str:
-        """What moved: a name, "raised" where it is not told yet, "" where nothing did."""
+        """Name of what moved, "raised" where it is not told yet, "" where nothing did."""
         if self.alarm is not None and self.alarm.raised is not None:
             return "raised"
         return self.alarms[-1].moved if self.alarms else ""
@@ -233,7 +233,7 @@ def _behind(plan: Plan, state: State, time: float, value: float) -> State:
 
 
 def _cut(plan: Plan, state: State) -> State:
-    """What comes now has a current of its own."""
+    """Begin a piece with a current of its own."""
     state = _closed(plan, state)
     return state._replace(piece=state.piece + 1)
 
@@ -301,7 +301,7 @@ def _answered(plan: Plan, state: State) -> State:
 
 
 def _noise_of_one(plan: Plan, state: State, noise: float) -> float:
-    """Of a reading, from that of a row."""
+    """Noise of a reading, from that of a row."""
     readings = plan.window / ROWS / max(state.interval, 1e-6)
     return max(noise * math.sqrt(max(readings, 1.0)), BEST_MONITOR * state.highest)
 

@@ -13,11 +13,12 @@ from matplotlib.figure import FigureBase
 from beamfit.errors import InputError
 from beamfit.lifetime import tables
 from beamfit.lifetime.course import Trend
-from beamfit.lifetime.decay_law import HOUR, current
+from beamfit.lifetime.decay_law import current
 from beamfit.lifetime.fit import DecayFit
 from beamfit.lifetime.ring_study import Shift
 from beamfit.lifetime.study import Decay, RecordStudy, cycle_lifetimes
 from beamfit.lifetime.systematics import moving_lifetime
+from beamfit.quantity import HOUR
 from beamfit.report.document import (
     BLUE,
     MANY,

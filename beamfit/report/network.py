@@ -9,11 +9,12 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import FigureBase
 
-from beamfit.lifetime.decay_law import HOUR, current
+from beamfit.lifetime.decay_law import current
 from beamfit.lifetime.mechanisms import loss_terms, scaled_losses
 from beamfit.lifetime.ring import Operation
 from beamfit.lifetime.ring_study import Shift
 from beamfit.lifetime.study import Decay, operation_during
+from beamfit.quantity import HOUR
 from beamfit.report.document import BLUE, RED, Picture, legend_below
 
 # Points of a curve.

@@ -8,13 +8,12 @@ import pytest
 
 from beamfit.errors import InputError
 from beamfit.io.decay_record import monitor_of
-from beamfit.lifetime.decay_law import HOUR
 from beamfit.lifetime.fit import fit_cycles, fit_decay, fit_decays
 from beamfit.lifetime.record import DecayRecord, Monitor
 from beamfit.lifetime.scales import summarise
 from beamfit.lifetime.study import study_record
 from beamfit.lifetime.systematics import systematics
-from beamfit.quantity import Status
+from beamfit.quantity import HOUR, Status
 
 I0, A, B = 300.0, 2e-8, 2e-6
 constant_fit = partial(fit_decay, law="constant")

@@ -15,13 +15,12 @@ from scipy.special import gamma
 from beamfit.errors import InputError
 from beamfit.io.decay_record import read_decay_record
 from beamfit.io.ring import read_operation, read_ring
-from beamfit.lifetime.bunch import bunch_in_bucket, population, stored_bunch
+from beamfit.lifetime.bunch import bunch_in_bucket, length_and_height, population, stored_bunch
 from beamfit.lifetime.gas import elastic_cross_section
 from beamfit.lifetime.mechanisms import loss_coefficients
 from beamfit.lifetime.ring import HarmonicCavity
 from beamfit.lifetime.study import Machine, budget, operation_during
 from beamfit.lifetime.touschek import piwinski_rate
-from beamfit.lifetime.well import length_and_height
 from tests.lifetime.test_mechanisms import spear3_cells
 
 SPEAR3 = Path("lattices/spear3_2003.toml")

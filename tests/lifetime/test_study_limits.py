@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 
 from beamfit.errors import InputError
-from beamfit.lifetime.decay_law import HOUR, current
+from beamfit.lifetime.decay_law import current
 from beamfit.lifetime.mechanisms import loss_coefficients, loss_terms, scaled_losses
 from beamfit.lifetime.record import Conditions, DecayRecord
 from beamfit.lifetime.ring_study import predict_held_back, study_shift
 from beamfit.lifetime.scales import fit_scales
 from beamfit.lifetime.study import operation_during, study_record
 from beamfit.lifetime.tables import shift_rows
-from beamfit.quantity import Status
+from beamfit.quantity import HOUR, Status
 from tests.lifetime.test_lifetime_study import simulated
 
 
