@@ -147,7 +147,7 @@ def _record(group: Any, name: str, rows: int) -> np.ndarray:
 
 
 def _place(store: Any) -> Any:
-    """Where the datasets are: at the top, or in its only group."""
+    """Find the group of the datasets: the top, or its only group."""
     import h5py
 
     only = next(iter(store)) if len(store) == 1 else None

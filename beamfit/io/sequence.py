@@ -239,7 +239,7 @@ def _check_ignored(said: str, source: Source) -> None:
 
 
 def _descriptions(parser: Any) -> dict[str, Any]:
-    """What the file says of each element, by name."""
+    """Parameters of each element in the file, by name."""
     return {v.name: v for v in parser.values() if hasattr(v, "origin")}
 
 

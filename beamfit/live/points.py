@@ -131,7 +131,7 @@ def warmed(machine: ScanMachine, line: Beamline) -> None:
 
 
 def sharp(fit: EmittanceFit | None, points: Sequence[Point], goal: float) -> bool:
-    """Whether every emittance is trusted and known to a relative error.
+    """Tell fits whose every emittance is trusted and known to a relative error.
 
     Parameters
     ----------
@@ -169,7 +169,7 @@ def doubt(fit: EmittanceFit | None, points: Sequence[Point]) -> str:
 
 
 def first_settings(machine: ScanMachine) -> tuple[float, ...]:
-    """Where a scan begins: as the machine file says, or over the range of its first magnet."""
+    """First settings of a scan: as the machine file says, or over the range of its first magnet."""
     first = machine.magnets[0]
     return machine.first or tuple(first.low + p * (first.high - first.low) for p in BEGIN)
 
@@ -298,7 +298,7 @@ def scan_text(points: Sequence[Point], machine: ScanMachine, before: Mapping[str
 
 
 def _head(machine: ScanMachine, before: Mapping[str, float]) -> list[str]:
-    """What a reader of the file wants to know of how it was measured, as comments."""
+    """Comments of the file on how it was measured."""
     screen = machine.screen
     variables = ", ".join((screen.sizes or screen.profiles).values())
     measured = "sizes" if screen.sizes else "Gaussian fits to projections"

@@ -38,7 +38,7 @@ LOOK = 0.2
 
 
 class Told(NamedTuple):
-    """How a scan stands: its points, the fit to them where there is one, and what is new.
+    """Progress of a scan: its points, the fit to them where there is one, and what is new.
 
     ``measured`` says whether that is the last of the points; ``news`` is then why it was chosen.
     """
@@ -50,7 +50,7 @@ class Told(NamedTuple):
 
 
 class Outcome(NamedTuple):
-    """How a scan ended.
+    """End of a scan.
 
     Attributes
     ----------
@@ -78,7 +78,7 @@ class Outcome(NamedTuple):
 
 @dataclass
 class Running:
-    """What a scan has so far; the one thing that changes as it goes on."""
+    """State of a scan; the one thing that changes as it goes on."""
 
     at: Connected
     line: Beamline

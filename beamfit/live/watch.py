@@ -28,7 +28,7 @@ WAITING = 100_000
 
 @dataclass(frozen=True)
 class Told:
-    """What is known at a moment.
+    """Knowledge at a moment.
 
     Attributes
     ----------
@@ -53,7 +53,7 @@ class Told:
 
     @property
     def sound(self) -> bool:
-        """Whether the numbers are of now."""
+        """Tell numbers that are of now."""
         return self.silent is None and not self.old and self.state.answer is not None
 
     @property
@@ -252,7 +252,7 @@ async def watch(
 
 @contextmanager
 def _signals() -> Iterator[list[int]]:
-    """What came; a second one ends the process as it would any."""
+    """Signal that came; a second one ends the process as it would any."""
     came: list[int] = []
     before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
 
