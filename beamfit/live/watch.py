@@ -122,7 +122,7 @@ class _Course:
     fitted: float | None = None
 
     def told(self) -> Told:
-        """What is known now."""
+        """Knowledge now."""
         now, patience = time.monotonic(), max(STALE, INTERVALS * self.apart)
         silent = now - self.arrived if now - self.arrived > patience else None
         age = None if self.fitted is None else now - self.fitted
