@@ -6,14 +6,11 @@ What a first-order, uncoupled line of one energy cannot hold is refused, never d
 from __future__ import annotations
 
 import math
-import re
 from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from os import PathLike
 from typing import Any
-
-import numpy as np
 
 from beamfit.errors import InputError
 
@@ -27,6 +24,8 @@ UNMODELLED = {
     "ktap": "a tapered field",
     "fse": "a field error",
     "etilt": "a tilt error",
+    "t0": "a tilted component",
+    "t1": "a tilted component",
     "bore": "a field given by its bore",
     "use_bn": "a field given by B1, B2, ...",
     "volt": "an accelerating voltage",
@@ -35,7 +34,7 @@ UNMODELLED = {
     "kill_ent_fringe": "an edge switched off",
     "kill_exi_fringe": "an edge switched off",
 }
-# Elements of MAD that are nothing where some parameter is zero; pyAT does not know them.
+# Elements that are nothing where some parameter is zero.
 NOTHING_AT_ZERO = {
     "srotation": ("angle",),
     "xrotation": ("angle",),
@@ -49,26 +48,6 @@ NOTHING_AT_ZERO = {
     "beambeam": ("charge",),
 }
 EDGES = ("edge1_effects", "edge2_effects")
-
-
-@dataclass(frozen=True)
-class Source:
-    """The file being read, to say where something stands."""
-
-    path: str | PathLike[str]
-    text: str
-    dialect: str
-
-    def line_of(self, name: str) -> int | None:
-        """Line on which a name is defined, if it is in this file."""
-        pattern = re.compile(rf'\s*"?{re.escape(name)}"?\s*(:|=)', re.IGNORECASE)
-        lines = enumerate(self.text.splitlines(), start=1)
-        return next((n for n, t in lines if pattern.match(t)), None)
-
-    def error(self, found: str, expected: str, name: str | None = None) -> InputError:
-        """Make the error that names the file, and the line that defines ``name``."""
-        line = None if name is None else self.line_of(name)
-        return InputError(found, expected, path=self.path, line=line)
 
 
 @dataclass(frozen=True)
@@ -93,6 +72,8 @@ class Element:
         All parameters of the file that mean something.
     place : tuple of path and int, or None
         File and line that define it.
+    elegant : bool
+        Whether an absent FINT is that of elegant, and an RBEN what it takes for one.
     """
 
     name: str
@@ -105,56 +86,7 @@ class Element:
     edges: tuple[float, ...] = (0.0, 0.0)
     said: Mapping[str, Any] = field(default_factory=dict)
     place: tuple[str | PathLike[str] | None, int | None] = (None, None)
-    dialect: str = "MAD-X"
-
-
-# What pyAT makes of elements, by its classes.
-PYAT_KINDS = {
-    "Monitor": "screen",
-    "Quadrupole": "quadrupole",
-    "Dipole": "dipole",
-    "ThinMultipole": "thin",
-}
-
-
-def pyat_element(element: Any, described: Mapping[str, Any], source: Source) -> Element:
-    """An element of a line that pyAT has read.
-
-    Parameters
-    ----------
-    element : at.Element
-        The element.
-    described : mapping of str to mapping
-        What the file says of each element: the parameters pyAT may have dropped.
-    source : Source
-        The file.
-    """
-    name, kind = element.FamName, type(element).__name__
-    said = described.get(name, {})
-    own = str(getattr(element, "origin", None) or kind).upper()
-    normal, skew = (
-        (*map(float, np.atleast_1d(getattr(element, f"Polynom{k}", []))), 0.0, 0.0) for k in "BA"
-    )
-    angle = float(getattr(element, "BendingAngle", 0.0))
-    edges = [float(getattr(element, f"{k}Angle", 0.0)) for k in ("Entrance", "Exit")]
-    if own == "RBEND" and angle < 0.0:
-        # pyAT adds |angle|/2 to the edges of an RBEND. MAD adds angle/2, so that the faces stay
-        # parallel whichever way it bends.
-        edges = [e + angle for e in edges]
-    marker = kind == "Marker" and own in ("MARKER", "MARK", "WATCH")
-    return Element(
-        name,
-        own,
-        "marker" if marker else PYAT_KINDS.get(kind, "space"),
-        float(getattr(element, "Length", 0.0)),
-        normal,
-        skew,
-        angle,
-        tuple(edges),
-        said,
-        (source.path, source.line_of(name)),
-        source.dialect,
-    )
+    elegant: bool = False
 
 
 def element_tables(elements: Iterable[Element]) -> list[dict[str, Any]]:
@@ -295,9 +227,9 @@ class _Translation:
     def check_dipole(self, angle: float) -> None:
         if any(self.skew[:2]):
             raise self.refuse("with a skew component of its own")
-        if self.type == "RBEN":
+        if self.element.elegant and "RB" in self.type:
             raise self.refuse(
-                "(rectangular; pyAT and elegant read its length differently)",
+                "(rectangular, whose length programs read differently)",
                 "CSBEND or SBEN with the arc length and E1 = E2 = ANGLE/2",
             )
         self.check_length()
@@ -305,7 +237,7 @@ class _Translation:
         if k0 and abs(k0 * self.length - angle) > 1e-9:
             raise self.refuse(f"with a field (K0 = {k0:g}) that is not ANGLE/L")
         # elegant takes FINT = 0.5 where the file has none, MAD takes 0.
-        usual = 0.5 if self.element.dialect == "elegant" else 0.0
+        usual = 0.5 if self.element.elegant else 0.0
         integrals = [self.number(k) for k in ("fint", "fintx", "fint1", "fint2")]
         if "fint" not in self.said:
             integrals.append(usual)
