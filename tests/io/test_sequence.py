@@ -553,3 +553,44 @@ def test_a_reflected_bend_has_its_faces_the_other_way_round(name, written):
     assert [b["entrance_edge_deg"] for b in bends] == pytest.approx(np.degrees([0.2, -0.05]))
     ring = LOADERS["line." + name[2:]](path, use="LC", energy=135e9)
     assert [b.EntranceAngle for b in ring] == pytest.approx([0.2, -0.05])
+
+
+COUNT = 40
+PARTS = {
+    "QUAD": "K1={k:.5f}", "SBEN": "ANGLE={a:.5f}, E1={b:.4f}, E2={c:.4f}", "SEXT": "K2=3",
+    "DRIF": "", "MONI": "", "HKICK": "",
+}  # fmt: skip
+FULL |= {"SEXT,": "SEXTUPOLE,", "MONI,": "MONITOR,", "HKICK,": "HKICKER,"}
+
+
+def any_line(number):
+    """A line of elements at random, written for MAD-8 and elegant."""
+    rng = np.random.default_rng(number)
+    kinds = rng.choice([*PARTS], rng.integers(2, 7))
+    text = ""
+    for i, kind in enumerate(kinds):
+        k, a, b, c, length = rng.uniform(-1, 1, 5)
+        more = PARTS[kind].format(k=5 * k, a=0.1 + 0.3 * abs(a), b=0.2 * b, c=0.2 * c)
+        text += f"E{i}: {kind}, {', '.join(filter(None, [f'L={0.3 + 0.2 * length:.4f}', more]))}\n"
+    names = [f"E{i}" for i in range(len(kinds))]
+    part = rng.permutation(names)[:2]
+    return f"{text}SUB: LINE=({','.join(part)})\nLC: LINE=({','.join(names)},-SUB,2*E0)\n"
+
+
+@pytest.mark.filterwarnings("ignore::at.AtWarning")
+@pytest.mark.parametrize("name", ["a.mad8", "a.lte"])
+def test_lines_at_random_are_those_of_pyat(name, written):
+    for number in range(COUNT):
+        text = any_line(number)
+        if name == "a.mad8":
+            text = f"BEAM, PARTICLE=ELECTRON, ENERGY=135\n{text}"
+        ours = load_lattice(written(name, text), use="LC", energy=135e3).matrix()
+        for short, full in FULL.items():
+            text = text.replace(short, full)
+        ring = LOADERS["line." + name[2:]](written("peer_" + name, text), use="LC", energy=135e9)
+        for element in ring:
+            if hasattr(element, "NumIntSteps"):
+                element.NumIntSteps = 100
+        m66 = at.find_m66(ring.disable_6d(copy=True), orbit=np.zeros(6))[0]
+        for plane, theirs in zip((ours.x, ours.y), planes_of(m66), strict=True):
+            np.testing.assert_allclose(plane[:2, :2], theirs[:2, :2], rtol=1e-5, atol=1e-5)
