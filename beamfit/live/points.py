@@ -29,6 +29,8 @@ BEGIN = (0.1, 0.37, 0.63, 0.9)
 # Points that each further magnet is moved for at least: a beam has three numbers, so that each
 # magnet by itself tells all of it. Where they disagree the line is wrong.
 FEW = 3
+# Settings of each of two magnets among which `wrong_line` looks for the best.
+LEVELS = 7
 # Points before which a goal is not taken for reached: three numbers meet five sizes too easily.
 FEWEST = 6
 
@@ -128,6 +130,9 @@ def warmed(machine: ScanMachine, line: Beamline) -> None:
         ]
         fit = fit_of(points, machine, line)
         next_setting(points, fit, (), machine, middle)
+        if fit is not None and machine.magnets[1:]:
+            for plane in planes:
+                fit.predict({name: np.full(LEVELS**2, v) for name, v in middle.items()}, plane)
 
 
 def sharp(fit: EmittanceFit | None, points: Sequence[Point], goal: float) -> bool:
