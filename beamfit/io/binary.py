@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import math
 import os
+import re
 import tempfile
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
@@ -36,6 +37,7 @@ NUMBERS = {
     *(f"{u}int{n}" for u in ("", "u") for n in (8, 16, 32, 64)),
 }
 SDDS = b"SDDS"
+SDDS_HEAD = re.compile(rb"&data\b.*?&end[^\n]*\n", re.DOTALL)
 # How the name of a magnet's setting ends; m/s.
 SETTING_ENDS, LIGHT = tuple(f"_{unit}" for unit in SETTINGS), 299792458.0
 # What ends an exponent or an index in a unit, and what begins one: 1/m$a2$n.
@@ -145,7 +147,7 @@ def _record(group: Any, name: str, rows: int) -> np.ndarray:
 
 
 def _place(store: Any) -> Any:
-    """Where the datasets are: at the top, or in its only group."""
+    """Find the group of the datasets: the top, or its only group."""
     import h5py
 
     only = next(iter(store)) if len(store) == 1 else None
@@ -301,16 +303,20 @@ def sdds_columns(
 
 def sdds_content(content: bytes, rows: int, texts: int) -> Columns:
     """Read an SDDS file; called in a process of its own."""
-    import sdds
-
     if b"&include" in content:
         raise InputError(
             "an SDDS file with &include", "a file that is whole: sddsconvert makes one"
         )
-    with tempfile.NamedTemporaryFile() as file:
-        file.write(content)
-        file.flush()
-        data = sdds.load(file.name)
+    data = _sdds_loaded(content)
+    # The library stops in silence where no further page can be read: the data twice are twice the
+    # pages only if nothing was left over.
+    head = SDDS_HEAD.search(content).end()
+    whole, gap = content, b""
+    if data.mode == data.SDDS_ASCII:
+        whole, gap = content.rstrip() + b"\n", b"\n" * (b"no_row_counts=1" in content[:head])
+    if _sdds_loaded(whole + gap + whole[head:]).loaded_pages != 2 * data.loaded_pages:
+        expected = "as many rows as it announces: sddscheck and sddsconvert -recover mend it"
+        raise InputError("an SDDS file with another number of rows than it announces", expected)
     parameters, columns = (
         {name: (_sdds_unit(about[1]), pages) for name, about, pages in zip(*held, strict=True)}
         for held in (
@@ -324,6 +330,16 @@ def sdds_content(content: bytes, rows: int, texts: int) -> Columns:
     held = {n: (unit, pages[0]) for n, (unit, pages) in columns.items()} or parameters
     found = {name: _sdds_values(name, values, rows, texts) for name, (_, values) in held.items()}
     return found, {name: unit for name, (unit, _) in held.items()}, said if columns else []
+
+
+def _sdds_loaded(content: bytes) -> Any:
+    """All pages of a file that can be read."""
+    import sdds
+
+    with tempfile.NamedTemporaryFile() as file:
+        file.write(content)
+        file.flush()
+        return sdds.load(file.name)
 
 
 def _sdds_values(name: str, values: list[Any], rows: int, texts: int) -> Sequence[Any]:

@@ -39,7 +39,7 @@ from beamfit.table import Table
 
 @dataclass(frozen=True)
 class Understood:
-    """What a file was understood to say.
+    """Summary of a file: its kind and what it holds.
 
     Attributes
     ----------
@@ -184,7 +184,7 @@ def with_lattice(scan: Understood, lattice: Understood) -> Understood:
 
 
 def _kind(path: str | PathLike[str], layout: Layout) -> str:
-    """What a file is, by its name and its head."""
+    """Tell the kind of a file by its name and its head."""
     suffix = Path(path).suffix.lower()
     if suffix in FOREIGN:
         return "lattice"
@@ -240,7 +240,7 @@ def _range(label: str, values: np.ndarray, unit: str = "", after: str = "", **mo
 
 
 def _counted(label: str, rows: Mapping[str, int], form: str = "{0} ({1} rows)") -> Fact:
-    """How many there are of each."""
+    """Count of each."""
     return Fact(label, ", ".join(form.format(name, n) for name, n in rows.items()), dict(rows))
 
 
@@ -301,7 +301,7 @@ def of_lattice(file: LatticeFile) -> list[Fact]:
 
 
 def _magnet(element: Mapping[str, Any], unit: str) -> Fact:
-    """What a magnet is set to where no scan says, and how a current becomes a gradient."""
+    """Setting of a magnet where no scan says it, and its calibration."""
     key = next(key for key, its in STRENGTHS.items() if its == unit and key in element)
     words = f"{element[key]:g} {SAID[unit]}"
     if "length_m" in element:
@@ -393,7 +393,7 @@ def of_run(run: Run) -> list[Fact]:
 
 
 def of_formulation(document: Document) -> list[Fact]:
-    """What is free, limited and best in a formulation, and what goes in and out."""
+    """Variables, constraints, objectives, inputs and outputs of a formulation."""
     mapping, problem = document.mapping, document.problem
     said = {
         "inputs": [part.name for part in mapping.inputs],

@@ -28,7 +28,7 @@ MOST_NAMED, MOST_ASIDE = 5, 8
 
 
 class Column(NamedTuple):
-    """What a header means: the quantity, the unit it is in, and the factor to SI."""
+    """Meaning of a header: the quantity, its unit, and the factor to SI."""
 
     header: str
     key: str

@@ -235,7 +235,7 @@ def _moments(sheet: Sheet, columns: Mapping[str, Column]) -> np.ndarray:
 
 
 def _goes_back(sheet: Sheet, columns: Mapping[str, Column], row: int, latest: object) -> InputError:
-    """Of a row whose time is not after that of an earlier one."""
+    """Error of a row whose time is not after that of an earlier one."""
     column = columns["time"]
     found, expected = f"time {sheet[column.header][row]} after {latest}", INCREASE
     if column.unit == DATE:
@@ -246,7 +246,7 @@ def _goes_back(sheet: Sheet, columns: Mapping[str, Column], row: int, latest: ob
 def _refused(
     sheet: Sheet, columns: Mapping[str, Column], fault: Fault, rows: np.ndarray, negative: bool
 ) -> InputError:
-    """What is wrong with a record, at its row of the file."""
+    """Error of a record, at its row of the file."""
     column, row = columns[fault.quantity], int(rows[fault.row])
     if column.unit == DATE and fault.row:
         return _goes_back(sheet, columns, row, sheet[column.header][int(rows[fault.row - 1])])
@@ -266,7 +266,7 @@ def _check_alone(sheet: Sheet, columns: Mapping[str, Column], positive: bool) ->
 
 
 def _below_zero(sheet: Sheet, columns: Mapping[str, Column]) -> tuple[str, ...]:
-    """What readings below zero, which are left out, say of those that stay, as a note."""
+    """Note on readings below zero, which are left out: an offset is in the others, too."""
     values = _values(
         sheet.good(lambda rows: _check_alone(rows, columns, False)), columns["current"]
     )
@@ -347,7 +347,7 @@ PARTS = 10
 
 
 class Offset(NamedTuple):
-    """What a monitor reads without beam, and its error, mA; which readings are of the beam."""
+    """Reading of a monitor without beam, its error in mA, and which readings are of the beam."""
 
     value: float
     error: float

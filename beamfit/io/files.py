@@ -51,7 +51,7 @@ Numbered = Iterator[tuple[int, str]]
 
 @lru_cache(maxsize=8)
 def _piped(path: str, inode: int) -> bytes:
-    """What a pipe gives: it can be read once, and is looked at several times."""
+    """Content of a pipe: it can be read once, and is looked at several times."""
     parts, size = [], 0
     with open(os.open(path, os.O_RDONLY | os.O_NONBLOCK), "rb", buffering=0) as stream:
         while select.select([stream], [], [], SILENCE)[0]:
@@ -136,7 +136,7 @@ def _raw_lines(stream: BinaryIO, seen: Any) -> Iterator[bytes]:
 
 
 def _blocks(stream: BinaryIO, seen: Any) -> Iterator[bytes]:
-    """What a file holds, part by part; of UTF-16 as UTF-8, where what is no letter is no number."""
+    """Content of a file, part by part; UTF-16 as UTF-8, where what is no letter is no number."""
     block = stream.read(1 << 16)
     wide = block.startswith(UTF16)
     decoder = codecs.getincrementaldecoder("utf-16")("replace")
@@ -256,7 +256,7 @@ def remember(path: str | PathLike[str], seen: Any) -> None:
 
 
 def name_of(path: str | PathLike[str]) -> str:
-    """What a file is called, in letters that can be shown: names need not be UTF-8."""
+    """Name of a file in letters that can be shown: names need not be UTF-8."""
     return plain(Path(path).name)
 
 

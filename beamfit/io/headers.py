@@ -111,7 +111,7 @@ def unit_at_end(name: str) -> str | None:
 
 
 def is_header(cells: Sequence[str]) -> bool:
-    """Whether some cells are names of columns: two or more with units, and no number among them."""
+    """Tell a header from other rows: two or more names with units, and no number among them."""
     values = any(is_number(cell) or unit_behind(cell) for cell in cells)
     return not values and sum(map(_has_unit, cells)) > 1
 
@@ -161,7 +161,7 @@ def with_units(names: Sequence[str], cells: Sequence[str]) -> list[str] | None:
 
 
 def separator_of(header: str) -> str:
-    """What separates the columns of a file with this header."""
+    """Separator of the columns below a header."""
     return next((s for s in ",;\t" if s in header), " ")
 
 
@@ -203,17 +203,17 @@ def header_at(lines: Sequence[str]) -> int:
 
 
 def _is_aside(text: str) -> bool:
-    """Whether a line is blank, a comment, or of the head of a TFS file."""
+    """Tell a line that is blank, a comment, or of the head of a TFS file."""
     return not text.strip(",;\t ") or text.lstrip().startswith(MARKS + TFS)
 
 
 def is_value(cell: str) -> bool:
-    """Whether a cell may be a number or a date."""
+    """Tell a cell that may be a number or a date."""
     return cell.lstrip("+-.")[:1].isdigit()
 
 
 def _has_rows(lines: Sequence[str], i: int) -> bool:
-    """Whether rows of as many cells as a line of words has follow it, below its units perhaps."""
+    """Tell a line of words that rows of as many cells follow, below its units perhaps."""
     cells = _words(lines[i])
     rows = [_words(text) for text in lines[i + 1 :] if not _is_aside(text)][:3]
     if rows and units_below(rows[0]):
@@ -275,7 +275,7 @@ def number(cell: object) -> float:
 
 
 def is_number(text: object) -> bool:
-    """Whether a cell is a number."""
+    """Tell a cell that is a number."""
     try:
         number(text)
     except ValueError:

@@ -1,7 +1,7 @@
 """Files that a library parses, read in a process of its own.
 
-HDF5, SciPy's reader of MATLAB files, SDDS and pyAT's parsers may crash, never end or fill the
-memory over a file with a few changed bits. That is one line of error here.
+HDF5, SciPy's reader of MATLAB files and SDDS may crash, never end or fill the memory over a file
+with a few changed bits. That is one line of error here.
 """
 
 from __future__ import annotations

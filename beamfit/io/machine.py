@@ -133,7 +133,7 @@ class Profiler:
 
 @dataclass(frozen=True)
 class Guard:
-    """What must hold for a shot to count: beam above, loss below. Limits are None without one."""
+    """Conditions of a shot that counts: beam above, loss below. Limits are None without one."""
 
     present: str | None = None
     present_above: float | None = None
@@ -144,7 +144,7 @@ class Guard:
 
 @dataclass(frozen=True)
 class ScanMachine:
-    """What `beamfit scan` needs to know of a machine.
+    """Machine as `beamfit scan` needs it.
 
     Attributes
     ----------
@@ -406,7 +406,7 @@ class Watched(NamedTuple):
 
 @dataclass(frozen=True)
 class WatchMachine:
-    """What `beamfit watch` needs to know of a machine.
+    """Machine as `beamfit watch` needs it.
 
     Attributes
     ----------

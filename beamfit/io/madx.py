@@ -1,4 +1,4 @@
-"""MAD-X files: their statements, carried out as MAD-X does.
+"""MAD-X files, and others in its words: their statements, carried out as MAD-X does.
 
 A statement that changes an element, a line or the beam is carried out or refused with its line.
 The rules are those of MAD-X 5.09, found by experiment where its manual is silent
@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from beamfit.errors import InputError, nearest
+from beamfit.io.dialects import ELEGANT, MADX, Dialect, blanked, decoded
 from beamfit.io.files import read_text
 from beamfit.io.madx_values import NAME, Values, compared, words
 
@@ -67,7 +68,10 @@ class Attribute(NamedTuple):
 
 @dataclass
 class Definition:
-    """An element, line or sequence: its class, its parameters, and where it is defined."""
+    """An element, line or sequence: its class, its parameters, and where it is defined.
+
+    ``type`` is the class as the file has it.
+    """
 
     name: str
     kind: str
@@ -76,6 +80,7 @@ class Definition:
     parameters: dict[str, Attribute] = field(default_factory=dict)
     members: str = ""
     placed: list[tuple[str, dict[str, Attribute]]] = field(default_factory=list)
+    type: str = ""
 
     def error(self, found: str, expected: str) -> InputError:
         """Make the error that names the place of the definition."""
@@ -107,7 +112,7 @@ def statements(text: str, path: str | PathLike[str], line: int = 1) -> Iterator[
     >>> [s.text for s in statements("a = 1; ! one; two\\nif (a > 0) {b = 2;}", "a.madx")]
     ['a = 1', 'if (a > 0)']
     """
-    text = COMMENT.sub(_uncommented, text)
+    text = COMMENT.sub(blanked, text)
     begin, depth, opened = 0, 0, None
 
     def made(end: int, block: str | None = None) -> Command:
@@ -135,11 +140,6 @@ def statements(text: str, path: str | PathLike[str], line: int = 1) -> Iterator[
         raise rest.error(found, "';' at the end of a statement, and quotes and braces that match")
 
 
-def _uncommented(found: re.Match[str]) -> str:
-    kept = found[0][0] in "\"'"
-    return found[0] if kept else re.sub(r"[^\n]", " ", found[0])
-
-
 def split_parameters(text: str) -> list[str]:
     """Cut a list at the commas that stand in no bracket and no quotes.
 
@@ -163,8 +163,8 @@ def split_parameters(text: str) -> list[str]:
 class Interpreter:
     """The state after a file's statements: variables, elements, sequences, lines and beams."""
 
-    def __init__(self) -> None:
-        self.values = Values(self._attribute)
+    def __init__(self, dialect: Dialect = MADX) -> None:
+        self.dialect, self.values = dialect, Values(self._attribute)
         self.elements: dict[str, Definition] = {}
         self.lines: dict[str, Definition] = {}
         self.beams: dict[str, dict[str, Attribute]] = {"": {}}
@@ -179,7 +179,7 @@ class Interpreter:
     ) -> None:
         """Carry out the statements of a file, or of a block of one."""
         self._main = path if self._main is None else self._main
-        for statement in statements(text, path, line):
+        for statement in statements(self.dialect.translate(text), path, line):
             if self._ended:
                 return
             taken, self._taken = self._taken, None
@@ -189,7 +189,7 @@ class Interpreter:
             elif word == "return":
                 if block:
                     raise statement.error()
-                if path != self._main:  # there MAD-X passes over it
+                if path != self._main or self.dialect is not MADX:  # which passes over it there
                     return
             else:
                 self._one(statement)
@@ -304,8 +304,10 @@ class Interpreter:
         self.values.changed()
 
     def _define(self, statement: Command, label: str, arguments: str, kind: str, rest: str) -> None:
-        name, kind = label.lower(), kind.lower()
-        own = Definition(label, kind, statement.path, statement.line)
+        name, said = label.lower(), kind.lower()
+        kind = said if said in self.elements else self.dialect.classes.get(said, said)
+        shown = decoded(label) if self.dialect is ELEGANT else label
+        own = Definition(shown, kind, statement.path, statement.line, type=said.upper())
         if kind in HARMLESS_CLASSES:
             return
         if arguments:
@@ -321,15 +323,15 @@ class Interpreter:
         elif kind in self.lines:
             raise statement.error()
         else:
-            self._element(statement, own, self._parameters(statement, rest))
+            self._element(name, own, self._parameters(statement, rest))
 
-    def _element(self, statement: Command, own: Definition, given: dict[str, Attribute]) -> None:
+    def _element(self, name: str, own: Definition, given: dict[str, Attribute]) -> None:
         place = {key: given.pop(key) for key in ("at", "from") if key in given}
         parent = self.elements.get(own.kind)
         if parent is not None:
-            own.kind, own.parameters = parent.kind, dict(parent.parameters)
+            own.kind, own.type = parent.kind, parent.type
+            own.parameters = dict(parent.parameters)
         own.parameters |= given
-        name = own.name.lower()
         known = self.elements.get(name) or self.lines.get(name)
         own.name = known.name if known else own.name
         self.lines.pop(name, None)

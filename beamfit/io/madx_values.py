@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import operator
 import re
+from collections import deque
 from collections.abc import Callable, Iterator
 
 
@@ -129,9 +130,9 @@ class Values:
             If it is none, names what nothing defines, or has no finite value.
         """
         try:
-            tokens = list(_tokens(text))
-            value, at = self._sum(tokens, 0)
-            if at != len(tokens):
+            tokens = deque(_tokens(text))
+            value = self._sum(tokens)
+            if tokens:
                 raise NoExpression("something after it")
         except NoExpression as error:
             raise NoExpression(f"'{_short(text)}' ({error})") from None
@@ -170,52 +171,54 @@ class Values:
                 self._pending.pop()
         return self._known[name]
 
-    def _sum(self, tokens: list[tuple], at: int) -> tuple[float, int]:
-        sign = 1.0
-        if at < len(tokens) and tokens[at] in (("op", "-"), ("op", "+")):
-            sign, at = -1.0 if tokens[at][1] == "-" else 1.0, at + 1
-        value, at = self._product(tokens, at)
-        value *= sign
-        while at < len(tokens) and tokens[at] in (("op", "-"), ("op", "+")):
-            other, end = self._product(tokens, at + 1)
-            value, at = value + (other if tokens[at][1] == "+" else -other), end
-        return value, at
+    def _sum(self, tokens: deque[tuple], level: int = 0) -> float:
+        """Left to right at each level, powers too; a sign stands only in front of a sum."""
+        if level == len(OPERATORS):
+            return self._atom(tokens)
+        sign = tokens.popleft()[1] if level == 0 and tokens and tokens[0] in SIGNS else "+"
+        value = self._sum(tokens, level + 1)
+        value = -value if sign == "-" else value
+        while tokens and tokens[0][0] == "op" and tokens[0][1] in OPERATORS[level]:
+            operation = OPERATORS[level][tokens.popleft()[1]]
+            value = operation(value, self._sum(tokens, level + 1))
+        return value
 
-    def _product(self, tokens: list[tuple], at: int) -> tuple[float, int]:
-        value, at = self._power(tokens, at)
-        while at < len(tokens) and tokens[at] in (("op", "*"), ("op", "/")):
-            other, end = self._power(tokens, at + 1)
-            value, at = value * other if tokens[at][1] == "*" else value / other, end
-        return value, at
-
-    def _power(self, tokens: list[tuple], at: int) -> tuple[float, int]:
-        value, at = self._atom(tokens, at)
-        while at < len(tokens) and tokens[at] == ("op", "^"):
-            other, at = self._atom(tokens, at + 1)
-            value = value**other
-            if isinstance(value, complex):
-                raise ArithmeticError("a root of a negative number")
-        return value, at
-
-    def _atom(self, tokens: list[tuple], at: int) -> tuple[float, int]:
-        if at >= len(tokens):
+    def _atom(self, tokens: deque[tuple]) -> float:
+        if not tokens:
             raise NoExpression("it ends early")
-        kind, *said = tokens[at]
+        kind, *said = tokens.popleft()
         if kind == "number":
-            return said[0], at + 1
+            return said[0]
         if kind == "attribute":
-            return self._attribute(*said), at + 1
+            return self._attribute(*said)
+        if kind == "name" and not (tokens and tokens[0] == OPENED):
+            return self._variable(said[0])
         if kind == "name":
-            if at + 1 < len(tokens) and tokens[at + 1] == ("op", "("):
-                if said[0] not in FUNCTIONS:
-                    raise ValueError(f"the function '{said[0]}'")
-                value, end = self._sum(tokens, at + 2)
-                return FUNCTIONS[said[0]](value), _closed(tokens, end)
-            return self._variable(said[0]), at + 1
-        if said[0] == "(":
-            value, end = self._sum(tokens, at + 1)
-            return value, _closed(tokens, end)
-        raise NoExpression(f"'{said[0]}' where a number belongs")
+            tokens.popleft()
+            if said[0] not in FUNCTIONS:
+                raise ValueError(f"the function '{said[0]}'")
+        elif said[0] != "(":
+            raise NoExpression(f"'{said[0]}' where a number belongs")
+        value = self._sum(tokens)
+        if not tokens or tokens.popleft() != ("op", ")"):
+            raise NoExpression("'(' without ')'")
+        return FUNCTIONS[said[0]](value) if kind == "name" else value
+
+
+def _power(base: float, exponent: float) -> float:
+    value = base**exponent
+    if isinstance(value, complex):
+        raise ArithmeticError("a root of a negative number")
+    return value
+
+
+OPENED, SIGNS = ("op", "("), (("op", "-"), ("op", "+"))
+# From those that bind last.
+OPERATORS = (
+    {"+": operator.add, "-": operator.sub},
+    {"*": operator.mul, "/": operator.truediv},
+    {"^": _power},
+)
 
 
 def compared(values: Values, text: str) -> bool:
@@ -240,12 +243,6 @@ def _holds(values: Values, text: str) -> bool:
     if len(parts) != 3:
         raise ValueError(f"'{_short(text)}', which is no comparison")
     return COMPARED[parts[1]](values.of(parts[0]), values.of(parts[2]))
-
-
-def _closed(tokens: list[tuple], at: int) -> int:
-    if at >= len(tokens) or tokens[at] != ("op", ")"):
-        raise NoExpression("'(' without ')'")
-    return at + 1
 
 
 def _tokens(text: str) -> Iterator[tuple]:

@@ -82,7 +82,7 @@ def record_columns(sheet: Sheet) -> dict[str, Column]:
 
 
 def known(sheet: Sheet, name: str) -> Column | None:
-    """What a header means by itself; None if nothing."""
+    """Meaning of a header by itself; None if it has none."""
     try:
         found = columns_of(sheet.only([name]), QUANTITIES, _other(sheet))
         return next(iter(found.values()), None)
@@ -91,7 +91,7 @@ def known(sheet: Sheet, name: str) -> Column | None:
 
 
 def is_current(header: str) -> bool:
-    """Whether a header names a beam's current.
+    """Tell a header that names a beam's current.
 
     Examples
     --------

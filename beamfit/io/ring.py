@@ -229,7 +229,7 @@ def read_operation(path: str | PathLike[str]) -> Operation:
 
 
 def _bunches(section: Section, given: float | list[float], buckets: float) -> dict[str, Any]:
-    """How many equal bunches lose as much, and the charges over one of theirs."""
+    """Number of equal bunches that lose as much, and the charges over one of theirs."""
     charge = np.array(given, float, ndmin=1)
     if isinstance(given, list):
         charge = charge[charge > 0]
@@ -395,7 +395,7 @@ def read_twiss(path: str | PathLike[str], circumference: float) -> Optics:
 
 
 def _twiss(path: str | PathLike[str], circumference: float) -> tuple[np.ndarray, Optics]:
-    """Where the points are, m, and the optics there."""
+    """Positions of the points, m, and the optics there."""
     sheet = read_sheet(path, "s_m,beta_x_m,beta_y_m")
     columns = {name: _column(sheet, name) for name in COLUMNS}
     s = columns.pop("s_m")

@@ -221,7 +221,7 @@ def likely_name(header: str) -> str | None:
 
 
 def _not_understood(header: str) -> str:
-    """What it is about a header that nobody knows."""
+    """Reason why a header is unknown."""
     bracket = re.search(r"[\[(]([^\[\]()]*)[\])]\s*$", header)
     before, _, last = header.rpartition("_")
     if _size(f"{header}_um") is not None:
@@ -234,7 +234,7 @@ def _not_understood(header: str) -> str:
 
 
 def is_size(header: str) -> bool:
-    """Whether a header names a beam size or its error, with its unit or without."""
+    """Tell a header that names a beam size or its error, with its unit or without."""
     said = spelled(header)
     return any(_size(one) is not None for one in (said, f"{said}_um"))
 
@@ -272,7 +272,7 @@ def _size(header: str) -> Column | None:
 
 
 def rms_of(column: Column) -> float:
-    """How many rms sizes one of a column's is."""
+    """Factor from a column's width to rms sizes."""
     return column.factor / UNITS["length"][column.unit]
 
 

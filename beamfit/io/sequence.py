@@ -1,55 +1,43 @@
-"""Lines of MAD-X, MAD-8 and elegant files; pyAT's parsers read the last two, in a process apart."""
+"""Sequences and lines of MAD-X, MAD-8 and elegant files as the elements of a beamfit lattice."""
 
 from __future__ import annotations
 
-import io
+import math
 import re
-import unicodedata
-import warnings
-from collections.abc import Iterator
-from contextlib import contextmanager, redirect_stderr, redirect_stdout
-from importlib.util import find_spec
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from itertools import count
 from os import PathLike
 from pathlib import Path
-from types import MappingProxyType
-from typing import Any
+from typing import NamedTuple
 
 from beamfit.errors import InputError, nearest
+from beamfit.io.dialects import DIALECTS, ELEGANT, MADX, coded
 from beamfit.io.files import digest, read_text
-from beamfit.io.isolated import isolated
-from beamfit.io.lattice import LatticeFile
-from beamfit.io.madx_lines import read_madx
-from beamfit.io.sequence_elements import NOTHING_AT_ZERO, Source, element_tables, pyat_element
+from beamfit.io.lattice import MOST, LatticeFile
+from beamfit.io.madx import NO_MATTER, Attribute, Definition, Interpreter, word_of
+from beamfit.io.madx_values import NAME, words
+from beamfit.io.sequence_elements import NOTHING_AT_ZERO, Element, element_tables
 from beamfit.particles import REST_ENERGY, expected_energy
 
-MADX, MAD8, ELEGANT = "MAD-X", "MAD-8", "elegant"
-DIALECTS = {
-    ".madx": MADX,
-    ".seq": MADX,
-    ".mad8": MAD8,
-    ".mad": MAD8,
-    ".lte": ELEGANT,
-    ".elegant": ELEGANT,
-}
-# What the parsers do not know but the programs do, as the type it is like to first order.
-ALSO_MAD = {
-    "drift": ("rcollimator", "ecollimator", "placeholder", *NOTHING_AT_ZERO),
-    "monitor": ("imonitor", "blmonitor", "slmonitor", "instrument", "profile", "wire"),
-}
-ALSO_ELEGANT = {"MARK": ("WATCH", "MARKER"), "DRIF": ("EDRIFT", "CSRDRIFT", "LSCDRIFT")}
-# The parsers evaluate expressions with Python's eval. No lattice needs these words, and code
-# that means harm needs one of them.
-HARMFUL = re.compile(r"__|_frame|f_back|f_globals|f_builtins")
-# pyAT takes the parameters of an element that is alone in an elegant LINE for its members.
-ALONE = re.compile(r"(LINE\s*=\s*\([^,()]*)\)", re.IGNORECASE)
-# MAD-X takes a name that nobody defines for zero, pyAT does not know it. Kicks and what focuses to
-# second order are often such names in published files, and are nothing to a linear line.
-NO_MATTER = re.compile(r",\s*(?:[hv]?kick|k[23]s?)\s*:?=\s*[^,;]*", re.IGNORECASE)
-# MAD-X reads these words as it reads all others, in either spelling.
-REFERENCE = re.compile(r"(\bREFER\s*=\s*)\"?(CENTER|CENTRE|ENTRY|EXIT)\"?", re.IGNORECASE)
-# Where a statement did not parse, as pyAT says it.
-TOLD = re.compile(r"Line (\d+) (['\"])(.*?)\2, (.*)", re.DOTALL)
-ENERGIES = ("energy", "pc", "gamma", "beta", "brho")
+# Gaps and overlaps in m that MAD-X takes for none.
+TINY = 1e-6
+# Half lengths from an element's reference point to its centre.
+TO_CENTRE = {"entry": 0.5, "centre": 0.0, "center": 0.0, "exit": -0.5}
+SCREENS = words("monitor hmonitor vmonitor imonitor blmonitor slmonitor instrument profile wire")
+SPACES = words(
+    "drift kicker hkicker vkicker tkicker sextupole octupole collimator ecollimator rcollimator "
+    "solenoid rfcavity elseparator placeholder"
+)
+MEANT = words(
+    "l k0 k1 angle tilt knl ksl k1s k0s ktap hgap fint fintx ks ksi volt ex ey ex_l ey_l "
+    "kill_ent_fringe kill_exi_fringe dx dy ds h knll charge cnll bet sigx sigy xma yma"
+)
+MEMBER = re.compile(rf"\s*([-+]?)\s*(?:(\d+)\s*\*)?\s*(?:({NAME})|(\())", re.I)
+# GeV; the charges of those that MAD-X knows by name.
+KNOWN = {"positron": 1.0, "electron": -1.0, "proton": 1.0, "antiproton": -1.0}
+# Relative: masses that differ by less are one particle's.
+SAME_MASS = 2e-4
 
 
 def read_sequence(
@@ -62,289 +50,360 @@ def read_sequence(
     path : str or path
         The file: ``.madx``, ``.seq``; ``.mad8``, ``.mad``; ``.lte``.
     use : str, optional
-        Name of the LINE or SEQUENCE; not needed where the file has only one.
+        Name of the LINE or SEQUENCE; not needed where the file has only one, or a USE.
     energy : float, optional
         Total energy in MeV; overrides the file's BEAM. An elegant file has none.
 
     Returns
     -------
     LatticeFile
-        Element tables as of a TOML lattice. The setting of a quadrupole is its k1 in 1/m².
+        The line as it is after the last statement. The setting of a quadrupole is its k1 in 1/m².
 
     Raises
     ------
     InputError
-        If pyAT is not installed, the file does not parse, or the line holds an element whose
-        focusing beamfit does not model.
+        If a statement cannot be carried out, or the line holds what beamfit does not model.
 
     Examples
     --------
-    >>> import tempfile, pathlib
-    >>> file = pathlib.Path(tempfile.mkdtemp()) / "line.lte"
-    >>> _ = file.write_text('Q1: QUAD, L=0.1, K1=3\\nS: MONI\\nLC: LINE=(Q1,S)\\n')
-    >>> read_sequence(file, energy=135.0).calibrations["Q1"]
-    'k1'
+    >>> import pathlib, tempfile
+    >>> file = pathlib.Path(tempfile.mkdtemp()) / "line.madx"
+    >>> _ = file.write_text("beam, particle=electron, energy=0.1; q: quadrupole, l=0.1, k1=1;"
+    ...                     "s: monitor; lc: line=(q, s); q->k1 = 2;")
+    >>> read_sequence(file).elements[0]["k1_per_m2"]
+    2.0
     """
-    suffix = Path(path).suffix.lower()
-    if suffix == ".ele":
+    if (suffix := Path(path).suffix.lower()) == ".ele":
         expected = "the lattice file (.lte) that its &run_setup names"
         raise InputError("an elegant command file", expected, path=path)
-    if DIALECTS[suffix] == MADX:
-        return read_madx(path, use=use, energy=energy)
-    source = Source(path, read_text(path), DIALECTS[suffix])
-    if find_spec("at") is None:
-        found = f"a {source.dialect} file, which needs pyAT to read"
-        raise source.error(found, "pip install 'beamfit[lattice]'")
-    name, particle, total, elements = isolated(
-        "pyAT", path, _valid(source), pyat_line, source, use, energy
-    )
-    return LatticeFile(path, digest(path), name, total, particle, tuple(elements))
-
-
-def pyat_line(
-    source: Source, use: str | None, energy: float | None
-) -> tuple[str, str, float, list[dict[str, Any]]]:
-    """Read a line with pyAT; called in a process of its own.
-
-    Returns
-    -------
-    tuple
-        Its name, the particle, its total energy in MeV and the tables of its elements.
-    """
-    with _silence() as printed:
-        try:
-            parser = _parser(source)
-            _parse(parser, source)
-            _check_ignored(printed.getvalue(), source)
-            name, key = _chosen(parser, source, use)
-            particle, total = _beam(parser, source, name, energy)
-            expanded = _expanded(parser, source, name, key)
-            said = _descriptions(parser)
-            elements = element_tables([pyat_element(e, said, source) for e in expanded])
-        except InputError:
-            raise
-        except Exception as error:  # whatever evaluating an expression may raise, also late
-            raise _unparsed(source, error) from None
+    program = Interpreter(DIALECTS[suffix])
+    program.run(read_text(path), path)
+    program.finish(path)
+    chosen = _chosen(program, path, use)
+    particle, total = _beam(program, path, chosen.name.lower(), energy)
+    elements = element_tables(_Expansion(program, chosen).elements())
     if not elements:
-        raise source.error(f"'{name}' without elements", "a line with magnets and a screen", name)
-    return name, particle, total, elements
+        raise chosen.error(f"'{chosen.name}' without elements", "a line with magnets and a screen")
+    return LatticeFile(path, digest(path), chosen.name, total, particle, tuple(elements))
 
 
-@contextmanager
-def _silence() -> Iterator[io.StringIO]:
-    """Keep what the parser prints and warns of from the user's terminal."""
-    said = io.StringIO()
-    with redirect_stdout(said), redirect_stderr(said), warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        yield said
-
-
-def _parser(source: Source) -> Any:
-    """Make pyAT's parser of the file's dialect, with the element types it lacks."""
-    import at
-
-    kinds = {MAD8: at.Mad8Parser, ELEGANT: at.ElegantParser}
-    parser = kinds[source.dialect]()
-    env = dict(parser.env)
-    for like, names in (ALSO_ELEGANT if source.dialect == ELEGANT else ALSO_MAD).items():
-        env |= {n: type(n, (env[like],), {}) for n in names if n not in env or n == "WATCH"}
-    if source.dialect == MAD8:  # whose keywords may be cut to four letters
-        words = [w for w in env if isinstance(env[w], type) and w not in ("line", "sequence")]
-        short = {w[:n]: env[w] for w in words for n in range(4, len(w))}
-        env |= {k: v for k, v in short.items() if k not in env}
-    parser.env = env
-    if source.dialect != ELEGANT:
-        # A default energy of 1 GeV would stand in for one that is missing, or given as pc.
-        default = {k: v for k, v in parser["beam"].default_beam.items() if k != "energy"}
-        parser["beam"].default_beam = MappingProxyType(default)
-        parser["beam%"].pop("energy")
-    return parser
-
-
-def _parse(parser: Any, source: Source) -> None:
-    statement = parser._statement
-
-    def checked(text: str) -> bool:
-        if HARMFUL.search(unicodedata.normalize("NFKC", text)):
-            raise ValueError("a name that no lattice needs and that could run code")
-        if not _balanced(text):  # on which the parser would never end
-            raise ValueError("parentheses that do not match")
-        if source.dialect != ELEGANT:
-            # pyAT takes 2^3 behind := for the bits of 1.
-            text = REFERENCE.sub(_reference, NO_MATTER.sub("", text)).replace("^", "**")
-        if source.dialect == ELEGANT:
-            parser.rpn.stack.clear()  # a "% 3.7 sto k" leaves its number there
-            text = ALONE.sub(r"\1,)", text)
-        return statement(text)
-
-    parser._statement = checked
-    parser._analyse = lambda key: None  # runs for ever on lines that hold one another
-    parser.bases.append(Path(source.path).resolve().parent)  # where CALL looks
-    parser.parse_lines(source.text.splitlines(keepends=True), final=False)
-    if any(str(said[2]).lower() == "call" for said in parser.postponed):
-        raise source.error("a CALL that pyAT does not carry out", "one file with all in it")
-
-
-def _reference(found: re.Match[str]) -> str:
-    return found[1] + found[2].lower().replace("center", "centre")
-
-
-def _balanced(text: str) -> bool:
-    opened = []
-    for bracket in re.findall(r"[(){}]", re.sub(r'"[^"]*"', "", text)):
-        if bracket in "({":
-            opened.append(bracket)
-        elif not opened or opened.pop() + bracket not in ("()", "{}"):
-            return False
-    return not opened
-
-
-def _unparsed(source: Source, error: Exception) -> InputError:
-    """Say which statement did not parse; the parser tells where it ended, counted from 0."""
-    told = TOLD.match(str(error))
-    if told is None:
-        cause = str(error) or type(error).__name__
-        return source.error(f"a file that does not parse ({_short(cause)})", _valid(source))
-    number, _, text, cause = told.groups()
-    while inner := TOLD.match(cause):  # in a file that was called
-        cause = inner[4]
-    return InputError(
-        f"'{_short(text)}' does not parse ({_short(cause)})",
-        _valid(source),
-        path=source.path,
-        line=int(number) + 1,
-    )
-
-
-def _valid(source: Source) -> str:
-    return f"a valid {source.dialect} file"
-
-
-def _short(text: str) -> str:
-    text = " ".join(re.sub(r"\s*\(<string>, line 1\)", "", text).split())
-    return text if len(text) <= 80 else text[:77] + "..."
-
-
-def _check_ignored(said: str, source: Source) -> None:
-    """Refuse what the parser only mentions and drops, such as TILT without a value."""
-    dropped = re.search(r"Unexpected positional argument '(.*)' ignored", said)
-    if dropped:
-        word = dropped[1]
-        pattern = re.compile(rf",\s*{re.escape(word)}\s*(?![\w.]*\s*:?=)", re.IGNORECASE)
-        lines = enumerate(source.text.splitlines(), start=1)
-        line = next((n for n, t in lines if pattern.search(t)), None)
-        raise InputError(
-            f"'{_short(word)}' without a value", f"{_short(word)} = ...", source.path, line
-        )
-
-
-def _descriptions(parser: Any) -> dict[str, Any]:
-    """What the file says of each element, by name."""
-    return {v.name: v for v in parser.values() if hasattr(v, "origin")}
-
-
-def _key(name: str) -> str:
-    """Spell a name as the parser's own bookkeeping does, for comparison only."""
-    return re.sub(r"[.:]", "_", name.strip('"')).lower()
-
-
-def _chosen(parser: Any, source: Source, use: str | None) -> tuple[str, str]:
-    """Name and parser key of the line to be read."""
-    sequences = set(parser.sequences)
-    found = {v.name: k for k, v in parser.items() if k in sequences and getattr(v, "valid", True)}
-    pending = [p[1] for p in parser.postponed if p[1] and p[2].lower() in ("line", "sequence")]
-    names = list(dict.fromkeys([*found, *pending]))
+def _chosen(program: Interpreter, path: str | PathLike[str], use: str | None) -> Definition:
+    names = [line.name for line in program.lines.values()]
     if not names:
-        raise source.error("no LINE and no SEQUENCE", f"{_valid(source)} with one of them")
-    if use is None and len(names) > 1:
-        raise source.error(
-            f"{len(names)} lines or sequences", f"--use NAME with {nearest('', names)}"
+        expected = f"a valid {program.dialect.name} file with one of them"
+        raise InputError("no LINE and no SEQUENCE", expected, path)
+    wanted = use or program.used
+    if wanted is None and len(names) > 1:
+        found, expected = (
+            f"{len(names)} lines or sequences",
+            f"--use NAME with {nearest('', names)}",
         )
-    chosen = names[0] if use is None else next((n for n in names if _key(n) == _key(use)), None)
-    if chosen is None:
-        raise source.error(f"no line or sequence '{use}'", nearest(str(use), names))
-    if chosen not in found:
-        raise _undefined(parser, source, chosen)
-    return chosen, found[chosen]
+        raise InputError(found, expected, path)
+    wanted = (names[0] if wanted is None else wanted).strip("\"'").lower()
+    if (key := coded(wanted)) not in program.lines:
+        raise InputError(f"no line or sequence '{wanted}'", nearest(wanted, names), path)
+    return program.lines[key]
 
 
-def _undefined(parser: Any, source: Source, name: str) -> InputError:
-    """Follow why a definition failed down to the word that is not defined."""
-    pending = {_key(p[1]): (p[1], _key(str(p[0]))) for p in parser.postponed if p[1]}
-    label, cause = pending.get(_key(name), (name, _key(name)))
-    seen = {_key(label)}
-    while cause in pending and cause not in seen:
-        seen.add(cause)
-        label, cause = pending[cause]
-    kind = next((p[2] for p in parser.postponed if p[1] == label), None)
-    if kind is not None and _key(kind) == cause:
-        return source.error(
-            f"element '{label}' of type '{kind.upper()}', which cannot be read",
-            "drifts, quadrupoles, dipoles, monitors and markers; cut the line around it",
-            label,
+class _Placed(NamedTuple):
+    """An element, or the end, of a sequence: start and length in m, and what places it there."""
+
+    own: Definition | None
+    start: float
+    length: float
+    place: tuple[str | PathLike[str], int]
+
+
+class _Expansion:
+    """The elements of one line, in order."""
+
+    def __init__(self, program: Interpreter, line: Definition) -> None:
+        self.program, self.line, self.made = program, line, 0
+        self.elegant = program.dialect is ELEGANT
+        self.meant = {*MEANT, *program.dialect.meant}
+
+    def elements(self) -> Iterator[Element]:
+        """Each element of the line, with drifts where nothing stands."""
+        if self.line.kind == "line":
+            for name, reflected in self._members(self.line, ()):
+                for one in self._whole(self.program.elements[name]):
+                    turned = reflected and self.program.dialect is not MADX  # which does not
+                    yield replace(one, edges=one.edges[::-1]) if turned else one
+            return
+        end, number = 0.0, count()
+        last = _Placed(None, self._length(self.line), 0.0, (self.line.path, self.line.line))
+        for one in [*self._placed(self.line, 0.0, ()), last]:
+            gap = one.start - end
+            if gap < -TINY:
+                what = f"'{one.own.name}' overlapping" if one.own else "elements beyond the end"
+                expected = "elements in the order of their places that do not overlap"
+                raise InputError(f"{what} by {-gap:g} m", expected, *one.place)
+            if gap > TINY:
+                yield Element(f"drift_{next(number)}", "DRIFT", "space", gap)
+            if one.own is not None:
+                yield from self._whole(one.own)
+                end = one.start + one.length
+
+    def _number(self, own: Definition, key: str, usual: float = 0.0) -> float:
+        parameter = own.parameters.get(key)
+        return usual if parameter is None else _single(self.program, parameter)
+
+    def _length(self, own: Definition) -> float:
+        """Length along the beam; MAD-X has that of an RBEND straight, unless RBARC is off."""
+        length = self._number(own, "l")
+        if own.kind == "sequence" and length <= 0.0:
+            raise own.error(f"sequence '{own.name}' of length {length:g} m", "L above zero")
+        if own.kind == "multipole" and not self.elegant:
+            return 0.0
+        if length < 0.0 or (own.kind == "marker" and length):
+            raise own.error(f"'{own.name}' of length {length:g} m", "a length that MAD-X takes")
+        half = 0.5 * self._number(own, "angle") if own.kind == "rbend" else 0.0
+        return length * half / math.sin(half) if half and self.program.rbarc else length
+
+    def _placed(
+        self, sequence: Definition, start: float, within: tuple[str, ...]
+    ) -> Iterator[_Placed]:
+        """Elements of a sequence that begins at a place."""
+        if sequence.name in within:
+            raise sequence.error(f"'{sequence.name}', which holds itself", "a sequence of others")
+        for i, (name, _) in enumerate(sequence.placed):
+            self._count(sequence)
+            own = self._part(sequence, name)
+            first = start + self._start(sequence, i)
+            if own.kind == "sequence":
+                yield from self._placed(own, first, (*within, sequence.name))
+            else:
+                at = sequence.placed[i][1]["at"]
+                yield _Placed(own, first, self._length(own), (at.path, at.line))
+
+    def _part(self, sequence: Definition, name: str) -> Definition:
+        own = self.program.elements.get(name) or self.program.lines[name]
+        if own.kind == "line":
+            found = f"line '{own.name}' within a sequence"
+            raise sequence.error(found, "elements and sequences")
+        return own
+
+    def _start(self, sequence: Definition, i: int) -> float:
+        own = self._part(sequence, sequence.placed[i][0])
+        return self._centre(sequence, i, ()) - 0.5 * self._length(own)
+
+    def _centre(self, sequence: Definition, i: int, behind: tuple[int, ...]) -> float:
+        """Place of the centre of one part of a sequence, from the sequence's start."""
+        name, place = sequence.placed[i]
+        own = self._part(sequence, name)
+        if i in behind or len(behind) > 100:
+            raise sequence.error(f"'{own.name}', placed FROM itself", "FROM another element")
+        if "at" not in place:
+            raise sequence.error(f"'{own.name}' without a place", "AT = ...")
+        at = _single(self.program, place["at"])
+        if "from" in place:
+            other = word_of(place["from"]).lower()
+            names = [n for n, _ in sequence.placed]
+            if other not in names:
+                raise sequence.error(f"'{own.name}' FROM '{other}'", nearest(other, names))
+            at += self._centre(sequence, names.index(other), (*behind, i))
+        if own.kind == "sequence" and "refpos" in own.parameters:
+            return at + 0.5 * self._length(own) - self._reference(own)
+        refer = (
+            word_of(sequence.parameters["refer"]) if "refer" in sequence.parameters else "centre"
         )
-    return source.error(
-        f"'{label}', which needs the undefined '{cause}'", f"a definition of '{cause}'", label
-    )
+        if refer.lower() not in TO_CENTRE:
+            raise sequence.error(f"REFER = {refer}", "ENTRY, CENTRE or EXIT")
+        return at + TO_CENTRE[refer.lower()] * self._length(own)
+
+    def _reference(self, own: Definition) -> float:
+        """Place in a sequence of the element that its REFPOS names."""
+        name, names = word_of(own.parameters["refpos"]).lower(), [n for n, _ in own.placed]
+        if name not in names:
+            raise own.error(f"REFPOS = '{name}'", nearest(name, names))
+        return self._centre(own, names.index(name), ())
+
+    def _members(self, line: Definition, within: tuple[str, ...]) -> list[tuple[str, bool]]:
+        """Names of the elements of a LINE, in order, and whether each is reflected."""
+        if line.name in within:
+            raise line.error(f"'{line.name}', which holds itself", "a line of others")
+        text = line.members.strip()
+        if not text.startswith("("):
+            raise line.error(f"'{text[:40]}' where a list belongs", "NAME: LINE = (A, B, ...);")
+        found, end = self._list(line, text, 1, (*within, line.name))
+        if text[end:].strip():
+            raise line.error(f"'{text[end:][:40]}' after a list", "NAME: LINE = (A, B, ...);")
+        return found
+
+    def _list(
+        self, line: Definition, text: str, at: int, within: tuple[str, ...]
+    ) -> tuple[list[tuple[str, bool]], int]:
+        """Names in a list in parentheses, as of `_members`, and where it ends."""
+        every: list[tuple[str, bool]] = []
+        while True:
+            found = MEMBER.match(text, at)
+            if found is None:
+                said = text[at:].strip()[:30]
+                raise line.error(f"'{said}' in a LINE", "names, lists, N*name and -name")
+            sign, times, name, _ = found.groups()
+            if name:
+                one, at = self._member(line, name.lower(), within), found.end()
+            else:
+                one, at = self._list(line, text, found.end(), within)
+            number = 1 if times is None else int(times)
+            if number < 1:
+                raise line.error(f"{number} times an element", "one or more")
+            self._count(line, number * len(one))
+            if sign == "-":
+                one = [(own, not reflected) for own, reflected in one[::-1]]
+            every += one * number
+            mark = re.compile(r"\s*([,)])").match(text, at)
+            if mark is None:
+                raise line.error(f"'{text[at:].strip()[:30]}' in a LINE", "',' or ')'")
+            at = mark.end()
+            if mark[1] == ")":
+                return every, at
+
+    def _member(
+        self, line: Definition, name: str, within: tuple[str, ...]
+    ) -> list[tuple[str, bool]]:
+        if name in self.program.elements:
+            return [(name, False)]
+        known = self.program.lines
+        if name not in known or known[name].kind != "line":
+            names = [d.name for d in (*self.program.elements.values(), *known.values())]
+            what = "a sequence" if name in known else "which nothing defines"
+            raise line.error(f"'{name}' in a LINE, {what}", nearest(name, names))
+        return self._members(known[name], within)
+
+    def _count(self, own: Definition, number: int = 1) -> None:
+        self.made += number
+        if self.made > MOST:
+            raise own.error(f"more than {MOST} elements", "a line that a machine has")
+
+    def _whole(self, own: Definition) -> list[Element]:
+        """An element, and the halves before and behind the centre of one that is a screen."""
+        kind = KINDS.get(own.kind)
+        if kind is None:
+            raise own.error(
+                f"element '{own.name}' of type '{own.type}', which cannot be read",
+                "drifts, quadrupoles, dipoles, monitors and markers; cut the line around it",
+            )
+        if kind == "nothing":
+            return []
+        odd = [k for k in own.parameters if k not in self.meant and k not in NO_MATTER]
+        if odd and not self.elegant:  # which has many that change no matrix
+            found = f"'{odd[0]}' of element '{own.name}', which MAD-X or beamfit does not know"
+            raise own.error(found, nearest(odd[0], ["l", "k1", "angle", "e1", "e2", "tilt", "knl"]))
+        if "tilt" in own.parameters and not own.parameters["tilt"].text:
+            raise own.error("'tilt' without a value", "tilt = ...")
+        length = self._length(own)
+        if kind == "screen" and length:
+            half = Element(own.name, "DRIFT", "space", 0.5 * length)
+            return [half, Element(own.name, own.type, kind, 0.0), half]
+        return [self._magnet(own, "space" if kind == "thin" and length else kind, length)]
+
+    def _magnet(self, own: Definition, kind: str, length: float) -> Element:
+        said = {
+            key: self.program.number(parameter)
+            for key, parameter in own.parameters.items()
+            if key in self.meant or (key in ("e1", "e2") and kind == "dipole")
+        }
+        if required := [k for k in ("angle", "l") if kind == "dipole" and k not in said]:
+            raise own.error(f"'{own.name}' without '{required[0]}'", f"{required[0].upper()} = ...")
+        normal = skew = (0.0, 0.0)
+        if kind == "thin" and self.elegant:
+            normal = tuple(said.get("knl", 0.0) * (said.get("order", 1) == n) for n in range(2))
+        elif kind == "thin":
+            lists = {"knl": [said.get(f"k{n}l", 0.0) for n in range(2)]} | said
+            normal, skew = ((*_several(lists.get(k, ())), 0.0, 0.0)[:2] for k in ("knl", "ksl"))
+        elif kind in ("quadrupole", "dipole") or self.elegant:
+            normal, skew = (0.0, float(said.get("k1", 0.0))), (0.0, float(said.get("k1s", 0.0)))
+        angle = float(said.get("angle", 0.0)) if kind == "dipole" else 0.0
+        edge = 0.5 * angle if own.kind == "rbend" else 0.0
+        edges = tuple(float(said.get(k, 0.0)) + edge for k in ("e1", "e2"))
+        if kind == "thin" and said.get("angle", 0.0) != 0.0:
+            raise own.error(f"'{own.name}' with a bend in a thin element", "ANGLE = 0")
+        place = (own.path, own.line)
+        return Element(
+            own.name, own.type, kind, length, normal, skew, angle, edges, said, place, self.elegant
+        )
 
 
-def _beam(parser: Any, source: Source, name: str, energy: float | None) -> tuple[str, float]:
-    """Particle and total energy in MeV."""
-    particle, total = "electron", energy
-    if source.dialect != ELEGANT:
-        beam = parser.get(f"beam%{name}") or parser["beam%"]
-        particle = str(beam["particle"]).lower()
-        if energy is None and any(k in beam for k in ENERGIES):
-            try:
-                total = 1e-6 * float(beam.resolve()["energy"])
-            except Exception as error:
-                cause = _short(str(error))
-                raise source.error(
-                    f"a BEAM that cannot be read ({cause})", "energy = ..."
-                ) from None
-    if particle not in REST_ENERGY:
-        raise source.error(f"particle '{particle}'", nearest(particle, list(REST_ENERGY)))
-    if total is None:
-        where = "" if source.dialect == ELEGANT else "BEAM, ENERGY = or "
-        expected = f"{where}--energy in MeV (energy= from Python)"
-        raise source.error("no beam energy in the file", expected)
+KINDS = {name: "screen" for name in SCREENS} | {
+    name: "space" for name in (*SPACES, *NOTHING_AT_ZERO)
+}
+KINDS |= {"marker": "marker", "quadrupole": "quadrupole", "multipole": "thin"}
+KINDS |= {"sbend": "dipole", "rbend": "dipole", "nothing": "nothing"}
+
+
+def _several(value: float | Sequence[float]) -> Sequence[float]:
+    return value if isinstance(value, tuple | list) else (value,)
+
+
+def _single(program: Interpreter, parameter: Attribute) -> float:
+    value = program.number(parameter)
+    if isinstance(value, tuple):
+        raise InputError("several numbers", "one", parameter.path, parameter.line)
+    return value
+
+
+def _beam(
+    program: Interpreter, path: str | PathLike[str], name: str, energy: float | None
+) -> tuple[str, float]:
+    """Particle and total energy in MeV, of the sequence's own BEAM or that of all."""
+    beam = program.beams.get(name) or program.beams[""]
+    particle = _particle(beam, program, path)
+    total = energy
+    key = next((k for k in ("energy", "pc", "gamma", "beta", "brho") if k in beam), None)
+    if energy is None:
+        if key is None:
+            expected = "" if program.dialect is ELEGANT else "BEAM, ENERGY = or "
+            expected += "--energy in MeV (energy= from Python)"
+            raise InputError("no beam energy in the file", expected, path)
+        value, rest = _of_beam(program, beam[key]), 1e-3 * REST_ENERGY[particle]
+        if key == "beta" and not 0.0 < value < 1.0:
+            raise InputError(f"BEAM with BETA = {value:g}", "one between 0 and 1", path)
+        momentum = value if key == "pc" else 0.299792458 * value
+        total = 1e3 * {
+            "energy": value,
+            "gamma": value * rest,
+            "beta": rest / math.sqrt(1.0 - value**2) if key == "beta" else 0.0,
+        }.get(key, math.hypot(momentum, rest))
     if expected := expected_energy(total, particle):
         found = f"an energy of {total:g} MeV"
-        raise source.error(found, f"{expected}; BEAM is in GeV, --energy in MeV")
+        raise InputError(found, f"{expected}; BEAM is in GeV, --energy in MeV", path)
     return particle, float(total)
 
 
-def _check_members(parser: Any, source: Source, members: Any, name: str, seen: set[int]) -> None:
-    """Refuse what the parser would drop without a word: numbers in a LINE."""
-    line = parser.env.get("line") or parser.env["LINE"]
-    for member in members if isinstance(members, line) or type(members) in (tuple, list) else ():
-        if isinstance(member, tuple | list):
-            if id(member) not in seen:
-                seen.add(id(member))
-                _check_members(parser, source, member, name, seen)
-        elif not hasattr(member, "expand"):
-            found = getattr(member, "expr", member)
-            raise source.error(f"'{name}' with {found!r} in it", "elements and lines", name)
-
-
-def _expanded(parser: Any, source: Source, name: str, key: str) -> list[Any]:
-    """Return the elements of a line as pyAT's, in order."""
+def _of_beam(program: Interpreter, parameter: Attribute) -> float:
     try:
-        _check_members(parser, source, parser[f'"{key}"'], name, set())
-        with warnings.catch_warnings(record=True) as warned:
-            warnings.simplefilter("always")
-            elements = list(parser.expand(f'"{key}"'))
-    except InputError:
-        raise
-    except Exception as error:
-        quoted = re.findall(r"'([\w.:]+)'", str(error.args[0]) if error.args else "")
-        waiting = {_key(p[1]) for p in parser.postponed if p[1]}
-        for word in quoted:
-            if _key(word) in waiting:
-                raise _undefined(parser, source, word) from None
-        cause = _short(": ".join(str(a) for a in error.args) or type(error).__name__)
-        raise source.error(f"'{name}' cannot be expanded ({cause})", _valid(source), name) from None
-    for warning in warned:
-        if "overlapping" in str(warning.message):
-            raise source.error(_short(str(warning.message)), "elements that do not overlap", name)
-    return elements
+        return _single(program, parameter)
+    except InputError as error:
+        found = f"a BEAM that cannot be read ({error.found})"
+        raise InputError(found, "a number", parameter.path, parameter.line) from None
+
+
+def _particle(beam: dict[str, Attribute], program: Interpreter, path: str | PathLike[str]) -> str:
+    """The particle of a BEAM by its name, which goes before, or by its mass and charge.
+
+    MAD-X passes over a mass and a charge beside a name that it knows; one that contradicts is
+    refused here.
+    """
+    named = word_of(beam["particle"]).lower() if "particle" in beam else None
+    mass = _of_beam(program, beam["mass"]) if "mass" in beam else None
+    charge = _of_beam(program, beam["charge"]) if "charge" in beam else None
+    if named is None and mass is None:
+        named = program.dialect.particle
+    known = [*KNOWN] if named in KNOWN else [*REST_ENERGY]
+    names = [named] if named in KNOWN else known
+    fits = []
+    for name in names:
+        own = KNOWN.get(name, -1.0 if name == "H-" else 1.0)
+        same = mass is None or abs(1e3 * mass / REST_ENERGY[name] - 1.0) < SAME_MASS
+        if same and (
+            (charge is None and named in KNOWN) or own == (1.0 if charge is None else charge)
+        ):
+            fits.append(name)
+    if not fits or (named not in KNOWN and mass is None):
+        found = f"particle '{named}'" if named else "a particle"
+        found += "" if mass is None else f" of mass {mass:g} GeV"
+        found += "" if charge is None else f" and charge {charge:g}"
+        expected = f"{nearest(str(named), known)}, by a name that MAD-X knows or by mass and charge"
+        raise InputError(found, expected, path)
+    return fits[0]

@@ -6,14 +6,11 @@ What a first-order, uncoupled line of one energy cannot hold is refused, never d
 from __future__ import annotations
 
 import math
-import re
 from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from os import PathLike
 from typing import Any
-
-import numpy as np
 
 from beamfit.errors import InputError
 
@@ -27,6 +24,8 @@ UNMODELLED = {
     "ktap": "a tapered field",
     "fse": "a field error",
     "etilt": "a tilt error",
+    "t0": "a tilted component",
+    "t1": "a tilted component",
     "bore": "a field given by its bore",
     "use_bn": "a field given by B1, B2, ...",
     "volt": "an accelerating voltage",
@@ -35,7 +34,7 @@ UNMODELLED = {
     "kill_ent_fringe": "an edge switched off",
     "kill_exi_fringe": "an edge switched off",
 }
-# Elements of MAD that are nothing where some parameter is zero; pyAT does not know them.
+# Elements that are nothing where some parameter is zero.
 NOTHING_AT_ZERO = {
     "srotation": ("angle",),
     "xrotation": ("angle",),
@@ -49,26 +48,6 @@ NOTHING_AT_ZERO = {
     "beambeam": ("charge",),
 }
 EDGES = ("edge1_effects", "edge2_effects")
-
-
-@dataclass(frozen=True)
-class Source:
-    """The file being read, to say where something stands."""
-
-    path: str | PathLike[str]
-    text: str
-    dialect: str
-
-    def line_of(self, name: str) -> int | None:
-        """Line on which a name is defined, if it is in this file."""
-        pattern = re.compile(rf'\s*"?{re.escape(name)}"?\s*(:|=)', re.IGNORECASE)
-        lines = enumerate(self.text.splitlines(), start=1)
-        return next((n for n, t in lines if pattern.match(t)), None)
-
-    def error(self, found: str, expected: str, name: str | None = None) -> InputError:
-        """Make the error that names the file, and the line that defines ``name``."""
-        line = None if name is None else self.line_of(name)
-        return InputError(found, expected, path=self.path, line=line)
 
 
 @dataclass(frozen=True)
@@ -93,6 +72,8 @@ class Element:
         All parameters of the file that mean something.
     place : tuple of path and int, or None
         File and line that define it.
+    elegant : bool
+        Whether an absent FINT is that of elegant, and an RBEN what it takes for one.
     """
 
     name: str
@@ -105,176 +86,88 @@ class Element:
     edges: tuple[float, ...] = (0.0, 0.0)
     said: Mapping[str, Any] = field(default_factory=dict)
     place: tuple[str | PathLike[str] | None, int | None] = (None, None)
-    dialect: str = "MAD-X"
-
-
-# What pyAT makes of elements, by its classes.
-PYAT_KINDS = {
-    "Monitor": "screen",
-    "Quadrupole": "quadrupole",
-    "Dipole": "dipole",
-    "ThinMultipole": "thin",
-}
-
-
-def pyat_element(element: Any, described: Mapping[str, Any], source: Source) -> Element:
-    """An element of a line that pyAT has read.
-
-    Parameters
-    ----------
-    element : at.Element
-        The element.
-    described : mapping of str to mapping
-        What the file says of each element: the parameters pyAT may have dropped.
-    source : Source
-        The file.
-    """
-    name, kind = element.FamName, type(element).__name__
-    said = described.get(name, {})
-    own = str(getattr(element, "origin", None) or kind).upper()
-    normal, skew = (
-        (*map(float, np.atleast_1d(getattr(element, f"Polynom{k}", []))), 0.0, 0.0) for k in "BA"
-    )
-    angle = float(getattr(element, "BendingAngle", 0.0))
-    edges = [float(getattr(element, f"{k}Angle", 0.0)) for k in ("Entrance", "Exit")]
-    if own == "RBEND" and angle < 0.0:
-        # pyAT adds |angle|/2 to the edges of an RBEND. MAD adds angle/2, so that the faces stay
-        # parallel whichever way it bends.
-        edges = [e + angle for e in edges]
-    marker = kind == "Marker" and own in ("MARKER", "MARK", "WATCH")
-    return Element(
-        name,
-        own,
-        "marker" if marker else PYAT_KINDS.get(kind, "space"),
-        float(getattr(element, "Length", 0.0)),
-        normal,
-        skew,
-        angle,
-        tuple(edges),
-        said,
-        (source.path, source.line_of(name)),
-        source.dialect,
-    )
-
-
-def element_tables(elements: Iterable[Element]) -> list[dict[str, Any]]:
-    """Translate a line.
-
-    Returns
-    -------
-    list of dict
-        Tables with the keys of a TOML lattice. Markers and screens that occur several times
-        are numbered as elegant numbers them, NAME#1, NAME#2.
-
-    Raises
-    ------
-    InputError
-        If an element does what beamfit does not model; it names element, type and file.
-    """
-    tables = [_Translation(e).table() for e in elements]
-    places = Counter(t["name"] for t in tables if t["type"] in ("marker", "screen"))
-    seen: Counter[str] = Counter()
-    for table in tables:
-        name = table["name"]
-        if table["type"] == "drift" and name in places:
-            table["name"] = f"{name}.drift"  # half of a monitor with a length
-        elif places[name] > 1:
-            seen[name] += 1
-            table["name"] = f"{name}#{seen[name]}"
-    return tables
-
-
-class _Translation:
-    """One element as a table."""
-
-    def __init__(self, element: Element) -> None:
-        self.element, self.said, self.name = element, element.said, element.name
-        self.type, self.length = element.type, element.length
-        self.normal, self.skew = element.normal, element.skew
+    elegant: bool = False
 
     def table(self) -> dict[str, Any]:
-        kind = self.element.kind
-        if kind in ("screen", "marker"):
-            return {"type": kind, "name": self.name}
-        self.check_unmodelled()
-        own = {"quadrupole": self.quadrupole, "dipole": self.dipole, "thin": self.thin_multipole}
-        if kind in own:
-            return own[kind]()
-        if any(self.normal[:2]) or any(self.skew[:2]):
-            raise self.refuse("with a dipole or quadrupole component of its own")
-        return self.space()
+        """Give the table of a TOML lattice; what beamfit does not model is refused."""
+        if self.kind in ("screen", "marker"):
+            return {"type": self.kind, "name": self.name}
+        self._check_unmodelled()
+        own = {"quadrupole": self._quadrupole, "dipole": self._dipole, "thin": self._lens}
+        return own.get(self.kind, self._space)()
 
-    def refuse(self, what: str, expected: str = "") -> InputError:
+    def _refuse(self, what: str, expected: str = "") -> InputError:
         return InputError(
             f"element '{self.name}' of type '{self.type}' {what}, which beamfit does not model",
             expected or "a line without it: cut the line after it, or set it to zero",
-            *self.element.place,
+            *self.place,
         )
 
-    def number(self, key: str) -> float:
-        """Return a parameter as the file has it; 0 where it has none or it is not a number."""
-        try:
-            return float(self.said.get(key, 0.0))
-        except (TypeError, ValueError):
-            return 0.0
+    def _number(self, key: str) -> float:
+        """A parameter as the file has it; 0 where it has none."""
+        if isinstance(value := self.said.get(key, 0.0), tuple):
+            raise self._refuse(f"with several numbers as {key.upper()}", "one number")
+        return float(value)
 
-    def check_unmodelled(self) -> None:
+    def _check_unmodelled(self) -> None:
         for key, meaning in UNMODELLED.items():
-            if self.number(key) != 0.0:
-                raise self.refuse(f"with {meaning} ({key.upper()} = {self.number(key):g})")
+            if self._number(key) != 0.0:
+                raise self._refuse(f"with {meaning} ({key.upper()} = {self._number(key):g})")
         for key in NOTHING_AT_ZERO.get(self.type.lower(), ()):
-            if self.number(key) != 0.0:
-                raise self.refuse(f"with {key.upper()} = {self.number(key):g}")
+            if self._number(key) != 0.0:
+                raise self._refuse(f"with {key.upper()} = {self._number(key):g}")
         for key in EDGES:
-            if key in self.said and self.number(key) == 0.0:
-                raise self.refuse(f"with an edge switched off ({key.upper()} = 0)")
-        if self.element.kind == "thin":
+            if key in self.said and self._number(key) == 0.0:
+                raise self._refuse(f"with an edge switched off ({key.upper()} = 0)")
+        if self.kind == "thin":
             return
         for key in ("knl", "ksl"):
             values = self.said.get(key, ())
             values = values if isinstance(values, tuple | list) else (values,)
             if any(float(v) for v in values[:2]):
-                raise self.refuse(f"with multipole components of its own ({key.upper()})")
+                raise self._refuse(f"with multipole components of its own ({key.upper()})")
 
-    def space(self) -> dict[str, Any]:
+    def _space(self) -> dict[str, Any]:
         """A length without focusing: drifts, collimators, correctors, sextupoles, ..."""
+        if any(self.normal) or any(self.skew):
+            raise self._refuse("with a dipole or quadrupole component of its own")
         if self.length == 0.0:
             return {"type": "marker", "name": self.name}
         return {"type": "drift", "name": self.name, "length_m": self.length}
 
-    def quarter_turns(self) -> int:
+    def _quarter_turns(self) -> int:
         """Tilt of the element in units of 90°."""
-        turns = self.number("tilt") / (math.pi / 2)
+        turns = self._number("tilt") / (math.pi / 2)
         # Four digits: files write pi/2 as 1.5708.
         if abs(turns - round(turns)) > 1e-4:
-            raise self.refuse(
-                f"tilted by {math.degrees(self.number('tilt')):g} degrees",
+            raise self._refuse(
+                f"tilted by {math.degrees(self._number('tilt')):g} degrees",
                 "upright elements, or bends tilted by a multiple of 90 degrees",
             )
         return round(turns) % 4
 
-    def quadrupole(self) -> dict[str, Any]:
-        self.check_own()
-        self.check_length()
-        k1 = self.upright() * self.normal[1] + 0.0
+    def _quadrupole(self) -> dict[str, Any]:
+        self._check_own()
+        self._check_length()
+        k1 = self._upright() * self.normal[1] + 0.0
         return {"type": "quadrupole", "name": self.name, "length_m": self.length, "k1_per_m2": k1}
 
-    def check_own(self) -> None:
-        if self.normal[0] or any(self.skew[:2]):
-            raise self.refuse("with a dipole or skew component of its own")
+    def _check_own(self) -> None:
+        if self.normal[0] or any(self.skew):
+            raise self._refuse("with a dipole or skew component of its own")
 
-    def check_length(self) -> None:
+    def _check_length(self) -> None:
         if self.length <= 0.0:
-            raise self.refuse(f"of length {self.length:g} m", "a length above zero")
+            raise self._refuse(f"of length {self.length:g} m", "a length above zero")
 
-    def upright(self) -> float:
+    def _upright(self) -> float:
         """The sign of a gradient: that of an element turned by 90° is the other one."""
-        return -1.0 if self.quarter_turns() % 2 else 1.0
+        return -1.0 if self._quarter_turns() % 2 else 1.0
 
-    def dipole(self) -> dict[str, Any]:
-        k1, angle, edges = self.normal[1], self.element.angle, self.element.edges
-        self.check_dipole(angle)
-        turns = self.quarter_turns()
+    def _dipole(self) -> dict[str, Any]:
+        k1, angle, edges = self.normal[1], self.angle, self.edges
+        self._check_dipole(angle)
+        turns = self._quarter_turns()
         k1 = -k1 if turns % 2 else k1
         if angle == 0.0:
             straight = {"type": "quadrupole", "k1_per_m2": k1} if k1 else {"type": "drift"}
@@ -292,33 +185,60 @@ class _Translation:
             "k1_per_m2": k1,
         }
 
-    def check_dipole(self, angle: float) -> None:
-        if any(self.skew[:2]):
-            raise self.refuse("with a skew component of its own")
-        if self.type == "RBEN":
-            raise self.refuse(
-                "(rectangular; pyAT and elegant read its length differently)",
+    def _check_dipole(self, angle: float) -> None:
+        if any(self.skew):
+            raise self._refuse("with a skew component of its own")
+        if self.elegant and "RB" in self.type:
+            raise self._refuse(
+                "(rectangular, whose length programs read differently)",
                 "CSBEND or SBEN with the arc length and E1 = E2 = ANGLE/2",
             )
-        self.check_length()
-        k0 = self.number("k0")
+        self._check_length()
+        k0 = self._number("k0")
         if k0 and abs(k0 * self.length - angle) > 1e-9:
-            raise self.refuse(f"with a field (K0 = {k0:g}) that is not ANGLE/L")
+            raise self._refuse(f"with a field (K0 = {k0:g}) that is not ANGLE/L")
         # elegant takes FINT = 0.5 where the file has none, MAD takes 0.
-        usual = 0.5 if self.element.dialect == "elegant" else 0.0
-        integrals = [self.number(k) for k in ("fint", "fintx", "fint1", "fint2")]
+        usual = 0.5 if self.elegant else 0.0
+        integrals = [self._number(k) for k in ("fint", "fintx", "fint1", "fint2")]
         if "fint" not in self.said:
             integrals.append(usual)
-        gap = self.number("hgap") or self.number("hgapx")
+        gap = self._number("hgap") or self._number("hgapx")
         if gap and any(integrals):
-            raise self.refuse(
+            raise self._refuse(
                 "with a fringe field (HGAP and FINT)",
                 "HGAP = 0, or a TOML lattice with effective edge angles",
             )
 
-    def thin_multipole(self) -> dict[str, Any]:
-        self.check_own()
+    def _lens(self) -> dict[str, Any]:
+        self._check_own()
         if not self.normal[1]:
             return {"type": "marker", "name": self.name}
-        k1l = self.upright() * self.normal[1]
+        k1l = self._upright() * self.normal[1]
         return {"type": "thin_lens", "name": self.name, "k1l_per_m": k1l}
+
+
+def element_tables(elements: Iterable[Element]) -> list[dict[str, Any]]:
+    """Translate a line.
+
+    Returns
+    -------
+    list of dict
+        Tables with the keys of a TOML lattice. Markers and screens that occur several times
+        are numbered as elegant numbers them, NAME#1, NAME#2.
+
+    Raises
+    ------
+    InputError
+        If an element does what beamfit does not model; it names element, type and file.
+    """
+    tables = [e.table() for e in elements]
+    places = Counter(t["name"] for t in tables if t["type"] in ("marker", "screen"))
+    seen: Counter[str] = Counter()
+    for table in tables:
+        name = table["name"]
+        if table["type"] == "drift" and name in places:
+            table["name"] = f"{name}.drift"  # half of a monitor with a length
+        elif places[name] > 1:
+            seen[name] += 1
+            table["name"] = f"{name}#{seen[name]}"
+    return tables

@@ -77,7 +77,7 @@ def _table_of(values: np.ndarray, group: np.ndarray) -> np.ndarray:
 
 
 def _means(values: np.ndarray, group: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """How many numbers each group has, and their mean; NaN, a shot not measured, is none."""
+    """Count and mean of the numbers of each group; NaN, a shot not measured, is none."""
     measured = ~np.isnan(values)
     number = np.bincount(group, measured)
     with np.errstate(invalid="ignore"):
@@ -85,7 +85,7 @@ def _means(values: np.ndarray, group: np.ndarray) -> tuple[np.ndarray, np.ndarra
 
 
 def scatter_of(size: np.ndarray, group: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Of each setting the mean of its shots, how many may still differ, and their square sum."""
+    """Mean of each setting's shots, their degrees of freedom, and their sum of squares."""
     number, mean = _means(size, group)
     with np.errstate(invalid="ignore"):
         square = number * _means((size - mean[group]) ** 2, group)[1]
@@ -93,7 +93,7 @@ def scatter_of(size: np.ndarray, group: np.ndarray) -> tuple[np.ndarray, np.ndar
 
 
 def _alike(size: np.ndarray, group: np.ndarray) -> bool:
-    """Whether repeats scatter as if by one relative noise: the largest against all others by F."""
+    """Tell repeats that scatter by one relative noise: the largest against all others by F."""
     from beamfit.statistics import POOR_FIT  # scipy, which most scans are read without
 
     mean, degrees, square = scatter_of(size, group)
@@ -101,7 +101,7 @@ def _alike(size: np.ndarray, group: np.ndarray) -> bool:
 
 
 def _outstanding(square: np.ndarray, degrees: np.ndarray) -> np.ndarray:
-    """How likely some setting scatters so much more than all others, by the F test of each.
+    """Probability that some setting scatters so much more than all others, by the F test of each.
 
     Examples
     --------

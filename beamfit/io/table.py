@@ -288,7 +288,7 @@ def _units_below(
 
 
 def _is_again(cells: list[str], title: list[str], path: str | PathLike[str], line: int) -> bool:
-    """Whether a row is the header once more, as of files put together; another one is refused."""
+    """Tell a row that is the header once more, as of files put together; refuse another one."""
     if not cells or is_value(cells[0]) or not (cells == title or is_header(cells)):
         return False
     if cells != title:

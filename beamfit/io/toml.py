@@ -35,7 +35,7 @@ KINDS = {
 
 
 class Key(NamedTuple):
-    """What may stand under a key.
+    """Kind, unit and range of the value of a key.
 
     Attributes
     ----------
@@ -105,7 +105,7 @@ class Key(NamedTuple):
 
 
 def is_number(value: object) -> bool:
-    """Whether a value of a file is a finite number (an integer of 400 digits is none)."""
+    """Tell a value that is a finite number (an integer of 400 digits is none)."""
     return isinstance(value, NUMBER) and not isinstance(value, bool) and abs(value) < 1e300
 
 
@@ -145,7 +145,7 @@ class Section:
         return InputError(found, expected, path=self.path, line=line, column=key)
 
     def _line(self, key: str) -> int:
-        """Where `key =` stands before the next table begins, or where a table of that name does."""
+        """Find the line of `key =` before the next table, or of a table of that name."""
         value = re.compile(rf"\s*['\"]?{key}['\"]?\s*=")
         head = re.compile(rf"\s*\[\[?\s*{self.prefix}{key}\s*\]")
         inside = True

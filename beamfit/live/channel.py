@@ -31,7 +31,7 @@ CONTEXTS: dict[asyncio.AbstractEventLoop, Any] = {}
 
 
 class Reading(NamedTuple):
-    """What a variable read.
+    """Reading of a variable.
 
     Attributes
     ----------
@@ -49,7 +49,7 @@ class Reading(NamedTuple):
 
     @property
     def good(self) -> bool:
-        """Whether it is a finite number (or some) that the control system vouches for."""
+        """Tell a finite number (or some) that the control system vouches for."""
         return self.severity < INVALID and bool(np.all(np.isfinite(self.value)))
 
 
@@ -188,7 +188,7 @@ def _closed() -> None:
 
 
 class Protocols(NamedTuple):
-    """How a protocol reads, writes, describes and follows a variable, and its ways to refuse."""
+    """Protocol: its calls to read, write, describe and follow a variable, and its errors."""
 
     get: Callable[[str], Awaitable[Reading]]
     put: Callable[[str, float], Awaitable[Any]]

@@ -54,7 +54,7 @@ Left = Callable[[float], Awaitable[str]]
 
 
 class Device(Protocol):
-    """What can be moved: a magnet of any control system, or of a simulation."""
+    """Magnet that can be moved, of any control system or of a simulation."""
 
     async def put(self, value: float) -> None:
         """Begin to move it to a setting, and return when it says that it is there."""
@@ -76,7 +76,7 @@ class Device(Protocol):
 
 
 class Sizes(Protocol):
-    """What measures the beam at a setting."""
+    """Screen that measures the beam at a setting."""
 
     async def shots(self) -> Shots:
         """Take new shots.
@@ -89,10 +89,10 @@ class Sizes(Protocol):
 
 
 class Watchman(Protocol):
-    """What says whether there is beam, and none of it is lost."""
+    """Guard that tells whether there is beam, and none of it is lost."""
 
     async def amiss(self) -> str:
-        """What is wrong, in words; "" if nothing is."""
+        """Fault in words; "" if there is none."""
 
     def followed(self) -> AbstractAsyncContextManager[Left]:
         """Follow the beam while the block lasts, and say in the end how it was lost."""
@@ -185,7 +185,7 @@ def _sound(reading: Reading, name: str) -> Reading:
 
 
 def _unsettled(magnet: Magnet, value: float, read: float) -> tuple[str, str]:
-    """What a read-back does instead of arriving, and what to look at."""
+    """Behaviour of a read-back that does not arrive, and where to look."""
     found = (
         f"{magnet.name} set to {value:.6g} {magnet.unit}, read back {read:.6g} after "
         f"{magnet.timeout:g} s"
@@ -404,7 +404,7 @@ async def connect(machine: ScanMachine) -> Connected:
 
 
 async def check_lengths(channel: Channel, profiler: Profiler) -> list[str]:
-    """What to say of the unit of some sizes.
+    """Note on the unit of some sizes.
 
     Raises
     ------

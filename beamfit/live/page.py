@@ -26,7 +26,7 @@ SAID |= {405: "Method Not Allowed", 503: "Service Unavailable"}
 
 
 def _policy(page: str) -> str:
-    """What the page may do: run its own script, look as it says, ask its own server."""
+    """Security policy of the page: its own script, its own style, its own server."""
 
     def digest(tag: str) -> str:
         [inside] = re.findall(rf"<{tag}>(.*?)</{tag}>", page, re.DOTALL)
@@ -98,7 +98,7 @@ class Page:
                 await writer.wait_closed()
 
     def _asked(self, head: str) -> tuple[int, str]:
-        """What a request gets: a status, and the path."""
+        """Answer to a request: a status, and the path."""
         first, *rest = head.split("\r\n")
         named = [line[5:].strip() for line in rest if line.lower().startswith("host:")]
         words = first.split(" ")

@@ -28,6 +28,8 @@ BEGIN = (0.1, 0.37, 0.63, 0.9)
 # Points that each further magnet is moved for at least: a beam has three numbers, so that each
 # magnet by itself tells all of it. Where they disagree the line is wrong.
 FEW = 3
+# Settings of each of two magnets among which `wrong_line` looks for the best.
+LEVELS = 7
 # Points before which a goal is not taken for reached: three numbers meet five sizes too easily.
 FEWEST = 6
 
@@ -127,10 +129,13 @@ def warmed(machine: ScanMachine, line: Beamline) -> None:
         ]
         fit = fit_of(points, machine, line)
         next_setting(points, fit, (), machine, middle)
+        if fit is not None and machine.magnets[1:]:
+            for plane in planes:
+                fit.predict({name: np.full(LEVELS**2, v) for name, v in middle.items()}, plane)
 
 
 def sharp(fit: EmittanceFit | None, points: Sequence[Point], goal: float) -> bool:
-    """Whether every emittance is trusted and known to a relative error.
+    """Tell fits whose every emittance is trusted and known to a relative error.
 
     Parameters
     ----------
@@ -168,7 +173,7 @@ def doubt(fit: EmittanceFit | None, points: Sequence[Point]) -> str:
 
 
 def first_settings(machine: ScanMachine) -> tuple[float, ...]:
-    """Where a scan begins: as the machine file says, or over the range of its first magnet."""
+    """First settings of a scan: as the machine file says, or over the range of its first magnet."""
     first = machine.magnets[0]
     return machine.first or tuple(first.low + p * (first.high - first.low) for p in BEGIN)
 
@@ -297,7 +302,7 @@ def scan_text(points: Sequence[Point], machine: ScanMachine, before: Mapping[str
 
 
 def _head(machine: ScanMachine, before: Mapping[str, float]) -> list[str]:
-    """What a reader of the file wants to know of how it was measured, as comments."""
+    """Comments of the file on how it was measured."""
     screen = machine.screen
     variables = ", ".join((screen.sizes or screen.profiles).values())
     measured = "sizes" if screen.sizes else "Gaussian fits to projections"

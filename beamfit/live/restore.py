@@ -185,7 +185,7 @@ def _demand(holds: bool) -> None:
 
 
 def journal_of(machine: ScanMachine, path: str | None) -> Path:
-    """Where the journal of a machine is, unless it is said: beside the machine's file."""
+    """Path of a machine's journal unless it is given: beside the machine's file."""
     return Path(path or Path(machine.path).with_suffix(".journal")).absolute()
 
 

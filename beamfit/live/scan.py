@@ -29,6 +29,7 @@ from beamfit.live.restore import (
     reach,
     restore,
 )
+from beamfit.live.wrong_line import MOST, WrongLine, suspect, telling_setting, wrong_lines
 from beamfit.optics.beamline import Beamline
 
 # Settings in a row at which nothing can be measured, after which a scan ends.
@@ -38,7 +39,7 @@ LOOK = 0.2
 
 
 class Told(NamedTuple):
-    """How a scan stands: its points, the fit to them where there is one, and what is new.
+    """Progress of a scan: its points, the fit to them where there is one, and what is new.
 
     ``measured`` says whether that is the last of the points; ``news`` is then why it was chosen.
     """
@@ -50,7 +51,7 @@ class Told(NamedTuple):
 
 
 class Outcome(NamedTuple):
-    """How a scan ended.
+    """End of a scan.
 
     Attributes
     ----------
@@ -78,7 +79,7 @@ class Outcome(NamedTuple):
 
 @dataclass
 class Running:
-    """What a scan has so far; the one thing that changes as it goes on."""
+    """State of a scan; the one thing that changes as it goes on."""
 
     at: Connected
     line: Beamline
@@ -90,6 +91,7 @@ class Running:
     barred: list[dict[str, float]] = field(default_factory=list)
     fit: EmittanceFit | None = None
     armed: bool = False
+    checks: int = 0
 
     def say(self, news: str, measured: bool = False) -> None:
         """Tell how it stands."""
@@ -160,6 +162,8 @@ async def scan(
                 problem, reason = error, str(error)
             await _to_the_end(_back(run, log))
         number, doubted = came[0] if came else 0, doubt(run.fit, run.points)
+        if not doubted and run.checks:
+            doubted = suspect(run.points, run.fit, at.machine, wrong_lines(line, at.machine))
         return Outcome(tuple(run.points), run.fit, reason, problem, number, doubted)
 
 
@@ -200,13 +204,13 @@ async def _back(run: Running, log: Journal) -> None:
 
 async def _measured(run: Running) -> str:
     """Measure setting after setting, and say why it ends."""
-    machine, barren = run.at.machine, 0
+    machine, barren, wrong = run.at.machine, 0, wrong_lines(run.line, run.at.machine)
     for magnet in machine.magnets:
         for value in magnet.degauss:
             await reach(magnet, run.at.magnets[magnet.name], value)
     while len(run.points) < machine.points:
         await run.ready()
-        chosen = next_setting(run.points, run.fit, run.barred, machine, run.before)
+        chosen = _chosen(run, wrong)
         if not isinstance(chosen, Next):
             return chosen
         point, why = await _point(run, chosen.settings)
@@ -224,9 +228,18 @@ async def _measured(run: Running) -> str:
         run.points.append(point)
         run.fit = fit_of(run.points, machine, run.line) or run.fit
         run.say(chosen.why, measured=True)
-        if sharp(run.fit, run.points, machine.goal) and not fresh(run.points, machine):
-            return f"the goal of {100 * machine.goal:.3g} % is reached"
     return f"all {machine.points} points are measured"
+
+
+def _chosen(run: Running, wrong: list[WrongLine]) -> Next | str:
+    """The next setting, or why there is none: the goal, and nothing that shows the line wrong."""
+    machine, points = run.at.machine, run.points
+    if not sharp(run.fit, points, machine.goal) or fresh(points, machine):
+        return next_setting(points, run.fit, run.barred, machine, run.before)
+    if run.checks < MOST and (one := telling_setting(points, run.fit, machine, wrong, run.before)):
+        run.checks += 1
+        return one
+    return f"the goal of {100 * machine.goal:.3g} % is reached"
 
 
 async def _point(run: Running, settings: Mapping[str, float]) -> tuple[Point | None, str]:

@@ -28,7 +28,7 @@ WAITING = 100_000
 
 @dataclass(frozen=True)
 class Told:
-    """What is known at a moment.
+    """Knowledge at a moment.
 
     Attributes
     ----------
@@ -53,7 +53,7 @@ class Told:
 
     @property
     def sound(self) -> bool:
-        """Whether the numbers are of now."""
+        """Tell numbers that are of now."""
         return self.silent is None and not self.old and self.state.answer is not None
 
     @property
@@ -122,7 +122,7 @@ class _Course:
     fitted: float | None = None
 
     def told(self) -> Told:
-        """What is known now."""
+        """Knowledge now."""
         now, patience = time.monotonic(), max(STALE, INTERVALS * self.apart)
         silent = now - self.arrived if now - self.arrived > patience else None
         age = None if self.fitted is None else now - self.fitted
@@ -252,7 +252,7 @@ async def watch(
 
 @contextmanager
 def _signals() -> Iterator[list[int]]:
-    """What came; a second one ends the process as it would any."""
+    """Signal that came; a second one ends the process as it would any."""
     came: list[int] = []
     before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
 

@@ -1,6 +1,7 @@
 """Files of other programs, each on the one reader of columns: SDDS, vectors of MATLAB."""
 
 import random
+import struct
 import sys
 import time
 
@@ -95,6 +96,9 @@ def test_the_final_properties_of_elegant(tmp_path):
     [
         ("&column name=Q", '&include filename="z" &end\n&column name=Q', "SDDS file with &include"),
         ("\n4\n", "\n5\n", "not SDDS, or is damaged"),
+        ("\n4\n", "\n3\n", "another number of rows than it announces"),
+        ("\n4\n", "\n1\n", "another number of rows than it announces"),
+        ("\n4\n", "\n0\n", "another number of rows than it announces"),
         (PAGE, f"{PAGE}135.0\n4\n{PAGE}", "2 pages; expected one; sddscombine -merge"),
         ("\n4\n", "\nfour\n", "is damaged"),
         ("53.6", "x", "is damaged"),
@@ -109,6 +113,24 @@ def test_sdds_that_is_no_table(old, new, words, tmp_path):
     with pytest.raises(InputError, match=words) as raised:
         read(tmp_path / "a.sdds", SDDS.replace(old, new))
     assert "\n" not in str(raised.value)
+
+
+def test_sdds_of_few_rows_or_with_blank_lines_is_read(tmp_path):
+    counted = SDDS.replace("no_row_counts=0", "no_row_counts=1").replace("\n4\n", "\n")
+    for text in (counted, SDDS + "\n\n", SDDS.rstrip()):
+        assert len(read(tmp_path / "a.sdds", text)) == 4
+
+
+@pytest.mark.parametrize("rows", [0, 1, 3, 5])
+def test_binary_sdds_with_a_wrong_row_count(rows, tmp_path):
+    path = tmp_path / "a.sdds"
+    path.write_text(SDDS)
+    as_binary(path)
+    content = path.read_bytes()
+    place = content.index(b"\n", content.index(b"&data")) + 1
+    path.write_bytes(content[:place] + struct.pack("<i", rows) + content[place + 4 :])
+    with pytest.raises(InputError, match=r"another number of rows|pages|is damaged"):
+        read_quad_scan(path)
 
 
 def test_sdds_without_its_package(tmp_path, monkeypatch):

@@ -324,9 +324,8 @@ def test_called_files_are_found_beside_the_file(written):
 
 def test_without_pyat(written, monkeypatch):
     monkeypatch.setitem(sys.modules, "at", None)
-    path = written("line.lte", ELEGANT)
-    assert "pip install 'beamfit[lattice]'" in refused(path)
-    assert read_lattice(written("line.madx", MADX)).name == "LC"  # which beamfit reads itself
+    for name, text in FILES.items():
+        assert read_lattice(written(name, text), energy=135.0).name == "LC"
 
 
 @given(
@@ -461,3 +460,137 @@ def test_a_power_is_a_power_however_it_is_assigned(written):
             for sign in ("=", ":=")]  # fmt: skip
     assert read[0].elements == read[1].elements
     assert 8.0 in read[1].elements[0].values()
+
+
+DIALECTS = {
+    "words cut, a part of an element, late": (
+        "a.mad8",
+        "Q1: QUADRU, L=0.1, K1=K*Q2[K1]\nQ2: QUAD, L=0.1, K1=K\nK = 1\nSET, K, 2\n"
+        "BEAM, ENERGY=0.1\nM: MONI\nTITLE\n it's (a scan\nLC: LINE=(Q1,Q2,M)\nUSE, LC\n",
+        [4.0, 2.0],
+    ),
+    "derived, two statements on a line": (
+        "a.mad8",
+        "BEAM, PC=0.1; Q: QUAD, L=0.1, K1=3 ! one\nR: Q, K1=-1; LC: LINE=(Q,R)\nRETURN\n(",
+        [3.0, -1.0],
+    ),
+    "calculator": (
+        "a.lte",
+        "% 2 sto a\n% a 3 swap - sto b ! 1\nQ1: QUAD, L=0.1, K1=\"a 2 pow b + sqrt\"\n"
+        "Q2: KQUAD, L=0.1, &\n K1=\"90 dsin chs\", GROUP=\"a b\"\nLC: LINE=(Q1,Q2)\n",
+        [5**0.5, -1.0],
+    ),
+    "names in quotes": (
+        "a.lte",
+        '"QUAD:IN20-1": QUAD, L=0.1, K1=3\nM: MARK\n"L-1": LINE=("QUAD:IN20-1",M)\n'
+        'LC: LINE=("L-1",-"L-1")\n',
+        [3.0, 3.0],
+    ),
+    "what has no length and no field": (
+        "a.lte",
+        "C: CHARGE, TOTAL=1e-9\nE: MALIGN\nQ: QUAD, L=0.1, K1=3\nH: HKICK, L=0.1\n"
+        "S: KSEXT, L=0.1, K2=3\nT: MULT, KNL=3, ORDER=2\nLC: LINE=(C,Q,E,H,S,T)\n",
+        [3.0],
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", DIALECTS)
+def test_what_other_programs_write(case, written):
+    name, text, k1 = DIALECTS[case]
+    file = read_lattice(written(name, text), use="LC", energy=100.0)
+    assert [e["k1_per_m2"] for e in file.elements if e["type"] == "quadrupole"] == pytest.approx(k1)
+
+
+def test_names_of_elegant_are_shown_as_they_are(written):
+    path = written("a.lte", DIALECTS["names in quotes"][1])
+    file = read_lattice(path, use="l-1", energy=100.0)
+    assert file.name == "L-1"
+    assert file.calibrations == {"QUAD:IN20-1": "k1"}
+
+
+def test_thin_quadrupoles(written):
+    for name, text in (
+        ("a.mad8", "BEAM, ENERGY=0.1\nT: MULT, K1L=0.3, K2L=4\nLC: LINE=(T)\n"),
+        ("a.lte", "T: MULT, KNL=0.3\nLC: LINE=(T)\n"),
+    ):
+        [lens] = read_lattice(written(name, text), energy=100.0).elements
+        assert (lens["type"], lens["k1l_per_m"]) == ("thin_lens", 0.3)
+
+
+def test_included_files_of_elegant(written):
+    written("optics.lte", ELEGANT)
+    assert read_lattice(written("a.lte", '#INCLUDE: "optics.lte"\n'), energy=9.0).name == "LC"
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "line", "said"),
+    [
+        ("a.mad8", "BEAM, ENERGY=1\n\nT: MULT, K1L=1, T1\nLC: LINE=(T)\n", 3, "T1 ="),
+        ("a.mad8", "BEAM, ENERGY=1\nQ: QUAD, L=1, KL=1\nLC: LINE=(Q)\n", 2, "'kl' of element 'Q'"),
+        ("a.mad8", "BEAM, ENERGY=1\nW: LCAV, L=1\nLC: LINE=(W)\n", 2, "type 'LCAV'"),
+        ("a.lte", 'Q: QUAD, L=1, K1="1 2"\nLC: LINE=(Q)\n', 1, "'\"1 2\"'"),
+        ("a.lte", "% 1 2 atan2 sto k\nLC: LINE=(Q)\n", 1, "'%'"),
+        ("a.lte", "M: MULT, KNL=1, ORDER=0\nLC: LINE=(M)\n", 1, "dipole or skew component"),
+        ("a.lte", "S: KSEXT, L=1, K1=1\nLC: LINE=(S)\n", 1, "quadrupole component"),
+    ],
+)
+def test_what_other_programs_write_and_is_refused(name, text, line, said, written):
+    path = written(name, text)
+    message = refused(path, energy=1000.0)
+    assert message.startswith(f"{path}:{line}:")
+    assert said in message
+
+
+@pytest.mark.filterwarnings("ignore::at.AtWarning")
+@pytest.mark.parametrize("name", ["a.mad8", "a.lte"])
+def test_a_reflected_bend_has_its_faces_the_other_way_round(name, written):
+    """As in pyAT, elegant and MAD-8, not as in MAD-X (tests/io/test_madx.py)."""
+    text = "B: SBEND, L=0.4, ANGLE=0.3, E1=0.2, E2=-0.05\nLC: LINE=(B,-B)\n"
+    text = "BEAM, ENERGY=135\n" * name.endswith("mad8") + text
+    path = written(name, text)
+    bends = read_lattice(path, energy=135e3).elements
+    assert [b["entrance_edge_deg"] for b in bends] == pytest.approx(np.degrees([0.2, -0.05]))
+    ring = LOADERS["line." + name[2:]](path, use="LC", energy=135e9)
+    assert [b.EntranceAngle for b in ring] == pytest.approx([0.2, -0.05])
+
+
+COUNT = 40
+PARTS = {
+    "QUAD": "K1={k:.5f}", "SBEN": "ANGLE={a:.5f}, E1={b:.4f}, E2={c:.4f}", "SEXT": "K2=3",
+    "DRIF": "", "MONI": "", "HKICK": "",
+}  # fmt: skip
+FULL |= {"SEXT,": "SEXTUPOLE,", "MONI,": "MONITOR,", "HKICK,": "HKICKER,"}
+
+
+def any_line(number):
+    """A line of elements at random, written for MAD-8 and elegant."""
+    rng = np.random.default_rng(number)
+    kinds = rng.choice([*PARTS], rng.integers(2, 7))
+    text = ""
+    for i, kind in enumerate(kinds):
+        k, a, b, c, length = rng.uniform(-1, 1, 5)
+        more = PARTS[kind].format(k=5 * k, a=0.1 + 0.3 * abs(a), b=0.2 * b, c=0.2 * c)
+        text += f"E{i}: {kind}, {', '.join(filter(None, [f'L={0.3 + 0.2 * length:.4f}', more]))}\n"
+    names = [f"E{i}" for i in range(len(kinds))]
+    part = rng.permutation(names)[:2]
+    return f"{text}SUB: LINE=({','.join(part)})\nLC: LINE=({','.join(names)},-SUB,2*E0)\n"
+
+
+@pytest.mark.filterwarnings("ignore::at.AtWarning")
+@pytest.mark.parametrize("name", ["a.mad8", "a.lte"])
+def test_lines_at_random_are_those_of_pyat(name, written):
+    for number in range(COUNT):
+        text = any_line(number)
+        if name == "a.mad8":
+            text = f"BEAM, PARTICLE=ELECTRON, ENERGY=135\n{text}"
+        ours = load_lattice(written(name, text), use="LC", energy=135e3).matrix()
+        for short, full in FULL.items():
+            text = text.replace(short, full)
+        ring = LOADERS["line." + name[2:]](written("peer_" + name, text), use="LC", energy=135e9)
+        for element in ring:
+            if hasattr(element, "NumIntSteps"):
+                element.NumIntSteps = 100
+        m66 = at.find_m66(ring.disable_6d(copy=True), orbit=np.zeros(6))[0]
+        for plane, theirs in zip((ours.x, ours.y), planes_of(m66), strict=True):
+            np.testing.assert_allclose(plane[:2, :2], theirs[:2, :2], rtol=1e-5, atol=1e-5)

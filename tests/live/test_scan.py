@@ -17,7 +17,14 @@ from beamfit.io.line import build_line, read_inputs
 from beamfit.io.machine import Guard, read_scan_machine
 from beamfit.live import devices
 from beamfit.live.channel import LostError, Reading, SilentError
-from beamfit.live.devices import BeamGuard, NotSettledError, Supply, rms_of
+from beamfit.live.devices import (
+    BeamGuard,
+    Connected,
+    NotSettledError,
+    Shots,
+    Supply,
+    rms_of,
+)
 from beamfit.live.points import (
     Next,
     Point,
@@ -31,6 +38,7 @@ from beamfit.live.points import (
 )
 from beamfit.live.restore import Journal, NotRestoredError, alone_with, reach, read_journal, restore
 from beamfit.live.scan import scan
+from beamfit.live.wrong_line import telling_setting, wrong_lines
 from tests.live.faulty import LINE, Injector
 from tests.live.simulated import Simulated, connected, written
 from tests.live.struck import struck
@@ -459,6 +467,68 @@ def test_each_magnet_is_moved_and_a_line_that_is_wrong_is_doubted(tmp_path):
         r"The sizes miss this line .* \(χ² \d+ with 4 degrees .*: is it right\?", said
     )
     assert doubt(None, []) == ""
+
+
+class TwoMagnets(Simulated):
+    """One of two magnets, and a screen behind them by the matrices of a line."""
+
+    def __init__(self, name, at, line):
+        super().__init__()
+        self.name, self.at, self.line = name, at, line
+
+    async def put(self, value):
+        self.at[self.name] = value
+
+    async def get(self):
+        return self.at[self.name]
+
+    async def settled(self, value):
+        return self.at[self.name]
+
+    async def shots(self):
+        [point] = points_of(self.line, [dict(self.at)])
+        scatter = 1 + 0.02 * self.rng.standard_normal(5)
+        return Shots({"x": point.shots["x"].mean() * scatter}, 1.7e9)
+
+
+@pytest.mark.parametrize("factor", [1.0, 4 / 3, 2 / 3])
+def test_a_drift_between_two_magnets_a_third_off_is_said(tmp_path, factor):
+    machine = replace(two_magnets(tmp_path, 2.2), points=12, goal=0.05)
+    line = build_line(machine.lattice)
+    [longer, shorter] = wrong_lines(line, machine)
+    assert longer.words == "the drift from Q1 to Q2 times 1.33"
+    assert float(longer.line.length) == pytest.approx(float(line.length) + 1 / 3)
+    assert float(shorter.line.length) == pytest.approx(float(line.length) - 1 / 3)
+    at = {"Q1": -2.0, "Q2": 1.0}
+    true = {1.0: line, 4 / 3: longer.line, 2 / 3: shorter.line}[factor]
+    magnets = {name: TwoMagnets(name, at, true) for name in at}
+    here = Connected(magnets, *[magnets["Q1"]] * 2, machine)
+    found = asyncio.run(scan(here, line, tmp_path / "journal"))
+    assert bool(found.doubt) == (factor != 1.0)
+    if factor == 1.0:
+        assert found.reason.startswith("the goal")
+        told = telling_setting(found.points, found.fit, machine, [longer, shorter], at)
+        assert told is None
+
+
+def test_the_setting_that_tells_a_wrong_drift_moves_what_stood_still(tmp_path):
+    machine = two_magnets(tmp_path, 2.2)
+    line, before = build_line(machine.lattice), {"Q1": -1.0, "Q2": 0.5}
+    points = points_of(line, [before | {"Q1": value} for value in (-5.0, -3.5, -2.0, -0.5, 1.0)])
+    fit, lines = fit_of(points, machine, line), wrong_lines(line, machine)
+    told = telling_setting(points, fit, machine, lines, before)
+    assert "the drift from Q1 to Q2 times" in told.why
+    assert told.settings["Q2"] != before["Q2"]
+    there, elsewhere = (
+        [*points, *points_of(lines[0].line, [told.settings | more] * 2)] for more in ({}, before)
+    )
+    assert doubt(fit_of(there, machine, line), there)
+    assert not doubt(fit_of(elsewhere, machine, line), elsewhere)
+
+
+def test_one_magnet_has_no_distance_to_another(tmp_path):
+    machine = connected(tmp_path, Simulated()).machine
+    assert wrong_lines(build_line(machine.lattice), machine) == []
 
 
 def test_a_projection_has_the_size_of_its_gaussian():
