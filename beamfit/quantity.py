@@ -83,6 +83,11 @@ class Quantity:
         return Quantity(self.value, None, self.unit)
 
     @property
+    def determined(self) -> bool:
+        """The data give it an error."""
+        return self.error is not None and math.isfinite(self.error) and math.isfinite(self.value)
+
+    @property
     def relative(self) -> float | None:
         """Error over value, or None."""
         return None if self.error is None or self.value == 0 else self.error / abs(self.value)

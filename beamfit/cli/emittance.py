@@ -233,11 +233,12 @@ def _show_fully(terminal: Terminal, fit: EmittanceFit, methods: tuple[SizeMethod
 
 def _show_briefly(terminal: Terminal, fit: EmittanceFit) -> None:
     """Show what is quoted, the largest systematic of each plane, and where the rest is."""
-    from beamfit.emittance.results import quoted_rows
+    from beamfit.emittance.results import result_rows
     from beamfit.emittance.sensitivity import systematics
 
-    if rows := quoted_rows(fit.planes):
-        terminal.table(labelled("", [p.plane for p in fit.planes], rows), wrap=False)
+    table = labelled("", [p.plane for p in fit.planes], result_rows(fit.planes)).quoted()
+    if table.rows:
+        terminal.table(table, wrap=False)
     largest: dict[str, list[str]] = {}
     for p in fit.planes if fit.statement.closed else ():
         for change in systematics(fit, p.plane)[:1]:
