@@ -68,11 +68,10 @@ def design(
     described.check_magnets(limits)
     described.check_energies(others)
 
-    from beamfit.emittance.design import plan_measurements  # JAX from here on
-
+    # JAX from here on
     fit = beamfit.fit_emittance(measured, build_line(described), scenario=scenario, **told)
     wanted = {"criterion": criterion, "goal": aim, "count": count, "energies": others}
-    advice = plan_measurements(fit, limits=limits or None, **wanted)
+    advice = beamfit.design(fit, limits=limits or None, **wanted)
     title = f"{fit.scan.name} on {fit.line.name}"
     answered(as_json, [advice], read.digests, lambda terminal: _show(terminal, advice, title))
 

@@ -176,6 +176,12 @@ def trend_of(studies: Sequence[RecordStudy], machine: Machine | None = None) -> 
     InputError
         If several records are not all dated.
 
+    Examples
+    --------
+    >>> import beamfit
+    >>> trend_of([beamfit.study("measurements/aps_1999_decay.csv")]).status.value
+    'unidentified'
+
     Notes
     -----
     Limits are those of an individuals chart (D. C. Montgomery, Introduction to Statistical Quality

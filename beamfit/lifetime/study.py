@@ -62,7 +62,15 @@ POINTS = 60
 
 @shown
 class Machine(NamedTuple):
-    """A ring and the settings and vacuum that hold where a record does not say otherwise."""
+    """A ring and the settings and vacuum that hold where a record does not say otherwise.
+
+    Examples
+    --------
+    >>> from beamfit.io.ring import read_operation, read_ring
+    >>> path = "lattices/spear3_2003.toml"
+    >>> round(float(Machine(read_ring(path), read_operation(path)).ring.circumference))
+    234
+    """
 
     ring: Ring
     operation: Operation
