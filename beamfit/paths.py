@@ -53,9 +53,12 @@ def opening(function: F, name: str) -> F:
 def machine_of(path: str | PathLike[str]) -> Any:
     """Read a ring and its usual operation from one file."""
     from beamfit.io.ring import read_operation, read_ring
-    from beamfit.lifetime.study import Machine
 
-    return Machine(read_ring(path), read_operation(path))
+    ring, operation = read_ring(path), read_operation(path)
+
+    from beamfit.lifetime.study import Machine  # JAX from here on
+
+    return Machine(ring, operation)
 
 
 def _record(path: Any) -> Any:

@@ -11,6 +11,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
+from beamfit.answer import answer
 from beamfit.emittance.candidates import (
     Candidate,
     by_plane,
@@ -23,9 +24,8 @@ from beamfit.emittance.candidates import (
 from beamfit.emittance.fit import EmittanceFit
 from beamfit.errors import InputError
 from beamfit.greybox.design import Information, greedy
-from beamfit.shown import shown
 from beamfit.status import Status
-from beamfit.table import Table, json_of, text_of
+from beamfit.table import Table, json_of
 
 CRITERIA = ("emittance", "D")
 # A further point that sharpens the emittance by less than this is not worth its shift time.
@@ -61,7 +61,7 @@ class Option(NamedTuple):
         return all(self.determined.values())
 
 
-@shown
+@answer
 @dataclass(frozen=True)
 class Advice:
     """What to measure next, and when to stop.
@@ -163,9 +163,6 @@ class Advice:
             for o in self.options
         ]
         return (steps, Table("", header, rows)) if rows else (steps,)
-
-    def __str__(self) -> str:
-        return "\n\n".join([*map(text_of, self.tables()), f"{self.status}: {self.message}"])
 
 
 def _cells(

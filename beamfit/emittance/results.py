@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from beamfit.answer import answer
 from beamfit.optics.beam import BeamMatrix
 from beamfit.quantity import Quantity, display_unit
 from beamfit.shown import shown
@@ -201,7 +202,7 @@ class Identifiability:
         }
 
 
-@shown
+@answer
 @dataclass(frozen=True, eq=False)
 class PlaneFit:
     """The fitted beam of one plane at the start of the line.

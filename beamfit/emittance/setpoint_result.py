@@ -8,12 +8,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from beamfit.answer import answer
 from beamfit.emittance.results import in_words
 from beamfit.emittance.wishes import SAME_ENERGY, Beam, Target
 from beamfit.quantity import Quantity
-from beamfit.shown import shown
 from beamfit.status import Status
-from beamfit.table import Table, cell, json_of, text_of
+from beamfit.table import Table, cell, json_of
 from beamfit.verdict import Finding, judge
 
 # A wish is met within the usual error of a measured size, or of the emittance growth of a mismatch.
@@ -50,7 +50,7 @@ class Minimum(NamedTuple):
     objective: float
 
 
-@shown
+@answer
 @dataclass(frozen=True)
 class Setpoint:
     """The best settings found, what they give, and how sure that is.
@@ -147,10 +147,6 @@ class Setpoint:
             for m in self.others[:5]
         ]
         return (best, Table("Other minima", [], others)) if others else (best,)
-
-    def __str__(self) -> str:
-        said = [f"{self.status}: {self.message}", *self.notes, *self.doubts.values()]
-        return "\n\n".join([*map(text_of, self.tables()), "\n".join(said)])
 
 
 class Evidence(NamedTuple):

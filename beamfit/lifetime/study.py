@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from beamfit.answer import answer
 from beamfit.errors import InputError, expect
 from beamfit.lifetime.bunch import stored_bunch
 from beamfit.lifetime.cycles import (
@@ -353,7 +354,7 @@ class Decay:
         return self.fit.to_json() | json_of(more)
 
 
-@shown
+@answer
 @dataclass(frozen=True, eq=False)
 class RecordStudy:
     """A record with its decays and what lies between them.
@@ -379,6 +380,17 @@ class RecordStudy:
     def answers(self) -> tuple[Decay, ...]:
         """What is quoted of the record: cycles together, then single decays; at least one."""
         return self.pooled + self.decays
+
+    @property
+    def headline(self) -> str:
+        """Lifetimes of the first answers, and how many more there are."""
+        said = [decay.fit.headline for decay in self.answers[:3]]
+        more = len(self.answers) - len(said)
+        return "; ".join(said + [f"{more} more"] * (more > 0))
+
+    def to_json(self) -> list[dict[str, Any]]:
+        """Give the ``results`` list of the JSON contract."""
+        return [decay.to_json() for decay in self.answers]
 
 
 def _steps(record: DecayRecord) -> dict[str, np.ndarray]:
