@@ -90,6 +90,18 @@ def labelled(
     return Table(title, ["", *names] if any(names) else [], cells, note, numeric, marked)
 
 
+def determined(rows: Sequence[Row]) -> list[Row]:
+    """Leave out rows of which no value is determined.
+
+    Examples
+    --------
+    >>> open_one, known = Quantity(1.0, None, "m"), Quantity(2.0, 0.1, "m")
+    >>> [row.label for row in determined([Row("beta", [open_one]), Row("size", [known])])]
+    ['size']
+    """
+    return [row for row in rows if any(map(_known, row.values))]
+
+
 def _known(value: object) -> bool:
     return value.determined if isinstance(value, Quantity) else value is not None
 

@@ -23,6 +23,8 @@ if TYPE_CHECKING:
     from beamfit.lifetime.study import Decay, Machine, RecordStudy
     from beamfit.sampling.posterior import Posterior
 
+# Decays that the first screen lists; all tables have every one.
+MOST_SHOWN = 10
 EXAMPLE = """\b
 Examples:
   beamfit lifetime measurements/aps_1999_decay.csv
@@ -258,15 +260,17 @@ def _show_record(terminal: Terminal, study: RecordStudy) -> None:
 
 
 def _show_many(terminal: Terminal, study: RecordStudy) -> None:
-    """Print a table with a row for each decay, below the record's name."""
+    """Say each verdict once, then print a table with a row for each decay."""
     from beamfit.lifetime import tables
     from beamfit.table import Table
 
-    for title, header, rows in tables.overview(study.decays):
-        cells = [[name.removeprefix(study.record.name), *found] for name, *found in rows]
-        terminal.table(Table(f"\n{title}", header, cells))
     for status, names, message in tables.alike(study.decays):
         terminal.verdict(names, status, message)
+    for title, header, rows in tables.overview(study.decays)[: None if terminal.full else 1]:
+        cells = [[name.removeprefix(study.record.name), *found] for name, *found in rows]
+        if not terminal.full and (left := len(cells) - MOST_SHOWN) > 0:
+            cells = [*cells[:MOST_SHOWN], [f"{left} more", *[""] * (len(header) - 1)]]
+        terminal.table(Table(f"\n{title}", header, cells))
     terminal.line()
 
 

@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING
 import click
 
 import beamfit
-from beamfit.cli.option_text import goal_of
 from beamfit.cli.options import Command, answered, command_line, option, options, reported
 from beamfit.errors import InputError, plain
 from beamfit.io.files import digest
@@ -41,7 +40,7 @@ Examples:
 @option("--recover JOURNAL", "Restore what a scan that was killed has left, and move nothing else.")
 @option("--save FILE.csv", "File of the scan; default: NAME_DATE_TIME.csv.")
 @option("--journal FILE", "Where what is to be restored stands; beside MACHINE unless.")
-@option("--goal PERCENT", "Emittance error to stop at.")
+@options("goal")
 @option("--points", "Most settings.", type=click.IntRange(4, 200))
 @options("report json")
 def scan(
@@ -50,7 +49,7 @@ def scan(
     recover: str | None,
     save: str | None,
     journal: str | None,
-    goal: str | None,
+    goal: float | None,
     points: int | None,
     report: str | None,
     as_json: bool,
@@ -67,7 +66,7 @@ def scan(
         if dry_run or save or journal or goal or points or report:
             raise InputError("--recover with an option of a scan", "--recover JOURNAL alone")
         return _recovered(recover, say, as_json)
-    wanted = {"goal": None if goal is None else goal_of(goal), "points": points}
+    wanted = {"goal": goal, "points": points}
     told = replace(read_scan_machine(machine), **{k: v for k, v in wanted.items() if v})
 
     from beamfit.live.channel import run

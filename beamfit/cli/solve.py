@@ -122,7 +122,7 @@ def _show(terminal: Terminal, found: ProblemSolution | Computed) -> None:
     from beamfit.language.solution import ProblemSolution
 
     if isinstance(found, ProblemSolution):
-        terminal.answer(found.headline, found.status, found.message)
+        terminal.verdict(found.headline, found.status, found.message)
         for note in found.notes:
             terminal.line(note)
         terminal.line()

@@ -162,7 +162,8 @@ class Advice:
             [o.words, *_cells(o.relative_error, o.determined), "yes" if o.identified else "no"]
             for o in self.options
         ]
-        return (steps, Table("", header, rows)) if rows else (steps,)
+        helps = any(o.identified for o in self.options)
+        return (steps, Table("", header, rows)) if helps else (steps,)
 
 
 def _cells(

@@ -22,7 +22,7 @@ from beamfit.greybox.problem import Problem
 from beamfit.noise.model import ROBUST, Noise
 from beamfit.optics.beamline import Beamline
 from beamfit.quantity import Quantity
-from beamfit.table import Table, html_of, json_of, labelled, text_of
+from beamfit.table import Table, determined, html_of, json_of, labelled, text_of
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -390,7 +390,7 @@ class EmittanceFit:
 
     @property
     def _table(self) -> Table:
-        return labelled("", [p.plane for p in self.planes], result_rows(self.planes))
+        return labelled("", [p.plane for p in self.planes], determined(result_rows(self.planes)))
 
     def __str__(self) -> str:
         heading = f"{self.scan.name} on {self.line.name}, fit of {self.planes[0].method}"
@@ -402,7 +402,7 @@ class EmittanceFit:
             rows = parameter_rows(self.parameters)
             lines += ["", f"scenario {self.scenario}, anchor: {self.anchor}"]
             lines += [text_of(Table("", [], rows))] if rows else []
-            lines += [f"Left open: {words}." for words in self.null_directions]
+            lines += [f"Not determined: {words}." for words in self.null_directions]
         return "\n".join(lines)
 
     def _repr_html_(self) -> str:
