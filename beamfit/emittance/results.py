@@ -326,7 +326,7 @@ def result_rows(planes: tuple[PlaneFit, ...]) -> list[Row]:
         ("status", lambda p: p.status, False),
         ("normalised emittance", lambda p: p.normalized_emittance, True),
         ("  95 % interval", _interval, any(p.emittance.determined for p in planes)),
-        ("  error includes", lambda p: p.holds if p.emittance.error is not None else "-", False),
+        ("  error includes", lambda p: p.holds if p.emittance.determined else None, False),
         ("geometric emittance", lambda p: p.emittance, False),
         ("beta at the start", lambda p: p.beta, True),
         ("alpha at the start", lambda p: p.alpha, True),

@@ -137,19 +137,19 @@ class Setpoint:
             unit, error = self.units[name], self.setting_error[name]
             moved = "-" if error is None else f"{error:.2g} {unit}"
             rows.append([name, f"{value:.6g} {unit}", moved])
-        rows.append(["objective", _met(self.best.objective)])
+        rows.append(["objective", _written(self.best.objective)])
         for p in self.predicted:
             rows += [[f"{key} {p.plane}", _shown(key, getattr(p, key))] for key in SHOWN]
         title = f"Best settings of {self.line} for the beam at {self.screen}"
         best = Table(title, ["", "setting", "± from the beam"], rows)
         others = [
-            [f"  {in_words(m.settings, self.units, 5)}: objective {_met(m.objective)}"]
+            [f"  {in_words(m.settings, self.units, 5)}: objective {_written(m.objective)}"]
             for m in self.others[:5]
         ]
         return (best, Table("Other minima", [], others)) if others else (best,)
 
 
-def _met(objective: float) -> str:
+def _written(objective: float) -> str:
     """Write an objective; below the rounding of the search all wishes are met."""
     return f"{objective:.6g}" if objective >= EXACT else "0"
 
@@ -246,7 +246,7 @@ def verdict_on(
     alike = other.objective - best.objective < 1e-6 * (1.0 + best.objective)
     lead = "Other settings do as well, such as" if alike else "The next local minimum is"
     at = in_words(other.settings, units)
-    return found.status, f"{found.message} {lead} {at} (objective {_met(other.objective)})."
+    return found.status, f"{found.message} {lead} {at} (objective {_written(other.objective)})."
 
 
 def reached_words(
