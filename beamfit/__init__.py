@@ -6,14 +6,16 @@
 '0.705 um'
 """
 
+from functools import cache
 from importlib import import_module
 
 __version__ = "0.1.0"
 
-# Public name -> module. Loaded on first use, so that `beamfit --help` and a bad file are
-# answered before JAX has been imported.
+# Public name -> module, and its name there where it is another one. Loaded on first use, so that
+# `beamfit --help` and a bad file are answered before JAX has been imported.
 _HOME = {
     "Anchor": "beamfit.emittance.assumptions",
+    "Beam": "beamfit.emittance.wishes",
     "BeamMatrix": "beamfit.optics.beam",
     "Beamline": "beamfit.optics.beamline",
     "DecayFit": "beamfit.lifetime.fit",
@@ -21,32 +23,74 @@ _HOME = {
     "Drift": "beamfit.optics.elements",
     "EmittanceFit": "beamfit.emittance.fit",
     "InputError": "beamfit.errors",
+    "Job": "beamfit.batch.job",
+    "Machine": "beamfit.lifetime.study",
+    "Monitor": "beamfit.lifetime.record",
     "Noise": "beamfit.noise.model",
     "Posterior": "beamfit.sampling.posterior",
     "QuadScan": "beamfit.emittance.scan",
     "Quadrupole": "beamfit.optics.elements",
+    "Quantity": "beamfit.quantity",
+    "Run": "beamfit.dynamics.record",
     "Screen": "beamfit.optics.elements",
     "SectorDipole": "beamfit.optics.elements",
+    "Status": "beamfit.status",
+    "Target": "beamfit.emittance.wishes",
     "ThinLens": "beamfit.optics.elements",
+    "check": "beamfit.io.check:understand",
     "constant_a_test": "beamfit.lifetime.systematics",
+    "control": "beamfit.commands",
+    "design": "beamfit.emittance.design:plan_measurements",
     "find_setpoint": "beamfit.emittance.setpoint",
     "fit_decay": "beamfit.lifetime.fit",
     "fit_decays": "beamfit.lifetime.fit",
     "fit_emittance": "beamfit.emittance.fit",
+    "fit_lifetimes": "beamfit.lifetime.lifetime_table",
     "fit_sizes": "beamfit.emittance.sigma",
+    "fit_slices": "beamfit.emittance.slices",
+    "identify": "beamfit.commands",
     "load_fit": "beamfit.io.result",
     "load_lattice": "beamfit.io.line",
     "loss_coefficients": "beamfit.lifetime.mechanisms",
     "moving_lifetime": "beamfit.lifetime.systematics",
     "read_decay_record": "beamfit.io.decay_record",
+    "read_formulation": "beamfit.io.formulation",
     "read_noise": "beamfit.io.noise",
     "read_operation": "beamfit.io.ring",
     "read_quad_scan": "beamfit.io.scan",
     "read_ring": "beamfit.io.ring",
+    "read_run": "beamfit.io.run",
+    "run_batch": "beamfit.batch.run",
     "save_fit": "beamfit.io.result",
+    "scan_machine": "beamfit.commands",
+    "solve": "beamfit.commands",
     "split_record": "beamfit.lifetime.pieces",
+    "study": "beamfit.lifetime.study:study_record",
+    "study_shift": "beamfit.lifetime.ring_study",
     "systematics": "beamfit.emittance.sensitivity",
+    "trend": "beamfit.lifetime.course:trend_of",
+    "watch": "beamfit.commands",
     "write_report": "beamfit.report.page",
+}
+# Functions that take paths in the place of what is read from them.
+_OPENING = {
+    "check",
+    "constant_a_test",
+    "control",
+    "design",
+    "find_setpoint",
+    "fit_decay",
+    "fit_decays",
+    "fit_emittance",
+    "fit_lifetimes",
+    "fit_slices",
+    "identify",
+    "loss_coefficients",
+    "moving_lifetime",
+    "split_record",
+    "study",
+    "study_shift",
+    "trend",
 }
 
 __all__ = ["__version__", *_HOME]
@@ -55,7 +99,14 @@ __all__ = ["__version__", *_HOME]
 def __getattr__(name: str) -> object:
     if name not in _HOME:
         raise AttributeError(f"module 'beamfit' has no attribute '{name}'")
-    return getattr(import_module(_HOME[name]), name)
+    return _found(name)
+
+
+@cache  # one object a name, or the functions could not be pickled
+def _found(name: str) -> object:
+    home, _, other = _HOME[name].partition(":")
+    found = getattr(import_module(home), other or name)
+    return import_module("beamfit.paths").opening(found, name) if name in _OPENING else found
 
 
 def __dir__() -> list[str]:

@@ -11,15 +11,15 @@ A figure belongs to no window: save it by ``figure.savefig``, or show it in a no
 
 from __future__ import annotations
 
+import io
 from collections.abc import Callable, Sequence
-from functools import partial
 from typing import TYPE_CHECKING, Any
+
+import matplotlib.figure
 
 from beamfit.errors import InputError
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
     from beamfit.emittance.fit import EmittanceFit
     from beamfit.lifetime.course import Trend
     from beamfit.lifetime.fit import DecayFit
@@ -33,10 +33,60 @@ __all__ = [
     "network",
     "pairs",
     "phase_space",
+    "picture",
     "residuals",
     "scan",
     "trend",
 ]
+
+# Width of a figure, inches, as in the report; dots an inch of the picture in a notebook.
+WIDTH, SHARP = 6.4, 110
+
+
+class Figure(matplotlib.figure.Figure):
+    """A matplotlib Figure that a notebook shows, also where nobody has imported pyplot."""
+
+    def _repr_png_(self) -> bytes:
+        buffer = io.BytesIO()
+        self.savefig(buffer, format="png", dpi=SHARP)
+        return buffer.getvalue()
+
+
+def picture(result: Any, **options: Any) -> Figure:
+    """Draw the first picture of a result's report; ``result.plot()`` calls this.
+
+    Parameters
+    ----------
+    result : EmittanceFit, DecayFit, RecordStudy, Trend, Posterior, or another result with a report
+        What is drawn.
+    **options
+        As for the function of this module that draws it, such as ``plane="y"`` of a scan.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+
+    Raises
+    ------
+    InputError
+        If its report has no picture.
+    """
+    from beamfit.emittance.fit import EmittanceFit
+    from beamfit.lifetime.course import Trend
+    from beamfit.lifetime.fit import DecayFit
+    from beamfit.lifetime.study import RecordStudy
+    from beamfit.report.kinds import OF_ONE, OF_SEVERAL, page_of
+    from beamfit.sampling.posterior import Posterior
+
+    own = {EmittanceFit: scan, DecayFit: decay, RecordStudy: decay, Trend: trend, Posterior: pairs}
+    if type(result) in own:
+        return own[type(result)](result, **options)
+    reported = type(result) in OF_ONE or type(result) in OF_SEVERAL
+    drawn = page_of((result,)).pictures if reported else ()
+    if not drawn:
+        expected = "a result whose report has one, such as a fit"
+        raise InputError(f"no picture of a {type(result).__name__}", expected)
+    return _drawn(drawn[0].draw, drawn[0].height)
 
 
 def scan(fit: EmittanceFit, plane: str | None = None) -> Figure:
@@ -203,7 +253,9 @@ def _drawn(draw: Callable[..., None], height: float, **bound: Any) -> Figure:
     """Draw what the report draws, in its style, so many inches high."""
     from matplotlib import rc_context
 
-    from beamfit.report.document import STYLE, Picture, figure_of
+    from beamfit.report.document import STYLE
 
     with rc_context(STYLE):
-        return figure_of(Picture("", height, partial(draw, **bound)))
+        figure = Figure(figsize=(WIDTH, height), layout="constrained")
+        draw(figure, **bound)
+    return figure

@@ -5,15 +5,23 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+from beamfit.errors import InputError
 from beamfit.status import Status
 
-__all__ = ["Quantity", "Status", "display_unit"]
+__all__ = ["Quantity", "Status", "display_unit", "percent"]
 
 # Half-width of the central 95 % of a normal distribution, in standard deviations.
 NORMAL_REACH = 1.96
 HOUR = 3600.0  # s
 # Factors and letters of the unit prefixes.
 _PREFIXES = ((1.0, ""), (1e-3, "m"), (1e-6, "µ"), (1e-9, "n"), (1e-12, "p"))
+# An error of more digits than this before the point is written with a power of ten.
+MOST_DIGITS = 4
+# Units that `Quantity.to` knows, with their dimension and size in SI; those of the second line
+# take prefixes.
+_SIZES = {"min": ("s", 60.0), "h": ("s", HOUR), "d": ("s", 24 * HOUR), "G": ("T", 1e-4)}
+_SIZES |= {u: (u, 1.0) for u in ("m", "s", "A", "eV", "V", "Pa", "rad", "T")}
+_SCALES = {"p": 1e-12, "n": 1e-9, "µ": 1e-6, "u": 1e-6, "m": 1e-3, "k": 1e3, "M": 1e6, "G": 1e9}
 
 
 @dataclass(frozen=True, repr=False)
@@ -46,6 +54,9 @@ class Quantity:
     41 nm (not determined)
     >>> print(Quantity(-1e-9, 2.0, "MeV/m²"))
     0.0 ± 2.0 MeV/m²
+    >>> emittance = Quantity(0.70468e-6, 0.0156e-6, "m")
+    >>> float(emittance), emittance.nominal_value, emittance.std_dev
+    (7.0468e-07, 7.0468e-07, 1.56e-08)
     """
 
     value: float
@@ -72,6 +83,50 @@ class Quantity:
         """
         return cls(value, error, unit, raw, (value - reach, value + reach))
 
+    def __float__(self) -> float:
+        return float(self.value)
+
+    @property
+    def nominal_value(self) -> float:
+        """The value, by the name it has in the package uncertainties: ``ufloat(q.nominal_value,
+        q.std_dev)`` goes on with errors. Quantities of one fit are correlated, which that does not
+        know.
+        """
+        return float(self.value)
+
+    @property
+    def std_dev(self) -> float:
+        """The error, by the name it has in the package uncertainties; NaN where there is none."""
+        return math.nan if self.error is None else float(self.error)
+
+    def to(self, unit: str) -> Quantity:
+        """Give the same in another unit.
+
+        Parameters
+        ----------
+        unit : str
+            Such as "µm" (or "um"), "mm mrad", "1/h", "d".
+
+        Raises
+        ------
+        InputError
+            If it measures something else.
+
+        Examples
+        --------
+        >>> Quantity(7e-7, 1e-8, "m").to("um").value, Quantity(48.0, 2.4, "h").to("d").value
+        (0.7, 2.0)
+        >>> print(Quantity(5e-6, 1e-7, "1/s").to("1/h"))
+        0.01800 ± 0.00036 1/h
+        """
+        (own, kind), (wanted, other) = _size(self.unit), _size(unit)
+        if kind != other:
+            raise InputError(f"{self.unit} in the unit '{unit}'", f"a unit of {self.unit}")
+        factor = own / wanted
+        error, raw = (None if e is None else e * factor for e in (self.error, self.error_raw))
+        ends = self.interval_95 and (self.interval_95[0] * factor, self.interval_95[1] * factor)
+        return Quantity(self.value * factor, error, unit, raw, ends)
+
     def open(self) -> Quantity:
         """The same of which nothing is known: without an error and an interval.
 
@@ -81,6 +136,11 @@ class Quantity:
         2 s (not determined)
         """
         return Quantity(self.value, None, self.unit)
+
+    @property
+    def determined(self) -> bool:
+        """The data give it an error."""
+        return self.error is not None and math.isfinite(self.error) and math.isfinite(self.value)
 
     @property
     def relative(self) -> float | None:
@@ -103,10 +163,10 @@ class Quantity:
             return "not determined"
         value = self.value / factor
         if self.error is None or not math.isfinite(self.error):
-            return f"{value:.3g}{end} (not determined)"
+            return f"{value + 0.0:.3g}{end} (not determined)"
         error = self.error / factor
         places, power = 3 if error == 0 else 1 - math.floor(math.log10(error)), 0
-        if abs(value) < 1e-3 or max(abs(value), error) >= 1e5:
+        if max(abs(value), error) < 1e-3 or abs(value) >= 1e5 or error >= 10**MOST_DIGITS:
             power = math.floor(math.log10(max(abs(value), error) or 1.0))
             value, error, places = value / 10**power, error / 10**power, places + power
         value, digits = round(value, max(places, 0)) + 0.0, f".{max(places, 0)}f"  # no -0.0
@@ -123,6 +183,45 @@ class Quantity:
         return display_unit(
             max(abs(self.value), self.error or 0.0) if self.value else 0.0, self.unit
         )
+
+
+def _size(unit: str) -> tuple[float, dict[str, int]]:
+    """Size of a unit in SI, and its dimensions with their powers."""
+    above, _, below = unit.replace("²", "^2").partition("/")
+    factor, powers = 1.0, dict[str, int]()
+    for part, sign in ((above, 1), (below, -1)):
+        for word in part.strip("() ").replace("·", " ").split():
+            name, _, power = word.partition("^")
+            if name == "1":
+                continue
+            kind, size = _named(name)
+            each = sign * (int(power) if power.isdigit() else 1)
+            factor *= size**each
+            powers[kind] = powers.get(kind, 0) + each
+    return factor, {kind: power for kind, power in powers.items() if power}
+
+
+def _named(name: str) -> tuple[str, float]:
+    """Dimension and size of a single unit; one that is not known is a dimension of its own."""
+    if name in _SIZES:
+        return _SIZES[name]
+    scale, base = _SCALES.get(name[:1]), _SIZES.get(name[1:])
+    return (base[0], scale * base[1]) if scale and base else (name, 1.0)
+
+
+def percent(share: float, digits: int = 2, sign: str = "") -> str:
+    """Write a share in per cent, never as a power of ten.
+
+    Examples
+    --------
+    >>> percent(0.0321), percent(96.4, sign="+"), percent(-0.0)
+    ('3.2 %', '+9640 %', '0 %')
+    """
+    value = 100 * share
+    if value == 0 or not math.isfinite(value):
+        return "0 %" if value == 0 else "-"
+    places = max(digits - 1 - math.floor(math.log10(abs(value))), 0)
+    return f"{value:{sign}.{places}f} %"
 
 
 def display_unit(size: float, unit: str) -> tuple[float, str]:

@@ -20,7 +20,8 @@ MOST_ROWS = 40
 class Table(NamedTuple):
     """Rows of cells under a heading; an empty header leaves the head row out.
 
-    `numeric` sets all cells but the first column's flush right.
+    `numeric` sets all cells but the first column's flush right; `marked` are the numbers of the
+    rows that people quote.
 
     Examples
     --------
@@ -34,12 +35,32 @@ class Table(NamedTuple):
     rows: Sequence[Sequence[str]]
     note: str = ""
     numeric: bool = False
+    marked: tuple[int, ...] = ()
+
+    def quoted(self) -> Table:
+        """Table of the rows that people quote, for a first screen.
+
+        Examples
+        --------
+        >>> rows = [Row("beta", [1.2], quoted=True), Row("alpha", [None], quoted=True)]
+        >>> [*labelled("", ["x"], [("status", ["fine"]), *rows]).quoted().rows]
+        [['beta', '1.2']]
+        """
+        return self._replace(rows=[self.rows[i] for i in self.marked], marked=())
+
+
+class Row(NamedTuple):
+    """A label and its values, one a result; `quoted` rows stand on the first screen."""
+
+    label: str
+    values: Sequence[object]
+    quoted: bool = False
 
 
 def labelled(
     title: str,
     names: Sequence[str],
-    rows: Sequence[tuple[str, Sequence[object]]],
+    rows: Sequence[Row | tuple[str, Sequence[object]]],
     note: str = "",
     numeric: bool = False,
 ) -> Table:
@@ -51,8 +72,9 @@ def labelled(
         Heading.
     names : sequence of str
         One a result.
-    rows : sequence of (str, sequence)
-        Label and values: numbers with errors, statuses, words.
+    rows : sequence of Row or (str, sequence)
+        Label and values: numbers with errors, statuses, words. A quoted row of which no value is
+        determined is not marked.
     note : str
         A sentence between heading and table.
     numeric : bool
@@ -62,8 +84,26 @@ def labelled(
     -------
     Table
     """
-    cells = [[label, *map(cell, values)] for label, values in rows]
-    return Table(title, ["", *names] if any(names) else [], cells, note, numeric)
+    rows = [Row(*row) for row in rows]
+    cells = [[row.label, *map(cell, row.values)] for row in rows]
+    marked = tuple(i for i, row in enumerate(rows) if row.quoted and any(map(_known, row.values)))
+    return Table(title, ["", *names] if any(names) else [], cells, note, numeric, marked)
+
+
+def determined(rows: Sequence[Row]) -> list[Row]:
+    """Leave out rows of which no value is determined.
+
+    Examples
+    --------
+    >>> open_one, known = Quantity(1.0, None, "m"), Quantity(2.0, 0.1, "m")
+    >>> [row.label for row in determined([Row("beta", [open_one]), Row("size", [known])])]
+    ['size']
+    """
+    return [row for row in rows if any(map(_known, row.values))]
+
+
+def _known(value: object) -> bool:
+    return value.determined if isinstance(value, Quantity) else value is not None
 
 
 def cell(value: object) -> str:

@@ -54,7 +54,7 @@ def test_one_side_of_the_waist_has_an_interval_that_reaches_to_the_truth():
 
 
 def test_two_wild_neighbours_that_hide_each_other_are_in_the_interval():
-    """1.31 ± 0.09 µm of 1 µm once: no reading is surely bad, and the interval holds both answers."""
+    """1.31 ± 0.09 µm of 1 µm once: none is surely bad, and the interval holds both answers."""
     fit = beamfit_fit(drawn("scans", "traps", "two outliers of ten, no errors", 92)).x
     low, high = fit.normalized_emittance.interval_95
     assert low < 1e-6 < high

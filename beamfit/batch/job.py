@@ -59,6 +59,11 @@ class Job:
     ------
     InputError
         If the lattice cannot be read.
+
+    Examples
+    --------
+    >>> Job("emittance", "lattices/lcls_otr2.toml").kind
+    'emittance'
     """
 
     kind: str

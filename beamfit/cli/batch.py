@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+import beamfit
 from beamfit.cli.options import Command, answered, command_line, option, options
 from beamfit.errors import InputError
 from beamfit.table import Table
@@ -75,15 +76,15 @@ def batch(
     reading = {n: told[n] for n in ("columns", "ignore", "skip_bad")}
     _check_kind(kind, {"lattice": lattice, "noise": noise, "learn-noise": learned} | part)
     from beamfit.batch.course import courses_of, followed
-    from beamfit.batch.job import Job
-    from beamfit.batch.run import run_batch
 
     followed(kind, quantity)  # says so before hours of work if there is none
     if learned is not None:
         check_place(learned)
-    job = Job(kind, lattice, part, reading, weights, noise=noise)
+    job = beamfit.Job(kind, lattice, part, reading, weights, noise=noise)
     with _Progress(not as_json and sys.stderr.isatty()) as progress:
-        found = run_batch(path, out, job, workers=workers, scheduler=scheduler, progress=progress)
+        found = beamfit.run_batch(
+            path, out, job, workers=workers, scheduler=scheduler, progress=progress
+        )
     if learned is not None:
         from beamfit.io.noise import write_noise
 

@@ -7,9 +7,10 @@ from typing import Any
 
 import click
 
+import beamfit
 from beamfit.cli.options import Command, command_line, options
 from beamfit.errors import InputError
-from beamfit.io.check import Understood, proposed_layout, understand, with_lattice
+from beamfit.io.check import Understood, proposed_layout, with_lattice
 from beamfit.io.columns import Layout
 from beamfit.io.result import results_text
 from beamfit.table import text_of
@@ -37,7 +38,7 @@ def check(files: tuple[str, ...], as_json: bool, **reading: Any) -> None:
     layouts: list[str] = []
     for path in dict.fromkeys(files):
         try:
-            found.append(understand(path, **reading))
+            found.append(beamfit.check(path, **reading))
         except InputError as error:
             wrong.append((path, error))
             layouts += filter(None, [_proposed(path, reading["columns"])])

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
 
 import click
 
+import beamfit
 from beamfit.cli.option_text import gains_of
 from beamfit.cli.options import Command, answered, option, options, reported
-from beamfit.errors import InputError, nearest
+from beamfit.errors import InputError
 from beamfit.io.files import digest
 from beamfit.io.run import read_run
 
@@ -25,6 +25,7 @@ Examples:
   beamfit control run.csv --map network --set level=12 --set level=14@60 --limit level=:15 \\
     --disturb level=-1@90 --report loop.html
 """
+READING = ("columns", "inputs", "outputs", "step", "ignore", "skip_bad")
 WISH = "OUTPUT=VALUE or OUTPUT=VALUE@SECONDS such as level=2.5@60"
 LIMIT = "NAME=LOW:HIGH, one of them may be left out, such as level=:3"
 
@@ -63,16 +64,12 @@ LIMIT = "NAME=LOW:HIGH, one of them may be left out, such as level=:3"
 @options("hidden columns ignore skip-bad seed report json")
 def control(
     record: tuple[str, ...],
-    model: str,
-    map: str,
     no_offset: bool,
     wishes: tuple[str, ...],
     limit: tuple[str, ...],
     rate: tuple[str, ...],
     disturb: tuple[str, ...],
     hard: tuple[str, ...],
-    duration: float | None,
-    seed: int,
     report: str | None,
     as_json: bool,
     **told: Any,
@@ -84,41 +81,15 @@ def control(
     can keep them; what cannot be kept is named.
     """
     targets, loads = _steps(wishes, "set"), _steps(disturb, "disturb")
-    limits, rates = gains_of(limit, "limit", LIMIT), _rates(rate)
-    reading = {n: told[n] for n in ("columns", "inputs", "outputs", "step", "ignore", "skip_bad")}
+    told |= {"limits": gains_of(limit, "limit", LIMIT), "rates": _rates(rate)}
+    reading = {n: told.pop(n) for n in READING}
     runs = [read_run(path, **reading) for path in record]
-    inputs, outputs = list(runs[0].inputs), list(runs[0].outputs)
-    _check("limit", limits, inputs + outputs)
-    _check("rate", rates, inputs)
-    _check("set", [t[0] for t in targets], outputs)
-    _check("disturb", [t[0] for t in loads], outputs)
-
-    from beamfit.dynamics.control import controller  # JAX from here on
-    from beamfit.dynamics.fit import identify
-    from beamfit.dynamics.loop import simulate_loop
-
-    settings = {n: told[n] for n in ("delay", "hidden", "gains")}
-    settings |= {"offset": not no_offset, "seed": seed}
-    wished = [name for name in outputs if name in {t[0] for t in targets} | set(limits)]
-    fits = [identify(runs, model, map, output=name, **settings) for name in wished or outputs]
-    made = controller(
-        fits,
-        inputs={n: v for n, v in limits.items() if n in inputs},
-        rates=rates,
-        outputs={n: v for n, v in limits.items() if n in outputs},
-        hard=gains_of(hard, "hard", "OUTPUT=SHARE:LOAD such as level=0.2:0.5"),
-        **{n: told[n] for n in ("horizon", "every", "smooth")},
-    )
-    loop = simulate_loop(fits, made, targets, disturbances=loads, duration=duration, seed=seed)
+    told |= {"hard": gains_of(hard, "hard", "OUTPUT=SHARE:LOAD such as level=0.2:0.5")}
+    told |= {"offset": not no_offset, "disturbances": loads}
+    loop = beamfit.control(runs, targets, **told)  # JAX from here on
     digests = {path: digest(path) for path in record}
     reported(report, loop, digests)
     answered(as_json, [loop], digests, lambda terminal: _show(terminal, loop), report)
-
-
-def _check(option: str, names: Iterable[str], known: list[str]) -> None:
-    for name in names:
-        if name not in known:
-            raise InputError(f"--{option} of '{name}'", nearest(name, known))
 
 
 def _steps(texts: tuple[str, ...], option: str) -> list[tuple[str, float, float]]:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 import beamfit
-from beamfit.cli.option_text import energies_of, goal_of
+from beamfit.cli.option_text import energies_of
 from beamfit.cli.options import Command, answered, option, options
 from beamfit.emittance.assumptions import Assumptions
 from beamfit.io.line import build_line, read_inputs
@@ -39,7 +39,7 @@ Examples:
     choices=["emittance", "D"],
     default="emittance",
 )
-@option("--goal PERCENT", "Emittance error to stop at.")
+@options("goal")
 @option("--count", "Most measurements.", default=5)
 @options("json")
 def design(
@@ -49,7 +49,7 @@ def design(
     limits: dict[str, tuple[float, float]],
     energies: str,
     criterion: str,
-    goal: str | None,
+    goal: float | None,
     count: int,
     as_json: bool,
     **told: Any,
@@ -59,7 +59,7 @@ def design(
     Magnets move between the limits of --vary, or half the scanned range beyond it. For a
     scenario that the data do not identify it says which kind of measurement would.
     """
-    aim, others = None if goal is None else goal_of(goal), energies_of(energies)
+    others = energies_of(energies)
     given = {name: told.pop(name) for name in GIVEN}
     Assumptions(**told).check_scenario(scenario)
     told["noise"] = None if noise is None else read_noise(noise)
@@ -68,11 +68,10 @@ def design(
     described.check_magnets(limits)
     described.check_energies(others)
 
-    from beamfit.emittance.design import plan_measurements  # JAX from here on
-
+    # JAX from here on
     fit = beamfit.fit_emittance(measured, build_line(described), scenario=scenario, **told)
-    wanted = {"criterion": criterion, "goal": aim, "count": count, "energies": others}
-    advice = plan_measurements(fit, limits=limits or None, **wanted)
+    wanted = {"criterion": criterion, "goal": goal, "count": count, "energies": others}
+    advice = beamfit.design(fit, limits=limits or None, **wanted)
     title = f"{fit.scan.name} on {fit.line.name}"
     answered(as_json, [advice], read.digests, lambda terminal: _show(terminal, advice, title))
 

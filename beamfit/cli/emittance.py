@@ -14,7 +14,8 @@ from beamfit.errors import InputError
 from beamfit.io.line import build_line, read_inputs
 from beamfit.io.noise import read_noise
 from beamfit.io.systematics import read_systematics
-from beamfit.table import Table, labelled
+from beamfit.quantity import percent
+from beamfit.table import Table, determined, labelled
 
 if TYPE_CHECKING:
     from beamfit.cli.show import Terminal
@@ -209,16 +210,16 @@ def _show_fully(terminal: Terminal, fit: EmittanceFit, methods: tuple[SizeMethod
     from beamfit.emittance.sensitivity import budget_rows, range_rows
 
     names, statuses = [p.plane for p in fit.planes], [p.status for p in fit.planes]
-    terminal.table(labelled("", names, result_rows(fit.planes)), statuses)
+    terminal.table(labelled("", names, determined(result_rows(fit.planes))), statuses)
     terminal.line()
     if fit.statement.closed:
         for head, rows in (
             ("Change of the normalised emittance if", budget_rows(fit)),
             ("Normalised emittance (shift in std. errors)", range_rows(fit)),
         ):
-            cells = [[label, *found] for label, found in rows]
-            terminal.table(Table("", [head, *names], cells), wrap=False)
-            terminal.line()
+            if cells := [[label, *found] for label, found in rows]:
+                terminal.table(Table("", [head, *names], cells), wrap=False)
+                terminal.line()
     elif fit.parameters:
         head = ["", "value", "bounds", "prior", "state"]
         terminal.table(Table("Other fitted parameters", head, parameter_rows(fit.parameters)))
@@ -233,15 +234,16 @@ def _show_fully(terminal: Terminal, fit: EmittanceFit, methods: tuple[SizeMethod
 
 def _show_briefly(terminal: Terminal, fit: EmittanceFit) -> None:
     """Show what is quoted, the largest systematic of each plane, and where the rest is."""
-    from beamfit.emittance.results import quoted_rows
+    from beamfit.emittance.results import result_rows
     from beamfit.emittance.sensitivity import systematics
 
-    if rows := quoted_rows(fit.planes):
-        terminal.table(labelled("", [p.plane for p in fit.planes], rows), wrap=False)
+    table = labelled("", [p.plane for p in fit.planes], result_rows(fit.planes)).quoted()
+    if table.rows:
+        terminal.table(table, wrap=False)
     largest: dict[str, list[str]] = {}
     for p in fit.planes if fit.statement.closed else ():
         for change in systematics(fit, p.plane)[:1]:
-            said = f"{p.plane} {100 * change.normalized_emittance:+.1f} %"
+            said = f"{p.plane} {percent(change.normalized_emittance, sign='+')}"
             largest.setdefault(change.cause, []).append(said)
     if largest:
         said = "; ".join(f"{cause}: {', '.join(parts)}" for cause, parts in largest.items())

@@ -6,7 +6,9 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+import beamfit
 from beamfit.cli.options import Command, answered, option, options, reported
+from beamfit.commands import check_model
 from beamfit.errors import InputError
 from beamfit.io.files import digest
 from beamfit.io.run import read_run
@@ -18,8 +20,6 @@ if TYPE_CHECKING:
     from beamfit.dynamics.state_fit import StatesFit
     from beamfit.dynamics.titre import TitreFit
 
-
-STATES, FED_BATCH = "state-space", "fed-batch"
 
 EXAMPLE = """\b
 Examples:
@@ -59,42 +59,23 @@ def identify(
     one of all outputs, with its time constants and gains; a fed-batch process the rates of its
     balances.
     """
-    if order is not None and model != STATES:
-        raise InputError(f"--order {order} with --model {model}", f"--model {STATES}")
-    if gains and model in (STATES, FED_BATCH):
-        raise InputError(f"--gain with --model {model}", "--model first-order or second-order")
-    if model == FED_BATCH and (map != "network" or delay or no_offset):
-        expected = "--map network, without --delay or --no-offset: its rates are a network's"
-        raise InputError(f"--model {FED_BATCH}", expected)
+    settings = {"order": order, "delay": delay, "offset": not no_offset, "gains": gains}
+    check_model(model, map, **settings)
     twice = [path for path in record if (*record, *hold_back).count(path) > 1]
     if twice:
         raise InputError("a run given twice", "each run once", path=twice[0])
     runs = [read_run(path, **reading) for path in record]
     held = [read_run(path, **reading) for path in hold_back]
-
-    options = {"map": map, "offset": not no_offset, "hidden": hidden, "seed": seed, "held": held}
-    if model == STATES:
-        from beamfit.dynamics.linear import identify_states  # JAX from here on
-
-        fits = [identify_states(runs, order, delay=delay or 0, **options)]
-    elif model == FED_BATCH:
-        from beamfit.dynamics.fedbatch import identify_batches
-        from beamfit.dynamics.titre import fit_titre
-
-        fits = [identify_batches(runs, held=held, hidden=hidden, seed=seed)]
-        if all("titre" in run.outputs for run in runs):
-            fits.append(fit_titre(fits[0], seed=seed))
-    else:
-        from beamfit.dynamics.fit import identify as fit_response
-
-        options |= {"model": model, "delay": delay, "gains": gains}
-        fits = [fit_response(runs, output=name, **options) for name in runs[0].outputs]
+    settings |= {"hidden": hidden, "seed": seed, "held": held}
+    fits = beamfit.identify(runs, model, map, **settings)  # JAX from here on
     digests = {path: digest(path) for path in (*record, *hold_back)}
     reported(report, fits, digests)
     answered(as_json, fits, digests, lambda terminal: _show(terminal, fits), report)
 
 
-def _show(terminal: Terminal, fits: list[ResponseFit | StatesFit | FedBatchFit | TitreFit]) -> None:
+def _show(
+    terminal: Terminal, fits: tuple[ResponseFit | StatesFit | FedBatchFit | TitreFit, ...]
+) -> None:
     for run in fits[0].runs:
         terminal.line(run.headline, style="bold")
         for note in run.notes:

@@ -13,6 +13,7 @@ from beamfit.errors import InputError
 from beamfit.io.decay_record import monitor_of, read_lifetime_input
 from beamfit.io.files import digest
 from beamfit.lifetime.record import LifetimeTable
+from beamfit.paths import machine_of
 
 if TYPE_CHECKING:
     from beamfit.cli.show import Terminal
@@ -22,6 +23,8 @@ if TYPE_CHECKING:
     from beamfit.lifetime.study import Decay, Machine, RecordStudy
     from beamfit.sampling.posterior import Posterior
 
+# Decays that the first screen lists; all tables have every one.
+MOST_SHOWN = 10
 EXAMPLE = """\b
 Examples:
   beamfit lifetime measurements/aps_1999_decay.csv
@@ -119,7 +122,7 @@ def lifetime(
     if len(records) < len(record):
         twice = next(path for path in record if record.count(path) > 1)
         raise InputError("a record given twice", "each record once", path=twice)
-    machine = None if ring is None else _machine(ring)
+    machine = None if ring is None else machine_of(ring)
     inputs = {path: digest(path) for path in (*record, ring) if path is not None}
 
     tables = [each for each in records if isinstance(each, LifetimeTable)]
@@ -131,15 +134,13 @@ def lifetime(
         _lifetimes(tables, inputs, as_json)
         return
 
-    from beamfit.lifetime.study import study_record  # JAX from here on
-
     if monitor is not None:
         records = [replace(each, monitor=monitor.beside(each.monitor)) for each in records]
-    studies = tuple(study_record(each, machine, law) for each in records)
+    studies = tuple(beamfit.study(each, machine, law) for each in records)  # JAX from here on
     decays = [decay for each in studies for decay in each.answers]
     single = [decay for each in studies for decay in each.decays or each.pooled]
     shift = _shift(single, machine, network, priors) if study else None
-    course = _trend(studies, machine) if trend else None
+    course = beamfit.trend(studies, machine) if trend else None
     drawn = sampling.drawn([decay.fit for decay in decays], inputs, quiet=as_json)
     posteriors = drawn if sample else None
     reported(report, studies, inputs, posterior=posteriors, shift=shift, trend=course)
@@ -160,9 +161,7 @@ def lifetime(
 
 def _lifetimes(tables: list[LifetimeTable], inputs: dict[str, str], as_json: bool) -> None:
     """Fit and show tables of lifetimes."""
-    from beamfit.lifetime.lifetime_table import fit_lifetimes  # JAX from here on
-
-    fits = [fit_lifetimes(table) for table in tables]
+    fits = [beamfit.fit_lifetimes(table) for table in tables]
     answered(as_json, fits, inputs, lambda terminal: _show_lifetimes(terminal, fits))
 
 
@@ -186,14 +185,6 @@ def _check_study(study: bool, ring: str | None, network: str | None, priors: dic
         raise InputError("--prior without a study", "--study --ring FILE.toml")
 
 
-def _machine(path: str) -> Machine:
-    ring, operation = beamfit.read_ring(path), beamfit.read_operation(path)
-
-    from beamfit.lifetime.study import Machine
-
-    return Machine(ring, operation)
-
-
 def _shift(
     decays: list[Decay],
     machine: Machine,
@@ -201,15 +192,8 @@ def _shift(
     priors: dict[str, tuple[float, float]] | None,
 ) -> Shift:
     from beamfit.lifetime.loss_network import Network
-    from beamfit.lifetime.ring_study import study_shift
 
-    return study_shift(decays, machine, network=network and Network(network), priors=priors)
-
-
-def _trend(studies: tuple[RecordStudy, ...], machine: Machine | None) -> Trend:
-    from beamfit.lifetime.course import trend_of
-
-    return trend_of(studies, machine)
+    return beamfit.study_shift(decays, machine, network=network and Network(network), priors=priors)
 
 
 def _show(
@@ -276,15 +260,17 @@ def _show_record(terminal: Terminal, study: RecordStudy) -> None:
 
 
 def _show_many(terminal: Terminal, study: RecordStudy) -> None:
-    """Print a table with a row for each decay, below the record's name."""
+    """Say each verdict once, then print a table with a row for each decay."""
     from beamfit.lifetime import tables
     from beamfit.table import Table
 
-    for title, header, rows in tables.overview(study.decays):
-        cells = [[name.removeprefix(study.record.name), *found] for name, *found in rows]
-        terminal.table(Table(f"\n{title}", header, cells))
     for status, names, message in tables.alike(study.decays):
         terminal.verdict(names, status, message)
+    for title, header, rows in tables.overview(study.decays)[: None if terminal.full else 1]:
+        cells = [[name.removeprefix(study.record.name), *found] for name, *found in rows]
+        if not terminal.full and (left := len(cells) - MOST_SHOWN) > 0:
+            cells = [*cells[:MOST_SHOWN], [f"{left} more", *[""] * (len(header) - 1)]]
+        terminal.table(Table(f"\n{title}", header, cells))
     terminal.line()
 
 

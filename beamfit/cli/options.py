@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import click
 
 import beamfit
-from beamfit.cli.option_text import anchor_of, bounds_of, gains_of, limits_of, priors_of
+from beamfit.cli.option_text import anchor_of, bounds_of, gains_of, goal_of, limits_of, priors_of
+from beamfit.cli.waiting import Waiting, ended
 from beamfit.emittance.assumptions import SCENARIOS
 from beamfit.errors import InputError
 from beamfit.io.columns import layout_of
@@ -24,6 +25,10 @@ if TYPE_CHECKING:
     from beamfit.sampling.posterior import Posterior
 
 
+# Commands that say themselves how they stand, or answer at once.
+TALKING = ("batch", "check", "scan", "watch")
+
+
 class _Option(click.Option):
     """An option that is listed under a heading of the help text."""
 
@@ -34,6 +39,14 @@ class _Option(click.Option):
 
 class Command(click.Command):
     """A command whose help lists options under headings, in the order in which these come."""
+
+    def invoke(self, ctx: click.Context) -> Any:
+        """Run the command; where it is silent for long, count the seconds."""
+        ctx.obj = None if self.name in TALKING else Waiting(f"beamfit {self.name}")
+        try:
+            return super().invoke(ctx)
+        finally:
+            ended()
 
     def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """Write a section for every heading."""
@@ -228,6 +241,7 @@ SHARED: dict[str, Callable[..., Any]] = {
     "step": option("--step SECONDS", "Distance of rows without a time.", type=float),
     "delay": option("--delay SAMPLES", "Known delay; default: fitted.", type=click.IntRange(0)),
     "no-offset": option("--no-offset", "The output at rest is 0, and not estimated.", is_flag=True),
+    "goal": option("--goal PERCENT", "Emittance error to stop at.", callback=_parsed(goal_of)),
     "report": option(
         "--report FILE.html|.pdf|.png|.svg",
         "Write a report page, or (.png, .svg) its pictures one by one.",
@@ -291,6 +305,8 @@ class Sampling(NamedTuple):
             raise InputError(found, "a record of one decay, or no --store")
         from beamfit.sampling.store import Provenance
 
+        ended()  # it has a progress bar of its own
+
         source = Provenance(command_line(), dict(inputs))
         told = {"seed": self.seed, "store": self.store, "provenance": source}
         return [fit.sample(**told, progress=not quiet) for fit in fits]
@@ -317,6 +333,7 @@ def answered(
 
     Results are asked for if they are printed; what there is ``further`` is named beside them.
     """
+    ended()
     if as_json:
         further = {name: found for name, found in further.items() if found is not None}
         click.echo(results_text(list(results), inputs, command_line(), **further))

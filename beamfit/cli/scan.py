@@ -8,12 +8,11 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from statistics import median
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import click
 
 import beamfit
-from beamfit.cli.option_text import goal_of
 from beamfit.cli.options import Command, answered, command_line, option, options, reported
 from beamfit.errors import InputError, plain
 from beamfit.io.files import digest
@@ -22,7 +21,6 @@ from beamfit.io.machine import ScanMachine, read_scan_machine
 from beamfit.io.result import results_text
 from beamfit.status import Status
 from beamfit.table import cell
-from beamfit.writing import check_place, write_atomically
 
 if TYPE_CHECKING:
     from beamfit.emittance.results import PlaneFit
@@ -42,7 +40,7 @@ Examples:
 @option("--recover JOURNAL", "Restore what a scan that was killed has left, and move nothing else.")
 @option("--save FILE.csv", "File of the scan; default: NAME_DATE_TIME.csv.")
 @option("--journal FILE", "Where what is to be restored stands; beside MACHINE unless.")
-@option("--goal PERCENT", "Emittance error to stop at.")
+@options("goal")
 @option("--points", "Most settings.", type=click.IntRange(4, 200))
 @options("report json")
 def scan(
@@ -51,7 +49,7 @@ def scan(
     recover: str | None,
     save: str | None,
     journal: str | None,
-    goal: str | None,
+    goal: float | None,
     points: int | None,
     report: str | None,
     as_json: bool,
@@ -68,7 +66,7 @@ def scan(
         if dry_run or save or journal or goal or points or report:
             raise InputError("--recover with an option of a scan", "--recover JOURNAL alone")
         return _recovered(recover, say, as_json)
-    wanted = {"goal": None if goal is None else goal_of(goal), "points": points}
+    wanted = {"goal": goal, "points": points}
     told = replace(read_scan_machine(machine), **{k: v for k, v in wanted.items() if v})
 
     from beamfit.live.channel import run
@@ -78,11 +76,7 @@ def scan(
     if dry_run:
         return run(_planned(told, place, as_json))
     target = Path(save or time.strftime(f"{_word(told.name)}_%Y%m%d_%H%M%S.csv"))
-    for each in (target, place):
-        check_place(each)
-    if target.exists():
-        raise InputError("a file that exists", "another name; no scan is written over", target)
-    found = run(_scanned(told, place, target, say))
+    found = beamfit.scan_machine(told, target, journal=journal, tell=say.told, note=say)
     return _answered(found, told, target, report, as_json)
 
 
@@ -166,23 +160,6 @@ async def _planned(machine: ScanMachine, journal: Path, as_json: bool) -> int:
         click.echo(plain(line))
     click.echo("Nothing was moved.")
     return 0
-
-
-async def _scanned(machine: ScanMachine, journal: Path, out: Path, say: _Lines) -> Outcome:
-    from beamfit.live.devices import connect
-    from beamfit.live.points import scan_text
-    from beamfit.live.scan import scan as measure
-
-    line = build_line(machine.lattice)
-    at = await connect(machine)
-    for note in at.notes:
-        say(note)
-    before = {name: await magnet.get() for name, magnet in at.magnets.items()}
-
-    def keep(points: Any) -> None:
-        write_atomically(out, scan_text(points, at.machine, before).encode())
-
-    return await measure(at, line, journal, keep=keep, tell=say.told)
 
 
 def _answered(

@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+import beamfit
 from beamfit.cli.options import Command, answered, option, options, reported
-from beamfit.errors import InputError
+from beamfit.errors import InputError, located
 from beamfit.io.files import digest
 
 if TYPE_CHECKING:
@@ -84,8 +85,14 @@ def solve(
     tables = _pairs("data", data, "FILE")
     numbers = {name: _numbers(name, text) for name, text in _pairs("set", values, "NUMBER").items()}
     starts = 1 if start == "seeds" else int(start)
-    found, files = _solved(document, tables, starts, numbers, derivatives, told)
-    inputs = {path: digest(path) for path in (document, *files)}
+    from beamfit.io.formulation import read_formulation, read_tables  # scipy
+
+    formulation = read_formulation(document)
+    numbers_of, files = read_tables(formulation, document, tables)
+    told |= {"starts": starts, "values": numbers, "derivatives": derivatives}
+    with located(document):
+        found = beamfit.solve(formulation, numbers_of, **told)
+    inputs = {path: digest(path) for path in (document, *files.values())}
     reported(report, found, inputs)
     answered(as_json, [found], inputs, lambda terminal: _show(terminal, found), report)
 
@@ -111,26 +118,18 @@ def _numbers(name: str, text: str) -> list[float]:
     return found
 
 
-def _solved(document, given, starts, values, gains, told) -> tuple[Any, tuple[str, ...]]:
-    """The solution of a document, and the files of its data."""
-    from beamfit.io.formulation import read_formulation, read_tables, solved_formulation
-
-    formulation = read_formulation(document)
-    tables, files = read_tables(formulation, document, given)
-    found = solved_formulation(formulation, document, tables, starts, values, gains, **told)
-    return found, tuple(files.values())
-
-
 def _show(terminal: Terminal, found: ProblemSolution | Computed) -> None:
+    from beamfit.language.solution import ProblemSolution
+
+    if isinstance(found, ProblemSolution):
+        terminal.verdict(found.headline, found.status, found.message)
+        for note in found.notes:
+            terminal.line(note)
+        terminal.line()
     for table in found.tables():
         terminal.table(table)
         terminal.line()
-    from beamfit.language.solution import ProblemSolution
-
-    if not isinstance(found, ProblemSolution):
-        return
-    asked = found.made.document.solver
-    terminal.line(f"Solver: {found.solver}" + (f" (asked for: {asked.name})" if asked else ""))
-    for note in found.notes:
-        terminal.line(note)
-    terminal.verdict(found.headline, found.status, found.message)
+    if isinstance(found, ProblemSolution):
+        asked = found.made.document.solver
+        said = f"Solver: {found.solver}" + (f" (asked for: {asked.name})" if asked else "")
+        terminal.line(said, style="dim")

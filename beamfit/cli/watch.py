@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-import beamfit
 from beamfit.cli.options import Command, answered, option, options
+from beamfit.commands import watch_plan
 from beamfit.errors import plain
 from beamfit.io.files import digest
 from beamfit.io.machine import WatchMachine, read_watch_machine
@@ -63,16 +63,11 @@ async def _watched(
     machine: WatchMachine, seconds: float | None, bind: str, port: int, quiet: bool
 ) -> tuple[Told, int]:
     """See that the variables answer, serve, and watch."""
-    from beamfit.lifetime.study import Machine
-    from beamfit.lifetime.watch import Plan
     from beamfit.live.page import page
     from beamfit.live.served import check_unserved, served
     from beamfit.live.watch import connect, watch
 
-    ring = machine.ring and Machine(
-        beamfit.read_ring(machine.ring), beamfit.read_operation(machine.ring)
-    )
-    plan = Plan(machine.name, machine.window, machine.interval, ring, machine.current)
+    plan = watch_plan(machine)
     say: Callable[[str], None] = lambda text: click.echo(plain(text), err=True)  # noqa: E731
     for note in await connect(machine):
         say(f"Note: {note}.")

@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from beamfit.answer import answer
 from beamfit.dynamics.case import rounds
 from beamfit.dynamics.curve import NEAR, POINTS, Curve
 from beamfit.dynamics.fedbatch_model import (
@@ -33,7 +34,6 @@ from beamfit.errors import InputError, nearest
 from beamfit.greybox.fit import Fit
 from beamfit.greybox.problem import Free, Problem
 from beamfit.greybox.solve import solve
-from beamfit.shown import shown
 from beamfit.status import Status
 from beamfit.table import Table, json_of
 from beamfit.verdict import judge
@@ -48,7 +48,7 @@ FIRST = 0.1
 VISITS, BESIDE, LEAST = 3, 0.5, 1e-3
 
 
-@shown
+@answer
 @dataclass(frozen=True, eq=False)
 class FedBatchFit:
     """Rates of a fed-batch process, identified from batches.

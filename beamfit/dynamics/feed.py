@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
+from beamfit.answer import answer
 from beamfit.dynamics.fedbatch_model import STATES, Batches, batches_of
 from beamfit.dynamics.titre import TITRE, TitreFit, predicted
 from beamfit.errors import InputError
@@ -16,7 +17,6 @@ from beamfit.greybox.fit import Fit
 from beamfit.greybox.problem import Constraint, Free, Objective, Problem
 from beamfit.greybox.solve import solve
 from beamfit.quantity import Quantity
-from beamfit.shown import shown
 from beamfit.status import Status
 from beamfit.table import Table
 
@@ -109,7 +109,7 @@ def _one(
     return batches_of([time], [held], like)
 
 
-@shown
+@answer
 @dataclass(frozen=True, eq=False)
 class FeedPlan:
     """The best feed profile found.

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from beamfit.answer import answer
 from beamfit.dynamics.case import used_by
 from beamfit.dynamics.checks import Checks, HeldOutRun, checks_of, predict_held, slopes_of
 from beamfit.dynamics.curve import Curve, curves_of, quantities_of, told
@@ -24,7 +25,6 @@ from beamfit.dynamics.verdict import ResponseEvidence, judged, rms_of
 from beamfit.errors import InputError, nearest
 from beamfit.greybox.fit import Fit
 from beamfit.quantity import Quantity
-from beamfit.shown import shown
 from beamfit.status import Status
 from beamfit.table import Table, json_of
 
@@ -36,7 +36,7 @@ MAPS = ("constant", "network")
 LATEST = "The delay is the longest that was tried: say a longer one by --delay."
 
 
-@shown
+@answer
 @dataclass(frozen=True, eq=False)
 class ResponseFit:
     """An identified response of one output.

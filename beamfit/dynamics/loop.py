@@ -12,10 +12,10 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.signal import lfilter
 
+from beamfit.answer import answer
 from beamfit.dynamics.fit import ResponseFit
 from beamfit.dynamics.receding import Controller, advance, moved, settled, start
 from beamfit.errors import InputError, nearest
-from beamfit.shown import shown
 from beamfit.status import Status
 from beamfit.table import Table, json_of
 from beamfit.verdict import Finding, judge
@@ -115,7 +115,7 @@ class StepResponse(NamedTuple):
         return [self.output, f"{self.time:.4g} s", how, took, over]
 
 
-@shown
+@answer
 @dataclass(frozen=True, eq=False)
 class Loop:
     """A simulated loop.

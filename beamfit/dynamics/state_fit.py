@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from beamfit.answer import answer
 from beamfit.dynamics.case import Case, Settled, used_by
 from beamfit.dynamics.checks import Checks, HeldOutRun, checks_of, percent
 from beamfit.dynamics.curve import quantity
@@ -35,7 +36,6 @@ from beamfit.greybox.fit import Derived, Fit
 from beamfit.greybox.mlp import MLP
 from beamfit.greybox.problem import Free, Prior
 from beamfit.quantity import Quantity
-from beamfit.shown import shown
 from beamfit.statistics import POOR_FIT
 from beamfit.status import Status
 from beamfit.table import Table, json_of
@@ -57,7 +57,7 @@ class StateSpaceOutput(NamedTuple):
     curves: tuple = ()
 
 
-@shown
+@answer
 @dataclass(frozen=True, eq=False)
 class StatesFit:
     """An identified state space of all outputs.

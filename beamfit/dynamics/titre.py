@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from beamfit.answer import answer
 from beamfit.dynamics.balances import titre_of
 from beamfit.dynamics.fedbatch import FedBatchFit, check_names, settled
 from beamfit.dynamics.fedbatch_model import (
@@ -34,7 +35,6 @@ from beamfit.greybox.covariance import triangle
 from beamfit.greybox.fit import Fit
 from beamfit.greybox.problem import Free, Prior, Problem, Record
 from beamfit.greybox.solve import solve
-from beamfit.shown import shown
 from beamfit.status import Status
 from beamfit.table import Table, json_of
 from beamfit.verdict import judge
@@ -44,7 +44,7 @@ TITRE = "titre"
 STAGES, OWN, JOINT = ("rates", "start"), ("make", "begin"), 5
 
 
-@shown
+@answer
 @dataclass(frozen=True, eq=False)
 class TitreFit:
     """Formation of product on top of identified rates.

@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
+from beamfit.answer import answer
 from beamfit.emittance.calibration import Kind, numbers_of_magnets
 from beamfit.emittance.fit import EmittanceFit
 from beamfit.emittance.model import emittance_parts, predict_sizes, sigma_of, spoken
@@ -42,9 +43,8 @@ from beamfit.greybox.design import Information, greedy
 from beamfit.greybox.fit import value_and_slope
 from beamfit.optics.beamline import Beamline
 from beamfit.optics.elements import Drift, Screen
-from beamfit.shown import shown
 from beamfit.status import Status
-from beamfit.table import Table, json_of, text_of
+from beamfit.table import Table, json_of
 
 # The error of ln ε whose 95 % interval spans the factor within which an emittance is of use.
 NARROW = float(np.log(USEFUL)) / 3.92
@@ -408,7 +408,7 @@ class Option(NamedTuple):
         return all(self.determined.values())
 
 
-@shown
+@answer
 @dataclass(frozen=True)
 class Advice:
     """Advice on the next measurements, and when to stop.
@@ -509,10 +509,8 @@ class Advice:
             [o.words, *_cells(o.relative_error, o.determined), "yes" if o.identified else "no"]
             for o in self.options
         ]
-        return (steps, Table("", header, rows)) if rows else (steps,)
-
-    def __str__(self) -> str:
-        return "\n\n".join([*map(text_of, self.tables()), f"{self.status}: {self.message}"])
+        helps = any(o.identified for o in self.options)
+        return (steps, Table("", header, rows)) if helps else (steps,)
 
 
 def _cells(

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from html import escape
 from typing import TYPE_CHECKING, Any
 
+from beamfit.answer import answer, quantity_frame
 from beamfit.emittance.assumptions import Anchor, Assumptions
 from beamfit.emittance.known import METHODS, WEIGHTS, judged_beam, prepared, see
 from beamfit.emittance.model import line_of
@@ -17,13 +18,11 @@ from beamfit.emittance.results import Parameter, PlaneFit, parameter_rows, resul
 from beamfit.emittance.scan import QuadScan
 from beamfit.emittance.statement import Scenario, Seen, scenario_of
 from beamfit.errors import InputError, expect
-from beamfit.frames import quantity_frame
 from beamfit.greybox.problem import Problem
 from beamfit.noise.model import ROBUST, Noise
 from beamfit.optics.beamline import Beamline
 from beamfit.quantity import Quantity
-from beamfit.shown import shown
-from beamfit.table import Table, html_of, json_of, labelled, text_of
+from beamfit.table import Table, determined, html_of, json_of, labelled, text_of
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -157,7 +156,7 @@ def fit_emittance(
     return EmittanceFit(judged, scan, found, statement, told, seen, parameters, left, fit)
 
 
-@shown
+@answer
 @dataclass(frozen=True, eq=False)
 class EmittanceFit:
     """A fitted scan, printed as a table: one `PlaneFit` a plane, with the scan and its line.
@@ -259,6 +258,9 @@ class EmittanceFit:
         if plane not in found:
             raise self.scan.unusable(f"no fit of plane '{plane}'", " or ".join(found))
         return found[plane]
+
+    def __iter__(self) -> Iterator[str]:
+        return (p.plane for p in self.planes)
 
     @property
     def x(self) -> PlaneFit:
@@ -388,7 +390,7 @@ class EmittanceFit:
 
     @property
     def _table(self) -> Table:
-        return labelled("", [p.plane for p in self.planes], result_rows(self.planes))
+        return labelled("", [p.plane for p in self.planes], determined(result_rows(self.planes)))
 
     def __str__(self) -> str:
         heading = f"{self.scan.name} on {self.line.name}, fit of {self.planes[0].method}"
@@ -400,7 +402,7 @@ class EmittanceFit:
             rows = parameter_rows(self.parameters)
             lines += ["", f"scenario {self.scenario}, anchor: {self.anchor}"]
             lines += [text_of(Table("", [], rows))] if rows else []
-            lines += [f"Left open: {words}." for words in self.null_directions]
+            lines += [f"Not determined: {words}." for words in self.null_directions]
         return "\n".join(lines)
 
     def _repr_html_(self) -> str:

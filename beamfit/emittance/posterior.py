@@ -156,7 +156,7 @@ def _sizes_of(problem: Problem, seen: Seen, planes: Sequence[str]) -> tuple[Size
 def _beams(model: Mapping[str, Any], told: Told) -> dict[str, Any]:
     """The beam matrix of each plane, and the model, for functions of the user's."""
     parts = model["beam"].items()
-    beams = {p: BeamMatrix(*(UNIT * beam[name] for name in CHOLESKY)) for p, beam in parts}
+    beams = {p: BeamMatrix(**{name: UNIT * beam[name] for name in CHOLESKY}) for p, beam in parts}
     return {**beams, "model": model}
 
 

@@ -9,18 +9,15 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from beamfit.answer import answer
 from beamfit.optics.beam import BeamMatrix
 from beamfit.quantity import Quantity, display_unit
 from beamfit.shown import shown
 from beamfit.status import Status
-from beamfit.table import Table, cell, json_of, labelled
+from beamfit.table import Row, Table, cell, json_of, labelled
 
 if TYPE_CHECKING:
     from beamfit.greybox.fit import FittedVariable
-
-
-# What a cell says of a number that the data leave open, and of one that is not there.
-OPEN, NOTHING = "(not determined)", ("-", "")
 
 
 def in_words(settings: Mapping[str, float], units: Mapping[str, str], digits: int = 4) -> str:
@@ -205,7 +202,7 @@ class Identifiability:
         }
 
 
-@shown
+@answer
 @dataclass(frozen=True, eq=False)
 class PlaneFit:
     """The fitted beam of one plane at the start of the line.
@@ -320,56 +317,44 @@ class PlaneFit:
         return json_of(entry | {"screen": screen, "points": points})
 
 
-def result_rows(planes: tuple[PlaneFit, ...]) -> list[tuple[str, list[str]]]:
-    """Label and one cell per plane of every number a result has, in the order they are read."""
-    at = f"at {planes[0].screen.name}"
+def result_rows(planes: tuple[PlaneFit, ...]) -> list[Row]:
+    """Label and one value per plane of every number a result has, in the order they are read."""
     there = planes[0].screen
+    at = f"at {there.name}"
     own = in_words(there.settings, there.units) or "-"
-    rows: list[tuple[str, Callable[[PlaneFit], object]]] = [
-        ("status", lambda p: p.status),
-        ("normalised emittance", lambda p: p.normalized_emittance),
-        ("  95 % interval", _interval),
-        ("  error includes", lambda p: p.holds if p.emittance.error is not None else "-"),
-        ("geometric emittance", lambda p: p.emittance),
-        ("beta at the start", lambda p: p.beta),
-        ("alpha at the start", lambda p: p.alpha),
-        ("sigma11", lambda p: p.sigma[0]),
-        ("sigma12", lambda p: p.sigma[1]),
-        ("sigma22", lambda p: p.sigma[2]),
-        (f"beta {at}", lambda p: p.screen.beta),
-        (f"alpha {at}", lambda p: p.screen.alpha),
-        (f"size {at}", lambda p: p.screen.size),
-        (f"{at}, for", lambda p: own),
+    rows: list[tuple[str, Callable[[PlaneFit], object], bool]] = [
+        ("status", lambda p: p.status, False),
+        ("normalised emittance", lambda p: p.normalized_emittance, True),
+        ("  95 % interval", _interval, any(p.emittance.determined for p in planes)),
+        ("  error includes", lambda p: p.holds if p.emittance.determined else None, False),
+        ("geometric emittance", lambda p: p.emittance, False),
+        ("beta at the start", lambda p: p.beta, True),
+        ("alpha at the start", lambda p: p.alpha, True),
+        ("sigma11", lambda p: p.sigma[0], False),
+        ("sigma12", lambda p: p.sigma[1], False),
+        ("sigma22", lambda p: p.sigma[2], False),
+        (f"beta {at}", lambda p: p.screen.beta, False),
+        (f"alpha {at}", lambda p: p.screen.alpha, False),
+        (f"size {at}", lambda p: p.screen.size, True),
+        (f"{at}, for", lambda p: own, False),
     ]
     if any(p.mismatch is not None for p in planes):
-        rows.append(("mismatch BMAG", lambda p: p.mismatch))
+        rows.append(("mismatch BMAG", lambda p: p.mismatch, True))
     rows += [
-        ("chi2/dof", _chi2),
-        ("rms residual", lambda p: f"{p.rms_residual.value * 1e6:.3g} µm"),
-        ("errors", lambda p: p.noise),
-        ("waist bracketed", lambda p: p.identifiability.waist_bracketed),
-        ("phase advance covered", lambda p: degrees(p.identifiability.phase_coverage)),
-        ("P(beam)", lambda p: f"{p.identifiability.probability['beam']:.4f}"),
+        ("chi2/dof", _chi2, True),
+        ("rms residual", lambda p: f"{p.rms_residual.value * 1e6:.3g} µm", False),
+        ("errors", lambda p: p.noise, False),
+        ("waist bracketed", lambda p: p.identifiability.waist_bracketed, False),
+        ("phase advance covered", lambda p: degrees(p.identifiability.phase_coverage), False),
+        ("P(beam)", lambda p: f"{p.identifiability.probability['beam']:.4f}", False),
     ]
-    return [(label, [cell(value(p)) for p in planes]) for label, value in rows]
+    return [Row(label, [value(p) for p in planes], quoted) for label, value, quoted in rows]
 
 
-def quoted_rows(planes: tuple[PlaneFit, ...]) -> list[tuple[str, list[str]]]:
-    """The rows of `result_rows` that people quote, without what no plane determines."""
-    at = f"at {planes[0].screen.name}"
-    quoted = ["normalised emittance", "  95 % interval", "beta at the start", "alpha at the start"]
-    quoted += [f"size {at}", "mismatch BMAG", "chi2/dof"]
-    rows = [(label, cells) for label, cells in result_rows(planes) if label in quoted]
-    rows = [row for row in rows if not all(c in NOTHING or OPEN in c for c in row[1])]
-    if rows and rows[0][0] == "  95 % interval":
-        rows[0] = ("normalised emittance, 95 % interval", rows[0][1])
-    return rows
-
-
-def _interval(p: PlaneFit) -> str:
+def _interval(p: PlaneFit) -> str | None:
     q = p.normalized_emittance
     if q.interval_95 is None:
-        return "-"
+        return None
     low, high = q.interval_95
     factor, unit = display_unit(abs(high), q.unit)
     if q.error is None:

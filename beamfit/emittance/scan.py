@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from beamfit.answer import frame_of
 from beamfit.errors import InputError, expect, nearest
-from beamfit.frames import frame_of
 from beamfit.particles import ENERGY_KEYS, total_energy
 from beamfit.shown import shown
 from beamfit.table import Table

@@ -8,12 +8,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from beamfit.answer import answer
 from beamfit.emittance.results import in_words
 from beamfit.emittance.wishes import SAME_ENERGY, Beam, Target
 from beamfit.quantity import Quantity
-from beamfit.shown import shown
 from beamfit.status import Status
-from beamfit.table import Table, cell, json_of, text_of
+from beamfit.table import Table, cell, json_of
 from beamfit.verdict import Finding, judge
 
 # A wish is met within the usual error of a measured size, or of the emittance growth of a mismatch.
@@ -50,7 +50,7 @@ class Minimum(NamedTuple):
     objective: float
 
 
-@shown
+@answer
 @dataclass(frozen=True)
 class Setpoint:
     """The best settings found, what they give, and how sure that is.
@@ -137,20 +137,21 @@ class Setpoint:
             unit, error = self.units[name], self.setting_error[name]
             moved = "-" if error is None else f"{error:.2g} {unit}"
             rows.append([name, f"{value:.6g} {unit}", moved])
-        rows.append(["objective", f"{self.best.objective:.6g}"])
+        rows.append(["objective", _written(self.best.objective)])
         for p in self.predicted:
             rows += [[f"{key} {p.plane}", _shown(key, getattr(p, key))] for key in SHOWN]
         title = f"Best settings of {self.line} for the beam at {self.screen}"
         best = Table(title, ["", "setting", "± from the beam"], rows)
         others = [
-            [f"  {in_words(m.settings, self.units, 5)}: objective {m.objective:.6g}"]
+            [f"  {in_words(m.settings, self.units, 5)}: objective {_written(m.objective)}"]
             for m in self.others[:5]
         ]
         return (best, Table("Other minima", [], others)) if others else (best,)
 
-    def __str__(self) -> str:
-        said = [f"{self.status}: {self.message}", *self.notes, *self.doubts.values()]
-        return "\n\n".join([*map(text_of, self.tables()), "\n".join(said)])
+
+def _written(objective: float) -> str:
+    """Write an objective; below the rounding of the search all wishes are met."""
+    return f"{objective:.6g}" if objective >= EXACT else "0"
 
 
 class Evidence(NamedTuple):
@@ -245,7 +246,7 @@ def verdict_on(
     alike = other.objective - best.objective < 1e-6 * (1.0 + best.objective)
     lead = "Other settings do as well, such as" if alike else "The next local minimum is"
     at = in_words(other.settings, units)
-    return found.status, f"{found.message} {lead} {at} (objective {other.objective:.6g})."
+    return found.status, f"{found.message} {lead} {at} (objective {_written(other.objective)})."
 
 
 def reached_words(

@@ -6,18 +6,18 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
+from beamfit.answer import answer
 from beamfit.emittance.fit import EmittanceFit, fit_emittance
 from beamfit.emittance.results import PlaneFit
 from beamfit.emittance.scan import PROJECTED, QuadScan
 from beamfit.optics.beamline import Beamline
-from beamfit.shown import shown
 from beamfit.table import Table, cell, text_of
 
 HEADER = ("slice", "energy", "status", "normalised emittance", "beta at the start")
 HEADER += ("alpha at the start", "chi2/dof")
 
 
-@shown
+@answer
 @dataclass(frozen=True, eq=False)
 class SliceFits:
     """The fits of the slices of a beam, in the order of the scan, the projected beam last.

@@ -30,6 +30,11 @@ class Target(NamedTuple):
         "x" or "y".
     value : float, tuple of float, or None
         The wanted value; None for a match to the lattice's own design.
+
+    Examples
+    --------
+    >>> Target("size", "x", 200e-6).value
+    0.0002
     """
 
     kind: str
@@ -54,6 +59,11 @@ class Beam(NamedTuple):
         Why a fit does not determine it; None if it does.
     line : str or None
         Digest of the line that it was fitted in (`Beamline.digest`), to be held against another.
+
+    Examples
+    --------
+    >>> Beam(np.array([1e-8, 0.0, 1e-8]), energy=135.0).energy
+    135.0
     """
 
     sigma: np.ndarray

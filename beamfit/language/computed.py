@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from beamfit.answer import answer
 from beamfit.compile_cache import SELDOM
 from beamfit.errors import InputError, nearest
 from beamfit.language import document as d
@@ -19,13 +20,12 @@ from beamfit.language.calls import defaults
 from beamfit.language.compiled import Program, compile_mapping
 from beamfit.language.expression import error_at
 from beamfit.language.scope import Scope
-from beamfit.shown import shown
 from beamfit.table import MOST_ROWS, Table
 
 GAIN = re.compile(r"\s*d(\w+)\s*/\s*d(\w+)\s*")
 
 
-@shown
+@answer
 @dataclass(frozen=True, eq=False)
 class Computed:
     """Outputs of a mapping without an objective, and the gains that were asked for.

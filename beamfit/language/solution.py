@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from beamfit.answer import answer
 from beamfit.greybox.assess import slopes
 from beamfit.greybox.diagnosis import diagnose
 from beamfit.greybox.fit import Fit, FittedConstraint, FittedVariable
@@ -20,7 +21,6 @@ from beamfit.language.computed import gain_tables, gains_at, outputs_at
 from beamfit.language.statement import Formulation, at_start, formulate, starts_of
 from beamfit.language.trace import cause_of
 from beamfit.quantity import Quantity
-from beamfit.shown import shown
 from beamfit.statistics import reach_of
 from beamfit.status import Status
 from beamfit.table import MOST_ROWS, Table, cell
@@ -39,7 +39,7 @@ TOLD_ELSEWHERE = {"contradictory_bounds", "not_finite", "unused"}
 TOLERANCES = {"major feasibility tolerance", "major optimality tolerance"}
 
 
-@shown
+@answer
 @dataclass(frozen=True, eq=False)
 class ProblemSolution:
     """Answer of the solver, in the names of the document.

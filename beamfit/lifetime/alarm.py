@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from beamfit.quantity import Quantity
+from beamfit.quantity import Quantity, percent
 
 MINUTE = 60.0
 # Windows, s: four begin in turn in each length, so that one of nearly any age is at hand.
@@ -452,7 +452,7 @@ class Alarm(NamedTuple):
     def said(self, dated: bool) -> str:
         """In words, with the date where times are Unix times."""
         changes = [
-            f"{name} moved by {100 * found.value:+.2g} ± {100 * found.error:.1g} %"
+            f"{name} moved by {percent(found.value, sign='+')} ± {percent(found.error, 1)}"
             for name, found in (("a", self.a), ("b", self.b))
             if found is not None and self.moved != "a or b"
         ]

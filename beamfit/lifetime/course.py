@@ -9,14 +9,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from beamfit.answer import answer
 from beamfit.errors import InputError
 from beamfit.lifetime.alarm import Alarm, Reference, alarms_of, when
 from beamfit.lifetime.fit import DecayFit, bare
 from beamfit.lifetime.mechanisms import loss_coefficients
 from beamfit.lifetime.scales import by_losses, summarise
 from beamfit.lifetime.study import Decay, Machine, RecordStudy
-from beamfit.quantity import HOUR, Quantity, Status
-from beamfit.shown import shown
+from beamfit.quantity import HOUR, Quantity, Status, percent
 from beamfit.statistics import FEWEST, baseline, control_limits
 from beamfit.table import Table, cell, json_of
 
@@ -60,7 +60,7 @@ class Point(NamedTuple):
     beyond: int
 
 
-@shown
+@answer
 @dataclass(frozen=True, eq=False)
 class Trend:
     """Many decays in order of time.
@@ -174,6 +174,12 @@ def trend_of(studies: Sequence[RecordStudy], machine: Machine | None = None) -> 
     ------
     InputError
         If several records are not all dated.
+
+    Examples
+    --------
+    >>> import beamfit
+    >>> trend_of([beamfit.study("measurements/aps_1999_decay.csv")]).status.value
+    'unidentified'
 
     Notes
     -----
@@ -330,10 +336,12 @@ def _verdict(trend: Trend) -> tuple[Status, str]:
         more = f"{FEWEST + 1} or more decays are needed to say what is usual."
         return Status.unidentified, f"{usual}; {more}"
     beyond = sum(point.beyond != 0 for point in trend.points)
-    said = f"{usual} ± {100 * trend.limit / centre:.2g} %, {beyond} beyond that."
+    said = f"{usual} ± {percent(trend.limit / centre)}, {beyond} beyond that."
     drift = trend.drift
     if drift.error is not None and abs(drift.value) > 3 * drift.error:
-        said += f" It changes by {100 * drift.value:+.2g} ± {100 * drift.error:.1g} % a week."
+        said += (
+            f" It changes by {percent(drift.value, sign='+')} ± {percent(drift.error, 1)} a week."
+        )
     if trend.reference is None:
         said += " Readings are not watched: the first decays give no a and b above zero."
     if trend.alarms:

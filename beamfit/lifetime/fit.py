@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from beamfit.answer import answer, quantity_frame
 from beamfit.errors import InputError, expect
-from beamfit.frames import quantity_frame
 from beamfit.lifetime.alternatives import Change, ConstantA, LifetimeLaw, Outgassing
 from beamfit.lifetime.answer import finding_of, finding_of_cycles
 from beamfit.lifetime.cycles import FEWEST_CYCLES, FEWEST_READINGS, averaged, cleaned
@@ -19,7 +19,6 @@ from beamfit.lifetime.expansion import Expansion, Pieces, Shape, solved, solved_
 from beamfit.lifetime.marginal import FreeLaw, Law
 from beamfit.lifetime.record import DecayRecord, Monitor
 from beamfit.quantity import Quantity, Status
-from beamfit.shown import shown
 from beamfit.table import Table, cell, json_of, labelled, plain_name
 
 if TYPE_CHECKING:
@@ -36,7 +35,7 @@ def bare(value: float | None, unit: str) -> dict[str, Any]:
     return {"value": value, "error": None, "unit": unit}
 
 
-@shown
+@answer
 @dataclass(frozen=True, eq=False)
 class DecayFit:
     """The result of `fit_decay`.

@@ -11,6 +11,7 @@ import numpy as np
 from jax import Array
 from scipy.special import chdtrc, fdtrc
 
+from beamfit.answer import answer
 from beamfit.errors import expect
 from beamfit.greybox.fit import Derived, Fit
 from beamfit.greybox.problem import Free, Problem, Record, padded_length
@@ -21,7 +22,6 @@ from beamfit.lifetime.evidence import EXACT, UNITS
 from beamfit.lifetime.fit import bare
 from beamfit.lifetime.record import FEWEST_LIFETIMES, LifetimeTable
 from beamfit.quantity import HOUR, Quantity, Status
-from beamfit.shown import shown
 from beamfit.statistics import reach_of
 from beamfit.table import Table, json_of, labelled, plain_name
 
@@ -33,7 +33,7 @@ BAD = 0.03
 RECORD = "lifetimes"
 
 
-@shown
+@answer
 @dataclass(frozen=True, eq=False)
 class LifetimeFit:
     """The result of `fit_lifetimes`.

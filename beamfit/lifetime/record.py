@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from beamfit.answer import frame_of
 from beamfit.errors import InputError
-from beamfit.frames import frame_of
 from beamfit.shown import shown
 from beamfit.table import Table
 

@@ -317,6 +317,14 @@ def study_shift(
     ------
     InputError
         As for `fit_scales`.
+
+    Examples
+    --------
+    >>> import beamfit
+    >>> beamfit.study_shift([], "lattices/spear3_2003.toml")
+    Traceback (most recent call last):
+    beamfit.errors.InputError: no decay; expected one or more; several settings separate the
+    mechanisms
     """
     fit = fit_scales(decays, machine, priors=priors)
     sample = fit.sample(seed=seed)

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from beamfit.answer import answer
 from beamfit.errors import InputError, expect
 from beamfit.lifetime.bunch import stored_bunch
 from beamfit.lifetime.cycles import (
@@ -61,7 +62,15 @@ POINTS = 60
 
 @shown
 class Machine(NamedTuple):
-    """A ring and the settings and vacuum that hold where a record does not say otherwise."""
+    """A ring and the settings and vacuum that hold where a record does not say otherwise.
+
+    Examples
+    --------
+    >>> from beamfit.io.ring import read_operation, read_ring
+    >>> path = "lattices/spear3_2003.toml"
+    >>> round(float(Machine(read_ring(path), read_operation(path)).ring.circumference))
+    234
+    """
 
     ring: Ring
     operation: Operation
@@ -344,7 +353,7 @@ class Decay:
         return self.fit.to_json() | json_of(more)
 
 
-@shown
+@answer
 @dataclass(frozen=True, eq=False)
 class RecordStudy:
     """A record with its decays and what lies between them.
@@ -370,6 +379,17 @@ class RecordStudy:
     def answers(self) -> tuple[Decay, ...]:
         """Quoted answers of the record: cycles together, then single decays; at least one."""
         return self.pooled + self.decays
+
+    @property
+    def headline(self) -> str:
+        """Lifetimes of the first answers, and how many more there are."""
+        said = [decay.fit.headline for decay in self.answers[:3]]
+        more = len(self.answers) - len(said)
+        return "; ".join(said + [f"{more} more"] * (more > 0))
+
+    def to_json(self) -> list[dict[str, Any]]:
+        """Give the ``results`` list of the JSON contract."""
+        return [decay.to_json() for decay in self.answers]
 
 
 def _steps(record: DecayRecord) -> dict[str, np.ndarray]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import KW_ONLY
 from typing import NamedTuple
 
 import jax
@@ -46,7 +47,8 @@ class BeamMatrix:
     Parameters
     ----------
     l11, l21, l22 : float or Array
-        L in m, rad, rad; l11 and l22 positive.
+        L in m, rad, rad; l11 and l22 positive. By name only: three numbers may as well be meant for
+        σ11, σ12, σ22, which `from_sigma` takes, or for ε, β, α, which `from_twiss` takes.
 
     Examples
     --------
@@ -55,6 +57,7 @@ class BeamMatrix:
     (2.67, -0.08)
     """
 
+    _: KW_ONLY
     l11: ArrayLike
     l21: ArrayLike
     l22: ArrayLike
@@ -81,7 +84,7 @@ class BeamMatrix:
                 "sigma11 > 0 and sigma11*sigma22 > sigma12**2: a positive definite matrix",
             )
         l11 = jnp.sqrt(s11)
-        return cls(l11, s12 / l11, jnp.sqrt(determinant) / l11)
+        return cls(l11=l11, l21=s12 / l11, l22=jnp.sqrt(determinant) / l11)
 
     @classmethod
     def from_twiss(cls, emittance: ArrayLike, beta: ArrayLike, alpha: ArrayLike) -> BeamMatrix:
@@ -96,7 +99,7 @@ class BeamMatrix:
             if not isinstance(given, jax.core.Tracer) and not np.all(np.asarray(given) > 0):
                 raise InputError(f"{name} = {given}", "a positive number")
         root = jnp.sqrt(emittance / beta)
-        return cls(beta * root, -alpha * root, root)
+        return cls(l11=beta * root, l21=-alpha * root, l22=root)
 
     @property
     def sigma(self) -> Array:
@@ -156,4 +159,5 @@ class BeamMatrix:
         p, q = a * self.l11 + b * self.l21, b * self.l22
         u, v = c * self.l11 + d * self.l21, d * self.l22
         l11 = jnp.sqrt(p * p + q * q)
-        return BeamMatrix(l11, (p * u + q * v) / l11, jnp.abs(p * v - q * u) / l11)
+        l21, l22 = (p * u + q * v) / l11, jnp.abs(p * v - q * u) / l11
+        return BeamMatrix(l11=l11, l21=l21, l22=l22)

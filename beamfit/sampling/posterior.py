@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from beamfit.answer import answer, frame_of
 from beamfit.errors import InputError, nearest
-from beamfit.frames import frame_of
 from beamfit.quantity import Quantity
 from beamfit.sampling.convergence import Diagnostics
 from beamfit.sampling.intervals import (
@@ -25,7 +25,7 @@ from beamfit.sampling.intervals import (
 from beamfit.sampling.likelihood import LOG_NOISE
 from beamfit.sampling.priors import in_words
 from beamfit.sampling.target import SamplingTarget
-from beamfit.shown import brief, shown
+from beamfit.shown import brief
 from beamfit.status import Status
 from beamfit.table import Table, html_of, json_of, text_of
 
@@ -43,7 +43,7 @@ APART = 1.2
 QUANTILES = (0.025, 0.16, 0.5, 0.84, 0.975)
 
 
-@shown
+@answer
 @dataclass(frozen=True, eq=False)
 class Posterior:
     """Draws from a posterior, with a verdict on them. Prints as a table.

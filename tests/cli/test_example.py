@@ -59,11 +59,13 @@ def test_readme_shows_the_files_and_the_answer(run, tmp_path, root):
     run("example", tmp_path)
     commands = {
         "first/": ("--lattice", tmp_path / "lattice.toml", tmp_path / "scan.csv"),
-        "measurements/": ("--lattice", "lattices/lcls_otr2.toml", "measurements/lcls_otr2.csv"),
+        "measurements/": ("measurements/aps_1999_decay.csv",),
     }
+    names = {"first/": "emittance", "measurements/": "lifetime"}
     for place, arguments in commands.items():
-        (answer,) = (block for block in blocks if f"$ beamfit emittance {place}" in block)
-        said = " ".join(run("emittance", *arguments)[1].split())
+        name = names[place]
+        (answer,) = (block for block in blocks if f"$ beamfit {name} {place}" in block)
+        said = " ".join(run(name, *arguments)[1].split())
         for shown in answer.partition("\n")[2].split("...\n"):
             assert " ".join(shown.split()) in said
 

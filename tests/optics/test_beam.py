@@ -67,9 +67,15 @@ def test_mismatch_is_the_trace_of_the_two_matrices(first, second):
 def test_any_cholesky_number_is_a_beam():
     """Half of all random starts of the report's appendices had no square root; none here has."""
     numbers = jax.random.normal(jax.random.key(0), (1000, 3))
-    sigma = jax.vmap(lambda factor: BeamMatrix(*factor).sigma)(numbers)
-    assert bool(jnp.all(jnp.linalg.eigvalsh(sigma) >= -1e-15))
-    assert bool(jnp.all(jax.vmap(lambda factor: BeamMatrix(*factor).emittance)(numbers) >= 0))
+    beams = jax.vmap(lambda f: BeamMatrix(l11=f[0], l21=f[1], l22=f[2]))(numbers)
+    assert bool(jnp.all(jnp.linalg.eigvalsh(beams.sigma) >= -1e-15))
+    assert bool(jnp.all(beams.emittance >= 0))
+
+
+def test_three_numbers_without_names_are_refused():
+    """They may be Cholesky factors, sigmas or emittance and Twiss parameters."""
+    with pytest.raises(TypeError, match="positional"):
+        BeamMatrix(1.0, 0.0, 1.0)
 
 
 @pytest.mark.parametrize("bad", [(1.0, 2.0, 1.0), (-1.0, 0.0, 1.0)])

@@ -1,0 +1,419 @@
+"""Commands that need more than one step, as functions: `beamfit COMMAND` calls these."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
+from os import PathLike
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from beamfit.errors import InputError, nearest
+from beamfit.paths import is_path, machine_of
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from beamfit.dynamics.fedbatch import FedBatchFit
+    from beamfit.dynamics.fit import ResponseFit
+    from beamfit.dynamics.loop import Loop
+    from beamfit.dynamics.record import Run
+    from beamfit.dynamics.state_fit import StatesFit
+    from beamfit.dynamics.titre import TitreFit
+    from beamfit.io.machine import ScanMachine, WatchMachine
+    from beamfit.language.computed import Computed
+    from beamfit.language.document import Document
+    from beamfit.language.solution import ProblemSolution
+    from beamfit.lifetime.watch import Plan
+    from beamfit.live.scan import Outcome
+    from beamfit.live.scan import Told as ScanTold
+    from beamfit.live.watch import Told
+
+Limits = Mapping[str, tuple[float, float]]
+Steps = Sequence[tuple[str, float, float]]
+# Models of all outputs together; the others are of one output at a time.
+STATES, FED_BATCH = "state-space", "fed-batch"
+
+
+def identify(
+    runs: Run | Sequence[Run],
+    model: str = "first-order",
+    map: str = "constant",
+    *,
+    order: int | None = None,
+    delay: int | None = None,
+    offset: bool = True,
+    hidden: int = 5,
+    seed: int = 1,
+    held: Sequence[Run] = (),
+    gains: Limits | None = None,
+) -> tuple[ResponseFit | StatesFit | FedBatchFit | TitreFit, ...]:
+    """Identify how the outputs of a process respond to its inputs.
+
+    Parameters
+    ----------
+    runs : Run, path, or sequence of them
+        Records with the same inputs and outputs.
+    model : {"first-order", "second-order", "arx", "state-space", "fed-batch"}
+        As for `beamfit identify`.
+    map : {"constant", "network"}
+        Parameters are numbers, or change with the inputs by a network.
+    order : int, optional
+        States of a state space; chosen by an information criterion if None.
+    delay : int, optional
+        Samples by which outputs follow late; fitted if None.
+    offset : bool
+        The output at rest is estimated; else it is 0.
+    hidden, seed : int
+        Hidden nodes of a network, seed of its weights.
+    held : sequence of Run or path
+        Runs that are only predicted.
+    gains : mapping of str to (float, float), optional
+        Limits that parameters keep for certain, such as {"K": (1.0, 3.0)}.
+
+    Returns
+    -------
+    tuple
+        A fit for each output; one of all outputs for a state space; rates, and the titre where it
+        was read, of a fed-batch process.
+
+    Raises
+    ------
+    InputError
+        If runs do not fit together, or an option does not belong to the model.
+
+    Examples
+    --------
+    >>> import beamfit
+    >>> (level,) = beamfit.identify("measurements/valve_level_simulated.csv")
+    >>> list(level.quantities), level.status.value
+    (['tau', 'K', 'offset'], 'poor_fit')
+    """
+    check_model(model, map, order=order, delay=delay, offset=offset, gains=gains)
+    runs = [runs] if not isinstance(runs, list | tuple) else runs
+    options: dict[str, Any] = {"hidden": hidden, "seed": seed, "held": tuple(held)}
+    if model == FED_BATCH:
+        from beamfit.dynamics.fedbatch import identify_batches
+        from beamfit.dynamics.titre import fit_titre
+
+        rates = identify_batches(runs, **options)
+        titred = all("titre" in run.outputs for run in runs)
+        return (rates, fit_titre(rates, seed=seed)) if titred else (rates,)
+    if model == STATES:
+        from beamfit.dynamics.linear import identify_states
+
+        return (identify_states(runs, order, map, delay=delay or 0, offset=offset, **options),)
+    from beamfit.dynamics.fit import identify as respond
+
+    options |= {"delay": delay, "offset": offset, "gains": gains}
+    return tuple(respond(runs, model, map, output=name, **options) for name in runs[0].outputs)
+
+
+def check_model(
+    model: str,
+    map: str,
+    *,
+    order: int | None = None,
+    delay: int | None = None,
+    offset: bool = True,
+    gains: Limits | None = None,
+) -> None:
+    """Refuse options that do not belong to a model, in the words of the command line.
+
+    Raises
+    ------
+    InputError
+        If one does not.
+    """
+    if order is not None and model != STATES:
+        raise InputError(f"--order {order} with --model {model}", f"--model {STATES}")
+    if gains and model in (STATES, FED_BATCH):
+        raise InputError(f"--gain with --model {model}", "--model first-order or second-order")
+    if model == FED_BATCH and (map != "network" or delay or not offset):
+        expected = "--map network, without --delay or --no-offset: its rates are a network's"
+        raise InputError(f"--model {FED_BATCH}", expected)
+
+
+def control(
+    runs: Run | Sequence[Run],
+    targets: Steps,
+    *,
+    limits: Limits | None = None,
+    rates: Mapping[str, float] | None = None,
+    disturbances: Steps = (),
+    hard: Limits | None = None,
+    model: str = "first-order",
+    map: str = "constant",
+    delay: int | None = None,
+    offset: bool = True,
+    hidden: int = 5,
+    gains: Limits | None = None,
+    horizon: int | None = None,
+    every: int | None = None,
+    smooth: float = 0.1,
+    duration: float | None = None,
+    seed: int = 1,
+) -> Loop:
+    """Identify a process, plan its inputs within limits, and simulate the loop.
+
+    Parameters
+    ----------
+    runs : Run, path, or sequence of them
+        Records with the same inputs and outputs.
+    targets, disturbances : sequence of (str, float, float)
+        Output, value, and the time in s from which it is wanted, or added.
+    limits : mapping of str to (float, float), optional
+        Of inputs, which keep to the range of the runs otherwise, and of outputs.
+    rates : mapping of str to float, optional
+        Largest change of an input in a second.
+    hard, horizon, every, smooth
+        As for `beamfit.dynamics.control.controller`.
+    model, map, delay, offset, hidden, gains
+        As for `identify`.
+    duration : float, optional
+        Time simulated, s; four horizons after the last change if None.
+    seed : int
+        Of the networks and the noise.
+
+    Returns
+    -------
+    Loop
+        Traces of inputs, outputs and targets, and a verdict.
+
+    Raises
+    ------
+    InputError
+        If a name is neither input nor output, or as `identify` and `controller`.
+
+    Examples
+    --------
+    >>> import beamfit
+    >>> loop = beamfit.control("measurements/valve_level_simulated.csv", [("level", 5.0, 0.0)])
+    >>> loop.headline
+    'level by valve: poor_fit'
+    """
+    runs = [runs] if not isinstance(runs, list | tuple) else runs
+    limits, inputs, outputs = dict(limits or {}), list(runs[0].inputs), list(runs[0].outputs)
+    _check("limit", limits, inputs + outputs)
+    _check("rate", rates or (), inputs)
+    _check("set", [t[0] for t in targets], outputs)
+    _check("disturb", [t[0] for t in disturbances], outputs)
+
+    from beamfit.dynamics.control import controller
+    from beamfit.dynamics.fit import identify as respond
+    from beamfit.dynamics.loop import simulate_loop
+
+    options = {"delay": delay, "offset": offset, "hidden": hidden, "seed": seed, "gains": gains}
+    wished = [name for name in outputs if name in {t[0] for t in targets} | set(limits)]
+    fits = [respond(runs, model, map, output=name, **options) for name in wished or outputs]
+    made = controller(
+        fits,
+        inputs={n: v for n, v in limits.items() if n in inputs},
+        rates=rates,
+        outputs={n: v for n, v in limits.items() if n in outputs},
+        hard=hard,
+        horizon=horizon,
+        every=every,
+        smooth=smooth,
+    )
+    told = {"disturbances": disturbances, "duration": duration, "seed": seed}
+    return simulate_loop(fits, made, targets, **told)
+
+
+def _check(option: str, names: Iterable[str], known: list[str]) -> None:
+    for name in names:
+        if name not in known:
+            raise InputError(f"--{option} of '{name}'", nearest(name, known))
+
+
+def solve(
+    document: Document | str | PathLike[str],
+    data: Mapping[str, np.ndarray] | None = None,
+    *,
+    starts: int = 1,
+    values: Mapping[str, Sequence[float]] | None = None,
+    derivatives: Iterable[str] = (),
+    **options: Any,
+) -> ProblemSolution | Computed:
+    """Solve a formulation, or compute its outputs where it has no objective.
+
+    Parameters
+    ----------
+    document : Document or path
+        Of `read_formulation`, or its file; a file finds its tables of data beside it.
+    data : mapping of str to array, optional
+        Tables by name; of a file also paths, in the place of those that it names.
+    starts : int
+        Searches: 1 from the document's seeds, more also from random numbers.
+    values : mapping of str to sequence of float, optional
+        Inputs; of a variable where the search starts.
+    derivatives : iterable of str
+        Gains to give too, such as "dy/dx".
+    **options
+        ``solver``, ``tolerance`` and ``seconds`` of `beamfit.language.solution.solve_document`.
+
+    Returns
+    -------
+    ProblemSolution or Computed
+
+    Raises
+    ------
+    InputError
+        With file, line and column, if the document or its data cannot be used.
+
+    Examples
+    --------
+    >>> import beamfit
+    >>> print(beamfit.solve("formulations/appendix_d.bf").headline)
+    obj = 2.113778016, local optimum
+    """
+    from beamfit.io.formulation import read_formulation, read_tables, solved_formulation
+
+    if not is_path(document):
+        found = data or {}
+        return solved_formulation(document, None, found, starts, values, derivatives, **options)
+    read, given = read_formulation(document), dict(data or {})
+    files = {name: str(one) for name, one in given.items() if is_path(one)}
+    tables, _ = read_tables(read, document, files)
+    tables |= {name: one for name, one in given.items() if name not in files}
+    return solved_formulation(read, document, tables, starts, values, derivatives, **options)
+
+
+def scan_machine(
+    machine: ScanMachine | str | PathLike[str],
+    save: str | PathLike[str],
+    *,
+    journal: str | None = None,
+    goal: float | None = None,
+    points: int | None = None,
+    tell: Callable[[ScanTold], None] = lambda told: None,
+    note: Callable[[str], None] = lambda text: None,
+) -> Outcome:
+    """Scan a running machine's quadrupoles, and put the magnets back whatever ends it.
+
+    Parameters
+    ----------
+    machine : ScanMachine or path
+        The TOML file of docs/live.md, read or not.
+    save : str or path
+        File of the scan, written after every point; it must not exist.
+    journal : str, optional
+        File with what is to be restored; beside the machine's if None.
+    goal : float, optional
+        Relative error of the emittances at which to stop; the machine file's if None.
+    points : int, optional
+        Most settings; the machine file's if None.
+    tell, note : callable
+        Told how the scan stands after each point, and what is odd about the machine.
+
+    Returns
+    -------
+    Outcome
+        Points, fit, what ended it, and what went wrong.
+
+    Raises
+    ------
+    InputError
+        If nothing was begun: the file exists, a variable does not answer, a journal is left.
+
+    Examples
+    --------
+    >>> import beamfit
+    >>> beamfit.scan_machine("machine.toml", "README.md")
+    Traceback (most recent call last):
+    beamfit.errors.InputError: machine.toml: no such file; expected a readable file
+    """
+    from beamfit.io.machine import read_scan_machine
+    from beamfit.live.channel import run
+    from beamfit.live.restore import journal_of
+    from beamfit.writing import check_place
+
+    wanted = {k: v for k, v in {"goal": goal, "points": points}.items() if v}
+    told = replace(read_scan_machine(machine) if is_path(machine) else machine, **wanted)
+    place, target = journal_of(told, journal), Path(save)
+    for each in (target, place):
+        check_place(each)
+    if target.exists():
+        raise InputError("a file that exists", "another name; no scan is written over", target)
+    return run(_scanned(told, place, target, tell, note))
+
+
+async def _scanned(
+    machine: ScanMachine,
+    journal: Path,
+    out: Path,
+    tell: Callable[[ScanTold], None],
+    note: Callable[[str], None],
+) -> Outcome:
+    from beamfit.io.line import build_line
+    from beamfit.live.devices import connect
+    from beamfit.live.points import scan_text
+    from beamfit.live.scan import scan
+    from beamfit.writing import write_atomically
+
+    line = build_line(machine.lattice)
+    at = await connect(machine)
+    for each in at.notes:
+        note(each)
+    before = {name: await magnet.get() for name, magnet in at.magnets.items()}
+
+    def keep(points: Any) -> None:
+        write_atomically(out, scan_text(points, at.machine, before).encode())
+
+    return await scan(at, line, journal, keep=keep, tell=tell)
+
+
+def watch(
+    machine: WatchMachine | str | PathLike[str],
+    seconds: float | None = None,
+    *,
+    show: Callable[[Told], None] = lambda told: None,
+) -> Told:
+    """Watch the lifetime of a stored beam; nothing is written to the machine.
+
+    Parameters
+    ----------
+    machine : WatchMachine or path
+        The TOML file of docs/live.md, read or not.
+    seconds : float, optional
+        How long; until Ctrl-C if None.
+    show : callable
+        Given what is known, every second.
+
+    Returns
+    -------
+    Told
+        What is known at the end.
+
+    Raises
+    ------
+    InputError
+        If a variable does not answer.
+
+    Examples
+    --------
+    >>> import beamfit
+    >>> beamfit.watch("ring.toml", seconds=60.0)
+    Traceback (most recent call last):
+    beamfit.errors.InputError: ring.toml: no such file; expected a readable file
+    """
+    from beamfit.io.machine import read_watch_machine
+    from beamfit.live.channel import run
+    from beamfit.live.watch import connect
+    from beamfit.live.watch import watch as follow
+
+    told = read_watch_machine(machine) if is_path(machine) else machine
+
+    async def followed() -> tuple[Told, int]:
+        await connect(told)
+        return await follow(told, watch_plan(told), show, seconds)
+
+    return run(followed())[0]
+
+
+def watch_plan(machine: WatchMachine) -> Plan:
+    """Window, interval and ring of a watch."""
+    from beamfit.lifetime.watch import Plan
+
+    ring = machine.ring and machine_of(machine.ring)
+    return Plan(machine.name, machine.window, machine.interval, ring, machine.current)
