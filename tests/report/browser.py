@@ -10,6 +10,7 @@ import subprocess
 NAME = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 # Widths in px: a telephone, a screen, and A4 less the margins of the page.
 WIDTHS = {"phone": 400, "screen": 1280, "print": 673}
+OPEN = "document.querySelectorAll('details').forEach(folded => folded.open = true)"
 SEEN = """JSON.stringify({
   wide: document.documentElement.scrollWidth - document.documentElement.clientWidth,
   cut: [...document.querySelectorAll(".wide")].some(e => e.scrollWidth > e.clientWidth + 1),
@@ -62,6 +63,7 @@ class Chromium:
         self.ask("Page.navigate", url=page.as_uri())
         while not any(e["method"] == "Page.loadEventFired" for e in self.events):
             self.events.append(self._message())
+        self.ask("Runtime.evaluate", expression=OPEN)
         seen = json.loads(self.ask("Runtime.evaluate", expression=SEEN)["result"]["value"])
         found = [f"{seen['wide']} px to scroll sideways"] * (seen["wide"] > 0)
         found += ["a table is cut off"] * (seen["cut"] and width != "phone")
