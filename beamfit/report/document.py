@@ -15,8 +15,9 @@ from typing import Any, NamedTuple
 
 import jinja2
 import numpy as np
-from matplotlib.axes import Axes
 from markupsafe import Markup, escape
+from matplotlib.axes import Axes
+from matplotlib.dates import AutoDateLocator, ConciseDateFormatter
 from matplotlib.figure import Figure, FigureBase
 
 import beamfit
@@ -196,6 +197,13 @@ def control_chart(
         axes.axhspan(*ends, color="0.92", zorder=0, label="control limits")
 
 
+def date_axis(axes: Axes) -> None:
+    """Label the horizontal axis with dates."""
+    locator = AutoDateLocator()
+    axes.xaxis.set_major_locator(locator)
+    axes.xaxis.set_major_formatter(ConciseDateFormatter(locator))
+
+
 def legend_below(figure: FigureBase, axes: Axes, columns: int) -> None:
     """Put the legend of some axes below their figure, in so many columns."""
     shown = axes.get_legend_handles_labels()
@@ -203,9 +211,7 @@ def legend_below(figure: FigureBase, axes: Axes, columns: int) -> None:
 
 
 # A value with its error and unit, or a short word with a hyphen, a sign or an exponent.
-WHOLE = re.compile(
-    r"\(?[-+]?\d\S* ± \d\S*(?: (?=[^\s\d(])\S+)?|(?<!\S)(?=\S{1,24}(?!\S))\S*-\S*"
-)
+WHOLE = re.compile(r"\(?[-+]?\d\S* ± \d\S*(?: (?=[^\s\d(])\S+)?|(?<!\S)(?=\S{1,24}(?!\S))\S*-\S*")
 
 
 def unbroken(text: str) -> Markup:

@@ -42,6 +42,12 @@ def scan_picture(fit: EmittanceFit, plane: str, width: float = ALONE) -> Picture
     return Picture(words, 0.54 * width + 1.15, draw, source_of(fit, plane), width)
 
 
+def residual_picture(fit: EmittanceFit, plane: str) -> Picture:
+    """The picture of one plane's residuals."""
+    draw = partial(draw_residuals, fit=fit, plane=plane)
+    return Picture(f"residuals of the {plane} plane", 2.6, draw, source_of(fit, plane))
+
+
 def ellipse_picture(fit: EmittanceFit) -> Picture:
     """The picture of the phase ellipses."""
     return Picture("phase ellipses", 3.4, partial(draw_ellipses, fit=fit), source_of(fit))
@@ -50,7 +56,7 @@ def ellipse_picture(fit: EmittanceFit) -> Picture:
 def source_of(fit: EmittanceFit, *planes: str) -> str:
     """File, slice, date, line, and the quality of the fit of some planes."""
     scan = fit.scan
-    parts = [scan.name, *(f"slice {name}" for name in scan.slices)]
+    parts = [scan.name]  # that of a slice names it
     parts += [day_of(f"{scan.name} {scan.path or ''}", scan.provenance), f"line {fit.line.name}"]
     parts += [f"{p}: {quality(fit[p].chi2, fit[p].dof)}" for p in planes]
     return ", ".join(part for part in parts if part)
