@@ -54,15 +54,26 @@ class Chromium:
             self.events.append(answer)
         return answer["result"]
 
+    def _open(self, page):
+        self.ask("Page.navigate", url=page.as_uri())
+        while not any(e["method"] == "Page.loadEventFired" for e in self.events):
+            self.events.append(self._message())
+
+    def screen(self, page):
+        """The first screen of a page, 1280 by 800, as PNG."""
+        self.events.clear()
+        size = {"width": 1280, "height": 800, "deviceScaleFactor": 1, "mobile": False}
+        self.ask("Emulation.setDeviceMetricsOverride", **size)
+        self._open(page)
+        return base64.b64decode(self.ask("Page.captureScreenshot", format="png")["data"])
+
     def faults(self, page, width, pictures):
         """What is wrong with a page of so many pictures at a width, in words."""
         self.events.clear()
         size = {"width": WIDTHS[width], "height": 900, "deviceScaleFactor": 1, "mobile": False}
         self.ask("Emulation.setDeviceMetricsOverride", **size)
         self.ask("Emulation.setEmulatedMedia", media="print" if width == "print" else "screen")
-        self.ask("Page.navigate", url=page.as_uri())
-        while not any(e["method"] == "Page.loadEventFired" for e in self.events):
-            self.events.append(self._message())
+        self._open(page)
         self.ask("Runtime.evaluate", expression=OPEN)
         seen = json.loads(self.ask("Runtime.evaluate", expression=SEEN)["result"]["value"])
         found = [f"{seen['wide']} px to scroll sideways"] * (seen["wide"] > 0)
