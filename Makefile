@@ -34,8 +34,9 @@ demo: .venv/runtime
 test: .venv/test lint
 	$(BIN)/python -m pytest --quiet --numprocesses 2 --dist loadfile
 
-# The site, in build/site/index.html. Offline; warnings are errors; notebooks are executed.
+# The site, in build/site/index.html. Offline; warnings are errors; notebooks are executed, pictures made.
 docs: .venv/test
+	$(BIN)/python docs/pictures.py
 	$(BIN)/python -m sphinx -W --keep-going -q -b html docs build/site
 
 # Simulation-based calibration of the posteriors: minutes, so not part of `make test`.

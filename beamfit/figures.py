@@ -12,7 +12,7 @@ A figure belongs to no window: save it by ``figure.savefig``, or show it in a no
 from __future__ import annotations
 
 import io
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import matplotlib.figure
@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from beamfit.lifetime.fit import DecayFit
     from beamfit.lifetime.ring_study import Shift
     from beamfit.lifetime.study import Decay, RecordStudy
+    from beamfit.report.document import Picture
     from beamfit.sampling.posterior import Posterior
 
 __all__ = [
@@ -39,8 +40,8 @@ __all__ = [
     "trend",
 ]
 
-# Width of a figure, inches, as in the report; dots an inch of the picture in a notebook.
-WIDTH, SHARP = 6.4, 110
+# Dots an inch of the picture in a notebook.
+SHARP = 110
 
 
 class Figure(matplotlib.figure.Figure):
@@ -86,7 +87,7 @@ def picture(result: Any, **options: Any) -> Figure:
     if not drawn:
         expected = "a result whose report has one, such as a fit"
         raise InputError(f"no picture of a {type(result).__name__}", expected)
-    return _drawn(drawn[0].draw, drawn[0].height)
+    return _drawn(drawn[0])
 
 
 def scan(fit: EmittanceFit, plane: str | None = None) -> Figure:
@@ -103,16 +104,16 @@ def scan(fit: EmittanceFit, plane: str | None = None) -> Figure:
     -------
     matplotlib.figure.Figure
     """
-    from beamfit.report.scan_pictures import draw_scan
+    from beamfit.report.scan_pictures import scan_picture
 
-    return _drawn(draw_scan, 4.6, fit=fit, plane=_plane(fit, plane))
+    return _drawn(scan_picture(fit, _plane(fit, plane)))
 
 
 def residuals(fit: EmittanceFit, plane: str | None = None) -> Figure:
     """Draw the residuals of one plane in standard errors; arguments as of `scan`."""
-    from beamfit.report.scan_pictures import draw_residuals
+    from beamfit.report.scan_pictures import residual_picture
 
-    return _drawn(draw_residuals, 2.6, fit=fit, plane=_plane(fit, plane))
+    return _drawn(residual_picture(fit, _plane(fit, plane)))
 
 
 def phase_space(fit: EmittanceFit) -> Figure:
@@ -133,12 +134,12 @@ def phase_space(fit: EmittanceFit) -> Figure:
     InputError
         If the data determine β and α of no plane.
     """
-    from beamfit.report.scan_pictures import draw_ellipses, has_ellipses
+    from beamfit.report.scan_pictures import ellipse_picture, has_ellipses
 
     if not any(has_ellipses(p) for p in fit.planes):
         expected = "a plane whose beta and alpha the data determine"
         raise InputError("a fit without phase ellipses", expected, path=fit.scan.path)
-    return _drawn(draw_ellipses, 3.4, fit=fit)
+    return _drawn(ellipse_picture(fit))
 
 
 def decay(result: DecayFit | RecordStudy) -> Figure:
@@ -153,16 +154,16 @@ def decay(result: DecayFit | RecordStudy) -> Figure:
     -------
     matplotlib.figure.Figure
     """
-    from beamfit.report.decays import draw_record, study_of
+    from beamfit.report.decays import record_picture, study_of
 
-    return _drawn(draw_record, 4.4, study=study_of(result))
+    return _drawn(record_picture(study_of(result)))
 
 
 def lifetime(result: DecayFit | RecordStudy) -> Figure:
     """Draw the momentary lifetime along a record beside that of the fit; argument as of `decay`."""
-    from beamfit.report.decays import draw_lifetime, study_of
+    from beamfit.report.decays import lifetime_picture, study_of
 
-    return _drawn(draw_lifetime, 3.0, study=study_of(result))
+    return _drawn(lifetime_picture(study_of(result)))
 
 
 def pairs(posterior: Posterior, names: Sequence[str] | None = None) -> Figure:
@@ -184,12 +185,12 @@ def pairs(posterior: Posterior, names: Sequence[str] | None = None) -> Figure:
     InputError
         If nothing was sampled, or a name is unknown.
     """
-    from beamfit.report.posterior import MOST_NUMBERS, draw_pairs
+    from beamfit.report.posterior import MOST_NUMBERS, pairs_picture
 
     names = tuple(names or posterior.shown[:MOST_NUMBERS])
     if not posterior.chain.size:
         raise InputError("a posterior without draws", posterior.message)
-    return _drawn(draw_pairs, 1.0 + 1.15 * len(names), posterior=posterior, names=names)
+    return _drawn(pairs_picture(posterior, names))
 
 
 def trend(result: Trend) -> Figure:
@@ -204,9 +205,9 @@ def trend(result: Trend) -> Figure:
     -------
     matplotlib.figure.Figure
     """
-    from beamfit.report.trend import draw_trend
+    from beamfit.report.trend import trend_picture
 
-    return _drawn(draw_trend, 2.6 if result.reference is None else 5.4, trend=result)
+    return _drawn(trend_picture(result))
 
 
 def network(shift: Shift, decays: Sequence[Decay], setting: str | None = None) -> Figure:
@@ -230,15 +231,15 @@ def network(shift: Shift, decays: Sequence[Decay], setting: str | None = None) -
     InputError
         If the study has no network, or there is no such setting.
     """
-    from beamfit.report.network import SETTINGS, draw_by_setting, draw_decays
+    from beamfit.report.network import SETTINGS, decays_picture, setting_picture
 
     if shift.network is None:
         raise InputError("a study without a network", "study_shift(..., network=Network.alone)")
     if setting is None:
-        return _drawn(draw_decays, 4.6, shift=shift, decays=decays)
+        return _drawn(decays_picture(shift, decays))
     if setting not in SETTINGS:
         raise InputError(f"a setting '{setting}'", " or ".join(SETTINGS))
-    return _drawn(draw_by_setting, 2.6, shift=shift, decays=decays, name=setting)
+    return _drawn(setting_picture(shift, decays, setting))
 
 
 def _plane(fit: EmittanceFit, plane: str | None) -> str:
@@ -249,13 +250,13 @@ def _plane(fit: EmittanceFit, plane: str | None) -> str:
     return plane or fitted[0]
 
 
-def _drawn(draw: Callable[..., None], height: float, **bound: Any) -> Figure:
-    """Draw what the report draws, in its style, so many inches high."""
+def _drawn(picture: Picture) -> Figure:
+    """Draw a picture of the report, in its style."""
     from matplotlib import rc_context
 
     from beamfit.report.document import STYLE
 
     with rc_context(STYLE):
-        figure = Figure(figsize=(WIDTH, height), layout="constrained")
-        draw(figure, **bound)
+        figure = Figure(figsize=(picture.width, picture.height), layout="constrained")
+        picture.on(figure)
     return figure

@@ -21,6 +21,11 @@ def test_every_equation_has_a_function_and_a_test(root):
     assert all(callable(found(n)) or type(found(n)).__module__.startswith("beamfit") for n in names)
     files = [f"tests/{name}.py" for name in re.findall(r"\w+/test_\w+", text)]
     assert len(files) > 25
+    for row in re.findall(r"^\| \d.*", text, re.MULTILINE):
+        name, test = (re.search(form, row) for form in (r"`beamfit\.([\w.]+)`", r"\w+/test_\w+"))
+        if name and test:
+            calls = (root / f"tests/{test[0]}.py").read_text()
+            assert re.search(rf"\b{name[1].rpartition('.')[2]}\b", calls), row
     files += re.findall(r"(?:benchmarks|measurements)/\w+\.py", text)
     assert [f for f in files if not (root / f).is_file()] == []
     numbers = set()

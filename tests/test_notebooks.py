@@ -46,6 +46,12 @@ def test_the_lifetime_study_runs(executed):
     [
         ("emittance_lcls", ["x converged 0.702 ± 0.023 µm", "0.786 µm (+2.0 errors)"]),
         ("greybox_from_scratch", ["free: rms off by 0.2", "rising: rms off by 0.0"]),
+        ("lifetime_aps", ["converged 39.149 ± 0.029 h", "a (7.0 ± 1.2)e-08"]),
+        ("when_data_do_not_tell", [" 8 settings: unidentified", " 9 settings: converged"]),
+        ("calibration", ["converged 0.679 ± 0.015 µm", "Q2.slope 167.2 ± 3.3"]),
+        ("slices", ["3          converged 0.4954 ± 0.0056 µm"]),
+        ("loss_mechanisms", ["longest: 18.4 h at 3.2 MV"]),
+        ("posterior", ["converged", "fit:     0.702 ± 0.023 µm"]),
         ("identification", ["poor_fit Past inputs", "converged The free run"]),
     ],
 )

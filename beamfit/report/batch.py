@@ -10,6 +10,7 @@ from os import PathLike
 from pathlib import Path
 from urllib.parse import quote
 
+import numpy as np
 from matplotlib import rc_context
 from matplotlib.figure import FigureBase
 
@@ -23,18 +24,32 @@ from beamfit.report.document import (
     ReportPage,
     Verdict,
     control_chart,
+    date_axis,
     legend_below,
+    moments,
 )
 from beamfit.report.page import write_page, write_report
 from beamfit.statistics import BEYOND
 from beamfit.status import Status
-from beamfit.table import MOST_ROWS, Table, plain_name
+from beamfit.table import MOST_ROWS, Table, labelled, plain_name
 
+NOTHING = Verdict(
+    Status.unidentified,
+    "No course to follow",
+    "No file gives an answer of this quantity: the reasons are below.",
+)
 RULE = (
     "Control limits are those of an individuals chart: the mean of the first 20 points (half of "
     "them if there are fewer) ± 3 standard deviations from their mean moving range, Student's "
     "quantile; a point is beyond if it is also 3 of its own errors from the mean."
 )
+
+
+# Standard deviations of all points; limits that are wider rest on fewer than five points, whose
+# Student's quantile they show.
+WIDEST = 6.0
+# Points within the limits for each that noise alone puts beyond: 370.
+NOISE_PASSES = 1 / (2 * (1 - BEYOND))
 
 
 def write_batch_report(
@@ -82,7 +97,8 @@ def _page(
 ) -> ReportPage:
     job = batch.ledger.job
     answers = [[name.replace("_", " "), f"{n}"] for name, n in batch.statuses.items()]
-    tables = [Table("Answers", ["status", "answers"], answers, numeric=True)]
+    tables = [_summary(courses)] if courses else []
+    tables.append(Table("Answers", ["status", "answers"], answers, numeric=True))
     for c in courses:
         rows = [
             [file, str(Quantity(value, error, c.unit))]
@@ -98,15 +114,17 @@ def _page(
         note = more if len(batch.refused) > MOST_ROWS else ""
         tables.append(Table("Without an answer", ["file and reason"], rows, note))
     pictures = [
-        Picture(f"course of {_label(c)}", 2.8, partial(draw_course, course=c)) for c in courses
+        Picture(f"course of {_label(c)}", 3.0, partial(draw_course, course=c), _source(c, job.kind))
+        for c in courses
     ]
     return ReportPage(
-        title=f"{len(batch.files)} files: {job.kind}",
-        subtitle="",
-        verdicts=[_verdict(c) for c in courses],
+        title=f"{job.kind.capitalize()} of {len(batch.files)} files",
+        subtitle=", ".join(f"{n} {name.replace('_', ' ')}" for name, n in batch.statuses.items()),
+        verdicts=[_verdict(c) for c in courses] or [NOTHING],
         tables=tables,
         pictures=pictures,
-        pictures_title="Course, in the order of the files",
+        pictures_title="Further courses",
+        leading=2,
         notes=(RULE,),
         inputs={} if job.lattice is None else {job.lattice: job.lattice_sha256},
         remarks=[("table", str(batch.ledger.out)), ("options", job.key[1])],
@@ -114,26 +132,57 @@ def _page(
     )
 
 
+def _summary(courses: Sequence[ControlChart]) -> Table:
+    """The spread of each quantity through the files."""
+    rows = [("answers", [f"{len(c.value)}" for c in courses])]
+    for label, number in (
+        ("median", np.median),
+        ("lowest", np.min),
+        ("highest", np.max),
+        ("standard deviation", np.std),
+    ):
+        rows.append((label, [_in_unit(c, float(number(c.value))) for c in courses]))
+    rows.append(("median error", [_in_unit(c, float(np.median(c.error))) for c in courses]))
+    rows.append(("beyond the limits", [f"{c.beyond.sum()}" for c in courses]))
+    return labelled("Result", [_label(c) for c in courses], rows)
+
+
+def _in_unit(c: ControlChart, value: float) -> str:
+    factor, unit = display_unit(abs(c.centre), c.unit)
+    return f"{value / factor:.3g} {unit}".strip()
+
+
 def _label(c: ControlChart) -> str:
     return f"{plain_name(c.name)} {c.of}".strip()
 
 
+def _source(c: ControlChart, kind: str) -> str:
+    first, last = (Path(c.files[i]).name for i in (0, -1))
+    return f"{kind} of {len(c.value)} files, {first} to {last}"
+
+
 def _verdict(c: ControlChart) -> Verdict:
-    beyond, points = int(c.beyond.sum()), len(c.value)
+    beyond, points, middle = int(c.beyond.sum()), len(c.value), float(np.median(c.value))
     status = Status.poor_fit if beyond else Status.converged
-    if not math.isfinite(c.limit):
-        few = f"{points} points are too few to say what is usual."
-        return Verdict(Status.unidentified, _label(c), few)
     factor, unit = display_unit(abs(c.centre), c.unit)
+    if not math.isfinite(_reach(c)):
+        few = f"{points} points are too few for control limits."
+        return Verdict(Status.unidentified, f"{_label(c)}: median {_in_unit(c, middle)}", few)
     usual = f"{c.centre / factor:.3g} ± {c.limit / factor:.2g} {unit}".strip()
     message = f"{beyond} of {points} points lie beyond the control limits"
-    by_chance = max(2 * points * (1 - BEYOND), 1)
-    message += f"; noise alone puts about {by_chance:.0f} there." if beyond else "."
+    message += f"; noise alone passes them in one point of {NOISE_PASSES:.0f}."
     return Verdict(status, f"{_label(c)}: usually {usual}", message)
 
 
+def _reach(c: ControlChart) -> float:
+    """The reach of the control limits; none where so few points make them that they say nothing."""
+    return c.limit if c.limit < WIDEST * np.std(c.value) else math.inf
+
+
 def draw_course(figure: FigureBase, course: ControlChart) -> None:
-    """Draw a quantity against the number of its file, with control limits.
+    """Draw a quantity against the time in the names of its files, with control limits.
+
+    Without a time in each name, against the number of the file.
 
     Parameters
     ----------
@@ -144,9 +193,15 @@ def draw_course(figure: FigureBase, course: ControlChart) -> None:
     """
     axes, many = figure.subplots(), len(course.value) > MANY
     factor, unit = display_unit(abs(course.centre), course.unit)
-    points = course.at, course.value / factor, None if many else course.error / factor
-    limits = course.centre / factor, course.limit / factor
+    days = [moments(Path(file).name) for file in course.files]
+    dated = all(days)
+    at = np.array([d[0] for d in days], "datetime64[s]") if dated else course.at
+    points = at, course.value / factor, None if many else course.error / factor
+    limits = course.centre / factor, _reach(course) / factor
     style = {"ms": 1.5 if many else 3.5, "lw": 0.8, "rasterized": many}
     control_chart(axes, points, course.beyond, limits, ("within", "beyond"), **style)
-    axes.set(title=_label(course), xlabel="file", ylabel=f"{plain_name(course.name)}, {unit}")
+    axes.set(title=_label(course), xlabel="time in the file's name" if dated else "file, number")
+    axes.set_ylabel(f"{plain_name(course.name)}, {unit}")
+    if dated:
+        date_axis(axes)
     legend_below(figure, axes, 3)

@@ -9,7 +9,9 @@ from matplotlib.figure import FigureBase
 
 from beamfit.dynamics.loop import Loop
 from beamfit.report.document import BLUE, RED, Picture, ReportPage, Verdict
-from beamfit.report.response import about_runs
+from beamfit.report.response import about_runs, unitless
+
+DISTURBED = "#7b4fa3"
 
 NOTES = (
     "SIMULATED: the process is the fitted model, with the noise of its residuals. Limits of inputs "
@@ -27,7 +29,14 @@ def control_page(loop: Loop) -> ReportPage:
         subtitle=f"a loop simulated on models of {', '.join(r.name for r in runs)}",
         verdicts=[Verdict.of(each) for each in (loop, *loop.fits)],
         tables=tables,
-        pictures=[Picture("Outputs, targets and inputs of the loop", 5.0, partial(_draw, loop))],
+        pictures=[
+            Picture(
+                "Outputs, targets and inputs of the loop",
+                4.6,
+                partial(_draw, loop),
+                f"SIMULATED on the model of {', '.join(r.name for r in runs)}",
+            )
+        ],
         pictures_title="Closed loop",
         notes=NOTES,
         **about_runs(runs),
@@ -46,13 +55,21 @@ def _draw(loop: Loop, figure: FigureBase) -> None:
         axes[i].step(loop.time, loop.targets[:, i], where="post", color="0.2", linestyle="--",
                      linewidth=1, label="target")  # fmt: skip
         _limit(axes[i], c.limits.below[i], c.limits.above[i])
-        axes[i].set_ylabel(r.name)
-    axes[0].legend(frameon=False, fontsize=8, ncols=4, loc="best")
+        axes[i].set_ylabel(unitless(r.name))
+    for change in loop.changes:
+        if change.disturbed:
+            row = axes[[r.name for r in c.responses].index(change.output)]
+            row.axvline(change.time, color=DISTURBED, linewidth=1, linestyle=":",
+                        label=f"disturbed by {change.disturbed:.3g}")  # fmt: skip
+    for row in axes[:outputs]:
+        row.margins(y=0.25)
+        row.legend(frameon=False, fontsize=8, ncols=5, loc="upper right")
     for i, name in enumerate(c.inputs):
         axes[outputs + i].step(loop.time, trace.inputs[:, i], where="post", color=BLUE)
         _limit(axes[outputs + i], c.limits.low[i], c.limits.high[i])
         axes[outputs + i].set_ylabel(name)
-    axes[-1].set_xlabel("time (s)")
+    axes[-1].set(xlabel="time, s")
+    figure.align_ylabels()
 
 
 def _limit(axes, low: float, high: float) -> None:

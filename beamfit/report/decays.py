@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from datetime import UTC, datetime
 from functools import partial
 from itertools import cycle
 
@@ -27,8 +28,10 @@ from beamfit.report.document import (
     Picture,
     ReportPage,
     Verdict,
+    day_of,
     from_head,
     legend_below,
+    quality,
 )
 from beamfit.report.network import network_pictures
 from beamfit.report.trend import trend_picture
@@ -102,7 +105,7 @@ def decay_page(
         verdicts=[*_together(shift, trend), *map(_verdict, pooled), *_verdicts(decays)],
         tables=listed,
         pictures=_of_all(decays, shift, trend) + _pictures(studies),
-        pictures_title="Records and fits",
+        pictures_title="Lifetime along the record" if len(studies) == 1 else "Records and fits",
         notes=from_head([note for study in studies for note in study.record.comments]),
     )
 
@@ -111,7 +114,8 @@ def _side_by_side(decays: Sequence[Decay]) -> list[Table]:
     """Every number of a few decays, one column each."""
     groups = [decays[k : k + ABREAST] for k in range(0, len(decays), ABREAST)]
     parts = [
-        ("Result", ERRORS, tables.decay_rows),
+        ("Result", "", tables.quoted_rows),
+        ("All numbers", ERRORS, tables.decay_rows),
         ("What the records determine", "", tables.separability_rows),
         ("Simpler analyses, and whether a is constant", CHECKS, tables.check_rows),
         ("Losses from first principles", BUDGET, tables.budget_rows),
@@ -181,6 +185,33 @@ def study_of(result: DecayFit | RecordStudy) -> RecordStudy:
     return RecordStudy(result.readings, (Decay(result.readings, 0.0, result, None),), ())
 
 
+def record_picture(study: RecordStudy) -> Picture:
+    """The picture of a record with its fits."""
+    draw = partial(draw_record, study=study)
+    return Picture(f"current of {study.record.name}", 4.4, draw, _source(study))
+
+
+def lifetime_picture(study: RecordStudy) -> Picture:
+    """The picture of the momentary lifetime along a record."""
+    draw = partial(draw_lifetime, study=study)
+    return Picture(f"lifetime of {study.record.name}", 3.0, draw, _source(study))
+
+
+def _source(study: RecordStudy) -> str:
+    """File, day and the quality of the fit of a record."""
+    record, answers = study.record, study.answers
+    day = day_of(record.name, record.comments)
+    if record.start is not None:
+        day = f"from {datetime.fromtimestamp(record.start, UTC):%Y-%m-%d %H:%M} UTC"
+    parts = [record.name, day]
+    if len(answers) == 1:
+        fit = answers[0].fit
+        parts.append(quality(None if fit.noise_inferred else fit.chi2, fit.dof))
+    else:
+        parts.append(f"{len(answers)} decays")
+    return ", ".join(part for part in parts if part)
+
+
 def draw_record(figure: FigureBase, study: RecordStudy) -> None:
     """Draw a record with the fit of each decay, and the residuals below.
 
@@ -213,7 +244,7 @@ def draw_record(figure: FigureBase, study: RecordStudy) -> None:
     if sum(len(d.segment) for d in study.pooled or study.decays) < len(record):
         above.plot([], [], "o", color="0.65", ms=5, label="left out")
     above.legend(frameon=False, loc="best")
-    above.set(title=record.name, ylabel="beam current, mA")
+    above.set(title="beam current", ylabel="beam current, mA")
     below.axhline(0, color="0.6", lw=0.8)
     below.set(xlabel=f"time, {unit}", ylabel="fit - reading,\nmA")
 
@@ -338,11 +369,11 @@ def _pictures(studies: Sequence[RecordStudy]) -> list[Picture]:
     """Two for each record, and the loss budget where a ring was given."""
     listed = []
     for study in studies:
-        name = study.record.name
-        listed.append(Picture(f"current of {name}", 4.4, partial(draw_record, study=study)))
-        listed.append(Picture(f"lifetime of {name}", 3.0, partial(draw_lifetime, study=study)))
+        listed += [record_picture(study), lifetime_picture(study)]
     decays = [decay for study in studies for decay in study.answers]
     if all(decay.budget is not None for decay in decays):
         height = 1.5 + 0.3 * min(len(decays), MOST_DRAWN)
-        listed.append(Picture("loss budget", height, partial(draw_budget, decays=decays)))
+        draw = partial(draw_budget, decays=decays)
+        names = ", ".join(study.record.name for study in studies)
+        listed.append(Picture("loss budget", height, draw, names))
     return listed

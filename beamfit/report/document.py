@@ -6,14 +6,18 @@ import base64
 import io
 import math
 import platform
+import re
 from collections.abc import Callable, Mapping, Sequence
 from datetime import UTC, datetime
 from importlib.metadata import version
+from textwrap import fill
 from typing import Any, NamedTuple
 
 import jinja2
 import numpy as np
+from markupsafe import Markup, escape
 from matplotlib.axes import Axes
+from matplotlib.dates import AutoDateLocator, ConciseDateFormatter
 from matplotlib.figure import Figure, FigureBase
 
 import beamfit
@@ -39,6 +43,14 @@ MANY = 500
 MOST_DRAWN = 12
 
 
+# A day as files and their names write it: 2021-02-18, perhaps with a time, or 22 June 2020.
+DAY = re.compile(
+    r"(?<!\d)((?:19|20)\d\d-\d\d-\d\d)(?:[-T _](\d\d)[:-]?(\d\d)[:-]?(\d\d))?(?!\d)"
+    r"|(?<!\d)(\d{1,2} (?:January|February|March|April|May|June|July|August|September|October"
+    r"|November|December) (?:19|20)\d\d)(?!\d)"
+)
+
+
 class Verdict(NamedTuple):
     """A status with its headline and its sentence."""
 
@@ -53,15 +65,31 @@ class Verdict(NamedTuple):
 
 
 class Picture(NamedTuple):
-    """A picture: alternative text, height in inches, and a function that draws it."""
+    """A picture: alternative text, height in inches, and a function that draws it.
+
+    ``source`` names file, date, line and quality of the fit, in small letters above the picture,
+    so that it can stand alone in a logbook. ``width`` is that of the picture by itself.
+    """
 
     alt: str
     height: float
     draw: Callable[[FigureBase], None]
+    source: str = ""
+    width: float = 6.4
+
+    def on(self, figure: FigureBase) -> None:
+        """Draw the picture and its source on a figure."""
+        self.draw(figure)
+        if self.source:
+            words = fill(self.source, round(14.5 * self.width))
+            figure.suptitle(words, fontsize=8, color="0.35", x=0.01, ha="left")
 
 
 class ReportPage(NamedTuple):
-    """A report: verdicts first, then tables with the pictures after the first one.
+    """A report: verdicts, the numbers people quote beside the leading pictures, then all else.
+
+    The first table has these numbers; the others are folded on a screen. ``leading`` is how many
+    pictures stand beside it.
 
     ``links`` are names and addresses of further pages. Files and their SHA-256 in ``inputs``, and
     ``remarks`` on them, are part of the ``provenance`` when it is `written_now`.
@@ -78,6 +106,7 @@ class ReportPage(NamedTuple):
     remarks: Sequence[tuple[str, str]] = ()
     provenance: Sequence[tuple[str, str]] = ()
     links: Sequence[tuple[str, str]] = ()
+    leading: int = 1
 
 
 def written_now(
@@ -108,6 +137,38 @@ def written() -> str:
     return "written " + datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")
 
 
+def moments(words: str) -> list[datetime]:
+    """Days, with the time where there is one, that stand in a text; those that exist.
+
+    Examples
+    --------
+    >>> [f"{day:%Y-%m-%d %H:%M}" for day in moments("OTR2-2021-02-18-124043.mat, 5 May 2020")]
+    ['2021-02-18 12:40', '2020-05-05 00:00']
+    """
+    found = []
+    for iso, *clock, said in DAY.findall(words):
+        form, text = ("%Y-%m-%d", iso) if iso else ("%d %B %Y", said)
+        if any(clock):
+            form, text = f"{form} %H%M%S", f"{text} {''.join(clock)}"
+        try:
+            found.append(datetime.strptime(text, form))
+        except ValueError:
+            continue
+    return found
+
+
+def day_of(name: str, comments: Sequence[str]) -> str:
+    """The one day that a file's name or its comments state, or nothing."""
+    days = {f"{moment:%Y-%m-%d}" for moment in moments(name)}
+    days = days or {f"{moment:%Y-%m-%d}" for line in comments for moment in moments(line)}
+    return days.pop() if len(days) == 1 else ""
+
+
+def quality(chi2: float | None, dof: int) -> str:
+    """The χ² of a fit for the source of a picture."""
+    return "χ² not testable" if chi2 is None or not dof else f"χ²/dof {chi2:.3g}/{dof}"
+
+
 def from_head(lines: Sequence[str]) -> tuple[str, ...]:
     """Comment lines at the head of a file, as notes of a page."""
     return ("From the head of the file:", *lines) if lines else ()
@@ -136,10 +197,26 @@ def control_chart(
         axes.axhspan(*ends, color="0.92", zorder=0, label="control limits")
 
 
+def date_axis(axes: Axes) -> None:
+    """Label the horizontal axis with dates."""
+    locator = AutoDateLocator()
+    axes.xaxis.set_major_locator(locator)
+    axes.xaxis.set_major_formatter(ConciseDateFormatter(locator))
+
+
 def legend_below(figure: FigureBase, axes: Axes, columns: int) -> None:
     """Put the legend of some axes below their figure, in so many columns."""
     shown = axes.get_legend_handles_labels()
     figure.legend(*shown, frameon=False, loc="outside lower center", ncols=columns)
+
+
+# A value with its error and unit, or a short word with a hyphen, a sign or an exponent.
+WHOLE = re.compile(r"\(?[-+]?\d\S* ± \d\S*(?: (?=[^\s\d(])\S+)?|(?<!\S)(?=\S{1,24}(?!\S))\S*-\S*")
+
+
+def unbroken(text: str) -> Markup:
+    """Mark in a text what no line may break: numbers with errors and units, words with a hyphen."""
+    return Markup(WHOLE.sub(r"<span>\g<0></span>", str(escape(text))))
 
 
 def html_of(page: ReportPage) -> bytes:
@@ -161,8 +238,10 @@ def html_of(page: ReportPage) -> bytes:
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,
     )
+    environment.filters["unbroken"] = unbroken
     pictures = [
-        {"alt": p.alt, "data": base64.b64encode(drawn(p, "svg")).decode()} for p in page.pictures
+        {"alt": p.alt, "data": base64.b64encode(drawn(p, "svg", clear=True)).decode()}
+        for p in page.pictures
     ]
     content = page._asdict() | {"pictures": pictures}
     return plain(environment.get_template("page.html.j2").render(**content)).encode()
@@ -170,13 +249,14 @@ def html_of(page: ReportPage) -> bytes:
 
 def figure_of(picture: Picture) -> Figure:
     """Draw a picture by itself."""
-    figure = Figure(figsize=(6.4, picture.height), layout="constrained")
-    picture.draw(figure)
+    figure = Figure(figsize=(picture.width, picture.height), layout="constrained")
+    picture.on(figure)
     return figure
 
 
-def drawn(picture: Picture, kind: str) -> bytes:
-    """A picture by itself as the bytes of a file, png or svg."""
+def drawn(picture: Picture, kind: str, clear: bool = False) -> bytes:
+    """A picture by itself as the bytes of a file, png or svg, on white or on nothing."""
     buffer = io.BytesIO()
-    figure_of(picture).savefig(buffer, format=kind, dpi=200 if kind == "png" else "figure")
+    dpi = 200 if kind == "png" else "figure"
+    figure_of(picture).savefig(buffer, format=kind, dpi=dpi, transparent=clear)
     return buffer.getvalue()

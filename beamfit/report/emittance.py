@@ -8,17 +8,20 @@ from functools import partial
 from typing import Any
 
 from beamfit.emittance.fit import EmittanceFit
-from beamfit.emittance.results import parameter_rows, result_rows
+from beamfit.emittance.results import parameter_rows, quoted_rows, result_rows
 from beamfit.emittance.scan import QuadScan
 from beamfit.emittance.sensitivity import budget_rows, range_rows
 from beamfit.emittance.size_methods import SizeMethods
 from beamfit.report.document import MOST_DRAWN, Picture, ReportPage, Verdict, from_head
 from beamfit.report.scan_pictures import (
+    ABREAST,
+    ALONE,
     PROFILES_ABREAST,
-    draw_ellipses,
     draw_profiles,
-    draw_scan,
+    ellipse_picture,
     has_ellipses,
+    scan_picture,
+    source_of,
     words_of,
 )
 from beamfit.report.scan_tables import identifiability_rows, point_rows
@@ -51,7 +54,8 @@ def emittance_page(fit: EmittanceFit, methods: tuple[SizeMethods, ...] = ()) -> 
     scan, line = fit.scan, fit.line
     names = [p.plane for p in fit.planes]
     tables = [
-        labelled("Result", names, result_rows(fit.planes), ERRORS),
+        labelled("Result", names, quoted_rows(fit.planes)),
+        labelled("All numbers", names, result_rows(fit.planes), ERRORS),
         labelled("What the data determine", names, identifiability_rows(fit.planes)),
         *(_budgets(fit, names) if fit.statement.closed else _fitted_too(fit)),
         *(Table(f"Points, {p.plane} plane", *point_rows(p), numeric=True) for p in fit.planes),
@@ -66,7 +70,8 @@ def emittance_page(fit: EmittanceFit, methods: tuple[SizeMethods, ...] = ()) -> 
         verdicts=[Verdict(p.status, f"{p.plane}: {words_of(p)}", p.message) for p in fit.planes],
         tables=tables + about_input(fit.notes),
         pictures=_pictures(fit),
-        pictures_title="Scan and fit",
+        pictures_title="Phase space" if not fit.scan.profiles else "Profiles and phase space",
+        leading=len(fit.planes),
         **about_scan(scan),
     )
 
@@ -111,15 +116,14 @@ def _fitted_too(fit: EmittanceFit) -> list[Table]:
 
 
 def _pictures(fit: EmittanceFit) -> list[Picture]:
-    listed = [
-        Picture(f"scan of the {p.plane} plane", 4.6, partial(draw_scan, fit=fit, plane=p.plane))
-        for p in fit.planes
-    ]
+    width = ALONE if len(fit.planes) == 1 else ABREAST
+    listed = [scan_picture(fit, p.plane, width) for p in fit.planes]
     for p in fit.planes:
         if shown := [f for f in fit.scan.profiles if f.plane == p.plane][:MOST_DRAWN]:
             height = 0.6 + 1.3 * math.ceil(len(shown) / PROFILES_ABREAST)
             draw = partial(draw_profiles, profiles=shown, fit=fit)
-            listed.append(Picture(f"profiles of the {p.plane} plane", height, draw))
+            words, source = f"profiles of the {p.plane} plane", source_of(fit)
+            listed.append(Picture(words, height, draw, source))
     if any(has_ellipses(p) for p in fit.planes):
-        listed.append(Picture("phase ellipses", 3.4, partial(draw_ellipses, fit=fit)))
+        listed.append(ellipse_picture(fit))
     return listed

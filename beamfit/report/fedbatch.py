@@ -25,11 +25,18 @@ def fedbatch_page(fits: Sequence[FedBatchFit | TitreFit]) -> ReportPage:
     """Lay out the rates, and the titre if it was fitted."""
     rates = fits[0].rates if isinstance(fits[0], TitreFit) else fits[0]
     pictures = [
-        Picture(f"Measured and predicted in {run.name}", 6.8, partial(draw_batch, fits[-1], i))
+        Picture(
+            f"Measured and predicted in {run.name}", 6.8, partial(draw_batch, fits[-1], i), run.name
+        )
         for i, run in enumerate(rates.runs)
     ]
     pictures += [
-        Picture(f"{c.parameter} by {c.input} with its band", 2.8, partial(draw_curve, rates, j))
+        Picture(
+            f"{c.parameter} by {c.input} with its band",
+            2.8,
+            partial(draw_curve, rates, j),
+            ", ".join(run.name for run in rates.runs),
+        )
         for j, c in enumerate(rates.curves)
     ]
     return ReportPage(
@@ -66,14 +73,14 @@ def draw_batch(fit: FedBatchFit | TitreFit, i: int, figure: FigureBase) -> None:
     for axis, name, predicted in zip(axes, names, fit.courses[i].T, strict=False):
         axis.plot(hours, run.outputs[name], ".", color="0.6", markersize=4, label="measured")
         axis.plot(hours, predicted, color=BLUE, label="predicted")
-        axis.set_ylabel(f"{name} ({UNITS[name]})")
+        axis.set_ylabel(f"{name}, {UNITS[name]}")
     axes[0].legend(frameon=False, fontsize=8)
     axes[0].set_title(run.name)
     for name, values in run.inputs.items():
         if np.ptp(values) > 0:
             axes[-1].step(hours, values, where="post", label=name)
     axes[-1].legend(frameon=False, fontsize=8)
-    axes[-1].set(xlabel="time (h)", ylabel="inputs")
+    axes[-1].set(xlabel="time, h", ylabel="inputs")
     figure.align_ylabels(axes)
 
 
@@ -84,9 +91,9 @@ def draw_course(course: FeedCourse, figure: FigureBase) -> None:
         axis.plot(course.time, value, color=BLUE)
         error = course.error[name]
         axis.fill_between(course.time, value - error, value + error, color=BLUE, alpha=0.25, lw=0)
-        axis.set_ylabel(f"{name} ({UNITS[name]})")
+        axis.set_ylabel(f"{name}, {UNITS[name]}")
     axes[-1].step(course.time, course.feed, where="post", color=RED)
-    axes[-1].set(xlabel="time (h)", ylabel="feed (L/h)")
+    axes[-1].set(xlabel="time, h", ylabel="feed, L/h")
     figure.align_ylabels(axes)
 
 

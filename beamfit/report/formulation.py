@@ -39,13 +39,14 @@ def formulation_page(found: ProblemSolution) -> ReportPage:
     pictures = []
     if drawn:
         height = 0.6 + 1.7 * ceil(len(drawn) / 2)
-        pictures = [Picture("outputs by index", height, partial(draw_outputs, found=found))]
+        draw = partial(draw_outputs, found=found)
+        pictures = [Picture("outputs by index", height, draw, f"{found.headline}, {found.solver}")]
     goals = "maximised" if found.factor < 0 else "minimised"
     called = found.made.document.mapping.name
     sizes = {"variable": len(p.names), "limit": len(p.constraint_names)}
     counts = ", ".join(f"{n} {what}" + "s" * (n != 1) for what, n in sizes.items())
     return ReportPage(
-        title=f"Formulation {called}".strip(),
+        title=f"Formulation {called}" if called else f"Formulation of {found.name}",
         subtitle=f"{counts}, {goals}",
         verdicts=[
             Verdict(found.status, found.headline, found.message[:1].upper() + found.message[1:])
@@ -97,7 +98,7 @@ def draw_outputs(figure: FigureBase, found: ProblemSolution) -> None:
     for axes, (name, over, values) in zip(grid.flat, drawn, strict=False):
         few = values.size <= 60
         axes.plot(over.elements, values, "o-" if few else "-", ms=3, lw=1.0, color=BLUE)
-        axes.set(title=name, xlabel=over.name or "index")
+        axes.set(title=name, xlabel=over.name or "index", ylabel="document's unit")
         axes.locator_params(axis="x", integer=True)
         if not np.any(np.isfinite(values)):
             axes.text(0.5, 0.5, "not finite", transform=axes.transAxes, ha="center")

@@ -30,14 +30,24 @@ SETTINGS = {
 
 def network_pictures(shift: Shift, decays: Sequence[Decay]) -> list[Picture]:
     """Decays with the network's prediction, then a, b and lifetime by each setting that varied."""
-    listed = [
-        Picture("decays by the network", 4.6, partial(draw_decays, shift=shift, decays=decays))
-    ]
-    for name, (low, high) in shift.limits._asdict().items():
-        if high > 1.01 * low:
-            draw = partial(draw_by_setting, shift=shift, decays=decays, name=name)
-            listed.append(Picture(f"losses by {SETTINGS[name][1]}", 2.6, draw))
-    return listed
+    varied = (name for name, (low, high) in shift.limits._asdict().items() if high > 1.01 * low)
+    return [decays_picture(shift, decays), *(setting_picture(shift, decays, n) for n in varied)]
+
+
+def decays_picture(shift: Shift, decays: Sequence[Decay]) -> Picture:
+    """The picture of four decays with the network's prediction."""
+    draw = partial(draw_decays, shift=shift, decays=decays)
+    return Picture("decays by the network", 4.6, draw, _source(decays))
+
+
+def setting_picture(shift: Shift, decays: Sequence[Decay], name: str) -> Picture:
+    """The picture of a, b and lifetime by one setting."""
+    draw = partial(draw_by_setting, shift=shift, decays=decays, name=name)
+    return Picture(f"losses by {SETTINGS[name][1]}", 2.6, draw, _source(decays))
+
+
+def _source(decays: Sequence[Decay]) -> str:
+    return f"{len(decays)} decays, {decays[0].fit.record} to {decays[-1].fit.record}"
 
 
 def draw_decays(figure: FigureBase, shift: Shift, decays: Sequence[Decay]) -> None:

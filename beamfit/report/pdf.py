@@ -117,7 +117,7 @@ class _Pages:
         ratios = {"height_ratios": (above, height, below)}
         ratios |= {"width_ratios": (0.6 * MARGIN, WIDTH - 1.5 * MARGIN, 0.9 * MARGIN)}
         place = page.add_gridspec(3, 3, hspace=0, wspace=0, **ratios)[1, 1]
-        picture.draw(page.add_subfigure(place))
+        picture.on(page.add_subfigure(place))
         self.y -= height + 0.6 * LINE
 
 

@@ -18,7 +18,7 @@ from beamfit.emittance.posterior import expected_sizes
 from beamfit.lifetime.fit import DecayFit
 from beamfit.lifetime.posterior import expected_current
 from beamfit.report.document import BLUE, MANY, Picture, ReportPage, Verdict, legend_below
-from beamfit.report.scan_pictures import COLOUR, setting_axis
+from beamfit.report.scan_pictures import COLOUR, setting_axis, source_of
 from beamfit.sampling.intervals import Expected, in_unit
 from beamfit.sampling.likelihood import noise_words
 from beamfit.sampling.posterior import Posterior
@@ -265,9 +265,12 @@ def of_scan(fit: EmittanceFit, posterior: Posterior) -> ReportedPosterior:
             unit=1e6,
             colour=COLOUR[p.plane],
         )
-        expected.append(Picture(f"sizes expected in the {p.plane} plane", 3.4, draw))
+        expected.append(
+            Picture(f"sizes expected in the {p.plane} plane", 3.4, draw, source_of(fit))
+        )
         words, of_plane = f"numbers of the {p.plane} plane in pairs", f"{p.plane} plane: posterior"
-        pairs.append(_pairs(words, posterior, names, of_plane, COLOUR[p.plane]))
+        pair = pairs_picture(posterior, names, of_plane, COLOUR[p.plane])
+        pairs.append(pair._replace(alt=words, source=source_of(fit)))
     return ReportedPosterior("", posterior, expected + pairs)
 
 
@@ -296,16 +299,17 @@ def of_decay(fit: DecayFit, posterior: Posterior, label: str = "") -> ReportedPo
         unit=1.0,
         colour=BLUE,
     )
-    words = f"numbers of {fit.record} in pairs"
+    pairs = pairs_picture(posterior, names, f"{fit.record}: posterior")
     pictures = [
-        _pairs(words, posterior, names, f"{fit.record}: posterior", BLUE),
+        pairs._replace(alt=f"numbers of {fit.record} in pairs"),
         Picture(f"current expected of {fit.record}", 3.4, draw),
     ]
     return ReportedPosterior(label, posterior, pictures)
 
 
-def _pairs(
-    words: str, posterior: Posterior, names: Sequence[str], title: str, colour: str
+def pairs_picture(
+    posterior: Posterior, names: Sequence[str], title: str = "posterior", colour: str = BLUE
 ) -> Picture:
+    """The picture of some numbers of a posterior and of their pairs."""
     draw = partial(draw_pairs, posterior=posterior, names=names, title=title, colour=colour)
-    return Picture(words, 1.0 + 1.15 * len(names), draw)
+    return Picture("numbers in pairs", 1.0 + 1.15 * len(names), draw)

@@ -12,7 +12,8 @@ from matplotlib.figure import FigureBase
 from beamfit.dynamics.fit import ResponseFit
 from beamfit.dynamics.record import Run
 from beamfit.dynamics.state_fit import StatesFit, StateSpaceOutput
-from beamfit.report.document import BLUE, RED, Picture, ReportPage, Verdict
+from beamfit.report.document import BLUE, RED, Picture, ReportPage, Verdict, day_of
+from beamfit.table import Table
 
 NOTES = (
     "Errors are one standard deviation. The model runs free from the start of each run: measured "
@@ -30,12 +31,35 @@ def response_page(fits: Sequence[ResponseFit | StatesFit]) -> ReportPage:
         title=f"Response of {', '.join(fit.output for fit in fits)}",
         subtitle=f"identified from {', '.join(run.name for run in runs)}",
         verdicts=[Verdict.of(fit) for fit in fits],
-        tables=[table for fit in fits for table in fit.tables()],
+        tables=[table for fit in fits for table in _tables(fit)],
         pictures=[picture for fit in fits for part in fit.parts for picture in _pictures(part)],
         pictures_title="Measured and simulated",
         notes=NOTES,
         **about_runs(runs),
     )
+
+
+def _tables(fit: ResponseFit | StatesFit) -> list[Table]:
+    """Those of a fit, the range of each parameter curve in the first."""
+    first, *others = fit.tables()
+    ranges = []
+    for curve in (c for part in fit.parts for c in part.curves if c.visited.any()):
+        seen = curve.value[curve.visited]
+        words = f"{seen.min():.4g} to {seen.max():.4g} {curve.unit}, by {curve.input}"
+        ranges.append([curve.parameter, words])
+    return [first._replace(rows=[*ranges, *first.rows]), *others]
+
+
+def source_of(run: Run, fit: ResponseFit | StateSpaceOutput) -> str:
+    """File, day and quality of a fitted run."""
+    parts = [run.name, day_of(run.name, run.provenance)]
+    parts.append(f"free run explains {fit.checks.free_run_percent:.4g} %")
+    return ", ".join(part for part in parts if part)
+
+
+def unitless(name: str) -> str:
+    """A label of a column whose unit the file leaves open."""
+    return f"{name}, as in the file"
 
 
 def about_runs(runs: Sequence[Run]) -> dict[str, Any]:
@@ -50,15 +74,17 @@ def _pictures(fit: ResponseFit | StateSpaceOutput) -> list[Picture]:
     runs = range(min(len(fit.runs), RUNS))
     found = [
         Picture(f"{fit.output} measured and simulated in {fit.runs[i].name}", 4.2,
-                partial(_draw_run, fit, i))
+                partial(_draw_run, fit, i), source_of(fit.runs[i], fit))
         for i in runs
     ]  # fmt: skip
+    every = ", ".join(run.name for run in fit.runs)
     found += [
-        Picture(f"{c.parameter} against {c.input} with its band", 2.8, partial(draw_curve, fit, j))
+        Picture(f"{c.parameter} against {c.input} with its band", 2.8,
+                partial(draw_curve, fit, j), f"{fit.output} in {every}")
         for j, c in enumerate(fit.curves)
-    ]
-    return [*found, Picture(f"Correlations of the residuals of {fit.output}", 2.8,
-                            partial(_draw_correlations, fit))]  # fmt: skip
+    ]  # fmt: skip
+    words = f"Correlations of the residuals of {fit.output}"
+    return [*found, Picture(words, 2.8, partial(_draw_correlations, fit), every)]
 
 
 def _draw_run(fit: ResponseFit | StateSpaceOutput, i: int, figure: FigureBase) -> None:
@@ -69,16 +95,19 @@ def _draw_run(fit: ResponseFit | StateSpaceOutput, i: int, figure: FigureBase) -
     above, middle, below = figure.subplots(3, 1, sharex=True, height_ratios=(3, 1, 1))
     above.plot(time[thin], y[thin], ".", color="0.6", markersize=3, label="measured")
     above.plot(time[thin], simulated[thin], color=BLUE, label="simulated")
-    above.set(title=run.name, ylabel=fit.output)
-    above.legend(frameon=False, loc="best", fontsize=8)
+    above.set(title=f"{fit.output}: measured and simulated", ylabel=unitless(fit.output))
+    above.legend(frameon=False, loc="upper right", fontsize=8, ncols=2)
+    above.margins(y=0.2)
     middle.plot(time[thin], (y - simulated)[thin], ".", color=RED, markersize=2)
     middle.axhline(0.0, color="0.7", linewidth=0.8)
-    middle.set_ylabel("difference")
+    middle.set_ylabel("measured -\nsimulated")
     for name, values in run.inputs.items():
         below.step(run.time[thin], values[thin], where="post", label=name)
-    below.set(xlabel="time (s)", ylabel="inputs")
-    if len(run.inputs) > 1:
-        below.legend(frameon=False, fontsize=8, ncols=len(run.inputs))
+    names = list(run.inputs)
+    below.set(xlabel="time, s", ylabel="inputs" if len(names) > 1 else names[0])
+    if len(names) > 1:
+        below.legend(frameon=False, fontsize=8, ncols=len(names))
+    figure.align_ylabels()
 
 
 def draw_curve(fit: ResponseFit | StateSpaceOutput, j: int, figure: FigureBase) -> None:
@@ -90,8 +119,8 @@ def draw_curve(fit: ResponseFit | StateSpaceOutput, j: int, figure: FigureBase) 
     axes.plot(c.at, np.where(c.visited, c.value, np.nan), color=BLUE)
     low, high = (np.where(known, c.value + s * c.error, np.nan) for s in (-1, 1))
     axes.fill_between(c.at, low, high, color=BLUE, alpha=0.25, linewidth=0)
-    label = f"{c.parameter} ({c.unit})" if c.unit == "s" else c.parameter
-    axes.set(xlabel=c.input, ylabel=label)
+    axes.set(title=f"{c.parameter} by {c.input}", xlabel=unitless(c.input))
+    axes.set_ylabel(f"{c.parameter}, {c.unit}")
     if c.visited.any():  # the band where data were; a wild end elsewhere is cut off
         inside = np.concatenate([low[known], high[known], c.value[c.visited]])
         edge = 0.15 * max(float(np.ptp(inside)), 1e-12)

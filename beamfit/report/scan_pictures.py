@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 from textwrap import fill
 
 import numpy as np
@@ -12,7 +13,15 @@ from matplotlib.figure import FigureBase
 from beamfit.emittance.fit import EmittanceFit
 from beamfit.emittance.results import PlaneFit
 from beamfit.emittance.scan import Profile
-from beamfit.report.document import BLUE, MANY, RED, legend_below
+from beamfit.report.document import (
+    BLUE,
+    MANY,
+    RED,
+    Picture,
+    day_of,
+    legend_below,
+    quality,
+)
 
 # Profiles in a row of the picture.
 PROFILES_ABREAST = 3
@@ -22,7 +31,38 @@ FURTHER = {"x": ("#0f8b8d", "#7b4fa3", "#5a6570"), "y": ("#c98a00", "#8a3b6b", "
 MARKERS, LINES = "os^D", ("-", "--", ":", "-.")
 
 
-def draw_scan(figure: FigureBase, fit: EmittanceFit, plane: str) -> None:
+# The picture of a scan where two stand side by side: narrow, so that its letters can be read.
+ABREAST, ALONE = 4.6, 6.4
+
+
+def scan_picture(fit: EmittanceFit, plane: str, width: float = ALONE) -> Picture:
+    """The picture of one plane's scan."""
+    words = f"scan of the {plane} plane"
+    draw = partial(draw_scan, fit=fit, plane=plane, letters=round(10 * width))
+    return Picture(words, 0.54 * width + 1.15, draw, source_of(fit, plane), width)
+
+
+def residual_picture(fit: EmittanceFit, plane: str) -> Picture:
+    """The picture of one plane's residuals."""
+    draw = partial(draw_residuals, fit=fit, plane=plane)
+    return Picture(f"residuals of the {plane} plane", 2.6, draw, source_of(fit, plane))
+
+
+def ellipse_picture(fit: EmittanceFit) -> Picture:
+    """The picture of the phase ellipses."""
+    return Picture("phase ellipses", 3.4, partial(draw_ellipses, fit=fit), source_of(fit))
+
+
+def source_of(fit: EmittanceFit, *planes: str) -> str:
+    """File, slice, date, line, and the quality of the fit of some planes."""
+    scan = fit.scan
+    parts = [scan.name]  # that of a slice names it
+    parts += [day_of(f"{scan.name} {scan.path or ''}", scan.provenance), f"line {fit.line.name}"]
+    parts += [f"{p}: {quality(fit[p].chi2, fit[p].dof)}" for p in planes]
+    return ", ".join(part for part in parts if part)
+
+
+def draw_scan(figure: FigureBase, fit: EmittanceFit, plane: str, letters: int = 62) -> None:
     """Draw one plane's sizes with the fit, and the residuals in standard errors below.
 
     One varied magnet gives a curve against its setting; several give the points in order.
@@ -35,6 +75,8 @@ def draw_scan(figure: FigureBase, fit: EmittanceFit, plane: str) -> None:
         The fit.
     plane : str
         "x" or "y".
+    letters : int
+        Letters after which a line of the title breaks.
     """
     p = fit[plane]
     above, below = figure.subplots(2, 1, sharex=True, height_ratios=(3, 1))
@@ -48,7 +90,8 @@ def draw_scan(figure: FigureBase, fit: EmittanceFit, plane: str) -> None:
         above.plot(at, 1e6 * p.points.model, "_", label="fit", **style)
     above.legend(frameon=False, loc="best", fontsize=8)
     title = f"{plane} plane: {words_of(p).removesuffix(' (statistics only)')}"
-    above.set(title=fill(title, 62), ylabel="rms size, µm", ylim=(0.0, None))
+    above.set_title(fill(title, letters), fontsize=9.5)
+    above.set(ylabel="rms size, µm", ylim=(0.0, None))
     _residuals(below, p)
 
 
@@ -168,7 +211,7 @@ def draw_profiles(figure: FigureBase, profiles: list[Profile], fit: EmittanceFit
         axes.tick_params(labelsize=7)
     for axes in every[len(profiles) :]:
         axes.set_axis_off()
-    figure.suptitle(f"projected profiles in {profiles[0].plane}, mm from their centres", fontsize=9)
+    figure.supxlabel(f"{profiles[0].plane}, mm from the centre of each profile", fontsize=9)
 
 
 def has_ellipses(p: PlaneFit) -> bool:

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
 from matplotlib.figure import FigureBase
 
-from beamfit.emittance.results import result_rows
+from beamfit.emittance.results import PlaneFit, result_rows
 from beamfit.emittance.scan import PROJECTED
 from beamfit.emittance.slices import SliceFits
 from beamfit.report.document import MOST_DRAWN, Picture, ReportPage, Verdict
 from beamfit.report.emittance import ERRORS, about_input, about_scan
-from beamfit.report.scan_pictures import COLOUR, draw_scan, words_of
+from beamfit.report.scan_pictures import COLOUR, scan_picture, source_of, words_of
 from beamfit.report.scan_tables import identifiability_rows, point_rows
 from beamfit.status import Status
 from beamfit.table import Table, labelled
@@ -45,21 +47,42 @@ def slices_page(fits: SliceFits) -> ReportPage:
         *(Table(f"Points of slice {n}", *point_rows(p), numeric=True) for n, _, p in found),
         *about_input(fits.notes),
     ]
-    pictures = [Picture("emittance of each slice", 3.8, partial(draw_slices, fits=fits))]
+    source = source_of(replace(fits.fits[0], scan=scan))
+    draw = partial(draw_slices, fits=fits)
+    pictures = [Picture("emittance of each slice", 3.1, draw, source)]
     pictures += [
-        Picture(f"scan of slice {name}", 4.6, partial(draw_scan, fit=fit, plane=p.plane))
+        scan_picture(fit, p.plane)._replace(alt=f"scan of slice {name}")
         for name, fit, p in found[:MOST_DRAWN]
     ]
     return ReportPage(
         title=f"Slice emittances of {scan.name}",
         subtitle=f"{len(scan)} rows of {len(fits)} slices on line {line.name}, "
         f"{float(line.energy):g} MeV",
-        verdicts=[Verdict(p.status, f"{name}: {words_of(p)}", p.message) for name, _, p in found],
+        verdicts=list(_verdicts(fits)),
         tables=tables,
         pictures=pictures,
         pictures_title="Slices, and the scan and fit of each",
         **about_scan(scan),
     )
+
+
+def _verdicts(fits: SliceFits) -> Iterator[Verdict]:
+    """Verdict of each slice, those that say the same together."""
+    alike: dict[tuple[str, Status, str], list[tuple[str, PlaneFit]]] = {}
+    for plane in fits.planes:
+        for fit, p in fits.of_plane(plane):
+            alike.setdefault((plane, p.status, p.message), []).append((fit.scan.slices[0], p))
+    for (plane, status, message), same in alike.items():
+        names, answers = zip(*same, strict=True)
+        words = words_of(answers[0])
+        if len(same) > 1:
+            words = "normalised emittance not determined"
+            values = [p.normalized_emittance for p in answers]
+            if all(q.error is not None for q in values):
+                low, high = (f(values, key=lambda q: q.value) for f in (min, max))
+                words = f"normalised emittance {low} to {high}"
+        noun = "slice" if len(same) == 1 else "slices"
+        yield Verdict(status, f"{noun} {', '.join(names)}, {plane}: {words}", message)
 
 
 def draw_slices(figure: FigureBase, fits: SliceFits) -> None:

@@ -6,11 +6,11 @@ from functools import partial
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.dates import AutoDateLocator, ConciseDateFormatter
 from matplotlib.figure import FigureBase
 
+from beamfit.lifetime.alarm import when
 from beamfit.lifetime.course import Trend
-from beamfit.report.document import BLUE, RED, Picture, control_chart
+from beamfit.report.document import BLUE, RED, Picture, control_chart, date_axis
 
 RELATIVE = ("a", "b")
 
@@ -18,7 +18,9 @@ RELATIVE = ("a", "b")
 def trend_picture(trend: Trend) -> Picture:
     """The picture of a page."""
     height = 2.6 if trend.reference is None else 5.4
-    return Picture("course of the lifetime", height, partial(draw_trend, trend=trend))
+    ends = [when(point.time, trend.dated) for point in trend.points[:1] + trend.points[-1:]]
+    source = f"{len(trend.points)} decays, {' to '.join(ends)}"
+    return Picture("course of the lifetime", height, partial(draw_trend, trend=trend), source)
 
 
 def draw_trend(figure: FigureBase, trend: Trend) -> None:
@@ -48,9 +50,7 @@ def draw_trend(figure: FigureBase, trend: Trend) -> None:
             axes.axvline(_at(trend, alarm.since), color=RED, lw=1.2, ls="--")
     panels[-1].set(xlabel="UTC" if trend.dated else "time, h")
     if trend.dated:
-        locator = AutoDateLocator()
-        panels[-1].xaxis.set_major_locator(locator)
-        panels[-1].xaxis.set_major_formatter(ConciseDateFormatter(locator))
+        date_axis(panels[-1])
 
 
 def _at(trend: Trend, time: float) -> np.datetime64 | float:

@@ -1,5 +1,7 @@
 """The Taylor difference equation against a plain loop, and identified back from its own output."""
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -45,6 +47,24 @@ def test_second_degree_has_every_product_once():
     p = np.random.default_rng(2).normal(size=20)
     expected = p.reshape(2, 10) @ monomials
     np.testing.assert_allclose(both(np.array([*p, y, z, u])), expected, rtol=1e-14)
+
+
+def test_second_degree_is_the_taylor_series_of_a_process():
+    """Eq 2: λ are first derivatives, halves of second ones; what remains is of third order."""
+
+    def process(past):
+        return jnp.exp(0.4 * past[0]) * jnp.sin(1.0 + past[1]) - jnp.sin(1.0)
+
+    zero = jnp.zeros(2)
+    slope, bend = jax.grad(process)(zero), jax.hessian(process)(zero)
+    p = [process(zero), *slope, 0.5 * bend[0, 0], bend[0, 1], 0.5 * bend[1, 1]]
+    series = TaylorDifference(("u",), ("y",), y_past=1, u_past=0, degree=2)
+
+    def remainder(step):
+        past = step * jnp.array([1.0, -0.7])
+        return float(process(past) - series(jnp.array([*p, *past]))[0])
+
+    assert remainder(0.01) / remainder(0.005) == pytest.approx(8.0, rel=0.02)
 
 
 def simulated(model, data):

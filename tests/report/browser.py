@@ -10,6 +10,7 @@ import subprocess
 NAME = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 # Widths in px: a telephone, a screen, and A4 less the margins of the page.
 WIDTHS = {"phone": 400, "screen": 1280, "print": 673}
+OPEN = "document.querySelectorAll('details').forEach(folded => folded.open = true)"
 SEEN = """JSON.stringify({
   wide: document.documentElement.scrollWidth - document.documentElement.clientWidth,
   cut: [...document.querySelectorAll(".wide")].some(e => e.scrollWidth > e.clientWidth + 1),
@@ -53,15 +54,27 @@ class Chromium:
             self.events.append(answer)
         return answer["result"]
 
+    def _open(self, page):
+        self.ask("Page.navigate", url=page.as_uri())
+        while not any(e["method"] == "Page.loadEventFired" for e in self.events):
+            self.events.append(self._message())
+
+    def screen(self, page):
+        """The first screen of a page, 1280 by 800, as PNG."""
+        self.events.clear()
+        size = {"width": 1280, "height": 800, "deviceScaleFactor": 1, "mobile": False}
+        self.ask("Emulation.setDeviceMetricsOverride", **size)
+        self._open(page)
+        return base64.b64decode(self.ask("Page.captureScreenshot", format="png")["data"])
+
     def faults(self, page, width, pictures):
         """What is wrong with a page of so many pictures at a width, in words."""
         self.events.clear()
         size = {"width": WIDTHS[width], "height": 900, "deviceScaleFactor": 1, "mobile": False}
         self.ask("Emulation.setDeviceMetricsOverride", **size)
         self.ask("Emulation.setEmulatedMedia", media="print" if width == "print" else "screen")
-        self.ask("Page.navigate", url=page.as_uri())
-        while not any(e["method"] == "Page.loadEventFired" for e in self.events):
-            self.events.append(self._message())
+        self._open(page)
+        self.ask("Runtime.evaluate", expression=OPEN)
         seen = json.loads(self.ask("Runtime.evaluate", expression=SEEN)["result"]["value"])
         found = [f"{seen['wide']} px to scroll sideways"] * (seen["wide"] > 0)
         found += ["a table is cut off"] * (seen["cut"] and width != "phone")
