@@ -83,7 +83,10 @@ class Factor:
         """A⁻¹, of a sparse A only at the places of its factors."""
         if sparse.issparse(self.matrix):
             return _selected(self.factors)
-        return self.solve(np.eye(len(self.matrix)))
+        factor, lower = self.factors
+        found = linalg.lapack.dpotri(factor, lower=lower)[0]
+        half = np.tril(found) if lower else np.triu(found)
+        return half + half.T - np.diag(half.diagonal())
 
     def loss(self, more: np.ndarray) -> np.ndarray:
         """Diagonal of A⁻¹ diag(more) A⁻¹: how fast that of A⁻¹ falls with what A has more.
