@@ -31,7 +31,7 @@ LIMIT = "NAME=LOW:HIGH, one of them may be left out, such as level=:3"
 
 @click.command(cls=Command, epilog=EXAMPLE)
 @click.argument("record", nargs=-1, required=True)
-@options("model map input output step delay no-offset response-gain")
+@options("model map input output step delay no-offset")
 @option(
     "--set OUTPUT=VALUE[@SECONDS]",
     "Target of an output, from a time on.",
@@ -50,12 +50,6 @@ LIMIT = "NAME=LOW:HIGH, one of them may be left out, such as level=:3"
     "Added to an output in the simulation, from a time on.",
     multiple=True,
 )
-@option(
-    "--hard OUTPUT=SHARE:LOAD",
-    "Keep an output's limits for certain: with gains off by a share, such as 0.2, and with "
-    "disturbances up to a size.",
-    multiple=True,
-)
 @option("--horizon STEPS", "Steps of a plan.", type=click.IntRange(2))
 @option("--every SAMPLES", "Samples of the runs in a step of control.", type=click.IntRange(1))
 @option("--smooth", "Cost of input changes against errors.", type=float, default=0.1)
@@ -70,7 +64,6 @@ def control(
     limit: tuple[str, ...],
     rate: tuple[str, ...],
     disturb: tuple[str, ...],
-    hard: tuple[str, ...],
     duration: float | None,
     seed: int,
     report: str | None,
@@ -97,7 +90,7 @@ def control(
     from beamfit.dynamics.fit import identify
     from beamfit.dynamics.loop import simulate_loop
 
-    settings = {n: told[n] for n in ("delay", "hidden", "gains")}
+    settings = {n: told[n] for n in ("delay", "hidden")}
     settings |= {"offset": not no_offset, "seed": seed}
     wished = [name for name in outputs if name in {t[0] for t in targets} | set(limits)]
     fits = [identify(runs, model, map, output=name, **settings) for name in wished or outputs]
@@ -106,7 +99,6 @@ def control(
         inputs={n: v for n, v in limits.items() if n in inputs},
         rates=rates,
         outputs={n: v for n, v in limits.items() if n in outputs},
-        hard=gains_of(hard, "hard", "OUTPUT=SHARE:LOAD such as level=0.2:0.5"),
         **{n: told[n] for n in ("horizon", "every", "smooth")},
     )
     loop = simulate_loop(fits, made, targets, disturbances=loads, duration=duration, seed=seed)

@@ -33,7 +33,7 @@ Examples:
 
 @click.command(cls=Command, epilog=EXAMPLE)
 @click.argument("record", nargs=-1, required=True)
-@options("model order map input output step delay no-offset response-gain")
+@options("model order map input output step delay no-offset")
 @option("--hold-back RECORD", "A run that is only predicted.", multiple=True)
 @options("hidden columns ignore skip-bad seed report json")
 def identify(
@@ -43,7 +43,6 @@ def identify(
     map: str,
     delay: int | None,
     no_offset: bool,
-    gains: dict[str, tuple[float, float]],
     hidden: int,
     hold_back: tuple[str, ...],
     seed: int,
@@ -61,8 +60,6 @@ def identify(
     """
     if order is not None and model != STATES:
         raise InputError(f"--order {order} with --model {model}", f"--model {STATES}")
-    if gains and model in (STATES, FED_BATCH):
-        raise InputError(f"--gain with --model {model}", "--model first-order or second-order")
     if model == FED_BATCH and (map != "network" or delay or no_offset):
         expected = "--map network, without --delay or --no-offset: its rates are a network's"
         raise InputError(f"--model {FED_BATCH}", expected)
@@ -87,7 +84,7 @@ def identify(
     else:
         from beamfit.dynamics.fit import identify as fit_response
 
-        options |= {"model": model, "delay": delay, "gains": gains}
+        options |= {"model": model, "delay": delay}
         fits = [fit_response(runs, output=name, **options) for name in runs[0].outputs]
     digests = {path: digest(path) for path in (*record, *hold_back)}
     reported(report, fits, digests)

@@ -14,7 +14,7 @@ from beamfit.dynamics.model import CLOSE, PreparedOutput, output_of, predicted
 from beamfit.dynamics.noise import noise_of
 from beamfit.greybox.fit import Fit
 from beamfit.greybox.memory import Memory
-from beamfit.greybox.problem import Constraint, Free, Prior, Problem, Record
+from beamfit.greybox.problem import Free, Prior, Problem, Record
 from beamfit.greybox.solve import solve
 from beamfit.noise.correlated import Noise, innovations, remembers
 from beamfit.status import Status
@@ -24,7 +24,7 @@ AGAIN, GAINED = 3, 0.05
 
 
 class Case(NamedTuple):
-    """A fit to be made: prepared outputs, runs, free numbers, priors and limits.
+    """A fit to be made: prepared outputs, runs, free numbers and priors.
 
     A course is a run as its model sees it: `model.Driven` or `shooting.Course`.
     """
@@ -33,7 +33,6 @@ class Case(NamedTuple):
     courses: tuple[Any, ...]
     free: tuple[Free, ...]
     priors: tuple[Prior, ...]
-    limits: tuple[Constraint, ...] = ()
 
     @property
     def guess(self) -> np.ndarray:
@@ -91,7 +90,7 @@ class Case(NamedTuple):
                 predict = _surprising
             records.append(Record(f"run {i + 1}", predict, course, y, error, worth=worth))
         free = [*self.free, *([Free("nodes", nuisance=True)] if cuts else [])]
-        return Problem(model, free, records, self.priors, self.limits)
+        return Problem(model, free, records, self.priors)
 
     def search(
         self, model: Any, noise: np.ndarray, steps: int, memory: Noise | None = None, gap: Any = ()

@@ -27,6 +27,9 @@ from beamfit.greybox.fit import Fit
 LAGS, PAST, LATER, ORDER = 20, 10, 5, 8
 # Time constants of the additional paths in the test for a fuller model.
 SLOW = 5
+# An input is band-limited if its changes have less than the share `FAINT` of their power above the
+# share `HIGH` of the highest frequency; white ones have a tenth there, noise that is fed back too.
+HIGH, FAINT = 0.9, 2e-3
 # Share of an input's variance, independent of other inputs, below which its gain is not separable.
 ALONE = 1e-3
 
@@ -57,6 +60,8 @@ class Checks(NamedTuple):
         Inputs that the others give but for a thousandth of their variance.
     first_order : bool
         Whether a first order does as well.
+    band_limited : tuple of str
+        Inputs without high frequencies, which move between samples; that goes with later inputs.
     """
 
     free_run_percent: float
@@ -70,6 +75,7 @@ class Checks(NamedTuple):
     against_constant: float | None
     together: tuple[str, ...] = ()
     first_order: bool = False
+    band_limited: tuple[str, ...] = ()
 
     def rows(self) -> list[list[str]]:
         """Label and value."""
@@ -135,7 +141,21 @@ def checks_of(
         later,
         gain,
         _together(seen),
+        band_limited=_band_limited(seen),
     )
+
+
+def _band_limited(seen: PreparedOutput) -> tuple[str, ...]:
+    """Inputs of runs at equal steps that have no high frequencies."""
+    high, whole = np.zeros(len(seen.inputs)), np.zeros(len(seen.inputs))
+    for run in seen.runs:
+        count = int(np.count_nonzero(np.asarray(run.dt)))
+        rows = slice(0, count + 1, 1 if run.held is None else 2)
+        changes = np.diff(np.asarray(run.u)[rows], axis=0)
+        power = np.abs(np.fft.rfft(changes * np.hanning(len(changes))[:, None], axis=0)) ** 2
+        high += power[int(HIGH * len(power)) :].sum(axis=0)
+        whole += power.sum(axis=0)
+    return tuple(np.array(seen.inputs)[(high < FAINT * whole) & (whole > 0)].tolist())
 
 
 def _together(seen: PreparedOutput) -> tuple[str, ...]:
@@ -274,4 +294,4 @@ def predict_held(run: Run, output: str, fit: Fit, physics: Physics, delay: float
     target = y - base - float(fit.model["offset"])
     first = np.linalg.lstsq(moved, target, rcond=1e-10)[0]
     rest = target - moved @ first
-    return HeldOutRun(run.name, percent(rest, y), float(rest.std()))
+    return HeldOutRun(run.name, percent(rest, y), float(np.sqrt(np.mean(rest**2))))

@@ -8,7 +8,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from beamfit.dynamics.certified_limits import certain_range
 from beamfit.dynamics.fit import ResponseFit
 from beamfit.dynamics.model import parameters_at, predicted
 from beamfit.dynamics.receding import Controller, ControlLimits, Response
@@ -29,7 +28,6 @@ def controller(
     inputs: Mapping[str, tuple[float, float]] | None = None,
     rates: Mapping[str, float] | None = None,
     outputs: Mapping[str, tuple[float, float]] | None = None,
-    hard: Mapping[str, tuple[float, float]] | None = None,
     horizon: int | None = None,
     every: int | None = None,
     smooth: float = 0.1,
@@ -44,10 +42,6 @@ def controller(
         Limits. An input keeps to the range of the runs unless told: beyond it nothing is known.
     rates : mapping of str to float, optional
         Largest change of an input in a second.
-    hard : mapping of str to (float, float), optional
-        Outputs whose limits shall hold for certain: for processes whose gains are off by up to such
-        a share, whatever their time constants, and for disturbances up to such a size. The range
-        of the inputs is narrowed until that is so (`beamfit.dynamics.certified_limits`).
     horizon : int, optional
         Steps of a plan; to where 5 % of a transient is left, 8 to 40 and the delay, if None.
     every : int, optional
@@ -63,8 +57,7 @@ def controller(
     Raises
     ------
     InputError
-        If a limit names nothing, is no range, or a number is not positive; if hard limits cannot be
-        certified of a model, or no inputs keep them.
+        If a limit names nothing, is no range, or a number is not positive.
 
     Notes
     -----
@@ -94,10 +87,6 @@ def controller(
     usual = {n: (v.min(), v.max()) for n, v in zip(names, values.T, strict=True)}
     low, high = _ranges(names, inputs or {}, usual)
     below, above = _ranges([fit.output for fit in fits], outputs or {}, {})
-    if hard:
-        ends = {r.name: (a + r.margin, b - r.margin)
-                for r, a, b in zip(responses, below, above, strict=True)}  # fmt: skip
-        low, high = certain_range(fits, hard, (low, high), ends)
     rate = step * np.array([_rates(names, rates or {}).get(name, np.inf) for name in names])
     limits = ControlLimits(low, high, rate, below, above)
     return Controller(names, responses, step, seen.wide, limits, horizon, smooth)

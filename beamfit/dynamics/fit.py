@@ -2,23 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from beamfit.dynamics.case import used_by
 from beamfit.dynamics.checks import Checks, HeldOutRun, checks_of, predict_held, slopes_of
 from beamfit.dynamics.curve import Curve, curves_of, quantities_of, told
-from beamfit.dynamics.limits import limited
 from beamfit.dynamics.misread import Misread, sound
 from beamfit.dynamics.model import PreparedOutput, network_of, output_of
 from beamfit.dynamics.noise import Noise
 from beamfit.dynamics.record import Run, check_inputs, checked
 from beamfit.dynamics.response import PHYSICS
-from beamfit.dynamics.settle import begun, case_of, is_first_order, remembering, within
+from beamfit.dynamics.settle import begun, case_of, is_first_order, remembering
 from beamfit.dynamics.starts import latest
 from beamfit.dynamics.verdict import ResponseEvidence, judged, rms_of
 from beamfit.errors import InputError, nearest
@@ -27,10 +26,6 @@ from beamfit.quantity import Quantity
 from beamfit.shown import shown
 from beamfit.status import Status
 from beamfit.table import Table, json_of
-
-if TYPE_CHECKING:
-    from beamfit.sampling.posterior import Posterior
-
 
 MAPS = ("constant", "network")
 LATEST = "The delay is the longest that was tried: say a longer one by --delay."
@@ -129,23 +124,6 @@ class ResponseFit:
             | {"left_out": [each._asdict() for each in self.left_out]}
         )
 
-    def sample(self, **options: Any) -> Posterior:
-        """Draw the free numbers of a response with constant parameters from their posterior.
-
-        Parameters
-        ----------
-        **options
-            As `beamfit.greybox.fit.Fit.sample`.
-
-        Raises
-        ------
-        InputError
-            If the parameters are a network: the weights are too many and stand for each other.
-        """
-        if self.map != "constant":
-            raise InputError("a posterior of a network", "constant parameters; curves have bands")
-        return self.fit.sample(**options)
-
 
 def identify(
     runs: Run | Sequence[Run],
@@ -159,7 +137,6 @@ def identify(
     starts: int = 3,
     seed: int = 0,
     held: Sequence[Run] = (),
-    gains: Mapping[str, tuple[float, float]] | None = None,
 ) -> ResponseFit:
     """Identify the response of an output to the inputs of some runs.
 
@@ -184,10 +161,6 @@ def identify(
         Hidden nodes of the network, starts of its training, seed of their weights.
     held : sequence of Run
         Runs that are only predicted.
-    gains : mapping of str to (float, float), optional
-        Limits of parameters and of their slopes by an input, such as {"K": (1.0, 3.0),
-        "dK/dvalve": (0.0, inf)}, which a network certainly keeps over the whole range of the runs;
-        of tau, T and zeta only signs of slopes.
 
     Returns
     -------
@@ -240,9 +213,6 @@ def identify(
         raw = np.asarray(first["map"])
         nets = (network_of(seen, physics, raw, hidden, seed + k) for k in range(starts))
         answer = remembering(case_of(seen, offset, True), [first | {"map": net} for net in nets])
-    if gains:
-        limits = limited(gains, seen, physics, map == "network")
-        answer = within(case_of(seen, offset, map == "network", limits), answer)
     checks = checks_of(
         seen,
         tuple(rest for (rest,) in answer.rest),

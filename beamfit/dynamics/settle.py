@@ -8,16 +8,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from beamfit.dynamics.case import (
-    AGAIN,
     GAINED,
     Case,
     Settled,
     information,
-    rounds,
     settled,
     with_memory,
 )
-from beamfit.dynamics.limits import LimitedParameter
 from beamfit.dynamics.model import PreparedOutput, weight_priors
 from beamfit.dynamics.noise import Noise
 from beamfit.dynamics.record import Run
@@ -29,16 +26,12 @@ from beamfit.greybox.problem import Free
 STEPS, ROUNDS = 100, 30
 
 
-def case_of(
-    seen: PreparedOutput, offset: bool, network: bool = False, told: LimitedParameter | None = None
-) -> Case:
-    """The case of one output: constant raw numbers or a network of them, within limits if told."""
-    ends = {} if told is None or network else {"lower": told.lower, "upper": told.upper}
-    free = [Free("start", nuisance=True), Free("map", nuisance=network, **ends)]
+def case_of(seen: PreparedOutput, offset: bool, network: bool = False) -> Case:
+    """The case of one output: constant raw numbers or a network of them."""
+    free = [Free("start", nuisance=True), Free("map", nuisance=network)]
     free += [Free("offset")] if offset else []
     free += [] if seen.runs[0].held is None else [Free("late")]
-    priors = weight_priors("map") if network else ()
-    return Case((seen,), seen.runs, tuple(free), priors, () if told is None else told.constraints)
+    return Case((seen,), seen.runs, tuple(free), weight_priors("map") if network else ())
 
 
 def _round(case: Case, model: Any, noise: np.ndarray, memory: Noise | None = None) -> Settled:
@@ -82,15 +75,3 @@ def is_first_order(found: Begun, offset: bool) -> bool:
     lower = found.seen._replace(runs=driven_by(found.seen, FIRST_ORDER))
     start = best_start(lower, offset)
     return remembering(case_of(lower, offset), [start.model]).likelihood <= found.plain.likelihood
-
-
-def within(case: Case, found: Settled) -> Settled:
-    """A fit brought within the limits of a case; as it is where it keeps them."""
-    problem = case.problem(found.fit.model | {"late": 0.0}, found.noise, found.memory)
-    values = np.asarray(problem.constraint_values(problem.start))
-    kept = (values >= problem.constraint_lower) & (values <= problem.constraint_upper)
-    kept = np.append(kept, (problem.start >= problem.lower) & (problem.start <= problem.upper))
-    if kept.all():
-        return found
-    again, _ = rounds(found, lambda f: _round(case, f.fit.model, f.noise, f.memory), GAINED, AGAIN)
-    return again._replace(errors=found.errors)

@@ -55,8 +55,6 @@ def rms_of(fit: Fit) -> float:
 
 
 def _lost(e: ResponseEvidence) -> Finding | None:
-    if e.fit.status is Status.infeasible:
-        return Finding(Status.infeasible, e.fit.message)
     if e.rests:
         return None
     lost = e.fit.status is Status.not_finite
@@ -116,6 +114,14 @@ def _fed_back(e: ResponseEvidence) -> Finding | None:
     c = e.checks
     if c.feedback_probability >= POOR_FIT:
         return None
+    if c.band_limited:
+        cause = (
+            f"Inputs of the same moment and later explain {100 * c.feedback_share:.0f} % of the "
+            f"residuals (p = {c.feedback_probability:.1g}), and {', '.join(c.band_limited)} has no "
+            "high frequencies: it moves between samples, where the model holds each value until "
+            "the next."
+        )
+        return Finding(Status.poor_fit, cause, "Sample faster, or hold inputs between samples.")
     cause = (
         f"Inputs of the same moment and later go with {100 * c.feedback_share:.0f} % of the noise "
         f"(p = {c.feedback_probability:.1g}): they were set from the output (feedback). What noise "
@@ -159,9 +165,6 @@ def _good(e: ResponseEvidence) -> Finding:
     gains = [q for name, q in e.quantities.items() if name.startswith("K")]
     if gains and all(q.error is not None and abs(q.value) < 2 * q.error for q in gains):
         cause += " All gains are compatible with 0: only the return of the output to rest is seen."
-    held = [c.name for c in e.fit.constraints if c.state in ("lower", "upper")]
-    if held:
-        cause += f" Limits reached: {', '.join(held[:3])}."
     gain = e.checks.against_constant
     if gain is not None and gain < 0:
         cause += " Constant parameters fit as well (BIC): the operating point is not needed."
