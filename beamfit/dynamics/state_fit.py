@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from beamfit.dynamics.case import Case, Settled, used_by
-from beamfit.dynamics.checks import Checks, HeldOutRun, checks_of, percent
+from beamfit.dynamics.checks import Checks, HeldOutRun, RunSlopes, checks_of, percent
 from beamfit.dynamics.curve import quantity
 from beamfit.dynamics.model import PreparedOutput, weight_priors
 from beamfit.dynamics.noise import Noise
@@ -332,8 +332,8 @@ def answer(
         own = [case.split(i, each)[k] for i, each in enumerate(slopes)]
         fitted = tuple(y - r for y, r in zip(s.measured, rest, strict=True))
         added = [_added(s, i, y) for i, y in enumerate(fitted)]
-        pairs = list(zip(own, added, strict=True))
-        checks = checks_of(s, rest, pairs, max(1, used // len(case.seen)), gain, delay)
+        pairs = (RunSlopes(o, a, o[:, :0]) for o, a in zip(own, added, strict=True))
+        checks = checks_of(s, rest, list(pairs), max(1, used // len(case.seen)), gain, delay)
         parts.append(StateSpaceOutput(list(runs[0].outputs)[k], runs, s, fitted, checks))
     ahead = _ahead(case, found, held, delay)
     nothing = all(part.checks.nothing_probability >= POOR_FIT for part in parts)
@@ -375,10 +375,9 @@ def _ahead(
         sizes = np.array([[np.sqrt(np.mean(found.noise[:, k] ** 2)) for k in range(len(one.seen))]])
         (rest,) = one.rest(begun(one, model, sizes))
         for s, r in zip(one.seen, rest, strict=True):
+            y = s.measured[0] - s.measured[0].mean()
             ahead[s.output].append(
-                HeldOutRun(
-                    run.name, percent(r, s.measured[0] - s.measured[0].mean()), float(r.std())
-                )
+                HeldOutRun(run.name, percent(r, y), float(np.sqrt(np.mean(r**2))))
             )
     names = [s.output for s in case.seen]
     return {name: tuple(ahead.get(name, ())) for name in names}

@@ -141,6 +141,10 @@ def _refuted(e: ResponseEvidence) -> Finding | None:
         f"the residuals (p = {c.input_probability:.1g}): the model lacks a part of the response. "
         f"The free run explains {c.free_run_percent:.1f} % of the output."
     )
+    if c.law is not None:
+        cause += f" Most of it is {c.law}; what moves up and down then differs."
+        remedy = "Go to each value from the same side, or move by much more than the width."
+        return Finding(Status.poor_fit, cause, remedy)
     more = "parameters that change with the operating point (--map network), or a higher order"
     more = "a higher order" if e.map == "network" else more
     return Finding(Status.poor_fit, cause, f"Try {more}.")
