@@ -23,10 +23,9 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from beamfit.dynamics.control import controller
+from beamfit.dynamics.control import Controller, ControlLimits, Response, controller
 from beamfit.dynamics.fit import identify
 from beamfit.dynamics.loop import closed_loop
-from beamfit.dynamics.receding import Controller, ControlLimits, Response
 from beamfit.dynamics.record import Run
 from beamfit.dynamics.response import FIRST_ORDER, SECOND_ORDER, simulate
 

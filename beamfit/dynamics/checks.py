@@ -22,7 +22,7 @@ from beamfit.dynamics.model import (
 )
 from beamfit.dynamics.record import Run
 from beamfit.dynamics.response import FIRST_ORDER, Physics, simulate
-from beamfit.dynamics.starts import driven_by, unit_outputs
+from beamfit.dynamics.search import driven_by, unit_outputs
 from beamfit.greybox.fit import Fit
 from beamfit.statistics import POOR_FIT
 

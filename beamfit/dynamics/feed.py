@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from beamfit.dynamics.fedbatch_model import STATES, Batches, batches_of
+from beamfit.dynamics.balances import STATES, Batches, batches_of
 from beamfit.dynamics.titre import TITRE, TitreFit, predicted
 from beamfit.errors import InputError
 from beamfit.greybox.fit import Fit

@@ -9,19 +9,33 @@ from typing import Any
 
 import numpy as np
 
-from beamfit.dynamics.case import used_by
+from beamfit.dynamics.answer import (
+    Curve,
+    ResponseEvidence,
+    curves_of,
+    judged,
+    quantities_of,
+    rms_of,
+    told,
+)
+from beamfit.dynamics.bad_readings import Misread, sound
 from beamfit.dynamics.checks import Checks, HeldOutRun, checks_of, predict_held, slopes_of
-from beamfit.dynamics.curve import Curve, curves_of, quantities_of, told
-from beamfit.dynamics.misread import Misread, sound
 from beamfit.dynamics.model import PreparedOutput, network_of, output_of
-from beamfit.dynamics.noise import Noise
 from beamfit.dynamics.record import Run, check_inputs, checked
 from beamfit.dynamics.response import PHYSICS
-from beamfit.dynamics.settle import begun, case_of, is_first_order, remembering
-from beamfit.dynamics.starts import latest
-from beamfit.dynamics.verdict import ResponseEvidence, judged, rms_of
+from beamfit.dynamics.search import (
+    Begun,
+    Settled,
+    begun,
+    case_of,
+    is_first_order,
+    latest,
+    remembering,
+    used_by,
+)
 from beamfit.errors import InputError, nearest
 from beamfit.greybox.fit import Fit
+from beamfit.noise.correlated import Noise
 from beamfit.quantity import Quantity
 from beamfit.shown import shown
 from beamfit.status import Status
@@ -202,40 +216,50 @@ def identify(
     shortest = min(len(run) for run in runs)
     if delay is not None and not 0 <= delay < shortest - 1:
         raise InputError(f"a delay of {delay} samples", f"less than the {shortest} rows of a run")
-    given = delay
     runs, left_out, found = sound(
-        runs, output, lambda these: begun(these, output, physics, given, offset)
+        runs, output, lambda these: begun(these, output, physics, delay, offset)
     )
-    seen, delay, plain = found
-    answer = plain
+    answer = found.plain
     if map == "network":
-        first = plain.fit.model
-        raw = np.asarray(first["map"])
-        nets = (network_of(seen, physics, raw, hidden, seed + k) for k in range(starts))
-        answer = remembering(case_of(seen, offset, True), [first | {"map": net} for net in nets])
+        answer = _with_network(found, offset, hidden, range(seed, seed + starts))
+    checks, quantities, curves = _known(found, answer, offset, map)
+    fit, late = answer.fit, found.delay
+    ahead = tuple(predict_held(each, output, fit, physics, late) for each in held)
+    evidence = (fit, answer.rests, checks, quantities, curves, ahead, map)
+    status, message = judged({output: ResponseEvidence(*evidence, rms_of(fit))})
+    longest = [LATEST] if delay is None and late == latest(runs) > 0 else []
+    message = " ".join([message, *longest, *(f"Left out: {each}." for each in left_out)])
+    late = late if late % 1 == 0 else late + float(fit.model["late"])
+    noise = tuple(answer.noise[:, 0].tolist())
+    parts = (quantities, curves, noise, answer.memory, checks, ahead, left_out)
+    return ResponseFit(output, status, message, model, map, late, runs, found.seen, fit, *parts)
+
+
+def _with_network(found: Begun, offset: bool, hidden: int, seeds: range) -> Settled:
+    """The best fit with a network of parameters, from the constant ones."""
+    seen, first = found.seen, found.plain.fit.model
+    physics, raw = seen.runs[0].physics, np.asarray(first["map"])
+    nets = (network_of(seen, physics, raw, hidden, seed) for seed in seeds)
+    return remembering(case_of(seen, offset, True), [first | {"map": net} for net in nets])
+
+
+def _known(
+    found: Begun, answer: Settled, offset: bool, map: str
+) -> tuple[Checks, dict[str, Quantity], tuple[Curve, ...]]:
+    """Tests of the residuals, and what the runs determine of constants or curves."""
+    seen, constant = found.seen, map == "constant"
     checks = checks_of(
         seen,
         tuple(rest for (rest,) in answer.rest),
         slopes_of(seen, answer.fit),
         used_by(answer.fit),
-        plain.likelihood - answer.likelihood if map == "network" else None,
-        int(np.ceil(delay)) * (1 if delay % 1 == 0 else 2),  # in rows
+        None if constant else found.plain.likelihood - answer.likelihood,
+        int(np.ceil(found.delay)) * (1 if found.delay % 1 == 0 else 2),  # in rows
     )
-    checks = checks._replace(first_order=map == "constant" and is_first_order(found, offset))
-    quantities = (
-        quantities_of(answer.fit, answer.errors, seen, physics, delay) if map == "constant" else {}
-    )
-    curves = curves_of(answer.fit, answer.errors, seen) if map == "network" else ()
-    quantities, curves = told(quantities, curves, seen, checks)
-    ahead = tuple(predict_held(each, output, answer.fit, physics, delay) for each in held)
-    evidence = (answer.fit, answer.rests, checks, quantities, curves, ahead, map)
-    status, message = judged({output: ResponseEvidence(*evidence, rms_of(answer.fit))})
-    late = [LATEST] if given is None and delay == latest(runs) > 0 else []
-    message = " ".join([message, *late, *(f"Left out: {each}." for each in left_out)])
-    delay = delay if delay % 1 == 0 else delay + float(answer.fit.model["late"])
-    noise = tuple(answer.noise[:, 0].tolist())
-    parts = (quantities, curves, noise, answer.memory, checks, ahead, left_out)
-    return ResponseFit(output, status, message, model, map, delay, runs, seen, answer.fit, *parts)
+    checks = checks._replace(first_order=constant and is_first_order(found, offset))
+    parts = answer.fit, answer.errors, seen
+    quantities = quantities_of(*parts, seen.runs[0].physics, found.delay) if constant else {}
+    return checks, *told(quantities, () if constant else curves_of(*parts), seen, checks)
 
 
 def _output(run: Run, output: str | None) -> str:

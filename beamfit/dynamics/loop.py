@@ -12,8 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.signal import lfilter
 
+from beamfit.dynamics.control import Controller, advance, moved, settled, start
 from beamfit.dynamics.fit import ResponseFit
-from beamfit.dynamics.receding import Controller, advance, moved, settled, start
 from beamfit.errors import InputError, nearest
 from beamfit.shown import shown
 from beamfit.status import Status

@@ -199,6 +199,22 @@ def test_inputs_that_were_set_from_the_output_are_named(closed):
         assert not closed or fit.status is Status.poor_fit
 
 
+def test_good_readings_that_a_wrong_model_misses_are_kept():
+    """A response that first goes the wrong way, as a first order: 14 readings were left out."""
+    t, rng = 0.5 * np.arange(400), np.random.default_rng(1)
+    u = np.repeat(rng.uniform(0, 3, 10), 40)
+    # (2 - 2 s)/((2 s + 1)(3 s + 1)) = 8/(3 s + 1) - 6/(2 s + 1)
+    level = sum(
+        np.asarray(simulate(FIRST_ORDER, jnp.tile(jnp.array(p), (400, 1)), jnp.asarray(u)[:, None],
+                            jnp.full(400, 0.5), jnp.zeros(1)))
+        for p in ([3.0, 8.0], [2.0, -6.0])
+    )  # fmt: skip
+    level = level + 0.003 * level.std() * rng.normal(size=400)
+    fit = identify(Run(t, {"valve": u}, {"level": level}))
+    assert fit.status is Status.poor_fit
+    assert not fit.left_out
+
+
 def lawful(law, seed, noise=0.05, n=300):
     """A first order, K = 2, behind a play or a stop of the valve, or behind none."""
     rng, half = np.random.default_rng(seed), 0.6 if law == "stop" else 0.2
