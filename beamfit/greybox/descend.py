@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from beamfit.greybox.factors import FEW, RIDGE, Factor, Rows, in_units, lengths, with_diagonal
+from beamfit.greybox.covariance import FEW, RIDGE, Factor, Rows, in_units, lengths, with_diagonal
 from beamfit.greybox.problem import Problem, sloped, with_slope
 from beamfit.greybox.problem import residual as problem_residual
 
