@@ -46,7 +46,6 @@ def identify(
     hidden: int = 5,
     seed: int = 1,
     held: Sequence[Run] = (),
-    gains: Limits | None = None,
 ) -> tuple[ResponseFit | StatesFit | FedBatchFit | TitreFit, ...]:
     """Identify how the outputs of a process respond to its inputs.
 
@@ -68,8 +67,6 @@ def identify(
         Hidden nodes of a network, seed of its weights.
     held : sequence of Run or path
         Runs that are only predicted.
-    gains : mapping of str to (float, float), optional
-        Limits that parameters keep for certain, such as {"K": (1.0, 3.0)}.
 
     Returns
     -------
@@ -89,7 +86,7 @@ def identify(
     >>> list(level.quantities), level.status.value
     (['tau', 'K', 'offset'], 'poor_fit')
     """
-    check_model(model, map, order=order, delay=delay, offset=offset, gains=gains)
+    check_model(model, map, order=order, delay=delay, offset=offset)
     runs = [runs] if not isinstance(runs, list | tuple) else runs
     options: dict[str, Any] = {"hidden": hidden, "seed": seed, "held": tuple(held)}
     if model == FED_BATCH:
@@ -105,7 +102,7 @@ def identify(
         return (identify_states(runs, order, map, delay=delay or 0, offset=offset, **options),)
     from beamfit.dynamics.fit import identify as respond
 
-    options |= {"delay": delay, "offset": offset, "gains": gains}
+    options |= {"delay": delay, "offset": offset}
     return tuple(respond(runs, model, map, output=name, **options) for name in runs[0].outputs)
 
 
@@ -116,7 +113,6 @@ def check_model(
     order: int | None = None,
     delay: int | None = None,
     offset: bool = True,
-    gains: Limits | None = None,
 ) -> None:
     """Refuse options that do not belong to a model, in the words of the command line.
 
@@ -127,8 +123,6 @@ def check_model(
     """
     if order is not None and model != STATES:
         raise InputError(f"--order {order} with --model {model}", f"--model {STATES}")
-    if gains and model in (STATES, FED_BATCH):
-        raise InputError(f"--gain with --model {model}", "--model first-order or second-order")
     if model == FED_BATCH and (map != "network" or delay or not offset):
         expected = "--map network, without --delay or --no-offset: its rates are a network's"
         raise InputError(f"--model {FED_BATCH}", expected)
@@ -141,13 +135,11 @@ def control(
     limits: Limits | None = None,
     rates: Mapping[str, float] | None = None,
     disturbances: Steps = (),
-    hard: Limits | None = None,
     model: str = "first-order",
     map: str = "constant",
     delay: int | None = None,
     offset: bool = True,
     hidden: int = 5,
-    gains: Limits | None = None,
     horizon: int | None = None,
     every: int | None = None,
     smooth: float = 0.1,
@@ -166,9 +158,9 @@ def control(
         Of inputs, which keep to the range of the runs otherwise, and of outputs.
     rates : mapping of str to float, optional
         Largest change of an input in a second.
-    hard, horizon, every, smooth
+    horizon, every, smooth
         As for `beamfit.dynamics.control.controller`.
-    model, map, delay, offset, hidden, gains
+    model, map, delay, offset, hidden
         As for `identify`.
     duration : float, optional
         Time simulated, s; four horizons after the last change if None.
@@ -203,7 +195,7 @@ def control(
     from beamfit.dynamics.fit import identify as respond
     from beamfit.dynamics.loop import simulate_loop
 
-    options = {"delay": delay, "offset": offset, "hidden": hidden, "seed": seed, "gains": gains}
+    options = {"delay": delay, "offset": offset, "hidden": hidden, "seed": seed}
     wished = [name for name in outputs if name in {t[0] for t in targets} | set(limits)]
     fits = [respond(runs, model, map, output=name, **options) for name in wished or outputs]
     made = controller(
@@ -211,7 +203,6 @@ def control(
         inputs={n: v for n, v in limits.items() if n in inputs},
         rates=rates,
         outputs={n: v for n, v in limits.items() if n in outputs},
-        hard=hard,
         horizon=horizon,
         every=every,
         smooth=smooth,

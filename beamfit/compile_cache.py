@@ -6,11 +6,9 @@ imports no JAX.
 
 from __future__ import annotations
 
-import hashlib
 import os
 import warnings
 from pathlib import Path
-from typing import Any
 
 # JAX's own names; in the environment they have capitals. Everything is kept: a command compiles
 # hundreds of small functions in milliseconds each.
@@ -30,16 +28,15 @@ QUICK, TRIED = "xla_cpu_use_fusion_emitters", "0.10."
 # compiled in half the time. No other compiled function can call such a one.
 SELDOM = {"xla_backend_optimization_level": 0}
 
-# Functions of JAX that read, pack and unpack what is kept.
-OWN = ("get_executable_and_time", "compress_executable", "decompress_executable")
-
 
 def prepare_jax() -> None:
     """Import JAX with 64 bits, a compile cache, and quick compilation.
 
-    The cache is ``$XDG_CACHE_HOME/beamfit`` (or ``~/.cache/beamfit``); where nobody can write
-    there, or others can, code is compiled anew, as it is in the place of what is damaged. What the
-    user has set, in the environment or in ``jax.config``, stands. Calling it again does nothing.
+    All of it by JAX's public settings, for the whole process. The cache is
+    ``$XDG_CACHE_HOME/beamfit/jax`` (or ``~/.cache/…``); where nobody can write there, or others
+    can, code is compiled anew. So is what is damaged, with JAX's warning until the folder is
+    emptied. What the user has set, in the environment or in ``jax.config``, stands, but for
+    64 bits. Calling it again does nothing.
 
     Examples
     --------
@@ -60,13 +57,14 @@ def prepare_jax() -> None:
             jax.config.update(name, ours)
     if FOLDER.upper() not in os.environ and jax.config.jax_compilation_cache_dir is None:
         place = own_folder()
-        jax.config.update(FOLDER, place)
-        if place is not None:
-            _seal(Path(place))
+        code = None if place is None else Path(place, "jax")
+        if code is not None:  # apart from locks of magnets, so that it can be emptied
+            code.mkdir(mode=0o700, exist_ok=True)
+        jax.config.update(FOLDER, None if code is None else str(code))
 
 
 def own_folder() -> str | None:
-    """Cache folder of this user alone, or None; compiled code in it is executed.
+    """Cache folder of this user alone, or None; code compiled into it is executed.
 
     Examples
     --------
@@ -85,36 +83,3 @@ def own_folder() -> str | None:
         warnings.warn(f"{said}; chmod 700 and empty it", stacklevel=4)
         return None
     return str(folder) if os.access(folder, os.W_OK) else None
-
-
-def _seal(folder: Path) -> None:
-    """Keep code with its digest, and have what is damaged compiled anew in silence.
-
-    JAX warns of it in every process and does not replace it. It has no public place for this; in
-    a version that has not these functions, nothing is done.
-    """
-    from jax._src import compilation_cache as kept
-
-    try:
-        read, pack, unpack = (getattr(kept, name) for name in OWN)
-    except AttributeError:
-        return
-
-    def packed(code: bytes) -> bytes:
-        content = pack(code)
-        return hashlib.sha256(content).digest() + content
-
-    def unpacked(content: bytes) -> bytes:
-        if hashlib.sha256(content[32:]).digest() != content[:32]:
-            raise ValueError("damaged")
-        return unpack(content[32:])
-
-    def found(key: str, *rest: Any) -> Any:
-        try:
-            return read(key, *rest)
-        except Exception:
-            (folder / f"{key}-cache").unlink(missing_ok=True)
-            return None, None
-
-    for name, own in zip(OWN, (found, packed, unpacked), strict=True):
-        setattr(kept, name, own)

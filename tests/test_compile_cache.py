@@ -27,7 +27,7 @@ print(json.dumps([jax.config.jax_compilation_cache_dir, *counts, str(value.dtype
 CHOSEN = ("JAX_", "XLA_")
 
 
-def run(before="", **environment):
+def run(before="", warned="", **environment):
     kept = {k: v for k, v in os.environ.items() if not k.startswith(CHOSEN)}
     done = subprocess.run(
         [sys.executable, "-c", SCRIPT.format(before=before)],
@@ -36,22 +36,36 @@ def run(before="", **environment):
         text=True,
         check=True,
     )
-    assert done.stderr == ""
+    assert warned in done.stderr
+    assert bool(done.stderr) == bool(warned)
     return json.loads(done.stdout)
 
 
 def test_the_second_script_compiles_nothing(tmp_path):
     folder, hits, misses, dtype, _ = run(XDG_CACHE_HOME=str(tmp_path))
-    assert folder == str(tmp_path / "beamfit")
+    assert folder == str(tmp_path / "beamfit" / "jax")
     assert (hits, dtype) == (0, "float64")
     assert misses > 0
     assert run(XDG_CACHE_HOME=str(tmp_path))[1:3] == [misses, 0]
-    for path in (tmp_path / "beamfit").iterdir():  # damaged code is compiled anew in silence
+
+
+def test_damaged_code_is_compiled_anew_with_a_warning(tmp_path):
+    misses = run(XDG_CACHE_HOME=str(tmp_path))[2]
+    for path in (tmp_path / "beamfit" / "jax").iterdir():
         content = bytearray(path.read_bytes())
         content[len(content) // 2] ^= 4
         path.write_bytes(content)
-    assert run(XDG_CACHE_HOME=str(tmp_path))[1:3] == [0, misses]
-    assert run(XDG_CACHE_HOME=str(tmp_path))[1:3] == [misses, 0]
+    said = "Error reading persistent compilation cache entry"
+    assert run(warned=said, XDG_CACHE_HOME=str(tmp_path))[1:3] == [0, misses]
+
+
+def test_no_private_part_of_jax_is_replaced(tmp_path):
+    before = (
+        "from jax._src import compilation_cache as own; had = dict(vars(own)); import atexit\n"
+        "same = lambda: all(vars(own)[k] is v for k, v in had.items() if callable(v))\n"
+        "atexit.register(lambda: same() or sys.stderr.write('replaced'))"
+    )
+    run(before, XDG_CACHE_HOME=str(tmp_path))
 
 
 def test_a_folder_that_others_can_write_to_is_not_used(tmp_path, monkeypatch):
@@ -86,7 +100,7 @@ def test_what_the_user_has_set_stands(tmp_path):
     assert run(before, XDG_CACHE_HOME=str(tmp_path))[0] == mine
     off = "jax.config.update('jax_enable_compilation_cache', False)"
     assert run(off, XDG_CACHE_HOME=str(tmp_path))[1:3] == [0, 0]
-    assert not (tmp_path / "beamfit").exists() or not list((tmp_path / "beamfit").iterdir())
+    assert not list(tmp_path.glob("beamfit/jax/*"))
 
 
 ANSWER = """

@@ -32,7 +32,7 @@ LIMIT = "NAME=LOW:HIGH, one of them may be left out, such as level=:3"
 
 @click.command(cls=Command, epilog=EXAMPLE)
 @click.argument("record", nargs=-1, required=True)
-@options("model map input output step delay no-offset response-gain")
+@options("model map input output step delay no-offset")
 @option(
     "--set OUTPUT=VALUE[@SECONDS]",
     "Target of an output, from a time on.",
@@ -51,12 +51,6 @@ LIMIT = "NAME=LOW:HIGH, one of them may be left out, such as level=:3"
     "Added to an output in the simulation, from a time on.",
     multiple=True,
 )
-@option(
-    "--hard OUTPUT=SHARE:LOAD",
-    "Keep an output's limits for certain: with gains off by a share, such as 0.2, and with "
-    "disturbances up to a size.",
-    multiple=True,
-)
 @option("--horizon STEPS", "Steps of a plan.", type=click.IntRange(2))
 @option("--every SAMPLES", "Samples of the runs in a step of control.", type=click.IntRange(1))
 @option("--smooth", "Cost of input changes against errors.", type=float, default=0.1)
@@ -69,7 +63,6 @@ def control(
     limit: tuple[str, ...],
     rate: tuple[str, ...],
     disturb: tuple[str, ...],
-    hard: tuple[str, ...],
     report: str | None,
     as_json: bool,
     **told: Any,
@@ -84,7 +77,6 @@ def control(
     told |= {"limits": gains_of(limit, "limit", LIMIT), "rates": _rates(rate)}
     reading = {n: told.pop(n) for n in READING}
     runs = [read_run(path, **reading) for path in record]
-    told |= {"hard": gains_of(hard, "hard", "OUTPUT=SHARE:LOAD such as level=0.2:0.5")}
     told |= {"offset": not no_offset, "disturbances": loads}
     loop = beamfit.control(runs, targets, **told)  # JAX from here on
     digests = {path: digest(path) for path in record}

@@ -33,7 +33,7 @@ Examples:
 
 @click.command(cls=Command, epilog=EXAMPLE)
 @click.argument("record", nargs=-1, required=True)
-@options("model order map input output step delay no-offset response-gain")
+@options("model order map input output step delay no-offset")
 @option("--hold-back RECORD", "A run that is only predicted.", multiple=True)
 @options("hidden columns ignore skip-bad seed report json")
 def identify(
@@ -43,7 +43,6 @@ def identify(
     map: str,
     delay: int | None,
     no_offset: bool,
-    gains: dict[str, tuple[float, float]],
     hidden: int,
     hold_back: tuple[str, ...],
     seed: int,
@@ -59,7 +58,7 @@ def identify(
     one of all outputs, with its time constants and gains; a fed-batch process the rates of its
     balances.
     """
-    settings = {"order": order, "delay": delay, "offset": not no_offset, "gains": gains}
+    settings = {"order": order, "delay": delay, "offset": not no_offset}
     check_model(model, map, **settings)
     twice = [path for path in record if (*record, *hold_back).count(path) > 1]
     if twice:

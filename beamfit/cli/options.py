@@ -195,13 +195,6 @@ SHARED: dict[str, Callable[..., Any]] = {
         multiple=True,
         callback=_parsed(gains_of),
     ),
-    "response-gain": option(
-        "--gain NAME=LOW:HIGH",
-        "Limits that a parameter keeps for certain, K=1:3 or dK/dvalve=0:.",
-        name="gains",
-        multiple=True,
-        callback=_parsed(gains_of),
-    ),
     "anchor": option(
         "--anchor ANCHOR",
         "Networks: their tie to the lattice: first-principles=2%, a setting such as "

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -14,19 +15,26 @@ from beamfit.dynamics.model import (
     PreparedOutput,
     changed_by,
     driven,
+    output_of,
     parameters_at,
     predicted,
     steps_of,
 )
 from beamfit.dynamics.record import Run
 from beamfit.dynamics.response import FIRST_ORDER, Physics, simulate
-from beamfit.dynamics.starts import driven_by, unit_outputs
+from beamfit.dynamics.search import driven_by, unit_outputs
 from beamfit.greybox.fit import Fit
+from beamfit.statistics import POOR_FIT
 
 # Most lags of residuals, of earlier inputs, of later inputs, and of the whitening autoregression.
 LAGS, PAST, LATER, ORDER = 20, 10, 5, 8
 # Time constants of the additional paths in the test for a fuller model.
 SLOW = 5
+# An input is band-limited if its changes have less than the share `FAINT` of their power above the
+# share `HIGH` of the highest frequency; white ones have a tenth there, noise that is fed back too.
+HIGH, FAINT = 0.9, 2e-3
+# Half widths of a play, a stop or a dead zone that are looked for, as shares of an input's range.
+WIDTHS = (0.02, 0.05, 0.1, 0.2)
 # Share of an input's variance, independent of other inputs, below which its gain is not separable.
 ALONE = 1e-3
 
@@ -57,6 +65,11 @@ class Checks(NamedTuple):
         Inputs that the others give but for a thousandth of their variance.
     first_order : bool
         Whether a first order does as well.
+    law : str or None
+        What explains most of the residuals where a play, a stop or a dead zone of an input does
+        more than chance and than the other paths: its name, input and half width.
+    band_limited : tuple of str
+        Inputs without high frequencies, which move between samples; that goes with later inputs.
     """
 
     free_run_percent: float
@@ -70,6 +83,8 @@ class Checks(NamedTuple):
     against_constant: float | None
     together: tuple[str, ...] = ()
     first_order: bool = False
+    law: str | None = None
+    band_limited: tuple[str, ...] = ()
 
     def rows(self) -> list[list[str]]:
         """Label and value."""
@@ -108,22 +123,22 @@ def percent(rest: np.ndarray, y: np.ndarray) -> float:
 def checks_of(
     seen: PreparedOutput,
     residuals: tuple[np.ndarray, ...],
-    slopes: Sequence[tuple[np.ndarray, np.ndarray]],
+    slopes: Sequence[RunSlopes],
     used: int,
     gain: float | None,
     delay: int,
 ) -> Checks:
     """Test the residuals of every run together.
 
-    `slopes` has those of the output by the model's own numbers, and what a fuller model would add.
+    `slopes` has those of the output by the model's own numbers, and what fuller models would add.
     """
     y = np.concatenate([m - m.mean() for m in seen.measured])
     rest = np.concatenate(residuals)
     ahead = np.concatenate([_whitened(r, [_share(residuals)]) for r in residuals])
-    (explained, chance), (later, fed) = _explained(seen, residuals, slopes, delay)
+    (explained, chance), (later, fed), law = _explained(seen, residuals, slopes, delay)
     white = _white(residuals)
     if rest.std() <= CLOSE * seen.size_y:  # what is left is rounding, or the network's own detail
-        explained, chance, later, fed, white = 0.0, 1.0, 0.0, 1.0, 1.0
+        explained, chance, later, fed, white, law = 0.0, 1.0, 0.0, 1.0, 1.0, None
     return Checks(
         percent(rest, y),
         percent(ahead, y),
@@ -135,7 +150,22 @@ def checks_of(
         later,
         gain,
         _together(seen),
+        law=law,
+        band_limited=_band_limited(seen),
     )
+
+
+def _band_limited(seen: PreparedOutput) -> tuple[str, ...]:
+    """Inputs of runs at equal steps that have no high frequencies."""
+    high, whole = np.zeros(len(seen.inputs)), np.zeros(len(seen.inputs))
+    for run in seen.runs:
+        count = int(np.count_nonzero(np.asarray(run.dt)))
+        rows = slice(0, count + 1, 1 if run.held is None else 2)
+        changes = np.diff(np.asarray(run.u)[rows], axis=0)
+        power = np.abs(np.fft.rfft(changes * np.hanning(len(changes))[:, None], axis=0)) ** 2
+        high += power[int(HIGH * len(power)) :].sum(axis=0)
+        whole += power.sum(axis=0)
+    return tuple(np.array(seen.inputs)[(high < FAINT * whole) & (whole > 0)].tolist())
 
 
 def _together(seen: PreparedOutput) -> tuple[str, ...]:
@@ -192,30 +222,31 @@ def _white(residuals: tuple[np.ndarray, ...]) -> float:
 def _explained(
     seen: PreparedOutput,
     residuals: tuple[np.ndarray, ...],
-    slopes: Sequence[tuple[np.ndarray, np.ndarray]],
+    slopes: Sequence[RunSlopes],
     delay: int,
-) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Share of the whitened residuals that a fuller model explains, with its chance, and the share
-    of the rest that later inputs explain.
+) -> tuple[tuple[float, float], tuple[float, float], str | None]:
+    """Share of the whitened residuals that a fuller model explains, with its chance, the share of
+    the rest that later inputs explain, and the law of an input that explains most.
 
     A score test (Lagrange multipliers): columns are inputs before, those within the delay too,
     further paths of first order, and the slopes of the output by parameters that change with the
-    operating point, less what the model's own numbers can do.
+    operating point, less what the model's own numbers can do; or one law of an input alone.
     """
     memory = _memory(residuals)
     apart = min(float(np.median(np.diff(t))) for t in seen.time)
     times = np.geomspace(apart, max(float(np.ptp(t)) for t in seen.time) / 4, SLOW)[:, None]
     paths = driven_by(seen, FIRST_ORDER)
-    own, slow, quick, later, targets = [], [], [], [], []
-    for run, path, r, (by_own, added) in zip(seen.runs, paths, residuals, slopes, strict=True):
+    own, slow, quick, later, turned, targets = [], [], [], [], [], []
+    for run, path, r, each in zip(seen.runs, paths, residuals, slopes, strict=True):
         u = seen.scaled(run.u)
         index = np.asarray(run.index)
         past = [u[np.clip(index + k, 0, len(u) - 1)] for k in range(-PAST, delay)]
         after = [u[np.clip(index + delay + k, 0, len(u) - 1)] for k in range(LATER)]
         later.append(np.concatenate(after, axis=1))
         slow.append(np.asarray(unit_outputs(path, times))[:, : u.shape[1]].reshape(-1, len(r)).T)
-        quick.append(np.concatenate([*past, added], axis=1))
-        own.append(by_own)
+        quick.append(np.concatenate([*past, each.changing], axis=1))
+        own.append(each.own)
+        turned.append(each.laws)
         targets.append(r)
 
     def white(parts: list[np.ndarray]) -> np.ndarray:
@@ -225,10 +256,42 @@ def _explained(
     rest = white(targets)
     rest = rest - basis @ (basis.T @ rest)
     few, more = (_tested(rest, basis, white(columns)) for columns in (slow, quick))
-    share, chance = min(few, more, key=lambda each: each[1])
-    basis = _basis(np.hstack([white(columns) for columns in (own, slow, quick)]))
+    each = [_tested(rest, basis, column[:, None]) for column in white(turned).T]
+    laws = [(share, len(each) * chance) for share, chance in each]
+    share, chance = min(few, more, *laws, key=lambda each: each[1])
+    lawful = chance < min(few[1], more[1], POOR_FIT / 3)
+    law = law_names(seen)[laws.index((share, chance))] if lawful else None
+    basis = _basis(np.hstack([white(columns) for columns in (own, slow, quick, turned)]))
     rest = rest - basis @ (basis.T @ rest)
-    return (share, min(2.0 * chance, 1.0)), _tested(rest, basis, white(later))
+    return (share, min(3.0 * chance, 1.0)), _tested(rest, basis, white(later)), law
+
+
+def law_names(seen: PreparedOutput) -> list[str]:
+    """Names of the laws of the inputs, in the order of the columns that `slopes_of` gives them."""
+    widths = WIDTHS * np.ptp(seen.points, axis=0)[:, None]
+    return [
+        f"a {law} of {name} by ±{width:.2g}"
+        for name, own in zip(seen.inputs, widths, strict=True)
+        for law in ("play", "stop", "dead zone")
+        for width in own
+    ]
+
+
+def _lawful(u: np.ndarray, widths: np.ndarray) -> np.ndarray:
+    """One input as a play, a stop and a dead zone hand it on, shape (rows, 3 widths).
+
+    A play follows when its clearance is used up, a stop (Coulomb friction) goes all the way once it
+    moves at all. A dead zone lies about 0, or about the middle of a range without it.
+    """
+    low, high = float(u.min()), float(u.max())
+    middle = 0.0 if low < 0 < high else 0.5 * (low + high)
+    play, stop, found = u[0] + 0 * widths, u[0] + 0 * widths, []
+    for now in u:
+        play = np.clip(play, now - widths, now + widths)
+        stop = np.where(np.abs(now - stop) > widths, now, stop)
+        dead = middle + np.sign(now - middle) * np.maximum(np.abs(now - middle) - widths, 0.0)
+        found.append(np.concatenate([play, stop, dead]))
+    return np.array(found)
 
 
 def _tested(rest: np.ndarray, basis: np.ndarray, columns: np.ndarray) -> tuple[float, float]:
@@ -249,13 +312,30 @@ def _basis(columns: np.ndarray, size: np.ndarray | None = None) -> np.ndarray:
     return found[:, values > 1e-6]
 
 
-def slopes_of(seen: PreparedOutput, fit: Fit) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Slopes of the output by the model's own numbers, and by parameters that change."""
-    found = []
+class RunSlopes(NamedTuple):
+    """Slopes of a run's output by the model's numbers, by parameters that change with the inputs,
+    and its changes by laws of the inputs, shape (readings, 0) where none are looked for.
+    """
+
+    own: np.ndarray
+    changing: np.ndarray
+    laws: np.ndarray
+
+
+def slopes_of(seen: PreparedOutput, fit: Fit) -> list[RunSlopes]:
+    """Slopes of the output by the model's own numbers, and by what fuller models would have."""
+    widths, found = np.multiply.outer(np.ptp(seen.points, axis=0), WIDTHS), []
     for run in seen.runs:
         u = seen.scaled(run.u)
         added = changed_by(fit.model, run, np.concatenate([u, u**2], axis=1))
-        found.append((fit.derive(predicted, run).slope, np.asarray(added)))
+        plain, inputs = np.asarray(output_of(fit.model, run)), np.asarray(run.u)
+        changes = []
+        for i, own in enumerate(widths):
+            for other in _lawful(inputs[:, i], own).T:
+                turned = replace(run, u=jnp.asarray(inputs).at[:, i].set(other))
+                changes.append(np.asarray(output_of(fit.model, turned)) - plain)
+        slope = fit.derive(predicted, run).slope
+        found.append(RunSlopes(slope, np.asarray(added), np.stack(changes, axis=1)))
     return found
 
 
@@ -274,4 +354,4 @@ def predict_held(run: Run, output: str, fit: Fit, physics: Physics, delay: float
     target = y - base - float(fit.model["offset"])
     first = np.linalg.lstsq(moved, target, rcond=1e-10)[0]
     rest = target - moved @ first
-    return HeldOutRun(run.name, percent(rest, y), float(rest.std()))
+    return HeldOutRun(run.name, percent(rest, y), float(np.sqrt(np.mean(rest**2))))

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from beamfit.answer import answer
-from beamfit.dynamics.fedbatch_model import STATES, Batches, batches_of
+from beamfit.dynamics.balances import STATES, Batches, batches_of
 from beamfit.dynamics.titre import TITRE, TitreFit, predicted
 from beamfit.errors import InputError
 from beamfit.greybox.fit import Fit

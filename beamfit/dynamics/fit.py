@@ -2,35 +2,44 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from beamfit.answer import answer
-from beamfit.dynamics.case import used_by
+from beamfit.dynamics.answer import (
+    Curve,
+    ResponseEvidence,
+    curves_of,
+    judged,
+    quantities_of,
+    rms_of,
+    told,
+)
+from beamfit.dynamics.bad_readings import Misread, sound
 from beamfit.dynamics.checks import Checks, HeldOutRun, checks_of, predict_held, slopes_of
-from beamfit.dynamics.curve import Curve, curves_of, quantities_of, told
-from beamfit.dynamics.limits import limited
-from beamfit.dynamics.misread import Misread, sound
 from beamfit.dynamics.model import PreparedOutput, network_of, output_of
-from beamfit.dynamics.noise import Noise
 from beamfit.dynamics.record import Run, check_inputs, checked
 from beamfit.dynamics.response import PHYSICS
-from beamfit.dynamics.settle import begun, case_of, is_first_order, remembering, within
-from beamfit.dynamics.starts import latest
-from beamfit.dynamics.verdict import ResponseEvidence, judged, rms_of
+from beamfit.dynamics.search import (
+    Begun,
+    Settled,
+    begun,
+    case_of,
+    is_first_order,
+    latest,
+    remembering,
+    used_by,
+)
 from beamfit.errors import InputError, nearest
 from beamfit.greybox.fit import Fit
+from beamfit.noise.correlated import Noise
 from beamfit.quantity import Quantity
 from beamfit.status import Status
 from beamfit.table import Table, json_of
-
-if TYPE_CHECKING:
-    from beamfit.sampling.posterior import Posterior
-
 
 MAPS = ("constant", "network")
 LATEST = "The delay is the longest that was tried: say a longer one by --delay."
@@ -129,23 +138,6 @@ class ResponseFit:
             | {"left_out": [each._asdict() for each in self.left_out]}
         )
 
-    def sample(self, **options: Any) -> Posterior:
-        """Draw the free numbers of a response with constant parameters from their posterior.
-
-        Parameters
-        ----------
-        **options
-            As `beamfit.greybox.fit.Fit.sample`.
-
-        Raises
-        ------
-        InputError
-            If the parameters are a network: the weights are too many and stand for each other.
-        """
-        if self.map != "constant":
-            raise InputError("a posterior of a network", "constant parameters; curves have bands")
-        return self.fit.sample(**options)
-
 
 def identify(
     runs: Run | Sequence[Run],
@@ -159,7 +151,6 @@ def identify(
     starts: int = 3,
     seed: int = 0,
     held: Sequence[Run] = (),
-    gains: Mapping[str, tuple[float, float]] | None = None,
 ) -> ResponseFit:
     """Identify the response of an output to the inputs of some runs.
 
@@ -184,10 +175,6 @@ def identify(
         Hidden nodes of the network, starts of its training, seed of their weights.
     held : sequence of Run
         Runs that are only predicted.
-    gains : mapping of str to (float, float), optional
-        Limits of parameters and of their slopes by an input, such as {"K": (1.0, 3.0),
-        "dK/dvalve": (0.0, inf)}, which a network certainly keeps over the whole range of the runs;
-        of tau, T and zeta only signs of slopes.
 
     Returns
     -------
@@ -229,43 +216,50 @@ def identify(
     shortest = min(len(run) for run in runs)
     if delay is not None and not 0 <= delay < shortest - 1:
         raise InputError(f"a delay of {delay} samples", f"less than the {shortest} rows of a run")
-    given = delay
     runs, left_out, found = sound(
-        runs, output, lambda these: begun(these, output, physics, given, offset)
+        runs, output, lambda these: begun(these, output, physics, delay, offset)
     )
-    seen, delay, plain = found
-    answer = plain
+    answer = found.plain
     if map == "network":
-        first = plain.fit.model
-        raw = np.asarray(first["map"])
-        nets = (network_of(seen, physics, raw, hidden, seed + k) for k in range(starts))
-        answer = remembering(case_of(seen, offset, True), [first | {"map": net} for net in nets])
-    if gains:
-        limits = limited(gains, seen, physics, map == "network")
-        answer = within(case_of(seen, offset, map == "network", limits), answer)
+        answer = _with_network(found, offset, hidden, range(seed, seed + starts))
+    checks, quantities, curves = _known(found, answer, offset, map)
+    fit, late = answer.fit, found.delay
+    ahead = tuple(predict_held(each, output, fit, physics, late) for each in held)
+    evidence = (fit, answer.rests, checks, quantities, curves, ahead, map)
+    status, message = judged({output: ResponseEvidence(*evidence, rms_of(fit))})
+    longest = [LATEST] if delay is None and late == latest(runs) > 0 else []
+    message = " ".join([message, *longest, *(f"Left out: {each}." for each in left_out)])
+    late = late if late % 1 == 0 else late + float(fit.model["late"])
+    noise = tuple(answer.noise[:, 0].tolist())
+    parts = (quantities, curves, noise, answer.memory, checks, ahead, left_out)
+    return ResponseFit(output, status, message, model, map, late, runs, found.seen, fit, *parts)
+
+
+def _with_network(found: Begun, offset: bool, hidden: int, seeds: range) -> Settled:
+    """The best fit with a network of parameters, from the constant ones."""
+    seen, first = found.seen, found.plain.fit.model
+    physics, raw = seen.runs[0].physics, np.asarray(first["map"])
+    nets = (network_of(seen, physics, raw, hidden, seed) for seed in seeds)
+    return remembering(case_of(seen, offset, True), [first | {"map": net} for net in nets])
+
+
+def _known(
+    found: Begun, answer: Settled, offset: bool, map: str
+) -> tuple[Checks, dict[str, Quantity], tuple[Curve, ...]]:
+    """Tests of the residuals, and what the runs determine of constants or curves."""
+    seen, constant = found.seen, map == "constant"
     checks = checks_of(
         seen,
         tuple(rest for (rest,) in answer.rest),
         slopes_of(seen, answer.fit),
         used_by(answer.fit),
-        plain.likelihood - answer.likelihood if map == "network" else None,
-        int(np.ceil(delay)) * (1 if delay % 1 == 0 else 2),  # in rows
+        None if constant else found.plain.likelihood - answer.likelihood,
+        int(np.ceil(found.delay)) * (1 if found.delay % 1 == 0 else 2),  # in rows
     )
-    checks = checks._replace(first_order=map == "constant" and is_first_order(found, offset))
-    quantities = (
-        quantities_of(answer.fit, answer.errors, seen, physics, delay) if map == "constant" else {}
-    )
-    curves = curves_of(answer.fit, answer.errors, seen) if map == "network" else ()
-    quantities, curves = told(quantities, curves, seen, checks)
-    ahead = tuple(predict_held(each, output, answer.fit, physics, delay) for each in held)
-    evidence = (answer.fit, answer.rests, checks, quantities, curves, ahead, map)
-    status, message = judged({output: ResponseEvidence(*evidence, rms_of(answer.fit))})
-    late = [LATEST] if given is None and delay == latest(runs) > 0 else []
-    message = " ".join([message, *late, *(f"Left out: {each}." for each in left_out)])
-    delay = delay if delay % 1 == 0 else delay + float(answer.fit.model["late"])
-    noise = tuple(answer.noise[:, 0].tolist())
-    parts = (quantities, curves, noise, answer.memory, checks, ahead, left_out)
-    return ResponseFit(output, status, message, model, map, delay, runs, seen, answer.fit, *parts)
+    checks = checks._replace(first_order=constant and is_first_order(found, offset))
+    parts = answer.fit, answer.errors, seen
+    quantities = quantities_of(*parts, seen.runs[0].physics, found.delay) if constant else {}
+    return checks, *told(quantities, () if constant else curves_of(*parts), seen, checks)
 
 
 def _output(run: Run, output: str | None) -> str:

@@ -10,22 +10,23 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from beamfit.dynamics.case import Case, Settled
-from beamfit.dynamics.curve import GAIN, PURE, TIME, WIDE, derived, quantity
+from beamfit.dynamics.answer import GAIN, PURE, TIME, WIDE, derived, quantity
 from beamfit.dynamics.fit import MAPS
 from beamfit.dynamics.model import WEIGHT
 from beamfit.dynamics.order import (
+    LINEAR,
+    NETWORK,
     Tried,
     count_of,
     criterion,
     free_of,
     largest_order,
     orders,
+    stripped,
 )
-from beamfit.dynamics.realise import LINEAR, NETWORK, stripped
 from beamfit.dynamics.record import Run, check_inputs, checked
-from beamfit.dynamics.shooting import Course, remembering, trained
-from beamfit.dynamics.state_fit import StatesFit, answer, case_of
+from beamfit.dynamics.search import Case, Settled
+from beamfit.dynamics.state_fit import Course, StatesFit, answer, case_of, remembering, trained
 from beamfit.dynamics.states import linear_outputs
 from beamfit.errors import InputError, nearest
 from beamfit.greybox import tree
@@ -81,7 +82,7 @@ def identify_states(
     Notes
     -----
     Output error in a stable and minimal parametrisation (`beamfit.dynamics.states.contraction`),
-    from the best realisation of an order (`beamfit.dynamics.realise`). The criterion
+    from the best realisation of an order (`beamfit.dynamics.order`). The criterion
     takes the noise, with its memory, of the largest order tried: a drift is no reason for a
     further state. L. Ljung, System Identification (1999), chapters 4 and 16.
 

@@ -13,8 +13,8 @@ import numpy as np
 from scipy.signal import lfilter
 
 from beamfit.answer import answer
+from beamfit.dynamics.control import Controller, advance, moved, settled, start
 from beamfit.dynamics.fit import ResponseFit
-from beamfit.dynamics.receding import Controller, advance, moved, settled, start
 from beamfit.errors import InputError, nearest
 from beamfit.status import Status
 from beamfit.table import Table, json_of

@@ -8,12 +8,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from beamfit.dynamics.noise import Noise
 from beamfit.dynamics.record import Run
 from beamfit.dynamics.response import Physics, simulate
 from beamfit.greybox import tree
 from beamfit.greybox.mlp import MLP, Port, dense
 from beamfit.greybox.problem import Prior, padded_length
+from beamfit.noise.correlated import Noise
 
 # Residual, as a share of the output's scatter, below which a fit counts as exact.
 CLOSE = 2e-4

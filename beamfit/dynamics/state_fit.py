@@ -1,44 +1,150 @@
-"""Fit of a state space whose equations the user writes."""
+"""Fit of a state space whose equations the user writes.
+
+Runs go in segments whose ends must meet (multiple shooting), or run free as one.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
-from typing import Any, NamedTuple
+from functools import cached_property, partial
+from typing import Any, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from beamfit.answer import answer
-from beamfit.dynamics.case import Case, Settled, used_by
-from beamfit.dynamics.checks import Checks, HeldOutRun, checks_of, percent
-from beamfit.dynamics.curve import quantity
+from beamfit.dynamics.answer import ResponseEvidence, judged, quantity
+from beamfit.dynamics.checks import Checks, HeldOutRun, RunSlopes, checks_of, percent
 from beamfit.dynamics.model import PreparedOutput, weight_priors
-from beamfit.dynamics.noise import Noise
 from beamfit.dynamics.record import Run, checked
 from beamfit.dynamics.response import FIRST_ORDER
-from beamfit.dynamics.shooting import (
-    System,
-    begun,
-    closed,
-    course_of,
-    remembering,
-    trained,
+from beamfit.dynamics.search import (
+    GAINED,
+    Case,
+    Settled,
+    seen_of,
+    settled,
+    used_by,
+    with_memory,
 )
-from beamfit.dynamics.starts import seen_of
 from beamfit.dynamics.states import StateSpace
-from beamfit.dynamics.verdict import ResponseEvidence, judged
 from beamfit.errors import InputError
 from beamfit.greybox import tree
 from beamfit.greybox.fit import Derived, Fit
 from beamfit.greybox.mlp import MLP
 from beamfit.greybox.problem import Free, Prior
+from beamfit.greybox.solve import solve
+from beamfit.noise.correlated import Noise
 from beamfit.quantity import Quantity
 from beamfit.statistics import POOR_FIT
 from beamfit.status import Status
 from beamfit.table import Table, json_of
+
+# Steps of a round, after which the noise is estimated again; most rounds; gain in -2 ln L per
+# reading below which they end.
+STEPS, ROUNDS, EACH = 25, 80, 1e-4
+# Allowed gaps between segments in turn, in units of the states' scatter.
+CLOSING = (1.0, 0.1, 1e-2, 1e-3, 1e-4)
+# Distance in time between the series of two outputs, in lengths of the run: no correlation is left.
+APART = 1e6
+# Most readings of each output that estimate correlated noise; factor by which the fit with it may
+# leave larger squares than the fit without.
+LONGEST, WORSE = 5000, 1.5
+
+
+class System(Protocol):
+    """A system: `beamfit.dynamics.states.StateSpace`, or anything hashable with its `run`."""
+
+    def run(
+        self, p: Any, u: jax.Array, dt: jax.Array, x0: jax.Array
+    ) -> tuple[jax.Array, jax.Array]:
+        """Outputs at the samples and the state after the last."""
+
+
+@tree.node("system")
+class Course:
+    """A run as the model sees it: inputs and steps, padded, and which outputs were read.
+
+    Shapes (samples, m), (samples,); `index` (readings,) points into all outputs one after the
+    other, `time` is theirs, s, far apart from output to output; `run` is its number, `noise` that
+    of its readings, if it has a memory.
+    """
+
+    system: System
+    u: Any
+    dt: Any
+    index: Any
+    time: Any
+    run: Any
+    noise: Noise | None
+
+    def shot(self, model: Any) -> tuple[jax.Array, jax.Array]:
+        """Outputs from every segment's own start, and the gaps where segments meet."""
+        nodes = model["nodes"][self.run]
+        starts = jnp.concatenate([model["start"][self.run][None], nodes])
+        parts = [v.reshape(len(starts), -1, *v.shape[1:]) for v in (self.u, self.dt)]
+        y, last = jax.vmap(self.system.run, (None, 0, 0, 0))(model["p"], *parts, starts)
+        y = y.reshape(len(self.u), -1)
+        return y.T.ravel()[self.index], (last[:-1] - nodes).ravel()
+
+    def predicted(self, model: Any) -> jax.Array:
+        """Outputs where they were read, one after the other, shape (readings,)."""
+        return self.shot(model)[0]
+
+
+def course_of(system: System, seen: Sequence[PreparedOutput], i: int) -> Course:
+    """Course of a run, from the prepared outputs."""
+    run = seen[0].runs[i]
+    index = [k * len(run.u) + np.asarray(s.runs[i].index) for k, s in enumerate(seen)]
+    far = APART * float(np.sum(np.asarray(run.dt)))
+    time = [far * k + np.asarray(s.runs[i].time) for k, s in enumerate(seen)]
+    index, time = (jnp.asarray(np.concatenate(part)) for part in (index, time))
+    return Course(system, run.u, run.dt, index, time, run.run, None)
+
+
+_round = partial(Case.search, steps=STEPS)
+
+
+def closed(case: Case, model: Any, close: np.ndarray) -> Any:
+    """The model from where the free run may begin: ends of segments have met.
+
+    `close` (n,) is the states' scatter. H. Bock, multiple shooting, 1983.
+    """
+    noise = case.guess
+    for width in CLOSING:
+        shot = _round(case, model, noise, gap=width * close)
+        if not np.isfinite(shot.likelihood):
+            break
+        model, noise = shot.fit.model, shot.noise
+    return model | {"nodes": model["nodes"][:, :0]}
+
+
+def trained(case: Case, models: Sequence[Any]) -> Settled:
+    """Fit from each start for a round, then from the best until nothing is gained."""
+    enough = GAINED + EACH * sum(len(each) for s in case.seen for each in s.measured)
+    return settled(case, models, _round, lambda found: enough, ROUNDS)
+
+
+def begun(case: Case, model: Any, noise: np.ndarray) -> Any:
+    """The model with what is free fitted once: the first states of runs that were held back."""
+    return solve(case.problem(model, noise)).model
+
+
+def remembering(case: Case, white: Settled) -> Settled:
+    """The fit again, its noise with a memory, where residuals are correlated."""
+    if not white.correlated(case):
+        return white
+    found = with_memory(case, white, _round, LONGEST)
+    if case.squares(found.rest) > WORSE * case.squares(white.rest):
+        # What the model lacks was taken for noise that wanders, and the response with it.
+        found = white
+    errors = found.remembered(case, most=LONGEST)[0]
+    if found is not white and max(len(r) for row in found.rest for r in row) > LONGEST:
+        errors = found.remembered(case, found.memory)[0]
+    return found._replace(rests=white.rests, errors=errors)
+
 
 # Percent of an output explained by the free run below which segments are tried.
 ASTRAY = 50.0
@@ -332,8 +438,8 @@ def answer(
         own = [case.split(i, each)[k] for i, each in enumerate(slopes)]
         fitted = tuple(y - r for y, r in zip(s.measured, rest, strict=True))
         added = [_added(s, i, y) for i, y in enumerate(fitted)]
-        pairs = list(zip(own, added, strict=True))
-        checks = checks_of(s, rest, pairs, max(1, used // len(case.seen)), gain, delay)
+        pairs = (RunSlopes(o, a, o[:, :0]) for o, a in zip(own, added, strict=True))
+        checks = checks_of(s, rest, list(pairs), max(1, used // len(case.seen)), gain, delay)
         parts.append(StateSpaceOutput(list(runs[0].outputs)[k], runs, s, fitted, checks))
     ahead = _ahead(case, found, held, delay)
     nothing = all(part.checks.nothing_probability >= POOR_FIT for part in parts)
@@ -375,10 +481,9 @@ def _ahead(
         sizes = np.array([[np.sqrt(np.mean(found.noise[:, k] ** 2)) for k in range(len(one.seen))]])
         (rest,) = one.rest(begun(one, model, sizes))
         for s, r in zip(one.seen, rest, strict=True):
+            y = s.measured[0] - s.measured[0].mean()
             ahead[s.output].append(
-                HeldOutRun(
-                    run.name, percent(r, s.measured[0] - s.measured[0].mean()), float(r.std())
-                )
+                HeldOutRun(run.name, percent(r, y), float(np.sqrt(np.mean(r**2))))
             )
     names = [s.output for s in case.seen]
     return {name: tuple(ahead.get(name, ())) for name in names}

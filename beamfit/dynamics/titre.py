@@ -12,9 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from beamfit.answer import answer
-from beamfit.dynamics.balances import titre_of
-from beamfit.dynamics.fedbatch import FedBatchFit, check_names, settled
-from beamfit.dynamics.fedbatch_model import (
+from beamfit.dynamics.balances import (
     ABOVE,
     RATES,
     STATES,
@@ -26,8 +24,16 @@ from beamfit.dynamics.fedbatch_model import (
     network_of,
     padded,
     rates_at,
+    titre_of,
 )
-from beamfit.dynamics.fedbatch_verdict import RULES, RateEvidence, ReadingNoise
+from beamfit.dynamics.fedbatch import (
+    RULES,
+    FedBatchFit,
+    RateEvidence,
+    ReadingNoise,
+    check_names,
+    settled,
+)
 from beamfit.dynamics.model import weight_priors
 from beamfit.errors import InputError
 from beamfit.greybox import tree

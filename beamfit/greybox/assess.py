@@ -17,7 +17,7 @@ import numpy as np
 from scipy import sparse
 
 from beamfit.greybox import problem
-from beamfit.greybox.factors import Rows, lengths
+from beamfit.greybox.covariance import Rows, lengths
 from beamfit.greybox.problem import Problem
 
 # A bound also counts as reached if moving onto it changes the cost by less than this share.

@@ -13,8 +13,7 @@ import jax
 import numpy as np
 
 from beamfit.greybox import assess, problem
-from beamfit.greybox.covariance import null_space, triangle
-from beamfit.greybox.factors import FEW, in_units, weakest
+from beamfit.greybox.covariance import FEW, in_units, null_space, triangle, weakest
 from beamfit.greybox.problem import Problem
 
 # A search has not ended while the next Newton step exceeds this, in sizes of the numbers.

@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from beamfit.greybox.factors import FEW, RIDGE, Factor, Rows, in_units, lengths, with_diagonal
+from beamfit.greybox.covariance import FEW, RIDGE, Factor, Rows, in_units, lengths, with_diagonal
 from beamfit.greybox.problem import Problem, sloped, with_slope
 from beamfit.greybox.problem import residual as problem_residual
 
@@ -34,6 +34,8 @@ EASED = 1e-4
 STUCK = 1e30
 # A promised decrease below this share of the sum of squares is rounding.
 ROUNDING = 1e-16
+# The same for many numbers, whose last steps cost most and move them by 1e-7 of an error.
+FINISHED = 1e-14
 # Rounds in which a step pins numbers to bounds; the rest is clipped.
 PINNED = 3
 # Factor on the damping of many numbers, times the relative miss of a step's promised decrease.
@@ -408,8 +410,8 @@ class ManyLanes(Lanes):
             new, slope = self.slopes(trial)
             steps += 1
             ratio = 0.5 * (r - new) @ (r + new) / promised if promised > 0 else -1.0
-            # What promises less than rounding cannot be judged: it is taken, as the last step.
-            rested = bool(0 <= promised <= ROUNDING * (r @ r)) and np.isfinite(slope.sum())
+            # What promises next to nothing cannot be judged: it is taken, as the last step.
+            rested = bool(0 <= promised <= FINISHED * (r @ r)) and np.isfinite(slope.sum())
             if rested:
                 theta, r, j = trial, new, slope
                 break

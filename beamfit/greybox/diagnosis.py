@@ -11,7 +11,7 @@ import numpy as np
 
 from beamfit.greybox import assess, tree
 from beamfit.greybox.covariance import CUT, directions
-from beamfit.greybox.evidence import listed
+from beamfit.greybox.optimum import listed
 from beamfit.greybox.problem import Problem, with_slope
 
 # Rows are badly scaled if their sizes differ by more than this: half the digits are lost.

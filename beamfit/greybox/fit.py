@@ -16,8 +16,7 @@ from beamfit.compile_cache import SELDOM
 from beamfit.errors import InputError, nearest
 from beamfit.greybox import tree
 from beamfit.greybox.assess import KKT
-from beamfit.greybox.covariance import MOST_SHARE, FactoredSpread, Group, Spread
-from beamfit.greybox.factors import Rows
+from beamfit.greybox.covariance import MOST_SHARE, FactoredSpread, Group, Rows, Spread
 from beamfit.greybox.problem import Problem, with_slope
 from beamfit.greybox.stated import Optimum
 from beamfit.status import Status

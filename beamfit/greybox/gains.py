@@ -17,8 +17,7 @@ import numpy as np
 
 from beamfit.errors import InputError
 from beamfit.greybox import tree
-from beamfit.greybox.activations import KINDS
-from beamfit.greybox.bounds import LayeredNetwork, cells, gain_bounds
+from beamfit.greybox.bounds import KINDS, LayeredNetwork, cells, gain_bounds
 from beamfit.greybox.maps import Map, positions
 from beamfit.greybox.terms import Constraint
 

@@ -14,8 +14,7 @@ import numpy as np
 
 from beamfit.errors import InputError, nearest
 from beamfit.greybox import tree
-from beamfit.greybox.activations import KINDS
-from beamfit.greybox.bounds import gain_bounds, over_cells
+from beamfit.greybox.bounds import KINDS, gain_bounds, over_cells
 from beamfit.greybox.gains import gain
 from beamfit.greybox.maps import positions
 

@@ -13,9 +13,8 @@ from beamfit.greybox.assess import SearchState
 from beamfit.greybox.conflict import relaxed
 from beamfit.greybox.descend import Lanes, lanes_of
 from beamfit.greybox.diagnosis import contradictory, not_finite
-from beamfit.greybox.evidence import Search, settled
 from beamfit.greybox.fit import Attempt, Fit
-from beamfit.greybox.optimum import outgrown
+from beamfit.greybox.optimum import Search, outgrown, settled
 from beamfit.greybox.problem import Problem
 from beamfit.greybox.programs import SOLVERS, SearchLimit, scaled
 from beamfit.greybox.verdict import conclude, refused

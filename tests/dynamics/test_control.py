@@ -9,10 +9,9 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 
-from beamfit.dynamics.control import controller
+from beamfit.dynamics.control import Controller, ControlLimits, Response, controller, start
 from beamfit.dynamics.fit import identify
 from beamfit.dynamics.loop import closed_loop, simulate_loop
-from beamfit.dynamics.receding import Controller, ControlLimits, Response, start
 from beamfit.dynamics.record import Run
 from beamfit.dynamics.response import ARX, FIRST_ORDER, SECOND_ORDER, simulate
 from beamfit.errors import InputError
@@ -218,24 +217,6 @@ def test_what_cannot_be_kept_or_reached_is_named(fit):
     loop = simulate_loop(fit, control, [("level", 2.0, 0.0)], disturbances=[("level", 0.9, 20.0)])
     assert loop.status is Status.infeasible
     assert "passes its limit by up to 0." in loop.message
-
-
-def test_a_hard_limit_holds_for_every_gain_and_lag_it_is_told_of(fit):
-    ends, steps = {"level": (-INF, 2.7)}, 60
-    hard = controller(fit, outputs=ends, hard={"level": (0.2, 0.1)})
-    gain, level = (fit.quantities[name].value for name in ("K", "offset"))
-    most = (2.7 - hard.responses[0].margin - 0.1 - level) / (1.2 * gain)
-    assert hard.limits.high[0] == pytest.approx(most, rel=1e-6)
-    load = np.where(np.arange(steps) < 30, 0.0, 0.1)[:, None]
-    for control, passes in ((hard, False), (controller(fit, outputs=ends), True)):
-        run = jax.jit(lambda factor, c=control: closed_loop(
-            c, [0.2], np.full((steps, 1), 2.7), np.zeros((steps, 1)), load, [factor]))  # fmt: skip
-        highest = [float(run(np.array([tau, 1.2])).outputs.max()) for tau in (0.5, 2.0)]
-        assert (max(highest) > 2.7) == passes
-    with pytest.raises(InputError, match="hard limits of 'levl'"):
-        controller(fit, outputs=ends, hard={"levl": (0.2, 0.1)})
-    with pytest.raises(InputError, match="ones that some inputs keep"):
-        controller(fit, outputs={"level": (-INF, 0.3)}, hard={"level": (0.2, 0.1)})
 
 
 @pytest.mark.parametrize(

@@ -13,9 +13,8 @@ import pytest
 from beamfit.dynamics import fedbatch as rates_of
 from beamfit.dynamics import feed as feeding
 from beamfit.dynamics import titre as titre_of
-from beamfit.dynamics.fedbatch import identify_batches
-from beamfit.dynamics.fedbatch_model import STATES, bounds_of, course, network_of, rates_at
-from beamfit.dynamics.fedbatch_verdict import RULES, RateEvidence
+from beamfit.dynamics.balances import STATES, bounds_of, course, network_of, rates_at
+from beamfit.dynamics.fedbatch import RULES, RateEvidence, identify_batches
 from beamfit.dynamics.feed import best_feed, predict
 from beamfit.dynamics.record import Run
 from beamfit.dynamics.titre import fit_titre, rank_inputs

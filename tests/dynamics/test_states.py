@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from scipy.signal import cont2discrete, dlsim, lfilter
 
-from beamfit.dynamics.case import Case
 from beamfit.dynamics.linear import identify_states
 from beamfit.dynamics.order import criterion
 from beamfit.dynamics.record import Run
+from beamfit.dynamics.search import Case
 from beamfit.dynamics.state_fit import fit_states
 from beamfit.dynamics.states import StateSpace
 from beamfit.errors import InputError

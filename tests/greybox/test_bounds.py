@@ -8,8 +8,7 @@ import pytest
 from scipy.optimize import minimize_scalar
 
 from beamfit.errors import InputError
-from beamfit.greybox.activations import KINDS
-from beamfit.greybox.bounds import cells, gain_bounds, over_cells, value_bounds
+from beamfit.greybox.bounds import KINDS, cells, gain_bounds, over_cells, value_bounds
 from beamfit.greybox.mlp import MLP, Layer, NetworkGain, Port, dense
 
 sampled_gains = jax.jit(lambda net, x: jax.vmap(jax.jacfwd(net.values))(x))

@@ -7,7 +7,7 @@ import pytest
 from scipy import sparse
 
 from beamfit.greybox import covariance, curvature, descend, sparsity
-from beamfit.greybox.factors import Factor, weakest
+from beamfit.greybox.covariance import Factor, weakest
 from beamfit.greybox.problem import Free, Prior, Problem, Record
 from beamfit.greybox.solve import solve
 from beamfit.greybox.sparsity import pattern_of as pattern_of_program

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from beamfit.errors import InputError
-from beamfit.greybox.activations import KINDS, Range, range_of
+from beamfit.greybox.bounds import KINDS, Range, range_of
 from beamfit.greybox.gains import monotone_signs
 from beamfit.greybox.mlp import MLP, Layer, NetworkGain, Port, dense
 from beamfit.io.formulation import read_network, write_network

@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from beamfit.greybox.optimum import convex
 from beamfit.greybox.problem import Constraint, Free, Objective, Problem, Record
-from beamfit.greybox.proof import convex
 from beamfit.greybox.solve import solve
 from beamfit.status import Status
 

@@ -1,0 +1,472 @@
+"""Search for a response: the start, the fit in rounds, the noise of its residuals.
+
+For given time constants the output is linear in gains, offset and first states: a grid of them with
+linear least squares finds the basin also where noise ruins equation errors. Then all numbers are
+fitted in rounds, each with the noise that the residuals of the round before had. That noise is a
+part that wanders with a correlation time and a part without memory; one lag tells neither, so both
+are estimated together, and errors average over what stays open.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from scipy.optimize import minimize
+
+from beamfit.dynamics.model import (
+    CLOSE,
+    Driven,
+    PreparedOutput,
+    driven,
+    output_of,
+    predicted,
+    weight_priors,
+)
+from beamfit.dynamics.record import Run
+from beamfit.dynamics.response import ARX, FIRST_ORDER, SECOND_ORDER, Physics, simulate
+from beamfit.greybox.fit import Fit
+from beamfit.greybox.memory import Memory, noises, range_of, whitened_by_each
+from beamfit.greybox.problem import Free, Prior, Problem, Record
+from beamfit.greybox.solve import solve
+from beamfit.noise.correlated import Noise, innovations, remembers
+from beamfit.status import Status
+
+# Longest delay that is tried, in samples, and as a share of the run.
+LATEST, SHARE = 24, 0.1
+# Gain in log likelihood that a longer delay needs over a shorter one; fractions of a sample
+# that are tried besides.
+BETTER, PARTS = 5.0, (-0.75, -0.5, -0.25, 0.25, 0.5, 0.75)
+# Time constants of the grid, and dampings of a second order.
+TIMES, DAMPINGS = 16, (0.2, 0.6, 1.0, 2.0)
+# Share of a second lag's transient after one sample below which the lag is ignored.
+FORGOTTEN = 1e-4
+
+
+class Start(NamedTuple):
+    """Raw numbers, first states (runs, free states), offset, and the sum of squares."""
+
+    raw: np.ndarray
+    first: np.ndarray
+    offset: float
+    squares: float
+
+    @property
+    def model(self) -> dict[str, Any]:
+        """The model that a search begins with."""
+        raw = jnp.asarray(self.raw)
+        return {"map": raw, "start": self.first, "offset": self.offset, "late": 0.0}
+
+
+def best_start(seen: PreparedOutput, offset: bool) -> Start:
+    """The best of the grid."""
+    physics = seen.runs[0].physics
+    if physics is ARX:
+        return _as_difference(
+            seen, best_start(seen._replace(runs=driven_by(seen, SECOND_ORDER)), offset)
+        )
+    apart = min(float(np.median(np.diff(t))) for t in seen.time)
+    span = max(float(t[-1] - t[0]) for t in seen.time)
+    times = np.geomspace(0.3 * apart, span, TIMES)
+    shapes = np.array([[t] for t in times] if physics is FIRST_ORDER
+                      else [[t, z] for t in times for z in DAMPINGS])  # fmt: skip
+    columns = [np.asarray(unit_outputs(run, shapes)) for run in seen.runs]
+    found = [_fitted(seen, s, [c[i] for c in columns], offset) for i, s in enumerate(shapes)]
+    best = min(range(len(shapes)), key=lambda i: found[i].squares)
+
+    def at(logarithms: np.ndarray) -> Start:
+        shape = np.exp(np.clip(logarithms, *np.log([1e-3 * apart, 1e3 * span])))
+        there = [np.asarray(unit_outputs(run, shape[None]))[0] for run in seen.runs]
+        return _fitted(seen, shape, there, offset)
+
+    # To a hundredth of a time constant: delays are compared by what remains.
+    begin = np.log(shapes[best])
+    simplex = begin + 0.3 * np.vstack([np.zeros(len(begin)), np.eye(len(begin))])
+    options = {"initial_simplex": simplex, "xatol": 0.01, "fatol": 0.0, "maxiter": 40}
+    end = minimize(lambda x: at(x).squares, begin, method="Nelder-Mead", options=options)
+    return min(at(end.x), found[best], key=lambda each: each.squares)
+
+
+@jax.jit
+def unit_outputs(run: Driven, shapes: jax.Array) -> jax.Array:
+    """Outputs for unit gains and unit first states, shape (shapes, columns, readings)."""
+    m, k = run.u.shape[1], run.physics.free_states
+
+    def one(shape, gains, first):
+        p = jnp.broadcast_to(jnp.concatenate([shape, gains]), (len(run.u), len(shape) + m))
+        return simulate(run.physics, p, run.u, run.dt, first)[run.index]
+
+    gains = jnp.concatenate([jnp.eye(m), jnp.zeros((k, m))])
+    firsts = jnp.concatenate([jnp.zeros((m, k)), jnp.eye(k)])
+    each = jax.vmap(one, in_axes=(None, 0, 0))
+    return jax.vmap(each, in_axes=(0, None, None))(shapes, gains, firsts)
+
+
+def _fitted(
+    seen: PreparedOutput, shape: np.ndarray, columns: list[np.ndarray], offset: bool
+) -> Start:
+    m, k, runs = len(seen.inputs), seen.runs[0].physics.free_states, len(columns)
+    parts = []
+    for i, column in enumerate(columns):
+        first = np.zeros((column.shape[1], runs * k))
+        first[:, i * k : (i + 1) * k] = column[m:].T
+        parts.append(np.hstack([column[:m].T, first, np.ones((len(first), 1))]))
+    design, y = np.vstack(parts), np.concatenate(seen.measured)
+    if not offset:
+        design = design[:, :-1]
+    size = np.linalg.norm(design, axis=0)
+    size = np.where(size > 0, size, 1.0)
+    found = np.linalg.lstsq(design / size, y, rcond=1e-10)[0] / size
+    rest = float(np.sum((design @ found - y) ** 2))
+    raw = np.concatenate([np.log(shape), found[:m]])
+    first = found[m : m + runs * k].reshape(runs, k)
+    return Start(raw, first, float(found[-1]) if offset else 0.0, rest)
+
+
+def driven_by(seen: PreparedOutput, physics: Physics) -> tuple[Driven, ...]:
+    """The runs with another physics."""
+    return tuple(replace(run, physics=physics) for run in seen.runs)
+
+
+def _as_difference(seen: PreparedOutput, found: Start) -> Start:
+    """The difference equation whose samples are those of a second order (eqs 13-16)."""
+    m = len(seen.inputs)
+    dt = float(np.median(np.asarray(seen.runs[0].dt)[: len(seen.time[0]) - 1]))
+    p = np.asarray(SECOND_ORDER.physical(jnp.asarray(found.raw), m))
+    advance = partial(SECOND_ORDER.advance, jnp.asarray(p), dt=dt)
+    rest = np.column_stack([advance(jnp.asarray(e), jnp.zeros(m)) for e in np.eye(2)])
+    a1, a2 = -np.trace(rest), np.linalg.det(rest)
+    once = np.stack([np.asarray(advance(jnp.zeros(2), jnp.asarray(e))) for e in np.eye(m)])
+    twice = np.stack([np.asarray(advance(jnp.asarray(s), jnp.asarray(e)))
+                      for s, e in zip(once, np.eye(m), strict=True)])  # fmt: skip
+    b1 = once[:, 0]
+    b2 = twice[:, 0] + a1 * b1 - b1
+    raw = ARX.raw(jnp.asarray(np.concatenate([[a1, a2], b1, b2])), m)
+    # The sample before the first, by running the state backwards; a lag far below a sample has
+    # forgotten it.
+    back = np.linalg.inv(rest) if a2 > FORGOTTEN else np.eye(2)
+    states = np.stack([
+        [s[0], (back @ (s - np.stack(once, axis=1) @ np.asarray(r.u[0])))[0]]
+        for s, r in zip(found.first, seen.runs, strict=True)
+    ])  # fmt: skip
+    return Start(np.asarray(raw), states, found.offset, found.squares)
+
+
+def seen_of(runs: tuple[Run, ...], output: str, physics: Physics, delay: float) -> PreparedOutput:
+    """The runs as the model sees them."""
+    drives = tuple(driven(run, i, output, physics, delay) for i, run in enumerate(runs))
+    read = [np.isfinite(run.outputs[output]) for run in runs]
+    measured = tuple(run.outputs[output][k] for run, k in zip(runs, read, strict=True))
+    time = tuple(run.time[k] for run, k in zip(runs, read, strict=True))
+    u = np.concatenate([np.stack(list(run.inputs.values()), axis=1) for run in runs])
+    spread = float(np.concatenate(measured).std()) or 1.0
+    return PreparedOutput(
+        tuple(runs[0].inputs), output, drives, measured, time, u.mean(0), u.std(0), spread
+    )
+
+
+def start_of(
+    runs: tuple[Run, ...], output: str, physics: Physics, delay: float | None, offset: bool
+) -> tuple[Start, PreparedOutput, float]:
+    """The best start, and the delay: the shortest of those that fit about as well as any.
+
+    A part of a sample must do as much better: only an input that moves within a sample tells it.
+    """
+
+    def at(late: float) -> tuple[Start, PreparedOutput, float]:
+        seen = seen_of(runs, output, physics, late)
+        return best_start(seen, offset), seen, late
+
+    if delay is not None:
+        return at(delay)
+    found = [at(late) for late in range(latest(runs) + 1)]
+    count = sum(map(len, found[0][1].measured))
+    worth = np.exp(2.0 * BETTER / count)
+    near = worth * min(start.squares for start, _, _ in found)
+    whole = next(each for each in found if each[0].squares <= near)
+    if physics.even:
+        return whole
+    parts = [whole[2] + part for part in PARTS if 0 < whole[2] + part < max(latest(runs), 1)]
+    best = min((at(part) for part in parts), key=lambda each: each[0].squares)
+    return best if worth * best[0].squares < whole[0].squares else whole
+
+
+def latest(runs: tuple[Run, ...]) -> int:
+    """The longest delay that is tried."""
+    return min(LATEST, int(SHARE * min(map(len, runs))))
+
+
+# Correlation times looked at, and variances of the part without memory, in those that the part
+# that wanders gets anew from one sample to the next.
+CORRELATION_TIMES, WHITE = 16, (0.0, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0, 1000.0)
+
+
+def noise_of(
+    rows: Sequence[np.ndarray],
+    time: Sequence[np.ndarray],
+    known: np.ndarray,
+    noise: Noise | None = None,
+) -> tuple[Memory, Noise, float]:
+    """The noise by what residuals say of it, all runs together, and its size in units of theirs.
+
+    `rows` hold the slopes of each run's residuals and, last, the residuals, in units of their
+    noise; `known` those of the priors; `noise` is it if it is known.
+    """
+    apart = min(float(np.median(np.diff(t))) for t in time)
+    ends = np.array([range_of(t) for t in time])
+    grid = noises((ends[:, 0].min(), ends[:, 1].max()), apart, CORRELATION_TIMES, WHITE)
+    grid = grid if noise is None else [noise]
+    memory = whitened_by_each(grid, list(zip(rows, time, strict=True)), known).memory()
+    best = int(np.argmax(memory.weight))
+    return memory, grid[best], float(np.sqrt(memory.squares[best] / memory.dof))
+
+
+# Most rounds with a memory of the noise, and the gain in -2 ln L below which they end.
+AGAIN, GAINED = 3, 0.05
+
+
+class Case(NamedTuple):
+    """A fit to be made: prepared outputs, runs, free numbers and priors.
+
+    A course is a run as its model sees it: `model.Driven` or `shooting.Course`.
+    """
+
+    seen: tuple[PreparedOutput, ...]
+    courses: tuple[Any, ...]
+    free: tuple[Free, ...]
+    priors: tuple[Prior, ...]
+
+    @property
+    def guess(self) -> np.ndarray:
+        """The noise by run and output, before anything is known of it."""
+        return np.array([[0.1 * s.size_y for s in self.seen]] * len(self.courses))
+
+    @property
+    def floor(self) -> np.ndarray:
+        """Residual of each output below which the model explains it completely."""
+        return np.array([CLOSE * s.size_y for s in self.seen])
+
+    def measured(self, i: int) -> np.ndarray:
+        """Readings of a run, one output after the other."""
+        return np.concatenate([s.measured[i] for s in self.seen])
+
+    def split(self, i: int, rows: np.ndarray) -> list[np.ndarray]:
+        """Rows of the readings of a run, by output."""
+        return np.split(rows, np.cumsum([len(s.measured[i]) for s in self.seen])[:-1])
+
+    def rest(self, model: Any) -> tuple[tuple[np.ndarray, ...], ...]:
+        """Residuals of a model, by run and output."""
+        return tuple(
+            tuple(self.split(i, self.measured(i) - np.asarray(output_of(model, course))))
+            for i, course in enumerate(self.courses)
+        )
+
+    def rows(self, rest: Any) -> list[tuple[np.ndarray, np.ndarray, PreparedOutput]]:
+        """Residuals, their times and the output, for each run and output."""
+        pairs = ((i, zip(row, self.seen, strict=True)) for i, row in enumerate(rest))
+        return [(r, s.time[i], s) for i, row in pairs for r, s in row]
+
+    def squares(self, rest: Any) -> float:
+        """Sum of squared residuals, in units of each output's scatter."""
+        return sum(float(np.sum((r / s.size_y) ** 2)) for r, _, s in self.rows(rest))
+
+    def problem(
+        self, model: Any, noise: np.ndarray, memory: Noise | None = None, gap: Any = ()
+    ) -> Problem:
+        """State it; `gap` is how far ends of segments may lie apart, shape (states,).
+
+        `noise` by run and output is a guess that the residuals correct, `memory` how it wanders.
+        """
+        records = []
+        cuts = model["nodes"].shape[1] if len(gap) else 0
+        for i, course in enumerate(self.courses):
+            y, predict = self.measured(i), _with_gaps if cuts else predicted
+            error = np.repeat(noise[i], [len(s.measured[i]) for s in self.seen])
+            worth = np.inf if np.all(noise[i] <= 1.001 * self.floor) else 1.0
+            if cuts:
+                y = np.concatenate([y, np.zeros(cuts * len(gap))])
+                error = np.concatenate([error, np.tile(gap, cuts)])
+            if memory is not None:
+                course = replace(course, noise=Noise(*map(jnp.asarray, memory)))
+                y = np.asarray(innovations(jnp.asarray(y), course.time, course.noise)[0])
+                predict = _surprising
+            records.append(Record(f"run {i + 1}", predict, course, y, error, worth=worth))
+        free = [*self.free, *([Free("nodes", nuisance=True)] if cuts else [])]
+        return Problem(model, free, records, self.priors)
+
+    def search(
+        self, model: Any, noise: np.ndarray, steps: int, memory: Noise | None = None, gap: Any = ()
+    ) -> Settled:
+        """Fit with the noise that the residuals of the round before had."""
+        fit = solve(self.problem(model, noise, memory, gap), iterations=steps)
+        rest = self.rest(fit.model)
+        found = np.maximum([[float(r.std()) for r in row] for row in rest], self.floor)
+        minus = sum(_minus(r, t, s.size_y, None) for r, t, s in self.rows(rest))
+        minus = minus if np.isfinite(found).all() else np.inf
+        rests = fit.status not in (Status.not_finite, Status.not_converged)
+        return Settled(fit, rest, found, memory, None, minus, rests)
+
+
+class Settled(NamedTuple):
+    """A fit whose noise is that of its own residuals.
+
+    `rest` and `noise` by run and output; `memory` of a noise with one and `errors` that average
+    over what is open of it; `likelihood` is -2 ln L, for responses with the cost of the Bayesian
+    information criterion; `rests` whether a further round would gain nothing.
+    """
+
+    fit: Fit
+    rest: tuple[tuple[np.ndarray, ...], ...]
+    noise: np.ndarray
+    memory: Noise | None
+    errors: Memory | None
+    likelihood: float
+    rests: bool
+
+    def slopes(self, case: Case) -> list[np.ndarray]:
+        """Slopes of each run's outputs by the free numbers; 0 by those that are held."""
+        free = self.fit.problem.moving
+        return [free * self.fit.derive(predicted, course).slope for course in case.courses]
+
+    def remembered(
+        self, case: Case, noise: Noise | None = None, most: int | None = None
+    ) -> tuple[Memory, Noise, float]:
+        """The noise with a memory that the residuals have, of so many of them at most."""
+        problem, size, rest = self.fit.problem, self.fit.problem.size, case.rows(self.rest)
+        own = [part for i, s in enumerate(self.slopes(case)) for part in case.split(i, s)]
+        parts = zip(own, rest, self.noise.ravel(), strict=True)
+        rows = [np.column_stack([slope, -r])[:most] / s for slope, (r, _, _), s in parts]
+        prior = np.asarray(problem.residual(self.fit.theta))[size:]
+        known = np.column_stack([self.fit.dense_jacobian[size:], prior])
+        return noise_of(rows, [time[:most] for _, time, _ in rest], known, noise)
+
+    def correlated(self, case: Case) -> bool:
+        """True if the noise of any output has a memory and exceeds rounding."""
+        used = used_by(self.fit)
+        return any(remembers(r, used) and r.std() > CLOSE * s.size_y
+                   for r, _, s in case.rows(self.rest))  # fmt: skip
+
+
+def used_by(fit: Fit) -> int:
+    """Number of numbers that the readings determine."""
+    return max(round(sum(group.count - group.dof for group in fit.groups)), 1)
+
+
+def information(case: Case, found: Settled, noise: Noise | None) -> float:
+    """The Bayesian information criterion of a fit under a noise with a memory, or without."""
+    rows = case.rows(found.rest)
+    cost = used_by(found.fit) * np.log(sum(len(rest) for rest, _, _ in rows))
+    return float(cost + sum(_minus(r, t, s.size_y, noise) for r, t, s in rows))
+
+
+def _minus(rest: np.ndarray, time: np.ndarray, size_y: float, noise: Noise | None) -> float:
+    """-2 ln L of residuals, their size being their own."""
+    white, volume = (rest, 0.0) if noise is None else innovations(rest, time, noise)
+    size = max(float(np.std(white)), CLOSE * size_y)
+    return 2.0 * (len(rest) * np.log(size) + float(volume))
+
+
+def _with_gaps(model: Any, course: Any) -> jax.Array:
+    return jnp.concatenate(course.shot(model))
+
+
+def _surprising(model: Any, course: Any) -> jax.Array:
+    """Innovations of a run: readings less their prediction from earlier ones."""
+    return innovations(predicted(model, course), course.time, course.noise)[0]
+
+
+def rounds(found: Any, again: Callable[[Any], Any], gained: float, most: int) -> tuple[Any, bool]:
+    """Search again from what was found, until nothing is gained; and whether that came to be."""
+    for _ in range(most):
+        if not np.isfinite(found.likelihood):
+            break
+        before, found = found, again(found)
+        if abs(before.likelihood - found.likelihood) < gained:
+            return found, True
+    return found, False
+
+
+def settled(
+    case: Case,
+    models: Sequence[Any],
+    search: Callable[..., Settled],
+    gained: Callable[[Settled], float],
+    most: int,
+) -> Settled:
+    """Search from each start for a round, then from the best until nothing is gained."""
+    tried = (search(case, model, case.guess) for model in models)
+    found = min(tried, key=lambda each: each.likelihood)
+    found, rests = rounds(found, lambda f: search(case, f.fit.model, f.noise), gained(found), most)
+    return found._replace(rests=rests or found.rests)
+
+
+def with_memory(
+    case: Case, white: Settled, search: Callable[..., Settled], most: int | None = None
+) -> Settled:
+    """The fit again, the noise of its residuals with a memory."""
+
+    def again(found: Settled) -> Settled:
+        _, memory, size = found.remembered(case, most=most)
+        return search(case, found.fit.model, size * found.noise, memory=memory)
+
+    return rounds(white, again, GAINED, AGAIN)[0]
+
+
+# Steps of a round, after which the noise is estimated again, and most rounds.
+STEPS, ROUNDS = 100, 30
+
+
+def case_of(seen: PreparedOutput, offset: bool, network: bool = False) -> Case:
+    """The case of one output: constant raw numbers or a network of them."""
+    free = [Free("start", nuisance=True), Free("map", nuisance=network)]
+    free += [Free("offset")] if offset else []
+    free += [] if seen.runs[0].held is None else [Free("late")]
+    return Case((seen,), seen.runs, tuple(free), weight_priors("map") if network else ())
+
+
+def _round(case: Case, model: Any, noise: np.ndarray, memory: Noise | None = None) -> Settled:
+    """A search that pays for what it uses; the part of a sample in a delay begins anew."""
+    found = case.search(model | {"late": 0.0}, noise, STEPS, memory)
+    return found._replace(likelihood=information(case, found, memory))
+
+
+def remembering(case: Case, models: Sequence[Any]) -> Settled:
+    """The best fit from some starts, its noise with a memory where residuals are correlated.
+
+    The noise weighs against the priors of a network, so it is taken anew in every round.
+    """
+    found = settled(case, models, _round, lambda f: GAINED + 1e-9 * abs(f.likelihood), ROUNDS)
+    if not found.correlated(case):
+        return found
+    again = with_memory(case, found, _round)
+    return again._replace(rests=found.rests, errors=again.remembered(case)[0])
+
+
+class Begun(NamedTuple):
+    """Runs as the model sees them, the delay, and the fit with constant parameters."""
+
+    seen: PreparedOutput
+    delay: float
+    plain: Settled
+
+
+def begun(
+    runs: tuple[Run, ...], output: str, physics: Physics, delay: float | None, offset: bool
+) -> Begun:
+    """Identify with constant parameters; the delay among candidates if None."""
+    start, seen, delay = start_of(runs, output, physics, delay, offset)
+    return Begun(seen, delay, remembering(case_of(seen, offset), [start.model]))
+
+
+def is_first_order(found: Begun, offset: bool) -> bool:
+    """True if a first order does as well as a higher one by the Bayesian information criterion."""
+    if found.seen.runs[0].physics is FIRST_ORDER:
+        return False
+    lower = found.seen._replace(runs=driven_by(found.seen, FIRST_ORDER))
+    start = best_start(lower, offset)
+    return remembering(case_of(lower, offset), [start.model]).likelihood <= found.plain.likelihood
