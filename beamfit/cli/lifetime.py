@@ -244,7 +244,7 @@ def _show_record(terminal: Terminal, study: RecordStudy) -> None:
         terminal.answer(decay.fit.headline, status, decay.fit.message)
         terminal.line()
         if not terminal.full:
-            terminal.table(labelled("", [name], tables.quoted_rows([decay])), wrap=False)
+            terminal.table(labelled("", [name], tables.decay_rows([decay])).quoted(), wrap=False)
             continue
         rows = tables.decay_rows([decay]) + tables.separability_rows([decay])[:2]
         rows += tables.check_rows([decay])

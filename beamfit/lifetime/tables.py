@@ -15,10 +15,7 @@ from beamfit.lifetime.ring_study import Shift
 from beamfit.lifetime.scales import VOLTAGE
 from beamfit.lifetime.study import Decay, RecordStudy
 from beamfit.quantity import Quantity, Status
-from beamfit.table import cell
-
-# Label and values, as `beamfit.table.labelled` takes them.
-Rows = list[tuple[str, list[object]]]
+from beamfit.table import Row, cell
 
 
 class DecayRow(NamedTuple):
@@ -36,8 +33,8 @@ FEW = 4
 NEGLIGIBLE = 1e-6
 
 
-def _laid_out(decays: Sequence[Decay], rows: Sequence[DecayRow]) -> Rows:
-    return [(row.label, [row.value(decay) for decay in decays]) for row in rows]
+def _laid_out(decays: Sequence[Decay], rows: Sequence[DecayRow]) -> list[Row]:
+    return [Row(row.label, [row.value(each) for each in decays], row.quoted) for row in rows]
 
 
 def _span(seconds: float) -> str:
@@ -120,14 +117,9 @@ def _rows_of(decays: Sequence[Decay]) -> tuple[DecayRow, ...]:
     return *RESULT, *EXACT * free, *QUALITY
 
 
-def decay_rows(decays: Sequence[Decay]) -> Rows:
+def decay_rows(decays: Sequence[Decay]) -> list[Row]:
     """Label and one cell per decay, for every number a fit has."""
     return _laid_out(decays, _rows_of(decays))
-
-
-def quoted_rows(decays: Sequence[Decay]) -> Rows:
-    """The rows of `decay_rows` that people quote."""
-    return _laid_out(decays, [row for row in _rows_of(decays) if row.quoted])
 
 
 def _number(value: float | None, form: str, unit: str = "") -> str:
@@ -156,7 +148,7 @@ APART: tuple[DecayRow, ...] = (
 )
 
 
-def separability_rows(decays: Sequence[Decay]) -> Rows:
+def separability_rows(decays: Sequence[Decay]) -> list[Row]:
     """Label and one cell per decay for what the record tells of a and b apart."""
     return _laid_out(decays, APART)
 
@@ -197,7 +189,7 @@ OUTGASSING: tuple[DecayRow, ...] = (
 SYSTEMATIC = ["if the", "a", "b", "lifetime at the mean"]
 
 
-def check_rows(decays: Sequence[Decay]) -> Rows:
+def check_rows(decays: Sequence[Decay]) -> list[Row]:
     """Label and one cell per decay for what simpler analyses say, and whether a is constant."""
     rows = CHECKS if any(decay.checks for decay in decays) else CHECKS[-1:]
     rows += LIFETIMES if any(decay.fit.lifetimes for decay in decays) else ()
@@ -280,7 +272,7 @@ def _budgets_known(decays: Sequence[Decay]) -> bool:
     return all(decay.budget is not None for decay in decays) and len(decays) > 0
 
 
-def budget_rows(decays: Sequence[Decay]) -> Rows:
+def budget_rows(decays: Sequence[Decay]) -> list[Row]:
     """Label and one cell per decay: first principles beside the measured; empty without a ring."""
     return _laid_out(decays, BUDGET) if _budgets_known(decays) else []
 
@@ -353,7 +345,7 @@ def _setting(operation: Operation) -> str:
     return f"{voltage:.6g} kV, {scraper:.4g} mm, {float(operation.bunches):.6g} bunches"
 
 
-def shift_rows(shift: Shift) -> Rows:
+def shift_rows(shift: Shift) -> list[Row]:
     """Label and one cell for each answer of a study of many decays."""
     fit, best, at = shift.fit, shift.best, f"at {shift.current:.4g} mA"
     rows: list[tuple[str, object]] = [("status", fit.status)]
@@ -383,10 +375,10 @@ def shift_rows(shift: Shift) -> Rows:
         asked = proposal.candidate
         said = f"{asked.current:.4g} mA (information {proposal.information:.3g})"
         rows.append((f"next decay, choice {number}", f"{_setting(asked.operation)}, {said}"))
-    return [(label, [value]) for label, value in rows]
+    return [Row(label, [value]) for label, value in rows]
 
 
-def network_rows(shift: Shift) -> Rows:
+def network_rows(shift: Shift) -> list[Row]:
     """Label and one cell for what a network of the losses says, and what it obeys."""
     network, at = shift.network, f"at the usual settings, {shift.current:.4g} mA"
     a, b, lifetime = network.predict(network.usual, shift.current)
@@ -401,4 +393,4 @@ def network_rows(shift: Shift) -> Rows:
         ("falls with scraper and bunches, rises with pressure", held.holds),
         ("single maximum of the lifetime in the RF voltage", held.single_maximum),
     ]
-    return [(label, [value]) for label, value in rows]
+    return [Row(label, [value]) for label, value in rows]

@@ -114,13 +114,12 @@ def _side_by_side(decays: Sequence[Decay]) -> list[Table]:
     """Every number of a few decays, one column each."""
     groups = [decays[k : k + ABREAST] for k in range(0, len(decays), ABREAST)]
     parts = [
-        ("Result", "", tables.quoted_rows),
         ("All numbers", ERRORS, tables.decay_rows),
         ("What the records determine", "", tables.separability_rows),
         ("Simpler analyses, and whether a is constant", CHECKS, tables.check_rows),
         ("Losses from first principles", BUDGET, tables.budget_rows),
     ]
-    return [
+    every = [
         labelled(
             title, [decay.fit.record for decay in group], rows, note if group is groups[0] else ""
         )
@@ -128,6 +127,8 @@ def _side_by_side(decays: Sequence[Decay]) -> list[Table]:
         for group in groups
         if (rows := rows_of(group))
     ]
+    first = [each.quoted()._replace(title="Result", note="") for each in every[: len(groups)]]
+    return [*first, *every]
 
 
 def _single(decays: Sequence[Decay]) -> list[Table]:

@@ -8,7 +8,7 @@ from functools import partial
 from typing import Any
 
 from beamfit.emittance.fit import EmittanceFit
-from beamfit.emittance.results import parameter_rows, quoted_rows, result_rows
+from beamfit.emittance.results import parameter_rows, result_rows
 from beamfit.emittance.scan import QuadScan
 from beamfit.emittance.sensitivity import budget_rows, range_rows
 from beamfit.emittance.size_methods import SizeMethods
@@ -54,7 +54,7 @@ def emittance_page(fit: EmittanceFit, methods: tuple[SizeMethods, ...] = ()) -> 
     scan, line = fit.scan, fit.line
     names = [p.plane for p in fit.planes]
     tables = [
-        labelled("Result", names, quoted_rows(fit.planes)),
+        labelled("Result", names, result_rows(fit.planes)).quoted(),
         labelled("All numbers", names, result_rows(fit.planes), ERRORS),
         labelled("What the data determine", names, identifiability_rows(fit.planes)),
         *(_budgets(fit, names) if fit.statement.closed else _fitted_too(fit)),
