@@ -21,7 +21,7 @@ from beamfit.emittance.transport import setting_units
 from beamfit.emittance.verdict import (
     CARRIES,
     MOVES,
-    Evidence,
+    PlaneEvidence,
     noise_remark,
     point_remarks,
     verdict,
@@ -68,7 +68,7 @@ class Beside(NamedTuple):
     dof : float
         Degrees of freedom of the plane's sizes.
     ending, opened, remedy, remark, scenario
-        As of `Evidence`, and a further sentence.
+        As of `PlaneEvidence`, and a further sentence.
     holds : str
         What the error includes.
     """
@@ -94,7 +94,7 @@ class Influence(NamedTuple):
     without: float = math.nan
 
 
-class Numbers(NamedTuple):
+class PlaneNumbers(NamedTuple):
     """Numbers of a plane in the order of `QUANTITIES`, each of shape (11,)."""
 
     value: np.ndarray
@@ -179,7 +179,7 @@ def plane_answer(
 
 def _numbers(
     post: PlanePosterior, p: Points, places: Places, b: Beside | None
-) -> tuple[Numbers, Influence]:
+) -> tuple[PlaneNumbers, Influence]:
     """The numbers of a plane, and the point that carries them."""
     spread = None if b is None else b.spread
     quantiles = _quantiles(post, tuple(places), spread)
@@ -192,11 +192,16 @@ def _numbers(
         low, high, half = _reaching(low, high, half, value, carrying.without)
     raw = _raw(post, tuple(places))
     raw = raw if b is None else np.hypot(raw, b.spread)
-    return Numbers(value, half, low, high, raw), carrying
+    return PlaneNumbers(value, half, low, high, raw), carrying
 
 
 def _judged(
-    seen: Seen, plane: str, e: Evidence, b: Beside | None, carrying: Influence, value: np.ndarray
+    seen: Seen,
+    plane: str,
+    e: PlaneEvidence,
+    b: Beside | None,
+    carrying: Influence,
+    value: np.ndarray,
 ) -> Judged:
     """The verdict on a plane."""
     work = seen.works[plane]
@@ -219,7 +224,7 @@ def _judged(
     return Judged(finding, e.determined, e.of_a_beam, advice)
 
 
-def _scale(n: Numbers) -> float:
+def _scale(n: PlaneNumbers) -> float:
     """The error of the emittance over that by the stated errors alone; 1 without."""
     return float(n.half[0] / n.raw[0]) if np.isfinite(n.raw[0]) and n.raw[0] > 0 else 1.0
 
@@ -234,7 +239,7 @@ def _covariance(post: PlanePosterior, b: Beside | None, scale: float, known: boo
 
 
 def _identifiability(
-    post: PlanePosterior, p: Points, n: Numbers, e: Evidence, j: Judged, b: Beside | None
+    post: PlanePosterior, p: Points, n: PlaneNumbers, e: PlaneEvidence, j: Judged, b: Beside | None
 ) -> Identifiability:
     directions = _directions(p, post) if b is None else b.directions
     return Identifiability(
@@ -285,10 +290,10 @@ def _reaching(
     return low, high, half
 
 
-def _evidence(seen: Seen, plane: str, low: float, high: float, b: Beside | None) -> Evidence:
+def _evidence(seen: Seen, plane: str, low: float, high: float, b: Beside | None) -> PlaneEvidence:
     work = seen.works[plane]
     p, post = work.points, work.posterior
-    found = Evidence(
+    found = PlaneEvidence(
         probability=post.probability,
         seen=post.seen,
         points=len(p.size),

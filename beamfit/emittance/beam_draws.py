@@ -15,7 +15,7 @@ from scipy.special import fdtri, gammaln, ndtri
 
 from beamfit.noise.model import LN_2PI, Noise
 from beamfit.noise.sizes import (
-    Kind,
+    NoiseKind,
     Scales,
     averaged,
     log_likelihood,
@@ -137,14 +137,14 @@ class BeamDraws(NamedTuple):
         return weight / weight.sum(-1, keepdims=True)
 
 
-def draw_beams(c: Coordinates, kind: Kind, noise: Noise) -> BeamDraws:
+def draw_beams(c: Coordinates, kind: NoiseKind, noise: Noise) -> BeamDraws:
     """Draw beams from their posterior.
 
     Parameters
     ----------
     c : Coordinates
         The scan, in its own coordinates.
-    kind : Kind
+    kind : NoiseKind
         In the same units.
     noise : Noise
         Priors of bad readings.
@@ -211,7 +211,7 @@ def model_sizes(x: np.ndarray, c: Coordinates) -> np.ndarray:
 
 
 def _log_likelihood(
-    x: np.ndarray, c: Coordinates, kind: Kind, scale: np.ndarray, noise: Noise
+    x: np.ndarray, c: Coordinates, kind: NoiseKind, scale: np.ndarray, noise: Noise
 ) -> np.ndarray:
     """Log likelihood of beams x, shape (..., d, k), in blocks of draws that memory holds."""
     step = max(1, int(BLOCK / (scale.size * c.size.shape[-1])))
@@ -232,7 +232,7 @@ def left_out(n: int) -> np.ndarray:
     return kept
 
 
-def fits(c: Coordinates, kind: Kind) -> tuple[np.ndarray, np.ndarray]:
+def fits(c: Coordinates, kind: NoiseKind) -> tuple[np.ndarray, np.ndarray]:
     """Fits of size² with all points and without some: centres and roots of their covariances.
 
     Returns
@@ -255,7 +255,7 @@ def _joined(found: list[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.
     return np.concatenate(centres, -2), np.concatenate(roots, -3)
 
 
-def _deviations(kind: Kind, c: Coordinates) -> list[np.ndarray]:
+def _deviations(kind: NoiseKind, c: Coordinates) -> list[np.ndarray]:
     """Deviations of points to weigh them by: as stated, and with the usual scatter beside."""
     if kind.special == 0.0 and kind.chance:
         return [kind.floor, np.hypot(kind.floor, kind.prior.middle * kind.unit)]
@@ -263,7 +263,7 @@ def _deviations(kind: Kind, c: Coordinates) -> list[np.ndarray]:
 
 
 def _fitted(
-    c: Coordinates, kind: Kind, deviation: np.ndarray, kept: np.ndarray
+    c: Coordinates, kind: NoiseKind, deviation: np.ndarray, kept: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     rows, target = c.rows[..., None, :, :], (c.size**2 - c.known)[..., None, :]
     size = c.size[..., None, :]
@@ -293,7 +293,9 @@ def _little(normal: np.ndarray) -> np.ndarray:
     return 1e-9 * np.maximum(trace, 1e-30) * np.eye(3)
 
 
-def _greedy(c: Coordinates, kind: Kind, deviation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _greedy(
+    c: Coordinates, kind: NoiseKind, deviation: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Fits that leave out the worst point of the one before, up to a share of them."""
     n = c.size.shape[-1]
     kept, found, most = np.ones((*c.unit.shape, 1, n)), [], int(WORST * n)

@@ -24,7 +24,7 @@ from beamfit.status import Status
 WIDTH = 20.0 / 167.23
 
 
-class Kind(Enum):
+class NumberKind(Enum):
     """The effect of a calibration's number on k1: it scales it, shifts it, or bends its curve."""
 
     slope = "slope"
@@ -33,10 +33,14 @@ class Kind(Enum):
 
 
 # The numbers of a calibration in the order of its fields; of any further ones the last.
-_SCALE = ((Kind.slope, "1"),)
+_SCALE = ((NumberKind.slope, "1"),)
 _MEANINGS = {
-    SlopeIntercept: ((Kind.slope, "MeV/(m^2 A)"), (Kind.offset, "MeV/m^2")),
-    CurrentPolynomial: ((Kind.offset, "T/m"), (Kind.slope, "T/(m A)"), (Kind.bend, "1")),
+    SlopeIntercept: ((NumberKind.slope, "MeV/(m^2 A)"), (NumberKind.offset, "MeV/m^2")),
+    CurrentPolynomial: (
+        (NumberKind.offset, "T/m"),
+        (NumberKind.slope, "T/(m A)"),
+        (NumberKind.bend, "1"),
+    ),
 }
 
 
@@ -49,7 +53,7 @@ class Number(NamedTuple):
         Whose, and where in its calibration.
     value : float
         In ``unit``.
-    kind : Kind
+    kind : NumberKind
         What it does.
     reach : float
         Half the width of its usual bounds.
@@ -60,7 +64,7 @@ class Number(NamedTuple):
     magnet: str
     path: str
     value: float
-    kind: Kind
+    kind: NumberKind
     reach: float
     unit: str
 
@@ -105,9 +109,9 @@ def numbers_of_magnets(line: Beamline, magnets: tuple[str, ...] | None = None) -
         meanings = _MEANINGS.get(type(calibration), _SCALE)
         values = [float(v) for v in jax.tree_util.tree_leaves(calibration)]
         told = [meanings[min(i, len(meanings) - 1)] for i in range(len(values))]
-        slopes = [v for v, (kind, _) in zip(values, told, strict=True) if kind is Kind.slope]
+        slopes = [v for v, (kind, _) in zip(values, told, strict=True) if kind is NumberKind.slope]
         for leaf, value, (kind, unit) in zip(leaves(calibration), values, told, strict=True):
-            own = WIDTH * abs(value) + 1e-3 if kind is Kind.bend else WIDTH * abs(slopes[0])
+            own = WIDTH * abs(value) + 1e-3 if kind is NumberKind.bend else WIDTH * abs(slopes[0])
             number = Number(magnet, leaf.path, value, kind, own, unit)
             found[number.name] = number
     return found
@@ -162,7 +166,7 @@ def _free_numbers(seen: Seen, told: Assumptions) -> dict[str, Number]:
     return {
         name: number
         for name, number in known.items()
-        if name in named or (number.magnet in varied and number.kind is not Kind.bend)
+        if name in named or (number.magnet in varied and number.kind is not NumberKind.bend)
     }
 
 
@@ -196,7 +200,7 @@ def _null_directions(
     for parameter in parameters:
         if parameter.status is Status.converged:
             continue
-        if known[parameter.name].kind is Kind.offset:
+        if known[parameter.name].kind is NumberKind.offset:
             said.append(
                 f"{parameter.name}: a shift of k1 is undone by a lens at that magnet in the beam, "
                 "so beta and alpha change and the emittance does not (exact for a thin lens)"
@@ -213,7 +217,7 @@ def _null_directions(
 
 def _remedy(seen: Seen, told: Assumptions) -> str:
     known = numbers_of_magnets(seen.scanned, varied_magnets(seen.scan))
-    slopes = [name for name, number in known.items() if number.kind is Kind.slope]
+    slopes = [name for name, number in known.items() if number.kind is NumberKind.slope]
     without = [name for name in slopes if name not in told.priors]
     second = "a second screen (see beamfit design)"
     if without:

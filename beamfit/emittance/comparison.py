@@ -22,7 +22,7 @@ from beamfit.emittance.beam_draws import (
 from beamfit.emittance.model import coefficients
 from beamfit.noise.model import LN_2PI, Noise
 from beamfit.noise.sizes import (
-    Kind,
+    NoiseKind,
     Scales,
     averaged,
     kinds_of,
@@ -60,7 +60,7 @@ LEVEL = 1.0
 FEW = 256
 
 
-def flat_beam(c: Coordinates, kind: Kind, noise: Noise) -> np.ndarray:
+def flat_beam(c: Coordinates, kind: NoiseKind, noise: Noise) -> np.ndarray:
     """A beam of no emittance: sizes |w·v|, shape (...,).
 
     Notes
@@ -136,7 +136,7 @@ class CurveEvidence(NamedTuple):
     curve: np.ndarray
 
 
-def curve_evidences(u: np.ndarray, c: Coordinates, kind: Kind, noise: Noise) -> CurveEvidence:
+def curve_evidences(u: np.ndarray, c: Coordinates, kind: NoiseKind, noise: Noise) -> CurveEvidence:
     """Evidences of one size, sizes at random, a drift in time, a smooth curve of the setting.
 
     Parameters
@@ -296,7 +296,7 @@ class PlanePosterior(NamedTuple):
     relative: float
     chi2: float
     seen: bool
-    kinds: tuple[Kind, ...]
+    kinds: tuple[NoiseKind, ...]
     scales: tuple[Scales, ...]
     by_scale: tuple[np.ndarray, ...]
     unit: float
@@ -363,7 +363,7 @@ class _Stack(NamedTuple):
 
     c: Coordinates
     u: np.ndarray
-    kinds: tuple[Kind, ...]
+    kinds: tuple[NoiseKind, ...]
 
 
 def _stacked(planes: Sequence[PlaneSizes], noise: Noise) -> _Stack:
@@ -478,7 +478,7 @@ def _model(x: np.ndarray, c: Coordinates) -> np.ndarray:
 
 
 def _expected(
-    model: np.ndarray, c: Coordinates, kind: Kind, draws: BeamDraws, noise: Noise
+    model: np.ndarray, c: Coordinates, kind: NoiseKind, draws: BeamDraws, noise: Noise
 ) -> tuple[np.ndarray, np.ndarray]:
     """Expected precision of each point's size, and probability that it is bad, (planes, n)."""
     off, model = (c.size - model)[:, None, :], model[:, None, :]
@@ -539,7 +539,7 @@ def _posterior(
     )
 
 
-def _of_plane(kind: Kind, i: int) -> Kind:
+def _of_plane(kind: NoiseKind, i: int) -> NoiseKind:
     """A kind of noise of one plane of many."""
     return kind._replace(floor=kind.floor[i], unit=kind.unit[i], usual=kind.usual[i])
 

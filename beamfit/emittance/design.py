@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from beamfit.answer import answer
-from beamfit.emittance.calibration import Kind, numbers_of_magnets
+from beamfit.emittance.calibration import NumberKind, numbers_of_magnets
 from beamfit.emittance.fit import EmittanceFit
 from beamfit.emittance.model import emittance_parts, predict_sizes, sigma_of, spoken
 from beamfit.emittance.next_point import (
@@ -372,7 +372,7 @@ def _priors(fit: EmittanceFit) -> Iterator[tuple[str, np.ndarray]]:
     slopes = {
         f"magnets.{name}": number.value
         for name, number in numbers_of_magnets(fit.seen.scanned).items()
-        if number.kind is Kind.slope
+        if number.kind is NumberKind.slope
     }
     for i, name in enumerate(fit.problem.names):
         if name in slopes:

@@ -14,7 +14,7 @@ from beamfit.emittance.model import size_squared
 from beamfit.emittance.results import in_words
 from beamfit.emittance.statement import Seen
 from beamfit.emittance.transport import Rows, rows_at
-from beamfit.emittance.verdict import Evidence
+from beamfit.emittance.verdict import PlaneEvidence
 from beamfit.greybox.design import Information, greedy, rows_of
 from beamfit.optics.beamline import Beamline
 from beamfit.optics.rows import transfer_rows
@@ -225,4 +225,4 @@ def simulated(seen: Seen, plane: str, r11: np.ndarray, r12: np.ndarray, known: n
     drawn = emittances(found.sigma)
     low, high = emittance_quantiles(drawn, found.weight, found.flat, (0.025, 0.975))
     given = len(rows[0]), old.moved, error is not None
-    return Evidence(found.probability, found.seen, *given, low, high, None).determined
+    return PlaneEvidence(found.probability, found.seen, *given, low, high, None).determined

@@ -29,7 +29,7 @@ from beamfit.greybox.posterior import predicted, target_of
 from beamfit.greybox.problem import Problem
 from beamfit.greybox.stated import Optimum, Statement
 from beamfit.noise.model import Lognormal, Noise
-from beamfit.noise.sizes import Kind, averaged, log_likelihood
+from beamfit.noise.sizes import NoiseKind, averaged, log_likelihood
 from beamfit.optics.beam import BeamMatrix
 from beamfit.quantity import Status
 from beamfit.sampling.intervals import Expected
@@ -88,14 +88,14 @@ class AveragedNoise:
     log_scale_weight: Any
 
     @property
-    def kind(self) -> Kind:
+    def kind(self) -> NoiseKind:
         """The same as the likelihood takes it."""
         named = (self.power, self.floor, self.unit, self.usual, Lognormal(*self.prior))
-        return Kind(*named, self.special, self.chance, self.least, self.log_weight)
+        return NoiseKind(*named, self.special, self.chance, self.least, self.log_weight)
 
 
 @tree.node("plane", "noise")
-class Sizes:
+class PlaneLikelihood:
     """The sizes of a plane for its likelihood: where its rows are, what was measured, its noise."""
 
     plane: str
@@ -126,7 +126,7 @@ class Told(NamedTuple):
     """Data of the functions of a scan's statement."""
 
     asked: tuple[Asked, ...]
-    sizes: tuple[Sizes, ...]
+    sizes: tuple[PlaneLikelihood, ...]
 
 
 def _log_volume(model: Mapping[str, Any], told: Told) -> Array:
@@ -134,7 +134,7 @@ def _log_volume(model: Mapping[str, Any], told: Told) -> Array:
     return sum((each.log_density(model) for each in told.sizes), jnp.zeros(()))
 
 
-def _sizes_of(problem: Problem, seen: Seen, planes: Sequence[str]) -> tuple[Sizes, ...]:
+def _sizes_of(problem: Problem, seen: Seen, planes: Sequence[str]) -> tuple[PlaneLikelihood, ...]:
     """Data of each plane for the likelihood."""
     records, found = size_records(problem), []
     for plane in planes:
@@ -149,7 +149,7 @@ def _sizes_of(problem: Problem, seen: Seen, planes: Sequence[str]) -> tuple[Size
         ]  # fmt: skip
         at, size = seen.measured(plane), work.sizes.size / post.unit
         own = (records[plane].data, at, size, post.unit, post.trace, tuple(kinds))
-        found.append(Sizes(plane, seen.noise.of_points(len(size)), *own))
+        found.append(PlaneLikelihood(plane, seen.noise.of_points(len(size)), *own))
     return tuple(found)
 
 

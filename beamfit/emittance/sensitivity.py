@@ -50,7 +50,7 @@ RESOLUTION, DISPERSION, SPREAD = 10e-6, 0.01, 1e-3
 AT_WAIST = 0.05
 
 
-class Change(NamedTuple):
+class BudgetChange(NamedTuple):
     """Change of the emittance by one small change of the line.
 
     Attributes
@@ -86,7 +86,7 @@ class RangeRow(NamedTuple):
     shift: float
 
 
-def systematics(fit: EmittanceFit, plane: str) -> list[Change]:
+def systematics(fit: EmittanceFit, plane: str) -> list[BudgetChange]:
     """Change of the emittance for small changes of the line, the energy, the screen and the beam.
 
     Parameters
@@ -98,7 +98,7 @@ def systematics(fit: EmittanceFit, plane: str) -> list[Change]:
 
     Returns
     -------
-    list of Change
+    list of BudgetChange
         The largest change first; empty where the emittance is not determined. For +1 % of each
         magnet, scanned or not, of the angle of each bend, of the energy and of the screen's scale;
         for +1 cm of each drift; for 10 µm of resolution and 1 cm of dispersion of the incoming beam
@@ -147,7 +147,7 @@ def systematics(fit: EmittanceFit, plane: str) -> list[Change]:
     stiffer = 0.01 * energy**2 / (energy**2 - mass**2)
     # What is zero but for rounding is zero, and keeps its place.
     whole = {cause: d if abs(d) > ROUNDING else 0.0 for cause, d in changes.items()}
-    found = [Change(c, d, d + stiffer * (c == of_energy)) for c, d in whole.items()]
+    found = [BudgetChange(c, d, d + stiffer * (c == of_energy)) for c, d in whole.items()]
     return sorted(found, key=lambda change: -abs(change.normalized_emittance))
 
 

@@ -18,10 +18,10 @@ from scipy.stats import qmc
 from beamfit.compile_cache import SELDOM
 from beamfit.emittance.calibration import with_numbers
 from beamfit.emittance.setpoint_result import (
-    Evidence,
     Minimum,
     PlaneBeam,
     Setpoint,
+    SetPointEvidence,
     doubts_on,
     notes_on,
     reached_words,
@@ -157,7 +157,7 @@ def find_setpoint(
     listed = [Minimum(_settings(wanted, theta), value) for theta, value in minima]
     predicted = _predicted(wanted, used, fit.theta)
     misses = _relative_misses(wanted, targets, fit.theta)
-    evidence = Evidence(
+    evidence = SetPointEvidence(
         reached_words(targets, predicted, misses),
         misses,
         listed[0].objective,

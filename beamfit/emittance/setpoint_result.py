@@ -154,7 +154,7 @@ def _written(objective: float) -> str:
     return f"{objective:.6g}" if objective >= EXACT else "0"
 
 
-class Evidence(NamedTuple):
+class SetPointEvidence(NamedTuple):
     """Evidence for the verdict on a set point.
 
     Attributes
@@ -178,11 +178,11 @@ class Evidence(NamedTuple):
     held: tuple[str, ...]
 
 
-def _exact(e: Evidence) -> Finding | None:
+def _exact(e: SetPointEvidence) -> Finding | None:
     return Finding(Status.converged, e.reached) if e.objective < EXACT else None
 
 
-def _restless(e: Evidence) -> Finding | None:
+def _restless(e: SetPointEvidence) -> Finding | None:
     if e.optimum:
         return None
     return Finding(
@@ -193,7 +193,7 @@ def _restless(e: Evidence) -> Finding | None:
     )
 
 
-def _at_limit(e: Evidence) -> Finding | None:
+def _at_limit(e: SetPointEvidence) -> Finding | None:
     if not e.held:
         return None
     return Finding(
@@ -203,7 +203,7 @@ def _at_limit(e: Evidence) -> Finding | None:
     )
 
 
-def _out_of_reach(e: Evidence) -> Finding | None:
+def _out_of_reach(e: SetPointEvidence) -> Finding | None:
     if max(e.misses) <= MET:
         return None
     why = "the wishes contradict one another" if len(e.misses) > 1 else "the beam does not allow it"
@@ -214,7 +214,7 @@ def _out_of_reach(e: Evidence) -> Finding | None:
     )
 
 
-def _met(e: Evidence) -> Finding:
+def _met(e: SetPointEvidence) -> Finding:
     return Finding(Status.converged, e.reached)
 
 
@@ -222,13 +222,13 @@ RULES = (_exact, _restless, _at_limit, _out_of_reach, _met)
 
 
 def verdict_on(
-    e: Evidence, minima: Sequence[Minimum], units: Mapping[str, str]
+    e: SetPointEvidence, minima: Sequence[Minimum], units: Mapping[str, str]
 ) -> tuple[Status, str]:
     """Judge the best point, and name the next minimum.
 
     Parameters
     ----------
-    e : Evidence
+    e : SetPointEvidence
         Of the best point.
     minima : sequence of Minimum
         Best first.

@@ -53,7 +53,7 @@ class Gain(NamedTuple):
         return self.upper <= reach if self.sign < 0 else self.lower >= -reach
 
 
-class Certificate(NamedTuple):
+class GainCertificate(NamedTuple):
     """Certified gains of a fitted network, and the box they hold over."""
 
     gains: tuple[Gain, ...]
@@ -258,7 +258,7 @@ SCENARIO = Scenario(
 )
 
 
-def certificate_of(problem: Problem, net: MLP) -> Certificate:
+def certificate_of(problem: Problem, net: MLP) -> GainCertificate:
     """Enclose the gains of a fitted network over the box of the scan.
 
     Parameters
@@ -271,7 +271,7 @@ def certificate_of(problem: Problem, net: MLP) -> Certificate:
 
     Returns
     -------
-    Certificate
+    GainCertificate
         For every current in the box, not only the measured ones, outward rounding included.
     """
     ports = net.input_ports
@@ -288,7 +288,7 @@ def certificate_of(problem: Problem, net: MLP) -> Certificate:
         for i, port in enumerate(ports)
     )
     box = {p.name: (float(a), float(b)) for p, a, b in zip(ports, low, high, strict=True)}
-    return Certificate(gains, box)
+    return GainCertificate(gains, box)
 
 
 def _asked(problem: Problem, net: MLP) -> np.ndarray:

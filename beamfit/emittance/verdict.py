@@ -40,7 +40,7 @@ REMEDIES = {
 }
 
 
-class Evidence(NamedTuple):
+class PlaneEvidence(NamedTuple):
     """Evidence for the verdict on one plane.
 
     Attributes
@@ -105,12 +105,12 @@ class Evidence(NamedTuple):
         return self.of_a_beam and sure and narrow and not self.opened and self.ending is None
 
 
-def verdict(e: Evidence, remarks: str = "", advice: str = "") -> Finding:
+def verdict(e: PlaneEvidence, remarks: str = "", advice: str = "") -> Finding:
     """Say whether a plane's sizes determine its emittance.
 
     Parameters
     ----------
-    e : Evidence
+    e : PlaneEvidence
         Of the plane.
     remarks : str
         Further sentences on noise and points.
@@ -120,7 +120,7 @@ def verdict(e: Evidence, remarks: str = "", advice: str = "") -> Finding:
     Examples
     --------
     >>> probability = {"beam": 0.999, "beam of no emittance": 0.001}
-    >>> e = Evidence(probability, True, 9, True, True, 0.9e-6, 1.1e-6, True)
+    >>> e = PlaneEvidence(probability, True, 9, True, True, 0.9e-6, 1.1e-6, True)
     >>> verdict(e).status.value, verdict(e._replace(high=4e-6)).status.value
     ('converged', 'unidentified')
     """
@@ -138,7 +138,7 @@ def verdict(e: Evidence, remarks: str = "", advice: str = "") -> Finding:
     return Finding(status, f"{said} {remarks}".strip(), " ".join(filter(None, help_)))
 
 
-def _determined(e: Evidence) -> str:
+def _determined(e: PlaneEvidence) -> str:
     where = f" in scenario {e.scenario}" if e.scenario else ""
     if e.untested:
         return (
@@ -155,7 +155,7 @@ def _sure(probability: float) -> str:
     )
 
 
-def _open(e: Evidence) -> str:
+def _open(e: PlaneEvidence) -> str:
     """Why the emittance is not determined."""
     if not e.seen:
         return (

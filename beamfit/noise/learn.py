@@ -12,7 +12,7 @@ from scipy.optimize import minimize
 
 from beamfit.errors import InputError
 from beamfit.noise.model import Lognormal, Noise
-from beamfit.noise.sizes import Kind, Scales, averaged
+from beamfit.noise.sizes import NoiseKind, Scales, averaged
 
 # With fewer planes nothing is learned of a prior.
 FEWEST = 5
@@ -35,7 +35,7 @@ class Sample(NamedTuple):
     ----------
     noise : str
         "shots", "stated" or "none": which prior it tells of.
-    kinds : tuple of Kind
+    kinds : tuple of NoiseKind
         Kinds of noise, one but for "none".
     scales : tuple of Scales
         Their nodes.
@@ -44,7 +44,7 @@ class Sample(NamedTuple):
     """
 
     noise: str
-    kinds: tuple[Kind, ...]
+    kinds: tuple[NoiseKind, ...]
     scales: tuple[Scales, ...]
     log_evidence: tuple[np.ndarray, ...]
 

@@ -33,7 +33,7 @@ STATED = 8.0
 WRONG, SIZES = np.log(30.0), 121
 
 
-class Kind(NamedTuple):
+class MemoryKind(NamedTuple):
     """A noise: its prior probability, correlation time, white share, and power of 1/f."""
 
     chance: float
@@ -42,7 +42,7 @@ class Kind(NamedTuple):
     power: float = 0.0
 
 
-def kinds_of(time: np.ndarray, count: int = TIMES) -> list[Kind]:
+def kinds_of(time: np.ndarray, count: int = TIMES) -> list[MemoryKind]:
     """List the noises that readings at these times may have, with so many correlation times.
 
     Examples
@@ -54,9 +54,9 @@ def kinds_of(time: np.ndarray, count: int = TIMES) -> list[Kind]:
     usual, span = float(np.median(np.diff(time))), float(time[-1] - time[0])
     times = np.geomspace(SHORTEST * usual, LONGEST * span, count)
     each = CORRELATED / count / len(SHARES)
-    memory = [Kind(each, float(t), white) for t in times for white in SHARES]
+    memory = [MemoryKind(each, float(t), white) for t in times for white in SHARES]
     flicker = (1.0 - WHITE - CORRELATED) / len(POWERS)
-    return [Kind(WHITE), *(Kind(flicker, power=power) for power in POWERS), *memory]
+    return [MemoryKind(WHITE), *(MemoryKind(flicker, power=power) for power in POWERS), *memory]
 
 
 def without_flicker(rows: np.ndarray, power: float) -> np.ndarray:
@@ -76,7 +76,7 @@ def without_flicker(rows: np.ndarray, power: float) -> np.ndarray:
     return found[: len(rows)]
 
 
-def _whitened(kinds: list[Kind], rows: np.ndarray, time: np.ndarray):
+def _whitened(kinds: list[MemoryKind], rows: np.ndarray, time: np.ndarray):
     """Yield the rows whitened by each noise, in order, with the log of the volume."""
     interval = np.diff(time)
     for length, alike in groupby(kinds, key=lambda kind: kind.time):
@@ -98,7 +98,7 @@ class Products(NamedTuple):
 
     Attributes
     ----------
-    kinds : list of Kind
+    kinds : list of MemoryKind
         The noises.
     log_prior : array, shape (k,)
         Logarithms of their prior probability and the volume of their density.
@@ -110,7 +110,7 @@ class Products(NamedTuple):
         Readings that stated errors are worth; 0 where none are stated.
     """
 
-    kinds: list[Kind]
+    kinds: list[MemoryKind]
     log_prior: np.ndarray
     matrix: np.ndarray
     count: int

@@ -18,7 +18,7 @@ NODES, DEEP = 12, 12.0
 REACH = 4.5
 
 
-class Kind(NamedTuple):
+class NoiseKind(NamedTuple):
     """One kind of noise: a point's standard deviation is (floor² + (s unit)²)^½ model^power.
 
     Attributes
@@ -64,7 +64,7 @@ def kinds_of(
     size: np.ndarray,
     error: np.ndarray | None,
     floor: np.ndarray | None = None,
-) -> tuple[Kind, ...]:
+) -> tuple[NoiseKind, ...]:
     """Kinds of noise that sizes may have.
 
     Parameters
@@ -80,18 +80,18 @@ def kinds_of(
 
     Returns
     -------
-    tuple of Kind
+    tuple of NoiseKind
         Of sizes without errors a share and the same everywhere; else one.
     """
     zero, one = np.zeros_like(size), np.ones_like(size)
     if floor is not None:
-        return (Kind(0, floor, size, one, noise.scatter, 0.0, noise.even, 0.0, 0.0),)
+        return (NoiseKind(0, floor, size, one, noise.scatter, 0.0, noise.even, 0.0, 0.0),)
     if error is None:
         middle = np.median(size, axis=-1, keepdims=True) * np.ones_like(size)
         share, same = math.log(noise.share), math.log1p(-noise.share)
         return (
-            Kind(1, zero, one, one, noise.unstated, 1.0, 0.0, 0.0, share),
-            Kind(0, zero, middle, one, noise.unstated, 1.0, 0.0, 0.0, same),
+            NoiseKind(1, zero, one, one, noise.unstated, 1.0, 0.0, 0.0, share),
+            NoiseKind(0, zero, middle, one, noise.unstated, 1.0, 0.0, 0.0, same),
         )
     share = error / size
     alike = bool(np.all(np.ptp(share, axis=-1) <= 0.01 * share.mean(-1)))
@@ -101,10 +101,10 @@ def kinds_of(
         np.median(error, axis=-1, keepdims=True) / error,
     )
     usual = np.maximum(usual, 1.0)
-    return (Kind(int(alike), zero, unit, usual, noise.factor, 1.0, noise.right, 1.0, 0.0),)
+    return (NoiseKind(int(alike), zero, unit, usual, noise.factor, 1.0, noise.right, 1.0, 0.0),)
 
 
-def scales_between(kind: Kind, low: np.ndarray, high: np.ndarray) -> Scales:
+def scales_between(kind: NoiseKind, low: np.ndarray, high: np.ndarray) -> Scales:
     """Nodes between two logs of the scale, shape (...,), and the special value before them."""
     if kind.least:
         low = np.maximum(low, math.log(kind.least))
@@ -122,13 +122,13 @@ def scales_between(kind: Kind, low: np.ndarray, high: np.ndarray) -> Scales:
     return Scales(scale, np.concatenate([math.log(kind.chance) * first, weight], axis=-1))
 
 
-def wide_scales(kind: Kind, lead: tuple[int, ...]) -> Scales:
+def wide_scales(kind: NoiseKind, lead: tuple[int, ...]) -> Scales:
     """Nodes over all of the prior, for planes of leading shape ``lead``."""
     middle, far = math.log(kind.prior.middle), REACH * kind.prior.spread
     return scales_between(kind, np.full(lead, middle - far), np.full(lead, middle + far))
 
 
-def narrowed(kind: Kind, scales: Scales, log_posterior: np.ndarray) -> Scales:
+def narrowed(kind: NoiseKind, scales: Scales, log_posterior: np.ndarray) -> Scales:
     """New nodes where the log posterior of the present ones, shape (..., k), counts."""
     skip = int(kind.chance > 0)
     log = np.log(scales.scale[..., skip:])
@@ -140,13 +140,13 @@ def narrowed(kind: Kind, scales: Scales, log_posterior: np.ndarray) -> Scales:
     return scales_between(kind, low, high)
 
 
-def variance_of(kind: Kind, scale: Any) -> Any:
+def variance_of(kind: NoiseKind, scale: Any) -> Any:
     """Variance over model^(2 power) of every point at every scale, shape (..., k, n)."""
     grown = scale[..., :, None] * kind.unit[..., None, :]
     return kind.floor[..., None, :] ** 2 + grown**2
 
 
-def squared_pulls(off: Any, model: Any, kind: Kind, scale: Any) -> Any:
+def squared_pulls(off: Any, model: Any, kind: NoiseKind, scale: Any) -> Any:
     """(size - model)² over the variance, points first: shape (n, ..., d, k), d draws, k scales."""
     xp = off.__array_namespace__()
     z = off / model if kind.power else off
@@ -160,14 +160,14 @@ def _points_first(values: Any, xp: Any) -> Any:
     return xp.reshape(xp.reshape(turned, (-1,)), turned.shape)
 
 
-def log_likelihood(off: Any, model: Any, kind: Kind, scale: Any, noise: Noise) -> Any:
+def log_likelihood(off: Any, model: Any, kind: NoiseKind, scale: Any, noise: Noise) -> Any:
     """Log likelihood of sizes at every scale of a noise, bad readings averaged over.
 
     Parameters
     ----------
     off, model : array
         Shape (..., d, n): measured less predicted sizes, and the predicted ones, of d draws.
-    kind : Kind
+    kind : NoiseKind
         With arrays of shape (..., n).
     scale : array
         Shape (..., k).
@@ -197,7 +197,7 @@ def log_likelihood(off: Any, model: Any, kind: Kind, scale: Any, noise: Noise) -
     return found + n * math.log1p(-noise.bad) + xp.sum(doubt, axis=0)
 
 
-def log_odds(squared_pull: Any, kind: Kind, noise: Noise) -> Any:
+def log_odds(squared_pull: Any, kind: NoiseKind, noise: Noise) -> Any:
     """Log odds that a reading is bad, from its squared pull, points first as `squared_pulls`."""
     xp = squared_pull.__array_namespace__()
     width = noise.width * xp.moveaxis(kind.usual, -1, 0)[..., None, None]
