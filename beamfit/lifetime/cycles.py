@@ -365,10 +365,11 @@ def joined(cycles: Sequence[DecayRecord], name: str) -> DecayRecord:
     def all_of(parts: Sequence[np.ndarray | None]) -> np.ndarray | None:
         return None if parts[0] is None else np.concatenate(parts)
 
+    begin = cycles[0].start
     return DecayRecord(
-        np.concatenate([cycle.start + cycle.time for cycle in cycles]),
+        np.concatenate([cycle.start - begin + cycle.time for cycle in cycles]),
         np.concatenate([cycle.current for cycle in cycles]),
-        all_of([cycle.error for cycle in cycles]), name, cycles[0].start,
+        all_of([cycle.error for cycle in cycles]), name, begin,
         Conditions(*map(all_of, zip(*(c.conditions for c in cycles), strict=True))),
         notes=cycles[0].notes,
     )  # fmt: skip

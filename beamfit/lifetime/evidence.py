@@ -476,8 +476,12 @@ class Evidence:
             known = plain and refuted and self.outgassing is None
         return lifetime_law(self.about, self.independent, refuted) if known else None
 
+    @cached_property
+    def by_drift(self) -> Physical:
+        """Shifts of the values by a straight drift of the monitor of 1 mA over the record."""
+        return self.about.moved(self.time / self.time[-1] / self.about.pieces.over)
+
     def drift_of_one_error(self, name: str) -> float:
         """Straight drift of the monitor over the record, mA, that moves a value by its error."""
-        change = self.time / self.time[-1] / self.about.pieces.over
-        moved = abs(float(getattr(self.about.moved(change), name)))
+        moved = abs(float(getattr(self.by_drift, name)))
         return float(getattr(self.errors, name)) / moved if moved > 0 else math.inf

@@ -456,6 +456,11 @@ class Expansion:
         columns = np.column_stack([self.rows, self.residuals])
         return columns if self.levels is None else self.beside(columns)
 
+    @cached_property
+    def triangle(self) -> np.ndarray:
+        """A few rows with the sums of products of `left`: all that independent noise asks of it."""
+        return np.linalg.qr(self.left, mode="r")
+
     def beside(self, columns: np.ndarray) -> np.ndarray:
         """Columns without what the levels of many pieces explain."""
         if self.levels is None:
@@ -478,7 +483,7 @@ class Expansion:
             kept = found.weight > NO_WEIGHT * found.weight.max()
             return Memory(*(part[kept] for part in found[:-1]), found.dof)
         known = np.append(np.equal(columns, QUADRATIC), self.numbers[QUADRATIC - 1])
-        rows = np.vstack([self.left[:, [*columns, -1]], self.prior * known])
+        rows = np.vstack([self.triangle[:, [*columns, -1]], self.prior * known])
         count = self.residuals.size - (0 if self.levels is None else self.level.size)
         triangle = np.linalg.qr(rows, mode="r")[None]
         return Whitened(Noise(np.zeros(1), np.zeros(1)), triangle, np.zeros(1), count).memory()

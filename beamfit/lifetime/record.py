@@ -11,6 +11,7 @@ import numpy as np
 
 from beamfit.answer import frame_of
 from beamfit.errors import InputError
+from beamfit.quantity import HOUR
 from beamfit.shown import shown
 from beamfit.table import Table
 
@@ -90,8 +91,9 @@ def _first(bad: np.ndarray) -> int | None:
 def _unit_change(current: np.ndarray) -> int | None:
     """Row at which the unit switches between A and mA: by 1000, and the decay goes on there."""
     with np.errstate(divide="ignore", invalid="ignore"):
-        decades = np.abs(np.log10(current[1:] / current[:-1]))
-    for row in np.flatnonzero(np.abs(decades - 3) < 0.01) + 1:
+        decades = current[1:] / current[:-1]
+        np.abs(np.log10(decades, out=decades), out=decades)
+    for row in np.flatnonzero((decades > 2.99) & (decades < 3.01)) + 1:
         before, after = np.median(current[max(row - 3, 0) : row]), np.median(current[row : row + 3])
         if before > 0 and after > 0 and abs(abs(np.log10(after / before)) - 3) < 0.05:
             return int(row)
@@ -143,7 +145,7 @@ def first_fault(
     for name, values in (named | conditions.given).items():
         if (row := _first(~np.isfinite(values))) is not None:
             return Fault(row, name, f"{values[row]}", "a finite number")
-    if (row := _first(np.diff(time, prepend=-np.inf) <= 0)) is not None:
+    if (row := _first(np.append(False, time[1:] <= time[:-1]))) is not None:
         found = f"time {time[row]:.10g} s after {time[row - 1]:.10g} s"
         return Fault(row, "time", found, "times that increase")
     if (row := _first(current < 0)) is not None:
@@ -160,9 +162,6 @@ def first_fault(
         found = f"{current[row]:.6g} mA after {current[row - 1]:.6g} mA, a factor of 1000"
         return Fault(row, "current", found, "one unit throughout, A or mA")
     return None
-
-
-HOUR = 3600.0
 
 
 @shown
@@ -233,7 +232,10 @@ def _digit(values: np.ndarray) -> float | None:
 
 
 def _frozen(values: object, rows: int, quantity: str) -> np.ndarray:
-    array = np.array(values, float)
+    if isinstance(values, np.ndarray) and values.base is None and not values.flags.writeable:
+        array = np.asarray(values, float)  # that of another record
+    else:
+        array = np.array(values, float)
     if array.shape != (rows,):
         found = f"{quantity} of shape {array.shape}"
         raise InputError(found, f"{rows} readings", column=quantity)
@@ -306,7 +308,8 @@ class DecayRecord:
         if fault is not None:
             found = f"reading {fault.row + 1}: {fault.found}"
             raise InputError(found, fault.expected, path=self.name, column=fault.quantity)
-        own |= frozen({"time": own["time"] - own["time"][0]})
+        if own["time"][0] != 0:
+            own |= frozen({"time": own["time"] - own["time"][0]})
         vars(self).update(own, conditions=conditions)
 
     def __len__(self) -> int:

@@ -401,6 +401,8 @@ def _steps(record: DecayRecord) -> dict[str, np.ndarray]:
 def at_settings(segment: DecayRecord) -> list[DecayRecord]:
     """Cut where somebody changed a setting."""
     moved = np.any(list(_steps(segment).values()), axis=0)
+    if not moved.any():
+        return [segment] if len(segment) >= SHORTEST else []
     pieces = np.split(np.arange(len(segment)), np.flatnonzero(moved) + 1)
     return [segment.select(rows) for rows in pieces if len(rows) >= SHORTEST]
 

@@ -5,8 +5,11 @@ from functools import partial
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp, trapezoid
+from scipy.signal import lfilter
 
+from beamfit.lifetime import alternatives
 from beamfit.lifetime.decay_law import Moments, beam_current
+from beamfit.lifetime.expansion import Pieces, further_columns, solved
 from beamfit.lifetime.fit import fit_decay
 from beamfit.lifetime.record import Conditions, DecayRecord
 from beamfit.lifetime.systematics import systematics
@@ -338,3 +341,42 @@ def test_five_readings_are_an_answer_also_where_they_refute_the_law():
     fit = fit_decay(DecayRecord(time, 100 - time / 100))
     assert fit.status is Status.infeasible
     assert fit.outgassing is None
+
+
+@pytest.mark.parametrize(
+    ("kind", "when", "course"),
+    [
+        ("step", 0.4, lambda s: s >= 0.4),
+        ("relaxing", 0.2, lambda s: np.exp(-s / 0.2)),
+        ("drift", 0.0, lambda s: s - 0.5),
+    ],
+)
+def test_slopes_by_a_further_loss_are_differences_of_the_integrated_law(kind, when, course):
+    ends = []
+    for more in (0.05, -0.05):
+        rate = lambda t, i, more=more: A * i + B + more / SPAN * course(t / SPAN)  # noqa: E731
+        time, beam = integrated(rate)
+        ends.append(beam)
+    about = solved(Pieces.of(DecayRecord(time, integrated(lambda t, i: A * i + B)[1])))
+    found = further_columns(about, kind, np.array([when]))[:, 0]
+    expected = (ends[0] - ends[1]) / 0.1
+    assert found == pytest.approx(expected, abs=2e-3 * np.abs(expected).max())
+
+
+def test_no_alternative_that_wins_is_left_out_unfitted(monkeypatch):
+    random, records = np.random.default_rng(8), []
+    for further in (0.0, 0.003, 0.03):
+        rate = lambda t, i, f=further: A * i + B + f / HOUR * (t > 0.4 * SPAN)  # noqa: E731
+        time, beam = integrated(rate, count=150)
+        steps = random.normal(size=time.size)
+        noise = lfilter([0.6], [1, -0.8], steps)
+        records += [DecayRecord(time, beam + 0.02 * part) for part in (steps, noise)]
+    abouts = [solved(Pieces.of(record)) for record in records]
+    chosen = [alternatives.rival_of(about) for about in abouts]
+    every = lambda plain: ["step", "steps", "relaxing"]  # noqa: E731
+    left_out = sum(len(alternatives._likely(about)) < 3 for about in abouts)
+    monkeypatch.setattr(alternatives, "_likely", every)
+    answers = [alternatives.rival_of(about) for about in abouts]
+    assert list(map(str, chosen)) == list(map(str, answers))
+    assert any(answers)
+    assert left_out >= 2
