@@ -20,7 +20,7 @@ from beamfit.cli import main
 from beamfit.errors import InputError
 from beamfit.io.machine import Watched, read_watch_machine
 from beamfit.lifetime.watch import Plan
-from beamfit.live.channel import Described, Reading, open_channel, run
+from beamfit.live.channel import Described, PvReading, open_channel, run
 from beamfit.live.served import values_of
 from beamfit.live.watch import Arrived, _Course
 from tests.live.conftest import ROOT
@@ -226,7 +226,7 @@ def test_a_variable_that_comes_back_in_another_unit_ends_the_watch():
     class Changed:
         async def monitor(self):
             for value in (1.0, None, 1.0):
-                yield value and Reading(value, 1.7e9)
+                yield value and PvReading(value, 1.7e9)
 
         async def describe(self):
             return Described("A")
@@ -263,7 +263,7 @@ CURRENT = Watched("beam_current", "I", "mA", 1.0)
 def arrived(begin, at):
     """A minute of readings that came at a time of this computer's clock."""
     beam = [300.0 * np.exp(-k / 3e4) for k in range(60)]
-    return [Arrived(CURRENT, Reading(i, begin + k), at) for k, i in enumerate(beam)]
+    return [Arrived(CURRENT, PvReading(i, begin + k), at) for k, i in enumerate(beam)]
 
 
 def test_what_is_shown_is_as_old_as_the_newest_reading_that_is_fitted():
