@@ -60,12 +60,14 @@ class WatchView:
     def headline(self) -> tuple[str, str]:
         """Its colour, and what to look at first."""
         state, answer = self.state, self.state.answer
+        gone = f"No connection to {', '.join(self.lost)}" if self.lost else ""
         if self.silent is not None:
-            return "red", f"No reading of the current for {self.silent:.0f} s: all below is old"
+            old = f"o reading of the current for {self.silent:.0f} s: all below is old"
+            return "red", f"{gone}, n{old}" if gone else f"N{old}"
         if self.old:
             return "red", f"The newest reading fitted is {self.age:.0f} s old: fits fall behind"
-        if self.lost:
-            return "red", f"No connection to {', '.join(self.lost)}"
+        if gone:
+            return "red", gone
         if state.alarmed:
             return "red", f"Alarm: {state.said()}"
         if answer is None and not state.last and state.counts.bad:
