@@ -178,7 +178,8 @@ def test_an_ioc_that_ends_is_said_and_followed_again(watching):
     watching.ioc.kill()
     gone = watching.until(lambda: (t := watching.state())["lost"] and t)
     assert gone["headline"].startswith("No connection to ")
-    assert (gone["colour"], gone["sound"]) == ("red", gone["silent"] is None)
+    known = gone["silent"] is None and gone["quantities"]["lifetime"] is not None
+    assert (gone["colour"], gone["sound"]) == ("red", known)
     before = gone["counts"]["readings"]
     watching.ioc.start()
     # Its simulated time begins anew: a clock set back. Made faster only when that was seen, or it
