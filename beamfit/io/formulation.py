@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from beamfit.language.computed import Computed
     from beamfit.language.solution import ProblemSolution
 
+# 32 MB as numbers; a table that a formulation uses is far smaller.
 MOST_NUMBERS = 4_000_000
 
 

@@ -23,7 +23,8 @@ APPROACHES = ("either", "below", "above")
 SPELLINGS = {u.lower(): u for u in SETTINGS}
 SPELLINGS |= {word.lower(): unit for word, unit in ALSO.items() if unit in SETTINGS}
 LENGTHS = {"um": 1e-6, "mm": 1e-3, "m": 1.0}
-PV, WAIT = Key(kind=TEXT), {"low": 0.0, "said": "a time above zero"}
+# Bounds that several keys share.
+WAIT = {"low": 0.0, "said": "a time above zero"}
 MAYBE = Key(kind=TEXT, default=None)
 POSITIVE = {"low": 0.0, "said": "a positive number"}
 MAGNET = {
