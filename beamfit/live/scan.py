@@ -96,6 +96,7 @@ class Running:
     keep: Callable[[Sequence[MeasuredPoint]], None]
     tell: Callable[[ScanProgress], None]
     ready: Callable[[], Awaitable[None]]
+    wrong: Sequence[WrongLine] = ()
     points: list[MeasuredPoint] = field(default_factory=list)
     barred: list[dict[str, float]] = field(default_factory=list)
     fit: EmittanceFit | None = None
@@ -156,7 +157,7 @@ async def scan(
         check_none_left(journal)
         before = {m.name: await at.magnets[m.name].get() for m in at.machine.magnets}
         log = _journal_for(journal, at.machine, before)
-        run = Running(at, line, before, keep, tell, ready)
+        run = Running(at, line, before, keep, tell, ready, wrong_lines(line, at.machine))
         measuring = asyncio.ensure_future(_begun(run, log))
         reason, problem = "", None
         with ended_by_signals(measuring, run.say) as came:
@@ -172,7 +173,7 @@ async def scan(
             await _to_the_end(_back(run, log))
         number, doubted = came[0] if came else 0, doubt(run.fit, run.points)
         if not doubted and run.checks:
-            doubted = suspect(run.points, run.fit, at.machine, wrong_lines(line, at.machine))
+            doubted = suspect(run.points, run.fit, at.machine, run.wrong)
         return Outcome(tuple(run.points), run.fit, reason, problem, number, doubted)
 
 
@@ -213,13 +214,13 @@ async def _back(run: Running, log: Journal) -> None:
 
 async def _measured(run: Running) -> str:
     """Measure setting after setting, and say why it ends."""
-    machine, barren, wrong = run.at.machine, 0, wrong_lines(run.line, run.at.machine)
+    machine, barren = run.at.machine, 0
     for magnet in machine.magnets:
         for value in magnet.degauss:
             await reach(magnet, run.at.magnets[magnet.name], value)
     while len(run.points) < machine.points:
         await run.ready()
-        chosen = _chosen(run, wrong)
+        chosen = _chosen(run)
         if not isinstance(chosen, Next):
             return chosen
         point, why = await _point(run, chosen.settings)
@@ -240,12 +241,13 @@ async def _measured(run: Running) -> str:
     return f"all {machine.points} points are measured"
 
 
-def _chosen(run: Running, wrong: list[WrongLine]) -> Next | str:
+def _chosen(run: Running) -> Next | str:
     """The next setting, or why there is none: the goal, and nothing that shows the line wrong."""
     machine, points = run.at.machine, run.points
     if not sharp(run.fit, points, machine.goal) or fresh(points, machine):
         return next_setting(points, run.fit, run.barred, machine, run.before)
-    if run.checks < MOST and (one := telling_setting(points, run.fit, machine, wrong, run.before)):
+    left = run.wrong if run.checks < MOST else ()
+    if one := telling_setting(points, run.fit, machine, left, run.before):
         run.checks += 1
         return one
     return f"the goal of {100 * machine.goal:.3g} % is reached"
