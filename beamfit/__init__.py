@@ -55,7 +55,7 @@ _HOME = {
     "moving_lifetime": "beamfit.lifetime.systematics",
     "read_decay_record": "beamfit.io.decay_record",
     "read_formulation": "beamfit.io.formulation",
-    "read_noise": "beamfit.io.noise",
+    "read_noise": "beamfit.io.priors",
     "read_operation": "beamfit.io.ring",
     "read_quad_scan": "beamfit.io.scan",
     "read_ring": "beamfit.io.ring",

@@ -22,7 +22,7 @@ import beamfit
 from beamfit.io.line import build_line
 from beamfit.io.machine import ScanMachine, read_scan_machine
 from beamfit.live.devices import Connected, Left, Shots
-from beamfit.live.points import FEWEST, Point, fit_of, sharp
+from beamfit.live.points import FEWEST, MeasuredPoint, fit_of, sharp
 from beamfit.live.scan import scan
 
 NOISE, SHOTS, MOST = 0.03, 5, 60
@@ -146,7 +146,7 @@ def uniform(machine: ScanMachine, beam: Beam, seed: int, goal: float) -> int:
         device, points = Simulated(beam, np.random.default_rng(seed + count)), []
         for setting in np.linspace(magnet.low, magnet.high, count):
             device.setting = float(setting)
-            points.append(Point({"Q": device.setting}, *asyncio.run(device.shots())))
+            points.append(MeasuredPoint({"Q": device.setting}, *asyncio.run(device.shots())))
         if sharp(fit_of(points, machine, beam.line), points, goal):
             return count
     return 10 * MOST

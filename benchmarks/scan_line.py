@@ -2,8 +2,8 @@
 
     python benchmarks/scan_line.py [SCANS]
 
-SIMULATED: beams and noise of benchmarks/scan.py, a line of two quadrupoles; in the file a drift is
-a third shorter than in truth. Written to docs/live.md.
+SIMULATED: beams and noise of benchmarks/scan.py, a line of two quadrupoles; a drift is a third
+longer or shorter than the file says. Written to docs/live.md.
 """
 
 from __future__ import annotations
@@ -27,7 +27,8 @@ GOAL, FIRST, SECOND = 0.05, 1.0, 2.2
 CASES = {
     "right": (FIRST, SECOND),
     "drift behind the magnets a third off": (FIRST, 4 / 3 * SECOND),
-    "drift between them a third off": (4 / 3 * FIRST, SECOND),
+    "drift between them a third longer": (4 / 3 * FIRST, SECOND),
+    "drift between them a third shorter": (2 / 3 * FIRST, SECOND),
 }
 
 

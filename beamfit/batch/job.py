@@ -14,7 +14,7 @@ from beamfit.io.decay_record import read_lifetime_input
 from beamfit.io.files import digest
 from beamfit.io.lattice import LatticeFile
 from beamfit.io.line import Inputs, build_line, read_inputs, read_lattice
-from beamfit.io.noise import read_noise
+from beamfit.io.priors import read_noise
 from beamfit.lifetime.record import LifetimeTable
 from beamfit.noise.learn import Learned, learn_noise
 from beamfit.noise.model import Noise

@@ -86,7 +86,7 @@ def batch(
             path, out, job, workers=workers, scheduler=scheduler, progress=progress
         )
     if learned is not None:
-        from beamfit.io.noise import write_noise
+        from beamfit.io.priors import write_noise
 
         write_noise(learned, job.learned_noise(found.files))
     if report is not None:

@@ -12,8 +12,7 @@ from beamfit.cli.options import Command, Sampling, answered, option, options, re
 from beamfit.emittance.assumptions import Assumptions
 from beamfit.errors import InputError
 from beamfit.io.line import build_line, read_inputs
-from beamfit.io.noise import read_noise
-from beamfit.io.systematics import read_systematics
+from beamfit.io.priors import read_noise, read_systematics
 from beamfit.quantity import percent
 from beamfit.table import Table, determined, labelled
 

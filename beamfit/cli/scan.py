@@ -24,7 +24,7 @@ from beamfit.table import cell
 
 if TYPE_CHECKING:
     from beamfit.emittance.results import PlaneFit
-    from beamfit.live.scan import Outcome, Told
+    from beamfit.live.scan import Outcome, ScanProgress
 
 EXAMPLE = """\b
 Examples:
@@ -93,7 +93,7 @@ class _Lines:
                 return
             self.err = True
 
-    def told(self, now: Told) -> None:
+    def told(self, now: ScanProgress) -> None:
         """A new point with what is known after it, or what else is new."""
         from beamfit.live.points import FEWEST
 

@@ -17,7 +17,7 @@ from beamfit.io.machine import WatchMachine, read_watch_machine
 from beamfit.table import Table, cell
 
 if TYPE_CHECKING:
-    from beamfit.live.watch import Told
+    from beamfit.live.watch import WatchView
 
 EXAMPLE = """\b
 Examples:
@@ -61,7 +61,7 @@ def watch(machine: str, seconds: float | None, port: int, bind: str, as_json: bo
 
 async def _watched(
     machine: WatchMachine, seconds: float | None, bind: str, port: int, quiet: bool
-) -> tuple[Told, int]:
+) -> tuple[WatchView, int]:
     """See that the variables answer, serve, and watch."""
     from beamfit.live.page import page
     from beamfit.live.served import check_unserved, served
@@ -85,7 +85,7 @@ async def _watched(
 
 
 @contextmanager
-def _terminal() -> Iterator[Callable[[Told], None]]:
+def _terminal() -> Iterator[Callable[[WatchView], None]]:
     """A table that lives, or where nobody looks a line for every fit."""
     from rich.live import Live
 
@@ -97,7 +97,7 @@ def _terminal() -> Iterator[Callable[[Told], None]]:
             yield lambda told: live.update(laid_out(_table(told)), refresh=True)
         return
 
-    def line(told: Told) -> None:
+    def line(told: WatchView) -> None:
         answer = told.state.answer
         if answer is not None and answer.time != seen[0]:
             seen[0] = answer.time
@@ -110,7 +110,7 @@ def _clock(time: float) -> str:
     return datetime.fromtimestamp(time, UTC).strftime("%Y-%m-%d %H:%M:%S")
 
 
-def _table(told: Told) -> Table:
+def _table(told: WatchView) -> Table:
     """Present state of the watch, a line for each quantity."""
     state, answer = told.state, told.state.answer
     fit = answer and answer.window.fit
@@ -134,7 +134,7 @@ def _table(told: Told) -> Table:
     return Table(told.plan.name, [], rows)
 
 
-def _results(told: Told) -> list[dict[str, Any]]:
+def _results(told: WatchView) -> list[dict[str, Any]]:
     """Results in the form of `beamfit lifetime --json`, with alarms and counts."""
     from beamfit.lifetime.watch import nothing_yet
 

@@ -22,6 +22,7 @@ from beamfit.io.isolated import LARGEST, isolated
 
 # Filters that are part of every HDF5 library: deflate, shuffle, fletcher32, and h5py's own lzf.
 FILTERS = {1, 2, 3, 32000}
+# Letters of an attribute that is kept as a comment; a whole log may stand in one.
 LONGEST_COMMENT = 1000
 FEWER = "fewer: average what is repeated, or cut the file"
 ELSEWHERE = "datasets that hold their numbers in this file"

@@ -25,6 +25,7 @@ from beamfit.io.headers import (
     unit_behind,
 )
 
+# Seconds.
 DAY = 86400.0
 # Orders of dates in which day and month are numbers.
 DAY_FIRST, MONTH_FIRST = "day-month-year", "month-day-year"

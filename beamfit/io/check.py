@@ -22,13 +22,11 @@ from beamfit.io.emittance_gui import is_emittance_gui, read_emittance_gui
 from beamfit.io.files import digest
 from beamfit.io.lattice import CALIBRATIONS, STRENGTHS, LatticeFile
 from beamfit.io.line import FOREIGN, build_line, read_lattice
-from beamfit.io.record_columns import is_current, known
-from beamfit.io.record_columns import likely_name as record_name
+from beamfit.io.record_columns import is_current, known, likely_record_name
 from beamfit.io.ring import read_operation, read_ring
 from beamfit.io.run import read_run
 from beamfit.io.scan import read_quad_scan
-from beamfit.io.scan_columns import is_known, is_size
-from beamfit.io.scan_columns import likely_name as scan_name
+from beamfit.io.scan_columns import is_known, is_size, likely_scan_name
 from beamfit.io.table import header_of, is_binary, read_columns, read_sheet
 from beamfit.io.toml import read_toml
 from beamfit.language.document import Document
@@ -156,7 +154,7 @@ def proposed_layout(path: str | PathLike[str], columns: Columns = None) -> str |
         return None
     sheet = read_columns(path, "", layout, skip_bad=True)
     unknown = {
-        name: (scan_name(name) or record_name(name, cell), cell)
+        name: (likely_scan_name(name) or likely_record_name(name, cell), cell)
         for name, cells in zip(sheet.names, sheet.cells, strict=True)
         if not (is_known(name, sheet) or known(sheet, name))
         for cell in [next(iter(cells), "")]

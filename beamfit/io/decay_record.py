@@ -53,6 +53,7 @@ INCREASE = "times that increase; --skip-bad leaves out rows whose time does not"
 UNIX, LATEST, MILLISECONDS = 1e8, 2.5e9, 1e11
 # Times of day without a date lie on the first day.
 DAY = 86400.0
+# Seconds since 1970 that are milliseconds, ... below these.
 FINER = ((1e14, "ms", "milliseconds"), (1e17, "us", "microseconds"))
 FINER += ((np.inf, "ns", "nanoseconds"),)
 

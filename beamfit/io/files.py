@@ -35,6 +35,7 @@ SIGNATURES = {
 UTF16 = codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE
 # ° ± ² ³ µ in the code pages of Windows, and what needs none.
 MARKS, ASCII = bytes([0xB0, 0xB1, 0xB2, 0xB3, 0xB5]), bytes(range(128))
+# Bytes of a lattice of 50 000 elements, of an archive's day, and of a pipe kept in memory.
 LARGEST_TEXT = 4_000_000
 LARGEST_JSON = 64_000_000
 LARGEST_PIPE = 256_000_000
@@ -44,6 +45,7 @@ SILENCE = 30.0
 UNLIKE = (ArithmeticError, AttributeError, LookupError, RecursionError, TypeError, ValueError)
 # SHA-256 of what was last read whole, by path: a file may change after that.
 _READ: dict[str, str] = {}
+# Digests that are kept: those of a large batch, at 200 bytes each.
 MOST_KEPT = 10_000
 # Lines of a file, each with its number.
 Numbered = Iterator[tuple[int, str]]

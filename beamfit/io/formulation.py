@@ -24,8 +24,9 @@ from beamfit.writing import write_atomically
 
 if TYPE_CHECKING:
     from beamfit.language.computed import Computed
-    from beamfit.language.solution import ProblemSolution as Solution
+    from beamfit.language.solution import ProblemSolution
 
+# 32 MB as numbers; a table that a formulation uses is far smaller.
 MOST_NUMBERS = 4_000_000
 
 
@@ -185,7 +186,7 @@ def solved_formulation(
     values: Mapping[str, Sequence[float]] | None = None,
     gains: Iterable[str] = (),
     **options: Any,
-) -> Solution | Computed:
+) -> ProblemSolution | Computed:
     """Solve a document, or compute its mapping if it has no objective.
 
     What is wrong with it is said with its file.
@@ -199,7 +200,7 @@ def solved_formulation(
 
     Returns
     -------
-    Solution or Computed
+    ProblemSolution or Computed
 
     Raises
     ------

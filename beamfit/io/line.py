@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from beamfit.emittance.scan import QuadScan
 from beamfit.errors import InputError, expect, nearest
 from beamfit.io.columns import Columns
+from beamfit.io.dialects import DIALECTS
 from beamfit.io.emittance_gui import EmittanceGuiFile, is_emittance_gui, read_emittance_gui
 from beamfit.io.lattice import LatticeFile, element_of, read_toml_lattice
 from beamfit.io.scan import read_quad_scan
@@ -21,7 +22,7 @@ if TYPE_CHECKING:
 
 # What the place is called where matrices of rows begin.
 START = "start"
-FOREIGN = {".madx", ".seq", ".mad8", ".mad", ".lte", ".ele", ".elegant"}
+FOREIGN = {".ele", *DIALECTS}
 
 
 def load_lattice(

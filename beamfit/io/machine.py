@@ -23,7 +23,8 @@ APPROACHES = ("either", "below", "above")
 SPELLINGS = {u.lower(): u for u in SETTINGS}
 SPELLINGS |= {word.lower(): unit for word, unit in ALSO.items() if unit in SETTINGS}
 LENGTHS = {"um": 1e-6, "mm": 1e-3, "m": 1.0}
-PV, WAIT = Key(kind=TEXT), {"low": 0.0, "said": "a time above zero"}
+# Bounds that several keys share.
+WAIT = {"low": 0.0, "said": "a time above zero"}
 MAYBE = Key(kind=TEXT, default=None)
 POSITIVE = {"low": 0.0, "said": "a positive number"}
 MAGNET = {
@@ -222,16 +223,15 @@ def read_scan_machine(path: str | PathLike[str]) -> ScanMachine:
     for name in (screen.name, *(m.name for m in magnets)):
         if not name.isprintable():
             raise top.error(f"the name {name!r}", "one of letters that can be shown")
-    name = plain(said.pop("name") or Path(path).stem)
-    return ScanMachine(
-        name, str(path), top.sha256, lattice, magnets, screen, guard, first=first, **plan, **said
-    )
+    name, own = said.pop("name"), (magnets, screen, guard)
+    return ScanMachine(name, str(path), top.sha256, lattice, *own, first=first, **plan, **said)
 
 
 def read_machine(path: str | PathLike[str]) -> tuple[Section, dict[str, Any]]:
-    """A machine file, and what stands at its top."""
+    """A machine file, and what stands at its top; a name is that of the file unless it is given."""
     top = read_toml(path, "a machine", FORMAT)
-    return top, top.values(TOP)
+    said = top.values(TOP)
+    return top, said | {"name": plain(said["name"] or Path(path).stem)}
 
 
 def unit_of(word: str) -> str | None:
@@ -476,11 +476,9 @@ def read_watch_machine(path: str | PathLike[str]) -> WatchMachine:
     if watch["interval"] > watch["window"] / 3:
         found = f"interval {watch['interval']:g} s in a window of {watch['window']:g} s"
         raise section.error(found, "a third of the window, or less", "interval_s")
-    name = plain(said["name"] or Path(path).stem)
     beside = None if file is None else Path(path).parent / file
-    return WatchMachine(
-        name, str(path), top.sha256, variables, beside, timeout=said["timeout"], **watch
-    )
+    name, timeout = said["name"], said["timeout"]
+    return WatchMachine(name, str(path), top.sha256, variables, beside, timeout=timeout, **watch)
 
 
 def _variables(ring: Section) -> tuple[Watched, ...]:

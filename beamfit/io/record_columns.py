@@ -102,12 +102,12 @@ def is_current(header: str) -> bool:
     return said.lower().startswith("beam_current") or _current(said) is not None
 
 
-def likely_name(header: str, cell: object) -> str | None:
+def likely_record_name(header: str, cell: object) -> str | None:
     """The name that a header may mean, by a word in it or by a first cell that is a date.
 
     Examples
     --------
-    >>> likely_name("When", "2024-03-01 12:00:00"), likely_name("Current", "200.1")
+    >>> likely_record_name("When", "2024-03-01 12:00:00"), likely_record_name("Current", "200.1")
     ('time', 'beam_current_mA')
     """
     try:

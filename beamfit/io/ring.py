@@ -43,6 +43,7 @@ RANGES = {
     "alpha": (-1e4, 1e4, "a Twiss alpha"),
     "dispersion": (-1e3, 1e3, "a dispersion of metres"),
 }
+# Beyond the circumference of any ring.
 ANYWHERE = (-1e6, 1e6, "a position in m")
 INFINITE = math.inf
 SHARE = "a positive number that is a share: up to 1, 0.03 for 3 %"

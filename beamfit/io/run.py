@@ -25,6 +25,7 @@ from beamfit.io.table import read_columns
 if TYPE_CHECKING:
     from pandas import DataFrame
 
+# A month of readings a second.
 MOST_ROWS = 2_000_000
 ASIDE, TIME = "aside", "time"
 EXAMPLE = "time_s,u_valve,y_level"

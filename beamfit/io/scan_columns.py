@@ -206,12 +206,12 @@ def _other(header: str, sheet: Sheet) -> Column:
     )
 
 
-def likely_name(header: str) -> str | None:
+def likely_scan_name(header: str) -> str | None:
     """The name that a header without a unit may mean, in a usual unit.
 
     Examples
     --------
-    >>> [likely_name(header) for header in ("xrms", "QUAD:525:BACT", "foo")]
+    >>> [likely_scan_name(header) for header in ("xrms", "QUAD:525:BACT", "foo")]
     ['size_x_um', 'QUAD_525_kG', None]
     """
     if (size := _size(f"{header}_um")) is not None:

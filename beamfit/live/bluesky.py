@@ -17,9 +17,9 @@ import beamfit
 from beamfit.emittance.fit import EmittanceFit
 from beamfit.io.machine import ScanMachine
 from beamfit.live.devices import connect
-from beamfit.live.points import Point
+from beamfit.live.points import MeasuredPoint
 from beamfit.live.restore import journal_of
-from beamfit.live.scan import Outcome, Told, scan
+from beamfit.live.scan import Outcome, ScanProgress, scan
 from beamfit.optics.beamline import Beamline
 
 # Quantities of each plane in the event of a fit.
@@ -31,7 +31,7 @@ def emittance_scan(
     line: Beamline,
     *,
     journal: str | None = None,
-    tell: Callable[[Told], None] = lambda told: None,
+    tell: Callable[[ScanProgress], None] = lambda told: None,
     md: Mapping[str, Any] | None = None,
 ) -> MsgGenerator[Outcome]:
     """Scan magnets until the emittances are known as well as is wanted, and put them back.
@@ -78,7 +78,7 @@ def emittance_scan(
         steps.put_nowait(_given(turn))
         await turn.acquire()
 
-    def told(now: Told) -> None:
+    def told(now: ScanProgress) -> None:
         tell(now)
         if now.measured:
             steps.put_nowait(_shots(machine, now.points[-1]))
@@ -146,7 +146,7 @@ def _over(task: asyncio.Future[Outcome]) -> MsgGenerator[None]:
         task.result()
 
 
-def _shots(machine: ScanMachine, point: Point) -> MsgGenerator[None]:
+def _shots(machine: ScanMachine, point: MeasuredPoint) -> MsgGenerator[None]:
     """Each shot of a point as an event."""
     settings = {m.name: (point.settings[m.name], m.unit) for m in machine.magnets}
     sizes = {f"{machine.screen.name}-{p}": 1e6 * each for p, each in point.shots.items()}

@@ -30,7 +30,7 @@ WAITING = 100_000
 CONTEXTS: dict[asyncio.AbstractEventLoop, Any] = {}
 
 
-class Reading(NamedTuple):
+class PvReading(NamedTuple):
     """Reading of a variable.
 
     Attributes
@@ -77,7 +77,7 @@ class Channel(Protocol):
 
     name: str
 
-    async def get(self) -> Reading:
+    async def get(self) -> PvReading:
         """Read it."""
 
     async def put(self, value: float) -> None:
@@ -86,7 +86,7 @@ class Channel(Protocol):
     async def describe(self) -> Described:
         """Ask for its unit and limits."""
 
-    def monitor(self) -> AsyncIterator[Reading | None]:
+    def monitor(self) -> AsyncIterator[PvReading | None]:
         """Each reading as it comes; None where the connection was lost."""
 
 
@@ -190,7 +190,7 @@ def _closed() -> None:
 class Protocols(NamedTuple):
     """Protocol: its calls to read, write, describe and follow a variable, and its errors."""
 
-    get: Callable[[str], Awaitable[Reading]]
+    get: Callable[[str], Awaitable[PvReading]]
     put: Callable[[str, float], Awaitable[Any]]
     describe: Callable[[str], Awaitable[Described]]
     follow: Callable[[str, Callable[[Any], None]], Any]
@@ -205,7 +205,7 @@ class Variable:
     timeout: float
     speech: Protocols
 
-    async def get(self) -> Reading:
+    async def get(self) -> PvReading:
         """As `Channel.get`."""
         return await self._asked(self.speech.get(self.name))
 
@@ -217,9 +217,9 @@ class Variable:
         """As `Channel.describe`."""
         return await self._asked(self.speech.describe(self.name))
 
-    async def monitor(self) -> AsyncIterator[Reading | None]:
+    async def monitor(self) -> AsyncIterator[PvReading | None]:
         """As `Channel.monitor`."""
-        queue: asyncio.Queue[Reading | None] = asyncio.Queue(WAITING)
+        queue: asyncio.Queue[PvReading | None] = asyncio.Queue(WAITING)
 
         subscription = self.speech.follow(self.name, lambda reading: kept(queue, reading))
         before = None
@@ -253,13 +253,13 @@ def kept(queue: asyncio.Queue[T], one: T) -> None:
     queue.put_nowait(one)
 
 
-def _reading(found: Any) -> Reading:
+def _reading(found: Any) -> PvReading:
     """NaN for what is no number."""
     value: Any = math.nan
     with suppress(TypeError, ValueError):
         value = np.asarray(found, float)
         value = value if value.ndim else float(value)
-    return Reading(value, float(found.timestamp), int(found.severity))
+    return PvReading(value, float(found.timestamp), int(found.severity))
 
 
 def _described(unit: object, low: float, high: float) -> Described:
@@ -272,7 +272,7 @@ def _described(unit: object, low: float, high: float) -> Described:
 def _channel_access() -> Protocols:
     import aioca
 
-    async def get(name: str) -> Reading:
+    async def get(name: str) -> PvReading:
         return _reading(await aioca.caget(name, format=aioca.FORMAT_TIME, timeout=None))
 
     async def describe(name: str) -> Described:
@@ -280,7 +280,7 @@ def _channel_access() -> Protocols:
         ends = (getattr(found, f"{end}_ctrl_limit", 0.0) for end in ("lower", "upper"))
         return _described(getattr(found, "units", ""), *ends)
 
-    def follow(name: str, come: Callable[[Reading | None], None]) -> Any:
+    def follow(name: str, come: Callable[[PvReading | None], None]) -> Any:
         return aioca.camonitor(
             name, lambda found: come(_reading(found) if found.ok else None),
             format=aioca.FORMAT_TIME, notify_disconnect=True, all_updates=True,
@@ -301,7 +301,7 @@ def _pv_access() -> Protocols:
         loop = asyncio.get_running_loop()
         return CONTEXTS.get(loop) or CONTEXTS.setdefault(loop, Context("pva"))
 
-    async def get(name: str) -> Reading:
+    async def get(name: str) -> PvReading:
         return _reading(await here().get(name))
 
     async def describe(name: str) -> Described:
@@ -309,7 +309,7 @@ def _pv_access() -> Protocols:
         ends = (found.get(f"control.limit{end}", 0.0) for end in ("Low", "High"))
         return _described(found.get("display.units", ""), *ends)
 
-    def follow(name: str, come: Callable[[Reading | None], None]) -> Any:
+    def follow(name: str, come: Callable[[PvReading | None], None]) -> Any:
         async def arrived(found: Any) -> None:
             come(None if isinstance(found, Exception) else _reading(found))
 

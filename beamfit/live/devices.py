@@ -16,7 +16,7 @@ from scipy.optimize import curve_fit
 from beamfit.errors import InputError, plain
 from beamfit.io.headers import UNITS, known_unit
 from beamfit.io.machine import LENGTHS, Guard, Magnet, Profiler, ScanMachine, moved, unit_of
-from beamfit.live.channel import Channel, LostError, Reading, SilentError, open_channel
+from beamfit.live.channel import Channel, LostError, PvReading, SilentError, open_channel
 
 # Of the time a read-back has to stay, between two looks at it; not shorter, not longer, s.
 LOOKS, SHORTEST, LONGEST = 8, 0.02, 0.25
@@ -75,7 +75,7 @@ class Device(Protocol):
         """Follow it while the block lasts, and say in the end how it left a setting."""
 
 
-class Sizes(Protocol):
+class SizeMonitor(Protocol):
     """Screen that measures the beam at a setting."""
 
     async def shots(self) -> Shots:
@@ -102,7 +102,7 @@ class Connected(NamedTuple):
     """A machine at hand: magnets by name, screen, guard, and what was found besides."""
 
     magnets: Mapping[str, Device]
-    screen: Sizes
+    screen: SizeMonitor
     guard: Watchman
     machine: ScanMachine
     notes: tuple[str, ...] = ()
@@ -158,7 +158,7 @@ class Supply:
         """As `Device.followed`: by set point and read-back."""
         magnet = self.magnet
 
-        def wrong(name: str, found: Reading) -> str:
+        def wrong(name: str, found: PvReading) -> str:
             if found.good and np.all(np.abs(found.value - value) <= magnet.tolerance):
                 return ""
             return f"{magnet.name} left {value:.6g} {magnet.unit}, '{plain(name)}' {found.value}"
@@ -175,7 +175,7 @@ class Supply:
         return value
 
 
-def _sound(reading: Reading, name: str) -> Reading:
+def _sound(reading: PvReading, name: str) -> PvReading:
     if np.ndim(reading.value):
         raise LostError(f"'{plain(name)}' with {np.size(reading.value)} numbers", "one number")
     if not reading.good:
@@ -205,7 +205,7 @@ class ScreenShots:
     channels: Mapping[str, Channel]
 
     async def shots(self) -> Shots:
-        """As `Sizes.shots`; the planes at the same time."""
+        """As `SizeMonitor.shots`; the planes at the same time."""
         found = await asyncio.gather(*map(self._of_plane, self.channels))
         each = dict(zip(self.channels, map(np.array, found), strict=True))
         sizes = {plane: shots[:, 1] for plane, shots in each.items()}
@@ -245,7 +245,7 @@ class ScreenShots:
                 found = f"{bad} shots of '{plain(channel.name)}' without a size"
                 raise NoSizesError(found, "a beam that fits on the screen")
 
-    def _size(self, reading: Reading) -> float | None:
+    def _size(self, reading: PvReading) -> float | None:
         if not reading.good:
             return None
         if self.profiler.profiles:
@@ -274,22 +274,22 @@ class BeamGuard:
         return followed(*self._each)
 
     @property
-    def _each(self) -> list[tuple[Channel, Callable[[Reading], str], float]]:
+    def _each(self) -> list[tuple[Channel, Callable[[PvReading], str], float]]:
         each = ((self.present, self._no_beam), (self.loss, self._loss))
         return [(channel, wrong, AFTER) for channel, wrong in each if channel is not None]
 
-    def _no_beam(self, found: Reading) -> str:
+    def _no_beam(self, found: PvReading) -> str:
         there = found.good and np.all(found.value > self.guard.present_above)
         return "" if there else f"no beam ('{plain(self.guard.present)}' reads {found.value})"
 
-    def _loss(self, found: Reading) -> str:
+    def _loss(self, found: PvReading) -> str:
         small = found.good and np.all(found.value < self.guard.loss_below)
         return "" if small else f"beam loss ('{plain(self.guard.loss)}' reads {found.value})"
 
 
 @asynccontextmanager
 async def followed(
-    *each: tuple[Channel, Callable[[Reading], str], float],
+    *each: tuple[Channel, Callable[[PvReading], str], float],
 ) -> AsyncIterator[Left]:
     """Follow variables while the block lasts.
 
@@ -320,7 +320,7 @@ async def followed(
 
 @asynccontextmanager
 async def _followed(
-    channel: Channel, wrong: Callable[[Reading], str], patience: float
+    channel: Channel, wrong: Callable[[PvReading], str], patience: float
 ) -> AsyncIterator[Left]:
     said: list[str] = []
     begun = asyncio.Event()

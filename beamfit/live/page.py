@@ -16,7 +16,7 @@ from contextlib import asynccontextmanager, suppress
 from importlib.resources import files
 
 from beamfit.errors import InputError
-from beamfit.live.watch import Told
+from beamfit.live.watch import WatchView
 
 # Readers at a time, bytes of a request, and s within which it has to come and an event to go.
 MOST, LONGEST, WAIT = 16, 8192, 5.0
@@ -62,7 +62,7 @@ class Page:
         # A page of another site that has its own name point here does not know this one's.
         self.here = ipaddress.ip_address(address).is_loopback
 
-    def show(self, told: Told) -> None:
+    def show(self, told: WatchView) -> None:
         """Tell every reader."""
         self.last = json.dumps(told.to_json(), allow_nan=False).encode()
         self.news.set()
@@ -131,7 +131,7 @@ def _loopback(host: str) -> bool:
 
 
 @asynccontextmanager
-async def page(address: str, port: int) -> AsyncIterator[tuple[str, Callable[[Told], None]]]:
+async def page(address: str, port: int) -> AsyncIterator[tuple[str, Callable[[WatchView], None]]]:
     """Serve the page while the block lasts.
 
     Parameters

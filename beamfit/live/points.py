@@ -34,7 +34,7 @@ LEVELS = 7
 FEWEST = 6
 
 
-class Point(NamedTuple):
+class MeasuredPoint(NamedTuple):
     """A setting as it was read back, the shots of each plane, m, and when, Unix time."""
 
     settings: dict[str, float]
@@ -61,12 +61,12 @@ def standard_errors(shots: Sequence[np.ndarray]) -> list[float]:
     return found if min(found) > 0 else []
 
 
-def scan_of(points: Sequence[Point], machine: ScanMachine) -> QuadScan:
+def scan_of(points: Sequence[MeasuredPoint], machine: ScanMachine) -> QuadScan:
     """The points as a scan, with the shots themselves where they scatter.
 
     Parameters
     ----------
-    points : sequence of Point
+    points : sequence of MeasuredPoint
         At three different settings at least.
     machine : ScanMachine
         Whose magnets they are of.
@@ -103,7 +103,9 @@ def _padded(shots: Sequence[np.ndarray]) -> np.ndarray:
     return table
 
 
-def fit_of(points: Sequence[Point], machine: ScanMachine, line: Beamline) -> EmittanceFit | None:
+def fit_of(
+    points: Sequence[MeasuredPoint], machine: ScanMachine, line: Beamline
+) -> EmittanceFit | None:
     """The fit to the points, None as long as they are no scan."""
     try:
         return fit_emittance(scan_of(points, machine), line)
@@ -120,7 +122,7 @@ def warmed(machine: ScanMachine, line: Beamline) -> None:
     # One number of points of each length that records are padded to.
     for count in {padded_length(n): n for n in range(FEWEST - 1, machine.points + 1)}.values():
         points = [
-            Point(
+            MeasuredPoint(
                 middle | {magnet.name: value},
                 {p: 1e-4 * (1 + 0.02 * rng.standard_normal(3)) for p in planes},
                 0.0,
@@ -134,14 +136,14 @@ def warmed(machine: ScanMachine, line: Beamline) -> None:
                 fit.predict({name: np.full(LEVELS**2, v) for name, v in middle.items()}, plane)
 
 
-def sharp(fit: EmittanceFit | None, points: Sequence[Point], goal: float) -> bool:
+def sharp(fit: EmittanceFit | None, points: Sequence[MeasuredPoint], goal: float) -> bool:
     """Tell fits whose every emittance is trusted and known to a relative error.
 
     Parameters
     ----------
     fit : EmittanceFit or None
         To the points.
-    points : sequence of Point
+    points : sequence of MeasuredPoint
         Fewer than six are never enough.
     goal : float
         Relative error.
@@ -156,7 +158,7 @@ def sharp(fit: EmittanceFit | None, points: Sequence[Point], goal: float) -> boo
     )
 
 
-def doubt(fit: EmittanceFit | None, points: Sequence[Point]) -> str:
+def doubt(fit: EmittanceFit | None, points: Sequence[MeasuredPoint]) -> str:
     """Sizes that miss the line by far more than their shots scatter, in words; "" if none do.
 
     The errors of the fit hold it as a scatter of the settings, which real magnets have; a line that
@@ -179,7 +181,7 @@ def first_settings(machine: ScanMachine) -> tuple[float, ...]:
 
 
 def next_setting(
-    points: Sequence[Point],
+    points: Sequence[MeasuredPoint],
     fit: EmittanceFit | None,
     barred: Sequence[Mapping[str, float]],
     machine: ScanMachine,
@@ -189,7 +191,7 @@ def next_setting(
 
     Parameters
     ----------
-    points : sequence of Point
+    points : sequence of MeasuredPoint
         What is measured.
     fit : EmittanceFit or None
         To the points.
@@ -229,12 +231,12 @@ def next_setting(
     return Next(_clipped(dict(before) | {first.name: middle}, limits), "the largest gap")
 
 
-def fresh(points: Sequence[Point], machine: ScanMachine) -> list[str]:
+def fresh(points: Sequence[MeasuredPoint], machine: ScanMachine) -> list[str]:
     """Magnets that fewer than three points have moved.
 
     Parameters
     ----------
-    points : sequence of Point
+    points : sequence of MeasuredPoint
         What is measured, at least one.
     machine : ScanMachine
         Whose magnets they are of.
@@ -269,12 +271,14 @@ def _clipped(
     return {name: float(np.clip(float(f"{settings[name]:.6g}"), *limits[name])) for name in limits}
 
 
-def scan_text(points: Sequence[Point], machine: ScanMachine, before: Mapping[str, float]) -> str:
+def scan_text(
+    points: Sequence[MeasuredPoint], machine: ScanMachine, before: Mapping[str, float]
+) -> str:
     """Write the points as CSV that `beamfit.read_quad_scan` reads.
 
     Parameters
     ----------
-    points : sequence of Point
+    points : sequence of MeasuredPoint
         At least one.
     machine : ScanMachine
         Whose magnets and screen they are of.

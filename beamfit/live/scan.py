@@ -19,7 +19,16 @@ from beamfit.emittance.fit import EmittanceFit
 from beamfit.errors import InputError
 from beamfit.io.machine import ScanMachine
 from beamfit.live.devices import Connected, NoSizesError, Shots
-from beamfit.live.points import Next, Point, doubt, fit_of, fresh, next_setting, sharp, warmed
+from beamfit.live.points import (
+    MeasuredPoint,
+    Next,
+    doubt,
+    fit_of,
+    fresh,
+    next_setting,
+    sharp,
+    warmed,
+)
 from beamfit.live.restore import (
     Journal,
     alone_with,
@@ -38,13 +47,13 @@ BARREN = 3
 LOOK = 0.2
 
 
-class Told(NamedTuple):
+class ScanProgress(NamedTuple):
     """Progress of a scan: its points, the fit to them where there is one, and what is new.
 
     ``measured`` says whether that is the last of the points; ``news`` is then why it was chosen.
     """
 
-    points: tuple[Point, ...]
+    points: tuple[MeasuredPoint, ...]
     fit: EmittanceFit | None
     news: str
     measured: bool = False
@@ -55,7 +64,7 @@ class Outcome(NamedTuple):
 
     Attributes
     ----------
-    points : tuple of Point
+    points : tuple of MeasuredPoint
         What was measured.
     fit : EmittanceFit or None
         The fit to them.
@@ -69,7 +78,7 @@ class Outcome(NamedTuple):
         Why the line may be wrong, in words; "" where the sizes follow it.
     """
 
-    points: tuple[Point, ...]
+    points: tuple[MeasuredPoint, ...]
     fit: EmittanceFit | None
     reason: str
     problem: Exception | None = None
@@ -84,10 +93,11 @@ class Running:
     at: Connected
     line: Beamline
     before: Mapping[str, float]
-    keep: Callable[[Sequence[Point]], None]
-    tell: Callable[[Told], None]
+    keep: Callable[[Sequence[MeasuredPoint]], None]
+    tell: Callable[[ScanProgress], None]
     ready: Callable[[], Awaitable[None]]
-    points: list[Point] = field(default_factory=list)
+    wrong: Sequence[WrongLine] = ()
+    points: list[MeasuredPoint] = field(default_factory=list)
     barred: list[dict[str, float]] = field(default_factory=list)
     fit: EmittanceFit | None = None
     armed: bool = False
@@ -95,7 +105,7 @@ class Running:
 
     def say(self, news: str, measured: bool = False) -> None:
         """Tell how it stands."""
-        self.tell(Told(tuple(self.points), self.fit, news, measured))
+        self.tell(ScanProgress(tuple(self.points), self.fit, news, measured))
 
 
 async def scan(
@@ -103,8 +113,8 @@ async def scan(
     line: Beamline,
     journal: Path,
     *,
-    keep: Callable[[Sequence[Point]], None] = lambda points: None,
-    tell: Callable[[Told], None] = lambda told: None,
+    keep: Callable[[Sequence[MeasuredPoint]], None] = lambda points: None,
+    tell: Callable[[ScanProgress], None] = lambda told: None,
     ready: Callable[[], Awaitable[None]] = lambda: asyncio.sleep(0),
 ) -> Outcome:
     """Scan magnets until the emittances are known as well as is wanted, and put them back.
@@ -147,7 +157,7 @@ async def scan(
         check_none_left(journal)
         before = {m.name: await at.magnets[m.name].get() for m in at.machine.magnets}
         log = _journal_for(journal, at.machine, before)
-        run = Running(at, line, before, keep, tell, ready)
+        run = Running(at, line, before, keep, tell, ready, wrong_lines(line, at.machine))
         measuring = asyncio.ensure_future(_begun(run, log))
         reason, problem = "", None
         with ended_by_signals(measuring, run.say) as came:
@@ -163,7 +173,7 @@ async def scan(
             await _to_the_end(_back(run, log))
         number, doubted = came[0] if came else 0, doubt(run.fit, run.points)
         if not doubted and run.checks:
-            doubted = suspect(run.points, run.fit, at.machine, wrong_lines(line, at.machine))
+            doubted = suspect(run.points, run.fit, at.machine, run.wrong)
         return Outcome(tuple(run.points), run.fit, reason, problem, number, doubted)
 
 
@@ -204,13 +214,13 @@ async def _back(run: Running, log: Journal) -> None:
 
 async def _measured(run: Running) -> str:
     """Measure setting after setting, and say why it ends."""
-    machine, barren, wrong = run.at.machine, 0, wrong_lines(run.line, run.at.machine)
+    machine, barren = run.at.machine, 0
     for magnet in machine.magnets:
         for value in magnet.degauss:
             await reach(magnet, run.at.magnets[magnet.name], value)
     while len(run.points) < machine.points:
         await run.ready()
-        chosen = _chosen(run, wrong)
+        chosen = _chosen(run)
         if not isinstance(chosen, Next):
             return chosen
         point, why = await _point(run, chosen.settings)
@@ -231,18 +241,19 @@ async def _measured(run: Running) -> str:
     return f"all {machine.points} points are measured"
 
 
-def _chosen(run: Running, wrong: list[WrongLine]) -> Next | str:
+def _chosen(run: Running) -> Next | str:
     """The next setting, or why there is none: the goal, and nothing that shows the line wrong."""
     machine, points = run.at.machine, run.points
     if not sharp(run.fit, points, machine.goal) or fresh(points, machine):
         return next_setting(points, run.fit, run.barred, machine, run.before)
-    if run.checks < MOST and (one := telling_setting(points, run.fit, machine, wrong, run.before)):
+    left = run.wrong if run.checks < MOST else ()
+    if one := telling_setting(points, run.fit, machine, left, run.before):
         run.checks += 1
         return one
     return f"the goal of {100 * machine.goal:.3g} % is reached"
 
 
-async def _point(run: Running, settings: Mapping[str, float]) -> tuple[Point | None, str]:
+async def _point(run: Running, settings: Mapping[str, float]) -> tuple[MeasuredPoint | None, str]:
     """Measure at a setting; None, and why, where that cannot be done.
 
     Once more is tried where a magnet left it or the beam was lost during the shots; for a lost beam
@@ -263,7 +274,7 @@ async def _point(run: Running, settings: Mapping[str, float]) -> tuple[Point | N
         elif plane := _stuck(run, reads, shots.sizes):
             return None, f"{plane} as before the magnets moved, to the last digit: is it stuck?"
         else:
-            return Point(reads, dict(shots.sizes), shots.time), ""
+            return MeasuredPoint(reads, dict(shots.sizes), shots.time), ""
     return None, lost or left
 
 

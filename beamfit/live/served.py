@@ -11,7 +11,7 @@ from typing import Any
 
 from beamfit.errors import InputError, plain
 from beamfit.live.channel import LostError, open_channel
-from beamfit.live.watch import Told
+from beamfit.live.watch import WatchView
 from beamfit.table import cell
 
 # Severities of EPICS.
@@ -29,12 +29,12 @@ UNITS = {
 ANSWERED = 1.0
 
 
-def values_of(told: Told) -> dict[str, tuple[Any, int]]:
+def values_of(told: WatchView) -> dict[str, tuple[Any, int]]:
     """The value and the severity of each variable; NaN of what the readings do not determine.
 
     Parameters
     ----------
-    told : Told
+    told : WatchView
         What is known.
 
     Returns
@@ -93,7 +93,7 @@ async def check_unserved(prefix: str) -> None:
 
 
 @contextmanager
-def served(prefix: str, address: str) -> Iterator[Callable[[Told], None]]:
+def served(prefix: str, address: str) -> Iterator[Callable[[WatchView], None]]:
     """Serve variables while the block lasts.
 
     Parameters
@@ -126,7 +126,7 @@ def served(prefix: str, address: str) -> Iterator[Callable[[Told], None]]:
     start |= {name: {"value": ""} for name in TEXTS}
     variables = {name: SharedPV(nt=kinds[name], initial=start[name]) for name in kinds}
 
-    def show(told: Told) -> None:
+    def show(told: WatchView) -> None:
         state = told.state
         time = state.last - state.shift if state.last else 0.0
         for name, (value, severity) in values_of(told).items():

@@ -14,7 +14,7 @@ import numpy as np
 
 from beamfit.io.machine import Watched, WatchMachine
 from beamfit.lifetime.watch import CURRENT, RULE, Plan, State, noted, stepped
-from beamfit.live.channel import Channel, LostError, Reading, kept, open_channel
+from beamfit.live.channel import Channel, LostError, PvReading, kept, open_channel
 from beamfit.status import Status
 from beamfit.table import cell, json_of
 
@@ -27,7 +27,7 @@ WAITING = 100_000
 
 
 @dataclass(frozen=True)
-class Told:
+class WatchView:
     """Knowledge at a moment.
 
     Attributes
@@ -60,12 +60,14 @@ class Told:
     def headline(self) -> tuple[str, str]:
         """Its colour, and what to look at first."""
         state, answer = self.state, self.state.answer
+        gone = f"No connection to {', '.join(self.lost)}" if self.lost else ""
         if self.silent is not None:
-            return "red", f"No reading of the current for {self.silent:.0f} s: all below is old"
+            old = f"o reading of the current for {self.silent:.0f} s: all below is old"
+            return "red", f"{gone}, n{old}" if gone else f"N{old}"
         if self.old:
             return "red", f"The newest reading fitted is {self.age:.0f} s old: fits fall behind"
-        if self.lost:
-            return "red", f"No connection to {', '.join(self.lost)}"
+        if gone:
+            return "red", gone
         if state.alarmed:
             return "red", f"Alarm: {state.said()}"
         if answer is None and not state.last and state.counts.bad:
@@ -105,7 +107,7 @@ class Arrived(NamedTuple):
     """A reading of a variable, None where its connection was lost, and when it came, s."""
 
     watched: Watched
-    reading: Reading | None
+    reading: PvReading | None
     at: float
 
 
@@ -121,14 +123,14 @@ class _Course:
     apart: float = 0.0
     fitted: float | None = None
 
-    def told(self) -> Told:
+    def told(self) -> WatchView:
         """Knowledge now."""
         now, patience = time.monotonic(), max(STALE, INTERVALS * self.apart)
         silent = now - self.arrived if now - self.arrived > patience else None
         age = None if self.fitted is None else now - self.fitted
         old = age is not None and age > self.plan.every + patience
         lost = tuple(name for name, gone in self.lost.items() if gone)
-        return Told(self.plan, self.state, lost, silent, age, old)
+        return WatchView(self.plan, self.state, lost, silent, age, old)
 
     async def take(self) -> None:
         """All readings that wait; a fit leaves the page and the served variables alive."""
@@ -142,7 +144,7 @@ class _Course:
         self.state, fitted = await asyncio.to_thread(_stepped, self.plan, self.state, batch)
         self.fitted = fitted or self.fitted
 
-    def _seen(self, watched: Watched, reading: Reading | None) -> None:
+    def _seen(self, watched: Watched, reading: PvReading | None) -> None:
         gone = reading is None
         if self.lost.get(watched.variable, False) != gone:
             said = f"{'no' if gone else 'again a'} connection to {watched.variable}"
@@ -205,9 +207,9 @@ async def connect(machine: WatchMachine) -> list[str]:
 async def watch(
     machine: WatchMachine,
     plan: Plan,
-    show: Callable[[Told], None],
+    show: Callable[[WatchView], None],
     seconds: float | None = None,
-) -> tuple[Told, int]:
+) -> tuple[WatchView, int]:
     """Watch until the time is over, or somebody ends it.
 
     Parameters
@@ -223,7 +225,7 @@ async def watch(
 
     Returns
     -------
-    Told, int
+    WatchView, int
         What is known at the end, and the signal that ended it, 0 for none.
     """
     queue: asyncio.Queue[Arrived] = asyncio.Queue(WAITING)

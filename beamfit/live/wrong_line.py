@@ -11,7 +11,7 @@ import numpy as np
 
 from beamfit.emittance.fit import EmittanceFit
 from beamfit.io.machine import ScanMachine
-from beamfit.live.points import LEVELS, Next, Point, fit_of
+from beamfit.live.points import LEVELS, MeasuredPoint, Next, fit_of
 from beamfit.optics.beamline import Beamline
 from beamfit.optics.elements import Drift
 
@@ -55,14 +55,14 @@ def _is_drift(element: object) -> bool:
 
 
 def telling_setting(
-    points: Sequence[Point], fit: EmittanceFit, machine: ScanMachine, lines: Sequence[WrongLine],
-    before: Mapping[str, float],
+    points: Sequence[MeasuredPoint], fit: EmittanceFit, machine: ScanMachine,
+    lines: Sequence[WrongLine], before: Mapping[str, float],
 ) -> Next | None:  # fmt: skip
     """Choose the setting at which some wrong line parts most from the right one.
 
     Parameters
     ----------
-    points : sequence of Point
+    points : sequence of MeasuredPoint
         What is measured.
     fit : EmittanceFit
         To the points, by the line of the file.
@@ -97,7 +97,11 @@ def telling_setting(
 
 
 def _apart(
-    fit: EmittanceFit, other: EmittanceFit, plane: str, settings: Mapping, points: Sequence[Point]
+    fit: EmittanceFit,
+    other: EmittanceFit,
+    plane: str,
+    settings: Mapping,
+    points: Sequence[MeasuredPoint],
 ) -> np.ndarray:
     """Squared difference of the logarithms of predicted sizes; 0 beyond the sizes measured."""
     one, two = (each.predict(settings, plane).size for each in (fit, other))
@@ -112,7 +116,10 @@ def misfit(fit: EmittanceFit) -> float:
 
 
 def suspect(
-    points: Sequence[Point], fit: EmittanceFit, machine: ScanMachine, lines: Sequence[WrongLine]
+    points: Sequence[MeasuredPoint],
+    fit: EmittanceFit,
+    machine: ScanMachine,
+    lines: Sequence[WrongLine],
 ) -> str:
     """Name a wrong line that meets the sizes clearly better than the file's; "" if none does."""
     for wrong in lines:

@@ -11,7 +11,7 @@ from scipy.stats import binom
 import beamfit
 from beamfit.emittance.sensitivity import systematics
 from beamfit.errors import InputError
-from beamfit.io.systematics import read_systematics
+from beamfit.io.priors import read_systematics
 from beamfit.optics.calibration import scaled
 from beamfit.optics.elements import Drift, Screen
 from beamfit.quantity import Status

@@ -16,7 +16,7 @@ from beamfit.errors import InputError
 from beamfit.io.line import build_line, read_inputs
 from beamfit.io.machine import Guard, read_scan_machine
 from beamfit.live import devices
-from beamfit.live.channel import LostError, Reading, SilentError
+from beamfit.live.channel import LostError, PvReading, SilentError
 from beamfit.live.devices import (
     BeamGuard,
     Connected,
@@ -26,8 +26,8 @@ from beamfit.live.devices import (
     rms_of,
 )
 from beamfit.live.points import (
+    MeasuredPoint,
     Next,
-    Point,
     doubt,
     fit_of,
     fresh,
@@ -158,7 +158,7 @@ class Feed:
     name = "FEED"
 
     def __init__(self, *readings):
-        self.readings = [Reading(value, time) for value, time in readings]
+        self.readings = [PvReading(value, time) for value, time in readings]
 
     async def monitor(self):
         for reading in self.readings:
@@ -414,7 +414,7 @@ def test_a_setting_is_reached_from_its_side(tmp_path, side, passed):
 def test_the_first_settings_are_those_of_the_file(tmp_path):
     path = written(tmp_path, points=("points = 7", "points = 7\nfirst = [0.5, -1.5]"))
     machine = read_scan_machine(path)
-    point = Point({"Q1": 0.5}, {"x": np.ones(3) * 1e-4}, 0.0)
+    point = MeasuredPoint({"Q1": 0.5}, {"x": np.ones(3) * 1e-4}, 0.0)
     assert next_setting([point], None, (), machine, {"Q1": 0.0}).settings == {"Q1": -1.5}
     gap = next_setting([point] * 2, None, (), machine, {"Q1": 0.0})
     assert isinstance(gap, Next)
@@ -429,7 +429,7 @@ def points_of(line, settings, shots=5):
         r11, r12 = np.asarray(matrix.x)[0, :2]
         size = np.sqrt(2e-9 * (8.0 * r11**2 - 2.0 * r11 * r12 + 0.25 * r12**2))
         sizes = {"x": float(size) * (1 + 0.02 * rng.standard_normal(shots))}
-        found.append(Point(dict(setting), sizes, 0.0))
+        found.append(MeasuredPoint(dict(setting), sizes, 0.0))
     return found
 
 

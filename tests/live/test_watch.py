@@ -11,6 +11,7 @@ import sys
 import time
 import urllib.error
 import urllib.request
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -19,8 +20,9 @@ import pytest
 from beamfit.cli import main
 from beamfit.errors import InputError
 from beamfit.io.machine import Watched, read_watch_machine
-from beamfit.lifetime.watch import Plan
-from beamfit.live.channel import Described, Reading, open_channel, run
+from beamfit.lifetime.watch import Plan, State
+from beamfit.live import watch as live_watch
+from beamfit.live.channel import Described, PvReading, open_channel, run
 from beamfit.live.served import values_of
 from beamfit.live.watch import Arrived, _Course
 from tests.live.conftest import ROOT
@@ -176,7 +178,8 @@ def test_an_ioc_that_ends_is_said_and_followed_again(watching):
     watching.ioc.kill()
     gone = watching.until(lambda: (t := watching.state())["lost"] and t)
     assert gone["headline"].startswith("No connection to ")
-    assert (gone["colour"], gone["sound"]) == ("red", True)
+    known = gone["silent"] is None and gone["quantities"]["lifetime"] is not None
+    assert (gone["colour"], gone["sound"]) == ("red", known)
     before = gone["counts"]["readings"]
     watching.ioc.start()
     # Its simulated time begins anew: a clock set back. Made faster only when that was seen, or it
@@ -226,7 +229,7 @@ def test_a_variable_that_comes_back_in_another_unit_ends_the_watch():
     class Changed:
         async def monitor(self):
             for value in (1.0, None, 1.0):
-                yield value and Reading(value, 1.7e9)
+                yield value and PvReading(value, 1.7e9)
 
         async def describe(self):
             return Described("A")
@@ -263,25 +266,33 @@ CURRENT = Watched("beam_current", "I", "mA", 1.0)
 def arrived(begin, at):
     """A minute of readings that came at a time of this computer's clock."""
     beam = [300.0 * np.exp(-k / 3e4) for k in range(60)]
-    return [Arrived(CURRENT, Reading(i, begin + k), at) for k, i in enumerate(beam)]
+    return [Arrived(CURRENT, PvReading(i, begin + k), at) for k, i in enumerate(beam)]
 
 
-def test_what_is_shown_is_as_old_as_the_newest_reading_that_is_fitted():
-    course = _Course(Plan(every=10.0), asyncio.Queue())
-    now = time.monotonic()
+def test_what_is_shown_is_as_old_as_the_newest_reading_that_is_fitted(monkeypatch):
+    now = 5000.0  # of a clock that stands still, however long a fit takes
+    monkeypatch.setattr(live_watch, "time", SimpleNamespace(monotonic=lambda: now))
+    course = _Course(Plan(every=10.0), asyncio.Queue(), arrived=now)
     for late in (40.0, 0.0):  # fits that fall behind, and that do not
         for one in arrived(1.7e9 - 100 * late, now - late):
             course.queue.put_nowait(one)
         asyncio.run(course.take())
-        course.arrived = time.monotonic()  # readings come all the time
         told = course.told()
         assert told.silent is None
-        assert told.age == pytest.approx(late, abs=5.0)
+        assert told.age == late
         assert told.old == (not told.sound) == (late > 0)
         assert ("fits fall behind" in told.headline[1]) == told.old
         found = values_of(told)
         assert (found["AGE"][1] == found["STATUS"][1] == 3) == told.old
         assert found["AGE"][0] == told.to_json()["age"] == told.age
+
+
+def test_a_lost_connection_is_said_before_what_it_makes_old():
+    lost = live_watch.WatchView(Plan(), State(), ("SR:I",), silent=12.0)
+    said = "No connection to SR:I, no reading of the current for 12 s: all below is old"
+    assert lost.headline == ("red", said)
+    assert replace(lost, lost=()).headline[1].startswith("No reading of the current for 12 s")
+    assert replace(lost, silent=None).headline == ("red", "No connection to SR:I")
 
 
 def test_a_name_that_would_turn_the_line_round_is_shown_by_its_number(tmp_path):

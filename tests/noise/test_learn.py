@@ -8,7 +8,7 @@ from beamfit.emittance.many import noise_samples
 from beamfit.emittance.scan import QuadScan
 from beamfit.emittance.transport import rows_line
 from beamfit.errors import InputError
-from beamfit.io.noise import read_noise, write_noise
+from beamfit.io.priors import read_noise, write_noise
 from beamfit.noise.learn import learn_noise
 from beamfit.noise.model import Noise
 
