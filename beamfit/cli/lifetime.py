@@ -23,8 +23,8 @@ if TYPE_CHECKING:
     from beamfit.lifetime.study import Decay, Machine, RecordStudy
     from beamfit.sampling.posterior import Posterior
 
-# Decays that the first screen lists; all tables have every one.
-MOST_SHOWN = 10
+# Decays, and kinds of verdict on many of them, that the first screen lists; --full has every one.
+MOST_SHOWN, MOST_VERDICTS = 3, 2
 EXAMPLE = """\b
 Examples:
   beamfit lifetime measurements/aps_1999_decay.csv
@@ -232,13 +232,13 @@ def _show_record(terminal: Terminal, study: RecordStudy) -> None:
     terminal.line(str(study.record), style="bold")
     for note in study.record.notes:
         terminal.line(f"Note: {note}")
-    if study.pooled:
+    many = len(study.decays) > tables.FEW
+    if study.pooled or (many and not terminal.full):
         terminal.line(f"Cut at or left out: {tables.counted(study.events)}")
     elif study.events:
         said = "; ".join(str(event) for event in study.events[:8])
         left = len(study.events) - 8
         terminal.line(f"Cut at or left out: {said}" + (f"; {left} more" if left > 0 else ""))
-    many = len(study.decays) > tables.FEW
     for decay in study.pooled if many else study.answers:
         name, status = decay.fit.record, decay.fit.status
         terminal.answer(decay.fit.headline, status, decay.fit.message)
@@ -262,10 +262,15 @@ def _show_record(terminal: Terminal, study: RecordStudy) -> None:
 def _show_many(terminal: Terminal, study: RecordStudy) -> None:
     """Say each verdict once, then print a table with a row for each decay."""
     from beamfit.lifetime import tables
-    from beamfit.table import Table
+    from beamfit.table import Table, cell
 
-    for status, names, message in tables.alike(study.decays):
-        terminal.verdict(names, status, message)
+    verdicts = tables.alike(study.decays)
+    told = verdicts if terminal.full else verdicts[:MOST_VERDICTS]
+    for status, names, message in told:
+        terminal.verdict(names.replace(study.record.name, ""), status, message)
+    if left := verdicts[len(told) :]:
+        others = ", ".join(dict.fromkeys(cell(status) for status, *_ in left))
+        terminal.line(f"\n{len(left)} more kinds of verdict ({others}): --full.")
     for title, header, rows in tables.overview(study.decays)[: None if terminal.full else 1]:
         cells = [[name.removeprefix(study.record.name), *found] for name, *found in rows]
         if not terminal.full and (left := len(cells) - MOST_SHOWN) > 0:

@@ -322,10 +322,12 @@ def result_rows(planes: tuple[PlaneFit, ...]) -> list[Row]:
     there = planes[0].screen
     at = f"at {there.name}"
     own = in_words(there.settings, there.units) or "-"
+    alone = not any(p.emittance.determined for p in planes)  # the interval is all that is known
+    interval = "normalised emittance, 95 % interval" if alone else "  95 % interval"
     rows: list[tuple[str, Callable[[PlaneFit], object], bool]] = [
         ("status", lambda p: p.status, False),
         ("normalised emittance", lambda p: p.normalized_emittance, True),
-        ("  95 % interval", _interval, any(p.emittance.determined for p in planes)),
+        (interval, _interval, True),
         ("  error includes", lambda p: p.holds if p.emittance.determined else None, False),
         ("geometric emittance", lambda p: p.emittance, False),
         ("beta at the start", lambda p: p.beta, True),
