@@ -84,6 +84,7 @@ def _identified(model: str, truth: Callable, noise: float, title: str) -> Figure
     near = slice(0, 160)
     axes.plot(run.time[near], run.outputs["y"][near], ".", color="0.6", ms=3, label="read")
     axes.plot(run.time[near], fit.fitted[0][near], color="#1f5fa8", label="free run of the model")
+    axes.margins(y=0.25)
     axes.set(xlabel="time, s", ylabel="y, output's unit")
     axes.legend(frameon=False, fontsize=8, ncols=2, loc="upper right")
     return figure
