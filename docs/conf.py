@@ -35,7 +35,8 @@ nb_execution_timeout = 300
 nb_merge_streams = True
 
 autodoc_member_order = "bysource"
-autodoc_typehints = "none"
+autodoc_typehints_format = "short"
+python_use_unqualified_type_names = True
 # Types are words for people, "shape (outputs,)", not names to be linked.
 napoleon_use_param = napoleon_use_rtype = False
 default_role = "literal"
@@ -49,8 +50,11 @@ def _typeset(writer, node):
 
 
 def _plain(app, context, lines):
-    """Keep a name that ends in an underscore, such as u_, from being read as a link."""
-    lines[:] = [re.sub(r"(\w)_(?!\w)", r"\1\\_", line) for line in lines]
+    """Keep help texts as they are: u_ is no link, and an option has two hyphens."""
+    for i, line in enumerate(lines):
+        if not line.startswith(".. "):
+            line = re.sub(r"(\w)_(?!\w)", r"\1\\_", line)
+            lines[i] = re.sub(r"(?<![\w`-])(--[a-z][\w-]*)", r"``\1``", line)
 
 
 def setup(app):

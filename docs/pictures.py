@@ -13,6 +13,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+import report_pictures
 from matplotlib.figure import Figure
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -99,7 +100,8 @@ def more_settings() -> Figure:
 
 
 FIGURES: dict[str, Callable[[], Figure]] = {
-    each.__name__: each for each in (scan, phase_space, lifetime, mechanisms, more_settings)
+    each.__name__: each
+    for each in (scan, phase_space, lifetime, mechanisms, more_settings, *report_pictures.FIGURES)
 }
 
 

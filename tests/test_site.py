@@ -32,3 +32,29 @@ def test_every_public_name_is_in_the_reference(site):
     reference = (site / "api.html").read_text()
     missing = [name for name in beamfit._HOME if f'id="beamfit.{name}"' not in reference]
     assert missing == []
+
+
+# Pages that are still longer than a reader takes in; none may join them.
+LONG = {"design", "files_reference", "greybox", "language", "league", "lifetime", "live", "verdict"}
+
+
+def test_pages_and_paragraphs_are_short(root):
+    """A page has at most 2 000 words, a paragraph or an item of a list 90."""
+    for page in (root / "docs").glob("*.md"):
+        if page.stem in LONG:
+            continue
+        text = re.sub(r"```.*?```", "", page.read_text(), flags=re.DOTALL)
+        assert len(text.split()) <= 2000, page
+        for block in re.split(r"\n\s*\n", text):
+            for item in re.split(r"\n(?=[-*] |\d+\. )", block):
+                # Tables and indented blocks are no prose.
+                prose = not item.startswith(("|", "    ", "$$"))
+                assert not prose or len(item.split()) <= 90, (page, item)
+
+
+def test_every_picture_of_a_page_is_made_by_the_build(root):
+    made = (root / "docs/pictures.py").read_text() + (root / "docs/report_pictures.py").read_text()
+    pages = "".join(page.read_text() for page in (root / "docs").glob("*.md"))
+    shown = set(re.findall(r"\(_static/(\w+)\.png\)", pages))
+    assert shown == {path.stem for path in (root / "docs/_static").glob("*.png")}
+    assert [name for name in shown if not re.search(rf"\b{name}\b", made)] == []

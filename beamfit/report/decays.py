@@ -138,7 +138,7 @@ def _single(decays: Sequence[Decay]) -> list[Table]:
         return [Table(*each, note=ERRORS if each[0] == "Result" else "") for each in many]
     listed = _side_by_side(decays)
     for d in (d for d in decays if d.systematics):
-        title = f"What no residual of {d.fit.record} shows"
+        title = f"Systematics of {d.fit.record}"
         listed.append(Table(title, tables.SYSTEMATIC, tables.systematic_rows(d)))
     return listed
 

@@ -60,12 +60,17 @@ class Chromium:
             self.events.append(self._message())
 
     def screen(self, page):
-        """The first screen of a page, 1280 by 800, as PNG."""
+        """The first screen of a page, 1280 by 800, as PNG; `foot` of it is then known."""
         self.events.clear()
         size = {"width": 1280, "height": 800, "deviceScaleFactor": 1, "mobile": False}
         self.ask("Emulation.setDeviceMetricsOverride", **size)
         self._open(page)
         return base64.b64decode(self.ask("Page.captureScreenshot", format="png")["data"])
+
+    def foot(self):
+        """Height in px, from the top, at which the numbers that people quote end."""
+        rule = "document.querySelector('.first').getBoundingClientRect().bottom"
+        return self.ask("Runtime.evaluate", expression=rule)["result"]["value"]
 
     def faults(self, page, width, pictures):
         """What is wrong with a page of so many pictures at a width, in words."""

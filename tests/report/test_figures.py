@@ -15,7 +15,7 @@ import beamfit
 import beamfit.figures
 from beamfit.errors import InputError
 from beamfit.report.decays import decay_page, study_of
-from beamfit.report.document import written_now
+from beamfit.report.document import day_of, written_now
 from beamfit.report.emittance import emittance_page
 from beamfit.report.pdf import HEIGHT, pages_of
 
@@ -59,6 +59,25 @@ def test_each_is_a_figure(otr, decay):
         assert isinstance(figure, Figure)
         FigureCanvasAgg(figure).draw()
         assert any(axes.has_data() for axes in figure.axes)
+
+
+def test_each_picture_of_a_page_says_where_it_comes_from(otr, decay):
+    pages = emittance_page(otr), decay_page((study_of(decay),))
+    for page, words in zip(pages, ("2020-06-22, line LCLS OTR2", "1999-02-11"), strict=True):
+        assert all(words in picture.source for picture in page.pictures)
+    scans = [p for p in pages[0].pictures if p.alt.startswith("scan")]
+    assert [re.search(r"[xy]: χ²/dof \S+", p.source)[0] for p in scans] == [
+        f"{p.plane}: χ²/dof {p.chi2:.3g}/{p.dof}" for p in otr.planes
+    ]
+    drawn = beamfit.figures.scan(otr, "x")
+    assert drawn.get_suptitle() == scans[0].source
+
+
+def test_a_day_is_said_only_where_the_file_states_one():
+    assert day_of("OTRS-2021-02-18-124043.mat", ()) == "2021-02-18"
+    assert day_of("scan.csv", ("taken 22 June 2020",)) == "2020-06-22"
+    assert day_of("scan.csv", ("taken 22 June 2020, calibrated 2019-03-01",)) == ""
+    assert day_of("scan-20210299.csv", ("2021-02-31",)) == ""
 
 
 def test_a_curve_goes_through_what_was_fitted(otr):

@@ -22,6 +22,8 @@ def test_an_emittance_is_well_shown_and_printed(root, tmp_path, browser, well_sh
     beamfit.write_report(page, fit, command=command, inputs={"a/" + 40 * "long_": "f" * 64})
     assert well_shown(page, 3) == []
     assert 3 <= len(re.findall(rb"/Type ?/Page\b", browser.printed())) <= 6
+    browser.screen(page)
+    assert 300 < browser.foot() < 800
 
 
 @pytest.mark.parametrize(

@@ -10,6 +10,7 @@ import pytest
 
 import beamfit
 from beamfit.errors import InputError
+from beamfit.report.document import unbroken
 
 
 @pytest.fixture(scope="module")
@@ -58,6 +59,20 @@ def test_everything_a_colleague_asks_for_is_there(page):
     ):  # fmt: skip
         assert words in " ".join(page.split()), words
     assert re.search(r"0\.70\d ± 0\.0\d\d µm", page)
+
+
+def test_other_tables_are_folded(page):
+    first, _, rest = page.partition("<details>")
+    assert first.count("<table") == 1
+    assert "normalised emittance" in first
+    assert rest.count("<summary>") == rest.count("</details>") == 6
+    assert "All numbers" in rest
+
+
+def test_numbers_with_errors_are_not_broken():
+    assert unbroken("x: 0.70 ± 0.02 µm <at> -4.2 kG") == (
+        "x: <span>0.70 ± 0.02 µm</span> &lt;at&gt; <span>-4.2</span> kG"
+    )
 
 
 def test_three_pictures_are_drawn(page):
