@@ -163,7 +163,7 @@ def told(
 
     def is_open(name: str, q: Quantity) -> bool:
         wide = q.unit == TIME and q.error is not None and q.error > WIDE * abs(q.value)
-        # Of a higher order that is a first one: its gains and its longer lag are told.
+        # A higher order that is a first one determines only its gains and its longer lag.
         more = checks.first_order and not name.startswith(("K", "offset", "tau1", "delay"))
         return nothing or wide or more or name in joint
 

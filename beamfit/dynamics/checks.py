@@ -1,4 +1,4 @@
-"""What residuals say of an identified response, and how runs are predicted that it never saw."""
+"""Tests of the residuals of an identified response, and predictions of runs it never saw."""
 
 from __future__ import annotations
 

@@ -184,7 +184,7 @@ def conclude(p: Problem, s: SearchState, search: Search, seconds: float) -> Fit:
     ratio = chi2 / dof if dof > 0 else np.nan
     judged = p.errors_known or not p.records
     scale = (np.sqrt(max(1.0, ratio)) if dof > 0 else 1.0) if judged else np.sqrt(ratio)
-    # What has no errors cannot speak for or against the model.
+    # Records without errors cannot speak for or against the model.
     silent = [group for group in found.groups if not group.errors_given]
     spoken = chi2 - sum(g.chi2 for g in silent), dof - sum(g.dof for g in silent)
     rest = not s.optimal and settled(p, s)
