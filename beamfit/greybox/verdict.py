@@ -248,13 +248,13 @@ def _undetermined(e: FitEvidence) -> Finding | None:
     found = gauges(e.problem, e.state.theta, e.unseen)
     tied = [g for g in found if set(names.tolist()) & set(g.names)]
     if tied:
-        return _together(tied)
+        return together(tied)
     cause = f"the data do not determine {listed(names)};"
     remedy = "add data of another kind, a prior, or fix it."
     return Finding(Status.unidentified, cause, remedy, tuple(names.tolist()))
 
 
-def _together(found: list[Gauge]) -> Finding:
+def together(found: list[Gauge]) -> Finding:
     """Say which numbers move together whatever the data."""
     said = []
     for g in found:
