@@ -56,7 +56,8 @@ def dense(n):
 def ipopt(p):
     """IPOPT on the same squares: a function of the start."""
     (record,), n = p.records, len(p.start)
-    x = casadi.SX.sym("x", n)
+    # Scalars where each row sees a few numbers, matrices (a hundredth of the memory) where all.
+    x = casadi.SX.sym("x", n) if record.data is None else casadi.MX.sym("x", n)
     seen = x if record.data is None else casadi.mtimes(casadi.DM(np.asarray(record.data)), x)
     rows = [(seen + 0.1 * seen**3 - np.asarray(record.measured)) / 0.05]
     if p.priors:

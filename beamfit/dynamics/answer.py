@@ -17,6 +17,7 @@ from beamfit.dynamics.model import PreparedOutput, curves
 from beamfit.dynamics.response import ARX, FIRST_ORDER, SECOND_ORDER, Physics
 from beamfit.greybox.fit import Derived, Fit
 from beamfit.greybox.memory import Memory
+from beamfit.greybox.verdict import gauges, together
 from beamfit.quantity import Quantity
 from beamfit.statistics import POOR_FIT
 from beamfit.status import Status
@@ -163,7 +164,7 @@ def told(
 
     def is_open(name: str, q: Quantity) -> bool:
         wide = q.unit == TIME and q.error is not None and q.error > WIDE * abs(q.value)
-        # Of a higher order that is a first one: its gains and its longer lag are told.
+        # A higher order that is a first one determines only its gains and its longer lag.
         more = checks.first_order and not name.startswith(("K", "offset", "tau1", "delay"))
         return nothing or wide or more or name in joint
 
@@ -279,6 +280,10 @@ def _open(e: ResponseEvidence) -> Finding | None:
     }
     if not left:
         return None
+    if e.fit.undetermined.shape[1]:  # a freedom of the model, that no run would end
+        tied = gauges(e.fit.problem, e.fit.theta, e.fit.undetermined)
+        if tied := [g for g in tied if {n.removeprefix("p.") for n in g.names} & set(left)]:
+            return together(tied)
     cause = f"The runs do not determine {', '.join(left)}."
     remedy = "Move the inputs over more of their range."
     if TIME in left.values():

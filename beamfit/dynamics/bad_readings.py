@@ -26,7 +26,7 @@ AFTER, CHANCE = 3, 0.05
 HELD, AWAY = 8, 3.0
 
 
-class Misread(NamedTuple):
+class BadReadings(NamedTuple):
     """Readings of a run that are left out: how many, the first one's time, and what they are."""
 
     run: str
@@ -40,7 +40,7 @@ class Misread(NamedTuple):
 
 def sound(
     runs: tuple[Run, ...], output: str, begin: Callable[[tuple[Run, ...]], Begun]
-) -> tuple[tuple[Run, ...], tuple[Misread, ...], Begun]:
+) -> tuple[tuple[Run, ...], tuple[BadReadings, ...], Begun]:
     """Runs without readings that show no output, what those were, and the fit of the others."""
     found, left_out = begin(runs), []
     for _ in range(ROUNDS):
@@ -75,7 +75,7 @@ def _beside(
 
 def _without(
     runs: tuple[Run, ...], output: str, masks: Sequence[np.ndarray], what: str
-) -> tuple[tuple[Run, ...] | None, list[Misread]]:
+) -> tuple[tuple[Run, ...] | None, list[BadReadings]]:
     """Runs without some readings, and which; None if there are none, or too few others."""
     kept, found = [], []
     for run, mask in zip(runs, masks, strict=True):
@@ -86,7 +86,7 @@ def _without(
             return None, []
         kept.append(replace(run, outputs={**run.outputs, output: y}))
         if rows.size:
-            found.append(Misread(run.name, int(rows.size), float(run.time[rows[0]]), what))
+            found.append(BadReadings(run.name, int(rows.size), float(run.time[rows[0]]), what))
     return (tuple(kept) if found else None), found
 
 

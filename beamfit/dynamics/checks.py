@@ -1,4 +1,4 @@
-"""What residuals say of an identified response, and how runs are predicted that it never saw."""
+"""Tests of the residuals of an identified response, and predictions of runs it never saw."""
 
 from __future__ import annotations
 
@@ -285,13 +285,15 @@ def _lawful(u: np.ndarray, widths: np.ndarray) -> np.ndarray:
     """
     low, high = float(u.min()), float(u.max())
     middle = 0.0 if low < 0 < high else 0.5 * (low + high)
+    away = (u - middle)[:, None]
+    dead = middle + np.sign(away) * np.maximum(np.abs(away) - widths, 0.0)
+    changes = np.diff(u, prepend=np.nan) != 0
     play, stop, found = u[0] + 0 * widths, u[0] + 0 * widths, []
-    for now in u:
+    for now in u[changes]:
         play = np.clip(play, now - widths, now + widths)
         stop = np.where(np.abs(now - stop) > widths, now, stop)
-        dead = middle + np.sign(now - middle) * np.maximum(np.abs(now - middle) - widths, 0.0)
-        found.append(np.concatenate([play, stop, dead]))
-    return np.array(found)
+        found.append(np.concatenate([play, stop]))
+    return np.concatenate([np.array(found)[np.cumsum(changes) - 1], dead], axis=1)
 
 
 def _tested(rest: np.ndarray, basis: np.ndarray, columns: np.ndarray) -> tuple[float, float]:

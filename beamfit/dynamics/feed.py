@@ -1,4 +1,4 @@
-"""What comes of another feed profile, and the best one within limits (report fig 36)."""
+"""Prediction of a batch under another feed profile, and the best one within limits (fig 36)."""
 
 from __future__ import annotations
 

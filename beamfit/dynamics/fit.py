@@ -19,7 +19,7 @@ from beamfit.dynamics.answer import (
     rms_of,
     told,
 )
-from beamfit.dynamics.bad_readings import Misread, sound
+from beamfit.dynamics.bad_readings import BadReadings, sound
 from beamfit.dynamics.checks import Checks, HeldOutRun, checks_of, predict_held, slopes_of
 from beamfit.dynamics.model import PreparedOutput, network_of, output_of
 from beamfit.dynamics.record import Run, check_inputs, checked
@@ -78,7 +78,7 @@ class ResponseFit:
         What the residuals say.
     held : tuple of HeldOutRun
         How runs are predicted that were not used.
-    left_out : tuple of Misread
+    left_out : tuple of BadReadings
         Readings that show no output; they are missing from ``runs`` and ``seen``.
     """
 
@@ -97,7 +97,7 @@ class ResponseFit:
     memory: Noise | None
     checks: Checks
     held: tuple[HeldOutRun, ...] = ()
-    left_out: tuple[Misread, ...] = ()
+    left_out: tuple[BadReadings, ...] = ()
 
     @property
     def parts(self) -> tuple[ResponseFit]:

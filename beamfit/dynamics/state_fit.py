@@ -138,7 +138,7 @@ def remembering(case: Case, white: Settled) -> Settled:
         return white
     found = with_memory(case, white, _round, LONGEST)
     if case.squares(found.rest) > WORSE * case.squares(white.rest):
-        # What the model lacks was taken for noise that wanders, and the response with it.
+        # The search took a part of the response for noise that wanders.
         found = white
     errors = found.remembered(case, most=LONGEST)[0]
     if found is not white and max(len(r) for row in found.rest for r in row) > LONGEST:

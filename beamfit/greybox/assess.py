@@ -254,7 +254,7 @@ def state(p: Problem, theta: np.ndarray, scale: Scale, at: Slopes | None = None)
     cost = scale.cost if p.objectives else max(float(at.cost), 0.5 * p.least_residual**2)
     near = p.tolerance * np.minimum(np.maximum(np.abs(theta), np.abs(p.start)), p.upper - p.lower)
     with np.errstate(divide="ignore", invalid="ignore"):
-        # Where the gradient pushes to a bound that is as good as reached.
+        # A bound to which the gradient pushes counts when moving there gains nothing.
         pushed = np.abs(at.gradient) > p.tolerance * size
         near = np.where(pushed, np.maximum(near, CLOSE * cost / np.abs(at.gradient)), near)
     near = np.where(np.isfinite(near), near, 0.0)

@@ -142,7 +142,7 @@ def dependence(p: Problem, s: SearchState, stationary: bool) -> Dependence | Non
     on = (low | high) & np.concatenate([moving, np.ones(len(s.limits.size), bool)])
     if not on.any():
         return None
-    # Of both signs what holds from both sides, and a multiplier that may become less.
+    # Free in sign: equalities, and multipliers that may become smaller.
     equal = low & high
     force = np.concatenate([s.found.bounds, s.found.constraints])
     pull = np.concatenate([unit, np.linalg.norm(s.at.jacobian * unit, axis=1)])
@@ -182,7 +182,7 @@ def _combination(rows: np.ndarray, free: np.ndarray, cut: float) -> np.ndarray |
         return v if np.min(v[~free]) >= -PART * np.max(np.abs(v)) else None
     from scipy.optimize import linprog
 
-    # Of several: the one with most that is not free; then one of what is free alone.
+    # Prefer combinations of constrained rows; otherwise take a free one.
     bound = [(-1.0, 1.0)] * none.shape[1]
     found = linprog(-none[~free].sum(axis=0), -none[~free], np.zeros((~free).sum()), bounds=bound)
     v = none @ found.x if found.status == 0 else np.zeros(len(rows))

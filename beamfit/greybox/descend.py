@@ -221,7 +221,7 @@ def _advance(residual, lower: Array, upper: Array, tolerance: float, moves, s: W
     change = trial - theta
     promised = -(r @ (j @ change)) - 0.5 * jnp.sum((j @ change) ** 2)
     small = jnp.linalg.norm(scale * change) <= tolerance * jnp.linalg.norm(scale * theta)
-    # Of a refused step, what was promised is below rounding.
+    # The decrease that a refused step promised is below rounding.
     nothing = ~good & (s.promised >= 0) & (s.promised <= ROUNDING * (r @ r))
     return Walk(
         theta, r, j, scale, damping, kept(jnp.where(first, s.growth, 2.0), 2.0 * s.growth),
@@ -410,7 +410,7 @@ class ManyLanes(Lanes):
             new, slope = self.slopes(trial)
             steps += 1
             ratio = 0.5 * (r - new) @ (r + new) / promised if promised > 0 else -1.0
-            # What promises next to nothing cannot be judged: it is taken, as the last step.
+            # A step that promises next to nothing cannot be judged: it is taken, as the last.
             rested = bool(0 <= promised <= FINISHED * (r @ r)) and np.isfinite(slope.sum())
             if rested:
                 theta, r, j = trial, new, slope

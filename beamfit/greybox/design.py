@@ -1,4 +1,4 @@
-"""What to measure next: what further rows of the Jacobian would tell, in linear approximation.
+"""Advice on what to measure next: gain by further rows of the Jacobian, in linear approximation.
 
 A candidate is the derivatives of what it would measure by the free numbers, over its own errors.
 """

@@ -1,4 +1,4 @@
-"""What is wrong with a problem as it is stated, before anything is searched for."""
+"""Mistakes in a problem as it is stated, found before anything is searched for."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is to be fitted: a model, its free numbers, and everything that is known about them.
+"""A problem: a model, its free numbers, and everything that is known about them.
 
 A problem is stated with functions of ``(model, data)``, where the model is any JAX tree and its
 numbers are addressed by path. It offers them as functions of one flat vector ``theta`` of the free

@@ -129,7 +129,7 @@ def _next(problem: Quadratic, now: _Point, steps: jax.Array) -> tuple[_Point, ja
     left = jnp.maximum(jnp.maximum(dual, jnp.max(jnp.abs(primal))), _gap(problem, new))
     good = jnp.isfinite(left)
     kept = (jnp.where(good, a, b) for a, b in zip(new, now, strict=True))
-    # What is not finite cannot get better: rounding has had its say.
+    # A point that is not finite ends the search: rounding leaves nothing to gain.
     return _Point(*kept), jnp.where(good, left, 0.0), steps + 1
 
 

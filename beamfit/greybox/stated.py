@@ -1,4 +1,4 @@
-"""What a fit and its study tell a sampler of their problem."""
+"""The problem of a fit and its study, as a sampler needs it."""
 
 from __future__ import annotations
 

@@ -184,7 +184,7 @@ def conclude(p: Problem, s: SearchState, search: Search, seconds: float) -> Fit:
     ratio = chi2 / dof if dof > 0 else np.nan
     judged = p.errors_known or not p.records
     scale = (np.sqrt(max(1.0, ratio)) if dof > 0 else 1.0) if judged else np.sqrt(ratio)
-    # What has no errors cannot speak for or against the model.
+    # Records without errors cannot speak for or against the model.
     silent = [group for group in found.groups if not group.errors_given]
     spoken = chi2 - sum(g.chi2 for g in silent), dof - sum(g.dof for g in silent)
     rest = not s.optimal and settled(p, s)
@@ -248,13 +248,13 @@ def _undetermined(e: FitEvidence) -> Finding | None:
     found = gauges(e.problem, e.state.theta, e.unseen)
     tied = [g for g in found if set(names.tolist()) & set(g.names)]
     if tied:
-        return _together(tied)
+        return together(tied)
     cause = f"the data do not determine {listed(names)};"
     remedy = "add data of another kind, a prior, or fix it."
     return Finding(Status.unidentified, cause, remedy, tuple(names.tolist()))
 
 
-def _together(found: list[Gauge]) -> Finding:
+def together(found: list[Gauge]) -> Finding:
     """Say which numbers move together whatever the data."""
     said = []
     for g in found:

@@ -1,4 +1,4 @@
-"""Whether a chain has settled, how much it is worth, and the rules of its verdict."""
+"""Convergence of a chain, its effective size, and the rules of its verdict."""
 
 from __future__ import annotations
 
@@ -165,7 +165,7 @@ def held_by_priors(target: SamplingTarget, draws: np.ndarray) -> tuple[str, ...]
         i = target.names.index(name)
         before[i] = min(float(prior.std()), before[i])
     wide = np.isfinite(before) & (np.std(draws, axis=0) > LITTLE * before)
-    # How many points are outliers is asked on the way; its prior is the sampler's own.
+    # The share of outliers is a by-product; its prior is the sampler's own.
     return tuple(
         name
         for name, held in zip(target.names, wide, strict=True)

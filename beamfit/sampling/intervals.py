@@ -1,4 +1,4 @@
-"""What draws say of a number: intervals, correlations, bands, and their tables."""
+"""Summaries of draws: intervals, correlations, bands, and their tables."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How walkers move: leaps informed by the fit, steps along differences between walkers."""
+"""Moves of walkers: leaps informed by the fit, steps along differences between walkers."""
 
 from __future__ import annotations
 

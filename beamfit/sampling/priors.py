@@ -1,4 +1,4 @@
-"""What is known of a number before the data: four distributions, or any frozen one of scipy."""
+"""Priors of a number: four distributions, or any frozen one of scipy."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class Distribution(Protocol):
 class _OfScipy:
     """A prior with the names of its field, computed by the distribution of scipy it names."""
 
-    # How scipy calls it, and which of the fields must be above zero.
+    # Name in scipy, and the fields that must be above zero.
     _name: ClassVar[str]
     _positive: ClassVar[tuple[str, ...]] = ()
 

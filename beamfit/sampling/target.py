@@ -1,4 +1,4 @@
-"""What is to be sampled: residuals and a prior in JAX, where the optimum is, what is open."""
+"""Target of a sampler: residuals and a prior in JAX, the optimum, open directions."""
 
 from __future__ import annotations
 

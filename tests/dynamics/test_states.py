@@ -141,3 +141,21 @@ def test_an_order_is_worth_what_it_adds_to_what_readings_before_foretell():
     rough, smooth, more = criterion(case, [missed(0.9, 3), missed(0.99, 6), missed(0.99, 7)])
     assert smooth < rough - 100.0
     assert more - smooth == pytest.approx(np.log(n))
+
+
+def test_the_scale_of_a_state_is_told_as_a_freedom_of_the_model():
+    """Only b c and b s0 act: further runs would not tell them apart."""
+    u, y = (np.arange(80) // 10) % 2, [0.5]
+    for value in u[:-1]:
+        y.append(0.8 * y[-1] + 0.4 * value)
+    level = y + 0.01 * np.random.default_rng(0).normal(size=80)
+    lag = StateSpace(
+        lambda x, u, p: p["k"] * x + p["b"] * u, lambda x, u, p: p["c"] * x, discrete=True
+    )
+    run = Run(np.arange(80.0), {"valve": u}, {"level": level})
+    fit = fit_states(run, lag, {"k": 0.5, "b": 1.0, "c": 1.0}, [0.0])
+    assert fit.status is Status.unidentified
+    assert "p.b, p.c, start[0,0] move together" in fit.message
+    assert "fix one of them" in fit.message
+    assert fit.quantities["b"].error is None
+    assert fit.quantities["k"].value == pytest.approx(0.8, abs=4 * fit.quantities["k"].error)

@@ -1,6 +1,7 @@
 """Bounds as information: exact where data decide, and a Monte Carlo of an open number."""
 
 import numpy as np
+import pytest
 
 from beamfit.greybox.covariance import directions, spread_of, triangle
 
@@ -57,3 +58,16 @@ def test_directions_keep_to_equations_of_any_size():
     assert half.shape == (3, 2)
     assert unseen.shape == (3, 0)
     np.testing.assert_allclose(half[0], half[1])
+
+
+@pytest.mark.parametrize("n", [3, 230])
+def test_rows_divided_by_a_factor_have_the_spread_times_it(n):
+    rows = np.random.default_rng(n).normal(size=(2 * n, n))
+    free = np.full(n, np.inf)
+    direct = spread_of(rows / 1.7, -free, free)
+    scaled = spread_of(rows, -free, free).times(1.7)
+    expected = 1.7**2 * np.linalg.inv(rows.T @ rows)
+    for found in (direct, scaled):
+        np.testing.assert_allclose(found.covariance, expected, rtol=1e-9, atol=1e-12)
+        np.testing.assert_allclose(found.errors, np.sqrt(np.diag(expected)), rtol=1e-9)
+        assert found.trace(rows) == pytest.approx(1.7**2 * n)
