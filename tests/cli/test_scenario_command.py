@@ -39,7 +39,7 @@ def test_without_it_the_emittance_has_no_error(run):
 def test_the_terminal_says_what_is_left_open(run):
     status, out, _ = run("emittance", *GTF, "--scenario", "transport-network", "--starts", "2")
     assert status == 0
-    assert "not determined" in out
+    assert "Not determined: " in out
     assert "[A B] -> [A B] G" in " ".join(out.split())
 
 
