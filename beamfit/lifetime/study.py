@@ -25,7 +25,7 @@ from beamfit.lifetime.cycles import (
 )
 from beamfit.lifetime.evidence import SEPARABLE
 from beamfit.lifetime.fit import DecayFit, bare, fit_cycles, fit_decay
-from beamfit.lifetime.marginal import Law
+from beamfit.lifetime.marginal import DRIFT, Law
 from beamfit.lifetime.mechanisms import MECHANISMS, Losses, loss_coefficients
 from beamfit.lifetime.pieces import (
     Event,
@@ -91,6 +91,9 @@ class Budget(NamedTuple):
         Rms length of the bunches, m, computed or given.
     emittances : tuple of float
         Horizontal and vertical, m rad, as given: intrabeam scattering is not computed.
+    filed_pressure : float or None
+        Pressure at the mean current by the ring file, Pa, where the record's own gauge, which the
+        losses are computed for, contradicts it by more than gauges are read to.
     """
 
     operation: Operation
@@ -98,6 +101,12 @@ class Budget(NamedTuple):
     current: float
     bunch_length: float
     emittances: tuple[float, float]
+    filed_pressure: float | None = None
+
+    @property
+    def pressure(self) -> float:
+        """Pressure at the mean current that the losses are computed for, Pa."""
+        return pressure_at(self.operation, self.current)
 
     @property
     def rates(self) -> dict[str, float]:
@@ -132,6 +141,18 @@ def settings_json(operation: Operation) -> dict[str, float]:
         "scraper_y_m": float(operation.scraper_y),
         "bunches": float(operation.bunches),
     }
+
+
+def pressure_at(operation: Operation, current: float) -> float:
+    """Pressure at a current, Pa.
+
+    Examples
+    --------
+    >>> from beamfit.io.ring import read_operation
+    >>> print(f"{pressure_at(read_operation('lattices/spear3_2003.toml'), 500.0):.2g}")
+    1e-07
+    """
+    return float(operation.pressure_base + operation.pressure_slope * current)
 
 
 def operation_during(record: DecayRecord, machine: Machine) -> Operation:
@@ -230,7 +251,9 @@ def budget(record: DecayRecord, machine: Machine) -> Budget:
     ring, parts = machine.ring, Losses(*(float(part) for part in losses))
     length = float(stored_bunch(ring, operation, current).length)
     emittances = float(ring.emittance_x), float(ring.emittance_y)
-    return Budget(operation, parts, current, length, emittances)
+    filed = pressure_at(machine.operation, current)
+    contradicted = abs(pressure_at(operation, current) - filed) > DRIFT * filed > 0
+    return Budget(operation, parts, current, length, emittances, filed if contradicted else None)
 
 
 def stands_alone(cycle: DecayRecord, fit: DecayFit) -> bool:

@@ -233,8 +233,11 @@ def _emittances(decay: Decay) -> str:
 
 
 def _pressure(decay: Decay) -> str:
-    operation, current = decay.budget.operation, decay.budget.current
-    return f"{float(operation.pressure_base + operation.pressure_slope * current):.3g} Pa"
+    budget = decay.budget
+    filed = budget.filed_pressure
+    return f"{budget.pressure:.3g} Pa" + (
+        "" if filed is None else f", as the gauge reads; {filed:.3g} Pa by the ring file"
+    )
 
 
 SETTINGS: tuple[DecayRow, ...] = (

@@ -12,7 +12,7 @@ from beamfit.lifetime.record import Conditions, DecayRecord
 from beamfit.lifetime.ring_study import predict_held_back, study_shift
 from beamfit.lifetime.scales import fit_scales
 from beamfit.lifetime.study import operation_during, study_record
-from beamfit.lifetime.tables import shift_rows
+from beamfit.lifetime.tables import budget_rows, shift_rows
 from beamfit.quantity import HOUR, Status
 from tests.lifetime.test_lifetime_study import simulated
 
@@ -112,3 +112,22 @@ def test_decays_held_back_lie_in_the_band_of_the_others(machine, decays):
         hours = 1 / float(a * there[1] + b) / HOUR
         assert found[k].predicted.value == pytest.approx(hours, rel=2e-3)
         assert found[k].measured.value == pytest.approx(decays[k].fit.lifetime_mean.value)
+
+
+def test_a_gauge_that_contradicts_the_ring_file_is_used_and_said(machine):
+    operation, found = machine.operation, {}
+    time = np.linspace(0.0, 4 * HOUR, 40)
+    beam = 500.0 * np.exp(-time / (20 * HOUR)) + 1e-3 * np.cos(9 * np.arange(40))
+    filed = float(operation.pressure_base + beam.mean() * operation.pressure_slope)
+    for factor in (1.05, 5.0):
+        read = Conditions(pressure=np.full(40, factor * filed))
+        [decay] = study_record(DecayRecord(time, beam, conditions=read), machine).decays
+        rows = dict(budget_rows([decay]))
+        found[factor] = decay.budget, rows["pressure at the mean current"][0]
+    (close, plain), (far, named) = found.values()
+    assert close.filed_pressure is None
+    assert "ring file" not in plain
+    assert far.pressure == pytest.approx(5.0 * filed, rel=1e-6)
+    assert far.filed_pressure == pytest.approx(filed, rel=1e-6)
+    assert "by the ring file" in named
+    assert far.lifetime < 0.6 * close.lifetime
