@@ -216,7 +216,7 @@ HELD = {
     "beamfit.quantity": "Quantity",
     "beamfit.status": "Status",
     "beamfit.noise.model": "Noise Lognormal",
-    f"{SCAN}.scans": "QuadScan Profile",
+    f"{SCAN}.scan": "QuadScan Profile",
     f"{SCAN}.results": "PlaneFit Points Parameter ScreenTwiss Identifiability",
     f"{SCAN}.assumptions": "Anchor Assumptions Entry",
     f"{SCAN}.focusing_network": "NetworkStrength",
