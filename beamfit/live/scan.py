@@ -218,11 +218,8 @@ async def _measured(run: Running) -> str:
     for magnet in machine.magnets:
         for value in magnet.degauss:
             await reach(magnet, run.at.magnets[magnet.name], value)
-    while len(run.points) < machine.points:
+    while isinstance(chosen := _chosen(run), Next):
         await run.ready()
-        chosen = _chosen(run)
-        if not isinstance(chosen, Next):
-            return chosen
         point, why = await _point(run, chosen.settings)
         if point is None:
             run.barred.append(chosen.settings)
@@ -238,15 +235,17 @@ async def _measured(run: Running) -> str:
         run.points.append(point)
         run.fit = fit_of(run.points, machine, run.line) or run.fit
         run.say(chosen.why, measured=True)
-    return f"all {machine.points} points are measured"
+    return chosen
 
 
 def _chosen(run: Running) -> Next | str:
     """The next setting, or why there is none: the goal, and nothing that shows the line wrong."""
     machine, points = run.at.machine, run.points
+    full = len(points) >= machine.points
     if not sharp(run.fit, points, machine.goal) or fresh(points, machine):
-        return next_setting(points, run.fit, run.barred, machine, run.before)
-    left = run.wrong if run.checks < MOST else ()
+        every = f"all {machine.points} points are measured"
+        return every if full else next_setting(points, run.fit, run.barred, machine, run.before)
+    left = () if full or run.checks == MOST else run.wrong
     if one := telling_setting(points, run.fit, machine, left, run.before):
         run.checks += 1
         return one
