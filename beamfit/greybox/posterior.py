@@ -129,9 +129,8 @@ def target_of(
     moving = np.flatnonzero(p.moving)
     names = tuple(stated.renamed.get(p.names[i], p.names[i]) for i in moving)
     priors = checked(priors, names)
-    own = zip(names, p.lower[moving], strict=True)
-    lower = np.array([stated.lower.get(name, low) for name, low in own])
-    upper = p.upper[moving]
+    lower, upper = p.lower[moving], p.upper[moving]
+    lower = np.array([stated.lower.get(n, low) for n, low in zip(names, lower, strict=True)])
     theta, turn = _changed(p, stated, optimum.theta)
     law, with_priors = _law(stated.own, stated.log_volume, stated.derive, stated.build)
     data = _data(p, theta, moving, stated)
@@ -142,8 +141,6 @@ def target_of(
     unseen = np.zeros((len(theta), 0)) if optimum.undetermined is None else optimum.undetermined
     with_prior = np.array([name in priors for name in names])
     held, loose = _open((turn @ unseen)[moving], names, with_prior, width)
-    steps = [(turn @ (other - optimum.theta))[moving] for other in optimum.others]
-    far = any(np.any(np.abs(step) > FAR * np.sqrt(np.diag(covariance))) for step in steps)
     group_of, block_of = _belonging(slopes, bool(p.constraints))
     return SamplingTarget(
         law=law,
@@ -161,7 +158,7 @@ def target_of(
         priors=priors,
         derived=stated.derived,
         observed=_observed(p),
-        remark=" ".join(filter(None, (stated.remark, ELSEWHERE if far else ""))),
+        remark=_remark(optimum, stated, turn[moving], covariance),
         stated={prior.name: _words(prior) for prior in p.priors},
         priors_own=(*held, *stated.priors_own),
         open_directions=stated.nothing or loose,
@@ -171,6 +168,13 @@ def target_of(
         block_of=block_of,
         along=stated.along,
     )
+
+
+def _remark(optimum: Optimum, stated: Statement, turn: np.ndarray, covariance: np.ndarray) -> str:
+    """The study's remark, and that other optima lie too far away to be reached."""
+    steps = [turn @ (other - optimum.theta) for other in optimum.others]
+    far = any(np.any(np.abs(step) > FAR * np.sqrt(np.diag(covariance))) for step in steps)
+    return " ".join(filter(None, (stated.remark, ELSEWHERE if far else "")))
 
 
 class Predicted(NamedTuple):
