@@ -187,9 +187,9 @@ def draw_course(figure: FigureBase, course: ControlChart) -> None:
     Parameters
     ----------
     figure : Figure or SubFigure
-        Where to.
+        The figure to draw on.
     course : ControlChart
-        What.
+        The quantity through the batch.
     """
     axes, many = figure.subplots(), len(course.value) > MANY
     factor, unit = display_unit(abs(course.centre), course.unit)

@@ -41,9 +41,8 @@ from beamfit.table import Table, labelled
 COLOURS = (BLUE, "#c98a00", "#2c7a3f", "#7b4fa3", RED, "#4f9aa3", "0.5")
 
 ERRORS = (
-    "dI/dt = -a I² - b I. Errors are one standard deviation, scaled by sqrt(χ²/dof) where that "
-    "exceeds 1. “Not determined” means the record puts no error on the value; it is not to be "
-    "quoted."
+    "dI/dt = -a I² - b I. Errors are half of the central 68 % of the posterior. “Not determined” "
+    "means the record puts no error on the value; it is not to be quoted."
 )
 CHECKS = (
     "Analyses that take the lifetime as constant, for comparison: their errors do not contain the "
@@ -219,7 +218,7 @@ def draw_record(figure: FigureBase, study: RecordStudy) -> None:
     Parameters
     ----------
     figure : Figure or SubFigure
-        Where to.
+        The figure to draw on.
     study : RecordStudy
         The record.
     """
@@ -271,7 +270,7 @@ def draw_lifetime(figure: FigureBase, study: RecordStudy) -> None:
     Parameters
     ----------
     figure : Figure or SubFigure
-        Where to.
+        The figure to draw on.
     study : RecordStudy
         The record.
     """
@@ -332,7 +331,7 @@ def draw_budget(figure: FigureBase, decays: Sequence[Decay]) -> None:
     Parameters
     ----------
     figure : Figure or SubFigure
-        Where to.
+        The figure to draw on.
     decays : sequence of Decay
         With budgets.
     """

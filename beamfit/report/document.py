@@ -1,4 +1,4 @@
-"""What a report page consists of, whatever it reports, and its HTML form."""
+"""Parts of every report page, and its HTML form."""
 
 from __future__ import annotations
 

@@ -86,7 +86,7 @@ def draw_outputs(figure: FigureBase, found: ProblemSolution) -> None:
     Parameters
     ----------
     figure : Figure or SubFigure
-        Where to.
+        The figure to draw on.
     found : ProblemSolution
         The solution.
     """

@@ -1,4 +1,4 @@
-"""What lays out a result that is neither of a scan nor of decays; imports every study."""
+"""The page of each result that is neither of a scan nor of decays; imports every study."""
 
 from __future__ import annotations
 

@@ -56,7 +56,7 @@ def draw_decays(figure: FigureBase, shift: Shift, decays: Sequence[Decay]) -> No
     Parameters
     ----------
     figure : Figure or SubFigure
-        Where to.
+        The figure to draw on.
     shift : Shift
         With a network.
     decays : sequence of Decay
@@ -91,7 +91,7 @@ def draw_by_setting(figure: FigureBase, shift: Shift, decays: Sequence[Decay], n
     Parameters
     ----------
     figure : Figure or SubFigure
-        Where to.
+        The figure to draw on.
     shift : Shift
         With a network.
     decays : sequence of Decay

@@ -1,4 +1,4 @@
-"""What a report says of a sampled posterior: verdict, intervals, correlations, diagnostics."""
+"""A sampled posterior in a report: verdict, intervals, correlations, diagnostics."""
 
 from __future__ import annotations
 
@@ -125,7 +125,7 @@ def draw_pairs(
     Parameters
     ----------
     figure : Figure or SubFigure
-        Where to.
+        The figure to draw on.
     posterior : Posterior
         With draws.
     names : sequence of str

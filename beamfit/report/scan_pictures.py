@@ -70,7 +70,7 @@ def draw_scan(figure: FigureBase, fit: EmittanceFit, plane: str, letters: int = 
     Parameters
     ----------
     figure : Figure or SubFigure
-        Where to.
+        The figure to draw on.
     fit : EmittanceFit
         The fit.
     plane : str
@@ -101,7 +101,7 @@ def draw_residuals(figure: FigureBase, fit: EmittanceFit, plane: str) -> None:
     Parameters
     ----------
     figure : Figure or SubFigure
-        Where to.
+        The figure to draw on.
     fit : EmittanceFit
         The fit.
     plane : str
@@ -192,7 +192,7 @@ def draw_profiles(figure: FigureBase, profiles: list[Profile], fit: EmittanceFit
     Parameters
     ----------
     figure : Figure or SubFigure
-        Where to.
+        The figure to draw on.
     profiles : list of Profile
         Of one plane.
     fit : EmittanceFit
@@ -227,7 +227,7 @@ def draw_ellipses(figure: FigureBase, fit: EmittanceFit) -> None:
     Parameters
     ----------
     figure : Figure or SubFigure
-        Where to.
+        The figure to draw on.
     fit : EmittanceFit
         A fit that determines β and α of at least one plane.
     """

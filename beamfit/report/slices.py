@@ -93,7 +93,7 @@ def draw_slices(figure: FigureBase, fits: SliceFits) -> None:
     Parameters
     ----------
     figure : Figure or SubFigure
-        Where to.
+        The figure to draw on.
     fits : SliceFits
         The fits.
     """

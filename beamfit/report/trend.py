@@ -29,7 +29,7 @@ def draw_trend(figure: FigureBase, trend: Trend) -> None:
     Parameters
     ----------
     figure : Figure or SubFigure
-        Where to.
+        The figure to draw on.
     trend : Trend
         The lifetimes. Hours of the record where they have no dates.
     """
