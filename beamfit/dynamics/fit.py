@@ -36,7 +36,7 @@ from beamfit.dynamics.search import (
 )
 from beamfit.errors import InputError, nearest
 from beamfit.greybox.fit import Fit
-from beamfit.noise.correlated import Noise
+from beamfit.noise.correlated import CorrelatedNoise
 from beamfit.quantity import Quantity
 from beamfit.status import Status
 from beamfit.table import Table, json_of
@@ -72,7 +72,7 @@ class ResponseFit:
         Parameters against the operating point, of a network.
     noise : tuple of float
         Rms residual of each run.
-    memory : Noise or None
+    memory : CorrelatedNoise or None
         How the noise wanders; None where it does not.
     checks : Checks
         What the residuals say.
@@ -94,7 +94,7 @@ class ResponseFit:
     quantities: dict[str, Quantity]
     curves: tuple[Curve, ...]
     noise: tuple[float, ...]
-    memory: Noise | None
+    memory: CorrelatedNoise | None
     checks: Checks
     held: tuple[HeldOutRun, ...] = ()
     left_out: tuple[BadReadings, ...] = ()

@@ -19,7 +19,7 @@ from beamfit.dynamics.search import Case, Settled, information, noise_of, used_b
 from beamfit.dynamics.state_fit import LONGEST, trained
 from beamfit.dynamics.states import Matrices, contraction, linear_outputs
 from beamfit.greybox.problem import Free
-from beamfit.noise.correlated import Noise, remembers
+from beamfit.noise.correlated import CorrelatedNoise, remembers
 
 # Most samples of past and future, and most rows, of the regression.
 HORIZON, ROWS = 20, 20_000
@@ -278,7 +278,7 @@ def criterion(case: Case, found: Sequence[Settled], last: Settled | None = None)
     return [information(case, each, noise) for each in found]
 
 
-def _noise_of(case: Case, found: Settled) -> Noise | None:
+def _noise_of(case: Case, found: Settled) -> CorrelatedNoise | None:
     """The noise with a memory of residuals that have one; slopes are left out for speed."""
     rows = case.rows(found.rest)
     if not any(remembers(rest, used_by(found.fit)) for rest, _, _ in rows):

@@ -34,7 +34,7 @@ from beamfit.greybox.fit import Fit
 from beamfit.greybox.memory import Memory, noises, range_of, whitened_by_each
 from beamfit.greybox.problem import Free, Prior, Problem, Record
 from beamfit.greybox.solve import solve
-from beamfit.noise.correlated import Noise, innovations, remembers
+from beamfit.noise.correlated import CorrelatedNoise, innovations, remembers
 from beamfit.status import Status
 
 # Longest delay that is tried, in samples, and as a share of the run.
@@ -210,8 +210,8 @@ def noise_of(
     rows: Sequence[np.ndarray],
     time: Sequence[np.ndarray],
     known: np.ndarray,
-    noise: Noise | None = None,
-) -> tuple[Memory, Noise, float]:
+    noise: CorrelatedNoise | None = None,
+) -> tuple[Memory, CorrelatedNoise, float]:
     """The noise by what residuals say of it, all runs together, and its size in units of theirs.
 
     `rows` hold the slopes of each run's residuals and, last, the residuals, in units of their
@@ -276,7 +276,7 @@ class Case(NamedTuple):
         return sum(float(np.sum((r / s.size_y) ** 2)) for r, _, s in self.rows(rest))
 
     def problem(
-        self, model: Any, noise: np.ndarray, memory: Noise | None = None, gap: Any = ()
+        self, model: Any, noise: np.ndarray, memory: CorrelatedNoise | None = None, gap: Any = ()
     ) -> Problem:
         """State it; `gap` is how far ends of segments may lie apart, shape (states,).
 
@@ -292,7 +292,7 @@ class Case(NamedTuple):
                 y = np.concatenate([y, np.zeros(cuts * len(gap))])
                 error = np.concatenate([error, np.tile(gap, cuts)])
             if memory is not None:
-                course = replace(course, noise=Noise(*map(jnp.asarray, memory)))
+                course = replace(course, noise=CorrelatedNoise(*map(jnp.asarray, memory)))
                 y = np.asarray(innovations(jnp.asarray(y), course.time, course.noise)[0])
                 predict = _surprising
             records.append(Record(f"run {i + 1}", predict, course, y, error, worth=worth))
@@ -300,7 +300,12 @@ class Case(NamedTuple):
         return Problem(model, free, records, self.priors)
 
     def search(
-        self, model: Any, noise: np.ndarray, steps: int, memory: Noise | None = None, gap: Any = ()
+        self,
+        model: Any,
+        noise: np.ndarray,
+        steps: int,
+        memory: CorrelatedNoise | None = None,
+        gap: Any = (),
     ) -> Settled:
         """Fit with the noise that the residuals of the round before had."""
         fit = solve(self.problem(model, noise, memory, gap), iterations=steps)
@@ -323,7 +328,7 @@ class Settled(NamedTuple):
     fit: Fit
     rest: tuple[tuple[np.ndarray, ...], ...]
     noise: np.ndarray
-    memory: Noise | None
+    memory: CorrelatedNoise | None
     errors: Memory | None
     likelihood: float
     rests: bool
@@ -334,8 +339,8 @@ class Settled(NamedTuple):
         return [free * self.fit.derive(predicted, course).slope for course in case.courses]
 
     def remembered(
-        self, case: Case, noise: Noise | None = None, most: int | None = None
-    ) -> tuple[Memory, Noise, float]:
+        self, case: Case, noise: CorrelatedNoise | None = None, most: int | None = None
+    ) -> tuple[Memory, CorrelatedNoise, float]:
         """The noise with a memory that the residuals have, of so many of them at most."""
         problem, size, rest = self.fit.problem, self.fit.problem.size, case.rows(self.rest)
         own = [part for i, s in enumerate(self.slopes(case)) for part in case.split(i, s)]
@@ -357,14 +362,16 @@ def used_by(fit: Fit) -> int:
     return max(round(sum(group.count - group.dof for group in fit.groups)), 1)
 
 
-def information(case: Case, found: Settled, noise: Noise | None) -> float:
+def information(case: Case, found: Settled, noise: CorrelatedNoise | None) -> float:
     """The Bayesian information criterion of a fit under a noise with a memory, or without."""
     rows = case.rows(found.rest)
     cost = used_by(found.fit) * np.log(sum(len(rest) for rest, _, _ in rows))
     return float(cost + sum(_minus(r, t, s.size_y, noise) for r, t, s in rows))
 
 
-def _minus(rest: np.ndarray, time: np.ndarray, size_y: float, noise: Noise | None) -> float:
+def _minus(
+    rest: np.ndarray, time: np.ndarray, size_y: float, noise: CorrelatedNoise | None
+) -> float:
     """-2 ln L of residuals, their size being their own."""
     white, volume = (rest, 0.0) if noise is None else innovations(rest, time, noise)
     size = max(float(np.std(white)), CLOSE * size_y)
@@ -429,7 +436,9 @@ def case_of(seen: PreparedOutput, offset: bool, network: bool = False) -> Case:
     return Case((seen,), seen.runs, tuple(free), weight_priors("map") if network else ())
 
 
-def _round(case: Case, model: Any, noise: np.ndarray, memory: Noise | None = None) -> Settled:
+def _round(
+    case: Case, model: Any, noise: np.ndarray, memory: CorrelatedNoise | None = None
+) -> Settled:
     """A search that pays for what it uses; the part of a sample in a delay begins anew."""
     found = case.search(model | {"late": 0.0}, noise, STEPS, memory)
     return found._replace(likelihood=information(case, found, memory))

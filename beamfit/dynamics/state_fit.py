@@ -36,7 +36,7 @@ from beamfit.greybox.fit import Derived, Fit
 from beamfit.greybox.mlp import MLP
 from beamfit.greybox.problem import Free, Prior
 from beamfit.greybox.solve import solve
-from beamfit.noise.correlated import Noise
+from beamfit.noise.correlated import CorrelatedNoise
 from beamfit.quantity import Quantity
 from beamfit.statistics import POOR_FIT
 from beamfit.status import Status
@@ -78,7 +78,7 @@ class Course:
     index: Any
     time: Any
     run: Any
-    noise: Noise | None
+    noise: CorrelatedNoise | None
 
     def shot(self, model: Any) -> tuple[jax.Array, jax.Array]:
         """Outputs from every segment's own start, and the gaps where segments meet."""
@@ -186,7 +186,7 @@ class StatesFit:
         What is quoted, with errors.
     noise : array, shape (runs, outputs)
         Rms residuals.
-    memory : Noise or None
+    memory : CorrelatedNoise or None
         How the noise of all outputs wanders; None where it does not.
     held : dict of str to tuple of HeldOutRun
         How runs are predicted that were not used, by output.
@@ -203,7 +203,7 @@ class StatesFit:
     fit: Fit
     quantities: dict[str, Quantity]
     noise: np.ndarray
-    memory: Noise | None
+    memory: CorrelatedNoise | None
     held: dict[str, tuple[HeldOutRun, ...]]
     more: dict[str, Any]
 

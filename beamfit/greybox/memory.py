@@ -14,7 +14,7 @@ import numpy as np
 from scipy.special import stdtr, stdtrit
 
 from beamfit.greybox.covariance import CUT
-from beamfit.noise.correlated import Levels, Noise, log_volume, white_beside, whitened
+from beamfit.noise.correlated import CorrelatedNoise, Levels, log_volume, white_beside, whitened
 
 # Grid of correlation times: from this share of the median interval to this many records, and count.
 SHORTEST, LONGEST, TIMES = 0.3, 5.0, 40
@@ -71,9 +71,9 @@ class Memory(NamedTuple):
         return int(np.argmax(np.where(self.time == median, self.weight, -1.0)))
 
     @property
-    def noise(self) -> Noise:
+    def noise(self) -> CorrelatedNoise:
         """That."""
-        return Noise(float(self.time[self.likely]), float(self.white[self.likely]))
+        return CorrelatedNoise(float(self.time[self.likely]), float(self.white[self.likely]))
 
     @property
     def mean_step(self) -> np.ndarray:
@@ -123,7 +123,7 @@ class Whitened(NamedTuple):
 
     Attributes
     ----------
-    noise : Noise of array, shape (g,)
+    noise : CorrelatedNoise of array, shape (g,)
         What is looked at.
     triangle : array, shape (g, m, p + 1)
         With the same sums of squares and products as the whitened rows.
@@ -133,7 +133,7 @@ class Whitened(NamedTuple):
         Values, less what was eliminated.
     """
 
-    noise: Noise
+    noise: CorrelatedNoise
     triangle: np.ndarray
     volume: np.ndarray
     count: int
@@ -169,7 +169,7 @@ class Whitened(NamedTuple):
 
 
 def whitened_by_each(
-    grid: Sequence[Noise],
+    grid: Sequence[CorrelatedNoise],
     runs: Sequence[tuple[np.ndarray, np.ndarray]],
     known: np.ndarray | None = None,
     levels: Levels | None = None,
@@ -184,11 +184,13 @@ def whitened_by_each(
     count -= 0 if levels is None else levels.first.size
     if known is not None:
         triangles, count = [*triangles, np.tile(known, (len(grid), 1, 1))], count + len(known)
-    return Whitened(Noise(*np.array(grid).T), np.concatenate(triangles, axis=1), volume, count)
+    return Whitened(
+        CorrelatedNoise(*np.array(grid).T), np.concatenate(triangles, axis=1), volume, count
+    )
 
 
 def _triangles(
-    grid: Sequence[Noise], rows: np.ndarray, interval: np.ndarray, levels: Levels | None
+    grid: Sequence[CorrelatedNoise], rows: np.ndarray, interval: np.ndarray, levels: Levels | None
 ) -> tuple[np.ndarray, np.ndarray]:
     """Triangular factors of one run's whitened rows, and log volumes, for each noise."""
     triangles, volumes = [], []
@@ -214,17 +216,17 @@ def range_of(time: np.ndarray) -> tuple[float, float]:
 
 def noises(
     ends: tuple[float, float], usual: float, count: int, ratios: Sequence[float] = (0.0,)
-) -> list[Noise]:
+) -> list[CorrelatedNoise]:
     """Noises that are looked at: correlation times between two, and with each the ratios of the
     white variance to what the part with a memory gets anew in a usual interval.
 
     Examples
     --------
-    >>> noises((1.0, 4.0), 1.0, 3)
-    [Noise(time=1.0, white=0.0), Noise(time=2.0, white=0.0), Noise(time=4.0, white=0.0)]
+    >>> [noise.time for noise in noises((1.0, 4.0), 1.0, 3)]
+    [1.0, 2.0, 4.0]
     """
     return [
-        Noise(float(each), float(ratio / (ratio + 1.0 / -np.expm1(-2.0 * usual / each))))
+        CorrelatedNoise(float(each), float(ratio / (ratio + 1.0 / -np.expm1(-2.0 * usual / each))))
         for each in np.geomspace(*ends, count)
         for ratio in ratios
     ]
@@ -240,7 +242,7 @@ def remembered(
     """Rows of one record whitened by what its noise may be, as of `memory_of`."""
     looked_at = (FEWER, WHITE) if levels is None else (TIMES,)
     usual = float(np.median(np.diff(time)))
-    grid = noises(range_of(time), usual, *looked_at) if known is None else [Noise(known)]
+    grid = noises(range_of(time), usual, *looked_at) if known is None else [CorrelatedNoise(known)]
     return whitened_by_each(grid, [(np.column_stack([slopes, residuals]), time)], levels=levels)
 
 

@@ -23,7 +23,7 @@ from beamfit.greybox.memory import Memory, Whitened, remembered
 from beamfit.greybox.problem import padded_length
 from beamfit.lifetime.decay_law import Moments, beam_current, cumulative
 from beamfit.lifetime.record import DecayRecord, Monitor
-from beamfit.noise.correlated import Levels, Noise, remembers
+from beamfit.noise.correlated import CorrelatedNoise, Levels, remembers
 from beamfit.quantity import HOUR, Quantity
 
 # Columns of the slopes: the current of the piece, loss at the mean current and its quadratic part,
@@ -486,7 +486,9 @@ class Expansion:
         rows = np.vstack([self.triangle[:, [*columns, -1]], self.prior * known])
         count = self.residuals.size - (0 if self.levels is None else self.level.size)
         triangle = np.linalg.qr(rows, mode="r")[None]
-        return Whitened(Noise(np.zeros(1), np.zeros(1)), triangle, np.zeros(1), count).memory()
+        return Whitened(
+            CorrelatedNoise(np.zeros(1), np.zeros(1)), triangle, np.zeros(1), count
+        ).memory()
 
     def moved(self, change: np.ndarray) -> Physical:
         """Shift the values by a change of the readings, over their errors, by least squares;

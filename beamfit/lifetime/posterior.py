@@ -21,7 +21,7 @@ from beamfit.lifetime.decay_law import Moments, beam_current, current
 from beamfit.lifetime.expansion import Pieces, solved
 from beamfit.lifetime.record import DecayRecord
 from beamfit.noise.correlated import (
-    Noise,
+    CorrelatedNoise,
     innovations,
     log_volume,
     whitened,
@@ -234,14 +234,14 @@ class Remembered(NamedTuple):
     white: Array | None
 
 
-def _noise_of(fit) -> Noise:
+def _noise_of(fit) -> CorrelatedNoise:
     """Correlation time of a fit's errors, and the share without, by how neighbours are alike."""
     usual = np.median(np.diff(fit.readings.time)) / fit.correlation_time
     white = 1.0 - fit.identifiability.residual_correlation * np.exp(usual)
-    return Noise(fit.correlation_time, float(white) if white > ROUNDING else 0.0)
+    return CorrelatedNoise(fit.correlation_time, float(white) if white > ROUNDING else 0.0)
 
 
-def _with_memory(problem: Problem, fit, noise: Noise, inferred: bool) -> Problem:
+def _with_memory(problem: Problem, fit, noise: CorrelatedNoise, inferred: bool) -> Problem:
     """The problem with the correlation time free, and residuals of independent errors.
 
     An unknown noise is sampled by what is new in a usual interval, which a record tells well
@@ -266,7 +266,7 @@ def _with_memory(problem: Problem, fit, noise: Noise, inferred: bool) -> Problem
     return replace(problem, free=free, records=[own])
 
 
-def log_wander(noise: Noise, record: DecayRecord) -> float:
+def log_wander(noise: CorrelatedNoise, record: DecayRecord) -> float:
     """Logarithm of the variance that is new in a usual interval over that of the white part."""
     new = (1.0 - noise.white) * -np.expm1(-2 * np.median(np.diff(record.time)) / noise.time)
     return float(np.log(np.clip(new / noise.white, LEAST_NEW, MOST_NEW)))
@@ -292,7 +292,7 @@ def _whitened(model: DecayNumbers, data: Remembered) -> tuple[Array, Array]:
         between = apart(model, data.at)
         return whitened(rows, between), log_volume(between)
     white, rest = _parts(model, data)
-    noise = Noise(jnp.exp(model.log_memory), white / (white + rest))
+    noise = CorrelatedNoise(jnp.exp(model.log_memory), white / (white + rest))
     white, sizes = innovations(rows, jnp.asarray(data.at.time), noise)
     return white, -sizes
 

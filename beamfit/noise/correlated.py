@@ -89,7 +89,7 @@ def remembers(residuals: np.ndarray, parameters: int, slow: float = SEEN) -> boo
     return any(is_correlated(m, parameters, slow) for m in means if len(m) > 2 * parameters)
 
 
-class Noise(NamedTuple):
+class CorrelatedNoise(NamedTuple):
     """Correlation time of the part that wanders, and the share of variance without memory."""
 
     time: float
@@ -97,7 +97,9 @@ class Noise(NamedTuple):
 
 
 @jax.jit  # a scan that is called as it is would be compiled at every call
-def innovations(rows: jax.Array, time: jax.Array, noise: Noise) -> tuple[jax.Array, jax.Array]:
+def innovations(
+    rows: jax.Array, time: jax.Array, noise: CorrelatedNoise
+) -> tuple[jax.Array, jax.Array]:
     """Rows less what those before foretell, over the error of that; and log sum of the errors.
 
     The Kalman filter of an Ornstein-Uhlenbeck process read with white noise (A. C. Harvey,
@@ -121,7 +123,7 @@ def innovations(rows: jax.Array, time: jax.Array, noise: Noise) -> tuple[jax.Arr
 
 
 def whitened_of_both(
-    rows: np.ndarray, interval: np.ndarray, noise: Noise
+    rows: np.ndarray, interval: np.ndarray, noise: CorrelatedNoise
 ) -> tuple[np.ndarray, float]:
     """Rows as those with independent errors of the same size, and the log of the volume.
 
@@ -130,7 +132,8 @@ def whitened_of_both(
 
     Examples
     --------
-    >>> both, volume = whitened_of_both(np.array([1.0, 2.0]), np.array([1.0]), Noise(1.0, 1.0))
+    >>> noise = CorrelatedNoise(1.0, 1.0)
+    >>> both, volume = whitened_of_both(np.array([1.0, 2.0]), np.array([1.0]), noise)
     >>> both.round(9).tolist(), round(volume, 9) + 0.0
     ([1.0, 2.0], 0.0)
     """

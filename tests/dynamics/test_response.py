@@ -11,7 +11,7 @@ from beamfit.dynamics.fit import identify
 from beamfit.dynamics.record import Run
 from beamfit.dynamics.response import FIRST_ORDER, SECOND_ORDER, simulate
 from beamfit.errors import InputError
-from beamfit.noise.correlated import Noise, innovations
+from beamfit.noise.correlated import CorrelatedNoise, innovations
 from beamfit.status import Status
 
 
@@ -92,7 +92,7 @@ def test_a_drift_that_is_as_slow_as_the_response_is_said_and_leaves_no_small_err
 
 
 def test_innovations_of_a_noise_are_those_of_its_covariance():
-    rng, noise = np.random.default_rng(0), Noise(3.0, 0.4)
+    rng, noise = np.random.default_rng(0), CorrelatedNoise(3.0, 0.4)
     time = np.cumsum(rng.uniform(0.1, 2.0, 30))
     rows = rng.normal(size=(30, 2))
     apart = np.abs(time[:, None] - time[None, :])

@@ -9,7 +9,7 @@ from beamfit.greybox.memory import memory_of
 from beamfit.greybox.problem import Free, Problem, Record
 from beamfit.greybox.solve import solve
 from beamfit.noise.correlated import (
-    Noise,
+    CorrelatedNoise,
     is_correlated,
     log_volume,
     whitened,
@@ -42,7 +42,15 @@ def test_the_density_is_scipys(uneven):
     assert ours - 20 * np.log(2 * np.pi) == pytest.approx(theirs, rel=1e-9)
 
 
-@pytest.mark.parametrize("noise", [Noise(2.0), Noise(2.0, 0.3), Noise(1e4, 0.9), Noise(0.05, 1.0)])
+@pytest.mark.parametrize(
+    "noise",
+    [
+        CorrelatedNoise(2.0),
+        CorrelatedNoise(2.0, 0.3),
+        CorrelatedNoise(1e4, 0.9),
+        CorrelatedNoise(0.05, 1.0),
+    ],
+)
 def test_both_parts_of_the_noise_have_scipys_density(uneven, noise):
     row = np.random.default_rng(5).normal(size=40)
     white, volume = whitened_of_both(row, np.diff(uneven), noise)
@@ -60,7 +68,7 @@ def test_each_noise_is_generalised_least_squares_by_dense_matrices(uneven):
     residuals = rng.normal(size=40)
     found = memory_of(slopes, residuals, uneven)
     for k in (0, 17, 40, 63, 99):
-        weight = np.linalg.inv(both(uneven, Noise(found.time[k], found.white[k])))
+        weight = np.linalg.inv(both(uneven, CorrelatedNoise(found.time[k], found.white[k])))
         information = slopes.T @ weight @ slopes
         step = -np.linalg.solve(information, slopes.T @ weight @ residuals)
         np.testing.assert_allclose(found.step[k], step, rtol=1e-4)
