@@ -104,7 +104,7 @@ _READERS: dict[str, Callable[[Any], Any]] = {
 
 
 def _read(arguments: Mapping[str, Any]) -> dict[str, Any]:
-    """What stands in the place of the arguments that are paths."""
+    """Read the arguments that are paths."""
     found = _scan_and_line(arguments.get("scan"), arguments.get("line"))
     for name in arguments.keys() & _READERS.keys():
         value, read = arguments[name], _READERS[name]

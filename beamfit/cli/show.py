@@ -55,7 +55,7 @@ class _Console(Console):
 
 
 class Terminal:
-    """Where a command answers: all of it, or what fits the first screen."""
+    """The screen a command answers on: all of the answer, or its first screen."""
 
     def __init__(self, full: bool = True) -> None:
         self.full = full

@@ -122,14 +122,14 @@ class PlaneLikelihood:
         return averaged(jnp.stack(parts), 0.0) + prior
 
 
-class Told(NamedTuple):
+class DensityData(NamedTuple):
     """Data of the functions of a scan's statement."""
 
     asked: tuple[Asked, ...]
     sizes: tuple[PlaneLikelihood, ...]
 
 
-def _log_volume(model: Mapping[str, Any], told: Told) -> Array:
+def _log_volume(model: Mapping[str, Any], told: DensityData) -> Array:
     """The density of the sizes, whose noise is averaged over, and the prior of the beams."""
     return sum((each.log_density(model) for each in told.sizes), jnp.zeros(()))
 
@@ -153,14 +153,14 @@ def _sizes_of(problem: Problem, seen: Seen, planes: Sequence[str]) -> tuple[Plan
     return tuple(found)
 
 
-def _beams(model: Mapping[str, Any], told: Told) -> dict[str, Any]:
+def _beams(model: Mapping[str, Any], told: DensityData) -> dict[str, Any]:
     """The beam matrix of each plane, and the model, for functions of the user's."""
     parts = model["beam"].items()
     beams = {p: BeamMatrix(**{name: UNIT * beam[name] for name in CHOLESKY}) for p, beam in parts}
     return {**beams, "model": model}
 
 
-def _twiss(model: Mapping[str, Any], told: Told) -> Array:
+def _twiss(model: Mapping[str, Any], told: DensityData) -> Array:
     """Emittance, normalised emittance, β, α at the start and mismatch, plane after plane."""
     return jnp.concatenate([asked_numbers(model, plane)[PLACES] for plane in told.asked])
 
@@ -262,7 +262,7 @@ def _stated(
         derived={f"{plane}.{name}": QUANTITIES[name] for plane, name in shown},
         derive=_twiss,
         build=_beams,
-        data=Told(
+        data=DensityData(
             asked_in(
                 problem, fit.seen, planes := [p.plane for p in chosen], fit.statement.whole_map
             ),

@@ -87,7 +87,7 @@ class Definition:
         return InputError(found, expected, self.path, self.line)
 
 
-class Statement(NamedTuple):
+class MadxStatement(NamedTuple):
     """A statement, its block where it has one, and where it begins."""
 
     text: str
@@ -104,7 +104,7 @@ class Statement(NamedTuple):
         return InputError(found, expected, self.path, self.line)
 
 
-def statements(text: str, path: str | PathLike[str], line: int = 1) -> Iterator[Statement]:
+def statements(text: str, path: str | PathLike[str], line: int = 1) -> Iterator[MadxStatement]:
     """Split a file at its semicolons and blocks; comments are left out.
 
     Examples
@@ -115,10 +115,10 @@ def statements(text: str, path: str | PathLike[str], line: int = 1) -> Iterator[
     text = COMMENT.sub(blanked, text)
     begin, depth, opened = 0, 0, None
 
-    def made(end: int, block: str | None = None) -> Statement:
+    def made(end: int, block: str | None = None) -> MadxStatement:
         said = text[begin:end]
         at = line + text.count("\n", 0, begin + len(said) - len(said.lstrip()))
-        return Statement(said.strip(), block, path, at)
+        return MadxStatement(said.strip(), block, path, at)
 
     for found in PART.finditer(text):
         mark, place = found[0], found.start()
@@ -223,11 +223,11 @@ class Interpreter:
         except ValueError as error:
             return error
 
-    def _parameter(self, statement: Statement, later: bool, text: str) -> Attribute:
+    def _parameter(self, statement: MadxStatement, later: bool, text: str) -> Attribute:
         value = None if later else self._evaluated(text)
         return Attribute(text, later, value, statement.path, statement.line)
 
-    def _parameters(self, statement: Statement, text: str) -> dict[str, Attribute]:
+    def _parameters(self, statement: MadxStatement, text: str) -> dict[str, Attribute]:
         found: dict[str, Attribute] = {}
         text = text.strip()
         if not text:
@@ -253,7 +253,7 @@ class Interpreter:
         parameter = self.elements[name].parameters.get(key)
         return 0.0 if parameter is None else float(self.number(parameter))
 
-    def _block(self, statement: Statement, word: str, taken: bool | None) -> None:
+    def _block(self, statement: MadxStatement, word: str, taken: bool | None) -> None:
         if word in ("if", "elseif", "else"):
             if word != "if" and taken is None:
                 raise statement.error(f"{word.upper()} without IF", "IF (...) {...} before it")
@@ -268,13 +268,13 @@ class Interpreter:
         elif word == "while":
             raise statement.error()
 
-    def _holds(self, statement: Statement, text: str) -> bool:
+    def _holds(self, statement: MadxStatement, text: str) -> bool:
         try:
             return compared(self.values, text)
         except ValueError as error:
             raise statement.error(str(error), "a comparison of numbers") from None
 
-    def _one(self, statement: Statement) -> None:
+    def _one(self, statement: MadxStatement) -> None:
         text = statement.text
         if found := ASSIGNMENT.fullmatch(text):
             self._assign(statement, *found.groups())
@@ -290,13 +290,15 @@ class Interpreter:
         else:
             raise statement.error()
 
-    def _assign(self, statement: Statement, kind: str, name: str, equals: str, text: str) -> None:
+    def _assign(
+        self, statement: MadxStatement, kind: str, name: str, equals: str, text: str
+    ) -> None:
         try:
             self.values.assign((kind or "").lower(), name.lower(), equals == ":=", text.strip())
         except ValueError as error:
             raise statement.error(str(error), "an expression that MAD-X reads") from None
 
-    def _set(self, statement: Statement, name: str, given: Mapping[str, Attribute]) -> None:
+    def _set(self, statement: MadxStatement, name: str, given: Mapping[str, Attribute]) -> None:
         """Change parameters of an element; as in MAD-X, not of those derived from it."""
         if name not in self.elements or {"at", "from"} & given.keys():
             raise statement.error()
@@ -304,7 +306,7 @@ class Interpreter:
         self.values.changed()
 
     def _define(
-        self, statement: Statement, label: str, arguments: str, kind: str, rest: str
+        self, statement: MadxStatement, label: str, arguments: str, kind: str, rest: str
     ) -> None:
         name, said = label.lower(), kind.lower()
         kind = said if said in self.elements else self.dialect.classes.get(said, said)
@@ -342,7 +344,7 @@ class Interpreter:
         if self._open is not None:
             self._open.placed.append((name, place))
 
-    def _command(self, statement: Statement, name: str, rest: str) -> None:
+    def _command(self, statement: MadxStatement, name: str, rest: str) -> None:
         if self._open is not None:
             self._within(statement, name, rest)
         elif name in HARMLESS or name.startswith("ptc_"):
@@ -356,7 +358,7 @@ class Interpreter:
         else:
             raise statement.error()
 
-    def _within(self, statement: Statement, name: str, rest: str) -> None:
+    def _within(self, statement: MadxStatement, name: str, rest: str) -> None:
         """A statement between SEQUENCE and ENDSEQUENCE."""
         if name == "endsequence":
             self._open = None
@@ -372,7 +374,7 @@ class Interpreter:
             raise statement.error(found, "AT and FROM; give it where the element is defined")
         self._open.placed.append((name, given))
 
-    def _use_command(self, statement: Statement, given: Mapping[str, Attribute]) -> None:
+    def _use_command(self, statement: MadxStatement, given: Mapping[str, Attribute]) -> None:
         for key in given:
             if key not in ("sequence", "period"):
                 raise statement.error(
@@ -380,7 +382,7 @@ class Interpreter:
                 )
         self.used = next((word_of(p).lower() for p in given.values()), self.used)
 
-    def _call_command(self, statement: Statement, given: Mapping[str, Attribute]) -> None:
+    def _call_command(self, statement: MadxStatement, given: Mapping[str, Attribute]) -> None:
         if "file" not in given or self._calls >= MOST_CALLS:
             most = f"more than {MOST_CALLS} files called" if "file" in given else ""
             raise statement.error(most, "CALL, FILE = ..., of files that do not call one another")
@@ -392,7 +394,7 @@ class Interpreter:
             raise statement.error(f"{path}: {error.found}", error.expected) from None
         self.run(text, path)
 
-    def _option_command(self, statement: Statement, given: Mapping[str, Attribute]) -> None:
+    def _option_command(self, statement: MadxStatement, given: Mapping[str, Attribute]) -> None:
         for key, parameter in given.items():
             on = word_of(parameter).lower() not in ("false", "no", "0") and parameter.value != 0.0
             if key in ("rbarc", "reset"):
@@ -402,7 +404,7 @@ class Interpreter:
                     f"option '{key}', which beamfit does not know", "RBARC or none"
                 )
 
-    def _beam_command(self, statement: Statement, given: dict[str, Attribute]) -> None:
+    def _beam_command(self, statement: MadxStatement, given: dict[str, Attribute]) -> None:
         sequence = word_of(given.pop("sequence")).lower() if "sequence" in given else ""
         if "bv" in given and self.number(given["bv"]) != 1.0:
             raise statement.error("a beam with BV = -1, which runs the other way", "BV = 1")
@@ -413,7 +415,7 @@ class Interpreter:
                 del beam[key]
         beam |= own
 
-    def _resbeam_command(self, statement: Statement, given: Mapping[str, Attribute]) -> None:
+    def _resbeam_command(self, statement: MadxStatement, given: Mapping[str, Attribute]) -> None:
         self.beams[word_of(given["sequence"]).lower() if "sequence" in given else ""] = {}
 
 

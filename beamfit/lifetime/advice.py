@@ -28,7 +28,7 @@ READINGS = 64
 GRID = 33
 
 
-class Candidate(NamedTuple):
+class DecayCandidate(NamedTuple):
     """A decay that could be recorded.
 
     Attributes
@@ -54,7 +54,7 @@ class Proposal(NamedTuple):
 
     Attributes
     ----------
-    candidate : Candidate
+    candidate : DecayCandidate
         The decay.
     information : float
         Logarithm of the factor by which the volume of the scales' error ellipsoid shrinks.
@@ -62,12 +62,12 @@ class Proposal(NamedTuple):
         Expected standard deviations of Touschek, bremsstrahlung, elastic, desorption afterwards.
     """
 
-    candidate: Candidate
+    candidate: DecayCandidate
     information: float
     errors: np.ndarray
 
 
-def _rows(fit: ScaleFit, candidate: Candidate) -> np.ndarray:
+def _rows(fit: ScaleFit, candidate: DecayCandidate) -> np.ndarray:
     """Readings of the candidate predicted by the scales, over its errors, shape (2, scales)."""
     scales = jnp.asarray(fit.vector)
     terms = fit.terms_at(candidate.operation, candidate.current)
@@ -82,14 +82,14 @@ def _rows(fit: ScaleFit, candidate: Candidate) -> np.ndarray:
     return fit.about(stacked, one)[2].reshape(-1, len(scales))
 
 
-def next_decays(fit: ScaleFit, candidates: Sequence[Candidate]) -> tuple[Proposal, ...]:
+def next_decays(fit: ScaleFit, candidates: Sequence[DecayCandidate]) -> tuple[Proposal, ...]:
     """Rank decays by what they would tell about the scales.
 
     Parameters
     ----------
     fit : ScaleFit
         What is known so far.
-    candidates : sequence of Candidate
+    candidates : sequence of DecayCandidate
         What could be recorded.
 
     Returns

@@ -22,7 +22,7 @@ PHASES = LENGTHS * np.tile([0.0, 0.25, 0.5, 0.75], 6)
 WIDE = 0.3
 
 
-class State(NamedTuple):
+class AlarmState(NamedTuple):
     """Sums kept between readings; arrays may have leading axes, of many beams at once.
 
     Attributes
@@ -75,7 +75,7 @@ def either(chosen: np.ndarray, new: np.ndarray, old: np.ndarray) -> np.ndarray:
 
 
 def with_reading(
-    state: State, before: np.ndarray, path: np.ndarray, weight: np.ndarray, step: np.ndarray
+    state: AlarmState, before: np.ndarray, path: np.ndarray, weight: np.ndarray, step: np.ndarray
 ) -> dict[str, np.ndarray]:
     """Weighted means and central products with one reading more (Welford); those due, anew.
 
@@ -99,7 +99,7 @@ def with_reading(
     return {"age": age, "weight": total, "mean": mean, "product": product}
 
 
-def falls_of(state: State) -> tuple[np.ndarray, ...]:
+def falls_of(state: AlarmState) -> tuple[np.ndarray, ...]:
     """Fall of chi² if a, if b, if both moved, in each window."""
     uu, uv, vv, uy, vy = np.moveaxis(state.product, -1, 0)
     covariance = state.covariance[..., None, :, :]
@@ -119,7 +119,7 @@ def falls_of(state: State) -> tuple[np.ndarray, ...]:
     return by_a, by_b, np.maximum(both, np.maximum(by_a, by_b))
 
 
-def change_since(state: State, moved: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def change_since(state: AlarmState, moved: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Relative changes since the alarm, of what moved alone, their errors, and the covariance.
 
     Errors contain those of the reference.
@@ -145,7 +145,7 @@ def change_since(state: State, moved: np.ndarray) -> tuple[np.ndarray, np.ndarra
     return change, np.sqrt(square), covariance
 
 
-def set_off(state: State, raised: np.ndarray, best: np.ndarray) -> State:
+def set_off(state: AlarmState, raised: np.ndarray, best: np.ndarray) -> AlarmState:
     """An alarm begins: what comes from now on tells what moved."""
     anew = raised[..., None] & (np.arange(LENGTHS.size + 1) == LENGTHS.size)
     level = np.take_along_axis(state.mean[..., 0], best[..., None], -1)[..., 0]
@@ -227,7 +227,7 @@ class Reading(NamedTuple):
     b_factor: float = 1.0
 
 
-class Told(NamedTuple):
+class AlarmStep(NamedTuple):
     """Finding of the alarm at one reading.
 
     Attributes
@@ -249,7 +249,7 @@ class Told(NamedTuple):
     since: np.ndarray
 
 
-def started(reference: Reference, shape: tuple[int, ...] = ()) -> State:
+def started(reference: Reference, shape: tuple[int, ...] = ()) -> AlarmState:
     """Begin to watch.
 
     Parameters
@@ -261,11 +261,11 @@ def started(reference: Reference, shape: tuple[int, ...] = ()) -> State:
 
     Returns
     -------
-    State
+    AlarmState
     """
     windows = (*shape, LENGTHS.size + 1)
     none, zero = np.full(shape, np.nan), np.zeros(shape)
-    return State(
+    return AlarmState(
         time=none, current=none, step=zero, pace=zero, expected=np.ones((*shape, 2)), clock=zero,
         hold=zero, path=np.zeros((*shape, 3)), noise=np.ones(shape), factor=np.ones((*shape, 2)),
         covariance=np.broadcast_to(np.asarray(reference.covariance, float), (*shape, 2, 2)),
@@ -274,23 +274,25 @@ def started(reference: Reference, shape: tuple[int, ...] = ()) -> State:
     )  # fmt: skip
 
 
-def watched(reference: Reference, state: State, reading: Reading) -> tuple[State, Told]:
+def watched(
+    reference: Reference, state: AlarmState, reading: Reading
+) -> tuple[AlarmState, AlarmStep]:
     """Take a reading.
 
     Parameters
     ----------
     reference : Reference
         The usual loss.
-    state : State
+    state : AlarmState
         Of `started`, or of the reading before.
     reading : Reading
         The reading; of many beams, arrays.
 
     Returns
     -------
-    State
+    AlarmState
         To be given with the next reading.
-    Told
+    AlarmStep
         Whether an alarm is raised, and what moved once that is told; after that the loss found is
         the usual one.
 
@@ -319,11 +321,11 @@ def watched(reference: Reference, state: State, reading: Reading) -> tuple[State
     usable = np.isfinite(reading.current) & (np.nan_to_num(reading.current) > 0)
     reading = reading._replace(current=np.where(usable, reading.current, 1.0))
     after = _moved_on(reference, state, reading)
-    after = State(*(either(usable, new, old) for new, old in zip(after, state, strict=True)))
+    after = AlarmState(*(either(usable, new, old) for new, old in zip(after, state, strict=True)))
     return _judged(reference, after, usable)
 
 
-def _step(usual: Reference, state: State, reading: Reading) -> tuple[np.ndarray, ...]:
+def _step(usual: Reference, state: AlarmState, reading: Reading) -> tuple[np.ndarray, ...]:
     """From one reading to the next: seconds, whether the path goes on, and whether it was cut by
     a step; how far ln I moved against the expected, with derivatives; what is expected of a and b;
     noise and its memory.
@@ -352,7 +354,7 @@ def _step(usual: Reference, state: State, reading: Reading) -> tuple[np.ndarray,
     return seconds, going & level, going & ~level, moved, expected, noise, memory
 
 
-def _moved_on(usual: Reference, state: State, reading: Reading) -> State:
+def _moved_on(usual: Reference, state: AlarmState, reading: Reading) -> AlarmState:
     """The path from the last reading to this one, and every window with it."""
     seconds, going, cut, moved, expected, noise, memory = _step(usual, state, reading)
     between = np.where(going, seconds, 0.0)
@@ -384,7 +386,9 @@ def _moved_on(usual: Reference, state: State, reading: Reading) -> State:
     )
 
 
-def _judged(usual: Reference, state: State, usable: np.ndarray) -> tuple[State, Told]:
+def _judged(
+    usual: Reference, state: AlarmState, usable: np.ndarray
+) -> tuple[AlarmState, AlarmStep]:
     by_a, by_b, both = falls_of(state)
     quiet = np.isnan(state.raised)
     old = state.age[..., :-1] >= MINUTE
@@ -402,13 +406,13 @@ def _judged(usual: Reference, state: State, usable: np.ndarray) -> tuple[State, 
     moved = np.where(settled, np.where(apart > 0, apart, late), 0)
     if not moved.any():
         nothing = np.zeros_like(state.factor)
-        return state, Told(raised, moved, nothing, nothing, state.time)
+        return state, AlarmStep(raised, moved, nothing, nothing, state.time)
     change, error, covariance = change_since(state, moved)
-    told = Told(raised, moved, change, error, _since(usual, state, change))
+    told = AlarmStep(raised, moved, change, error, _since(usual, state, change))
     return _adopted(state, moved > 0, change, covariance), told
 
 
-def _since(usual: Reference, state: State, change: np.ndarray) -> np.ndarray:
+def _since(usual: Reference, state: AlarmState, change: np.ndarray) -> np.ndarray:
     """When the loss found later had made the excess that raised the alarm, within its window."""
     rates = np.stack([usual.a * state.current, np.full_like(state.current, usual.b)], axis=-1)
     pace = -np.sum(rates * state.factor * change, axis=-1)
@@ -417,7 +421,9 @@ def _since(usual: Reference, state: State, change: np.ndarray) -> np.ndarray:
     return state.time - state.raised - made
 
 
-def _adopted(state: State, done: np.ndarray, change: np.ndarray, covariance: np.ndarray) -> State:
+def _adopted(
+    state: AlarmState, done: np.ndarray, change: np.ndarray, covariance: np.ndarray
+) -> AlarmState:
     """After a named alarm, take the loss that was found as the usual one."""
     new = {name: np.zeros_like(getattr(state, name)) for name in ("age", "weight", "product")}
     new["factor"], new["covariance"] = state.factor * (1 + change), state.covariance + covariance
@@ -493,11 +499,11 @@ def alarms_of(
     if raised is not None:
         change, error, _ = change_since(state, np.int64(4))
         since = _since(reference, state, change)
-        alarms.append(alarm_of(raised, Told(True, 4, change, error, since), None))
+        alarms.append(alarm_of(raised, AlarmStep(True, 4, change, error, since), None))
     return tuple(alarms)
 
 
-def alarm_of(raised: float, told: Told, at: float | None) -> Alarm:
+def alarm_of(raised: float, told: AlarmStep, at: float | None) -> Alarm:
     """Make the alarm of a finding, with its time."""
     moved = NAMES[int(told.moved)]
     a, b = (

@@ -29,7 +29,7 @@ BEST_MONITOR = 1e-7
 MOST = 50_000
 
 
-class Point(NamedTuple):
+class CoursePoint(NamedTuple):
     """One decay.
 
     Attributes
@@ -72,7 +72,7 @@ class Trend:
         limits, `unidentified` if there are too few lifetimes to say what is usual.
     message : str
         The verdict in a sentence.
-    points : tuple of Point
+    points : tuple of CoursePoint
         The decays whose lifetime is determined.
     current : float
         Reference current, mA.
@@ -92,7 +92,7 @@ class Trend:
 
     status: Status
     message: str
-    points: tuple[Point, ...]
+    points: tuple[CoursePoint, ...]
     current: float
     scaled: bool
     centre: float
@@ -247,7 +247,7 @@ def _normalised(
 
 def _point(
     decay: Decay, time: float, a: float, b: float, value: Quantity, usual: Reference | None, limits
-) -> Point:
+) -> CoursePoint:
     centre, limit = limits
     off = value.value - centre
     beyond = int(np.sign(off)) if abs(off) > max(limit, 3 * value.error) else 0
@@ -258,7 +258,9 @@ def _point(
             None if q.error is None else Quantity(q.value / by, q.error / by, "1")
             for q, by in ((fit.if_constant("a"), usual.a * a), (fit.if_constant("b"), usual.b * b))
         ]
-    return Point(fit.record, time, fit.mean_current, fit.lifetime_mean, value, *relative, beyond)
+    return CoursePoint(
+        fit.record, time, fit.mean_current, fit.lifetime_mean, value, *relative, beyond
+    )
 
 
 def _drift(time: np.ndarray, values: Sequence[Quantity], centre: float) -> Quantity:

@@ -124,7 +124,7 @@ def log_prior(power: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 @dataclass(frozen=True)
-class Seen:
+class SeenDecay:
     """A record as products of the columns that its readings see the nodes through.
 
     Parameters
@@ -154,7 +154,7 @@ class Seen:
     share: tuple[float, float] = (0.0, 1.0)
 
     @classmethod
-    def of(cls, record: DecayRecord, values: Physical) -> Seen:
+    def of(cls, record: DecayRecord, values: Physical) -> SeenDecay:
         """Whiten the readings of a record about the law with constant a and b."""
         span, mean = record.span, float(record.current.mean())
         rate = max(float(values.rate_mean) * span, 1e-9)
@@ -179,7 +179,7 @@ class Seen:
         products = Products.of(rows, time, error is not None)
         return cls(products, start, origin, gas, ends, record.gauge is None)
 
-    def of_noises(self, kept: np.ndarray) -> Seen:
+    def of_noises(self, kept: np.ndarray) -> SeenDecay:
         """The same with some of the noises."""
         return replace(self, products=self.products.some(kept))
 
@@ -204,7 +204,7 @@ class Peaks(NamedTuple):
     numbers: np.ndarray
 
 
-def _slopes(seen: Seen, numbers: np.ndarray, free: list[int]) -> tuple[np.ndarray, np.ndarray]:
+def _slopes(seen: SeenDecay, numbers: np.ndarray, free: list[int]) -> tuple[np.ndarray, np.ndarray]:
     """Slopes of the currents at the nodes, (14, m, p), and of the share, (m, p)."""
     currents, share = [], []
     for move in STEP * np.eye(5)[free]:
@@ -223,7 +223,7 @@ def _log_within(bounds: tuple[float, float], middle: np.ndarray, sd: np.ndarray)
     return upper + np.log1p(-np.exp(np.minimum(lower - upper, -1e-12)))
 
 
-def _expanded(seen: Seen, numbers: np.ndarray, free: list[int]) -> Peaks:
+def _expanded(seen: SeenDecay, numbers: np.ndarray, free: list[int]) -> Peaks:
     """Expand the posterior about numbers (5, m) for every noise."""
     slopes, of_share = _slopes(seen, numbers, free)
     squares, pulled = seen.left(numbers)
@@ -252,7 +252,7 @@ def _expanded(seen: Seen, numbers: np.ndarray, free: list[int]) -> Peaks:
     return Peaks(centre, precision, log + log_prior(numbers[3])[0], numbers)
 
 
-def _searched(seen: Seen, numbers: np.ndarray, free: list[int]) -> Peaks:
+def _searched(seen: SeenDecay, numbers: np.ndarray, free: list[int]) -> Peaks:
     """The most probable of the free numbers at each exponent, by Gauss and Newton."""
     for _ in range(STEPS):
         found = _expanded(seen, numbers, free)
@@ -269,7 +269,7 @@ def _searched(seen: Seen, numbers: np.ndarray, free: list[int]) -> Peaks:
     return _expanded(seen, numbers, free)
 
 
-def _by_exponent(seen: Seen, free: list[int]) -> tuple[Seen, Peaks]:
+def _by_exponent(seen: SeenDecay, free: list[int]) -> tuple[SeenDecay, Peaks]:
     """Expansions at exponents and by noises that hold the posterior, in ever narrower ranges."""
     low, high, numbers = LEAST, MOST, np.tile(seen.start, (1, EXPONENTS))
     for _ in range(RANGES):
@@ -297,7 +297,7 @@ class Draws(NamedTuple):
     worth: float
 
 
-def drawn(seen: Seen, free: list[int]) -> Draws:
+def drawn(seen: SeenDecay, free: list[int]) -> Draws:
     """Draw the free numbers from their posterior; more of them where they are worth too few."""
     if 3 in free:
         seen, peaks = _by_exponent(seen, free[:3] + free[4:])
@@ -307,7 +307,7 @@ def drawn(seen: Seen, free: list[int]) -> Draws:
     return found if found.worth >= WORTH else _drawn(seen, peaks, DRAWS[1])
 
 
-def _drawn(seen: Seen, peaks: Peaks, draws: int) -> Draws:
+def _drawn(seen: SeenDecay, peaks: Peaks, draws: int) -> Draws:
     """Draw from normal approximations, Student's tails, each draw weighed by the posterior."""
     rng, free = np.random.default_rng(0), [0, 1, 2, 4][: peaks.centre.shape[2]]
     odds = np.exp(peaks.log - peaks.log.max()).ravel()
@@ -455,7 +455,7 @@ def free_law(record: DecayRecord, values: Physical) -> FreeLaw | None:
     >>> found.spans["a"].interval[0] < 1e-7 <= found.spans["a"].interval[1]
     True
     """
-    seen = Seen.of(record, values)
+    seen = SeenDecay.of(record, values)
     draws = drawn(seen, [0, 1, 2, 3, 4] if seen.drifts else [0, 1, 2, 3])
     if draws.worth < WORTH / 4:
         return None
@@ -479,7 +479,7 @@ def free_law(record: DecayRecord, values: Physical) -> FreeLaw | None:
     )  # fmt: skip
 
 
-def _quoted(record: DecayRecord, seen: Seen, found: Numbers) -> dict[str, np.ndarray]:
+def _quoted(record: DecayRecord, seen: SeenDecay, found: Numbers) -> dict[str, np.ndarray]:
     """Quoted quantities, by draw."""
     span, mean = record.span, float(record.current.mean())
     x = found.currents(seen.gas)

@@ -16,7 +16,7 @@ from scipy.special import chdtrc
 from beamfit.errors import InputError
 from beamfit.lifetime.advice import (
     BestPoint,
-    Candidate,
+    DecayCandidate,
     Limits,
     Proposal,
     best_operating_point,
@@ -347,14 +347,14 @@ def study_shift(
 
 def _candidates(
     decays: Sequence[Decay], machine: Machine, limits: Limits, current: float
-) -> list[Candidate]:
+) -> list[DecayCandidate]:
     """The corners of what was seen, as long and as noisy as the decays were."""
     duration = float(np.median([d.segment.span for d in decays]))
     noise = float(np.median([d.fit.rms_residual / np.sqrt(len(d.segment) / 64) for d in decays]))
     lowest = min(decay.fit.mean_current for decay in decays)
     corners = itertools.product(*(sorted(set(pair)) for pair in (*limits, (lowest, current))))
     return [
-        Candidate(
+        DecayCandidate(
             machine.operation._replace(rf_voltage=voltage, scraper_y=scraper, bunches=bunches),
             at,
             duration,

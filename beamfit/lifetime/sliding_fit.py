@@ -30,7 +30,7 @@ from beamfit.quantity import HOUR, Quantity, Status
 from beamfit.table import json_of
 
 
-class Row(NamedTuple):
+class WindowRow(NamedTuple):
     """The mean of some neighbouring readings.
 
     Attributes
@@ -110,12 +110,12 @@ class Answer(NamedTuple):
         return fit | json_of(named | more)
 
 
-def fit_window(rows: Sequence[Row], name: str) -> Window:
+def fit_window(rows: Sequence[WindowRow], name: str) -> Window:
     """Cut a window at refills and changes of setting, and fit what is as it is now.
 
     Parameters
     ----------
-    rows : sequence of Row
+    rows : sequence of WindowRow
         In order of time.
     name : str
         What to call the result.
@@ -129,7 +129,8 @@ def fit_window(rows: Sequence[Row], name: str) -> Window:
     Examples
     --------
     >>> settings = Conditions(*[np.nan] * 5)
-    >>> rows = [Row(0, t, 500 * np.exp(-t / 36000), settings) for t in np.arange(0.0, 3600.0, 10.0)]
+    >>> times = np.arange(0.0, 3600.0, 10.0)
+    >>> rows = [WindowRow(0, t, 500 * np.exp(-t / 36000), settings) for t in times]
     >>> found = fit_window(rows, "ring")
     >>> found.pieces, f"{found.fit.lifetime_mean.value:.3f} h"
     (1, '10.000 h')
@@ -181,7 +182,7 @@ def _fitted(group: list[DecayRecord], name: str) -> DecayFit:
     return seen_through(fit, *usual_cycle(group)) if len(group) > 2 else fit
 
 
-def _pieces(rows: Sequence[Row], name: str) -> list[DecayRecord]:
+def _pieces(rows: Sequence[WindowRow], name: str) -> list[DecayRecord]:
     """Records without gaps; before it was first read a setting is taken as it was then."""
     if not rows:
         return []
@@ -237,7 +238,7 @@ class Alarmed(NamedTuple):
     """
 
     usual: alarm.Reference
-    state: alarm.State
+    state: alarm.AlarmState
     ring: Terms | None = None
     losses: np.ndarray | None = None
     expected: tuple[float, float] = (1.0, 1.0)
@@ -245,7 +246,7 @@ class Alarmed(NamedTuple):
 
 
 def learnt(
-    before: Alarmed | None, window: Window, rows: Sequence[Row], machine: Machine | None
+    before: Alarmed | None, window: Window, rows: Sequence[WindowRow], machine: Machine | None
 ) -> Alarmed | None:
     """The usual loss, where a fit is the first to tell it, or tells it twice as well.
 
@@ -255,7 +256,7 @@ def learnt(
         What is known; an alarm that is raised keeps it.
     window : Window
         The fit, of these rows.
-    rows : sequence of Row
+    rows : sequence of WindowRow
     machine : Machine or None
         The ring: where the fit does not tell a from b, they have its shares.
 
@@ -316,7 +317,7 @@ def _shared(window: Window, machine: Machine) -> tuple[float, float, np.ndarray]
     return a, b, np.outer(apart, apart) + lifetime.relative**2 * np.eye(2)
 
 
-def _terms(machine: Machine, before: Terms | None, row: Row) -> Terms:
+def _terms(machine: Machine, before: Terms | None, row: WindowRow) -> Terms:
     """Losses of the ring at the settings of a row; anew but for the pressure if they moved."""
     at = Conditions(*(None if math.isnan(value) else [value, value] for value in row.settings))
     moment = DecayRecord([0.0, 1.0], row.current * np.array([1.0, 1 - 1e-6]), conditions=at)
@@ -330,14 +331,14 @@ def _terms(machine: Machine, before: Terms | None, row: Row) -> Terms:
     return Terms(place, parts, np.array([losses.a, losses.b], float))
 
 
-def followed(known: Alarmed, row: Row, apart: float, machine: Machine | None) -> Alarmed:
+def followed(known: Alarmed, row: WindowRow, apart: float, machine: Machine | None) -> Alarmed:
     """Follow the expected loss at the settings of a row, smoothed: noise of a gauge would bend it.
 
     Parameters
     ----------
     known : Alarmed
         As it was at the row before.
-    row : Row
+    row : WindowRow
     apart : float
         Time between the two, s.
     machine : Machine or None

@@ -16,8 +16,8 @@ from beamfit.lifetime.record import PLAUSIBLE, Conditions
 from beamfit.lifetime.sliding_fit import (
     Alarmed,
     Answer,
-    Row,
     Window,
+    WindowRow,
     fit_window,
     followed,
     learnt,
@@ -91,7 +91,7 @@ class State(NamedTuple):
 
     Attributes
     ----------
-    rows : tuple of Row
+    rows : tuple of WindowRow
         The window.
     sums : tuple
         Of the row that grows: readings, where it begins, sums of time since then and of current.
@@ -99,7 +99,8 @@ class State(NamedTuple):
         Time of the last reading, what is added to times since the clock was set back, and the
         usual interval, s.
     piece, dead, spikes, late : int, int, int, tuple
-        As of `Row`; readings in a row without beam or far too high, or late, and the last late one.
+        As of `WindowRow`; readings in a row without beam or far too high, or late, and the last
+        late one.
     settings : Conditions
         Last ones read, in SI.
     highest, noise, due : float
@@ -110,7 +111,7 @@ class State(NamedTuple):
         None until the usual loss is known; those within the window.
     """
 
-    rows: tuple[Row, ...] = ()
+    rows: tuple[WindowRow, ...] = ()
     sums: tuple[int, float, float, float] = (0, 0.0, 0.0, 0.0)
     last: float | None = None
     shift: float = 0.0
@@ -264,7 +265,7 @@ def _closed(plan: Plan, state: State) -> State:
     count, begin, times, currents = state.sums
     if not count:
         return state
-    row = Row(state.piece, begin + times / count, currents / count, state.settings)
+    row = WindowRow(state.piece, begin + times / count, currents / count, state.settings)
     state = state._replace(rows=(*state.rows[1 - 2 * ROWS :], row), sums=(0, 0.0, 0.0, 0.0))
     return state if state.alarm is None else _watched(plan, state, state.alarm, row)
 
@@ -327,7 +328,7 @@ def nothing_yet(state: State) -> Answer:
     return Answer(time, math.nan, Window(None, None, 0), Status.unidentified, why)
 
 
-def _watched(plan: Plan, state: State, known: Alarmed, row: Row) -> State:
+def _watched(plan: Plan, state: State, known: Alarmed, row: WindowRow) -> State:
     """A row seen by the alarm."""
     apart = row.time - state.rows[-2].time if len(state.rows) > 1 else 0.0
     known = followed(known, row, apart, plan.machine)

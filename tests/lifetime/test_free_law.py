@@ -12,7 +12,7 @@ from beamfit.lifetime.cycles import find_cycles
 from beamfit.lifetime.expansion import Pieces, solved
 from beamfit.lifetime.fit import fit_cycles, fit_decay, fit_decays
 from beamfit.lifetime.lifetime_table import fit_lifetimes
-from beamfit.lifetime.marginal import NODE, Numbers, Seen, drawn, quantiles
+from beamfit.lifetime.marginal import NODE, Numbers, SeenDecay, drawn, quantiles
 from beamfit.lifetime.record import Conditions, DecayRecord, LifetimeTable
 from beamfit.lifetime.study import study_record
 
@@ -71,7 +71,7 @@ def test_the_draws_are_those_of_the_posterior():
     """With constant a and b against a grid of the exact law in white noise."""
     one = record(3, noise=3.0)
     values = solved(Pieces.of(one)).values
-    draws = drawn(Seen.of(one, values), [0, 1, 2])
+    draws = drawn(SeenDecay.of(one, values), [0, 1, 2])
     time, rates, shares = one.time, np.linspace(0.97, 1.03, 61), np.linspace(0.0, 1.0, 81)
     unit, mean, log = float(values.rate_mean), float(one.current.mean()), np.zeros((61, 81))
     for j, rate in enumerate(rates * unit):

@@ -9,7 +9,7 @@ from scipy.optimize import brentq
 
 import beamfit
 from beamfit.errors import InputError
-from beamfit.lifetime.advice import Candidate, Limits, best_operating_point, next_decays
+from beamfit.lifetime.advice import DecayCandidate, Limits, best_operating_point, next_decays
 from beamfit.lifetime.bunch import rf_acceptance
 from beamfit.lifetime.decay_law import current
 from beamfit.lifetime.mechanisms import SCALES, loss_coefficients, loss_terms, scaled_losses
@@ -180,7 +180,7 @@ def test_the_next_decay_closes_the_gap(machine, decays):
     still = [d for d in decays[:15] if d.segment.conditions.scraper_y[0] > 5.9e-3]
     fit = fit_scales(still, machine, priors={"elastic": (1.0, 0.3)})
     candidates = [
-        Candidate(machine.operation._replace(scraper_y=y, rf_voltage=v), 500.0, 5760.0, 2e-3)
+        DecayCandidate(machine.operation._replace(scraper_y=y, rf_voltage=v), 500.0, 5760.0, 2e-3)
         for y in (6e-3, 2e-3)
         for v in (3.2e6, 2.4e6)
     ]

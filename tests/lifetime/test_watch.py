@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from beamfit.lifetime.mechanisms import loss_coefficients
-from beamfit.lifetime.sliding_fit import Row, fit_window, learnt
+from beamfit.lifetime.sliding_fit import WindowRow, fit_window, learnt
 from beamfit.lifetime.watch import CURRENT, Plan, State, stepped
 from tests.lifetime.test_alarm import beam_after
 
@@ -149,7 +149,7 @@ def test_under_top_up_the_ring_shares_the_loss_and_without_it_nothing_is_usual(m
     time, beam, random, rows = np.arange(0.0, 3600.0, 4.0), 500.0, np.random.default_rng(6), []
     for now in time:
         beam = 500.0 if now % 120 == 0 else float(beam_after(beam, 4.0, a, b))
-        rows.append(Row(0, START + now, beam + NOISE * random.normal(), UNREAD))
+        rows.append(WindowRow(0, START + now, beam + NOISE * random.normal(), UNREAD))
     window = fit_window(rows, "ring")
     assert window.fit.status == "unidentified"
     assert learnt(None, window, rows, None) is None
