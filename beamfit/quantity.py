@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from beamfit.errors import InputError
 from beamfit.status import Status
 
-__all__ = ["Quantity", "Status", "display_unit", "percent"]
+__all__ = ["Quantity", "Status", "display_unit", "percent", "relative_change"]
 
 # Half-width of the central 95 % of a normal distribution, in standard deviations.
 NORMAL_REACH = 1.96
@@ -222,6 +222,17 @@ def percent(share: float, digits: int = 2, sign: str = "") -> str:
         return "0 %" if value == 0 else "-"
     places = max(digits - 1 - math.floor(math.log10(abs(value))), 0)
     return f"{value:{sign}.{places}f} %"
+
+
+def relative_change(share: Quantity) -> str:
+    """Write a relative change with its error, in per cent.
+
+    Examples
+    --------
+    >>> relative_change(Quantity(0.2, 0.0057, "1"))
+    '+20 ± 0.6 %'
+    """
+    return f"{percent(share.value, sign='+').removesuffix(' %')} ± {percent(share.error, 1)}"
 
 
 def display_unit(size: float, unit: str) -> tuple[float, str]:

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from beamfit.quantity import Quantity, percent
+from beamfit.quantity import Quantity, relative_change
 
 MINUTE = 60.0
 # Windows, s: four begin in turn in each length, so that one of nearly any age is at hand.
@@ -458,7 +458,7 @@ class Alarm(NamedTuple):
     def said(self, dated: bool) -> str:
         """In words, with the date where times are Unix times."""
         changes = [
-            f"{name} moved by {percent(found.value, sign='+')} ± {percent(found.error, 1)}"
+            f"{name} moved by {relative_change(found)}"
             for name, found in (("a", self.a), ("b", self.b))
             if found is not None and self.moved != "a or b"
         ]

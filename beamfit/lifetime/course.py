@@ -16,7 +16,7 @@ from beamfit.lifetime.fit import DecayFit, bare
 from beamfit.lifetime.mechanisms import loss_coefficients
 from beamfit.lifetime.scales import by_losses, summarise
 from beamfit.lifetime.study import Decay, Machine, RecordStudy
-from beamfit.quantity import HOUR, Quantity, Status, percent
+from beamfit.quantity import HOUR, Quantity, Status, percent, relative_change
 from beamfit.statistics import FEWEST, baseline, control_limits
 from beamfit.table import Table, cell, json_of
 
@@ -341,9 +341,7 @@ def _verdict(trend: Trend) -> tuple[Status, str]:
     said = f"{usual} ± {percent(trend.limit / centre)}, {beyond} beyond that."
     drift = trend.drift
     if drift.error is not None and abs(drift.value) > 3 * drift.error:
-        said += (
-            f" It changes by {percent(drift.value, sign='+')} ± {percent(drift.error, 1)} a week."
-        )
+        said += f" It changes by {relative_change(drift)} a week."
     if trend.reference is None:
         said += " Readings are not watched: the first decays give no a and b above zero."
     if trend.alarms:

@@ -46,7 +46,7 @@ def test_a_change_is_found_dated_and_named(leaking):
     assert [point.beyond for point in leaking.points] == [0, 0, 0, 0, 0, -1, -1, -1]
     assert leaking.points[-1].b.value == pytest.approx(1.1, abs=4 * leaking.points[-1].b.error)
     assert leaking.points[5].b is None  # that decay refutes one a and b
-    assert "Alarm: b moved by +10 ± " in leaking.message
+    assert "Alarm: b moved by +10.0 ± " in leaking.message
     assert "2023-11-16 18:" in leaking.message
     assert json.loads(json.dumps(leaking.to_json()))["alarms"][0]["a"] is None
 
