@@ -5,21 +5,20 @@ A figure belongs to no window: save it by ``figure.savefig``, or show it in a no
 >>> import beamfit, beamfit.figures
 >>> record = beamfit.read_decay_record("measurements/aps_1999_decay.csv")
 >>> figure = beamfit.figures.decay(beamfit.fit_decay(record))
->>> type(figure).__name__, len(figure.axes)
-('Figure', 2)
+>>> len(figure.axes)
+2
 """
 
 from __future__ import annotations
 
-import io
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
-
-import matplotlib.figure
 
 from beamfit.errors import InputError
 
 if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
     from beamfit.emittance.fit import EmittanceFit
     from beamfit.lifetime.course import Trend
     from beamfit.lifetime.fit import DecayFit
@@ -39,18 +38,6 @@ __all__ = [
     "scan",
     "trend",
 ]
-
-# Dots an inch of the picture in a notebook.
-SHARP = 110
-
-
-class Figure(matplotlib.figure.Figure):
-    """A matplotlib Figure that a notebook shows, also where nobody has imported pyplot."""
-
-    def _repr_png_(self) -> bytes:
-        buffer = io.BytesIO()
-        self.savefig(buffer, format="png", dpi=SHARP)
-        return buffer.getvalue()
 
 
 def picture(result: Any, **options: Any) -> Figure:
@@ -254,9 +241,7 @@ def _drawn(picture: Picture) -> Figure:
     """Draw a picture of the report, in its style."""
     from matplotlib import rc_context
 
-    from beamfit.report.document import STYLE
+    from beamfit.report.document import STYLE, figure_of
 
     with rc_context(STYLE):
-        figure = Figure(figsize=(picture.width, picture.height), layout="constrained")
-        picture.on(figure)
-    return figure
+        return figure_of(picture)

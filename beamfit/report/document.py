@@ -39,6 +39,8 @@ STYLE = {
 BLUE, RED = "#1f5fa8", "#b5421f"
 # Points above which a curve is drawn as an image, to keep the page small.
 MANY = 500
+# Dots an inch of a picture in a notebook.
+SHARP = 110
 # Most curves, bars or profiles in a picture; the tables have all.
 MOST_DRAWN = 12
 
@@ -247,9 +249,18 @@ def html_of(page: ReportPage) -> bytes:
     return plain(environment.get_template("page.html.j2").render(**content)).encode()
 
 
+class ShownFigure(Figure):
+    """A matplotlib Figure that a notebook shows, also where nobody has imported pyplot."""
+
+    def _repr_png_(self) -> bytes:
+        buffer = io.BytesIO()
+        self.savefig(buffer, format="png", dpi=SHARP)
+        return buffer.getvalue()
+
+
 def figure_of(picture: Picture) -> Figure:
     """Draw a picture by itself."""
-    figure = Figure(figsize=(picture.width, picture.height), layout="constrained")
+    figure = ShownFigure(figsize=(picture.width, picture.height), layout="constrained")
     picture.on(figure)
     return figure
 

@@ -17,3 +17,8 @@ def machine(root):
 def decays(root):
     record = beamfit.read_decay_record(root / "measurements/spear3_shift_simulated.csv")
     return study_record(record).decays
+
+
+def values_of(rows):
+    """Values of rows of a table by their labels."""
+    return {row.label: row.values for row in rows}

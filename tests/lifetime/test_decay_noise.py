@@ -23,6 +23,7 @@ from beamfit.lifetime.posterior import (
 from beamfit.lifetime.record import DecayRecord
 from beamfit.lifetime.study import study_record
 from beamfit.lifetime.tables import separability_rows
+from tests.lifetime.conftest import values_of
 
 constant_fit = partial(fit_decay, law="constant")
 constant_fits = partial(fit_decays, law="constant")
@@ -117,7 +118,7 @@ def test_how_much_the_memory_enlarges_is_only_said_of_what_is_determined():
     assert fit.identifiability.error_inflation is None
     assert "times those of independent" not in fit.message
     assert "which the errors contain." in fit.message
-    rows = dict(separability_rows(study_record(flat).decays))
+    rows = values_of(separability_rows(study_record(flat).decays))
     assert rows["errors enlarged for that"] == ["-"]
     # What a study weighs the record by: a mean of such readings is twice as uncertain.
     assert fit.inflation == pytest.approx(np.sqrt(1.6 / 0.4), rel=0.15)

@@ -185,7 +185,7 @@ def _truth(machine, operation, beam):
 def test_the_design_questions_of_the_docs_are_answered_and_true(root, machine, monkeypatch):
     """docs/lifetime_study.md: its code gives its numbers, and the truth is where they say."""
     page = (root / "docs/lifetime_study.md").read_text()
-    part = page.partition("### Two design questions")[2].partition("A worked study")[0]
+    part = page.partition("## Two design questions")[2].partition("A worked study")[0]
     blocks = re.findall(r"(?:^    .*\n|^\n(?=    ))+", part, flags=re.MULTILINE)
     shown, names = io.StringIO(), {}
     monkeypatch.chdir(root)

@@ -14,6 +14,7 @@ from beamfit.lifetime.scales import fit_scales
 from beamfit.lifetime.study import operation_during, study_record
 from beamfit.lifetime.tables import budget_rows, shift_rows
 from beamfit.quantity import HOUR, Status
+from tests.lifetime.conftest import values_of
 from tests.lifetime.test_lifetime_study import simulated
 
 
@@ -32,7 +33,7 @@ def test_what_only_the_limits_of_the_scales_decide_is_not_determined(machine):
     said = json.loads(json.dumps(shift.to_json()))
     assert [row["median"] for row in said["budget"] if row["name"] in "ab"] == [None, None]
     assert "a, b at 499.3 mA" in said["not_determined"]
-    assert "not determined" in dict(shift_rows(shift))["b at 499.3 mA"][0]
+    assert "not determined" in values_of(shift_rows(shift))["b at 499.3 mA"][0]
     truth = 1 / float(losses.a * 500 + losses.b) / HOUR
     assert found["lifetime"].separable
     assert found["lifetime"].lower < truth < found["lifetime"].upper
@@ -122,7 +123,7 @@ def test_a_gauge_that_contradicts_the_ring_file_is_used_and_said(machine):
     for factor in (1.05, 5.0):
         read = Conditions(pressure=np.full(40, factor * filed))
         [decay] = study_record(DecayRecord(time, beam, conditions=read), machine).decays
-        rows = dict(budget_rows([decay]))
+        rows = values_of(budget_rows([decay]))
         found[factor] = decay.budget, rows["pressure at the mean current"][0]
     (close, plain), (far, named) = found.values()
     assert close.filed_pressure is None
