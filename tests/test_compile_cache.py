@@ -52,9 +52,9 @@ def test_the_second_script_compiles_nothing(tmp_path):
 def test_damaged_code_is_compiled_anew_with_a_warning(tmp_path):
     misses = run(XDG_CACHE_HOME=str(tmp_path))[2]
     for path in (tmp_path / "beamfit" / "jax").iterdir():
-        content = bytearray(path.read_bytes())
-        content[len(content) // 2] ^= 4
-        path.write_bytes(content)
+        content = path.read_bytes()
+        # Half of a file: a single bit may stand where nothing is read, and the times in it vary.
+        path.write_bytes(content[: len(content) // 2])
     said = "Error reading persistent compilation cache entry"
     assert run(warned=said, XDG_CACHE_HOME=str(tmp_path))[1:3] == [0, misses]
 
