@@ -39,9 +39,9 @@ docs: .venv/test
 	$(BIN)/python docs/pictures.py
 	$(BIN)/python -m sphinx -W --keep-going -q -b html docs build/site
 
-# Simulation-based calibration of the posteriors: minutes, so not part of `make test`.
+# Simulation-based calibration of the posteriors, and what needs hundreds of records: minutes, so not part of `make test`.
 calibrate: .venv/test
-	$(BIN)/python -m pytest --quiet -m calibrate --numprocesses 2 -rP tests/sampling
+	$(BIN)/python -m pytest --quiet -m calibrate --numprocesses 2 -rP tests
 
 # Errors of every scenario held against 500 simulated scans each.
 coverage: .venv/test

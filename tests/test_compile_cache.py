@@ -24,7 +24,8 @@ counts = [count("cache_hits"), count("cache_misses")]
 least = jax.config.jax_persistent_cache_min_compile_time_secs
 print(json.dumps([jax.config.jax_compilation_cache_dir, *counts, str(value.dtype), least]))
 """
-CHOSEN = ("JAX_", "XLA_")
+# A command run in this process before has silenced warnings for those it starts.
+CHOSEN = ("JAX_", "XLA_", "PYTHONWARNINGS")
 
 
 def run(before="", warned="", **environment):

@@ -273,10 +273,11 @@ def test_the_moving_lifetime_follows_the_law():
         moving_lifetime(record, 20.0)
 
 
-def test_a_thousand_random_records_leave_no_failure():
+@pytest.mark.parametrize("count", [250, pytest.param(1000, marks=pytest.mark.calibrate)])
+def test_random_records_leave_no_failure(count):
     rng = np.random.default_rng(8)
     records = []
-    for k in range(1000):
+    for k in range(count):
         lifetime, share = 10 ** rng.uniform(0, 2.3) * HOUR, rng.uniform()
         i0, noise = 10 ** rng.uniform(0, 2.8), 10 ** rng.uniform(-4, -1)
         span = 60.0 if k % 4 == 0 else 10 ** rng.uniform(1.7, np.log10(2 * lifetime))
@@ -288,8 +289,8 @@ def test_a_thousand_random_records_leave_no_failure():
     statuses = Counter(fit.status for fit in fits)
     assert set(statuses) <= {"converged", "unidentified", "poor_fit"}
     # One in a thousand good fits has a chi² this improbable.
-    assert statuses["poor_fit"] <= 3
-    assert statuses["converged"] > 200
+    assert statuses["poor_fit"] <= max(1, 3 * count // 1000)
+    assert statuses["converged"] > 0.2 * count
     assert all(not fit.lifetime_mean.value <= 0 for fit in fits)
 
 
