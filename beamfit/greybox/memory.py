@@ -10,17 +10,26 @@ from collections.abc import Sequence
 from itertools import groupby
 from typing import NamedTuple
 
+import jax
 import numpy as np
 from scipy.special import stdtr, stdtrit
 
 from beamfit.greybox.covariance import CUT
-from beamfit.noise.correlated import CorrelatedNoise, Levels, log_volume, white_beside, whitened
+from beamfit.greybox.problem import padded_length
+from beamfit.noise.correlated import (
+    CorrelatedNoise,
+    Levels,
+    levelled,
+    log_volume,
+    white_beside,
+    whitened,
+)
 
 # Grid of correlation times: from this share of the median interval to this many records, and count.
-SHORTEST, LONGEST, TIMES = 0.3, 5.0, 40
+SHORTEST, LONGEST, TIMES = 0.3, 5.0, 20
 # Grid of the white noise's variance, in units of the variance that the correlated part gains from
-# one reading to the next; with it a smaller count of correlation times.
-WHITE, FEWER = (0.0, 1.0, 10.0, 100.0, 1000.0), 20
+# one reading to the next.
+WHITE = (0.0, 1.0, 10.0, 100.0, 1000.0)
 # Central 68 %, one standard deviation to either side of a normal distribution, and its upper end.
 CENTRAL, HALF = 0.682689492, 0.841344746
 
@@ -172,16 +181,18 @@ def whitened_by_each(
     grid: Sequence[CorrelatedNoise],
     runs: Sequence[tuple[np.ndarray, np.ndarray]],
     known: np.ndarray | None = None,
-    levels: Levels | None = None,
+    levels: Sequence[Levels] = (),
 ) -> Whitened:
     """Whiten runs, each of rows and times, by each noise; all of them have the same.
 
-    `known` are rows of priors, in units of the noise; `levels` are eliminated, of a single run.
+    `known` are rows of priors, in units of the noise; `levels`, of each run, are eliminated.
     """
-    parts = [_triangles(grid, rows, np.diff(time), levels) for rows, time in runs]
+    if levels:
+        parts = [_levelled(grid, *run, own) for run, own in zip(runs, levels, strict=True)]
+    else:
+        parts = [_triangles(grid, rows, np.diff(time)) for rows, time in runs]
     triangles, volume = [triangle for triangle, _ in parts], sum(volume for _, volume in parts)
-    count = sum(len(rows) for rows, _ in runs)
-    count -= 0 if levels is None else levels.first.size
+    count = sum(len(rows) for rows, _ in runs) - sum(own.first.size for own in levels)
     if known is not None:
         triangles, count = [*triangles, np.tile(known, (len(grid), 1, 1))], count + len(known)
     return Whitened(
@@ -190,7 +201,7 @@ def whitened_by_each(
 
 
 def _triangles(
-    grid: Sequence[CorrelatedNoise], rows: np.ndarray, interval: np.ndarray, levels: Levels | None
+    grid: Sequence[CorrelatedNoise], rows: np.ndarray, interval: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Triangular factors of one run's whitened rows, and log volumes, for each noise."""
     triangles, volumes = [], []
@@ -200,12 +211,24 @@ def _triangles(
         begun, volume = whitened(rows, apart, np), float(log_volume(apart, np))
         for noise in alike:
             row, beside = white_beside(begun, apart, noise.white) if noise.white else (begun, 0.0)
-            if levels is not None:
-                row, lost = levels.left(row, apart)
-                beside -= lost
             triangles.append(np.linalg.qr(row, mode="r"))
             volumes.append(volume + beside)
     return np.array(triangles), np.array(volumes)
+
+
+_levelled_by_each = jax.jit(jax.vmap(levelled, in_axes=(None, None, None, None, 0)))
+
+
+def _levelled(
+    grid: Sequence[CorrelatedNoise], rows: np.ndarray, time: np.ndarray, levels: Levels
+) -> tuple[np.ndarray, np.ndarray]:
+    """The same without levels, the rows padded to one of a few lengths."""
+    extra = (0, padded_length(max(time.size, 64)) - time.size)
+    begins = np.isin(np.arange(time.size + extra[1]), levels.first)
+    padded = np.pad(rows, (extra, (0, 0))), np.pad(time, extra, mode="edge"), begins
+    slope, each = np.pad(levels.slope, extra, mode="edge"), CorrelatedNoise(*np.array(grid).T)
+    found, volume = _levelled_by_each(*padded, slope, each)
+    return np.linalg.qr(np.asarray(found), mode="r"), -np.asarray(volume)
 
 
 def range_of(time: np.ndarray) -> tuple[float, float]:
@@ -232,25 +255,15 @@ def noises(
     ]
 
 
-def remembered(
-    slopes: np.ndarray,
-    residuals: np.ndarray,
-    time: np.ndarray,
-    levels: Levels | None = None,
-    known: float | None = None,
-) -> Whitened:
-    """Rows of one record whitened by what its noise may be, as of `memory_of`."""
-    looked_at = (FEWER, WHITE) if levels is None else (TIMES,)
-    usual = float(np.median(np.diff(time)))
-    grid = noises(range_of(time), usual, *looked_at) if known is None else [CorrelatedNoise(known)]
-    return whitened_by_each(grid, [(np.column_stack([slopes, residuals]), time)], levels=levels)
+def usual_noises(time: np.ndarray) -> list[CorrelatedNoise]:
+    """Noises that readings at these times may have, as of `memory_of`."""
+    return noises(range_of(time), float(np.median(np.diff(time))), TIMES, WHITE)
 
 
 def memory_of(
     slopes: np.ndarray,
     residuals: np.ndarray,
     time: np.ndarray,
-    levels: Levels | None = None,
     known: float | None = None,
 ) -> Memory:
     """Least squares with correlated errors, averaged over what the residuals leave open of them.
@@ -263,8 +276,6 @@ def memory_of(
         Model less reading, in the same units.
     time : array, shape (n,)
         When each was taken, increasing.
-    levels : Levels, optional
-        Further numbers, one a block, that are eliminated.
     known : float, optional
         The correlation time; 0 for independent errors. Otherwise it is averaged over.
 
@@ -294,4 +305,5 @@ def memory_of(
     >>> print(f"{found.mean_step[0]:.1f}, {np.exp(-1 / found.time[found.likely]):.1f}")
     4.9, 0.8
     """
-    return remembered(slopes, residuals, time, levels, known).memory()
+    grid = usual_noises(time) if known is None else [CorrelatedNoise(known)]
+    return whitened_by_each(grid, [(np.column_stack([slopes, residuals]), time)]).memory()

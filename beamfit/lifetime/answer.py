@@ -292,16 +292,17 @@ def _with_remarks(found: Finding, said: Iterable[str | None]) -> Finding:
     return Finding(found.status, ". ".join([found.cause.rstrip("."), *filter(None, said)]) + ".")
 
 
-def _parts_differ(e: Evidence) -> Finding | None:
-    chance, lifetimes = e.parts
-    if not e.changed or not lifetimes:
+def _course(e: Evidence) -> str | None:
+    """Sentence on a loss rate that is not the same in all cycles."""
+    if not e.course:
         return None
-    low, high = (pick(lifetimes, key=lambda q: q.value) for pick in (min, max))
-    return Finding(
-        Status.poor_fit,
-        f"The loss rate is not the same in all cycles (p = {max(chance, 1e-300):.2g}): between "
-        f"lifetimes of {low} and {high} at the mean current in parts of the record. Look for a "
-        "vacuum or a setting that changes, and cut the record there",
+    low, high = (pick(e.course, key=lambda part: part.lifetime.value) for pick in (min, max))
+    hours = [f"{part.start / HOUR:.3g} to {part.end / HOUR:.3g} h" for part in (low, high)]
+    return (
+        f"The loss rate is not the same in all cycles: of {len(e.course)} parts the lifetime at "
+        f"the mean current is shortest, {low.lifetime}, from {hours[0]}, and longest, "
+        f"{high.lifetime}, from {hours[1]}; the answer is their mean. Look for a vacuum or a "
+        "setting that changes"
     )
 
 
@@ -325,7 +326,7 @@ def _rises(e: Evidence) -> Finding | None:
     return Finding(Status.infeasible, cause)
 
 
-CYCLE_RULES = (_rises, *NEGATIVE, _within_noise, _parts_differ, _refuted)
+CYCLE_RULES = (_rises, *NEGATIVE, _within_noise, _refuted)
 CYCLE_RULES += (_one_current, _improbable, _bending, _determined)
 
 
@@ -335,7 +336,7 @@ def finding_of_cycles(
     """Status and sentences on many cycles fitted together; `left_out` is what was not fitted."""
     found, (low, high) = judge(evidence, CYCLE_RULES), evidence.currents
     first = f"One answer from {evidence.cycles} cycles between {low:.4g} and {high:.4g} mA"
-    remarks = [remark(evidence) for remark in (_noise_inferred, _correlated, _odd_clock)]
+    remarks = [remark(evidence) for remark in (_course, _noise_inferred, _correlated, _odd_clock)]
     remarks += [] if monitor is None else [_stated(monitor)]
     remarks += [text[0].upper() + text[1:] for text in left_out]
     return _with_remarks(found._replace(cause=f"{first}. {found.cause}"), remarks)

@@ -7,11 +7,12 @@ import math
 from collections.abc import Callable, Sequence
 
 import numpy as np
-from scipy.ndimage import maximum_filter1d
+from scipy.ndimage import maximum_filter1d, median_filter
 from scipy.special import ndtr
 
 from beamfit.lifetime.expansion import LOSS, Expansion, Pieces, solved
 from beamfit.lifetime.pieces import Event, Split, beam_readings, event_of, split_record
+from beamfit.lifetime.rate_course import with_course
 from beamfit.lifetime.record import Conditions, DecayRecord
 
 # Standard deviations by which two levels must differ to be two: a false step costs no more than an
@@ -383,6 +384,8 @@ OUTLIER, SHARE = 7.0, 0.2
 # Errors of the mean by which readings at the edges of cycles lie off the law where they are of an
 # injection: what stays below moves the lifetime by no more than its error.
 EDGE, WITHIN = 2.5, "they lie within injections"
+# Cycles whose median tells what a loss rate in their middle should be.
+NEIGHBOURS = 9
 # Readings from the edge inwards that tell whether the edge lies off.
 NEXT = 9
 
@@ -408,19 +411,21 @@ def averaged(cycles: Sequence[DecayRecord]) -> Pieces:
     )  # fmt: skip
 
 
-def _per_cycle(about: Expansion) -> tuple[np.ndarray, np.ndarray]:
-    """Departure of the loss of each cycle, and its error for noise of size 1."""
-    first, slope, residual = about.pieces.first, about.left[:, LOSS], about.left[:, -1]
-    squares = np.add.reduceat(slope**2, first)
-    return -np.add.reduceat(slope * residual, first) / squares, 1 / np.sqrt(squares)
-
-
 def _far(values: np.ndarray) -> np.ndarray:
     """Which values lie off the others, unless these are too many to be outliers."""
     off = np.abs(values - np.median(values))
     spread = 1.4826 * np.median(off)
     far = off > OUTLIER * spread
     return far if spread > 0 and far.mean() <= SHARE else np.zeros(values.size, bool)
+
+
+def _odd_cycles(about: Expansion) -> np.ndarray:
+    """Which cycles have a loss rate far off that of their neighbours."""
+    first, slope, residual = about.pieces.first, about.left[:, LOSS], about.left[:, -1]
+    squares = np.add.reduceat(slope**2, first)
+    rate = -np.add.reduceat(slope * residual, first) / squares
+    near = median_filter(rate, NEIGHBOURS, mode="nearest")
+    return _far((rate - near) * np.sqrt(squares))
 
 
 def _edges(about: Expansion) -> np.ndarray:
@@ -451,7 +456,8 @@ def _trimmed(about: Expansion) -> tuple[Expansion, list[str]]:
         long = lengths > NEXT
         for side, ends in enumerate((first, first + lengths - 1)):
             keep[ends[long]] &= not far[side]
-        about, cut = solved(about.pieces.kept(keep, FEWEST_READINGS)), cut + far
+        about = with_course(solved(about.pieces.kept(keep, FEWEST_READINGS)))
+        cut = cut + far
     said = []
     for side, why in enumerate(
         ("fresh beam decays faster" if 2 * high >= cut[0] else WITHIN, WITHIN)
@@ -467,18 +473,16 @@ def _trimmed(about: Expansion) -> tuple[Expansion, list[str]]:
 
 def cleaned(cycles: Pieces) -> tuple[Expansion, tuple[str, ...]]:
     """The fit without readings, edges of cycles and cycles that are not of the decay."""
-    said, about = [], solved(cycles)
-    departure, error = _per_cycle(about)
-    cut = np.repeat(_far(departure / error), about.pieces.lengths)
+    trimmed, said = _trimmed(with_course(solved(cycles)))
+    about, before = solved(trimmed.pieces), trimmed.pieces
+    cut = np.repeat(_odd_cycles(about), before.lengths)
     if cut.any():
-        before = about.pieces.first.size
-        about = solved(about.pieces.kept(~cut, FEWEST_READINGS))
-        left = before - about.pieces.first.size
+        about = solved(before.kept(~cut, FEWEST_READINGS))
+        left = before.first.size - about.pieces.first.size
         were = "cycle was" if left == 1 else "cycles were"
         said.append(f"{left} {were} left out, whose loss rate lies far off the others'")
-    about, edges = _trimmed(about)
-    said = edges + said
+    about = with_course(about)
     if (lone := _far(about.left[:, -1])).any():
         said.append(f"{int(lone.sum())} readings were left out as outliers")
-        about = solved(about.pieces.kept(~lone, FEWEST_READINGS))
+        about = with_course(solved(about.pieces.kept(~lone, FEWEST_READINGS)))
     return about, tuple(said)

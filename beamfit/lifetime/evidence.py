@@ -5,14 +5,12 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.special import fdtrc
 
 from beamfit.greybox.memory import AveragedMoments, Memory
 from beamfit.lifetime.alternatives import (
-    REJECTED,
     Change,
     ConstantA,
     LifetimeLaw,
@@ -22,14 +20,14 @@ from beamfit.lifetime.alternatives import (
     lifetime_law,
     rival_of,
 )
-from beamfit.lifetime.expansion import LOSS, POWER, QUADRATIC, Expansion, Physical, lifetime_of
+from beamfit.lifetime.expansion import LOSS, POWER, Expansion, Physical, lifetime_of
 from beamfit.lifetime.marginal import BELOW, FreeLaw, Law, free_law
 from beamfit.lifetime.record import DecayRecord
-from beamfit.noise.correlated import whitened
 from beamfit.noise.memory import CLOSE, Products
 from beamfit.quantity import HOUR, Quantity
 from beamfit.shown import shown
 from beamfit.status import Status
+from beamfit.table import json_of
 
 UNITS = {
     "a": "1/(mA s)",
@@ -53,8 +51,6 @@ NORMAL = 1.96
 EXACT = 1e-12
 # A smooth law is believed where it is likelier than not.
 LIKELIER = 0.5
-# Parts of a record of many cycles whose loss rates are compared.
-PARTS = 8
 
 
 @shown
@@ -84,6 +80,28 @@ class Separability:
     correlation: float | None
     residual_correlation: float | None
     error_inflation: float | None
+
+
+class RatePart(NamedTuple):
+    """A part of a record of many cycles, with a loss rate of its own.
+
+    Attributes
+    ----------
+    start, end : float
+        Since the first reading, s.
+    lifetime : Quantity
+        At the mean current of the record, h.
+    """
+
+    start: float
+    end: float
+    lifetime: Quantity
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the ends with their unit, and the lifetime, as JSON's types."""
+        ends = {name: {"value": getattr(self, name), "error": None, "unit": "s"}
+                for name in ("start", "end")}  # fmt: skip
+        return json_of(ends | {"lifetime": self.lifetime})
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,17 +147,13 @@ class Evidence:
 
     @cached_property
     def changed(self) -> bool:
-        """True if the loss rate is not the same all along: something else than noise correlates the
-        residuals of a decay, or parts of many cycles differ.
-        """
-        if self.cycles > 1:
-            return self.parts[0] < REJECTED
-        return self.about.wanders and self.rival is not None
+        """True if something else than noise correlates the residuals of a decay."""
+        return self.cycles == 1 and self.about.wanders and self.rival is not None
 
     @cached_property
     def independent(self) -> bool:
         """True if errors of neighbouring readings are independent."""
-        return not self.about.wanders or (self.cycles == 1 and self.changed)
+        return not self.about.wanders or self.changed
 
     def _memory(self, independent: bool, *more: int) -> Memory:
         return self.about.memory(self.about.columns(*more), independent)
@@ -428,7 +442,7 @@ class Evidence:
         exact |= {f"lifetime_{at}": self.lifetime(f"rate_{at}", known) for at in ENDS}
         found = {name: self.widely(name, quantity) for name, quantity in exact.items()}
         found |= {"exact": exact, "free_law": self.free, "shaped": self.shaped}
-        found |= {name: getattr(self, name) for name in (*same, "inflation", "residuals")}
+        found |= {name: getattr(self, name) for name in (*same, "inflation", "residuals", "course")}
         return found | {"identifiability": self.separability}
 
     @cached_property
@@ -442,26 +456,20 @@ class Evidence:
         return products.stated_odds(np.maximum(squares, 0.0), rows.shape[1])
 
     @cached_property
-    def parts(self) -> tuple[float, list[Quantity]]:
-        """The chance that the loss rate is one in all parts of many cycles, and their lifetimes."""
-        about, pieces = self.about, self.about.pieces
-        count = min(PARTS, self.cycles)
-        part = np.repeat(np.arange(self.cycles) * count // self.cycles, pieces.lengths)
-        length = self.correlation_time or 1e-300
-        apart = np.diff(pieces.time) / length
-        own = about.rows[:, [LOSS]] * (part[:, None] == np.arange(count))
-        every = np.column_stack([own, about.rows[:, QUADRATIC], about.residuals])
-        every = about.levels.left(whitened(every, apart, np), apart)[0]
-        columns, residual = every[:, :-1], every[:, -1]
-        step, rest, *_ = np.linalg.lstsq(columns, -residual, rcond=None)
-        dof = self.dof - count + 1
-        unit = max(float(rest[0]) / dof, self.about.given)
-        fall = float(self.memory.squares[self.memory.likely]) - float(rest[0])
-        chance = float(fdtrc(count - 1, dof, max(fall, 0.0) / (count - 1) / unit))
-        spread = np.linalg.norm(np.linalg.pinv(columns), axis=1) * math.sqrt(unit)
-        span = pieces.units[0]
-        pairs = zip((about.numbers[0] + step[:count]) / span, spread[:count] / span, strict=True)
-        return chance, [lifetime_of(rate, error) for rate, error in pairs if rate > 0]
+    def course(self) -> tuple[RatePart, ...]:
+        """Lifetimes of the parts of many cycles whose loss rate is not the same all along."""
+        parts, (span, _) = self.about.parts, self.about.pieces.units
+        if parts is None:
+            return ()
+        slopes = np.hstack([np.tile([1.0, 0.0], (parts.first.size, 1)), parts.shares]) / span
+        found = self.memory.moments(slopes, self.about.given)
+        shift = 0.0 if self.independent else found.shift
+        rates = (self.about.numbers[LOSS - 1] + parts.departure) / span + shift
+        since = self.time - self.time[0]
+        ends = np.append(since[parts.first[1:]], since[-1])
+        lifetimes = (lifetime_of(*pair, 1 / DETERMINED) for pair in
+                     zip(rates, found.error, strict=True))  # fmt: skip
+        return tuple(map(RatePart, since[parts.first].tolist(), ends.tolist(), lifetimes))
 
     @cached_property
     def lifetimes(self) -> LifetimeLaw | None:
@@ -470,7 +478,8 @@ class Evidence:
         """
         refuted = self.constant_a.status is Status.poor_fit
         if self.cycles > 1:
-            known = self.separability.separable
+            # The search for a power knows no parts.
+            known = self.separability.separable and not (refuted and self.course)
         else:
             plain = not self.shaped and self.about.pieces.gauge is None
             known = plain and refuted and self.outgassing is None

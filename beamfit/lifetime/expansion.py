@@ -9,8 +9,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
+from itertools import pairwise
 from typing import NamedTuple
 
 import jax
@@ -19,7 +20,7 @@ import numpy as np
 from jax import Array
 from scipy.integrate import cumulative_simpson
 
-from beamfit.greybox.memory import Memory, Whitened, remembered
+from beamfit.greybox.memory import Memory, Whitened, usual_noises, whitened_by_each
 from beamfit.greybox.problem import padded_length
 from beamfit.lifetime.decay_law import Moments, beam_current, cumulative
 from beamfit.lifetime.record import DecayRecord, Monitor
@@ -156,7 +157,8 @@ class Pieces(NamedTuple):
 
 class _Rows(NamedTuple):
     """As `Pieces`, scaled: `piece` is the place of each reading's, None of a single one; highest
-    and lowest current, the pressure over its mean at both ends, and the mean current, mA.
+    and lowest current, the pressure over its mean at both ends, the mean current, mA, and by how
+    much the loss rate of each reading's piece departs from the mean.
     """
 
     time: Array
@@ -167,6 +169,7 @@ class _Rows(NamedTuple):
     ends: Array
     pressure: Array
     mean: Array
+    departure: Array | None = None
 
     def shape_of(self, shape: Shape | None) -> Shape | None:
         """A shape of the current over its mean."""
@@ -176,6 +179,13 @@ class _Rows(NamedTuple):
     def count(self) -> int:
         """Pieces at most: of three readings or more each."""
         return 1 if self.piece is None else self.time.size // 2
+
+    @property
+    def starts(self) -> Array | None:
+        """First reading of the piece of each; None of a single piece."""
+        if self.piece is None:
+            return None
+        return jnp.searchsorted(self.piece, self.piece, side="left")
 
     def sums(self, values: Array) -> Array:
         """Sum the values of each piece."""
@@ -191,6 +201,24 @@ class _Rows(NamedTuple):
         """Columns without what the levels explain, and what they are worth of each level."""
         worth = self.sums(own[:, None] * columns) / jnp.maximum(self.sums(own**2), 1e-300)[:, None]
         return columns - own[:, None] * self.each(worth), worth
+
+
+class Parts(NamedTuple):
+    """Parts of many cycles, each with a loss rate of its own.
+
+    Attributes
+    ----------
+    first : array of int, shape (p,)
+        First reading of each.
+    shares : array, shape (p, p - 1)
+        Departures of the loss rate of all parts by those of the first p - 1.
+    departure : array, shape (p,)
+        Of the loss from the mean, in units of the search.
+    """
+
+    first: np.ndarray
+    shares: np.ndarray
+    departure: np.ndarray
 
 
 class _State(NamedTuple):
@@ -215,15 +243,13 @@ def padded_size(rows: int) -> int:
 
 def _about(numbers: Array, level: Array, rows: _Rows, kind: str | None, shape: Shape | None):
     """Residuals over errors and physical values, and their slopes by all columns."""
-    starts = None
-    if rows.piece is not None:
-        starts = jnp.searchsorted(rows.piece, rows.piece, side="left")
-    at, shape = Moments(rows.time, rows.gas, starts), rows.shape_of(shape)
+    at, shape = Moments(rows.time, rows.gas, rows.starts), rows.shape_of(shape)
 
     def answer(step: Array) -> tuple[Array, Array]:
         now = numbers + step[1:]
         begin = level[0] if rows.piece is None else rows.each(level)
-        model = beam_current(begin + step[0], now, at, kind, shape)
+        own = now if rows.departure is None else (now[0] + rows.departure, *now[1:])
+        model = beam_current(begin + step[0], own, at, kind, shape)
         ends = rows.ends
         if rows.piece is None:
             ends = jnp.stack([begin + step[0], model[-1]])
@@ -259,14 +285,12 @@ def _start(rows: _Rows) -> tuple[Array, Array, Array, Array]:
     Integrated once, the law is linear: x(t) = level - loss ∫x dt - quadratic ∫x (x - 1) dt. The
     integrals average the noise, so the start is good for a decay of any length.
     """
-    x, weight = rows.current, rows.weight
-    inside = jnp.diff(rows.time)
-    if rows.piece is not None:
-        inside = inside * (jnp.diff(rows.piece) == 0)
+    x, weight, inside = rows.current, rows.weight, jnp.diff(rows.time)
 
     def integral(values: Array) -> Array:
         parts = jnp.append(0.0, inside * (values[1:] + values[:-1]) / 2)
-        return cumulative(parts)
+        whole = cumulative(parts)
+        return whole if rows.piece is None else whole - whole[rows.starts]
 
     columns = jnp.stack([-integral(x), -integral(x * (x - 1)), x], axis=1)
     left, worth = rows.without_levels(weight, weight[:, None] * columns)
@@ -402,6 +426,8 @@ class Expansion:
         Weight of the prior on the quadratic part.
     rested : bool
         Whether the search came to rest, at finite values.
+    parts : Parts or None
+        Of many cycles whose loss rate is not the same all along; the last columns are theirs.
     """
 
     pieces: Pieces
@@ -413,6 +439,7 @@ class Expansion:
     slopes: np.ndarray
     prior: float = 0.0
     rested: bool = True
+    parts: Parts | None = None
 
     @classmethod
     def of(cls, pieces: Pieces, found: Sequence[np.ndarray]) -> Expansion:
@@ -465,11 +492,15 @@ class Expansion:
         """Columns without what the levels of many pieces explain."""
         if self.levels is None:
             return columns
-        return self.levels.left(columns, np.full(len(columns) - 1, np.inf))[0]
+        return self.levels.left(columns)
 
     def columns(self, *more: int) -> list[int]:
-        """Places of the plain law's columns and of more; levels of many pieces are eliminated."""
-        return [LEVEL] * (self.level.size == 1) + [*PLAIN, *more]
+        """Places of the columns of the plain law, of parts with rates of their own, and of more;
+        levels of many pieces are eliminated.
+        """
+        own = 0 if self.parts is None else self.parts.shares.shape[1]
+        last = range(self.rows.shape[1] - own, self.rows.shape[1])
+        return [LEVEL] * (self.level.size == 1) + [*PLAIN, *last, *more]
 
     def memory(self, columns: Sequence[int], independent: bool) -> Memory:
         """Posterior over noises, given the slopes by some columns and the residuals.
@@ -478,8 +509,7 @@ class Expansion:
         memory the noise may have otherwise. Noises of no weight are left out.
         """
         if not independent:
-            slopes, time = self.rows[:, columns], self.pieces.time
-            found = remembered(slopes, self.residuals, time, self.levels).memory()
+            found = self._whitened(columns).memory()
             kept = found.weight > NO_WEIGHT * found.weight.max()
             return Memory(*(part[kept] for part in found[:-1]), found.dof)
         known = np.append(np.equal(columns, QUADRATIC), self.numbers[QUADRATIC - 1])
@@ -489,6 +519,28 @@ class Expansion:
         return Whitened(
             CorrelatedNoise(np.zeros(1), np.zeros(1)), triangle, np.zeros(1), count
         ).memory()
+
+    def _whitened(self, columns: Sequence[int]) -> Whitened:
+        """Slopes by some columns and residuals, whitened by each noise; the cycles of a part, in
+        which a departure is one of the loss, by themselves.
+        """
+        time, own = self.pieces.time, self.parts or Parts(np.zeros(1, int), np.zeros((1, 0)), None)
+        plain = [column for column in columns if column < self.rows.shape[1] - own.shares.shape[1]]
+        rows = np.column_stack([self.rows[:, plain], self.residuals])
+        if self.levels is None:
+            return whitened_by_each(usual_noises(time), [(rows, time)])
+        first, slope = self.levels
+        grid = usual_noises(time)
+        ends = [slice(*pair) for pair in pairwise([*own.first, time.size])]
+        blocks = [first[(first >= part.start) & (first < part.stop)] - part.start for part in ends]
+        levels = [
+            Levels(*pair) for pair in zip(blocks, (slope[part] for part in ends), strict=True)
+        ]
+        found = whitened_by_each(grid, [(rows[part], time[part]) for part in ends], levels=levels)
+        triangle, count = found.triangle, found.triangle.shape[1] // len(ends)
+        more = triangle[..., :1] * np.repeat(own.shares, count, axis=0)
+        parts = (triangle[..., : len(PLAIN)], more, triangle[..., len(PLAIN) :])
+        return found._replace(triangle=np.concatenate(parts, axis=2))
 
     def moved(self, change: np.ndarray) -> Physical:
         """Shift the values by a change of the readings, over their errors, by least squares;
@@ -590,6 +642,17 @@ def expanded(
     level = np.array([float(values.i0) / mean])
     found = _looked(pieces.scaled(), numbers, level, kind, shape)
     return Expansion.of(pieces, (numbers, level, *found))
+
+
+def expanded_about(about: Expansion, numbers: np.ndarray, departure: np.ndarray) -> Expansion:
+    """Expand the law of many pieces about other numbers, with a departure of the loss rate for each
+    reading's piece; levels are eliminated.
+    """
+    rows = about.pieces.scaled()
+    departure = np.pad(departure, (0, rows.time.size - departure.size))
+    level = np.pad(about.level, (0, rows.count - about.level.size), constant_values=1.0)
+    found = _looked(rows._replace(departure=departure), numbers, level, None, None)
+    return replace(Expansion.of(about.pieces, (numbers, level, *found)), prior=about.prior)
 
 
 def further_columns(about: Expansion, kind: str, times: np.ndarray) -> np.ndarray:

@@ -14,7 +14,7 @@ from beamfit.errors import InputError, expect
 from beamfit.lifetime.alternatives import Change, ConstantA, LifetimeLaw, Outgassing
 from beamfit.lifetime.answer import finding_of, finding_of_cycles
 from beamfit.lifetime.cycles import FEWEST_CYCLES, FEWEST_READINGS, averaged, cleaned
-from beamfit.lifetime.evidence import BELIEVED, UNITS, Evidence, Separability
+from beamfit.lifetime.evidence import BELIEVED, UNITS, Evidence, RatePart, Separability
 from beamfit.lifetime.expansion import Expansion, Pieces, Shape, solved, solved_together
 from beamfit.lifetime.marginal import FreeLaw, Law
 from beamfit.lifetime.record import DecayRecord, Monitor
@@ -91,6 +91,8 @@ class DecayFit:
         The same quantities if a and b are constant.
     free_law : FreeLaw or None
         The exponent of a and the drift of b that the errors contain; None where the law is known.
+    course : tuple of RatePart
+        Lifetimes by part of the record, of many cycles whose loss rate is not the same in all.
 
     Examples
     --------
@@ -127,6 +129,7 @@ class DecayFit:
     first: np.ndarray | None = None
     exact: Mapping[str, Quantity] = field(default_factory=dict)
     free_law: FreeLaw | None = None
+    course: tuple[RatePart, ...] = ()
 
     def sample(
         self,
@@ -246,7 +249,9 @@ class DecayFit:
         if self.free_law is not None:
             found |= {"if_a_and_b_are_constant": dict(self.exact), "free_law": self.free_law}
         found |= {} if self.outgassing is None else {"outgassing": self.outgassing}
-        return json_of(found if self.first is None else found | {"cycles": self.first.size})
+        if self.first is not None:
+            found |= {"cycles": self.first.size, "course": [part.to_json() for part in self.course]}
+        return json_of(found)
 
 
 def fit_decay(
@@ -435,7 +440,9 @@ def fit_cycles(
     -----
     Least squares; the currents at the starts are eliminated, so that time and memory grow with the
     readings alone. Noise with a memory goes on from cycle to cycle (`beamfit.noise.correlated`).
-    Readings, cycles and heads of cycles that lie far off are left out and counted.
+    Readings, cycles and heads of cycles that lie far off are left out and counted. Where the loss
+    rate is not the same in all cycles the answer is that of the mean rate, and `course` has the
+    lifetimes of parts (`beamfit.lifetime.rate_course`).
 
     Examples
     --------

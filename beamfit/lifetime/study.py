@@ -321,7 +321,9 @@ def cycle_lifetimes(fit: DecayFit) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     at, level = (np.add.reduceat(v, part) / count for v in (record.time, record.current))
     squares = np.add.reduceat(since**2, part)
     rate = np.add.reduceat(since * residual, part) / squares / level
-    rate += fit.a.value * level + fit.b.value
+    usual = np.array([of.lifetime.value for of in fit.course] or [fit.lifetime_mean.value])
+    which = np.searchsorted([of.start for of in fit.course][1:], at - record.time[0])
+    rate += fit.a.value * (level - fit.mean_current) + 1 / usual[which] / HOUR
     error = fit.rms_residual / np.sqrt(squares) / level
     seen = rate > 0
     return at[seen], 1 / rate[seen] / HOUR, (error / rate**2)[seen] / HOUR

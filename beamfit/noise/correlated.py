@@ -11,7 +11,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy.linalg import cho_solve_banded, cholesky_banded
+from scipy.linalg import cholesky_banded
 from scipy.linalg.lapack import dtbtrs
 
 # Correlation of neighbouring residuals, in standard errors of that of independent ones, from which
@@ -171,26 +171,65 @@ class Levels(NamedTuple):
     first: np.ndarray
     slope: np.ndarray
 
-    def left(self, rows: np.ndarray, apart: np.ndarray) -> tuple[np.ndarray, float]:
-        """Whitened rows less what the levels can explain, and half the log of the levels' matrix.
+    def left(self, rows: np.ndarray) -> np.ndarray:
+        """Rows less what the levels can explain, in independent noise.
 
-        Whitening carries the last row of a block into the first of the next, so the matrix has
-        three diagonals: O(n). Done twice, for what rounding leaves of the first time.
+        Done twice, for what rounding leaves of the first time.
         """
-        kept, new, begins = np.exp(-apart), np.sqrt(-np.expm1(-2 * apart)), self.first[1:]
-        own = np.append(self.slope[:1], (self.slope[1:] - kept * self.slope[:-1]) / new)
-        own[begins] = self.slope[begins] / new[begins - 1]
-        carried = -(kept * self.slope[:-1] / new)[begins - 1]
-        matrix = np.zeros((2, self.first.size))
-        matrix[1] = np.add.reduceat(own**2, self.first)
-        matrix[1, :-1] += carried**2
-        matrix[0, 1:] = carried * own[begins]
-        factor = cholesky_banded(matrix)
+        squares = np.add.reduceat(self.slope**2, self.first)
         lengths = np.diff(self.first, append=len(rows))
         for _ in range(2):
-            moment = np.add.reduceat(own[:, None] * rows, self.first)
-            moment[:-1] += carried[:, None] * rows[begins]
-            found = cho_solve_banded((factor, False), moment)
-            rows = rows - own[:, None] * np.repeat(found, lengths, axis=0)
-            rows[begins] -= carried[:, None] * found[:-1]
-        return rows, float(np.sum(np.log(factor[1])))
+            found = np.add.reduceat(self.slope[:, None] * rows, self.first) / squares[:, None]
+            rows = rows - self.slope[:, None] * np.repeat(found, lengths, axis=0)
+        return rows
+
+
+@jax.jit
+def levelled(
+    rows: jax.Array, time: jax.Array, begins: jax.Array, slope: jax.Array, noise: CorrelatedNoise
+) -> tuple[jax.Array, jax.Array]:
+    """Rows without levels, whitened as by `innovations`; and log sum of the errors.
+
+    Parameters
+    ----------
+    rows : array, shape (n, p)
+        Residuals and their slopes, which the noise of the readings is beside.
+    time : array, shape (n,)
+        When. Noise goes on from block to block; rows at the time of the one before are padding.
+    begins : array of bool, shape (n,)
+        Where a block begins, of whose level nothing is known.
+    slope : array, shape (n,)
+        As of `Levels`, which are all free: their density is flat.
+    noise : CorrelatedNoise
+        Of the readings.
+
+    Notes
+    -----
+    The filter has the level as a second state. The first row of a block says what the level is,
+    and no more: a diffuse start (A. C. Harvey, 1989, section 3.3.4).
+    """
+    interval = jnp.diff(time, append=time[-1:])
+    kept, wander = jnp.exp(-interval / noise.time), 1.0 - noise.white
+    used = jnp.append(True, interval[:-1] > 0)
+
+    def on(carry, now):
+        (value, level), (own, both, whole) = carry
+        row, k, begin, s, counts = now
+        size = jnp.where(begin, 1.0, own + 2 * s * both + s**2 * whole + noise.white)
+        surprise = row - value - s * level
+        gains = (own + s * both) / size, (both + s * whole) / size
+        gains = jnp.where(begin, 0.0, gains[0]), jnp.where(begin, 1.0 / s, gains[1])
+        value, level = value + gains[0] * surprise, level + gains[1] * surprise
+        known = own - gains[0] * (own + s * both), both - gains[1] * (own + s * both)
+        known += (whole - gains[1] * (both + s * whole),)
+        fresh = own, -own / s, (own + noise.white) / s**2
+        own, both, whole = (jnp.where(begin, f, g) for f, g in zip(fresh, known, strict=True))
+        carry = (k * value, level), (k**2 * own + wander * (1.0 - k**2), k * both, whole)
+        tells = counts & ~begin
+        return carry, (jnp.where(tells, surprise / jnp.sqrt(size), 0.0),
+                       jnp.where(tells, 0.5 * jnp.log(size), 0.0))  # fmt: skip
+
+    nothing = jnp.zeros(rows.shape[1])
+    start = (nothing, nothing), (jnp.asarray(wander), jnp.zeros(()), jnp.zeros(()))
+    _, (white, sizes) = jax.lax.scan(on, start, (rows, kept, begins, slope, used))
+    return white, jnp.sum(sizes)
