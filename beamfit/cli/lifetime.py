@@ -254,6 +254,8 @@ def _show_record(terminal: Terminal, study: RecordStudy) -> None:
             terminal.table(Table("\nSystematics", tables.SYSTEMATIC, unseen))
         if losses := tables.budget_rows([decay]):
             terminal.table(labelled("\nLosses from first principles", [name], losses))
+        for course in tables.course_tables([decay]):
+            terminal.table(course)
         terminal.line()
     if many:
         _show_many(terminal, study)

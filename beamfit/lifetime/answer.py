@@ -361,9 +361,11 @@ def _correlated(e: Evidence) -> str | None:
         return None
     times = found.error_inflation
     than = f": they are {times:.1f} times those of independent readings" if times else ""
+    span = float(e.time[-1] - e.time[0])
+    over = f"over {length:.3g} s" if length < span else "longer than the record"
     return (
-        f"Neighbouring residuals are correlated ({found.residual_correlation:.2f}, over "
-        f"{length:.3g} s), which the errors contain{than}"
+        f"Neighbouring residuals are correlated ({found.residual_correlation:.2f}, {over}), which "
+        f"the errors contain{than}"
     )
 
 

@@ -19,8 +19,8 @@ CHANGES = 0.05
 # A change is normal, its size a share of the loss rate flat in its logarithm: none smaller is seen,
 # larger ones are of other beams.
 SIZES = np.geomspace(1e-4, 0.5, 16)
-# Cycles of a part at least, and how often a part is halved at most: 64 parts draw any course.
-FEWEST, HALVED = 2, 6
+# Cycles of a part at least, and parts at most: so many draw any course.
+FEWEST, MOST = 2, 64
 # Steps of Gauss and Newton for them: each leaves the square of what the last one left.
 STEPS = 3
 
@@ -61,7 +61,7 @@ def with_course(about: Expansion) -> Expansion:
     rate, error = _cycle_rates(about)
     apart = np.abs(np.diff(rate)) / np.hypot(error[1:], error[:-1])
     error = error * max(1.4826 * float(np.median(apart)), 1e-12)
-    begins = _divided(rate, error, abs(float(about.numbers[0])), 0, HALVED)
+    begins = _divided(rate, error, abs(float(about.numbers[0])))
     return _with_parts(about, np.array([0, *begins])) if begins else about
 
 
@@ -80,10 +80,24 @@ def _cycle_rates(about: Expansion) -> tuple[np.ndarray, np.ndarray]:
     return rate - found * power, 1 / np.sqrt(squares)
 
 
-def _divided(rate: np.ndarray, error: np.ndarray, mean: float, at: int, halved: int) -> list[int]:
-    """Cycles, counted from `at`, with which a part begins after the first."""
-    if halved == 0 or rate.size < 2 * FEWEST:
-        return []
+def _divided(rate: np.ndarray, error: np.ndarray, mean: float) -> list[int]:
+    """Cycles with which a part begins after the first; the likeliest changes first."""
+
+    def with_change(begin: int, end: int) -> tuple[float, int, int, int]:
+        odds, cut = _change(rate[begin:end], error[begin:end], mean)
+        return odds, begin, begin + cut, end
+
+    parts = [with_change(0, rate.size)]
+    while len(parts) < MOST and max(parts)[0] > 0:
+        _, begin, cut, end = parts.pop(parts.index(max(parts)))
+        parts += [with_change(begin, cut), with_change(cut, end)]
+    return sorted(begin for _, begin, *_ in parts if begin)
+
+
+def _change(rate: np.ndarray, error: np.ndarray, mean: float) -> tuple[float, int]:
+    """Log odds that a rate changes among some cycles, and the likeliest first cycle after it."""
+    if rate.size < 2 * FEWEST:
+        return -np.inf, 0
     weight = 1 / error**2
     before, sums = np.cumsum(weight)[:-1], np.cumsum(weight * rate)[:-1]
     after = weight.sum() - before
@@ -92,17 +106,11 @@ def _divided(rate: np.ndarray, error: np.ndarray, mean: float, at: int, halved: 
     place = slice(FEWEST - 1, rate.size - FEWEST)
     change, variance = change[place], variance[place]
     worth = (mean * SIZES[:, None]) ** 2 / variance
-    few = rate.size - 1  # neighbours that tell the noise: Student's density for a normal one
-    log = 0.5 * (few + 1) * (
-        np.log1p(change**2 / variance / few) - np.log1p(change**2 / variance / (1 + worth) / few)
-    ) - 0.5 * np.log1p(worth)
-    log = logsumexp(log, axis=0) - np.log(len(SIZES))
-    if logsumexp(log) - np.log(log.size) + np.log(CHANGES / (1 - CHANGES)) < 0:
-        return []
-    cut = int(np.argmax(log)) + FEWEST
-    parts = (slice(None, cut), at), (slice(cut, None), at + cut)
-    first, last = (_divided(rate[p], error[p], mean, begin, halved - 1) for p, begin in parts)
-    return [*first, at + cut, *last]
+    few, squares = rate.size - 1, change**2 / variance  # neighbours tell the noise: Student's
+    log = np.log1p(squares / few) - np.log1p(squares / (1 + worth) / few)
+    log = logsumexp(0.5 * (few + 1) * log - 0.5 * np.log1p(worth), axis=0) - np.log(SIZES.size)
+    odds = logsumexp(log) - np.log(log.size) + np.log(CHANGES / (1 - CHANGES))
+    return float(odds), int(np.argmax(log)) + FEWEST
 
 
 def _with_parts(about: Expansion, begins: np.ndarray) -> Expansion:

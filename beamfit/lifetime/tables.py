@@ -14,8 +14,8 @@ from beamfit.lifetime.ring import Operation
 from beamfit.lifetime.ring_study import Shift
 from beamfit.lifetime.scales import VOLTAGE
 from beamfit.lifetime.study import Decay, RecordStudy
-from beamfit.quantity import Quantity, Status
-from beamfit.table import Row, cell
+from beamfit.quantity import HOUR, Quantity, Status
+from beamfit.table import Row, Table, cell
 
 
 class DecayRow(NamedTuple):
@@ -120,6 +120,18 @@ def _rows_of(decays: Sequence[Decay]) -> tuple[DecayRow, ...]:
 def decay_rows(decays: Sequence[Decay]) -> list[Row]:
     """Label and one cell per decay, for every number a fit has."""
     return _laid_out(decays, _rows_of(decays))
+
+
+def course_tables(decays: Sequence[Decay]) -> list[Table]:
+    """Lifetimes by part, of each record whose loss rate is not the same all along."""
+    header = ["from, h", "to, h", "lifetime at the mean current"]
+    return [
+        Table(f"Course of the lifetime in {decay.fit.record}", header, [
+            [f"{part.start / HOUR:.4g}", f"{part.end / HOUR:.4g}", cell(part.lifetime)]
+            for part in decay.fit.course
+        ])
+        for decay in decays if decay.fit.course
+    ]  # fmt: skip
 
 
 def _number(value: float | None, form: str, unit: str = "") -> str:

@@ -86,7 +86,7 @@ def decay_page(
         listed.append(labelled("A network of the losses", ["value"], tables.network_rows(shift)))
     listed += [] if trend is None else trend.tables()
     pooled = [decay for study in studies for decay in study.pooled]
-    listed += _side_by_side(pooled) + _single(decays)
+    listed += _side_by_side(pooled) + tables.course_tables(pooled) + _single(decays)
     header = ["what", "at", "for", "change"]
     listed += [
         Table(f"Cut at or left out of {study.record.name}", header, tables.event_rows(study))
@@ -281,7 +281,11 @@ def draw_lifetime(figure: FigureBase, study: RecordStudy) -> None:
         time, lifetime, error = cycle_lifetimes(decay.fit)
         at = (decay.fit.readings.start + time) / scale
         axes.errorbar(at, lifetime, error, fmt="o", ms=3, lw=0.8, color=BLUE, zorder=2)
-        axes.plot(at[[0, -1]], 2 * [decay.fit.lifetime_mean.value], color=RED, lw=1.5, zorder=3)
+        fit, begin = decay.fit, decay.fit.readings.start
+        whole = (at[0] * scale - begin, at[-1] * scale - begin, fit.lifetime_mean)
+        for start, end, mean in fit.course or (whole,):
+            ends = np.array([begin + start, begin + end]) / scale
+            axes.plot(ends, 2 * [mean.value], color=RED, lw=1.5, zorder=3)
     for decay in study.decays:
         tops.append(_momentary(axes, decay, scale))
         fit = decay.fit
