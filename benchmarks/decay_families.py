@@ -97,6 +97,28 @@ def top_up(
     return Case(record, np.nan, LIFETIME / HOUR)
 
 
+def changing_top_up(random: np.random.Generator, course: str, walk: float = 0.0) -> Case:
+    """Top-up whose lifetime wanders by 1 to 10 %, or steps; the monitor may walk under white
+    noise, by so many of its standard deviations in 20 readings. The truth is the mean loss rate.
+    """
+    time, period = 5.0 * np.arange(6000), random.uniform(120.0, 300.0)
+    turned, rate = time / time[-1] * random.uniform(0.3, 3.0) + random.random(), 1 / LIFETIME
+    loss = np.full(time.size, rate)
+    if course == "wanders":
+        loss = rate / (1 + random.uniform(0.01, 0.1) * np.sin(2 * np.pi * turned))
+    elif course == "steps":
+        for _ in range(random.integers(1, 4)):
+            later = time > random.uniform(0.1, 0.9) * time[-1]
+            loss = np.where(later, loss * random.uniform(0.85, 1.15), loss)
+    lost = np.append(0.0, np.cumsum(5.0 * loss[:-1]))
+    cycle = np.floor(time / period)
+    beam = START * np.exp(lost[np.searchsorted(cycle, cycle)] - lost)
+    noise = random.normal(size=time.size)
+    noise += walk / np.sqrt(20) * np.cumsum(random.normal(size=time.size))
+    current = beam + START * 10 ** random.uniform(-5.0, -3.9) * noise
+    return Case(DecayRecord(time, current), np.nan, 1 / loss.mean() / HOUR)
+
+
 FAMILIES: dict[str, Callable[[np.random.Generator], Case]] = {
     "constant a and b": lambda r: decay(Decay(), r),
     "errors stated": lambda r: decay(Decay(stated=1.0), r),
@@ -110,6 +132,10 @@ FAMILIES: dict[str, Callable[[np.random.Generator], Case]] = {
     "top-up, 1 s, 1e5 readings": lambda r: top_up(r, 1.0, 100_000),
     "top-up, readings within refills": lambda r: top_up(r, 10.0, 3000, within=4.0),
     "top-up, shots, the last small": lambda r: top_up(r, 2.0, 3000, within=12.0, shots=4),
+    "top-up, lifetime wanders": lambda r: changing_top_up(r, "wanders"),
+    "top-up, loss rate steps": lambda r: changing_top_up(r, "steps"),
+    "top-up, monitor walks": lambda r: changing_top_up(r, "", walk=0.3),
+    "top-up, wanders, monitor walks": lambda r: changing_top_up(r, "wanders", walk=0.3),
     "archive slower than refills": lambda r: top_up(r, r.uniform(310.0, 2000.0), 500),
 }
 

@@ -188,6 +188,27 @@ def test_a_loss_rate_that_changes_has_a_course():
     assert fit_cycles(cut(*top_up(0.01, 1))).course == ()
 
 
+def test_a_lifetime_that_wanders_is_followed_and_its_mean_is_right():
+    time = np.arange(0.0, 30 * 3600.0, 10.0)
+    lives = LIFETIME * (1 + 0.05 * np.sin(2 * np.pi * time / time[-1]))
+    lost = np.append(0.0, np.cumsum(10.0 / lives[:-1]))
+    number = (time // 300).astype(int)
+    beam = 300 * np.exp(lost[np.searchsorted(number, number)] - lost)
+    noise = 0.01 * np.random.default_rng(2).normal(size=time.size)
+    fit = fit_cycles(cut(time, beam + noise, number))
+
+    def off(found, some):
+        return (found.value - 1 / np.mean(1 / lives[some]) / 3600) / found.error
+
+    assert abs(off(fit.lifetime_mean, slice(None))) < 2.5
+    pulls = [off(p.lifetime, (time >= p.start) & (time <= p.end)) for p in fit.course]
+    assert len(pulls) > 10
+    assert np.mean(np.square(pulls)) == pytest.approx(1.0, abs=0.9)
+    shortest, longest = (pick(p.lifetime.value for p in fit.course) for pick in (min, max))
+    assert shortest == pytest.approx(9.51, abs=0.05)
+    assert longest == pytest.approx(10.51, abs=0.05)
+
+
 def test_a_that_depends_on_the_current_is_seen():
     time = np.arange(0.0, 6 * 3600, 30.0)
     rate = 1 / LIFETIME
