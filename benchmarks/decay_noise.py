@@ -89,7 +89,7 @@ def top_up(
 
 def of_top_up(trials: int, white: float) -> Table:
     table = Table("readings a cycle", "correlation", "noise", "within 1 / 1.96 / interval", "error")
-    for readings in (3, 18, 180):
+    for readings in (6, 18, 180):
         for correlation in (0.9, 0.97, 0.99) if white else (0.0, 0.6, 0.95):
             for noise in (0.001, 0.05):
                 found = [top_up(readings, correlation, noise, k, white) for k in range(trials)]
