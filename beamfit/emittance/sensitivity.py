@@ -1,4 +1,4 @@
-"""What the emittance would be if something were a little different.
+"""Sensitivity of the emittance to screen, beam and line.
 
 The systematics budget takes the exact derivative of the whole chain, transport and fit, by
 each number of the line; the range table refits without some points.

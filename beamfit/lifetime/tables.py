@@ -168,7 +168,7 @@ def _constant_a(decay: Decay) -> str | None:
         return None
     said = {Status.converged: "not contradicted", Status.poor_fit: "rejected"}
     chance = f" (p = {found.p_value:.2g})"
-    return said[found.status] + chance if found.status in said else "the record cannot tell"
+    return said[found.status] + chance if found.status in said else "not testable with this record"
 
 
 CHECKS: tuple[DecayRow, ...] = (
