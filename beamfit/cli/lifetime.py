@@ -210,7 +210,10 @@ def _show(
         terminal.verdict("trend", trend.status, trend.message)
         terminal.line()
     for each in studies:
-        _show_record(terminal, each)
+        if shift is not None and not terminal.full:
+            terminal.line(str(each.record), style="bold")
+        else:
+            _show_record(terminal, each)
     fits = [decay.fit for study in studies for decay in study.answers]
     for fit, posterior in zip(fits, posteriors or (), strict=False):
         held = "" if fit.free_law is None else ", a and b constant"
@@ -227,7 +230,7 @@ def _show(
 def _show_record(terminal: Terminal, study: RecordStudy) -> None:
     """Lay out a record: what was cut away, and every decay with its verdict and budget."""
     from beamfit.lifetime import tables
-    from beamfit.table import Table, labelled
+    from beamfit.table import Table, determined, labelled
 
     terminal.line(str(study.record), style="bold")
     for note in study.record.notes:
@@ -248,7 +251,7 @@ def _show_record(terminal: Terminal, study: RecordStudy) -> None:
             continue
         rows = tables.decay_rows([decay]) + tables.separability_rows([decay])[:2]
         rows += tables.check_rows([decay])
-        terminal.table(labelled("", [name], rows), [status])
+        terminal.table(labelled("", [name], determined(rows)), [status])
         if decay.systematics:
             unseen = tables.systematic_rows(decay)
             terminal.table(Table("\nSystematics", tables.SYSTEMATIC, unseen))
@@ -302,7 +305,7 @@ def _show_shift(terminal: Terminal, shift: Shift) -> None:
     fit, count = shift.fit, len(shift.fit.names)
     names = ["1 decay" if count == 1 else f"{count} decays"]
     table = labelled("First principles fitted to", names, tables.shift_rows(shift))
-    terminal.table(table, [fit.status])
+    terminal.table(table if terminal.full else table.quoted(), [fit.status])
     if shift.network is not None:
         table = labelled("A network of the losses", names, tables.network_rows(shift))
         terminal.table(table, [shift.network.fit.status])

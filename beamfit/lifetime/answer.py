@@ -165,8 +165,9 @@ def _inseparable(e: Evidence) -> Finding | None:
     return Finding(
         Status.unidentified,
         f"a and b are not separable on this record (correlation {found.correlation:.6f}; share "
-        f"of a in the loss {found.share:.2g} ± {found.share_error:.2g}); the lifetime at the "
-        f"mean current is: record {max(longer, 1.1):.2g} times longer, or at several currents",
+        f"of a in the loss {found.share:.2g} ± {found.share_error:.2g}), the lifetime at the mean "
+        f"current is determined. A record {max(longer, 1.1):.2g} times longer, or at several "
+        "currents, would separate them",
     )
 
 

@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 from beamfit.lifetime.fit import DecayFit
-from beamfit.lifetime.mechanisms import LINEAR, QUADRATIC, Mechanism
+from beamfit.lifetime.mechanisms import LINEAR, QUADRATIC, SCALES, Mechanism
 from beamfit.lifetime.pieces import Event
 from beamfit.lifetime.ring import Operation
 from beamfit.lifetime.ring_study import Shift
@@ -29,6 +29,8 @@ class DecayRow(NamedTuple):
 MOST_EVENTS = 100
 # How many decays have every number shown; of more only the main ones, a row each.
 FEW = 4
+# Rows of a study of many decays that stand on the first screen, by the beginnings of their labels.
+QUOTED = (*(f"{name}, " for name in SCALES), "chi2/dof", "lifetime", "best", "next decay, choice 1")
 # Percent of the loss below which a mechanism's digits say nothing.
 NEGLIGIBLE = 1e-6
 
@@ -378,7 +380,7 @@ def shift_rows(shift: Shift) -> list[Row]:
         asked = proposal.candidate
         said = f"{asked.current:.4g} mA (information {proposal.information:.3g})"
         rows.append((f"next decay, choice {number}", f"{_setting(asked.operation)}, {said}"))
-    return [Row(label, [value]) for label, value in rows]
+    return [Row(label, [value], label.startswith(QUOTED)) for label, value in rows]
 
 
 def network_rows(shift: Shift) -> list[Row]:
