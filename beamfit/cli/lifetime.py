@@ -270,15 +270,14 @@ def _show_many(terminal: Terminal, study: RecordStudy) -> None:
     verdicts = tables.alike(study.decays)
     told = verdicts if terminal.full else verdicts[:MOST_VERDICTS]
     for status, names, message in told:
-        terminal.verdict(names.replace(study.record.name, ""), status, message)
+        terminal.verdict(names, status, message)
     if left := verdicts[len(told) :]:
         others = ", ".join(dict.fromkeys(cell(status) for status, *_ in left))
         terminal.line(f"\n{len(left)} more kinds of verdict ({others}): --full.")
     for title, header, rows in tables.overview(study.decays)[: None if terminal.full else 1]:
-        cells = [[name.removeprefix(study.record.name), *found] for name, *found in rows]
-        if not terminal.full and (left := len(cells) - MOST_SHOWN) > 0:
-            cells = [*cells[:MOST_SHOWN], [f"{left} more", *[""] * (len(header) - 1)]]
-        terminal.table(Table(f"\n{title}", header, cells))
+        if not terminal.full and (left := len(rows) - MOST_SHOWN) > 0:
+            rows = [*rows[:MOST_SHOWN], [f"{left} more", *[""] * (len(header) - 1)]]
+        terminal.table(Table(f"\n{title}", header, rows))
     terminal.line()
 
 

@@ -296,11 +296,19 @@ def overview(decays: Sequence[Decay]) -> list[tuple[str, list[str], list[list[st
         Title, header and rows of each table.
     """
     known = {"Losses from first principles": LOSSES} if _budgets_known(decays) else {}
-    tables = []
+    tables, names = [], numbered(decays)
     for title, wanted in (MAIN | known).items():
-        rows = [[d.fit.record, *(cell(row.value(d)) for row in wanted)] for d in decays]
+        rows = [[names[d.fit.record], *(cell(row.value(d)) for row in wanted)] for d in decays]
         tables.append((title, ["decay", *(row.label for row in wanted)], rows))
     return tables
+
+
+def numbered(decays: Sequence[Decay]) -> dict[str, str]:
+    """Name of each decay in a table: its number alone where all are of one record."""
+    names = [decay.fit.record for decay in decays]
+    records = {name.rpartition("#")[0] for name in names}
+    whole = len(records) > 1 or "" in records
+    return {name: name if whole else "#" + name.rpartition("#")[2] for name in names}
 
 
 def alike(decays: Sequence[Decay]) -> list[tuple[Status, str, str]]:
@@ -313,11 +321,11 @@ def alike(decays: Sequence[Decay]) -> list[tuple[Status, str, str]]:
         well = fit.status is Status.converged
         words = re.sub(r"\d[\d.e+-]*", "#", fit.message) if well else fit.message
         found.setdefault((fit.status, words), []).append(fit)
-    told = []
+    told, names = [], numbered(decays)
     for (status, _), fits in found.items():
-        who, said = fits[0].record, fits[0].message
+        who, said = names[fits[0].record], fits[0].message
         if len(fits) > 1:
-            who = f"{len(fits)} decays, {who} to {fits[-1].record}"
+            who = f"{len(fits)} decays, {who} to {names[fits[-1].record]}"
         if len({fit.message for fit in fits}) > 1:
             said = f"{said.rstrip('.')} (numbers are the first's)."
         told.append((status, who, said))
