@@ -13,6 +13,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+import planning_pictures
 import report_pictures
 from matplotlib.figure import Figure
 
@@ -99,9 +100,9 @@ def more_settings() -> Figure:
     return figure
 
 
+OWN = (scan, phase_space, lifetime, mechanisms, more_settings)
 FIGURES: dict[str, Callable[[], Figure]] = {
-    each.__name__: each
-    for each in (scan, phase_space, lifetime, mechanisms, more_settings, *report_pictures.FIGURES)
+    each.__name__: each for each in (*OWN, *planning_pictures.FIGURES, *report_pictures.FIGURES)
 }
 
 

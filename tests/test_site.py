@@ -47,7 +47,7 @@ def test_pages_and_paragraphs_are_short(root):
 
 
 def test_every_picture_of_a_page_is_made_by_the_build(root):
-    made = (root / "docs/pictures.py").read_text() + (root / "docs/report_pictures.py").read_text()
+    made = "".join(path.read_text() for path in (root / "docs").glob("*pictures.py"))
     pages = "".join(page.read_text() for page in (root / "docs").glob("*.md"))
     shown = set(re.findall(r"\(_static/(\w+)\.png\)", pages))
     assert shown == {path.stem for path in (root / "docs/_static").glob("*.png")}
