@@ -29,10 +29,10 @@ DECAY, VALVE = "beamfit/example/decay.csv", "measurements/valve_level_simulated.
 # Files of a reader's own that pages name, and what stands in for them.
 OWN = {
     "line.toml": "lattices/lcls_otr2.toml",
+    "spear3_2003_twiss.csv": "lattices/spear3_2003_twiss.csv",
     "ring.toml": "lattices/spear3_2003.toml",
     **{f"scans/{day}.csv": "measurements/lcls_otr2.csv" for day in ("mon", "tue", "wed")},
     **dict.fromkeys(("fills/one.csv", "fill.csv", "fill1.csv", "fill2.csv"), DECAY),
-    **dict.fromkeys(("week1.csv", "week2.csv"), "measurements/aps_1999_decay.csv"),
     "shift.csv": "measurements/spear3_shift_simulated.csv",
     **dict.fromkeys(("measured.csv", "monday.csv", "tuesday.csv", "friday.csv"), VALVE),
 }
@@ -79,7 +79,7 @@ def lay_out(page, words, folder):
     if words[0] != "example":
         (folder / "first").symlink_to(ROOT / "beamfit/example")
     renamed(ROOT / "measurements/lcls_otr2.csv", folder / "scan.csv", SCAN_HEADERS)
-    export(ROOT / DECAY, folder)
+    dated(ROOT / DECAY, folder)
     for block in re.findall(r"(?:^    .*\n|^\n)+", page.read_text(), re.MULTILINE):
         text = re.sub(r"^    ", "", block, flags=re.MULTILINE).strip()
         if text.startswith('format = "beamfit-layout-1"'):
@@ -95,17 +95,16 @@ def renamed(source, path, headers):
     path.write_text("\n".join([head, *rows]) + "\n")
 
 
-def export(source, folder):
-    """Write readings as an archive exports them, and as EPICS' Archiver Appliance gives them."""
-    rows = [line.split(",")[:2] for line in lines_of(source)[1:]]
+def dated(source, folder):
+    """Write readings of two weeks, as an archive exports them and as EPICS' archiver gives them."""
+    rows = [[float(cell) for cell in line.split(",")[:2]] for line in lines_of(source)[1:]]
     begin = datetime(2024, 3, 1, tzinfo=UTC)
-    times = [begin + timedelta(seconds=float(time)) for time, _ in rows]
-    lines = [f"{t:%Y-%m-%d %H:%M:%S},{i}" for t, (_, i) in zip(times, rows, strict=True)]
-    (folder / "export.csv").write_text("\n".join(["Timestamp,SR:DCCT:CURRENT", *lines]) + "\n")
-    data = [
-        {"secs": int(t.timestamp()), "nanos": 0, "val": float(i)}
-        for t, (_, i) in zip(times, rows, strict=True)
-    ]
+    heads = {"week1": "time,beam_current_mA", "week2": "time,beam_current_mA"}
+    for week, (name, head) in enumerate({"export": "Timestamp,SR:DCCT:CURRENT", **heads}.items()):
+        start = begin + week * timedelta(days=7)
+        lines = [f"{start + timedelta(seconds=time):%Y-%m-%d %H:%M:%S},{i}" for time, i in rows]
+        (folder / f"{name}.csv").write_text("\n".join([head, *lines]) + "\n")
+    data = [{"secs": int(begin.timestamp() + time), "nanos": 0, "val": i} for time, i in rows]
     archived = [{"meta": {"name": "SR:DCCT:CURRENT", "EGU": "mA"}, "data": data}]
     (folder / "archiver.json").write_text(json.dumps(archived))
 
