@@ -27,6 +27,11 @@ PAGES = {
     "page_emittance": ("emittance", *OTR2),
     "page_slices": ("emittance", "measurements/gtf_slices_simulated.csv",
                     "--lattice", "lattices/gtf.toml"),
+    "page_half": ("emittance", "{}/half.csv", "--lattice", "beamfit/example/lattice.toml",
+                  "--plane", "x"),
+    "page_posterior": ("emittance", *OTR2, "--sample"),
+    "page_study": ("lifetime", "measurements/spear3_shift_simulated.csv",
+                   "--ring", "lattices/spear3_2003.toml", "--study"),
     "page_lifetime": ("lifetime", "measurements/aps_1999_decay.csv"),
     "page_identify": ("identify", *VALVE),
     "page_control": ("control", *VALVE, "--set", "level=12", "--set", "level=15@30",
@@ -171,6 +176,8 @@ def main(names: list[str]) -> None:
     if wanted:
         with tempfile.TemporaryDirectory() as place:
             many_scans(Path(place) / "scans")
+            head = (ROOT / "beamfit/example/scan.csv").read_text().splitlines()[:8]
+            (Path(place) / "half.csv").write_text("\n".join(head) + "\n")
             shown(wanted, Path(place))
 
 
