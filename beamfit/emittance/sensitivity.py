@@ -373,5 +373,5 @@ def range_rows(fit: EmittanceFit) -> list[tuple[str, list[str]]]:
 def _range_cell(row: RangeRow | None) -> str:
     if row is None or math.isnan(row.normalized_emittance):
         return "-" if row is None else "none"
-    shift = "" if math.isnan(row.shift) else f" ({row.shift:+.1f})"
+    shift = "" if math.isnan(row.shift) else f" ({row.shift:+z.1f})"
     return f"{row.normalized_emittance * 1e6:.3f} µm{shift}"
