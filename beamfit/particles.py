@@ -6,7 +6,7 @@ REST_ENERGY = {"electron": 0.51099895069, "positron": 0.51099895069, "proton": 9
 REST_ENERGY |= {"antiproton": REST_ENERGY["proton"], "H-": 939.294073, "deuteron": 1875.612945}
 """MeV, CODATA 2022 (NIST), all of one charge; H- is a proton and two electrons, less 14.35 eV."""
 ENERGY_KEYS = {"energy_MeV": "total", "kinetic_energy_MeV": "kinetic", "momentum_MeV": "momentum"}
-"""How files say the energy of a beam, and what that is; a momentum is p c."""
+"""Energy of a beam as files give it; a momentum is p c."""
 # MeV, above the energy of every machine: a larger number is in another unit.
 _HIGHEST = 1e7
 

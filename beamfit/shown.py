@@ -1,4 +1,4 @@
-"""How a value shows itself: one line at a prompt, a table in a notebook."""
+"""Display of a value: one line at a prompt, a table in a notebook."""
 
 from __future__ import annotations
 

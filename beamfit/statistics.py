@@ -1,4 +1,4 @@
-"""What a set of data determines about a set of parameters, by singular values."""
+"""Identifiability of parameters from data, by singular values."""
 
 from __future__ import annotations
 

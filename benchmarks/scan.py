@@ -3,7 +3,7 @@
     python benchmarks/scan.py [BEAMS]
 
 SIMULATED: random beams in a line of a quadrupole and a drift, sizes of 5 shots with 3 % of noise;
-both scans over the same limits. Written to docs/live.md.
+both scans over the same limits. Written to docs/live_measured.md.
 """
 
 from __future__ import annotations

@@ -3,7 +3,7 @@
     python benchmarks/scan_line.py [SCANS]
 
 SIMULATED: beams and noise of benchmarks/scan.py, a line of two quadrupoles; a drift is a third
-longer or shorter than the file says. Written to docs/live.md.
+longer or shorter than the file says. Written to docs/live_measured.md.
 """
 
 from __future__ import annotations

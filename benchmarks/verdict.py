@@ -1,7 +1,7 @@
 """How often answers of scans hold the truth: python benchmarks/verdict.py [DRAWS] [SEED] [PAGE].
 
 Every scan is SIMULATED and drawn from a family anew: line, beam, phase advance covered, number of
-points and noise. Tables go to docs/verdict.md, between its markers, or to another PAGE.
+points and noise. Tables go to docs/verdict_measured.md, between its markers, or to another PAGE.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from beamfit.emittance.scan import QuadScan
 from beamfit.emittance.transport import rows_line
 from beamfit.status import Status
 
-PAGE = Path(__file__).resolve().parents[1] / "docs" / "verdict.md"
+PAGE = Path(__file__).resolve().parents[1] / "docs" / "verdict_measured.md"
 MARKS = "<!-- measured: benchmarks/verdict.py -->", "<!-- end of measured -->"
 POINTS = (4, 5, 6, 8, 12, 30)
 

@@ -13,6 +13,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+import planning_pictures
 import report_pictures
 from matplotlib.figure import Figure
 
@@ -26,6 +27,11 @@ PAGES = {
     "page_emittance": ("emittance", *OTR2),
     "page_slices": ("emittance", "measurements/gtf_slices_simulated.csv",
                     "--lattice", "lattices/gtf.toml"),
+    "page_half": ("emittance", "{}/half.csv", "--lattice", "beamfit/example/lattice.toml",
+                  "--plane", "x"),
+    "page_posterior": ("emittance", *OTR2, "--sample"),
+    "page_study": ("lifetime", "measurements/spear3_shift_simulated.csv",
+                   "--ring", "lattices/spear3_2003.toml", "--study"),
     "page_lifetime": ("lifetime", "measurements/aps_1999_decay.csv"),
     "page_identify": ("identify", *VALVE),
     "page_control": ("control", *VALVE, "--set", "level=12", "--set", "level=15@30",
@@ -99,9 +105,9 @@ def more_settings() -> Figure:
     return figure
 
 
+OWN = (scan, phase_space, lifetime, mechanisms, more_settings)
 FIGURES: dict[str, Callable[[], Figure]] = {
-    each.__name__: each
-    for each in (scan, phase_space, lifetime, mechanisms, more_settings, *report_pictures.FIGURES)
+    each.__name__: each for each in (*OWN, *planning_pictures.FIGURES, *report_pictures.FIGURES)
 }
 
 
@@ -170,6 +176,8 @@ def main(names: list[str]) -> None:
     if wanted:
         with tempfile.TemporaryDirectory() as place:
             many_scans(Path(place) / "scans")
+            head = (ROOT / "beamfit/example/scan.csv").read_text().splitlines()[:8]
+            (Path(place) / "half.csv").write_text("\n".join(head) + "\n")
             shown(wanted, Path(place))
 
 

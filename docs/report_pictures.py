@@ -106,6 +106,12 @@ def figs_11_13() -> Figure:
     return _identified("second-order", _other_lag, 0.1, words)
 
 
+def fig_14() -> Figure:
+    """The same with three times the output's scatter as noise."""
+    words = "figure 14: the lags of eqs 17 to 19, noise of three times the output's scatter"
+    return _identified("second-order", _other_lag, 3.0, words)
+
+
 @cache
 def _batches():
     from beamfit.dynamics.fedbatch import identify_batches
@@ -159,4 +165,4 @@ def figs_27_30() -> Figure:
     return beamfit.figures.network(study_shift(decays, machine, network=Network.alone), decays)
 
 
-FIGURES = (figs_7_8, figs_9_10, figs_11_13, figs_27_30, figs_31_33, figs_34_36)
+FIGURES = (figs_7_8, figs_9_10, figs_11_13, fig_14, figs_27_30, figs_31_33, figs_34_36)

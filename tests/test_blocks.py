@@ -1,22 +1,42 @@
-"""Code blocks of the documentation: commands are what the program takes, Python runs as it stands.
+"""Code blocks of the documentation: every command and every Python block runs as it stands.
 
-Blocks with a test beside their subject are run there: tutorial, extending, control, fedbatch,
-live_adapters, the language's own examples.
+Blocks with a test beside their subject are run there: tutorial, README and the example's files
+(cli/test_example), extending, control and fedbatch in Python, live_adapters, the language's own
+examples, and scans and watches of a machine (tests/live).
 """
 
+import json
 import re
 import shlex
+import sys
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import click
 import pytest
 
-from beamfit.cli import cli
+from beamfit.cli import cli, main
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = sorted([ROOT / "README.md", *(ROOT / "docs").glob("*.md")])
 # An indented or fenced line that begins with the program's name, and the lines it goes on in.
 COMMAND = re.compile(r"^(?:    |\$ )\$? ?(beamfit (?:.*\\\n)*.*)$", re.MULTILINE)
+ELSEWHERE = {"README", "tutorial", "language", "live", "watch"}
+# Networks, studies of a shift, posteriors and workers take 10 s and more: `make calibrate`.
+SLOW = {"network", "--study", "--sample", "--workers", "state-space", "--hold-back", "--trend"}
+SLOW |= {"transport-network"}
+DECAY, VALVE = "beamfit/example/decay.csv", "measurements/valve_level_simulated.csv"
+# Files of a reader's own that pages name, and what stands in for them.
+OWN = {
+    "line.toml": "lattices/lcls_otr2.toml",
+    "spear3_2003_twiss.csv": "lattices/spear3_2003_twiss.csv",
+    "ring.toml": "lattices/spear3_2003.toml",
+    **{f"scans/{day}.csv": "measurements/lcls_otr2.csv" for day in ("mon", "tue", "wed")},
+    **dict.fromkeys(("fills/one.csv", "fill.csv", "fill1.csv", "fill2.csv"), DECAY),
+    "shift.csv": "measurements/spear3_shift_simulated.csv",
+    **dict.fromkeys(("measured.csv", "monday.csv", "tuesday.csv", "friday.csv"), VALVE),
+}
+SCAN_HEADERS = {"Q525_kG": "QUAD:Q525:BACT", "size_x_um": "xrms", "size_x_error_um": "err"}
 
 
 def commands():
@@ -25,11 +45,83 @@ def commands():
         for found in COMMAND.findall(page.read_text()):
             words = shlex.split(found.replace("\\\n", " "), comments=True)
             if len(words) > 1 and words[1] in cli.commands:
-                yield pytest.param(words[1:], id=f"{page.stem}: {' '.join(words)[:60]}")
+                yield page, words[1:]
 
 
-@pytest.mark.parametrize("words", list(commands()))
-def test_every_command_of_every_page_has_the_options_that_it_names(words):
+def rows_of(chosen):
+    """Rows of a test, a command each; those that take long are marked."""
+    for page, words in commands():
+        if chosen(page.stem):
+            marks = [pytest.mark.calibrate] if SLOW & set(words) else []
+            name = f"{page.stem}: {' '.join(words)[:60]}"
+            yield pytest.param(page, words, id=name, marks=marks)
+
+
+@pytest.mark.parametrize(("page", "words"), list(rows_of(lambda stem: stem not in ELSEWHERE)))
+def test_every_command_of_every_page_runs(page, words, tmp_path, monkeypatch, capsys):
+    lay_out(page, words, tmp_path)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["beamfit", *expanded(words, tmp_path)])
+    with pytest.raises(SystemExit) as stop:
+        main()
+    shown = capsys.readouterr()
+    assert stop.value.code == 0, shown.err
+    assert shown.out
+
+
+def lay_out(page, words, folder):
+    """Write what stands in for a reader's files, and the files whose text the page has."""
+    for name in ("measurements", "lattices", "formulations"):
+        (folder / name).symlink_to(ROOT / name)
+    for name, source in OWN.items():
+        (folder / name).parent.mkdir(exist_ok=True)
+        (folder / name).write_text((ROOT / source).read_text())
+    if words[0] != "example":
+        (folder / "first").symlink_to(ROOT / "beamfit/example")
+    renamed(ROOT / "measurements/lcls_otr2.csv", folder / "scan.csv", SCAN_HEADERS)
+    dated(ROOT / DECAY, folder)
+    for block in re.findall(r"(?:^    .*\n|^\n)+", page.read_text(), re.MULTILINE):
+        text = re.sub(r"^    ", "", block, flags=re.MULTILINE).strip()
+        if text.startswith('format = "beamfit-layout-1"'):
+            (folder / "lcls.toml").write_text(text.partition("beamfit emittance")[0])
+        if text.startswith("# known.toml"):
+            (folder / "known.toml").write_text(text.partition("beamfit emittance")[0])
+
+
+def renamed(source, path, headers):
+    """Copy a scan under a laboratory's own headers."""
+    head, *rows = lines_of(source)
+    head = ",".join(headers.get(name, name) for name in head.split(","))
+    path.write_text("\n".join([head, *rows]) + "\n")
+
+
+def dated(source, folder):
+    """Write readings of two weeks, as an archive exports them and as EPICS' archiver gives them."""
+    rows = [[float(cell) for cell in line.split(",")[:2]] for line in lines_of(source)[1:]]
+    begin = datetime(2024, 3, 1, tzinfo=UTC)
+    heads = {"week1": "time,beam_current_mA", "week2": "time,beam_current_mA"}
+    for week, (name, head) in enumerate({"export": "Timestamp,SR:DCCT:CURRENT", **heads}.items()):
+        start = begin + week * timedelta(days=7)
+        lines = [f"{start + timedelta(seconds=time):%Y-%m-%d %H:%M:%S},{i}" for time, i in rows]
+        (folder / f"{name}.csv").write_text("\n".join([head, *lines]) + "\n")
+    data = [{"secs": int(begin.timestamp() + time), "nanos": 0, "val": i} for time, i in rows]
+    archived = [{"meta": {"name": "SR:DCCT:CURRENT", "EGU": "mA"}, "data": data}]
+    (folder / "archiver.json").write_text(json.dumps(archived))
+
+
+def lines_of(source):
+    return [line for line in source.read_text().splitlines() if not line.startswith("#")]
+
+
+def expanded(words, folder):
+    """The words as a shell gives them: patterns of files as their names."""
+    for word in words:
+        found = sorted(folder.glob(word)) if re.search(r"[*?]", word) and "=" not in word else []
+        yield from (str(path.relative_to(folder)) for path in found) if found else [word]
+
+
+@pytest.mark.parametrize(("page", "words"), list(rows_of(ELSEWHERE.__contains__)))
+def test_commands_that_run_elsewhere_have_the_options_that_they_name(page, words):
     parsed(words)
 
 
@@ -44,15 +136,6 @@ def test_an_option_that_is_none_is_found():
     assert parsed(["emittance", "scan.csv", "--json"])["as_json"]
     with pytest.raises(click.NoSuchOption):
         parsed(["emittance", "scan.csv", "--jsn"])
-
-
-@pytest.mark.parametrize("words", list(commands()))
-def test_every_file_of_measurements_that_a_command_names_is_there(words):
-    named = [w for w in words if re.match(r"(measurements|lattices|formulations|benchmarks)/", w)]
-    named += [
-        w.partition("=")[2] for w in words if re.match(r"\w+=(measurements|formulations)/", w)
-    ]
-    assert [name for name in named if not list(ROOT.glob(name))] == []
 
 
 @pytest.mark.parametrize("name", ["uncertainty", "greybox", "language"])

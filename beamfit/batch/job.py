@@ -1,4 +1,4 @@
-"""What is asked of every file, and the answer: hundreds of files at a time, wherever that runs."""
+"""Job of a batch: hundreds of files at a time, wherever they run, a row for each."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What has been answered: parts written whole beside the table, and the table made of them."""
+"""Ledger of answered files: parts written whole beside the table, and the table made of them."""
 
 from __future__ import annotations
 

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from beamfit.io.emittance_gui import EmittanceGuiFile
     from beamfit.optics.beamline import Beamline
     from beamfit.sampling.posterior import Posterior
+    from beamfit.status import Status
 
 # What `read_inputs` takes besides the scan.
 GIVEN = ["lattice", "use", "first", "last", "screen", "energy", "particle"]
@@ -126,7 +127,9 @@ def emittance(
         fits = fit_slices(measured, line, **told)
         reported(report, fits, inputs)
         results = (entry for fit in fits for entry in results_of(fit))
-        answered(as_json, results, inputs, lambda terminal: _show_slices(terminal, fits), report)
+        answered(
+            as_json, results, inputs, lambda terminal: _show_slices(terminal, fits), report, full
+        )
         return
     fit = beamfit.fit_emittance(measured, line, **told)
     methods = () if gui is None else compared(gui, line, planes)
@@ -146,16 +149,29 @@ def emittance(
 def _show_slices(terminal: Terminal, fits: SliceFits) -> None:
     """Show a row a slice, and what is said of each."""
     terminal.line(f"{fits.scan.name} on {fits.fits[0].line.name}", style="bold")
+    alike: dict[tuple[str, Status, str], list[str]] = {}
     for fit in fits:
         for p in fit.planes:
-            terminal.answer(f"slice {fit.scan.slices[0]}, {p.headline}", p.status, p.message)
+            alike.setdefault((p.plane, p.status, p.message), []).append(fit.scan.slices[0])
+    for (plane, status, message), names in alike.items():
+        which = f"slice{'s' * (len(names) > 1)} {', '.join(names)}"
+        terminal.verdict(f"{plane}, {which}", status, message)
     for note in fits.notes:
         terminal.line(note)
     terminal.line()
     for table in fits.tables():
-        terminal.table(table)
+        terminal.table(table if terminal.full else _without(table, ("status", "chi2/dof")))
         terminal.line()
     _about_the_input(terminal, fits, ())
+    if not terminal.full:
+        terminal.line("All columns: --full. A page with pictures: --report FILE.html.", style="dim")
+
+
+def _without(table: Table, names: tuple[str, ...]) -> Table:
+    """Leave out the columns of these headers."""
+    kept = [i for i, name in enumerate(table.header) if name not in names]
+    rows = [[row[i] for i in kept] for row in table.rows]
+    return table._replace(header=[table.header[i] for i in kept], rows=rows)
 
 
 def compared(

@@ -19,8 +19,11 @@ if TYPE_CHECKING:
     from beamfit.dynamics.fit import ResponseFit
     from beamfit.dynamics.state_fit import StatesFit
     from beamfit.dynamics.titre import TitreFit
+    from beamfit.table import Table
 
 
+# A table of more rows is shown by three of them; --full has all.
+MOST_SHOWN = 4
 EXAMPLE = """\b
 Examples:
   beamfit identify run.csv --model first-order
@@ -35,7 +38,7 @@ Examples:
 @click.argument("record", nargs=-1, required=True)
 @options("model order map input output step delay no-offset")
 @option("--hold-back RECORD", "A run that is only predicted.", multiple=True)
-@options("hidden columns ignore skip-bad seed report json")
+@options("hidden columns ignore skip-bad seed report full json")
 def identify(
     record: tuple[str, ...],
     model: str,
@@ -47,6 +50,7 @@ def identify(
     hold_back: tuple[str, ...],
     seed: int,
     report: str | None,
+    full: bool,
     as_json: bool,
     **reading: Any,
 ) -> None:
@@ -69,7 +73,7 @@ def identify(
     fits = beamfit.identify(runs, model, map, **settings)  # JAX from here on
     digests = {path: digest(path) for path in (*record, *hold_back)}
     reported(report, fits, digests)
-    answered(as_json, fits, digests, lambda terminal: _show(terminal, fits), report)
+    answered(as_json, fits, digests, lambda terminal: _show(terminal, fits), report, full)
 
 
 def _show(
@@ -82,6 +86,18 @@ def _show(
     for fit in fits:
         terminal.answer(fit.headline, fit.status, fit.message)
         terminal.line()
-        for table in fit.tables():
-            terminal.table(table)
+        numbers, *curves = fit.tables()
+        terminal.table(numbers)
+        terminal.line()
+        for curve in curves:
+            terminal.table(curve if terminal.full else _ends(curve))
             terminal.line()
+    if not terminal.full:
+        terminal.line("All tables: --full. A page with pictures: --report FILE.html.", style="dim")
+
+
+def _ends(curve: Table) -> Table:
+    """Keep the first, middle and last row of a long table."""
+    rows = curve.rows
+    few = [rows[0], rows[len(rows) // 2], rows[-1]] if len(rows) > MOST_SHOWN else rows
+    return curve._replace(rows=few)

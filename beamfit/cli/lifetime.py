@@ -210,7 +210,10 @@ def _show(
         terminal.verdict("trend", trend.status, trend.message)
         terminal.line()
     for each in studies:
-        _show_record(terminal, each)
+        if shift is not None and not terminal.full:
+            terminal.line(str(each.record), style="bold")
+        else:
+            _show_record(terminal, each)
     fits = [decay.fit for study in studies for decay in study.answers]
     for fit, posterior in zip(fits, posteriors or (), strict=False):
         held = "" if fit.free_law is None else ", a and b constant"
@@ -227,7 +230,7 @@ def _show(
 def _show_record(terminal: Terminal, study: RecordStudy) -> None:
     """Lay out a record: what was cut away, and every decay with its verdict and budget."""
     from beamfit.lifetime import tables
-    from beamfit.table import Table, labelled
+    from beamfit.table import Table, determined, labelled
 
     terminal.line(str(study.record), style="bold")
     for note in study.record.notes:
@@ -248,7 +251,7 @@ def _show_record(terminal: Terminal, study: RecordStudy) -> None:
             continue
         rows = tables.decay_rows([decay]) + tables.separability_rows([decay])[:2]
         rows += tables.check_rows([decay])
-        terminal.table(labelled("", [name], rows), [status])
+        terminal.table(labelled("", [name], determined(rows)), [status])
         if decay.systematics:
             unseen = tables.systematic_rows(decay)
             terminal.table(Table("\nSystematics", tables.SYSTEMATIC, unseen))
@@ -269,15 +272,14 @@ def _show_many(terminal: Terminal, study: RecordStudy) -> None:
     verdicts = tables.alike(study.decays)
     told = verdicts if terminal.full else verdicts[:MOST_VERDICTS]
     for status, names, message in told:
-        terminal.verdict(names.replace(study.record.name, ""), status, message)
+        terminal.verdict(names, status, message)
     if left := verdicts[len(told) :]:
         others = ", ".join(dict.fromkeys(cell(status) for status, *_ in left))
         terminal.line(f"\n{len(left)} more kinds of verdict ({others}): --full.")
     for title, header, rows in tables.overview(study.decays)[: None if terminal.full else 1]:
-        cells = [[name.removeprefix(study.record.name), *found] for name, *found in rows]
-        if not terminal.full and (left := len(cells) - MOST_SHOWN) > 0:
-            cells = [*cells[:MOST_SHOWN], [f"{left} more", *[""] * (len(header) - 1)]]
-        terminal.table(Table(f"\n{title}", header, cells))
+        if not terminal.full and (left := len(rows) - MOST_SHOWN) > 0:
+            rows = [*rows[:MOST_SHOWN], [f"{left} more", *[""] * (len(header) - 1)]]
+        terminal.table(Table(f"\n{title}", header, rows))
     terminal.line()
 
 
@@ -304,7 +306,7 @@ def _show_shift(terminal: Terminal, shift: Shift) -> None:
     fit, count = shift.fit, len(shift.fit.names)
     names = ["1 decay" if count == 1 else f"{count} decays"]
     table = labelled("First principles fitted to", names, tables.shift_rows(shift))
-    terminal.table(table, [fit.status])
+    terminal.table(table if terminal.full else table.quoted(), [fit.status])
     if shift.network is not None:
         table = labelled("A network of the losses", names, tables.network_rows(shift))
         terminal.table(table, [shift.network.fit.status])

@@ -1,4 +1,4 @@
-"""What commands share: options, declared once, and how a command reports and answers."""
+"""Options of several commands, declared once, and the way a command reports and answers."""
 
 from __future__ import annotations
 

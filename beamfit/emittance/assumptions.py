@@ -1,4 +1,4 @@
-"""What a user tells a scenario besides the data: priors, bounds, anchors. Plain values, no JAX."""
+"""Assumptions of a scenario: priors, bounds, anchors. Plain values, no JAX."""
 
 from __future__ import annotations
 

@@ -232,5 +232,5 @@ SCENARIO = Scenario(
     _parameters,
     _null_directions,
     _remedy,
-    aside=", and the emittance hardly does",
+    aside="; the emittance is not affected",
 )

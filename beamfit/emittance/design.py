@@ -1,4 +1,4 @@
-"""What to measure next: Fisher information of further settings, screens and energies.
+"""Design of the next measurement: Fisher information of further settings, screens and energies.
 
 Every candidate is one more measured size (of each plane that was measured), with the relative error
 the scan has. Its row of the Jacobian updates the covariance of all free numbers of the scenario, so

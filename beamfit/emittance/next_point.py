@@ -1,4 +1,4 @@
-"""What a further size would tell of the beams of a scan, from the draws of their posterior."""
+"""Expected information of a further size, from the posterior draws of a scan."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a fitted beam would measure at other settings, and how its numbers go together."""
+"""Predicted sizes of a fitted beam at other settings, and correlations of its numbers."""
 
 from __future__ import annotations
 

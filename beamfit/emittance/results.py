@@ -1,4 +1,4 @@
-"""What a fit says of one plane: frozen values that say whether to believe them, and a table."""
+"""Result of a fit for one plane: quantities, status, message, points and a table."""
 
 from __future__ import annotations
 

@@ -213,7 +213,7 @@ def _remark(scenario: Scenario, parameters: tuple[Parameter, ...]) -> str:
     priors = ", ".join(p.name for p in parameters if p.prior is not None)
     said = ""
     if left:
-        said += f" {left} not determined: what depends on it has no error{scenario.aside}."
+        said += f" {left} not determined{scenario.aside}."
     if not parameters and not scenario.network:
         said += " Nothing is free besides the beam, so this is the fit with known transport."
     if priors:

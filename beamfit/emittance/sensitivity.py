@@ -1,4 +1,4 @@
-"""What the emittance would be if something were a little different.
+"""Sensitivity of the emittance to screen, beam and line.
 
 The systematics budget takes the exact derivative of the whole chain, transport and fit, by
 each number of the line; the range table refits without some points.
@@ -373,5 +373,5 @@ def range_rows(fit: EmittanceFit) -> list[tuple[str, list[str]]]:
 def _range_cell(row: RangeRow | None) -> str:
     if row is None or math.isnan(row.normalized_emittance):
         return "-" if row is None else "none"
-    shift = "" if math.isnan(row.shift) else f" ({row.shift:+.1f})"
+    shift = "" if math.isnan(row.shift) else f" ({row.shift:+z.1f})"
     return f"{row.normalized_emittance * 1e6:.3f} µm{shift}"

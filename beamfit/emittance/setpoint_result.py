@@ -1,4 +1,4 @@
-"""What a search for settings found, and the rules by which it is judged."""
+"""Result of a search for settings, and the rules of its verdict."""
 
 from __future__ import annotations
 
@@ -283,7 +283,7 @@ def notes_on(beams: Mapping[str, Beam], energy: float, lattice: float) -> tuple[
     if any(beam.calibration and beam.covariance is not None for beam in beams.values()):
         said.append(CALIBRATED)
     if all(beam.covariance is None and beam.doubt is None for beam in beams.values()):
-        said.append("No errors: the beam was given without its own (--fit brings them).")
+        said.append("No errors: pass --fit to include the beam's.")
     return tuple(said)
 
 

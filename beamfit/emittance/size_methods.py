@@ -1,4 +1,4 @@
-"""What the way of taking sizes from profiles does to the answer of a scan."""
+"""Emittances of one scan by several ways of taking sizes from profiles."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a scenario is: a value that states a scan as a problem and says what it cannot know."""
+"""A scenario: the value that states a scan as a problem, with its null spaces."""
 
 from __future__ import annotations
 

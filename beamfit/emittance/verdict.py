@@ -1,4 +1,4 @@
-"""Whether sizes determine an emittance: what the comparison of models says, in sentences."""
+"""The verdict on an emittance: the comparison of models in sentences."""
 
 from __future__ import annotations
 

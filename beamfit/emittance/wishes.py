@@ -1,4 +1,4 @@
-"""What is wanted at a screen, of which beam, and whether it can be searched for at all."""
+"""Targets at a screen, the beams they are for, and what a search needs of both."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a file says, as beamfit reads it: for a person to see before anything is fitted."""
+"""Summary of a file as beamfit reads it, for a person to see before anything is fitted."""
 
 from __future__ import annotations
 

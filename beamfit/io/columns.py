@@ -23,7 +23,7 @@ DATE = "a date"
 # What programs write where there is no number.
 BLANK = {"", "nan", "-nan", "na", "n/a", "n.a.", "#n/a", "<na>", "null", "none", "-", "--", "---"}
 BLANK |= {"nan(ind)", "-nan(ind)", "1.#qnan", "-1.#ind", "1.#ind", "#num!", "#value!"}
-# Rows left out, and columns left aside, that a note names one by one.
+# Most rows left out, or columns ignored, that a note names one by one.
 MOST_NAMED, MOST_ASIDE = 5, 8
 
 
@@ -65,7 +65,7 @@ class Sheet:
     order : str
         Of dates whose day and month are numbers, where a layout says it.
     arranged : bool
-        Whether there is a layout: columns that nobody knows are then left aside.
+        Whether there is a layout: unknown columns are then ignored.
     """
 
     path: str | PathLike[str]
@@ -125,7 +125,7 @@ class Sheet:
         found : str
             How to say what stands there, with {} in the place of the value.
         values : sequence, optional
-            One a row; the cells unless said.
+            One a row; default: the cells.
         """
         if wrong.any():
             row = int(np.argmax(wrong))
@@ -163,7 +163,7 @@ class Sheet:
         if len(left) in (0, len(self.names)):
             return self
         names = tuple(self.names[i] for i in left)
-        note = "A column without a name was left aside."
+        note = "A column without a name was ignored."
         cells = [self.cells[i] for i in left]
         return replace(self, names=names, cells=cells, notes=(*self.notes, note))
 
@@ -448,7 +448,7 @@ class Layout:
 
 
 Columns = str | PathLike[str] | Mapping[str, str] | Layout | None
-"""How a reader takes what is said of columns; see `layout_of`."""
+"""Layout of columns as a reader takes it; see `layout_of`."""
 
 
 def _spellings(header: str) -> set[str]:
@@ -529,7 +529,7 @@ def arranged(sheet: Sheet, layout: Layout) -> Sheet:
     sheet : Sheet
         The file.
     layout : Layout
-        What its columns are; unknown columns beside are then left aside.
+        What its columns are; other columns of unknown names are then ignored.
 
     Returns
     -------

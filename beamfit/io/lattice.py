@@ -245,7 +245,7 @@ def _element(section: Section, number: int) -> Mapping[str, Any]:
 
 
 def _check_strength(section: Section, setting: str) -> None:
-    """With a current exactly one calibration, otherwise none."""
+    """Require exactly one calibration where there is a current, none elsewhere."""
     given = set().union(*CALIBRATIONS) & set(section.table)
     name, current = section.table["name"], setting == "current_A"
     if "signed_intercept" in section.table and not given >= POLYNOMIAL:

@@ -1,4 +1,4 @@
-"""What the columns of a record of beam current mean, also of an archive's and of a logger's."""
+"""Columns of a record of beam current, also of an archive's and of a logger's."""
 
 from __future__ import annotations
 

@@ -50,9 +50,9 @@ def read_run(
         and outputs ``y_…``. A blank output was not read.
     columns : str, path, mapping or Layout, optional
         What columns are: ``{"valve position": "u_valve"}``, or as `beamfit.io.columns.layout_of`
-        reads it. Other columns of unknown names are left aside.
+        reads it. Other columns of unknown names are ignored.
     inputs, outputs : iterable of str
-        Columns of other names that are inputs or outputs; what is not named is then left aside.
+        Columns of other names that are inputs or outputs; the others are then ignored.
     step : float, optional
         Distance of the rows in s, of a file without a time.
     ignore : iterable of str

@@ -1,4 +1,4 @@
-"""What is wrong with a document is found before JAX is loaded."""
+"""Check a document before JAX is loaded."""
 
 from __future__ import annotations
 

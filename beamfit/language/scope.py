@@ -1,4 +1,4 @@
-"""What the names of a mapping mean: sets, arrays, functions, other mappings; and its steps.
+"""Scope of a mapping: the sets, arrays, functions and mappings of its names; and its steps.
 
 All of it is known before anything is computed: elements of sets are whole numbers, so that every
 index is checked, and every statement's reach known, without JAX.

@@ -1,4 +1,4 @@
-"""What a step of a mapping writes, what it computes from, and what a call calls."""
+"""Steps of a mapping: what they write, what they read, and what a call calls."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is wrong with a text that is not in the language, in words."""
+"""Syntax errors of the language in words."""
 
 from __future__ import annotations
 

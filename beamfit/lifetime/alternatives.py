@@ -1,4 +1,4 @@
-"""What may be behind a decay that constant a and b do not describe, compared by evidence.
+"""Alternatives to constant a and b of a decay, compared by evidence.
 
 A bunch that lengthens, a gas that is pumped away after a fill, a loss rate that changes once or
 twice: each is the one law with further numbers, under the same noises, with stated priors.
@@ -73,15 +73,15 @@ class ConstantA:
     ----------
     status : Status
         `converged` if a constant a describes the record, `poor_fit` if it is rejected,
-        `unidentified` if the record cannot tell.
+        `unidentified` if the record does not test it.
     message : str
         The verdict in a sentence.
     exponent : Quantity
         s in a(I) proportional to I^s: 0 for constant a, -1/3 for a strongly lengthening bunch,
         above 0 where the loss rate falls otherwise, as in a vacuum that recovers; NaN if the
-        record cannot tell.
+        record does not test it.
     p_value : float
-        Probability of a worse contradiction if a is constant; NaN if the record cannot tell.
+        Probability of a worse contradiction if a is constant; NaN if the record does not test it.
     """
 
     status: Status

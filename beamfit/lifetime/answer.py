@@ -165,8 +165,9 @@ def _inseparable(e: Evidence) -> Finding | None:
     return Finding(
         Status.unidentified,
         f"a and b are not separable on this record (correlation {found.correlation:.6f}; share "
-        f"of a in the loss {found.share:.2g} ± {found.share_error:.2g}); the lifetime at the "
-        f"mean current is: record {max(longer, 1.1):.2g} times longer, or at several currents",
+        f"of a in the loss {found.share:.2g} ± {found.share_error:.2g}), the lifetime at the mean "
+        f"current is determined. A record {max(longer, 1.1):.2g} times longer, or at several "
+        "currents, would separate them",
     )
 
 
@@ -202,14 +203,14 @@ def _improbable(e: Evidence | TableEvidence, remedy: str = "") -> Finding | None
 
 
 def _determined(e: Evidence | TableEvidence) -> Finding:
-    """Each of the two by itself: one that is small is known to be so, but is not told from zero."""
+    """Judge a and b each by itself; one that is compatible with zero has an upper limit."""
     found = {name: e.sure(name) for name in "ab"}
     small = {n: (v, error) for n, (v, error) in found.items() if not error < DETERMINED * v}
     if not small:
         return Finding(Status.converged, "a and b are determined")
     limits = " and ".join(
-        f"{name} is not told from zero: it is below {max(v, 0) + LIMIT * error:.2g} {UNITS[name]} "
-        "at 95 %"
+        f"{name} is compatible with zero: it is below {max(v, 0) + LIMIT * error:.2g} "
+        f"{UNITS[name]} at 95 %"
         for name, (v, error) in small.items()
     )
     clear = "".join(f"{name} is determined; " for name in found if name not in small)
@@ -433,8 +434,8 @@ def _drifting(e: Evidence) -> str | None:
         return None
     called = {"rate_mean": "the lifetime"}.get(name, name)
     return (
-        "The monitor's stability is not stated; if it drifted by "
-        f"{drift:.2g} mA over the record, {called} is off by its error"
+        "The monitor's stability is not stated; a drift of "
+        f"{drift:.2g} mA over the record would shift {called} by 1 σ"
     )
 
 

@@ -1,4 +1,4 @@
-"""What a fitted law is worth: values and errors of one decay or many cycles, with their noise."""
+"""Evidence of a fitted law: values and errors of one decay or many cycles, with their noise."""
 
 from __future__ import annotations
 

@@ -285,7 +285,7 @@ def fit_lifetimes(table: LifetimeTable) -> LifetimeFit:
 
 
 def _reach(table: LifetimeTable, fit: Fit) -> float:
-    """Errors that 95 % of answers lie within."""
+    """Half of the 95 % interval, in standard errors."""
     return reach_of(math.inf if table.error is not None else round(fit.group(RECORD).dof))
 
 

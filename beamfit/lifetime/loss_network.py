@@ -215,7 +215,7 @@ MOST = 30.0
 # Relative error of the model that a first fit is made with, and its correlation length: of half the
 # range of each input, or of that where less was seen. Chosen on simulated shifts.
 TRIAL, LENGTH, SHORTEST = 0.05, 0.8, 0.1
-# Where b is less than this share of the loss it is not told from it.
+# Below this share of the loss b is compatible with zero.
 SMALLEST = 1e-3
 # Voltages at which a correction is looked at.
 VOLTAGES = 65

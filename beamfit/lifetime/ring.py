@@ -1,4 +1,4 @@
-"""What the loss mechanisms must know of a storage ring: plain values, pytrees for JAX."""
+"""A storage ring as its loss mechanisms need it: plain values, pytrees for JAX."""
 
 from __future__ import annotations
 

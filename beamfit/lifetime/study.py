@@ -354,7 +354,7 @@ class Decay:
     def of(
         cls, segment: DecayRecord, offset: float, fit: DecayFit, machine: Machine | None
     ) -> Decay:
-        """With the losses of a ring, if there is one."""
+        """Add the losses of a ring, if there is one."""
         return cls(segment, offset, fit, None if machine is None else budget(segment, machine))
 
     @cached_property

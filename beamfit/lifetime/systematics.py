@@ -1,4 +1,4 @@
-"""What no residual shows, and how far off simpler analyses are."""
+"""Systematics of a decay that no residual shows, and the bias of simpler analyses."""
 
 from __future__ import annotations
 

@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 from beamfit.lifetime.fit import DecayFit
-from beamfit.lifetime.mechanisms import LINEAR, QUADRATIC, Mechanism
+from beamfit.lifetime.mechanisms import LINEAR, QUADRATIC, SCALES, Mechanism
 from beamfit.lifetime.pieces import Event
 from beamfit.lifetime.ring import Operation
 from beamfit.lifetime.ring_study import Shift
@@ -29,6 +29,8 @@ class DecayRow(NamedTuple):
 MOST_EVENTS = 100
 # How many decays have every number shown; of more only the main ones, a row each.
 FEW = 4
+# Rows of a study of many decays that stand on the first screen, by the beginnings of their labels.
+QUOTED = (*(f"{name}, " for name in SCALES), "chi2/dof", "lifetime", "best", "next decay, choice 1")
 # Percent of the loss below which a mechanism's digits say nothing.
 NEGLIGIBLE = 1e-6
 
@@ -180,7 +182,7 @@ def _constant_a(decay: Decay) -> str | None:
         return None
     said = {Status.converged: "not contradicted", Status.poor_fit: "rejected"}
     chance = f" (p = {found.p_value:.2g})"
-    return said[found.status] + chance if found.status in said else "the record cannot tell"
+    return said[found.status] + chance if found.status in said else "not testable with this record"
 
 
 CHECKS: tuple[DecayRow, ...] = (
@@ -306,11 +308,19 @@ def overview(decays: Sequence[Decay]) -> list[tuple[str, list[str], list[list[st
         Title, header and rows of each table.
     """
     known = {"Losses from first principles": LOSSES} if _budgets_known(decays) else {}
-    tables = []
+    tables, names = [], numbered(decays)
     for title, wanted in (MAIN | known).items():
-        rows = [[d.fit.record, *(cell(row.value(d)) for row in wanted)] for d in decays]
+        rows = [[names[d.fit.record], *(cell(row.value(d)) for row in wanted)] for d in decays]
         tables.append((title, ["decay", *(row.label for row in wanted)], rows))
     return tables
+
+
+def numbered(decays: Sequence[Decay]) -> dict[str, str]:
+    """Name of each decay in a table: its number alone where all are of one record."""
+    names = [decay.fit.record for decay in decays]
+    records = {name.rpartition("#")[0] for name in names}
+    whole = len(records) > 1 or "" in records
+    return {name: name if whole else "#" + name.rpartition("#")[2] for name in names}
 
 
 def alike(decays: Sequence[Decay]) -> list[tuple[Status, str, str]]:
@@ -323,11 +333,11 @@ def alike(decays: Sequence[Decay]) -> list[tuple[Status, str, str]]:
         well = fit.status is Status.converged
         words = re.sub(r"\d[\d.e+-]*", "#", fit.message) if well else fit.message
         found.setdefault((fit.status, words), []).append(fit)
-    told = []
+    told, names = [], numbered(decays)
     for (status, _), fits in found.items():
-        who, said = fits[0].record, fits[0].message
+        who, said = names[fits[0].record], fits[0].message
         if len(fits) > 1:
-            who = f"{len(fits)} decays, {who} to {fits[-1].record}"
+            who = f"{len(fits)} decays, {who} to {names[fits[-1].record]}"
         if len({fit.message for fit in fits}) > 1:
             said = f"{said.rstrip('.')} (numbers are the first's)."
         told.append((status, who, said))
@@ -390,7 +400,7 @@ def shift_rows(shift: Shift) -> list[Row]:
         asked = proposal.candidate
         said = f"{asked.current:.4g} mA (information {proposal.information:.3g})"
         rows.append((f"next decay, choice {number}", f"{_setting(asked.operation)}, {said}"))
-    return [Row(label, [value]) for label, value in rows]
+    return [Row(label, [value], label.startswith(QUOTED)) for label, value in rows]
 
 
 def network_rows(shift: Shift) -> list[Row]:

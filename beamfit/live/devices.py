@@ -1,4 +1,4 @@
-"""What a scan moves and reads: magnets, a screen and a guard, as a scan asks of them, by EPICS."""
+"""Devices of a scan by EPICS: magnets, a screen and a guard."""
 
 from __future__ import annotations
 

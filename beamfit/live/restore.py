@@ -1,4 +1,4 @@
-"""What a scan has to restore: on disk before anything moves, put back whatever happens."""
+"""Restoring a machine after a scan: on disk before anything moves, put back whatever happens."""
 
 from __future__ import annotations
 

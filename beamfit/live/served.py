@@ -1,4 +1,4 @@
-"""What a watch finds as variables of the control system: PV Access, nobody can write to them."""
+"""Results of a watch as read-only variables of the control system, by PV Access."""
 
 from __future__ import annotations
 

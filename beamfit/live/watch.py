@@ -221,7 +221,7 @@ async def watch(
     show : callable
         Is given what is known, every second.
     seconds : float, optional
-        How long; for good unless said.
+        Duration; default: without end.
 
     Returns
     -------

@@ -1,4 +1,4 @@
-"""What is known of the noise of beam sizes before they are seen: priors, each with its reason."""
+"""Noise models of beam sizes: priors, each with its reason."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What numpy and JAX share: values whose numbers may be either's."""
+"""Arrays of numpy or JAX behind one type."""
 
 from __future__ import annotations
 

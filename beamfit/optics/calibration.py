@@ -1,4 +1,4 @@
-"""What a magnet's setting means: from amperes, kilogauss or 1/m² to focusing strength.
+"""Calibration of a magnet: from amperes, kilogauss or 1/m² to focusing strength.
 
 Each calibration is a frozen value with ``unit`` (the word a scan's column header ends in) and
 ``k1l(setting, length, energy)``, the integrated strength in 1/m, of any shape.
@@ -16,7 +16,7 @@ from beamfit.optics.arrays import array_module, value
 from beamfit.optics.particle import ELECTRON_MASS, rigidity
 
 SETTING_UNITS = {"A": "A", "kG": "kG", "T_per_m": "T/m", "k1": "1/m²", "k1l": "1/m"}
-"""How the unit of a setting is written for people."""
+"""Units of settings as people write them."""
 
 
 @value()

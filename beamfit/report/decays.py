@@ -81,7 +81,8 @@ def decay_page(
     decays = [decay for study in studies for decay in study.decays]
     listed = []
     if shift is not None:
-        listed.append(labelled("All decays", ["value"], tables.shift_rows(shift), SHIFT))
+        found = labelled("All decays", ["value"], tables.shift_rows(shift), SHIFT)
+        listed += [found.quoted()._replace(title="Result", note="", header=[]), found]
     if shift is not None and shift.network is not None:
         listed.append(labelled("A network of the losses", ["value"], tables.network_rows(shift)))
     listed += [] if trend is None else trend.tables()
@@ -355,7 +356,8 @@ def draw_budget(figure: FigureBase, decays: Sequence[Decay]) -> None:
             hollow = "white" if found.error is None else "black"
             axes.errorbar(1 / found.value, y, xerr=error, fmt="D", color="black", mfc=hollow, ms=5)
     axes.errorbar([], [], fmt="D", color="black", ms=5, label="measured")
-    axes.set_yticks(place, [decay.fit.record for decay in shown])
+    names = tables.numbered(shown)
+    axes.set_yticks(place, [names[decay.fit.record] for decay in shown])
     more = f", {MOST_DRAWN} of {len(decays)} decays" if len(decays) > MOST_DRAWN else ""
     axes.set(title=f"computed losses{more}", xlabel="loss rate at the mean current, 1/h")
     axes.set(xlim=(0, None), ylim=(-0.6, len(shown) - 0.4))

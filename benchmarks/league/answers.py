@@ -11,7 +11,9 @@ DEFINITION = """\
 A tool **answers** if it gives a finite value, says no warning (none in Python, no status or flag
 of its own that speaks against the answer), and the error it gives, if it gives any, is finite. An
 answer is **confident and wrong** if it lies more than 3 of its errors *and* more than 10 % from the
-truth; a tool that gives no error is wrong beyond 10 %. Where a tool gives an interval of 95 %, as
+truth; a tool that gives no error is wrong beyond 10 %.
+
+Where a tool gives an interval of 95 %, as
 beamfit does (by Student's t where few residuals tell the noise, to one side where a bunch may
 lengthen), how far it reaches towards the truth, over 1.96, is the error.
 Where nothing is there (no beam, no decay), an emittance or a loss rate more than 3 errors from zero

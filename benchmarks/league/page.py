@@ -1,4 +1,4 @@
-"""docs/league.md from results.json: the page is written, never edited."""
+"""docs/league*.md from results.json: the pages are written, never edited."""
 
 from __future__ import annotations
 
@@ -8,18 +8,22 @@ from pathlib import Path
 from .answers import DEFINITION
 from .honesty import KINDS, cases
 
-PAGE = Path(__file__).resolve().parents[2] / "docs" / "league.md"
+PLACE = Path(__file__).resolve().parents[2] / "docs"
 MOST_WRONG, MOST_REFUSED = 1.0, 2.0  # percent
 HEAD = """\
 # The league
 
 beamfit and what else can be had, on the same SIMULATED data in the same run; `make league` measures
 it again and writes this page. Cases and their noise are in `benchmarks/league/scans.py` and
-`decays.py`, made without the tools. Of the peers pyemittance analyses scans; cheetah has the
+`decays.py`, made without the tools.
+
+Of the peers pyemittance analyses scans; cheetah has the
 optics, and scipy, lmfit and emcee the fits that one then writes oneself, as here (emcee: 32 chains,
 300 steps, no look at whether they have settled). lcls-tools and elegant's sddsemitproc are not on
 PyPI: what is run is their method, written from its description. pyAT, MAD-X, xfields, CasADi,
-jax-sysid and do-mpc analyse no such measurement: they are asked for speed alone. Draws are in the
+jax-sysid and do-mpc analyse no such measurement: they are asked for speed alone.
+
+Draws are in the
 heads of tables, least and most: 1000 where time allowed; one wrong answer of 60 is 1.7 %. What is
 not in a table was not reached. In bold is what exceeds 1 % of wrong or 2 % of refused.
 
@@ -27,6 +31,7 @@ not in a table was not reached. In bold is what exceeds 1 % of wrong or 2 % of r
 
 """
 TITLES = {"scans": "Emittance from a quadrupole scan", "decays": "a, b and lifetime from a decay"}
+PAGES = {"scans": "league_scans", "decays": "league_decays"}
 
 
 def percent(count: int, draws: int) -> str:
@@ -94,22 +99,31 @@ def ordered(found: dict, names: dict) -> dict:
     return {name: found[name] for name in names if name in found}
 
 
+def field_of(name: str, found: dict) -> dict:
+    """Cases of a study by kind."""
+    return {kind: ordered(found[kind], cases(name, kind)) for kind in KINDS if kind in found}
+
+
 def honesty(results: dict) -> str:
     said = DEFINITION + "\n"
     for name, found in results.items():
-        field = {kind: ordered(found[kind], cases(name, kind)) for kind in KINDS if kind in found}
-        said += f"\n### {TITLES[name]}\n\n{summary(field)}"
-        said += "\n**Traps that the data can reveal**: confident and wrong, % (draws)\n\n"
-        said += share_of(field["traps"], "wrong", MOST_WRONG)
-        said += "\n**Good cases**: refused, %\n\n" + share_of(
-            field["good"], "refused", MOST_REFUSED
-        )
-        said += "\n**Good cases**: confident and wrong, %\n\n"
-        said += share_of(field["good"], "wrong", MOST_WRONG)
-        if "hidden" not in field:
-            continue
-        said += "\n**What the data cannot show**: confident and wrong, %, and what beamfit says\n\n"
-        said += share_of(field["hidden"], "wrong", 100.0)
+        said += f"\n### {TITLES[name]}\n\n{summary(field_of(name, found))}"
+        said += f"\nCase by case: [{TITLES[name]}]({PAGES[name]}.md).\n"
+    return said
+
+
+def every_case(name: str, found: dict) -> str:
+    """Page of the cases of one study."""
+    field = field_of(name, found)
+    said = f"# The league: {TITLES[name][0].lower()}{TITLES[name][1:]}\n\n"
+    said += "All data are SIMULATED; words and tools are those of [the league](league.md).\n"
+    said += "\n## Traps that the data can reveal\n\nConfident and wrong, % (draws):\n\n"
+    said += share_of(field["traps"], "wrong", MOST_WRONG)
+    said += "\n## Good cases\n\nRefused, %:\n\n" + share_of(field["good"], "refused", MOST_REFUSED)
+    said += "\nConfident and wrong, %:\n\n" + share_of(field["good"], "wrong", MOST_WRONG)
+    if "hidden" in field:
+        said += "\n## What the data cannot show\n\nConfident and wrong, %:\n\n"
+        said += share_of(field["hidden"], "wrong", 100.0) + "\nWhat beamfit says:\n"
         said += "".join(f"\n- {n}: {c['says']}" for n, c in field["hidden"].items()) + "\n"
     return said
 
@@ -162,8 +176,10 @@ def write(results: dict) -> None:
     text = HEAD
     if "honesty" in results:
         text += honesty(results["honesty"])
+        for name, found in results["honesty"].items():
+            (PLACE / f"{PAGES[name]}.md").write_text(every_case(name, found))
     if "speed" in results:
         text += speed(results["speed"])
     if "machine" in results:
         text += f"\nMeasured with {results['machine']}.\n"
-    PAGE.write_text(text)
+    (PLACE / "league.md").write_text(text)

@@ -49,7 +49,7 @@ def test_pure_noise_is_never_an_emittance(request, spread, errors):
 
 @pytest.mark.parametrize("which", ["9 gradients", "the 5 of OTR2"])
 def test_few_points_of_noise_are_seldom_lucky(request, which):
-    """At five points a parabola can fit noise by chance; docs/verdict.md has the rate."""
+    """At five points a parabola can fit noise by chance; docs/verdict_measured.md has the rate."""
     statuses = [
         fit.status
         for errors in (True, False)

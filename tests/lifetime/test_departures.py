@@ -208,7 +208,7 @@ def test_each_of_a_and_b_is_judged_by_itself():
     time, beam = integrated(lambda t, i: A * i + 1e-10)
     fit = fit_decay(noisy(time, beam, 0.05), law="constant")
     assert fit.status == "converged"
-    assert "a is determined; b is not told from zero" in fit.message
+    assert "a is determined; b is compatible with zero" in fit.message
     free = fit_decay(noisy(time, beam, 0.05))
     assert "b is compatible with zero: it is below" in free.message
     assert free.b.interval_95[0] == 0.0

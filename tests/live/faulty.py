@@ -1,6 +1,6 @@
 """Scans of the simulated injector with a fault each: what became of the magnet.
 
-`python -m tests.live.faulty 1000 [SEED [FAULT ...]]` runs as many: the table of docs/live.md.
+`python -m tests.live.faulty 1000 [SEED [FAULT ...]]` runs as many: docs/live_measured.md.
 """
 
 from __future__ import annotations

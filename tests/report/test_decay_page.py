@@ -76,5 +76,5 @@ def test_many_decays_have_a_row_each_and_alike_verdicts_are_said_once(tmp_path):
     for suffix in ("html", "pdf"):
         beamfit.write_report(tmp_path / f"many.{suffix}", (study,))
     page = (tmp_path / "many.html").read_text()
-    assert "<td>record#6</td>" in page
+    assert "<td>#6</td>" in page
     assert page.count('<div class="verdict') - len(study.pooled) < 6
