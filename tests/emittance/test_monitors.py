@@ -12,6 +12,7 @@ from beamfit.errors import InputError
 from beamfit.optics.beam import BeamMatrix
 from beamfit.optics.beamline import Beamline
 from beamfit.optics.elements import Drift, Quadrupole, Screen
+from tests.simulations import simulations
 
 # A focusing cell with five wires; nothing moves.
 FODO = """format = "beamfit-lattice-1"

@@ -51,6 +51,7 @@ def test_the_density_is_scipys(uneven):
         CorrelatedNoise(0.05, 1.0),
     ],
 )
+from tests.simulations import simulations
 def test_both_parts_of_the_noise_have_scipys_density(uneven, noise):
     row = np.random.default_rng(5).normal(size=40)
     white, volume = whitened_of_both(row, np.diff(uneven), noise)
@@ -76,12 +77,13 @@ def test_each_noise_is_generalised_least_squares_by_dense_matrices(uneven):
         np.testing.assert_allclose(covariance, np.linalg.inv(information), rtol=1e-4)
 
 
-def test_a_slow_drift_under_white_noise_is_in_the_errors():
+@simulations(20, 60)
+def test_a_slow_drift_under_white_noise_is_in_the_errors(count):
     """With a memory alone, a third of such intervals of 95 % held the truth."""
     rng, time = np.random.default_rng(9), np.linspace(0.0, 1.0, 300)
     slopes = np.column_stack([np.ones(300), time, time**2])
     held = []
-    for _ in range(60):
+    for _ in range(count):
         drift = lfilter([np.sqrt(1 - 0.98**2)], [1, -0.98], rng.normal(size=1300))[1000:]
         said = memory_of(slopes, drift + rng.normal(size=300), time).moments(np.eye(3))
         held.append(np.abs(said.shift) < said.reach)
