@@ -15,6 +15,7 @@ from beamfit.lifetime.lifetime_table import fit_lifetimes
 from beamfit.lifetime.marginal import NODE, Numbers, SeenDecay, drawn, quantiles
 from beamfit.lifetime.record import Conditions, DecayRecord, LifetimeTable
 from beamfit.lifetime.study import study_record
+from tests.simulations import simulations
 
 HOUR, A, B, I0 = 3600.0, 4e-8, 6e-6, 300.0
 
@@ -53,7 +54,6 @@ def test_the_closed_form_is_the_integrated_law(share, power, drift):
 @pytest.mark.parametrize(
     "given", [{}, {"exponent": -1 / 3}, {"exponent": 0.3}, {"drift": 0.1}, {"drift": -0.1}]
 )
-from tests.simulations import simulations
 def test_intervals_hold_the_truth_whatever_the_law(given, count):
     """At 0.1 % noise a constant a is off by up to 35 % at a quoted 1 %."""
     records = [record(seed, **given) for seed in range(count)]
