@@ -8,6 +8,7 @@ from beamfit.lifetime.evidence import Evidence
 from beamfit.lifetime.expansion import PLAIN, POWER, Pieces, solved, solved_together
 from beamfit.lifetime.posterior import decay_problem
 from beamfit.lifetime.record import DecayRecord
+from tests.simulations import simulations, widened
 
 
 def law(time, i0, a, b):
@@ -35,7 +36,6 @@ def fitted(time, measured, error=None, **options):
         (2.4925e-7, 2.437e-6, 36000),
     ],
 )
-from tests.simulations import simulations, widened
 def test_the_decays_of_figures_27_to_30(a, b, span):
     time = np.linspace(0, span, 300)
     _, fit = fitted(time, noisy(time, 500.0, a, b, 0.05, 1), 0.05)

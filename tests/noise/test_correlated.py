@@ -15,6 +15,7 @@ from beamfit.noise.correlated import (
     whitened,
     whitened_of_both,
 )
+from tests.simulations import simulations
 
 
 @pytest.fixture
@@ -51,7 +52,6 @@ def test_the_density_is_scipys(uneven):
         CorrelatedNoise(0.05, 1.0),
     ],
 )
-from tests.simulations import simulations
 def test_both_parts_of_the_noise_have_scipys_density(uneven, noise):
     row = np.random.default_rng(5).normal(size=40)
     white, volume = whitened_of_both(row, np.diff(uneven), noise)
