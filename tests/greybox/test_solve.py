@@ -354,7 +354,7 @@ def test_appendix_b_reaches_an_optimum_from_random_starts(count):
     assert all(attempt.kkt.worst <= 1e-6 for attempt in fit.attempts)
     # Any invertible change of (A, B) is taken up by sigma: the beam is not determined, and the
     # best of few starts lies at limits of the gains.
-    assert fit.status == Status.unidentified or count < 10 and fit.status == Status.at_limit
+    assert fit.status == Status.unidentified or (count < 10 and fit.status == Status.at_limit)
     assert np.isnan(fit["s11"].error)
 
 
