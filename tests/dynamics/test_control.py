@@ -37,7 +37,7 @@ def made(*responses, horizon=10, rate=0.3, above=INF, step=0.5, m=1, smooth=0.1)
 LAG = response(FIRST_ORDER, [2.0, 1.5], delay=2)
 
 
-@simulations(100, 1000)
+@simulations(300, 1000)
 def test_perturbed_loops_break_no_limit_of_an_input_or_of_its_rate(count):
     """Noise, gain and time constant 20 % off, steps of disturbances, and an upper limit."""
     control = made(LAG, above=3.0, horizon=8)

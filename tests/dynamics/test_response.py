@@ -62,7 +62,7 @@ def walk_and_white(rng, n):
     return rng.normal(size=n) + 0.3 * np.cumsum(rng.normal(size=n))
 
 
-@simulations(5, 16)
+@simulations(10, 16)
 @pytest.mark.parametrize(
     "noise_of",
     [lambda rng, n: lfilter([1.0], [1.0, -0.8], rng.normal(size=n)), walk_and_white],
