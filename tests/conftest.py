@@ -9,10 +9,13 @@ from pathlib import Path
 import pytest
 from hypothesis import settings
 
-# Compiling is most of the tests' time: do it without optimisation and by the older of XLA's two
-# ways to emit fused loops, which takes a third of the time, and keep it for the next run.
+# Compiling is most of the tests' time: do it without optimisation, in one part, and by the older of
+# XLA's two ways to emit fused loops, which takes a third of the time, and keep it for the next run.
 _QUICK = "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false"
+_QUICK += " --xla_llvm_disable_expensive_passes=true --xla_cpu_parallel_codegen_split_count=1"
 os.environ.setdefault("XLA_FLAGS", _QUICK)
+# No test reads which line of Python an instruction of a compiled program came from.
+os.environ.setdefault("JAX_TRACEBACK_IN_LOCATIONS_LIMIT", "0")
 _CACHE = Path(__file__).resolve().parents[1] / ".pytest_cache" / "jax"
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(_CACHE))
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
@@ -51,6 +54,12 @@ class _Programs:
             # What is freed is given back, or every test after this one would drop its own, too.
             if trim := getattr(ctypes.CDLL(None), "malloc_trim", None):
                 trim(0)
+
+
+def pytest_collection_finish():
+    # Modules are there to stay: they are not searched for rubbish again with every traced program.
+    gc.freeze()
+    gc.set_threshold(50_000, 20, 100)
 
 
 def pytest_configure(config):

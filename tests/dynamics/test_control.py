@@ -16,6 +16,7 @@ from beamfit.dynamics.record import Run
 from beamfit.dynamics.response import ARX, FIRST_ORDER, SECOND_ORDER, simulate
 from beamfit.errors import InputError
 from beamfit.status import Status
+from tests.simulations import simulations
 
 INF = np.inf
 
@@ -36,10 +37,11 @@ def made(*responses, horizon=10, rate=0.3, above=INF, step=0.5, m=1, smooth=0.1)
 LAG = response(FIRST_ORDER, [2.0, 1.5], delay=2)
 
 
-def test_1000_perturbed_loops_break_no_limit_of_an_input_or_of_its_rate():
+@simulations(300, 1000)
+def test_perturbed_loops_break_no_limit_of_an_input_or_of_its_rate(count):
     """Noise, gain and time constant 20 % off, steps of disturbances, and an upper limit."""
     control = made(LAG, above=3.0, horizon=8)
-    random, runs, steps = np.random.default_rng(0), 1000, 25
+    random, runs, steps = np.random.default_rng(0), count, 25
     noise = 0.05 * random.normal(size=(runs, steps, 1))
     at = random.integers(5, 20, (runs, 1, 1))
     load = random.uniform(-1.0, 1.0, (runs, 1, 1)) * (np.arange(runs)[:, None, None] % 2)
@@ -127,7 +129,9 @@ def changing_lag(u):
     return jnp.array([[0.5, -0.3], [0.3, -0.4]]) @ inner + jnp.array([0.7, 1.3])
 
 
-@pytest.mark.parametrize("above", [1.2, 1.8, 2.1])
+@pytest.mark.parametrize(
+    "above", [1.8, *(pytest.param(above, marks=pytest.mark.calibrate) for above in (1.2, 2.1))]
+)
 def test_plans_of_a_process_that_changes_are_the_best_where_a_limit_binds(above):
     """Each plan of a loop beside SLSQP's of the whole horizon, from that plan and from the last."""
     n, process = 10, response(FIRST_ORDER, None, of=changing_lag, margin=0.0)

@@ -1,9 +1,7 @@
 """The errors of every scenario hold what they claim, on simulated scans.
 
-Fast here; `make coverage` does 500 scans of each.
+Fast here; `make calibrate` does 500 scans of each.
 """
-
-import os
 
 import numpy as np
 import pytest
@@ -14,8 +12,7 @@ from beamfit.emittance.fit import scenario_of
 from beamfit.emittance.known import see
 from tests.emittance.coverage import binomial_limits, coverage, deviations
 
-ALL = os.environ.get("BEAMFIT_COVERAGE")
-# Case: scan, scenario, what is told, simulated scans in the quick run.
+# Case: scan, scenario, what is told, simulated scans with all tests.
 CASES = {
     "known": ("one", "known", Assumptions(), 500),
     "calibration with a prior": (
@@ -44,10 +41,11 @@ def seen(root):
     return found
 
 
+@pytest.mark.parametrize("number", [None, pytest.param(500, marks=pytest.mark.calibrate)])
 @pytest.mark.parametrize("case", CASES)
-def test_intervals_hold_the_truth_as_often_as_they_say(seen, case):
-    scan, scenario, told, number = CASES[case]
-    number = int(ALL) if ALL else number
+def test_intervals_hold_the_truth_as_often_as_they_say(seen, case, number):
+    scan, scenario, told, few = CASES[case]
+    number = number or few
     problem = scenario_of(scenario).state(seen[scan], told)
     pulls, known = deviations(problem, problem.start, number=number, seed=3)
     assert known.all()

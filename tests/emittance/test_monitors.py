@@ -12,6 +12,7 @@ from beamfit.errors import InputError
 from beamfit.optics.beam import BeamMatrix
 from beamfit.optics.beamline import Beamline
 from beamfit.optics.elements import Drift, Quadrupole, Screen
+from tests.simulations import simulations
 
 # A focusing cell with five wires; nothing moves.
 FODO = """format = "beamfit-lattice-1"
@@ -21,6 +22,7 @@ energy_MeV = 135.0
     f'[[element]]\ntype = "drift"\nlength_m = 0.9\n[[element]]\ntype = "screen"\nname = "W{i}"\n'
     for i, k in enumerate((8.0, -8.0, 8.0, -8.0, 8.0))
 )
+
 WIRES = ("W0", "W1", "W2", "W3", "W4")
 TRUE = BeamMatrix.from_twiss(2e-9, 3.0, -0.5)
 
@@ -200,19 +202,20 @@ def test_three_monitors_without_errors_and_three_settings_of_a_magnet_are_refuse
     assert beamfit.fit_emittance(moved, fodo()).x.status.value == "unidentified"
 
 
-def test_errors_of_three_monitors_cover():
+@simulations(50, 200)
+def test_errors_of_three_monitors_cover(count):
     """95 % of intervals of the answers that are given hold the truth, within binomial limits."""
     r, truth = {"x": seen_from(fodo(), THREE)["x"]}, 2e-9
     true, rng, line = sizes_at(r)["x"], np.random.default_rng(12), fodo()
     held = []
-    for _ in range(200):
+    for _ in range(count):
         size = true * (1 + 0.02 * rng.normal(size=3))
         scan = beamfit.QuadScan({}, {}, {"x": size}, {"x": 0.02 * true}, screen=THREE)
         found = beamfit.fit_emittance(scan, line).x.emittance
         if found.error is not None:
             low, high = found.interval_95
             held.append(low < truth < high)
-    assert len(held) > 150
+    assert len(held) > 0.75 * count
     assert abs(np.mean(held) - 0.95) < 4 * np.sqrt(0.95 * 0.05 / len(held))
 
 

@@ -9,6 +9,7 @@ import beamfit
 from beamfit.emittance.design import plan_measurements
 from beamfit.errors import InputError
 from beamfit.optics.elements import Drift
+from tests.simulations import simulations, widened
 
 EMITTANCE, BETA, ALPHA, K1 = 2e-9, 6.0, 0.5, np.linspace(-2.0, 12.0, 9)
 OTHER = np.array([-3.0, 1.1, 5.0, 13.0])
@@ -53,9 +54,10 @@ def test_without_noise_the_truth_is_predicted_at_any_screen(line):
     assert one.size[0] == pytest.approx(true_sizes(5.0, 2.0), rel=1e-6)
 
 
-def test_errors_and_correlations_are_those_of_repeated_scans(line):
+@simulations(80, 400)
+def test_errors_and_correlations_are_those_of_repeated_scans(line, count):
     rng, found, numbers, pulls = np.random.default_rng(4), [], [], []
-    for _ in range(400):
+    for _ in range(count):
         fit = beamfit.fit_emittance(scan_of(rng, 0.01), line)
         predicted = fit.predict({"Q": OTHER})
         pulls.append((predicted.size - true_sizes(OTHER, 2.0)) / predicted.error)
@@ -63,10 +65,12 @@ def test_errors_and_correlations_are_those_of_repeated_scans(line):
         q = fit.x
         sigma = [each.value for each in q.sigma]
         numbers.append([*sigma, q.emittance.value, q.beta.value, q.alpha.value])
-    np.testing.assert_allclose(np.std(pulls, axis=0), 1.0, atol=0.15)
+    np.testing.assert_allclose(np.std(pulls, axis=0), 1.0, atol=widened(0.15, 400, count))
     names, values = fit.correlations()
     assert names == ("sigma11", "sigma12", "sigma22", "emittance", "beta", "alpha")
-    np.testing.assert_allclose(values, np.corrcoef(np.transpose(numbers)), atol=0.12)
+    np.testing.assert_allclose(
+        values, np.corrcoef(np.transpose(numbers)), atol=widened(0.12, 400, count)
+    )
     np.testing.assert_allclose(np.diagonal(values), 1.0)
 
 

@@ -12,6 +12,7 @@ from beamfit.optics.beam import BeamMatrix
 from beamfit.optics.particle import beta_gamma
 from beamfit.quantity import Status
 from tests.emittance.conftest import TABLE_2, design, scan_of
+from tests.simulations import simulations
 
 BEAM = BeamMatrix.from_twiss(1e-6 / 264.1865, 5.5, 5.3)
 REAL = np.array([-4.219, -3.153, -2.64, -2.124, -1.026])
@@ -69,27 +70,29 @@ def test_weights_of_the_model_have_no_bias(relative, most):
     assert bias["measured"] < -4 * relative**2
 
 
+@simulations(30, 120)
 @pytest.mark.parametrize("points", [5, 6, 8, 12])
-def test_errors_that_are_half_of_the_truth_are_no_trap(otr2, true, points):
-    """What is answered holds as often as it says, within what 120 scans can tell."""
+def test_errors_that_are_half_of_the_truth_are_no_trap(otr2, true, points, count):
+    """What is answered holds as often as it says, within what so many scans can tell."""
     settings = np.linspace(-4.5, -1.0, points)
     sizes, rng, inside, far = true(settings), np.random.default_rng(points), [], []
-    for _ in range(120):
+    for _ in range(count):
         size = sizes * (1 + 0.02 * rng.normal(size=points))
         q = beamfit.fit_emittance(otr2_scan(settings, size, 0.01 * sizes), otr2).x
         if (q := q.normalized_emittance).error is not None:
             inside.append(q.interval_95[0] < 1e-6 < q.interval_95[1])
             far.append(abs(q.value - 1e-6) > 4 * q.error)
-    assert len(inside) >= 114
+    assert len(inside) >= 0.95 * count
     assert np.mean(inside) > 0.82  # 88 %, less two standard deviations of a binomial
-    assert np.sum(far) <= 8  # 3 %, and three standard deviations of a binomial
+    assert np.sum(far) <= 8 * count / 120  # 3 %, and three standard deviations of a binomial
 
 
-def test_errors_far_too_small_are_said_and_enlarged(otr2, true):
+@simulations(20, 60)
+def test_errors_far_too_small_are_said_and_enlarged(otr2, true, count):
     """A fifth of the truth at 12 points: the factor is found, and the answer holds."""
     settings, rng, inside, factors = np.linspace(-4.5, -1.0, 12), np.random.default_rng(12), 0, []
     sizes, refused = true(settings), 0
-    for _ in range(60):
+    for _ in range(count):
         size = sizes * (1 + 0.02 * rng.normal(size=12))
         fit = beamfit.fit_emittance(otr2_scan(settings, size, 0.004 * sizes), otr2).x
         if fit.status is not Status.converged:
@@ -99,22 +102,23 @@ def test_errors_far_too_small_are_said_and_enlarged(otr2, true):
         inside += fit.emittance.interval_95[0] < 1e-6 / 264.1865 < fit.emittance.interval_95[1]
         if said := re.search(r"too small by a factor (\S+) \((\S+) to (\S+)\)", fit.message):
             factors.append([float(v) for v in said.groups()])
-    assert refused <= 2
-    assert inside >= 51
-    assert len(factors) > 50
+    assert refused <= 2 * count / 60
+    assert inside >= 0.85 * count
+    assert len(factors) > 50 * count / 60
     middle, low, high = np.array(factors).T
     assert np.median(middle) == pytest.approx(5.0, rel=0.2)
     assert np.mean((low < 5.0) & (high > 5.0)) > 0.5  # 68 %
 
 
 # Four points of 3 % stated at half are refused in a third of scans: P(beam) is .985 there.
+@simulations(2, 8)
 @pytest.mark.parametrize(
     ("points", "relative"), [(4, 0.01), (6, 0.01), (6, 0.03), (9, 0.01), (9, 0.03)]
 )
-def test_stated_errors_from_half_to_twice_give_one_status(otr2, true, points, relative):
+def test_stated_errors_from_half_to_twice_give_one_status(otr2, true, points, relative, count):
     settings = np.linspace(-4.5, -1.0, points)
     sizes, rng = true(settings), np.random.default_rng(points)
-    for _ in range(8):
+    for _ in range(count):
         size = sizes * (1 + relative * rng.normal(size=points))
         found = [
             beamfit.fit_emittance(otr2_scan(settings, size, f * relative * sizes), otr2).x
@@ -125,31 +129,35 @@ def test_stated_errors_from_half_to_twice_give_one_status(otr2, true, points, re
         assert np.ptp(values) < 2.0 * min(fit.emittance.error for fit in found)
 
 
-def test_few_residuals_are_not_taken_for_precision(otr2, true):
+@simulations(60, 300)
+def test_few_residuals_are_not_taken_for_precision(otr2, true, count):
     """Five points of 10 % noise without errors: few answers are beyond 4 errors (37 % before)."""
     settings = np.linspace(-4.5, -1.0, 5)
     sizes, rng, off = true(settings), np.random.default_rng(7), []
-    for _ in range(300):
+    for _ in range(count):
         size = sizes * (1 + 0.1 * rng.normal(size=5))
         q = beamfit.fit_emittance(otr2_scan(settings, size), otr2).x.normalized_emittance
         if q.error is not None:
             off.append(abs(q.value - 1e-6) / q.error)
-    assert len(off) > 150
+    assert len(off) > 0.5 * count
     assert np.mean(np.array(off) > 4) < 0.08
 
 
-def test_four_points_without_errors_are_believed_where_nothing_else_explains_them(otr2, true):
+@simulations(30, 100)
+def test_four_points_without_errors_are_believed_where_nothing_else_explains_them(
+    otr2, true, count
+):
     """Four exact sizes of a beam are no accident; four sizes at random seldom look like them."""
     settings, rng = np.linspace(-4.5, -1.0, 4), np.random.default_rng(4)
     fit = beamfit.fit_emittance(otr2_scan(settings, true(settings)), otr2).x
     assert fit.status is Status.converged
     assert fit.normalized_emittance.interval_95[0] < 1e-6 < fit.normalized_emittance.interval_95[1]
     answered = 0
-    for _ in range(100):
+    for _ in range(count):
         noise = 1e-6 * rng.uniform(50, 200, 4)
         fit = beamfit.fit_emittance(otr2_scan(settings, noise), otr2).x
         answered += fit.emittance.error is not None
-    assert answered <= 6  # 2 %, and three standard deviations of a binomial
+    assert answered <= 6 * count / 100  # 2 %, and three standard deviations of a binomial
 
 
 def test_no_cliff_where_chi2_is_its_degrees_of_freedom(otr2, true):
@@ -176,12 +184,13 @@ def test_sizes_that_do_not_answer_the_magnet(otr2, errors):
     assert "Check that the magnet moved" in fit.message
 
 
-def test_shots_of_a_setting_are_evened_out(otr2, true):
+@simulations(40, 200)
+def test_shots_of_a_setting_are_evened_out(otr2, true, count):
     """30 settings of 5 shots: false poor fits below 2 % (24 % by each one's own scatter)."""
     settings = np.linspace(-4.5, -1.0, 30)
     sizes, rng = true(settings), np.random.default_rng(5)
     poor, inside = 0, 0
-    for _ in range(200):
+    for _ in range(count):
         shots = sizes[:, None] * (1 + 0.05 * rng.normal(size=(30, 5)))
         error = shots.std(axis=1, ddof=1) / math.sqrt(5)
         scan = otr2_scan(settings, shots.mean(axis=1), error, shots=np.full(30, 5))
@@ -189,8 +198,8 @@ def test_shots_of_a_setting_are_evened_out(otr2, true):
         low, high = fit.normalized_emittance.interval_95
         poor += fit.status is Status.poor_fit
         inside += low < 1e-6 < high
-    assert poor <= 3
-    assert inside >= 180
+    assert poor <= 3 * count / 200
+    assert inside >= 0.9 * count
 
 
 def test_errors_that_are_one_share_of_the_size_follow_the_model(otr2, true):
@@ -274,11 +283,12 @@ def test_robust_together_with_a_calibration(gtf, gtf_sizes):
         assert f"Q2 = {currents[4]:.4g} A" in fit.message
 
 
-def test_what_is_not_determined_has_an_interval_that_holds(otr2, true):
+@simulations(30, 100)
+def test_what_is_not_determined_has_an_interval_that_holds(otr2, true, count):
     """One-sided scans: where a beam or one of no emittance is sure, 95 % hold the truth."""
     settings = np.linspace(-8.0, -4.2, 8)
     sizes, rng, inside, from_zero = true(settings), np.random.default_rng(4), [], []
-    for _ in range(100):
+    for _ in range(count):
         size = sizes * (1 + 0.05 * rng.normal(size=8))
         q = beamfit.fit_emittance(otr2_scan(settings, size, 0.05 * sizes), otr2).x
         if q.emittance.error is None and q.emittance.interval_95 is not None:
@@ -289,7 +299,7 @@ def test_what_is_not_determined_has_an_interval_that_holds(otr2, true):
             flat = p["beam of no emittance"] / (p["beam"] + p["beam of no emittance"])
             assert (low == 0.0) == (flat > 0.025)
             from_zero.append(low == 0.0)
-    assert len(inside) > 60
+    assert len(inside) > 0.6 * count
     assert np.mean(inside) > 0.9
     assert np.mean(from_zero) > 0.5
 
@@ -304,11 +314,12 @@ def test_overstated_errors_are_said(otr2, true):
     assert "too large" not in right.message
 
 
-def test_a_good_neighbour_does_not_vouch(otr2, rows, true):
+@simulations(6, 20)
+def test_a_good_neighbour_does_not_vouch(otr2, rows, true, count):
     """Noise in y beside a perfect x: judged as if x were not there."""
     settings = np.linspace(-4.5, -1.0, 7)
     clean, rng = true(settings), np.random.default_rng(8)
-    for _ in range(20):
+    for _ in range(count):
         noise = 1e-6 * rng.uniform(50, 200, 7)
         both = beamfit.QuadScan(
             {"Q525": settings},
@@ -321,17 +332,18 @@ def test_a_good_neighbour_does_not_vouch(otr2, rows, true):
         assert together.status is beamfit.fit_emittance(alone, otr2).y.status
 
 
+@simulations(25, 150)
 @pytest.mark.parametrize("points", [5, 8, 14])
 @pytest.mark.parametrize("errors", [True, False])
-def test_good_scans_of_two_percent_are_not_refused(otr2, true, points, errors):
+def test_good_scans_of_two_percent_are_not_refused(otr2, true, points, errors, count):
     settings = np.linspace(-4.5, -1.0, points)
     sizes, rng, refused = true(settings), np.random.default_rng(points), 0
-    for _ in range(150):
+    for _ in range(count):
         size = sizes * (1 + 0.02 * rng.normal(size=points))
         error = 0.02 * sizes if errors else None
         fit = beamfit.fit_emittance(otr2_scan(settings, size, error), otr2).x
         refused += fit.emittance.error is None
-    assert refused <= 6  # 2 %, and three standard deviations of a binomial
+    assert refused <= 6 * count / 150  # 2 %, and three standard deviations of a binomial
 
 
 def test_an_anchor_has_a_part_that_all_settings_share(gtf, gtf_sizes):
@@ -394,12 +406,13 @@ def test_advice_keeps_the_sizes_of_both_planes_within_those_measured(otr2, rows,
     assert beyond[0] > tall.max()
 
 
+@simulations(30, 120)
 @pytest.mark.parametrize("shots", [0, 5])
-def test_noise_that_is_the_same_in_micrometres_is_told(otr2, true, shots):
+def test_noise_that_is_the_same_in_micrometres_is_told(otr2, true, shots, count):
     """11 settings with 5 µm everywhere, 4 to 8 % of the size: answers hold as often as they say."""
     settings, rng, inside, far = np.linspace(-4.5, -1.0, 11), np.random.default_rng(9), 0, 0
     sizes = true(settings)
-    for _ in range(120):
+    for _ in range(count):
         if shots:
             each = sizes[:, None] + 5e-6 * rng.normal(size=(11, shots))
             error = each.std(axis=1, ddof=1) / math.sqrt(shots)
@@ -410,8 +423,8 @@ def test_noise_that_is_the_same_in_micrometres_is_told(otr2, true, shots):
         assert q.error is not None
         inside += q.interval_95[0] < 1e-6 < q.interval_95[1]
         far += abs(q.value - 1e-6) > 4 * q.error
-    assert inside >= 107
-    assert far <= 2
+    assert inside >= 0.89 * count
+    assert far <= 2 * count / 120
 
 
 @pytest.mark.parametrize("wild", [9e-4, 0.0])
@@ -445,13 +458,16 @@ def test_a_setting_whose_shots_all_differ_from_the_law_is_a_bad_reading(otr2, tr
     assert abs(fit.normalized_emittance.value - 1e-6) < 4 * fit.normalized_emittance.error
 
 
+@simulations(25, 100)
 @pytest.mark.parametrize("points", [4, 6])
 @pytest.mark.parametrize("scatter", [0.0, 0.05])
-def test_what_settings_scatter_beyond_their_shots_is_in_the_error(otr2, true, points, scatter):
+def test_what_settings_scatter_beyond_their_shots_is_in_the_error(
+    otr2, true, points, scatter, count
+):
     """5 shots of 2 %, and settings off by 0 or 5 %, of which the shots show nothing."""
     settings = np.linspace(-4.5, -1.0, points)
     sizes, rng, inside, far, answered = true(settings), np.random.default_rng(points), 0, 0, 0
-    for _ in range(100):
+    for _ in range(count):
         own = sizes * (1 + scatter * rng.normal(size=points))
         shots = own[:, None] * (1 + 0.02 * rng.normal(size=(points, 5)))
         q = beamfit.fit_emittance(shot_scan(settings, shots), otr2).x.normalized_emittance
@@ -459,6 +475,6 @@ def test_what_settings_scatter_beyond_their_shots_is_in_the_error(otr2, true, po
             answered += 1
             inside += q.interval_95[0] < 1e-6 < q.interval_95[1]
             far += abs(q.value - 1e-6) > 4 * q.error
-    assert answered >= 92
+    assert answered >= 0.92 * count
     assert inside >= 0.85 * answered
     assert far <= 0.05 * answered

@@ -1,7 +1,6 @@
 """Errors of screen, beam and line as part of the error: against the budget, and on simulations."""
 
 import math
-import os
 from dataclasses import replace
 
 import numpy as np
@@ -16,8 +15,8 @@ from beamfit.optics.calibration import scaled
 from beamfit.optics.elements import Drift, Screen
 from beamfit.quantity import Status
 from tests.emittance.conftest import TABLE_2, design, scan_of
+from tests.simulations import simulations
 
-DRAWS = int(os.environ.get("BEAMFIT_COVERAGE", "120"))
 KNOWN = {
     "size_scale": (None, 0.02),
     "energy": (None, 0.01),
@@ -95,12 +94,13 @@ def test_dispersion_of_the_incoming_beam(gtf, gtf_sizes):
         beamfit.fit_emittance(scan, gtf, priors={"dispersion": (0.05, 1e-3)})
 
 
-def test_total_errors_cover(gtf):
+@simulations(40, 500)
+def test_total_errors_cover(gtf, count):
     """Line, energy and screen wrong by what is known of them: the truth is in interval_95."""
     currents, random = np.linspace(0.0, 3.9, 14), np.random.default_rng(3)
     truth = math.sqrt(TABLE_2[0] * TABLE_2[2] - TABLE_2[1] ** 2)
     inside = one = 0
-    for _ in range(DRAWS):
+    for _ in range(count):
         shift = {name: sd * random.normal() for name, (_, sd) in KNOWN.items()}
         magnet = gtf["Q2"]
         own = scaled(magnet.calibration, 1 + shift["Q2.gradient"])
@@ -113,9 +113,9 @@ def test_total_errors_cover(gtf):
         q = beamfit.fit_emittance(scan, gtf, priors=KNOWN).x.emittance
         inside += q.interval_95[0] < truth < q.interval_95[1]
         one += abs(q.value - truth) < q.error
-    low, high = binom.ppf([0.001, 0.999], DRAWS, 0.95)
+    low, high = binom.ppf([0.001, 0.999], count, 0.95)
     assert low <= inside <= high
-    low, high = binom.ppf([0.001, 0.999], DRAWS, 0.683)
+    low, high = binom.ppf([0.001, 0.999], count, 0.683)
     assert low <= one <= high
 
 

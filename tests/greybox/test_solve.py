@@ -30,6 +30,7 @@ from beamfit.greybox.maps import Foreign
 from beamfit.greybox.mlp import dense
 from beamfit.greybox.problem import Constraint, Free, Objective, Prior, Problem, Record
 from beamfit.greybox.solve import search, solve, starting_points
+from tests.simulations import simulations
 
 X = np.linspace(-1.0, 1.0, 21)
 
@@ -339,19 +340,21 @@ def test_a_certified_gain_holds_between_the_points():
     assert tame.cost > wild.cost
 
 
-def test_appendix_b_reaches_an_optimum_from_random_starts():
-    """28 gains at points; a network of 22 weights. Each of ten starts ends on an optimum.
+@simulations(3, 10)
+def test_appendix_b_reaches_an_optimum_from_random_starts(count):
+    """28 gains at points; a network of 22 weights. Each of so many starts ends on an optimum.
 
     Twenty are benchmarks/greybox.py; where one in ten fails, ten of ten tell it as 19 of 20 do.
     """
     p = appendix_b(simulated_scan(1), point_constraints())
     assert len(p.constraint_names) == 28
     assert len(p.names) == 25
-    fit = solve(p, starts=10, seed=7)
-    assert len(fit.attempts) == 10
+    fit = solve(p, starts=count, seed=7)
+    assert len(fit.attempts) == count
     assert all(attempt.kkt.worst <= 1e-6 for attempt in fit.attempts)
-    # Any invertible change of (A, B) is taken up by sigma: the beam is not determined.
-    assert fit.status == Status.unidentified
+    # Any invertible change of (A, B) is taken up by sigma: the beam is not determined, and the
+    # best of few starts lies at limits of the gains.
+    assert fit.status == Status.unidentified or (count < 10 and fit.status == Status.at_limit)
     assert np.isnan(fit["s11"].error)
 
 

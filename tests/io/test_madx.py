@@ -6,8 +6,8 @@ import pytest
 from beamfit.errors import InputError
 from beamfit.io.line import load_lattice, read_lattice
 from beamfit.particles import REST_ENERGY
+from tests.simulations import simulations
 
-COUNT = 300
 # In every text @ begins the names, so that one MAD-X reads all files, and {0}, {1}, ... are
 # numbers between -1 and 1. Elements: quadrupoles q1 and q2, drift d, marker m, monitor b.
 ELEMENTS = """@k = 2 + {0};
@@ -153,10 +153,11 @@ def written(tmp_path, name, number, text):
     return path
 
 
-def test_no_file_is_read_otherwise_than_madx_reads_it(tmp_path):
+@simulations(100, 300)
+def test_no_file_is_read_otherwise_than_madx_reads_it(tmp_path, count):
     cpymad = pytest.importorskip("cpymad.madx", reason="cpymad is not installed")
     with cpymad.Madx(stdout=False) as madx:
-        for number in range(COUNT):
+        for number in range(count):
             name = [*READ][number % len(READ)]
             path = written(tmp_path, name, number, READ[name])
             sequence = f"f{number}_lc"

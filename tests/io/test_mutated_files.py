@@ -18,8 +18,8 @@ from tests.conftest import resident
 from tests.io.forked import in_forks  # noqa: F401
 from tests.io.test_emittance_gui import gui_data
 from tests.io.test_sequence import MADX
+from tests.simulations import simulations
 
-COUNT = 100
 # MB that reading so many files may leave behind: caches of compiled code and of the parser.
 GROWTH = 150
 TOKENS = [
@@ -88,10 +88,10 @@ def mutated(content, rng):
     return bytes(found)
 
 
-def read_all(path, content, read, seed):
+def read_all(path, content, read, seed, count):
     """Read mutated files; how many were refused, and how much memory stayed."""
     rng, refused, before = random.Random(seed), 0, None
-    for number in range(COUNT):
+    for number in range(count):
         path.write_bytes(mutated(content, rng))
         try:
             read(path)
@@ -100,7 +100,7 @@ def read_all(path, content, read, seed):
             said = str(error)
             assert "\n" not in said
             assert len(said) <= 391
-        if number == COUNT // 5:  # what is loaded once is loaded
+        if number == count // 5:  # what is loaded once is loaded
             before = resident()
     return refused, resident() - (before or resident())
 
@@ -110,20 +110,22 @@ def fit(scan, line):
     return str(beamfit.fit_emittance(scan, line))
 
 
-def test_csv(tmp_path, root):
+@simulations(100, 300)
+def test_csv(tmp_path, root, count):
     line = beamfit.load_lattice(root / "lattices/lcls_otr2.toml")
     path = tmp_path / "scan.csv"
-    refused, grown = read_all(path, CSV.encode(), lambda p: fit(read_quad_scan(p), line), 1)
-    assert 0.3 * COUNT < refused < COUNT
+    refused, grown = read_all(path, CSV.encode(), lambda p: fit(read_quad_scan(p), line), 1, count)
+    assert 0.3 * count < refused < count
     assert grown < GROWTH
     kept, _ = read_all(
-        path, CSV.encode(), lambda p: read_quad_scan(p, skip_bad=True, ignore=["note_*"]), 2
+        path, CSV.encode(), lambda p: read_quad_scan(p, skip_bad=True, ignore=["note_*"]), 2, count
     )
-    assert kept < COUNT
+    assert kept < count
 
 
+@simulations(30, 100)
 @pytest.mark.parametrize("compressed", [True, False])
-def test_mat(compressed, tmp_path):
+def test_mat(compressed, tmp_path, count):
     path = tmp_path / "scan.mat"
     scipy.io.savemat(path, {"data": gui_data()}, do_compression=compressed)
     content = path.read_bytes()
@@ -132,12 +134,13 @@ def test_mat(compressed, tmp_path):
         gui = read_emittance_gui(file)
         fit(gui.scan(), build_line(gui.lattice))
 
-    refused, grown = read_all(path, content, read, 3)
-    assert 0.3 * COUNT < refused <= COUNT
+    refused, grown = read_all(path, content, read, 3, count)
+    assert 0.3 * count < refused <= count
     assert grown < GROWTH
 
 
-def test_mat_packed_after_the_damage(tmp_path):
+@simulations(30, 100)
+def test_mat_packed_after_the_damage(tmp_path, count):
     """So that the damage lies in what is unpacked, and not in the packing."""
     path = tmp_path / "scan.mat"
     scipy.io.savemat(path, {"data": gui_data()})
@@ -152,14 +155,15 @@ def test_mat_packed_after_the_damage(tmp_path):
         packed(file.read_bytes())
         read_emittance_gui(file)
 
-    refused, grown = read_all(path, whole[128:], read, 4)
-    assert 0.3 * COUNT < refused <= COUNT
+    refused, grown = read_all(path, whole[128:], read, 4, count)
+    assert 0.3 * count < refused <= count
     assert grown < GROWTH
 
 
-def test_madx(tmp_path):
+@simulations(100, 300)
+def test_madx(tmp_path, count):
     pytest.importorskip("at", reason="accelerator-toolbox is not installed")
     path = tmp_path / "line.madx"
-    refused, grown = read_all(path, MADX.encode(), lambda p: build_line(read_lattice(p)), 5)
-    assert 0.3 * COUNT < refused < COUNT
+    refused, grown = read_all(path, MADX.encode(), lambda p: build_line(read_lattice(p)), 5, count)
+    assert 0.3 * count < refused < count
     assert grown < GROWTH

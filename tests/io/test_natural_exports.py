@@ -17,6 +17,7 @@ from beamfit.errors import InputError
 from beamfit.io.decay_record import read_decay_record
 from beamfit.io.scan import read_quad_scan
 from tests.io.forked import in_forks  # noqa: F401
+from tests.simulations import simulations
 
 pandas = pytest.importorskip("pandas")
 
@@ -358,7 +359,7 @@ def spelling(rng):
     return (rng.choice(AROUND) if rng.random() < 0.2 else "") + text, changed
 
 
-@pytest.mark.parametrize("count", [2000, pytest.param(6000, marks=pytest.mark.calibrate)])
+@simulations(1000, 6000)
 def test_every_number_of_a_mutated_table_is_right_refused_or_asked(tmp_path, count):
     rng, path = random.Random(20261123), tmp_path / "a.csv"
     read = 0

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from beamfit.errors import InputError
 from beamfit.io.line import build_line, load_lattice, read_lattice
 from tests.io.forked import in_forks  # noqa: F401
+from tests.simulations import simulations
 
 at = pytest.importorskip("at", reason="accelerator-toolbox is not installed")
 
@@ -555,7 +556,6 @@ def test_a_reflected_bend_has_its_faces_the_other_way_round(name, written):
     assert [b.EntranceAngle for b in ring] == pytest.approx([0.2, -0.05])
 
 
-COUNT = 40
 PARTS = {
     "QUAD": "K1={k:.5f}", "SBEN": "ANGLE={a:.5f}, E1={b:.4f}, E2={c:.4f}", "SEXT": "K2=3",
     "DRIF": "", "MONI": "", "HKICK": "",
@@ -577,10 +577,11 @@ def any_line(number):
     return f"{text}SUB: LINE=({','.join(part)})\nLC: LINE=({','.join(names)},-SUB,2*E0)\n"
 
 
+@simulations(10, 40)
 @pytest.mark.filterwarnings("ignore::at.AtWarning")
 @pytest.mark.parametrize("name", ["a.mad8", "a.lte"])
-def test_lines_at_random_are_those_of_pyat(name, written):
-    for number in range(COUNT):
+def test_lines_at_random_are_those_of_pyat(name, written, count):
+    for number in range(count):
         text = any_line(number)
         if name == "a.mad8":
             text = f"BEAM, PARTICLE=ELECTRON, ENERGY=135\n{text}"

@@ -13,6 +13,7 @@ from beamfit.lifetime.pieces import thinned
 from beamfit.lifetime.record import Conditions, DecayRecord
 from beamfit.lifetime.study import study_record
 from beamfit.noise.correlated import CorrelatedNoise, Levels
+from tests.simulations import simulations, widened
 
 LIFETIME = 10.01 * 3600
 
@@ -58,18 +59,19 @@ def test_top_up_of_ten_hours_has_one_answer(noise):
     assert "200 cycles" in fit.message
 
 
+@simulations(10, 30)
 @pytest.mark.parametrize(("step", "memory"), [(60.0, 0.0), (10.0, 0.0), (10.0, 0.6), (10.0, 0.95)])
-def test_errors_cover(step, memory):
+def test_errors_cover(step, memory, count):
     pulls, held = [], []
-    for seed in range(30):
+    for seed in range(count):
         fit = fit_cycles(cut(*top_up(0.01, seed, step=step, memory=memory)))
         truth = true_lifetime(fit.mean_current)
         pulls.append(abs(fit.lifetime_mean.value - truth) / fit.lifetime_mean.error)
         low, high = fit.lifetime_mean.interval_95
         held.append(low < truth < high)
-    # 68 % and 95 % of 30, within three standard deviations; more would be errors too large.
-    assert 13 <= np.sum(np.array(pulls) < 1) <= 28
-    assert np.sum(held) >= 25
+    # 68 % and 95 %, within three standard deviations; more would be errors too large.
+    assert abs(np.mean(np.array(pulls) < 1) - 0.6827) < widened(0.255, 30, count)
+    assert np.mean(held) >= 0.9545 - widened(0.121, 30, count)
 
 
 def test_the_fit_is_that_of_all_numbers_at_once():

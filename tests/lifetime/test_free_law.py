@@ -15,6 +15,7 @@ from beamfit.lifetime.lifetime_table import fit_lifetimes
 from beamfit.lifetime.marginal import NODE, Numbers, SeenDecay, drawn, quantiles
 from beamfit.lifetime.record import Conditions, DecayRecord, LifetimeTable
 from beamfit.lifetime.study import study_record
+from tests.simulations import simulations
 
 HOUR, A, B, I0 = 3600.0, 4e-8, 6e-6, 300.0
 
@@ -49,12 +50,13 @@ def test_the_closed_form_is_the_integrated_law(share, power, drift):
     np.testing.assert_allclose(Numbers.of(found).currents(NODE)[:, 0], true, rtol=1e-9)
 
 
+@simulations(4, 12)
 @pytest.mark.parametrize(
     "given", [{}, {"exponent": -1 / 3}, {"exponent": 0.3}, {"drift": 0.1}, {"drift": -0.1}]
 )
-def test_intervals_hold_the_truth_whatever_the_law(given):
+def test_intervals_hold_the_truth_whatever_the_law(given, count):
     """At 0.1 % noise a constant a is off by up to 35 % at a quoted 1 %."""
-    records = [record(seed, **given) for seed in range(12)]
+    records = [record(seed, **given) for seed in range(count)]
     free, constant = fit_decays(records), fit_decays(records, law="constant")
     held = {"free": 0, "constant": 0}
     for name, fits in (("free", free), ("constant", constant)):
@@ -63,8 +65,8 @@ def test_intervals_hold_the_truth_whatever_the_law(given):
             true = A * (fit.mean_current / I0) ** given.get("exponent", 0.0)
             held[name] += fit.a.interval_95[0] <= true <= fit.a.interval_95[1]
     assert {fit.status for fit in free} == {"converged"}
-    assert held["free"] >= 11
-    assert held["constant"] >= 10 if not given else held["constant"] <= 2
+    assert held["free"] >= count - 1
+    assert held["constant"] >= count - 2 if not given else held["constant"] <= max(1, count / 6)
 
 
 def test_the_draws_are_those_of_the_posterior():
@@ -110,9 +112,10 @@ def test_a_gauge_leaves_no_drift_open():
     assert blind.drift is not None
 
 
-def test_correlated_noise_of_stated_size_is_no_poor_fit():
+@simulations(4, 12)
+def test_correlated_noise_of_stated_size_is_no_poor_fit(count):
     found = []
-    for seed in range(12):
+    for seed in range(count):
         time, beam = law()
         random, noise = np.random.default_rng(seed), np.zeros(time.size)
         for k in range(1, time.size):
@@ -171,20 +174,22 @@ def test_stretches_find_the_steps_of_the_whole(monkeypatch):
     assert len(set(whole) ^ set(parts)) <= 0.02 * len(whole)
 
 
+@simulations(3, 8)
 @pytest.mark.parametrize("within", [4.0, 30.0])
-def test_readings_within_an_injection_are_left_out(within):
+def test_readings_within_an_injection_are_left_out(within, count):
     off = []
-    for seed in range(8):
+    for seed in range(count):
         one = sawtooth(10.0, 3000, 0.02, 187.0 + seed, within, seed)
         lifetime = study_record(one).pooled[0].fit.lifetime_mean
         off.append((lifetime.value - 10.0) / lifetime.error)
-    assert np.mean(np.abs(off) < 2) >= 0.75
+    assert np.mean(np.abs(off) < 2) >= 0.66
     assert np.max(np.abs(off)) < 4
 
 
+@simulations(2, 5)
 @pytest.mark.parametrize("interval", [300.0, 600.0, 1700.0])
-def test_an_archive_slower_than_the_refills_has_no_limit(interval):
-    for seed in range(5):
+def test_an_archive_slower_than_the_refills_has_no_limit(interval, count):
+    for seed in range(count):
         one = sawtooth(interval, 400, 0.02, 180.0 + 3 * seed, seed=seed)
         try:
             found = study_record(one).answers[0].fit
@@ -195,10 +200,11 @@ def test_an_archive_slower_than_the_refills_has_no_limit(interval):
         assert found.lifetime_mean.interval_95 is None
 
 
+@simulations(3, 8)
 @pytest.mark.parametrize("hours", [0.3, 0.8])
-def test_a_staircase_of_digits_is_fitted_at_its_edges(hours):
+def test_a_staircase_of_digits_is_fitted_at_its_edges(hours, count):
     off = []
-    for seed in range(8):
+    for seed in range(count):
         time = np.linspace(0.0, hours * HOUR, 1000 + 13 * seed)
         beam = I0 * np.exp(-time / 36000.0)
         [decay] = study_record(DecayRecord(time, np.round(beam, 1))).decays

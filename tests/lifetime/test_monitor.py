@@ -14,6 +14,7 @@ from beamfit.lifetime.scales import summarise
 from beamfit.lifetime.study import study_record
 from beamfit.lifetime.systematics import systematics
 from beamfit.quantity import HOUR, Status
+from tests.simulations import simulations, widened
 
 I0, A, B = 300.0, 2e-8, 2e-6
 constant_fit = partial(fit_decay, law="constant")
@@ -32,20 +33,21 @@ def read(seed, time=TIME, **options):
     return DecayRecord(time, seen, np.full(time.size, 2e-3), **options)
 
 
-def test_errors_with_a_stated_stability_cover_the_truth():
+@simulations(60, 300)
+def test_errors_with_a_stated_stability_cover_the_truth(count):
     """Over 300 fills, each with a drift and an offset of its own; without it next to none do."""
     truth = {"a": A, "b": B, "lifetime_start": 1 / (A * I0 + B) / HOUR}
-    fits = constant_fits([read(seed, monitor=STATED) for seed in range(300)])
+    fits = constant_fits([read(seed, monitor=STATED) for seed in range(count)])
     for name, value in truth.items():
         found = [getattr(fit, name) for fit in fits]
         off = np.array([abs(q.value - value) / q.error for q in found])
-        assert 0.60 < np.mean(off < 1) < 0.76, name
-        assert 0.92 < np.mean(off < 1.96) < 0.98, name
+        assert abs(np.mean(off < 1) - 0.68) < widened(0.08, 300, count), name
+        assert abs(np.mean(off < 1.96) - 0.95) < widened(0.03, 300, count), name
         above, below = np.mean(
             [[q.interval_95[0] > value, q.interval_95[1] < value] for q in found], 0
         )
-        assert 0.005 < above < 0.045, name
-        assert 0.005 < below < 0.045, name
+        assert abs(above - 0.025) < widened(0.02, 300, count), name
+        assert abs(below - 0.025) < widened(0.02, 300, count), name
     blind = np.array([abs(fit.b.value - B) / fit.b.error_raw for fit in fits])
     assert np.mean(blind < 1.96) < 0.5
 
@@ -93,12 +95,13 @@ def test_a_study_weighs_decays_with_the_monitor():
     assert np.sqrt(slope @ covariance @ slope) == pytest.approx(fit.b.error, rel=0.01)
 
 
-def test_cycles_together_contain_the_monitor():
+@simulations(12, 40)
+def test_cycles_together_contain_the_monitor(count):
     """One drift through a day of top-up, whose cycles are refilled to the same current."""
     time = np.arange(0.0, 600.0, 30.0)
     drift, noise = 0.5 / HOUR, 1e-4
     off, blind = [], []
-    for seed in range(40):
+    for seed in range(count):
         random = np.random.default_rng(seed)
         rate = drift * random.normal()
         cycles = [
@@ -113,8 +116,8 @@ def test_cycles_together_contain_the_monitor():
         found = fit_cycles(cycles).lifetime_mean
         off.append(abs(found.value - 10) / found.error)
         blind.append(abs(found.value - 10) / found.error_raw)
-    assert 0.5 < np.mean(np.array(off) < 1) < 0.85
-    assert np.mean(np.array(off) < 1.96) > 0.85
+    assert abs(np.mean(np.array(off) < 1) - 0.675) < widened(0.175, 40, count)
+    assert np.mean(np.array(off) < 1.96) > 0.95 - widened(0.1, 40, count)
     assert np.mean(np.array(blind) < 1.96) < 0.5
 
 

@@ -143,7 +143,7 @@ def report(ranks, least):
 @pytest.mark.parametrize("kind", [scan_ranks, decay_ranks])
 def test_a_few_simulations_are_ranked_uniformly(kind):
     """Enough to see a posterior that is shifted or much too narrow."""
-    report(kind(10, seed=1), 1e-3)
+    report(kind(5, seed=1), 1e-3)
 
 
 @pytest.mark.calibrate
