@@ -8,12 +8,18 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from functools import lru_cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from beamfit.greybox import assess, curvature, problem
 from beamfit.greybox.problem import Problem
+
+# Damping of Gauss-Newton steps under constraints, times the gradient of the Lagrangian: in the flat
+# valleys of networks steps stay short, and they are undamped at an optimum (D.-H. Li, M. Fukushima,
+# L. Qi & N. Yamashita, Comput. Optim. Appl. 28 (2004) 131). Its first steps, in sizes of the
+# numbers, are at most as long as RADIUS: longer ones end in saturated weights.
+DAMPED, RADIUS = 1e-2, 1.0
 
 
 class SearchLimit(NamedTuple):
@@ -64,8 +70,8 @@ class SolverEnd(NamedTuple):
     said: str
 
 
-def _uno(preset: str) -> Callable[[NonlinearProgram, np.ndarray, int], SolverEnd]:
-    """A solver by Uno with one of its presets."""
+def _uno(preset: str, **further: Any) -> Callable[..., SolverEnd]:
+    """A solver by Uno with one of its presets and further options."""
 
     def solve(
         program: NonlinearProgram, x: np.ndarray, iterations: int, budget: SearchLimit
@@ -76,6 +82,8 @@ def _uno(preset: str) -> Callable[[NonlinearProgram, np.ndarray, int], SolverEnd
         solver.set_preset(preset)
         solver.set_option("logger", "SILENT")
         solver.set_option("max_iterations", iterations)
+        for name, value in further.items():
+            solver.set_option(name, value)
         solver.set_option("primal_tolerance", min(1e-9, 1e-3 * budget.tolerance))
         solver.set_option("dual_tolerance", min(1e-8, 1e-2 * budget.tolerance))
         solver.set_option("time_limit", float(min(120.0, max(budget.left, 0.01))))
@@ -188,7 +196,13 @@ class Stage(NamedTuple):
 _SHARP = Stage("Uno filtersqp", "filtersqp", "exact", 300, _uno("filtersqp"))
 # Solvers in the order they are tried.
 SOLVERS: tuple[Stage, ...] = (
-    Stage("Uno filtersqp with Gauss-Newton", "filtersqp", "gauss_newton", 3000, _uno("filtersqp")),
+    Stage(
+        "Uno filtersqp with Gauss-Newton",
+        "filtersqp",
+        "gauss_newton",
+        3000,
+        _uno("filtersqp", TR_radius=RADIUS),
+    ),
     _SHARP,
     Stage("Uno ipopt", "ipopt", "exact", 1000, _uno("ipopt")),
     _SHARP,
@@ -227,6 +241,7 @@ def scaled(
     """
     moving = np.flatnonzero(p.moving)
     unit, limit = _tame(scale.unit)[moving], _tame(scale.limit)
+    lower, upper = p.lower[moving] / unit, p.upper[moving] / unit
     steepest = max(np.max(np.abs(at.gradient * scale.unit)), 1e-300)
     # Squares are counted in their errors; a steep cost is flattened, as IPOPT does.
     flat = 1.0 / scale.cost if p.objectives else min(1.0, 100.0 / steepest)
@@ -250,7 +265,11 @@ def scaled(
 
     def squares(x, sigma, y):
         rows = parts(assess.first_order, x.tobytes())[1][:, moving] * unit
-        return sigma * flat * rows.T @ rows
+        gradient, jacobian = slopes(x)
+        pull = sigma * gradient - y @ jacobian
+        out = np.where(pull > 0, x <= lower, x >= upper)
+        damping = DAMPED * np.linalg.norm(np.where(out, 0.0, pull))
+        return sigma * flat * rows.T @ rows + damping * np.eye(len(x))
 
     def bend(x, sigma, y):
         exact = p.compiled(curvature.lagrangian_hessian)
@@ -261,8 +280,8 @@ def scaled(
         values,
         slopes,
         squares if hessian == "gauss_newton" else bend,
-        p.lower[moving] / unit,
-        p.upper[moving] / unit,
+        lower,
+        upper,
         p.constraint_lower / limit,
         p.constraint_upper / limit,
         full,
