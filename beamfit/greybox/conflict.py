@@ -164,7 +164,8 @@ def dependence(p: Problem, s: SearchState, stationary: bool) -> Dependence | Non
 def _changes(p: Problem, s: SearchState) -> np.ndarray:
     """Largest change of each constraint per unit of the numbers, at random points nearby."""
     points = nearby(p, s.theta, scale_of(p, s.theta, s.at).unit)
-    values = np.array([p.constraint_values(point) for point in points])
+    look = p.compiled(problem.constraints)
+    values = np.array([look(point) for point in points])
     change = np.abs(values - s.at.constraints) / NEAR
     return np.max(np.where(np.isfinite(change), change, 0.0), axis=0, initial=0.0)
 

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import jax
 import numpy as np
-from scipy.special import stdtr, stdtrit
+from scipy.special import gammaln, stdtr, stdtrit
 
 from beamfit.greybox.covariance import CUT
 from beamfit.greybox.problem import padded_length
@@ -32,6 +32,8 @@ SHORTEST, LONGEST, TIMES = 0.3, 5.0, 20
 WHITE = (0.0, 1.0, 10.0, 100.0, 1000.0)
 # Central 68 %, one standard deviation to either side of a normal distribution, and its upper end.
 CENTRAL, HALF = 0.682689492, 0.841344746
+# Most steps to a distance of given probability, and the last step's share of its size.
+ROUNDS, ENOUGH = 50, 1e-10
 
 
 class AveragedMoments(NamedTuple):
@@ -107,9 +109,12 @@ class Memory(NamedTuple):
                 shift, stdtrit(dof, HALF) * spread, stdtrit(dof, 0.975) * spread, chance
             )
 
-        def within(reach: np.ndarray) -> np.ndarray:
-            ends = [(shift + sign * reach - centre) / spread for sign in (1, -1)]
-            return self.weight @ (stdtr(self.dof, ends[0]) - stdtr(self.dof, ends[1]))
+        def within(reach: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+            above, below = ((shift + sign * reach - centre) / spread for sign in (1, -1))
+            slope = (_density(self.dof, above) + _density(self.dof, below)) / spread
+            return self.weight @ (stdtr(self.dof, above) - stdtr(self.dof, below)), (
+                self.weight @ slope
+            )
 
         reaches = [_inverted(within, np.max(np.abs(centre - shift) + spread, 0), p)
                    for p in (CENTRAL, 0.95)]  # fmt: skip
@@ -117,14 +122,31 @@ class Memory(NamedTuple):
         return AveragedMoments(shift, *reaches, chance)
 
 
+def _density(dof: int, t: np.ndarray) -> np.ndarray:
+    """Density of Student's t."""
+    top = gammaln(0.5 * (dof + 1)) - gammaln(0.5 * dof) - 0.5 * np.log(np.pi * dof)
+    return np.exp(top - 0.5 * (dof + 1) * np.log1p(t * t / dof))
+
+
 def _inverted(within, scale: np.ndarray, probability: float) -> np.ndarray:
-    """Distance within which this probability lies, by bisection."""
-    low, high = np.zeros_like(scale), 100.0 * scale
-    for _ in range(50):
-        middle = 0.5 * (low + high)
-        less = within(middle) < probability
-        low, high = np.where(less, middle, low), np.where(less, high, middle)
-    return 0.5 * (low + high)
+    """Distance within which this probability lies.
+
+    By Newton steps, and halves of the bracket where one leaves it or is no shorter by half.
+    """
+    low, high, at = np.zeros_like(scale), 100.0 * scale, scale
+    last = high
+    for _ in range(ROUNDS):
+        found, slope = within(at)
+        less = found < probability
+        low, high = np.where(less, at, low), np.where(less, high, at)
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+            step = (probability - found) / slope
+        usable = (at + step >= low) & (at + step <= high) & (2 * np.abs(step) <= last)
+        step = np.where(usable, step, 0.5 * (low + high) - at)
+        at, last = at + step, np.abs(step)
+        if np.all(last <= ENOUGH * at):
+            break
+    return at
 
 
 class Whitened(NamedTuple):

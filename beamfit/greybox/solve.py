@@ -42,6 +42,7 @@ def solve(
     progress: bool = False,
     seconds: float | None = None,
     solver: str | None = None,
+    began: float | None = None,
 ) -> Fit:
     """Minimise the cost of a problem within its bounds and constraints.
 
@@ -74,6 +75,8 @@ def solve(
     solver : {"levenberg-marquardt", "filtersqp", "ipopt", "slsqp"}, optional
         The one to use, in the place of all that suit the problem in turn. The first is for least
         squares within bounds.
+    began : float, optional
+        Moment of `time.perf_counter` from which `seconds` count; that of the call by default.
 
     Returns
     -------
@@ -95,7 +98,7 @@ def solve(
     >>> fit.status, round(fit["slope"].value, 4), round(fit["slope"].error, 4)
     (<Status.converged: 'converged'>, 1.9929, 0.0267)
     """
-    began = time.perf_counter()
+    began = time.perf_counter() if began is None else began
     _check(starts, iterations, hessian, seconds)
     squares = not (p.constraints or p.objectives)
     _check_solver(solver, squares)

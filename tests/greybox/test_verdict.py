@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+import time
 
 import jax.numpy as jnp
 import numpy as np
@@ -166,6 +167,9 @@ def test_a_limit_of_time_is_said_and_the_best_point_kept(kind):
     fit = solve(p, starts=5, seconds=1e-9)
     assert "The limit of 1e-09 s cut the search." in fit.message
     assert fit.cost <= p.cost(np.array([9.0]))
+    assert "cut the search" not in solve(p, seconds=1e3).message
+    late = solve(p, starts=5, seconds=1e3, began=time.perf_counter() - 2e3)
+    assert "The limit of 1000 s cut the search." in late.message
     with pytest.raises(InputError, match="a time above 0"):
         solve(p, seconds=0.0)
 
