@@ -27,6 +27,8 @@ if TYPE_CHECKING:
 PLANES = ("x", "y")
 # Units of settings: current, integrated gradient, gradient, focusing strength, 1/focal length.
 SETTINGS = ("A", "kG", "T_per_m", "k1", "k1l")
+# Of a setting that is no magnet of the line: what a machine is tuned by.
+KNOB = "knob"
 # What rows that look at no single slice of the beam say for one.
 PROJECTED = "projected"
 # Rows of a scan that a notebook shows.
@@ -352,7 +354,7 @@ class QuadScan:
         expect(self.units, Mapping, '{"Q1": "kG"}')
         for name in self.settings:
             unit = self.units.get(name)
-            if unit not in SETTINGS:
+            if unit not in (*SETTINGS, KNOB):
                 found = f"'{name}' in the unit {unit!r}" if unit else f"no unit for '{name}'"
                 raise self.unusable(found, f"units of {nearest(str(unit), list(SETTINGS))}", name)
         if self.energy_kind not in ENERGY_KEYS.values():
