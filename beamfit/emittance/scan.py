@@ -6,7 +6,7 @@ Plain numpy, so that a bad file is reported before JAX is ever loaded.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import compress
 from os import PathLike
@@ -329,6 +329,19 @@ class QuadScan:
         profiles = tuple(p._replace(row=at.index(p.row)) for p in self.profiles if p.row in at)
         word = "" if name == PROJECTED else "slice "
         return replace(self, **part, profiles=profiles, name=f"{self.name}, {word}{name}")
+
+    def without_settings(self, names: Iterable[str]) -> QuadScan:
+        """The same scan without some of its settings, which are no magnets of the line.
+
+        Examples
+        --------
+        >>> scan = QuadScan({"Q": [0.0, 1.0, 2.0], "phase": [5.0, 6.0, 7.0]},
+        ...                 {"Q": "A", "phase": KNOB}, {"x": [2e-4, 1e-4, 3e-4]})
+        >>> list(scan.without_settings(["phase"]).settings)
+        ['Q']
+        """
+        left = {n: v for n, v in self.settings.items() if n not in set(names)}
+        return replace(self, settings=left, units={n: self.units[n] for n in left})
 
     def of_particle(self, rest_energy: float) -> QuadScan:
         """The same scan with total energies, for a particle of a rest energy in MeV.

@@ -3,45 +3,41 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from beamfit.answer import answer
 from beamfit.emittance.results import in_words
-from beamfit.emittance.scan import QuadScan
-from beamfit.emittance.statement import Seen
+from beamfit.emittance.scan import KNOB, QuadScan
+from beamfit.emittance.statement import Seen, varied_magnets
+from beamfit.emittance.transport import setting_units
 from beamfit.errors import InputError, expect
 from beamfit.noise.model import Noise
 from beamfit.optics.beamline import Beamline
+from beamfit.optics.calibration import SETTING_UNITS
 from beamfit.optics.particle import beta_gamma
 from beamfit.quantity import Quantity, percent
 from beamfit.status import Status
 from beamfit.table import Table, cell, json_of
-from beamfit.tuning.knob_map import design, orders_of
+from beamfit.tuning.knobs import Knobs, knobs_of, planes_of
 from beamfit.tuning.minimum import Emittances, Minima, emittances_of, minima_of, values_at
-from beamfit.tuning.posterior import MapPosterior, map_posterior
-from beamfit.tuning.readings import (
-    Knobs,
-    PlaneReadings,
-    knobs_of,
-    plane_readings,
-    planes_of,
-    seen_without,
-)
+from beamfit.tuning.next_row import NextRow, next_row
+from beamfit.tuning.posterior import MapPosterior, map_posterior, numbers_at
+from beamfit.tuning.readings import PlaneReadings, plane_readings, seen_without
 from beamfit.verdict import Finding, judge
 
 # Draws of the map: the ends of a 95 % interval are known to a sixth of its half-width.
 DRAWS = 128
-# What is made small: the geometric mean of the planes' emittances, or one of them.
-GOALS = ("emittance", "emittance_x", "emittance_y")
 # Probability below which an emittance is told from one that no knob changes, and a setting is
 # accepted as within the goal of the minimum.
 TOLD = 0.05
+# Parts of a table whose course is shown, and rows of the first.
+POINTS, FIRST = 5, 6
 # Half ranges within which a minimum is on the limit.
 EDGE = 1e-6
 CENTRAL, WIDE = (0.16, 0.84), (0.025, 0.975)
@@ -134,7 +130,7 @@ def fit_tuning(
     expect(knobs, Mapping, '{"SOL": (180.0, 220.0)}')
     if not (within > 0.0 and draws > 1):
         raise InputError(f"{draws} draws, within {within:g}", "2 or more, and a positive share")
-    planes, own = planes_of(scan, goal, GOALS), knobs_of(scan, knobs)
+    planes, own = planes_of(scan, goal), knobs_of(scan, knobs)
     seen, count = seen_without(scan, line, own, noise), len(own.names)
     maps = {}
     for i, plane in enumerate(planes):
@@ -172,8 +168,12 @@ class TuningFit:
 
     Examples
     --------
-    >>> TuningFit.__name__
-    'TuningFit'
+    >>> import beamfit
+    >>> knobs = {"SOL": (190, 210), "phase_deg": (-12, 12)}
+    >>> scan = beamfit.read_tuning_scan("measurements/gun_tuning_simulated.csv", knobs)
+    >>> fit = beamfit.fit_tuning(scan, beamfit.load_lattice("lattices/gun_tuning.toml"), knobs)
+    >>> fit.status.value, fit.done, round(fit.place["SOL"].value)
+    ('converged', True, 198)
     """
 
     scan: QuadScan
@@ -191,8 +191,8 @@ class TuningFit:
         every = self.knobs.settings(self.minima.place)
         best = self.knobs.settings(self.minima.best)
         return {
-            name: _quantity(every[:, i], best[i], unit)
-            for i, (name, unit) in enumerate(zip(self.knobs.names, self.knobs.units, strict=True))
+            name: _quantity(every[:, i], best[i], unit or "1")
+            for i, (name, unit) in enumerate(self.units.items())
         }
 
     @property
@@ -260,8 +260,8 @@ class TuningFit:
     @property
     def headline(self) -> str:
         """The best setting and the emittance there, in a line."""
-        best = in_words(self.settings, dict(zip(self.knobs.names, self._units, strict=True)))
-        return f"{cell(self.status)}: {self._goal} {self.emittance} at {best}".rstrip()
+        best = in_words(self.settings, self.units).strip()
+        return f"{cell(self.status)}: {self._goal} {self.emittance} at {best}"
 
     @property
     def _goal(self) -> str:
@@ -273,8 +273,10 @@ class TuningFit:
         )
 
     @property
-    def _units(self) -> list[str]:
-        return ["" if unit == "knob" else unit for unit in self.knobs.units]
+    def units(self) -> dict[str, str]:
+        """Units of the knobs as people write them; "" where the name says it."""
+        known = {**SETTING_UNITS, KNOB: ""}
+        return {n: known[u] for n, u in zip(self.knobs.names, self.knobs.units, strict=True)}
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -286,6 +288,11 @@ class TuningFit:
             rows = ", ".join(str(self.seen.measured(plane)[i] + 1) for i in bad)
             said += [f"Bad readings of size {plane}: rows {rows}."] if rows else []
         return (*self.scan.notes, *said)
+
+    def noise_of(self, plane: str) -> float:
+        """Median relative error of a plane's sizes that was found."""
+        there = np.asarray(self.maps[plane].readings.readings.there) > 0
+        return float(np.median(np.asarray(self.maps[plane].posterior.error)[there]))
 
     def beam(self, settings: Mapping[str, Any]) -> dict[str, dict[str, Band]]:
         """Predict the beam at settings of the knobs, with its band.
@@ -314,6 +321,20 @@ class TuningFit:
             }
         return found
 
+    @cached_property
+    def next(self) -> NextRow | None:
+        """The row that tells most about the minimum; None where no quadrupole was moved."""
+        return next_row(self) if varied_magnets(self.seen.scan) else None
+
+    @property
+    def next_words(self) -> str:
+        """The next row in a sentence."""
+        if self.next is None:
+            return ""
+        units = self.units | setting_units(self.seen.scanned, self.seen.scan.settings)
+        words = in_words(self.next.settings, units, 5).replace(" ,", ",").strip()
+        return f"Measure next at {words}: this row tells most about the minimum."
+
     def _half_ranges(self, settings: Mapping[str, Any]) -> np.ndarray:
         missing = [name for name in self.knobs.names if name not in settings]
         if missing:
@@ -331,7 +352,7 @@ class TuningFit:
             "message": " ".join([self.message, *self.notes]),
             "goal": self.goal,
             "settings": self.place,
-            "units": dict(zip(self.knobs.names, self._units, strict=True)),
+            "units": self.units,
             "normalized_emittance": self.emittance,
             "minimum": self.minimum,
             "excess_95": float(np.quantile(self.excess, 1.0 - TOLD)),
@@ -340,6 +361,7 @@ class TuningFit:
             "at_limit": self.edge,
             "flat": self.flat,
             "rows": len(self.scan),
+            "next": self.next,
         }
         return json_of(found)
 
@@ -356,11 +378,30 @@ class TuningFit:
         return (Table(f"Best setting, from {len(self.scan)} rows", head, rows),)
 
 
+def course_of(fit: TuningFit, points: int = POINTS) -> list[tuple[int, Quantity]]:
+    """Emittance at the best setting, as the first rows of a table said it, and all of them.
+
+    Returns
+    -------
+    list of (int, Quantity)
+        Number of rows, and the normalised emittance at the setting that they say is best. Parts in
+        which too few magnet settings or no row within the limits stand are left out.
+    """
+    scan, found = fit.scan, []
+    for count in np.unique(np.linspace(FIRST, len(scan), points).astype(int))[:-1]:
+        limits = dict(zip(fit.knobs.names, np.stack(fit.knobs[1:3], -1), strict=True))
+        with suppress(InputError):
+            part = replace(scan, **scan.columns_at(range(count)), profiles=())
+            own = fit_tuning(part, fit.seen.line, limits, goal=fit.goal, noise=fit.seen.noise)
+            found.append((int(count), own.emittance))
+    return [*found, (len(scan), fit.emittance)]
+
+
 def _ends(q: Quantity) -> str:
     """The ends of an interval in the unit that the value is written in."""
     factor, unit = q._prefix()
     low, high = (end / factor for end in q.interval_95)
-    return f"{low:.4g} to {high:.4g} {unit.replace('knob', '')}".rstrip()
+    return f"{low:.4g} to {high:.4g} {unit}".rstrip()
 
 
 def _quantity(draws: np.ndarray, value: float | None, unit: str) -> Quantity:
@@ -369,17 +410,6 @@ def _quantity(draws: np.ndarray, value: float | None, unit: str) -> Quantity:
     ends = np.quantile(draws, WIDE)
     value = float(np.median(draws)) if value is None else float(value)
     return Quantity(value, 0.5 * float(high - low), unit, None, (float(ends[0]), float(ends[1])))
-
-
-@jax.jit
-def numbers_at(posterior: MapPosterior, x: np.ndarray) -> jax.Array:
-    """ln ε, ln β, α of every draw at settings, shape (m, knobs) to (d, m, 3), in coordinates."""
-    orders = orders_of(x.shape[-1])
-
-    def one(scales: Any, v: jax.Array) -> jax.Array:
-        return jax.vmap(lambda at: design(at, scales, orders) @ v)(jnp.asarray(x))
-
-    return jax.vmap(one)(posterior.scales, posterior.coefficients)
 
 
 def _even(numbers: jax.Array) -> np.ndarray:

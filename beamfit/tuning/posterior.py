@@ -300,3 +300,14 @@ def map_posterior(
     bad = 1.0 - (state.good - data.wide**-2) / (1.0 - data.wide**-2)
     pull = (data.y - model) / error
     return MapPosterior(scales, coefficients, log_evidence, log_flat, pull, bad, model, error)
+
+
+@jax.jit
+def numbers_at(posterior: MapPosterior, x: np.ndarray) -> Array:
+    """ln ε, ln β, α of every draw at settings, shape (m, knobs) to (d, m, 3), in coordinates."""
+    orders = orders_of(x.shape[-1])
+
+    def one(scales: Scales, v: Array) -> Array:
+        return jax.vmap(lambda at: design(at, scales, orders) @ v)(jnp.asarray(x))
+
+    return jax.vmap(one)(posterior.scales, posterior.coefficients)
