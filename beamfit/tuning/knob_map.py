@@ -60,7 +60,7 @@ def features(x: Array, length: Array, orders: np.ndarray) -> Array:
     -----
     exp(-|x - x'|²/2) = Σ_n Π_k φ_n(x_k) φ_n(x'_k), φ_n(x) = exp(-x²/2) xⁿ/√n!: A. Cotter,
     J. Keshet and N. Srebro, Explicit approximations of the Gaussian kernel, arXiv:1109.4603
-    (2011), sect. 3.
+    (2011).
 
     Examples
     --------

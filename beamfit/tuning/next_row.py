@@ -49,7 +49,7 @@ def next_row(fit: TuningFit, magnets: Mapping[str, tuple[float, float]] | None =
     -----
     The information of a size about the emittance where some draw has its minimum, on average over
     draws: W. Neiswanger, K. A. Wang and S. Ermon, Bayesian algorithm execution, Proc. 38th ICML
-    (2021), eq. 5, with the covariances of draws through the known line: -½ ln(1 - ρ² v/(v + e²)) of
+    (2021), with the covariances of draws through the known line: -½ ln(1 - ρ² v/(v + e²)) of
     a correlation ρ, a variance v of ln of the size over draws and its error e.
 
     Examples

@@ -13,10 +13,11 @@ from jax import Array
 from beamfit.noise.model import LN_2PI
 from beamfit.tuning.knob_map import MEAN, NUMBERS, Scales, design, log_size, orders_of
 
-# Priors of ln of the scales, middle and standard deviation. Lengths of 0.5 to 5 half ranges: a
-# range is chosen so that the beam bends once or twice. Emittances change by a tenth to a factor of
+# Priors of ln of the scales, middle and standard deviation. Lengths of 0.6 to 2.7 half ranges: a
+# range is chosen so that the beam bends once or twice; longer ones would have a weak knob's
+# emittance straight, and its minimum at a limit. Emittances change by a tenth to a factor of
 # three over it, beta and alpha by a third to a factor of five.
-LENGTH, EMITTANCE, TWISS = (0.4, 0.6), (-1.0, 1.0), (-0.4, 0.9)
+LENGTH, EMITTANCE, TWISS = (0.2, 0.4), (-1.0, 1.0), (-0.4, 0.9)
 # Rounds of scales and map; steps of the map and of the scales in each; steps tried.
 ROUNDS, STEPS, NEWTON = 6, 6, 2
 TRIED = np.array([1.0, 0.5, 0.2, 0.05, 0.0])
@@ -240,7 +241,7 @@ def _draw(key: Array, data: Readings, state: _State, orders: np.ndarray) -> Arra
     """A draw of the map at given scales: a prior draw, corrected by the readings.
 
     J. T. Wilson et al., Pathwise conditioning of Gaussian processes, J. Mach. Learn. Res. 22 (2021)
-    105, eq. 8, with the sizes linear about the best map.
+    105, with the sizes linear about the best map.
     """
     scales = scales_of(state.eta, jnp.ones(()))
     every = _numbers_at(data, scales, orders)
