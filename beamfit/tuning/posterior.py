@@ -22,7 +22,7 @@ LENGTH, EMITTANCE, TWISS = (0.2, 0.4), (-1.0, 1.0), (-0.4, 0.9)
 ROUNDS, STEPS, NEWTON = 6, 6, 2
 TRIED = np.array([1.0, 0.5, 0.2, 0.05, 0.0])
 # Draws of the scales, and the farthest step of them in standard deviations of the prior.
-SETS, FAR = 32, 1.5
+SETS, FAR = 64, 1.5
 
 
 class Readings(NamedTuple):
