@@ -65,7 +65,7 @@ def _planes(fit: TuningFit) -> list[Table]:
             ends = f"{each[3]:.3g} to {each[4]:.3g}{unit}"
             rows.append([label, f"{each[0]:.4g}{unit}", ends])
     noise = [
-        [f"relative error of a size {plane}", percent(fit.noise_of(plane)), ""]
+        [f"relative error of a size {plane}", percent(fit.maps[plane].noise), ""]
         for plane in fit.maps
     ]
     head = ["", "value", "95 % interval"]

@@ -26,9 +26,9 @@ from beamfit.status import Status
 from beamfit.table import Table, cell, json_of
 from beamfit.tuning.knobs import Knobs, knobs_of, planes_of
 from beamfit.tuning.minimum import Emittances, Minima, emittances_of, minima_of, values_at
-from beamfit.tuning.next_row import NextRow, next_row
-from beamfit.tuning.posterior import MapPosterior, map_posterior, numbers_at
-from beamfit.tuning.readings import PlaneReadings, plane_readings, seen_without
+from beamfit.tuning.next_row import NextRow, PlaneMap, next_row
+from beamfit.tuning.posterior import map_posterior, numbers_at
+from beamfit.tuning.readings import plane_readings, seen_without
 from beamfit.verdict import Finding, judge
 
 # Draws of the map: the ends of a 95 % interval are known to a tenth of its half-width.
@@ -41,13 +41,6 @@ POINTS, FIRST = 5, 6
 # Half ranges within which a minimum is on the limit.
 EDGE = 1e-6
 CENTRAL, WIDE = (0.16, 0.84), (0.025, 0.975)
-
-
-class PlaneMap(NamedTuple):
-    """A plane's readings and the posterior of its map."""
-
-    readings: PlaneReadings
-    posterior: MapPosterior
 
 
 class Band(NamedTuple):
@@ -288,11 +281,6 @@ class TuningFit:
             rows = ", ".join(str(self.seen.measured(plane)[i] + 1) for i in bad)
             said += [f"Bad readings of size {plane}: rows {rows}."] if rows else []
         return (*self.scan.notes, *said)
-
-    def noise_of(self, plane: str) -> float:
-        """Median relative error of a plane's sizes that was found."""
-        there = np.asarray(self.maps[plane].readings.readings.there) > 0
-        return float(np.median(np.asarray(self.maps[plane].posterior.error)[there]))
 
     def beam(self, settings: Mapping[str, Any]) -> dict[str, dict[str, Band]]:
         """Predict the beam at settings of the knobs, with its band.

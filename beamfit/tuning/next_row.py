@@ -3,25 +3,48 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from beamfit.emittance.next_point import SHARPEST, candidate_settings, elements_at
+from beamfit.emittance.statement import Seen
 from beamfit.errors import InputError
 from beamfit.tuning.knob_map import log_size
-from beamfit.tuning.minimum import settings_within, values_at
+from beamfit.tuning.knobs import Knobs
+from beamfit.tuning.minimum import Emittances, Minima, settings_within, values_at
 from beamfit.tuning.posterior import MapPosterior, numbers_at
-
-if TYPE_CHECKING:
-    from beamfit.tuning.fit import TuningFit
+from beamfit.tuning.readings import PlaneReadings
 
 # Knob settings that are considered, as a power of two, and minima of draws that are besides.
 POWER, PLACES = 7, 48
 # Draws on a correlation of which rests what a row would tell; less is noise.
 CHANCE = 2.0
+
+
+class PlaneMap(NamedTuple):
+    """A plane's readings and the posterior of its map."""
+
+    readings: PlaneReadings
+    posterior: MapPosterior
+
+    @property
+    def noise(self) -> float:
+        """Median relative error of the sizes that was found."""
+        there = np.asarray(self.readings.readings.there) > 0
+        return float(np.median(np.asarray(self.posterior.error)[there]))
+
+
+class Tuned(Protocol):
+    """Parts of a `TuningFit` that advice rests on."""
+
+    seen: Seen
+    knobs: Knobs
+    maps: dict[str, PlaneMap]
+    draws: Emittances
+    minima: Minima
 
 
 class NextRow(NamedTuple):
@@ -31,7 +54,7 @@ class NextRow(NamedTuple):
     information: float
 
 
-def next_row(fit: TuningFit, magnets: Mapping[str, tuple[float, float]] | None = None) -> NextRow:
+def next_row(fit: Tuned, magnets: Mapping[str, tuple[float, float]] | None = None) -> NextRow:
     """Choose the single row that tells most about the minimum.
 
     Parameters
@@ -83,7 +106,7 @@ def _scanned(settings: Mapping[str, np.ndarray]) -> dict[str, tuple[float, float
 
 
 def _told(
-    fit: TuningFit, x: np.ndarray, table: Mapping[str, np.ndarray], goal: np.ndarray
+    fit: Tuned, x: np.ndarray, table: Mapping[str, np.ndarray], goal: np.ndarray
 ) -> np.ndarray:
     """Nats that sizes at knobs ``x`` and magnets tell of the goal, shape (settings, magnets)."""
     seen, count = fit.seen, len(next(iter(table.values())))
@@ -97,7 +120,7 @@ def _told(
         w = np.stack([r11, r12], -1) @ c.back
         drawn = np.asarray(_log_sizes(posterior, x, w, known / c.unit**2))
         there = np.asarray(readings.readings.there) > 0
-        error = max(fit.noise_of(plane), SHARPEST)
+        error = max(fit.maps[plane].noise, SHARPEST)
         told += _information(drawn.reshape(len(drawn), -1), goal, error).reshape(told.shape)
         on_screen &= drawn.mean(0) <= np.asarray(readings.readings.y)[there].max()
     return np.where(on_screen, told, -1.0)
