@@ -14,11 +14,11 @@ import beamfit
 NAMES = """
 Anchor Beam BeamMatrix Beamline DecayFit DecayRecord Drift EmittanceFit InputError Job Machine
 Monitor Noise Posterior QuadScan Quadrupole Quantity Run Screen SectorDipole Status Target ThinLens
-check constant_a_test control design find_setpoint fit_decay fit_decays fit_emittance fit_lifetimes
-fit_sizes fit_slices identify load_fit load_lattice loss_coefficients moving_lifetime
-read_decay_record read_formulation read_noise read_operation read_quad_scan read_ring read_run
-run_batch save_fit scan_machine solve split_record study study_shift systematics trend watch
-write_report
+TuningFit check constant_a_test control design find_setpoint fit_decay fit_decays fit_emittance
+fit_lifetimes fit_sizes fit_slices fit_tuning identify load_fit load_lattice loss_coefficients
+moving_lifetime read_decay_record read_formulation read_noise read_operation read_quad_scan
+read_ring read_run read_tuning_scan run_batch save_fit scan_machine solve split_record study
+study_shift systematics trend watch write_report
 """
 PUBLIC = NAMES.split()
 # Every command and the function that answers as it does.
@@ -33,6 +33,7 @@ COMMANDS = {
     "scan": "scan_machine",
     "setpoint": "find_setpoint",
     "solve": "solve",
+    "tune": "fit_tuning",
     "watch": "watch",
 }
 # What a reader of `beamfit` gives, so that nobody has to make one: no public names.

@@ -22,6 +22,7 @@ from beamfit.cli.lifetime import lifetime
 from beamfit.cli.scan import scan
 from beamfit.cli.setpoint import setpoint
 from beamfit.cli.solve import solve
+from beamfit.cli.tune import tune
 from beamfit.cli.watch import watch
 from beamfit.errors import LONGEST, InputError, plain, short
 
@@ -46,7 +47,7 @@ def cli() -> None:
     """Beam emittance and lifetime from scans and decays, with errors you can defend."""
 
 
-for command in (emittance, lifetime, setpoint, design, example, check):
+for command in (emittance, lifetime, setpoint, design, tune, example, check):
     cli.add_command(command)
 for command in (solve, identify, control, batch, watch, scan):
     cli.add_command(command)

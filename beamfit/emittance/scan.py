@@ -6,7 +6,7 @@ Plain numpy, so that a bad file is reported before JAX is ever loaded.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import compress
 from os import PathLike
@@ -27,6 +27,8 @@ if TYPE_CHECKING:
 PLANES = ("x", "y")
 # Units of settings: current, integrated gradient, gradient, focusing strength, 1/focal length.
 SETTINGS = ("A", "kG", "T_per_m", "k1", "k1l")
+# Of a setting that is no magnet of the line: what a machine is tuned by.
+KNOB = "knob"
 # What rows that look at no single slice of the beam say for one.
 PROJECTED = "projected"
 # Rows of a scan that a notebook shows.
@@ -328,6 +330,19 @@ class QuadScan:
         word = "" if name == PROJECTED else "slice "
         return replace(self, **part, profiles=profiles, name=f"{self.name}, {word}{name}")
 
+    def without_settings(self, names: Iterable[str]) -> QuadScan:
+        """The same scan without some of its settings, which are no magnets of the line.
+
+        Examples
+        --------
+        >>> scan = QuadScan({"Q": [0.0, 1.0, 2.0], "phase": [5.0, 6.0, 7.0]},
+        ...                 {"Q": "A", "phase": KNOB}, {"x": [2e-4, 1e-4, 3e-4]})
+        >>> list(scan.without_settings(["phase"]).settings)
+        ['Q']
+        """
+        left = {n: v for n, v in self.settings.items() if n not in set(names)}
+        return replace(self, settings=left, units={n: self.units[n] for n in left})
+
     def of_particle(self, rest_energy: float) -> QuadScan:
         """The same scan with total energies, for a particle of a rest energy in MeV.
 
@@ -352,7 +367,7 @@ class QuadScan:
         expect(self.units, Mapping, '{"Q1": "kG"}')
         for name in self.settings:
             unit = self.units.get(name)
-            if unit not in SETTINGS:
+            if unit not in (*SETTINGS, KNOB):
                 found = f"'{name}' in the unit {unit!r}" if unit else f"no unit for '{name}'"
                 raise self.unusable(found, f"units of {nearest(str(unit), list(SETTINGS))}", name)
         if self.energy_kind not in ENERGY_KEYS.values():

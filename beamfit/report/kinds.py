@@ -20,6 +20,8 @@ from beamfit.report.fedbatch import fedbatch_page, feed_page
 from beamfit.report.formulation import computed_page, formulation_page
 from beamfit.report.response import response_page
 from beamfit.report.slices import slices_page
+from beamfit.report.tuning import tuning_page
+from beamfit.tuning.fit import TuningFit
 
 # A result by itself, and several beside one another.
 OF_ONE = {
@@ -28,6 +30,7 @@ OF_ONE = {
     SliceFits: slices_page,
     FeedPlan: feed_page,
     Loop: control_page,
+    TuningFit: tuning_page,
 }
 OF_SEVERAL = dict.fromkeys((ResponseFit, StatesFit), response_page)
 OF_SEVERAL |= dict.fromkeys((FedBatchFit, TitreFit), fedbatch_page)

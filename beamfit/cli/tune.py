@@ -1,0 +1,93 @@
+"""`beamfit tune`: sizes at settings of knobs in, the setting of the lowest emittance out."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from beamfit.cli.option_text import goal_of, limits_of
+from beamfit.cli.options import Command, answered, option, options, reported
+from beamfit.errors import InputError
+from beamfit.io.line import build_line, lattice_of
+from beamfit.io.priors import read_noise
+from beamfit.io.tuning import read_tuning_scan
+from beamfit.tuning.knobs import GOALS, knobs_of, planes_of
+
+if TYPE_CHECKING:
+    from beamfit.cli.show import Terminal
+    from beamfit.tuning.fit import TuningFit
+
+EXAMPLE = """\b
+Examples:
+  beamfit tune measurements/gun_tuning_simulated.csv --lattice lattices/gun_tuning.toml \\
+    --vary SOL=190:210 --vary phase_deg=-12:12
+  beamfit tune table.csv --lattice line.toml --vary SOL=190:210 --goal emittance_x --json
+"""
+
+
+@click.command(cls=Command, epilog=EXAMPLE)
+@click.argument("table")
+@options("columns ignore skip-bad maybe-lattice use from to screen energy particle")
+@option(
+    "--vary KNOB=LOW:HIGH",
+    "A knob by the header of its column, and its limits.",
+    name="limits",
+    multiple=True,
+    callback=lambda context, parameter, value: limits_of(value),
+)
+@option("--goal", "What is to be low; emittance is the mean of x and y.", choices=GOALS,
+        default=GOALS[0])  # fmt: skip
+@option(
+    "--within PERCENT",
+    "Stop when the best setting is this close to the minimum with 95 % probability.",
+    callback=lambda context, parameter, value: goal_of(value),
+    default="5%",
+)
+@options("noise seed report json")
+def tune(
+    table: str,
+    limits: dict[str, tuple[float, float]],
+    goal: str,
+    within: float,
+    noise: str | None,
+    seed: int,
+    report: str | None,
+    as_json: bool,
+    columns: Any,
+    ignore: tuple[str, ...],
+    skip_bad: bool,
+    **part: Any,
+) -> None:
+    """Find the setting of the knobs at which the emittance is lowest, and the next row to measure.
+
+    TABLE is a scan with columns of knobs beside quadrupoles and sizes: Q2_A, SOL_A, phase_deg,
+    size_x_um, ... Rows stand in any order; no setting of the knobs needs a whole scan.
+    """
+    if not limits:
+        raise InputError("no --vary", "KNOB=LOW:HIGH such as SOL=190:210")
+    scan = read_tuning_scan(table, limits, columns=columns, ignore=ignore, skip_bad=skip_bad)
+    knobs_of(scan, limits)
+    planes_of(scan, goal)
+    described = lattice_of(scan.without_settings(limits), part.pop("lattice"), **part)
+    own = None if noise is None else read_noise(noise)
+    line = build_line(described) if scan.transfer is None else None  # JAX from here on
+
+    from beamfit.tuning.fit import fit_tuning
+
+    fit = fit_tuning(scan, line, limits, goal=goal, within=within, noise=own, seed=seed)
+    inputs = {str(each.path): each.sha256 for each in (scan, described)}
+    reported(report, fit, inputs)
+    answered(as_json, [fit], inputs, lambda terminal: _show(terminal, fit), report)
+
+
+def _show(terminal: Terminal, fit: TuningFit) -> None:
+    """Say the verdict first, then the best setting and the next row."""
+    terminal.answer(fit.headline, fit.status, fit.message)
+    for note in fit.notes:
+        terminal.line(note)
+    terminal.line()
+    for table in fit.tables():
+        terminal.table(table)
+    terminal.line()
+    terminal.line(fit.next_words)

@@ -1,0 +1,137 @@
+"""The report of a tuned machine: maps of two knobs at a time, and the course of the best."""
+
+from __future__ import annotations
+
+from functools import partial
+from itertools import combinations
+
+import numpy as np
+from matplotlib.figure import FigureBase
+
+from beamfit.quantity import percent
+from beamfit.report.document import BLUE, RED, Picture, ReportPage, Verdict
+from beamfit.report.emittance import about_input, about_scan
+from beamfit.table import Table
+from beamfit.tuning.fit import TuningFit, course_of
+
+# Points along each axis of a map, and most maps that are drawn.
+FINE, MOST_MAPS = 25, 6
+
+
+def tuning_page(fit: TuningFit) -> ReportPage:
+    """Lay out a tuning fit.
+
+    Parameters
+    ----------
+    fit : TuningFit
+        From `beamfit.fit_tuning`.
+
+    Returns
+    -------
+    ReportPage
+    """
+    source = f"{fit.scan.name}, {len(fit.scan)} rows on {fit.seen.line.name}"
+    names = fit.knobs.names
+    pairs = list(combinations(range(len(names)), 2))[:MOST_MAPS] or [(0, 0)]
+    pictures = [
+        Picture(f"map of {names[i]} and {names[j]}", 3.2, partial(draw_map, fit=fit, i=i, j=j),
+                source)
+        for i, j in pairs
+    ]  # fmt: skip
+    draw = partial(draw_course, fit=fit)
+    pictures.append(Picture("course of the best emittance", 2.8, draw, source))
+    tables = [*fit.tables(), *_planes(fit), *about_input(fit.notes)]
+    return ReportPage(
+        title=f"Tuning by {fit.scan.name}",
+        subtitle=f"{len(fit.scan)} rows of {', '.join(names)} on line {fit.seen.line.name}, "
+        f"{float(fit.seen.energy):g} MeV",
+        verdicts=[Verdict(fit.status, fit.headline, f"{fit.message} {fit.next_words}".strip())],
+        tables=tables,
+        pictures=pictures,
+        pictures_title="The emittance over the knobs",
+        **about_scan(fit.scan),
+    )
+
+
+def _planes(fit: TuningFit) -> list[Table]:
+    """The beam at the best setting, and the noise that was found."""
+    rows = []
+    for plane, found in fit.beam(fit.settings).items():
+        for name, band in found.items() if plane != "goal" else ():
+            scale, unit = (1e6, " µm") if name == "normalized_emittance" else (1.0, "")
+            unit = " m" if name == "beta" else unit
+            each = [scale * float(part[0]) for part in band]
+            label = f"{name.replace('_', ' ')} {plane}"
+            ends = f"{each[3]:.3g} to {each[4]:.3g}{unit}"
+            rows.append([label, f"{each[0]:.4g}{unit}", ends])
+    noise = [
+        [f"relative error of a size {plane}", percent(fit.maps[plane].noise), ""]
+        for plane in fit.maps
+    ]
+    head = ["", "value", "95 % interval"]
+    return [Table("The beam at the best setting", head, rows + noise)]
+
+
+def draw_map(figure: FigureBase, fit: TuningFit, i: int, j: int) -> None:
+    """Draw the emittance over two knobs, the others at their best, and its relative error.
+
+    Parameters
+    ----------
+    figure : Figure or SubFigure
+        The figure to draw on.
+    fit : TuningFit
+        The fit.
+    i, j : int
+        Numbers of the knobs; of a single one the curve with its bands is drawn.
+    """
+    names, low, high = fit.knobs.names, fit.knobs.low, fit.knobs.high
+    along = [np.linspace(low[k], high[k], FINE) for k in (i, j)]
+    if i == j:
+        _draw_curve(figure, fit, along[0])
+        return
+    first, second = np.meshgrid(*along, indexing="ij")
+    settings = fit.settings | {names[i]: first.ravel(), names[j]: second.ravel()}
+    band = fit.beam(settings)["goal"]["normalized_emittance"]
+    value = 1e6 * band.value.reshape(FINE, FINE)
+    error = 50.0 * ((band.high - band.low) / band.value).reshape(FINE, FINE)
+    titles = ("normalised emittance, µm", "its standard error, %")
+    for axes, part, title in zip(figure.subplots(1, 2), (value, error), titles, strict=True):
+        drawn = axes.contourf(*along, part.T, levels=12, cmap="viridis")
+        figure.colorbar(drawn, ax=axes)
+        axes.plot(fit.scan.settings[names[i]], fit.scan.settings[names[j]], "w.", ms=4, mec="0.3")
+        best = [fit.place[names[k]] for k in (i, j)]
+        axes.errorbar(*([q.value] for q in best), *([q.error] for q in best[::-1]), fmt="*",
+                      color=RED, ms=10)  # fmt: skip
+        axes.set(xlabel=names[i], ylabel=names[j], xlim=(low[i], high[i]), ylim=(low[j], high[j]))
+        axes.set_title(title)
+
+
+def _draw_curve(figure: FigureBase, fit: TuningFit, at: np.ndarray) -> None:
+    """The emittance over a single knob with its 68 and 95 % bands."""
+    axes, name = figure.subplots(), fit.knobs.names[0]
+    band = fit.beam({name: at})["goal"]["normalized_emittance"]
+    axes.fill_between(at, 1e6 * band.low_95, 1e6 * band.high_95, color=BLUE, alpha=0.15, lw=0)
+    axes.fill_between(at, 1e6 * band.low, 1e6 * band.high, color=BLUE, alpha=0.3, lw=0)
+    axes.plot(at, 1e6 * band.value, color=BLUE)
+    bottom = axes.get_ylim()[0]
+    axes.plot(fit.scan.settings[name], np.full(len(fit.scan), bottom), "k|", ms=8)
+    axes.axvline(fit.settings[name], color=RED, lw=1.2, ls="--")
+    axes.set(xlabel=name, ylabel="normalised emittance, µm", xlim=(at[0], at[-1]))
+
+
+def draw_course(figure: FigureBase, fit: TuningFit) -> None:
+    """Draw the emittance at the best setting against the number of rows that it was found from.
+
+    Parameters
+    ----------
+    figure : Figure or SubFigure
+        The figure to draw on.
+    fit : TuningFit
+        The fit.
+    """
+    axes, course = figure.subplots(), course_of(fit)
+    rows = [count for count, _ in course]
+    value, error = (np.array([1e6 * getattr(q, n) for _, q in course]) for n in ("value", "error"))
+    axes.errorbar(rows, value, error, fmt="o-", color=BLUE, ms=4, capsize=3, lw=1.0)
+    axes.axhline(1e6 * fit.minimum.value, color="0.5", lw=1.0, ls="--")
+    axes.set(xlabel="rows", ylabel="normalised emittance\nat the best setting, µm")

@@ -1,0 +1,443 @@
+"""The tuning fit: a scan of knobs and a line in, the setting of the lowest emittance out."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from beamfit.answer import answer
+from beamfit.emittance.results import in_words
+from beamfit.emittance.scan import KNOB, QuadScan
+from beamfit.emittance.statement import Seen, varied_magnets
+from beamfit.emittance.transport import setting_units
+from beamfit.errors import InputError, expect
+from beamfit.noise.model import Noise
+from beamfit.optics.beamline import Beamline
+from beamfit.optics.calibration import SETTING_UNITS
+from beamfit.optics.particle import beta_gamma
+from beamfit.quantity import Quantity, percent
+from beamfit.status import Status
+from beamfit.table import Table, cell, json_of
+from beamfit.tuning.knobs import Knobs, knobs_of, planes_of
+from beamfit.tuning.minimum import Emittances, Minima, emittances_of, minima_of, values_at
+from beamfit.tuning.next_row import NextRow, PlaneMap, next_row
+from beamfit.tuning.posterior import map_posterior, numbers_at
+from beamfit.tuning.readings import plane_readings, seen_without
+from beamfit.verdict import Finding, judge
+
+# Draws of the map: the ends of a 95 % interval are known to a tenth of its half-width.
+DRAWS = 256
+# Probability below which an emittance is told from one that no knob changes, and a setting is
+# accepted as within the goal of the minimum.
+TOLD = 0.05
+# Parts of a table whose course is shown, and rows of the first.
+POINTS, FIRST = 5, 6
+# Half ranges within which a minimum is on the limit.
+EDGE = 1e-6
+CENTRAL, WIDE = (0.16, 0.84), (0.025, 0.975)
+
+
+class Band(NamedTuple):
+    """Values along settings with their central 68 and 95 %, arrays of shape (m,)."""
+
+    value: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+    low_95: np.ndarray
+    high_95: np.ndarray
+
+    @classmethod
+    def of(cls, draws: np.ndarray) -> Band:
+        """Take quantiles over draws, shape (d, m)."""
+        return cls(np.median(draws, 0), *np.quantile(draws, (*CENTRAL, *WIDE), axis=0))
+
+
+def fit_tuning(
+    scan: QuadScan,
+    line: Beamline | None,
+    knobs: Mapping[str, tuple[float, float]],
+    *,
+    goal: str = "emittance",
+    within: float = 0.05,
+    noise: Noise | None = None,
+    draws: int = DRAWS,
+    seed: int = 1,
+) -> TuningFit:
+    """Find the setting of a machine's knobs at which the emittance is lowest, with its error.
+
+    Parameters
+    ----------
+    scan : QuadScan
+        Sizes at settings of quadrupoles and knobs, in any order; no setting of the knobs needs a
+        whole scan. A knob is one of its ``settings``, in the unit "knob" if it is no magnet.
+    line : Beamline or None
+        From where the emittance is wanted to the screens; None for rows with matrices.
+    knobs : mapping of str to (float, float)
+        Name of a knob to its limits.
+    goal : {"emittance", "emittance_x", "emittance_y"}
+        What is to be low; "emittance" is the geometric mean of the planes that were measured.
+    within : float
+        Share of the minimum that is good enough, for the stop rule.
+    noise : Noise, optional
+        Priors of the noise of sizes; `beamfit.Noise()` if None.
+    draws, seed : int
+        Draws of the map, and the seed of their random numbers.
+
+    Returns
+    -------
+    TuningFit
+        The place and value of the minimum with intervals; `print` it.
+
+    Raises
+    ------
+    InputError
+        If knobs, limits, line or goal do not fit the scan.
+
+    Notes
+    -----
+    ln ε, ln β and α of each plane are Gaussian processes of the knobs; a size is that beam carried
+    through the line (report eq. 37). Lengths, amplitudes and noise are averaged over; see
+    docs/tuning.md.
+
+    Examples
+    --------
+    >>> from beamfit.optics.elements import Drift, Quadrupole, Screen
+    >>> from beamfit.optics.beam import BeamMatrix
+    >>> line = Beamline((Quadrupole("Q", 0.1), Drift("D", 2.0), Screen("S")), energy=135.0)
+    >>> k1, solenoid = np.tile([0.0, 3.0, 6.0, 9.0], 6), np.repeat(np.linspace(-1, 1, 6), 4)
+    >>> beams = [BeamMatrix.from_twiss(2e-9 * (1 + s**2), 5.0, 0.0) for s in solenoid]
+    >>> size = [float(b.transport(line.matrix({"Q": k}).x).l11) for b, k in zip(beams, k1)]
+    >>> scan = QuadScan({"Q": k1, "SOL": solenoid}, {"Q": "k1", "SOL": "knob"}, {"x": size},
+    ...                 {"x": 0.02 * np.array(size)})
+    >>> fit = fit_tuning(scan, line, {"SOL": (-1.0, 1.0)})
+    >>> fit.status.value, abs(fit.place["SOL"].value) < 0.2
+    ('converged', True)
+    """
+    expect(scan, QuadScan, "beamfit.read_tuning_scan(path, knobs)")
+    expect(knobs, Mapping, '{"SOL": (180.0, 220.0)}')
+    if not (within > 0.0 and draws > 1):
+        raise InputError(f"{draws} draws, within {within:g}", "2 or more, and a positive share")
+    planes, own = planes_of(scan, goal), knobs_of(scan, knobs)
+    seen, count = seen_without(scan, line, own, noise), len(own.names)
+    maps = {}
+    for i, plane in enumerate(planes):
+        readings = plane_readings(seen, plane, own, scan.settings)
+        given = readings.readings, readings.start, 2 * seed + i
+        maps[plane] = PlaneMap(readings, map_posterior(*given, knobs=count, draws=draws))
+    found = emittances_of([m.posterior for m in maps.values()])
+    minima = jax.tree.map(np.asarray, minima_of(found, count))
+    return TuningFit(scan, seen, own, goal, within, maps, found, minima)
+
+
+@answer
+@dataclass(frozen=True, eq=False)
+class TuningFit:
+    """A map of the emittance over the knobs of a machine, and its minimum.
+
+    Attributes
+    ----------
+    scan : QuadScan
+        The scan, knobs among its settings.
+    seen : Seen
+        The scan without the knobs, through its line.
+    knobs : Knobs
+        Names, limits and units.
+    goal : str
+        What is to be low.
+    within : float
+        Share of the minimum that is good enough.
+    maps : dict of str to PlaneMap
+        Plane to its readings and its map.
+    draws : Emittances
+        Draws of ln of the goal.
+    minima : Minima
+        Their lowest values and places, in half ranges.
+
+    Examples
+    --------
+    >>> import beamfit
+    >>> knobs = {"SOL": (190, 210), "phase_deg": (-12, 12)}
+    >>> scan = beamfit.read_tuning_scan("measurements/gun_tuning_simulated.csv", knobs)
+    >>> fit = beamfit.fit_tuning(scan, beamfit.load_lattice("lattices/gun_tuning.toml"), knobs)
+    >>> fit.status.value, round(fit.place["SOL"].value)
+    ('converged', 198)
+    """
+
+    scan: QuadScan
+    seen: Seen
+    knobs: Knobs
+    goal: str
+    within: float
+    maps: dict[str, PlaneMap]
+    draws: Emittances
+    minima: Minima
+
+    @cached_property
+    def place(self) -> dict[str, Quantity]:
+        """Setting of each knob at which the emittance is lowest, with errors."""
+        every = self.knobs.settings(self.minima.place)
+        best = self.knobs.settings(self.minima.best)
+        return {
+            name: _quantity(every[:, i], best[i], unit or "1")
+            for i, (name, unit) in enumerate(self.units.items())
+        }
+
+    @property
+    def settings(self) -> dict[str, float]:
+        """The best setting of the knobs."""
+        return {name: q.value for name, q in self.place.items()}
+
+    @cached_property
+    def minimum(self) -> Quantity:
+        """The lowest normalised emittance between the limits, m."""
+        return _quantity(self.normalized * np.exp(self.minima.value), None, "m")
+
+    @cached_property
+    def emittance(self) -> Quantity:
+        """The normalised emittance at the best setting, m."""
+        here = np.asarray(values_at(self.draws, self.minima.best[None]))[:, 0]
+        return _quantity(self.normalized * np.exp(here), None, "m")
+
+    @cached_property
+    def excess(self) -> np.ndarray:
+        """Emittance at the best setting over the minimum, less one, of every draw, shape (d,)."""
+        here = np.asarray(values_at(self.draws, self.minima.best[None]))[:, 0]
+        return np.expm1(np.maximum(here - self.minima.value, 0.0))
+
+    @property
+    def normalized(self) -> float:
+        """Normalised emittance of which the draws have the logarithm, m."""
+        own = np.prod([m.readings.emittance for m in self.maps.values()]) ** (1 / len(self.maps))
+        return float(own * beta_gamma(self.seen.energy, self.seen.line.mass))
+
+    @cached_property
+    def edge(self) -> dict[str, float]:
+        """Probability that the minimum is at a limit of each knob."""
+        on = (np.abs(self.minima.place) >= 1.0 - EDGE).mean(axis=0)
+        return dict(zip(self.knobs.names, map(float, on), strict=True))
+
+    @cached_property
+    def flat(self) -> float:
+        """Probability that no knob changes the emittance, of even odds before."""
+        posts = [m.posterior for m in self.maps.values()]
+        odds = sum(float(p.log_flat - p.log_evidence) for p in posts)
+        return float(1.0 / (1.0 + np.exp(min(-odds, 500.0))))
+
+    @property
+    def done(self) -> bool:
+        """The best setting is within the goal of the minimum with 95 % probability."""
+        close = float((self.excess > self.within).mean()) <= TOLD
+        return self.flat <= TOLD and close
+
+    @cached_property
+    def finding(self) -> Finding:
+        """Status with its sentences."""
+        return judge(self, RULES)
+
+    @property
+    def status(self) -> Status:
+        """Whether a minimum is found: converged, at_limit or unidentified."""
+        return self.finding.status
+
+    @property
+    def message(self) -> str:
+        """What is found, and what to do."""
+        return self.finding.message
+
+    @property
+    def headline(self) -> str:
+        """The best setting and the emittance there, in a line."""
+        best = in_words(self.settings, self.units).strip()
+        return f"{cell(self.status)}: {self._goal} {self.emittance} at {best}"
+
+    @property
+    def _goal(self) -> str:
+        plane = self.goal[-2:].removeprefix("_")
+        return (
+            f"normalised emittance {plane}".rstrip()
+            if len(plane) == 1
+            else ("mean normalised emittance" if len(self.maps) > 1 else "normalised emittance")
+        )
+
+    @property
+    def units(self) -> dict[str, str]:
+        """Units of the knobs as people write them; "" where the name says it."""
+        known = {**SETTING_UNITS, KNOB: ""}
+        return {n: known[u] for n, u in zip(self.knobs.names, self.knobs.units, strict=True)}
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Sentences on the file, bad readings, and rows beyond the limits."""
+        outside = (np.abs(self.knobs.half_ranges(self.scan.settings)) > 1.0).any(axis=1).sum()
+        said = [f"{outside} of {len(self.scan)} rows are beyond the limits."] if outside else []
+        for plane, m in self.maps.items():
+            bad = np.flatnonzero(np.asarray(m.posterior.bad) > 0.5)
+            rows = ", ".join(str(self.seen.measured(plane)[i] + 1) for i in bad)
+            said += [f"Bad readings of size {plane}: rows {rows}."] if rows else []
+        return (*self.scan.notes, *said)
+
+    def beam(self, settings: Mapping[str, Any]) -> dict[str, dict[str, Band]]:
+        """Predict the beam at settings of the knobs, with its band.
+
+        Parameters
+        ----------
+        settings : mapping of str to float or array
+            Every knob to settings, shape (m,) or one number for all.
+
+        Returns
+        -------
+        dict of str to dict of str to Band
+            Plane to ``normalized_emittance`` (m), ``beta`` (m) and ``alpha`` at the start of the
+            line; "goal" to the first of what is tuned.
+        """
+        x = self._half_ranges(settings)
+        found = {"goal": {"normalized_emittance": self._goal_band(x)}}
+        boost = beta_gamma(self.seen.energy, self.seen.line.mass)
+        for plane, m in self.maps.items():
+            sigma = m.readings.coordinates.sigma(_even(numbers_at(m.posterior, x)))
+            emittance = np.sqrt(sigma[..., 0] * sigma[..., 2] - sigma[..., 1] ** 2)
+            found[plane] = {
+                "normalized_emittance": Band.of(boost * emittance),
+                "beta": Band.of(sigma[..., 0] / emittance),
+                "alpha": Band.of(-sigma[..., 1] / emittance),
+            }
+        return found
+
+    @cached_property
+    def next(self) -> NextRow | None:
+        """The row that tells most about the minimum; None where no quadrupole was moved."""
+        return next_row(self) if varied_magnets(self.seen.scan) else None
+
+    @property
+    def next_words(self) -> str:
+        """The next row in a sentence."""
+        if self.next is None:
+            return ""
+        units = self.units | setting_units(self.seen.scanned, self.seen.scan.settings)
+        words = in_words(self.next.settings, units, 5).replace(" ,", ",").strip()
+        return f"Measure next at {words}: this row tells most about the minimum."
+
+    def _half_ranges(self, settings: Mapping[str, Any]) -> np.ndarray:
+        missing = [name for name in self.knobs.names if name not in settings]
+        if missing:
+            raise InputError(f"no setting of {missing[0]}", ", ".join(self.knobs.names))
+        values = np.broadcast_arrays(*(np.atleast_1d(settings[n]) for n in self.knobs.names))
+        return self.knobs.half_ranges(dict(zip(self.knobs.names, values, strict=True)))
+
+    def _goal_band(self, x: np.ndarray) -> Band:
+        return Band.of(self.normalized * np.exp(np.asarray(values_at(self.draws, x))))
+
+    def to_json(self) -> dict[str, Any]:
+        """Give the entry of ``results`` of the JSON contract."""
+        found = {
+            "status": self.status,
+            "message": " ".join([self.message, *self.notes]),
+            "goal": self.goal,
+            "settings": self.place,
+            "units": self.units,
+            "normalized_emittance": self.emittance,
+            "minimum": self.minimum,
+            "excess_95": float(np.quantile(self.excess, 1.0 - TOLD)),
+            "within": self.within,
+            "done": self.done,
+            "at_limit": self.edge,
+            "flat": self.flat,
+            "rows": len(self.scan),
+            "next": self.next,
+        }
+        return json_of(found)
+
+    def tables(self) -> tuple[Table, ...]:
+        """Lay out the best setting, the emittance there, and how sure both are."""
+        rows = [
+            [name, cell(q), _ends(q), percent(self.edge[name])] for name, q in self.place.items()
+        ]
+        rows += [
+            [f"{self._goal} there", cell(self.emittance), _ends(self.emittance), ""],
+            ["lowest between the limits", cell(self.minimum), _ends(self.minimum), ""],
+        ]
+        head = ["", "value", "95 % interval", "at a limit"]
+        return (Table(f"Best setting, from {len(self.scan)} rows", head, rows),)
+
+
+def course_of(fit: TuningFit, points: int = POINTS) -> list[tuple[int, Quantity]]:
+    """Emittance at the best setting, as the first rows of a table said it, and all of them.
+
+    Returns
+    -------
+    list of (int, Quantity)
+        Number of rows, and the normalised emittance at the setting that they say is best. Parts in
+        which too few magnet settings or no row within the limits stand are left out.
+    """
+    scan, found = fit.scan, []
+    for count in np.unique(np.linspace(FIRST, len(scan), points).astype(int))[:-1]:
+        limits = dict(zip(fit.knobs.names, np.stack(fit.knobs[1:3], -1), strict=True))
+        with suppress(InputError):
+            part = replace(scan, **scan.columns_at(range(count)), profiles=())
+            own = fit_tuning(part, fit.seen.line, limits, goal=fit.goal, noise=fit.seen.noise)
+            found.append((int(count), own.emittance))
+    return [*found, (len(scan), fit.emittance)]
+
+
+def _ends(q: Quantity) -> str:
+    """The ends of an interval in the unit that the value is written in."""
+    factor, unit = q._prefix()
+    low, high = (end / factor for end in q.interval_95)
+    return f"{low:.4g} to {high:.4g} {unit}".rstrip()
+
+
+def _quantity(draws: np.ndarray, value: float | None, unit: str) -> Quantity:
+    """Median of draws, or another value, with half of the central 68 %, and the central 95 %."""
+    low, high = np.quantile(draws, CENTRAL)
+    ends = np.quantile(draws, WIDE)
+    value = float(np.median(draws)) if value is None else float(value)
+    return Quantity(value, 0.5 * float(high - low), unit, None, (float(ends[0]), float(ends[1])))
+
+
+def _even(numbers: jax.Array) -> np.ndarray:
+    """T, T p_1, T p_2 of the coordinates of a scan, of ln ε, ln β, α; shape (..., 3)."""
+    log_emittance, log_beta, alpha = np.moveaxis(np.asarray(numbers), -1, 0)
+    emittance, beta = np.exp(log_emittance), np.exp(log_beta)
+    s11, s22 = emittance * beta, emittance * (1.0 + alpha**2) / beta
+    return np.stack([s11 + s22, s11 - s22, -2.0 * emittance * alpha], -1)
+
+
+def _flat(fit: TuningFit) -> Finding | None:
+    """No knob is known to change the emittance."""
+    if fit.flat <= TOLD:
+        return None
+    cause = f"The emittance is compatible with one value at all settings ({percent(fit.flat)})."
+    return Finding(Status.unidentified, cause, "Measure more rows, or widen the limits.")
+
+
+def _at_limit(fit: TuningFit) -> Finding | None:
+    """The minimum is rather at a limit than inside."""
+    at = {name: p for name, p in fit.edge.items() if p > 0.5}
+    if not at:
+        return None
+    where = ", ".join(f"{name} ({percent(p)})" for name, p in at.items())
+    cause = f"No minimum inside: it is at a limit of {where}. {_close(fit)}"
+    return Finding(Status.at_limit, cause, "Widen these limits if the machine allows it.")
+
+
+def _close(fit: TuningFit) -> str:
+    worst = float(np.quantile(fit.excess, 1.0 - TOLD))
+    end = "Stop: that is the goal." if fit.done else "Measure more rows."
+    return (
+        f"The best setting is within {percent(worst)} of the minimum with 95 % probability; the "
+        f"goal is {percent(fit.within)}. {end}"
+    )
+
+
+def _found(fit: TuningFit) -> Finding:
+    return Finding(Status.converged, f"A minimum is found. {_close(fit)}")
+
+
+# In order of gravity.
+RULES = (_flat, _at_limit, _found)

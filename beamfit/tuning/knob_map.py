@@ -1,0 +1,118 @@
+"""The beam as a smooth map of the knobs, and the sizes that it predicts.
+
+One-point functions of JAX arrays. Knobs are in half ranges, from -1 to 1 between their limits.
+"""
+
+from __future__ import annotations
+
+import math
+from itertools import product
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+# Numbers of a beam: ln of the emittance, ln of beta, alpha, in coordinates even to the scan.
+NUMBERS = 3
+# Highest total degree of the features by the number of knobs: beyond it their prior variance is
+# below 1 % for lengths of a half range (of 0.7 for four knobs and more), and they are few.
+DEGREE = {1: 10, 2: 8, 3: 6, 4: 5, 5: 4, 6: 4}
+# Standard deviation of a number's mean over the knobs: any eccentricity of the ellipse.
+MEAN = 3.0
+
+
+class Scales(NamedTuple):
+    """Scales of a map: length of each knob in half ranges, amplitude of each number, noise.
+
+    ``length`` has shape (knobs,), ``amplitude`` (3,), ``noise`` (); all are positive.
+    """
+
+    length: Array
+    amplitude: Array
+    noise: Array
+
+
+def orders_of(knobs: int) -> np.ndarray:
+    """Powers of the knobs in each feature, up to the total degree, shape (features, knobs).
+
+    Examples
+    --------
+    >>> len(orders_of(2)), orders_of(2)[:3].tolist()
+    (45, [[0, 0], [0, 1], [1, 0]])
+    """
+    top = DEGREE.get(knobs, 3)
+    every = [n for n in product(range(top + 1), repeat=knobs) if sum(n) <= top]
+    return np.array(sorted(every, key=lambda n: (sum(n), n)))
+
+
+def features(x: Array, length: Array, orders: np.ndarray) -> Array:
+    """Features of a knob setting, shape (features,): their products make the Gaussian kernel.
+
+    Parameters
+    ----------
+    x, length : Array
+        Shape (knobs,), in half ranges.
+    orders : ndarray
+        As `orders_of`.
+
+    Notes
+    -----
+    exp(-|x - x'|²/2) = Σ_n Π_k φ_n(x_k) φ_n(x'_k), φ_n(x) = exp(-x²/2) xⁿ/√n!: A. Cotter,
+    J. Keshet and N. Srebro, Explicit approximations of the Gaussian kernel, arXiv:1109.4603
+    (2011).
+
+    Examples
+    --------
+    >>> a, b, one = jnp.array([0.3, -0.5]), jnp.array([0.6, 0.1]), jnp.ones(2)
+    >>> orders = orders_of(2)
+    >>> kernel = features(a, one, orders) @ features(b, one, orders)
+    >>> round(float(kernel), 6), round(math.exp(-0.5 * (0.3**2 + 0.6**2)), 6)
+    (0.798516, 0.798516)
+    """
+    z = x / length
+    top = int(orders.max())
+    root = np.array([math.sqrt(math.factorial(n)) for n in range(top + 1)])
+    # Products, since the derivative of 0**n is not finite.
+    powers = jnp.cumprod(jnp.concatenate([jnp.ones((1, len(z))), jnp.tile(z, (top, 1))]), axis=0)
+    each = powers / root[:, None] * jnp.exp(-0.5 * z**2)
+    return jnp.prod(each[orders, np.arange(orders.shape[1])], axis=1)
+
+
+def design(x: Array, scales: Scales, orders: np.ndarray) -> Array:
+    """Derivatives of the three numbers of a beam by the map's coefficients, shape (3, n).
+
+    The coefficients are of one prior standard deviation: of each number its mean, then features.
+    """
+    row = jnp.append(MEAN, jnp.ones(len(orders)))
+    phi = jnp.append(1.0, features(x, scales.length, orders)) * row
+    grown = jnp.concatenate(
+        [jnp.ones((NUMBERS, 1)), jnp.repeat(scales.amplitude[:, None], len(orders), axis=1)], axis=1
+    )
+    return jnp.einsum("ij,ik->ijk", jnp.eye(NUMBERS), grown * phi).reshape(NUMBERS, -1)
+
+
+def log_size(numbers: Array, w: Array, known: Array) -> Array:
+    """Logarithm of the size of a beam, in the unit of its coordinates.
+
+    Parameters
+    ----------
+    numbers : Array
+        Shape (3,): ln ε, ln β, α.
+    w : Array
+        Shape (2,): R11 and R12 in the coordinates.
+    known : Array
+        Size² that is not due to the beam.
+
+    Notes
+    -----
+    size² = ε (w1² β - 2 w1 w2 α + w2² (1 + α²)/β) + known: report eq. 37 in Twiss parameters.
+
+    Examples
+    --------
+    >>> float(log_size(jnp.zeros(3), jnp.array([3.0, 4.0]), jnp.array(0.0)) - jnp.log(5.0))
+    0.0
+    """
+    emittance, beta, alpha = jnp.exp(numbers[0]), jnp.exp(numbers[1]), numbers[2]
+    along = beta * (w[0] - w[1] * alpha / beta) ** 2 + w[1] ** 2 / beta
+    return 0.5 * jnp.log(emittance * along + known)

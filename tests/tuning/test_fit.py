@@ -1,0 +1,225 @@
+"""The tuning fit on SIMULATED machines of known minimum, and its next row."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.stats import binom
+
+from beamfit.emittance.scan import QuadScan
+from beamfit.errors import InputError
+from beamfit.optics.particle import beta_gamma
+from beamfit.status import Status
+from beamfit.tuning.fit import fit_tuning
+from beamfit.tuning.next_row import _information, next_row
+from tests.tuning.machines import (
+    EMITTANCE,
+    LINE,
+    SCATTER,
+    SHOT,
+    Machine,
+    limits_of,
+    machine_of,
+    scan_of,
+    size_of,
+)
+
+BOOST = float(beta_gamma(135.0))
+MACHINE = Machine(np.array([0.3, -0.4]), np.array([0.7, 0.9]), np.array([[0.4, 0.1], [-0.3, 0.5]]))
+
+
+def fitted(machine, seed=0, count=32, **noise):
+    scan = scan_of(machine, np.random.default_rng(seed), count, **noise)
+    return fit_tuning(scan, LINE, limits_of(machine), seed=seed)
+
+
+@pytest.fixture(scope="module")
+def fit():
+    return fitted(MACHINE)
+
+
+def test_an_exact_table_gives_the_known_beam():
+    found = fitted(MACHINE, count=64, scatter=0.0, shot=1e-4)
+    for i, q in enumerate(found.place.values()):
+        assert q.value == pytest.approx(MACHINE.place[i], abs=0.05)
+    assert found.minimum.value == pytest.approx(BOOST * EMITTANCE, rel=0.02)
+    emittance, beta, alpha = MACHINE.numbers(np.array([[0.5, 0.5]]))
+    there = found.beam({"K0": 0.5, "K1": 0.5})["x"]
+    assert there["normalized_emittance"].value == pytest.approx(BOOST * emittance, rel=0.03)
+    assert there["beta"].value == pytest.approx(beta, rel=0.03)
+    assert there["alpha"].value == pytest.approx(alpha, abs=0.05)
+
+
+def test_a_minimum_inside_is_found_with_its_interval(fit):
+    assert fit.status is Status.converged
+    for i, q in enumerate(fit.place.values()):
+        assert abs(q.value - MACHINE.place[i]) < 3.0 * q.error
+        assert 0.01 < q.error < 0.4
+        assert q.interval_95[0] < q.value < q.interval_95[1]
+    assert abs(fit.minimum.value - BOOST * EMITTANCE) < 3.0 * fit.minimum.error
+
+
+def test_a_table_in_other_units_of_the_knobs_says_the_same(fit):
+    scan = fit.scan
+    settings = scan.settings | {"K0": 200.0 + 10.0 * scan.settings["K0"]}
+    other = fit_tuning(
+        replace(scan, settings=settings), LINE, {"K0": (190, 210), "K1": (-1, 1)}, seed=0
+    )
+    assert (other.place["K0"].value - 200.0) / 10.0 == pytest.approx(fit.place["K0"].value)
+    assert other.minimum.value == pytest.approx(fit.minimum.value)
+
+
+def test_the_order_of_rows_says_nothing(fit):
+    order = np.random.default_rng(0).permutation(len(fit.scan))
+    other = fit_tuning(
+        replace(fit.scan, **fit.scan.columns_at(order)), LINE, limits_of(MACHINE)
+    )  # draws differ, since readings have other random numbers
+    assert other.place["K0"].value == pytest.approx(fit.place["K0"].value, abs=0.1)
+    assert other.minimum.value == pytest.approx(fit.minimum.value, rel=0.1)
+
+
+def test_of_two_planes_the_geometric_mean_is_made_small(fit):
+    scan = replace(fit.scan, size={"x": fit.scan.size["x"], "y": fit.scan.size["x"]})
+    scan = replace(scan, error={p: SHOT * scan.size[p] for p in "xy"})
+    both = fit_tuning(scan, LINE, limits_of(MACHINE))
+    assert list(both.maps) == ["x", "y"]
+    at = both.beam({"K0": [0.0], "K1": [0.0]})
+    x, y = (at[p]["normalized_emittance"].value for p in "xy")
+    assert at["goal"]["normalized_emittance"].value == pytest.approx(np.sqrt(x * y), rel=0.03)
+    one = fit_tuning(scan, LINE, limits_of(MACHINE), goal="emittance_x", seed=0)
+    assert list(one.maps) == ["x"]
+    assert one.minimum.value == pytest.approx(fit.minimum.value)
+
+
+def test_a_minimum_beyond_a_limit_is_not_inside():
+    found = fitted(MACHINE._replace(place=np.array([2.0, 0.0])))
+    assert found.status is Status.at_limit
+    assert found.edge["K0"] > 0.9 > 0.5 > found.edge["K1"]
+    assert "No minimum inside" in found.message
+
+
+def test_a_flat_machine_has_no_minimum():
+    found = fitted(machine_of(np.random.default_rng(1), 2, flat=True))
+    assert found.status is Status.unidentified
+    assert found.flat > 0.05
+    assert not found.done
+
+
+def test_an_answer_in_every_form(fit):
+    assert "K0" in str(fit)
+    assert fit["settings.K0"].value == fit.settings["K0"]
+    entry = fit.to_json()
+    assert entry["status"] == "converged"
+    assert entry["settings"]["K1"]["interval_95"][0] < MACHINE.place[1]
+
+
+def scan_with(**change):
+    return replace(scan_of(MACHINE, np.random.default_rng(0), 8), **change)
+
+
+@pytest.mark.parametrize(
+    ("knobs", "goal", "said"),
+    [
+        ({}, "emittance", "no knob"),
+        ({"K7": (0, 1)}, "emittance", "no knob 'K7'"),
+        ({"K0": (1, 0)}, "emittance", "limits 1:0 of K0"),
+        ({"K0": (5, 9)}, "emittance", "which was set from"),
+        ({"K0": (-1, 1), "K1": (-1, 1)}, "emittance_y", "no sizes in plane y"),
+        ({"K0": (-1, 1), "K1": (-1, 1)}, "size", "goal 'size'"),
+        ({"K0": (-1, 1)}, "emittance", "no magnet 'K1' in the lattice"),
+    ],
+)
+def test_what_does_not_fit_is_refused(knobs, goal, said):
+    with pytest.raises(InputError, match=said):
+        fit_tuning(scan_with(), LINE, knobs, goal=goal)
+
+
+def test_rows_at_one_quadrupole_setting_are_refused():
+    with pytest.raises(InputError, match="distinct settings"):
+        fit_tuning(scan_with(settings=scan_with().settings | {"Q": np.ones(8)}), LINE, {
+            "K0": (-1, 1), "K1": (-1, 1)})  # fmt: skip
+
+
+def test_information_is_that_of_normal_numbers():
+    """T. M. Cover and J. A. Thomas, Elements of Information Theory (2006), example 8.5.1."""
+    rng, rho, error = np.random.default_rng(0), 0.8, 0.5
+    goal = rng.normal(size=(20000, 1))
+    seen = rho * goal + np.sqrt(1 - rho**2) * rng.normal(size=goal.shape)
+    joint = np.array([[1.0, rho], [rho, 1.0 + error**2]])
+    expected = -0.5 * np.log(np.linalg.det(joint) / (1.0 + error**2))
+    assert _information(seen, goal, error)[0] == pytest.approx(expected, rel=0.05)
+
+
+def test_the_next_row_is_within_limits_and_tells_more_than_others(fit):
+    row = next_row(fit, {"Q": (-0.5, 1.5)})
+    assert set(row.settings) == {"K0", "K1", "Q"}
+    assert all(abs(row.settings[k]) <= 1.0 for k in ("K0", "K1"))
+    assert -0.5 <= row.settings["Q"] <= 1.5
+    assert row.information > 0.01
+
+
+def with_row(scan, machine, row, rng):
+    x, strength = np.array([[row[k] for k in limits_of(machine)]]), np.array([row["Q"]])
+    noise = np.hypot(SCATTER, SHOT) * rng.normal(size=1)
+    size = np.append(scan.size["x"], size_of(machine, x, strength) * np.exp(noise))
+    settings = {k: np.append(v, row[k]) for k, v in scan.settings.items()}
+    return QuadScan(settings, scan.units, {"x": size}, {"x": SHOT * size}, shots=10)
+
+
+def loop(machine, seed, most=40):
+    """Rows until the fit says to stop, and how far above the minimum its setting then is."""
+    rng = np.random.default_rng(seed)
+    scan = scan_of(machine, rng, 8)
+    while True:
+        fit = fit_tuning(scan, LINE, limits_of(machine), seed=len(scan))
+        if fit.done or len(scan) == most:
+            break
+        scan = with_row(scan, machine, next_row(fit, {"Q": (-0.5, 1.5)}).settings, rng)
+    best = np.array([list(fit.settings.values())])
+    return len(scan), float(machine.numbers(best)[0][0] / EMITTANCE - 1.0), fit
+
+
+def test_rows_that_are_chosen_come_to_the_minimum():
+    count, excess, fit = loop(MACHINE, 1)
+    assert count < 40
+    assert excess < 0.05
+    assert fit.done
+
+
+@pytest.mark.calibrate
+@pytest.mark.parametrize("knobs", [1, 2, 3])
+def test_intervals_hold_the_truth_as_often_as_they_say(knobs):
+    """Machines drawn anew; of several knobs each counts as a share of a machine."""
+    seeds, held = 120, {0.68: np.zeros(2), 0.95: np.zeros(2)}
+    for seed in range(seeds):
+        machine = machine_of(np.random.default_rng(1000 + seed), knobs)
+        found = fitted(machine, seed)
+        places = found.knobs.settings(found.minima.place)
+        values = found.normalized * np.exp(found.minima.value)
+        for share, count in held.items():
+            ends = (0.5 - share / 2, 0.5 + share / 2)
+            low, high = np.quantile(places, ends, axis=0)
+            count[0] += ((low <= machine.place) & (machine.place <= high)).mean()
+            low, high = np.quantile(values, ends)
+            count[1] += low <= BOOST * EMITTANCE <= high
+    for share, count in held.items():
+        assert np.all(count >= binom.ppf(0.005, seeds, share)), (share, count / seeds)
+
+
+@pytest.mark.calibrate
+def test_a_flat_machine_is_claimed_a_minimum_in_at_most_two_of_a_hundred():
+    seeds = 150
+    claims = [
+        fitted(machine_of(np.random.default_rng(2000 + seed), 2, flat=True), seed).status
+        for seed in range(seeds)
+    ]
+    assert sum(s is not Status.unidentified for s in claims) <= 0.02 * seeds
+
+
+@pytest.mark.calibrate
+def test_a_search_that_stops_is_within_its_goal():
+    found = [loop(machine_of(np.random.default_rng(s), 2), s, 60) for s in range(30)]
+    stopped = [excess for _, excess, fit in found if fit.done]
+    assert len(stopped) >= 20
+    within = sum(excess <= 0.05 for excess in stopped)
+    assert within >= binom.ppf(0.005, len(stopped), 0.95)

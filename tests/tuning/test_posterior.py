@@ -1,0 +1,148 @@
+"""The map of the knobs against independent references: kernels, Gaussian formulas, differences."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.optimize import differential_evolution
+from scipy.stats import multivariate_normal, norm
+
+from beamfit.tuning import posterior as of
+from beamfit.tuning.knob_map import MEAN, design, features, log_size, orders_of
+from beamfit.tuning.minimum import _of_draw, emittances_of, minima_of
+
+RNG = np.random.default_rng(3)
+COUNT, KNOBS = 24, 2
+X = RNG.uniform(-1, 1, (COUNT, KNOBS))
+W = RNG.normal(size=(COUNT, 2))
+NUMBERS = np.stack([-1.0 + 0.5 * (X**2).sum(1), 0.5 * X[:, 0], 0.3 * X[:, 1]], -1)
+
+
+def size_by_matrix(numbers, w):
+    emittance, beta, alpha = np.exp(numbers[0]), np.exp(numbers[1]), numbers[2]
+    sigma = emittance * np.array([[beta, -alpha], [-alpha, (1 + alpha**2) / beta]])
+    return np.sqrt(w @ sigma @ w)
+
+
+@pytest.fixture(scope="module")
+def data():
+    size = np.array([size_by_matrix(n, w) for n, w in zip(NUMBERS, W, strict=True)])
+    y = np.log(size) + 0.04 * RNG.normal(size=COUNT)
+    floor, one = np.full(COUNT, 0.01), np.ones(COUNT)
+    noise = np.array([np.log(0.05), 0.7])
+    return of.Readings(X, W, 0.0 * one, y, floor, one, one, noise, np.float64(0.03), np.float64(12))
+
+
+@pytest.fixture(scope="module")
+def found(data):
+    return of.map_posterior(data, np.array([-1.0, 0.0, 0.0]), 1, KNOBS, 256)
+
+
+def kernel(a, b, length):
+    return np.exp(-0.5 * (((a[:, None] - b[None]) / length) ** 2).sum(-1))
+
+
+@pytest.mark.parametrize("knobs", [1, 2, 4, 6])
+def test_features_make_the_gaussian_kernel(knobs):
+    x, length = np.random.default_rng(knobs).uniform(-1, 1, (30, knobs)), 1.5
+    rows = jax.vmap(lambda at: features(at, jnp.full(knobs, length), orders_of(knobs)))(x)
+    assert np.allclose(rows @ rows.T, kernel(x, x, length), atol=0.03)
+
+
+def test_a_size_is_that_of_the_beam_matrix():
+    for numbers, w in zip(NUMBERS, W, strict=True):
+        assert np.exp(log_size(numbers, w, 0.0)) == pytest.approx(size_by_matrix(numbers, w))
+
+
+def linear(data):
+    return of._linear(data, jnp.asarray(NUMBERS), jnp.ones(COUNT), jnp.ones(()))
+
+
+def scales_at():
+    return np.log([1.6, 2.0, 0.5, 0.7, 0.6, 0.05])
+
+
+def covariance_by_kernel(eta, slope):
+    length, amplitude, noise = np.exp(eta[:2]), np.exp(eta[2:5]), np.exp(eta[5])
+    same = kernel(X, X, length)
+    parts = [(MEAN**2 + amplitude[i] ** 2 * same) * np.outer(s, s) for i, s in enumerate(slope.T)]
+    return sum(parts) + (0.01**2 + noise**2) * np.eye(COUNT)
+
+
+def test_the_evidence_is_that_of_a_gaussian_process(data):
+    by, eta = linear(data), scales_at()
+    mean, spread = map(np.asarray, of.prior_of(data))
+    covariance = covariance_by_kernel(eta, np.asarray(by.slope))
+    expected = multivariate_normal.logpdf(by.off, np.zeros(COUNT), covariance)
+    expected += norm.logpdf(eta, mean, spread).sum()
+    assert float(of._log_evidence(eta, by, orders_of(2))) == pytest.approx(expected, abs=0.02)
+
+
+def test_slope_and_curvature_of_the_evidence_are_its_differences(data):
+    by, eta, orders, h = linear(data), scales_at(), orders_of(2), 1e-5
+    slope, curvature = map(np.asarray, of._scoring(eta, by, orders))
+    value = jax.jit(lambda e: of._log_evidence(e, by, orders))
+    for i, step in enumerate(h * np.eye(len(eta))):
+        assert (value(eta + step) - value(eta - step)) / (2 * h) == pytest.approx(
+            slope[i], rel=1e-4
+        )
+    # Expected curvature: the mean over readings drawn from the scales' own distribution.
+    covariance = np.asarray(of._covariance(eta, by, orders))
+    drawn = np.random.default_rng(0).multivariate_normal(np.zeros(COUNT), covariance, 4000)
+    mean, spread = map(np.asarray, of.prior_of(data))
+    each = jax.vmap(lambda off: of._scoring(eta, by._replace(off=off), orders)[0])(drawn)
+    each = np.asarray(each) + (eta - mean) / spread**2
+    assert np.allclose(each.T @ each / 4000 + np.diag(spread**-2), curvature, rtol=0.15, atol=0.4)
+
+
+def test_draws_have_the_mean_and_spread_of_gaussian_regression(data):
+    """Rasmussen and Williams, eq. 2.25 and 2.26, the readings linear about the best map."""
+    orders, eta, one = orders_of(2), scales_at(), jnp.ones(())
+    state = of._State(jnp.zeros(3 * (1 + len(orders))), jnp.asarray(eta), jnp.ones(COUNT))
+    for _ in range(4):
+        state = state._replace(v=of._settled(data, state, one, orders))
+    scales = of.scales_of(jnp.asarray(eta), one)
+    rows = np.asarray(of._numbers_at(data, scales, orders))
+    by = of._linear(data, rows @ state.v, jnp.ones(COUNT), one)
+    a = np.einsum("ij,ijk->ik", by.slope, rows)
+    gain = a.T @ np.linalg.inv(np.asarray(of._covariance(eta, by, orders)))
+    at = np.asarray(design(jnp.array([0.2, -0.4]), scales, orders))
+    mean, covariance = at @ gain @ by.off, at @ (np.eye(a.shape[1]) - gain @ a) @ at.T
+    keys = jax.random.split(jax.random.key(2), 4000)
+    drawn = np.asarray(jax.vmap(lambda key: of._draw(key, data, state, orders))(keys)) @ at.T
+    assert np.allclose(drawn.mean(0), mean, atol=0.02)
+    assert np.allclose(np.cov(drawn.T), covariance, rtol=0.15, atol=0.005)
+
+
+def test_padding_changes_nothing(data, found):
+    pad = [np.pad(v, [(0, 8)] + [(0, 0)] * (v.ndim - 1)) for v in data[:7]]
+    known, floor = (np.pad(v, (0, 8), constant_values=1.0) for v in (data.known, data.floor))
+    longer = of.Readings(*pad, *data[7:])._replace(known=known, floor=floor)
+    other = of.map_posterior(longer, np.array([-1.0, 0.0, 0.0]), 1, KNOBS, 256)
+    assert float(other.log_evidence) == pytest.approx(float(found.log_evidence), abs=1e-4)
+    assert np.allclose(other.model[:COUNT], found.model, atol=1e-4)
+
+
+def test_a_bad_reading_is_found_and_moves_little(data, found):
+    y = data.y.copy()
+    y[5] += 1.5
+    moved = of.map_posterior(data._replace(y=y), np.array([-1.0, 0.0, 0.0]), 1, KNOBS, 256)
+    assert moved.bad[5] > 0.95
+    assert np.delete(np.asarray(moved.bad), 5).max() < 0.5
+    assert np.abs(np.delete(np.asarray(moved.model - found.model), 5)).max() < 0.1
+
+
+def test_the_search_finds_the_lowest_point_of_each_draw(found):
+    draws, orders = emittances_of([found]), orders_of(KNOBS)
+    minima = minima_of(draws, KNOBS)
+    for i in range(6):
+        one = jax.tree.map(lambda v, i=i: v[i], draws)
+        value = jax.jit(lambda x, one=one: _of_draw(x, one, orders))
+        best = differential_evolution(value, [(-1, 1)] * KNOBS, rng=1, tol=1e-10)
+        assert float(minima.value[i]) == pytest.approx(best.fun, abs=1e-5)
+
+
+def test_scales_have_an_amplitude_of_no_emittance_where_nothing_varies():
+    eta = jnp.log(jnp.array([1.0, 2.0, 3.0, 4.0]))
+    found = of.scales_of(jnp.append(jnp.zeros(2), eta), jnp.zeros(()))
+    assert np.allclose(np.concatenate(list(map(np.ravel, found))), [1, 1, 0, 2, 3, 4])
