@@ -331,6 +331,9 @@ async def _followed(
             said.extend([words] * bool(words))
             begun.set()
 
+    def ended(task: asyncio.Task) -> None:  # whatever ends it sees no more
+        said.append(f"'{plain(channel.name)}' is followed no more")
+
     async def left(last: float) -> str:
         until = time.monotonic() + patience
         while not said:  # an answer comes behind whatever the monitor sent before it
@@ -343,6 +346,7 @@ async def _followed(
         return "".join(said[:1])
 
     task = asyncio.create_task(follow())
+    task.add_done_callback(ended)
     try:
         await _in_time(begun, channel)
         yield left

@@ -55,7 +55,7 @@ def done(tmp_path_factory):
     folder, device, texts = tmp_path_factory.mktemp("scan"), Simulated(), []
     at = connected(folder, device)
     at = at._replace(machine=replace(at.machine, goal=0.03, points=20))
-    keep = lambda points: texts.append(scan_text(points, at.machine, {"Q1": -2.0}))  # noqa: E731
+    keep = lambda points, before: texts.append(scan_text(points, at.machine, before))  # noqa: E731
     return scanned(at, folder, keep=keep), texts, device, at, folder
 
 
@@ -163,6 +163,7 @@ class Feed:
     async def monitor(self):
         for reading in self.readings:
             yield reading
+        await asyncio.Event().wait()
 
     async def get(self):
         return self.readings[-1]
@@ -204,6 +205,20 @@ def test_beam_is_followed_to_the_last_shot_and_a_silent_variable_is_lost(monkeyp
         asyncio.run(shots(Feed(), None))
 
 
+def test_a_variable_that_is_followed_no_more_is_said():
+    class Ends(Feed):
+        async def monitor(self):
+            yield self.readings[0]
+
+    async def shots():
+        guard = BeamGuard(Guard("PRESENT", 0.1, None, None), Ends((0.25, 4.0)), None)
+        async with guard.followed() as left:
+            await asyncio.sleep(0.01)
+            return await left(4.0)
+
+    assert asyncio.run(shots()) == "'FEED' is followed no more"
+
+
 def test_one_outlying_shot_makes_no_mean(done):
     found, _, _, at, folder = done
     last = found.points[-1]
@@ -241,6 +256,48 @@ def test_a_magnet_that_does_not_come_back_is_an_error_and_stays_in_the_journal(t
         scanned(connected(tmp_path, Simulated()), tmp_path)
 
 
+@pytest.mark.parametrize("setting", [3.0, np.nan])
+def test_a_magnet_that_could_not_be_put_back_is_not_moved(tmp_path, setting):
+    device = Simulated()
+    device.setting = setting
+    with pytest.raises(InputError, match=r"a setting of (3|nan) for Q1; expected within its"):
+        scanned(connected(tmp_path, device), tmp_path)
+    assert device.puts == []
+    assert not (tmp_path / "a.journal").exists()
+
+
+class Breaks(Simulated):
+    """A magnet whose library raises errors of its own, some times."""
+
+    def __init__(self, times):
+        super().__init__()
+        self.times = times
+
+    async def put(self, value):
+        self.times -= 1
+        if self.times >= 0:
+            raise RuntimeError("connection \x1b lost")
+        await super().put(value)
+
+
+@pytest.mark.parametrize("times", [1, 100])
+def test_an_error_of_a_library_keeps_no_magnet_from_being_restored(tmp_path, times):
+    [magnet] = read_scan_machine(written(tmp_path)).magnets
+    other = replace(magnet, name="Q2", set="SIM:Q2:SET")
+    devices = {"Q1": Breaks(times), "Q2": Simulated()}
+    log = Journal(tmp_path / "a.journal", "m", ((magnet, -1.0), (other, 0.5)), patience=0.1)
+    log.write()
+    if times > 1:
+        said = r"^Q1 -1 T_per_m not seen to be restored \(RuntimeError: connection \\x1b lost\);"
+        with pytest.raises(NotRestoredError, match=said):
+            asyncio.run(restore(log, devices))
+    else:
+        asyncio.run(restore(log, devices))
+        assert devices["Q1"].setting == -1.0
+    assert devices["Q2"].setting == 0.5
+    assert log.path.exists() == (times > 1)
+
+
 DAMAGE = [
     {"magnets": []},  # nothing to restore is not "restored"
     {"tolerance": np.inf},  # would call any read-back restored
@@ -248,6 +305,7 @@ DAMAGE = [
     {"low": -np.inf},
     {"set": 5},
     {"patience": np.nan},
+    {"setting": 9.0},  # which nothing would ever write
 ]
 
 
