@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from os import PathLike
 from pathlib import Path
@@ -113,8 +114,8 @@ class Profiler:
         Its name in the lattice.
     sizes, profiles : mapping of str to str
         Plane to variable; one of the two is empty.
-    unit : float
-        Of the sizes, m.
+    unit : str
+        Of the sizes.
     pixel : float or None
         Of the projections, m.
     shots : int
@@ -126,7 +127,7 @@ class Profiler:
     name: str
     sizes: dict[str, str]
     profiles: dict[str, str]
-    unit: float
+    unit: str
     pixel: float | None
     shots: int
     timeout: float
@@ -297,8 +298,7 @@ def _screen(section: Section, lattice: LatticeFile) -> Profiler:
         expected = nearest(str(name), lattice.places) + f", of {lattice.path}"
         raise section.error(f"no screen '{name}'", expected, "name")
     shots = _whole(section, "shots", said["shots"])
-    unit = LENGTHS[said["unit"]]
-    return Profiler(name, sizes, profiles, unit, said["pixel"], shots, said["timeout"])
+    return Profiler(name, sizes, profiles, said["unit"], said["pixel"], shots, said["timeout"])
 
 
 def _seen_at(lattice: LatticeFile, screen: str) -> LatticeFile:
@@ -393,15 +393,42 @@ class Watched(NamedTuple):
             ...
         beamfit.errors.InputError: unit 'A' of 'SR:I'; expected mA, as in the machine file
         """
-        known = UNITS_OF[self.quantity]
-        if not given or not self.unit or (found := known_unit(given)) == self.unit:
-            return None
-        if found in known and known[found] == self.factor:
-            return None
-        said = f"unit '{plain(given)}' of '{plain(self.variable)}'"
-        if found in known:
-            raise InputError(said, f"{self.unit}, as in the machine file")
-        return f"{said} is not understood: taken as {self.unit}"
+        return check_unit(given, self.variable, self.unit, UNITS_OF[self.quantity])
+
+
+def check_unit(given: str, variable: str, unit: str, known: Mapping[str, float]) -> str | None:
+    """Compare the unit that the control system gives with that of the machine file.
+
+    Parameters
+    ----------
+    given, variable, unit : str
+        Unit that the control system gives to a variable, its name, and the unit of the file.
+    known : mapping of str to float
+        Factors of all units that there are.
+
+    Returns
+    -------
+    str or None
+        A note if nobody knows the unit that is given.
+
+    Raises
+    ------
+    InputError
+        If it is another one.
+
+    Examples
+    --------
+    >>> check_unit("lp", "SCREEN:X", "um", {"um": 1e-6, "mm": 1e-3})
+    "unit 'lp' of 'SCREEN:X' is not understood: taken as um"
+    """
+    if not given or not unit or (found := known_unit(given)) == unit:
+        return None
+    if known.get(found or "") == known[unit]:
+        return None
+    said = f"unit '{plain(given)}' of '{plain(variable)}'"
+    if found in known:
+        raise InputError(said, f"{unit}, as in the machine file")
+    return f"{said} is not understood: taken as {unit}"
 
 
 @dataclass(frozen=True)
@@ -439,12 +466,12 @@ class WatchMachine:
 
 
 def read_watch_machine(path: str | PathLike[str]) -> WatchMachine:
-    """Read what a watch needs of a machine file.
+    """Read what a watch needs of a machine file (docs/watch.md).
 
     Parameters
     ----------
     path : str or path
-        TOML, format "beamfit-machine-1" (docs/live.md); paths in it are beside it.
+        Of TOML as `read_scan_machine` takes it.
 
     Returns
     -------
@@ -453,7 +480,7 @@ def read_watch_machine(path: str | PathLike[str]) -> WatchMachine:
     Raises
     ------
     InputError
-        If it cannot be used, naming line and key.
+        As by `read_scan_machine`.
 
     Examples
     --------

@@ -300,7 +300,7 @@ async def _put_back(magnet: Magnet, device: Device, value: float) -> None:
 
 @contextmanager
 def ended_by_signals(task: asyncio.Future, tell: Callable[[str], None]) -> Iterator[list[int]]:
-    """Have the first signal cancel a task, and any more only say that all is being restored.
+    """Have the first signal cancel something, and any more only say that all is being restored.
 
     Outside the main thread signals are left to whoever runs it.
     """

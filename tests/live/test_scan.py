@@ -704,7 +704,7 @@ def test_a_dry_run_checks_and_moves_nothing(ioc, injector):
     [
         (("SIM:SCREEN:X", "SIM:NONE"), r"no answer from 'SIM:NONE' within 1 s"),
         (("SIM:Q1:READ", "SIM:SCREEN:X"), r"'SIM:SCREEN:X' in 'um'; expected T_per_m"),
-        (("shots = 3", 'shots = 3\nunit = "mm"'), r"'SIM:SCREEN:X' in 'um'; expected mm"),
+        (("shots = 3", 'shots = 3\nunit = "mm"'), r"unit 'um' of 'SIM:SCREEN:X'; expected mm"),
         (("low = -5.5", "low = 2.0"), r"a setting of -2.5 for Q1; expected within its limits"),
     ],
 )
