@@ -85,7 +85,8 @@ class Magnet:
     settle, timeout : float
         How long the read-back has to stay there, and after how long it is given up, s.
     approach : {"either", "below", "above"}
-        From which side a setting is reached, by passing it by ``approach_by``.
+        From which side a setting is reached, by passing it by ``approach_by``, which is within
+        the limits too.
     degauss : tuple of float
         Settings gone through before a scan.
     """
@@ -102,6 +103,18 @@ class Magnet:
     approach: str = "either"
     approach_by: float = 0.0
     degauss: tuple[float, ...] = ()
+
+    @property
+    def span(self) -> tuple[float, float]:
+        """Lowest and highest setting that can be reached from the side that is asked for.
+
+        Examples
+        --------
+        >>> Magnet("Q", "SET", "READ", "A", -1.0, 1.0, 0.01, 0.1, 60.0, "below", 0.5).span
+        (-0.5, 1.0)
+        """
+        below, above = self.approach == "below", self.approach == "above"
+        return self.low + below * self.approach_by, self.high - above * self.approach_by
 
 
 @dataclass(frozen=True)
@@ -213,7 +226,7 @@ def read_scan_machine(path: str | PathLike[str]) -> ScanMachine:
             raise top.error(found, "one [[magnet]] for each", "magnet")
     wanted = top.section("scan")
     plan = wanted.values(SCAN)
-    first = _numbers(wanted, "first", plan.pop("first"), magnets[0])
+    first = _numbers(wanted, "first", plan.pop("first"), magnets[0].span)
     plan["points"] = _whole(wanted, "points", plan["points"])
     screen, guard = _screen(top.section("screen"), lattice), _guard(top.section("beam"))
     lattice = _seen_at(lattice, screen.name)
@@ -263,15 +276,20 @@ def _magnet(section: Section, lattice: LatticeFile) -> Magnet:
     if magnet.approach != "either" and not magnet.approach_by > 0:
         expected = "how far beyond a setting to go first, in the unit of the settings"
         raise section.error(f"approach from {magnet.approach}", expected, "approach_by")
-    degauss = _numbers(section, "degauss", magnet.degauss, magnet)
+    if not magnet.span[1] - magnet.span[0] > 10 * magnet.tolerance:
+        found = f"approach by {magnet.approach_by:g} within {magnet.low:g} to {magnet.high:g}"
+        raise section.error(found, "room to scan besides", "approach_by")
+    degauss = _numbers(section, "degauss", magnet.degauss, (magnet.low, magnet.high))
     return replace(magnet, unit=wanted, degauss=degauss)
 
 
-def _numbers(section: Section, key: str, values: Any, magnet: Magnet) -> tuple[float, ...]:
+def _numbers(
+    section: Section, key: str, values: Any, span: tuple[float, float]
+) -> tuple[float, ...]:
     """Settings that a magnet can have."""
     for value in values:
-        if not is_number(value) or not magnet.low <= value <= magnet.high:
-            expected = f"numbers within {magnet.low:g} and {magnet.high:g}"
+        if not is_number(value) or not span[0] <= value <= span[1]:
+            expected = f"numbers within {span[0]:g} and {span[1]:g}"
             raise section.error(f"{value!r}"[:80], expected, key)
     return tuple(map(float, values))
 

@@ -448,11 +448,14 @@ async def checked(supply: Supply) -> tuple[Supply, list[str]]:
         raise InputError(found, f"some of {magnet.low:g} to {magnet.high:g}, of the machine file")
     if (low, high) == (magnet.low, magnet.high):
         return supply, []
-    if not magnet.tolerance < 0.1 * (high - low):  # or a journal would not be one
+    magnet = replace(magnet, low=low, high=high)
+    if not magnet.tolerance < 0.1 * (magnet.span[1] - magnet.span[0]):
         found = f"tolerance {magnet.tolerance:g} of {magnet.name} within {low:g} to {high:g}"
         raise InputError(found, "less than a tenth of what the control system lets it move")
+    for value in magnet.degauss:
+        moved(magnet, value)
     said = f"Limits of {magnet.name}: {low:g} to {high:g} {magnet.unit}, of the control system."
-    return replace(supply, magnet=replace(magnet, low=low, high=high)), [said]
+    return replace(supply, magnet=magnet), [said]
 
 
 def rms_of(counts: np.ndarray, pixel: float) -> float | None:

@@ -204,7 +204,9 @@ class NotRestoredError(InputError):
     """A magnet that could not be put back, or is not seen to be back."""
 
 
-async def reach(magnet: Magnet, device: Device, value: float) -> float:
+async def reach(
+    magnet: Magnet, device: Device, value: float, present: float | None = None
+) -> float:
     """Move a magnet to a setting, from below or above where that is asked for.
 
     Parameters
@@ -215,6 +217,8 @@ async def reach(magnet: Magnet, device: Device, value: float) -> float:
         What moves it.
     value : float
         The setting, in the magnet's unit.
+    present : float, optional
+        The setting it comes from; asked unless given. From NaN it passes by whichever side it is.
 
     Returns
     -------
@@ -226,13 +230,8 @@ async def reach(magnet: Magnet, device: Device, value: float) -> float:
     InputError
         If the setting is outside the limits (nothing is written then), or is not reached.
     """
-    value = moved(magnet, value)
-    return await _sent(magnet, device, value, await device.get())
-
-
-async def _sent(magnet: Magnet, device: Device, value: float, present: float) -> float:
-    """Move a magnet from a setting to another; from NaN it passes by, whichever side it is on."""
-    by = magnet.approach_by
+    value, by = moved(magnet, value), magnet.approach_by
+    present = await device.get() if present is None else present
     if magnet.approach == "below" and not present <= value:
         await _put(device, max(value - by, magnet.low))
     if magnet.approach == "above" and not present >= value:
@@ -295,7 +294,7 @@ async def _put_back(magnet: Magnet, device: Device, value: float) -> None:
     present = math.nan
     with suppress(Exception):
         present = await device.get()
-    await _sent(magnet, device, moved(magnet, value), present)
+    await reach(magnet, device, value, present)
 
 
 @contextmanager

@@ -262,7 +262,7 @@ async def _point(run: Running, settings: Mapping[str, float]) -> tuple[MeasuredP
     lost = left = ""
     for _ in range(2):
         await _well(run, lost)
-        reads = await _moved(run, settings)
+        reads = await _moved(run, settings, math.nan if left else None)
         shots, none, lost, left = await _taken(run, settings)
         if lost:
             run.say(f"Paused: {lost}")
@@ -307,9 +307,13 @@ def _stuck(run: Running, reads: Mapping[str, float], shots: Mapping[str, np.ndar
     return next((p for p, each in shots.items() if np.all(each == last.shots[p][-1])), "")
 
 
-async def _moved(run: Running, settings: Mapping[str, float]) -> dict[str, float]:
-    magnets = [m for m in run.at.machine.magnets if m.name in settings]
-    return {m.name: await reach(m, run.at.magnets[m.name], settings[m.name]) for m in magnets}
+async def _moved(
+    run: Running, settings: Mapping[str, float], present: float | None = None
+) -> dict[str, float]:
+    """Move magnets; from NaN each passes its setting, from wherever somebody has moved it."""
+    magnets = {m.name: m for m in run.at.machine.magnets if m.name in settings}
+    devices = run.at.magnets
+    return {n: await reach(m, devices[n], settings[n], present) for n, m in magnets.items()}
 
 
 async def _well(run: Running, lost: str) -> None:

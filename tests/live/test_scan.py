@@ -29,6 +29,7 @@ from beamfit.live.points import (
     MeasuredPoint,
     Next,
     doubt,
+    first_settings,
     fit_of,
     fresh,
     next_setting,
@@ -469,6 +470,26 @@ def test_a_setting_is_reached_from_its_side(tmp_path, side, passed):
     assert device.puts[-1] == 0.0
 
 
+@pytest.mark.parametrize(("side", "low", "high"), [("below", -5.1, 2.5), ("above", -5.5, 2.1)])
+def test_no_setting_is_chosen_that_cannot_be_passed(tmp_path, side, low, high):
+    text = f'approach = "{side}"\napproach_by = 0.4'
+    machine = read_scan_machine(written(tmp_path, more=text))
+    assert machine.magnets[0].span == pytest.approx((low, high))
+    first = first_settings(machine)
+    assert (first[0] - low, high - first[-1]) == pytest.approx([0.1 * (high - low)] * 2)
+    point = MeasuredPoint({"Q1": low + 5.0}, {"x": np.ones(3) * 1e-4}, 0.0)
+    gap = next_setting([point] * 4, None, (), machine, {"Q1": 0.0})
+    assert gap.settings["Q1"] == pytest.approx(low + 2.5)
+
+
+def test_a_setting_that_was_left_is_reached_again_from_its_side(tmp_path):
+    at = connected(tmp_path, device := Restless(), more='approach = "below"\napproach_by = 0.4')
+    scanned(at, tmp_path)
+    again = next(i for i, value in enumerate(device.puts) if value in device.restless)
+    value = device.puts[again]
+    assert device.puts[again + 1 : again + 3] == [pytest.approx(value - 0.4), value]
+
+
 def test_the_first_settings_are_those_of_the_file(tmp_path):
     path = written(tmp_path, points=("points = 7", "points = 7\nfirst = [0.5, -1.5]"))
     machine = read_scan_machine(path)
@@ -620,6 +641,7 @@ BAD = [
     (('name = "Q1"', 'name = "Q2"'), r"column 'name': no magnet 'Q2'; expected .*Q1"),
     (("points = 7", "points = 7.5"), r"column 'points': 7.5; expected a whole number"),
     (("points = 7", "points = 7\nfirst = [9]"), r"'first': 9; expected numbers within -5.5 and"),
+    (("settle_s", 'approach = "above"\napproach_by = 7.95\nsettle_s'), r"room to scan besides"),
     (("present_above = 0.1", ""), r"present and no present_above; expected both"),
     (('lattice = "line.toml"', ""), r"no lattice; expected lattice = "),
     (("settle_s", "setle_s"), r"column 'setle_s': an unknown key; expected .*settle_s"),
