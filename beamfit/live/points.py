@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from io import StringIO
 from itertools import zip_longest
@@ -19,7 +19,6 @@ from beamfit.emittance.scan import QuadScan
 from beamfit.errors import InputError, plain
 from beamfit.greybox.problem import padded_length
 from beamfit.io.machine import Magnet, ScanMachine
-from beamfit.io.shots import average_shots
 from beamfit.optics.beamline import Beamline
 from beamfit.statistics import POOR_FIT, chi2_probability
 from beamfit.status import Status
@@ -50,8 +49,20 @@ class Next(NamedTuple):
     why: str
 
 
+def standard_errors(shots: Sequence[np.ndarray]) -> list[float]:
+    """Standard errors of the means of some shots; none where a setting has no scatter.
+
+    Examples
+    --------
+    >>> standard_errors([np.array([1.0, 3.0]), np.array([2.0, 2.0])])
+    []
+    """
+    found = [float(s.std(ddof=1) / np.sqrt(s.size)) if s.size > 1 else 0.0 for s in shots]
+    return found if min(found) > 0 else []
+
+
 def scan_of(points: Sequence[MeasuredPoint], machine: ScanMachine) -> QuadScan:
-    """The points as a scan, as it is read from their file: with the shots where they scatter.
+    """The points as a scan, with the shots themselves where they scatter.
 
     Parameters
     ----------
@@ -69,18 +80,27 @@ def scan_of(points: Sequence[MeasuredPoint], machine: ScanMachine) -> QuadScan:
     InputError
         If they are no scan yet.
     """
-    rows = [(point.settings, shot) for point in points for shot in _shots(point)]
-    settings = {m.name: np.array([at[m.name] for at, _ in rows]) for m in machine.magnets}
+    settings = {m.name: np.array([p.settings[m.name] for p in points]) for m in machine.magnets}
+    shots = {plane: [p.shots[plane] for p in points] for plane in points[0].shots}
+    size = {plane: np.array([s.mean() for s in each]) for plane, each in shots.items()}
+    found = {plane: standard_errors(each) for plane, each in shots.items()}
+    error = {plane: np.array(each) for plane, each in found.items() if each}
+    count = np.array([min(map(len, p.shots.values())) for p in points])
+    single = {plane: _padded(shots[plane]) for plane in error}
     units = {m.name: m.unit for m in machine.magnets}
-    sizes = dict(zip(points[0].shots, np.array([shot for _, shot in rows]).T, strict=True))
-    screens = (machine.screen.name,) * len(rows)
-    scan = QuadScan(settings, units, sizes, name=machine.name, screen=screens)
-    return average_shots(scan, marked=True)
+    return QuadScan(
+        settings, units, size, error, shots=count if error else None, name=machine.name,
+        shot_size=single, screen=(machine.screen.name,) * len(points),
+        error_source="the scatter of the shots",
+    )  # fmt: skip
 
 
-def _shots(point: MeasuredPoint) -> Iterator[tuple[float, ...]]:
-    """Sizes of each shot by plane, NaN where a plane has fewer."""
-    return zip_longest(*point.shots.values(), fillvalue=math.nan)
+def _padded(shots: Sequence[np.ndarray]) -> np.ndarray:
+    """Shots of all settings in one table, NaN where there are fewer."""
+    table = np.full((len(shots), max(map(len, shots))), np.nan)
+    for row, own in zip(table, shots, strict=True):
+        row[: len(own)] = own
+    return table
 
 
 def fit_of(
@@ -276,9 +296,9 @@ def scan_text(
     for point in points:
         settings = [point.settings[m.name] for m in machine.magnets]
         last = [machine.screen.name, _written(point.time)]
-        for number, shot in enumerate(_shots(point), 1):
-            numbers = (*settings, *(1e6 * size for size in shot))
-            rows.append([*(f"{value:.9g}" for value in numbers), str(number), *last])
+        sizes = zip_longest(*(1e6 * point.shots[plane] for plane in planes), fillvalue=math.nan)
+        for number, shot in enumerate(sizes, 1):
+            rows.append([*(f"{value:.9g}" for value in (*settings, *shot)), str(number), *last])
     table = StringIO()
     csv.writer(table, lineterminator="\n").writerows(rows)
     head = (plain(" ".join(line.split())) for line in _head(machine, before))

@@ -543,7 +543,7 @@ def test_each_magnet_is_moved_and_a_line_that_is_wrong_is_doubted(tmp_path):
     points = points_of(build_line(two_magnets(tmp_path, 3.0).lattice), settings)
     said = doubt(fit_of(points, machine, line), points)
     assert re.fullmatch(
-        r"The sizes miss this line .* \(χ² \d+ with 2 degrees .*: is it right\?", said
+        r"The sizes miss this line .* \(χ² \d+ with 4 degrees .*: is it right\?", said
     )
     assert doubt(None, []) == ""
 
