@@ -25,9 +25,8 @@ if TYPE_CHECKING:
     from beamfit.language.document import Document
     from beamfit.language.solution import ProblemSolution
     from beamfit.lifetime.watch import Plan
-    from beamfit.live.scan import Outcome
-    from beamfit.live.scan import Told as ScanTold
-    from beamfit.live.watch import Told
+    from beamfit.live.scan import Outcome, ScanProgress
+    from beamfit.live.watch import WatchView
 
 Limits = Mapping[str, tuple[float, float]]
 Steps = Sequence[tuple[str, float, float]]
@@ -277,7 +276,7 @@ def scan_machine(
     journal: str | None = None,
     goal: float | None = None,
     points: int | None = None,
-    tell: Callable[[ScanTold], None] = lambda told: None,
+    tell: Callable[[ScanProgress], None] = lambda told: None,
     note: Callable[[str], None] = lambda text: None,
 ) -> Outcome:
     """Scan a running machine's quadrupoles, and put the magnets back whatever ends it.
@@ -333,7 +332,7 @@ async def _scanned(
     machine: ScanMachine,
     journal: Path,
     out: Path,
-    tell: Callable[[ScanTold], None],
+    tell: Callable[[ScanProgress], None],
     note: Callable[[str], None],
 ) -> Outcome:
     from beamfit.io.line import build_line
@@ -346,9 +345,8 @@ async def _scanned(
     at = await connect(machine)
     for each in at.notes:
         note(each)
-    before = {name: await magnet.get() for name, magnet in at.magnets.items()}
 
-    def keep(points: Any) -> None:
+    def keep(points: Any, before: Mapping[str, float]) -> None:
         write_atomically(out, scan_text(points, at.machine, before).encode())
 
     return await scan(at, line, journal, keep=keep, tell=tell)
@@ -358,8 +356,8 @@ def watch(
     machine: WatchMachine | str | PathLike[str],
     seconds: float | None = None,
     *,
-    show: Callable[[Told], None] = lambda told: None,
-) -> Told:
+    show: Callable[[WatchView], None] = lambda told: None,
+) -> WatchView:
     """Watch the lifetime of a stored beam; nothing is written to the machine.
 
     Parameters
@@ -373,7 +371,7 @@ def watch(
 
     Returns
     -------
-    Told
+    WatchView
         What is known at the end.
 
     Raises
@@ -395,7 +393,7 @@ def watch(
 
     told = read_watch_machine(machine) if is_path(machine) else machine
 
-    async def followed() -> tuple[Told, int]:
+    async def followed() -> tuple[WatchView, int]:
         await connect(told)
         return await follow(told, watch_plan(told), show, seconds)
 

@@ -4,6 +4,7 @@
 µA of noise; refilled every four hours, in the second half below 480 mA. Gaps, steps of the clock,
 IOC restarts (two minutes of silence, then an old time stamp), readings without a number, dropouts
 and repeated time stamps at random. Nothing else happens: every alarm is false. CPU time, one core.
+Then the watch as it stood before the top-up is followed again, twice, with a loss that steps.
 """
 
 from __future__ import annotations
@@ -21,9 +22,23 @@ A, B, FULL, NOISE = 3.7e-8, 9.26e-6, 500.0, 2e-3
 DAY = 24 * HOUR
 
 
-def beam_after(beam, seconds):
-    gone = np.exp(-B * seconds)
-    return beam * gone / (1 + A / B * beam * (1 - gone))
+STEP = 1.15
+
+
+def beam_after(beam, seconds, a=A, b=B):
+    gone = np.exp(-b * seconds)
+    return beam * gone / (1 + a / b * beam * (1 - gone))
+
+
+def named_after(plan, state, a, b):
+    """Name of what moved, and the minutes after which it was told, where the loss steps now."""
+    beam, begun, random = FULL, state.last - state.shift + 1, np.random.default_rng(17)
+    for second in range(int(4 * HOUR)):
+        beam = float(beam_after(beam, 1.0, a, b))
+        state = stepped(plan, state, CURRENT, begun + second, beam + NOISE * random.normal())
+        if state.alarms:
+            return f"{state.alarms[-1].moved} after {second / 60:.0f} min"
+    return "nothing"
 
 
 def readings(days, random):
@@ -65,12 +80,13 @@ def main() -> None:
     days = float(sys.argv[1]) if len(sys.argv) > 1 else 7.0
     plan, state, before = Plan(window=2 * HOUR, every=900.0), State(), None
     pulls, fits, total, count, alarms, open_ones = [], 0.0, 0.0, 0, 0, 0
-    hour = 0
+    hour, middle, half_way = 0, None, int(0.45 * days * DAY)
     for stamp, value in readings(days, np.random.default_rng(16)):
         begun = time.process_time()
         state = stepped(plan, state, CURRENT, stamp, value)
         spent = time.process_time() - begun
         total, count = total + spent, count + 1
+        middle = state if count == half_way else middle
         raised = sum("alarm: the loss moved" in text for _, text in state.events)
         alarms = max(alarms, raised) if raised else alarms
         if state.answer is not before:
@@ -95,6 +111,8 @@ def main() -> None:
     quarters = np.array_split(np.array(pulls), 4)
     print("pulls by quarter:", ", ".join(f"{q.mean():+.2f} ± {q.std():.2f}" for q in quarters))
     print(f"beyond 3: {np.mean(np.abs(pulls) > 3):.1%}, worst {np.max(np.abs(pulls)):.1f}")
+    for name, a, b in (("a", STEP * A, B), ("b", A, STEP * B)):
+        print(f"{name} times {STEP}: {named_after(plan, middle, a, b)}")
 
 
 if __name__ == "__main__":

@@ -1,20 +1,22 @@
 """Thousands of damaged files of every kind: read, or refused in one line of 400 characters.
 
 `make soak` runs it: `python -m tests.soak [COUNT [READER ...]]`. Each reader is given COUNT files
-with one to twenty things changed, in a process of its own. A traceback, a file that takes more
-than 11 s and a process of more than 1 GB are faults; the file is kept and the exit status is 1.
+with one to twenty things changed, in a process of its own; others with every value of SOAK_SEED.
+A traceback, a file that takes more than 11 s of processor time (of the process it is read in too)
+and a process of more than 1 GB are faults; the file is kept and the exit status is 1.
 """
 
 from __future__ import annotations
 
 import json
+import os
 import random
+import re
 import resource
 import signal
 import subprocess
 import sys
 import tempfile
-import time
 import warnings
 from collections.abc import Callable
 from pathlib import Path
@@ -54,6 +56,9 @@ from tests.sampling.targets import half_normal, target
 # Seconds, megabytes and letters.
 PATIENCE, ROOM, LONGEST = 10, 1000, 391
 STORE = "posterior store"
+SEED = os.environ.get("SOAK_SEED", "")
+# Share of files of which a row alone has slipped.
+SLIP = 0.05
 DATES = "time,beam_current_mA,rf_voltage_kV\n" + "".join(
     f"2024-03-01T12:{minute:02d}:00,{100 - 0.1 * minute},3200\n" for minute in range(30)
 )
@@ -161,15 +166,16 @@ def soaked(name: str, count: int) -> dict[str, object]:
     said = {"read": 0, "refused": 0, "slowest": 0.0, "faults": []}
     with tempfile.TemporaryDirectory() as place:
         reader = readers(Path(place), name == STORE)[name]
-        path, rng = Path(place) / f"a{reader.suffix}", random.Random(name)
+        path, rng = Path(place) / f"a{reader.suffix}", random.Random(name + SEED)
         for content in reader.files:  # the whole ones are good
             path.write_bytes(content)
             reader.read(path)
-        signal.signal(signal.SIGALRM, late)
+        signal.signal(signal.SIGPROF, late)
         for _ in range(count):
-            path.write_bytes(mutated(rng.choice(reader.files), rng))
-            began = time.perf_counter()
-            signal.alarm(PATIENCE + 1)
+            content = rng.choice(reader.files)
+            path.write_bytes((slipped if rng.random() < SLIP else mutated)(content, rng))
+            began = spent()
+            signal.setitimer(signal.ITIMER_PROF, PATIENCE + 1)
             try:
                 reader.read(path)
                 said["read"] += 1
@@ -179,10 +185,26 @@ def soaked(name: str, count: int) -> dict[str, object]:
                     said["faults"].append(kept(path, name, "a message of several lines"))
             except Exception as error:
                 said["faults"].append(kept(path, name, f"{type(error).__name__}: {error}"[:200]))
-            signal.alarm(0)
-            said["slowest"] = max(said["slowest"], time.perf_counter() - began)
+            signal.setitimer(signal.ITIMER_PROF, 0)
+            said["slowest"] = max(said["slowest"], spent() - began)
     said["MB"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024
     return said | {"ended": ENDED}
+
+
+def slipped(content: bytes, rng: random.Random) -> bytes:
+    """One file of which a row has a cell more or less, so that others stand beside their column."""
+    lines = content.splitlines(keepends=True)
+    at = rng.randrange(len(lines))
+    cells = re.split(rb"([,;\t ]+)", lines[at])
+    place = rng.randrange(len(cells))
+    cells[place : place + 1] = rng.choice([[], [cells[place], b",", cells[place]], [b",", b""]])
+    lines[at] = b"".join(cells)
+    return b"".join(lines)
+
+
+def spent() -> float:
+    """Processor time of this process and of those it has waited for, s."""
+    return sum(os.times()[:4])
 
 
 def late(*_: object) -> None:

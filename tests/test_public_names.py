@@ -38,7 +38,7 @@ COMMANDS = {
 }
 # What a reader of `beamfit` gives, so that nobody has to make one: no public names.
 READ = {"Document", "Decay", "LifetimeTable", "Operation", "RecordStudy", "Ring"}
-READ |= {"ScanMachine", "ScanTold", "Told", "WatchMachine", "Layout"}
+READ |= {"ScanMachine", "ScanProgress", "WatchView", "WatchMachine", "Layout"}
 # Words for what may be given in their place, or what a report is written of.
 WORDS = {"Any", "Array", "ArrayLike", "Callable", "Columns", "DataFrame", "Iterable", "Law"}
 WORDS |= {"Limits", "Mapping", "None", "PathLike", "Reported", "Sequence", "Steps"}

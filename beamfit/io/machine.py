@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from os import PathLike
 from pathlib import Path
@@ -84,7 +85,8 @@ class Magnet:
     settle, timeout : float
         How long the read-back has to stay there, and after how long it is given up, s.
     approach : {"either", "below", "above"}
-        From which side a setting is reached, by passing it by ``approach_by``.
+        From which side a setting is reached, by passing it by ``approach_by``, which is within
+        the limits too.
     degauss : tuple of float
         Settings gone through before a scan.
     """
@@ -102,6 +104,18 @@ class Magnet:
     approach_by: float = 0.0
     degauss: tuple[float, ...] = ()
 
+    @property
+    def span(self) -> tuple[float, float]:
+        """Lowest and highest setting that can be reached from the side that is asked for.
+
+        Examples
+        --------
+        >>> Magnet("Q", "SET", "READ", "A", -1.0, 1.0, 0.01, 0.1, 60.0, "below", 0.5).span
+        (-0.5, 1.0)
+        """
+        below, above = self.approach == "below", self.approach == "above"
+        return self.low + below * self.approach_by, self.high - above * self.approach_by
+
 
 @dataclass(frozen=True)
 class Profiler:
@@ -113,8 +127,8 @@ class Profiler:
         Its name in the lattice.
     sizes, profiles : mapping of str to str
         Plane to variable; one of the two is empty.
-    unit : float
-        Of the sizes, m.
+    unit : str
+        Of the sizes.
     pixel : float or None
         Of the projections, m.
     shots : int
@@ -126,7 +140,7 @@ class Profiler:
     name: str
     sizes: dict[str, str]
     profiles: dict[str, str]
-    unit: float
+    unit: str
     pixel: float | None
     shots: int
     timeout: float
@@ -212,7 +226,7 @@ def read_scan_machine(path: str | PathLike[str]) -> ScanMachine:
             raise top.error(found, "one [[magnet]] for each", "magnet")
     wanted = top.section("scan")
     plan = wanted.values(SCAN)
-    first = _numbers(wanted, "first", plan.pop("first"), magnets[0])
+    first = _numbers(wanted, "first", plan.pop("first"), magnets[0].span)
     plan["points"] = _whole(wanted, "points", plan["points"])
     screen, guard = _screen(top.section("screen"), lattice), _guard(top.section("beam"))
     lattice = _seen_at(lattice, screen.name)
@@ -262,15 +276,20 @@ def _magnet(section: Section, lattice: LatticeFile) -> Magnet:
     if magnet.approach != "either" and not magnet.approach_by > 0:
         expected = "how far beyond a setting to go first, in the unit of the settings"
         raise section.error(f"approach from {magnet.approach}", expected, "approach_by")
-    degauss = _numbers(section, "degauss", magnet.degauss, magnet)
+    if not magnet.span[1] - magnet.span[0] > 10 * magnet.tolerance:
+        found = f"approach by {magnet.approach_by:g} within {magnet.low:g} to {magnet.high:g}"
+        raise section.error(found, "room to scan besides", "approach_by")
+    degauss = _numbers(section, "degauss", magnet.degauss, (magnet.low, magnet.high))
     return replace(magnet, unit=wanted, degauss=degauss)
 
 
-def _numbers(section: Section, key: str, values: Any, magnet: Magnet) -> tuple[float, ...]:
+def _numbers(
+    section: Section, key: str, values: Any, span: tuple[float, float]
+) -> tuple[float, ...]:
     """Settings that a magnet can have."""
     for value in values:
-        if not is_number(value) or not magnet.low <= value <= magnet.high:
-            expected = f"numbers within {magnet.low:g} and {magnet.high:g}"
+        if not is_number(value) or not span[0] <= value <= span[1]:
+            expected = f"numbers within {span[0]:g} and {span[1]:g}"
             raise section.error(f"{value!r}"[:80], expected, key)
     return tuple(map(float, values))
 
@@ -297,8 +316,7 @@ def _screen(section: Section, lattice: LatticeFile) -> Profiler:
         expected = nearest(str(name), lattice.places) + f", of {lattice.path}"
         raise section.error(f"no screen '{name}'", expected, "name")
     shots = _whole(section, "shots", said["shots"])
-    unit = LENGTHS[said["unit"]]
-    return Profiler(name, sizes, profiles, unit, said["pixel"], shots, said["timeout"])
+    return Profiler(name, sizes, profiles, said["unit"], said["pixel"], shots, said["timeout"])
 
 
 def _seen_at(lattice: LatticeFile, screen: str) -> LatticeFile:
@@ -393,15 +411,42 @@ class Watched(NamedTuple):
             ...
         beamfit.errors.InputError: unit 'A' of 'SR:I'; expected mA, as in the machine file
         """
-        known = UNITS_OF[self.quantity]
-        if not given or not self.unit or (found := known_unit(given)) == self.unit:
-            return None
-        if found in known and known[found] == self.factor:
-            return None
-        said = f"unit '{plain(given)}' of '{plain(self.variable)}'"
-        if found in known:
-            raise InputError(said, f"{self.unit}, as in the machine file")
-        return f"{said} is not understood: taken as {self.unit}"
+        return check_unit(given, self.variable, self.unit, UNITS_OF[self.quantity])
+
+
+def check_unit(given: str, variable: str, unit: str, known: Mapping[str, float]) -> str | None:
+    """Compare the unit that the control system gives with that of the machine file.
+
+    Parameters
+    ----------
+    given, variable, unit : str
+        Unit that the control system gives to a variable, its name, and the unit of the file.
+    known : mapping of str to float
+        Factors of all units that there are.
+
+    Returns
+    -------
+    str or None
+        A note if nobody knows the unit that is given.
+
+    Raises
+    ------
+    InputError
+        If it is another one.
+
+    Examples
+    --------
+    >>> check_unit("lp", "SCREEN:X", "um", {"um": 1e-6, "mm": 1e-3})
+    "unit 'lp' of 'SCREEN:X' is not understood: taken as um"
+    """
+    if not given or not unit or (found := known_unit(given)) == unit:
+        return None
+    if known.get(found or "") == known[unit]:
+        return None
+    said = f"unit '{plain(given)}' of '{plain(variable)}'"
+    if found in known:
+        raise InputError(said, f"{unit}, as in the machine file")
+    return f"{said} is not understood: taken as {unit}"
 
 
 @dataclass(frozen=True)
@@ -439,12 +484,12 @@ class WatchMachine:
 
 
 def read_watch_machine(path: str | PathLike[str]) -> WatchMachine:
-    """Read what a watch needs of a machine file.
+    """Read what a watch needs of a machine file (docs/watch.md).
 
     Parameters
     ----------
     path : str or path
-        TOML, format "beamfit-machine-1" (docs/live.md); paths in it are beside it.
+        Of TOML as `read_scan_machine` takes it.
 
     Returns
     -------
@@ -453,7 +498,7 @@ def read_watch_machine(path: str | PathLike[str]) -> WatchMachine:
     Raises
     ------
     InputError
-        If it cannot be used, naming line and key.
+        As by `read_scan_machine`.
 
     Examples
     --------

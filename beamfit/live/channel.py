@@ -188,13 +188,12 @@ def _closed() -> None:
 
 
 class Protocols(NamedTuple):
-    """Protocol: its calls to read, write, describe and follow a variable, and its errors."""
+    """Protocol: its calls to read, write, describe and follow a variable."""
 
     get: Callable[[str], Awaitable[PvReading]]
     put: Callable[[str, float], Awaitable[Any]]
     describe: Callable[[str], Awaitable[Described]]
     follow: Callable[[str, Callable[[Any], None]], Any]
-    refusal: type[Exception]
 
 
 @dataclass(frozen=True)
@@ -241,8 +240,9 @@ class Variable:
             found = f"no answer from '{plain(self.name)}' within {self.timeout:g} s"
             expected = "a variable within reach; is its IOC up, and EPICS_CA_ADDR_LIST right?"
             raise SilentError(found, expected) from None
-        except self.speech.refusal as error:
-            found = f"'{plain(self.name)}' refuses: {plain(str(error))[:150]}"
+        except Exception as error:  # a refusal, a lost connection, a record without a value
+            said = plain(str(error) or type(error).__name__)[:150]
+            found = f"'{plain(self.name)}' refuses: {said}"
             raise LostError(found, "a variable that does what it is asked") from None
 
 
@@ -289,13 +289,12 @@ def _channel_access() -> Protocols:
     def put(name: str, value: float) -> Awaitable[Any]:
         return aioca.caput(name, value, wait=True, timeout=None)
 
-    return Protocols(get, put, describe, follow, aioca.CANothing)
+    return Protocols(get, put, describe, follow)
 
 
 @lru_cache(maxsize=1)
 def _pv_access() -> Protocols:
     from p4p.client.asyncio import Context
-    from p4p.client.raw import RemoteError
 
     def here() -> Context:
         loop = asyncio.get_running_loop()
@@ -318,4 +317,4 @@ def _pv_access() -> Protocols:
     def put(name: str, value: float) -> Awaitable[Any]:
         return here().put(name, value, wait=True, get=False)
 
-    return Protocols(get, put, describe, follow, RemoteError)
+    return Protocols(get, put, describe, follow)

@@ -5,7 +5,12 @@ from __future__ import annotations
 import asyncio
 import time
 from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
-from contextlib import AbstractAsyncContextManager, AsyncExitStack, asynccontextmanager
+from contextlib import (
+    AbstractAsyncContextManager,
+    AsyncExitStack,
+    asynccontextmanager,
+    suppress,
+)
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import NamedTuple, Protocol
@@ -14,8 +19,17 @@ import numpy as np
 from scipy.optimize import curve_fit
 
 from beamfit.errors import InputError, plain
-from beamfit.io.headers import UNITS, known_unit
-from beamfit.io.machine import LENGTHS, Guard, Magnet, Profiler, ScanMachine, moved, unit_of
+from beamfit.io.headers import UNITS
+from beamfit.io.machine import (
+    LENGTHS,
+    Guard,
+    Magnet,
+    Profiler,
+    ScanMachine,
+    check_unit,
+    moved,
+    unit_of,
+)
 from beamfit.live.channel import Channel, LostError, PvReading, SilentError, open_channel
 
 # Of the time a read-back has to stay, between two looks at it; not shorter, not longer, s.
@@ -250,7 +264,7 @@ class ScreenShots:
             return None
         if self.profiler.profiles:
             return rms_of(np.atleast_1d(reading.value), self.profiler.pixel)
-        size = reading.value * self.profiler.unit
+        size = reading.value * LENGTHS[self.profiler.unit]
         return float(size) if np.ndim(size) == 0 and size > 0 else None
 
 
@@ -331,6 +345,9 @@ async def _followed(
             said.extend([words] * bool(words))
             begun.set()
 
+    def ended(task: asyncio.Task) -> None:  # whatever ends it sees no more
+        said.append(f"'{plain(channel.name)}' is followed no more")
+
     async def left(last: float) -> str:
         until = time.monotonic() + patience
         while not said:  # an answer comes behind whatever the monitor sent before it
@@ -343,21 +360,18 @@ async def _followed(
         return "".join(said[:1])
 
     task = asyncio.create_task(follow())
+    task.add_done_callback(ended)
     try:
-        await _in_time(begun, channel)
+        with suppress(TimeoutError):
+            async with asyncio.timeout(FIRST):
+                await begun.wait()
+        if not begun.is_set():
+            found = f"no reading of '{plain(channel.name)}' within {FIRST:g} s"
+            raise LostError(found, "a variable that can be followed")
         yield left
     finally:
         task.cancel()
         await asyncio.gather(task, return_exceptions=True)
-
-
-async def _in_time(begun: asyncio.Event, channel: Channel) -> None:
-    try:
-        async with asyncio.timeout(FIRST):
-            await begun.wait()
-    except TimeoutError:
-        found = f"no reading of '{plain(channel.name)}' within {FIRST:g} s"
-        raise LostError(found, "a variable that can be followed") from None
 
 
 async def connect(machine: ScanMachine) -> Connected:
@@ -393,7 +407,10 @@ async def connect(machine: ScanMachine) -> Connected:
     screen = {plane: open_channel(name, machine.timeout) for plane, name in names.items()}
     for channel in screen.values():
         await channel.get()
-        notes += await check_lengths(channel, wanted) if wanted.sizes else []
+        if wanted.sizes:
+            given = (await channel.describe()).unit
+            note = check_unit(given, channel.name, wanted.unit, UNITS["length"])
+            notes += [note] * bool(note)
     watchmen = [
         None if name is None else open_channel(name, machine.timeout)
         for name in (guard.present, guard.loss)
@@ -401,25 +418,6 @@ async def connect(machine: ScanMachine) -> Connected:
     ready = BeamGuard(guard, *watchmen)
     await ready.amiss()
     return Connected(supplies, ScreenShots(wanted, screen), ready, machine, tuple(notes))
-
-
-async def check_lengths(channel: Channel, profiler: Profiler) -> list[str]:
-    """Note on the unit of some sizes.
-
-    Raises
-    ------
-    InputError
-        If it is another one than the machine file says.
-    """
-    given = (await channel.describe()).unit
-    found = UNITS["length"].get(known_unit(given) or "")
-    if not given or found == profiler.unit:
-        return []
-    said = f"'{plain(channel.name)}' in '{plain(given)}'"
-    own = next(name for name, unit in LENGTHS.items() if unit == profiler.unit)
-    if found is None:
-        return [f"{said}, which is no unit of length here: taken as {own}."]
-    raise InputError(said, f"{own}, as the machine file says of the screen")
 
 
 def supply_of(magnet: Magnet, timeout: float) -> Supply:
@@ -450,11 +448,14 @@ async def checked(supply: Supply) -> tuple[Supply, list[str]]:
         raise InputError(found, f"some of {magnet.low:g} to {magnet.high:g}, of the machine file")
     if (low, high) == (magnet.low, magnet.high):
         return supply, []
-    if not magnet.tolerance < 0.1 * (high - low):  # or a journal would not be one
+    magnet = replace(magnet, low=low, high=high)
+    if not magnet.tolerance < 0.1 * (magnet.span[1] - magnet.span[0]):
         found = f"tolerance {magnet.tolerance:g} of {magnet.name} within {low:g} to {high:g}"
         raise InputError(found, "less than a tenth of what the control system lets it move")
+    for value in magnet.degauss:
+        moved(magnet, value)
     said = f"Limits of {magnet.name}: {low:g} to {high:g} {magnet.unit}, of the control system."
-    return replace(supply, magnet=replace(magnet, low=low, high=high)), [said]
+    return replace(supply, magnet=magnet), [said]
 
 
 def rms_of(counts: np.ndarray, pixel: float) -> float | None:

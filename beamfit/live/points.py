@@ -176,8 +176,8 @@ def doubt(fit: EmittanceFit | None, points: Sequence[MeasuredPoint]) -> str:
 
 def first_settings(machine: ScanMachine) -> tuple[float, ...]:
     """First settings of a scan: as the machine file says, or over the range of its first magnet."""
-    first = machine.magnets[0]
-    return machine.first or tuple(first.low + p * (first.high - first.low) for p in BEGIN)
+    low, high = machine.magnets[0].span
+    return machine.first or tuple(low + p * (high - low) for p in BEGIN)
 
 
 def next_setting(
@@ -210,7 +210,7 @@ def next_setting(
         some, since a wrong line shows there alone. The middle of the largest gap where nothing can
         be fitted.
     """
-    limits = {m.name: _within(m.name, m.low, m.high, barred, before) for m in machine.magnets}
+    limits = {m.name: _within(m.name, *m.span, barred, before) for m in machine.magnets}
     first = machine.magnets[0]
     low, high = limits[first.name]
     begin = first_settings(machine)[len(points) + len(barred) :]

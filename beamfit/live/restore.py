@@ -22,7 +22,6 @@ from beamfit.errors import InputError, plain
 from beamfit.io.files import read_json
 from beamfit.io.machine import APPROACHES, Magnet, ScanMachine, moved
 from beamfit.io.toml import is_number
-from beamfit.live.channel import LostError
 from beamfit.live.devices import Device, NotSettledError
 from beamfit.writing import alone, write_atomically
 
@@ -176,6 +175,7 @@ def _magnet(table: dict[str, object]) -> tuple[Magnet, float]:
     _demand(all(isinstance(word, str) and word for word in (m.name, m.set, m.read, m.unit)))
     _demand(all(map(is_number, numbers)) and m.approach in APPROACHES)
     _demand(0 < m.tolerance < 0.1 * (m.high - m.low) and m.settle >= 0 and m.timeout > 0)
+    _demand(m.low <= setting <= m.high)
     return m, float(setting)
 
 
@@ -204,7 +204,9 @@ class NotRestoredError(InputError):
     """A magnet that could not be put back, or is not seen to be back."""
 
 
-async def reach(magnet: Magnet, device: Device, value: float) -> float:
+async def reach(
+    magnet: Magnet, device: Device, value: float, present: float | None = None
+) -> float:
     """Move a magnet to a setting, from below or above where that is asked for.
 
     Parameters
@@ -215,6 +217,8 @@ async def reach(magnet: Magnet, device: Device, value: float) -> float:
         What moves it.
     value : float
         The setting, in the magnet's unit.
+    present : float, optional
+        The setting it comes from; asked unless given. From NaN it passes by whichever side it is.
 
     Returns
     -------
@@ -226,13 +230,8 @@ async def reach(magnet: Magnet, device: Device, value: float) -> float:
     InputError
         If the setting is outside the limits (nothing is written then), or is not reached.
     """
-    value = moved(magnet, value)
-    return await _sent(magnet, device, value, await device.get())
-
-
-async def _sent(magnet: Magnet, device: Device, value: float, present: float) -> float:
-    """Move a magnet from a setting to another; from NaN it passes by, whichever side it is on."""
-    by = magnet.approach_by
+    value, by = moved(magnet, value), magnet.approach_by
+    present = await device.get() if present is None else present
     if magnet.approach == "below" and not present <= value:
         await _put(device, max(value - by, magnet.low))
     if magnet.approach == "above" and not present >= value:
@@ -260,52 +259,47 @@ async def restore(journal: Journal, magnets: Mapping[str, Device]) -> None:
     NotRestoredError
         If one is not back. All others are, and the journal stays.
     """
-    until, failed = time.monotonic() + journal.patience, []
-    for magnet, value in journal.before:
-        if error := await _restored(magnet, magnets[magnet.name], value, until):
-            failed.append((magnet, value, error))
-    if not failed:
+    until = time.monotonic() + journal.patience
+    errors = await asyncio.gather(  # no magnet waits for another's IOC
+        *(_restored(magnet, magnets[magnet.name], value, until) for magnet, value in journal.before)
+    )
+    first = next(filter(None, errors), None)
+    if first is None:
         journal.done()
         return
-    settings = named((magnet, value) for magnet, value, _ in failed)
-    found = f"{settings} not seen to be restored ({failed[0][2].found})"
+    left = (one for one, error in zip(journal.before, errors, strict=True) if error)
+    said = getattr(first, "found", plain(f"{type(first).__name__}: {first}")[:150])
+    found = f"{named(left)} not seen to be restored ({said})"
     expected = f"beamfit scan --recover {journal.path}, or by hand"
     with suppress(InputError, OSError):  # somebody may have removed it
         journal.write()
     raise NotRestoredError(found, expected)
 
 
-async def _restored(
-    magnet: Magnet, device: Device, value: float, until: float
-) -> InputError | None:
-    attempts = 0
+async def _restored(magnet: Magnet, device: Device, value: float, until: float) -> Exception | None:
+    """Put a magnet back, again and again; the last error where that fails."""
+    unsettled = 0
     while True:
         try:
-            await _put_back(magnet, device, value)
-            return None
-        except LostError as error:
-            if time.monotonic() > until:
+            return await _put_back(magnet, device, value)
+        except Exception as error:  # of whatever kind, of a library too: it may pass
+            unsettled += isinstance(error, NotSettledError)
+            if unsettled >= ATTEMPTS or time.monotonic() > until:
                 return error
-        except NotSettledError as error:
-            attempts += 1
-            if attempts >= ATTEMPTS:
-                return error
-        except InputError as error:
-            return error
         await asyncio.sleep(PAUSE)
 
 
 async def _put_back(magnet: Magnet, device: Device, value: float) -> None:
     """Move a magnet back, also where its set point is undefined: an IOC may return like that."""
     present = math.nan
-    with suppress(LostError):
+    with suppress(Exception):
         present = await device.get()
-    await _sent(magnet, device, moved(magnet, value), present)
+    await reach(magnet, device, value, present)
 
 
 @contextmanager
 def ended_by_signals(task: asyncio.Future, tell: Callable[[str], None]) -> Iterator[list[int]]:
-    """Have the first signal cancel a task, and any more only say that all is being restored.
+    """Have the first signal cancel something, and any more only say that all is being restored.
 
     Outside the main thread signals are left to whoever runs it.
     """

@@ -17,7 +17,7 @@ import numpy as np
 
 from beamfit.emittance.fit import EmittanceFit
 from beamfit.errors import InputError
-from beamfit.io.machine import ScanMachine
+from beamfit.io.machine import ScanMachine, moved
 from beamfit.live.devices import Connected, NoSizesError, Shots
 from beamfit.live.points import (
     MeasuredPoint,
@@ -93,7 +93,7 @@ class Running:
     at: Connected
     line: Beamline
     before: Mapping[str, float]
-    keep: Callable[[Sequence[MeasuredPoint]], None]
+    keep: Callable[[Sequence[MeasuredPoint], Mapping[str, float]], None]
     tell: Callable[[ScanProgress], None]
     ready: Callable[[], Awaitable[None]]
     wrong: Sequence[WrongLine] = ()
@@ -113,7 +113,7 @@ async def scan(
     line: Beamline,
     journal: Path,
     *,
-    keep: Callable[[Sequence[MeasuredPoint]], None] = lambda points: None,
+    keep: Callable[[Sequence[MeasuredPoint], Mapping[str, float]], None] = lambda *given: None,
     tell: Callable[[ScanProgress], None] = lambda told: None,
     ready: Callable[[], Awaitable[None]] = lambda: asyncio.sleep(0),
 ) -> Outcome:
@@ -129,7 +129,7 @@ async def scan(
     journal : Path
         Where the settings to restore are written before anything moves.
     keep : callable
-        Is given all points after each new one, to write them.
+        Is given all points after each new one, to write them, and the settings before the scan.
     tell : callable
         Is told how the scan stands.
     ready : callable
@@ -155,7 +155,8 @@ async def scan(
     warmed(at.machine, line)
     with alone_with(journal, at.machine.magnets):
         check_none_left(journal)
-        before = {m.name: await at.magnets[m.name].get() for m in at.machine.magnets}
+        magnets = at.machine.magnets  # what could not be put back is not moved
+        before = {m.name: moved(m, await at.magnets[m.name].get()) for m in magnets}
         log = _journal_for(journal, at.machine, before)
         run = Running(at, line, before, keep, tell, ready, wrong_lines(line, at.machine))
         measuring = asyncio.ensure_future(_begun(run, log))
@@ -231,7 +232,7 @@ async def _measured(run: Running) -> str:
                 raise NoSizesError(found, "a beam on the screen")
             continue
         barren = 0
-        run.keep([*run.points, point])
+        run.keep([*run.points, point], run.before)
         run.points.append(point)
         run.fit = fit_of(run.points, machine, run.line) or run.fit
         run.say(chosen.why, measured=True)
@@ -261,7 +262,7 @@ async def _point(run: Running, settings: Mapping[str, float]) -> tuple[MeasuredP
     lost = left = ""
     for _ in range(2):
         await _well(run, lost)
-        reads = await _moved(run, settings)
+        reads = await _moved(run, settings, math.nan if left else None)
         shots, none, lost, left = await _taken(run, settings)
         if lost:
             run.say(f"Paused: {lost}")
@@ -306,9 +307,13 @@ def _stuck(run: Running, reads: Mapping[str, float], shots: Mapping[str, np.ndar
     return next((p for p, each in shots.items() if np.all(each == last.shots[p][-1])), "")
 
 
-async def _moved(run: Running, settings: Mapping[str, float]) -> dict[str, float]:
-    magnets = [m for m in run.at.machine.magnets if m.name in settings]
-    return {m.name: await reach(m, run.at.magnets[m.name], settings[m.name]) for m in magnets}
+async def _moved(
+    run: Running, settings: Mapping[str, float], present: float | None = None
+) -> dict[str, float]:
+    """Move magnets; from NaN each passes its setting, from wherever somebody has moved it."""
+    magnets = {m.name: m for m in run.at.machine.magnets if m.name in settings}
+    devices = run.at.magnets
+    return {n: await reach(m, devices[n], settings[n], present) for n, m in magnets.items()}
 
 
 async def _well(run: Running, lost: str) -> None:

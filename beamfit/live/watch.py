@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import asyncio
-import signal
 import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -15,6 +14,7 @@ import numpy as np
 from beamfit.io.machine import Watched, WatchMachine
 from beamfit.lifetime.watch import CURRENT, RULE, Plan, State, noted, stepped
 from beamfit.live.channel import Channel, LostError, PvReading, kept, open_channel
+from beamfit.live.restore import ended_by_signals
 from beamfit.status import Status
 from beamfit.table import cell, json_of
 
@@ -234,9 +234,9 @@ async def watch(
         asyncio.create_task(course.follow(one, open_channel(one.variable, machine.timeout)))
         for one in machine.variables
     ]
-    begun, shown = time.monotonic(), -SHOWN
+    begun, shown, over = time.monotonic(), -SHOWN, asyncio.get_running_loop().create_future()
     try:
-        with _signals() as came:
+        with ended_by_signals(over, lambda text: None) as came:
             while not came and (seconds is None or time.monotonic() - begun < seconds):
                 await course.take()
                 for task in followers:
@@ -250,22 +250,3 @@ async def watch(
         for task in followers:
             task.cancel()
         await asyncio.gather(*followers, return_exceptions=True)
-
-
-@contextmanager
-def _signals() -> Iterator[list[int]]:
-    """Signal that came; a second one ends the process as it would any."""
-    came: list[int] = []
-    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
-
-    def stop(number: int, frame: Any) -> None:
-        came.append(number)
-        signal.signal(number, before[number])
-
-    for number in before:
-        signal.signal(number, stop)
-    try:
-        yield came
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)

@@ -85,7 +85,7 @@ def telling_setting(
         other = fit_of(points, machine, wrong.line)
         if other is None or misfit(other) > misfit(fit) + OUT:
             continue
-        limits = [(m.low, m.high) for m in machine.magnets if m.name in wrong.magnets]
+        limits = [m.span for m in machine.magnets if m.name in wrong.magnets]
         grid = np.array([*product(*(np.linspace(*ends, LEVELS) for ends in limits))]).T
         names = [m.name for m in machine.magnets if m.name in wrong.magnets]
         settings = dict(before) | dict(zip(names, grid, strict=True))

@@ -29,6 +29,7 @@ from beamfit.live.points import (
     MeasuredPoint,
     Next,
     doubt,
+    first_settings,
     fit_of,
     fresh,
     next_setting,
@@ -55,7 +56,7 @@ def done(tmp_path_factory):
     folder, device, texts = tmp_path_factory.mktemp("scan"), Simulated(), []
     at = connected(folder, device)
     at = at._replace(machine=replace(at.machine, goal=0.03, points=20))
-    keep = lambda points: texts.append(scan_text(points, at.machine, {"Q1": -2.0}))  # noqa: E731
+    keep = lambda points, before: texts.append(scan_text(points, at.machine, before))  # noqa: E731
     return scanned(at, folder, keep=keep), texts, device, at, folder
 
 
@@ -163,6 +164,7 @@ class Feed:
     async def monitor(self):
         for reading in self.readings:
             yield reading
+        await asyncio.Event().wait()
 
     async def get(self):
         return self.readings[-1]
@@ -204,6 +206,20 @@ def test_beam_is_followed_to_the_last_shot_and_a_silent_variable_is_lost(monkeyp
         asyncio.run(shots(Feed(), None))
 
 
+def test_a_variable_that_is_followed_no_more_is_said():
+    class Ends(Feed):
+        async def monitor(self):
+            yield self.readings[0]
+
+    async def shots():
+        guard = BeamGuard(Guard("PRESENT", 0.1, None, None), Ends((0.25, 4.0)), None)
+        async with guard.followed() as left:
+            await asyncio.sleep(0.01)
+            return await left(4.0)
+
+    assert asyncio.run(shots()) == "'FEED' is followed no more"
+
+
 def test_one_outlying_shot_makes_no_mean(done):
     found, _, _, at, folder = done
     last = found.points[-1]
@@ -241,6 +257,48 @@ def test_a_magnet_that_does_not_come_back_is_an_error_and_stays_in_the_journal(t
         scanned(connected(tmp_path, Simulated()), tmp_path)
 
 
+@pytest.mark.parametrize("setting", [3.0, np.nan])
+def test_a_magnet_that_could_not_be_put_back_is_not_moved(tmp_path, setting):
+    device = Simulated()
+    device.setting = setting
+    with pytest.raises(InputError, match=r"a setting of (3|nan) for Q1; expected within its"):
+        scanned(connected(tmp_path, device), tmp_path)
+    assert device.puts == []
+    assert not (tmp_path / "a.journal").exists()
+
+
+class Breaks(Simulated):
+    """A magnet whose library raises errors of its own, some times."""
+
+    def __init__(self, times):
+        super().__init__()
+        self.times = times
+
+    async def put(self, value):
+        self.times -= 1
+        if self.times >= 0:
+            raise RuntimeError("connection \x1b lost")
+        await super().put(value)
+
+
+@pytest.mark.parametrize("times", [1, 100])
+def test_an_error_of_a_library_keeps_no_magnet_from_being_restored(tmp_path, times):
+    [magnet] = read_scan_machine(written(tmp_path)).magnets
+    other = replace(magnet, name="Q2", set="SIM:Q2:SET")
+    devices = {"Q1": Breaks(times), "Q2": Simulated()}
+    log = Journal(tmp_path / "a.journal", "m", ((magnet, -1.0), (other, 0.5)), patience=0.1)
+    log.write()
+    if times > 1:
+        said = r"^Q1 -1 T_per_m not seen to be restored \(RuntimeError: connection \\x1b lost\);"
+        with pytest.raises(NotRestoredError, match=said):
+            asyncio.run(restore(log, devices))
+    else:
+        asyncio.run(restore(log, devices))
+        assert devices["Q1"].setting == -1.0
+    assert devices["Q2"].setting == 0.5
+    assert log.path.exists() == (times > 1)
+
+
 DAMAGE = [
     {"magnets": []},  # nothing to restore is not "restored"
     {"tolerance": np.inf},  # would call any read-back restored
@@ -248,6 +306,7 @@ DAMAGE = [
     {"low": -np.inf},
     {"set": 5},
     {"patience": np.nan},
+    {"setting": 9.0},  # which nothing would ever write
 ]
 
 
@@ -411,6 +470,26 @@ def test_a_setting_is_reached_from_its_side(tmp_path, side, passed):
     assert device.puts[-1] == 0.0
 
 
+@pytest.mark.parametrize(("side", "low", "high"), [("below", -5.1, 2.5), ("above", -5.5, 2.1)])
+def test_no_setting_is_chosen_that_cannot_be_passed(tmp_path, side, low, high):
+    text = f'approach = "{side}"\napproach_by = 0.4'
+    machine = read_scan_machine(written(tmp_path, more=text))
+    assert machine.magnets[0].span == pytest.approx((low, high))
+    first = first_settings(machine)
+    assert (first[0] - low, high - first[-1]) == pytest.approx([0.1 * (high - low)] * 2)
+    point = MeasuredPoint({"Q1": low + 5.0}, {"x": np.ones(3) * 1e-4}, 0.0)
+    gap = next_setting([point] * 4, None, (), machine, {"Q1": 0.0})
+    assert gap.settings["Q1"] == pytest.approx(low + 2.5)
+
+
+def test_a_setting_that_was_left_is_reached_again_from_its_side(tmp_path):
+    at = connected(tmp_path, device := Restless(), more='approach = "below"\napproach_by = 0.4')
+    scanned(at, tmp_path)
+    again = next(i for i, value in enumerate(device.puts) if value in device.restless)
+    value = device.puts[again]
+    assert device.puts[again + 1 : again + 3] == [pytest.approx(value - 0.4), value]
+
+
 def test_the_first_settings_are_those_of_the_file(tmp_path):
     path = written(tmp_path, points=("points = 7", "points = 7\nfirst = [0.5, -1.5]"))
     machine = read_scan_machine(path)
@@ -562,6 +641,7 @@ BAD = [
     (('name = "Q1"', 'name = "Q2"'), r"column 'name': no magnet 'Q2'; expected .*Q1"),
     (("points = 7", "points = 7.5"), r"column 'points': 7.5; expected a whole number"),
     (("points = 7", "points = 7\nfirst = [9]"), r"'first': 9; expected numbers within -5.5 and"),
+    (("settle_s", 'approach = "above"\napproach_by = 7.95\nsettle_s'), r"room to scan besides"),
     (("present_above = 0.1", ""), r"present and no present_above; expected both"),
     (('lattice = "line.toml"', ""), r"no lattice; expected lattice = "),
     (("settle_s", "setle_s"), r"column 'setle_s': an unknown key; expected .*settle_s"),
@@ -646,7 +726,7 @@ def test_a_dry_run_checks_and_moves_nothing(ioc, injector):
     [
         (("SIM:SCREEN:X", "SIM:NONE"), r"no answer from 'SIM:NONE' within 1 s"),
         (("SIM:Q1:READ", "SIM:SCREEN:X"), r"'SIM:SCREEN:X' in 'um'; expected T_per_m"),
-        (("shots = 3", 'shots = 3\nunit = "mm"'), r"'SIM:SCREEN:X' in 'um'; expected mm"),
+        (("shots = 3", 'shots = 3\nunit = "mm"'), r"unit 'um' of 'SIM:SCREEN:X'; expected mm"),
         (("low = -5.5", "low = 2.0"), r"a setting of -2.5 for Q1; expected within its limits"),
     ],
 )
