@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Iterator
+import math
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -13,8 +14,13 @@ from beamfit.batch.run import Batch
 from beamfit.emittance.model import QUANTITIES
 from beamfit.errors import InputError, nearest
 from beamfit.lifetime.evidence import UNITS
+from beamfit.quantity import display_unit
 from beamfit.statistics import baseline, control_limits
+from beamfit.table import Table, labelled, plain_name
 
+# Standard deviations of all points; limits that are wider rest on fewer than five points, whose
+# Student's quantile they show.
+WIDEST = 6.0
 # Quantities of each kind, and the default one.
 FOLLOWED = {
     "emittance": (QUANTITIES, "normalized_emittance"),
@@ -55,6 +61,39 @@ class ControlChart(NamedTuple):
     def beyond(self) -> np.ndarray:
         """True for each point beyond the limits and beyond 3 of its own errors from the centre."""
         return np.abs(self.value - self.centre) > np.maximum(self.limit, 3.0 * self.error)
+
+    @property
+    def label(self) -> str:
+        """The quantity and its plane, as people read them."""
+        return f"{plain_name(self.name)} {self.of}".strip()
+
+    @property
+    def reach(self) -> float:
+        """How far the control limits reach; infinite where too few points make them to say
+        anything.
+        """
+        return self.limit if self.limit < WIDEST * np.std(self.value) else math.inf
+
+    def shown(self, value: float) -> str:
+        """Write a value of it in the unit in which its usual value is read."""
+        factor, unit = display_unit(abs(self.centre), self.unit)
+        return f"{value / factor:#.4g} {unit}".strip()
+
+
+def summary_of(courses: Sequence[ControlChart]) -> Table:
+    """The spread of each quantity through the files."""
+    rows = [("answers", [f"{len(c.value)}" for c in courses])]
+    for label, number in (
+        ("median", np.median),
+        ("lowest", np.min),
+        ("highest", np.max),
+        ("standard deviation", np.std),
+    ):
+        rows.append((label, [c.shown(float(number(c.value))) for c in courses]))
+    rows.append(("median error", [c.shown(float(np.median(c.error))) for c in courses]))
+    beyond = [f"{c.beyond.sum()}" if math.isfinite(c.reach) else "no limits" for c in courses]
+    rows.append(("beyond the limits", beyond))
+    return labelled("Result", [c.label for c in courses], rows)
 
 
 def followed(kind: str, name: str | None = None) -> tuple[str, str]:

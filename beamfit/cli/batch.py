@@ -75,7 +75,7 @@ def batch(
     part = {n: told[n] for n in ("use", "energy", "particle", "first", "last", "screen")}
     reading = {n: told[n] for n in ("columns", "ignore", "skip_bad")}
     _check_kind(kind, {"lattice": lattice, "noise": noise, "learn-noise": learned} | part)
-    from beamfit.batch.course import courses_of, followed
+    from beamfit.batch.course import courses_of, followed, summary_of
 
     followed(kind, quantity)  # says so before hours of work if there is none
     if learned is not None:
@@ -89,14 +89,16 @@ def batch(
         from beamfit.io.priors import write_noise
 
         write_noise(learned, job.learned_noise(found.files))
+    courses = courses_of(found, quantity)
     if report is not None:
         from beamfit.report.batch import write_batch_report
 
-        write_batch_report(report, found, courses_of(found, quantity), command_line())
+        write_batch_report(report, found, courses, command_line())
     inputs = {} if lattice is None else {lattice: job.lattice_sha256}
     results = {"table": out, "files": len(found.files), "new": found.new}
     results |= {"statuses": found.statuses, "unusable": found.refused}
-    answered(as_json, [results], inputs, lambda terminal: _show(terminal, found, out), report)
+    summary = summary_of(courses) if courses else None
+    answered(as_json, [results], inputs, lambda t: _show(t, found, out, summary), report)
 
 
 def _check_kind(kind: str, of_scans: dict[str, Any]) -> None:
@@ -127,12 +129,15 @@ class _Progress:
             click.echo("", err=True)
 
 
-def _show(terminal: Terminal, found: Batch, out: str) -> None:
+def _show(terminal: Terminal, found: Batch, out: str, summary: Table | None) -> None:
     before = len(found.files) - found.new
     kept = f", {before} of them before" if before else ""
     terminal.line(f"{len(found.files)} files answered{kept}: {out}", style="bold")
     rows = [[name.replace("_", " "), str(n)] for name, n in found.statuses.items()]
     terminal.table(Table("", ["status", "answers"], rows, numeric=True))
+    if summary is not None:
+        terminal.line()
+        terminal.table(summary._replace(title=""), wrap=False)
     for reason in list(found.refused.values())[:NAMED]:
         terminal.line(reason)
     if (more := len(found.refused) - NAMED) > 0:

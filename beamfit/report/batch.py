@@ -14,7 +14,7 @@ import numpy as np
 from matplotlib import rc_context
 from matplotlib.figure import FigureBase
 
-from beamfit.batch.course import ControlChart
+from beamfit.batch.course import ControlChart, summary_of
 from beamfit.batch.run import Batch
 from beamfit.quantity import Quantity, display_unit
 from beamfit.report.document import (
@@ -31,7 +31,7 @@ from beamfit.report.document import (
 from beamfit.report.page import write_page, write_report
 from beamfit.statistics import BEYOND
 from beamfit.status import Status
-from beamfit.table import MOST_ROWS, Table, labelled, plain_name
+from beamfit.table import MOST_ROWS, Table, plain_name
 
 NOTHING = Verdict(
     Status.unidentified,
@@ -45,9 +45,6 @@ RULE = (
 )
 
 
-# Standard deviations of all points; limits that are wider rest on fewer than five points, whose
-# Student's quantile they show.
-WIDEST = 6.0
 # Points within the limits for each that noise alone puts beyond: 370.
 NOISE_PASSES = 1 / (2 * (1 - BEYOND))
 
@@ -97,7 +94,7 @@ def _page(
 ) -> ReportPage:
     job = batch.ledger.job
     answers = [[name.replace("_", " "), f"{n}"] for name, n in batch.statuses.items()]
-    tables = [_summary(courses)] if courses else []
+    tables = [summary_of(courses)] if courses else []
     tables.append(Table("Answers", ["status", "answers"], answers, numeric=True))
     for c in courses:
         rows = [
@@ -106,7 +103,7 @@ def _page(
             if off
         ]
         more = f"the first {MOST_ROWS} of {len(rows)}" if len(rows) > MOST_ROWS else ""
-        title = f"Beyond the control limits: {_label(c)}"
+        title = f"Beyond the control limits: {c.label}"
         tables += [Table(title, ["file", plain_name(c.name)], rows[:MOST_ROWS], more)] * bool(rows)
     if batch.refused:
         more = f"the first {MOST_ROWS} of {len(batch.refused)}; all are in the table of answers"
@@ -114,7 +111,7 @@ def _page(
         note = more if len(batch.refused) > MOST_ROWS else ""
         tables.append(Table("Without an answer", ["file and reason"], rows, note))
     pictures = [
-        Picture(f"course of {_label(c)}", 3.0, partial(draw_course, course=c), _source(c, job.kind))
+        Picture(f"course of {c.label}", 3.0, partial(draw_course, course=c), _source(c, job.kind))
         for c in courses
     ]
     return ReportPage(
@@ -132,30 +129,6 @@ def _page(
     )
 
 
-def _summary(courses: Sequence[ControlChart]) -> Table:
-    """The spread of each quantity through the files."""
-    rows = [("answers", [f"{len(c.value)}" for c in courses])]
-    for label, number in (
-        ("median", np.median),
-        ("lowest", np.min),
-        ("highest", np.max),
-        ("standard deviation", np.std),
-    ):
-        rows.append((label, [_in_unit(c, float(number(c.value))) for c in courses]))
-    rows.append(("median error", [_in_unit(c, float(np.median(c.error))) for c in courses]))
-    rows.append(("beyond the limits", [f"{c.beyond.sum()}" for c in courses]))
-    return labelled("Result", [_label(c) for c in courses], rows)
-
-
-def _in_unit(c: ControlChart, value: float) -> str:
-    factor, unit = display_unit(abs(c.centre), c.unit)
-    return f"{value / factor:.3g} {unit}".strip()
-
-
-def _label(c: ControlChart) -> str:
-    return f"{plain_name(c.name)} {c.of}".strip()
-
-
 def _source(c: ControlChart, kind: str) -> str:
     first, last = (Path(c.files[i]).name for i in (0, -1))
     return f"{kind} of {len(c.value)} files, {first} to {last}"
@@ -165,18 +138,13 @@ def _verdict(c: ControlChart) -> Verdict:
     beyond, points, middle = int(c.beyond.sum()), len(c.value), float(np.median(c.value))
     status = Status.poor_fit if beyond else Status.converged
     factor, unit = display_unit(abs(c.centre), c.unit)
-    if not math.isfinite(_reach(c)):
+    if not math.isfinite(c.reach):
         few = f"{points} points are too few for control limits."
-        return Verdict(Status.unidentified, f"{_label(c)}: median {_in_unit(c, middle)}", few)
-    usual = f"{c.centre / factor:.3g} ± {c.limit / factor:.2g} {unit}".strip()
+        return Verdict(Status.converged, f"{c.label}: median {c.shown(middle)}", few)
+    usual = f"{c.centre / factor:#.4g} ± {c.limit / factor:.2g} {unit}".strip()
     message = f"{beyond} of {points} points lie beyond the control limits"
     message += f"; noise alone passes them in one point of {NOISE_PASSES:.0f}."
-    return Verdict(status, f"{_label(c)}: usually {usual}", message)
-
-
-def _reach(c: ControlChart) -> float:
-    """The reach of the control limits; none where so few points make them that they say nothing."""
-    return c.limit if c.limit < WIDEST * np.std(c.value) else math.inf
+    return Verdict(status, f"{c.label}: usually {usual}", message)
 
 
 def draw_course(figure: FigureBase, course: ControlChart) -> None:
@@ -197,10 +165,10 @@ def draw_course(figure: FigureBase, course: ControlChart) -> None:
     dated = all(days)
     at = np.array([d[0] for d in days], "datetime64[s]") if dated else course.at
     points = at, course.value / factor, None if many else course.error / factor
-    limits = course.centre / factor, _reach(course) / factor
+    limits = course.centre / factor, course.reach / factor
     style = {"ms": 1.5 if many else 3.5, "lw": 0.8, "rasterized": many}
     control_chart(axes, points, course.beyond, limits, ("within", "beyond"), **style)
-    axes.set(title=_label(course), xlabel="time in the file's name" if dated else "file, number")
+    axes.set(title=course.label, xlabel="time in the file's name" if dated else "file, number")
     axes.set_ylabel(f"{plain_name(course.name)}, {unit}")
     if dated:
         date_axis(axes)
