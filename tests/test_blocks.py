@@ -1,8 +1,8 @@
 """Code blocks of the documentation: every command and every Python block runs as it stands.
 
 Blocks with a test beside their subject are run there: tutorial, README and the example's files
-(cli/test_example), extending, control and fedbatch in Python, live_adapters, the language's own
-examples, and scans and watches of a machine (tests/live).
+(cli/test_example, test_readme), extending, control and fedbatch in Python, live_adapters, the
+language's own examples, and scans and watches of a machine (tests/live).
 """
 
 import json
@@ -22,6 +22,9 @@ PAGES = sorted([ROOT / "README.md", *(ROOT / "docs").glob("*.md")])
 # An indented or fenced line that begins with the program's name, and the lines it goes on in.
 COMMAND = re.compile(r"^(?:    |\$ )\$? ?(beamfit (?:.*\\\n)*.*)$", re.MULTILINE)
 ELSEWHERE = {"README", "tutorial", "language", "live", "watch"}
+PYTHON_ELSEWHERE = {"README", "tutorial", "python", "extending", "control", "fedbatch"}
+PYTHON_ELSEWHERE |= {"live_adapters", "batch"}  # the batch's wants a cluster's queue
+PYTHON_SLOW = {"lifetime_study", "response"}
 # Networks, studies of a shift, posteriors and workers take 10 s and more: `make calibrate`.
 SLOW = {"network", "--study", "--sample", "--workers", "state-space", "--hold-back", "--trend"}
 SLOW |= {"transport-network"}
@@ -138,13 +141,18 @@ def test_an_option_that_is_none_is_found():
         parsed(["emittance", "scan.csv", "--jsn"])
 
 
-@pytest.mark.parametrize("name", ["uncertainty", "greybox", "language"])
-def test_python_runs_as_it_stands(name, monkeypatch, tmp_path, capsys):
-    for folder in ("measurements", "lattices", "formulations"):
-        (tmp_path / folder).symlink_to(ROOT / folder)
+def python_pages():
+    """Pages with Python that no other test runs; a network's take 10 s and more."""
+    for page in PAGES:
+        if page.stem not in PYTHON_ELSEWHERE and "```python\n" in page.read_text():
+            marks = [pytest.mark.calibrate] if page.stem in PYTHON_SLOW else []
+            yield pytest.param(page, id=page.stem, marks=marks)
+
+
+@pytest.mark.parametrize("page", list(python_pages()))
+def test_python_runs_as_it_stands(page, monkeypatch, tmp_path, capsys):
+    lay_out(page, [""], tmp_path)
     monkeypatch.chdir(tmp_path)
-    blocks = re.findall(r"```python\n(.*?)```", (ROOT / f"docs/{name}.md").read_text(), re.DOTALL)
     names = {}
-    for block in blocks:
+    for block in re.findall(r"```python\n(.*?)```", page.read_text(), re.DOTALL):
         exec(block, names)
-    assert blocks
