@@ -15,7 +15,7 @@ from beamfit.errors import InputError
 PRIOR = "NAME=MEAN+-SD such as Q2.slope=167.23+-3.3446"
 BOUNDS = "NAME=LOWER:UPPER such as Q2.slope=147.23:187.23"
 GAINS = "NAME=LOWER:UPPER, one of them may be left out, such as dA_x/dQ2=:-0.0083"
-VARY = "MAGNET=LOW:HIGH such as Q2=0:10"
+VARY = "NAME=LOW:HIGH such as Q2=0:10"
 ANCHOR = "first-principles=2%, determinant, or a setting such as Q2=0"
 TARGET = "size=200um, divergence=140urad (with _x or _y), match, or match=BETA_M:ALPHA"
 UNITS = {
@@ -123,7 +123,7 @@ def gains_of(
 
 
 def limits_of(texts: Iterable[str]) -> dict[str, tuple[float, float]]:
-    """Read the limits of magnets, ``MAGNET=LOW:HIGH``.
+    """Read the limits of magnets, ``NAME=LOW:HIGH``.
 
     Raises
     ------

@@ -204,8 +204,8 @@ SHARED: dict[str, Callable[..., Any]] = {
     ),
     "hidden": option("--hidden", "Networks: hidden nodes.", default=5),
     "vary": option(
-        "--vary MAGNET=LOW:HIGH",
-        "A magnet and its limits, in the unit of its calibration.",
+        "--vary NAME=LOW:HIGH",
+        "A magnet or a knob and its limits, in the unit of its calibration or column.",
         name="limits",
         multiple=True,
         callback=_parsed(limits_of),

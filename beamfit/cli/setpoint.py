@@ -70,7 +70,7 @@ def setpoint(
         said = "neither --sigma nor --fit" if sigma is None else "both --sigma and --fit"
         raise InputError(said, "one of them: the beam at the start of the line")
     if not limits:
-        raise InputError("no --vary", "MAGNET=LOW:HIGH such as Q2=0:10")
+        raise InputError("no --vary", "NAME=LOW:HIGH such as Q2=0:10")
     targets = [target_of(text, plane) for text in target]
     described = read_lattice(lattice, **part)
     described.check_magnets(limits)

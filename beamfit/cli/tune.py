@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from beamfit.cli.option_text import goal_of, limits_of
+from beamfit.cli.option_text import goal_of
 from beamfit.cli.options import Command, answered, option, options, reported
 from beamfit.errors import InputError
 from beamfit.io.line import build_line, lattice_of
@@ -28,14 +28,7 @@ Examples:
 
 @click.command(cls=Command, epilog=EXAMPLE)
 @click.argument("table")
-@options("columns ignore skip-bad maybe-lattice use from to screen energy particle")
-@option(
-    "--vary KNOB=LOW:HIGH",
-    "A knob by the header of its column, and its limits.",
-    name="limits",
-    multiple=True,
-    callback=lambda context, parameter, value: limits_of(value),
-)
+@options("columns ignore skip-bad maybe-lattice use from to screen energy particle vary")
 @option("--goal", "What is to be low; emittance is the mean of x and y.", choices=GOALS,
         default=GOALS[0])  # fmt: skip
 @option(
@@ -65,7 +58,7 @@ def tune(
     size_x_um, ... Rows stand in any order; no setting of the knobs needs a whole scan.
     """
     if not limits:
-        raise InputError("no --vary", "KNOB=LOW:HIGH such as SOL=190:210")
+        raise InputError("no --vary", "NAME=LOW:HIGH such as SOL=190:210")
     scan = read_tuning_scan(table, limits, columns=columns, ignore=ignore, skip_bad=skip_bad)
     knobs_of(scan, limits)
     planes_of(scan, goal)

@@ -222,7 +222,7 @@ HELD = {
     f"{SCAN}.focusing_network": "NetworkStrength",
     f"{DECAY}.record": "DecayRecord Conditions Monitor",
     f"{DECAY}.fit": "DecayFit",
-    f"{DECAY}.evidence": "Separability",
+    f"{DECAY}.evidence": "Separability RatePart",
     f"{DECAY}.alternatives": "ConstantA LifetimeLaw Change Outgassing",
     f"{DECAY}.marginal": "FreeLaw Span",
     f"{OPTICS}.beamline": "Beamline Design",

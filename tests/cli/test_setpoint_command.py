@@ -62,13 +62,13 @@ def test_the_fitted_beam_brings_its_errors(run, tmp_path):
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        (("--vary", "Q2=0"), "MAGNET=LOW:HIGH"),
+        (("--vary", "Q2=0"), "NAME=LOW:HIGH"),
         (("--target", "size=200"), "a number with a unit"),
         (("--target", "width=200um"), "size=200um"),
         (("--fit", "nowhere.json"), "both --sigma and --fit"),
         (("--target", "match"), "without design Twiss"),
         (("--vary", "Q9=0:1"), "lattices/gtf.toml: --vary Q9: no magnet 'Q9'"),
-        (("--vary", "Q1=0:10%"), "MAGNET=LOW:HIGH"),
+        (("--vary", "Q1=0:10%"), "NAME=LOW:HIGH"),
         (("--target", "match=5:nan"), "alpha = nan"),
     ],
 )
@@ -186,9 +186,7 @@ def test_a_calibrated_beam_says_that_its_errors_are_too_large(of_fit):
 
 def test_a_bare_beam_says_why_it_has_no_errors(run):
     _, out, _ = run(*APPENDIX_D, "--json")
-    assert (
-        "No errors: the beam was given without its own" in json.loads(out)["results"][0]["message"]
-    )
+    assert "No errors: pass --fit" in json.loads(out)["results"][0]["message"]
 
 
 GTF = ("--lattice", "lattices/gtf.toml")
