@@ -53,7 +53,7 @@ def knobs_of(scan: QuadScan, limits: Mapping[str, tuple[float, float]]) -> Knobs
     [-1.0, 0.0, 0.8]
     """
     if not limits:
-        raise scan.unusable("no knob", "KNOB=LOW:HIGH such as SOL=180:220")
+        raise scan.unusable("no knob", "NAME=LOW:HIGH such as SOL=180:220")
     for name, (low, high) in limits.items():
         if name not in scan.settings:
             raise scan.unusable(f"no knob '{name}'", nearest(name, list(scan.settings)))
