@@ -32,7 +32,7 @@ Examples:
 @option("--goal", "What is to be low; emittance is the mean of x and y.", choices=GOALS,
         default=GOALS[0])  # fmt: skip
 @option(
-    "--within PERCENT",
+    "--close PERCENT",
     "Stop when the best setting is this close to the minimum with 95 % probability.",
     callback=lambda context, parameter, value: goal_of(value),
     default="5%",
@@ -42,7 +42,7 @@ def tune(
     table: str,
     limits: dict[str, tuple[float, float]],
     goal: str,
-    within: float,
+    close: float,
     noise: str | None,
     seed: int,
     report: str | None,
@@ -68,7 +68,7 @@ def tune(
 
     from beamfit.tuning.fit import fit_tuning
 
-    fit = fit_tuning(scan, line, limits, goal=goal, within=within, noise=own, seed=seed)
+    fit = fit_tuning(scan, line, limits, goal=goal, within=close, noise=own, seed=seed)
     inputs = {str(each.path): each.sha256 for each in (scan, described)}
     reported(report, fit, inputs)
     answered(as_json, [fit], inputs, lambda terminal: _show(terminal, fit), report)

@@ -38,7 +38,7 @@ def test_an_option_means_the_same_in_every_command():
     said = {}
     for command in cli.commands.values():
         for option in command.params:
-            # A plane goes with the command, and the goal of a scan is an error, of tuning a quantity.
+            # The goal of a scan is an error, that of tuning a quantity.
             if hasattr(option, "help") and option.name not in ("plane", "goal"):
                 text = (option.opts, option.metavar, option.default)
                 # What a prior or a gain is of goes with the command.

@@ -41,7 +41,7 @@ def test_the_answer_as_json(run):
         (("--vary", "SOL=210:190", *KNOBS[2:]), "limits 210:190 of SOL; expected two numbers"),
         (KNOBS[2:], f"{TABLE}: column 'SOL_A': no magnet 'SOL' in the lattice"),
         ((*KNOBS, "--goal", "emittance_y"), "no sizes in plane y"),
-        ((*KNOBS, "--within", "none"), "none"),
+        ((*KNOBS, "--close", "none"), "none"),
     ],
 )
 def test_bad_input_is_named(run, words, said):
