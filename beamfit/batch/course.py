@@ -69,7 +69,7 @@ class ControlChart(NamedTuple):
 
     @property
     def reach(self) -> float:
-        """How far the control limits reach; infinite where too few points make them to say
+        """Reach of the control limits; infinite where too few points make them to say
         anything.
         """
         return self.limit if self.limit < WIDEST * np.std(self.value) else math.inf

@@ -43,7 +43,7 @@ EDGE = 1e-6
 CENTRAL, WIDE = (0.16, 0.84), (0.025, 0.975)
 
 
-class Band(NamedTuple):
+class TuningBand(NamedTuple):
     """Values along settings with their central 68 and 95 %, arrays of shape (m,)."""
 
     value: np.ndarray
@@ -53,7 +53,7 @@ class Band(NamedTuple):
     high_95: np.ndarray
 
     @classmethod
-    def of(cls, draws: np.ndarray) -> Band:
+    def of(cls, draws: np.ndarray) -> TuningBand:
         """Take quantiles over draws, shape (d, m)."""
         return cls(np.median(draws, 0), *np.quantile(draws, (*CENTRAL, *WIDE), axis=0))
 
@@ -242,12 +242,12 @@ class TuningFit:
 
     @property
     def status(self) -> Status:
-        """Whether a minimum is found: converged, at_limit or unidentified."""
+        """Status of the minimum: converged, at_limit or unidentified."""
         return self.finding.status
 
     @property
     def message(self) -> str:
-        """What is found, and what to do."""
+        """Cause of the status, and what to do."""
         return self.finding.message
 
     @property
@@ -282,7 +282,7 @@ class TuningFit:
             said += [f"Bad readings of size {plane}: rows {rows}."] if rows else []
         return (*self.scan.notes, *said)
 
-    def beam(self, settings: Mapping[str, Any]) -> dict[str, dict[str, Band]]:
+    def beam(self, settings: Mapping[str, Any]) -> dict[str, dict[str, TuningBand]]:
         """Predict the beam at settings of the knobs, with its band.
 
         Parameters
@@ -292,7 +292,7 @@ class TuningFit:
 
         Returns
         -------
-        dict of str to dict of str to Band
+        dict of str to dict of str to TuningBand
             Plane to ``normalized_emittance`` (m), ``beta`` (m) and ``alpha`` at the start of the
             line; "goal" to the first of what is tuned.
         """
@@ -303,9 +303,9 @@ class TuningFit:
             sigma = m.readings.coordinates.sigma(_even(numbers_at(m.posterior, x)))
             emittance = np.sqrt(sigma[..., 0] * sigma[..., 2] - sigma[..., 1] ** 2)
             found[plane] = {
-                "normalized_emittance": Band.of(boost * emittance),
-                "beta": Band.of(sigma[..., 0] / emittance),
-                "alpha": Band.of(-sigma[..., 1] / emittance),
+                "normalized_emittance": TuningBand.of(boost * emittance),
+                "beta": TuningBand.of(sigma[..., 0] / emittance),
+                "alpha": TuningBand.of(-sigma[..., 1] / emittance),
             }
         return found
 
@@ -330,8 +330,8 @@ class TuningFit:
         values = np.broadcast_arrays(*(np.atleast_1d(settings[n]) for n in self.knobs.names))
         return self.knobs.half_ranges(dict(zip(self.knobs.names, values, strict=True)))
 
-    def _goal_band(self, x: np.ndarray) -> Band:
-        return Band.of(self.normalized * np.exp(np.asarray(values_at(self.draws, x))))
+    def _goal_band(self, x: np.ndarray) -> TuningBand:
+        return TuningBand.of(self.normalized * np.exp(np.asarray(values_at(self.draws, x))))
 
     def to_json(self) -> dict[str, Any]:
         """Give the entry of ``results`` of the JSON contract."""

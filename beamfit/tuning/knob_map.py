@@ -22,7 +22,7 @@ DEGREE = {1: 10, 2: 8, 3: 6, 4: 5, 5: 4, 6: 4}
 MEAN = 3.0
 
 
-class Scales(NamedTuple):
+class KnobScales(NamedTuple):
     """Scales of a map: length of each knob in half ranges, amplitude of each number, noise.
 
     ``length`` has shape (knobs,), ``amplitude`` (3,), ``noise`` (); all are positive.
@@ -79,7 +79,7 @@ def features(x: Array, length: Array, orders: np.ndarray) -> Array:
     return jnp.prod(each[orders, np.arange(orders.shape[1])], axis=1)
 
 
-def design(x: Array, scales: Scales, orders: np.ndarray) -> Array:
+def design(x: Array, scales: KnobScales, orders: np.ndarray) -> Array:
     """Derivatives of the three numbers of a beam by the map's coefficients, shape (3, n).
 
     The coefficients are of one prior standard deviation: of each number its mean, then features.

@@ -12,7 +12,7 @@ import numpy as np
 from jax import Array
 from scipy.stats.qmc import Sobol
 
-from beamfit.tuning.knob_map import MEAN, Scales, features, orders_of
+from beamfit.tuning.knob_map import MEAN, KnobScales, features, orders_of
 from beamfit.tuning.posterior import MapPosterior
 
 # Settings among which the search begins, as a power of two, its steps, and its dampings.
@@ -25,13 +25,13 @@ class Emittances(NamedTuple):
 
     Attributes
     ----------
-    scales : tuple of Scales
+    scales : tuple of KnobScales
         One a plane, arrays (d, ...).
     coefficients : tuple of Array
         Shape (d, 1 + features) each: of ln of the emittance alone.
     """
 
-    scales: tuple[Scales, ...]
+    scales: tuple[KnobScales, ...]
     coefficients: tuple[Array, ...]
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from jax import Array
 
 from beamfit.noise.model import LN_2PI
-from beamfit.tuning.knob_map import MEAN, NUMBERS, Scales, design, log_size, orders_of
+from beamfit.tuning.knob_map import MEAN, NUMBERS, KnobScales, design, log_size, orders_of
 
 # Priors of ln of the scales, middle and standard deviation. Lengths of 0.6 to 2.7 half ranges: a
 # range is chosen so that the beam bends once or twice; longer ones would have a weak knob's
@@ -25,7 +25,7 @@ TRIED = np.array([1.0, 0.5, 0.2, 0.05, 0.0])
 SETS, FAR = 64, 1.5
 
 
-class Readings(NamedTuple):
+class KnobReadings(NamedTuple):
     """Sizes of one plane at knob settings, padded; arrays begin with the n rows.
 
     Attributes
@@ -63,7 +63,7 @@ class MapPosterior(NamedTuple):
 
     Attributes
     ----------
-    scales : Scales
+    scales : KnobScales
         Of each draw, arrays (d, ...).
     coefficients : Array
         Shape (d, n): in prior standard deviations, as `design` multiplies them.
@@ -75,7 +75,7 @@ class MapPosterior(NamedTuple):
         Shape (rows,): relative error of the sizes that was found.
     """
 
-    scales: Scales
+    scales: KnobScales
     coefficients: Array
     log_evidence: Array
     log_flat: Array
@@ -85,20 +85,20 @@ class MapPosterior(NamedTuple):
     error: Array
 
 
-def prior_of(data: Readings) -> tuple[Array, Array]:
+def prior_of(data: KnobReadings) -> tuple[Array, Array]:
     """Prior means and deviations of ln of all scales: lengths, amplitudes, noise."""
     own = [LENGTH] * data.x.shape[1] + [EMITTANCE] + [TWISS] * (NUMBERS - 1)
     mean, spread = jnp.array(own).T
     return jnp.append(mean, data.noise[0]), jnp.append(spread, data.noise[1])
 
 
-def scales_of(eta: Array, varies: Array) -> Scales:
+def scales_of(eta: Array, varies: Array) -> KnobScales:
     """Scales from their logarithms; ``varies`` is 1, or 0 for an emittance that is constant."""
     each = jnp.exp(eta)
-    return Scales(each[:-4], each[-4:-1].at[0].multiply(varies), each[-1])
+    return KnobScales(each[:-4], each[-4:-1].at[0].multiply(varies), each[-1])
 
 
-class _State(NamedTuple):
+class _Peak(NamedTuple):
     """Coefficients of the map, ln of its scales, and how good each reading is, from 0 to 1."""
 
     v: Array
@@ -106,24 +106,24 @@ class _State(NamedTuple):
     good: Array
 
 
-def _variance(data: Readings, noise: Array, good: Array) -> Array:
+def _variance(data: KnobReadings, noise: Array, good: Array) -> Array:
     """Variance of ln of the sizes; of padding 1."""
     own = data.floor**2 + (noise * data.unit) ** 2
     return jnp.where(data.there > 0, own / good, 1.0)
 
 
-def _numbers_at(data: Readings, scales: Scales, orders: np.ndarray) -> Array:
+def _numbers_at(data: KnobReadings, scales: KnobScales, orders: np.ndarray) -> Array:
     """Derivatives of every row's numbers by the coefficients, shape (n, 3, coefficients)."""
     return jax.vmap(lambda x: design(x, scales, orders))(data.x)
 
 
-def _slopes(data: Readings, u: Array) -> tuple[Array, Array]:
+def _slopes(data: KnobReadings, u: Array) -> tuple[Array, Array]:
     """Predicted ln sizes and their derivatives by the rows' numbers."""
     both = jax.vmap(jax.value_and_grad(log_size))(u, data.w, data.known)
     return both[0], both[1] * data.there[:, None]
 
 
-def _settled(data: Readings, state: _State, varies: Array, orders: np.ndarray) -> Array:
+def _settled(data: KnobReadings, state: _Peak, varies: Array, orders: np.ndarray) -> Array:
     """Coefficients that fit best at given scales: Gauss-Newton with the best of a few steps."""
     scales = scales_of(state.eta, varies)
     every = _numbers_at(data, scales, orders)
@@ -148,14 +148,14 @@ def _settled(data: Readings, state: _State, varies: Array, orders: np.ndarray) -
 class _Linear(NamedTuple):
     """Readings that are linear about the numbers of the rows: how good each is, and a constant."""
 
-    data: Readings
+    data: KnobReadings
     off: Array
     slope: Array
     good: Array
     varies: Array
 
 
-def _linear(data: Readings, u: Array, good: Array, varies: Array) -> _Linear:
+def _linear(data: KnobReadings, u: Array, good: Array, varies: Array) -> _Linear:
     """The readings, linear about the numbers ``u`` of the rows, shape (n, 3)."""
     model, slope = _slopes(data, u)
     off = data.there * (data.y - model) + jnp.sum(slope * u, axis=1)
@@ -201,8 +201,8 @@ def _scoring(eta: Array, by: _Linear, orders: np.ndarray) -> tuple[Array, Array]
 
 
 def _fitted(
-    data: Readings, start: Array, varies: Array, orders: np.ndarray
-) -> tuple[_State, _Linear, Array, Array]:
+    data: KnobReadings, start: Array, varies: Array, orders: np.ndarray
+) -> tuple[_Peak, _Linear, Array, Array]:
     """The best map and scales, readings about it, log evidence, root of the scales' covariance."""
     mean, spread = prior_of(data)
 
@@ -214,7 +214,7 @@ def _fitted(
         found = jax.vmap(lambda each: _log_evidence(each, by, orders))(tried)
         return tried[jnp.argmax(jnp.nan_to_num(found, nan=-jnp.inf))]
 
-    def settled(state: _State) -> tuple[_State, _Linear]:
+    def settled(state: _Peak) -> tuple[_Peak, _Linear]:
         v = _settled(data, state, varies, orders)
         scales = scales_of(state.eta, varies)
         u = _numbers_at(data, scales, orders) @ v
@@ -223,21 +223,21 @@ def _fitted(
         doubt = jnp.exp(jnp.minimum(0.5 * pull * (1.0 - narrower), 500.0))
         doubt = doubt * data.odds / data.wide
         good = jnp.where(data.there > 0, (1.0 + doubt * narrower) / (1.0 + doubt), 1.0)
-        return _State(v, state.eta, good), _linear(data, u, good, varies)
+        return _Peak(v, state.eta, good), _linear(data, u, good, varies)
 
-    def round_of(state: _State, _: None) -> tuple[_State, None]:
+    def round_of(state: _Peak, _: None) -> tuple[_Peak, None]:
         state, by = settled(state)
         eta = jax.lax.fori_loop(0, NEWTON, lambda _, e: newton(e, by), state.eta)
         return state._replace(eta=eta), None
 
-    state = _State(start, mean, jnp.ones(len(data.y)))
+    state = _Peak(start, mean, jnp.ones(len(data.y)))
     state, by = settled(jax.lax.scan(round_of, state, length=ROUNDS)[0])
     root = jnp.linalg.cholesky(jnp.linalg.inv(_scoring(state.eta, by, orders)[1]))
     whole = _log_evidence(state.eta, by, orders) + 0.5 * len(mean) * LN_2PI
     return state, by, whole + jnp.sum(jnp.log(jnp.diag(root))), root
 
 
-def _draw(key: Array, data: Readings, state: _State, orders: np.ndarray) -> Array:
+def _draw(key: Array, data: KnobReadings, state: _Peak, orders: np.ndarray) -> Array:
     """A draw of the map at given scales: a prior draw, corrected by the readings.
 
     J. T. Wilson et al., Pathwise conditioning of Gaussian processes, J. Mach. Learn. Res. 22 (2021)
@@ -256,13 +256,13 @@ def _draw(key: Array, data: Readings, state: _State, orders: np.ndarray) -> Arra
 
 @partial(jax.jit, static_argnames=("knobs", "draws"))
 def map_posterior(
-    data: Readings, start: Array, seed: Array, knobs: int, draws: int
+    data: KnobReadings, start: Array, seed: Array, knobs: int, draws: int
 ) -> MapPosterior:
     """Draw maps of a plane's beam from their posterior.
 
     Parameters
     ----------
-    data : Readings
+    data : KnobReadings
         The sizes.
     start : Array
         Shape (3,): numbers of a beam to begin with, the same at all knobs.
@@ -292,7 +292,7 @@ def map_posterior(
     chosen = jnp.minimum(jnp.searchsorted(jnp.cumsum(weight), at), SETS - 1)
     settled = jax.vmap(lambda e: _settled(data, state._replace(eta=e), one, orders))(eta)
     coefficients = jax.vmap(
-        lambda key, i: _draw(key, data, _State(settled[i], eta[i], state.good), orders)
+        lambda key, i: _draw(key, data, _Peak(settled[i], eta[i], state.good), orders)
     )(jax.random.split(of_draws, draws), chosen)
     error = jnp.sqrt(_variance(data, jnp.exp(state.eta[-1]), 1.0))
     u = _numbers_at(data, scales_of(state.eta, one), orders) @ state.v
@@ -308,7 +308,7 @@ def numbers_at(posterior: MapPosterior, x: np.ndarray) -> Array:
     """ln ε, ln β, α of every draw at settings, shape (m, knobs) to (d, m, 3), in coordinates."""
     orders = orders_of(x.shape[-1])
 
-    def one(scales: Scales, v: Array) -> Array:
+    def one(scales: KnobScales, v: Array) -> Array:
         return jax.vmap(lambda at: design(at, scales, orders) @ v)(jnp.asarray(x))
 
     return jax.vmap(one)(posterior.scales, posterior.coefficients)

@@ -19,7 +19,7 @@ from beamfit.noise.model import Noise
 from beamfit.noise.sizes import kinds_of
 from beamfit.optics.beamline import Beamline
 from beamfit.tuning.knobs import Knobs
-from beamfit.tuning.posterior import Readings
+from beamfit.tuning.posterior import KnobReadings
 
 # A beam to begin with where no constant one fits: ln of its emittance in the coordinates.
 BEGIN = np.array([-1.0, 0.0, 0.0])
@@ -35,7 +35,7 @@ def seen_without(scan: QuadScan, line: Beamline | None, knobs: Knobs, noise: Noi
 class PlaneReadings(NamedTuple):
     """Readings of a plane, the coordinates they are in, and a beam to begin with, shape (3,)."""
 
-    readings: Readings
+    readings: KnobReadings
     coordinates: Coordinates
     start: np.ndarray
 
@@ -72,7 +72,7 @@ def plane_readings(
         return np.pad(values, more, constant_values=fill)
 
     bad = seen.noise.of_points(n).bad
-    readings = Readings(
+    readings = KnobReadings(
         filled(x), filled(c.w), filled(c.known, 1.0), filled(np.log(c.size)), filled(floor, 1.0),
         filled(unit), filled(np.ones(n)), noise, np.float64(bad / (1.0 - bad)),
         np.float64(seen.noise.width),

@@ -30,7 +30,9 @@ def data():
     y = np.log(size) + 0.04 * RNG.normal(size=COUNT)
     floor, one = np.full(COUNT, 0.01), np.ones(COUNT)
     noise = np.array([np.log(0.05), 0.7])
-    return of.Readings(X, W, 0.0 * one, y, floor, one, one, noise, np.float64(0.03), np.float64(12))
+    return of.KnobReadings(
+        X, W, 0.0 * one, y, floor, one, one, noise, np.float64(0.03), np.float64(12)
+    )
 
 
 @pytest.fixture(scope="module")
@@ -98,7 +100,7 @@ def test_slope_and_curvature_of_the_evidence_are_its_differences(data):
 def test_draws_have_the_mean_and_spread_of_gaussian_regression(data):
     """Rasmussen and Williams, eq. 2.25 and 2.26, the readings linear about the best map."""
     orders, eta, one = orders_of(2), scales_at(), jnp.ones(())
-    state = of._State(jnp.zeros(3 * (1 + len(orders))), jnp.asarray(eta), jnp.ones(COUNT))
+    state = of._Peak(jnp.zeros(3 * (1 + len(orders))), jnp.asarray(eta), jnp.ones(COUNT))
     for _ in range(4):
         state = state._replace(v=of._settled(data, state, one, orders))
     scales = of.scales_of(jnp.asarray(eta), one)
@@ -117,7 +119,7 @@ def test_draws_have_the_mean_and_spread_of_gaussian_regression(data):
 def test_padding_changes_nothing(data, found):
     pad = [np.pad(v, [(0, 8)] + [(0, 0)] * (v.ndim - 1)) for v in data[:7]]
     known, floor = (np.pad(v, (0, 8), constant_values=1.0) for v in (data.known, data.floor))
-    longer = of.Readings(*pad, *data[7:])._replace(known=known, floor=floor)
+    longer = of.KnobReadings(*pad, *data[7:])._replace(known=known, floor=floor)
     other = of.map_posterior(longer, np.array([-1.0, 0.0, 0.0]), 1, KNOBS, 256)
     assert float(other.log_evidence) == pytest.approx(float(found.log_evidence), abs=1e-4)
     assert np.allclose(other.model[:COUNT], found.model, atol=1e-4)
