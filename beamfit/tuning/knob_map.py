@@ -13,6 +13,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from beamfit.compile_cache import prepare_jax
+
+prepare_jax()
+
 # Numbers of a beam: ln of the emittance, ln of beta, alpha, in coordinates even to the scan.
 NUMBERS = 3
 # Highest total degree of the features by the number of knobs: beyond it their prior variance is
