@@ -93,8 +93,8 @@ def test_design_as_json_and_on_the_terminal(run):
         (("--energies", "25,0.1"), "rest energy of 0.510999 MeV"),
         (("--energies", "1e9"), "10 TeV"),
         (("--energies", "nan"), "rest energy"),
-        (("--vary", "Q2"), "MAGNET="),
-        (("--vary", "Q2=0:10%"), "MAGNET="),
+        (("--vary", "Q2"), "NAME="),
+        (("--vary", "Q2=0:10%"), "NAME="),
         (("--vary", "Q9=0:10"), "lattices/gtf.toml: --vary Q9: no magnet"),
     ],
 )

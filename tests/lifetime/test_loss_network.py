@@ -3,7 +3,6 @@
 import contextlib
 import io
 import re
-import textwrap
 
 import jax
 import numpy as np
@@ -186,13 +185,12 @@ def test_the_design_questions_of_the_docs_are_answered_and_true(root, machine, m
     """docs/lifetime_study.md: its code gives its numbers, and the truth is where they say."""
     page = (root / "docs/lifetime_study.md").read_text()
     part = page.partition("## Two design questions")[2].partition("A worked study")[0]
-    blocks = re.findall(r"(?:^    .*\n|^\n(?=    ))+", part, flags=re.MULTILINE)
+    blocks = re.findall(r"```python\n(.*?)```", part, re.DOTALL)
     shown, names = io.StringIO(), {}
     monkeypatch.chdir(root)
     with contextlib.redirect_stdout(shown):
         for block in blocks:
-            code = block.partition("\n\n    475 mA,")[0]
-            exec(textwrap.dedent(code.partition("\n\n    gap 5.5")[0]), names)
+            exec(block, names)
     said = [line.strip() for line in part.splitlines() if re.match(r"    (475|700|gap) ", line)]
     told = shown.getvalue().splitlines()
     assert len(told) == len(said) == 8
