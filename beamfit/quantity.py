@@ -147,6 +147,21 @@ class Quantity:
         """Error over value, or None."""
         return None if self.error is None or self.value == 0 else self.error / abs(self.value)
 
+    @property
+    def interval_words(self) -> str | None:
+        """The interval of 95 % in the unit that the value is written in; None without one.
+
+        Examples
+        --------
+        >>> Quantity(7e-7, 1e-8, "m", None, (6.8e-7, 7.2e-7)).interval_words
+        '0.68 to 0.72 µm'
+        """
+        if self.interval_95 is None:
+            return None
+        factor, unit = self._prefix()
+        low, high = (end / factor for end in self.interval_95)
+        return f"{low:.4g} to {high:.4g} {unit}".rstrip()
+
     def to_json(self) -> dict[str, float | str | list[float] | None]:
         """Give the object of the JSON contract; numbers that are not finite are null."""
         fields = {"value": self.value, "error": self.error, "error_raw": self.error_raw}

@@ -89,7 +89,8 @@ def batch(
         from beamfit.io.priors import write_noise
 
         write_noise(learned, job.learned_noise(found.files))
-    courses = courses_of(found, quantity)
+    # The table is read again only where somebody looks at it.
+    courses = [] if as_json and report is None else courses_of(found, quantity)
     if report is not None:
         from beamfit.report.batch import write_batch_report
 

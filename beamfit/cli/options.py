@@ -235,6 +235,12 @@ SHARED: dict[str, Callable[..., Any]] = {
     "delay": option("--delay SAMPLES", "Known delay; default: fitted.", type=click.IntRange(0)),
     "no-offset": option("--no-offset", "The output at rest is 0, and not estimated.", is_flag=True),
     "goal": option("--goal PERCENT", "Emittance error to stop at.", callback=_parsed(goal_of)),
+    "close": option(
+        "--close PERCENT",
+        "Stop when the best setting is this close to the minimum with 95 % probability.",
+        callback=_parsed(goal_of),
+        default="5%",
+    ),
     "report": option(
         "--report FILE.html|.pdf|.png|.svg",
         "Write a report page, or (.png, .svg) its pictures one by one.",

@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from beamfit.cli.option_text import goal_of
 from beamfit.cli.options import Command, answered, option, options, reported
 from beamfit.errors import InputError
 from beamfit.io.line import build_line, lattice_of
@@ -31,13 +30,7 @@ Examples:
 @options("columns ignore skip-bad maybe-lattice use from to screen energy particle vary")
 @option("--goal", "What is to be low; emittance is the mean of x and y.", choices=GOALS,
         default=GOALS[0])  # fmt: skip
-@option(
-    "--close PERCENT",
-    "Stop when the best setting is this close to the minimum with 95 % probability.",
-    callback=lambda context, parameter, value: goal_of(value),
-    default="5%",
-)
-@options("noise seed report json")
+@options("close noise seed report json")
 def tune(
     table: str,
     limits: dict[str, tuple[float, float]],

@@ -21,14 +21,14 @@ if TYPE_CHECKING:
 
 
 def in_words(settings: Mapping[str, float], units: Mapping[str, str], digits: int = 4) -> str:
-    """Write settings of magnets with their units.
+    """Write settings of magnets or knobs with their units; "" where a name says it.
 
     Examples
     --------
     >>> in_words({"Q1": 1.5, "Q2": -2.0}, {"Q1": "A", "Q2": "kG"})
     'Q1 = 1.5 A, Q2 = -2 kG'
     """
-    return ", ".join(f"{n} = {v:.{digits}g} {units[n]}" for n, v in settings.items())
+    return ", ".join(f"{n} = {v:.{digits}g} {units[n]}".rstrip() for n, v in settings.items())
 
 
 @shown

@@ -473,15 +473,16 @@ def _trimmed(about: Expansion) -> tuple[Expansion, list[str]]:
 
 def cleaned(cycles: Pieces) -> tuple[Expansion, tuple[str, ...]]:
     """The fit without readings, edges of cycles and cycles that are not of the decay."""
-    trimmed, said = _trimmed(with_course(solved(cycles)))
-    about, before = solved(trimmed.pieces), trimmed.pieces
-    cut = np.repeat(_odd_cycles(about), before.lengths)
+    plain = solved(cycles)
+    about, said = _trimmed(with_course(plain))
+    before = about.pieces
+    plain = plain if before is cycles else solved(before)
+    cut = np.repeat(_odd_cycles(plain), before.lengths)
     if cut.any():
-        about = solved(before.kept(~cut, FEWEST_READINGS))
+        about = with_course(solved(before.kept(~cut, FEWEST_READINGS)))
         left = before.first.size - about.pieces.first.size
         were = "cycle was" if left == 1 else "cycles were"
         said.append(f"{left} {were} left out, whose loss rate lies far off the others'")
-    about = with_course(about)
     if (lone := _far(about.left[:, -1])).any():
         said.append(f"{int(lone.sum())} readings were left out as outliers")
         about = with_course(solved(about.pieces.kept(~lone, FEWEST_READINGS)))

@@ -61,13 +61,6 @@ def _noise(decay: Decay) -> str:
     return "inferred from the residuals" if decay.fit.noise_inferred else "as given"
 
 
-def _interval(found: Quantity) -> str | None:
-    if found.interval_95 is None:
-        return None
-    low, high = found.interval_95
-    return f"{low:.4g} to {high:.4g} {found.unit}"
-
-
 STATUS = DecayRow("status", lambda d: d.fit.status)
 READINGS = DecayRow("readings", lambda d: f"{len(d.segment)} over {_span(d.segment.span)}")
 START = DecayRow("current at the start", lambda d: d.fit.i0, quoted=True)
@@ -75,7 +68,7 @@ MEAN = DecayRow("lifetime at the mean current", lambda d: d.fit.lifetime_mean, q
 A, B = (DecayRow(name, lambda d, name=name: getattr(d.fit, name), quoted=True) for name in "ab")
 INTERVALS = tuple(
     DecayRow(
-        f"95 % interval of {row.label}", lambda d, row=row: _interval(row.value(d)), quoted=True
+        f"95 % interval of {row.label}", lambda d, row=row: row.value(d).interval_words, quoted=True
     )
     for row in (A, B)
 )

@@ -24,7 +24,7 @@ from beamfit.optics.particle import beta_gamma
 from beamfit.quantity import Quantity, percent
 from beamfit.status import Status
 from beamfit.table import Table, cell, json_of
-from beamfit.tuning.knobs import Knobs, knobs_of, planes_of
+from beamfit.tuning.knobs import GOALS, Knobs, knobs_of, planes_of
 from beamfit.tuning.minimum import Emittances, Minima, emittances_of, minima_of, values_at
 from beamfit.tuning.next_row import NextRow, PlaneMap, next_row
 from beamfit.tuning.posterior import map_posterior, numbers_at
@@ -199,16 +199,19 @@ class TuningFit:
         return _quantity(self.normalized * np.exp(self.minima.value), None, "m")
 
     @cached_property
+    def _at_best(self) -> np.ndarray:
+        """Value of every draw at the best setting, shape (d,)."""
+        return np.asarray(values_at(self.draws, self.minima.best[None]))[:, 0]
+
+    @cached_property
     def emittance(self) -> Quantity:
         """The normalised emittance at the best setting, m."""
-        here = np.asarray(values_at(self.draws, self.minima.best[None]))[:, 0]
-        return _quantity(self.normalized * np.exp(here), None, "m")
+        return _quantity(self.normalized * np.exp(self._at_best), None, "m")
 
     @cached_property
     def excess(self) -> np.ndarray:
         """Emittance at the best setting over the minimum, less one, of every draw, shape (d,)."""
-        here = np.asarray(values_at(self.draws, self.minima.best[None]))[:, 0]
-        return np.expm1(np.maximum(here - self.minima.value, 0.0))
+        return np.expm1(np.maximum(self._at_best - self.minima.value, 0.0))
 
     @property
     def normalized(self) -> float:
@@ -253,17 +256,14 @@ class TuningFit:
     @property
     def headline(self) -> str:
         """The best setting and the emittance there, in a line."""
-        best = in_words(self.settings, self.units).strip()
+        best = in_words(self.settings, self.units)
         return f"{cell(self.status)}: {self._goal} {self.emittance} at {best}"
 
     @property
     def _goal(self) -> str:
-        plane = self.goal[-2:].removeprefix("_")
-        return (
-            f"normalised emittance {plane}".rstrip()
-            if len(plane) == 1
-            else ("mean normalised emittance" if len(self.maps) > 1 else "normalised emittance")
-        )
+        if self.goal != GOALS[0]:
+            return f"normalised emittance {self.goal[-1]}"
+        return "mean normalised emittance" if len(self.maps) > 1 else "normalised emittance"
 
     @property
     def units(self) -> dict[str, str]:
@@ -320,7 +320,7 @@ class TuningFit:
         if self.next is None:
             return ""
         units = self.units | setting_units(self.seen.scanned, self.seen.scan.settings)
-        words = in_words(self.next.settings, units, 5).replace(" ,", ",").strip()
+        words = in_words(self.next.settings, units, 5)
         return f"Measure next at {words}: this row tells most about the minimum."
 
     def _half_ranges(self, settings: Mapping[str, Any]) -> np.ndarray:
@@ -356,11 +356,12 @@ class TuningFit:
     def tables(self) -> tuple[Table, ...]:
         """Lay out the best setting, the emittance there, and how sure both are."""
         rows = [
-            [name, cell(q), _ends(q), percent(self.edge[name])] for name, q in self.place.items()
+            [name, cell(q), q.interval_words, percent(self.edge[name])]
+            for name, q in self.place.items()
         ]
         rows += [
-            [f"{self._goal} there", cell(self.emittance), _ends(self.emittance), ""],
-            ["lowest between the limits", cell(self.minimum), _ends(self.minimum), ""],
+            [f"{self._goal} there", cell(self.emittance), self.emittance.interval_words, ""],
+            ["lowest between the limits", cell(self.minimum), self.minimum.interval_words, ""],
         ]
         head = ["", "value", "95 % interval", "at a limit"]
         return (Table(f"Best setting, from {len(self.scan)} rows", head, rows),)
@@ -383,13 +384,6 @@ def course_of(fit: TuningFit, points: int = POINTS) -> list[tuple[int, Quantity]
             own = fit_tuning(part, fit.seen.line, limits, goal=fit.goal, noise=fit.seen.noise)
             found.append((int(count), own.emittance))
     return [*found, (len(scan), fit.emittance)]
-
-
-def _ends(q: Quantity) -> str:
-    """The ends of an interval in the unit that the value is written in."""
-    factor, unit = q._prefix()
-    low, high = (end / factor for end in q.interval_95)
-    return f"{low:.4g} to {high:.4g} {unit}".rstrip()
 
 
 def _quantity(draws: np.ndarray, value: float | None, unit: str) -> Quantity:

@@ -69,8 +69,8 @@ class MapPosterior(NamedTuple):
         Shape (d, n): in prior standard deviations, as `design` multiplies them.
     log_evidence, log_flat : Array
         Of a map, and of one whose emittance is the same at all knobs.
-    pull, bad, model : Array
-        Shape (rows,): residual over its error, probability of a bad reading, fitted ln size.
+    bad, model : Array
+        Shape (rows,): probability of a bad reading, fitted ln size.
     error : Array
         Shape (rows,): relative error of the sizes that was found.
     """
@@ -79,7 +79,6 @@ class MapPosterior(NamedTuple):
     coefficients: Array
     log_evidence: Array
     log_flat: Array
-    pull: Array
     bad: Array
     model: Array
     error: Array
@@ -299,8 +298,7 @@ def map_posterior(
     model = _slopes(data, u)[0]
     scales = jax.vmap(lambda e: scales_of(e, one))(eta[chosen])
     bad = 1.0 - (state.good - data.wide**-2) / (1.0 - data.wide**-2)
-    pull = (data.y - model) / error
-    return MapPosterior(scales, coefficients, log_evidence, log_flat, pull, bad, model, error)
+    return MapPosterior(scales, coefficients, log_evidence, log_flat, bad, model, error)
 
 
 @jax.jit
