@@ -100,7 +100,7 @@ def draw_map(figure: FigureBase, fit: TuningFit, i: int, j: int) -> None:
         figure.colorbar(drawn, ax=axes)
         axes.plot(fit.scan.settings[names[i]], fit.scan.settings[names[j]], "w.", ms=4, mec="0.3")
         best = [fit.place[names[k]] for k in (i, j)]
-        axes.errorbar(*([q.value] for q in best), *([q.error] for q in best[::-1]), fmt="*",
+        axes.errorbar(*([q.value] for q in best), *([q.std_dev] for q in best[::-1]), fmt="*",
                       color=RED, ms=10)  # fmt: skip
         axes.set(xlabel=names[i], ylabel=names[j], xlim=(low[i], high[i]), ylim=(low[j], high[j]))
         axes.set_title(title)
@@ -131,7 +131,9 @@ def draw_course(figure: FigureBase, fit: TuningFit) -> None:
     """
     axes, course = figure.subplots(), course_of(fit)
     rows = [count for count, _ in course]
-    value, error = (np.array([1e6 * getattr(q, n) for _, q in course]) for n in ("value", "error"))
+    value, error = (
+        np.array([1e6 * getattr(q, n) for _, q in course]) for n in ("value", "std_dev")
+    )
     axes.errorbar(rows, value, error, fmt="o-", color=BLUE, ms=4, capsize=3, lw=1.0)
     axes.axhline(1e6 * fit.minimum.value, color="0.5", lw=1.0, ls="--")
     axes.set(xlabel="rows", ylabel="normalised emittance\nat the best setting, µm")

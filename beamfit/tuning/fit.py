@@ -180,13 +180,22 @@ class TuningFit:
 
     @cached_property
     def place(self) -> dict[str, Quantity]:
-        """Setting of each knob at which the emittance is lowest, with errors."""
+        """Setting of each knob at which the emittance is lowest, with errors.
+
+        A place that may be anywhere between the limits has no error.
+        """
         every = self.knobs.settings(self.minima.place)
         best = self.knobs.settings(self.minima.best)
-        return {
-            name: _quantity(every[:, i], best[i], unit or "1")
-            for i, (name, unit) in enumerate(self.units.items())
-        }
+        found = {}
+        for i, (name, unit) in enumerate(self.units.items()):
+            q = self._told(_quantity(every[:, i], best[i], unit or "1"))
+            ends = np.abs(np.quantile(self.minima.place[:, i], WIDE))
+            found[name] = replace(q, error=None) if ends.min() >= 1.0 - EDGE else q
+        return found
+
+    def _told(self, q: Quantity) -> Quantity:
+        """A quantity of the map; nothing is known of it where a map is not told from one beam."""
+        return q if self.flat <= TOLD else q.open()
 
     @property
     def settings(self) -> dict[str, float]:
@@ -196,7 +205,7 @@ class TuningFit:
     @cached_property
     def minimum(self) -> Quantity:
         """The lowest normalised emittance between the limits, m."""
-        return _quantity(self.normalized * np.exp(self.minima.value), None, "m")
+        return self._told(_quantity(self.normalized * np.exp(self.minima.value), None, "m"))
 
     @cached_property
     def _at_best(self) -> np.ndarray:
@@ -206,7 +215,7 @@ class TuningFit:
     @cached_property
     def emittance(self) -> Quantity:
         """The normalised emittance at the best setting, m."""
-        return _quantity(self.normalized * np.exp(self._at_best), None, "m")
+        return self._told(_quantity(self.normalized * np.exp(self._at_best), None, "m"))
 
     @cached_property
     def excess(self) -> np.ndarray:
@@ -356,12 +365,17 @@ class TuningFit:
     def tables(self) -> tuple[Table, ...]:
         """Lay out the best setting, the emittance there, and how sure both are."""
         rows = [
-            [name, cell(q), q.interval_words, percent(self.edge[name])]
+            [name, cell(q), cell(q.interval_words), percent(self.edge[name])]
             for name, q in self.place.items()
         ]
         rows += [
-            [f"{self._goal} there", cell(self.emittance), self.emittance.interval_words, ""],
-            ["lowest between the limits", cell(self.minimum), self.minimum.interval_words, ""],
+            [f"{self._goal} there", cell(self.emittance), cell(self.emittance.interval_words), ""],
+            [
+                "lowest between the limits",
+                cell(self.minimum),
+                cell(self.minimum.interval_words),
+                "",
+            ],
         ]
         head = ["", "value", "95 % interval", "at a limit"]
         return (Table(f"Best setting, from {len(self.scan)} rows", head, rows),)
