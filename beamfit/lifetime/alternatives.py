@@ -1,14 +1,15 @@
 """Alternatives to constant a and b of a decay, compared by evidence.
 
 A bunch that lengthens, a gas that is pumped away after a fill, a loss rate that changes once or
-twice: each is the one law with further numbers, under the same noises, with stated priors.
+twice, current lost at once: each is the one law with further numbers, under the same noises, with
+stated priors.
 """
 
 from __future__ import annotations
 
 import itertools
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import jax
@@ -54,8 +55,10 @@ FINER = 3
 # Two changes within so many readings are a step.
 STEP = 3.0
 # Prior probabilities: constant a and b, a power of a, a drift of b beside, one change, two, gas
-# that relaxes; and between which shares of the loss a further one lies, flat in its logarithm.
-CHANCES = {"": 0.4, "power": 0.2, "drift": 0.2, "step": 0.08, "steps": 0.04, "relaxing": 0.08}
+# that relaxes, current lost at once between two readings, each as likely, once or twice; and
+# between which shares of the loss a further one lies, flat in its logarithm.
+CHANCES = {"": 0.34, "power": 0.2, "drift": 0.2, "step": 0.08, "steps": 0.04, "relaxing": 0.08,
+           "sudden": 0.04, "sudden twice": 0.02}  # fmt: skip
 SIZES = (1e-3, 1.0)
 # An alternative is fitted if in linear approximation its evidence, by noises of so many correlation
 # times, is not below that of constant a and b by more than this: it is good to about 1.
@@ -246,14 +249,34 @@ class Outgassing(NamedTuple):
         )
 
 
+class SuddenLoss(NamedTuple):
+    """Current lost, or gained, between two readings: a decay ends there and another begins.
+
+    Attributes
+    ----------
+    time : float
+        When, s from the first reading.
+    current : Quantity
+        What was lost, mA; below zero of a refill.
+    """
+
+    time: float
+    current: Quantity
+
+    def __str__(self) -> str:
+        kind = "lost" if self.current.value > 0 else "gained"
+        gone = replace(self.current, value=abs(self.current.value))
+        return f"{gone} were {kind} at once near t = {self.time:.4g} s"
+
+
 class Rival(NamedTuple):
-    """A change or relaxing gas that explains a record better than a smooth law, and by how much.
+    """What explains a record better than a smooth law, and by how much.
 
     `odds` is the logarithm of its probability over that of a power of a with a drift of b, and
     `scatter` what it leaves of the readings, mA rms.
     """
 
-    found: Change | Outgassing
+    found: Change | Outgassing | SuddenLoss
     odds: float
     scatter: float
 
@@ -264,7 +287,7 @@ class Rival(NamedTuple):
 
 
 def rival_of(plain: Expansion) -> Rival | None:
-    """The likeliest of a change, two changes and gas that relaxes, if it beats a smooth law.
+    """The likeliest of changes, gas that relaxes and a sudden loss, if it beats a smooth law.
 
     Parameters
     ----------
@@ -291,15 +314,35 @@ def rival_of(plain: Expansion) -> Rival | None:
         return None
     smooth = _smooth(plain)
     fitted = {"step": lambda: _changed(plain, 1), "steps": lambda: _changed(plain, 2),
-              "relaxing": lambda: _relaxing(plain)}  # fmt: skip
+              "relaxing": lambda: _relaxing(plain),
+              "sudden": lambda: _changed(plain, 1, "sudden"),
+              "sudden twice": lambda: _changed(plain, 2, "sudden")}  # fmt: skip
     laws = [(name, fitted[name]()) for name in likely]
     found = [(_log_evidence(law, name), name, law) for name, law in laws if law is not None]
     log, name, best = max(found, key=lambda one: one[0], default=(-math.inf, "", plain))
     if not log > smooth:
         return None
-    answer = _outgassing(best) if name == "relaxing" else _change(best)
+    told = {"relaxing": _outgassing, "sudden": _sudden_loss, "sudden twice": _sudden_loss}
+    answer = told.get(name, _change)(best)
     scatter = float(np.sqrt(np.mean((best.residuals * pieces.over) ** 2)))
     return Rival(answer, log - smooth, scatter)
+
+
+def sudden_loss(record: DecayRecord) -> SuddenLoss | None:
+    """Find current that a single decay lost or gained at once, too little for its noise to show
+    between two readings; None if a smooth law or another alternative is likelier.
+
+    Examples
+    --------
+    >>> time = np.linspace(0.0, 7200.0, 400)
+    >>> beam = 100 * np.exp(-time / 36000) * np.where(time > 3000, 0.995, 1.0)
+    >>> noise = 0.1 * np.random.default_rng(1).normal(size=400)
+    >>> print(sudden_loss(DecayRecord(time, beam + noise)))
+    0.464 ± 0.019 mA were lost at once near t = 3013 s
+    """
+    plain = solved(Pieces.of(record))
+    rival = rival_of(plain) if plain.rested and plain.wanders else None
+    return rival.found if rival is not None and isinstance(rival.found, SuddenLoss) else None
 
 
 def _averaged(pieces: Pieces) -> Pieces:
@@ -316,9 +359,9 @@ def _likely(plain: Expansion) -> list[str]:
     Their evidence is that of losses about the law without, averaged over times and noises.
     """
     columns = plain.rows[:, [LEVEL, *PLAIN]]
-    kinks, gas = further_columns(plain, "step", GRID[::2]), further_columns(
-        plain, "relaxing", np.array(STARTS))  # fmt: skip
-    columns = np.column_stack([columns, plain.residuals, kinks, gas])
+    looked = {"step": GRID[::2], "relaxing": np.array(STARTS), "sudden": GRID}
+    further = [further_columns(plain, kind, times) for kind, times in looked.items()]
+    columns = np.column_stack([columns, plain.residuals, *further])
     products = Products.of(columns, plain.pieces.time, bool(plain.given), COARSE)
     base, across = products.matrix[:, :3, :3], products.matrix[:, :3, 3:]
     left = products.matrix[:, 3:, 3:] - np.swapaxes(across, 1, 2) @ np.linalg.solve(base, across)
@@ -339,11 +382,12 @@ def _likely(plain: Expansion) -> list[str]:
         log = known[:, None] + log - 0.5 * np.linalg.slogdet(pairs)[1]
         return float(logsumexp(log)) - math.log(len(place))
 
-    first, last = np.split(np.arange(1, left.shape[1])[:, None], [kinks.shape[1]])
-    both = np.array(list(itertools.combinations(first[:, 0], 2)))
-    places = {"step": first, "steps": both} | (
-        {"relaxing": last} if plain.pieces.gauge is None else {}
-    )
+    ends = np.cumsum([times.size for times in looked.values()])[:-1]
+    places = dict(zip(looked, np.split(np.arange(1, left.shape[1])[:, None], ends), strict=True))
+    for twice, once in (("steps", "step"), ("sudden twice", "sudden")):
+        places[twice] = np.array(list(itertools.combinations(places[once][:, 0], 2)))
+    if plain.pieces.gauge is not None:
+        del places["relaxing"]
     least_log = log_evidence(np.empty((1, 0), int)) + math.log(CHANCES[""]) + HOPELESS
     return [
         name
@@ -370,9 +414,9 @@ def _smooth(plain: Expansion) -> float:
     return float(logsumexp([_log_evidence(law, name) for law, name in named if law.rested]))
 
 
-def _changed(plain: Expansion, count: int) -> Expansion | None:
-    """The law with changes of the loss rate at the times that explain most, in linear
-    approximation about the law without.
+def _changed(plain: Expansion, count: int, kind: str = "step") -> Expansion | None:
+    """The law with changes of the loss rate, or a sudden loss, at the times that explain most, in
+    linear approximation about the law without.
     """
     basis = np.linalg.qr(plain.left[:, [LEVEL, *PLAIN]])[0]
 
@@ -382,7 +426,7 @@ def _changed(plain: Expansion, count: int) -> Expansion | None:
     residual, windows = beside(plain.residuals), [GRID] * count
     for _ in range(FINER):
         every = np.concatenate(windows)
-        kinks = beside(further_columns(plain, "step", every))
+        kinks = beside(further_columns(plain, kind, every))
         size = np.linalg.norm(kinks, axis=0) + 1e-300
         along, products = kinks.T @ residual / size, kinks.T @ kinks / size / size[:, None]
         place = np.array(list(itertools.product(*np.split(np.arange(every.size), count))))
@@ -394,7 +438,7 @@ def _changed(plain: Expansion, count: int) -> Expansion | None:
     further = np.column_stack([-sizes[best] / size[place[best]], times])
     further = further[np.argsort(times)].ravel()
     free = (*PLAIN, *range(FURTHER, FURTHER + 2 * count, 2))
-    law = solved(plain.pieces, free, "step", start=np.append(plain.numbers, further))
+    law = solved(plain.pieces, free, kind, start=np.append(plain.numbers, further))
     apart = STEP * float(np.median(np.diff(plain.pieces.time))) / plain.pieces.units[0]
     clear = np.all(np.diff([0.0, *law.numbers[4::2], 1.0]) > apart)
     return law if law.rested and clear else None
@@ -427,10 +471,13 @@ def _log_evidence(law: Expansion, name: str) -> float:
     flat = []
     for k in range(0, len(further) * (name != "drift"), 2):
         # A flat prior as a normal one of that density: what is not determined costs nothing.
-        time = 1.0 if name != "relaxing" else further[1] * math.log(LONGEST / TIMES[0])
         extra[FURTHER + k] = _flat(max(abs(further[k]), SIZES[0] * abs(loss)))
+        flat.append(FURTHER + k)
+        if name.startswith("sudden"):
+            continue
+        time = 1.0 if name != "relaxing" else further[1] * math.log(LONGEST / TIMES[0])
         extra[WHEN + k] = time / math.sqrt(2 * math.pi)
-        flat += [FURTHER + k, WHEN + k]
+        flat.append(WHEN + k)
     columns = [LEVEL, *PLAIN, *extra]
     width = np.array([np.inf] * 3 + list(extra.values()))
     known = [0.0 if column in flat else law.numbers[column - 1] for column in extra]
@@ -453,6 +500,9 @@ def _log_evidence(law: Expansion, name: str) -> float:
     finite = np.isfinite(width)
     log = log - 0.5 * np.sum(((centre + step) / width)[:, finite] ** 2, 1)
     chance = math.log(CHANCES[name])
+    if name.startswith("sudden"):
+        # The time of each is an interval between readings, all of them as likely.
+        chance -= len(further) / 2 * math.log(law.pieces.time.size - 1)
     return float(logsumexp(log)) - float(np.log(width[finite]).sum()) + chance
 
 
@@ -485,6 +535,19 @@ def _change(law: Expansion) -> Change:
     for k in reversed(range(len(pairs))):
         told = Change(float(pairs[k][0] * span), *lifetimes[2 * k : 2 * k + 2], told)
     return told
+
+
+def _sudden_loss(law: Expansion) -> SuddenLoss:
+    """What was lost at once, the larger of two, from the law with it."""
+    (span, _), pairs = law.pieces.units, law.numbers[3:].reshape(-1, 2)
+    largest = int(np.argmax(np.abs(pairs[:, 0])))
+    size, when = pairs[largest]
+    at = float(np.interp(when * span, law.pieces.time, law.pieces.current))
+    slopes = np.zeros((1, law.rows.shape[1]))
+    slopes[0, FURTHER + 2 * largest] = at * math.exp(-size)
+    columns = [LEVEL, *PLAIN, *range(FURTHER, slopes.shape[1], 2)]
+    ((value, error),) = _quantities(law, np.array([-at * math.expm1(-size)]), slopes, columns)
+    return SuddenLoss(float(when * span), Quantity(float(value), float(error), "mA"))
 
 
 def _outgassing(law: Expansion) -> Outgassing:

@@ -129,12 +129,15 @@ def cumulative(values: Array) -> Array:
 def course(kind: str, time: Array, when: Array) -> Array:
     """Integral from zero of a further loss of 1.
 
-    One that is "relaxing" within a time, a "step" at a time, or a "drift" about zero in time 1.
+    One that is "relaxing" within a time, a "step" at a time, a "drift" about zero in time 1, or
+    "sudden", all of it at a time.
     """
     if kind == "step":
         return jnp.maximum(time - when, 0.0)
     if kind == "drift":
         return time * (time - 1.0) / 2
+    if kind == "sudden":
+        return jnp.where(time > when, 1.0, 0.0)
     return -when * jnp.expm1(-time / when)
 
 
@@ -156,7 +159,7 @@ def beam_current(
         shape, and k times a further loss and its time.
     at : Moments
         When.
-    kind : {"relaxing", "step", "drift"}, optional
+    kind : {"relaxing", "step", "drift", "sudden"}, optional
         The further losses, as of `course`.
     shape : callable, optional
         Dependence of a on the current over its mean, up to a factor, where it is no power; the rate

@@ -673,5 +673,7 @@ def further_columns(about: Expansion, kind: str, times: np.ndarray) -> np.ndarra
     if kind == "step":
         whole = cumulative_simpson(fading, x=time, axis=0, initial=0.0)
         return -level * np.maximum(whole - np.interp(times, time, whole[:, 0]), 0.0)
+    if kind == "sudden":
+        return -level * np.interp(times, time, fading[:, 0]) * (time[:, None] > times)
     rates = time[:, None] - 0.5 if kind == "drift" else np.exp(-time[:, None] / times)
     return -level * cumulative_simpson(rates * fading, x=time, axis=0, initial=0.0)

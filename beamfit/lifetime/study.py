@@ -12,6 +12,7 @@ import numpy as np
 
 from beamfit.answer import answer
 from beamfit.errors import InputError, expect
+from beamfit.lifetime.alternatives import sudden_loss
 from beamfit.lifetime.bunch import stored_bunch
 from beamfit.lifetime.cycles import (
     FEWEST_CYCLES,
@@ -479,7 +480,27 @@ def _decays(record: DecayRecord) -> tuple[list[DecayRecord], tuple[Event, ...]]:
         expected = f"at least {SHORTEST} readings in a row of a stored beam"
         expected += "; leave out a setting that only scatters with --ignore" if moving else ""
         raise InputError(f"no decay between {kinds}", expected, record.name, column="current")
-    return pieces, split.events
+    cut = [_cut_at_losses(piece) for piece in pieces]
+    lost = tuple(event for _, events in cut for event in events)
+    return [part for parts, _ in cut for part in parts], split.events + lost
+
+
+def _cut_at_losses(piece: DecayRecord) -> tuple[list[DecayRecord], list[Event]]:
+    """Cut a decay where current was lost at once, though single readings do not show it."""
+    looked = thinned(on_edges(piece))
+    loss = sudden_loss(looked)
+    if loss is None:
+        return [piece], []
+    at, apart = looked.time[0] - piece.time[0] + loss.time, float(np.median(np.diff(looked.time)))
+    within = apart * (len(looked) < len(piece))
+    since = piece.time - piece.time[0]
+    halves = [piece.select(rows) for rows in (since < at - within, since > at + within)]
+    if min(map(len, halves)) < SHORTEST:
+        return [piece], []
+    kind = "loss" if loss.current.value > 0 else "refill"
+    parts, events = zip(*map(_cut_at_losses, halves), strict=True)
+    event = Event(kind, piece.start + at, 0.0, -loss.current.value)
+    return [*parts[0], *parts[1]], [*events[0], event, *events[1]]
 
 
 def study_record(

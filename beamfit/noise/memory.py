@@ -15,15 +15,17 @@ from scipy.special import logsumexp
 
 from beamfit.noise.correlated import log_volume, white_beside, whitened
 
-# Prior probabilities of white noise and of noise with one correlation time; 1/f noise has the rest.
-# Readings are white unless something slow moves the monitor, and amplifiers have 1/f noise.
-WHITE, CORRELATED = 0.5, 0.35
-# Correlation times, from this share of the interval between readings to so many records, and the
-# shares of the variance that are white beside: flat in the logarithm of both.
+# Prior probabilities of white noise, of noise with one correlation time, and of a random walk; 1/f
+# noise has the rest. Readings are white unless something slow moves the monitor: amplifiers have
+# 1/f noise, and what a changing temperature adds up in a monitor is a walk.
+WHITE, CORRELATED, WALK = 0.5, 0.25, 0.1
+# Correlation times, from this share of the interval between readings to so many records, flat in
+# the logarithm, and the white noise's variance beside, over what the correlated part gains from one
+# reading to the next: a monitor that walks by a third of its noise a reading has 10.
 SHORTEST, LONGEST, TIMES = 0.5, 3.0, 17
-SHARES = (0.0, 0.5, 0.9, 0.99)
+BESIDE = (0.0, 1.0, 10.0, 100.0, 1000.0)
 # Spectra 1/f^power. P. Dutta and P. M. Horn, Rev. Mod. Phys. 53 (1981) 497: 1/f noise of devices
-# has powers of 0.8 to 1.4; beyond 1 it is as a random walk, which `CORRELATED` has.
+# has powers of 0.8 to 1.4; beyond 1 it is as a random walk.
 POWERS = (0.4, 0.7, 1.0)
 # A verdict on the size of the noise needs correlation times as close as this many.
 CLOSE = 49
@@ -49,13 +51,20 @@ def kinds_of(time: np.ndarray, count: int = TIMES) -> list[MemoryKind]:
     --------
     >>> found = kinds_of(np.arange(100.0))
     >>> len(found), round(sum(kind.chance for kind in found), 9)
-    (72, 1.0)
+    (89, 1.0)
     """
     usual, span = float(np.median(np.diff(time))), float(time[-1] - time[0])
     times = np.geomspace(SHORTEST * usual, LONGEST * span, count)
-    each = CORRELATED / count / len(SHARES)
-    memory = [MemoryKind(each, float(t), white) for t in times for white in SHARES]
-    flicker = (1.0 - WHITE - CORRELATED) / len(POWERS)
+    gain = -np.expm1(-2 * usual / times)
+    shares = np.outer(gain, BESIDE) / (1.0 + np.outer(gain, BESIDE))
+    chance = np.full(count, CORRELATED / count)
+    chance[-1] += WALK  # the longest memory is as a walk of the record
+    memory = [
+        MemoryKind(float(each) / len(BESIDE), float(t), float(white))
+        for t, each, row in zip(times, chance, shares, strict=True)
+        for white in row
+    ]
+    flicker = (1.0 - WHITE - CORRELATED - WALK) / len(POWERS)
     return [MemoryKind(WHITE), *(MemoryKind(flicker, power=power) for power in POWERS), *memory]
 
 
@@ -130,7 +139,7 @@ class Products(NamedTuple):
         >>> rows = np.random.default_rng(1).normal(size=(200, 1))
         >>> found = Products.of(rows, np.arange(200.0), stated=True)
         >>> found.matrix.shape, found.kinds[int(np.argmax(found.log_likelihood()))].white
-        ((72, 1, 1), 1.0)
+        ((89, 1, 1), 1.0)
         """
         kinds = kinds_of(time, times)
         parts = list(_whitened(kinds, columns, time))
