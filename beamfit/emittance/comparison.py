@@ -203,6 +203,54 @@ def _process(
     return averaged(log, scales.log_weight)
 
 
+# Amplitudes of a smooth departure from a beam's sizes, as shares of the size, and the part of the
+# chance of "a smooth curve" that it has: with it one scan in a thousand departs, and one that
+# the noise would hide refuses no good scan.
+DEPARTURES, NEAR = np.array([0.1, 0.2, 0.4]), 1 / 30
+
+
+def departure_odds(x: np.ndarray, u: np.ndarray, c: Coordinates, kind: NoiseKind) -> np.ndarray:
+    """Log odds of a smooth departure beside a beam against a beam alone, shape (...,).
+
+    Parameters
+    ----------
+    x : ndarray
+        Shape (..., 3): T, T p_1, T p_2 of a beam near the best.
+    u, c, kind
+        As for `curve_evidences`.
+
+    Notes
+    -----
+    Both in linear approximation about the beam, whose three numbers are integrated out with a flat
+    prior: D. A. Harville, Biometrika 61 (1974) 383. The departure is a Gaussian process of the
+    setting, as of `curve_evidences`.
+    """
+    n = c.size.shape[-1]
+    if n < 5:
+        return np.full(c.unit.shape, -np.inf)
+    model = _model(x, c)
+    wide = wide_scales(kind, c.unit.shape)
+    root = np.sqrt(variance_of(kind, wide.scale)) * model[..., None, :] ** kind.power
+    rows = c.rows[..., None, :, :] / (2.0 * model)[..., None, :, None] / root[..., None]
+    basis, triangle = np.linalg.qr(rows, mode="complete")
+    left = np.swapaxes(basis[..., 3:], -1, -2)
+    q = (left @ ((c.size - model)[..., None, :] / root)[..., None])[..., 0]
+    known = np.log(root).sum(-1)
+    known = known + np.log(np.abs(np.einsum("...ii->...i", triangle[..., :3, :]))).sum(-1)
+    alone = averaged(-0.5 * np.sum(q**2, axis=-1) - known, wide.log_weight)
+    found = []
+    for length in LENGTHS:
+        shares = model[..., None, :] / root
+        kernel = _bends(u, length)[..., None, :, :] * shares[..., None] * shares[..., None, :]
+        values, vectors = np.linalg.eigh(left @ kernel @ np.swapaxes(left, -1, -2))
+        turned = (np.swapaxes(vectors, -1, -2) @ q[..., None])[..., None, :, 0]
+        grown = 1.0 + DEPARTURES[:, None] ** 2 * np.maximum(values, 0.0)[..., None, :]
+        log = -0.5 * np.sum(turned**2 / grown + np.log(grown), axis=-1) - known[..., None]
+        log = averaged(log, -math.log(len(DEPARTURES)))
+        found.append(averaged(log, wide.log_weight))
+    return np.logaddexp(*found) - math.log(2.0) - alone
+
+
 class PlaneSizes(NamedTuple):
     """The sizes of one plane and how they were seen, arrays of shape (n,).
 
@@ -414,6 +462,9 @@ def _evidences(s: _Stack, i: int, draws: BeamDraws, noise: Noise) -> np.ndarray:
         flat = flat_beam(s.c, kind._replace(power=0, unit=kind.unit * s.c.size), noise)
     jacobian = np.log(s.c.size).sum(-1)
     curves = curve_evidences(s.u, s.c, kind, noise)
+    near = beam + jacobian + departure_odds(draws.best, s.u, s.c, kind)
+    curve = np.logaddexp(curves.curve + math.log1p(-NEAR), near + math.log(NEAR))
+    curves = curves._replace(curve=curve)
     return np.stack([beam + jacobian, flat + jacobian, *curves], -1)
 
 
