@@ -168,7 +168,7 @@ def told(
     """Quantities and curves with errors only where the runs determine them.
 
     No errors: of anything where the inputs explain no more than chance, of the gains of inputs that
-    move together, of time constants compatible with 0.
+    move together, of time constants compatible with 0 or of which a sample leaves nothing.
     """
     nothing = checks.nothing_probability >= POOR_FIT
     physics, inputs = seen.runs[0].physics, seen.inputs
@@ -176,8 +176,12 @@ def told(
     gains = [name for name, (_, gain) in powers if gain]
     joint = {n for k, n in enumerate(gains) if inputs[k % len(inputs)] in checks.together}
 
+    apart = min(float(np.median(np.diff(t))) for t in seen.time)
+
     def is_open(name: str, q: Quantity) -> bool:
-        wide = q.unit == TIME and q.error is not None and q.error > WIDE * abs(q.value)
+        # Readings see what a sample leaves, exp(-apart/tau): its relative error is larger by this.
+        below = 1.0 if name == "delay" else max(1.0, apart / abs(q.value))
+        wide = q.unit == TIME and q.error is not None and q.error * below > WIDE * abs(q.value)
         # A higher order that is a first one determines only its gains and its longer lag.
         more = checks.first_order and not name.startswith(("K", "offset", "tau1", "delay"))
         return nothing or wide or more or name in joint

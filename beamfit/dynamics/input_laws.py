@@ -41,8 +41,8 @@ ODDS = 1.0
 CORRELATION_TIMES, WHITE, MOST = 6, (0.0, 1.0, 10.0, 100.0), 2048
 # Share of what a law hands on that no gain and level give, below which it is none.
 SAME = 1e-6
-# Smallest weight and sum of squares.
-TINY = 1e-300
+# Smallest weight and sum of squares; largest residual, of a step that went astray.
+TINY, VAST = 1e-300, 1e100
 # Prior: a law changes the logarithm of a time constant, or what a damping is made of, by so much.
 FACTOR = 1.0
 # Gauss-Newton rounds of each, and shorter delays that a law may stand for.
@@ -202,7 +202,7 @@ def _rows(
         value, slope = _predicted(core.chosen, core.model, run, theta[:, :-1], u)
         rest = np.asarray(value) + theta[:, -1:] * term - y
         rows = np.concatenate([slope, term[..., None], rest[..., None]], axis=2)
-        parts.append((np.nan_to_num(rows[:, :MOST]) / size, time[:MOST]))
+        parts.append((np.clip(np.nan_to_num(rows[:, :MOST]) / size, -VAST, VAST), time[:MOST]))
     near = _shape(found, seen)
     prior = np.concatenate([np.eye(theta.shape[1])[near] / FACTOR, np.eye(theta.shape[1])[-1:]])
     rest = (theta - np.append(fit.theta, 0.0)) @ prior.T
