@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from beamfit.dynamics.checks import Checks, HeldOutRun
+from beamfit.dynamics.input_laws import LawEvidence
 from beamfit.dynamics.model import PreparedOutput, curves
 from beamfit.dynamics.response import ARX, FIRST_ORDER, SECOND_ORDER, Physics
 from beamfit.greybox.fit import Derived, Fit
@@ -106,11 +107,16 @@ def _late(model: Any, of: tuple[Any, float]) -> jax.Array:
 
 
 def quantities_of(
-    fit: Fit, errors: Memory | None, seen: PreparedOutput, physics: Physics, delay: float
+    fit: Fit,
+    errors: Memory | None,
+    laws: LawEvidence | None,
+    seen: PreparedOutput,
+    physics: Physics,
+    delay: float,
 ) -> dict[str, Quantity]:
     """Constant parameters with errors, and the offset if it is free."""
     m = len(seen.inputs)
-    found = derived(fit, errors, _constants, seen.runs[0])
+    found = derived(fit, errors, _constants, seen.runs[0], laws)
     names, units = list(physics.parameters(seen.inputs)), _units(physics, m)
     if physics is SECOND_ORDER and found.value[1] > 1.0:
         names, units = [*names, "tau1", "tau2"], [*units, TIME, TIME]
@@ -122,20 +128,28 @@ def quantities_of(
     }
     free = {v.name for v in fit.variables}
     if "offset" in free:
-        said["offset"] = quantity(derived(fit, errors, _offset, seen.runs[0]), (), "output")
+        said["offset"] = quantity(derived(fit, errors, _offset, seen.runs[0], laws), (), "output")
     if "late" in free:
         said["delay"] = quantity(derived(fit, errors, _late, (seen.runs[0], delay)), (), TIME)
     return said
 
 
-def derived(fit: Fit, errors: Memory | None, function: Callable, data: Any) -> Derived:
-    """Numbers of a fit, with errors averaged over what is open of a noise with a memory."""
+def derived(
+    fit: Fit,
+    errors: Memory | None,
+    function: Callable,
+    data: Any,
+    laws: LawEvidence | None = None,
+) -> Derived:
+    """Numbers of a fit, with errors averaged over what is open of the noise and of laws."""
     found = fit.derive(function, data)
-    if errors is None:
-        return found
-    slopes = found.slope.reshape(-1, found.slope.shape[-1])
-    known = errors.moments(slopes).error.reshape(found.value.shape)
-    return found._replace(error=np.where(np.isfinite(found.error), known, np.nan))
+    known = found.error
+    if errors is not None:
+        slopes = found.slope.reshape(-1, found.slope.shape[-1])
+        averaged = errors.moments(slopes).error.reshape(found.value.shape)
+        known = np.where(np.isfinite(known), averaged, np.nan)
+    known = known if laws is None else laws.error(found.slope, known)
+    return found._replace(error=known)
 
 
 def quantity(found: Derived, i: Any, unit: str) -> Quantity:
@@ -154,7 +168,7 @@ def told(
     """Quantities and curves with errors only where the runs determine them.
 
     No errors: of anything where the inputs explain no more than chance, of the gains of inputs that
-    move together, of time constants compatible with 0.
+    move together, of time constants compatible with 0 or of which a sample leaves nothing.
     """
     nothing = checks.nothing_probability >= POOR_FIT
     physics, inputs = seen.runs[0].physics, seen.inputs
@@ -162,8 +176,12 @@ def told(
     gains = [name for name, (_, gain) in powers if gain]
     joint = {n for k, n in enumerate(gains) if inputs[k % len(inputs)] in checks.together}
 
+    apart = min(float(np.median(np.diff(t))) for t in seen.time)
+
     def is_open(name: str, q: Quantity) -> bool:
-        wide = q.unit == TIME and q.error is not None and q.error > WIDE * abs(q.value)
+        # Readings see what a sample leaves, exp(-apart/tau): its relative error is larger by this.
+        below = 1.0 if name == "delay" else max(1.0, apart / abs(q.value))
+        wide = q.unit == TIME and q.error is not None and q.error * below > WIDE * abs(q.value)
         # A higher order that is a first one determines only its gains and its longer lag.
         more = checks.first_order and not name.startswith(("K", "offset", "tau1", "delay"))
         return nothing or wide or more or name in joint
@@ -316,6 +334,18 @@ def _fed_back(e: ResponseEvidence) -> Finding | None:
     return Finding(Status.poor_fit, cause, remedy)
 
 
+def _lawful(e: ResponseEvidence) -> Finding | None:
+    c = e.checks
+    if c.law is None or 1.0 - c.law_probability >= POOR_FIT:
+        return None
+    cause = (
+        f"The output follows {c.law} (p = {1.0 - c.law_probability:.1g} without): what moves up "
+        f"and down then differs. The free run explains {c.free_run_percent:.1f} % of the output."
+    )
+    remedy = "Go to each value from the same side, or move by much more than the width."
+    return Finding(Status.poor_fit, cause, remedy)
+
+
 def _refuted(e: ResponseEvidence) -> Finding | None:
     c = e.checks
     if c.input_probability >= POOR_FIT:
@@ -325,10 +355,6 @@ def _refuted(e: ResponseEvidence) -> Finding | None:
         f"the residuals (p = {c.input_probability:.1g}): the model lacks a part of the response. "
         f"The free run explains {c.free_run_percent:.1f} % of the output."
     )
-    if c.law is not None:
-        cause += f" Most of it is {c.law}; what moves up and down then differs."
-        remedy = "Go to each value from the same side, or move by much more than the width."
-        return Finding(Status.poor_fit, cause, remedy)
     more = "parameters that change with the operating point (--map network), or a higher order"
     more = "a higher order" if e.map == "network" else more
     return Finding(Status.poor_fit, cause, f"Try {more}.")
@@ -350,6 +376,8 @@ def _good(e: ResponseEvidence) -> Finding:
     cause = f"The free run explains {e.checks.free_run_percent:.2f} % of the output."
     if e.checks.white_probability < POOR_FIT:
         cause += " The noise has a memory, which the errors contain."
+    if e.checks.law is not None:
+        cause += f" {e.checks.law.capitalize()} is likelier than none, which the errors contain."
     gains = [q for name, q in e.quantities.items() if name.startswith("K")]
     if gains and all(q.error is not None and abs(q.value) < 2 * q.error for q in gains):
         cause += " All gains are compatible with 0: only the return of the output to rest is seen."
@@ -362,4 +390,4 @@ def _good(e: ResponseEvidence) -> Finding:
     return Finding(Status.converged, cause)
 
 
-RULES = (_lost, _nothing, _joint, _fed_back, _lower, _open, _refuted, _worse, _good)
+RULES = (_lost, _nothing, _joint, _lawful, _fed_back, _lower, _open, _refuted, _worse, _good)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -15,7 +14,6 @@ from beamfit.dynamics.model import (
     PreparedOutput,
     changed_by,
     driven,
-    output_of,
     parameters_at,
     predicted,
     steps_of,
@@ -24,7 +22,6 @@ from beamfit.dynamics.record import Run
 from beamfit.dynamics.response import FIRST_ORDER, Physics, simulate
 from beamfit.dynamics.search import driven_by, unit_outputs
 from beamfit.greybox.fit import Fit
-from beamfit.statistics import POOR_FIT
 
 # Most lags of residuals, of earlier inputs, of later inputs, and of the whitening autoregression.
 LAGS, PAST, LATER, ORDER = 20, 10, 5, 8
@@ -33,8 +30,6 @@ SLOW = 5
 # An input is band-limited if its changes have less than the share `FAINT` of their power above the
 # share `HIGH` of the highest frequency; white ones have a tenth there, noise that is fed back too.
 HIGH, FAINT = 0.9, 2e-3
-# Half widths of a play, a stop or a dead zone that are looked for, as shares of an input's range.
-WIDTHS = (0.02, 0.05, 0.1, 0.2)
 # Share of an input's variance, independent of other inputs, below which its gain is not separable.
 ALONE = 1e-3
 
@@ -66,8 +61,9 @@ class Checks(NamedTuple):
     first_order : bool
         Whether a first order does as well.
     law : str or None
-        What explains most of the residuals where a play, a stop or a dead zone of an input does
-        more than chance and than the other paths: its name, input and half width.
+        The law of an input that is likelier than none: its name, input and half width.
+    law_probability : float
+        Its probability, where no law and laws of inputs are all that can be.
     band_limited : tuple of str
         Inputs without high frequencies, which move between samples; that goes with later inputs.
     """
@@ -84,6 +80,7 @@ class Checks(NamedTuple):
     together: tuple[str, ...] = ()
     first_order: bool = False
     law: str | None = None
+    law_probability: float = 0.0
     band_limited: tuple[str, ...] = ()
 
     def rows(self) -> list[list[str]]:
@@ -135,10 +132,10 @@ def checks_of(
     y = np.concatenate([m - m.mean() for m in seen.measured])
     rest = np.concatenate(residuals)
     ahead = np.concatenate([_whitened(r, [_share(residuals)]) for r in residuals])
-    (explained, chance), (later, fed), law = _explained(seen, residuals, slopes, delay)
+    (explained, chance), (later, fed) = _explained(seen, residuals, slopes, delay)
     white = _white(residuals)
     if rest.std() <= CLOSE * seen.size_y:  # what is left is rounding, or the network's own detail
-        explained, chance, later, fed, white, law = 0.0, 1.0, 0.0, 1.0, 1.0, None
+        explained, chance, later, fed, white = 0.0, 1.0, 0.0, 1.0, 1.0
     return Checks(
         percent(rest, y),
         percent(ahead, y),
@@ -150,7 +147,6 @@ def checks_of(
         later,
         gain,
         _together(seen),
-        law=law,
         band_limited=_band_limited(seen),
     )
 
@@ -224,76 +220,46 @@ def _explained(
     residuals: tuple[np.ndarray, ...],
     slopes: Sequence[RunSlopes],
     delay: int,
-) -> tuple[tuple[float, float], tuple[float, float], str | None]:
-    """Share of the whitened residuals that a fuller model explains, with its chance, the share of
-    the rest that later inputs explain, and the law of an input that explains most.
+) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Share of the whitened residuals that a fuller model explains, with its chance, and the share
+    of the rest that later inputs explain.
 
     A score test (Lagrange multipliers): columns are inputs before, those within the delay too,
     further paths of first order, and the slopes of the output by parameters that change with the
-    operating point, less what the model's own numbers can do; or one law of an input alone.
+    operating point, less what the model's own numbers can do.
     """
     memory = _memory(residuals)
-    apart = min(float(np.median(np.diff(t))) for t in seen.time)
-    times = np.geomspace(apart, max(float(np.ptp(t)) for t in seen.time) / 4, SLOW)[:, None]
-    paths = driven_by(seen, FIRST_ORDER)
-    own, slow, quick, later, turned, targets = [], [], [], [], [], []
-    for run, path, r, each in zip(seen.runs, paths, residuals, slopes, strict=True):
+    own, quick, later, targets = [], [], [], []
+    for run, r, each in zip(seen.runs, residuals, slopes, strict=True):
         u = seen.scaled(run.u)
         index = np.asarray(run.index)
         past = [u[np.clip(index + k, 0, len(u) - 1)] for k in range(-PAST, delay)]
         after = [u[np.clip(index + delay + k, 0, len(u) - 1)] for k in range(LATER)]
         later.append(np.concatenate(after, axis=1))
-        slow.append(np.asarray(unit_outputs(path, times))[:, : u.shape[1]].reshape(-1, len(r)).T)
         quick.append(np.concatenate([*past, each.changing], axis=1))
         own.append(each.own)
-        turned.append(each.laws)
         targets.append(r)
 
     def white(parts: list[np.ndarray]) -> np.ndarray:
         return np.concatenate([_whitened(part, memory) for part in parts])
 
-    basis = _basis(white(own))
+    slow, basis = slow_paths(seen), _basis(white(own))
     rest = white(targets)
     rest = rest - basis @ (basis.T @ rest)
     few, more = (_tested(rest, basis, white(columns)) for columns in (slow, quick))
-    each = [_tested(rest, basis, column[:, None]) for column in white(turned).T]
-    laws = [(share, len(each) * chance) for share, chance in each]
-    share, chance = min(few, more, *laws, key=lambda each: each[1])
-    lawful = chance < min(few[1], more[1], POOR_FIT / 3)
-    law = law_names(seen)[laws.index((share, chance))] if lawful else None
-    basis = _basis(np.hstack([white(columns) for columns in (own, slow, quick, turned)]))
+    share, chance = min(few, more, key=lambda each: each[1])
+    basis = _basis(np.hstack([white(columns) for columns in (own, slow, quick)]))
     rest = rest - basis @ (basis.T @ rest)
-    return (share, min(3.0 * chance, 1.0)), _tested(rest, basis, white(later)), law
+    return (share, min(2.0 * chance, 1.0)), _tested(rest, basis, white(later))
 
 
-def law_names(seen: PreparedOutput) -> list[str]:
-    """Names of the laws of the inputs, in the order of the columns that `slopes_of` gives them."""
-    widths = WIDTHS * np.ptp(seen.points, axis=0)[:, None]
-    return [
-        f"a {law} of {name} by ±{width:.2g}"
-        for name, own in zip(seen.inputs, widths, strict=True)
-        for law in ("play", "stop", "dead zone")
-        for width in own
-    ]
-
-
-def _lawful(u: np.ndarray, widths: np.ndarray) -> np.ndarray:
-    """One input as a play, a stop and a dead zone hand it on, shape (rows, 3 widths).
-
-    A play follows when its clearance is used up, a stop (Coulomb friction) goes all the way once it
-    moves at all. A dead zone lies about 0, or about the middle of a range without it.
-    """
-    low, high = float(u.min()), float(u.max())
-    middle = 0.0 if low < 0 < high else 0.5 * (low + high)
-    away = (u - middle)[:, None]
-    dead = middle + np.sign(away) * np.maximum(np.abs(away) - widths, 0.0)
-    changes = np.diff(u, prepend=np.nan) != 0
-    play, stop, found = u[0] + 0 * widths, u[0] + 0 * widths, []
-    for now in u[changes]:
-        play = np.clip(play, now - widths, now + widths)
-        stop = np.where(np.abs(now - stop) > widths, now, stop)
-        found.append(np.concatenate([play, stop]))
-    return np.concatenate([np.array(found)[np.cumsum(changes) - 1], dead], axis=1)
+def slow_paths(seen: PreparedOutput) -> list[np.ndarray]:
+    """Outputs of further paths of first order from each input, shape (readings, paths) by run."""
+    apart = min(float(np.median(np.diff(t))) for t in seen.time)
+    times = np.geomspace(apart, max(float(np.ptp(t)) for t in seen.time) / 4, SLOW)[:, None]
+    m, paths = len(seen.inputs), driven_by(seen, FIRST_ORDER)
+    found = [np.asarray(unit_outputs(path, times))[:, :m] for path in paths]
+    return [each.reshape(-1, each.shape[2]).T for each in found]
 
 
 def _tested(rest: np.ndarray, basis: np.ndarray, columns: np.ndarray) -> tuple[float, float]:
@@ -315,29 +281,19 @@ def _basis(columns: np.ndarray, size: np.ndarray | None = None) -> np.ndarray:
 
 
 class RunSlopes(NamedTuple):
-    """Slopes of a run's output by the model's numbers, by parameters that change with the inputs,
-    and its changes by laws of the inputs, shape (readings, 0) where none are looked for.
-    """
+    """Slopes of a run's output by the model's numbers, and by what a fuller model would have."""
 
     own: np.ndarray
     changing: np.ndarray
-    laws: np.ndarray
 
 
 def slopes_of(seen: PreparedOutput, fit: Fit) -> list[RunSlopes]:
     """Slopes of the output by the model's own numbers, and by what fuller models would have."""
-    widths, found = np.multiply.outer(np.ptp(seen.points, axis=0), WIDTHS), []
+    found = []
     for run in seen.runs:
         u = seen.scaled(run.u)
         added = changed_by(fit.model, run, np.concatenate([u, u**2], axis=1))
-        plain, inputs = np.asarray(output_of(fit.model, run)), np.asarray(run.u)
-        changes = []
-        for i, own in enumerate(widths):
-            for other in _lawful(inputs[:, i], own).T:
-                turned = replace(run, u=jnp.asarray(inputs).at[:, i].set(other))
-                changes.append(np.asarray(output_of(fit.model, turned)) - plain)
-        slope = fit.derive(predicted, run).slope
-        found.append(RunSlopes(slope, np.asarray(added), np.stack(changes, axis=1)))
+        found.append(RunSlopes(fit.derive(predicted, run).slope, np.asarray(added)))
     return found
 
 

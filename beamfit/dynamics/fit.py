@@ -21,6 +21,7 @@ from beamfit.dynamics.answer import (
 )
 from beamfit.dynamics.bad_readings import BadReadings, sound
 from beamfit.dynamics.checks import Checks, HeldOutRun, checks_of, predict_held, slopes_of
+from beamfit.dynamics.input_laws import laws_of, shorter
 from beamfit.dynamics.model import PreparedOutput, network_of, output_of
 from beamfit.dynamics.record import Run, check_inputs, checked
 from beamfit.dynamics.response import PHYSICS
@@ -222,7 +223,8 @@ def identify(
     answer = found.plain
     if map == "network":
         answer = _with_network(found, offset, hidden, range(seed, seed + starts))
-    checks, quantities, curves = _known(found, answer, offset, map)
+    delays = shorter(found.delay) if delay is None else [delay]
+    checks, quantities, curves = _known(runs, found, answer, offset, map, delays)
     fit, late = answer.fit, found.delay
     ahead = tuple(predict_held(each, output, fit, physics, late) for each in held)
     evidence = (fit, answer.rests, checks, quantities, curves, ahead, map)
@@ -244,22 +246,31 @@ def _with_network(found: Begun, offset: bool, hidden: int, seeds: range) -> Sett
 
 
 def _known(
-    found: Begun, answer: Settled, offset: bool, map: str
+    runs: tuple[Run, ...], found: Begun, answer: Settled, offset: bool, map: str, delays: Sequence
 ) -> tuple[Checks, dict[str, Quantity], tuple[Curve, ...]]:
     """Tests of the residuals, and what the runs determine of constants or curves."""
     seen, constant = found.seen, map == "constant"
+    slopes = slopes_of(seen, answer.fit)
     checks = checks_of(
         seen,
         tuple(rest for (rest,) in answer.rest),
-        slopes_of(seen, answer.fit),
+        slopes,
         used_by(answer.fit),
         None if constant else found.plain.likelihood - answer.likelihood,
         int(np.ceil(found.delay)) * (1 if found.delay % 1 == 0 else 2),  # in rows
     )
     checks = checks._replace(first_order=constant and is_first_order(found, offset))
-    parts = answer.fit, answer.errors, seen
-    quantities = quantities_of(*parts, seen.runs[0].physics, found.delay) if constant else {}
-    return checks, *told(quantities, () if constant else curves_of(*parts), seen, checks)
+    laws = (
+        laws_of(runs, seen, answer, delays, slopes)
+        if constant and not answer.exact(case_of(seen, offset))
+        else None
+    )
+    if laws is not None and laws.none < 0.5 and laws.fuller < 0.5:
+        checks = checks._replace(law=laws.likeliest, law_probability=1.0 - laws.none)
+    parts = answer.fit, answer.errors
+    physics = seen.runs[0].physics
+    quantities = quantities_of(*parts, laws, seen, physics, found.delay) if constant else {}
+    return checks, *told(quantities, () if constant else curves_of(*parts, seen), seen, checks)
 
 
 def _output(run: Run, output: str | None) -> str:

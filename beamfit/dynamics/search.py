@@ -350,6 +350,10 @@ class Settled(NamedTuple):
         known = np.column_stack([self.fit.dense_jacobian[size:], prior])
         return noise_of(rows, [time[:most] for _, time, _ in rest], known, noise)
 
+    def exact(self, case: Case) -> bool:
+        """True if the model explains all outputs but for rounding."""
+        return bool(np.all(self.noise <= case.floor))
+
     def correlated(self, case: Case) -> bool:
         """True if the noise of any output has a memory and exceeds rounding."""
         used = used_by(self.fit)

@@ -438,7 +438,7 @@ def answer(
         own = [case.split(i, each)[k] for i, each in enumerate(slopes)]
         fitted = tuple(y - r for y, r in zip(s.measured, rest, strict=True))
         added = [_added(s, i, y) for i, y in enumerate(fitted)]
-        pairs = (RunSlopes(o, a, o[:, :0]) for o, a in zip(own, added, strict=True))
+        pairs = (RunSlopes(o, a) for o, a in zip(own, added, strict=True))
         checks = checks_of(s, rest, list(pairs), max(1, used // len(case.seen)), gain, delay)
         parts.append(StateSpaceOutput(list(runs[0].outputs)[k], runs, s, fitted, checks))
     ahead = _ahead(case, found, held, delay)

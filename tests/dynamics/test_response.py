@@ -276,6 +276,17 @@ def test_a_shift_of_a_run_that_was_held_back_is_part_of_its_residual():
     assert fit.status is Status.poor_fit
 
 
+@pytest.mark.parametrize("tau", [0.02, 0.2])
+def test_a_time_constant_of_which_a_sample_leaves_nothing_has_no_error(tau):
+    """Samples of 0.5 s: of 0.02 s they see e^-25, and 0.06 ± 0.01 s was said; of 0.2 s, 8 %."""
+    fit = identify(run_of(FIRST_ORDER, constant(tau, 2.0), noise=0.01), delay=0)
+    found, gain = fit.quantities["tau"], fit.quantities["K"]
+    assert (found.error is None) == (tau == 0.02)
+    assert abs(gain.value - 2.0) < 4 * gain.error
+    assert fit.status is (Status.unidentified if tau == 0.02 else Status.converged)
+    assert ("Sample faster" in fit.message) == (tau == 0.02)
+
+
 def test_readings_that_show_no_output_are_left_out_and_named():
     run = run_of(FIRST_ORDER, constant(3.0, 2.0), noise=0.05)
     level = run.outputs["level"].copy()

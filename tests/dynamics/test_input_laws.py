@@ -1,0 +1,92 @@
+"""Laws of an input as alternatives: what they hand on, their weights, what errors contain."""
+
+import numpy as np
+import pytest
+
+from beamfit.dynamics.fit import identify
+from beamfit.dynamics.input_laws import LawEvidence, moved
+from beamfit.dynamics.record import Run
+from beamfit.status import Status
+
+UP_AND_DOWN = np.array([0.0, 1.0, 2.0, 2.0, 1.5, 1.0, 0.0, -1.0])
+
+
+@pytest.mark.parametrize(
+    ("law", "width", "wanted"),
+    [
+        # By hand: the play's right edge pushes from 0.5 on, its left one from 1.0 down.
+        ("play", 0.5, [0.0, 0.5, 1.5, 1.5, 1.5, 1.5, 0.5, -0.5]),
+        ("stop", 0.8, [0.0, 1.0, 2.0, 2.0, 2.0, 1.0, 0.0, -1.0]),
+        ("dead zone", 0.5, [0.0, 0.5, 1.5, 1.5, 1.0, 0.5, 0.0, -0.5]),
+    ],
+)
+def test_what_a_law_hands_on(law, width, wanted):
+    assert moved(UP_AND_DOWN, law, width).tolist() == wanted
+
+
+def test_a_hysteresis_is_the_mean_of_plays():
+    plays = [moved(UP_AND_DOWN, "play", share * 0.3) for share in (0, 0.4, 0.8, 1.2, 1.6, 2)]
+    np.testing.assert_allclose(moved(UP_AND_DOWN, "hysteresis", 0.3), np.mean(plays, axis=0))
+
+
+def test_an_error_is_that_of_the_mixture_about_the_value_without_a_law():
+    """Beside draws from the mixture."""
+    random = np.random.default_rng(0)
+    shift, covariance = np.array([[2.0, 1.0], [0.0, -3.0]]), np.stack([np.diag([1.0, 0.5])] * 2)
+    found = LawEvidence(0.5, 0.0, "", np.array([0.3, 0.2]), shift, covariance)
+    slope = np.array([1.0, 0.5])
+    which = random.choice(3, 200_000, p=[0.5, 0.3, 0.2])
+    laws = [random.multivariate_normal(s, c, 200_000) @ slope
+            for s, c in zip(shift, covariance, strict=True)]  # fmt: skip
+    drawn = np.choose(which, [0.7 * random.normal(size=200_000), *laws])
+    assert found.error(slope, np.array(0.7)) == pytest.approx(np.sqrt(np.mean(drawn**2)), rel=0.01)
+
+
+def response(u, moves, noise, random, tau=3.0):
+    """A first order of gain 2 behind what moves, read every 0.5 s with noise, SIMULATED."""
+    kept, y = np.exp(-0.5 / tau), 2.0 * np.asarray(moves)
+    for k in range(1, len(u)):
+        y[k] = 2.0 * moves[k - 1] + (y[k - 1] - 2.0 * moves[k - 1]) * kept
+    y = y + noise * y.std() * random.normal(size=len(u))
+    return Run(0.5 * np.arange(len(u)), {"valve": np.asarray(u)}, {"level": y})
+
+
+def plays(u, half):
+    """A play written as a loop."""
+    at, found = u[0], []
+    for now in u:
+        at = min(max(at, now - half), now + half)
+        found.append(at)
+    return np.array(found)
+
+
+FAMILIES = {
+    "a play, steps": lambda u: plays(u, 0.08),
+    "a hysteresis": lambda u: np.mean([plays(u, h) for h in np.linspace(0, 0.3, 7)], axis=0),
+    "a dead zone": lambda u: 1.5 + np.sign(u - 1.5) * np.maximum(np.abs(u - 1.5) - 0.1, 0.0),
+    "a shift by the direction": lambda u: u - 0.1 * np.sign(np.diff(u, prepend=u[0])),
+}
+SEEDS = (1, pytest.param(12, marks=pytest.mark.calibrate))
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+@pytest.mark.parametrize("count", SEEDS)
+def test_no_gain_behind_a_law_is_sure_and_wrong(family, count):
+    """Up to 9 errors off without the laws' part of the error."""
+    for seed in range(count):
+        random = np.random.default_rng([seed, 3])
+        u = np.repeat(random.uniform(0, 3, 15), 20)
+        noise = random.choice([0.03, 0.1])
+        fit = identify(response(u, FAMILIES[family](u), noise, random), delay=0)
+        gain = fit.quantities["K"]
+        assert fit.status is not Status.converged or abs(gain.value - 2) < 3 * gain.error, seed
+
+
+def test_two_values_of_an_input_do_not_tell_a_dead_zone():
+    """The gain between them is what is measured: no law makes its error larger."""
+    random = np.random.default_rng(2)
+    u = np.repeat(random.integers(0, 2, 40) * 3.0, 6)
+    fit = identify(response(u, u, 0.1, random), delay=0)
+    assert fit.status is Status.converged
+    assert fit.quantities["K"].error < 0.1
+    assert abs(fit.quantities["K"].value - 2) < 3 * fit.quantities["K"].error
