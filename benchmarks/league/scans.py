@@ -159,10 +159,13 @@ def clipped(rng, size):
 
 
 def halo(rng, size):
-    """A part of 2 to 10 %, three times as wide, seen as far as 4 to 8 smallest sizes reach."""
+    """A part of 2 to 10 %, three times as wide, seen as far as 4 to 8 smallest sizes reach.
+
+    The truth is the emittance of core and halo; a window of full sensitivity has rms w / sqrt(3).
+    """
     part, window = among(rng, 0.02, 0.1), rng.uniform(4.0, 8.0) * size.min()
-    core = np.minimum(9 * size**2, window**2 / 3)
-    return np.sqrt((1 - part) * size**2 + part * core)
+    wide = np.minimum(9 * size**2, window**2 / 3)
+    return np.sqrt(((1 - part) * size**2 + part * wide) / (1 + 8 * part))
 
 
 def pixels(rng, size):
@@ -178,8 +181,9 @@ def outliers(rng, size):
 
 
 def widths(rng, size):
-    """A part of the sizes is full width at half maximum."""
-    return size * np.where(rng.random(len(size)) < rng.uniform(0.2, 0.8), 2.355, 1.0)
+    """Some sizes, one to a third of them, are full widths at half maximum."""
+    few = rng.integers(1, len(size) // 3 + 1)
+    return size * np.where(rng.permutation(len(size)) < few, 2.355, 1.0)
 
 
 def tails(rng, size):
