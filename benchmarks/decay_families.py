@@ -27,7 +27,7 @@ LIFETIME, START = 10.0 * HOUR, 300.0
 
 
 class Case(NamedTuple):
-    """A record with its true a, 1/(mA s), and lifetime, h, at a current; NaN where there is none."""
+    """A record with its true a, 1/(mA s), and lifetime, h, at a current; NaN is left open."""
 
     record: DecayRecord
     law: Callable[[float], tuple[float, float]]

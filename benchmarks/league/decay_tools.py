@@ -66,11 +66,7 @@ def pieces(case: Case) -> list[DecayRecord]:
     scatter = 1.4826 * np.median(np.abs(steps - np.median(steps)))
     cuts = np.flatnonzero(steps > RISE * scatter) + 1
     rows = np.split(np.arange(record.time.size), cuts)
-    return [
-        DecayRecord(record.time[r], record.current[r], None if record.error is None else record.error[r])
-        for r in rows
-        if r.size >= FEWEST
-    ]
+    return [DecayRecord(record.time[r], record.current[r]) for r in rows if r.size >= FEWEST]
 
 
 def longest(case: Case) -> DecayRecord:

@@ -25,7 +25,9 @@ def refuse_if_missing() -> None:
         try:
             importlib.import_module(name)
         except ImportError as error:
-            raise SystemExit(f"league: {name} is not installed ({error}); make .venv/league") from None
+            raise SystemExit(
+                f"league: {name} is not installed ({error}); make .venv/league"
+            ) from None
 
 
 def cases(field: str, kind: str) -> dict[str, Any]:
