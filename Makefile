@@ -53,17 +53,9 @@ lint: .venv/test
 	$(BIN)/ruff format --check .
 	$(BIN)/lint-imports
 
+# beamfit beside its peers in processor time: docs/speed.md.
 bench: .venv/bench
-	$(BIN)/python benchmarks/emittance.py
-	$(BIN)/python benchmarks/lifetime.py
-	$(BIN)/python benchmarks/greybox.py 20 0
-	$(BIN)/python benchmarks/size.py
-	$(BIN)/python benchmarks/language.py
-	$(BIN)/python benchmarks/optimisation.py 20
-	$(BIN)/python benchmarks/sampling.py
-	$(BIN)/python benchmarks/scenarios.py
-	$(BIN)/python benchmarks/response.py
-	$(BIN)/python benchmarks/control.py
+	$(BIN)/python -m benchmarks.speed
 
 # Families of simulated records by beamfit and every peer: docs/league*.md. Half an hour; DRAWS=200 for hours.
 DRAWS ?= 30

@@ -280,7 +280,7 @@ def samples(n: int) -> dict[str, Callable]:
 
 
 def effective(n: int) -> dict[str, Callable]:
-    """Seconds for n thousand effective samples of the slowest number, as each tool judges itself."""
+    """Seconds for n thousand effective samples of the slowest number."""
     from . import sampling
 
     case = sampling.scan()
