@@ -56,11 +56,18 @@ class Decay(NamedTuple):
     noise: str = "white"
     stated: float | None = None
     spoil: Spoil | None = None
+    step: tuple[float, float] | None = None  # of the beam on the way, parts of the first current
     known: str = "aτ"
     share: tuple[float, float] = (0.15, 0.85)
     span: tuple[float, float] = (0.5, 2.0)  # lifetimes
     readings: tuple[int, int] = (100, 1000)
     level: tuple[float, float] = (-3.5, -2.5)  # log10 of the noise over the first current
+
+
+def run(slope: Callable, start: float, current: float, times: np.ndarray) -> np.ndarray:
+    """Currents at some times, of a beam that starts with one."""
+    found = solve_ivp(slope, (start, times[-1]), [current], t_eval=times, rtol=1e-10, atol=1e-9)
+    return found.y[0]
 
 
 def drift(change: float) -> Course:
@@ -97,7 +104,11 @@ def decay(law: Decay, random: np.random.Generator) -> Case:
         own, gas = losses(t, i)
         return -(own * i + gas) * i
 
-    beam = solve_ivp(slope, (0.0, span), [START], t_eval=time, rtol=1e-10, atol=1e-9).y[0]
+    beam = run(slope, 0.0, START, time)
+    if law.step is not None:
+        later = int(random.uniform(0.3, 0.7) * count)
+        stepped = beam[later] + START * random.uniform(*law.step)
+        beam = np.append(beam[:later], run(slope, time[later], stepped, time[later:]))
     shown = beam + noise * noise_of(law.noise, count, random)
     shown = shown if law.spoil is None else law.spoil(random, time, shown, noise)
     error = None if law.stated is None else np.full(count, noise * law.stated)

@@ -14,7 +14,9 @@ DEFINITION = """\
 A tool **answers** if it gives a finite value with a finite error, says no warning, and has no
 status or flag of its own that speaks against the answer. A tool that gives no error answers, but
 has no cover. Intervals of 68 and 95 % are the tool's own; one that gives a standard deviation
-inferred from few residuals is given Student's factor for them. An answer is **wrong** if it
+inferred from few residuals is given Student's factor for them.
+
+An answer is **wrong** if it
 lies more than 3 errors from the truth, whatever the size of both: an error is what the 95 %
 interval reaches towards the truth, over 1.96. Without an error, an answer beyond 10 % is wrong.
 Where nothing is there to be found, an emittance more than 3 errors from zero is wrong.

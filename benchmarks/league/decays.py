@@ -53,16 +53,6 @@ def voltage(random):
     return lambda s: np.where(np.asarray(s) < when, 1.0, 1.0 + change)
 
 
-def stepped(low: float, high: float):
-    """The current steps at some time, by so much of the first; afterwards the monitor is right."""
-
-    def spoil(random, time, current, noise):
-        when, step = random.uniform(0.3, 0.7) * time[-1], START * random.uniform(low, high)
-        return current + np.where(time > when, step, 0.0)
-
-    return spoil
-
-
 def spikes(random, time, current, noise):
     """One reading in a hundred is anything."""
     wild = current * random.uniform(0, 1.2, time.size)
@@ -154,8 +144,8 @@ TRAPS: dict[str, Draw] = {
     "vacuum gets better after the fill": of(of_b=pumped),
     "three bursts of gas": of(of_b=bursts, known="a"),
     "RF voltage changed, not logged": of(of_a=voltage, known="τ"),
-    "a refill of 0.1-1 %": of(spoil=stepped(0.001, 0.01)),
-    "a loss of 0.3-3 %": of(spoil=stepped(-0.03, -0.003)),
+    "a refill of 0.1-1 %": of(step=(0.001, 0.01)),
+    "a loss of 0.3-3 %": of(step=(-0.03, -0.003)),
     "one reading in a hundred is anything": of(spoil=spikes),
     "one reading in a hundred is zero": of(spoil=zeros),
     "heavy tails": of(spoil=tails),
