@@ -47,7 +47,7 @@ PEERS = ("pyemittance", "lmfit", "emcee", "casadi", "do_mpc", "at", "cpymad", "j
 HEAD = """\
 # Speed
 
-Made by `make bench`, never by hand: beamfit and its peers take turns in one run. Every number is
+Made by `make bench`, never by hand: beamfit and its peers one after the other in one run. Every number is
 processor time of all threads, the least of several repeats, with one BLAS thread. Ratios are the
 peer's time over beamfit's: above 1 beamfit is faster. Warm: nothing compiles. Where beamfit gives
 more than the peer (verdicts, correlated noise, errors) the line above a table says so.
@@ -422,7 +422,8 @@ def main() -> None:
                 print(table(work, list(measured(work))))
         return
     versions = f"Python {platform.python_version()}, JAX {jax.__version__}, numpy {np.__version__}"
-    made = f"Measured with {versions}, {os.cpu_count()} processors.\n"
+    load = os.getloadavg()[0]
+    made = f"Measured with {versions}, {os.cpu_count()} processors, load {load:.0f}.\n"
     parts = [HEAD, made, first_answers()]
     for work in WORK:
         parts.append(table(work, list(measured(work))))
