@@ -48,8 +48,8 @@ HEAD = """\
 # Speed
 
 Made by `make bench`, never by hand: beamfit and its peers one after the other in one run. Numbers
-are processor time of all threads, the least of several repeats, with one BLAS thread. Ratios are the
-peer's time over beamfit's: above 1 beamfit is faster. Warm: nothing compiles. Where beamfit gives
+are processor time of all threads, the least of several repeats, with one BLAS thread. Ratios are
+the peer's time over beamfit's: above 1 beamfit is faster. Warm: nothing compiles. Where beamfit gives
 more than the peer (verdicts, correlated noise, errors) the line above a table says so.
 """
 FIRST = """\
