@@ -47,10 +47,11 @@ PEERS = ("pyemittance", "lmfit", "emcee", "casadi", "do_mpc", "at", "cpymad", "j
 HEAD = """\
 # Speed
 
-Made by `make bench`, never by hand: beamfit and its peers one after the other in one run. Numbers
-are processor time of all threads, the least of several repeats, with one BLAS thread. Ratios are
-the peer's time over beamfit's: above 1 beamfit is faster. Warm: nothing compiles. Where beamfit gives
-more than the peer (verdicts, correlated noise, errors) the line above a table says so.
+Made by `make bench`, never by hand: beamfit and its peers one after the other in one run.
+Numbers are processor time of all threads, the least of several repeats, with one BLAS thread.
+Ratios are the peer's time over beamfit's: above 1 beamfit is faster. Warm: nothing compiles.
+Where beamfit gives more than the peer (verdicts, correlated noise, errors) the line above a
+table says so.
 """
 FIRST = """\
 ## First answers
