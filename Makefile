@@ -18,13 +18,12 @@ export PIP_DISABLE_PIP_VERSION_CHECK := 1
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[test]'
 	touch $@
 
-.venv/bench: .venv/test
-	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[bench]'
+.venv/league: .venv/test
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[league]'
 	touch $@
 
-# cheetah brings torch, of several GB where it is not installed yet.
-.venv/league: .venv/bench
-	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[league]'
+.venv/bench: .venv/league
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[bench]'
 	touch $@
 
 demo: .venv/runtime
@@ -54,24 +53,14 @@ lint: .venv/test
 	$(BIN)/ruff format --check .
 	$(BIN)/lint-imports
 
+# beamfit beside its peers in processor time: docs/speed.md.
 bench: .venv/bench
-	$(BIN)/python benchmarks/emittance.py
-	$(BIN)/python benchmarks/lifetime.py
-	$(BIN)/python benchmarks/greybox.py 20 0
-	$(BIN)/python benchmarks/size.py
-	$(BIN)/python benchmarks/language.py
-	$(BIN)/python benchmarks/optimisation.py 20
-	$(BIN)/python benchmarks/sampling.py
-	$(BIN)/python benchmarks/scenarios.py
-	$(BIN)/python benchmarks/response.py
-	$(BIN)/python benchmarks/control.py
+	$(BIN)/python -m benchmarks.speed
 
-# beamfit beside every peer, honesty and speed: docs/league.md. Hours with 1000 draws; DRAWS=40 for a look.
-# Each case by each tool is kept as it is done; `make league AGAIN=` goes on where one was stopped.
-DRAWS ?= 1000
-AGAIN ?= --again
+# Families of simulated records by beamfit and every peer: docs/league*.md. Half an hour; DRAWS=200 for hours.
+DRAWS ?= 30
 league: .venv/league
-	$(BIN)/python -m benchmarks.league --draws $(DRAWS) $(AGAIN)
+	$(BIN)/python -m benchmarks.league --draws $(DRAWS)
 
 clean:
 	rm -rf .venv demo dist build

@@ -27,20 +27,52 @@ LIFETIME, START = 10.0 * HOUR, 300.0
 
 
 class Case(NamedTuple):
-    """A record with the true a at the mean current, 1/(mA s), and lifetime there, h."""
+    """A record with its true a, 1/(mA s), and lifetime, h, at a current; NaN is left open."""
 
     record: DecayRecord
-    a: float
-    lifetime: float
+    law: Callable[[float], tuple[float, float]]
+    refilled: bool = False
+
+    def truth(self, current: float | None = None) -> tuple[float, float]:
+        """a and lifetime, at the mean current if None."""
+        return self.law(float(self.record.current.mean()) if current is None else current)
+
+
+Course = Callable[[np.random.Generator], Callable[[np.ndarray], np.ndarray]]
+Spoil = Callable[[np.random.Generator, np.ndarray, np.ndarray, float], np.ndarray]
 
 
 class Decay(NamedTuple):
-    """The law of a family: exponent of a, drift of b over the record, and how the noise goes."""
+    """The law of a family: exponent of a, courses of a and b over the record, noise, monitor.
+
+    A course draws a factor against time in lengths of the record. `spoil` makes of the time, the
+    current and its noise what the monitor shows; `known` names the truths that are left.
+    """
 
     exponent: float = 0.0
-    drift: float = 0.0
+    of_a: Course | None = None
+    of_b: Course | None = None
+    follows: float = 0.0  # part of b that goes with the current
     noise: str = "white"
     stated: float | None = None
+    spoil: Spoil | None = None
+    step: tuple[float, float] | None = None  # of the beam on the way, parts of the first current
+    known: str = "aτ"
+    share: tuple[float, float] = (0.15, 0.85)
+    span: tuple[float, float] = (0.5, 2.0)  # lifetimes
+    readings: tuple[int, int] = (100, 1000)
+    level: tuple[float, float] = (-3.5, -2.5)  # log10 of the noise over the first current
+
+
+def run(slope: Callable, start: float, current: float, times: np.ndarray) -> np.ndarray:
+    """Currents at some times, of a beam that starts with one."""
+    found = solve_ivp(slope, (start, times[-1]), [current], t_eval=times, rtol=1e-10, atol=1e-9)
+    return found.y[0]
+
+
+def drift(change: float) -> Course:
+    """A straight line through the middle of the record."""
+    return lambda random: lambda s: 1 + change * (s - 0.5)
 
 
 def noise_of(kind: str, count: int, random: np.random.Generator) -> np.ndarray:
@@ -58,21 +90,40 @@ def noise_of(kind: str, count: int, random: np.random.Generator) -> np.ndarray:
 
 def decay(law: Decay, random: np.random.Generator) -> Case:
     """One decay of a family."""
-    share, span = random.uniform(0.15, 0.85), LIFETIME * random.uniform(0.5, 2.0)
-    count, noise = int(random.integers(100, 1000)), START * 10 ** random.uniform(-3.5, -2.5)
+    share, span = random.uniform(*law.share), LIFETIME * random.uniform(*law.span)
+    count, noise = int(random.integers(*law.readings)), START * 10 ** random.uniform(*law.level)
     a, b = share / LIFETIME / START, (1 - share) / LIFETIME
+    of_a, of_b = ((c or drift(0.0))(random) for c in (law.of_a, law.of_b))
     time = np.linspace(0.0, span, count)
 
-    def slope(t: float, i: np.ndarray) -> np.ndarray:
-        return -(a * (i / START) ** law.exponent * i + b * (1 + law.drift * (t / span - 0.5))) * i
+    def losses(t: float, i: float) -> tuple[float, float]:
+        gas = b * of_b(t / span) * (1 + law.follows * (i / START - 1))
+        return a * of_a(t / span) * (i / START) ** law.exponent, gas
 
-    beam = solve_ivp(slope, (0.0, span), [START], t_eval=time, rtol=1e-10, atol=1e-9).y[0]
-    current = beam + noise * noise_of(law.noise, count, random)
+    def slope(t: float, i: np.ndarray) -> np.ndarray:
+        own, gas = losses(t, i)
+        return -(own * i + gas) * i
+
+    beam = run(slope, 0.0, START, time)
+    if law.step is not None:
+        later = int(random.uniform(0.3, 0.7) * count)
+        stepped = beam[later] + START * random.uniform(*law.step)
+        beam = np.append(beam[:later], run(slope, time[later], stepped, time[later:]))
+    shown = beam + noise * noise_of(law.noise, count, random)
+    shown = shown if law.spoil is None else law.spoil(random, time, shown, noise)
     error = None if law.stated is None else np.full(count, noise * law.stated)
-    record, mean = DecayRecord(time, current, error), float(current.mean())
-    at = float(np.interp(-mean, -beam, time)) / span - 0.5
-    own = a * (mean / START) ** law.exponent
-    return Case(record, own, 1 / (own * mean + b * (1 + law.drift * at)) / HOUR)
+
+    def truth(current: float) -> tuple[float, float]:
+        own, gas = losses(float(np.interp(-current, -beam, time)), current)
+        lifetime = 1 / (own * current + gas) / HOUR
+        return own if "a" in law.known else np.nan, lifetime if "τ" in law.known else np.nan
+
+    return Case(DecayRecord(time, np.maximum(shown, 0.0), error), truth)
+
+
+def stored(lifetime: float) -> Callable[[float], tuple[float, float]]:
+    """The truth of a record whose lifetime does not hang on the current, s."""
+    return lambda current: (np.nan, lifetime / HOUR)
 
 
 def top_up(
@@ -94,7 +145,7 @@ def top_up(
     place = np.searchsorted(at, time, side="right") - 1
     beam = np.array(level)[place] * np.exp(-(time - np.array(at)[place]) / LIFETIME)
     record = DecayRecord(time, beam + noise * random.normal(size=count))
-    return Case(record, np.nan, LIFETIME / HOUR)
+    return Case(record, stored(LIFETIME), True)
 
 
 def changing_top_up(random: np.random.Generator, course: str, walk: float = 0.0) -> Case:
@@ -116,7 +167,7 @@ def changing_top_up(random: np.random.Generator, course: str, walk: float = 0.0)
     noise = random.normal(size=time.size)
     noise += walk / np.sqrt(20) * np.cumsum(random.normal(size=time.size))
     current = beam + START * 10 ** random.uniform(-5.0, -3.9) * noise
-    return Case(DecayRecord(time, current), np.nan, 1 / loss.mean() / HOUR)
+    return Case(DecayRecord(time, current), stored(1 / loss.mean()), True)
 
 
 FAMILIES: dict[str, Callable[[np.random.Generator], Case]] = {
@@ -124,8 +175,8 @@ FAMILIES: dict[str, Callable[[np.random.Generator], Case]] = {
     "errors stated": lambda r: decay(Decay(stated=1.0), r),
     "a as I^-1/3": lambda r: decay(Decay(exponent=-1 / 3), r),
     "a as I^0.3": lambda r: decay(Decay(exponent=0.3), r),
-    "b rises by 10 %": lambda r: decay(Decay(drift=0.1), r),
-    "b falls by 10 %": lambda r: decay(Decay(drift=-0.1), r),
+    "b rises by 10 %": lambda r: decay(Decay(of_b=drift(0.1)), r),
+    "b falls by 10 %": lambda r: decay(Decay(of_b=drift(-0.1)), r),
     "correlated, 0.6-0.98": lambda r: decay(Decay(noise="correlated"), r),
     "correlated, errors stated": lambda r: decay(Decay(noise="correlated", stated=1.0), r),
     "1/f": lambda r: decay(Decay(noise="1/f"), r),
@@ -179,11 +230,12 @@ def main() -> None:
         random = np.random.default_rng([number, chosen.trials])
         cases = [FAMILIES[name](random) for _ in range(chosen.trials)]
         pairs = [(case, fit) for case in cases if (fit := fitted(case, chosen.law))]
-        told = [(c, f) for c, f in pairs if f.a.error is not None and np.isfinite(c.a)]
-        far = sum(abs(f.a.value - c.a) > 4 * f.a.error for c, f in told)
-        error = np.median([f.a.error / c.a for c, f in told]) if told else np.nan
-        a, lifetime = ([holds(f.a, c.a) for c, f in pairs],
-                       [holds(f.lifetime_mean, c.lifetime) for c, f in pairs])  # fmt: skip
+        true = [(f, *c.truth()) for c, f in pairs]
+        told = [(f.a, a) for f, a, _ in true if f.a.error is not None and np.isfinite(a)]
+        far = sum(abs(q.value - a) > 4 * q.error for q, a in told)
+        error = np.median([q.error / a for q, a in told]) if told else np.nan
+        a = [holds(f.a, a) for f, a, _ in true]
+        lifetime = [holds(f.lifetime_mean, hours) for f, _, hours in true]
         poor = sum(f.status in ("poor_fit", "infeasible") for _, f in pairs) / len(cases)
         print(f"| {name} | {share(a)} | {share(lifetime)} | {far} | {100 * error:.0f} % "
               f"| {100 * poor:.0f} % |", flush=True)  # fmt: skip

@@ -19,45 +19,95 @@ from scipy.special import betaincinv
 
 from beamfit.emittance.many import fit_many
 from beamfit.emittance.scan import QuadScan
-from beamfit.emittance.transport import rows_line
+from beamfit.optics.beamline import Beamline
+from beamfit.optics.elements import Drift, Quadrupole, Screen
 from beamfit.status import Status
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "verdict_measured.md"
 MARKS = "<!-- measured: benchmarks/verdict.py -->", "<!-- end of measured -->"
 POINTS = (4, 5, 6, 8, 12, 30)
+ENERGY = 100.0  # MeV
+
+
+class Line(NamedTuple):
+    """A scanned quadrupole, then drifts (k1 = 0) and fixed quadrupoles, then the screen.
+
+    Matrices are written out here in plain numpy, so that no tool is its own judge.
+    """
+
+    length: float  # m
+    rest: tuple[tuple[float, float], ...]  # (k1 in 1/m², length in m), as the beam goes
+
+    @property
+    def after(self) -> np.ndarray:
+        """Matrix of the rest, shape (2, 2)."""
+        matrix = np.eye(2)
+        for k1, length in self.rest:
+            matrix = thick(np.array([k1]), length)[0] @ matrix
+        return matrix
+
+    def rows(self, k1: np.ndarray) -> np.ndarray:
+        """R11 and R12 (m) of every setting, shape (n, 2)."""
+        return (self.after @ thick(k1, self.length))[:, 0]
+
+    def strengths(self, beta: float, angle: np.ndarray) -> np.ndarray:
+        """k1 at which a beam with a waist of `beta` m before the magnet has such phases."""
+        k1 = np.linspace(-8.0, 8.0, 4001) / self.length
+        r11, r12 = self.rows(k1).T
+        phase = np.unwrap(np.arctan2(beta * r11, r12))
+        return np.interp(-np.asarray(angle), -phase, k1)
+
+
+def thick(k1: np.ndarray, length: float) -> np.ndarray:
+    """Matrices of a quadrupole (Wiedemann, Particle Accelerator Physics, 5.2): a complex phase."""
+    root = np.sqrt(np.where(k1 == 0, 1e-12, k1).astype(complex))
+    c, s = np.cos(root * length), np.sin(root * length)
+    return np.array([[c, s / root], [-root * s, c]]).real.transpose(2, 0, 1)
 
 
 class Truth(NamedTuple):
-    """A scan as it would be without noise: R11, R12 (m), sizes (m) and the emittance (m)."""
+    """A scan as it would be without noise: line, k1 (1/m²), sizes (m) and the emittance (m)."""
 
-    r11: np.ndarray
-    r12: np.ndarray
+    line: Line
+    k1: np.ndarray
     size: np.ndarray
     emittance: float
+    beta: float
 
 
 def truth(rng: np.random.Generator, n: int, waist: tuple[float, float] = (-0.3, 0.3)) -> Truth:
-    """Draw a line and a beam; the waist lies within so many radians of the middle of the scan."""
-    length, beta = rng.uniform(1.0, 4.0), 10 ** rng.uniform(0.3, 1.5)
+    """Draw a line and a beam; the waist lies within so many radians of the middle of the scan.
+
+    One line in three has a fixed quadrupole behind the scanned one.
+    """
+    drift, beta = rng.uniform(1.0, 4.0), 10 ** rng.uniform(0.3, 1.5)
     emittance = 10 ** rng.uniform(-9.5, -8.0)
-    half = 0.5 * np.radians(rng.uniform(100.0, 165.0))
-    angle = np.clip(np.linspace(-half, half, n) + rng.uniform(*waist), -1.54, 1.54)
-    r12, r11 = np.full(n, length), np.tan(angle) * length / beta
-    size = np.sqrt(emittance * (beta * r11**2 + r12**2 / beta))
-    return Truth(r11, r12, size, emittance)
+    half, middle = 0.5 * np.radians(rng.uniform(100.0, 165.0)), rng.uniform(*waist)
+    angle = np.linspace(max(middle - half, -1.45), min(middle + half, 1.45), n)
+    fixed = rng.uniform(-5.0, 5.0) / drift if rng.random() < 1 / 3 else 0.0
+    line = Line(rng.uniform(0.05, 0.15), ((0.0, 0.4 * drift), (fixed, 0.1), (0.0, 0.6 * drift)))
+    k1 = line.strengths(beta, angle)
+    return Truth(line, k1, sizes(line, k1, emittance, beta), emittance, beta)
+
+
+def sizes(line: Line, k1: np.ndarray, emittance: float, beta: float) -> np.ndarray:
+    """Rms sizes in m of a beam with its waist before the magnet."""
+    r11, r12 = line.rows(k1).T
+    return np.sqrt(emittance * (beta * r11**2 + r12**2 / beta))
+
+
+def beamline(line: Line) -> Beamline:
+    parts = [
+        Quadrupole(f"F{i}", length, k1) if k1 else Drift(f"D{i}", length)
+        for i, (k1, length) in enumerate(line.rest)
+    ]
+    return Beamline((Quadrupole("Q", line.length), *parts, Screen("S")), ENERGY)
 
 
 def scan_of(t: Truth, size: np.ndarray, error: np.ndarray | None, **more) -> QuadScan:
-    """A scan of one plane that brings its matrices."""
-    return QuadScan(
-        {"Q": np.arange(float(len(size)))},
-        {"Q": "A"},
-        {"x": size},
-        {} if error is None else {"x": error},
-        energy=np.full(len(size), 100.0),
-        transfer={"x": np.stack([t.r11, t.r12], -1)},
-        **more,
-    )
+    """A scan of one plane, as a user has it."""
+    given = {} if error is None else {"x": error}
+    return QuadScan({"Q": t.k1}, {"Q": "k1"}, {"x": size}, given, **more)
 
 
 def noisy(rng, t: Truth, deviation: np.ndarray) -> np.ndarray:
@@ -171,7 +221,7 @@ def fitted(draw: Callable, rng, n: int, draws: int) -> Iterator:
     pairs = [draw(rng, n) for _ in range(draws)]
     for start in range(0, draws, 250):
         part = pairs[start : start + 250]
-        fits = fit_many((scan, rows_line(scan)) for _, scan in part)
+        fits = fit_many((scan, beamline(t.line)) for t, scan in part)
         yield from zip((t for t, _ in part), (fit.x for fit in fits), strict=True)
 
 
@@ -210,15 +260,15 @@ def same_status(rng, draws: int) -> str:
     for _ in range(draws):
         t, scan = relative(rng.uniform(0.01, 0.08), 1.0)(rng, int(rng.integers(6, 13)))
         again = [scan_of(t, scan.size["x"], f * scan.error["x"]) for f in (0.5, 1.0, 2.0)]
-        fits = fit_many((s, rows_line(s)) for s in again)
+        fits = fit_many((s, beamline(t.line)) for s in again)
         changed += len({fit.x.status for fit in fits} - {Status.not_finite}) > 1
     return limits(changed, draws)
 
 
 def speed(rng) -> str:
     """Processor time of a judged plane: many in one call, and one warm."""
-    scans = [relative(0.05, 1.0)(rng, 8)[1] for _ in range(500)]
-    pairs = [(scan, rows_line(scan)) for scan in scans]
+    drawn = [relative(0.05, 1.0)(rng, 8) for _ in range(500)]
+    pairs = [(scan, beamline(t.line)) for t, scan in drawn]
     fit_many(pairs[:300])
     begin = time.process_time()
     fit_many(pairs)

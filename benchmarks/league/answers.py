@@ -1,4 +1,4 @@
-"""What counts as confident and wrong, and as refused; the same for every tool."""
+"""An answer with its intervals, and its score; the same for every tool."""
 
 from __future__ import annotations
 
@@ -7,52 +7,71 @@ import warnings
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-DEFINITION = """\
-A tool **answers** if it gives a finite value, says no warning (none in Python, no status or flag
-of its own that speaks against the answer), and the error it gives, if it gives any, is finite. An
-answer is **confident and wrong** if it lies more than 3 of its errors *and* more than 10 % from the
-truth; a tool that gives no error is wrong beyond 10 %.
+import numpy as np
+from scipy.stats import t
 
-Where a tool gives an interval of 95 %, as
-beamfit does (by Student's t where few residuals tell the noise, to one side where a bunch may
-lengthen), how far it reaches towards the truth, over 1.96, is the error.
-Where nothing is there (no beam, no decay), an emittance or a loss rate more than 3 errors from zero
-is wrong. A good case is **refused** if there is no answer, or one with an error larger than the
-value."""
+DEFINITION = """\
+A tool **answers** if it gives a finite value with a finite error, says no warning, and has no
+status or flag of its own that speaks against the answer. A tool that gives no error answers, but
+has no cover. Intervals of 68 and 95 % are the tool's own; one that gives a standard deviation
+inferred from few residuals is given Student's factor for them.
+
+An answer is **wrong** if it
+lies more than 3 errors from the truth, whatever the size of both: an error is what the 95 %
+interval reaches towards the truth, over 1.96. Without an error, an answer beyond 10 % is wrong.
+Where nothing is there to be found, an emittance more than 3 errors from zero is wrong.
+
+In brackets stand binomial limits of 95 %. Bias is the median of value over truth, less one; the
+error is the median of half of the 68 % interval, over the truth."""
 FAR, SHARE = 3.0, 0.1
 
 
 class Answer(NamedTuple):
-    """A number a tool stands for; `error` is None where it gives none, `less` the error below."""
+    """A value with half of its 68 % interval and its 95 % interval; None where none is given."""
 
     value: float
-    error: float | None
-    less: float | None = None
+    error: float | None = None
+    interval_95: tuple[float, float] | None = None
+
+    def holds(self, truth: float) -> bool:
+        """Whether the truth lies in the 95 % interval."""
+        return self.interval_95[0] <= truth <= self.interval_95[1]
 
     def wrong(self, truth: float) -> bool:
-        """Confident and wrong; no decay is an infinite lifetime."""
-        error = self.error if truth > self.value or self.less is None else self.less
-        if math.isinf(truth):
-            return abs(self.value) > FAR * (error or 0.0)
-        off = abs(self.value - truth)
-        return off > SHARE * abs(truth) and off > FAR * (error or 0.0)
+        """Whether the truth is more than 3 errors off."""
+        if self.interval_95 is None:
+            return abs(self.value - truth) > SHARE * truth
+        reach = abs(self.interval_95[int(truth > self.value)] - self.value)
+        return abs(self.value - truth) > FAR * reach / 1.96
 
     @property
-    def useful(self) -> bool:
-        """Whether it says anything."""
-        return self.error is None or self.error + (self.less or self.error) < 2 * abs(self.value)
+    def given(self) -> bool:
+        """Whether value and error are finite numbers."""
+        return math.isfinite(self.value) and (self.error is None or math.isfinite(self.error))
+
+
+def of_sigma(value: float, sigma: float, freedom: float = math.inf) -> Answer:
+    """An answer with one standard deviation, by so many residuals to spare where they tell it."""
+    if not freedom > 0 or not math.isfinite(sigma):
+        return Answer(value, math.nan)
+    inner, outer = (float(t.ppf(p, freedom)) for p in (0.841345, 0.975))
+    reach = outer * float(sigma)
+    return Answer(float(value), inner * float(sigma), (float(value) - reach, float(value) + reach))
+
+
+def of_draws(draws: np.ndarray) -> Answer:
+    """Median and central intervals of a sample."""
+    low, left, middle, right, high = np.percentile(draws, [2.5, 16, 50, 84, 97.5])
+    return Answer(float(middle), float(right - left) / 2, (float(low), float(high)))
 
 
 def of_quantity(quantity: Any, scale: float = 1.0) -> Answer:
-    """beamfit's value with the errors that its 95 % interval stands for."""
-    low, high = (scale * abs(end - quantity.value) / 1.96 for end in quantity.interval_95)
-    return Answer(scale * quantity.value, high, low)
+    """A quantity of beamfit."""
+    low, high = quantity.interval_95
+    return Answer(scale * quantity.value, scale * quantity.error, (scale * low, scale * high))
 
 
-Tool = Callable[[Any], dict[str, Answer]]
-
-
-def ask(tool: Tool, case: Any) -> dict[str, Answer]:
+def ask(tool: Callable[[Any], dict[str, Answer]], case: Any) -> dict[str, Answer]:
     """What a tool stands for: nothing if it raises or warns."""
     try:
         with warnings.catch_warnings():
@@ -60,4 +79,21 @@ def ask(tool: Tool, case: Any) -> dict[str, Answer]:
             found = tool(case)
     except (Exception, Warning):
         return {}
-    return {name: a for name, a in found.items() if math.isfinite(a.value + (a.error or 0.0))}
+    return {name: answer for name, answer in found.items() if answer.given}
+
+
+def score(truths: list[float], answers: list[Answer | None]) -> dict[str, Any]:
+    """Counts of a tool on the draws of a family; a truth of zero is that nothing is there."""
+    said = [(a, truth) for a, truth in zip(answers, truths, strict=True) if a is not None]
+    sure = [(a, truth) for a, truth in said if a.error is not None and truth > 0]
+    real = [(a.value / truth - 1, truth) for a, truth in said if truth > 0]
+    return {
+        "draws": len(truths),
+        "answered": len(said),
+        "sure": len(sure),
+        "in_68": sum(abs(a.value - truth) <= a.error for a, truth in sure),
+        "in_95": sum(a.holds(truth) for a, truth in sure),
+        "wrong": sum(a.wrong(truth) for a, truth in said),
+        "bias": float(np.median([off for off, _ in real])) if real else None,
+        "error": float(np.median([a.error / truth for a, truth in sure])) if sure else None,
+    }
