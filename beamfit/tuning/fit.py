@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -10,12 +11,15 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
+from scipy.special import expit
 
 from beamfit.answer import answer
+from beamfit.emittance.comparison import BEAM, MODELS
 from beamfit.emittance.results import in_words
 from beamfit.emittance.scan import KNOB, QuadScan
 from beamfit.emittance.statement import Seen, varied_magnets
 from beamfit.emittance.transport import setting_units
+from beamfit.emittance.verdict import REMEDIES, SURE
 from beamfit.errors import InputError, expect
 from beamfit.noise.model import Noise
 from beamfit.optics.beamline import Beamline
@@ -27,8 +31,8 @@ from beamfit.table import Table, cell, json_of
 from beamfit.tuning.knobs import GOALS, Knobs, knobs_of, planes_of
 from beamfit.tuning.minimum import Emittances, Minima, emittances_of, minima_of, values_at
 from beamfit.tuning.next_row import NextRow, PlaneMap, next_row
-from beamfit.tuning.posterior import map_posterior, numbers_at
-from beamfit.tuning.readings import plane_readings, seen_without
+from beamfit.tuning.posterior import map_posterior, mixed, numbers_at
+from beamfit.tuning.readings import log_no_beam, plane_readings, seen_without
 from beamfit.verdict import Finding, judge
 
 # Draws of the map: the ends of a 95 % interval are known to a tenth of its half-width.
@@ -36,6 +40,8 @@ DRAWS = 256
 # Probability below which an emittance is told from one that no knob changes, and a setting is
 # accepted as within the goal of the minimum.
 TOLD = 0.05
+# Odds, before the sizes are seen, that they are of no beam: as of scans.
+NO_BEAM = (MODELS["sizes at random"] + MODELS["one constant size"]) / MODELS[BEAM]
 # Parts of a table whose course is shown, and rows of the first.
 POINTS, FIRST = 5, 6
 # Half ranges within which a minimum is on the limit.
@@ -125,14 +131,23 @@ def fit_tuning(
         raise InputError(f"{draws} draws, within {within:g}", "2 or more, and a positive share")
     planes, own = planes_of(scan, goal), knobs_of(scan, knobs)
     seen, count = seen_without(scan, line, own, noise), len(own.names)
-    maps = {}
-    for i, plane in enumerate(planes):
-        readings = plane_readings(seen, plane, own, scan.settings)
-        given = readings.readings, readings.start, 2 * seed + i
-        maps[plane] = PlaneMap(readings, map_posterior(*given, knobs=count, draws=draws))
+    readings = [plane_readings(seen, plane, own, scan.settings) for plane in planes]
+    both = [
+        map_posterior(r.readings, r.start, 2 * seed + i, knobs=count, draws=draws)
+        for i, r in enumerate(readings)
+    ]
+    evidence = np.array([p.log_evidence for p in both])
+    none = np.array([log_no_beam(r.readings) for r in readings]) + math.log(NO_BEAM)
+    beam = np.prod(expit(np.logaddexp.reduce(evidence, axis=1) - none - math.log(2.0)))
+    flat = float(expit(np.diff(evidence.sum(axis=0))[0]))
+    still = np.random.default_rng(seed).permutation(draws) < round(flat * draws)
+    maps = {
+        plane: PlaneMap(r, mixed(p, still))
+        for plane, r, p in zip(planes, readings, both, strict=True)
+    }
     found = emittances_of([m.posterior for m in maps.values()])
     minima = jax.tree.map(np.asarray, minima_of(found, count))
-    return TuningFit(scan, seen, own, goal, within, maps, found, minima)
+    return TuningFit(scan, seen, own, goal, within, maps, found, minima, flat, float(beam))
 
 
 @answer
@@ -158,6 +173,10 @@ class TuningFit:
         Draws of ln of the goal.
     minima : Minima
         Their lowest values and places, in half ranges.
+    flat : float
+        Probability that no knob changes the emittance, of even odds before.
+    of_a_beam : float
+        Probability that the sizes are those of a beam through this line.
 
     Examples
     --------
@@ -177,25 +196,29 @@ class TuningFit:
     maps: dict[str, PlaneMap]
     draws: Emittances
     minima: Minima
+    flat: float
+    of_a_beam: float
 
     @cached_property
     def place(self) -> dict[str, Quantity]:
         """Setting of each knob at which the emittance is lowest, with errors.
 
-        A place that may be anywhere between the limits has no error.
+        A place has no error where no minimum is told from none, or it may be anywhere between the
+        limits.
         """
         every = self.knobs.settings(self.minima.place)
         best = self.knobs.settings(self.minima.best)
+        ends = np.abs(np.quantile(self.minima.place, WIDE, axis=0)).min(axis=0)
         found = {}
         for i, (name, unit) in enumerate(self.units.items()):
             q = self._told(_quantity(every[:, i], best[i], unit or "1"))
-            ends = np.abs(np.quantile(self.minima.place[:, i], WIDE))
-            found[name] = replace(q, error=None) if ends.min() >= 1.0 - EDGE else q
+            known = self.flat <= TOLD and ends[i] < 1.0 - EDGE
+            found[name] = q if known else q.open()
         return found
 
     def _told(self, q: Quantity) -> Quantity:
-        """A quantity of the map; nothing is known of it where a map is not told from one beam."""
-        return q if self.flat <= TOLD else q.open()
+        """A quantity of the map; nothing is known of it if the sizes are of no beam."""
+        return q if self.of_a_beam > SURE else q.open()
 
     @property
     def settings(self) -> dict[str, float]:
@@ -234,18 +257,11 @@ class TuningFit:
         on = (np.abs(self.minima.place) >= 1.0 - EDGE).mean(axis=0)
         return dict(zip(self.knobs.names, map(float, on), strict=True))
 
-    @cached_property
-    def flat(self) -> float:
-        """Probability that no knob changes the emittance, of even odds before."""
-        posts = [m.posterior for m in self.maps.values()]
-        odds = sum(float(p.log_flat - p.log_evidence) for p in posts)
-        return float(1.0 / (1.0 + np.exp(min(-odds, 500.0))))
-
     @property
     def done(self) -> bool:
         """The best setting is within the goal of the minimum with 95 % probability."""
         close = float((self.excess > self.within).mean()) <= TOLD
-        return self.flat <= TOLD and close
+        return self.of_a_beam > SURE and self.flat <= TOLD and close
 
     @cached_property
     def finding(self) -> Finding:
@@ -357,6 +373,7 @@ class TuningFit:
             "done": self.done,
             "at_limit": self.edge,
             "flat": self.flat,
+            "of_a_beam": self.of_a_beam,
             "rows": len(self.scan),
             "next": self.next,
         }
@@ -416,6 +433,14 @@ def _even(numbers: jax.Array) -> np.ndarray:
     return np.stack([s11 + s22, s11 - s22, -2.0 * emittance * alpha], -1)
 
 
+def _no_beam(fit: TuningFit) -> Finding | None:
+    """The sizes may be of no beam."""
+    if fit.of_a_beam > SURE:
+        return None
+    cause = f"The sizes are of no beam through this line ({percent(1.0 - fit.of_a_beam)})."
+    return Finding(Status.unidentified, cause, REMEDIES["sizes at random"])
+
+
 def _flat(fit: TuningFit) -> Finding | None:
     """No knob is known to change the emittance."""
     if fit.flat <= TOLD:
@@ -448,4 +473,4 @@ def _found(fit: TuningFit) -> Finding:
 
 
 # In order of gravity.
-RULES = (_flat, _at_limit, _found)
+RULES = (_no_beam, _flat, _at_limit, _found)

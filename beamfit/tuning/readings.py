@@ -9,13 +9,13 @@ from typing import NamedTuple
 import numpy as np
 
 from beamfit.emittance.beam_draws import Coordinates, coordinates
-from beamfit.emittance.comparison import PlaneSizes
+from beamfit.emittance.comparison import LEVEL, STEPS, PlaneSizes
 from beamfit.emittance.known import one_by_one, plane_sizes, prepared, unfitted
 from beamfit.emittance.scan import QuadScan
 from beamfit.emittance.statement import Seen
 from beamfit.emittance.transport import look_through
 from beamfit.greybox.problem import padded_length
-from beamfit.noise.model import Noise
+from beamfit.noise.model import LN_2PI, Noise
 from beamfit.noise.sizes import kinds_of
 from beamfit.optics.beamline import Beamline
 from beamfit.tuning.knobs import Knobs
@@ -23,6 +23,8 @@ from beamfit.tuning.posterior import KnobReadings
 
 # A beam to begin with where no constant one fits: ln of its emittance in the coordinates.
 BEGIN = np.array([-1.0, 0.0, 0.0])
+# Nodes over ln of the scale of the noise, in standard deviations of its prior.
+NODES = np.linspace(-2.5, 2.5, 11)
 
 
 def seen_without(scan: QuadScan, line: Beamline | None, knobs: Knobs, noise: Noise | None) -> Seen:
@@ -102,3 +104,31 @@ def _constant_beam(c: Coordinates) -> np.ndarray:
         return BEGIN
     emittance = math.sqrt(square)
     return np.array([math.log(emittance), math.log(s11 / emittance), -s12 / emittance])
+
+
+def log_no_beam(data: KnobReadings) -> float:
+    """Log evidence of sizes that are of no beam: the same at all settings, or at random.
+
+    Notes
+    -----
+    ln of a size is a level with steps of one size about it, as of scans (docs/verdict_constants.md)
+    or none; steps and noise are averaged over.
+
+    Examples
+    --------
+    >>> one, none = np.ones(2), np.zeros(2)
+    >>> data = KnobReadings(none, none, none, none, none, one, one, np.log([1e-3, 2.0]), 0.0, 1.0)
+    >>> log_no_beam(data) < 0.0
+    True
+    """
+    here = data.there > 0
+    y, floor, unit = data.y[here], data.floor[here], data.unit[here]
+    scale = np.exp(data.noise[0] + data.noise[1] * NODES)[:, None]
+    noise = floor**2 + (scale * unit) ** 2
+    variance = np.append(0.0, STEPS)[:, None, None] ** 2 + noise
+    weight, own = (1.0 / variance).sum(-1) + LEVEL**-2, (y / variance).sum(-1)
+    log = -0.5 * ((y**2 / variance + np.log(variance) + LN_2PI).sum(-1) - own**2 / weight)
+    log -= 0.5 * np.log(weight * LEVEL**2)
+    prior = -0.5 * NODES**2
+    prior -= np.logaddexp.reduce(prior) + math.log(len(variance))
+    return float(np.logaddexp.reduce((log + prior).ravel()))
