@@ -87,6 +87,7 @@ _OPENING = {
     "fit_emittance",
     "fit_lifetimes",
     "fit_slices",
+    "fit_tuning",
     "identify",
     "loss_coefficients",
     "moving_lifetime",

@@ -33,7 +33,7 @@ class KnobReadings(NamedTuple):
     x : Array
         Shape (n, knobs), in half ranges.
     w, known : Array
-        Shape (n, 2) and (n,): as for `log_size`.
+        Shape (n, 3) and (n,): as for `log_size`.
     y : Array
         ln of the size.
     floor, unit : Array
@@ -238,9 +238,7 @@ def _fitted(
     return state, by, whole + jnp.sum(jnp.log(jnp.diag(root))), root
 
 
-def _draw(
-    key: Array, data: KnobReadings, state: _Peak, varies: Array, orders: np.ndarray
-) -> Array:
+def _draw(key: Array, data: KnobReadings, state: _Peak, varies: Array, orders: np.ndarray) -> Array:
     """A draw of the map at given scales: a prior draw, corrected by the readings.
 
     J. T. Wilson et al., Pathwise conditioning of Gaussian processes, J. Mach. Learn. Res. 22 (2021)
