@@ -100,6 +100,8 @@ def _emittances(sheet: Sheet, names: Mapping[str, str], called: dict[str, str]) 
     quantities = {f"{word}{end}": "length" for end in ("x", "y", "x_error", "y_error")}
     found = columns_of(sheet.only(known), quantities)
     values = {k.removeprefix(word): sheet.values(c, blank=True) for k, c in found.items()}
+    for column, each in zip(found.values(), values.values(), strict=True):
+        sheet.refuse(column.header, each <= 0.0, "a positive number")
     return EmittanceTable(
         settings={knob: sheet.numbers(name) for knob, name in names.items()},
         emittance={p: v for p, v in values.items() if p in "xy"},

@@ -85,7 +85,7 @@ def test_a_table_of_emittances_needs_no_lattice(run, tmp_path):
 @pytest.mark.parametrize(
     ("old", "new", "said"),
     [
-        ("0.72", "-1", "column 'normalized_emittance_x_um': the value -1; expected a positive"),
+        ("0.72", "-1", ":4: column 'normalized_emittance_x_um': '-1'; expected a positive number"),
         ("0.72", "x", ":4: column 'normalized_emittance_x_um': 'x'; expected a number"),
         ("200,", "x,", ":4: column 'SOL_A': 'x'; expected a number"),
         ("x_um", "x_furlong", "unit"),
