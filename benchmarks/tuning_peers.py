@@ -12,7 +12,8 @@ minimum, up to the most that are measured; "-" where it never does.
   of the knobs, its emittance by `beamfit.fit_emittance`. Best is the lowest mean of its model.
 - BAX: Xopt's BaxGenerator with PathwiseMinimizeEmittance of bax-algorithms (S. Miskovich et al.,
   arXiv:2209.04587): a Gaussian process of size² over knobs and quadrupole, Matérn times a
-  polynomial of second degree in the quadrupole. Best is the minimum of its mean.
+  polynomial of second degree in the quadrupole. Best is the minimum of its mean. 16 paths, each
+  searched at 192 settings and at as many about the lowest of them.
 """
 
 from __future__ import annotations
@@ -30,6 +31,7 @@ from bax_algorithms.pathwise.optimize import DifferentialEvolution
 from bax_algorithms.utils import get_bax_mean_prediction
 from gpytorch.kernels import MaternKernel, PolynomialKernel, ProductKernel, ScaleKernel
 from pandas import DataFrame
+from scipy.stats.qmc import Sobol
 from xopt import VOCS
 from xopt.generators.bayesian import ExpectedImprovementGenerator
 from xopt.generators.bayesian.bax_generator import BaxGenerator
@@ -57,8 +59,8 @@ torch.cholesky = torch.linalg.cholesky
 WITHIN, SCAN, UNIT = 0.05, 5, 1e-4  # sizes of a scan; m
 # Energy in eV at which bax-algorithms' kG are 1/m of a thin lens.
 ENERGY = 299.792458e5
-# Paths of BAX, and generations of its search: as many as take seconds, not minutes, a row.
-PATHS, GENERATIONS = 10, 40
+# Paths of BAX, and settings at which each is searched for its minimum.
+PATHS, SETTINGS = 16, 192
 
 Course = Iterator[tuple[int, dict[str, float]]]
 
@@ -97,6 +99,27 @@ def scans(gun: Gun, seed: int, first: int, most: int) -> Course:
             yield SCAN * len(found), dict(zip(gun.names, map(float, best), strict=True))
 
 
+class EachPath(DifferentialEvolution):
+    """The lowest of so many settings for each path by itself, then of as many about it.
+
+    Quicker and lower than bax-algorithms' own search, differential evolution of all paths at once.
+    """
+
+    def optimize(self, virtual_objective, sample_functions_list, bounds, n_samples,
+                 optimization_indeces=None):  # fmt: skip
+        low, high = bounds[:, optimization_indeces]
+        cube = Sobol(len(low), rng=0).random(SETTINGS * n_samples).reshape(n_samples, SETTINGS, -1)
+        cube, best = torch.tensor(cube), 0.5 * (low + high).repeat(n_samples, 1)
+        for width in (1.0, 0.2):
+            near = best[:, None] + width * (cube - 0.5) * (high - low)
+            at = bounds.mean(dim=0).repeat(n_samples, SETTINGS, 1)
+            at[..., optimization_indeces] = torch.clamp(near, low, high)
+            value = virtual_objective(sample_functions_list, at, bounds).reshape(n_samples, -1)
+            lowest = torch.nan_to_num(value, nan=torch.inf).argmin(dim=1)
+            best = at[torch.arange(n_samples), lowest][:, optimization_indeces].detach()
+        return best[:, None]
+
+
 def bax(gun: Gun, seed: int, first: int, most: int) -> Course:
     rng, names = np.random.default_rng(seed), (*gun.names, "Q")
     vocs = VOCS(variables=limits_of(names), observables=["square"])
@@ -107,7 +130,7 @@ def bax(gun: Gun, seed: int, first: int, most: int) -> Course:
             PolynomialKernel(power=2, active_dims=(quad,)),
         )
     )
-    search = DifferentialEvolution(maxiter=GENERATIONS)
+    search = EachPath()
     algorithm = PathwiseMinimizeEmittance(
         x_key="square", observable_names_ordered=["square"], energy=ENERGY, q_len=1.0,
         rmat_x=[[1.0, 2.0], [0.0, 1.0]], meas_dim=quad, thin_lens=True, use_bmag=False,

@@ -71,10 +71,10 @@ def tune(
     fit = fit_tuning(scan, line, limits, goal=goal, within=close, noise=own, seed=seed)
     inputs = {str(each.path): each.sha256 for each in inputs}
     reported(report, fit, inputs)
-    answered(as_json, [fit], inputs, lambda terminal: _show(terminal, fit), report)
+    answered(as_json, [fit], inputs, lambda terminal: show_tuning(terminal, fit), report)
 
 
-def _show(terminal: Terminal, fit: TuningFit) -> None:
+def show_tuning(terminal: Terminal, fit: TuningFit) -> None:
     """Say the verdict first, then the best setting and the next row."""
     terminal.answer(fit.headline, fit.status, fit.message)
     for note in fit.notes:

@@ -15,6 +15,7 @@ from bluesky.utils import FailedStatus, MsgGenerator
 
 import beamfit
 from beamfit.emittance.fit import EmittanceFit
+from beamfit.errors import InputError
 from beamfit.io.machine import ScanMachine
 from beamfit.live.devices import connect
 from beamfit.live.points import MeasuredPoint
@@ -71,6 +72,10 @@ def emittance_scan(
     --------
     See docs/live_adapters.md, which is run as it stands.
     """
+    if machine.knobs:
+        raise InputError(
+            "knobs in a plan of bluesky", "beamfit scan, which tunes them", machine.path
+        )
     steps: asyncio.Queue[MsgGenerator[None] | None] = asyncio.Queue()
     turn = asyncio.Semaphore(0)
 
