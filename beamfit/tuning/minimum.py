@@ -66,7 +66,7 @@ def _lowered(x: Array, value: object) -> Array:
         held = ((x >= 1.0) & (slope < 0.0)) | ((x <= -1.0) & (slope > 0.0))
         free = jnp.where(held, 0.0, 1.0)
         bend = bend * jnp.outer(free, free) + jnp.diag(1.0 - free)
-        size = jnp.abs(jnp.diag(bend)).max()
+        size = jnp.maximum(jnp.abs(jnp.diag(bend)).max(), 1e-30)  # of a level map 0
         values, vectors = jnp.linalg.eigh(bend)
         along = vectors.T @ (slope * free)
         curved = jnp.abs(values) + (DAMPED[:, None] + 1e-9) * size

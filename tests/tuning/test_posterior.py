@@ -166,6 +166,8 @@ def test_draws_of_a_map_that_no_knob_changes_stand_where_they_are_wanted(data):
     assert np.all(np.ptp(values[~still], axis=1) > 1e-3)
     place = np.asarray(minima_of(found, KNOBS).place)[still]
     assert kstest(place.ravel(), uniform(-1, 2).cdf).pvalue > 1e-3
+    level = minima_of(emittances_of([of.mixed(both, np.ones(256, bool))]), KNOBS)
+    assert np.isfinite(np.asarray(level.best)).all()
 
 
 def test_the_evidence_of_no_beam_is_the_integral_of_its_likelihood(data):
