@@ -22,6 +22,7 @@ _HOME = {
     "DecayRecord": "beamfit.lifetime.record",
     "Drift": "beamfit.optics.elements",
     "EmittanceFit": "beamfit.emittance.fit",
+    "EmittanceTable": "beamfit.tuning.knobs",
     "InputError": "beamfit.errors",
     "Job": "beamfit.batch.job",
     "Machine": "beamfit.lifetime.study",
