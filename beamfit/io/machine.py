@@ -225,7 +225,7 @@ def read_scan_machine(path: str | PathLike[str]) -> ScanMachine:
     if not top.table.get("magnet"):
         raise top.error("no magnet to scan", "tables [[magnet]]", "magnet")
     scanned = tuple(_magnet(section, lattice) for section in top.sections("magnet"))
-    knobs = tuple(map(_knob, top.sections("knob")))
+    knobs = tuple(map(_knob, top.sections("knob"))) if "knob" in top.table else ()
     magnets = scanned + knobs
     for said_once in ({m.name for m in magnets}, {m.set.rpartition("://")[2] for m in magnets}):
         if len(said_once) < len(magnets):

@@ -139,6 +139,13 @@ def test_nothing_is_chosen_beyond_what_could_not_be_measured(done):
     assert full == "all 40 points are measured"
 
 
+def test_a_machine_without_knobs_scans_and_has_fewer_points(tmp_path):
+    usual = machine_in(tmp_path, **{"points = 40": ""})
+    plain = machine_in(tmp_path, **{"points = 40": "", KNOB: ""})
+    assert (usual.knobs, usual.points) == (("phase",), 60)
+    assert (plain.knobs, plain.points) == ((), 15)
+
+
 @pytest.mark.parametrize(
     ("old", "new", "said"),
     [
