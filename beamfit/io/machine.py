@@ -229,7 +229,7 @@ def read_scan_machine(path: str | PathLike[str]) -> ScanMachine:
     magnets = scanned + knobs
     for said_once in ({m.name for m in magnets}, {m.set.rpartition("://")[2] for m in magnets}):
         if len(said_once) < len(magnets):
-            found = "a magnet, a knob or the variable that sets it twice"
+            found = "a magnet or the variable that sets it twice"
             raise top.error(found, "one [[magnet]] or [[knob]] for each", "magnet")
     wanted = top.section("scan")
     plan = wanted.values(SCAN)
