@@ -128,7 +128,7 @@ def _told(
 def _through(
     fit: Tuned, table: Mapping[str, np.ndarray]
 ) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """What sizes at settings of the magnets are seen through, as for `log_size`, by plane."""
+    """R11, R12 and what is known at settings of the magnets, as for `log_size`, by plane."""
     seen = fit.seen
     if seen is None:
         return dict.fromkeys(fit.maps, (np.array([[0.0, 0.0, 1.0]]), np.zeros(1)))
